@@ -37,18 +37,16 @@ from tables.case import FLY, SyntheticCase
 
 from phyradgs_cl import __version__
 from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, PerRow, Protocol, Scan
-from phyradgs_cl.calibrate import Calibration, calibrate
-from phyradgs_cl.calibrate.moved import Change, Moved, Sway, Views, moved
-from phyradgs_cl.calibrate.parameters import PARAMETERS, change_of
-from phyradgs_cl.calibrate.views import SPLINES
-from phyradgs_cl.calibrate.wobble import (
-    numbers_of_sway,
-    numbers_of_views,
-    views_of,
-    without_gauges,
-    without_smooth_gauges,
-    without_sway_gauges,
+from phyradgs_cl.acquisition.altered.perturbed import (
+    GeometryCorrection,
+    PerturbedTrajectory,
+    Sway,
+    Views,
+    perturb,
 )
+from phyradgs_cl.calibrate import Calibration, calibrate
+from phyradgs_cl.calibrate.parameters import PARAMETERS, correction_of
+from phyradgs_cl.calibrate.per_view import SPLINES, MotionParameters, WobbleParameters
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.importers import load_attenuation
 from phyradgs_cl.metrics import psnr
@@ -68,7 +66,7 @@ class Planned(Protocol):
 
     is_backwards: bool = False
     views_off: Views | Sway | None = None
-    off: Change = Change()
+    off: GeometryCorrection = GeometryCorrection()
 
     def orbit(self, geometry: ConeGeometry, jitter_deg: float = 0.0, rng: np.random.Generator | None = None):  # type: ignore[no-untyped-def]
         path = super().orbit(geometry, jitter_deg, rng)
@@ -76,9 +74,9 @@ class Planned(Protocol):
             sweeps = path.kinematics
             first, last = -sweeps.angle_start_rad, -sweeps.angle_end_rad
             path = CircularOrbit(geometry, replace(sweeps, angle_start_rad=first, angle_end_rad=last))
-        if self.views_off is None and self.off == Change():
+        if self.views_off is None and self.off == GeometryCorrection():
             return path
-        return Moved(path, geometry.detector_shape, self.off, self.views_off)
+        return PerturbedTrajectory(path, geometry.detector_shape, self.off, self.views_off)
 
 
 @dataclass(frozen=True)
@@ -136,10 +134,10 @@ def wobble(make: Maker, seed: int) -> Case:
 
 def slow(make: Maker, seed: int) -> Case:
     scan = make(seed)
-    numbers = numbers_of_views(scan, 6)
-    drawn = without_smooth_gauges(scan, numbers, np.random.default_rng(seed).normal(size=(6, 3)))
+    parameters = WobbleParameters.of(scan, 6)
+    drawn = parameters.without_gauges(np.random.default_rng(seed).normal(size=(6, 3)))
     size = np.array([np.deg2rad(0.3), *scan.geometry.pixel_size_mm])
-    views = views_of(numbers.basis @ drawn / np.std(numbers.basis @ drawn, axis=0) * size)
+    views = parameters.views_of(drawn / np.std(parameters.basis @ drawn, axis=0) * size)
     shaken = make(seed, views_off=views)
     return Case(replace(shaken, trajectory=scan.trajectory), shaken, "wobble", {}, views=views, splines=6)
 
@@ -153,7 +151,8 @@ def kaist(make: Maker, seed: int) -> Case:
 
 def _shaken(make: Maker, scan: Scan, seed: int, sizes: np.ndarray) -> Case:
     rng = np.random.default_rng(seed)
-    views = views_of(without_gauges(scan, sizes * rng.normal(size=(scan.frames, 3))))
+    parameters = WobbleParameters.of(scan)
+    views = parameters.views_of(parameters.without_gauges(sizes * rng.normal(size=(scan.frames, 3))))
     shaken = make(seed, views_off=views)
     return Case(replace(shaken, trajectory=scan.trajectory), shaken, "wobble", {}, views=views)
 
@@ -161,11 +160,11 @@ def _shaken(make: Maker, scan: Scan, seed: int, sizes: np.ndarray) -> Case:
 def motion(make: Maker, seed: int) -> Case:
     """Splines with coefficients that are half of one drift and half of chance, about the mean place."""
     scan, rng = make(seed), np.random.default_rng(seed)
-    numbers = numbers_of_sway(scan, SPLINES)
+    parameters = MotionParameters.of(scan)
     course = np.linspace(-1, 1, SPLINES)[:, None] * rng.choice([-1, 1], 6) + rng.uniform(-1, 1, (SPLINES, 6))
-    course = course / np.ptp(numbers.basis @ course, axis=0)
+    course = course / np.ptp(parameters.basis @ course, axis=0)
     most = np.array([np.deg2rad(2.0)] * 3 + [2 * scan.grid.voxel_size_mm[0]] * 3)
-    sway = numbers.views(without_sway_gauges(scan, numbers, course * most))
+    sway = parameters.views_of(parameters.without_gauges(course * most))
     shaken = make(seed, views_off=sway)
     return Case(replace(shaken, trajectory=scan.trajectory), shaken, "motion", {})
 
@@ -180,7 +179,7 @@ def beads(make: Maker, seed: int) -> Case:
     }  # fmt: skip
     planted = {name: most * rng.uniform(0.5, 1) * rng.choice([-1, 1]) for name, most in size.items()}
     times = {name: planted[name] for name in ("readout", "exposure")}
-    off = change_of({name: size for name, size in planted.items() if name not in times})
+    off = correction_of({name: size for name, size in planted.items() if name not in times})
     right = make(seed, phantom=lying, off=off)
     stated = replace(right, trajectory=right.trajectory.base)  # type: ignore[attr-defined]
     return Case(_without(stated, times), right, None, planted, is_scored=False, phantom=known)
@@ -225,7 +224,7 @@ def _drawn(right: Scan, seed: int) -> Case:
 
 
 def _without(scan: Scan, planted: dict[str, float]) -> Scan:
-    return moved(scan, change_of({name: -value for name, value in planted.items()}))
+    return perturb(scan, correction_of({name: -value for name, value in planted.items()}))
 
 
 CASES = {

@@ -10,8 +10,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from phyradgs_cl.acquisition import CircularOrbit, Scan
+from phyradgs_cl.acquisition.altered.perturbed import GeometryCorrection, perturb
 from phyradgs_cl.api import calibrate, reconstruct, simulate
-from phyradgs_cl.calibrate.moved import Change, moved
 from phyradgs_cl.check import check
 from phyradgs_cl.drawing import SAMPLE
 from phyradgs_cl.metrics import psnr
@@ -57,7 +57,7 @@ def calibrate_figure(size: int = 48) -> Figure:
     right = simulate("foot", size=size, detector=2 * size, noise="tigre", dose=1e4)
     planted = {"offset-u": 2.5 * 4 / (2 * size), "roll": 2.0, "tilt-v": 1.0}  # mm, degrees
     shift_mm, roll_rad, tilt_rad = planted["offset-u"], np.deg2rad(planted["roll"]), np.deg2rad(planted["tilt-v"])
-    stated = moved(right, Change(offset_u_mm=-shift_mm, roll_rad=-roll_rad, tilt_v_rad=-tilt_rad))
+    stated = perturb(right, GeometryCorrection(offset_u_mm=-shift_mm, roll_rad=-roll_rad, tilt_v_rad=-tilt_rad))
     found = calibrate(stated, "offset,roll,tilt")
     figure = Figure(figsize=(10.5, 4.4), layout="constrained")
     axes = figure.subplots(2, 3)

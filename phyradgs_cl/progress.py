@@ -52,6 +52,11 @@ class Ticker:
             _say(self._over(text), ends_line=False)
             self.is_open = self.is_counting = True
 
+    def note(self, text: str) -> None:
+        """Prints a line that stays, above the one that is rewritten."""
+        _say(self._over(text) if self.is_open else text)
+        self.is_open = self.is_counting = False
+
     def progress(self, p: Progress) -> None:
         cloud = f"  {p.gaussians} Gaussians" if p.gaussians else ""
         self.show(p.iteration, p.iterations, f"  {p.quantity} {p.loss:.5f}{cloud}")

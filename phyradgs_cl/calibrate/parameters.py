@@ -1,4 +1,4 @@
-"""What can be asked for by name: how it is stated, in which unit, and what it looks like when nothing tells it."""
+"""The parameters that can be calibrated: name, unit, stated value, step, and what an object would have to be instead."""
 
 import math
 from collections.abc import Callable, Mapping
@@ -7,29 +7,32 @@ from dataclasses import dataclass
 import numpy as np
 
 from phyradgs_cl.acquisition import Scan
-from phyradgs_cl.calibrate.moved import Change
-from phyradgs_cl.check.questions.timing import exposure_arc_rad
+from phyradgs_cl.acquisition.altered.angles import exposure_arc_rad
+from phyradgs_cl.acquisition.altered.perturbed import GeometryCorrection
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.text import near_miss
 
-_STEP_PX = 0.25  # how far a derivative's differences move the image at its edge
-_TIMING_STEP, _LEAST_TIME = 0.1, 0.7  # of the time that is stated: of a difference, and what may be taken off
-_PER_ONE = 50.0  # what moves nothing is tried by half a percent, and stepped by four at most
+_STEP_PX = 0.25  # by which a central difference moves the image at its edge
+_TIMING_STEP, _LARGEST_CUT = 0.1, 0.7  # of the stated time: a difference, and the most to subtract
+_PER_ONE = 50.0  # pixels per unit of lag and drift, which move nothing: differences of 0.5 %, steps of 4 % at most
 _MOST_TILT_RAD = math.radians(2.0)
-_SMALL_MISMATCH = 1.3  # of signals that are the other way half a turn later, which errors of voxels are not
-_LEAST_KNOWN_RAD = math.radians(10.0)  # standard deviation of an angle that says nothing: sines are straight no further
+_SMALL_MISMATCH = 1.3  # of signals that change sign after half a turn, as errors of voxels do not
+_LEAST_KNOWN_RAD = math.radians(10.0)  # deviation of an angle that is unknown: sines are linear no further
+_DEGREES = math.degrees(1.0)
 
 
 @dataclass(frozen=True)
 class Parameter:
-    """A field of ``Change``. ``scale``: of the unit that people read per unit of the field. ``alike``: what the object does
-    instead, where the frames cannot tell. ``pixels``: by how many pixels a unit of the field moves the image at its edge.
-    ``mismatch``: errors that were measured (docs/calibrate.md) over what noise alone would do: voxels are no object."""
+    """A field of ``GeometryCorrection``.
+
+    scale: of the displayed unit per unit of the field. object_instead: the object that explains the frames as well, where
+    they do not determine the parameter. pixels: how far a unit of the field moves the image at its edge. mismatch: measured
+    errors (docs/calibrate.md) over those of noise, because voxels do not represent the object exactly."""
 
     name: str
     field: str
     unit: str
-    alike: str
+    object_instead: str
     stated: Callable[[Scan], float]
     pixels: Callable[[Scan], float]
     scale: float = 1.0
@@ -37,20 +40,20 @@ class Parameter:
     mismatch: float = 2.0
 
     def step(self, scan: Scan) -> float:
-        """Half the distance of a central difference, in the field's unit."""
+        """Returns half the distance of a central difference, in the field's unit."""
         step = _STEP_PX / self.pixels(scan)
         if self.unit == "deg":
             return min(step, _MOST_TILT_RAD)
         return min(step, _TIMING_STEP * self.stated(scan) or step) if self.is_timing else step
 
-    def is_told(self, deviation: float) -> bool:
-        """Whether a value with this standard deviation, in the field's unit, says anything: an angle may be all round."""
+    def is_known(self, deviation: float) -> bool:
+        """True where a value with this standard deviation, in the field's unit, says anything."""
         return self.unit != "deg" or deviation < _LEAST_KNOWN_RAD
 
     def lowest(self, scan: Scan) -> float:
-        """The lowest value of the field that is tried: times stay above 0."""
+        """Returns the lowest value of the field to try: times stay above 0."""
         stated = self.stated(scan) if self.is_timing else 0.0
-        return -_LEAST_TIME * stated if stated > 0 else -math.inf
+        return -_LARGEST_CUT * stated if stated > 0 else -math.inf
 
 
 def _half_mm(scan: Scan, axis: int) -> float:
@@ -61,27 +64,23 @@ def _pitch_mm(scan: Scan) -> float:
     return min(scan.geometry.pixel_size_mm)
 
 
-def _roll_pixels(scan: Scan) -> float:
-    return max(_half_mm(scan, 0), _half_mm(scan, 1)) / _pitch_mm(scan)
+def _edge_pixels(scan: Scan, factor: float = 1.0) -> float:
+    """Pixels from the panel's middle to its further edge, by which a radian of roll moves that; times a factor."""
+    return factor * max(_half_mm(scan, 0), _half_mm(scan, 1)) / _pitch_mm(scan)
 
 
 def _tilt_pixels(axis: int) -> Callable[[Scan], float]:
-    """A tilt magnifies one side: points go outwards by the square of their distance from the axis of the tilt."""
+    """A tilt magnifies one side: points move outwards by the square of their distance from the tilt's axis."""
     return lambda scan: _half_mm(scan, axis) ** 2 / scan.geometry.source_to_detector_mm / _pitch_mm(scan)
 
 
-def _distance_pixels(share: Callable[[Scan], float]) -> Callable[[Scan], float]:
-    return lambda scan: share(scan) * max(_half_mm(scan, 0), _half_mm(scan, 1)) / _pitch_mm(scan)
-
-
 def _timing_pixels(scan: Scan) -> float:
-    """A second turns the object's edge by so many pixels."""
+    """Pixels by which the object's edge turns in a second."""
     speed_rad_per_s = exposure_arc_rad(scan) / scan.shutter.exposure_s
     edge_mm = max(scan.grid.size_mm[1:]) / 2 * scan.geometry.magnification
     return max(speed_rad_per_s * edge_mm / _pitch_mm(scan), 1e-12)
 
 
-_DEGREES = math.degrees(1.0)
 _SCALE = "a larger or smaller object"
 _TURN = "an object turned about the axis"
 PARAMETERS = {
@@ -95,7 +94,7 @@ PARAMETERS = {
             "offset-v", "offset_v_mm", "mm", "an object further along the axis",
             lambda s: s.geometry.detector_offset_mm[0], lambda s: 1 / _pitch_mm(s),
         ),
-        Parameter("roll", "roll_rad", "deg", "a sheared object", lambda s: 0.0, _roll_pixels, _DEGREES),
+        Parameter("roll", "roll_rad", "deg", "a sheared object", lambda s: 0.0, _edge_pixels, _DEGREES),
         Parameter(
             "tilt-v", "tilt_v_rad", "deg", "a shifted panel", lambda s: 0.0, _tilt_pixels(1), _DEGREES,
             mismatch=_SMALL_MISMATCH,
@@ -103,12 +102,12 @@ PARAMETERS = {
         Parameter("tilt-u", "tilt_u_rad", "deg", "an object wider at one end", lambda s: 0.0, _tilt_pixels(0), _DEGREES),
         Parameter(
             "source-distance", "source_distance_mm", "mm", _SCALE,
-            lambda s: s.geometry.source_to_axis_mm, _distance_pixels(lambda s: 1 / s.geometry.source_to_axis_mm),
+            lambda s: s.geometry.source_to_axis_mm, lambda s: _edge_pixels(s, 1 / s.geometry.source_to_axis_mm),
         ),
         Parameter(
             "detector-distance", "detector_distance_mm", "mm", _SCALE,
             lambda s: s.geometry.source_to_detector_mm - s.geometry.source_to_axis_mm,
-            _distance_pixels(lambda s: 1 / s.geometry.source_to_detector_mm),
+            lambda s: _edge_pixels(s, 1 / s.geometry.source_to_detector_mm),
         ),
         Parameter(
             "readout", "readout_s", "s", "an object twisted about the axis",
@@ -123,39 +122,56 @@ PARAMETERS = {
         Parameter("drift", "drift", "%", "an object denser at one side", lambda s: 0.0, lambda s: _PER_ONE, 100.0),
     )
 }  # fmt: skip
-GAUGE = Parameter("all angles", "turn_rad", "deg", _TURN, lambda s: 0.0, lambda s: _roll_pixels(s), _DEGREES)
-"""What no frame can tell: what is left of its signal is what this discretisation leaves of anything."""
-GROUPS = {
-    "offset": ("offset-u", "offset-v"),
+OFFSET_U, LAG, DRIFT = "offset-u", "lag", "drift"
+GAUGE = Parameter("all angles", "turn_rad", "deg", _TURN, lambda s: 0.0, _edge_pixels, _DEGREES)
+"""A parameter that no frame determines: its remaining signal is an error of the voxels."""
+PARAMETER_GROUPS = {
+    "offset": (OFFSET_U, "offset-v"),
     "tilt": ("tilt-v", "tilt-u"),
     "distance": ("source-distance", "detector-distance"),
     "timing": ("readout", "exposure", "start"),
 }
 WOBBLE, MOTION, DIRECTION = "wobble", "motion", "direction"
+NAMES = list(dict.fromkeys([*PARAMETER_GROUPS, *PARAMETERS, WOBBLE, MOTION, DIRECTION]))
 
 
-def chosen(what: str | None, scan: Scan, knows_shape: bool = False) -> tuple[list[Parameter], str, bool]:
-    """(the parameters that ``what`` names with commas; whether views are asked for one by one or the object's motion, as
-    named; whether the readout's direction is); None: those of the panel, of an object of known shape distances and, of a
-    fly-scan, readout and exposure. InputError: a name that there is not, views and motion, timing of a gantry at rest."""
-    words = [word.strip() for word in (_usual(scan) + ",distance" * knows_shape if what is None else what).split(",")]
+@dataclass(frozen=True)
+class Request:
+    """Parameters to estimate; ``per_view``: wobble, motion or nothing (""); whether the readout's direction is tested."""
+
+    parameters: list[Parameter]
+    per_view: str
+    asks_direction: bool
+
+    @property
+    def names(self) -> list[str]:
+        return [one.name for one in self.parameters]
+
+
+def requested(what: str | None, scan: Scan, knows_shape: bool = False) -> Request:
+    """Reads names separated by commas. None: offset, roll and tilt; of a fly-scan readout and exposure as well, of an object
+    of known shape distances as well.
+
+    InputError: an unknown name, wobble together with motion, timing of a gantry that stands still."""
+    if what is None:
+        what = _usual(scan) + (",distance" if knows_shape else "")
     names: list[str] = []
-    for word in words:
-        if word not in (known := [*GROUPS, *PARAMETERS, WOBBLE, MOTION, DIRECTION]):
-            raise InputError("--what", repr(word), ", ".join(known), near_miss(word, known, "name some of them"))
-        names += GROUPS.get(word, (word,))
+    for word in (word.strip() for word in what.split(",")):
+        if word not in NAMES:
+            raise InputError("--what", repr(word), ", ".join(NAMES), near_miss(word, NAMES, "name some of them"))
+        names += PARAMETER_GROUPS.get(word, (word,))
     names = list(dict.fromkeys(names))
-    per_view = [name for name in names if name in (WOBBLE, MOTION)]
-    if len(per_view) > 1:
-        raise InputError("--what", f"{WOBBLE} and {MOTION}", "one of the two: each would take the other's part", "ask twice")
-    found = [PARAMETERS[name] for name in names if name in PARAMETERS]
-    asks_direction = DIRECTION in names
-    timed = [one.name for one in found if one.is_timing] + [DIRECTION] * asks_direction
+    if WOBBLE in names and MOTION in names:
+        expected = "one of the two, because each explains the other"
+        raise InputError("--what", f"{WOBBLE} and {MOTION}", expected, "run it twice")
+    per_view = next((name for name in names if name in (WOBBLE, MOTION)), "")
+    request = Request([PARAMETERS[name] for name in names if name in PARAMETERS], per_view, DIRECTION in names)
+    timed = [name for name in names if name == DIRECTION or (name in PARAMETERS and PARAMETERS[name].is_timing)]
     if timed and not _turns(scan):
         raise InputError("--what", timed[0], "a parameter of the panel: this gantry stands still in each frame")
-    if asks_direction and scan.shutter.readout_s == 0:
+    if request.asks_direction and scan.shutter.readout_s == 0:
         raise InputError(f"--what {DIRECTION}", "a readout of 0 s", "lines that are read one after the other")
-    return found, "".join(per_view), asks_direction
+    return request
 
 
 def _turns(scan: Scan) -> bool:
@@ -163,20 +179,21 @@ def _turns(scan: Scan) -> bool:
 
 
 def _usual(scan: Scan) -> str:
-    return "offset,roll,tilt" + ",readout,exposure" * (_turns(scan) and scan.shutter.readout_s > 0)
+    is_rolling = _turns(scan) and scan.shutter.readout_s > 0
+    return "offset,roll,tilt,readout,exposure" if is_rolling else "offset,roll,tilt"
 
 
-def change_of(values: Mapping[str, float]) -> Change:
-    """A change by the parameters' names, in the units of the fields."""
+def correction_of(values: Mapping[str, float]) -> GeometryCorrection:
+    """Returns the correction with these values by parameter name, in the fields' units."""
     fields = {**PARAMETERS, GAUGE.name: GAUGE}
-    return Change(**{fields[name].field: float(value) for name, value in values.items()})
+    return GeometryCorrection(**{fields[name].field: float(value) for name, value in values.items()})
 
 
 def in_words(weights: Mapping[str, float]) -> str:
-    """A combination of parameters (weights by name, of their signals' norms), those that matter, the largest first."""
+    """Describes a combination of parameters (weights by name), the largest first, without small ones."""
     order = sorted(weights, key=lambda name: -abs(weights[name]))
     largest = abs(weights[order[0]])
-    parts = [name for name in order if abs(weights[name]) > 0.3 * largest]
-    sign = np.sign(weights[parts[0]])
-    text = parts[0] + "".join(f" {'with' if weights[p] * sign > 0 else 'against'} {p}" for p in parts[1:])
-    return f"{text}: looks like {PARAMETERS[parts[0]].alike}"
+    main, *others = [name for name in order if abs(weights[name]) > 0.3 * largest]
+    sign = np.sign(weights[main])
+    text = main + "".join(f" {'with' if weights[name] * sign > 0 else 'against'} {name}" for name in others)
+    return f"{text}: looks like {PARAMETERS[main].object_instead}"

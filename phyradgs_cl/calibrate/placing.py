@@ -1,4 +1,4 @@
-"""Where a phantom of known shape lies: bright spots of a first volume, and the rigid motion that takes known beads there."""
+"""A first placement of a known phantom: bright spots of a volume, and the rigid motion that takes known beads there."""
 
 from collections.abc import Iterator
 
@@ -11,50 +11,51 @@ from phyradgs_cl.fields import Grid
 from phyradgs_cl.phantoms import Ellipsoid, EllipsoidPhantom
 
 FEWEST_BEADS = 4
-WRONG_PHANTOM = "is it this one, is all of it in view, in mm? Does the gantry turn as stated ('phyradgs check')?"
-_LEAST_SHARE = 0.75  # of the beads that have to be found
-_SMOOTH = 0.5  # of a bead's radius: one of many voxels has one middle then
-_OVER = 2.0  # peaks that are looked for, per bead
+WRONG_PHANTOM = "is it the right phantom, all of it in view, in mm? Does the gantry turn as stated ('phyradgs check')?"
+_LEAST_SHARE = 0.75  # of the beads have to be found
+_SMOOTH = 0.5  # of a bead's radius: a bead of many voxels then has one maximum
+_PEAKS_PER_BEAD = 2.0
 _TOLERANCE_VOXELS = 1.5
-_TRIANGLES = 40  # of known beads that are tried
-_APART = 0.05  # rad between placements that are not the same
-_MOST = 6  # placements that fit alike: a phantom that turned looks as it did
+_TRIANGLES = 40  # of known beads to try
+_APART = 0.05  # rad between different placements
+_MOST = 6  # placements that fit equally well, of a nearly symmetric phantom
 
 
 def bead_centres_mm(phantom: EllipsoidPhantom) -> np.ndarray:
-    """Centres (n, 3) of a phantom's beads; InputError for fewer than four, or such as lie on a line."""
+    """Returns the centres (n, 3) of a phantom's beads; InputError for fewer than four, and for beads on a line."""
     centres_mm = np.array([body.centre_mm for body in phantom.ellipsoids if isinstance(body, Ellipsoid)]).reshape(-1, 3)
     spread_mm = np.linalg.svd(centres_mm - centres_mm.mean(0), compute_uv=False) if len(centres_mm) else np.zeros(3)
     if len(centres_mm) < FEWEST_BEADS or spread_mm[1] < 0.01 * spread_mm[0]:
-        found = f"{len(centres_mm)} beads" + " on a line" * (len(centres_mm) >= FEWEST_BEADS)
-        raise InputError("--phantom", found, f"at least {FEWEST_BEADS} beads that do not lie on a line")
+        on_a_line = " on a line" if len(centres_mm) >= FEWEST_BEADS else ""
+        expected = f"at least {FEWEST_BEADS} beads that do not lie on a line"
+        raise InputError("--phantom", f"{len(centres_mm)} beads{on_a_line}", expected)
     return centres_mm
 
 
 def placements(phantom: EllipsoidPhantom, volume: np.ndarray, grid: Grid) -> list[np.ndarray]:
-    """Turns (rotation vectors, rad) and shifts (mm), (6,) each, that take the most of the known beads to bright spots of a
-    volume (z, y, x), the best first. InputError where none does."""
+    """Returns placements (6,): turns (rotation vectors, rad) and shifts (mm), which take most of the known beads to bright
+    spots of a volume (z, y, x), the best first. InputError where none does."""
     known = bead_centres_mm(phantom)
     radius_mm = np.median([body.reach_mm for body in phantom.ellipsoids if isinstance(body, Ellipsoid)])
     smooth = gaussian_filter(volume, _SMOOTH * radius_mm / np.array(grid.voxel_size_mm))
-    seen = _peaks_mm(smooth, grid, int(_OVER * len(known)) + FEWEST_BEADS)
+    seen = _peaks_mm(smooth, grid, int(_PEAKS_PER_BEAD * len(known)) + FEWEST_BEADS)
     within_mm = _TOLERANCE_VOXELS * max(grid.voxel_size_mm)
-    found: list[tuple[int, float, np.ndarray]] = []
-    for three, corners in _alike(known, seen, within_mm):
+    matches: list[tuple[int, float, np.ndarray]] = []  # beads found (negative), mean distance, placement
+    for three, corners in _matching_triangles(known, seen, within_mm):
         place = _rigid(known[list(three)], seen[corners])
-        for _ in range(2):  # of three, then of all that are near
+        for _ in range(2):  # from three beads, then from all near ones
             apart_mm = np.linalg.norm(_moved(place, known)[:, None] - seen, axis=-1)
             near = apart_mm.min(1) < within_mm
             if near.sum() < 3:
                 break
             place = _rigid(known[near], seen[apart_mm[near].argmin(1)])
-        found.append((-int(near.sum()), float(np.mean(np.minimum(apart_mm.min(1), within_mm))), place))
-    found.sort(key=lambda one: one[:2])
-    most = -found[0][0] if found else 0
+        matches.append((-int(near.sum()), float(np.mean(np.minimum(apart_mm.min(1), within_mm))), place))
+    matches.sort(key=lambda one: one[:2])
+    most = -matches[0][0] if matches else 0
     if most < max(_LEAST_SHARE * len(known), FEWEST_BEADS - 1):
         raise InputError("--phantom", f"{most} of {len(known)} beads where they should be", "most of them", WRONG_PHANTOM)
     best: list[np.ndarray] = []
-    for count, _, place in found:
+    for count, _, place in matches:
         if -count < most - 1 or len(best) == _MOST:
             break
         if all(_turn_between(place, other) > _APART for other in best):
@@ -63,7 +64,7 @@ def placements(phantom: EllipsoidPhantom, volume: np.ndarray, grid: Grid) -> lis
 
 
 def _peaks_mm(volume: np.ndarray, grid: Grid, most: int) -> np.ndarray:
-    """Bright spots (m, 3) of a volume (z, y, x), as x, y, z: the middles of the largest local maxima's surroundings."""
+    """Returns bright spots (m, 3) of a volume (z, y, x), as x, y, z in mm: the centroids about the largest local maxima."""
     inner = np.zeros(volume.shape, bool)
     inner[1:-1, 1:-1, 1:-1] = True
     peaks = np.argwhere((volume == maximum_filter(volume, 3)) & inner & (volume > 0))
@@ -78,8 +79,10 @@ def _peaks_mm(volume: np.ndarray, grid: Grid, most: int) -> np.ndarray:
     return np.array(places).reshape(-1, 3)
 
 
-def _alike(known: np.ndarray, seen: np.ndarray, within_mm: float) -> Iterator[tuple[tuple[int, int, int], list[int]]]:
-    """Triangles of known points (n, 3) with those of seen ones (m, 3) whose sides are as long."""
+def _matching_triangles(
+    known: np.ndarray, seen: np.ndarray, within_mm: float
+) -> Iterator[tuple[tuple[int, int, int], list[int]]]:
+    """Yields triangles of known points (n, 3) with triangles of seen ones (m, 3) whose sides are as long."""
     rng = np.random.default_rng(0)
     apart = np.linalg.norm(seen[:, None] - seen, axis=-1)
     for _ in range(_TRIANGLES):
@@ -93,7 +96,7 @@ def _alike(known: np.ndarray, seen: np.ndarray, within_mm: float) -> Iterator[tu
 
 
 def _rigid(points: np.ndarray, targets: np.ndarray) -> np.ndarray:
-    """The turn and shift (6,) that take points (n, 3) as near to targets (n, 3) as they can."""
+    """Returns the turn and shift (6,) that take points (n, 3) nearest to targets (n, 3)."""
     middle, there = points.mean(0), targets.mean(0)
     turn, _ = Rotation.align_vectors(targets - there, points - middle)
     return np.concatenate([turn.as_rotvec(), there - turn.apply(middle)])

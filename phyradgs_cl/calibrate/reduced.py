@@ -1,6 +1,9 @@
-"""What of the parameters' signals no volume takes over, the step that it asks for, and how sure that is.
+"""The Gauss–Newton step of the parameters, after removing what a change of the volume explains.
 
-Variable projection (Golub and Pereyra, SIAM J. Numer. Anal. 10 (1973) 413) in Kaufman's form: J = (I − P_A) ∂A/∂θ x.
+Variable projection (Golub and Pereyra, SIAM J. Numer. Anal. 10 (1973) 413) in Kaufman's form: with A the operator at the
+parameters θ, x the volume and P the projector onto A's range, the Jacobian is J = (I − P) ∂A/∂θ x. Each parameter's signal
+∂A/∂θ x is a central difference. CGLS removes from it the part that some volume explains. The remaining signals and the
+remaining residual give the step, its standard deviations, and the parameters that the frames determine at all.
 """
 
 from collections.abc import Mapping, Sequence
@@ -10,134 +13,146 @@ from typing import Any
 import numpy as np
 import scipy
 
-from phyradgs_cl.calibrate.beads import BeadLevel
-from phyradgs_cl.calibrate.level import Level
-from phyradgs_cl.calibrate.parameters import GAUGE, Parameter, change_of
+from phyradgs_cl.calibrate.beads import BeadProblem
+from phyradgs_cl.calibrate.parameters import GAUGE, Parameter, correction_of
+from phyradgs_cl.calibrate.problem import CoarseProblem
 
-LEAST_SHARE = 0.2  # of a signal, beyond what the object and the other parameters take over
+LEAST_SHARE = 0.2  # of a signal, beyond what the object and the other parameters explain
+LEAST_SHARE_OF_BEADS = 0.02  # of a known object, which has no voxels that explain signals by accident
 _TINY = 1e-9
-_OVER_GAUGE, _MOST_GAUGE = 2.0, 0.2  # and of what is left of a gauge's, which is much where the geometry is wrong
+_GAUGE_FACTOR, _MOST_GAUGE = 2.0, 0.2  # over a gauge's share, which is itself large where the geometry is wrong
 
 
 @dataclass(frozen=True, eq=False)
 class Reduced:
-    """Signals of the parameters ``names`` on one level: ``jacobian`` (K, N) beyond what a volume explains, per unit of each
-    parameter's field; ``sizes`` (K,) their norms before; ``residual`` (N,) likewise beyond; both by frame, N = F · pixels.
-    ``noise``: standard deviation of a pixel's noise. ``mismatch`` (K,): of errors, over what noise alone would do."""
+    """The linear problem of the parameters ``names`` (K of them) on one grid, N = F · pixels, ordered by frame.
+
+    jacobian (K, N): signals beyond what a volume explains, per unit of each parameter's field. sizes (K,): norms of the
+    whole signals. whole_gram (K, K): inner products of the whole signals over their norms. residual (N,): beyond what a
+    volume explains. noise: standard deviation of a pixel. mismatch (K,): factor of the deviations for errors other than
+    noise."""
 
     names: tuple[str, ...]
     mismatch: np.ndarray
     jacobian: np.ndarray
     sizes: np.ndarray
-    whole: np.ndarray
+    whole_gram: np.ndarray
     residual: np.ndarray
     frames: int
     noise: float
 
     def only(self, names: Sequence[str]) -> "Reduced":
+        """Returns the problem of some parameters, the others fixed."""
         at = [self.names.index(name) for name in names]
-        whole = self.whole[np.ix_(at, at)]
-        of = {name: getattr(self, name)[at] for name in ("mismatch", "jacobian", "sizes")}
-        return replace(self, names=tuple(names), whole=whole, **of)
+        whole_gram = self.whole_gram[np.ix_(at, at)]
+        mismatch, jacobian, sizes = self.mismatch[at], self.jacobian[at], self.sizes[at]
+        return replace(
+            self, names=tuple(names), whole_gram=whole_gram, mismatch=mismatch, jacobian=jacobian, sizes=sizes
+        )
+
+    def relative_to_stated(self, at: Mapping[str, float]) -> "Reduced":
+        """Returns the same problem, linearised at the values ``at``, with its step counted from the stated values."""
+        back = np.array([at.get(name, 0.0) for name in self.names]) @ self.jacobian
+        return replace(self, residual=self.residual + back)
+
+    @property
+    def unit(self) -> np.ndarray:
+        """The remaining signals (K, N) over the norms of the whole ones."""
+        return self.jacobian / self.sizes[:, None]
 
     @property
     def gram(self) -> np.ndarray:
-        """Inner products (K, K) of the signals, each over the norms that they had before: 1 is nothing lost."""
-        unit = self.jacobian / self.sizes[:, None]
+        """Inner products (K, K) of ``unit``: 1 on the diagonal where a volume explains nothing of a signal."""
+        unit = self.unit
         return unit @ unit.T
 
     @property
     def shares(self) -> np.ndarray:
-        """What of each parameter's signal (K,) no object takes over, 0 to 1: of its norm, or if that is less, of how surely
-        it would be known beside the others if the object were."""
-        known, unknown = (np.diag(np.linalg.inv(g + _TINY * np.eye(len(g)))) for g in (self.whole, self.gram))
-        found: np.ndarray = np.sqrt(np.minimum(np.minimum(known / unknown, np.diag(self.gram)), 1.0))
-        return found
+        """Share of each parameter's signal (K,) that no object explains, 0 to 1.
 
-    def about(self, at: Mapping[str, float]) -> "Reduced":
-        """The same problem with its parameters, now at these values, back at what is stated: they are then its step."""
-        back = np.array([at.get(name, 0.0) for name in self.names]) @ self.jacobian
-        return replace(self, residual=self.residual + back)
+        The smaller of: what remains of its norm; its certainty beside the other parameters, over that with a known
+        object."""
+        known, unknown = (np.diag(np.linalg.inv(gram + _TINY * np.eye(len(gram)))) for gram in (self.whole_gram, self.gram))
+        shares: np.ndarray = np.sqrt(np.minimum(np.minimum(known / unknown, np.diag(self.gram)), 1.0))
+        return shares
 
     def step(self) -> np.ndarray:
-        """The Gauss–Newton step (K,) in the fields' units."""
-        unit = self.jacobian / self.sizes[:, None]
-        found: np.ndarray = np.linalg.solve(self.gram, unit @ self.residual) / self.sizes
-        return found
+        """Returns the Gauss–Newton step (K,) in the fields' units."""
+        step: np.ndarray = np.linalg.solve(self.gram, self.unit @ self.residual) / self.sizes
+        return step
 
     def deviations(self) -> np.ndarray:
-        """Standard deviations (K,) of the step, frames being the sample, whatever their noise and what it shares within one
-        (sandwich estimator). What the fit has taken out of the noise is put back."""
-        unit = self.jacobian / self.sizes[:, None]
-        left = self.residual - self.step() @ self.jacobian
-        by_frame = (unit * left).reshape(len(self.names), self.frames, -1).sum(-1)
-        spread = by_frame @ by_frame.T * self.frames / max(self.frames - len(self.names), 1)
+        """Returns the standard deviations (K,) of the step, by a sandwich estimator with frames as the sample, so that noise
+        may be correlated within a frame. They are at least those of white noise; noise that the fit has removed from the
+        residual is added back."""
+        unit = self.unit
+        residual = self.residual - self.step() @ self.jacobian
+        by_frame = (unit * residual).reshape(len(self.names), self.frames, -1).sum(-1)
+        scatter = by_frame @ by_frame.T * self.frames / max(self.frames - len(self.names), 1)
         inverse = np.linalg.inv(self.gram)
-        variance = np.diag(inverse @ spread @ inverse)
+        variance = np.diag(inverse @ scatter @ inverse)
         white = np.diag(inverse) * self.noise**2
-        eaten = max(1.0, self.noise**2 / max(float(np.mean(left**2)), 1e-30))
-        found: np.ndarray = self.mismatch * np.sqrt(np.maximum(variance * eaten, white)) / self.sizes
-        return found
+        fitted_noise = max(1.0, self.noise**2 / max(float(np.mean(residual**2)), 1e-30))
+        deviations: np.ndarray = self.mismatch * np.sqrt(np.maximum(variance * fitted_noise, white)) / self.sizes
+        return deviations
 
 
 def reduced(
-    level: Level | BeadLevel,
+    problem: CoarseProblem | BeadProblem,
     parameters: Sequence[Parameter],
     at: Mapping[str, float],
     volume: np.ndarray,
     iterations: int,
 ) -> Reduced:
-    """The signals of ``parameters`` about the values ``at`` (by name), for the object ``volume``, by central differences."""
-    # What a level's operator takes is what it reconstructed.
-    operator: Any = level.operator(change_of(at))
-    signals = [_signal(level, one, at, volume) for one in parameters]
-    images = [*signals, level.at(change_of(at)).residual(operator, volume)]
-    *left, beyond = level.off_range(operator, volume, images, iterations)
-    compared = np.array([level.compared(signal) for signal in signals], np.float64)
-    sizes = np.maximum(np.linalg.norm(compared, axis=1), 1e-30)
-    unit = compared / sizes[:, None]
+    """Linearises the frames about the parameters' values ``at`` (by name) and the object ``volume``."""
+    operator: Any = problem.operator(correction_of(at))  # of the kind that takes the problem's objects
+    signals = [_signal(problem, one, at, volume) for one in parameters]
+    images = [*signals, problem.corrected(correction_of(at)).residual(operator, volume)]
+    *jacobian, residual = problem.beyond_object(operator, volume, images, iterations)
+    whole = np.array([problem.compared(signal) for signal in signals], np.float64)
+    sizes = np.maximum(np.linalg.norm(whole, axis=1), 1e-30)
+    unit = whole / sizes[:, None]
     return Reduced(
         names=tuple(one.name for one in parameters),
         mismatch=np.array([one.mismatch for one in parameters]),
-        jacobian=np.array([one.ravel() for one in left], np.float64),
+        jacobian=np.array([one.ravel() for one in jacobian], np.float64),
         sizes=sizes,
-        whole=unit @ unit.T,
-        residual=beyond.ravel().astype(np.float64),
-        frames=len(beyond),
-        noise=level.noise(beyond),
+        whole_gram=unit @ unit.T,
+        residual=residual.ravel().astype(np.float64),
+        frames=len(residual),
+        noise=problem.noise(residual),
     )
 
 
-def _signal(level: Level | BeadLevel, one: Parameter, at: Mapping[str, float], volume: np.ndarray) -> np.ndarray:
-    """Change of what is expected over what is measured (F, rows, columns) by a unit of a parameter."""
-    step = one.step(level.scans[0]) * (1 if one.is_timing else level.block)
+def _signal(
+    problem: CoarseProblem | BeadProblem, one: Parameter, at: Mapping[str, float], volume: np.ndarray
+) -> np.ndarray:
+    """Returns the change of expected less measured frames (F, rows, columns) per unit of a parameter."""
+    step = one.step(problem.scans[0]) * (1 if one.is_timing else problem.block)
     ends = []
     for sign in (1, -1):
-        there = change_of({**at, one.name: at.get(one.name, 0.0) + sign * step})
-        operator: Any = level.operator(there)
-        ends.append(operator.forward(volume) - level.at(there).measured)
-    return level.masked((ends[0] - ends[1]) / np.float32(2 * step))
+        correction = correction_of({**at, one.name: at.get(one.name, 0.0) + sign * step})
+        operator: Any = problem.operator(correction)
+        ends.append(operator.forward(volume) - problem.corrected(correction).measured)
+    return problem.masked((ends[0] - ends[1]) / np.float32(2 * step))
 
 
-def gauge_share(level: Level, at: Mapping[str, float], volume: np.ndarray, iterations: int) -> float:
-    """What is left of a signal that no frame can tell from another object: what the volume's voxels cannot follow."""
-    problem = reduced(level, [GAUGE], at, volume, iterations)
-    return float(problem.shares[0])
+def least_share(problem: CoarseProblem, at: Mapping[str, float], volume: np.ndarray, iterations: int) -> float:
+    """Returns the share that has to remain of a parameter's signal.
 
-
-def least_share(gauge: float) -> float:
-    """What has to be left of a parameter's signal, where ``gauge`` is left of one that says nothing."""
-    return max(LEAST_SHARE, _OVER_GAUGE * min(gauge, _MOST_GAUGE))
+    It exceeds the share of a turn of all views, which no frame distinguishes from a turned object: voxels do not follow that
+    turn exactly, and leave as much of any other signal."""
+    gauge = float(reduced(problem, [GAUGE], at, volume, iterations).shares[0])
+    return max(LEAST_SHARE, _GAUGE_FACTOR * min(gauge, _MOST_GAUGE))
 
 
 def identifiable(problem: Reduced, least: float) -> tuple[str, ...]:
-    """The parameters of which ``least`` is left, all others being free: one that is left as stated, and wrong, would
-    else pass its error on."""
+    """Returns the parameters of which ``least`` remains with all others free. The error of a parameter that stays as stated
+    would otherwise pass to them."""
     return tuple(name for name, share in zip(problem.names, problem.shares, strict=True) if share >= least)
 
 
-def alike(problem: Reduced, least: float) -> list[dict[str, float]]:
-    """Combinations of parameters of whose signals an object leaves less than ``least``: weights by name, a dict each."""
-    values, vectors = scipy.linalg.eigh(problem.gram, problem.whole + _TINY * np.eye(len(problem.names)))
-    found = vectors[:, values < least**2].T
-    return [dict(zip(problem.names, map(float, weights), strict=True)) for weights in found]
+def indistinguishable(problem: Reduced, least: float) -> list[dict[str, float]]:
+    """Returns combinations of parameters, as weights by name, of which an object explains all but ``least``."""
+    values, vectors = scipy.linalg.eigh(problem.gram, problem.whole_gram + _TINY * np.eye(len(problem.names)))
+    return [dict(zip(problem.names, map(float, weights), strict=True)) for weights in vectors[:, values < least**2].T]

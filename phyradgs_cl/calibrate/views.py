@@ -1,116 +1,79 @@
-"""Every view by itself, or an object that moves slowly, coarse to fine."""
+"""Estimates the parameters of all views, or of a motion, from coarse to fine grids."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
 
 from phyradgs_cl.acquisition import Scan
-from phyradgs_cl.calibrate.finding import AGREES, CORRECTED, Found
-from phyradgs_cl.calibrate.level import Level
-from phyradgs_cl.calibrate.moved import Change, Sway, Views
-from phyradgs_cl.calibrate.parameters import MOTION, WOBBLE
-from phyradgs_cl.calibrate.wobble import (
-    KINDS,
-    SHIFT_U,
-    SHIFT_V,
-    TURN,
-    Numbers,
-    certainty,
-    numbers_of_sway,
-    numbers_of_views,
-    view_step,
-    without_gauges,
-    without_smooth_gauges,
-    without_sway_gauges,
-)
-from phyradgs_cl.calibrate.work import Work, cost_of
+from phyradgs_cl.acquisition.altered.perturbed import GeometryCorrection, Sway, Views
+from phyradgs_cl.calibrate.passes import PassCounter, pass_cost
+from phyradgs_cl.calibrate.per_view import PerViewParameters, view_deviations, view_step
+from phyradgs_cl.calibrate.problem import CoarseProblem, Stage
+from phyradgs_cl.calibrate.result import AGREES, CORRECTED, ParameterEstimate
 from phyradgs_cl.runtime import Runtime
 
-SPLINES = 7  # of a motion: one for every seventh of the scan, about
+DISCRETISATION = 0.5  # of the change since a grid half as fine: the error that remains, if it is of first order
 _STEPS = 3
 _ITERATIONS = 20
-_OF_WAY = 0.5  # from a level to one twice as fine: what is left of it, as of an error of first order
-_DEVIATIONS = 3.0  # of one value, that all of them have to be off by (root mean square)
-_DEG = float(np.rad2deg(1.0))
-_OF_VIEWS = (("turn per view", "deg", _DEG), ("shift-v per view", "mm", 1.0), ("shift-u per view", "mm", 1.0))
-_OF_OBJECT = tuple(
-    (f"{kind} {axis} of the object", unit, scale)
-    for kind, unit, scale in (("turn about", "deg", _DEG), ("shift along", "mm", 1.0))
-    for axis in "xyz"
-)
-KINDS_OF = {WOBBLE: len(_OF_VIEWS), MOTION: len(_OF_OBJECT)}
-Stages = Sequence[tuple[int, int, int]]
+_DEVIATIONS = 3.0  # of one value; their root mean square has to exceed these
 
 
 @dataclass(frozen=True, eq=False)
-class Wobble:
-    """``views``: what was found of the kinds that are off, None where none is; a line of the table per kind."""
+class ViewsEstimate:
+    """``views``: corrections of the kinds that are significant, None without any; a line of the table per kind."""
 
     views: Views | Sway | None
-    table: list[Found]
+    table: list[ParameterEstimate]
 
 
-def passes_of(scan: Scan, stages: Stages, kinds: int) -> list[tuple[float, int]]:
-    """Passes through the frames of looking for so many ``kinds`` of numbers, with their costs."""
-    costs = [cost_of([scan], columns, scan.frames) for columns, *_ in stages]
-    steps = [first + (_STEPS - 1) * again + _STEPS * _ITERATIONS for _, first, again in stages]
-    return [*zip(costs, steps, strict=True), (costs[-1], kinds * _ITERATIONS)]
+def passes_of_views(scan: Scan, stages: Sequence[Stage], kinds: int) -> list[tuple[float, int]]:
+    """Returns the passes through the frames that ``estimate_views`` makes, with their costs."""
+    costs = [pass_cost([scan], stage.columns, scan.frames) for stage in stages]
+    counts = [stage.first + (_STEPS - 1) * stage.again + _STEPS * _ITERATIONS for stage in stages]
+    return [*zip(costs, counts, strict=True), (costs[-1], kinds * _ITERATIONS)]
 
 
-def find_wobble(rt: Runtime, scan: Scan, stages: Stages, change: Change, work: Work, splines: int = 0) -> Wobble:
-    """Turns and shifts of all views of a scan after ``change``, each by itself or by so many ``splines`` of time; stages:
-    columns, iterations of a first and next volume.
-
-    Shifts on each level; turns, which need fine detail, on the last two, each time from nothing: how well these agree says
-    how sure they are."""
-    kinds = [(SHIFT_V, SHIFT_U)] * (len(stages) - 2) + [KINDS] * min(len(stages), 2)
-    numbers = numbers_of_views(scan, splines)
-    without = partial(without_smooth_gauges, scan, numbers) if splines else partial(without_gauges, scan)
-    return _found(rt, scan, stages, change, work, numbers, kinds, without, _OF_VIEWS, (TURN,))
-
-
-def find_sway(rt: Runtime, scan: Scan, stages: Stages, change: Change, work: Work) -> Wobble:
-    """As ``find_wobble``, a rigid motion of the object."""
-    kinds = [range(len(_OF_OBJECT))] * len(stages)
-    numbers = numbers_of_sway(scan, SPLINES)
-    without = partial(without_sway_gauges, scan, numbers)
-    return _found(rt, scan, stages, change, work, numbers, kinds, without, _OF_OBJECT)
-
-
-def _found(
+def estimate_views(
     rt: Runtime,
     scan: Scan,
-    stages: Stages,
-    change: Change,
-    work: Work,
-    numbers: Numbers,
-    kinds: Sequence[Sequence[int]],
-    without: Callable[[np.ndarray], np.ndarray],
-    names: Sequence[tuple[str, str, float]],
-    anew: Sequence[int] = (),
-) -> Wobble:
-    """``kinds`` of each stage; ``anew``: those that begin at nothing on each."""
-    former = numbers.values
-    for (columns, first, again), asked in zip(stages, kinds, strict=True):
-        level, volume, former = Level.of(rt, False, [scan], columns, scan.frames), None, numbers.values
-        level = replace(level, count_pass=work.counts(cost_of([scan], columns, scan.frames)))
-        numbers = replace(numbers, values=former * ~np.isin(np.arange(len(names)), anew))
+    parameters: PerViewParameters,
+    stages: Sequence[Stage],
+    correction: GeometryCorrection,
+    passes: PassCounter,
+) -> ViewsEstimate:
+    """Estimates ``parameters`` of a scan after ``correction``, in a few Gauss–Newton steps per stage.
+
+    A deviation combines noise and discretisation error; the latter is half the change since the coarser grid."""
+    for number, stage in enumerate(stages):
+        problem = CoarseProblem.of(rt, False, [scan], stage, scan.frames)
+        problem = replace(problem, count_pass=passes.counter(pass_cost([scan], stage.columns, scan.frames)))
+        former, volume = parameters.values, None
+        is_kept = ~np.isin(np.arange(len(parameters.KINDS)), parameters.RESTARTED)
+        parameters = replace(parameters, values=former * is_kept)
+        kinds = parameters.kinds_of_stage(number, len(stages))
         for _ in range(_STEPS):
-            operator = numbers.operator(level, change)
-            volume = level.reconstruct(operator, volume, first if volume is None else again)
-            step = view_step(level, change, numbers, volume, asked, _ITERATIONS)
-            numbers = replace(numbers, values=without(numbers.values + step.values))
-    deviations, shares = certainty(level, change, numbers, step.signals, _ITERATIONS)
-    way = np.sqrt(np.mean(np.square(numbers.basis @ (numbers.values - former)), 0))
-    told_twice = np.isin(np.arange(len(names)), kinds[-2] if len(stages) > 1 else [])
-    deviations = np.hypot(deviations, _OF_WAY * way * told_twice)
-    sizes = np.sqrt(np.mean(np.square(numbers.basis @ numbers.values), 0))
-    is_off = sizes > _DEVIATIONS * deviations
+            operator = parameters.operator(problem, correction)
+            volume = problem.reconstruct(operator, volume, stage.first if volume is None else stage.again)
+            step, signals = view_step(problem, correction, parameters, volume, kinds, _ITERATIONS)
+            parameters = replace(parameters, values=parameters.without_gauges(parameters.values + step))
+    noise, shares = view_deviations(problem, correction, parameters, signals, _ITERATIONS)
+    change = _rms_over_views(parameters, parameters.values - former)
+    kinds_before = parameters.kinds_of_stage(len(stages) - 2, len(stages)) if len(stages) > 1 else []
+    was_estimated = np.isin(np.arange(len(parameters.KINDS)), kinds_before)
+    deviations = np.hypot(noise, DISCRETISATION * change * was_estimated)
+    sizes = _rms_over_views(parameters, parameters.values)
+    is_significant = sizes > _DEVIATIONS * deviations
     table = []
-    for kind, (name, unit, scale) in enumerate(names):
-        size, deviation = float(sizes[kind] * scale), float(deviations[kind] * scale)
-        verdict = CORRECTED if is_off[kind] else AGREES
-        table.append(Found(name, unit, 0.0, size, deviation, float(shares[kind]), verdict))
-    return Wobble(numbers.views(numbers.values * is_off) if is_off.any() else None, table)
+    for k, kind in enumerate(parameters.KINDS):
+        size, deviation = float(sizes[k] * kind.scale), float(deviations[k] * kind.scale)
+        verdict = CORRECTED if is_significant[k] else AGREES
+        table.append(ParameterEstimate(kind.name, kind.unit, 0.0, size, deviation, float(shares[k]), verdict))
+    views = parameters.views_of(parameters.values * is_significant) if is_significant.any() else None
+    return ViewsEstimate(views, table)
+
+
+def _rms_over_views(parameters: PerViewParameters, values: np.ndarray) -> np.ndarray:
+    """Returns the root mean square (K,) over the views of values (n, K)."""
+    rms: np.ndarray = np.sqrt(np.mean(np.square(parameters.basis @ values), 0))
+    return rms

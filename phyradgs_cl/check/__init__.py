@@ -1,7 +1,8 @@
-"""What is wrong or suspicious in a scan, before anyone waits for a reconstruction: one file per question."""
+"""What is wrong or suspicious in a scan, before a reconstruction: questions by subject, asked in order by ``run``."""
 
+from phyradgs_cl.check.detector import CountReader
 from phyradgs_cl.check.finding import CANNOT_TELL, OK, SUSPICIOUS, Finding
-from phyradgs_cl.check.questions.saturation import CountReader
+from phyradgs_cl.check.orbit import CENTRE
 from phyradgs_cl.check.run import CheckResult, check
 
-__all__ = ["CANNOT_TELL", "OK", "SUSPICIOUS", "CheckResult", "CountReader", "Finding", "check"]
+__all__ = ["CANNOT_TELL", "CENTRE", "OK", "SUSPICIOUS", "CheckResult", "CountReader", "Finding", "check"]

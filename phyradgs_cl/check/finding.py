@@ -1,4 +1,4 @@
-"""What a check found: one answer per question, with the number it rests on."""
+"""The answers of a check: a verdict per question, with the number on which it rests."""
 
 from dataclasses import asdict, dataclass
 
@@ -10,9 +10,10 @@ FEWEST_COLUMNS = 8  # four gave false alarms, five did not
 
 @dataclass(frozen=True)
 class Finding:
-    """The answer to one question: ``ok``, ``suspicious`` or ``cannot tell``. value: what was measured, in ``unit``,
-    with its standard deviation ``uncertainty`` where it is an estimate; threshold: from where it is suspicious. text:
-    what was found, advice: what to do about it."""
+    """The answer to one question: ``ok``, ``suspicious`` or ``cannot tell``.
+
+    value: the measured number, in ``unit``, with its standard deviation ``uncertainty`` where it is an estimate. threshold:
+    the value from which it is suspicious. text: what was found. advice: what to do about it."""
 
     question: str
     verdict: str
@@ -24,10 +25,10 @@ class Finding:
     uncertainty: float | None = None
 
     def facts(self) -> dict[str, object]:
-        """The fields as plain values, for JSON."""
+        """Returns the fields as plain values, for JSON."""
         return asdict(self)
 
 
 def too_narrow(question: str, unit: str) -> Finding:
-    """The answer to a question about columns, of a panel that has too few."""
+    """Answers a question about columns for a panel with too few."""
     return Finding(question, CANNOT_TELL, 0.0, 0.0, unit, f"fewer than {FEWEST_COLUMNS} columns")

@@ -1,4 +1,4 @@
-"""The scan under another statement: other sizes, distances, angles or orders, frames that are mirrored or transposed."""
+"""Other statements about a scan: sizes, distances, angles or orders of frames, frames mirrored or transposed."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
@@ -7,38 +7,40 @@ from functools import partial
 import numpy as np
 
 from phyradgs_cl.acquisition import Scan
-from phyradgs_cl.acquisition.geometry import default_grid
-from phyradgs_cl.check.coarse import coarse_grid
-from phyradgs_cl.check.finding import FEWEST_COLUMNS, MIRROR_U, MIRROR_V, PIXEL_SIZES
-from phyradgs_cl.check.questions.timing import start_azimuths_rad, wrapped
-from phyradgs_cl.check.variants import (
-    Path,
+from phyradgs_cl.acquisition.altered.angles import start_azimuths_rad, wrapped
+from phyradgs_cl.acquisition.altered.coarse import coarse_grid
+from phyradgs_cl.acquisition.altered.variants import (
+    altered_trajectory,
     mirrored,
-    path_of,
     resized,
     stretched,
     transposed,
     turned,
-    with_path,
+    with_trajectory,
 )
+from phyradgs_cl.acquisition.geometry import default_grid
+from phyradgs_cl.check.finding import FEWEST_COLUMNS, MIRROR_U, MIRROR_V, PIXEL_SIZES
 from phyradgs_cl.fields import Grid
 
-FACTORS = (10.0, 0.1, 1e3, 1e-3)
+SIZE_FACTORS = (10.0, 0.1, 1e3, 1e-3)
+LEAST_REDUNDANCY = 0.5  # of the columns: with fewer rays measured twice, frames fit any size
 _UNITS = {10.0: " (in cm, read as mm?)", 1e3: " (in m, read as mm?)", 1e-3: " (in µm, read as mm?)"}
-_FANS = (0.02, 3.0)  # the panel's width over its distance from the source, of scans that there are
-_NEAR = 3.0  # times as large as what the panel sees: from there a stated grid does not belong to the hypothesis
-_APART = 1.0  # coarse pixels
+_FANS = (0.02, 3.0)  # the panel's width over its distance from the source, in real scanners
+_GRID_FACTOR = 3.0  # a stated grid that differs more from what the panel sees does not belong to the hypothesis
+_SAME_PLACE = 1.0  # coarse pixels
+_ARC_PERCENTS = (-5, -4, -3, -2, -1, 1, 2, 3, 4, 5)
+_NEAR_SIZES = (0.5, 0.8, 0.9, 1.1, 1.25, 2.0)
+_GAPS = 15  # places at which a missing or repeated frame is tried
 _TRANSPOSED = (
     "transpose the frames (numpy: .T of each) or turn them by 90° (numpy: rot90) and import them again: the two differ by "
-    "a mirror that no frame shows, so that one gives a mirror image; only a feature whose side is known tells which"
+    "a mirror that no frame shows, so that one gives a mirror image; only a feature whose side is known decides which"
 )
-REDUNDANT = 0.5  # share of columns that see a ray twice in a full turn: frames that see it once fit with anything
 
 
 @dataclass(frozen=True, eq=False)
-class Cause:
-    """Another statement about the scan: what it is, what to do, and the scan under it. Of causes with the same ``factor`` of
-    sizes only the shift of the panel tells them apart."""
+class Hypothesis:
+    """Another statement about the scan: a description, what to do about it, and the scan under it. Hypotheses with the same
+    ``factor`` of sizes differ only by the panel's shift."""
 
     text: str
     advice: str
@@ -47,171 +49,172 @@ class Cause:
 
 
 def stated_redundancy(scan: Scan) -> float:
-    """The share of columns whose rays a full turn measures twice; below 0 the stated axis is beside the panel."""
+    """Returns the share of columns whose rays a full turn measures twice; negative where the stated axis is beside the
+    panel."""
     geometry = scan.geometry
     return 1 - 2 * abs(geometry.detector_offset_mm[1]) / (geometry.pixel_size_mm[1] * geometry.detector_shape[1])
 
 
-def whole_scans(scan: Scan, stated: Scan) -> Iterator[Cause]:
-    """What may be wrong with the coarse ``scan`` as a whole, which was made of the scan as ``stated``."""
-    yield from _fans(scan, stated)
-    yield from _images(scan, stated)
+def frame_number(scan: Scan, frame: int) -> int:
+    """Returns a frame's number in the file, from 0."""
+    return int(altered_trajectory(scan).frame_numbers(scan)[frame])
 
 
-def _fans(scan: Scan, stated: Scan) -> Iterator[Cause]:
+def hypotheses_of_scan(scan: Scan, stated: Scan) -> Iterator[Hypothesis]:
+    """Yields hypotheses about the whole coarse ``scan``, which was made of ``stated``: sizes in another unit, frames
+    mirrored or transposed."""
+    yield from _other_units(scan, stated)
+    yield from _other_images(scan, stated)
+
+
+def _other_units(scan: Scan, stated: Scan) -> Iterator[Hypothesis]:
+    """Sizes and distances enter the fan alone, as a ratio. Only the panel's offset, which is in mm, may distinguish them."""
     geometry = stated.geometry
     fan = geometry.detector_shape[1] * geometry.pixel_size_mm[1] / geometry.source_to_detector_mm
-    for factor in FACTORS:
+    offset_px = np.abs(np.array(geometry.detector_offset_mm) / geometry.pixel_size_mm)
+    for factor in SIZE_FACTORS:
         if not _FANS[0] < factor * fan < _FANS[1]:
             continue
         sizes, distances = _times("pixel sizes", factor), _times("distances", 1 / factor)
         correct_sizes, correct_distances = f"correct {PIXEL_SIZES}", "correct the distances"
-        moved_px = np.abs(np.array(geometry.detector_offset_mm) / geometry.pixel_size_mm) * abs(1 - 1 / factor)
-        if (moved_px < _APART * np.array(path_of(scan).blocks)).all():
+        with_axis, with_offset = (partial(_with_sizes, scan, stated, factor, keeps_axis) for keeps_axis in (True, False))
+        shift_px = offset_px * abs(1 - 1 / factor)
+        if (shift_px < _SAME_PLACE * np.array(altered_trajectory(scan).blocks)).all():
             text = f"frames fit with {sizes}, or with {distances}: they do not tell which"
-            advice = f"{correct_sizes}, or {correct_distances}"
-            yield Cause(text, advice, partial(_under, scan, stated, factor, True), factor)
+            yield Hypothesis(text, f"{correct_sizes}, or {correct_distances}", with_axis, factor)
             continue
-        if 1 - (1 - stated_redundancy(stated)) / factor >= REDUNDANT:
-            text = f"frames fit with {sizes}, detector_offset as stated"
-            yield Cause(text, correct_sizes, partial(_under, scan, stated, factor, False), factor)
-        if stated_redundancy(stated) >= REDUNDANT:
+        if 1 - (1 - stated_redundancy(stated)) / factor >= LEAST_REDUNDANCY:
+            yield Hypothesis(f"frames fit with {sizes}, detector_offset as stated", correct_sizes, with_offset, factor)
+        if stated_redundancy(stated) >= LEAST_REDUNDANCY:
             text = f"frames fit with {distances}, or with pixel sizes and detector_offset {factor:g} times as large"
-            advice = f"{correct_distances}, or pixel sizes and detector_offset"
-            yield Cause(text, advice, partial(_under, scan, stated, factor, True), factor)
+            yield Hypothesis(text, f"{correct_distances}, or pixel sizes and detector_offset", with_axis, factor)
 
 
-def _times(what: str, factor: float) -> str:
-    return f"{what} {factor:g} times as large{_UNITS.get(round(factor, 6), '')}"
+def _times(name: str, factor: float) -> str:
+    return f"{name} {factor:g} times as large{_UNITS.get(round(factor, 6), '')}"
 
 
-def _images(scan: Scan, stated: Scan) -> Iterator[Cause]:
-    advice = "import again with the other {}, and check again"
-    offset_v_mm, offset_u_mm = stated.geometry.detector_offset_mm
-    if offset_u_mm or stated.shutter.axis == "columns":
-        text = "frames fit if they are mirrored in u (or with rotation, detector_offset and readout the other way)"
-        yield Cause(text, advice.format(MIRROR_U), partial(mirrored, scan, "u"))
-    if offset_v_mm:
-        text = "frames fit if they are mirrored in v (or with detector_offset along v and readout the other way)"
-        yield Cause(text, advice.format(MIRROR_V), partial(mirrored, scan, "v"))
-    if scan.geometry.detector_shape[0] >= FEWEST_COLUMNS:
-        text = "frames fit if they are transposed, rows and columns exchanged (or turned by 90°"
-        yield Cause(f"{text})", _TRANSPOSED, partial(transposed, scan, False))
-        yield Cause(f"{text}: more likely)", _TRANSPOSED, partial(transposed, scan, True))
-
-
-def _under(scan: Scan, stated: Scan, factor: float, keeps_axis: bool) -> Scan:
-    """The coarse scan with pixels ``factor`` times as large, and the grid that belongs to them."""
+def _with_sizes(scan: Scan, stated: Scan, factor: float, keeps_axis: bool) -> Scan:
+    """Returns the coarse scan with pixels ``factor`` times as large, and the grid that belongs to them."""
     v_mm, u_mm = stated.geometry.pixel_size_mm
     off_v_mm, off_u_mm = (offset * (factor if keeps_axis else 1) for offset in stated.geometry.detector_offset_mm)
     pixel_size_mm = (factor * v_mm, factor * u_mm)
     geometry = replace(stated.geometry, pixel_size_mm=pixel_size_mm, detector_offset_mm=(off_v_mm, off_u_mm))
-    blocks = path_of(scan).blocks
+    blocks = altered_trajectory(scan).blocks
     panel = replace(scan.geometry, pixel_size_mm=(blocks[0] * pixel_size_mm[0], blocks[1] * pixel_size_mm[1]))
-    other = resized(scan, factor, keeps_axis)
-    return replace(other, geometry=panel, grid=coarse_grid(_grid(stated, default_grid(geometry)), panel, 1.0))
+    grid = coarse_grid(_matching_grid(stated, default_grid(geometry)), panel)
+    return replace(resized(scan, factor, keeps_axis), geometry=panel, grid=grid)
 
 
-def _grid(stated: Scan, seen: Grid) -> Grid:
-    """The stated grid, or what the panel would see where that is another size or the grid was made of the wrong panel."""
-    share = max(stated.grid.size_mm) / max(seen.size_mm)
-    is_made = stated.grid == default_grid(stated.geometry)
-    return seen if is_made or not 1 / _NEAR < share < _NEAR else stated.grid
+def _matching_grid(stated: Scan, panel_grid: Grid) -> Grid:
+    """Returns the stated grid, or the one of the panel's view where the stated one has another size or was derived from the
+    wrong panel."""
+    ratio = max(stated.grid.size_mm) / max(panel_grid.size_mm)
+    is_derived = stated.grid == default_grid(stated.geometry)
+    return panel_grid if is_derived or not 1 / _GRID_FACTOR < ratio < _GRID_FACTOR else stated.grid
 
 
-def causes_of_frames(scan: Scan, shifted_scan: Scan, looks_closely: bool) -> Iterator[Cause]:
-    """Other angles, sizes near the stated ones (of the scan with its panel shifted) and, looked at closely, other orders."""
-    yield from _arcs(scan)
-    yield from _sizes(shifted_scan)
-    if looks_closely:
-        yield from _orders(scan)
-        yield from _missing(scan)
+def _other_images(scan: Scan, stated: Scan) -> Iterator[Hypothesis]:
+    advice = "import again with the other {}, and check again"
+    offset_v_mm, offset_u_mm = stated.geometry.detector_offset_mm
+    if offset_u_mm or stated.shutter.axis == "columns":
+        text = "frames fit if they are mirrored in u (or with rotation, detector_offset and readout the other way)"
+        yield Hypothesis(text, advice.format(MIRROR_U), partial(mirrored, scan, "u"))
+    if offset_v_mm:
+        text = "frames fit if they are mirrored in v (or with detector_offset along v and readout the other way)"
+        yield Hypothesis(text, advice.format(MIRROR_V), partial(mirrored, scan, "v"))
+    if scan.geometry.detector_shape[0] >= FEWEST_COLUMNS:
+        text = "frames fit if they are transposed, rows and columns exchanged (or turned by 90°"
+        yield Hypothesis(f"{text})", _TRANSPOSED, partial(transposed, scan, False))
+        yield Hypothesis(f"{text}: more likely)", _TRANSPOSED, partial(transposed, scan, True))
 
 
-def _orders(scan: Scan) -> Iterator[Cause]:
-    path = path_of(scan)
-    numbers = np.arange(scan.frames) if path.frames is None else path.frames
-    count = int(numbers[-1]) + 1
-    starts = np.interp(np.arange(count), numbers, scan.frame_start_s)
-    for first in (0, 1):
-        lexical = np.array(sorted(range(first, count + first), key=str)) - first
-        if (lexical == np.arange(count)).all():
-            continue
-        true = lexical[numbers]
-
-        def ordered(true: np.ndarray = true) -> Scan:
-            return replace(with_path(scan, frames=true), frame_start_s=starts[true])
-
-        text = "frames fit in another order: that of names without leading zeros (1, 10, 11, ... 2)"
-        yield Cause(text, "sort the frames by number, not by name, and import them again", ordered)
+def hypotheses_of_frames(scan: Scan, shifted_scan: Scan, tries_orders: bool) -> Iterator[Hypothesis]:
+    """Yields other angle steps, sizes near the stated ones (with the panel shifted) and, with ``tries_orders``, other orders
+    and missing or repeated frames."""
+    yield from _other_steps(scan)
+    yield from _near_sizes(shifted_scan)
+    if tries_orders:
+        yield from _name_orders(scan)
+        yield from _missing_frames(scan)
 
 
 def _azimuths(scan: Scan) -> np.ndarray:
-    """Angle of each frame's start from the first one's (F,), as the trajectory counts it where it does."""
-    base = path_of(scan).base
-    if hasattr(base, "angle_rad"):
-        path = path_of(scan)
-        numbers = np.arange(scan.frames) if path.frames is None else path.frames
-        at = [float(base.angle_rad(int(n), np.array([scan.frame_start_s[f]]))[0]) for f, n in enumerate(numbers)]
-        return np.array(at) - at[0]
-    angles = start_azimuths_rad(scan)
-    return np.unwrap(angles) - angles[:1]
+    """Returns each frame's angle from the first one's (F,): as stated, turns included, where the trajectory has angles."""
+    trajectory = altered_trajectory(scan)
+    angle_rad = getattr(trajectory.base, "angle_rad", None)
+    if angle_rad is None:
+        angles = np.unwrap(start_azimuths_rad(scan))
+    else:
+        starts = zip(trajectory.frame_numbers(scan), scan.frame_start_s, strict=True)
+        angles = np.array([float(angle_rad(int(number), np.array([start_s]))[0]) for number, start_s in starts])
+    return angles - angles[0]
 
 
-def _arcs(scan: Scan) -> Iterator[Cause]:
+def _other_steps(scan: Scan) -> Iterator[Hypothesis]:
     from_first = _azimuths(scan)
-    path = path_of(scan)
-    sense = -1.0 if path.is_reversed else 1.0
+    sense = -1.0 if altered_trajectory(scan).is_reversed else 1.0
     total_deg = float(np.rad2deg(abs(from_first[-1])))
-    radian = float(np.degrees(1.0))
-    named = {
-        radian: "angles in radians were taken for degrees",
-        1 / radian: "angles in degrees were taken for radians",
+    radian_deg = float(np.degrees(1.0))
+    steps = {
+        radian_deg: "angles in radians were taken for degrees",
+        1 / radian_deg: "angles in degrees were taken for radians",
         0.5: "the step of the angles is half of what is stated",
         2.0: "the step of the angles is twice what is stated",
     }
-    for percent in (-5, -4, -3, -2, -1, 1, 2, 3, 4, 5):
-        than_stated = f"{abs(percent)} % {'smaller' if percent < 0 else 'larger'} than stated"
-        named[1 + percent / 100] = f"the step of the angles is about {than_stated}"
-    for factor, text in named.items():
+    for percent in _ARC_PERCENTS:
+        sign = "smaller" if percent < 0 else "larger"
+        steps[1 + percent / 100] = f"the step of the angles is about {abs(percent)} % {sign} than stated"
+    for factor, text in steps.items():
         span = f"the frames span {factor * total_deg:.4g}°, not {total_deg:.4g}°"
         advice = f"{span}: correct rotation_angle, its unit or its step"
-        turn = sense * (factor - 1) * from_first
-        yield Cause(text, advice, partial(turned, scan, turn, factor))
+        yield Hypothesis(text, advice, partial(turned, scan, sense * (factor - 1) * from_first, factor))
 
 
-def _sizes(scan: Scan) -> Iterator[Cause]:
+def _near_sizes(scan: Scan) -> Iterator[Hypothesis]:
     v, u = scan.geometry.pixel_size_mm
     if abs(v / u - 1) > 0.02:
         text, advice = "pixel sizes fit if v and u are exchanged", f"exchange {PIXEL_SIZES}"
-        yield Cause(text, advice, partial(stretched, scan, u / v, v / u))
-    for factor in (0.5, 0.8, 0.9, 1.1, 1.25, 2.0):
+        yield Hypothesis(text, advice, partial(stretched, scan, u / v, v / u))
+    for factor in _NEAR_SIZES:
         text = f"pixels over the distance of the panel fit if they are {factor:g} times as large"
         advice = f"correct {PIXEL_SIZES} (binning? unit?) or distances (unit? source to panel?)"
-        yield Cause(text, advice, partial(nearly_sized, scan, factor))
+        yield Hypothesis(text, advice, partial(nearly_sized, scan, factor))
 
 
 def nearly_sized(scan: Scan, factor: float) -> Scan:
-    """Pixels ``factor`` times as large with the axis at its column, and a grid that grows as it does for ``stretched``."""
+    """Returns the scan with pixels ``factor`` times as large, the axis at its column, and the grid of ``stretched``."""
     return replace(resized(scan, factor, keeps_axis=True), grid=stretched(scan, factor, factor).grid)
 
 
-def _missing(scan: Scan) -> Iterator[Cause]:
-    """Frames that are missing, or there twice, with later ones moved up or back by a step."""
-    steps = wrapped(np.diff(_azimuths(scan)))
-    step = float(np.median(steps)) * (-1.0 if path_of(scan).is_reversed else 1.0)
-    for at in np.unique(np.linspace(1, scan.frames - 1, 15).round().astype(int)):
+def _name_orders(scan: Scan) -> Iterator[Hypothesis]:
+    """The order of file names without leading zeros, counted from 0 or 1."""
+    numbers = altered_trajectory(scan).frame_numbers(scan)
+    count = int(numbers[-1]) + 1
+    starts_s = np.interp(np.arange(count), numbers, scan.frame_start_s)
+    for first in (0, 1):
+        by_name = np.array(sorted(range(first, count + first), key=str)) - first
+        if (by_name == np.arange(count)).all():
+            continue
+        text = "frames fit in another order: that of names without leading zeros (1, 10, 11, ... 2)"
+        advice = "sort the frames by number, not by name, and import them again"
+        yield Hypothesis(text, advice, partial(_in_order, scan, by_name[numbers], starts_s[by_name[numbers]]))
+
+
+def _in_order(scan: Scan, numbers: np.ndarray, starts_s: np.ndarray) -> Scan:
+    return replace(with_trajectory(scan, frames=numbers), frame_start_s=starts_s)
+
+
+def _missing_frames(scan: Scan) -> Iterator[Hypothesis]:
+    """A missing or a repeated frame at fifteen places, later frames being one step further or less far."""
+    sense = -1.0 if altered_trajectory(scan).is_reversed else 1.0
+    step = float(np.median(wrapped(np.diff(_azimuths(scan))))) * sense
+    for at in np.unique(np.linspace(1, scan.frames - 1, _GAPS).round().astype(int)):
         later = (np.arange(scan.frames) >= at) * step
         number = frame_number(scan, int(at))
-        text = f"a frame is missing near frame {number} (from 0): later ones fit one step further on"
+        text = f"a frame is missing near frame {number} (from 0): later frames fit one step further on"
         advice = "find the missing frame, or shift the angles behind it by a step"
-        yield Cause(text, advice, partial(turned, scan, later))
-        text = f"a frame is there twice near frame {number} (from 0): later ones fit one step before"
+        yield Hypothesis(text, advice, partial(turned, scan, later))
+        text = f"a frame is there twice near frame {number} (from 0): later frames fit one step before"
         advice = "take the frame out, so that later ones get their own angles"
-        yield Cause(text, advice, partial(turned, scan, -later))
-
-
-def frame_number(scan: Scan, frame: int) -> int:
-    """A frame's number in the file, from 0."""
-    path = scan.trajectory
-    return int(path.frames[frame]) if isinstance(path, Path) and path.frames is not None else int(frame)
+        yield Hypothesis(text, advice, partial(turned, scan, -later))

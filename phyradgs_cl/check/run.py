@@ -1,4 +1,4 @@
-"""All questions in the order in which they rest on each other; what is found is taken out of the way of the next."""
+"""All questions in an order in which each rests on the ones before: what a question finds is corrected for the next."""
 
 import math
 from collections.abc import Callable
@@ -8,43 +8,57 @@ import numpy as np
 
 from phyradgs_cl import checks
 from phyradgs_cl.acquisition import Scan
-from phyradgs_cl.check.coarse import FINE, QUICK, coarse, some_frames
+from phyradgs_cl.acquisition.altered.coarse import FINE_COLUMNS, QUICK_COLUMNS, coarse, some_frames
+from phyradgs_cl.acquisition.altered.variants import reversed_rotation, shifted
+from phyradgs_cl.check.consistency import CONSISTENCY, check_consistency
+from phyradgs_cl.check.coverage import CUT_OFF, NO_OBJECT, OPAQUE, TOO_BRIGHT, check_coverage
+from phyradgs_cl.check.detector import (
+    GAIN,
+    OVERFLOW,
+    CountReader,
+    check_dead_pixels,
+    check_gain,
+    check_saturation,
+)
 from phyradgs_cl.check.finding import CANNOT_TELL, FEWEST_COLUMNS, OK, SUSPICIOUS, Finding, too_narrow
-from phyradgs_cl.check.questions.angles import check_angles
-from phyradgs_cl.check.questions.consistency import CONSISTENCY, check_consistency
-from phyradgs_cl.check.questions.coverage import CUT_OFF, NO_OBJECT, OPAQUE, TOO_BRIGHT, check_coverage
-from phyradgs_cl.check.questions.dead_pixels import check_dead_pixels
-from phyradgs_cl.check.questions.distances import DISTANCES, UNVERIFIED, check_distances
-from phyradgs_cl.check.questions.exposure import EXPOSURE, check_exposure
-from phyradgs_cl.check.questions.gain import GAIN, check_gain
-from phyradgs_cl.check.questions.offset import (
+from phyradgs_cl.check.orbit import (
     CENTRE,
+    DISTANCES,
     OTHER_CAUSE,
-    Offset,
-    best_offset,
-    block_of,
-    check_offset,
-    rough_offset,
+    SIGN,
+    UNVERIFIED,
+    check_centre,
+    check_distances,
+    check_rotation,
+    is_clear,
+    with_cause,
     with_coarseness,
 )
-from phyradgs_cl.check.questions.readout import READOUT, check_readout
-from phyradgs_cl.check.questions.rotation import SIGN, blamed, check_rotation, is_clear
-from phyradgs_cl.check.questions.saturation import OVERFLOW, CountReader, check_saturation
-from phyradgs_cl.check.questions.timing import check_timing
-from phyradgs_cl.check.variants import reversed_rotation, shifted
+from phyradgs_cl.check.shutter import EXPOSURE, READOUT, check_exposure, check_readout
+from phyradgs_cl.check.timing import check_angles, check_timing
 from phyradgs_cl.errors import InputError
+from phyradgs_cl.reconstructors.fits.axis import (
+    AxisShift,
+    columns_per_block,
+    refined_axis_shift,
+    rough_axis_shift,
+)
 from phyradgs_cl.reconstructors.frames.preprocess import Preprocessing, prepared
 from phyradgs_cl.runtime import Runtime
+
+Report = Callable[[int, int, str], None]
+"""Takes how many questions are answered, how many there are, and the next one."""
 
 
 @dataclass(frozen=True, eq=False)
 class CheckResult:
-    """The findings in order, and the shift of the panel along u in mm that explains the frames best (NaN: none does, or
-    something else has to be put right first, and ``is_consistent`` is false)."""
+    """The findings in order. ``offset_mm``: the shift of the panel along u that explains the frames best, with its standard
+    deviation ``offset_spread_mm``; NaN where none does, or where something else has to be corrected first (then
+    ``is_consistent`` is false)."""
 
     findings: list[Finding]
-    offset_mm: float
-    offset_spread_mm: float
+    offset_mm: float = math.nan
+    offset_spread_mm: float = math.nan
     is_consistent: bool = True
 
     @property
@@ -52,131 +66,150 @@ class CheckResult:
         return [finding for finding in self.findings if finding.verdict == SUSPICIOUS]
 
 
-def check(
-    scan: Scan,
-    rt: Runtime,
-    counts: CountReader | None = None,
-    report: Callable[[int, int, str], None] = lambda done, total, question: None,
-) -> CheckResult:
-    """What is wrong or suspicious in a scan; ``counts`` is what its file was read with, where it was. ``report`` gets how
-    many questions are answered, of how many, and the next. InputError: every pixel masked; NaN or infinity elsewhere."""
-    scan = prepared(_usable(scan), Preprocessing())
-    asks_readout = scan.is_fly and scan.shutter.exposure_s + scan.shutter.readout_s > 0
-    asks_exposure = scan.shutter.exposure_s > 0
-    names = ["timing", "angles", "saturation", "dead pixels", "coverage", CONSISTENCY, SIGN, CENTRE, DISTANCES, GAIN]
-    names += [READOUT] * asks_readout + [EXPOSURE] * asks_exposure
-    found: list[Finding] = []
+class _Answers:
+    """Collects the findings and reports each."""
 
-    def add(finding: Finding) -> Finding:
+    def __init__(self, questions: list[str], report: Report) -> None:
+        self.findings: list[Finding] = []
+        self._questions, self._report = [*questions, ""], report
+        self._say()
+
+    def add(self, finding: Finding) -> Finding:
         if finding.question == DISTANCES and finding.verdict == CANNOT_TELL:
             finding = replace(finding, text=f"{finding.text}; {UNVERIFIED}")
-        found.append(finding)
-        report(len(found), len(names), names[len(found)] if len(found) < len(names) else "")
+        self.findings.append(finding)
+        self._say()
         return finding
 
-    report(0, len(names), names[0])
-    add(check_timing(scan))
-    add(check_angles(scan))
-    saturation = add(check_saturation(scan, counts))
+    def stop(self) -> CheckResult:
+        """Leaves the remaining questions open because of the last finding."""
+        cause = self.findings[-1]
+        for question in self._questions[len(self.findings) : -1]:
+            self.add(Finding(question, CANNOT_TELL, 0.0, 0.0, "", f"rests on {cause.question}: {cause.verdict}"))
+        return CheckResult(self.findings, is_consistent=False)
 
-    def leave_the_rest() -> CheckResult:
-        cause = found[-1]
-        for name in names[len(found) :]:
-            add(Finding(name, CANNOT_TELL, 0.0, 0.0, "", f"rests on {cause.question}: {cause.verdict}"))
-        return CheckResult(found, math.nan, math.nan, False)
+    def _say(self) -> None:
+        count = len(self.findings)
+        self._report(count, len(self._questions) - 1, self._questions[count])
 
+
+def check(
+    scan: Scan, rt: Runtime, counts: CountReader | None = None, report: Report = lambda done, total, question: None
+) -> CheckResult:
+    """Looks for what is wrong or suspicious in a scan. ``counts``: the reader of the scan's file, if it remembers counts.
+
+    Raises InputError where every pixel is masked, and for NaN or infinity elsewhere."""
+    scan = prepared(_finite(scan), Preprocessing())
+    questions = ["timing", "angles", "saturation", "dead pixels", "coverage", CONSISTENCY, SIGN, CENTRE, DISTANCES, GAIN]
+    if scan.is_fly and scan.shutter.exposure_s + scan.shutter.readout_s > 0:
+        questions.append(READOUT)
+    if scan.shutter.exposure_s > 0:
+        questions.append(EXPOSURE)
+    answers = _Answers(questions, report)
+    answers.add(check_timing(scan))
+    answers.add(check_angles(scan))
+    saturation = answers.add(check_saturation(scan, counts))
     if saturation.unit == OVERFLOW:
-        return leave_the_rest()
+        return answers.stop()
     finding, dead = check_dead_pixels(scan)
-    if finding.verdict == SUSPICIOUS and saturation.verdict != OK:  # a saturated pixel is as still as a dead one
+    if finding.verdict == SUSPICIOUS and saturation.verdict != OK:  # a saturated pixel is as constant as a dead one
         finding = replace(finding, verdict=CANNOT_TELL, text=f"rests on saturation: {saturation.verdict}", advice="")
-    add(finding)
-    scan = _without(scan, dead)
-    coverage = add(check_coverage(scan))
+    answers.add(finding)
+    scan = _with_masked(scan, dead)
+    coverage = answers.add(check_coverage(scan))
     if coverage.unit in (NO_OBJECT, OPAQUE, TOO_BRIGHT):
-        return leave_the_rest()
-    quick = coarse(scan, QUICK)
-    fits = check_consistency(rt, quick, scan)
-    add(fits.finding)
-    if not fits.is_sound:
-        return leave_the_rest()
-    quick = some_frames(quick, fits.kept)
-    is_reversed, offset, centre = _turning(rt, quick, scan, add, fits.sees_angles)
-    pitch_mm = scan.geometry.pixel_size_mm[1]
-    quick = _under(quick, is_reversed, offset, centre)
-    add(check_distances(rt, quick) if fits.sees_angles else _looks_alike(DISTANCES))
+        return answers.stop()
+    quick = coarse(scan, QUICK_COLUMNS)
+    consistency = check_consistency(rt, quick, scan)
+    answers.add(consistency.finding)
+    if not consistency.is_sound:
+        return answers.stop()
+    quick = some_frames(quick, consistency.frames)
+    orbit = _check_orbit(rt, quick, scan, answers, consistency.sees_angles)
+    quick = orbit.corrected(quick)
+
+    def ask(question: str, check_question: Callable[[Runtime, Scan], Finding], coarse_scan: Scan) -> None:
+        answers.add(check_question(rt, coarse_scan) if consistency.sees_angles else _same_from_everywhere(question))
+
+    ask(DISTANCES, check_distances, quick)
     gain = check_gain(rt, quick)
-    if gain.verdict == SUSPICIOUS and coverage.unit == CUT_OFF:  # what leaves the panel takes its attenuation along
+    if gain.verdict == SUSPICIOUS and coverage.unit == CUT_OFF:  # an object that leaves the panel changes the levels too
         gain = replace(gain, verdict=CANNOT_TELL, text=f"{gain.text}, or the object does beyond the panel")
-    add(gain)
-    if asks_readout:
-        fine = _under(some_frames(coarse(scan, FINE), fits.kept), is_reversed, offset, centre)
-        add(check_readout(rt, fine) if fits.sees_angles else _looks_alike(READOUT))
-    if asks_exposure:
-        add(check_exposure(rt, quick) if fits.sees_angles else _looks_alike(EXPOSURE))
-    if is_reversed or centre.unit == OTHER_CAUSE:  # its sign or size is another's to say
-        return CheckResult(found, math.nan, math.nan, False)
-    return CheckResult(found, offset.pixels * pitch_mm, offset.spread * pitch_mm)
+    answers.add(gain)
+    if READOUT in questions:
+        ask(READOUT, check_readout, orbit.corrected(some_frames(coarse(scan, FINE_COLUMNS), consistency.frames)))
+    if EXPOSURE in questions:
+        ask(EXPOSURE, check_exposure, quick)
+    if orbit.is_reversed or orbit.centre.unit == OTHER_CAUSE:  # the offset's sign or size depends on another correction
+        return CheckResult(answers.findings, is_consistent=False)
+    pitch_mm = scan.geometry.pixel_size_mm[1]
+    return CheckResult(answers.findings, orbit.shift.pixels * pitch_mm, orbit.shift.deviation * pitch_mm)
 
 
-def _looks_alike(question: str) -> Finding:
+@dataclass(frozen=True, eq=False)
+class _Orbit:
+    """Whether the gantry turns the other way, the panel's shift, and the finding about it."""
+
+    is_reversed: bool
+    shift: AxisShift
+    centre: Finding
+
+    def corrected(self, scan: Scan) -> Scan:
+        """Returns a coarse scan with its sense of rotation corrected, and its panel shifted where that is significant."""
+        scan = reversed_rotation(scan) if self.is_reversed else scan
+        is_shifted = self.shift.is_found and abs(self.shift.pixels) > self.centre.threshold
+        return shifted(scan, self.shift.pixels) if is_shifted else scan
+
+
+def _check_orbit(rt: Runtime, quick: Scan, as_stated: Scan, answers: _Answers, sees_angles: bool) -> _Orbit:
+    """Answers the questions of the sense of rotation and of the axis; a panel of few columns decides neither."""
+    nowhere = AxisShift(math.nan, math.nan, np.empty(0))
+    if quick.geometry.detector_shape[1] < FEWEST_COLUMNS:
+        answers.add(too_narrow(SIGN, "standard errors"))
+        return _Orbit(False, nowhere, answers.add(too_narrow(CENTRE, "pixels")))
+    if not sees_angles:
+        answers.add(_same_from_everywhere(SIGN))
+        return _Orbit(False, nowhere, answers.add(_same_from_everywhere(CENTRE)))
+    reverse, block = reversed_rotation(quick), columns_per_block(quick)
+    stated, other = rough_axis_shift(rt, quick), rough_axis_shift(rt, reverse)
+    was_clear = is_clear(stated, other)
+    if not was_clear:
+        stated, other = refined_axis_shift(rt, quick, stated), refined_axis_shift(rt, reverse, other)
+    sign = check_rotation(stated, other)
+    is_reversed = sign.verdict == SUSPICIOUS
+    shift = other if is_reversed else stated
+    if was_clear:
+        shift = refined_axis_shift(rt, reverse if is_reversed else quick, shift)
+    shift = with_coarseness(shift, block, as_stated)
+    pitch_mm = quick.geometry.pixel_size_mm[1] / block
+    stated_px = as_stated.geometry.detector_offset_mm[1] / pitch_mm
+    centre = check_centre(shift, block, pitch_mm, stated_px)
+    if is_reversed:
+        sign = with_cause(sign, shift.pixels, stated_px, centre.threshold)
+        centre = replace(centre, verdict=CANNOT_TELL, text=f"rests on {SIGN}: {SUSPICIOUS}", advice="")
+    answers.add(sign)
+    return _Orbit(is_reversed, shift, answers.add(centre))
+
+
+def _same_from_everywhere(question: str) -> Finding:
     return Finding(question, CANNOT_TELL, 0.0, 0.0, "", "the object looks the same from every angle")
 
 
-def _turning(
-    rt: Runtime, quick: Scan, as_stated: Scan, add: Callable[[Finding], Finding], sees_angles: bool
-) -> tuple[bool, Offset, Finding]:
-    """(does the gantry turn the other way, where is its axis on the panel, what was found about that); a panel
-    of few columns says neither."""
-    if quick.geometry.detector_shape[1] < FEWEST_COLUMNS:
-        add(too_narrow(SIGN, "standard errors"))
-        return False, Offset(math.nan, math.nan, np.empty(0)), add(too_narrow(CENTRE, "pixels"))
-    if not sees_angles:
-        add(_looks_alike(SIGN))
-        return False, Offset(math.nan, math.nan, np.empty(0)), add(_looks_alike(CENTRE))
-    turned, block = reversed_rotation(quick), block_of(quick)
-    stated, other = rough_offset(rt, quick), rough_offset(rt, turned)
-    was_clear = is_clear(stated, other)
-    if not was_clear:
-        stated, other = best_offset(rt, quick, stated), best_offset(rt, turned, other)
-    sign = check_rotation(stated, other)
-    is_reversed = sign.verdict == SUSPICIOUS
-    offset = other if is_reversed else stated
-    if was_clear:
-        offset = best_offset(rt, turned if is_reversed else quick, offset)
-    offset = with_coarseness(offset, block, as_stated)
-    pitch_mm = quick.geometry.pixel_size_mm[1] / block
-    stated_px = as_stated.geometry.detector_offset_mm[1] / pitch_mm
-    centre = check_offset(offset, block, pitch_mm, stated_px)
-    if is_reversed:
-        sign = blamed(sign, offset.pixels, stated_px, centre.threshold)
-        centre = replace(centre, verdict=CANNOT_TELL, text=f"rests on {SIGN}: {SUSPICIOUS}", advice="")
-    add(sign)
-    return is_reversed, offset, add(centre)
-
-
-def _usable(scan: Scan) -> Scan:
-    """The scan with zeros for masked values that are not finite."""
+def _finite(scan: Scan) -> Scan:
+    """Returns the scan with zeros for masked values that are not finite."""
     p = np.asarray(scan.projections)
     if not scan.valid.any():
-        raise InputError("pixel_mask", "every pixel masked", "pixels that say something", "check the mask")
-    finite = np.isfinite(p)
-    if finite.all():
+        raise InputError("pixel_mask", "every pixel masked", "at least one usable pixel", "correct the mask")
+    is_finite = np.isfinite(p)
+    if is_finite.all():
         return scan
     checks.finite("projections", p[scan.valid])
-    return replace(scan, projections=np.where(finite, p, 0).astype(np.float32))
+    return replace(scan, projections=np.where(is_finite, p, 0).astype(np.float32))
 
 
-def _without(scan: Scan, dead: np.ndarray) -> Scan:
-    """The scan with dead pixels (v, u) in its mask."""
+def _with_masked(scan: Scan, dead: np.ndarray) -> Scan:
+    """Returns the scan with dead pixels (v, u) in its mask."""
     if not dead.any():
         return scan
     mask = dead if scan.pixel_mask is None else (np.asarray(scan.pixel_mask) != 0) | dead
     return replace(scan, pixel_mask=mask)
-
-
-def _under(scan: Scan, is_reversed: bool, offset: Offset, centre: Finding) -> Scan:
-    """The scan as the questions so far have it: turned round where it has to be, the panel where it really is."""
-    scan = reversed_rotation(scan) if is_reversed else scan
-    is_moved = math.isfinite(offset.pixels) and abs(offset.pixels) > centre.threshold
-    return shifted(scan, offset.pixels) if is_moved else scan

@@ -5,7 +5,7 @@ import math
 from pathlib import Path
 from typing import Annotated
 
-from phyradgs_cl.check import CANNOT_TELL, CheckResult, CountReader, check
+from phyradgs_cl.check import CANNOT_TELL, CENTRE, CheckResult, CountReader, check
 from phyradgs_cl.commands.console import AsJson, say
 from phyradgs_cl.commands.files import file_option, option
 from phyradgs_cl.commands.options import Device, Scan
@@ -20,8 +20,8 @@ from phyradgs_cl.workflow.files import expecting, refuse_foreign_suffix, refuse_
 
 EXAMPLE = "Example: phyradgs check scan.h5"
 SUSPICIOUS_STATUS = 10
-_NOT_ASKED = "not asked: which end of the panel is up (row 0; --row-0 of import), as no frame can tell"
-_FIX_OFFSET = "Write a copy of the scan (-o) with the centre-of-rotation offset that was found."
+_NOT_ASKED = "not asked: which end of the panel is up (row 0; --row-0 of import), because no frame shows it"
+_FIX_OFFSET = "Write a copy of the scan (-o) whose panel is shifted along u to the centre of rotation that was found."
 
 
 def check_command(
@@ -33,11 +33,10 @@ def check_command(
     ] = None,
     device: Device = None,
 ) -> int:
-    """Look for what is wrong or suspicious in a scan: timing, angles, pixels, order of frames,
-    signs, gain, centre of rotation.
+    """Look for what is wrong or suspicious in a scan: timing, angles, pixels, coverage, order of frames, geometry, gain.
 
-    Frames that do not fit together are named, and other questions then answered without them, or not at all.
-    Ends with status 0 if nothing was found and 10 if something is suspicious.
+    Frames that do not fit the others are named, and further questions are answered without them. Exit status: 0 if nothing
+    is suspicious, or if --fix-offset has corrected the only suspicious answer; 10 otherwise.
     """
     wish = device_wish(device)
     target = _checked_output(scan, fix_offset, output)
@@ -46,17 +45,19 @@ def check_command(
         ticker.stage(f"reading {scan.name}")
         with expecting(scan, "scan"):
             loaded = read_scan(scan, counts)
-        found = check(loaded, Runtime(wish), counts, lambda done, total, name: ticker.show(done, total, f"  {name}"))
-    say(_as_json(found, scan) if as_json else _as_text(found))
+        result = check(loaded, Runtime(wish), counts, lambda done, total, name: ticker.show(done, total, f"  {name}"))
+    say(_as_json(result, scan) if as_json else _as_text(result))
+    suspicious = {finding.question for finding in result.suspicious}
     if target is not None:
-        _write_copy(scan, target, found, quiet=as_json)
-    return SUSPICIOUS_STATUS if found.suspicious else 0
+        _write_copy(scan, target, result, quiet=as_json)
+        suspicious.discard(CENTRE)
+    return SUSPICIOUS_STATUS if suspicious else 0
 
 
 def _checked_output(scan: Path, fix_offset: bool, output: Path | None) -> Path | None:
     if fix_offset != (output is not None):
-        found = "--fix-offset without -o" if fix_offset else "-o without --fix-offset"
-        raise InputError("check", found, "both or neither", "write for example --fix-offset -o fixed.h5")
+        combination = "--fix-offset without -o" if fix_offset else "-o without --fix-offset"
+        raise InputError("check", combination, "both or neither", "write for example --fix-offset -o fixed.h5")
     if output is not None:
         refuse_overwriting("-o", output, scan)
         refuse_foreign_suffix(output)
@@ -64,37 +65,34 @@ def _checked_output(scan: Path, fix_offset: bool, output: Path | None) -> Path |
     return output
 
 
-def _write_copy(scan: Path, target: Path, found: CheckResult, quiet: bool) -> None:
-    if not found.is_consistent:
-        remedy = "set right what is suspicious, and check again"
-        found_instead = "frames that do not fit together as stated"
-        raise InputError("--fix-offset", found_instead, "an offset that means something", remedy)
-    if not (math.isfinite(found.offset_mm) and math.isfinite(found.offset_spread_mm)):
-        expected = "a scan whose frames tell it"
-        raise InputError("--fix-offset", "no offset that fits best", expected, "leave it out")
+def _write_copy(scan: Path, target: Path, result: CheckResult, quiet: bool) -> None:
+    if not result.is_consistent:
+        expected, remedy = "frames that fit together", "correct what is suspicious above, and check again"
+        raise InputError("--fix-offset", "frames that do not fit together as stated", expected, remedy)
+    if not (math.isfinite(result.offset_mm) and math.isfinite(result.offset_spread_mm)):
+        expected = "a scan whose frames determine the offset"
+        raise InputError("--fix-offset", "no offset that fits best", expected, "leave --fix-offset out")
     with only_run(target), finish_despite_interrupt():
-        copy_with_offset(scan, target, found.offset_mm)
+        copy_with_offset(scan, target, result.offset_mm)
     if not quiet:
-        say(f"{target}: a copy with the panel moved {found.offset_mm:+.4g} mm along u")
+        say(f"{target}: a copy with the panel moved {result.offset_mm:+.4g} mm along u")
 
 
-def _as_text(found: CheckResult) -> str:
-    """A line per question, what to do below it, and the sum."""
+def _as_text(result: CheckResult) -> str:
+    """Returns a line per question with its advice below, and the totals."""
     lines: list[str] = []
-    for finding in found.findings:
+    for finding in result.findings:
         lines.append(f"{finding.verdict:12s} {finding.question:19s} {finding.text}")
         if finding.advice:
             lines.append(f"{'':33s}-> {finding.advice}")
-    count = len(found.suspicious)
-    unsure = [finding.question for finding in found.findings if finding.verdict == CANNOT_TELL]
-    lines.append(_NOT_ASKED)
-    named = f": {', '.join(unsure)}" if unsure else ""
-    lines.append(f"{count} of {len(found.findings)} questions suspicious, {len(unsure)} cannot be told{named}")
-    return "\n".join(lines)
+    open_questions = [finding.question for finding in result.findings if finding.verdict == CANNOT_TELL]
+    names = f": {', '.join(open_questions)}" if open_questions else ""
+    suspicious = f"{len(result.suspicious)} of {len(result.findings)} questions suspicious"
+    return "\n".join([*lines, _NOT_ASKED, f"{suspicious}, {len(open_questions)} cannot be told{names}"])
 
 
-def _as_json(found: CheckResult, scan: Path) -> str:
-    offset = {"offset_mm": found.offset_mm, "offset_spread_mm": found.offset_spread_mm}
-    known = {key: value if math.isfinite(value) else None for key, value in offset.items()}
-    facts = {"scan": str(scan), "suspicious": len(found.suspicious), **known}
-    return json.dumps({**facts, "findings": [finding.facts() for finding in found.findings]})
+def _as_json(result: CheckResult, scan: Path) -> str:
+    offset = {"offset_mm": result.offset_mm, "offset_spread_mm": result.offset_spread_mm}
+    finite = {key: value if math.isfinite(value) else None for key, value in offset.items()}
+    facts = {"scan": str(scan), "suspicious": len(result.suspicious), **finite}
+    return json.dumps({**facts, "findings": [finding.facts() for finding in result.findings]})

@@ -8,10 +8,11 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from phyradgs_cl.acquisition import ConeGeometry, Protocol
+from phyradgs_cl.acquisition.altered.perturbed import GeometryCorrection, perturb
 from phyradgs_cl.calibrate import CANNOT_TELL, CORRECTED, calibrate
-from phyradgs_cl.calibrate.beads import BeadLevel
-from phyradgs_cl.calibrate.moved import Change, moved
+from phyradgs_cl.calibrate.beads import BeadProblem
 from phyradgs_cl.calibrate.placing import placements
+from phyradgs_cl.calibrate.problem import Stage
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.importers import load_beads
@@ -100,13 +101,13 @@ def scanned(rt, phantom, axis="rows", model="log", noise="none", is_fly=True, vi
 def test_frames_are_those_of_the_simulator(rt, known, axis, model, is_fly) -> None:
     """Of bodies that are turned and shifted there, and poses that are here; two thirds as dense."""
     scan = scanned(rt, lying(known), axis, model, is_fly=is_fly, views=3)
-    level = BeadLevel.of(known, np.array([*LYING, 1.0]), [scan], 128)
-    found = level.operator(Change()).forward(level.start)
+    level = BeadProblem.of(known, np.array([*LYING, 1.0]), [scan], Stage(128, 6, 4))
+    found = level.operator(GeometryCorrection()).forward(level.start)
     largest = scan.projections.max()
     np.testing.assert_allclose(found, scan.projections, atol=0.05 * largest)
     assert np.sqrt(np.mean((found - scan.projections) ** 2)) < 0.003 * largest
     if model == "log":
-        thinner = level.operator(Change()).forward(level.start * [1, 1, 1, 1, 1, 1, 2 / 3])
+        thinner = level.operator(GeometryCorrection()).forward(level.start * [1, 1, 1, 1, 1, 1, 2 / 3])
         np.testing.assert_allclose(thinner, found * 2 / 3, atol=1e-5)
 
 
@@ -117,8 +118,8 @@ def test_a_placement_is_found_and_a_background_taken_out(rt, known) -> None:
     mask[10:14, 5:20] = True
     for masked in (None, mask):
         scan = replace(scan, projections=np.asarray(scan.projections) + slope, pixel_mask=masked)
-        level = BeadLevel.of(known, np.array([*LYING, 1.0]) + 0.03, [scan], 128)
-        operator = level.operator(Change())
+        level = BeadProblem.of(known, np.array([*LYING, 1.0]) + 0.03, [scan], Stage(128, 6, 4))
+        operator = level.operator(GeometryCorrection())
         found = level.reconstruct(operator, None, 10)
         np.testing.assert_allclose(found[:6], LYING, atol=3e-3)
         assert found[6] == pytest.approx(1, abs=0.02)
@@ -141,8 +142,8 @@ def test_a_scanner_is_found_by_what_it_shows_of_beads(cli, rt, file, known, tmp_
     """Rows read, from the other end than stated, one turn; another start of all frames is the phantom turned."""
     scan = scanned(rt, lying(known), noise="tigre", views=10)
     planted = {"readout": 0.09, "exposure": -0.17, "offset-u": 0.15, "detector-distance": -0.05, "direction": 2.0}
-    off = Change(readout_s=0.09, exposure_s=-0.17, offset_u_mm=0.15, detector_distance_mm=-0.05)
-    stated = moved(scan, Change(**{name: -value for name, value in vars(off).items()}))
+    off = GeometryCorrection(readout_s=0.09, exposure_s=-0.17, offset_u_mm=0.15, detector_distance_mm=-0.05)
+    stated = perturb(scan, GeometryCorrection(**{name: -value for name, value in vars(off).items()}))
     path, out = tmp_path / "scan.h5", tmp_path / "out.h5"
     write_scan(path, replace(stated, shutter=replace(stated.shutter, direction=-1)))
     what = "direction,offset-u,roll,distance,readout,exposure"

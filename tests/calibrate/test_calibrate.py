@@ -7,23 +7,16 @@ import numpy as np
 import pytest
 
 from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, Protocol
+from phyradgs_cl.acquisition.altered.perturbed import GeometryCorrection, Sway, Views, perturb, without_drift
 from phyradgs_cl.api import simulate
 from phyradgs_cl.calibrate import AGREES, CANNOT_TELL, CORRECTED, Calibration, calibrate
-from phyradgs_cl.calibrate.level import Level
-from phyradgs_cl.calibrate.moved import Change, Sway, Views, evenly_lit, moved
 from phyradgs_cl.calibrate.parameters import in_words
+from phyradgs_cl.calibrate.passes import PassCounter
+from phyradgs_cl.calibrate.per_view import SPLINES, MotionParameters, WobbleParameters
+from phyradgs_cl.calibrate.problem import CoarseProblem, Stage
 from phyradgs_cl.calibrate.reduced import Reduced
-from phyradgs_cl.calibrate.run import _corrections, _Search
-from phyradgs_cl.calibrate.views import SPLINES, find_sway, find_wobble
-from phyradgs_cl.calibrate.wobble import (
-    numbers_of_sway,
-    numbers_of_views,
-    views_of,
-    without_gauges,
-    without_smooth_gauges,
-    without_sway_gauges,
-)
-from phyradgs_cl.calibrate.work import Work
+from phyradgs_cl.calibrate.search import Search
+from phyradgs_cl.calibrate.views import estimate_views
 from phyradgs_cl.detector import lagged
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
@@ -35,12 +28,12 @@ from phyradgs_cl.workflow import load_scan
 
 OFFSET_MM, ROLL_DEG = 0.3, 0.8
 
-SILENT = Work(lambda *progress: None, {})
+SILENT = PassCounter(lambda *progress: None, {})
 
 
 @pytest.fixture(scope="module")
 def wrong(right):
-    return moved(right, Change(offset_u_mm=-OFFSET_MM, roll_rad=-np.deg2rad(ROLL_DEG)))
+    return perturb(right, GeometryCorrection(offset_u_mm=-OFFSET_MM, roll_rad=-np.deg2rad(ROLL_DEG)))
 
 
 def by_name(found):
@@ -91,7 +84,8 @@ def test_what_differs_by_less_than_three_deviations_is_not_corrected_along(tilt,
     wrong = np.array([40.0, tilt]) * deviation @ signals
     known = ("offset-u", "tilt-v")
     shares = dict(zip(known, problem.shares.tolist(), strict=True))
-    kept = _corrections(_Search({}, {}, known, shares, [], replace(problem, residual=problem.residual + wrong)))
+    off = replace(problem, residual=problem.residual + wrong)
+    kept = Search([], known=known, shares=shares, reduced=off).corrections()
     assert set(kept) == names
     alone = problem.only(tuple(sorted(names)))
     expected = replace(alone, residual=problem.residual + wrong).step()
@@ -108,10 +102,10 @@ def test_a_panel_of_one_row_tells_its_offset_and_no_turn(rt, right, monkeypatch,
         trajectory=CircularOrbit(geometry, right.trajectory.kinematics),
         shutter=replace(right.shutter, readout_s=0.0),
     )
-    found = by_name(calibrate(moved(row, Change(offset_u_mm=-OFFSET_MM)), rt, "offset-u,roll,tilt-u"))
+    found = by_name(calibrate(perturb(row, GeometryCorrection(offset_u_mm=-OFFSET_MM)), rt, "offset-u,roll,tilt-u"))
     assert abs(found["offset-u"].found) < 0.03 and found["offset-u"].verdict == CORRECTED
     assert {found[name].verdict for name in ("roll", "tilt-u")} == {CANNOT_TELL}
-    monkeypatch.setattr("phyradgs_cl.calibrate.run._corrections", lambda search: {"offset-u": OFFSET_MM})
+    monkeypatch.setattr("phyradgs_cl.calibrate.search.Search.corrections", lambda search: {"offset-u": OFFSET_MM})
     worse = calibrate(row, rt, "offset-u")
     assert by_name(worse)["offset-u"].verdict == CANNOT_TELL and worse.scan.geometry is row.geometry
     assert worse.residual_rms[0] == worse.residual_rms[1] and "beyond the panel" not in caplog.text
@@ -122,9 +116,9 @@ def test_a_panel_of_one_row_tells_its_offset_and_no_turn(rt, right, monkeypatch,
 
 def test_a_second_turn_the_other_way_tells_readout_and_exposure(cli, right, turned, tmp_path, capsys, caplog) -> None:
     """Which one scan does not, and two that turn alike do not."""
-    longer = Change(readout_s=0.08, exposure_s=0.15)
+    longer = GeometryCorrection(readout_s=0.08, exposure_s=0.15)
     for name, scan in (("on", right), ("back", turned(back=True))):
-        write_scan(tmp_path / name, moved(scan, Change(readout_s=-0.08, exposure_s=-0.15)))
+        write_scan(tmp_path / name, perturb(scan, GeometryCorrection(readout_s=-0.08, exposure_s=-0.15)))
     words = ["calibrate", str(tmp_path / "on"), "--what", "readout,exposure", "--with"]
     assert cli.run([*words, str(tmp_path / "back"), "--json"]) == 0
     for one in json.loads(capsys.readouterr().out)["parameters"]:
@@ -144,7 +138,7 @@ def test_blocks_mix_no_rows_that_are_read_at_other_times(rt, turned) -> None:
     frames[:, 10:12] = 1
     rolled = replace(scan, projections=frames)
     frozen = replace(rolled, shutter=replace(scan.shutter, readout_s=0.0))
-    profile = {name: Level.of(rt, False, [one], 16).measured.mean((0, 2)) for name, one in
+    profile = {name: CoarseProblem.of(rt, False, [one], Stage(16, 0, 0)).measured.mean((0, 2)) for name, one in
                (("rolled", rolled), ("frozen", frozen))}  # fmt: skip
     np.testing.assert_allclose(profile["rolled"], np.arange(16) == 5, atol=1e-6)
     assert 0.2 < profile["frozen"][5] < 0.9 and profile["frozen"][4] > 0.05
@@ -152,15 +146,16 @@ def test_blocks_mix_no_rows_that_are_read_at_other_times(rt, turned) -> None:
 
 def test_a_detector_that_adds_photons(rt, turned) -> None:
     scan = turned(model="intensity")
-    (found,) = calibrate(moved(scan, Change(offset_u_mm=-OFFSET_MM)), rt, "offset-u").parameters
+    (found,) = calibrate(perturb(scan, GeometryCorrection(offset_u_mm=-OFFSET_MM)), rt, "offset-u").parameters
     assert abs(found.found) < 3 * found.deviation < 0.03 and found.verdict == CORRECTED
 
 
 def test_shifts_of_views_are_found_and_turns_too_small_for_these_voxels_left(rt, right) -> None:
     rng = np.random.default_rng(1)
-    planted = without_gauges(right, np.array([0.0, 0.125, 0.125]) * rng.normal(size=(15, 3)))
-    off = moved(right, Change(), views_of(-planted))
-    found = find_wobble(rt, off, [(16, 30, 10), (32, 30, 10)], Change(), SILENT)
+    planted = WobbleParameters.of(right).without_gauges(np.array([0.0, 0.125, 0.125]) * rng.normal(size=(15, 3)))
+    off = perturb(right, GeometryCorrection(), WobbleParameters.of(right).views_of(-planted))
+    stages = [Stage(16, 30, 10), Stage(32, 30, 10)]
+    found = estimate_views(rt, off, WobbleParameters.of(off), stages, GeometryCorrection(), SILENT)
     assert [one.verdict for one in found.table][1:] == [CORRECTED, CORRECTED]
     left_mm = found.views.shift_mm - planted[:, 1:]
     assert np.sqrt(np.mean(left_mm**2)) < 0.1 * np.sqrt(np.mean(planted[:, 1:] ** 2))
@@ -175,7 +170,9 @@ def test_turns_of_a_smooth_object_on_which_levels_differ_are_left(rt) -> None:
     scan = simulate_frames(scene.source, geometry, scene.grid, SimulationOptions(plan, noise="beer", dose=1e5))
     planted = np.zeros((40, 3))
     planted[:, 0] = np.radians(np.sin(4 * np.pi * np.arange(40) / 40))
-    found = find_wobble(rt, moved(scan, Change(), views_of(planted)), [(24, 40, 15), (48, 40, 12)], Change(), SILENT)
+    wobbling = perturb(scan, GeometryCorrection(), WobbleParameters.of(scan).views_of(planted))
+    stages = [Stage(24, 40, 15), Stage(48, 40, 12)]
+    found = estimate_views(rt, wobbling, WobbleParameters.of(scan), stages, GeometryCorrection(), SILENT)
     turn = found.table[0]
     assert turn.verdict == AGREES and found.views is None, found.table
 
@@ -184,15 +181,16 @@ def test_a_slow_wobble_by_splines_of_time(cli, rt, tmp_path, capsys) -> None:
     """Better than view by view, with what was corrected in the answer, the picture and the report of a volume."""
     how = {"size": 24, "detector": 36, "views": 40, "exposure_deg": 3.0, "readout_ratio": 0.5, "noise": "tigre", "dose": 1e5}
     scan = simulate("foot", **how, device=rt)
-    numbers = numbers_of_views(scan, 6)
+    parameters = WobbleParameters.of(scan, 6)
     drawn = np.array([np.deg2rad(3.0), 0.1, 0.1]) * np.random.default_rng(1).normal(size=(6, 3))
-    values = without_smooth_gauges(scan, numbers, drawn)
-    np.testing.assert_allclose(without_smooth_gauges(scan, numbers, values), values, atol=1e-12)
-    planted = numbers.basis @ values
-    off = moved(scan, Change(), views_of(-planted))
+    values = parameters.without_gauges(drawn)
+    np.testing.assert_allclose(parameters.without_gauges(values), values, atol=1e-12)
+    planted = parameters.basis @ values
+    off = perturb(scan, GeometryCorrection(), parameters.views_of(-values))
     left = []
     for splines in (0, 6):
-        found = find_wobble(rt, off, [(18, 40, 15), (36, 40, 12)], Change(), SILENT, splines)
+        stages = [Stage(18, 40, 15), Stage(36, 40, 12)]
+        found = estimate_views(rt, off, WobbleParameters.of(off, splines), stages, GeometryCorrection(), SILENT)
         left.append(np.sqrt(np.mean((np.c_[found.views.turn_rad, found.views.shift_mm] - planted) ** 2, axis=0)))
     assert [one.verdict for one in found.table] == [CORRECTED] * 3
     most = np.array([0.4, 0.05, 0.05]) * np.sqrt(np.mean(planted**2, axis=0))
@@ -216,9 +214,10 @@ def test_a_wobble_does_not_pass_for_a_roll(rt, monkeypatch) -> None:
     how = {"size": 24, "detector": 36, "views": 30, "exposure_deg": 6.0, "noise": "tigre", "dose": 1e5}
     scan = simulate("jaw", **how, device=rt)
     course = np.cos(np.pi * np.linspace(0, 1, 30))
-    planted = without_gauges(scan, np.stack([0 * course, 0.1 * course**2, 0.15 * course], -1))
+    parameters = WobbleParameters.of(scan)
+    planted = parameters.without_gauges(np.stack([0 * course, 0.1 * course**2, 0.15 * course], -1))
     offset_mm = 0.2
-    off = moved(scan, Change(offset_u_mm=-offset_mm), views_of(-planted))
+    off = perturb(scan, GeometryCorrection(offset_u_mm=-offset_mm), parameters.views_of(-planted))
     found = calibrate(off, rt, "offset-u,roll,wobble", splines=6)
     lines = by_name(found)
     assert lines["roll"].verdict == AGREES and lines["offset-u"].verdict == CORRECTED
@@ -227,11 +226,11 @@ def test_a_wobble_does_not_pass_for_a_roll(rt, monkeypatch) -> None:
     again = calibrate(found.scan, rt, "roll").scan.provenance
     assert again["calibrated_before"] == [found.scan.provenance["calibration"]]
     assert [one["name"] for one in again["calibration"]["parameters"]] == ["roll"]
-    asked: list[Change] = []
-    counted = "phyradgs_cl.calibrate.run.find_wobble"
-    monkeypatch.setattr(counted, lambda *args, **given: asked.append(args[3]) or find_wobble(*args, **given))
+    asked: list[GeometryCorrection] = []
+    counted = "phyradgs_cl.calibrate.run.estimate_views"
+    monkeypatch.setattr(counted, lambda *args: asked.append(args[4]) or estimate_views(*args))
     assert by_name(calibrate(found.scan, rt, "roll,wobble", splines=6))["roll"].verdict == AGREES
-    assert asked == [Change()]  # nothing that all views share was off: they are not solved for again
+    assert asked == [GeometryCorrection()]  # nothing that all views share was off: they are not solved for again
 
 
 def test_a_figure_has_a_curve_for_each_number_of_a_view(right) -> None:
@@ -252,15 +251,15 @@ def test_a_figure_has_a_curve_for_each_number_of_a_view(right) -> None:
 
 def test_an_object_that_moves_is_followed_and_the_file_has_its_poses(cli, rt, right, tmp_path, capsys) -> None:
     """Frames that overlap in time are no hindrance: a motion is of time alone."""
-    numbers = numbers_of_sway(right, SPLINES)
+    parameters = MotionParameters.of(right)
     course = np.zeros((SPLINES, 6))
     course[:, 3:] = 0.15 * np.random.default_rng(2).normal(size=(SPLINES, 3))
-    planted = without_sway_gauges(right, numbers, course)
+    planted = parameters.without_gauges(course)
     path, out = tmp_path / "scan.h5", tmp_path / "out.h5"
-    write_scan(path, moved(right, Change(), numbers.views(-planted)))
+    write_scan(path, perturb(right, GeometryCorrection(), parameters.views_of(-planted)))
     assert cli.run(["calibrate", str(path), "--what", "motion", "-o", str(out), "--json"]) == 0
     lines = {one["name"]: one for one in json.loads(capsys.readouterr().out)["parameters"]}
-    sizes_mm = np.std(numbers.basis @ planted, 0)
+    sizes_mm = np.std(parameters.basis @ planted, 0)
     for kind, axis in enumerate("xyz"):
         one = lines[f"shift along {axis} of the object"]
         assert one["verdict"] == CORRECTED and one["unit"] == "mm"
@@ -274,29 +273,30 @@ def test_an_object_that_moves_is_followed_and_the_file_has_its_poses(cli, rt, ri
 
 
 def test_a_still_object_stays_still(rt, right) -> None:
-    found = find_sway(rt, right, [(16, 30, 10), (32, 30, 10)], Change(), SILENT)
+    stages = [Stage(16, 30, 10), Stage(32, 30, 10)]
+    found = estimate_views(rt, right, MotionParameters.of(right), stages, GeometryCorrection(), SILENT)
     shifts_mm = np.zeros(1) if found.views is None else found.views.coefficients[:, 3:]
     assert np.abs(shifts_mm).max() < 0.02
 
 
 def test_gauges_of_a_motion_are_an_object_elsewhere_and_a_larger_one(right) -> None:
-    numbers = numbers_of_sway(right, SPLINES)
+    parameters = MotionParameters.of(right)
     angle = np.deg2rad(24 * np.arange(15))
-    towards = np.linalg.lstsq(numbers.basis, np.stack([np.cos(angle), np.sin(angle)], -1), rcond=None)[0]
+    towards = np.linalg.lstsq(parameters.basis, np.stack([np.cos(angle), np.sin(angle)], -1), rcond=None)[0]
     gauges = np.tile(np.arange(6.0), (SPLINES, 1))
     gauges[:, 3:5] += towards
-    np.testing.assert_allclose(without_sway_gauges(right, numbers, gauges), 0, atol=1e-9)
-    once = without_sway_gauges(right, numbers, np.random.default_rng(0).normal(size=(SPLINES, 6)))
-    np.testing.assert_allclose(without_sway_gauges(right, numbers, once), once, atol=1e-12)
+    np.testing.assert_allclose(parameters.without_gauges(gauges), 0, atol=1e-9)
+    once = parameters.without_gauges(np.random.default_rng(0).normal(size=(SPLINES, 6)))
+    np.testing.assert_allclose(parameters.without_gauges(once), once, atol=1e-12)
 
 
 def test_gauges_of_views_are_what_another_object_looks_like(right) -> None:
     angle = np.deg2rad(24 * np.arange(15))
     gauges = np.stack([np.full(15, 0.1), np.full(15, 0.2), 0.3 * np.cos(angle) - 0.1 * np.sin(angle)], -1)
-    np.testing.assert_allclose(without_gauges(right, gauges), 0, atol=1e-12)
+    np.testing.assert_allclose(WobbleParameters.of(right).without_gauges(gauges), 0, atol=1e-12)
     offset = np.zeros((15, 3))
     offset[:, 2] = 0.2  # the panel's, which shows
-    np.testing.assert_allclose(without_gauges(right, offset), offset, atol=1e-12)
+    np.testing.assert_allclose(WobbleParameters.of(right).without_gauges(offset), offset, atol=1e-12)
 
 
 def test_a_combination_in_words() -> None:
@@ -318,7 +318,7 @@ def few(scan):
         ("wobble", lambda s: s, (lambda s: s,), "one scan"),
         ("motion", lambda s: s, (lambda s: s,), "one scan"),
         ("wobble,motion", lambda s: s, (), "one of the two"),
-        ("roll", lambda s: s, (lambda s: moved(s, Change(offset_u_mm=1.0)),), "--with: geometry"),
+        ("roll", lambda s: s, (lambda s: perturb(s, GeometryCorrection(offset_u_mm=1.0)),), "--with: geometry"),
     ],
 )
 def test_what_cannot_be_asked_is_refused(rt, right, what, change, others, said) -> None:
@@ -347,7 +347,7 @@ def test_views_of_frames_that_overlap_have_no_place_in_a_file(refused, right, tm
 
 def test_views_in_a_result_are_its_trajectory(right) -> None:
     views = Views.none(15)
-    assert not isinstance(moved(right, Change(), views).trajectory, CircularOrbit)
+    assert not isinstance(perturb(right, GeometryCorrection(), views).trajectory, CircularOrbit)
 
 
 def test_the_end_that_is_read_first_is_told_where_it_bends_the_object(cli, turned, tmp_path, capsys) -> None:
@@ -376,7 +376,7 @@ def test_lag_and_drift_are_numbers_of_the_frames(cli, rt, right, tmp_path, capsy
     assert load_scan(out).lag == pytest.approx(lines["lag"]["found"] / 100)
     drifting = replace(right, projections=brighter)
     found = calibrate(drifting, rt, "drift")
-    assert np.abs(found.scan.projections - evenly_lit(drifting, 0.04).projections).max() < 0.01
+    assert np.abs(found.scan.projections - without_drift(drifting, 0.04).projections).max() < 0.01
     both = calibrate(replace(right, projections=lagged(brighter, 0.05).astype(np.float32)), rt, "lag,drift")
     for one, truth in zip([*found.parameters, *both.parameters], (4, 5, 4), strict=True):
         assert one.verdict == CORRECTED and abs(one.found - truth) < 3 * one.deviation < 3, one

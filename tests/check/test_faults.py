@@ -7,15 +7,15 @@ import numpy as np
 import pytest
 
 from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, PoseTable
+from phyradgs_cl.acquisition.altered.variants import reversed_rotation
 from phyradgs_cl.acquisition.geometry import default_grid
-from phyradgs_cl.check import CANNOT_TELL, OK, SUSPICIOUS, check
-from phyradgs_cl.check.questions import consistency
-from phyradgs_cl.check.questions.exposure import check_exposure
-from phyradgs_cl.check.questions.offset import OTHER_CAUSE, Offset, check_offset
-from phyradgs_cl.check.variants import reversed_rotation
+from phyradgs_cl.check import CANNOT_TELL, OK, SUSPICIOUS, check, consistency
+from phyradgs_cl.check.orbit import OTHER_CAUSE, check_centre
+from phyradgs_cl.check.shutter import check_exposure
 from phyradgs_cl.commands.check import SUSPICIOUS_STATUS
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.io import read_scan, write_scan
+from phyradgs_cl.reconstructors.fits.axis import AxisShift
 from phyradgs_cl.workflow import load_scan
 
 
@@ -94,14 +94,14 @@ def test_both_senses_are_looked_at_where_few_iterations_do_not_tell(rt, clean, m
     monkeypatch.setattr(consistency, "shifted", lambda scan, pixels: (scan, pixels))
     first = {id(clean): 1.1, id(other): 1.0}
     monkeypatch.setattr(
-        consistency, "rough_offset", lambda rt, scan: Offset(2.0, np.nan, np.array([first[id(scan)]]))
+        consistency, "rough_axis_shift", lambda rt, scan: AxisShift(2.0, np.nan, np.array([first[id(scan)]]))
     )
-    monkeypatch.setattr(consistency, "best_offset", lambda rt, scan, rough: Offset(2.5, 0.1, rough.residuals))
+    monkeypatch.setattr(consistency, "refined_axis_shift", lambda rt, scan, rough: AxisShift(2.5, 0.1, rough.squares))
     left = {id(clean): 0.1, id(other): 0.6}
     monkeypatch.setattr(
-        consistency, "fitted", lambda rt, way: np.array([left[id(way[0])] if isinstance(way, tuple) else 2.0])
+        consistency, "fit_squares", lambda rt, way: np.array([left[id(way[0])] if isinstance(way, tuple) else 2.0])
     )
-    assert consistency._best_turning(rt, clean) == (clean, (clean, 2.5), 1.0)
+    assert consistency._best_sense(rt, clean) == (clean, (clean, 2.5), 1.0)
 
 
 @pytest.fixture(scope="module", params=[0.0, 0.375])
@@ -157,7 +157,7 @@ def test_a_beam_without_a_fan_leaves_sizes_and_offset_open() -> None:
     """Stated 20 pixels beside the middle, found at 2, the panel may have larger pixels; at -20 it may be a mirror image."""
 
     def found(pixels):
-        return check_offset(Offset(pixels, 0.05, np.empty(0)), 2, 0.1, 20.0)
+        return check_centre(AxisShift(pixels, 0.05, np.empty(0)), 2, 0.1, 20.0)
 
     assert found(-18.0).unit == OTHER_CAUSE and "pixel sizes were 10 times as large" in found(-18.0).text
     assert "--fix-offset" not in found(-18.0).advice and "--fix-offset" in found(-15.0).advice
@@ -309,8 +309,12 @@ def test_the_offset_goes_into_a_copy(cli, clean, tmp_path, capsys, kind) -> None
     path, fixed = tmp_path / "scan.h5", tmp_path / "fixed.h5"
     write_scan(path, wrong)
     before = path.read_bytes()
-    assert cli.run(["check", str(path), "--fix-offset", "-o", str(fixed), "--json"]) == SUSPICIOUS_STATUS
-    shift_mm = json.loads(capsys.readouterr().out)["offset_mm"]
+    assert cli.run(["check", str(path), "--json"]) == SUSPICIOUS_STATUS
+    capsys.readouterr()
+    assert cli.run(["check", str(path), "--fix-offset", "-o", str(fixed), "--json"]) == 0  # corrected, nothing else wrong
+    facts = json.loads(capsys.readouterr().out)
+    shift_mm = facts["offset_mm"]
+    assert facts["suspicious"] == 1
     copy, expected = load_scan(fixed), frames.trajectory.pose(3, clean.frame_start_s[3:4])
     offset_v_mm, offset_u_mm = copy.geometry.detector_offset_mm
     assert offset_v_mm == 0.25 and offset_u_mm == pytest.approx(3 * pitch_mm + shift_mm)

@@ -6,12 +6,11 @@ import numpy as np
 import pytest
 
 from phyradgs_cl.acquisition import CircularOrbit, EncoderTable, FrameSweeps, PoseTable, Saturation
+from phyradgs_cl.acquisition.altered.angles import exposure_arc_rad
 from phyradgs_cl.check import OK, SUSPICIOUS, CountReader
-from phyradgs_cl.check.questions.angles import check_angles
-from phyradgs_cl.check.questions.coverage import check_coverage
-from phyradgs_cl.check.questions.dead_pixels import check_dead_pixels
-from phyradgs_cl.check.questions.saturation import check_saturation
-from phyradgs_cl.check.questions.timing import check_timing, exposure_arc_rad
+from phyradgs_cl.check.coverage import check_coverage
+from phyradgs_cl.check.detector import check_dead_pixels, check_saturation
+from phyradgs_cl.check.timing import check_angles, check_timing
 
 
 def some_frames(scan, chosen):
@@ -195,7 +194,7 @@ def test_frames_that_are_no_line_integrals_of_an_object(clean) -> None:
     bright[:, 8:24, 10:22] = -p.max()
     for values, said, advised in (
         (1000 * np.exp(-p), "largest, 1e+03, beside the object", "--quantity"),
-        (50 * p / p.max(), "one photon in", "--quantity"), (bright, "brighter than the flats", "flats those of this scan"),
+        (50 * p / p.max(), "one photon in", "--quantity"), (bright, "brighter than the flats", "flats from this scan"),
     ):
         finding = check_coverage(replace(clean, projections=values.astype(np.float32)))
         assert finding.verdict == SUSPICIOUS and said in finding.text and advised in finding.advice

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from phyradgs_cl.acquisition import CircularOrbit, PoseTable, Shutter, pixel_centres
-from phyradgs_cl.check.coarse import FINE, QUICK, binned, coarse, fewer_frames
-from phyradgs_cl.check.statistics import residual_ratio, t_statistic, vertex
-from phyradgs_cl.check.variants import exposed, reversed_readout, reversed_rotation, shifted
+from phyradgs_cl.acquisition.altered.coarse import FINE_COLUMNS, binned, coarse, fewer_frames
+from phyradgs_cl.acquisition.altered.variants import exposed, reversed_readout, reversed_rotation, shifted
+from phyradgs_cl.reconstructors.fits.residuals import residual_ratio, t_statistic, vertex
 
 CLOSE = {"rtol": 0, "atol": 1e-12}
 
@@ -99,10 +99,10 @@ def test_fewer_frames_keep_their_poses_and_times(clean) -> None:
 
 
 def test_levels_bound_pixels_and_voxels(clean) -> None:
-    assert coarse(clean, FINE).projections.shape == clean.projections.shape
-    small = coarse(replace(clean, projections=clean.projections), replace(QUICK, columns=16))
+    assert coarse(clean, FINE_COLUMNS).projections.shape == clean.projections.shape
+    small = coarse(replace(clean, projections=clean.projections), 16)
     assert small.geometry.detector_shape == (16, 16)
-    assert coarse(of_rows(clean, 1), replace(QUICK, columns=16)).projections.shape[1:] == (1, 32)
+    assert coarse(of_rows(clean, 1), 16).projections.shape[1:] == (1, 32)
     around = 2 * np.array(small.grid.voxel_size_mm)
     assert max(small.grid.shape) <= 26 and small.grid.size_mm - around == pytest.approx(clean.grid.size_mm)
 

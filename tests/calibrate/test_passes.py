@@ -4,20 +4,21 @@ import pytest
 
 from phyradgs_cl.api import simulate
 from phyradgs_cl.calibrate import calibrate
-from phyradgs_cl.calibrate.work import Work
+from phyradgs_cl.calibrate.passes import PassCounter
 
 
 def test_the_share_is_of_costs_and_what_is_not_needed_is_taken_out() -> None:
     told = []
-    work = Work(lambda *report: told.append(report), {"coarse": [(1.0, 4)], "middle": [(8.0, 5)], "fine": [(64.0, 2)]})
+    plan = {"coarse": [(1.0, 4)], "middle": [(8.0, 5)], "fine": [(64.0, 2)]}
+    work = PassCounter(lambda *report: told.append(report), plan)
     work.begin("coarse", "24 columns")
-    count = work.counts(1.0)
+    count = work.counter(1.0)
     count()
     assert told == [(0, 11, "24 columns", 0.0), (1, 11, "24 columns", pytest.approx(1 / 172))]
     work.begin("fine", "96 columns")  # the first ended early, the second is not needed
     assert told[-1] == (1, 3, "96 columns", pytest.approx(1 / 129))
     work.expect([(64.0, 1)])
-    work.counts(64.0)()
+    work.counter(64.0)()
     assert told[-1] == (2, 2, "96 columns", 1.0)
 
 

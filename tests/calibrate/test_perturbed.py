@@ -8,14 +8,20 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from phyradgs_cl.acquisition import CircularOrbit, EncoderTable, PerRow, pixel_centres
-from phyradgs_cl.calibrate.moved import Change, Moved, Sway, Views, moved
+from phyradgs_cl.acquisition.altered.perturbed import (
+    GeometryCorrection,
+    PerturbedTrajectory,
+    Sway,
+    Views,
+    perturb,
+)
 from phyradgs_cl.io import write_scan
 from phyradgs_cl.io.scan.copy import copy_with_motion
 from phyradgs_cl.workflow import load_scan
 
-NUMBERS = Change(offset_u_mm=0.3, offset_v_mm=-0.2, source_distance_mm=0.1, detector_distance_mm=-0.4)
-TURNS = Change(roll_rad=0.02, tilt_v_rad=-0.03, tilt_u_rad=0.01)
-TIMES = Change(readout_s=0.1, exposure_s=-0.2, start_s=0.05)
+NUMBERS = GeometryCorrection(offset_u_mm=0.3, offset_v_mm=-0.2, source_distance_mm=0.1, detector_distance_mm=-0.4)
+TURNS = GeometryCorrection(roll_rad=0.02, tilt_v_rad=-0.03, tilt_u_rad=0.01)
+TIMES = GeometryCorrection(readout_s=0.1, exposure_s=-0.2, start_s=0.05)
 
 TIMED = {"count_time", "detector_readout_time", "frame_start_time", "rotation_angle", "rotation_angle_end"}
 
@@ -25,17 +31,17 @@ def poses(scan):
 
 
 def test_numbers_of_the_geometry_move_poses_as_that_does(right) -> None:
-    by_geometry = moved(right, NUMBERS)
+    by_geometry = perturb(right, NUMBERS)
     assert isinstance(by_geometry.trajectory, CircularOrbit)
-    by_poses = replace(right, trajectory=Moved(right.trajectory, right.geometry.detector_shape, NUMBERS))
+    by_poses = replace(right, trajectory=PerturbedTrajectory(right.trajectory, right.geometry.detector_shape, NUMBERS))
     np.testing.assert_allclose(poses(by_poses), poses(by_geometry), atol=1e-12)
 
 
 def test_turns_leave_the_middle_of_the_panel_where_it_is(right) -> None:
-    stated, turned = (pixel_centres(poses(scan)[:1], (32, 32))[0] for scan in (right, moved(right, TURNS)))
+    stated, turned = (pixel_centres(poses(scan)[:1], (32, 32))[0] for scan in (right, perturb(right, TURNS)))
     np.testing.assert_allclose(turned.mean((0, 1)), stated.mean((0, 1)), atol=1e-12)
-    for along, change in enumerate((Change(tilt_v_rad=0.1), Change(tilt_u_rad=0.1))):
-        shift = pixel_centres(poses(moved(right, change))[:1], (32, 32))[0] - stated
+    for along, change in enumerate((GeometryCorrection(tilt_v_rad=0.1), GeometryCorrection(tilt_u_rad=0.1))):
+        shift = pixel_centres(poses(perturb(right, change))[:1], (32, 32))[0] - stated
         assert np.allclose(np.diff(shift, axis=along), 0), change  # along the axis of the tilt it moves as one
         assert np.abs(shift).max() > 0.1, change
     np.testing.assert_allclose(np.linalg.norm(turned[0, 1] - turned[0, 0]), 0.125)
@@ -44,7 +50,7 @@ def test_turns_leave_the_middle_of_the_panel_where_it_is(right) -> None:
 def test_views_move_by_themselves(right) -> None:
     views = Views(np.zeros(15), np.zeros((15, 2)))
     views.turn_rad[3], views.shift_mm[5] = 0.01, (0.2, 0.0)
-    after = moved(right, Change(), views)
+    after = perturb(right, GeometryCorrection(), views)
     time_s = np.array([1.0])
     is_off = [not np.allclose(after.trajectory.pose(f, time_s), right.trajectory.pose(f, time_s)) for f in range(15)]
     assert np.flatnonzero(is_off).tolist() == [3, 5]
@@ -56,7 +62,7 @@ def test_an_object_that_moves_sees_source_and_panel_move_the_other_way(right) ->
     """Rays meet the object where they would have met it at rest."""
     rng = np.random.default_rng(0)
     sway = replace(Sway.none(right, 5), coefficients=0.1 * rng.normal(size=(5, 6)))
-    path = moved(right, Change(), sway).trajectory
+    path = perturb(right, GeometryCorrection(), sway).trajectory
     time_s = right.frame_start_s[0] + np.array([0.0, 0.3, 5.0])
     stated, seen = (trajectory.pose(0, time_s).reshape(3, 4, 3) for trajectory in (right.trajectory, path))
     for at, before, after in zip(sway.at(time_s), stated, seen, strict=True):
@@ -87,7 +93,7 @@ def test_a_copy_says_what_was_changed_and_nothing_else(right, tmp_path, change, 
     counts = np.random.default_rng(0).integers(1, 60000, (17, 32, 32)).astype(np.uint16)
     write_scan(path, right, data=counts, image_key=[1, 2, *[0] * 15], quantity="counts")
     stated = load_scan(path)
-    changed = moved(stated, change)
+    changed = perturb(stated, change)
     copy_with_motion(path, copy, replace(changed, provenance={"why": "a test"}))
     read = load_scan(copy)
     np.testing.assert_allclose(poses(read), poses(changed), atol=1e-5)
@@ -107,7 +113,7 @@ def test_encoder_standing_gantry_and_views_are_copied_too(right, tmp_path) -> No
         (encoded, TIMES, None), (replace(right, is_fly=False), TURNS, None), (right, TURNS, views)
     ):  # fmt: skip
         write_scan(path, scan)
-        changed = moved(load_scan(path), change, off)
+        changed = perturb(load_scan(path), change, off)
         copy_with_motion(path, copy, changed)
         read = load_scan(copy)
         np.testing.assert_allclose(poses(read), poses(changed), atol=1e-5)

@@ -1,0 +1,1 @@
+"""Scans derived from a stated one: coarser, with another geometry or timing, under another hypothesis."""

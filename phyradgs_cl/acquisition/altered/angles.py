@@ -1,0 +1,40 @@
+"""Angles of the source about the axis of rotation (+z), from poses or from a scan."""
+
+import numpy as np
+
+from phyradgs_cl.acquisition.scan import Scan
+
+
+def azimuth_rad(pose: np.ndarray) -> np.ndarray:
+    """Returns the source's angles (...) about +z of poses (..., 12), in (-π, π]."""
+    angle_rad: np.ndarray = np.arctan2(pose[..., 1], pose[..., 0])
+    return angle_rad
+
+
+def start_azimuths_rad(scan: Scan) -> np.ndarray:
+    """Returns the source's angles (F,) about +z at the start of each frame."""
+    starts = [scan.trajectory.pose(f, scan.frame_start_s[f : f + 1]) for f in range(scan.frames)]
+    return azimuth_rad(np.concatenate(starts))
+
+
+def exposure_arc_rad(scan: Scan) -> float:
+    """Returns the angle by which the gantry turns during one line's exposure, in the middle frame; 0 for a gantry at
+    rest."""
+    if not scan.is_fly:
+        return 0.0
+    frame = scan.frames // 2
+    start_s = float(scan.frame_start_s[frame])
+    ends = azimuth_rad(scan.trajectory.pose(frame, np.array([start_s, start_s + scan.shutter.exposure_s])))
+    return abs(float(wrapped(ends[1:] - ends[:1])[0]))
+
+
+def exposure_steps(scan: Scan, voxels_across: int, voxels_per_step: float, most: int) -> int:
+    """Returns the number of times, 2 to ``most``, at which to sample an exposure: the edge of a volume of ``voxels_across``
+    voxels moves by ``voxels_per_step`` between two."""
+    moved_voxels = exposure_arc_rad(scan) * voxels_across / 2
+    return int(np.clip(np.ceil(moved_voxels / voxels_per_step), 2, most))
+
+
+def wrapped(angle: np.ndarray | float) -> np.ndarray:
+    """Returns angles (...) in radians, in [-π, π)."""
+    return (np.asarray(angle) + np.pi) % (2 * np.pi) - np.pi

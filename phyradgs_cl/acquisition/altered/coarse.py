@@ -1,0 +1,136 @@
+"""A scan made small enough to be reconstructed many times: fewer frames, blocks of pixels, coarse voxels."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+from scipy.ndimage import gaussian_filter
+
+from phyradgs_cl.acquisition.altered.variants import altered_trajectory, with_trajectory
+from phyradgs_cl.acquisition.geometry import ConeGeometry
+from phyradgs_cl.acquisition.scan import Scan
+from phyradgs_cl.acquisition.shutter import Shutter
+from phyradgs_cl.fields import Grid
+
+MOST_FRAMES = 60
+QUICK_COLUMNS, FINE_COLUMNS = 20, 32  # along the detector's longer side
+SMOOTHING = 0.8  # blocks: standard deviation
+_LEAST_VALID = 0.5  # of a block's pixels
+_MOST_VOXELS = 64  # per side
+_MARGIN = 1  # voxels around the box: an object that fills it would fit better with a smaller size
+_LEAST_COLUMNS = 12  # of blocks, where the panel has that many
+_NARROW = 3  # times the columns, on a panel lower than a block: a row of few blocks holds little
+
+
+def coarse(scan: Scan, columns: int) -> Scan:
+    """Returns the scan with at most 60 frames, its pixels averaged in blocks, and a grid to match; without a reference.
+
+    The detector's longer side has at most ``columns`` blocks."""
+    shape = scan.geometry.detector_shape
+    block = min(math.ceil(max(shape) / columns), max(1, shape[1] // _LEAST_COLUMNS))
+    if block > shape[0]:
+        block = max(shape[0], math.ceil(block / _NARROW))
+    small = binned(smooth(fewer_frames(scan, MOST_FRAMES), SMOOTHING * block), block)
+    return replace(small, grid=coarse_grid(scan.grid, small.geometry))
+
+
+def smooth(scan: Scan, pixels: float | tuple[float, float]) -> Scan:
+    """Returns the scan with frames smoothed by a Gaussian of ``pixels`` (or a pair: across rows, across columns), from valid
+    pixels only. Blocks of smoothed frames have no aliasing."""
+    v_px, u_px = pixels if isinstance(pixels, tuple) else (pixels, pixels)
+    if max(v_px, u_px) <= 0.5:
+        return scan
+    sigma = (0, v_px, u_px)
+    p = np.asarray(scan.projections, np.float32)
+    if scan.pixel_mask is None:
+        return replace(scan, projections=gaussian_filter(p, sigma, truncate=3))
+    valid = scan.valid.astype(np.float32)
+    weight = gaussian_filter(valid, sigma, truncate=3)
+    mean = gaussian_filter(p * valid, sigma, truncate=3) / np.maximum(weight, 1e-6)
+    return replace(scan, projections=mean)
+
+
+def fewer_frames(scan: Scan, most: int) -> Scan:
+    """Returns the scan with at most ``most`` frames, spread evenly."""
+    if scan.frames <= most:
+        return scan
+    return some_frames(scan, np.unique(np.linspace(0, scan.frames - 1, most).round().astype(int)))
+
+
+def some_frames(scan: Scan, frames: np.ndarray) -> Scan:
+    """Returns the scan with the given frames (indices) only. Its trajectory still counts them as in the file."""
+    trajectory = altered_trajectory(scan)
+    mask = scan.pixel_mask
+    return replace(
+        scan,
+        projections=scan.projections[frames],
+        trajectory=replace(trajectory, frames=trajectory.frame_numbers(scan)[frames]),
+        frame_start_s=np.asarray(scan.frame_start_s)[frames],
+        pixel_mask=mask if mask is None or np.ndim(mask) == 2 else np.asarray(mask)[frames],
+    )
+
+
+def binned(scan: Scan, block: int) -> Scan:
+    """Returns the scan with blocks of ``block`` × ``block`` pixels as one pixel each, no larger than the panel.
+
+    A block is the mean of its valid pixels, masked where less than half are valid. Rows and columns that fill no block are
+    dropped at the far end. A block of lines opens at the mean of its lines' times."""
+    if block == 1:
+        return replace(scan, reference=None)
+    height, width = blocks = tuple(min(block, count) for count in scan.geometry.detector_shape)
+    rows, columns = scan.geometry.detector_shape[0] // height, scan.geometry.detector_shape[1] // width
+    shape = (scan.frames, rows, height, columns, width)
+    inside = (slice(None), slice(rows * height), slice(columns * width))
+    weight = scan.valid[inside].reshape(shape)
+    values = np.asarray(scan.projections)[inside].reshape(shape)
+    valid_share = weight.mean((2, 4))
+    mean = (values * weight).mean((2, 4)) / np.where(valid_share > 0, valid_share, 1.0)
+    is_masked = valid_share < _LEAST_VALID
+    shutter, later_s = _binned_shutter(scan, width if scan.shutter.axis == "columns" else height)
+    return replace(
+        scan,
+        projections=mean.astype(np.float32),
+        geometry=_binned_panel(scan.geometry, height, width),
+        trajectory=with_trajectory(scan, blocks=blocks).trajectory,
+        shutter=shutter,
+        frame_start_s=np.asarray(scan.frame_start_s) + later_s,
+        pixel_mask=is_masked if is_masked.any() else None,
+        reference=None,
+    )
+
+
+def coarse_grid(grid: Grid, geometry: ConeGeometry) -> Grid:
+    """Returns the same box with a margin of one voxel, in voxels of about a pixel at the axis, never finer than ``grid``."""
+    height_mm, width_mm = (pitch / geometry.magnification for pitch in geometry.pixel_size_mm)
+    least_mm = max(max(grid.size_mm) / _MOST_VOXELS, min(grid.voxel_size_mm))
+    wanted_mm = (max(height_mm, least_mm), *(max(width_mm, least_mm),) * 2)
+    shape = [max(1, math.ceil(side / wanted - 1e-6)) for side, wanted in zip(grid.size_mm, wanted_mm, strict=True)]
+    voxel = [side / n for side, n in zip(grid.size_mm, shape, strict=True)]
+    nz, ny, nx = (n + 2 * _MARGIN for n in shape)
+    return Grid((nz, ny, nx), (voxel[0], voxel[1], voxel[2]), grid.offset_mm)
+
+
+def _binned_panel(geometry: ConeGeometry, height: int, width: int) -> ConeGeometry:
+    """Returns the panel of the whole blocks; pixels dropped at the far end move its middle."""
+    (rows, columns), (pitch_v_mm, pitch_u_mm) = geometry.detector_shape, geometry.pixel_size_mm
+    offset_v_mm, offset_u_mm = geometry.detector_offset_mm
+    return replace(
+        geometry,
+        detector_shape=(rows // height, columns // width),
+        pixel_size_mm=(pitch_v_mm * height, pitch_u_mm * width),
+        detector_offset_mm=(
+            offset_v_mm - rows % height / 2 * pitch_v_mm,
+            offset_u_mm - columns % width / 2 * pitch_u_mm,
+        ),
+    )
+
+
+def _binned_shutter(scan: Scan, block: int) -> tuple[Shutter, float]:
+    """Returns the shutter of blocks of lines, and how much later than the frame the first of them opens."""
+    shutter, lines = scan.shutter, scan.lines
+    line_s = shutter.readout_s / max(lines - 1, 1)
+    blocks = lines // block
+    dropped = lines - blocks * block if shutter.direction < 0 else 0  # the far end is read first
+    later_s = (dropped + (block - 1) / 2) * line_s
+    pulse_s = shutter.pulse_s and (shutter.pulse_s[0] - later_s, shutter.pulse_s[1])
+    return replace(shutter, readout_s=(blocks - 1) * block * line_s, pulse_s=pulse_s), later_s

@@ -1,0 +1,180 @@
+"""A scan with corrected or planted errors of its panel, distances, timing and single views."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.interpolate import BSpline
+from scipy.spatial.transform import Rotation
+
+from phyradgs_cl.acquisition.scan import LARGEST_LAG, Scan
+from phyradgs_cl.acquisition.trajectory import CircularOrbit, Trajectory
+
+
+@dataclass(frozen=True)
+class GeometryCorrection:
+    """Differences from a scan's stated geometry and timing; all 0 is the scan as stated.
+
+    Offsets move the panel along its own columns and rows. Roll turns it in its plane, tilts about v and u through its
+    middle. Distances move source and panel away from the axis. Times lengthen readout and exposure, or start frames later.
+    lag adds to the share of the frame before. drift is the logarithm of the beam's gain from the first frame to the last.
+    turn_rad turns all views about the axis, which no frame can distinguish from a turned object.
+    """
+
+    offset_u_mm: float = 0.0
+    offset_v_mm: float = 0.0
+    roll_rad: float = 0.0
+    tilt_v_rad: float = 0.0
+    tilt_u_rad: float = 0.0
+    source_distance_mm: float = 0.0
+    detector_distance_mm: float = 0.0
+    readout_s: float = 0.0
+    exposure_s: float = 0.0
+    start_s: float = 0.0
+    lag: float = 0.0
+    drift: float = 0.0
+    turn_rad: float = 0.0
+
+    @property
+    def turns(self) -> bool:
+        """True where panel or views turn, which a circular orbit cannot state."""
+        return any((self.roll_rad, self.tilt_v_rad, self.tilt_u_rad, self.turn_rad))
+
+    @property
+    def moves(self) -> bool:
+        """True where source or panel move or turn."""
+        shifts = (self.offset_u_mm, self.offset_v_mm, self.source_distance_mm, self.detector_distance_mm)
+        return any(shifts) or self.turns
+
+
+@dataclass(frozen=True, eq=False)
+class Views:
+    """Corrections per view of the file: turns about the axis (F,) in rad, shifts of the panel along v and u (F, 2) in mm."""
+
+    turn_rad: np.ndarray
+    shift_mm: np.ndarray
+
+    @classmethod
+    def none(cls, frames: int) -> "Views":
+        return cls(np.zeros(frames), np.zeros((frames, 2)))
+
+
+@dataclass(frozen=True, eq=False)
+class Sway:
+    """A rigid motion of the object: turns about x, y and z in rad, then shifts along them in mm. Both are cubic splines of
+    time from ``start_s`` to ``end_s`` with coefficients (n, 6), constant before and after."""
+
+    coefficients: np.ndarray
+    start_s: float
+    end_s: float
+
+    @classmethod
+    def none(cls, scan: Scan, count: int) -> "Sway":
+        """Returns no motion, by ``count`` splines over the scan."""
+        starts_s = np.asarray(scan.frame_start_s, np.float64)
+        return cls(np.zeros((count, 6)), float(starts_s.min()), float(starts_s.max() + scan.shutter.span_s))
+
+    def basis(self, time_s: np.ndarray) -> np.ndarray:
+        """Returns the splines (..., n) at times (...)."""
+        return splines((np.asarray(time_s, np.float64) - self.start_s) / (self.end_s - self.start_s), len(self.coefficients))
+
+    def at(self, time_s: np.ndarray) -> np.ndarray:
+        """Returns turns and shifts (..., 6) at times (...)."""
+        six: np.ndarray = self.basis(time_s) @ self.coefficients
+        return six
+
+
+def splines(fraction: np.ndarray, count: int) -> np.ndarray:
+    """Returns cubic splines (..., count), which sum to 1, at fractions (...) of a time, 0 to 1."""
+    knots = np.concatenate([np.zeros(3), np.linspace(0, 1, count - 2), np.ones(3)])
+    basis: np.ndarray = BSpline.design_matrix(np.clip(np.ravel(fraction), 0, 1), knots, 3).toarray()
+    return basis.reshape(*np.shape(fraction), count)
+
+
+@dataclass(frozen=True, eq=False)
+class PerturbedTrajectory:
+    """Poses of ``base`` for a panel of ``shape`` (rows, columns) after a correction of all views. ``views`` then corrects
+    each by itself, or lets the object move."""
+
+    base: Trajectory
+    shape: tuple[int, int]
+    correction: GeometryCorrection
+    views: "Views | Sway | None" = None
+
+    def pose(self, frame: int, time_s: np.ndarray) -> np.ndarray:
+        """Returns poses (..., 12) at times (...)."""
+        shift_v_mm, shift_u_mm, turn_rad = 0.0, 0.0, self.correction.turn_rad
+        if isinstance(self.views, Views):
+            shift_v_mm, shift_u_mm = self.views.shift_mm[frame]
+            turn_rad += float(self.views.turn_rad[frame])
+        vectors = self._with_moved_panel(np.array(self.base.pose(frame, time_s)), shift_v_mm, shift_u_mm)
+        about_z = Rotation.from_rotvec([0.0, 0.0, turn_rad]).as_matrix()
+        vectors = [vector @ about_z.T for vector in vectors]
+        if isinstance(self.views, Sway):
+            vectors = _seen_by(self.views.at(time_s), vectors)
+        return np.concatenate(vectors, -1)
+
+    def _with_moved_panel(self, pose: np.ndarray, shift_v_mm: float, shift_u_mm: float) -> list[np.ndarray]:
+        """Returns source, first pixel, column step and row step (..., 3) after the correction and shifts of one view."""
+        correction = self.correction
+        source, first, column, row = np.moveaxis(pose.reshape(*pose.shape[:-1], 4, 3), -2, 0)
+        pitch_u_mm, pitch_v_mm = (np.linalg.norm(step, axis=-1, keepdims=True) for step in (column, row))
+        u_hat, v_hat = column / pitch_u_mm, row / pitch_v_mm
+        normal = np.cross(u_hat, v_hat)  # towards the source
+        half_v, half_u = ((n - 1) / 2 for n in self.shape)
+        middle = first + half_u * column + half_v * row - correction.detector_distance_mm * normal
+        middle = middle + (correction.offset_u_mm + shift_u_mm) * u_hat + (correction.offset_v_mm + shift_v_mm) * v_hat
+        # The columns of ``turn`` are the turned u, v and normal, as components along u, v and normal.
+        turn = Rotation.from_rotvec([correction.tilt_u_rad, correction.tilt_v_rad, correction.roll_rad]).as_matrix()
+        axes = np.stack([u_hat, v_hat, normal], -1)
+        column, row = axes @ turn[:, 0] * pitch_u_mm, axes @ turn[:, 1] * pitch_v_mm
+        return [source + correction.source_distance_mm * normal, middle - half_u * column - half_v * row, column, row]
+
+
+def _seen_by(motion: np.ndarray, vectors: list[np.ndarray]) -> list[np.ndarray]:
+    """Returns two places and two steps (..., 3) as an object sees them that has turned and shifted by ``motion`` (...,
+    6)."""
+    back = Rotation.from_rotvec(motion[..., :3].reshape(-1, 3)).as_matrix().reshape(*motion.shape[:-1], 3, 3)
+    places, steps = np.stack(vectors[:2], -2), np.stack(vectors[2:], -2)
+    places = places - motion[..., None, 3:]
+    return list(np.moveaxis(np.concatenate([places @ back, steps @ back], -2), -2, 0))
+
+
+def perturb(scan: Scan, correction: GeometryCorrection, views: Views | Sway | None = None) -> Scan:
+    """Returns the scan after a correction, its frames unchanged (``without_drift`` changes those).
+
+    Offsets and distances of a circular orbit stay numbers of its geometry; other corrections make the trajectory a
+    ``PerturbedTrajectory``."""
+    shutter, geometry, trajectory = scan.shutter, scan.geometry, scan.trajectory
+    source_mm = correction.source_distance_mm
+    offset_v_mm, offset_u_mm = geometry.detector_offset_mm
+    geometry = replace(
+        geometry,
+        source_to_axis_mm=geometry.source_to_axis_mm + source_mm,
+        source_to_detector_mm=geometry.source_to_detector_mm + source_mm + correction.detector_distance_mm,
+        detector_offset_mm=(offset_v_mm + correction.offset_v_mm, offset_u_mm + correction.offset_u_mm),
+    )
+    if isinstance(trajectory, CircularOrbit) and not correction.turns and views is None:
+        trajectory = CircularOrbit(geometry, trajectory.kinematics)
+    elif correction.moves or views is not None:
+        trajectory = PerturbedTrajectory(trajectory, geometry.detector_shape, correction, views)
+    readout_s, exposure_s = shutter.readout_s + correction.readout_s, shutter.exposure_s + correction.exposure_s
+    return replace(
+        scan,
+        geometry=geometry,
+        trajectory=trajectory,
+        shutter=replace(shutter, readout_s=readout_s, exposure_s=exposure_s),
+        frame_start_s=np.asarray(scan.frame_start_s, np.float64) + correction.start_s,
+        lag=float(np.clip(scan.lag + correction.lag, 0, LARGEST_LAG)),
+    )
+
+
+def without_drift(scan: Scan, drift: float) -> Scan:
+    """Returns the scan as a beam of constant brightness would have recorded it."""
+    return replace(scan, projections=(scan.projections + drift * scan_course(scan)[:, None, None]).astype(np.float32))
+
+
+def scan_course(scan: Scan) -> np.ndarray:
+    """Returns where in the scan each frame (F,) begins, -1/2 to 1/2."""
+    starts_s = np.asarray(scan.frame_start_s, np.float64)
+    course: np.ndarray = (starts_s - starts_s.min()) / max(np.ptp(starts_s), 1e-30) - 0.5
+    return course

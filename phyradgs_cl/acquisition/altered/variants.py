@@ -1,0 +1,217 @@
+"""The same frames under another hypothesis: rotation or readout reversed, longer exposure, panel shifted or mirrored.
+
+Poses (..., 12) are four vectors: the source, the middle of the first pixel, the steps to the next column and the next
+row."""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from phyradgs_cl.acquisition.altered.angles import azimuth_rad, start_azimuths_rad, wrapped
+from phyradgs_cl.acquisition.geometry import transpose_pose
+from phyradgs_cl.acquisition.scan import Scan
+from phyradgs_cl.acquisition.trajectory import CircularOrbit, Trajectory
+
+_MIRROR_Y = np.array([1.0, -1.0, 1.0] * 4)
+_FIRST, _COLUMN_STEP, _ROW_STEP = slice(3, 6), slice(6, 9), slice(9, 12)
+_STEPS = _ROW_STEP, _COLUMN_STEP  # by axis: v, u
+
+
+@dataclass(frozen=True, eq=False)
+class AlteredTrajectory:
+    """Poses of ``base`` for a ``panel`` of (rows, columns), altered in the order of the fields.
+
+    is_reversed: the gantry turns the other way (a mirror image, whose columns run backwards); offset_u_mm of the panel stays
+    on its side. shift_px: the panel moves along u, in its own columns. images: maps poses (..., 12) to those of frames that
+    lie otherwise on the panel; None: as stated. blocks: rows and columns per block of pixels. frames (F,): the frames of
+    ``base`` in use; None: all.
+    """
+
+    base: Trajectory
+    panel: tuple[int, int]
+    offset_u_mm: float = 0.0
+    is_reversed: bool = False
+    shift_px: float = 0.0
+    images: Callable[[np.ndarray], np.ndarray] | None = None
+    blocks: tuple[int, int] = (1, 1)
+    frames: np.ndarray | None = None
+
+    def pose(self, frame: int, time_s: np.ndarray) -> np.ndarray:
+        """Returns poses (..., 12) at times (...)."""
+        number = frame if self.frames is None else int(self.frames[frame])
+        pose = np.array(self.base.pose(number, time_s))
+        if self.is_reversed:
+            pose = self._mirrored(pose)
+        pose[..., _FIRST] += self.shift_px * pose[..., _COLUMN_STEP]
+        if self.images is not None:
+            pose = self.images(pose)
+        for block, step in zip(self.blocks, _STEPS, strict=True):
+            pose[..., _FIRST] += (block - 1) / 2 * pose[..., step]
+            pose[..., step] *= block
+        return pose
+
+    def frame_numbers(self, scan: Scan) -> np.ndarray:
+        """Returns the numbers (F,) of the scan's frames in ``base``."""
+        return np.arange(scan.frames) if self.frames is None else self.frames
+
+    def _mirrored(self, pose: np.ndarray) -> np.ndarray:
+        pose = pose * _MIRROR_Y
+        column = pose[..., _COLUMN_STEP]
+        pitch_mm = np.linalg.norm(column, axis=-1, keepdims=True)
+        pose[..., _FIRST] += (self.panel[1] - 1 - 2 * self.offset_u_mm / pitch_mm) * column
+        pose[..., _COLUMN_STEP] = -column
+        return pose
+
+
+@dataclass(frozen=True, eq=False)
+class MappedTrajectory:
+    """Poses of ``base`` after ``change``, which maps a frame and its poses (..., 12) to poses."""
+
+    base: Trajectory
+    change: Callable[[int, np.ndarray], np.ndarray]
+
+    def pose(self, frame: int, time_s: np.ndarray) -> np.ndarray:
+        """Returns poses (..., 12) at times (...)."""
+        return self.change(frame, np.array(self.base.pose(frame, time_s)))
+
+
+def altered_trajectory(scan: Scan) -> AlteredTrajectory:
+    """Returns the scan's trajectory in a form that can be altered."""
+    trajectory = scan.trajectory
+    if isinstance(trajectory, AlteredTrajectory):
+        return trajectory
+    offset_u_mm = scan.geometry.detector_offset_mm[1] if isinstance(trajectory, CircularOrbit) else 0.0
+    return AlteredTrajectory(trajectory, scan.geometry.detector_shape, offset_u_mm)
+
+
+def with_trajectory(scan: Scan, **changes: Any) -> Scan:
+    """Returns the scan with changed fields of its ``AlteredTrajectory``."""
+    return replace(scan, trajectory=replace(altered_trajectory(scan), **changes))
+
+
+def reversed_rotation(scan: Scan) -> Scan:
+    """Returns the scan with the gantry turning the other way."""
+    return with_trajectory(scan, is_reversed=True)
+
+
+def reversed_readout(scan: Scan) -> Scan:
+    """Returns the scan with the last line read first."""
+    return replace(scan, shutter=replace(scan.shutter, direction=-scan.shutter.direction))
+
+
+def exposed(scan: Scan, factor: float) -> Scan:
+    """Returns the scan with lines open ``factor`` times as long, from the same moments."""
+    return replace(scan, shutter=replace(scan.shutter, exposure_s=factor * scan.shutter.exposure_s))
+
+
+def shifted(scan: Scan, pixels: float) -> Scan:
+    """Returns the scan with its panel moved along u by ``pixels`` of the recorded scan, whatever the binning."""
+    return with_trajectory(scan, shift_px=pixels)
+
+
+def at_rest(scan: Scan) -> Scan:
+    """Returns the scan with the gantry at rest during exposures."""
+    return replace(scan, is_fly=False)
+
+
+def read(scan: Scan, axis: str, direction: int, readout_s: float) -> Scan:
+    """Returns the scan with lines along ``axis`` read one after another in ``readout_s``."""
+    shutter = replace(scan.shutter, axis=axis, direction=direction, readout_s=readout_s)
+    return replace(scan, shutter=shutter, is_fly=True)
+
+
+def turned(scan: Scan, angle_rad: np.ndarray, speed: float = 1.0) -> Scan:
+    """Returns the scan with frames turned about z by ``angle_rad`` (F,), and the gantry ``speed`` times as fast in them."""
+    first_rad = start_azimuths_rad(scan)
+
+    def change(frame: int, pose: np.ndarray) -> np.ndarray:
+        since_start = wrapped(azimuth_rad(pose) - first_rad[frame])
+        return _rotated(pose, angle_rad[frame] + (speed - 1) * since_start)
+
+    return replace(scan, trajectory=MappedTrajectory(scan.trajectory, change))
+
+
+def stretched(scan: Scan, v: float, u: float) -> Scan:
+    """Returns the scan with pixels ``v`` times as high and ``u`` times as wide about the panel's middle. The grid grows with
+    them if it then matches the panel's view better."""
+    rows, columns = scan.geometry.detector_shape
+
+    def change(_: int, pose: np.ndarray) -> np.ndarray:
+        wider, higher = (columns - 1) / 2 * (u - 1), (rows - 1) / 2 * (v - 1)
+        pose[..., _FIRST] -= wider * pose[..., _COLUMN_STEP] + higher * pose[..., _ROW_STEP]
+        pose[..., _COLUMN_STEP] *= u
+        pose[..., _ROW_STEP] *= v
+        return pose
+
+    view_mm = u * columns * scan.geometry.pixel_size_mm[1] / scan.geometry.magnification
+    share = max(scan.grid.size_mm[1:]) / view_mm
+    grows = abs(math.log(share * u)) < abs(math.log(share))
+    z, y, x = scan.grid.voxel_size_mm
+    grid = replace(scan.grid, voxel_size_mm=(v * z, u * y, u * x)) if grows else scan.grid
+    return replace(scan, trajectory=MappedTrajectory(scan.trajectory, change), grid=grid)
+
+
+def mirrored(scan: Scan, axis: str) -> Scan:
+    """Returns the scan with its frames mirrored in ``axis``, u or v, on the stated panel."""
+    number = ("v", "u").index(axis)
+    is_read_along = scan.shutter.axis == ("rows", "columns")[number]
+    images = partial(_flipped, axis=number, count=altered_trajectory(scan).panel[number])
+    return with_trajectory(reversed_readout(scan) if is_read_along else scan, images=images)
+
+
+def transposed(scan: Scan, is_quarter_turn: bool) -> Scan:
+    """Returns the scan with its frames' rows along u and columns along v; is_quarter_turn: mirrored in u as well, which
+    makes it a turn by 90°."""
+    rows, columns = altered_trajectory(scan).panel
+
+    def change(pose: np.ndarray) -> np.ndarray:
+        pose[..., _FIRST] += (columns - rows) / 2 * (pose[..., _COLUMN_STEP] - pose[..., _ROW_STEP])
+        pose = transpose_pose(pose)
+        return _flipped(pose, 0, rows) if is_quarter_turn else pose
+
+    axis = "columns" if scan.shutter.axis == "rows" else "rows"
+    runs_back = is_quarter_turn and axis == "rows"
+    shutter = replace(scan.shutter, axis=axis, direction=-scan.shutter.direction if runs_back else scan.shutter.direction)
+    return with_trajectory(replace(scan, shutter=shutter), images=change)
+
+
+def resized(scan: Scan, factor: float, keeps_axis: bool) -> Scan:
+    """Returns the scan with pixels ``factor`` times as large. keeps_axis: the central ray stays at its pixel, as with
+    shorter distances; else the panel's offset stays in mm."""
+    trajectory = altered_trajectory(scan)
+    rows, columns = trajectory.panel
+
+    def change(_: int, pose: np.ndarray) -> np.ndarray:
+        source, first, step_u, step_v = (pose[..., i : i + 3].copy() for i in (0, 3, 6, 9))
+        if keeps_axis:
+            normal = np.cross(step_u, step_v)
+            normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
+            centre = source + normal * ((first - source) * normal).sum(-1, keepdims=True)
+        else:
+            centre = first + (columns - 1) / 2 * step_u + (rows - 1) / 2 * step_v
+        pose[..., _FIRST] = centre + factor * (first - centre)
+        pose[..., 6:] *= factor
+        return pose
+
+    return with_trajectory(scan, base=MappedTrajectory(trajectory.base, change))
+
+
+def _flipped(pose: np.ndarray, axis: int, count: int) -> np.ndarray:
+    """Returns poses (..., 12) of frames whose ``count`` rows (axis 0) or columns (1) run backwards."""
+    step = _STEPS[axis]
+    pose[..., _FIRST] += (count - 1) * pose[..., step]
+    pose[..., step] *= -1
+    return pose
+
+
+def _rotated(pose: np.ndarray, angle_rad: np.ndarray) -> np.ndarray:
+    """Returns poses (..., 12) turned about z by angles (...)."""
+    cos, sin = np.cos(angle_rad)[..., None], np.sin(angle_rad)[..., None]
+    vectors: np.ndarray = pose.reshape(*pose.shape[:-1], 4, 3).copy()
+    x, y = vectors[..., 0].copy(), vectors[..., 1].copy()
+    vectors[..., 0], vectors[..., 1] = cos * x - sin * y, sin * x + cos * y
+    return vectors.reshape(pose.shape)

@@ -1,0 +1,240 @@
+"""Parameters of single views (a wobble), or of an object that moves slowly (a motion), by splines of time.
+
+A view's parameters change its own frame only, so their signals are images of that frame. CGLS solves the normal equations of
+a Gauss–Newton step for the volume and all parameters together: what an object can explain, the volume takes over.
+"""
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import ClassVar
+
+import numpy as np
+
+from phyradgs_cl.acquisition import Scan
+from phyradgs_cl.acquisition.altered.angles import start_azimuths_rad
+from phyradgs_cl.acquisition.altered.perturbed import GeometryCorrection, Sway, Views, scan_course, splines
+from phyradgs_cl.calibrate.problem import CoarseProblem
+from phyradgs_cl.detector import noise_level
+from phyradgs_cl.operators.rays.operator import RayOperator
+from phyradgs_cl.reconstructors.fits.augmented import AugmentedOperator, ViewParameters
+from phyradgs_cl.reconstructors.voxels.cgls import Cgls
+
+SPLINES = 7  # of a motion: about one per seventh of the scan
+TURN, SHIFT_V, SHIFT_U = 0, 1, 2
+_STEP_PX = 0.25
+_LEAST_NORM = 0.1  # of the largest of a kind: parameters with weaker signals are not scaled up further
+_DEG = float(np.rad2deg(1.0))
+
+
+@dataclass(frozen=True)
+class Kind:
+    """A kind of parameter: its name in the table, its unit there, and that unit per unit of the parameter."""
+
+    name: str
+    unit: str
+    scale: float
+
+
+@dataclass(frozen=True, eq=False)
+class PerViewParameters(ABC):
+    """``values`` (n, K), of which view f has ``basis`` (F, n) @ values (K,). ``units`` (K,): the amount of each kind that
+    moves a frame by a pixel at its edge. ``circle`` (n, 2): values that vary as cosine and sine of the angle, as far as the
+    basis can. MISMATCH: measured errors (docs/calibrate.md) over those of noise, because voxels do not represent the object
+    exactly. RESTARTED: kinds that start from 0 on each grid."""
+
+    values: np.ndarray
+    basis: np.ndarray
+    units: np.ndarray
+    circle: np.ndarray
+
+    KINDS: ClassVar[tuple[Kind, ...]]
+    MISMATCH: ClassVar[float]
+    RESTARTED: ClassVar[tuple[int, ...]] = ()
+
+    @abstractmethod
+    def views_of(self, values: np.ndarray) -> Views | Sway:
+        """Returns values (n, K) as a change of a scan."""
+
+    @abstractmethod
+    def without_gauges(self, values: np.ndarray) -> np.ndarray:
+        """Returns values (n, K) without the part that another object explains exactly."""
+
+    def kinds_of_stage(self, number: int, count: int) -> Sequence[int]:
+        """Returns the kinds to estimate in a stage; by default all."""
+        return range(len(self.KINDS))
+
+    def operator(
+        self, problem: CoarseProblem, correction: GeometryCorrection, more: np.ndarray | float = 0.0
+    ) -> RayOperator:
+        """Returns A after a correction and these values plus ``more``."""
+        return problem.operator(correction, self.views_of(self.values + more))
+
+
+class WobbleParameters(PerViewParameters):
+    """A turn and two shifts per view, each by itself or by splines of time."""
+
+    KINDS = (Kind("turn per view", "deg", _DEG), Kind("shift-v per view", "mm", 1.0), Kind("shift-u per view", "mm", 1.0))
+    MISMATCH = 4.0
+    RESTARTED = (TURN,)
+
+    @classmethod
+    def of(cls, scan: Scan, count: int = 0) -> "WobbleParameters":
+        """Returns zeros for every view, or for ``count`` splines."""
+        basis = splines(scan_course(scan) + 0.5, count) if count else np.eye(scan.frames)
+        pitch_v_mm, pitch_u_mm = scan.geometry.pixel_size_mm
+        units = np.array([_turn_unit_rad(scan), pitch_v_mm, pitch_u_mm])
+        return cls(np.zeros((basis.shape[1], len(cls.KINDS))), basis, units, _circle(scan, basis))
+
+    def views_of(self, values: np.ndarray) -> Views:
+        per_view = self.basis @ values
+        return Views(per_view[:, TURN], per_view[:, SHIFT_V:])
+
+    def without_gauges(self, values: np.ndarray) -> np.ndarray:
+        """A turned or shifted object explains the mean of turns and of shifts along v, and shifts along u that vary as
+        cosine and sine of the angle."""
+        rest = values.copy()
+        rest[:, :SHIFT_U] -= (self.basis @ rest[:, :SHIFT_U]).mean(0)
+        pattern, shifts = self.basis @ self.circle, self.basis @ rest[:, SHIFT_U]
+        rest[:, SHIFT_U] -= self.circle @ np.linalg.lstsq(pattern, shifts, rcond=None)[0]
+        return rest
+
+    def kinds_of_stage(self, number: int, count: int) -> Sequence[int]:
+        """Turns need fine detail: they are estimated on the last two grids only, each time from 0, so that the difference
+        between the two shows their error."""
+        return (TURN, SHIFT_V, SHIFT_U) if number >= count - 2 else (SHIFT_V, SHIFT_U)
+
+
+@dataclass(frozen=True, eq=False)
+class MotionParameters(PerViewParameters):
+    """Three turns and three shifts of the object, by splines of time."""
+
+    still: Sway
+
+    KINDS = tuple(
+        Kind(f"{kind} {axis} of the object", unit, scale)
+        for kind, unit, scale in (("turn about", "deg", _DEG), ("shift along", "mm", 1.0))
+        for axis in "xyz"
+    )
+    MISMATCH = 7.0
+
+    @classmethod
+    def of(cls, scan: Scan, count: int = SPLINES) -> "MotionParameters":
+        """Returns no motion, by ``count`` splines."""
+        still = Sway.none(scan, count)
+        basis = still.basis(np.asarray(scan.frame_start_s) + scan.shutter.middle_s)
+        shift_mm = scan.geometry.pixel_size_mm[1] / scan.geometry.magnification
+        units = np.array([_turn_unit_rad(scan)] * 3 + [shift_mm] * 3)
+        return cls(still.coefficients, basis, units, _circle(scan, basis), still)
+
+    def views_of(self, values: np.ndarray) -> Sway:
+        return replace(self.still, coefficients=values)
+
+    def without_gauges(self, values: np.ndarray) -> np.ndarray:
+        """An object elsewhere explains the mean of each kind; a larger or smaller one shifts along x and y that follow the
+        source."""
+        rest = values - (self.basis @ values).mean(0)
+        towards_source = self.circle - (self.basis @ self.circle).mean(0)
+        shifts, pattern = self.basis @ rest[:, 3:5], self.basis @ towards_source
+        rest[:, 3:5] -= np.sum(shifts * pattern) / np.sum(pattern**2) * towards_source
+        return rest
+
+
+def _turn_unit_rad(scan: Scan) -> float:
+    """Returns the turn that moves the object's edge by a pixel."""
+    edge_mm = max(scan.grid.size_mm[1:]) / 2 * scan.geometry.magnification
+    return scan.geometry.pixel_size_mm[1] / edge_mm
+
+
+def _circle(scan: Scan, basis: np.ndarray) -> np.ndarray:
+    azimuth_rad = start_azimuths_rad(scan)
+    circle: np.ndarray = np.linalg.lstsq(basis, np.stack([np.cos(azimuth_rad), np.sin(azimuth_rad)], -1), rcond=None)[0]
+    return circle
+
+
+def view_step(
+    problem: CoarseProblem,
+    correction: GeometryCorrection,
+    parameters: PerViewParameters,
+    volume: np.ndarray,
+    kinds: Sequence[int],
+    iterations: int,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Returns the Gauss–Newton step (n, K) from the parameters' values, 0 for other kinds than ``kinds``, and the signals
+    (F, kinds, rows, columns) of one pixel's worth of each kind, for the object ``volume``."""
+    operator = parameters.operator(problem, correction)
+    residual = problem.residual(operator, volume)
+    signals = np.stack([_signal(problem, correction, parameters, volume, kind) for kind in kinds], 1)
+    norms = _norms(parameters.basis, signals)
+    scale = _strength(operator) / np.maximum(norms, _LEAST_NORM * norms.max(0))
+    if not np.array_equal(parameters.basis, np.eye(len(signals))):
+        scale = np.broadcast_to(scale.mean(0), scale.shape)  # a spline reaches over many views
+    per_view = parameters.basis @ scale / parameters.basis.sum(1, keepdims=True)
+    scaled = (signals * per_view[:, :, None, None]).astype(np.float32)
+    views = ViewParameters(scaled, parameters.basis)
+    augmented = AugmentedOperator(operator, views)
+    method = Cgls(augmented.system(residual, problem.valid))
+    for _ in range(iterations):
+        method.step()
+        problem.count_pass()
+    step = np.zeros(parameters.values.shape)
+    _, values = augmented.parts(method.volume)
+    step[:, kinds] = views.parts(values) * scale * parameters.units[list(kinds)]
+    return step, signals
+
+
+def view_deviations(
+    problem: CoarseProblem,
+    correction: GeometryCorrection,
+    parameters: PerViewParameters,
+    signals: np.ndarray,
+    iterations: int,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Returns the standard deviations (K,) of a view's parameters, and the shares (K,) of their signals (F, K, rows,
+    columns) that no object explains. Errors of the values that make up a view are taken as independent."""
+    operator = parameters.operator(problem, correction)
+    norms = _norms(parameters.basis, signals)
+    noise = noise_level(problem.measured, problem.valid)
+    kinds = range(signals.shape[1])
+    shares = np.array([_share(problem, operator, parameters.basis, signals[:, k], iterations) for k in kinds])
+    weight = np.sqrt(np.mean(np.sum(parameters.basis**2, 1)))
+    deviations = parameters.MISMATCH * weight * noise / (shares * np.median(norms, 0) + 1e-30) * parameters.units
+    return deviations, shares
+
+
+def _norms(basis: np.ndarray, signals: np.ndarray) -> np.ndarray:
+    """Returns the norms (n, K) of each value's signal."""
+    norms: np.ndarray = np.sqrt(basis.T**2 @ np.sum(np.square(signals, dtype=np.float64), (2, 3)))
+    return norms
+
+
+def _strength(operator: RayOperator) -> float:
+    """Returns about the largest singular value of A: parameters in its units converge as fast as the object's main
+    features."""
+    lengths = operator.forward(np.ones(operator.volume_shape, np.float32))
+    return float(np.linalg.norm(operator.adjoint(lengths)) / np.linalg.norm(lengths))
+
+
+def _signal(
+    problem: CoarseProblem,
+    correction: GeometryCorrection,
+    parameters: PerViewParameters,
+    volume: np.ndarray,
+    kind: int,
+) -> np.ndarray:
+    """Returns the change of the frames (F, rows, columns) per pixel's worth of a kind in each view."""
+    step_px = _STEP_PX * problem.block
+    step = np.zeros(len(parameters.units))
+    step[kind] = step_px * parameters.units[kind]
+    ends = [parameters.operator(problem, correction, sign * step).forward(volume) for sign in (1, -1)]
+    return problem.masked((ends[0] - ends[1]) / np.float32(2 * step_px))
+
+
+def _share(
+    problem: CoarseProblem, operator: RayOperator, basis: np.ndarray, signals: np.ndarray, iterations: int
+) -> float:
+    """Returns the share of signals (F, rows, columns), with random signs, that no object explains."""
+    signs = np.random.default_rng(0).choice([-1.0, 1.0], basis.shape[1]).astype(np.float32)
+    probe = signals * (basis @ signs).astype(np.float32)[:, None, None]
+    (rest,) = problem.beyond_object(operator, np.zeros(operator.volume_shape, np.float32), [probe], iterations)
+    return float(np.linalg.norm(rest) / max(float(np.linalg.norm(probe)), 1e-30))

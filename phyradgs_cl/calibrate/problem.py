@@ -1,0 +1,203 @@
+"""The frames of one or two scans on one coarse grid, their operator after a correction, and the volume that fits them."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from phyradgs_cl.acquisition import PerRow, Scan
+from phyradgs_cl.acquisition.altered.angles import exposure_steps
+from phyradgs_cl.acquisition.altered.coarse import (
+    MOST_FRAMES,
+    SMOOTHING,
+    binned,
+    coarse_grid,
+    fewer_frames,
+    smooth,
+)
+from phyradgs_cl.acquisition.altered.perturbed import GeometryCorrection, Sway, Views, perturb, scan_course
+from phyradgs_cl.checks import ceil_div
+from phyradgs_cl.detector import noise_level
+from phyradgs_cl.detector.attenuation import TRANSMISSION_FLOOR
+from phyradgs_cl.fields import Grid
+from phyradgs_cl.objective import TvProx
+from phyradgs_cl.operators.rays.operator import RayOperator
+from phyradgs_cl.reconstructors.voxels.cgls import Cgls
+from phyradgs_cl.reconstructors.voxels.fista_tv import FistaTv, FistaTvOptions
+from phyradgs_cl.reconstructors.voxels.priors import axis_weights
+from phyradgs_cl.reconstructors.voxels.system import System
+from phyradgs_cl.runtime import Runtime
+
+_MOST_TIMES = 8  # per exposure
+_VOXELS_PER_TIME = 2.0  # by which the volume's edge moves between two
+_TV = FistaTvOptions(tv_weight=0.0005, tv_iterations=8)
+
+
+@dataclass(frozen=True)
+class Stage:
+    """One of the grids, from coarse to fine: at most ``columns`` blocks along the panel's longer side, and iterations of a
+    ``first`` volume and of one made ``again``. ``steps`` Gauss–Newton steps at most, with ``project`` iterations each to
+    remove from a signal what a volume explains."""
+
+    columns: int
+    first: int
+    again: int
+    steps: int = 3
+    project: int = 20
+
+    def block(self, scan: Scan) -> int:
+        """Returns the pixels along a block's side."""
+        return ceil_div(max(scan.geometry.detector_shape), self.columns)
+
+    def passes(self, parameters: int, steps: int, asks: bool) -> int:
+        """Returns the most passes through the frames of the last ``steps``; ``asks``: identifiability is tested as well."""
+        first = self.first - self.again if steps == self.steps else 0
+        return first + steps * (self.again + self.project * (parameters + (3 if asks else 1)))
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class CoarseFrames:
+    """``scans`` as stated, with at most 60 frames each and no pixels; measured (F, rows, columns): the frames of all of them
+    in blocks of ``block`` pixels, with their ``valid`` pixels (None: all). ``count_pass`` is called once per iteration, each
+    of which passes through the frames forward and back."""
+
+    scans: Sequence[Scan]
+    block: int
+    measured: np.ndarray
+    valid: np.ndarray | None
+    count_pass: Callable[[], None] = lambda: None
+
+    def masked(self, frames: np.ndarray) -> np.ndarray:
+        """Returns frames with 0 at invalid pixels."""
+        return frames if self.valid is None else np.where(self.valid, frames, np.float32(0))
+
+
+def measured_blocks(small: Sequence[Scan]) -> tuple[np.ndarray, np.ndarray | None]:
+    """Returns the frames (F, rows, columns) of all binned scans, and their valid pixels (None: all)."""
+    valid = np.concatenate([scan.valid for scan in small])
+    return np.concatenate([np.asarray(scan.projections, np.float32) for scan in small]), None if valid.all() else valid
+
+
+def without_pixels(scan: Scan) -> Scan:
+    """Returns the scan with zeros that take no memory for its frames."""
+    return replace(scan, projections=np.broadcast_to(np.float32(0), scan.projections.shape))
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class CoarseProblem(CoarseFrames):
+    """Frames of an unknown object, whose volume has ``grid``. ``course`` (F,): course of a drift. ``before`` (F, rows,
+    columns): transmission of the frame before each, where lag is a parameter."""
+
+    rt: Runtime
+    grid: Grid
+    course: np.ndarray
+    before: np.ndarray | None = None
+
+    @classmethod
+    def of(
+        cls, rt: Runtime, asks_lag: bool, scans: Sequence[Scan], stage: Stage, most_frames: int = MOST_FRAMES
+    ) -> "CoarseProblem":
+        """Makes the scans as coarse as the stage says."""
+        block = stage.block(scans[0])
+
+        def shrink(scan: Scan) -> Scan:
+            return binned(smooth(fewer_frames(scan, most_frames), _smoothing_px(scan, block)), block)
+
+        fewer = [fewer_frames(scan, most_frames) for scan in scans]
+        small = [shrink(scan) for scan in scans]
+        measured, valid = measured_blocks(small)
+        problem = cls(
+            rt=rt,
+            scans=[without_pixels(scan) for scan in fewer],
+            block=block,
+            grid=coarse_grid(scans[0].grid, small[0].geometry),
+            measured=measured,
+            valid=valid,
+            course=np.concatenate([scan_course(scan) for scan in fewer]),
+            before=np.concatenate([_transmission_before(scan, shrink) for scan in scans]) if asks_lag else None,
+        )
+        return replace(problem, measured=problem.masked(measured))
+
+    def corrected(self, correction: GeometryCorrection) -> "CoarseProblem":
+        """Returns the problem with the correction's lag and drift removed from its frames."""
+        measured = self.measured
+        if self.before is not None:
+            lag = self.scans[0].lag + correction.lag
+            transmission = (np.exp(-measured) - lag * self.before) / (1 - lag)
+            measured = -np.log(np.maximum(transmission, TRANSMISSION_FLOOR))
+        measured = measured + correction.drift * self.course[:, None, None]
+        return replace(self, measured=self.masked(measured.astype(np.float32)), before=None)
+
+    def operator(self, correction: GeometryCorrection, views: Views | Sway | None = None) -> RayOperator:
+        """Returns A of all frames after a correction."""
+        tables = []
+        for scan in self.scans:
+            small = binned(perturb(scan, correction, views), self.block)
+            times = exposure_steps(scan, max(self.grid.shape[1:]), _VOXELS_PER_TIME, _MOST_TIMES)
+            tables += [PerRow(sub_intervals=times).cells(small, frame) for frame in range(small.frames)]
+        return RayOperator(self.rt, self.grid, small.geometry.detector_shape, tables)
+
+    def line_integrals(self, operator: RayOperator, volume: np.ndarray) -> np.ndarray:
+        """Returns the measurement as mean line integrals. A detector that averages intensity lowers them at edges; the
+        difference is added as ``volume`` has it."""
+        if self.scans[0].detector_model != "intensity":
+            return self.measured
+        return self.measured + self.masked(operator.intensity_gap(volume))
+
+    def reconstruct(self, operator: RayOperator, start: np.ndarray | None, iterations: int) -> np.ndarray:
+        """Returns a nonnegative volume with little total variation, iterated from ``start``."""
+        volume = np.zeros(self.grid.shape, np.float32) if start is None else start
+        system = System(operator, self.line_integrals(operator, volume), self.valid)
+        method = FistaTv(system, _TV, TvProx(self.rt, self.grid.shape, axis_weights(self.grid)))
+        projected = system.expected(volume)
+        current = {"volume": volume, "previous": volume, "projected": projected, "projected_previous": projected}
+        method.restore({**method.state(), **current})
+        for _ in range(iterations):
+            method.step()
+            self.count_pass()
+        return method.volume
+
+    def compared(self, frames: np.ndarray) -> np.ndarray:
+        """Returns the values of frames that enter the misfit (F · pixels)."""
+        return self.masked(frames).ravel()
+
+    def residual(self, operator: RayOperator, volume: np.ndarray) -> np.ndarray:
+        """Returns measured less expected frames (F, rows, columns)."""
+        return self.line_integrals(operator, volume) - self.masked(operator.forward(volume))
+
+    def noise(self, residual: np.ndarray) -> float:
+        """Returns the standard deviation of a pixel's noise; not from ``residual``, because a volume fits some noise."""
+        return noise_level(self.measured, self.valid)
+
+    def beyond_object(
+        self, operator: RayOperator, volume: np.ndarray, images: Sequence[np.ndarray], iterations: int
+    ) -> list[np.ndarray]:
+        """Returns the part of each image (F, rows, columns) that no volume explains, after ``iterations`` of CGLS."""
+        return [self._beyond_volumes(operator, image, iterations) for image in images]
+
+    def _beyond_volumes(self, operator: RayOperator, frames: np.ndarray, iterations: int) -> np.ndarray:
+        method = Cgls(System(operator, self.masked(frames), self.valid))
+        for _ in range(iterations):
+            if method.finished:
+                break
+            method.step()
+            self.count_pass()
+        return method.residual
+
+
+def _smoothing_px(scan: Scan, block: int) -> float | tuple[float, float]:
+    """Returns the smoothing of blocks, across rows and columns. Rows read one after the other see the object turned:
+    smoothing across them would look like a shorter readout. Columns read so are sheared, which smoothing keeps."""
+    if block == 1:
+        return 0.0
+    is_rolling = scan.shutter.readout_s > 0 and scan.shutter.axis == "rows"
+    return 0.0 if is_rolling else SMOOTHING * block, SMOOTHING * block
+
+
+def _transmission_before(scan: Scan, shrink: Callable[[Scan], Scan]) -> np.ndarray:
+    """Returns the transmission (F, rows, columns) of the frame before each; 0 before the first, when the beam was off."""
+    frames = np.asarray(scan.projections)
+    small = shrink(replace(scan, projections=np.concatenate([frames[:1], frames[:-1]])))
+    transmission: np.ndarray = np.exp(-np.asarray(small.projections, np.float32))
+    transmission[0] = 0
+    return transmission

@@ -1,0 +1,200 @@
+"""Do the frames fit together under the stated order, angles and geometry?
+
+A coarse reconstruction of consistent frames leaves far less than one of the same frames in a random order. Where it does
+not, or where another hypothesis leaves half as much, something stated is wrong. The steps: remove odd frames; choose sense
+of rotation and panel shift, which have questions of their own; remove outliers; compare with random orders; try hypotheses.
+"""
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from functools import partial
+from itertools import chain
+
+import numpy as np
+
+from phyradgs_cl.acquisition import Scan
+from phyradgs_cl.acquisition.altered.coarse import some_frames
+from phyradgs_cl.acquisition.altered.variants import reversed_rotation, shifted
+from phyradgs_cl.check.finding import CANNOT_TELL, FEWEST_COLUMNS, OK, SUSPICIOUS, Finding
+from phyradgs_cl.check.hypotheses import (
+    LEAST_REDUNDANCY,
+    Hypothesis,
+    hypotheses_of_frames,
+    hypotheses_of_scan,
+    stated_redundancy,
+)
+from phyradgs_cl.check.odd_frames import without_odd_frames, without_outliers
+from phyradgs_cl.reconstructors.fits.axis import (
+    AxisShift,
+    columns_per_block,
+    refined_axis_shift,
+    rough_axis_shift,
+)
+from phyradgs_cl.reconstructors.fits.residuals import Fit, fit, fit_squares, t_statistic
+from phyradgs_cl.runtime import Runtime
+
+CONSISTENCY = "consistency"
+_LARGEST = 0.35  # residual over that in a random order: correct scans of every kind leave 0.02 to 0.23
+_DOUBTFUL = 0.1  # of that ratio: from here other orders and missing frames are tried
+_RANDOM_ORDERS = 2
+_FEWEST_FRAMES, _FEWEST_PIXELS = 5, 32
+_CLEAR = 0.5  # squared residual of another hypothesis over the stated one's
+_NEARLY = 1.5  # squared residual of a rough fit over the best one's: up to here a sense of rotation is refined
+_ERRORS = 4.0
+_SYMMETRIC = 2.0  # residual in a random order over the stated one's
+_SAME = 0.03  # residual in a random order over the frames' spread: an object below both looks the same from every angle
+_MOST_REFINED = 2  # hypotheses about the whole scan
+_SHIFT_PENALTY = 1.5  # of the squared residual, per coarse pixel of shift: stated offsets are mostly right
+
+
+@dataclass(frozen=True, eq=False)
+class Consistency:
+    """The finding, the ``frames`` (indices) that fit together, whether further questions make sense (``is_sound``), and
+    whether the object looks different from different angles (``sees_angles``)."""
+
+    finding: Finding
+    frames: np.ndarray
+    is_sound: bool
+    sees_angles: bool
+
+
+@dataclass(frozen=True, eq=False)
+class _CoarseFit:
+    """The coarse scan with its best sense of rotation (``turned``) and panel shift as well (``best``), the fit of the latter
+    (``stated``), and the squared residuals of its frames in a random order and of the best rough fit."""
+
+    turned: Scan
+    best: Scan
+    stated: Fit
+    random: float
+    rough_square: float
+
+    @property
+    def ratio(self) -> float:
+        return float(np.sqrt(self.stated.total / max(self.random, 1e-30)))
+
+
+def check_consistency(rt: Runtime, scan: Scan, as_stated: Scan) -> Consistency:
+    """Finds frames and hypotheses that explain why the frames of a coarse ``scan`` do not fit together.
+
+    The value is the root of the squared residual over that of a random order. ``as_stated``: the scan before it was made
+    coarse."""
+    pixels = float(scan.valid.sum()) / scan.frames
+    if scan.frames < _FEWEST_FRAMES or pixels < _FEWEST_PIXELS or scan.projections.shape[2] < FEWEST_COLUMNS:
+        text = f"fewer than {_FEWEST_FRAMES} frames, {FEWEST_COLUMNS} columns or {_FEWEST_PIXELS} coarse pixels per frame"
+        finding = Finding(CONSISTENCY, CANNOT_TELL, 0.0, _LARGEST, "share", text)
+        return Consistency(finding, np.arange(scan.frames), False, False)
+    frames, notes = without_odd_frames(scan)
+    turned, best, rough_square = _best_sense(rt, some_frames(scan, frames))
+    remaining, stated, outlier_notes = without_outliers(rt, best, fit(rt, best))
+    frames, notes = frames[remaining], notes + outlier_notes
+    if outlier_notes:
+        turned, best = some_frames(turned, remaining), some_frames(best, remaining)
+    coarse = _CoarseFit(turned, best, stated, _random_order(rt, best), rough_square)
+    ratio = coarse.ratio
+
+    def answer(verdict: str, text: str, advice: str, is_sound: bool, sees_angles: bool = True) -> Consistency:
+        finding = Finding(CONSISTENCY, verdict, ratio, _LARGEST, "share", "; ".join([*notes, text]), advice)
+        return Consistency(finding, frames, is_sound, sees_angles)
+
+    about_frames = "exclude these frames (image_key 3), or correct them; further answers do not use them" if notes else ""
+    spread = float(np.asarray(best.projections, np.float64).var()) * best.frames
+    if ratio * _SYMMETRIC >= 1 and coarse.random <= _SAME**2 * spread:
+        text = "the frames look the same from every angle: their order and angles leave no trace"
+        return answer(SUSPICIOUS if notes else CANNOT_TELL, text, about_frames, True, sees_angles=False)
+    text = f"residual {ratio:.2g} of that of the frames in a random order"
+    hypothesis = _explanation(rt, some_frames(scan, frames), as_stated, coarse)
+    if hypothesis is not None:
+        return answer(SUSPICIOUS, hypothesis.text, hypothesis.advice, False)
+    if stated_redundancy(as_stated) < 0:
+        text = "detector_offset puts the axis of rotation beside the panel, where frames fit under any geometry"
+        advice = "compare detector_offset and pixel sizes, and their units, with the scanner's log"
+        return answer(SUSPICIOUS, text, advice, False)
+    if ratio > _LARGEST:
+        advice = "compare order, angles, distances and pixel sizes, flats and the panel's tilt with the scanner's log"
+        return answer(SUSPICIOUS, f"frames do not fit together, cause not found: {text}", advice, False)
+    return answer(SUSPICIOUS if notes else OK, text, about_frames, True)
+
+
+def _best_sense(rt: Runtime, scan: Scan) -> tuple[Scan, Scan, float]:
+    """Chooses the sense of rotation and the panel's shift, where they fit far better than as stated.
+
+    Returns the scan with the sense, the same with the shift, and the mean squared residual of the best rough fit."""
+    senses = [scan, reversed_rotation(scan)]
+    roughs = [rough_axis_shift(rt, sense) for sense in senses]
+    least_rough = min(float(rough.squares.mean()) for rough in roughs)
+    turned = best = scan
+    least = _CLEAR * fit_squares(rt, scan).sum()
+    for sense, rough in zip(senses, roughs, strict=True):
+        if rough.squares.mean() > _NEARLY * least_rough:  # in a narrow fan rough fits do not decide
+            continue
+        shift = refined_axis_shift(rt, sense, rough)
+        if not shift.is_found:
+            continue
+        other = shifted(sense, shift.pixels)
+        if (squares := fit_squares(rt, other).sum()) < least:
+            turned, best, least = sense, other, squares
+    return turned, best, least_rough
+
+
+def _random_order(rt: Runtime, scan: Scan) -> float:
+    """Returns the sum of squared residuals of the scan's frames in a random order, as the mean of two draws."""
+    rng = np.random.default_rng(0)
+    orders = [rng.permutation(scan.frames) for _ in range(_RANDOM_ORDERS)]
+    return float(np.mean([fit_squares(rt, replace(scan, projections=scan.projections[order])).sum() for order in orders]))
+
+
+def _explanation(rt: Runtime, scan: Scan, as_stated: Scan, coarse: _CoarseFit) -> Hypothesis | None:
+    """Returns the hypothesis that explains the frames best, if it fits far better than the stated scan does.
+
+    A panel that sees few rays twice fits any geometry. Other sizes then only have to make the frames consistent."""
+    is_one_sided = stated_redundancy(as_stated) < LEAST_REDUNDANCY
+    of_scan = _refined_hypotheses(rt, scan, as_stated, np.inf if is_one_sided else coarse.rough_square)
+    if is_one_sided:
+        sized = (hypothesis for hypothesis in of_scan if hypothesis.factor != 1)
+        consistent = next((hypothesis for hypothesis in sized if _is_consistent(rt, hypothesis.scan())), None)
+        if consistent is not None or stated_redundancy(as_stated) < 0:
+            return consistent
+    most = min(_CLEAR * coarse.stated.total, _LARGEST**2 * coarse.random)
+    of_frames = hypotheses_of_frames(coarse.turned, coarse.best, tries_orders=coarse.ratio > _DOUBTFUL)
+    return _best_below(rt, chain(of_scan, of_frames), coarse.stated, most)
+
+
+def _refined_hypotheses(rt: Runtime, scan: Scan, as_stated: Scan, most: float) -> list[Hypothesis]:
+    """Returns the best two hypotheses about the whole scan, the panel shifted to fit best.
+
+    Both have to leave less than ``most`` (mean squared residual) in a rough fit. Large shifts count against a hypothesis; of
+    hypotheses with the same factor of sizes the one with the smaller shift counts."""
+    tried: list[tuple[Hypothesis, Scan, AxisShift]] = []
+    for hypothesis in hypotheses_of_scan(scan, as_stated):
+        other = hypothesis.scan()
+        tried.append((hypothesis, other, rough_axis_shift(rt, other)))
+    block = columns_per_block(scan)
+    tried.sort(key=lambda one: one[2].squares.sum() * _SHIFT_PENALTY ** (abs(one[2].pixels) / block))
+    factors: set[float] = set()
+    distinct = []
+    for hypothesis, other, rough in tried:
+        if hypothesis.factor == 1 or hypothesis.factor not in factors:
+            distinct.append((hypothesis, other, rough))
+            factors.add(hypothesis.factor)
+    refined = []
+    for hypothesis, other, rough in distinct[:_MOST_REFINED]:
+        if rough.squares.mean() < most:
+            shift = refined_axis_shift(rt, other, rough)
+            pixels = shift.pixels if shift.is_found else rough.pixels
+            refined.append(replace(hypothesis, scan=partial(shifted, other, pixels)))
+    return refined
+
+
+def _is_consistent(rt: Runtime, scan: Scan) -> bool:
+    return bool(fit_squares(rt, scan).sum() < _LARGEST**2 * _random_order(rt, scan))
+
+
+def _best_below(rt: Runtime, hypotheses: Iterable[Hypothesis], stated: Fit, most: float) -> Hypothesis | None:
+    """Returns the hypothesis with the least squared residual, if that is below ``most`` and four standard errors better."""
+    best, least = None, most
+    for hypothesis in hypotheses:
+        squares = fit_squares(rt, hypothesis.scan())
+        if squares.sum() < least and t_statistic(stated.squares, squares) <= -_ERRORS:
+            best, least = hypothesis, float(squares.sum())
+    return best

@@ -1,0 +1,118 @@
+"""Does the panel see the whole object, and are its values line integrals?"""
+
+import math
+
+import numpy as np
+
+from phyradgs_cl.acquisition import Scan
+from phyradgs_cl.acquisition.geometry import field_of_view_mm
+from phyradgs_cl.check.finding import FEWEST_COLUMNS, OK, SUSPICIOUS, Finding, too_narrow
+from phyradgs_cl.detector import noise_level
+
+_LARGEST_SHARE = 0.1  # of the largest line integral
+_DISPLACED = 0.1  # of the panel's width: a panel this far off centre was displaced on purpose
+_NOISES = 4.0
+_OPAQUE = 30.0  # line integral: nothing passes
+_INVERTED = 0.9  # of the largest value: panel sides this high are no air
+_BRIGHT = 0.05  # of the pixels may be brighter than the flats
+_FRAMES = 0.1  # of the frames may touch a border
+_COVERED = 0.1  # of a column's rows
+_ANOTHER_SIZE = 5.0  # times as wide: a grid may hold a part of an object, or be a little wider, but no more
+NO_OBJECT, OPAQUE, TOO_BRIGHT = "no object", "opaque", "too bright"  # units of findings that make line integrals meaningless
+CUT_OFF = "line integral at the border"  # unit: the object reaches beyond the panel
+_QUESTION = "coverage"
+
+
+def check_coverage(scan: Scan) -> Finding:
+    """Compares the line integrals at the panel's sides with a tenth of the largest one.
+
+    The object touches a side where the mean over a few rows of the two outermost columns is above threshold and noise in a
+    tenth of the frames. A displaced panel may cut the object on its short side. Rows at the top and bottom are not checked.
+    Other findings: no object above the noise, inverted values, line integrals beyond 30, pixels brighter than the flats, a
+    grid of another size than the object.
+    """
+    p = np.asarray(scan.projections)
+    if p.shape[2] < FEWEST_COLUMNS:
+        return too_narrow(_QUESTION, "line integral")
+    valid = scan.valid
+    largest = float(np.percentile(p[valid], 99.9))
+    threshold = max(_LARGEST_SHARE * largest, _NOISES * noise_level(p, valid))
+    return _check_values(p, valid, largest, threshold) or _check_sides(scan, p, valid, largest, threshold)
+
+
+def _check_values(p: np.ndarray, valid: np.ndarray, largest: float, threshold: float) -> Finding | None:
+    """Returns why the values are no line integrals of an object; None where they may be."""
+    noise = _NOISES * noise_level(p, valid)
+    if largest <= noise:
+        text = f"no object: line integrals reach {largest:.3g}, noise {noise:.3g}"
+        advice = "was the object in the beam? Are the values line integrals, larger behind more material?"
+        return Finding(_QUESTION, SUSPICIOUS, largest, noise, NO_OBJECT, text, advice)
+    air = float(np.median(p[:, :, [0, -1]]))
+    if air > _INVERTED * largest:
+        text = f"values are largest, {air:.3g}, beside the object"
+        advice = "are these transmissions, or inverted images? Declare them: import --quantity, or quantity of the data"
+        return Finding(_QUESTION, SUSPICIOUS, air, _INVERTED * largest, NO_OBJECT, text, advice)
+    if largest > _OPAQUE:
+        text = f"line integrals reach {largest:.3g}: one photon in {math.exp(min(largest, 700)):.1g} passes"
+        advice = "are these counts, or transmissions? Declare them: import --quantity, or quantity of the data"
+        return Finding(_QUESTION, SUSPICIOUS, largest, _OPAQUE, OPAQUE, text, advice)
+    least = float(np.percentile(p[valid], 100 * _BRIGHT))
+    if least < -threshold:
+        text = f"line integrals go down to {least:.3g}: pixels are brighter than the flats"
+        advice = "are the flats from this scan, with its exposure and beam? Without flats: is the flat value right?"
+        return Finding(_QUESTION, SUSPICIOUS, -least, threshold, TOO_BRIGHT, text, advice)
+    return None
+
+
+def _check_sides(scan: Scan, p: np.ndarray, valid: np.ndarray, largest: float, threshold: float) -> Finding:
+    """Looks for the object at the panel's sides, and compares its width with the grid's."""
+    sides = {"left": _border(p, valid, slice(0, 2)), "right": _border(p, valid, slice(-2, None))}
+    sides.pop(_short_side(scan), None)
+    name, level = max(sides.items(), key=lambda item: item[1])
+    width_mm, grid_mm = _width_mm(scan, p, valid, threshold), max(scan.grid.size_mm[1:])
+    text = (
+        f"at most {level:.3g} at the {name} border, where air is 0 and the object reaches {largest:.3g}; "
+        f"it is about {width_mm:.3g} mm wide at the axis, the grid {grid_mm:.3g} mm"
+    )
+    panel_mm = 2 * field_of_view_mm(scan.geometry)[1]
+    if grid_mm > _ANOTHER_SIZE * max(panel_mm, *scan.grid.voxel_size_mm) or width_mm > _ANOTHER_SIZE * grid_mm:
+        text += f", and the panel sees {panel_mm:.3g} mm"
+        advice = "compare pixel sizes, distances and the grid, and their units, with the scanner's log"
+        return Finding(_QUESTION, SUSPICIOUS, width_mm, grid_mm, "mm", text, advice)
+    if level <= threshold:
+        return Finding(_QUESTION, OK, level, threshold, "line integral", text)
+    advice = (
+        "the object reaches beyond the panel (or air is not 0: check the flats). Expect a bright rim, unless the method "
+        "reconstructs a box as large as the object: --roi-mm with --margin-mm, or fdk with --set extrapolate=reprojected"
+    )
+    return Finding(_QUESTION, SUSPICIOUS, level, threshold, CUT_OFF, text, advice)
+
+
+def _width_mm(scan: Scan, p: np.ndarray, valid: np.ndarray, threshold: float) -> float:
+    """Returns the object's usual width at the axis: the columns in which a tenth of the rows is above ``threshold``."""
+    geometry = scan.geometry
+    columns = float(np.median((((p > threshold) & valid).mean(1) > _COVERED).sum(1)))
+    half_fan_rad = math.atan2(columns * geometry.pixel_size_mm[1] / 2, geometry.source_to_detector_mm)
+    return 2 * geometry.source_to_axis_mm * math.sin(half_fan_rad)
+
+
+def _border(p: np.ndarray, valid: np.ndarray, columns: slice) -> float:
+    """Returns the largest mean over an eighth of the border's rows, in the frame at the 90th percentile."""
+    edge = p[:, :, columns]
+    weight = valid[:, :, columns].astype(float)
+    rows = max(1, edge.shape[1] // 8)
+    starts = np.arange(0, edge.shape[1], rows)
+    total = np.add.reduceat((edge * weight).sum(2), starts, axis=1)
+    count = np.add.reduceat(weight.sum(2), starts, axis=1)
+    means = np.where(count > 0, total / np.maximum(count, 1), 0).max(1)
+    return float(np.percentile(means, 100 * (1 - _FRAMES)))
+
+
+def _short_side(scan: Scan) -> str:
+    """Returns the side on which a displaced panel is short of the axis; "" for a centred one."""
+    geometry = scan.geometry
+    offset_mm = geometry.detector_offset_mm[1]
+    width_mm = geometry.detector_shape[1] * geometry.pixel_size_mm[1]
+    if abs(offset_mm) < _DISPLACED * width_mm:
+        return ""
+    return "left" if offset_mm > 0 else "right"

@@ -1,0 +1,85 @@
+"""Frames that do not belong to the scan: black or bright ones, repeated ones, and ones that do not fit the others."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from phyradgs_cl.acquisition import Scan
+from phyradgs_cl.acquisition.altered.angles import start_azimuths_rad, wrapped
+from phyradgs_cl.acquisition.altered.coarse import some_frames
+from phyradgs_cl.check.hypotheses import frame_number
+from phyradgs_cl.detector import robust_deviation
+from phyradgs_cl.reconstructors.fits.residuals import Fit, fit, fit_squares
+from phyradgs_cl.runtime import Runtime
+
+_DEVIATIONS = 12.0
+_LEAST_CHANGE = 0.75  # of the usual mean line integral
+_FEWEST = 5
+_REPEATED = 0.15  # of the usual difference between neighbours
+_OUTLIER = 4.0  # a frame's residual over the usual one
+_MOST_OUTLIERS = 0.2  # of the frames
+_EXCHANGED = 0.5  # squared residual after an exchange of two frames over the stated one
+
+
+def without_odd_frames(scan: Scan) -> tuple[np.ndarray, list[str]]:
+    """Finds odd and repeated frames before any reconstruction. Returns the other frames (indices), and a note for each."""
+    odd, repeated = odd_frames(scan.projections, scan.pixel_mask), repeated_frames(scan)
+    notes = [f"frame {frame_number(scan, f)} is unlike all others (black, bright, or no image)" for f in odd]
+    notes += [f"frame {frame_number(scan, f)} is frame {frame_number(scan, f - 1)} recorded twice" for f in repeated]
+    return np.setdiff1d(np.arange(scan.frames), [*odd, *repeated]), notes
+
+
+def odd_frames(p: np.ndarray, mask: np.ndarray | None) -> list[int]:
+    """Returns frames of p (F, v, u) whose mean line integral is far from that of their neighbours."""
+    if len(p) < _FEWEST:
+        return []
+    valid = 1.0 if mask is None else (np.asarray(mask) == 0).astype(np.float32)
+    weight = np.broadcast_to(valid, p.shape)
+    level = (p * weight).sum((1, 2), dtype=np.float64) / np.maximum(weight.sum((1, 2)), 1)
+    difference = level - np.median(_neighbours(level), axis=0)
+    least = max(_DEVIATIONS * robust_deviation(difference), _LEAST_CHANGE * abs(float(np.median(level))))
+    return [int(f) for f in np.flatnonzero(np.abs(difference) > least)]
+
+
+def repeated_frames(scan: Scan) -> list[int]:
+    """Returns frames that repeat their predecessor although the gantry has turned: they differ from it far less than
+    neighbours do."""
+    p = scan.projections
+    if len(p) < _FEWEST:
+        return []
+    steps = np.array([float(np.square(b - a, dtype=np.float64).mean()) ** 0.5 for a, b in zip(p[:-1], p[1:], strict=True)])
+    has_turned = np.abs(wrapped(np.diff(start_azimuths_rad(scan)))) > 1e-6
+    return [int(f) + 1 for f in np.flatnonzero(has_turned & (steps < _REPEATED * np.min(_neighbours(steps), axis=0)))]
+
+
+def _neighbours(values: np.ndarray) -> np.ndarray:
+    """Returns (4, F): the two values before and the two after each of ``values`` (F,), mirrored at the ends."""
+    wide = np.r_[values[2:0:-1], values, values[-2:-4:-1]]
+    return np.stack([wide[:-4], wide[1:-3], wide[3:-1], wide[4:]])
+
+
+def without_outliers(rt: Runtime, scan: Scan, stated: Fit) -> tuple[np.ndarray, Fit, list[str]]:
+    """Removes frames whose residual is far above the others', the worst first, with a new fit after each.
+
+    Returns the other frames (indices), their fit, and notes. Where a fifth of the frames would go, the cause is common to
+    all, and none is removed. Two outliers may be frames whose order is exchanged."""
+    remaining, current = np.arange(scan.frames), stated
+    outliers: list[int] = []
+    while len(outliers) < _MOST_OUTLIERS * scan.frames:
+        size = np.sqrt(current.squares)
+        worst = int(np.argmax(size))
+        if size[worst] < _OUTLIER * np.median(size):
+            break
+        outliers.append(int(remaining[worst]))
+        remaining = np.delete(remaining, worst)
+        current = fit(rt, some_frames(scan, remaining))
+    if not outliers or len(outliers) >= _MOST_OUTLIERS * scan.frames:
+        return np.arange(scan.frames), stated, []
+    numbers = sorted(frame_number(scan, f) for f in outliers)
+    note = f"frame{'s' if len(outliers) > 1 else ''} {', '.join(map(str, numbers))} (from 0) do not fit the others"
+    if len(outliers) == 2:
+        order = np.arange(scan.frames)
+        order[outliers] = order[outliers[::-1]]
+        if fit_squares(rt, replace(scan, projections=scan.projections[order])).sum() < _EXCHANGED * stated.total:
+            note = f"frames {numbers[0]} and {numbers[1]} (from 0) fit if their order is exchanged"
+    return remaining, current, [note]

@@ -1,0 +1,116 @@
+"""Does the gantry turn as the angles say, is its axis where it is stated, and do the distances fit?"""
+
+import math
+from dataclasses import replace
+
+from phyradgs_cl.acquisition import Scan
+from phyradgs_cl.check.finding import CANNOT_TELL, MIRROR_U, OK, PIXEL_SIZES, SUSPICIOUS, Finding
+from phyradgs_cl.check.hypotheses import SIZE_FACTORS, nearly_sized, stated_redundancy
+from phyradgs_cl.check.timing import is_full_turn
+from phyradgs_cl.reconstructors.fits.axis import AxisShift, with_best_shift
+from phyradgs_cl.reconstructors.fits.residuals import fit_squares, residual_ratio, t_statistic
+from phyradgs_cl.runtime import Runtime
+
+SIGN, CENTRE, DISTANCES = "sign of rotation", "centre of rotation", "distances"
+OTHER_CAUSE = "pixels, if pixel sizes are right"  # unit of an offset that wrong pixel sizes explain as well
+UNVERIFIED = "neither pixel sizes nor distances are verified by these frames"
+_ERRORS = 4.0  # standard errors between two hypotheses
+_SIGN_RATIO, _CLEAR_RATIO = 1.2, 3.0
+_TOLERATED_BLOCKS, _TOLERATED_PX = 0.2, 0.5
+_DEVIATIONS = 4.0
+_BIAS_FULL_TURN, _BIAS_HALF_TURN = 0.003, 0.04  # coarse pixels: measured errors of the axis in coarse scans
+_LEAST_REDUNDANCY = 0.1  # of a panel that sees the axis at its edge
+_OTHER_SIZES, _SIZE_RATIO = (0.8, 1.25), 1.05
+
+
+def check_rotation(stated: AxisShift, other: AxisShift) -> Finding:
+    """Compares the residuals with the angles as stated and reversed, each with its own best shift of the panel.
+
+    It takes four standard errors and 20 % of the squared residual, because a mirror image in a narrow fan fits as well.
+    Frames mirrored in u fit reversed angles and the opposite offset: ``with_cause`` decides between the two."""
+    errors, ratio = t_statistic(stated.squares, other.squares), residual_ratio(stated.squares, other.squares)
+    text = f"turned the other way, the squared residual is {ratio:.3g} times as large ({errors:+.1f} standard errors)"
+    values = (errors, -_ERRORS, "standard errors", text)
+    if errors >= _ERRORS and ratio >= _SIGN_RATIO:
+        return Finding(SIGN, OK, *values)
+    if errors <= -_ERRORS and ratio <= 1 / _SIGN_RATIO:
+        return Finding(SIGN, SUSPICIOUS, *values)
+    advice = "look for a feature whose side is known: a mirror image would fit as well"
+    return Finding(SIGN, CANNOT_TELL, *values, advice)
+
+
+def is_clear(stated: AxisShift, other: AxisShift) -> bool:
+    """True where one of two rough fits is so much better that the other needs no closer look."""
+    ratio = residual_ratio(stated.squares, other.squares)
+    return max(ratio, 1 / max(ratio, 1e-30)) >= _CLEAR_RATIO
+
+
+def with_cause(finding: Finding, shift_px: float, stated_px: float, tolerance_px: float) -> Finding:
+    """Adds the cause to a suspicious sign of rotation: reversed angles, or frames mirrored in u.
+
+    Frames are mirrored where the best panel offset under reversed angles (stated_px + shift_px) is nearer to the opposite of
+    the stated one than to it. A stated offset below the tolerance does not decide."""
+    if abs(stated_px) < tolerance_px:
+        text = f"{finding.text}; frames mirrored in u would look the same"
+        advice = f"change the sign of the angles ('gantry' for 'sample'), or import with the other {MIRROR_U}"
+    elif abs(shift_px + 2 * stated_px) < abs(shift_px):
+        text = f"frames are mirrored in u: {finding.text}, with detector_offset of the other sign"
+        advice = f"import with the other {MIRROR_U}, or change the signs of the angles and of detector_offset along u"
+    else:
+        text = f"{finding.text}, with detector_offset as stated"
+        advice = "change the sign of the angles ('gantry' for 'sample')"
+    return replace(finding, text=text, advice=f"{advice}, and check again")
+
+
+def with_coarseness(shift: AxisShift, block: int, scan: Scan) -> AxisShift:
+    """Adds the error of coarse pixels to a shift's deviation, which the bootstrap over frames does not include.
+
+    The error is far larger where ``scan`` measures few rays twice: a shift that leaves fewer of them fits better anyway."""
+    twice = min(2 * stated_redundancy(scan), 1.0)
+    is_whole = is_full_turn(scan) and twice == 1
+    bias = _BIAS_FULL_TURN if is_whole else _BIAS_HALF_TURN / max(twice, _LEAST_REDUNDANCY)
+    return replace(shift, deviation=math.hypot(shift.deviation, block * bias))
+
+
+def check_centre(shift: AxisShift, block: int, pitch_mm: float, stated_px: float) -> Finding:
+    """Compares the panel's shift with half a pixel, a fifth of a coarse pixel and four standard deviations.
+
+    A stated offset that is wrong by the factor of a unit may be right in mm, with pixel sizes wrong by that factor."""
+    threshold = max(_TOLERATED_PX, _TOLERATED_BLOCKS * block, _DEVIATIONS * shift.deviation)
+    if not (shift.is_found and math.isfinite(shift.deviation)):
+        return Finding(CENTRE, CANNOT_TELL, 0.0, _TOLERATED_PX, "pixels", "no shift fits best")
+    shift_mm = shift.pixels * pitch_mm
+    text = (
+        f"the panel is {shift.pixels:+.2f} ± {shift.deviation:.2f} pixels ({shift_mm:+.4g} mm) from its stated place along u"
+    )
+    if abs(shift.pixels) <= threshold:
+        verdict = OK if threshold <= block else CANNOT_TELL
+        return Finding(CENTRE, verdict, shift.pixels, threshold, "pixels", text, uncertainty=shift.deviation)
+    near = [f for f in SIZE_FACTORS if abs(stated_px + shift.pixels - stated_px / f) <= threshold < abs(stated_px / f)]
+    if near:
+        text += f": {1 / near[0]:g} times the stated offset, as if pixel sizes were {near[0]:g} times as large"
+        advice = "compare detector_offset and pixel sizes, and their units, with the scanner's log: frames fit either"
+        return Finding(CENTRE, SUSPICIOUS, shift.pixels, threshold, OTHER_CAUSE, text, advice, shift.deviation)
+    if abs(2 * stated_px + shift.pixels) <= threshold:
+        text += "; frames mirrored in u and turned the other way would look the same"
+    advice = (
+        f"add {shift_mm:.4g} mm to detector_offset along u: --fix-offset writes a copy of the scan; "
+        "'phyradgs calibrate' looks for roll and tilt as well"
+    )
+    return Finding(CENTRE, SUSPICIOUS, shift.pixels, threshold, "pixels", text, advice, shift.deviation)
+
+
+def check_distances(rt: Runtime, scan: Scan) -> Finding:
+    """Fits a coarse scan with its fan 0.8 and 1.25 times as wide, each with its own best shift of the panel.
+
+    Only the fan distinguishes these: the answer is ``ok`` where both fit worse, else ``cannot tell``. Sizes that fit far
+    better make the frames inconsistent, which is another question's finding."""
+    stated = fit_squares(rt, scan)
+    others = {factor: fit_squares(rt, with_best_shift(rt, nearly_sized(scan, factor))) for factor in _OTHER_SIZES}
+    ratios = {factor: residual_ratio(stated, other) for factor, other in others.items()}
+    best = min(ratios, key=lambda factor: ratios[factor])
+    text = f"pixels over the panel's distance {best:g} times as large leave {ratios[best]:.3g} times the squared residual"
+    values = (ratios[best], _SIZE_RATIO, "share", text)
+    if all(ratios[f] >= _SIZE_RATIO and t_statistic(stated, others[f]) >= _ERRORS for f in _OTHER_SIZES):
+        return Finding(DISTANCES, OK, *values)
+    return Finding(DISTANCES, CANNOT_TELL, *values, f"compare distances and {PIXEL_SIZES} with the scanner's log")

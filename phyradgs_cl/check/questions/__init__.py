@@ -1,1 +1,0 @@
-"""One question per file: from a scan, or from fits to it, to a finding."""

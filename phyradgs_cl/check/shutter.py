@@ -1,0 +1,123 @@
+"""Are lines read in the stated order, axis and time, and is the exposure as long as stated?"""
+
+import math
+from contextlib import suppress
+
+import numpy as np
+
+from phyradgs_cl.acquisition import Scan
+from phyradgs_cl.acquisition.altered.variants import at_rest, exposed, read, reversed_readout
+from phyradgs_cl.check.finding import CANNOT_TELL, MIRROR_U, MIRROR_V, OK, SUSPICIOUS, Finding
+from phyradgs_cl.errors import InputError
+from phyradgs_cl.reconstructors.fits.residuals import fit_squares, residual_ratio, t_statistic
+from phyradgs_cl.runtime import Runtime
+
+READOUT, EXPOSURE = "sign of readout", "exposure"
+_ERRORS = 4.0
+_ORDER_RATIO = 1.04  # of the other order's squared residual, whose model is as free
+_OTHER_RATIO = 1.5  # of another axis or time
+_REST_RATIO = 2.0  # of a gantry at rest: a model without blur fits better anyway, the more so with few views
+_AS_GOOD = 1.15
+_READOUT_SHARE = 0.86  # of the time between frames: the readout to try where none is stated
+_OTHER_WAY, _AT_REST = "the other way", "all at once, the gantry at rest"
+_NEEDED_RATIO = {_OTHER_WAY: _ORDER_RATIO, _AT_REST: _REST_RATIO}
+_HALF_RATIO = 0.6  # of half the exposure's squared residual: correct scans leave 0.8 or more
+_WORSE_RATIO = 1.05
+
+
+def check_readout(rt: Runtime, scan: Scan) -> Finding:
+    """Fits a coarse fly-scan with its lines read as stated, and otherwise.
+
+    Squared residuals have to differ by four standard errors and by a ratio. A wrong order of rows only twists the object,
+    which the cone reveals; a wrong order of columns bends it."""
+    stated = fit_squares(rt, scan)
+    others: dict[str, np.ndarray] = {}
+    for name, variant in _other_readouts(scan).items():
+        with suppress(InputError):  # a table of poses or angles may end before the variant's last line
+            others[name] = fit_squares(rt, variant)
+    if not others:
+        text = "the tables of poses or angles end with the stated times: no other readout can be tried"
+        return Finding(READOUT, CANNOT_TELL, 0.0, -_ERRORS, "standard errors", text)
+    needed = {name: _NEEDED_RATIO.get(name, _OTHER_RATIO) for name in others}
+    best = min(others, key=lambda name: float(others[name].sum()) * needed[name])
+    text, errors, ratio = _compared(f"read {best}", stated, others[best])
+    if errors <= -_ERRORS and ratio <= 1 / needed[best]:
+        as_good = [n for n in others if n != best and others[n].sum() <= _AS_GOOD * others[best].sum()]
+        if as_good:
+            text += f"; nearly as well: {', '.join(as_good)}"
+        return Finding(READOUT, SUSPICIOUS, errors, -_ERRORS, "standard errors", text, _readout_advice(scan, best))
+    if _OTHER_WAY in others:
+        text, errors, ratio = _compared(f"read {_OTHER_WAY}", stated, others[_OTHER_WAY])
+        if errors >= _ERRORS and ratio >= _ORDER_RATIO:
+            return Finding(READOUT, OK, errors, -_ERRORS, "standard errors", text)
+    advice = "ask which line the panel reads first: in a narrow cone the wrong order only twists the object"
+    return Finding(READOUT, CANNOT_TELL, errors, -_ERRORS, "standard errors", text, advice)
+
+
+def _compared(hypothesis: str, stated: np.ndarray, other: np.ndarray) -> tuple[str, float, float]:
+    """Returns a sentence, by how many standard errors the stated readout fits better, and the ratio of residuals."""
+    ratio, errors = residual_ratio(stated, other), t_statistic(stated, other)
+    return f"{hypothesis}, the squared residual is {ratio:.4g} times as large ({errors:+.1f} standard errors)", errors, ratio
+
+
+def _other_readouts(scan: Scan) -> dict[str, Scan]:
+    """Returns the scan under other readouts, by description."""
+    shutter = scan.shutter
+    other_axis = "columns" if shutter.axis == "rows" else "rows"
+    if shutter.readout_s == 0:
+        readout_s = _READOUT_SHARE * float(np.diff(scan.frame_start_s).min(initial=math.inf))
+        orders = [(axis, direction) for axis in ("rows", "columns") for direction in (1, -1)]
+        return {f"by {a}, index {'0' if d > 0 else 'last'} first": read(scan, a, d, readout_s) for a, d in orders}
+    return {
+        _OTHER_WAY: reversed_readout(scan),
+        "all at once": read(scan, shutter.axis, 1, 0.0),
+        _AT_REST: at_rest(scan),
+        f"by {other_axis}, index 0 first": read(scan, other_axis, 1, shutter.readout_s),
+        f"by {other_axis}, index last first": read(scan, other_axis, -1, shutter.readout_s),
+    }
+
+
+def _readout_advice(scan: Scan, name: str) -> str:
+    if name == _OTHER_WAY:
+        mirror, option = ("v", MIRROR_V) if scan.shutter.axis == "rows" else ("u", MIRROR_U)
+        reverse = f"set readout_direction to {-scan.shutter.direction}, or import with --readout-direction"
+        return f"{reverse}; frames mirrored in {mirror} look the same: then import with the other {option}"
+    if name == _AT_REST:
+        return "did the gantry stop for every view? Then import without a frame time (stop-and-shoot)"
+    return "check the readout's axis, direction and time: another readout fits the frames better"
+
+
+def check_exposure(rt: Runtime, scan: Scan) -> Finding:
+    """Fits a coarse scan with half the stated exposure, and with twice as long a one.
+
+    Only detail as fine as the arc of an exposure distinguishes a steady blur from a blurred object. A sharper model fits a
+    little better anyway, so half the exposure has to leave 40 % less. ``ok`` needs both half and twice to fit worse."""
+    if not scan.is_fly:
+        text = "the gantry is stated to stand still: had it turned, a blurred object would fit as well"
+        return Finding(EXPOSURE, CANNOT_TELL, 1.0, _HALF_RATIO, "share", text)
+    if scan.shutter.pulse_s is not None:
+        text = "the beam is pulsed: the pulse alone decides when lines see light"
+        advice = "compare the pulse with the generator's log"
+        return Finding(EXPOSURE, CANNOT_TELL, 1.0, _HALF_RATIO, "share", text, advice)
+    stated, half = fit_squares(rt, scan), fit_squares(rt, exposed(scan, 0.5))
+    ratio, errors = residual_ratio(stated, half), t_statistic(stated, half)
+    text = f"exposed half as long, the squared residual is {ratio:.3g} times as large ({errors:+.1f} standard errors)"
+    values = (ratio, _HALF_RATIO, "share", text)
+    if ratio <= _HALF_RATIO and errors <= -_ERRORS:
+        advice = f"correct the exposure time: {scan.shutter.exposure_s / 2:g} s explains the frames better"
+        return Finding(EXPOSURE, SUSPICIOUS, *values, advice)
+    if _fits_worse(stated, half) and _fits_worse(stated, _twice_as_long(rt, scan)):
+        return Finding(EXPOSURE, OK, *values)
+    return Finding(EXPOSURE, CANNOT_TELL, *values, "compare the exposure time with the scanner's log")
+
+
+def _fits_worse(stated: np.ndarray, other: np.ndarray | None) -> bool:
+    return other is not None and residual_ratio(stated, other) >= _WORSE_RATIO and t_statistic(stated, other) >= _ERRORS
+
+
+def _twice_as_long(rt: Runtime, scan: Scan) -> np.ndarray | None:
+    """Returns squared residuals (F,) with twice the exposure; None where the table of poses or angles ends too early."""
+    try:
+        return fit_squares(rt, exposed(scan, 2.0))
+    except InputError:
+        return None

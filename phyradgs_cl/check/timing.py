@@ -1,0 +1,148 @@
+"""Do exposure, readout, frame times and angles fit each other, and do the views cover the turn?"""
+
+import math
+
+import numpy as np
+
+from phyradgs_cl.acquisition import CircularOrbit, EncoderTable, FrameSweeps, PoseTable, Scan
+from phyradgs_cl.acquisition.altered.angles import azimuth_rad, start_azimuths_rad, wrapped
+from phyradgs_cl.check.finding import OK, SUSPICIOUS, Finding
+
+_TIMING, _ANGLES = "timing", "angles"
+_ROUNDING = 1e-3  # relative: files round times and angles
+_SPEED_TOLERANCE = 0.02  # relative: gantries vary their speed by less
+_LONGEST_TABLE = 100.0  # times the scan's duration: a longer table belongs to no single scan
+_FEW_RAD = math.radians(5)  # a scan that covers less of its table may have another unit of time
+_MILLISECONDS = (900.0, 3000.0)  # times the scan's duration: a table in ms and frames in s, the table a little longer
+_WIDE = 3.0  # times the median step between angles
+_SAME_RAD = 1e-6
+_TOLERATED_DEG = 1.0  # nearly parallel rays need no more than half a turn
+
+
+def check_timing(scan: Scan) -> Finding:
+    """Compares exposure, readout and table times with the frame times, and the angles with the speed.
+
+    A line cannot open while it is open, a frame cannot be read while the last one is, and a gantry has one angle at a time.
+    The value is the worst of: exposure and readout over the shortest frame period (at most 1); 1 + the relative difference
+    between the angle steps and the speed within the frames; a table's duration over the scan's.
+    """
+    starts_s = np.asarray(scan.frame_start_s, np.float64)
+    if scan.frames < 2:
+        return Finding(_TIMING, OK, 0.0, 1.0, "share", "one frame: nothing to compare")
+    period_s = float(np.diff(starts_s).min())
+    if period_s <= 0:
+        text = "a frame starts before the frame that precedes it in the file"
+        advice = "correct frame_start_time: frames must follow each other"
+        return Finding(_TIMING, SUSPICIOUS, period_s, 0.0, "s", text, advice)
+    if not scan.is_fly:
+        return Finding(_TIMING, OK, 0.0, 1.0, "share", "the gantry stands still during exposures: any timing fits")
+    findings = [
+        _share("exposure", "a line would open again while it is open", scan.shutter.exposure_s / period_s),
+        _share("readout", "a frame would be read while the last one is", scan.shutter.readout_s / period_s),
+    ]
+    if isinstance(scan.trajectory, CircularOrbit) and isinstance(scan.trajectory.kinematics, FrameSweeps):
+        findings.append(_speed(scan, starts_s))  # other trajectories hold one course for all times
+    findings += _table(scan)
+    suspicious = [finding for finding in findings if finding.verdict == SUSPICIOUS]
+    return suspicious[0] if suspicious else max(findings, key=lambda finding: finding.value / finding.threshold)
+
+
+def _share(name: str, consequence: str, share: float) -> Finding:
+    text = f"{name} takes {100 * share:.4g} % of the time between frames"
+    if share <= 1 + _ROUNDING:
+        return Finding(_TIMING, OK, share, 1.0, "share", text)
+    advice = f"correct the {name} time (is it stated {share:.3g} times too long?) or frame_start_time"
+    return Finding(_TIMING, SUSPICIOUS, share, 1.0, "share", f"{text}: {consequence}", advice)
+
+
+def _table(scan: Scan) -> list[Finding]:
+    """Finds a table of angles or poses that lasts far longer than the scan, which sees next to nothing of it: its unit of
+    time differs from the frames'."""
+    table = scan.trajectory.kinematics if isinstance(scan.trajectory, CircularOrbit) else scan.trajectory
+    if not isinstance(table, EncoderTable | PoseTable):
+        return []
+    ratio = float(np.ptp(table.time_s)) / (float(np.ptp(scan.frame_start_s)) + scan.shutter.span_s)
+    seen_rad = float(np.ptp(np.unwrap(start_azimuths_rad(scan))))
+    if ratio <= _LONGEST_TABLE or seen_rad >= _FEW_RAD:
+        return []
+    kind, seen_deg = "poses" if isinstance(table, PoseTable) else "angles", math.degrees(seen_rad)
+    text = f"the table of {kind} runs {ratio:.4g} times as long as the frames, which see {seen_deg:.3g}° of it"
+    advice = "correct its times or the frames', and their units"
+    if _MILLISECONDS[0] <= ratio <= _MILLISECONDS[1]:
+        advice = "are its times in ms, and the frames' in s?"
+    return [Finding(_TIMING, SUSPICIOUS, ratio, _LONGEST_TABLE, "share", text, advice)]
+
+
+def _speed(scan: Scan, starts_s: np.ndarray) -> Finding:
+    """Compares the angle to the next frame with the speed within the frame. Medians, since gantries vary their speed."""
+    span_s = scan.shutter.exposure_s or scan.shutter.span_s
+    by_speed, stepped = np.empty(scan.frames - 1), np.empty(scan.frames - 1)
+    for frame in range(scan.frames - 1):
+        times_s = starts_s[frame] + np.array([0.0, span_s])
+        first, last = azimuth_rad(scan.trajectory.pose(frame, times_s))
+        following = azimuth_rad(scan.trajectory.pose(frame + 1, starts_s[frame + 1 : frame + 2]))[0]
+        by_speed[frame] = wrapped(last - first) * (starts_s[frame + 1] - starts_s[frame]) / span_s
+        stepped[frame] = by_speed[frame] + wrapped(following - first - by_speed[frame])
+    difference = float(np.median(np.abs(stepped - by_speed))) / max(float(np.median(np.abs(stepped))), 1e-9)
+    text = f"angle steps between frames differ by {100 * difference:.2f} % from the speed within the frames"
+    values = (1 + difference, 1 + _SPEED_TOLERANCE, "share", text)
+    if difference <= _SPEED_TOLERANCE:
+        return Finding(_TIMING, OK, *values)
+    speed_deg, step_deg = math.degrees(float(np.median(by_speed))), math.degrees(float(np.median(stepped)))
+    advice = (
+        f"at the speed within the frames the gantry turns {speed_deg:.4g}° from frame to frame, the angles say "
+        f"{step_deg:.4g}°: correct the exposure time, frame_start_time or rotation_angle_end"
+    )
+    return Finding(_TIMING, SUSPICIOUS, *values, advice)
+
+
+def check_angles(scan: Scan) -> Finding:
+    """Compares the largest gap between neighbouring views with three times the median one.
+
+    Views that cover half a turn and the fan, or more, may leave one gap. Less coverage is suspicious with any steps."""
+    steps_deg = _steps_deg(scan)
+    if steps_deg.size < 3:
+        count = max(steps_deg.size, 1)
+        text = f"{count} different angle{'s' if count > 1 else ''}"
+        advice = "check rotation_angle and its unit (degrees)"
+        return Finding(_ANGLES, SUSPICIOUS, float(steps_deg.size), 3.0, "angles", text, advice)
+    usual_deg = float(np.median(steps_deg))
+    widest = np.sort(steps_deg)[::-1]
+    is_short = widest[0] > _WIDE * usual_deg
+    covered_deg = 360 - float(widest[0]) + (usual_deg if is_short else 0.0)  # half a step beyond the first and last view
+    needed_deg = 180 + 2 * _half_fan_deg(scan)
+    if is_short and covered_deg < needed_deg - _TOLERATED_DEG:
+        text = f"views cover {covered_deg:.4g}°; half a turn and the fan are {needed_deg:.4g}°"
+        advice = "expect streaks along the missing directions; check rotation_angle, its unit and its sign"
+        return Finding(_ANGLES, SUSPICIOUS, covered_deg, needed_deg, "degrees", text, advice)
+    gap_deg = float(widest[1] if is_short else widest[0])
+    text = f"{steps_deg.size} angles over {covered_deg:.4g}°, usually {usual_deg:.3g}° apart, at most {gap_deg:.3g}°"
+    if gap_deg <= _WIDE * usual_deg:
+        return Finding(_ANGLES, OK, gap_deg, _WIDE * usual_deg, "degrees", text)
+    advice = "are frames missing, or angles mixed up? Exclude doubtful frames (image_key 3)"
+    return Finding(_ANGLES, SUSPICIOUS, gap_deg, _WIDE * usual_deg, "degrees", text, advice)
+
+
+def is_full_turn(scan: Scan) -> bool:
+    """True where no gap between views is wide."""
+    steps_deg = _steps_deg(scan)
+    return steps_deg.size > 0 and float(steps_deg.max()) <= _WIDE * float(np.median(steps_deg))
+
+
+def _steps_deg(scan: Scan) -> np.ndarray:
+    """Returns the degrees from each different view angle to the next, around the turn."""
+    middle_s = np.asarray(scan.frame_start_s) + scan.shutter.middle_s
+    poses = np.stack([scan.trajectory.pose(f, middle_s[f : f + 1])[0] for f in range(scan.frames)])
+    angles_rad = np.sort(azimuth_rad(poses) % (2 * np.pi))
+    steps_deg = np.rad2deg(np.diff(angles_rad, append=angles_rad[0] + 2 * np.pi))
+    return steps_deg[steps_deg > math.degrees(_SAME_RAD)]
+
+
+def _half_fan_deg(scan: Scan) -> float:
+    """Returns half the fan of the reconstruction's box, at most half that of the panel."""
+    geometry = scan.geometry
+    half_width_mm = geometry.detector_shape[1] * geometry.pixel_size_mm[1] / 2
+    panel_rad = math.atan2(half_width_mm, geometry.source_to_detector_mm)
+    radius_mm = max(scan.grid.size_mm[1:]) / 2
+    box_rad = math.asin(min(1.0, radius_mm / geometry.source_to_axis_mm))
+    return math.degrees(min(panel_rad, box_rad))

@@ -1,0 +1,1 @@
+"""Quick least-squares fits of coarse scans: how well a hypothesis explains the frames, and where the axis is."""
