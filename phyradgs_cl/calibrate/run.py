@@ -2,7 +2,7 @@
 corrects the scan where corrections are significant and explain the frames better."""
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -42,6 +42,7 @@ from phyradgs_cl.reconstructors.fits.axis import axis_shift, columns_per_block
 from phyradgs_cl.reconstructors.fits.residuals import residual_ratio, t_statistic
 from phyradgs_cl.reconstructors.frames.preprocess import Preprocessing, prepared
 from phyradgs_cl.runtime import Runtime
+from phyradgs_cl.text import to_digits_of
 
 log = logging.getLogger(__name__)
 STAGES = (
@@ -64,12 +65,13 @@ def calibrate(
     report: Report = lambda done, total, text, share: None,
     phantom: EllipsoidPhantom | None = None,
     splines: int = 0,
+    note: Callable[[str], None] = lambda line: None,
 ) -> Calibration:
     """Estimates a scan's true geometry and timing, as far as its frames determine them.
 
     what: parameters with commas, None the usual ones. others: more scans of the same object in the same place, with the same
     errors. phantom: the object, in any place, if its shape is known. splines: of time, for a wobble; 0: every view by
-    itself.
+    itself. note: takes a line with the estimates so far after each grid.
 
     InputError for unknown parameters, a scan too small, others that do not fit the first, a phantom that the frames do not
     show."""
@@ -77,7 +79,7 @@ def calibrate(
     ready = [prepared(one, Preprocessing(ignore_lag=LAG in request.names)) for one in (scan, *others)]
     _check(ready, request, phantom, splines)
     _warn(ready, phantom)
-    return _Calibrator(rt, scan, ready, request, phantom, splines, report).run()
+    return _Calibrator(rt, scan, ready, request, phantom, splines, report, note).run()
 
 
 class _Calibrator:
@@ -92,7 +94,9 @@ class _Calibrator:
         phantom: EllipsoidPhantom | None,
         splines: int,
         report: Report,
+        note: Callable[[str], None],
     ) -> None:
+        self.note = note
         self.rt, self.scan, self.ready, self.request = rt, scan, ready, request
         self.phantom, self.placement = phantom, np.zeros(0)
         self.stages = _different(STAGES if phantom is None else BEAD_STAGES, scan)
@@ -162,6 +166,8 @@ class _Calibrator:
             self.passes.begin(f"stage {number}", f"at most {stage.columns} columns")
             cost = pass_cost(steady, stage.columns, MOST_FRAMES)
             self.search.descend(self._problem(steady, stage), stage, partial(self._expect, cost))
+            estimates = ", ".join(_in_short(one) for one in self.search.table(self.scan, {}))
+            self.note(f"so far, {stage.columns} columns: {estimates}")
             if not self.search.known:
                 return
             self.passes.plan |= self._plan_of_stages(len(self.search.known), number + 1)
@@ -273,6 +279,13 @@ class _Calibrator:
 def _different(stages: Sequence[Stage], scan: Scan) -> list[Stage]:
     """Returns the stages whose grids differ: a small panel has the same blocks on several."""
     return [stage for k, stage in enumerate(stages) if k == 0 or stage.block(scan) < stages[k - 1].block(scan)]
+
+
+def _in_short(one: ParameterEstimate) -> str:
+    if one.found is None or one.deviation is None:
+        return f"{one.name} -"
+    value, deviation = (to_digits_of(number, one.deviation) for number in (one.found, one.deviation))
+    return f"{one.name} {value} ± {deviation} {one.unit}"
 
 
 def _with_provenance(corrected: Scan, scan: Scan, calibration: Calibration) -> Scan:

@@ -59,7 +59,7 @@ def calibrate_command(
         if output is not None:
             _check_storable(loaded, [word.strip() for word in (what or "").split(",")])
         report = lambda done, total, phase, share: ticker.show(done, total, f"  {phase}", share)  # noqa: E731
-        result = calibrate(loaded, Runtime(wish), what, others, report, shape, splines)
+        result = calibrate(loaded, Runtime(wish), what, others, report, shape, splines, ticker.note)
     if output is not None:
         with only_run(output), finish_despite_interrupt():
             copy_with_motion(scan, output, result.scan)

@@ -101,13 +101,13 @@ def scanned(rt, phantom, axis="rows", model="log", noise="none", is_fly=True, vi
 def test_frames_are_those_of_the_simulator(rt, known, axis, model, is_fly) -> None:
     """Of bodies that are turned and shifted there, and poses that are here; two thirds as dense."""
     scan = scanned(rt, lying(known), axis, model, is_fly=is_fly, views=3)
-    level = BeadProblem.of(known, np.array([*LYING, 1.0]), [scan], Stage(128, 6, 4))
-    found = level.operator(GeometryCorrection()).forward(level.start)
+    problem = BeadProblem.of(known, np.array([*LYING, 1.0]), [scan], Stage(128, 6, 4))
+    found = problem.operator(GeometryCorrection()).forward(problem.start)
     largest = scan.projections.max()
     np.testing.assert_allclose(found, scan.projections, atol=0.05 * largest)
     assert np.sqrt(np.mean((found - scan.projections) ** 2)) < 0.003 * largest
     if model == "log":
-        thinner = level.operator(GeometryCorrection()).forward(level.start * [1, 1, 1, 1, 1, 1, 2 / 3])
+        thinner = problem.operator(GeometryCorrection()).forward(problem.start * [1, 1, 1, 1, 1, 1, 2 / 3])
         np.testing.assert_allclose(thinner, found * 2 / 3, atol=1e-5)
 
 
@@ -118,12 +118,12 @@ def test_a_placement_is_found_and_a_background_taken_out(rt, known) -> None:
     mask[10:14, 5:20] = True
     for masked in (None, mask):
         scan = replace(scan, projections=np.asarray(scan.projections) + slope, pixel_mask=masked)
-        level = BeadProblem.of(known, np.array([*LYING, 1.0]) + 0.03, [scan], Stage(128, 6, 4))
-        operator = level.operator(GeometryCorrection())
-        found = level.reconstruct(operator, None, 10)
+        problem = BeadProblem.of(known, np.array([*LYING, 1.0]) + 0.03, [scan], Stage(128, 6, 4))
+        operator = problem.operator(GeometryCorrection())
+        found = problem.reconstruct(operator, None, 10)
         np.testing.assert_allclose(found[:6], LYING, atol=3e-3)
         assert found[6] == pytest.approx(1, abs=0.02)
-        (left,) = level.off_range(operator, found, [operator.forward(found) + slope], 0)
+        (left,) = problem.beyond_object(operator, found, [operator.forward(found) + slope], 0)
         shown = np.abs(left if masked is None else left[:, ~masked])
         assert shown.max() < 0.1 * slope.max()
 
