@@ -65,10 +65,8 @@ def micro_view_cells(
 def per_line_cells(
     trajectory: Trajectory, shutter: Shutter, frame: int, start_s: float, lines: int, samples: int
 ) -> TimeCells:
-    """Returns ``samples`` cells for every line, at times of its exposure by the midpoint rule.
-
-    The error falls with samples⁻² for fields that are smooth along the motion of one step.
-    """
+    """Returns ``samples`` cells for every line, at times of its exposure by the midpoint rule. The error falls with
+    samples⁻² for fields that are smooth along the motion of one step."""
     if samples < 1:
         raise InputError("time samples", str(samples), "at least 1")
     opens_s, closes_s = shutter.line_windows_s(lines).T
@@ -145,10 +143,8 @@ def _shares(windows_s: np.ndarray, edges_s: np.ndarray) -> np.ndarray:
 def exact_cells(
     trajectory: Trajectory, shutter: Shutter, frame: int, start_s: float, lines: int, segments: int
 ) -> TimeCells:
-    """Returns ``segments`` equal segments of the frame's lit span, in which splats move (docs/mathematics.md).
-
-    Every line integrates over its own window. A gantry at rest, or a span of 0 s, gives the cell of ``static_cells``.
-    """
+    """Returns ``segments`` equal segments of the frame's lit span, in which splats move (docs/mathematics.md). Every line
+    integrates over its own window. A gantry at rest, or a span of 0 s, gives the cell of ``static_cells``."""
     if segments < 1:
         raise InputError("segments", str(segments), "at least 1")
     first_s, last_s = shutter.lit_span_s
@@ -167,10 +163,8 @@ def exact_cells(
 
 
 def _line_times(windows_s: np.ndarray, edges_s: np.ndarray) -> np.ndarray:
-    """Returns ``TimeCells.line_times`` (K, 3, lines) for windows (lines, 2) and edges of segments (K + 1,), in s.
-
-    A line that reaches only a little way into a segment stays in the neighbouring one, which saves footprints.
-    """
+    """Returns ``TimeCells.line_times`` (K, 3, lines) for windows (lines, 2) and edges of segments (K + 1,), in s. A line
+    that reaches only a little way into a segment stays in the neighbouring one, which saves footprints."""
     length_s = edges_s[1] - edges_s[0]
     count = len(edges_s) - 1
     opens, closes = ((windows_s - edges_s[0]) / length_s).T  # in segments from the first light
@@ -218,10 +212,8 @@ def segments_for(
 
 
 def _turns_rad(pose: np.ndarray) -> np.ndarray:
-    """Returns the angles (T − 1,) between successive poses (T, 12), of the source about the origin or of the detector.
-
-    The larger of the two counts.
-    """
+    """Returns the angles (T − 1,) between successive poses (T, 12), of the source about the origin or of the detector. The
+    larger of the two counts."""
     u_hat = pose[:, 6:9] / np.linalg.norm(pose[:, 6:9], axis=1, keepdims=True)
     normal = np.cross(u_hat, pose[:, 9:12])
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)

@@ -107,10 +107,8 @@ def pixel_centres(pose: np.ndarray, detector_shape: tuple[int, int]) -> np.ndarr
 
 
 def plain_geometry(pose: np.ndarray, panel: tuple[int, int]) -> ConeGeometry:
-    """Returns the circular geometry nearest to poses (F, 12), by mean distances and offsets.
-
-    The detector's distance is that of its plane, its offset that of its middle from the source's foot on the plane.
-    """
+    """Returns the circular geometry nearest to poses (F, 12), by mean distances and offsets. The detector's distance is that
+    of its plane, its offset that of its middle from the source's foot on the plane."""
     source, first, step_u, step_v = (pose[:, i : i + 3] for i in (0, 3, 6, 9))
     pitch_u, pitch_v = (np.linalg.norm(step, axis=1, keepdims=True) for step in (step_u, step_v))
     u_hat, v_hat = step_u / pitch_u, step_v / pitch_v
@@ -144,10 +142,8 @@ def field_of_view_mm(geometry: ConeGeometry) -> tuple[float, float, float]:
 
 
 def default_grid(geometry: ConeGeometry) -> Grid:
-    """Returns the cube as wide as a full turn's field of view, in voxels of one pixel pitch at the axis.
-
-    It is lower where the panel has few rows.
-    """
+    """Returns the cube as wide as a full turn's field of view, in voxels of one pixel pitch at the axis. It is lower where
+    the panel has few rows."""
     half_height_mm, radius_mm, _ = field_of_view_mm(geometry)
     voxel_mm = min(geometry.pixel_size_mm) / geometry.magnification
     wide = max(1, math.ceil(2 * radius_mm / voxel_mm))
@@ -180,10 +176,8 @@ def hidden(grid: Grid, pose: np.ndarray, detector_shape: tuple[int, int]) -> str
 
 
 def panel_behind_mm(grid: Grid, pose: np.ndarray) -> float:
-    """Returns how far behind the middle of ``grid`` the panel of a pose (12,) stands.
-
-    A panel less than half the grid's width behind stands inside it, and rays end there.
-    """
+    """Returns how far behind the middle of ``grid`` the panel of a pose (12,) stands. A panel less than half the grid's
+    width behind stands inside it, and rays end there."""
     source, first, step_u, step_v = pose.reshape(4, 3)
     away = np.cross(step_u, step_v)
     away = away * np.sign(away @ (first - source)) / np.linalg.norm(away)

@@ -83,10 +83,8 @@ class MicroViews:
 
 @dataclass(frozen=True)
 class PerRow:
-    """Every line averages over its own window; all lines of a frame share their times, ``sub_intervals`` to an exposure.
-
-    The weight of a line in a cell is the fraction of its window that lies there. Raises InputError for a count below 1.
-    """
+    """Every line averages over its own window; all lines of a frame share their times, ``sub_intervals`` to an exposure. The
+    weight of a line in a cell is the fraction of its window that lies there. Raises InputError for a count below 1."""
 
     operators: ClassVar = (RAYS,)
     name: str = field(default="per-row", init=False, repr=False)
@@ -105,10 +103,8 @@ class PerRow:
 
 @dataclass(frozen=True)
 class OwnTimes:
-    """Every line has ``sub_intervals`` poses in its exposure, as in the simulator.
-
-    ``per-row`` is faster and equally exact. Raises InputError for a count below 1.
-    """
+    """Every line has ``sub_intervals`` poses in its exposure, as in the simulator. ``per-row`` is faster and equally exact.
+    Raises InputError for a count below 1."""
 
     operators: ClassVar = (RAYS,)
     name: str = field(default="own-times", init=False, repr=False)

@@ -16,9 +16,7 @@ from phyradgs_cl.errors import InputError
 @dataclass(frozen=True)
 class Protocol:
     """``views`` frames of a turn at constant speed, each exposing an arc of ``exposure_deg`` (paper, section 3.1).
-
-    ``readout_ratio`` is T_ro/T_exp. ``pulse``: when the beam is on, (start, length) in exposures; None always.
-    """
+    ``readout_ratio`` is T_ro/T_exp. ``pulse``: when the beam is on, (start, length) in exposures; None always."""
 
     views: int = 25
     exposure_deg: float = 14.4
@@ -49,10 +47,8 @@ class Protocol:
         return 360.0 / self.views
 
     def at_rate(self, fps: float, readout_ms: float | None = None, named: Named = str) -> "Protocol":
-        """Returns the protocol with exposure time and readout ratio from frames per second and a readout in ms.
-
-        Raises InputError for an arc of 0, and for a readout longer than a frame.
-        """
+        """Returns the protocol with exposure time and readout ratio from frames per second and a readout in ms. Raises
+        InputError for an arc of 0, and for a readout longer than a frame."""
         checks.positive(named("fps"), fps)
         if self.exposure_deg == 0:
             raise InputError(named("fps"), f"{fps:g} with an exposure arc of 0°", "a gantry that turns", "leave fps out")
@@ -82,11 +78,8 @@ class Protocol:
     def orbit(
         self, geometry: ConeGeometry, jitter_deg: float = 0.0, rng: np.random.Generator | None = None
     ) -> CircularOrbit:
-        """Returns the trajectory. Stop-and-shoot rests at the mid-window angles of the same fly-scan.
-
-        Jitter is a smooth wander of the gantry, with standard deviation ``jitter_deg`` and one knot per frame, which the
-        encoder records.
-        """
+        """Returns the trajectory. Stop-and-shoot rests at the mid-window angles of the same fly-scan. Jitter is a smooth
+        wander of the gantry, with standard deviation ``jitter_deg`` and one knot per frame, which the encoder records."""
         first = self.angle_start_rad()
         arc_rad = np.deg2rad(self.exposure_deg)
         if not self.is_fly:

@@ -18,10 +18,8 @@ Named = Callable[[str], str]
 
 @dataclass(frozen=True)
 class Readout:
-    """Puts frames and poses in the order that operators use, with the readout's lines as rows.
-
-    ``axis``: what a line is on the detector, "rows" or "columns".
-    """
+    """Puts frames and poses in the order that operators use, with the readout's lines as rows. ``axis``: what a line is on
+    the detector, "rows" or "columns"."""
 
     axis: str
 
@@ -46,10 +44,8 @@ class Readout:
 def readout_order(
     first: str | None, axis: str | None, direction: int | None, named: Named = str
 ) -> tuple[str | None, int | None]:
-    """Returns readout axis and direction; ``first``, a key of ``FIRST_LINES``, states both.
-
-    Raises InputError where they contradict.
-    """
+    """Returns readout axis and direction; ``first``, a key of ``FIRST_LINES``, states both. Raises InputError where they
+    contradict."""
     if first is None:
         return axis, direction
     checks.one_of(named("first"), first, FIRST_LINES)

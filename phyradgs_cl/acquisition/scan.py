@@ -169,9 +169,7 @@ class Scan:
 
     def astra_vectors(self) -> np.ndarray:
         """Returns ASTRA's ``cone_vec`` (F, 12) in mm, each frame at the middle of its lit window; ``from_astra`` inverts it.
-
-        ASTRA stacks frames as (rows, F, columns): ``scan.projections.swapaxes(0, 1)``. Its volumes are (z, y, x) too.
-        """
+        ASTRA stacks frames as (rows, F, columns): ``scan.projections.swapaxes(0, 1)``. Its volumes are (z, y, x) too."""
         times_s = self.frame_start_s + self.shutter.middle_s
         poses = np.stack([self.trajectory.pose(f, np.array(t)) for f, t in enumerate(times_s)])
         return astra_of_poses(poses, self.geometry.detector_shape)
@@ -184,9 +182,7 @@ class Scan:
 
     def plot(self, frame: int = 0) -> "Figure":
         """Returns a figure of one frame (rows, columns), and of the times and gantry angles at which its lines are open.
-
-        Raises InputError for a frame number out of range.
-        """
+        Raises InputError for a frame number out of range."""
         from phyradgs_cl.acquisition.plot import plot_frame
 
         return plot_frame(self, frame)
@@ -236,9 +232,7 @@ class Scan:
 
     def check_timing(self) -> None:
         """Raises InputError for a trajectory that does not cover every frame's window, and for poses that are not numbers.
-
-        Raises it too for an exposure too short for the precision of the scan's times.
-        """
+        Raises it too for an exposure too short for the precision of the scan's times."""
         self.shutter.check_resolved(self.frame_start_s)
         last_s = self.shutter.span_s if self.is_fly else self.shutter.middle_s  # a gantry at rest has one pose
         for frame, start_s in enumerate(self.frame_start_s):
@@ -253,10 +247,8 @@ class Scan:
             log.warning(text, behind_mm, "Of a parallel beam state distances that clear the object")
 
     def check_sight(self) -> None:
-        """Raises InputError for a grid that no ray meets as any frame opens: its volume would be 0.
-
-        Warns of a panel inside the grid.
-        """
+        """Raises InputError for a grid that no ray meets as any frame opens: its volume would be 0. Warns of a panel inside
+        the grid."""
         self.warn_of_near_panel()
         places = set()
         for frame, start_s in enumerate(self.frame_start_s):

@@ -85,10 +85,8 @@ class Shutter:
         return first_s + (last_s - first_s) / 2
 
     def in_pulse(self, time_s: np.ndarray) -> np.ndarray:
-        """Returns times (...) after the frame's start, moved to the nearest moment with beam.
-
-        The ends of a window become those of its part in the pulse, or equal times where the pulse misses it.
-        """
+        """Returns times (...) after the frame's start, moved to the nearest moment with beam. The ends of a window become
+        those of its part in the pulse, or equal times where the pulse misses it."""
         if self.pulse_s is None:
             return time_s
         start_s, length_s = self.pulse_s
@@ -104,10 +102,8 @@ class Shutter:
         return order / max(lines - 1, 1) * self.readout_s
 
     def line_windows_s(self, lines: int) -> np.ndarray:
-        """Returns first and last light (lines, 2) of every line index, in seconds after the frame's start.
-
-        Without a pulse they are opening and closing; a line that the pulse misses has equal times.
-        """
+        """Returns first and last light (lines, 2) of every line index, in seconds after the frame's start. Without a pulse
+        they are opening and closing; a line that the pulse misses has equal times."""
         delay = self.delay_s(lines)
         return self.in_pulse(np.stack([delay, delay + self.exposure_s], -1))
 

@@ -101,10 +101,8 @@ class TimeCells:
         return self
 
     def line_poses(self) -> np.ndarray:
-        """Returns poses (lines, 12) of the cell nearest to each line's mid-exposure, (1, 12) for a single cell.
-
-        Raises InputError for a line without a cell.
-        """
+        """Returns poses (lines, 12) of the cell nearest to each line's mid-exposure, (1, 12) for a single cell. Raises
+        InputError for a line without a cell."""
         if self.count == 1:
             return self.pose
         lengths = self.line_stop - self.line_start

@@ -18,16 +18,12 @@ _SAME_PLACE = 1e-9  # of the longest distance: rounding of an orbit in float64
 
 
 class Trajectory(Protocol):
-    """The interface of a trajectory: poses (..., 12) in mm of a frame at times (...) in seconds.
-
-    A user-defined class with this method works in every reconstruction method; ``save_scan`` samples it into a table.
-    """
+    """The interface of a trajectory: poses (..., 12) in mm of a frame at times (...) in seconds. A user-defined class with
+    this method works in every reconstruction method; ``save_scan`` samples it into a table."""
 
     def pose(self, frame: int, time_s: np.ndarray) -> np.ndarray:
-        """Returns poses (..., 12) in mm of frame number ``frame`` at times (...) s.
-
-        A pose is source, centre of pixel (0, 0), step to the next column, step to the next row, x y z each.
-        """
+        """Returns poses (..., 12) in mm of frame number ``frame`` at times (...) s. A pose is source, centre of pixel (0,
+        0), step to the next column, step to the next row, x y z each."""
         ...
 
 
@@ -56,10 +52,8 @@ class ConstantSpeed:
 
 @dataclass(frozen=True)
 class SpeedRamp:
-    """θ(t) = θ0 + ω t + ½ a t²: a gantry that speeds up or brakes.
-
-    ``angle_start_rad`` and ``speed_rad_per_s`` hold at time 0. Raises InputError for infinite values or NaN.
-    """
+    """θ(t) = θ0 + ω t + ½ a t²: a gantry that speeds up or brakes. ``angle_start_rad`` and ``speed_rad_per_s`` hold at time
+    0. Raises InputError for infinite values or NaN."""
 
     angle_start_rad: float
     speed_rad_per_s: float
@@ -77,9 +71,7 @@ class SpeedRamp:
 @dataclass(frozen=True, eq=False, repr=False)
 class EncoderTable:
     """Measured θ(t): linear between samples ``time_s`` (T,) in s and ``angle_rad_table`` (T,) in rad, not extrapolated.
-
-    Raises InputError for times that do not increase, and for times beyond the table.
-    """
+    Raises InputError for times that do not increase, and for times beyond the table."""
 
     time_s: np.ndarray
     angle_rad_table: "NDArray[np.float64]"
@@ -133,10 +125,8 @@ class FrameSweeps:
 
 @dataclass(frozen=True, eq=False)
 class CircularOrbit:
-    """A circular ``geometry`` in mm, with ``kinematics`` that give its angle: anything with angle_rad(frame, time_s).
-
-    Raises InputError for other objects.
-    """
+    """A circular ``geometry`` in mm, with ``kinematics`` that give its angle: anything with angle_rad(frame, time_s). Raises
+    InputError for other objects."""
 
     geometry: ConeGeometry
     kinematics: Kinematics
@@ -197,10 +187,8 @@ class PoseTable:
 
 
 def resting_poses(poses: np.ndarray, middle_s: np.ndarray, span_s: float, subject: str = "poses") -> PoseTable:
-    """Returns a table for a gantry that stops for every frame.
-
-    It holds each pose (F, 12) for ``span_s`` about its frame's middle (F,) in s.
-    """
+    """Returns a table for a gantry that stops for every frame. It holds each pose (F, 12) for ``span_s`` about its frame's
+    middle (F,) in s."""
     half_s = max(span_s / 2, 0.25) * (1 - 1e-10)  # two frames in a row must not share a time
     time_s = np.stack([middle_s - half_s, middle_s + half_s], -1).ravel()
     return PoseTable(time_s, np.repeat(poses, 2, axis=0), subject)
@@ -219,9 +207,7 @@ _AS_TABLE = "give it as a PoseTable"
 
 def sampled(trajectory: Trajectory, frame_start_s: np.ndarray, span_s: float, error_mm: float) -> PoseTable:
     """Samples a user-defined trajectory to a table within ``error_mm`` of it, over ``span_s`` from each frame's start (F,).
-
-    Raises InputError where a fine table is not close enough, as for frames that overlap in time with different poses.
-    """
+    Raises InputError where a fine table is not close enough, as for frames that overlap in time with different poses."""
     samples = 2
     while True:
         offsets_s = np.linspace(0.0, max(span_s, _LEAST_SPAN_S), samples)

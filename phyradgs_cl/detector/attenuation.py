@@ -48,10 +48,8 @@ def frames_to_attenuation(
     darks: NDArray[np.generic] | None = None,
     largest: float = _LARGEST,
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-    """Does the same for projections (P, v, u) with flats and darks (n, v, u) of their own.
-
-    Attenuation above ``largest`` is marked as unusable too.
-    """
+    """Does the same for projections (P, v, u) with flats and darks (n, v, u) of their own. Attenuation above ``largest`` is
+    marked as unusable too."""
     return _converted(frames, range(len(frames)), quantity, flats, darks, largest)
 
 
@@ -97,10 +95,8 @@ def mean_dark(darks: NDArray[np.generic] | None, panel: tuple[int, ...]) -> NDAr
 def minus_log(
     signal: NDArray[np.float64], gain: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """Returns −ln(signal / gain) for arrays of one shape, and where the result must not be used.
-
-    A pixel without gain becomes 0, because it holds no information; a dark one becomes −ln ``TRANSMISSION_FLOOR``.
-    """
+    """Returns −ln(signal / gain) for arrays of one shape, and where the result must not be used. A pixel without gain
+    becomes 0, because it holds no information; a dark one becomes −ln ``TRANSMISSION_FLOOR``."""
     live = np.isfinite(signal) & np.isfinite(gain) & (gain > 0)
     transmission = np.divide(signal, gain, out=np.zeros_like(signal), where=live)
     p = -np.log(np.maximum(transmission, TRANSMISSION_FLOOR))
@@ -130,10 +126,8 @@ def average(p: ArrayLike, weight: ArrayLike, model: str) -> NDArray[np.float64]:
 def intensity_average(
     p: Iterable[np.ndarray], weights: Iterable[np.ndarray]
 ) -> tuple[np.ndarray, list[np.ndarray]]:
-    """Returns −ln Σ w exp(−p) over S moments, and each moment's share w exp(−p) / Σ w exp(−p), without overflow.
-
-    p: S arrays of the result's precision. weights: S numbers or arrays that broadcast, sum 1; all 0 gives 0 for both.
-    """
+    """Returns −ln Σ w exp(−p) over S moments, and each moment's share w exp(−p) / Σ w exp(−p), without overflow. p: S arrays
+    of the result's precision. weights: S numbers or arrays that broadcast, sum 1; all 0 gives 0 for both."""
     pairs = list(zip(p, weights, strict=True))
     least = np.minimum.reduce([np.where(w > 0, q, np.inf) for q, w in pairs])  # of the brightest moment
     least = np.where(np.isfinite(least), least, 0)

@@ -77,10 +77,8 @@ def noise_rms(line_integrals: NDArray[np.float32], chosen: NDArray[np.bool_], va
 
 
 def noise_behind(line_integrals: NDArray[np.float32], valid: NDArray[np.bool_]) -> float:
-    """Returns ``noise_rms`` behind the object, from some of the frames. line_integrals and valid (F, v, u).
-
-    Air has less noise, and in some files half of it is clipped at 0.
-    """
+    """Returns ``noise_rms`` behind the object, from some of the frames. line_integrals and valid (F, v, u). Air has less
+    noise, and in some files half of it is clipped at 0."""
     some = slice(None, None, max(1, len(line_integrals) // _FRAMES))
     frames, usable = line_integrals[some], valid[some]
     behind = usable & (frames > _BEHIND * noise_level(frames, usable))
@@ -127,9 +125,7 @@ def find_saturation(frames: NDArray[np.generic], flat: NDArray[np.floating]) -> 
 
 def clustered_share(extreme: Iterable[NDArray[np.bool_]]) -> float:
     """Returns the fraction of pixels at an extreme, given frame by frame (v, u), if most have four such neighbours; else 0.
-
-    Saturation puts whole areas at an extreme, clipped noise single pixels.
-    """
+    Saturation puts whole areas at an extreme, clipped noise single pixels."""
     pixels = count = inner = touching = 0
     for at in extreme:
         pixels, count = pixels + at.size, count + int(np.count_nonzero(at))

@@ -66,9 +66,7 @@ class Gaussians:
 
     def averaged(self, box: tuple[float, float, float]) -> "Gaussians":
         """Returns the cloud blurred by a box with sides x y z, whose variance is added to every Gaussian; mass is kept.
-
-        Sampled at the centres of voxels of that size it is the mean over a voxel, to the Gaussians' second moments.
-        """
+        Sampled at the centres of voxels of that size it is the mean over a voxel, to the Gaussians' second moments."""
         if self.count == 0:
             return self
         turn = scipy.spatial.transform.Rotation.from_quat(self.quaternion[:, [1, 2, 3, 0]]).as_matrix()

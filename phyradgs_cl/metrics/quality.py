@@ -56,9 +56,7 @@ def printed(metrics: Mapping[str, object], names: Mapping[str, Metric] = METRICS
 
 def compare(volume: np.ndarray, reference: np.ndarray) -> dict[str, float]:
     """Returns psnr_db in dB, ssim (3D) and data_range, the maximum of ``reference``; volume and reference are (z, y, x).
-
-    Raises InputError for an empty reference, shapes that differ, NaN and infinity.
-    """
+    Raises InputError for an empty reference, shapes that differ, NaN and infinity."""
     for name, values in {"volume": volume, "reference": reference}.items():
         if not isinstance(values, np.ndarray):
             remedy = "of a result or scan: its .volume or .reference"

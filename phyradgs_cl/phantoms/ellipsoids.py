@@ -99,9 +99,7 @@ class Ellipsoid:
 @dataclass(frozen=True)
 class Cylinder:
     """A straight wire or rod with flat ends between two points (x, y, z), whose attenuation adds to that of other bodies.
-
-    Raises InputError for equal ends, a radius that is not positive, and values that are not finite.
-    """
+    Raises InputError for equal ends, a radius that is not positive, and values that are not finite."""
 
     ends_mm: tuple[Triple, Triple]
     radius_mm: float

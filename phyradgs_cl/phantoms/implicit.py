@@ -135,10 +135,8 @@ def _intersect(part: Box, box: Box) -> Box:
 def texture(
     lattice: Lattice, wavelengths: tuple[float, float], waves: int, rng: np.random.Generator
 ) -> Field:
-    """Draws isotropic noise (n, n, n) float32 of unit variance: ``waves`` random cosines between two wavelengths.
-
-    They are averaged over each voxel, and the draws from ``rng`` do not depend on the resolution.
-    """
+    """Draws isotropic noise (n, n, n) float32 of unit variance: ``waves`` random cosines between two wavelengths. They are
+    averaged over each voxel, and the draws from ``rng`` do not depend on the resolution."""
     direction = rng.standard_normal((waves, 3))
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
     k = 2 * np.pi * direction / rng.uniform(*wavelengths, waves)[:, None]  # rad per unit length

@@ -57,10 +57,8 @@ _FLESH = (
 
 
 def foot(grid_shape: int, seed: int) -> Field:
-    """Returns the phantom (n, n, n) float32 (z, y, x) in [0, 1], air exactly 0, inside the cube's inscribed cylinder.
-
-    A ``seed`` gives the same foot at every resolution. Raises InputError for fewer than 4 voxels.
-    """
+    """Returns the phantom (n, n, n) float32 (z, y, x) in [0, 1], air exactly 0, inside the cube's inscribed cylinder. A
+    ``seed`` gives the same foot at every resolution. Raises InputError for fewer than 4 voxels."""
     at_least("grid_shape", grid_shape, 4)
     rng = np.random.default_rng(seed)
     bones = [_chain([(p[:3], p[3]) for p in chain], rng) for chain in _TARSALS]

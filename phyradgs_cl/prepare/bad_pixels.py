@@ -103,10 +103,8 @@ def _height(frame: np.ndarray) -> np.ndarray:
 
 
 def _opposite(frame: np.ndarray) -> Iterable[np.ndarray]:
-    """Yields for each direction the lower of the two opposite pixels (v, u), mirrored beyond the panel's edge.
-
-    They are two pixels away, or three where another spark is there.
-    """
+    """Yields for each direction the lower of the two opposite pixels (v, u), mirrored beyond the panel's edge. They are two
+    pixels away, or three where another spark is there."""
     wide = np.pad(frame, _FAR, mode="symmetric")
     rows, columns = frame.shape
 
@@ -156,9 +154,7 @@ def find_dead(
 
 def _lines(frames: np.ndarray, deviations: float) -> np.ndarray:
     """Returns whole rows and columns (v, u) bool that exceed both neighbours nearly everywhere, in the median over frames.
-
-    That includes air, and no object is so long and thin.
-    """
+    That includes air, and no object is so long and thin."""
     dead = np.zeros(frames.shape[1:], bool)
     floor = 1e-3 * max(float(np.percentile(frames, 99.9)), 1e-9)
     for axis in (0, 1):

@@ -135,9 +135,7 @@ def _straighten_two(
     frames: np.ndarray, spectrum: Spectrum, model: Model, blur: float, water: Polynomial, bone_in: BoneIn
 ) -> tuple[np.ndarray, float]:
     """Returns straight line integrals (F, v, u) of soft tissue and bone, and bone's fraction of the volume's attenuation.
-
-    Without bone in the volume they are corrected for water. blur: of frames for the model, in pixels.
-    """
+    Without bone in the volume they are corrected for water. blur: of frames for the model, in pixels."""
     clean, share = straighten(frames, water), 0.0
     for _ in range(_PASSES):
         volume = model.regularised(smooth(clean, blur))
@@ -210,10 +208,8 @@ def fit_polynomial(frames: np.ndarray, model: Model) -> Polynomial:
 
 
 def _bend(frames: np.ndarray, model: Model) -> tuple[np.ndarray, float, float, float]:
-    """Fits p = t + b t² to line integrals (F, v, u), with t in proportion to the path through the object.
-
-    Returns the path (F, v, u) in mm, the object's attenuation in 1/mm, b, and the relative RMS of the residual.
-    """
+    """Fits p = t + b t² to line integrals (F, v, u), with t in proportion to the path through the object. Returns the path
+    (F, v, u) in mm, the object's attenuation in 1/mm, b, and the relative RMS of the residual."""
     volume = model.volume(frames)
     level = float(np.median(volume[volume > 0.5 * np.percentile(volume, 99)])) if volume.max() > 0 else 0.0
     path = model.frames(np.clip(volume / max(level, 1e-20), 0, 1).astype(np.float32))
@@ -237,10 +233,8 @@ def _from(bone_per_mm: float, volume: np.ndarray) -> np.ndarray:
 
 
 def _between(soft_to: float, bone_from: float, volume: np.ndarray) -> np.ndarray:
-    """Returns the bone of voxels (z, y, x) that may mix both: none up to ``soft_to``, all from ``bone_from``.
-
-    Both are fractions of the densest voxel, which the correction makes denser.
-    """
+    """Returns the bone of voxels (z, y, x) that may mix both: none up to ``soft_to``, all from ``bone_from``. Both are
+    fractions of the densest voxel, which the correction makes denser."""
     if soft_to >= bone_from:
         return np.zeros_like(volume)
     soft, bone = soft_to * densest(volume), bone_from * densest(volume)

@@ -96,9 +96,7 @@ def _of_components(
 
 def _least_variation(frame: np.ndarray, components: np.ndarray) -> np.ndarray:
     """Returns the weights (k,) of components (k, v, u) that minimise the total variation of frame (v, u) − components.
-
-    Solves it by iteratively reweighted least squares, each difference weighted by its inverse size.
-    """
+    Solves it by iteratively reweighted least squares, each difference weighted by its inverse size."""
 
     def differences(image: np.ndarray) -> np.ndarray:
         return np.concatenate([np.diff(image, axis=axis).ravel() for axis in (-2, -1)])

@@ -83,9 +83,7 @@ def ring_pattern(
     frames: np.ndarray, *, window: int = 10, axis_column: float | None = None, full_turn: bool = True
 ) -> np.ndarray:
     """Returns the error (v, u) float32 that the pixels' gains add to line integrals (F, v, u); 0 without a certain pattern.
-
-    window: side of the blocks in pixels. The other arguments are those of ``ring_strength``.
-    """
+    window: side of the blocks in pixels. The other arguments are those of ``ring_strength``."""
     strength = ring_strength(frames, axis_column=axis_column, full_turn=full_turn)
     return _pattern(frames, strength, window, axis_column if full_turn else np.inf)
 
@@ -137,10 +135,8 @@ def _means(frames: np.ndarray, full_turn: bool) -> np.ndarray:
 
 
 def _pattern(frames: np.ndarray, strength: Strength, window: int, axis_column: float | None) -> np.ndarray:
-    """Returns the pattern (v, u) float32 of a given strength.
-
-    The symmetric and the antisymmetric part of the mean are denoised apart; each has half of the pattern's variance.
-    """
+    """Returns the pattern (v, u) float32 of a given strength. The symmetric and the antisymmetric part of the mean are
+    denoised apart; each has half of the pattern's variance."""
     mean = frames.mean(axis=0, dtype=np.float64)
     if not strength.is_certain:
         return np.zeros(mean.shape, np.float32)
@@ -153,10 +149,8 @@ def _pattern(frames: np.ndarray, strength: Strength, window: int, axis_column: f
 
 
 def _denoised(image: np.ndarray, variances: np.ndarray, window: int) -> np.ndarray:
-    """Removes noise with two ``variances``, of each pixel and common to a column, from an image (v, u).
-
-    Coefficients of overlapping cosine blocks are thresholded first; that result guides a Wiener filter.
-    """
+    """Removes noise with two ``variances``, of each pixel and common to a column, from an image (v, u). Coefficients of
+    overlapping cosine blocks are thresholded first; that result guides a Wiener filter."""
     sigma = np.full((window, window), variances[0])
     sigma[0] += window * variances[1]
     sigma = np.sqrt(np.maximum(sigma, 1e-30))
@@ -167,10 +161,8 @@ def _denoised(image: np.ndarray, variances: np.ndarray, window: int) -> np.ndarr
 def _blockwise(
     image: np.ndarray, guide: np.ndarray, share_of: Callable[[np.ndarray], np.ndarray], window: int
 ) -> np.ndarray:
-    """Multiplies the cosine coefficients of overlapping blocks by ``share_of`` the guide's, and averages the blocks.
-
-    The mean value of a block stays. Blocks with fewer coefficients have more weight.
-    """
+    """Multiplies the cosine coefficients of overlapping blocks by ``share_of`` the guide's, and averages the blocks. The
+    mean value of a block stays. Blocks with fewer coefficients have more weight."""
     width = [(window, window + (-n) % window) for n in image.shape]
     padded, guiding = (np.pad(part, width, mode="symmetric") for part in (image, guide))
     total, weight = np.zeros_like(padded), np.zeros_like(padded)
@@ -213,9 +205,7 @@ def _mirror(columns: int, axis_column: float | None) -> np.ndarray:
 
 def _antisymmetric(mean: np.ndarray, axis_column: float | None) -> np.ndarray:
     """Returns the difference of a mean over views (v, u) from its mirror image, over √2: white noise keeps its variance.
-
-    Where few columns have a mirror image it returns the mean itself.
-    """
+    Where few columns have a mirror image it returns the mean itself."""
     mirrored = _mirror(mean.shape[1], axis_column)
     if len(mirrored) < _LEAST_PAIRS * mean.shape[1]:
         return mean

@@ -77,9 +77,7 @@ def remove_scatter(frames: np.ndarray, kernel: Kernel) -> np.ndarray:
 
 def fit_scatter(frames: np.ndarray, air: np.ndarray, reach: float = 0.0) -> Kernel:
     """Fits the kernel to the light above 1 of the pixels ``air`` in line integrals (F, v, u), by non-negative least squares.
-
-    A ``reach`` other than 0 fixes its width. Single frames may be lighter or darker, but not their mean.
-    """
+    A ``reach`` other than 0 fixes its width. Single frames may be lighter or darker, but not their mean."""
     numbers = _some(len(frames))
     recorded, where = np.exp(-frames[numbers].astype(np.float64)), air[numbers]
     terms = list(itertools.product((reach,) if reach > 0 else _REACHES, _POWERS))
@@ -98,9 +96,7 @@ def fit_scatter(frames: np.ndarray, air: np.ndarray, reach: float = 0.0) -> Kern
 
 def raised(kernel: Kernel, frames: np.ndarray, air: np.ndarray, model: Model, blur: float = 0.0) -> Kernel:
     """Returns the kernel scaled to the height with the least ``unexplained`` rest, unchanged where that gains little.
-
-    frames: line integrals (F, v, u), blurred by ``blur`` pixels for the model; each frame's ``air`` is shifted to 0.
-    """
+    frames: line integrals (F, v, u), blurred by ``blur`` pixels for the model; each frame's ``air`` is shifted to 0."""
     if not kernel:
         return kernel
     coarse = smooth(frames, blur)

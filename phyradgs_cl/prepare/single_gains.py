@@ -43,10 +43,8 @@ class SingleGains:
 def find_single_gains(
     means: np.ndarray, mirrored: np.ndarray, usable: np.ndarray, full_turn: bool
 ) -> SingleGains:
-    """Finds single gains in the means (2, v, u) of two sets of views.
-
-    mirrored: mirror images of the columns that have one; other columns stay. usable: (v, u) bool, pixels without a mask.
-    """
+    """Finds single gains in the means (2, v, u) of two sets of views. mirrored: mirror images of the columns that have one;
+    other columns stay. usable: (v, u) bool, pixels without a mask."""
     offset = np.zeros(usable.shape, np.float32)
     if len(mirrored) < _NEAR:
         return SingleGains(offset)
@@ -71,10 +69,8 @@ def _deviation(means: np.ndarray) -> np.ndarray:
 
 
 def _outliers(deviation: np.ndarray, unlike: np.ndarray, usable: np.ndarray) -> np.ndarray:
-    """Returns the errors (v, u) of outliers, 0 elsewhere.
-
-    deviation: ``_deviation`` (set, v, u) of the means. unlike: the same for the difference between mirrored columns.
-    """
+    """Returns the errors (v, u) of outliers, 0 elsewhere. deviation: ``_deviation`` (set, v, u) of the means. unlike: the
+    same for the difference between mirrored columns."""
     around = (1, 3, 3)
     mirrored = deviation[..., ::-1]
     low, high = scipy.ndimage.minimum_filter(mirrored, around), scipy.ndimage.maximum_filter(mirrored, around)

@@ -42,10 +42,8 @@ def unmasked_frames(scan: Scan) -> np.ndarray:
 
 
 def fill_masked(frames: np.ndarray, mask: np.ndarray) -> np.ndarray:
-    """Returns frames (F, v, u) with masked pixels interpolated linearly along their row.
-
-    A row without valid pixels is interpolated between its neighbours; a frame without any becomes 0.
-    """
+    """Returns frames (F, v, u) with masked pixels interpolated linearly along their row. A row without valid pixels is
+    interpolated between its neighbours; a frame without any becomes 0."""
     filled = frames.copy()
     empty: np.ndarray = np.asarray(mask.all(axis=-1))
     for f, v in zip(*np.nonzero(mask.any(axis=-1) & ~empty), strict=True):
@@ -77,10 +75,8 @@ def with_masked(scan: Scan, bad: np.ndarray) -> Scan:
 
 
 def coarse_model(scan: Scan, make_model: MakeModel, most: int = _COARSE_VOXELS) -> tuple[Model, float]:
-    """Returns the scan's model on at most ``most`` voxels along the longest side, and the blur that its frames need.
-
-    The blur is a standard deviation in pixels.
-    """
+    """Returns the scan's model on at most ``most`` voxels along the longest side, and the blur that its frames need. The
+    blur is a standard deviation in pixels."""
     factor = max(1.0, max(scan.grid.shape) / most)
     return make_model(scan.with_grid(GridChoice(size=round(max(scan.grid.shape) / factor)))), (factor - 1) / 2
 

@@ -74,11 +74,8 @@ def scanner_for(
     detector_offset_mm: tuple[float, float] | None = None,
     truncation: float = 0.0,
 ) -> Scanner:
-    """Returns a scanner by name or TOML file.
-
-    detector: another number of columns, with rows in proportion. detector_offset_mm: of the panel, (v, u). truncation:
-    fraction of the columns to cut off, half at each side.
-    """
+    """Returns a scanner by name or TOML file. detector: another number of columns, with rows in proportion.
+    detector_offset_mm: of the panel, (v, u). truncation: fraction of the columns to cut off, half at each side."""
     scanner = load_scanner(name, resource("data"))
     geometry = scanner.geometry
     if detector is not None:
@@ -95,9 +92,7 @@ def scanner_for(
 
 def scanner_options(scanner: Scanner, protocol: str, **given: Any) -> SimulationOptions:
     """Returns options of a simulation with a named protocol; missing ones and None take the scanner's value or the default.
-
-    Raises InputError for unknown options, values out of range, and values that contradict each other.
-    """
+    Raises InputError for unknown options, values out of range, and values that contradict each other."""
     given = {key: value for key, value in given.items() if value is not None}
     order = readout_order(given.get("first"), given.get("readout_axis"), given.get("readout_direction"), _flag)
     keys = ("readout_axis", "readout_direction", "lag", "readout_ratio", "pulse", "fps", "readout_ms")

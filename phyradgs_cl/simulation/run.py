@@ -81,10 +81,8 @@ def simulate(
     report: Callable[[int, int], None] = lambda done, total: None,
     bone: FrameSource | None = None,
 ) -> Scan:
-    """Returns a scan of the object that ``source`` projects, noise included.
-
-    reference (nz, ny, nx): the truth, which ``peak`` scales too. bone: the source of its bone, for a beam of many energies.
-    """
+    """Returns a scan of the object that ``source`` projects, noise included. reference (nz, ny, nx): the truth, which
+    ``peak`` scales too. bone: the source of its bone, for a beam of many energies."""
     if options.kvp and bone is None:
         expected = "an object of voxels, whose dense ones are bone: foot, jaw or a volume"
         raise InputError("--kvp", "a phantom in closed form", expected, "leave it out")

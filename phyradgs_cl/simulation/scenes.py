@@ -84,10 +84,8 @@ def line_groups(cells: TimeCells) -> Iterator[tuple[int, int, np.ndarray]]:
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """An object to scan: a source of frames, the grid to reconstruct, and the truth (nz, ny, nx) on it.
-
-    source_shape: voxels (z, y, x) of a source that is a user's volume. bone: makes the source of its dense part.
-    """
+    """An object to scan: a source of frames, the grid to reconstruct, and the truth (nz, ny, nx) on it. source_shape: voxels
+    (z, y, x) of a source that is a user's volume. bone: makes the source of its dense part."""
 
     source: FrameSource
     grid: Grid
@@ -174,10 +172,8 @@ def _voxel_sources(
 
 
 def bone_from(volume: np.ndarray) -> float:
-    """Returns the attenuation from which voxels (z, y, x) are bone.
-
-    It is half the largest, or the end of the material that this value would divide.
-    """
+    """Returns the attenuation from which voxels (z, y, x) are bone. It is half the largest, or the end of the material that
+    this value would divide."""
     largest = float(volume.max())
     counts, edges = np.histogram(volume, 64, (0.1 * largest, max(largest, 1e-20)))
     is_rare = (edges[1:] > _DENSE * largest) & (counts < _RARE * counts.max())
