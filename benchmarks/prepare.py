@@ -4,7 +4,7 @@
     python benchmarks/prepare.py docs/results/prepare.jsonl --table
 
 A line per effect, volume and method: ``clean``, ``clean_prepared`` (the step on a scan without the effect), ``spoilt`` and
-``prepared``, dB. Lines that are there are not made again. docs/prepare.md has the tables, and the figure that
+``prepared``, dB. Lines that are there are not made again. docs/results/prepare.md has the tables, and the figure that
 --figure docs/images/prepare.png draws.
 """
 

@@ -4,7 +4,7 @@
     python benchmarks/prepare_clean.py docs/results/prepare_clean.jsonl --table
 
 A line per volume, views, method and cell: a step on the clean scan, or rings of some percent. ``lost_db`` is 0 without a run
-where the step leaves the frames bit for bit. Lines that are there are not made again. docs/prepare.md has the table.
+where the step leaves the frames bit for bit. Lines that are there are not made again. docs/results/prepare.md has the table.
 """
 
 import argparse
