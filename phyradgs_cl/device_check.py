@@ -1,7 +1,7 @@
-"""Whether a device computes what it should: every kernel once, on problems of a moment, against float64 on the host.
+"""Compares every kernel on a device with float64 on the host, on small problems.
 
-Gradients are held against central differences of the twins. Limits are several times what float32 leaves on a device
-that rounds as OpenCL asks, and far below what a wrong kernel does.
+Gradients are compared with central differences of the twins. Limits are several times the rounding of float32 on a
+conforming device, and far below the error of a wrong kernel.
 """
 
 from collections.abc import Callable, Iterator
@@ -48,19 +48,19 @@ from phyradgs_cl.optim import DeviceAdam, adam_step
 from phyradgs_cl.runtime import DeviceSpace, HostSpace, Runtime
 from phyradgs_cl.runtime.layout import pad_rows, pitch_of, unpad_rows
 
-VALUE, GRADIENT = 1e-4, 1e-3  # of the largest number expected; in tests float32 leaves a tenth of them
+VALUE, GRADIENT = 1e-4, 1e-3  # relative to the largest number; float32 leaves a tenth of them in tests
 SHAPE, GRID = (9, 12), Grid((5, 7, 6), (0.3, 0.24, 0.28), (0.1, -0.05, 0.1))
 GEOMETRY = ConeGeometry(5.0, 7.5, SHAPE, (3.9 / 9, 4.1 / 12), (0.1, 0.2))
 ORBIT = CircularOrbit(GEOMETRY, ConstantSpeed(0.3, 0.5))
 UNIT = 2.0  # line integral that is 1 in images of the intensity model
 STEP = 1e-6  # of central differences
 Comparison = tuple[np.ndarray, np.ndarray, float]
-"""Found, expected, and the largest difference allowed as a share of the largest number expected."""
+"""Computed, expected, and the largest difference allowed, relative to the largest number expected."""
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """``agreeing``: kernels that gave what their twins give; ``failures``: what did not, in words."""
+    """``agreeing``: kernels that agree with their twins; ``failures``: the others, in words."""
 
     device: str
     agreeing: frozenset[str]
@@ -73,11 +73,11 @@ class Verdict:
 
 
 def check_device(device: str | None = None, **launch_shape: bool | int) -> Verdict:
-    """Builds and runs every kernel that a device would be asked for; ``launch_shape`` as Runtime has it."""
+    """Builds and runs every kernel of a device; ``launch_shape``: options of Runtime."""
     agreeing: set[str] = set()
     failures = []
     for check in CHECKS:
-        rt = Runtime(device, **launch_shape)  # type: ignore[arg-type]  # its own: what it has built is what has run
+        rt = Runtime(device, **launch_shape)  # type: ignore[arg-type]  # a new Runtime: the kernels that it has built are those that have run
         if problem := _problem(check, rt, agreeing):
             suspects = sorted(rt.built_kernels - agreeing) or sorted(rt.built_kernels)
             failures.append(f"{', '.join(suspects)} ({problem})" if suspects else problem)
@@ -85,10 +85,10 @@ def check_device(device: str | None = None, **launch_shape: bool | int) -> Verdi
 
 
 def _problem(check: Callable[[Runtime], Iterator[Comparison]], rt: Runtime, agreeing: set[str]) -> str:
-    """What is wrong, in words; nothing where all comparisons hold. Adds to ``agreeing`` what has run for one that does."""
+    """Returns the first problem in words, or "". Adds the kernels of comparisons that hold to ``agreeing``."""
     try:
-        for found, expected, limit in check(rt):
-            off = float(np.abs(np.asarray(found, np.float64) - expected).max() / (np.abs(expected).max() or 1.0))
+        for computed, expected, limit in check(rt):
+            off = float(np.abs(np.asarray(computed, np.float64) - expected).max() / (np.abs(expected).max() or 1.0))
             if not off <= limit:
                 return f"off by {off:.1e}, at most {limit:.0e}"
             agreeing |= rt.built_kernels
@@ -97,7 +97,7 @@ def _problem(check: Callable[[Runtime], Iterator[Comparison]], rt: Runtime, agre
     return ""
 
 
-# --- what is run -------------------------------------------------------------------------------------------------
+# --- the checks --------------------------------------------------------------------------------------------------
 
 
 def _algebra(rt: Runtime) -> Iterator[Comparison]:
@@ -280,10 +280,10 @@ CHECKS = (
     _algebra, _binning, _splats, _layered_splats, _plain_splats, _voxels, _rays, _backprojections,
     _image_terms, _variation, _optimiser,
 )  # fmt: skip
-"""From what others need to what needs others: a kernel that has agreed is no suspect later."""
+"""Ordered by dependence: a kernel that has agreed is not suspected later."""
 
 
-# --- what it is run on -------------------------------------------------------------------------------------------
+# --- their data --------------------------------------------------------------------------------------------------
 
 
 def _noise(shape: tuple[int, ...], seed: int) -> np.ndarray:

@@ -9,7 +9,7 @@ from kernel_kit import CPU_ONLY
 from phyradgs_cl import device_check
 from phyradgs_cl.device_check import check_device
 from phyradgs_cl.runtime import context
-from phyradgs_cl.runtime.source import kernel_source
+from phyradgs_cl.runtime.opencl import kernel_source
 
 KERNELS = Path(__file__).resolve().parent.parent / "cl"
 GPU_ONLY = {"splat_forward_pixels", "splat_backward_group"}

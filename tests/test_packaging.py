@@ -70,7 +70,7 @@ def test_the_wheel_runs_outside_the_repository(wheel: Path, tmp_path: Path) -> N
     environment = {**os.environ, "PYTHONPATH": str(site)}
     for arguments, expected in (
         (["-c", "from phyradgs_cl.resources import resource; print(resource('cl'))"], str(site)),
-        (["-c", "from phyradgs_cl.runtime.source import kernel_source as s; print(s('rays'))"], "__kernel"),
+        (["-c", "from phyradgs_cl.runtime.opencl import kernel_source as s; print(s('rays'))"], "__kernel"),
         (["-m", "phyradgs_cl", "--help"], "reconstruct"),
     ):
         where = {"cwd": elsewhere, "env": environment, "timeout": 120}

@@ -1,30 +1,30 @@
-"""Shrinkage of all 4³ block cosine transforms: a prior for textures and edges that total variation flattens.
+"""Shrinkage of all 4³ block cosine transforms: a prior for textures and edges, which total variation flattens.
 
-argmin of a sparsity term by soft threshold of an overcomplete transform: B_sᵀ T(B_s v), averaged over the shifts s of the
-blocks (Coifman and Donoho, "Translation-invariant de-noising", 1995; block DCT: Guleryuz, IEEE Trans. Image Process. 16
-(2007) 3020). A block's mean is not shrunk. Near faces the average is over the blocks that lie in the volume.
+Soft threshold of an overcomplete transform: B_sᵀ T(B_s v), averaged over the shifts s of the blocks (Coifman and Donoho,
+"Translation-invariant de-noising", 1995; block DCT: Guleryuz, IEEE Trans. Image Process. 16 (2007) 3020). A block's mean is
+not shrunk. Near faces the average is over the blocks inside the volume.
 
-A map takes a quarter of the shifts, the next one the next quarter: within iterations the average is the same (cycle
-spinning; Kamilov, Bostan and Unser, IEEE Signal Process. Lett. 21 (2014) 1326).
+A map takes a quarter of the shifts, the next map the next quarter: over iterations the average is the same (cycle spinning;
+Kamilov, Bostan and Unser, IEEE Signal Process. Lett. 21 (2014) 1326).
 """
 
 import itertools
 from collections.abc import Sequence
-from typing import cast
 
 import numpy as np
 import scipy.fft
 
+from phyradgs_cl.checks import ceil_div
 from phyradgs_cl.runtime import DeviceArray, Runtime, SameArray
-from phyradgs_cl.runtime.layout import GUARD, padded_zeros, pitch_of
+from phyradgs_cl.runtime.layout import GUARD, on_device, padded_zeros, pitch_of
 
 EDGE = 4
-# the shift along y of every shift along z: a turn has each of both once, and four have all pairs
+# By turn, the shift along y for every shift along z: a turn has each of both once, four turns have all pairs
 TURNS = ((0, 1, 2, 3), (1, 3, 0, 2), (2, 0, 3, 1), (3, 2, 1, 0))
 
 
 class DctProx:
-    """The map for volumes of a fixed ``shape`` (z, y, x); a volume thinner than a block is left as it is."""
+    """The map for volumes of a fixed ``shape`` (z, y, x); it does not change a volume thinner than a block."""
 
     def __init__(self, rt: Runtime, shape: tuple[int, int, int]) -> None:
         self.rt, self.shape = rt, shape
@@ -39,16 +39,15 @@ class DctProx:
     def __call__(
         self, volume: SameArray, threshold: float, turn: int, *, nonnegative: bool, out: DeviceArray | None = None
     ) -> SameArray:
-        """The map of a volume (z, y, x), float32; ``threshold`` in its unit, of coefficients of the orthonormal transform.
+        """Maps a volume (z, y, x), float32; ``threshold`` of coefficients of the orthonormal transform, in its unit.
 
-        ``turn``, 0 to 3: which quarter of the shifts. A device array gives a device array, ``out`` if there is one, and
-        nothing crosses the bus.
+        ``turn``, 0 to 3, chooses a quarter of the shifts. A device array gives a device array (``out``, if given).
         """
-        is_there = isinstance(volume, DeviceArray)
-        observed = volume if isinstance(volume, DeviceArray) else self.rt.upload(volume, np.float32)
-        result = self.rt.empty(self.shape) if out is None else out
-        self._map(observed, threshold, TURNS[turn], nonnegative, result)
-        return cast(SameArray, result if is_there else self.rt.download(result))
+
+        def shrink(observed: DeviceArray, result: DeviceArray) -> None:
+            self._map(observed, threshold, TURNS[turn], nonnegative, result)
+
+        return on_device(self.rt, shrink, volume, out)
 
     def _map(
         self, volume: DeviceArray, threshold: float, turn: Sequence[int], nonnegative: bool, result: DeviceArray
@@ -57,15 +56,15 @@ class DctProx:
         voxels, by_voxel = (nx, ny, nz), rt.group(on_cpu=16)
         layout = self._shape4, self._pitch
         rt.launch(self._start, voxels, volume, *layout, self._padded, self._excess, group=by_voxel)
-        # blocks of one launch are apart: in x too where they are work-items, else a vector of them is one
+        # Blocks of one launch do not overlap. On a GPU they are work-items, also along x; on a CPU a vector runs along x
         along_x = EDGE if rt.pixel_items else 1
-        blocks = -(-nx // EDGE) if rt.pixel_items else 1, -(-ny // EDGE), -(-nz // EDGE)
+        blocks = ceil_div(nx, EDGE) if rt.pixel_items else 1, ceil_div(ny, EDGE), ceil_div(nz, EDGE)
         for (z, y), x in itertools.product(enumerate(turn), range(along_x)):
             shift = np.array([x, y, z, 0], np.int32)
             arguments = self._padded, *layout, shift, np.float32(threshold), self._excess
             rt.launch(self._excess_of, blocks, *arguments, group=rt.group())
         clip = np.int32(nonnegative)
-        items = (-(-nx // rt.lanes), ny, nz)
+        items = (ceil_div(nx, rt.lanes), ny, nz)
         rt.launch(self._end, items, volume, self._excess, *layout, clip, result, group=rt.group(on_cpu=min(items[0], 8)))
 
 

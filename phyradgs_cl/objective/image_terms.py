@@ -1,6 +1,6 @@
 """Image terms of the objective (paper, Eq. 4): L1 + λ (1 − SSIM) of one frame, with their gradient.
 
-Beside them a term for photon noise, λ_P mean(½ t (x − y)²) with transmissions t (detector/transmission.py), off by default.
+A term for photon noise, λ_P mean(½ t (x − y)²) with transmissions t, is off by default.
 
 Eq. 4 prints "+ SSIM"; what is minimised, there and here, is 1 − SSIM. SSIM is Wang et al. 2004 (IEEE Trans.
 Image Process. 13, 600) with an 11-tap Gaussian window of σ 1.5, zero padding, C1 = 0.01², C2 = 0.03².
@@ -11,6 +11,7 @@ import math
 import numpy as np
 import scipy
 
+from phyradgs_cl.checks import ceil_div
 from phyradgs_cl.runtime import DeviceArray, Runtime
 from phyradgs_cl.runtime.layout import GUARD
 
@@ -52,14 +53,14 @@ class ImageLoss:
         pixels: float,
         transmission: DeviceArray | None = None,
     ) -> DeviceArray:
-        """dL/drendered, until the next call; ``mask`` is 1 where a pixel counts and ``pixels`` its sum.
+        """Returns dL/drendered, valid until the next call; ``mask`` is 1 where a pixel counts, ``pixels`` its sum.
 
-        ``transmission`` weighs pixels in the Poisson term and is needed where that has a weight.
+        ``transmission`` weighs pixels in the Poisson term, and is needed where that term has a weight.
         """
         rt = self.rt
         poisson = 0.0 if transmission is None else self.poisson_weight
-        weights = mask if transmission is None else transmission  # the kernels do not look without a weight
-        vectors = -(-self.width // rt.lanes)
+        weights = mask if transmission is None else transmission  # not read without a Poisson weight
+        vectors = ceil_div(self.width, rt.lanes)
         size = (np.int32(self.lines), np.int32(self.width), np.int32(self.pitch))
         group = rt.group()
         items, tile, _ = rt.shape_of_lines(self.width, self.lines)
@@ -106,7 +107,7 @@ class ImageLoss:
         return self.gradient
 
     def value(self) -> float:
-        """The loss at the last ``evaluate``; waits for the device."""
+        """Returns the loss at the last ``evaluate``; waits for the device."""
         ssim, l1, pixels, squares = self.rt.download(self._sums).astype(np.float64).sum(axis=0)
         data = (self.l1_weight * l1 + 0.5 * self.poisson_weight * squares) / max(pixels, 1.0)
         return float(data + self.ssim_weight * (1 - ssim / (self.lines * self.width)))
@@ -121,7 +122,7 @@ def image_loss(
     poisson_weight: float = 0.0,
     transmission: np.ndarray | None = None,
 ) -> tuple[float, np.ndarray]:
-    """Float64 twin: the loss and dL/drendered, images (lines, width)."""
+    """Float64 twin: returns the loss and dL/drendered, images (lines, width)."""
     x, y = rendered * mask, measured * mask
     mx, my = _blur(x), _blur(y)
     xx, yy, xy = _blur(x * x) - mx * mx, _blur(y * y) - my * my, _blur(x * y) - mx * my

@@ -1,19 +1,18 @@
-"""Nonlocal smoothing: voxels are drawn to those near them whose surroundings look the same.
+"""Nonlocal smoothing: moves voxels towards near ones with similar surroundings.
 
 A gradient step of the quadratic nonlocal functional ½ Σ w_ij (x_i − x_j)² over pairs in 5³ neighbourhoods (Gilboa and Osher,
 Multiscale Model. Simul. 6 (2007) 595). w_ij = l_ij min(1/S_i, 1/S_j), S_i = Σ_j l_ij, with the likeness l_ij = exp(−d_ij/h²)
 of nonlocal means (Buades, Coll and Morel, Multiscale Model. Simul. 4 (2005) 490), d_ij the mean square between 3³ patches
-about i and j of a guide, whose outermost voxels go on beyond its faces. The weights are symmetric and no row of them sums to
+about i and j of a guide, which is continued by its outermost voxels. The weights are symmetric and no row of them sums to
 more than 1: a step of at most 1 gives weighted means, one of at most ½ is the proximal map of a convex function.
 """
 
 import itertools
-from typing import cast
 
 import numpy as np
 
 from phyradgs_cl.runtime import DeviceArray, Kernel, Runtime, SameArray
-from phyradgs_cl.runtime.layout import GUARD, padded_zeros, pitch_of
+from phyradgs_cl.runtime.layout import GUARD, on_device, padded_zeros, pitch_of
 
 REACH = 2
 HALO = REACH + 1
@@ -23,10 +22,10 @@ LARGEST = 255  # a likeness of 1
 
 
 class NonlocalStep:
-    """The step for volumes of a fixed ``shape`` (z, y, x). Without a guide, until ``learn``, it leaves them as they are."""
+    """The step for volumes of a fixed ``shape`` (z, y, x). Before ``learn`` it does not change them."""
 
     VOLUMES = 24
-    """How many volumes of floats it holds in memory, with 64 voxels in a row or more."""
+    """Volumes of floats that it holds in memory, with 64 voxels in a row or more."""
 
     def __init__(self, rt: Runtime, shape: tuple[int, int, int]) -> None:
         self.rt, self.shape = rt, shape
@@ -48,21 +47,21 @@ class NonlocalStep:
         return rows[..., :nx] / LARGEST
 
     def learn(self, guide: DeviceArray | np.ndarray, width: float) -> None:
-        """Takes the weights from a volume (z, y, x), float32; ``width``: h, in its unit."""
+        """Computes the weights from a volume (z, y, x), float32; ``width`` is h, in its unit."""
         self._pad(guide)
         slope = np.float32(-1 / (27 * width**2))
         self._launch(self._likeness_of, self._padded, *self._layout, slope, self._likeness)
         self._launch(self._share_of, self._likeness, *self._layout, self._share)
 
     def __call__(self, volume: SameArray, step: float, *, out: DeviceArray | None = None) -> SameArray:
-        """The step of a volume (z, y, x), float32, by ``step`` of its gradient; a device array gives a device array, ``out``
-        if there is one, and nothing crosses the bus."""
-        is_there = isinstance(volume, DeviceArray)
-        result = self.rt.empty(self.shape) if out is None else out
-        self._pad(volume)
-        arguments = self._padded, self._share, self._likeness, *self._layout, np.float32(step)
-        self._launch(self._step, *arguments, result)
-        return cast(SameArray, result if is_there else self.rt.download(result))
+        """Moves a volume (z, y, x), float32, by ``step`` down the gradient; a device array gives one (``out``, if given)."""
+
+        def descend(observed: DeviceArray, result: DeviceArray) -> None:
+            self._pad(observed)
+            arguments = self._padded, self._share, self._likeness, *self._layout, np.float32(step)
+            self._launch(self._step, *arguments, result)
+
+        return on_device(self.rt, descend, volume, out)
 
     def _pad(self, volume: DeviceArray | np.ndarray) -> None:
         there = volume if isinstance(volume, DeviceArray) else self.rt.upload(volume, np.float32)

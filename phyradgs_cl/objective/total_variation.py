@@ -24,7 +24,7 @@ class TotalVariation:
         self.gradient = rt.zeros(2 * GUARD + nz * ny * pitch)
 
     def evaluate(self, volume: DeviceArray) -> DeviceArray:
-        """dTV/dvolume, until the next call."""
+        """Returns dTV/dvolume, valid until the next call."""
         nz, ny, _ = self.shape
         items, tile, _ = self.rt.shape_of_lines(self.pitch, ny, nz)
         self.rt.launch(
@@ -42,12 +42,12 @@ class TotalVariation:
         return self.gradient
 
     def value(self) -> float:
-        """TV at the last ``evaluate``; waits for the device."""
+        """Returns TV at the last ``evaluate``; waits for the device."""
         return float(self.rt.download(self._sums).astype(np.float64).sum())
 
 
 def total_variation(volume: np.ndarray) -> tuple[float, np.ndarray]:
-    """Float64 twin: TV of a volume (z, y, x) and its gradient."""
+    """Float64 twin: returns TV of a volume (z, y, x) and its gradient."""
     volume = np.asarray(volume, np.float64)
     gradient = np.zeros_like(volume)
     value = 0.0
@@ -61,6 +61,6 @@ def total_variation(volume: np.ndarray) -> tuple[float, np.ndarray]:
 
 
 def _axis_weights(shape: tuple[int, ...]) -> list[float]:
-    """One over the number of differences along each axis (z, y, x); 0 along an axis of one voxel."""
+    """Returns one over the number of differences along each axis (z, y, x); 0 along an axis of one voxel."""
     total = int(np.prod(shape))
     return [1.0 / (total // n * (n - 1)) if n > 1 else 0.0 for n in shape]

@@ -1,7 +1,7 @@
-"""Steepest descent of the isotropic total variation in steps of a fixed length, as ASD-POCS takes them.
+"""Steepest descent of the isotropic total variation in steps of a fixed length, for ASD-POCS.
 
 Sidky and Pan, Phys. Med. Biol. 53 (2008) 4777; backward differences and their floor as in TIGRE. With a prior image i it
-goes down (1 − share) TV(x) + share TV(x − i) (Chen, Tang and Leng, Med. Phys. 35 (2008) 660).
+descends (1 − share) TV(x) + share TV(x − i) (Chen, Tang and Leng, Med. Phys. 35 (2008) 660).
 """
 
 from collections.abc import Callable
@@ -28,11 +28,11 @@ class TvDescent:
         self._space = DeviceSpace(rt)
 
     def gradient(self, volume: SameArray) -> SameArray:
-        """dTV/dvolume (z, y, x) float32, on the device where the volume is."""
+        """Returns dTV/dvolume (z, y, x) float32; a device array gives a device array."""
         return self._where_it_is(self._gradient, volume)
 
     def __call__(self, volume: SameArray, step: float, count: int) -> SameArray:
-        """``count`` steps of Euclidean length ``step`` (1/mm) downhill; of a device array on the device alone."""
+        """Takes ``count`` steps of Euclidean length ``step`` (1/mm) downhill; a device array gives a device array."""
 
         def descended(x: DeviceArray) -> DeviceArray:
             for _ in range(count):

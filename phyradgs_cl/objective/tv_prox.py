@@ -1,18 +1,17 @@
-"""Proximal map of the isotropic total variation: argmin_x ½‖x − b‖² + weight · TV(x), x ≥ 0 if asked.
+"""Proximal map of the isotropic total variation: argmin_x ½‖x − b‖² + weight · TV(x), optionally over x ≥ 0.
 
 Fast gradient projection on the dual (Beck and Teboulle, IEEE Trans. Image Process. 18 (2009) 2419). Differences along
 an axis may be weighted, for voxels that are not cubes.
 """
 
-from typing import cast
-
 import numpy as np
 
 from phyradgs_cl.runtime import DeviceArray, Kernel, Runtime, SameArray
+from phyradgs_cl.runtime.layout import on_device
 
 
 class TvProx:
-    """The map for volumes of a fixed ``shape`` (z, y, x). The dual is kept, so that the next call starts from it."""
+    """The map for volumes of a fixed ``shape`` (z, y, x). The next call starts from the dual of the last one."""
 
     def __init__(
         self,
@@ -41,15 +40,15 @@ class TvProx:
     def __call__(
         self, volume: SameArray, weight: float, iterations: int, *, nonnegative: bool, out: DeviceArray | None = None
     ) -> SameArray:
-        """The map of a volume (z, y, x), float32, after ``iterations`` from the last dual.
+        """Maps a volume (z, y, x), float32, by ``iterations`` from the last dual.
 
-        A device array gives a device array, ``out`` if there is one, and nothing crosses the bus.
+        A device array gives a device array (``out``, if given).
         """
-        is_there = isinstance(volume, DeviceArray)
-        observed = volume if isinstance(volume, DeviceArray) else self.rt.upload(volume, np.float32)
-        result = self.rt.empty(self.shape) if out is None else out
-        self._map(observed, weight, iterations, nonnegative, result)
-        return cast(SameArray, result if is_there else self.rt.download(result))
+
+        def denoise(observed: DeviceArray, result: DeviceArray) -> None:
+            self._map(observed, weight, iterations, nonnegative, result)
+
+        return on_device(self.rt, denoise, volume, out)
 
     def _map(
         self, observed: DeviceArray, weight: float, iterations: int, nonnegative: bool, result: DeviceArray

@@ -1,11 +1,8 @@
-"""Several processes (ranks) at work on one scan: how they were launched, how they communicate, who does what."""
+"""Several processes (ranks) that work on one scan: launch, communication, shares of work."""
 
-from phyradgs_cl.parallel.communicator import Alone, Communicator
-from phyradgs_cl.parallel.ending import failing_together
+from phyradgs_cl.parallel.communicator import Alone, Communicator, failing_together, span
 from phyradgs_cl.parallel.exact_sum import exact_sum
-from phyradgs_cl.parallel.launch import Launch, launched
-from phyradgs_cl.parallel.mpi import Mpi, launched_ranks
-from phyradgs_cl.parallel.shares import span
+from phyradgs_cl.parallel.mpi import Launch, Mpi, launched, launched_ranks
 
 __all__ = [
     "Alone",

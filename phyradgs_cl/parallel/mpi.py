@@ -1,6 +1,12 @@
-"""Ranks of an MPI launch through mpi4py, which is imported here and only when it is needed."""
+"""Ranks of an MPI launch: how this process was started, and the communicator through mpi4py.
 
+mpi4py is imported only where several processes were launched.
+"""
+
+import os
 import time
+from collections.abc import Mapping
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, NoReturn
 
@@ -8,35 +14,76 @@ import numpy as np
 
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.parallel.communicator import Alone, Communicator
-from phyradgs_cl.parallel.launch import Launch, launched
 
-_PATIENCE_S, _LATER_S = (
-    5.0,
-    0.5,
-)  # of rank 0, and how much later each next one gives up: one alone is to speak
+# (rank, size, rank on this machine, ranks on this machine) in the names of the launchers
+_LAUNCHERS = (
+    (
+        "OMPI_COMM_WORLD_RANK",
+        "OMPI_COMM_WORLD_SIZE",
+        "OMPI_COMM_WORLD_LOCAL_RANK",
+        "OMPI_COMM_WORLD_LOCAL_SIZE",
+    ),
+    ("MV2_COMM_WORLD_RANK", "MV2_COMM_WORLD_SIZE", "MV2_COMM_WORLD_LOCAL_RANK", "MV2_COMM_WORLD_LOCAL_SIZE"),
+    ("PMI_RANK", "PMI_SIZE", "MPI_LOCALRANKID", "MPI_LOCALNRANKS"),
+    ("PMIX_RANK", "SLURM_STEP_NUM_TASKS", "SLURM_LOCALID", "SLURM_STEP_TASKS_PER_NODE"),
+)
+# How long rank 0 waits for other failing ranks, and how much longer each next rank waits, so that one rank reports alone
+_PATIENCE_S = 5.0
+_LATER_S = 0.5
 _MOST_VALUES = 1 << 26  # of one call: counts of MPI before its version 4 end at 2³¹
+
+
+@dataclass(frozen=True)
+class Launch:
+    """Rank ``rank`` of ``size`` processes, ``local_rank`` of ``local_size`` on this machine; 0 of 1 for a single process."""
+
+    rank: int = 0
+    size: int = 1
+    local_rank: int = 0
+    local_size: int = 1
+
+
+def launched(environment: Mapping[str, str] = os.environ) -> Launch:
+    """Reads from the environment how mpiexec (MPICH, Open MPI, MVAPICH, Intel MPI) or srun started this process."""
+    for names in _LAUNCHERS:
+        rank, size, local_rank, local_size = (_count(environment.get(name)) for name in names)
+        if rank is None or size is None or size < 2:
+            continue
+        if local_rank is None:
+            local_rank = _count(environment.get("SLURM_LOCALID"))
+        if local_size is None:
+            local_size = _count(environment.get("SLURM_STEP_TASKS_PER_NODE"))
+        on_machine = size if local_size is None else local_size
+        return Launch(rank, size, rank % on_machine if local_rank is None else local_rank, on_machine)
+    return Launch()
+
+
+def _count(text: str | None) -> int | None:
+    """A count; SLURM writes 4(x2) for four on each of two machines."""
+    number = (text or "").split("(")[0].split(",")[0]
+    return int(number) if number.isdigit() else None
 
 
 @lru_cache(maxsize=1)
 def launched_ranks(launch: Launch | None = None) -> Communicator:
-    """The ranks that this process was launched with, always the same; ``Alone``, without mpi4py, where it was not.
+    """Returns the ranks that this process was launched with, or ``Alone``.
 
     Raises InputError where mpi4py is missing, or belongs to another MPI than the launcher.
     """
-    found = launched() if launch is None else launch
-    if found.size == 1:
+    start = launched() if launch is None else launch
+    if start.size == 1:
         return Alone()
     try:
         from mpi4py import MPI
     except ImportError as error:
-        subject = f"rank {found.rank} of {found.size}"
+        subject = f"rank {start.rank} of {start.size}"
         remedy = 'pip install "phyradgs-cl[mpi]", or start it without mpiexec'
         raise InputError(subject, "no package mpi4py", "the extra mpi", remedy) from error
     world = MPI.COMM_WORLD
-    if world.size != found.size:
+    if world.size != start.size:
         remedy = "start it with the mpiexec that mpi4py was built for (with srun: --mpi=pmi2 or pmix)"
-        raise InputError("mpi4py", f"{world.size} of {found.size} processes", "all of them", remedy)
-    return Mpi(world, found)
+        raise InputError("mpi4py", f"{world.size} of {start.size} processes", "all of them", remedy)
+    return Mpi(world, start)
 
 
 class Mpi:
@@ -44,7 +91,7 @@ class Mpi:
 
     def __init__(self, comm: Any, launch: Launch) -> None:
         self._comm = comm
-        self._failing = comm.Dup()  # where those who fail meet, whatever the others are at
+        self._failing = comm.Dup()  # failing ranks meet here, whatever the others do
         self.rank, self.size = comm.rank, comm.size
         self.local_rank, self.local_size = launch.local_rank, launch.local_size
         self.sent_bytes = 0

@@ -1,4 +1,4 @@
-"""The only room that knows OpenCL: devices, programs, buffers, launches."""
+"""Devices, programs, buffers and launches: the only folder that imports pyopencl."""
 
 from phyradgs_cl.runtime.algebra import DeviceSpace, HostSpace, Space
 from phyradgs_cl.runtime.context import Runtime
@@ -18,8 +18,8 @@ from phyradgs_cl.runtime.memory import (
     lent,
     with_smaller_bricks,
 )
+from phyradgs_cl.runtime.opencl import Kernel
 from phyradgs_cl.runtime.profile import KernelUse, Rates, profile_text
-from phyradgs_cl.runtime.source import Kernel
 
 __all__ = [
     "DEVICE_VARIABLE",

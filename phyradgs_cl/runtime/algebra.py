@@ -1,51 +1,51 @@
-"""Algebra of arrays where they are: one small interface, on the device by kernels (cl/algebra.cl) and on the host by NumPy.
+"""Algebra of arrays with one interface: on the device by kernels (cl/algebra.cl), on the host by NumPy.
 
-A method is written once, over a ``Space``. Every function gives a new array, or a number; numbers are all that comes back
-from a device. Sums are deterministic: the same arrays on the same device give the same bits.
+A method is written once, over a ``Space``. Every function returns a new array or a number; only numbers come back from a
+device. Sums are deterministic: the same arrays on the same device give the same bits.
 """
 
 import weakref
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Sequence
 from functools import cached_property
-from typing import Any, Generic, TypeVar
-from typing import Protocol as Interface
+from typing import Any, Generic, Protocol, TypeVar
 
 import numpy as np
 
+from phyradgs_cl.checks import ceil_div
 from phyradgs_cl.runtime.context import Runtime
 from phyradgs_cl.runtime.memory import DeviceArray
 
 A = TypeVar("A")
 Shape = tuple[int, ...]
-_CPU_SPAN = 1 << 14  # elements that a work-item sums by itself
+_CPU_SPAN = 1 << 14  # elements that one work-item sums
 _GPU_GROUP, _GPU_GROUPS = 256, 512
 _ITEMS = 64  # of a work-group on a CPU, element by element
 
 
-class Space(Interface, Generic[A]):
-    """Arrays of one kind. Shapes of operands are the same unless said otherwise."""
+class Space(Protocol, Generic[A]):
+    """Arrays of one kind. Operands have the same shape unless a function states another."""
 
     def array(self, values: np.ndarray) -> A:
-        """Host values as an array of this space, which may share their memory."""
+        """Returns host values as an array of this space, which may share their memory."""
         ...
 
     def numpy(self, x: A) -> np.ndarray:
-        """The values on the host; may share memory."""
+        """Returns the values on the host; they may share memory."""
         ...
 
     def full(self, shape: Shape, value: float) -> A: ...
 
     def apply(self, function: Callable[..., Any], x: A, shape: Shape) -> A:
-        """``function(x)`` of ``shape``, as operators have it: where results lie on a device it is told ``out``."""
+        """Returns ``function(x)`` of ``shape``; on a device the function receives ``out``, the memory of its result."""
         ...
 
     def take(self, x: A, chosen: Sequence[int]) -> A:
-        """Some of the entries along the first axis, in this order."""
+        """Returns the ``chosen`` entries along the first axis, in this order."""
         ...
 
     def add(self, x: A, y: A, scale: float = 1.0, *, nonnegative: bool = False) -> A:
-        """x + ``scale`` y, clipped at 0 if asked."""
+        """x + ``scale`` y; ``nonnegative`` clips it at 0."""
         ...
 
     def extrapolate(self, x: A, y: A, scale: float) -> A:
@@ -53,23 +53,23 @@ class Space(Interface, Generic[A]):
         ...
 
     def add_product(self, x: A, y: A, z: A, scale: float = 1.0, *, nonnegative: bool = False) -> A:
-        """x + ``scale`` y z element by element, clipped at 0 if asked."""
+        """x + ``scale`` y z element by element; ``nonnegative`` clips it at 0."""
         ...
 
     def multiply(self, x: A, y: A) -> A:
-        """x y element by element; y may have the last axes of x alone."""
+        """x y element by element; y may have only the last axes of x."""
         ...
 
     def reciprocal(self, x: A, share: float) -> A:
-        """1/x; below ``share`` of the largest x as at that share, and 0 where x is not above 0."""
+        """1/x, with x raised to ``share`` of its largest; 0 where x is not above 0."""
         ...
 
     def inner(self, x: A, y: A) -> float:
-        """Σ x y, summed in float64 or as accurately."""
+        """Σ x y, with the accuracy of float64."""
         ...
 
     def turn(self, x: A, y: A, z: A) -> float:
-        """Σ (x − y) (y − z), above 0 where the step from z to y goes on to x."""
+        """Σ (x − y) (y − z): above 0 where the steps z to y and y to x have one direction."""
         ...
 
     def norm(self, x: A) -> float:
@@ -77,7 +77,7 @@ class Space(Interface, Generic[A]):
         ...
 
     def sum_squares(self, arrays: Iterable[A]) -> float:
-        """Σ ‖x‖² over arrays that may be made on the way; one number comes back at the end."""
+        """Σ ‖x‖² over arrays, which may be generated; a device sends one number back."""
         ...
 
     def largest(self, x: A, *, absolute: bool = False) -> float:
@@ -144,7 +144,7 @@ class HostSpace:
 
 
 class DeviceSpace:
-    """Float32 arrays of one device: a ``Space`` that reuses the memory of arrays which nobody holds any more."""
+    """Float32 arrays of one device: a ``Space`` that reuses the memory of released arrays."""
 
     def __init__(self, rt: Runtime) -> None:
         self.rt = rt
@@ -152,7 +152,7 @@ class DeviceSpace:
 
     @cached_property
     def _parts(self) -> DeviceArray:
-        """What the groups of a sum come to, each of 8 bytes."""
+        """The partial sums of the groups, 8 bytes each."""
         return self.rt.empty(_GPU_GROUPS, np.float64)
 
     @cached_property
@@ -161,11 +161,11 @@ class DeviceSpace:
 
     @cached_property
     def _total(self) -> DeviceArray:
-        """That of a sum over arrays, between which others are summed."""
+        """The sum over several arrays, between whose parts other sums may be made."""
         return self.rt.empty(1, np.float64)
 
     def empty(self, shape: Shape) -> DeviceArray:
-        """Memory whose content is anything. Work on the device is done in order, so it may still be read from."""
+        """Returns uninitialised memory. The queue is in order, so earlier work may still read it."""
         unused = self._unused[int(np.prod(shape, dtype=np.int64))]
         memory = unused.pop() if unused else self.rt.empty(shape)
         array = DeviceArray(memory.buffer, tuple(shape), memory.dtype)
@@ -217,7 +217,7 @@ class DeviceSpace:
         return self._each("reciprocal", x, np.float32(least))
 
     def descend(self, x: DeviceArray, y: DeviceArray, step: float) -> DeviceArray:
-        """x − ``step`` y/‖y‖, and x where y is 0; nothing comes back."""
+        """x − ``step`` y/‖y‖, and x where y is 0; no number comes back."""
         self._sum("dot_parts", self._whole, y, y)
         high = np.float32(step)
         return self._each("descend", x, y, np.array([high, step - float(high)], np.float32), self._whole)
@@ -244,9 +244,9 @@ class DeviceSpace:
         return float(self.rt.download(self._parts).view(np.float32)[:groups].max())
 
     def _each(self, name: str, x: DeviceArray, *others: Any, period: int = 0) -> DeviceArray:
-        """An element-wise kernel of x and others, for runs of ``period`` elements."""
+        """Launches an element-wise kernel of x and others, for runs of ``period`` elements."""
         result, count = self.empty(x.shape), period or x.size
-        items = -(-count // self.rt.lanes), x.size // max(count, 1)
+        items = ceil_div(count, self.rt.lanes), x.size // max(count, 1)
         kernel = self.rt.kernel("algebra", name)
         self.rt.launch(
             kernel, items, x, *others, np.int64(count), result, group=self.rt.group(_ITEMS, _GPU_GROUP)
@@ -258,7 +258,7 @@ class DeviceSpace:
         return float(values[0] if self.rt.fp64 else values.view(np.float32).astype(np.float64).sum())
 
     def _sum(self, name: str, whole: DeviceArray, *arrays: DeviceArray, add: bool = False) -> None:
-        """A sum over arrays, whose first level the named kernel makes, into a number, or onto it, on the device alone."""
+        """Sums over arrays on the device into ``whole``, or adds to it; the named kernel makes the first level."""
         groups = self._reduce(name, *arrays, scratch=8)
         group = self.rt.group(1, _GPU_GROUP)
         kernel = self.rt.kernel("algebra", "dot_whole")
@@ -266,15 +266,15 @@ class DeviceSpace:
         self.rt.launch(kernel, group, self._parts, np.int32(groups), np.int32(add), scratch, whole, group=group)
 
     def _reduce(self, name: str, *arguments: Any, scratch: int) -> int:
-        """The first level of a sum over the first array: how many groups have a result in ``_parts``."""
+        """Launches the first level of a sum over the first array; returns the number of results in ``_parts``."""
         count, group = arguments[0].size, self.rt.group(1, _GPU_GROUP)
         if self.rt.pixel_items:  # neighbours side by side
-            groups = min(_GPU_GROUPS, -(-count // group))
+            groups = min(_GPU_GROUPS, ceil_div(count, group))
             first_by, step, span = 1, groups * group, count
         else:
-            span = max(_CPU_SPAN, -(-count // _GPU_GROUPS))
-            span = -(-span // self.rt.lanes) * self.rt.lanes
-            groups, first_by, step = -(-count // span), span, self.rt.lanes
+            span = max(_CPU_SPAN, ceil_div(count, _GPU_GROUPS))
+            span = ceil_div(span, self.rt.lanes) * self.rt.lanes
+            groups, first_by, step = ceil_div(count, span), span, self.rt.lanes
         where = (np.int64(n) for n in (count, first_by, step, span))
         kernel = self.rt.kernel("algebra", name)
         local = self.rt.local(scratch * group)
@@ -290,7 +290,7 @@ def norm(values: np.ndarray) -> float:
 def inner(a: np.ndarray, b: np.ndarray) -> float:
     """Inner product of two arrays of one shape on the host, summed in float64.
 
-    Not by BLAS, whose threads wait for cores that the device is using: on two busy ones that took most of a small run.
+    BLAS is avoided: its threads wait for cores that the device uses, which took most of a small run.
     """
     return float(np.einsum("i,i->", a.ravel(), b.ravel(), dtype=np.float64))
 

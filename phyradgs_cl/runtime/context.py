@@ -10,14 +10,14 @@ from typing import Any
 
 import numpy as np
 
+from phyradgs_cl.checks import ceil_div
 from phyradgs_cl.errors import DeviceError
 from phyradgs_cl.parallel import Alone, Communicator
 from phyradgs_cl.runtime.device import DeviceInfo, choose_device
 from phyradgs_cl.runtime.faults import naming_failures, translated
 from phyradgs_cl.runtime.memory import DeviceArray, LaterItem, MemoryLedger, Room, Traffic, memory_limit
-from phyradgs_cl.runtime.opencl import cl
+from phyradgs_cl.runtime.opencl import Kernel, cl, kernel_source
 from phyradgs_cl.runtime.profile import KernelUse, Profile, Rates, measure_rates
-from phyradgs_cl.runtime.source import Kernel, kernel_source
 
 log = logging.getLogger(__name__)
 
@@ -28,11 +28,11 @@ _TILE_ITEMS = 256  # of a work-group that shares local memory
 class Runtime:
     """Owns everything OpenCL. Declare (``kernel``), allocate (``empty``, ``upload``), call (``launch``, which builds).
 
-    ``lanes`` is the width of the vectors that kernels use: wide on CPUs, 1 on GPUs, where work-items are
-    the lanes; it follows from the device unless given. ``fp64`` false selects the float32-pair fallback.
-    ``pixel_items`` selects the launch shape: one work-item per pixel and small groups (GPUs, needs ``lanes`` 1), or a
-    work-item a band of lines (CPUs). ``memory`` (bytes, or text as 2GiB) limits what its buffers hold together.
-    ``ranks``: the processes that work on the same scan, each with a Runtime of its own on the device that is its turn.
+    ``lanes`` is the width of the vectors in kernels: wide on CPUs, 1 on GPUs, where work-items are the lanes. It follows
+    from the device unless given. ``fp64`` false selects the fallback of float32 pairs. ``pixel_items`` selects the launch
+    shape: a work-item per pixel in small groups (GPUs, needs ``lanes`` 1), or per band of lines (CPUs). ``memory`` (bytes,
+    or text as 2GiB) limits the sum of its buffers. ``ranks``: the processes that work on the same scan, each with its own
+    Runtime; where a machine has several devices, each rank takes the next.
     """
 
     def __init__(
@@ -65,7 +65,7 @@ class Runtime:
         self.pixel_items = self.device.kind != "cpu" if pixel_items is None else pixel_items
         if self.pixel_items and self.lanes != 1:
             raise DeviceError("lanes", str(self.lanes), "1 where work-items are pixels")
-        # A CPU's driver may put memory off to a buffer's first use, and then end the process where there is none.
+        # A CPU's driver may allocate at a buffer's first use, and end the process where memory is short.
         at_once = cl.mem_flags.ALLOC_HOST_PTR if self.device.kind == "cpu" else 0
         self._memory_flags = cl.mem_flags.READ_WRITE | at_once
         self.profile = profile
@@ -77,12 +77,12 @@ class Runtime:
     # --- programs -----------------------------------------------------------------------------------
 
     def kernel(self, program: str, name: str, **defines: int | float | bool) -> Kernel:
-        """Declares the kernel ``name`` of ``cl/<program>.cl``; its first launch builds it, once for all its declarations."""
+        """Declares the kernel ``name`` of ``cl/<program>.cl``; the first launch builds it, once for all its declarations."""
         key = (program, name, self._options(defines))
         return self._kernels.setdefault(key, Kernel(*key))
 
     def compile(self, kernel: Kernel) -> "cl.Kernel":
-        """What OpenCL launches; a program is built once for all its kernels."""
+        """Returns the built kernel; a program is built once for all its kernels."""
         if kernel.built is None:
             key = (kernel.program, kernel.options)
             if key not in self._programs:
@@ -92,7 +92,7 @@ class Runtime:
 
     @property
     def built_kernels(self) -> set[str]:
-        """Names of the kernels that were launched so far."""
+        """The names of the kernels that were launched so far."""
         return {kernel.function_name for kernel in self._kernels.values() if kernel.built is not None}
 
     def _options(self, defines: dict[str, int | float | bool]) -> tuple[str, ...]:
@@ -121,7 +121,7 @@ class Runtime:
     # --- memory -------------------------------------------------------------------------------------
 
     def empty(self, shape: int | Sequence[int], dtype: np.typing.DTypeLike = np.float32) -> DeviceArray:
-        """Uninitialised memory. Raises MemoryShortage when the device, or the limit, has too little."""
+        """Returns uninitialised memory. Raises MemoryShortage where the device, or the limit, has too little."""
         shape = (int(shape),) if isinstance(shape, (int, np.integer)) else tuple(int(n) for n in shape)
         kind = np.dtype(dtype)
         nbytes = max(int(np.prod(shape, dtype=np.int64)), 1) * kind.itemsize
@@ -136,16 +136,16 @@ class Runtime:
         return array
 
     def room(self) -> Room:
-        """What an operator may plan with now: what is left of the limit, and the largest allocation."""
+        """Returns the memory that an operator may plan with now: the rest of the limit, and the largest allocation."""
         return self.ledger.room(self.device.largest_allocation_bytes)
 
     @property
     def peak_bytes(self) -> int:
-        """Most device memory that was held at one time, since the start or the last ``reset_peak``."""
+        """The most device memory in use at one time, since the start or the last ``reset_peak``."""
         return self.ledger.peak_bytes
 
     def reset_peak(self) -> None:
-        """``peak_bytes`` counts from what is held now."""
+        """Restarts ``peak_bytes`` from the memory in use now."""
         self.ledger.peak_bytes = self.ledger.held_bytes
 
     def zeros(self, shape: int | Sequence[int], dtype: np.typing.DTypeLike = np.float32) -> DeviceArray:
@@ -183,7 +183,7 @@ class Runtime:
 
     @naming_failures("a copy from it")
     def read_item(self, array: DeviceArray, index: int) -> np.generic:
-        """One element of a flat array; waits for the queue."""
+        """Returns one element of a flat array; waits for the queue."""
         value = np.empty(1, array.dtype)
         offset = index * array.dtype.itemsize
         cl.enqueue_copy(self.queue, value, array.buffer, src_offset=offset, is_blocking=True)
@@ -192,7 +192,7 @@ class Runtime:
 
     @naming_failures("a copy from it")
     def read_item_later(self, array: DeviceArray, index: int) -> LaterItem:
-        """One element of a flat array as it is after the work so far; nobody waits for it."""
+        """Returns one element of a flat array after the work enqueued so far, without waiting."""
         value = np.empty(1, array.dtype)
         offset = index * array.dtype.itemsize
         event = cl.enqueue_copy(self.queue, value, array.buffer, src_offset=offset, is_blocking=False)
@@ -210,7 +210,7 @@ class Runtime:
         source_offset: int = 0,
         target_offset: int = 0,
     ) -> None:
-        """Bytes of one device array to another: all of the source's, or ``nbytes`` between the offsets given."""
+        """Copies bytes of one device array to another: the whole source, or ``nbytes`` from and to the offsets."""
         count = source.nbytes if nbytes is None else nbytes
         event = cl.enqueue_copy(
             self.queue,
@@ -224,7 +224,7 @@ class Runtime:
 
     @staticmethod
     def local(nbytes: int) -> "cl.LocalMemory":
-        """Local memory of a work-group, as an argument of a launch."""
+        """Returns local memory of a work-group, as an argument of a launch."""
         return cl.LocalMemory(nbytes)
 
     # --- launches -----------------------------------------------------------------------------------
@@ -239,7 +239,7 @@ class Runtime:
             return
         given = (group,) if isinstance(group, (int, np.integer)) else group
         local = (*given, *([1] * (len(shape) - len(given))))
-        rounded = tuple(-(-int(n) // size) * size for n, size in zip(shape, local, strict=True))
+        rounded = tuple(ceil_div(int(n), size) * size for n, size in zip(shape, local, strict=True))
         arrays = [a for a in args if isinstance(a, DeviceArray)]
         built = self.compile(kernel)
         built.set_args(*[a.buffer if isinstance(a, DeviceArray) else a for a in args])
@@ -251,7 +251,7 @@ class Runtime:
         return on_gpu if self.pixel_items else on_cpu
 
     def tile(self) -> tuple[int, int]:
-        """Sides of a tile that one work-group of a GPU takes: a line as wide as items run together, and some lines of it."""
+        """Returns the sides of a work-group's tile on a GPU: as wide as items run together, and some lines high."""
         if self._tile is None:
             handle = self.device.handle
             asked = self.compile(self.kernel("rates", "multiply_add")).get_work_group_info(
@@ -262,12 +262,13 @@ class Runtime:
         return self._tile
 
     def shape_of_lines(self, width: int, *rows: int) -> tuple[tuple[int, ...], tuple[int, int], int]:
-        """Work-items, group and number of groups of kernels that step along lines of ``width`` pixels: an item takes a
-        line on a CPU, and a pixel on a GPU.
+        """Returns work-items, group and number of groups of kernels that step along lines of ``width`` pixels.
+
+        A work-item takes a line on a CPU, and a pixel on a GPU.
         """
         items, group = ((width, *rows), self.tile()) if self.pixel_items else ((1, *rows), (1, 1))
         sides = (*group, *([1] * (len(rows) - 1)))
-        return items, group, math.prod(-(-n // side) for n, side in zip(items, sides, strict=True))
+        return items, group, math.prod(ceil_div(n, side) for n, side in zip(items, sides, strict=True))
 
     @naming_failures("the work before")
     def finish(self) -> None:
@@ -290,13 +291,13 @@ class Runtime:
         return {name: use.seconds for name, use in self.kernel_uses().items()}
 
     def best_rates(self) -> Rates:
-        """What the device copies and computes at best, measured now (per second); needs ``profile=True``."""
+        """Measures the device's best rates of copying and computing (per second); needs ``profile=True``."""
         kernel = self.compile(self.kernel("rates", "multiply_add"))
         return measure_rates(self.queue, kernel, self.lanes, self.device.compute_units, self.group())
 
 
 def default_lanes(device: DeviceInfo) -> int:
-    """Vector width: a CPU's own; 1 where work-items are the lanes."""
+    """Returns the vector width: a CPU's native one; 1 where work-items are the lanes."""
     if device.kind != "cpu":
         return 1
     return max((n for n in LANE_CHOICES if n <= device.vector_width), default=1)

@@ -1,4 +1,4 @@
-"""Which OpenCL devices there are, and which one is taken and why."""
+"""The OpenCL devices of this machine, and the choice between them."""
 
 import os
 from dataclasses import dataclass
@@ -14,7 +14,7 @@ _targets: dict[int, str | None] = {}
 
 @dataclass(frozen=True)
 class DeviceInfo:
-    """One OpenCL device and what the choice between devices looks at."""
+    """One OpenCL device with the properties that the choice between devices uses."""
 
     index: int
     name: str
@@ -39,28 +39,27 @@ class DeviceInfo:
 
 
 def list_devices() -> list[DeviceInfo]:
-    """All devices of all platforms, in the order in which OpenCL names them."""
+    """Returns all devices of all platforms, in OpenCL's order."""
     try:
         platforms = cl.get_platforms()
     except cl.LogicError:  # the loader reports "no platform" as an error
         return []
-    found: list[DeviceInfo] = []
+    infos: list[DeviceInfo] = []
     for platform in platforms:
         try:
             devices = platform.get_devices()
         except cl.Error:
             continue
-        found.extend(_describe(len(found) + i, platform, d) for i, d in enumerate(devices))
-    return found
+        infos.extend(_describe(len(infos) + i, platform, d) for i, d in enumerate(devices))
+    return infos
 
 
 def choose_device(wish: str | None = None, turn: int = 0) -> tuple[DeviceInfo, str]:
-    """The device to use and the reason in words.
+    """Returns the device to use and the reason in words.
 
-    ``wish`` (or the environment variable PHYRADGS_DEVICE) is an index, ``cpu``, ``gpu`` or a part of a
-    device's or platform's name, or several of these with commas. Where several processes share a machine, ``turn`` counts
-    them: each takes the next of the list, or else, where no index is given, the next device like the one found first.
-    Raises DeviceError when nothing fits.
+    ``wish`` (or the environment variable PHYRADGS_DEVICE) is an index, ``cpu``, ``gpu`` or a part of a device's or
+    platform's name, or several of these with commas. ``turn`` counts processes that share a machine: each takes the next of
+    the list, or, without a list or an index, the next device of the same name. Raises DeviceError where nothing fits.
     """
     source = "--device"
     if not wish:
@@ -81,24 +80,24 @@ def choose_device(wish: str | None = None, turn: int = 0) -> tuple[DeviceInfo, s
     if wish:
         several = [one for one in wish.split(",") if one.strip()] or [wish]
         named = several[turn % len(several)]
-        found, reason = _wished(named, source, devices)
+        device, reason = _wished(named, source, devices)
         is_exact = len(several) > 1 or named.strip().isdigit()
-        return found if is_exact else _alike(found, devices, turn), reason
+        return device if is_exact else _next_of_name(device, devices, turn), reason
     eligible = [d for d in devices if d.by_default]
     if not eligible:
         names = ", ".join(d.name for d in devices)
         raise DeviceError(
-            "OpenCL", f"only {names}", "a real device", "name one with --device to use it all the same"
+            "OpenCL", f"only {names}", "a real device", "name one with --device to use it"
         )
     best = max(eligible, key=lambda d: d.rank)
     reason = f"best of {len(eligible)} by capability (GPU before CPU, then memory, vector width, units)"
-    return _alike(best, devices, turn), reason
+    return _next_of_name(best, devices, turn), reason
 
 
-def _alike(found: DeviceInfo, devices: list[DeviceInfo], turn: int) -> DeviceInfo:
-    """``found``, or the ``turn``-th after it of the devices of its platform and name."""
-    same = [d for d in devices if (d.platform, d.name) == (found.platform, found.name)]
-    return same[(same.index(found) + turn) % len(same)]
+def _next_of_name(first: DeviceInfo, devices: list[DeviceInfo], turn: int) -> DeviceInfo:
+    """Returns ``first``, or the ``turn``-th after it among the devices of its platform and name."""
+    same = [d for d in devices if (d.platform, d.name) == (first.platform, first.name)]
+    return same[(same.index(first) + turn) % len(same)]
 
 
 def _wished(wish: str, source: str, devices: list[DeviceInfo]) -> tuple[DeviceInfo, str]:
@@ -111,14 +110,14 @@ def _wished(wish: str, source: str, devices: list[DeviceInfo]) -> tuple[DeviceIn
     if not matching:
         known = "; ".join(f"{d.index}: {d.name} ({d.platform})" for d in devices)
         raise NoSuchDeviceError(source, f"{wish!r}, which fits no device", f"an index or part of a name of {known}")
-    return max(matching, key=lambda d: d.rank), f"asked for by {source}={wish}"
+    return max(matching, key=lambda d: d.rank), f"chosen by {source}={wish}"
 
 
 def _describe(index: int, platform: "cl.Platform", device: "cl.Device") -> DeviceInfo:
     is_pocl = "portable computing language" in platform.name.lower()
     kind = _kind(device)
     if is_pocl:
-        pocl.tell_of_cache()
+        pocl.warn_of_cache()
     if is_pocl and kind == "cpu" and device.int_ptr not in _targets:
         named = device.version.rpartition("-linux-gnu-")[2] if "-linux-gnu-" in device.version else None
         is_old = "PoCL 3.0" in platform.version

@@ -1,4 +1,4 @@
-"""What a result depends on besides its options."""
+"""Versions and hardware that a result depends on besides its options."""
 
 import os
 import platform
@@ -10,11 +10,11 @@ import numpy as np
 
 from phyradgs_cl import __version__
 from phyradgs_cl.runtime.context import Runtime
-from phyradgs_cl.runtime.host_cpu import cpu_name
+from phyradgs_cl.runtime.pocl import cpu_name
 
 
 def environment(rt: Runtime) -> dict[str, Any]:
-    """What a number depends on besides its options: program, interpreter, libraries, device."""
+    """Returns the versions of program, interpreter and libraries, the device, and the time."""
     return {
         "version": __version__,
         "python": platform.python_version(),

@@ -1,7 +1,7 @@
-"""What an OpenCL driver reports when a device fails, in this package's words.
+"""Translates errors of an OpenCL driver into DeviceError and MemoryShortage.
 
-Drivers queue work: a launch may be refused, or accepted and reported as failed by whatever waits for it next. Every call
-that enqueues or waits is therefore translated, and says what it was about.
+Drivers queue work: a launch may be refused at once, or fail later in any call that waits. Every call that enqueues or
+waits is therefore translated, and names its work.
 """
 
 from collections.abc import Callable
@@ -19,27 +19,27 @@ _MEMORY_CODES = (-4, -5, -6, -61)
 
 
 def exhausted(error: "cl.Error") -> bool:
-    """Whether a driver's error says that memory ran out; some say so only at a launch, or when it is waited for."""
+    """True where a driver's error means that memory ran out; some drivers report it only at a launch or a wait."""
     if isinstance(error, cl.MemoryError):
         return True
     return _code(error) in _MEMORY_CODES
 
 
 def translated(error: "cl.Error", ledger: MemoryLedger, work: str) -> DeviceError:
-    """An OpenCL error as one of ours; ``work`` is what was being done: a kernel's name, or "a copy"."""
+    """Returns an OpenCL error as a DeviceError; ``work`` names what failed: a kernel, or "a copy"."""
     if exhausted(error):
         return ledger.refused(work, error)
-    said = " ".join(str(error).split())[:300] or type(error).__name__
+    message = " ".join(str(error).split())[:300] or type(error).__name__
     remedy = "see the system's log, or try another --device"
     return DeviceError(
-        f"device {ledger.device.name}", f"{work} failed ({said})", "a device that works", remedy
+        f"device {ledger.device.name}", f"{work} failed ({message})", "a device that works", remedy
     )
 
 
 def naming_failures(work: str | None = None) -> Callable[[Callable[P, R]], Callable[P, R]]:
-    """Decorates a method of a runtime: OpenCL's errors come out as DeviceError or MemoryShortage.
+    """Decorates a method of a runtime, so that OpenCL's errors become DeviceError or MemoryShortage.
 
-    ``work`` is None for launches, whose kernel (the first argument) has a name of its own.
+    ``work`` names the method's work; None takes the name of the kernel, the first argument of a launch.
     """
 
     def decorate(method: Callable[P, R]) -> Callable[P, R]:

@@ -1,16 +1,18 @@
-"""How images and volumes lie in device memory: rows with a pitch.
+"""The layout of images and volumes in device memory: rows with a pitch.
 
 GUARD floats, then (rows, pitch), where every row ends in at least GUARD zeros. A vector of pixels may therefore start or end
-outside a row without a test. Kernels know it as ``IMAGE_GUARD``.
+outside a row without a test. In kernels GUARD is ``IMAGE_GUARD``.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import cast
 
 import numpy as np
 
+from phyradgs_cl.checks import ceil_div
 from phyradgs_cl.runtime.context import Runtime
-from phyradgs_cl.runtime.memory import DeviceArray
+from phyradgs_cl.runtime.memory import DeviceArray, SameArray
 
 GUARD = 16
 
@@ -19,7 +21,7 @@ _TILE = 16  # rows and columns that a CPU's work-item turns at a time
 
 @dataclass(frozen=True)
 class Strides:
-    """Where element (z, y, x) of a volume or stack of images lies: ``start`` + z ``slice`` + y ``row`` + x, in floats."""
+    """The place of element (z, y, x) of a volume or stack of images: ``start`` + z ``slice`` + y ``row`` + x, in floats."""
 
     start: int
     slice: int
@@ -27,12 +29,12 @@ class Strides:
 
     @classmethod
     def plain(cls, shape: Sequence[int], first: Sequence[int] = (0, 0, 0)) -> "Strides":
-        """Of C-contiguous (nz, ny, nx), from element ``first`` on."""
+        """Returns the strides of C-contiguous (nz, ny, nx), from element ``first`` on."""
         _, ny, nx = shape
         return cls((first[0] * ny + first[1]) * nx + first[2], ny * nx, nx)
 
     def vector(self) -> np.ndarray:
-        """As kernels take it."""
+        """Returns the strides as kernels take them."""
         return np.array([self.start, self.row, self.slice, 0], np.int64)
 
 
@@ -51,24 +53,39 @@ def move(
     if turned:
         tile = 1 if rt.pixel_items else _TILE
         kernel = rt.kernel("layout", "move_turned", TILE=tile)
-        rt.launch(kernel, (-(-nx // tile), -(-ny // tile), nz), *ends, group=rt.group())
+        rt.launch(kernel, (ceil_div(nx, tile), ceil_div(ny, tile), nz), *ends, group=rt.group())
         return
-    blocks = -(-nx // rt.lanes)
+    blocks = ceil_div(nx, rt.lanes)
     kernel = rt.kernel("layout", "move_rows", TILE=1)
     rt.launch(kernel, (blocks, ny, nz), *ends, group=rt.group(on_cpu=min(blocks, 8)))
 
 
+def on_device(
+    rt: Runtime, function: Callable[[DeviceArray, DeviceArray], None], volume: SameArray, out: DeviceArray | None
+) -> SameArray:
+    """Runs ``function(volume, result)`` on the device; the result has the shape of ``volume`` and lies where it lies.
+
+    ``out``: the memory of a result on the device.
+    """
+    result = rt.empty(volume.shape) if out is None else out
+    if isinstance(volume, DeviceArray):
+        function(volume, result)
+        return cast(SameArray, result)
+    function(rt.upload(volume, np.float32), result)
+    return cast(SameArray, rt.download(result))
+
+
 def pitch_of(width: int) -> int:
-    return -(-width // GUARD) * GUARD + GUARD
+    return ceil_div(width, GUARD) * GUARD + GUARD
 
 
 def padded_zeros(rt: Runtime, rows: int, width: int, images: int = 1) -> DeviceArray:
-    """Zeroed memory for ``images`` images or volumes of ``rows`` rows."""
+    """Returns zeroed memory for ``images`` images or volumes of ``rows`` rows."""
     return rt.zeros(images * (GUARD + rows * pitch_of(width)) + GUARD)
 
 
 def pad_rows(values: np.ndarray) -> np.ndarray:
-    """(..., rows, width) float to the flat padded layout, float32."""
+    """Returns (..., rows, width) in the flat padded layout, float32."""
     width = values.shape[-1]
     rows = int(np.prod(values.shape[:-1], dtype=np.int64))
     flat = np.zeros(2 * GUARD + rows * pitch_of(width), np.float32)
@@ -77,7 +94,7 @@ def pad_rows(values: np.ndarray) -> np.ndarray:
 
 
 def unpad_rows(flat: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    """The inverse of ``pad_rows`` for an image or volume of the given shape."""
+    """Inverts ``pad_rows`` for an image or volume of the given shape."""
     width, rows = shape[-1], int(np.prod(shape[:-1], dtype=np.int64))
     body = flat[GUARD : GUARD + rows * pitch_of(width)].reshape(rows, -1)
     return np.ascontiguousarray(body[:, :width]).reshape(shape)

@@ -1,4 +1,4 @@
-"""Device memory: how much of it may be taken, how much is, and what happens when there is too little."""
+"""Device memory: arrays, the limit and its ledger, shortages, and arrays of pyopencl."""
 
 import logging
 import os
@@ -17,7 +17,7 @@ from phyradgs_cl.runtime.opencl import cl
 
 MEMORY_VARIABLE = "PHYRADGS_MEMORY"
 _SMALLER = 0.25
-_PLANNED = 0.9  # of what is free
+_PLANNED = 0.9  # of the free memory
 _UNITS = {"": 1, "B": 1}
 for _power, _letter in enumerate("KMGT", start=1):
     _UNITS |= {_letter: 1024**_power, f"{_letter}IB": 1024**_power, f"{_letter}B": 1000**_power}
@@ -26,7 +26,7 @@ T = TypeVar("T")
 
 
 class MemoryShortage(OutOfMemoryError):
-    """A buffer that the device, or the limit, has no room for; smaller bricks may do."""
+    """A buffer is too large for the device or the limit; smaller bricks may fit."""
 
 
 @dataclass(eq=False)
@@ -48,7 +48,7 @@ class DeviceArray:
 
 @dataclass(eq=False)
 class LaterItem:
-    """A number that is on its way from the device."""
+    """A number that the device is still computing."""
 
     _values: np.ndarray
     _event: "cl.Event"
@@ -59,18 +59,18 @@ class LaterItem:
 
     @property
     def value(self) -> np.generic:
-        """Once it is here."""
+        """The number, once ``is_here``."""
         return self._values[0]
 
 
 Array = np.ndarray | DeviceArray
-"""Plain C-contiguous values where they are: operators give their results where their arguments lie."""
+"""Plain C-contiguous values. Operators return host arrays for host arrays and device arrays for device arrays."""
 SameArray = TypeVar("SameArray", bound=Array)
 
 
 @dataclass
 class Traffic:
-    """What has crossed the bus: bytes to the device and from it, and how often the host waited for the device."""
+    """Bytes sent to the device and back, and how often the host waited for the device."""
 
     bytes_up: int = 0
     bytes_down: int = 0
@@ -85,13 +85,13 @@ class Traffic:
 
 @dataclass(frozen=True)
 class Room:
-    """What an operator may plan with: bytes that are free in all, and the most for one buffer."""
+    """The memory that an operator may plan with: free bytes in all, and the most for one buffer."""
 
     free_bytes: int
     largest_bytes: int
 
     def holds(self, *sizes_bytes: int) -> bool:
-        """Whether buffers of these sizes fit beside each other."""
+        """True where buffers of these sizes fit at the same time."""
         return sum(sizes_bytes) <= self.free_bytes and max(sizes_bytes, default=0) <= self.largest_bytes
 
     def scaled(self, share: float) -> "Room":
@@ -99,7 +99,7 @@ class Room:
 
 
 class MemoryLedger:
-    """What is held of a device's memory, against a limit."""
+    """Counts the memory in use on a device against a limit."""
 
     def __init__(self, device: DeviceInfo, limit_bytes: int | None) -> None:
         self.device = device
@@ -113,7 +113,7 @@ class MemoryLedger:
         self.peak_bytes = max(self.peak_bytes, self.held_bytes)
 
     def room(self, largest_bytes: int) -> Room:
-        """What is left of the limit, but for a little that small tables take; buffers of ``largest_bytes`` at most."""
+        """Returns nine tenths of the rest of the limit, in buffers of at most ``largest_bytes``."""
         free_bytes = max(self.limit_bytes - self.held_bytes, 0)
         return Room(int(_PLANNED * free_bytes), min(largest_bytes, self.limit_bytes))
 
@@ -131,14 +131,14 @@ class MemoryLedger:
             raise MemoryShortage(subject, found, expected, remedy)
 
     def refused(self, what: str, error: Exception) -> MemoryShortage:
-        """What a driver's refusal is to the rest of the program."""
+        """Returns a driver's refusal as a MemoryShortage."""
         expected = "enough free memory"
         remedy = f"set a limit with --memory or {MEMORY_VARIABLE}, or use a smaller problem"
         return MemoryShortage(f"memory of {self.device.name}", f"{what} refused ({error})", expected, remedy)
 
 
 def reported_bytes(device: DeviceInfo) -> int:
-    """Free memory where the device tells (AMD's extension), else all of it."""
+    """Returns the free memory where the device reports it (AMD's extension), else all memory."""
     with suppress(cl.Error, AttributeError):
         if "cl_amd_device_attribute_query" in device.handle.extensions:
             return int(device.handle.global_free_memory_amd[0]) * 1024  # type: ignore[index]
@@ -146,7 +146,7 @@ def reported_bytes(device: DeviceInfo) -> int:
 
 
 def memory_limit(wish: str | int | None) -> int | None:
-    """Bytes that ``wish`` or, without one, the environment variable PHYRADGS_MEMORY allows; None: no limit is asked."""
+    """Returns the bytes that ``wish`` or the environment variable PHYRADGS_MEMORY allows; None without a limit."""
     if wish is not None:
         return bytes_of(wish, "--memory")
     text = os.environ.get(MEMORY_VARIABLE)
@@ -154,7 +154,7 @@ def memory_limit(wish: str | int | None) -> int | None:
 
 
 def bytes_of(wish: str | int, subject: str) -> int:
-    """2GiB, 1.5 GB, 512M or a plain number of bytes; K, M, G and T alone are powers of 1024, as with iB."""
+    """Parses 2GiB, 1.5 GB, 512M or a plain number of bytes; K, M, G and T alone are powers of 1024, as with iB."""
     text = "" if isinstance(wish, bool) else str(wish)
     match = re.fullmatch(r"\s*(\d+(?:\.\d+)?)\s*([A-Za-z]*)\s*", text)
     factor = _UNITS.get(match.group(2).upper()) if match else None
@@ -165,46 +165,46 @@ def bytes_of(wish: str | int, subject: str) -> int:
 
 
 def mebibytes(nbytes: int) -> str:
-    """A size for people: 12 MiB, 0.3 MiB."""
+    """Formats a size: 12 MiB, 0.3 MiB."""
     size = nbytes / 2**20
     return f"{size:.0f} MiB" if size >= 10 else f"{size:.2g} MiB"
 
 
 def with_smaller_bricks(what: str, attempt: Callable[[float], T]) -> T:
-    """``attempt(share)`` with all of the room; once more with a quarter of it, and a warning, if there was a shortage."""
+    """Returns ``attempt(1.0)``, or after a shortage, with a warning, ``attempt`` with a quarter of the memory."""
     try:
         return attempt(1.0)
     except MemoryShortage as error:
-        said = str(error)  # a log that kept the error itself would keep the buffers of the attempt
-    log.warning("%s: %s; trying again with smaller bricks", what, said)
+        message = str(error)  # a log that kept the error itself would keep the buffers of the attempt
+    log.warning("%s: %s; trying again with smaller bricks", what, message)
     return attempt(_SMALLER)
 
 
 def is_cl_array(value: object) -> bool:
-    """Whether a value is an Array of pyopencl, which who has one has loaded."""
+    """True for a pyopencl.array.Array. Looks into sys.modules: a caller who has one has imported pyopencl."""
     module = sys.modules.get("pyopencl.array")
     return module is not None and isinstance(value, module.Array)
 
 
 def adopted(name: str, array: Any, queue: "cl.CommandQueue") -> DeviceArray:
-    """A float32 Array of pyopencl (C order) as a DeviceArray on its own memory; a part of another is copied on the device.
+    """Returns a float32 Array of pyopencl (C order) as a DeviceArray on the same memory; a view of another is copied.
 
-    Raises InputError for one of another context, queue or type, of which ``name`` is the subject.
+    Raises InputError, with ``name`` as its subject, for another context, queue or type.
     """
     remedy = "make it with the operator's to_device, or on its queue"
     if array.context != queue.context:
-        raise InputError(name, "an Array of another OpenCL context", "one of the operator's own", remedy)
+        raise InputError(name, "an Array of another OpenCL context", "the operator's context", remedy)
     if array.queue not in (None, queue):
-        raise InputError(name, "an Array on another queue", "one on the operator's own", remedy)
+        raise InputError(name, "an Array on another queue", "the operator's queue", remedy)
     if array.dtype != np.float32 or not array.flags.c_contiguous:
         order = "" if array.flags.c_contiguous else ", not in C order"
         raise InputError(name, f"an Array of {array.dtype}{order}", "float32 in C order", "convert it on the device")
-    whole = array.with_queue(queue).copy() if array.offset else array
-    return DeviceArray(whole.base_data, tuple(array.shape), array.dtype)
+    contiguous = array.with_queue(queue).copy() if array.offset else array
+    return DeviceArray(contiguous.base_data, tuple(array.shape), array.dtype)
 
 
 def lent(array: DeviceArray, queue: "cl.CommandQueue") -> Any:
-    """A DeviceArray as an Array of pyopencl on the same memory, which the ledger counts for as long as the Array lives."""
+    """Returns a DeviceArray as an Array of pyopencl on the same memory, which the ledger counts while the Array lives."""
     import pyopencl.array
 
     shared = pyopencl.array.Array(queue, array.shape, array.dtype, data=array.buffer)

@@ -1,9 +1,18 @@
-"""pyopencl, loaded when something of it is first used: a command that needs no device does not wait for it."""
+"""pyopencl, loaded when it is first used, and kernels with their sources.
 
+Sources are files of ``cl/`` with their headers pasted in, because an include path fails on a folder with a space.
+``#line`` marks keep file and line in the compiler's messages.
+"""
+
+import re
+from dataclasses import dataclass
 from functools import cache
 from typing import TYPE_CHECKING, Any
 
+from phyradgs_cl.resources import resource
 from phyradgs_cl.runtime import pocl
+
+__all__ = ["Kernel", "cl", "kernel_source"]
 
 if TYPE_CHECKING:
     import pyopencl as cl
@@ -20,4 +29,37 @@ else:
 
     cl = _WhenUsed()
 
-__all__ = ["cl"]
+_INCLUDE = re.compile(r'^\s*#include\s+"([^"]+)"\s*$')
+
+
+@dataclass(eq=False)
+class Kernel:
+    """The kernel ``function_name`` of ``cl/<program>.cl``, built with ``options`` at its first launch."""
+
+    program: str
+    function_name: str
+    options: tuple[str, ...]
+    built: "cl.Kernel | None" = None
+
+
+@cache
+def kernel_source(name: str) -> str:
+    """Returns the text of ``cl/<name>.cl`` with every header pasted once."""
+    pasted: set[str] = set()
+    return "\n".join(_expand(f"{name}.cl", pasted))
+
+
+def _expand(relative: str, pasted: set[str]) -> list[str]:
+    lines = [f'#line 1 "{relative}"']
+    text = (resource("cl") / relative).read_text()
+    for number, line in enumerate(text.splitlines(), start=1):
+        match = _INCLUDE.match(line)
+        if match is None:
+            lines.append(line)
+        elif match.group(1) not in pasted:
+            pasted.add(match.group(1))
+            lines += _expand(match.group(1), pasted)
+            lines.append(f'#line {number + 1} "{relative}"')
+        else:
+            lines.append("")  # keeps the line numbers
+    return lines

@@ -23,7 +23,6 @@ from pathlib import Path
 from phyradgs_cl import checks
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.parallel import Launch, launched
-from phyradgs_cl.runtime.host_cpu import cpu_facts
 
 log = logging.getLogger(__name__)
 
@@ -54,13 +53,11 @@ _kept_alive: list[ctypes.Array[ctypes.c_char]] = []
 
 
 def prepare_environment() -> None:
-    """Gives PoCL a kernel cache of its own for this processor, unless the user has chosen one. Before pyopencl loads.
+    """Gives PoCL a kernel cache for this processor, unless the user has chosen one. To be called before pyopencl loads.
 
-    PoCL names its cache after the LLVM target, so two unknown processors would share binaries. Without a cache that
-    can be written it has no device at all: then there is one in the temporary folder. pyopencl's own goes then.
-
-    Raises:
-        InputError: a number of threads that PoCL would crash on, or take for none without a word.
+    PoCL names its cache after the LLVM target, so two unknown processors would share binaries. Without a writable cache
+    PoCL has no device: then the cache lies in the temporary folder, and pyopencl's is switched off.
+    Raises InputError for a number of threads that PoCL would crash on or ignore.
     """
     global _unwritable
     if platform.system() != "Linux":
@@ -81,7 +78,7 @@ def prepare_environment() -> None:
 
 
 def _share_cores(launch: Launch) -> None:
-    """Gives each of several processes on a machine its part of the cores, unless their launcher has bound them."""
+    """Divides the cores among the processes on a machine, unless their launcher has bound them."""
     cores = os.cpu_count() or 1
     is_bound = len(os.sched_getaffinity(0)) < cores
     if launch.local_size > 1 and not is_bound:
@@ -95,12 +92,12 @@ def _check_threads(wish: str | None) -> None:
 
 
 def unwritable_cache() -> Path | None:
-    """The cache that cannot be written, where that has not been said yet."""
+    """Returns a cache that cannot be written, until ``warn_of_cache`` has named it."""
     return _unwritable
 
 
-def tell_of_cache() -> None:
-    """Says, once, that kernels are kept elsewhere than they should be; for those who do use PoCL."""
+def warn_of_cache() -> None:
+    """Warns once that kernels are kept in the temporary folder. To be called where PoCL is used."""
     global _unwritable
     if _unwritable is not None:
         log.warning(
@@ -133,18 +130,18 @@ def _can_write(folder: Path) -> bool:
 
 
 def _temporary_cache() -> Path:
-    """A folder that is this user's alone: what lies in it is run."""
+    """Returns a folder that only this user can write, because its binaries are executed."""
     folder = Path(tempfile.gettempdir()) / f"phyradgs-cl-{os.getuid()}"
     with contextlib.suppress(OSError):
         folder.mkdir(mode=0o700, exist_ok=True)
-        found = folder.lstat()
-        if stat.S_ISDIR(found.st_mode) and found.st_uid == os.getuid() and not found.st_mode & 0o077:
+        status = folder.lstat()
+        if stat.S_ISDIR(status.st_mode) and status.st_uid == os.getuid() and not status.st_mode & 0o077:
             return folder
     return Path(tempfile.mkdtemp(prefix="phyradgs-cl-"))
 
 
 def library_target() -> str | None:
-    """LLVM's name of the processor that PoCL's library for this machine was compiled for; None where there is none."""
+    """Returns LLVM's name of the processor that PoCL's library for this machine was compiled for; None off x86-64."""
     if platform.machine() not in ("x86_64", "AMD64"):
         return None
     flags = _cpu_flags()
@@ -176,14 +173,14 @@ def use_library_target(device_address: int) -> str | None:
 
 
 def _text(memory: bytes) -> bytes | None:
-    """The C string that a piece of memory begins with; None where it does not end in it."""
+    """Returns the C string at the start of some memory; None where it does not end there."""
     text, end, _ = memory.partition(b"\0")
     return text if end else None
 
 
 @contextlib.contextmanager
 def _own_memory() -> Iterator[Callable[[int, int], bytes]]:
-    """A reader of this process's memory that answers b'' for an unmapped address instead of crashing."""
+    """Yields a reader of this process's memory, which returns b'' for an unmapped address instead of crashing."""
     handle = os.open("/proc/self/mem", os.O_RDONLY)
 
     def read(address: int, count: int) -> bytes:
@@ -200,3 +197,22 @@ def _own_memory() -> Iterator[Callable[[int, int], bytes]]:
 
 def _cpu_flags() -> set[str]:
     return set(cpu_facts().get("flags", "").split())
+
+
+def cpu_facts(described: Path = Path("/proc/cpuinfo")) -> dict[str, str]:
+    """Reads Linux's description of its first processor ("model name", "flags", …); empty where there is no such file."""
+    facts: dict[str, str] = {}
+    with contextlib.suppress(OSError):
+        for line in described.read_text().split("\n\n", 1)[0].splitlines():
+            name, _, value = line.partition(":")
+            facts[name.strip()] = value.strip()
+    return facts
+
+
+def cpu_name(facts: dict[str, str] | None = None) -> str:
+    """Returns the processor's name with family and model where they are known: generations may share a name."""
+    facts = cpu_facts() if facts is None else facts
+    name = facts.get("model name") or platform.processor() or platform.machine()
+    if "cpu family" in facts and "model" in facts:
+        return f"{name}, family {facts['cpu family']} model {facts['model']}"
+    return name

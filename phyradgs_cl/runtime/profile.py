@@ -1,7 +1,7 @@
-"""Where a run's device time goes: launches, time and bytes by kernel, beside what the device can do at best.
+"""A run's device time by kernel: launches, seconds and bytes, compared with the device's best rates.
 
-Times are OpenCL events. Bytes are those of a launch's buffers, each counted once: what a kernel has to touch at least if it
-touches all of them. The best is measured on the spot: copies by the driver, multiply-adds by a kernel of ours.
+Seconds are of OpenCL events. Bytes count each buffer of a launch once. The best rates are measured by copies of the driver
+and by a kernel of multiply-adds.
 """
 
 from collections import defaultdict
@@ -19,7 +19,7 @@ _REPEATS = 5
 
 @dataclass
 class KernelUse:
-    """One kernel's share of a run."""
+    """Launches, seconds and bytes of one kernel in a run."""
 
     launches: int = 0
     seconds: float = 0.0
@@ -39,11 +39,11 @@ class Profile:
             self._fold()
 
     def uses(self) -> dict[str, KernelUse]:
-        """By kernel, the longest first, since the last call."""
+        """Returns the uses by kernel since the last call, the longest first."""
         self._fold()
-        found = dict(sorted(self._uses.items(), key=lambda item: -item[1].seconds))
+        uses = dict(sorted(self._uses.items(), key=lambda item: -item[1].seconds))
         self._uses = defaultdict(KernelUse)
-        return found
+        return uses
 
     def _fold(self) -> None:
         for name, event, nbytes in self._events:
@@ -57,16 +57,16 @@ class Profile:
 
 @dataclass(frozen=True)
 class Rates:
-    """What the device reached in this program: bytes moved (read and written) and floating-point operations per second."""
+    """The device's measured rates: bytes moved (read and written) and floating-point operations per second."""
 
     copy_bytes_per_s: float
     flops_per_s: float
 
 
 def profile_text(uses: dict[str, KernelUse], wall_s: float, rates: Rates, pairs: dict[str, int]) -> str:
-    """A table of ``uses`` (Profile.uses), the longest first, and the share of ``wall_s`` that all of them fill.
+    """Formats a table of ``uses`` (Profile.uses) and the part of ``wall_s`` that kernels take.
 
-    ``pairs``: Gaussian–pixel pairs that one launch of a kernel evaluates, where that is known.
+    ``pairs``: Gaussian–pixel pairs per launch of a kernel, where known.
     """
     busy_s = sum(use.seconds for use in uses.values())
     heads = ("kernel", "launches", "seconds", "share", "ms each", "GB/s", "of copy", "Gpairs/s", "ns/pair")
@@ -104,7 +104,7 @@ def profile_text(uses: dict[str, KernelUse], wall_s: float, rates: Rates, pairs:
 def measure_rates(
     queue: "cl.CommandQueue", multiply_add: "cl.Kernel", lanes: int, units: int, group: int
 ) -> Rates:
-    """Both rates, the best of a few runs; ``queue`` needs profiling."""
+    """Measures both rates, the best of a few runs; ``queue`` needs profiling."""
     context = queue.context
     source, target = (cl.Buffer(context, cl.mem_flags.READ_WRITE, _COPY_BYTES) for _ in range(2))
     cl.enqueue_fill_buffer(queue, source, np.zeros(1, np.float32), 0, _COPY_BYTES)

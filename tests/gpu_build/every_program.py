@@ -20,7 +20,7 @@ from compilers import TARGETS, KernelCost, Refused, missing  # noqa: E402
 from every_kernel import cases  # noqa: E402
 
 from phyradgs_cl.runtime import Kernel, Runtime  # noqa: E402
-from phyradgs_cl.runtime.source import kernel_source  # noqa: E402
+from phyradgs_cl.runtime.opencl import kernel_source  # noqa: E402
 
 Programs = dict[tuple[str, tuple[str, ...]], set[str]]
 """Names of the kernels that are launched, by program and options."""

@@ -2,7 +2,7 @@
 
 import platform
 
-from phyradgs_cl.runtime.host_cpu import cpu_facts, cpu_name
+from phyradgs_cl.runtime.pocl import cpu_facts, cpu_name
 
 _TWO_CORES = """processor\t: 0
 cpu family\t: 25

@@ -6,9 +6,9 @@ import pytest
 from phyradgs_cl.errors import DeviceError
 from phyradgs_cl.resources import resource
 from phyradgs_cl.runtime import Runtime
-from phyradgs_cl.runtime import source as sources
+from phyradgs_cl.runtime import opencl as sources
 from phyradgs_cl.runtime.context import default_lanes
-from phyradgs_cl.runtime.source import kernel_source
+from phyradgs_cl.runtime.opencl import kernel_source
 
 PROGRAMS = sorted(path.stem for path in resource("cl").glob("*.cl"))
 
