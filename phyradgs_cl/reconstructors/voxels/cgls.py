@@ -87,4 +87,4 @@ class Cgls:
         *arrays, gamma = state_arrays(state, ["volume", "residual", "direction", "gradient", "gamma"])
         self.volume, self.residual, self.direction, self.gradient = map(self.system.space.array, arrays)
         self.gamma = float(gamma)
-        self.system.stand_at(self.volume)
+        self.system.linearise_at(self.volume)

@@ -194,8 +194,8 @@ class Fista:
         self.momentum, self.least = 1.0, float("inf")
         self.finished: str | None = None
         # AᵀA has no negative entry: its largest row sum bounds its norm
-        self.curvature = space.largest(system.adjoint(system.weighed(system.row_sums()))) or 1.0
-        self._smallest = _FEWEST * space.largest(system.adjoint(system.weighed(system.measured)), absolute=True)
+        self.curvature = space.largest(system.adjoint(system.apply_weights(system.row_sums()))) or 1.0
+        self._smallest = _FEWEST * space.largest(system.adjoint(system.apply_weights(system.measured)), absolute=True)
         self._reach = Reach.of(system)
         self.subsets = self._subsets(min(options.subsets, system.frames))
 
@@ -230,7 +230,7 @@ class Fista:
         beta = (self.momentum - 1) / following
         point = space.extrapolate(self.volume, self.previous, beta)
         residual = subset.residual(point)
-        gradient = subset.back(subset.weighed(residual))
+        gradient = subset.back(subset.apply_weights(residual))
         moved = space.add(point, gradient, len(self.subsets) / self.curvature)
         volume = self.prior(space, moved, weight / self.curvature, nonnegative=self.options.nonnegative)
         uphill = space.turn(point, volume, self.volume) > 0

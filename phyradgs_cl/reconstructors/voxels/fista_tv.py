@@ -64,8 +64,8 @@ class FistaTv:
         self.momentum = 1.0
         self.finished: str | None = None
         # AᵀA has no negative entry: its largest row sum bounds its norm
-        self.curvature = space.largest(system.adjoint(system.weighed(system.row_sums()))) or 1.0
-        gradient = system.adjoint(system.weighed(system.measured))
+        self.curvature = space.largest(system.adjoint(system.apply_weights(system.row_sums()))) or 1.0
+        gradient = system.adjoint(system.apply_weights(system.measured))
         self.tv_weight = options.tv_weight * space.largest(gradient, absolute=True)
 
     def start_from(self, volume: Any) -> None:
@@ -76,9 +76,9 @@ class FistaTv:
         system, space, options = self.system, self.system.space, self.options
         following = float((1 + np.sqrt(1 + 4 * self.momentum**2)) / 2)
         beta = (self.momentum - 1) / following
-        point = space.add(self.volume, system.less(self.volume, self.previous), beta)
-        projected = space.add(self.projected, system.less(self.projected, self.projected_previous), beta)
-        gradient = system.back(system.weighed(system.less(system.measured, projected)))
+        point = space.add(self.volume, system.difference(self.volume, self.previous), beta)
+        projected = space.add(self.projected, system.difference(self.projected, self.projected_previous), beta)
+        gradient = system.back(system.apply_weights(system.difference(system.measured, projected)))
         moved = space.add(point, gradient, 1 / self.curvature)
         prox = partial(
             self.prox,
@@ -87,11 +87,11 @@ class FistaTv:
             nonnegative=options.nonnegative,
         )
         volume = space.apply(prox, moved, system.volume_shape)
-        uphill = space.inner(system.less(point, volume), system.less(volume, self.volume)) > 0
+        uphill = space.inner(system.difference(point, volume), system.difference(volume, self.volume)) > 0
         self.previous, self.volume = self.volume, volume
         self.projected_previous, self.projected = self.projected, system.expected(volume)
         self.momentum = 1.0 if uphill else following
-        return space.norm(system.less(system.measured, self.projected))
+        return space.norm(system.difference(system.measured, self.projected))
 
     def state(self) -> dict[str, np.ndarray]:
         arrays = (self.volume, self.previous, self.projected, self.projected_previous)
@@ -102,4 +102,4 @@ class FistaTv:
         *arrays, momentum, dual = state_arrays(state, [*_ARRAYS, "momentum", "dual"])
         self.volume, self.previous, self.projected, self.projected_previous = map(self.system.space.array, arrays)
         self.momentum, self.prox.dual = float(momentum), dual
-        self.system.stand_at(self.volume)
+        self.system.linearise_at(self.volume)

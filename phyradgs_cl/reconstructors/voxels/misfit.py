@@ -63,7 +63,7 @@ class Reach:
     @classmethod
     def of(cls, system: System) -> "Reach":
         drawn = np.random.default_rng(0).standard_normal(system.measured.shape, np.float32)
-        backs = system.adjoint(system.masked(system.weighed(system.space.array(drawn)))), system.column_sums()
+        backs = system.adjoint(system.masked(system.apply_weights(system.space.array(drawn)))), system.column_sums()
         middle = tuple(slice(n // 4, n - n // 4) for n in system.volume_shape)
         noise, ones = (system.space.numpy(back)[middle] for back in backs)
         return cls(float(noise.std(dtype=np.float64)), float(ones.mean(dtype=np.float64)))

@@ -1,14 +1,12 @@
-"""The iterative voxel methods between scan and loop: options, system, convergence, facts.
+"""Runs an iterative voxel method on a scan: its options, its inputs, its convergence, the facts of its result.
 
-A method is a class with ``system``, ``volume``, ``step()``, ``state()`` and ``restore()``; ``run_iterations`` runs it, and
-``voxel_method`` makes a line of the registry of it.
+A method is a subclass of ``Algorithm``. ``voxel_method`` makes it an entry of the registry; ``run_iterations`` runs it.
 """
 
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, ClassVar, NamedTuple
-from typing import Protocol as Interface
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -26,29 +24,30 @@ from phyradgs_cl.reconstructors.result import (
     State,
     ignore_progress,
     option_facts,
+    state_arrays,
 )
 from phyradgs_cl.reconstructors.voxels.system import System
 from phyradgs_cl.runtime import Runtime
 
 MOST_ITERATIONS = 1_000_000
-_SYSTEM_FRAMES = 6  # stacks of frames: measurement, mask, transmission, and what one comparison makes
+_SYSTEM_FRAMES = 6  # stacks of frames: measurement, mask, transmission, and the intermediate results of one residual
 
 
 @dataclass(frozen=True)
 class IterativeOptions:
-    """What every iterative method can be told.
+    """Options of every iterative method.
 
     motion: static, micro-views, or per-row (every line at its own times). iterations: passes over all frames.
     nonnegative: clip the volume at 0 after every update. tolerance: stop when an iteration changes the volume by
-    less than this share of its norm; 0 runs all iterations. detector_model: what is averaged over a line's times, line
-    integrals (log) or intensity, or what the scan says.
+    less than this share of its norm; 0 runs all iterations. detector_model: which quantity the detector averages over a
+    line's times, line integrals (log) or intensity, or the model that the scan states (scan).
     """
 
     transmission_weights: ClassVar[bool] = False
-    """Weigh pixels by their transmission; methods that can have an option of this name."""
+    """Weights pixels by their transmission. Some methods have an option of this name."""
 
     noise_stop: ClassVar[float] = 0.0
-    """Times the noise, the residual at which the run ends; likewise."""
+    """Ends the run when the residual is this many times the noise. Some methods have an option of this name."""
 
     MOTIONS: ClassVar[tuple[Motion, ...]] = motions_for(RAYS)
 
@@ -66,62 +65,78 @@ class IterativeOptions:
         check_motion(self.motion, self.MOTIONS)
 
 
-class Algorithm(Interface):
-    """One iterative method on one system."""
+class Algorithm:
+    """One iterative method on one system. ``volume`` (nz, ny, nx) in 1/mm is an array of the system's space.
 
-    system: System
-    volume: Any
-    """The present estimate (nz, ny, nx) float32, 1/mm, an array of the system's space; a new one after every step."""
-    finished: str | None
-    """Why the method stops by itself, else None."""
+    A subclass writes ``step``, and names its running state: attributes that are arrays of the space, and numbers.
+    """
+
+    ARRAYS: ClassVar[tuple[str, ...]] = ("volume",)
+    NUMBERS: ClassVar[tuple[str, ...]] = ()
+
+    finished: str | None = None
+    """Why the method stops before its last iteration; None while it goes on."""
+
+    def __init__(self, system: System) -> None:
+        self.system = system
+        self.volume = system.space.full(system.volume_shape, 0.0)
 
     def start_from(self, volume: Any) -> None:
         """Takes a volume of the system's space as the first estimate, before the first step."""
-        ...
+        self.volume = volume
 
     def step(self) -> float:
-        """One iteration; the norm of p − A x as far as the method knows it (see its own docstring)."""
-        ...
+        """Does one iteration, which replaces ``volume``. Returns a norm of p − A x; each subclass says of which x."""
+        raise NotImplementedError
 
     def state(self) -> dict[str, np.ndarray]:
-        """What ``restore`` needs to go on with the next iteration."""
-        ...
+        """Returns the arrays from which ``restore`` continues with the next iteration."""
+        arrays = {name: self.system.space.numpy(getattr(self, name)) for name in self.ARRAYS}
+        return {**arrays, **{name: np.array(getattr(self, name)) for name in self.NUMBERS}}
 
-    def restore(self, state: State) -> None: ...
+    def restore(self, state: State) -> None:
+        """Continues from ``state``; the derivative of the intensity model is again that at ``volume``."""
+        for name, array in zip(self.ARRAYS, state_arrays(state, self.ARRAYS), strict=True):
+            setattr(self, name, self.system.space.array(array))
+        for name, number in zip(self.NUMBERS, state_arrays(state, self.NUMBERS), strict=True):
+            setattr(self, name, number.item())
+        self.system.linearise_at(self.volume)
+
+
+@dataclass(frozen=True, eq=False)
+class MethodInputs:
+    """The arguments of one run: scan, options, device, seed, report, the state to resume from, the first volume in 1/mm."""
+
+    scan: Scan
+    options: Any
+    rt: Runtime
+    seed: int = 0
+    report: ProgressReport = ignore_progress
+    resume: State | None = None
+    initial: np.ndarray | None = None
 
 
 def run_iterations(
-    method: str,
-    make: Callable[[System], Algorithm],
-    scan: Scan,
-    options: IterativeOptions,
-    rt: Runtime,
-    report: ProgressReport,
-    resume: State | None,
-    initial: np.ndarray | None = None,
-    *,
-    volumes: int,
-    frames: int,
+    method: str, make: Callable[[System], Algorithm], inputs: MethodInputs, *, volumes: int, frames: int
 ) -> Reconstruction:
-    """Builds the scan's system, runs the method on it, and returns volume, record and facts. ``initial``: where it starts.
+    """Builds the scan's system, runs the method on it, and returns volume, record and facts.
 
-    ``volumes`` and ``frames`` (stacks of all of them) are what the method holds at one time, its tables included: where the
-    device has room for them they stay on it.
-    The record has a line an iteration: residual ‖p − A x‖/‖p‖, change ‖x − x'‖/‖x‖, seconds since the start.
+    The method holds ``volumes`` volumes and ``frames`` stacks of all frames at one time, its tables included. They stay on
+    the device where it has room for them. The record has a line per iteration: the residual ‖p − A x‖/‖p‖, the change
+    ‖x − x'‖/‖x‖, and the seconds since the start.
     """
     started = time.perf_counter()
+    scan, options, rt = inputs.scan, inputs.options, inputs.rt
     system = System.of_scan(rt, scan, options.motion, options.detector_model)
     if options.transmission_weights:
         system = system.transmission_weighted()
     system = system.resident(rt, volumes + 2, frames + _SYSTEM_FRAMES)
     algorithm = make(system)
-    if initial is not None and resume is None:
-        algorithm.start_from(system.space.array(np.ascontiguousarray(initial, np.float32)))
-    norm = system.space.norm(system.measured) or 1.0
-    enough = options.noise_stop * system.noise_norm() / norm if options.noise_stop else 0.0
-    run = _Iterations(algorithm, options, scan.grid, norm, enough)
-    loop = Loop(run, rt.ranks, report, started)
-    loop.run(resume)
+    if inputs.initial is not None and inputs.resume is None:
+        algorithm.start_from(system.space.array(np.ascontiguousarray(inputs.initial, np.float32)))
+    run = _Iterations(algorithm, options, scan.grid)
+    loop = Loop(run, rt.ranks, inputs.report, started)
+    loop.run(inputs.resume)
     facts: dict[str, object] = {
         "method": method,
         "options": option_facts(options),
@@ -136,62 +151,43 @@ def run_iterations(
     return Reconstruction(volume, scan.grid, record=loop.record, facts=facts, state=state)
 
 
-class Setting(NamedTuple):
-    """What a method may need beside its system and its options."""
-
-    scan: Scan
-    rt: Runtime
-    seed: int
-    initial: np.ndarray | None
-
-
 def voxel_method(
     name: str,
     default: IterativeOptions,
-    make: Callable[[System, Any, Setting], Algorithm],
+    make: Callable[[System, Any, MethodInputs], Algorithm],
     *,
     volumes: int | Callable[[Scan, Any], int],
     frames: int,
 ) -> Method:
-    """An algorithm as a method; ``volumes``, of scan and options where it depends on them, and ``frames`` as of
-    ``run_iterations``."""
+    """Returns an algorithm as a method. ``volumes`` and ``frames`` as in ``run_iterations``; volumes may depend on the run."""
 
-    def run(
-        scan: Scan,
-        options: Any,
-        rt: Runtime,
-        *,
-        seed: int = 0,
-        report: ProgressReport = ignore_progress,
-        resume: State | None = None,
-        initial: np.ndarray | None = None,
-    ) -> Reconstruction:
-        setting = Setting(scan, rt, seed, initial)
+    def run(scan: Scan, options: Any, rt: Runtime, **arguments: Any) -> Reconstruction:
+        inputs = MethodInputs(scan, options, rt, **arguments)
         held = volumes(scan, options) if callable(volumes) else volumes
         return run_iterations(
-            name, lambda system: make(system, options, setting), scan, options, rt, report, resume, initial,
-            volumes=held, frames=frames,
-        )  # fmt: skip
+            name, lambda system: make(system, options, inputs), inputs, volumes=held, frames=frames
+        )
 
     return Method(run, {"default": default}, is_shared=True, takes_initial=True, ends_anywhere=True)
 
 
 class _Iterations:
-    """An algorithm with its convergence, ``Stepwise`` for the loop."""
+    """An algorithm and its convergence, as the ``Stepwise`` that a ``Loop`` runs."""
 
     quantity, remedy = "residual", "check the scan for extreme values, or lower the relaxation"
 
-    def __init__(
-        self, algorithm: Algorithm, options: IterativeOptions, grid: Grid, measured_norm: float, enough: float
-    ) -> None:
+    def __init__(self, algorithm: Algorithm, options: IterativeOptions, grid: Grid) -> None:
         self.algorithm, self.options, self.grid = algorithm, options, grid
-        self.measured_norm, self.enough = measured_norm, enough
         self.iteration, self.iterations = 0, options.iterations
         self.residual, self.change = 0.0, 0.0
+        system = algorithm.system
+        self.measured_norm = system.space.norm(system.measured) or 1.0
+        noise = system.noise_norm() if options.noise_stop else 0.0
+        self.noise_residual = options.noise_stop * noise / self.measured_norm
 
     @property
     def finished(self) -> str | None:
-        if self.enough and self.residual <= self.enough:
+        if self.noise_residual and self.residual <= self.noise_residual:
             return "residual as small as the noise"
         return self.algorithm.finished or ("tolerance" if self.change < self.options.tolerance else None)
 

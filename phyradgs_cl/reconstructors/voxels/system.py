@@ -120,13 +120,13 @@ class System:
 
     def residual(self, volume: Any) -> Any:
         """Measured less expected, dimensionless: p − A x, or p − I(x)."""
-        return self.less(self.measured, self.expected(volume))
+        return self.difference(self.measured, self.expected(volume))
 
-    def less(self, x: Any, y: Any) -> Any:
+    def difference(self, x: Any, y: Any) -> Any:
         """x − y."""
         return self.space.add(x, y, -1.0)
 
-    def stand_at(self, volume: Any) -> None:
+    def linearise_at(self, volume: Any) -> None:
         """Puts J where an interrupted run had it; A is the same everywhere."""
         if self.intensity is not None:
             self.expected(volume)
@@ -144,9 +144,9 @@ class System:
 
     def column_sums(self) -> Any:
         """Aᵀ 1 in mm over the pixels that count, or Aᵀ t with transmission weights."""
-        return self.adjoint(self.masked(self.weighed(self.space.full(self.measured.shape, 1.0))))
+        return self.adjoint(self.masked(self.apply_weights(self.space.full(self.measured.shape, 1.0))))
 
-    def weighed(self, frames: Any) -> Any:
+    def apply_weights(self, frames: Any) -> Any:
         """Frames times their transmission weights, where there are any."""
         return frames if self.transmission is None else self.space.multiply(frames, self.transmission)
 
@@ -179,7 +179,7 @@ def row_weights(system: System) -> Any:
     A ray that only grazes an edge of the volume would else put its whole noise on a voxel or two, and bright corners
     are what one sees of it. TIGRE measures the paths in a box that is a tenth larger, to the same end.
     """
-    return system.weighed(system.space.reciprocal(system.row_sums(), _SHORTEST_PATH))
+    return system.apply_weights(system.space.reciprocal(system.row_sums(), _SHORTEST_PATH))
 
 
 def column_weights(system: System) -> Any:
