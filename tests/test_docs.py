@@ -73,7 +73,7 @@ def test_the_worked_example_of_a_method_works(rt, monkeypatch) -> None:
     protocol = SimulationOptions(protocol=make_protocol("rapid", views=8, exposure_deg=45.0))
     scan = simulate(scene.source, geometry, scene.grid, protocol, reference=scene.reference)
     blocks = re.findall(r"```python\n(.*?)```", (DOCS / "methods.md").read_text(encoding="utf-8"), re.S)
-    source = next(b for b in blocks if "class Landweber:" in b)
+    source = next(b for b in blocks if "class Landweber(" in b)
     module = ModuleType("landweber_of_the_docs")
     monkeypatch.setitem(sys.modules, module.__name__, module)
     exec(compile(source, "docs/methods.md", "exec"), module.__dict__)

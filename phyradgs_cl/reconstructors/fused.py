@@ -1,12 +1,11 @@
-"""Voxels and splats of one scan together: their errors differ, so that their mean is nearer to the truth than either.
+"""The weighted mean of a voxel and a splat reconstruction of one scan, which is nearer to the truth than either.
 
-Two estimates of about the same error whose errors correlate by ρ have a mean that is 10 log10(2/(1 + ρ)) dB better. First
-``fista`` on voxels, then Gaussians that start from its volume, then a mean in which the better voxels weigh more; half
-their difference says where neither is sure.
+Two estimates with equal errors that correlate by ρ have a mean that is 10 log10(2/(1 + ρ)) dB better. ``fista`` runs first;
+Gaussians then start from its volume. Half the difference of the two volumes maps their disagreement.
 """
 
 from dataclasses import dataclass, replace
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 from scipy.ndimage import uniform_filter
@@ -16,28 +15,23 @@ from phyradgs_cl.acquisition import Exact, Motion, PerRow, Scan, Static
 from phyradgs_cl.acquisition.motion import check_motion
 from phyradgs_cl.acquisition.scan import DETECTOR_MODELS
 from phyradgs_cl.reconstructors.method import Method
-from phyradgs_cl.reconstructors.result import (
-    ProgressReport,
-    Reconstruction,
-    State,
-    ignore_progress,
-    option_facts,
-)
-from phyradgs_cl.reconstructors.splats import phyradgs
+from phyradgs_cl.reconstructors.result import Reconstruction, option_facts
+from phyradgs_cl.reconstructors.splats.method import reconstruct_splats
 from phyradgs_cl.reconstructors.splats.options import SplatOptions
 from phyradgs_cl.reconstructors.voxels.fista import FistaOptions, fista_stages
+from phyradgs_cl.reconstructors.voxels.run import MethodInputs
 from phyradgs_cl.reconstructors.voxels.stages import Stage, run_stages
 from phyradgs_cl.runtime import Runtime
 
-_NEAR = 3  # voxels along each side: at a single one two estimates may agree by chance
+_NEIGHBOURHOOD = 3  # voxels along each side; at a single voxel two estimates may agree by chance
 
 
 @dataclass(frozen=True)
 class FusedOptions:
-    """iterations: of the splats, whose presets' shares of it are kept; voxel_iterations: passes of ``fista`` before them.
+    """iterations: of the splats; voxel_iterations: passes of ``fista`` before them.
 
-    splat_weight: share of the splats' volume in the result. prior_weight: as of ``fista``. motion: static, or exact (the
-    voxels' lines each at their own times, the splats moving).
+    splat_weight: share of the splats' volume in the result. prior_weight: as in ``fista``. motion: static, or exact (lines
+    at their own times for the voxels, moving splats).
     """
 
     MOTIONS: ClassVar[tuple[Motion, ...]] = (Static(), Exact())
@@ -72,48 +66,43 @@ class FusedOptions:
         return SplatOptions(motion=self.motion, iterations=self.iterations, detector_model=self.detector_model)
 
 
-def fused(
-    scan: Scan,
-    options: FusedOptions,
-    rt: Runtime,
-    *,
-    seed: int = 0,
-    report: ProgressReport = ignore_progress,
-    resume: State | None = None,
-    initial: np.ndarray | None = None,
-) -> Reconstruction:
-    """The weighted mean of both volumes in 1/mm, with the Gaussians of one; the seed is the splats'.
+def fused(scan: Scan, options: FusedOptions, rt: Runtime, **arguments: Any) -> Reconstruction:
+    """Returns the weighted mean of both volumes in 1/mm, with the Gaussians. ``arguments``: the other ``MethodInputs``.
 
-    ``disagreement`` is the map of where they differ, None before there are splats. The fact ``stages`` has those of the
-    parts; ``disagreement_per_mm`` is half the RMS of their difference.
+    ``disagreement`` maps where the volumes differ; it is None before there are splats. The fact ``disagreement_per_mm`` is
+    half the RMS of their difference.
     """
-    voxels = fista_stages(scan, options.voxels(), rt)
+    inputs = MethodInputs(scan, options, rt, **arguments)
     halves: dict[str, np.ndarray] = {}
 
-    def splats(before: np.ndarray | None, told: ProgressReport, left: State | None) -> Reconstruction:
-        assert before is not None
-        start = np.maximum(before, 0)
-        return phyradgs.METHOD.run(scan, options.splats(), rt, seed=seed, report=told, resume=left, initial=start)
+    def splats(stage: MethodInputs) -> Reconstruction:
+        assert stage.initial is not None
+        start = np.maximum(stage.initial, 0)
+        return reconstruct_splats(
+            scan, options.splats(), rt, method="phyradgs",
+            seed=stage.seed, report=stage.report, resume=stage.resume, initial=start,
+        )  # fmt: skip
 
-    def both(volume: np.ndarray, before: np.ndarray | None) -> np.ndarray:
+    def mean_of_both(volume: np.ndarray, before: np.ndarray | None) -> np.ndarray:
         assert before is not None
         halves["difference"] = volume - before
         mean: np.ndarray = before + np.float32(options.splat_weight) * halves["difference"]
         return mean
 
-    stages = [*voxels, Stage("splats", options.iterations, splats, both)]
-    result = run_stages(stages, scan.grid, report, resume, initial)
+    stages = fista_stages(replace(inputs, options=options.voxels()))
+    stages.append(Stage("splats", options.iterations, splats, mean_of_both))
+    result = run_stages(stages, inputs)
     result.facts.update(method="fused", options=option_facts(options))
     if "difference" not in halves:
         return result
     squares = np.square(halves["difference"], dtype=np.float64)
     result.facts["disagreement_per_mm"] = float(np.sqrt(squares.mean()) / 2)
-    return replace(result, disagreement=_half_of_nearby(squares))
+    return replace(result, disagreement=_half_local_rms(squares))
 
 
-def _half_of_nearby(squares: np.ndarray) -> np.ndarray:
-    """Half the root of the means of squares (nz, ny, nx) over nearby voxels, float32."""
-    means = np.maximum(uniform_filter(squares, _NEAR, mode="nearest"), 0)  # its running sums round
+def _half_local_rms(squares: np.ndarray) -> np.ndarray:
+    """Half the RMS over neighbouring voxels, from squares (nz, ny, nx), float32."""
+    means = np.maximum(uniform_filter(squares, _NEIGHBOURHOOD, mode="nearest"), 0)  # rounding may make a mean negative
     return (np.sqrt(means) / 2).astype(np.float32)
 
 

@@ -21,8 +21,13 @@ from phyradgs_cl.reconstructors import (
     reconstruct,
 )
 from phyradgs_cl.reconstructors.voxels.fista import Fista, FistaOptions
-from phyradgs_cl.reconstructors.voxels.misfit import Misfit, Reach, misfit_of
-from phyradgs_cl.reconstructors.voxels.priors import OwnPrior, prior_of
+from phyradgs_cl.reconstructors.voxels.prior_weight import (
+    AdjointResponse,
+    FrameError,
+    PriorWeight,
+    frame_error,
+)
+from phyradgs_cl.reconstructors.voxels.priors import OwnPrior, Prior, PriorInputs, prior_of
 from phyradgs_cl.reconstructors.voxels.system import System
 from phyradgs_cl.simulation import SimulationOptions, phantom_scene, simulate
 
@@ -60,8 +65,9 @@ def test_each_prior_is_better_than_none_and_subsets_are_quicker(rt, scan) -> Non
 def test_subsets_that_pull_apart_are_joined(rt, scan) -> None:
     """One frame a subset, with momentum, diverges; joined it ends near the whole scan's residual."""
     options = FistaOptions(subsets=1000)
-    prior = prior_of("tv", rt, scan.grid, 5, 12)
-    algorithm = Fista(System.of_scan(rt, scan, options.motion), options, prior, Misfit(0.01))
+    prior = prior_of("tv", PriorInputs(rt, scan.grid, 5, 12))
+    system = System.of_scan(rt, scan, options.motion)
+    algorithm = Fista(system, options, prior, PriorWeight(system, FrameError(0.01), 0.42))
     assert len(algorithm.subsets) == scan.frames
     residuals = [algorithm.step() for _ in range(30)]
     assert 1 <= len(algorithm.subsets) <= scan.frames // 2
@@ -109,36 +115,33 @@ def test_subsets_that_pull_apart_slowly_are_joined_too(rt) -> None:
 
 def test_the_weight_follows_what_comes_back_of_noise_and_edges(rt, scan) -> None:
     """A blur, which spreads a ray over voxels, averages noise."""
-    prior = prior_of("tv", rt, scan.grid, 5, 12)
 
-    def weight(motion: Motion, misfit: Misfit, density: float = 0.0) -> float:
-        method = Fista(System.of_scan(rt, scan, motion), FistaOptions(), prior, misfit)
+    def weight(motion: Motion, error: FrameError, density: float = 0.0) -> float:
         volume = np.zeros(scan.grid.shape, np.float32)
         volume[4:9, 5:8] = density
-        method.start_from(method.system.space.array(volume))
-        return method.weight
+        return PriorWeight(System.of_scan(rt, scan, motion), error, 0.42).at(volume)
 
-    noise, edges = weight(PerRow(), Misfit(0.03)), weight(PerRow(), Misfit(0.0, 0.1), 0.4)
-    assert noise == pytest.approx(3 * weight(PerRow(), Misfit(0.01)), rel=1e-6)
-    assert noise < 0.95 * weight(Static(), Misfit(0.03))
-    assert edges == pytest.approx(weight(PerRow(), Misfit(0.0, 0.2), 0.2), rel=1e-6)
-    assert weight(PerRow(), Misfit(0.03, 0.1), 0.4) == pytest.approx(np.hypot(noise, edges), rel=1e-6)
+    noise, edges = weight(PerRow(), FrameError(0.03)), weight(PerRow(), FrameError(0.0, 0.1), 0.4)
+    assert noise == pytest.approx(3 * weight(PerRow(), FrameError(0.01)), rel=1e-6)
+    assert noise < 0.95 * weight(Static(), FrameError(0.03))
+    assert edges == pytest.approx(weight(PerRow(), FrameError(0.0, 0.2), 0.2), rel=1e-6)
+    assert weight(PerRow(), FrameError(0.03, 0.1), 0.4) == pytest.approx(np.hypot(noise, edges), rel=1e-6)
 
 
 def test_rays_that_are_wrong_alike_add_up_and_noise_averages(rt, scan) -> None:
     """Of half the frames half as much of the first comes back, and √½ of the second."""
     half = replace(scan, projections=scan.projections[::2], frame_start_s=scan.frame_start_s[::2])
-    whole, fewer = (Reach.of(System.of_scan(rt, one, Static())) for one in (scan, half))
-    assert fewer.alike_mm == pytest.approx(whole.alike_mm / 2, rel=0.01)
+    whole, fewer = (AdjointResponse.of(System.of_scan(rt, one, Static())) for one in (scan, half))
+    assert fewer.common_mm == pytest.approx(whole.common_mm / 2, rel=0.01)
     assert fewer.noise_mm == pytest.approx(whole.noise_mm / np.sqrt(2), rel=0.1)
 
 
 def test_voxels_miss_more_the_larger_they_are_and_less_behind_a_blur(scan) -> None:
     grids = (replace(scan, grid=Grid.cube(n, 2.0), reference=None) for n in (12, 24))
-    coarse, fine = (misfit_of(one, Static()) for one in grids)
+    coarse, fine = (frame_error(one, Static()) for one in grids)
     assert coarse.noise == fine.noise and coarse.edges_mm == pytest.approx(2 * fine.edges_mm)
     smeared = 4 / 5 * np.deg2rad(18.0) * (2.0 / 4) / (2.0 / 24)  # voxels, half-way from the axis to the side
-    blurred = misfit_of(replace(scan, grid=Grid.cube(24, 2.0), reference=None), PerRow(5))
+    blurred = frame_error(replace(scan, grid=Grid.cube(24, 2.0), reference=None), PerRow(5))
     assert blurred.noise == fine.noise
     assert blurred.edges_mm == pytest.approx(fine.edges_mm / np.sqrt(1 + smeared), rel=0.02)
 
@@ -151,12 +154,13 @@ def test_a_denoiser_of_ones_own_is_the_prior(rt, scan) -> None:
         return volume / 2
 
     options = FistaOptions(subsets=1)
-    algorithm = Fista(System.of_scan(rt, scan, options.motion), options, OwnPrior(half), Misfit(0.01))
+    system = System.of_scan(rt, scan, options.motion)
+    weight = PriorWeight(system, FrameError(0.01), 0.42)
+    algorithm, plain = (Fista(system, options, prior, weight) for prior in (OwnPrior(half), Prior()))
     algorithm.step()
-    plain = Fista(algorithm.system, options, prior_of("none", rt, scan.grid, 5, 12), Misfit(0.01))
     plain.step()
     np.testing.assert_allclose(algorithm.volume, plain.volume / 2, rtol=1e-6)
-    assert seen == [algorithm.weight / algorithm.curvature]
+    assert seen == [weight.at(algorithm.volume) / algorithm.curvature]
 
 
 @pytest.mark.parametrize("method", [name for name, one in METHODS.items() if one.takes_initial])

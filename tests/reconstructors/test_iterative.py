@@ -23,10 +23,11 @@ from phyradgs_cl.reconstructors.voxels.asd_pocs import AsdPocs, AsdPocsOptions
 from phyradgs_cl.reconstructors.voxels.cgls import Cgls
 from phyradgs_cl.reconstructors.voxels.fista import Fista, FistaOptions
 from phyradgs_cl.reconstructors.voxels.fista_tv import FistaTv, FistaTvOptions
-from phyradgs_cl.reconstructors.voxels.misfit import Misfit
-from phyradgs_cl.reconstructors.voxels.priors import NoPrior
-from phyradgs_cl.reconstructors.voxels.sart import OS_SART, Sart, SartOptions, spread_order
+from phyradgs_cl.reconstructors.voxels.prior_weight import FrameError, PriorWeight
+from phyradgs_cl.reconstructors.voxels.priors import Prior
+from phyradgs_cl.reconstructors.voxels.sart import OS_SART, Sart, SartOptions
 from phyradgs_cl.reconstructors.voxels.sirt import Sirt, SirtOptions
+from phyradgs_cl.reconstructors.voxels.subsets import spread_order
 from phyradgs_cl.reconstructors.voxels.system import System
 from phyradgs_cl.runtime.algebra import norm
 from phyradgs_cl.simulation import SimulationOptions, phantom_scene, simulate
@@ -250,7 +251,9 @@ def algorithms(rt, system: System) -> dict[str, Callable[[], object]]:
         "os-sart": lambda: Sart(system, replace(OS_SART, frames_per_subset=2), 0),
         "sirt": lambda: Sirt(system, SirtOptions()), "cgls": lambda: Cgls(system),
         "asd-pocs": lambda: AsdPocs(system, free, 0, TvDescent(rt, VOLUME), 0.0),
-        "fista": lambda: Fista(system, FistaOptions(subsets=1), NoPrior(), Misfit(0.0)),
+        "fista": lambda: Fista(
+            system, FistaOptions(subsets=1), Prior(), PriorWeight(system, FrameError(0.0), 0.42)
+        ),
         "fista-tv": lambda: without_tv(rt, system),
     }
 

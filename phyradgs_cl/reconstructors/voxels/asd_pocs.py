@@ -1,4 +1,4 @@
-"""ASD-POCS: a SART pass, then a few steps down the total variation, the two kept in balance.
+"""ASD-POCS: a SART pass, then a few descent steps of the total variation, with the two lengths kept in balance.
 
 Sidky and Pan, Phys. Med. Biol. 53 (2008) 4777, with the step control of TIGRE (Biguri et al. 2016).
 """
@@ -14,18 +14,18 @@ from phyradgs_cl.errors import InputError
 from phyradgs_cl.objective import TvDescent
 from phyradgs_cl.reconstructors.fdk import static_fdk
 from phyradgs_cl.reconstructors.result import State, state_arrays
-from phyradgs_cl.reconstructors.voxels.run import Setting, voxel_method
-from phyradgs_cl.reconstructors.voxels.sart import Sart, SartOptions, kept_columns
+from phyradgs_cl.reconstructors.voxels.run import Algorithm, MethodInputs, voxel_method
+from phyradgs_cl.reconstructors.voxels.sart import Sart, SartOptions, held_volumes
 from phyradgs_cl.reconstructors.voxels.system import System
 
 
 @dataclass(frozen=True)
 class AsdPocsOptions(SartOptions):
-    """tv_steps: TV steps per iteration. tv_share: α, length of a TV step over the first SART pass's change.
+    """tv_steps: TV steps per iteration. tv_share: α, length of a TV step over the change of the first SART pass.
 
-    tv_reduction: factor of that length when TV moves more than ``tv_ratio`` (r_max) of what the data moved while the
-    residual is above ε. residual_share: ε over the residual of FDK's volume. prior_share: of the total variation, that of
-    the difference to the volume that the run starts from (PICCS).
+    tv_reduction: factor of that length when TV moves the volume by more than ``tv_ratio`` (r_max) of the SART pass's change
+    and the residual is above ε. residual_share: ε over the residual of the FDK volume. prior_share: share of the total
+    variation that is taken of the difference to the run's first volume (PICCS).
     """
 
     iterations: int = 10
@@ -47,38 +47,16 @@ class AsdPocsOptions(SartOptions):
         checks.within("prior_share", self.prior_share, 0, 1)
 
 
-def _started(system: System, options: AsdPocsOptions, setting: Setting) -> "AsdPocs":
-    if options.prior_share > 0 and setting.initial is None:
-        found, remedy = f"{options.prior_share:g} without a prior image", "say --initial, or leave prior_share out"
-        raise InputError("prior_share", found, "a volume to start from", remedy)
-    start = system.space.array(static_fdk(setting.rt, setting.scan))
-    epsilon = options.residual_share * system.space.norm(system.residual(start))
-    descend = TvDescent(setting.rt, setting.scan.grid.shape, setting.initial, options.prior_share)
-    return AsdPocs(system, options, setting.seed, descend, epsilon)
-
-
-def _volumes(scan: Scan, options: AsdPocsOptions) -> int:
-    """The prior image and what the volume differs from it by are two more."""
-    return 8 + kept_columns(scan, options) + 2 * (options.prior_share > 0)
-
-
-METHOD = voxel_method("asd-pocs", AsdPocsOptions(), _started, volumes=_volumes, frames=2)
-
-
-class AsdPocs:
-    """The residual that is reported is that of the volume between the SART pass and the TV steps."""
+class AsdPocs(Algorithm):
+    """The residual is that of the volume between the SART pass and the TV steps."""
 
     def __init__(
         self, system: System, options: AsdPocsOptions, seed: int, descend: TvDescent, epsilon: float
     ) -> None:
-        self.system, self.options, self.descend, self.epsilon = system, options, descend, epsilon
+        super().__init__(system)
+        self.options, self.descend, self.epsilon = options, descend, epsilon
         self.sart = Sart(system, options, seed)
-        self.volume = self.sart.volume
-        self.finished: str | None = None
         self.tv_step = 0.0
-
-    def start_from(self, volume: Any) -> None:
-        self.volume = volume
 
     def step(self) -> float:
         options, space = self.options, self.system.space
@@ -108,3 +86,21 @@ class AsdPocs:
         self.volume = self.sart.volume
         (tv_step,) = state_arrays(state, ["tv_step"])
         self.tv_step = float(tv_step)
+
+
+def _started(system: System, options: AsdPocsOptions, inputs: MethodInputs) -> AsdPocs:
+    if options.prior_share > 0 and inputs.initial is None:
+        found, remedy = f"{options.prior_share:g} without a prior image", "say --initial, or leave prior_share out"
+        raise InputError("prior_share", found, "a volume to start from", remedy)
+    start = system.space.array(static_fdk(inputs.rt, inputs.scan))
+    epsilon = options.residual_share * system.space.norm(system.residual(start))
+    descend = TvDescent(inputs.rt, inputs.scan.grid.shape, inputs.initial, options.prior_share)
+    return AsdPocs(system, options, inputs.seed, descend, epsilon)
+
+
+def _held_volumes(scan: Scan, options: Any) -> int:
+    """Those of SART, four of the steps, and with a prior image two more: the image and the difference to it."""
+    return held_volumes(scan, options) + 4 + (2 if options.prior_share > 0 else 0)
+
+
+METHOD = voxel_method("asd-pocs", AsdPocsOptions(), _started, volumes=_held_volumes, frames=2)

@@ -1,14 +1,14 @@
-"""FISTA with a prior, over subsets of the frames: min ½‖p − A x‖² + R(x), x ≥ 0, in some ten passes a grid.
+"""FISTA with a prior over ordered subsets of the frames: min ½‖p − A x‖² + R(x), x ≥ 0, in some ten passes.
 
-The volume that is asked for is a mean over each of its voxels, which large voxels cannot follow an edge with. So the last
-passes are on a grid of smaller ones, where there is room for it, and the result is mostly of their means.
-
-Accelerated proximal gradients (Beck and Teboulle, SIAM J. Imaging Sci. 2 (2009) 183) whose gradients are those of ordered
-subsets, times their number (Kim, Ramani and Fessler, IEEE Trans. Med. Imaging 34 (2015) 167), with restart of the momentum.
+Each subset S of M makes one step: xₖ = prox(yₖ + M/L · A_Sᵀ (p_S − A_S yₖ)), yₖ₊₁ = xₖ + βₖ (xₖ − xₖ₋₁).
+The step and its momentum are FISTA's (Beck and Teboulle, SIAM J. Imaging Sci. 2 (2009) 183, Eqs. 4.1 to 4.3). The gradient
+of a subset, times the number of subsets, stands for that of all frames (Kim, Ramani and Fessler, IEEE Trans. Med. Imaging
+34 (2015) 167). L bounds the norm of AᵀA. The last passes run on smaller voxels (``stages.py``).
 """
 
 import math
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, ClassVar
 
 import numpy as np
@@ -16,42 +16,39 @@ import numpy as np
 from phyradgs_cl import checks
 from phyradgs_cl.acquisition import Motion, PerRow, Scan
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.fields import Grid
 from phyradgs_cl.fields.volume import MOST_VOXELS
 from phyradgs_cl.reconstructors.method import Method
-from phyradgs_cl.reconstructors.result import (
-    ProgressReport,
-    Reconstruction,
-    State,
-    ignore_progress,
-    option_facts,
-    state_arrays,
+from phyradgs_cl.reconstructors.result import Reconstruction, State, option_facts, state_arrays
+from phyradgs_cl.reconstructors.voxels.prior_weight import PriorWeight, frame_error
+from phyradgs_cl.reconstructors.voxels.priors import (
+    PRIORS,
+    Denoiser,
+    Prior,
+    PriorInputs,
+    prior_of,
+    volumes_of,
 )
-from phyradgs_cl.reconstructors.voxels.misfit import Misfit, Reach, density, misfit_of
-from phyradgs_cl.reconstructors.voxels.priors import PRIORS, Denoiser, Prior, prior_of, volumes_of
-from phyradgs_cl.reconstructors.voxels.run import IterativeOptions, run_iterations
-from phyradgs_cl.reconstructors.voxels.sart import spread_order
-from phyradgs_cl.reconstructors.voxels.stages import Stage, run_stages
+from phyradgs_cl.reconstructors.voxels.run import Algorithm, IterativeOptions, MethodInputs, run_iterations
+from phyradgs_cl.reconstructors.voxels.stages import Stage, finer, merge_subvoxels, repeated, run_stages
+from phyradgs_cl.reconstructors.voxels.subsets import OrderedSubsets
 from phyradgs_cl.reconstructors.voxels.system import System
 from phyradgs_cl.runtime import Runtime
 
-_GROWTH = 1.2  # of the residual over the least so far: subsets that pull apart so much are too small
-_FEWEST = 1e-4  # of the largest value of Aᵀp: the weight where frames have no noise
-_VOLUMES, _FRAMES = 16, 3  # held at one time, with the prior `dct`
-_FINE_PASSES, _FINE_SHARE = 3 / 7, np.float32(2 / 3)  # of passes and result: the smaller voxels' (docs/results/settings.md)
-_MOST_PARTED = 90**3  # voxels of a grid that smaller ones are worth their time for: of 64³ they are, of 128³ not
+_VOLUMES, _FRAMES = 16, 3  # that are held at one time, with the prior `dct`
+_SUBVOXEL_PASSES = 3 / 7  # share of the passes on smaller voxels (docs/results/settings.md)
+_MOST_DIVIDED = 90**3  # voxels of a grid: smaller voxels are worth their time at 64³, not at 128³
 
 
 @dataclass(frozen=True)
 class FistaOptions(IterativeOptions):
-    """prior: one of ``PRIORS``, or a function of one's own or its ``package.module:function``: (volume (nz, ny, nx) in 1/mm,
-    noise in 1/mm) to a volume; piccs takes the volume that the run starts from as its prior image, and prior_share of the
-    total variation from the difference to it. prior_weight: strength, relative to what reaches a voxel of the frames' noise
-    and of what voxels so large miss at edges.
+    """prior: one of ``PRIORS``, or a function of the user's own, or its ``package.module:function``. A function takes
+    (volume (nz, ny, nx) in 1/mm, noise in 1/mm) and returns a volume. The prior piccs takes the run's first volume as its
+    prior image, and a prior_share of the total variation from the difference to it. prior_weight: threshold relative to the
+    estimated noise of the gradient plus the discretisation error of large voxels at edges.
 
-    subvoxels: parts of a voxel's side in the last 3 of 7 passes; 0: 2 up to 90³ voxels where there is room, else 1.
-    subsets: of the frames, each with a step of its own; those whose steps pull apart are joined two by two.
-    tv_iterations: dual iterations per proximal map of TV. transmission_weights: as of ``fista-tv``.
+    subvoxels: parts of a voxel's side in the last 3 of 7 passes; 0: 2 up to 90³ voxels where memory allows, else 1.
+    subsets: of the frames, with one step each; subsets whose steps diverge are joined two by two.
+    tv_iterations: dual iterations per proximal map of TV. transmission_weights: as in ``fista-tv``.
     """
 
     FUNCTIONS: ClassVar[tuple[str, ...]] = ("prior",)
@@ -81,19 +78,92 @@ class FistaOptions(IterativeOptions):
         checks.within("tv_iterations", self.tv_iterations, 1, 10_000)
 
 
-def fista(
-    scan: Scan,
-    options: FistaOptions,
-    rt: Runtime,
-    *,
-    seed: int = 0,
-    report: ProgressReport = ignore_progress,
-    resume: State | None = None,
-    initial: np.ndarray | None = None,
-) -> Reconstruction:
-    """The regularised volume of a scan in 1/mm. ``seed`` is accepted for the common signature; nothing is drawn."""
-    stages = fista_stages(scan, options, rt, initial)
-    result = run_stages(stages, scan.grid, report, resume, initial)
+class Accelerated(Algorithm):
+    """A proximal gradient method with FISTA's momentum, restarted where it points uphill.
+
+    The restart is the gradient scheme of O'Donoghue and Candès, Found. Comput. Math. 15 (2015) 715.
+    """
+
+    ARRAYS: ClassVar[tuple[str, ...]] = ("volume", "previous")
+    NUMBERS = ("momentum",)
+
+    def __init__(self, system: System, prior: Prior) -> None:
+        super().__init__(system)
+        self.prior = prior
+        self.previous = self.volume
+        self.momentum = 1.0  # tₖ
+        # AᵀA has no negative entry: its largest row sum bounds its norm
+        bound = system.space.largest(system.adjoint(system.apply_weights(system.row_sums())))
+        self.curvature = bound or 1.0  # L
+
+    def start_from(self, volume: Any) -> None:
+        self.volume = self.previous = volume
+
+    @property
+    def next_momentum(self) -> float:
+        """tₖ₊₁ of Eq. 4.2."""
+        return float((1 + np.sqrt(1 + 4 * self.momentum**2)) / 2)
+
+    @property
+    def extrapolation(self) -> float:
+        """βₖ of Eq. 4.3."""
+        return (self.momentum - 1) / self.next_momentum
+
+    def accept(self, point: Any, volume: Any) -> None:
+        """Takes the result of the step from ``point`` as the present volume."""
+        is_uphill = self.system.space.turn(point, volume, self.volume) > 0
+        self.momentum = 1.0 if is_uphill else self.next_momentum
+        self.previous, self.volume = self.volume, volume
+
+    def state(self) -> dict[str, np.ndarray]:
+        return {**super().state(), **self.prior.state()}
+
+    def restore(self, state: State) -> None:
+        super().restore(state)
+        self.prior.restore(state)
+
+
+class Fista(Accelerated):
+    """The residual is that of the pass: of every subset just before its step."""
+
+    def __init__(self, system: System, options: FistaOptions, prior: Prior, weight: PriorWeight) -> None:
+        super().__init__(system, prior)
+        self.nonnegative, self.weight = options.nonnegative, weight
+        self.subsets = OrderedSubsets(system, options.subsets)
+
+    def step(self) -> float:
+        weight = self.weight.at(self.volume)
+        residual = self.system.space.sum_squares(self._update(subset, weight) for subset in self.subsets) ** 0.5
+        if self.subsets.join_if_diverging(residual):
+            self.momentum, self.previous = 1.0, self.volume
+        self.prior.end_pass(self.system.space, self.volume)
+        return residual
+
+    def _update(self, subset: System, weight: float) -> Any:
+        """Steps down the gradient of a subset. Returns the residual of its frames just before."""
+        space = self.system.space
+        point = space.extrapolate(self.volume, self.previous, self.extrapolation)
+        residual = subset.residual(point)
+        gradient = subset.back(subset.apply_weights(residual))
+        descended = space.add(point, gradient, len(self.subsets) / self.curvature)
+        volume = self.prior(space, descended, weight / self.curvature, nonnegative=self.nonnegative)
+        self.accept(point, volume)
+        return residual
+
+    def state(self) -> dict[str, np.ndarray]:
+        return {**super().state(), "subsets": np.array([len(self.subsets), self.subsets.least_residual])}
+
+    def restore(self, state: State) -> None:
+        super().restore(state)
+        (subsets,) = state_arrays(state, ["subsets"])
+        self.subsets.split(int(subsets[0]))
+        self.subsets.least_residual = float(subsets[1])
+
+
+def fista(scan: Scan, options: FistaOptions, rt: Runtime, **arguments: Any) -> Reconstruction:
+    """Returns the regularised volume of a scan in 1/mm. ``arguments``: the other ``MethodInputs``; no seed is used."""
+    inputs = MethodInputs(scan, options, rt, **arguments)
+    result = run_stages(fista_stages(inputs), inputs)
     result.facts["options"] = option_facts(options)
     return result
 
@@ -101,155 +171,40 @@ def fista(
 METHOD = Method(fista, {"default": FistaOptions()}, is_shared=True, takes_initial=True)
 
 
-def fista_stages(
-    scan: Scan, options: FistaOptions, rt: Runtime, image: np.ndarray | None = None
-) -> list[Stage]:
-    """All passes on the scan's own grid, or the first of them and the rest on one of smaller voxels; ``image``: of piccs."""
-    is_small = math.prod(scan.grid.shape) <= _MOST_PARTED
-    parts = options.subvoxels or (2 if is_small and _has_room(scan.grid, 2, options.prior, rt) else 1)
-    first = options.iterations - (int(_FINE_PASSES * options.iterations) if parts > 1 else 0)
-
-    def voxels(before: np.ndarray | None, report: ProgressReport, resume: State | None) -> Reconstruction:
-        return _run(scan, replace(options, iterations=first), rt, report, resume, before, image)
-
-    def parted(before: np.ndarray | None, report: ProgressReport, resume: State | None) -> Reconstruction:
-        assert before is not None
-        grid = finer(scan.grid, parts)
-        small = replace(options, iterations=options.iterations - first)
-        fine = replace(scan, grid=grid, reference=None)
-        return _run(fine, small, rt, report, resume, repeated(before, parts), repeated(image, parts))
-
-    if parts == 1:
-        return [Stage("voxels", first, voxels)]
-
-    def mixed(volume: np.ndarray, before: np.ndarray | None) -> np.ndarray:
-        assert before is not None
-        mean: np.ndarray = before + _FINE_SHARE * (block_means(volume, parts) - before)
-        return mean
-
-    rest = Stage("subvoxels", options.iterations - first, parted, mixed)
-    return [Stage("voxels", first, voxels), rest]
+def fista_stages(inputs: MethodInputs) -> list[Stage]:
+    """Returns the passes on the scan's own voxels, and those on smaller ones if there are any."""
+    options = inputs.options
+    parts = options.subvoxels or (2 if _gains_from_subvoxels(inputs, 2) else 1)
+    fine_passes = int(_SUBVOXEL_PASSES * options.iterations) if parts > 1 else 0
+    passes = options.iterations - fine_passes
+    stages = [Stage("voxels", passes, partial(_run, options=replace(options, iterations=passes), image=inputs.initial))]
+    if parts > 1:
+        run = partial(_run, options=replace(options, iterations=fine_passes), image=inputs.initial, parts=parts)
+        stages.append(Stage("subvoxels", fine_passes, run, partial(merge_subvoxels, parts=parts)))
+    return stages
 
 
-def finer(grid: Grid, parts: int) -> Grid:
-    """The same box with ``parts`` voxels for one along each axis."""
-    z, y, x = grid.shape
-    dz, dy, dx = grid.voxel_size_mm
-    return replace(grid, shape=(parts * z, parts * y, parts * x), voxel_size_mm=(dz / parts, dy / parts, dx / parts))
+def _run(inputs: MethodInputs, options: FistaOptions, image: np.ndarray | None, parts: int = 1) -> Reconstruction:
+    """Runs one stage, with every voxel divided into ``parts`` along each side. ``image``: the prior image of piccs."""
+    scan, rt = replace(inputs.scan, grid=finer(inputs.scan.grid, parts), reference=None), inputs.rt
+    image, initial = repeated(image, parts), repeated(inputs.initial, parts)
+
+    def make(system: System) -> Fista:
+        prior_inputs = PriorInputs(rt, scan.grid, options.tv_iterations, options.iterations, image, options.prior_share)
+        weight = PriorWeight(system, frame_error(scan, options.motion), options.prior_weight)
+        return Fista(system, options, prior_of(options.prior, prior_inputs), weight)
+
+    stage_inputs = replace(inputs, scan=scan, options=options, initial=initial)
+    volumes = _VOLUMES + volumes_of(options.prior)
+    return run_iterations("fista", make, stage_inputs, volumes=volumes, frames=_FRAMES)
 
 
-def repeated(volume: np.ndarray | None, parts: int) -> np.ndarray | None:
-    """The same volume in ``parts`` voxels for one along each axis."""
-    return None if volume is None else volume.repeat(parts, 0).repeat(parts, 1).repeat(parts, 2)
-
-
-def block_means(volume: np.ndarray, parts: int) -> np.ndarray:
-    """Means of a volume (parts nz, parts ny, parts nx) over blocks, (nz, ny, nx) float32."""
-    nz, ny, nx = (count // parts for count in volume.shape)
-    blocks = volume.reshape(nz, parts, ny, parts, nx, parts)
-    means: np.ndarray = blocks.mean((1, 3, 5), dtype=np.float64).astype(np.float32)
-    return means
-
-
-def _has_room(grid: Grid, parts: int, prior: str | Denoiser, rt: Runtime) -> bool:
-    """Whether every rank's device holds the method's volumes with voxels so much smaller."""
-    voxels = math.prod(grid.shape) * parts**3
-    sizes_bytes = *[4 * voxels] * (_VOLUMES + 2), 4 * voxels * volumes_of(prior)
-    holds = voxels <= MOST_VOXELS and rt.room().holds(*sizes_bytes)
-    return not rt.ranks.any(not holds)
-
-
-def _run(
-    scan: Scan,
-    options: FistaOptions,
-    rt: Runtime,
-    report: ProgressReport,
-    resume: State | None,
-    initial: np.ndarray | None,
-    image: np.ndarray | None,
-) -> Reconstruction:
-    """All passes on the scan's grid."""
-    def make(system: System) -> "Fista":
-        prior = prior_of(
-            options.prior, rt, scan.grid, options.tv_iterations, options.iterations, image, options.prior_share
-        )
-        return Fista(system, options, prior, misfit_of(scan, options.motion))
-
-    sizes = {"volumes": _VOLUMES + volumes_of(options.prior), "frames": _FRAMES}
-    return run_iterations("fista", make, scan, options, rt, report, resume, initial, **sizes)
-
-
-class Fista:
-    """The residual that is reported is the pass's own: of every subset just before its step.
-
-    The weight of the prior is ``prior_weight`` times what the misfit makes of the gradient, back through Aᵀ, which averages
-    noise along a blur. It follows the volume's density from pass to pass.
-    """
-
-    def __init__(self, system: System, options: FistaOptions, prior: Prior, misfit: Misfit) -> None:
-        self.system, self.options, self.prior, self.misfit = system, options, prior, misfit
-        space = system.space
-        self.volume = space.full(system.volume_shape, 0.0)
-        self.previous = self.volume
-        self.momentum, self.least = 1.0, float("inf")
-        self.finished: str | None = None
-        # AᵀA has no negative entry: its largest row sum bounds its norm
-        self.curvature = space.largest(system.adjoint(system.apply_weights(system.row_sums()))) or 1.0
-        self._smallest = _FEWEST * space.largest(system.adjoint(system.apply_weights(system.measured)), absolute=True)
-        self._reach = Reach.of(system)
-        self.subsets = self._subsets(min(options.subsets, system.frames))
-
-    @property
-    def weight(self) -> float:
-        """The prior's, in the unit of the gradient."""
-        gradient_mm = self._reach.gradient_mm(self.misfit, density(self.system.space, self.volume))
-        return max(self.options.prior_weight * gradient_mm, self._smallest)
-
-    def _subsets(self, count: int) -> list[System]:
-        return [self.system.subset(range(first, self.system.frames, count)) for first in spread_order(count)]
-
-    def start_from(self, volume: Any) -> None:
-        self.volume = self.previous = volume
-
-    def step(self) -> float:
-        weight = self.weight
-        squares = self.system.space.sum_squares(self._step_of(subset, weight) for subset in self.subsets)
-        residual = squares**0.5
-        pull_apart = residual > _GROWTH * self.least and len(self.subsets) > 1
-        if pull_apart:
-            self.subsets = self._subsets(-(-len(self.subsets) // 2))
-            self.momentum, self.previous = 1.0, self.volume
-        self.least = residual if pull_apart else min(self.least, residual)
-        self.prior.end_pass(self.system.space, self.volume)
-        return residual
-
-    def _step_of(self, subset: System, weight: float) -> Any:
-        """The residual of the subset's frames just before its step."""
-        space = self.system.space
-        following = float((1 + np.sqrt(1 + 4 * self.momentum**2)) / 2)
-        beta = (self.momentum - 1) / following
-        point = space.extrapolate(self.volume, self.previous, beta)
-        residual = subset.residual(point)
-        gradient = subset.back(subset.apply_weights(residual))
-        moved = space.add(point, gradient, len(self.subsets) / self.curvature)
-        volume = self.prior(space, moved, weight / self.curvature, nonnegative=self.options.nonnegative)
-        uphill = space.turn(point, volume, self.volume) > 0
-        self.previous, self.volume = self.volume, volume
-        self.momentum = 1.0 if uphill else following
-        return residual
-
-    def state(self) -> dict[str, np.ndarray]:
-        numpy = self.system.space.numpy
-        return {
-            "volume": numpy(self.volume),
-            "previous": numpy(self.previous),
-            "progress": np.array([self.momentum, self.least, len(self.subsets)]),
-            **self.prior.state(),
-        }
-
-    def restore(self, state: State) -> None:
-        volume, previous, progress = state_arrays(state, ["volume", "previous", "progress"])
-        self.volume, self.previous = map(self.system.space.array, (volume, previous))
-        self.momentum, self.least = float(progress[0]), float(progress[1])
-        self.subsets = self._subsets(int(progress[2]))
-        self.prior.restore(state)
+def _gains_from_subvoxels(inputs: MethodInputs, parts: int) -> bool:
+    """Whether the grid is small enough for smaller voxels, and every rank's device holds the method's volumes of them."""
+    coarse_voxels, rt = math.prod(inputs.scan.grid.shape), inputs.rt
+    if coarse_voxels > _MOST_DIVIDED:
+        return False
+    voxels = coarse_voxels * parts**3
+    sizes_bytes = *[4 * voxels] * (_VOLUMES + 2), 4 * voxels * volumes_of(inputs.options.prior)
+    has_room = voxels <= MOST_VOXELS and rt.room().holds(*sizes_bytes)
+    return not rt.ranks.any(not has_room)

@@ -1,9 +1,10 @@
-"""Priors of volumes by name, as proximal maps that start from where the last one ended."""
+"""The priors of ``fista``, as proximal maps. A new one is a class and a line of ``PRIORS``; its map is in ``objective``."""
 
 import traceback
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -17,78 +18,61 @@ from phyradgs_cl.reconstructors.method import imported
 from phyradgs_cl.reconstructors.result import State, function_name, state_arrays
 from phyradgs_cl.runtime import Runtime, Space
 
-_ALIKE = {"nonlocal": 300.0, "nonlocal+dct": 100.0}  # h of the nonlocal weights over the weight
-_STEP = 0.01  # how far a map goes down their quadratic
-PRIORS = ("dct", "tv", *_ALIKE, "piccs", "none")
-_TV_SHARE, _DCT_SHARE = 0.8, 1.5  # of the weight where both are in one step
-_TV_ALONE_SHARE = 1.6  # without transforms
+# shares of the prior's weight, by the prior (docs/results/settings.md)
+_TV_ALONE, _TV_BEFORE_DCT, _DCT = 1.6, 0.8, 1.5
+_NONLOCAL, _NONLOCAL_BEFORE_DCT = 300.0, 100.0  # of the filtering parameter h
+_NONLOCAL_STEP = 0.01  # length of a step down the nonlocal quadratic
+
+
+@dataclass(frozen=True, eq=False)
+class PriorInputs:
+    """The arguments of a prior: device, grid, and of piccs its image (nz, ny, nx) in 1/mm and the share of the change to it.
+
+    tv_iterations: dual iterations per map. passes: over all frames, of the run.
+    """
+
+    rt: Runtime
+    grid: Grid
+    tv_iterations: int
+    passes: int
+    image: np.ndarray | None = None
+    share: float = 0.5
+
+    def tv(self, share: float = 1.0) -> "TvPrior":
+        """Total variation with a share of the weight."""
+        return TvPrior(TvProx(self.rt, self.grid.shape, axis_weights(self.grid)), self.tv_iterations, share)
+
+    def tv_and_dct(self) -> "TvAndDct":
+        """Total variation, then block cosine transforms."""
+        return TvAndDct(self.tv(_TV_BEFORE_DCT), DctProx(self.rt, self.grid.shape))
+
+    def nonlocal_then(self, then: "Prior", h_share: float) -> "Nonlocal":
+        """A nonlocal step, then another prior."""
+        return Nonlocal(then, NonlocalStep(self.rt, self.grid.shape), h_share, self.passes)
 
 
 class Prior:
-    """A map x → argmin ½‖x' − x‖² + weight R(x'), x' ≥ 0 if asked, or what stands for one; by itself without a memory."""
+    """A map x → argmin ½‖x' − x‖² + weight R(x'), x' ≥ 0 if asked, or an approximation of it.
+
+    A subclass that starts from its last result keeps it in ``state``. This class is the prior none: x ≥ 0 alone.
+    """
+
+    VOLUMES: ClassVar[int] = 0
+    """How many more volumes the prior holds than ``dct``."""
 
     def __call__(self, space: Space[Any], volume: Any, weight: float, *, nonnegative: bool) -> Any:
-        """The map of a volume (nz, ny, nx) of ``space``; ``weight`` in 1/mm."""
-        raise NotImplementedError
+        """Maps a volume (nz, ny, nx) of ``space``; ``weight`` in 1/mm."""
+        return space.add(volume, volume, 0.0, nonnegative=nonnegative)
 
     def end_pass(self, space: Space[Any], volume: Any) -> None:
-        """Tells of the volume after a pass over all frames."""
+        """Learns from the volume after a pass over all frames."""
 
     def state(self) -> dict[str, np.ndarray]:
-        """What the next map starts from."""
+        """Returns the arrays that the next map starts from."""
         return {}
 
     def restore(self, state: State) -> None:
-        """The inverse of ``state``."""
-
-
-Denoiser = Callable[[np.ndarray, float], np.ndarray]
-"""(volume (nz, ny, nx) float32 in 1/mm, noise in 1/mm) → volume: a prior of one's own (plug-and-play)."""
-
-
-def prior_of(
-    prior: str | Denoiser,
-    rt: Runtime,
-    grid: Grid,
-    tv_iterations: int,
-    passes: int,
-    image: np.ndarray | None = None,
-    share: float = 0.5,
-) -> Prior:
-    """A prior by its name in ``PRIORS``, or one's own, itself or by ``package.module:function``, for a run of so many
-    ``passes``; of piccs the prior image (nz, ny, nx) in 1/mm, and its share. InputError: without one, or no function."""
-    if callable(prior) or ":" in prior:
-        own = prior if callable(prior) else imported(prior, "--prior")
-        if not callable(own):
-            raise InputError("--prior", checks.shown(own), "a function (volume, noise)")
-        return OwnPrior(own)
-    if prior == "none":
-        return NoPrior()
-    prox = TvProx(rt, grid.shape, axis_weights(grid))
-    if prior == "tv":
-        return TvPrior(prox, tv_iterations, _TV_ALONE_SHARE)
-    if prior == "piccs":
-        if image is None:
-            raise InputError("--prior piccs", "no prior image", "a volume to start from", "say --initial, or take tv")
-        change = TvProx(rt, grid.shape, axis_weights(grid))
-        return Piccs(TvPrior(prox, tv_iterations), TvPrior(change, tv_iterations), image, share)
-    if prior == "nonlocal":
-        local = TvPrior(prox, tv_iterations, _TV_ALONE_SHARE)
-    else:
-        local = TvAndDct(prox, tv_iterations, DctProx(rt, grid.shape))
-    return Nonlocal(local, NonlocalStep(rt, grid.shape), _ALIKE[prior], passes) if prior in _ALIKE else local
-
-
-def volumes_of(prior: str | Denoiser) -> int:
-    """How many more volumes a prior holds than ``dct``."""
-    return NonlocalStep.VOLUMES if prior in _ALIKE else 0
-
-
-def axis_weights(grid: Grid) -> tuple[float, float, float]:
-    """Weights (z, y, x) that make differences slopes, 1 along the finest axis."""
-    finest = min(grid.voxel_size_mm)
-    z, y, x = (finest / pitch for pitch in grid.voxel_size_mm)
-    return z, y, x
+        """Continues from ``state``."""
 
 
 class TvPrior(Prior):
@@ -108,76 +92,86 @@ class TvPrior(Prior):
         (self.prox.dual,) = state_arrays(state, ["dual"])
 
 
-class TvAndDct(TvPrior):
-    """Total variation, then the shrinkage of block DCTs: alone the latter falls where it is run on."""
+class TvAndDct(Prior):
+    """Total variation, then a shrinkage of block cosine transforms, which follows best from a smooth volume."""
 
-    def __init__(self, prox: TvProx, iterations: int, shrink: DctProx) -> None:
-        super().__init__(prox, iterations, _TV_SHARE)
-        self.shrink, self.turn = shrink, 0
+    def __init__(self, tv: TvPrior, shrink: DctProx) -> None:
+        self.tv, self.shrink, self.turn = tv, shrink, 0
 
     def __call__(self, space: Space[Any], volume: Any, weight: float, *, nonnegative: bool) -> Any:
-        smooth = super().__call__(space, volume, weight, nonnegative=nonnegative)
-        shrink = partial(self.shrink, threshold=_DCT_SHARE * weight, turn=self.turn, nonnegative=nonnegative)
+        smooth = self.tv(space, volume, weight, nonnegative=nonnegative)
+        shrink = partial(self.shrink, threshold=_DCT * weight, turn=self.turn, nonnegative=nonnegative)
         self.turn = (self.turn + 1) % len(TURNS)
-        return space.apply(shrink, smooth, self.prox.shape)
+        return space.apply(shrink, smooth, self.tv.prox.shape)
 
     def state(self) -> dict[str, np.ndarray]:
-        return {**super().state(), "turn": np.array(self.turn)}
+        return {**self.tv.state(), "turn": np.array(self.turn)}
 
     def restore(self, state: State) -> None:
-        super().restore(state)
+        self.tv.restore(state)
         self.turn = count_of(state, "turn", len(TURNS) - 1)
 
 
 class Nonlocal(Prior):
-    """A step down a nonlocal quadratic, then another map. Its weights come from the volume after a quarter of the passes,
-    and anew after half of them: weights that follow the volume for ever sharpen what is not there."""
+    """A step down a nonlocal quadratic, then another prior.
 
-    def __init__(self, then: Prior, smooth: NonlocalStep, alike: float, passes: int) -> None:
-        self.then, self.smooth, self.alike, self.passes = then, smooth, alike, passes
-        self._done, self._is_learned = 0, False
+    The quadratic's weights come from the volume after a quarter and after half of the passes. Weights that kept following
+    the volume would sharpen structures that are not in the data.
+    """
+
+    VOLUMES = NonlocalStep.VOLUMES
+
+    def __init__(self, then: Prior, smooth: NonlocalStep, h_share: float, passes: int) -> None:
+        self.then, self.smooth, self.h_share, self.passes = then, smooth, h_share, passes
+        self._passes_done, self._is_learned = 0, False
         self._guide: np.ndarray | None = None
-        self._h = 0.0  # of the guide's weights; 0: not known yet
+        self._h = 0.0  # of the guide's weights; 0 before the first map with this guide
 
     def __call__(self, space: Space[Any], volume: Any, weight: float, *, nonnegative: bool) -> Any:
         if self._guide is not None and weight > 0:
             if not self._is_learned:
-                self._h = self._h or self.alike * weight
+                self._h = self._h or self.h_share * weight
                 self.smooth.learn(self._guide, self._h)
                 self._is_learned = True
-            volume = space.apply(partial(self.smooth, step=_STEP), volume, self.smooth.shape)
+            volume = space.apply(partial(self.smooth, step=_NONLOCAL_STEP), volume, self.smooth.shape)
         return self.then(space, volume, weight, nonnegative=nonnegative)
 
     def end_pass(self, space: Space[Any], volume: Any) -> None:
-        self._done += 1
-        if self._done in (-(-self.passes // 4), -(-self.passes // 2)):
+        self._passes_done += 1
+        if self._passes_done in (checks.ceil_div(self.passes, 4), checks.ceil_div(self.passes, 2)):
             self._guide, self._is_learned, self._h = space.numpy(volume), False, 0.0
 
     def state(self) -> dict[str, np.ndarray]:
         guide = np.zeros(self.smooth.shape, np.float32) if self._guide is None else self._guide
-        return {**self.then.state(), "guide": guide, "h": np.array(self._h), "passes": np.array(self._done)}
+        return {**self.then.state(), "guide": guide, "h": np.array(self._h), "passes": np.array(self._passes_done)}
 
     def restore(self, state: State) -> None:
         self.then.restore(state)
         guide, h = state_arrays(state, ["guide", "h"])
-        self._done = count_of(state, "passes", self.passes)
+        self._passes_done = count_of(state, "passes", self.passes)
         self._guide, self._is_learned, self._h = guide if guide.any() else None, False, float(h)
 
 
 class Piccs(Prior):
-    """Total variation of the volume, and that of what it differs from a prior image by: (1 − share) TV(x) + share TV(x − i),
-    one map after the other (prior image constrained compressed sensing; Chen, Tang and Leng, Med. Phys. 35 (2008) 660)."""
+    """(1 − share) TV(x) + share TV(x − image), as one map after the other.
 
-    def __init__(self, plain: TvPrior, change: TvPrior, image: np.ndarray, share: float) -> None:
-        self.plain, self.change, self.image, self.share = plain, change, image, share
-        self._there: Any = None
+    Prior image constrained compressed sensing: Chen, Tang and Leng, Med. Phys. 35 (2008) 660.
+    """
+
+    def __init__(self, inputs: PriorInputs) -> None:
+        if inputs.image is None:
+            raise InputError("--prior piccs", "no prior image", "a volume to start from", "say --initial, or take tv")
+        self.plain, self.change = inputs.tv(), inputs.tv()
+        self.image, self.share = inputs.image, inputs.share
+        self._image_in_space: Any = None
 
     def __call__(self, space: Space[Any], volume: Any, weight: float, *, nonnegative: bool) -> Any:
-        if self._there is None:
-            self._there = space.array(np.ascontiguousarray(self.image, np.float32))
+        if self._image_in_space is None:
+            self._image_in_space = space.array(np.ascontiguousarray(self.image, np.float32))
         volume = self.plain(space, volume, (1 - self.share) * weight, nonnegative=nonnegative)
-        change = self.change(space, space.add(volume, self._there, -1.0), self.share * weight, nonnegative=False)
-        return space.add(change, self._there, 1.0, nonnegative=nonnegative)
+        change = space.add(volume, self._image_in_space, -1.0)
+        change = self.change(space, change, self.share * weight, nonnegative=False)
+        return space.add(change, self._image_in_space, 1.0, nonnegative=nonnegative)
 
     def state(self) -> dict[str, np.ndarray]:
         return {**self.plain.state(), "dual_of_change": self.change.prox.dual}
@@ -187,26 +181,58 @@ class Piccs(Prior):
         (self.change.prox.dual,) = state_arrays(state, ["dual_of_change"])
 
 
-class NoPrior(Prior):
-    """Nothing but x ≥ 0."""
-
-    def __call__(self, space: Space[Any], volume: Any, weight: float, *, nonnegative: bool) -> Any:
-        return space.add(volume, volume, 0.0, nonnegative=nonnegative)
+Denoiser = Callable[[np.ndarray, float], np.ndarray]
+"""(volume (nz, ny, nx) float32 in 1/mm, noise in 1/mm) → volume: a user's own prior (plug-and-play)."""
 
 
 class OwnPrior(Prior):
-    """A user's denoiser on the host, in the place of a proximal map (Venkatakrishnan, Bouman and Wohlberg 2013)."""
+    """A user's denoiser on the host in place of a proximal map (Venkatakrishnan, Bouman and Wohlberg 2013)."""
 
     def __init__(self, denoiser: Denoiser) -> None:
         self.denoiser, self.subject = denoiser, f"--prior {function_name(denoiser)}"
 
     def __call__(self, space: Space[Any], volume: Any, weight: float, *, nonnegative: bool) -> Any:
-        before = space.numpy(volume)
+        noisy = space.numpy(volume)
         try:
-            made = self.denoiser(before, weight)
-        except Exception as error:  # whatever somebody's function does
+            result = self.denoiser(noisy, weight)
+        except Exception as error:  # a user's function may raise anything
             at = traceback.extract_tb(error.__traceback__)[-1]
-            found = f"{type(error).__name__}: {error} ({at.filename}, line {at.lineno})"
-            raise InputError(self.subject, found, "a function of (volume, noise) that returns a volume") from error
-        cleaned = checks.numbers(self.subject, made, before.shape).astype(np.float32)
-        return space.array(np.maximum(cleaned, 0) if nonnegative else cleaned)
+            message = f"{type(error).__name__}: {error} ({at.filename}, line {at.lineno})"
+            raise InputError(self.subject, message, "a function of (volume, noise) that returns a volume") from error
+        clean = checks.numbers(self.subject, result, noisy.shape).astype(np.float32)
+        return space.array(np.maximum(clean, 0) if nonnegative else clean)
+
+
+PRIORS: dict[str, Callable[[PriorInputs], Prior]] = {
+    "dct": PriorInputs.tv_and_dct,
+    "tv": lambda inputs: inputs.tv(_TV_ALONE),
+    "nonlocal": lambda inputs: inputs.nonlocal_then(inputs.tv(_TV_ALONE), _NONLOCAL),
+    "nonlocal+dct": lambda inputs: inputs.nonlocal_then(inputs.tv_and_dct(), _NONLOCAL_BEFORE_DCT),
+    "piccs": Piccs,
+    "none": lambda inputs: Prior(),
+}
+
+
+def prior_of(prior: str | Denoiser, inputs: PriorInputs) -> Prior:
+    """Returns a prior by its name in ``PRIORS``, or a user's function, itself or by ``package.module:function``.
+
+    Raises InputError for a name that is no function, and for piccs without an image.
+    """
+    if isinstance(prior, str) and prior in PRIORS:
+        return PRIORS[prior](inputs)
+    own = imported(prior, "--prior") if isinstance(prior, str) else prior
+    if not callable(own):
+        raise InputError("--prior", checks.shown(own), "a function (volume, noise)")
+    return OwnPrior(own)
+
+
+def volumes_of(prior: str | Denoiser) -> int:
+    """Returns how many more volumes a prior holds than ``dct``."""
+    return Nonlocal.VOLUMES if prior in ("nonlocal", "nonlocal+dct") else 0
+
+
+def axis_weights(grid: Grid) -> tuple[float, float, float]:
+    """Returns weights (z, y, x) that turn differences into slopes, 1 along the finest axis."""
+    finest = min(grid.voxel_size_mm)
+    z, y, x = (finest / pitch for pitch in grid.voxel_size_mm)
+    return z, y, x

@@ -159,7 +159,7 @@ def voxel_method(
     volumes: int | Callable[[Scan, Any], int],
     frames: int,
 ) -> Method:
-    """Returns an algorithm as a method. ``volumes`` and ``frames`` as in ``run_iterations``; volumes may depend on the run."""
+    """Returns an algorithm as a method. ``volumes`` and ``frames`` as in ``run_iterations``; a function gives volumes."""
 
     def run(scan: Scan, options: Any, rt: Runtime, **arguments: Any) -> Reconstruction:
         inputs = MethodInputs(scan, options, rt, **arguments)

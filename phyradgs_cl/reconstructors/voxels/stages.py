@@ -1,7 +1,11 @@
-"""A run of several stages, each a run of its own that starts from the volume of the one before."""
+"""Runs of several stages: each stage starts from the volume of the stage before it.
+
+``fista`` reconstructs voxels, then subvoxels; ``fused`` adds splats. Coarse voxels cannot represent edges. The last passes
+therefore run on voxels half as large; their block means make up two thirds of the result.
+"""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
 
@@ -11,34 +15,39 @@ from phyradgs_cl.fields import Grid
 from phyradgs_cl.reconstructors.checkpoint import check_array, checked_history, count_of
 from phyradgs_cl.reconstructors.result import (
     Progress,
-    ProgressReport,
     Reconstruction,
     Report,
     State,
     history_arrays,
     state_arrays,
 )
+from phyradgs_cl.reconstructors.voxels.run import MethodInputs
 
-_STAGE, _VOLUME = "stage", "volume_before"  # of a state: which stage, and what it has started from
+_STAGE, _VOLUME = "stage", "volume_before"  # entries of a state: the present stage, and the volume that it started from
 _HISTORY = {"record": "record_before", "seconds": "seconds_before"}
+_SUBVOXEL_SHARE = np.float32(2 / 3)  # of the result (docs/results/settings.md)
+
+
+def _last_volume(volume: np.ndarray, before: np.ndarray | None) -> np.ndarray:
+    return volume
 
 
 @dataclass(frozen=True)
 class Stage:
-    """run: from the volume before it, with a report, from a state of its own, if any. iterations: how many it has.
+    """One stage: its number of iterations and a function that runs them.
 
-    shown: its volume, and the one before it, to what the whole run has by then (nz, ny, nx).
+    ``merge`` combines the stage's volume and that of the stages before it to the result of the whole run (nz, ny, nx).
     """
 
     name: str
     iterations: int
-    run: Callable[[np.ndarray | None, ProgressReport, State | None], Reconstruction]
-    shown: Callable[[np.ndarray, np.ndarray | None], np.ndarray] = lambda volume, before: volume
+    run: Callable[[MethodInputs], Reconstruction]
+    merge: Callable[[np.ndarray, np.ndarray | None], np.ndarray] = _last_volume
 
 
 @dataclass
-class _Way:
-    """What the stages so far have come to."""
+class StageProgress:
+    """The result of the finished stages: volume, iterations, seconds and record; ``index``: the present stage."""
 
     volume: np.ndarray | None
     index: int = 0
@@ -46,67 +55,87 @@ class _Way:
     seconds: float = 0.0
     record: list[dict[str, float]] = field(default_factory=list)
 
-    def state(self, own: State) -> State:
-        """The state of the present stage as the whole run's."""
+    def state(self, stage_state: State) -> State:
+        """Returns the state of the present stage as one of the whole run."""
         history = history_arrays(self.record, self.seconds)
         volume = {} if self.index == 0 or self.volume is None else {_VOLUME: self.volume}
-        return {**own, **volume, **{_HISTORY[name]: a for name, a in history.items()}, _STAGE: np.array(self.index)}
+        history = {_HISTORY[name]: array for name, array in history.items()}
+        return {**stage_state, **volume, **history, _STAGE: np.array(self.index)}
 
     def restore(self, state: State, stages: Sequence[Stage], grid: Grid) -> State:
-        """The inverse of ``state``; raises InputError for one that the run cannot have left."""
+        """Continues from ``state``. Returns the present stage's own. Raises InputError for one that does not fit the run."""
         self.index = count_of(state, _STAGE, len(stages) - 1)
         if self.index:
             (volume,) = state_arrays(state, [_VOLUME])
             check_array(_VOLUME, volume, grid.shape, np.float32)
             self.volume = volume
-        before = dict(zip(_HISTORY, state_arrays(state, list(_HISTORY.values())), strict=True))
-        self.record, self.seconds = checked_history(before)
+        history = dict(zip(_HISTORY, state_arrays(state, list(_HISTORY.values())), strict=True))
+        self.record, self.seconds = checked_history(history)
         self.iterations = sum(stage.iterations for stage in stages[: self.index])
         return {name: array for name, array in state.items() if name not in (_STAGE, _VOLUME, *_HISTORY.values())}
 
+    def finish(self, stage: Stage, result: Reconstruction) -> None:
+        """Adds a stage's record and seconds."""
+        shifted = [{**line, "iteration": self.iterations + line["iteration"]} for line in result.record]
+        self.record = self.record + shifted
+        self.seconds += result.facts["seconds"]
 
-def run_stages(
-    stages: Sequence[Stage], grid: Grid, report: ProgressReport, resume: State | None, initial: np.ndarray | None
-) -> Reconstruction:
-    """One stage after the other, reported as one run, from ``initial`` or from a state of the whole run.
 
-    The result is the last stage's; iterations, seconds and the record are of all, facts has ``stages``: those of each.
+def run_stages(stages: Sequence[Stage], inputs: MethodInputs) -> Reconstruction:
+    """Runs one stage after the other as one run, which is reported, stopped and resumed as such.
+
+    Iterations, seconds and the record are those of all stages; the other facts are the last stage's. The fact ``stages``
+    lists the iterations and seconds of each.
     """
-    way, facts = _Way(initial), {}
-    own, report = None if resume is None else way.restore(resume, stages, grid), Report.of(report)
-    total = sum(stage.iterations for stage in stages)
-    while True:
-        stage = stages[way.index]
-        with report.through(partial(_of_whole_run, stage, way, total, grid)):
-            result = stage.run(way.volume, report, own)
-        done = result.facts.get("iterations", stage.iterations)
-        facts[stage.name], own = {"iterations": done, "seconds": result.facts["seconds"]}, None
-        volume = stage.shown(result.volume, way.volume)
-        at, state = result.facts["interrupted_at"], result.state
-        state = None if state is None else way.state(state)
-        way.record = _later(way.record, result.record, way.iterations)
-        way.seconds += result.facts["seconds"]
-        if at is not None or way.index == len(stages) - 1:
+    progress, stage_facts, grid = StageProgress(inputs.initial), {}, inputs.scan.grid
+    resume = None if inputs.resume is None else progress.restore(inputs.resume, stages, grid)
+    report, total = Report.of(inputs.report), sum(stage.iterations for stage in stages)
+    for stage in stages[progress.index :]:
+        with report.through(partial(_of_whole_run, stage, progress, total, grid)):
+            result = stage.run(replace(inputs, initial=progress.volume, report=report, resume=resume))
+        volume, state = stage.merge(result.volume, progress.volume), result.state
+        state = None if state is None else progress.state(state)
+        iterations, interrupted_at = result.facts.get("iterations", stage.iterations), result.facts["interrupted_at"]
+        stage_facts[stage.name] = {"iterations": iterations, "seconds": result.facts["seconds"]}
+        progress.finish(stage, result)
+        if interrupted_at is not None or stage is stages[-1]:
             break
-        way.volume, way.index, way.iterations = volume, way.index + 1, way.iterations + stage.iterations
-    whole: dict[str, Any] = {**result.facts, "stages": facts, "seconds": way.seconds}
-    whole["iterations"] = way.iterations + done
-    whole["interrupted_at"] = None if at is None else way.iterations + at
-    return Reconstruction(volume, grid, result.gaussians, way.record, whole, state)
+        resume, progress.volume = None, volume
+        progress.index, progress.iterations = progress.index + 1, progress.iterations + stage.iterations
+    facts: dict[str, Any] = {**result.facts, "stages": stage_facts, "seconds": progress.seconds}
+    facts["iterations"] = progress.iterations + iterations
+    facts["interrupted_at"] = None if interrupted_at is None else progress.iterations + interrupted_at
+    return Reconstruction(volume, grid, result.gaussians, progress.record, facts, state)
 
 
-def _later(
-    record: list[dict[str, float]], own: list[dict[str, float]], iterations: int
-) -> list[dict[str, float]]:
-    return record + [{**line, "iteration": iterations + line["iteration"]} for line in own]
-
-
-def _of_whole_run(stage: Stage, way: _Way, total: int, grid: Grid, progress: Progress) -> Progress:
+def _of_whole_run(stage: Stage, done: StageProgress, total: int, grid: Grid, progress: Progress) -> Progress:
     """Returns the progress of one stage as that of the whole run."""
     return progress.mapped(
-        state=way.state,
-        volume=lambda volume, _: (stage.shown(volume, way.volume), grid),
-        iteration=way.iterations + progress.iteration,
+        state=done.state,
+        volume=lambda volume, _: (stage.merge(volume, done.volume), grid),
+        iteration=done.iterations + progress.iteration,
         iterations=total,
-        seconds=way.seconds + progress.seconds,
+        seconds=done.seconds + progress.seconds,
     )
+
+
+def finer(grid: Grid, parts: int) -> Grid:
+    """Returns the same box with every voxel divided into ``parts`` along each axis."""
+    z, y, x = grid.shape
+    dz, dy, dx = grid.voxel_size_mm
+    return replace(grid, shape=(parts * z, parts * y, parts * x), voxel_size_mm=(dz / parts, dy / parts, dx / parts))
+
+
+def repeated(volume: np.ndarray | None, parts: int) -> np.ndarray | None:
+    """Returns a volume with every voxel repeated ``parts`` times along each axis; None stays None."""
+    return None if volume is None else volume.repeat(parts, 0).repeat(parts, 1).repeat(parts, 2)
+
+
+def merge_subvoxels(volume: np.ndarray, before: np.ndarray | None, parts: int) -> np.ndarray:
+    """Returns the weighted mean of ``before`` (nz, ny, nx) and the means of ``volume`` over blocks of ``parts``³ voxels."""
+    assert before is not None
+    nz, ny, nx = before.shape
+    blocks = volume.reshape(nz, parts, ny, parts, nx, parts)
+    means = blocks.mean((1, 3, 5), dtype=np.float64).astype(np.float32)
+    merged: np.ndarray = before + _SUBVOXEL_SHARE * (means - before)
+    return merged

@@ -1,14 +1,14 @@
-"""The linear system A x = p of a scan under a motion model, as the iterative methods see it.
+"""The linear system A x = p of a scan under a motion model, for the iterative methods.
 
-Its arrays lie on the device from the first iteration to the last where everything fits there (``resident``), else on the
-host; a method does the same with both, through the system's ``space``.
+Its arrays stay on the device where everything fits there (``resident``), else on the host. A method computes with either
+through the system's ``space``. Over several ranks each projects its own frames; frames are gathered, volumes summed.
 """
 
 import logging
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
 
@@ -16,24 +16,39 @@ from phyradgs_cl.acquisition import Motion, Scan
 from phyradgs_cl.detector import noise_level, transmission_weights
 from phyradgs_cl.operators.rays.intensity import IntensityOperator
 from phyradgs_cl.operators.rays.operator import LinearOperator, RayOperator
-from phyradgs_cl.reconstructors.voxels.ranks import Intensity, SharedIntensity, SharedOperator
+from phyradgs_cl.parallel import Communicator, exact_sum, span
 from phyradgs_cl.runtime import DeviceSpace, HostSpace, MemoryShortage, Runtime, Space
 
 log = logging.getLogger(__name__)
 
 _SHORTEST_PATH = 0.1  # of the longest
 _FAINTEST = 1e-6  # of the largest sum over a voxel's rays
+S = TypeVar("S", bound="SharedOperator")
+
+
+class Intensity(Protocol):
+    """The function I of a detector that averages intensity, and its derivative J."""
+
+    def expected(self, volume: np.ndarray) -> np.ndarray:
+        """Returns I(x) (F, rows, columns) float32 of a volume (nz, ny, nx) in 1/mm. J is that at x from then on."""
+        ...
+
+    def forward(self, volume: np.ndarray) -> np.ndarray: ...
+
+    def adjoint(self, frames: np.ndarray) -> np.ndarray: ...
+
+    def subset(self, frames: Sequence[int]) -> "Intensity": ...
 
 
 @dataclass(frozen=True, eq=False)
 class System:
-    """Operator A and measurement p (F, rows, columns) float32; ``valid`` (F, rows, columns) or (rows, columns), 1 or 0;
-    None: all pixels. Volumes (nz, ny, nx) and frames are arrays of ``space``.
+    """Operator A and measurement p (F, rows, columns) float32. Volumes (nz, ny, nx) and frames are arrays of ``space``.
 
-    Pixels that are not valid are 0 in ``measured`` and in every residual, as if their rows were not in A.
-    ``intensity`` is there where the detector adds photons: the measurement is then compared with I(x) instead of A x,
-    and what comes back goes through Jᵀ, the derivative of I at the volume of the last comparison, instead of Aᵀ.
-    ``transmission`` (F, rows, columns) weighs pixels by their transmission, mean 1; None: all alike.
+    valid: (F, rows, columns) or (rows, columns), 1 or 0; None: all pixels are valid. Pixels that are not valid are 0 in
+    ``measured`` and in every residual, as if A had no rows for them.
+    intensity: set where the detector averages intensity. The measurement is then compared with I(x) in place of A x, and
+    residuals go back through Jᵀ in place of Aᵀ; J is the derivative of I at the volume of the last comparison.
+    transmission: (F, rows, columns) weights of pixels by their transmission, mean 1; None: equal weights.
     """
 
     operator: LinearOperator
@@ -45,15 +60,15 @@ class System:
 
     @classmethod
     def of_scan(cls, rt: Runtime, scan: Scan, motion: Motion, detector_model: str = "log") -> "System":
-        """The scan's frames with the cells of ``motion``; ``detector_model``: log, intensity, or the scan's own."""
+        """Returns the system of a scan under ``motion``. detector_model: log, intensity, or scan for the stated one."""
         tables = [motion.cells(scan, f).still() for f in range(scan.frames)]
         operator: LinearOperator = RayOperator(rt, scan.grid, scan.geometry.detector_shape, tables)
         measured = np.asarray(scan.projections, np.float32)
         model = scan.detector_model if detector_model == "scan" else detector_model
         intensity: Intensity | None = None
-        if model == "intensity" and any(table.averages for table in tables):  # of one value both are the mean
-            every = IntensityOperator(rt, scan.grid, scan.geometry.detector_shape, tables)
-            intensity = SharedIntensity(rt.ranks, every) if rt.ranks.size > 1 else every
+        if model == "intensity" and any(table.averages for table in tables):  # both models agree on a single value
+            alone = IntensityOperator(rt, scan.grid, scan.geometry.detector_shape, tables)
+            intensity = SharedIntensity(rt.ranks, alone) if rt.ranks.size > 1 else alone
         if rt.ranks.size > 1:
             operator = SharedOperator(rt.ranks, operator)
         if scan.pixel_mask is None:
@@ -62,9 +77,9 @@ class System:
         return cls(operator, np.where(valid, measured, np.float32(0)), valid, intensity)
 
     def resident(self, rt: Runtime, volumes: int, frames: int) -> "System":
-        """The same on the device, where there is room for the operators and for so many volumes and stacks of all frames.
+        """Returns the system on the device, if it has room for the operators, the volumes, and stacks of all frames.
 
-        Else the system itself, on the host: in bricks, and on ranks, which sum there.
+        Otherwise the system stays on the host. It always does in bricks and on several ranks, which sum there.
         """
         operators = [o for o in (self.operator, self.intensity) if isinstance(o, (RayOperator, IntensityOperator))]
         if len(operators) < 1 + (self.intensity is not None):
@@ -75,10 +90,10 @@ class System:
         volume_bytes, frames_bytes = 4 * math.prod(self.operator.volume_shape), self.measured.nbytes
         sizes_bytes = [volume_bytes] * volumes + [frames_bytes] * frames
         try:
-            whole = all(o.memory.holds_all(self.frames) for o in operators)
+            is_whole = all(o.memory.holds_all(self.frames) for o in operators)
         except MemoryShortage:
-            whole = False
-        if not (whole and rt.room().holds(*sizes_bytes)):
+            is_whole = False
+        if not (is_whole and rt.room().holds(*sizes_bytes)):
             log.info("the device has no room for all arrays of the method: they stay on the host")
             return self
         space = DeviceSpace(rt)
@@ -94,79 +109,78 @@ class System:
         return self.operator.volume_shape
 
     def masked(self, frames: Any) -> Any:
-        """Frames with 0 at the pixels that do not count."""
+        """Returns frames with 0 at pixels that are not valid."""
         return frames if self.valid is None else self.space.multiply(frames, self.valid)
 
     def forward(self, volume: Any) -> Any:
-        """A x at the pixels that count."""
+        """Returns A x at the valid pixels."""
         return self._projected(self.operator.forward, volume)
 
     def adjoint(self, frames: Any) -> Any:
-        """Aᵀ y of frames that are 0 where pixels do not count."""
+        """Returns Aᵀ y of frames that are 0 at pixels that are not valid."""
         return self.space.apply(self.operator.adjoint, frames, self.volume_shape)
 
     def expected(self, volume: Any) -> Any:
-        """What the detector would measure of x, at the pixels that count: A x, or I(x) in the intensity model."""
+        """Returns the measurement expected of x at the valid pixels: A x, or I(x) in the intensity model."""
         return self._projected(self.operator.forward if self.intensity is None else self.intensity.expected, volume)
 
     def derivative(self, change: Any) -> Any:
-        """What a change of the volume of the last ``expected`` or ``residual`` would change in it: A d, or J d."""
+        """Returns A d, or J d: the change in ``expected`` for a change d of the last volume compared."""
         return self._projected((self.operator if self.intensity is None else self.intensity).forward, change)
 
     def back(self, frames: Any) -> Any:
-        """The transpose of ``derivative``: frames (0 where pixels do not count) to a volume by Aᵀ, or Jᵀ."""
+        """The transpose of ``derivative``: Aᵀ y, or Jᵀ y, of frames that are 0 at pixels that are not valid."""
         operator = self.operator if self.intensity is None else self.intensity
         return self.space.apply(operator.adjoint, frames, self.volume_shape)
 
     def residual(self, volume: Any) -> Any:
-        """Measured less expected, dimensionless: p − A x, or p − I(x)."""
+        """Returns p − A x, or p − I(x), dimensionless."""
         return self.difference(self.measured, self.expected(volume))
 
     def difference(self, x: Any, y: Any) -> Any:
-        """x − y."""
+        """Returns x − y."""
         return self.space.add(x, y, -1.0)
 
     def linearise_at(self, volume: Any) -> None:
-        """Puts J where an interrupted run had it; A is the same everywhere."""
+        """Makes J the derivative of I at ``volume``, for a run that resumes there. A is the same everywhere."""
         if self.intensity is not None:
             self.expected(volume)
 
     def noise_norm(self) -> float:
-        """The norm of the measurement's noise, estimated from it."""
+        """Returns the norm of the measurement's noise, estimated from the measurement."""
         measured = self.space.numpy(self.measured)
         valid = None if self.valid is None else np.broadcast_to(self.space.numpy(self.valid) != 0, measured.shape)
         pixels = measured.size if valid is None else np.count_nonzero(valid)
         return float(noise_level(measured, valid) * np.sqrt(pixels))
 
     def row_sums(self) -> Any:
-        """A 1 in mm: the length of every ray in the volume."""
+        """Returns A 1 in mm: the length of every ray in the volume."""
         return self.forward(self.space.full(self.volume_shape, 1.0))
 
     def column_sums(self) -> Any:
-        """Aᵀ 1 in mm over the pixels that count, or Aᵀ t with transmission weights."""
+        """Returns Aᵀ 1 in mm over the valid pixels, or Aᵀ t with transmission weights."""
         return self.adjoint(self.masked(self.apply_weights(self.space.full(self.measured.shape, 1.0))))
 
     def apply_weights(self, frames: Any) -> Any:
-        """Frames times their transmission weights, where there are any."""
+        """Returns frames times their transmission weights, if there are any."""
         return frames if self.transmission is None else self.space.multiply(frames, self.transmission)
 
     def transmission_weighted(self) -> "System":
-        """The same system, on the host, its pixels weighted by their transmission (PWLS)."""
+        """Returns the system, on the host, with pixels weighted by their transmission (PWLS)."""
         return replace(self, transmission=transmission_weights(self.measured, self.valid))
 
     def subset(self, frames: Sequence[int]) -> "System":
-        """The system of some frames."""
-        chosen = list(frames)
-        valid = self.valid
+        """Returns the system of some frames."""
+        numbers, valid = list(frames), self.valid
         if valid is not None and len(valid.shape) == 3:
-            valid = self.space.take(valid, chosen)
+            valid = self.space.take(valid, numbers)
         return replace(
             self,
-            operator=self.operator.subset(chosen),
-            measured=self.space.take(self.measured, chosen),
+            operator=self.operator.subset(numbers),
+            measured=self.space.take(self.measured, numbers),
             valid=valid,
-            intensity=None if self.intensity is None else self.intensity.subset(chosen),
-            transmission=None if self.transmission is None else self.space.take(self.transmission, chosen),
+            intensity=None if self.intensity is None else self.intensity.subset(numbers),
+            transmission=None if self.transmission is None else self.space.take(self.transmission, numbers),
         )
 
     def _projected(self, function: Callable[..., Any], volume: Any) -> Any:
@@ -174,14 +188,59 @@ class System:
 
 
 def row_weights(system: System) -> Any:
-    """1/(A 1) of every ray, 1/mm, at most that of a ray through a tenth of the longest path; times its transmission weight.
+    """Returns 1/(A 1) of every ray in 1/mm, times its transmission weight.
 
-    A ray that only grazes an edge of the volume would else put its whole noise on a voxel or two, and bright corners
-    are what one sees of it. TIGRE measures the paths in a box that is a tenth larger, to the same end.
+    A ray shorter than a tenth of the longest path counts as that long. A ray that only grazes an edge of the volume would
+    otherwise put its noise on one or two voxels, and corners of the volume become bright. TIGRE measures the paths in a box
+    that is a tenth larger, for the same reason.
     """
     return system.apply_weights(system.space.reciprocal(system.row_sums(), _SHORTEST_PATH))
 
 
 def column_weights(system: System) -> Any:
-    """1/(Aᵀ 1) of every voxel, 1/mm; 0 where no ray goes."""
+    """Returns 1/(Aᵀ 1) of every voxel in 1/mm; 0 where no ray passes."""
     return system.space.reciprocal(system.column_sums(), _FAINTEST)
+
+
+class SharedOperator:
+    """A ``LinearOperator`` whose frames the ranks share; ``whole`` has all frames.
+
+    Volumes and frames are complete on every rank, so that methods do the same on each. Sums of volumes do not depend on
+    their order, only on how many frames a rank adds up by itself.
+    """
+
+    def __init__(self, ranks: Communicator, whole: LinearOperator) -> None:
+        self.ranks, self.whole = ranks, whole
+        self.volume_shape, self.frames_shape = whole.volume_shape, whole.frames_shape
+        run = span(self.frames_shape[0], ranks.size, ranks.rank)
+        self._own = slice(run.start, run.stop)
+        self._part = whole.subset(list(run)) if len(run) else None
+
+    def forward(self, volume: np.ndarray) -> np.ndarray:
+        """A x: volume (nz, ny, nx) 1/mm to frames (F, rows, columns) float32."""
+        return self._gathered(None if self._part is None else self._part.forward(volume))
+
+    def adjoint(self, frames: np.ndarray) -> np.ndarray:
+        """Aᵀ y: frames (F, rows, columns) to a volume (nz, ny, nx) float32."""
+        shape = (self.volume_shape[0], self.volume_shape[1] * self.volume_shape[2])
+        parts = [] if self._part is None else [self._part.adjoint(frames[self._own]).reshape(shape)]
+        return exact_sum(self.ranks, parts, shape, self.ranks.size).reshape(self.volume_shape)
+
+    def subset(self: S, frames: Sequence[int]) -> S:
+        """Returns the operator of some of the frames, in this order, which the ranks share again."""
+        return type(self)(self.ranks, self.whole.subset(frames))
+
+    def _gathered(self, part: np.ndarray | None) -> np.ndarray:
+        no_frames = np.zeros((0, *self.frames_shape[1:]), np.float32)
+        return self.ranks.allgather(no_frames if part is None else part)
+
+
+class SharedIntensity(SharedOperator):
+    """An ``IntensityOperator`` whose frames the ranks share."""
+
+    whole: IntensityOperator
+    _part: IntensityOperator | None
+
+    def expected(self, volume: np.ndarray) -> np.ndarray:
+        """Returns I(x) (F, rows, columns) float32 of a volume (nz, ny, nx) in 1/mm. J is that at x from then on."""
+        return self._gathered(None if self._part is None else self._part.expected(volume))
