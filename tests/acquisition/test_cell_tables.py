@@ -11,10 +11,8 @@ from phyradgs_cl.acquisition import (
     ConeGeometry,
     ConstantSpeed,
     EncoderTable,
-    Exact,
     FrameSweeps,
     MicroViews,
-    PerRow,
     PoseTable,
     Protocol,
     Scan,
@@ -179,13 +177,6 @@ def test_a_panel_that_turns_about_itself_needs_segments_too(steps) -> None:
     assert segments_for(Turning(), *where) == segments_for(ORBIT, *where) == count
 
 
-def test_a_gantry_at_rest_is_one_cell_of_all_lines() -> None:
-    at_rest = CircularOrbit(GEOMETRY, ConstantSpeed(0.1, 0.0))
-    assert exact_cells(at_rest, Shutter(0.8, 0.6), 0, 3.0, LINES, 1).end_poses is None
-    table = static_cells(ORBIT, Shutter(0.8, 0.6), 0, 3.0, LINES)
-    assert (table.count, table.line_start[0], table.line_stop[0], table.weight[0]) == (1, 0, LINES, 1.0)
-
-
 def test_geometry_and_timing_are_values() -> None:
     """What holds arrays, whose equality is an array, is equal to itself alone; all can be keys."""
     times = np.array([0.0, 1.0])
@@ -202,18 +193,3 @@ def test_geometry_and_timing_are_values() -> None:
     for value in [*plain, *(make() for make in arrays)]:
         with pytest.raises(FrozenInstanceError):
             setattr(value, fields(value)[0].name, None)
-
-
-def test_motions_and_panels_hold_the_ends_of_their_ranges() -> None:
-    assert (MicroViews(), PerRow(), Exact()) == (MicroViews(8, 5), PerRow(5), Exact(0, 0.005))
-    for model, name, ends, beyond in (
-        (MicroViews, "strips", (1, 10_000), (0, 10_001)), (MicroViews, "sub_intervals", (1, 10_000), (0, 10_001)),
-        (PerRow, "sub_intervals", (1, 10_000), (0, 10_001)), (Exact, "segments", (0, 1000), (-1, 1001)),
-        (Exact, "time_error", (1e-6, 1), (9e-7, 1.001)),
-    ):
-        for inside in ends:
-            assert getattr(model(**{name: inside}), name) == inside
-        for outside in beyond:
-            with pytest.raises(InputError):
-                model(**{name: outside})
-    assert ConeGeometry(50.0, 70.0, (1, 1), (0.6, 0.5)).detector_shape == (1, 1)

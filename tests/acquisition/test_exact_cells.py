@@ -9,12 +9,10 @@ from phyradgs_cl.acquisition import (
     ConeGeometry,
     ConstantSpeed,
     EncoderTable,
-    Exact,
     Shutter,
     SpeedRamp,
 )
 from phyradgs_cl.acquisition.cells import exact_cells, segments_for, static_cells
-from phyradgs_cl.errors import InputError
 
 LINES = 9
 GEOMETRY = ConeGeometry(50.0, 70.0, (LINES, 10), (0.6, 0.5))
@@ -96,11 +94,3 @@ def test_the_fastest_of_32_parts_of_a_frame_counts() -> None:
     fastest_rad = 32 * 1.5 * (1 - (31 / 32) ** 2)
     assert segments_for(ramp, Shutter(0.4, 0.6), 0, 0.0, 0.0005) == 75
     assert 74 < fastest_rad * np.sqrt(0.32 / 0.0005) < 75
-
-
-def test_impossible_numbers_are_named() -> None:
-    for option in ("segments", "time_error"):
-        with pytest.raises(InputError, match=f"^{option}"):
-            Exact(**{option: -1 if option == "segments" else 0.0})
-    with pytest.raises(InputError, match="segments"):
-        exact_cells(ORBIT, Shutter(0.8, 0.6), 0, START_S, LINES, 0)

@@ -118,9 +118,6 @@ def test_options_replace_and_nonsense_is_refused() -> None:
     assert make_protocol("rapid", views=30, exposure_deg=None) == Protocol(views=30)
     with pytest.raises(InputError, match="rapid, standard, static"):
         make_protocol("quick")
-    for change in ({"views": 0}, {"exposure_deg": -1.0}, {"readout_ratio": np.nan}):
-        with pytest.raises(InputError):
-            make_protocol("rapid", **change)
 
 
 def scan(**changes) -> Scan:

@@ -131,6 +131,8 @@ def test_counts_below_one_are_refused() -> None:
             MicroViews(strips, sub_intervals)
     with pytest.raises(InputError, match="time samples"):
         per_line_cells(ORBIT, Shutter(1.0), 0, 0.0, 7, 0)
+    with pytest.raises(InputError, match="segments"):
+        exact_cells(ORBIT, Shutter(1.0), 0, 0.0, 7, 0)
 
 
 def scan(is_fly: bool) -> Scan:
@@ -144,6 +146,7 @@ def test_motion_models_of_fly_and_stop_and_shoot_scans() -> None:
         Static(): 1, StaticStart(): 1, MicroViews(4, 3): 12, PerRow(sub_intervals=3): 5, OwnTimes(sub_intervals=3): 30,
         Exact(segments=5): 5, LineMiddles(): 10,
     }
+    assert (MicroViews(), PerRow(), Exact()) == (MicroViews(8, 5), PerRow(5), Exact(0, 0.005))
     for motion, count in counts.items():
         moving = motion.cells(scan(True), 1)
         assert moving.count == count and motion.cells(scan(False), 1).count == 1

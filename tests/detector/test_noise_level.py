@@ -1,9 +1,18 @@
-"""The estimate of noise from the line integrals themselves."""
+"""Estimates from frames: noise, transmission weights, and which raw counts are clipped."""
+
+from itertools import product
 
 import numpy as np
 import pytest
 
-from phyradgs_cl.detector import noise_behind, noise_level, noise_rms
+from phyradgs_cl.detector import (
+    beer_lambert_noise,
+    find_saturation,
+    noise_behind,
+    noise_level,
+    noise_rms,
+    transmission_weights,
+)
 
 
 def smooth_frames(noise: float, seed: int = 0) -> np.ndarray:
@@ -44,3 +53,63 @@ def test_the_noise_behind_the_object_does_not_depend_on_the_air() -> None:
     for frames in (noisy, clipped):
         assert noise_behind(frames, every) == pytest.approx(0.02, rel=0.08)
     assert noise_behind(np.zeros((2, 3, 2), np.float32), np.ones((2, 3, 2), bool)) == 0
+
+
+def test_the_mean_is_one_over_the_pixels_that_count() -> None:
+    p = np.random.default_rng(0).uniform(0, 5, (3, 8, 9)).astype(np.float32)
+    weights = transmission_weights(p)
+    assert weights.dtype == np.float32 and weights.mean() == pytest.approx(1, rel=1e-5)
+    np.testing.assert_allclose(weights / weights[0, 0, 0], np.exp(p[0, 0, 0] - p), rtol=1e-5)
+    valid = np.ones((8, 9), bool)
+    valid[2:4] = False
+    p[:, 2:4] = -50.0  # what a masked pixel holds does not matter
+    chosen = np.broadcast_to(valid, p.shape)
+    assert transmission_weights(p, valid)[chosen].mean() == pytest.approx(1, rel=1e-5)
+
+
+def test_weights_are_one_over_the_variance_and_extremes_stay_finite() -> None:
+    p = np.repeat(np.array([0.0, 1.0, 3.0], np.float32), 40_000).reshape(3, 200, 200)
+    noisy = beer_lambert_noise(p, 1e4, 0.0, np.random.default_rng(1))
+    products = transmission_weights(p).mean(axis=(1, 2)) * noisy.var(axis=(1, 2))
+    np.testing.assert_allclose(products, products[0], rtol=0.05)
+    p = np.array([[[-1e3, 0.0, 1e3]]], np.float32)
+    assert np.isfinite(transmission_weights(p)).all()
+    np.testing.assert_array_equal(transmission_weights(np.full((1, 2, 2), 1e4, np.float32)), 1)
+    np.testing.assert_array_equal(transmission_weights(p, np.zeros(p.shape, bool))[0, 0, :2], 1)
+
+
+AIR, SHAPE = 50_000.0, (4, 48, 64)
+
+
+def counts(noisy: bool, seed: int = 0) -> np.ndarray:
+    """Counts (4, 48, 64) of a ball that moves, with air around it, rounded."""
+    v, u = np.mgrid[:48, :64]
+    chords = [2 * np.sqrt(np.clip(400 - (v - 23.5) ** 2 - (u - c) ** 2, 0, None)) for c in (25, 30, 35, 40)]
+    expected = AIR * np.exp(-0.05 * np.stack(chords))
+    return np.round(np.random.default_rng(seed).normal(expected, np.sqrt(expected))) if noisy else np.round(expected)
+
+
+def test_a_panel_that_clips_is_found() -> None:
+    for level, flat_too, dtype in product(
+        (40_000, 50_100), (False, True), (np.uint16, np.float32, np.float64)
+    ):
+        frames = np.minimum(counts(noisy=True) + 400, level).astype(dtype)
+        found = find_saturation(frames, np.full(SHAPE[1:], min(AIR + 400, level) if flat_too else AIR + 400))
+        assert found.level == level and found.share == np.mean(frames == level) > 0.3
+
+
+GOOD = {
+    "noise": (counts(noisy=True), AIR), "no noise": (counts(noisy=False), AIR),
+    "no noise at the end of 16 bits": (np.round(counts(noisy=False) * 65535 / AIR), 65535.0),
+    "noise and a hot pixel": (np.where(np.arange(64) == 9, 65535, counts(noisy=True)) * (np.arange(48) == 9)[:, None], AIR),
+    "NaN": (np.where(counts(True) > 50_500, np.nan, counts(True)), AIR),
+}
+
+
+def test_what_is_not_clipped_is_not_found_and_what_is_all_clipped_is(recwarn) -> None:
+    for name, (frames, flat) in GOOD.items():
+        found = find_saturation(frames, np.full(SHAPE[1:], flat))
+        assert found.share == 0 and found.level == np.nanmax(frames), name
+    for frames, share in ((np.full(SHAPE, 4095), 1.0), (np.full(SHAPE, np.nan), 0.0)):
+        assert find_saturation(frames, np.full(SHAPE[1:], 4095.0)).share == share
+    assert not recwarn

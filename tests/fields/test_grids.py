@@ -1,9 +1,38 @@
-"""Grids that are chosen: what size, voxel and box mean alone and together, and what is refused."""
+"""Grids and the choice of another."""
 
+import numpy as np
 import pytest
 
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid, GridChoice
+
+SHIFTED = Grid((2, 3, 4), (1.0, 2.0, 3.0), (10.0, 20.0, 30.0))
+
+
+def test_centres_are_symmetric_about_the_offset() -> None:
+    z, y, x = SHIFTED.axes_mm()
+    np.testing.assert_allclose(z, [9.5, 10.5])
+    np.testing.assert_allclose(y, [18, 20, 22])
+    np.testing.assert_allclose(x, [25.5, 28.5, 31.5, 34.5])
+    assert SHIFTED.first_centre_mm == (9.5, 18.0, 25.5)
+    assert SHIFTED.size_mm == (2.0, 6.0, 12.0)
+    assert SHIFTED.half_longest_mm == 6.0
+    cube = Grid.cube(4, 8.0)
+    assert cube == Grid((4, 4, 4), (2.0, 2.0, 2.0))
+    scaled = SHIFTED.scaled(0.5)
+    assert scaled.shape == SHIFTED.shape
+    for fine, coarse in zip(scaled.axes_mm(), SHIFTED.axes_mm(), strict=True):
+        np.testing.assert_allclose(fine, coarse / 2)
+
+
+def test_impossible_grids_are_refused() -> None:
+    for subject, *arguments in [
+        ("shape", (0, 3, 4), (1, 1, 1)), ("shape", (3, 4), (1, 1, 1)), ("voxel_size", (2, 3, 4), (1, 0, 1)),
+        ("voxel_size", (2, 3, 4), (1, np.nan, 1)), ("offset", (2, 3, 4), (1, 1, 1), (0, np.inf, 0)),
+    ]:  # fmt: skip
+        with pytest.raises(InputError, match=subject):
+            Grid(*arguments)
+
 
 GRID = Grid((10, 20, 40), (1.0, 1.0, 2.0), (1.0, 2.0, 3.0))  # z −4 to 6, y −8 to 12, x −37 to 43
 BOX = (-2.0, 2.0, -4.0, 4.0, 0.0, 4.0)

@@ -1,0 +1,116 @@
+"""PSNR against its definition, SSIM against scikit-image's with a margin of zeros, and both together."""
+
+from importlib import import_module
+
+import numpy as np
+import pytest
+from refusals import assert_refused
+from skimage.metrics import peak_signal_noise_ratio, structural_similarity
+
+from phyradgs_cl.errors import InputError
+from phyradgs_cl.metrics import METRICS, compare, printed, psnr, ssim, ssim_map
+
+
+def _pair() -> tuple[np.ndarray, np.ndarray]:
+    rng = np.random.default_rng(0)
+    truth = rng.uniform(0, 0.8, (6, 7, 8)).astype(np.float32)
+    return truth + rng.normal(0, 0.05, truth.shape).astype(np.float32), truth
+
+
+def test_equals_scikit_image() -> None:
+    result, truth = _pair()
+    for data_range in (1.0, 0.3):
+        expected = peak_signal_noise_ratio(truth.astype(float), result.astype(float), data_range=data_range)
+        assert psnr(result, truth, data_range) == pytest.approx(expected, rel=1e-12)
+    assert psnr(result, truth) == psnr(result, truth, float(truth.max()))
+    assert psnr(np.full((3, 4, 5), 1.1), np.ones((3, 4, 5))) == pytest.approx(20.0)
+    result, truth = _pair()
+    assert psnr(result * 64, truth * 64) == pytest.approx(psnr(result, truth), rel=1e-9)
+    assert psnr(truth, truth) == np.inf
+
+
+def test_wrong_arguments_of_psnr_are_refused() -> None:
+    result, truth = _pair()
+    assert_refused({
+        "result: found shape": lambda: psnr(result[1:], truth),
+        "result: found 336 NaN": lambda: psnr(result * np.nan, truth),
+        "data range": lambda: psnr(result, truth * 0), "data.range": lambda: psnr(result, truth, -1.0),
+        "at least one voxel": lambda: psnr(np.zeros((0, 2)), np.zeros((0, 2))),
+    })  # fmt: skip
+
+
+def _two_stacks() -> tuple[np.ndarray, np.ndarray]:
+    rng = np.random.default_rng(0)
+    truth = rng.uniform(0.2, 1.7, (20, 24, 18))
+    truth[:3] = 0  # empty slices, as air above an object
+    truth[:, :, 14:] = 0
+    return truth + rng.normal(0, 0.3, truth.shape), truth
+
+
+def _reference_map(image: np.ndarray, truth: np.ndarray, data_range: float) -> np.ndarray:
+    margin = 12  # more than the window reaches, so that mirroring only ever mirrors zeros
+    window = {
+        "gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False, "data_range": data_range,
+    }
+    _, full = structural_similarity(np.pad(image, margin), np.pad(truth, margin), full=True, **window)
+    return full[margin:-margin, margin:-margin]
+
+
+def test_map_equals_scikit_image_up_to_the_border() -> None:
+    result, truth = _two_stacks()
+    expected = np.stack([_reference_map(a, b, 1.3) for a, b in zip(result, truth, strict=True)])
+    assert np.allclose(ssim_map(result, truth, 1.3), expected, atol=1e-10)
+
+
+@pytest.mark.parametrize("data_range", [None, 1.0])
+def test_volume_equals_the_mean_over_slices_that_are_not_empty(data_range: float | None) -> None:
+    result, truth = _two_stacks()
+    peak = data_range or truth.max()
+    means = []
+    for axis in range(3):
+        slices = zip(np.moveaxis(result, axis, 0), np.moveaxis(truth, axis, 0), strict=True)
+        means.append(np.mean([_reference_map(a, b, peak).mean() for a, b in slices if b.any()]))
+    assert ssim(result, truth, data_range) == pytest.approx(np.mean(means), abs=1e-10)
+
+
+def test_laws_and_batches(monkeypatch: pytest.MonkeyPatch) -> None:
+    result, truth = _two_stacks()
+    assert ssim(truth, truth) == pytest.approx(1.0, abs=1e-12)
+    full = np.abs(result) + 0.1, np.abs(truth) + 0.1  # no empty slices: then the order does not matter
+    assert ssim(*full, 1.0) == pytest.approx(ssim(full[1], full[0], 1.0), rel=1e-12)
+    assert ssim(result * 0.01, truth * 0.01) == pytest.approx(ssim(result, truth), rel=1e-9)
+    result, truth = _two_stacks()
+    whole = ssim(result, truth)
+    module = import_module("phyradgs_cl.metrics.quality")
+    monkeypatch.setattr(module, "_VOXELS_PER_BATCH", 700)
+    assert ssim(result, truth) == pytest.approx(whole, rel=1e-13)
+
+
+def test_wrong_arguments_of_ssim_are_refused() -> None:
+    assert_refused({
+        "reference: found shape": lambda: ssim(np.ones((4, 4)), np.ones((4, 4))),
+        "zeros only": lambda: ssim(np.ones((4, 4, 4)), np.zeros((4, 4, 4)), 1.0),
+        "result: found shape": lambda: ssim(np.ones((4, 4, 5)), np.ones((4, 4, 4))),
+    })  # fmt: skip
+
+
+def _frames() -> np.ndarray:
+    return np.random.default_rng(0).uniform(0, 3, (4, 12, 14))
+
+
+def test_compare_uses_the_references_maximum_and_says_so() -> None:
+    truth = _frames()
+    found = compare(truth + 0.1, truth)
+    assert found == {
+        "psnr_db": psnr(truth + 0.1, truth, truth.max()), "ssim": ssim(truth + 0.1, truth, truth.max()),
+        "data_range": truth.max(),
+    }
+    with pytest.raises(InputError, match="reference: found a maximum of 0"):
+        compare(truth, truth * 0)
+
+
+def test_every_metric_is_printed_with_its_unit() -> None:
+    truth = _frames()
+    assert compare(truth + 0.1, truth).keys() == {*METRICS, "data_range"}
+    assert list(printed({"psnr_db": 22.126, "ssim": 1.0})) == [("PSNR", "22.13 dB"), ("SSIM", "1.0000")]
+    assert list(printed({"psnr_db": "x", "ssim": None})) == []
