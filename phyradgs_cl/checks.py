@@ -21,19 +21,19 @@ def ceil_div(count: int, divisor: int) -> int:
 
 def positive(subject: str, value: float) -> None:
     """Raise InputError unless the scalar `value` is finite and above zero."""
-    if not (_is_finite(value) and value > 0):
+    if not (is_number(value) and value > 0):
         raise InputError(subject, shown(value), "a finite number above 0")
 
 
 def at_least(subject: str, value: float, minimum: float) -> None:
     """Raise InputError unless the scalar `value` is finite and not below `minimum`."""
-    if not (_is_finite(value) and value >= minimum):
+    if not (is_number(value) and value >= minimum):
         raise InputError(subject, shown(value), f"a finite number, at least {minimum}")
 
 
 def within(subject: str, value: float, lowest: float, highest: float) -> None:
     """Raise InputError unless the scalar `value` is finite and between two bounds, both included."""
-    if not (_is_finite(value) and lowest <= value <= highest):
+    if not (is_number(value) and lowest <= value <= highest):
         raise InputError(subject, shown(value), f"a number from {lowest} to {highest}")
 
 
@@ -117,7 +117,8 @@ def shown(value: object) -> str:
     return text if len(text) <= _LONGEST_SHOWN else f"{text[: _LONGEST_SHOWN - 3]}..."
 
 
-def _is_finite(value: object) -> bool:
+def is_number(value: object) -> bool:
+    """True for a finite number that is no bool."""
     if isinstance(value, bool) or not isinstance(value, int | float | np.integer | np.floating):
         return False
     return isinstance(value, int) or math.isfinite(value)  # isfinite fails on whole numbers beyond floats

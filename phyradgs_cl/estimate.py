@@ -15,7 +15,7 @@ from typing import Any
 
 from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.io import sha256_of, write_volume
-from phyradgs_cl.io.memory import in_use_bytes
+from phyradgs_cl.io.files import in_use_bytes
 from phyradgs_cl.metrics import compare
 from phyradgs_cl.reconstructors import Reconstruction, RunPlan, method_of, reconstruct
 from phyradgs_cl.reconstructors.splats.options import SplatOptions

@@ -1,8 +1,8 @@
 from .beads import load_beads as load_beads
 from .options import ImportOptions as ImportOptions
-from .recognise import recognise as recognise
 from .scan import FORMATS as FORMATS
 from .scan import import_scan as import_scan
+from .scan import recognise as recognise
 from .volumes import foreign_volume as foreign_volume
 from .volumes import load_attenuation as load_attenuation
 from .volumes import load_volume as load_volume

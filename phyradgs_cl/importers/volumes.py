@@ -8,7 +8,7 @@ import numpy as np
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid, triple
 from phyradgs_cl.importers.reading import tiff
-from phyradgs_cl.importers.reading.bounded import read_json, read_npy
+from phyradgs_cl.importers.reading.files import read_json, read_npy
 from phyradgs_cl.importers.reading.images import read_image_volume
 from phyradgs_cl.io.tables import Fields
 from phyradgs_cl.io.volume import Volume, check_attenuation, finite_float32, read_volume, shares_of_maximum

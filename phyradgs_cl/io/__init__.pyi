@@ -3,8 +3,10 @@ from .checkpoint import former_checkpoint_path as former_checkpoint_path
 from .checkpoint import partial_path as partial_path
 from .checkpoint import read_checkpoint as read_checkpoint
 from .checkpoint import write_checkpoint as write_checkpoint
-from .lock import only_run as only_run
+from .files import hashing as hashing
+from .files import sha256_of as sha256_of
 from .output import check_writable as check_writable
+from .output import only_run as only_run
 from .output import written_beside as written_beside
 from .scan.reader import ToAttenuation as ToAttenuation
 from .scan.reader import read_scan as read_scan
@@ -13,8 +15,6 @@ from .scan.writer import write_scan as write_scan
 from .scanner import Scanner as Scanner
 from .scanner import load_scanner as load_scanner
 from .scanner import with_detector_count as with_detector_count
-from .sha256 import hashing as hashing
-from .sha256 import sha256_of as sha256_of
 from .volume import Volume as Volume
 from .volume import file_kind as file_kind
 from .volume import read_state as read_state

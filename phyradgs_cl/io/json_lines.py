@@ -1,4 +1,5 @@
-"""Results files: JSON lines, one per run, only appended to; a damaged last line is skipped, and closed off by the next."""
+"""Results files: one JSON line per run, appended. A damaged line is left out, and the next one begins on a line of its
+own."""
 
 import json
 import logging
@@ -8,22 +9,21 @@ from pathlib import Path
 from typing import Any
 
 from phyradgs_cl.errors import InputError, OutputError
-from phyradgs_cl.io.hdf5.facts import damage
-from phyradgs_cl.io.regular import read_regular, regular_file
+from phyradgs_cl.io.files import read_regular, regular_file
 from phyradgs_cl.text import plain_text
 
 Line = dict[str, Any]
 log = logging.getLogger(__name__)
-_WANTED = "a results file (JSON lines)"
+_EXPECTED = "a results file (JSON lines)"
 _MOST_BYTES = 1 << 30
 
 
 def read_lines(path: Path, is_sound: Callable[[Line], bool] = lambda line: True) -> list[Line]:
-    """All whole and sound lines of a results file, with a word about others; none where there is no file. InputError
-    for a file that cannot be read, or that has content but no result."""
+    """Reads the lines of a results file that are whole and pass ``is_sound``, and warns of others; no lines where there
+    is no file. InputError for a file that cannot be read, or with content but no result."""
     text = ""
     if path.exists():
-        text = read_regular(path, str(path), _MOST_BYTES, _WANTED).decode(errors="replace")
+        text = read_regular(path, str(path), _MOST_BYTES, _EXPECTED).decode(errors="replace")
     lines: list[Line] = []
     damaged = []
     for number, row in enumerate(text.split("\n"), 1):
@@ -33,7 +33,7 @@ def read_lines(path: Path, is_sound: Callable[[Line], bool] = lambda line: True)
         elif row.strip():
             damaged.append(number)
     if damaged and not lines and len(damaged) > 1:
-        raise InputError(str(path), "no result in any line", _WANTED, "choose another -o")
+        raise InputError(str(path), "no result in any line", _EXPECTED, "choose another -o")
     if damaged:
         where = ("line %s is" if len(damaged) == 1 else "lines %s are") % ", ".join(map(str, damaged))
         log.warning("%s: %s damaged and left out", path, where)
@@ -41,13 +41,13 @@ def read_lines(path: Path, is_sound: Callable[[Line], bool] = lambda line: True)
 
 
 def refuse_irregular(path: Path) -> None:
-    """Raise InputError for what is there and no regular file: a device or a pipe may never end."""
+    """Raises InputError for an existing path that is no regular file: reading a device or a pipe may never end."""
     if path.exists():
-        regular_file(path, str(path), _WANTED)
+        regular_file(path, str(path), _EXPECTED)
 
 
 def append_line(path: Path, line: Mapping[str, Any]) -> None:
-    """Add one line in a single write that is on the disk when this returns."""
+    """Appends one line in a single write, and waits until it is on the disk."""
     text = json_text(line) + "\n"
     try:
         with open(path, "ab+") as file:
@@ -62,7 +62,7 @@ def append_line(path: Path, line: Mapping[str, Any]) -> None:
 
 
 def json_text(value: object) -> str:
-    """JSON of numbers that are finite, in which text stays readable."""
+    """Returns JSON with finite numbers and readable text."""
     return plain_text(json.dumps(value, ensure_ascii=False, allow_nan=False))
 
 
@@ -71,7 +71,7 @@ def _parsed(row: str) -> Line | None:
         line = json.loads(row)
     except (ValueError, RecursionError):
         return None
-    return line if isinstance(line, dict) and "run" in line and not damage(line, {}) else None
+    return line if isinstance(line, dict) and "run" in line else None
 
 
 def _is_open_ended(file: Any) -> bool:

@@ -1,4 +1,4 @@
-"""Outputs that are there whole or not at all: written beside the target, then moved over it; names of files beside."""
+"""Outputs that are whole or absent: written beside the target, then renamed over it; one run per output by a lock file."""
 
 import errno
 import glob
@@ -18,24 +18,59 @@ from zlib import crc32
 from phyradgs_cl.errors import OutputError
 
 NO_SPACE = (errno.ENOSPC, errno.EFBIG, getattr(errno, "EDQUOT", errno.ENOSPC))
-"""What an operating system says where there is no room: the disk, the largest file, the user's share."""
+"""System errors for a lack of room: on the disk, for one file, of the user's quota."""
 _LONGEST = 50  # characters of the target's name, of up to four bytes each: names end at 255
+_LONGEST_BYTES = 255  # of a name, in all common file systems
 _SPARE_BYTES = 1 << 16  # for headers beside the arrays
 _WRITER = re.compile(r"\.([0-9a-f]{8})-(\d{1,9})-[0-9a-f]{8}\.part(\.[a-z.]+)?$")
+_TRY_EVERY_S = 0.2
+
+
+class BusyError(OutputError):
+    """Another run is at work on the output."""
 
 
 def check_writable(path: str | Path) -> None:
-    """Raise OutputError now if ``path`` could not be written later: makes, and removes, an empty file in its folder."""
+    """Raises OutputError where ``path`` could not be written later: creates and removes an empty file in its folder."""
     _create_beside(_target(path)).unlink()
 
 
 def make_folder(folder: Path, subject: Path) -> None:
-    """Makes a folder, and those above it; OutputError about ``subject`` where that cannot be."""
+    """Creates a folder and those above it; OutputError about ``subject`` where that fails."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         found = error.strerror or str(error)
         raise OutputError(str(subject), found, "a folder that can be written") from error
+
+
+def lock_path(output: str | Path) -> Path:
+    """Returns the lock file of ``output``. It exists while a run writes there and means nothing after that run."""
+    return beside(Path(os.path.realpath(output)), ".lock", ".")
+
+
+@contextmanager
+def only_run(output: str | Path, wait_s: float = 0.0) -> Iterator[None]:
+    """Holds the lock of ``output``, which the system releases when a process ends. BusyError where another run still holds
+    it after ``wait_s``."""
+    from filelock import FileLock, Timeout
+
+    path = lock_path(output)
+    lock = FileLock(path)
+    try:
+        lock.acquire(timeout=wait_s, poll_interval=_TRY_EVERY_S)
+    except Timeout:
+        remedy = "wait for it, or choose another output"
+        raise BusyError(str(output), "another run at work on it", "one run per output", remedy) from None
+    except OSError as error:
+        found = f"{error.strerror or error} for its lock {path}"
+        raise OutputError(str(output), found, "a folder that can be written", "choose another") from error
+    try:
+        yield
+    finally:
+        with suppress(OSError):
+            path.unlink()  # while locked: a waiting process then sees that the file is gone
+        lock.release()
 
 
 @contextmanager
@@ -68,7 +103,7 @@ def written_beside(path: str | Path, size_bytes: int = 0, suffix: str = "") -> I
 
 
 def _target(path: str | Path) -> Path:
-    """The file to write, behind any symbolic link; OutputError if it, or its folder, will not do."""
+    """Returns the file to write, behind any symbolic link; OutputError where it or its folder is unsuitable."""
     shown = str(path)
     if not shown or shown.endswith(("/", os.sep)) or os.path.isdir(shown):
         raise OutputError(shown or "output path", "a folder", "a file name", "add a file name to the path")
@@ -114,7 +149,7 @@ def temporary_name(target: Path, suffix: str = "") -> Path:
 
 @cache
 def _machine() -> str:
-    """Where process numbers mean the same: a machine, or a container on it."""
+    """Returns a name of this machine, or of the container on it, in which process numbers are unique."""
     namespace = ""
     with suppress(OSError):
         namespace = os.readlink("/proc/self/ns/pid")
@@ -122,12 +157,12 @@ def _machine() -> str:
 
 
 def _is_dead(process: int) -> bool:
-    if os.name != "posix":  # elsewhere asking ends the process
+    if os.name != "posix":  # elsewhere os.kill ends the process
         return False
     try:
         os.kill(process, 0)
     except OSError as error:
-        return isinstance(error, ProcessLookupError)  # others say that it is somebody else's
+        return isinstance(error, ProcessLookupError)  # other errors mean another user's process
     return False
 
 
@@ -140,7 +175,7 @@ def _discard(path: Path) -> None:
 
 
 def _flush_folder(folder: Path) -> None:
-    """Make the renaming itself durable where folders can be opened; elsewhere there is nothing to do."""
+    """Makes the renaming durable, on systems that open folders."""
     with suppress(OSError):
         descriptor = os.open(folder, os.O_RDONLY)
         try:
@@ -151,8 +186,7 @@ def _flush_folder(folder: Path) -> None:
 
 def _output_error(target: Path, error: BaseException) -> OutputError:
     code = getattr(error, "errno", None)
-    full = code in NO_SPACE or any(f"errno = {number}," in str(error) for number in NO_SPACE)
-    if full:
+    if code in NO_SPACE or any(f"errno = {number}," in str(error) for number in NO_SPACE):
         found = f"no room left in folder {target.parent}"
         expected = "enough space on the disk"
         return OutputError(str(target), found, expected, "free some space or choose another folder")
@@ -162,11 +196,8 @@ def _output_error(target: Path, error: BaseException) -> OutputError:
     return OutputError(str(target), found, "a file that can be written", "choose another folder")
 
 
-_LONGEST_BYTES = 255  # of a name, in every file system that is common
-
-
 def shortened(name: str, most_bytes: int) -> str:
-    """``name``, or as much of it as fits in front of a digest of all of it."""
+    """Returns ``name``, or its beginning and a digest of all of it in ``most_bytes``."""
     raw = os.fsencode(name)
     if len(raw) <= most_bytes:
         return name
@@ -175,7 +206,7 @@ def shortened(name: str, most_bytes: int) -> str:
 
 
 def beside(path: str | Path, ending: str, beginning: str = "") -> Path:
-    """The path ``beginning`` + name + ``ending`` in the same folder, shortened where no file system would take it."""
+    """Returns the path ``beginning`` + name + ``ending`` in the same folder, shortened to a name that file systems take."""
     room = _LONGEST_BYTES - len(os.fsencode(beginning + ending))
     path = Path(path)
     return path.with_name(f"{beginning}{shortened(path.name, room)}{ending}")

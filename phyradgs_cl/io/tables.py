@@ -1,5 +1,7 @@
-"""Typed values out of nested plain containers (JSON, TOML, pickles), each named by its path when it is wrong."""
+"""Typed values out of plain containers (TOML, JSON, pickles). An error names the value by its path in the container."""
 
+import json
+import logging
 import sys
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -9,7 +11,7 @@ import numpy as np
 
 from phyradgs_cl import checks
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.io.regular import read_regular
+from phyradgs_cl.io.files import read_regular
 from phyradgs_cl.text import near_miss
 
 if sys.version_info >= (3, 11):
@@ -20,63 +22,98 @@ else:
 LARGEST = 1e12  # of any length, angle or time that makes sense; keeps sums finite
 _MOST_TOML_BYTES = 16 << 20
 _COUNTS = {2: "two", 3: "three"}
+_log = logging.getLogger(__name__)
+PROVENANCE: dict[str, tuple[type, ...]] = {
+    **dict.fromkeys(("method", "program", "scan", "scan_sha256", "device"), (str,)),
+    **dict.fromkeys(("seed", "gaussians", "interrupted_at"), (int,)),
+    **dict.fromkeys(("options", "input"), (dict,)),
+    "seconds": (int, float),
+    "record": (list,),
+}
+"""The types of the fields of a volume's provenance."""
 
 
 def read_toml(path: Path, subject: str = "") -> dict[str, Any]:
-    """The content of a TOML file. Raises InputError, about ``subject`` or the path, where there is none or no TOML."""
+    """Parses a TOML file. InputError about ``subject``, or the path, for a missing file or other text."""
     subject = subject or str(path)
     try:
         return tomllib.loads(read_regular(path, subject, _MOST_TOML_BYTES, "a TOML file").decode("utf-8-sig"))
-    except (ValueError, RecursionError) as error:  # not TOML, not text, too many digits; tables too deep
+    except (ValueError, RecursionError) as error:  # also numbers of too many digits and tables that are too deep
         raise InputError(subject, f"text that is not TOML ({error})", "a TOML file") from error
 
 
-def refuse_unknown(subject: str, found: Collection[str], known: Collection[str], what: str = "a key") -> None:
-    """InputError for the first name that is not known, with the one that it nearly is."""
-    for key in found:
-        if key not in known:
-            remedy = near_miss(key, known, "remove it")
-            raise InputError(f"{subject} {key}", f"{what} that is not known", ", ".join(known), remedy)
+def read_facts(subject: str, text: str, types: Mapping[str, tuple[type, ...]]) -> dict[str, object]:
+    """Parses a JSON object, such as provenance, which users edit. A field of a wrong type is left out with a warning; None
+    passes everywhere. InputError for other text."""
+    try:
+        facts = json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise InputError(subject, f"text that is not JSON ({error})", "a JSON object") from error
+    if not isinstance(facts, dict):
+        raise InputError(subject, f"JSON {type(facts).__name__}", "a JSON object")
+    for name, allowed in types.items():
+        value = facts.get(name)
+        if value is not None and (not isinstance(value, allowed) or isinstance(value, bool) or not _fits(value)):
+            expected = " or ".join(one.__name__ for one in allowed)
+            _log.warning("%s: %s is left out: found %s; expected %s", subject, name, described(value), expected)
+            del facts[name]
+    return facts
+
+
+def _fits(value: object) -> bool:
+    """Whether a list holds tables only, and a number is finite, of 64 bits at most."""
+    if isinstance(value, list):
+        return all(isinstance(line, dict) for line in value)
+    return not isinstance(value, (int, float)) or abs(value) < 2**63
+
+
+def refuse_unknown(subject: str, names: Collection[str], allowed: Collection[str], what: str = "a key") -> None:
+    """Raises InputError for the first unknown name, with the allowed name that is close to it."""
+    for key in names:
+        if key not in allowed:
+            remedy = near_miss(key, allowed, "remove it")
+            raise InputError(f"{subject} {key}", f"{what} that is not known", ", ".join(allowed), remedy)
 
 
 class Fields:
-    """A mapping and the name to blame: values are taken out one by one, each checked. ``known``: the only names that it
-    may have; None for a table that may have more than is read of it."""
+    """A mapping whose values are read one by one, each checked; ``subject`` names it in messages. ``allowed``: the only keys
+    that it may have; None allows any."""
 
-    def __init__(self, subject: str, values: object, known: Collection[str] | None = None) -> None:
+    def __init__(self, subject: str, values: object, allowed: Collection[str] | None = None) -> None:
         if not isinstance(values, Mapping):
             raise InputError(subject, described(values), "a table of names and values")
-        if known is not None:
-            refuse_unknown(subject, values, known)
+        if allowed is not None:
+            refuse_unknown(subject, values, allowed)
         self.subject = subject
         self.values = values
-        self._joint = " " if known is not None or subject.endswith(":") else "."
+        self._joint = " " if allowed is not None or subject.endswith(":") else "."
 
     def name(self, key: str) -> str:
-        """How messages name a value of the table."""
+        """Returns the name of a value in messages."""
         return f"{self.subject}{self._joint}{key}"
 
     def error(self, key: str, found: str, expected: str, remedy: str = "") -> InputError:
-        """What to raise about a value of the table."""
+        """Returns an InputError about a value of the table."""
         return InputError(self.name(key), found, expected, remedy)
 
     def has(self, key: str) -> bool:
+        """True where the table has a value that is not None."""
         return self.values.get(key) is not None
 
     def get(self, key: str) -> object:
-        """A required value of any kind."""
+        """Returns a required value of any type."""
         if not self.has(key):
             raise self.error(key, "nothing", "a value", "add it to the file")
         return self.values[key]
 
     def table(self, key: str) -> "Fields":
-        """A required table inside this one."""
+        """Returns a required table inside this one."""
         return Fields(self.name(key), self.get(key))
 
     def number(
         self, key: str, default: float | None = None, lowest: float = -LARGEST, highest: float = LARGEST
     ) -> float:
-        """A finite number between two bounds, both included."""
+        """Returns a finite number between two bounds, both included."""
         if default is not None and not self.has(key):
             return default
         value = self._finite(key, self.get(key))
@@ -86,47 +123,47 @@ class Fields:
         return value
 
     def length(self, key: str) -> float:
-        """A number above zero."""
+        """Returns a number above zero."""
         value = self.number(key)
         if value <= 0:
             raise self.error(key, f"{value:g}", "a number above 0")
         return value
 
     def numbers(self, key: str, count: int | None = None, largest: float = LARGEST) -> np.ndarray:
-        """A list, or an array, of finite numbers (count,) float64, in size at most ``largest``."""
-        found = self.get(key)
-        if isinstance(found, np.ndarray):
-            found = found.tolist() if found.ndim == 1 else None
-        wanted = f"{_COUNTS.get(count, count)} numbers" if count is not None else "a list of numbers"
-        if not isinstance(found, Sequence) or isinstance(found, (str, bytes)):
-            raise self.error(key, described(self.get(key)), wanted)
-        if count is not None and len(found) != count:
-            raise self.error(key, f"{len(found)} values", wanted)
-        return np.array([self._finite(key, value, largest) for value in found], np.float64)
+        """Returns the finite numbers of a list or an array, (count,) float64, of size ``largest`` at most."""
+        values = self.get(key)
+        if isinstance(values, np.ndarray):
+            values = values.tolist() if values.ndim == 1 else None
+        expected = f"{_COUNTS.get(count, count)} numbers" if count is not None else "a list of numbers"
+        if not isinstance(values, Sequence) or isinstance(values, (str, bytes)):
+            raise self.error(key, described(self.get(key)), expected)
+        if count is not None and len(values) != count:
+            raise self.error(key, f"{len(values)} values", expected)
+        return np.array([self._finite(key, value, largest) for value in values], np.float64)
 
     def lengths(self, key: str, count: int) -> np.ndarray:
-        """(count,) numbers above zero."""
+        """Returns (count,) numbers above zero."""
         values = self.numbers(key, count)
         if values.min() <= 0:
             raise self.error(key, str(values.tolist()), "numbers above 0")
         return values
 
     def count(self, key: str, most: int) -> int:
-        """A whole number from 1 to ``most``."""
+        """Returns a whole number from 1 to ``most``."""
         value = self.number(key)
         if not 1 <= value <= most or value != int(value):
             raise self.error(key, f"{value:g}", f"a whole number from 1 to {most}")
         return int(value)
 
     def counts(self, key: str, count: int) -> tuple[int, ...]:
-        """``count`` whole numbers of at least 1."""
+        """Returns ``count`` whole numbers from 1 to 1,000,000."""
         values = self.numbers(key, count)
         if values.min() < 1 or values.max() > 1e6 or np.any(values != np.rint(values)):
             raise self.error(key, str(values.tolist()), "whole numbers from 1 to 1000000")
         return tuple(int(value) for value in values)
 
     def word(self, key: str, allowed: Sequence[str] | None = None, default: str | None = None) -> str:
-        """A string, one of ``allowed`` where they are given."""
+        """Returns a string, one of ``allowed`` where that is given."""
         if default is not None and not self.has(key):
             return default
         value = self.get(key)
@@ -137,23 +174,22 @@ class Fields:
         return value
 
     def tables(self, key: str) -> "Iterator[Fields]":
-        """The tables of a list that is not empty."""
-        found = self.get(key)
-        if not isinstance(found, list) or not found:
-            raise self.error(key, described(found), "a list with at least one entry")
-        return (Fields(f"{self.name(key)}[{index}]", value) for index, value in enumerate(found))
+        """Returns the tables of a list with at least one entry."""
+        entries = self.get(key)
+        if not isinstance(entries, list) or not entries:
+            raise self.error(key, described(entries), "a list with at least one entry")
+        return (Fields(f"{self.name(key)}[{index}]", value) for index, value in enumerate(entries))
 
     def _finite(self, key: str, value: object, largest: float = LARGEST) -> float:
         if isinstance(value, np.generic):
             value = value.item()
-        good = isinstance(value, (int, float)) and not isinstance(value, bool)
-        if not good or not abs(value) <= largest:  # type: ignore[arg-type]
+        if isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) <= largest:
             raise self.error(key, described(value), f"a finite number of at most {largest:g}")
-        return float(value)  # type: ignore[arg-type]
+        return float(value)
 
 
 def described(value: object) -> str:
-    """A value for a message; of containers the kind and length only, for a hostile one can take for ever to print."""
+    """Returns a value for a message; of containers only type and length, since nested ones can take for ever to print."""
     if value is None or isinstance(value, (bool, int, float, str, bytes, np.generic)):
         return checks.shown(value)
     size = f" of {len(value)}" if isinstance(value, (Mapping, Sequence)) else ""

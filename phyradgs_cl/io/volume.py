@@ -14,10 +14,10 @@ import numpy as np
 from phyradgs_cl import checks
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Gaussians, Grid, triple
+from phyradgs_cl.io.files import sha256_of
 from phyradgs_cl.io.hdf5 import datasets as h5
-from phyradgs_cl.io.hdf5.facts import PROVENANCE, Schema, read_facts
 from phyradgs_cl.io.hdf5.source import Hdf5Source, open_hdf5
-from phyradgs_cl.io.sha256 import sha256_of
+from phyradgs_cl.io.tables import PROVENANCE, read_facts
 from phyradgs_cl.text import plain_text
 
 _DATA = "/entry/reconstruction"
@@ -36,7 +36,7 @@ log = logging.getLogger(__name__)
 @dataclass(frozen=True, eq=False)
 class Volume:
     """Values (nz, ny, nx) float32 in 1/mm and their grid; None for a bare array. A volume file also holds ``provenance``
-    (types as in ``facts.PROVENANCE``), ``gaussians`` float32 in mm and 1/mm, ``metrics`` by name and ``disagreement``: half
+    (types as in ``tables.PROVENANCE``), ``gaussians`` float32 in mm and 1/mm, ``metrics`` by name and ``disagreement``: half
     the RMS difference of two estimates (nz, ny, nx) float32 in 1/mm."""
 
     values: np.ndarray
@@ -289,11 +289,11 @@ def _read_part(source: Hdf5Source, address: str) -> np.ndarray:
     return np.array(h5.read_word(source, address)) if is_text else h5.read_values(source, address, dataset)
 
 
-def _read_facts(source: Hdf5Source, name: str, schema: Schema) -> dict[str, object] | None:
+def _read_facts(source: Hdf5Source, name: str, types: Mapping[str, tuple[type, ...]]) -> dict[str, object] | None:
     address = f"/entry/{name}/json"
     if source.optional_group(f"/entry/{name}") is None:
         return None
-    return read_facts(source.name(address), h5.read_word(source, address), schema)
+    return read_facts(source.name(address), h5.read_word(source, address), types)
 
 
 def _read_metrics(source: Hdf5Source) -> dict[str, object] | None:

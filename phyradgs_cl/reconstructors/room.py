@@ -8,7 +8,7 @@ from typing import Any
 from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.errors import OutOfMemoryError
 from phyradgs_cl.fields import Grid
-from phyradgs_cl.io.memory import HOST_SHARE, free_bytes, host_bytes
+from phyradgs_cl.io.files import HOST_SHARE, free_bytes, host_bytes
 from phyradgs_cl.runtime import Runtime
 
 # Volumes that voxel methods hold at one time at most (docs/large.md), with two of the intensity model; they hold stacks of

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from phyradgs_cl import checks
 from phyradgs_cl.drawing import ACCENT, COLOURS, INK, SOFT, draw_curve, style_axes
-from phyradgs_cl.io.hdf5.facts import NUMBER
 from phyradgs_cl.report.markup import Markup, element, label, number, unit
 
 if TYPE_CHECKING:
@@ -122,7 +122,7 @@ def draw_tuning(axes: "Axes", tuned: Mapping[str, Any]) -> None:
 
 def views_chart(key: str, values: object) -> Chart | None:
     """Returns a chart of a correction of every view; None for values that are no numbers, as a file may hold."""
-    if not isinstance(values, list) or len(values) < 2 or not all(map(NUMBER.fits, values)):
+    if not isinstance(values, list) or len(values) < 2 or not all(map(checks.is_number, values)):
         return None
     words = label(key).capitalize()
     caption = f"{words} of every view, corrected."

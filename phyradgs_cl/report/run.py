@@ -9,11 +9,11 @@ from typing import Any
 
 import numpy as np
 
+from phyradgs_cl import checks
 from phyradgs_cl.acquisition import Motion, Scan
 from phyradgs_cl.acquisition.motion import motion_from_facts
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.io import Volume, file_kind, read_scan, read_volume, scan_summary, sha256_of
-from phyradgs_cl.io.hdf5.facts import NUMBER
 from phyradgs_cl.metrics import METRICS, aligned, compare
 from phyradgs_cl.prepare import flat_correction
 from phyradgs_cl.reconstructors import Preprocessing, preprocessing_of
@@ -63,7 +63,7 @@ class Run:
     def record(self) -> list[dict[str, float]]:
         """The convergence record: finite numbers only."""
         lines: Any = self.stored.provenance.get("record") or []
-        return [{k: float(v) for k, v in line.items() if NUMBER.fits(v)} for line in lines]
+        return [{k: float(v) for k, v in line.items() if checks.is_number(v)} for line in lines]
 
 
     @property

@@ -30,7 +30,7 @@ from tables.results import read_lines
 from phyradgs_cl.acquisition import PROTOCOLS, ConeGeometry
 from phyradgs_cl.errors import InputError, NumericalError
 from phyradgs_cl.io import only_run
-from phyradgs_cl.io.lock import BusyError
+from phyradgs_cl.io.output import BusyError
 from phyradgs_cl.runtime import Runtime
 
 TINY = BenchSize("T", 12, 16, 8)

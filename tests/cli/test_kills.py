@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from phyradgs_cl.io import checkpoint_path, read_volume
-from phyradgs_cl.io.lock import lock_path
+from phyradgs_cl.io.output import lock_path
 
 TINY = ["--phantom", "jaw", "--size", "12", "--detector", "16", "--views", "4", "--time-samples", "2"]
 RUNS = {

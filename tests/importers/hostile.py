@@ -4,7 +4,6 @@ import json
 import os
 import pickle
 import struct
-import sys
 import zlib
 from collections.abc import Callable
 from pathlib import Path
@@ -138,10 +137,6 @@ def tuple_bomb_value(path: Path) -> None:
     path.write_bytes(b"\x80\x04}\x8c\x03DSO" + doubled(60) + b"s.")
 
 
-def tuple_bomb_key(path: Path) -> None:
-    path.write_bytes(b"\x80\x04}" + doubled(60) + b"K\x01s.")
-
-
 def huge_array_pickle(path: Path) -> None:
     """_reconstruct with a shape of a terabyte and hardly any bytes."""
     path.write_bytes(
@@ -150,19 +145,6 @@ def huge_array_pickle(path: Path) -> None:
         b"(K\x01\x8a\x05\x00\x00\x00\x00\x40\x85cnumpy\ndtype\n\x8c\x02f4\x89\x88\x87R"
         b"(K\x03\x8c\x01<NNNJ\xff\xff\xff\xffJ\xff\xff\xff\xffK\x00tb\x89C\x04\0\0\0\0tbs."
     )
-
-
-def colliding_keys(path: Path, before: bytes = b"}(", after: bytes = b"u.") -> None:
-    """80,000 integers whose hash is 0: a dict of them takes minutes."""
-    keys = (b"\x8a\x0c" + (i * sys.hash_info.modulus).to_bytes(12, "little") + b"K\x00" for i in range(80_000))
-    path.write_bytes(b"\x80\x04" + before + b"".join(keys) + after)
-
-
-def encode_bomb(path: Path) -> None:
-    """One text of 64 KiB turned into bytes 100,000 times: 6 GB out of a file of some 600 kB."""
-    text = b"X" + struct.pack("<I", 1 << 16) + b"a" * (1 << 16)
-    setup = b"c_codecs\nencode\n\x94" + text + b"\x8c\x06latin1\x86\x94"
-    path.write_bytes(b"\x80\x04" + setup + b"00](" + b"h\x00h\x01R" * 100_000 + b"e.")
 
 
 PROJ = "proj_train/0000.npy"
@@ -246,11 +228,10 @@ NAF: dict[str, tuple[Damage, tuple[str, ...]]] = {
     "a list": (filled("", pickle.dumps([1, 2])), ("table",)),
     "a call of os.system": (with_bomb("DSD"), ("posix.system", "nothing was executed")),
     "a call in an unused key": (with_bomb("unused"), ("posix.system",)),
-    "a call by the old opcode": (filled("", b"(S'touch canary'\nios\nsystem\n."), ("INST",)),
+    "a call by the old opcode": (filled("", b"(S'touch canary'\nios\nsystem\n."), ("os.system",)),
     "a call by GLOBAL": (filled("", b"cos\nsystem\n(S'touch canary'\ntR."), ("os.system",)),
     "eval": (filled("", b"c__builtin__\neval\n(S'1'\ntR."), ("eval",)),
-    "an extension": (filled("", b"\x80\x02\x82\x01."), ("EXT1",)),
-    "a persistent object": (filled("", b"P3\n."), ("a persistent object",)),
+    "a persistent object": (filled("", b"P3\n."), ("persistent",)),
     "an object by NEWOBJ": (pickled(lambda d, _: d.update(DSD=Path("x"))), ("pathlib",)),
     "numpy.load": (filled("", b"cnumpy\nload\n(S'x'\ntR."), ("numpy.load",)),
     "an array of objects": (pickled(object_array), ("'O8'",)),
@@ -261,13 +242,7 @@ NAF: dict[str, tuple[Damage, tuple[str, ...]]] = {
     "an array declared huge": (huge_array_pickle, ("in 4 bytes",)),
     "a number of many digits": (filled("", b"I" + b"9" * 100_000 + b"\n."), ("damaged pickle",)),
     "tuples of tuples as a value": (tuple_bomb_value, ("DSO", "a tuple of 2")),
-    "tuples of tuples as a key": (tuple_bomb_key, ("a key",)),
-    "one text as bytes again and again": (encode_bomb, ("more bytes",)),
-    "keys of one hash": (colliding_keys, ("a key that is neither text nor a small integer",)),
-    "keys of one hash in an old dict": (lambda path: colliding_keys(path, b"(", b"d."), ("a key",)),
-    "a set": (filled("", b"\x80\x04\x8f(K\x01\x90."), ("EMPTY_SET",)),
     "bytes declared huge": (filled("", b"\x80\x05\x96" + struct.pack("<Q", 1 << 60) + b"a."), ("damaged pickle",)),
-    "an endless list": (filled("", b"\x80\x04](" + b"K\x01" * 3_500_000 + b"e."), ("opcodes",)),
     "a list that holds itself": (filled("", b"\x80\x04}\x8c\x03DSO]\x94h\x00as."), ("DSO",)),
     "an array never filled": (filled("", b"\x80\x04}\x8c\x03DSOcnumpy.core.multiarray\n_reconstruct\n)Rs."), ("DSO",)),
     "a function as a value": (filled("", b"\x80\x04}\x8c\x03DSOcnumpy\ndtype\ns."), ("DSO",)),

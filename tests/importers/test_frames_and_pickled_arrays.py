@@ -1,5 +1,6 @@
 """Frames to line integrals, masks put together, and arrays out of pickles: what is refused, and what it says."""
 
+import io
 import pickle
 
 import numpy as np
@@ -103,28 +104,27 @@ CALLS = {
         ((RAW, "i2", (6,), "C"), "without numbers"), ((None, "TYPE", (6,), "C"), "without numbers"),
     ],
     "numpy dtype": [((code,), "plain real numbers") for code in ("O8", "c8", "V9", "i4,i4", "a", "b1\n", 3)],
-    "_codecs encode": [(("a", "utf-7"), "not latin1"), ((b"a", "latin1"), "not latin1")],
-    "numpy ndarray": [(((3,),), "not callable")],
+    "numpy ndarray": [(((3,),), "no arguments")],
     "numpy load": [(("x",), "a call of numpy.load")],
     "builtins bytearray": [((1 << 40,), "a call of builtins.bytearray")],
 }
 
 
 def test_what_is_no_array_of_plain_numbers_is_refused() -> None:
+    """NumPy's own constructors would read memory where a type of objects, or one with fields, points."""
+    machine = PlainUnpickler(io.BytesIO(b""))
     for name, cases in CALLS.items():
         for arguments, words in cases:
-            machine = PlainUnpickler("f", RAW)
             dtype = machine.find_class("numpy", "dtype")("i2")
             given = [dtype if a == "TYPE" else a for a in arguments]
             with pytest.raises((InputError, ValueError, TypeError), match=words):
                 machine.find_class(*name.split())(*given)
+    with pytest.raises(ValueError):
+        machine.find_class("numpy", "dtype")("i2").__setstate__((3, {"names": 1}, None, ("a",), {}))
 
 
-def test_what_a_pickle_may_call_has_no_state_to_set() -> None:
-    """BUILD would otherwise change a function of this process for good."""
-    machine = PlainUnpickler("f", b"")
-    for allowed in ("_reconstruct", "scalar"):
-        with pytest.raises(ValueError, match="a state for something that has none"):
-            machine.find_class("numpy._core.multiarray", allowed).__setstate__((None, {"_function": 1}))
-    with pytest.raises(ValueError, match="without shape"):
-        machine.find_class("numpy.core.multiarray", "_reconstruct")().__setstate__({"shape": (1 << 40,)})
+def test_a_pickle_cannot_change_a_function_of_this_process() -> None:
+    """The opcode BUILD sets attributes of whatever find_class has returned: that is made for one name of one pickle."""
+    machine = PlainUnpickler(io.BytesIO(b""))
+    names = [("numpy", "dtype"), ("numpy.core.multiarray", "_reconstruct"), ("numpy.core.numeric", "_frombuffer")]
+    assert all(machine.find_class(*name) is not machine.find_class(*name) for name in names)

@@ -90,7 +90,7 @@ def test_a_deflated_image_larger_than_this_machine_s_share_is_refused(tmp_path, 
     path = w.write_tiff(tmp_path / "tiff", make_truth())
     hostile.tifffile.imwrite(path / "proj_all.tif", np.zeros((6, 1000, 1000), np.float32), compression="zlib")
     hostile.in_text(hostile.TOML, "proj_*", "proj_all")(path)
-    monkeypatch.setattr("phyradgs_cl.importers.reading.bounded.host_bytes", lambda: 50e6)
+    monkeypatch.setattr("phyradgs_cl.importers.reading.files.host_bytes", lambda: 50e6)
     said = r"proj_all.tif: found 0.0503 GiB to unpack; expected at most 0.0373 GiB"
     with at_most(2e6), pytest.raises(InputError, match=said):
         import_scan(path)

@@ -10,7 +10,7 @@ import pytest
 
 from phyradgs_cl.errors import OutputError
 from phyradgs_cl.io import only_run
-from phyradgs_cl.io.lock import lock_path
+from phyradgs_cl.io.output import lock_path
 
 HOLD = """
 import sys, time

@@ -7,11 +7,10 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-from tables import results as bench_results
 
 from phyradgs_cl.io import read_volume, write_volume
-from phyradgs_cl.io.hdf5.facts import PROVENANCE, read_facts
 from phyradgs_cl.io.json_lines import read_lines
+from phyradgs_cl.io.tables import PROVENANCE, read_facts
 from phyradgs_cl.settings import read_config
 from phyradgs_cl.workflow.files import load_scan
 from phyradgs_cl.workflow.sweep import RESULTS, plan_sweep, read_grid
@@ -105,20 +104,6 @@ def test_a_sweep_s_lines_of_another_type_are_left_out(plan, tmp_path, caplog) ->
             lines = read_lines(tmp_path / RESULTS, is_sound)
             assert good in lines, (name, case)
             write_tables(tmp_path, lines, [run.facts for run in plan])
-
-
-def test_a_benchmark_s_lines_of_another_type_are_left_out(tmp_path) -> None:
-    words = ("study", "volume", "run", "acquisition", "protocol", "axis", "device", "platform")
-    good = dict.fromkeys((*words, "version", "python", "numpy"), "a")
-    good |= dict.fromkeys(("voxels", "pixels", "seed", "views"), 3) | {"metrics": {"psnr_db": 1.0}}
-    cases = [ABSURD[case] for case in ("a list", "a truth value", "NaN")]
-    wrong = [(name, value) for name in (*good, "seconds", "source", "options") for value in cases]
-    wrong += [("metrics", {"psnr_db": value}) for value in ("x", True, float("nan"))]
-    for name, value in wrong:
-        (tmp_path / RESULTS).write_text(f"{json.dumps({**good, name: value})}\n{json.dumps(good)}\n")
-        lines = bench_results.read_lines(tmp_path / RESULTS)
-        is_kept = name == "source" and isinstance(value, bool | float)
-        assert lines[-1] == good and (len(lines) == 1 or is_kept), (name, str(value)[:50])
 
 
 def test_a_scan_that_provenance_names_may_be_any_file(tmp_path, cli, files) -> None:

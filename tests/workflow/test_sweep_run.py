@@ -16,7 +16,7 @@ from phyradgs_cl.cluster import Workers
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.io import only_run, read_volume
 from phyradgs_cl.io.json_lines import read_lines
-from phyradgs_cl.io.lock import BusyError
+from phyradgs_cl.io.output import BusyError
 from phyradgs_cl.settings import read_config
 from phyradgs_cl.workflow.sweep import (
     RESULTS,

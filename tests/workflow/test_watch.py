@@ -14,7 +14,7 @@ import pytest
 
 from phyradgs_cl.errors import DeviceError, InputError, OutOfMemoryError, OutputError
 from phyradgs_cl.io import only_run, read_volume
-from phyradgs_cl.io.lock import BusyError
+from phyradgs_cl.io.output import BusyError
 from phyradgs_cl.reconstructors import plan_run
 from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.workflow import watch as watch_module

@@ -6,12 +6,14 @@ in degrees unless units differ; row 0 is the top of the image.
 
 from pathlib import Path
 
+import h5py
+
 from phyradgs_cl.acquisition import ConeGeometry, Scan
+from phyradgs_cl.importers.assemble import assemble_scan, cone
+from phyradgs_cl.importers.motion import StoredTiming, make_timing, turning
 from phyradgs_cl.importers.options import OF_BARE_FRAMES, ImportOptions, needed
-from phyradgs_cl.importers.reading import hdf5_frames
+from phyradgs_cl.importers.reading import frames as reading
 from phyradgs_cl.importers.reading.frames import line_integrals, oriented
-from phyradgs_cl.importers.scan_parts import cone, put_together
-from phyradgs_cl.importers.timing import StoredTiming, make_timing, turning
 from phyradgs_cl.io.hdf5.datasets import ANGLE, TIME, read_array, read_title
 from phyradgs_cl.io.hdf5.source import Hdf5Source, open_hdf5
 
@@ -20,34 +22,42 @@ _INSTRUMENT = "/measurement/instrument"
 _DETECTOR = f"{_INSTRUMENT}/detector"
 
 
-def import_data_exchange(path: Path, options: ImportOptions) -> Scan:
-    """The projections of /exchange, with its flats and darks."""
+def recognises(path: Path) -> bool:
+    """True for an HDF5 file with a group /exchange."""
+    if not path.is_file() or not h5py.is_hdf5(path):
+        return False
+    with open_hdf5(path) as source:
+        return isinstance(source.find(_EXCHANGE), h5py.Group)
+
+
+def import_scan(path: Path, options: ImportOptions) -> Scan:
+    """Imports the projections of /exchange, with its flats and darks."""
     options.refuse_unused("data-exchange", OF_BARE_FRAMES)
     with open_hdf5(path) as source:
-        frames = hdf5_frames.read_frames(source, f"{_EXCHANGE}/data")
+        frames = reading.read_frames(source, f"{_EXCHANGE}/data")
         panel = (frames.shape[1], frames.shape[2])
         places = {name: f"{_EXCHANGE}/data_{name}" for name in ("white", "dark")}
         there = {name: address for name, address in places.items() if source.find(address) is not None}
-        stacks = {name: hdf5_frames.read_frames(source, there[name], panel) for name in there}
+        stacks = {name: reading.read_frames(source, there[name], panel) for name in there}
         theta_rad = read_array(source, f"{_EXCHANGE}/theta", (len(frames),), ANGLE)
         geometry = _geometry(source, panel, options)
-        exposure_s = hdf5_frames.optional_length(source, f"{_DETECTOR}/exposure_time", quantity=TIME)
+        exposure_s = reading.optional_length(source, f"{_DETECTOR}/exposure_time", quantity=TIME)
         title = read_title(source, f"{_EXCHANGE}/title", path.stem)
     timing = make_timing(str(path), len(frames), options, StoredTiming(exposure_s=exposure_s))
     turned = {name: oriented(stack, options, "top") for name, stack in stacks.items()}
     subject, flats, darks = f"{path}:{_EXCHANGE}/data", turned.get("white"), turned.get("dark")
     integrals = line_integrals(subject, oriented(frames, options, "top"), options, flats=flats, darks=darks)
-    trajectory = turning(geometry, hdf5_frames.gantry_sign(options, "sample") * theta_rad, timing)
-    return put_together(integrals, trajectory, geometry, timing, options, title=title, source=str(path))
+    trajectory = turning(geometry, reading.gantry_sign(options, "sample") * theta_rad, timing)
+    return assemble_scan(integrals, trajectory, geometry, timing, options, title=title, source=str(path))
 
 
 def _geometry(source: Hdf5Source, panel: tuple[int, int], options: ImportOptions) -> ConeGeometry:
-    where = f"{_INSTRUMENT}/source/distance"
-    to_axis = options.source_to_axis_mm or hdf5_frames.optional_length(source, where)
-    to_axis = needed(to_axis, "source_to_axis_mm", source.name(where), options.named)
-    to_detector = hdf5_frames.distance_to_detector(source, f"{_DETECTOR}/distance", to_axis, options)
+    address = f"{_INSTRUMENT}/source/distance"
+    to_axis = options.source_to_axis_mm or reading.optional_length(source, address)
+    to_axis = needed(to_axis, "source_to_axis_mm", source.name(address), options.named)
+    to_detector = reading.distance_to_detector(source, f"{_DETECTOR}/distance", to_axis, options)
     pitch = options.pixel_size_mm or (
-        hdf5_frames.stored_pitch(source, options, f"{_DETECTOR}/pixel_size_y", f"{_DETECTOR}/y_pixel_size"),
-        hdf5_frames.stored_pitch(source, options, f"{_DETECTOR}/pixel_size_x", f"{_DETECTOR}/x_pixel_size"),
+        reading.stored_pitch(source, options, f"{_DETECTOR}/pixel_size_y", f"{_DETECTOR}/y_pixel_size"),
+        reading.stored_pitch(source, options, f"{_DETECTOR}/pixel_size_x", f"{_DETECTOR}/x_pixel_size"),
     )
     return cone(options, to_axis, to_detector, panel, pitch, (0.0, 0.0))

@@ -6,12 +6,12 @@ import numpy as np
 
 from phyradgs_cl import checks
 from phyradgs_cl.acquisition import Scan
-from phyradgs_cl.importers.formats import tigre_frame
+from phyradgs_cl.importers.assemble import assemble_scan
+from phyradgs_cl.importers.formats import r2_gaussian as tigre
+from phyradgs_cl.importers.motion import make_timing, turning
 from phyradgs_cl.importers.options import TIMING, ImportOptions
 from phyradgs_cl.importers.reading.frames import line_integrals, oriented
 from phyradgs_cl.importers.reading.pickle import read_pickle
-from phyradgs_cl.importers.scan_parts import put_together
-from phyradgs_cl.importers.timing import make_timing, turning
 from phyradgs_cl.io.tables import Fields, described
 
 OPTIONS = (*TIMING, "detector_model", "part")
@@ -19,21 +19,26 @@ _PER_MM = 1e-3  # of a density per metre
 _PARTS = {"train": ("train",), "test": ("val",), "all": ("train", "val")}
 
 
-def import_naf(path: Path, options: ImportOptions) -> Scan:
-    """The train (or val, or both) projections of a pickle."""
+def recognises(path: Path) -> bool:
+    """True for the suffix of a pickle."""
+    return path.is_file() and path.suffix.lower() in (".pickle", ".pkl")
+
+
+def import_scan(path: Path, options: ImportOptions) -> Scan:
+    """Imports the train (or val, or both) projections of a pickle."""
     options.refuse_unused("naf", OPTIONS)
     data = Fields(f"{path}:", read_pickle(path))
-    geometry, grid = tigre_frame.read_geometry(data, 1.0), tigre_frame.read_grid(data, 1.0)
+    geometry, grid = tigre.read_geometry(data, 1.0), tigre.read_grid(data, 1.0)
     frames, angle_rad = _frames(data, _PARTS[options.part], geometry.detector_shape)
     timing = make_timing(str(path), len(angle_rad), options)
     reference = None
     if data.has("image"):
         volume = _array(data, "image", 3)
-        reference = tigre_frame.turned_volume(data.name("image"), volume, grid, _PER_MM)
-    frames = oriented(frames, options, tigre_frame.ROW_0)
+        reference = tigre.turned_volume(data.name("image"), volume, grid, _PER_MM)
+    frames = oriented(frames, options, tigre.ROW_0)
     integrals = line_integrals(str(path), frames, options, custom="attenuation")
     trajectory = turning(geometry, angle_rad, timing)
-    return put_together(
+    return assemble_scan(
         integrals,
         trajectory,
         geometry,

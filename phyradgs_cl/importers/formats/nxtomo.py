@@ -1,22 +1,23 @@
-"""NXtomo files of other programs (HDF5): what this package's own reader insists on may be missing, or come from options.
+"""NXtomo files of other programs (HDF5). Values that this package's scan files must have may come from options.
 
-The format does not say which row is on top: row 0 is taken as the lowest, and this is said, after flips that the file
-declares in either of the nxtomo package's ways. The rotation axis's column becomes a detector offset.
+The format does not state which row is on top. Row 0 is taken as the lowest, with a warning, after the flips that the file
+declares in either way of the nxtomo package. The column of the rotation axis becomes a detector offset.
 """
 
 import logging
 from dataclasses import replace
 from pathlib import Path
 
+import h5py
 import numpy as np
 
 from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, FrameSweeps, Scan
-from phyradgs_cl.importers.formats.moving_poses import Turned
+from phyradgs_cl.errors import InputError
+from phyradgs_cl.importers.assemble import assemble_scan, cone
+from phyradgs_cl.importers.motion import StoredTiming, Timing, Turned, make_timing, turning
 from phyradgs_cl.importers.options import OF_BARE_FRAMES, ImportOptions, needed
-from phyradgs_cl.importers.reading import hdf5_frames
+from phyradgs_cl.importers.reading import frames as reading
 from phyradgs_cl.importers.reading.frames import line_integrals, oriented
-from phyradgs_cl.importers.scan_parts import cone, put_together
-from phyradgs_cl.importers.timing import StoredTiming, Timing, make_timing, turning
 from phyradgs_cl.io.hdf5 import datasets as h5
 from phyradgs_cl.io.hdf5.datasets import ANGLE, LENGTH, TIME
 from phyradgs_cl.io.hdf5.source import Hdf5Source, open_hdf5
@@ -29,16 +30,30 @@ _log = logging.getLogger(__name__)
 _MOVES = ("x_translation", "y_translation", "z_translation")
 
 
-def import_nxtomo(path: Path, options: ImportOptions) -> Scan:
-    """The projections of the file's NXtomo entry, with its flats and darks."""
+def recognises(path: Path) -> bool:
+    """True for an HDF5 file of no other format. InputError for a volume of this package."""
+    if not path.is_file() or not h5py.is_hdf5(path):
+        return False
+    with open_hdf5(path) as source:
+        if isinstance(source.find("/exchange"), h5py.Group):
+            return False
+        for member in ("/entry/reconstruction", "/volume"):
+            if source.find(member) is not None and source.find("/entry/instrument") is None:
+                remedy = "'phyradgs export' writes volumes in other formats, 'phyradgs simulate --volume' projects one"
+                raise InputError(f"{path}:{member}", "a volume", "projections with their geometry", remedy)
+    return True
+
+
+def import_scan(path: Path, options: ImportOptions) -> Scan:
+    """Imports the projections of the file's NXtomo entry, with its flats and darks."""
     options.refuse_unused("nxtomo", OF_BARE_FRAMES)
     with open_hdf5(path) as source:
         entry = find_entry(source)
-        if source.find(ours := f"{entry}/{schema.EXTRA}") is not None:  # it has more to say than an import keeps
+        if source.find(extra := f"{entry}/{schema.EXTRA}") is not None:  # an import would lose a part of it
             found, expected = "a scan file of this package", "a file of another program"
-            raise source.error(ours, found, expected, "use it as it is")
+            raise source.error(extra, found, expected, "use it as it is")
         detector = f"{entry}/{schema.DETECTOR}"
-        frames = hdf5_frames.read_frames(source, f"{detector}/data")
+        frames = reading.read_frames(source, f"{detector}/data")
         key = _image_key(source, detector, len(frames))
         used = key == schema.PROJECTION
         turn = _turned(source, detector)
@@ -58,14 +73,14 @@ def import_nxtomo(path: Path, options: ImportOptions) -> Scan:
     if mask is not None:
         mask = oriented(turn.frames(mask), options, "bottom")
         integrals = replace(integrals, mask=united(mask, integrals.mask))
-    return put_together(integrals, trajectory, geometry, timing, options, title=title, source=str(path))
+    return assemble_scan(integrals, trajectory, geometry, timing, options, title=title, source=str(path))
 
 
 def _image_key(source: Hdf5Source, detector: str, frames: int) -> np.ndarray:
     for name in ("image_key", "image_key_control"):
         if source.find(f"{detector}/{name}") is not None:
             key = h5.read_integers(source, f"{detector}/{name}", (frames,))
-            key = np.where(key == -1, schema.INVALID, key)  # nxtomo's frames taken to check the alignment
+            key = np.where(key == -1, schema.INVALID, key)  # of nxtomo's alignment frames
             if not np.any(key == schema.PROJECTION):
                 raise source.error(f"{detector}/{name}", "no projection", "at least one 0")
             return key
@@ -73,7 +88,7 @@ def _image_key(source: Hdf5Source, detector: str, frames: int) -> np.ndarray:
 
 
 def _turned(source: Hdf5Source, detector: str) -> Turned:
-    """Flips that the file declares: half turns of the detector about its x axis (rows) and y axis (columns)."""
+    """Reads the flips that the file declares: half turns of the detector about its x axis (rows) and y axis (columns)."""
     flips = [False, False]
     for index, address in enumerate((f"{detector}/y_flipped", f"{detector}/x_flipped")):
         if source.find(address) is not None:
@@ -107,9 +122,9 @@ def _geometry(
     if to_axis is None and source.find(where) is not None:
         to_axis = abs(h5.read_number(source, where, LENGTH)) or None  # NeXus gives it a minus sign
     to_axis = needed(to_axis, "source_to_axis_mm", source.name(where), options.named)
-    to_detector = hdf5_frames.distance_to_detector(source, f"{detector}/distance", to_axis, options)
+    to_detector = reading.distance_to_detector(source, f"{detector}/distance", to_axis, options)
     v, u = f"{detector}/y_pixel_size", f"{detector}/x_pixel_size"
-    stored = hdf5_frames.stored_pitch
+    stored = reading.stored_pitch
     pitch = options.pixel_size_mm or (stored(source, options, v), stored(source, options, u))
     offset = options.detector_offset_mm or _axis_offset(source, detector, pitch, turn, options)
     return cone(options, to_axis, to_detector, panel, pitch, offset)
@@ -118,7 +133,7 @@ def _geometry(
 def _axis_offset(
     source: Hdf5Source, detector: str, pitch: tuple[float, ...], turn: Turned, options: ImportOptions
 ) -> tuple[float, float]:
-    """Detector offset (v, u) in mm from the axis's column, counted from the panel's middle as nxtomo does."""
+    """Reads the detector offset (v, u) in mm from the axis's column, which nxtomo counts from the panel's middle."""
     for name in ("x_rotation_axis_pixel_position", "estimated_cor_from_motor"):
         address = f"{detector}/{name}"
         if source.find(address) is None:
@@ -134,10 +149,10 @@ def _axis_offset(
 def _motion(
     source: Hdf5Source, entry: str, used: np.ndarray, geometry: ConeGeometry, options: ImportOptions
 ) -> tuple[Timing, CircularOrbit]:
-    """Timing and orbit; a stored ``rotation_angle_end`` is each frame's own sweep, else angles follow each other."""
+    """Reads timing and orbit. With ``rotation_angle_end`` every frame has its own sweep; else the angles give the speed."""
     detector, sample = f"{entry}/{schema.DETECTOR}", f"{entry}/{schema.SAMPLE}"
     rotates = h5.read_attribute(source, f"{sample}/rotation_angle", "rotates") or "sample"
-    sign = hdf5_frames.gantry_sign(options, rotates)
+    sign = reading.gantry_sign(options, rotates)
     angle = sign * h5.read_array(source, f"{sample}/rotation_angle", used.shape, ANGLE)[used]
     sweeps = source.find(f"{sample}/rotation_angle_end") is not None and options.frame_time_s is None
     start_s = h5.read_array(source, f"{detector}/frame_start_time", used.shape, TIME)[used] if sweeps else None
@@ -156,7 +171,7 @@ def _motion(
 
 
 def _refuse_moves(source: Hdf5Source, entry: str, used: np.ndarray) -> None:
-    """A sample that moves between projections would need poses of its own."""
+    """Refuses a sample that moves between projections, which this import cannot express."""
     for name in _MOVES:
         address = f"{entry}/{schema.SAMPLE}/{name}"
         if source.find(address) is None:

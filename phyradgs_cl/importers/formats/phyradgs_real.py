@@ -14,15 +14,14 @@ from phyradgs_cl import checks
 from phyradgs_cl.acquisition import PoseTable, Scan, Shutter
 from phyradgs_cl.acquisition.geometry import plain_geometry
 from phyradgs_cl.errors import InputError
+from phyradgs_cl.importers.assemble import assemble_scan
 from phyradgs_cl.importers.formats import phyradgs_synthetic as synthetic
-from phyradgs_cl.importers.formats.moving_poses import turn_of
+from phyradgs_cl.importers.formats.r2_gaussian import META, META_WITH_TIMES
+from phyradgs_cl.importers.motion import Timing, turn_of
 from phyradgs_cl.importers.options import ImportOptions
 from phyradgs_cl.importers.reading import tiff
-from phyradgs_cl.importers.reading.bounded import read_json
-from phyradgs_cl.importers.reading.folder import SafeFolder, check_numbering
+from phyradgs_cl.importers.reading.files import SafeFolder, check_numbering, read_json
 from phyradgs_cl.importers.reading.frames import line_integrals
-from phyradgs_cl.importers.scan_parts import put_together
-from phyradgs_cl.importers.timing import Timing
 from phyradgs_cl.io.tables import Fields
 
 OPTIONS = (
@@ -37,7 +36,7 @@ _GAP = 1e-3  # of a frame's span, between the windows of two frames
 
 @dataclass(frozen=True, eq=False)
 class Circle:
-    """Where a body turns: centre (x, y), radius, and for each view its height and angles (F,), (F, 3), in mm and rad."""
+    """The circle of a body: centre (x, y), radius, height z (F,) and angles (F, 3) of each view, in mm and rad."""
 
     centre: np.ndarray
     radius: float
@@ -46,7 +45,7 @@ class Circle:
 
     @classmethod
     def read(cls, common: Fields, views: list[Fields], body: str) -> "Circle":
-        """The circle of "source" or "detector"."""
+        """Reads the circle of "source" or "detector"."""
         circle = common.table(body)
         tables = [view.table("rolling_shutter").table(body) for view in views]
         angles = np.deg2rad([[table.number(key) for key in _ANGLES] for table in tables])
@@ -57,15 +56,27 @@ class Circle:
         return cls(centre[:2], circle.length("radius"), z, angles)
 
     def at(self, view: int, share: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Angles (T,) and points (T, 3) at times in exposures after the view's start."""
+        """Returns angles (T,) and points (T, 3) at times in exposures after the view's start."""
         start, closed, _ = self.angle_rad[view]
         angle = start + (closed - start) * share
         x, y = (self.centre[:, None] + self.radius * np.stack([np.cos(angle), np.sin(angle)])).tolist()
         return angle, np.stack([x, y, np.full(angle.shape, self.z[view])], -1)
 
 
-def import_phyradgs_real(path: Path, options: ImportOptions) -> Scan:
-    """A folder with a geometry JSON and TIFF frames (in it, or in its folder ``projections``), or the JSON itself."""
+def recognises(path: Path) -> bool:
+    """True for a .json that is not the description of another format, and for a folder with one and TIFF frames."""
+    others = (META, META_WITH_TIMES)
+    if not path.is_dir():
+        return path.suffix.lower() == ".json" and path.name not in others
+    folder = SafeFolder(path)
+    if any(folder.exists(name) for name in others) or not folder.matching(".json"):
+        return False
+    return folder.exists(PROJECTIONS) or bool(folder.matching(*tiff.SUFFIXES))
+
+
+def import_scan(path: Path, options: ImportOptions) -> Scan:
+    """Imports a folder with a geometry JSON and TIFF frames (in it, or in its folder ``projections``), or the JSON
+    itself."""
     options.refuse_unused("phyradgs-real", OPTIONS)
     checks.one_of(options.called("readout_axis"), options.readout_axis or "rows", ("rows",))
     description = path if path.is_file() else SafeFolder(path).only("description of the views", ".json")
@@ -89,19 +100,19 @@ def import_phyradgs_real(path: Path, options: ImportOptions) -> Scan:
     trajectory = PoseTable(times.ravel(), poses.reshape(-1, 12), f"{description} views")
     plain = plain_geometry(poses[:, 0], panel)
     title = path.resolve().stem
-    return put_together(integrals, trajectory, plain, timing, options, title=title, source=str(path))
+    return assemble_scan(integrals, trajectory, plain, timing, options, title=title, source=str(path))
 
 
 def _frames_and_views(
     description: Path, views: list[Fields], options: ImportOptions
 ) -> tuple[np.ndarray, list[Fields]]:
-    """Frames (F, v, u) as stored, and their F views: all of the file, or those from ``first_view`` on."""
+    """Reads frames (F, v, u) as stored, and returns their F views: all of the file, or those from ``first_view`` on."""
     folder = SafeFolder(description.parent)
     if folder.exists(PROJECTIONS) and not (folder.root / PROJECTIONS).is_symlink():
         folder = SafeFolder(folder.root / PROJECTIONS)
     paths = folder.matching(*tiff.SUFFIXES)
     if options.first_view is not None:
-        check_numbering(paths, "complete the frames")  # each takes the view of its place
+        check_numbering(paths, "complete the frames")  # frame i has view first_view + i
         views = views[options.first_view : options.first_view + len(paths)]
     if not paths or len(paths) != len(views):
         remedy = f"say {options.named('first_view')} if the JSON holds several scans"
@@ -114,7 +125,7 @@ def _frames_and_views(
 
 
 def _with_flat(options: ImportOptions, frames: np.ndarray) -> ImportOptions:
-    """Without a flat value, the brightest pixel of all frames stands for air, as in the published treatment."""
+    """Takes the brightest pixel of all frames for air where no flat value is given, as the published code does."""
     if options.flat_value is not None or options.quantity not in (None, "counts"):
         return options
     brightest = float(frames.max())
@@ -131,7 +142,8 @@ def _pitch(options: ImportOptions, subject: str) -> tuple[float, float]:
 
 
 def _timing(subject: str, detector: Circle, options: ImportOptions) -> Timing:
-    """Shutter and opening times; frames whose windows would overlap are moved apart, for each has its own poses."""
+    """Returns shutter and opening times. Frames whose windows would overlap are moved apart, since each has its own
+    poses."""
     exposure_s = synthetic.exposure_of_blurred_s(options)
     first, closed, done = np.unwrap(detector.angle_rad, axis=1).T
     ratio = synthetic.readout_ratio(subject, closed - first, done - closed)
@@ -150,7 +162,7 @@ def _all_poses(
     panel: tuple[int, int],
     pitch: tuple[float, float],
 ) -> np.ndarray:
-    """Poses (F, T, 12) of the stored images at T times of every frame's window."""
+    """Returns poses (F, T, 12) of the stored images at T times of every frame's window."""
     share = np.linspace(0, timing.shutter.span_s / timing.shutter.exposure_s, _TIMES_A_FRAME)
     return np.stack([
         _view_poses(view, source.at(i, share)[1], detector.at(i, share), detector.centre, panel, pitch)
@@ -166,7 +178,7 @@ def _view_poses(
     panel: tuple[int, int],
     pitch: tuple[float, float],
 ) -> np.ndarray:
-    """Poses (T, 12) of one view, its panel turned about +z from where its matrix holds."""
+    """Returns poses (T, 12) of one view. The panel is turned about +z from the angle at which its matrix holds."""
     rotation, stands_at = _matrix(view)
     angle_rad, centre_mm = detector
     turned_rad = angle_rad - np.arctan2(stands_at[1] - centre[1], stands_at[0] - centre[0])

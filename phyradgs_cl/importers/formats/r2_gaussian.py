@@ -1,4 +1,7 @@
-"""Folders of R2-Gaussian: meta_data.json beside .npy projections and the true volume; taken at rest."""
+"""Folders of R2-Gaussian: meta_data.json beside .npy projections and the true volume; taken at rest.
+
+Its frame is TIGRE's, which PhyRadGS and NAF share: projections [v, u] with row 0 at +z, volumes [x, y, z].
+"""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,23 +12,23 @@ from phyradgs_cl import checks
 from phyradgs_cl.acquisition import CircularOrbit, Scan
 from phyradgs_cl.acquisition.geometry import ConeGeometry
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.fields import Grid
-from phyradgs_cl.importers.formats import tigre_frame
+from phyradgs_cl.fields import Grid, triple
+from phyradgs_cl.importers.assemble import assemble_scan
+from phyradgs_cl.importers.motion import Timing, make_timing, turning
 from phyradgs_cl.importers.options import TIMING, ImportOptions
-from phyradgs_cl.importers.reading.bounded import read_json, read_npy
-from phyradgs_cl.importers.reading.folder import SafeFolder
+from phyradgs_cl.importers.reading.files import SafeFolder, read_json, read_npy
 from phyradgs_cl.importers.reading.frames import LineIntegrals, line_integrals, oriented
-from phyradgs_cl.importers.scan_parts import put_together
-from phyradgs_cl.importers.timing import Timing, make_timing, turning
 from phyradgs_cl.io.tables import Fields
 
 META = "meta_data.json"
+META_WITH_TIMES = "meta_data_motion_blur_rolling_shutter_fps18.json"  # in folders of PhyRadGS, beside the other
+ROW_0 = "top"
 OPTIONS = (*TIMING, "unit_mm", "detector_model", "part")
 
 
 @dataclass(frozen=True, eq=False)
 class R2Folder:
-    """An opened folder: its description, geometry and where the truth is."""
+    """An opened folder with its description and geometry."""
 
     folder: SafeFolder
     meta: Fields
@@ -34,25 +37,25 @@ class R2Folder:
 
     @classmethod
     def opened(cls, given: Path, usual: str, unit_mm: float) -> "R2Folder":
-        """Read the description called ``usual`` of a folder, or the description that is given itself."""
+        """Reads the description named ``usual`` of a folder, or ``given`` if that is a description."""
         folder = SafeFolder(given if given.is_dir() else given.parent)
         name = usual if given.is_dir() else given.name
         path = folder.file(name, str(folder.root / name))
         meta = Fields(f"{path}:", read_json(path))
-        return cls(folder, meta, tigre_frame.read_geometry(meta.table("scanner"), unit_mm), unit_mm)
+        return cls(folder, meta, read_geometry(meta.table("scanner"), unit_mm), unit_mm)
 
     def frame(self, entry: Fields) -> np.ndarray:
-        """One projection (v, u) as stored."""
+        """Reads one projection (v, u) as stored."""
         name = entry.word("file_path")
-        simulated = name.replace("_sim1", "")  # a repeated simulation whose first copy was kept
-        path = self.folder.root / simulated
-        chosen = simulated if simulated != name and path.exists() else name
-        image = read_npy(self.folder.file(chosen, entry.name("file_path")), 2)
-        checks.shape(str(self.folder.root / chosen), image, self.geometry.detector_shape)
+        first_copy = name.replace("_sim1", "")  # of a repeated simulation, whose first copy was kept
+        if (self.folder.root / first_copy).exists():
+            name = first_copy
+        image = read_npy(self.folder.file(name, entry.name("file_path")), 2)
+        checks.shape(str(self.folder.root / name), image, self.geometry.detector_shape)
         return image
 
     def projections(self, entries: list[Fields], options: ImportOptions) -> LineIntegrals:
-        """Line integrals of the listed frames, row 0 the lowest."""
+        """Reads the line integrals of the listed frames, row 0 the lowest."""
         names = [entry.word("file_path") for entry in entries]
         if len(set(names)) < len(names):  # a short list must not ask for more memory than its files hold
             at = next(i for i, name in enumerate(names) if name in names[:i])
@@ -61,39 +64,106 @@ class R2Folder:
         frames = np.empty((len(entries), *first.shape), first.dtype)
         for index, entry in enumerate(entries):
             frames[index] = self.frame(entry)
-        oriented_frames = oriented(frames, options, tigre_frame.ROW_0)
+        oriented_frames = oriented(frames, options, ROW_0)
         return line_integrals(str(self.folder.root), oriented_frames, options, custom="attenuation")
 
     def reference(self) -> tuple[Grid, np.ndarray | None]:
-        """The grid, and the true volume in 1/mm where the folder has it."""
-        grid = tigre_frame.read_grid(self.meta.table("scanner"), self.unit_mm)
+        """Reads the grid, and the true volume in 1/mm where the folder has it."""
+        grid = read_grid(self.meta.table("scanner"), self.unit_mm)
         if not self.meta.has("vol"):
             return grid, None
         path = self.folder.file(self.meta.word("vol"), self.meta.name("vol"))
         volume = read_npy(path, 3)
-        return grid, tigre_frame.turned_volume(str(path), volume, grid, 1 / self.unit_mm)
+        return grid, turned_volume(str(path), volume, grid, 1 / self.unit_mm)
 
     def scan(
         self, path: Path, entries: list[Fields], orbit: CircularOrbit, timing: Timing, options: ImportOptions
     ) -> Scan:
-        """The listed frames along ``orbit``, with the truth."""
+        """Returns the scan of the listed frames along ``orbit``, with the truth."""
         grid, reference = self.reference()
         integrals, title = self.projections(entries, options), path.resolve().name
-        found = {"title": title, "source": str(path), "grid": grid, "reference": reference}
-        return put_together(integrals, orbit, self.geometry, timing, options, **found)  # type: ignore[arg-type]
+        return assemble_scan(
+            integrals,
+            orbit,
+            self.geometry,
+            timing,
+            options,
+            title=title,
+            source=str(path),
+            grid=grid,
+            reference=reference,
+        )
 
 
 def entries_of(meta: Fields, prefix: str, part: str) -> list[Fields]:
-    """The frames of a part, "all" meaning train, then test."""
+    """Returns the entries of a part; "all" means train, then test."""
     parts = ("train", "test") if part == "all" else (part,)
     return [entry for name in parts for entry in meta.tables(f"{prefix}{name}")]
 
 
-def import_r2(path: Path, options: ImportOptions) -> Scan:
-    """A folder's ``proj_train`` (or test, or all) frames."""
+def recognises(path: Path) -> bool:
+    """True for a folder with R2-Gaussian's description, and for the description itself."""
+    if path.is_dir():
+        return (path / META).exists() and not (path / META_WITH_TIMES).exists()
+    return path.name == META
+
+
+def import_scan(path: Path, options: ImportOptions) -> Scan:
+    """Imports the ``proj_train`` (or test, or all) frames of a folder."""
     options.refuse_unused("r2", OPTIONS)
     opened = R2Folder.opened(path, META, options.unit_mm)
     entries = entries_of(opened.meta, "proj_", options.part)
     angle_rad = np.array([entry.number("angle") for entry in entries])
     timing = make_timing(str(path), len(entries), options)
     return opened.scan(path, entries, turning(opened.geometry, angle_rad, timing), timing, options)
+
+
+def read_geometry(scanner: Fields, unit_mm: float) -> ConeGeometry:
+    """Reads the cone of a scanner's table, lengths in ``unit_mm``; "Detector" values run [v, u], ``offDetector`` [u, v]."""
+    mode = scanner.word("mode", default="cone")
+    if mode != "cone":
+        raise scanner.error("mode", repr(mode), "'cone'", "parallel beams have no source distance")
+    to_axis, to_detector = scanner.length("DSO"), scanner.length("DSD")
+    if to_detector <= to_axis:
+        raise scanner.error("DSD", f"{to_detector:g}", f"more than DSO ({to_axis:g})")
+    rows, columns = scanner.counts("nDetector", 2)
+    pitch_v, pitch_u = (float(p * unit_mm) for p in _pitches(scanner, "Detector", (rows, columns)))
+    offset_u, offset_v = (float(o * unit_mm) for o in _offset(scanner, "offDetector", 2))
+    sides = (rows, columns), (pitch_v, pitch_u), (offset_v, offset_u)
+    return ConeGeometry(to_axis * unit_mm, to_detector * unit_mm, *sides)
+
+
+def read_grid(scanner: Fields, unit_mm: float) -> Grid:
+    """Reads the voxel grid of a scanner's table, whose triples run [x, y, z]."""
+    counts = scanner.counts("nVoxel", 3)
+    size = _pitches(scanner, "Voxel", counts) * unit_mm
+    origin = _offset(scanner, "offOrigin", 3) * unit_mm
+    return Grid(triple(counts[::-1]), triple(size[::-1].tolist()), triple(origin[::-1].tolist()))
+
+
+def _pitches(scanner: Fields, what: str, counts: tuple[int, ...]) -> np.ndarray:
+    """Returns the size of a pixel or voxel along each axis: dDetector or dVoxel, else sDetector or sVoxel over the count."""
+    if scanner.has(f"d{what}"):
+        return scanner.lengths(f"d{what}", len(counts))
+    return scanner.lengths(f"s{what}", len(counts)) / np.array(counts)
+
+
+def _offset(scanner: Fields, key: str, count: int) -> np.ndarray:
+    """Returns (count,) lengths, 0 where the table has none; a third number of offDetector is not used."""
+    if not scanner.has(key):
+        return np.zeros(count)
+    values = scanner.numbers(key)
+    if len(values) < count:
+        raise scanner.error(key, f"{len(values)} values", f"{count} numbers")
+    return values[:count]
+
+
+def turned_volume(subject: str, volume: np.ndarray, grid: Grid, per_mm: float) -> np.ndarray:
+    """Returns a stored volume [x, y, z] as (z, y, x) float32 in 1/mm."""
+    checks.shape(subject, volume, grid.shape[::-1])
+    checks.finite(subject, volume)
+    turned = np.transpose(volume, (2, 1, 0)).astype(np.float64) * per_mm
+    largest = float(np.abs(turned).max())
+    if largest > float(np.finfo(np.float32).max):
+        raise InputError(subject, f"a density of {largest:.3g} 1/mm", "one that float32 holds", "check the file")
+    return np.ascontiguousarray(turned, np.float32)

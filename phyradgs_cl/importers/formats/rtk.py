@@ -1,7 +1,14 @@
-"""Scans of RTK: a geometry XML and a stack of projections as MetaImage."""
+"""Scans of RTK: a geometry file (RTKThreeDCircularGeometry, version 3) and a stack of projections as MetaImage.
 
+The geometry has nine numbers per projection. XML entities and external files are refused: of DOCTYPEs only the empty one of
+RTK's own files passes.
+"""
+
+import math
+import re
 from dataclasses import dataclass
 from pathlib import Path
+from xml.etree import ElementTree
 
 import numpy as np
 
@@ -9,16 +16,28 @@ from phyradgs_cl import checks
 from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, PoseTable, Scan
 from phyradgs_cl.acquisition.geometry import plain_geometry
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.importers.formats.moving_poses import Turned, table_over_time, turn_of
-from phyradgs_cl.importers.formats.rtk_xml import RtkGeometry, read_rtk_xml
+from phyradgs_cl.importers.assemble import assemble_scan
+from phyradgs_cl.importers.motion import Timing, Turned, make_timing, table_over_time, turn_of, turning
 from phyradgs_cl.importers.options import TIMING, ImportOptions
-from phyradgs_cl.importers.reading.folder import SafeFolder
+from phyradgs_cl.importers.reading.files import SafeFolder, read_bytes
 from phyradgs_cl.importers.reading.frames import line_integrals
 from phyradgs_cl.importers.reading.images import STACKS, read_image
-from phyradgs_cl.importers.scan_parts import put_together
-from phyradgs_cl.importers.timing import Timing, make_timing, turning
 
 OPTIONS = (*TIMING, "quantity", "flat_value", "detector_model")
+ROOT = "RTKThreeDCircularGeometry"
+NAMES = (
+    *("SourceToIsocenterDistance", "SourceToDetectorDistance", "GantryAngle"),
+    *("SourceOffsetX", "SourceOffsetY", "ProjectionOffsetX", "ProjectionOffsetY"),
+    *("InPlaneAngle", "OutOfPlaneAngle"),
+)
+_REQUIRED = ("SourceToIsocenterDistance", "SourceToDetectorDistance", "GantryAngle")
+_ANGLES = ("GantryAngle", "InPlaneAngle", "OutOfPlaneAngle")
+_RADIUS = "RadiusCylindricalDetector"
+_DECLARATIONS = re.compile(rb"<!DOCTYPE[^>]*(SYSTEM|PUBLIC|\[)")
+_LARGEST = 1e9
+# RTK's axes (X, Y, Z) are (y, z, x) here: the same right-handed frame under other names.
+_TO_WORLD = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,8 +50,16 @@ class _Stack:
     step_v_mm: np.ndarray
 
 
-def import_rtk(path: Path, options: ImportOptions) -> Scan:
-    """A folder with one .xml and one .mha (or .mhd), or the .xml itself with the stack beside it."""
+def recognises(path: Path) -> bool:
+    """True for an .xml file, and for a folder with one and a MetaImage."""
+    if not path.is_dir():
+        return path.suffix.lower() == ".xml"
+    folder = SafeFolder(path)
+    return bool(folder.matching(".xml") and folder.matching(*STACKS))
+
+
+def import_scan(path: Path, options: ImportOptions) -> Scan:
+    """Imports a folder with one .xml and one .mha (or .mhd), or an .xml with the stack beside it."""
     options.refuse_unused("rtk", OPTIONS)
     folder = SafeFolder(path if path.is_dir() else path.parent)
     description = path if path.is_file() else folder.only("geometry", ".xml")
@@ -46,7 +73,7 @@ def import_rtk(path: Path, options: ImportOptions) -> Scan:
     custom = "attenuation" if stack.frames.dtype.kind == "f" and options.flat_value is None else None
     integrals = line_integrals(str(stack_path), turn.frames(stack.frames), options, custom=custom)
     title = description.stem
-    return put_together(integrals, trajectory, geometry, timing, options, title=title, source=str(path))
+    return assemble_scan(integrals, trajectory, geometry, timing, options, title=title, source=str(path))
 
 
 def _read_stack(path: Path) -> _Stack:
@@ -61,9 +88,9 @@ def _read_stack(path: Path) -> _Stack:
 
 
 def _trajectory(
-    rtk: RtkGeometry, stack: _Stack, timing: Timing, subject: str
+    rtk: "RtkGeometry", stack: _Stack, timing: Timing, subject: str
 ) -> tuple[CircularOrbit | PoseTable, ConeGeometry, Turned]:
-    """A circular orbit where one describes the file, else a table of poses; and how images have to be turned."""
+    """Returns a circular orbit where one describes the file, else a table of poses, with a plain geometry and the flips."""
     panel = (stack.frames.shape[1], stack.frames.shape[2])
 
     def stored(position: np.ndarray) -> np.ndarray:
@@ -79,3 +106,127 @@ def _trajectory(
     if rtk.is_circular and stack.step_u_mm[1] == stack.step_v_mm[0] == 0:
         return turning(geometry, rtk.values["GantryAngle"], timing), geometry, turn
     return table_over_time(poses, timing, subject), geometry, turn
+
+
+@dataclass(frozen=True, eq=False)
+class RtkGeometry:
+    """Numbers of all projections by RTK's names: each (F,), lengths in mm, angles in radians."""
+
+    values: dict[str, np.ndarray]
+
+    @property
+    def frames(self) -> int:
+        """The number of projections."""
+        return len(self.values["GantryAngle"])
+
+    @property
+    def is_circular(self) -> bool:
+        """True where all projections are on one untilted circle with one panel."""
+        steady = [v for name, v in self.values.items() if name != "GantryAngle"]
+        still = all(np.ptp(v) <= 1e-9 * (1 + np.abs(v).max()) for v in steady)
+        tilts = ("SourceOffsetX", "SourceOffsetY", "InPlaneAngle", "OutOfPlaneAngle")
+        return still and all(np.all(self.values[name] == 0) for name in tilts)
+
+    def poses(
+        self, position: np.ndarray, origin_mm: np.ndarray, step_u: np.ndarray, step_v: np.ndarray
+    ) -> np.ndarray:
+        """Returns poses (T, 12) at frame positions (T,), linear between and beyond frames. ``origin_mm`` (2,): place
+        (u, v) of pixel (0, 0) in the image's plane; ``step_u``, ``step_v`` (2,): from column to column and row to
+        row."""
+        at = {
+            name: _along(np.unwrap(v) if name in _ANGLES else v, position) for name, v in self.values.items()
+        }
+        turn = _rotations(at)
+        to_detector = at["SourceToIsocenterDistance"] - at["SourceToDetectorDistance"]
+        shift = np.stack([at["ProjectionOffsetX"], at["ProjectionOffsetY"], to_detector], -1)
+        first = shift + np.array([*origin_mm, 0.0])
+        offsets = [at["SourceOffsetX"], at["SourceOffsetY"], at["SourceToIsocenterDistance"]]
+        steps = [np.broadcast_to([*step, 0.0], first.shape) for step in (step_u, step_v)]
+        parts = [
+            np.einsum("tij,tj->ti", turn, part) @ _TO_WORLD.T
+            for part in (np.stack(offsets, -1), first, *steps)
+        ]
+        return np.concatenate(parts, -1)
+
+
+def read_rtk_xml(path: Path) -> RtkGeometry:
+    """Reads all projections of a geometry file."""
+    root = _root(path)
+    common, projections = _numbers(path, root), [_numbers(path, e) for e in root.iterfind("Projection")]
+    if not projections:
+        raise InputError(str(path), "no Projection", "at least one")
+    columns = {}
+    for name in NAMES:
+        column = [projection.get(name, common.get(name)) for projection in projections]
+        if name in _REQUIRED and None in column:
+            found = f"no {name} for projection {column.index(None)}"
+            raise InputError(str(path), found, "one, in the projection or above all of them")
+        values = np.array([0.0 if value is None else value for value in column])
+        columns[name] = np.deg2rad(values) if name in _ANGLES else values
+    for name in _REQUIRED[:2]:
+        if columns[name].min() <= 0:
+            raise InputError(f"{path} {name}", f"{columns[name].min():g}", "a length above 0")
+    if np.any(columns[_REQUIRED[1]] <= columns[_REQUIRED[0]]):
+        expected = "more than SourceToIsocenterDistance"
+        raise InputError(f"{path} {_REQUIRED[1]}", f"{columns[_REQUIRED[1]].min():g}", expected)
+    return RtkGeometry(columns)
+
+
+def _along(values: np.ndarray, position: np.ndarray) -> np.ndarray:
+    """Returns values (F,) at positions (T,), linear between frames and beyond them."""
+    if len(values) == 1:
+        return np.full(position.shape, values[0])
+    left = np.clip(np.floor(position).astype(int), 0, len(values) - 2)
+    return values[left] + (position - left) * (values[left + 1] - values[left])
+
+
+def _rotations(at: dict[str, np.ndarray]) -> np.ndarray:
+    """Returns (T, 3, 3) from the gantry's to RTK's fixed frame: the inverse of Rz(−in plane) Rx(−out of plane)
+    Ry(−gantry)."""
+    y, x, z = (at[name] for name in ("GantryAngle", "OutOfPlaneAngle", "InPlaneAngle"))
+    zero, one = np.zeros_like(y), np.ones_like(y)
+
+    def matrix(*rows: np.ndarray) -> np.ndarray:
+        return np.stack(rows, -1).reshape(*y.shape, 3, 3)
+
+    about_y = matrix(np.cos(y), zero, np.sin(y), zero, one, zero, -np.sin(y), zero, np.cos(y))
+    about_x = matrix(one, zero, zero, zero, np.cos(x), -np.sin(x), zero, np.sin(x), np.cos(x))
+    about_z = matrix(np.cos(z), -np.sin(z), zero, np.sin(z), np.cos(z), zero, zero, zero, one)
+    return about_y @ about_x @ about_z
+
+
+def _root(path: Path) -> ElementTree.Element:
+    data, subject = read_bytes(path), str(path)
+    if _DECLARATIONS.search(data):
+        expected, remedy = "plain elements", "nothing outside of the file is read"
+        raise InputError(subject, "a DOCTYPE with declarations or an external file", expected, remedy)
+    try:
+        root = ElementTree.fromstring(data)
+    except ElementTree.ParseError as error:
+        raise InputError(subject, f"XML that is not well formed ({error})", f"a {ROOT}") from error
+    except (ValueError, LookupError) as error:  # an unknown encoding
+        raise InputError(subject, f"XML that cannot be read ({error})", f"a {ROOT}") from error
+    if root.tag != ROOT:
+        raise InputError(subject, f"a root element {root.tag[:60]!r}", ROOT)
+    if (version := root.get("version", "3")) != "3":
+        raise InputError(subject, f"version {version[:20]!r}", "version 3")
+    return root
+
+
+def _numbers(path: Path, parent: ElementTree.Element) -> dict[str, float]:
+    """Returns the numbers directly inside an element by their names. InputError for a curved panel."""
+    values = {e.tag: _number(f"{path} {e.tag}", e.text) for e in parent if e.tag in (*NAMES, _RADIUS)}
+    if radius := values.pop(_RADIUS, 0.0):
+        raise InputError(f"{path} {_RADIUS}", f"{radius:g}", "a flat panel")
+    return values
+
+
+def _number(subject: str, text: str | None) -> float:
+    text = (text or "").strip()
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not abs(value) <= _LARGEST:
+        raise InputError(subject, repr(text[:40]), "a finite number")
+    return value

@@ -1,7 +1,7 @@
-"""A folder of TIFF frames and one TOML that says what they are, where things stood and when they were taken.
+"""A folder of TIFF frames and one TOML with their contents, geometry, angles and timing.
 
-Its tables are a scanner file's, and [frames], [angles], [timing]. Row 0 is the top, column 0 the left, seen from the source.
-"""
+The TOML has the tables of a scanner file, and [frames], [angles] and [timing]. Row 0 is the top, column 0 the left,
+seen from the source. """
 
 from dataclasses import replace
 from pathlib import Path, PurePosixPath
@@ -12,14 +12,12 @@ import numpy as np
 from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.acquisition.readout import frame_time_of, readout_of
 from phyradgs_cl.errors import InputError
+from phyradgs_cl.importers.assemble import assemble_scan, with_options
+from phyradgs_cl.importers.motion import StoredTiming, make_timing, turning
 from phyradgs_cl.importers.options import FIELDS, OF_BARE_FRAMES, WORDS, ImportOptions
 from phyradgs_cl.importers.reading import tiff
-from phyradgs_cl.importers.reading.bounded import read_numbers
-from phyradgs_cl.importers.reading.folder import SafeFolder, check_numbering, checked_name, in_natural_order
-from phyradgs_cl.importers.reading.frames import LineIntegrals, line_integrals, oriented
-from phyradgs_cl.importers.reading.hdf5_frames import gantry_sign
-from phyradgs_cl.importers.scan_parts import put_together, with_options
-from phyradgs_cl.importers.timing import StoredTiming, make_timing, turning
+from phyradgs_cl.importers.reading.files import SafeFolder, check_numbering, checked_name, read_numbers
+from phyradgs_cl.importers.reading.frames import LineIntegrals, gantry_sign, line_integrals, oriented
 from phyradgs_cl.io.scan.reader import united
 from phyradgs_cl.io.scanner import TABLES, Scanner, scanner_from
 from phyradgs_cl.io.tables import Fields, read_toml, refuse_unknown
@@ -31,7 +29,7 @@ OWN_TABLES = {
 }
 _TO_RAD = {"deg": np.pi / 180, "rad": 1.0}
 _PER_FRAME, _ANGLES = ("values_deg", "file"), ("step_deg", "last_deg", "values_deg", "file")
-_KEYS = {  # where the file has what an option states
+_KEYS = {  # by option: where the file states the same
     **{name: f"[timing] {name}" for name in ("exposure_s", "readout_s", "frame_time_s")},
     **{name: f"[readout] {name}" for name in ("first", "fps", "readout_ms")},
     **{name: f"[frames] {name}" for name in ("quantity", "flat_value", "row_0", "column_0")},
@@ -42,23 +40,28 @@ _KEYS = {  # where the file has what an option states
 _SCANNER = ("title", "source", "detector", "volume", "readout", "beam")
 
 
-def import_tiff(path: Path, options: ImportOptions) -> Scan:
-    """A folder with one TOML, or the TOML itself with its frames beside it."""
+def recognises(path: Path) -> bool:
+    """True for a .toml file, and for a folder with one."""
+    return bool(SafeFolder(path).matching(".toml")) if path.is_dir() else path.suffix.lower() == ".toml"
+
+
+def import_scan(path: Path, options: ImportOptions) -> Scan:
+    """Imports a folder with one TOML and its frames, or the TOML with the frames beside it."""
     options.refuse_unused("tiff", OF_BARE_FRAMES)
     folder = SafeFolder(path if path.is_dir() else path.parent)
     description = path if path.is_file() else folder.only("description of the scan", ".toml")
     tables = _tables(description)
     options = in_words_of_file(options)
-    said = _with_file(options, tables["frames"], tables["angles"])
+    combined = _with_file(options, tables["frames"], tables["angles"])
     stacks = _stacks(folder, tables["frames"], tables["angles"])
     frames, rows, columns = stacks["projections"].shape
     scanner = _scanner(description, tables[""], (rows, columns))
     geometry = with_options(scanner.geometry, options)
     stored = _stored_timing(tables, scanner)
     timing = make_timing(str(description), frames, options, stored)
-    angle_rad = gantry_sign(said, "gantry") * _angles_rad(folder, tables["angles"], frames)
-    integrals = _line_integrals(stacks, said, tables["frames"], str(description))
-    return put_together(
+    angle_rad = gantry_sign(combined, "gantry") * _angles_rad(folder, tables["angles"], frames)
+    integrals = _line_integrals(stacks, combined, tables["frames"], str(description))
+    return assemble_scan(
         integrals,
         turning(geometry, angle_rad, timing),
         geometry,
@@ -73,7 +76,7 @@ def import_tiff(path: Path, options: ImportOptions) -> Scan:
 
 
 def _subjects(tables: dict[str, Fields]) -> dict[str, str]:
-    """How messages call what the file states, where that is no option of an import."""
+    """Returns the names in messages of values that the file states and that are no options."""
     subjects = {"grid": tables[""].name("[volume]"), "angles": tables["angles"].subject}
     if tables["readout"].has("readout_ms"):
         subjects["readout_s"] = tables["readout"].name("readout_ms")
@@ -81,7 +84,7 @@ def _subjects(tables: dict[str, Fields]) -> dict[str, str]:
 
 
 def _tables(path: Path) -> dict[str, Fields]:
-    """The file's own tables by name, and under "" what a scanner file has; unknown names are refused."""
+    """Returns the file's own tables by name, and under "" those of a scanner file. InputError for unknown names."""
     content = read_toml(path)
     refuse_unknown(str(path), content, (*_SCANNER, *OWN_TABLES), "a name")
     tables = {name: Fields(f"{path} [{name}]", content.get(name, {}), keys) for name, keys in OWN_TABLES.items()}
@@ -90,7 +93,7 @@ def _tables(path: Path) -> dict[str, Fields]:
 
 
 def in_words_of_file(options: ImportOptions) -> ImportOptions:
-    """The options, whose messages name keys of the TOML for what the user did not give as an option."""
+    """Returns the options with messages that name keys of the TOML for values not given as options."""
     given = options.given(FIELDS)
 
     def named(field: str) -> str:
@@ -100,53 +103,49 @@ def in_words_of_file(options: ImportOptions) -> ImportOptions:
 
 
 def _with_file(options: ImportOptions, frames: Fields, angles: Fields) -> ImportOptions:
-    """The options, and under them what the file says in the same words."""
+    """Returns the options, completed by values of the file with the same names."""
     tables = {"quantity": frames, "row_0": frames, "column_0": frames, "rotates": angles}
-    said: dict[str, Any] = {k: t.word(k, WORDS[k]) for k, t in tables.items() if t.has(k)}
+    combined: dict[str, Any] = {k: t.word(k, WORDS[k]) for k, t in tables.items() if t.has(k)}
     if frames.has("flat_value"):
-        said["flat_value"] = frames.length("flat_value")
-    return replace(options, **{k: v for k, v in said.items() if not getattr(options, k)})
+        combined["flat_value"] = frames.length("flat_value")
+    return replace(options, **{k: v for k, v in combined.items() if not getattr(options, k)})
 
 
 def _stacks(folder: SafeFolder, frames: Fields, angles: Fields) -> dict[str, np.ndarray]:
-    found = {}
+    stacks = {}
     for name in ("projections", "flats", "darks", "mask"):
         if name != "projections" and not frames.has(name):
             continue
         paths = _files(folder, frames, name)
         if name == "projections" and not any(angles.has(key) for key in _PER_FRAME):
             check_numbering(paths, "complete the frames, or give every one its angle: [angles] values_deg or file")
-        found[name] = tiff.read_tiffs(paths)
-    return found
+        stacks[name] = tiff.read_tiffs(paths)
+    return stacks
 
 
 def _line_integrals(
-    stacks: dict[str, np.ndarray], said: ImportOptions, frames: Fields, subject: str
+    stacks: dict[str, np.ndarray], combined: ImportOptions, frames: Fields, subject: str
 ) -> LineIntegrals:
-    turned = {name: oriented(stack, said, "top") for name, stack in stacks.items()}
+    turned = {name: oriented(stack, combined, "top") for name, stack in stacks.items()}
     stack = turned["projections"]
-    found = line_integrals(subject, stack, said, flats=turned.get("flats"), darks=turned.get("darks"))
+    integrals = line_integrals(subject, stack, combined, flats=turned.get("flats"), darks=turned.get("darks"))
     if "mask" not in turned:
-        return found
-    return replace(found, mask=united(found.mask, _mask(turned["mask"], stack.shape, frames.name("mask"))))
+        return integrals
+    return replace(integrals, mask=united(integrals.mask, _mask(turned["mask"], stack.shape, frames.name("mask"))))
 
 
 def _files(folder: SafeFolder, frames: Fields, name: str) -> list[Path]:
     pattern = checked_name(frames.word(name, default="*.tif*"), frames.name(name))
-    below, last = PurePosixPath(pattern).parent, PurePosixPath(pattern).name
-    if "*" in str(below) or "**" in last:
+    if "**" in pattern or "*" in str(PurePosixPath(pattern).parent):
         raise frames.error(name, repr(pattern), "a pattern for files of one folder")
-    found = []
-    if (folder.root / below).is_dir():
-        names = [str(below / path.name) for path in (folder.root / below).iterdir() if path.match(last)]
-        found = in_natural_order([folder.file(text, frames.name(name)) for text in names])
-    if not found:
+    paths = folder.glob(pattern)
+    if not paths:
         raise frames.error(name, f"no file that matches {pattern!r}", "at least one TIFF")
-    return found
+    return paths
 
 
 def _scanner(path: Path, scanner: Fields, panel: tuple[int, int]) -> Scanner:
-    """The scanner that the file describes; its panel has as many pixels as the images."""
+    """Returns the described scanner, whose panel has as many pixels as the images."""
     content = dict(scanner.values)
     content["detector"] = {"rows": panel[0], "columns": panel[1], **scanner.table("detector").values}
     described = scanner_from(path, content)
@@ -187,7 +186,7 @@ def _stored_timing(tables: dict[str, Fields], scanner: Scanner) -> StoredTiming:
 
 
 def _angles_rad(folder: SafeFolder, angles: Fields, frames: int) -> np.ndarray:
-    """(F,) as stored: a list, a file of one angle per line, or the first with the last or a step."""
+    """Reads angles (F,) as stored: a list, a file with one per line, or the first with the last or a step."""
     given = [key for key in _ANGLES if angles.has(key)]
     if len(given) != 1:
         raise InputError(angles.subject, " and ".join(given) or "no angles", f"one of {', '.join(_ANGLES)}")

@@ -1,4 +1,4 @@
-"""A TOML for a folder of TIFFs, to be filled in: every key with its unit, and what the folder itself shows."""
+"""A template of the TOML for a folder of TIFFs: every key with its unit, and the values that the folder shows."""
 
 import json
 import re
@@ -9,8 +9,7 @@ import numpy as np
 
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.importers.reading import tiff
-from phyradgs_cl.importers.reading.bounded import read_numbers
-from phyradgs_cl.importers.reading.folder import SafeFolder, in_natural_order
+from phyradgs_cl.importers.reading.files import SafeFolder, in_natural_order, read_numbers
 
 _KINDS = {"flats": r"flat|white", "darks": r"dark", "mask": r"mask"}  # what the names of such files contain
 _OPTIONAL = ("beam", "volume")  # tables that a file either leaves out or states in full
@@ -77,7 +76,7 @@ _TABLES: dict[str, dict[str, tuple[object, str]]] = {
 
 
 def template_of(path: Path) -> str:
-    """The TOML for a folder of TIFFs, which ``import`` refuses, by the key, until it is filled in. InputError: no TIFFs."""
+    """Returns the TOML for a folder of TIFFs, which ``import`` refuses until it is filled in. InputError: no TIFFs."""
     tiffs = SafeFolder(path).matching(*tiff.SUFFIXES)
     if not tiffs:
         remedy = "leave --template out: the other formats describe themselves"
@@ -111,7 +110,7 @@ def _toml(value: object) -> str:
 
 
 def _patterns(tiffs: list[Path]) -> dict[str, str]:
-    """A pattern of names for the projections, the largest series, and for flats, darks and mask by their names."""
+    """Returns a pattern of names for the projections, the largest series, and for flats, darks and mask."""
     series: dict[str, int] = {}
     for file in tiffs:
         pattern = re.sub(r"\d+(?=\D*$)", "*", file.name)
@@ -125,7 +124,7 @@ def _patterns(tiffs: list[Path]) -> dict[str, str]:
 
 
 def _angles(folder: Path, frames: int) -> dict[str, object]:
-    """The text file of the folder that has a number for every frame, and the unit that its numbers look like."""
+    """Returns the text file of the folder with a number for every frame, and the likely unit of its numbers."""
     for file in SafeFolder(folder).matching(".txt", ".csv"):
         with suppress(InputError):
             values = read_numbers(file, frames, "angles")

@@ -1,4 +1,4 @@
-"""Raw frames of any origin to line integrals with row 0 the lowest, with bad pixels masked."""
+"""Frames of any origin: read from HDF5, turned to row 0 the lowest, converted to line integrals, bad pixels masked."""
 
 import logging
 from collections.abc import Mapping
@@ -10,7 +10,9 @@ from phyradgs_cl.acquisition import Saturation
 from phyradgs_cl.acquisition.scan import applied_facts
 from phyradgs_cl.detector import find_saturation, frames_to_attenuation
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.importers.options import ImportOptions
+from phyradgs_cl.importers.options import ImportOptions, needed
+from phyradgs_cl.io.hdf5.datasets import LENGTH, Quantity, read_length, read_values
+from phyradgs_cl.io.hdf5.source import Hdf5Source
 from phyradgs_cl.io.scan.reader import LARGEST_LINE_INTEGRAL
 
 _log = logging.getLogger(__name__)
@@ -20,8 +22,8 @@ _SAME = 1e-3  # relative difference of a flat that is at the ceiling too
 
 @dataclass(frozen=True, eq=False)
 class LineIntegrals:
-    """Line integrals (P, v, u) float32, the pixels not to be used, what raw counts said of the panel's ceiling, and how many
-    flats and darks were applied to them, as provenance."""
+    """Line integrals (P, v, u) float32 with the mask of unusable pixels, the panel's saturation as raw counts show it,
+    and the numbers of applied flats and darks as provenance."""
 
     values: np.ndarray
     mask: Mask
@@ -38,9 +40,9 @@ def line_integrals(
     darks: np.ndarray | None = None,
     custom: str | None = None,
 ) -> LineIntegrals:
-    """Line integrals of ``frames`` (P, v, u) of any real type; clipped counts and values that no object has are masked,
-    and said. ``subject`` names the file; ``flats``, ``darks``: (n, v, u) or None. The options' ``quantity`` wins over
-    ``custom``, the format's or file's; where neither says, frames with flats are counts and others refused."""
+    """Converts ``frames`` (P, v, u) of any real type to line integrals. Masks clipped counts and values that no object has,
+    with a warning. ``subject`` names the file; ``flats``, ``darks``: (n, v, u) or None. The quantity is that of the options,
+    else ``custom``, of the format or file; without either, frames with flats are counts and others are refused."""
     has_flats = (flats is not None and len(flats) > 0) or options.flat_value is not None
     quantity = options.quantity or custom or ("counts" if has_flats else None)
     if quantity is None:
@@ -71,9 +73,9 @@ def line_integrals(
 def _mask_clipped(
     subject: str, frames: np.ndarray, flat: np.ndarray, saturation: Saturation, unusable: np.ndarray
 ) -> None:
-    """Masks each frame's clipped pixels where the flat is brighter, so that even air would read as an object. Where the
-    flat is clipped too the integral is 0: right for air, which is most of it; without air a reconstruction is 2 to 3
-    times further off than with thin parts lost."""
+    """Masks each frame's clipped pixels where the flat is brighter, since even air would read as an object there. Where the
+    flat is clipped too, the integral is 0, which is right for air. Masking those pixels as well would leave no air, and the
+    reconstruction would be 2 to 3 times further off than with thin parts lost."""
     brighter = flat > saturation.level * (1 + _SAME)
     for frame, bad in zip(frames, unusable, strict=True):
         bad |= (frame == saturation.level) & brighter
@@ -83,7 +85,7 @@ def _mask_clipped(
 
 
 def compact(mask: np.ndarray) -> Mask:
-    """A mask (P, v, u) as (v, u) where all frames agree, and None where it marks nothing."""
+    """Returns a mask (P, v, u) as (v, u) where all frames agree, and None where no pixel is masked."""
     if not mask.any():
         return None
     if mask.all():
@@ -93,8 +95,8 @@ def compact(mask: np.ndarray) -> Mask:
 
 
 def oriented(array: np.ndarray, options: ImportOptions, row_0: str, column_0: str = "left") -> np.ndarray:
-    """Frames or a mask (..., v, u) with row 0 the lowest and column 0 on the left, seen from the source; ``row_0`` and
-    ``column_0`` are the format's custom, over which the options win."""
+    """Returns frames or a mask (..., v, u) with row 0 the lowest and column 0 on the left, seen from the source. ``row_0``,
+    ``column_0``: where the format has them, unless the options state it."""
     if (options.row_0 or row_0) == "top":
         array = array[..., ::-1, :]
     if (options.column_0 or column_0) == "right":
@@ -107,3 +109,44 @@ def _constant_flat(subject: str, frames: np.ndarray, options: ImportOptions) -> 
         remedy = f"add flat frames, or say {options.named('flat_value')}"
         raise InputError(f"{subject} flats", "none", "flat frames to divide counts by", remedy)
     return np.full((1, *frames.shape[1:]), options.flat_value, np.float32)
+
+
+def read_frames(source: Hdf5Source, address: str, panel: tuple[int, int] | None = None) -> np.ndarray:
+    """Reads frames (F, v, u) in their own type. With ``panel`` all must have that shape, and one frame may be (v, u)."""
+    dataset, subject = source.dataset(address), source.name(address)
+    if dataset.dtype.kind not in "iuf":
+        raise InputError(subject, f"type {dataset.dtype}", "real numbers")
+    if panel is not None and dataset.shape == panel:
+        return read_values(source, address, dataset)[None]
+    if dataset.ndim != 3 or min(dataset.shape) < 1:
+        raise InputError(subject, f"shape {dataset.shape}", "three axes (frame, v, u), none of them empty")
+    if panel is not None and dataset.shape[1:] != panel:
+        expected = f"(any, {panel[0]}, {panel[1]}), as the projections"
+        raise InputError(subject, f"shape {dataset.shape}", expected)
+    return read_values(source, address, dataset)
+
+
+def optional_length(source: Hdf5Source, *addresses: str, quantity: Quantity = LENGTH) -> float | None:
+    """Reads a number above 0 at the first of the addresses that exists, in the package's unit."""
+    address = next((address for address in addresses if source.find(address) is not None), None)
+    return None if address is None else read_length(source, address, quantity)
+
+
+def stored_pitch(source: Hdf5Source, options: ImportOptions, *addresses: str) -> float:
+    """Reads the size of a pixel in mm at the first of the addresses that exists; InputError where none does."""
+    size = optional_length(source, *addresses)
+    if size is None:
+        raise source.error(addresses[0], "nothing", "a length", f"say {options.named('pixel_size_mm')}")
+    return size
+
+
+def distance_to_detector(source: Hdf5Source, address: str, to_axis_mm: float, options: ImportOptions) -> float:
+    """Returns the source-to-detector distance in mm: the option's, or that of the axis and the length at ``address``."""
+    behind_mm = None if options.source_to_detector_mm else optional_length(source, address)
+    to_detector_mm = options.source_to_detector_mm if behind_mm is None else to_axis_mm + behind_mm
+    return needed(to_detector_mm, "source_to_detector_mm", source.name(address), options.named)
+
+
+def gantry_sign(options: ImportOptions, custom: str) -> float:
+    """Returns +1 where stored angles are the gantry's, −1 where they are the sample's."""
+    return 1.0 if (options.rotates or custom) == "gantry" else -1.0

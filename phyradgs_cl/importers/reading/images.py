@@ -12,11 +12,9 @@ import numpy as np
 from phyradgs_cl import checks
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid, triple
-from phyradgs_cl.importers.reading.bounded import check_room
-from phyradgs_cl.importers.reading.folder import SafeFolder
+from phyradgs_cl.importers.reading.files import SafeFolder, check_room
+from phyradgs_cl.io.files import HOST_SHARE, host_bytes, regular_file
 from phyradgs_cl.io.hdf5.datasets import LENGTH
-from phyradgs_cl.io.memory import HOST_SHARE, host_bytes
-from phyradgs_cl.io.regular import regular_file
 from phyradgs_cl.io.volume import Volume, finite_float32, shares_of_maximum
 
 STACKS = (".mha", ".mhd")

@@ -13,8 +13,8 @@ import numpy as np
 
 from phyradgs_cl import checks
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.importers.reading.bounded import check_room
-from phyradgs_cl.io.regular import regular_file
+from phyradgs_cl.importers.reading.files import check_room
+from phyradgs_cl.io.files import regular_file
 
 SUFFIXES = (".tif", ".tiff")
 _MOST_EXPANSION = 1200  # of a compressed image: deflate reaches 1032

@@ -11,7 +11,7 @@ from pathlib import Path
 import h5py
 
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.io.regular import regular_file
+from phyradgs_cl.io.files import regular_file
 
 _MOST_SOFT_LINKS = 16
 # Names in scan and volume files. A name outside this set that is close to one of them is taken for a misspelling.

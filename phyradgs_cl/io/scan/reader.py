@@ -10,11 +10,11 @@ from phyradgs_cl import checks
 from phyradgs_cl.acquisition import CircularOrbit, EncoderTable, PoseTable, Scan
 from phyradgs_cl.acquisition.scan import APPLIED, applied_facts
 from phyradgs_cl.errors import InputError
+from phyradgs_cl.io.files import sha256_of
 from phyradgs_cl.io.hdf5.datasets import ATTENUATION, in_unit, read_values
 from phyradgs_cl.io.hdf5.source import Hdf5Source, open_hdf5
 from phyradgs_cl.io.scan import schema
 from phyradgs_cl.io.scan.header import ScanHeader, read_header
-from phyradgs_cl.io.sha256 import sha256_of
 
 LARGEST_LINE_INTEGRAL = 1e6
 # (data (F, v, u), image_key (F,), quantity) -> line integrals (P, v, u) of the projections, bad pixels.

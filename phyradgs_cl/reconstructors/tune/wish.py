@@ -8,7 +8,6 @@ import numpy as np
 
 from phyradgs_cl import checks
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.io.hdf5.facts import NUMBER
 from phyradgs_cl.text import near_miss
 
 _STOPS = "its short runs are not the beginnings of long ones; set --iterations"
@@ -42,7 +41,7 @@ def check_wish(text: str, method: str, options: Any, changes: Mapping[str, Any],
     runs are the beginnings of its long ones."""
     wish = wish_of(text)
     name = wish.option
-    numbers = [f.name for f in fields(options) if NUMBER.fits(getattr(options, f.name))]
+    numbers = [f.name for f in fields(options) if checks.is_number(getattr(options, f.name))]
     if not ends_anywhere:
         numbers = [number for number in numbers if number != "iterations"]
     if name not in numbers:
@@ -84,7 +83,7 @@ def is_told(found: object) -> bool:
     if not (isinstance(values, list) and isinstance(errors, list) and len(values) == len(errors) > 0):
         return False
     others = [found.get(name) for name in ("chosen", "holdout_noise_rms", "seconds")]
-    return all(map(NUMBER.fits, [*values, *errors, *others]))
+    return all(map(checks.is_number, [*values, *errors, *others]))
 
 
 def with_value(options: Any, name: str, value: float) -> Any:

@@ -19,8 +19,7 @@ from phyradgs_cl.cluster import Lost, Pool, Workers, runtime_of_process
 from phyradgs_cl.errors import DeviceError, OutputError, PhyradgsError
 from phyradgs_cl.io import only_run, written_beside
 from phyradgs_cl.io.json_lines import Line, append_line, json_text, read_lines, refuse_irregular
-from phyradgs_cl.io.lock import BusyError
-from phyradgs_cl.io.output import make_folder, shortened
+from phyradgs_cl.io.output import BusyError, make_folder, shortened
 from phyradgs_cl.reconstructors import Progress, ProgressReport, ignore_progress
 from phyradgs_cl.runtime.environment import environment
 from phyradgs_cl.signals import finish_despite_interrupt, keep_finished_work

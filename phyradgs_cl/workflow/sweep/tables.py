@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
+from phyradgs_cl import checks
 from phyradgs_cl.io import written_beside
-from phyradgs_cl.io.hdf5.facts import NUMBER
 from phyradgs_cl.io.json_lines import Line
 from phyradgs_cl.metrics import HELD_OUT, METRICS
 from phyradgs_cl.text import plain_text
@@ -36,7 +36,7 @@ def is_sound(line: Any) -> bool:
     return (
         all(isinstance(text, str) for text in (line["run"], line["scan"], *texts))
         and all(isinstance(table, Mapping) for table in tables)
-        and all(number is None or NUMBER.fits(number) for number in numbers)
+        and all(number is None or checks.is_number(number) for number in numbers)
     )
 
 

@@ -1,4 +1,4 @@
-"""The last step of every importer: parts of a scan put together, with what the user says over them."""
+"""The last step of every importer: line integrals, trajectory, geometry, timing and options make a scan."""
 
 from collections.abc import Mapping
 
@@ -9,12 +9,12 @@ from phyradgs_cl.acquisition.geometry import default_grid
 from phyradgs_cl.acquisition.plausible import check_plausible
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
+from phyradgs_cl.importers.motion import Timing
 from phyradgs_cl.importers.options import ImportOptions
 from phyradgs_cl.importers.reading.frames import LineIntegrals
-from phyradgs_cl.importers.timing import Timing
 
 
-def put_together(
+def assemble_scan(
     integrals: LineIntegrals,
     trajectory: CircularOrbit | PoseTable,
     geometry: ConeGeometry,
@@ -28,8 +28,8 @@ def put_together(
     lag: float = 0.0,
     names: Mapping[str, str] | None = None,
 ) -> Scan:
-    """A scan of line integrals, row 0 the lowest already; the grid is the cone's cube where none is given. ``names``: how
-    messages about implausible values call what a file states. InputError for such values."""
+    """Returns the scan of line integrals with row 0 the lowest; without a grid it gets the cone's cube. ``names``: names in
+    messages about implausible values that a file states. InputError for such values."""
     assumed = [*timing.assumed, *([] if options.detector_model else ["average"])] if timing.is_fly else []
     scan = Scan(
         projections=integrals.values,
@@ -54,7 +54,7 @@ def put_together(
 
 
 def with_options(geometry: ConeGeometry, options: ImportOptions) -> ConeGeometry:
-    """The geometry with the distances, pitches and offset that the user gives in place of the file's."""
+    """Returns the geometry with the distances, pixel sizes and offset of the options in place of the file's."""
     own = geometry.source_to_axis_mm, geometry.source_to_detector_mm
     return cone(options, *own, geometry.detector_shape, geometry.pixel_size_mm, geometry.detector_offset_mm)
 
@@ -67,7 +67,8 @@ def cone(
     pitch_mm: tuple[float, ...],
     offset_mm: tuple[float, float],
 ) -> ConeGeometry:
-    """A geometry of a file's numbers, over which the options win. InputError unless the panel stands behind the axis."""
+    """Returns a geometry of a file's numbers, or the options' where they are given. InputError unless the panel stands
+    behind the axis."""
     to_axis_mm = options.source_to_axis_mm or to_axis_mm
     to_detector_mm = options.source_to_detector_mm or to_detector_mm
     if to_detector_mm <= to_axis_mm:

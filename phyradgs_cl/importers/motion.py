@@ -1,24 +1,28 @@
-"""From a list of angles, and what is known about time, to shutter, trajectory and opening times."""
+"""Motion of an imported scan: from angles or poses, and what is known about time, to shutter, trajectory and opening
+times."""
 
 import logging
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
 from phyradgs_cl import checks
-from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, FrameSweeps, Shutter
+from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, FrameSweeps, PoseTable, Shutter
+from phyradgs_cl.acquisition.trajectory import resting_poses
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.importers.options import ImportOptions
 
 _log = logging.getLogger(__name__)
 _OF_A_TURN = ("exposure_s", "readout_s", "angle_at", "readout_axis", "readout_direction")
+_SLACK = 1e-6  # of a span: how far a table extends beyond the times that are needed
 
 
 @dataclass(frozen=True, eq=False)
 class Timing:
-    """When frames were taken. ``start_s`` (F,) opening of each first-read line; ``is_fly``: the gantry never stops;
-    ``angle_at``: a stored angle belongs to the "start" or "middle" of the first line's exposure. ``assumed``: what neither
-    file nor user stated, in the words of ``acquisition/plausible.py``."""
+    """When frames were taken. ``start_s`` (F,): opening of the line that is read first; ``is_fly``: the gantry never
+    stops; ``angle_at``: a stored angle belongs to the "start" or "middle" of the first line's exposure. ``assumed``:
+    the values that neither file nor user stated, by their names in ``acquisition/plausible.py``."""
 
     shutter: Shutter
     start_s: np.ndarray
@@ -28,14 +32,14 @@ class Timing:
 
     @property
     def angle_time_s(self) -> np.ndarray:
-        """(F,): the moments that the stored angles belong to."""
+        """The times (F,) of the stored angles."""
         return self.start_s + (self.shutter.exposure_s / 2 if self.angle_at == "middle" else 0.0)
 
 
 @dataclass(frozen=True, eq=False)
 class StoredTiming:
-    """What a format itself says; None where it is silent. ``start_s`` (F,): the gantry did not stop. ``written``: by
-    what names a description that the user wrote says any of it; a file's header does not count."""
+    """The timing that a file states; None for missing values. ``start_s`` (F,): of a gantry that did not stop. ``written``:
+    names of the values in a description that the user wrote, as against a file's header."""
 
     exposure_s: float | None = None
     readout_s: float | None = None
@@ -51,9 +55,9 @@ class StoredTiming:
 def make_timing(
     subject: str, frames: int, options: ImportOptions, stored: StoredTiming | None = None
 ) -> Timing:
-    """Timing of ``frames`` frames; the options win over what is stored. Start times, or the time from frame to frame,
-    say that the gantry turned all the while, which needs an exposure. Without them every frame is taken at rest, and
-    what a user says of a turn in between is refused."""
+    """Returns the timing of ``frames`` frames; options replace stored values. Start times, or a time from frame to
+    frame, mean that the gantry turned continuously, which needs an exposure. Without them every frame was taken at
+    rest, and options about a turn are refused."""
     stored = stored or StoredTiming()
     exposure_s = _first(options.exposure_s, stored.exposure_s) or 0.0
     readout_s = _first(options.readout_s, stored.readout_s)
@@ -85,8 +89,8 @@ def make_timing(
 
 
 def turning(geometry: ConeGeometry, angle_rad: np.ndarray, timing: Timing) -> CircularOrbit:
-    """A circular orbit through gantry angles (F,), each frame at the slope of the angles over time around it (one-sided
-    at both ends); at rest where the gantry stands."""
+    """Returns a circular orbit through gantry angles (F,). Each frame turns at the slope of the angles over time, one-sided
+    at both ends; a frame at rest does not turn."""
     angle_rad = np.asarray(angle_rad, np.float64)
     exposure_s = timing.shutter.exposure_s
     if not timing.is_fly:
@@ -102,7 +106,7 @@ def _first(*values: float | None) -> float | None:
 
 
 def _check_rest(subject: str, shutter: Shutter, options: ImportOptions, stored: StoredTiming) -> None:
-    """Refuses what a user says of a turn without the time from frame to frame; warns where a file has an exposure."""
+    """Refuses options about a turn without a time from frame to frame; warns of a file's exposure."""
     asked = [options.called(name) for name in options.given(_OF_A_TURN)]
     frame_time = f"{options.named('frame_time_s')} or {options.named('fps')}"
     for name in (*asked, *stored.written):
@@ -122,3 +126,55 @@ def _check_flight(subject: str, shutter: Shutter, start_s: np.ndarray, options: 
     if len(start_s) < 2 or np.any(np.diff(start_s) <= 0):
         found = f"{len(start_s)} frames" if len(start_s) < 2 else "start times that do not increase"
         raise InputError(f"{subject} start times", found, "at least two frames, one after the other in time")
+
+
+@dataclass(frozen=True)
+class Turned:
+    """The flips of stored images after which v points up and u to the right, seen from the source."""
+
+    rows: bool
+    columns: bool
+
+    def frames(self, array: np.ndarray) -> np.ndarray:
+        """Returns frames or masks (..., v, u), flipped."""
+        array = array[..., ::-1, :] if self.rows else array
+        return array[..., ::-1] if self.columns else array
+
+    def poses(self, pose: np.ndarray, panel: tuple[int, int]) -> np.ndarray:
+        """Returns the poses (..., 12) of the flipped images."""
+        pose = np.array(pose, np.float64)
+        if self.rows:
+            pose[..., 3:6] += (panel[0] - 1) * pose[..., 9:12]
+            pose[..., 9:12] *= -1
+        if self.columns:
+            pose[..., 3:6] += (panel[1] - 1) * pose[..., 6:9]
+            pose[..., 6:9] *= -1
+        return pose
+
+
+def turn_of(pose: np.ndarray) -> Turned:
+    """Returns the flips of a stored image to row 0 below and column 0 left, from one of its poses (12,)."""
+    source, step_u, step_v = pose[:3], pose[6:9], pose[9:12]
+    right = np.array([-source[1], source[0], 0.0])
+    return Turned(rows=bool(step_v[2] < 0), columns=bool(step_u @ right < 0))
+
+
+def table_over_time(pose_at: Callable[[np.ndarray], np.ndarray], timing: Timing, subject: str) -> PoseTable:
+    """Returns a pose table that covers every frame's window. ``pose_at``: poses (T, 12) at frame positions (T,), where 2.5
+    is halfway from frame 2 to 3. A gantry at rest has each frame's pose at its middle."""
+    if not timing.is_fly:
+        at_s = np.asarray(timing.start_s) + timing.shutter.middle_s
+        poses = pose_at(np.arange(len(at_s), dtype=np.float64))
+        return resting_poses(poses, at_s, timing.shutter.span_s, f"{subject} poses")
+    at_s = timing.angle_time_s
+    span_s = timing.shutter.span_s
+    before, after = at_s[0] - timing.start_s[0] + _SLACK * span_s, timing.start_s[-1] + span_s - at_s[-1]
+    first = at_s[0] - max(before, 0.0)
+    last = at_s[-1] + max(after, 0.0) + _SLACK * span_s
+    time_s = np.concatenate([[first], at_s, [last]])
+    position = np.concatenate([
+        [-(at_s[0] - first) / (at_s[1] - at_s[0])],
+        np.arange(len(at_s)),
+        [len(at_s) - 1 + (last - at_s[-1]) / (at_s[-1] - at_s[-2])],
+    ])  # fmt: skip
+    return PoseTable(time_s, pose_at(position), f"{subject} poses")

@@ -1,0 +1,109 @@
+"""Reading within bounds: regular files no further than their size, their hashes, and the memory of this machine."""
+
+import hashlib
+import os
+import stat
+import threading
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import BinaryIO
+
+from phyradgs_cl.errors import InputError
+
+try:
+    import resource
+except ImportError:  # not POSIX
+    resource = None  # type: ignore[assignment]
+
+HOST_SHARE = 0.8
+"""The share of this machine's memory that one array may take."""
+_NO_WAITING = getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_NOCTTY", 0) | getattr(os, "O_BINARY", 0)
+_BLOCK_BYTES = 1 << 20
+
+
+def regular_file(path: Path, subject: str, expected: str = "a regular file") -> os.stat_result:
+    """Returns the status of a readable regular file. InputError about ``subject`` for a missing file, a folder, a device or
+    a pipe: reading the last two may never end."""
+    where = "" if str(path) in subject else f" {path}"
+    try:
+        status = os.stat(path)
+    except FileNotFoundError as error:
+        found = f"no file{where}" if where else "no such file"
+        raise InputError(subject, found, expected, "check the path") from error
+    except (OSError, ValueError) as error:  # ValueError: a NUL, or half a surrogate pair
+        reason = getattr(error, "strerror", None) or "no name of a file"
+        raise InputError(subject, f"{reason}{where}", expected, "check the path") from error
+    if not stat.S_ISREG(status.st_mode):
+        kind = "a folder" if stat.S_ISDIR(status.st_mode) else "something that is not a regular file"
+        raise InputError(subject, f"{kind}{where}", expected, "check the path")
+    if not os.access(path, os.R_OK):
+        raise InputError(subject, f"no permission to read it{where}", expected, "ask whoever owns the file")
+    return status
+
+
+@contextmanager
+def open_regular(path: Path, subject: str, expected: str = "a regular file") -> Iterator[tuple[BinaryIO, int]]:
+    """Yields an open file and its size. System errors of the body become InputError about ``subject``."""
+    regular_file(path, subject, expected)
+    try:
+        with open(os.open(path, os.O_RDONLY | _NO_WAITING), "rb") as file:
+            yield file, os.fstat(file.fileno()).st_size
+    except OSError as error:
+        raise InputError(subject, error.strerror or str(error), expected) from error
+
+
+def read_regular(path: Path, subject: str, most_bytes: int, expected: str) -> bytes:
+    """Reads a whole file of at most ``most_bytes``."""
+    with open_regular(path, subject, expected) as (file, size):
+        if size > most_bytes:
+            raise InputError(subject, f"{size} bytes", f"at most {most_bytes} bytes for {expected}")
+        return file.read(size)
+
+
+def sha256_of(path: str | Path, given_up: threading.Event | None = None) -> str:
+    """Returns the SHA-256 of a file as 64 hexadecimal digits; stops early when ``given_up`` is set."""
+    digest = hashlib.sha256()
+    with open_regular(Path(path), str(path), "a readable file") as (file, left):
+        while left > 0 and not (given_up and given_up.is_set()) and (block := file.read(_BLOCK_BYTES)):
+            digest.update(block[:left])
+            left -= len(block)
+    return digest.hexdigest()
+
+
+@contextmanager
+def hashing(path: str | Path) -> Iterator[Callable[[], str]]:
+    """Hashes a file while the body reads it, so that the disk is read once. Yields a function that returns the SHA-256."""
+    given_up = threading.Event()
+    with ThreadPoolExecutor(1) as pool:
+        try:
+            yield pool.submit(sha256_of, path, given_up).result
+        finally:
+            given_up.set()
+
+
+def host_bytes() -> float:
+    """Returns this machine's memory; infinity where the system does not report it."""
+    try:
+        return float(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
+    except (AttributeError, OSError, ValueError):
+        return float("inf")
+
+
+def free_bytes() -> float:
+    """Returns the memory that this process may still take; infinity where the system does not report it."""
+    free = host_bytes()
+    with suppress(OSError, ValueError, IndexError):
+        free = 1024.0 * int(Path("/proc/meminfo").read_text().partition("MemAvailable:")[2].split()[0])
+    limit = -1 if resource is None else resource.getrlimit(resource.RLIMIT_AS)[0]
+    return free if limit < 0 else min(free, limit - in_use_bytes("VmSize:"))
+
+
+def in_use_bytes(field: str) -> int:
+    """Returns the memory of this process from a field of Linux' /proc/self/status: "VmHWM:" for the peak of resident memory,
+    "VmSize:" for the address space; 0 on other systems."""
+    try:
+        return 1024 * int(Path("/proc/self/status").read_text().partition(field)[2].split()[0])
+    except (OSError, ValueError, IndexError):
+        return 0
