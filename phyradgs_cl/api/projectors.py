@@ -102,7 +102,7 @@ def splat_operator(
     pixel_footprint: bool = False,
     device: Device = None,
 ) -> "SplatProjection":
-    """Returns the projector Φ of PhyRadGS (Eq. 3): ``Gaussians`` or parameter rows (11, G) to frames (F, rows, columns).
+    """Returns a scan's projector Φ (PhyRadGS, Eq. 3): ``Gaussians`` or rows (11, G) to frames (F, rows, columns).
 
     The rows are mean x y z and three scales in mm, quaternion w x y z of any length, density in 1/mm. motion: a model of
     docs/methods.md that splats support. affine: use R2-Gaussian's approximation. cutoff_sigma: the Mahalanobis radius at

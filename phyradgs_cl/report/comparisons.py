@@ -18,25 +18,26 @@ Image = NDArray[np.float32]
 
 
 def chosen_frames(frames: int, count: int) -> list[int]:
-    """``count`` frames spread evenly over the scan, the first one among them."""
+    """Returns ``count`` frame numbers spread evenly over the scan, with the first."""
     return sorted({(k * frames) // count for k in range(min(count, frames))})
 
 
 def computed_views(run: Run, rt: Runtime, count: int) -> list[FramePair]:
-    """``count`` frames of the run's scan beside those of its volume, as the run's method saw them: lag undone and
-    filtered.
-    """
+    """Returns ``count`` frames of the scan after the run's preprocessing, with those computed from its volume."""
     if run.scan is None or count < 1:
         return []
-    scan = prepared(run.scan, run.before, rt)
+    scan = prepared(run.scan, run.preprocessing, rt)
     return frame_pairs(rt, scan, run.stored.values, run.stored.required_grid, chosen_frames(scan.frames, count))
 
 
 @dataclass(frozen=True, eq=False)
 class Change:
-    """What a step did: its numbers; by name an image (rows, columns) before and after: the frame that changed most, the
-    sinogram (frames, columns) of the row that did, the middle slice (y, x) by FDK; the scan's line integrals as ``counts``
-    (2, n), before and after, between ``edges`` (n + 1,)."""
+    """The effect of a preprocessing step.
+
+    numbers: the facts that the step reports. pairs: images before and after, by name: the frame (rows, columns) and the
+    sinogram (frames, columns) that changed most, and the middle slice (y, x) by FDK. counts (2, n): histograms of all line
+    integrals, before and after, between ``edges`` (n + 1,).
+    """
 
     step: str
     numbers: Facts
@@ -46,21 +47,21 @@ class Change:
 
 
 def step_changes(run: Run, rt: Runtime) -> list[Change]:
-    """The steps of the run, done again on its scan."""
-    if run.scan is None or not run.before.chosen:
+    """Repeats the run's preprocessing on its scan and returns the effect of each step."""
+    if run.scan is None or not run.preprocessing.chosen:
         return []
-    found: list[Change] = []
+    changes: list[Change] = []
     former: tuple[np.ndarray, Image] | None = None
-    for name, scan, numbers in stages(run.scan, run.before, rt):
+    for name, scan, numbers in stages(run.scan, run.preprocessing, rt):
         now = scan.projections, static_fdk(rt, scan.on_grid(_middle(scan.grid)))[0]
         if former is not None:
-            found.append(_change(name, numbers, former, now))
+            changes.append(_change(name, numbers, former, now))
         former = now
-    return found
+    return changes
 
 
 def _middle(grid: Grid) -> Grid:
-    """One slice across the axis, in the middle of a grid."""
+    """Returns the middle slice of a grid, across the axis."""
     return Grid((1, *grid.shape[1:]), grid.voxel_size_mm, grid.offset_mm)
 
 

@@ -16,14 +16,13 @@ BUDGET_PIXELS = 16_000_000  # of all slices together: some 20 MB of page at wors
 PLANES = (("axial", 0, "z", "x", "y"), ("coronal", 1, "y", "x", "z"), ("sagittal", 2, "x", "y", "z"))
 _ROOM = 0.25  # of the window, on either side of it
 _BLUE, _WHITE, _RED = (33, 86, 158), (247, 247, 245), (178, 34, 40)
-
 _PERCENTILE = 99.9  # a few hot voxels would make the rest dark
 Volume = NDArray[np.floating]
 
 
 def png_bytes(image: NDArray[np.uint8], colours: NDArray[np.uint8] | None = None) -> bytes:
-    """A PNG of an image (rows, columns) uint8, row 0 at the top; colours (256, 3) uint8, None is grey."""
-    from PIL import Image  # a tenth of a second, which most commands need not wait for
+    """Returns a PNG of an image (rows, columns) uint8, row 0 at the top; colours (256, 3) uint8, None is grey."""
+    from PIL import Image  # takes a tenth of a second, which most commands save
 
     picture = Image.fromarray(image)
     if colours is not None:
@@ -38,33 +37,43 @@ def data_uri(png: bytes) -> str:
 
 
 def base64_of(content: bytes) -> str:
-    """Bytes as text that a page holds."""
+    """Returns bytes as text."""
     return base64.b64encode(content).decode("ascii")
 
 
 def bytes_of(image: NDArray[np.floating], low: float, high: float) -> NDArray[np.uint8]:
-    """Values (any shape) as 0 to 255 from ``low`` to ``high``, clipped; what overflowed on its way here is 0."""
+    """Returns values of any shape as 0 to 255 for ``low`` to ``high``, clipped; NaN and infinity become 0."""
     span = high - low if high > low else 1.0
     share = np.nan_to_num((image.astype(np.float64) - low) / span)
     return np.rint(255 * np.clip(share, 0, 1)).astype(np.uint8)
 
 
 def top_row_first(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """An image (rows, columns) whose row 0 is the lowest, as a picture, whose row 0 is the top."""
+    """Returns an image (rows, columns) whose row 0 is the lowest as a picture, whose row 0 is the top."""
     return np.ascontiguousarray(image[::-1])
 
 
+def grey_png(image: NDArray[np.floating], low: float, high: float) -> bytes:
+    """Returns a PNG of an image (rows, columns) whose row 0 is the lowest, black at ``low`` and white at ``high``."""
+    return png_bytes(top_row_first(bytes_of(image, low, high)))
+
+
+def signed_png(image: NDArray[np.floating], limit: float) -> bytes:
+    """Returns a PNG of differences (rows, columns), blue at −``limit``, red at +``limit``."""
+    return png_bytes(top_row_first(bytes_of(image, -limit, limit)), diverging())
+
+
 def diverging() -> NDArray[np.uint8]:
-    """Colours (256, 3) from blue over white, in the middle, to red: for differences."""
+    """Returns colours (256, 3) for differences: blue, white in the middle, red."""
     at = np.linspace(-1, 1, 256)[:, None]
     ends = np.where(at < 0, np.array(_BLUE), np.array(_RED))
-    # The root makes small differences visible, as a white page swallows them.
+    # the power makes small differences visible on a white page
     mixed = np.array(_WHITE) + np.abs(at) ** 0.8 * (ends - np.array(_WHITE))
     return np.rint(mixed).astype(np.uint8)
 
 
 def grey_range(volume: NDArray[np.floating]) -> tuple[float, float]:
-    """From 0 (or below, where there is no more than that) to a high percentile: what black and white stand for."""
+    """Returns the values of black and white: 0 and a high percentile, or the extremes where nothing is above 0."""
     high = float(np.percentile(volume, _PERCENTILE))
     if high > 0:
         return 0.0, high
@@ -77,8 +86,10 @@ def grey_range(volume: NDArray[np.floating]) -> tuple[float, float]:
 
 @dataclass(frozen=True)
 class Window:
-    """What black and white stand for at first, and the values ``least`` to ``most`` that 256 steps span, all in 1/mm.
-    ``beyond``: whether there are smaller, and larger values than those."""
+    """The first values of black and white, ``low`` and ``high``, and the values ``least`` to ``most`` of 256 grey levels.
+
+    All are in 1/mm. beyond: whether there are smaller values than ``least``, and larger ones than ``most``.
+    """
 
     low: float
     high: float
@@ -88,7 +99,7 @@ class Window:
 
     @classmethod
     def of(cls, low: float, high: float, *volumes: Volume) -> "Window":
-        """Room on both sides for streaks and overshoots, as far as there are any."""
+        """Returns a window with room on both sides for streaks and overshoots, where there are any."""
         room = _ROOM * (high - low)
         lowest, highest = (float(f([f(v) for v in volumes])) for f in (np.min, np.max))
         least, most = min(low, max(lowest, low - room)), max(high, min(highest, high + room))
@@ -97,8 +108,11 @@ class Window:
 
 @dataclass(frozen=True)
 class Plane:
-    """The slices of one orientation: PNGs in base64 (``layers``) of ``indices`` among ``count``. first_mm, step_mm: centre
-    of slice 0 and the way to the next. size_mm: (width, height). still: the middle slice as seen without a script, a PNG."""
+    """The slices of one orientation: ``indices`` among ``count`` slices.
+
+    layers: PNGs in base64, by layer. first_mm, step_mm: the centre of slice 0 and the distance to the next. size_mm:
+    (width, height). still: a PNG of the middle slice, for browsers without scripts.
+    """
 
     name: str
     axis: str
@@ -114,16 +128,16 @@ class Plane:
 
     @property
     def middle(self) -> int:
-        """Which of ``indices`` the still shows."""
+        """The position in ``indices`` of the slice that the still shows."""
         return len(self.indices) // 2
 
     def position_mm(self, k: int) -> float:
-        """Where the ``k``-th of the slices in the page is."""
+        """Returns the position of the ``k``-th slice of the page."""
         return self.first_mm + self.indices[k] * self.step_mm
 
 
 def windows_of(volume: Volume, reference: Volume | None) -> dict[str, Window]:
-    """A window per layer; the truth's range serves both where there is one, so that a wrong gain shows."""
+    """Returns a window per layer; result and truth share the range of the truth, so that a wrong gain shows."""
     if reference is None or not float(reference.max()) > 0:
         return {"result": Window.of(*grey_range(volume), volume)}
     grey = Window.of(min(0.0, float(reference.min())), float(reference.max()), volume, reference)
@@ -133,7 +147,7 @@ def windows_of(volume: Volume, reference: Volume | None) -> dict[str, Window]:
 
 
 def planes_of(volume: Volume, reference: Volume | None, grid: Grid, windows: Mapping[str, Window]) -> list[Plane]:
-    """The three orientations of a volume (nz, ny, nx), a layer for each of the windows."""
+    """Returns the three orientations of a volume (nz, ny, nx), with a layer for each of the windows."""
     layers: dict[str, Volume] = {"result": volume}
     if reference is not None and "truth" in windows:
         layers |= {"truth": reference, "difference": volume - reference}
@@ -155,13 +169,13 @@ def planes_of(volume: Volume, reference: Volume | None, grid: Grid, windows: Map
 
 
 def stills_of(planes: Sequence[Plane], volume: Volume, window: tuple[float, float]) -> list[Plane]:
-    """The stills of another volume (nz, ny, nx) at the places of ``planes``; black and white: ``window``."""
+    """Returns ``planes`` with the stills of another volume (nz, ny, nx); ``window`` is the values of black and white."""
     pictures = (_picture(volume, axis, plane.indices[plane.middle], *window) for axis, plane in enumerate(planes))
     return [replace(plane, layers={}, still=still) for plane, still in zip(planes, pictures, strict=True)]
 
 
 def _kept_slices(shape: tuple[int, ...], layers: int) -> list[int]:
-    """How many slices along every axis: all, or equal shares of the budget."""
+    """Returns the number of slices along every axis: all, or what the budget allows."""
     seen = [min(n, LONGEST_EDGE) for n in shape]
     pixels = [int(np.prod(seen)) // seen[axis] for axis in range(3)]
     most = max(1, BUDGET_PIXELS // (layers * sum(pixels)))
@@ -169,11 +183,11 @@ def _kept_slices(shape: tuple[int, ...], layers: int) -> list[int]:
 
 
 def _picture(volume: Volume, axis: int, index: int, low: float, high: float) -> bytes:
-    return png_bytes(top_row_first(bytes_of(_reduced(np.take(volume, index, axis=axis)), low, high)))
+    return grey_png(_reduced(np.take(volume, index, axis=axis)), low, high)
 
 
 def _reduced(image: Volume) -> Volume:
-    """Means over blocks of pixels where an image (rows, columns) is longer than a page shows."""
+    """Returns means over blocks of pixels, where an image (rows, columns) is longer than ``LONGEST_EDGE``."""
     for axis in (0, 1):
         edge = image.shape[axis]
         if edge > LONGEST_EDGE:

@@ -8,7 +8,7 @@ from collections.abc import Iterator, Mapping
 from phyradgs_cl.text import plain_text
 
 UNITS = {"_per_mm": "1/mm", "_mm": "mm", "_deg": "°", "_db": "dB", "_s": "s"}
-_RESOLUTION = {"mm": 1e-4, "°": 1e-4, "s": 1e-6}  # finer than anything a scanner knows
+_RESOLUTION = {"mm": 1e-4, "°": 1e-4, "s": 1e-6}  # finer than any scanner's
 _WORDS = {"psnr": "PSNR", "rms": "RMS", "ssim": "SSIM", "sha256": "SHA-256", "tv": "TV", "l1": "L1", "fdk": "FDK"}
 _LONGEST = 400
 _RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
@@ -16,34 +16,37 @@ _RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
 class Markup(str):
-    """Text that is HTML already; every other text is escaped where it is put into an element."""
+    """Text that is HTML. Any other text is escaped when it becomes part of an element."""
 
 
 VOID = frozenset({"br", "img", "input", "link", "meta"})
 
 
 def element(name: str, /, *children: object, **attributes: object) -> Markup:
-    """``<name attributes>children</name>``; what is no Markup is escaped. Attributes that are None or False are left out,
-    True has no value; underscores in names become dashes, one at the end goes (``class_``)."""
+    """Returns ``<name attributes>children</name>``; children that are no Markup are escaped.
+
+    Attributes that are None or False are left out, and True has no value. Underscores in names become dashes; one at the
+    end is removed (``class_``).
+    """
     opening = f"<{name}{''.join(_attribute(key, value) for key, value in attributes.items())}>"
     return Markup(opening) if name in VOID else Markup(f"{opening}{joined(*children)}</{name}>")
 
 
 def joined(*children: object) -> Markup:
-    """Children one after the other, escaped where they are no Markup; None and empty ones add nothing."""
+    """Joins children, escaped where they are no Markup; None adds nothing."""
     shown = (c if isinstance(c, Markup) else html.escape(_plain(c)) for c in children if c is not None)
     return Markup("".join(shown))
 
 
 def raw_text(name: str, content: str, /, **attributes: object) -> Markup:
-    """A ``style`` or ``script`` element of our own text, which HTML reads without unescaping."""
+    """Returns a ``style`` or ``script`` element of text from this package, which HTML does not unescape."""
     if "</" + name in content.lower():
         raise ValueError(f"{name}: the content would end its element")
     return element(name, Markup(content), **attributes)
 
 
 def json_block(identifier: str, value: object) -> Markup:
-    """Data for the page's script: JSON in which no element can begin or end."""
+    """Returns data for the page's script, as JSON in which no element can begin or end."""
     text = json.dumps(value, separators=(",", ":"), allow_nan=False)
     safe = text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
     return element("script", Markup(safe), id=identifier, type="application/json")
@@ -57,7 +60,7 @@ def _attribute(key: str, value: object) -> str:
 
 
 def _plain(value: object) -> str:
-    """Numbers of drawings need no more than hundredths."""
+    """Returns a value as text, floats with two decimals."""
     return f"{value:.2f}".rstrip("0").rstrip(".") if isinstance(value, float) else plain_text(str(value))
 
 
@@ -65,7 +68,7 @@ def _plain(value: object) -> str:
 
 
 def flattened(facts: Mapping[str, object], prefix: str = "") -> Iterator[tuple[str, object]]:
-    """(key, value) of all facts, those of nested tables with a dotted key."""
+    """Yields (key, value) of all facts; keys of nested tables are dotted."""
     for key, value in facts.items():
         if isinstance(value, Mapping):
             yield from flattened(value, f"{prefix}{key}.")
@@ -74,7 +77,7 @@ def flattened(facts: Mapping[str, object], prefix: str = "") -> Iterator[tuple[s
 
 
 def label(key: str) -> str:
-    """``source_to_axis_mm`` as "source to axis"."""
+    """Returns the words of a key: ``source_to_axis_mm`` is "source to axis"."""
     for ending in UNITS:
         if key.endswith(ending) and key != ending:
             key = key[: -len(ending)]
@@ -83,12 +86,12 @@ def label(key: str) -> str:
 
 
 def unit(key: str) -> str:
-    """The unit in which a fact of this name is given; empty where there is none."""
+    """Returns the unit that the name of a fact ends with, or an empty text."""
     return next((u for ending, u in UNITS.items() if key.endswith(ending)), "")
 
 
 def shown(value: object, unit_name: str = "") -> str:
-    """A value with its unit, short enough to be read."""
+    """Returns a value with its unit, cut if it is very long."""
     text = _text(value, _RESOLUTION.get(unit_name, 0.0))
     if len(text) > _LONGEST:
         text = text[:_LONGEST] + "…"
@@ -97,7 +100,7 @@ def shown(value: object, unit_name: str = "") -> str:
 
 
 def number(value: float, resolution: float = 0.0) -> str:
-    """Four digits at most, powers of ten only where they save zeros; a millionth of ``resolution`` or less is 0, rounded."""
+    """Returns a number with at most four digits; values up to a millionth of ``resolution`` are 0."""
     if abs(value) <= 1e-6 * resolution:
         value = 0.0
     if not math.isfinite(value):

@@ -1,5 +1,5 @@
 "use strict";
-// Slices, window, zoom and values of the three planes; without this script the middle slices stay.
+// Slices, window, zoom and values of the three planes. Without this script the page shows the middle slices.
 (() => {
   const block = document.getElementById("slice-data");
   if (!block) return;
@@ -9,11 +9,11 @@
   const zoom = document.getElementById("zoom"), reading = document.getElementById("reading");
   const ends = {}; // first and last of the 256 steps that are shown, by window
   const parts = {}; // by the axis that a plane cuts
-  const origin = {}; // by axis: the share of it that stays where it is under zoom
+  const origin = {}; // by axis: the fraction at which the picture stays fixed under zoom
   let layer = "result", pointed = null, armed = null;
 
   const clamp = (value, low, high) => Math.min(Math.max(value, low), high);
-  const told = (value, decimals) => value.toFixed(decimals).replace(/^-(?=[0.]*$)/, "").replace("-", "−");
+  const inWords = (value, decimals) => value.toFixed(decimals).replace(/^-(?=[0.]*$)/, "").replace("-", "−");
   const isGrey = () => layer !== "difference";
   const kind = () => (isGrey() ? "result" : "difference"); // the truth has the result's window
   const valueOf = (step) => windows[layer].least + (step / 255) * (windows[layer].most - windows[layer].least);
@@ -21,7 +21,7 @@
   function inPerMm(step) {
     const { beyond, decimals } = windows[layer];
     const sign = step <= 0 && beyond[0] ? "≤ " : step >= 255 && beyond[1] ? "≥ " : "";
-    return sign + told(valueOf(step), decimals) + " 1/mm";
+    return sign + inWords(valueOf(step), decimals) + " 1/mm";
   }
 
   function initialEnds(name) {
@@ -83,7 +83,7 @@
     for (const [slider, step, name] of [[black, first, isGrey() ? "Black" : "Blue"], [white, last, isGrey() ? "White" : "Red"]]) {
       slider.previousElementSibling.textContent = name;
       slider.value = step;
-      document.getElementById(slider.id + "-told").textContent = inPerMm(step);
+      document.getElementById(slider.id + "-value").textContent = inPerMm(step);
       slider.setAttribute("aria-valuetext", inPerMm(step));
     }
     Object.values(parts).forEach(paint);
@@ -98,7 +98,7 @@
 
   function magnify() {
     const times = Number(zoom.value);
-    document.getElementById("zoom-told").textContent = times + "×";
+    document.getElementById("zoom-value").textContent = times + "×";
     zoom.setAttribute("aria-valuetext", times + "×");
     for (const axis of Object.keys(parts)) {
       const at = origin[axis], here = share(axis); // out of sight: it becomes the middle of what is seen
@@ -126,7 +126,7 @@
     const at = { [plane.right]: right, [plane.up]: up, [plane.axis]: share(plane.axis) };
     const places = ["x", "y", "z"].map((axis) => {
       const { first_mm, step_mm, count, decimals } = parts[axis].plane;
-      return `${axis} ${told(first_mm + Math.floor(clamp(at[axis], 0, 0.999999) * count) * step_mm, decimals)}`;
+      return `${axis} ${inWords(first_mm + Math.floor(clamp(at[axis], 0, 0.999999) * count) * step_mm, decimals)}`;
     });
     const value = inPerMm(steps[clamp(row, 0, canvas.height - 1) * canvas.width + clamp(column, 0, canvas.width - 1)]);
     reading.textContent = `${pointed ? "Under the pointer" : "Where the lines cross"}, ${places.join(", ")} mm: ${value}`;

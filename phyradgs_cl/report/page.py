@@ -1,4 +1,4 @@
-"""A reconstruction as one HTML page that needs nothing but itself."""
+"""A reconstruction as one HTML page that loads nothing."""
 
 import hashlib
 from collections.abc import Callable, Sequence
@@ -22,7 +22,7 @@ from phyradgs_cl.runtime import Runtime
 DEFAULT_VIEWS = 3
 
 
-@np.errstate(all="ignore")  # absurd values are shown as they are
+@np.errstate(all="ignore")  # a file may hold any values
 def write_report(
     volume: Path,
     output: Path,
@@ -31,11 +31,13 @@ def write_report(
     scan: Path | None = None,
     views: int = DEFAULT_VIEWS,
 ) -> Run:
-    """Writes the page ``output`` of a volume file, whole or not at all; returns what was found for it. ``scan`` None takes
-    the one that the volume's provenance names, if it is there unchanged; ``views`` frames of it are projected from the
-    volume, on the device of ``make_runtime``, which is not asked without any. InputError: files that cannot be read, or are
-    of another kind; an output that is one of them. OutputError: the page cannot be written. DeviceError: none to project
-    with."""
+    """Writes the page ``output`` of a volume file, completely or not at all, and returns the run.
+
+    scan: None is the file that the volume's provenance names, if it is unchanged. views: the number of frames that are
+    computed from the volume, on the device of ``make_runtime``; without frames no device is needed. Raises InputError for
+    files that cannot be read or are of another kind, and for an output that is one of them; OutputError where the page
+    cannot be written; DeviceError where no device can project.
+    """
     check_writable(output)
     run = load_run(volume, scan)
     for path in (volume, run.scan_path):
@@ -50,7 +52,7 @@ def write_report(
 
 
 def report_page(run: Run, views: Sequence[FramePair] = (), changes: Sequence[Change] = ()) -> str:
-    """The page as text; ``views`` as from ``computed_views``, ``changes`` as from ``step_changes``."""
+    """Returns the page as text; ``views`` come from ``computed_views``, ``changes`` from ``step_changes``."""
     of_scan = {} if run.scan is None else {
         "preparation": sections.preparation_section(run, changes),
         "projections": sections.projections_section(run.scan, views),
@@ -82,7 +84,7 @@ def report_page(run: Run, views: Sequence[FramePair] = (), changes: Sequence[Cha
 
 
 def _in_pairs(there: dict[str, Markup]) -> list[Markup]:
-    """The sections; two that need half the width side by side where there is room."""
+    """Returns the sections; metrics and convergence are side by side where there is room."""
     narrow = [part for name in ("metrics", "convergence") if (part := there.get(name)) is not None]
     pair = element("div", *narrow, class_="pair") if narrow else Markup()
     rest = {name: part for name, part in there.items() if name not in ("metrics", "convergence")}
@@ -90,7 +92,7 @@ def _in_pairs(there: dict[str, Markup]) -> list[Markup]:
 
 
 def _head(title: str) -> Markup:
-    """Styles and a policy that lets nothing in: no network, no script but the page's own."""
+    """Returns the styles, and a policy that permits no network and no script except the page's own."""
     digest = base64_of(hashlib.sha256(_file("page.js").encode()).digest())
     policy = f"default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'sha256-{digest}'"
     policy += "; base-uri 'none'; form-action 'none'"
@@ -109,12 +111,12 @@ def _top(run: Run) -> list[Markup]:
     title = run.scan.title if run.scan is not None else run.path.name
     motion = f", motion {motion_facts(run.motion)['name']}" if run.motion is not None else ""
     method = run.stored.provenance.get("method", "unknown method")
-    told = f"{run.path.name}: {method}{motion}"
+    words = f"{run.path.name}: {method}{motion}"
     if run.scan_path is not None:
-        told += f", from {run.scan_path.name}"
+        words += f", from {run.scan_path.name}"
     notes = [element("p", note, class_="warning", role="note") for note in run.notes]
     tiles = [element("li", element("b", value), element("span", name)) for name, value in _tiles(run)]
-    return [element("h1", title), element("p", told), *notes, element("ul", *tiles, class_="tiles")]
+    return [element("h1", title), element("p", words), *notes, element("ul", *tiles, class_="tiles")]
 
 
 def _tiles(run: Run) -> list[tuple[str, str]]:

@@ -1,4 +1,4 @@
-"""A picture of a volume's three middle slices, for a look at a run that is under way."""
+"""A volume outside of a report: a picture of its middle slices, also during a run, and a window of napari."""
 
 import logging
 import math
@@ -30,9 +30,11 @@ log = logging.getLogger(__name__)
 
 
 def write_preview(volume: NDArray[np.floating], grid: Grid, path: str | Path) -> None:
-    """Writes a grey PNG of a volume's (nz, ny, nx) middle slices in true proportions, whole or not at all: axial (y
-    up), coronal and sagittal (z up) from left to right. InputError: a volume that does not fit its grid, NaN or
-    infinity. OutputError: the file cannot be written."""
+    """Writes a grey PNG of the middle slices of a volume (nz, ny, nx), in true proportions, completely or not at all.
+
+    From left to right: axial (y up), coronal and sagittal (z up). Raises InputError for a volume that does not fit its
+    grid, NaN and infinity; OutputError where the file cannot be written.
+    """
     checks.shape("volume", volume, grid.shape)
     checks.finite("volume", volume)
     picture = png_bytes(preview_image(volume, grid))
@@ -41,7 +43,7 @@ def write_preview(volume: NDArray[np.floating], grid: Grid, path: str | Path) ->
 
 
 def check_preview(path: Path, *others: Path) -> None:
-    """Raises InputError or OutputError now if the picture could not be written, or would replace one of ``others``."""
+    """Raises InputError or OutputError if the picture cannot be written, or would replace one of ``others``."""
     if path.suffix.lower() != ".png":
         raise InputError("--preview", str(path), "a file name that ends in .png")
     if {one.resolve() for one in (path, partial_path(path))} & {other.resolve() for other in others}:
@@ -50,8 +52,10 @@ def check_preview(path: Path, *others: Path) -> None:
 
 
 class Preview:
-    """A listener to a running method that keeps a picture of the present volume at ``io.partial_path`` of ``path``, at
-    most one every ``every_s`` seconds. One that cannot be written is a warning, once."""
+    """A listener to a running method that writes a picture of the present volume to ``io.partial_path`` of ``path``.
+
+    It writes at most every ``every_s`` seconds. A picture that cannot be written is a warning, once.
+    """
 
     def __init__(self, path: Path, every_s: float = 5.0) -> None:
         self.path, self.partial, self.every_s = path, partial_path(path), every_s
@@ -65,7 +69,7 @@ class Preview:
         self._last_s = time.monotonic()
 
     def finish(self, volume: NDArray[np.floating], grid: Grid) -> None:
-        """The picture of the result, under its own name."""
+        """Writes the picture of the result, and removes that of the run."""
         self._write(volume, grid, self.path)
         with suppress(OSError):
             self.partial.unlink()
@@ -80,7 +84,7 @@ class Preview:
 
 
 def preview_image(volume: NDArray[np.floating], grid: Grid) -> NDArray[np.uint8]:
-    """The picture (rows, columns) uint8, row 0 at the top; the slices stand side by side on one ground line."""
+    """Returns the picture (rows, columns) uint8, row 0 at the top; the slices are aligned at the bottom."""
     low, high = grey_range(volume)
     per_mm = np.clip(max(grid.shape), _SMALLEST, _LARGEST) / max(grid.size_mm)
     slices = []
@@ -88,7 +92,7 @@ def preview_image(volume: NDArray[np.floating], grid: Grid) -> NDArray[np.uint8]
         image = bytes_of(np.take(volume, volume.shape[axis] // 2, axis=axis), low, high)
         size_mm = [side for a, side in enumerate(grid.size_mm) if a != axis]
         shape = [max(1, round(side * per_mm)) for side in size_mm]
-        ends = zip(shape, image.shape, strict=True)  # the nearest pixel everywhere: voxels stay visible as such
+        ends = zip(shape, image.shape, strict=True)  # by the nearest pixel, so that voxels stay visible
         rows, columns = (((np.arange(n) + 0.5) * m / n).astype(int) for n, m in ends)
         slices.append(top_row_first(image[rows[:, None], columns]))
     height, width = max(s.shape[0] for s in slices), sum(s.shape[1] + _GAP for s in slices) - _GAP
@@ -101,7 +105,7 @@ def preview_image(volume: NDArray[np.floating], grid: Grid) -> NDArray[np.uint8]
 
 
 def _shown_axes(grid: Grid) -> list[int]:
-    """The axes along which to look: of a grid of one layer not into the layer's edge, which is a line."""
+    """Returns the axes to look along; for a grid of one layer only the axis across the layer."""
     across = [min(n for a, n in enumerate(grid.shape) if a != axis) for axis in range(3)]
     return [axis for axis in range(3) if across[axis] > 1] or [0, 1, 2]
 
@@ -113,7 +117,10 @@ _AXES = ("z", "y", "x")
 
 
 def view_volume(path: Path) -> None:
-    """Opens a window with a volume file and returns when it is closed. InputError: no napari, or no volume file of ours."""
+    """Opens a window with a volume file and returns when it is closed.
+
+    Raises InputError where napari is missing, and for anything but a volume file of phyradgs-cl.
+    """
     napari = checks.package("napari", "the package for this, 0.5.4 or later", "napari[all]")
     if (kind := file_kind(path)) != "volume":
         raise InputError(str(path), f"a {kind}", "a volume of phyradgs-cl")
@@ -122,7 +129,7 @@ def view_volume(path: Path) -> None:
 
 
 def add_volume(viewer: Any, stored: Volume, name: str) -> None:
-    """Puts a volume into a viewer at its place in the world: lengths in mm, axes z, y, x, y up, grey from 0."""
+    """Adds a volume to a viewer, in mm at its position, with axes z, y, x, y up, grey from 0."""
     viewer.add_image(
         stored.values,
         name=f"{name} (1/mm)",

@@ -1,4 +1,4 @@
-"""What a report is about: a stored volume, the scan that it comes from, and how the two compare."""
+"""The subject of a report: a stored volume, its scan, and how the two compare."""
 
 import logging
 from collections.abc import Mapping
@@ -26,9 +26,11 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, eq=False)
 class Run:
-    """A reconstruction and what is known of it. scan, scan_path, scan_facts: its scan, on the volume's grid, where found.
-    reference (nz, ny, nx) 1/mm: the truth on that. metrics: by name. notes: what to know about the page itself. compared:
-    how the metrics compare volume and truth; empty without a truth."""
+    """A reconstruction from its volume file and, where it is found, its scan.
+
+    scan, scan_path, scan_facts: the scan, on the volume's grid. reference (nz, ny, nx) 1/mm: the truth on that grid.
+    metrics: by name. notes: remarks for the reader of the page. compared: how volume and truth were compared.
+    """
 
     path: Path
     stored: Volume
@@ -42,100 +44,101 @@ class Run:
 
     @property
     def motion(self) -> Motion | None:
-        """The motion model that the run used, with the segments that it chose, where its provenance says so."""
+        """The motion model of the run, with the segments that it chose; None where the provenance lacks it."""
         options = self.stored.provenance.get("options")
         table = options.get("motion") if isinstance(options, Mapping) else None
         if not isinstance(table, Mapping):
             return None
         segments = self.stored.provenance.get("segments")
-        known = {"segments": segments} if table.get("name") == "exact" and isinstance(segments, int) else {}
+        if table.get("name") == "exact" and isinstance(segments, int):
+            table = {**table, "segments": segments}
         try:
-            return motion_from_facts({**table, **known})
+            return motion_from_facts(table)
         except (InputError, TypeError):  # of another version, or of another program
             return None
 
     @property
-    def before(self) -> Preprocessing:
-        """What was done to the frames first; nothing but what is usual where the provenance does not say."""
-        return input_of(self.stored)
+    def preprocessing(self) -> Preprocessing:
+        """The preprocessing of the frames; the usual one where the provenance lacks it."""
+        table = self.stored.provenance.get("input")
+        try:
+            return preprocessing_of(dict(table)) if isinstance(table, Mapping) else Preprocessing()
+        except InputError:
+            return Preprocessing()
 
     @property
     def record(self) -> list[dict[str, float]]:
-        """The convergence record: finite numbers only."""
+        """The finite numbers of the convergence record."""
         lines: Any = self.stored.provenance.get("record") or []
         return [{k: float(v) for k, v in line.items() if checks.is_number(v)} for line in lines]
 
-
     @property
     def tuned(self) -> Mapping[str, Any] | None:
-        """How an option was chosen from the scan, where the provenance says it in numbers."""
-        found: Any = self.stored.provenance.get(TUNED)
-        return found if is_told(found) else None
-
-
-def input_of(stored: Volume) -> Preprocessing:
-    """What was done to the frames before a volume was made of them, as far as its provenance says."""
-    table = stored.provenance.get("input")
-    try:
-        return preprocessing_of(dict(table)) if isinstance(table, Mapping) else Preprocessing()
-    except InputError:
-        return Preprocessing()
+        """The trials by which the scan chose an option, where the provenance has them."""
+        trials: Any = self.stored.provenance.get(TUNED)
+        return trials if is_told(trials) else None
 
 
 def load_run(path: Path, scan_path: Path | None = None) -> Run:
-    """Reads a volume file and its scan: ``scan_path``, or the one that the provenance names if it is still the same.
-    InputError: not a volume file of ours; a scan that is named and cannot be read."""
-    if (kind := file_kind(path)) != "volume":
-        remedy = "reconstruct one with 'phyradgs reconstruct'"
-        raise InputError(str(path), f"a {kind}", "a volume of phyradgs-cl", remedy)
+    """Reads a volume file and its scan: ``scan_path``, or the unchanged file that the provenance names.
+
+    Raises InputError for anything but a volume file of phyradgs-cl, and for a ``scan_path`` that cannot be read.
+    """
+    kind = file_kind(path)
+    if kind != "volume":
+        raise InputError(str(path), f"a {kind}", "a volume of phyradgs-cl", "make one with 'phyradgs reconstruct'")
     notes: list[str] = []
-    run = _found(path, read_volume(path), scan_path, notes)
+    stored = read_volume(path)
+    run = Run(path, stored, metrics=stored.metrics or {})
+    named = scan_path or _scan_of(path, stored.provenance, notes)
+    if named is not None:
+        run = _with_scan(run, named, scan_path is not None, notes)
     for note in notes:
         log.warning("%s: %s", path, note)
-    return run
+    return replace(run, notes=tuple(notes))
 
 
-def _found(path: Path, stored: Volume, scan_path: Path | None, notes: list[str]) -> Run:
-    found = scan_path or _scan_of(path, stored.provenance, notes)
-    if found is None:
-        return Run(path, stored, metrics=stored.metrics or {}, notes=tuple(notes))
-    if scan_path is not None and (kind := file_kind(scan_path)) != "scan":
-        raise InputError(f"--scan {scan_path}", f"a {kind}", "a scan")
-    known = stored.provenance.get("scan_sha256")
-    facts = scan_summary(found, str(known) if scan_path is None else None)
-    if known is not None and facts["sha256"] != known:
+def _with_scan(run: Run, path: Path, is_given: bool, notes: list[str]) -> Run:
+    """Adds the scan of a file, and the comparison with its reference; appends remarks to ``notes``."""
+    kind = file_kind(path) if is_given else "scan"
+    if kind != "scan":
+        raise InputError(f"--scan {path}", f"a {kind}", "a scan")
+    stored, grid = run.stored, run.stored.required_grid
+    sha256 = stored.provenance.get("scan_sha256")
+    facts = scan_summary(path, None if is_given else str(sha256))
+    if sha256 is not None and facts["sha256"] != sha256:
         notes.append("The scan shown here is not the file that this volume was reconstructed from: its hash differs.")
-    before = input_of(stored)
-    if before.margin_mm is not None:
-        notes.append("What the method filled beyond the box is discarded: frames computed from the volume lack it.")
-    whole = read_scan(found, flat_correction(before.flats))
-    whole = replace(whole, provenance={**whole.provenance, "flats": before.flats})
-    scan = whole.on_grid(stored.required_grid)
-    metrics: dict[str, object] = dict(stored.metrics or {})
-    pair = None if whole.reference is None else aligned(stored.values, stored.required_grid, whole.reference, whole.grid)
-    if whole.reference is not None and (pair is None or not pair.reference.max() > 0):
+    if run.preprocessing.margin_mm is not None:
+        notes.append("The filled margin around the box is discarded: frames computed from the volume lack it.")
+    flats = run.preprocessing.flats
+    scan = read_scan(path, flat_correction(flats))
+    scan = replace(scan, provenance={**scan.provenance, "flats": flats})
+    run = replace(run, scan=scan.on_grid(grid), scan_path=path, scan_facts=facts)
+    if scan.reference is None:
+        return run
+    pair = aligned(stored.values, grid, scan.reference, scan.grid)
+    if pair is None or not pair.reference.max() > 0:
         notes.append("Nothing of the scan's reference lies in the volume's box: there is no PSNR.")
-        pair = None
-    if pair is None:
-        return Run(path, stored, scan, found, facts, None, metrics, tuple(notes))
+        return run
+    metrics = run.metrics
     if not metrics.keys() >= METRICS.keys():
         metrics = {**compare(pair.volume, pair.reference), **metrics}
-    reference = pair.reference if pair.grid is stored.required_grid else None
-    if reference is None:
+    if pair.grid is not grid:
         notes.append("The scan's reference is on another grid than the volume: its slices are not shown.")
-    return Run(path, stored, scan, found, facts, reference, metrics, tuple(notes), pair.how)
+        return replace(run, metrics=metrics, compared=pair.how)
+    return replace(run, metrics=metrics, compared=pair.how, reference=pair.reference)
 
 
 def _scan_of(path: Path, provenance: Mapping[str, object], notes: list[str]) -> Path | None:
-    """The file that the provenance names, from here or from beside the volume, if it has the hash that is kept."""
-    named = provenance.get("scan")
-    if not isinstance(named, str) or not named:
+    """Returns the file that the provenance names, in the present or the volume's folder, if it has the stored hash."""
+    name = provenance.get("scan")
+    if not isinstance(name, str) or not name:
         notes.append("The volume file names no scan.")
         return None
-    known = provenance.get("scan_sha256")
-    for place in (Path(named), path.parent / named, path.parent / Path(named).name):
-        with suppress(InputError):  # whatever else there is: it may be any file of this machine
-            if file_kind(place) == "scan" and sha256_of(place) == known:
+    sha256 = provenance.get("scan_sha256")
+    for place in (Path(name), path.parent / name, path.parent / Path(name).name):
+        with suppress(InputError):  # the name may be that of any file of this machine
+            if file_kind(place) == "scan" and sha256_of(place) == sha256:
                 return place
-    notes.append(f"The scan {plain_text(named)} was not found, or has changed since; --scan names it.")
+    notes.append(f"The scan {plain_text(name)} was not found, or has changed since; --scan names it.")
     return None

@@ -1,4 +1,4 @@
-"""The sections of a page, each from a run to HTML; a section that has nothing to show is None."""
+"""The sections of a page, each from a run to HTML. A section with nothing to show is None."""
 
 from collections.abc import Iterable, Mapping, Sequence
 
@@ -12,14 +12,12 @@ from phyradgs_cl.report.charts import Chart, convergence_charts, histogram, tuni
 from phyradgs_cl.report.comparisons import Change
 from phyradgs_cl.report.images import (
     Plane,
-    bytes_of,
     data_uri,
-    diverging,
+    grey_png,
     grey_range,
     planes_of,
-    png_bytes,
+    signed_png,
     stills_of,
-    top_row_first,
     windows_of,
 )
 from phyradgs_cl.report.markup import Markup, element, flattened, joined, label, number, shown, unit
@@ -28,38 +26,36 @@ from phyradgs_cl.report.scan_charts import frames_chart, orbit_chart, shutter_ch
 from phyradgs_cl.report.viewer import stills, viewer
 from phyradgs_cl.text import to_digits_of
 
-_MOST_ROWS = 400  # of provenance
-_MOST_CHARTS, _MOST_ALIKE = 6, 20  # of a calibration
-_ABSURD = 1e9  # a value of a parameter that no file of ours has
+_MOST_ROWS = 400  # of a table
+_MOST_CHARTS, _MOST_COMBINATIONS = 6, 20  # of a calibration
+_ABSURD = 1e9  # no parameter of our files is larger
 _DISAGREEMENT = (
-    "Half the RMS of their difference over 3³ voxels, in the middle slices: where the volume leans on its method. It is no "
-    "confidence interval: both are estimates from the same frames, errors that they share are not in it, and the volume's "
-    "error is larger, where we measured it 1.5 to 3.5 times."
+    "Half the RMS of the difference of the two estimates over 3³ voxels, in the middle slices. It shows where the volume "
+    "depends on the method. It is no confidence interval: both estimates use the same frames, and it lacks the errors that "
+    "they share. In our measurements the volume's error is 1.5 to 3.5 times as large."
 )
 
 
 def slices_section(run: Run) -> Markup:
-    """The volume, or the volume against the truth."""
-    stored = run.stored
+    """The volume, together with the truth where the scan has one."""
+    stored, grid = run.stored, run.stored.required_grid
     windows = windows_of(stored.values, run.reference)
-    planes = planes_of(stored.values, run.reference, stored.required_grid, windows)
-    size = " × ".join(number(side) for side in stored.required_grid.size_mm)
-    told = f"{' × '.join(map(str, stored.required_grid.shape))} voxels (z, y, x), {size} mm"
-    left_out = any(len(plane.indices) < plane.count for plane in planes)
-    told += "; the page has evenly chosen slices of them" if left_out else ""
-    note = element("p", told + ".", class_="note")
-    return _section("slices", "Slices", note, viewer(planes, windows), _disagreement(run, planes))
+    planes = planes_of(stored.values, run.reference, grid, windows)
+    size = " × ".join(number(side) for side in grid.size_mm)
+    words = f"{' × '.join(map(str, grid.shape))} voxels (z, y, x), {size} mm"
+    if any(len(plane.indices) < plane.count for plane in planes):
+        words += "; the page has evenly chosen slices of them"
+    return _section("slices", "Slices", _note(words + "."), viewer(planes, windows), _disagreement(run, planes))
 
 
 def _disagreement(run: Run, planes: Sequence[Plane]) -> Markup | None:
-    """Where two estimates differ, in the middle slices."""
+    """The middle slices of the difference between two estimates."""
     values = run.stored.disagreement
     if values is None:
         return None
     high = grey_range(values)[1]
     heading = element("h3", "Disagreement of voxels and splats", id="disagreement")
-    shown = stills(stills_of(planes, values, (0.0, high)), "disagreement", high)
-    return joined(heading, element("p", _DISAGREEMENT, class_="note"), shown)
+    return joined(heading, _note(_DISAGREEMENT), stills(stills_of(planes, values, (0.0, high)), "disagreement", high))
 
 
 def metrics_section(run: Run, views: Sequence[FramePair]) -> Markup | None:
@@ -73,10 +69,10 @@ def metrics_section(run: Run, views: Sequence[FramePair]) -> Markup | None:
         facts["residual_of_the_shown_frames"] = float(np.sqrt(np.mean([view.rms**2 for view in views])))
     if not facts:
         return None
-    told = f"Against the reference that the scan carries, {run.compared}. " if run.compared else ""
+    words = f"Against the reference of the scan, {run.compared}. " if run.compared else ""
     if "holdout_rms" in facts:
-        told += "Holdout: of line integrals that the method did not see, and what their noise makes of it."
-    return _section("metrics", "Metrics", told and element("p", told, class_="note"), facts_table(facts))
+        words += "Holdout: RMS error of line integrals that the method did not see, and the RMS of their noise."
+    return _section("metrics", "Metrics", words and _note(words), facts_table(facts))
 
 
 def convergence_section(run: Run) -> Markup | None:
@@ -85,7 +81,7 @@ def convergence_section(run: Run) -> Markup | None:
 
 
 def tuning_section(run: Run) -> Markup | None:
-    """What an option was chosen by."""
+    """The trials that chose an option."""
     return _section("tuning", "Tuning", _charts([tuning_chart(run.tuned)])) if run.tuned else None
 
 
@@ -95,144 +91,130 @@ def scan_section(run: Run) -> Markup:
 
 
 def geometry_section(scan: Scan) -> Markup:
-    arc = ", and the arc through which it moves in the first; grey, the panel at the arc's end"
-    above = f"From above: where the source stands in the middle of every frame{arc if scan.is_fly else ''}."
+    above = "From above: the source in the middle of every frame"
+    above += ", and its arc in the first frame; grey, the panel at the end of the arc." if scan.is_fly else "."
     side = "From the side: the cone of the first frame."
     return _section("geometry", "Geometry", _charts([(above, orbit_chart(scan)), (side, side_chart(scan))]))
 
 
 def shutter_section(run: Run, scan: Scan) -> Markup | None:
-    """Times of a frame, and of frames after each other where the gantry moves; None of a scan that stops for exposures of no
-    stated length."""
+    """The times of a frame, and of successive frames if the gantry moves; None for stops without a stated exposure."""
     if not scan.is_fly and scan.shutter.exposure_s == 0:
         return None
     words = shutter_words(scan)
-    one = words[0].upper() + words[1:] + "."
+    caption = f"{words[0].upper()}{words[1:]}."
     if run.motion is not None:
-        one += f" {_motion_words(run.motion)}"
-    several = "The first frames on one axis of time."
-    charts = [(one, shutter_chart(scan, run.motion))]
+        caption += f" {_motion_words(run.motion)}"
+    charts = [(caption, shutter_chart(scan, run.motion))]
     if scan.is_fly:
-        charts.append((several, frames_chart(scan)))
+        charts.append(("The first frames on one axis of time.", frames_chart(scan)))
     return _section("shutter", "Shutter in space and time", _charts(charts))
 
 
 def projections_section(scan: Scan, views: Sequence[FramePair]) -> Markup | None:
-    """Measured, computed and residual frames; one range of grey values for all, one of residuals."""
+    """Measured, computed and residual frames, with one range of grey values and one of residuals."""
     if not views:
         return None
     low = min(0.0, *(float(v.measured.min()) for v in views))
     high = max(float(v.measured.max()) for v in views)
     limit = max(float(np.percentile(np.abs(v.residual), 99.5)) for v in views) or 1.0
-    shape, pitch_mm = scan.geometry.detector_shape, scan.geometry.pixel_size_mm
-    proportion = shape[1] * pitch_mm[1], shape[0] * pitch_mm[0]
-    told = f"Line integrals, black {number(low)}, white {number(high)}; residuals, measured less computed, "
-    told += f"blue −{number(limit)}, red +{number(limit)}. "
+    (rows, columns), (dv_mm, du_mm) = scan.geometry.detector_shape, scan.geometry.pixel_size_mm
+    words = f"Line integrals, black {number(low)}, white {number(high)}; residuals, measured less computed, "
+    words += f"blue −{number(limit)}, red +{number(limit)}. "
     if scan.is_fly:
-        told += f"Every line is computed from the volume at {TIMES_PER_LINE} times of its own exposure."
+        words += f"Every line is computed from the volume at {TIMES_PER_LINE} times of its own exposure."
     else:
-        told += "Every frame is computed from its one pose."
-    rows = [_view(view, (low, high), limit, proportion) for view in views]
-    return _section("projections", "Projections", element("p", told, class_="note"), *rows)
+        words += "Every frame is computed from its one pose."
+    style = f"aspect-ratio: {columns * du_mm:.6g} / {rows * dv_mm:.6g}"
+    parts = []
+    for view in views:
+        residual = f"residual, RMS {number(view.rms)} ({number(100 * view.relative)} %)"
+        pictures = [
+            ("measured", grey_png(view.measured, low, high)),
+            ("computed", grey_png(view.computed, low, high)),
+            (residual, signed_png(view.residual, limit)),
+        ]
+        parts.append(_row(f"Frame {view.frame}", f"frame {view.frame}", pictures, style))
+    return _section("projections", "Projections", _note(words), *parts)
 
 
 def preparation_section(run: Run, changes: Sequence[Change]) -> Markup | None:
-    """What each step before the method did: a frame, the line integrals of all, and numbers; those of a scan file that was
-    written by ``prepare`` in numbers alone."""
-    told = [] if run.scan is None else run.scan.provenance.get(PREPARED_KEY)
-    earlier = [element("div", element("h3", str(line.get("step"))), facts_table(line)) for line in _tables(told)]
+    """The effect of each preprocessing step: pictures, a histogram and numbers; numbers only of an earlier ``prepare``."""
+    prepared = [] if run.scan is None else run.scan.provenance.get(PREPARED_KEY)
+    earlier = [element("div", element("h3", str(line.get("step"))), facts_table(line)) for line in _tables(prepared)]
     if not changes and not earlier:
         return None
-    words = "The frame and the sinogram (a line per frame) that each step changed most, and the middle slice, in one range "
-    words += "of grey values each; difference, after less before."
-    note = element("p", words, class_="note") if changes else None
-    return _section("preparation", "Preparation", note, *earlier, *(_change(change) for change in changes))
+    words = "The frame and the sinogram (a line per frame) that each step changed most, and the middle slice. Before and "
+    words += "after have one range of grey values; the difference is after less before."
+    return _section("preparation", "Preparation", changes and _note(words), *earlier, *map(_change, changes))
+
+
+def _change(change: Change) -> Markup:
+    parts = []
+    for name, (before, after) in change.pairs.items():
+        low, high, difference = float(before.min()), float(before.max()), after - before
+        limit = float(np.percentile(np.abs(difference), 99.9)) or float(np.abs(difference).max()) or 1.0
+        pictures = [
+            ("before", grey_png(before, low, high)),
+            ("after", grey_png(after, low, high)),
+            (f"difference, ±{number(limit)}", signed_png(difference, limit)),
+        ]
+        parts.append(_row(f"{change.step}: {name}", f"{change.step}, {name}", pictures))
+    caption = "Line integrals of all frames: dashed before, solid after."
+    return joined(*parts, _charts([(caption, histogram(change.edges, change.counts))]), facts_table(change.numbers))
 
 
 def calibration_section(scan: Scan) -> Markup | None:
-    """What `calibrate` found before the scan was reconstructed, the first time first: tables, and what was corrected of
-    single views."""
-    known = [*_tables(scan.provenance.get("calibrated_before")), *_tables([scan.provenance.get("calibration")])]
-    parts = [part for told in known if (lines := _tables(told.get("parameters"))) for part in _calibrated(told, lines, scan)]
+    """The results of ``calibrate``, the first run first: tables of parameters, and charts of corrections of the views."""
+    calibrations = _tables(scan.provenance.get("calibrated_before")) + _tables([scan.provenance.get("calibration")])
+    parts = [part for one in calibrations for part in _calibration(one, scan)]
     if not parts:
         return None
-    words = "What the scan says of itself was found from its frames"
-    words += f", {len(known)} times over, each from what was left before." if len(known) > 1 else "."
-    return _section("calibration", "Calibration", element("p", words, class_="note"), *parts)
+    words = "Parameters of the scan were estimated from its frames"
+    words += f", {len(calibrations)} times, each from the result before." if len(calibrations) > 1 else "."
+    return _section("calibration", "Calibration", _note(words), *parts)
 
 
-def _calibrated(told: Mapping[str, object], lines: Sequence[Mapping[str, object]], scan: Scan) -> list[Markup]:
-    """A table of a line per parameter, what cannot be told apart, and a chart of every number of views."""
-    heads = element("tr", *(element("th", name, scope="col") for name in ("parameter", "stated", "found", "verdict")))
-    rows = [element("tr", *(element("td", cell) for cell in _found(line))) for line in lines[:_MOST_ROWS]]
-    before, after = (_or_dash(told.get(f"residual_rms_{when}")) for when in ("before", "after"))
+def _calibration(calibration: Mapping[str, object], scan: Scan) -> list[Markup]:
+    """A row per parameter, the combinations that frames cannot tell apart, and a chart per correction of the views."""
+    parameters = _tables(calibration.get("parameters"))
+    if not parameters:
+        return []
+    names = ("parameter", "stated", "found", "verdict")
+    head = element("tr", *(element("th", name, scope="col") for name in names))
+    rows = [element("tr", *(element("td", cell) for cell in _cells(line))) for line in parameters[:_MOST_ROWS]]
+    before, after = (_or_dash(calibration.get(f"residual_rms_{when}")) for when in ("before", "after"))
     notes = [f"Residual of the frames: {before} before, {after} after (RMS)."]
-    alike, views = told.get("alike"), told.get("views")
-    notes += [f"Cannot be told apart: {shown(words)}." for words in alike[:_MOST_ALIKE]] if isinstance(alike, list) else []
-    known = list(views.items())[:_MOST_CHARTS] if isinstance(views, Mapping) else []
-    charts = [views_chart(key, values) for key, values in known if isinstance(values, list) and len(values) == scan.frames]
+    combinations, views = calibration.get("alike"), calibration.get("views")
+    if isinstance(combinations, list):
+        notes += [f"Cannot be told apart: {shown(words)}." for words in combinations[:_MOST_COMBINATIONS]]
+    corrections = list(views.items())[:_MOST_CHARTS] if isinstance(views, Mapping) else []
+    charts = [views_chart(k, v) for k, v in corrections if isinstance(v, list) and len(v) == scan.frames]
     return [
-        element("table", element("thead", heads), element("tbody", *rows)),
-        *(element("p", words, class_="note") for words in notes),
+        element("table", element("thead", head), element("tbody", *rows)),
+        *map(_note, notes),
         _charts(chart for chart in charts if chart is not None),
     ]
 
 
-def _found(line: Mapping[str, object]) -> list[str]:
-    """The cells of a parameter: found with its deviation, or nothing."""
-    name, scale, stated, found, deviation, verdict = (
-        line.get(key) for key in ("name", "unit", "stated", "found", "deviation", "verdict")
-    )
-    of = scale if isinstance(scale, str) else ""
-    value = "–" if found is None else f"{shown(found)} ± {_or_dash(deviation, of)}"
-    if isinstance(found, float) and isinstance(deviation, float) and abs(found) + deviation < _ABSURD:
-        value = f"{to_digits_of(found, deviation)} ± {shown(to_digits_of(deviation, deviation), of)}"
-    return [_or_dash(name), _or_dash(stated, of), value, _or_dash(verdict)]
-
-
-def _or_dash(value: object, unit_name: str = "") -> str:
-    return "–" if value is None else shown(value, unit_name)
-
-
-def _tables(told: object) -> list[Mapping[str, object]]:
-    return [line for line in told if isinstance(line, Mapping)] if isinstance(told, list) else []
-
-
-def _change(change: Change) -> Markup:
-    shown = [_compared(change.step, name, *pair) for name, pair in change.pairs.items()]
-    chart = _charts([("Line integrals of all frames: dashed before, drawn after.", histogram(change.edges, change.counts))])
-    return joined(*shown, chart, facts_table(change.numbers))
-
-
-def _compared(step: str, name: str, before: np.ndarray, after: np.ndarray) -> Markup:
-    """An image before and after a step, and what the step did to it."""
-    low, high = float(before.min()), float(before.max())
-    difference = after - before
-    limit = float(np.percentile(np.abs(difference), 99.9)) or float(np.abs(difference).max()) or 1.0
-    pictures = [
-        ("before", png_bytes(top_row_first(bytes_of(before, low, high)))),
-        ("after", png_bytes(top_row_first(bytes_of(after, low, high)))),
-        (f"difference, ±{number(limit)}", png_bytes(top_row_first(bytes_of(difference, -limit, limit)), diverging())),
-    ]
-    figures = [
-        element(
-            "figure",
-            element("div", element("img", src=data_uri(png), alt=f"{step}, {name}, {words}"), class_="picture"),
-            element("figcaption", words),
-        )
-        for words, png in pictures
-    ]
-    return element("div", element("h3", f"{step}: {name}"), *figures, class_="view")
+def _cells(line: Mapping[str, object]) -> list[str]:
+    """The cells of a parameter: name, stated value, estimate with its deviation, verdict."""
+    estimate, deviation, unit_name = line.get("found"), line.get("deviation"), line.get("unit")
+    of = unit_name if isinstance(unit_name, str) else ""
+    value = "–" if estimate is None else f"{shown(estimate)} ± {_or_dash(deviation, of)}"
+    if isinstance(estimate, float) and isinstance(deviation, float) and abs(estimate) + deviation < _ABSURD:
+        value = f"{to_digits_of(estimate, deviation)} ± {shown(to_digits_of(deviation, deviation), of)}"
+    return [_or_dash(line.get("name")), _or_dash(line.get("stated"), of), value, _or_dash(line.get("verdict"))]
 
 
 def provenance_section(run: Run) -> Markup:
-    """Everything that the volume file keeps about its making, but the convergence record."""
+    """Everything that the volume file stores about its making, except the convergence record."""
     facts = {k: v for k, v in run.stored.provenance.items() if k not in ("record", "options")}
     options = run.stored.provenance.get("options")
     parts: list[object] = [facts_table(facts)]
     if isinstance(options, Mapping):
-        told = element("summary", "All options of the method")
-        parts.append(element("details", told, facts_table(options)))
+        summary = element("summary", "All options of the method")
+        parts.append(element("details", summary, facts_table(options)))
     return _section("provenance", "Provenance", *parts)
 
 
@@ -241,22 +223,6 @@ def facts_table(facts: Mapping[str, object]) -> Markup:
     cells = [(label(key), shown(value, unit(key))) for key, value in list(flattened(facts))[:_MOST_ROWS]]
     lines = [element("tr", element("th", name, scope="row"), element("td", value)) for name, value in cells]
     return element("table", element("tbody", *lines))
-
-
-def _view(view: FramePair, window: tuple[float, float], limit: float, proportion: tuple[float, float]) -> Markup:
-    residual = png_bytes(top_row_first(bytes_of(view.residual, -limit, limit)), diverging())
-    pictures = [
-        ("measured", png_bytes(top_row_first(bytes_of(view.measured, *window)))),
-        ("computed", png_bytes(top_row_first(bytes_of(view.computed, *window)))),
-        (f"residual, RMS {number(view.rms)} ({number(100 * view.relative)} %)", residual),
-    ]
-    style = f"aspect-ratio: {proportion[0]:.6g} / {proportion[1]:.6g}"
-    figures = []
-    for words, png in pictures:
-        image = element("img", src=data_uri(png), alt=f"frame {view.frame}, {words}", style=style)
-        picture = element("div", image, class_="picture")
-        figures.append(element("figure", picture, element("figcaption", words)))
-    return element("div", element("h3", f"Frame {view.frame}"), *figures, class_="view")
 
 
 def _motion_words(motion: Motion) -> str:
@@ -276,9 +242,31 @@ def _motion_words(motion: Motion) -> str:
     return f"The run's motion is {motion_facts(motion)['name']}: {words}."
 
 
+def _tables(value: object) -> list[Mapping[str, object]]:
+    """The tables of a list from a file; nothing of anything else."""
+    return [line for line in value if isinstance(line, Mapping)] if isinstance(value, list) else []
+
+
+def _or_dash(value: object, unit_name: str = "") -> str:
+    return "–" if value is None else shown(value, unit_name)
+
+
+def _row(heading: str, of: str, pictures: Sequence[tuple[str, bytes]], style: str | None = None) -> Markup:
+    """Pictures next to each other under a heading, each with its caption."""
+    figures = []
+    for words, png in pictures:
+        image = element("img", src=data_uri(png), alt=f"{of}, {words}", style=style)
+        figures.append(element("figure", element("div", image, class_="picture"), element("figcaption", words)))
+    return element("div", element("h3", heading), *figures, class_="view")
+
+
 def _charts(charts: Iterable[Chart]) -> Markup:
     figures = [element("figure", drawing, element("figcaption", words)) for words, drawing in charts]
     return element("div", *figures, class_="charts")
+
+
+def _note(words: str) -> Markup:
+    return element("p", words, class_="note")
 
 
 def _section(identifier: str, heading: str, *content: object) -> Markup:

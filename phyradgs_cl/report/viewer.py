@@ -1,4 +1,4 @@
-"""The part of a page in which one walks through the volume, with keyboard, mouse or finger."""
+"""The part of a page that shows the slices of a volume, by keyboard, mouse or finger; and pictures without controls."""
 
 import math
 from collections.abc import Mapping
@@ -13,13 +13,13 @@ _LAYER_NAMES = {"result": "Result", "truth": "Truth", "difference": "Difference"
 _MOST_ZOOM = 8
 _BAR = 0.3  # of a picture's width, at most
 _HELP = (
-    "Arrow keys, Page Up and Down, Home and End move a slider, the wheel the slice under the pointer, with Ctrl the zoom; "
-    "a click in a picture, or dragging, moves the other two there."
+    "Arrow keys, Page Up and Down, Home and End move a slider. The wheel moves the slice under the pointer, with Ctrl the "
+    "zoom. A click in a picture, or dragging, moves the other two slices to that point."
 )
 
 
 def viewer(planes: list[Plane], windows: Mapping[str, Window]) -> Markup:
-    """Three pictures with a slider each, a choice of layers where there is a truth, window and zoom, and their data."""
+    """Returns three pictures with a slider each, the choice of layers, window and zoom, and the data of the script."""
     sliders = [
         _slider("black", "Black", 0, 255, 0, ""),
         _slider("white", "White", 0, 255, 255, ""),
@@ -42,12 +42,12 @@ def viewer(planes: list[Plane], windows: Mapping[str, Window]) -> Markup:
     )
 
 
-def _slider(name: str, words: str, low: float, high: float, value: float, told: str, step: float = 1) -> Markup:
+def _slider(name: str, words: str, low: float, high: float, value: float, shown: str, step: float = 1) -> Markup:
     control = element(
-        "input", type="range", id=name, min=low, max=high, step=step, value=value, aria_describedby=f"{name}-told"
+        "input", type="range", id=name, min=low, max=high, step=step, value=value, aria_describedby=f"{name}-value"
     )
     label = element("label", words, for_=name)
-    return element("span", label, control, element("output", told, id=f"{name}-told", for_=name))
+    return element("span", label, control, element("output", shown, id=f"{name}-value", for_=name))
 
 
 def _figure(plane: Plane) -> Markup:
@@ -60,12 +60,12 @@ def _figure(plane: Plane) -> Markup:
         element("label", f"{name} ({plane.axis})", for_=slider_id),
         element("output", _place(plane, middle), id=place_id, for_=slider_id),
     )
-    picture = _picture(plane, "volume", is_walked=True)
+    picture = _picture(plane, "volume", has_controls=True)
     return element("figure", picture, caption, slider, id=f"plane-{plane.name}")
 
 
 def stills(planes: list[Plane], of: str, high: float) -> Markup:
-    """Pictures that stay as they are, black 0 and white ``high`` in 1/mm or more, and a bar of these values."""
+    """Returns pictures without controls, black 0 and white ``high`` in 1/mm or more, and a bar of these values."""
     figures = []
     for plane in planes:
         words = f"{plane.name.capitalize()} slice ({_place(plane, plane.middle)})"
@@ -75,8 +75,8 @@ def stills(planes: list[Plane], of: str, high: float) -> Markup:
     return joined(element("div", *figures, class_="slices"), element("p", *bar, class_="values"))
 
 
-def _picture(plane: Plane, of: str, *, is_walked: bool = False) -> Markup:
-    """The slice, the names of the directions at its edges, a bar of a round length; cross lines where one walks."""
+def _picture(plane: Plane, of: str, *, has_controls: bool = False) -> Markup:
+    """Returns a slice with the directions at its edges and a scale bar, and with cross lines if ``has_controls``."""
     width_mm, height_mm = plane.size_mm
     image = element(
         "img",
@@ -85,8 +85,8 @@ def _picture(plane: Plane, of: str, *, is_walked: bool = False) -> Markup:
         style=f"aspect-ratio: {width_mm:.6g} / {height_mm:.6g}",
         draggable="false",
     )
-    lines = [element("i", class_=way, aria_hidden="true") for way in ("across", "upwards")] if is_walked else []
-    sheet = element("div", image, element("canvas", aria_hidden="true") if is_walked else None, class_="sheet")
+    lines = [element("i", class_=way, aria_hidden="true") for way in ("across", "upwards")] if has_controls else []
+    sheet = element("div", image, element("canvas", aria_hidden="true") if has_controls else None, class_="sheet")
     ways = {"left": f"−{plane.right}", "right": f"+{plane.right}", "top": f"+{plane.up}", "bottom": f"−{plane.up}"}
     marks = (element("b", way, class_=edge, aria_hidden="true") for edge, way in ways.items())
     bar_mm = round_length(_BAR * width_mm)
@@ -95,7 +95,7 @@ def _picture(plane: Plane, of: str, *, is_walked: bool = False) -> Markup:
 
 
 def _place(plane: Plane, k: int) -> str:
-    """Where a slice is; the page's script says it in the same words."""
+    """Returns the position of a slice, in the words of the page's script."""
     where = number(plane.position_mm(k), plane.step_mm)
     return f"{plane.axis} = {where} mm, {plane.indices[k] + 1} of {plane.count}"
 

@@ -83,7 +83,7 @@ def test_a_box_inside_of_what_is_seen_is_said_where_it_matters(cli, scan, tmp_pa
     found = read_volume(tmp_path / "v.h5")
     assert found.grid == alone.grid and found.metrics["psnr_db"] > alone.metrics["psnr_db"] + 3
     assert found.provenance["input"]["margin_mm"] == [0.5] * 3
-    assert "filled beyond the box is discarded" in load_run(tmp_path / "v.h5", scan).notes[-1]
+    assert "margin around the box is discarded" in load_run(tmp_path / "v.h5", scan).notes[-1]
 
 
 def test_a_run_does_not_go_on_with_another_grid(cli, refused, scan, tmp_path, monkeypatch) -> None:
