@@ -45,7 +45,9 @@ def test_offset_and_roll_are_found_in_a_file_of_which_all_else_stays(cli, right,
     write_scan(path, wrong)
     words = ["calibrate", str(path), "--what", "offset,roll,readout,exposure", "-o", str(out), "--json"]
     assert cli.run(words) == 0
-    facts = json.loads(capsys.readouterr().out)
+    streams = capsys.readouterr()
+    assert "so far, 24 columns: offset-u " in streams.err
+    facts = json.loads(streams.out)
     lines = {one["name"]: one for one in facts["parameters"]}
     for name, truth, most in (("offset-u", 0.0, 0.01), ("roll", ROLL_DEG, 0.1)):
         one = lines[name]

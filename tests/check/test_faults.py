@@ -323,6 +323,14 @@ def test_the_offset_goes_into_a_copy(cli, clean, tmp_path, capsys, kind) -> None
     np.testing.assert_allclose(pose[:, 3:5], expected[:, 3:5], atol=0.15 * pitch_mm)
 
 
+def test_an_offset_is_corrected_and_the_status_stays_where_something_else_is_suspicious(cli, clean, tmp_path) -> None:
+    gain = np.linspace(0, 0.05, clean.frames, dtype=np.float32)
+    wrong = stated(clean, detector_offset_mm=(0.0, 3 * clean.geometry.pixel_size_mm[1]))
+    path, fixed = tmp_path / "scan.h5", tmp_path / "fixed.h5"
+    write_scan(path, replace(wrong, projections=clean.projections - gain[:, None, None]))
+    assert cli.run(["check", str(path), "--fix-offset", "-o", str(fixed)]) == SUSPICIOUS_STATUS and fixed.exists()
+
+
 def test_raw_counts_stay_raw_in_the_copy(cli, clean, tmp_path) -> None:
     path, fixed = tmp_path / "scan.h5", tmp_path / "fixed.h5"
     light = np.concatenate([np.zeros((1, 32, 32)), clean.projections])
