@@ -11,10 +11,12 @@ result_plot.png    what ``result.plot`` draws
 methods.png        one scan by five methods
 check.png          a wrong offset, and after ``check --fix-offset``
 calibrate.png      a panel that stands elsewhere, and after ``calibrate``
+motion.gif         the motion ignored, then known: from the volumes of ``make demo`` in demo/ (or $DEMO)
 
 The first four are computed on the spot in float64 and need no OpenCL device. ``make demo`` draws demo.png.
 """
 
+import os
 import sys
 from pathlib import Path
 
@@ -22,17 +24,22 @@ import numpy as np
 from conventions import conventions_figure
 from examples_drawn import calibrate_figure, check_figure, methods_figure
 from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from matplotlib.patches import Arc, Polygon
+from matplotlib.patches import Arc, Polygon, Rectangle
+from PIL import Image
 
 from phyradgs_cl.acquisition import ConeGeometry, TimeCells, make_protocol
 from phyradgs_cl.acquisition.cells import micro_view_cells, per_line_cells, static_cells
 from phyradgs_cl.api import reconstruct, simulate
 from phyradgs_cl.drawing import ACCENT, EDGE, EXPOSED, SAMPLE
 from phyradgs_cl.fields import Grid
+from phyradgs_cl.io import read_volume
+from phyradgs_cl.metrics import psnr
 from phyradgs_cl.operators.twins.splat import splat_image
 from phyradgs_cl.phantoms import shepp_logan
 from phyradgs_cl.simulation import AnalyticSource, default_time_samples
+from phyradgs_cl.workflow import load_reference
 
 IMAGES = Path(__file__).resolve().parent / "images"
 
@@ -215,6 +222,51 @@ def api_figures() -> None:
     save(reconstruct(scan, "fista-tv", motion="per-row", iterations=60).plot(scan, frame=3), "result_plot.png")
 
 
+# --- the moving picture of the README -------------------------------------------------------------------
+
+
+def motion_figure() -> None:
+    """One slice of `make demo`; a line sweeps over it, and behind the line the motion is known."""
+    folder = Path(os.environ.get("DEMO", IMAGES.parents[1] / "demo"))
+    truth = load_reference(folder / "scan.h5").values
+    ignored, known = (read_volume(folder / name).values for name in ("static.h5", "moving.h5"))
+    part = round(0.28 * len(truth)), slice(round(0.28 * truth.shape[1]), None), slice(round(0.3 * truth.shape[2]), -18)
+    names = f"motion ignored: {psnr(ignored, truth):.1f} dB", f"motion known: {psnr(known, truth):.1f} dB"
+    frames = [_swept_frame(ignored[part].T, known[part].T, truth[part].T, names, share) for share in _sweep()]
+    frames[0].save(IMAGES / "motion.gif", save_all=True, append_images=frames[1:], duration=90, loop=0, optimize=True)
+
+
+def _sweep() -> np.ndarray:
+    """Positions of the line from frame to frame, as shares of the width: a rest, there, a rest, and back."""
+    there = np.linspace(0, 1, 14)
+    return np.concatenate([np.zeros(8), there, np.ones(12), there[::-1]])
+
+
+def _swept_frame(
+    ignored: np.ndarray, known: np.ndarray, truth: np.ndarray, names: tuple[str, str], share: float
+) -> Image.Image:
+    """Draws one frame: motion known left of the line, ignored right of it, on the grey scale of the truth."""
+    rows, columns = truth.shape
+    width, title = 7.2, 0.35  # inches
+    height = width * rows / columns
+    figure = Figure(figsize=(width, height + title), dpi=100)
+    axes = figure.add_axes((0.0, 0.0, 1.0, height / (height + title)))
+    extent = (0.0, float(columns), 0.0, float(rows))
+    for image, start, stop in ((known, 0.0, share), (ignored, share, 1.0)):
+        drawn = axes.imshow(
+            image, cmap="gray", vmin=0, vmax=float(truth.max()), origin="lower", extent=extent, interpolation="bicubic"
+        )
+        drawn.set_clip_path(Rectangle((start * columns, 0), (stop - start) * columns, rows, transform=axes.transData))
+    axes.axvline(share * columns, color=ACCENT, lw=2)
+    axes.set(xlim=extent[:2], ylim=extent[2:])
+    axes.set_axis_off()
+    figure.text(0.02, 0.945, names[1], color=SAMPLE, fontsize=12, alpha=1.0 if share > 0.15 else 0.25)
+    figure.text(0.98, 0.945, names[0], color=ACCENT, fontsize=12, ha="right", alpha=1.0 if share < 0.85 else 0.25)
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()
+    return Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB").quantize(112)
+
+
 FIGURES = {
     "shutter": shutter_figure,
     "splat": splat_figure,
@@ -224,6 +276,7 @@ FIGURES = {
     "methods": lambda: save(methods_figure(), "methods.png"),
     "check": lambda: save(check_figure(), "check.png"),
     "calibrate": lambda: save(calibrate_figure(), "calibrate.png"),
+    "motion": motion_figure,
 }
 
 
