@@ -32,13 +32,8 @@ def static_start_cells(
 
 
 def micro_view_cells(
-    trajectory: Trajectory,
-    shutter: Shutter,
-    frame: int,
-    start_s: float,
-    lines: int,
-    strips: int,
-    sub_intervals: int,
+    trajectory: Trajectory, shutter: Shutter, frame: int, start_s: float, lines: int, strips: int,
+    sub_intervals: int
 ) -> TimeCells:
     """Returns M strips × N sub-intervals at t = t_f + (j+½)/M·T_ro + (k+½)/N·T_exp (paper, Eq. 2).
 
@@ -189,12 +184,8 @@ def _segments_of_lines(opens: np.ndarray, closes: np.ndarray, count: int) -> tup
 
 
 def segments_for(
-    trajectory: Trajectory,
-    shutter: Shutter,
-    frame: int,
-    start_s: float,
-    time_error: float,
-    intensity_peak: float = 0.0,
+    trajectory: Trajectory, shutter: Shutter, frame: int, start_s: float, time_error: float,
+    intensity_peak: float = 0.0
 ) -> int:
     """Returns how many segments keep the error of straight paths and constant conics below ``time_error`` (relative RMS).
 
@@ -229,14 +220,8 @@ def _single_cell(trajectory: Trajectory, shutter: Shutter, frame: int, time_s: f
 
 
 def cell_table(
-    trajectory: Trajectory,
-    shutter: Shutter,
-    frame: int,
-    time_s: np.ndarray,
-    line_start: np.ndarray,
-    line_stop: np.ndarray,
-    weight: np.ndarray,
-    lines: int,
+    trajectory: Trajectory, shutter: Shutter, frame: int, time_s: np.ndarray, line_start: np.ndarray,
+    line_stop: np.ndarray, weight: np.ndarray, lines: int
 ) -> TimeCells:
     """Returns cells at times (C,) s, sorted by their first lines."""
     order = np.argsort(line_start, kind="stable")

@@ -42,11 +42,8 @@ def counts_to_attenuation(
 
 
 def frames_to_attenuation(
-    frames: NDArray[np.generic],
-    quantity: str,
-    flats: NDArray[np.generic] | None = None,
-    darks: NDArray[np.generic] | None = None,
-    largest: float = _LARGEST,
+    frames: NDArray[np.generic], quantity: str, flats: NDArray[np.generic] | None = None,
+    darks: NDArray[np.generic] | None = None, largest: float = _LARGEST
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
     """Does the same for projections (P, v, u) with flats and darks (n, v, u) of their own. Attenuation above ``largest`` is
     marked as unusable too."""
@@ -54,12 +51,8 @@ def frames_to_attenuation(
 
 
 def _converted(
-    frames: NDArray[np.generic],
-    projections: Sequence[int] | NDArray[np.intp],
-    quantity: str,
-    flats: NDArray[np.generic] | None,
-    darks: NDArray[np.generic] | None,
-    largest: float = _LARGEST,
+    frames: NDArray[np.generic], projections: Sequence[int] | NDArray[np.intp], quantity: str,
+    flats: NDArray[np.generic] | None, darks: NDArray[np.generic] | None, largest: float = _LARGEST
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
     panel = frames.shape[1:]
     result = np.empty((len(projections), *panel), dtype=np.float32)

@@ -58,11 +58,8 @@ def sample_counts(expected: Array, electronic_noise: float, rng: np.random.Gener
 
 
 def tigre_noise(
-    line_integrals: ArrayLike,
-    dose: float,
-    electronic_noise: float,
-    rng: np.random.Generator,
-    light: ArrayLike = 1.0,
+    line_integrals: ArrayLike, dose: float, electronic_noise: float, rng: np.random.Generator,
+    light: ArrayLike = 1.0
 ) -> NDArray[np.float32]:
     """Returns noisy line integrals −ln(counts/dose) · m, (F, v, u) float32, after TIGRE's scaling; negatives become 0.
 
@@ -79,12 +76,8 @@ def tigre_noise(
 
 
 def beer_lambert_noise(
-    line_integrals: ArrayLike,
-    dose: float,
-    electronic_noise: float,
-    rng: np.random.Generator,
-    light: ArrayLike = 1.0,
-    lag: float = 0.0,
+    line_integrals: ArrayLike, dose: float, electronic_noise: float, rng: np.random.Generator,
+    light: ArrayLike = 1.0, lag: float = 0.0
 ) -> NDArray[np.float32]:
     """Returns −ln(counts/dose) with counts clamped at ``COUNT_FLOOR``; negatives stay, else air would attenuate.
 

@@ -69,10 +69,8 @@ OPTION_NAMES = frozenset({f.name for f in fields(SimulationOptions)} - {"protoco
 
 
 def scanner_for(
-    name: str,
-    detector: int | None = None,
-    detector_offset_mm: tuple[float, float] | None = None,
-    truncation: float = 0.0,
+    name: str, detector: int | None = None, detector_offset_mm: tuple[float, float] | None = None,
+    truncation: float = 0.0
 ) -> Scanner:
     """Returns a scanner by name or TOML file. detector: another number of columns, with rows in proportion.
     detector_offset_mm: of the panel, (v, u). truncation: fraction of the columns to cut off, half at each side."""

@@ -33,15 +33,9 @@ log = logging.getLogger(__name__)
 
 
 def simulated_scan(
-    rt: Runtime,
-    of: str | Volume | EllipsoidPhantom,
-    scanner: Scanner,
-    options: SimulationOptions,
-    *,
-    size: int | None = None,
-    pixel_samples: int = 1,
-    name: str = "volume",
-    report: Callable[[int, int], None] = lambda done, total: None,
+    rt: Runtime, of: str | Volume | EllipsoidPhantom, scanner: Scanner, options: SimulationOptions, *,
+    size: int | None = None, pixel_samples: int = 1, name: str = "volume",
+    report: Callable[[int, int], None] = lambda done, total: None
 ) -> Scan:
     """Returns a scanner's scan of a phantom, given by name or as an object, or of a volume; the truth is its reference.
 
@@ -71,15 +65,9 @@ def simulated_scan(
 
 
 def simulate(
-    source: FrameSource,
-    geometry: ConeGeometry,
-    grid: Grid,
-    options: SimulationOptions,
-    *,
-    reference: np.ndarray | None = None,
-    title: str = "simulated scan",
-    report: Callable[[int, int], None] = lambda done, total: None,
-    bone: FrameSource | None = None,
+    source: FrameSource, geometry: ConeGeometry, grid: Grid, options: SimulationOptions, *,
+    reference: np.ndarray | None = None, title: str = "simulated scan",
+    report: Callable[[int, int], None] = lambda done, total: None, bone: FrameSource | None = None
 ) -> Scan:
     """Returns a scan of the object that ``source`` projects, noise included. reference (nz, ny, nx): the truth, which
     ``peak`` scales too. bone: the source of its bone, for a beam of many energies."""

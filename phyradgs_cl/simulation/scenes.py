@@ -105,14 +105,8 @@ class Scene:
 
 
 def phantom_scene(
-    rt: Runtime,
-    of: str | EllipsoidPhantom,
-    geometry: ConeGeometry,
-    box: Grid,
-    size: int,
-    axis: str,
-    seed: int,
-    pixel_samples: int = 1,
+    rt: Runtime, of: str | EllipsoidPhantom, geometry: ConeGeometry, box: Grid, size: int, axis: str,
+    seed: int, pixel_samples: int = 1
 ) -> Scene:
     """Returns the scene of a phantom, or of one by its name, in the scanner's box, with ``size`` voxels per side.
 
@@ -136,14 +130,8 @@ def phantom_scene(
 
 
 def volume_scene(
-    rt: Runtime,
-    loaded: Volume,
-    name: str,
-    geometry: ConeGeometry,
-    box: Grid,
-    size: int | None,
-    axis: str,
-    pixel_samples: int = 1,
+    rt: Runtime, loaded: Volume, name: str, geometry: ConeGeometry, box: Grid, size: int | None, axis: str,
+    pixel_samples: int = 1
 ) -> Scene:
     """Returns the scene of a volume, called ``name``, at its own resolution with ``pixel_samples``² rays per pixel.
 
