@@ -43,18 +43,14 @@ def micro_view_cells(
     if strips < 1 or sub_intervals < 1:
         raise InputError("strips × sub-intervals", f"{strips} × {sub_intervals}", "two counts of at least 1")
     share = (np.arange(sub_intervals) + 0.5) / sub_intervals
-    time_s, first, last = [], [], []
-    for strip, (line_start, line_stop) in enumerate(shutter.strip_ranges(lines, strips)):
-        if line_stop > line_start:
-            opens_s = (strip + 0.5) / strips * shutter.readout_s
-            first_s, last_s = shutter.in_pulse(np.array([opens_s, opens_s + shutter.exposure_s]))
-            time_s.append(start_s + first_s + share * (last_s - first_s))
-            first.append(np.full(sub_intervals, line_start))
-            last.append(np.full(sub_intervals, line_stop))
-    times = np.concatenate(time_s)
-    weight = np.full(times.size, 1.0 / sub_intervals)
-    ranges = np.concatenate(first), np.concatenate(last)
-    return cell_table(trajectory, shutter, frame, times, *ranges, weight, lines)
+    ranges = np.array(shutter.strip_ranges(lines, strips))
+    strip = np.flatnonzero(ranges[:, 1] > ranges[:, 0])
+    opens_s = (strip + 0.5) / strips * shutter.readout_s
+    first_s, last_s = shutter.in_pulse(np.stack([opens_s, opens_s + shutter.exposure_s]))[..., None]
+    time_s = (start_s + first_s + share * (last_s - first_s)).ravel()
+    line_start, line_stop = np.repeat(ranges[strip], sub_intervals, axis=0).T
+    weight = np.full(time_s.size, 1.0 / sub_intervals)
+    return cell_table(trajectory, shutter, frame, time_s, line_start, line_stop, weight, lines)
 
 
 def per_line_cells(

@@ -59,7 +59,8 @@ def noise_rms(line_integrals: NDArray[np.float32], chosen: NDArray[np.bool_], va
     Each estimate is the median of |second differences along rows of those along columns|, which vanish at straight edges
     along either (Immerkær, Comput. Vis. Image Underst. 64 (1996) 300). Panels of fewer than three rows use rows alone.
     """
-    usable, differences, means = valid, line_integrals, line_integrals
+    usable, differences = valid, line_integrals
+    means = line_integrals
     cuts = (_along_rows, _along_columns) if line_integrals.shape[-2] >= 3 else (_along_rows,)
     for cut in cuts:
         left, middle, right = cut(differences)

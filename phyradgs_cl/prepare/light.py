@@ -6,8 +6,9 @@ variation, in logarithms (Van Nieuwenhove et al., Opt. Express 23 (2015) 27975).
 the step ``air``: pixels beside the object, as in nabu and in algotom's ROI normalisation.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 import scipy
@@ -37,46 +38,42 @@ def flat_correction(way: str) -> ToAttenuation:
     InputError for other quantities and for too few flats.
     """
     checks.one_of("flats", way, WAYS)
-    if way == "mean":
-        return counts_to_attenuation
-
-    def convert(data: Counts, image_key: np.ndarray, quantity: str) -> tuple[np.ndarray, np.ndarray]:
-        flats = np.flatnonzero(image_key == FLAT)
-        needed = 2 if way == "time" else 3
-        if quantity != "counts" or len(flats) < needed:
-            found = f"{quantity} with {len(flats)} flats"
-            remedy = "take the mean of the flats (flats=mean)"
-            raise InputError(f"flats={way}", found, f"counts with at least {needed} flats", remedy)
-        dark = mean_dark(data[image_key == DARK], data.shape[1:])
-        signal = np.maximum(data[flats].astype(np.float64) - dark, 0)
-        numbers = np.flatnonzero(image_key == PROJECTION)
-        light = _in_time(signal, flats, numbers) if way == "time" else _of_components(signal, data, dark, numbers)
-        result = np.empty((len(numbers), *data.shape[1:]), np.float32)
-        bad = np.empty(result.shape, bool)
-        for i, frame in enumerate(numbers):
-            result[i], bad[i] = minus_log(data[frame] - dark, light(i))
-        return result, bad
-
-    return convert
+    return counts_to_attenuation if way == "mean" else partial(_with_changing_flats, way)
 
 
-def _in_time(signal: np.ndarray, flats: np.ndarray, numbers: np.ndarray) -> Callable[[int], np.ndarray]:
-    """Returns the flat of each projection, between the means of groups of flats by their frame numbers."""
+def _with_changing_flats(
+    way: str, data: Counts, image_key: np.ndarray, quantity: str
+) -> tuple[np.ndarray, np.ndarray]:
+    """Converts counts with the flats of ``way``, "time" or "pca"."""
+    flats = np.flatnonzero(image_key == FLAT)
+    needed = 2 if way == "time" else 3
+    if quantity != "counts" or len(flats) < needed:
+        found, remedy = f"{quantity} with {len(flats)} flats", "take the mean of the flats (flats=mean)"
+        raise InputError(f"flats={way}", found, f"counts with at least {needed} flats", remedy)
+    dark = mean_dark(data[image_key == DARK], data.shape[1:])
+    signal = np.maximum(data[flats].astype(np.float64) - dark, 0)
+    numbers = np.flatnonzero(image_key == PROJECTION)
+    counts = (data[frame] - dark for frame in numbers)
+    lights = _in_time(signal, flats, numbers) if way == "time" else _of_components(signal, counts)
+    result = np.empty((len(numbers), *data.shape[1:]), np.float32)
+    bad = np.empty(result.shape, bool)
+    for i, (frame, light) in enumerate(zip(numbers, lights, strict=True)):
+        result[i], bad[i] = minus_log(data[frame] - dark, light)
+    return result, bad
+
+
+def _in_time(signal: np.ndarray, flats: np.ndarray, numbers: np.ndarray) -> Iterator[np.ndarray]:
+    """Yields the flat of each projection, between the means of groups of flats by their frame numbers."""
     groups = np.split(np.arange(len(flats)), np.flatnonzero(np.diff(flats) > 1) + 1)
     time = np.array([flats[group].mean() for group in groups])
     means = np.stack([signal[group].mean(axis=0) for group in groups])
-
-    def light(i: int) -> np.ndarray:
-        share = np.array([np.interp(numbers[i], time, unit) for unit in np.eye(len(time))])
-        return np.tensordot(share, means, axes=1)
-
-    return light
+    for number in numbers:
+        share = np.array([np.interp(number, time, unit) for unit in np.eye(len(time))])
+        yield np.tensordot(share, means, axes=1)
 
 
-def _of_components(
-    signal: np.ndarray, data: Counts, dark: np.ndarray, numbers: np.ndarray
-) -> Callable[[int], np.ndarray]:
-    """Returns the flat of each projection, from the principal components of the flats' logarithms."""
+def _of_components(signal: np.ndarray, counts: Iterable[np.ndarray]) -> Iterator[np.ndarray]:
+    """Yields the flat of each projection's counts (v, u), from the principal components of the flats' logarithms."""
     mean = signal.mean(axis=0)
     live = mean > 0
     ratio = np.divide(signal, mean, out=np.ones_like(signal), where=live)
@@ -85,13 +82,13 @@ def _of_components(
     size = size[: len(signal) - 1]  # the mean took one
     clear = size**2 > _CLEAR * np.median(size**2) if len(size) > 2 else size > 0
     used = components[: len(size)][clear][:_MOST_COMPONENTS].reshape(-1, *mean.shape)
-
-    def light(i: int) -> np.ndarray:
-        seen = np.divide(data[numbers[i]] - dark, mean, out=np.ones(mean.shape), where=live)
-        weights = _least_variation(np.log(np.maximum(seen, TRANSMISSION_FLOOR)), used)
-        return mean * np.exp(np.tensordot(weights, used, axes=1))
-
-    return light if len(used) else lambda i: mean
+    if not len(used):
+        yield from (mean for _ in counts)
+        return
+    for count in counts:
+        ratio = np.divide(count, mean, out=np.ones(mean.shape), where=live)
+        weights = _least_variation(np.log(np.maximum(ratio, TRANSMISSION_FLOOR)), used)
+        yield mean * np.exp(np.tensordot(weights, used, axes=1))
 
 
 def _least_variation(frame: np.ndarray, components: np.ndarray) -> np.ndarray:
