@@ -26,8 +26,7 @@ from phyradgs_cl.objective import (
 )
 from phyradgs_cl.objective.dct_prox import DctProx, dct_prox
 from phyradgs_cl.objective.nonlocal_step import LARGEST, NonlocalStep, likeness_of, nonlocal_step
-from phyradgs_cl.objective.tv_descent import TvDescent, tv_descent
-from phyradgs_cl.objective.tv_prox import TvProx, tv_prox
+from phyradgs_cl.objective.tv import TvDescent, TvProx, tv_descent, tv_prox
 from phyradgs_cl.operators import (
     DensityOperator,
     DeviceCells,
@@ -40,10 +39,14 @@ from phyradgs_cl.operators import (
     backproject_lines,
 )
 from phyradgs_cl.operators.splats.binning import TileLists
-from phyradgs_cl.operators.twins.backproject import backprojection, lines_backprojection
-from phyradgs_cl.operators.twins.rays import intensity_volume, ray_frame, ray_volume
-from phyradgs_cl.operators.twins.splat import splat_frame, splat_image, voxel_field
-from phyradgs_cl.operators.twins.splat_moving import moving_frame
+from phyradgs_cl.operators.twins.rays import (
+    backprojection,
+    intensity_volume,
+    lines_backprojection,
+    ray_frame,
+    ray_volume,
+)
+from phyradgs_cl.operators.twins.splat import moving_frame, splat_frame, splat_image, voxel_field
 from phyradgs_cl.optim import DeviceAdam, adam_step
 from phyradgs_cl.runtime import DeviceSpace, HostSpace, Runtime
 from phyradgs_cl.runtime.layout import pad_rows, pitch_of, unpad_rows

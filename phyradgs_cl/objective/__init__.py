@@ -1,12 +1,16 @@
 """The objective (paper, Eq. 4): image terms, total variation, density and shape terms; TV maps of voxel methods."""
 
 from phyradgs_cl.objective.dct_prox import DctProx
-from phyradgs_cl.objective.image_terms import ImageLoss, image_loss
 from phyradgs_cl.objective.nonlocal_step import NonlocalStep
-from phyradgs_cl.objective.parameter_terms import ParameterTerms, parameter_loss
-from phyradgs_cl.objective.total_variation import TotalVariation, total_variation
-from phyradgs_cl.objective.tv_descent import TvDescent
-from phyradgs_cl.objective.tv_prox import TvProx
+from phyradgs_cl.objective.terms import (
+    ImageLoss,
+    ParameterTerms,
+    TotalVariation,
+    image_loss,
+    parameter_loss,
+    total_variation,
+)
+from phyradgs_cl.objective.tv import TvDescent, TvProx
 
 __all__ = [
     "DctProx",

@@ -30,7 +30,7 @@ from phyradgs_cl.detector import intensity_average
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.operators import SplatProjector
-from phyradgs_cl.operators.rays.cell_layers import layered
+from phyradgs_cl.operators.rays.layout import layered
 from phyradgs_cl.operators.twins.splat import splat_frame, voxel_field
 from phyradgs_cl.runtime import Runtime
 

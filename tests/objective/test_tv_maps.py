@@ -5,8 +5,7 @@ import pytest
 from tolerances import TV_MAP, TWIN_GRADIENT
 
 from phyradgs_cl.objective import TvDescent, TvProx
-from phyradgs_cl.objective.tv_descent import tv_descent, tv_gradient
-from phyradgs_cl.objective.tv_prox import isotropic_tv, tv_prox
+from phyradgs_cl.objective.tv import isotropic_tv, tv_descent, tv_gradient, tv_prox
 
 SHAPES = [(5, 6, 7), (4, 3, 33), (1, 8, 17), (8, 1, 5), (6, 7, 1), (1, 1, 1)]
 SKEWED = (1.0, 0.5, 0.25)

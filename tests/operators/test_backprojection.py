@@ -10,7 +10,7 @@ from tolerances import BACKPROJECTION
 from phyradgs_cl.acquisition import ConeGeometry
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.operators import backproject, backproject_lines
-from phyradgs_cl.operators.twins.backproject import backprojection, lines_backprojection
+from phyradgs_cl.operators.twins.rays import backprojection, lines_backprojection
 from phyradgs_cl.runtime import Runtime
 
 backprojection, lines_backprojection = remembered(backprojection), remembered(lines_backprojection)

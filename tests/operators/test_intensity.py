@@ -12,7 +12,7 @@ from tolerances import ADJOINT, FLOAT32, RAYS, RAYS_BACK
 from phyradgs_cl.acquisition.time_cells import TimeCells
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.operators import IntensityOperator, RayOperator, RayProjector
-from phyradgs_cl.operators.rays.cell_layers import layers
+from phyradgs_cl.operators.rays.layout import layers
 from phyradgs_cl.operators.twins.rays import intensity_change, intensity_volume, ray_frame
 
 intensity_change, intensity_volume, ray_frame = map(remembered, (intensity_change, intensity_volume, ray_frame))

@@ -13,8 +13,7 @@ from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, ConstantSpeed, 
 from phyradgs_cl.acquisition.cells import static_cells
 from phyradgs_cl.acquisition.time_cells import TimeCells
 from phyradgs_cl.operators import DeviceCells, DeviceGaussians, SplatProjector
-from phyradgs_cl.operators.twins.splat import splat_image
-from phyradgs_cl.operators.twins.splat_moving import moving_frame
+from phyradgs_cl.operators.twins.splat import moving_frame, splat_image
 from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.runtime.layout import pad_rows
 

@@ -13,8 +13,7 @@ from phyradgs_cl.acquisition import Shutter
 from phyradgs_cl.acquisition.time_cells import TimeCells
 from phyradgs_cl.detector import average
 from phyradgs_cl.operators import DeviceCells, SplatProjector
-from phyradgs_cl.operators.twins.splat import splat_frame
-from phyradgs_cl.operators.twins.splat_moving import moving_frame
+from phyradgs_cl.operators.twins.splat import moving_frame, splat_frame
 from phyradgs_cl.runtime import Runtime
 
 SHAPE = (13, 18)

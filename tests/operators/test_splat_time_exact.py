@@ -26,7 +26,7 @@ from phyradgs_cl.acquisition.cells import (
 )
 from phyradgs_cl.acquisition.time_cells import TimeCells
 from phyradgs_cl.operators import DEFAULT_CUTOFF_SIGMA, DeviceCells, DeviceGaussians, SplatProjector
-from phyradgs_cl.operators.twins.splat_moving import moving_frame
+from phyradgs_cl.operators.twins.splat import moving_frame
 
 moving_frame = remembered(moving_frame)
 SHAPE = (13, 18)

@@ -15,8 +15,7 @@ from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.metrics import psnr
 from phyradgs_cl.objective import TvDescent, TvProx
-from phyradgs_cl.objective.tv_descent import tv_gradient
-from phyradgs_cl.objective.tv_prox import isotropic_tv, tv_prox
+from phyradgs_cl.objective.tv import isotropic_tv, tv_gradient, tv_prox
 from phyradgs_cl.reconstructors import METHODS, RunPlan, method_options, plan_run, reconstruct
 from phyradgs_cl.reconstructors.result import Progress
 from phyradgs_cl.reconstructors.voxels.asd_pocs import AsdPocs, AsdPocsOptions

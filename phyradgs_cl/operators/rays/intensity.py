@@ -14,7 +14,7 @@ import numpy as np
 from phyradgs_cl.acquisition.time_cells import TimeCells
 from phyradgs_cl.detector import intensity_average
 from phyradgs_cl.fields import Grid
-from phyradgs_cl.operators.rays.cell_layers import layered
+from phyradgs_cl.operators.rays.layout import layered
 from phyradgs_cl.operators.rays.memory import RayMemory
 from phyradgs_cl.operators.rays.operator import RayOperator
 from phyradgs_cl.runtime import Array, DeviceArray, DeviceSpace, HostSpace, Runtime, SameArray, Space

@@ -10,9 +10,8 @@ import numpy as np
 from phyradgs_cl.acquisition.time_cells import TimeCells
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
-from phyradgs_cl.operators.rays.cell_layers import averaged, layered
 from phyradgs_cl.operators.rays.launches import AVERAGES, launch_adjoint, launch_forward
-from phyradgs_cl.operators.rays.layout import RayCells, RayLayout
+from phyradgs_cl.operators.rays.layout import RayCells, RayLayout, averaged, layered
 from phyradgs_cl.operators.rays.memory import RayMemory
 from phyradgs_cl.operators.rays.slots import Slots, UprightPoses, merge_slots, split_slots
 from phyradgs_cl.operators.rays.upright import launch_upright, launch_upright_adjoint, upright_of

@@ -1,8 +1,11 @@
-"""Splats as whole operators in mm and 1/mm: of a scan's frames, and of a grid, each with its derivative's transpose.
+"""Splats as operators in mm and 1/mm: a cloud to the frames of a scan or to a grid, each with its transposed derivative.
 
-A cloud is entered once (``rows.enter``), then rendered and differentiated as often as needed. ``back`` renders nothing: it
-sees the Gaussians again from the poses (``prepare``), and leaves that out where ``forward`` has just done so. Everything
-lies on the device, without padding.
+``rows.enter`` converts a cloud once; it can then be rendered and differentiated any number of times. ``back`` renders
+nothing: it projects the Gaussians again (``prepare``), unless ``forward`` has just done so. All arrays lie on the device,
+without padding.
+
+``by_pose`` turns gradients by Gaussians into gradients by the pose: a gantry that turns equals an object that turns the
+other way; a panel that moves equals centres that move the other way on it, and rays of other lengths.
 """
 
 from collections.abc import Sequence
@@ -13,10 +16,9 @@ import numpy as np
 from phyradgs_cl.acquisition.time_cells import TimeCells
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
-from phyradgs_cl.fields.gaussians import ROWS
+from phyradgs_cl.fields.gaussians import MEAN, QUATERNION, ROWS
 from phyradgs_cl.operators.splats.layout import DeviceCells
 from phyradgs_cl.operators.splats.plain import PlainImages, PlainRows, SplatPoint
-from phyradgs_cl.operators.splats.poses import by_length, by_pose
 from phyradgs_cl.operators.splats.projector import DEFAULT_CUTOFF_SIGMA, DEFAULT_TIME_ERROR, SplatProjector
 from phyradgs_cl.operators.splats.voxelise import Voxeliser
 from phyradgs_cl.runtime import DeviceArray, Runtime
@@ -185,3 +187,24 @@ class _Ready:
 
     def holds(self, point: SplatPoint, where: object) -> bool:
         return self._point is point and self._where is where
+
+
+def by_pose(rows: np.ndarray, gradients: np.ndarray) -> tuple[float, float, float]:
+    """dL by the gantry's turn about z (rad), and half a line's length and half the lines' number times that by the panel's
+    shifts (pixels) along a line and across, from internal rows (11, G) and their gradients (13, G) of a frame."""
+    values, by = rows.astype(np.float64), gradients.astype(np.float64)
+    (x, y, _), (by_x, by_y, _) = values[MEAN], by[MEAN]
+    w, i, j, k = values[QUATERNION]
+    turned = np.stack([-k, -j, i, w]) / 2  # of a quaternion, by a turn about z before its own
+    by_object = np.sum(x * by_y - y * by_x) + np.sum(turned * by[QUATERNION])
+    return -float(by_object), -float(by[11].sum()), -float(by[12].sum())
+
+
+def by_length(pose: np.ndarray, weighed: np.ndarray) -> np.ndarray:
+    """dL by the panel's shifts (2,) along its columns and rows (pixels), as far as rays get longer by it, which line
+    integrals are in proportion to: from the ``pose`` (12,) and the frame times dL/dframe (rows, columns)."""
+    source, first, column, row = pose.reshape(4, 3)
+    v, u = (np.arange(n, dtype=np.float64) for n in weighed.shape)
+    ray = first - source + v[:, None, None] * row + u[:, None] * column
+    share = weighed / np.sum(ray**2, -1)
+    return np.array([np.sum(share * (ray @ step)) for step in (row, column)])

@@ -12,8 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from phyradgs_cl.operators.splats.binning import TileLists
-from phyradgs_cl.operators.splats.layers import Layers
-from phyradgs_cl.operators.splats.layout import DeviceCells, DeviceGaussians
+from phyradgs_cl.operators.splats.layout import DeviceCells, DeviceGaussians, Layers
 from phyradgs_cl.operators.splats.work import UNSEEN, Work, moving_work, still_work
 from phyradgs_cl.runtime import DeviceArray, Kernel, Runtime
 from phyradgs_cl.runtime.layout import GUARD, pad_rows, padded_zeros, pitch_of, unpad_rows

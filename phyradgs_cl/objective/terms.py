@@ -1,17 +1,22 @@
-"""Image terms of the objective (paper, Eq. 4): L1 + λ (1 − SSIM) of one frame, with their gradient.
+"""Terms of the objective (paper, Eq. 4): image loss, total variation of a small volume, terms of the parameters.
 
-A term for photon noise, λ_P mean(½ t (x − y)²) with transmissions t, is off by default.
+The image loss of one frame is L1 + λ (1 − SSIM). A term for photon noise, λ_P mean(½ t (x − y)²) with transmissions t
+(detector/transmission.py), is off by default. Eq. 4 prints "+ SSIM"; the paper minimises 1 − SSIM, and so does this module.
+SSIM is that of Wang et al. 2004 (IEEE Trans. Image Process. 13, 600): 11-tap Gaussian window of σ 1.5, zero padding,
+C1 = 0.01², C2 = 0.03².
 
-Eq. 4 prints "+ SSIM"; what is minimised, there and here, is 1 − SSIM. SSIM is Wang et al. 2004 (IEEE Trans.
-Image Process. 13, 600) with an 11-tap Gaussian window of σ 1.5, zero padding, C1 = 0.01², C2 = 0.03².
+Total variation is anisotropic, as in R2-Gaussian: the mean absolute difference between neighbouring voxels along z, y and
+x, added up.
 """
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 import scipy
 
 from phyradgs_cl.checks import ceil_div
+from phyradgs_cl.fields import gaussians as g
 from phyradgs_cl.runtime import DeviceArray, Runtime
 from phyradgs_cl.runtime.layout import GUARD
 
@@ -143,3 +148,89 @@ def _blur(image: np.ndarray) -> np.ndarray:
     for axis in (1, 0):
         image = scipy.ndimage.correlate1d(image, WINDOW, axis=axis, mode="constant")
     return image
+
+
+class TotalVariation:
+    """Value and gradient for volumes of a fixed ``shape`` (z, y, x) in the padded layout."""
+
+    def __init__(self, rt: Runtime, shape: tuple[int, int, int], pitch: int) -> None:
+        self.rt, self.shape, self.pitch = rt, shape, pitch
+        nz, ny, nx = shape
+        self._shape4 = np.array([nx, ny, nz, 0], np.int32)
+        self._weight4 = np.array([*_axis_weights(shape)[::-1], 0], np.float32)
+        self._kernel = rt.kernel("total_variation", "total_variation", IMAGE_GUARD=GUARD)
+        self._sums = rt.zeros(rt.shape_of_lines(pitch, ny, nz)[2])
+        self.gradient = rt.zeros(2 * GUARD + nz * ny * pitch)
+
+    def evaluate(self, volume: DeviceArray) -> DeviceArray:
+        """Returns dTV/dvolume, valid until the next call."""
+        nz, ny, _ = self.shape
+        items, tile, _ = self.rt.shape_of_lines(self.pitch, ny, nz)
+        self.rt.launch(
+            self._kernel,
+            items,
+            volume,
+            self._shape4,
+            np.int32(self.pitch),
+            self._weight4,
+            self.gradient,
+            self.rt.local(4 * math.prod(tile)),
+            self._sums,
+            group=tile,
+        )
+        return self.gradient
+
+    def value(self) -> float:
+        """Returns TV at the last ``evaluate``; waits for the device."""
+        return float(self.rt.download(self._sums).astype(np.float64).sum())
+
+
+def total_variation(volume: np.ndarray) -> tuple[float, np.ndarray]:
+    """Float64 twin: returns TV of a volume (z, y, x) and its gradient."""
+    volume = np.asarray(volume, np.float64)
+    gradient = np.zeros_like(volume)
+    value = 0.0
+    for axis, weight in enumerate(_axis_weights(volume.shape)):
+        difference = np.diff(volume, axis=axis)
+        value += weight * np.abs(difference).sum()
+        pad = [(0, 0)] * 3
+        pad[axis] = (1, 1)
+        gradient -= weight * np.diff(np.pad(np.sign(difference), pad), axis=axis)
+    return float(value), gradient
+
+
+def _axis_weights(shape: tuple[int, ...]) -> list[float]:
+    """Returns one over the number of differences along each axis (z, y, x); 0 along an axis of one voxel."""
+    total = int(np.prod(shape))
+    return [1.0 / (total // n * (n - 1)) if n > 1 else 0.0 for n in shape]
+
+
+@dataclass(frozen=True)
+class ParameterTerms:
+    """Weights of the mean density and of mean relu(longest/shortest − ratio)² + mean relu(floor − shortest)².
+
+    ``shape_floor`` is in half-sides of the volume.
+    """
+
+    density_weight: float = 0.001
+    shape_weight: float = 0.0
+    shape_ratio: float = 10.0
+    shape_floor: float = 0.004
+
+
+def parameter_loss(rows: np.ndarray, terms: ParameterTerms) -> tuple[float, np.ndarray]:
+    """Float64 twin of the terms in ``chain_activations``: the value and its gradient by rows (11, G)."""
+    count = rows.shape[1]
+    gradient = np.zeros_like(rows)
+    if count == 0:
+        return 0.0, gradient
+    scale = rows[g.SCALE]
+    longest, shortest = scale.max(0), scale.min(0)
+    excess = np.maximum(longest / shortest - terms.shape_ratio, 0)
+    lack = np.maximum(terms.shape_floor - shortest, 0)
+    value = terms.density_weight * rows[g.DENSITY].mean() + terms.shape_weight * (excess**2 + lack**2).mean()
+    gradient[g.DENSITY] = terms.density_weight / count
+    each = 2 * terms.shape_weight / count
+    gradient[g.SCALE] += np.where(scale == longest, each * excess / shortest, 0)
+    gradient[g.SCALE] -= np.where(scale == shortest, each * (excess * longest / shortest**2 + lack), 0)
+    return float(value), gradient
