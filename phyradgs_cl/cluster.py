@@ -11,6 +11,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import CancelledError
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
@@ -169,26 +170,38 @@ class Pool:
         if not running:
             time.sleep(_WAIT_S)
             return set()
-        try:
-            with self._client.as_current():
+        with self._needing_the_scheduler(), self._client.as_current():
+            try:
                 return set(distributed().wait(list(running), timeout=_WAIT_S, return_when="FIRST_COMPLETED").done)
-        except (TimeoutError, asyncio.TimeoutError):
-            return set()
-        except CancelledError as error:
-            raise self._scheduler_gone() from error
+            except (TimeoutError, asyncio.TimeoutError):
+                return set()
 
     def _result(self, future: Any) -> Any:
-        try:
-            return future.result(timeout=_CONNECT_S)
-        except distributed().KilledWorker as error:
+        with self._needing_the_scheduler():
+            if future.status != "error":
+                return future.result(timeout=_CONNECT_S)
+            error = future.exception(timeout=_CONNECT_S)
+        if isinstance(error, distributed().KilledWorker):
             return Lost(f"{error.allowed_failures + 1} workers died at it")
-        except ImportError as error:
+        if isinstance(error, ImportError):
             expected, remedy = "the phyradgs-cl of this process", "install the same version there"
             raise InputError("a worker", str(error), expected, remedy) from error
+        raise error
+
+    def _count_devices(self) -> int:
+        with self._needing_the_scheduler():
+            workers = self._client.scheduler_info(n_workers=-1)["workers"].values()
+            if self._client.status != "running":
+                raise OSError("no connection")
+        return sum(int(worker.get("resources", {}).get(RESOURCE, 0)) for worker in workers)
+
+    @contextmanager
+    def _needing_the_scheduler(self) -> Iterator[None]:
+        try:
+            yield
         except _NO_ANSWER as error:
-            if future.status == "error":
-                raise
-            raise self._scheduler_gone() from error
+            expected, remedy = "a running scheduler", "start it, and repeat the command to go on"
+            raise InputError(self._subject, "gone", expected, remedy) from error
 
     def _address(self) -> dict[str, Any]:
         """Returns the arguments of ``distributed.Client`` that say where the scheduler is."""
@@ -200,15 +213,6 @@ class Pool:
         if not Path(scheduler).is_file():  # Dask would wait for the file
             raise FileNotFoundError("no such file")
         return {"scheduler_file": scheduler}
-
-    def _count_devices(self) -> int:
-        try:
-            workers = self._client.scheduler_info(n_workers=-1)["workers"].values()
-        except _NO_ANSWER as error:
-            raise self._scheduler_gone() from error
-        if self._client.status != "running":
-            raise self._scheduler_gone()
-        return sum(int(worker.get("resources", {}).get(RESOURCE, 0)) for worker in workers)
 
     def _await_workers(self) -> None:
         """Starts local workers again: Dask gives up a worker that dies while it starts. Warns of others that are missing."""
@@ -226,9 +230,6 @@ class Pool:
     @property
     def _subject(self) -> str:
         return "local workers" if self.workers.is_local else f"--scheduler {self.workers.scheduler}"
-
-    def _scheduler_gone(self) -> InputError:
-        return InputError(self._subject, "gone", "a running scheduler", "start it, and repeat the command to go on")
 
     def _close(self) -> None:
         for part in (self._client, self._cluster):

@@ -21,6 +21,8 @@ if TYPE_CHECKING:
 
 State = Mapping[str, np.ndarray]
 """What an interrupted run needs to go on, as named arrays: each method knows its own names."""
+VolumeMap = Callable[[np.ndarray, Grid], tuple[np.ndarray, Grid]]
+"""A function from a volume and its grid to others."""
 HELD_OUT = "held_out"
 """Where a result's facts have its error on pixels that its method did not see."""
 COMPARED = "compared"
@@ -128,7 +130,7 @@ class Progress:
     def mapped(
         self,
         state: "Callable[[State], State] | None" = None,
-        volume: "Callable[[np.ndarray, Grid], tuple[np.ndarray, Grid]] | None" = None,
+        volume: "VolumeMap | None" = None,
         **changes: Any,
     ) -> "Progress":
         """Returns the report with other fields; ``state`` and ``volume`` change what the run gives, where it gives any."""
