@@ -7,48 +7,49 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperGroup
 
-from phyradgs_cl import signals
-from phyradgs_cl.commands.console import PanelledCommand, complain, give_up_stdout, say, usage_text
-from phyradgs_cl.commands.ranks import takes_part
+from phyradgs_cl import __version__, signals
+from phyradgs_cl.commands.console import GroupedCommand, complain, give_up_stdout, say, takes_part, usage_text
 from phyradgs_cl.errors import OutputError, PhyradgsError, naming_host_memory
+from phyradgs_cl.io.output import NO_SPACE
 
 _CLICK_ERROR: type[Exception] = next(c for c in typer.BadParameter.__mro__ if c.__name__ == "ClickException")
 HELP = {"help_option_names": ["-h", "--help"]}
-# by name: the module of commands/ that has NAME_command, and what it does
+# name: the module of commands/ that has NAME_command, and the command's help in the list
 COMMANDS = {
     "simulate": ("simulate", "Simulate a fly-scan of a phantom or a volume."),
     "import": ("import_scan", "Turn the scan of another program into a scan file."),
-    "check": ("check", "Look for what is wrong or suspicious in a scan."),
-    "calibrate": ("calibrate", "Find a scan's true geometry and timing from its frames."),
-    "prepare": ("prepare", "Undo what the panel and the beam did to a scan."),
+    "check": ("check", "Look for problems of a scan."),
+    "calibrate": ("calibrate", "Estimate a scan's true geometry and timing from its frames."),
+    "prepare": ("prepare", "Correct the effects of panel and beam in a scan."),
     "reconstruct": ("reconstruct", "Reconstruct a scan into a volume."),
-    "estimate": ("estimate", "Say what time and memory a reconstruction would take."),
+    "estimate": ("reconstruct", "Estimate the time and memory of a reconstruction."),
     "evaluate": ("evaluate", "Measure a volume against the truth."),
     "report": ("report", "Write one HTML page about a reconstruction."),
-    "view": ("view", "Look at a volume in napari."),
-    "export": ("export_volume", "Write a volume for 3D Slicer, ImageJ, napari and others."),
-    "bench": ("bench", "Compare methods on two built-in phantoms."),
+    "view": ("report", "Look at a volume in napari."),
+    "export": ("files", "Write a volume for 3D Slicer, ImageJ, napari and others."),
+    "bench": ("sweep", "Compare methods on two built-in phantoms."),
     "sweep": ("sweep", "Reconstruct many scans with many settings."),
     "watch": ("watch", "Reconstruct the scans of a folder as they arrive."),
-    "info": ("info", "Say what a scan or volume file holds."),
-    "devices": ("devices", "List OpenCL devices, and say which one is taken."),
+    "info": ("files", "Print the contents of a scan or volume file."),
+    "devices": ("devices", "List OpenCL devices, and the one that is used."),
 }
 
 
 class Interrupted(Exception):
-    """Ctrl-C on its way past Typer, with what is to be said about it."""
+    """Carries Ctrl-C past Typer, which would end it without a message."""
 
 
 class Loaded(Mapping[str, Any]):
-    """Typer's commands by name, each imported when it is asked for: what they need takes time."""
+    """Typer's commands by name, each imported when it is used: their imports take time."""
 
     def __getitem__(self, name: str) -> Any:
-        module_name, told = COMMANDS[name]
+        module_name, summary = COMMANDS[name]
         module = importlib.import_module(f"phyradgs_cl.commands.{module_name}")
         alone = typer.Typer(add_completion=False, rich_markup_mode=None, context_settings=HELP)
-        alone.command(name, cls=PanelledCommand, short_help=told, epilog=module.EXAMPLE)(getattr(module, f"{name}_command"))
+        function = getattr(module, f"{name}_command")
+        alone.command(name, cls=GroupedCommand, short_help=summary, epilog=module.EXAMPLES[name])(function)
         command: Any = typer.main.get_command(alone)
-        command.groups = getattr(module, "GROUPS", {})
+        command.groups = getattr(module, "GROUPS", {}).get(name, {})
         return command
 
     def __iter__(self) -> Iterator[str]:
@@ -59,7 +60,7 @@ class Loaded(Mapping[str, Any]):
 
 
 class Commands(TyperGroup):
-    """The commands. Typer would end Ctrl-C without a word; here it is handed on under another name."""
+    """The group of all commands."""
 
     def __init__(self, **attributes: Any) -> None:
         super().__init__(**attributes)
@@ -70,7 +71,7 @@ class Commands(TyperGroup):
 
     def format_commands(self, ctx: Any, formatter: Any) -> None:
         with formatter.section("Commands"):
-            formatter.write_dl([(name, told) for name, (_, told) in COMMANDS.items()])
+            formatter.write_dl([(name, summary) for name, (_, summary) in COMMANDS.items()])
 
     def invoke(self, ctx: Any) -> object:
         try:
@@ -87,9 +88,9 @@ app = typer.Typer(
     rich_markup_mode=None,
     context_settings=HELP,
     pretty_exceptions_enable=False,
-    help="Fly-scanning cone-beam CT: simulate scans, reconstruct them with motion known, measure the result. "
+    help="Fly-scanning cone-beam CT: simulate scans, reconstruct them with known motion, measure the result. "
     "'phyradgs COMMAND --help' explains a command.\n\n"
-    "Exit status: 0 done, 2 wrong input, 3 numbers that overflowed, 4 output not written, 5 no device or one that fails, "
+    "Exit status: 0 done, 2 wrong input, 3 numbers that overflowed, 4 output not written, 5 no device or a failing one, "
     "6 out of memory, 10 suspicious (check), 130 interrupted, 143 terminated.",
 )
 
@@ -99,8 +100,6 @@ def root(
     ctx: typer.Context, version: Annotated[bool, typer.Option("--version", help="Print the version.")] = False
 ) -> None:
     if version:
-        from phyradgs_cl import __version__
-
         say(f"phyradgs-cl {__version__}")
         raise typer.Exit
     if ctx.invoked_subcommand is None:
@@ -108,7 +107,7 @@ def root(
 
 
 def run(arguments: list[str], program: typer.Typer = app) -> int:
-    """Runs one command of ``program``; the exit status."""
+    """Runs one command of ``program``; returns the exit status."""
     if not takes_part(arguments):
         return 0
     with signals.answer_signals():
@@ -125,11 +124,9 @@ def _run(arguments: list[str], program: typer.Typer) -> int:
     except _CLICK_ERROR as error:
         return complain(usage_text(error, arguments))
     except OSError as error:  # one that no reader or writer has named
-        from phyradgs_cl.io.output import NO_SPACE
-
         text = f"{error.filename or 'operating system'}: {error.strerror or error}"
         return complain(text, OutputError.exit_code if error.errno in NO_SPACE else 2)
-    except SystemExit:  # Typer's answer to a reader of its help that has gone away, as in `| head`
+    except SystemExit:  # Typer's answer to a reader of its help that has left, as in `| head`
         give_up_stdout()
         return 0
     except Interrupted as interrupted:

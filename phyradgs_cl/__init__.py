@@ -1,17 +1,23 @@
 """phyradgs-cl: OpenCL tomography for fly-scanning cone-beam CT."""
 
-__all__ = ["__version__"]
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+
+__all__ = ["__version__", "resource"]
+
+try:
+    __version__ = version("phyradgs-cl")
+except PackageNotFoundError:  # run from a checkout that is not installed
+    __version__ = "0+unknown"
 
 
-def __getattr__(name: str) -> str:
-    """``__version__``, looked up when it is first asked for: the command line has to be ready for Ctrl-C by then."""
-    if name != "__version__":
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    from importlib.metadata import PackageNotFoundError, version
+def resource(name: str) -> Path:
+    """Returns the path of ``cl``, ``data`` or ``cli.py``: inside the package in a wheel, next to it in a checkout.
 
-    try:
-        found = version("phyradgs-cl")
-    except PackageNotFoundError:  # run from a checkout that is not installed
-        found = "0+unknown"
-    globals()[name] = found
-    return found
+    Raises FileNotFoundError where both are missing.
+    """
+    package = Path(__file__).resolve().parent
+    for folder in (package, package.parent):
+        if (folder / name).exists():
+            return folder / name
+    raise FileNotFoundError(f"{name} is missing from the installation at {package}: install phyradgs-cl again")

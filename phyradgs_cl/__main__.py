@@ -5,7 +5,7 @@ import signal
 import sys
 from types import ModuleType
 
-from phyradgs_cl.resources import resource
+from phyradgs_cl import resource
 
 
 def load_cli() -> ModuleType:

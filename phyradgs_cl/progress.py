@@ -1,4 +1,4 @@
-"""How far a run is, on stderr: one line rewritten on a terminal or in a notebook, a line every ten seconds elsewhere."""
+"""Progress of a command on stderr: a line that is rewritten on a terminal or in a notebook, else one every ten seconds."""
 
 import sys
 import time
@@ -8,12 +8,12 @@ import typer
 
 from phyradgs_cl.reconstructors import Progress
 
-_OVER = "\r\x1b[K"  # what stands in the line
+_OVER = "\r\x1b[K"  # clears the line
 _TERMINAL_EVERY_S, _ELSEWHERE_EVERY_S = 0.2, 10.0
 
 
 def has_reader() -> bool:
-    """Whether a line that is rewritten finds eyes: on a terminal, or in a notebook's cell."""
+    """True on a terminal or in a notebook's cell, where a line can be rewritten."""
     return sys.stderr is not None and (sys.stderr.isatty() or _in_notebook())
 
 
@@ -22,12 +22,12 @@ def _in_notebook() -> bool:
 
 
 class Ticker:
-    """Counts ``noun``s done; says rate and time left. As a context it ends the line that it rewrites."""
+    """Counts finished ``noun``s, with the rate and the time left. As a context it ends the line that it rewrites."""
 
     def __init__(self, noun: str) -> None:
         self.noun = noun
         self.is_terminal = has_reader()
-        self._width = 0  # of the line in a notebook, which knows no sequence that clears one
+        self._width = 0  # of the line in a notebook, which cannot clear one
         self.started = self.last = time.monotonic()
         self.first: int | None = None
         self.first_share = 0.0
@@ -37,35 +37,44 @@ class Ticker:
         return self
 
     def __exit__(self, *_: object) -> None:
+        self.end_line()
+
+    def end_line(self) -> None:
+        """Ends the line of a counter, and clears that of a stage."""
         if self.is_open:
-            _say("" if self.is_counting else self._over(""), ends_line=self.is_counting)
+            _write("" if self.is_counting else self._over(""), ends_line=self.is_counting)
+        self.is_open = False
 
     def stage(self, text: str) -> None:
-        """Says at once, on a terminal, what is under way before there is something to count."""
+        """Shows the present stage at once, on a terminal."""
         if self.is_terminal:
-            _say(self._over(text), ends_line=False)
+            _write(self._over(text), ends_line=False)
             self.is_open, self.is_counting = True, False
 
     def end(self, text: str) -> None:
-        """Says at once, on a terminal, what stays in the place of the line."""
+        """Replaces the line by a last one, on a terminal."""
         if self.is_terminal:
-            _say(self._over(text), ends_line=False)
+            _write(self._over(text), ends_line=False)
             self.is_open = self.is_counting = True
 
     def note(self, text: str) -> None:
         """Prints a line that stays, above the one that is rewritten."""
-        _say(self._over(text) if self.is_open else text)
+        _write(self._over(text) if self.is_open else text)
         self.is_open = self.is_counting = False
 
     def progress(self, p: Progress) -> None:
+        """Shows the progress of a method."""
         cloud = f"  {p.gaussians} Gaussians" if p.gaussians else ""
         self.show(p.iteration, p.iterations, f"  {p.quantity} {p.loss:.5f}{cloud}")
 
     def show(self, done: int, total: int, more: str = "", share: float | None = None) -> None:
-        """Says ``done`` of ``total`` and ``more``, unless it has just said something. ``share`` of the work that is done,
-        where some of what is counted takes longer."""
+        """Shows ``done`` of ``total`` and ``more``, unless the last line is too recent.
+
+        share: the fraction of the work that is done, where the counted things differ in length.
+        """
         now = time.monotonic()
-        share = done / total if share is None and total else share or 0.0
+        if share is None:
+            share = done / total if total else 0.0
         if self.first is None:
             self.first, self.started, self.first_share = done, now, share
         every_s = _TERMINAL_EVERY_S if self.is_terminal else _ELSEWHERE_EVERY_S
@@ -73,11 +82,11 @@ class Ticker:
             return
         self.last = now
         line = f"{self.noun} {done}/{total}{more}{self._rate(done, share, now)}"
-        _say(self._over(line) if self.is_terminal else line, ends_line=not self.is_terminal)
+        _write(self._over(line) if self.is_terminal else line, ends_line=not self.is_terminal)
         self.is_open = self.is_counting = self.is_terminal
 
     def _over(self, line: str) -> str:
-        """``line`` in the place of the one that stands."""
+        """Returns the text that replaces the present line."""
         if not _in_notebook():
             return f"{_OVER}{line}"
         before, self._width = self._width, len(line)
@@ -92,11 +101,11 @@ class Ticker:
 
 
 def clock(seconds: float) -> str:
-    """Seconds as minutes:seconds, or hours:minutes:seconds."""
+    """Returns minutes:seconds, or hours:minutes:seconds."""
     minutes, rest = divmod(int(seconds + 0.5), 60)
     return f"{minutes // 60}:{minutes % 60:02d}:{rest:02d}" if minutes >= 60 else f"{minutes}:{rest:02d}"
 
 
-def _say(text: str, ends_line: bool = True) -> None:
+def _write(text: str, ends_line: bool = True) -> None:
     with suppress(OSError):  # a full disk or a closed pipe behind stderr is no reason to stop
         typer.echo(text, err=True, nl=ends_line)

@@ -1,10 +1,9 @@
 """Reads options by name from a configuration file and the command line, and turns them into a plan of a run."""
 
 import json
-import math
 import re
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -165,29 +164,3 @@ def device_wish(value: object, subject: str = "--device") -> str | None:
         remedy = "see 'phyradgs devices', or leave it out for the best device"
         raise InputError(subject, checks.shown(value), "an index, cpu, gpu or part of a name", remedy)
     return value
-
-
-def pair_parser(
-    option: str, form: str, example: str, largest: float = math.inf
-) -> Callable[[str], tuple[float, float]]:
-    """Reads two finite numbers with a comma between, ``form``, in size at most ``largest``."""
-
-    def pair(text: str) -> tuple[float, float]:
-        try:
-            first, second = (float(part) for part in text.split(","))
-        except ValueError:
-            raise InputError(option, repr(text), f"two numbers {form}", f"write for example {example}") from None
-        if not all(math.isfinite(x) and abs(x) <= largest for x in (first, second)):
-            raise InputError(option, repr(text), f"two numbers {form}, of at most {largest:g}")
-        return first, second
-
-    return pair
-
-
-def numbers(text: str) -> float | list[float] | str:
-    """A number, or several with commas between; a text that is neither as it is, for the error of whoever wants numbers."""
-    try:
-        found = [float(part) for part in text.split(",")]
-    except ValueError:
-        return text
-    return found if len(found) > 1 else found[0]

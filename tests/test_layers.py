@@ -28,7 +28,7 @@ def floors_of_the_page() -> dict[str, int]:
 
 FLOOR_OF = {"__init__": 0, **floors_of_the_page()}
 # Within floor 0: text knows nothing, errors are text, checks and signals know errors.
-GROUND_FLOOR = {name: set() for name in ("__init__", "text", "resources")}
+GROUND_FLOOR = {name: set() for name in ("__init__", "text")}
 GROUND_FLOOR |= {"errors": {"text"}, "checks": {"errors", "text"}, "signals": {"errors"}}
 
 
@@ -87,7 +87,7 @@ def complaint(room: str, name: str) -> str:
         return "write the import with its full name"
     if first != NAME:
         return ""
-    other = "__init__" if not other or other.startswith("__version") else other
+    other = "__init__" if not other or other.startswith("__version") or name == f"{NAME}.resource" else other
     if other not in FLOOR_OF:
         return f"imports {other}, which is no room of docs/architecture.md"
     if forbidden(room, other):

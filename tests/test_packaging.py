@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from phyradgs_cl.resources import resource
+from phyradgs_cl import resource
 
 REPOSITORY = Path(__file__).resolve().parent.parent
 MOST_BYTES = 850_000  # kernels, code and small TOML files; nothing measured or rendered
@@ -69,7 +69,7 @@ def test_the_wheel_runs_outside_the_repository(wheel: Path, tmp_path: Path) -> N
         archive.extractall(site)
     environment = {**os.environ, "PYTHONPATH": str(site)}
     for arguments, expected in (
-        (["-c", "from phyradgs_cl.resources import resource; print(resource('cl'))"], str(site)),
+        (["-c", "from phyradgs_cl import resource; print(resource('cl'))"], str(site)),
         (["-c", "from phyradgs_cl.runtime.opencl import kernel_source as s; print(s('rays'))"], "__kernel"),
         (["-m", "phyradgs_cl", "--help"], "reconstruct"),
     ):

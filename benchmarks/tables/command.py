@@ -8,8 +8,7 @@ import typer
 
 from phyradgs_cl import signals
 from phyradgs_cl.cluster import LOCAL, Workers
-from phyradgs_cl.commands.console import complain, remark, say
-from phyradgs_cl.commands.files import file_parser
+from phyradgs_cl.commands.console import complain, file_parser, remark, say
 from phyradgs_cl.commands.options import Axis, Device, Scheduler, WorkerCount
 from phyradgs_cl.progress import Ticker
 from phyradgs_cl.runtime import Runtime

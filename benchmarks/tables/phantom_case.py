@@ -9,12 +9,12 @@ from dataclasses import replace
 
 import numpy as np
 
+from phyradgs_cl import resource
 from phyradgs_cl.acquisition import ConeGeometry, Protocol, Scan
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.io import load_scanner, with_detector_count
 from phyradgs_cl.metrics import compare
 from phyradgs_cl.phantoms import EllipsoidPhantom, sphere_phantom
-from phyradgs_cl.resources import resource
 from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.simulation import AnalyticSource, SimulationOptions, simulate
 from tables.case import FLY, HeldOutViews, Images, Measure, stop_and_shoot

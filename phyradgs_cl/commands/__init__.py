@@ -1,1 +1,1 @@
-"""The commands of the command line, one file each: options in, one call into the library, a result printed."""
+"""The commands: options in, one call into the library, a result printed. cli.py has the table of them."""

@@ -9,8 +9,7 @@ import numpy as np
 from phyradgs_cl.acquisition import Scan as Loaded
 from phyradgs_cl.calibrate import Calibration, ParameterEstimate, calibrate
 from phyradgs_cl.calibrate.parameters import DRIFT, NAMES, WOBBLE
-from phyradgs_cl.commands.console import AsJson, say
-from phyradgs_cl.commands.files import file_option, option
+from phyradgs_cl.commands.console import AsJson, file_option, option, say
 from phyradgs_cl.commands.options import Device, Scan
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.importers import load_beads
@@ -23,7 +22,13 @@ from phyradgs_cl.signals import finish_despite_interrupt
 from phyradgs_cl.text import to_digits_of
 from phyradgs_cl.workflow.files import load_scan, refuse_foreign_suffix, refuse_overwriting
 
-EXAMPLE = "Example: phyradgs calibrate scan.h5 -o calibrated.h5"
+EXAMPLES = {"calibrate": "Example: phyradgs calibrate scan.h5 -o calibrated.h5"}
+GROUPS = {
+    "calibrate": {
+        "Basics": ("output", "what", "other", "phantom", "picture"),
+        "Run": ("splines", "as_json", "device"),
+    }
+}
 _WHAT = f"Parameters to estimate, with commas: {', '.join(NAMES)}."
 _USUAL = "offset,roll,tilt; of a fly-scan also readout,exposure; with --phantom also distance"
 _OUTPUT = "The scan to write, with the corrections. An existing file is replaced."

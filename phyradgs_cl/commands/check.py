@@ -6,8 +6,7 @@ from pathlib import Path
 from typing import Annotated
 
 from phyradgs_cl.check import CANNOT_TELL, CENTRE, CheckResult, CountReader, check
-from phyradgs_cl.commands.console import AsJson, say
-from phyradgs_cl.commands.files import file_option, option
+from phyradgs_cl.commands.console import AsJson, file_option, option, say
 from phyradgs_cl.commands.options import Device, Scan
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.io import check_writable, only_run, read_scan
@@ -18,7 +17,7 @@ from phyradgs_cl.settings import device_wish
 from phyradgs_cl.signals import finish_despite_interrupt
 from phyradgs_cl.workflow.files import expecting, refuse_foreign_suffix, refuse_overwriting
 
-EXAMPLE = "Example: phyradgs check scan.h5"
+EXAMPLES = {"check": "Example: phyradgs check scan.h5"}
 SUSPICIOUS_STATUS = 10
 _NOT_ASKED = "not asked: which end of the panel is up (row 0; --row-0 of import), because no frame shows it"
 _FIX_OFFSET = "Write a copy of the scan (-o) whose panel is shifted along u to the centre of rotation that was found."

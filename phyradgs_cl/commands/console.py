@@ -1,25 +1,64 @@
-"""What a command says: results on stdout, one line about trouble on stderr, its status, and its help."""
+"""The console side of commands: options and arguments, output lines, exit statuses, help, and ranks under mpiexec."""
 
 import os
 import sys
-from collections.abc import Mapping, Sequence
+import traceback
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
+from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 from typer.core import TyperCommand
 
-from phyradgs_cl.errors import OutputError
+from phyradgs_cl import signals
+from phyradgs_cl.checks import shown
+from phyradgs_cl.errors import InputError, OutputError, PhyradgsError
+from phyradgs_cl.parallel import launched
 from phyradgs_cl.text import plain_text
 
 AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
+SHARED_BY_RANKS = ("reconstruct",)
+"""Commands whose work ranks share; rank 0 alone runs the others."""
+
+
+# --- options and arguments --------------------------------------------------------------------------------------------
+
+
+def option(help: str, default: bool | str = True, *flags: str, **more: Any) -> Any:
+    """An option with its help; ``default`` replaces the value in the help where it is text."""
+    return typer.Option(*flags, help=help, show_default=default, **more)
+
+
+def file_option(help: str, *flags: str, default: bool | str = True) -> Any:
+    """An option that takes a file name."""
+    return option(help, default, *flags, parser=file_parser(flags[-1]), metavar="FILE")
+
+
+def file_argument(name: str, help: str) -> Any:
+    """An argument that is a file name."""
+    return typer.Argument(parser=file_parser(name), metavar=name, help=help)
+
+
+def file_parser(subject: str) -> Callable[[str], Path]:
+    """Returns a parser that refuses an empty name, which would mean the current folder."""
+
+    def file(text: str) -> Path:
+        if not text.strip():
+            raise InputError(subject, repr(text), "a file name", "name a file")
+        return Path(text)
+
+    return file
+
+
+# --- lines and statuses -----------------------------------------------------------------------------------------------
 
 
 def say(text: str) -> None:
-    """One result on stdout."""
+    """Prints a result on stdout."""
     try:
         typer.echo(plain_text(text))
-    except BrokenPipeError:  # nobody reads on, as after `| head`: no error, and no reason to stop
+    except BrokenPipeError:  # the reader has left, as after `| head`: no error, and no reason to stop
         give_up_stdout()
     except OSError as error:
         give_up_stdout()
@@ -28,31 +67,42 @@ def say(text: str) -> None:
 
 
 def complain(text: str, status: int = 2) -> int:
-    """One line on stderr; the exit status to end with."""
-    with suppress(OSError):  # nobody is left to be told
-        typer.echo("phyradgs: " + plain_text(" ".join(text.split())), err=True)
+    """Prints an error on stderr in one line; returns the exit status."""
+    remark("phyradgs: " + " ".join(text.split()))
     return status
+
+
+def remark(text: str) -> None:
+    """Prints a line on stderr."""
+    with suppress(OSError):
+        typer.echo(plain_text(text), err=True)
+
+
+def give_up_stdout() -> None:
+    """Discards unwritten output, which the interpreter would try to write at its end, with a traceback."""
+    with suppress(OSError, ValueError):
+        nowhere = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(nowhere, sys.stdout.fileno())
+        os.close(nowhere)
 
 
 def scores(metrics: Mapping[str, float | None]) -> str:
     """Returns the metrics of a run, and its errors on held-out pixels, with a comma before each."""
-    from phyradgs_cl.metrics import HELD_OUT, printed
+    from phyradgs_cl.metrics import HELD_OUT, printed  # loads SciPy
 
     words = [*printed(metrics), *printed(metrics, HELD_OUT)]
     return "".join(f", {title} {value}" for title, value in words)
 
 
 def usage_text(error: Any, arguments: Sequence[str]) -> str:
-    """What Typer found wrong with the words of a command, with the value that it could not read."""
+    """Returns Typer's message about the words of a command, with the value that it could not read."""
     text = str(error.format_message()).replace("Value error, ", "")
-    from phyradgs_cl.checks import shown
-
     value = _value_of(getattr(error, "param", None), arguments)
     return text if value is None or repr(value) in text else f"{text.rstrip('.')}; found {shown(value)}"
 
 
 def _value_of(parameter: Any, arguments: Sequence[str]) -> str | None:
-    """The word that was given for an option; None for an argument, whose place only Typer knows."""
+    """Returns the word that follows an option; None for an argument, whose place only Typer knows."""
     for flag in (name for name in getattr(parameter, "opts", ()) if name.startswith("-")):
         for word, following in zip(arguments, [*arguments[1:], None], strict=True):
             if word == flag:
@@ -62,23 +112,14 @@ def _value_of(parameter: Any, arguments: Sequence[str]) -> str | None:
     return None
 
 
-def remark(text: str) -> None:
-    """One line on stderr that is neither a result nor trouble."""
-    with suppress(OSError):
-        typer.echo(plain_text(text), err=True)
+# --- help -------------------------------------------------------------------------------------------------------------
 
 
-def give_up_stdout() -> None:
-    """What could not be written would be tried again at the interpreter's end, with a traceback."""
-    with suppress(OSError, ValueError):
-        nowhere = os.open(os.devnull, os.O_WRONLY)
-        os.dup2(nowhere, sys.stdout.fileno())
-        os.close(nowhere)
+class GroupedCommand(TyperCommand):
+    """A command whose help lists its options under the headings of ``groups``, heading: names of parameters.
 
-
-class PanelledCommand(TyperCommand):
-    """A command whose help lists its options under the headings of ``groups``, heading: names of parameters. ``help`` comes
-    last under the first heading, what no group names under "Options"."""
+    ``help`` is the last option of the first group. Options without a group are listed under "Options".
+    """
 
     groups: Mapping[str, Sequence[str]] = {}
 
@@ -86,12 +127,37 @@ class PanelledCommand(TyperCommand):
         headings = {name: heading for heading, names in self.groups.items() for name in names}
         order = list(headings)
         headings["help"] = next(iter(self.groups), "Options")
-        panels: dict[str, list[tuple[str, str]]] = {name: [] for name in ("Arguments", "Options", *self.groups)}
+        sections: dict[str, list[tuple[str, str]]] = {name: [] for name in ("Arguments", "Options", *self.groups)}
         for parameter in sorted(self.get_params(ctx), key=lambda p: order.index(p.name) if p.name in order else len(order)):
             usual = "Arguments" if parameter.param_type_name == "argument" else "Options"
             if (record := parameter.get_help_record(ctx)) is not None:
-                panels[headings.get(parameter.name or "", usual)].append(record)
-        for name, records in panels.items():
+                sections[headings.get(parameter.name or "", usual)].append(record)
+        for name, records in sections.items():
             if records:
                 with formatter.section(name):
                     formatter.write_dl(records)
+
+
+# --- ranks under mpiexec ----------------------------------------------------------------------------------------------
+
+
+def takes_part(arguments: Sequence[str]) -> bool:
+    """True if this process has work in the command. Ranks other than 0 write nothing from here on."""
+    if launched().rank == 0:
+        return True
+    sys.stdout = sys.stderr = None  # as in a process of a window: writers check for None
+    return any(arguments[:1] == [name] for name in SHARED_BY_RANKS)
+
+
+def last_words(error: BaseException) -> int:
+    """Writes the error with which a rank ends all ranks to stderr; returns the exit status."""
+    rank = launched().rank
+    if isinstance(error, KeyboardInterrupt):
+        text, status = signals.farewell(), signals.exit_status()
+    elif isinstance(error, PhyradgsError):
+        text, status = str(error), error.exit_code
+    else:
+        text, status = "".join(traceback.format_exception(error)), 1
+    with suppress(OSError):
+        os.write(2, f"phyradgs: {f'rank {rank}: ' if rank else ''}{text}\n".encode())
+    return status

@@ -1,9 +1,8 @@
-"""devices: what OpenCL offers, what would be taken, and whether that computes what it should."""
+"""devices: the OpenCL devices, the one that is used, and whether its kernels compute correctly."""
 
 from typing import Annotated
 
-from phyradgs_cl.commands.console import say
-from phyradgs_cl.commands.files import option
+from phyradgs_cl.commands.console import option, say
 from phyradgs_cl.commands.options import Device
 from phyradgs_cl.device_check import check_device
 from phyradgs_cl.errors import DeviceError
@@ -11,15 +10,12 @@ from phyradgs_cl.runtime import choose_device, list_devices
 from phyradgs_cl.runtime.context import default_lanes
 from phyradgs_cl.settings import device_wish
 
-_CHECK = "Run every kernel on the device against float64, and say whether it can be trusted."
-EXAMPLE = "Example: phyradgs devices --device cpu"
+EXAMPLES = {"devices": "Example: phyradgs devices --device cpu"}
+_CHECK = "Run every kernel on the device and compare it with float64."
 
 
-def devices_command(
-    check: Annotated[bool, option(_CHECK)] = False,
-    device: Device = None,
-) -> int:
-    """List OpenCL devices and say which one is taken, and why; or, with --check, whether it computes what it should."""
+def devices_command(check: Annotated[bool, option(_CHECK)] = False, device: Device = None) -> int:
+    """List the OpenCL devices and the one that is used, with the reason; --check runs every kernel on it."""
     chosen, reason = choose_device(device_wish(device))
     if check:
         verdict = check_device(device_wish(device))
@@ -27,11 +23,11 @@ def devices_command(
         return DeviceError.exit_code if verdict.failures else 0
     for d in list_devices():
         mark = "*" if d.index == chosen.index else " "
-        never = "" if d.by_default else ", only when asked for"
+        by_name = "" if d.by_default else ", only by --device"
         say(
             f"{mark} {d.index}: {d.name} ({d.kind}; {d.platform}), {d.compute_units} units, vector width {default_lanes(d)} "
             f"of {d.vector_width}, {d.memory_bytes / 2**30:.1f} GiB, at most {d.largest_allocation_bytes / 2**30:.1f} GiB "
-            f"at once, float64 {'yes' if d.has_fp64 else 'no'}{never}"
+            f"in one buffer, float64 {'yes' if d.has_fp64 else 'no'}{by_name}"
         )
         say(f"     {d.version}" + (f", kernels built for {d.target}" if d.target else ""))
     say(f"takes {chosen.index}: {reason}")

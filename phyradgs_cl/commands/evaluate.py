@@ -5,18 +5,18 @@ import math
 from pathlib import Path
 from typing import Annotated, Any
 
-from phyradgs_cl.commands.console import AsJson, say
-from phyradgs_cl.commands.files import file_argument, file_option, option
+from phyradgs_cl.commands.console import AsJson, file_argument, file_option, option, say
+from phyradgs_cl.commands.options import numbers
 from phyradgs_cl.metrics import printed
-from phyradgs_cl.settings import numbers
 from phyradgs_cl.workflow import run_evaluation
 
-EXAMPLE = "Example: phyradgs evaluate volume.h5 --reference scan.h5 --json"
+EXAMPLES = {"evaluate": "Example: phyradgs evaluate volume.h5 --reference scan.h5 --json"}
 _REFERENCE = (
     "Scan with a known truth, or a volume. One with voxels an integer multiple finer is averaged onto VOLUME's grid; else "
     "VOLUME is resampled onto the reference's (linear)."
 )
 _VOXEL = "Sides of the voxels of a reference without a scale, mm; it is centred on the axis."
+_PICTURE = "PNG of slices: result, truth, difference."
 
 
 def evaluate_command(
@@ -24,18 +24,14 @@ def evaluate_command(
     reference: Annotated[Path, file_option(_REFERENCE, "--reference")],
     as_json: AsJson = False,
     reference_voxel_mm: Annotated[Any, option(_VOXEL, "the file's", parser=numbers, metavar="D|Z,Y,X")] = None,
-    picture: Annotated[
-        Path | None,
-        file_option("PNG of slices: result, truth, difference.", "--picture", default="v.evaluated.png of v.h5"),
-    ] = None,
+    picture: Annotated[Path | None, file_option(_PICTURE, "--picture", default="v.evaluated.png for v.h5")] = None,
 ) -> None:
     """Measure a volume against the truth: 3D PSNR and SSIM, and a picture of slices."""
-    stem = volume.stem if volume.suffix in ("", ".h5") else volume.name  # v.h5 and v.nii may stand beside each other
+    stem = volume.stem if volume.suffix in ("", ".h5") else volume.name  # v.h5 and v.nii may lie in one folder
     usual = volume.with_name(f"{stem}.evaluated.png")  # v.png may be the preview of the run
     facts = run_evaluation(volume, reference, picture or usual, reference_voxel_mm)
     if as_json:
-        numbers = {key: None if value == math.inf else value for key, value in facts.items()}  # JSON has no infinity
-        say(json.dumps(numbers))
+        say(json.dumps({key: None if value == math.inf else value for key, value in facts.items()}))  # JSON has no infinity
     else:
         words = [f"{title} {value}" for title, value in printed(facts)]
         say("   ".join([*words, str(facts["compared"]), f"picture {facts['picture']}"]))

@@ -1,35 +1,73 @@
-"""How commands declare their options and arguments."""
+"""info and export: what a file contains, and a volume for other programs."""
 
-from collections.abc import Callable
+import json
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
-import typer
+from phyradgs_cl.commands.console import AsJson, file_argument, file_option, option, say
+from phyradgs_cl.exporters import CLOUDS, EXPORTS, DicomLabels, export_volume, format_of
+from phyradgs_cl.signals import finish_despite_interrupt
+from phyradgs_cl.workflow.files import expecting, summary
 
-from phyradgs_cl.errors import InputError
-
-
-def option(help: str, default: bool | str = True, *flags: str, **more: Any) -> Any:
-    """An option of Typer: what its help says, and what that calls the default where it is not the value itself."""
-    return typer.Option(*flags, help=help, show_default=default, **more)
-
-
-def file_parser(subject: str) -> Callable[[str], Path]:
-    """Reads the file name given for ``subject``; an empty one would pass for the current folder."""
-
-    def file(text: str) -> Path:
-        if not text.strip():
-            raise InputError(subject, repr(text), "a file name", "name a file")
-        return Path(text)
-
-    return file
-
-
-def file_option(help: str, *flags: str, default: bool | str = True) -> Any:
-    """An option that takes a file name."""
-    return option(help, default, *flags, parser=file_parser(flags[-1]), metavar="FILE")
+EXAMPLES = {
+    "info": "Example: phyradgs info scan.h5",
+    "export": "Example: phyradgs export volume.h5 -o volume.nii --mu-water-per-mm 0.0195",
+}
+GROUPS = {
+    "export": {
+        "Basics": ("output", "to", "mu_water_per_mm"),
+        "DICOM": ("patient", "title", "description", "date"),
+    }
+}
+_LONGEST = 2000
+_OUTPUT = "File to write, or for dicom a new folder; nii.gz is compressed."
+_TO = "nii, mha, nrrd, tiff, npy, dicom (a folder): the voxels; ply, npz: the Gaussians."
+_WATER = "Attenuation of water in 1/mm; the values are then Hounsfield units."
 
 
-def file_argument(name: str, help: str) -> Any:
-    """An argument that is a file name."""
-    return typer.Argument(parser=file_parser(name), metavar=name, help=help)
+def info_command(
+    file: Annotated[Path, file_argument("FILE", "Scan or volume file, or a volume as mha, nii, nrrd, npy, tiff.")],
+    as_json: AsJson = False,
+) -> None:
+    """Print the contents of a scan or volume file."""
+    facts = summary(file)
+    if as_json:
+        say(json.dumps(facts, default=str))
+        return
+    for key, value in facts.items():
+        text = _short(value)
+        say(f"{key.replace('_', ' '):24s} {text[:_LONGEST]}{'…' if len(text) > _LONGEST else ''}")
+
+
+def export_command(
+    volume: Annotated[Path, file_argument("VOLUME", "Volume file.")],
+    output: Annotated[
+        Path | None, file_option(_OUTPUT, "--output", "-o", default="VOLUME with the format's suffix")
+    ] = None,
+    to: Annotated[Literal[EXPORTS] | None, option(_TO, "by the output's suffix", "--to")] = None,  # type: ignore[valid-type]
+    mu_water_per_mm: Annotated[float | None, option(_WATER, "none: values in 1/mm")] = None,
+    patient: Annotated[str | None, option("The patient's name and ID, as Family^Given.", metavar="NAME")] = None,
+    title: Annotated[str | None, option("The study's description.", metavar="TEXT")] = None,
+    description: Annotated[str | None, option("The series' description.", "the unit", metavar="TEXT")] = None,
+    date: Annotated[str | None, option("The study's date.", metavar="YYYY-MM-DD")] = None,
+) -> None:
+    """Export a volume, upright and to scale, for 3D Slicer, ITK-SNAP, ImageJ, napari and others."""
+    form, labels = to or format_of(output), DicomLabels(patient, title, description, date)
+    with finish_despite_interrupt(), expecting(volume, "volume"):
+        written = export_volume(volume, form, output, mu_water_per_mm, labels)
+    unit = "" if form in CLOUDS else ", HU" if mu_water_per_mm is not None else ", 1/mm"
+    say(f"{written}: {form}{unit}")
+
+
+def _short(value: Any, is_inside: bool = False) -> str:
+    """Returns a value as text, its numbers to six digits."""
+    match value:
+        case float():
+            return f"{value:.6g}"
+        case tuple():
+            return f"({', '.join(_short(part, True) for part in value)})"
+        case list():
+            return f"[{', '.join(_short(part, True) for part in value)}]"
+        case dict():
+            return f"{{{', '.join(f'{key!r}: {_short(part, True)}' for key, part in value.items())}}}"
+    return repr(value) if is_inside else str(value)

@@ -1,42 +1,69 @@
-"""Options that several commands share, and the words that they take."""
+"""Options that several commands share, those of a reconstruction among them, and parsers of their words."""
 
+import functools
+import inspect
+import math
+from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, get_args
 
+from phyradgs_cl.acquisition import MOTIONS
 from phyradgs_cl.acquisition.readout import SIDES
 from phyradgs_cl.acquisition.scan import DETECTOR_MODELS
 from phyradgs_cl.acquisition.shutter import AXES
-from phyradgs_cl.commands.files import file_argument, file_option, option
+from phyradgs_cl.commands.console import file_argument, file_option, option
+from phyradgs_cl.errors import InputError
 from phyradgs_cl.prepare import DEFAULT_STEPS, STEPS
+from phyradgs_cl.reconstructors import DEFAULT_METHOD, METHODS
 from phyradgs_cl.runtime import DEVICE_VARIABLE, MEMORY_VARIABLE
-from phyradgs_cl.settings import numbers, pair_parser
+from phyradgs_cl.settings import read_settings
 
 LARGEST_MM = 1e6
+DETECTOR_OFFSET = "Shift V,U of the panel's centre, mm: V > 0 up (rows), U > 0 right (columns), seen from the source."
 Axis = Literal[AXES]  # type: ignore[valid-type]
 First = Literal[SIDES]  # type: ignore[valid-type]
 DetectorModel = Literal[DETECTOR_MODELS]  # type: ignore[valid-type]
 
 Scan = Annotated[Path, file_argument("SCAN", "Scan file (HDF5, NXtomo).")]
-Output = Annotated[Path, file_option("File to write; an existing one is replaced whole.", "--output", "-o")]
-_DEVICE = (
-    f"Device: index, cpu, gpu or part of a name (phyradgs devices), for ranks a list with commas; also ${DEVICE_VARIABLE}."
-)
+Output = Annotated[Path, file_option("File to write; an existing one is replaced.", "--output", "-o")]
+_DEVICE = f"Index, cpu, gpu or part of a name (phyradgs devices); a list with commas for ranks. Also ${DEVICE_VARIABLE}."
 Device = Annotated[str | None, option(_DEVICE, "best by capability")]
-_MEMORY = (
-    f"Most device memory to take, such as 2GiB; volumes are then cut into bricks (docs: large.md). Also ${MEMORY_VARIABLE}."
-)
+_MEMORY = f"Limit of device memory, such as 2GiB; larger volumes are cut into bricks (large.md). Also ${MEMORY_VARIABLE}."
 Memory = Annotated[str | None, option(_MEMORY, "what the device has", metavar="SIZE")]
 
-_STEPS = f"What to undo in the frames first, of {', '.join(STEPS)} (docs: prepare.md)."
+_STEPS = f"Corrections of the frames, of {', '.join(STEPS)} (docs: prepare.md)."
 STEPS_OF_PREPARE = option(_STEPS, DEFAULT_STEPS, metavar="NAME,...")
 Steps = Annotated[str | None, option(_STEPS, "none", metavar="NAME,...")]
 
-DETECTOR_OFFSET = "Shift V,U of the panel's centre, mm: V > 0 up (rows), U > 0 right (columns), seen from the source."
-
-# where many runs are made
-_SCHEDULER = "Dask scheduler to send the runs to: its address or its JSON file; local starts workers here."
+_SCHEDULER = "Dask scheduler for the runs: its address or its JSON file; local starts workers here."
 Scheduler = Annotated[str | None, option(_SCHEDULER, metavar="ADDRESS|local")]
 WorkerCount = Annotated[int | None, option("Local workers, each a process.", "one per device", metavar="N")]
+
+
+def pair_parser(
+    flag: str, form: str, example: str, largest: float = math.inf
+) -> Callable[[str], tuple[float, float]]:
+    """Returns a parser of two finite numbers with a comma between, ``form``, of absolute value at most ``largest``."""
+
+    def pair(text: str) -> tuple[float, float]:
+        try:
+            first, second = (float(part) for part in text.split(","))
+        except ValueError:
+            raise InputError(flag, repr(text), f"two numbers {form}", f"write for example {example}") from None
+        if not all(math.isfinite(x) and abs(x) <= largest for x in (first, second)):
+            raise InputError(flag, repr(text), f"two numbers {form}, of at most {largest:g}")
+        return first, second
+
+    return pair
+
+
+def numbers(text: str) -> float | list[float] | str:
+    """Returns a number, or several with commas between; other text unchanged, for the error of the check that follows."""
+    try:
+        values = [float(part) for part in text.split(",")]
+    except ValueError:
+        return text
+    return values if len(values) > 1 else values[0]
 
 
 def lengths(flag: str, help: str, default: str) -> Any:
@@ -46,20 +73,107 @@ def lengths(flag: str, help: str, default: str) -> Any:
 
 
 def pitches(flag: str, help: str, default: str) -> Any:
-    """An option that takes the pitches of a pixel V,U, or one of a square pixel."""
-    pair = pair_parser(flag, "V,U in mm, or one of square pixels", "0.148 or 0.3,0.15", LARGEST_MM)
+    """An option that takes the pitches of a pixel V,U, or one for square pixels."""
+    pair = pair_parser(flag, "V,U in mm, or one for square pixels", "0.148 or 0.3,0.15", LARGEST_MM)
     return option(help, default, flag, parser=lambda text: pair(text if "," in text else f"{text},{text}"), metavar="D|V,U")
 
 
-def _numbers(help: str, metavar: str, *flags: str) -> Any:
-    return option(help, "the scan's", *flags, parser=numbers, metavar=metavar)
+def _asked(kind: Any, help: str, default: str, *flags: str, **more: Any) -> Any:
+    return Annotated[kind | None, option(help, default, *flags, **more)]
 
 
-# which voxels; Any, as the numbers are checked where they are used
-_SIZE = "Voxels of the volume, of a single number along its longest side; the box stays as it is."
-Size = Annotated[Any, _numbers(_SIZE, "N|Z,Y,X")]
-VoxelMm = Annotated[Any, _numbers("Sides of a voxel, mm; the box stays.", "D|Z,Y,X")]
-_ROI = "Box of the volume, mm about the axis, or its sides about the scan's middle; the voxels stay."
-RoiMm = Annotated[Any, _numbers(_ROI, "D|Z,Y,X|Z0,Z1,Y0,Y1,X0,X1", "--roi-mm", "--roi")]
-_MARGIN = "Voxels beyond the box, mm, that are reconstructed but not kept: for objects larger than box or panel."
-MarginMm = Annotated[Any, option(_MARGIN, "0", parser=numbers, metavar="D|Z,Y,X")]
+def _numbers(help: str, metavar: str, *flags: str, default: str = "the scan's") -> Any:
+    """An option of numbers, which are checked where they are used."""
+    return Annotated[Any, option(help, default, *flags, parser=numbers, metavar=metavar)]
+
+
+Size = _numbers("Voxels of the volume; a single number: along its longest side. The box stays.", "N|Z,Y,X")
+VoxelMm = _numbers("Sides of a voxel, mm; the box stays.", "D|Z,Y,X")
+_ROI = "Box of the volume about the axis, mm, or its sides about the scan's middle; the voxels stay."
+RoiMm = _numbers(_ROI, "D|Z,Y,X|Z0,Z1,Y0,Y1,X0,X1", "--roi-mm", "--roi")
+_MARGIN = "Width around the box, mm, that is reconstructed and discarded: for objects larger than box or panel."
+
+# heading of the help: names of parameters; a command shows those that it has
+RUN_GROUPS = {
+    "Basics": ("output", "method", "motion", "size", "iterations"),
+    "Volume": ("voxel_mm", "roi_mm", "margin_mm", "initial"),
+    "Motion": ("strips", "sub_intervals", "segments", "time_error", "detector_model"),
+    "Quality": (
+        *("prior", "preset", "assignments", "tune", "holdout", "steps", "median_filter", "ignore_lag", "gaussians", "seed"),
+    ),
+    "Run": ("device", "memory", "config", "preview", "resume", "checkpoint_every", "profile"),
+    "Under mpiexec (docs: cluster.md)": ("batch",),
+}
+_METHOD = "fdk: analytic; phyradgs, r2: splats; naf, sax-nerf: neural fields; the others: voxels (docs: methods.md)."
+_MOTION = (
+    "Poses of a frame: one (static, static-start), M×N micro-views, one per line (per-row), or, for splats, integrals "
+    "over time (exact)."
+)
+_PRIOR = "Prior, for fista: dct, tv, nonlocal, nonlocal+dct, piccs or none; MODULE:NAME: a denoiser of your own."
+_PRESET = "Constants: default, quick, paper, released (phyradgs); published (r2, naf, sax-nerf); a window (fdk)."
+_CONFIG = "TOML file of options, with underscores for dashes (docs: formats.md); the command line wins."
+_SET = "An option of the method by name: --set tv_weight=0.002 (docs: methods.md)."
+_TUNE = "Option that held-out pixels choose: tv_weight, prior_weight=0.4,0.8,1.6, iterations (docs: methods.md)."
+_HOLDOUT = "Pixels hidden from the method, to measure its error on them."
+RUN_OPTIONS: dict[str, Any] = {
+    "method": _asked(str, _METHOD, DEFAULT_METHOD, metavar=f"{'|'.join(METHODS)}|MODULE:NAME"),
+    "motion": _asked(Literal[MOTIONS], _MOTION, "per-row"),
+    "strips": _asked(int, "Strips M of a frame; means micro-views.", "8"),
+    "sub_intervals": _asked(int, "Sub-intervals N of an exposure; for phyradgs means micro-views.", "5"),
+    "segments": _asked(int, "Segments of a frame (exact); 0: by --time-error.", "0"),
+    "time_error": _asked(float, "Relative error of averaging over time (exact).", "0.005"),
+    "iterations": _asked(int, "Iterations: of voxels all frames each, of splats one frame (then 3000).", "35"),
+    "prior": _asked(str, _PRIOR, "dct", metavar="NAME|MODULE:NAME"),
+    "gaussians": _asked(int, "Gaussians at the start, for splats.", "from the grid"),
+    "size": Size,
+    "voxel_mm": VoxelMm,
+    "roi_mm": RoiMm,
+    "margin_mm": _numbers(_MARGIN, "D|Z,Y,X", default="0"),
+    "seed": _asked(int, "Seed of the random numbers.", "0"),
+    "preset": _asked(str, _PRESET, "the method's first"),
+    "batch": _asked(int, "Frames per step, for splats.", "as many as ranks", metavar="B"),
+    "config": Annotated[Path | None, file_option(_CONFIG, "--config")],
+    "assignments": Annotated[list[str] | None, option(_SET, True, "--set", metavar="NAME=VALUE")],
+    "detector_model": _asked(DetectorModel, "An exposure averages line integrals (log) or intensity.", "the scan's"),
+    "ignore_lag": Annotated[bool, option("Leave the scan's lag in the frames.", True, "--ignore-lag")],
+    "steps": Steps,
+    "holdout": _asked(float, _HOLDOUT, "0", metavar="PERCENT"),
+    "tune": _asked(str, _TUNE, "none", metavar="NAME[=VALUES]"),
+    "median_filter": _asked(int, "Median filter of the frames, of 3 or 5 pixels a side.", "0"),
+    "device": Device,
+    "memory": Memory,
+}
+
+
+def with_run_options(*without: str) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """Gives a command the options of a reconstruction, except ``without``, in place of its parameter ``settings``.
+
+    Typer reads a command's signature, so the signature lists the options; the command gets the ``Settings`` that they make.
+    """
+    names = [name for name in RUN_OPTIONS if name not in without]
+
+    def decorated(command: Callable[..., None]) -> Callable[..., None]:
+        @functools.wraps(command)
+        def called(**values: Any) -> None:
+            options = {name: values.pop(name) for name in names}
+            given = {name: None if value is False else value for name, value in options.items()}  # False: a flag not given
+            config, assignments = given.pop("config"), given.pop("assignments") or []
+            command(settings=read_settings(config, given, assignments), **values)
+
+        called.__signature__ = _signature(command, names)  # type: ignore[attr-defined]
+        return called
+
+    return decorated
+
+
+def _signature(command: Callable[..., None], names: list[str]) -> inspect.Signature:
+    """Returns the command's signature with the options of a reconstruction in place of ``settings``."""
+    parameters: list[inspect.Parameter] = []
+    for own in inspect.signature(command, eval_str=True).parameters.values():
+        if own.name == "settings":
+            for name in names:
+                default = False if get_args(kind := RUN_OPTIONS[name])[0] is bool else None
+                parameters.append(inspect.Parameter(name, own.KEYWORD_ONLY, default=default, annotation=kind))
+        else:
+            parameters.append(own.replace(kind=own.KEYWORD_ONLY))
+    return inspect.Signature(parameters)

@@ -1,4 +1,4 @@
-"""reconstruct: a scan file to a volume file."""
+"""reconstruct: a scan file to a volume file; estimate: the time and memory that this takes."""
 
 import time
 from pathlib import Path
@@ -7,31 +7,31 @@ from typing import Annotated
 import typer
 
 from phyradgs_cl import signals
-from phyradgs_cl.commands.console import complain, say, scores
-from phyradgs_cl.commands.files import file_option, option
-from phyradgs_cl.commands.options import Output, Scan
-from phyradgs_cl.commands.ranks import last_words
-from phyradgs_cl.commands.run_options import GROUPS as GROUPS
-from phyradgs_cl.commands.run_options import with_run_options
+from phyradgs_cl.commands.console import complain, file_option, last_words, option, say, scores
+from phyradgs_cl.commands.options import RUN_GROUPS, Output, Scan, with_run_options
+from phyradgs_cl.estimate import duration, estimate, seconds_around
 from phyradgs_cl.io import partial_path
 from phyradgs_cl.parallel import failing_together, launched_ranks
 from phyradgs_cl.progress import Ticker
-from phyradgs_cl.reconstructors import ProgressReport, Report
+from phyradgs_cl.reconstructors import ProgressReport, Reconstruction, Report
 from phyradgs_cl.reconstructors.result import COMPARED
 from phyradgs_cl.reconstructors.tune.trials import TUNED, tuned_words
 from phyradgs_cl.report import Preview, check_preview
 from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.settings import Settings
 from phyradgs_cl.signals import finish_despite_interrupt
-from phyradgs_cl.workflow import profile_report, run_reconstruction
+from phyradgs_cl.workflow import load_scan, profile_report, run_reconstruction
 
-EXAMPLE = (
-    "Example: phyradgs reconstruct scan.h5 -o volume.h5 --method phyradgs --iterations 2000\n\n"
-    "Ctrl-C keeps what there is, here as volume.partial.h5, and a checkpoint; --resume goes on from it."
-)
+EXAMPLES = {
+    "reconstruct": (
+        "Example: phyradgs reconstruct scan.h5 -o volume.h5 --method phyradgs --iterations 2000\n\n"
+        "Ctrl-C keeps the volume so far, here as volume.partial.h5, and a checkpoint; --resume continues from it."
+    ),
+    "estimate": "Example: phyradgs estimate scan.h5 --method fista-tv --motion per-row",
+}
+GROUPS = {"reconstruct": RUN_GROUPS, "estimate": RUN_GROUPS}
 _CHECKPOINT = "Seconds from checkpoint to checkpoint, for --resume; 0: on Ctrl-C only."
 _PREVIEW = "PNG of the three middle slices; during the run NAME.partial.png, every five seconds."
-_PROFILE = "Print the device's time by kernel."
 
 
 @with_run_options()
@@ -39,19 +39,15 @@ def reconstruct_command(
     scan: Scan,
     output: Output,
     settings: Settings,
-    initial: Annotated[
-        Path | None, file_option("Volume to start from.", "--initial")
-    ] = None,
-    resume: Annotated[bool, option("Go on from an interrupted run's checkpoint.", True, "--resume")] = False,
+    initial: Annotated[Path | None, file_option("Volume to start from.", "--initial")] = None,
+    resume: Annotated[bool, option("Continue an interrupted run from its checkpoint.", True, "--resume")] = False,
     checkpoint_every: Annotated[float, option(_CHECKPOINT, metavar="SECONDS")] = 600.0,
     preview: Annotated[Path | None, file_option(_PREVIEW, "--preview")] = None,
-    profile: Annotated[bool, option(_PROFILE, True, "--profile")] = False,
+    profile: Annotated[bool, option("Print the device's time by kernel.", True, "--profile")] = False,
 ) -> None:
     """Reconstruct a scan into a volume; print PSNR and SSIM if the scan carries the truth. Defaults are those of fista."""
-    plan = settings.plan(initial)
-    ranks = launched_ranks()
-    runtimes: list[Runtime] = []
-    ticker = Ticker("iteration")
+    plan, ranks = settings.plan(initial), launched_ranks()
+    ticker, runtimes = Ticker("iteration"), list[Runtime]()
 
     def runtime() -> Runtime:
         runtimes.append(settings.runtime(profile=profile, ranks=ranks))
@@ -82,7 +78,7 @@ def reconstruct_command(
             with finish_despite_interrupt():
                 picture.finish(result.volume, result.grid)
     written = output if result.state is None else partial_path(output)
-    used_s = time.process_time()  # of the command so far, its start included: other programs do not change it
+    used_s = time.process_time()  # of the command so far, with its start; other programs do not change it
     how = f"{plan.method_name}{result.early_stop}, {result.facts['seconds']:.1f} s ({used_s:.1f} s of processor time)"
     compared = f" ({result.facts[COMPARED]})" if COMPARED in result.facts else ""
     say(f"{written}: {how}{scores(metrics)}{compared}")
@@ -92,5 +88,21 @@ def reconstruct_command(
         say(profile_report(runtimes[-1], result))
     if result.state is not None:
         at, asked = result.facts["interrupted_at"], result.facts["options"]["iterations"]
-        complain(f"interrupted at iteration {at} of {asked}: repeat the command with --resume to go on")
+        complain(f"interrupted at iteration {at} of {asked}: repeat the command with --resume to continue")
         raise typer.Exit(signals.exit_status())
+
+
+@with_run_options("seed", "tune")
+def estimate_command(scan: Scan, settings: Settings) -> None:
+    """Estimate the time and memory of a reconstruction, from a few iterations of it."""
+    plan = settings.plan()
+    loaded = load_scan(scan, plan.preprocessing.flats)
+    rt = settings.runtime()
+    before_s = time.process_time()  # a run will start, and read the scan, as this command did
+
+    def around(result: Reconstruction) -> float:
+        return before_s + seconds_around(scan, loaded, result)
+
+    values = estimate(loaded, plan, rt, around)
+    say(f"{plan.method_name} on {rt.device.name}, from a trial of {duration(values.trial_seconds)}")
+    say(values.text())

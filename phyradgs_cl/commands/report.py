@@ -1,34 +1,37 @@
-"""report: a reconstruction as an HTML page."""
+"""report: a reconstruction as an HTML page; view: a volume in a window."""
 
 from pathlib import Path
 from typing import Annotated
 
-from phyradgs_cl.commands.console import say
-from phyradgs_cl.commands.files import file_argument, file_option, option
+from phyradgs_cl.commands.console import file_argument, file_option, option, say
 from phyradgs_cl.commands.options import Device, Output
-from phyradgs_cl.report import write_report
+from phyradgs_cl.report import view_volume, write_report
 from phyradgs_cl.report.page import DEFAULT_VIEWS
 from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.settings import device_wish
 
-EXAMPLE = "Example: phyradgs report volume.h5 -o report.html"
+EXAMPLES = {
+    "report": "Example: phyradgs report volume.h5 -o report.html",
+    "view": "Example: phyradgs view volume.h5",
+}
 MOST_VIEWS = 24
+_SCAN_DEFAULT = "the one that the volume file names, if unchanged"
+_VIEWS = "Frames to compute from the volume and compare with the measurement."
 
 
 def report_command(
     run: Annotated[Path, file_argument("RUN", "Volume file of a reconstruction.")],
     output: Output,
-    scan: Annotated[
-        Path | None,
-        file_option("Its scan.", "--scan", default="the one that the volume file names, if unchanged"),
-    ] = None,
-    views: Annotated[
-        int,
-        option("Frames to compute from the volume and compare with the measurement.", min=0, max=MOST_VIEWS),
-    ] = DEFAULT_VIEWS,
+    scan: Annotated[Path | None, file_option("Its scan.", "--scan", default=_SCAN_DEFAULT)] = None,
+    views: Annotated[int, option(_VIEWS, min=0, max=MOST_VIEWS)] = DEFAULT_VIEWS,
     device: Device = None,
 ) -> None:
     """Write one HTML page about a reconstruction: slices, convergence, projections, scan, provenance."""
     wish = device_wish(device)
     write_report(run, output, lambda: Runtime(wish), scan=scan, views=views)
     say(f"{output}: {output.stat().st_size / 1e6:.3g} MB")
+
+
+def view_command(volume: Annotated[Path, file_argument("VOLUME", "Volume file.")]) -> None:
+    """Open a volume in napari, if that is installed (pip install 'napari[all]')."""
+    view_volume(volume)

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from functools import cache
 from typing import TYPE_CHECKING, Any
 
-from phyradgs_cl.resources import resource
+from phyradgs_cl import resource
 from phyradgs_cl.runtime import pocl
 
 __all__ = ["Kernel", "cl", "kernel_source"]

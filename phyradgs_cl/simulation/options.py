@@ -3,14 +3,13 @@
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
-from phyradgs_cl import checks
+from phyradgs_cl import checks, resource
 from phyradgs_cl.acquisition import Protocol, make_protocol
 from phyradgs_cl.acquisition.readout import readout_order, readout_ratio_of
 from phyradgs_cl.acquisition.scan import LARGEST_LAG
 from phyradgs_cl.detector.spectrum import HIGHEST_KVP, LOWEST_KVP
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.io import Scanner, load_scanner, with_detector_count
-from phyradgs_cl.resources import resource
 
 _NOISES = ("none", "tigre", "beer")
 # Far beyond any scanner, and far below an overflow of float32 or a sampler.

@@ -132,7 +132,7 @@ def test_the_words_of_reconstruct(cli, refused, scan, monkeypatch) -> None:
         plans.append(plan)
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("phyradgs_cl.commands.estimate.estimate", fake)
+    monkeypatch.setattr("phyradgs_cl.commands.reconstruct.estimate", fake)
     before = ["--detector-model", "intensity", "--median-filter", "3", "--ignore-lag"]
     for words in (["--strips", "2", "--sub-intervals", "1"], ["--segments", "2", "--time-error", "0.01"]):
         cli.run(["estimate", str(scan), "--method", "phyradgs", *words, *before])

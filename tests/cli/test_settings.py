@@ -9,7 +9,7 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from phyradgs_cl.commands.run_options import with_run_options
+from phyradgs_cl.commands.options import with_run_options
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.reconstructors import RunPlan, method_options
 from phyradgs_cl.settings import Settings, read_settings

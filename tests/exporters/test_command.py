@@ -10,7 +10,7 @@ import typer
 from typer.testing import CliRunner
 
 from phyradgs_cl.api import save_scan, simulate
-from phyradgs_cl.commands.export_volume import EXAMPLE, export_command
+from phyradgs_cl.commands.files import EXAMPLES, export_command
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.exporters import EXPORTS
 
@@ -18,7 +18,7 @@ from phyradgs_cl.exporters import EXPORTS
 @pytest.fixture
 def run():
     app = typer.Typer(rich_markup_mode=None)
-    app.command("export", epilog=EXAMPLE)(export_command)
+    app.command("export", epilog=EXAMPLES["export"])(export_command)
     return lambda *arguments: CliRunner().invoke(app, [str(a) for a in arguments])
 
 

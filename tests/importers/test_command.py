@@ -13,7 +13,7 @@ import writers_of_importers as w
 from typer.testing import CliRunner
 
 from phyradgs_cl.acquisition import Shutter
-from phyradgs_cl.commands.import_scan import EXAMPLE, import_command
+from phyradgs_cl.commands.import_scan import EXAMPLES, import_command
 from phyradgs_cl.detector import counts_to_attenuation
 from phyradgs_cl.errors import InputError, OutputError
 from phyradgs_cl.importers import FORMATS, import_scan
@@ -27,7 +27,7 @@ DOCS = Path(__file__).resolve().parents[2] / "docs" / "import.md"
 def run(tmp_path):
     """(input, words...) → what the command did; its scan.h5 is in tmp_path where none other is named."""
     app = typer.Typer(rich_markup_mode=None)
-    app.command("import", epilog=EXAMPLE)(import_command)
+    app.command("import", epilog=EXAMPLES["import"])(import_command)
 
     def command(path: Path, *words: object, out: Path = tmp_path / "scan.h5", ok: bool = True):
         done = CliRunner().invoke(app, [str(a) for a in (path, "-o", out, *words)])

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from phyradgs_cl.commands import ranks as commands
+from phyradgs_cl.commands import console as commands
 from phyradgs_cl.errors import InputError, OutputError
 from phyradgs_cl.parallel import Launch, launched, span
 from phyradgs_cl.runtime import device as devices

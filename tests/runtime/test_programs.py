@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from phyradgs_cl import resource
 from phyradgs_cl.errors import DeviceError
-from phyradgs_cl.resources import resource
 from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.runtime import opencl as sources
 from phyradgs_cl.runtime.context import default_lanes
