@@ -8,7 +8,7 @@
 
 #define AVERAGE_LOG 0       /* sum of w p */
 #define AVERAGE_INTENSITY 1 /* -log of the sum of w exp(-p) */
-#define AVERAGE_GAP 2       /* the first less the second, from differences between cells: no cancellation */
+#define AVERAGE_CORRECTION 2       /* the first less the second, from differences between cells: no cancellation */
 
 __kernel void rays_forward(
     __global const float *volume,     /* guard, then (z, y, pitch) with a border of BORDER in y and z */
@@ -75,7 +75,7 @@ __kernel void rays_forward(
         intensity_add(&sum, (vf)(weight), p);
     }
     if (AVERAGE != AVERAGE_LOG && any)
-        total = AVERAGE == AVERAGE_GAP ? sum.mean + intensity_brighter(sum) : sum.from - intensity_brighter(sum);
+        total = AVERAGE == AVERAGE_CORRECTION ? sum.mean + intensity_brighter(sum) : sum.from - intensity_brighter(sum);
     __global float *pixels = image + IMAGE_GUARD + ((size_t)n * lines + v) * image_pitch + u;
     if (add)
         total += V_LOAD(pixels);

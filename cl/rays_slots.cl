@@ -6,7 +6,7 @@
 
 #define AVERAGE_LOG 0       /* sum of w p */
 #define AVERAGE_INTENSITY 1 /* -log of the sum of w exp(-p) */
-#define AVERAGE_GAP 2       /* the first less the second, from differences between poses: no cancellation */
+#define AVERAGE_CORRECTION 2       /* the first less the second, from differences between poses: no cancellation */
 
 #define SHARE 4        /* ints of a share: slot (or frame), first line, line after the last, where its weights begin */
 
@@ -66,7 +66,7 @@ __kernel void merge_slots(
             intensity_add(&sum, weight, V_PICK(sum.from, p, is_lit));
         }
         if (AVERAGE != AVERAGE_LOG)
-            total = AVERAGE == AVERAGE_GAP ? sum.mean + intensity_brighter(sum) : sum.from - intensity_brighter(sum);
+            total = AVERAGE == AVERAGE_CORRECTION ? sum.mean + intensity_brighter(sum) : sum.from - intensity_brighter(sum);
         for (int k = 0; k < min(LANES, height - v); ++k)
             pixels[(v + k) * to.z] = LANE(float, total, k);
     }

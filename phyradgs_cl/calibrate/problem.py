@@ -142,7 +142,7 @@ class CoarseProblem(CoarseFrames):
         difference is added as ``volume`` has it."""
         if self.scans[0].detector_model != "intensity":
             return self.measured
-        return self.measured + self.masked(operator.intensity_gap(volume))
+        return self.measured + self.masked(operator.intensity_correction(volume))
 
     def reconstruct(self, operator: RayOperator, start: np.ndarray | None, iterations: int) -> np.ndarray:
         """Returns a nonnegative volume with little total variation, iterated from ``start``."""

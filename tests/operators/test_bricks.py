@@ -74,10 +74,10 @@ def test_rays(any_rt, motion, axis, nbytes) -> None:
     assert np.abs(few - expected["log"][[3, 1]]).max() <= BRICKS * expected["log"].max()
     if motion == "per line":  # layers bring tables of their own
         with room_for(any_rt, nbytes + 120_000):
-            for name in ("intensity", "gap"):
+            for name in ("intensity", "correction"):
                 found = RayOperator(any_rt, TALL, SHAPE, cells).project(x, name)
                 assert np.abs(found - expected[name]).max() <= 2 * BRICKS * expected["log"].max()
-        assert expected["gap"].max() > 1e-4
+        assert expected["correction"].max() > 1e-4
 
 
 def test_a_projector_of_frames(any_rt, monkeypatch) -> None:

@@ -104,7 +104,7 @@ def test_the_gap_is_what_the_models_differ_by(any_rt, motion, axis) -> None:
         log, intensity = (
             np.stack([ray_frame(x, GRID, t, SHAPE, model) for t in cells]) for model in ("log", "intensity")
         )
-        expected, found = log - intensity, operator.intensity_gap(x)
+        expected, found = log - intensity, operator.intensity_correction(x)
         assert found.min() >= -1e-6 * peak
         np.testing.assert_allclose(found, expected, rtol=0, atol=1e-3 * expected.max() + 2e-7)
 
@@ -115,7 +115,7 @@ def test_very_opaque_volumes_stay_finite(rt) -> None:
     expected = np.stack([ray_frame(x / 100, GRID, t, SHAPE) for t in cells]) * 100
     assert expected.max() > 300
     assert np.isfinite(operator.expected(x)).all() and np.isfinite(operator.adjoint(expected)).all()
-    assert np.isfinite(RayOperator(rt, GRID, SHAPE, cells).intensity_gap(x)).all()
+    assert np.isfinite(RayOperator(rt, GRID, SHAPE, cells).intensity_correction(x)).all()
 
 
 @pytest.mark.parametrize("motion", MOTIONS)
@@ -142,7 +142,7 @@ def test_frames_with_fewer_cells_and_lines_without_any(rt) -> None:
     assert_near(found[0], expected, RAYS)
     assert not found[1, :3].any() and found[1, 3:].any()
     assert not operator.forward(x)[1, :3].any()
-    assert not RayOperator(rt, GRID, SHAPE, [first, fewer]).intensity_gap(x)[1, :3].any()
+    assert not RayOperator(rt, GRID, SHAPE, [first, fewer]).intensity_correction(x)[1, :3].any()
 
 
 @AXES

@@ -116,8 +116,8 @@ def test_intensities(cpu_rt, motion) -> None:
     found = operator.project(x, "intensity")
     expected = np.stack([ray_frame(x, GRID, table, TALL_PANEL, "intensity") for table in cells])
     assert np.abs(found - expected).max() <= RAYS * expected.max()
-    np.testing.assert_allclose(operator.intensity_gap(x), operator.forward(x) - found, atol=1e-5)
-    assert operator.intensity_gap(x).max() > 1e-3
+    np.testing.assert_allclose(operator.intensity_correction(x), operator.forward(x) - found, atol=1e-5)
+    assert operator.intensity_correction(x).max() > 1e-3
 
 
 def leaning(cells: list[TimeCells], roll_deg: float, tilt_deg: float) -> list[TimeCells]:

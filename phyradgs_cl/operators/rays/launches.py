@@ -16,7 +16,7 @@ _BLOCK = 4  # voxels per side of what a work-group takes where work-items are vo
 _SAMPLES_PER_VOXEL = 4  # of a view that the adjoint takes, about
 _LONG_FROM = 2**31  # floats: where 32-bit indices end
 _MOST_SAMPLES = 2**29  # of a GPU's launch: a tenth of a second on a slow one, whose screen's driver ends long ones
-AVERAGES = ("log", "intensity", "gap")  # gap: log less intensity; in the order of cl/rays.cl
+AVERAGES = ("log", "intensity", "correction")  # correction: log minus intensity; in the order of cl/rays.cl
 
 
 def launch_forward(

@@ -204,13 +204,13 @@ def layered(tables: Sequence[TimeCells]) -> tuple[list[list[TimeCells]], list[np
 def averaged(integrals: Sequence[np.ndarray], weights: Sequence[np.ndarray], average: str) -> np.ndarray:
     """Frames (F, rows, columns) float32 from line integrals p of each layer (the same) and weights as of ``layered``.
 
-    ``intensity``: −ln Σ w exp(−p); ``gap``: what Σ w p is more than that. Lines without cells are 0. The twin of what
+    ``intensity``: −ln Σ w exp(−p); ``correction``: Σ w p minus that. Lines without cells are 0. The twin of what
     cl/rays.cl does where a line's cells are at hand together; weights of a line sum to 1.
     """
     sums = np.sum(weights, axis=0, dtype=np.float64)  # 1 but for float32's rounding, which a small gap would show
     exact = [np.divide(w, sums, out=np.zeros_like(sums), where=sums > 0) for w in weights]
     frames, _ = intensity_average(integrals, exact)
-    if average == "gap":
+    if average == "correction":
         frames = np.add.reduce([w * (p - frames) for p, w in zip(integrals, exact, strict=True)])
     return frames.astype(np.float32)
 

@@ -91,13 +91,13 @@ class RayOperator:
         """A x; volume (nz, ny, nx) 1/mm, result (F, rows, columns) float32."""
         return self.project(volume, "log", out)
 
-    def intensity_gap(self, volume: SameArray, out: SameArray | None = None) -> SameArray:
+    def intensity_correction(self, volume: SameArray, out: SameArray | None = None) -> SameArray:
         """A x − I(x) with I(x) = −ln Σ w exp(−p) over a line's cells, where A x is Σ w p; shapes as in ``forward``.
 
         Never negative but for rounding; computed from differences between cells, so that small gaps are right too. Added
         to what an intensity detector measured of about x, it is what a log detector would have measured.
         """
-        return self.project(volume, "gap", out)
+        return self.project(volume, "correction", out)
 
     def project(self, volume: SameArray, average: str, out: SameArray | None = None) -> SameArray:
         """Frames with a line's cells averaged by ``average``, one of rays.AVERAGES; shapes as in ``forward``."""

@@ -52,7 +52,7 @@ def frame_pairs(
     operator = RayOperator(rt, grid, scan.geometry.detector_shape, tables)
     computed = operator.forward(volume)
     if scan.detector_model == "intensity":
-        computed = computed - operator.intensity_gap(volume)
+        computed = computed - operator.intensity_correction(volume)
     pairs = []
     for frame, image in zip(frames, computed, strict=True):
         valid = scan.valid[frame]
