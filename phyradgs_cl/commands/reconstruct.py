@@ -15,7 +15,7 @@ from phyradgs_cl.parallel import failing_together, launched_ranks
 from phyradgs_cl.progress import Ticker
 from phyradgs_cl.reconstructors import ProgressReport, Reconstruction, Report
 from phyradgs_cl.reconstructors.result import COMPARED
-from phyradgs_cl.reconstructors.tune.trials import TUNED, tuned_words
+from phyradgs_cl.reconstructors.tune import TUNED, tuning_line
 from phyradgs_cl.report import Preview, check_preview
 from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.settings import Settings
@@ -83,7 +83,7 @@ def reconstruct_command(
     compared = f" ({result.facts[COMPARED]})" if COMPARED in result.facts else ""
     say(f"{written}: {how}{scores(metrics)}{compared}")
     if TUNED in result.facts:
-        say(tuned_words(result.facts[TUNED]))
+        say(tuning_line(result.facts[TUNED]))
     if profile:
         say(profile_report(runtimes[-1], result))
     if result.state is not None:

@@ -13,7 +13,7 @@ from phyradgs_cl.acquisition.motion import MODELS, RAYS, SPLATS, motions_for
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.reconstructors.frames.preprocess import Preprocessing
 from phyradgs_cl.reconstructors.registry import METHODS, method_name, method_of
-from phyradgs_cl.reconstructors.tune.wish import check_wish
+from phyradgs_cl.reconstructors.tune import check_tuning
 from phyradgs_cl.text import near_miss
 
 _COUNTS = tuple(dict.fromkeys(f.name for model in MODELS for f in fields(model) if f.init))
@@ -44,7 +44,7 @@ def method_options(
         base = replace(base, motion=_motion(name, base, motion, counts))
     options = _changed(base, changes, f"--method {name}")
     if tune:
-        check_wish(tune, name, options, changes, method_of(method).ends_anywhere)
+        check_tuning(tune, name, options, changes, method_of(method).ends_anywhere)
     return options
 
 

@@ -8,8 +8,8 @@ from phyradgs_cl.drawing import draw_curve, draw_image, new_figure
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.metrics import reference_on
 from phyradgs_cl.metrics.slices import draw_slices
-from phyradgs_cl.reconstructors.frames.pairs import frame_pairs
 from phyradgs_cl.reconstructors.frames.preprocess import Preprocessing, prepared
+from phyradgs_cl.reconstructors.frames.projected import frame_pairs
 from phyradgs_cl.reconstructors.result import MARGIN_MM
 from phyradgs_cl.runtime import Runtime
 

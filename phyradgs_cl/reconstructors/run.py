@@ -16,8 +16,8 @@ from phyradgs_cl.metrics import resampled, shared_slices
 from phyradgs_cl.prepare import PREPARED_KEY
 from phyradgs_cl.prepare.step import with_masked
 from phyradgs_cl.reconstructors.checkpoint import with_identity, without_identity
-from phyradgs_cl.reconstructors.frames.holdout import held_out, holdout_errors
 from phyradgs_cl.reconstructors.frames.preprocess import Preprocessing, prepared
+from phyradgs_cl.reconstructors.frames.projected import held_out, holdout_errors
 from phyradgs_cl.reconstructors.plan import InitialVolume, RunPlan
 from phyradgs_cl.reconstructors.registry import METHODS, method_of
 from phyradgs_cl.reconstructors.result import (

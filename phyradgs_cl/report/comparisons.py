@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.prepare.step import Facts
 from phyradgs_cl.reconstructors.fdk import static_fdk
-from phyradgs_cl.reconstructors.frames.pairs import FramePair, frame_pairs
 from phyradgs_cl.reconstructors.frames.preprocess import prepared, stages
+from phyradgs_cl.reconstructors.frames.projected import FramePair, frame_pairs
 from phyradgs_cl.report.run import Run
 from phyradgs_cl.runtime import Runtime
 

@@ -11,7 +11,7 @@ from phyradgs_cl.acquisition.motion import motion_facts
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.io import check_writable, written_beside
 from phyradgs_cl.metrics import printed
-from phyradgs_cl.reconstructors.frames.pairs import FramePair
+from phyradgs_cl.reconstructors.frames.projected import FramePair
 from phyradgs_cl.report import sections
 from phyradgs_cl.report.comparisons import Change, computed_views, step_changes
 from phyradgs_cl.report.images import base64_of

@@ -17,8 +17,7 @@ from phyradgs_cl.io import Volume, file_kind, read_scan, read_volume, scan_summa
 from phyradgs_cl.metrics import METRICS, aligned, compare
 from phyradgs_cl.prepare import flat_correction
 from phyradgs_cl.reconstructors import Preprocessing, preprocessing_of
-from phyradgs_cl.reconstructors.tune.trials import TUNED
-from phyradgs_cl.reconstructors.tune.wish import is_told
+from phyradgs_cl.reconstructors.tune import TUNED, is_tuning
 from phyradgs_cl.text import plain_text
 
 log = logging.getLogger(__name__)
@@ -76,7 +75,7 @@ class Run:
     def tuned(self) -> Mapping[str, Any] | None:
         """The trials by which the scan chose an option, where the provenance has them."""
         trials: Any = self.stored.provenance.get(TUNED)
-        return trials if is_told(trials) else None
+        return trials if is_tuning(trials) else None
 
 
 def load_run(path: Path, scan_path: Path | None = None) -> Run:

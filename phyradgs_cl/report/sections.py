@@ -7,7 +7,7 @@ import numpy as np
 from phyradgs_cl.acquisition import Exact, LineMiddles, MicroViews, Motion, OwnTimes, PerRow, Scan
 from phyradgs_cl.acquisition.motion import motion_facts
 from phyradgs_cl.prepare import PREPARED_KEY
-from phyradgs_cl.reconstructors.frames.pairs import TIMES_PER_LINE, FramePair
+from phyradgs_cl.reconstructors.frames.projected import TIMES_PER_LINE, FramePair
 from phyradgs_cl.report.charts import Chart, convergence_charts, histogram, tuning_chart, views_chart
 from phyradgs_cl.report.comparisons import Change
 from phyradgs_cl.report.images import (

@@ -10,7 +10,7 @@ from tolerances import RANK_GRADIENT, RANK_VOLUME
 from phyradgs_cl.acquisition import Exact, Scan
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.reconstructors import Preprocessing, Progress, RunPlan, loop, method_options, reconstruct
-from phyradgs_cl.reconstructors.tune.trials import TUNED
+from phyradgs_cl.reconstructors.tune import TUNED
 from phyradgs_cl.runtime import Runtime
 
 DIVIDED = {

@@ -14,10 +14,9 @@ from phyradgs_cl.errors import InputError
 from phyradgs_cl.io import checkpoint_path
 from phyradgs_cl.reconstructors import Preprocessing, Progress, RunPlan, method_options, plan_run
 from phyradgs_cl.reconstructors import reconstruct as run_method
-from phyradgs_cl.reconstructors.frames.holdout import held_out
+from phyradgs_cl.reconstructors.frames.projected import held_out
 from phyradgs_cl.reconstructors.result import HELD_OUT
-from phyradgs_cl.reconstructors.tune import trials
-from phyradgs_cl.reconstructors.tune.trials import TUNED
+from phyradgs_cl.reconstructors.tune import TUNED, trials
 from phyradgs_cl.report.page import report_page
 from phyradgs_cl.report.run import load_run
 
@@ -81,8 +80,8 @@ def test_the_choice_is_where_the_curve_is_least(rt, scan) -> None:
 @pytest.mark.parametrize("errors, expected", [([4.0, 2.0, 1.0, 2.0, 4.0], 4.0), ([3.0, 2.0, 1.0, 1.0, 2.0], 4 * 2**0.5)])
 def test_between_values_a_parabola_is_least(errors, expected) -> None:
     values = np.array([1.0, 2.0, 4.0, 8.0, 16.0])
-    assert trials._least(values, np.array(errors)) == pytest.approx(expected)
-    assert trials._least(values[:3], np.array(errors[:3])) == 4.0
+    assert trials._parabola_minimum(values, np.array(errors)) == pytest.approx(expected)
+    assert trials._parabola_minimum(values[:3], np.array(errors[:3])) == 4.0
 
 
 def test_a_run_that_goes_on_does_not_choose_again(rt, scan, file, cli, tmp_path, capsys) -> None:

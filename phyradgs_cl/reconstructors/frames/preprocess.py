@@ -1,4 +1,4 @@
-"""What happens to a scan before any method sees it: another grid, lag undone, the steps of ``prepare``, a median filter."""
+"""Changes to a scan before any method sees it: another grid, lag removal, the steps of ``prepare``, a median filter."""
 
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, replace
@@ -15,20 +15,21 @@ from phyradgs_cl.fields import GridChoice
 from phyradgs_cl.prepare import STEP_FIELDS, Model, PrepareOptions, prepare
 from phyradgs_cl.prepare.chain import one_by_one
 from phyradgs_cl.prepare.step import Facts, unmasked_frames
-from phyradgs_cl.reconstructors.tune.wish import wish_of
+from phyradgs_cl.reconstructors.tune import TuningRequest
 from phyradgs_cl.runtime import Runtime
 
 MEDIAN_EDGES = (0, 3, 5)
-MOST_HELD = 50.0
+MOST_HELD_OUT = 50.0
 _HIDING = ("holdout", "tune")
 
 
 @dataclass(frozen=True)
 class Preprocessing(PrepareOptions, GridChoice):
-    """size, voxel_mm, roi_mm, margin_mm: the grid, as of ``GridChoice``. ignore_lag: leave the panel's lag in the frames.
-    median_filter: edge of its window in pixels, 0 for none. holdout: percent of the pixels that no method sees
-    (``holdout.py``). tune: the option of the method that such pixels choose (``tune/``). steps and a table each: as of
-    ``PrepareOptions``.
+    """size, voxel_mm, roi_mm, margin_mm: the grid, as in ``GridChoice``. ignore_lag: leave the panel's lag in the frames.
+
+    median_filter: edge of its window in pixels, 0 for none. holdout: percentage of the pixels that the method does not use,
+    for a measure of quality. tune: the option of the method that such pixels choose (``tune/``). steps and a table for each:
+    as in ``PrepareOptions``.
     """
 
     ignore_lag: bool = False
@@ -40,49 +41,51 @@ class Preprocessing(PrepareOptions, GridChoice):
         GridChoice.__post_init__(self)
         PrepareOptions.__post_init__(self)
         checks.one_of("median_filter", self.median_filter, MEDIAN_EDGES)
-        checks.within("holdout", self.holdout, 0, MOST_HELD)
+        checks.within("holdout", self.holdout, 0, MOST_HELD_OUT)
         if self.tune:
-            wish_of(self.tune)
+            TuningRequest.parse(self.tune)
         if self._hiding and self.median_filter:
             found = "a median filter, which mixes held-out pixels into their neighbours"
             raise InputError(f"--{self._hiding[0]}", found, "frames as they are", "leave one of the two out")
 
     @property
     def _hiding(self) -> list[str]:
-        """What keeps pixels from a method."""
+        """The options in use that hide pixels from the method."""
         return [name for name in _HIDING if getattr(self, name)]
 
     def facts(self) -> dict[str, object]:
-        """What is chosen, by name."""
-        plain = {name: value for name, value in asdict(self).items() if name not in STEP_FIELDS and value is not None}
-        left_out = set(_HIDING) - set(self._hiding)
-        return {**{name: value for name, value in plain.items() if name not in left_out}, **self.step_facts()}
+        """Returns the options by name, without those that are not set."""
+        unset = set(_HIDING) - set(self._hiding) | set(STEP_FIELDS)
+        plain = {name: value for name, value in asdict(self).items() if name not in unset and value is not None}
+        return {**plain, **self.step_facts()}
 
     def check_written(self) -> None:
-        """InputError for what makes no sense in a scan that is kept."""
+        """Raises InputError for options that mean nothing in a scan that is written to a file."""
         for name in [*self._hiding, *(["margin_mm"] if self.margin_mm is not None else [])]:
             found, remedy = f"{getattr(self, name)}, without a method", "give it to the reconstruction"
             raise InputError(f"--{name.replace('_', '-')}", found, "none where a scan is prepared", remedy)
 
 
 def prepared(scan: Scan, options: Preprocessing, rt: Runtime | None = None) -> Scan:
-    """The scan as a method gets it, on a grid with its margin; the scan itself where nothing is to be done. ``rt``: where
-    steps that ask the object reconstruct and project it."""
-    scan = prepare(_begun(scan, options), options, partial(_model, rt))
+    """Returns the scan for a method, on a grid with its margin; the scan itself if there is nothing to do.
+
+    ``rt``: the device of steps that reconstruct and project.
+    """
+    scan = prepare(regrid_and_remove_lag(scan, options), options, partial(_model, rt))
     if options.median_filter > 0:
         scan = replace(scan, projections=median_frames(scan, options.median_filter))
     return scan
 
 
 def stages(scan: Scan, options: Preprocessing, rt: Runtime) -> Iterator[tuple[str, Scan, Facts]]:
-    """(name, scan, numbers) before the steps of ``options`` and after each of them."""
-    scan = _begun(scan, options)
+    """Yields (name, scan, numbers) before the steps of ``options`` and after each of them."""
+    scan = regrid_and_remove_lag(scan, options)
     yield "", scan, {}
     yield from one_by_one(scan, options, partial(_model, rt))
 
 
-def _begun(scan: Scan, options: Preprocessing) -> Scan:
-    """The scan as the first step gets it."""
+def regrid_and_remove_lag(scan: Scan, options: Preprocessing) -> Scan:
+    """Returns the scan for the first step of ``prepare``."""
     scan = scan.with_grid(options)
     scan = scan.on_grid(options.with_margin(scan.grid))
     return scan if options.ignore_lag else without_lag(scan)
@@ -91,15 +94,15 @@ def _begun(scan: Scan, options: Preprocessing) -> Scan:
 def _model(rt: Runtime | None, scan: Scan) -> Model:
     if rt is None:
         raise InputError("--steps", "a step that reconstructs, without a device", "a Runtime", "pass one")
-    from phyradgs_cl.reconstructors.frames.reprojection import reprojection  # methods: slow to import
+    from phyradgs_cl.reconstructors.frames.projected import reprojection  # methods are slow to import
 
     return reprojection(rt, scan)
 
 
 def median_frames(scan: Scan, edge: int) -> np.ndarray:
-    """Line integrals (F, rows, columns) float32, each the median of ``edge`` × ``edge`` pixels of its frame.
+    """Returns line integrals (F, rows, columns) float32, each the median of ``edge`` × ``edge`` pixels of its frame.
 
-    Masked pixels are filled in from their row first, so that what they hold does not reach their neighbours.
+    Masked pixels are filled in from their row first, so that their values do not reach their neighbours.
     """
     frames = unmasked_frames(scan)
     smooth = [scipy.ndimage.median_filter(frame, size=edge, mode="nearest") for frame in frames]

@@ -1,0 +1,118 @@
+"""Frames computed from a volume: beside the measured ones, at held-out pixels, and for steps of ``prepare``.
+
+Held-out pixels measure quality without a true volume: cross-validation over pixels (as of one parameter in Golub, Heath and
+Wahba, Technometrics 21 (1979) 215). They are the same for every method, option and seed, so that errors can be compared.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from phyradgs_cl.acquisition import LineMiddles, PerRow, Scan
+from phyradgs_cl.detector import noise_rms
+from phyradgs_cl.errors import InputError
+from phyradgs_cl.fields import Grid
+from phyradgs_cl.operators import RayOperator
+from phyradgs_cl.prepare import Model
+from phyradgs_cl.reconstructors.fdk import FdkOptions, fdk
+from phyradgs_cl.reconstructors.result import Reconstruction
+from phyradgs_cl.reconstructors.voxels import fista_tv
+from phyradgs_cl.runtime import Runtime
+
+TIMES_PER_LINE = 16  # samples of a line's exposure, whose error is far below the noise
+_HOLDOUT_SEED, _HOLDOUT_FRAMES = 20, 8  # frames that are projected at one time
+Image = NDArray[np.float32]
+
+
+@dataclass(frozen=True, eq=False)
+class FramePair:
+    """One frame: measured and computed (rows, columns) line integrals, 0 where ``valid`` is not."""
+
+    frame: int
+    measured: Image
+    computed: Image
+    valid: NDArray[np.bool_]
+
+    @property
+    def residual(self) -> Image:
+        """Measured minus computed."""
+        return self.measured - self.computed
+
+    @property
+    def rms(self) -> float:
+        """Root mean square of the residual over the valid pixels."""
+        return _rms(self.residual[self.valid])
+
+    @property
+    def relative(self) -> float:
+        """``rms`` as a share of that of the measurement."""
+        return self.rms / (_rms(self.measured[self.valid]) or 1.0)
+
+
+def _rms(values: NDArray[np.floating]) -> float:
+    return float(np.sqrt(np.mean(values.astype(np.float64) ** 2))) if values.size else 0.0
+
+
+def frame_pairs(
+    rt: Runtime, scan: Scan, volume: np.ndarray, grid: Grid, frames: Sequence[int]
+) -> list[FramePair]:
+    """Returns some frames of a scan with those of a volume (nz, ny, nx) in 1/mm, under the scan's true motion.
+
+    For a detector that averages intensity the computed frames do so too.
+    """
+    motion = PerRow(sub_intervals=TIMES_PER_LINE)
+    tables = [motion.cells(scan, frame) for frame in frames]
+    operator = RayOperator(rt, grid, scan.geometry.detector_shape, tables)
+    computed = operator.forward(volume)
+    if scan.detector_model == "intensity":
+        computed = computed - operator.intensity_correction(volume)
+    pairs = []
+    for frame, image in zip(frames, computed, strict=True):
+        valid = scan.valid[frame]
+        measured = np.where(valid, scan.projections[frame], 0).astype(np.float32)
+        pairs.append(FramePair(frame, measured, np.where(valid, image, 0).astype(np.float32), valid))
+    return pairs
+
+
+def held_out(scan: Scan, percent: float, seed: int = _HOLDOUT_SEED, subject: str = "--holdout") -> np.ndarray:
+    """Draws a percentage of the valid pixels (F, v, u) bool, the same in every run. Raises InputError for none."""
+    drawn = np.random.default_rng(seed).random(scan.projections.shape, np.float32) < percent / 100
+    held: np.ndarray = drawn & scan.valid
+    if not held.any():
+        raise InputError(subject, f"{percent:g} % of {int(scan.valid.sum())} pixels", "at least one pixel", "take more")
+    return held
+
+
+def holdout_errors(rt: Runtime, scan: Scan, held: np.ndarray, result: Reconstruction) -> dict[str, float]:
+    """Returns the RMS residual at held-out pixels (F, v, u), the part of it that is their own noise, and their number.
+
+    No reconstruction can have a smaller true error than the noise. Both are dimensionless, as line integrals are.
+    """
+    squares = 0.0
+    for first in range(0, scan.frames, _HOLDOUT_FRAMES):
+        frames = range(first, min(first + _HOLDOUT_FRAMES, scan.frames))
+        for pair in frame_pairs(rt, scan, result.volume, result.grid, frames):
+            squares += float(np.sum(np.square(pair.residual[held[pair.frame]], dtype=np.float64)))
+    count = int(held.sum())
+    noise = noise_rms(scan.projections, held, scan.valid)
+    return {"holdout_rms": float(np.sqrt(squares / count)), "holdout_noise_rms": noise, "holdout_pixels": count}
+
+
+def reprojection(rt: Runtime, scan: Scan) -> Model:
+    """Returns FDK with every line at the middle of its own exposure, and projection at the same times."""
+    motion = LineMiddles()
+    fdk_options = FdkOptions(window="hann", motion=motion)
+    tv_options = fista_tv.FistaTvOptions(motion=PerRow(sub_intervals=2), iterations=30, tv_weight=0.002)
+    tables = [motion.cells(scan, frame).still() for frame in range(scan.frames)]
+    operator = RayOperator(rt, scan.grid, scan.geometry.detector_shape, tables)
+
+    def volume(frames: np.ndarray) -> np.ndarray:
+        return fdk(replace(scan, projections=np.asarray(frames, np.float32)), fdk_options, rt).volume
+
+    def regularised(frames: np.ndarray) -> np.ndarray:
+        own = replace(scan, projections=np.asarray(frames, np.float32))
+        return fista_tv.METHOD.run(own, tv_options, rt).volume
+
+    return Model(volume, operator.forward, regularised)
