@@ -52,8 +52,10 @@ class ConstantSpeed:
 
 @dataclass(frozen=True)
 class SpeedRamp:
-    """θ(t) = θ0 + ω t + ½ a t²: a gantry that speeds up or brakes. ``angle_start_rad`` and ``speed_rad_per_s`` hold at time
-    0. Raises InputError for infinite values or NaN."""
+    """θ(t) = θ0 + ω t + ½ a t²: a gantry that speeds up or brakes by ``acceleration_rad_per_s2``.
+
+    ``angle_start_rad`` and ``speed_rad_per_s`` hold at time 0. Raises InputError for infinite values or NaN.
+    """
 
     angle_start_rad: float
     speed_rad_per_s: float

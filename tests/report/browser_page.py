@@ -165,8 +165,8 @@ def test_the_value_under_the_pointer_is_that_of_the_file(page, files) -> None:
     page.locator("#plane-coronal").scroll_into_view_if_needed()
     for right, up, column, row in ((0.375, 0.625, 4, 7), (0.54, 0.46, 6, 5)):
         hover(page, "coronal", right, up)
-        told = re.fullmatch(r"Under the pointer, x (.*), y (.*), z (.*) mm: (.*) 1/mm", reading(page).replace("−", "-"))
-        x, _, z, value = (float(number) for number in told.groups())
+        match = re.fullmatch(r"Under the pointer, x (.*), y (.*), z (.*) mm: (.*) 1/mm", reading(page).replace("−", "-"))
+        x, _, z, value = (float(number) for number in match.groups())
         assert (x, z) == pytest.approx(((column - 5.5) / 6, (row - 5.5) / 6), abs=6e-3)
         assert value == pytest.approx(volume[row, 6, column], abs=0.006)
     page.mouse.move(0, 0)
@@ -182,8 +182,8 @@ def test_window_sliders_change_what_black_and_white_are(page) -> None:
     assert after != before and page.locator("#white").get_attribute("aria-valuetext").endswith("1/mm")
     page.locator("#layer-difference").check()
     assert page.locator("#black").is_disabled()
-    told = [page.locator(f"#{end}-told").inner_text().strip("≤≥ ") for end in ("black", "white")]
-    assert told[0] == f"−{told[1]}"
+    ends = [page.locator(f"#{end}-value").inner_text().strip("≤≥ ") for end in ("black", "white")]
+    assert ends[0] == f"−{ends[1]}"
     page.locator("#layer-result").check()
     assert picture(page, "axial") == after
     page.locator("#reset").click()
