@@ -12,7 +12,7 @@ import itertools
 from collections.abc import Sequence
 
 import numpy as np
-import scipy.fft
+import scipy
 
 from phyradgs_cl.checks import ceil_div
 from phyradgs_cl.runtime import DeviceArray, Runtime, SameArray
