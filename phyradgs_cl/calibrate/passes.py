@@ -7,8 +7,8 @@ from phyradgs_cl.acquisition import Scan
 
 Report = Callable[[int, int, str, float], None]
 """Takes passes done, passes in all, the phase, and the share of the time that has passed."""
-Passes = Sequence[tuple[float, int]]
-"""Passes to come: (cost of one, number)."""
+Passes = tuple[int, float]
+"""Number of passes to come, and what they cost together."""
 
 
 def pass_cost(scans: Sequence[Scan], columns: int, most_frames: int) -> float:
@@ -26,19 +26,14 @@ class PassCounter:
         self.plan = dict(plan)
         self._report = report
         self._done, self._spent, self._text = 0, 0.0, ""
-        self._current: tuple[int, float] = (0, 0.0)  # passes and cost that remain in this phase
+        self._current: Passes = (0, 0.0)  # those that remain in this phase
 
     def begin(self, phase: str, text: str) -> None:
         """Begins a phase; the plan's earlier phases are over."""
         while phase in self.plan and next(iter(self.plan)) != phase:
             self.plan.pop(next(iter(self.plan)))
-        self._text = text
-        self.expect(self.plan.pop(phase, ()))
+        self._text, self._current = text, self.plan.pop(phase, (0, 0.0))
         self._say()
-
-    def expect(self, passes: Passes) -> None:
-        """Replaces what remains of this phase."""
-        self._current = _total(passes)
 
     def counter(self, cost: float) -> Callable[[], None]:
         """Returns a function that counts one pass of this cost at each call."""
@@ -52,12 +47,6 @@ class PassCounter:
         return count
 
     def _say(self) -> None:
-        later_count, later_cost = _total([one for passes in self.plan.values() for one in passes])
-        count, cost = self._current
-        spent_share = self._spent / max(self._spent + (cost + later_cost), 1e-30)
-        self._report(self._done, self._done + count + later_count, self._text, spent_share)
-
-
-def _total(passes: Passes) -> tuple[int, float]:
-    """Returns the number and the cost of all passes."""
-    return sum(count for _, count in passes), sum(cost * count for cost, count in passes)
+        passes, costs = zip(self._current, *self.plan.values(), strict=True)
+        spent_share = self._spent / max(self._spent + sum(costs), 1e-30)
+        self._report(self._done, self._done + sum(passes), self._text, spent_share)

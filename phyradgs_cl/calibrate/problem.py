@@ -49,10 +49,9 @@ class Stage:
         """Returns the pixels along a block's side."""
         return ceil_div(max(scan.geometry.detector_shape), self.columns)
 
-    def passes(self, parameters: int, steps: int, asks: bool) -> int:
-        """Returns the most passes through the frames of the last ``steps``; ``asks``: identifiability is tested as well."""
-        first = self.first - self.again if steps == self.steps else 0
-        return first + steps * (self.again + self.project * (parameters + (3 if asks else 1)))
+    def passes(self, parameters: int, asks: bool) -> int:
+        """Returns the most passes through the frames; ``asks``: it is tested which parameters the frames determine."""
+        return self.first - self.again + self.steps * (self.again + self.project * (parameters + (3 if asks else 1)))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

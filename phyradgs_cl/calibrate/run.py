@@ -3,8 +3,7 @@ corrects the scan where corrections are significant and explain the frames bette
 
 import logging
 from collections.abc import Callable, Sequence
-from dataclasses import replace
-from functools import partial
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -35,7 +34,7 @@ from phyradgs_cl.calibrate.search import Fallback, Problem, Search
 from phyradgs_cl.calibrate.views import ViewsEstimate, estimate_views, passes_of_views
 from phyradgs_cl.check import SUSPICIOUS
 from phyradgs_cl.check.coverage import CUT_OFF, check_coverage
-from phyradgs_cl.check.orbit import OTHER_CAUSE, check_centre, with_coarseness
+from phyradgs_cl.check.orbit import OTHER_CAUSE, centre_of
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.phantoms import EllipsoidPhantom
 from phyradgs_cl.reconstructors.fits.axis import axis_shift, columns_per_block
@@ -82,30 +81,29 @@ def calibrate(
     return _Calibrator(rt, scan, ready, request, phantom, splines, report, note).run()
 
 
+@dataclass(eq=False)
 class _Calibrator:
-    """One calibration: its inputs, its grids, and the progress of its phases."""
+    """One calibration: its inputs, its grids, and the progress of its phases. ``ready``: the scans with lag removed."""
 
-    def __init__(
-        self,
-        rt: Runtime,
-        scan: Scan,
-        ready: list[Scan],
-        request: Request,
-        phantom: EllipsoidPhantom | None,
-        splines: int,
-        report: Report,
-        note: Callable[[str], None],
-    ) -> None:
-        self.note = note
-        self.rt, self.scan, self.ready, self.request = rt, scan, ready, request
-        self.phantom, self.placement = phantom, np.zeros(0)
-        self.stages = _different(STAGES if phantom is None else BEAD_STAGES, scan)
+    rt: Runtime
+    scan: Scan
+    ready: list[Scan]
+    request: Request
+    phantom: EllipsoidPhantom | None
+    splines: int
+    report: Report
+    note: Callable[[str], None]
+
+    def __post_init__(self) -> None:
+        self.placement = np.zeros(0)
+        self.stages = _different(STAGES if self.phantom is None else BEAD_STAGES, self.scan)
         self.per_view: PerViewParameters | None = None
-        if request.per_view:
-            first = ready[0]
-            self.per_view = WobbleParameters.of(first, splines) if request.per_view == WOBBLE else MotionParameters.of(first)
-        self.passes = PassCounter(report, self._plan())
-        self.search = Search(request.parameters)
+        if self.request.per_view == WOBBLE:
+            self.per_view = WobbleParameters.of(self.ready[0], self.splines)
+        elif self.request.per_view:
+            self.per_view = MotionParameters.of(self.ready[0])
+        self.passes = PassCounter(self.report, self._plan())
+        self.search = Search(self.request.parameters)
         self.views_estimates: dict[GeometryCorrection, ViewsEstimate] = {}
 
     def run(self) -> Calibration:
@@ -143,14 +141,11 @@ class _Calibrator:
 
         Half a turn of nearly parallel rays leaves too little of the offset's signal for a step. The fit itself still has its
         best axis, so ``check``'s answer then stands."""
-        scan, pitch_mm = self.ready[0], self.scan.geometry.pixel_size_mm[1]
-        quick = coarse(scan, QUICK_COLUMNS)
-        shift, block = axis_shift(self.rt, quick), columns_per_block(quick)
+        quick, pitch_mm = coarse(self.ready[0], QUICK_COLUMNS), self.scan.geometry.pixel_size_mm[1]
+        shift, finding = centre_of(axis_shift(self.rt, quick), columns_per_block(quick), self.ready[0])
         if not shift.is_found:
             return
         self.search.at[OFFSET_U] = shift.pixels * pitch_mm
-        shift = with_coarseness(shift, block, scan)
-        finding = check_centre(shift, block, pitch_mm, scan.geometry.detector_offset_mm[1] / pitch_mm)
         if finding.verdict != CANNOT_TELL and finding.unit != OTHER_CAUSE:
             is_significant = finding.verdict == SUSPICIOUS
             self.search.fallback = {OFFSET_U: Fallback(shift.pixels * pitch_mm, shift.deviation * pitch_mm, is_significant)}
@@ -164,16 +159,12 @@ class _Calibrator:
             steady = [self._with_steady_views(self.ready[0])]
         for number, stage in enumerate(self.stages):
             self.passes.begin(f"stage {number}", f"at most {stage.columns} columns")
-            cost = pass_cost(steady, stage.columns, MOST_FRAMES)
-            self.search.descend(self._problem(steady, stage), stage, partial(self._expect, cost))
+            self.search.descend(self._problem(steady, stage), stage)
             estimates = ", ".join(_in_short(one) for one in self.search.table(self.scan, {}))
             self.note(f"so far, {stage.columns} columns: {estimates}")
             if not self.search.known:
                 return
             self.passes.plan |= self._plan_of_stages(len(self.search.known), number + 1)
-
-    def _expect(self, cost: float, passes: int) -> None:
-        self.passes.expect([(cost, passes)])
 
     def _with_steady_views(self, scan: Scan) -> Scan:
         """Returns the scan with its views corrected. A shift along u common to all views is the panel's offset, where that
@@ -251,29 +242,26 @@ class _Calibrator:
     def _plan(self) -> dict[str, Passes]:
         """Returns the most passes through the frames of all phases, in order."""
         second, last = self.stages[min(1, len(self.stages) - 1)], self.stages[-1]
-        parameters, views, most_frames = len(self.request.parameters), [], MOST_FRAMES
+        parameters, views, most_frames = len(self.request.parameters), (0, 0.0), MOST_FRAMES
         if self.per_view is not None:
             views = passes_of_views(self.ready[0], self.stages, len(self.per_view.KINDS))
             most_frames = self.scan.frames
-        order = (pass_cost(self.ready, second.columns, MOST_FRAMES), 2 * second.first)
         return {
-            "start": [],
-            "order": [order] if self.request.asks_direction else [],
-            "views before": views if parameters else [],
+            "start": (0, 0.0),
+            "order": self._passes(second, 2 * second.first if self.request.asks_direction else 0),
+            "views before": views if parameters else (0, 0.0),
             **(self._plan_of_stages(parameters, 0) if parameters else {}),
             "views": views,
-            "residuals": [(pass_cost(self.ready, last.columns, most_frames), 2 * last.first)],
+            "residuals": self._passes(last, 2 * last.first, most_frames),
         }
 
     def _plan_of_stages(self, parameters: int, start: int) -> dict[str, Passes]:
         """Returns the most passes of the stages from ``start`` on."""
-        return {
-            f"stage {k}": [
-                (pass_cost(self.ready, stage.columns, MOST_FRAMES), stage.passes(parameters, stage.steps, k == 0))
-            ]
-            for k, stage in enumerate(self.stages)
-            if k >= start
-        }
+        stages = list(enumerate(self.stages))[start:]
+        return {f"stage {k}": self._passes(stage, stage.passes(parameters, k == 0)) for k, stage in stages}
+
+    def _passes(self, stage: Stage, count: int, most_frames: int = MOST_FRAMES) -> Passes:
+        return count, count * pass_cost(self.ready, stage.columns, most_frames)
 
 
 def _different(stages: Sequence[Stage], scan: Scan) -> list[Stage]:

@@ -4,7 +4,7 @@ On each grid a volume is reconstructed, the parameters' signals are reduced by w
 parameters step, until the steps are small. On the first grid each step decides which parameters the frames determine.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -62,14 +62,13 @@ class Search:
     alike: list[str] = field(default_factory=list)
     reduced: Reduced | None = None
 
-    def descend(self, problem: Problem, stage: Stage, expect: Callable[[int], None]) -> None:
-        """Steps on one grid until the steps are small. ``expect`` takes the most passes that remain."""
+    def descend(self, problem: Problem, stage: Stage) -> None:
+        """Steps on one grid until the steps are small."""
         volume: np.ndarray | None = None
         asks = self.known is None
         self.former = {} if asks or isinstance(problem, BeadProblem) else dict(self.at)
         for number in range(stage.steps):
             parameters = self.parameters if asks else [PARAMETERS[name] for name in self.known or ()]
-            expect(stage.passes(len(parameters), stage.steps - number, asks))
             correction = correction_of(self.at)
             operator: Any = problem.operator(correction)
             volume = problem.corrected(correction).reconstruct(operator, volume, stage.again if number else stage.first)

@@ -7,7 +7,7 @@ import numpy as np
 
 from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.acquisition.altered.perturbed import GeometryCorrection, Sway, Views
-from phyradgs_cl.calibrate.passes import PassCounter, pass_cost
+from phyradgs_cl.calibrate.passes import PassCounter, Passes, pass_cost
 from phyradgs_cl.calibrate.per_view import PerViewParameters, view_deviations, view_step
 from phyradgs_cl.calibrate.problem import CoarseProblem, Stage
 from phyradgs_cl.calibrate.result import AGREES, CORRECTED, ParameterEstimate
@@ -27,11 +27,12 @@ class ViewsEstimate:
     table: list[ParameterEstimate]
 
 
-def passes_of_views(scan: Scan, stages: Sequence[Stage], kinds: int) -> list[tuple[float, int]]:
-    """Returns the passes through the frames that ``estimate_views`` makes, with their costs."""
+def passes_of_views(scan: Scan, stages: Sequence[Stage], kinds: int) -> Passes:
+    """Returns the passes through the frames that ``estimate_views`` makes."""
     costs = [pass_cost([scan], stage.columns, scan.frames) for stage in stages]
     counts = [stage.first + (_STEPS - 1) * stage.again + _STEPS * _ITERATIONS for stage in stages]
-    return [*zip(costs, counts, strict=True), (costs[-1], kinds * _ITERATIONS)]
+    counts[-1] += kinds * _ITERATIONS
+    return sum(counts), sum(cost * count for cost, count in zip(costs, counts, strict=True))
 
 
 def estimate_views(

@@ -32,3 +32,8 @@ class Finding:
 def too_narrow(question: str, unit: str) -> Finding:
     """Answers a question about columns for a panel with too few."""
     return Finding(question, CANNOT_TELL, 0.0, 0.0, unit, f"fewer than {FEWEST_COLUMNS} columns")
+
+
+def same_from_everywhere(question: str) -> Finding:
+    """Answers a question about angles for an object that looks the same from all of them."""
+    return Finding(question, CANNOT_TELL, 0.0, 0.0, "", "the object looks the same from every angle")

@@ -1,13 +1,32 @@
 """Does the gantry turn as the angles say, is its axis where it is stated, and do the distances fit?"""
 
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
+
+import numpy as np
 
 from phyradgs_cl.acquisition import Scan
-from phyradgs_cl.check.finding import CANNOT_TELL, MIRROR_U, OK, PIXEL_SIZES, SUSPICIOUS, Finding
+from phyradgs_cl.acquisition.altered.variants import reversed_rotation, shifted
+from phyradgs_cl.check.finding import (
+    CANNOT_TELL,
+    FEWEST_COLUMNS,
+    MIRROR_U,
+    OK,
+    PIXEL_SIZES,
+    SUSPICIOUS,
+    Finding,
+    same_from_everywhere,
+    too_narrow,
+)
 from phyradgs_cl.check.hypotheses import SIZE_FACTORS, nearly_sized, stated_redundancy
 from phyradgs_cl.check.timing import is_full_turn
-from phyradgs_cl.reconstructors.fits.axis import AxisShift, with_best_shift
+from phyradgs_cl.reconstructors.fits.axis import (
+    AxisShift,
+    columns_per_block,
+    refined_axis_shift,
+    rough_axis_shift,
+    with_best_shift,
+)
 from phyradgs_cl.reconstructors.fits.residuals import fit_squares, residual_ratio, t_statistic
 from phyradgs_cl.runtime import Runtime
 
@@ -21,6 +40,46 @@ _DEVIATIONS = 4.0
 _BIAS_FULL_TURN, _BIAS_HALF_TURN = 0.003, 0.04  # coarse pixels: measured errors of the axis in coarse scans
 _LEAST_REDUNDANCY = 0.1  # of a panel that sees the axis at its edge
 _OTHER_SIZES, _SIZE_RATIO = (0.8, 1.25), 1.05
+
+
+@dataclass(frozen=True, eq=False)
+class Orbit:
+    """Whether the gantry turns the other way, the panel's shift along u, and the findings about the two."""
+
+    sign: Finding
+    centre: Finding
+    shift: AxisShift = AxisShift(math.nan, math.nan, np.empty(0))
+    is_reversed: bool = False
+
+    def corrected(self, scan: Scan) -> Scan:
+        """Returns a coarse scan with its sense of rotation corrected, and its panel shifted where that is significant."""
+        scan = reversed_rotation(scan) if self.is_reversed else scan
+        is_shifted = self.shift.is_found and abs(self.shift.pixels) > self.centre.threshold
+        return shifted(scan, self.shift.pixels) if is_shifted else scan
+
+
+def find_orbit(rt: Runtime, quick: Scan, as_stated: Scan, sees_angles: bool) -> Orbit:
+    """Answers the questions of the sense of rotation and of the axis, from a coarse scan; few columns decide neither."""
+    if quick.geometry.detector_shape[1] < FEWEST_COLUMNS:
+        return Orbit(too_narrow(SIGN, "standard errors"), too_narrow(CENTRE, "pixels"))
+    if not sees_angles:
+        return Orbit(same_from_everywhere(SIGN), same_from_everywhere(CENTRE))
+    reverse, block = reversed_rotation(quick), columns_per_block(quick)
+    stated, other = rough_axis_shift(rt, quick), rough_axis_shift(rt, reverse)
+    is_rough = is_clear(stated, other)
+    if not is_rough:
+        stated, other = refined_axis_shift(rt, quick, stated), refined_axis_shift(rt, reverse, other)
+    sign = check_rotation(stated, other)
+    is_reversed = sign.verdict == SUSPICIOUS
+    shift = other if is_reversed else stated
+    if is_rough:
+        shift = refined_axis_shift(rt, reverse if is_reversed else quick, shift)
+    shift, centre = centre_of(shift, block, as_stated)
+    if is_reversed:
+        stated_px = as_stated.geometry.detector_offset_mm[1] / as_stated.geometry.pixel_size_mm[1]
+        sign = with_cause(sign, shift.pixels, stated_px, centre.threshold)
+        centre = replace(centre, verdict=CANNOT_TELL, text=f"rests on {SIGN}: {SUSPICIOUS}", advice="")
+    return Orbit(sign, centre, shift, is_reversed)
 
 
 def check_rotation(stated: AxisShift, other: AxisShift) -> Finding:
@@ -62,14 +121,17 @@ def with_cause(finding: Finding, shift_px: float, stated_px: float, tolerance_px
     return replace(finding, text=text, advice=f"{advice}, and check again")
 
 
-def with_coarseness(shift: AxisShift, block: int, scan: Scan) -> AxisShift:
-    """Adds the error of coarse pixels to a shift's deviation, which the bootstrap over frames does not include.
+def centre_of(shift: AxisShift, block: int, scan: Scan) -> tuple[AxisShift, Finding]:
+    """Returns a shift found with blocks of ``block`` pixels, and the finding about it.
 
-    The error is far larger where ``scan`` measures few rays twice: a shift that leaves fewer of them fits better anyway."""
+    The error of coarse pixels is added to its deviation, because the bootstrap over frames does not include it. It is far
+    larger where ``scan`` measures few rays twice: a shift that leaves fewer of them fits better anyway."""
     twice = min(2 * stated_redundancy(scan), 1.0)
     is_whole = is_full_turn(scan) and twice == 1
     bias = _BIAS_FULL_TURN if is_whole else _BIAS_HALF_TURN / max(twice, _LEAST_REDUNDANCY)
-    return replace(shift, deviation=math.hypot(shift.deviation, block * bias))
+    shift = replace(shift, deviation=math.hypot(shift.deviation, block * bias))
+    pitch_mm = scan.geometry.pixel_size_mm[1]
+    return shift, check_centre(shift, block, pitch_mm, scan.geometry.detector_offset_mm[1] / pitch_mm)
 
 
 def check_centre(shift: AxisShift, block: int, pitch_mm: float, stated_px: float) -> Finding:
@@ -80,9 +142,8 @@ def check_centre(shift: AxisShift, block: int, pitch_mm: float, stated_px: float
     if not (shift.is_found and math.isfinite(shift.deviation)):
         return Finding(CENTRE, CANNOT_TELL, 0.0, _TOLERATED_PX, "pixels", "no shift fits best")
     shift_mm = shift.pixels * pitch_mm
-    text = (
-        f"the panel is {shift.pixels:+.2f} ± {shift.deviation:.2f} pixels ({shift_mm:+.4g} mm) from its stated place along u"
-    )
+    pixels = f"{shift.pixels:+.2f} ± {shift.deviation:.2f} pixels"
+    text = f"the panel is {pixels} ({shift_mm:+.4g} mm) from its stated place along u"
     if abs(shift.pixels) <= threshold:
         verdict = OK if threshold <= block else CANNOT_TELL
         return Finding(CENTRE, verdict, shift.pixels, threshold, "pixels", text, uncertainty=shift.deviation)

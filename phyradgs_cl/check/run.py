@@ -9,7 +9,6 @@ import numpy as np
 from phyradgs_cl import checks
 from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.acquisition.altered.coarse import FINE_COLUMNS, QUICK_COLUMNS, coarse, some_frames
-from phyradgs_cl.acquisition.altered.variants import reversed_rotation, shifted
 from phyradgs_cl.check.consistency import CONSISTENCY, check_consistency
 from phyradgs_cl.check.coverage import CUT_OFF, NO_OBJECT, OPAQUE, TOO_BRIGHT, check_coverage
 from phyradgs_cl.check.detector import (
@@ -20,29 +19,19 @@ from phyradgs_cl.check.detector import (
     check_gain,
     check_saturation,
 )
-from phyradgs_cl.check.finding import CANNOT_TELL, FEWEST_COLUMNS, OK, SUSPICIOUS, Finding, too_narrow
+from phyradgs_cl.check.finding import CANNOT_TELL, OK, SUSPICIOUS, Finding, same_from_everywhere
 from phyradgs_cl.check.orbit import (
     CENTRE,
     DISTANCES,
     OTHER_CAUSE,
     SIGN,
     UNVERIFIED,
-    check_centre,
     check_distances,
-    check_rotation,
-    is_clear,
-    with_cause,
-    with_coarseness,
+    find_orbit,
 )
 from phyradgs_cl.check.shutter import EXPOSURE, READOUT, check_exposure, check_readout
 from phyradgs_cl.check.timing import check_angles, check_timing
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.reconstructors.fits.axis import (
-    AxisShift,
-    columns_per_block,
-    refined_axis_shift,
-    rough_axis_shift,
-)
 from phyradgs_cl.reconstructors.frames.preprocess import Preprocessing, prepared
 from phyradgs_cl.runtime import Runtime
 
@@ -125,11 +114,13 @@ def check(
     if not consistency.is_sound:
         return answers.stop()
     quick = some_frames(quick, consistency.frames)
-    orbit = _check_orbit(rt, quick, scan, answers, consistency.sees_angles)
+    orbit = find_orbit(rt, quick, scan, consistency.sees_angles)
+    answers.add(orbit.sign)
+    answers.add(orbit.centre)
     quick = orbit.corrected(quick)
 
     def ask(question: str, check_question: Callable[[Runtime, Scan], Finding], coarse_scan: Scan) -> None:
-        answers.add(check_question(rt, coarse_scan) if consistency.sees_angles else _same_from_everywhere(question))
+        answers.add(check_question(rt, coarse_scan) if consistency.sees_angles else same_from_everywhere(question))
 
     ask(DISTANCES, check_distances, quick)
     gain = check_gain(rt, quick)
@@ -144,55 +135,6 @@ def check(
         return CheckResult(answers.findings, is_consistent=False)
     pitch_mm = scan.geometry.pixel_size_mm[1]
     return CheckResult(answers.findings, orbit.shift.pixels * pitch_mm, orbit.shift.deviation * pitch_mm)
-
-
-@dataclass(frozen=True, eq=False)
-class _Orbit:
-    """Whether the gantry turns the other way, the panel's shift, and the finding about it."""
-
-    is_reversed: bool
-    shift: AxisShift
-    centre: Finding
-
-    def corrected(self, scan: Scan) -> Scan:
-        """Returns a coarse scan with its sense of rotation corrected, and its panel shifted where that is significant."""
-        scan = reversed_rotation(scan) if self.is_reversed else scan
-        is_shifted = self.shift.is_found and abs(self.shift.pixels) > self.centre.threshold
-        return shifted(scan, self.shift.pixels) if is_shifted else scan
-
-
-def _check_orbit(rt: Runtime, quick: Scan, as_stated: Scan, answers: _Answers, sees_angles: bool) -> _Orbit:
-    """Answers the questions of the sense of rotation and of the axis; a panel of few columns decides neither."""
-    nowhere = AxisShift(math.nan, math.nan, np.empty(0))
-    if quick.geometry.detector_shape[1] < FEWEST_COLUMNS:
-        answers.add(too_narrow(SIGN, "standard errors"))
-        return _Orbit(False, nowhere, answers.add(too_narrow(CENTRE, "pixels")))
-    if not sees_angles:
-        answers.add(_same_from_everywhere(SIGN))
-        return _Orbit(False, nowhere, answers.add(_same_from_everywhere(CENTRE)))
-    reverse, block = reversed_rotation(quick), columns_per_block(quick)
-    stated, other = rough_axis_shift(rt, quick), rough_axis_shift(rt, reverse)
-    was_clear = is_clear(stated, other)
-    if not was_clear:
-        stated, other = refined_axis_shift(rt, quick, stated), refined_axis_shift(rt, reverse, other)
-    sign = check_rotation(stated, other)
-    is_reversed = sign.verdict == SUSPICIOUS
-    shift = other if is_reversed else stated
-    if was_clear:
-        shift = refined_axis_shift(rt, reverse if is_reversed else quick, shift)
-    shift = with_coarseness(shift, block, as_stated)
-    pitch_mm = quick.geometry.pixel_size_mm[1] / block
-    stated_px = as_stated.geometry.detector_offset_mm[1] / pitch_mm
-    centre = check_centre(shift, block, pitch_mm, stated_px)
-    if is_reversed:
-        sign = with_cause(sign, shift.pixels, stated_px, centre.threshold)
-        centre = replace(centre, verdict=CANNOT_TELL, text=f"rests on {SIGN}: {SUSPICIOUS}", advice="")
-    answers.add(sign)
-    return _Orbit(is_reversed, shift, answers.add(centre))
-
-
-def _same_from_everywhere(question: str) -> Finding:
-    return Finding(question, CANNOT_TELL, 0.0, 0.0, "", "the object looks the same from every angle")
 
 
 def _finite(scan: Scan) -> Scan:

@@ -2,11 +2,12 @@
 
 import math
 from contextlib import suppress
+from dataclasses import replace
 
 import numpy as np
 
 from phyradgs_cl.acquisition import Scan
-from phyradgs_cl.acquisition.altered.variants import at_rest, exposed, read, reversed_readout
+from phyradgs_cl.acquisition.altered.variants import reversed_readout
 from phyradgs_cl.check.finding import CANNOT_TELL, MIRROR_U, MIRROR_V, OK, SUSPICIOUS, Finding
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.reconstructors.fits.residuals import fit_squares, residual_ratio, t_statistic
@@ -67,14 +68,19 @@ def _other_readouts(scan: Scan) -> dict[str, Scan]:
     if shutter.readout_s == 0:
         readout_s = _READOUT_SHARE * float(np.diff(scan.frame_start_s).min(initial=math.inf))
         orders = [(axis, direction) for axis in ("rows", "columns") for direction in (1, -1)]
-        return {f"by {a}, index {'0' if d > 0 else 'last'} first": read(scan, a, d, readout_s) for a, d in orders}
+        return {f"by {a}, index {'0' if d > 0 else 'last'} first": _read(scan, a, d, readout_s) for a, d in orders}
     return {
         _OTHER_WAY: reversed_readout(scan),
-        "all at once": read(scan, shutter.axis, 1, 0.0),
-        _AT_REST: at_rest(scan),
-        f"by {other_axis}, index 0 first": read(scan, other_axis, 1, shutter.readout_s),
-        f"by {other_axis}, index last first": read(scan, other_axis, -1, shutter.readout_s),
+        "all at once": _read(scan, shutter.axis, 1, 0.0),
+        _AT_REST: replace(scan, is_fly=False),
+        f"by {other_axis}, index 0 first": _read(scan, other_axis, 1, shutter.readout_s),
+        f"by {other_axis}, index last first": _read(scan, other_axis, -1, shutter.readout_s),
     }
+
+
+def _read(scan: Scan, axis: str, direction: int, readout_s: float) -> Scan:
+    shutter = replace(scan.shutter, axis=axis, direction=direction, readout_s=readout_s)
+    return replace(scan, shutter=shutter, is_fly=True)
 
 
 def _readout_advice(scan: Scan, name: str) -> str:
@@ -99,7 +105,7 @@ def check_exposure(rt: Runtime, scan: Scan) -> Finding:
         text = "the beam is pulsed: the pulse alone decides when lines see light"
         advice = "compare the pulse with the generator's log"
         return Finding(EXPOSURE, CANNOT_TELL, 1.0, _HALF_RATIO, "share", text, advice)
-    stated, half = fit_squares(rt, scan), fit_squares(rt, exposed(scan, 0.5))
+    stated, half = fit_squares(rt, scan), _squares_exposed(rt, scan, 0.5)
     ratio, errors = residual_ratio(stated, half), t_statistic(stated, half)
     text = f"exposed half as long, the squared residual is {ratio:.3g} times as large ({errors:+.1f} standard errors)"
     values = (ratio, _HALF_RATIO, "share", text)
@@ -118,6 +124,11 @@ def _fits_worse(stated: np.ndarray, other: np.ndarray | None) -> bool:
 def _twice_as_long(rt: Runtime, scan: Scan) -> np.ndarray | None:
     """Returns squared residuals (F,) with twice the exposure; None where the table of poses or angles ends too early."""
     try:
-        return fit_squares(rt, exposed(scan, 2.0))
+        return _squares_exposed(rt, scan, 2.0)
     except InputError:
         return None
+
+
+def _squares_exposed(rt: Runtime, scan: Scan, factor: float) -> np.ndarray:
+    """Returns squared residuals (F,) with lines open ``factor`` times as long, from the same moments."""
+    return fit_squares(rt, replace(scan, shutter=replace(scan.shutter, exposure_s=factor * scan.shutter.exposure_s)))

@@ -241,7 +241,7 @@ def test_a_figure_has_a_curve_for_each_number_of_a_view(right) -> None:
     sway = Sway.none(right, 7)
     moving = replace(alone, views=replace(sway, coefficients=np.ones((7, 6))))
     shifted = replace(alone, views=Views(np.zeros(15), np.ones((15, 2))))
-    left = replace(alone, views=Views.none(15))
+    left = replace(alone, views=Views(np.zeros(15), np.zeros((15, 2))))
     count = [len(found.plot().axes) for found in (alone, shifted, moving, left)]
     assert alone.per_view() == {} and alone.facts()["views"] == {}
     assert repr(alone) == "Calibration(; residual 1, then 0.5)"
@@ -348,7 +348,7 @@ def test_views_of_frames_that_overlap_have_no_place_in_a_file(refused, right, tm
 
 
 def test_views_in_a_result_are_its_trajectory(right) -> None:
-    views = Views.none(15)
+    views = Views(np.zeros(15), np.zeros((15, 2)))
     assert not isinstance(perturb(right, GeometryCorrection(), views).trajectory, CircularOrbit)
 
 

@@ -55,13 +55,13 @@ def test_what_only_the_axis_tells_is_not_said_to_be_undetermined(rt, half_turn) 
     scan, stage = half_turn(0.0), Stage(16, first=20, again=10, steps=1)
     problem = CoarseProblem.of(rt, False, [scan], stage)
     alone = Search([PARAMETERS["offset-u"]])
-    alone.descend(problem, stage, lambda passes: None)
+    alone.descend(problem, stage)
     assert alone.known == () and alone.shares["offset-u"] < 2 * LEAST_SHARE
     assert alone.alike == ["offset-u: looks like an object beside the axis"]
     assert alone.table(scan, {})[0].verdict == CANNOT_TELL
     for fallback, verdict in ((Fallback(0.3, 0.01, True), CORRECTED), (Fallback(0.001, 0.01, False), AGREES)):
         helped = Search([PARAMETERS["offset-u"]], fallback={"offset-u": fallback})
-        helped.descend(problem, stage, lambda passes: None)
+        helped.descend(problem, stage)
         corrections = helped.corrections()
         assert corrections == ({"offset-u": 0.3} if verdict == CORRECTED else {}) and helped.alike == []
         (offset,) = helped.table(scan, corrections)

@@ -53,10 +53,6 @@ class Views:
     turn_rad: np.ndarray
     shift_mm: np.ndarray
 
-    @classmethod
-    def none(cls, frames: int) -> "Views":
-        return cls(np.zeros(frames), np.zeros((frames, 2)))
-
 
 @dataclass(frozen=True, eq=False)
 class Sway:

@@ -103,25 +103,9 @@ def reversed_readout(scan: Scan) -> Scan:
     return replace(scan, shutter=replace(scan.shutter, direction=-scan.shutter.direction))
 
 
-def exposed(scan: Scan, factor: float) -> Scan:
-    """Returns the scan with lines open ``factor`` times as long, from the same moments."""
-    return replace(scan, shutter=replace(scan.shutter, exposure_s=factor * scan.shutter.exposure_s))
-
-
 def shifted(scan: Scan, pixels: float) -> Scan:
     """Returns the scan with its panel moved along u by ``pixels`` of the recorded scan, whatever the binning."""
     return with_trajectory(scan, shift_px=pixels)
-
-
-def at_rest(scan: Scan) -> Scan:
-    """Returns the scan with the gantry at rest during exposures."""
-    return replace(scan, is_fly=False)
-
-
-def read(scan: Scan, axis: str, direction: int, readout_s: float) -> Scan:
-    """Returns the scan with lines along ``axis`` read one after another in ``readout_s``."""
-    shutter = replace(scan.shutter, axis=axis, direction=direction, readout_s=readout_s)
-    return replace(scan, shutter=shutter, is_fly=True)
 
 
 def turned(scan: Scan, angle_rad: np.ndarray, speed: float = 1.0) -> Scan:
