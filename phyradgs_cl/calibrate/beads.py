@@ -86,7 +86,7 @@ class BeadProblem(CoarseFrames):
         return float(np.std(residual if self.valid is None else residual[self.valid]))
 
     def explained(self, operator: BeadOperator, placement: np.ndarray) -> float:
-        """Returns the share of the compared frames' squares that the phantom explains; 0 for a negative density."""
+        """Returns the fraction of the compared frames' squares that the phantom explains; 0 for a negative density."""
         residual = self.compared(self.residual(operator, placement))
         whole = self.compared(self.masked(self.measured))
         return float(1 - residual @ residual / max(float(whole @ whole), 1e-30)) if placement[DENSITY] > 0 else 0.0
@@ -164,7 +164,7 @@ def _clipped_noise(scans: Sequence[Scan]) -> float:
 
 def _with_spread_of(scan: Scan, times: int) -> Scan:
     """Returns the scan with longer exposures about the same middle, so that ``times`` moments have the standard deviation of
-    the whole exposure. Few moments would otherwise look like a shorter exposure. Pulses stay as they are."""
+    the whole exposure. Few moments would otherwise look like a shorter exposure. Pulses stay unchanged."""
     if scan.shutter.pulse_s is not None:
         return scan
     exposure_s = scan.shutter.exposure_s / math.sqrt(1 - times**-2)

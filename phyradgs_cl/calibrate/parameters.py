@@ -1,4 +1,4 @@
-"""The parameters that can be calibrated: name, unit, stated value, step, and what an object would have to be instead."""
+"""The parameters that can be calibrated: name, unit, stated value, step, and the object that would look the same."""
 
 import math
 from collections.abc import Callable, Mapping

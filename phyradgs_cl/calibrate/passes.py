@@ -8,7 +8,7 @@ from phyradgs_cl.acquisition import Scan
 Report = Callable[[int, int, str, float], None]
 """Takes passes done, passes in all, the phase, and the share of the time that has passed."""
 Passes = tuple[int, float]
-"""Number of passes to come, and what they cost together."""
+"""Number of passes to come, and their cost together."""
 
 
 def pass_cost(scans: Sequence[Scan], columns: int, most_frames: int) -> float:

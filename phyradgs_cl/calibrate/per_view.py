@@ -1,7 +1,7 @@
 """Parameters of single views (a wobble), or of an object that moves slowly (a motion), by splines of time.
 
 A view's parameters change its own frame only, so their signals are images of that frame. CGLS solves the normal equations of
-a Gauss–Newton step for the volume and all parameters together: what an object can explain, the volume takes over.
+a Gauss–Newton step for the volume and all parameters together, so that parameters explain only what the volume cannot.
 """
 
 from abc import ABC, abstractmethod
@@ -72,7 +72,7 @@ class PerViewParameters(ABC):
 
 
 class WobbleParameters(PerViewParameters):
-    """A turn and two shifts per view, each by itself or by splines of time."""
+    """A turn and two shifts per view, separately for each or by splines of time."""
 
     KINDS = (Kind("turn per view", "deg", _DEG), Kind("shift-v per view", "mm", 1.0), Kind("shift-u per view", "mm", 1.0))
     MISMATCH = 4.0
@@ -160,8 +160,8 @@ def view_step(
     kinds: Sequence[int],
     iterations: int,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the Gauss–Newton step (n, K) from the parameters' values, 0 for other kinds than ``kinds``, and the signals
-    (F, kinds, rows, columns) of one pixel's worth of each kind, for the object ``volume``."""
+    """Returns the Gauss–Newton step (n, K) from the parameters' values for the object ``volume``, 0 for other kinds than
+    ``kinds``. Also returns the signals (F, kinds, rows, columns) of one pixel's worth of each kind."""
     operator = parameters.operator(problem, correction)
     residual = problem.residual(operator, volume)
     signals = np.stack([_signal(problem, correction, parameters, volume, kind) for kind in kinds], 1)
@@ -233,7 +233,7 @@ def _signal(
 def _share(
     problem: CoarseProblem, operator: RayOperator, basis: np.ndarray, signals: np.ndarray, iterations: int
 ) -> float:
-    """Returns the share of signals (F, rows, columns), with random signs, that no object explains."""
+    """Returns the fraction of signals (F, rows, columns), with random signs, that no object explains."""
     signs = np.random.default_rng(0).choice([-1.0, 1.0], basis.shape[1]).astype(np.float32)
     probe = signals * (basis @ signs).astype(np.float32)[:, None, None]
     (rest,) = problem.beyond_object(operator, np.zeros(operator.volume_shape, np.float32), [probe], iterations)

@@ -37,7 +37,7 @@ _TV = FistaTvOptions(tv_weight=0.0005, tv_iterations=8)
 class Stage:
     """One of the grids, from coarse to fine: at most ``columns`` blocks along the panel's longer side, and iterations of a
     ``first`` volume and of one made ``again``. ``steps`` Gauss–Newton steps at most, with ``project`` iterations each to
-    remove from a signal what a volume explains."""
+    remove the part of a signal that a volume explains."""
 
     columns: int
     first: int

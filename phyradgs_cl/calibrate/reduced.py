@@ -1,4 +1,4 @@
-"""The Gauss–Newton step of the parameters, after removing what a change of the volume explains.
+"""The Gauss–Newton step of the parameters, after removing the signals that a change of the volume explains.
 
 Variable projection (Golub and Pereyra, SIAM J. Numer. Anal. 10 (1973) 413) in Kaufman's form: with A the operator at the
 parameters θ, x the volume and P the projector onto A's range, the Jacobian is J = (I − P) ∂A/∂θ x. Each parameter's signal
@@ -27,10 +27,9 @@ _GAUGE_FACTOR, _MOST_GAUGE = 2.0, 0.2  # over a gauge's share, which is itself l
 class Reduced:
     """The linear problem of the parameters ``names`` (K of them) on one grid, N = F · pixels, ordered by frame.
 
-    jacobian (K, N): signals beyond what a volume explains, per unit of each parameter's field. sizes (K,): norms of the
-    whole signals. whole_gram (K, K): inner products of the whole signals over their norms. residual (N,): beyond what a
-    volume explains. noise: standard deviation of a pixel. mismatch (K,): factor of the deviations for errors other than
-    noise."""
+    jacobian (K, N): the parts of the signals that no volume explains, per unit of each parameter's field. residual (N,):
+    that of the residual. sizes (K,): norms of the whole signals. whole_gram (K, K): their inner products over their norms.
+    noise: standard deviation of a pixel. mismatch (K,): factor of the deviations for errors other than noise."""
 
     names: tuple[str, ...]
     mismatch: np.ndarray
@@ -68,10 +67,10 @@ class Reduced:
 
     @property
     def shares(self) -> np.ndarray:
-        """Share of each parameter's signal (K,) that no object explains, 0 to 1.
+        """How much of each parameter's signal (K,) no object explains, 0 to 1.
 
-        The smaller of: what remains of its norm; its certainty beside the other parameters, over that with a known
-        object."""
+        The smaller of two ratios: the remaining norm over the whole one; the parameter's certainty among all others, over
+        that with a known object."""
         known, unknown = (np.diag(np.linalg.inv(gram + _TINY * np.eye(len(gram)))) for gram in (self.whole_gram, self.gram))
         shares: np.ndarray = np.sqrt(np.minimum(np.minimum(known / unknown, np.diag(self.gram)), 1.0))
         return shares
@@ -138,10 +137,10 @@ def _signal(
 
 
 def least_share(problem: CoarseProblem, at: Mapping[str, float], volume: np.ndarray, iterations: int) -> float:
-    """Returns the share that has to remain of a parameter's signal.
+    """Returns the least share that has to remain of a parameter's signal.
 
-    It exceeds the share of a turn of all views, which no frame distinguishes from a turned object: voxels do not follow that
-    turn exactly, and leave as much of any other signal."""
+    It exceeds the one that remains of a turn of all views. No frame distinguishes that turn from a turned object; voxels do
+    not follow it exactly, and leave as much of any other signal."""
     gauge = float(reduced(problem, [GAUGE], at, volume, iterations).shares[0])
     return max(LEAST_SHARE, _GAUGE_FACTOR * min(gauge, _MOST_GAUGE))
 

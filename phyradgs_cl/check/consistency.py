@@ -1,8 +1,9 @@
 """Do the frames fit together under the stated order, angles and geometry?
 
 A coarse reconstruction of consistent frames leaves far less than one of the same frames in a random order. Where it does
-not, or where another hypothesis leaves half as much, something stated is wrong. The steps: remove odd frames; choose sense
-of rotation and panel shift, which have questions of their own; remove outliers; compare with random orders; try hypotheses.
+not, or where another hypothesis leaves half as much, something stated is wrong. The steps: remove odd frames; choose the
+sense of rotation and the panel's shift, which other questions judge; remove outliers; compare with random orders; try
+hypotheses.
 """
 
 from collections.abc import Iterable
@@ -60,8 +61,8 @@ class Consistency:
 
 @dataclass(frozen=True, eq=False)
 class _CoarseFit:
-    """The coarse scan with its best sense of rotation (``turned``) and panel shift as well (``best``), the fit of the latter
-    (``stated``), and the squared residuals of its frames in a random order and of the best rough fit."""
+    """The coarse scan with its best sense of rotation (``turned``), and with its best panel shift as well (``best``).
+    stated: the fit of ``best``. random: its squared residual in a random order. rough_square: that of the best rough fit."""
 
     turned: Scan
     best: Scan

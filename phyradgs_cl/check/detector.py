@@ -30,7 +30,7 @@ _FEWEST_FRAMES = 8  # for a drift
 @dataclass
 class CountReader:
     """``counts_to_attenuation`` for ``read_scan`` that remembers the counts' range. ``ceiling``: the largest count of any
-    frame, None for files without counts. ``at_ceiling``: the share of the projections' pixels with that count."""
+    frame, None for files without counts. ``at_ceiling``: the fraction of the projections' pixels with that count."""
 
     ceiling: float | None = None
     at_ceiling: float = 0.0
@@ -90,7 +90,7 @@ def _clipped(saturation: Saturation, remedy: str) -> Finding:
 
 
 def _jumps(p: np.ndarray, masked: np.ndarray) -> float:
-    """Returns the share of pixels (F, v, u) next to one that differs by most of the range; single dead pixels do not
+    """Returns the fraction of pixels (F, v, u) next to one that differs by most of the range; single dead pixels do not
     count."""
     if p.shape[2] < 2:
         return 0.0
@@ -101,8 +101,8 @@ def _jumps(p: np.ndarray, masked: np.ndarray) -> float:
 
 
 def _at_own_least(p: np.ndarray, masked: np.ndarray) -> float:
-    """Returns the share of pixels (F, v, u) that repeat their own least value: counts clipped before the flats. Pixels that
-    never change are dead, and line integrals of 0 are air in scans without noise."""
+    """Returns the fraction of pixels (F, v, u) that repeat their own least value: counts clipped before the flats. Pixels
+    that never change are dead, and line integrals of 0 are air in scans without noise."""
     least = p.min(0)
     at = (p == least) & ~masked & (np.abs(least) > _ZERO) & (p.max(0) > least)
     return clustered_share(at & (at.sum(0) >= _REPEATS))

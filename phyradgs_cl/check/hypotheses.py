@@ -26,7 +26,7 @@ SIZE_FACTORS = (10.0, 0.1, 1e3, 1e-3)
 LEAST_REDUNDANCY = 0.5  # of the columns: with fewer rays measured twice, frames fit any size
 _UNITS = {10.0: " (in cm, read as mm?)", 1e3: " (in m, read as mm?)", 1e-3: " (in µm, read as mm?)"}
 _FANS = (0.02, 3.0)  # the panel's width over its distance from the source, in real scanners
-_GRID_FACTOR = 3.0  # a stated grid that differs more from what the panel sees does not belong to the hypothesis
+_GRID_FACTOR = 3.0  # a stated grid that differs more from the panel's view does not belong to the hypothesis
 _SAME_PLACE = 1.0  # coarse pixels
 _ARC_PERCENTS = (-5, -4, -3, -2, -1, 1, 2, 3, 4, 5)
 _NEAR_SIZES = (0.5, 0.8, 0.9, 1.1, 1.25, 2.0)
@@ -49,7 +49,7 @@ class Hypothesis:
 
 
 def stated_redundancy(scan: Scan) -> float:
-    """Returns the share of columns whose rays a full turn measures twice; negative where the stated axis is beside the
+    """Returns the fraction of columns whose rays a full turn measures twice; negative where the stated axis misses the
     panel."""
     geometry = scan.geometry
     return 1 - 2 * abs(geometry.detector_offset_mm[1]) / (geometry.pixel_size_mm[1] * geometry.detector_shape[1])

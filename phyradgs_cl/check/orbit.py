@@ -99,7 +99,7 @@ def check_rotation(stated: AxisShift, other: AxisShift) -> Finding:
 
 
 def is_clear(stated: AxisShift, other: AxisShift) -> bool:
-    """True where one of two rough fits is so much better that the other needs no closer look."""
+    """True where one of two rough fits is better by a factor of three: the other needs no closer look."""
     ratio = residual_ratio(stated.squares, other.squares)
     return max(ratio, 1 / max(ratio, 1e-30)) >= _CLEAR_RATIO
 

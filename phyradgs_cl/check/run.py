@@ -1,4 +1,4 @@
-"""All questions in an order in which each rests on the ones before: what a question finds is corrected for the next."""
+"""All questions in an order in which each rests on the ones before: each error found is corrected for the next question."""
 
 import math
 from collections.abc import Callable

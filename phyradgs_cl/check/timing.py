@@ -16,7 +16,7 @@ _FEW_RAD = math.radians(5)  # a scan that covers less of its table may have anot
 _MILLISECONDS = (900.0, 3000.0)  # times the scan's duration: a table in ms and frames in s, the table a little longer
 _WIDE = 3.0  # times the median step between angles
 _SAME_RAD = 1e-6
-_TOLERATED_DEG = 1.0  # nearly parallel rays need no more than half a turn
+_TOLERATED_DEG = 1.0  # nearly parallel rays need half a turn only
 
 
 def check_timing(scan: Scan) -> Finding:

@@ -35,6 +35,7 @@ _OUTPUT = "The scan to write, with the corrections. An existing file is replaced
 _PHANTOM = "The object, if its shape is known: a TOML file of beads and wires (docs/formats.md), in any place."
 _SPLINES = "Let a wobble follow N cubic splines of time, at least 4."
 _WITH = "Another scan of the same object in the same place. Turned the other way, it determines readout and exposure."
+_UNDETERMINED = "parameters that are not determined stay as stated; docs/calibrate.md lists the scan that each needs"
 _PICTURE = "PNG of residuals before and after, and of corrections per view."
 
 
@@ -114,6 +115,8 @@ def _as_text(result: Calibration) -> str:
     for one in result.parameters:
         lines.append(f"{one.name:18s} {one.stated:12.6g} {_value(one):>25s} {one.unit:4s} {one.verdict}")
     lines += [f"not determined: {words}" for words in result.alike]
+    if result.alike:
+        lines.append(_UNDETERMINED)
     before, after = result.residual_rms
     lines.append(f"residual of the frames: {before:.4g} before, {after:.4g} after (RMS of line integrals)")
     return "\n".join(lines)

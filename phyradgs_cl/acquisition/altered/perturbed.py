@@ -16,8 +16,8 @@ class GeometryCorrection:
 
     Offsets move the panel along its own columns and rows. Roll turns it in its plane, tilts about v and u through its
     middle. Distances move source and panel away from the axis. Times lengthen readout and exposure, or start frames later.
-    lag adds to the share of the frame before. drift is the logarithm of the beam's gain from the first frame to the last.
-    turn_rad turns all views about the axis, which no frame can distinguish from a turned object.
+    lag adds to the fraction of each frame that the next one repeats. drift is the logarithm of the beam's gain from the
+    first frame to the last. turn_rad turns all views about the axis, which no frame can distinguish from a turned object.
     """
 
     offset_u_mm: float = 0.0
@@ -89,7 +89,7 @@ def splines(fraction: np.ndarray, count: int) -> np.ndarray:
 @dataclass(frozen=True, eq=False)
 class PerturbedTrajectory:
     """Poses of ``base`` for a panel of ``shape`` (rows, columns) after a correction of all views. ``views`` then corrects
-    each by itself, or lets the object move."""
+    single views, or lets the object move."""
 
     base: Trajectory
     shape: tuple[int, int]

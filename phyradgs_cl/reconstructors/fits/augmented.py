@@ -1,4 +1,4 @@
-"""A linear system with unknowns beside the volume, solved together with it."""
+"""A linear system with further unknowns than the volume, solved together with it."""
 
 import math
 from dataclasses import dataclass
