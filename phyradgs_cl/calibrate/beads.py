@@ -13,8 +13,9 @@ from phyradgs_cl.acquisition.altered.angles import exposure_arc_rad
 from phyradgs_cl.acquisition.altered.coarse import MOST_FRAMES, binned, fewer_frames
 from phyradgs_cl.acquisition.altered.perturbed import GeometryCorrection, Sway, Views, perturb
 from phyradgs_cl.acquisition.time_cells import TimeCells
-from phyradgs_cl.calibrate.problem import CoarseFrames, Stage, measured_blocks, without_pixels
+from phyradgs_cl.calibrate.problem import CoarseFrames, measured_blocks, without_pixels
 from phyradgs_cl.calibrate.shadows import DENSITY, BeadOperator
+from phyradgs_cl.calibrate.stages import Stage
 from phyradgs_cl.phantoms import EllipsoidPhantom
 
 _FEWEST_TIMES, _MOST_TIMES = 6, 24  # per exposure; the phantom's edge moves by a pixel between two

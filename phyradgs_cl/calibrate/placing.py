@@ -12,7 +12,7 @@ from phyradgs_cl.phantoms import Ellipsoid, EllipsoidPhantom
 
 FEWEST_BEADS = 4
 WRONG_PHANTOM = "is it the right phantom, all of it in view, in mm? Does the gantry turn as stated ('phyradgs check')?"
-_LEAST_SHARE = 0.75  # of the beads have to be found
+_LEAST_SHARE = 0.75  # of the beads have to be in bright spots
 _SMOOTH = 0.5  # of a bead's radius: a bead of many voxels then has one maximum
 _PEAKS_PER_BEAD = 2.0
 _TOLERANCE_VOXELS = 1.5
@@ -35,25 +35,26 @@ def bead_centres_mm(phantom: EllipsoidPhantom) -> np.ndarray:
 def placements(phantom: EllipsoidPhantom, volume: np.ndarray, grid: Grid) -> list[np.ndarray]:
     """Returns placements (6,): turns (rotation vectors, rad) and shifts (mm), which take most of the known beads to bright
     spots of a volume (z, y, x), the best first. InputError where none does."""
-    known = bead_centres_mm(phantom)
+    beads_mm = bead_centres_mm(phantom)
     radius_mm = np.median([body.reach_mm for body in phantom.ellipsoids if isinstance(body, Ellipsoid)])
     smooth = gaussian_filter(volume, _SMOOTH * radius_mm / np.array(grid.voxel_size_mm))
-    seen = _peaks_mm(smooth, grid, int(_PEAKS_PER_BEAD * len(known)) + FEWEST_BEADS)
+    spots_mm = _peaks_mm(smooth, grid, int(_PEAKS_PER_BEAD * len(beads_mm)) + FEWEST_BEADS)
     within_mm = _TOLERANCE_VOXELS * max(grid.voxel_size_mm)
     matches: list[tuple[int, float, np.ndarray]] = []  # beads found (negative), mean distance, placement
-    for three, corners in _matching_triangles(known, seen, within_mm):
-        place = _rigid(known[list(three)], seen[corners])
+    for three, corners in _matching_triangles(beads_mm, spots_mm, within_mm):
+        place = _rigid(beads_mm[list(three)], spots_mm[corners])
         for _ in range(2):  # from three beads, then from all near ones
-            apart_mm = np.linalg.norm(_moved(place, known)[:, None] - seen, axis=-1)
+            apart_mm = np.linalg.norm(_moved(place, beads_mm)[:, None] - spots_mm, axis=-1)
             near = apart_mm.min(1) < within_mm
             if near.sum() < 3:
                 break
-            place = _rigid(known[near], seen[apart_mm[near].argmin(1)])
+            place = _rigid(beads_mm[near], spots_mm[apart_mm[near].argmin(1)])
         matches.append((-int(near.sum()), float(np.mean(np.minimum(apart_mm.min(1), within_mm))), place))
     matches.sort(key=lambda one: one[:2])
     most = -matches[0][0] if matches else 0
-    if most < max(_LEAST_SHARE * len(known), FEWEST_BEADS - 1):
-        raise InputError("--phantom", f"{most} of {len(known)} beads where they should be", "most of them", WRONG_PHANTOM)
+    if most < max(_LEAST_SHARE * len(beads_mm), FEWEST_BEADS - 1):
+        matched = f"{most} of {len(beads_mm)} beads where they should be"
+        raise InputError("--phantom", matched, f"{100 * _LEAST_SHARE:.0f} % or more", WRONG_PHANTOM)
     best: list[np.ndarray] = []
     for count, _, place in matches:
         if -count < most - 1 or len(best) == _MOST:
@@ -80,14 +81,14 @@ def _peaks_mm(volume: np.ndarray, grid: Grid, most: int) -> np.ndarray:
 
 
 def _matching_triangles(
-    known: np.ndarray, seen: np.ndarray, within_mm: float
+    beads_mm: np.ndarray, spots_mm: np.ndarray, within_mm: float
 ) -> Iterator[tuple[tuple[int, int, int], list[int]]]:
     """Yields triangles of known points (n, 3) with triangles of seen ones (m, 3) whose sides are as long."""
     rng = np.random.default_rng(0)
-    apart = np.linalg.norm(seen[:, None] - seen, axis=-1)
+    apart = np.linalg.norm(spots_mm[:, None] - spots_mm, axis=-1)
     for _ in range(_TRIANGLES):
-        a, b, c = map(int, rng.permutation(len(known))[:3])
-        ab, bc, ca = (float(np.linalg.norm(known[i] - known[j])) for i, j in ((a, b), (b, c), (c, a)))
+        a, b, c = map(int, rng.permutation(len(beads_mm))[:3])
+        ab, bc, ca = (float(np.linalg.norm(beads_mm[i] - beads_mm[j])) for i, j in ((a, b), (b, c), (c, a)))
         if min(ab, bc, ca) < 3 * within_mm:
             continue
         for i, j in np.argwhere(np.abs(apart - ab) < within_mm):

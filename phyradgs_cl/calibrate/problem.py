@@ -16,7 +16,7 @@ from phyradgs_cl.acquisition.altered.coarse import (
     smooth,
 )
 from phyradgs_cl.acquisition.altered.perturbed import GeometryCorrection, Sway, Views, perturb, scan_course
-from phyradgs_cl.checks import ceil_div
+from phyradgs_cl.calibrate.stages import Stage
 from phyradgs_cl.detector import noise_level
 from phyradgs_cl.detector.attenuation import TRANSMISSION_FLOOR
 from phyradgs_cl.fields import Grid
@@ -31,27 +31,6 @@ from phyradgs_cl.runtime import Runtime
 _MOST_TIMES = 8  # per exposure
 _VOXELS_PER_TIME = 2.0  # by which the volume's edge moves between two
 _TV = FistaTvOptions(tv_weight=0.0005, tv_iterations=8)
-
-
-@dataclass(frozen=True)
-class Stage:
-    """One of the grids, from coarse to fine: at most ``columns`` blocks along the panel's longer side, and iterations of a
-    ``first`` volume and of one made ``again``. ``steps`` Gauss–Newton steps at most, with ``project`` iterations each to
-    remove the part of a signal that a volume explains."""
-
-    columns: int
-    first: int
-    again: int
-    steps: int = 3
-    project: int = 20
-
-    def block(self, scan: Scan) -> int:
-        """Returns the pixels along a block's side."""
-        return ceil_div(max(scan.geometry.detector_shape), self.columns)
-
-    def passes(self, parameters: int, asks: bool) -> int:
-        """Returns the most passes through the frames; ``asks``: it is tested which parameters the frames determine."""
-        return self.first - self.again + self.steps * (self.again + self.project * (parameters + (3 if asks else 1)))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -71,8 +71,10 @@ class Reduced:
 
         The smaller of two ratios: the remaining norm over the whole one; the parameter's certainty among all others, over
         that with a known object."""
-        known, unknown = (np.diag(np.linalg.inv(gram + _TINY * np.eye(len(gram)))) for gram in (self.whole_gram, self.gram))
-        shares: np.ndarray = np.sqrt(np.minimum(np.minimum(known / unknown, np.diag(self.gram)), 1.0))
+        tiny = _TINY * np.eye(len(self.names))
+        variance, variance_with_object = (np.diag(np.linalg.inv(gram + tiny)) for gram in (self.gram, self.whole_gram))
+        certainty = variance_with_object / variance
+        shares: np.ndarray = np.sqrt(np.minimum(np.minimum(certainty, np.diag(self.gram)), 1.0))
         return shares
 
     def step(self) -> np.ndarray:

@@ -25,12 +25,12 @@ from phyradgs_cl.calibrate.parameters import (
     correction_of,
     requested,
 )
-from phyradgs_cl.calibrate.passes import PassCounter, Passes, Report, pass_cost
 from phyradgs_cl.calibrate.per_view import MotionParameters, PerViewParameters, WobbleParameters
 from phyradgs_cl.calibrate.placing import WRONG_PHANTOM, bead_centres_mm, placements
-from phyradgs_cl.calibrate.problem import CoarseProblem, Stage
+from phyradgs_cl.calibrate.problem import CoarseProblem
 from phyradgs_cl.calibrate.result import AGREES, CANNOT_TELL, CORRECTED, Calibration, ParameterEstimate, rms
 from phyradgs_cl.calibrate.search import Fallback, Problem, Search
+from phyradgs_cl.calibrate.stages import PassCounter, Passes, Report, Stage, pass_cost
 from phyradgs_cl.calibrate.views import ViewsEstimate, estimate_views, passes_of_views
 from phyradgs_cl.check import SUSPICIOUS
 from phyradgs_cl.check.coverage import CUT_OFF, check_coverage
@@ -128,7 +128,7 @@ class _Calibrator:
         after = self._residual(problem, self.stages[-1], correction, views)
         if views is None and rms(after) > rms(before):  # a correction that explains the frames worse is none
             corrections, correction, after = {}, GeometryCorrection(), before
-            self.search.known, self.search.fixed = (), {}
+            self.search.determined, self.search.fixed = (), {}
         table += self.search.table(self.scan, corrections) + views_table
         corrected = perturb(self.scan, correction, views) if corrections or views is not None else self.scan
         if correction.drift:
@@ -162,9 +162,9 @@ class _Calibrator:
             self.search.descend(self._problem(steady, stage), stage)
             estimates = ", ".join(_in_short(one) for one in self.search.table(self.scan, {}))
             self.note(f"so far, {stage.columns} columns: {estimates}")
-            if not self.search.known:
+            if not self.search.determined:
                 return
-            self.passes.plan |= self._plan_of_stages(len(self.search.known), number + 1)
+            self.passes.plan |= self._plan_of_stages(len(self.search.determined), number + 1)
 
     def _with_steady_views(self, scan: Scan) -> Scan:
         """Returns the scan with its views corrected. A shift along u common to all views is the panel's offset, where that

@@ -13,7 +13,7 @@ import numpy as np
 from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.calibrate.beads import BeadProblem
 from phyradgs_cl.calibrate.parameters import PARAMETERS, Parameter, correction_of, in_words
-from phyradgs_cl.calibrate.problem import CoarseProblem, Stage
+from phyradgs_cl.calibrate.problem import CoarseProblem
 from phyradgs_cl.calibrate.reduced import (
     LEAST_SHARE_OF_BEADS,
     Reduced,
@@ -23,6 +23,7 @@ from phyradgs_cl.calibrate.reduced import (
     reduced,
 )
 from phyradgs_cl.calibrate.result import AGREES, CANNOT_TELL, CORRECTED, ParameterEstimate
+from phyradgs_cl.calibrate.stages import Stage
 from phyradgs_cl.calibrate.views import DISCRETISATION
 
 DEVIATIONS = 3.0  # by which a parameter has to differ from its stated value
@@ -48,8 +49,8 @@ class Fallback:
 @dataclass(eq=False)
 class Search:
     """The state of a search. ``at``: the current values by name; ``former``: those at the end of the previous grid, for
-    voxels. ``known``: the parameters that the frames determine, None before the first step. ``fallback``: estimates of
-    parameters from elsewhere, for those that are not known; ``fixed``: those in use. ``shares``: what remains of each
+    voxels. ``determined``: the parameters that the frames determine, None before the first step. ``fallback``: estimates of
+    parameters from elsewhere, for those that are not determined; ``fixed``: those in use. ``shares``: what remains of each
     signal. ``alike``: combinations that no frame distinguishes, in words. ``reduced``: the last linear problem."""
 
     parameters: Sequence[Parameter]
@@ -57,7 +58,7 @@ class Search:
     fixed: dict[str, Fallback] = field(default_factory=dict)
     at: dict[str, float] = field(default_factory=dict)
     former: dict[str, float] = field(default_factory=dict)
-    known: tuple[str, ...] | None = None
+    determined: tuple[str, ...] | None = None
     shares: dict[str, float] = field(default_factory=dict)
     alike: list[str] = field(default_factory=list)
     reduced: Reduced | None = None
@@ -65,66 +66,66 @@ class Search:
     def descend(self, problem: Problem, stage: Stage) -> None:
         """Steps on one grid until the steps are small."""
         volume: np.ndarray | None = None
-        asks = self.known is None
+        asks = self.determined is None
         self.former = {} if asks or isinstance(problem, BeadProblem) else dict(self.at)
         for number in range(stage.steps):
-            parameters = self.parameters if asks else [PARAMETERS[name] for name in self.known or ()]
+            parameters = self.parameters if asks else [PARAMETERS[name] for name in self.determined or ()]
             correction = correction_of(self.at)
             operator: Any = problem.operator(correction)
             volume = problem.corrected(correction).reconstruct(operator, volume, stage.again if number else stage.first)
             linear = reduced(problem, parameters, self.at, volume, stage.project)
             if asks:
-                self._determine_known(problem, stage, linear, volume)
-            assert self.known is not None
-            self.reduced = linear.relative_to_stated(self.at).only(self.known)
-            if not self.known or self._step(problem):
+                self._decide_determined(problem, stage, linear, volume)
+            assert self.determined is not None
+            self.reduced = linear.relative_to_stated(self.at).only(self.determined)
+            if not self.determined or self._step(problem):
                 return
 
-    def _determine_known(self, problem: Problem, stage: Stage, linear: Reduced, volume: np.ndarray) -> None:
+    def _decide_determined(self, problem: Problem, stage: Stage, linear: Reduced, volume: np.ndarray) -> None:
         """Decides which parameters the frames determine: those with a large enough share, and a useful deviation."""
         least = LEAST_SHARE_OF_BEADS
         if isinstance(problem, CoarseProblem):
             least = least_share(problem, self.at, volume, stage.project)
         names = identifiable(linear, least)
         deviations = linear.only(names).deviations() if names else ()
-        self.known = tuple(n for n, d in zip(names, deviations, strict=True) if PARAMETERS[n].is_known(float(d)))
+        self.determined = tuple(n for n, d in zip(names, deviations, strict=True) if PARAMETERS[n].is_known(float(d)))
         self.shares = dict(zip(linear.names, linear.shares.tolist(), strict=True))
-        self.fixed = {name: estimate for name, estimate in self.fallback.items() if name not in self.known}
+        self.fixed = {name: estimate for name, estimate in self.fallback.items() if name not in self.determined}
         free = linear.only([name for name in linear.names if name not in self.fixed])
         self.alike = [in_words(weights) for weights in indistinguishable(free, least)] if free.names else []
         for name, estimate in self.fixed.items():
             self.at[name] = estimate.correction
 
     def _step(self, problem: Problem) -> bool:
-        """Moves the known parameters, each as far as its signal is linear; True where the step was small."""
-        assert self.reduced is not None and self.known is not None
-        current = np.array([self.at.get(name, 0.0) for name in self.known])
+        """Moves the determined parameters, each as far as its signal is linear; True where the step was small."""
+        assert self.reduced is not None and self.determined is not None
+        current = np.array([self.at.get(name, 0.0) for name in self.determined])
         change = self.reduced.step() - current
         self.at = {name: estimate.correction for name, estimate in self.fixed.items()}
-        for name, old, difference in zip(self.known, current, change, strict=True):
+        for name, old, difference in zip(self.determined, current, change, strict=True):
             most = _MOST_PX * problem.block / PARAMETERS[name].pixels(problem.scans[0])
             lowest = PARAMETERS[name].lowest(problem.scans[0])
             self.at[name] = max(old + float(np.clip(difference, -most, most)), lowest)
         return bool(np.all(np.abs(change) < _SETTLED * self.reduced.deviations()))
 
     def estimates(self) -> tuple[np.ndarray, np.ndarray]:
-        """Returns the values of the known parameters and their standard deviations.
+        """Returns the values of the determined parameters and their standard deviations.
 
         A deviation combines noise and discretisation error; the latter is half the change since the coarser grid. Both grow
-        where a parameter resembles unknown ones, which stay as stated, right or wrong."""
-        if self.reduced is None or not self.known:
+        where a parameter resembles undetermined ones, which stay as stated, right or wrong."""
+        if self.reduced is None or not self.determined:
             return np.zeros(0), np.zeros(0)
         values, noise = self.reduced.step(), self.reduced.deviations()
-        change = values - [self.former.get(name, value) for name, value in zip(self.known, values, strict=True)]
-        resemblance = np.maximum(self.reduced.shares / [self.shares[name] for name in self.known], 1.0)
+        change = values - [self.former.get(name, value) for name, value in zip(self.determined, values, strict=True)]
+        resemblance = np.maximum(self.reduced.shares / [self.shares[name] for name in self.determined], 1.0)
         return values, resemblance * np.hypot(noise, DISCRETISATION * change)
 
     def corrections(self) -> dict[str, float]:
         """Returns the values of the parameters that differ from the stated ones by three deviations. The others go back to
         their stated values, which changes the rest: this repeats until all of the rest differ."""
         values, deviations = self.estimates()
-        deviation = dict(zip(self.known or (), deviations, strict=True))
-        names = self.known or ()
+        deviation = dict(zip(self.determined or (), deviations, strict=True))
+        names = self.determined or ()
         while self.reduced is not None and names:
             is_off = [abs(value) > DEVIATIONS * deviation[name] for name, value in zip(names, values, strict=True)]
             if all(is_off):
@@ -135,19 +136,18 @@ class Search:
         return significant | dict(zip(names, map(float, values), strict=True))
 
     def table(self, scan: Scan, corrections: Mapping[str, float]) -> list[ParameterEstimate]:
-        """Returns an estimate per parameter."""
+        """Returns an estimate per parameter; with ``corrections``, their values."""
         values, deviations = self.estimates()
-        known = {name: (estimate.value, estimate.deviation) for name, estimate in self.fixed.items()}
-        known |= dict(zip(self.known or (), zip(values.tolist(), deviations.tolist(), strict=True), strict=True))
-        return [self._estimate(one, scan, known.get(one.name), corrections) for one in self.parameters]
-
-    def _estimate(
-        self, one: Parameter, scan: Scan, known: tuple[float, float] | None, corrections: Mapping[str, float]
-    ) -> ParameterEstimate:
-        stated, share = one.stated(scan) * one.scale, self.shares[one.name]
-        if known is None:
-            return ParameterEstimate(one.name, one.unit, stated, None, None, share, CANNOT_TELL)
-        value, deviation = known
-        verdict = CORRECTED if one.name in corrections else AGREES
-        found = stated + corrections.get(one.name, value) * one.scale
-        return ParameterEstimate(one.name, one.unit, stated, found, deviation * one.scale, share, verdict)
+        estimates = {name: (estimate.value, estimate.deviation) for name, estimate in self.fixed.items()}
+        estimates |= dict(zip(self.determined or (), zip(values.tolist(), deviations.tolist(), strict=True), strict=True))
+        table = []
+        for one in self.parameters:
+            stated, share = one.stated(scan) * one.scale, self.shares[one.name]
+            if one.name not in estimates:
+                table.append(ParameterEstimate(one.name, one.unit, stated, None, None, share, CANNOT_TELL))
+                continue
+            value, deviation = estimates[one.name]
+            found = stated + corrections.get(one.name, value) * one.scale
+            verdict = CORRECTED if one.name in corrections else AGREES
+            table.append(ParameterEstimate(one.name, one.unit, stated, found, deviation * one.scale, share, verdict))
+        return table

@@ -7,10 +7,10 @@ import numpy as np
 
 from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.acquisition.altered.perturbed import GeometryCorrection, Sway, Views
-from phyradgs_cl.calibrate.passes import PassCounter, Passes, pass_cost
 from phyradgs_cl.calibrate.per_view import PerViewParameters, view_deviations, view_step
-from phyradgs_cl.calibrate.problem import CoarseProblem, Stage
+from phyradgs_cl.calibrate.problem import CoarseProblem
 from phyradgs_cl.calibrate.result import AGREES, CORRECTED, ParameterEstimate
+from phyradgs_cl.calibrate.stages import PassCounter, Passes, Stage, pass_cost
 from phyradgs_cl.runtime import Runtime
 
 DISCRETISATION = 0.5  # of the change since a grid half as fine: the error that remains, if it is of first order

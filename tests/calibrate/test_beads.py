@@ -12,7 +12,7 @@ from phyradgs_cl.acquisition.altered.perturbed import GeometryCorrection, pertur
 from phyradgs_cl.calibrate import CANNOT_TELL, CORRECTED, calibrate
 from phyradgs_cl.calibrate.beads import BeadProblem
 from phyradgs_cl.calibrate.placing import placements
-from phyradgs_cl.calibrate.problem import Stage
+from phyradgs_cl.calibrate.stages import Stage
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.importers import load_beads
@@ -192,3 +192,4 @@ def test_files_of_beads_are_checked(refused, file, tmp_path) -> None:
         refused(words, said)
     refused([*words[:6], tmp_path / "none.toml", *words[7:]], "none.toml")
     refused([*words[:6], file, "-o", file], "the input file")
+

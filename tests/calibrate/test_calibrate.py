@@ -11,11 +11,11 @@ from phyradgs_cl.acquisition.altered.perturbed import GeometryCorrection, Sway, 
 from phyradgs_cl.api import simulate
 from phyradgs_cl.calibrate import AGREES, CANNOT_TELL, CORRECTED, Calibration, calibrate
 from phyradgs_cl.calibrate.parameters import in_words
-from phyradgs_cl.calibrate.passes import PassCounter
 from phyradgs_cl.calibrate.per_view import SPLINES, MotionParameters, WobbleParameters
-from phyradgs_cl.calibrate.problem import CoarseProblem, Stage
+from phyradgs_cl.calibrate.problem import CoarseProblem
 from phyradgs_cl.calibrate.reduced import Reduced
 from phyradgs_cl.calibrate.search import Search
+from phyradgs_cl.calibrate.stages import PassCounter, Stage
 from phyradgs_cl.calibrate.views import estimate_views
 from phyradgs_cl.detector import lagged
 from phyradgs_cl.errors import InputError
@@ -87,7 +87,7 @@ def test_what_differs_by_less_than_three_deviations_is_not_corrected_along(tilt,
     known = ("offset-u", "tilt-v")
     shares = dict(zip(known, problem.shares.tolist(), strict=True))
     off = replace(problem, residual=problem.residual + wrong)
-    kept = Search([], known=known, shares=shares, reduced=off).corrections()
+    kept = Search([], determined=known, shares=shares, reduced=off).corrections()
     assert set(kept) == names
     alone = problem.only(tuple(sorted(names)))
     expected = replace(alone, residual=problem.residual + wrong).step()

@@ -8,9 +8,10 @@ import pytest
 from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, Protocol, Scan
 from phyradgs_cl.calibrate import AGREES, CANNOT_TELL, CORRECTED, calibrate
 from phyradgs_cl.calibrate.parameters import PARAMETERS
-from phyradgs_cl.calibrate.problem import CoarseProblem, Stage
+from phyradgs_cl.calibrate.problem import CoarseProblem
 from phyradgs_cl.calibrate.reduced import LEAST_SHARE
 from phyradgs_cl.calibrate.search import Fallback, Search
+from phyradgs_cl.calibrate.stages import Stage
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.simulation import SimulationOptions, phantom_scene, simulate
 
@@ -56,7 +57,7 @@ def test_what_only_the_axis_tells_is_not_said_to_be_undetermined(rt, half_turn) 
     problem = CoarseProblem.of(rt, False, [scan], stage)
     alone = Search([PARAMETERS["offset-u"]])
     alone.descend(problem, stage)
-    assert alone.known == () and alone.shares["offset-u"] < 2 * LEAST_SHARE
+    assert alone.determined == () and alone.shares["offset-u"] < 2 * LEAST_SHARE
     assert alone.alike == ["offset-u: looks like an object beside the axis"]
     assert alone.table(scan, {})[0].verdict == CANNOT_TELL
     for fallback, verdict in ((Fallback(0.3, 0.01, True), CORRECTED), (Fallback(0.001, 0.01, False), AGREES)):

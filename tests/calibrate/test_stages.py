@@ -4,7 +4,7 @@ import pytest
 
 from phyradgs_cl.api import simulate
 from phyradgs_cl.calibrate import calibrate
-from phyradgs_cl.calibrate.passes import PassCounter
+from phyradgs_cl.calibrate.stages import PassCounter
 
 
 def test_the_share_is_of_costs_and_what_is_not_needed_is_taken_out() -> None:

@@ -1,9 +1,10 @@
-"""Progress of a calibration: passes through the frames, each of which costs more on a finer grid."""
+"""The grids of a calibration, from coarse to fine, and its progress in passes through the frames."""
 
-import math
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 
 from phyradgs_cl.acquisition import Scan
+from phyradgs_cl.checks import ceil_div
 
 Report = Callable[[int, int, str, float], None]
 """Takes passes done, passes in all, the phase, and the share of the time that has passed."""
@@ -11,10 +12,31 @@ Passes = tuple[int, float]
 """Number of passes to come, and their cost together."""
 
 
+@dataclass(frozen=True)
+class Stage:
+    """One of the grids, from coarse to fine: at most ``columns`` blocks along the panel's longer side, and iterations of a
+    ``first`` volume and of one made ``again``. ``steps`` Gauss–Newton steps at most, with ``project`` iterations each to
+    remove the part of a signal that a volume explains."""
+
+    columns: int
+    first: int
+    again: int
+    steps: int = 3
+    project: int = 20
+
+    def block(self, scan: Scan) -> int:
+        """Returns the pixels along a block's side."""
+        return ceil_div(max(scan.geometry.detector_shape), self.columns)
+
+    def passes(self, parameters: int, asks: bool) -> int:
+        """Returns the most passes through the frames; ``asks``: it is tested which parameters the frames determine."""
+        return self.first - self.again + self.steps * (self.again + self.project * (parameters + (3 if asks else 1)))
+
+
 def pass_cost(scans: Sequence[Scan], columns: int, most_frames: int) -> float:
     """Returns the cost of one pass with at most ``columns``: in proportion to rays times voxels along a ray."""
     shape = scans[0].geometry.detector_shape
-    rows, across = (math.ceil(n / math.ceil(max(shape) / columns)) for n in shape)
+    rows, across = (ceil_div(n, ceil_div(max(shape), columns)) for n in shape)
     return float(sum(min(scan.frames, most_frames) for scan in scans) * rows * across * max(rows, across))
 
 
