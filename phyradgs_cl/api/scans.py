@@ -181,7 +181,7 @@ def _pixels(
     if quantity is None and flat is None:
         check_not_counts(values, 'give flats=, or quantity="attenuation"', mask)
         _warn_of_transmission(values)
-    found = line_integrals("frames", values, ImportOptions(), flats=flat, darks=dark, custom=held)
+    found = line_integrals("frames", values, ImportOptions(), flats=flat, darks=dark, convention=held)
     if mask is None:
         return found
     own = np.asarray(mask) != 0

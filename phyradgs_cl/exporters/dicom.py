@@ -46,7 +46,7 @@ class DicomLabels:
 
     @property
     def given(self) -> dict[str, object]:
-        """The stated labels by name."""
+        """Returns the stated labels by name."""
         return {one.name: value for one in fields(self) if (value := getattr(self, one.name)) is not None}
 
     @property

@@ -1,6 +1,6 @@
-"""Scans and volumes in other programs' formats: read, checked as if by strangers, and turned into our conventions.
+"""Scans and volumes in other programs' formats, checked and converted to this package's conventions.
 
-`import_scan` and `load_volume` are the doors; one module per format.
+`import_scan` and `load_volume` read them; a format is a module of formats/.
 """
 
 import lazy_loader

@@ -16,8 +16,8 @@ _KEYS = {
 
 
 def load_beads(path: Path) -> EllipsoidPhantom:
-    """The beads, then the wires, of a TOML file, called as it is. InputError: not TOML; keys that are unknown, missing or
-    wrong; no bead; more than a thousand bodies."""
+    """Reads the beads, then the wires, of a TOML file as a phantom with the file's name. InputError: not TOML; unknown,
+    missing or wrong keys; no bead; more than a thousand bodies."""
     content = read_toml(path)
     refuse_unknown(str(path), content, ("title", _COMMON, *_KEYS))
     top = Fields(str(path), content)

@@ -1,4 +1,4 @@
-"""What the user says about a foreign scan that its files do not say, or say differently."""
+"""Options of an import: values that a foreign scan's files do not state, or that replace theirs."""
 
 from dataclasses import dataclass, field, fields
 
@@ -25,18 +25,18 @@ _TIMES = ("exposure_s", "readout_s")
 
 @dataclass(frozen=True)
 class ImportOptions:
-    """Options of an import; None leaves it to the file, or to the format's custom.
+    """Options of an import. None leaves a value to the file or to the format's convention.
 
-    Timing: ``exposure_s`` and ``readout_s`` of a frame; ``frame_time_s`` from one opening to the next: the gantry turned
-    without a stop; ``angle_at``: a frame's angle is that of its first line's opening ("start") or mid-exposure. Readout
-    axis and direction are those of the imported scan: row 0 the lowest, column 0 on the left, seen from the source.
-    In a data sheet's words: ``first`` ("top", "bottom", "left", "right") is the line that is read first and states axis and
-    direction; ``fps`` states the frame time, ``readout_ms`` the readout. Two that contradict are refused.
-    Geometry: distances, pixel size and detector offset (v, u) in mm; ``unit_mm``: a scene unit where formats have none;
-    ``rotates``: what the angles turn; ``row_0``, ``column_0``: where the first stored ones are, seen from the source.
-    Pixels: ``quantity`` that is stored; ``flat_value``: counts without an object, where there are no flat frames.
-    ``part``: which projections of a benchmark folder; ``first_view``: where this scan begins in a file of several.
-    ``named``: how messages call a field; by itself as Python does.
+    Timing: ``exposure_s`` and ``readout_s`` of a frame; ``frame_time_s`` from one opening to the next, of a gantry that
+    turned without a stop; ``angle_at``: a frame's angle is that of its first line's opening ("start") or mid-exposure
+    ("middle"). Readout axis and direction are those of the imported scan: row 0 the lowest, column 0 on the left, seen from
+    the source. In a data sheet's words: ``first`` ("top", "bottom", "left", "right") is the line that is read first and
+    states axis and direction; ``fps`` states the frame time, ``readout_ms`` the readout. Contradictions are refused.
+    Geometry: distances, pixel size and detector offset (v, u) in mm; ``unit_mm``: length of a scene unit of formats without
+    millimetres; ``rotates``: gantry or sample; ``row_0``, ``column_0``: places of the first stored ones, seen from the
+    source. Pixels: the stored ``quantity``; ``flat_value``: counts without an object, where there are no flat frames.
+    ``part``: the projections of a benchmark folder; ``first_view``: the first view of this scan in a file of several.
+    ``named``: returns the name of a field in messages.
     """
 
     exposure_s: float | None = None
@@ -67,12 +67,12 @@ class ImportOptions:
         for name, allowed in {**WORDS, "readout_direction": (1, -1)}.items():
             if getattr(self, name) is not None:
                 checks.one_of(self.named(name), getattr(self, name), allowed)
-        for name in (*_POSITIVE, *_TIMES):
-            if (value := getattr(self, name)) is not None:
-                if name in _TIMES:
-                    checks.at_least(self.named(name), value, 0)
-                else:
-                    checks.positive(self.named(name), value)
+        for name in _POSITIVE:
+            if getattr(self, name) is not None:
+                checks.positive(self.named(name), getattr(self, name))
+        for name in _TIMES:
+            if getattr(self, name) is not None:
+                checks.at_least(self.named(name), getattr(self, name), 0)
         if self.first_view is not None:
             checks.within(self.named("first_view"), self.first_view, 0, 1_000_000)
         for length in self.pixel_size_mm or ():
@@ -82,7 +82,7 @@ class ImportOptions:
         self._take_words()
 
     def _take_words(self) -> None:
-        """What the words of a data sheet state, in the fields that every format reads."""
+        """Converts the words of a data sheet to the fields that every format reads."""
         axis, direction = readout_order(self.first, self.readout_axis, self.readout_direction, self.named)
         stated = {
             "readout_axis": axis,
@@ -94,28 +94,28 @@ class ImportOptions:
             object.__setattr__(self, name, value)
 
     def given(self, among: tuple[str, ...]) -> list[str]:
-        """Those fields of ``among`` that the user gave."""
+        """Returns the fields of ``among`` that the user gave."""
         return [name for name in among if getattr(self, name) != _DEFAULTS[name]]
 
     def called(self, name: str) -> str:
-        """How messages call a field, by the word of a data sheet where the user gave that."""
+        """Returns the name of a field in messages: the word of a data sheet where the user gave that."""
         word = _WORD_OF.get(name, name)
         return self.named(name if getattr(self, word) is None else word)
 
     def refuse_unused(self, form: str, used: tuple[str, ...]) -> None:
-        """InputError for an option that the format ``form`` would pass over in silence."""
+        """Raises InputError for an option that the format ``form`` does not read."""
         for name in self.given(tuple(name for name in FIELDS if name not in (*used, *_WORD_OF.values()))):
             subject, found = f"{self.called(name)} with format {form}", str(getattr(self, name))
-            expected = "none of it: the files say it, or it has no meaning there"
+            expected = "no such option: the files state it, or it has no meaning there"
             raise InputError(subject, found, expected, "leave the option out")
 
 
 _WORD_OF = {"readout_axis": "first", "readout_direction": "first", "frame_time_s": "fps", "readout_s": "readout_ms"}
 _DEFAULTS = {item.name: item.default for item in fields(ImportOptions) if item.name != "named"}
 FIELDS = tuple(_DEFAULTS)
-"""The names of what a user may say; ``named`` is none of it."""
+"""The names of the options, without ``named``."""
 
-# what formats that say little take from the user
+# options of formats whose files state little
 TIMING = (
     *("exposure_s", "readout_s", "frame_time_s", "angle_at", "readout_axis", "readout_direction"),
     *("first", "fps", "readout_ms"),
@@ -129,12 +129,12 @@ _OPTIONS = {"readout_axis": "--readout", "detector_offset_mm": "--detector-offse
 
 
 def option_name(field: str) -> str:
-    """How the command line calls a field of ImportOptions."""
+    """Returns the option of the command line for a field of ImportOptions."""
     return _OPTIONS.get(field, "--" + field.replace("_", "-"))
 
 
 def needed(value: float | None, field: str, subject: str, named: Named) -> float:
-    """A length that the file does not carry, from the options, or an InputError that asks for it."""
+    """Returns a length that the file does not hold, from the options; InputError that asks for it where it is missing."""
     if value is None:
         parallel = "; of a parallel beam a thousand panel widths, and one more to the detector"
         remedy = f"say {named(field)}{parallel if field.startswith('source_to') else ''}"

@@ -39,7 +39,7 @@ def _reader(path: str | Path) -> tuple[str, Callable[[Path], Volume]] | None:
 
 
 def _read_npy(path: Path) -> Volume:
-    """Reads an array (z, y, x), with its grid from the .json file beside it."""
+    """Reads an array (z, y, x) and its grid, which a .json file of the same name holds."""
     values, beside = read_npy(path, 3), path.with_suffix(".json")
     facts = read_json(beside) if beside.is_file() else {}
     if "voxel_size_mm" not in facts:
@@ -67,7 +67,8 @@ def _bare(path: Path, values: np.ndarray) -> Volume:
 
 
 def _on_grid(path: Path, values: np.ndarray, size_mm: np.ndarray, first_mm: np.ndarray | None, note: str) -> Volume:
-    """A volume with voxels of ``size_mm``, the first of them centred at ``first_mm`` (z, y, x); None centres the volume."""
+    """Returns a volume with voxels of ``size_mm``, the first of them centred at ``first_mm`` (z, y, x); None centres the
+    volume."""
     if "HU" in note.split():
         raise InputError(str(path), "Hounsfield units", "1/mm", "export it without --mu-water-per-mm")
     centre_mm = np.zeros(3) if first_mm is None else first_mm + (np.array(values.shape) - 1) / 2 * size_mm

@@ -13,17 +13,17 @@ _RESTART = "start without --resume"
 
 
 def checkpoint_path(output: str | Path) -> Path:
-    """Where the checkpoint of a run that writes ``output`` lies."""
+    """Returns the path of the checkpoint of a run that writes ``output``."""
     return beside(output, ".checkpoint.npz")
 
 
 def former_checkpoint_path(output: str | Path) -> Path:
-    """Where the checkpoint of an earlier run is kept that another run of the same output has found."""
+    """Returns the path to which a new run moves the checkpoint of an earlier run of the same output."""
     return beside(output, ".checkpoint.npz.bak")
 
 
 def partial_path(output: str | Path) -> Path:
-    """Where an interrupted run that was to write ``output`` leaves what it has: NAME.partial.SUFFIX."""
+    """Returns the path of an interrupted run's result: NAME.partial.SUFFIX for ``output`` NAME.SUFFIX."""
     path = Path(output)
     return beside(path.with_suffix(""), f".partial{path.suffix}")
 

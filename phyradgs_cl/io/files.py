@@ -18,7 +18,7 @@ except ImportError:  # not POSIX
     resource = None  # type: ignore[assignment]
 
 HOST_SHARE = 0.8
-"""The share of this machine's memory that one array may take."""
+"""The largest part of this machine's memory for one array."""
 _NO_WAITING = getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_NOCTTY", 0) | getattr(os, "O_BINARY", 0)
 _BLOCK_BYTES = 1 << 20
 

@@ -1,4 +1,4 @@
-"""Outputs that are whole or absent: written beside the target, then renamed over it; one run per output by a lock file."""
+"""Outputs that are whole or absent: written under another name, then renamed; one run per output by a lock file."""
 
 import errno
 import glob
@@ -21,7 +21,7 @@ NO_SPACE = (errno.ENOSPC, errno.EFBIG, getattr(errno, "EDQUOT", errno.ENOSPC))
 """System errors for a lack of room: on the disk, for one file, of the user's quota."""
 _LONGEST = 50  # characters of the target's name, of up to four bytes each: names end at 255
 _LONGEST_BYTES = 255  # of a name, in all common file systems
-_SPARE_BYTES = 1 << 16  # for headers beside the arrays
+_SPARE_BYTES = 1 << 16  # for headers
 _WRITER = re.compile(r"\.([0-9a-f]{8})-(\d{1,9})-[0-9a-f]{8}\.part(\.[a-z.]+)?$")
 _TRY_EVERY_S = 0.2
 
@@ -138,7 +138,8 @@ def _create_beside(target: Path, suffix: str = "") -> Path:
 
 
 def temporary_name(target: Path, suffix: str = "") -> Path:
-    """Returns a new name beside ``target`` that holds the number of this process; removes files that dead processes left."""
+    """Returns a new name in the target's folder that holds the number of this process; removes files that dead
+    processes left."""
     for path in target.parent.glob(f".{glob.escape(target.stem[:_LONGEST])}*.part*"):
         writer = _WRITER.search(path.name)
         if writer and writer[1] == _machine() and _is_dead(int(writer[2])):

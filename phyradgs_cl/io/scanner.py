@@ -1,4 +1,4 @@
-"""Scanner descriptions: a small TOML file with a geometry, a volume and how the panel reads out."""
+"""Scanner descriptions: a TOML file with the geometry, the volume and the readout of the panel."""
 
 import math
 from dataclasses import dataclass, replace
@@ -32,9 +32,9 @@ MOST_LINES = 65_536
 
 @dataclass(frozen=True)
 class Scanner:
-    """A scanner: where things stand, what volume it images, and how its panel is read by default. ``readout_ratio``:
-    T_ro/T_exp, None is the protocol's. ``pulse``: when the beam is on in a frame (start, length; shares of the
-    exposure), None always. ``lag``: the panel's λ. ``fps`` and ``readout_ms``: the data sheet's frame rate and readout."""
+    """A scanner: geometry, imaged volume, and the default readout of its panel. ``readout_ratio``: T_ro/T_exp, None for the
+    protocol's. ``pulse``: start and length of the beam in a frame, in exposures; None for a steady beam. ``lag``: the
+    panel's λ. ``fps``, ``readout_ms``: frame rate and readout of the data sheet."""
 
     name: str
     geometry: ConeGeometry
@@ -49,14 +49,14 @@ class Scanner:
 
 
 def load_scanner(name_or_path: str | Path, data_dir: Path) -> Scanner:
-    """A scanner by name (``data_dir``/NAME.toml) or from a path that ends in .toml. InputError: no such scanner, not
-    TOML, unknown, missing or wrong keys: "FILE [table] key"."""
+    """Loads a scanner by name (``data_dir``/NAME.toml) or from a path that ends in .toml. InputError: no such scanner, not
+    TOML; unknown, missing or wrong keys, as "FILE [table] key"."""
     path = _located(str(name_or_path), data_dir)
     return scanner_from(path, read_toml(path))
 
 
 def with_detector_count(geometry: ConeGeometry, rows: int, columns: int) -> ConeGeometry:
-    """The same panel, equally large and in the same place, with another number of pixels."""
+    """Returns the same panel, of the same size and place, with another number of pixels."""
     if min(rows, columns) < 1:
         raise InputError("detector count", f"{rows} × {columns}", "at least 1 row and 1 column")
     (nv, nu), (pitch_v, pitch_u) = geometry.detector_shape, geometry.pixel_size_mm
@@ -75,7 +75,7 @@ def _located(name: str, data_dir: Path) -> Path:
 
 
 def _describes_scanner(path: Path) -> bool:
-    """Whether a TOML file has what every scanner has; other files may lie beside the scanners."""
+    """True for a TOML file with the table that every scanner has; the folder may hold other files."""
     try:
         return "source" in read_toml(path)
     except InputError:
@@ -83,7 +83,7 @@ def _describes_scanner(path: Path) -> bool:
 
 
 def scanner_from(path: Path, content: dict[str, object]) -> Scanner:
-    """The scanner that a TOML file's content describes; ``path`` names it in messages."""
+    """Returns the scanner that the content of a TOML file describes; ``path`` names it in messages."""
     refuse_unknown(str(path), content, (*TABLES, *_WORDS), "a table")
     tables = {name: Fields(f"{path} [{name}]", content.get(name, {}), keys) for name, keys in TABLES.items()}
     geometry = _geometry(tables["source"], tables["detector"])
@@ -108,7 +108,7 @@ def scanner_from(path: Path, content: dict[str, object]) -> Scanner:
 
 
 def _order(readout: Fields) -> tuple[str, int]:
-    """Readout axis and direction, as ``first`` or as themselves; rows from the lowest up where the table has none."""
+    """Returns readout axis and direction, from ``first`` or their own keys; rows from the lowest up by default."""
     direction = readout.get("direction") if readout.has("direction") else 1
     if isinstance(direction, bool) or direction not in (1, -1):
         raise readout.error("direction", described(direction), "1 (index 0 first) or -1 (index 0 last)")

@@ -61,7 +61,7 @@ def read_facts(subject: str, text: str, types: Mapping[str, tuple[type, ...]]) -
 
 
 def _fits(value: object) -> bool:
-    """Whether a list holds tables only, and a number is finite, of 64 bits at most."""
+    """True for a list of tables, for a finite number of 64 bits at most, and for other types."""
     if isinstance(value, list):
         return all(isinstance(line, dict) for line in value)
     return not isinstance(value, (int, float)) or abs(value) < 2**63

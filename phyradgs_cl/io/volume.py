@@ -48,7 +48,7 @@ class Volume:
 
     @property
     def required_grid(self) -> Grid:
-        """The grid of a volume that has one; InputError for a bare array."""
+        """Returns the grid; InputError for a bare array."""
         if self.grid is None:
             raise InputError("volume", "values without voxel sizes", "a volume with its grid in mm")
         return self.grid
@@ -269,7 +269,7 @@ def _read_bare(source: Hdf5Source) -> np.ndarray:
 
 
 def shares_of_maximum(values: np.ndarray) -> np.ndarray:
-    """Returns integers divided by the maximum of their type, in float32; other numbers as they are."""
+    """Returns integers divided by the maximum of their type, in float32, and other numbers unchanged."""
     return values / np.float32(np.iinfo(values.dtype).max) if values.dtype.kind in "iu" else values
 
 

@@ -36,7 +36,7 @@ def import_scan(path: Path, options: ImportOptions) -> Scan:
         volume = _array(data, "image", 3)
         reference = tigre.turned_volume(data.name("image"), volume, grid, _PER_MM)
     frames = oriented(frames, options, tigre.ROW_0)
-    integrals = line_integrals(str(path), frames, options, custom="attenuation")
+    integrals = line_integrals(str(path), frames, options, convention="attenuation")
     trajectory = turning(geometry, angle_rad, timing)
     return assemble_scan(
         integrals,

@@ -69,7 +69,7 @@ def import_scan(path: Path, options: ImportOptions) -> Scan:
     frames = oriented(turn.frames(frames), options, "bottom")
     flats, darks = (frames[key == kind] for kind in (schema.FLAT, schema.DARK))
     where = f"{path}:{detector}/data"
-    integrals = line_integrals(where, frames[used], options, flats=flats, darks=darks, custom=quantity)
+    integrals = line_integrals(where, frames[used], options, flats=flats, darks=darks, convention=quantity)
     if mask is not None:
         mask = oriented(turn.frames(mask), options, "bottom")
         integrals = replace(integrals, mask=united(mask, integrals.mask))

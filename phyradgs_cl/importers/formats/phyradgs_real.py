@@ -95,7 +95,7 @@ def import_scan(path: Path, options: ImportOptions) -> Scan:
     poses = turn.poses(poses, panel)
     times = timing.start_s[:, None] + np.linspace(0, shutter.span_s, _TIMES_A_FRAME)
     integrals = line_integrals(
-        str(description), turn.frames(frames), _with_flat(options, frames), custom="counts"
+        str(description), turn.frames(frames), _with_flat(options, frames), convention="counts"
     )
     trajectory = PoseTable(times.ravel(), poses.reshape(-1, 12), f"{description} views")
     plain = plain_geometry(poses[:, 0], panel)

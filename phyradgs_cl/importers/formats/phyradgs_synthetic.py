@@ -43,8 +43,8 @@ def timing_of_marks(subject: Fields, marks_rad: np.ndarray, options: ImportOptio
         subject.subject, marks_rad[:, 1] - marks_rad[:, 0], marks_rad[:, 2] - marks_rad[:, 1]
     )
     axis = options.readout_axis or "columns"
-    custom = 1 if axis == "columns" else -1
-    direction = custom if options.readout_direction is None else options.readout_direction
+    convention = 1 if axis == "columns" else -1
+    direction = convention if options.readout_direction is None else options.readout_direction
     shutter = Shutter(exposure_s, ratio * exposure_s, axis, direction)
     unstated = {"exposure": options.exposure_s, "axis": options.readout_axis, "first": options.readout_direction}
     assumed = tuple(name for name, value in unstated.items() if value is None)

@@ -1,4 +1,4 @@
-"""Folders of R2-Gaussian: meta_data.json beside .npy projections and the true volume; taken at rest.
+"""Folders of R2-Gaussian: meta_data.json with .npy projections and the true volume; taken at rest.
 
 Its frame is TIGRE's, which PhyRadGS and NAF share: projections [v, u] with row 0 at +z, volumes [x, y, z].
 """
@@ -21,7 +21,7 @@ from phyradgs_cl.importers.reading.frames import LineIntegrals, line_integrals, 
 from phyradgs_cl.io.tables import Fields
 
 META = "meta_data.json"
-META_WITH_TIMES = "meta_data_motion_blur_rolling_shutter_fps18.json"  # in folders of PhyRadGS, beside the other
+META_WITH_TIMES = "meta_data_motion_blur_rolling_shutter_fps18.json"  # in folders of PhyRadGS
 ROW_0 = "top"
 OPTIONS = (*TIMING, "unit_mm", "detector_model", "part")
 
@@ -65,7 +65,7 @@ class R2Folder:
         for index, entry in enumerate(entries):
             frames[index] = self.frame(entry)
         oriented_frames = oriented(frames, options, ROW_0)
-        return line_integrals(str(self.folder.root), oriented_frames, options, custom="attenuation")
+        return line_integrals(str(self.folder.root), oriented_frames, options, convention="attenuation")
 
     def reference(self) -> tuple[Grid, np.ndarray | None]:
         """Reads the grid, and the true volume in 1/mm where the folder has it."""

@@ -59,7 +59,7 @@ def recognises(path: Path) -> bool:
 
 
 def import_scan(path: Path, options: ImportOptions) -> Scan:
-    """Imports a folder with one .xml and one .mha (or .mhd), or an .xml with the stack beside it."""
+    """Imports a folder with one .xml and one .mha (or .mhd), or an .xml with the stack in its folder."""
     options.refuse_unused("rtk", OPTIONS)
     folder = SafeFolder(path if path.is_dir() else path.parent)
     description = path if path.is_file() else folder.only("geometry", ".xml")
@@ -70,8 +70,8 @@ def import_scan(path: Path, options: ImportOptions) -> Scan:
         raise InputError(str(stack_path), found, "one frame per projection")
     timing = make_timing(str(description), rtk.frames, options)
     trajectory, geometry, turn = _trajectory(rtk, stack, timing, str(description))
-    custom = "attenuation" if stack.frames.dtype.kind == "f" and options.flat_value is None else None
-    integrals = line_integrals(str(stack_path), turn.frames(stack.frames), options, custom=custom)
+    convention = "attenuation" if stack.frames.dtype.kind == "f" and options.flat_value is None else None
+    integrals = line_integrals(str(stack_path), turn.frames(stack.frames), options, convention=convention)
     title = description.stem
     return assemble_scan(integrals, trajectory, geometry, timing, options, title=title, source=str(path))
 

@@ -46,7 +46,7 @@ def recognises(path: Path) -> bool:
 
 
 def import_scan(path: Path, options: ImportOptions) -> Scan:
-    """Imports a folder with one TOML and its frames, or the TOML with the frames beside it."""
+    """Imports a folder with one TOML and its frames, or the TOML with the frames in its folder."""
     options.refuse_unused("tiff", OF_BARE_FRAMES)
     folder = SafeFolder(path if path.is_dir() else path.parent)
     description = path if path.is_file() else folder.only("description of the scan", ".toml")

@@ -20,7 +20,7 @@ _LONGEST_NAME = 4096
 
 
 def check_room(subject: str, needed_bytes: int) -> None:
-    """Raises InputError for more than the share of this machine's memory that one array may take."""
+    """Raises InputError for more than ``HOST_SHARE`` of this machine's memory."""
     most_bytes = HOST_SHARE * host_bytes()
     if needed_bytes > most_bytes:
         found, expected = (f"{n / 2**30:.3g} GiB" for n in (needed_bytes, most_bytes))
@@ -137,7 +137,7 @@ class SafeFolder:
         return paths
 
     def only(self, what: str, *suffixes: str) -> Path:
-        """Returns the one regular file with one of the suffixes; ``what`` says in messages what it is."""
+        """Returns the one regular file with one of the suffixes; ``what`` names it in messages."""
         paths = self.matching(*suffixes)
         if len(paths) != 1:
             names = ", ".join(path.name for path in paths[:5]) or "none"

@@ -38,13 +38,13 @@ def line_integrals(
     *,
     flats: np.ndarray | None = None,
     darks: np.ndarray | None = None,
-    custom: str | None = None,
+    convention: str | None = None,
 ) -> LineIntegrals:
     """Converts ``frames`` (P, v, u) of any real type to line integrals. Masks clipped counts and values that no object has,
     with a warning. ``subject`` names the file; ``flats``, ``darks``: (n, v, u) or None. The quantity is that of the options,
-    else ``custom``, of the format or file; without either, frames with flats are counts and others are refused."""
+    else ``convention``, of the format or file; without either, frames with flats are counts and others are refused."""
     has_flats = (flats is not None and len(flats) > 0) or options.flat_value is not None
-    quantity = options.quantity or custom or ("counts" if has_flats else None)
+    quantity = options.quantity or convention or ("counts" if has_flats else None)
     if quantity is None:
         remedy = f"say {options.named('quantity')} attenuation, transmission or counts"
         raise InputError(f"{subject} quantity", "nothing that says it", "what the pixels hold", remedy)
@@ -147,6 +147,6 @@ def distance_to_detector(source: Hdf5Source, address: str, to_axis_mm: float, op
     return needed(to_detector_mm, "source_to_detector_mm", source.name(address), options.named)
 
 
-def gantry_sign(options: ImportOptions, custom: str) -> float:
+def gantry_sign(options: ImportOptions, convention: str) -> float:
     """Returns +1 where stored angles are the gantry's, −1 where they are the sample's."""
-    return 1.0 if (options.rotates or custom) == "gantry" else -1.0
+    return 1.0 if (options.rotates or convention) == "gantry" else -1.0

@@ -40,7 +40,7 @@ class PlainUnpickler(pickle.Unpickler):
 
     def find_class(self, module: str, name: str) -> Any:
         """Returns the function for a name of the list; InputError for any other name."""
-        functions: dict[str, Any] = {  # made anew, since a pickle can set attributes of what it gets
+        functions: dict[str, Any] = {  # new for every name, since a pickle can set attributes of a function
             "numpy.ndarray": object,  # an argument of _reconstruct
             "numpy.dtype": lambda code, *_: _Type(code),
             "numpy.core.multiarray._reconstruct": lambda *_: _Array((0,)),

@@ -1,4 +1,4 @@
-"""Grey TIFF images, plain or deflated, one per file or many in one, of a size that the file can hold."""
+"""Grey TIFF images, plain or deflated, one or many per file, of a size that the file can hold."""
 
 import logging
 import math
@@ -21,7 +21,7 @@ _MOST_EXPANSION = 1200  # of a compressed image: deflate reaches 1032
 _MOST_PAGES = 100_000
 _PLAIN, _DEFLATED = 1, (8, 32946)
 _FREE_BYTES, _BLOCK_BYTES = 16 << 20, 16 << 20
-_BESIDE = 5  # bytes per pixel that follow: a line integral in float32, and whether it is masked
+_RESULT_BYTES = 5  # per pixel: a line integral in float32, and its mask
 _ORIENTATION = 274  # 1: row 0 at the top, column 0 on the left
 
 
@@ -33,8 +33,8 @@ class _Header:
 
 
 def read_tiffs(paths: list[Path]) -> np.ndarray:
-    """Every image of every file, in order: frames (F, v, u) in their own type, row 0 as stored. All headers are read
-    before any pixel, so that the frames are unpacked into one array of a known size."""
+    """Reads all images of all files in order: frames (F, v, u) in their own type, row 0 as stored. All headers are read
+    before any pixel, so that the frames are unpacked into one array of known size."""
     headers = [_header(path) for path in paths]
     first = headers[0]
     for path, header in zip(paths, headers, strict=True):
@@ -42,7 +42,7 @@ def read_tiffs(paths: list[Path]) -> np.ndarray:
             expected = f"{first.shape} {first.dtype} as in {paths[0].name}"
             raise InputError(str(path), f"{header.shape} {header.dtype}", expected)
     frames = sum(header.images for header in headers)
-    check_room(str(paths[0]), frames * math.prod(first.shape) * (first.dtype.itemsize + _BESIDE))
+    check_room(str(paths[0]), frames * math.prod(first.shape) * (first.dtype.itemsize + _RESULT_BYTES))
     stack = np.empty((frames, *first.shape), first.dtype)
     at = 0
     for path in paths:
@@ -57,14 +57,15 @@ def read_tiffs(paths: list[Path]) -> np.ndarray:
 
 
 def stack_shape(paths: list[Path]) -> tuple[int, int, int]:
-    """(frames, rows, columns) of what ``read_tiffs`` would read, by headers alone; rows and columns of the first file."""
+    """Returns the shape (frames, rows, columns) that ``read_tiffs`` would read, from headers alone; rows and columns of the
+    first file."""
     headers = [_header(path) for path in paths]
     rows, columns = headers[0].shape
     return sum(header.images for header in headers), rows, columns
 
 
 def _header(path: Path) -> _Header:
-    """What one file holds, with every page checked against the bytes that there are."""
+    """Returns the images of one file, after a check of every page against the size of the file."""
     with _opened(path) as tiff:
         images = pages = total_bytes = 0
         for page in tiff.pages:
@@ -77,18 +78,18 @@ def _header(path: Path) -> _Header:
                 raise InputError(str(path), "pages of several sizes or types", "one for all frames")
             pages, images = pages + 1, images + math.prod(page.shape[:-2])
             total_bytes = images * math.prod(shape) * dtype.itemsize
-        behind = int((tiff.imagej_metadata or {}).get("images", 0)) if tiff.is_imagej else 0
+        stated_images = int((tiff.imagej_metadata or {}).get("images", 0)) if tiff.is_imagej else 0
     if not pages:
         raise InputError(str(path), "no page", "at least one image")
-    if behind > images:  # what ImageJ writes beyond 4 GB
-        found, expected = f"{behind} images and {images} of them in its directory", "a directory of all images"
+    if stated_images > images:  # ImageJ writes such files beyond 4 GB
+        found, expected = f"{stated_images} images and {images} of them in its directory", "a directory of all images"
         raise InputError(str(path), found, expected, "save it as BigTIFF, or as one file per image")
     return _Header(images, shape, dtype)
 
 
 @contextmanager
 def _opened(path: Path) -> Iterator[Any]:
-    """A TIFF; whatever the library stumbles over in the body comes out as an InputError."""
+    """Yields an open TIFF. Any error of the library in the body becomes InputError."""
     regular_file(path, str(path))
     tifffile = checks.package("tifffile", "the package that reads TIFF", "phyradgs-cl[formats]")
     try:
@@ -98,14 +99,15 @@ def _opened(path: Path) -> Iterator[Any]:
         raise
     except OSError as error:
         raise InputError(str(path), error.strerror or str(error), "a readable TIFF") from error
-    except Exception as error:  # damage shows as anything
+    except Exception as error:  # damage raises any exception
         found = f"a TIFF that cannot be read ({type(error).__name__}: {str(error)[:80]})"
         raise InputError(str(path), found, "grey images, uncompressed or deflated") from error
 
 
 def imagej_calibration(path: Path) -> tuple[np.ndarray | None, np.ndarray | None, str]:
-    """Voxel sizes (x, y, z) mm, the origin's place (x, y, z) in voxels and "Info", where a stack states them: ImageJ's
-    own, and BigTIFF in which tifffile keeps the same words as JSON. Call ``read_tiffs`` first."""
+    """Returns the voxel sizes (x, y, z) in mm, the origin's place (x, y, z) in voxels and the text "Info" of a stack that
+    ImageJ wrote, or of a BigTIFF in which tifffile keeps the same values as JSON; None for missing values. Call
+    ``read_tiffs`` first."""
     tifffile = checks.package("tifffile", "the package that reads TIFF", "phyradgs-cl[formats]")
     try:
         with _quiet("tifffile"), tifffile.TiffFile(path) as tiff:
@@ -122,7 +124,7 @@ def imagej_calibration(path: Path) -> tuple[np.ndarray | None, np.ndarray | None
 
 @contextmanager
 def _quiet(name: str) -> Iterator[None]:
-    """Keeps a library from logging a line for every damaged tag: one error says it all."""
+    """Stops a library from logging a line for every damaged tag, since one error names the file."""
     logger = logging.getLogger(name)
     before = logger.disabled
     logger.disabled = True
@@ -133,7 +135,7 @@ def _quiet(name: str) -> Iterator[None]:
 
 
 def _check_page(path: Path, page: Any, before_bytes: int) -> None:
-    """What a page needs is compared with what is there before anything is decoded; one page may be a stack (n, v, u)."""
+    """Compares the size of a page with the file before anything is decoded. One page may be a stack (n, v, u)."""
     shape, dtype = page.shape, page.dtype
     grey = len(shape) == 2 or (len(shape) == 3 and page.axes.endswith("YX"))
     if not grey or min(shape) < 1 or dtype is None or dtype.kind not in "iuf":
@@ -159,7 +161,7 @@ def _chunk(page: Any) -> int:
 
 
 def _check_inflation(path: Path, page: Any, most: int) -> None:
-    """The library unpacks a strip to its end; one that has more in it than its pixels is refused before that."""
+    """Refuses a strip that unpacks to more than its pixels: the library would unpack all of it."""
     with open(path, "rb") as file:
         for offset, count in zip(page.dataoffsets, page.databytecounts, strict=True):
             file.seek(offset)

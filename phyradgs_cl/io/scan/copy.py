@@ -1,4 +1,4 @@
-"""Copies of a scan file with another geometry or timing; everything else stays as it is, raw counts included."""
+"""Copies of a scan file with another geometry or timing and the same frames, raw counts included."""
 
 import json
 import shutil
@@ -19,8 +19,8 @@ from phyradgs_cl.io.scan.motion import storable, write_motion, write_poses
 
 
 def copy_with_offset(source: str | Path, target: str | Path, shift_u_mm: float) -> None:
-    """Copy a scan file with its panel ``shift_u_mm`` further along u: detector_offset, and poses where it has them.
-    Raises InputError for a file that is no scan, OutputError where the copy cannot be written."""
+    """Copies a scan file with its panel ``shift_u_mm`` further along u: changes detector_offset, and poses where it has
+    them. InputError for a file that is no scan, OutputError where the copy cannot be written."""
     with open_hdf5(source) as opened:
         header = read_header(opened)
         poses = f"{header.entry}/{schema.POSES}/pose"
@@ -35,8 +35,8 @@ def copy_with_offset(source: str | Path, target: str | Path, shift_u_mm: float) 
 
 
 def copy_with_motion(source: str | Path, target: str | Path, scan: Scan) -> None:
-    """Copy a scan file with geometry, timing, lag, trajectory and provenance of ``scan``, which has its frames; what is the
-    same is not touched. Raises InputError for a file that is no scan, OutputError where the copy cannot be written."""
+    """Copies a scan file with geometry, timing, lag, trajectory and provenance of ``scan``, which has its frames; equal
+    values are not touched. InputError for a file that is no scan, OutputError where the copy cannot be written."""
     with open_hdf5(source) as opened:
         header = read_header(opened)
         start = f"{header.entry}/{schema.DETECTOR}/frame_start_time"
@@ -63,7 +63,7 @@ def copy_with_motion(source: str | Path, target: str | Path, scan: Scan) -> None
             write_motion(entry, scan, frame_of)
         elif isinstance(scan.trajectory, PoseTable):
             _remove(entry, schema.POSES)
-            if not scan.is_fly:  # with poses and an exposure it would read as moving; poses need frames' times
+            if not scan.is_fly:  # with poses and an exposure it would be read as moving; poses need the times of frames
                 detector = entry[schema.DETECTOR]
                 _replace(detector, "count_time", 0.0, "s")
                 _replace(detector, "detector_readout_time", 0.0, "s")
@@ -78,7 +78,7 @@ def copy_with_motion(source: str | Path, target: str | Path, scan: Scan) -> None
 
 @contextmanager
 def _copied(source: str | Path, target: str | Path, entry: str) -> Iterator[h5py.Group]:
-    """The entry, with a group of our own, of a copy that takes the target's place when the body has done its work."""
+    """Yields the entry of a copy, with the package's own group; the copy replaces ``target`` after the body."""
     with written_beside(target) as temporary:
         shutil.copyfile(source, temporary)
         with h5py.File(temporary, "r+") as file:

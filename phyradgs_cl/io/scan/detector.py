@@ -1,4 +1,4 @@
-"""The detector's part of a scan file: frames, keys, geometry, shutter and mask, all but the pixels."""
+"""The detector's part of a scan file: frames, keys, geometry, shutter and mask, without the pixels."""
 
 import h5py
 import numpy as np
@@ -14,7 +14,7 @@ from phyradgs_cl.io.scan import schema
 
 
 def read_data_kind(source: Hdf5Source, entry: str) -> tuple[h5py.Dataset, str]:
-    """The frames' dataset (F, v, u), unread, and what it holds."""
+    """Returns the dataset of frames (F, v, u), unread, and their quantity."""
     address = f"{entry}/{schema.DETECTOR}/data"
     data, subject = source.dataset(address), source.name(address)
     if data.ndim != 3 or min(data.shape) < 1:
@@ -34,7 +34,7 @@ def read_data_kind(source: Hdf5Source, entry: str) -> tuple[h5py.Dataset, str]:
 
 
 def read_image_key(source: Hdf5Source, entry: str, frames: int) -> np.ndarray:
-    """What each stored frame is (F,): at least one of them a projection."""
+    """Reads the key of each stored frame (F,); at least one is a projection."""
     address = f"{entry}/{schema.DETECTOR}/image_key"
     image_key = h5.read_integers(source, address, (frames,))
     wrong = ~np.isin(image_key, (schema.PROJECTION, schema.FLAT, schema.DARK, schema.INVALID))
@@ -48,7 +48,7 @@ def read_image_key(source: Hdf5Source, entry: str, frames: int) -> np.ndarray:
 
 
 def read_geometry(source: Hdf5Source, entry: str, detector_shape: tuple[int, int]) -> ConeGeometry:
-    """The circular geometry that the distances, pitches and offset describe."""
+    """Reads the circular geometry from distances, pixel sizes and offset."""
     detector, address = f"{entry}/{schema.DETECTOR}", f"{entry}/{schema.SOURCE}/distance"
     to_axis_mm = abs(h5.read_number(source, address, LENGTH))  # NeXus gives it a minus sign
     if to_axis_mm == 0:
@@ -64,12 +64,12 @@ def read_geometry(source: Hdf5Source, entry: str, detector_shape: tuple[int, int
 
 
 def read_shutter(source: Hdf5Source, entry: str, used: np.ndarray, moving: bool) -> Shutter:
-    """Exposure and readout; what a rolling readout needs is required only where the gantry moves."""
+    """Reads exposure and readout. The values of a rolling readout are required only where the gantry moves."""
     exposure_s = read_duration(source, f"{entry}/{schema.DETECTOR}/count_time", used, moving)
     needed = moving and exposure_s > 0
     readout_s = read_duration(source, f"{entry}/{schema.DETECTOR}/detector_readout_time", used, needed)
     axis, direction = f"{entry}/{schema.EXTRA}/readout_axis", f"{entry}/{schema.EXTRA}/readout_direction"
-    rolling = needed and readout_s > 0  # only then does it matter which line comes first
+    rolling = needed and readout_s > 0  # only then the order of lines matters
     word, way = "rows", 1
     if rolling or source.optional(axis) is not None:
         word = h5.read_word(source, axis, AXES)
@@ -95,7 +95,7 @@ def _read_pulse(source: Hdf5Source, entry: str, span_s: float) -> tuple[float, f
 
 
 def read_duration(source: Hdf5Source, address: str, used: np.ndarray, needed: bool) -> float:
-    """One time in s for all projections, stored once or for every frame; 0 where it may be missing."""
+    """Reads one time in s for all projections, stored once or for every frame; 0 where it is not needed and missing."""
     dataset = source.dataset(address) if needed else source.optional(address)
     if dataset is None:
         return 0.0
@@ -117,7 +117,7 @@ def read_duration(source: Hdf5Source, address: str, used: np.ndarray, needed: bo
 def read_starts(
     source: Hdf5Source, entry: str, used: np.ndarray, shutter: Shutter, moving: bool
 ) -> np.ndarray:
-    """Opening times (frames,) of the projections; evenly spaced where nothing moves and none are stored."""
+    """Reads opening times (frames,) of the projections; evenly spaced where nothing moves and none are stored."""
     address = f"{entry}/{schema.DETECTOR}/frame_start_time"
     if not moving and source.optional(address) is None:
         return np.arange(int(used.sum())) * max(shutter.span_s, 1.0)
@@ -125,7 +125,7 @@ def read_starts(
 
 
 def check_mask(source: Hdf5Source, entry: str, data_shape: tuple[int, ...]) -> tuple[int, ...] | None:
-    """Shape of the pixel mask, unread, or None without one."""
+    """Returns the shape of the pixel mask, unread, or None without one."""
     address = f"{entry}/{schema.DETECTOR}/pixel_mask"
     mask = source.optional(address)
     if mask is None:

@@ -1,4 +1,4 @@
-"""Everything in a scan file except its large arrays, checked in full before those are read."""
+"""The header of a scan file: everything but its large arrays, checked before those are read."""
 
 import logging
 from dataclasses import dataclass
@@ -37,7 +37,7 @@ class ScanHeader:
 
 
 def read_header(source: Hdf5Source) -> ScanHeader:
-    """Read and check everything but pixels, mask and reference; InputError names what is wrong."""
+    """Reads and checks everything but pixels, mask and reference; InputError names the damage by its HDF5 path."""
     entry = find_entry(source)
     data, quantity = detector.read_data_kind(source, entry)
     image_key = detector.read_image_key(source, entry, len(data))
@@ -50,8 +50,8 @@ def read_header(source: Hdf5Source) -> ScanHeader:
     shutter.check_resolved(start_s, source.name(f"{entry}/{schema.DETECTOR}/count_time"))
     trajectory = read_trajectory(source, entry, geometry, used, start_s, shutter.exposure_s)
     grid, has_grid = _read_or_derive_grid(source, entry, geometry)
-    model, told = (f"{entry}/{schema.EXTRA}/{name}" for name in ("detector_model", "provenance"))
-    has_model, has_told = source.optional(model) is not None, source.optional(told) is not None
+    model, provenance = (f"{entry}/{schema.EXTRA}/{name}" for name in ("detector_model", "provenance"))
+    has_model, has_provenance = source.optional(model) is not None, source.optional(provenance) is not None
     scan = Scan(
         projections=np.broadcast_to(np.float32(0), (int(used.sum()), *data.shape[1:])),
         geometry=geometry,
@@ -62,7 +62,7 @@ def read_header(source: Hdf5Source) -> ScanHeader:
         is_fly=is_fly,
         detector_model=read_word(source, model, DETECTOR_MODELS) if has_model else "log",
         title=read_title(source, f"{entry}/title", "cone-beam scan"),
-        provenance=read_facts(source.name(told), read_word(source, told), {}) if has_told else {},
+        provenance=read_facts(source.name(provenance), read_word(source, provenance), {}) if has_provenance else {},
         lag=_read_lag(source, entry),
         saturation=_read_saturation(source, entry),
     )
@@ -79,7 +79,7 @@ def read_header(source: Hdf5Source) -> ScanHeader:
 
 
 def find_entry(source: Hdf5Source) -> str:
-    """Address of the NXtomo entry: the root's @default, /entry, or the only NXentry."""
+    """Returns the address of the NXtomo entry: the root's @default, /entry, or the only NXentry."""
     default = read_attribute(source, "/", "default")
     for name in (default, "entry"):
         if name and isinstance(source.find(f"/{name.strip('/')}"), h5py.Group):

@@ -1,4 +1,4 @@
-"""Where θ(t) comes from in a scan file: pose table, encoder table, or each frame's own two angles."""
+"""The motion θ(t) of a scan file: a pose table, an encoder table, or two angles for each frame."""
 
 import logging
 import math
@@ -31,14 +31,14 @@ from phyradgs_cl.io.hdf5.source import Hdf5Source
 from phyradgs_cl.io.scan import schema
 
 _log = logging.getLogger(__name__)
-_KINEMATICS = (ConstantSpeed, SpeedRamp, EncoderTable, FrameSweeps)  # what files can hold
+_KINEMATICS = (ConstantSpeed, SpeedRamp, EncoderTable, FrameSweeps)  # trajectories that files can hold
 _RAMP_ERROR_RAD = 1e-9
 _MOST_RAMP_SAMPLES = 500_000
 _SUSPECT_RAD = math.radians(5.0)
 
 
 def has_motion(source: Hdf5Source, entry: str) -> bool:
-    """Whether the file says how the gantry moved during an exposure."""
+    """True where the file states how the gantry moved during an exposure."""
     end = source.optional(f"{entry}/{schema.SAMPLE}/rotation_angle_end")
     groups = (schema.KINEMATICS, schema.POSES)
     found = [source.optional_group(f"{entry}/{group}") for group in groups]
@@ -53,7 +53,7 @@ def read_trajectory(
     start_s: np.ndarray,
     exposure_s: float,
 ) -> CircularOrbit | PoseTable:
-    """The trajectory of the frames that the mask ``used`` (F,) selects and that open at ``start_s``."""
+    """Reads the trajectory of the frames that the mask ``used`` (F,) selects and that open at ``start_s``."""
     first_rad = read_angles(source, entry, "rotation_angle", used)
     poses, kinematics = f"{entry}/{schema.POSES}", f"{entry}/{schema.KINEMATICS}"
     if source.optional_group(poses) is not None:
@@ -74,16 +74,17 @@ def read_trajectory(
 
 
 def read_angles(source: Hdf5Source, entry: str, name: str, used: np.ndarray) -> np.ndarray:
-    """Gantry angles in radians of the used frames, from rotation_angle or rotation_angle_end."""
+    """Reads gantry angles in radians of the used frames, from rotation_angle or rotation_angle_end."""
     address = f"{entry}/{schema.SAMPLE}/{name}"
     angle_rad = read_array(source, address, used.shape, ANGLE)[used]
-    # The end angle turns as the start angle does, unless it says so itself.
+    # The end angle has the sense of the start angle unless it states its own.
     start = f"{entry}/{schema.SAMPLE}/rotation_angle"
     return angle_rad * _sense(source, address, absent=_sense(source, start, absent=-1.0))
 
 
 def storable(scan: Scan) -> Scan:
-    """The scan with a trajectory that files can hold: one of one's own becomes a table, to a ten-thousandth of a pixel."""
+    """Returns the scan with a trajectory that files can hold. A user's own trajectory becomes a table of poses, exact to a
+    ten-thousandth of a pixel."""
     path = scan.trajectory
     if isinstance(path, PoseTable) or (isinstance(path, CircularOrbit) and isinstance(path.kinematics, _KINEMATICS)):
         return scan
@@ -92,7 +93,7 @@ def storable(scan: Scan) -> Scan:
 
 
 def write_motion(entry: h5py.Group, scan: Scan, frame_of: np.ndarray) -> None:
-    """Write rotation angles and tables; row i of the (F,) arrays describes projection ``frame_of[i]``."""
+    """Writes rotation angles and tables; row i of the (F,) arrays describes projection ``frame_of[i]``."""
     first_rad, last_rad = _exposure_angles(scan)
     sample = entry[schema.SAMPLE]
     write_number(sample, "rotation_angle", np.rad2deg(first_rad)[frame_of], "degree", rotates="gantry")
@@ -108,7 +109,7 @@ def write_motion(entry: h5py.Group, scan: Scan, frame_of: np.ndarray) -> None:
 
 
 def write_poses(entry: h5py.Group, scan: Scan) -> None:
-    """Write the table of a scan whose trajectory is one."""
+    """Writes the table of a scan whose trajectory is a pose table."""
     path = scan.trajectory
     assert isinstance(path, PoseTable)
     # a stop-and-shoot scan is stored without exposure, so its poses move to the frames' starts
@@ -123,7 +124,7 @@ def _table_group(entry: h5py.Group, name: str, time_s: np.ndarray) -> h5py.Group
 
 
 def _exposure_angles(scan: Scan) -> tuple[np.ndarray, np.ndarray]:
-    """Gantry angles (F,) as each exposure starts and ends; both at mid-window if the gantry stands."""
+    """Returns gantry angles (F,) at the start and end of each exposure; both at mid-window if the gantry stands."""
     shutter = scan.shutter
     offsets_s = np.array([0.0, shutter.exposure_s] if scan.is_fly else [shutter.middle_s] * 2)
     pairs = np.array([_angles(scan, f, start_s + offsets_s) for f, start_s in enumerate(scan.frame_start_s)])
@@ -133,12 +134,12 @@ def _exposure_angles(scan: Scan) -> tuple[np.ndarray, np.ndarray]:
 def _angles(scan: Scan, frame: int, time_s: np.ndarray) -> np.ndarray:
     if isinstance(scan.trajectory, CircularOrbit):
         return scan.trajectory.angle_rad(frame, time_s)
-    pose = scan.trajectory.pose(frame, time_s)  # the source's azimuth: only other programs read it
+    pose = scan.trajectory.pose(frame, time_s)  # the source's azimuth, for other programs
     return np.unwrap(np.arctan2(pose[:, 1], pose[:, 0]))
 
 
 def _angle_table(scan: Scan, kinematics: EncoderTable | SpeedRamp) -> tuple[np.ndarray, np.ndarray]:
-    """The encoder's table, or a speed ramp sampled until straight pieces follow it to a nanoradian."""
+    """Returns the encoder's table, or a speed ramp sampled until straight pieces follow it to a nanoradian."""
     if isinstance(kinematics, EncoderTable):
         return kinematics.time_s, kinematics.angle_rad_table
     first_s, last_s = float(np.min(scan.frame_start_s)), float(np.max(scan.frame_start_s)) + scan.shutter.span_s
@@ -160,7 +161,7 @@ def _read_table_times(source: Hdf5Source, address: str) -> np.ndarray:
 
 
 def _sense(source: Hdf5Source, address: str, absent: float) -> float:
-    """+1 where the angle is the gantry's, −1 where it is the sample's."""
+    """Returns +1 where the angle is the gantry's, −1 where it is the sample's."""
     rotates = read_attribute(source, address, "rotates")
     if rotates is None:
         return absent
@@ -170,7 +171,7 @@ def _sense(source: Hdf5Source, address: str, absent: float) -> float:
 
 
 def _warn_if_apart(source: Hdf5Source, address: str, table_rad: np.ndarray, first_rad: np.ndarray) -> None:
-    """The table wins, but a wrong sense of rotation should not pass in silence."""
+    """Warns of a table that contradicts rotation_angle, as with a wrong sense of rotation. The table is used."""
     apart_rad = np.abs((table_rad - first_rad + np.pi) % (2 * np.pi) - np.pi)
     if apart_rad.max() > _SUSPECT_RAD:
         text = "%s: up to %.3g° from rotation_angle; the table is used"

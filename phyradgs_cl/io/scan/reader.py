@@ -22,15 +22,14 @@ ToAttenuation = Callable[[np.ndarray, np.ndarray, str], tuple[np.ndarray, np.nda
 
 
 def read_scan(path: str | Path, to_attenuation: ToAttenuation) -> Scan:
-    """Read a scan file; the frames become line integrals by ``to_attenuation``.
+    """Reads a scan file; ``to_attenuation`` converts the frames to line integrals.
 
-    That takes (data (F, v, u), image_key (F,), quantity) to line integrals (P, v, u) of the P projections and a mask (v, u)
-    or (P, v, u) of unusable values, or None. Everything but the pixels is checked before they are read; flat, dark and
-    invalid frames are left out. The scan has projections (P, v, u) float32 and a bool ``pixel_mask`` or None: what the file
-    or the conversion calls bad, as everything that is not finite must be.
+    It takes (data (F, v, u), image_key (F,), quantity) and returns line integrals (P, v, u) of the P projections, and a
+    mask (v, u) or (P, v, u) of unusable values or None. Everything but the pixels is checked before they are read. Flat,
+    dark and invalid frames are left out. The scan has projections (P, v, u) float32 and a bool ``pixel_mask`` or None, from
+    the file and the conversion; values that are not finite must be masked.
 
-    Raises:
-        InputError: the file is missing, damaged or incomplete; its subject is "FILE:/hdf5/path".
+    Raises: InputError for a missing, damaged or incomplete file; its subject is "FILE:/hdf5/path".
     """
     with open_hdf5(path) as source:
         header = read_header(source)
@@ -39,25 +38,25 @@ def read_scan(path: str | Path, to_attenuation: ToAttenuation) -> Scan:
         data = _read_frames(source, header, mask)
     projections, bad = _convert(source.name(f"{header.entry}/{schema.DATA}"), header, data, to_attenuation)
     used = header.image_key == schema.PROJECTION
-    kept = mask[used] if mask is not None and mask.ndim == 3 else mask
+    stored_mask = mask[used] if mask is not None and mask.ndim == 3 else mask
     provenance = header.scan.provenance
     if header.quantity == "counts":
         stored = (int(np.count_nonzero(header.image_key == kind)) for kind in (schema.FLAT, schema.DARK))
         provenance = {**provenance, **applied_facts(*stored)}
-    mask = united(kept, bad)
+    mask = united(stored_mask, bad)
     return replace(header.scan, projections=projections, pixel_mask=mask, reference=reference, provenance=provenance)
 
 
 def scan_summary(path: str | Path, sha256: str | None = None) -> dict[str, object]:
-    """Facts about a scan file, checked but for its pixels. sha256: of the file, where it is known already."""
+    """Returns facts about a scan file, checked without its pixels. sha256: the file's, where it is known already."""
     with open_hdf5(path) as source:
         header = read_header(source)
     scan, key = header.scan, header.image_key
     kinds = ("projections", "flats", "darks", "invalid")
     counts = {name: int(np.count_nonzero(key == number)) for number, name in enumerate(kinds)}
     if header.quantity == "attenuation":  # flats and darks that went into the line integrals are no longer in the file
-        known = {name: scan.provenance.get(name) for name in APPLIED}
-        counts |= {name: count for name, count in known.items() if isinstance(count, int)}
+        applied = {name: scan.provenance.get(name) for name in APPLIED}
+        counts |= {name: count for name, count in applied.items() if isinstance(count, int)}
     return {
         "title": scan.title,
         **counts,
@@ -78,8 +77,8 @@ def scan_summary(path: str | Path, sha256: str | None = None) -> dict[str, objec
 
 
 def _timing_facts(scan: Scan) -> dict[str, object]:
-    """Exposure, readout, and the arcs of the first frame where the gantry has an angle. Times of a scan that stops are no
-    facts unless its exposure is stated: where its frames start is only their order."""
+    """Returns exposure, readout, and the arcs of the first frame where the gantry has an angle. A scan that stops has no
+    times unless its exposure is stated, since its frames' starts are only their order."""
     shutter = scan.shutter
     facts: dict[str, object] = {}
     if scan.is_fly or shutter.exposure_s > 0:
@@ -140,7 +139,8 @@ def _read_reference(source: Hdf5Source, header: ScanHeader) -> np.ndarray | None
 
 
 def _read_frames(source: Hdf5Source, header: ScanHeader, mask: np.ndarray | None) -> np.ndarray:
-    """All stored frames (F, v, u); every value of a frame in use is finite unless it is masked."""
+    """Reads all stored frames (F, v, u); InputError for a value that is neither finite nor masked in a frame that is
+    used."""
     data = read_values(source, f"{header.entry}/{schema.DATA}", source.dataset(f"{header.entry}/{schema.DATA}"))
     if data.dtype.kind == "f":
         for frame in np.flatnonzero(header.image_key != schema.INVALID):
@@ -178,7 +178,7 @@ def _convert(
 
 
 def united(mask: np.ndarray | None, bad: np.ndarray | None) -> np.ndarray | None:
-    """Union of two masks, each (v, u) or (P, v, u) or None; a mask that marks nothing adds nothing."""
+    """Returns the union of two masks, each (v, u) or (P, v, u) or None; a mask without a masked pixel adds nothing."""
     if bad is None or not np.any(bad):
         return mask
     return np.asarray(bad, bool) if mask is None else mask | np.asarray(bad, bool)

@@ -1,4 +1,4 @@
-"""Where things stand in a scan file (a NeXus NXtomo entry; see docs on file formats)."""
+"""Addresses in a scan file, which is a NeXus NXtomo entry (docs/formats.md)."""
 
 DETECTOR = "instrument/detector"
 DATA, MASK = f"{DETECTOR}/data", f"{DETECTOR}/pixel_mask"
@@ -15,7 +15,7 @@ PROJECTION, FLAT, DARK, INVALID = 0, 1, 2, 3
 QUANTITIES = ("attenuation", "transmission", "counts")
 ROTATES = ("gantry", "sample")
 
-# Standard fields that would move the geometry and that this package does not read.
+# Standard fields that change the geometry and that this package does not read.
 IGNORED = (
     *(f"{DETECTOR}/{name}" for name in ("transformations", "x_rotation_axis_pixel_position")),
     *(f"{DETECTOR}/{name}" for name in ("y_rotation_axis_pixel_position", "estimated_cor_from_motor")),

@@ -1,4 +1,4 @@
-"""Writing scan files: the NXtomo entry of scan_schema, as other programs read it too."""
+"""Writes scan files: an NXtomo entry, which other programs read too."""
 
 import json
 import logging
@@ -26,18 +26,17 @@ def write_scan(
     image_key: np.ndarray | None = None,
     quantity: str = "attenuation",
 ) -> None:
-    """Write a scan file, whole or not at all; one that exists is replaced.
+    """Writes a scan file, whole or not at all, in place of an existing one.
 
-    ``scan`` has the line integrals unless ``data`` is given, (F, v, u) float32 or uint16 raw frames, flats and darks
-    included, whose ``quantity`` is "attenuation", "transmission" or "counts"; image_key (F,): 0 projection, 1 flat, 2 dark,
-    3 invalid, as many 0 as ``scan`` has frames. A trajectory of one's own becomes a table of poses.
+    Without ``data`` the line integrals of ``scan`` are written. ``data``: (F, v, u) float32 or uint16 raw frames with flats
+    and darks, whose ``quantity`` is "attenuation", "transmission" or "counts"; image_key (F,): 0 projection, 1 flat, 2
+    dark, 3 invalid, with as many 0 as ``scan`` has frames. A user's own trajectory becomes a table of poses.
 
-    Raises:
-        InputError: arguments that do not fit each other, or a scan that the format cannot express.
-        OutputError: the file cannot be written.
+    Raises: InputError for arguments that contradict each other, or a scan that the format cannot express; OutputError where
+    the file cannot be written.
     """
     frames, key = _checked_frames(scan, data, image_key, quantity)
-    if scan.is_fly and scan.shutter.exposure_s == 0 and scan.shutter.readout_s > 0:  # in a file it would stand
+    if scan.is_fly and scan.shutter.exposure_s == 0 and scan.shutter.readout_s > 0:  # in a file the gantry would stand
         remedy = "give the exposure its real length"
         raise InputError("exposure_s", "0 in a fly-scan with a readout", "a time above 0 s", remedy)
     scan = storable(scan)
@@ -46,7 +45,7 @@ def write_scan(
         entry.attrs["default"], entry.attrs["definition"] = "data", "NXtomo"
         entry["definition"], entry["title"] = "NXtomo", plain_text(scan.title)
         new_group(entry, schema.SAMPLE, "NXsample")["name"] = plain_text(scan.title)
-        # Frames between projections (flats, darks) are filed under the projection before them.
+        # Frames between projections (flats, darks) get the values of the projection before them.
         frame_of = np.clip(np.cumsum(key == schema.PROJECTION) - 1, 0, None)
         _write_instrument(entry, scan, frames, key, quantity, frame_of)
         _write_extra(entry, scan)
@@ -101,7 +100,8 @@ def _write_instrument(
 
 
 def _stored_durations(scan: Scan) -> tuple[float, float]:
-    """Exposure and readout in s, as stored; 0 for a gantry that stops along a pose table, or it would read as moving."""
+    """Returns exposure and readout in s for the file: 0 for a gantry that stops along a pose table, which would be read as
+    moving."""
     if not scan.is_fly and isinstance(scan.trajectory, PoseTable):
         return 0.0, 0.0
     return scan.shutter.exposure_s, scan.shutter.readout_s
