@@ -1,4 +1,4 @@
-"""Checks for the public doors: each raises InputError with the subject's name, or returns nothing."""
+"""Checks of values from users and files: each raises InputError about its subject, or returns."""
 
 import importlib
 import math
@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.text import near_miss
+from phyradgs_cl.text import suggest_name
 
-_LONGEST_SHOWN = 80
+_LONGEST = 80
 
 
 def ceil_div(count: int, divisor: int) -> int:
@@ -20,25 +20,25 @@ def ceil_div(count: int, divisor: int) -> int:
 
 
 def positive(subject: str, value: float) -> None:
-    """Raise InputError unless the scalar `value` is finite and above zero."""
+    """Raises InputError unless the scalar ``value`` is finite and above zero."""
     if not (is_number(value) and value > 0):
-        raise InputError(subject, shown(value), "a finite number above 0")
+        raise InputError(subject, short_repr(value), "a finite number above 0")
 
 
 def at_least(subject: str, value: float, minimum: float) -> None:
-    """Raise InputError unless the scalar `value` is finite and not below `minimum`."""
+    """Raises InputError unless the scalar ``value`` is finite and not below ``minimum``."""
     if not (is_number(value) and value >= minimum):
-        raise InputError(subject, shown(value), f"a finite number, at least {minimum}")
+        raise InputError(subject, short_repr(value), f"a finite number, at least {minimum}")
 
 
 def within(subject: str, value: float, lowest: float, highest: float) -> None:
-    """Raise InputError unless the scalar `value` is finite and between two bounds, both included."""
+    """Raises InputError unless the scalar ``value`` is finite and between two bounds, both included."""
     if not (is_number(value) and lowest <= value <= highest):
-        raise InputError(subject, shown(value), f"a number from {lowest} to {highest}")
+        raise InputError(subject, short_repr(value), f"a number from {lowest} to {highest}")
 
 
 def fields_within(prefix: str, options: object, ranges: Mapping[str, tuple[float, float]]) -> None:
-    """Check every number of `options` that `ranges` names (lowest, highest), those inside tuples one by one."""
+    """Checks every number of ``options`` that ``ranges`` names (lowest, highest), those inside tuples one by one."""
     for name, (lowest, highest) in ranges.items():
         value = getattr(options, name)
         for number in value if isinstance(value, tuple) else (value,):
@@ -46,15 +46,15 @@ def fields_within(prefix: str, options: object, ranges: Mapping[str, tuple[float
 
 
 def one_of(subject: str, value: object, allowed: Iterable[object]) -> None:
-    """Raise InputError unless `value` is among `allowed`, which the message lists."""
+    """Raises InputError unless ``value`` is among ``allowed``, which the message lists."""
     choices = list(allowed)
     if value not in choices:
-        remedy = near_miss(value, (choice for choice in choices if isinstance(choice, str)), "")
-        raise InputError(subject, shown(value), "one of " + ", ".join(repr(choice) for choice in choices), remedy)
+        remedy = suggest_name(value, (choice for choice in choices if isinstance(choice, str)), "")
+        raise InputError(subject, short_repr(value), "one of " + ", ".join(repr(choice) for choice in choices), remedy)
 
 
 def finite(subject: str, array: ArrayLike) -> None:
-    """Raise InputError if any element of `array` (any shape) is NaN or infinite; names the first."""
+    """Raises InputError if any element of ``array`` (any shape) is NaN or infinite; the message has the first."""
     good = np.isfinite(np.asarray(array))
     if not good.all():
         count = int(good.size - np.count_nonzero(good))
@@ -63,7 +63,7 @@ def finite(subject: str, array: ArrayLike) -> None:
 
 
 def shape(subject: str, array: ArrayLike, expected: Sequence[int | None]) -> None:
-    """Raise InputError unless `array` has the shape `expected`, in which None stands for any length."""
+    """Raises InputError unless ``array`` has the shape ``expected``, in which None stands for any length."""
     found = np.shape(array)
     fits = len(found) == len(expected) and all(e in (None, f) for f, e in zip(found, expected, strict=True))
     if not fits:
@@ -72,7 +72,7 @@ def shape(subject: str, array: ArrayLike, expected: Sequence[int | None]) -> Non
 
 
 def numbers(subject: str, value: ArrayLike, expected: Sequence[int | None] | None = None) -> NDArray[np.float64]:
-    """``value`` as float64; InputError unless it is real, finite and, where ``expected`` is given, of that shape."""
+    """Returns ``value`` as float64. Raises InputError unless it is real, finite and of the shape ``expected``, if given."""
     array = real_array(subject, value)
     if expected is not None:
         shape(subject, array, expected)
@@ -81,40 +81,40 @@ def numbers(subject: str, value: ArrayLike, expected: Sequence[int | None] | Non
 
 
 def real_array(subject: str, value: ArrayLike) -> np.ndarray:
-    """``value`` as an array of its own real type; InputError for what holds anything else than real numbers."""
+    """Returns ``value`` as an array of its real type. Raises InputError for anything but real numbers."""
     try:
         array = np.asarray(value)
-    except ValueError as error:  # NumPy's words for it are long
+    except ValueError as error:  # NumPy's message is long
         raise InputError(subject, "lists of unequal length", "an array of numbers") from error
     if array.dtype.kind not in "iuf":
-        raise InputError(subject, shown(value), "numbers")
+        raise InputError(subject, short_repr(value), "numbers")
     return array
 
 
 def whole(subject: str, value: float, lowest: int, highest: int) -> None:
-    """Raise InputError unless the scalar `value` is a whole number between two bounds, both included."""
+    """Raises InputError unless the scalar ``value`` is a whole number between two bounds, both included."""
     within(subject, value, lowest, highest)
     if value != int(value):
-        raise InputError(subject, shown(value), f"a whole number from {lowest} to {highest}")
+        raise InputError(subject, short_repr(value), f"a whole number from {lowest} to {highest}")
 
 
 def package(name: str, use: str, install: str) -> ModuleType:
-    """The imported package, or an InputError that says how to install it."""
+    """Imports a package. Raises InputError with the command that installs it."""
     try:
         return importlib.import_module(name)
     except ImportError as error:
         raise InputError(name, "not installed", use, f"pip install '{install}'") from error
 
 
-def shown(value: object) -> str:
-    """A value met where another was expected, short enough for a line."""
+def short_repr(value: object) -> str:
+    """Returns the repr of a wrong value, short enough for a message."""
     try:
         text = repr(value)
     except ValueError:  # Python refuses to print whole numbers of thousands of digits
         return "a number of thousands of digits"
     except RecursionError:
         return "hundreds of tables or lists in each other"
-    return text if len(text) <= _LONGEST_SHOWN else f"{text[: _LONGEST_SHOWN - 3]}..."
+    return text if len(text) <= _LONGEST else f"{text[: _LONGEST - 3]}..."
 
 
 def is_number(value: object) -> bool:

@@ -1,6 +1,6 @@
-"""The package's exceptions: each names the subject, what was found, what was expected and what to do, in one line.
+"""The package's exceptions. Each message is one line: subject, found value, expected value, remedy.
 
-Exit statuses are told apart by scripts (docs/trouble.md); 1 is Python's own, for a defect of this program.
+Scripts distinguish exit statuses (docs/trouble.md). Status 1 is Python's own, for a defect of this program.
 """
 
 import re
@@ -9,14 +9,16 @@ from contextlib import contextmanager
 
 from phyradgs_cl.text import plain_text
 
-_OPTION = re.compile(r"(?<!\w)'[^']*'|--set |(?<![\w-])--([a-z][a-z-]*)")  # what is quoted, a command or a value, stays
-_ELSEWHERE = {"with": "others", "readout": "readout_axis"}  # options whose argument has another name
+_OPTION = re.compile(r"(?<!\w)'[^']*'|--set |(?<![\w-])--([a-z][a-z-]*)")  # quoted commands and values stay
+_OTHER_NAMES = {"with": "others", "readout": "readout_axis"}  # options whose argument has another name
 
 
 class PhyradgsError(Exception):
-    """Base of every error that this package raises on purpose. subject: what is wrong: an option, a file with its HDF5
-    path, a device; found: the value or state met there; expected: what would have been right; remedy: what to do about it,
-    as an imperative. ``exit_code``: the command line's status."""
+    """Base of every error that this package raises on purpose.
+
+    subject: an option, a file with its HDF5 path, a device. found: the wrong value or state. expected: a right one.
+    remedy: an imperative. ``exit_code``: the command line's exit status.
+    """
 
     exit_code = 2
 
@@ -32,7 +34,7 @@ class PhyradgsError(Exception):
         expected = f"expected {self.expected}" if self.expected else ""
         details = "; ".join(part for part in (found, expected, self.remedy) if part)
         text = f"{self.subject}: {details}" if details else self.subject
-        return plain_text(" ".join(text.split()))  # messages of other libraries bring line breaks along
+        return plain_text(" ".join(text.split()))  # messages of other libraries contain line breaks
 
 
 class InputError(PhyradgsError):
@@ -40,11 +42,13 @@ class InputError(PhyradgsError):
 
 
 class NumericalError(PhyradgsError):
+    """Numbers are no longer finite."""
+
     exit_code = 3
 
 
 class OutputError(PhyradgsError):
-    """A result cannot be written: no room, no permission, or another run is at work on it."""
+    """A result cannot be written: no room, no permission, or another run writes it."""
 
     exit_code = 4
 
@@ -56,7 +60,7 @@ class DeviceError(PhyradgsError):
 
 
 class NoSuchDeviceError(InputError, DeviceError):
-    """The device that was asked for is not there: as wrong an option as any other."""
+    """The named device does not exist: a wrong option."""
 
     exit_code = 2
 
@@ -69,12 +73,12 @@ class OutOfMemoryError(DeviceError):
 
 @contextmanager
 def naming_arguments() -> Iterator[None]:
-    """Errors of the body name arguments of Python for options of the command line: ``time_error`` for ``--time-error``."""
+    """Makes errors of the body name Python's arguments instead of options: ``time_error`` instead of ``--time-error``."""
     try:
         yield
     except PhyradgsError as error:
-        told = error.subject, error.found, error.expected, error.remedy
-        error.args = tuple(_OPTION.sub(_argument, text) for text in told)
+        parts = error.subject, error.found, error.expected, error.remedy
+        error.args = tuple(_OPTION.sub(_argument, text) for text in parts)
         error.subject, error.found, error.expected, error.remedy = error.args
         raise
 
@@ -83,12 +87,12 @@ def _argument(match: re.Match[str]) -> str:
     option = match[1]
     if option is None:
         return "" if match[0] == "--set " else match[0]
-    return _ELSEWHERE.get(option, option.replace("-", "_"))
+    return _OTHER_NAMES.get(option, option.replace("-", "_"))
 
 
 @contextmanager
 def naming_host_memory() -> Iterator[None]:
-    """Python's and NumPy's MemoryError in the body comes out as OutOfMemoryError."""
+    """Turns a MemoryError of Python or NumPy in the body into an OutOfMemoryError."""
     try:
         yield
     except MemoryError as error:

@@ -83,7 +83,7 @@ class Settings:
     def _word(self, values: dict[str, Any], name: str) -> str | None:
         value = values.pop(name, None)
         if value is not None and not isinstance(value, str):
-            raise InputError(self.origins.get(name, _flag(name)), checks.shown(value), "a word in quotation marks")
+            raise InputError(self.origins.get(name, _flag(name)), checks.short_repr(value), "a word in quotation marks")
         return value
 
 
@@ -162,5 +162,5 @@ def device_wish(value: object, subject: str = "--device") -> str | None:
         return None
     if not isinstance(value, str) or not value.strip():
         remedy = "see 'phyradgs devices', or leave it out for the best device"
-        raise InputError(subject, checks.shown(value), "an index, cpu, gpu or part of a name", remedy)
+        raise InputError(subject, checks.short_repr(value), "an index, cpu, gpu or part of a name", remedy)
     return value

@@ -1,4 +1,4 @@
-"""Text from strangers: made fit for terminals, pages and files, and compared with what is known. Numbers as text."""
+"""Text of files, users and other programs, made printable and compared with known names; numbers as text."""
 
 import difflib
 import math
@@ -7,36 +7,36 @@ from collections.abc import Iterable
 from dataclasses import fields
 from typing import Any
 
-# Controls but tab and line feed, which would move a terminal's cursor or end a string; half a surrogate pair, by which
-# Python stands for a byte of a name that is not UTF-8, and which nothing encodes.
-_UNFIT = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\ud800-\udfff]")
+# Control characters except tab and line feed: they move a terminal's cursor or end a string. Half surrogate pairs: Python
+# puts them in the place of bytes that are not UTF-8, and nothing encodes them.
+_UNPRINTABLE = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\ud800-\udfff]")
 
 
 def plain_text(text: str) -> str:
-    """``text`` with a replacement character for everything that not every terminal, page or file takes."""
-    return _UNFIT.sub("\ufffd", text)
+    """Returns ``text`` with a replacement character for each that a terminal, a page or a file may refuse."""
+    return _UNPRINTABLE.sub("\ufffd", text)
 
 
-def near_miss(name: object, known: Iterable[str], otherwise: str) -> str:
-    """What to do about a name that is not known: take the one that it nearly is, or ``otherwise``."""
-    close = difflib.get_close_matches(str(name)[:200], list(known), n=1)
+def suggest_name(name: object, known_names: Iterable[str], otherwise: str) -> str:
+    """Returns the advice to use the known name that is most similar, or ``otherwise``."""
+    close = difflib.get_close_matches(str(name)[:200], list(known_names), n=1)
     return f"did you mean {close[0]!r}?" if close else otherwise
 
 
-def short_repr(thing: Any) -> str:
-    """A dataclass with the fields that are not as they are by themselves; of arrays the shape."""
-    shown = []
+def repr_of_changes(thing: Any) -> str:
+    """Returns the repr of a dataclass with the fields that differ from their defaults; arrays as their shape."""
+    texts = []
     for field in fields(thing):
         value = getattr(thing, field.name)
         if not field.repr:
             continue
         if hasattr(value, "shape"):
-            shown.append(f"{field.name}=array{tuple(value.shape)}")
+            texts.append(f"{field.name}=array{tuple(value.shape)}")
         elif value != field.default:
-            shown.append(f"{field.name}={value!r}")
-    return f"{type(thing).__name__}({', '.join(shown)})"
+            texts.append(f"{field.name}={value!r}")
+    return f"{type(thing).__name__}({', '.join(texts)})"
 
 
 def to_digits_of(value: float, deviation: float) -> str:
-    """A value with the decimals that two digits of its deviation have."""
+    """Returns a value with as many decimals as two digits of its deviation have."""
     return f"{value:.{max(0, 1 - math.floor(math.log10(max(deviation, 1e-12))))}f}"

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.text import near_miss
+from phyradgs_cl.text import suggest_name
 
 _COUNTED = re.compile(r"(?P<name>.+)_(?P<count>\d+)")
 
@@ -30,7 +30,7 @@ def find_volumes(folder: Path, names: Sequence[str] | None, voxels: int) -> dict
         raise InputError("--volumes", f"no .h5 file in {folder}", expected)
     for name in names or ():
         if name not in found:
-            raise InputError("--names", repr(name), f"one of {', '.join(found)}", near_miss(name, found, ""))
+            raise InputError("--names", repr(name), f"one of {', '.join(found)}", suggest_name(name, found, ""))
     chosen = list(dict.fromkeys(names)) if names else list(found)
     return {name: _best(found[name], 2 * voxels) for name in chosen}
 

@@ -95,7 +95,7 @@ def _positive_mm(name: str, value: object, shape: tuple[int, ...]) -> None:
     """Raises InputError unless ``value`` is a positive length, or a pair (v, u) of them."""
     if (checks.numbers(name, value, shape) <= 0).any():  # type: ignore[arg-type]
         expected = "two positive lengths in mm (v, u)" if shape else "a positive length in mm"
-        raise InputError(name, checks.shown(value), expected)
+        raise InputError(name, checks.short_repr(value), expected)
 
 
 def pixel_centres(pose: np.ndarray, detector_shape: tuple[int, int]) -> np.ndarray:

@@ -173,7 +173,7 @@ def motion_of(motion: str | Motion) -> Motion:
     if not isinstance(motion, str):
         return motion
     if motion not in MOTIONS:
-        raise InputError("motion", checks.shown(motion), f"one of {', '.join(MOTIONS)}")
+        raise InputError("motion", checks.short_repr(motion), f"one of {', '.join(MOTIONS)}")
     return next(model() for model in MODELS if model.name == motion)
 
 
@@ -199,7 +199,7 @@ def check_motion(motion: Motion, taken: tuple[Motion, ...]) -> None:
     if isinstance(motion, type) and hasattr(motion, "cells"):
         raise InputError("--motion", f"the class {motion.__name__}", "a model", f"write {motion.__name__}()")
     if not callable(getattr(motion, "cells", None)):
-        raise InputError("--motion", checks.shown(motion), "a model with cells(scan, frame)")
+        raise InputError("--motion", checks.short_repr(motion), "a model with cells(scan, frame)")
     if isinstance(motion, MODELS) and type(motion) not in {type(model) for model in taken}:
         raise InputError("--motion", repr(motion), f"one of {', '.join(map(repr, taken))}, or a class of your own")
 

@@ -24,7 +24,7 @@ from phyradgs_cl.acquisition.toolkits import astra_of_poses, poses_of_astra, pos
 from phyradgs_cl.acquisition.trajectory import CircularOrbit, Trajectory, checked_poses, resting_trajectory
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid, GridChoice
-from phyradgs_cl.text import near_miss
+from phyradgs_cl.text import suggest_name
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -81,9 +81,9 @@ class Scan:
     def __post_init__(self) -> None:
         for name, kind in {"geometry": ConeGeometry, "shutter": Shutter, "grid": Grid}.items():
             if not isinstance(getattr(self, name), kind):
-                raise InputError(name, checks.shown(getattr(self, name)), f"a {kind.__name__}")
+                raise InputError(name, checks.short_repr(getattr(self, name)), f"a {kind.__name__}")
         if not callable(getattr(self.trajectory, "pose", None)):
-            raise InputError("trajectory", checks.shown(self.trajectory), "anything with pose(frame, time_s)")
+            raise InputError("trajectory", checks.short_repr(self.trajectory), "anything with pose(frame, time_s)")
         object.__setattr__(self, "projections", _line_integrals(self.projections, self.pixel_mask))
         frames = len(self.projections)
         expected = (frames, *self.geometry.detector_shape)
@@ -94,7 +94,7 @@ class Scan:
             raise InputError("projections", "no frame", "at least one projection")
         object.__setattr__(self, "frame_start_s", checks.numbers("frame_start_s", self.frame_start_s, (frames,)))
         if not isinstance(self.title, str):
-            raise InputError("title", checks.shown(self.title), "text")
+            raise InputError("title", checks.short_repr(self.title), "text")
         if self.detector_model not in DETECTOR_MODELS:
             raise InputError("detector_model", repr(self.detector_model), "'log' or 'intensity'")
         checks.within("lag", self.lag, 0, LARGEST_LAG)
@@ -277,7 +277,7 @@ def check_others(others: Iterable[str], arguments: Iterable[str] = ()) -> None:
     allowed = (*arguments, *_OTHERS)
     for name in others:
         if name not in _OTHERS:
-            raise InputError(name, "no such option", ", ".join(allowed), near_miss(name, allowed, "leave it out"))
+            raise InputError(name, "no such option", ", ".join(allowed), suggest_name(name, allowed, "leave it out"))
 
 
 def check_not_counts(frames: np.ndarray, remedy: str, mask: ArrayLike | None = None) -> None:

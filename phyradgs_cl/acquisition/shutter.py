@@ -36,7 +36,7 @@ class Shutter:
             raise InputError("readout axis", repr(self.axis), "'rows' or 'columns'")
         if self.direction not in (1, -1):
             expected = "1 (index 0 first) or -1 (index 0 last)"
-            raise InputError("readout direction", checks.shown(self.direction), expected)
+            raise InputError("readout direction", checks.short_repr(self.direction), expected)
         if self.pulse_s is not None:
             self._check_pulse(*checks.numbers("pulse_s", self.pulse_s, (2,)).tolist())
 

@@ -48,7 +48,7 @@ def poses_of_tigre(geo: Any, angles_rad: ArrayLike) -> tuple[np.ndarray, tuple[i
     turned panel, a second or third Euler angle, a volume that moves; and for attributes that are missing or not numbers.
     """
     if getattr(geo, "mode", None) not in (None, "cone"):
-        raise InputError("geo.mode", checks.shown(geo.mode), "'cone'", "parallel beams have no source distance")
+        raise InputError("geo.mode", checks.short_repr(geo.mode), "'cone'", "parallel beams have no source distance")
     angles = np.asarray(angles_rad)
     angles = checks.numbers("angles", angles_rad, (None, 3) if angles.ndim == 2 else (None,))
     if angles.ndim == 2:
@@ -85,7 +85,7 @@ def _of(geo: Any, name: str) -> Any:
 def _counts(geo: Any, name: str, length: int) -> np.ndarray:
     counts = checks.numbers(f"geo.{name}", _of(geo, name), (length,))
     if (counts < 1).any() or (counts != np.floor(counts)).any():
-        raise InputError(f"geo.{name}", checks.shown(counts.tolist()), f"{length} whole numbers of at least 1")
+        raise InputError(f"geo.{name}", checks.short_repr(counts.tolist()), f"{length} whole numbers of at least 1")
     return counts
 
 
@@ -104,4 +104,4 @@ def _each(geo: Any, name: str, frames: int, length: int, absent: float) -> np.nd
 
 def _refuse(subject: str, values: np.ndarray, expected: str) -> None:
     if np.any(values):
-        raise InputError(subject, checks.shown(float(values[np.nonzero(values)][0])), expected)
+        raise InputError(subject, checks.short_repr(float(values[np.nonzero(values)][0])), expected)

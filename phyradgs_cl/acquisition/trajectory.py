@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from phyradgs_cl import checks
 from phyradgs_cl.acquisition.geometry import POSE_LENGTH, ConeGeometry
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.text import short_repr
+from phyradgs_cl.text import repr_of_changes
 
 _LEAST_SPAN_S = 1e-6  # for frames of no duration
 _MOST_SAMPLES = 1024  # per frame
@@ -79,7 +79,7 @@ class EncoderTable:
     angle_rad_table: "NDArray[np.float64]"
     subject: str = "encoder table"
 
-    __repr__ = short_repr
+    __repr__ = repr_of_changes
 
     def __post_init__(self) -> None:
         wanted = "two equal 1D arrays of at least 2 samples"
@@ -108,7 +108,7 @@ class FrameSweeps:
     angle_start_rad: np.ndarray
     angle_end_rad: np.ndarray
 
-    __repr__ = short_repr
+    __repr__ = repr_of_changes
 
     def __post_init__(self) -> None:
         checks.at_least("exposure_s", self.exposure_s, 0)
@@ -135,9 +135,9 @@ class CircularOrbit:
 
     def __post_init__(self) -> None:
         if not isinstance(self.geometry, ConeGeometry):
-            raise InputError("geometry", checks.shown(self.geometry), "a ConeGeometry")
+            raise InputError("geometry", checks.short_repr(self.geometry), "a ConeGeometry")
         if not callable(getattr(self.kinematics, "angle_rad", None)):
-            raise InputError("kinematics", checks.shown(self.kinematics), "anything with angle_rad(frame, time_s)")
+            raise InputError("kinematics", checks.short_repr(self.kinematics), "anything with angle_rad(frame, time_s)")
 
     def pose(self, frame: int, time_s: np.ndarray) -> np.ndarray:
         """Returns poses (..., 12) in mm of frame number ``frame`` at times (...) s."""
@@ -163,7 +163,7 @@ class PoseTable:
     subject: str = "pose table"
     _frames: np.ndarray = field(init=False, repr=False)
 
-    __repr__ = short_repr
+    __repr__ = repr_of_changes
 
     def __post_init__(self) -> None:
         expected, row = "times (T,) and poses (T, 12), T at least 2", (POSE_LENGTH,)

@@ -52,9 +52,9 @@ def calibrate(
     check_scan(scan)
     scan.check_timing()
     if not (what is None or isinstance(what, str)):
-        raise InputError("what", checks.shown(what), "names in one text, with commas", "write for example 'offset,roll'")
+        raise InputError("what", checks.short_repr(what), "names with commas between", "write for example 'offset,roll'")
     if not isinstance(others, Sequence):
-        raise InputError("others", checks.shown(others), "a list of Scans")
+        raise InputError("others", checks.short_repr(others), "a list of Scans")
     for other in others:
         check_scan(other, "others")
     shape = None if phantom is None else load_beads(Path(phantom))

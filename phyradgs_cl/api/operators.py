@@ -119,7 +119,7 @@ class Operator:
         count = self._range[1][0] or 0
         numbers = list(chosen) if isinstance(chosen, Sequence | np.ndarray) else []
         if not numbers or not all(_is_index(number, count) for number in numbers):
-            raise InputError("frames", checks.shown(chosen), f"at least one whole number from 0 to {count - 1}")
+            raise InputError("frames", checks.short_repr(chosen), f"at least one whole number from 0 to {count - 1}")
         return self._frames([int(f) for f in numbers])
 
     @cached_property
@@ -236,7 +236,7 @@ def as_torch(operator: Operator) -> Callable[..., Any]:
 
     def function(x: Any, frames: Sequence[int] | None = None) -> Any:
         if not isinstance(x, torch.Tensor):
-            raise InputError("x", checks.shown(x), "a tensor", "of a cloud, torch.tensor(cloud.rows())")
+            raise InputError("x", checks.short_repr(x), "a tensor", "of a cloud, torch.tensor(cloud.rows())")
         of = operator if frames is None else operator.frames(frames)
         return (Linear if isinstance(of, LinearOperator) else Curved).apply(x, of)
 

@@ -268,7 +268,7 @@ def _checked(scan: Scan, motion: str | Motion, taken: tuple[Motion, ...]) -> Mot
 
 def _a_grid(grid: Grid) -> Grid:
     if not isinstance(grid, Grid):
-        raise InputError("grid", checks.shown(grid), "a Grid")
+        raise InputError("grid", checks.short_repr(grid), "a Grid")
     return grid
 
 

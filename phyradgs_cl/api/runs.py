@@ -35,7 +35,7 @@ from phyradgs_cl.reconstructors import reconstruct as run_method
 from phyradgs_cl.reconstructors.frames.preprocess import prepared
 from phyradgs_cl.signals import keep_finished_work
 from phyradgs_cl.simulation import OPTION_NAMES, scanner_for, scanner_options, simulated_scan
-from phyradgs_cl.text import near_miss
+from phyradgs_cl.text import suggest_name
 
 
 @naming_arguments()
@@ -94,7 +94,7 @@ def save_volume(
     """
     if not isinstance(result, Reconstruction):
         remedy = "for an array, Reconstruction(volume, grid)"
-        raise InputError("result", checks.shown(result), "a Reconstruction", remedy)
+        raise InputError("result", checks.short_repr(result), "a Reconstruction", remedy)
     file = _checked_path(path)
     if foreign_suffix(file) is not None:
         checks.finite("volume", result.volume)
@@ -136,11 +136,12 @@ def simulate(
     Raises InputError for unknown names and for values out of range.
     """
     if not isinstance(phantom, str | Path):
-        raise InputError("phantom", checks.shown(phantom), "a name, or the path of a volume file", "save_volume writes one")
+        expected = "a name, or the path of a volume file"
+        raise InputError("phantom", checks.short_repr(phantom), expected, "save_volume writes one")
     own = ("scanner", "protocol", "size", "detector", "detector_offset_mm", "truncation", "pixel_samples", "device")
     if unknown := sorted(set(options) - OPTION_NAMES):
         known = [*own, *sorted(OPTION_NAMES)]
-        remedy = near_miss(unknown[0], known, "")
+        remedy = suggest_name(unknown[0], known, "")
         expected = "" if remedy else f"one of {', '.join(known)}"
         raise InputError(f"simulate: option {unknown[0]}", "no such option", expected, remedy)
     described = scanner_for(scanner, detector, detector_offset_mm, truncation)
@@ -148,7 +149,8 @@ def simulate(
     is_toml = str(phantom).endswith(".toml")
     if isinstance(phantom, str) and phantom not in PHANTOMS and not Path(phantom).exists():
         expected = f"one of {', '.join(PHANTOMS)}, or a volume's file"
-        raise InputError("phantom", f"{phantom}, which is no file", expected, near_miss(phantom, PHANTOMS, "check the path"))
+        remedy = suggest_name(phantom, PHANTOMS, "check the path")
+        raise InputError("phantom", f"{phantom}, which is no file", expected, remedy)
     of = str(phantom) if phantom in PHANTOMS else (load_beads(Path(phantom)) if is_toml else load_attenuation(phantom))
     name = f"volume {phantom}"
     rt = runtime_of(device)
@@ -239,13 +241,13 @@ def _first_volume(initial: object, grid: Grid) -> InitialVolume:
     if isinstance(initial, Reconstruction):
         return InitialVolume(initial.volume, initial.grid)
     if not isinstance(initial, np.ndarray):
-        raise InputError("initial", checks.shown(initial), "a Reconstruction, or an array (nz, ny, nx) in 1/mm")
+        raise InputError("initial", checks.short_repr(initial), "a Reconstruction, or an array (nz, ny, nx) in 1/mm")
     return InitialVolume(checks.numbers("initial", initial, grid.shape), grid)
 
 
 def _checked_path(path: object) -> Path:
     if not isinstance(path, str | Path) or not str(path):
-        raise InputError("path", checks.shown(path), "the name of a file")
+        raise InputError("path", checks.short_repr(path), "the name of a file")
     return Path(path)
 
 
@@ -253,15 +255,15 @@ def check_scan(scan: object, subject: str = "scan") -> None:
     """Raises InputError for anything but a Scan."""
     if not isinstance(scan, Scan):
         remedy = "read a file with load_scan, or make one with fly_scan or static_scan"
-        raise InputError(subject, checks.shown(scan), "a Scan", remedy)
+        raise InputError(subject, checks.short_repr(scan), "a Scan", remedy)
 
 
 def _check_reconstruct(scan: object, grid: object, report: object, on_interrupt: object) -> None:
     check_scan(scan)
     if not (grid is None or isinstance(grid, Grid)):
-        raise InputError("grid", checks.shown(grid), "a Grid, or None for the scan's")
+        raise InputError("grid", checks.short_repr(grid), "a Grid, or None for the scan's")
     if not (isinstance(report, bool) or callable(report)):
-        raise InputError("report", checks.shown(report), "a function, True or False")
+        raise InputError("report", checks.short_repr(report), "a function, True or False")
     checks.one_of("on_interrupt", on_interrupt, ("raise", "return"))
 
 
@@ -281,6 +283,6 @@ def _reporting(report: ProgressReport | bool) -> Iterator[tuple[ProgressReport, 
 def _state_of(partial: object) -> State:
     """Returns the state of an interrupted result."""
     if not isinstance(partial, Reconstruction) or partial.state is None:
-        found = "a result that is complete" if isinstance(partial, Reconstruction) else checks.shown(partial)
+        found = "a result that is complete" if isinstance(partial, Reconstruction) else checks.short_repr(partial)
         raise InputError("resume", found, "the partial result of an interrupted run")
     return partial.state

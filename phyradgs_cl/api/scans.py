@@ -163,7 +163,7 @@ def _pixels(
 ) -> LineIntegrals:
     """Returns frames of any quantity as line integrals, with the mask of unusable pixels."""
     if not isinstance(geometry, ConeGeometry):
-        raise InputError("geometry", checks.shown(geometry), "a ConeGeometry")
+        raise InputError("geometry", checks.short_repr(geometry), "a ConeGeometry")
     panel = geometry.detector_shape
     values = _stack("frames", frames, panel)
     flat, dark = (

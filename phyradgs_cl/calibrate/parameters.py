@@ -10,7 +10,7 @@ from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.acquisition.altered.angles import exposure_arc_rad
 from phyradgs_cl.acquisition.altered.perturbed import GeometryCorrection
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.text import near_miss
+from phyradgs_cl.text import suggest_name
 
 _STEP_PX = 0.25  # by which a central difference moves the image at its edge
 _TIMING_STEP, _LARGEST_CUT = 0.1, 0.7  # of the stated time: a difference, and the most to subtract
@@ -158,7 +158,7 @@ def requested(what: str | None, scan: Scan, knows_shape: bool = False) -> Reques
     names: list[str] = []
     for word in (word.strip() for word in what.split(",")):
         if word not in NAMES:
-            raise InputError("--what", repr(word), ", ".join(NAMES), near_miss(word, NAMES, "name some of them"))
+            raise InputError("--what", repr(word), ", ".join(NAMES), suggest_name(word, NAMES, "name some of them"))
         names += PARAMETER_GROUPS.get(word, (word,))
     names = list(dict.fromkeys(names))
     if WOBBLE in names and MOTION in names:

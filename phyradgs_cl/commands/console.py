@@ -12,7 +12,7 @@ import typer
 from typer.core import TyperCommand
 
 from phyradgs_cl import signals
-from phyradgs_cl.checks import shown
+from phyradgs_cl.checks import short_repr
 from phyradgs_cl.errors import InputError, OutputError, PhyradgsError
 from phyradgs_cl.parallel import launched
 from phyradgs_cl.text import plain_text
@@ -98,7 +98,7 @@ def usage_text(error: Any, arguments: Sequence[str]) -> str:
     """Returns Typer's message about the words of a command, with the value that it could not read."""
     text = str(error.format_message()).replace("Value error, ", "")
     value = _value_of(getattr(error, "param", None), arguments)
-    return text if value is None or repr(value) in text else f"{text.rstrip('.')}; found {shown(value)}"
+    return text if value is None or repr(value) in text else f"{text.rstrip('.')}; found {short_repr(value)}"
 
 
 def _value_of(parameter: Any, arguments: Sequence[str]) -> str | None:

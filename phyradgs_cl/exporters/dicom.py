@@ -38,11 +38,11 @@ class DicomLabels:
         for name, value in self.given.items():
             option = f"--{name}"
             if not (isinstance(value, str) and value.strip() and value.isprintable() and len(value) <= _LONGEST):
-                raise InputError(option, checks.shown(value), f"a line of 1 to {_LONGEST} characters")
+                raise InputError(option, checks.short_repr(value), f"a line of 1 to {_LONGEST} characters")
             if "\\" in value:
-                raise InputError(option, checks.shown(value), "text without \\, which separates values in DICOM")
+                raise InputError(option, checks.short_repr(value), "text without \\, which separates values in DICOM")
         if self.date is not None and self._day is None:
-            raise InputError("--date", checks.shown(self.date), "a day as YYYY-MM-DD, such as 2026-03-31")
+            raise InputError("--date", checks.short_repr(self.date), "a day as YYYY-MM-DD, such as 2026-03-31")
 
     @property
     def given(self) -> dict[str, object]:

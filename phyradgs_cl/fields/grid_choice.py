@@ -36,7 +36,7 @@ class GridChoice:
         if self.size is not None:
             counts = _numbers("--size", self.size, (1, 3), "64 or 48,64,64")
             if any(n != int(n) or not 1 <= n <= MOST_VOXELS for n in counts):
-                raise InputError("--size", checks.shown(self.size), "whole numbers of voxels, at least 1")
+                raise InputError("--size", checks.short_repr(self.size), "whole numbers of voxels, at least 1")
             object.__setattr__(self, "size", triple(map(int, counts)) if len(counts) == 3 else int(counts[0]))
         if self.voxel_mm is not None:
             object.__setattr__(self, "voxel_mm", voxel_sides_mm("--voxel-mm", self.voxel_mm))
@@ -46,7 +46,7 @@ class GridChoice:
             for end_mm in ends_mm:
                 checks.within("--roi-mm", end_mm, -_LARGEST_MM if len(ends_mm) == 6 else 1 / _LARGEST_MM, _LARGEST_MM)
             if len(ends_mm) == 6 and any(b - a < 1 / _LARGEST_MM for a, b in zip(ends_mm[::2], ends_mm[1::2], strict=True)):
-                raise InputError("--roi-mm", checks.shown(self.roi_mm), "Z0 below Z1, Y0 below Y1, X0 below X1")
+                raise InputError("--roi-mm", checks.short_repr(self.roi_mm), "Z0 below Z1, Y0 below Y1, X0 below X1")
             object.__setattr__(self, "roi_mm", ends_mm)
         if self.margin_mm is not None:
             widths_mm = _numbers("--margin-mm", self.margin_mm, (1, 3), "20 or 0,20,20")
@@ -74,7 +74,7 @@ class GridChoice:
             if shape.max() == 1 < max(grid.shape):
                 box = " × ".join(f"{side:.4g}" for side in sides_mm)
                 expected = f"several voxels in the box of {box} mm (z, y, x)"
-                raise InputError("--voxel-mm", checks.shown(self.voxel_mm), expected)
+                raise InputError("--voxel-mm", checks.short_repr(self.voxel_mm), expected)
         elif self.roi_mm is not None:
             return self._cut(grid, box_mm)
         else:
@@ -136,5 +136,5 @@ def _numbers(option: str, value: Any, counts: tuple[int, ...], example: str) -> 
     if not (fits and all(abs(n) < 1e300 for n in parts)):  # false for NaN too
         many = " or ".join(str(count) for count in counts)
         expected = f"{many} finite numbers" if counts != (1, 3) else "a finite number, or three (z, y, x)"
-        raise InputError(option, checks.shown(value), expected, f"write for example {example}")
+        raise InputError(option, checks.short_repr(value), expected, f"write for example {example}")
     return tuple(float(n) for n in parts)

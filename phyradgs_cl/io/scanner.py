@@ -15,7 +15,7 @@ from phyradgs_cl.fields import Grid, triple
 from phyradgs_cl.fields.volume import MOST_VOXELS
 from phyradgs_cl.io.hdf5.datasets import LENGTH
 from phyradgs_cl.io.tables import Fields, described, read_toml, refuse_unknown
-from phyradgs_cl.text import near_miss
+from phyradgs_cl.text import suggest_name
 
 TABLES: dict[str, tuple[str, ...]] = {
     "source": ("to_axis_mm", "to_detector_mm"),
@@ -69,7 +69,7 @@ def _located(name: str, data_dir: Path) -> Path:
         return Path(name)
     names = sorted(path.stem for path in Path(data_dir).glob("*.toml") if _describes_scanner(path))
     if name not in names:
-        remedy = near_miss(name, names, "or give the path of a .toml file")
+        remedy = suggest_name(name, names, "or give the path of a .toml file")
         raise InputError("scanner", repr(name), f"one of {', '.join(names)}" if names else "a path", remedy)
     return Path(data_dir) / f"{name}.toml"
 
@@ -160,7 +160,7 @@ def _grid(volume: Fields) -> Grid:
     if any(n < 1 or n != int(n) for n in shape):
         raise volume.error("shape", str(list(shape)), "three counts of at least 1 (z, y, x)")
     if math.prod(shape) > MOST_VOXELS:
-        raise volume.error("shape", checks.shown(list(shape)), f"at most {MOST_VOXELS:.3g} voxels")
+        raise volume.error("shape", checks.short_repr(list(shape)), f"at most {MOST_VOXELS:.3g} voxels")
     if min(size_mm) < 1 / LENGTH.largest:
         raise volume.error("size_mm", str(list(size_mm)), "three lengths above 0 (z, y, x)")
     voxel_mm = triple(side / n for side, n in zip(size_mm, shape, strict=True))

@@ -12,7 +12,7 @@ import numpy as np
 from phyradgs_cl import checks
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.io.files import read_regular
-from phyradgs_cl.text import near_miss
+from phyradgs_cl.text import suggest_name
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -71,7 +71,7 @@ def refuse_unknown(subject: str, names: Collection[str], allowed: Collection[str
     """Raises InputError for the first unknown name, with the allowed name that is close to it."""
     for key in names:
         if key not in allowed:
-            remedy = near_miss(key, allowed, "remove it")
+            remedy = suggest_name(key, allowed, "remove it")
             raise InputError(f"{subject} {key}", f"{what} that is not known", ", ".join(allowed), remedy)
 
 
@@ -191,6 +191,6 @@ class Fields:
 def described(value: object) -> str:
     """Returns a value for a message; of containers only type and length, since nested ones can take for ever to print."""
     if value is None or isinstance(value, (bool, int, float, str, bytes, np.generic)):
-        return checks.shown(value)
+        return checks.short_repr(value)
     size = f" of {len(value)}" if isinstance(value, (Mapping, Sequence)) else ""
     return f"a {type(value).__name__}{size}"

@@ -303,7 +303,7 @@ def _read_metrics(source: Hdf5Source) -> dict[str, object] | None:
         return None
     wrong = [name for name, value in metrics.items() if isinstance(value, str | bool | dict | list)]
     if wrong:
-        log.warning("%s: %s: no numbers, left out", source.name("/entry/metrics"), checks.shown(wrong))
+        log.warning("%s: %s: no numbers, left out", source.name("/entry/metrics"), checks.short_repr(wrong))
     return {name: value for name, value in metrics.items() if name not in wrong}
 
 

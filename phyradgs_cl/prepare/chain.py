@@ -14,7 +14,7 @@ from phyradgs_cl.prepare.light import WAYS, AirOptions, normalise_air
 from phyradgs_cl.prepare.rings import RingOptions, remove_rings
 from phyradgs_cl.prepare.scatter import ScatterOptions, subtract_scatter
 from phyradgs_cl.prepare.step import Facts, MakeModel, Step
-from phyradgs_cl.text import near_miss
+from phyradgs_cl.text import suggest_name
 
 log = logging.getLogger(__name__)
 
@@ -50,8 +50,8 @@ class PrepareOptions:
         checks.one_of("flats", self.flats, WAYS)
         for name in self.steps.split(",") if self.steps.strip() else ():
             if name.strip() not in STEPS:
-                remedy = near_miss(name.strip(), STEPS, "leave it out")
-                raise InputError("--steps", checks.shown(name.strip()), f"some of {', '.join(STEPS)}", remedy)
+                remedy = suggest_name(name.strip(), STEPS, "leave it out")
+                raise InputError("--steps", checks.short_repr(name.strip()), f"some of {', '.join(STEPS)}", remedy)
         for name in STEPS:
             if name not in self.chosen and getattr(self, name) != type(getattr(self, name))():
                 found = f"options of a step that is not among --steps {self.steps or '(none)'}"

@@ -39,7 +39,7 @@ def _differences(then: object, now: object, name: str = "") -> Iterator[str]:
         for key in sorted({*then, *now}):
             yield from _differences(then.get(key), now.get(key), f"{name}.{key}" if name else key)
     elif then != now:
-        yield f"{name[:_LONGEST_NAME]} ({checks.shown(then)}, now {checks.shown(now)})"
+        yield f"{name[:_LONGEST_NAME]} ({checks.short_repr(then)}, now {checks.short_repr(now)})"
 
 
 def check_like(state: State, like: Mapping[str, np.ndarray]) -> None:

@@ -59,7 +59,7 @@ def own_method(name: str, function: Any) -> Method:
     try:
         parameters = inspect.signature(function).parameters
     except (TypeError, ValueError):
-        raise InputError(subject, checks.shown(function), _FORM) from None
+        raise InputError(subject, checks.short_repr(function), _FORM) from None
     by_place = [p for p in parameters.values() if p.kind in (p.POSITIONAL_ONLY, p.POSITIONAL_OR_KEYWORD)]
     if len(by_place) < 3:
         raise InputError(subject, f"{function!r} with {len(by_place)} parameters", _FORM)

@@ -14,7 +14,7 @@ from phyradgs_cl.errors import InputError
 from phyradgs_cl.reconstructors.frames.preprocess import Preprocessing
 from phyradgs_cl.reconstructors.registry import METHODS, method_name, method_of
 from phyradgs_cl.reconstructors.tune import check_tuning
-from phyradgs_cl.text import near_miss
+from phyradgs_cl.text import suggest_name
 
 _COUNTS = tuple(dict.fromkeys(f.name for model in MODELS for f in fields(model) if f.init))
 """The fields of motion models, by which options name them."""
@@ -35,7 +35,7 @@ def method_options(
     if not isinstance(chosen, str) or chosen not in presets:
         having = [other for other, one in METHODS.items() if isinstance(chosen, str) and chosen in one.presets]
         remedy = f"--method {' or '.join(having)} has it" if having else ""
-        raise InputError("--preset", checks.shown(chosen), f"one of {', '.join(presets)} for --method {name}", remedy)
+        raise InputError("--preset", checks.short_repr(chosen), f"one of {', '.join(presets)} for --method {name}", remedy)
     changes = dict(changes or {})
     base = presets[chosen]
     if hasattr(base, "motion"):
@@ -83,7 +83,7 @@ def _motion(method: str, options: Any, motion: Any, counts: dict[str, Any]) -> M
         return options.motion
     name = _implied_motion(options.motion.name, counts, models) if motion is None else motion
     if not isinstance(name, str) or name not in models:
-        raise InputError("--motion", checks.shown(name), f"one of {', '.join(models)} for --method {method}")
+        raise InputError("--motion", checks.short_repr(name), f"one of {', '.join(models)} for --method {method}")
     model = models[name]
     for key, value in counts.items():
         option = "--" + key.replace("_", "-")
@@ -121,7 +121,7 @@ def _changed(options: Any, changes: Mapping[str, Any], subject: str) -> Any:
     for key, value in changes.items():
         if key not in known:
             names = [*known, *_motion_options(options)]
-            remedy = near_miss(key, names, _having(key) or "leave it out")
+            remedy = suggest_name(key, names, _having(key) or "leave it out")
             raise InputError(f"{subject}: option {key}", "no such option", ", ".join(names), remedy)
         is_function = callable(value) and key in getattr(options, "FUNCTIONS", ())
         values[key] = value if is_function else _converted(known[key], value, f"{subject}: option {key}")
@@ -146,17 +146,17 @@ def _converted(current: Any, value: Any, subject: str) -> Any:
         value = value.tolist()
     if is_dataclass(current):
         if not isinstance(value, Mapping):
-            raise InputError(subject, checks.shown(value), "a table")
+            raise InputError(subject, checks.short_repr(value), "a table")
         return _changed(current, value, subject)
     if isinstance(current, tuple):
         if not isinstance(value, (list, tuple)) or len(value) != len(current):
-            raise InputError(subject, checks.shown(value), f"a list of {len(current)} numbers")
+            raise InputError(subject, checks.short_repr(value), f"a list of {len(current)} numbers")
         return tuple(_converted(c, v, subject) for c, v in zip(current, value, strict=True))
     if type(current) not in _EXPECTED:  # of options of one's own
         return value
     expected, fits = _EXPECTED[type(current)]
     if not fits(value):
-        raise InputError(subject, checks.shown(value), expected)
+        raise InputError(subject, checks.short_repr(value), expected)
     return type(current)(value)
 
 

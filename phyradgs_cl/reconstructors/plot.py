@@ -27,7 +27,7 @@ def plot_result(
 ) -> "Figure":
     """Returns a figure of the three middle slices, the convergence record and, with a scan, a frame and its residual."""
     if not (scan is None or isinstance(scan, Scan)):
-        raise InputError("scan", checks.shown(scan), "the Scan of the result, or None")
+        raise InputError("scan", checks.short_repr(scan), "the Scan of the result, or None")
     truth = None
     if scan is not None:
         checks.whole("frame", frame, 0, scan.frames - 1)

@@ -7,7 +7,7 @@ from phyradgs_cl import checks
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.reconstructors.method import Method, imported, own_method
 from phyradgs_cl.reconstructors.result import function_name
-from phyradgs_cl.text import near_miss
+from phyradgs_cl.text import suggest_name
 
 
 class _Methods(MutableMapping[str, Method]):
@@ -66,7 +66,7 @@ def method_name(method: object) -> str:
         return function_name(method)
     if not isinstance(method, str) or ":" not in method:
         expected = f"one of {', '.join(METHODS)}, or package.module:function of your own"
-        raise InputError("--method", checks.shown(method), expected, near_miss(method, METHODS, ""))
+        raise InputError("--method", checks.short_repr(method), expected, suggest_name(method, METHODS, ""))
     return method
 
 

@@ -51,7 +51,7 @@ class Reconstruction:
 
     def __post_init__(self) -> None:
         if not isinstance(self.grid, Grid):
-            raise InputError("grid", checks.shown(self.grid), "a Grid")
+            raise InputError("grid", checks.short_repr(self.grid), "a Grid")
         checks.shape("volume", self.volume, self.grid.shape)
         if self.disagreement is not None:
             checks.shape("disagreement", self.disagreement, self.grid.shape)

@@ -88,7 +88,7 @@ def _share_cores(launch: Launch) -> None:
 def _check_threads(wish: str | None) -> None:
     if wish and not (wish.isdecimal() and 1 <= int(wish[:9]) <= _MOST_THREADS):
         expected = f"a whole number from 1 to {_MOST_THREADS}"
-        raise InputError(THREADS_VARIABLE, checks.shown(wish), expected, f"unset {THREADS_VARIABLE}")
+        raise InputError(THREADS_VARIABLE, checks.short_repr(wish), expected, f"unset {THREADS_VARIABLE}")
 
 
 def unwritable_cache() -> Path | None:

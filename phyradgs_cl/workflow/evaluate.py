@@ -55,7 +55,7 @@ def _grid_of(path: Path, reference: np.ndarray, grid: Grid | None, voxel_mm: obj
     if voxel_mm is not None:
         if grid is not None:
             expected = f"a reference without a scale; {path} has {in_words(grid)}"
-            raise InputError("--reference-voxel-mm", checks.shown(voxel_mm), expected, "leave it out")
+            raise InputError("--reference-voxel-mm", checks.short_repr(voxel_mm), expected, "leave it out")
         return Grid(triple(reference.shape), voxel_sides_mm("--reference-voxel-mm", voxel_mm))
     if grid is None:
         found, expected = "voxels without a scale", f"a reference that says where they lie, as {volume_path} does"

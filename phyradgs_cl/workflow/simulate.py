@@ -15,7 +15,7 @@ from phyradgs_cl.phantoms import PHANTOMS, EllipsoidPhantom
 from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.signals import finish_despite_interrupt
 from phyradgs_cl.simulation import SimulationOptions, simulated_scan
-from phyradgs_cl.text import near_miss
+from phyradgs_cl.text import suggest_name
 from phyradgs_cl.workflow.files import expecting, refuse_foreign_suffix, refuse_overwriting
 
 _TOML = ".toml"
@@ -52,8 +52,8 @@ def phantom_of(name: str) -> str | EllipsoidPhantom:
     if name.endswith(_TOML):
         return load_beads(Path(name))
     if name not in PHANTOMS:
-        remedy = near_miss(name, PHANTOMS, "or give the path of a .toml file")
-        raise InputError("--phantom", checks.shown(name), f"one of {', '.join(PHANTOMS)}", remedy)
+        remedy = suggest_name(name, PHANTOMS, "or give the path of a .toml file")
+        raise InputError("--phantom", checks.short_repr(name), f"one of {', '.join(PHANTOMS)}", remedy)
     return name
 
 

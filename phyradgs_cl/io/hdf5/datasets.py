@@ -158,7 +158,7 @@ def read_attribute(source: Hdf5Source, address: str, name: str) -> str | None:
         raise InputError(subject, f"an attribute that HDF5 cannot read ({error})", "a string") from error
     text = _text(value)
     if text is None:
-        raise InputError(subject, checks.shown(value), "a string")
+        raise InputError(subject, checks.short_repr(value), "a string")
     return text
 
 

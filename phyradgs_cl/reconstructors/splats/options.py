@@ -11,7 +11,7 @@ from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Activation, Grid
 from phyradgs_cl.operators import DEFAULT_CUTOFF_SIGMA
 from phyradgs_cl.optim import PUBLISHED_RATES, DensityControl, Rates
-from phyradgs_cl.text import short_repr
+from phyradgs_cl.text import repr_of_changes
 
 _WEIGHT = (0, 1e6)
 _RANGES = {
@@ -77,7 +77,7 @@ class SplatOptions:
     rates: Rates = Rates()
     control: DensityControl = DensityControl()
 
-    __repr__ = short_repr
+    __repr__ = repr_of_changes
 
     def __post_init__(self) -> None:
         checks.within("--iterations", self.iterations, 0, 1_000_000_000)

@@ -8,7 +8,7 @@ import numpy as np
 
 from phyradgs_cl import checks
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.text import near_miss
+from phyradgs_cl.text import suggest_name
 
 TUNED = "tuned"
 """The key of facts and states that holds the chosen value and the errors of the trials."""
@@ -49,7 +49,7 @@ def check_tuning(text: str, method: str, options: Any, changes: Mapping[str, Any
         numbers = [number for number in numbers if number != "iterations"]
     if name not in numbers:
         expected = f"one of {', '.join(numbers)}" if numbers else "a method with numbers to choose"
-        remedy = near_miss(name, numbers, "leave --tune out")
+        remedy = suggest_name(name, numbers, "leave --tune out")
         if name == "iterations":
             remedy = "its short runs are not the beginnings of long ones; set --iterations"
         raise InputError("--tune", f"{name}, no number to choose of --method {method}", expected, remedy)
@@ -61,7 +61,7 @@ def check_tuning(text: str, method: str, options: Any, changes: Mapping[str, Any
         raise InputError("--tune", "values of iterations", "none: every iteration is looked at", remedy)
     if name in changes and name != "iterations":
         remedy = f"leave one of the two out, or try values: --tune {name}=A,B,C"
-        raise InputError("--tune", f"{name}, which is set to {checks.shown(changes[name])}", "one choice", remedy)
+        raise InputError("--tune", f"{name}, which is set to {checks.short_repr(changes[name])}", "one choice", remedy)
     for value in request.values:
         if isinstance(getattr(options, name), int) and value != round(value):
             raise InputError("--tune", f"{name} = {value:g}", "whole numbers")

@@ -222,7 +222,7 @@ def prior_of(prior: str | Denoiser, inputs: PriorInputs) -> Prior:
         return PRIORS[prior](inputs)
     own = imported(prior, "--prior") if isinstance(prior, str) else prior
     if not callable(own):
-        raise InputError("--prior", checks.shown(own), "a function (volume, noise)")
+        raise InputError("--prior", checks.short_repr(own), "a function (volume, noise)")
     return OwnPrior(own)
 
 

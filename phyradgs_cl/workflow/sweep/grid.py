@@ -104,7 +104,7 @@ def _nested(values: Table) -> dict[str, Any]:
         for group in groups:
             table = table.setdefault(group, {})
             if not isinstance(table, dict):
-                raise InputError(name, f"{group}={checks.shown(table)} too", f"a value or a table {group}")
+                raise InputError(name, f"{group}={checks.short_repr(table)} too", f"a value or a table {group}")
         table[last] = value
     return tables
 
@@ -116,7 +116,7 @@ def _scans(patterns: Any, path: Path) -> tuple[Path, ...]:
     subject = f"{path}: scans"
     if not _is_list_of(str, patterns):
         expected = 'a list of file names or patterns, as scans = ["scans/*.h5"]'
-        raise InputError(subject, checks.shown(patterns), expected)
+        raise InputError(subject, checks.short_repr(patterns), expected)
     folder = path.resolve().parent
     scans: dict[Path, None] = {}
     for pattern in patterns:
@@ -144,7 +144,7 @@ def _files(pattern: str, folder: Path, subject: str) -> list[Path]:
 def _seeds(seeds: Any, path: Path) -> tuple[int, ...]:
     if not (_is_list_of(int, seeds) and all(type(s) is int and 0 <= s <= _LARGEST_SEED for s in seeds)):
         expected = f"a list of whole numbers from 0 to {_LARGEST_SEED}"
-        raise InputError(f"{path}: seeds", checks.shown(seeds), expected)
+        raise InputError(f"{path}: seeds", checks.short_repr(seeds), expected)
     return tuple(dict.fromkeys(seeds))
 
 
@@ -178,7 +178,7 @@ def _settings(document: Table, path: Path) -> tuple[Setting, ...]:
 def _tables(document: Table, key: str, path: Path) -> Iterator[tuple[str, Table]]:
     tables = document.get(key, [])
     if not isinstance(tables, list):
-        raise InputError(f"{path}: {key}", checks.shown(tables), f"tables that begin with [[{key}]]")
+        raise InputError(f"{path}: {key}", checks.short_repr(tables), f"tables that begin with [[{key}]]")
     for number, table in enumerate(tables, 1):
         where = f"{path}: [[{key}]] {number}"
         yield where, _table(table, where)
@@ -186,7 +186,7 @@ def _tables(document: Table, key: str, path: Path) -> Iterator[tuple[str, Table]
 
 def _table(table: Any, where: str) -> Table:
     if not isinstance(table, Mapping):
-        raise InputError(where, checks.shown(table), "a table")
+        raise InputError(where, checks.short_repr(table), "a table")
     return table
 
 
@@ -210,7 +210,7 @@ def _setting(values: dict[str, Any], where: str) -> Setting:
     try:
         return _checked(values)
     except PhyradgsError as error:
-        words = ", ".join(f"{name}={checks.shown(value)}" for name, value in values.items())
+        words = ", ".join(f"{name}={checks.short_repr(value)}" for name, value in values.items())
         subject = f"{where} ({words}): {error.subject}"
         raise type(error)(subject, error.found, error.expected, error.remedy) from error
 
@@ -220,7 +220,7 @@ def _checked(values: dict[str, Any]) -> Setting:
     method, preset = method_name(changes.pop("method", DEFAULT_METHOD)), changes.pop("preset", None)
     for name, remedy in _ELSEWHERE.items():
         if name in changes:
-            raise InputError(name, checks.shown(changes[name]), "no option of a run", remedy)
+            raise InputError(name, checks.short_repr(changes[name]), "no option of a run", remedy)
     before = {name: changes.pop(name) for name in preprocessing_names(method, preset) if name in changes}
     nested = _nested(changes)
     plan_run(method, {**nested, **before}, preset=preset)
