@@ -94,7 +94,7 @@ def regrid_and_remove_lag(scan: Scan, options: Preprocessing) -> Scan:
 def _model(rt: Runtime | None, scan: Scan) -> Model:
     if rt is None:
         raise InputError("--steps", "a step that reconstructs, without a device", "a Runtime", "pass one")
-    from phyradgs_cl.reconstructors.frames.projected import reprojection  # methods are slow to import
+    from phyradgs_cl.reconstructors.frames.reprojection import reprojection  # methods are slow to import
 
     return reprojection(rt, scan)
 

@@ -5,20 +5,17 @@ Wahba, Technometrics 21 (1979) 215). They are the same for every method, option 
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from phyradgs_cl.acquisition import LineMiddles, PerRow, Scan
+from phyradgs_cl.acquisition import PerRow, Scan
 from phyradgs_cl.detector import noise_rms
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.operators import RayOperator
-from phyradgs_cl.prepare import Model
-from phyradgs_cl.reconstructors.fdk import FdkOptions, fdk
 from phyradgs_cl.reconstructors.result import Reconstruction
-from phyradgs_cl.reconstructors.voxels import fista_tv
 from phyradgs_cl.runtime import Runtime
 
 TIMES_PER_LINE = 16  # samples of a line's exposure, whose error is far below the noise
@@ -98,21 +95,3 @@ def holdout_errors(rt: Runtime, scan: Scan, held: np.ndarray, result: Reconstruc
     count = int(held.sum())
     noise = noise_rms(scan.projections, held, scan.valid)
     return {"holdout_rms": float(np.sqrt(squares / count)), "holdout_noise_rms": noise, "holdout_pixels": count}
-
-
-def reprojection(rt: Runtime, scan: Scan) -> Model:
-    """Returns FDK with every line at the middle of its own exposure, and projection at the same times."""
-    motion = LineMiddles()
-    fdk_options = FdkOptions(window="hann", motion=motion)
-    tv_options = fista_tv.FistaTvOptions(motion=PerRow(sub_intervals=2), iterations=30, tv_weight=0.002)
-    tables = [motion.cells(scan, frame).still() for frame in range(scan.frames)]
-    operator = RayOperator(rt, scan.grid, scan.geometry.detector_shape, tables)
-
-    def volume(frames: np.ndarray) -> np.ndarray:
-        return fdk(replace(scan, projections=np.asarray(frames, np.float32)), fdk_options, rt).volume
-
-    def regularised(frames: np.ndarray) -> np.ndarray:
-        own = replace(scan, projections=np.asarray(frames, np.float32))
-        return fista_tv.METHOD.run(own, tv_options, rt).volume
-
-    return Model(volume, operator.forward, regularised)
