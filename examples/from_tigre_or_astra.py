@@ -1,4 +1,4 @@
-"""Frames with a geometry of TIGRE or ASTRA, to a volume and back; neither program is needed to run this."""
+"""From frames with a geometry of TIGRE or ASTRA to a volume and back, without either package."""
 
 from types import SimpleNamespace
 
@@ -6,7 +6,7 @@ import numpy as np
 
 from phyradgs_cl.api import Scan, compare, reconstruct, simulate
 
-# stop-and-shoot frames to work on, (F, rows, columns); put your own in their place
+# stop-and-shoot frames (F, rows, columns); replace them by your own
 made = simulate("jaw", size=32, detector=48, views=60, protocol="static")
 frames, angles_rad = made.projections, made.trajectory.kinematics.angle_start_rad
 

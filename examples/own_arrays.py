@@ -4,16 +4,16 @@ import numpy as np
 
 from phyradgs_cl.api import ConeGeometry, Reconstruction, compare, fly_scan, reconstruct, save_scan
 
-# --- your arrays: here the counts of two balls on a gantry that never stops
+# --- your arrays: here counts of two balls, from a gantry that never stops
 VIEWS, ROWS, COLUMNS, PIXEL_MM = 30, 32, 48, 4.0
 TO_AXIS_MM, TO_DETECTOR_MM = 500.0, 800.0
-ARC_DEG, READOUT = 12.0, 0.86  # an exposure's arc; readout over exposure time
+ARC_DEG, READOUT = 12.0, 0.86  # arc of an exposure; readout over exposure time
 BALLS = [((18.0, 6.0, 4.0), 14.0, 0.02), ((-15.0, -20.0, -8.0), 10.0, 0.03)]  # centre x y z, radius, 1/mm
 angles_deg = np.arange(VIEWS) * 360 / VIEWS
 
 
 def line_integrals(turn_deg: np.ndarray) -> np.ndarray:
-    """One picture (rows, columns) of the balls, every row at its own angle (rows,)."""
+    """Returns line integrals (rows, columns) of the balls, with one gantry angle (rows,) for each row."""
     turn = np.deg2rad(turn_deg)[:, None]
     v_mm, u_mm = ((np.arange(n) - (n - 1) / 2) * PIXEL_MM for n in (ROWS, COLUMNS))
     picture = np.zeros((ROWS, COLUMNS))
@@ -27,7 +27,7 @@ def line_integrals(turn_deg: np.ndarray) -> np.ndarray:
     return picture
 
 
-late = READOUT * np.arange(ROWS) / (ROWS - 1)  # in exposures: row 0 is read first
+late = READOUT * np.arange(ROWS) / (ROWS - 1)  # delay of each row in exposures: row 0 is read first
 times = (np.arange(9) + 0.5) / 9
 frames = [np.mean([line_integrals(a + ARC_DEG * (late + t)) for t in times], 0) for a in angles_deg]
 rng = np.random.default_rng(0)
@@ -42,7 +42,7 @@ scan = fly_scan(counts, cone, angles_deg, **motion, flats=flats, darks=darks)
 moving = reconstruct(scan, "fista-tv", motion="per-row", iterations=30)
 moving.plot(scan).savefig("own_arrays.png")
 
-# --- was it worth it?
+# --- how much the known motion gains
 save_scan("own_arrays.h5", scan)
 still = reconstruct(scan, "fista-tv", motion="static", iterations=30)
 z, y, x = np.meshgrid(*scan.grid.axes_mm(), indexing="ij")

@@ -1,4 +1,4 @@
-"""A motion model and a trajectory of one's own: a readout whose time nobody has told, and a gantry that sags."""
+"""A user-defined motion model, for an unknown readout time, and a user-defined trajectory, for a gantry that sags."""
 
 from dataclasses import dataclass, replace
 
@@ -9,7 +9,7 @@ from phyradgs_cl.api import OwnTimes, Scan, TimeCells, compare, load_scan, recon
 
 @dataclass(frozen=True)
 class ReadoutOf:
-    """Every line at its own times, in a frame that is read out in ``ratio`` exposures, whatever the scan says."""
+    """Gives every line its own times, for a readout of ``ratio`` exposures in place of the scan's."""
 
     ratio: float
 
@@ -20,7 +20,7 @@ class ReadoutOf:
 
 @dataclass(frozen=True)
 class Sagging:
-    """A trajectory whose source and panel sink as they turn, by ``sag_mm`` at most; poses are (..., 12) in mm."""
+    """A trajectory whose source and panel sink by up to ``sag_mm`` as they turn; poses are (..., 12) in mm."""
 
     level: object  # anything with pose(frame, time_s)
     sag_mm: float
@@ -32,7 +32,7 @@ class Sagging:
         return pose
 
 
-# which readout time explains the frames? The panel of this scan took 0.86 of an exposure
+# Which readout time explains the frames? The panel of this scan takes 0.86 of an exposure.
 true = simulate("jaw", size=24, detector=32, views=60, exposure_deg=30.0)
 residual = {}
 for ratio in (0.0, 0.43, 0.86, 1.29):
@@ -41,7 +41,7 @@ for ratio in (0.0, 0.43, 0.86, 1.29):
     print(f"residual {residual[ratio]:.5f} with {result.facts['options']['motion']}")
 print("readout takes", min(residual, key=residual.__getitem__), "of an exposure")
 
-# the same frames as if the gantry had sagged: the volume shows what such a mistake costs
+# The same frames with a trajectory that sags: the volume shows how much such an error costs.
 sagging = replace(true, trajectory=Sagging(true.trajectory, sag_mm=0.2))
 for name, scan in {"level": true, "sagging": sagging}.items():
     result = reconstruct(scan, "cgls", iterations=10, motion="per-row", report=False)

@@ -1,4 +1,4 @@
-"""Poses of single views by gradients through splats, beside what calibrate finds: python examples/own_poses.py"""
+"""Poses of single views by gradients through splats, compared with calibrate: python examples/own_poses.py"""
 
 import numpy as np
 
@@ -9,14 +9,14 @@ RATES = np.repeat([0.004, 0.03, 0.02, 0.03], [3, 3, 4, 1])[:, None]  # of mean (
 
 
 def adam(values, gradient, moments, rate, step):
-    """One step down the gradient: new values and moments."""
+    """Returns new values and moments after one step of Adam."""
     first, second = moments[0] + 0.1 * (gradient - moments[0]), moments[1] + 0.01 * (gradient**2 - moments[1])
     move = first / (1 - 0.9**step) / (np.sqrt(second / (1 - 0.99**step)) + 1e-12)
     return values - rate * move, np.stack([first, second])
 
 
 def refine(scan, pixels):
-    """Gaussians and views (F, 3) together; ``pixels`` (3,): turn and shifts that move a frame by about a pixel."""
+    """Fits Gaussians and views (F, 3) together; ``pixels`` (3,): turn and shifts that move a frame by about a pixel."""
     rng, raw, views = np.random.default_rng(0), phy.initial_gaussians(scan, 1200).rows(), np.zeros((scan.frames, 3))
     raw[LOGS] = np.log(raw[LOGS])
     moments, of_views = np.zeros((2, *raw.shape)), np.zeros((2, *views.shape))
@@ -32,8 +32,8 @@ def refine(scan, pixels):
             by_rows, by_views = back(residual), S.by_poses(rows, residual) * units
             by_rows[LOGS] *= rows[LOGS]
             raw, moments = adam(raw, by_rows, moments, slower * RATES, number * scan.frames // BATCH + 1)
-            kept = of_views[:, batch]
-            views[batch], of_views[:, batch] = adam(views[batch], by_views, kept, slower * 0.1 * pixels, number + 1)
+            moments_now = of_views[:, batch]
+            views[batch], of_views[:, batch] = adam(views[batch], by_views, moments_now, slower * 0.1 * pixels, number + 1)
     return views
 
 

@@ -1,4 +1,4 @@
-"""SIRT of one's own, on arrays of the device: python examples/own_sirt.py [scan.h5 [iterations]]"""
+"""SIRT written with the operators, on arrays of the device: python examples/own_sirt.py [scan.h5 [iterations]]"""
 
 import sys
 
@@ -8,7 +8,7 @@ from phyradgs_cl.api import Reconstruction, compare, load_scan, ray_operator, sa
 
 
 def sirt(A, frames, iterations):
-    """x ← x + C Aᵀ R (y − A x), with the inverse sums of A's rows (R) and columns (C); from arrays to a volume (z, y, x)."""
+    """Iterates x ← x + C Aᵀ R (y − A x), R and C the inverse row and column sums of A, and returns x (z, y, x)."""
     y = A.to_device(frames)
     R = A.to_device(1 / np.maximum(A(np.ones(A.domain_shape)), 1e-3))
     C = A.to_device(1 / np.maximum(A.T(np.ones(A.range_shape)), 1e-3))

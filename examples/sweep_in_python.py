@@ -23,7 +23,7 @@ for views, (name, options) in itertools.product(VIEWS, SETTINGS.items()):
     result = reconstruct(scans[views], **options, report=False)
     metrics = compare(result.volume, scans[views].reference)
     lines.append({"views": views, "setting": name, **metrics, "seconds": round(result.facts["seconds"], 2)})
-    with open("sweep.jsonl", "a", encoding="utf-8") as file:  # a sweep that is stopped loses nothing
+    with open("sweep.jsonl", "a", encoding="utf-8") as file:  # line by line, so that an interrupted sweep loses nothing
         file.write(json.dumps(lines[-1]) + "\n")
 
 print(f"{'PSNR (dB)':20}" + "".join(f"{views:>6} views" for views in VIEWS))

@@ -1,4 +1,4 @@
-"""Gaussians trained on a fly-scan by a loop of one's own, in PyTorch: python examples/train_own.py [scan.h5 [steps]]"""
+"""Gaussians trained on a fly-scan by a PyTorch loop: python examples/train_own.py [scan.h5 [steps]]"""
 
 import sys
 
@@ -9,10 +9,10 @@ import phyradgs_cl.api as api
 
 
 def train(scan, steps, smoothness=0.02, seed=0):
-    """The cloud whose frames are the scan's: mean absolute misfit of one frame a step, and little total variation."""
+    """Fits a cloud to the scan: mean absolute residual of one frame a step, plus total variation."""
     project, field = api.as_torch(api.splat_operator(scan)), api.as_torch(api.voxel_operator(scan.grid))
     start, measured = api.initial_gaussians(scan, seed=seed), torch.tensor(scan.projections)
-    length, peak = scan.grid.half_longest_mm, start.density.max() / 0.15  # for numbers of order 1
+    length, peak = scan.grid.half_longest_mm, start.density.max() / 0.15  # scales parameters to order 1
     density = np.log(np.expm1(start.density / peak))[None]
     parts = [start.mean.T / length, np.log(start.scale.T / length), start.quaternion.T, density]
     raw = [torch.tensor(part, dtype=torch.float32, requires_grad=True) for part in parts]
@@ -25,11 +25,11 @@ def train(scan, steps, smoothness=0.02, seed=0):
         return torch.cat([length * mean, length * scale.exp(), turn, peak * torch.nn.functional.softplus(density)])
 
     rng = np.random.default_rng(seed)
-    order = np.concatenate([rng.permutation(scan.frames) for _ in range(-(-steps // scan.frames))])
+    order = np.concatenate([rng.permutation(scan.frames) for _ in range(steps // scan.frames + 1)])
     for step, frame in enumerate(order[:steps]):
         now = rows()
         loss = (project(now, frames=[frame])[0] - measured[frame]).abs().mean() / (length * peak)
-        if step % 8 == 0:  # for eight steps
+        if step % 8 == 0:  # eight times the weight, every eighth step
             volume = field(now) / peak
             loss = loss + 8 * smoothness * sum(volume.diff(dim=axis).abs().mean() for axis in range(3))
         adam.zero_grad()
