@@ -22,7 +22,7 @@ from phyradgs_cl.runtime import Runtime
 
 MOTIONS = {"static": Static(), "8x5": MicroViews(8, 5), "exact": Exact()}
 STAGES = {
-    "prepare": ("splat_prepare",),
+    "prepare": ("splat_prepare", "splat_prepare_moving"),
     "binning": ("bin_count", "bin_within", "bin_starts", "bin_fill"),  # the sub-volume of TV is binned too
     "forward": ("splat_forward_rows", "intensity_merge"),
     "loss": ("ssim_moments", "ssim_map", "ssim_spread", "image_gradient", "intensity_split"),

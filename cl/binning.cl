@@ -1,8 +1,8 @@
 /* Which splats touch which tile: a stable counting sort without atomics. Chunks of splats are counted per
-   tile, the counts are summed up, then every chunk writes its entries; the order in a list is the order of
+   tile, the counts are summed up, then every chunk writes the indices of its splats; the order in a list is the order of
    the splats, so sums over a list always run the same way.
-   bin_count, bin_within, bin_starts, bin_fill: a work-item per chunk, per tile, one alone, per chunk (CPUs).
-   The same with _group: a work-item per splat and a group per chunk, a group per tile, one alone, as the first (GPUs). */
+   On CPUs a work-item takes a chunk (bin_count, bin_fill) or a tile (bin_within); bin_starts is one work-item.
+   On GPUs, with _group, a group takes a chunk, with a work-item per splat, or a tile; bin_starts_group is one group. */
 #include "common/group_sums.h"
 
 __kernel void bin_count(
@@ -32,8 +32,8 @@ __kernel void bin_count(
     }
 }
 
-/* per tile: counts become positions within the tile, totals go to starts[tile + 1] */
-__kernel void bin_within(const int total, const int chunks, __global int *counts, __global int *starts)
+/* per tile: counts become positions within the tile, totals go to tile_offsets[tile + 1] */
+__kernel void bin_within(const int total, const int chunks, __global int *counts, __global int *tile_offsets)
 {
     const int t = (int)get_global_id(0);
     if (t >= total)
@@ -44,19 +44,19 @@ __kernel void bin_within(const int total, const int chunks, __global int *counts
         counts[(size_t)t * chunks + k] = sum;
         sum += here;
     }
-    starts[t + 1] = sum;
+    tile_offsets[t + 1] = sum;
 }
 
-/* stays at the largest int where there are more entries than it counts: the host looks, later */
-__kernel void bin_starts(const int total, __global int *starts)
+/* stays at the largest int where there are more indices than it can count: the host raises an error */
+__kernel void bin_starts(const int total, __global int *tile_offsets)
 {
     if (get_global_id(0) > 0)
         return;
-    starts[0] = 0;
+    tile_offsets[0] = 0;
     long sum = 0;
     for (int t = 0; t < total; ++t) {
-        sum = min(sum + starts[t + 1], (long)INT_MAX);
-        starts[t + 1] = (int)sum;
+        sum = min(sum + tile_offsets[t + 1], (long)INT_MAX);
+        tile_offsets[t + 1] = (int)sum;
     }
 }
 
@@ -64,8 +64,8 @@ __kernel void bin_fill(
     __global const int *extents,
     const int stride, const int count, const int chunk, const int chunks,
     const int4 tile, const int4 tiles,
-    __global int *counts, __global const int *starts,
-    __global int *entries, const int capacity)
+    __global int *counts, __global const int *tile_offsets,
+    __global int *tile_splat_ids, const int capacity)
 {
     const int k = (int)get_global_id(0);
     if (k >= chunks)
@@ -81,9 +81,9 @@ __kernel void bin_fill(
             for (int y = y0; y <= y1; ++y)
                 for (int x = x0; x <= x1; ++x) {
                     const int t = (z * tiles.y + y) * tiles.x + x;
-                    const int position = starts[t] + counts[(size_t)t * chunks + k]++;
+                    const int position = tile_offsets[t] + counts[(size_t)t * chunks + k]++;
                     if (position < capacity)
-                        entries[position] = g;
+                        tile_splat_ids[position] = g;
                 }
     }
 }
@@ -130,8 +130,8 @@ __kernel void bin_count_group(
             counts[(size_t)t * chunks + k] = having(boxes, item, chunk, x, y, z);
 }
 
-/* the sum of what the items before this one give; `whole`: of all items */
-ALWAYS_INLINE long group_scan(const long own, __local long *scratch, long *whole)
+/* the sum of what the items before this one give; `group_sum`: of all items */
+ALWAYS_INLINE long group_scan(const long own, __local long *scratch, long *group_sum)
 {
     const int item = GROUP_ITEM, items = GROUP_ITEMS;
     scratch[item] = own;
@@ -142,59 +142,59 @@ ALWAYS_INLINE long group_scan(const long own, __local long *scratch, long *whole
         scratch[item] += before;
     }
     barrier(CLK_LOCAL_MEM_FENCE);
-    *whole = scratch[items - 1];
+    *group_sum = scratch[items - 1];
     const long sum = scratch[item] - own;
     barrier(CLK_LOCAL_MEM_FENCE);
     return sum;
 }
 
 __kernel void bin_within_group(
-    const int total, const int chunks, __global int *counts, __global int *starts, __local long *scratch)
+    const int total, const int chunks, __global int *counts, __global int *tile_offsets, __local long *scratch)
 {
     const int t = (int)get_group_id(0);
     if (t >= total)
         return;
     __global int *own = counts + (size_t)t * chunks;
-    long sum = 0, whole;
+    long sum = 0, group_sum;
     for (int first = 0; first < chunks; first += GROUP_ITEMS) {
         const int k = first + GROUP_ITEM;
-        const long before = group_scan(k < chunks ? own[k] : 0, scratch, &whole);
+        const long before = group_scan(k < chunks ? own[k] : 0, scratch, &group_sum);
         if (k < chunks)
             own[k] = (int)(sum + before);
-        sum += whole;
+        sum += group_sum;
     }
     if (GROUP_ITEM == 0)
-        starts[t + 1] = (int)sum;
+        tile_offsets[t + 1] = (int)sum;
 }
 
-__kernel void bin_starts_group(const int total, __global int *starts, __local long *scratch)
+__kernel void bin_starts_group(const int total, __global int *tile_offsets, __local long *scratch)
 {
-    long sum = 0, whole;
+    long sum = 0, group_sum;
     for (int first = 0; first < total; first += GROUP_ITEMS) {
         const int t = first + GROUP_ITEM;
-        const long here = t < total ? starts[t + 1] : 0;
-        const long before = group_scan(here, scratch, &whole);
+        const long here = t < total ? tile_offsets[t + 1] : 0;
+        const long before = group_scan(here, scratch, &group_sum);
         if (t < total)
-            starts[t + 1] = (int)min(sum + before + here, (long)INT_MAX);
-        sum += whole;
+            tile_offsets[t + 1] = (int)min(sum + before + here, (long)INT_MAX);
+        sum += group_sum;
     }
     if (GROUP_ITEM == 0)
-        starts[0] = 0;
+        tile_offsets[0] = 0;
 }
 
 __kernel void bin_fill_group(
     __global const int *extents,
     const int stride, const int count, const int chunk, const int chunks,
     const int4 tile, const int4 tiles,
-    __global const int *counts, __global const int *starts,
-    __global int *entries, const int capacity,
+    __global const int *counts, __global const int *tile_offsets,
+    __global int *tile_splat_ids, const int capacity,
     __local int *boxes)
 {
     const int item = GROUP_ITEM, k = (int)get_group_id(0), g = k * chunk + item;
     share_box(extents, stride, count, g, tile, boxes);
     FOR_TILES_OF(item, boxes, tiles, x, y, z, t) {
-        const int position = starts[t] + counts[(size_t)t * chunks + k] + having(boxes, 0, item, x, y, z);
+        const int position = tile_offsets[t] + counts[(size_t)t * chunks + k] + having(boxes, 0, item, x, y, z);
         if (position < capacity)
-            entries[position] = g;
+            tile_splat_ids[position] = g;
     }
 }

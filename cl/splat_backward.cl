@@ -98,7 +98,7 @@ ALWAYS_INLINE void visit(gatherer *own, const footprint_line line)
 
 #define ARGUMENTS                                                                                                    \
     __global float *records,          /* (stride, C, RECORD); the sums come in their place */                        \
-    __global const uchar *seen,       /* (stride, C) */                                                              \
+    __global const uchar *is_visible, /* (stride, C) */                                                              \
     __global const float *cells,      /* (C, CELL) */                                                                \
     __global const float *line_times, /* MOVING: (C, TIME_ROWS, time_pitch) */                                       \
     const int time_pitch, const float4 path_limits,                                                                  \
@@ -113,39 +113,39 @@ __kernel void splat_backward_rows(ARGUMENTS)
         return;
     for (int c = 0; c < cell_count; ++c) {
         const size_t at = (size_t)g * cell_count + c;
-        if (!seen[at])
+        if (!is_visible[at])
             continue;
-        __global float *rec = records + at * RECORD;
+        __global float *splat_record = records + at * RECORD;
         __global const float *cell = cells + c * CELL;
-        __global const int *whole = (__global const int *)rec;
+        __global const int *record_as_int = (__global const int *)splat_record;
         gatherer own = {no_sums(), images + LAYER_AT(cell, lines, pitch), pitch, cutoff2 > 0.0f ? cutoff2 : MAXFLOAT};
-        walk_footprint(rec, cell, TIMES_OF(c, line_times, time_pitch), time_pitch, path_limits, cutoff2,
-                       whole[REC_V_LO], whole[REC_V_HI], &own);
+        walk_footprint(splat_record, cell, TIMES_OF(c, line_times, time_pitch), time_pitch, path_limits, cutoff2,
+                       record_as_int[REC_V_LO], record_as_int[REC_V_HI], &own);
         for (int f = 0; f < SUM_COUNT; ++f)
-            rec[SUMS + f] = v_sum(own.sums.of[f]);
+            splat_record[SUMS + f] = v_sum(own.sums.of[f]);
     }
 }
 #else
 __kernel void splat_backward_group(ARGUMENTS)
 {
     const int g = (int)get_group_id(0), item = GROUP_ITEM;
-    __local float tree[SUM_COUNT * GROUP], rec[RECORD], cell[CELL];
-    __local const int *whole = (__local const int *)rec;
+    __local float tree[SUM_COUNT * GROUP], splat_record[RECORD], cell[CELL];
+    __local const int *record_as_int = (__local const int *)splat_record;
     const float limit = cutoff2 > 0.0f ? cutoff2 : MAXFLOAT;
     for (int c = 0; c < cell_count; ++c) {
         const size_t at = (size_t)g * cell_count + c;
-        if (!seen[at])
+        if (!is_visible[at])
             continue;
         for (int f = item; f < RECORD; f += GROUP)
-            rec[f] = records[at * RECORD + f];
+            splat_record[f] = records[at * RECORD + f];
         for (int f = item; f < CELL; f += GROUP)
             cell[f] = cells[c * CELL + f];
         barrier(CLK_LOCAL_MEM_FENCE | CLK_GLOBAL_MEM_FENCE); /* all have read where sums will be */
         __global const float *times = TIMES_OF(c, line_times, time_pitch);
         __global const float *image = images + LAYER_AT(cell, lines, pitch) + IMAGE_GUARD;
         splat_sums mine = no_sums();
-        for (int v = whole[REC_V_LO] + (int)get_local_id(1); v <= whole[REC_V_HI]; v += GROUP / ACROSS) {
-            const footprint_line line = footprint_within(rec, cell, times, time_pitch, v, path_limits, cutoff2);
+        for (int v = record_as_int[REC_V_LO] + (int)get_local_id(1); v <= record_as_int[REC_V_HI]; v += GROUP / ACROSS) {
+            const footprint_line line = footprint_within(splat_record, cell, times, time_pitch, v, path_limits, cutoff2);
             for (int u = line.u_lo + (int)get_local_id(0); u <= line.u_hi; u += ACROSS)
                 gather(&mine, line, u, limit, image[(size_t)v * pitch + u]);
         }

@@ -44,7 +44,7 @@ __kernel void splat_chain(
     __global const float *cells,          /* (C, CELL) */
     __global const coefficient *matrices, /* (C, POSES, 12) */
     __global const float *records,        /* (stride, C, RECORD), with sums in them */
-    __global const uchar *is_drawn,       /* (stride, C) */
+    __global const uchar *is_visible,     /* (stride, C) */
     const int cell_count, const int count, const int stride,
     const float half_width, const float half_lines,
     __global float *gradients)            /* (13, stride) */
@@ -63,21 +63,21 @@ __kernel void splat_chain(
     vf by_log_density = zero, by_u0 = zero, by_v0 = zero;
 
     for (int c = 0; c < cell_count; ++c) {
-        float fields[(SUM_COUNT + TURNED) * LANES], seen[LANES];
+        float fields[(SUM_COUNT + TURNED) * LANES], visible[LANES];
         int drawn = 0;
         for (int lane = 0; lane < LANES; ++lane) {
             const size_t at = (size_t)(first + lane) * cell_count + c;
-            const int here = first + lane < count && is_drawn[at];
-            __global const float *rec = records + at * RECORD;
+            const int here = first + lane < count && is_visible[at];
+            __global const float *splat_record = records + at * RECORD;
             drawn |= here;
-            seen[lane] = here;
+            visible[lane] = here;
             for (int f = 0; f < SUM_COUNT; ++f)
-                fields[f * LANES + lane] = here ? rec[SUMS + f] : 0.0f;
+                fields[f * LANES + lane] = here ? splat_record[SUMS + f] : 0.0f;
 #if MOVING
-            fields[SUM_COUNT * LANES + lane] = here ? rec[REC_ALONG_U] : 1.0f;
-            fields[(SUM_COUNT + 1) * LANES + lane] = here ? rec[REC_ALONG_V] : 0.0f;
-            fields[(SUM_COUNT + 2) * LANES + lane] = here ? rec[REC_ACROSS_U] : 0.0f;
-            fields[(SUM_COUNT + 3) * LANES + lane] = here ? rec[REC_ACROSS_V] : 1.0f;
+            fields[SUM_COUNT * LANES + lane] = here ? splat_record[REC_ALONG_U] : 1.0f;
+            fields[(SUM_COUNT + 1) * LANES + lane] = here ? splat_record[REC_ALONG_V] : 0.0f;
+            fields[(SUM_COUNT + 2) * LANES + lane] = here ? splat_record[REC_ACROSS_U] : 0.0f;
+            fields[(SUM_COUNT + 3) * LANES + lane] = here ? splat_record[REC_ACROSS_V] : 1.0f;
 #endif
         }
         if (!drawn)
@@ -105,16 +105,16 @@ __kernel void splat_chain(
         __global const float *cell = cells + c * CELL;
         __global const coefficient *m = matrices + c * POSES * 12;
         /* lanes that are not drawn have sums of 0, and may be at the source: any other place keeps them from 0/0 */
-        const vi is_seen = V_LOAD(seen) > 0.0f;
-        const vf z = V_PICK((vf)(1.0f), wide_value(wide_dot(m + 8, mean.x, mean.y, mean.z)), is_seen);
+        const vi is_in_view = V_LOAD(visible) > 0.0f;
+        const vf z = V_PICK((vf)(1.0f), wide_value(wide_dot(m + 8, mean.x, mean.y, mean.z)), is_in_view);
         const vf inv_z = 1.0f / z;
         const vf u0 = wide_value(wide_dot(m, mean.x, mean.y, mean.z)) * inv_z;
         const vf v0 = wide_value(wide_dot(m + 4, mean.x, mean.y, mean.z)) * inv_z;
         const v3 from_source = v3_make(mean.x - cell[CELL_SOURCE], mean.y - cell[CELL_SOURCE + 1],
                                        mean.z - cell[CELL_SOURCE + 2]);
-        const v3 ray = to_local(axes, v3_make(V_PICK((vf)(1.0f), from_source.x, is_seen),
-                                              V_PICK((vf)(0.0f), from_source.y, is_seen),
-                                              V_PICK((vf)(0.0f), from_source.z, is_seen)));
+        const v3 ray = to_local(axes, v3_make(V_PICK((vf)(1.0f), from_source.x, is_in_view),
+                                              V_PICK((vf)(0.0f), from_source.y, is_in_view),
+                                              V_PICK((vf)(0.0f), from_source.z, is_in_view)));
         const v3 eu = to_local(axes, v3_make((vf)(cell[CELL_EU]), (vf)(cell[CELL_EU + 1]), (vf)(cell[CELL_EU + 2])));
         const v3 ev = to_local(axes, v3_make((vf)(cell[CELL_EV]), (vf)(cell[CELL_EV + 1]), (vf)(cell[CELL_EV + 2])));
         const v3 white = v3_mul(ray, inv_scale);
@@ -126,16 +126,16 @@ __kernel void splat_chain(
         const v3 au = v3_mul(scale, mu), av = v3_mul(scale, mv);
         const vf factor = (z / det) * (z / det) * inv_kappa;
         const vf s11 = factor * v3_dot(au, au), s12 = factor * v3_dot(au, av), s22 = factor * v3_dot(av, av);
-        vf seen11 = s11, seen12 = s12, seen22 = s22, t_det = zero; /* S as drawn; derivative by log det S */
+        vf drawn11 = s11, drawn12 = s12, drawn22 = s22, t_det = zero; /* S as drawn; derivative by log det S */
 #if FOOTPRINT
-        /* S is drawn as (S + E det S) / delta and the amplitude over sqrt(delta): see widened_by_pixel */
+        /* S is drawn as (S + E det S) / delta and the amplitude over sqrt(delta): see widen_by_pixel */
         const vf root_det = z * z * z * fabs((vf)(cell[CELL_VOLUME])) * rsqrt(kappa) / det;
         const vf det_s = root_det * root_det;
         const vf inv_delta = 1.0f / (1.0f + PIXEL_VARIANCE * ((s11 + s22) + PIXEL_VARIANCE * det_s));
-        seen11 = (s11 + PIXEL_VARIANCE * det_s) * inv_delta;
-        seen12 = s12 * inv_delta;
-        seen22 = (s22 + PIXEL_VARIANCE * det_s) * inv_delta;
-        const vf by_delta = -inv_delta * (s_uu * seen11 + s_uv * seen12 + s_vv * seen22 + 0.5f * w);
+        drawn11 = (s11 + PIXEL_VARIANCE * det_s) * inv_delta;
+        drawn12 = s12 * inv_delta;
+        drawn22 = (s22 + PIXEL_VARIANCE * det_s) * inv_delta;
+        const vf by_delta = -inv_delta * (s_uu * drawn11 + s_uv * drawn12 + s_vv * drawn22 + 0.5f * w);
         t_det = PIXEL_VARIANCE * det_s * ((s_uu + s_vv) * inv_delta + PIXEL_VARIANCE * by_delta);
         s_uu = s_uu * inv_delta + PIXEL_VARIANCE * by_delta;
         s_uv *= inv_delta;
@@ -183,8 +183,8 @@ __kernel void splat_chain(
         const vf g_u0 = -(2.0f * (along_u * s_z + across_u * s_c) + b1 * s_b);
         const vf g_v0 = -(2.0f * (along_v * s_z + across_v * s_c) + b2 * s_b);
 #else
-        const vf g_u0 = -(2.0f * (seen11 * s_u + seen12 * s_v) + b1 * s_b);
-        const vf g_v0 = -(2.0f * (seen12 * s_u + seen22 * s_v) + b2 * s_b);
+        const vf g_u0 = -(2.0f * (drawn11 * s_u + drawn12 * s_v) + b1 * s_b);
+        const vf g_v0 = -(2.0f * (drawn12 * s_u + drawn22 * s_v) + b2 * s_b);
 #endif
         by_scale = v3_add(by_scale, by_s);
         by_log_density += w;
@@ -200,7 +200,7 @@ __kernel void splat_chain(
         for (int end = 0; end < 2; ++end) {
             __global const coefficient *n = m + 12 * (end + 1);
             const float sign = end ? 1.0f : -1.0f;
-            const vf inv = 1.0f / V_PICK((vf)(1.0f), wide_value(wide_dot(n + 8, mean.x, mean.y, mean.z)), is_seen);
+            const vf inv = 1.0f / V_PICK((vf)(1.0f), wide_value(wide_dot(n + 8, mean.x, mean.y, mean.z)), is_in_view);
             add_by_centre(&by_mean, n, wide_value(wide_dot(n, mean.x, mean.y, mean.z)) * inv,
                           wide_value(wide_dot(n + 4, mean.x, mean.y, mean.z)) * inv, inv,
                           0.16666666667f * g_u0 + sign * g_path_u, 0.16666666667f * g_v0 + sign * g_path_v, zero);

@@ -1,6 +1,6 @@
 /* Micro-view accumulation and strip concatenation (paper, Eq. 3) in one gather: every tile of the merged
    frame sums its list of splats over all time cells that serve its lines.
-   splat_forward_rows: a work-item owns a band of whole lines, where it walks vectors of pixels (CPUs).
+   splat_forward_rows: a work-item owns a band of complete lines and adds vectors of pixels (CPUs).
    splat_forward_pixels: a work-item owns a pixel and a work-group a tile, whose records it reads once (GPUs).
    Nobody else writes those pixels: no atomics. */
 #if BLOCK_PIXEL
@@ -52,14 +52,14 @@ ALWAYS_INLINE void add_line(const footprint_line line, const float limit, __glob
 
 #define ARGUMENTS                                                                                                       \
     __global const float *records,    /* (stride, C, RECORD) */                                                         \
-    __global const uchar *seen,       /* (stride, C) */                                                                 \
+    __global const uchar *is_visible, /* (stride, C) */                                                                 \
     __global const float *cells,      /* (C, CELL) */                                                                   \
     __global const int *line_cells,   /* (lines, 2): first cell and cell after the last that serve a line */            \
     __global const float *line_times, /* MOVING: (C, TIME_ROWS, time_pitch) */                                          \
     const int time_pitch,                                                                                               \
     const float4 path_limits,         /* MOVING: the longest paths, in widths, that 1, 2 and 3 times serve */           \
-    __global const int *starts,       /* (tiles + 1,) */                                                                \
-    __global const int *entries, const int capacity, const int count,                                                  \
+    __global const int *tile_offsets, /* (tiles + 1,) */                                                                \
+    __global const int *tile_splat_ids, const int capacity, const int count,                                            \
     const int cell_count, const int lines, const int width, const int pitch,                                            \
     const int tile_w, const int tile_h, const int tiles_u, const float cutoff2,                                         \
     const int layer_count,            /* LAYERED: images, each of guard and (lines, pitch); else one of all cells */    \
@@ -72,15 +72,14 @@ ALWAYS_INLINE void add_line(const footprint_line line, const float limit, __glob
 __kernel void splat_forward_pixels(ARGUMENTS)
 {
     __local float records_here[STAGED * RECORD], cells_here[STAGED * CELL];
-    __local int place[STAGED], cell_of[STAGED]; /* in records, -1 where the splat is not seen in this tile; its cell */
+    __local int place[STAGED], cell_of[STAGED]; /* in records, -1 where the splat is not visible in this tile; its cell */
     const int u = (int)get_global_id(0), v = (int)get_global_id(1);
     const int item = (int)(get_local_id(1) * get_local_size(0) + get_local_id(0));
     const int items = (int)(get_local_size(0) * get_local_size(1));
     const int left = (int)get_group_id(0) * tile_w, top = (int)get_group_id(1) * tile_h;
     const int right = min(left + tile_w, width) - 1, bottom = min(top + tile_h, lines) - 1;
     const int tile = (int)get_group_id(1) * tiles_u + (int)get_group_id(0);
-    const int fits = starts[tile + 1] <= capacity;
-    const int first = fits ? starts[tile] : 0, listed = fits ? starts[tile + 1] - first : count;
+    const tile_list list = list_of(tile_offsets, tile, capacity, count);
     const int c_first = line_cells[2 * top], c_count = line_cells[2 * bottom + 1] - c_first;
     const int inside = u < width && v < lines;
     const int own_first = line_cells[2 * min(v, bottom)], own_stop = inside ? line_cells[2 * v + 1] : own_first;
@@ -90,17 +89,17 @@ __kernel void splat_forward_pixels(ARGUMENTS)
         for (int layer = 0; layer < LAYERS(layer_count); ++layer)
             image[layer * layer_size + at] = 0.0f;
     float sum = 0.0f;
-    for (int done = 0; done < listed * c_count; done += STAGED) {
-        const int here = min(STAGED, listed * c_count - done);
+    for (int done = 0; done < list.count * c_count; done += STAGED) {
+        const int here = min(STAGED, list.count * c_count - done);
         barrier(CLK_LOCAL_MEM_FENCE); /* all have read what was there */
         for (int k = item; k < here; k += items) {
             const int e = (done + k) / c_count, c = c_first + (done + k) % c_count;
-            const int splat = (fits ? entries[first + e] : e) * cell_count + c;
-            int is_here = seen[splat];
+            const int splat = listed_splat(list, tile_splat_ids, e) * cell_count + c;
+            int is_here = is_visible[splat];
             if (is_here) {
-                __global const int *whole = (__global const int *)(records + (size_t)splat * RECORD);
-                is_here = whole[REC_U_LO] <= right && whole[REC_U_HI] >= left &&
-                          whole[REC_V_LO] <= bottom && whole[REC_V_HI] >= top;
+                __global const int *record_as_int = (__global const int *)(records + (size_t)splat * RECORD);
+                is_here = record_as_int[REC_U_LO] <= right && record_as_int[REC_U_HI] >= left &&
+                          record_as_int[REC_V_LO] <= bottom && record_as_int[REC_V_HI] >= top;
             }
             place[k] = is_here ? splat : -1;
             cell_of[k] = c;
@@ -116,11 +115,11 @@ __kernel void splat_forward_pixels(ARGUMENTS)
             const int c = cell_of[k];
             if (place[k] < 0 || c < own_first || c >= own_stop)
                 continue;
-            __local const float *rec = records_here + k * RECORD, *cell = cells_here + k * CELL;
-            __local const int *whole = (__local const int *)rec;
-            if (v < whole[REC_V_LO] || v > whole[REC_V_HI] || u < whole[REC_U_LO] || u > whole[REC_U_HI])
+            __local const float *splat_record = records_here + k * RECORD, *cell = cells_here + k * CELL;
+            __local const int *record_as_int = (__local const int *)splat_record;
+            if (v < record_as_int[REC_V_LO] || v > record_as_int[REC_V_HI] || u < record_as_int[REC_U_LO] || u > record_as_int[REC_U_HI])
                 continue;
-            const footprint_line line = footprint_alone(rec, cell, TIMES_OF(c, line_times, time_pitch), time_pitch, v,
+            const footprint_line line = footprint_alone(splat_record, cell, TIMES_OF(c, line_times, time_pitch), time_pitch, v,
                                                         path_limits);
             const float value = value_at(line, u, limit);
 #if LAYERED
@@ -160,12 +159,19 @@ __kernel void splat_forward_rows(ARGUMENTS)
             for (int u = 0; u < pitch; u += LANES)
                 V_STORE((vf)(0.0f), row + u);
         }
-    FOR_SPLATS(splat, c, starts, entries, tile, capacity, count, cell_count, line_cells[2 * top], line_cells[2 * bottom + 1], seen) {
-        __global const float *rec = records + splat * RECORD, *cell = cells + c * CELL;
-        __global const int *whole = (__global const int *)rec;
-        painter own = {image + LAYER_AT(cell, lines, pitch), pitch, cutoff2 > 0.0f ? cutoff2 : MAXFLOAT};
-        walk_footprint(rec, cell, TIMES_OF(c, line_times, time_pitch), time_pitch, path_limits, cutoff2,
-                       max(whole[REC_V_LO], top), min(whole[REC_V_HI], bottom), &own);
+    const int c_first = line_cells[2 * top], c_stop = line_cells[2 * bottom + 1];
+    const tile_list list = list_of(tile_offsets, tile, capacity, count);
+    for (int k = 0; k < list.count; ++k) {
+        const size_t splat = (size_t)listed_splat(list, tile_splat_ids, k) * cell_count;
+        for (int c = c_first; c < c_stop; ++c) {
+            if (!is_visible[splat + c])
+                continue;
+            __global const float *splat_record = records + (splat + c) * RECORD, *cell = cells + c * CELL;
+            __global const int *record_as_int = (__global const int *)splat_record;
+            painter own = {image + LAYER_AT(cell, lines, pitch), pitch, cutoff2 > 0.0f ? cutoff2 : MAXFLOAT};
+            walk_footprint(splat_record, cell, TIMES_OF(c, line_times, time_pitch), time_pitch, path_limits, cutoff2,
+                           max(record_as_int[REC_V_LO], top), min(record_as_int[REC_V_HI], bottom), &own);
+        }
     }
     for (int layer = 0; layer < LAYERS(layer_count); ++layer)
         for (int v = top; v <= bottom; ++v) {  /* vectors may have run past the last pixel: padding stays zero */

@@ -40,16 +40,16 @@ __kernel void voxel_backward(
         return;
 #endif
     const float limit = cutoff2 > 0.0f ? cutoff2 : MAXFLOAT;
-    __global const float *rec = records + (size_t)g * VOXEL_RECORD;
-    __global const int *whole = (__global const int *)rec;
+    __global const float *voxel_record = records + (size_t)g * VOXEL_RECORD;
+    __global const int *record_as_int = (__global const int *)voxel_record;
     __global float *out = sums + (size_t)g * SUMS;
     vf w_ = (vf)(0.0f), x_ = w_, y_ = w_, z_ = w_, xx = w_, xy = w_, xz = w_, yy = w_, yz = w_, zz = w_;
-    for (int z = whole[VOX_LO + 2]; z <= whole[VOX_HI + 2]; ++z)
-        for (int y = whole[VOX_LO + 1] + ROW_OF_GROUP; y <= whole[VOX_HI + 1]; y += GROUP / ACROSS) {
-            const voxel_row r = voxel_row_at(rec, y, z);
+    for (int z = record_as_int[VOX_LO + 2]; z <= record_as_int[VOX_HI + 2]; ++z)
+        for (int y = record_as_int[VOX_LO + 1] + ROW_OF_GROUP; y <= record_as_int[VOX_HI + 1]; y += GROUP / ACROSS) {
+            const voxel_row r = voxel_row_at(voxel_record, y, z);
             if (r.k > limit) /* a corner of the box */
                 continue;
-            const int2 span = voxel_span(r, whole[VOX_LO], whole[VOX_HI], limit);
+            const int2 span = voxel_span(r, record_as_int[VOX_LO], record_as_int[VOX_HI], limit);
             __global const float *row = by_volume + IMAGE_GUARD + ((size_t)z * shape.y + y) * pitch;
             for (int x = span.x + PLACE_IN_ROW; x <= span.y; x += LANES * ACROSS) {
                 const vf dx = voxel_dx(r, x);
@@ -70,7 +70,7 @@ __kernel void voxel_backward(
     const vf all[SUM_COUNT] = {w_, x_, y_, z_, xx, xy, xz, yy, yz, zz};
 #if GROUP > 1
     __local float tree[SUM_COUNT * GROUP];
-    if (whole[VOX_HI + 2] >= whole[VOX_LO + 2]) /* most Gaussians are nowhere near a small volume */
+    if (record_as_int[VOX_HI + 2] >= record_as_int[VOX_LO + 2]) /* most Gaussians are nowhere near a small volume */
         group_sums(all, SUM_COUNT, tree, out);
     else
         for (int f = GROUP_ITEM; f < SUM_COUNT; f += GROUP)

@@ -10,7 +10,7 @@
 #define DEPTH 8   /* voxels of a work-item: tile.z */
 
 __kernel void voxel_forward(
-    __global const float *records, __global const int *starts, __global const int *entries,
+    __global const float *records, __global const int *tile_offsets, __global const int *tile_splat_ids,
     const int capacity, const int count,
     const int4 shape, const int pitch, const int4 tile, const int4 tiles, const float cutoff2,
     __global float *volume)          /* guard, then (z, y, pitch) */
@@ -22,26 +22,25 @@ __kernel void voxel_forward(
     const int item = (int)(get_local_id(1) * get_local_size(0) + get_local_id(0));
     const int items = (int)(get_local_size(0) * get_local_size(1));
     const int t = ((int)get_group_id(2) * tiles.y + (int)get_group_id(1)) * tiles.x + (int)get_group_id(0);
-    const int fits = starts[t + 1] <= capacity;
-    const int first = fits ? starts[t] : 0, listed = fits ? starts[t + 1] - first : count;
+    const tile_list list = list_of(tile_offsets, t, capacity, count);
     float sum[DEPTH] = {0.0f};
-    for (int done = 0; done < listed; done += STAGED) {
-        const int here = min(STAGED, listed - done);
+    for (int done = 0; done < list.count; done += STAGED) {
+        const int here = min(STAGED, list.count - done);
         barrier(CLK_LOCAL_MEM_FENCE); /* all have read what was there */
         for (int f = item; f < here * VOXEL_RECORD; f += items) {
             const int e = done + f / VOXEL_RECORD;
-            records_here[f] = records[(size_t)(fits ? entries[first + e] : e) * VOXEL_RECORD + f % VOXEL_RECORD];
+            records_here[f] = records[(size_t)listed_splat(list, tile_splat_ids, e) * VOXEL_RECORD + f % VOXEL_RECORD];
         }
         barrier(CLK_LOCAL_MEM_FENCE);
         for (int k = 0; k < here; ++k) {
-            __local const float *rec = records_here + k * VOXEL_RECORD;
-            __local const int *whole = (__local const int *)rec;
-            if (x < whole[VOX_LO] || x > whole[VOX_HI] || y < whole[VOX_LO + 1] || y > whole[VOX_HI + 1])
+            __local const float *voxel_record = records_here + k * VOXEL_RECORD;
+            __local const int *record_as_int = (__local const int *)voxel_record;
+            if (x < record_as_int[VOX_LO] || x > record_as_int[VOX_HI] || y < record_as_int[VOX_LO + 1] || y > record_as_int[VOX_HI + 1])
                 continue;
 #pragma unroll
             for (int d = 0; d < DEPTH; ++d)
-                if (z_first + d >= whole[VOX_LO + 2] && z_first + d <= whole[VOX_HI + 2]) {
-                    const voxel_row r = voxel_row_at(rec, y, z_first + d);
+                if (z_first + d >= record_as_int[VOX_LO + 2] && z_first + d <= record_as_int[VOX_HI + 2]) {
+                    const voxel_row r = voxel_row_at(voxel_record, y, z_first + d);
                     sum[d] += voxel_value(r, voxel_dx(r, x), 1.0f, limit);
                 }
         }
@@ -62,15 +61,16 @@ __kernel void voxel_forward(
         for (int y = y_first; y <= y_last; ++y)
             for (int x = 0; x < pitch; x += LANES)
                 V_STORE((vf)(0.0f), volume + IMAGE_GUARD + ((size_t)z * shape.y + y) * pitch + x);
-    FOR_LISTED(g, starts, entries, t, capacity, count) {
-        __global const float *rec = records + (size_t)g * VOXEL_RECORD;
-        __global const int *whole = (__global const int *)rec;
-        const int z_lo = max(z_first, whole[VOX_LO + 2]), z_hi = min(z_last, whole[VOX_HI + 2]);
-        const int y_lo = max(y_first, whole[VOX_LO + 1]), y_hi = min(y_last, whole[VOX_HI + 1]);
-        const int x_lo = whole[VOX_LO], x_hi = whole[VOX_HI];
+    const tile_list list = list_of(tile_offsets, t, capacity, count);
+    for (int k = 0; k < list.count; ++k) {
+        __global const float *voxel_record = records + (size_t)listed_splat(list, tile_splat_ids, k) * VOXEL_RECORD;
+        __global const int *record_as_int = (__global const int *)voxel_record;
+        const int z_lo = max(z_first, record_as_int[VOX_LO + 2]), z_hi = min(z_last, record_as_int[VOX_HI + 2]);
+        const int y_lo = max(y_first, record_as_int[VOX_LO + 1]), y_hi = min(y_last, record_as_int[VOX_HI + 1]);
+        const int x_lo = record_as_int[VOX_LO], x_hi = record_as_int[VOX_HI];
         for (int z = z_lo; z <= z_hi; ++z)
             for (int y = y_lo; y <= y_hi; ++y) {
-                const voxel_row r = voxel_row_at(rec, y, z);
+                const voxel_row r = voxel_row_at(voxel_record, y, z);
                 if (r.k > limit) /* a corner of the box */
                     continue;
                 __global float *row = volume + IMAGE_GUARD + ((size_t)z * shape.y + y) * pitch;

@@ -34,7 +34,7 @@ __kernel void voxel_prepare(
     const vf u23 = -v3_dot(sz, sy) * (inv_det * inv_u11) * (inv_det * inv_u11) / u22;
     const vf u33 = inv_det * inv_u11 / u22;
     vf rest[3];
-    /* split in the whole grid's frame, so that a part has the bits of the whole */
+    /* split in the frame of the complete grid, so that a part has the bits of the whole */
     const vf whole[3] = {wide_split(wide_dot(matrix, mean.x, mean.y, mean.z), rest) - (float)start.x,
                          wide_split(wide_dot(matrix + 4, mean.x, mean.y, mean.z), rest + 1) - (float)start.y,
                          wide_split(wide_dot(matrix + 8, mean.x, mean.y, mean.z), rest + 2) - (float)start.z};
@@ -75,11 +75,11 @@ __kernel void voxel_prepare(
         VI_STORE(hi[k], extents + (size_t)(2 * k + 1) * stride + first);
     }
     for (int lane = 0; lane < LANES; ++lane) {
-        __global float *rec = records + (size_t)(first + lane) * VOXEL_RECORD;
-        __global int *whole_rec = (__global int *)rec;
+        __global float *voxel_record = records + (size_t)(first + lane) * VOXEL_RECORD;
+        __global int *record_as_int = (__global int *)voxel_record;
         for (int f = 0; f < VOX_WHOLE; ++f)
-            rec[f] = fields[f * LANES + lane];
+            voxel_record[f] = fields[f * LANES + lane];
         for (int f = VOX_WHOLE; f < VOX_HI + 3; ++f)
-            whole_rec[f] = bounds[(f - VOX_WHOLE) * LANES + lane];
+            record_as_int[f] = bounds[(f - VOX_WHOLE) * LANES + lane];
     }
 }

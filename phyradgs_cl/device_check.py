@@ -138,8 +138,8 @@ def _binning(rt: Runtime) -> Iterator[Comparison]:
         for at in ((i, j, k) for k in range(tiles[2]) for j in range(tiles[1]) for i in range(tiles[0]))
     ]
     starts = np.cumsum([0, *map(len, expected)])
-    yield rt.download(lists.starts), starts, 0.0
-    yield rt.download(lists.entries)[: starts[-1]], np.concatenate(expected), 0.0
+    yield rt.download(lists.tile_offsets), starts, 0.0
+    yield rt.download(lists.splat_ids)[: starts[-1]], np.concatenate(expected), 0.0
 
 
 def _splats(rt: Runtime) -> Iterator[Comparison]:

@@ -14,44 +14,44 @@ typedef struct {
 } footprint_line;
 
 #if MOVING
-ALWAYS_INLINE footprint_line footprint_at(SPLAT_SPACE const float *rec, SPLAT_SPACE const float *cell, const int v, const float dv,
+ALWAYS_INLINE footprint_line footprint_at(SPLAT_SPACE const float *splat_record, SPLAT_SPACE const float *cell, const int v, const float dv,
                                           const float middle, const float half_time, const float weight,
                                           const float4 path_limits)
 #else
-ALWAYS_INLINE footprint_line footprint_at(SPLAT_SPACE const float *rec, SPLAT_SPACE const float *cell, const int v, const float dv)
+ALWAYS_INLINE footprint_line footprint_at(SPLAT_SPACE const float *splat_record, SPLAT_SPACE const float *cell, const int v, const float dv)
 #endif
 {
-    SPLAT_SPACE const int *whole = (SPLAT_SPACE const int *)rec;
+    SPLAT_SPACE const int *record_as_int = (SPLAT_SPACE const int *)splat_record;
     footprint_line line;
 #if MOVING
-    line.s = moving_on_line(rec, cell, (float)v, dv, middle, half_time, weight, path_limits);
-    line.amp = rec[REC_AMP] * weight;
-    line.speed = rec[REC_SPEED];
+    line.s = moving_on_line(splat_record, cell, (float)v, dv, middle, half_time, weight, path_limits);
+    line.amp = splat_record[REC_AMP] * weight;
+    line.speed = splat_record[REC_SPEED];
     line.middle = middle;
     line.half_time = half_time;
 #else
-    line.s = splat_on_line(rec, cell, (float)v, dv);
+    line.s = splat_on_line(splat_record, cell, (float)v, dv);
 #endif
     line.v = v;
     line.dv = dv;
-    line.u_lo = whole[REC_U_LO];
-    line.u_hi = whole[REC_U_HI];
-    line.u_whole = whole[REC_U_WHOLE];
-    line.u_rest = rec[REC_U_REST];
+    line.u_lo = record_as_int[REC_U_LO];
+    line.u_hi = record_as_int[REC_U_HI];
+    line.u_whole = record_as_int[REC_U_WHOLE];
+    line.u_rest = splat_record[REC_U_REST];
     return line;
 }
 
 /* the same for whoever looks at one line alone; `times`: the cell's (TIME_ROWS, time_pitch), if splats move */
-ALWAYS_INLINE footprint_line footprint_alone(SPLAT_SPACE const float *rec, SPLAT_SPACE const float *cell,
+ALWAYS_INLINE footprint_line footprint_alone(SPLAT_SPACE const float *splat_record, SPLAT_SPACE const float *cell,
                                              __global const float *times, const int time_pitch, const int v,
                                              const float4 path_limits)
 {
-    const float dv = (float)(v - ((SPLAT_SPACE const int *)rec)[REC_V_WHOLE]) - rec[REC_V_REST];
+    const float dv = (float)(v - ((SPLAT_SPACE const int *)splat_record)[REC_V_WHOLE]) - splat_record[REC_V_REST];
 #if MOVING
-    return footprint_at(rec, cell, v, dv, times[v], times[TIME_HALF * time_pitch + v],
+    return footprint_at(splat_record, cell, v, dv, times[v], times[TIME_HALF * time_pitch + v],
                         times[TIME_WEIGHT * time_pitch + v], path_limits);
 #else
-    return footprint_at(rec, cell, v, dv);
+    return footprint_at(splat_record, cell, v, dv);
 #endif
 }
 
@@ -64,13 +64,13 @@ ALWAYS_INLINE vf footprint_du(const footprint_line line, const int u)
 #if GROUP > 1
 /* the same, and only the pixels within the cutoff: with t = l11 du + t0 and B = beta t + gamma, num <= cutoff2 Q is a
    quadratic in t that does not know how far the line is from the centre, so that needles keep their digits */
-ALWAYS_INLINE footprint_line footprint_within(SPLAT_SPACE const float *rec, SPLAT_SPACE const float *cell,
+ALWAYS_INLINE footprint_line footprint_within(SPLAT_SPACE const float *splat_record, SPLAT_SPACE const float *cell,
                                               __global const float *times, const int time_pitch, const int v,
                                               const float4 path_limits, const float cutoff2)
 {
-    footprint_line line = footprint_alone(rec, cell, times, time_pitch, v, path_limits);
+    footprint_line line = footprint_alone(splat_record, cell, times, time_pitch, v, path_limits);
 #if MOVING
-    moving_span(rec, line.dv, line.middle, line.half_time, times[TIME_WEIGHT * time_pitch + v], cutoff2 > 0.0f,
+    moving_span(splat_record, line.dv, line.middle, line.half_time, times[TIME_WEIGHT * time_pitch + v], cutoff2 > 0.0f,
                 &line.u_lo, &line.u_hi);
 #else
     if (cutoff2 > 0.0f) {

@@ -75,16 +75,16 @@ typedef struct {
     float l11, t0, k, b1, b0, inv_kappa, amp, d0, d1, d2;
 } splat_line;
 
-static inline splat_line splat_on_line(SPLAT_SPACE const float *rec, SPLAT_SPACE const float *cell, float v, float dv)
+static inline splat_line splat_on_line(SPLAT_SPACE const float *splat_record, SPLAT_SPACE const float *cell, float v, float dv)
 {
     splat_line s;
-    s.l11 = rec[REC_L11];
-    s.t0 = rec[REC_L12] * dv;
-    s.k = (rec[REC_L22] * dv) * (rec[REC_L22] * dv);
-    s.b1 = rec[REC_B1];
-    s.b0 = 1.0f + rec[REC_B2] * dv;
-    s.inv_kappa = rec[REC_INV_KAPPA];
-    s.amp = rec[REC_AMP];
+    s.l11 = splat_record[REC_L11];
+    s.t0 = splat_record[REC_L12] * dv;
+    s.k = (splat_record[REC_L22] * dv) * (splat_record[REC_L22] * dv);
+    s.b1 = splat_record[REC_B1];
+    s.b0 = 1.0f + splat_record[REC_B2] * dv;
+    s.inv_kappa = splat_record[REC_INV_KAPPA];
+    s.amp = splat_record[REC_AMP];
     s.d0 = cell[CELL_D00] + v * (cell[CELL_DV] + cell[CELL_DVV] * v);
     s.d1 = cell[CELL_DU] + cell[CELL_DUV] * v;
     s.d2 = cell[CELL_DUU];

@@ -35,26 +35,26 @@ ALWAYS_INLINE int moving_rule(const float path, const float4 limits)
     return path <= limits.x ? 1 : (path <= limits.y ? 2 : (path <= limits.z ? 3 : CLOSED));
 }
 
-ALWAYS_INLINE moving_line moving_on_line(SPLAT_SPACE const float *rec, SPLAT_SPACE const float *cell, const float v,
+ALWAYS_INLINE moving_line moving_on_line(SPLAT_SPACE const float *splat_record, SPLAT_SPACE const float *cell, const float v,
                                          const float dv, const float middle, const float half_time, const float weight,
                                          const float4 limits)
 {
     moving_line s;
-    const float speed = rec[REC_SPEED];
+    const float speed = splat_record[REC_SPEED];
     s.shift = speed * middle;
     s.half_path = speed * half_time;
-    s.z1 = rec[REC_ALONG_U];
-    s.z0 = rec[REC_ALONG_V] * dv - s.shift;
-    s.c1 = rec[REC_ACROSS_U];
-    s.c0 = rec[REC_ACROSS_V] * dv;
-    s.b1 = rec[REC_B1];
-    s.b0 = 1.0f + rec[REC_B2] * dv;
-    s.inv_kappa = rec[REC_INV_KAPPA];
+    s.z1 = splat_record[REC_ALONG_U];
+    s.z0 = splat_record[REC_ALONG_V] * dv - s.shift;
+    s.c1 = splat_record[REC_ACROSS_U];
+    s.c0 = splat_record[REC_ACROSS_V] * dv;
+    s.b1 = splat_record[REC_B1];
+    s.b0 = 1.0f + splat_record[REC_B2] * dv;
+    s.inv_kappa = splat_record[REC_INV_KAPPA];
     s.d0 = cell[CELL_D00] + v * (cell[CELL_DV] + cell[CELL_DVV] * v);
     s.d1 = cell[CELL_DU] + cell[CELL_DUV] * v;
     s.d2 = cell[CELL_DUU];
     s.rule = moving_rule(2.0f * s.half_path, limits);
-    s.amplitude = rec[REC_AMP] * weight;
+    s.amplitude = splat_record[REC_AMP] * weight;
     if (s.rule == CLOSED)
         s.amplitude *= ROOT_HALF_PI / (2.0f * s.half_path);
     return s;
@@ -192,16 +192,16 @@ ALWAYS_INLINE moving_means moving_all_means(const moving_line s, const moving_pi
 
 /* Pixels of LANES lines from `v` on that the splat reaches within each line's window: the discs at its two ends (in
    whitened coordinates) and the flat sides between them. Lines that see nothing of the segment come out empty. */
-ALWAYS_INLINE void moving_span(SPLAT_SPACE const float *rec, const vf dv, const vf middle, const vf half_time,
+ALWAYS_INLINE void moving_span(SPLAT_SPACE const float *splat_record, const vf dv, const vf middle, const vf half_time,
                                const vf weight, const int cuts, vi *u_lo, vi *u_hi)
 {
-    SPLAT_SPACE const int *whole = (SPLAT_SPACE const int *)rec;
-    *u_lo = (vi)(whole[REC_U_LO]);
-    *u_hi = VI_PICK(whole[REC_U_LO] - 1, whole[REC_U_HI], weight > 0.0f);
+    SPLAT_SPACE const int *record_as_int = (SPLAT_SPACE const int *)splat_record;
+    *u_lo = (vi)(record_as_int[REC_U_LO]);
+    *u_hi = VI_PICK(record_as_int[REC_U_LO] - 1, record_as_int[REC_U_HI], weight > 0.0f);
     if (!cuts)
         return;
-    const float a1 = rec[REC_ALONG_U], c1 = rec[REC_ACROSS_U], reach2 = rec[REC_REACH2], speed = rec[REC_SPEED];
-    const vf a0 = rec[REC_ALONG_V] * dv, c0 = rec[REC_ACROSS_V] * dv;
+    const float a1 = splat_record[REC_ALONG_U], c1 = splat_record[REC_ACROSS_U], reach2 = splat_record[REC_REACH2], speed = splat_record[REC_SPEED];
+    const vf a0 = splat_record[REC_ALONG_V] * dv, c0 = splat_record[REC_ACROSS_V] * dv;
     const float norm = a1 * a1 + c1 * c1, per = 1.0f / norm;
     const vf none = (vf)(1e9f);
     vf lo = none, hi = -none;
@@ -223,8 +223,8 @@ ALWAYS_INLINE void moving_span(SPLAT_SPACE const float *rec, const vf dv, const 
         lo = min(lo, V_PICK(none, at, some));
         hi = max(hi, V_PICK(-none, at, some));
     }
-    const float centre = rec[REC_U_REST], far = 4e6f;
-    *u_lo = max(*u_lo, whole[REC_U_WHOLE] + V_INT(ceil(clamp(lo + (centre - 0.01f), -far, far))));
-    *u_hi = min(*u_hi, whole[REC_U_WHOLE] + V_INT(floor(clamp(hi + (centre + 0.01f), -far, far))));
+    const float centre = splat_record[REC_U_REST], far = 4e6f;
+    *u_lo = max(*u_lo, record_as_int[REC_U_WHOLE] + V_INT(ceil(clamp(lo + (centre - 0.01f), -far, far))));
+    *u_hi = min(*u_hi, record_as_int[REC_U_WHOLE] + V_INT(floor(clamp(hi + (centre + 0.01f), -far, far))));
 }
 #endif

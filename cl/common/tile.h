@@ -1,12 +1,19 @@
-/* The Gaussians of a tile in their order: the list that binning.cl made, entries[starts[tile]] to
-   entries[starts[tile + 1] - 1], or all `count` of them where the lists outgrew `capacity`, which is slow and gives the same. */
-#define FOR_LISTED(g, starts, entries, tile, capacity, count)                                                         \
-    for (int fits_ = (starts)[(tile) + 1] <= (capacity), e_ = fits_ ? (starts)[tile] : 0,                             \
-             stop_ = fits_ ? (starts)[(tile) + 1] : (count), g = 0;                                                   \
-         e_ < stop_ && (g = fits_ ? (entries)[e_] : e_, 1); ++e_)
+/* The splats of a tile, in their order: tile_splat_ids[tile_offsets[tile]] to tile_splat_ids[tile_offsets[tile + 1] - 1], as
+   binning.cl writes them. Where the lists outgrew `capacity`, a tile's list is all splats: slow, with the same result. */
+#include "common/lanes.h"
 
-/* Every splat of a tile from every cell that serves its lines: `at` is its place in records (stride, C) and seen (stride, C). */
-#define FOR_SPLATS(at, c, starts, entries, tile, capacity, count, cell_count, c_first, c_stop, seen)                  \
-    FOR_LISTED(g_, starts, entries, tile, capacity, count)                                                            \
-        for (int c = (c_first); c < (c_stop); ++c)                                                                    \
-            for (size_t at = (size_t)g_ * (cell_count) + c, once_ = 1; once_ && (seen)[at]; once_ = 0)
+typedef struct { int is_written, first, count; } tile_list;
+
+ALWAYS_INLINE tile_list list_of(__global const int *tile_offsets, const int tile, const int capacity, const int splat_count)
+{
+    tile_list list;
+    list.is_written = tile_offsets[tile + 1] <= capacity;
+    list.first = list.is_written ? tile_offsets[tile] : 0;
+    list.count = list.is_written ? tile_offsets[tile + 1] - list.first : splat_count;
+    return list;
+}
+
+ALWAYS_INLINE int listed_splat(const tile_list list, __global const int *tile_splat_ids, const int k)
+{
+    return list.is_written ? tile_splat_ids[list.first + k] : k;
+}

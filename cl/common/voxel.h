@@ -22,19 +22,19 @@
 /* a Gaussian on one row of voxels */
 typedef struct { float u11, a0, k, density, dy, dz, x_rest; int x_whole; } voxel_row;
 
-ALWAYS_INLINE voxel_row voxel_row_at(VOXEL_SPACE const float *rec, const int y, const int z)
+ALWAYS_INLINE voxel_row voxel_row_at(VOXEL_SPACE const float *voxel_record, const int y, const int z)
 {
-    VOXEL_SPACE const int *whole = (VOXEL_SPACE const int *)rec;
+    VOXEL_SPACE const int *record_as_int = (VOXEL_SPACE const int *)voxel_record;
     voxel_row r;
-    r.dz = (float)(z - whole[VOX_WHOLE + 2]) - rec[VOX_REST + 2];
-    r.dy = (float)(y - whole[VOX_WHOLE + 1]) - rec[VOX_REST + 1];
-    r.u11 = rec[VOX_U11];
-    r.a0 = rec[VOX_U12] * r.dy + rec[VOX_U13] * r.dz;
-    const float b = rec[VOX_U22] * r.dy + rec[VOX_U23] * r.dz, c = rec[VOX_U33] * r.dz;
+    r.dz = (float)(z - record_as_int[VOX_WHOLE + 2]) - voxel_record[VOX_REST + 2];
+    r.dy = (float)(y - record_as_int[VOX_WHOLE + 1]) - voxel_record[VOX_REST + 1];
+    r.u11 = voxel_record[VOX_U11];
+    r.a0 = voxel_record[VOX_U12] * r.dy + voxel_record[VOX_U13] * r.dz;
+    const float b = voxel_record[VOX_U22] * r.dy + voxel_record[VOX_U23] * r.dz, c = voxel_record[VOX_U33] * r.dz;
     r.k = b * b + c * c; /* least |U D|^2 on the row */
-    r.density = rec[VOX_DENSITY];
-    r.x_rest = rec[VOX_REST];
-    r.x_whole = whole[VOX_WHOLE];
+    r.density = voxel_record[VOX_DENSITY];
+    r.x_rest = voxel_record[VOX_REST];
+    r.x_whole = record_as_int[VOX_WHOLE];
     return r;
 }
 

@@ -189,7 +189,7 @@ def test_lists_of_too_many_entries_are_made_for_smaller_bricks(rt, make_cloud, m
     rows = make_cloud(200, 102)
     whole = Voxeliser(rt, TALL.shape)
     expected = whole.voxelise(rows, TALL)
-    monkeypatch.setattr(binning, "_MOST_ENTRIES", int(rt.download(whole.lists.starts)[-1]))
+    monkeypatch.setattr(binning, "_MOST_ENTRIES", int(rt.download(whole.lists.tile_offsets)[-1]))
     del whole
     with room_for(rt, 1_200_000):
         np.testing.assert_array_equal(voxelise(rt, rows, TALL), expected)

@@ -25,14 +25,14 @@ def test_lists_that_do_not_fit_give_the_same_bits(any_rt, make_cloud, make_geome
         cells = DeviceCells.upload(rt, table)
         run = lambda: rt.download(operator.forward(gaussians, cells))  # noqa: E731
     expected = run()
-    needed = int(rt.download(operator.lists.starts)[-1])
-    assert expected.any() and operator.lists.entries.size > needed
+    needed = int(rt.download(operator.lists.tile_offsets)[-1])
+    assert expected.any() and operator.lists.splat_ids.size > needed
     rt.finish()
-    operator.lists.entries = rt.empty(needed // 2, np.int32)
+    operator.lists.splat_ids = rt.empty(needed // 2, np.int32)
     operator.lists._needed = None  # the last number is of lists that fitted
     np.testing.assert_array_equal(run(), expected)
     np.testing.assert_array_equal(run(), expected)
-    assert operator.lists.entries.size > needed, "the number has come meanwhile"
+    assert operator.lists.splat_ids.size > needed, "the number has come meanwhile"
 
 
 @pytest.mark.parametrize("many", [binning._MANY_COUNTS, 1], ids=["short chunks", "long chunks"])
@@ -50,8 +50,8 @@ def test_a_gpus_lists_are_a_cpus(monkeypatch, many) -> None:
         for rt in shapes:
             lists = binning.TileLists(rt, tile, tiles)
             lists.build(rt.upload(extents), count, count + 7)
-            starts = rt.download(lists.starts)
-            found.append((starts, rt.download(lists.entries)[: starts[-1]]))
+            starts = rt.download(lists.tile_offsets)
+            found.append((starts, rt.download(lists.splat_ids)[: starts[-1]]))
         np.testing.assert_array_equal(found[0][0], found[1][0], str(count))
         np.testing.assert_array_equal(found[0][1], found[1][1], str(count))
         assert count < 2 or found[0][0][-1] > count

@@ -28,8 +28,8 @@ class TileLists:
         self.tile = np.array([*tile, 0], np.int32)
         self.tiles = np.array([*tiles, 0], np.int32)
         self.waits = False
-        self.starts = rt.zeros(self.total + 1, np.int32)
-        self.entries = rt.empty(1, np.int32)
+        self.tile_offsets = rt.zeros(self.total + 1, np.int32)
+        self.splat_ids = rt.empty(1, np.int32)
         self._counts: DeviceArray = rt.empty(1, np.int32)
         self._count_seen = -1
         self._needed: LaterItem | None = None
@@ -70,13 +70,13 @@ class TileLists:
             total,
             np.int32(chunks),
             self._counts,
-            self.starts,
+            self.tile_offsets,
             *scratch,
             group=scan,
         )
-        rt.launch(self._starts, scan, total, self.starts, *scratch, group=scan)
+        rt.launch(self._starts, scan, total, self.tile_offsets, *scratch, group=scan)
         if self.waits or count != self._count_seen:
-            self._make_room(int(rt.read_item(self.starts, self.total)), 1.0)
+            self._make_room(int(rt.read_item(self.tile_offsets, self.total)), 1.0)
             self._count_seen, self._needed = count, None
         elif self._needed is not None and self._needed.is_here:
             self._make_room(int(self._needed.value), _NEAR)
@@ -86,14 +86,14 @@ class TileLists:
             chunks * group,
             *domain,
             self._counts,
-            self.starts,
-            self.entries,
-            np.int32(self.entries.size),
+            self.tile_offsets,
+            self.splat_ids,
+            np.int32(self.splat_ids.size),
             *boxes,
             group=group,
         )
         if not self.waits and self._needed is None:
-            self._needed = rt.read_item_later(self.starts, self.total)
+            self._needed = rt.read_item_later(self.tile_offsets, self.total)
 
     @staticmethod
     def bytes(rt: Runtime, tiles: int, count: int) -> int:
@@ -106,9 +106,9 @@ class TileLists:
             found, expected = f"{needed} entries or more", f"fewer than {_MOST_ENTRIES}"
             remedy = "use fewer or smaller Gaussians"
             raise MemoryShortage("lists of splats per tile", found, expected, remedy)
-        if share * needed > self.entries.size:
-            self.entries = self.rt.empty(1, np.int32)
-            self.entries = self.rt.empty(min(int(needed * _SLACK) + 16, _MOST_ENTRIES), np.int32)
+        if share * needed > self.splat_ids.size:
+            self.splat_ids = self.rt.empty(1, np.int32)
+            self.splat_ids = self.rt.empty(min(int(needed * _SLACK) + 16, _MOST_ENTRIES), np.int32)
 
 
 def chunk_of(rt: Runtime, tiles: int, count: int) -> int:

@@ -54,13 +54,13 @@ class _Kernels:
     chain: Kernel
 
     @classmethod
-    def declare(cls, rt: Runtime, **options: bool) -> "_Kernels":
+    def declare(cls, rt: Runtime, moving: bool, **options: bool) -> "_Kernels":
         by_pixel = rt.pixel_items
-        defines = {"IMAGE_GUARD": GUARD, **options}
+        defines = {"IMAGE_GUARD": GUARD, "MOVING": moving, **options}
         forward = "splat_forward_pixels" if by_pixel else "splat_forward_rows"
         backward = "splat_backward_group" if by_pixel else "splat_backward_rows"
         return cls(
-            prepare=rt.kernel("splat_prepare", "splat_prepare", **defines),
+            prepare=rt.kernel("splat_prepare", "splat_prepare_moving" if moving else "splat_prepare", **defines),
             forward=rt.kernel("splat_forward", forward, BLOCK_PIXEL=by_pixel, **defines),
             backward=rt.kernel("splat_backward", backward, **GROUP_DEFINES[by_pixel], **defines),
             chain=rt.kernel("splat_chain", "splat_chain", **defines),
@@ -100,10 +100,10 @@ class SplatProjector:
         self.image = padded_zeros(rt, lines, width)
         self._layers = None if intensity_unit is None else Layers(rt, lines, width, intensity_unit)
         self._records = rt.empty(1)
-        self._seen = rt.empty(1, np.uint8)
+        self._is_visible = rt.empty(1, np.uint8)
         self._extents = rt.empty(1, np.int32)
         options = {"AFFINE": affine, "FOOTPRINT": pixel_footprint, "LAYERED": self._layers is not None}
-        self._kernels = {moving: _Kernels.declare(rt, MOVING=moving, **options) for moving in (False, True)}
+        self._kernels = {moving: _Kernels.declare(rt, moving, **options) for moving in (False, True)}
 
     # --- device to device: the reconstruction's loop --------------------------------------------------
 
@@ -123,15 +123,15 @@ class SplatProjector:
             self._kernels[cells.moving].forward,
             items,
             self._records,
-            self._seen,
+            self._is_visible,
             cells.cells,
             cells.line_cells,
             cells.line_times,
             np.int32(cells.time_pitch),
             self.path_limits,
-            self.lists.starts,
-            self.lists.entries,
-            np.int32(self.lists.entries.size),
+            self.lists.tile_offsets,
+            self.lists.splat_ids,
+            np.int32(self.lists.splat_ids.size),
             np.int32(gaussians.count),
             np.int32(cells.count),
             np.int32(self.lines),
@@ -168,7 +168,7 @@ class SplatProjector:
             kernels.backward,
             items,
             self._records,
-            self._seen,
+            self._is_visible,
             cells.cells,
             cells.line_times,
             np.int32(cells.time_pitch),
@@ -188,7 +188,7 @@ class SplatProjector:
             cells.cells,
             cells.matrices,
             self._records,
-            self._seen,
+            self._is_visible,
             np.int32(cells.count),
             np.int32(gaussians.count),
             np.int32(gaussians.stride),
@@ -211,7 +211,7 @@ class SplatProjector:
         shape = (gaussians.stride, cells.count, RECORD_FLOATS[cells.moving])
         size = int(np.prod(shape))
         records = self.rt.download(DeviceArray(self._records.buffer, (size,), np.dtype(np.float32)))
-        seen = self.rt.download(DeviceArray(self._seen.buffer, shape[:2], np.dtype(np.uint8)))
+        seen = self.rt.download(DeviceArray(self._is_visible.buffer, shape[:2], np.dtype(np.uint8)))
         records = np.where(seen[..., None], records.reshape(shape), UNSEEN[: shape[2]])[: gaussians.count]
         if not cells.moving:
             return still_work(records, self.rt.lanes)
@@ -225,30 +225,22 @@ class SplatProjector:
         if self._records.size < footprints * RECORD_FLOATS[cells.moving]:
             self._records = rt.empty(1)  # the old goes before the new comes
             self._records = rt.empty(footprints * RECORD_FLOATS[cells.moving])
-        if self._seen.size < footprints:
-            self._seen = rt.empty(1, np.uint8)
-            self._seen = rt.empty(footprints, np.uint8)
+        if self._is_visible.size < footprints:
+            self._is_visible = rt.empty(1, np.uint8)
+            self._is_visible = rt.empty(footprints, np.uint8)
         if self._extents.size < 6 * gaussians.stride:
             self._extents = rt.empty(6 * gaussians.stride, np.int32)
+        times = (cells.line_times, np.int32(cells.time_pitch)) if cells.moving else ()
         rt.launch(
             self._kernels[cells.moving].prepare,
             gaussians.stride // rt.lanes,
-            gaussians.rows,
-            cells.cells,
-            cells.matrices,
-            cells.cell_lines,
-            cells.line_times,
-            np.int32(cells.time_pitch),
-            np.int32(cells.count),
-            np.int32(gaussians.count),
-            np.int32(gaussians.stride),
-            np.int32(self.width),
-            self.cutoff2,
-            self._records,
-            self._seen,
-            self._extents,
+            gaussians.rows, np.int32(gaussians.count), np.int32(gaussians.stride),
+            cells.cells, cells.matrices, cells.cell_lines, np.int32(cells.count),
+            np.int32(self.width), self.cutoff2,
+            self._records, self._is_visible, self._extents,
+            *times,
             group=rt.group(),
-        )
+        )  # fmt: skip
 
     # --- arrays to arrays -----------------------------------------------------------------------------
 

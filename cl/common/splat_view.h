@@ -1,0 +1,145 @@
+/* A Gaussian projected from one time cell: its centre on the detector, its splat, and the pixels within the cutoff.
+   The formulas are derived in docs/mathematics.md. */
+#include "common/precise.h"
+#include "common/gaussian.h"
+#include "common/splat.h"
+
+/* Smallest depth of a centre that is drawn, as a share of the detector's: closer to the source's plane float32 cannot tell
+   them apart, and derivatives grow with the inverse depth. */
+#define NEAREST 1e-6f
+
+/* position in pixels, u = u_whole + u_rest and likewise v; depth 1 is on the detector */
+typedef struct { vf u_whole, u_rest, v_whole, v_rest, depth; } splat_centre;
+
+/* matrix (12,): its rows give u z, v z and z of a world point */
+ALWAYS_INLINE splat_centre project_centre(__global const coefficient *matrix, const v3 mean)
+{
+    splat_centre centre;
+    const vwide depth = wide_dot(matrix + 8, mean.x, mean.y, mean.z);
+    centre.u_whole = wide_ratio(wide_dot(matrix, mean.x, mean.y, mean.z), depth, &centre.u_rest);
+    centre.v_whole = wide_ratio(wide_dot(matrix + 4, mean.x, mean.y, mean.z), depth, &centre.v_rest);
+    centre.depth = wide_value(depth);
+    return centre;
+}
+
+/* the splat of common/splat.h; is_drawn: the Gaussian lies in front of the source */
+typedef struct { vf l11, l12, l22, b1, b2, inv_kappa, amplitude; vi is_drawn; } splat_view;
+
+#if FOOTPRINT
+/* Averages the splat over a pixel's area: the pixel's variance E is added to the splat's covariance,
+   (S^-1 + E)^-1 = (S + E det S) / delta with delta = 1 + E tr S + E^2 det S. The mass does not change. */
+ALWAYS_INLINE void widen_by_pixel(splat_view *s)
+{
+    const vf det_s = (s->l11 * s->l22) * (s->l11 * s->l22);
+    const vf trace = s->l11 * s->l11 + s->l12 * s->l12 + s->l22 * s->l22;
+    const vf inv = 1.0f / (1.0f + PIXEL_VARIANCE * (trace + PIXEL_VARIANCE * det_s));
+    const vf wide11 = sqrt((s->l11 * s->l11 + PIXEL_VARIANCE * det_s) * inv);
+    s->l12 = s->l11 * s->l12 * inv / wide11;
+    s->l22 = sqrt(det_s * inv) / wide11;
+    s->l11 = wide11;
+    s->amplitude *= sqrt(inv);
+}
+#endif
+
+ALWAYS_INLINE splat_view view_splat(const gaussian g, __global const float *cell, const vf z)
+{
+    splat_view s;
+    const vf inv_det = g.inv_scale.x * g.inv_scale.y * g.inv_scale.z;
+    const v3 ray = to_local(g.axes, v3_make(g.mean.x - cell[CELL_SOURCE], g.mean.y - cell[CELL_SOURCE + 1],
+                                            g.mean.z - cell[CELL_SOURCE + 2]));
+    const v3 eu = to_local(g.axes, v3_make((vf)(cell[CELL_EU]), (vf)(cell[CELL_EU + 1]), (vf)(cell[CELL_EU + 2])));
+    const v3 ev = to_local(g.axes, v3_make((vf)(cell[CELL_EV]), (vf)(cell[CELL_EV + 1]), (vf)(cell[CELL_EV + 2])));
+    const v3 white = v3_mul(ray, g.inv_scale);
+    const vf kappa = v3_dot(white, white);
+    const vf inv_kappa = 1.0f / kappa;
+    const vf root = rsqrt(kappa);
+    s.is_drawn = (z > NEAREST) & (kappa > 0.0f);
+
+    /* Gram form of S: no difference of large numbers, so that needles keep their digits */
+    const v3 gu = v3_scale(v3_mul(g.scale, v3_cross(ray, eu)), inv_det);
+    const v3 gv = v3_scale(v3_mul(g.scale, v3_cross(ray, ev)), inv_det);
+    const vf gu_length = sqrt(v3_dot(gu, gu));
+    const vf factor = z * root;
+    s.l11 = gu_length * factor;
+    s.l12 = v3_dot(gu, gv) / gu_length * factor;
+    s.l22 = z * z * z * fabs((vf)(cell[CELL_VOLUME])) * inv_det * root / s.l11;
+#if AFFINE
+    s.b1 = s.b2 = s.inv_kappa = (vf)(0.0f);
+    const vf ray_length = sqrt(v3_dot(ray, ray)) / z;
+#else
+    s.b1 = z * inv_kappa * v3_dot(white, v3_mul(eu, g.inv_scale));
+    s.b2 = z * inv_kappa * v3_dot(white, v3_mul(ev, g.inv_scale));
+    s.inv_kappa = inv_kappa;
+    const vf ray_length = (vf)(1.0f);
+#endif
+    s.amplitude = cell[CELL_WEIGHT] * 2.50662827463f * g.density * factor * ray_length;
+#if FOOTPRINT
+    widen_by_pixel(&s);
+#endif
+    return s;
+}
+
+/* The ellipse q <= cutoff2 as offsets from the splat's centre: its middle (u, v) and half its extent along u and v.
+   is_bounded: it is an ellipse; else the Gaussian reaches the plane of the source. */
+typedef struct { vf u, v, half_u, half_v; vi is_bounded; } cutoff_ellipse;
+
+/* q <= cutoff2 is D'TD - 2 c b.D - c <= 0 with T = S (1 - c/kappa) - c b b' */
+ALWAYS_INLINE cutoff_ellipse ellipse_of(const splat_view s, const float cutoff2)
+{
+    cutoff_ellipse e;
+    const vf l11 = s.l11, l12 = s.l12, l22 = s.l22, b1 = s.b1, b2 = s.b2;
+    const vf shrink = 1.0f - cutoff2 * s.inv_kappa;
+    const vf t11 = l11 * l11 * shrink - cutoff2 * b1 * b1;
+    const vf t12 = l11 * l12 * shrink - cutoff2 * b1 * b2;
+    const vf t22 = (l12 * l12 + l22 * l22) * shrink - cutoff2 * b2 * b2;
+    /* det T = shrink^2 det S - c shrink b' adj(S) b, again without large differences */
+    const vf s_b1 = l11 * b2 - l12 * b1, s_b2 = l22 * b1;
+    const vf det = shrink * (shrink * (l11 * l22) * (l11 * l22) - cutoff2 * (s_b1 * s_b1 + s_b2 * s_b2));
+    e.is_bounded = (shrink > 0.0f) & (det > 0.0f) & (t11 > 0.0f);
+    const vf inv_t = 1.0f / det;
+    e.u = cutoff2 * (t22 * b1 - t12 * b2) * inv_t;
+    e.v = cutoff2 * (t11 * b2 - t12 * b1) * inv_t;
+    const vf level = cutoff2 * (1.0f + b1 * e.u + b2 * e.v);
+    e.half_u = sqrt(level * t22 * inv_t) * 1.0001f + 0.002f;
+    e.half_v = sqrt(level * t11 * inv_t) * 1.0001f + 0.002f;
+    return e;
+}
+
+/* the pixels u_lo..u_hi of the lines v_lo..v_hi */
+typedef struct { vi u_lo, u_hi, v_lo, v_hi; } pixel_box;
+
+/* narrows [lo, hi] to the pixels between whole + low and whole + high */
+ALWAYS_INLINE void narrow(const vf whole, const vf low, const vf high, vi *lo, vi *hi)
+{
+    const vf far = (vf)(4e6f);
+    *lo = max(*lo, V_INT(ceil(clamp(whole + low, -far, far))));
+    *hi = min(*hi, V_INT(floor(clamp(whole + high, -far, far))));
+}
+
+/* empties the boxes of splats that are not drawn, and returns which are: those in front, with pixels in their box */
+ALWAYS_INLINE vi close_box(pixel_box *box, const vi is_drawn)
+{
+    const vi is_visible = is_drawn & (box->u_hi >= box->u_lo) & (box->v_hi >= box->v_lo);
+    box->u_lo = VI_PICK(1, box->u_lo, is_visible);
+    box->u_hi = VI_PICK(0, box->u_hi, is_visible);
+    box->v_lo = VI_PICK(1, box->v_lo, is_visible);
+    box->v_hi = VI_PICK(0, box->v_hi, is_visible);
+    return is_visible;
+}
+
+/* the smallest box around all visible splats of a Gaussian */
+ALWAYS_INLINE pixel_box empty_box(void)
+{
+    pixel_box box;
+    box.u_lo = box.v_lo = (vi)(0x7fffffff);
+    box.u_hi = box.v_hi = (vi)(-1);
+    return box;
+}
+
+ALWAYS_INLINE void enclose(pixel_box *extent, const pixel_box box, const vi is_visible)
+{
+    extent->u_lo = VI_PICK(extent->u_lo, min(extent->u_lo, box.u_lo), is_visible);
+    extent->u_hi = VI_PICK(extent->u_hi, max(extent->u_hi, box.u_hi), is_visible);
+    extent->v_lo = VI_PICK(extent->v_lo, min(extent->v_lo, box.v_lo), is_visible);
+    extent->v_hi = VI_PICK(extent->v_hi, max(extent->v_hi, box.v_hi), is_visible);
+}
