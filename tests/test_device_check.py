@@ -29,7 +29,7 @@ def test_every_kernel_is_asked(launch_shape, others) -> None:
 # a check, a program, what is changed in it, and what the line says
 WRONG = [
     ("_optimiser", "adam", "sqrt(v) + epsilon", "sqrt(m * m) + epsilon", ": adam_step (off by"),
-    ("_binning", "binning", "tile_splat_ids[position] = g;", "entries[position] = 0;", "bin_fill"),
+    ("_binning", "binning", "tile_splat_ids[position] = g;", "tile_splat_ids[position] = 0;", "bin_fill"),
     ("_voxels", "voxel_backward", "__kernel void voxel_chain(", "nonsense", "kernel voxel_backward.cl on"),
 ]
 
