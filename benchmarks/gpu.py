@@ -137,7 +137,7 @@ def fdk(rt: Runtime, quick: bool) -> Facts:
 
 
 def table(facts: Facts) -> str:
-    """Markdown, for docs/gpu.md."""
+    """Returns the results as a Markdown table."""
     rows = [
         ("kernels against float64", facts.get("verdict"), "all agree"),
         ("kernel tests", facts.get("tests"), "all pass"),

@@ -93,7 +93,7 @@ def _worst(costs_of_kernel: list[KernelCost]) -> str:
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--table", type=Path, help="file for the table, or a page that has it: docs/gpu.md")
+    parser.add_argument("--table", type=Path, help="file for the table, or a page that has it: docs/results/gpu.md")
     asked = parser.parse_args()
     if missing():
         print(f"not installed: {', '.join(missing())}; run make test-gpu-build", file=sys.stderr)
