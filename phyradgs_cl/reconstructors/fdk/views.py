@@ -5,6 +5,7 @@ from collections.abc import Callable
 
 import numpy as np
 
+from phyradgs_cl.acquisition.altered.angles import azimuth_rad
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.reconstructors.fdk import weights
@@ -27,7 +28,7 @@ def pose_of_pixels(pose: np.ndarray, axis: str) -> np.ndarray:
 
 def view_angles(by_pixel: np.ndarray) -> np.ndarray:
     """Each view's gantry angle (F,): the mean of its lines' angles, radians."""
-    angle_rad = weights.source_angle(by_pixel)
+    angle_rad = azimuth_rad(by_pixel)
     first = angle_rad[:, :1, :1]
     turned = np.mod(angle_rad - first + np.pi, 2 * np.pi) - np.pi
     return (first + turned.mean(axis=(1, 2), keepdims=True))[:, 0, 0]
@@ -70,7 +71,7 @@ def _redundancy_angle(pose: np.ndarray, rays: np.ndarray, arc: Arc) -> np.ndarra
     angle_rad = weights.fan_angle(pose, rays)
     if arc.is_full or pose.shape[1] == 1:
         return angle_rad
-    return angle_rad + weights.source_angle(pose)
+    return angle_rad + azimuth_rad(pose)
 
 
 def widened(pose: np.ndarray, axis: str, missing: tuple[int, int]) -> np.ndarray:
@@ -88,7 +89,7 @@ def check_orbit(pose: np.ndarray) -> None:
     """Says of poses (F, 12) or (F, lines, 12) how far they are from one circle about z with a panel that turns along, and
     from that circle's plane. Raises InputError where FDK would make no volume of the object."""
     middle = pose if pose.ndim == 2 else pose[:, pose.shape[1] // 2]
-    canonical = weights.turned_back(middle, weights.source_angle(middle)).reshape(-1, 4, 3)
+    canonical = weights.turned_back(middle, azimuth_rad(middle)).reshape(-1, 4, 3)
     source, corner = canonical[:, 0], canonical[:, 1]
     usual = np.median(canonical, axis=0)
     length_mm = float(np.linalg.norm(usual[1] - usual[0]))

@@ -17,11 +17,6 @@ _SYMMETRIC = 0.01  # pixels of overhang that are no displacement
 _ASIDE = 0.1  # of the fan: a panel that is less off centre was not put there on purpose, and sees the object's both sides
 
 
-def source_angle(pose: np.ndarray) -> np.ndarray:
-    """The source's angle (...) about +z, radians, of poses (..., 12)."""
-    return np.arctan2(pose[..., 1], pose[..., 0])
-
-
 def turned_back(pose: np.ndarray, angle_rad: np.ndarray) -> np.ndarray:
     """Poses (F, ..., 12) turned by −angle (F,) about +z: equal for all views of a circular orbit."""
     c, s = np.cos(angle_rad), np.sin(angle_rad)
