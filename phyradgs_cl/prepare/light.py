@@ -123,7 +123,7 @@ class AirOptions:
 def normalise_air(scan: Scan, options: AirOptions, make_model: MakeModel) -> tuple[Scan, Facts]:
     """Returns the scan with the median of each frame's air shifted to 0."""
     frames = unmasked_frames(scan)
-    air = enough_air(frames, options.below, options.least, "air", "leave the step out, or lower air.least")
+    air = enough_air(frames, options.below, options.least, "air", "raise air.below, or leave the step out")
     clean, value = with_air_at_0(frames, air)
     light = np.exp(-value)
     facts = {"light": [float(light.min()), float(light.max())], "air_share": float(air.mean())}

@@ -5,7 +5,7 @@ A method is a class with ``Stepwise``'s attributes; ``Loop`` runs it, on one pro
 
 import time
 from collections.abc import Mapping
-from typing import Protocol as Interface
+from typing import Protocol
 
 import numpy as np
 
@@ -19,7 +19,7 @@ from phyradgs_cl.signals import stop_on_interrupt
 SILENT_S = 10.0
 
 
-class Stepwise(Interface):
+class Stepwise(Protocol):
     """A method between its start and its result."""
 
     quantity: str

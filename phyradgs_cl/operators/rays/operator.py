@@ -2,8 +2,7 @@
 
 from collections.abc import Iterator, Sequence
 from copy import copy
-from typing import Any
-from typing import Protocol as Interface
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -19,7 +18,7 @@ from phyradgs_cl.runtime import Array, DeviceArray, Runtime, SameArray, with_sma
 from phyradgs_cl.runtime.layout import Strides
 
 
-class LinearOperator(Interface):
+class LinearOperator(Protocol):
     """What the iterative methods need to know of a scanner: A, Aᵀ, and A restricted to some frames."""
 
     @property

@@ -3,7 +3,7 @@
 The batch alone decides about the bits; how many ranks there are does not.
 """
 
-from typing import Protocol as Interface
+from typing import Protocol
 
 import numpy as np
 
@@ -16,7 +16,7 @@ _ROWS, _STATISTICS = 11, 2
 _DERIVED = 13  # with the centre on the detector, which density control looks at
 
 
-class Sharing(Interface):
+class Sharing(Protocol):
     """What all ranks do together, in the same order."""
 
     def differentiate(self, step: FrameStep, cloud: DeviceCloud, batch: Batch) -> None:
