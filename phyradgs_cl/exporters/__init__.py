@@ -9,8 +9,15 @@ import numpy as np
 from phyradgs_cl import checks
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.exporters.dicom import DicomLabels, write_dicom
-from phyradgs_cl.exporters.gaussians import gaussians_of, write_npz, write_ply
-from phyradgs_cl.exporters.voxels import hounsfield, write_image, write_npy, write_tiff
+from phyradgs_cl.exporters.writers import (
+    gaussians_of,
+    hounsfield,
+    write_image,
+    write_npy,
+    write_npz,
+    write_ply,
+    write_tiff,
+)
 from phyradgs_cl.io import Volume, read_volume
 
 __all__ = [

@@ -39,7 +39,7 @@ def test_an_export_comes_back_bit_for_bit_and_in_its_place(exported, stored, nam
 
 
 def test_a_bigtiff_has_the_same_grid(exported, stored, monkeypatch) -> None:
-    monkeypatch.setattr("phyradgs_cl.exporters.voxels._MOST_IMAGEJ_BYTES", 100)
+    monkeypatch.setattr("phyradgs_cl.exporters.writers._MOST_IMAGEJ_BYTES", 100)
     path = exported("v.tif")
     assert path.read_bytes()[:4] == b"II\x2b\x00"
     assert_same(path, stored)

@@ -1,4 +1,4 @@
-"""Voxels in other programs' formats: NIfTI, NRRD and MetaImage by SimpleITK, TIFF as ImageJ writes it, NumPy.
+"""Voxels as NIfTI, NRRD and MetaImage (by SimpleITK), TIFF as ImageJ writes it and NumPy; Gaussians as PLY and NumPy.
 
 The world's x, y, z are left, posterior, superior (LPS, the frame of DICOM and ITK). So the rotation axis, z, is up in every
 viewer, and a slice looks the same in viewers that know directions and in those that show row 0 at the top.
@@ -17,6 +17,9 @@ from phyradgs_cl.io.volume import Volume
 _WRITERS = {".mha": "MetaImageIO", ".nii": "NiftiImageIO", ".nii.gz": "NiftiImageIO", ".nrrd": "NrrdImageIO"}
 _MOST_NIFTI_VOXELS = 32_767  # along one axis
 _MOST_IMAGEJ_BYTES = 4_000_000_000  # ImageJ's TIFF counts in 32 bits
+_PLY_NAMES = (
+    *("x", "y", "z", "scale_0", "scale_1", "scale_2"), *("rot_0", "rot_1", "rot_2", "rot_3", "density")
+)
 
 
 def hounsfield(values: np.ndarray, mu_water_per_mm: float) -> np.ndarray:
@@ -89,3 +92,32 @@ def write_npy(path: Path, volume: Volume, unit: str) -> None:
         temporary.write_text(json.dumps(facts, indent=1) + "\n", encoding="utf-8")
     with written_beside(path) as temporary, open(temporary, "wb") as file:
         np.save(file, volume.values)  # given a name, it would add a suffix
+
+
+def gaussians_of(volume: Volume, subject: str) -> dict[str, np.ndarray]:
+    """Returns mean (G, 3) and scale (G, 3) in mm, quaternion (G, 4) w x y z, density (G,) in 1/mm; float32."""
+    if volume.gaussians is None:
+        remedy = "reconstruct with --method phyradgs or r2"
+        raise InputError(f"{subject}:/entry/gaussians", "nothing there", "Gaussians", remedy)
+    return vars(volume.gaussians)
+
+
+def write_npz(path: Path, cloud: dict[str, np.ndarray]) -> None:
+    """Writes four arrays by their names, without a pickle."""
+    with written_beside(path) as temporary, open(temporary, "wb") as file:
+        np.savez(file, **cloud)  # type: ignore[arg-type]
+
+
+def write_ply(path: Path, cloud: dict[str, np.ndarray]) -> None:
+    """Writes binary PLY with one vertex per Gaussian; comments in the header state the units."""
+    columns = [cloud["mean"], cloud["scale"], cloud["quaternion"], cloud["density"][:, None]]
+    rows = np.concatenate(columns, axis=1)
+    properties = "".join(f"property float {name}\n" for name in _PLY_NAMES)
+    head = (
+        "ply\nformat binary_little_endian 1.0\n"
+        "comment radiative Gaussians: density * exp(-1/2 d^T (R diag(scale^2) R^T)^-1 d)\n"
+        "comment x y z and scale in mm, rot quaternion w x y z, density in 1/mm; all linear\n"
+        f"element vertex {len(rows)}\n{properties}end_header\n"
+    )
+    with written_beside(path) as temporary:
+        temporary.write_bytes(head.encode("ascii") + np.ascontiguousarray(rows, "<f4").tobytes())
