@@ -227,6 +227,75 @@ def estimates() -> str:
     return markdown(["method", "estimate, s", "taken, s", "ratio", "host memory", "device buffers"], text)
 
 
+def prepared(name: str) -> str:
+    """What the steps of ``prepare`` give back: decibels that an effect costs, and the part of them that returns."""
+    lines = [line for line in lines_of(name) if "regained" in line and not line["effect"].startswith("a third")]
+    methods = [method for method in ("fdk", "fista-tv", "phyradgs") if any(line["method"] == method for line in lines)]
+    cells: dict[tuple[str, str], dict[str, dict[str, Any]]] = {}
+    for line in lines:
+        cells.setdefault((line["effect"], line["phantom"]), {})[line["method"]] = line
+    text = []
+    for (effect, phantom), by_method in cells.items():
+        shown = [_regained(by_method.get(method)) for method in methods]
+        text.append([effect, phantom.removesuffix("_128"), *shown])
+    return markdown(["effect", "volume", *methods], text)
+
+
+def _regained(line: dict[str, Any] | None) -> str:
+    """The loss in dB and the part of it that returns; the part of a loss below 0.1 dB says nothing."""
+    if line is None:
+        return ""
+    lost_db = line["clean"] - line["spoilt"]
+    return f"{lost_db:.2f}" + (f", {100 * line['regained']:.0f} %" if lost_db > 0.1 else "")
+
+
+def clean_scans() -> str:
+    """What the usual steps change in clean scans, and the part of rings that returns."""
+    text = []
+    lines = lines_of("prepare_clean.jsonl")
+    for method, views in sorted({(line["method"], line["views"]) for line in lines}):
+        cell = [line for line in lines if (line["method"], line["views"]) == (method, views)]
+        clean = [line for line in cell if "lost_db" in line]
+        changed = sum(not line["unchanged"] for line in clean)
+        rings = [[line["regained"] for line in cell if line["steps"] == f"rings {spread}"] for spread in (0.01, 0.02, 0.05)]
+        ranges = [f"{100 * min(parts):.0f} to {100 * max(parts):.0f} %" if parts else "" for parts in rings]
+        lost = f"{changed} of {len(clean)}, {max((line['lost_db'] for line in clean), default=0):.3f} dB"
+        text.append([method, str(views), str(len({line["phantom"] for line in cell})), lost, *ranges])
+    heads = ["method", "views", "volumes", "clean: changed, most lost", "rings of 1 %", "2 %", "5 %"]
+    return markdown(heads, text)
+
+
+def calibrated_parameters() -> str:
+    """The error of every estimated parameter, its stated deviation, and how often two deviations held the truth."""
+    cells: dict[tuple[Any, ...], list[dict[str, Any]]] = {}
+    for line in lines_of("calibrate.jsonl"):
+        for one in line["parameters"]:
+            if one.get("error") is not None:
+                key = (line["case"], f"{line['size']}, {line['views']}", one["name"], one["unit"])
+                cells.setdefault(key, []).append(one)
+    text = []
+    for (case, size, name, unit), found in cells.items():
+        worst = max(abs(one["error"]) for one in found)
+        inside = sum(abs(one["z"]) <= 2 for one in found)
+        sigma = mean(one["deviation"] for one in found)
+        text.append([case, size, name, f"{worst:.2g} {unit}", f"{sigma:.2g}", f"{inside} of {len(found)}"])
+    return markdown(["case", "voxels, views", "parameter", "worst error", "σ stated", "within 2 σ"], text)
+
+
+def calibrated_psnr() -> str:
+    """PSNR with the stated, the calibrated and the right geometry."""
+    cells: dict[tuple[Any, ...], list[dict[str, Any]]] = {}
+    for line in lines_of("calibrate.jsonl"):
+        if "stated" in line.get("psnr_db", {}) and not line["case"].startswith("draw"):
+            cells.setdefault((line["case"], f"{line['size']}, {line['views']}"), []).append(line["psnr_db"])
+    text = []
+    for (case, size), found in cells.items():
+        means = [f"{mean(one[key] for one in found):.2f}" for key in ("stated", "calibrated", "right")]
+        worst = min(one["calibrated"] - one["right"] for one in found)
+        text.append([case, size, *means, f"{worst:+.3f}", str(len(found))])
+    return markdown(["case", "voxels, views", "stated", "calibrated", "right", "worst difference", "runs"], text)
+
+
 TABLES: dict[str, Callable[[], str]] = {
     "table1_S_rapid": lambda: quality("table1_S.csv", "rapid"),
     "table1_S_standard": lambda: quality("table1_S.csv", "standard"),
@@ -243,6 +312,13 @@ TABLES: dict[str, Callable[[], str]] = {
     "ray_motions": ray_motions,
     "before_after": before_after,
     "estimates": estimates,
+    "prepare": lambda: prepared("prepare.jsonl"),
+    "prepare_volumes": lambda: prepared("prepare_volumes.jsonl"),
+    "prepare_fresh": lambda: prepared("prepare_fresh.jsonl"),
+    "prepare_64": lambda: prepared("prepare_64.jsonl"),
+    "prepare_clean": clean_scans,
+    "calibrated_parameters": calibrated_parameters,
+    "calibrated_psnr": calibrated_psnr,
 }
 
 
