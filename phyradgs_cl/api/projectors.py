@@ -75,12 +75,12 @@ def _rays(engine: RayOperator) -> LinearOperator:
 
 def _intensities(rt: Runtime, engine: IntensityOperator) -> Operator:
     def at(volume: Values) -> tuple[Values, Map]:
-        here, on_device = copy(engine), isinstance(volume, DeviceArray)  # the copy's derivative stays at this volume
+        own, on_device = copy(engine), isinstance(volume, DeviceArray)  # the copy's derivative stays at this volume
 
         def adjoint(frames: Values) -> Values:
-            return _in_new_memory(rt, here.adjoint, frames, engine.volume_shape)
+            return _in_new_memory(rt, own.adjoint, frames, engine.volume_shape)
 
-        expected = _in_new_memory(rt, here.expected, volume, engine.frames_shape)
+        expected = _in_new_memory(rt, own.expected, volume, engine.frames_shape)
         return expected, partial(computed, rt, on_device, adjoint)
 
     domain, frames = (_VOLUME, engine.volume_shape), (_FRAMES, engine.frames_shape)
@@ -170,7 +170,7 @@ class SplatProjection(GaussianOperator):
             engine,
             (_FRAMES, engine.frames_shape),
             frames=lambda few: SplatProjection(engine.subset(few), [chosen[f] for f in few], intensity),
-            intensity=None if intensity is None else partial(_averaging, intensity, chosen),
+            intensity=None if intensity is None else lambda: SplatProjection(intensity(chosen), chosen, None),
         )
 
     def by_poses(self, gaussians: Any, by_frames: Any) -> np.ndarray:
@@ -188,10 +188,6 @@ class SplatProjection(GaussianOperator):
             raise InputError("of_densities", "averages of intensity", "averages of line integrals, which are linear")
         linear = DensityOperator(engine, engine.rows.enter(moved_to(rt, rows, True)))
         return _densities(rt, linear, rows.shape[1], engine.frames_shape)
-
-
-def _averaging(engine: Callable[[Sequence[int]], SplatOperator], chosen: Sequence[int]) -> SplatProjection:
-    return SplatProjection(engine(chosen), chosen, None)
 
 
 def _densities(rt: Runtime, engine: DensityOperator, count: int, frames_shape: Shape) -> LinearOperator:

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
+from inspect import signature
 from pathlib import Path
 from typing import Any
 
@@ -138,23 +139,23 @@ def simulate(
     if not isinstance(phantom, str | Path):
         expected = "a name, or the path of a volume file"
         raise InputError("phantom", checks.short_repr(phantom), expected, "save_volume writes one")
-    own = ("scanner", "protocol", "size", "detector", "detector_offset_mm", "truncation", "pixel_samples", "device")
-    if unknown := sorted(set(options) - OPTION_NAMES):
-        known = [*own, *sorted(OPTION_NAMES)]
-        remedy = suggest_name(unknown[0], known, "")
-        expected = "" if remedy else f"one of {', '.join(known)}"
+    unknown = sorted(set(options) - OPTION_NAMES)
+    if unknown:
+        names = [*list(signature(simulate).parameters)[1:-1], *sorted(OPTION_NAMES)]
+        remedy = suggest_name(unknown[0], names, "")
+        expected = "" if remedy else f"one of {', '.join(names)}"
         raise InputError(f"simulate: option {unknown[0]}", "no such option", expected, remedy)
     described = scanner_for(scanner, detector, detector_offset_mm, truncation)
-    chosen = scanner_options(described, protocol, **options)
-    is_toml = str(phantom).endswith(".toml")
+    settings = scanner_options(described, protocol, **options)
     if isinstance(phantom, str) and phantom not in PHANTOMS and not Path(phantom).exists():
         expected = f"one of {', '.join(PHANTOMS)}, or a volume's file"
         remedy = suggest_name(phantom, PHANTOMS, "check the path")
         raise InputError("phantom", f"{phantom}, which is no file", expected, remedy)
-    of = str(phantom) if phantom in PHANTOMS else (load_beads(Path(phantom)) if is_toml else load_attenuation(phantom))
-    name = f"volume {phantom}"
-    rt = runtime_of(device)
-    return simulated_scan(rt, of, described, chosen, size=size, pixel_samples=pixel_samples, name=name)
+    of: Any = str(phantom)
+    if phantom not in PHANTOMS:
+        of = load_beads(Path(phantom)) if of.endswith(".toml") else load_attenuation(phantom)
+    rt, name = runtime_of(device), f"volume {phantom}"
+    return simulated_scan(rt, of, described, settings, size=size, pixel_samples=pixel_samples, name=name)
 
 
 @naming_arguments()

@@ -166,31 +166,29 @@ def _pixels(
         raise InputError("geometry", checks.short_repr(geometry), "a ConeGeometry")
     panel = geometry.detector_shape
     values = _stack("frames", frames, panel)
-    flat, dark = (
-        None if s is None else _stack(name, s, panel) for name, s in (("flats", flats), ("darks", darks))
-    )
+    flat = None if flats is None else _stack("flats", flats, panel)
+    dark = None if darks is None else _stack("darks", darks, panel)
     if quantity is not None:
         checks.one_of("quantity", quantity, QUANTITIES)
-    held = quantity or ("attenuation" if flat is None else "counts")
-    if held == "counts" and flat is None:
-        raise InputError("flats", "None beside counts", "(n, rows, columns) counts without an object")
-    if held != "counts" and not (flat is None and dark is None):
-        raise InputError(
-            "flats, darks", f"some beside {held}", "both, or flats alone, beside counts", "leave them out"
-        )
+    unit = quantity or ("attenuation" if flat is None else "counts")
+    if unit == "counts" and flat is None:
+        raise InputError("flats", "None together with counts", "(n, rows, columns) counts without an object")
+    if unit != "counts" and not (flat is None and dark is None):
+        expected = "both, or flats alone, together with counts"
+        raise InputError("flats, darks", f"some together with {unit}", expected, "leave them out")
     if quantity is None and flat is None:
         check_not_counts(values, 'give flats=, or quantity="attenuation"', mask)
         _warn_of_transmission(values)
-    found = line_integrals("frames", values, ImportOptions(), flats=flat, darks=dark, convention=held)
+    integrals = line_integrals("frames", values, ImportOptions(), flats=flat, darks=dark, custom=unit)
     if mask is None:
-        return found
-    own = np.asarray(mask) != 0
-    if own.shape not in (panel, values.shape):
-        raise InputError("mask", f"shape {own.shape}", f"{panel} or {values.shape}")
-    if own.all():
+        return integrals
+    unusable = np.asarray(mask) != 0
+    if unusable.shape not in (panel, values.shape):
+        raise InputError("mask", f"shape {unusable.shape}", f"{panel} or {values.shape}")
+    if unusable.all():
         expected = "non-zero where a pixel must not be used"
         raise InputError("mask", "every pixel masked", expected, "turn it round")
-    return replace(found, mask=own if found.mask is None else own | found.mask)
+    return replace(integrals, mask=unusable if integrals.mask is None else unusable | integrals.mask)
 
 
 def _scan(

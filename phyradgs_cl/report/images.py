@@ -151,9 +151,9 @@ def planes_of(volume: Volume, reference: Volume | None, grid: Grid, windows: Map
     layers: dict[str, Volume] = {"result": volume}
     if reference is not None and "truth" in windows:
         layers |= {"truth": reference, "difference": volume - reference}
-    kept = _kept_slices(volume.shape, len(layers))
+    counts = _slice_counts(volume.shape, len(layers))
     planes = []
-    for (name, axis, letter, right, up), count in zip(PLANES, kept, strict=True):
+    for (name, axis, letter, right, up), count in zip(PLANES, counts, strict=True):
         indices = np.unique(np.linspace(0, volume.shape[axis] - 1, count).round().astype(int)).tolist()
         place = grid.first_centre_mm[axis], grid.voxel_size_mm[axis]
         height_mm, width_mm = (side for a, side in enumerate(grid.size_mm) if a != axis)
@@ -174,10 +174,10 @@ def stills_of(planes: Sequence[Plane], volume: Volume, window: tuple[float, floa
     return [replace(plane, layers={}, still=still) for plane, still in zip(planes, pictures, strict=True)]
 
 
-def _kept_slices(shape: tuple[int, ...], layers: int) -> list[int]:
+def _slice_counts(shape: tuple[int, ...], layers: int) -> list[int]:
     """Returns the number of slices along every axis: all, or what the budget allows."""
-    seen = [min(n, LONGEST_EDGE) for n in shape]
-    pixels = [int(np.prod(seen)) // seen[axis] for axis in range(3)]
+    edges = [min(n, LONGEST_EDGE) for n in shape]
+    pixels = [int(np.prod(edges)) // edges[axis] for axis in range(3)]
     most = max(1, BUDGET_PIXELS // (layers * sum(pixels)))
     return [min(n, most) for n in shape]
 

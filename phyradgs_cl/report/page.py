@@ -69,13 +69,13 @@ def report_page(run: Run, views: Sequence[FramePair] = (), changes: Sequence[Cha
         **of_scan,
         "provenance": sections.provenance_section(run),
     }
-    there = {name: part for name, part in parts.items() if part is not None}
-    links = [element("a", name.capitalize(), href=f"#{name}") for name in there]
+    shown = {name: part for name, part in parts.items() if part is not None}
+    links = [element("a", name.capitalize(), href=f"#{name}") for name in shown]
     skip = element("a", "To the content", href="#slices", class_="skip")
     body = joined(
         skip,
         element("header", *_top(run), element("nav", *links, aria_label="Sections")),
-        element("main", *_in_pairs(there)),
+        element("main", *_arranged(shown)),
         element("footer", f"Written by phyradgs-cl {__version__} from {run.path.name}."),
     )
     title = f"{run.path.name} – {run.stored.provenance.get('method', 'volume')}"
@@ -83,12 +83,12 @@ def report_page(run: Run, views: Sequence[FramePair] = (), changes: Sequence[Cha
     return "<!doctype html>\n" + element("html", _head(title), page, lang="en") + "\n"
 
 
-def _in_pairs(there: dict[str, Markup]) -> list[Markup]:
+def _arranged(shown: dict[str, Markup]) -> list[Markup]:
     """Returns the sections; metrics and convergence are side by side where there is room."""
-    narrow = [part for name in ("metrics", "convergence") if (part := there.get(name)) is not None]
+    narrow = [part for name, part in shown.items() if name in ("metrics", "convergence")]
+    wide = [part for name, part in shown.items() if name not in ("metrics", "convergence")]
     pair = element("div", *narrow, class_="pair") if narrow else Markup()
-    rest = {name: part for name, part in there.items() if name not in ("metrics", "convergence")}
-    return [rest.pop("slices"), pair, *rest.values()]
+    return [wide[0], pair, *wide[1:]]
 
 
 def _head(title: str) -> Markup:

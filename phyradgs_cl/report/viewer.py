@@ -112,8 +112,8 @@ def _choice(layers: list[str]) -> Markup:
 
 def _plane_data(plane: Plane) -> dict[str, object]:
     places = [_place(plane, k) for k in range(len(plane.indices))]
-    kept = ("axis", "right", "up", "count", "indices", "first_mm", "step_mm", "layers")
-    facts = {name: getattr(plane, name) for name in kept}
+    names = ("axis", "right", "up", "count", "indices", "first_mm", "step_mm", "layers")
+    facts = {name: getattr(plane, name) for name in names}
     return {**facts, "width_mm": plane.size_mm[0], "decimals": _decimals(plane.step_mm) + 1, "places": places}
 
 

@@ -109,7 +109,7 @@ class Arrivals:
     """Finds the complete scans of a folder.
 
     A file is complete when its size and times have not changed for ``settle_s``. A file that was renamed into place, or
-    copied with its times kept, is complete at once: its last change (ctime) is later than its last byte (mtime), both
+    copied with its times, is complete at once: its last change (ctime) is later than its last byte (mtime), both
     by the clock of the file server.
     """
 
@@ -207,7 +207,7 @@ class _Watch:
             if work.exists() and not checkpoint_path(work).exists():
                 self._publish(arrival)
             raise
-        except (DeviceError, OutputError):  # the next scan would fail alike
+        except (DeviceError, OutputError):  # the next scan would fail too
             raise
         except (PhyradgsError, MemoryError) as error:
             return self._fail(arrival, error)

@@ -95,11 +95,11 @@ def comma_separated(lines: Sequence[Line]) -> str:
 
 
 def _mean(values: Sequence[Any], form: str) -> str:
-    known = [float(value) for value in values if value is not None]
-    if not known:
+    numbers = [float(value) for value in values if value is not None]
+    if not numbers:
         return "–"
-    mean = format(np.mean(known), form)
-    return f"{mean} ± {np.std(known, ddof=1):{form}}" if len(known) > 1 else mean
+    mean = format(np.mean(numbers), form)
+    return f"{mean} ± {np.std(numbers, ddof=1):{form}}" if len(numbers) > 1 else mean
 
 
 def _cell(text: str) -> str:
