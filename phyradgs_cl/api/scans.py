@@ -179,7 +179,7 @@ def _pixels(
     if quantity is None and flat is None:
         check_not_counts(values, 'give flats=, or quantity="attenuation"', mask)
         _warn_of_transmission(values)
-    integrals = line_integrals("frames", values, ImportOptions(), flats=flat, darks=dark, custom=unit)
+    integrals = line_integrals("frames", values, ImportOptions(), flats=flat, darks=dark, convention=unit)
     if mask is None:
         return integrals
     unusable = np.asarray(mask) != 0
