@@ -1,12 +1,11 @@
-"""Operators between fields and frames: splat, voxelise, rays, and FDK's backprojection.
+"""Operators between fields and frames: splats, voxels of splats, rays, and FDK's backprojection.
 
-Each knows its domain, its range and its transpose, and no algorithm.
+An operator knows its domain, its range and its transpose. It knows no algorithm.
 """
 
 from phyradgs_cl.operators.backproject import backproject, backproject_lines
 from phyradgs_cl.operators.rays.intensity import IntensityOperator
 from phyradgs_cl.operators.rays.operator import LinearOperator, RayOperator
-from phyradgs_cl.operators.rays.projector import RayProjector
 from phyradgs_cl.operators.splats.layout import DeviceCells, DeviceGaussians
 from phyradgs_cl.operators.splats.operator import DensityOperator, SplatOperator, VoxelOperator
 from phyradgs_cl.operators.splats.projector import DEFAULT_CUTOFF_SIGMA, SplatProjector
@@ -20,7 +19,6 @@ __all__ = [
     "IntensityOperator",
     "LinearOperator",
     "RayOperator",
-    "RayProjector",
     "SplatOperator",
     "SplatProjector",
     "VoxelOperator",

@@ -13,9 +13,11 @@ from phyradgs_cl.detector import average
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.io import Volume
-from phyradgs_cl.operators import RayProjector
+from phyradgs_cl.operators import RayOperator
+from phyradgs_cl.operators.rays.layout import RayLayout
+from phyradgs_cl.operators.rays.memory import RayMemory
 from phyradgs_cl.phantoms import EllipsoidPhantom, make_phantom
-from phyradgs_cl.runtime import Runtime
+from phyradgs_cl.runtime import DeviceArray, MemoryShortage, Runtime
 
 _DENSE = 0.5  # of the largest attenuation: denser voxels may be bone in a beam of many energies
 _RARE = 0.2  # of the most common attenuation's voxels: a more common one is a material that no threshold may divide
@@ -32,15 +34,27 @@ class VolumeSource:
     """Frames of a voxel volume (z, y, x) in 1/mm by the ray-driven projector."""
 
     def __init__(self, rt: Runtime, volume: np.ndarray, grid: Grid, geometry: ConeGeometry, axis: str) -> None:
-        self._projector = RayProjector(rt, grid, geometry.detector_shape, axis)
+        self._rt, self._grid, self._detector_shape = rt, grid, geometry.detector_shape
+        self._memory = RayMemory(rt, RayLayout.of_scan(grid, geometry.detector_shape, axis), 1)
         self._volume = volume
         self._factor: float | None = None
 
     def frame(self, cells: TimeCells, model: str, factor: float) -> np.ndarray:
         if factor != self._factor:
-            self._on_device = self._projector.upload_volume(self._volume * np.float32(factor))
+            self._scaled = self._where_it_fits((self._volume * np.float32(factor)).astype(np.float32))
             self._factor = factor
-        return self._projector.forward(self._on_device, cells, model)
+        operator = RayOperator(self._rt, self._grid, self._detector_shape, [cells], memory=self._memory)
+        frames = operator.project(self._scaled, model)
+        return (self._rt.download(frames) if isinstance(frames, DeviceArray) else frames)[0]
+
+    def _where_it_fits(self, volume: np.ndarray) -> np.ndarray | DeviceArray:
+        """On the device, beside the operator's padded copy; on the host where the device has no room for both."""
+        if not self._rt.room().holds(volume.nbytes, 4 * self._memory.layout.volume_floats):
+            return volume
+        try:
+            return self._rt.upload(volume)
+        except MemoryShortage:  # the operator says so, and projects in bricks
+            return volume
 
 
 class AnalyticSource:

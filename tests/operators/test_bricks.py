@@ -14,7 +14,6 @@ from phyradgs_cl.errors import OutOfMemoryError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.operators import (
     RayOperator,
-    RayProjector,
     Voxeliser,
     backproject,
     backproject_lines,
@@ -80,21 +79,15 @@ def test_rays(any_rt, motion, axis, nbytes) -> None:
         assert expected["correction"].max() > 1e-4
 
 
-def test_a_projector_of_frames(any_rt, monkeypatch) -> None:
-    """What a simulation uses; 64-bit indices change nothing in bricks either."""
-    table, volume = tables("per line", SHAPE, frames=1)[0], noise(TALL.shape, 93)
-    projector = RayProjector(any_rt, TALL, SHAPE)
-    on_device = projector.upload_volume(volume)
-    expected = [projector.forward(on_device, table, model) for model in ("log", "intensity")]
-    back = projector.backproject(expected[0], table)
-    small = RayProjector(any_rt, TALL, SHAPE)
+def test_indices_of_64_bits_change_nothing_in_bricks(any_rt, monkeypatch) -> None:
+    cells, x = tables("per line", SHAPE, frames=1), noise(TALL.shape, 93)
+    expected = RayOperator(any_rt, TALL, SHAPE, cells).forward(x)
+    back = RayOperator(any_rt, TALL, SHAPE, cells).adjoint(expected)
     monkeypatch.setattr(rays, "_LONG_FROM", 0)
     with room_for(any_rt, Z_AND_Y + 120_000):
-        held = small.upload_volume(volume)
-        assert isinstance(held, np.ndarray)
-        for model, image in zip(("log", "intensity"), expected, strict=True):
-            assert np.abs(small.forward(held, table, model) - image).max() <= 2 * BRICKS * image.max()
-        assert_near(small.backproject(expected[0], table), back, BRICKS)
+        long = RayOperator(any_rt, TALL, SHAPE, cells)
+        assert np.abs(long.forward(x) - expected).max() <= 2 * BRICKS * expected.max()
+        assert_near(long.adjoint(expected), back, BRICKS)
 
 
 @pytest.mark.parametrize(

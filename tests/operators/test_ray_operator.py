@@ -12,7 +12,7 @@ from tolerances import ADJOINT, FLOAT32, RAYS, RAYS_BACK
 from phyradgs_cl.acquisition.time_cells import TimeCells
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
-from phyradgs_cl.operators import LinearOperator, RayOperator, RayProjector
+from phyradgs_cl.operators import LinearOperator, RayOperator
 from phyradgs_cl.operators.rays import launches as rays
 from phyradgs_cl.operators.twins.rays import ray_frame, ray_volume
 from phyradgs_cl.runtime import Runtime
@@ -142,9 +142,9 @@ def test_a_gpus_launches_of_bounded_length_have_the_bits_of_one(monkeypatch) -> 
 
 def test_one_launch_is_the_frames_one_by_one_and_bits_repeat(any_rt) -> None:
     cells, x = tables("micro-views", frames=4), noise(GRID.shape, 78)
-    projector, operator = RayProjector(any_rt, GRID, SHAPE), RayOperator(any_rt, GRID, SHAPE, cells)
-    on_device, y = projector.upload_volume(x), noise(operator.frames_shape, 80)
-    singles = np.stack([projector.forward(on_device, table) for table in cells])
+    operator = RayOperator(any_rt, GRID, SHAPE, cells)
+    y = noise(operator.frames_shape, 80)
+    singles = np.concatenate([RayOperator(any_rt, GRID, SHAPE, [table]).forward(x) for table in cells])
     for _ in range(2):
         np.testing.assert_array_equal(operator.forward(x), singles)
     np.testing.assert_array_equal(operator.adjoint(y), operator.adjoint(y))

@@ -10,7 +10,6 @@ from tolerances import (
     DISCRETISATION_GAUSSIANS,
     DISCRETISATION_ORDER,
     DISCRETISATION_SHEPP_LOGAN,
-    FLOAT32,
     FLOAT64,
     RAYS,
     RAYS_BACK,
@@ -18,9 +17,8 @@ from tolerances import (
 
 from phyradgs_cl.acquisition import pixel_centres
 from phyradgs_cl.acquisition.time_cells import TimeCells
-from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
-from phyradgs_cl.operators import RayProjector, voxelise
+from phyradgs_cl.operators import RayOperator, voxelise
 from phyradgs_cl.operators.twins.rays import joseph_adjoint, joseph_image
 from phyradgs_cl.operators.twins.splat import splat_image
 from phyradgs_cl.phantoms import Ellipsoid, EllipsoidPhantom, rotation_about_z, shepp_logan
@@ -29,8 +27,7 @@ GRID = Grid((9, 14, 11), (0.21, 0.13, 0.16), (0.1, -0.05, 0.2))
 
 
 def project(rt, volume: np.ndarray, grid: Grid, table: TimeCells, shape: tuple[int, int]) -> np.ndarray:
-    projector = RayProjector(rt, grid, shape, table.axis)
-    return projector.forward(projector.upload_volume(volume), table)
+    return RayOperator(rt, grid, shape, [table]).forward(volume)[0]
 
 
 @pytest.mark.parametrize("shape", [(13, 18), (17, 5), (1, 1), (1, 20), (31, 27)])
@@ -40,7 +37,7 @@ def test_static_projection_and_backprojection_are_josephs(any_rt, one_cell, make
         pose = make_geometry(*shape, offset=(0.1, -0.1)).pose(angle)
         table, expected = one_cell(pose, shape[0]), joseph_image(volume, GRID, pose, shape)
         assert_near(project(any_rt, volume, GRID, table, shape), expected, RAYS, max(expected.max(), 1))
-        back = RayProjector(any_rt, GRID, shape).backproject(frame, table)
+        back = RayOperator(any_rt, GRID, shape, [table]).adjoint(frame[None])
         assert_near(back, joseph_adjoint(frame, GRID, pose), RAYS_BACK)
 
 
@@ -48,7 +45,7 @@ def test_adjoint_in_every_build(any_rt) -> None:
     (table,) = tables("micro-views", SHAPE, "columns", -1, frames=1)
     x, y = noise(GRID.shape, 54), noise(SHAPE, 55)
     forward = float((project(any_rt, x, GRID, table, SHAPE).astype(np.float64) * y).sum())
-    back = RayProjector(any_rt, GRID, SHAPE, "columns").backproject(y, table)
+    back = RayOperator(any_rt, GRID, SHAPE, [table]).adjoint(y[None])
     backward = float((x.astype(np.float64) * back).sum())
     assert forward > 0 and abs(forward - backward) <= ADJOINT * forward
 
@@ -57,18 +54,6 @@ def test_twins_are_adjoint(make_geometry) -> None:
     x, y, pose = noise(GRID.shape, 61), noise(SHAPE, 62), make_geometry(*SHAPE).pose(0.7)
     forward = (joseph_image(x, GRID, pose, SHAPE) * y).sum()
     assert abs((joseph_adjoint(y, GRID, pose) * x).sum() - forward) <= FLOAT64 * forward
-
-
-def test_adjoint_adds_where_it_is_told(rt) -> None:
-    projector, y = RayProjector(rt, GRID, SHAPE), noise(SHAPE, 56)
-    (table,) = tables("static", frames=1)
-    volume = projector.upload_volume(np.zeros(GRID.shape))
-    projector.adjoint(y, table, volume)
-    projector.adjoint(y, table, volume, add=True)
-    twice = rt.download(volume)
-    projector.adjoint(2 * y, table, volume)
-    np.testing.assert_allclose(twice, rt.download(volume), rtol=FLOAT32)
-    assert twice.max() > 0
 
 
 def test_voxelised_gaussians_project_like_splats(rt, one_cell, make_cloud, make_geometry) -> None:
@@ -107,15 +92,3 @@ def test_phantoms_project_like_their_closed_form(rt, one_cell, make_geometry, ph
         errors.append(np.linalg.norm(image - exact) / np.linalg.norm(exact))
     assert errors[1] <= tolerance
     assert errors[1] <= 0.65 * errors[0]
-
-
-def test_cells_of_another_panel_are_refused(rt) -> None:
-    """They would be read past their ends."""
-    grid, shape = Grid.cube(4, 2.0), (3, 9)
-    projector = RayProjector(rt, grid, shape, "rows")
-    volume = projector.upload_volume(np.ones(grid.shape, np.float32))
-    (table,) = tables("per line", shape, "columns", frames=1)
-    with pytest.raises(InputError, match="9 lines along columns"):
-        projector.forward(volume, table)
-    with pytest.raises(InputError, match="time cells"):
-        projector.adjoint(np.ones(shape, np.float32), table, volume)

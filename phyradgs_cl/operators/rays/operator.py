@@ -67,8 +67,9 @@ class RayOperator:
         self.volume_shape = grid.shape
         self._readout = tables[0].readout
         layout = RayLayout.of_scan(grid, detector_shape, self._readout.axis)
-        # a GPU's work-items are pixels, whose loads the general kernel has side by side
-        self._upright = None if rt.pixel_items else upright_of(grid, tables, detector_shape, rt.lanes)
+        # On a GPU work-items are pixels: the general kernel reads neighbouring addresses there.
+        may_use_slots = not rt.pixel_items and (memory is None or memory.slot_floats > 0)
+        self._upright = upright_of(grid, tables, detector_shape, rt.lanes) if may_use_slots else None
         self._poses: UprightPoses | None = None
         self.slot_floats = 0
         if self._upright is not None:
