@@ -26,7 +26,8 @@ from phyradgs_cl.fields import Grid
 from phyradgs_cl.metrics import compare
 from phyradgs_cl.reconstructors import RunPlan, method_options, reconstruct
 from phyradgs_cl.reconstructors.fdk import static_fdk
-from phyradgs_cl.reconstructors.splats.method import SplatRun, first_population, internal_scale
+from phyradgs_cl.reconstructors.splats.run import SplatRun
+from phyradgs_cl.reconstructors.splats.start import first_population, internal_scale
 from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.simulation import SimulationOptions, phantom_scene, simulate
 

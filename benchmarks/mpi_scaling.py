@@ -35,7 +35,7 @@ from phyradgs_cl.optim import DensityControl
 from phyradgs_cl.parallel import launched_ranks
 from phyradgs_cl.phantoms import shepp_logan
 from phyradgs_cl.reconstructors.fdk import static_fdk
-from phyradgs_cl.reconstructors.splats import ranks as splat_ranks
+from phyradgs_cl.reconstructors.splats import step as splat_step
 from phyradgs_cl.reconstructors.splats.options import SplatOptions
 from phyradgs_cl.reconstructors.splats.run import SplatRun
 from phyradgs_cl.reconstructors.splats.start import first_population, internal_scale
@@ -121,13 +121,13 @@ class Clock:
 def measure(run: SplatRun, steps: int) -> tuple[np.ndarray, int]:
     """(steps, parts) milliseconds of this rank, and bytes that it hands over in a step."""
     ranks, clock = run.rt.ranks, Clock(run.rt)
-    summing = clock.part(splat_ranks.exact_sum, "summing")
+    summing = clock.part(splat_step.exact_sum, "summing")
 
     def together(*arguments: object) -> np.ndarray:
         clock.wait()
         return summing(*arguments)
 
-    splat_ranks.exact_sum = together  # type: ignore[assignment]
+    splat_step.exact_sum = together  # type: ignore[assignment]
     for name in ("allreduce_sum", "allreduce_max"):
         setattr(ranks, name, clock.part(getattr(ranks, name), "sending"))
     rows = [clock.step(run) for _ in range(WARM)]

@@ -19,8 +19,9 @@ from phyradgs_cl.acquisition import ConeGeometry, MicroViews, Scan, Static, make
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.operators import DeviceCells, DeviceGaussians, SplatProjector
 from phyradgs_cl.reconstructors.fdk import static_fdk
-from phyradgs_cl.reconstructors.splats.method import SplatRun, first_population, internal_scale
 from phyradgs_cl.reconstructors.splats.options import SplatOptions
+from phyradgs_cl.reconstructors.splats.run import SplatRun
+from phyradgs_cl.reconstructors.splats.start import first_population, internal_scale
 from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.runtime.layout import pad_rows
 from phyradgs_cl.simulation import SimulationOptions, phantom_scene, simulate

@@ -31,7 +31,7 @@ from phyradgs_cl.acquisition.time_cells import TimeCells
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.operators import DeviceCells, DeviceGaussians, SplatProjector
 from phyradgs_cl.operators.twins.splat import precision_matrices
-from phyradgs_cl.reconstructors.splats.initial_cloud import initial_cloud
+from phyradgs_cl.reconstructors.splats.start import initial_cloud
 from phyradgs_cl.runtime import DeviceArray, Runtime
 from phyradgs_cl.runtime.layout import pad_rows
 from phyradgs_cl.simulation import phantom_scene

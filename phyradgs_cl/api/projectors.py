@@ -33,7 +33,7 @@ from phyradgs_cl.operators import (
 )
 from phyradgs_cl.operators import voxelise as voxelise_rows
 from phyradgs_cl.operators.splats.projector import DEFAULT_TIME_ERROR
-from phyradgs_cl.reconstructors.splats.frames import tables_of
+from phyradgs_cl.reconstructors.splats.device import tables_of
 from phyradgs_cl.reconstructors.splats.method import first_cloud
 from phyradgs_cl.reconstructors.splats.options import SplatOptions
 from phyradgs_cl.runtime import DeviceArray, Runtime

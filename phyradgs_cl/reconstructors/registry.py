@@ -39,8 +39,8 @@ class _Methods(MutableMapping[str, Method]):
 
 DEFAULT_METHOD = "fista"
 METHODS = _Methods({
-    "phyradgs": "splats.phyradgs",
-    "r2": "splats.r2",
+    "phyradgs": "splats.method:PHYRADGS",
+    "r2": "splats.method:R2",
     "sart": "voxels.sart",
     "os-sart": "voxels.sart:OS_METHOD",
     "sirt": "voxels.sirt",

@@ -1,11 +1,17 @@
-"""The engine under ``phyradgs`` and ``r2``: radiative Gaussians optimised against a scan's frames.
+"""The splatting methods ``phyradgs`` and ``r2``: radiative Gaussians that are optimised against a scan's frames.
 
-The one place where scan, operators, objective and optimiser meet. Inside, lengths are divided by half the
-volume's longest side and densities by a reference (FDK's 99.9th percentile), so that rates, thresholds and SSIM's
-constants mean the same for every scan; both are undone on the way out.
+phyradgs is the paper's method, exact splats that follow the gantry's motion; with a static motion it is the paper's
+"w/o ST". r2 is R2-Gaussian (Zha et al. 2024): affine splats with its published constants, static by default; micro-views
+make it the paper's "R2 w/ ST".
+
+Inside, lengths are divided by half the volume's longest side and densities by a reference (FDK's 99.9th percentile), so that
+rates, thresholds and SSIM's constants hold for every scan.
 """
 
 import time
+from dataclasses import replace
+from functools import partial
+from typing import Any
 
 import numpy as np
 
@@ -15,6 +21,7 @@ from phyradgs_cl.operators.splats.work import Work
 from phyradgs_cl.optim import Population
 from phyradgs_cl.reconstructors.fdk import static_fdk
 from phyradgs_cl.reconstructors.loop import Loop
+from phyradgs_cl.reconstructors.method import Method
 from phyradgs_cl.reconstructors.result import (
     ProgressReport,
     Reconstruction,
@@ -22,8 +29,8 @@ from phyradgs_cl.reconstructors.result import (
     ignore_progress,
     option_facts,
 )
-from phyradgs_cl.reconstructors.splats.frames import Scale
-from phyradgs_cl.reconstructors.splats.options import SplatOptions
+from phyradgs_cl.reconstructors.splats.device import Scale
+from phyradgs_cl.reconstructors.splats.options import PRESETS, R2_PUBLISHED, SplatOptions
 from phyradgs_cl.reconstructors.splats.run import SplatRun
 from phyradgs_cl.reconstructors.splats.start import first_population, internal_scale
 from phyradgs_cl.runtime import Runtime
@@ -32,7 +39,7 @@ REPORT_EVERY, LEAST_RECORDED = 50, 20
 
 
 def record_interval(iterations: int) -> int:
-    """Iterations from line to line of the record: as for reports, but fewer in short runs, to show how they went."""
+    """Returns the iterations per line of the record: as for reports, but fewer in short runs, to show their course."""
     return max(1, min(REPORT_EVERY, iterations // LEAST_RECORDED))
 
 
@@ -47,13 +54,13 @@ def reconstruct_splats(
     resume: State | None = None,
     initial: np.ndarray | None = None,
 ) -> Reconstruction:
-    """Runs a splatting method, called ``phyradgs`` or ``r2``.
+    """Runs a splatting method under its name ``phyradgs`` or ``r2``.
 
-    ``resume`` continues an interrupted run of the same scan and options from its state; ``initial`` (nz, ny, nx) in 1/mm
-    is what the cloud is drawn from in place of an FDK volume.
+    ``resume`` continues an interrupted run of the same scan and options from its state. The cloud is drawn from ``initial``
+    (nz, ny, nx) in 1/mm, or else from an FDK volume.
     """
     started = time.perf_counter()
-    # a volume that one rank alone has on its host
+    # rank 0 alone makes the first volume
     scale, population, rng = rt.ranks.bcast(first_cloud(rt, scan, options, seed, initial) if rt.ranks.rank == 0 else None)
     first_count = population.count
     run = SplatRun(rt, scan, options, scale, population, rng)
@@ -89,7 +96,7 @@ def reconstruct_splats(
 def first_cloud(
     rt: Runtime, scan: Scan, options: SplatOptions, seed: int, initial: np.ndarray | None = None
 ) -> tuple[Scale, Population, np.random.Generator]:
-    """Internal units, the first cloud, and the generator that drew it, all from an ``initial`` volume, or FDK's."""
+    """Returns internal units, the first cloud, and the generator that drew it, from an ``initial`` volume or FDK's."""
     first = static_fdk(rt, scan) if initial is None else initial
     scale = internal_scale(first, scan.grid)
     rng = np.random.default_rng(seed)
@@ -98,17 +105,24 @@ def first_cloud(
 
 
 def time_facts(run: SplatRun) -> dict[str, object]:
-    """How the motion ``exact`` averaged over time: the largest K of a frame, and the share of pairs by rule."""
+    """Returns how the motion ``exact`` averaged over time: a frame's largest K, and the share of pairs by rule."""
     return {"segments": run.frames.most_cells, "time_rules": _first_frame_work(run).rule_shares()}
 
 
 def evaluated_pairs(run: SplatRun) -> dict[str, int]:
-    """Gaussian–pixel pairs that a launch evaluates, of the last cloud in the first frame, by kernel."""
-    evaluated = _first_frame_work(run).evaluated
-    return dict.fromkeys(PAIR_KERNELS, evaluated)
+    """Returns the Gaussian–pixel pairs that each kernel evaluates for the last cloud in the first frame."""
+    return dict.fromkeys(PAIR_KERNELS, _first_frame_work(run).evaluated)
 
 
 def _first_frame_work(run: SplatRun) -> Work:
     gaussians, cells, projector = run.cloud.gaussians, run.frames.cells(0), run.frame_step.projector
     run.cloud.activate(run.adam)
     return projector.work(gaussians, cells)
+
+
+def _r2(scan: Scan, options: SplatOptions, rt: Runtime, **arguments: Any) -> Reconstruction:
+    return reconstruct_splats(scan, replace(options, affine=True), rt, method="r2", **arguments)
+
+
+PHYRADGS = Method(partial(reconstruct_splats, method="phyradgs"), PRESETS, is_shared=True, takes_initial=True)
+R2 = Method(_r2, {"published": R2_PUBLISHED}, is_shared=True, takes_initial=True)

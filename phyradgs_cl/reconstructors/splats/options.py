@@ -1,4 +1,4 @@
-"""Options of the splatting methods, and the named presets: ours, the paper's, the released code's."""
+"""Options of the splatting methods, and their presets: ours, the paper's, the released code's."""
 
 from dataclasses import dataclass, replace
 from typing import ClassVar
@@ -37,15 +37,15 @@ _RANGES = {
 
 @dataclass(frozen=True, repr=False)
 class SplatOptions:
-    """Everything that a splatting run can be told; lengths in half-sides of the volume, densities relative.
+    """Options of a splatting run; lengths in half-sides of the volume, densities relative to FDK's 99.9th percentile.
 
-    gaussians: size of the first cloud; 0 chooses it from the grid. Weights are Eq. 4's λ; ``tv_edge`` is the
-    edge of the random sub-volume in voxels. ``scale_min_voxels`` > 0 raises the smallest scale to that share
-    of a voxel. ``detector_model``: what is averaged over a line's times, line integrals (log) or intensity, or
-    what the scan says. ``pixel_footprint`` lets pixels average over their area.
+    gaussians: size of the first cloud; 0 chooses it from the grid. Weights are Eq. 4's λ. tv_edge: edge of the random
+    sub-volume in voxels. scale_min_voxels: raises the smallest scale to this share of a voxel. detector_model: what quantity
+    the detector averages over a line's times, line integrals (log) or intensity, or the model that the scan states (scan).
+    pixel_footprint: pixels average over their area.
 
-    ``iterations`` counts frames: a step of Adam is taken every ``batch`` of them (0: as many as there are ranks), with
-    rates × √batch. The same batch gives the same bits on any number of ranks (docs/cluster.md).
+    iterations: frames, with a step of Adam every ``batch`` of them (0: as many as there are ranks) at rates × √batch. The
+    same batch gives the same bits on any number of ranks (docs/cluster.md).
     """
 
     MOTIONS: ClassVar[tuple[Motion, ...]] = motions_for(SPLATS)
@@ -90,26 +90,26 @@ class SplatOptions:
         check_motion(self.motion, self.MOTIONS)
 
     def activation(self, grid: Grid) -> Activation:
-        """Bounds of the scales on ``grid`` (in internal units)."""
+        """Returns the bounds of the scales on ``grid`` (in internal units)."""
         smallest = max(self.scale_min, self.scale_min_voxels * min(grid.voxel_size_mm))
         return Activation(smallest, max(self.scale_max, 2 * smallest))
 
     def gaussians_for(self, grid: Grid) -> int:
-        """Size of the first cloud: as asked, else a share of the voxels that grows with their number."""
+        """Returns the size of the first cloud: the option, or one sixteenth of the voxels within 1,000 to 50,000."""
         if self.gaussians:
             return self.gaussians
         voxels = grid.shape[0] * grid.shape[1] * grid.shape[2]
         return int(min(max(voxels / 16, 1000), 50_000))
 
     def batch_for(self, frames: int, ranks: int) -> int:
-        """Frames per step: as asked, else one for every rank, none twice."""
+        """Returns the frames per step: the option, or one for every rank."""
         if self.batch > frames:
             raise InputError("--batch", str(self.batch), f"no more than the scan's {frames} frames")
         return self.batch or min(ranks, frames)
 
     @property
     def asks_for_gaussians(self) -> bool:
-        """Whether the size of the first cloud is somebody's own wish and not a preset's."""
+        """Whether the user chose the size of the first cloud: it is no preset's."""
         return self.gaussians not in {0, *(preset.gaussians for preset in (*PRESETS.values(), R2_PUBLISHED))}
 
 
@@ -122,7 +122,7 @@ _PAPER = SplatOptions(
     control=PUBLISHED_CONTROL,
 )
 _RELEASED = replace(_PAPER, ssim_weight=0.25, tv_weight=0.05, density_weight=0.01, shape_weight=0.02)
-# a sixth of the iterations with everything at the same share of them, and two or three segments per frame
+# a sixth of the iterations, the schedule scaled with them, and two or three segments per frame
 _QUICK = SplatOptions(
     motion=Exact(time_error=0.02),
     iterations=500,

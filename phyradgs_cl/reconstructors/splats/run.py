@@ -1,4 +1,4 @@
-"""One optimisation of radiative Gaussians: everything that changes from step to step."""
+"""One optimisation of radiative Gaussians: its state, which changes from step to step."""
 
 import json
 import time
@@ -6,23 +6,22 @@ import time
 import numpy as np
 
 from phyradgs_cl.acquisition import Scan
+from phyradgs_cl.checks import ceil_div
 from phyradgs_cl.fields import Gaussians, Grid
 from phyradgs_cl.fields.gaussians import SCALE
 from phyradgs_cl.operators import voxelise
 from phyradgs_cl.optim import Population, control_density
 from phyradgs_cl.reconstructors.checkpoint import check_cloud, count_of, restore_generator
 from phyradgs_cl.reconstructors.result import State, state_arrays
-from phyradgs_cl.reconstructors.splats.cloud import DeviceCloud
-from phyradgs_cl.reconstructors.splats.frames import Scale
+from phyradgs_cl.reconstructors.splats.device import DeviceCloud, Scale
 from phyradgs_cl.reconstructors.splats.options import SplatOptions
-from phyradgs_cl.reconstructors.splats.ranks import sharing_of
 from phyradgs_cl.reconstructors.splats.start import box_of
-from phyradgs_cl.reconstructors.splats.step import Batch, FrameStep
+from phyradgs_cl.reconstructors.splats.step import Batch, FrameStep, sharing_of
 from phyradgs_cl.runtime import Runtime
 
 
 class SplatRun:
-    """The state of one optimisation, ``Stepwise`` for the loop: the same on every rank."""
+    """The state of one optimisation, the same on every rank, as the ``Stepwise`` that a ``Loop`` runs."""
 
     quantity, remedy, finished = "loss", "check the scan for extreme values", None
 
@@ -48,20 +47,20 @@ class SplatRun:
         self.cloud = DeviceCloud(rt, population)
 
     def step(self) -> None:
-        """One batch of frames: gradient, move, and now and then density control."""
+        """Does one batch of frames: gradient, move, and density control where it is due."""
         options, before = self.options, self.iteration
         batch = self.next_batch()
         self.cloud.activate(self.adam)
         self.sharing.differentiate(self.frame_step, self.cloud, batch)
         rates = options.rates.at(before / max(options.iterations, 1)) * np.sqrt(len(batch.frames))
         self.iteration += len(batch.frames)
-        self.cloud.move(self.adam, rates, -(-self.iteration // self.batch))
+        self.cloud.move(self.adam, rates, ceil_div(self.iteration, self.batch))
         passed = range(before + 1, self.iteration + 1)
         if any(options.control.is_due(iteration, options.iterations) for iteration in passed):
             self.control_density()
 
     def next_batch(self) -> Batch:
-        """Frames in random order, each once per pass."""
+        """Draws the frames of a step in random order, each once per pass."""
         frames = []
         for _ in range(min(self.batch, max(self.iterations - self.iteration, 1))):
             if not self._queue:
@@ -71,30 +70,25 @@ class SplatRun:
         return Batch(frames, corners, late=self.iteration >= self.options.parameter_terms_from)
 
     def measures(self) -> dict[str, float]:
-        """Mean loss of the last batch, and how many Gaussians there are."""
+        """Returns the mean loss of the last batch, and the number of Gaussians."""
         return {"loss": self.sharing.loss(self.frame_step), "gaussians": self.cloud.count}
 
     def control_density(self) -> None:
-        """One round of density control."""
+        """Does one round of density control."""
         sums = self.cloud.read_statistics().astype(np.float64)
-        begun = time.perf_counter()  # the statistics were the last to come: the device has nothing left to do
+        begun = time.perf_counter()  # the download has waited for the device
         statistic = sums[0] / np.maximum(sums[1], 1)
         population, box = self.cloud.population(), box_of(self.grid)
-        grown = control_density(
-            population, statistic, self.activation, self.options.control, box, self.rng
-        )
-        self._load(grown)
+        self._load(control_density(population, statistic, self.activation, self.options.control, box, self.rng))
         self.control_seconds += time.perf_counter() - begun
         self.control_rounds += 1
 
     def _load(self, population: Population) -> None:
-        del self.cloud  # the old goes before the new comes
+        del self.cloud  # free the old arrays before the new ones are allocated
         self.cloud = DeviceCloud(self.rt, population)
 
-    # --- stop and go on ---------------------------------------------------------------------------------
-
     def state(self) -> dict[str, np.ndarray]:
-        """Everything that the next step depends on."""
+        """Returns the arrays that the next step depends on."""
         population = self.cloud.population()
         return {
             "raw": population.raw,
@@ -107,7 +101,7 @@ class SplatRun:
         }
 
     def restore(self, state: State) -> None:
-        """The inverse of ``state``, on any number of ranks up to the batch: raw (11, G), moments (2, 11, G), …"""
+        """Continues from ``state``, on any number of ranks up to the batch."""
         check_cloud(state, self.frames.count)
         raw, moments, statistics, queue = state_arrays(state, ("raw", "moments", "statistics", "queue"))
         self.iteration = count_of(state, "iteration", self.iterations)
@@ -118,21 +112,19 @@ class SplatRun:
         self.cloud.write_statistics(statistics)
         self._queue = [int(f) for f in queue]
 
-    # --- what there is to see ---------------------------------------------------------------------------
-
     def parameters(self) -> np.ndarray:
-        """Parameter rows (11, G) float64 in internal units."""
+        """Returns parameter rows (11, G) float64 in internal units."""
         return self.activation.apply(self.cloud.population().raw.astype(np.float64))
 
     def present_cloud(self) -> Gaussians:
-        """The cloud in internal units, without what density control would remove for its shape."""
+        """Returns the cloud in internal units, without Gaussians that density control would remove for their shape."""
         rows = self.parameters()
         return Gaussians.from_rows(rows[:, self.options.control.allows(rows[SCALE])])
 
     def present_volume(self) -> tuple[np.ndarray, Grid]:
-        """``present_cloud`` as a volume (nz, ny, nx) in 1/mm, on the scan's grid in mm."""
+        """Returns ``present_cloud`` as a volume (nz, ny, nx) in 1/mm, on the scan's grid in mm."""
         cloud = self.present_cloud()
-        if self.options.pixel_footprint:  # its field is as sharp as it is: voxels average over their volume, too
+        if self.options.pixel_footprint:  # voxels then average over their volume as pixels over their area
             cloud = cloud.averaged(self.grid.voxel_size_mm[::-1])
         volume = voxelise(self.rt, cloud.rows(), self.grid, cutoff_sigma=self.options.cutoff_sigma)
         return volume * np.float32(self.scale.density_per_mm), self.grid.scaled(self.scale.length_mm)

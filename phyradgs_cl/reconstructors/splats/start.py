@@ -1,14 +1,14 @@
-"""Where a splatting run starts: its internal units, and the first cloud."""
+"""The start of a splatting run: its internal units, and the first cloud, drawn from an FDK volume."""
 
 import logging
 
 import numpy as np
+import scipy
 
 from phyradgs_cl.errors import NumericalError
-from phyradgs_cl.fields import Grid
+from phyradgs_cl.fields import Gaussians, Grid
 from phyradgs_cl.optim import Population, prune
-from phyradgs_cl.reconstructors.splats.frames import Scale
-from phyradgs_cl.reconstructors.splats.initial_cloud import initial_cloud
+from phyradgs_cl.reconstructors.splats.device import Scale
 from phyradgs_cl.reconstructors.splats.options import SplatOptions
 
 log = logging.getLogger(__name__)
@@ -16,7 +16,7 @@ _REFERENCE_PERCENTILE = 99.9
 
 
 def internal_scale(fdk: np.ndarray, grid: Grid) -> Scale:
-    """Half the longest side, and a high percentile of a first volume (1 where that is not positive)."""
+    """Returns half the longest side, and a high percentile of a first volume (1 where that is not positive)."""
     reference = float(np.percentile(fdk, _REFERENCE_PERCENTILE))
     if not np.isfinite(reference):
         raise NumericalError("projections", "values that overflow in FDK", "line integrals of order 1")
@@ -26,32 +26,74 @@ def internal_scale(fdk: np.ndarray, grid: Grid) -> Scale:
 def first_population(
     volume: np.ndarray, grid: Grid, options: SplatOptions, rng: np.random.Generator
 ) -> Population:
-    """The raw parameters of the initial cloud, drawn from an FDK volume in internal units."""
+    """Returns the raw parameters of the initial cloud, drawn from an FDK volume in internal units."""
     activation = options.activation(grid)
-    asked = options.gaussians_for(grid)
+    requested = options.gaussians_for(grid)
     cloud = initial_cloud(
         volume,
         grid,
-        asked,
+        requested,
         threshold=options.initial_threshold,
         density_share=options.initial_density,
         scale_bounds=(activation.scale_min, activation.scale_max),
         scale_factor=options.initial_scale,
         rng=rng,
     )
-    if options.asks_for_gaussians and cloud.count < asked:
+    if options.asks_for_gaussians and cloud.count < requested:
         log.warning(
             "%d Gaussians asked for, %d voxels of the first volume attenuate enough: starting with %d",
-            asked,
-            cloud.count,
-            cloud.count,
-        )
+            requested, cloud.count, cloud.count,
+        )  # fmt: skip
     raw = activation.invert(cloud.rows())
     return prune(Population(raw, np.zeros((2, *raw.shape))), activation, options.control, box_of(grid))
 
 
+def initial_cloud(
+    volume: np.ndarray,
+    grid: Grid,
+    count: int,
+    *,
+    threshold: float,
+    density_share: float,
+    scale_bounds: tuple[float, float],
+    scale_factor: float,
+    rng: np.random.Generator,
+) -> Gaussians:
+    """Draws up to ``count`` isotropic Gaussians at voxels above ``threshold``, without replacement.
+
+    volume (nz, ny, nx) and everything else in internal units. Density is ``density_share`` of the voxel's value;
+    the scale is ``scale_factor`` × the RMS distance to the three nearest others. An empty volume still gives
+    one faint Gaussian in the middle, so that there is something to optimise.
+    """
+    candidates = np.flatnonzero(volume.ravel() > threshold)
+    if candidates.size == 0:
+        log.warning(
+            "no voxel of the first volume is above initial_threshold %g (the largest is %.3g): starting with one "
+            "Gaussian in the middle", threshold, volume.max(),
+        )  # fmt: skip
+        candidates = np.array([np.ravel_multi_index([n // 2 for n in grid.shape], grid.shape)])
+    voxels = np.sort(rng.choice(candidates, size=min(count, candidates.size), replace=False))
+    z, y, x = np.unravel_index(voxels, grid.shape)
+    axis_z, axis_y, axis_x = grid.axes_mm()
+    mean = np.stack([axis_x[x], axis_y[y], axis_z[z]], -1)
+    spacing = _neighbour_distance(mean, max(grid.voxel_size_mm)) * scale_factor
+    scale = np.repeat(np.clip(spacing, *scale_bounds)[:, None], 3, axis=1)
+    density = np.maximum(volume.ravel()[voxels], threshold) * density_share
+    quaternion = np.tile([1.0, 0.0, 0.0, 0.0], (len(mean), 1))
+    return Gaussians(mean, scale, quaternion, density.astype(np.float64))
+
+
+def _neighbour_distance(points: np.ndarray, fallback: float) -> np.ndarray:
+    """Returns the RMS distance (G,) from each point to its three nearest others."""
+    neighbours = min(4, len(points))
+    if neighbours < 2:
+        return np.full(len(points), fallback)
+    distance, _ = scipy.spatial.cKDTree(points).query(points, k=neighbours)
+    return np.sqrt((distance[:, 1:] ** 2).mean(axis=1))
+
+
 def box_of(grid: Grid) -> np.ndarray:
-    """Lowest and highest corner (2, 3) of a grid, x y z."""
+    """Returns the lowest and the highest corner (2, 3) of a grid, x y z."""
     half = np.array(grid.size_mm[::-1]) / 2
     centre = np.array(grid.offset_mm[::-1])
     return np.stack([centre - half, centre + half])

@@ -1,29 +1,36 @@
-"""One frame's part of a step: render, compare, go back, total variation, chain rule. The only place where they stand."""
+"""The gradient of one step: render a frame, compare, go back, total variation, chain rule; and its sum over ranks.
+
+``FrameStep.gradient`` is the only place where these parts meet. Ranks have all Gaussians each, and some frames of the batch;
+their gradients sum to bits that depend on the batch, not on the number of ranks.
+"""
 
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 
 from phyradgs_cl.acquisition import Scan
+from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.objective import ImageLoss, TotalVariation
 from phyradgs_cl.operators import SplatProjector, Voxeliser
 from phyradgs_cl.operators.splats.projector import DEFAULT_TIME_ERROR
 from phyradgs_cl.optim import DeviceAdam
-from phyradgs_cl.reconstructors.splats.cloud import DeviceCloud
-from phyradgs_cl.reconstructors.splats.frames import DeviceFrames, Scale
+from phyradgs_cl.parallel import Communicator, exact_sum
+from phyradgs_cl.reconstructors.splats.device import DeviceCloud, DeviceFrames, Scale
 from phyradgs_cl.reconstructors.splats.options import SplatOptions
 from phyradgs_cl.runtime import DeviceArray, Runtime
 
+_ROWS, _STATISTICS = 11, 2
+_DERIVED = 13  # with the centre on the detector, for density control
 Corner = tuple[int, int, int]
-"""Where the sub-volume of the total variation starts, z y x."""
+"""First voxel (z, y, x) of the sub-volume of the total variation."""
 
 
 @dataclass(frozen=True)
 class Batch:
-    """The frames of one step, a corner for each (None where the total variation has no weight), and whether it is ``late``
-    enough for the parameter terms.
-    """
+    """The frames of one step, a corner for each (None if the total variation has no weight), and whether the parameter
+    terms apply (``late``)."""
 
     frames: list[int]
     corners: list[Corner | None]
@@ -55,7 +62,7 @@ class FrameStep:
         self.adam = DeviceAdam(rt, options.activation(grid))
 
     def draw_corner(self, rng: np.random.Generator) -> Corner | None:
-        """A random sub-volume for the total variation, if it has a weight."""
+        """Draws a sub-volume for the total variation, if it has a weight."""
         if self.options.tv_weight == 0:
             return None
         room = (n - edge + 1 for n, edge in zip(self.grid.shape, self.crop.shape, strict=True))
@@ -65,10 +72,8 @@ class FrameStep:
     def gradient(
         self, cloud: DeviceCloud, frame: int, corner: Corner | None, late: bool, statistics: DeviceArray
     ) -> None:
-        """Writes dL/draw of a frame into the gradients of an activated cloud; ``corner`` and ``late`` are as in ``Batch``.
-
-        Adds to the ``statistics`` (2, stride) of density control.
-        """
+        """Writes dL/draw of a frame into the gradients of an activated cloud, and adds to the ``statistics`` (2, stride) of
+        density control. ``corner`` and ``late`` as in ``Batch``."""
         options, gaussians, by_cloud = self.options, cloud.gaussians, cloud.gradients
         cells, measured, mask, pixels = self.frames.get(frame)
         rendered = self.projector.forward(gaussians, cells)
@@ -89,3 +94,59 @@ class FrameStep:
             shape_ratio=options.shape_ratio,
             shape_floor=options.shape_floor,
         )
+
+
+class Sharing(Protocol):
+    """The work that all ranks do together, in the same order."""
+
+    def differentiate(self, step: FrameStep, cloud: DeviceCloud, batch: Batch) -> None:
+        """Writes dL/draw of the batch into the cloud's gradients and adds to its statistics."""
+        ...
+
+    def loss(self, step: FrameStep) -> float:
+        """Mean loss of the frames of the last batch."""
+        ...
+
+
+class Alone:
+    """One process, one frame per step."""
+
+    def differentiate(self, step: FrameStep, cloud: DeviceCloud, batch: Batch) -> None:
+        step.gradient(cloud, batch.frames[0], batch.corners[0], batch.late, cloud.statistics)
+
+    def loss(self, step: FrameStep) -> float:
+        return step.loss.value()
+
+
+class SharedFrames:
+    """Several frames per step: rank r has frames r, r + ranks, … of the batch."""
+
+    def __init__(self, ranks: Communicator) -> None:
+        self.ranks = ranks
+        self._losses = np.zeros(1)
+
+    def differentiate(self, step: FrameStep, cloud: DeviceCloud, batch: Batch) -> None:
+        rt, stride, count = step.rt, cloud.gaussians.stride, len(batch.frames)
+        self._losses = np.zeros(count)
+        own = []
+        for place in range(self.ranks.rank, count, self.ranks.size):
+            statistics = rt.zeros((_STATISTICS, stride))
+            step.gradient(cloud, batch.frames[place], batch.corners[place], batch.late, statistics)
+            self._losses[place] = step.loss.value()
+            own.append(np.concatenate([rt.download(cloud.gradients)[:_ROWS], rt.download(statistics)]))
+        total = exact_sum(self.ranks, own, (_ROWS + _STATISTICS, stride), count)
+        rt.write(cloud.gradients, np.pad(total[:_ROWS], ((0, _DERIVED - _ROWS), (0, 0))))
+        rt.write(cloud.statistics, rt.download(cloud.statistics) + total[_ROWS:])
+
+    def loss(self, step: FrameStep) -> float:
+        losses = self._losses.copy()
+        self.ranks.allreduce_sum(losses)
+        return float(losses.mean())
+
+
+def sharing_of(ranks: Communicator, batch: int) -> Sharing:
+    """Returns how ``ranks`` share steps of ``batch`` frames. Raises InputError if some would have no frame."""
+    if ranks.size > batch:
+        found = f"{batch} for {ranks.size} ranks"
+        raise InputError("--batch", found, "a frame for every rank", "raise it, or take fewer ranks")
+    return SharedFrames(ranks) if batch > 1 else Alone()

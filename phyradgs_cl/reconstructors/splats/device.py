@@ -1,0 +1,123 @@
+"""The device arrays of a splatting run: the Gaussians with their gradients and moments, and the scan's frames."""
+
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+
+from phyradgs_cl.acquisition import Exact, Motion, Scan, TimeCells
+from phyradgs_cl.detector import transmission_weights
+from phyradgs_cl.operators import DeviceCells, DeviceGaussians
+from phyradgs_cl.operators.splats.layout import pad_columns, stride_of
+from phyradgs_cl.optim import DeviceAdam, Population
+from phyradgs_cl.reconstructors.splats.options import SplatOptions
+from phyradgs_cl.runtime import DeviceArray, Runtime
+from phyradgs_cl.runtime.layout import pad_rows
+
+_PEAK_PERCENTILE = 99.9  # of line integrals; the maximum would be noise
+
+
+@dataclass(frozen=True)
+class Scale:
+    """One internal unit of length in mm, and of density in 1/mm."""
+
+    length_mm: float
+    density_per_mm: float
+
+    @property
+    def line_integral(self) -> float:
+        return self.length_mm * self.density_per_mm
+
+
+class DeviceCloud:
+    """A population on the device. Arrays have ``gaussians.stride`` columns, of which the first ``count`` are Gaussians."""
+
+    def __init__(self, rt: Runtime, population: Population) -> None:
+        self.rt, self.count = rt, population.count
+        stride = stride_of(self.count)
+        moments = np.zeros((2, 11, stride), np.float32)
+        moments[:, :, : self.count] = population.moments
+        self.raw = rt.upload(pad_columns(population.raw))
+        self.moments = rt.upload(moments)
+        self.gradients = rt.zeros((13, stride))
+        self.statistics = rt.zeros((2, stride))
+        self.gaussians = DeviceGaussians(rt.zeros((11, stride)), self.count, stride)
+
+    def activate(self, adam: DeviceAdam) -> None:
+        """Computes the parameters from the raw ones."""
+        adam.activate(self.raw, self.gaussians.rows, self.count, self.gaussians.stride)
+
+    def move(self, adam: DeviceAdam, rates: np.ndarray, step: int) -> None:
+        """Does one step of Adam down the gradients; ``rates`` (11,), ``step`` counts from 1."""
+        adam.step(self.raw, self.gradients, self.moments, self.gaussians.stride, rates, step)
+
+    def population(self) -> Population:
+        """Returns the present population."""
+        count = self.count
+        return Population(self.rt.download(self.raw)[:, :count], self.rt.download(self.moments)[:, :, :count])
+
+    def read_statistics(self) -> np.ndarray:
+        """Returns (2, count) float32: the sum of the centre's gradient norms, and the number of frames that had one."""
+        return self.rt.download(self.statistics)[:, : self.count]
+
+    def write_statistics(self, statistics: np.ndarray) -> None:
+        """Replaces the statistics (2, count)."""
+        padded = np.zeros((2, self.gaussians.stride), np.float32)
+        padded[:, : self.count] = statistics
+        self.rt.write(self.statistics, padded)
+
+
+class DeviceFrames:
+    """Time cells, measurement in internal units and mask of every frame."""
+
+    def __init__(self, rt: Runtime, scan: Scan, options: SplatOptions, scale: Scale) -> None:
+        self.count = scan.frames
+        readout = scan.shutter.readout
+        self.lines, self.width = readout.shape(scan.geometry.detector_shape)
+        model = scan.detector_model if options.detector_model == "scan" else options.detector_model
+        tables, merges = tables_of(scan, options.motion, model)
+        self._cells = [DeviceCells.upload(rt, table.scaled(1 / scale.length_mm)) for table in tables]
+        self.intensity_unit = scale.line_integral if merges else None
+        measured = (frame / np.float32(scale.line_integral) for frame in scan.projections)
+        self._measured = [rt.upload(pad_rows(readout.frames(m))) for m in measured]
+        self._mask, self._pixels = _upload_masks(rt, scan)
+        self._transmission: list[DeviceArray] = []
+        if options.poisson_weight > 0:
+            valid = None if scan.pixel_mask is None else scan.pixel_mask == 0
+            weights = transmission_weights(scan.projections, valid)
+            self._transmission = [rt.upload(pad_rows(readout.frames(w))) for w in weights]
+
+    def cells(self, frame: int) -> DeviceCells:
+        """Returns the time cells of a frame."""
+        return self._cells[frame]
+
+    def transmission(self, frame: int) -> DeviceArray | None:
+        """Returns the pixels' weights in the Poisson term; None if the term has no weight."""
+        return self._transmission[frame] if self._transmission else None
+
+    @property
+    def most_cells(self) -> int:
+        """The largest number of time cells of a frame."""
+        return max(cells.count for cells in self._cells)
+
+    def get(self, frame: int) -> tuple[DeviceCells, DeviceArray, DeviceArray, float]:
+        """Returns a frame's time cells, measurement, mask and number of valid pixels."""
+        mask = frame if len(self._mask) > 1 else 0
+        return self._cells[frame], self._measured[frame], self._mask[mask], self._pixels[mask]
+
+
+def tables_of(scan: Scan, motion: Motion, model: str) -> tuple[list[TimeCells], bool]:
+    """Returns the time cells of every frame in mm, and whether the detector model averages intensities over them."""
+    peak = float(np.percentile(scan.projections, _PEAK_PERCENTILE)) if model == "intensity" else 0.0
+    cells = partial(motion.cells, intensity_peak=peak) if isinstance(motion, Exact) else motion.cells
+    tables = [cells(scan, frame) for frame in range(scan.frames)]
+    # both models agree on a single value
+    return tables, model == "intensity" and any(table.averages for table in tables)
+
+
+def _upload_masks(rt: Runtime, scan: Scan) -> tuple[list[DeviceArray], list[float]]:
+    """Uploads masks, 1 at valid pixels: one for all frames, or one per frame. Returns them with their valid pixels."""
+    masks = np.zeros((1, *scan.geometry.detector_shape)) if scan.pixel_mask is None else scan.pixel_mask
+    stack = [(m == 0).astype(np.float32) for m in (masks if masks.ndim == 3 else masks[None])]
+    arrays = [rt.upload(pad_rows(scan.shutter.readout.frames(m))) for m in stack]
+    return arrays, [float(m.sum()) for m in stack]
