@@ -82,7 +82,7 @@ def fly_scan(
     start_deg = checks.numbers("angles_deg", angles_deg, (len(pixels.values),))
     turned_deg = np.unwrap(start_deg, period=360.0)
     readout_ratio = readout_ratio_of(readout_ms, readout_ratio, fps, exposure_s)
-    is_timed = exposure_s is not None
+    has_exposure_s = exposure_s is not None
     exposure_deg, exposure_s = exposure_of(exposure_deg, exposure_s, fps, turned_deg)
     readout_s = readout_ms / 1000 if readout_ms is not None else (readout_ratio or 0.0) * exposure_s
     steps = np.diff(turned_deg) / exposure_deg
@@ -102,8 +102,8 @@ def fly_scan(
     _warn_of_exposure(steps)
     called = {**_ARGUMENTS, "frame_time_s": "exposure_s" if fps is None else "fps"}
     called |= {"readout_s": "readout_ms"} if readout_ms is not None else {}
-    called |= {"exposure_s": "exposure_s"} if is_timed else {}
-    return _scan(pixels, orbit, shutter, start_s, grid, True, others, called, is_timed)
+    called |= {"exposure_s": "exposure_s"} if has_exposure_s else {}
+    return _scan(pixels, orbit, shutter, start_s, grid, True, others, called, has_exposure_s or fps is not None)
 
 
 def _warn_of_exposure(steps: np.ndarray) -> None:

@@ -111,6 +111,7 @@ def test_numbers_that_hardly_a_scanner_has_are_warned_of(caplog) -> None:
         "^fps: 1.5 fps and 30° from frame to frame": lambda: fly_scan(
             FRAMES, CONE, TURN_DEG, fps=1.5, exposure_s=0.06, readout_ms=62
         ),
+        "^fps: 1.4 fps and": lambda: fly_scan(FRAMES, CONE, TURN_DEG, fps=1.4, exposure_deg=27.0),
         "": lambda: fly_scan(FRAMES, CONE, TURN_DEG, fps=15, exposure_s=0.06, readout_ms=62),
     }.items():
         caplog.clear()

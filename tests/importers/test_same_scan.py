@@ -63,6 +63,15 @@ def test_r2_gaussian(tmp_path, make_truth, assert_same) -> None:
     assert_same(import_scan(path, form="r2"), truth)  # at rest
 
 
+def test_a_slow_frame_rate_is_warned_of_where_a_time_was_stated(tmp_path, make_truth, caplog) -> None:
+    """The files state no time: without one, frames follow each other by convention."""
+    path = w.write_phyradgs(tmp_path / "phyradgs", make_truth(**MOVING))
+    import_scan(path)
+    assert "fps" not in caplog.text
+    import_scan(path, ImportOptions(exposure_s=0.4))
+    assert "0.8 fps and 25° from frame to frame" in caplog.text
+
+
 def test_naf_with_numpy_s_own_numbers(tmp_path, make_truth, assert_same) -> None:
     """Scalars and small arrays of NumPy, lists of them, and arrays in Fortran order."""
     content = w.naf_dict(make_truth())
