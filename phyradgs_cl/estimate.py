@@ -91,7 +91,7 @@ class _Trials:
         self.plan = replace(plan, preprocessing=replace(plan.preprocessing, tune=""))  # tuning would repeat in each trial
 
     def run(self, iterations: int | None) -> float:
-        """Returns the seconds of so many iterations, or of the method as a whole."""
+        """Returns the seconds of a number of iterations, or of the method as a whole."""
         options = self.plan.options
         plan = self.plan if iterations is None else replace(self.plan, options=shortened(options, iterations))
         self.iterations += iterations or 0

@@ -1,4 +1,4 @@
-"""States from files: what a checkpoint may not do to a run that goes on from it."""
+"""Checks of states from files, before a run resumes from them."""
 
 import json
 from collections.abc import Iterator, Mapping
@@ -43,13 +43,13 @@ def _differences(then: object, now: object, name: str = "") -> Iterator[str]:
 
 
 def check_like(state: State, like: Mapping[str, np.ndarray]) -> None:
-    """InputError unless ``state`` has every array of ``like``, each of its shape and kind, and finite."""
+    """Raises InputError unless ``state`` has every array of ``like``, with its shape and type, and finite."""
     for name, found in zip(like, state_arrays(state, list(like)), strict=True):
         check_array(name, found, np.asarray(like[name]).shape, np.asarray(like[name]).dtype)
 
 
 def check_cloud(state: State, frames: int) -> None:
-    """InputError unless raw (11, G), moments (2, 11, G), statistics (2, G) and a queue of ``frames`` fit each other."""
+    """Raises InputError unless raw (11, G), moments (2, 11, G), statistics (2, G) and queue (``frames``) fit."""
     raw, moments, statistics, queue = state_arrays(state, ("raw", "moments", "statistics", "queue"))
     gaussians = raw.shape[-1] if raw.ndim else 0
     check_array("raw", raw, (11, max(gaussians, 1)), np.float32)
@@ -61,7 +61,7 @@ def check_cloud(state: State, frames: int) -> None:
 
 
 def check_array(name: str, found: np.ndarray, shape: tuple[int, ...], dtype: np.typing.DTypeLike) -> None:
-    """InputError unless an array of a state has this shape and type, and no NaN or infinity; texts have any length."""
+    """Raises InputError unless an array has this shape and type, and is finite; texts may have any length."""
     wanted = np.dtype(dtype)
     same = found.dtype.kind == "U" if wanted.kind == "U" else found.dtype == wanted
     if found.shape != shape or not same:
@@ -71,7 +71,7 @@ def check_array(name: str, found: np.ndarray, shape: tuple[int, ...], dtype: np.
 
 
 def count_of(state: State, name: str, most: int) -> int:
-    """A whole number from 0 to ``most``."""
+    """Returns a whole number of a state; raises InputError unless it is from 0 to ``most``."""
     (found,) = state_arrays(state, [name])
     check_array(name, found, (), np.int64)
     if not 0 <= int(found) <= most:
@@ -80,36 +80,36 @@ def count_of(state: State, name: str, most: int) -> int:
 
 
 def parsed(state: State, name: str, kind: type[T]) -> T:
-    """What the JSON text of a state means, of type ``kind``."""
+    """Returns the content of a state's JSON text; raises InputError unless its type is ``kind``."""
     (found,) = state_arrays(state, [name])
     check_array(name, found, (), np.str_)
     try:
         content = json.loads(str(found))
     except (ValueError, RecursionError) as error:
-        raise _damaged(name, "text that is not JSON", "what a run has written") from error
+        raise _damaged(name, "text that is not JSON", "the text of a run") from error
     if not isinstance(content, kind):
         raise _damaged(name, f"JSON {type(content).__name__}", f"JSON {kind.__name__}")
     return content
 
 
 def checked_history(state: State) -> tuple[list[dict[str, float]], float]:
-    """The convergence record so far and its seconds, each line of the record an iteration's numbers."""
+    """Returns the convergence record and the seconds of a state; a line of the record has the numbers of an iteration."""
     lines = parsed(state, "record", list)
     (seconds,) = state_arrays(state, ["seconds"])
     check_array("seconds", seconds, (), np.float64)
     for line in lines:
         if not isinstance(line, dict) or not all(isinstance(v, (int, float)) for v in line.values()):
-            raise _damaged("record", "a line that is no table of numbers", "what a run has written")
+            raise _damaged("record", "a line that is no table of numbers", "the text of a run")
     return lines, float(seconds)
 
 
 def restore_generator(rng: np.random.Generator, state: State) -> None:
-    """Puts a random generator where it was."""
+    """Restores the state of a random generator."""
     content = parsed(state, "rng", dict)
     try:
         rng.bit_generator.state = content
     except (KeyError, TypeError, ValueError, OverflowError) as error:
-        raise _damaged("rng", "no state of a random generator", "what a run has written") from error
+        raise _damaged("rng", "no state of a random generator", "the text of a run") from error
 
 
 def _damaged(name: str, found: str, expected: str) -> InputError:

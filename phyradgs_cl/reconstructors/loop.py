@@ -1,6 +1,6 @@
-"""The loop around every method that goes step by step: progress, convergence record, Ctrl-C, stopping, going on.
+"""The loop of every iterative method: progress, convergence record, Ctrl-C, stopping, resuming.
 
-A method is a class with ``Stepwise``'s attributes; ``Loop`` runs it, on one process or on ranks that do the same.
+A method is a class with the attributes of ``Stepwise``. ``Loop`` runs it, in one process or in ranks that do the same.
 """
 
 import time
@@ -20,49 +20,49 @@ SILENT_S = 10.0
 
 
 class Stepwise(Protocol):
-    """A method between its start and its result."""
+    """An iterative method, between its start and its result."""
 
     quantity: str
-    """What ``measures`` says of how far the run is from its goal: loss or residual. It must stay finite."""
+    """The name of the measure of convergence in ``measures``: loss or residual. It must stay finite."""
     remedy: str
-    """What helps where it does not."""
+    """Advice for a run whose measure does not stay finite."""
     iterations: int
     """Iterations to do."""
 
     @property
     def iteration(self) -> int:
-        """Iterations done. A step may make several, or a part of one."""
+        """Finished iterations. A step may make several, or a part of one."""
         ...
 
     @property
     def finished(self) -> str | None:
-        """Why the method stops by itself, else None."""
+        """The reason for which the method has ended before its last iteration, or None."""
         ...
 
     def step(self) -> None: ...
 
     def measures(self) -> Mapping[str, float]:
-        """A line of the record: ``quantity``, and what else there is to tell."""
+        """Returns a line of the record: ``quantity`` and other numbers."""
         ...
 
     def state(self) -> dict[str, np.ndarray]:
-        """What ``restore`` needs to go on with the next step."""
+        """Returns the arrays from which ``restore`` continues with the next step."""
         ...
 
     def restore(self, state: State) -> None:
-        """The inverse of ``state``; raises InputError for one that this run cannot have left."""
+        """Restores a state; raises InputError for one that this run cannot have written."""
         ...
 
     def present_volume(self) -> tuple[np.ndarray, Grid]:
-        """The present estimate (nz, ny, nx) in 1/mm, and its grid in mm."""
+        """Returns the present volume (nz, ny, nx) in 1/mm, and its grid in mm."""
         ...
 
 
 class Loop:
-    """Where a run is, and why it ended: ``iterations``, ``interrupt``, or the method's own reason.
+    """Runs a method. ``stopped_by`` is ``iterations``, ``interrupt``, or the method's own reason.
 
-    The record has a line, and the report a call, for every so many iterations; a report comes sooner where they are slow.
-    ``started`` is the ``time.perf_counter`` from which seconds count.
+    record_every, report_every: iterations between lines of the record, and between reports, which come sooner for slow
+    iterations. started: the ``time.perf_counter`` from which seconds count.
     """
 
     def __init__(
@@ -82,8 +82,8 @@ class Loop:
         self._reported = time.perf_counter()
 
     def run(self, resume: State | None) -> None:
-        """All steps, those of ``resume`` excepted. Ctrl-C, or a report that raises KeyboardInterrupt, ends the run after the
-        step under way, if there would be another one.
+        """Makes all steps after the state ``resume``. Ctrl-C, or a report that raises KeyboardInterrupt, ends the run after
+        the present step, unless that is the last.
         """
         method = self.method
         if resume is not None:
@@ -102,24 +102,24 @@ class Loop:
 
     @property
     def seconds(self) -> float:
-        """Since the start, those before an interruption included."""
+        """Seconds since the start, with those before an interruption."""
         return time.perf_counter() - self._started
 
     @property
     def interrupted_at(self) -> int | None:
-        """The iteration after which somebody has stopped the run."""
+        """The iteration after which Ctrl-C has stopped the run, or None."""
         return self.method.iteration if self.stopped_by == "interrupt" else None
 
     def state(self) -> dict[str, np.ndarray]:
-        """What ``run`` needs to go on from here."""
+        """Returns the state from which ``run`` can resume."""
         return {**self.method.state(), **history_arrays(self.record, self.seconds)}
 
     def state_if_interrupted(self) -> dict[str, np.ndarray] | None:
-        """The state of a run that can go on; None of one that has ended."""
+        """Returns the state of an interrupted run, or None."""
         return self.state() if self.stopped_by == "interrupt" else None
 
     def _tell(self, before: int) -> bool:
-        """Keeps and reports what the step from iteration ``before`` has reached; whether the report asks to stop."""
+        """Records and reports the step from iteration ``before``; returns True if the report asks to stop."""
         is_recorded = self._reaches(self.record_every, before)
         is_reported = self._reaches(self.report_every, before) or self._was_silent_long(before)
         if not (is_recorded or is_reported):
@@ -128,7 +128,7 @@ class Loop:
         iteration, seconds = self.method.iteration, self.seconds
         if is_recorded:
             self.record.append({"iteration": iteration, **measures, "seconds": seconds})
-        if not is_reported or self.ranks.rank > 0:  # rank 0 speaks for all
+        if not is_reported or self.ranks.rank > 0:  # rank 0 reports for all
             return False
         self._reported = time.perf_counter()
         progress = Progress(
@@ -148,12 +148,12 @@ class Loop:
         return False
 
     def _reaches(self, every: int, before: int) -> bool:
-        """Whether the step from iteration ``before`` has reached a multiple of ``every``, or the end."""
+        """True if the step from iteration ``before`` has reached a multiple of ``every``, or the end."""
         now = self.method.iteration
         return now // every > before // every or now == self.method.iterations
 
     def _was_silent_long(self, before: int) -> bool:
-        """Whether iterations are so slow that a user wonders; ranks would have to agree on a time, and report by number."""
+        """True if the last report is long ago. Ranks report by iteration only, as they would have to agree on a time."""
         is_slow = time.perf_counter() - self._reported > SILENT_S
         return is_slow and self.ranks.size == 1 and self.method.iteration > before
 

@@ -1,7 +1,7 @@
-"""A method: a function ``(scan, options, rt, *, seed, report, resume)``, of the package's or of somebody's own.
+"""A method: a function ``(scan, options, rt, *, seed, report, resume)``, of the package or of the user.
 
-One's own needs no more than ``(scan, options, rt)``, of which ``options`` may be annotated with a dataclass: its fields
-are then what ``--set`` and ``reconstruct`` take. It gives a ``Reconstruction``, or a volume (nz, ny, nx) in 1/mm on the
+A user's function needs only ``(scan, options, rt)``. If ``options`` is annotated with a dataclass, its fields are the
+options of ``--set`` and ``reconstruct``. The function returns a ``Reconstruction``, or a volume (nz, ny, nx) in 1/mm on the
 scan's grid.
 """
 
@@ -45,15 +45,15 @@ class Method:
 
 @dataclass(frozen=True)
 class OwnOptions:
-    """What a function that says nothing of its options can be told: the motion model."""
+    """The only option of a function whose options have no annotation: the motion model."""
 
     motion: Motion = Static()
 
 
 def own_method(name: str, function: Any) -> Method:
-    """A function of somebody's own as a method, whose options are the defaults of their class.
+    """Returns the user's function as a method, whose options are the defaults of their class.
 
-    Raises InputError for what is no such function, or options that need a value.
+    Raises InputError for anything but such a function, and for options without defaults.
     """
     subject = f"--method {name}"
     try:
@@ -83,7 +83,7 @@ def own_method(name: str, function: Any) -> Method:
 
 
 def imported(text: str, subject: str = "--method") -> Any:
-    """What ``package.module:name`` names, found as by ``python -m`` in the present folder too."""
+    """Imports ``package.module:name``, as ``python -m`` does also from the present folder."""
     module, _, name = text.partition(":")
     if os.getcwd() not in sys.path:
         sys.path.append(os.getcwd())
@@ -92,7 +92,7 @@ def imported(text: str, subject: str = "--method") -> Any:
     except ModuleNotFoundError as error:
         remedy = "start in its folder, or add that to PYTHONPATH"
         raise InputError(subject, f"{text}: {error}", "package.module:function", remedy) from error
-    except Exception as error:  # whatever a module does as it is imported
+    except Exception as error:  # a module may raise anything while it is imported
         found_there = f"{text}: {type(error).__name__}: {error}"
         raise InputError(subject, found_there, "a module that can be imported") from error
     try:
@@ -102,17 +102,17 @@ def imported(text: str, subject: str = "--method") -> Any:
 
 
 def _plain(value: Any) -> Any:
-    """A fact as files keep it: what JSON has no word for as Python prints it."""
+    """Returns a fact for files: the repr of values that JSON cannot hold."""
     if isinstance(value, Mapping):
         return {key: _plain(one) for key, one in value.items()}
     return value if isinstance(value, int | float | str | None) else repr(value)
 
 
 def _default_options(subject: str, function: Any, parameter: inspect.Parameter) -> Any:
-    """The options of a function as they are by themselves."""
+    """Returns the default options of a function."""
     try:
         kind = typing.get_type_hints(function).get(parameter.name)
-    except (NameError, TypeError):  # annotations of what is not there when it runs
+    except (NameError, TypeError):  # annotations of names that do not exist at run time
         kind = None
     if not (isinstance(kind, type) and is_dataclass(kind)):
         return OwnOptions()
@@ -123,7 +123,7 @@ def _default_options(subject: str, function: Any, parameter: inspect.Parameter) 
 
 
 def _result(subject: str, made: object, scan: Scan) -> Reconstruction:
-    """What a function of somebody's own has given, checked."""
+    """Returns the checked result of the user's function."""
     if not isinstance(made, Reconstruction):
         if not isinstance(made, np.ndarray) or made.shape != scan.grid.shape:
             found = f"an array of shape {made.shape}" if isinstance(made, np.ndarray) else f"a {type(made).__name__}"

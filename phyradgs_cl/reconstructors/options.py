@@ -1,4 +1,4 @@
-"""Options of a method by name, from wherever they come: a preset, with what is asked for checked and put in its place."""
+"""Options of a method and of the preprocessing by name: a preset with checked changes."""
 
 import math
 from collections.abc import Callable, Mapping
@@ -18,17 +18,17 @@ from phyradgs_cl.text import suggest_name
 
 _COUNTS = tuple(dict.fromkeys(f.name for model in MODELS for f in fields(model) if f.init))
 """The fields of motion models, by which options name them."""
-_ALL = motions_for(RAYS, SPLATS)  # of methods of one's own
+_ALL = motions_for(RAYS, SPLATS)  # for the user's own methods
 
 
 def method_options(
     method: object, preset: str | None = None, changes: Mapping[str, Any] | None = None, tune: str = ""
 ) -> Any:
-    """The options of a method: a preset, with ``changes`` by field name (nested ones as tables) applied.
+    """Returns the options of a method: a preset with ``changes`` by field name, nested ones as tables.
 
     ``motion``, ``strips``, ``sub_intervals``, ``segments`` and ``time_error`` change the motion model together; ``motion``
-    may be a model of one's own. ``tune``: which option the scan will choose.
-    Raises InputError for a name that the method does not have, so that no option is accepted and ignored.
+    may be the user's own model. tune: the request to tune an option. Raises InputError for a name that the method lacks,
+    so that no option is ignored.
     """
     name, presets = method_name(method), method_of(method).presets
     chosen = next(iter(presets)) if preset is None else preset
@@ -49,23 +49,23 @@ def method_options(
 
 
 def preprocessing_of(changes: Mapping[str, Any]) -> Preprocessing:
-    """Input options by name, checked as the methods' own are."""
+    """Returns the checked preprocessing with ``changes`` by name."""
     return _changed(Preprocessing(), changes, "reconstruct")
 
 
 def preprocessing_names(method: object, preset: str | None = None) -> list[str]:
-    """The names of the input options, but those that the method's own options have too, which go before them."""
+    """Returns the names of preprocessing options, except names that the method's own options have too."""
     own = {f.name for f in fields(method_options(method, preset))}
     return [f.name for f in fields(Preprocessing) if f.name not in own]
 
 
 def motions_of(method: object) -> tuple[str, ...]:
-    """The names of the motion models that a method takes."""
+    """Returns the names of the motion models that a method accepts."""
     return tuple(_models(next(iter(method_of(method).presets.values()))))
 
 
 def _models(options: Any) -> dict[str, Any]:
-    """The models of ``options`` by name, with what the preset says of its own."""
+    """Returns the models of ``options`` by name; the preset's own model has the preset's counts."""
     own = [options.motion] if hasattr(options.motion, "name") else []
     return {model.name: model for model in (*getattr(options, "MOTIONS", _ALL), *own)}
 
@@ -75,7 +75,7 @@ def _has(model: Any, count: str) -> bool:
 
 
 def _motion(method: str, options: Any, motion: Any, counts: dict[str, Any]) -> Motion:
-    """The model of ``options`` by its name, with the counts that are given, of which it must have each; or one's own."""
+    """Returns the motion model of that name with the given counts, each of which it must have, or the user's own model."""
     if callable(getattr(motion, "cells", None)) and not counts:
         return motion
     models = _models(options)
@@ -97,9 +97,9 @@ def _motion(method: str, options: Any, motion: Any, counts: dict[str, Any]) -> M
 
 
 def _implied_motion(usual: str, counts: Mapping[str, Any], models: Mapping[str, Any]) -> str:
-    """The usual model; where that follows the motion in its own way, the one that has what is given.
+    """Returns the name of the usual model, or of the only model with the given counts.
 
-    A method that is static by itself stays so until it is told otherwise.
+    A method whose usual model is static stays static unless ``motion`` is given.
     """
     if usual.startswith("static") or all(_has(models[usual], key) for key in counts):
         return usual
@@ -108,14 +108,14 @@ def _implied_motion(usual: str, counts: Mapping[str, Any], models: Mapping[str, 
 
 
 def _motion_options(options: Any) -> list[str]:
-    """The names by which the motion of ``options`` can be changed."""
+    """Returns the option names that change the motion of ``options``."""
     if not hasattr(options, "motion"):
         return []
     return ["motion", *(key for key in _COUNTS if any(_has(m, key) for m in _models(options).values()))]
 
 
 def _changed(options: Any, changes: Mapping[str, Any], subject: str) -> Any:
-    """``options`` with ``changes`` by name; ``subject`` is the method, or the table that they belong to."""
+    """Returns ``options`` with ``changes`` by name; ``subject`` is the method, or the table of the options."""
     known = {f.name: getattr(options, f.name) for f in fields(options) if f.name != "motion"}
     values: dict[str, Any] = {}
     for key, value in changes.items():
@@ -127,19 +127,19 @@ def _changed(options: Any, changes: Mapping[str, Any], subject: str) -> Any:
         values[key] = value if is_function else _converted(known[key], value, f"{subject}: option {key}")
     try:
         return replace(options, **values)
-    except (TypeError, ValueError) as error:  # of options of one's own, which check in their own way
+    except (TypeError, ValueError) as error:  # the user's own options have their own checks
         raise InputError(subject, str(error), "values that its options take") from error
 
 
 def _having(option: str) -> str:
-    """The methods that have an option, as advice; nothing where none has."""
+    """Returns the advice to use a method that has the option, or nothing."""
     usual = {name: next(iter(one.presets.values())) for name, one in METHODS.items()}
     having = [name for name, options in usual.items() if hasattr(options, option)]
     return f"--method {' or '.join(having)} has it" if having else ""
 
 
 def _converted(current: Any, value: Any, subject: str) -> Any:
-    """``value`` as the type of the present value: numbers, words, tuples, nested tables; where there is none, as it is."""
+    """Returns ``value`` as the type of the present value: number, word, tuple or nested table; unchanged if that is None."""
     if current is None:  # the options check it themselves
         return value.item() if isinstance(value, np.generic) else value
     if isinstance(value, np.generic | np.ndarray):
@@ -152,7 +152,7 @@ def _converted(current: Any, value: Any, subject: str) -> Any:
         if not isinstance(value, (list, tuple)) or len(value) != len(current):
             raise InputError(subject, checks.short_repr(value), f"a list of {len(current)} numbers")
         return tuple(_converted(c, v, subject) for c, v in zip(current, value, strict=True))
-    if type(current) not in _EXPECTED:  # of options of one's own
+    if type(current) not in _EXPECTED:  # of the user's own options
         return value
     expected, fits = _EXPECTED[type(current)]
     if not fits(value):
@@ -161,7 +161,7 @@ def _converted(current: Any, value: Any, subject: str) -> Any:
 
 
 def _is_number(value: Any) -> bool:
-    """Whether ``value`` is a finite number that a float can hold."""
+    """True for a finite number that a float can hold."""
     if isinstance(value, bool) or not isinstance(value, (int, float)):
         return False
     try:

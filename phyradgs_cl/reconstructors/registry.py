@@ -1,4 +1,4 @@
-"""The methods by name, and those of one's own. Adding one is a file that says its METHOD, and a line in METHODS."""
+"""The methods by name, and the user's own. A new method is a file with a METHOD, and a line in METHODS."""
 
 from collections.abc import Iterator, Mapping, MutableMapping
 from importlib import import_module
@@ -11,30 +11,30 @@ from phyradgs_cl.text import suggest_name
 
 
 class _Methods(MutableMapping[str, Method]):
-    """Methods by name, each imported when it is asked for: what it needs takes time."""
+    """Methods by name, each imported when it is first used: imports take time."""
 
     def __init__(self, places: Mapping[str, str]) -> None:
-        self._found: dict[str, str | Method] = dict(places)
+        self._entries: dict[str, str | Method] = dict(places)
 
     def __getitem__(self, name: str) -> Method:
-        found = self._found[name]
-        if isinstance(found, str):
-            module, _, attribute = found.partition(":")
-            found = getattr(import_module(f"phyradgs_cl.reconstructors.{module}"), attribute or "METHOD")
-            self._found[name] = found
-        return found
+        entry = self._entries[name]
+        if isinstance(entry, str):
+            module, _, attribute = entry.partition(":")
+            entry = getattr(import_module(f"phyradgs_cl.reconstructors.{module}"), attribute or "METHOD")
+            self._entries[name] = entry
+        return entry
 
     def __setitem__(self, name: str, method: Method) -> None:
-        self._found[name] = method
+        self._entries[name] = method
 
     def __delitem__(self, name: str) -> None:
-        del self._found[name]
+        del self._entries[name]
 
     def __iter__(self) -> Iterator[str]:
-        return iter(self._found)
+        return iter(self._entries)
 
     def __len__(self) -> int:
-        return len(self._found)
+        return len(self._entries)
 
 
 DEFAULT_METHOD = "fista"
@@ -56,9 +56,9 @@ METHODS = _Methods({
 
 
 def method_name(method: object) -> str:
-    """The name of a method: a key of METHODS, however its letters are cased, or ``package.module:name`` of one's own.
+    """Returns the name of a method: a key of METHODS, given in any case, or ``package.module:name`` of the user's own.
 
-    Raises InputError for what is none.
+    Raises InputError for anything else.
     """
     if isinstance(method, str) and method.lower() in METHODS:
         return method.lower()
@@ -71,9 +71,9 @@ def method_name(method: object) -> str:
 
 
 def method_of(method: object) -> Method:
-    """The method of that name; a function of one's own, itself or by ``package.module:name``, as a method.
+    """Returns the method of that name, or the user's own function, given as such or as ``package.module:name``.
 
-    Raises InputError for what is none, or cannot be imported.
+    Raises InputError for anything else, and for a function that cannot be imported.
     """
     name = method_name(method)
     if name in METHODS:
@@ -82,5 +82,5 @@ def method_of(method: object) -> Method:
 
 
 def usual_preset(method: object) -> str:
-    """The name of the preset that a method has by itself."""
+    """Returns the name of a method's default preset."""
     return next(iter(method_of(method).presets))

@@ -1,4 +1,4 @@
-"""What every method returns, and how it reports on the way."""
+"""The result of every method, and its progress reports."""
 
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -20,15 +20,15 @@ if TYPE_CHECKING:
     from phyradgs_cl.runtime import Runtime
 
 State = Mapping[str, np.ndarray]
-"""What an interrupted run needs to go on, as named arrays: each method knows its own names."""
+"""The state of an interrupted run as named arrays, from which it resumes. Each method has its own names."""
 VolumeMap = Callable[[np.ndarray, Grid], tuple[np.ndarray, Grid]]
 """A function from a volume and its grid to others."""
 HELD_OUT = "held_out"
-"""Where a result's facts have its error on pixels that its method did not see."""
+"""The key, in a result's facts, of its error on held-out pixels."""
 COMPARED = "compared"
-"""Where they say how the volume was compared with the scan's reference, where not voxel by voxel."""
+"""The key of the way in which the volume was compared with the scan's reference, if not voxel by voxel."""
 MARGIN_MM = "margin_mm"
-"""Where they have the width (z, y, x) of what the method filled around the volume and discarded."""
+"""The key of the width (z, y, x) of the discarded margin."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -65,7 +65,7 @@ class Reconstruction:
 
     @property
     def early_stop(self) -> str:
-        """Why the method ended before its last iteration by itself, for the end of a line; nothing where it did not."""
+        """The reason for which the method ended before its last iteration, for the end of a line, or nothing."""
         done, reason = self.facts.get("iterations"), self.facts.get("stopped_by")
         options = self.facts.get("options")
         asked = options.get("iterations") if isinstance(options, Mapping) else None
@@ -74,7 +74,7 @@ class Reconstruction:
         return f", stopped after {done} of {asked} iterations ({reason})"
 
     def within(self, grid: Grid) -> "Reconstruction":
-        """The part of it that is on ``grid``, with all Gaussians; the result itself where that is no part of its own."""
+        """Returns the part of the result on ``grid``, with all Gaussians, or the result itself outside its grid."""
         if (part := grid.slices_in(self.grid)) is None:
             return self
         disagreement = None if self.disagreement is None else self.disagreement[part].copy()
@@ -95,9 +95,9 @@ class Reconstruction:
 
 
 def interrupted(partial: Reconstruction | None) -> KeyboardInterrupt:
-    """A KeyboardInterrupt with the result so far as its attribute ``partial``; None where there is no volume yet.
+    """Returns a KeyboardInterrupt whose attribute ``partial`` is the result so far, or None if there is no volume yet.
 
-    No class of its own: Python ends by the signal, so that shells stop too, for exactly this one.
+    Not a subclass: only for KeyboardInterrupt itself does Python end by the signal, so that shells stop too.
     """
     at = None if partial is None else partial.facts.get("interrupted_at")
     when = "at its end" if at is None else f"after iteration {at}"
@@ -109,12 +109,11 @@ def interrupted(partial: Reconstruction | None) -> KeyboardInterrupt:
 
 @dataclass(frozen=True)
 class Progress:
-    """One report of a running method: ``iteration`` of ``iterations`` done, after so many ``seconds`` in s.
+    """One report of a running method: ``iteration`` of ``iterations`` is finished, after ``seconds`` in s.
 
-    ``loss`` is what ``quantity`` names, dimensionless; ``gaussians``: how many, 0 where there are none.
-
-    ``state`` makes what a run needs to go on from here, ``volume`` the present volume (nz, ny, nx) in 1/mm with its grid;
-    both are for the time of the report only. A report that raises KeyboardInterrupt ends the run as Ctrl-C does.
+    loss: the dimensionless measure that ``quantity`` names. gaussians: their number, or 0. state: returns the state from
+    which the run can resume. volume: returns the present volume (nz, ny, nx) in 1/mm and its grid. Both may be called during
+    the report only. A report that raises KeyboardInterrupt ends the run as Ctrl-C does.
     """
 
     iteration: int
@@ -174,17 +173,17 @@ class Report:
 
 
 def ignore_progress(progress: Progress) -> None:
-    """The default report: none."""
+    """The default report: does nothing."""
 
 
 def function_name(function: object) -> str:
-    """``module:name`` of a function, of any other callable its class's."""
+    """Returns ``module:name`` of a function, or of the class of another callable."""
     of = function if hasattr(function, "__qualname__") else type(function)
     return f"{of.__module__}:{of.__qualname__}"
 
 
 def option_facts(options: Any) -> dict[str, object]:
-    """A method's options for the facts of its result, functions by name; those of one's own methods need no motion."""
+    """Returns a method's options as facts of its result, with functions by name."""
     own = {"motion": motion_facts(options.motion)} if hasattr(options, "motion") else {}
     given = {name: getattr(options, name) for name in getattr(options, "FUNCTIONS", ())}
     named = {name: function_name(value) for name, value in given.items() if callable(value)}
@@ -192,7 +191,7 @@ def option_facts(options: Any) -> dict[str, object]:
 
 
 def state_arrays(state: State, names: Sequence[str]) -> list[np.ndarray]:
-    """The arrays of an interrupted run by name; raises InputError for a state that lacks one."""
+    """Returns arrays of a state by name; raises InputError for a state that lacks one."""
     missing = sorted(set(names) - set(state))
     if missing:
         raise InputError(
@@ -202,5 +201,5 @@ def state_arrays(state: State, names: Sequence[str]) -> list[np.ndarray]:
 
 
 def history_arrays(record: Sequence[Mapping[str, float]], seconds: float) -> dict[str, np.ndarray]:
-    """A convergence record and the seconds so far as entries of a state."""
+    """Returns a convergence record and the seconds so far as arrays of a state."""
     return {"record": np.array(json.dumps(list(record))), "seconds": np.array(seconds)}

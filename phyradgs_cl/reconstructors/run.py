@@ -1,5 +1,6 @@
-"""A method on a scan: what is done to the frames first, its start, its margin, and what is said of the result."""
+"""Runs a plan on a scan: preprocessing, first volume, margin, tuning, held-out pixels, and the method."""
 
+import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -12,6 +13,7 @@ from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.acquisition.motion import check_own_motion
 from phyradgs_cl.errors import InputError, OutOfMemoryError, naming_host_memory
 from phyradgs_cl.fields import Grid, triple
+from phyradgs_cl.io.files import HOST_SHARE, free_bytes, host_bytes
 from phyradgs_cl.metrics import resampled, shared_slices
 from phyradgs_cl.prepare import PREPARED_KEY
 from phyradgs_cl.prepare.step import with_masked
@@ -30,9 +32,16 @@ from phyradgs_cl.reconstructors.result import (
     State,
     ignore_progress,
 )
-from phyradgs_cl.reconstructors.room import naming_size_that_fits
 from phyradgs_cl.reconstructors.tune.trials import tuned
 from phyradgs_cl.runtime import Runtime
+
+# Volumes that voxel methods hold at one time at most (docs/large.md), with two of the intensity model; they hold stacks of
+# all frames too, and one buffer of three volumes.
+_HELD = {"sirt": 8, "sart": 28, "os-sart": 28, "cgls": 11, "asd-pocs": 32, "fista-tv": 16, "fista": 20, "fused": 20}
+_STACKS, _ONE_BUFFER = 12, 3
+_OF_OTHERS = 4  # volumes: the result, and copies in which it is made, checked and written
+_DEVICE_SHARE = 0.9
+_ROUND = 8  # voxels
 
 
 def reconstruct(
@@ -43,7 +52,7 @@ def reconstruct(
     report: ProgressReport = ignore_progress,
     resume: State | None = None,
 ) -> Reconstruction:
-    """Runs a plan on a scan. resume: the state of an interrupted run of the same plan, to go on from.
+    """Runs a plan on a scan. resume: the state of an interrupted run of the same plan.
 
     The plan's first volume is resampled onto the scan's grid.
     """
@@ -120,7 +129,7 @@ def _check_margin(plan: RunPlan) -> None:
 
 
 def _within(volume: np.ndarray, grid: Grid, box: Grid) -> tuple[np.ndarray, Grid]:
-    """The voxels of a volume (nz, ny, nx), which may be coarser than the box, that lie in it."""
+    """Returns the part of a volume (nz, ny, nx) that lies in the box; its voxels may be coarser than the box's."""
     if (part := shared_slices(grid, box)) is None:
         return volume, grid
     inner = volume[part]
@@ -129,7 +138,7 @@ def _within(volume: np.ndarray, grid: Grid, box: Grid) -> tuple[np.ndarray, Grid
 
 @contextmanager
 def _naming_margin(preprocessing: Preprocessing, grid: Grid) -> Iterator[None]:
-    """Where memory does not do, the body's error says what the margin has made of the grid."""
+    """Adds the size of the grid with its margin to a shortage of memory in the body."""
     try:
         yield
     except OutOfMemoryError as error:
@@ -140,14 +149,55 @@ def _naming_margin(preprocessing: Preprocessing, grid: Grid) -> Iterator[None]:
 
 
 def _check_ranks(method: str, rt: Runtime) -> None:
-    """InputError where the method has no work for several ranks, or ranks would not come to the same numbers."""
+    """Raises InputError for a method that ranks cannot share, and for ranks on different devices."""
     if method not in METHODS or not METHODS[method].is_shared:
-        sharing = ", ".join(name for name, one in METHODS.items() if one.is_shared)
+        names = ", ".join(name for name, one in METHODS.items() if one.is_shared)
         found = f"{rt.ranks.size} ranks"
-        raise InputError(f"--method {method}", found, f"one, or one of {sharing}", "start it without mpiexec")
+        raise InputError(f"--method {method}", found, f"one, or one of {names}", "start it without mpiexec")
     device, first = rt.device.name, rt.ranks.bcast(rt.device.name)
     if device != first:
         subject = f"device of rank {rt.ranks.rank}"
         raise InputError(
             subject, device, f"that of rank 0, {first}", "choose devices of one kind with --device"
         )
+
+
+@contextmanager
+def naming_size_that_fits(rt: Runtime, scan: Scan, method: str, options: Any) -> Iterator[None]:
+    """Adds the ``--size`` that fits, if one does, to a shortage of memory in the body.
+
+    Raises OutOfMemoryError at once for a volume that this machine cannot hold.
+    """
+    size = _size_that_fits(rt, scan, method, options)
+    try:
+        volume_bytes, most_bytes = 4 * math.prod(scan.grid.shape), HOST_SHARE * host_bytes()
+        if volume_bytes > most_bytes:
+            voxels = "×".join(map(str, scan.grid.shape[::-1]))
+            found = f"{voxels} voxels (x y z), {volume_bytes / 2**30:.3g} GiB in one volume"
+            raise OutOfMemoryError("memory of this machine", found, f"at most {most_bytes / 2**30:.3g} GiB")
+        yield
+    except OutOfMemoryError as error:
+        if 0 < size < max(scan.grid.shape):
+            error.remedy = "; ".join(part for part in (error.remedy, f"--size {size} fits") if part)
+        raise
+
+
+def _size_that_fits(rt: Runtime, scan: Scan, method: str, options: Any) -> int:
+    """Returns the voxels along the longest side of the scan's grid for which the memory suffices, or 0."""
+    free, held = HOST_SHARE * free_bytes(), _HELD.get(method)
+    voxels = (free - scan.projections.nbytes) / (4 * _OF_OTHERS)
+    if held is not None:
+        free = min(free, _DEVICE_SHARE * rt.ledger.limit_bytes)
+        held += _of_prior(options.prior) if hasattr(options, "prior") else 0
+        voxels = (free - _STACKS * scan.projections.nbytes) / (4 * held)
+        voxels = min(voxels, rt.device.largest_allocation_bytes / (4 * _ONE_BUFFER))
+    if not 0 < voxels < math.inf:
+        return 0
+    size = int(max(scan.grid.shape) * (voxels / math.prod(scan.grid.shape)) ** (1 / 3))
+    return size - size % _ROUND if size > 2 * _ROUND else size
+
+
+def _of_prior(prior: Any) -> int:
+    from phyradgs_cl.reconstructors.voxels.priors import volumes_of  # which loads SciPy
+
+    return volumes_of(prior)

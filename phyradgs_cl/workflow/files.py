@@ -1,4 +1,4 @@
-"""Files by what they are: scans, references and volumes, and what each says of itself."""
+"""Loads files by their kind: scans, references and volumes; summaries of their contents."""
 
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
@@ -21,7 +21,7 @@ _KINDS = {
 
 
 def load_scan(path: str | Path, flats: str = "mean") -> Scan:
-    """A scan file as line integrals, its flats taken as ``prepare.flats`` says; see ``io.read_scan``."""
+    """Reads a scan file as line integrals, with flats as in ``prepare.flats``; see ``io.read_scan``."""
     with expecting(path, "scan"):
         scan = read_scan(path, flat_correction(flats))
     return scan if flats == "mean" else replace(scan, provenance={**scan.provenance, "flats": flats})
@@ -29,7 +29,7 @@ def load_scan(path: str | Path, flats: str = "mean") -> Scan:
 
 @contextmanager
 def expecting(path: str | Path, *kinds: str) -> Iterator[None]:
-    """An InputError of the body about a file of another kind than ``kinds`` says so; about a foreign scan, what reads it."""
+    """Makes an InputError of the body name the file's kind, if it is none of ``kinds``, or the command that reads it."""
     try:
         yield
     except InputError as error:
@@ -47,7 +47,7 @@ def expecting(path: str | Path, *kinds: str) -> Iterator[None]:
 
 
 def _is_foreign_scan(path: Path) -> bool:
-    """Whether ``import`` knows the format; an NXtomo file is ours if it says what its frames are."""
+    """True for a format of ``import``. An NXtomo file whose frames have a quantity is one of our scans."""
     try:
         if importers.recognise(path) != "nxtomo":
             return True
@@ -59,14 +59,14 @@ def _is_foreign_scan(path: Path) -> bool:
 
 
 def refuse_overwriting(option: str, output: Path, *inputs: Path) -> None:
-    """An output that is one of the inputs would destroy it."""
+    """Raises InputError for an output that is one of the inputs."""
     for path in inputs:
         if Path(output).resolve() == Path(path).resolve():
             raise InputError(option, f"the input file {path} itself", "another file to write")
 
 
 def refuse_foreign_suffix(output: Path, remedy: str = "write scan.h5") -> None:
-    """What is written is HDF5: under another format's suffix other programs would take it for that."""
+    """Raises InputError for an HDF5 output with another format's suffix, which would mislead other programs."""
     if (ending := foreign_suffix(output)) is not None:
         raise InputError("-o", f"the suffix {ending} of another format", "an HDF5 file, as NAME.h5", remedy)
 
@@ -89,7 +89,7 @@ def load_reference(path: Path) -> Volume:
 
 
 def summary(path: Path) -> dict[str, object]:
-    """Facts about a scan or volume file for people."""
+    """Returns facts about a scan or volume file."""
     if (form := importers.foreign_volume(path)) is not None:
         return {"kind": f"volume ({form})", **_voxel_facts(path)}
     with expecting(path, "scan", "volume", "plain-volume"):
@@ -101,7 +101,7 @@ def summary(path: Path) -> dict[str, object]:
         provenance = dict(facts.pop("provenance", None) or {})
         provenance.pop("record", None)
         options = provenance.pop("options", None)
-        return {"kind": "volume", **facts, **_asked_for(options), **provenance}
+        return {"kind": "volume", **facts, **_options_in_words(options), **provenance}
     return {"kind": "bare volume", **_voxel_facts(path)}
 
 
@@ -112,8 +112,8 @@ def _voxel_facts(path: Path) -> dict[str, object]:
     return {"shape": values.shape, **where, "minimum": float(values.min()), "maximum": float(values.max())}
 
 
-def _asked_for(options: object) -> dict[str, object]:
-    """What a run was asked for, in words; the file has every option."""
+def _options_in_words(options: object) -> dict[str, object]:
+    """Returns the motion and the iterations among the options of a run, in words."""
     if not isinstance(options, Mapping):
         return {}
     told: dict[str, object] = {}

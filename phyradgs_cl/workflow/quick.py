@@ -1,4 +1,4 @@
-"""A first comparison on one's own machine: a sweep over fly-scans of two built-in phantoms, in a minute or two."""
+"""A first comparison of methods: a sweep over fly-scans of two built-in phantoms, in a minute or two."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -27,8 +27,10 @@ _ROWS: tuple[tuple[str, Table], ...] = (
 def quick_grid(
     folder: Path, make_runtime: Callable[[], Runtime], *, seed: int = 0, iterations: int = ITERATIONS
 ) -> SweepGrid:
-    """Simulates what is missing of the scans in ``folder``/scans; every method, with and without motion, on each. seed:
-    of noise, cloud and frame order; iterations: of splats. OutputError for a folder that cannot be made."""
+    """Simulates the missing scans in ``folder``/scans; returns a sweep of every method, with and without motion, over them.
+
+    seed: of noise, cloud and frame order. iterations: of splats. Raises OutputError for a folder that cannot be made.
+    """
     checks.within("--iterations", iterations, 0, 10_000_000)
     settings = []
     for method, motion in _ROWS:

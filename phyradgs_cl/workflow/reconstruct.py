@@ -1,4 +1,4 @@
-"""From a scan file to a volume file, with checkpoints on the way."""
+"""From a scan file to a volume file, with checkpoints."""
 
 import logging
 import os
@@ -67,7 +67,7 @@ class _Files:
 class _Checkpoints:
     """A listener that writes a checkpoint at most every ``every_s`` seconds; 0: none. A kill leaves the last complete one.
 
-    A checkpoint that cannot be written is a warning, once; the run goes on.
+    A checkpoint that cannot be written is a warning, once, and no error.
     """
 
     def __init__(self, path: Path, every_s: float) -> None:
@@ -174,14 +174,16 @@ def _reconstructed(
                 write_volume(path, *parts, disagreement=result.disagreement)
                 _keep_checkpoint(files.output, result)
     except signals.InterruptedAfterwards:
-        if result is None or result.state is None:  # else told already, in the result
+        if result is None or result.state is None:  # else the result says so
             raise
     return result, metrics
 
 
 def _metrics(scan: Scan, result: Reconstruction) -> dict[str, float]:
-    """Against the scan's reference, by the rule of ``metrics.aligned``, and against held-out pixels. The result's facts say
-    how they were compared where that is not voxel by voxel."""
+    """Returns the metrics against the scan's reference, by the rule of ``metrics.aligned``, and those on held-out pixels.
+
+    The result's facts get the way of comparison, if it is not voxel by voxel.
+    """
     held_out = result.facts.pop(HELD_OUT, {})
     if scan.reference is None:
         return held_out
@@ -222,7 +224,7 @@ def _warn_of_doubts(plan: RunPlan, path: Path, scan: Scan) -> None:
 
 
 def _averages(scan: Scan, options: Any) -> bool:
-    """Whether the method merges several poses into a line: of one pose, both detector models are the same."""
+    """True if the method averages several poses in a line; with one pose, both detector models are the same."""
     if not hasattr(options, "motion"):
         return False
     cells = options.motion.cells(scan, 0)
@@ -230,7 +232,7 @@ def _averages(scan: Scan, options: Any) -> bool:
 
 
 def profile_report(rt: Runtime, result: Reconstruction) -> str:
-    """A table of where a run's device time went; ``rt`` is the run's own, with ``profile``."""
+    """Returns a table of a run's device time by kernel; ``rt`` is the run's, opened with ``profile``."""
     pairs = {str(name): int(n) for name, n in result.facts.get("evaluated_pairs", {}).items()}
     return profile_text(rt.kernel_uses(), float(result.facts["seconds"]), rt.best_rates(), pairs)
 
@@ -254,7 +256,7 @@ def _provenance(
 
 
 def _set_aside(output: Path) -> None:
-    """Whoever repeats a command without --resume may have meant it: the hours in a checkpoint are not thrown away."""
+    """Renames the checkpoint of an earlier run, which may hold hours of work, where a run starts without --resume."""
     checkpoint = checkpoint_path(output)
     if checkpoint.is_file():
         kept = former_checkpoint_path(output)
@@ -281,7 +283,7 @@ def resume_or_restart(
     report: ProgressReport = ignore_progress,
     checkpoint_every_s: float = 600.0,
 ) -> tuple[Reconstruction, dict[str, float]]:
-    """Goes on from the output's checkpoint, as ``run_reconstruction``; sets aside one that is damaged, or of another run."""
+    """Resumes from the output's checkpoint; starts from the beginning without one, or with a damaged or another run's."""
     run = partial(run_reconstruction, plan, scan, output, make_runtime, report, checkpoint_every_s=checkpoint_every_s)
     checkpoint = checkpoint_path(output)
     if checkpoint.is_file() and method_of(plan.method).is_resumable:
@@ -295,5 +297,5 @@ def resume_or_restart(
 
 
 def is_complete(result: Reconstruction) -> bool:
-    """Whether the run came to its end; a stopped one has left a checkpoint."""
+    """True if the run came to its end; an interrupted run has left a checkpoint."""
     return result.facts.get("interrupted_at") is None

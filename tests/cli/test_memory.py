@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from phyradgs_cl.io import read_volume
-from phyradgs_cl.reconstructors import room
+from phyradgs_cl.reconstructors import run as room
 from phyradgs_cl.runtime import MEMORY_VARIABLE, context
 from phyradgs_cl.workflow import load_scan
 
