@@ -1,5 +1,10 @@
-"""Calibrates a scan: finds the axis, the phantom and the readout's direction, then views and common parameters, and
-corrects the scan where corrections are significant and explain the frames better."""
+"""Calibrates a scan from its own frames.
+
+It starts from the axis that fits best and, for a known phantom, from the place where its beads are seen. On request it tests
+the readout's direction, and corrects single views or a motion first. The search (``search``) then estimates the parameters
+common to all views, from coarse to fine grids. Views or the motion are estimated again after that. Significant corrections
+that lower the residual enter the scan and its provenance.
+"""
 
 import logging
 from collections.abc import Callable, Sequence
