@@ -34,17 +34,6 @@ class GeometryCorrection:
     drift: float = 0.0
     turn_rad: float = 0.0
 
-    @property
-    def turns(self) -> bool:
-        """True where panel or views turn, which a circular orbit cannot state."""
-        return any((self.roll_rad, self.tilt_v_rad, self.tilt_u_rad, self.turn_rad))
-
-    @property
-    def moves(self) -> bool:
-        """True where source or panel move or turn."""
-        shifts = (self.offset_u_mm, self.offset_v_mm, self.source_distance_mm, self.detector_distance_mm)
-        return any(shifts) or self.turns
-
 
 @dataclass(frozen=True, eq=False)
 class Views:
@@ -149,9 +138,11 @@ def perturb(scan: Scan, correction: GeometryCorrection, views: Views | Sway | No
         source_to_detector_mm=geometry.source_to_detector_mm + source_mm + correction.detector_distance_mm,
         detector_offset_mm=(offset_v_mm + correction.offset_v_mm, offset_u_mm + correction.offset_u_mm),
     )
-    if isinstance(trajectory, CircularOrbit) and not correction.turns and views is None:
+    turns = any((correction.roll_rad, correction.tilt_v_rad, correction.tilt_u_rad, correction.turn_rad))
+    of_poses = replace(correction, readout_s=0.0, exposure_s=0.0, start_s=0.0, lag=0.0, drift=0.0)
+    if isinstance(trajectory, CircularOrbit) and not turns and views is None:
         trajectory = CircularOrbit(geometry, trajectory.kinematics)
-    elif correction.moves or views is not None:
+    elif of_poses != GeometryCorrection() or views is not None:
         trajectory = PerturbedTrajectory(trajectory, geometry.detector_shape, correction, views)
     readout_s, exposure_s = shutter.readout_s + correction.readout_s, shutter.exposure_s + correction.exposure_s
     return replace(
