@@ -7,13 +7,13 @@ import numpy as np
 
 from phyradgs_cl import checks
 from phyradgs_cl.acquisition import Motion, Scan
-from phyradgs_cl.acquisition.altered.perturbed import GeometryCorrection, perturb
+from phyradgs_cl.acquisition.altered.perturbed import GeometryCorrection, Views, perturb
 from phyradgs_cl.api.arrays import Device, runtime_of
 from phyradgs_cl.api.projectors import ray_operator, splat_operator
 from phyradgs_cl.api.runs import check_scan
 from phyradgs_cl.calibrate import Calibration
 from phyradgs_cl.calibrate import calibrate as run_calibration
-from phyradgs_cl.calibrate.per_view import WobbleParameters
+from phyradgs_cl.calibrate.per_view import WobbleParameters, units_of_views
 from phyradgs_cl.errors import InputError, naming_arguments
 from phyradgs_cl.fields import Gaussians
 from phyradgs_cl.fields.gaussians import ROWS
@@ -75,10 +75,9 @@ def move_views(scan: Scan, views: np.ndarray, *, without_gauges: bool = False) -
     check_scan(scan)
     checks.numbers("views", views, (scan.frames, 3))
     numbers = np.asarray(views, np.float64)
-    parameters = WobbleParameters.of(scan)
     if without_gauges:
-        numbers = parameters.without_gauges(numbers)
-    return perturb(scan, GeometryCorrection(), parameters.views_of(numbers))
+        numbers = WobbleParameters.of(scan).without_gauges(numbers)
+    return perturb(scan, GeometryCorrection(), Views(numbers[:, 0], numbers[:, 1:]))
 
 
 @naming_arguments()
@@ -108,7 +107,7 @@ def pose_gradient(
     if np.shape(x)[:1] == (ROWS,) and np.ndim(x) == 2:
         raise InputError("x", f"shape {np.shape(x)}", "Gaussians or a volume", "of rows (11, G): Gaussians.from_rows(rows)")
     checks.numbers("x", x, scan.grid.shape)
-    gradient, units = np.zeros((scan.frames, 3)), WobbleParameters.of(scan).units * _STEP_PX
+    gradient, units = np.zeros((scan.frames, 3)), units_of_views(scan) * _STEP_PX
     for kind, unit in enumerate(units):
         for sign in (1, -1):
             step = np.zeros((scan.frames, 3))

@@ -81,10 +81,12 @@ class WobbleParameters(PerViewParameters):
     @classmethod
     def of(cls, scan: Scan, count: int = 0) -> "WobbleParameters":
         """Returns zeros for every view, or for ``count`` splines."""
-        basis = splines(scan_course(scan) + 0.5, count) if count else np.eye(scan.frames)
-        pitch_v_mm, pitch_u_mm = scan.geometry.pixel_size_mm
-        units = np.array([_turn_unit_rad(scan), pitch_v_mm, pitch_u_mm])
-        return cls(np.zeros((basis.shape[1], len(cls.KINDS))), basis, units, _circle(scan, basis))
+        if count:
+            basis = splines(scan_course(scan) + 0.5, count)
+            circle = _fitted_circle(scan, basis)
+        else:
+            basis, circle = np.eye(scan.frames), _circle(scan)
+        return cls(np.zeros((basis.shape[1], len(cls.KINDS))), basis, units_of_views(scan), circle)
 
     def views_of(self, values: np.ndarray) -> Views:
         per_view = self.basis @ values
@@ -125,7 +127,7 @@ class MotionParameters(PerViewParameters):
         basis = still.basis(np.asarray(scan.frame_start_s) + scan.shutter.middle_s)
         shift_mm = scan.geometry.pixel_size_mm[1] / scan.geometry.magnification
         units = np.array([_turn_unit_rad(scan)] * 3 + [shift_mm] * 3)
-        return cls(still.coefficients, basis, units, _circle(scan, basis), still)
+        return cls(still.coefficients, basis, units, _fitted_circle(scan, basis), still)
 
     def views_of(self, values: np.ndarray) -> Sway:
         return replace(self.still, coefficients=values)
@@ -146,9 +148,19 @@ def _turn_unit_rad(scan: Scan) -> float:
     return scan.geometry.pixel_size_mm[1] / edge_mm
 
 
-def _circle(scan: Scan, basis: np.ndarray) -> np.ndarray:
+def units_of_views(scan: Scan) -> np.ndarray:
+    """Returns the turn (rad) and the shifts along v and u (mm) of a view that move its frame by a pixel at its edge."""
+    return np.array([_turn_unit_rad(scan), *scan.geometry.pixel_size_mm])
+
+
+def _circle(scan: Scan) -> np.ndarray:
+    """Returns cosine and sine (F, 2) of the views' angles."""
     azimuth_rad = start_azimuths_rad(scan)
-    circle: np.ndarray = np.linalg.lstsq(basis, np.stack([np.cos(azimuth_rad), np.sin(azimuth_rad)], -1), rcond=None)[0]
+    return np.stack([np.cos(azimuth_rad), np.sin(azimuth_rad)], -1)
+
+
+def _fitted_circle(scan: Scan, basis: np.ndarray) -> np.ndarray:
+    circle: np.ndarray = np.linalg.lstsq(basis, _circle(scan), rcond=None)[0]
     return circle
 
 
