@@ -1,6 +1,7 @@
 """Every defect of a scan file is one line that names the HDF5 path, and costs no output file."""
 
 import os
+import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -9,6 +10,8 @@ from typing import Any
 import h5py
 import numpy as np
 import pytest
+from corpus.hdf5_damage import on
+from corpus.hdf5_files import HARMLESS_COUNTS, HARMLESS_FLY, damages_of
 
 from phyradgs_cl.acquisition import CircularOrbit, EncoderTable, PoseTable, Scan
 from phyradgs_cl.detector import counts_to_attenuation
@@ -28,16 +31,6 @@ Damage = Callable[[h5py.File, str], object]
 
 def deleted(file: h5py.File, address: str) -> None:
     del file[address]
-
-
-def group_instead(file: h5py.File, address: str) -> None:
-    del file[address]
-    file.create_group(address)
-
-
-def empty(file: h5py.File, address: str) -> None:
-    del file[address]
-    file[address] = h5py.Empty("f8")
 
 
 def renamed(name: str) -> Damage:
@@ -96,24 +89,6 @@ def created(*arguments: object, **how: object) -> Damage:
     return damage
 
 
-def external_storage(file: h5py.File, address: str) -> None:
-    raw = Path(file.filename).with_suffix(".raw")
-    np.zeros((4, 3, 5), np.float32).tofile(raw)
-    created((4, 3, 5), "f4", external=[(str(raw), 0, h5py.h5f.UNLIMITED)])(file, address)
-
-
-def virtual_dataset(file: h5py.File, address: str) -> None:
-    layout = h5py.VirtualLayout((4, 3, 5), "f4")
-    layout[:] = h5py.VirtualSource("other.h5", "data", (4, 3, 5))
-    del file[address]
-    file.create_virtual_dataset(address, layout).attrs["quantity"] = "attenuation"
-
-
-def soft_loop(file: h5py.File, _: str) -> None:
-    linked(h5py.SoftLink("/loop"))(file, DATA)
-    file["/loop"] = h5py.SoftLink(DATA)
-
-
 def soft_link_to_external(file: h5py.File, away: str) -> None:
     file[away] = h5py.ExternalLink("other.h5", "/")
     linked(h5py.SoftLink(f"{away}/data"))(file, DATA)
@@ -126,102 +101,70 @@ def entry_misnamed(file: h5py.File, address: str) -> None:
 
 ENCODER_TIME, ENCODER_ANGLE = f"{EXTRA}/kinematics/time_s", f"{EXTRA}/kinematics/angle_deg"
 POSE = f"{EXTRA}/poses/pose"
-NEEDED = (
-    "/entry/instrument", DATA, KEY, PITCH_U, DISTANCE, "/entry/instrument/source", EXPOSURE, READOUT, START,
-    ANGLE, AXIS, GRID_SHAPE, REFERENCE, f"{EXTRA}/poses/time_s",
-)  # fmt: skip
 RENAMED = {
     DATA: "Dataa", KEY: "imagekey", PITCH_U: "x_pixelsize", MASK: "pixels_mask",
     ANGLE_END: "rotation_angles_end",
     f"{EXTRA}/grid": "grids", ENCODER_ANGLE: "angle_degs", f"{EXTRA}/kinematics": "kinematic",
 }  # fmt: skip
-HUGE = (4, 100_000, 200_000)
 # name: (the HDF5 path that the message must name, what happens to a good file there, words that the message must hold)
 CASES: dict[str, tuple[Any, ...]] = {
-    **{f"no {address}": (address, deleted, "nothing") for address in NEEDED},
     **{
         f"{address} misnamed": (address, renamed(name), f"rename '{name}'")
         for address, name in RENAMED.items()
     },
     "no entry": ("/entry", deleted, "NXentry"),
     "entry misnamed": ("/entry", entry_misnamed, "rename 'entrys'"),
-    "data is a group": (DATA, group_instead, "a group"),
     "data 2D": (DATA, changed(lambda d: d[0]), "(3, 5)", "three axes"),
     "data empty": (DATA, changed(lambda d: d[:0]), "(0, 3, 5)"),
     "data float64": (DATA, changed(np.float64), "float64", "float32"),
     "data int32": (DATA, changed(np.int32), "int32", "uint16"),
-    "data complex": (DATA, changed(np.complex64), "complex64"),
     "data uint16 attenuation": (DATA, changed(np.uint16), "uint16", "float32"),
     "data NaN": (DATA, poked((2, 1, 3), np.nan), "frame 2 at (1, 3)", "pixel_mask"),
     "data infinite": (DATA, poked((0, 0, 0), np.inf), "frame 0 at (0, 0)"),
-    "data elsewhere": (DATA, linked(h5py.ExternalLink("other.h5", "/data")), "other.h5"),
-    "detector elsewhere": (DETECTOR, linked(h5py.ExternalLink("other.h5", "/d")), "other.h5"),
     "soft link to elsewhere": ("/away", soft_link_to_external, "other.h5"),
-    "soft link to nothing": (DATA, linked(h5py.SoftLink("/gone")), "nothing there"),
-    "soft link loop": ("", soft_loop, "loop of links"),
-    "data in a raw file": (DATA, external_storage, "other files"),
-    "data virtual": (DATA, virtual_dataset, "other files"),
-    "data declared huge": (DATA, created(HUGE, "f4"), "298 GiB", "hold"),
-    "data declared huge in chunks": (DATA, created(HUGE, "f4", chunks=(1, 1000, 1000)), "298 GiB", "hold"),
     "no quantity": (f"{DATA} @quantity", lambda f, a: f[a].attrs.pop("quantity"), "attenuation"),
     "unknown quantity": (f"{DATA} @quantity", attribute("quantity", "HU"), "'HU'"),
     "quantity a number": (f"{DATA} @quantity", attribute("quantity", 3.0), "a string"),
     "counts without flats": (DATA, attribute("quantity", "counts"), "flat"),
     "image_key short": (KEY, changed(lambda k: k[:3]), "(3,)", "(4)"),
-    "image_key of floats": (KEY, changed(np.float64), "float64", "whole"),
     "image_key unknown": (KEY, poked(2, 7), "7 at index 2"),
     "no projections": (KEY, poked(slice(None), 1), "no projection"),
     "pixel size negative": (PITCH_V, poked((), -0.5), "-0.5", "above 0"),
     "pixel size zero": (PITCH_U, poked((), 0), "above 0"),
-    "pixel size NaN": (PITCH_U, poked((), np.nan), "NaN"),
     "pixel size two numbers": (PITCH_U, replaced([1.0, 2.0]), "(2,)"),
-    "pixel size text": (PITCH_U, replaced("0.5"), "numbers"),
-    "unknown unit": (f"{DISTANCE} @units", attribute("units", "furlong"), "'furlong'", "cm"),
     "unit of time for a length": (f"{DISTANCE} @units", attribute("units", "s"), "mm"),
     "detector distance negative": (DISTANCE, poked((), -1), "above 0"),
-    "distance without value": (DISTANCE, empty, "empty"),
     "source at the axis": (SOURCE, poked((), 0), "0"),
     "exposure negative": (EXPOSURE, poked((), -1), "-1 s"),
     "exposure varies": (EXPOSURE, replaced([0.8, 0.8, 0.9, 0.8]), "0.8 to 0.9 s", "one time"),
     "exposure in degrees": (f"{EXPOSURE} @units", attribute("units", "deg"), "ms"),
     "readout negative": (READOUT, poked((), -1), "-1 s"),
     "start times short": (START, changed(lambda t: t[1:]), "(3,)", "(4)"),
-    "start time NaN": (START, poked(1, np.nan), "first at (1,)"),
     "mask of another shape": (MASK, replaced(np.zeros((5, 3), np.uint8)), "(5, 3)", "(3, 5)"),
-    "mask of floats": (MASK, replaced(np.zeros((3, 5))), "float64"),
     "mask of everything": (MASK, replaced(np.ones((3, 5), np.uint8)), "every pixel"),
-    "angles 2D": (ANGLE, changed(lambda a: a[None]), "(1, 4)"),
-    "angle NaN": (ANGLE, poked(3, np.nan), "first at (3,)"),
     "angle unit": (f"{ANGLE} @units", attribute("units", "gon"), "deg, rad"),
     "end angles short": (ANGLE_END, changed(lambda a: a[:2]), "(2,)"),
     "what rotates": (f"{ANGLE} @rotates", attribute("rotates", "room"), "'room'"),
     "readout axis": (AXIS, replaced("diagonal"), "'diagonal'", "'rows'"),
-    "readout axis a number": (AXIS, replaced(1), "a string"),
     "readout direction": (DIRECTION, replaced(2), "2", "-1"),
     "readout direction between": (DIRECTION, replaced(1.5), "1.5"),
     "detector model": (f"{EXTRA}/detector_model", replaced("linear"), "'linear'", "'log'"),
     "offset of three": (OFFSET, replaced([1.0, 2.0, 3.0]), "(3,)", "(2)"),
-    "offset infinite": (OFFSET, poked(0, np.inf), "infinite"),
     "provenance": (f"{EXTRA}/provenance", lambda f, a: f.__setitem__(a, "{not json"), "JSON"),
     "grid shape zero": (GRID_SHAPE, poked(1, 0), "[2, 0, 4]"),
     "grid shape of floats": (GRID_SHAPE, changed(np.float64), "whole numbers"),
     "grid voxels negative": (f"{EXTRA}/grid/voxel_size", poked(0, -1), "above 0"),
     "reference of another shape": (REFERENCE, changed(lambda v: v[:, :, 1:]), "(2, 3, 3)", "(2, 3, 4)"),
-    "reference NaN": (REFERENCE, poked((0, 1, 2), np.nan), "(0, 1, 2)"),
     "reference unit": (f"{REFERENCE} @units", attribute("units", "HU"), "1/cm"),
-    "title a number": ("/entry/title", replaced(3), "a string"),
     "encoder too short": (
         ENCODER_TIME, all_changed(lambda t: t[:-1]), "frame 3 needs 4.5 to 5.6 s", "extend the table",
     ),
     "encoder starts late": (ENCODER_TIME, all_changed(lambda t: t[1:]), "frame 0 needs 0.5"),
     "encoder lengths": (ENCODER_ANGLE, changed(lambda t: t[1:]), "(8,)", "(9)"),
     "encoder goes back": (ENCODER_TIME, poked(4, 0.6), "index 4", "increasing"),
-    "encoder NaN": (ENCODER_ANGLE, poked(5, np.nan), "first at (5,)"),
-    "encoder group a dataset": (f"{EXTRA}/kinematics", replaced(1.0), "a dataset", "a group"),
     "encoder of one": (ENCODER_TIME, all_changed(lambda t: t[:1]), "1 samples"),
     "pose table too short": (POSE, all_changed(lambda t: t[:-1]), "frame 3 needs"),
     "poses of eleven numbers": (POSE, changed(lambda p: p[:, 1:]), "(9, 11)", "(9, 12)"),
-    "pose infinite": (POSE, poked((3, 2), np.inf), "(3, 2)"),
     "pose without plane": (POSE, poked((2, slice(6, 12)), 1.0), "parallel"),
 }
 
@@ -256,6 +199,23 @@ def refuses(path: Path, address: str, words: Sequence[str]) -> None:
     assert all(word in text for word in words), text
     assert len(text.splitlines()) == 1
     assert caught.value.found and caught.value.expected
+
+
+def test_every_object_in_every_way_is_named(good, tmp_path, make_scan) -> None:
+    """Each object of a good file is missing, misspelt, of another type or shape, not finite, boundless, or elsewhere."""
+    write_scan(good, scan_for(f"{EXTRA}/kinematics", make_scan))
+    objects: list[tuple[str, dict[str, Damage]]] = []
+    with h5py.File(good) as file:
+        file.visititems(lambda name, thing: objects.append((name, damages_of(thing))))
+    unread = {**HARMLESS_FLY, MASK[1:]: HARMLESS_COUNTS[MASK[1:]], f"{EXTRA[1:]}/grid": HARMLESS_COUNTS[MASK[1:]]}
+    for address, damages in objects:
+        for name in damages.keys() - set(unread.get(address, ())):
+            damaged = tmp_path / "damaged.h5"
+            shutil.copy(good, damaged)
+            on(address, damages[name])(damaged)
+            with pytest.raises(InputError) as caught:
+                read_scan(damaged, counts_to_attenuation)
+            assert caught.value.subject.startswith(f"{damaged}:/{address}"), (address, name, caught.value.subject)
 
 
 def test_damage_is_named(good, make_scan) -> None:
