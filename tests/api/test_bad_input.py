@@ -1,4 +1,4 @@
-"""Bad input at every name of the API: an InputError about its subject, in one line, and nothing half done."""
+"""Bad input at every name of the API: an InputError of a single line about its subject, and no file left."""
 
 import pickle
 import re

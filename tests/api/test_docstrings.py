@@ -1,4 +1,4 @@
-"""Every name of the API says what it takes and gives: parameters by name, shapes, units, errors."""
+"""The docstring of every name of the API states its parameters, shapes, units and errors."""
 
 import inspect
 import re
@@ -19,13 +19,13 @@ ARRAYS = ("ndarray", "NDArray", "ArrayLike", "Gaussians", "Scan")
 
 
 def said(name: str) -> str:
-    """The docstring of a name; nothing where dataclasses made it."""
+    """The docstring of a name; empty where a dataclass generated it."""
     doc = inspect.getdoc(getattr(api, name)) or ""
     return "" if doc.startswith(f"{name}(") else doc
 
 
 def parameters(thing: Any) -> list[inspect.Parameter]:
-    """What a function or a constructor takes, in so far as users give it."""
+    """The parameters of a function or a constructor that users give."""
     if inspect.isclass(thing) and (
         issubclass(thing, Exception | BaseException) or getattr(thing, "_is_protocol", False)
     ):
@@ -46,7 +46,7 @@ def members(name: str) -> Iterator[tuple[str, Any]]:
 
 
 def missing(name: str) -> list[str]:
-    """What the docstring of a name does not say."""
+    """The parts that the docstring of a name lacks."""
     thing, doc = getattr(api, name), said(name)
     if not doc:
         return ["a docstring"]

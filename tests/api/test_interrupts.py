@@ -1,4 +1,4 @@
-"""Ctrl-C in a script: the script stops, and what there is is not lost."""
+"""Ctrl-C in a script: the script stops, and the volume so far is not lost."""
 
 import signal
 import subprocess
@@ -159,7 +159,7 @@ def test_a_report_may_stop_the_run(rt, scan) -> None:
 
 
 class Screen:
-    """A stream that says of itself what it is."""
+    """A stream that is a terminal or not."""
 
     def __init__(self, is_terminal: bool) -> None:
         self.text, self.is_terminal = "", is_terminal
@@ -175,7 +175,7 @@ class Screen:
 
 
 class NotebookScreen(Screen):
-    """As a notebook's kernel has it."""
+    """The stream of a notebook's kernel."""
 
     __module__ = "ipykernel.iostream"
 
@@ -189,7 +189,7 @@ class NotebookScreen(Screen):
         (Screen(True), False, False),
         (Screen(True), lambda progress: None, False),
     ],
-    ids=["terminal", "notebook", "a file", "asked not to", "a report of one's own"],
+    ids=["terminal", "notebook", "a file", "asked not to", "a function"],
 )
 def test_a_line_tells_how_far_it_is(rt, scan, monkeypatch, screen, report, is_told) -> None:
     monkeypatch.setattr(sys, "stderr", screen)

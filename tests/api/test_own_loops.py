@@ -1,4 +1,4 @@
-"""Loops of one's own: nothing but scalars crosses the bus, and the examples reach what the methods reach."""
+"""Loops that users write: only scalars cross the bus, and the examples come near the methods."""
 
 import importlib.util
 import runpy

@@ -1,4 +1,4 @@
-"""Figures of scans and results: what they draw is what there is."""
+"""Figures of scans and results draw the values of the arrays."""
 
 import sys
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""Gradients by the poses of single views: against frames of views that were moved, and beside each other."""
+"""Gradients by the poses of single views: against differences of moved views, and volumes against clouds."""
 
 import numpy as np
 import pytest

@@ -186,7 +186,7 @@ def test_a_gradient_renders_nothing_again(rt, scan, cloud, monkeypatch) -> None:
         calls.clear()
         once = operator.T(misfit)
         assert calls == ["prepare"] * prepared
-        assert np.array_equal(operator.T(misfit), once)  # whose sums have taken the place of what was prepared
+        assert np.array_equal(operator.T(misfit), once)  # whose sums overwrite the prepared values
 
 
 @pytest.mark.parametrize("kind", ["rays", "densities"])

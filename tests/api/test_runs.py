@@ -67,7 +67,7 @@ def softened(volume: np.ndarray, noise: float, share: float = 0.9) -> np.ndarray
 
 
 class Softened:
-    """A denoiser with what no file could keep."""
+    """A denoiser with a part that no file can hold."""
 
     def __init__(self) -> None:
         self.lock = threading.Lock()  # that cannot be copied
@@ -77,7 +77,7 @@ class Softened:
 
 
 def test_a_prior_may_be_a_function(rt, scan, tmp_path) -> None:
-    """The facts have its name, by which a run goes on to the same bits, and with no other."""
+    """The facts have its name; a resumed run needs the same name and ends with the same bits."""
     usual = {"iterations": 4, "subvoxels": 1, "device": rt}
     named = {
         softened: f"{__name__}:softened",

@@ -26,7 +26,7 @@ PIXEL = 0.05
 
 
 def tigre(**changes: object) -> SimpleNamespace:
-    """A TIGRE geometry in which no two lengths are alike and nothing is centred."""
+    """A TIGRE geometry with different lengths and nothing centred."""
     own = {
         "mode": "cone", "DSO": 400.0, "DSD": 700.0, "nDetector": np.array(PANEL), "dDetector": np.array([4.0, 3.5]),
         "offDetector": np.array([5.0, -4.0]), "nVoxel": np.array([8, 10, 12]), "dVoxel": np.array([5.0, 4.5, 4.0]),

@@ -28,7 +28,7 @@ def sweep_folder(tiny_scan: Path, tmp_path: Path) -> Path:
 
 @pytest.fixture
 def start() -> Iterator[Start]:
-    """Starts a process in a group of its own; whatever is left of the group is killed with the test."""
+    """Starts a process in a new group, which is killed at the end of the test."""
     started: list[subprocess.Popen] = []
 
     def starting(*command: str, log: Path, **named: object) -> subprocess.Popen:

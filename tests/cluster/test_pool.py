@@ -1,4 +1,4 @@
-"""The workers: one device each, what they raise, what is said where they are missing."""
+"""The workers: one device each, their exceptions, and the messages where they are missing."""
 
 import os
 import shutil

@@ -86,7 +86,7 @@ def test_workers_killed_at_random_and_the_sweep_itself_once(sweep_folder, start,
 
 
 def test_a_sweep_goes_on_at_a_new_scheduler(sweep_folder, start, tmp_path) -> None:
-    """The scheduler goes away: the sweep says so in one line, and its command repeated makes what is missing."""
+    """When the scheduler ends, the sweep ends with a message; the same command makes the missing runs."""
     rng, log, port = np.random.default_rng(1), tmp_path / "log.txt", free_port()
     address = f"tcp://127.0.0.1:{port}"
 

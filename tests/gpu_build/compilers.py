@@ -1,7 +1,7 @@
 """Compiles OpenCL C for GPUs of three makers on a machine that has none, and reads what each kernel costs there.
 
-Needs clang-15 with libclc-15 (NVIDIA, AMD), ptxas (NVIDIA) and ocloc (Intel); ``make test-gpu-build`` unpacks them beside
-the environment, in the folder that GPU_COMPILERS names, and leaves the system as it is.
+Needs clang-15 with libclc-15 (NVIDIA, AMD), ptxas (NVIDIA) and ocloc (Intel); ``make test-gpu-build`` unpacks them into
+the folder that GPU_COMPILERS names and does not change the system.
 """
 
 import os
@@ -33,7 +33,7 @@ class KernelCost:
 
 
 class Refused(Exception):
-    """What a compiler said instead of building."""
+    """The message of a compiler that did not build."""
 
 
 def nvidia(source: Path, options: Sequence[str], folder: Path) -> list[KernelCost]:
@@ -44,7 +44,7 @@ def nvidia(source: Path, options: Sequence[str], folder: Path) -> list[KernelCos
 
 
 def ptxas_costs(text: str) -> list[KernelCost]:
-    """Of what ``ptxas -v`` prints."""
+    """Returns the costs from the output of ``ptxas -v``."""
     found = []
     for block in text.split("Compiling entry function ")[1:]:
         name, registers = _match(r"'(\w+)'", block), int(_match(r"Used (\d+) registers", block))
@@ -83,7 +83,7 @@ def intel(source: Path, options: Sequence[str], folder: Path) -> list[KernelCost
 
 
 def ocloc_costs(text: str, kernels: Sequence[str]) -> list[KernelCost]:
-    """Of what ocloc says of a program with these kernels."""
+    """Returns the costs from ocloc's output for a program with these kernels."""
     if "Build succeeded" not in text:
         raise Refused(text)
     spills = dict(re.findall(r"kernel (\w+)\s.*spilled around (\d+)", text))

@@ -62,7 +62,7 @@ def main() -> int:
 def _arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("room", choices=TESTS)
-    parser.add_argument("--count", type=int, help="draw so many of all mutants")
+    parser.add_argument("--count", type=int, help="number of mutants to draw")
     parser.add_argument("--seed", type=int, default=0)
     return parser.parse_args()
 

@@ -1,4 +1,4 @@
-"""Small wrong changes of a source text, one at a time: what a test suite should notice."""
+"""Small wrong changes of a source text, one at a time, which a test suite should notice."""
 
 import ast
 import copy

@@ -1,4 +1,4 @@
-"""What a mutant is: every kind of change, at its place, and nothing in texts and annotations."""
+"""Mutants: every kind of change, at its place, and none in texts and annotations."""
 
 import ast
 

@@ -4,7 +4,7 @@
     python tests/oclgrind/every_kernel.py BUILD CASE    one case; prints the kernels that it launched
 
 Oclgrind interprets kernels and reports accesses outside of buffers, data races and reads of memory that nobody wrote. Its
-log has to stay empty, and every kernel of cl/ has to have run. Each case has a process of its own because Oclgrind 21.10
+log has to stay empty, and every kernel of cl/ has to have run. Each case has its own process, because Oclgrind 21.10
 takes memory at an address that was freed for unwritten. Its min and max of a vector and a scalar are wrong beyond the first
 lane, so that builds with vectors cannot be run on it. Its check for unwritten memory knows neither float3 nor the compiler's
 "freeze", so that it is left out where kernels have them; bounds and races are checked in all.
@@ -176,7 +176,7 @@ def run_one(build: str, case: str) -> int:
 
 
 def checked(build: str, case: str, log: Path) -> tuple[set[str], str]:
-    """The kernels of a case in a process of its own, and what is wrong with them ("" if nothing)."""
+    """Runs a case in its own process; returns its kernels, and Oclgrind's reports ("" if none)."""
     log.unlink(missing_ok=True)
     unwritten = build not in FREEZES and not case.startswith(VECTORS_OR_FREEZES)
     checks = {"OCLGRIND_DATA_RACES": "1", **({"OCLGRIND_UNINITIALIZED": "1"} if unwritten else {})}

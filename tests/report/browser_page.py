@@ -97,7 +97,7 @@ def picture(page: Page, plane: str) -> str:
 
 
 def hover(page: Page, plane: str, right: float, up: float) -> None:
-    """Moves the pointer to a share of a picture's width and height."""
+    """Moves the pointer to fractions of a picture's width and height."""
     box = page.locator(f"#plane-{plane} .picture").bounding_box()
     page.mouse.move(box["x"] + right * box["width"], box["y"] + (1 - up) * box["height"])
 

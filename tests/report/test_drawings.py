@@ -1,4 +1,4 @@
-"""Charts of geometry, shutter and curves: what they draw, for every kind of scan."""
+"""Charts of geometry, shutter and curves, for every kind of scan."""
 
 import re
 from collections.abc import Callable
@@ -52,7 +52,7 @@ def test_every_kind_of_scan_is_drawn_with_finite_numbers(kinds) -> None:
 
 
 def test_a_chart_is_of_its_page(small_scan) -> None:
-    """It names itself, loads nothing, has the page's colours, and shares no name with another chart."""
+    """A chart has a label, loads nothing, uses the page's colours, and shares no id with another chart."""
     first, second = scan_charts.orbit_chart(small_scan), scan_charts.side_chart(small_scan)
     assert 'aria-label="Geometry from above. 8 source positions' in first and 'role="img"' in first
     for svg in (first, second):

@@ -1,4 +1,4 @@
-"""The page of a run: whole, on its own, with the right numbers, and safe from what files say."""
+"""The page of a run: complete, self-contained, with the right numbers, and safe from hostile text in files."""
 
 import base64
 import hashlib
@@ -275,7 +275,7 @@ def test_steps_before_the_method_are_shown(rt, small_scan, tmp_path, parse) -> N
 
 
 def test_what_a_calibration_says_of_itself_may_be_anything(rt, small_scan, tmp_path, parse) -> None:
-    """Shown where it is what it should be, in full; the page is written whatever it is, and nothing of it is markup."""
+    """Sound values are shown in full; any other value leaves the page whole, and none becomes markup."""
     line = {"name": "roll", "unit": "deg", "stated": 0.0, "found": 0.5, "deviation": 0.1, "verdict": "corrected"}
     views = {"shift_u_mm": [0.1] * small_scan.frames, "turn_deg": [1.0], "<b>": ["x"] * small_scan.frames, "none": "text"}
     good = {"parameters": [line, {"name": "<i>x</i>"}, 3], "alike": ["a against b"], "views": views, "residual_rms_after": 2}

@@ -1,4 +1,4 @@
-"""A sweep's file: what it expands to, and that everything wrong in it is named before any run."""
+"""A sweep's file: its runs, and the errors that are raised before any run."""
 
 import os
 import shutil
@@ -16,7 +16,7 @@ MANY = list(range(1, 400))
 
 @pytest.fixture
 def read(tmp_path: Path, tiny_scan: Path):
-    """A function from the text of GRID.toml, beside two scans, to what it asks for."""
+    """A function that writes GRID.toml next to two scans and reads it."""
     for name in ("a.h5", "b.h5"):
         shutil.copy(tiny_scan, tmp_path / name)
 

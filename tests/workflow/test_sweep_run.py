@@ -1,4 +1,4 @@
-"""Sweeps in one process: resumed, failures noted and tried again, results and tables; without Dask they say so."""
+"""Sweeps in one process: resumed, failures noted and tried again, results and tables, and a message without Dask."""
 
 import csv
 import json
@@ -128,7 +128,7 @@ def test_a_result_that_was_lost_on_its_way_is_not_made_again(job) -> None:
     first = sweep_run.make_run(run)
     made_ns = run.output.stat().st_mtime_ns
     assert sweep_run.make_run(run) == first and run.output.stat().st_mtime_ns == made_ns
-    run.output.unlink()  # whoever removes a volume wants it anew
+    run.output.unlink()  # a removed volume is made again
     assert sweep_run.make_run(run)["finished"] >= first["finished"] and run.output.exists()
 
 

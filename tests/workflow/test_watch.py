@@ -41,7 +41,7 @@ def drop(job: WatchJob, tiny_scan: Path):
 
 
 def watched(job: WatchJob, rt: Runtime) -> list[WatchEvent]:
-    """What a watch that ends when nothing is left has told."""
+    """Runs a watch until nothing is left, and returns its events."""
     told: list[WatchEvent] = []
     run_watch(job, lambda: rt, told.append)
     return told
@@ -138,7 +138,7 @@ def test_defects_and_too_little_memory_keep_no_other_scan_waiting(job, drop, rt,
 
 
 def test_devices_and_disks_that_fail_are_no_fault_of_a_scan(job, drop, rt, monkeypatch) -> None:
-    """A lost device is opened anew; one that is gone, or a full disk, ends the watch."""
+    """A lost device is opened again; one that is gone, or a full disk, ends the watch."""
     drop("a.h5")
     original, opened, told = watch_module.resume_or_restart, [], []
 

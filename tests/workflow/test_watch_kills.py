@@ -42,7 +42,7 @@ class Volumes(threading.Thread):
 
 
 def drop(tiny_scan: Path, folder: Path, number: int) -> None:
-    """A scan of its own: renamed into place, or written slowly in two pieces."""
+    """Writes a scan: renamed into place, or written slowly in two pieces."""
     part, target = folder / f".{number}.part", folder / f"scan{number:03d}.h5"
     shutil.copy(tiny_scan, part)
     with h5py.File(part, "r+") as file:
