@@ -23,10 +23,10 @@ class TimeCells:
     (C, lines) multiplies the weight of a still cell by the fraction of each line's window that lies in the cell; None: 1 for
     every line of the cell.
 
-    Moving cells are segments of the frame. ``end_poses`` (C, 2, 12) are the poses at their ends. ``line_times`` (C, 3,
-    lines) holds for each line the middle and half the length of its window in the segment, in units of the segment's length
-    from its mid-time, and the fraction of the line's window that lies in the segment. Their ``weight`` is 1. Methods raise
-    InputError for a user-defined cells that do not fit the scan.
+    Moving cells are segments of the frame, of ``weight`` 1. ``end_poses`` (C, 2, 12) are the poses at their ends.
+    ``line_times`` (C, 3, lines) describes the part of each line's window in the segment: its middle and half its length, in
+    units of the segment's length from its mid-time, and its fraction of the whole window. Methods raise InputError for
+    user-defined cells that do not fit the scan.
     """
 
     pose: np.ndarray
