@@ -1,21 +1,22 @@
-"""Launches of the ray-driven projector (Joseph) and its matched adjoint: cells of many frames at a time."""
+"""Launches of the ray-driven projector (Joseph) and its matched adjoint, over the time cells of many frames at a time."""
 
 import math
 from collections.abc import Iterator
 
 import numpy as np
 
+from phyradgs_cl.checks import ceil_div
 from phyradgs_cl.operators.rays.layout import RayCells, RayLayout
 from phyradgs_cl.runtime import DeviceArray, Runtime
 from phyradgs_cl.runtime.layout import GUARD
 
-# voxels (x, y, z) of one owner where work-items are bricks; kept in local memory, with a border of 1 around
+# On a CPU a work-item of the adjoint owns a brick of voxels (x, y, z), in local memory with a border of 1 around it.
 _BRICK = (32, 32, 8)
-_SMALL_BRICK = (24, 24, 8)  # 27 kB of the 32 that OpenCL promises
-_BLOCK = 4  # voxels per side of what a work-group takes where work-items are voxels; as in cl/rays.cl
-_SAMPLES_PER_VOXEL = 4  # of a view that the adjoint takes, about
-_LONG_FROM = 2**31  # floats: where 32-bit indices end
-_MOST_SAMPLES = 2**29  # of a GPU's launch: a tenth of a second on a slow one, whose screen's driver ends long ones
+_SMALL_BRICK = (24, 24, 8)  # 27 kB of the 32 that OpenCL guarantees
+_BLOCK = 4  # on a GPU a work-group owns a block with this many voxels per side; as in cl/rays_adjoint_gpu.cl
+_SAMPLES_PER_VOXEL = 4  # about as many samples of a view touch a voxel
+_LONG_FROM = 2**31  # floats that 32-bit indices cannot address
+_MOST_SAMPLES = 2**29  # of a GPU's launch: 0.1 s on a slow one; the driver of a screen ends long launches
 AVERAGES = ("log", "intensity", "correction")  # correction: log minus intensity; in the order of cl/rays.cl
 
 
@@ -30,29 +31,23 @@ def launch_forward(
     average: str = "log",
     add: bool = False,
 ) -> None:
-    """The listed frames of a padded volume, into ``frames``; ``average``, one of AVERAGES, is over a line's cells.
+    """Projects a padded volume to the listed frames. ``average``, one of AVERAGES, is taken over the cells of a line.
 
-    ``add`` lays them onto what is there: line integrals of several bricks, for ``log`` alone.
+    ``add`` adds line integrals to those in ``frames``, as several bricks of a volume need it; for ``log`` alone.
     """
-    blocks = -(-layout.width // rt.lanes)
-    kernel = rt.kernel("rays", "rays_forward", **_defines(rt, layout, average))
+    blocks = ceil_div(layout.width, rt.lanes)
+    kernel = rt.kernel("rays", "rays_forward", AVERAGE=AVERAGES.index(average), **_defines(layout))
     for first, stop in _parts(rt, frame_list.size, layout.lines * layout.width * max(layout.brick.shape)):
         rt.launch(
             kernel,
             (blocks, layout.lines, stop - first),
             volume,
-            cells.cells,
-            cells.cell_lines,
-            cells.line_cells,
-            frame_list,
-            cells.weights,
-            cells.weight_at,
+            cells.cells, cells.cell_lines, cells.line_cells, frame_list, cells.weights, cells.weight_at,
             *layout.constants(),
-            np.int32(first),
-            np.int32(add),
+            np.int32(first), np.int32(add),
             frames,
             group=rt.group(on_cpu=min(blocks, 8)),
-        )
+        )  # fmt: skip
 
 
 def launch_adjoint(
@@ -65,61 +60,50 @@ def launch_adjoint(
     *,
     add: bool = False,
 ) -> None:
-    """Sums the listed frames onto a padded volume."""
+    """Backprojects the listed frames into a padded volume; ``add`` keeps the sums that are in it."""
+    if rt.pixel_items:
+        owned, program, defines = (_BLOCK,) * 3, "rays_adjoint_gpu", _defines(layout)
+    else:
+        owned, program = brick_of(rt), "rays_adjoint_cpu"
+        defines = _defines(layout) | dict(zip(("BRICK_X", "BRICK_Y", "BRICK_Z"), owned, strict=True))
     nz, ny, nx = layout.brick.shape
-    bx, by, bz = (_BLOCK,) * 3 if rt.pixel_items else brick_of(rt)
-    owners = (-(-nx // bx), -(-ny // by), -(-nz // bz))
+    columns, rows, slices = (ceil_div(n, side) for n, side in zip((nx, ny, nz), owned, strict=True))
     group = rt.group(on_cpu=1, on_gpu=_BLOCK**3)
-    kernel = rt.kernel("rays", "rays_adjoint", **_defines(rt, layout, "log"))
+    kernel = rt.kernel(program, "rays_adjoint", **defines)
     for first, stop in _parts(rt, frame_list.size, _SAMPLES_PER_VOXEL * nz * ny * nx):
+        adds = add or first > 0  # a launch continues the sums of the launch before: the same bits as one launch
         rt.launch(
             kernel,
-            (owners[0] * group, *owners[1:]),
+            (columns * group, rows, slices),
             frames,
-            cells.cells,
-            cells.cell_lines,
-            cells.matrices,
-            np.int32(cells.matrix_stride),
-            cells.frame_cells,
-            frame_list,
-            cells.weights,
-            cells.weight_at,
-            np.int32(first),
-            np.int32(stop),
+            cells.cells, cells.cell_lines, cells.matrices, np.int32(cells.matrix_stride),
+            cells.frame_cells, frame_list, cells.weights, cells.weight_at,
+            np.int32(first), np.int32(stop),
             *layout.constants(),
-            np.int32(add or first > 0),  # onto what the launch before has left: the same sums, bit for bit
+            np.int32(adds),
             volume,
             group=group,
-        )
+        )  # fmt: skip
 
 
 def _parts(rt: Runtime, frames: int, samples_per_frame: int) -> Iterator[tuple[int, int]]:
-    """First frame and the one after the last of each launch: all in one on a CPU, few enough on a GPU."""
+    """Yields the first frame of each launch and the one after its last. On a CPU one launch takes all frames."""
     step = max(_MOST_SAMPLES // samples_per_frame, 1) if rt.pixel_items else frames
     for first in range(0, frames, step):
         yield first, min(first + step, frames)
 
 
 def brick_of(rt: Runtime) -> tuple[int, int, int]:
-    """Voxels (x, y, z) that a work-item of the adjoint owns: larger bricks share fewer rays, 14 % faster."""
+    """Voxels (x, y, z) that a CPU's work-item owns. Larger bricks share fewer rays with their neighbours: 14 % faster."""
     tile_bytes = 4 * math.prod(n + 2 for n in _BRICK)
     return _BRICK if rt.device.handle.local_mem_size >= tile_bytes else _SMALL_BRICK
 
 
 def owner_steps(rt: Runtime) -> tuple[int, int]:
-    """Voxels (z, y) of which the adjoint's owners are made: bricks that are multiples have the bits of the whole."""
+    """Voxels (z, y) that one owner has: a volume cut at multiples of them gives the bits of the uncut volume."""
     x, y, z = brick_of(rt)
     return (_BLOCK, _BLOCK) if rt.pixel_items else (z, y)
 
 
-def _defines(rt: Runtime, layout: RayLayout, average: str) -> dict[str, int]:
-    x, y, z = brick_of(rt)
-    return {
-        "AVERAGE": AVERAGES.index(average),
-        "IMAGE_GUARD": GUARD,
-        "BRICK_X": x,
-        "BRICK_Y": y,
-        "BRICK_Z": z,
-        "RAY_VOXEL_ITEMS": int(rt.pixel_items),
-        "RAY_LONG": int(layout.volume_floats >= _LONG_FROM),
-    }
+def _defines(layout: RayLayout) -> dict[str, int]:
+    return {"IMAGE_GUARD": GUARD, "RAY_LONG": int(layout.volume_floats >= _LONG_FROM)}
