@@ -1,6 +1,7 @@
 """What a user says in a data sheet's words, at each door in the words of that door; and the TOML to fill in."""
 
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -201,3 +202,23 @@ def test_names_that_are_no_series_and_angles_in_radians(run, tmp_path) -> None:
     stated = tomllib.loads(run(folder, "--template", out=())[1])
     assert stated["title"] == "odd 😀" and stated["angles"] == {"file": "theta.txt", "unit": "rad"}
     assert stated["frames"] == {"projections": "stack.tif", "flats": "White.tif", "darks": "DARK.tif"}
+
+
+CONE = ImportOptions(source_to_axis_mm=500.0, source_to_detector_mm=800.0)
+SAID = {
+    "exposure_s": {"exposure_s": 0.4}, "readout_s": {"readout_s": 0.3}, "angle_at": {"angle_at": "middle"},
+    "readout_axis": {"readout_axis": "rows"}, "readout_direction": {"readout_direction": -1},
+    "first": {"first": "left"}, "readout_ms": {"readout_ms": 300.0},
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("form", ["r2", "naf", "rtk", "data-exchange", "nxtomo", "tiff"])
+def test_a_turn_without_a_frame_time_is_refused(tmp_path, make_truth, form) -> None:
+    """The same way in every format."""
+    path, options = w.write(form, tmp_path, make_truth), CONE if form == "data-exchange" else ImportOptions()
+    for name, said in SAID.items():
+        with pytest.raises(InputError, match=f"^{name}: .*time from frame to frame.*say .*frame_time_s or .*fps"):
+            import_scan(path, replace(options, **said), form)
+        timed = replace(options, frame_time_s=1.25, **{"exposure_s": 0.4, **said})
+        assert import_scan(path, timed, form).is_fly
+    assert not import_scan(path, options, form).is_fly
