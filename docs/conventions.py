@@ -121,7 +121,7 @@ def _draw_file(axes: Axes) -> None:
 
 
 def _draw_pixels(axes: Axes, marked: tuple[int, int], words: dict[tuple[int, int], str]) -> None:
-    """Draws all pixels, row 0 below; ``marked`` is the shadow, ``words`` stand in the pixels (row, column)."""
+    """Draws all pixels, row 0 below; ``marked`` is the shadow, ``words`` are written into the pixels (row, column)."""
     rows, columns = GEOMETRY.detector_shape
     for row, column in np.ndindex(rows, columns):
         face = SAMPLE if (row, column) == marked else EXPOSED if (row, column) in words else "white"

@@ -17,7 +17,7 @@ from phyradgs_cl.drawing import SAMPLE
 from phyradgs_cl.metrics import psnr
 from phyradgs_cl.runtime import Runtime
 
-_HEIGHT = 0.28  # of the slice that is shown, as a share of the volume's
+_HEIGHT = 0.28  # of the slice, relative to the volume
 _CROP = slice(0.28, 0.98), slice(0.33, 0.69)  # of that slice along y and x: the foot
 _SMALL = 10
 
@@ -36,7 +36,7 @@ def methods_figure() -> Figure:
 
 
 def check_figure(size: int = 48) -> Figure:
-    """A scan whose panel stands three pixels beside where it is stated, before and after `check --fix-offset`."""
+    """A scan whose panel is three pixels off its stated place, before and after `check --fix-offset`."""
     offset_mm = 3 * 4 / (2 * size)
     right = simulate("foot", size=size, detector=2 * size, noise="tigre", dose=1e4, detector_offset_mm=(0.0, offset_mm))
     stated = _with_offset(right, 0.0)

@@ -1,17 +1,17 @@
 """Draws the figures of the documentation into docs/images: python docs/figures.py [NAME ...], by default all.
 
-shutter.png        exposure and readout of one frame, and its cut into strips and sub-intervals
-exact_splat.png    a wide Gaussian's line integrals: the exact splat and the affine one against quadrature
-time_sampling.png  what the simulator's time samples and the micro-views leave of a fine average
+shutter.png        exposure and readout of one frame, and its cut into strips and sub-intervals.
+exact_splat.png    line integrals of a wide Gaussian: exact and affine splat against quadrature.
+time_sampling.png  error of the simulator's time samples and of micro-views against a fine average.
 
-conventions.png    gantry, panel and image file: how angle, rows and columns belong together
+conventions.png    gantry, panel and image file: conventions of angle, rows and columns.
 
-scan_plot.png      what ``scan.plot`` draws
-result_plot.png    what ``result.plot`` draws
-methods.png        one scan by five methods
-check.png          a wrong offset, and after ``check --fix-offset``
-calibrate.png      a panel that stands elsewhere, and after ``calibrate``
-motion.gif         the motion ignored, then known: from the volumes of ``make demo`` in demo/ (or $DEMO)
+scan_plot.png      ``scan.plot``.
+result_plot.png    ``result.plot``.
+methods.png        one scan by five methods.
+check.png          a wrong offset, and after ``check --fix-offset``.
+calibrate.png      a shifted, rolled and tilted panel, and after ``calibrate``.
+motion.gif         the motion ignored, then known: from the volumes of ``make demo`` in demo/ (or $DEMO).
 
 The first four are computed on the spot in float64 and need no OpenCL device. ``make demo`` draws demo.png.
 """

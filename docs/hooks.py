@@ -1,4 +1,4 @@
-"""What mkdocs needs to know of these pages: formulas become MathML, which browsers draw without scripts or network."""
+"""Hooks of mkdocs: formulas become MathML, which browsers draw without scripts or network."""
 
 import re
 from typing import Any
@@ -49,5 +49,5 @@ class _Inline(InlineProcessor):
 
 
 def _plain(formula: str) -> str:
-    """One line, with what latex2mathml draws wrongly written another way."""
+    """One line, rewritten where latex2mathml draws it wrongly."""
     return " ".join(formula.split()).replace(r"\big", "").replace(r"\Big", "")
