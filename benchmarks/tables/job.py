@@ -11,7 +11,7 @@ from phyradgs_cl.acquisition import PROTOCOLS
 from phyradgs_cl.acquisition.shutter import AXES
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
-from phyradgs_cl.neural.requirement import INSTALL
+from phyradgs_cl.neural import INSTALL
 from phyradgs_cl.reconstructors.splats.options import SplatOptions
 from tables.case import FLY, STILL
 from tables.identity import content_hash

@@ -16,7 +16,7 @@ from phyradgs_cl.errors import InputError, NumericalError, OutputError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.importers import load_attenuation
 from phyradgs_cl.io import file_kind, only_run
-from phyradgs_cl.neural.requirement import INSTALL
+from phyradgs_cl.neural import INSTALL
 from phyradgs_cl.reconstructors import Progress, ProgressReport, RunPlan, reconstruct
 from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.runtime.environment import environment

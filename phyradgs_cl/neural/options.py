@@ -1,4 +1,4 @@
-"""What the neural methods can be told; constants and ranges, without PyTorch."""
+"""Options of the neural methods, with their ranges. Loads without PyTorch."""
 
 import math
 from dataclasses import dataclass
@@ -43,19 +43,18 @@ _FINEST = 2**24  # cells along a side: beyond it float32 coordinates have no fra
 class NeuralOptions:
     """A field on a hash encoding and a small network, fitted to rays.
 
-    iterations: passes over all frames, of one step per frame. rays: pixels per step. samples: along a ray inside the volume,
-    0 for 1.5 per voxel of the longest side, 1.2 for each of several times. jitter: of the samples: one random shift
-    a ``ray``, one a ``sample`` inside its own interval, ``none``. times: how many of a line's a step looks at, drawn anew
-    for each pixel; 0: all of them. positive_only: pixels with a line integral above 0 only. voxel_points: along each side
-    of a voxel, which is the field's mean over their cube.
+    iterations: passes over all frames, with one step per frame. rays: pixels per step. samples: along a ray inside the
+    volume; 0: 1.5 per voxel of the longest side, 1.2 for a ray of several times. jitter: random shift of the samples: one
+    per ``ray``, one per ``sample`` inside its own interval, or ``none``. times: how many times of a line a step uses, drawn
+    for each pixel; 0: all of them. positive_only: use only pixels with a line integral above 0. voxel_points: points along
+    each side of a voxel, whose value is the field's mean over them.
 
-    levels (0: until the finest has a cell a voxel), features, base_resolution (cells along a side), level_growth,
-    table_log2 (most entries of a level): the encoding.
-    layers, width: the network. last_activation: its end; for a sigmoid density_bound, its largest value in units of FDK's
-    99.9th percentile, and first_share, the share of it at which the field starts everywhere. rate, rate_factor, rate_step:
-    Adam's rate, multiplied by the factor every so many passes; step 0 spreads one factor over the run. detector_model: what
-    is averaged over a line's times, or what the scan says.
-    torch_device: where PyTorch works.
+    The encoding: levels (0: until the finest has one cell per voxel), features, base_resolution (cells along a side),
+    level_growth, table_log2 (most entries of a level).
+    The network: layers, width, last_activation. A sigmoid has a density_bound, its largest value in units of FDK's 99.9th
+    percentile, and a first_share of it at which the field starts everywhere. The rate of Adam is multiplied by rate_factor
+    every rate_step passes; step 0 spreads one factor over the run. detector_model: which quantity the detector averages over
+    a line's times, or the model that the scan states (scan). torch_device: the device of PyTorch.
     """
 
     MOTIONS: ClassVar[tuple[Motion, ...]] = motions_for(RAYS)
@@ -98,7 +97,7 @@ class NeuralOptions:
         check_motion(self.motion, self.MOTIONS)
 
     def levels_for(self, longest_voxels: int) -> int:
-        """Levels of the encoding for a volume of so many voxels along its longest side."""
+        """Returns the levels of the encoding for a volume with ``longest_voxels`` along its longest side."""
         if self.levels or self.level_growth == 1:
             return max(self.levels, 1)
         steps = math.log(CELLS_PER_VOXEL * longest_voxels / self.base_resolution, self.level_growth)
@@ -106,15 +105,15 @@ class NeuralOptions:
         return 1 + max(math.ceil(min(steps, finest) - 1e-9), 0)
 
     def samples_for(self, longest_voxels: int, times: int = 1) -> int:
-        """Samples along each ray of a pixel of so many ``times``, for so many voxels along the longest side."""
+        """Returns the samples along each ray of a pixel with ``times``, for the voxels along the longest side."""
         density = SAMPLES_PER_VOXEL if times == 1 else SAMPLES_PER_TIME
         return self.samples or max(round(density * longest_voxels), 2)
 
     def times_for(self, count: int, model: str) -> int:
-        """How many of the ``count`` times of a line a step looks at.
+        """Returns how many of the ``count`` times of a line a step uses.
 
-        Raises InputError for a number that would be biased: one time leaves no measure of the spread that a square adds, and
-        the logarithm of a mean intensity is not the mean over subsets.
+        Raises InputError for a number that would bias the loss. One time gives no estimate of the variance that the square
+        adds, and the logarithm of a mean intensity is not the mean over subsets.
         """
         if self.times == 0:
             return count
@@ -129,9 +128,9 @@ class NeuralOptions:
 
 @dataclass(frozen=True)
 class LineOptions(NeuralOptions):
-    """The same with a transformer over line segments, and windows of neighbouring pixels beside the scattered rays.
+    """Options of a field with a transformer over line segments, and windows of pixels beside the scattered ones.
 
-    segment: samples of a line segment. heads, head_width, blocks: of its attention. windows: a step, each of ``window``
+    segment: samples of a line segment. heads, head_width, blocks: of its attention. windows: per step, each of ``window``
     by ``window`` pixels.
     """
 
@@ -155,5 +154,5 @@ class LineOptions(NeuralOptions):
         checks.fields_within("", self, ranges)
 
     def samples_for(self, longest_voxels: int, times: int = 1) -> int:
-        """As for every field, in whole segments."""
-        return -(-super().samples_for(longest_voxels, times) // self.segment) * self.segment
+        """Returns the samples of every field, rounded up to whole segments."""
+        return checks.ceil_div(super().samples_for(longest_voxels, times), self.segment) * self.segment

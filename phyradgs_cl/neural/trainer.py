@@ -1,4 +1,4 @@
-"""One step after the other of fitting a field to a scan's rays, and the state between two of them."""
+"""Fits a field to a scan's rays, step by step; its state lies between two steps."""
 
 import json
 
@@ -7,21 +7,18 @@ import torch
 
 from phyradgs_cl.acquisition import OwnTimes, PerRow, Scan
 from phyradgs_cl.fields import Grid
-from phyradgs_cl.neural.arrays import to_array, to_tensor
-from phyradgs_cl.neural.field.on_grid import NeuralField, voxel_values
+from phyradgs_cl.neural.field import NeuralField, voxel_values
+from phyradgs_cl.neural.integrals import intensity_average, line_integrals, log_squares, sample_shifts
 from phyradgs_cl.neural.options import LineOptions, NeuralOptions
-from phyradgs_cl.neural.rays.average import intensity_average, log_squares
-from phyradgs_cl.neural.rays.exposure import ExposureRays
-from phyradgs_cl.neural.rays.integral import line_integrals, sample_shifts
-from phyradgs_cl.neural.rays.pixel_choice import chosen_times, scattered_pixels, windows_and_scattered_pixels
-from phyradgs_cl.neural.torch_device import repeatable
+from phyradgs_cl.neural.rays import ExposureRays, chosen_times, scattered_pixels, windows_and_scattered_pixels
+from phyradgs_cl.neural.tensors import repeatable, to_array, to_tensor
 
 _BETAS, _EPSILON = (0.9, 0.999), 1e-8
 _POINTS_ON_CPU, _POINTS_ELSEWHERE = 2**14, 2**20  # at once: a cache's, a GPU's
 
 
 class Trainer:
-    """A field, its optimiser and what is drawn at random: everything that changes from step to step.
+    """A field, its optimiser and the random draws: the state that changes from step to step.
 
     Lengths are in units of half the volume's longest side, attenuation in units of ``density_per_mm``.
     """
@@ -41,7 +38,7 @@ class Trainer:
         self.unit = density_per_mm * scan.grid.half_longest_mm  # of line integrals
         self.rng = np.random.default_rng(seed)
         motion = options.motion
-        if isinstance(motion, PerRow):  # a field is asked for each ray by itself: common times would save nothing
+        if isinstance(motion, PerRow):  # the field evaluates each ray by itself: common times would save nothing
             motion = OwnTimes(motion.sub_intervals)
         tables = [motion.cells(scan, frame).still() for frame in range(scan.frames)]
         self.rays = [ExposureRays.of_cells(table, scan.grid) for table in tables]
@@ -69,11 +66,11 @@ class Trainer:
 
     @property
     def parameters(self) -> int:
-        """How many numbers are fitted."""
+        """Number of fitted parameters."""
         return sum(p.numel() for p in self.field.parameters())
 
     def step(self) -> None:
-        """One frame: some pixels, their rays, the squared error, and Adam; its loss goes to ``losses``."""
+        """Draws pixels of one frame, steps down the gradient of their squared error, and appends the loss to ``losses``."""
         if self.is_between_passes:
             self.losses = []
         frame = self.queue.pop()
@@ -100,7 +97,7 @@ class Trainer:
         return values * np.float32(self.density_per_mm)
 
     def state(self) -> dict[str, np.ndarray]:
-        """Everything that the next step depends on, and the losses of the pass so far."""
+        """Returns the arrays that the next step depends on, and the losses of the pass so far."""
         moments = [self._flat([self._moments(p)[k] for p in self.field.parameters()]) for k in range(2)]
         return {
             "parameters": self._flat([p.detach() for p in self.field.parameters()]),
@@ -113,7 +110,7 @@ class Trainer:
         }
 
     def restore(self, parameters: np.ndarray, moments: np.ndarray, updates: int) -> None:
-        """Goes on from values (n,) and Adam's moments (2, n) after so many updates; the rest is set by itself."""
+        """Sets the field's values (n,) and Adam's moments (2, n) after ``updates`` of them."""
         first = 0
         with torch.no_grad():
             for p in self.field.parameters():
@@ -125,8 +122,6 @@ class Trainer:
                     self._adam.state[p] = {"step": step, "exp_avg": mean, "exp_avg_sq": square}
                 first += p.numel()
         self.updates = updates
-
-    # --- one step -----------------------------------------------------------------------------------------
 
     def _shuffled(self) -> list[int]:
         return self.rng.permutation(self.scan.frames).tolist()
@@ -185,8 +180,6 @@ class Trainer:
         if self.model == "intensity":
             return (intensity_average(integrals, self.unit) - wanted) ** 2
         return log_squares(integrals, wanted, times)
-
-    # --- the optimiser's state ----------------------------------------------------------------------------
 
     def _moments(self, parameter: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         state = self._adam.state.get(parameter)

@@ -1,8 +1,7 @@
 """Optimisation of Gaussians: Adam, learning-rate schedules, density control."""
 
-from phyradgs_cl.optim.adam import DeviceAdam, adam_step
+from phyradgs_cl.optim.adam import PUBLISHED_RATES, DeviceAdam, Rates, adam_step
 from phyradgs_cl.optim.density_control import DensityControl, Population, control_density, prune
-from phyradgs_cl.optim.schedules import PUBLISHED_RATES, Rates
 
 __all__ = [
     "PUBLISHED_RATES",

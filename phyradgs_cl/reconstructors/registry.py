@@ -48,8 +48,8 @@ METHODS = _Methods({
     "asd-pocs": "voxels.asd_pocs",
     "fista": "voxels.fista",
     "fista-tv": "voxels.fista_tv",
-    "naf": "neural.naf",
-    "sax-nerf": "neural.sax_nerf",
+    "naf": "neural:NAF",
+    "sax-nerf": "neural:SAX_NERF",
     "fused": "fused",
     "fdk": "fdk",
 })

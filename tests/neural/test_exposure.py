@@ -10,9 +10,8 @@ from tolerances import FINITE_DIFFERENCE_STEP, FLOAT64, GRADIENT
 
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.neural import NeuralOptions
-from phyradgs_cl.neural.field.start import first_field
-from phyradgs_cl.neural.rays.average import intensity_average, log_squares
-from phyradgs_cl.neural.rays.integral import line_integrals, sample_shifts
+from phyradgs_cl.neural.field import first_field
+from phyradgs_cl.neural.integrals import intensity_average, line_integrals, log_squares, sample_shifts
 
 RAYS, TIMES, SAMPLES = 6, 5, 24
 SMALL = NeuralOptions(levels=2, base_resolution=3, width=8, first_share=0.3)

@@ -10,13 +10,13 @@ from phyradgs_cl.__main__ import load_cli
 from phyradgs_cl.api import Scan, compare, reconstruct, save_scan, simulate
 from phyradgs_cl.errors import InputError, NumericalError
 from phyradgs_cl.io import checkpoint_path, read_volume
-from phyradgs_cl.neural.field.start import first_field
+from phyradgs_cl.neural.field import first_field
 from phyradgs_cl.neural.trainer import Trainer
 from phyradgs_cl.parallel import Alone
 from phyradgs_cl.reconstructors import METHODS, RunPlan, method_options
 from phyradgs_cl.reconstructors import reconstruct as run_method
 from phyradgs_cl.reconstructors.loop import Loop
-from phyradgs_cl.reconstructors.neural.run import _Passes
+from phyradgs_cl.reconstructors.neural import _Passes
 from phyradgs_cl.reconstructors.result import Progress, ignore_progress
 
 NEURAL = ("naf", "sax-nerf")

@@ -11,8 +11,8 @@ from phyradgs_cl.acquisition import MicroViews, PerRow
 from phyradgs_cl.acquisition.geometry import pixel_centres
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.neural import NeuralOptions
-from phyradgs_cl.neural.rays.exposure import ExposureRays
-from phyradgs_cl.neural.rays.integral import box_span, line_integrals, sample_shifts
+from phyradgs_cl.neural.integrals import box_span, line_integrals, sample_shifts
+from phyradgs_cl.neural.rays import ExposureRays
 
 VOXELS = 64  # of the longest side; 96 samples per ray by default
 CENTRE, AXES = np.array([0.1, -0.2, 0.05]), np.array([0.45, 0.3, 0.5])

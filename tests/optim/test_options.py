@@ -7,7 +7,7 @@ import pytest
 
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.optim import DensityControl, Rates
-from phyradgs_cl.optim.schedules import PUBLISHED_RATES
+from phyradgs_cl.optim.adam import PUBLISHED_RATES
 
 # what the command line accepts (docs/reference/cli.md says the defaults)
 RANGES = {

@@ -4,10 +4,10 @@ import importlib.util
 
 import pytest
 
+from phyradgs_cl import neural
 from phyradgs_cl.__main__ import load_cli
 from phyradgs_cl.api import save_scan, simulate
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.neural import has_accelerator, requirement
 from phyradgs_cl.reconstructors import method_options, plan_run, reconstruct
 
 NEURAL = ("naf", "sax-nerf")
@@ -15,7 +15,7 @@ NEURAL = ("naf", "sax-nerf")
 
 @pytest.fixture
 def without_pytorch(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(requirement, "has_torch", lambda: False)
+    monkeypatch.setattr(neural, "has_torch", lambda: False)
 
 
 @pytest.mark.usefixtures("without_pytorch")
@@ -37,8 +37,8 @@ def test_options_are_checked_all_the_same() -> None:
     assert method_options("naf", None, {"motion": "per-row"}).motion.name == "per-row"
     with pytest.raises(InputError, match="--motion"):
         method_options("naf", None, {"motion": "exact"})
-    assert not has_accelerator()
+    assert not neural.has_accelerator()
 
 
 def test_pytorch_is_there_where_it_is_found() -> None:
-    assert requirement.has_torch() == (importlib.util.find_spec("torch") is not None)
+    assert neural.has_torch() == (importlib.util.find_spec("torch") is not None)

@@ -1,9 +1,12 @@
-"""Neural fields: scan and options to trainer, and the trainer to the loop.
+"""The neural methods ``naf`` and ``sax-nerf``: a field fitted to a scan's rays. A run imports PyTorch when it begins.
 
-The one place where the scan, the field and its training meet; PyTorch is imported when a run begins.
+NAF: R. Zha, Y. Zhang, H. Li, "NAF: Neural Attenuation Fields for Sparse-View CBCT Reconstruction", MICCAI 2022: a hash
+encoding and a small network. SAX-NeRF: Y. Cai, J. Wang, A. Yuille, Z. Zhou, A. Wang, "Structure-Aware Sparse-View X-ray 3D
+Reconstruction", CVPR 2024: attention along line segments, and windows of rays beside scattered ones.
 """
 
 import time
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -11,10 +14,11 @@ import numpy as np
 from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
-from phyradgs_cl.neural import NeuralOptions, require_torch
+from phyradgs_cl.neural import LineOptions, NeuralOptions, require_torch
 from phyradgs_cl.reconstructors.checkpoint import check_array, count_of, restore_generator
 from phyradgs_cl.reconstructors.fdk import static_fdk
 from phyradgs_cl.reconstructors.loop import Loop
+from phyradgs_cl.reconstructors.method import Method
 from phyradgs_cl.reconstructors.result import (
     ProgressReport,
     Reconstruction,
@@ -40,14 +44,14 @@ def reconstruct_neural(
     report: ProgressReport = ignore_progress,
     resume: State | None = None,
 ) -> Reconstruction:
-    """The volume of a neural field; the seed draws first parameters, frames, pixels and samples.
+    """Returns the volume of a neural field. The seed draws first parameters, frames, pixels and samples.
 
-    ``rt`` makes the FDK volume that sets the unit of attenuation; the rest is PyTorch's. ``resume`` continues an
+    ``rt`` computes the FDK volume that sets the unit of attenuation; PyTorch does the rest. ``resume`` continues an
     interrupted run of the same scan and options from its state. Raises InputError where PyTorch is not installed.
     """
     require_torch(f"--method {method}")
-    from phyradgs_cl.neural.field.start import first_field
-    from phyradgs_cl.neural.torch_device import torch_device
+    from phyradgs_cl.neural.field import first_field
+    from phyradgs_cl.neural.tensors import torch_device
     from phyradgs_cl.neural.trainer import Trainer
 
     started = time.perf_counter()
@@ -80,7 +84,7 @@ def reconstruct_neural(
 
 
 class _Passes:
-    """A trainer, ``Stepwise`` for the loop: a step is a frame, an iteration a pass over all of them."""
+    """A trainer as the ``Stepwise`` that a ``Loop`` runs: a step is a frame, an iteration a pass over all frames."""
 
     quantity, remedy, finished = "loss", "check the scan for extreme values, or lower the rate", None
 
@@ -124,3 +128,32 @@ def _torch_version() -> str:
     from importlib.metadata import version
 
     return version("torch")
+
+
+# Paper, section 3, and the released configuration chest_50: 192 samples for 128 voxels per side
+NAF_PUBLISHED = NeuralOptions(
+    iterations=1500,
+    rays=1024,
+    jitter="sample",
+    positive_only=True,
+    voxel_points=1,
+    levels=16,
+    base_resolution=16,
+    table_log2=19,
+    density_bound=1.0,
+    first_share=0.5,
+    rate=1e-3,
+    rate_factor=0.1,
+    rate_step=1500,
+)
+NAF_PRESETS = {"default": NeuralOptions(), "published": NAF_PUBLISHED}
+
+NAF = Method(partial(reconstruct_neural, method="naf"), NAF_PRESETS)
+
+
+# The released configuration Lineformer/chest_50: that of NAF, with 256 samples for 128 voxels
+SAX_PUBLISHED = LineOptions(**{**vars(NAF_PUBLISHED), "samples": 256})
+# Windows do not change the expected gradient of a squared error, and of few pixels per step they leave it to noise
+SAX_PRESETS = {"default": LineOptions(iterations=50, windows=0), "published": SAX_PUBLISHED}
+
+SAX_NERF = Method(partial(reconstruct_neural, method="sax-nerf"), SAX_PRESETS)

@@ -1,4 +1,7 @@
-"""The rays of a pixel: one to each of the times at which its line is exposed, from the frame's time cells."""
+"""The rays of a step: which pixels and times it takes, and their rays over the exposure.
+
+Windows beside scattered pixels: the masked local–global sampling of SAX-NeRF (Cai et al., CVPR 2024).
+"""
 
 from dataclasses import dataclass
 
@@ -25,7 +28,7 @@ class ExposureRays:
     def of_cells(cls, table: TimeCells, grid: Grid) -> "ExposureRays":
         """The rays of still cells in mm, for a volume on ``grid`` in mm.
 
-        Raises InputError for a table whose lines have unlike numbers of cells, or unlike weights: no model here makes one.
+        Raises InputError for a table whose lines have different numbers of cells or different weights.
         """
         centre, unit = np.array(grid.offset_mm[::-1]), grid.half_longest_mm
         pose = table.pose.copy()
@@ -77,3 +80,36 @@ class ExposureRays:
 def _within(place: np.ndarray, count: int) -> slice:
     first = int(np.clip(np.floor(place.min()), 0, count - 1))
     return slice(first, int(np.clip(np.ceil(place.max()) + 1, first + 1, count)))
+
+
+def scattered_pixels(usable: np.ndarray, count: int, rng: np.random.Generator) -> np.ndarray:
+    """``count`` pixels (R, 2) row, column of those that are usable (rows, columns) bool, each at most once."""
+    where = np.flatnonzero(usable)
+    chosen = rng.choice(where, min(count, where.size), replace=False, shuffle=False)
+    return np.stack(np.unravel_index(chosen, usable.shape), -1)
+
+
+def windows_and_scattered_pixels(
+    usable: np.ndarray, count: int, windows: int, edge: int, rng: np.random.Generator
+) -> np.ndarray:
+    """Draws the pixels (R, 2) of ``windows`` windows of ``edge``² usable pixels, and ``count`` scattered ones outside them.
+
+    Windows tile the frame. There are fewer where fewer of them are usable throughout.
+    """
+    down, across = (n // edge for n in usable.shape)
+    tiles = usable[: down * edge, : across * edge].reshape(down, edge, across, edge).all(axis=(1, 3))
+    whole = np.flatnonzero(tiles)
+    chosen = rng.choice(whole, min(windows, whole.size), replace=False, shuffle=False)
+    corner = np.stack(np.unravel_index(chosen, tiles.shape), -1) * edge
+    inside = np.stack(np.meshgrid(np.arange(edge), np.arange(edge), indexing="ij"), -1).reshape(-1, 2)
+    local = (corner[:, None] + inside).reshape(-1, 2)
+    rest = usable.copy()
+    rest[local[:, 0], local[:, 1]] = False
+    return np.concatenate([local, scattered_pixels(rest, count, rng)])
+
+
+def chosen_times(pixels: int, times: int, count: int, rng: np.random.Generator) -> np.ndarray:
+    """``count`` of the ``times`` of every pixel (R, count), each at most once and all equally likely."""
+    if count >= times:
+        return np.broadcast_to(np.arange(times), (pixels, times))
+    return np.argsort(rng.random((pixels, times)), axis=1)[:, :count]

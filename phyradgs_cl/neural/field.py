@@ -1,13 +1,15 @@
-"""The field that is fitted: positions in the volume's cube to attenuation, over all of a grid's voxels where asked."""
+"""The field that is fitted: positions in the volume's cube to attenuation, its first parameters, its values on a grid."""
 
 import numpy as np
 import torch
 from torch import nn
 
+from phyradgs_cl.checks import ceil_div
 from phyradgs_cl.fields import Grid, triple
-from phyradgs_cl.neural.arrays import to_array, to_tensor
-from phyradgs_cl.neural.field.attenuation_network import AttenuationNetwork
-from phyradgs_cl.neural.field.hash_encoding import HashEncoding
+from phyradgs_cl.neural.hash_encoding import HashEncoding
+from phyradgs_cl.neural.networks import AttenuationNetwork, naf_network, sax_network
+from phyradgs_cl.neural.options import LineOptions, NeuralOptions
+from phyradgs_cl.neural.tensors import to_array, to_tensor
 
 _ORDERS = ((0, 1, 2), (1, 2, 0), (2, 0, 1))  # of a volume's axes z, y, x
 
@@ -31,8 +33,8 @@ def voxel_values(
 ) -> np.ndarray:
     """The field in all voxels (nz, ny, nx) float32; ``grid`` in units of half the longest side, centred.
 
-    A voxel is the mean over ``points``³ points, the centres of its equal parts. They are asked brick by brick. Where
-    positions belong together, a point has no value of its own: it is the mean of three, in segments along x, y and z.
+    A voxel is the mean over ``points``³ points, the centres of its equal parts. With segments a point's value depends on its
+    neighbours along the segment; it is then the mean over segments along x, y and z.
     """
     orders = _ORDERS if field.segment > 1 else _ORDERS[:1]
     values = np.zeros(grid.shape, np.float32)
@@ -58,7 +60,7 @@ def _in_rows(
     """
     fine = _divided(grid, points)
     slow, middle, fast = fine.axes_mm()
-    filled = -(-fast.size // field.segment) * field.segment
+    filled = ceil_div(fast.size, field.segment) * field.segment
     fast = np.concatenate([fast, fast[-1] + fine.voxel_size_mm[2] * np.arange(1, filled - fast.size + 1)])
     slows, middles, fasts = grid.shape
     rows: np.ndarray = np.empty((slows, middles, points, points, 2))  # rows of points, row of voxels by row of voxels
@@ -83,3 +85,22 @@ def _divided(grid: Grid, points: int) -> Grid:
     (nz, ny, nx), (dz, dy, dx) = grid.shape, grid.voxel_size_mm
     counts = (points * nz, points * ny, points * nx)
     return Grid(counts, (dz / points, dy / points, dx / points), grid.offset_mm)
+
+
+def first_field(options: NeuralOptions, longest_voxels: int, seed: int) -> NeuralField:
+    """Returns SAX-NeRF's field for ``LineOptions``, else NAF's, for the voxels along a volume's longest side.
+
+    The same seed gives the same parameters on every device.
+    """
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        encoding = HashEncoding(
+            options.levels_for(longest_voxels),
+            options.features,
+            options.base_resolution,
+            options.level_growth,
+            options.table_log2,
+        )
+        if isinstance(options, LineOptions):
+            return NeuralField(encoding, sax_network(encoding.width, options), options.segment)
+        return NeuralField(encoding, naf_network(encoding.width, options))

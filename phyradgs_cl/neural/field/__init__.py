@@ -1,1 +1,0 @@
-"""The field: encoding, networks, voxels of a grid."""

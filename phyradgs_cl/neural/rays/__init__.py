@@ -1,1 +1,0 @@
-"""The rays of a pixel over its exposure, and their integrals."""

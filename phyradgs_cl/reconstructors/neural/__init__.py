@@ -1,1 +1,0 @@
-"""Methods that fit a neural field, on PyTorch."""
