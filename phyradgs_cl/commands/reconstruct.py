@@ -7,6 +7,7 @@ from typing import Annotated
 import typer
 
 from phyradgs_cl import signals
+from phyradgs_cl.acquisition.motion import motion_facts
 from phyradgs_cl.commands.console import complain, file_option, last_words, option, say, scores
 from phyradgs_cl.commands.options import RUN_GROUPS, Output, Scan, with_run_options
 from phyradgs_cl.estimate import duration, estimate, seconds_around
@@ -79,7 +80,9 @@ def reconstruct_command(
                 picture.finish(result.volume, result.grid)
     written = output if result.state is None else partial_path(output)
     used_s = time.process_time()  # of the command so far, with its start; other programs do not change it
-    how = f"{plan.method_name}{result.early_stop}, {result.facts['seconds']:.1f} s ({used_s:.1f} s of processor time)"
+    motion = getattr(plan.options, "motion", None)
+    method = plan.method_name if motion is None else f"{plan.method_name}, motion {motion_facts(motion)['name']}"
+    how = f"{method}{result.early_stop}, {result.facts['seconds']:.1f} s ({used_s:.1f} s of processor time)"
     compared = f" ({result.facts[COMPARED]})" if COMPARED in result.facts else ""
     say(f"{written}: {how}{scores(metrics)}{compared}")
     if TUNED in result.facts:

@@ -7,8 +7,7 @@ from tolerances import FLOAT64, RAMP
 from phyradgs_cl.acquisition import ConeGeometry
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
-from phyradgs_cl.reconstructors.fdk import METHOD, FdkOptions, fdk_volume
-from phyradgs_cl.reconstructors.fdk.filters import WINDOWS, ramp_filter, ramp_spectrum
+from phyradgs_cl.reconstructors.fdk import METHOD, WINDOWS, FdkOptions, fdk_volume, ramp_filter, ramp_spectrum
 
 FROM_SHARP_TO_SMOOTH = ["ram-lak", "shepp-logan", "cosine", "hamming", "hann"]
 

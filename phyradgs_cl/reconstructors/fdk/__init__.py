@@ -1,4 +1,8 @@
-"""FDK (Feldkamp, Davis and Kress 1984): ray weights, ramp filter, distance-weighted backprojection."""
+"""FDK (Feldkamp, Davis and Kress 1984): ray weights, ramp filter, distance-weighted backprojection.
+
+The ramp filter is Ram-Lak's in its space-domain form, with windows on its spectrum: A. C. Kak and M. Slaney, Principles of
+Computerized Tomographic Imaging, IEEE Press 1988, Eq. 61 of chapter 3.
+"""
 
 import logging
 import time
@@ -8,6 +12,7 @@ from functools import partial
 from typing import ClassVar
 
 import numpy as np
+import scipy
 
 from phyradgs_cl import checks
 from phyradgs_cl.acquisition import Motion, Scan, Static
@@ -17,16 +22,14 @@ from phyradgs_cl.fields import Grid
 from phyradgs_cl.operators import backproject, backproject_lines
 from phyradgs_cl.prepare.step import unmasked_frames
 from phyradgs_cl.reconstructors.fdk import weights
-from phyradgs_cl.reconstructors.fdk.arc import view_arc
-from phyradgs_cl.reconstructors.fdk.beyond import reprojected, whole_object
-from phyradgs_cl.reconstructors.fdk.extrapolate import WAYS, extrapolated
-from phyradgs_cl.reconstructors.fdk.filters import WINDOWS, ramp_filter
+from phyradgs_cl.reconstructors.fdk.beyond_panel import WAYS, extrapolated, reprojected, whole_object
 from phyradgs_cl.reconstructors.fdk.views import (
     RayWeight,
     check_orbit,
     pose_of_pixels,
     ray_weight,
     view_angles,
+    view_arc,
     warn_if_incomplete,
     widened,
 )
@@ -35,17 +38,26 @@ from phyradgs_cl.reconstructors.result import ProgressReport, Reconstruction, ig
 from phyradgs_cl.runtime import Runtime
 
 log = logging.getLogger(__name__)
-_SAME_POSE = 1e-9  # of the largest length: views whose poses differ by a turn alone share their weights
+_SAME_POSE = 1e-9  # of the largest length: views whose poses differ only by a rotation share their weights
 _BLOCK_BYTES = 1 << 26  # rows that are filtered at one time
+_WORKERS = -1  # all cores
+
+# Functions of the frequency over the Nyquist frequency; all are 1 at zero, so that no window changes the mean.
+WINDOWS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
+    "ram-lak": np.ones_like,
+    "shepp-logan": lambda share: np.sinc(share / 2),
+    "cosine": lambda share: np.cos(np.pi / 2 * share),
+    "hamming": lambda share: 0.54 + 0.46 * np.cos(np.pi * share),
+    "hann": lambda share: 0.5 + 0.5 * np.cos(np.pi * share),
+}
 
 
 @dataclass(frozen=True)
 class FdkOptions:
-    """``window`` is the ramp filter's (see ``WINDOWS``).
+    """window: of the ramp filter, one of ``WINDOWS``. extrapolate: how rows continue beyond the panel, one of ``WAYS``.
 
-    ``motion``: static (one pose per frame, mid-window), static-start (the frame's first pose) or per-row (every line
-    at the middle of its own exposure). Of a model with more poses it takes a line's middle one. ``extrapolate``: rows of an
-    object wider than the panel go on beyond it, one of ``WAYS``.
+    motion: static (one pose per frame, mid-window), static-start (the frame's first pose) or per-row (every line at the
+    middle of its own exposure). Of a model with more poses FDK uses a line's middle one.
     """
 
     MOTIONS: ClassVar[tuple[Motion, ...]] = motions_for(LINE_POSES)
@@ -63,19 +75,21 @@ class FdkOptions:
 def fdk(
     scan: Scan, options: FdkOptions, rt: Runtime, *, seed: int = 0, report: ProgressReport = ignore_progress
 ) -> Reconstruction:
-    """The FDK volume of a scan in 1/mm. ``seed`` is accepted for the common signature; FDK draws nothing.
+    """Returns the FDK volume of a scan in 1/mm. ``seed`` is part of the common signature and not used.
 
-    Of orbits that are no circle about z a warning is logged; InputError for those that are far from any.
+    Logs a warning for an orbit that is not a circle about z, and raises InputError for one that is far from it.
     """
     started = time.perf_counter()
-    frames, numbers = _seen_frames(scan)
+    frames, numbers = _measured_frames(scan)
     poses = [options.motion.cells(scan, f).still().line_poses() for f in numbers]
     lines = max(map(len, poses))
     pose = np.concatenate(poses) if lines == 1 else np.stack([np.broadcast_to(p, (lines, 12)) for p in poses])
     check_orbit(pose)
-    how = {"window": options.window, "extrapolate": options.extrapolate}
     whole = partial(whole_object, scan, options.motion, rt, report)
-    volume = fdk_volume(rt, frames, pose, scan.grid, axis=scan.shutter.axis, whole=whole, **how)
+    volume = fdk_volume(
+        rt, frames, pose, scan.grid, window=options.window, axis=scan.shutter.axis,
+        extrapolate=options.extrapolate, whole=whole,
+    )  # fmt: skip
     facts = {"method": "fdk", "options": option_facts(options), "seconds": time.perf_counter() - started}
     return Reconstruction(volume, scan.grid, facts=facts)
 
@@ -94,11 +108,11 @@ def fdk_volume(
     extrapolate: str = "none",
     whole: Callable[[], np.ndarray] | None = None,
 ) -> np.ndarray:
-    """FDK of line integrals (F, rows, columns) on ``grid``, (z, y, x) float32 in 1/mm.
+    """Returns FDK of line integrals (F, rows, columns) on ``grid``, (z, y, x) float32 in 1/mm.
 
-    pose (F, 12) mm, or (F, lines, 12) with a pose for every line along ``axis``. Displaced detectors (full turns)
-    and short scans are recognised and weighted; a warning is logged where data are missing. ``whole`` makes the
-    object (z, y, x) in 1/mm on ``grid``, for ``reprojected``. Raises InputError for a source on the rotation axis.
+    pose (F, 12) mm, or (F, lines, 12) with a pose for every line along ``axis``. Displaced detectors (full turns) and short
+    scans are recognised and weighted. Logs a warning where data are missing. ``whole`` reconstructs the object (z, y, x) in
+    1/mm on ``grid``, for ``reprojected``. Raises InputError for a source on the rotation axis.
     """
     shape = (frames.shape[1], frames.shape[2])
     by_pixel = pose_of_pixels(pose, axis)
@@ -121,16 +135,16 @@ def fdk_volume(
     missing = fan.missing_columns if arc.is_full else (0, 0)
     filtered = _filtered(frames, ray_weight(canonical, shape, arc, fan), missing, window)
     pose = widened(pose, axis, missing)
-    share = 0.5 * arc.gap_rad  # every ray is seen twice
+    share = 0.5 * arc.gap_rad  # every ray is measured twice
     if pose.ndim == 2:
         return backproject(rt, filtered, pose, share, grid)
     return backproject_lines(rt, filtered, pose, share, grid, axis)
 
 
 def _filtered(frames: np.ndarray, weight: RayWeight, missing: tuple[int, int], window: str) -> np.ndarray:
-    """Weighted and filtered frames (F, rows, columns + missing) float32.
+    """Returns weighted and filtered frames (F, rows, columns + missing) float32.
 
-    A displaced detector's rows grow to be symmetric: the filter's response goes on where nothing was measured.
+    The rows of a displaced detector are widened to be symmetric, because the filter's response continues beyond them.
     """
     views, rows, columns = frames.shape
     width = columns + sum(missing)
@@ -139,27 +153,52 @@ def _filtered(frames: np.ndarray, weight: RayWeight, missing: tuple[int, int], w
     for first in range(0, views, count):
         block = np.zeros((min(count, views - first), rows, width), np.float32)
         for i, frame in enumerate(frames[first : first + count]):
-            np.multiply(
-                frame,
-                weight(first + i),
-                out=block[i, :, missing[0] : missing[0] + columns],
-                casting="same_kind",
-            )
+            measured = block[i, :, missing[0] : missing[0] + columns]
+            np.multiply(frame, weight(first + i), out=measured, casting="same_kind")
         filtered[first : first + count] = ramp_filter(block, 1.0, window)
     return filtered
 
 
+def ramp_spectrum(length: int, window: str = "ram-lak") -> np.ndarray:
+    """The filter's real spectrum (length // 2 + 1,) for a pitch of 1 and a period of ``length`` samples.
+
+    Sampling |frequency| instead would put a false constant under every row.
+    """
+    n = np.minimum(np.arange(length), length - np.arange(length))
+    kernel = np.where(n % 2 == 1, -1.0 / (np.pi * np.maximum(n, 1)) ** 2, 0.0)
+    kernel[0] = 0.25
+    spectrum = scipy.fft.rfft(kernel).real
+    return spectrum * WINDOWS[window](np.arange(spectrum.size) / (length / 2))
+
+
+def ramp_filter(rows: np.ndarray, spacing_mm: float, window: str = "ram-lak") -> np.ndarray:
+    """The ramp filter along the last axis of (..., width), zero-padded so that nothing wraps around.
+
+    Returns the same shape in float32 and units of ``rows`` per mm. Float32 rows stay float32 throughout.
+    """
+    width = rows.shape[-1]
+    length = scipy.fft.next_fast_len(2 * width, real=True)
+    spectrum = scipy.fft.rfft(rows, length, axis=-1, workers=_WORKERS)
+    spectrum *= (ramp_spectrum(length, window) / spacing_mm).astype(spectrum.real.dtype)
+    filtered = scipy.fft.irfft(spectrum, length, axis=-1, overwrite_x=True, workers=_WORKERS)
+    return filtered[..., :width].astype(np.float32, copy=False)
+
+
 def static_fdk(rt: Runtime, scan: Scan) -> np.ndarray:
-    """FDK (z, y, x) in 1/mm at the mid-window poses: what other methods start from, or measure themselves by."""
-    frames, numbers = _seen_frames(scan)
+    """Returns FDK (z, y, x) in 1/mm at the mid-window poses, as a start or a reference of other methods."""
+    frames, numbers = _measured_frames(scan)
     pose = np.concatenate([Static().cells(scan, f).pose for f in numbers])
     return fdk_volume(rt, frames, pose, scan.grid)
 
 
-def _seen_frames(scan: Scan) -> tuple[np.ndarray, np.ndarray]:
-    """Frames (F, v, u) with masked pixels filled in, and their numbers: those that are masked whole are left out, as the
-    views beside them then stand for the angle between."""
-    frames, seen = unmasked_frames(scan), np.arange(scan.frames)
+def _measured_frames(scan: Scan) -> tuple[np.ndarray, np.ndarray]:
+    """Returns frames (F, v, u) with masked pixels filled in, and their numbers.
+
+    Frames that are masked completely are left out, so that their neighbours take over their share of the turn.
+    """
+    frames, numbers = unmasked_frames(scan), np.arange(scan.frames)
     if np.asarray(scan.pixel_mask).ndim == 3:
-        seen = np.flatnonzero(scan.valid.any(axis=(1, 2)))
-    return (frames, np.arange(scan.frames)) if len(seen) in (0, scan.frames) else (frames[seen], seen)
+        measured = np.flatnonzero(scan.valid.any(axis=(1, 2)))
+        if 0 < len(measured) < scan.frames:
+            return frames[measured], measured
+    return frames, numbers

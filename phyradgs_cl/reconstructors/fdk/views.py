@@ -1,7 +1,8 @@
-"""The views of an FDK reconstruction: where each pixel's ray starts, and what it counts before filtering."""
+"""The views of an FDK reconstruction: their orbit, the arc that they cover, and their pixels' weights before filtering."""
 
 import logging
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -9,7 +10,67 @@ from phyradgs_cl.acquisition.altered.angles import azimuth_rad
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.reconstructors.fdk import weights
-from phyradgs_cl.reconstructors.fdk.arc import Arc
+
+# A short scan has one gap that stands out. It is compared with the second largest and not with the median, so
+# that uneven views (four times as dense over one half, say) stay a full turn; 2.5 lets one view of many be lost.
+SHORT_SCAN_GAP = 2.5
+_SAME_VIEW = 1e-3  # of the mean gap: views closer than this share one cell (a second turn over the first)
+
+
+@dataclass(frozen=True, eq=False)
+class Arc:
+    """The views' angular cells.
+
+    gap_rad (F,) is each view's share of the arc; progress_rad (F,) its angle from the start of the arc, which
+    begins half a step before the first view and ends half a step behind the last. A full turn has no start.
+    """
+
+    gap_rad: np.ndarray
+    progress_rad: np.ndarray
+    coverage_rad: float
+    is_full: bool
+
+
+def view_arc(angle_rad: np.ndarray) -> Arc:
+    """Returns the arc that views at angles (F,) cover, in any order and over any number of turns."""
+    cell, centre = _distinct(angle_rad)
+    count = np.bincount(cell)
+    ahead = np.diff(centre, append=centre[0] + 2 * np.pi)
+    if not _is_short(ahead):
+        gap = (ahead + np.roll(ahead, 1)) / 2
+        return Arc((gap / count)[cell], (centre - centre[0])[cell], 2 * np.pi, True)
+    first = (int(np.argmax(ahead)) + 1) % ahead.size
+    ahead, centre = np.roll(ahead, -first), np.roll(centre, -first)  # the gap is now the last
+    ahead[-1] = ahead[-2]
+    behind = np.concatenate([ahead[:1], ahead[:-1]])
+    gap = (ahead + behind) / 2
+    progress = np.concatenate([[0.0], np.cumsum(ahead[:-1])]) + behind[0] / 2
+    place = (cell - first) % ahead.size
+    return Arc((gap / np.roll(count, -first))[place], progress[place], float(gap.sum()), False)
+
+
+def _is_short(ahead: np.ndarray) -> bool:
+    if ahead.size < 2:
+        return False
+    second, largest = np.sort(ahead)[-2:]
+    return bool(largest > SHORT_SCAN_GAP * second)
+
+
+def _distinct(angle_rad: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Returns each view's cell (F,), and the cells' ascending angles (K,) on the turn."""
+    turned = np.mod(np.asarray(angle_rad, np.float64), 2 * np.pi)
+    order = np.argsort(turned, kind="stable")
+    tolerance = _SAME_VIEW * 2 * np.pi / turned.size
+    is_new = np.diff(turned[order], prepend=-np.inf) > tolerance
+    index = np.cumsum(is_new) - 1
+    centre = turned[order][is_new]
+    if centre.size > 1 and centre[0] + 2 * np.pi - turned[order[-1]] <= tolerance:  # 0° and 360° are one
+        index[index == centre.size - 1] = 0
+        centre = centre[:-1]
+    cell = np.empty(turned.size, np.int64)
+    cell[order] = index
+    return cell, centre
+
 
 log = logging.getLogger(__name__)
 
@@ -27,7 +88,7 @@ def pose_of_pixels(pose: np.ndarray, axis: str) -> np.ndarray:
 
 
 def view_angles(by_pixel: np.ndarray) -> np.ndarray:
-    """Each view's gantry angle (F,): the mean of its lines' angles, radians."""
+    """Returns each view's gantry angle (F,), the mean of its lines' angles, in radians."""
     angle_rad = azimuth_rad(by_pixel)
     first = angle_rad[:, :1, :1]
     turned = np.mod(angle_rad - first + np.pi, 2 * np.pi) - np.pi
@@ -35,7 +96,7 @@ def view_angles(by_pixel: np.ndarray) -> np.ndarray:
 
 
 def ray_weight(canonical: np.ndarray, shape: tuple[int, int], arc: Arc, fan: weights.Fan) -> RayWeight:
-    """A function from a view's index to the weights (rows, columns) of its pixels before filtering, 1/mm."""
+    """Returns a function from a view's index to its pixels' weights (rows, columns) before filtering, in 1/mm."""
     rows, columns = np.arange(shape[0]), np.arange(shape[1])
 
     def geometry(view: int) -> tuple[np.ndarray, np.ndarray]:
@@ -63,7 +124,7 @@ def _redundancy(view: int, angle_rad: np.ndarray, arc: Arc, fan: weights.Fan) ->
 
 
 def _redundancy_angle(pose: np.ndarray, rays: np.ndarray, arc: Arc) -> np.ndarray:
-    """The fan angle (rows, columns) by which a ray finds its opposite.
+    """Returns the fan angle (rows, columns) that determines a ray's opposite.
 
     Where columns are read out one after the other, the arc of a short scan begins at another angle for every column,
     and a ray's opposite lies on another column: their lags behind the frame, whose own angle is 0 here, add up.
@@ -75,7 +136,7 @@ def _redundancy_angle(pose: np.ndarray, rays: np.ndarray, arc: Arc) -> np.ndarra
 
 
 def widened(pose: np.ndarray, axis: str, missing: tuple[int, int]) -> np.ndarray:
-    """The poses of frames with ``missing`` columns added at their two ends."""
+    """Returns the poses of frames with ``missing`` columns added at their two ends."""
     if missing == (0, 0):
         return pose
     if pose.ndim == 3 and axis == "columns":
@@ -86,8 +147,10 @@ def widened(pose: np.ndarray, axis: str, missing: tuple[int, int]) -> np.ndarray
 
 
 def check_orbit(pose: np.ndarray) -> None:
-    """Says of poses (F, 12) or (F, lines, 12) how far they are from one circle about z with a panel that turns along, and
-    from that circle's plane. Raises InputError where FDK would make no volume of the object."""
+    """Logs how far poses (F, 12) or (F, lines, 12) are from one circle about z in its plane, if FDK then loses accuracy.
+
+    Raises InputError where FDK could not reconstruct the object.
+    """
     middle = pose if pose.ndim == 2 else pose[:, pose.shape[1] // 2]
     canonical = weights.turned_back(middle, azimuth_rad(middle)).reshape(-1, 4, 3)
     source, corner = canonical[:, 0], canonical[:, 1]
@@ -100,16 +163,16 @@ def check_orbit(pose: np.ndarray) -> None:
         f"{above_deg:.0f}° above the middle of their circle",
     )
 
-    def beyond(most: float, most_deg: float) -> str:
-        """Those of the two that are too far."""
+    def distances_beyond(most: float, most_deg: float) -> str:
+        """Names the distances that are too large."""
         wrong = (off > most * length_mm, above_deg > most_deg)
         return " and ".join(part for part, is_wrong in zip(parts, wrong, strict=True) if is_wrong)
 
-    if found := beyond(_NO_CIRCLE, _NO_PLANE_DEG):
+    if found := distances_beyond(_NO_CIRCLE, _NO_PLANE_DEG):
         expected = f"at most {100 * _NO_CIRCLE:.0f} % off it and {_NO_PLANE_DEG:.0f}° above"
         remedy = "take an iterative or splatting method: they take any orbit"
         raise InputError("--method fdk", f"source and panel up to {found}", expected, remedy)
-    if found := beyond(_CIRCLE, _PLANE_DEG):
+    if found := distances_beyond(_CIRCLE, _PLANE_DEG):
         text = "FDK: source and panel up to %s: the volume is an approximation; %s"
         log.warning(text, found, "iterative and splatting methods take any orbit")
 

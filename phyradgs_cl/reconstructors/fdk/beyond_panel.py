@@ -1,0 +1,125 @@
+"""Objects wider than the panel: detector rows that continue beyond it, so that FDK's filter does not ring at a cut.
+
+cosine: rows end in a quarter of a cosine (similar to Ohnesorge et al., Med. Phys. 27 (2000) 39). cylinder: they continue as
+the chords of a cylinder from the row's last values and slope (Hsieh et al., Med. Phys. 31 (2004) 2385); a parabola through
+the squares of the row gives its attenuation. Both leave the object beyond the panel unknown. reprojected: FISTA-TV
+reconstructs a volume on a grid that holds the object, and its projections continue the rows.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+
+from phyradgs_cl.acquisition import LineMiddles, Motion, PerRow, Scan
+from phyradgs_cl.acquisition.time_cells import TimeCells
+from phyradgs_cl.fields import Grid
+from phyradgs_cl.operators import RayOperator
+from phyradgs_cl.reconstructors.fdk.views import widened
+from phyradgs_cl.reconstructors.result import Progress, ProgressReport, Report
+from phyradgs_cl.reconstructors.voxels import fista_tv
+from phyradgs_cl.reconstructors.voxels.fista_tv import FistaTvOptions
+from phyradgs_cl.runtime import Runtime
+
+WAYS = ("none", "cosine", "cylinder", "reprojected")
+_SHARE = 0.5  # of the panel's columns, added at each side
+_SLOPE_PIXELS = 5  # that the slope at the edge is measured over
+_NOISE = 0.01  # of the largest line integral: an edge below it is air
+
+
+def extrapolated(frames: np.ndarray, way: str) -> tuple[np.ndarray, int]:
+    """Returns line integrals (F, v, u + 2 n) float32 continued beyond the first and last column, and n."""
+    count = max(1, round(_SHARE * frames.shape[2]))
+    beyond = np.arange(1, count + 1)
+    least = _NOISE * float(np.percentile(frames, 99.9))
+    curvature = _curvature(frames)
+    sides = []
+    for rows in (frames[..., ::-1], frames):  # reversed or not, so that the row ends at the panel's edge
+        pixels = min(_SLOPE_PIXELS, rows.shape[-1])
+        end = rows[..., -pixels:].astype(np.float64)
+        edge, slope = end.mean(-1, keepdims=True), (end[..., -1:] - end[..., :1]) / max(pixels - 1, 1)
+        edge = np.where(edge > least, edge, 0)
+        if way == "cosine":
+            sides.append(edge * np.cos(np.pi / 2 * beyond / count))
+        else:
+            sides.append(_chords(edge, slope, curvature, beyond))
+    wide = np.concatenate([sides[0][..., ::-1], frames, sides[1]], axis=-1)
+    return wide.astype(np.float32), count
+
+
+def _chords(edge: np.ndarray, slope: np.ndarray, curvature: np.ndarray, beyond: np.ndarray) -> np.ndarray:
+    """Returns line integrals p (F, v, n): p² = edge² + 2 edge slope d − a d² at d pixels beyond the panel.
+
+    The slope does not rise, and the curvature a is large enough to reach 0 within the n pixels.
+    """
+    falling, reach = np.minimum(slope, 0), beyond[-1]
+    widest = (edge**2 + 2 * reach * edge * falling) / reach**2
+    squares = edge**2 + 2 * edge * falling * beyond - np.maximum(curvature, widest) * beyond**2
+    return np.sqrt(np.maximum(squares, 0))
+
+
+def _curvature(frames: np.ndarray) -> np.ndarray:
+    """Returns the downward curvature (F, v, 1) of the parabola through each row's squares: its median over the frames."""
+    u = np.linspace(-1, 1, frames.shape[2])
+    basis = np.stack([np.ones_like(u), u, u**2], axis=1)
+    squares = np.maximum(frames, 0).astype(np.float64) ** 2
+    down = -(squares @ np.linalg.pinv(basis)[2]) * (2 / max(frames.shape[2] - 1, 1)) ** 2
+    return np.broadcast_to(np.maximum(np.median(down, axis=0), 0)[None, :, None], (*frames.shape[:2], 1))
+
+
+_ITERATIONS = 30
+_MOST = 2.0  # of the panel's columns, added at each side
+
+
+def whole_object(scan: Scan, motion: Motion, rt: Runtime, report: ProgressReport) -> np.ndarray:
+    """Returns a volume (nz, ny, nx) in 1/mm on the scan's grid that explains its frames.
+
+    Raises KeyboardInterrupt if it is stopped, because FDK has no checkpoints.
+    """
+
+    def hook(progress: Progress) -> Progress:
+        return replace(progress, quantity=f"rows beyond the panel: {progress.quantity}", state=None)
+
+    at_times: Motion = PerRow(sub_intervals=2) if isinstance(motion, LineMiddles) else motion
+    options, report = FistaTvOptions(motion=at_times, iterations=_ITERATIONS), Report.of(report)
+    with report.through(hook):
+        result = fista_tv.METHOD.run(scan, options, rt, report=report)
+    if result.facts["interrupted_at"] is not None:
+        raise KeyboardInterrupt
+    return result.volume
+
+
+def reprojected(
+    rt: Runtime, frames: np.ndarray, pose: np.ndarray, axis: str, volume: np.ndarray, grid: Grid
+) -> tuple[np.ndarray, int]:
+    """Returns line integrals (F, v, u + 2 n) float32, ``frames`` (F, v, u) continued by the projections of a volume, and n.
+
+    volume (nz, ny, nx) in 1/mm; pose (F, 12) or (F, lines, 12) in mm, with a pose for every line along ``axis``.
+    """
+    rows, columns = frames.shape[1:]
+    count = _columns_beyond(pose.reshape(-1, 12), columns, grid)
+    wide = widened(pose, axis, (count, count))
+    by_line = wide[:, None] if wide.ndim == 2 else wide
+    shape = rows, columns + 2 * count
+    operator = RayOperator(rt, grid, shape, [_cells(poses, shape[axis == "columns"], axis) for poses in by_line])
+    continued = operator.forward(np.ascontiguousarray(volume, np.float32))
+    continued[..., count : count + columns] = frames
+    return continued, count
+
+
+def _cells(pose: np.ndarray, lines: int, axis: str) -> TimeCells:
+    """Returns a pose (1, 12) of all lines, or (lines, 12) of each, as still cells."""
+    ends = np.linspace(0, lines, len(pose) + 1).round().astype(np.int32)
+    return TimeCells(pose, np.zeros(len(pose)), ends[:-1], ends[1:], np.ones(len(pose)), lines, axis)
+
+
+def _columns_beyond(pose: np.ndarray, columns: int, grid: Grid) -> int:
+    """Returns how many more columns at a side panels of poses (n, 12) need to see the grid's whole box."""
+    source, first, step_u, step_v = (pose[:, None, i : i + 3] for i in (0, 3, 6, 9))
+    corners = np.stack(np.meshgrid(*grid.box_mm[::-1], indexing="ij"), -1).reshape(1, 8, 3)
+    normal = np.cross(step_u, step_v)
+    depth = ((corners - source) * normal).sum(-1) / ((first - source) * normal).sum(-1)  # 1 on the panel, 0 at the source
+    across = np.cross(step_v, normal)
+    hit = (corners - source) / np.maximum(depth, 1e-6)[..., None] - (first - source)
+    column = (hit * across).sum(-1) / (step_u * across).sum(-1)
+    beyond = max(-float(column.min()), float(column.max()) - (columns - 1))
+    return int(np.clip(np.ceil(beyond), 0, round(_MOST * columns)))
