@@ -135,7 +135,7 @@ def test_one_pixel_size_means_square_pixels(run, tmp_path, make_truth) -> None:
     cone = ("--source-to-axis-mm", "500", "--source-to-detector-mm", "800")
     assert run(data, *cone, "--pixel-size-mm", "2.5")[0] == 0
     assert read_scan(tmp_path / "scan.h5", counts_to_attenuation).geometry.pixel_size_mm == (2.5, 2.5)
-    assert "one of square pixels; write for example 0.148" in run(data, *cone, "--pixel-size-mm", "2.5,")[2]
+    assert "one for square pixels; write for example 0.148" in run(data, *cone, "--pixel-size-mm", "2.5,")[2]
 
 
 # --- the TOML to fill in ------------------------------------------------------------------------------------------------
