@@ -1,6 +1,6 @@
 """Voxel-driven backprojection with FDK's distance weight, from one pose per frame or one pose per line.
 
-Where memory is short the volume is made brick by brick, and views go to the device in smaller parts; neither changes a bit.
+If memory is short, the volume is computed in bricks and views are uploaded in smaller parts, with the same bits.
 """
 
 from collections.abc import Callable, Iterator
@@ -10,27 +10,28 @@ from typing import cast
 import numpy as np
 
 from phyradgs_cl.acquisition.readout import Readout
+from phyradgs_cl.checks import ceil_div
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.operators.bricks import Brick, Shape, cut
 from phyradgs_cl.operators.rays.layout import voxel_matrices
 from phyradgs_cl.runtime import Array, DeviceArray, Room, Runtime, SameArray, with_smaller_bricks
 from phyradgs_cl.runtime.layout import GUARD, Strides, move, padded_zeros, pitch_of, unpad_rows
 
-_VIEWS_PER_LAUNCH = 64  # a work-item visits a few lines of every view: they should stay in a core's cache
+_VIEWS_PER_LAUNCH = 64  # a work-item reads a few lines of every view: they should stay in a core's cache
 _BYTES_A_LAUNCH = 1 << 28
-_VIEWS_SHARE = 0.25  # of the room
-_BLOCK_VOXELS = 128  # along z for a work-item of the upright kernel
-_COLUMN_ROWS = 512  # detector rows that such a block may meet
-_UPRIGHT = 1e-7  # of the depth: how far u or depth may move over the whole height
-_MOST_LEAN = 0.25  # columns to a row, along z: further the general kernel is faster
+_VIEWS_SHARE = 0.25  # of the free memory
+_BLOCK_VOXELS = 128  # along z per work-item of the upright kernel
+_COLUMN_ROWS = 512  # detector rows that such a block may project to
+_UPRIGHT = 1e-7  # change of u or depth over the volume's height, relative to the depth
+_MOST_LEAN = 0.25  # columns per row along z: beyond it the general kernel is faster
 _Arguments = tuple[DeviceArray, DeviceArray, DeviceArray, np.int32, np.int32, np.int32, np.int32, np.int64]
 
 
 def backproject(rt: Runtime, frames: SameArray, pose: np.ndarray, weight: np.ndarray, grid: Grid) -> SameArray:
-    """Σ_f weight_f / z² · frame_f(u, v) at every voxel centre, z the voxel's depth as a share of the ray.
+    """Returns Σ_f weight_f / z² · frame_f(u, v) at every voxel centre; z is the voxel's depth relative to the detector's.
 
-    frames (F, rows, columns), bilinear and zero outside; pose (F, 12) mm; weight (F,). Returns (z, y, x) float32, on the
-    device where the frames are.
+    frames (F, rows, columns), bilinear and zero outside; pose (F, 12) mm; weight (F,). The result (z, y, x) float32 is on
+    the device if the frames are.
     """
     matrices = voxel_matrices(pose, grid)
     block, leans = (0, False) if rt.pixel_items else _upright_block(matrices, grid)
@@ -46,11 +47,11 @@ def backproject(rt: Runtime, frames: SameArray, pose: np.ndarray, weight: np.nda
 def backproject_lines(
     rt: Runtime, frames: SameArray, pose: np.ndarray, weight: np.ndarray, grid: Grid, axis: str = "rows"
 ) -> SameArray:
-    """The same where every line of a frame has its own pose: pose (F, lines, 12) mm, lines along ``axis``.
+    """Backprojects frames in which every line has its own pose: pose (F, lines, 12) mm, lines along ``axis``.
 
-    A voxel takes the line r whose pose projects it onto r, by linear interpolation between neighbouring lines, and
-    counts with the rate at which it crosses lines: once for its angular step, and where the frames were filtered
-    across lines (``axis`` columns) once more for the filter's scale (docs/mathematics.md).
+    A voxel reads the line r whose pose projects the voxel onto r, interpolated between neighbouring lines. Its value is
+    divided by the rate at which the voxel crosses lines: once for the angular step, and once more for the filter's scale
+    if frames were filtered across lines (``axis`` columns). See docs/mathematics.md.
     """
     readout = Readout(axis)
     pose = readout.poses(pose)
@@ -62,7 +63,7 @@ def backproject_lines(
 
 @dataclass(frozen=True, eq=False)
 class _Views:
-    """Frames (F, rows, columns), whether columns become rows, the matrices (F, …) and weights (F,) that go with them."""
+    """Frames (F, rows, columns), whether their columns become rows, their matrices (F, …) and weights (F,)."""
 
     frames: Array
     is_turned: bool
@@ -71,17 +72,17 @@ class _Views:
 
     @property
     def shape(self) -> tuple[int, int]:
-        """(lines, width) of each as the kernels have it."""
+        """(lines, width) of a frame in the kernels."""
         _, rows, columns = self.frames.shape
         return (columns, rows) if self.is_turned else (rows, columns)
 
     def bytes(self, count: int) -> int:
-        """What so many of them take on the device."""
+        """Returns the bytes of ``count`` views on the device."""
         rows, width = self.shape
         return 4 * count * int(2 * GUARD + rows * pitch_of(width) + self.matrices.shape[1] + 1)
 
     def padded(self, rt: Runtime, part: slice) -> DeviceArray:
-        """Some of the images, each a padded one by itself."""
+        """Returns some of the frames, each as a padded image."""
         count, (rows, width) = part.stop - part.start, self.shape
         pitch = pitch_of(width)
         each = 2 * GUARD + rows * pitch
@@ -98,7 +99,7 @@ class _Views:
         return rt.upload(on_host)
 
     def parts(self, room: Room) -> Iterator[slice]:
-        """Views that go to the device in one piece."""
+        """Yields runs of views that are uploaded together."""
         most_bytes = min(_BYTES_A_LAUNCH, room.largest_bytes, int(_VIEWS_SHARE * room.free_bytes))
         count = max(1, min(_VIEWS_PER_LAUNCH, most_bytes // self.bytes(1)))
         for first in range(0, len(self.matrices), count):
@@ -109,7 +110,7 @@ _Launch = Callable[["_Arguments", Brick, DeviceArray], None]
 
 
 def _in_bricks(rt: Runtime, views: _Views, grid: Grid, step: int, launch: _Launch) -> Array:
-    """The volume (z, y, x), in bricks of a multiple of ``step`` voxels along z where it does not fit as a whole."""
+    """Returns the volume (z, y, x), computed in bricks of a multiple of ``step`` voxels along z if it does not fit."""
 
     is_resident = isinstance(views.frames, DeviceArray)
     volume: Array = rt.empty(grid.shape) if is_resident else np.empty(grid.shape, np.float32)
@@ -133,20 +134,20 @@ def _in_bricks(rt: Runtime, views: _Views, grid: Grid, step: int, launch: _Launc
 def _backprojected(
     rt: Runtime, views: _Views, parts: list[slice], brick: Brick, launch: _Launch
 ) -> DeviceArray:
-    """A brick in the padded layout."""
+    """Returns a brick in the padded layout."""
     nz, ny, nx = brick.shape
     volume = padded_zeros(rt, nz * ny, nx)
     for part in parts:
         images = _images(rt, views, part)
         launch(images, brick, volume)
-        del images  # before the next part's
+        del images  # frees their memory for the next part
     return volume
 
 
 def _general(rt: Runtime, images: _Arguments, brick: Brick, volume: DeviceArray) -> None:
     nz, ny, nx = brick.shape
     kernel = rt.kernel("backproject", "backproject", IMAGE_GUARD=GUARD)
-    rt.launch(kernel, (-(-nx // rt.lanes), ny, nz), *images, *_volume_shape(brick), volume, group=rt.group())
+    rt.launch(kernel, (ceil_div(nx, rt.lanes), ny, nz), *images, *_volume_shape(brick), volume, group=rt.group())
 
 
 def _lines(rt: Runtime, across: np.int32, images: _Arguments, brick: Brick, volume: DeviceArray) -> None:
@@ -157,19 +158,19 @@ def _lines(rt: Runtime, across: np.int32, images: _Arguments, brick: Brick, volu
 
 
 def _upright(rt: Runtime, name: str, block: int, images: _Arguments, brick: Brick, volume: DeviceArray) -> None:
-    """``images`` are transposed: the width that they tell is the number of rows."""
+    """Launches an upright kernel. ``images`` are transposed: their width is the number of detector rows."""
     nz, ny, nx = brick.shape
     defines = {"IMAGE_GUARD": GUARD, "BLOCK_VOXELS": _BLOCK_VOXELS, "COLUMN_ROWS": _COLUMN_ROWS}
     kernel = rt.kernel("backproject", name, **defines)
     image, table, weights, views, columns, rows, *rest = images
     data = (image, table, weights, views, rows, columns, *rest)
-    rt.launch(kernel, (nx, ny, -(-nz // block)), *data, *_volume_shape(brick), np.int32(block), volume)
+    rt.launch(kernel, (nx, ny, ceil_div(nz, block)), *data, *_volume_shape(brick), np.int32(block), volume)
 
 
 def _upright_block(matrices: np.ndarray, grid: Grid) -> tuple[int, bool]:
-    """Voxels along z that a work-item of the upright kernels may take, 0 where they do not apply; whether columns lean.
+    """Returns the voxels along z per work-item of the upright kernels, 0 if they do not apply, and whether columns lean.
 
-    Upright columns have u and depth (rows 0 and 2 of a matrix) that do not change with z. Every voxel has to be before the
+    In upright columns u and depth (rows 0 and 2 of a matrix) do not change with z. All voxels must lie in front of the
     source.
     """
     nz, ny, nx = grid.shape
@@ -189,7 +190,7 @@ def _upright_block(matrices: np.ndarray, grid: Grid) -> tuple[int, bool]:
 
 
 def _images(rt: Runtime, views: _Views, part: slice) -> _Arguments:
-    """The kernels' first arguments: padded images on the device, matrices, weights, and their sizes."""
+    """Returns the kernels' first arguments: padded images on the device, matrices, weights, and their sizes."""
     images, (rows, width) = views.padded(rt, part), views.shape
     count, each = images.shape
     sizes = (np.int32(count), np.int32(rows), np.int32(width), np.int32(pitch_of(width)), np.int64(each))
@@ -204,7 +205,7 @@ def _volume_shape(brick: Brick) -> tuple[np.ndarray, np.ndarray, np.int32]:
 
 
 def _strides(brick: Brick) -> Strides:
-    """Where the voxels of a padded brick lie."""
+    """Returns the strides of a padded brick."""
     _, ny, nx = brick.shape
     return Strides(GUARD, ny * pitch_of(nx), pitch_of(nx))
 

@@ -1,8 +1,9 @@
-"""Volumes cut into bricks that fit a device: rows of x stay whole, z is cut first, then y."""
+"""Cuts volumes into bricks that fit on a device: first along z, then along y, never along x."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
+from phyradgs_cl.checks import ceil_div
 from phyradgs_cl.errors import OutOfMemoryError
 from phyradgs_cl.runtime import Room
 
@@ -18,7 +19,7 @@ class Brick:
 
     @property
     def box(self) -> tuple[slice, slice, slice]:
-        """The brick as an index of the volume (z, y, x)."""
+        """The brick as slices of the volume (z, y, x)."""
         z, y, x = (slice(s, s + n) for s, n in zip(self.start, self.shape, strict=True))
         return z, y, x
 
@@ -34,11 +35,11 @@ def cut(
     room: Room,
     share: float = 1.0,
 ) -> list[Brick]:
-    """Bricks as large as a share of the room allows, in the order z, y; all but the last of an axis are multiples of
-    ``steps`` (z, y).
+    """Returns bricks as large as ``share`` of the free memory allows, in the order z, y.
 
-    ``needs``: bytes of every buffer that a brick of a shape (z, y, x) takes. Where the share is too little for the smallest
-    brick, that one may take all of the room. Raises OutOfMemoryError where it does not fit even so.
+    Sides are multiples of ``steps`` (z, y), except the last along an axis. ``needs`` returns the bytes of all buffers for a
+    brick of shape (z, y, x). The smallest brick may take all of the room if the share is too little. Raises
+    OutOfMemoryError if it does not fit then.
     """
     nz, ny, nx = shape
     smallest = (min(steps[0], nz), min(steps[1], ny), nx)
@@ -55,7 +56,7 @@ def cut(
 
 
 def _candidates(shape: Shape, steps: tuple[int, int]) -> Iterator[Shape]:
-    """Shapes of bricks from the whole down to one of ``steps``."""
+    """Yields shapes of bricks, from the volume down to ``steps``."""
     nz, ny, nx = shape
     for dz in _parts(nz, steps[0]):
         yield dz, ny, nx
@@ -64,11 +65,11 @@ def _candidates(shape: Shape, steps: tuple[int, int]) -> Iterator[Shape]:
 
 
 def _parts(count: int, step: int) -> Iterator[int]:
-    """Lengths of the parts when ``count`` is cut into 1, 2, 3 … parts that are multiples of ``step``."""
+    """Yields the length of parts when ``count`` is cut into 1, 2, 3 … parts that are multiples of ``step``."""
     last = count + 1
-    for pieces in range(1, -(-count // step) + 1):
-        fair = -(-count // pieces)
-        length = count if pieces == 1 else -(-fair // step) * step
+    for pieces in range(1, ceil_div(count, step) + 1):
+        fair = ceil_div(count, pieces)
+        length = count if pieces == 1 else ceil_div(fair, step) * step
         if length < last:
             last = length
             yield length

@@ -88,7 +88,7 @@ def test_what_does_not_fit_is_said(rt) -> None:
         "float32": lambda: operator.forward(rt.zeros(UPRIGHT.shape, np.int32)),
         "frames": lambda: operator.adjoint(x),
         "shape": lambda: operator.forward(x, x),
-        "elsewhere": lambda: operator.forward(x, np.zeros(operator.frames_shape, np.float32)),
+        "out": lambda: operator.forward(x, np.zeros(operator.frames_shape, np.float32)),
     }.items():
         with pytest.raises(InputError, match=subject):
             call()

@@ -1,8 +1,8 @@
-"""The intensity model around one volume: I(x) = −ln Σ w exp(−A_k x), its derivative J and Jᵀ, exactly.
+"""The intensity model at a volume: I(x) = −ln Σ w exp(−A_k x), its exact derivative J and Jᵀ.
 
-A line's cells are numbered, and A_k is the projector of everyone's k-th cell. Then J = Σ_k s_k A_k with the softmax weight
-s_k = w_k exp(−p_k) / Σ_j w_j exp(−p_j) of every pixel, and Jᵀ y = Σ_k A_kᵀ (s_k y): launches of the linear projector, one
-per cell of a line, that cost together what one launch over all cells does. Twin: ``intensity_frame`` in twins/rays.py.
+A_k is the projector of the k-th cell of every line. J = Σ_k s_k A_k with each pixel's softmax weight
+s_k = w_k exp(−p_k) / Σ_j w_j exp(−p_j). Jᵀ y = Σ_k A_kᵀ (s_k y). This takes one launch of the linear projector for each
+cell of a line; together they cost as much as one launch over all cells. Twin: ``intensity_frame`` in twins/rays.py.
 """
 
 from collections.abc import Sequence
@@ -23,10 +23,10 @@ _HOST = HostSpace()
 
 
 class IntensityOperator:
-    """I(x), and J and Jᵀ at the volume for which I was asked last (A and Aᵀ before that).
+    """I(x), and J and Jᵀ at the last volume given to ``expected`` (A and Aᵀ before the first).
 
-    Arguments as for ``RayOperator``, whose rule for NumPy's and device arrays holds here too. It holds frames (F, rows,
-    columns) once for every cell of a line, which is what the softmax weights need.
+    Arguments are those of ``RayOperator``, as is the rule for NumPy and device arrays. The operator stores one stack of
+    frames (F, rows, columns) of softmax weights for each cell of a line.
     """
 
     def __init__(
@@ -36,7 +36,7 @@ class IntensityOperator:
         self.volume_shape = grid.shape
         self.frames_shape = (len(tables), *detector_shape)
         self._operators: list[RayOperator] = []
-        # one memory for all: they are used in turns; that of the operator over all cells has room for each
+        # One memory for all layers, which run one after the other. The operator over all cells needs the largest.
         memory = RayOperator(rt, grid, detector_shape, tables).memory
         for part in ones:
             self._operators.append(RayOperator(rt, grid, detector_shape, part, memory=memory))
@@ -47,17 +47,17 @@ class IntensityOperator:
 
     @property
     def memory(self) -> RayMemory:
-        """That of all my projectors."""
+        """The memory that the projectors of all layers share."""
         return self._operators[0].memory
 
     @property
     def holds(self) -> tuple[int, int]:
-        """Volumes and stacks of frames that I take on a device beside ``memory``: p and share of every cell of a line."""
+        """Volumes and stacks of frames on the device besides ``memory``: integrals and weights of each layer."""
         return 2, 2 * len(self._operators) + 3
 
     def expected(self, volume: SameArray, out: SameArray | None = None) -> SameArray:
-        """I(x) (F, rows, columns) float32 of a volume (nz, ny, nx) 1/mm, at which J stands from now on."""
-        self._shares = []  # their memory is wanted again
+        """Returns I(x), (F, rows, columns) float32, of a volume (nz, ny, nx) in 1/mm, and sets J to the derivative there."""
+        self._shares = []  # frees their memory
         frames: Array
         if isinstance(volume, DeviceArray):
             p = [self._device.apply(operator.forward, volume, self.frames_shape) for operator in self._operators]
@@ -72,7 +72,7 @@ class IntensityOperator:
         return same
 
     def forward(self, volume: SameArray, out: SameArray | None = None) -> SameArray:
-        """J d: a change of the volume (nz, ny, nx) to that of the frames (F, rows, columns) float32."""
+        """Returns J d, frames (F, rows, columns) float32, for a change d of the volume (nz, ny, nx)."""
         space = self._space(volume)
         total: Any = None
         for share, operator in zip(self._shares_for(volume), self._operators, strict=True):
@@ -82,7 +82,7 @@ class IntensityOperator:
         return same
 
     def adjoint(self, frames: SameArray, out: SameArray | None = None) -> SameArray:
-        """Jᵀ y: frames (F, rows, columns) to a volume (nz, ny, nx) float32."""
+        """Returns Jᵀ y for frames (F, rows, columns): a volume (nz, ny, nx) float32."""
         space = self._space(frames)
         total: Any = None
         for share, operator in zip(self._shares_for(frames), self._operators, strict=True):
@@ -92,7 +92,7 @@ class IntensityOperator:
         return same
 
     def subset(self, frames: Sequence[int]) -> "IntensityOperator":
-        """The same for some of the frames, in this order, with a volume of its own for J."""
+        """Returns the operator for some of the frames, in this order. J of the subset has its own volume."""
         chosen = list(frames)
         part = copy(self)
         part.frames_shape = (len(chosen), *self.frames_shape[1:])
@@ -101,7 +101,7 @@ class IntensityOperator:
         return part
 
     def _set(self, weights: list[np.ndarray]) -> None:
-        """Weights (F, lines, 1) or (F, 1, lines) of each layer; shares are those of a volume of zeros."""
+        """Sets the weights (F, lines, 1) or (F, 1, lines) of each layer, and J to that of a volume of zeros."""
         self._weights = weights
         self._line_weights: list[DeviceArray] = []
         self._shares = []
@@ -110,7 +110,7 @@ class IntensityOperator:
         return self._device if isinstance(like, DeviceArray) else _HOST
 
     def _given(self, result: Any, out: SameArray | None) -> SameArray:
-        """The result, in ``out`` if there is one."""
+        """Returns the result, copied to ``out`` if given."""
         if out is None:
             new: SameArray = result
             return new
@@ -122,7 +122,7 @@ class IntensityOperator:
 
     def _shares_for(self, like: Array) -> list[Any]:
         is_there = isinstance(like, DeviceArray)
-        if self._shares and isinstance(self._shares[0], DeviceArray) != is_there:  # ``expected`` had the other kind
+        if self._shares and isinstance(self._shares[0], DeviceArray) != is_there:  # made by the other kind
             brought = self._device.array if is_there else self._device.numpy
             self._shares = [brought(share) for share in self._shares]
         if not self._shares and is_there:
@@ -133,7 +133,7 @@ class IntensityOperator:
         return self._shares or self._weights
 
     def _device_average(self, p: list[DeviceArray]) -> tuple[DeviceArray, list[DeviceArray]]:
-        """``intensity_average`` of frames on the device, whose memory becomes that of the shares."""
+        """Computes ``intensity_average`` on the device. The shares overwrite p."""
         least, total = self._device.empty(self.frames_shape), self._device.empty(self.frames_shape)
         for k, (q, weights) in enumerate(zip(p, self._uploaded(), strict=True)):
             self._launch("layer_least", q, weights, least, first=k == 0)
@@ -146,7 +146,7 @@ class IntensityOperator:
         return least, [self._device.multiply(q, total) for q in p]
 
     def _launch(self, name: str, *arrays: DeviceArray, first: bool | None = None) -> None:
-        """A kernel over all pixels: its read-only arrays, shapes, whether it is the first layer, arrays to write."""
+        """Launches a kernel over all pixels: arrays to read, shapes, whether it is the first layer, arrays to write."""
         frames, rows, columns = self.frames_shape
         rt, inputs = self._device.rt, 1 if first is None else 2
         words = [np.int32(n) for n in (rows, columns, self._by_row)] + ([] if first is None else [np.int32(first)])
@@ -155,9 +155,9 @@ class IntensityOperator:
         rt.launch(kernel, items, *arrays[:inputs], *words, *arrays[inputs:], group=rt.group(on_cpu=16))
 
     def _uploaded(self) -> list[DeviceArray]:
-        """Weights (F, lines) of each layer on the device, which keeps them."""
+        """Returns the weights (F, lines) of each layer on the device, uploaded once."""
         if not self._line_weights:
             shape = (self.frames_shape[0], -1)
-            # in place: a copy of me that stays at a volume has them too
+            # In place: copies of this operator share the list.
             self._line_weights.extend(self._device.rt.upload(w.reshape(shape), np.float32) for w in self._weights)
         return self._line_weights

@@ -1,7 +1,7 @@
 """Layout of volumes, frames and time cells in device memory for the ray-driven projector (cl/common/ray.h).
 
 ``layered`` splits the cells of frames into layers in which no line has more than one cell. A detector averages intensities
-over the cells of a line, which needs the line integrals of each cell by itself.
+over the cells of a line, which needs separate line integrals for each cell.
 """
 
 from collections.abc import Sequence
@@ -25,10 +25,10 @@ _WIDEST = 16  # cells are read as vectors, which may run past the last one
 
 @dataclass(frozen=True)
 class RayLayout:
-    """How volumes (z, y, x) and stacks of frames of ``lines`` × ``width`` pixels lie in device memory.
+    """Layout of volumes (z, y, x) and of stacks of frames with ``lines`` × ``width`` pixels in device memory.
 
-    ``brick``: which voxels of the grid the volume has. A border of zeros around it makes it a volume of its own, so
-    that the frames of all bricks add up to those of the whole.
+    ``brick`` selects the voxels of the grid that the volume holds. It has a border of zeros, so that the frames of all
+    bricks add up to the frames of the grid.
     """
 
     grid: Grid
@@ -38,11 +38,11 @@ class RayLayout:
 
     @classmethod
     def of_scan(cls, grid: Grid, detector_shape: tuple[int, int], axis: str) -> "RayLayout":
-        """The whole grid, with the readout's lines as rows of the frames."""
+        """The layout of the complete grid, with the readout's lines as rows of the frames."""
         return cls(grid, *Readout(axis).shape(detector_shape), whole(grid.shape))
 
     def of(self, brick: Brick) -> "RayLayout":
-        """The same frames with another part of the grid."""
+        """The layout of the same frames with another brick of the grid."""
         return replace(self, brick=brick)
 
     @property
@@ -54,7 +54,7 @@ class RayLayout:
         return 2 * GUARD + count * self.lines * pitch_of(self.width)
 
     def turned_floats(self, count: int) -> int:
-        """Of frames with the readout's lines as columns."""
+        """Floats of frames with the readout's lines as columns."""
         return 2 * GUARD + count * self.width * pitch_of(self.lines)
 
     def frames_shape(self, count: int) -> tuple[int, int, int]:
@@ -62,35 +62,35 @@ class RayLayout:
 
     @property
     def volume_strides(self) -> Strides:
-        """Where the voxels of a padded volume lie."""
+        """Strides of a padded volume."""
         _, ny, nx = self.brick.shape
         row, slice_ = pitch_of(nx), pitch_of(nx) * (ny + 2 * BORDER)
         return Strides(GUARD + BORDER * (slice_ + row), slice_, row)
 
     @property
     def frames_strides(self) -> Strides:
-        """Where the pixels of padded frames lie."""
+        """Strides of padded frames."""
         row = pitch_of(self.width)
         return Strides(GUARD, self.lines * row, row)
 
     @property
     def turned_strides(self) -> Strides:
-        """Where the pixels of padded frames lie whose lines are columns."""
+        """Strides of padded frames whose lines are columns."""
         row = pitch_of(self.lines)
         return Strides(GUARD, self.width * row, row)
 
     def pixel_strides(self, axis: str) -> tuple[int, int, int, int]:
-        """Where the pixels of padded frames lie: start, and floats from column to column, row to row, frame to frame."""
+        """Start of padded frames, and floats from column to column, row to row, frame to frame."""
         row = pitch_of(self.width)
         slice_ = self.lines * row
         return (GUARD, 1, row, slice_) if axis == "rows" else (GUARD, row, 1, slice_)
 
     def column_floats(self, axis: str) -> int:
-        """What a padded frame takes with detector columns as rows."""
+        """Floats of a padded frame with detector columns as rows."""
         return self.width * pitch_of(self.lines) if axis == "rows" else self.lines * pitch_of(self.width)
 
     def inside(self, flat: np.ndarray) -> np.ndarray:
-        """The volume (z, y, x) as a view of its padded floats."""
+        """Returns the volume (z, y, x) as a view of its padded floats."""
         nz, ny, nx = self.brick.shape
         padded = flat[GUARD:-GUARD].reshape(nz + 2 * BORDER, ny + 2 * BORDER, pitch_of(nx))
         return padded[BORDER:-BORDER, BORDER:-BORDER, :nx]
@@ -101,7 +101,7 @@ class RayLayout:
         return flat
 
     def constants(self) -> tuple[np.ndarray | np.int32, ...]:
-        """The kernels' arguments about shapes: voxels, the first of them, pitch, voxel size, lines, width, pitch."""
+        """The kernels' arguments: voxels, first voxel, pitch, voxel size, lines, width, pitch of the frames."""
         nz, ny, nx = self.brick.shape
         dz, dy, dx = self.grid.voxel_size_mm
         return (
@@ -117,7 +117,7 @@ class RayLayout:
 
 @dataclass(frozen=True, eq=False)
 class RayCells:
-    """The time cells of many frames on the device, frame after frame, as cl/rays.cl describes them."""
+    """The time cells of many frames on the device, frame after frame; cl/rays.cl describes the arrays."""
 
     cells: DeviceArray
     cell_lines: DeviceArray
@@ -152,7 +152,7 @@ class RayCells:
 
 
 def matrix_table(pose: np.ndarray, grid: Grid) -> tuple[np.ndarray, int]:
-    """``voxel_matrices`` of poses (C, 12) as kernels read them, (12, stride), and the stride: vectors may run past C."""
+    """Returns ``voxel_matrices`` of poses (C, 12) as (12, stride), and the stride. Vectors may read past C."""
     stride = len(pose) + _WIDEST
     matrices = np.zeros((12, stride))
     matrices[:, : len(pose)] = voxel_matrices(pose, grid).T
@@ -160,7 +160,7 @@ def matrix_table(pose: np.ndarray, grid: Grid) -> tuple[np.ndarray, int]:
 
 
 def ray_constants(pose: np.ndarray, grid: Grid) -> np.ndarray:
-    """Poses (C, 12) in voxel indices: the (C, 16) float32 table that cl/common/ray.h describes."""
+    """Converts poses (C, 12) to voxel indices: the (C, 16) float32 table of cl/common/ray.h."""
     first = np.array(grid.first_centre_mm[::-1])
     pitch = np.array(grid.voxel_size_mm[::-1])
     constants = np.zeros((len(pose), _RAY_CELL_FLOATS))
@@ -172,7 +172,7 @@ def ray_constants(pose: np.ndarray, grid: Grid) -> np.ndarray:
 
 
 def voxel_matrices(pose: np.ndarray, grid: Grid) -> np.ndarray:
-    """Rows (C, 12) that turn a voxel index (x, y, z) into (u·z, v·z, z)."""
+    """Returns the rows (C, 12) that map a voxel index (x, y, z) to (u·z, v·z, z)."""
     matrix = projection_matrices(pose).reshape(-1, 3, 4)
     first = np.array(grid.first_centre_mm[::-1])
     pitch = np.array(grid.voxel_size_mm[::-1])
@@ -181,15 +181,15 @@ def voxel_matrices(pose: np.ndarray, grid: Grid) -> np.ndarray:
 
 
 def layers(table: TimeCells) -> list[TimeCells]:
-    """The cells of a frame in tables in which no line has more than one; cells sorted by line stay so."""
+    """Splits the cells of a frame into tables in which no line has more than one cell. Keeps their order."""
     numbers = table.layer_numbers
     return [_some(table, np.flatnonzero(numbers == k)) for k in range(int(numbers.max()) + 1)]
 
 
 def layered(tables: Sequence[TimeCells]) -> tuple[list[list[TimeCells]], list[np.ndarray]]:
-    """Of many frames (F tables): the tables of each layer with weights of 1, and the cells' own weights.
+    """Splits the cells of F frames: the tables of each layer with weights of 1, and the original weights.
 
-    Weights are float32, (F, lines, 1) or (F, 1, lines) by the readout's axis, 0 where a layer has no cell of a line.
+    Weights are float32, (F, lines, 1) or (F, 1, lines) by the readout's axis; 0 where a layer has no cell for a line.
     """
     split = [layers(table) for table in tables]
     ones, weights = [], []
@@ -202,12 +202,12 @@ def layered(tables: Sequence[TimeCells]) -> tuple[list[list[TimeCells]], list[np
 
 
 def averaged(integrals: Sequence[np.ndarray], weights: Sequence[np.ndarray], average: str) -> np.ndarray:
-    """Frames (F, rows, columns) float32 from line integrals p of each layer (the same) and weights as of ``layered``.
+    """Averages line integrals p of each layer, (F, rows, columns), with the weights of ``layered``; float32.
 
-    ``intensity``: −ln Σ w exp(−p); ``correction``: Σ w p minus that. Lines without cells are 0. The twin of what
-    cl/rays.cl does where a line's cells are at hand together; weights of a line sum to 1.
+    ``intensity`` is −ln Σ w exp(−p); ``correction`` is Σ w p minus that. Lines without cells are 0; the weights of other
+    lines sum to 1. cl/rays.cl does the same where one launch has all cells of a line.
     """
-    sums = np.sum(weights, axis=0, dtype=np.float64)  # 1 but for float32's rounding, which a small gap would show
+    sums = np.sum(weights, axis=0, dtype=np.float64)  # 1 except for float32 rounding, which would show in a small correction
     exact = [np.divide(w, sums, out=np.zeros_like(sums), where=sums > 0) for w in weights]
     frames, _ = intensity_average(integrals, exact)
     if average == "correction":
@@ -222,6 +222,6 @@ def _some(table: TimeCells, cells: Sequence[int] | np.ndarray) -> TimeCells:
 
 
 def _empty(table: TimeCells) -> TimeCells:
-    """A table of a frame without cells: one that serves no line, because a table must not be empty."""
+    """Returns a table with one cell that serves no line: a table must not be empty."""
     one = _some(table, [0])
     return replace(one, line_stop=one.line_start.copy(), weight=np.zeros(1))

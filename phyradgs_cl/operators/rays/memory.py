@@ -1,4 +1,4 @@
-"""The device memory of ray-driven operators: a volume, whole or a brick at a time, and the frames of a batch."""
+"""The device memory of ray-driven operators: a volume or a brick of it, a batch of frames, and slots."""
 
 from collections.abc import Iterator
 
@@ -13,17 +13,17 @@ from phyradgs_cl.operators.rays.upright import columns_floats, turn_volume
 from phyradgs_cl.runtime import Array, DeviceArray, Runtime
 from phyradgs_cl.runtime.layout import GUARD, Strides, move, pad_rows, unpad_rows
 
-_FRAMES_SHARE = 0.25  # of the room, for frames beside a brick
-_SLOTS_SHARE = 0.125  # of the room, for slots of frames
-_MOST_SLOT_FLOATS = 2**26  # for the slots of some frames at a time: more would not be faster
+_FRAMES_SHARE = 0.25  # of the free memory, for frames together with a brick
+_SLOTS_SHARE = 0.125  # of the free memory, for slots
+_MOST_SLOT_FLOATS = 2**26  # for slots at a time: more is not faster
 
 
 class RayMemory:
-    """Buffers for frames of ``layout`` and its volume, planned when they are first needed.
+    """Buffers for a volume and for frames of ``layout``, planned at their first use.
 
-    A volume that fits stays whole; else it is cut into bricks, each as large as fits beside some frames. slot_floats: what
-    the slots of a frame take (``slots.py``); the volume is then wanted turned as well, where both fit, and so are frames; 0:
-    no slots. Operators may share one, in turns: each call writes what it reads.
+    A volume that does not fit is cut into bricks, as large as fit together with some frames. ``slot_floats`` is the size of
+    the slots of one frame (``slots.py``), 0 without slots. With slots the volume is also stored with z along rows, if both
+    fit. Several operators may share one memory, one at a time: each call writes the buffers that it reads.
     """
 
     def __init__(self, rt: Runtime, layout: RayLayout, most_frames: int, slot_floats: int = 0) -> None:
@@ -36,12 +36,12 @@ class RayMemory:
         self._bricks: list[Brick] = []
         self._batch = 0
         self._volume: DeviceArray | None = None
-        self._bordered: tuple[int, int, int] | None = None  # the shape of brick around which zeros lie
+        self._bordered: tuple[int, int, int] | None = None  # the shape of the brick whose border is zero
         self._frames: DeviceArray | None = None
         self._padded: dict[tuple[int, int, int], np.ndarray] = {}
 
     def plan(self, share: float = 1.0) -> list[Brick]:
-        """The bricks. A share below 1 plans anew, for so much of the room."""
+        """Returns the bricks. A share below 1 plans again, with that share of the free memory."""
         if not self._bricks or share < 1:
             self._volume = self._frames = self._columns = self._slots = None
             self._padded.clear()
@@ -80,13 +80,13 @@ class RayMemory:
         return cut(layout.grid.shape, steps, needs, room, share), frames
 
     def batches(self, count: int) -> Iterator[slice]:
-        """Runs of frames that fit beside each other."""
+        """Yields runs of frames that fit on the device together."""
         self.plan()
         for start in range(0, count, self._batch):
             yield slice(start, min(start + self._batch, count))
 
     def holds_all(self, frames: int) -> bool:
-        """Whether a whole volume and so many frames fit beside each other; if so, that memory is taken now."""
+        """Whether the complete volume and so many frames fit together; if they do, allocates the memory."""
         if len(self.plan()) > 1 or self._batch < frames:
             return False
         self.volume(self._bricks[0])
@@ -98,20 +98,20 @@ class RayMemory:
         return True
 
     def volume(self, brick: Brick) -> tuple[RayLayout, DeviceArray]:
-        """Memory for a brick, whatever is in it."""
+        """Returns memory for a brick, with undefined content."""
         if self._volume is None:
             largest = self._bricks[0]
             self._volume = self.rt.zeros(self.layout.of(largest).volume_floats)
             self._bordered = largest.shape
         layout = self.layout.of(brick)
-        if brick.shape != self._bordered:  # the borders of the shape before are voxels now
+        if brick.shape != self._bordered:  # the border of the last shape lies among the voxels of this one
             self._bordered = None
         return layout, DeviceArray(self._volume.buffer, (layout.volume_floats,), self._volume.dtype)
 
     def write_volume(self, volume: Array, brick: Brick) -> tuple[RayLayout, DeviceArray]:
-        """A brick of a volume (z, y, x) in the padded layout.
+        """Copies a brick of a volume (z, y, x) to the device, into the padded layout.
 
-        Of a host's volume the padded floats are kept: fresh pages cost more than the copy.
+        The padded host array is kept for the next call: new pages cost more than the copy.
         """
         layout, on_device = self.volume(brick)
         if isinstance(volume, DeviceArray):
@@ -130,7 +130,7 @@ class RayMemory:
         return layout, on_device
 
     def read_volume(self, layout: RayLayout, on_device: DeviceArray, result: Array) -> None:
-        """A padded brick to its place in a volume (z, y, x)."""
+        """Copies a padded brick to its place in a volume (z, y, x)."""
         brick = layout.brick
         if isinstance(result, DeviceArray):
             plain = Strides.plain(result.shape, brick.start)
@@ -140,11 +140,11 @@ class RayMemory:
 
     @property
     def has_columns(self) -> bool:
-        """Whether there is room for a whole volume with z along a row, after ``plan``."""
+        """Whether a complete volume with z along rows fits as well; known after ``plan``."""
         return self._columns_bytes > 0
 
     def turned(self, volume: Array) -> DeviceArray:
-        """A whole volume (z, y, x) with z along a row: a device array as it lies, a host's by way of the padded layout."""
+        """Returns a complete volume (z, y, x) with z along rows."""
         if self._columns is None:
             self._columns = self.rt.zeros(self._columns_bytes // 4)
         if isinstance(volume, DeviceArray):
@@ -155,7 +155,7 @@ class RayMemory:
         return self._columns
 
     def slots(self) -> DeviceArray:
-        """Memory for the slots of ``slot_frames`` frames, whatever was in it. There is none where the room is too small."""
+        """Returns memory for the slots of ``slot_frames`` frames, with undefined content."""
         if self._slots is None:
             self._slots = self.rt.zeros(self._slots_floats)
         return self._slots
@@ -165,7 +165,7 @@ class RayMemory:
         return 2 * GUARD + self.slot_frames * self.slot_floats if self.slot_frames else 0
 
     def frames(self, count: int) -> DeviceArray:
-        """Memory for ``count`` frames of one batch, whatever was in it."""
+        """Returns memory for ``count`` frames of a batch, with undefined content."""
         return self._some_frames(self.layout.frames_floats(count))
 
     def _some_frames(self, floats: int) -> DeviceArray:
@@ -174,12 +174,12 @@ class RayMemory:
         return DeviceArray(self._frames.buffer, (floats,), self._frames.dtype)
 
     def _frames_floats(self, count: int) -> int:
-        """Of frames that lie either way, where both are wanted."""
+        """Floats of frames stored by rows or, with slots, by columns: the larger of both."""
         turned = self.layout.turned_floats(count) if self.slot_floats else 0
         return max(self.layout.frames_floats(count), turned)
 
     def write_frames(self, frames: Array, part: slice, axis: str) -> DeviceArray:
-        """Some of the frames (F, rows, columns), lines first and padded; ``axis`` is the readout's."""
+        """Copies some frames (F, rows, columns) to the device, padded, with lines as rows; ``axis`` is the readout's."""
         count = part.stop - part.start
         on_device = self.frames(count)
         if isinstance(frames, DeviceArray):
@@ -192,7 +192,7 @@ class RayMemory:
         return on_device
 
     def write_turned(self, frames: Array, part: slice, axis: str) -> DeviceArray:
-        """As ``write_frames``, with lines as columns."""
+        """Copies some frames to the device as ``write_frames`` does, with lines as columns."""
         count = part.stop - part.start
         on_device = self._some_frames(self.layout.turned_floats(count))
         if isinstance(frames, DeviceArray):
@@ -204,7 +204,7 @@ class RayMemory:
         return on_device
 
     def read_frames(self, on_device: DeviceArray, result: Array, part: slice, axis: str) -> None:
-        """The inverse of ``write_frames``: padded frames to their place among ``result`` (F, rows, columns)."""
+        """Copies padded frames to their place in ``result`` (F, rows, columns): the inverse of ``write_frames``."""
         shape = self.layout.frames_shape(part.stop - part.start)
         if isinstance(result, DeviceArray):
             plain = Strides.plain(result.shape, (part.start, 0, 0))

@@ -1,4 +1,13 @@
-"""The system matrix of a whole scan: all frames under one motion model, as one linear operator and its transpose."""
+"""The system matrix of a scan: line integrals of a volume for all frames, as one linear operator A and its transpose.
+
+Each frame has a table of time cells: poses, the detector lines that each pose serves, and weights. A pixel is the weighted
+average of the line integrals from the poses that serve its line. ``forward`` projects batches of frames (``RayMemory``),
+one brick of the volume after the other if the volume does not fit on the device; ``adjoint`` is its exact transpose.
+
+Two sets of kernels compute the same samples. The general ones follow each ray (``launches.py``). The upright ones serve
+CPUs and scans whose detector columns run nearly along z: they project each pose once, into a slot, and average slots to
+frames (``upright.py``, ``slots.py``).
+"""
 
 from collections.abc import Iterator, Sequence
 from copy import copy
@@ -19,7 +28,7 @@ from phyradgs_cl.runtime.layout import Strides
 
 
 class LinearOperator(Protocol):
-    """What the iterative methods need to know of a scanner: A, Aᵀ, and A restricted to some frames."""
+    """The interface that iterative methods need: A, Aᵀ, and A restricted to some frames."""
 
     @property
     def volume_shape(self) -> tuple[int, ...]: ...
@@ -36,19 +45,17 @@ class LinearOperator(Protocol):
         ...
 
     def subset(self, frames: Sequence[int]) -> "LinearOperator":
-        """The rows of A that belong to these frames, in this order."""
+        """Returns the rows of A for these frames, in this order."""
         ...
 
 
 class RayOperator:
     """Joseph's projector and its matched adjoint over the cells of many frames; a ``LinearOperator``.
 
-    Results lie where the arguments do: NumPy's arrays give NumPy's, device arrays (plain, float32) device arrays, and of
-    those nothing crosses the bus. ``out``: memory for the result, of the same kind; without it, it is new.
-    detector_shape (rows, columns); ``tables`` has the time cells of each frame, all read out along one axis.
-    Tables are uploaded once and shared with every subset, and so are the device's volume and frames: use an operator
-    and its subsets one at a time, and operators that were given one ``memory``. Each call is one launch, or as few as
-    memory allows: a volume that does not fit is taken brick by brick (docs/large.md).
+    NumPy arrays give NumPy arrays. Device arrays (plain, float32) give device arrays, without copies to the host. ``out``,
+    an array of the same kind, receives the result. detector_shape is (rows, columns); ``tables`` has the time cells of each
+    frame, all read out along one axis. An operator shares its tables and buffers with its subsets, and with operators that
+    were given the same ``memory``: use them one at a time. A volume that does not fit is projected in bricks.
 
     Joseph, IEEE Trans. Med. Imaging 1 (1982) 192. Raises InputError for tables that do not fit the detector.
     """
@@ -84,23 +91,23 @@ class RayOperator:
 
     @property
     def tables(self) -> list[TimeCells]:
-        """The cells of each frame."""
+        """The time cells of each frame."""
         return [self._tables[f] for f in self._chosen]
 
     def forward(self, volume: SameArray, out: SameArray | None = None) -> SameArray:
-        """A x; volume (nz, ny, nx) 1/mm, result (F, rows, columns) float32."""
+        """Returns A x for a volume (nz, ny, nx) in 1/mm: frames (F, rows, columns) float32."""
         return self.project(volume, "log", out)
 
     def intensity_correction(self, volume: SameArray, out: SameArray | None = None) -> SameArray:
         """A x − I(x) with I(x) = −ln Σ w exp(−p) over a line's cells, where A x is Σ w p; shapes as in ``forward``.
 
-        Never negative but for rounding; computed from differences between cells, so that small gaps are right too. Added
-        to what an intensity detector measured of about x, it is what a log detector would have measured.
+        At least 0 except for rounding. It is computed from differences between cells, so that small corrections keep their
+        digits. Intensity frames of about x plus this correction are the frames of a detector that averages line integrals.
         """
         return self.project(volume, "correction", out)
 
     def project(self, volume: SameArray, average: str, out: SameArray | None = None) -> SameArray:
-        """Frames with a line's cells averaged by ``average``, one of rays.AVERAGES; shapes as in ``forward``."""
+        """Projects with ``average``, one of AVERAGES, over the cells of each line; shapes as in ``forward``."""
         _check_shape("volume", volume, self.volume_shape)
         result: SameArray = _room_for(self.rt, self.frames_shape, volume, out)
         with_smaller_bricks(
@@ -131,11 +138,11 @@ class RayOperator:
 
     @property
     def _is_upright(self) -> bool:
-        """Whether the upright kernels serve, and the memory planned for has room for slots."""
+        """Whether the upright kernels apply, and the planned memory has room for slots."""
         return self._upright is not None and self.memory.slot_frames > 0
 
     def _project_upright(self, columns: DeviceArray, part: slice, average: str, frames: DeviceArray) -> None:
-        """Some frames of a turned volume, into their padded memory."""
+        """Projects a turned volume to some frames, in the padded layout."""
         assert self._upright is not None and self._poses is not None
         layout = self.memory.layout
         start, *steps = layout.pixel_strides(self._readout.axis)
@@ -150,7 +157,7 @@ class RayOperator:
             merge_slots(self.rt, self._cells, slots, there, target, *like)
 
     def _slots_of(self, part: slice) -> Iterator[tuple[int, Slots]]:
-        """Where runs of the part's frames begin in it, and their slots, as many as fit into memory together."""
+        """Yields the first frame, within the part, and the slots of as many frames as fit into memory at a time."""
         assert self._upright is not None and self._poses is not None
         for first in range(part.start, part.stop, self.memory.slot_frames):
             key = first, min(first + self.memory.slot_frames, part.stop)
@@ -160,7 +167,7 @@ class RayOperator:
             yield first - part.start, self._slots[key]
 
     def _project_layers(self, volume: Array, average: str, result: Array) -> None:
-        """Averages that need a whole ray at a time, where no brick has one: every layer by itself, averaged on the host."""
+        """Averages on the host, layer by layer: no brick holds complete rays, which these averages need."""
         ones, weights = layered(self.tables)
         like = (self.rt, self.grid, self.detector_shape)
         on_host = self.rt.download(volume) if isinstance(volume, DeviceArray) else volume
@@ -172,7 +179,7 @@ class RayOperator:
             result[...] = frames
 
     def adjoint(self, frames: SameArray, out: SameArray | None = None) -> SameArray:
-        """Aᵀ y; frames (F, rows, columns), result (nz, ny, nx) float32."""
+        """Returns Aᵀ y for frames (F, rows, columns): a volume (nz, ny, nx) float32."""
         _check_shape("frames", frames, self.frames_shape)
         result: SameArray = _room_for(self.rt, self.volume_shape, frames, out)
         with_smaller_bricks(
@@ -204,7 +211,7 @@ class RayOperator:
     def _adjoint_upright(
         self, layout: RayLayout, part: slice, frames: DeviceArray, target: tuple[DeviceArray, Strides], add: bool
     ) -> None:
-        """Sums some frames, with detector columns as rows, onto a volume with these strides."""
+        """Adds the backprojection of some frames, stored column by column, to a volume with these strides."""
         assert self._upright is not None and self._poses is not None
         there, pitch_mm = self.memory.slots(), layout.constants()[3]
         each = layout.column_floats(self._readout.axis)
@@ -216,7 +223,7 @@ class RayOperator:
             )
 
     def subset(self, frames: Sequence[int]) -> "RayOperator":
-        """The same operator on some of the frames, in this order; cheap, but worth keeping if it is used again."""
+        """Returns the operator for some of the frames, in this order. Keep it if you use it again: it keeps its tables."""
         chosen = self._chosen[np.asarray(frames, np.int64)]
         if chosen.size == 0:
             raise InputError("subset", "no frames", "at least one frame")
@@ -231,7 +238,7 @@ class RayOperator:
         self._slots: dict[tuple[int, int], Slots] = {}
 
     def _listed(self, part: slice) -> DeviceArray:
-        """The indices of some of the chosen frames on the device."""
+        """Returns the indices of some of the operator's frames, on the device."""
         key = part.start, part.stop
         if key not in self._lists:
             self._lists[key] = self.rt.upload(self._chosen[part], np.int32)
@@ -257,10 +264,10 @@ def _check_shape(name: str, values: Array, shape: tuple[int, ...]) -> None:
 
 
 def _room_for(rt: Runtime, shape: tuple[int, ...], like: Array, out: Array | None) -> Any:
-    """Memory for a float32 result where ``like`` is: ``out``, or new."""
+    """Returns ``out``, or a new float32 array on the side of ``like``: device or host."""
     if out is not None:
         _check_shape("out", out, shape)
         if isinstance(out, DeviceArray) != isinstance(like, DeviceArray):
-            raise InputError("out", "an array elsewhere than the argument", "both on the device, or both NumPy's")
+            raise InputError("out", "an array of the other kind", "a device array for a device array, NumPy for NumPy")
         return out
     return rt.empty(shape) if isinstance(like, DeviceArray) else np.empty(shape, np.float32)

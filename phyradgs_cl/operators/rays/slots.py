@@ -1,7 +1,7 @@
-"""Slots: poses of many frames, each with the part of the panel that it serves; and frames as weighted averages of them.
+"""Slots for the upright kernels: the projection of one pose onto the part of the panel that it serves.
 
-A line of a frame has a weight in each of its slots. Poses that frames share, as neighbours in a scan without gaps between
-exposures do, are projected once.
+Frames are weighted averages of slots; each line of a frame has a weight in each of its slots. Neighbouring frames share
+poses where exposures follow each other without gaps: such a pose is projected once.
 """
 
 from collections.abc import Sequence
@@ -16,14 +16,14 @@ from phyradgs_cl.runtime import DeviceArray, Runtime
 from phyradgs_cl.runtime.layout import GUARD, pitch_of
 
 _SLOT_INTS, _SHARE_INTS = 8, 4  # as in cl/common/ray_column.h and cl/rays_slots.cl
-_SAME_POSE = 10  # decimals of the longest distance to which poses agree that are projected once
+_SAME_POSE = 10  # decimals relative to the longest distance: poses that agree to them count as one
 
 
 @dataclass(frozen=True, eq=False)
 class UprightPoses:
-    """The distinct poses of many frames on the device, and which of them each frame's cells have.
+    """The distinct poses of many frames on the device, and the pose of each cell.
 
-    pose_of (E,): of every cell, frame after frame; first, stop (E,): its lines; frame_cells (F + 1,).
+    For all E cells, frame after frame: pose_of (E,), and lines first, stop (E,); frame_cells (F + 1,) where frames begin.
     """
 
     cells: DeviceArray
@@ -60,14 +60,14 @@ class UprightPoses:
         )
 
     def floats_per_frame(self, detector_shape: tuple[int, int], leans: bool) -> int:
-        """The most that the slots of a frame take: values and, where columns lean, slopes."""
+        """Floats of the largest frame's slots: values and, where columns lean, slopes."""
         rows, columns = detector_shape
         widest = int((self.stop - self.first).max())
         each = columns * pitch_of(widest) if self.axis == "rows" else widest * pitch_of(rows)
         return int(np.diff(self.frame_cells).max()) * each * (2 if leans else 1)
 
     def slots(self, rt: Runtime, frames: np.ndarray, detector_shape: tuple[int, int], leans: bool) -> "Slots":
-        """The slots of some frames, in the order in which these need them."""
+        """Returns the slots of some frames, in the order of their first use."""
         rows, columns = detector_shape
         cells = np.concatenate([np.arange(self.frame_cells[f], self.frame_cells[f + 1]) for f in frames])
         of_frame = np.repeat(np.arange(len(frames)), np.diff(self.frame_cells)[frames])
@@ -98,14 +98,14 @@ class UprightPoses:
         )
 
     def _shares(self, cells: np.ndarray, of: np.ndarray) -> np.ndarray:
-        """(E, 4): slot or frame, lines [first, stop), and where the cell's weights begin among those of ``RayCells``."""
+        """Returns (E, 4): slot or frame, lines [first, stop), and the index of the first weight in ``RayCells``."""
         begins = np.concatenate([[0], np.cumsum(self.stop - self.first)])
         return np.stack([of, self.first[cells], self.stop[cells], begins[cells]], -1)
 
 
 @dataclass(frozen=True, eq=False)
 class Slots:
-    """Some frames' slots on the device, as cl/rays_slots.cl describes them; ``columns``, ``rows``: of the largest."""
+    """Slots of some frames on the device (cl/rays_slots.cl); ``columns`` and ``rows`` are those of the largest."""
 
     slots: DeviceArray
     frame_shares: DeviceArray
@@ -126,12 +126,12 @@ class Slots:
 
     @property
     def floats(self) -> int:
-        """Of one value for each pixel of all slots."""
+        """Floats of one value for each pixel of all slots."""
         return self.count * self.columns * self.pitch
 
     @property
     def strides(self) -> np.ndarray:
-        """Where line integrals lie: start, and floats from column to column, row to row, slot to slot."""
+        """Start of the line integrals, and floats from column to column, row to row, slot to slot."""
         return np.array([GUARD, self.pitch, 1, self.columns * self.pitch], np.int64)
 
     @property
@@ -149,7 +149,7 @@ def merge_slots(
     axis: str,
     average: int,
 ) -> None:
-    """Frames from slots; target: an array and its strides (start, column, row, frame); ``average``: as in the kernel."""
+    """Averages slots to frames. ``target`` is an array and its strides (start, column, row, frame)."""
     rows, columns = detector_shape
     rt.launch(
         rt.kernel("rays_slots", "merge_slots", AVERAGE=average, **{**slots.defines, "LEAN": 0}),
@@ -181,8 +181,10 @@ def split_slots(
     start: int,
     values: DeviceArray,
 ) -> None:
-    """Slots' weighted shares of frames, times the length of each ray from plane to plane. turned: frames (F, columns,
-    rows) from ``start`` floats on."""
+    """Distributes frames to slots by weight, times each ray's length from plane to plane.
+
+    turned: frames (F, columns, rows), which begin at ``start`` floats.
+    """
     rows, columns = detector_shape
     rt.launch(
         rt.kernel("rays_slots", "split_slots", AVERAGE=0, **slots.defines),

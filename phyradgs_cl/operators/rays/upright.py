@@ -1,7 +1,7 @@
-"""The ray-driven projector where detector columns are nearly parallel to the volume's z and a pose serves many lines.
+"""The ray-driven projector for detector columns nearly parallel to the volume's z, and poses that serve many lines.
 
-The rays of a column share most of their work then. Each pose is projected once, into a slot for the part of the panel that
-it serves; frames are weighted averages of slots (``slots.py``). Samples are those of ``launches``.
+The rays of such a column share most of their work. Each pose is projected once, into a slot for its part of the panel;
+frames are weighted averages of slots (``slots.py``). Samples are the same as those of ``launches.py``.
 """
 
 from collections.abc import Sequence
@@ -10,24 +10,25 @@ from dataclasses import dataclass
 import numpy as np
 
 from phyradgs_cl.acquisition.time_cells import TimeCells
+from phyradgs_cl.checks import ceil_div
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.operators.rays.layout import BORDER, RayLayout, ray_constants
 from phyradgs_cl.operators.rays.slots import Slots, UprightPoses
 from phyradgs_cl.runtime import DeviceArray, Runtime
 from phyradgs_cl.runtime.layout import GUARD, Strides, pitch_of
 
-_LINES = 128  # of a detector column for a work-item
-_FEWEST_LINES = 8  # to a pose: fewer do not pay for its slot
-_VOXELS = 512  # of a column of the volume that they may meet in one slice
-_OWNED = (8, 4, 128)  # voxels (x, y, z) of a work-item of the adjoint: neighbouring columns share what rays bring
+_LINES = 128  # of a detector column per work-item
+_FEWEST_LINES = 8  # per pose: with fewer, slots cost more than they save
+_VOXELS = 512  # of a volume's column that the lines of a work-item may meet in one slice
+_OWNED = (8, 4, 128)  # voxels (x, y, z) of a work-item of the adjoint: neighbouring columns share rays
 _UPRIGHT = 1e-6  # voxels: how far a column, or a row, may lean over the whole detector
-_MOST_LEAN = 0.25  # of a column's voxels across to those along z: further the general kernel is faster
+_MOST_LEAN = 0.25  # voxels across per voxel along z: beyond it the general kernel is faster
 _TURN = 16  # voxels along x and z that are turned at a time; as in cl/rays_upright.cl
 
 
 @dataclass(frozen=True)
 class Upright:
-    """How the upright kernels take a scan: lines of a detector column per work-item, and whether columns lean."""
+    """Lines of a detector column per work-item of the upright kernels, and whether columns lean."""
 
     block: int
     leans: bool
@@ -36,10 +37,10 @@ class Upright:
 def upright_of(
     grid: Grid, tables: Sequence[TimeCells], detector_shape: tuple[int, int], lanes: int
 ) -> Upright | None:
-    """How the upright kernels take these cells; None where rays need the general kernel.
+    """Returns how the upright kernels project these cells; None if the general kernel is needed.
 
-    They need poses that serve several lines each, rays whose main axis is x or y, and columns nearly along z. Columns
-    that lean need the volume to lie between source and panel.
+    The upright kernels need poses that serve several lines each, rays with main axis x or y, and columns nearly along z. If
+    columns lean, the volume must lie between source and panel.
     """
     served = sum(int((table.line_stop - table.line_start).sum()) for table in tables)
     lines = tables[0].lines
@@ -62,7 +63,7 @@ def upright_of(
 
 
 def _least_horizontal(d00: np.ndarray, eu: np.ndarray, width: int) -> np.ndarray:
-    """(C,) the least length of d00 + u eu for u in [0, width − 1]; all (C, 2)."""
+    """Returns (C,) the smallest length of d00 + u eu for u in [0, width − 1]; arguments (C, 2)."""
     nearest = -np.sum(d00 * eu, 1) / np.maximum(np.sum(eu * eu, 1), 1e-30)
     length: np.ndarray = np.linalg.norm(d00 + np.clip(nearest, 0, width - 1)[:, None] * eu, axis=1)
     return length
@@ -78,7 +79,7 @@ def _lies_between(grid: Grid, source: np.ndarray, d00: np.ndarray, eu: np.ndarra
 
 
 def columns_floats(grid: Grid) -> int:
-    """What the turned volume takes."""
+    """Floats of the volume with z along rows."""
     nz, ny, nx = grid.shape
     return 2 * GUARD + (ny + 2 * BORDER) * (nx + 2 * BORDER) * pitch_of(nz)
 
@@ -92,13 +93,12 @@ def launch_upright(
     columns: DeviceArray,
     target: tuple[DeviceArray, np.ndarray],
 ) -> None:
-    """Line integrals of a turned volume, each slot's of its own part of the panel, into an array with strides as of
-    ``Slots.strides``."""
+    """Projects a turned volume to slots: an array, with strides as in ``Slots.strides``."""
     shape, origin, _, pitch_mm, *_ = layout.constants()
     array, strides = target
     rt.launch(
         rt.kernel("rays_upright", "rays_upright", **_defines(how)),
-        (slots.columns, -(-slots.rows // how.block), slots.count),
+        (slots.columns, ceil_div(slots.rows, how.block), slots.count),
         columns,
         poses.cells,
         slots.slots,
@@ -124,13 +124,13 @@ def launch_upright_adjoint(
     *,
     add: bool = False,
 ) -> None:
-    """Sums slots, as ``split_slots`` leaves them, onto a volume with these strides."""
+    """Backprojects slots, as ``split_slots`` writes them, into a volume with these strides."""
     nz, ny, nx = layout.brick.shape
     shape, origin, *_ = layout.constants()
     x, y, z = _OWNED
     rt.launch(
         rt.kernel("rays_upright_adjoint", "rays_upright_adjoint", ADJOINT_X=x, ADJOINT_Y=y, ADJOINT_Z=z, **slots.defines),
-        tuple(-(-n // own) for n, own in zip((nx, ny, nz), _OWNED, strict=True)),
+        tuple(ceil_div(n, own) for n, own in zip((nx, ny, nz), _OWNED, strict=True)),
         values,
         np.int32(slots.columns),
         np.int32(slots.pitch),
@@ -152,10 +152,10 @@ def launch_upright_adjoint(
 def turn_volume(
     rt: Runtime, layout: RayLayout, volume: tuple[DeviceArray, Strides], columns: DeviceArray
 ) -> None:
-    """A volume (z, y, x) with these strides to ``columns`` (y, x, z), whose padding is zero already and stays so."""
+    """Copies a volume (z, y, x) with these strides to ``columns`` (y, x, z). Does not write the padding, which is zero."""
     nz, ny, nx = layout.grid.shape
     shape, *_ = layout.constants()
-    size = (-(-nx // _TURN), ny, -(-nz // _TURN))
+    size = (ceil_div(nx, _TURN), ny, ceil_div(nz, _TURN))
     kernel = rt.kernel("rays_upright", "turn_upright", **_defines(Upright(_LINES, False)))
     rt.launch(kernel, size, volume[0], volume[1].vector(), shape, np.int32(pitch_of(nz)), columns, group=1)
 

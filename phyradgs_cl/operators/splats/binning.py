@@ -2,24 +2,25 @@
 
 import numpy as np
 
+from phyradgs_cl.checks import ceil_div
 from phyradgs_cl.runtime import DeviceArray, LaterItem, MemoryShortage, Runtime
 
-_CHUNK = 512  # splats that a work-item counts on a CPU
-_GROUP, _LARGEST_GROUP = 64, 256  # and a group on a GPU, an item each; the larger where counts would be too many
+_CHUNK = 512  # splats per work-item on a CPU
+_GROUP, _LARGEST_GROUP = 64, 256  # splats per group on a GPU; the larger where there would be too many counts
 _MANY_COUNTS = 1 << 22
-_SCANNED = 64  # counts that a group adds up at a time
-_SLACK = 1.5  # entries that there is memory for, over those of a build that was looked at
-_NEAR = 1.25  # grow before they outgrow it
-_MOST_ENTRIES = 2**31 - 1  # indices of entries are ints
+_SCANNED = 64  # counts per step of a group
+_SLACK = 1.5  # allocated over needed indices
+_NEAR = 1.25  # allocate again below this reserve
+_MOST_ENTRIES = 2**31 - 1  # the kernels index them by int
 
 
 class TileLists:
     """Builds, for tiles of a 2D or 3D domain, the list of splats whose extent touches each tile.
 
-    ``tile`` is a tile's size and ``tiles`` their number, along x, y, z. Lists keep the order of the splats,
-    so everything summed over them repeats bit for bit. Memory for entries follows what builds have needed. The host waits
-    for that number where the count of splats is new, or always where ``waits`` is set; else it comes while others work,
-    and kernels pass over lists that did not fit (cl/common/tile.h).
+    ``tile`` is a tile's size and ``tiles`` their number, along x, y, z. Lists keep the order of the splats, so that sums
+    over them repeat bit for bit. The memory for indices follows the number needed by former builds. The host waits for this
+    number if the count of splats is new or ``waits`` is set. Otherwise it reads the number later; until then kernels do not
+    use lists that did not fit (cl/common/tile.h).
     """
 
     def __init__(self, rt: Runtime, tile: tuple[int, int, int], tiles: tuple[int, int, int]) -> None:
@@ -39,15 +40,15 @@ class TileLists:
         )
 
     def build(self, extents: DeviceArray, count: int, stride: int) -> None:
-        """Fills ``starts`` (tiles + 1,) and ``entries`` from extents (6, stride).
+        """Fills ``tile_offsets`` (tiles + 1,) and ``splat_ids`` from extents (6, stride).
 
-        Raises MemoryShortage for 2^31 entries or more, which smaller bricks of a volume may not have.
+        Raises MemoryShortage for 2^31 indices or more; smaller bricks of a volume may have fewer.
         """
         rt = self.rt
         chunk = chunk_of(rt, self.total, count)
-        chunks = max(-(-count // chunk), 1)
+        chunks = max(ceil_div(count, chunk), 1)
         if self._counts.size < self.total * chunks:
-            self._counts = rt.empty(1, np.int32)  # the old goes before the new comes
+            self._counts = rt.empty(1, np.int32)  # frees the old memory before it allocates the new
             self._counts = rt.empty(self.total * chunks, np.int32)
         domain = (
             extents,
@@ -97,11 +98,11 @@ class TileLists:
 
     @staticmethod
     def bytes(rt: Runtime, tiles: int, count: int) -> int:
-        """What lists of ``count`` splats take beside their entries."""
-        return 4 * (tiles + 1 + tiles * max(-(-count // chunk_of(rt, tiles, count)), 1))
+        """Returns the bytes of lists of ``count`` splats, without their indices."""
+        return 4 * (tiles + 1 + tiles * max(ceil_div(count, chunk_of(rt, tiles, count)), 1))
 
     def _make_room(self, needed: int, share: float) -> None:
-        """Memory for ``needed`` entries and more, unless there is enough for ``share`` times as many."""
+        """Allocates memory for more than ``needed`` indices, unless there is enough for ``share`` times as many."""
         if needed >= _MOST_ENTRIES:
             found, expected = f"{needed} entries or more", f"fewer than {_MOST_ENTRIES}"
             remedy = "use fewer or smaller Gaussians"
@@ -112,10 +113,10 @@ class TileLists:
 
 
 def chunk_of(rt: Runtime, tiles: int, count: int) -> int:
-    """Splats that one work-item counts, one after the other (CPUs), or a group, each by an item of its own (GPUs)."""
+    """Returns the splats per work-item on a CPU, or per group on a GPU, where each has its own item."""
     if not rt.pixel_items:
         return _CHUNK
     chunk, largest = _GROUP, min(_LARGEST_GROUP, rt.device.handle.max_work_group_size)
-    while 2 * chunk <= largest and tiles * -(-count // chunk) > _MANY_COUNTS:
+    while 2 * chunk <= largest and tiles * ceil_div(count, chunk) > _MANY_COUNTS:
         chunk *= 2
     return chunk

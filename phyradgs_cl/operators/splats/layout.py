@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from phyradgs_cl.acquisition.time_cells import TimeCells
+from phyradgs_cl.checks import ceil_div
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.runtime import DeviceArray, Kernel, Runtime
 from phyradgs_cl.runtime.layout import GUARD, padded_zeros, pitch_of
@@ -27,16 +28,16 @@ class DeviceGaussians:
 
     @classmethod
     def upload(cls, rt: Runtime, rows: np.ndarray) -> "DeviceGaussians":
-        """From parameter rows (11, G); padding is a harmless unit Gaussian."""
+        """Uploads parameter rows (11, G). Padding is a unit Gaussian, which is never drawn."""
         return cls(rt.upload(pad_columns(rows)), rows.shape[1], stride_of(rows.shape[1]))
 
 
 def stride_of(count: int) -> int:
-    return max(-(-count // STRIDE_OF), 1) * STRIDE_OF
+    return max(ceil_div(count, STRIDE_OF), 1) * STRIDE_OF
 
 
 def pad_columns(rows: np.ndarray) -> np.ndarray:
-    """(11, G) rows to (11, stride) float32."""
+    """Pads rows (11, G) to (11, stride) float32."""
     padded = np.zeros((rows.shape[0], stride_of(rows.shape[1])), np.float32)
     padded[3:7] = 1.0
     padded[10] = 1.0
@@ -45,7 +46,7 @@ def pad_columns(rows: np.ndarray) -> np.ndarray:
 
 
 def split_coefficients(rt: Runtime, matrix: np.ndarray) -> DeviceArray:
-    """Uploads float64 coefficients as they are, or as (high, low) float pairs where the device has no fp64."""
+    """Uploads coefficients as float64, or as (high, low) pairs of floats where the device has no float64."""
     matrix = np.ascontiguousarray(matrix, np.float64)
     if rt.fp64:
         return rt.upload(matrix)
@@ -57,10 +58,10 @@ def split_coefficients(rt: Runtime, matrix: np.ndarray) -> DeviceArray:
 class DeviceCells:
     """The time cells of one frame on the device; lines are always the slow axis of the image.
 
-    A frame read out along columns is handled as its transpose: only the poses' pixel steps change places.
-    With motion, ``matrices`` has three poses per cell, middle and both ends, and ``line_times`` (C, 3, time_pitch) when
-    every line integrates (TimeCells.line_times); without, it is a dummy. For the intensity model cells are spread over
-    ``layers`` images in which no line has two; ``layer_weights`` (layers, lines) are their shares of a line's window.
+    A frame read out along columns is projected as its transpose: only the poses' pixel steps are exchanged. With motion,
+    ``matrices`` has three poses per cell (middle, both ends) and ``line_times`` (C, 3, time_pitch) the integration times of
+    the lines; without motion ``line_times`` has one element. The intensity model draws cells into ``layers`` images in
+    which no line has two cells; ``layer_weights`` (layers, lines) are the cells' shares of a line's window.
     """
 
     cells: DeviceArray
@@ -105,7 +106,7 @@ class DeviceCells:
 
 
 def projection_matrices(pose: np.ndarray) -> np.ndarray:
-    """Rows (C, 12) that turn a world point x into (u·z, v·z, z): pixel column, line and depth of its ray.
+    """Returns the rows (C, 12) that map a world point x to (u·z, v·z, z): pixel column, line and depth of its ray.
 
     x − source = z (d00 + u·eu + v·ev), with d00 from the source to pixel (0, 0).
     """
@@ -117,7 +118,7 @@ def projection_matrices(pose: np.ndarray) -> np.ndarray:
 
 
 def cell_constants(pose: np.ndarray, weight: np.ndarray, layer: np.ndarray) -> np.ndarray:
-    """The (C, 24) float32 table that cl/common/splat.h describes."""
+    """Returns the (C, 24) float32 table of cl/common/splat.h."""
     source, d00 = pose[:, 0:3], pose[:, 3:6] - pose[:, 0:3]
     eu, ev = pose[:, 6:9], pose[:, 9:12]
     table = np.zeros((len(pose), CELL_FLOATS))
@@ -142,7 +143,7 @@ class Layers:
         self._split = rt.kernel("intensity", "intensity_split", IMAGE_GUARD=GUARD)
 
     def images(self, cells: DeviceCells) -> DeviceArray:
-        """Memory for the layers of ``cells``: images of GUARD floats and (lines, pitch)."""
+        """Returns memory for the layers of ``cells``: images of GUARD floats and (lines, pitch)."""
         if cells.layers > self._count:
             self._count = cells.layers
             self._drawn, self._shares, self._by_layers = (
@@ -152,7 +153,7 @@ class Layers:
         return DeviceArray(self._drawn.buffer, (floats,), self._drawn.dtype)
 
     def merge(self, cells: DeviceCells, merged: DeviceArray) -> None:
-        """Writes −ln Σ w exp(−p) of the layers that were drawn last into ``merged``."""
+        """Writes −ln Σ w exp(−p) of the layers drawn last into ``merged``."""
         self._launch(
             self._merge,
             (self._drawn, cells.layer_weights),
@@ -161,7 +162,7 @@ class Layers:
         )
 
     def split(self, cells: DeviceCells, by_merged: DeviceArray) -> DeviceArray:
-        """dL/dlayers of the last ``merge`` from dL/dmerged; valid until the next call."""
+        """Returns dL/dlayers of the last ``merge`` from dL/dmerged, valid until the next call."""
         self._launch(self._split, (by_merged, self._shares), cells, (self._by_layers,))
         return self._by_layers
 
@@ -170,4 +171,4 @@ class Layers:
     ) -> None:
         rt = self.rt
         sizes = (np.int32(n) for n in (cells.layers, self.lines, self.width, pitch_of(self.width)))
-        rt.launch(kernel, (-(-self.width // rt.lanes), self.lines), *inputs, *sizes, *rest, group=rt.group())
+        rt.launch(kernel, (ceil_div(self.width, rt.lanes), self.lines), *inputs, *sizes, *rest, group=rt.group())

@@ -25,10 +25,10 @@ from phyradgs_cl.runtime import DeviceArray, Runtime
 
 
 class SplatOperator:
-    """Parameter rows (11, G) to frames (F, rows, columns) of line integrals, averaged as they are or by ``intensity``.
+    """Maps parameter rows (11, G) to frames (F, rows, columns) of line integrals; ``intensity`` averages intensities.
 
-    ``tables`` has the time cells of each frame in mm, all read out along one axis; ``length_mm`` is the kernels' unit of
-    length, in which their float32 likes the scene to be of order 1. Subsets share all memory: use them one at a time.
+    ``tables`` has the time cells of each frame in mm, all read out along one axis. ``length_mm`` is the kernels' unit of
+    length; the scene should have a size of about 1 in it. Subsets share all memory: use them one at a time.
     """
 
     def __init__(
@@ -63,7 +63,7 @@ class SplatOperator:
         self.frames_shape = (len(tables), *detector_shape)
 
     def forward(self, point: SplatPoint) -> DeviceArray:
-        """Frames (F, rows, columns) float32 of a cloud."""
+        """Renders a cloud to frames (F, rows, columns) float32."""
         frames = self.rt.empty(self.frames_shape)
         self._ready.forget()
         for number, cells in enumerate(self._cells):
@@ -73,7 +73,7 @@ class SplatOperator:
         return frames
 
     def back(self, point: SplatPoint, by_frames: DeviceArray) -> DeviceArray:
-        """dL/drows (11, G) float32 at a cloud from dL/dframes (F, rows, columns)."""
+        """Returns dL/drows (11, G) float32 at a cloud from dL/dframes (F, rows, columns)."""
         rt, gaussians = self.rt, point.gaussians
         by_rows, gradients = rt.empty((ROWS, gaussians.count)), rt.empty((ROWS + 2, gaussians.stride))
         for number, cells in enumerate(self._cells):
@@ -84,17 +84,17 @@ class SplatOperator:
     def _differentiate(
         self, point: SplatPoint, cells: DeviceCells, by_image: DeviceArray, gradients: DeviceArray
     ) -> None:
-        """Gradients (13, stride) by internal rows of a frame from dL/dframe, padded."""
+        """Writes the gradients (13, stride) by internal rows of a frame from dL/dframe, padded."""
         is_ready = self._ready.holds(point, cells)
         self._ready.forget()
         if not is_ready:
             see = self._projector.forward if self.is_layered else self._projector.prepare
-            see(point.gaussians, cells)  # intensities are merged anew: their derivative depends on every layer
+            see(point.gaussians, cells)  # the derivative of merged intensities depends on every layer
         self._projector.backward(point.gaussians, cells, by_image, gradients)
 
     def by_poses(self, point: SplatPoint, by_frames: DeviceArray) -> np.ndarray:
-        """dL by a turn (rad) of the gantry about z, and by the panel's shifts (pixels) along its columns and rows, of each
-        frame: (F, 3) float64 at a cloud from dL/dframes (F, rows, columns); not under intensity."""
+        """Returns, for each frame, dL by the gantry's turn about z (rad) and the panel's shifts (pixels) along its columns
+        and rows: (F, 3) float64 from dL/dframes (F, rows, columns). Not for the intensity model."""
         cloud, found = point.gaussians, np.empty((len(self._cells), 3))
         rows, gradients = self.rt.download(cloud.rows), self.rt.empty((ROWS + 2, cloud.stride))
         weighed = self.rt.download(self.forward(point)) * self.rt.download(by_frames)
@@ -104,12 +104,12 @@ class SplatOperator:
             turn, along, across = by_pose(rows[:, : cloud.count], by_rows)
             shifts = [across / (self._projector.lines / 2), along / (self._projector.width / 2)]
             found[number] = turn, *(shifts[::-1] if self._images.turned else shifts)
-            if not self._affine:  # whose rays are all as long as the middle one
+            if not self._affine:  # in that model all rays have the length of the central ray
                 found[number, 1:] += by_length(pose, weighed[number])
         return found
 
     def subset(self, frames: Sequence[int]) -> "SplatOperator":
-        """The same operator on some of the frames, in this order; costs nothing."""
+        """Returns the operator for some of the frames, in this order; costs nothing."""
         part = copy(self)
         part._cells, part._poses = [self._cells[f] for f in frames], [self._poses[f] for f in frames]
         if not part._cells:
@@ -119,26 +119,26 @@ class SplatOperator:
 
 
 class DensityOperator:
-    """The linear part of a ``SplatOperator``: densities (G,) in 1/mm of a cloud that stays where it is, to frames."""
+    """The linear part of a ``SplatOperator``: densities (G,) in 1/mm of a fixed cloud to frames."""
 
     def __init__(self, operator: SplatOperator, point: SplatPoint) -> None:
         self._operator, self._point = operator, point
 
     def forward(self, density: DeviceArray) -> DeviceArray:
-        """Densities (G,) float32 to frames (F, rows, columns)."""
+        """Projects densities (G,) float32 to frames (F, rows, columns)."""
         return self._operator.forward(self._operator.rows.with_densities(self._point, density))
 
     def adjoint(self, frames: DeviceArray) -> DeviceArray:
-        """Frames (F, rows, columns) float32 to densities (G,)."""
+        """Backprojects frames (F, rows, columns) float32 to densities (G,)."""
         return self._operator.rows.densities(self._operator.back(self._point, frames))
 
     def subset(self, frames: Sequence[int]) -> "DensityOperator":
-        """The same operator on some of the frames, in this order."""
+        """Returns the operator for some of the frames, in this order."""
         return DensityOperator(self._operator.subset(frames), self._point)
 
 
 class VoxelOperator:
-    """Parameter rows (11, G) to the field (nz, ny, nx) in 1/mm at the centres of a grid's voxels."""
+    """Maps parameter rows (11, G) to the field (nz, ny, nx) in 1/mm at the centres of a grid's voxels."""
 
     def __init__(self, rt: Runtime, grid: Grid, *, cutoff_sigma: float = DEFAULT_CUTOFF_SIGMA) -> None:
         nz, ny, nx = grid.shape
@@ -151,7 +151,7 @@ class VoxelOperator:
         self._ready = _Ready()
 
     def forward(self, point: SplatPoint) -> DeviceArray:
-        """The field (nz, ny, nx) float32 of a cloud."""
+        """Returns the field (nz, ny, nx) float32 of a cloud."""
         volume = self.rt.empty(self.volume_shape)
         self._ready.forget()
         self._images.leave(self._voxeliser.forward(point.gaussians, self._inside), volume)
@@ -159,7 +159,7 @@ class VoxelOperator:
         return volume
 
     def back(self, point: SplatPoint, by_volume: DeviceArray) -> DeviceArray:
-        """dL/drows (11, G) float32 at a cloud from dL/dvolume (nz, ny, nx)."""
+        """Returns dL/drows (11, G) float32 at a cloud from dL/dvolume (nz, ny, nx)."""
         rt, gaussians = self.rt, point.gaussians
         by_rows, gradients = rt.empty((ROWS, gaussians.count)), rt.empty((ROWS + 2, gaussians.stride))
         if not self._ready.holds(point, self):
@@ -172,13 +172,13 @@ class VoxelOperator:
 
 
 class _Ready:
-    """Of which cloud, seen from where, the kernels' buffers hold what a gradient needs."""
+    """Records the cloud and cells for which the kernels' buffers hold the input of a gradient."""
 
     def __init__(self) -> None:
         self.forget()
 
     def forget(self) -> None:
-        """Before the buffers change: what fails then must not be taken for done."""
+        """To be called before the buffers change: after a failure they are not valid."""
         self._point: SplatPoint | None = None
         self._where: object = None
 
@@ -190,8 +190,10 @@ class _Ready:
 
 
 def by_pose(rows: np.ndarray, gradients: np.ndarray) -> tuple[float, float, float]:
-    """dL by the gantry's turn about z (rad), and half a line's length and half the lines' number times that by the panel's
-    shifts (pixels) along a line and across, from internal rows (11, G) and their gradients (13, G) of a frame."""
+    """Returns dL by the gantry's turn about z (rad) and by the panel's shifts along and across a line.
+
+    Shifts are in halves of the detector's width and lines. From internal rows (11, G) and their gradients (13, G).
+    """
     values, by = rows.astype(np.float64), gradients.astype(np.float64)
     (x, y, _), (by_x, by_y, _) = values[MEAN], by[MEAN]
     w, i, j, k = values[QUATERNION]
@@ -201,8 +203,10 @@ def by_pose(rows: np.ndarray, gradients: np.ndarray) -> tuple[float, float, floa
 
 
 def by_length(pose: np.ndarray, weighed: np.ndarray) -> np.ndarray:
-    """dL by the panel's shifts (2,) along its columns and rows (pixels), as far as rays get longer by it, which line
-    integrals are in proportion to: from the ``pose`` (12,) and the frame times dL/dframe (rows, columns)."""
+    """Returns the part of dL by the panel's shifts (2,), along columns and rows (pixels), that comes from the rays' length.
+
+    Line integrals are proportional to it. From the ``pose`` (12,) and the frame times dL/dframe (rows, columns).
+    """
     source, first, column, row = pose.reshape(4, 3)
     v, u = (np.arange(n, dtype=np.float64) for n in weighed.shape)
     ray = first - source + v[:, None, None] * row + u[:, None] * column

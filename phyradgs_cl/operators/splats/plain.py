@@ -1,4 +1,4 @@
-"""Between the arrays that users hold, in mm and without padding, and what the splats' kernels work on; all on the device."""
+"""Conversion between users' device arrays, in mm and without padding, and the layout of the splat kernels."""
 
 from dataclasses import dataclass
 
@@ -12,16 +12,16 @@ from phyradgs_cl.runtime.layout import GUARD, Strides, move, padded_zeros, pitch
 
 @dataclass(eq=False)
 class SplatPoint:
-    """A cloud as the kernels see it, and the norms (stride,) of the quaternions that it was given with."""
+    """A cloud in the kernels' layout, and the norms (stride,) of the user's quaternions."""
 
     gaussians: DeviceGaussians
     norms: DeviceArray
 
 
 class PlainRows:
-    """Parameter rows (11, G) in mm, quaternions of any length, to internal rows: lengths in units of ``length_mm``.
+    """Converts parameter rows (11, G) in mm, quaternions of any length, to internal rows in units of ``length_mm``.
 
-    Densities are in units of 1/``length_mm`` for ``line_integrals``, which then need no unit, else in 1/mm.
+    Internal densities are in 1/``length_mm`` for ``line_integrals``, which have no unit then, else in 1/mm.
     """
 
     def __init__(self, rt: Runtime, length_mm: float, *, line_integrals: bool) -> None:
@@ -33,7 +33,7 @@ class PlainRows:
         self._copy = rt.kernel("splat_plain", "row_copy")
 
     def enter(self, rows: DeviceArray) -> SplatPoint:
-        """The cloud of rows (11, G) float32; a copy, so that the rows may change afterwards."""
+        """Copies rows (11, G) float32 to a cloud; the rows may change afterwards."""
         rt, count = self.rt, rows.shape[1]
         stride = stride_of(count)
         inside, norms = rt.empty((ROWS, stride)), rt.empty(stride)
@@ -42,7 +42,7 @@ class PlainRows:
         return SplatPoint(DeviceGaussians(inside, count, stride), norms)
 
     def leave(self, gradients: DeviceArray, point: SplatPoint, rows: DeviceArray, *, add: bool = False) -> None:
-        """Gradients (13, stride) by internal rows into, or with ``add`` onto, those by plain rows (11, G)."""
+        """Converts gradients (13, stride) by internal rows to gradients by plain rows (11, G); ``add`` adds to those."""
         rt, cloud = self.rt, point.gaussians
         rt.launch(
             self._leave,
@@ -59,7 +59,7 @@ class PlainRows:
 
 
     def with_densities(self, point: SplatPoint, density: DeviceArray) -> SplatPoint:
-        """The cloud with densities (G,) in 1/mm in place of its own."""
+        """Returns the cloud with densities (G,) in 1/mm in place of its former ones."""
         rt, cloud = self.rt, point.gaussians
         rows = rt.empty((ROWS, cloud.stride))
         rt.copy(cloud.rows, rows)
@@ -67,7 +67,7 @@ class PlainRows:
         return SplatPoint(DeviceGaussians(rows, cloud.count, cloud.stride), point.norms)
 
     def densities(self, rows: DeviceArray) -> DeviceArray:
-        """The last of plain rows (11, G)."""
+        """Returns the density row of plain rows (11, G)."""
         count = rows.shape[1]
         density = self.rt.empty(count)
         self._copy_row(rows, DENSITY * count, count, np.float32(1), 0, density)
@@ -81,9 +81,9 @@ class PlainRows:
 
 
 class PlainImages:
-    """Images (rows, columns) without padding, one after the other, to one padded image of ``lines`` by ``width``.
+    """Copies images (rows, columns) of a stack to one padded image of ``lines`` by ``width``, and back.
 
-    ``turned``: the lines are the columns. A volume (nz, ny, nx) is an image of nz · ny lines.
+    ``turned`` makes columns the lines. A volume (nz, ny, nx) counts as an image of nz · ny lines.
     """
 
     def __init__(self, rt: Runtime, lines: int, width: int, *, turned: bool = False) -> None:
@@ -94,7 +94,7 @@ class PlainImages:
         self._image: DeviceArray | None = None
 
     def enter(self, images: DeviceArray, number: int = 0) -> DeviceArray:
-        """Image ``number`` in the padded layout; valid until the next call."""
+        """Returns image ``number`` in the padded layout, valid until the next call."""
         if self._image is None:
             self._image = padded_zeros(self.rt, *self._by_line[1:])
         source, target = (images, self._place(number)), (self._image, self._padded)
@@ -102,7 +102,7 @@ class PlainImages:
         return self._image
 
     def leave(self, image: DeviceArray, images: DeviceArray, number: int = 0) -> None:
-        """A padded image to image ``number``."""
+        """Copies a padded image to image ``number``."""
         source, target = (image, self._padded), (images, self._place(number))
         move(self.rt, source, target, self._by_line, turned=self.turned)
 

@@ -1,43 +1,44 @@
 """Splat projector: Gaussians to one merged frame over all its time cells, and its adjoint.
 
-This is the paper's *multi-pose batch rendering* (section 2.3). All M×N micro-views of a frame go through one
-launch an operator: ``splat_prepare`` sees every Gaussian from every pose, ``splat_forward`` does micro-view
-accumulation and strip concatenation (Eq. 3) straight into the merged frame, ``splat_backward`` and
-``splat_chain`` are the adjoint. No micro-view is ever stored. A detector that adds photons instead of line integrals
-needs the cells of a line one by one: they are drawn into a few layers then, which ``Layers`` merges.
+This is the paper's *multi-pose batch rendering* (section 2.3): one launch per step handles all M×N micro-views of a frame.
+``splat_prepare`` projects every Gaussian from every pose. ``splat_forward`` accumulates micro-views and joins strips (Eq. 3)
+directly in the merged frame; no micro-view is stored. ``splat_backward`` and ``splat_chain`` are the adjoint.
+
+A detector that averages intensities needs the cells of a line separately: ``Layers`` merges a few layers of them.
 """
 
 from dataclasses import dataclass
 
 import numpy as np
 
+from phyradgs_cl.checks import ceil_div
 from phyradgs_cl.operators.splats.binning import TileLists
 from phyradgs_cl.operators.splats.layout import DeviceCells, DeviceGaussians, Layers
 from phyradgs_cl.operators.splats.work import UNSEEN, Work, moving_work, still_work
 from phyradgs_cl.runtime import DeviceArray, Kernel, Runtime
 from phyradgs_cl.runtime.layout import GUARD, pad_rows, padded_zeros, pitch_of, unpad_rows
 
-RECORD_FLOATS = {False: 16, True: 20}  # of a splat in a cell, by whether it moves there
-DEFAULT_TIME_ERROR = 0.005  # relative, RMS: what averaging over time may leave
-DEFAULT_CUTOFF_SIGMA = 3.7  # the value of a Gaussian has fallen to 0.1 % of its peak
+RECORD_FLOATS = {False: 16, True: 20}  # per splat and cell, by whether the cell has motion
+DEFAULT_TIME_ERROR = 0.005  # relative, RMS, of averages over time
+DEFAULT_CUTOFF_SIGMA = 3.7  # where a Gaussian has fallen to 0.1 % of its peak
 PAIR_KERNELS = ("splat_forward_rows", "splat_forward_pixels", "splat_backward_rows", "splat_backward_group")
 _BAND_LINES = 8
 GROUP_DEFINES = {False: {"GROUP": 1, "ACROSS": 1}, True: {"GROUP": 32, "ACROSS": 8}}
-"""How many work-items a Gaussian's adjoint takes, and how many of them along a line; by whether items are pixels."""
+"""Work-items of a Gaussian's adjoint, and how many of them lie along a line; by whether items are pixels."""
 
 
 def items_by_gaussian(rt: Runtime, count: int) -> tuple[tuple[int, int], tuple[int, int]]:
-    """Work-items and group of kernels in which Gaussians gather what is under them, as ``GROUP_DEFINES`` has it."""
+    """Returns work-items and group of the kernels in which Gaussians sum over their pixels (``GROUP_DEFINES``)."""
     items, across = (GROUP_DEFINES[rt.pixel_items][name] for name in ("GROUP", "ACROSS"))
     return (count * across, items // across), ((across, items // across) if items > 1 else (16, 1))
 
 
 def path_limits(time_error: float) -> tuple[float, float, float]:
-    """Longest paths within a line's window, in widths of the splat, for 1, 2 and 3 Gauss–Legendre times.
+    """Returns the longest paths within a line's window, in widths of the splat, for 1, 2 and 3 Gauss–Legendre times.
 
     The rules' remainders for exp(−x²/2), whose 2nd, 4th and 6th derivatives are at most 1, 3 and 15, are path²/24,
-    path⁴/1440 and path⁶/134400 of the peak. Twice ``time_error`` in the worst pixel leaves some half of it RMS.
-    Longer paths take the closed form, whose moments lose digits below 0.7.
+    path⁴/1440 and path⁶/134400 of the peak. An error of twice ``time_error`` in the worst pixel is about half of that RMS.
+    Longer paths use the closed form, whose moments lose digits below 0.7.
     """
     worst = 2 * time_error
     one, two, three = (24 * worst) ** (1 / 2), (1440 * worst) ** (1 / 4), (134400 * worst) ** (1 / 6)
@@ -46,7 +47,7 @@ def path_limits(time_error: float) -> tuple[float, float, float]:
 
 @dataclass(frozen=True)
 class _Kernels:
-    """The four passes; cells without motion get code without it."""
+    """The four passes, compiled for cells with or without motion."""
 
     prepare: Kernel
     forward: Kernel
@@ -68,13 +69,13 @@ class _Kernels:
 
 
 class SplatProjector:
-    """Renders frames of ``lines`` lines by ``width`` pixels (the readout axis is the lines').
+    """Renders frames of ``lines`` lines (along the readout axis) by ``width`` pixels.
 
-    ``affine`` selects R2-Gaussian's approximation instead of the exact ray integral. ``cutoff_sigma`` is the
-    Mahalanobis radius beyond which a Gaussian is not drawn; 0 draws all of it. ``time_error`` bounds what the rules
-    leave by which cells with motion average a splat over time (relative, RMS). ``pixel_footprint`` adds a pixel's
-    variance to that of every splat, mass kept: what pixels with an area see. ``intensity_unit``: the line integral
-    that is 1 in the image, where a detector averages intensities over a line's cells; None averages line integrals.
+    ``affine`` selects R2-Gaussian's approximation instead of the exact ray integral. ``cutoff_sigma`` is the Mahalanobis
+    radius beyond which a Gaussian is not drawn; 0 draws all of it. ``time_error`` (relative, RMS) bounds the error of
+    averages over time in cells with motion. ``pixel_footprint`` averages splats over the area of a pixel.
+    ``intensity_unit`` is the line integral that is 1 in the image of a detector that averages intensities over a line's
+    cells; with None line integrals are averaged.
     """
 
     def __init__(
@@ -95,7 +96,7 @@ class SplatProjector:
         self.path_limits = np.array([*path_limits(time_error), 0], np.float32)
         self.by_pixel = rt.pixel_items
         self.tile_w, self.tile_h = rt.tile() if self.by_pixel else (self.pitch, _BAND_LINES)
-        tiles = (-(-width // self.tile_w), -(-lines // self.tile_h), 1)
+        tiles = (ceil_div(width, self.tile_w), ceil_div(lines, self.tile_h), 1)
         self.lists = TileLists(rt, (self.tile_w, self.tile_h, 1), tiles)
         self.image = padded_zeros(rt, lines, width)
         self._layers = None if intensity_unit is None else Layers(rt, lines, width, intensity_unit)
@@ -108,12 +109,12 @@ class SplatProjector:
     # --- device to device: the reconstruction's loop --------------------------------------------------
 
     def forward(self, gaussians: DeviceGaussians, cells: DeviceCells) -> DeviceArray:
-        """The merged frame in the padded layout; valid until the next call."""
+        """Renders the merged frame in the padded layout, valid until the next call."""
         self.draw(gaussians, cells)
         return self.merge(cells)
 
     def draw(self, gaussians: DeviceGaussians, cells: DeviceCells) -> DeviceArray:
-        """The frame before its layers are merged: what several clouds' frames can be added up in, flat, padded."""
+        """Renders the frame before its layers are merged, flat and padded: frames of several clouds can be added here."""
         self.prepare(gaussians, cells)
         self.lists.build(self._extents, gaussians.count, gaussians.stride)
         rt = self.rt
@@ -139,7 +140,7 @@ class SplatProjector:
             np.int32(self.pitch),
             np.int32(self.tile_w),
             np.int32(self.tile_h),
-            np.int32(-(-self.width // self.tile_w)),
+            np.int32(ceil_div(self.width, self.tile_w)),
             self.cutoff2,
             np.int32(cells.layers),
             drawn,
@@ -148,7 +149,7 @@ class SplatProjector:
         return drawn
 
     def merge(self, cells: DeviceCells) -> DeviceArray:
-        """The merged frame of what was drawn last; valid until the next call."""
+        """Merges the layers of the last ``draw``; the frame is valid until the next call."""
         if self._layers is not None:
             self._layers.merge(cells, self.image)
         return self.image
@@ -156,9 +157,9 @@ class SplatProjector:
     def backward(
         self, gaussians: DeviceGaussians, cells: DeviceCells, by_image: DeviceArray, gradients: DeviceArray
     ) -> None:
-        """Writes dL/dparameters into ``gradients`` (13, stride), rows as cl/common/gradient.h says.
+        """Writes dL/dparameters into ``gradients`` (13, stride), rows as in cl/common/gradient.h.
 
-        Uses up what ``prepare`` (or ``forward``) has last made of the same Gaussians and cells: its sums take the place.
+        Call ``prepare`` or ``forward`` with the same Gaussians and cells before: the sums overwrite their records.
         """
         rt = self.rt
         items, group = items_by_gaussian(rt, gaussians.count)
@@ -199,14 +200,12 @@ class SplatProjector:
         )
 
     def count_pairs(self, gaussians: DeviceGaussians, cells: DeviceCells) -> tuple[int, int, int]:
-        """Of a ``forward``: Gaussian–pixel pairs in the spans that are walked, pairs that are evaluated (whole vectors),
-        and Gaussian–cell footprints.
-        """
+        """Counts, for a ``forward``: Gaussian–pixel pairs, evaluated pairs (complete vectors), Gaussian–cell footprints."""
         work = self.work(gaussians, cells)
         return work.pairs, work.evaluated, work.footprints
 
     def work(self, gaussians: DeviceGaussians, cells: DeviceCells) -> Work:
-        """What a ``forward`` of these Gaussians and cells has to do."""
+        """Counts the work of a ``forward`` of these Gaussians and cells."""
         self.prepare(gaussians, cells)
         shape = (gaussians.stride, cells.count, RECORD_FLOATS[cells.moving])
         size = int(np.prod(shape))
@@ -219,11 +218,11 @@ class SplatProjector:
         return moving_work(records, times, self.path_limits, self.rt.lanes, bool(self.cutoff2 > 0))
 
     def prepare(self, gaussians: DeviceGaussians, cells: DeviceCells) -> None:
-        """Sees every Gaussian from every pose: what ``draw`` begins with, and ``backward`` needs."""
+        """Projects every Gaussian from every pose: the first step of ``draw``, whose records ``backward`` needs."""
         rt = self.rt
         footprints = gaussians.stride * cells.count
         if self._records.size < footprints * RECORD_FLOATS[cells.moving]:
-            self._records = rt.empty(1)  # the old goes before the new comes
+            self._records = rt.empty(1)  # frees the old memory before it allocates the new
             self._records = rt.empty(footprints * RECORD_FLOATS[cells.moving])
         if self._is_visible.size < footprints:
             self._is_visible = rt.empty(1, np.uint8)
@@ -245,12 +244,12 @@ class SplatProjector:
     # --- arrays to arrays -----------------------------------------------------------------------------
 
     def project(self, rows: np.ndarray, cells: DeviceCells) -> np.ndarray:
-        """Parameter rows (11, G) to a frame (lines, width) float32."""
+        """Renders parameter rows (11, G) to a frame (lines, width) float32."""
         image = self.forward(DeviceGaussians.upload(self.rt, rows), cells)
         return unpad_rows(self.rt.download(image), (self.lines, self.width))
 
     def project_adjoint(self, rows: np.ndarray, cells: DeviceCells, by_image: np.ndarray) -> np.ndarray:
-        """dL/drows (11, G) for parameter rows (11, G) and dL/dframe (lines, width)."""
+        """Returns dL/drows (11, G) for parameter rows (11, G) and dL/dframe (lines, width)."""
         gaussians = DeviceGaussians.upload(self.rt, rows)
         self.forward(gaussians, cells)
         gradients = self.rt.zeros((13, gaussians.stride))

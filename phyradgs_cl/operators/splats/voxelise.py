@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from phyradgs_cl.checks import ceil_div
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.operators.bricks import Shape, cut
 from phyradgs_cl.operators.splats.binning import TileLists
@@ -44,9 +45,9 @@ class Voxeliser:
     def forward(
         self, gaussians: DeviceGaussians, grid: Grid, start: tuple[int, int, int] = (0, 0, 0)
     ) -> DeviceArray:
-        """The field on the voxels [start, start + shape) of ``grid``, in the padded layout, until the next call.
+        """Returns the field on the voxels [start, start + shape) of ``grid``, in the padded layout, until the next call.
 
-        Lengths in the Gaussians' unit; ``start`` runs z, y, x. A part has the same bits as the whole.
+        Lengths are in the Gaussians' unit; ``start`` is (z, y, x). A part has the same bits as the complete field.
         """
         rt = self.rt
         self.prepare(gaussians, grid, start)
@@ -54,7 +55,7 @@ class Voxeliser:
         nz, ny, nx = self.shape
         rt.launch(
             self._forward,
-            (nx, ny, -(-nz // _TILE_ROWS)) if self.by_pixel else self.lists.total,
+            (nx, ny, ceil_div(nz, _TILE_ROWS)) if self.by_pixel else self.lists.total,
             self._records,
             self.lists.tile_offsets,
             self.lists.splat_ids,
@@ -80,7 +81,7 @@ class Voxeliser:
         add: bool,
         weight: float = 1.0,
     ) -> None:
-        """``weight`` × dL/dparameters into (or, with ``add``, onto) ``gradients`` (13, stride); after ``forward``."""
+        """Writes ``weight`` × dL/dparameters to ``gradients`` (13, stride), or adds it; call ``forward`` before."""
         rt = self.rt
         if self._sums.size < gaussians.stride * SUM_FLOATS:
             self._sums = rt.zeros(gaussians.stride * SUM_FLOATS)
@@ -111,7 +112,7 @@ class Voxeliser:
         )
 
     def prepare(self, gaussians: DeviceGaussians, grid: Grid, start: tuple[int, int, int]) -> None:
-        """What ``forward`` begins with, and ``backward`` needs."""
+        """Projects every Gaussian onto the grid: the first step of ``forward``, whose records ``backward`` needs."""
         rt, stride = self.rt, gaussians.stride
         if self._records.size < stride * RECORD_FLOATS:
             self._records = rt.empty(stride * RECORD_FLOATS)
@@ -133,18 +134,18 @@ class Voxeliser:
         )
 
     def _index_of(self, grid: Grid) -> DeviceArray:
-        """``index_matrix`` on the device; it stays there from call to call."""
+        """Returns ``index_matrix`` on the device, uploaded once per grid."""
         if self._index is None or self._index[0] != grid:
             self._index = grid, split_coefficients(self.rt, index_matrix(grid))
         return self._index[1]
 
     def voxelise(self, rows: np.ndarray, grid: Grid) -> np.ndarray:
-        """Parameter rows (11, G) to the volume (z, y, x) float32."""
+        """Returns the volume (z, y, x) float32 of parameter rows (11, G)."""
         volume = self.forward(DeviceGaussians.upload(self.rt, rows), grid)
         return unpad_rows(self.rt.download(volume), self.shape)
 
     def voxelise_adjoint(self, rows: np.ndarray, grid: Grid, by_volume: np.ndarray) -> np.ndarray:
-        """dL/drows (11, G) for dL/dvolume (z, y, x)."""
+        """Returns dL/drows (11, G) for dL/dvolume (z, y, x)."""
         gaussians = DeviceGaussians.upload(self.rt, rows)
         self.forward(gaussians, grid)
         gradients = self.rt.zeros((13, gaussians.stride))
@@ -160,8 +161,9 @@ def voxelise(
     cutoff_sigma: float = DEFAULT_CUTOFF_SIGMA,
     brick_bytes: int = _DEFAULT_BRICK_BYTES,
 ) -> np.ndarray:
-    """The whole grid (z, y, x) float32, brick by brick: the device holds ``brick_bytes`` of voxels at a time, or less
-    where memory is short. Bricks have the bits of the whole.
+    """Returns the complete grid (z, y, x) float32, computed brick by brick with the same bits.
+
+    The device holds ``brick_bytes`` of voxels at a time, or less if memory is short.
     """
 
     def attempt(share: float) -> np.ndarray:
@@ -180,9 +182,9 @@ def _in_bricks(
         nz, ny, _ = shape
         voxels_bytes = 4 * (2 * GUARD + nz * ny * pitch_of(nx))
         if voxels_bytes > brick_bytes and nz * ny > 1:
-            return (room.free_bytes + 1,)  # more than was asked for
+            return (room.free_bytes + 1,)  # more than ``brick_bytes``
         lists_bytes = TileLists.bytes(rt, int(np.prod(_tiles(rt, shape)[1])), gaussians.count)
-        entries_bytes = lists_bytes  # how many there are is known when they are counted
+        entries_bytes = lists_bytes  # an estimate: the number is known after counting
         return voxels_bytes, lists_bytes, entries_bytes, records_bytes
 
     room = rt.room()
@@ -190,24 +192,24 @@ def _in_bricks(
     made: Voxeliser | None = None
     for brick in cut(grid.shape, (1, 1), needs, room, share):
         if made is None or made.shape != brick.shape:
-            made = None  # before the next one takes its memory
+            made = None  # frees its memory for the next one
             made = Voxeliser(rt, brick.shape, cutoff_sigma=cutoff_sigma)
-            made.lists.waits = True  # bricks differ, and each is waited for anyway
+            made.lists.waits = True  # bricks differ, and the host waits for each anyway
         part = made.forward(gaussians, grid, brick.start)
         volume[brick.box] = unpad_rows(rt.download(part), brick.shape)
     return volume
 
 
 def _tiles(rt: Runtime, shape: Shape) -> tuple[Shape, Shape]:
-    """Size of a tile, and number of tiles of a volume (z, y, x), both along x, y, z."""
+    """Returns size and number of the tiles of a volume (z, y, x), both along x, y, z."""
     nz, ny, nx = shape
     tile_x = 16 if rt.pixel_items else pitch_of(nx)
     tile = (tile_x, _TILE_ROWS, _TILE_ROWS)
-    return tile, (-(-nx // tile_x), -(-ny // _TILE_ROWS), -(-nz // _TILE_ROWS))
+    return tile, (ceil_div(nx, tile_x), ceil_div(ny, _TILE_ROWS), ceil_div(nz, _TILE_ROWS))
 
 
 def index_matrix(grid: Grid) -> np.ndarray:
-    """Rows (12,) that turn a world point (x, y, z) into voxel indices along x, y, z."""
+    """Returns the rows (12,) that map a world point (x, y, z) to voxel indices along x, y, z."""
     matrix = np.zeros((3, 4))
     for row, (first, d) in enumerate(zip(grid.first_centre_mm[::-1], grid.voxel_size_mm[::-1], strict=True)):
         matrix[row, row], matrix[row, 3] = 1 / d, -first / d

@@ -1,6 +1,6 @@
-"""What a splat projector's last launch had to do: pairs of Gaussian and pixel, and the rules that averaged over time.
+"""The work of a splat projector's launch: pairs of Gaussian and pixel, and the rules used to average over time.
 
-Reads the records of cl/common/splat.h back from the device; the loops of cl/splat_forward.cl are counted, not run.
+Computed from the records of cl/common/splat.h, which counts the iterations of cl/splat_forward.cl without running it.
 """
 
 from dataclasses import dataclass, field
@@ -9,15 +9,16 @@ import numpy as np
 
 _U_REST, _V_REST, _U_WHOLE, _V_WHOLE, _U_LO, _U_HI, _V_LO, _V_HI = 3, 4, 9, 10, 11, 12, 13, 14
 _ALONG_U, _ALONG_V, _ACROSS_V, _ACROSS_U, _SPEED, _REACH2 = 0, 1, 2, 15, 16, 17
-UNSEEN = np.zeros(20, np.float32)  # a record without lines, for splats that a cell does not see
+UNSEEN = np.zeros(20, np.float32)  # a record without lines, for splats that are not visible
 UNSEEN.view(np.int32)[[_V_LO, _V_HI]] = 1, 0
 RULES = ("1 time", "2 times", "3 times", "closed form")
 
 
 @dataclass(frozen=True)
 class Work:
-    """pairs: within the spans of lines that are walked; evaluated: in whole vectors; footprints: Gaussians in cells;
-    rules: of cells with motion, the pairs that each rule of ``RULES`` serves.
+    """``pairs`` of Gaussian and pixel; ``evaluated`` pairs, in complete vectors; ``footprints``, Gaussians in cells.
+
+    ``rules``: the pairs by rule of ``RULES``, for cells with motion.
     """
 
     pairs: int
@@ -26,23 +27,23 @@ class Work:
     rules: dict[str, int] = field(default_factory=dict)
 
     def rule_shares(self) -> dict[str, float]:
-        """Share of the pairs by rule; empty without motion."""
+        """Returns each rule's share of the pairs; empty without motion."""
         return {name: count / max(self.pairs, 1) for name, count in self.rules.items()}
 
 
 def still_work(records: np.ndarray, lanes: int) -> Work:
-    """Of records (G, C, 16) float32: bounding boxes, walked line by line."""
+    """Counts the work of records (G, C, 16) float32: the pixels of bounding boxes, line by line."""
     whole = records.view(np.int32)
     rows = np.maximum(whole[..., _V_HI].astype(np.int64) - whole[..., _V_LO] + 1, 0)
     columns = np.where(rows > 0, whole[..., _U_HI].astype(np.int64) - whole[..., _U_LO] + 1, 0)
-    vectors = -(-columns // lanes) * lanes
+    vectors = (columns + lanes - 1) // lanes * lanes
     return Work(int((rows * columns).sum()), int((rows * vectors).sum()), int((rows > 0).sum()))
 
 
 def moving_work(
     records: np.ndarray, times: np.ndarray, path_limits: np.ndarray, lanes: int, cuts: bool
 ) -> Work:
-    """Of records (G, C, 20) and ``TimeCells.line_times`` (C, 3, at least lines), both float32."""
+    """Counts the work of records (G, C, 20), with ``TimeCells.line_times`` (C, 3, at least lines), both float32."""
     pairs, evaluated, footprints, rules = 0, 0, 0, np.zeros(len(RULES), np.int64)
     for cell in range(records.shape[1]):
         record = np.ascontiguousarray(records[:, cell])
@@ -52,14 +53,14 @@ def moving_work(
         path = 2 * record[splat, _SPEED] * times[cell, 1, line]
         rule = np.searchsorted(path_limits[:3], path)
         pairs += int(columns.sum())
-        evaluated += int((-(-columns // lanes) * lanes).sum())
+        evaluated += int(((columns + lanes - 1) // lanes * lanes).sum())
         footprints += len(record)
         rules += np.bincount(rule, columns, len(RULES)).astype(np.int64)
     return Work(pairs, evaluated, footprints, dict(zip(RULES, rules.tolist(), strict=True)))
 
 
 def _lines_of(whole: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Every line of every splat: index of the splat and the line, both (splat lines,)."""
+    """Returns the splat and the line of every line of every splat, both (splat lines,)."""
     rows = (whole[:, _V_HI] - whole[:, _V_LO] + 1).astype(np.int64)
     splat = np.repeat(np.arange(len(whole)), rows)
     within = np.arange(rows.sum()) - np.repeat(np.cumsum(rows) - rows, rows)
@@ -67,9 +68,9 @@ def _lines_of(whole: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _span(record: np.ndarray, line: np.ndarray, times: np.ndarray, cuts: bool) -> np.ndarray:
-    """Pixels (splat lines,) between the ends that ``moving_span`` of cl/common/splat_moving.h finds."""
+    """Returns the number of pixels (splat lines,) that ``moving_span`` of cl/common/splat_moving.h selects."""
     whole = record.view(np.int32)
-    with np.errstate(invalid="ignore"):  # whole numbers seen as floats
+    with np.errstate(invalid="ignore"):  # integers read as floats
         wide = record.astype(np.float64)
     middle, half, weight = times[:, line].astype(np.float64)
     lo, hi = whole[:, _U_LO].astype(np.int64), whole[:, _U_HI].astype(np.int64)
@@ -85,7 +86,7 @@ def _span(record: np.ndarray, line: np.ndarray, times: np.ndarray, cuts: bool) -
 def _stadium(
     wide: np.ndarray, dv: np.ndarray, start: np.ndarray, stop: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Where lines enter and leave the discs about both ends of their path, and the sides between them."""
+    """Returns where lines enter and leave the region swept by a disc: the discs at both ends, and the sides between."""
     a1, c1, reach = wide[:, _ALONG_U], wide[:, _ACROSS_U], np.sqrt(wide[:, _REACH2])
     a0, c0 = wide[:, _ALONG_V] * dv, wide[:, _ACROSS_V] * dv
     norm = a1 * a1 + c1 * c1

@@ -43,7 +43,7 @@ def joseph_adjoint(image: np.ndarray, grid: Grid, pose: np.ndarray) -> np.ndarra
 def ray_frame(
     volume: np.ndarray, grid: Grid, table: TimeCells, detector_shape: tuple[int, int], model: str = "log"
 ) -> np.ndarray:
-    """The merged frame (rows, columns) of a volume (z, y, x): every cell's whole image, weighed, cut, added up."""
+    """Returns the merged frame (rows, columns) of a volume (z, y, x): the weighted lines of each cell's image, added up."""
     frame = np.zeros(detector_shape)
     for cell in range(table.count):
         image = joseph_image(volume, grid, table.pose[cell], detector_shape)
@@ -85,7 +85,7 @@ def intensity_volume(frame: np.ndarray, volume: np.ndarray, grid: Grid, table: T
 def _shares(
     volume: np.ndarray, grid: Grid, table: TimeCells, detector_shape: tuple[int, ...]
 ) -> Iterator[tuple[int, np.ndarray]]:
-    """(cell, share (rows, columns) of a pixel's light that comes in it, 0 at the lines that it does not serve)."""
+    """Yields each cell and its share (rows, columns) of a pixel's light, 0 on lines that it does not serve."""
     shape = (detector_shape[0], detector_shape[1])
     total = np.exp(-ray_frame(volume, grid, table, shape, "intensity"))
     for cell in range(table.count):
@@ -156,7 +156,7 @@ def detector_position(pose: np.ndarray, grid: Grid) -> tuple[np.ndarray, np.ndar
     u, v, depth = np.linalg.solve(basis, offset).reshape(3, *grid.shape)
     with np.errstate(
         divide="ignore", invalid="ignore"
-    ):  # a voxel beside the source has no place on the detector
+    ):  # a voxel in the plane of the source has no position on the detector
         return u / depth, v / depth, depth
 
 
