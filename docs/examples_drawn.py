@@ -23,7 +23,10 @@ _SMALL = 10
 
 
 def methods_figure() -> Figure:
-    """Five methods on the scan of `make demo`, the motion known, and the truth."""
+    """Five methods with their defaults on the scan of `make demo`, the motion known, and the truth.
+
+    phyradgs has 33.2 dB after its 3,000 iterations, and 34.5 dB if `--iterations 2000` is stated.
+    """
     scan = simulate("foot", size=64, detector=128, noise="tigre", dose=1e4, electronic_noise=10.0, seed=0)
     figure = Figure(figsize=(10.5, 4.1), layout="constrained")
     axes = figure.subplots(2, 3).ravel()
