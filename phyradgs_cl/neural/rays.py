@@ -1,6 +1,6 @@
 """The rays of a step: which pixels and times it takes, and their rays over the exposure.
 
-Windows beside scattered pixels: the masked local–global sampling of SAX-NeRF (Cai et al., CVPR 2024).
+Scattered pixels and windows: the masked local–global sampling of SAX-NeRF (Cai et al., CVPR 2024).
 """
 
 from dataclasses import dataclass
@@ -17,7 +17,7 @@ class ExposureRays:
     """The rays of one frame's pixels.
 
     pose (C, 12) in units of half the volume's longest side about the volume's centre; cell (K, lines), the cell of each
-    of a line's K times, which all weigh the same; axis: what a line is, rows or columns.
+    of a line's K times, which all weigh the same; axis: whether lines are rows or columns.
     """
 
     pose: np.ndarray

@@ -38,7 +38,7 @@ class Trainer:
         self.unit = density_per_mm * scan.grid.half_longest_mm  # of line integrals
         self.rng = np.random.default_rng(seed)
         motion = options.motion
-        if isinstance(motion, PerRow):  # the field evaluates each ray by itself: common times would save nothing
+        if isinstance(motion, PerRow):  # the field evaluates single rays: common times would save nothing
             motion = OwnTimes(motion.sub_intervals)
         tables = [motion.cells(scan, frame).still() for frame in range(scan.frames)]
         self.rays = [ExposureRays.of_cells(table, scan.grid) for table in tables]

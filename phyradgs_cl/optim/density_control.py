@@ -1,4 +1,4 @@
-"""Adaptive density control: clone and split Gaussians where the image pulls at them, prune what has faded.
+"""Adaptive density control: clone and split Gaussians with a large image gradient, prune faint and thin ones.
 
 After Kerbl et al. 2023 in R2-Gaussian's radiative form: the statistic is the mean norm of the gradient by the
 projected centre in normalised detector units; both halves of a clone or split keep half the density.
@@ -27,11 +27,11 @@ _RANGES = {
 
 @dataclass(frozen=True)
 class DensityControl:
-    """When and what to clone, split and prune; lengths in half-sides of the volume, fractions of the run.
+    """When to clone, split and prune, and which Gaussians; lengths in half-sides of the volume, fractions of the run.
 
-    ``every`` counts iterations from round to round; 0 leaves the population as it starts. Gaussians whose longest scale is
-    more than ``prune_aspect`` times their shortest are removed (0: never): sheets and needles that thin slip between the
-    rays, where no measurement holds them back, and stand in the volume all the same.
+    ``every``: iterations between two rounds; 0 keeps the first population. Gaussians whose longest scale is more than
+    ``prune_aspect`` times their shortest are removed (0: never). Such thin sheets and needles lie between the rays, where no
+    measurement constrains them, and are visible in the volume.
     """
 
     every: int = 100
@@ -48,7 +48,7 @@ class DensityControl:
         checks.fields_within("control.", self, _RANGES)
 
     def allows(self, scale: np.ndarray) -> np.ndarray:
-        """Which of the scales (3, G) are no thinner than may be."""
+        """Returns which of the scales (3, G) are not too thin."""
         if self.prune_aspect <= 0:
             return np.ones(scale.shape[1], bool)
         allowed: np.ndarray = scale.max(0) <= self.prune_aspect * scale.min(0)
@@ -62,7 +62,7 @@ class DensityControl:
 
 @dataclass(eq=False)
 class Population:
-    """Raw parameters (11, G) and Adam's moments (2, 11, G), which density control rearranges together."""
+    """Raw parameters (11, G) and Adam's moments (2, 11, G) of the same Gaussians."""
 
     raw: np.ndarray
     moments: np.ndarray
@@ -83,33 +83,33 @@ def control_density(
     box: np.ndarray,
     rng: np.random.Generator,
 ) -> Population:
-    """One round of density control.
+    """Does one round of density control.
 
-    statistic (G,) mean gradient norm; box (2, 3) lowest and highest corner x y z outside which centres go.
+    statistic (G,) mean gradient norm; box (2, 3): lowest and highest corner x y z; centres outside are removed.
     """
     rows = activation.apply(population.raw)
     room = max(control.max_gaussians - statistic.size, 0)
-    chosen = _strongest(statistic, control.threshold, room)
+    has_large_gradient = _strongest(statistic, control.threshold, room)
     is_large = rows[g.SCALE].max(0) > control.split_scale
-    cloned = np.flatnonzero(chosen & ~is_large)
-    split = np.flatnonzero(chosen & is_large)
+    cloned = np.flatnonzero(has_large_gradient & ~is_large)
+    split = np.flatnonzero(has_large_gradient & is_large)
     rows[g.DENSITY, cloned] *= 0.5
     copies, first = rows[:, cloned].copy(), _children(rows[:, split], control, rng)
     second = _children(rows[:, split], control, rng)
     changed = population.raw.copy()
     changed[:, cloned] = activation.invert(rows[:, cloned])
     new_raw = activation.invert(np.concatenate([copies, first, second], axis=1))
-    kept = np.setdiff1d(np.arange(population.count), split)
-    raw = np.concatenate([changed[:, kept], new_raw], axis=1)
+    remaining = np.setdiff1d(np.arange(population.count), split)
+    raw = np.concatenate([changed[:, remaining], new_raw], axis=1)
     fresh = np.zeros((2, g.ROWS, new_raw.shape[1]), population.moments.dtype)
-    grown = Population(raw, np.concatenate([population.moments[:, :, kept], fresh], axis=2))
+    grown = Population(raw, np.concatenate([population.moments[:, :, remaining], fresh], axis=2))
     return prune(grown, activation, control, box)
 
 
 def prune(
     population: Population, activation: Activation, control: DensityControl, box: np.ndarray
 ) -> Population:
-    """Without what has faded, left the box or become too thin; by height, so that neighbours share detector lines."""
+    """Removes Gaussians that are faint, outside the box or too thin. Sorts the others by height: neighbours share lines."""
     rows = activation.apply(population.raw)
     inside = np.all((rows[g.MEAN] >= box[0][:, None]) & (rows[g.MEAN] <= box[1][:, None]), axis=0)
     kept = np.flatnonzero(inside & (rows[g.DENSITY] >= control.prune_density) & control.allows(rows[g.SCALE]))
@@ -117,7 +117,7 @@ def prune(
 
 
 def _strongest(statistic: np.ndarray, threshold: float, room: int) -> np.ndarray:
-    """Those at or above the threshold, the strongest first when there is room for few."""
+    """Returns which statistics are at or above the threshold; the largest ``room`` of them if there are more."""
     chosen = statistic >= threshold
     if int(chosen.sum()) > room:
         order = np.argsort(-statistic, kind="stable")[:room]
@@ -127,7 +127,7 @@ def _strongest(statistic: np.ndarray, threshold: float, room: int) -> np.ndarray
 
 
 def _children(rows: np.ndarray, control: DensityControl, rng: np.random.Generator) -> np.ndarray:
-    """One child of each Gaussian (11, S): drawn from it, smaller, half as dense."""
+    """Draws one child from each Gaussian (11, S), smaller and half as dense."""
     child: np.ndarray = rows.copy()
     local = rng.normal(size=(3, rows.shape[1])) * rows[g.SCALE]
     child[g.MEAN] += rotate(rows[g.QUATERNION], local)

@@ -42,7 +42,7 @@ def test_lag_is_undone_unless_it_is_to_be_ignored(rt, scan) -> None:
     assert prepared(slow, Preprocessing(ignore_lag=True)) is slow and prepared(scan, Preprocessing()) is scan
     undone = prepared(slow, Preprocessing()).projections
     np.testing.assert_allclose(undone, scan.projections, atol=FLOAT32 * np.exp(3.0))
-    cases = (scan, None), (slow, None), (slow, Preprocessing(ignore_lag=True))
+    cases = (scan, Preprocessing()), (slow, Preprocessing()), (slow, Preprocessing(ignore_lag=True))
     volumes = [reconstruct(s, RunPlan("fdk", method_options("fdk"), preprocessing=before), rt).volume for s, before in cases]
     undone, ignored = (np.abs(volume - volumes[0]).max() for volume in volumes[1:])
     assert undone < 1e-3 * np.abs(volumes[0]).max() < ignored

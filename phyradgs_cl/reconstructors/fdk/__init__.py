@@ -194,7 +194,7 @@ def static_fdk(rt: Runtime, scan: Scan) -> np.ndarray:
 def _measured_frames(scan: Scan) -> tuple[np.ndarray, np.ndarray]:
     """Returns frames (F, v, u) with masked pixels filled in, and their numbers.
 
-    Frames that are masked completely are left out, so that their neighbours take over their share of the turn.
+    Frames that are masked completely are left out, so that their neighbours cover their angles.
     """
     frames, numbers = unmasked_frames(scan), np.arange(scan.frames)
     if np.asarray(scan.pixel_mask).ndim == 3:

@@ -2,8 +2,8 @@
 
 This is cross-validation (``projected.py``) on the scan's own grid, because a coarser grid has another best weight. Held-out
 pixels belong to angles that the method has seen: with few views their error is least before the volume is smooth enough.
-Among smoothing weights the strongest therefore wins whose error is not far above the least (as in Breiman et al.,
-Classification and Regression Trees, 1984, with a share in place of their standard error; docs/results/settings.md).
+Of smoothing weights the strongest is therefore chosen whose error is not far above the least. Breiman et al. (Classification
+and Regression Trees, 1984) allow a standard error there; this module allows a ratio (docs/results/settings.md).
 """
 
 import json
@@ -35,7 +35,7 @@ _PERCENT, _SEED = 2.0, 21  # of pixels; not those of --holdout
 _FACTORS = (0.25, 0.5, 1.0, 2.0, 4.0)  # of the present value
 _END_FACTOR, _MOST_FURTHER = 4.0, 4  # further values where the choice is at an end
 _WEIGHTS = ("tv_weight", "prior_weight", "tv_share")  # of smoothing
-_SHORTER = 3  # trials of weights have so many times fewer iterations
+_SHORTER = 3  # iterations of the run over those of a trial of weights
 _MARGIN, _MARGIN_OF_STOPS = 1.125, 1.5  # of the least squared error beyond the noise (docs/results/settings.md)
 _NEXT, _LAST = 1.1, 2  # iterations: the next that is measured over this one, and the last over the best
 
@@ -127,8 +127,8 @@ class _Trials:
     def compare(self, options: Any) -> None:
         """Measures the errors of runs at the requested values, or at some around the present one.
 
-        In the latter case it goes on where the choice is at an end. Whole numbers do not go on, because runs may take longer
-        with them. Trials of weights are shorter: a weight is as good there, which does not hold for a relaxation.
+        The latter are extended where the choice is at an end, but not for whole numbers, with which runs may take longer.
+        Trials of weights are shorter: a weight is as good there, which does not hold for a relaxation.
         """
         if self.option in _WEIGHTS and hasattr(options, "iterations"):
             options = replace(options, iterations=ceil_div(options.iterations, _SHORTER))

@@ -24,8 +24,8 @@ class AsdPocsOptions(SartOptions):
     """tv_steps: TV steps per iteration. tv_share: α, length of a TV step over the change of the first SART pass.
 
     tv_reduction: factor of that length when TV moves the volume by more than ``tv_ratio`` (r_max) of the SART pass's change
-    and the residual is above ε. residual_share: ε over the residual of the FDK volume. prior_share: share of the total
-    variation that is taken of the difference to the run's first volume (PICCS).
+    and the residual is above ε. residual_share: ε over the residual of the FDK volume. prior_share: weight of the total
+    variation of the difference to the run's first volume, 0 to 1 (PICCS).
     """
 
     iterations: int = 10

@@ -26,7 +26,7 @@ _NONLOCAL_STEP = 0.01  # length of a step down the nonlocal quadratic
 
 @dataclass(frozen=True, eq=False)
 class PriorInputs:
-    """The arguments of a prior: device, grid, and of piccs its image (nz, ny, nx) in 1/mm and the share of the change to it.
+    """The arguments of a prior: device, grid, and for piccs its image (nz, ny, nx) in 1/mm and the weight of the change.
 
     tv_iterations: dual iterations per map. passes: over all frames, of the run.
     """
@@ -39,7 +39,7 @@ class PriorInputs:
     share: float = 0.5
 
     def tv(self, share: float = 1.0) -> "TvPrior":
-        """Total variation with a share of the weight."""
+        """Total variation, its weight multiplied by ``share``."""
         return TvPrior(TvProx(self.rt, self.grid.shape, axis_weights(self.grid)), self.tv_iterations, share)
 
     def tv_and_dct(self) -> "TvAndDct":
@@ -76,7 +76,7 @@ class Prior:
 
 
 class TvPrior(Prior):
-    """Isotropic total variation, with a share of the weight."""
+    """Isotropic total variation, its weight multiplied by ``share``."""
 
     def __init__(self, prox: TvProx, iterations: int, share: float = 1.0) -> None:
         self.prox, self.iterations, self.share = prox, iterations, share

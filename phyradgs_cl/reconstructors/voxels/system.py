@@ -206,7 +206,7 @@ class SharedOperator:
     """A ``LinearOperator`` whose frames the ranks share; ``whole`` has all frames.
 
     Volumes and frames are complete on every rank, so that methods do the same on each. Sums of volumes do not depend on
-    their order, only on how many frames a rank adds up by itself.
+    their order, only on the number of frames per rank.
     """
 
     def __init__(self, ranks: Communicator, whole: LinearOperator) -> None:
