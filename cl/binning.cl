@@ -130,7 +130,7 @@ __kernel void bin_count_group(
             counts[(size_t)t * chunks + k] = having(boxes, item, chunk, x, y, z);
 }
 
-/* the sum of what the items before this one give; `group_sum`: of all items */
+/* returns the sum over the items before this one; `group_sum` is that over all items */
 ALWAYS_INLINE long group_scan(const long own, __local long *scratch, long *group_sum)
 {
     const int item = GROUP_ITEM, items = GROUP_ITEMS;

@@ -9,11 +9,11 @@
 
 __kernel void intensity_merge(
     __global const float *layers,   /* layer_count images: guard, then (lines, pitch) */
-    __global const float *weights,  /* (layer_count, lines): share of a line's window, 0 where a layer is not its own */
+    __global const float *weights,  /* (layer_count, lines): weight in a line's window, 0 where a layer has no cell of the line */
     const int layer_count, const int lines, const int width, const int pitch,
     const float unit,               /* line integral that is 1 in the images */
     __global float *shares,         /* layer_count images: derivative of the merged frame by the layers */
-    __global float *merged)         /* guard, then (lines, pitch), padding left as it is */
+    __global float *merged)         /* guard, then (lines, pitch), padding is not written */
 {
     const int u = (int)get_global_id(0) * LANES, v = (int)get_global_id(1);
     if (u >= width || v >= lines)

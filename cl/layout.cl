@@ -7,7 +7,7 @@ static inline size_t row_of(const long4 strides, const int y, const int z)
     return (size_t)(strides.s0 + y * strides.s1 + z * strides.s2);
 }
 
-/* a work-item takes LANES elements of a row, and leaves what lies behind the row alone */
+/* a work-item copies LANES elements of a row, and writes nothing behind the row */
 __kernel void move_rows(
     __global const float *source, const long4 from, __global float *target, const long4 to, const int rows, const int width)
 {

@@ -1,5 +1,5 @@
-/* A step down the quadratic ½ Σ w_ij (x_i − x_j)² over the voxels of 5³ neighbourhoods, whose weights say how alike the 3³
-   patches about i and j are in another volume, the guide (Buades, Coll and Morel 2005; Gilboa and Osher 2007).
+/* A step down the quadratic ½ Σ w_ij (x_i − x_j)² over the voxels of 5³ neighbourhoods, whose weights measure how similar
+   the 3³ patches about i and j of another volume are, the guide (Buades, Coll and Morel 2005; Gilboa and Osher 2007).
 
    Likeness exp(−d/h²), d the mean square between patches, is kept in bytes (62, nz, ny, pitch), for one of each pair of
    neighbours i and i + o, at i: w_ij = likeness · min(1/S_i, 1/S_j), S the sums over all neighbours. So weights are symmetric,

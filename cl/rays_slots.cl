@@ -53,7 +53,7 @@ __kernel void merge_slots(
             __global const float *column = integrals + IMAGE_GUARD
                 + ((size_t)share[0] * slot_columns + u - slot[SLOT_U]) * slot_pitch;
             const int own = v - slot[SLOT_V], most = slot_pitch - LANES;
-            /* near the ends of the slot: the lanes inside by themselves */
+            /* near the ends of the slot: only the lanes inside */
             const vf p = own >= 0 && own <= most
                 ? V_LOAD(column + own) : GATHER(column, min(max(own + VI_IOTA, 0), slot_pitch - 1));
             if (AVERAGE == AVERAGE_LOG) {

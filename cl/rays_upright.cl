@@ -175,7 +175,7 @@ RAY_INLINE void sample_plane(__global const float *plane, const planes_t r, cons
     }
     for (int k = 0; k < count; k += LANES) {
         vf wc;
-        /* the last vector's lanes beyond the last line may point outside of what was blended */
+        /* lanes beyond the last line may point outside of the blended voxels */
         const vi z = sample_at(V_LOAD(gc + k), r.sc, ahead, r.c_first, r.c_last, &wc) - base;
         const vi own = min(max(z, 0), stop - base - 2);
         const vf a = GATHER(blended, own), b = GATHER(blended + 1, own);

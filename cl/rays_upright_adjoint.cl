@@ -1,10 +1,10 @@
-/* The adjoint of rays_upright.cl. A ray of a column weighs a column of voxels by how near it passes, and lines follow each
-   other along the voxels: what a vector of voxels gets is gathered from a few neighbouring lines. One writer per voxel in a
-   fixed order. LEAN as in ray_column.h. Twin: operators/twins/rays.py. */
+/* The adjoint of rays_upright.cl. A ray of a detector column weighs the voxels of a column by its distance, and lines follow
+   each other along the voxels: a vector of voxels gathers from a few neighbouring lines. One writer per voxel, in a fixed
+   order. LEAN as in ray_column.h. Twin: operators/twins/rays.py. */
 #include "common/ray_column.h"
 
 #define LINE_MARGIN 0.01f /* lines: more than the rounding of where they lie; beyond a voxel's neighbours they weigh nothing */
-#define LEAST_SLOPE 1e-6f /* voxels per line: less beside the source, where all lines pass at one height */
+#define LEAST_SLOPE 1e-6f /* voxels per line: smaller near the source, where all lines have one height */
 
 /* Detector columns (first, last) whose rays may touch a box of voxels. */
 static inline int2 columns_of_box(__global const float *matrix, const int stride, const float4 first, const float4 last,
@@ -205,7 +205,7 @@ RAY_INLINE void lines_onto(const column_t r, const float ahead, const int z_firs
     /* lines within a voxel of a height; a little more where lines beyond the ends are denser */
     const float per = r.dense / fmax(fabs(ahead), LEAST_SLOPE);
     float reach = per * (1.0f + 4.0f * fabs(r.ea / r.da) * per) + LINE_MARGIN;
-    /* lines are spaced evenly but for a little in the middle */
+    /* lines are spaced nearly evenly */
     const float bottom = (float)(z_first + from), top = (float)(z_first + stop);
     const float line0 = line_at(r, ahead, bottom), line1 = line_at(r, ahead, top);
     reach += 1.2f * fabs(line_at(r, ahead, 0.5f * (bottom + top)) - 0.5f * (line0 + line1));

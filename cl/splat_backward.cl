@@ -1,5 +1,5 @@
-/* Adjoint of the splat, first pass: a Gaussian walks its own footprint in every time cell and keeps the
-   sums that the chain rule needs. Gathers only, no atomics: results repeat bit for bit.
+/* Adjoint of the splat, first pass: sums over the footprint of a Gaussian in every time cell, the input of the chain rule.
+   Every Gaussian has one writer, without atomics: results repeat bit for bit.
    splat_backward_rows: one work-item per Gaussian, vectors along its lines (CPUs).
    splat_backward_group: a group per Gaussian, ACROSS items along a line and as many lines as fit (GPUs). */
 #if GROUP > 1

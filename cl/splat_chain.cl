@@ -30,8 +30,8 @@ static inline vf torque_about(const vf forth, const vf back, const vf s2, const 
     return 0.5f * (forth * (s2 * inv3) + back * (s3 * inv2)) * out_of_round(s2, s3, inv2, inv3);
 }
 
-/* The torque is forth - back, the gradients by all vectors crossed with them. Line integrals depend on vectors over scales
-   alone, in which any turn leaves them as they are: forth s2 / s3 = back s3 / s2. What is left has no rounding of a difference. */
+/* The torque is forth - back, the gradients by all vectors crossed with them. Line integrals depend only on
+   vectors over scales, where a turn does not change them: forth s2 / s3 = back s3 / s2. The result is no small difference. */
 static inline v3 torque_of(const v3 forth, const v3 back, const v3 s, const v3 inv)
 {
     return v3_make(torque_about(forth.x, back.x, s.y, s.z, inv.y, inv.z),

@@ -179,7 +179,7 @@ ALWAYS_INLINE vf reach2_of(const splat_view s, const cutoff_ellipse e, const cen
 }
 
 __kernel void splat_prepare_moving(
-    __global const float *gaussians, const int count, const int stride, /* all as of splat_prepare */
+    __global const float *gaussians, const int count, const int stride, /* arguments: see splat_prepare */
     __global const float *cells,
     __global const coefficient *matrices, /* (C, POSES, 12) */
     __global const int *cell_lines, const int cell_count, const int width, const float cutoff2,

@@ -1,5 +1,5 @@
-/* Voxeliser: every tile of voxels sums its list of Gaussians. A work-item owns rows of x (BLOCK_PIXEL 0) or
-   voxels along z (BLOCK_PIXEL 1), where a work-group owns a tile, tile.x by tile.y items, and reads its records once. */
+/* Voxeliser: every tile of voxels sums its list of Gaussians. With BLOCK_PIXEL 0 a work-item owns rows along x.
+   With BLOCK_PIXEL 1 it owns voxels along z; a work-group owns a tile, tile.x by tile.y items, and reads its records once. */
 #if BLOCK_PIXEL
 #define VOXEL_SPACE __local
 #endif

@@ -1,5 +1,5 @@
-/* Every Gaussian as the voxeliser sees it on one grid: triangular factor and bounding box of its own
-   covariance (not a sphere of its largest axis). A work-item takes LANES Gaussians. */
+/* Projects every Gaussian onto a grid: the triangular factor of its precision matrix and its bounding box. A work-item
+   takes LANES Gaussians. */
 #include "common/precise.h"
 #include "common/gaussian.h"
 #include "common/voxel.h"

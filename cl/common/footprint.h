@@ -5,7 +5,7 @@
 typedef struct {
 #if MOVING
     moving_line s;
-    float amp, speed, middle, half_time; /* amp: times the line's share of its window in this segment */
+    float amp, speed, middle, half_time; /* amp: of the line's window, the part in this segment */
 #else
     splat_line s;
 #endif
@@ -41,7 +41,7 @@ ALWAYS_INLINE footprint_line footprint_at(SPLAT_SPACE const float *splat_record,
     return line;
 }
 
-/* the same for whoever looks at one line alone; `times`: the cell's (TIME_ROWS, time_pitch), if splats move */
+/* the same for a single line; `times`: the cell's (TIME_ROWS, time_pitch), if splats move */
 ALWAYS_INLINE footprint_line footprint_alone(SPLAT_SPACE const float *splat_record, SPLAT_SPACE const float *cell,
                                              __global const float *times, const int time_pitch, const int v,
                                              const float4 path_limits)
@@ -62,8 +62,8 @@ ALWAYS_INLINE vf footprint_du(const footprint_line line, const int u)
 }
 
 #if GROUP > 1
-/* the same, and only the pixels within the cutoff: with t = l11 du + t0 and B = beta t + gamma, num <= cutoff2 Q is a
-   quadratic in t that does not know how far the line is from the centre, so that needles keep their digits */
+/* The same, with only the pixels within the cutoff. With t = l11 du + t0 and B = beta t + gamma, num <= cutoff2 Q is a
+   quadratic in t. It does not depend on the distance of the line from the centre, so that needles keep their digits. */
 ALWAYS_INLINE footprint_line footprint_within(SPLAT_SPACE const float *splat_record, SPLAT_SPACE const float *cell,
                                               __global const float *times, const int time_pitch, const int v,
                                               const float4 path_limits, const float cutoff2)
@@ -81,7 +81,7 @@ ALWAYS_INLINE footprint_line footprint_within(SPLAT_SPACE const float *splat_rec
         const float centre = line.u_rest - line.s.t0 * per, far = 4e6f;
         line.u_lo = max(line.u_lo, line.u_whole + convert_int(ceil(clamp(centre + (middle - reach) * per - 0.01f, -far, far))));
         line.u_hi = min(line.u_hi, line.u_whole + convert_int(floor(clamp(centre + (middle + reach) * per + 0.01f, -far, far))));
-        if (left < 0.0f) /* the line passes beside it */
+        if (left < 0.0f) /* the line misses the ellipse */
             line.u_hi = line.u_lo - 1;
     }
 #endif

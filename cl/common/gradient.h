@@ -6,8 +6,8 @@
 #define ROW_STATISTIC 11
 #define ROUND 4e-6f /* of the sum of two scales: a difference that rounding makes */
 
-/* s3 / s2 - s2 / s3, the share of the moment of both axes that turns a Gaussian about the third one. Two scales that differ
-   by rounding alone count as equal: the torque would be rounding too, of which Adam makes steps as long as any other. */
+/* s3 / s2 - s2 / s3, the factor of the torque about the third axis. Two scales that differ only by rounding count as equal:
+   the torque would be rounding too, and Adam would make it a step of full length. */
 static inline vf out_of_round(const vf s2, const vf s3, const vf inv2, const vf inv3)
 {
     const vf more = s3 - s2, both = s3 + s2;

@@ -1,5 +1,5 @@
 /* A detector adds photons: -log(sum of w exp(-p)) over times whose weights w sum to 1, from differences between the
-   line integrals p and one of them, so that times that are nearly alike cost no digits. */
+   line integrals p and one of them, so that nearly equal times cost no digits. */
 #include "common/lanes.h"
 
 typedef struct {

@@ -1,6 +1,6 @@
 /* Joseph's samples along LANES rays of one detector line, for the projector and both shapes of its adjoint.
-   Everything is in voxel indices (x, y, z). All of them take axis, planes and weights from here, and fma leaves the
-   compiler no choice of rounding, so a ray has the same samples wherever it is followed. */
+   Everything is in voxel indices (x, y, z). All of them take axis, planes and weights from here, and fma fixes
+   the rounding: a ray has the same samples in all kernels. */
 #include "common/lanes.h"
 
 #define RAY_CELL 16    /* floats per cell */
@@ -60,7 +60,7 @@ static inline int v_largest(vi v)
 }
 #endif
 
-/* a call would copy these structs of vectors through memory, which takes longer than what is done with them */
+/* A call would copy these structs of vectors through memory, which takes longer than the computation. */
 #ifdef __clang__
 #define RAY_INLINE static inline __attribute__((always_inline))
 #else
@@ -139,7 +139,7 @@ RAY_INLINE int rays_enter(const rays_t r, __global const float *cell, const int 
     return w->lo <= w->hi;
 }
 
-/* Whole voxel at or below a position, and the share of the next one; beyond the box it is the zero border's.
+/* Voxel at or below a position, and the weight of the next one; beyond the box it is the border of zeros.
    PoCL's floor is slow: positions start at -1, so cutting off the fraction of position + 1 does the same. */
 RAY_INLINE vi sample_at(const vf g, const float s, const float ahead, const int first, const int last, vf *share)
 {

@@ -1,7 +1,7 @@
-/* What the projector keeps of a Gaussian seen from one time cell, and its value at a pixel.
+/* The record of a Gaussian projected from one time cell, and its value at a pixel.
 
-   With pixel offset D = (u - u0, v - v0), num = D'SD (S from the Gram form, kept as its triangular
-   factor L), B = 1 + b.D and Q = B^2 + num/kappa, the line integral of the Gaussian along the pixel's ray is
+   D = (u - u0, v - v0) is the offset of a pixel from the centre. num = D'SD, with S from the Gram form, stored as its
+   triangular factor L. B = 1 + b.D, and Q = B^2 + num/kappa. The line integral of the Gaussian along the pixel's ray is
 
        p = amp * sqrt(|d|^2 / Q) * exp(-num / (2 Q))
 

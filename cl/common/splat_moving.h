@@ -11,13 +11,13 @@
 /* rows of a cell's table of lines, `time_pitch` floats each */
 #define TIME_MIDDLE 0
 #define TIME_HALF 1
-#define TIME_WEIGHT 2 /* share of the line's window that lies in this segment */
+#define TIME_WEIGHT 2 /* part of the line's window in this segment */
 #define TIME_ROWS 3
 #define TIMES_OF(c, line_times, time_pitch) ((line_times) + (size_t)(c) * TIME_ROWS * (time_pitch))
 
 #if MOVING
 #define LANE(type, v, lane) (((type *)&(v))[lane])
-#define CLOSED 0 /* rules: closed form, or so many Gauss-Legendre times */
+#define CLOSED 0 /* rules: closed form, or the number of Gauss-Legendre times */
 #define GAUSS_2 0.57735026919f
 #define GAUSS_3 0.77459666924f
 #define ROOT_HALF 0.70710678119f
@@ -60,7 +60,7 @@ ALWAYS_INLINE moving_line moving_on_line(SPLAT_SPACE const float *splat_record, 
     return s;
 }
 
-/* what a pixel is to the splat: z and across, Q, 1/Q and the factor of squares in the exponent, across^2,
+/* a pixel relative to the splat: z and across, Q, 1/Q and the factor of squares in the exponent, across^2,
    |d|^2 (1 in the affine model), and whether it is drawn */
 typedef struct { vf z, across, b, q, rq, fall, c2, d2; vi drawn; } moving_pixel;
 

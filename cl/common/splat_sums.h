@@ -1,5 +1,5 @@
-/* What the adjoint keeps of the pixels under a splat in one cell: from here the chain rule goes on. It lies in the record,
-   from SUMS on, over what only the projector and the adjoint's first pass need of it. */
+/* Sums over the pixels of a splat in one cell, the input of the chain rule. They overwrite the record from SUMS on, which
+   only the projector and the first pass of the adjoint read. */
 #define SUM_W 0          /* sum of gradient x value: the derivative by log amplitude */
 #define SUM_IK 1         /* by 1/kappa */
 #define SUM_B 7          /* by B = 1 + b.D, and its moments */

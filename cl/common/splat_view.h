@@ -4,7 +4,7 @@
 #include "common/gaussian.h"
 #include "common/splat.h"
 
-/* Smallest depth of a centre that is drawn, as a share of the detector's: closer to the source's plane float32 cannot tell
+/* Smallest depth of a centre that is drawn, relative to the detector's: closer to the source's plane float32 cannot tell
    them apart, and derivatives grow with the inverse depth. */
 #define NEAREST 1e-6f
 

@@ -1,4 +1,4 @@
-/* What the voxeliser keeps of a Gaussian on a grid: with voxel offset D from the centre,
+/* The record of a Gaussian on a grid. With voxel offset D from the centre,
    value = density exp(-|U D|^2 / 2), U upper triangular. */
 #include "common/falling_exp2.h"
 
