@@ -183,7 +183,7 @@ def test_what_is_wrong_is_said_once(scan_file, tmp_path) -> None:
     for more, status, line in (
         (["--method", "fdk"], 2, "--method fdk: found 3 ranks"),
         (["--device", "99"], 2, "--device: found '99'"),
-        (["--batch", "2"], 2, "--batch: found 2 for 3 ranks"),
+        (["--method", "phyradgs", "--batch", "2"], 2, "--batch: found 2 for 3 ranks"),
         (["--memory", "100K"], 6, "memory of"),
     ):
         words = ["reconstruct", str(scan_file), "-o", str(tmp_path / "v.h5"), *more]

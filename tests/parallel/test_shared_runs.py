@@ -29,8 +29,9 @@ def scan() -> Scan:
 def on_ranks(ranks_of, scan):
     """(size, method, options, more of a reconstruction) → the result of every rank."""
 
-    def run(size: int, method: str, options=None, **more):
-        return ranks_of(size, lambda ranks: reconstruct(scan, RunPlan(method, options), Runtime(ranks=ranks), **more))
+    def run(size: int, method: str, options=None, seed: int = 0, before=None, **more):
+        plan = RunPlan(method, options or method_options(method), before or Preprocessing(), seed)
+        return ranks_of(size, lambda ranks: reconstruct(scan, plan, Runtime(ranks=ranks), **more))
 
     return run
 
