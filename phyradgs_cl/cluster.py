@@ -200,7 +200,7 @@ class Pool:
         try:
             yield
         except _NO_ANSWER as error:
-            expected, remedy = "a running scheduler", "start it, and repeat the command to go on"
+            expected, remedy = "a running scheduler", "start it, and repeat the command to continue"
             raise InputError(self._subject, "gone", expected, remedy) from error
 
     def _address(self) -> dict[str, Any]:

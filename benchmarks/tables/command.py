@@ -131,7 +131,7 @@ def bench_command(
     if scheduler is not None or workers is not None:
         pool = Workers(LOCAL if scheduler is None else scheduler, workers, wish)
     interrupted = (
-        f"interrupted: finished runs are in {job.output / RESULTS}; repeat the command to go on, "
+        f"interrupted: finished runs are in {job.output / RESULTS}; repeat the command to continue, "
         "with --table-only for their tables"
     )
     try:

@@ -100,7 +100,7 @@ class _Checkpoints:
                 yield
         except PhyradgsError as error:
             if self.iteration is not None:
-                way_on = f"--resume goes on from iteration {self.iteration}"
+                way_on = f"--resume continues from iteration {self.iteration}"
                 error.remedy = "; ".join(part for part in (error.remedy, way_on) if part)
             raise
 

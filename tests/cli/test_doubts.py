@@ -79,7 +79,7 @@ def test_files_of_another_kind_are_called_by_their_kind(refused, scan, volume, t
         (["reconstruct", bare, *output], f"{bare}: found a bare volume (dataset /volume); expected a scan"),
         (["evaluate", scan, "--reference", scan], f"{scan}: found a scan; expected a volume"),
         (["simulate", "--volume", scan, *output], f"{scan}: found a scan; expected a bare volume"),
-        (["reconstruct", scan, *output, "--resume"], "found a damaged checkpoint; expected a whole one"),
+        (["reconstruct", scan, *output, "--resume"], "found a damaged checkpoint; expected a complete one"),
     ):
         refused(words, expected)
 

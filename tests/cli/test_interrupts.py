@@ -171,7 +171,7 @@ def test_a_loop_is_saved_beside_the_output_and_goes_on(cli, scan, tmp_path, caps
     at = 2 if method == "sart" else 50  # splats report every 50 iterations
     expected = f"interrupted at iteration {at} of {iterations}"
     assert done.returncode == status
-    assert done.stderr == f"phyradgs: {expected}: repeat the command with --resume to go on\n"
+    assert done.stderr == f"phyradgs: {expected}: repeat the command with --resume to continue\n"
     partial = tmp_path / "volume.partial.h5"
     assert done.stdout.startswith(f"{partial}: {method}") and output.read_bytes() == b"an older result"
     left = {"volume.h5", "volume.h5.checkpoint.npz", "volume.partial.h5"}
@@ -251,7 +251,7 @@ def test_a_benchmark_ends_with_its_own_line(tmp_path, name, status, module, step
         r.{step} = lambda *_, **__: signal.raise_signal(signal.{name})
     """
     done = run_process(["bench", "quick", "-o", str(tmp_path)], body)
-    expected = f"phyradgs: interrupted: finished runs are in {tmp_path}/results.jsonl; repeat the command to go on\n"
+    expected = f"phyradgs: interrupted: finished runs are in {tmp_path}/results.jsonl; repeat the command to continue\n"
     assert (done.returncode, done.stderr) == (status, expected)
 
 

@@ -41,7 +41,7 @@ def test_a_device_that_fails_at_any_launch(run, scan, tmp_path, capfd, launches,
         assert output.read_bytes() == kit.OLD
         left = kit.names(tmp_path)
         assert left in (["v.h5", "whole.h5"], ["v.h5", "v.h5.checkpoint.npz", "whole.h5"])
-        assert ("--resume goes on from iteration" in line) == (len(left) == 3)
+        assert ("--resume continues from iteration" in line) == (len(left) == 3)
         kept += len(left) == 3
         launches.arm(None)
         assert run(*command(scan, output, RUNS[name]), *kit.resume_if_kept(output)) == 0
@@ -73,7 +73,7 @@ def test_memory_that_is_missed_late_leaves_the_checkpoint(run, scan, tmp_path, c
     capfd.readouterr()
     assert run(*command(scan, output, RUNS[name])) == 6
     line = capfd.readouterr().err.splitlines()[-1]
-    assert line.startswith("phyradgs: memory of ") and "--resume goes on from iteration" in line
+    assert line.startswith("phyradgs: memory of ") and "--resume continues from iteration" in line
     assert checkpoint_path(output).exists() and not output.exists()
     copies.arm(None)
     assert run(*command(scan, output, RUNS[name]), "--resume") == 0

@@ -67,7 +67,7 @@ def test_memory_that_runs_out_leaves_the_checkpoint(run, scan, tmp_path, capfd, 
     assert run("reconstruct", scan, "-o", output, *words) == OutOfMemoryError.exit_code
     line = capfd.readouterr().err.splitlines()[-1]
     assert line.startswith("phyradgs: memory of this machine: found too little (Unable to allocate 9.0 GiB)")
-    assert line.endswith("--resume goes on from iteration 3")
+    assert line.endswith("--resume continues from iteration 3")
     monkeypatch.setattr(sirt.Sirt, "step", step)
     assert run("reconstruct", scan, "-o", output, *words, "--resume") == 0
     kit.same_bits(output, whole)
@@ -88,7 +88,7 @@ def test_a_residual_that_is_no_number_is_named(run, scan, tmp_path, capfd, monke
     assert run("reconstruct", scan, "-o", tmp_path / "v.h5", *words) == 3
     line = capfd.readouterr().err.splitlines()[-1]
     assert line.startswith("phyradgs: residual: found nan at iteration 3; expected a finite number")
-    assert line.endswith("--resume goes on from iteration 2")
+    assert line.endswith("--resume continues from iteration 2")
     assert kit.names(tmp_path) == ["v.h5.checkpoint.npz"]
 
 
