@@ -1,6 +1,6 @@
 /* Projects every Gaussian from every time cell of a frame, in one launch. A work-item takes LANES Gaussians and loops over
    the cells. For each cell it writes one record per Gaussian (common/splat.h): the splat and the box of its pixels. At the
-   end it writes the box around all cells, from which binning.cl makes the lists of the tiles.
+   end it writes the box around each Gaussian's splats in all cells, from which binning.cl makes the lists of the tiles.
    splat_prepare: a cell is one pose. splat_prepare_moving: a cell is a segment of the frame, in which the centre moves from
    one end to the other (common/splat_moving.h). Twin: operators/twins/splat.py. */
 #include "common/splat_view.h"
@@ -29,7 +29,7 @@ ALWAYS_INLINE void collect(const splat_centre centre, const splat_view s, const 
     VI_STORE(box.u_hi, bounds + 3 * LANES);
 }
 
-/* Writes the records of LANES Gaussians, those that are visible, and which are. record_step: records from one Gaussian
+/* Writes the records of those of LANES Gaussians that are visible, and their flags. record_step: records from one Gaussian
    to the next. */
 ALWAYS_INLINE void write_records(__private const float *fields, __private int *bounds, const pixel_box box,
                                  const size_t first_record, const size_t record_step, __global float *records,
@@ -72,7 +72,7 @@ __kernel void splat_prepare(
     __global const coefficient *matrices, /* (C, 12): rows give u z, v z and z of a world point */
     __global const int *cell_lines,       /* (C, 2): first line, line after the last */
     const int cell_count,
-    const int width,                      /* pixels across the lines */
+    const int width,                      /* pixels of a line */
     const float cutoff2,                  /* squared Mahalanobis radius; 0 = no cutoff */
     __global float *records,              /* (stride, C, RECORD), not changed where nothing is visible */
     __global uchar *is_visible,           /* (stride, C): 1 where a record was written */
@@ -111,13 +111,14 @@ __kernel void splat_prepare(
 }
 #else
 
+#define MOVING_FIELD(rec) ((rec) - 6) /* fields have none of the record's six ints */
 #define POSES 3 /* of a cell: the middle of the segment and its two ends */
 
 /* The path of the centre in a segment, from one end to the other, and whether both ends lie in front of the source. */
 typedef struct { vf u, v; vi is_in_front; } centre_path;
 
-/* Finds the path, and shifts the centre at mid-time so that the straight path is right in the mean: a path bent by s t^2
-   has the mean s/12. */
+/* Finds the path, and shifts the centre at mid-time so that the straight path is right in the mean: over t from -1/2 to 1/2
+   a path bent by s t^2 has the mean s/12, a sixth of the sum of its ends. */
 ALWAYS_INLINE centre_path path_of(__global const coefficient *end_matrices, const v3 mean, splat_centre *middle)
 {
     centre_path path;
@@ -166,8 +167,8 @@ ALWAYS_INLINE void times_of_lines(__global const float *times, const int pitch, 
     *late = V_LOAD(to);
 }
 
-/* Squared reach of the splat about its path, in widths. Q is that of the segment's middle: the reach allows for its change
-   along the path. */
+/* Squared cutoff about the path, in widths of the splat. S and Q: common/splat.h, here of the segment's middle. slack bounds
+   how much Q changes along the path: 0.75 is the longest time from the middle, 1.1 and 1.2 are margins. */
 ALWAYS_INLINE vf reach2_of(const splat_view s, const cutoff_ellipse e, const centre_path path, const vf speed, const float cutoff2)
 {
     const vf tilt = fabs(s.b1) * (fabs(e.u) + e.half_u + 0.75f * fabs(path.u))
@@ -226,9 +227,9 @@ __kernel void splat_prepare_moving(
             V_STORE(s.l11 * cosine, fields + REC_ALONG_U * LANES);
             V_STORE(s.l12 * cosine + s.l22 * sine, fields + REC_ALONG_V * LANES);
             V_STORE(s.l22 * cosine - s.l12 * sine, fields + REC_ACROSS_V * LANES);
-            V_STORE(s.l11 * -sine, fields + (REC_ACROSS_U - 6) * LANES);
-            V_STORE(speed, fields + (REC_SPEED - 6) * LANES);
-            V_STORE(reach2, fields + (REC_REACH2 - 6) * LANES);
+            V_STORE(s.l11 * -sine, fields + MOVING_FIELD(REC_ACROSS_U) * LANES);
+            V_STORE(speed, fields + MOVING_FIELD(REC_SPEED) * LANES);
+            V_STORE(reach2, fields + MOVING_FIELD(REC_REACH2) * LANES);
             collect(centre, s, box, fields, bounds);
         }
         write_records(fields, bounds, box, (size_t)first * cell_count + c, cell_count, records, is_visible);

@@ -3,7 +3,7 @@
 It starts from the axis that fits best and, for a known phantom, from the place where its beads are seen. On request it tests
 the readout's direction, and corrects single views or a motion first. The search (``search``) then estimates the parameters
 common to all views, from coarse to fine grids. Views or the motion are estimated again after that. Significant corrections
-that lower the residual enter the scan and its provenance.
+enter the scan and its provenance; without views, only if they lower the residual.
 """
 
 import logging
@@ -101,6 +101,7 @@ class _Calibrator:
 
     def __post_init__(self) -> None:
         self.placement = np.zeros(0)
+        self.stated = self.ready  # ``ready`` may get the other readout direction
         self.stages = _different(STAGES if self.phantom is None else BEAD_STAGES, self.scan)
         self.per_view: PerViewParameters | None = None
         if self.request.per_view == WOBBLE:
@@ -129,7 +130,8 @@ class _Calibrator:
             views, views_table = estimate.views, estimate.table
         self.passes.begin("residuals", "residuals")
         problem = self._problem(self.ready, self.stages[-1], MOST_FRAMES if views is None else self.scan.frames)
-        before = self._residual(problem, self.stages[-1], GeometryCorrection())
+        as_stated = self._problem(self.stated, self.stages[-1], MOST_FRAMES if views is None else self.scan.frames)
+        before = self._residual(as_stated, self.stages[-1], GeometryCorrection())
         after = self._residual(problem, self.stages[-1], correction, views)
         if views is None and rms(after) > rms(before):  # a correction that explains the frames worse is none
             corrections, correction, after = {}, GeometryCorrection(), before
@@ -144,8 +146,8 @@ class _Calibrator:
     def _start_from_axis(self) -> None:
         """Starts from the offset that ``check`` finds, because steps lead there from a few pixels away only.
 
-        Half a turn of nearly parallel rays leaves too little of the offset's signal for a step. The fit itself still has its
-        best axis, so ``check``'s answer then stands."""
+        In half a turn of nearly parallel rays a volume explains most of what an offset changes, so the search cannot
+        determine it. ``check``'s answer then stands."""
         quick, pitch_mm = coarse(self.ready[0], QUICK_COLUMNS), self.scan.geometry.pixel_size_mm[1]
         shift, finding = centre_of(axis_shift(self.rt, quick), columns_per_block(quick), self.ready[0])
         if not shift.is_found:
@@ -156,8 +158,8 @@ class _Calibrator:
             self.search.fallback = {OFFSET_U: Fallback(shift.pixels * pitch_mm, shift.deviation * pitch_mm, is_significant)}
 
     def _search_common(self) -> None:
-        """Searches the parameters common to all views, in a scan whose views are corrected first: they would look like a
-        roll."""
+        """Searches the parameters common to all views, in a scan whose views are corrected first: errors of single
+        views would look like a roll."""
         steady = self.ready
         if self.per_view is not None:
             self.passes.begin("views before", "views, before the rest")

@@ -1,9 +1,9 @@
 """Do the frames fit together under the stated order, angles and geometry?
 
-A coarse reconstruction of consistent frames leaves far less than one of the same frames in a random order. Where it does
-not, or where another hypothesis leaves half as much, something stated is wrong. The steps: remove odd frames; choose the
-sense of rotation and the panel's shift, which other questions judge; remove outliers; compare with random orders; try
-hypotheses.
+A coarse reconstruction of consistent frames leaves a far smaller residual than one of the same frames in a random order.
+Where it does not, or where another hypothesis leaves at most half the squared residual, something stated is wrong. The
+steps: remove odd frames; choose the sense of rotation and the panel's shift (``orbit.py`` reports them); remove outliers;
+compare with random orders; try hypotheses.
 """
 
 from collections.abc import Iterable
@@ -43,7 +43,7 @@ _CLEAR = 0.5  # squared residual of another hypothesis over the stated one's
 _NEARLY = 1.5  # squared residual of a rough fit over the best one's: up to here a sense of rotation is refined
 _ERRORS = 4.0
 _SYMMETRIC = 2.0  # residual in a random order over the stated one's
-_SAME = 0.03  # residual in a random order over the frames' spread: an object below both looks the same from every angle
+_SAME = 0.03  # residual in a random order over the frames' spread: below this and _SYMMETRIC, angles leave no trace
 _MOST_REFINED = 2  # hypotheses about the whole scan
 _SHIFT_PENALTY = 1.5  # of the squared residual, per coarse pixel of shift: stated offsets are mostly right
 
@@ -62,24 +62,25 @@ class Consistency:
 @dataclass(frozen=True, eq=False)
 class _CoarseFit:
     """The coarse scan with its best sense of rotation (``turned``), and with its best panel shift as well (``best``).
-    stated: the fit of ``best``. random: its squared residual in a random order. rough_square: that of the best rough fit."""
+    fitted: the fit of ``best``. random_total: its squared residual in a random order. rough_mean_square: that of the best
+    rough fit, per value."""
 
     turned: Scan
     best: Scan
-    stated: Fit
-    random: float
-    rough_square: float
+    fitted: Fit
+    random_total: float
+    rough_mean_square: float
 
     @property
     def ratio(self) -> float:
-        return float(np.sqrt(self.stated.total / max(self.random, 1e-30)))
+        return float(np.sqrt(self.fitted.total / max(self.random_total, 1e-30)))
 
 
 def check_consistency(rt: Runtime, scan: Scan, as_stated: Scan) -> Consistency:
     """Finds frames and hypotheses that explain why the frames of a coarse ``scan`` do not fit together.
 
-    The value is the root of the squared residual over that of a random order. ``as_stated``: the scan before it was made
-    coarse."""
+    The value is the root of the ratio of two squared residuals: in the stated order over a random order.
+    ``as_stated``: the scan before it was made coarse."""
     pixels = float(scan.valid.sum()) / scan.frames
     if scan.frames < _FEWEST_FRAMES or pixels < _FEWEST_PIXELS or scan.projections.shape[2] < FEWEST_COLUMNS:
         text = f"fewer than {_FEWEST_FRAMES} frames, {FEWEST_COLUMNS} columns or {_FEWEST_PIXELS} coarse pixels per frame"
@@ -100,7 +101,7 @@ def check_consistency(rt: Runtime, scan: Scan, as_stated: Scan) -> Consistency:
 
     about_frames = "exclude these frames (image_key 3), or correct them; further answers do not use them" if notes else ""
     spread = float(np.asarray(best.projections, np.float64).var()) * best.frames
-    if ratio * _SYMMETRIC >= 1 and coarse.random <= _SAME**2 * spread:
+    if ratio * _SYMMETRIC >= 1 and coarse.random_total <= _SAME**2 * spread:
         text = "the frames look the same from every angle: their order and angles leave no trace"
         return answer(SUSPICIOUS if notes else CANNOT_TELL, text, about_frames, True, sees_angles=False)
     text = f"residual {ratio:.2g} of that of the frames in a random order"
@@ -146,19 +147,19 @@ def _random_order(rt: Runtime, scan: Scan) -> float:
 
 
 def _explanation(rt: Runtime, scan: Scan, as_stated: Scan, coarse: _CoarseFit) -> Hypothesis | None:
-    """Returns the hypothesis that explains the frames best, if it fits far better than the stated scan does.
+    """Returns the best hypothesis that fits far better than the stated scan does.
 
-    A panel that sees few rays twice fits any geometry. Other sizes then only have to make the frames consistent."""
+    A panel that sees few rays twice fits any geometry: then it is the first other size under which frames are consistent."""
     is_one_sided = stated_redundancy(as_stated) < LEAST_REDUNDANCY
-    of_scan = _refined_hypotheses(rt, scan, as_stated, np.inf if is_one_sided else coarse.rough_square)
+    of_scan = _refined_hypotheses(rt, scan, as_stated, np.inf if is_one_sided else coarse.rough_mean_square)
     if is_one_sided:
         sized = (hypothesis for hypothesis in of_scan if hypothesis.factor != 1)
         consistent = next((hypothesis for hypothesis in sized if _is_consistent(rt, hypothesis.scan())), None)
         if consistent is not None or stated_redundancy(as_stated) < 0:
             return consistent
-    most = min(_CLEAR * coarse.stated.total, _LARGEST**2 * coarse.random)
+    most = min(_CLEAR * coarse.fitted.total, _LARGEST**2 * coarse.random_total)
     of_frames = hypotheses_of_frames(coarse.turned, coarse.best, tries_orders=coarse.ratio > _DOUBTFUL)
-    return _best_below(rt, chain(of_scan, of_frames), coarse.stated, most)
+    return _best_below(rt, chain(of_scan, of_frames), coarse.fitted, most)
 
 
 def _refined_hypotheses(rt: Runtime, scan: Scan, as_stated: Scan, most: float) -> list[Hypothesis]:

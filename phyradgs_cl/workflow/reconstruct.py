@@ -174,7 +174,8 @@ def _reconstructed(
                 write_volume(path, *parts, disagreement=result.disagreement)
                 _keep_checkpoint(files.output, result)
     except signals.InterruptedAfterwards:
-        if result is None or result.state is None:  # else the result says so
+        # After a complete run the signal takes effect; an interrupted run reports it.
+        if result is None or result.state is None:
             raise
     return result, metrics
 
@@ -182,7 +183,7 @@ def _reconstructed(
 def _metrics(scan: Scan, result: Reconstruction) -> dict[str, float]:
     """Returns the metrics against the scan's reference, by the rule of ``metrics.aligned``, and those on held-out pixels.
 
-    The result's facts get the way of comparison, if it is not voxel by voxel.
+    The latter leave the result's facts. These get the way of comparison, if it is not voxel by voxel.
     """
     held_out = result.facts.pop(HELD_OUT, {})
     if scan.reference is None:
@@ -198,7 +199,7 @@ def _metrics(scan: Scan, result: Reconstruction) -> dict[str, float]:
 
 def _warn_of_doubts(plan: RunPlan, path: Path, scan: Scan) -> None:
     """Warns of a run that is possible, but hardly meant."""
-    motion, grid_choice = getattr(plan.options, "motion", None), plan.preprocessing
+    motion, preprocessing = getattr(plan.options, "motion", None), plan.preprocessing
     ignores_model = scan.detector_model == "intensity" and not hasattr(plan.options, "detector_model")
     if ignores_model and _averages(scan, plan.options):
         text = "%s averages intensity over an exposure; --method %s averages line integrals"
@@ -206,13 +207,13 @@ def _warn_of_doubts(plan: RunPlan, path: Path, scan: Scan) -> None:
     if scan.is_fly and isinstance(motion, MicroViews) and motion.strips > scan.lines:
         text = "%d strips are more than the %d lines of %s: one strip per line is the most there is"
         log.warning(text, motion.strips, scan.lines, path)
-    grid = grid_choice.with_margin(scan.with_grid(grid_choice).grid)
+    grid = preprocessing.with_margin(scan.with_grid(preprocessing).grid)
     if grid != scan.grid and hasattr(plan.options, "iterations") and cuts(grid, scan.grid, scan.geometry):
-        text = "%s: the grid ends inside the field of view, and --method %s puts what lies beyond into it; "
-        if grid_choice.margin_mm is None:
-            text += "--margin-mm has that filled, and discards it"
+        text = "%s: the grid ends inside the field of view, and --method %s puts the object beyond it into the grid; "
+        if preprocessing.margin_mm is None:
+            text += "--margin-mm reconstructs a margin, and discards it"
         else:
-            text += "if the object goes on, widen --margin-mm"
+            text += "if the object is larger still, widen --margin-mm"
         log.warning(text, path, plan.method_name)
     late = np.flatnonzero(np.diff(scan.frame_start_s) <= 0)
     if scan.is_fly and late.size:
@@ -224,7 +225,7 @@ def _warn_of_doubts(plan: RunPlan, path: Path, scan: Scan) -> None:
 
 
 def _averages(scan: Scan, options: Any) -> bool:
-    """True if the method averages several poses in a line; with one pose, both detector models are the same."""
+    """True if the method averages over several poses of a line; with one pose, both detector models are the same."""
     if not hasattr(options, "motion"):
         return False
     cells = options.motion.cells(scan, 0)

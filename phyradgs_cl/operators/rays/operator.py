@@ -52,7 +52,8 @@ class LinearOperator(Protocol):
 class RayOperator:
     """Joseph's projector and its matched adjoint over the cells of many frames; a ``LinearOperator``.
 
-    NumPy arrays give NumPy arrays. Device arrays (plain, float32) give device arrays, without copies to the host. ``out``,
+    NumPy arrays give NumPy arrays. Device arrays (plain, float32) give device arrays; only averages of intensity
+    over a volume in bricks are made on the host. ``out``,
     an array of the same kind, receives the result. detector_shape is (rows, columns); ``tables`` has the time cells of each
     frame, all read out along one axis. An operator shares its tables and buffers with its subsets, and with operators that
     were given the same ``memory``: use them one at a time. A volume that does not fit is projected in bricks.
@@ -74,7 +75,8 @@ class RayOperator:
         self.volume_shape = grid.shape
         self._readout = tables[0].readout
         layout = RayLayout.of_scan(grid, detector_shape, self._readout.axis)
-        # On a GPU work-items are pixels: the general kernel reads neighbouring addresses there.
+        # Upright kernels and their slots (``upright.py``, ``slots.py``) are for CPUs: on a GPU neighbouring pixels of the
+        # general kernel read neighbouring addresses already.
         may_use_slots = not rt.pixel_items and (memory is None or memory.slot_floats > 0)
         self._upright = upright_of(grid, tables, detector_shape, rt.lanes) if may_use_slots else None
         self._poses: UprightPoses | None = None
@@ -83,7 +85,7 @@ class RayOperator:
             self._poses = UprightPoses.upload(rt, grid, tables)
             self.slot_floats = self._poses.floats_per_frame(detector_shape, self._upright.leans)
         self.memory = memory or RayMemory(rt, layout, len(tables), self.slot_floats)
-        if self.slot_floats > self.memory.slot_floats:
+        if self.slot_floats > self.memory.slot_floats:  # the shared memory was planned without room for slots
             self._upright = None
         self._tables = list(tables)
         self._cells = RayCells.upload(rt, grid, self._tables)
@@ -167,7 +169,11 @@ class RayOperator:
             yield first - part.start, self._slots[key]
 
     def _project_layers(self, volume: Array, average: str, result: Array) -> None:
-        """Averages on the host, layer by layer: no brick holds complete rays, which these averages need."""
+        """Averages −ln Σ w exp(−p) of a volume in bricks, on the host.
+
+        These need the whole line integral of every cell, of which a brick holds a part. So a layer (at most one cell per
+        line) is projected at a time.
+        """
         ones, weights = layered(self.tables)
         like = (self.rt, self.grid, self.detector_shape)
         on_host = self.rt.download(volume) if isinstance(volume, DeviceArray) else volume

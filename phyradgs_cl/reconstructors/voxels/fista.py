@@ -1,9 +1,10 @@
-"""FISTA with a prior over ordered subsets of the frames: min ½‖p − A x‖² + R(x), x ≥ 0, in some ten passes.
+"""FISTA with a prior over ordered subsets of the frames: min ½‖p − A x‖² + R(x), x ≥ 0.
 
-Each subset S of M makes one step: xₖ = prox(yₖ + M/L · A_Sᵀ (p_S − A_S yₖ)), yₖ₊₁ = xₖ + βₖ (xₖ − xₖ₋₁).
+Each subset S of M makes one step: xₖ = prox(yₖ + M/L · A_Sᵀ (p_S − A_S yₖ)), yₖ₊₁ = xₖ + βₖ₊₁ (xₖ − xₖ₋₁).
 The step and its momentum are FISTA's (Beck and Teboulle, SIAM J. Imaging Sci. 2 (2009) 183, Eqs. 4.1 to 4.3). The gradient
 of a subset, times the number of subsets, stands for that of all frames (Kim, Ramani and Fessler, IEEE Trans. Med. Imaging
-34 (2015) 167). L bounds the norm of AᵀA. The last passes run on smaller voxels (``stages.py``).
+34 (2015) 167). L bounds the norm of AᵀA. The last 3/7 of
+the passes run on smaller voxels, whose means make up two thirds of the result (``stages.py``).
 """
 
 import math
@@ -34,7 +35,7 @@ from phyradgs_cl.reconstructors.voxels.subsets import OrderedSubsets
 from phyradgs_cl.reconstructors.voxels.system import System
 from phyradgs_cl.runtime import Runtime
 
-_VOLUMES, _FRAMES = 16, 3  # that are held at one time, with the prior `dct`
+_VOLUMES, _FRAMES = 16, 3  # in memory at one time, with the prior `dct`
 _SUBVOXEL_PASSES = 3 / 7  # share of the passes on smaller voxels (docs/results/settings.md)
 _MOST_DIVIDED = 90**3  # voxels of a grid: smaller voxels are worth their time at 64³, not at 128³
 
@@ -42,11 +43,11 @@ _MOST_DIVIDED = 90**3  # voxels of a grid: smaller voxels are worth their time a
 @dataclass(frozen=True)
 class FistaOptions(IterativeOptions):
     """prior: one of ``PRIORS``, or a function of the user's own, or its ``package.module:function``. A function takes
-    (volume (nz, ny, nx) in 1/mm, noise in 1/mm) and returns a volume. The prior piccs takes the run's first volume as its
-    prior image, and a prior_share of the total variation from the difference to it. prior_weight: threshold relative to the
-    estimated noise of the gradient plus the discretisation error of large voxels at edges.
+    (volume (nz, ny, nx) in 1/mm, noise in 1/mm) and returns a volume. The prior piccs is
+    (1 − prior_share) TV(x) + prior_share TV(x − first volume). prior_weight: threshold relative to two errors of the
+    gradient, added in squares: the noise of the frames, and edges inside large voxels.
 
-    subvoxels: parts of a voxel's side in the last 3 of 7 passes; 0: 2 up to 90³ voxels where memory allows, else 1.
+    subvoxels: parts of a voxel's side in the last 3/7 of the passes; 0: 2 up to 90³ voxels where memory allows, else 1.
     subsets: of the frames, with one step each; subsets whose steps diverge are joined two by two.
     tv_iterations: dual iterations per proximal map of TV. transmission_weights: as in ``fista-tv``.
     """
@@ -124,7 +125,7 @@ class Accelerated(Algorithm):
 
 
 class Fista(Accelerated):
-    """The residual is that of the pass: of every subset just before its step."""
+    """The residual of a pass is that of all subsets, each at the extrapolated point of its step."""
 
     def __init__(self, system: System, options: FistaOptions, prior: Prior, weight: PriorWeight) -> None:
         super().__init__(system, prior)
@@ -140,12 +141,12 @@ class Fista(Accelerated):
         return residual
 
     def _update(self, subset: System, weight: float) -> Any:
-        """Steps down the gradient of a subset. Returns the residual of its frames just before."""
+        """Steps down the gradient of a subset. Returns the residual of its frames at the extrapolated point."""
         space = self.system.space
         point = space.extrapolate(self.volume, self.previous, self.extrapolation)
         residual = subset.residual(point)
-        gradient = subset.back(subset.apply_weights(residual))
-        descended = space.add(point, gradient, len(self.subsets) / self.curvature)
+        downhill = subset.back(subset.apply_weights(residual))
+        descended = space.add(point, downhill, len(self.subsets) / self.curvature)
         volume = self.prior(space, descended, weight / self.curvature, nonnegative=self.nonnegative)
         self.accept(point, volume)
         return residual
