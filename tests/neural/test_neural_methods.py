@@ -170,9 +170,9 @@ def test_the_published_constants_run(rt, scan, method) -> None:
 def test_a_field_that_is_lost_is_told_in_one_line(scan) -> None:
     run = small_run(scan)
     with torch.no_grad():
-        run.trainer.field.encoding.table.fill_(float("nan"))
+        run.method.trainer.field.encoding.table.fill_(float("nan"))
     with pytest.raises(NumericalError, match="loss: found nan at iteration 1"):
-        run.loop()
+        run.run(None)
 
 
 @pytest.mark.parametrize("method", NEURAL)

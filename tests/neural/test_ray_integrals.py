@@ -7,7 +7,7 @@ import pytest
 import torch
 from tolerances import FLOAT32, RAY_SAMPLES, RAY_SAMPLES_SHARP
 
-from phyradgs_cl.acquisition import MicroViews, PerRow
+from phyradgs_cl.acquisition import MicroViews, OwnTimes
 from phyradgs_cl.acquisition.geometry import pixel_centres
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.neural import NeuralOptions
@@ -21,7 +21,7 @@ CENTRE, AXES = np.array([0.1, -0.2, 0.05]), np.array([0.45, 0.3, 0.5])
 @pytest.fixture(scope="module")
 def rays(scan) -> tuple[np.ndarray, np.ndarray]:
     """Sources and directions (R, 3) of pixels of a frame at five times of their lines, in half-sides."""
-    table = PerRow().cells(scan, 3)
+    table = OwnTimes().cells(scan, 3)
     exposure = ExposureRays.of_cells(table, scan.grid)
     rows, columns = scan.geometry.detector_shape
     pixels = np.stack(np.meshgrid(np.arange(rows), np.arange(columns), indexing="ij"), -1).reshape(-1, 2)
@@ -151,7 +151,7 @@ def test_the_way_through_the_box() -> None:
 
 
 def test_the_shadow_of_the_volume_holds_every_ray_that_meets_it(scan) -> None:
-    exposure = ExposureRays.of_cells(PerRow().cells(scan, 2), scan.grid)
+    exposure = ExposureRays.of_cells(OwnTimes().cells(scan, 2), scan.grid)
     shape = scan.geometry.detector_shape
     half = np.array([0.6, 0.5, 0.3])
     rows, columns = exposure.shadow(half, shape)
