@@ -169,8 +169,10 @@ def requested(what: str | None, scan: Scan, knows_shape: bool = False) -> Reques
     timed = [name for name in names if name == DIRECTION or (name in PARAMETERS and PARAMETERS[name].is_timing)]
     if timed and not _turns(scan):
         raise InputError("--what", timed[0], "a parameter of the panel: this gantry stands still in each frame")
-    if request.asks_direction and scan.shutter.readout_s == 0:
-        raise InputError(f"--what {DIRECTION}", "a readout of 0 s", "lines that are read one after the other")
+    of_readout = next((name for name in names if name in (DIRECTION, "readout")), "")
+    if of_readout and scan.shutter.readout_s == 0:
+        remedy = "state the readout that the panel may have, or leave it out: exposure alone can be estimated"
+        raise InputError(f"--what {of_readout}", "a readout of 0 s", "lines that are read one after the other", remedy)
     return request
 
 

@@ -385,3 +385,12 @@ def test_lag_and_drift_are_numbers_of_the_frames(cli, rt, right, tmp_path, capsy
     assert lines["lag"]["verdict"] == CORRECTED and abs(lines["lag"]["found"] - 5) < 3 * lines["lag"]["deviation"] < 3
     for one in calibrate(right, rt, "lag,drift").parameters:
         assert one.verdict == AGREES and abs(one.found) < 3 * one.deviation, one
+
+
+def test_the_readout_of_a_global_shutter_is_refused(rt) -> None:
+    """A step below 0 had ended the run with an error about a value that nobody had given."""
+    scan = simulate("foot", size=8, detector=16, readout_ratio=0.0, device=rt)
+    for what in ("readout", "timing", "direction"):
+        with pytest.raises(InputError) as refused:
+            calibrate(scan, rt, what)
+        assert refused.value.found == "a readout of 0 s", what

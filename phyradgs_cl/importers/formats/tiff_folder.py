@@ -140,7 +140,8 @@ def _files(folder: SafeFolder, frames: Fields, name: str) -> list[Path]:
         raise frames.error(name, repr(pattern), "a pattern for files of one folder")
     paths = folder.glob(pattern)
     if not paths:
-        raise frames.error(name, f"no file that matches {pattern!r}", "at least one TIFF")
+        remedy = "correct the pattern, or leave it out"
+        raise frames.error(name, f"no file that matches {pattern!r}", "at least one TIFF", remedy)
     return paths
 
 

@@ -91,6 +91,7 @@ def template_of(path: Path) -> str:
     }
     head = [
         f"# {frames} frames of {rows} × {columns} pixels. Fill in what says FILL IN, remove the # of a line that applies.",
+        "# A real panel averages intensity over an exposure: import with --detector-model intensity.",
         f"title = {_toml(path.resolve().name)}",
     ]
     return "\n".join([*head, *(line for name in _TABLES for line in _table(name, stated.get(name, {})))])
