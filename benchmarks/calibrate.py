@@ -289,7 +289,7 @@ def wobble_left(found: Calibration, case: Case) -> dict[str, object]:
     if case.views is None:
         return {}
     pitch_mm = case.right.geometry.pixel_size_mm[1]
-    none = Views.none(case.right.frames)
+    none = Views(np.zeros(case.right.frames), np.zeros((case.right.frames, 2)))
     facts: dict[str, object] = {}
     for name, views in (("planted", none), ("left", found.views or none)):
         facts[f"turn_{name}_deg"] = round(float(np.rad2deg(np.std(case.views.turn_rad - views.turn_rad))), 4)

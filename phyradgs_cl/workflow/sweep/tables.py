@@ -20,8 +20,12 @@ _RESULTS = (*METRICS, *HELD_OUT, "seconds", "gaussians", "device", "host", "vers
 
 
 def identity(line: Line) -> tuple[Any, ...]:
-    """Returns the values that equal lines of one run share: its name, and the size and time of the scan file."""
-    return tuple(line.get(name) for name in ("run", "scan", "scan_bytes", "scan_mtime_ns"))
+    """Returns the values that equal lines of one run share: its name, and the size and time of the scan file.
+
+    Names are as a results file has them, where text that is no UTF-8 is replaced.
+    """
+    values = (line.get(name) for name in ("run", "scan", "scan_bytes", "scan_mtime_ns"))
+    return tuple(plain_text(value) if isinstance(value, str) else value for value in values)
 
 
 def is_sound(line: Any) -> bool:
