@@ -127,7 +127,7 @@ def turned(make: Maker, seed: int) -> Case:
 
 
 def wobble(make: Maker, seed: int) -> Case:
-    """But for what an object turned or elsewhere looks like: its volume could not be compared with the truth."""
+    """Without the part that a turned or shifted object would explain: its volume could not be compared with the truth."""
     scan = make(seed)
     return _shaken(make, scan, seed, np.array([np.deg2rad(0.3), *scan.geometry.pixel_size_mm]))
 
@@ -285,7 +285,7 @@ def line(found, planted: dict[str, float]) -> dict[str, object]:  # type: ignore
 
 
 def wobble_left(found: Calibration, case: Case) -> dict[str, object]:
-    """What is left (RMS) of turns (deg) and shifts (pixels) of views, and what was planted."""
+    """The remaining and the planted turns (deg) and shifts (pixels) of views, RMS."""
     if case.views is None:
         return {}
     pitch_mm = case.right.geometry.pixel_size_mm[1]

@@ -46,12 +46,12 @@ def rotation(scan: Scan, rng: np.random.Generator) -> Scan:
 
 
 def readout(scan: Scan, rng: np.random.Generator) -> Scan:
-    """The first line said to be the last."""
+    """The readout direction is stated the wrong way round."""
     return replace(scan, shutter=replace(scan.shutter, direction=-scan.shutter.direction))
 
 
 def offset(scan: Scan, rng: np.random.Generator) -> Scan:
-    """A panel said to be three pixels from where it is, to either side."""
+    """The panel is stated three pixels off, to either side."""
     shift_mm = OFFSET_PX * scan.geometry.pixel_size_mm[1] * rng.choice([-1, 1])
     geometry = replace(scan.geometry, detector_offset_mm=(0.0, shift_mm))
     return replace(scan, geometry=geometry, trajectory=CircularOrbit(geometry, scan.trajectory.kinematics))
@@ -92,7 +92,7 @@ def stated(scan: Scan, **changes: object) -> Scan:
 
 
 def pixels(factor: float) -> Plant:
-    """Pixel sizes stated ``factor`` times as large as they are; the stated offset in mm is right."""
+    """Pixel sizes stated ``factor`` times their true size; the stated offset in mm is right."""
     return lambda scan, rng: stated(scan, pixel_size_mm=tuple(factor * p for p in scan.geometry.pixel_size_mm))
 
 

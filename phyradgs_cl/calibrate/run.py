@@ -130,7 +130,9 @@ class _Calibrator:
             views, views_table = estimate.views, estimate.table
         self.passes.begin("residuals", "residuals")
         problem = self._problem(self.ready, self.stages[-1], MOST_FRAMES if views is None else self.scan.frames)
-        as_stated = self._problem(self.stated, self.stages[-1], MOST_FRAMES if views is None else self.scan.frames)
+        as_stated = problem
+        if self.stated is not self.ready:
+            as_stated = self._problem(self.stated, self.stages[-1], MOST_FRAMES if views is None else self.scan.frames)
         before = self._residual(as_stated, self.stages[-1], GeometryCorrection())
         after = self._residual(problem, self.stages[-1], correction, views)
         if views is None and rms(after) > rms(before):  # a correction that explains the frames worse is none

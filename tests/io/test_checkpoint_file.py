@@ -19,9 +19,6 @@ def path(tmp_path: Path) -> Path:
     return tmp_path / "c.npz"
 
 
-
-
-
 def rewrite(path: Path, changes: dict[str, bytes]) -> None:
     with zipfile.ZipFile(path) as archive:
         content = {name: archive.read(name) for name in archive.namelist()}
