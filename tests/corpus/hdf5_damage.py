@@ -5,8 +5,8 @@ from pathlib import Path
 
 import h5py
 import numpy as np
-from corpus.case import Damage
 
+Damage = Callable[[Path], object]
 Change = Callable[[h5py.File, str], object]
 
 
@@ -18,6 +18,11 @@ def on(address: str, change: Change) -> Damage:
             change(file, address)
 
     return damage
+
+
+def truncated(keep: float) -> Damage:
+    """A file cut off after a share of its bytes."""
+    return lambda path: path.write_bytes(path.read_bytes()[: int(path.stat().st_size * keep)])
 
 
 def put(file: h5py.File, address: str, value: object = None, **how: object) -> h5py.Dataset:

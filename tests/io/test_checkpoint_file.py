@@ -1,6 +1,8 @@
 """Checkpoint archives: read as they were written, or refused with what to do."""
 
 import io
+import os
+import pickle
 import zipfile
 from pathlib import Path
 
@@ -55,15 +57,31 @@ def test_none_or_another_versions(path) -> None:
     refused(path, "a checkpoint of another version")
 
 
-def test_archives_that_no_run_writes(path) -> None:
+class Bomb:
+    """Runs a shell command when it is unpickled by anything that runs what a pickle says."""
+
+    def __reduce__(self) -> tuple[object, tuple[str]]:
+        return os.system, ("touch canary",)
+
+
+def test_archives_that_no_run_writes(path, monkeypatch) -> None:
+    """What executes, what declares terabytes, what is cut off: nothing of it is run."""
+    monkeypatch.chdir(path.parent)
     good, volume = path.read_bytes(), npy(ARRAYS["volume"])
     for name, content in [
-        ("volume.npy", volume.replace(b"(2, 3, 4)", b"(9, 9, 9)")), ("volume.npy", volume[:-8]),
+        *(("volume.npy", volume.replace(b"(2, 3, 4)", text)) for text in (b"(9, 9, 9)", b"(999999, 999999)", b"(-3, 8, 8)")),
+        ("volume.npy", volume.replace(b"(2, 3, 4)", b"__import__('os').system('touch canary')")),
+        ("volume.npy", volume.replace(b"(2, 3, 4)", b"(" * 500)), ("volume.npy", volume[:-8]),
         ("volume.npy", b"no array"), ("volume.txt", b"hello"), ("volume.npy", npy(np.array([None]))),
+        ("more.npy", npy(np.array([Bomb()], object))),
     ]:  # fmt: skip
         path.write_bytes(good)
         rewrite(path, {name: content})
         refused(path, "a damaged checkpoint")
+    for content in (b"", b"no archive", pickle.dumps(Bomb()), b"PK\x05\x06" + b"\0" * 18, good[: len(good) // 2]):
+        path.write_bytes(content)
+        refused(path, "checkpoint")
+    assert list(path.parent.iterdir()) == [path]
 
 
 def test_a_changed_byte_is_noticed(path) -> None:
