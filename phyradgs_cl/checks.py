@@ -2,8 +2,10 @@
 
 import importlib
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
+from dataclasses import field
 from types import ModuleType
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -12,6 +14,7 @@ from phyradgs_cl.errors import InputError
 from phyradgs_cl.text import suggest_name
 
 _LONGEST = 80
+T = TypeVar("T")
 
 
 def ceil_div(count: int, divisor: int) -> int:
@@ -37,12 +40,18 @@ def within(subject: str, value: float, lowest: float, highest: float) -> None:
         raise InputError(subject, short_repr(value), f"a number from {lowest} to {highest}")
 
 
-def fields_within(prefix: str, options: object, ranges: Mapping[str, tuple[float, float]]) -> None:
-    """Checks every number of ``options`` that ``ranges`` names (lowest, highest), those inside tuples one by one."""
-    for name, (lowest, highest) in ranges.items():
+def ranged(default: T, lowest: float, highest: float, subject: str = "") -> T:
+    """Returns the default of a dataclass's field with the bounds that ``fields_within`` checks, and a name for messages."""
+    return field(default=default, metadata={"range": (lowest, highest), "subject": subject})
+
+
+def fields_within(prefix: str, options: object) -> None:
+    """Checks every field of a dataclass that is ``ranged``, there or in a base class; numbers inside tuples one by one."""
+    own = [one for kind in reversed(type(options).__mro__) for one in getattr(kind, "__dataclass_fields__", {}).values()]
+    for name, known in {one.name: one.metadata for one in own if "range" in one.metadata}.items():
         value = getattr(options, name)
         for number in value if isinstance(value, tuple) else (value,):
-            within(prefix + name, number, lowest, highest)
+            within(known["subject"] or prefix + name, number, *known["range"])
 
 
 def one_of(subject: str, value: object, allowed: Iterable[object]) -> None:

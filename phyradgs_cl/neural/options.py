@@ -17,25 +17,6 @@ CELLS_PER_VOXEL = 1.0  # of the finest level
 SAMPLES_PER_VOXEL = 1.5  # NAF: 192 samples for 128 voxels
 SAMPLES_PER_TIME = 1.2  # of each of several: what counts is the mean over their rays
 
-_RANGES = {
-    "iterations": (0, 1_000_000),
-    "rays": (1, 1_000_000),
-    "samples": (0, 100_000),
-    "times": (0, 10_000),
-    "voxel_points": (1, 16),
-    "levels": (0, 32),
-    "features": (1, 64),
-    "base_resolution": (1, 4096),
-    "level_growth": (1, 16),
-    "table_log2": (4, 28),
-    "layers": (2, 64),
-    "width": (1, 4096),
-    "density_bound": (1e-3, 1e6),
-    "first_share": (1e-6, 0.999),
-    "rate": (1e-9, 10),
-    "rate_factor": (1e-9, 1),
-    "rate_step": (0, 1_000_000),
-}
 _FINEST = 2**24  # cells along a side: beyond it float32 coordinates have no fractions
 
 
@@ -61,30 +42,30 @@ class NeuralOptions:
 
     motion: Motion = Static()
     detector_model: str = "scan"
-    iterations: int = 30
-    rays: int = 512
-    samples: int = 0
+    iterations: int = checks.ranged(30, 0, 1_000_000)
+    rays: int = checks.ranged(512, 1, 1_000_000)
+    samples: int = checks.ranged(0, 0, 100_000)
     jitter: str = "ray"
-    times: int = 0
+    times: int = checks.ranged(0, 0, 10_000)
     positive_only: bool = False
-    voxel_points: int = 2
-    levels: int = 0
-    features: int = 2
-    base_resolution: int = 8
-    level_growth: float = 2.0
-    table_log2: int = 19
-    layers: int = 4
-    width: int = 32
+    voxel_points: int = checks.ranged(2, 1, 16)
+    levels: int = checks.ranged(0, 0, 32)
+    features: int = checks.ranged(2, 1, 64)
+    base_resolution: int = checks.ranged(8, 1, 4096)
+    level_growth: float = checks.ranged(2.0, 1, 16)
+    table_log2: int = checks.ranged(19, 4, 28)
+    layers: int = checks.ranged(4, 2, 64)
+    width: int = checks.ranged(32, 1, 4096)
     last_activation: str = "sigmoid"
-    density_bound: float = 2.0
-    first_share: float = 0.05
-    rate: float = 1e-2
-    rate_factor: float = 0.3
-    rate_step: int = 0
+    density_bound: float = checks.ranged(2.0, 1e-3, 1e6)
+    first_share: float = checks.ranged(0.05, 1e-6, 0.999)
+    rate: float = checks.ranged(1e-2, 1e-9, 10)
+    rate_factor: float = checks.ranged(0.3, 1e-9, 1)
+    rate_step: int = checks.ranged(0, 0, 1_000_000)
     torch_device: str = "auto"
 
     def __post_init__(self) -> None:
-        checks.fields_within("", self, _RANGES)
+        checks.fields_within("", self)
         checks.one_of("detector_model", self.detector_model, ("scan", *DETECTOR_MODELS))
         checks.one_of("jitter", self.jitter, JITTERS)
         checks.one_of("last_activation", self.last_activation, LAST_ACTIVATIONS)
@@ -134,24 +115,12 @@ class LineOptions(NeuralOptions):
     by ``window`` pixels.
     """
 
-    segment: int = 2
-    heads: int = 8
-    head_width: int = 4
-    blocks: int = 1
-    window: int = 8
-    windows: int = 16
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        ranges = {
-            "segment": (1, 256),
-            "heads": (1, 256),
-            "head_width": (1, 1024),
-            "blocks": (1, 32),
-            "window": (1, 1024),
-            "windows": (0, 100_000),
-        }
-        checks.fields_within("", self, ranges)
+    segment: int = checks.ranged(2, 1, 256)
+    heads: int = checks.ranged(8, 1, 256)
+    head_width: int = checks.ranged(4, 1, 1024)
+    blocks: int = checks.ranged(1, 1, 32)
+    window: int = checks.ranged(8, 1, 1024)
+    windows: int = checks.ranged(16, 0, 100_000)
 
     def samples_for(self, longest_voxels: int, times: int = 1) -> int:
         """Returns the samples of every field, rounded up to whole segments."""

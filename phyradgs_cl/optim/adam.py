@@ -8,8 +8,7 @@ from phyradgs_cl import checks
 from phyradgs_cl.fields import Activation
 from phyradgs_cl.runtime import DeviceArray, Runtime
 
-# A rate of 0 has no decay; 1e-12 moves nothing in float32.
-_RANGES = {name: (1e-12, 10) for name in ("position", "scale", "rotation", "density")}
+_RANGE = (1e-12, 10)  # a rate of 0 has no decay; 1e-12 moves nothing in float32
 
 
 @dataclass(frozen=True)
@@ -20,13 +19,13 @@ class Rates:
     3,000 they leave 1 to 2 dB on the table (docs/results/settings.md).
     """
 
-    position: tuple[float, float] = (2e-3, 2e-4)
-    scale: tuple[float, float] = (2e-2, 2e-3)
-    rotation: tuple[float, float] = (1e-2, 1e-3)
-    density: tuple[float, float] = (6e-2, 6e-3)
+    position: tuple[float, float] = checks.ranged((2e-3, 2e-4), *_RANGE)
+    scale: tuple[float, float] = checks.ranged((2e-2, 2e-3), *_RANGE)
+    rotation: tuple[float, float] = checks.ranged((1e-2, 1e-3), *_RANGE)
+    density: tuple[float, float] = checks.ranged((6e-2, 6e-3), *_RANGE)
 
     def __post_init__(self) -> None:
-        checks.fields_within("rates.", self, _RANGES)
+        checks.fields_within("rates.", self)
 
     def at(self, progress: float) -> np.ndarray:
         """Rates (11,) per parameter row at ``progress`` (0 to 1) through the run."""

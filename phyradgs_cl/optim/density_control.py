@@ -12,18 +12,6 @@ from phyradgs_cl import checks
 from phyradgs_cl.fields import Activation
 from phyradgs_cl.fields import gaussians as g
 
-_RANGES = {
-    "every": (0, 1_000_000_000),
-    "start_iteration": (0, 1_000_000_000),
-    "stop_fraction": (0, 1),
-    "threshold": (0, 1e6),
-    "split_scale": (0, 1e3),
-    "split_factor": (1, 1e3),
-    "prune_density": (0, 1e6),
-    "prune_aspect": (0, 1e9),
-    "max_gaussians": (1, 100_000_000),
-}
-
 
 @dataclass(frozen=True)
 class DensityControl:
@@ -34,18 +22,18 @@ class DensityControl:
     measurement constrains them, and are visible in the volume.
     """
 
-    every: int = 100
-    start_iteration: int = 500
-    stop_fraction: float = 0.75
-    threshold: float = 3e-4
-    split_scale: float = 0.2
-    split_factor: float = 1.6
-    prune_density: float = 1e-5
-    prune_aspect: float = 50.0
-    max_gaussians: int = 500_000
+    every: int = checks.ranged(100, 0, 1_000_000_000)
+    start_iteration: int = checks.ranged(500, 0, 1_000_000_000)
+    stop_fraction: float = checks.ranged(0.75, 0, 1)
+    threshold: float = checks.ranged(3e-4, 0, 1e6)
+    split_scale: float = checks.ranged(0.2, 0, 1e3)
+    split_factor: float = checks.ranged(1.6, 1, 1e3)
+    prune_density: float = checks.ranged(1e-5, 0, 1e6)
+    prune_aspect: float = checks.ranged(50.0, 0, 1e9)
+    max_gaussians: int = checks.ranged(500_000, 1, 100_000_000)
 
     def __post_init__(self) -> None:
-        checks.fields_within("control.", self, _RANGES)
+        checks.fields_within("control.", self)
 
     def allows(self, scale: np.ndarray) -> np.ndarray:
         """Returns which of the scales (3, G) are not too thin."""

@@ -40,12 +40,12 @@ class SparkOptions:
     """threshold: least height in local deviations (``find_sparks``). least: least height in line integrals, dimensionless.
     pixels: largest number of touching pixels that are one spark."""
 
-    threshold: float = 5.0
-    least: float = 0.1
-    pixels: int = 6
+    threshold: float = checks.ranged(5.0, 1, 1e3)
+    least: float = checks.ranged(0.1, 0, 10)
+    pixels: int = checks.ranged(6, 1, 100)
 
     def __post_init__(self) -> None:
-        checks.fields_within("sparks.", self, {"threshold": (1, 1e3), "least": (0, 10), "pixels": (1, 100)})
+        checks.fields_within("sparks.", self)
 
 
 @dataclass(frozen=True)

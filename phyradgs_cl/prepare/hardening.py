@@ -57,18 +57,17 @@ class HardeningOptions:
     With kvp, bone_per_mm: attenuation from which a voxel is bone, 0: candidates are tried. filter_mm: of aluminium.
     anode_deg: angle of a tungsten anode, for SpekPy's spectrum; 0: Kramers' law."""
 
-    polynomial: Polynomial = _NONE
+    polynomial: Polynomial = checks.ranged(_NONE, -_LARGEST, _LARGEST)
     kvp: float = 0.0
-    bone_per_mm: float = 0.0
-    filter_mm: float = FILTER_MM
-    anode_deg: float = 0.0
+    bone_per_mm: float = checks.ranged(0.0, 0, _LARGEST)
+    filter_mm: float = checks.ranged(FILTER_MM, 0, 50)
+    anode_deg: float = checks.ranged(0.0, 0, 45)
 
     def __post_init__(self) -> None:
-        beside_kvp = {"bone_per_mm": (0, _LARGEST), "filter_mm": (0, 50), "anode_deg": (0, 45)}
-        checks.fields_within("hardening.", self, {"polynomial": (-_LARGEST, _LARGEST), **beside_kvp})
+        checks.fields_within("hardening.", self)
         if self.kvp != 0:
             checks.within("hardening.kvp", self.kvp, LOWEST_KVP, HIGHEST_KVP)
-        for name in beside_kvp:
+        for name in ("bone_per_mm", "filter_mm", "anode_deg"):
             if getattr(self, name) != getattr(type(self), name) and not self.kvp:
                 raise InputError(f"hardening.{name}", "given without hardening.kvp", "both, or neither", "state the voltage")
         if self.kvp and any(self.polynomial):

@@ -113,11 +113,11 @@ class AirOptions:
     """below: fraction of the scan's largest line integral below which a pixel may be air, if it is connected with a side of
     the panel. least: least fraction of air in every frame."""
 
-    below: float = 0.05
-    least: float = 0.01
+    below: float = checks.ranged(0.05, 1e-4, 0.5)
+    least: float = checks.ranged(0.01, 0, 1)
 
     def __post_init__(self) -> None:
-        checks.fields_within("air.", self, {"below": (1e-4, 0.5), "least": (0, 1)})
+        checks.fields_within("air.", self)
 
 
 def normalise_air(scan: Scan, options: AirOptions, make_model: MakeModel) -> tuple[Scan, Facts]:

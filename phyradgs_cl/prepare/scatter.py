@@ -48,11 +48,11 @@ class ScatterOptions:
     """to_primary: scatter over primary light behind the object; 0: fitted on air. reach: standard deviation of the kernel
     over the panel's longer side; 0: fitted, or 0.18 where to_primary is stated."""
 
-    to_primary: float = 0.0
-    reach: float = 0.0
+    to_primary: float = checks.ranged(0.0, 0, 5)
+    reach: float = checks.ranged(0.0, 0, 2)
 
     def __post_init__(self) -> None:
-        checks.fields_within("scatter.", self, {"to_primary": (0, 5), "reach": (0, 2)})
+        checks.fields_within("scatter.", self)
 
 
 def subtract_scatter(scan: Scan, options: ScatterOptions, make_model: MakeModel) -> tuple[Scan, Facts]:

@@ -37,17 +37,14 @@ class FusedOptions:
     MOTIONS: ClassVar[tuple[Motion, ...]] = (Static(), Exact())
 
     motion: Motion = Exact()
-    iterations: int = 1500
-    voxel_iterations: int = FistaOptions.iterations
-    splat_weight: float = 0.2
-    prior_weight: float = FistaOptions.prior_weight
+    iterations: int = checks.ranged(1500, 0, 1_000_000_000, "--iterations")
+    voxel_iterations: int = checks.ranged(FistaOptions.iterations, 0, 1_000_000)
+    splat_weight: float = checks.ranged(0.2, 0, 1)
+    prior_weight: float = checks.ranged(FistaOptions.prior_weight, 0, 1e6)
     detector_model: str = "scan"
 
     def __post_init__(self) -> None:
-        checks.within("--iterations", self.iterations, 0, 1_000_000_000)
-        checks.within("voxel_iterations", self.voxel_iterations, 0, 1_000_000)
-        checks.within("splat_weight", self.splat_weight, 0, 1)
-        checks.within("prior_weight", self.prior_weight, 0, 1e6)
+        checks.fields_within("", self)
         checks.one_of("detector_model", self.detector_model, ("scan", *DETECTOR_MODELS))
         check_motion(self.motion, self.MOTIONS)
 

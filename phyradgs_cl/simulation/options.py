@@ -13,7 +13,7 @@ from phyradgs_cl.io import Scanner, load_scanner, with_detector_count
 
 _NOISES = ("none", "tigre", "beer")
 # Far beyond any scanner, and far below an overflow of float32 or a sampler.
-_LARGEST_PEAK, _LARGEST_ELECTRONIC_NOISE = 1e4, 1e9
+_LARGEST_PEAK, _LARGEST_NOISE = 1e4, 1e9
 _SMALLEST_DOSE, _LARGEST_DOSE = 1e-3, 1e12
 _LARGEST_DETECTOR = 32_000
 _TIMING = ("views", "exposure_deg", "readout_ratio", "start_deg", "pulse")
@@ -34,31 +34,24 @@ class SimulationOptions:
     readout_axis: str = "rows"
     readout_direction: int = 1
     detector_model: str = "log"
-    peak: float = 0.0
+    peak: float = checks.ranged(0.0, 0, _LARGEST_PEAK)
     noise: str = "none"
-    dose: float = 1e4
-    electronic_noise: float = 10.0
-    jitter_deg: float = 0.0
-    lag: float = 0.0
-    time_samples: int = 0
-    seed: int = 0
-    rings: float = 0.0
-    sparks: float = 0.0
-    drift: float = 0.0
-    scatter: float = 0.0
+    dose: float = checks.ranged(1e4, _SMALLEST_DOSE, _LARGEST_DOSE, "--dose (photons per pixel)")
+    electronic_noise: float = checks.ranged(10.0, 0, _LARGEST_NOISE, "--electronic-noise (counts)")
+    jitter_deg: float = checks.ranged(0.0, 0, 360, "--jitter-deg")
+    lag: float = checks.ranged(0.0, 0, LARGEST_LAG)
+    time_samples: int = checks.ranged(0, 0, 10_000, "--time-samples")
+    seed: int = checks.ranged(0, 0, 2**63)
+    rings: float = checks.ranged(0.0, 0, 0.5)
+    sparks: float = checks.ranged(0.0, 0, 0.1)
+    drift: float = checks.ranged(0.0, 0, 0.5)
+    scatter: float = checks.ranged(0.0, 0, 10)
     kvp: float = 0.0
 
     def __post_init__(self) -> None:
         if self.noise not in _NOISES:
             raise InputError("--noise", repr(self.noise), f"one of {', '.join(_NOISES)}")
-        checks.within("--peak", self.peak, 0, _LARGEST_PEAK)
-        checks.within("--electronic-noise (counts)", self.electronic_noise, 0, _LARGEST_ELECTRONIC_NOISE)
-        checks.within("--dose (photons per pixel)", self.dose, _SMALLEST_DOSE, _LARGEST_DOSE)
-        checks.within("--lag", self.lag, 0, LARGEST_LAG)
-        checks.within("--jitter-deg", self.jitter_deg, 0, 360)
-        checks.within("--time-samples", self.time_samples, 0, 10_000)
-        checks.within("--seed", self.seed, 0, 2**63)
-        checks.fields_within("--", self, {"rings": (0, 0.5), "sparks": (0, 0.1), "drift": (0, 0.5), "scatter": (0, 10)})
+        checks.fields_within("--", self)
         if self.kvp != 0:
             checks.within("--kvp (kV)", self.kvp, LOWEST_KVP, HIGHEST_KVP)
 

@@ -13,27 +13,6 @@ from phyradgs_cl.operators import DEFAULT_CUTOFF_SIGMA
 from phyradgs_cl.optim import PUBLISHED_RATES, DensityControl, Rates
 from phyradgs_cl.text import repr_of_changes
 
-_WEIGHT = (0, 1e6)
-_RANGES = {
-    "ssim_weight": _WEIGHT,
-    "l1_weight": _WEIGHT,
-    "poisson_weight": _WEIGHT,
-    "tv_weight": _WEIGHT,
-    "tv_edge": (1, 4096),
-    "density_weight": _WEIGHT,
-    "shape_weight": _WEIGHT,
-    "shape_ratio": (1, 1e6),
-    "shape_floor": (0, 10),
-    "parameter_terms_from": (0, 1_000_000_000),
-    "cutoff_sigma": (0, 100),  # 0 cuts nothing off
-    "initial_threshold": (0, 1e6),
-    "initial_density": (1e-6, 1e3),
-    "initial_scale": (1e-6, 1e3),
-    "scale_min": (1e-9, 10),
-    "scale_min_voxels": (0, 100),
-    "scale_max": (1e-6, 100),
-}
-
 
 @dataclass(frozen=True, repr=False)
 class SplatOptions:
@@ -54,36 +33,33 @@ class SplatOptions:
     affine: bool = False
     detector_model: str = "scan"
     pixel_footprint: bool = False
-    iterations: int = 3000
-    gaussians: int = 0
-    ssim_weight: float = 0.2
-    l1_weight: float = 1.0
-    poisson_weight: float = 0.0
-    tv_weight: float = 0.01
-    tv_edge: int = 32
-    density_weight: float = 0.001
-    shape_weight: float = 0.0
-    shape_ratio: float = 10.0
-    shape_floor: float = 0.004
-    parameter_terms_from: int = 500
-    cutoff_sigma: float = DEFAULT_CUTOFF_SIGMA
-    initial_threshold: float = 0.05
-    initial_density: float = 0.15
-    initial_scale: float = 1.0
-    scale_min: float = 0.001
-    scale_min_voxels: float = 0.0
-    scale_max: float = 1.0
-    batch: int = 0
+    iterations: int = checks.ranged(3000, 0, 1_000_000_000, "--iterations")
+    gaussians: int = checks.ranged(0, 0, 100_000_000, "--gaussians (0 chooses from the grid)")
+    ssim_weight: float = checks.ranged(0.2, 0, 1e6)
+    l1_weight: float = checks.ranged(1.0, 0, 1e6)
+    poisson_weight: float = checks.ranged(0.0, 0, 1e6)
+    tv_weight: float = checks.ranged(0.01, 0, 1e6)
+    tv_edge: int = checks.ranged(32, 1, 4096)
+    density_weight: float = checks.ranged(0.001, 0, 1e6)
+    shape_weight: float = checks.ranged(0.0, 0, 1e6)
+    shape_ratio: float = checks.ranged(10.0, 1, 1e6)
+    shape_floor: float = checks.ranged(0.004, 0, 10)
+    parameter_terms_from: int = checks.ranged(500, 0, 1_000_000_000)
+    cutoff_sigma: float = checks.ranged(DEFAULT_CUTOFF_SIGMA, 0, 100)  # 0 cuts nothing off
+    initial_threshold: float = checks.ranged(0.05, 0, 1e6)
+    initial_density: float = checks.ranged(0.15, 1e-6, 1e3)
+    initial_scale: float = checks.ranged(1.0, 1e-6, 1e3)
+    scale_min: float = checks.ranged(0.001, 1e-9, 10)
+    scale_min_voxels: float = checks.ranged(0.0, 0, 100)
+    scale_max: float = checks.ranged(1.0, 1e-6, 100)
+    batch: int = checks.ranged(0, 0, 1_000_000, "--batch (0: as many as ranks)")
     rates: Rates = Rates()
     control: DensityControl = DensityControl()
 
     __repr__ = repr_of_changes
 
     def __post_init__(self) -> None:
-        checks.within("--iterations", self.iterations, 0, 1_000_000_000)
-        checks.within("--gaussians (0 chooses from the grid)", self.gaussians, 0, 100_000_000)
-        checks.within("--batch (0: as many as ranks)", self.batch, 0, 1_000_000)
-        checks.fields_within("", self, _RANGES)
+        checks.fields_within("", self)
         checks.one_of("detector_model", self.detector_model, ("scan", *DETECTOR_MODELS))
         if self.scale_max <= self.scale_min:
             raise InputError("scale_max", f"{self.scale_max:g}", f"more than scale_min ({self.scale_min:g})")

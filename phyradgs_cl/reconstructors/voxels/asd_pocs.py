@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from phyradgs_cl import checks
 from phyradgs_cl.acquisition import Scan
+from phyradgs_cl.checks import ranged
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.objective import TvDescent
 from phyradgs_cl.reconstructors.fdk import static_fdk
@@ -30,21 +30,12 @@ class AsdPocsOptions(SartOptions):
 
     iterations: int = 10
     relaxation_reduction: float = 0.9999
-    tv_steps: int = 20
-    tv_share: float = 0.002
-    tv_reduction: float = 0.95
-    tv_ratio: float = 0.94
-    residual_share: float = 0.15
-    prior_share: float = 0.0
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        checks.within("tv_steps", self.tv_steps, 0, 10_000)
-        checks.within("tv_share", self.tv_share, 0, 10)
-        checks.within("tv_reduction", self.tv_reduction, 1e-6, 1)
-        checks.within("tv_ratio", self.tv_ratio, 0, 1e6)
-        checks.within("residual_share", self.residual_share, 0, 1e6)
-        checks.within("prior_share", self.prior_share, 0, 1)
+    tv_steps: int = ranged(20, 0, 10_000)
+    tv_share: float = ranged(0.002, 0, 10)
+    tv_reduction: float = ranged(0.95, 1e-6, 1)
+    tv_ratio: float = ranged(0.94, 0, 1e6)
+    residual_share: float = ranged(0.15, 0, 1e6)
+    prior_share: float = ranged(0.0, 0, 1)
 
 
 class AsdPocs(Algorithm):

@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 from typing import Any
 
+from phyradgs_cl.checks import ranged
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.reconstructors.voxels.run import Algorithm, IterativeOptions, voxel_method
 from phyradgs_cl.reconstructors.voxels.system import System
@@ -14,7 +15,7 @@ class CglsOptions(IterativeOptions):
 
     iterations: int = 60
     nonnegative: bool = False
-    noise_stop: float = 1.1  # type: ignore[misc]
+    noise_stop: float = ranged(1.1, 0, 1e6)  # type: ignore[misc]
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -58,25 +58,20 @@ class FistaOptions(IterativeOptions):
     motion: Motion = PerRow()
     iterations: int = 35
     prior: str | Denoiser = "dct"
-    prior_weight: float = 0.42
-    subvoxels: int = 0
-    prior_share: float = 0.5
-    subsets: int = 5
-    tv_iterations: int = 5
+    prior_weight: float = checks.ranged(0.42, 0, 1e6)
+    subvoxels: int = checks.ranged(0, 0, 8)
+    prior_share: float = checks.ranged(0.5, 0, 1)
+    subsets: int = checks.ranged(5, 1, 1_000_000)
+    tv_iterations: int = checks.ranged(5, 1, 10_000)
     transmission_weights: bool = False  # type: ignore[misc]
 
     def __post_init__(self) -> None:
         super().__post_init__()
         if not (callable(self.prior) or ":" in self.prior):
             checks.one_of("prior", self.prior, (*PRIORS, "package.module:function"))
-        checks.within("subvoxels", self.subvoxels, 0, 8)
-        checks.within("prior_weight", self.prior_weight, 0, 1e6)
-        checks.within("prior_share", self.prior_share, 0, 1)
         if self.prior != "piccs" and self.prior_share != FistaOptions.prior_share:
             found = f"{self.prior_share:g} with the prior {self.prior}"
             raise InputError("prior_share", found, "the prior piccs", "set prior=piccs, or leave prior_share out")
-        checks.within("subsets", self.subsets, 1, 1_000_000)
-        checks.within("tv_iterations", self.tv_iterations, 1, 10_000)
 
 
 class Accelerated(Algorithm):

@@ -6,7 +6,7 @@ Beck and Teboulle, IEEE Trans. Image Process. 18 (2009) 2419, on all frames at o
 from dataclasses import dataclass
 from typing import Any
 
-from phyradgs_cl import checks
+from phyradgs_cl.checks import ranged
 from phyradgs_cl.objective import TvProx
 from phyradgs_cl.reconstructors.voxels.fista import Accelerated
 from phyradgs_cl.reconstructors.voxels.priors import TvPrior, axis_weights
@@ -23,14 +23,9 @@ class FistaTvOptions(IterativeOptions):
     """
 
     iterations: int = 100
-    tv_weight: float = 0.001
-    tv_iterations: int = 10
+    tv_weight: float = ranged(0.001, 0, 1e6)
+    tv_iterations: int = ranged(10, 1, 10_000)
     transmission_weights: bool = False  # type: ignore[misc]
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        checks.within("tv_weight", self.tv_weight, 0, 1e6)
-        checks.within("tv_iterations", self.tv_iterations, 1, 10_000)
 
 
 class FistaTv(Accelerated):

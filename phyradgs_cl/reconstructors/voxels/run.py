@@ -52,15 +52,13 @@ class IterativeOptions:
     MOTIONS: ClassVar[tuple[Motion, ...]] = motions_for(RAYS)
 
     motion: Motion = Static()
-    iterations: int = 20
+    iterations: int = checks.ranged(20, 0, MOST_ITERATIONS)
     nonnegative: bool = True
-    tolerance: float = 0.0
+    tolerance: float = checks.ranged(0.0, 0, 1)
     detector_model: str = "scan"
 
     def __post_init__(self) -> None:
-        checks.within("iterations", self.iterations, 0, MOST_ITERATIONS)
-        checks.within("tolerance", self.tolerance, 0, 1)
-        checks.within("noise_stop", self.noise_stop, 0, 1e6)
+        checks.fields_within("", self)
         checks.one_of("detector_model", self.detector_model, ("scan", *DETECTOR_MODELS))
         check_motion(self.motion, self.MOTIONS)
 

@@ -32,18 +32,15 @@ class SartOptions(IterativeOptions):
     principle, Morozov 1966); further iterations fit the noise. 0 runs all iterations.
     """
 
-    relaxation: float = 1.0
-    relaxation_reduction: float = 0.999
-    frames_per_subset: int = 1
+    relaxation: float = checks.ranged(1.0, 1e-6, 2)
+    relaxation_reduction: float = checks.ranged(0.999, 1e-6, 1)
+    frames_per_subset: int = checks.ranged(1, 1, 1_000_000)
     order: str = "spread"
     transmission_weights: bool = False  # type: ignore[misc]
-    noise_stop: float = 0.0  # type: ignore[misc]
+    noise_stop: float = checks.ranged(0.0, 0, 1e6)  # type: ignore[misc]
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        checks.within("relaxation", self.relaxation, 1e-6, 2)
-        checks.within("relaxation_reduction", self.relaxation_reduction, 1e-6, 1)
-        checks.within("frames_per_subset", self.frames_per_subset, 1, 1_000_000)
         checks.one_of("order", self.order, ORDERS)
 
 

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from phyradgs_cl import checks
+from phyradgs_cl.checks import ranged
 from phyradgs_cl.reconstructors.voxels.run import Algorithm, IterativeOptions, voxel_method
 from phyradgs_cl.reconstructors.voxels.system import System, column_weights, row_weights
 
@@ -12,12 +12,8 @@ class SirtOptions(IterativeOptions):
     """relaxation: λ between 0 and 2. transmission_weights: transmission-weighted (PWLS), R = t/(A 1), C = 1/(Aᵀ t)."""
 
     iterations: int = 100
-    relaxation: float = 1.0
+    relaxation: float = ranged(1.0, 1e-6, 2)
     transmission_weights: bool = False  # type: ignore[misc]
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        checks.within("relaxation", self.relaxation, 1e-6, 2)
 
 
 class Sirt(Algorithm):
