@@ -19,7 +19,7 @@ from phyradgs_cl.io import file_kind, only_run
 from phyradgs_cl.neural import INSTALL
 from phyradgs_cl.reconstructors import Progress, ProgressReport, RunPlan, reconstruct
 from phyradgs_cl.runtime import Runtime
-from phyradgs_cl.runtime.environment import environment
+from phyradgs_cl.runtime.device import environment
 from phyradgs_cl.signals import finish_despite_interrupt, keep_finished_work
 from phyradgs_cl.simulation import Scene, phantom_scene, volume_scene
 from tables.case import Case, SyntheticCase
@@ -192,7 +192,7 @@ def reference_lines(
         facts = {**run.facts, **same, "run": name, "label": name}
         if not present.has(facts):
             metrics = {key: _number(value) for key, value in measure().items()}
-            yield {**facts, "metrics": metrics, **environment(rt)}
+            yield {**facts, "metrics": metrics, **environment(rt.device)}
 
 
 def one_run(job: BenchJob, run: PlannedRun, case: Case, rt: Runtime, progress: ProgressReport) -> Line:
@@ -203,7 +203,7 @@ def one_run(job: BenchJob, run: PlannedRun, case: Case, rt: Runtime, progress: P
         result = reconstruct(scan, RunPlan(str(run.row.method), run.options, seed=run.seed), rt, report=progress)
     except NumericalError as error:  # one method that overflows must not cost a night's other runs
         log.warning("%s: %s", run.title, error)
-        return {**run.facts, "error": str(error), **environment(rt)}
+        return {**run.facts, "error": str(error), **environment(rt.device)}
     seconds, processor_s = time.perf_counter() - started, time.process_time() - used
     refuse_interrupted(result)
     write_slices(job.output, run.facts, case.slices(result.volume))
@@ -213,7 +213,7 @@ def one_run(job: BenchJob, run: PlannedRun, case: Case, rt: Runtime, progress: P
         "seconds": round(seconds, 3),
         "processor_s": round(processor_s, 3),  # of all threads: comparable beside other work, unlike seconds
         "gaussians": result.facts.get("gaussians"),
-        **environment(rt),
+        **environment(rt.device),
     }
 
 

@@ -7,7 +7,6 @@ device. Sums are deterministic: the same arrays on the same device give the same
 import weakref
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Sequence
-from functools import cached_property
 from typing import Any, Generic, Protocol, TypeVar
 
 import numpy as np
@@ -28,61 +27,47 @@ class Space(Protocol, Generic[A]):
 
     def array(self, values: np.ndarray) -> A:
         """Returns host values as an array of this space, which may share their memory."""
-        ...
 
     def numpy(self, x: A) -> np.ndarray:
         """Returns the values on the host; they may share memory."""
-        ...
 
     def full(self, shape: Shape, value: float) -> A: ...
 
     def apply(self, function: Callable[..., Any], x: A, shape: Shape) -> A:
         """Returns ``function(x)`` of ``shape``; on a device the function receives ``out``, the memory of its result."""
-        ...
 
     def take(self, x: A, chosen: Sequence[int]) -> A:
         """Returns the ``chosen`` entries along the first axis, in this order."""
-        ...
 
     def add(self, x: A, y: A, scale: float = 1.0, *, nonnegative: bool = False) -> A:
         """x + ``scale`` y; ``nonnegative`` clips it at 0."""
-        ...
 
     def extrapolate(self, x: A, y: A, scale: float) -> A:
         """x + ``scale`` (x − y)."""
-        ...
 
     def add_product(self, x: A, y: A, z: A, scale: float = 1.0, *, nonnegative: bool = False) -> A:
         """x + ``scale`` y z element by element; ``nonnegative`` clips it at 0."""
-        ...
 
     def multiply(self, x: A, y: A) -> A:
         """x y element by element; y may have only the last axes of x."""
-        ...
 
     def reciprocal(self, x: A, share: float) -> A:
         """1/x, with x raised to ``share`` of its largest; 0 where x is not above 0."""
-        ...
 
     def inner(self, x: A, y: A) -> float:
         """Σ x y, with the accuracy of float64."""
-        ...
 
     def turn(self, x: A, y: A, z: A) -> float:
         """Σ (x − y) (y − z): above 0 where the steps z to y and y to x have one direction."""
-        ...
 
     def norm(self, x: A) -> float:
         """√Σ x²."""
-        ...
 
     def sum_squares(self, arrays: Iterable[A]) -> float:
         """Σ ‖x‖² over arrays, which may be generated; a device sends one number back."""
-        ...
 
     def largest(self, x: A, *, absolute: bool = False) -> float:
         """The largest x, or |x|."""
-        ...
 
 
 class HostSpace:
@@ -149,20 +134,8 @@ class DeviceSpace:
     def __init__(self, rt: Runtime) -> None:
         self.rt = rt
         self._unused: dict[int, list[DeviceArray]] = defaultdict(list)
-
-    @cached_property
-    def _parts(self) -> DeviceArray:
-        """The partial sums of the groups, 8 bytes each."""
-        return self.rt.empty(_GPU_GROUPS, np.float64)
-
-    @cached_property
-    def _whole(self) -> DeviceArray:
-        return self.rt.empty(1, np.float64)
-
-    @cached_property
-    def _total(self) -> DeviceArray:
-        """The sum over several arrays, between whose parts other sums may be made."""
-        return self.rt.empty(1, np.float64)
+        # partial sums of the groups; their sum; the sum over several arrays, between whose parts other sums may be made
+        self._parts, self._whole, self._total = (rt.empty(count, np.float64) for count in (_GPU_GROUPS, 1, 1))
 
     def empty(self, shape: Shape) -> DeviceArray:
         """Returns uninitialised memory. The queue is in order, so earlier work may still read it."""
@@ -240,7 +213,7 @@ class DeviceSpace:
         return self._read(self._total) if count else 0.0
 
     def largest(self, x: DeviceArray, *, absolute: bool = False) -> float:
-        groups = self._reduce("largest_parts", x, np.int32(absolute), scratch=4)
+        groups = self._reduce("largest_parts", x, absolute, scratch=4)
         return float(self.rt.download(self._parts).view(np.float32)[:groups].max())
 
     def _each(self, name: str, x: DeviceArray, *others: Any, period: int = 0) -> DeviceArray:
@@ -263,7 +236,7 @@ class DeviceSpace:
         group = self.rt.group(1, _GPU_GROUP)
         kernel = self.rt.kernel("algebra", "dot_whole")
         scratch = self.rt.local(8 * group)
-        self.rt.launch(kernel, group, self._parts, np.int32(groups), np.int32(add), scratch, whole, group=group)
+        self.rt.launch(kernel, group, self._parts, groups, add, scratch, whole, group=group)
 
     def _reduce(self, name: str, *arguments: Any, scratch: int) -> int:
         """Launches the first level of a sum over the first array; returns the number of results in ``_parts``."""
@@ -295,5 +268,5 @@ def inner(a: np.ndarray, b: np.ndarray) -> float:
     return float(np.einsum("i,i->", a.ravel(), b.ravel(), dtype=np.float64))
 
 
-def _least(nonnegative: bool) -> np.float32:
-    return np.float32(0 if nonnegative else -np.inf)
+def _least(nonnegative: bool) -> float:
+    return 0.0 if nonnegative else -np.inf

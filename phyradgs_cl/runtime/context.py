@@ -14,8 +14,15 @@ from phyradgs_cl.checks import ceil_div
 from phyradgs_cl.errors import DeviceError
 from phyradgs_cl.parallel import Alone, Communicator
 from phyradgs_cl.runtime.device import DeviceInfo, choose_device
-from phyradgs_cl.runtime.faults import naming_failures, translated
-from phyradgs_cl.runtime.memory import DeviceArray, LaterItem, MemoryLedger, Room, Traffic, memory_limit
+from phyradgs_cl.runtime.memory import (
+    DeviceArray,
+    LaterItem,
+    MemoryLedger,
+    Room,
+    Traffic,
+    memory_limit,
+    naming_failures,
+)
 from phyradgs_cl.runtime.opencl import Kernel, cl, kernel_source
 from phyradgs_cl.runtime.profile import KernelUse, Profile, Rates, measure_rates
 
@@ -57,7 +64,7 @@ class Runtime:
             self.context = cl.Context([self.device.handle])
             self.queue = cl.CommandQueue(self.context, properties=properties)  # type: ignore[arg-type]
         except cl.Error as error:
-            raise translated(error, self.ledger, "opening it") from error
+            raise self.ledger.error("opening it", error) from error
         self.lanes = lanes or default_lanes(self.device)
         if self.lanes not in LANE_CHOICES:
             raise DeviceError("lanes", str(self.lanes), f"one of {LANE_CHOICES}")
@@ -78,7 +85,9 @@ class Runtime:
 
     def kernel(self, program: str, name: str, **defines: int | float | bool) -> Kernel:
         """Declares the kernel ``name`` of ``cl/<program>.cl``; the first launch builds it, once for all its declarations."""
-        key = (program, name, self._options(defines))
+        merged: dict[str, int | float | bool] = {"LANES": self.lanes, "FP64": int(self.fp64), **defines}
+        flags = [f"-D{name}={_literal(value)}" for name, value in sorted(merged.items())]
+        key = (program, name, ("-cl-std=CL1.2", "-cl-mad-enable", *flags))
         return self._kernels.setdefault(key, Kernel(*key))
 
     def compile(self, kernel: Kernel) -> "cl.Kernel":
@@ -95,11 +104,6 @@ class Runtime:
         """The names of the kernels that were launched so far."""
         return {kernel.function_name for kernel in self._kernels.values() if kernel.built is not None}
 
-    def _options(self, defines: dict[str, int | float | bool]) -> tuple[str, ...]:
-        merged: dict[str, int | float | bool] = {"LANES": self.lanes, "FP64": int(self.fp64), **defines}
-        flags = [f"-D{name}={_literal(value)}" for name, value in sorted(merged.items())]
-        return ("-cl-std=CL1.2", "-cl-mad-enable", *flags)
-
     def _build(self, program: str, options: tuple[str, ...]) -> "cl.Program":
         started = time.perf_counter()
         try:
@@ -109,12 +113,8 @@ class Runtime:
         except cl.Error as error:
             message_lines = [line for line in str(error).splitlines() if "error:" in line]
             message = " ".join((message_lines or str(error).splitlines())[:3])[:600]
-            raise DeviceError(
-                f"kernel {program}.cl on {self.device.name}",
-                message,
-                "a program that builds",
-                "try another --device",
-            ) from error
+            subject, remedy = f"kernel {program}.cl on {self.device.name}", "try another --device"
+            raise DeviceError(subject, message, "a program that builds", remedy) from error
         log.debug("built %s in %.2f s", program, time.perf_counter() - started)
         return built
 
@@ -129,7 +129,7 @@ class Runtime:
         try:
             buffer = cl.Buffer(self.context, self._memory_flags, nbytes)
         except cl.Error as error:
-            raise translated(error, self.ledger, f"{nbytes / 2**20:.0f} MiB") from error
+            raise self.ledger.error(f"{nbytes / 2**20:.0f} MiB", error) from error
         array = DeviceArray(buffer, shape, kind)
         self.ledger.count(nbytes)
         weakref.finalize(array, self.ledger.count, -nbytes)
@@ -212,13 +212,9 @@ class Runtime:
     ) -> None:
         """Copies bytes of one device array to another: the whole source, or ``nbytes`` from and to the offsets."""
         count = source.nbytes if nbytes is None else nbytes
+        to, of = target.buffer, source.buffer
         event = cl.enqueue_copy(
-            self.queue,
-            target.buffer,
-            source.buffer,
-            byte_count=count,
-            src_offset=source_offset,
-            dst_offset=target_offset,
+            self.queue, to, of, byte_count=count, src_offset=source_offset, dst_offset=target_offset
         )
         self._record("copy", event, 2 * count)
 
@@ -233,7 +229,10 @@ class Runtime:
     def launch(
         self, kernel: Kernel, items: int | tuple[int, ...], *args: Any, group: int | tuple[int, ...] = 1
     ) -> None:
-        """Enqueues ``items`` work-items (kernels ignore those past the end) in groups of ``group``, other sides 1."""
+        """Enqueues ``items`` work-items (kernels ignore those past the end) in groups of ``group``, other sides 1.
+
+        Python's whole numbers become int, its others float. A long is np.int64, a float that may be whole np.float32.
+        """
         shape = (items,) if isinstance(items, (int, np.integer)) else items
         if min(shape) < 1:
             return
@@ -242,7 +241,7 @@ class Runtime:
         rounded = tuple(ceil_div(int(n), size) * size for n, size in zip(shape, local, strict=True))
         arrays = [a for a in args if isinstance(a, DeviceArray)]
         built = self.compile(kernel)
-        built.set_args(*[a.buffer if isinstance(a, DeviceArray) else a for a in args])
+        built.set_args(*map(_argument, args))
         event = cl.enqueue_nd_range_kernel(self.queue, built, rounded, local)
         self._record(kernel.function_name, event, sum(a.nbytes for a in arrays) if self.profile else 0)
 
@@ -301,6 +300,12 @@ def default_lanes(device: DeviceInfo) -> int:
     if device.kind != "cpu":
         return 1
     return max((n for n in LANE_CHOICES if n <= device.vector_width), default=1)
+
+
+def _argument(value: Any) -> Any:
+    if isinstance(value, DeviceArray):
+        return value.buffer
+    return np.int32(value) if type(value) in (bool, int) else np.float32(value) if type(value) is float else value
 
 
 def _literal(value: int | float | bool) -> str:

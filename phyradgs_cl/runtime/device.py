@@ -1,8 +1,15 @@
-"""The OpenCL devices of this machine, and the choice between them."""
+"""The OpenCL devices of this machine, the choice between them, and the versions that results depend on."""
 
 import os
+import platform
 from dataclasses import dataclass
+from datetime import datetime, timezone
+from importlib.metadata import PackageNotFoundError, version
+from typing import Any
 
+import numpy as np
+
+from phyradgs_cl import __version__
 from phyradgs_cl.errors import DeviceError, NoSuchDeviceError
 from phyradgs_cl.runtime import pocl
 from phyradgs_cl.runtime.opencl import cl
@@ -45,12 +52,12 @@ def list_devices() -> list[DeviceInfo]:
     except cl.LogicError:  # the loader reports "no platform" as an error
         return []
     infos: list[DeviceInfo] = []
-    for platform in platforms:
+    for one in platforms:
         try:
-            devices = platform.get_devices()
+            devices = one.get_devices()
         except cl.Error:
             continue
-        infos.extend(_describe(len(infos) + i, platform, d) for i, d in enumerate(devices))
+        infos.extend(_describe(len(infos) + i, one, d) for i, d in enumerate(devices))
     return infos
 
 
@@ -65,18 +72,14 @@ def choose_device(wish: str | None = None, turn: int = 0) -> tuple[DeviceInfo, s
     if not wish:
         wish, source = os.environ.get(DEVICE_VARIABLE), DEVICE_VARIABLE
     devices = list_devices()
-    if not devices and pocl.unwritable_cache() is not None:
-        without = f"no device, and PoCL's cache {pocl.unwritable_cache()} cannot be written"
-        raise DeviceError(
-            "OpenCL", without, "at least one", f"set {pocl.CACHE_VARIABLE} to a folder that can be written"
-        )
     if not devices:
-        raise DeviceError(
-            "OpenCL",
-            "no device",
-            "at least one",
-            "install your vendor's OpenCL driver; on Linux x86-64, pip install 'phyradgs-cl[cpu]' brings PoCL for the CPU",
-        )
+        found = "no device"
+        remedy = "install your vendor's OpenCL driver; on Linux x86-64, pip install 'phyradgs-cl[cpu]' "
+        remedy += "brings PoCL for the CPU"
+        if pocl.unwritable_cache() is not None:
+            found += f", and PoCL's cache {pocl.unwritable_cache()} cannot be written"
+            remedy = f"set {pocl.CACHE_VARIABLE} to a folder that can be written"
+        raise DeviceError("OpenCL", found, "at least one", remedy)
     if wish:
         several = [one for one in wish.split(",") if one.strip()] or [wish]
         named = several[turn % len(several)]
@@ -85,10 +88,8 @@ def choose_device(wish: str | None = None, turn: int = 0) -> tuple[DeviceInfo, s
         return device if is_exact else _next_of_name(device, devices, turn), reason
     eligible = [d for d in devices if d.by_default]
     if not eligible:
-        names = ", ".join(d.name for d in devices)
-        raise DeviceError(
-            "OpenCL", f"only {names}", "a real device", "name one with --device to use it"
-        )
+        found = f"only {', '.join(d.name for d in devices)}"
+        raise DeviceError("OpenCL", found, "a real device", "name one with --device to use it")
     best = max(eligible, key=lambda d: d.rank)
     reason = f"best of {len(eligible)} by capability (GPU before CPU, then memory, vector width, units)"
     return _next_of_name(best, devices, turn), reason
@@ -113,21 +114,21 @@ def _wished(wish: str, source: str, devices: list[DeviceInfo]) -> tuple[DeviceIn
     return max(matching, key=lambda d: d.rank), f"chosen by {source}={wish}"
 
 
-def _describe(index: int, platform: "cl.Platform", device: "cl.Device") -> DeviceInfo:
-    is_pocl = "portable computing language" in platform.name.lower()
+def _describe(index: int, of: "cl.Platform", device: "cl.Device") -> DeviceInfo:
+    is_pocl = "portable computing language" in of.name.lower()
     kind = _kind(device)
     if is_pocl:
         pocl.warn_of_cache()
     if is_pocl and kind == "cpu" and device.int_ptr not in _targets:
         named = device.version.rpartition("-linux-gnu-")[2] if "-linux-gnu-" in device.version else None
-        is_old = "PoCL 3.0" in platform.version
+        is_old = "PoCL 3.0" in of.version
         _targets[device.int_ptr] = pocl.use_library_target(device.int_ptr) if is_old else named
-    text = f"{platform.name} {platform.vendor} {device.name}".lower()
+    text = f"{of.name} {of.vendor} {device.name}".lower()
     usable = bool(device.available and device.compiler_available)
     return DeviceInfo(
         index=index,
         name=" ".join(device.name.split()),
-        platform=platform.name,
+        platform=of.name,
         version=device.version.strip(),
         kind=kind,
         compute_units=device.max_compute_units,
@@ -146,3 +147,28 @@ def _kind(device: "cl.Device") -> str:
     if device.type & cl.device_type.CPU:
         return "cpu"
     return "gpu" if device.type & cl.device_type.GPU else "accelerator"
+
+
+def environment(device: DeviceInfo) -> dict[str, Any]:
+    """Returns the versions of program, interpreter and libraries, the device, and the time."""
+    return {
+        "version": __version__,
+        "python": platform.python_version(),
+        "numpy": np.__version__,
+        "pyopencl": _installed("pyopencl"),
+        "pocl": _installed("pocl-binary-distribution"),
+        "platform": device.platform,
+        "device": device.name,
+        "device_version": device.version,
+        "compute_units": device.compute_units,
+        "host_cores": os.cpu_count(),
+        "processor": pocl.cpu_name(),
+        "finished": datetime.now(timezone.utc).isoformat(timespec="seconds"),
+    }
+
+
+def _installed(package: str) -> str | None:
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return None

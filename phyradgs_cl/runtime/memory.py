@@ -1,4 +1,4 @@
-"""Device memory: arrays, the limit and its ledger, shortages, and arrays of pyopencl."""
+"""Device memory: arrays, the limit and its ledger, the driver's errors, and arrays of pyopencl."""
 
 import logging
 import os
@@ -7,11 +7,12 @@ import sys
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
-from typing import Any, TypeVar
+from functools import wraps
+from typing import Any, ParamSpec, TypeVar
 
 import numpy as np
 
-from phyradgs_cl.errors import InputError, OutOfMemoryError
+from phyradgs_cl.errors import DeviceError, InputError, OutOfMemoryError
 from phyradgs_cl.runtime.device import DeviceInfo
 from phyradgs_cl.runtime.opencl import cl
 
@@ -22,7 +23,10 @@ _UNITS = {"": 1, "B": 1}
 for _power, _letter in enumerate("KMGT", start=1):
     _UNITS |= {_letter: 1024**_power, f"{_letter}IB": 1024**_power, f"{_letter}B": 1000**_power}
 log = logging.getLogger(__name__)
-T = TypeVar("T")
+# mem object allocation failure, out of resources, out of host memory, invalid buffer size
+_MEMORY_CODES = (-4, -5, -6, -61)
+P = ParamSpec("P")
+R = TypeVar("R")
 
 
 class MemoryShortage(OutOfMemoryError):
@@ -130,11 +134,38 @@ class MemoryLedger:
                 remedy = f"allow more with --memory or {MEMORY_VARIABLE}, or {remedy}"
             raise MemoryShortage(subject, found, expected, remedy)
 
-    def refused(self, what: str, error: Exception) -> MemoryShortage:
-        """Returns a driver's refusal as a MemoryShortage."""
-        expected = "enough free memory"
-        remedy = f"set a limit with --memory or {MEMORY_VARIABLE}, or use a smaller problem"
-        return MemoryShortage(f"memory of {self.device.name}", f"{what} refused ({error})", expected, remedy)
+    def error(self, work: str, error: "cl.Error") -> DeviceError:
+        """Returns an error of the driver as a DeviceError, or as a MemoryShortage where memory ran out, which some drivers
+        report only at a launch or a wait. ``work`` names what failed: a kernel, or "a copy"."""
+        code = getattr(error, "code", 0)  # none where pyopencl raises a text, as of a build
+        if isinstance(error, cl.MemoryError) or code in _MEMORY_CODES:
+            remedy = f"set a limit with --memory or {MEMORY_VARIABLE}, or use a smaller problem"
+            found = f"{work} refused ({error})"
+            return MemoryShortage(f"memory of {self.device.name}", found, "enough free memory", remedy)
+        found = f"{work} failed ({' '.join(str(error).split())[:300] or type(error).__name__})"
+        remedy = "see the system's log, or try another --device"
+        return DeviceError(f"device {self.device.name}", found, "a device that works", remedy)
+
+
+def naming_failures(work: str | None = None) -> Callable[[Callable[P, R]], Callable[P, R]]:
+    """Decorates a method of a runtime, so that OpenCL's errors become DeviceError or MemoryShortage.
+
+    Drivers queue work: a launch may be refused at once, or fail later in any call that waits. ``work`` names the method's
+    work; None takes the name of the kernel, the first argument of a launch.
+    """
+
+    def decorate(method: Callable[P, R]) -> Callable[P, R]:
+        @wraps(method)
+        def named(*args: P.args, **kwargs: P.kwargs) -> R:
+            try:
+                return method(*args, **kwargs)
+            except cl.Error as error:
+                what = work or f"a launch of {args[1].function_name}"  # type: ignore[attr-defined]
+                raise args[0].ledger.error(what, error) from error  # type: ignore[attr-defined]
+
+        return named
+
+    return decorate
 
 
 def reported_bytes(device: DeviceInfo) -> int:
@@ -170,7 +201,7 @@ def mebibytes(nbytes: int) -> str:
     return f"{size:.0f} MiB" if size >= 10 else f"{size:.2g} MiB"
 
 
-def with_smaller_bricks(what: str, attempt: Callable[[float], T]) -> T:
+def with_smaller_bricks(what: str, attempt: Callable[[float], R]) -> R:
     """Returns ``attempt(1.0)``, or after a shortage, with a warning, ``attempt`` with a quarter of the memory."""
     try:
         return attempt(1.0)

@@ -21,7 +21,7 @@ from phyradgs_cl.io import only_run, written_beside
 from phyradgs_cl.io.json_lines import Line, append_line, json_text, read_lines, refuse_irregular
 from phyradgs_cl.io.output import BusyError, make_folder, shortened
 from phyradgs_cl.reconstructors import Progress, ProgressReport, ignore_progress
-from phyradgs_cl.runtime.environment import environment
+from phyradgs_cl.runtime.device import environment
 from phyradgs_cl.signals import finish_despite_interrupt, keep_finished_work
 from phyradgs_cl.text import plain_text
 from phyradgs_cl.workflow.reconstruct import is_complete, resume_or_restart
@@ -194,7 +194,7 @@ def _reconstructed(run: SweepRun, report: ProgressReport, device: str | None) ->
         "seconds": round(float(result.facts["seconds"]), 3),
         "total_s": round(time.perf_counter() - started, 3),
         "gaussians": result.facts.get("gaussians"),
-        **environment(rt),
+        **environment(rt.device),
         "host": platform.node(),
     }
     with written_beside(run.record) as temporary:
