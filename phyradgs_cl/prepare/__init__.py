@@ -4,12 +4,13 @@ from phyradgs_cl.prepare.bad_pixels import find_dead, find_sparks
 from phyradgs_cl.prepare.chain import DEFAULT_STEPS, PREPARED_KEY, STEP_FIELDS, STEPS, PrepareOptions, prepare
 from phyradgs_cl.prepare.hardening import fit_polynomial, straighten, water_polynomial
 from phyradgs_cl.prepare.light import find_air, flat_correction
+from phyradgs_cl.prepare.phase import retrieve_phase
 from phyradgs_cl.prepare.rings import ring_pattern, ring_strength
 from phyradgs_cl.prepare.scatter import fit_scatter, remove_scatter
 from phyradgs_cl.prepare.step import Model
 
 __all__ = [
     "DEFAULT_STEPS", "PREPARED_KEY", "STEPS", "STEP_FIELDS", "Model", "PrepareOptions", "find_air", "find_dead",
-    "find_sparks", "fit_polynomial", "fit_scatter", "flat_correction", "prepare", "remove_scatter", "ring_pattern",
-    "ring_strength", "straighten", "water_polynomial"
+    "find_sparks", "fit_polynomial", "fit_scatter", "flat_correction", "prepare", "remove_scatter", "retrieve_phase",
+    "ring_pattern", "ring_strength", "straighten", "water_polynomial"
 ]  # fmt: skip

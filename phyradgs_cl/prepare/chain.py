@@ -11,6 +11,7 @@ from phyradgs_cl.errors import InputError
 from phyradgs_cl.prepare.bad_pixels import DeadOptions, SparkOptions, mask_dead, mask_sparks
 from phyradgs_cl.prepare.hardening import HardeningOptions, correct_hardening
 from phyradgs_cl.prepare.light import WAYS, AirOptions, normalise_air
+from phyradgs_cl.prepare.phase import PhaseOptions, retrieve
 from phyradgs_cl.prepare.rings import RingOptions, remove_rings
 from phyradgs_cl.prepare.scatter import ScatterOptions, subtract_scatter
 from phyradgs_cl.prepare.step import Facts, MakeModel, Step
@@ -25,6 +26,7 @@ STEPS: Mapping[str, Step] = {
     "air": normalise_air,
     "hardening": correct_hardening,
     "rings": remove_rings,
+    "phase": retrieve,
 }
 """In the order in which they run, whatever the order in which the user names them."""
 DEFAULT_STEPS = "sparks,dead,rings"
@@ -45,6 +47,7 @@ class PrepareOptions:
     air: AirOptions = AirOptions()
     hardening: HardeningOptions = HardeningOptions()
     rings: RingOptions = RingOptions()
+    phase: PhaseOptions = PhaseOptions()
 
     def __post_init__(self) -> None:
         checks.one_of("flats", self.flats, WAYS)
@@ -56,6 +59,8 @@ class PrepareOptions:
             if name not in self.chosen and getattr(self, name) != type(getattr(self, name))():
                 found = f"options of a step that is not among --steps {self.steps or '(none)'}"
                 raise InputError(f"option {name}", found, f"{name} among the steps", "add it, or leave the options out")
+        if "phase" in self.chosen:
+            self.phase.stated()
 
     @property
     def chosen(self) -> list[str]:

@@ -1,0 +1,107 @@
+"""Phase retrieval from a single distance: line integrals of attenuation alone, without the bright and dark edges that
+free propagation from object to panel adds.
+
+Paganin, Mayo, Gureyev, Miller and Wilkins, J. Microsc. 206 (2002) 33. For an object of one material (δ and β of its
+refractive index 1 − δ + iβ, thickness T) the transport-of-intensity equation gives the transmission exp(−p) at the panel as
+(1 − d δ/μ ∇²) exp(−μT), with μ = 4πβ/λ. Its inverse is a division by 1 + π λ d (δ/β) f² at the frequency f, in 1/mm.
+
+The filter is linear in the intensity, so it may follow the average over an exposure that a panel records. Rows that a
+rolling shutter reads later see the object turned further; the filter ignores that within its reach of some pixels.
+"""
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+import scipy
+
+from phyradgs_cl import checks
+from phyradgs_cl.acquisition import Scan
+from phyradgs_cl.detector.attenuation import TRANSMISSION_FLOOR
+from phyradgs_cl.errors import InputError
+from phyradgs_cl.prepare.step import Facts, MakeModel, unmasked_frames
+
+WAVELENGTH_MM_KEV = 1.239841984e-6  # Planck's constant times the speed of light
+_REACHES = 8  # of the filter's decay length, as a margin around a frame: exp(−8) of an edge comes back from the other side
+_RANGES = {"energy_kev": (1, 1000), "distance_mm": (0, 1e6), "delta_beta": (0, 1e6), "delta": (0, 1), "beta": (0, 1)}
+
+
+@dataclass(frozen=True)
+class PhaseOptions:
+    """energy_kev: of the beam. distance_mm: from object to panel; None: from the axis to the panel, by the geometry.
+    delta_beta: δ/β of the object's material; or delta and beta themselves."""
+
+    energy_kev: float | None = None
+    distance_mm: float | None = None
+    delta_beta: float | None = None
+    delta: float | None = None
+    beta: float | None = None
+
+    def __post_init__(self) -> None:
+        given = [name for name in _RANGES if getattr(self, name) is not None]
+        for name in given:
+            checks.within(f"phase.{name}", getattr(self, name), *_RANGES[name])
+        both = {"delta", "beta"} & set(given)
+        if "delta_beta" in given and both:
+            raise InputError("phase.delta_beta", f"given with phase.{min(both)}", "δ/β, or δ and β", "leave one out")
+        if len(both) == 1:
+            missing = min({"delta", "beta"} - both)
+            raise InputError(f"phase.{missing}", "missing", "phase.delta and phase.beta", "state both, or phase.delta_beta")
+        if self.beta == 0:
+            remedy = "an object without absorption hides its thickness"
+            raise InputError("phase.beta", "0", "a number above 0", remedy)
+
+    def stated(self) -> tuple[float, float]:
+        """Returns energy in keV and δ/β. Raises InputError where one of them is missing, because no scan states them."""
+        if self.energy_kev is None:
+            raise InputError("phase.energy_kev", "no energy", "the one of the beam", "say --set phase.energy_kev=25")
+        if self.delta is not None and self.beta is not None:
+            return self.energy_kev, self.delta / self.beta
+        if self.delta_beta is None:
+            expected = "δ/β of the object: phase.delta_beta, or phase.delta and phase.beta"
+            raise InputError("phase.delta_beta", "no material", expected, "say --set phase.delta_beta=200")
+        return self.energy_kev, self.delta_beta
+
+
+def retrieve_phase(
+    frames: np.ndarray, pixel_mm: tuple[float, float], distance_mm: float, energy_kev: float, delta_beta: float
+) -> np.ndarray:
+    """Returns the line integrals of attenuation, float32, of line integrals (F, v, u) that free propagation changed.
+
+    pixel_mm (v, u) and distance_mm: those of a parallel beam. A cone beam that magnifies M times has pixels of pitch/M and a
+    distance of R₁R₂/(R₁ + R₂), from source to object R₁ and from object to panel R₂. delta_beta: δ/β of the material; with
+    0, or at a distance of 0, the frames themselves are returned. Frames continue with the values at their edges.
+    """
+    reach_mm = filter_reach_mm(distance_mm, energy_kev, delta_beta)
+    if reach_mm == 0:
+        return frames
+    margins = [math.ceil(_REACHES * reach_mm / pitch) for pitch in pixel_mm]
+    margins = [min(margin, count) for margin, count in zip(margins, frames.shape[1:], strict=True)]
+    shape = [scipy.fft.next_fast_len(n + 2 * m, real=True) for n, m in zip(frames.shape[1:], margins, strict=True)]
+    along_v, along_u = np.fft.fftfreq(shape[0], pixel_mm[0]), np.fft.rfftfreq(shape[1], pixel_mm[1])
+    response = 1 / (1 + (2 * math.pi * reach_mm) ** 2 * (along_v[:, None] ** 2 + along_u**2))
+    inside = tuple(slice(m, m + n) for n, m in zip(frames.shape[1:], margins, strict=True))
+    width = [(m, s - n - m) for n, m, s in zip(frames.shape[1:], margins, shape, strict=True)]
+    result = np.empty(frames.shape, np.float32)
+    for frame, line_integrals in enumerate(frames):
+        intensity = np.pad(np.exp(-line_integrals.astype(np.float64)), width, mode="edge")
+        smooth = scipy.fft.irfft2(scipy.fft.rfft2(intensity) * response, shape)[inside]
+        result[frame] = -np.log(np.maximum(smooth, TRANSMISSION_FLOOR))
+    return result
+
+
+def filter_reach_mm(distance_mm: float, energy_kev: float, delta_beta: float) -> float:
+    """Returns the length over which the filter's kernel decays by e, √(λ d (δ/β) / 4π), at the object."""
+    return math.sqrt(WAVELENGTH_MM_KEV / energy_kev * distance_mm * delta_beta / (4 * math.pi))
+
+
+def retrieve(scan: Scan, options: PhaseOptions, make_model: MakeModel) -> tuple[Scan, Facts]:
+    """Returns the scan with line integrals of attenuation alone."""
+    (energy_kev, delta_beta), geometry = options.stated(), scan.geometry
+    pixel_mm = (geometry.pixel_size_mm[0] / geometry.magnification, geometry.pixel_size_mm[1] / geometry.magnification)
+    behind_mm = geometry.source_to_detector_mm - geometry.source_to_axis_mm
+    distance_mm = (behind_mm if options.distance_mm is None else options.distance_mm) / geometry.magnification
+    clean = retrieve_phase(unmasked_frames(scan), pixel_mm, distance_mm, energy_kev, delta_beta)
+    reach_px = filter_reach_mm(distance_mm, energy_kev, delta_beta) / pixel_mm[1]
+    facts = {"effective_distance_mm": distance_mm, "delta_beta": delta_beta, "reach_px": reach_px}
+    return replace(scan, projections=clean), facts
