@@ -112,6 +112,12 @@ def refused(cli, capfd) -> Callable[..., str]:
     return refuse
 
 
+@pytest.fixture
+def fast_pictures(monkeypatch) -> None:
+    """`evaluate` draws nothing: a figure of nine panels takes a second, and tests/metrics looks at one."""
+    monkeypatch.setattr("phyradgs_cl.workflow.evaluate.slices_png", lambda path, *_: Path(path).write_bytes(b"\x89PNG"))
+
+
 @pytest.fixture(scope="session")
 def simulated(cli, tmp_path_factory) -> Callable[..., Path]:
     """(words of ``phyradgs simulate``...) → the scan, made once and not to be written to."""

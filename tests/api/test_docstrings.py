@@ -5,7 +5,6 @@ import re
 from collections.abc import Iterator
 from typing import Any
 
-import numpy as np
 import pytest
 
 from phyradgs_cl import api
@@ -78,20 +77,3 @@ def test_a_signature_is_short_enough_to_read(name) -> None:
     for called, thing in own:
         for parameter in parameters(thing) if callable(thing) else []:
             assert len(inspect.formatannotation(parameter.annotation)) <= 60, f"{called}: {parameter.name}"
-
-
-def test_the_test_sees_what_is_not_said(monkeypatch) -> None:
-    def silent(volume: np.ndarray, side_mm: float) -> None: ...
-
-    def brief(volume: np.ndarray, side_mm: float) -> None:
-        """The volume."""
-
-    monkeypatch.setattr(api, "silent", silent, raising=False)
-    monkeypatch.setattr(api, "brief", brief, raising=False)
-    assert missing("silent") == ["a docstring"]
-    assert missing("brief") == [
-        "its parameter side_mm",
-        "the shape of its arrays",
-        "its units",
-        "the error that it raises",
-    ]

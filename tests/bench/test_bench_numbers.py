@@ -6,15 +6,12 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 from scipy.special import erfc
-from skimage.metrics import peak_signal_noise_ratio
 from tables import Row, rows_of
 from tables.case import FLY, STILL
 from tables.gains import gain_over_static
-from tables.metrics import Bead, compare_projections, regional_bias, roundness
+from tables.metrics import Bead, roundness
 from tables.metrics.edge import RISE_PER_SIGMA, bead_edge, blurred_ball
 from tables.metrics.roundness import bead_sections
-from tables.raw_counts import Panel, measured_attenuation
-from tables.summary import summarise
 
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.phantoms import Ellipsoid, EllipsoidPhantom
@@ -51,45 +48,6 @@ def test_round_beads_are_round_and_an_ellipsoid_is_out_of_round_by_its_axes() ->
         # radii of an ellipse run between the axes as a cosine: RMS is the amplitude over √2
         assert sections[name].rms == pytest.approx(0.3 / 6.3 / np.sqrt(2), abs=0.006)
     assert np.isnan(roundness(np.zeros(GRID.shape), GRID, [Bead(CENTRE, 6.0)])["roundness"])
-
-
-def test_projections_are_compared_at_true_scale_over_the_whole_stack() -> None:
-    truth = np.random.default_rng(0).uniform(0, 3, (4, 12, 14))
-    truth[0] *= 0.1  # a faint frame: its own maximum must not become the range
-    result = truth + np.random.default_rng(1).normal(0, 0.05, truth.shape)
-    expected = peak_signal_noise_ratio(truth, result, data_range=truth.max())
-    assert compare_projections(result, truth)["psnr_2d_db"] == pytest.approx(expected, rel=1e-12)
-    assert compare_projections(truth, truth)["ssim_2d"] == pytest.approx(1.0)
-
-
-def test_bias_of_regions_is_that_of_their_means_inside() -> None:
-    labels = np.zeros((12, 12, 12), int)
-    labels[2:10, 2:10, 2:6], labels[2:10, 2:10, 7:10] = 1, 2
-    truth = np.where(labels == 1, 2.0, np.where(labels == 2, 0.5, 0.0))
-    result = truth.copy()
-    result[3:9, 3:9, 3:5] *= 1.1  # the region 1 without its surface
-    result[4, 4, 8] -= 0.25 * 36  # one voxel of the 36 inside region 2
-    assert regional_bias(result, truth, labels) == {1: pytest.approx(0.1), 2: pytest.approx(-0.5)}
-
-
-def test_raw_counts_come_back_as_line_integrals() -> None:
-    clean = np.random.default_rng(0).uniform(0, 2, (6, 32, 32))
-    frames, unusable = measured_attenuation(clean, Panel(), np.random.default_rng(1))
-    assert not unusable.any()
-    # variance of −ln of counts: 1/counts + (σ/counts)², and that of ten flats
-    counts = 5e4 * np.exp(-clean)
-    expected = np.sqrt(np.mean((1 / counts + 100 / counts**2) + 0.1 / 5e4))
-    assert np.std(frames - clean) == pytest.approx(expected, rel=0.1)
-
-
-def test_a_spread_is_that_of_seeds_and_not_of_volumes() -> None:
-    """Three volumes with one seed, one of them with two: its two seeds are the spread, and it weighs as any other."""
-    scores = [("a", 0, 20.0), ("b", 0, 30.0), ("c", 0, 40.0), ("a", 1, 22.0)]
-    lines = [{"volume": v, "seed": seed, "metrics": {"psnr_db": db, "ssim": None}} for v, seed, db in scores]
-    summary = summarise(lines)
-    assert summary is not None and (summary.volumes, summary.seeds) == (3, 2)
-    assert summary.mean == {"psnr_db": pytest.approx((21 + 30 + 40) / 3)}
-    assert summary.spread == {"psnr_db": pytest.approx(np.std([20, 22], ddof=1))}
 
 
 def line(row: Row, volume: str, seed: int, psnr_db: float, **others: Any) -> dict[str, Any]:

@@ -12,25 +12,19 @@ from tables import (
     KINDS,
     RESULTS,
     BenchJob,
-    BenchProgress,
     BenchSize,
     plan_runs,
     remake_tables,
-    result_text,
     rows_of,
     run_bench,
     sizes,
 )
-from tables import run as bench_run
 from tables.__main__ import run
-from tables.case import FLY, STILL, stop_and_shoot
+from tables.case import FLY, STILL
 from tables.published import TABLE1, TABLE2
 from tables.results import read_lines
 
-from phyradgs_cl.acquisition import PROTOCOLS, ConeGeometry
-from phyradgs_cl.errors import InputError, NumericalError
-from phyradgs_cl.io import only_run
-from phyradgs_cl.io.output import BusyError
+from phyradgs_cl.errors import InputError
 from phyradgs_cl.runtime import Runtime
 
 TINY = BenchSize("T", 12, 16, 8)
@@ -67,47 +61,6 @@ def lines_of(job: BenchJob) -> list[dict]:
     return read_lines(job.output / RESULTS)
 
 
-def test_a_run_is_made_once_and_a_damaged_line_again(made: BenchJob, rt: Runtime) -> None:
-    results = made.output / RESULTS
-    before = results.read_bytes()
-    assert before.count(b"\n") == RUNS
-    run_bench(made, no_runtime)
-    assert results.read_bytes() == before
-    results.write_bytes(before[:-40])  # killed while the last line was written
-    seen: list[BenchProgress] = []
-    run_bench(made, lambda: rt, seen.append)
-    assert [p.number for p in seen if p.line is not None] == [RUNS] and len(lines_of(made)) == RUNS
-    with only_run(results), pytest.raises(BusyError):
-        run_bench(made, no_runtime)
-
-
-def test_an_interruption_loses_one_run_and_a_failure_is_tried_again(
-    made: BenchJob, rt: Runtime, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    shutil.rmtree(made.output)
-    job = replace(made, rows=["FDK"], names=["ball"])
-
-    def overflow(*_: object, **__: object) -> object:
-        raise NumericalError("projections", "values that overflow")
-
-    monkeypatch.setattr(bench_run, "reconstruct", overflow)
-    seen: list[BenchProgress] = []
-    with pytest.raises(InputError):  # nothing to make a table of
-        run_bench(job, lambda: rt, seen.append)
-    assert "failed: projections" in result_text(seen[-1])
-    monkeypatch.undo()
-
-    def stop_after_one(progress: BenchProgress) -> None:
-        if progress.number == 2:
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        run_bench(job, lambda: rt, stop_after_one)
-    assert len([line for line in lines_of(job) if "error" not in line]) == 1
-    run_bench(job, lambda: rt)
-    assert len([line for line in lines_of(job) if "error" not in line]) == 2
-
-
 def test_lines_and_tables_have_what_the_page_needs(made: BenchJob, rt: Runtime) -> None:
     job = replace(made, seeds=(0, 1))
     run_bench(job, lambda: rt)
@@ -134,13 +87,6 @@ def test_lines_and_tables_have_what_the_page_needs(made: BenchJob, rt: Runtime) 
     assert {path: path.read_text() for path in tables} == tables
 
 
-def test_a_name_stands_for_one_object(made: BenchJob) -> None:
-    shutil.copy(made.volumes / "box.h5", made.volumes / "ball_24.h5")
-    with pytest.raises(InputError, match="ball_24.h5 from before its contents changed"):
-        run_bench(made, no_runtime)
-    run_bench(replace(made, names=["box"]), no_runtime)
-
-
 def test_rows_are_the_papers_and_a_plan_runs_over_seeds_volumes_and_protocols(tmp_path: Path) -> None:
     labels = {kind: [row.label for row in rows_of(kind)] for kind in KINDS}
     assert set(TABLE1) <= set(labels["table1"]) and set(TABLE2) == set(labels["table2"])
@@ -154,17 +100,6 @@ def test_rows_are_the_papers_and_a_plan_runs_over_seeds_volumes_and_protocols(tm
     for wrong in ({"rows": ["PhyRad"]}, {"protocols": ["static"]}, {"seeds": ()}, {"size": "XXL"}, {"names": ["hand"]}):
         with pytest.raises(InputError):
             plan_runs(BenchJob("table1", tmp_path, **wrong))  # type: ignore[arg-type]
-
-
-def test_stop_and_shoot_stands_at_the_mid_window_poses() -> None:
-    geometry = ConeGeometry(5.0, 7.0, (8, 8), (0.5, 0.5))
-    for protocol in (PROTOCOLS["rapid"], PROTOCOLS["standard"]):
-        shutter, start_s = protocol.shutter(), protocol.frame_start_s()
-        moving, still = protocol.orbit(geometry), stop_and_shoot(protocol).orbit(geometry)
-        for frame in range(protocol.views):
-            middle_s = np.array([start_s[frame] + shutter.span_s / 2])
-            for time_s in (middle_s, middle_s + 0.3):
-                np.testing.assert_allclose(still.pose(frame, time_s), moving.pose(frame, middle_s), atol=1e-9)
 
 
 def test_the_sphere_phantom_study_runs_and_says_shape(tmp_path: Path, rt: Runtime) -> None:

@@ -48,16 +48,13 @@ def test_damaged_scans(kept, scan, tmp_path) -> None:
         kept(["reconstruct", path, "--iterations", "2"], subject)
 
 
-# what the line must name: options after `reconstruct SCAN`
+# what the line must name: options after `reconstruct SCAN`. Ranges of numbers: tests of the options' own rooms
 RECONSTRUCT = {
     "abacus": ("--device abacus",),
     "--method": ("--method magic",),
-    "--motion": ("--motion wobble", "--method fdk --motion micro-views", "--motion per-row"),
-    "strips": ("--strips 0", "--strips 1000000000", f"--strips {DIGITS}"),
-    "--strips": ("--motion static --strips 4", "--method fdk --strips 4"),
-    "--sub-intervals": ("--method fdk --motion per-row --sub-intervals 3",),
-    "iterations": ("--iterations -5", "--method fdk --iterations 5"),
-    "'1e3'": ("--iterations 1e3",),
+    "--motion": ("--motion wobble", "--method fdk --motion micro-views"),
+    "strips": ("--strips 0", f"--strips {DIGITS}", "--motion static --strips 4", "--method fdk --strips 4"),
+    "iterations": ("--iterations -5", "--iterations 1e3", "--method fdk --iterations 5"),
     "--preset": ("--preset best", "--preset ''"),
     "--seed": ("--seed -1", "--seed 1.5", f"--seed {DIGITS}"),
     "none.toml": ("--config {tmp}/none.toml",),
@@ -68,17 +65,13 @@ RECONSTRUCT = {
     "--detector-model: found no such option of --method fdk": ("--method fdk --detector-model intensity",),
     "--resume": ("--resume",),
     "--iteration-count": ("--iteration-count 5",),
-    "--median-filter: found 4": ("--median-filter 4",),
+    "--median-filter": ("--median-filter 4",),
     "--set": ("--set tv_weight", "--set 'x y=3'"),
     "tv_weight": ("--set tv_weigth=3", "--set tv_weight=much"),
     "magic": ("--set method=magic",),
-    "--size: found 'a,b,c'": ("--size a,b,c",),
-    "--size: found 0": ("--size 0",),
-    "--voxel-mm: found -1.0": ("--voxel-mm -1",),
-    "--voxel-mm: found a grid of": ("--voxel-mm 1e-8",),
-    "--roi-mm": ("--roi 1,-1,-1,1,-1,1",),
-    "the field of view": ("--roi 90,91,-1,1,-1,1",),
-    "--size: found all three": ("--size 4 --voxel-mm 1 --roi -1,1,-1,1,-1,1",),
+    "--size": ("--size a,b,c", "--size 0", "--size 4 --voxel-mm 1 --roi -1,1,-1,1,-1,1"),
+    "--voxel-mm": ("--voxel-mm -1", "--voxel-mm 1e-8"),
+    "--roi-mm": ("--roi 1,-1,-1,1,-1,1", "--roi 90,91,-1,1,-1,1"),
 }
 # the same of `simulate --size 8 --detector 8`
 SIMULATE = {
@@ -87,17 +80,16 @@ SIMULATE = {
     "--volume": ("--phantom foot --volume {scan}", "--volume ''"),
     "r3": ("--scanner r3",),
     "scanner": ("--scanner demo",),
-    "--dose 100: found --noise none": ("--dose 100",),
-    "--electronic-noise 5": ("--electronic-noise 5",),
+    "--dose": ("--dose 100", "--noise beer --dose=1o", "--noise beer --dose=nan", "--noise beer --dose=1e13"),
+    "--electronic-noise": ("--electronic-noise 5",),
     "--jitter-deg": ("--protocol static --jitter-deg 0.1",),
-    "found '1o'": ("--noise beer --dose=1o",),
-    "direction": ("--readout-direction 0", "--readout-direction 2"),
-    "pulse": ("--pulse 0.5", "--pulse a,b", "--pulse 0,0", "--pulse 5,1"),
-    "views": ("--views 1000000000", "--views 0", "--views many", "--views 1e23", f"--views {'9' * 5000}"),
-    "--size": ("--size 100000", "--size -4", f"--size {DIGITS}"),
-    "--size: found 1; expected a number from 2 to 4096": ("--size 1",),
+    "direction": ("--readout-direction 0",),
+    "pulse": ("--pulse 0.5", "--pulse a,b", "--pulse 0,0"),
+    "views": ("--views 1000000000", "--views many", "--views 1e23", f"--views {'9' * 5000}"),
+    "--size": ("--size 100000", "--size 1", f"--size {DIGITS}"),
     "--detector": (f"--detector {DIGITS}",),
-    "--detector-offset": ("--detector-offset left", "--detector-offset 0,inf"),
+    "--detector-offset": ("--detector-offset left", "--detector-offset 0,inf", "--detector-offset 1,2,3"),
+    "exposure": ("--exposure-deg=1e300",),
     "--device": ("--device ' '",),
 }
 
@@ -113,7 +105,7 @@ def test_wrong_options(kept, scan, tmp_path, command) -> None:
             "none.h5": ("reconstruct {tmp}/none.h5",),
             "text.h5": ("reconstruct {text}",),
             "SCAN": ("reconstruct '' --method fdk",),
-            "--size: found 0": ("import {scan} --size 0",),
+            "--size": ("import {scan} --size 0",),
         }),
     }[command]  # fmt: skip
     for subject, many in table.items():
@@ -121,68 +113,6 @@ def test_wrong_options(kept, scan, tmp_path, command) -> None:
             begun = start.replace(" --method phyradgs", "") if "method" in options else start
             words = shlex.split(f"{begun} {options}".format(tmp=tmp_path, scan=scan, text=text))
             kept(words, subject)
-
-
-ABSURD_VALUES = {
-    "--dose": ("1e300", "1e13", "nan", "inf", "-1", "0"),
-    "--electronic-noise": ("1e300", "1e10", "nan", "inf", "-1"),
-    "--jitter-deg": ("1e300", "361", "nan", "inf", "-1"),
-    "--peak": ("1e300", "1e5", "nan", "inf", "-1"),
-    "--exposure-deg": ("1e300", "nan", "inf", "-1"),
-    "--start-deg": ("1e300", "-1e300", "1e7", "nan", "inf"),
-    "--readout-ratio": ("1e300", "nan", "inf", "-1"),
-    "--detector-offset": ("1e300,0", "0,-1e7", "nan,0", "0", "1,2,3"),
-    "--detector": ("99999999999999999999", "-1", "0"),
-    "--views": ("99999999999999999999", "-1", "0"),
-    "--size": ("99999999999999999999", "-1", "0"),
-    "--time-samples": ("99999999999999999999", "-1"),
-    "--seed": ("99999999999999999999", "-1"),
-}
-
-
-@pytest.mark.parametrize("option", ABSURD_VALUES)
-def test_absurd_numbers_of_a_simulation(kept, option) -> None:
-    for value in ABSURD_VALUES[option]:
-        words = ["simulate", "--noise", "beer", *SMALL.split(), f"{option}={value}"]
-        kept(words, option.strip("-").split("-")[0])
-
-
-# what the line must name: texts of a configuration; tests/cli/test_settings.py has how the line of the file is named
-CONFIGS = {
-    "iteration": ("iteration = 5",),
-    "iterations": ("iterations = inf", "iterations = nan", f"iterations = 0x{'f' * 5000}"),
-    "gaussians": ("gaussians = 10.5",),
-    "rates": ("rates = 3",),
-    "position": ("[rates]\nposition = [1e-3]", "[rates]\nposition = [nan, 1e-4]"),
-    "rates.scale": ("[rates]\nscale = [0, 0]",),
-    "tv_weight": ("tv_weight = true", "tv_weight = nan"),
-    "ssim_weight": ("ssim_weight = -0.5",),
-    "density_weight": ("density_weight = 1e300",),
-    "control.every": ("[control]\nevery = -1", "[control]\nevery = 0.5"),
-    "did you mean 'every'?": ("[control]\nevry = 3",),
-    "scale_max": ("scale_min = 0.5\nscale_max = 0.1",),
-    "preset": ("preset = ['default']",),
-    "device": ("device = [0]", "device = ''", "device = true"),
-    "method": ("method = ['fdk']", "method = 3"),
-    "motion": ("motion = ['static']", "motion = 3"),
-    "strips": ("strips = true",),
-    "seed": ("seed = true", "seed = 1e300", "seed = 2024-01-01"),
-    "did you mean 'sub_intervals'?": ("sub-intervals = 3",),
-    "did you mean 'strips'?": ("strip = 3",),
-    "size: found '4,4,4'": ("size = '4,4,4'",),
-    "voxel_mm: found": ("voxel_mm = [1, 2]",),
-    "roi_mm: found": ("roi_mm = [-inf, inf, 0, 1, 0, 1]",),
-    "config": (f"iterations = {'9' * 5000}", "a = " + "[" * 20_000),
-}
-
-
-def test_wrong_configs(kept, scan, tmp_path) -> None:
-    config = tmp_path / "run.toml"
-    for subject, texts in CONFIGS.items():
-        for text in texts:
-            config.write_text(text)
-            method = [] if text.startswith("method") else ["--method", "phyradgs"]
-            kept(["reconstruct", scan, "--config", config, *method], subject)
 
 
 def test_outputs_that_cannot_be_written(refused, scan, tmp_path) -> None:

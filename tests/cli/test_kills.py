@@ -14,11 +14,10 @@ from phyradgs_cl.io import checkpoint_path, read_volume
 from phyradgs_cl.io.output import lock_path
 
 TINY = ["--phantom", "jaw", "--size", "12", "--detector", "16", "--views", "4", "--time-samples", "2"]
+# every other method goes on from its state in tests/reconstructors/test_iterative.py
 RUNS = {
     "phyradgs": ["--method", "phyradgs", "--iterations", "400", "--gaussians", "60", "--set", "control.start_iteration=50"],
     "sirt": ["--method", "sirt", "--motion", "per-row", "--iterations", "300"],
-    "cgls": ["--method", "cgls", "--iterations", "300", "--set", "noise_stop=0"],
-    "fista-tv": ["--method", "fista-tv", "--iterations", "200"],
 }
 # STRESS=50 is what `make stress` sets
 KILLS = int(os.environ.get("STRESS", "1"))

@@ -4,19 +4,18 @@ import os
 import shutil
 import signal
 import time
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import tables.__main__ as tables_command
 from cluster.processes import free_port, wait_until
-from tables import RESULTS, BenchJob, BenchSize, run_bench, run_bench_at_workers
+from tables import RESULTS, BenchJob, BenchSize, run_bench_at_workers
 from tables.results import read_lines
 
 from phyradgs_cl import cluster as cluster_module
 from phyradgs_cl.cluster import Lost, Pool, Workers
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.runtime import DEVICE_VARIABLE, Runtime
+from phyradgs_cl.runtime import DEVICE_VARIABLE
 
 TINY = BenchSize("T", 12, 16, 8)
 
@@ -62,32 +61,6 @@ def test_no_scheduler_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[
         assert tables_command.run([*options, "--scheduler", where]) == 2
         error = capsys.readouterr().err
         assert error.count("\n") == 1 and f"--scheduler {where}: found no answer" in error
-
-
-def test_a_benchmark_at_workers_gives_the_lines_and_tables_of_one_without(tmp_path: Path) -> None:
-    what = {"names": ["jaw"], "protocols": ["rapid"], "rows": ["FDK", "SIRT"]}
-    job = BenchJob("table1", tmp_path / "here", size=TINY, **what)
-    run_bench(job, lambda: Runtime("cpu"))
-    there = replace(job, output=tmp_path / "there")
-    told: list[str] = []
-    run_bench_at_workers(there, Workers(count=2, device="cpu"), told=told.append)
-    volatile = {"seconds", "processor_s", "finished"}
-
-    def lines(where: BenchJob) -> dict[tuple[str, str], dict]:
-        found = read_lines(where.output / RESULTS)
-        kept = {(x["run"], x["acquisition"]): {k: x[k] for k in x.keys() - volatile} for x in found}
-        assert len(kept) == len(found)
-        return kept
-
-    alone, shared = lines(job), lines(there)
-    assert alone.keys() == shared.keys() and told[0].startswith("http://")
-    for name, line in alone.items():  # Dask gives BLAS one thread: its sums round otherwise
-        assert shared[name].pop("metrics") == pytest.approx(line.pop("metrics"), rel=1e-6)
-        assert shared[name] == line
-    assert sorted(p.name for p in there.output.rglob("*")) == sorted(p.name for p in job.output.rglob("*"))
-    before = (there.output / RESULTS).read_bytes()
-    run_bench_at_workers(there, Workers(count=1, device="cpu"))
-    assert (there.output / RESULTS).read_bytes() == before
 
 
 def test_the_phantoms_pseudo_truth_is_made_by_one_worker(tmp_path: Path) -> None:

@@ -52,6 +52,8 @@ HARMLESS_VOLUME: Mapping[str, tuple[str, ...]] = {
     # the grid is there, so the axes are for viewers
     **{f"{_R}/{axis}": _ANY_NUMBER for axis in "xyz"},
 }
+_WHOLE = ("entry", _R, "volume")  # without them it is a file of another kind
+_OTHERS = (("entry/gaussians/mean", "nothing in it"),)  # the first says how many there are
 UNITS = {"an unknown unit": "furlong", "a unit that is a number": 3.0, "units in a list": ["mm", "mm"]}
 
 
@@ -62,6 +64,8 @@ class Case(NamedTuple):
     of: str
     damage: Damage
     refused: bool = True
+    address: str = ""
+    """The HDF5 path that the message must name."""
 
 
 def cases(good: Path, seed: int) -> Iterator[Case]:
@@ -93,7 +97,9 @@ def field_cases(good: Path, of: str, harmless: Mapping[str, tuple[str, ...]]) ->
         file.visititems(lambda name, thing: addresses.append((name, damages_of(thing))))
     for address, damages in addresses:
         for name, change in damages.items():
-            yield Case(f"{of}: {address}: {name}", of, on(address, change), name not in harmless.get(address, ()))
+            refused = name not in harmless.get(address, ())
+            named = "" if address in _WHOLE or (address, name) in _OTHERS else address
+            yield Case(f"{of}: {address}: {name}", of, on(address, change), refused, named)
 
 
 def _units(good: Path) -> Iterator[Case]:
@@ -135,9 +141,13 @@ def _numbers() -> Iterator[Case]:
         f"{_D}/detector_readout_time": (1e20,),
         f"{_E}/grid/shape": ([-1, 8, 8], [10**7, 10**7, 10**7], [2**62, 2**62, 2**62]),
         f"{_E}/provenance": ("[" * 100_000,),
+        f"{_E}/lag": (-0.1, 1.0),
+        f"{_E}/pulse_length": (0.0,),
+        f"{_E}/pulse_start": (7.0e3,),
     }.items():
         for number in values:
-            yield Case(f"fly.h5: {address} = {str(number)[:30]}", "fly.h5", on(address, value(number)))
+            of = "counts.h5" if address.endswith(("lag", "pulse_length", "pulse_start")) else "fly.h5"
+            yield Case(f"{of}: {address} = {str(number)[:30]}", of, on(address, value(number)), True, address)
     keys = {"no projections": [1] * 8, "no flats": [2, 3, 0, 0, 3, 0, 0, 3], "a key of 7": [7] * 8}
     for name, key in keys.items():
         yield Case(f"counts.h5: {name}", "counts.h5", on(f"{_D}/image_key", value(key)))

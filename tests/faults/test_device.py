@@ -13,10 +13,7 @@ from phyradgs_cl.runtime import context
 MOST = 2 * int(os.environ.get("STRESS", "1"))
 RUNS = {
     "sirt": ["--method", "sirt", "--motion", "per-row", "--iterations", "5"],
-    "cgls": ["--method", "cgls", "--iterations", "5", "--set", "noise_stop=0"],
     "fista-tv": ["--method", "fista-tv", "--iterations", "4"],
-    "os-sart": ["--method", "os-sart", "--iterations", "4"],
-    "asd-pocs": ["--method", "asd-pocs", "--iterations", "4"],
     "phyradgs": ["--method", "phyradgs", "--iterations", "60", "--gaussians", "30", "--set", "control.start_iteration=20"],
 }
 

@@ -1,21 +1,22 @@
 """Disks that fill up, at every write: one line, status 4, older outputs and checkpoints whole, nothing half written."""
 
 import errno
-import json
 import os
 import subprocess
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import faults_kit as kit
 import numpy as np
 import pytest
-from tables.results import append_line, read_lines
 
+from phyradgs_cl.api import ConeGeometry, fly_scan
 from phyradgs_cl.errors import OutputError
+from phyradgs_cl.exporters import export_stored
 from phyradgs_cl.fields import Grid
-from phyradgs_cl.io import read_checkpoint, write_checkpoint, write_volume
+from phyradgs_cl.io import Volume, read_checkpoint, write_checkpoint, write_scan, write_volume
 
 ARRAYS = {"volume": np.arange(5000, dtype=np.float32), "iteration": np.array(3)}
 GRID = Grid.cube(4, 2.0)
@@ -44,15 +45,18 @@ class FullAt:
         self.made, self.at = 0, at
 
 
+SCAN = fly_scan(np.zeros((2, 3, 4), np.float32), ConeGeometry(5.0, 7.0, (3, 4), 0.2), [0.0, 9.0], exposure_deg=5.0)
 WRITERS: dict[str, Callable[[Path, int], None]] = {
     "checkpoint": lambda path, n: write_checkpoint(path, {**ARRAYS, "n": np.array(n)}),
     "volume": lambda path, n: write_volume(path, np.full((4, 4, 4), n, np.float32), GRID, {"n": n}),
+    "scan": lambda path, n: write_scan(path, replace(SCAN, title=str(n))),
+    "export.mha": lambda path, n: export_stored(Volume(np.full((4, 4, 4), n, np.float32), GRID, {}), "mha", path, ""),
 }
 
 
 @pytest.mark.parametrize("kind", WRITERS)
 def test_no_room_at_any_call_leaves_the_old_file_or_the_new_one(tmp_path, monkeypatch, kind) -> None:
-    target = tmp_path / "output"
+    target = tmp_path / kind
     full = FullAt(monkeypatch)
     WRITERS[kind](target, 1)
     calls, old = full.made, target.read_bytes()
@@ -69,79 +73,7 @@ def test_no_room_at_any_call_leaves_the_old_file_or_the_new_one(tmp_path, monkey
             full.arm(None)
             assert "no room left" in str(error) or "No space left" in str(error)
             assert target.read_bytes() == old and (kind != "checkpoint" or read_checkpoint(target))
-        assert kit.names(tmp_path) == ["output"]
-
-
-def test_results_keep_their_lines_when_there_is_no_room(tmp_path, monkeypatch) -> None:
-    results = tmp_path / "results.jsonl"
-    full = FullAt(monkeypatch)
-    append_line(results, {"run": "one"})
-    for at in range(1, full.made + 1):
-        full.arm(at)
-        with pytest.raises(OutputError, match="No space left"):
-            append_line(results, {"run": "two"})
-        full.arm(None)
-        assert read_lines(results)[0] == {"run": "one"}
-
-
-# In a process of its own, which may not write files of more bytes than this: a disk that is full at that byte.
-LIMITED = """
-import json, resource, sys
-from pathlib import Path
-from phyradgs_cl.__main__ import load_cli
-run, output = load_cli().run, Path(sys.argv[1])
-for limit_bytes in json.loads(sys.argv[2]):
-    before = {path.name: path.read_bytes() for path in output.parent.iterdir()}
-    resource.setrlimit(resource.RLIMIT_FSIZE, (limit_bytes, resource.RLIM_INFINITY))
-    status = run(sys.argv[3:])
-    resource.setrlimit(resource.RLIMIT_FSIZE, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
-    after = {path.name: path.read_bytes() for path in output.parent.iterdir()}
-    print(json.dumps([limit_bytes, status, before == after]), flush=True)
-    for name in set(after) - set(before):
-        (output.parent / name).unlink()
-    for name, content in before.items():
-        (output.parent / name).write_bytes(content)
-"""
-
-
-@pytest.fixture(scope="module")
-def volume(run, scan, tmp_path_factory) -> Path:
-    path = tmp_path_factory.mktemp("volume") / "volume.h5"
-    assert run("reconstruct", scan, "--method", "fdk", "-o", path) == 0
-    return path
-
-
-# without a device: the limit would hit PoCL's cache of kernels too
-COMMANDS = {
-    "simulate": ["simulate", "--phantom", "shepp-logan", *kit.TINY[2:], "-o", "{out}.h5"],
-    "export": ["export", "{volume}", "--to", "mha", "-o", "{out}.mha"],
-    "export of slices": ["export", "{volume}", "--to", "nrrd", "-o", "{out}.nrrd"],
-}
-
-
-@pytest.mark.skipif(os.name != "posix", reason="file size limits of POSIX")
-@pytest.mark.parametrize("name", COMMANDS)
-def test_a_file_that_may_not_grow(run, scan, volume, tmp_path, name) -> None:
-    words = [w.format(scan=scan, volume=volume, out=tmp_path / "existing") for w in COMMANDS[name]]
-    output = Path(words[-1])
-    assert run(*words) == 0
-    whole_bytes = output.stat().st_size
-    output.write_bytes(kit.OLD)
-    limits = [0, 1, 100, *np.linspace(0.05, 0.99, 8) * whole_bytes]
-    answers = _limited(output, [int(n) for n in limits], words)
-    for limit, status, same in answers[0]:
-        assert (status, same) == (4, True), (limit, answers[1])
-    assert len(answers[0]) == len(limits)
-    lines = [line for line in answers[1].splitlines() if line.startswith("phyradgs:")]
-    assert len(lines) == len(limits) and "Traceback" not in answers[1]
-    assert all(output.name in line for line in lines)
-
-
-def _limited(output: Path, limits: list[int], words: list[str]) -> tuple[list[list[object]], str]:
-    command = [sys.executable, "-c", LIMITED, str(output), json.dumps(limits), *words]
-    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=300)
-    assert done.returncode == 0, done.stderr
-    return [json.loads(line) for line in done.stdout.splitlines() if line.startswith("[")], done.stderr
+        assert kit.names(tmp_path) == [kind]
 
 
 def can_mount() -> bool:

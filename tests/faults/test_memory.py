@@ -73,8 +73,8 @@ def test_memory_that_runs_out_leaves_the_checkpoint(run, scan, tmp_path, capfd, 
     kit.same_bits(output, whole)
 
 
-@pytest.mark.parametrize("method", ["sirt", "os-sart", "cgls", "fista-tv", "asd-pocs"])
-def test_a_residual_that_is_no_number_is_named(run, scan, tmp_path, capfd, monkeypatch, method) -> None:
+def test_a_residual_that_is_no_number_is_named(run, scan, tmp_path, capfd, monkeypatch) -> None:
+    """By the loop that all methods share."""
     step = voxels._Iterations.step
 
     def poisoned(self: voxels._Iterations) -> None:
@@ -83,8 +83,7 @@ def test_a_residual_that_is_no_number_is_named(run, scan, tmp_path, capfd, monke
         step(self)
 
     monkeypatch.setattr(voxels._Iterations, "step", poisoned)
-    words = ["--method", method, "--iterations", "5", "--checkpoint-every", "1e-6"]
-    words += ["--set", "noise_stop=0"] if method == "cgls" else []
+    words = ["--method", "sirt", "--iterations", "5", "--checkpoint-every", "1e-6"]
     assert run("reconstruct", scan, "-o", tmp_path / "v.h5", *words) == 3
     line = capfd.readouterr().err.splitlines()[-1]
     assert line.startswith("phyradgs: residual: found nan at iteration 3; expected a finite number")

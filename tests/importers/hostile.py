@@ -442,9 +442,9 @@ def deflated_zeros(megabytes: int) -> bytes:
 
 
 def inflated_strip(path: Path) -> None:
-    """A strip of 300 kB out of which 300 MB would come; the page needs 1 kB."""
+    """A strip of 200 kB out of which 200 MB would come; the page needs 1 kB."""
     tifffile.imwrite(path / "proj_1.tif", np.zeros((10, 14)), compression="zlib")
-    bomb = deflated_zeros(300)
+    bomb = deflated_zeros(200)
     with tifffile.TiffFile(path / "proj_1.tif", mode="r+b") as tiff:
         at = (path / "proj_1.tif").stat().st_size
         tiff.pages[0].tags["StripOffsets"].overwrite(at)

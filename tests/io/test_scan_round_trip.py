@@ -152,20 +152,6 @@ def test_pulse_and_lag_come_back(path, make_scan, is_fly) -> None:
     assert facts["dark_lines"] == 2
 
 
-def test_impossible_pulses_and_lags_are_named(path, make_scan) -> None:
-    pulsed = make_scan(shutter=Shutter(0.8, 0.3, "columns", -1, (0.25, 0.5)), lag=0.1)
-    for name, value in [
-        ("lag", 1.0), ("lag", -0.1), ("pulse_length", 0.0), ("pulse_start", 7.0), ("pulse_start", None)
-    ]:  # fmt: skip
-        write_scan(path, pulsed)
-        with h5py.File(path, "r+") as file:
-            del file[f"entry/phyradgs/{name}"]
-            if value is not None:
-                file[f"entry/phyradgs/{name}"] = value
-        with pytest.raises(InputError, match=f"/entry/phyradgs/{name}"):
-            again_of(path)
-
-
 def test_fly_rule_follows_motion_and_exposure(path, make_scan) -> None:
     write_scan(path, make_scan())
     assert again_of(path).is_fly

@@ -88,36 +88,28 @@ def _set(name: str, value: object, units: str | None = None):
     return damage
 
 
-VOLUME, GAUSSIANS = "entry/reconstruction/volume", "entry/gaussians"
-DISAGREEMENT = "entry/reconstruction/disagreement"
+VOLUME, DISAGREEMENT = "entry/reconstruction/volume", "entry/reconstruction/disagreement"
+# beyond tests/corpus, which damages every object of a volume in every way
 DAMAGE = {
-    "no volume": (lambda f: f.pop(VOLUME), VOLUME), "flat volume": (_set(VOLUME, np.zeros((2, 3))), VOLUME),
-    "text": (_set(VOLUME, "no"), VOLUME), "other shape": (_set(VOLUME, np.zeros((3, 3, 4))), VOLUME),
-    "NaN": (_set(VOLUME, np.full(GRID.shape, np.nan)), VOLUME),
-    "units": (_set(VOLUME, np.zeros(GRID.shape), "HU"), f"{VOLUME} @units"),
+    "other shape": (_set(VOLUME, np.zeros((3, 3, 4))), VOLUME),
     "another disagreement": (_set(DISAGREEMENT, np.zeros((2, 3, 3))), DISAGREEMENT),
     "NaN in it": (_set(DISAGREEMENT, np.full(GRID.shape, np.nan)), DISAGREEMENT),
     "voxels": (_set("entry/grid/voxel_size", [1.0, 0.0, 1.0], "mm"), "entry/grid/voxel_size"),
-    "facts": (_set("entry/provenance/json", "[1"), "entry/provenance/json"),
     "facts a list": (_set("entry/provenance/json", "[1]"), "entry/provenance/json"),
-    "gaussians": (_set(f"{GAUSSIANS}/density", [1, 2, 3, 4, np.inf]), f"{GAUSSIANS}/density"),
-    "other gaussians": (_set(f"{GAUSSIANS}/scale", np.ones((4, 3))), f"{GAUSSIANS}/scale"),
-    "a negative scale": (_set(f"{GAUSSIANS}/scale", -np.ones((5, 3))), f"{GAUSSIANS}/scale"),
-    "no mean": (lambda f: f.pop(f"{GAUSSIANS}/mean"), f"{GAUSSIANS}/mean"),
-    "elsewhere": (_set(GAUSSIANS, h5py.ExternalLink("o.h5", "/")), GAUSSIANS),
+    "a negative scale": (_set("entry/gaussians/scale", -np.ones((5, 3))), "entry/gaussians/scale"),
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("case", DAMAGE)
-def test_damage_is_named(stored, case) -> None:
+def test_damage_is_named(stored) -> None:
     path, _, _ = stored
-    damage, address = DAMAGE[case]
-    with h5py.File(path, "r+") as file:
-        damage(file)
-    with pytest.raises(InputError) as caught:
-        read_volume(path)
-    assert caught.value.subject == f"{path}:/{address}"
-    assert "\n" not in str(caught.value)
+    content = path.read_bytes()
+    for damage, address in DAMAGE.values():
+        path.write_bytes(content)
+        with h5py.File(path, "r+") as file:
+            damage(file)
+        with pytest.raises(InputError) as caught:
+            read_volume(path)
+        assert caught.value.subject == f"{path}:/{address}"
 
 
 def test_kinds(tmp_path, stored) -> None:

@@ -49,60 +49,40 @@ def options_of(method: str, model: str, iterations: int = 4):
 
 @pytest.mark.parametrize("model", MODELS)
 @pytest.mark.parametrize("method", ITERATIVE)
-def test_an_iteration_moves_numbers_alone(scan, method, model) -> None:
-    rt = Runtime()
-    seen: list[Traffic] = []
-    plan = RunPlan(method, options_of(method, model))
-    result = reconstruct(scan, plan, rt, report=lambda p: seen.append(replace(rt.traffic)))
-    moved = np.diff([(t.bytes_up, t.bytes_down, t.blocking) for t in seen], axis=0)
-    assert len(moved) == 3
-    assert moved[:, 1].min() > 0, "the record has numbers, which somebody has to have asked for"
-    assert moved[:, :2].sum(axis=1).max() <= MOST_BYTES and moved[:, 2].max() <= MOST_WAITS[method]
-    assert rt.traffic.bytes_down - seen[-1].bytes_down == result.volume.nbytes
-    again = reconstruct(scan, RunPlan(method, options_of(method, model)), Runtime())
-    np.testing.assert_array_equal(again.volume, result.volume)
-
-
-@pytest.mark.parametrize("model", MODELS)
-@pytest.mark.parametrize("method", ITERATIVE)
-def test_the_host_comes_to_the_same_volume(scan, monkeypatch, method, model) -> None:
-    """Where the device has too little room for all: the same lines over NumPy's arrays."""
+def test_a_run_on_the_device_and_one_on_the_host(scan, monkeypatch, method, model) -> None:
+    """Numbers alone cross the bus; the room that is asked for is enough and not far more than is used; the same bits twice.
+    Where the device has too little room for all, the same lines over NumPy's arrays come to the same volume."""
+    resident, volume_bytes, frames_bytes = System.resident, 4 * int(np.prod(GRID.shape)), scan.projections.nbytes
     spaces: list[object] = []
-    resident = System.resident
+    asked: list[int] = []
 
     def noted(self: System, rt: Runtime, volumes: int, frames: int) -> System:
         found = resident(self, rt, volumes, frames)
         spaces.append(found.space)
-        return found
-
-    monkeypatch.setattr(System, "resident", noted)
-    rt = Runtime()
-    on_device = reconstruct(scan, RunPlan(method, options_of(method, model)), rt)
-    tight = Runtime(memory=int(0.9 * rt.peak_bytes))
-    on_host = reconstruct(scan, RunPlan(method, options_of(method, model)), tight)
-    assert [isinstance(space, DeviceSpace) for space in spaces] == [True, False]
-    error = np.linalg.norm(on_host.volume - on_device.volume) / np.linalg.norm(on_host.volume)
-    assert error <= RESIDENT[method]
-    assert on_host.record[-1]["residual"] == pytest.approx(on_device.record[-1]["residual"], rel=1e-4)
-
-
-@pytest.mark.parametrize("model", MODELS)
-@pytest.mark.parametrize("method", ITERATIVE)
-def test_a_method_holds_what_it_says(scan, monkeypatch, method, model) -> None:
-    """The room that is asked for is enough, and not far more than is used."""
-    rt, asked = Runtime(), []
-    resident, volume_bytes, frames_bytes = System.resident, 4 * int(np.prod(GRID.shape)), scan.projections.nbytes
-
-    def noted(self: System, rt: Runtime, volumes: int, frames: int) -> System:
-        found = resident(self, rt, volumes, frames)
         more = (0, 0) if self.intensity is None else self.intensity.holds
         operators_bytes = rt.ledger.held_bytes - self.measured.nbytes
         asked.append(operators_bytes + (volumes + more[0]) * volume_bytes + (frames + more[1]) * frames_bytes)
         return found
 
+    plan, rt = RunPlan(method, options_of(method, model)), Runtime()
+    seen: list[Traffic] = []
+    on_device = reconstruct(scan, plan, rt, report=lambda p: seen.append(replace(rt.traffic)))
+    moved = np.diff([(t.bytes_up, t.bytes_down, t.blocking) for t in seen], axis=0)
+    assert len(moved) == 3
+    assert moved[:, 1].min() > 0, "the record has numbers, which somebody has to have asked for"
+    assert moved[:, :2].sum(axis=1).max() <= MOST_BYTES and moved[:, 2].max() <= MOST_WAITS[method]
+    assert rt.traffic.bytes_down - seen[-1].bytes_down == on_device.volume.nbytes
+
     monkeypatch.setattr(System, "resident", noted)
-    reconstruct(scan, RunPlan(method, options_of(method, model, 3)), rt)
-    assert 0.5 * asked[0] <= rt.peak_bytes <= asked[0]
+    quiet = Runtime()
+    again = reconstruct(scan, plan, quiet)
+    np.testing.assert_array_equal(again.volume, on_device.volume)
+    assert 0.5 * asked[0] <= quiet.peak_bytes <= asked[0]
+    on_host = reconstruct(scan, plan, Runtime(memory=int(0.9 * quiet.peak_bytes)))
+    assert [isinstance(space, DeviceSpace) for space in spaces] == [True, False]
+    error = np.linalg.norm(on_host.volume - on_device.volume) / np.linalg.norm(on_host.volume)
+    assert error <= RESIDENT[method]
+    assert on_host.record[-1]["residual"] == pytest.approx(on_device.record[-1]["residual"], rel=1e-4)
 
 
 def test_reports_alone_download(scan) -> None:

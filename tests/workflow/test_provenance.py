@@ -16,6 +16,7 @@ from phyradgs_cl.workflow.files import load_scan
 from phyradgs_cl.workflow.sweep import RESULTS, plan_sweep, read_grid
 from phyradgs_cl.workflow.sweep.tables import is_sound, write_tables
 
+pytestmark = pytest.mark.usefixtures("fast_pictures")
 ABSURD = {
     "half a surrogate pair": "x\udcff\ud800",
     "a control": "x\x1b[2J\0",

@@ -199,8 +199,7 @@ def test_a_folder_that_is_away_for_a_while_is_waited_for(job, drop, rt, monkeypa
     assert caplog.text.count("cannot be read") == 1 and outputs(job) == ["a.h5"]
 
 
-@pytest.mark.parametrize(("number", "status"), [(signal.SIGTERM, 143), (signal.SIGINT, 130)])
-def test_a_signal_keeps_a_checkpoint_that_the_next_start_goes_on_from(job, drop, number, status) -> None:
+def test_a_signal_keeps_a_checkpoint_that_the_next_start_goes_on_from(job, drop) -> None:
     drop("long.h5")
     command = [sys.executable, "-m", "phyradgs_cl", "watch", str(job.folder), "-o", str(job.output)]
     command += ["--method", "sirt", "--iterations", "1000000"]
@@ -218,9 +217,9 @@ def test_a_signal_keeps_a_checkpoint_that_the_next_start_goes_on_from(job, drop,
         return process
 
     process = started_until_a_new_checkpoint()
-    process.send_signal(number)
+    process.send_signal(signal.SIGTERM)
     _, said = process.communicate(timeout=60)
-    assert process.returncode == status
+    assert process.returncode == 143
     assert said.splitlines()[-1].startswith("phyradgs: interrupted: finished volumes are in")
     assert outputs(job) == [] and checkpoint.exists()
     assert [path.name for path in job.output.iterdir()] == [".work"]  # no lock is left
