@@ -9,16 +9,14 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from phyradgs_cl.parallel.communicator import Communicator
+from phyradgs_cl.parallel.ranks import Communicator
 
 _BITS = 62
 _NOT_FINITE = 100_000  # more than any float's exponent
 _BLOCK_VALUES = 1 << 20
 
 
-def exact_sum(
-    ranks: Communicator, parts: Sequence[np.ndarray], shape: tuple[int, int], terms: int
-) -> np.ndarray:
+def exact_sum(ranks: Communicator, parts: Sequence[np.ndarray], shape: tuple[int, int], terms: int) -> np.ndarray:
     """Sums all ranks' ``parts``, each of ``shape`` (rows, n) float32; ``terms`` counts them over all ranks.
 
     Returns the sum (rows, n) float32 on every rank. Rows with a non-finite number become NaN. ``parts`` may be empty.

@@ -12,7 +12,7 @@ import numpy as np
 
 from phyradgs_cl.checks import ceil_div
 from phyradgs_cl.errors import DeviceError
-from phyradgs_cl.parallel import Alone, Communicator
+from phyradgs_cl.parallel import Communicator
 from phyradgs_cl.runtime.device import DeviceInfo, choose_device
 from phyradgs_cl.runtime.memory import (
     DeviceArray,
@@ -54,7 +54,7 @@ class Runtime:
         ranks: Communicator | None = None,
     ) -> None:
         limit_bytes = memory_limit(memory)
-        self.ranks: Communicator = Alone() if ranks is None else ranks
+        self.ranks = Communicator() if ranks is None else ranks
         self.device: DeviceInfo
         self.device, self.reason = choose_device(device, self.ranks.local_rank)
         self.ledger = MemoryLedger(self.device, limit_bytes)

@@ -12,7 +12,7 @@ from phyradgs_cl.errors import InputError, NumericalError
 from phyradgs_cl.io import checkpoint_path, read_volume
 from phyradgs_cl.neural.field import first_field
 from phyradgs_cl.neural.trainer import Trainer
-from phyradgs_cl.parallel import Alone
+from phyradgs_cl.parallel import Communicator
 from phyradgs_cl.reconstructors import METHODS, RunPlan, method_options
 from phyradgs_cl.reconstructors import reconstruct as run_method
 from phyradgs_cl.reconstructors.loop import Loop
@@ -95,7 +95,7 @@ def small_run(scan: Scan) -> Loop:
     """Three passes of naf, not begun yet."""
     options = method_options("naf", None, SHORT["naf"])
     trainer = Trainer(scan, options, first_field(options, 16, 0), torch.device("cpu"), 1.0, 0)
-    return Loop(_Passes(trainer, 3), Alone(), ignore_progress, 0.0)
+    return Loop(_Passes(trainer, 3), Communicator(), ignore_progress, 0.0)
 
 
 def test_a_run_goes_on_from_the_middle_of_a_pass(scan) -> None:

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from phyradgs_cl.parallel import Alone, exact_sum
+from phyradgs_cl.parallel import Communicator, exact_sum
 
 
 def parts(count: int = 12, rows: int = 13, columns: int = 501) -> list[np.ndarray]:
@@ -15,18 +15,18 @@ def parts(count: int = 12, rows: int = 13, columns: int = 501) -> list[np.ndarra
 
 def test_it_is_the_sum_to_a_float_of_the_row_s_largest() -> None:
     given = parts()
-    found = exact_sum(Alone(), given, given[0].shape, len(given))
+    found = exact_sum(Communicator(), given, given[0].shape, len(given))
     expected = np.sum(np.asarray(given, np.float64), axis=0)
     largest = np.abs(given).max(axis=(0, 2))
     last_place = np.spacing(np.abs(expected).astype(np.float32))
     assert np.all(np.abs(found - expected) <= last_place + 1e-10 * largest[:, None])
     many = [np.full((1, 2), np.float32(2.0**100))] * 64  # the largest floats do not overflow
-    np.testing.assert_array_equal(exact_sum(Alone(), many, (1, 2), 64), np.float32(2.0**106))
+    np.testing.assert_array_equal(exact_sum(Communicator(), many, (1, 2), 64), np.float32(2.0**106))
 
 
 def test_same_bits_on_any_number_of_ranks_in_any_order(ranks_of) -> None:
     given = parts()
-    alone = exact_sum(Alone(), given[::-1], given[0].shape, len(given))
+    alone = exact_sum(Communicator(), given[::-1], given[0].shape, len(given))
 
     def work(ranks) -> np.ndarray:
         return exact_sum(ranks, given[ranks.rank :: ranks.size], given[0].shape, len(given))

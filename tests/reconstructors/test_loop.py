@@ -8,7 +8,7 @@ import pytest
 
 from phyradgs_cl.errors import NumericalError
 from phyradgs_cl.fields import Grid
-from phyradgs_cl.parallel import Alone
+from phyradgs_cl.parallel import Communicator
 from phyradgs_cl.reconstructors import Progress
 from phyradgs_cl.reconstructors.loop import Loop
 
@@ -43,7 +43,7 @@ class Halving:
 
 
 def loop_of(report: Callable[[Progress], None], every: int = 1, record_every: int = 1) -> Loop:
-    return Loop(Halving(), Alone(), report, time.perf_counter(), record_every, every)
+    return Loop(Halving(), Communicator(), report, time.perf_counter(), record_every, every)
 
 
 def iterations_of(loop: Loop) -> list[float]:

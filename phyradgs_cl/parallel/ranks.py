@@ -1,11 +1,12 @@
-"""Ranks of an MPI launch: how this process was started, and the communicator through mpi4py.
+"""The processes (ranks) that work on the same scan: their launch, communication, shares of work; failing together.
 
 mpi4py is imported only where several processes were launched.
 """
 
 import os
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, NoReturn
@@ -13,17 +14,11 @@ from typing import Any, NoReturn
 import numpy as np
 
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.parallel.communicator import Alone, Communicator
 
 # (rank, size, rank on this machine, ranks on this machine) in the names of the launchers
+_NAMES = ("RANK", "SIZE", "LOCAL_RANK", "LOCAL_SIZE")
 _LAUNCHERS = (
-    (
-        "OMPI_COMM_WORLD_RANK",
-        "OMPI_COMM_WORLD_SIZE",
-        "OMPI_COMM_WORLD_LOCAL_RANK",
-        "OMPI_COMM_WORLD_LOCAL_SIZE",
-    ),
-    ("MV2_COMM_WORLD_RANK", "MV2_COMM_WORLD_SIZE", "MV2_COMM_WORLD_LOCAL_RANK", "MV2_COMM_WORLD_LOCAL_SIZE"),
+    *(tuple(f"{mpi}_COMM_WORLD_{name}" for name in _NAMES) for mpi in ("OMPI", "MV2")),
     ("PMI_RANK", "PMI_SIZE", "MPI_LOCALRANKID", "MPI_LOCALNRANKS"),
     ("PMIX_RANK", "SLURM_STEP_NUM_TASKS", "SLURM_LOCALID", "SLURM_STEP_TASKS_PER_NODE"),
 )
@@ -64,29 +59,47 @@ def _count(text: str | None) -> int | None:
     return int(number) if number.isdigit() else None
 
 
-@lru_cache(maxsize=1)
-def launched_ranks(launch: Launch | None = None) -> Communicator:
-    """Returns the ranks that this process was launched with, or ``Alone``.
+class Communicator:
+    """``size`` processes (ranks) with one scan; this class itself is a single process.
 
-    Raises InputError where mpi4py is missing, or belongs to another MPI than the launcher.
+    All ranks call every method except the last two, in the same order. ``sent_bytes`` counts what this rank has given to
+    sums and gathers.
     """
-    start = launched() if launch is None else launch
-    if start.size == 1:
-        return Alone()
-    try:
-        from mpi4py import MPI
-    except ImportError as error:
-        subject = f"rank {start.rank} of {start.size}"
-        remedy = 'pip install "phyradgs-cl[mpi]", or start it without mpiexec'
-        raise InputError(subject, "no package mpi4py", "the extra mpi", remedy) from error
-    world = MPI.COMM_WORLD
-    if world.size != start.size:
-        remedy = "start it with the mpiexec that mpi4py was built for (with srun: --mpi=pmi2 or pmix)"
-        raise InputError("mpi4py", f"{world.size} of {start.size} processes", "all of them", remedy)
-    return Mpi(world, start)
+
+    rank, size, local_rank, local_size = 0, 1, 0, 1
+    sent_bytes = 0
+
+    def allreduce_sum(self, values: np.ndarray) -> None:
+        """Sums contiguous ``values`` over all ranks, in place: integers, or numbers that are 0 on all ranks except one.
+
+        Both are exact in any order of summation; for other values there is ``exact_sum``.
+        """
+
+    def allreduce_max(self, values: np.ndarray) -> None:
+        """Replaces contiguous ``values`` by their maxima over all ranks, in place."""
+
+    def any(self, flag: bool) -> bool:
+        """True where ``flag`` is set on any rank."""
+        return flag
+
+    def bcast(self, value: Any) -> Any:
+        """Returns rank 0's ``value`` on every rank."""
+        return value
+
+    def allgather(self, values: np.ndarray) -> np.ndarray:
+        """Concatenates the arrays (n, ...) of all ranks along their first axis, in the order of the ranks."""
+        return values
+
+    def all_fail(self) -> bool:
+        """Waits, on a rank that fails, for the others: True if all ranks fail within a few seconds."""
+        return True
+
+    def abort(self, status: int) -> NoReturn:
+        """Ends all ranks at once with the exit status ``status``."""
+        raise SystemExit(status)
 
 
-class Mpi:
+class Mpi(Communicator):
     """A ``Communicator`` over an mpi4py communicator."""
 
     def __init__(self, comm: Any, launch: Launch) -> None:
@@ -140,3 +153,44 @@ class Mpi:
     def abort(self, status: int) -> NoReturn:
         self._comm.Abort(status)
         raise SystemExit(status)
+
+
+@lru_cache(maxsize=1)
+def launched_ranks(launch: Launch | None = None) -> Communicator:
+    """Returns the ranks that this process was launched with, or a single process.
+
+    Raises InputError where mpi4py is missing, or belongs to another MPI than the launcher.
+    """
+    start = launched() if launch is None else launch
+    if start.size == 1:
+        return Communicator()
+    try:
+        from mpi4py import MPI
+    except ImportError as error:
+        subject = f"rank {start.rank} of {start.size}"
+        remedy = 'pip install "phyradgs-cl[mpi]", or start it without mpiexec'
+        raise InputError(subject, "no package mpi4py", "the extra mpi", remedy) from error
+    world = MPI.COMM_WORLD
+    if world.size != start.size:
+        remedy = "start it with the mpiexec that mpi4py was built for (with srun: --mpi=pmi2 or pmix)"
+        raise InputError("mpi4py", f"{world.size} of {start.size} processes", "all of them", remedy)
+    return Mpi(world, start)
+
+
+@contextmanager
+def failing_together(ranks: Communicator, report_error: Callable[[BaseException], int]) -> Iterator[None]:
+    """Raises an exception of the body where all ranks have one; if only some fail, reports it and ends all ranks.
+
+    The others would wait for a failed rank for ever. ``report_error`` prints the error and returns the exit status.
+    """
+    try:
+        yield
+    except BaseException as error:
+        if not ranks.all_fail():
+            ranks.abort(report_error(error))
+        raise
+
+
+def span(count: int, parts: int, part: int) -> range:
+    """The ``part``-th of ``parts`` runs of 0 … count−1, whose lengths differ by at most one."""
+    return range(part * count // parts, (part + 1) * count // parts)
