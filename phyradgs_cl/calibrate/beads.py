@@ -185,5 +185,4 @@ def _cosines(count: int) -> np.ndarray:
     """Returns the slowest cosines (count, n) along a side, orthonormal."""
     order = np.arange(min(_BACKGROUND, count))
     waves = np.cos(np.pi * order * (np.arange(count)[:, None] + 0.5) / count)
-    cosines: np.ndarray = waves / np.linalg.norm(waves, axis=0)
-    return cosines
+    return waves / np.linalg.norm(waves, axis=0)

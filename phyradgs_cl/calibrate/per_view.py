@@ -160,8 +160,7 @@ def _circle(scan: Scan) -> np.ndarray:
 
 
 def _fitted_circle(scan: Scan, basis: np.ndarray) -> np.ndarray:
-    circle: np.ndarray = np.linalg.lstsq(basis, _circle(scan), rcond=None)[0]
-    return circle
+    return np.linalg.lstsq(basis, _circle(scan), rcond=None)[0]
 
 
 def view_step(
@@ -216,8 +215,7 @@ def view_deviations(
 
 def _norms(basis: np.ndarray, signals: np.ndarray) -> np.ndarray:
     """Returns the norms (n, K) of each value's signal."""
-    norms: np.ndarray = np.sqrt(basis.T**2 @ np.sum(np.square(signals, dtype=np.float64), (2, 3)))
-    return norms
+    return np.sqrt(basis.T**2 @ np.sum(np.square(signals, dtype=np.float64), (2, 3)))
 
 
 def _strength(operator: RayOperator) -> float:

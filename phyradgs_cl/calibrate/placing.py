@@ -104,8 +104,7 @@ def _rigid(points: np.ndarray, targets: np.ndarray) -> np.ndarray:
 
 
 def _moved(place: np.ndarray, points: np.ndarray) -> np.ndarray:
-    moved: np.ndarray = Rotation.from_rotvec(place[:3]).apply(points) + place[3:]
-    return moved
+    return Rotation.from_rotvec(place[:3]).apply(points) + place[3:]
 
 
 def _turn_between(one: np.ndarray, other: np.ndarray) -> float:

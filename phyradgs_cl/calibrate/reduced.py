@@ -74,13 +74,11 @@ class Reduced:
         tiny = _TINY * np.eye(len(self.names))
         variance, variance_with_object = (np.diag(np.linalg.inv(gram + tiny)) for gram in (self.gram, self.whole_gram))
         certainty = variance_with_object / variance
-        shares: np.ndarray = np.sqrt(np.minimum(np.minimum(certainty, np.diag(self.gram)), 1.0))
-        return shares
+        return np.sqrt(np.minimum(np.minimum(certainty, np.diag(self.gram)), 1.0))
 
     def step(self) -> np.ndarray:
         """Returns the Gauss–Newton step (K,) in the fields' units."""
-        step: np.ndarray = np.linalg.solve(self.gram, self.unit @ self.residual) / self.sizes
-        return step
+        return np.linalg.solve(self.gram, self.unit @ self.residual) / self.sizes
 
     def deviations(self) -> np.ndarray:
         """Returns the standard deviations (K,) of the step, by a sandwich estimator with frames as the sample, so that noise
@@ -94,8 +92,7 @@ class Reduced:
         variance = np.diag(inverse @ scatter @ inverse)
         white = np.diag(inverse) * self.noise**2
         fitted_noise = max(1.0, self.noise**2 / max(float(np.mean(residual**2)), 1e-30))
-        deviations: np.ndarray = self.mismatch * np.sqrt(np.maximum(variance * fitted_noise, white)) / self.sizes
-        return deviations
+        return self.mismatch * np.sqrt(np.maximum(variance * fitted_noise, white)) / self.sizes
 
 
 def reduced(

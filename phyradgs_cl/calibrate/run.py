@@ -40,11 +40,11 @@ from phyradgs_cl.calibrate.views import ViewsEstimate, estimate_views, passes_of
 from phyradgs_cl.check import SUSPICIOUS
 from phyradgs_cl.check.coverage import CUT_OFF, check_coverage
 from phyradgs_cl.check.orbit import OTHER_CAUSE, centre_of
+from phyradgs_cl.detector import without_lag
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.phantoms import EllipsoidPhantom
 from phyradgs_cl.reconstructors.fits.axis import axis_shift, columns_per_block
 from phyradgs_cl.reconstructors.fits.residuals import residual_ratio, t_statistic
-from phyradgs_cl.reconstructors.frames.preprocess import Preprocessing, prepared
 from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.text import to_digits_of
 
@@ -80,7 +80,7 @@ def calibrate(
     InputError for unknown parameters, a scan too small, others that do not fit the first, a phantom that the frames do not
     show."""
     request = requested(what, scan, phantom is not None)
-    ready = [prepared(one, Preprocessing(ignore_lag=LAG in request.names)) for one in (scan, *others)]
+    ready = [one if LAG in request.names else without_lag(one) for one in (scan, *others)]
     _check(ready, request, phantom, splines)
     _warn(ready, phantom)
     return _Calibrator(rt, scan, ready, request, phantom, splines, report, note).run()

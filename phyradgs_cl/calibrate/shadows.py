@@ -58,8 +58,7 @@ class BeadOperator:
 def _mean_of_clipped(p: np.ndarray, sigma: float) -> np.ndarray:
     """Returns the mean of max(p + noise, 0) for normal noise: clipping raises air more than faint shadows."""
     ratio = p / sigma
-    mean: np.ndarray = p * scipy.special.ndtr(ratio) + sigma * np.exp(-(ratio**2) / 2) / math.sqrt(2 * math.pi)
-    return mean
+    return p * scipy.special.ndtr(ratio) + sigma * np.exp(-(ratio**2) / 2) / math.sqrt(2 * math.pi)
 
 
 def _poses_by_line(tables: Sequence[TimeCells]) -> tuple[np.ndarray, np.ndarray]:

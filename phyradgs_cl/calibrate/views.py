@@ -76,5 +76,4 @@ def estimate_views(
 
 def _rms_over_views(parameters: PerViewParameters, values: np.ndarray) -> np.ndarray:
     """Returns the root mean square (K,) over the views of values (n, K)."""
-    rms: np.ndarray = np.sqrt(np.mean(np.square(parameters.basis @ values), 0))
-    return rms
+    return np.sqrt(np.mean(np.square(parameters.basis @ values), 0))

@@ -31,8 +31,8 @@ from phyradgs_cl.check.orbit import (
 )
 from phyradgs_cl.check.shutter import EXPOSURE, READOUT, check_exposure, check_readout
 from phyradgs_cl.check.timing import check_angles, check_timing
+from phyradgs_cl.detector import without_lag
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.reconstructors.frames.preprocess import Preprocessing, prepared
 from phyradgs_cl.runtime import Runtime
 
 Report = Callable[[int, int, str], None]
@@ -88,7 +88,7 @@ def check(
     """Looks for what is wrong or suspicious in a scan. ``counts``: the reader of the scan's file, if it remembers counts.
 
     Raises InputError where every pixel is masked, and for NaN or infinity elsewhere."""
-    scan = prepared(_finite(scan), Preprocessing())
+    scan = without_lag(_finite(scan))
     questions = ["timing", "angles", "saturation", "dead pixels", "coverage", CONSISTENCY, SIGN, CENTRE, DISTANCES, GAIN]
     if scan.is_fly and scan.shutter.exposure_s + scan.shutter.readout_s > 0:
         questions.append(READOUT)

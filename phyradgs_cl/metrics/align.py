@@ -63,8 +63,7 @@ def block_means(values: Values, factors: tuple[int, int, int]) -> Values:
     if factors == (1, 1, 1):
         return values
     split = [part for n, factor in zip(values.shape, factors, strict=True) for part in (n // factor, factor)]
-    means: Values = values.reshape(split).mean((1, 3, 5), dtype=np.float64).astype(np.float32)
-    return means
+    return values.reshape(split).mean((1, 3, 5), dtype=np.float64).astype(np.float32)
 
 
 def in_words(grid: Grid) -> str:

@@ -156,8 +156,7 @@ class Cylinder:
         points = [c - c0 for c, c0 in zip((x, y, z), self.ends_mm[0], strict=True)]
         height = sum(a * p for a, p in zip(self.axis, points, strict=True))
         across = sum((p - a * height) ** 2 for a, p in zip(self.axis, points, strict=True))
-        inside: NDArray[np.bool_] = (across <= self.radius_mm**2) & (height >= 0) & (height <= self.length_mm)
-        return inside
+        return (across <= self.radius_mm**2) & (height >= 0) & (height <= self.length_mm)
 
 
 Body = Ellipsoid | Cylinder

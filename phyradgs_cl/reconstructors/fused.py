@@ -83,8 +83,7 @@ def fused(scan: Scan, options: FusedOptions, rt: Runtime, **arguments: Any) -> R
     def mean_of_both(volume: np.ndarray, before: np.ndarray | None) -> np.ndarray:
         assert before is not None
         halves["difference"] = volume - before
-        mean: np.ndarray = before + np.float32(options.splat_weight) * halves["difference"]
-        return mean
+        return before + np.float32(options.splat_weight) * halves["difference"]
 
     stages = fista_stages(replace(inputs, options=options.voxels()))
     stages.append(Stage("splats", options.iterations, splats, mean_of_both))

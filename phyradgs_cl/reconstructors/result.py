@@ -91,7 +91,8 @@ class Reconstruction:
         """
         from phyradgs_cl.reconstructors.plot import plot_result
 
-        return plot_result(self, scan, frame, device)
+        note = ", without the margin" if MARGIN_MM in self.facts else ""
+        return plot_result(self.volume, self.grid, self.record, scan, frame, device, note)
 
 
 def interrupted(partial: Reconstruction | None) -> KeyboardInterrupt:
@@ -125,12 +126,8 @@ class Progress:
     state: "Callable[[], State] | None" = None
     volume: "Callable[[], tuple[np.ndarray, Grid]] | None" = None
 
-
     def mapped(
-        self,
-        state: "Callable[[State], State] | None" = None,
-        volume: "VolumeMap | None" = None,
-        **changes: Any,
+        self, state: "Callable[[State], State] | None" = None, volume: "VolumeMap | None" = None, **changes: Any
     ) -> "Progress":
         """Returns the report with other fields; ``state`` and ``volume`` change what the run gives, where it gives any."""
         own_state, own_volume = self.state, self.volume
@@ -194,9 +191,7 @@ def state_arrays(state: State, names: Sequence[str]) -> list[np.ndarray]:
     """Returns arrays of a state by name; raises InputError for a state that lacks one."""
     missing = sorted(set(names) - set(state))
     if missing:
-        raise InputError(
-            "checkpoint", f"no {', '.join(missing)}", "a whole checkpoint", "start without --resume"
-        )
+        raise InputError("checkpoint", f"no {', '.join(missing)}", "a whole checkpoint", "start without --resume")
     return [state[name] for name in names]
 
 

@@ -90,7 +90,7 @@ def reconstruct(
     if result.state is not None:
         result = replace(result, state=with_identity(result.state, identity()))
     if hidden is not None and rt.ranks.rank == 0:
-        result.facts[HELD_OUT] = holdout_errors(rt, ready, hidden, result)
+        result.facts[HELD_OUT] = holdout_errors(rt, ready, hidden, result.volume, result.grid)
     if PREPARED_KEY in ready.provenance:
         result.facts[PREPARED_KEY] = ready.provenance[PREPARED_KEY]
     if box is None:

@@ -53,7 +53,7 @@ def test_noise_is_told_where_the_held_out_pixels_lie(rt, scan) -> None:
     held = held_out(scan, 5.0)
     true = float(np.sqrt(np.mean((scan.projections - clean.projections)[held] ** 2)))
     truth = Reconstruction(scan.reference, scan.grid)
-    errors = holdout_errors(rt, scan, held, truth)
+    errors = holdout_errors(rt, scan, held, truth.volume, truth.grid)
     assert errors["holdout_noise_rms"] == pytest.approx(true, rel=0.15)
     assert errors["holdout_pixels"] == held.sum()
 

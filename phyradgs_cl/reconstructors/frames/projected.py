@@ -15,7 +15,6 @@ from phyradgs_cl.detector import noise_rms
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.operators import RayOperator
-from phyradgs_cl.reconstructors.result import Reconstruction
 from phyradgs_cl.runtime import Runtime
 
 TIMES_PER_LINE = 16  # samples of a line's exposure, whose error is far below the noise
@@ -52,9 +51,7 @@ def _rms(values: NDArray[np.floating]) -> float:
     return float(np.sqrt(np.mean(values.astype(np.float64) ** 2))) if values.size else 0.0
 
 
-def frame_pairs(
-    rt: Runtime, scan: Scan, volume: np.ndarray, grid: Grid, frames: Sequence[int]
-) -> list[FramePair]:
+def frame_pairs(rt: Runtime, scan: Scan, volume: np.ndarray, grid: Grid, frames: Sequence[int]) -> list[FramePair]:
     """Returns some frames of a scan with those of a volume (nz, ny, nx) in 1/mm, under the scan's true motion.
 
     For a detector that averages intensity the computed frames do so too.
@@ -82,15 +79,16 @@ def held_out(scan: Scan, percent: float, seed: int = _HOLDOUT_SEED, subject: str
     return held
 
 
-def holdout_errors(rt: Runtime, scan: Scan, held: np.ndarray, result: Reconstruction) -> dict[str, float]:
-    """Returns the RMS residual at held-out pixels (F, v, u), the part of it that is their own noise, and their number.
+def holdout_errors(rt: Runtime, scan: Scan, held: np.ndarray, volume: np.ndarray, grid: Grid) -> dict[str, float]:
+    """Returns the RMS residual of a volume (nz, ny, nx) in 1/mm at held-out pixels (F, v, u), the part of it that is their
+    own noise, and their number.
 
     No reconstruction can have a smaller true error than the noise. Both are dimensionless, as line integrals are.
     """
     squares = 0.0
     for first in range(0, scan.frames, _HOLDOUT_FRAMES):
         frames = range(first, min(first + _HOLDOUT_FRAMES, scan.frames))
-        for pair in frame_pairs(rt, scan, result.volume, result.grid, frames):
+        for pair in frame_pairs(rt, scan, volume, grid, frames):
             squares += float(np.sum(np.square(pair.residual[held[pair.frame]], dtype=np.float64)))
     count = int(held.sum())
     noise = noise_rms(scan.projections, held, scan.valid)

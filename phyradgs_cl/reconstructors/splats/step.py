@@ -5,7 +5,6 @@ their gradients sum to bits that depend on the batch, not on the number of ranks
 """
 
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 
@@ -96,29 +95,19 @@ class FrameStep:
         )
 
 
-class Sharing(Protocol):
-    """The work that all ranks do together, in the same order."""
-
-    def differentiate(self, step: FrameStep, cloud: DeviceCloud, batch: Batch) -> None:
-        """Writes dL/draw of the batch into the cloud's gradients and adds to its statistics."""
-        ...
-
-    def loss(self, step: FrameStep) -> float:
-        """Mean loss of the frames of the last batch."""
-        ...
-
-
 class Alone:
     """One process, one frame per step."""
 
     def differentiate(self, step: FrameStep, cloud: DeviceCloud, batch: Batch) -> None:
+        """Writes dL/draw of the batch into the cloud's gradients and adds to its statistics."""
         step.gradient(cloud, batch.frames[0], batch.corners[0], batch.late, cloud.statistics)
 
     def loss(self, step: FrameStep) -> float:
+        """Returns the mean loss of the frames of the last batch."""
         return step.loss.value()
 
 
-class SharedFrames:
+class SharedFrames(Alone):
     """Several frames per step: rank r has frames r, r + ranks, … of the batch."""
 
     def __init__(self, ranks: Communicator) -> None:
@@ -144,7 +133,7 @@ class SharedFrames:
         return float(losses.mean())
 
 
-def sharing_of(ranks: Communicator, batch: int) -> Sharing:
+def sharing_of(ranks: Communicator, batch: int) -> Alone:
     """Returns how ``ranks`` share steps of ``batch`` frames. Raises InputError if some would have no frame."""
     if ranks.size > batch:
         found = f"{batch} for {ranks.size} ranks"

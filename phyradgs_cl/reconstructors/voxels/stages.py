@@ -137,5 +137,4 @@ def merge_subvoxels(volume: np.ndarray, before: np.ndarray | None, parts: int) -
     nz, ny, nx = before.shape
     blocks = volume.reshape(nz, parts, ny, parts, nx, parts)
     means = blocks.mean((1, 3, 5), dtype=np.float64).astype(np.float32)
-    merged: np.ndarray = before + _SUBVOXEL_SHARE * (means - before)
-    return merged
+    return before + _SUBVOXEL_SHARE * (means - before)

@@ -8,7 +8,7 @@ import logging
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Protocol, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -26,20 +26,6 @@ _FAINTEST = 1e-6  # of the largest sum over a voxel's rays
 S = TypeVar("S", bound="SharedOperator")
 
 
-class Intensity(Protocol):
-    """The function I of a detector that averages intensity, and its derivative J."""
-
-    def expected(self, volume: np.ndarray) -> np.ndarray:
-        """Returns I(x) (F, rows, columns) float32 of a volume (nz, ny, nx) in 1/mm. J is that at x from then on."""
-        ...
-
-    def forward(self, volume: np.ndarray) -> np.ndarray: ...
-
-    def adjoint(self, frames: np.ndarray) -> np.ndarray: ...
-
-    def subset(self, frames: Sequence[int]) -> "Intensity": ...
-
-
 @dataclass(frozen=True, eq=False)
 class System:
     """Operator A and measurement p (F, rows, columns) float32. Volumes (nz, ny, nx) and frames are arrays of ``space``.
@@ -54,7 +40,7 @@ class System:
     operator: LinearOperator
     measured: Any
     valid: Any = None
-    intensity: Intensity | None = None
+    intensity: "IntensityOperator | SharedIntensity | None" = None
     transmission: Any = None
     space: Space[Any] = HostSpace()
 
@@ -65,7 +51,7 @@ class System:
         operator: LinearOperator = RayOperator(rt, scan.grid, scan.geometry.detector_shape, tables)
         measured = np.asarray(scan.projections, np.float32)
         model = scan.detector_model if detector_model == "scan" else detector_model
-        intensity: Intensity | None = None
+        intensity: IntensityOperator | SharedIntensity | None = None
         if model == "intensity" and any(table.averages for table in tables):  # both models agree on a single value
             alone = IntensityOperator(rt, scan.grid, scan.geometry.detector_shape, tables)
             intensity = SharedIntensity(rt.ranks, alone) if rt.ranks.size > 1 else alone
