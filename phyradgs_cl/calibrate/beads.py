@@ -38,11 +38,7 @@ class BeadProblem(CoarseFrames):
 
     @classmethod
     def of(
-        cls,
-        phantom: EllipsoidPhantom,
-        start: np.ndarray,
-        scans: Sequence[Scan],
-        stage: Stage,
+        cls, phantom: EllipsoidPhantom, start: np.ndarray, scans: Sequence[Scan], stage: Stage,
         most_frames: int = MOST_FRAMES,
     ) -> "BeadProblem":
         """Makes the scans as coarse as the stage says."""

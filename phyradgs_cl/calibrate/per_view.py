@@ -164,12 +164,8 @@ def _fitted_circle(scan: Scan, basis: np.ndarray) -> np.ndarray:
 
 
 def view_step(
-    problem: CoarseProblem,
-    correction: GeometryCorrection,
-    parameters: PerViewParameters,
-    volume: np.ndarray,
-    kinds: Sequence[int],
-    iterations: int,
+    problem: CoarseProblem, correction: GeometryCorrection, parameters: PerViewParameters, volume: np.ndarray,
+    kinds: Sequence[int], iterations: int,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Returns the Gauss–Newton step (n, K) from the parameters' values for the object ``volume``, 0 for other kinds than
     ``kinds``. Also returns the signals (F, kinds, rows, columns) of one pixel's worth of each kind."""
@@ -195,11 +191,8 @@ def view_step(
 
 
 def view_deviations(
-    problem: CoarseProblem,
-    correction: GeometryCorrection,
-    parameters: PerViewParameters,
-    signals: np.ndarray,
-    iterations: int,
+    problem: CoarseProblem, correction: GeometryCorrection, parameters: PerViewParameters,
+    signals: np.ndarray, iterations: int,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Returns the standard deviations (K,) of a view's parameters, and the shares (K,) of their signals (F, K, rows,
     columns) that no object explains. Errors of the values that make up a view are taken as independent."""
@@ -226,10 +219,7 @@ def _strength(operator: RayOperator) -> float:
 
 
 def _signal(
-    problem: CoarseProblem,
-    correction: GeometryCorrection,
-    parameters: PerViewParameters,
-    volume: np.ndarray,
+    problem: CoarseProblem, correction: GeometryCorrection, parameters: PerViewParameters, volume: np.ndarray,
     kind: int,
 ) -> np.ndarray:
     """Returns the change of the frames (F, rows, columns) per pixel's worth of a kind in each view."""

@@ -96,11 +96,8 @@ class Reduced:
 
 
 def reduced(
-    problem: CoarseProblem | BeadProblem,
-    parameters: Sequence[Parameter],
-    at: Mapping[str, float],
-    volume: np.ndarray,
-    iterations: int,
+    problem: CoarseProblem | BeadProblem, parameters: Sequence[Parameter], at: Mapping[str, float],
+    volume: np.ndarray, iterations: int,
 ) -> Reduced:
     """Linearises the frames about the parameters' values ``at`` (by name) and the object ``volume``."""
     operator: Any = problem.operator(correction_of(at))  # of the kind that takes the problem's objects

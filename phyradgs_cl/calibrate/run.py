@@ -62,14 +62,9 @@ _ORDER_ERRORS, _ORDER_RATIO = 4.0, 1.04  # of the other readout direction's resi
 
 
 def calibrate(
-    scan: Scan,
-    rt: Runtime,
-    what: str | None = None,
-    others: Sequence[Scan] = (),
-    report: Report = lambda done, total, text, share: None,
-    phantom: EllipsoidPhantom | None = None,
-    splines: int = 0,
-    note: Callable[[str], None] = lambda line: None,
+    scan: Scan, rt: Runtime, what: str | None = None, others: Sequence[Scan] = (),
+    report: Report = lambda done, total, text, share: None, phantom: EllipsoidPhantom | None = None,
+    splines: int = 0, note: Callable[[str], None] = lambda line: None,
 ) -> Calibration:
     """Estimates a scan's true geometry and timing, as far as its frames determine them.
 

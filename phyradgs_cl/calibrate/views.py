@@ -36,12 +36,8 @@ def passes_of_views(scan: Scan, stages: Sequence[Stage], kinds: int) -> Passes:
 
 
 def estimate_views(
-    rt: Runtime,
-    scan: Scan,
-    parameters: PerViewParameters,
-    stages: Sequence[Stage],
-    correction: GeometryCorrection,
-    passes: PassCounter,
+    rt: Runtime, scan: Scan, parameters: PerViewParameters, stages: Sequence[Stage],
+    correction: GeometryCorrection, passes: PassCounter,
 ) -> ViewsEstimate:
     """Estimates ``parameters`` of a scan after ``correction``, in a few Gauss–Newton steps per stage.
 

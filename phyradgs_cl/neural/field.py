@@ -47,11 +47,7 @@ def voxel_values(
 
 @torch.no_grad()
 def _in_rows(
-    field: NeuralField,
-    grid: Grid,
-    order: tuple[int, int, int],
-    device: torch.device,
-    points_at_once: int,
+    field: NeuralField, grid: Grid, order: tuple[int, int, int], device: torch.device, points_at_once: int,
     points: int,
 ) -> np.ndarray:
     """The voxels of a grid whose axes are z, y, x in another ``order``, with segments along its last.
@@ -95,11 +91,8 @@ def first_field(options: NeuralOptions, longest_voxels: int, seed: int) -> Neura
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         encoding = HashEncoding(
-            options.levels_for(longest_voxels),
-            options.features,
-            options.base_resolution,
-            options.level_growth,
-            options.table_log2,
+            options.levels_for(longest_voxels), options.features, options.base_resolution,
+            options.level_growth, options.table_log2,
         )
         if isinstance(options, LineOptions):
             return NeuralField(encoding, sax_network(encoding.width, options), options.segment)

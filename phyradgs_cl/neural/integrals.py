@@ -32,11 +32,7 @@ def sample_shifts(rays: int, samples: int, jitter: str, rng: np.random.Generator
 
 
 def line_integrals(
-    field: Field,
-    source: torch.Tensor,
-    direction: torch.Tensor,
-    half_sides: torch.Tensor,
-    samples: int,
+    field: Field, source: torch.Tensor, direction: torch.Tensor, half_sides: torch.Tensor, samples: int,
     shifts: torch.Tensor,
 ) -> torch.Tensor:
     """Integrals (R,) of a field along rays (R, 3), a sample in each of ``samples`` equal intervals inside the box.

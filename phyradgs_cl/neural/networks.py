@@ -50,11 +50,8 @@ class LineAttentionBlocks(nn.Module):
         )
         self.feed_forward = nn.ModuleList(
             nn.Sequential(
-                nn.LayerNorm(width),
-                nn.Linear(width, _WIDER * width, bias=False),
-                nn.GELU(),
-                nn.Linear(_WIDER * width, _WIDER * width, bias=False),
-                nn.GELU(),
+                nn.LayerNorm(width), nn.Linear(width, _WIDER * width, bias=False), nn.GELU(),
+                nn.Linear(_WIDER * width, _WIDER * width, bias=False), nn.GELU(),
                 nn.Linear(_WIDER * width, width, bias=False),
             )
             for _ in range(blocks)

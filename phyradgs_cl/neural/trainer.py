@@ -24,13 +24,8 @@ class Trainer:
     """
 
     def __init__(
-        self,
-        scan: Scan,
-        options: NeuralOptions,
-        field: NeuralField,
-        device: torch.device,
-        density_per_mm: float,
-        seed: int,
+        self, scan: Scan, options: NeuralOptions, field: NeuralField, device: torch.device,
+        density_per_mm: float, seed: int,
     ) -> None:
         self.scan, self.options, self.device = scan, options, device
         self.field = field.to(device)

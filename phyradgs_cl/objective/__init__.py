@@ -13,14 +13,6 @@ from phyradgs_cl.objective.terms import (
 from phyradgs_cl.objective.tv import TvDescent, TvProx
 
 __all__ = [
-    "DctProx",
-    "ImageLoss",
-    "NonlocalStep",
-    "ParameterTerms",
-    "TotalVariation",
-    "TvDescent",
-    "TvProx",
-    "image_loss",
-    "parameter_loss",
-    "total_variation",
+    "DctProx", "ImageLoss", "NonlocalStep", "ParameterTerms", "TotalVariation", "TvDescent", "TvProx",
+    "image_loss", "parameter_loss", "total_variation",
 ]

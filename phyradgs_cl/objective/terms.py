@@ -29,13 +29,7 @@ class ImageLoss:
     """Loss and gradient of a frame of ``lines`` lines by ``width`` pixels, in the padded image layout."""
 
     def __init__(
-        self,
-        rt: Runtime,
-        lines: int,
-        width: int,
-        pitch: int,
-        ssim_weight: float,
-        l1_weight: float = 1.0,
+        self, rt: Runtime, lines: int, width: int, pitch: int, ssim_weight: float, l1_weight: float = 1.0,
         poisson_weight: float = 0.0,
     ) -> None:
         self.rt, self.lines, self.width, self.pitch = rt, lines, width, pitch
@@ -51,11 +45,7 @@ class ImageLoss:
         self.gradient = rt.zeros(image + GUARD)
 
     def evaluate(
-        self,
-        rendered: DeviceArray,
-        measured: DeviceArray,
-        mask: DeviceArray,
-        pixels: float,
+        self, rendered: DeviceArray, measured: DeviceArray, mask: DeviceArray, pixels: float,
         transmission: DeviceArray | None = None,
     ) -> DeviceArray:
         """Returns dL/drendered, valid until the next call; ``mask`` is 1 where a pixel counts, ``pixels`` its sum.
@@ -73,41 +63,19 @@ class ImageLoss:
         images = (rendered, measured, mask, self._window)
         rt.launch(self._kernels["ssim_moments"], (vectors, self.lines), *images, *size, self._moments, group=group)
         rt.launch(
-            self._kernels["ssim_map"],
-            items,
-            self._moments,
-            *images,
-            *size,
-            np.float32(C1),
-            np.float32(C2),
-            weights,
-            np.int32(poisson != 0),
-            self._partials,
-            rt.local(16 * math.prod(tile)),
-            self._sums,
+            self._kernels["ssim_map"], items, self._moments, *images, *size, np.float32(C1), np.float32(C2),
+            weights, np.int32(poisson != 0), self._partials, rt.local(16 * math.prod(tile)), self._sums,
             group=tile,
         )
         rt.launch(
-            self._kernels["ssim_spread"],
-            (vectors, self.lines),
-            self._partials,
-            self._window,
-            *size,
-            self._spread,
-            group=group,
+            self._kernels["ssim_spread"], (vectors, self.lines), self._partials, self._window, *size,
+            self._spread, group=group,
         )
         rt.launch(
-            self._kernels["image_gradient"],
-            rt.shape_of_lines(self.pitch, self.lines)[0],
-            self._spread,
-            *images,
-            *size,
-            np.float32(self.l1_weight / max(pixels, 1.0)),
-            np.float32(self.ssim_weight / (self.lines * self.width)),
-            weights,
-            np.float32(poisson / max(pixels, 1.0)),
-            self.gradient,
-            group=tile,
+            self._kernels["image_gradient"], rt.shape_of_lines(self.pitch, self.lines)[0], self._spread,
+            *images, *size, np.float32(self.l1_weight / max(pixels, 1.0)),
+            np.float32(self.ssim_weight / (self.lines * self.width)), weights,
+            np.float32(poisson / max(pixels, 1.0)), self.gradient, group=tile,
         )
         return self.gradient
 
@@ -119,13 +87,8 @@ class ImageLoss:
 
 
 def image_loss(
-    rendered: np.ndarray,
-    measured: np.ndarray,
-    mask: np.ndarray,
-    ssim_weight: float,
-    l1_weight: float = 1.0,
-    poisson_weight: float = 0.0,
-    transmission: np.ndarray | None = None,
+    rendered: np.ndarray, measured: np.ndarray, mask: np.ndarray, ssim_weight: float, l1_weight: float = 1.0,
+    poisson_weight: float = 0.0, transmission: np.ndarray | None = None,
 ) -> tuple[float, np.ndarray]:
     """Float64 twin: returns the loss and dL/drendered, images (lines, width)."""
     x, y = rendered * mask, measured * mask
@@ -167,16 +130,8 @@ class TotalVariation:
         nz, ny, _ = self.shape
         items, tile, _ = self.rt.shape_of_lines(self.pitch, ny, nz)
         self.rt.launch(
-            self._kernel,
-            items,
-            volume,
-            self._shape4,
-            np.int32(self.pitch),
-            self._weight4,
-            self.gradient,
-            self.rt.local(4 * math.prod(tile)),
-            self._sums,
-            group=tile,
+            self._kernel, items, volume, self._shape4, np.int32(self.pitch), self._weight4, self.gradient,
+            self.rt.local(4 * math.prod(tile)), self._sums, group=tile,
         )
         return self.gradient
 

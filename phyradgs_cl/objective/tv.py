@@ -21,9 +21,7 @@ class TvProx:
     """The map for volumes of a fixed ``shape`` (z, y, x). The next call starts from the dual of the last one."""
 
     def __init__(
-        self,
-        rt: Runtime,
-        shape: tuple[int, int, int],
+        self, rt: Runtime, shape: tuple[int, int, int],
         axis_weights: tuple[float, float, float] = (1.0, 1.0, 1.0),
     ) -> None:
         self.rt, self.shape = rt, shape
@@ -89,11 +87,7 @@ class TvProx:
 
 
 def tv_prox(
-    volume: np.ndarray,
-    weight: float,
-    iterations: int,
-    *,
-    nonnegative: bool,
+    volume: np.ndarray, weight: float, iterations: int, *, nonnegative: bool,
     axis_weights: tuple[float, float, float] = (1.0, 1.0, 1.0),
 ) -> np.ndarray:
     """Float64 twin of ``TvProx`` from a dual of zeros."""
@@ -126,10 +120,7 @@ def differences(volume: np.ndarray, axis_weights: tuple[float, float, float]) ->
 
 
 def _primal_of(
-    b: np.ndarray,
-    dual: np.ndarray,
-    weight: float,
-    nonnegative: bool,
+    b: np.ndarray, dual: np.ndarray, weight: float, nonnegative: bool,
     axis_weights: tuple[float, float, float],
 ) -> np.ndarray:
     adjoint = np.zeros_like(b)

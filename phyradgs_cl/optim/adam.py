@@ -76,73 +76,33 @@ class DeviceAdam:
     def activate(self, raw: DeviceArray, parameters: DeviceArray, count: int, stride: int) -> None:
         """Parameter rows from raw rows."""
         self.rt.launch(
-            self._activate,
-            stride // self.rt.lanes,
-            raw,
-            np.int32(count),
-            np.int32(stride),
-            np.float32(self.activation.scale_min),
-            np.float32(self.activation.scale_max),
-            parameters,
+            self._activate, stride // self.rt.lanes, raw, np.int32(count), np.int32(stride),
+            np.float32(self.activation.scale_min), np.float32(self.activation.scale_max), parameters,
             group=self.rt.group(),
         )
 
     def chain(
-        self,
-        raw: DeviceArray,
-        parameters: DeviceArray,
-        gradients: DeviceArray,
-        statistics: DeviceArray,
-        count: int,
-        stride: int,
-        *,
-        density_weight: float,
-        shape_weight: float,
-        shape_ratio: float,
+        self, raw: DeviceArray, parameters: DeviceArray, gradients: DeviceArray, statistics: DeviceArray,
+        count: int, stride: int, *, density_weight: float, shape_weight: float, shape_ratio: float,
         shape_floor: float,
     ) -> None:
         """dL/dparameters to dL/draw in place, with the parameter terms (means) added and the statistics gathered."""
         share = 1.0 / max(count, 1)
         self.rt.launch(
-            self._chain,
-            stride // self.rt.lanes,
-            raw,
-            parameters,
-            np.int32(count),
-            np.int32(stride),
-            np.float32(self.activation.scale_min),
-            np.float32(self.activation.scale_max),
-            np.float32(density_weight * share),
-            np.float32(shape_weight * share),
-            np.float32(shape_ratio),
-            np.float32(shape_floor),
-            gradients,
-            statistics,
-            group=self.rt.group(),
+            self._chain, stride // self.rt.lanes, raw, parameters, np.int32(count), np.int32(stride),
+            np.float32(self.activation.scale_min), np.float32(self.activation.scale_max),
+            np.float32(density_weight * share), np.float32(shape_weight * share), np.float32(shape_ratio),
+            np.float32(shape_floor), gradients, statistics, group=self.rt.group(),
         )
 
     def step(
-        self,
-        raw: DeviceArray,
-        gradients: DeviceArray,
-        moments: DeviceArray,
-        stride: int,
-        rates: np.ndarray,
+        self, raw: DeviceArray, gradients: DeviceArray, moments: DeviceArray, stride: int, rates: np.ndarray,
         step: int,
     ) -> None:
         """One step of Adam; ``rates`` (11,), ``step`` counts from 1."""
         rates16 = np.zeros(16, np.float32)
         rates16[:11] = folded_rates(rates, step)
         self.rt.launch(
-            self._step,
-            (stride // self.rt.lanes, 11),
-            raw,
-            gradients,
-            moments,
-            np.int32(stride),
-            rates16,
-            np.float32(BETA1),
-            np.float32(BETA2),
-            np.float32(EPSILON),
-            group=self.rt.group(),
+            self._step, (stride // self.rt.lanes, 11), raw, gradients, moments, np.int32(stride), rates16,
+            np.float32(BETA1), np.float32(BETA2), np.float32(EPSILON), group=self.rt.group(),
         )

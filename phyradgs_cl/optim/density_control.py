@@ -64,12 +64,8 @@ class Population:
 
 
 def control_density(
-    population: Population,
-    statistic: np.ndarray,
-    activation: Activation,
-    control: DensityControl,
-    box: np.ndarray,
-    rng: np.random.Generator,
+    population: Population, statistic: np.ndarray, activation: Activation, control: DensityControl,
+    box: np.ndarray, rng: np.random.Generator,
 ) -> Population:
     """Does one round of density control.
 

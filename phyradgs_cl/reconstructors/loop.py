@@ -66,13 +66,8 @@ class Loop:
     """
 
     def __init__(
-        self,
-        method: Stepwise,
-        ranks: Communicator,
-        report: ProgressReport,
-        started: float,
-        record_every: int = 1,
-        report_every: int = 1,
+        self, method: Stepwise, ranks: Communicator, report: ProgressReport, started: float,
+        record_every: int = 1, report_every: int = 1,
     ) -> None:
         self.method, self.ranks, self.report = method, ranks, report
         self.record_every, self.report_every = record_every, report_every
@@ -132,13 +127,8 @@ class Loop:
             return False
         self._reported = time.perf_counter()
         progress = Progress(
-            iteration,
-            self.method.iterations,
-            measures[self.method.quantity],
-            int(measures.get("gaussians", 0)),
-            seconds,
-            quantity=self.method.quantity,
-            state=self.state,
+            iteration, self.method.iterations, measures[self.method.quantity],
+            int(measures.get("gaussians", 0)), seconds, quantity=self.method.quantity, state=self.state,
             volume=self.method.present_volume,
         )
         try:

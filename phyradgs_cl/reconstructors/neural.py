@@ -35,14 +35,8 @@ if TYPE_CHECKING:
 
 
 def reconstruct_neural(
-    scan: Scan,
-    options: NeuralOptions,
-    rt: Runtime,
-    *,
-    method: str,
-    seed: int = 0,
-    report: ProgressReport = ignore_progress,
-    resume: State | None = None,
+    scan: Scan, options: NeuralOptions, rt: Runtime, *, method: str, seed: int = 0,
+    report: ProgressReport = ignore_progress, resume: State | None = None,
 ) -> Reconstruction:
     """Returns the volume of a neural field. The seed draws first parameters, frames, pixels and samples.
 

@@ -78,13 +78,8 @@ def _digest(*arrays: np.ndarray) -> str:
 
 
 def plan_run(
-    method: object = DEFAULT_METHOD,
-    values: Mapping[str, Any] | None = None,
-    *,
-    preset: str | None = None,
-    seed: int = 0,
-    initial: InitialVolume | None = None,
-    of_preprocessing: Collection[str] = (),
+    method: object = DEFAULT_METHOD, values: Mapping[str, Any] | None = None, *, preset: str | None = None,
+    seed: int = 0, initial: InitialVolume | None = None, of_preprocessing: Collection[str] = (),
 ) -> RunPlan:
     """Returns the plan of a run: ``values`` by name over the method's preset.
 

@@ -45,11 +45,7 @@ _ROUND = 8  # voxels
 
 
 def reconstruct(
-    scan: Scan,
-    plan: RunPlan,
-    rt: Runtime,
-    *,
-    report: ProgressReport = ignore_progress,
+    scan: Scan, plan: RunPlan, rt: Runtime, *, report: ProgressReport = ignore_progress,
     resume: State | None = None,
 ) -> Reconstruction:
     """Runs a plan on a scan. resume: the state of an interrupted run of the same plan.

@@ -133,8 +133,7 @@ def perturb(scan: Scan, correction: GeometryCorrection, views: Views | Sway | No
     source_mm = correction.source_distance_mm
     offset_v_mm, offset_u_mm = geometry.detector_offset_mm
     geometry = replace(
-        geometry,
-        source_to_axis_mm=geometry.source_to_axis_mm + source_mm,
+        geometry, source_to_axis_mm=geometry.source_to_axis_mm + source_mm,
         source_to_detector_mm=geometry.source_to_detector_mm + source_mm + correction.detector_distance_mm,
         detector_offset_mm=(offset_v_mm + correction.offset_v_mm, offset_u_mm + correction.offset_u_mm),
     )

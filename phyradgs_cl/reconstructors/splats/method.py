@@ -44,15 +44,8 @@ def record_interval(iterations: int) -> int:
 
 
 def reconstruct_splats(
-    scan: Scan,
-    options: SplatOptions,
-    rt: Runtime,
-    *,
-    method: str,
-    seed: int = 0,
-    report: ProgressReport = ignore_progress,
-    resume: State | None = None,
-    initial: np.ndarray | None = None,
+    scan: Scan, options: SplatOptions, rt: Runtime, *, method: str, seed: int = 0,
+    report: ProgressReport = ignore_progress, resume: State | None = None, initial: np.ndarray | None = None,
 ) -> Reconstruction:
     """Runs a splatting method under its name ``phyradgs`` or ``r2``.
 

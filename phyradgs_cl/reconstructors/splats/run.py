@@ -26,12 +26,7 @@ class SplatRun:
     quantity, remedy, finished = "loss", "check the scan for extreme values", None
 
     def __init__(
-        self,
-        rt: Runtime,
-        scan: Scan,
-        options: SplatOptions,
-        scale: Scale,
-        population: Population,
+        self, rt: Runtime, scan: Scan, options: SplatOptions, scale: Scale, population: Population,
         rng: np.random.Generator,
     ) -> None:
         self.rt, self.options, self.scale, self.rng = rt, options, scale, rng

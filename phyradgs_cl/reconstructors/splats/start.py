@@ -49,15 +49,8 @@ def first_population(
 
 
 def initial_cloud(
-    volume: np.ndarray,
-    grid: Grid,
-    count: int,
-    *,
-    threshold: float,
-    density_share: float,
-    scale_bounds: tuple[float, float],
-    scale_factor: float,
-    rng: np.random.Generator,
+    volume: np.ndarray, grid: Grid, count: int, *, threshold: float, density_share: float,
+    scale_bounds: tuple[float, float], scale_factor: float, rng: np.random.Generator,
 ) -> Gaussians:
     """Draws up to ``count`` isotropic Gaussians at voxels above ``threshold``, without replacement.
 

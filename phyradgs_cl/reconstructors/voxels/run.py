@@ -150,12 +150,8 @@ def run_iterations(
 
 
 def voxel_method(
-    name: str,
-    default: IterativeOptions,
-    make: Callable[[System, Any, MethodInputs], Algorithm],
-    *,
-    volumes: int | Callable[[Scan, Any], int],
-    frames: int,
+    name: str, default: IterativeOptions, make: Callable[[System, Any, MethodInputs], Algorithm], *,
+    volumes: int | Callable[[Scan, Any], int], frames: int,
 ) -> Method:
     """Returns an algorithm as a method. ``volumes`` and ``frames`` as in ``run_iterations``; a function gives volumes."""
 
