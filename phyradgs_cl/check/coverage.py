@@ -29,8 +29,7 @@ def check_coverage(scan: Scan) -> Finding:
     The object touches a side where the mean over a few rows of the two outermost columns is above threshold and noise in a
     tenth of the frames. A displaced panel may cut the object on its short side. Rows at the top and bottom are not checked.
     Other findings: no object above the noise, inverted values, line integrals beyond 30, pixels brighter than the flats, a
-    grid of another size than the object.
-    """
+    grid of another size than the object."""
     p = np.asarray(scan.projections)
     if p.shape[2] < FEWEST_COLUMNS:
         return too_narrow(_QUESTION, "line integral")

@@ -24,8 +24,7 @@ def check_timing(scan: Scan) -> Finding:
 
     A line cannot open while it is open, a frame cannot be read while the last one is, and a gantry has one angle at a time.
     The value is the worst of: exposure and readout over the shortest frame period (at most 1); 1 + the relative difference
-    between the angle steps and the speed within the frames; a table's duration over the scan's.
-    """
+    between the angle steps and the speed within the frames; a table's duration over the scan's."""
     starts_s = np.asarray(scan.frame_start_s, np.float64)
     if scan.frames < 2:
         return Finding(_TIMING, OK, 0.0, 1.0, "share", "one frame: nothing to compare")

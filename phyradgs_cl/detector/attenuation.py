@@ -27,8 +27,7 @@ def counts_to_attenuation(
     darks); "transmission" is taken as it is, "attenuation" is returned unchanged. image_key (F,): 0 projection, 1 flat,
     2 dark, 3 invalid. The second result (P, v, u) is True where a value must not be used: it is not finite, the flat is not
     brighter than the dark, or the transmission is at most ``TRANSMISSION_FLOOR``.
-    Raises InputError for a wrong shape, key or quantity, for no projection, and for counts without a flat.
-    """
+    Raises InputError for a wrong shape, key or quantity, for no projection, and for counts without a flat."""
     one_of("quantity", quantity, QUANTITIES)
     frames, key = np.asarray(data), np.asarray(image_key)
     shape("data", frames, (None, None, None))
@@ -102,8 +101,7 @@ def average(p: ArrayLike, weight: ArrayLike, model: str) -> NDArray[np.float64]:
 
     Model "log" takes their weighted mean (PhyRadGS, Eq. 1). Model "intensity" adds photons as a detector does,
     −ln Σ w exp(−p), without overflow at any p. weight (S,): fractions of the exposure, not negative, sum 1.
-    Raises InputError for an unknown model, shapes or weights that do not fit, and NaN.
-    """
+    Raises InputError for an unknown model, shapes or weights that do not fit, and NaN."""
     one_of("detector model", model, MODELS)
     values, weights = np.asarray(p, dtype=np.float64), np.asarray(weight, dtype=np.float64)
     if values.ndim == 0 or values.shape[0] == 0:

@@ -66,8 +66,7 @@ def tigre_noise(
     line_integrals (F, v, u): all projections of the scan, m is their maximum. ``dose``: counts of an unattenuated pixel.
     ``electronic_noise``: standard deviation in counts. The published scans have 1e4 and 10. ``light``: fraction of the dose
     for each pixel, above 0, broadcast to (F, v, u), because a pulse may miss part of a line's window. Raises InputError for
-    a dose that is not positive, negative noise, and line integrals that are not finite.
-    """
+    a dose that is not positive, negative noise, and line integrals that are not finite."""
     _check(line_integrals, dose, electronic_noise)
     expected, scale = tigre_counts(line_integrals, dose)
     share = np.asarray(light, dtype=np.float64)
@@ -82,8 +81,7 @@ def beer_lambert_noise(
     """Returns −ln(counts/dose) with counts clamped at ``COUNT_FLOOR``; negatives stay, else air would attenuate.
 
     Arguments, result and errors as in ``tigre_noise``. Lag λ mixes the photons of successive frames; electronic noise is
-    added after it.
-    """
+    added after it."""
     _check(line_integrals, dose, electronic_noise)
     expected = beer_lambert_counts(line_integrals, dose)
     share = np.asarray(light, dtype=np.float64)
@@ -124,8 +122,7 @@ def without_lag(scan: Scan) -> Scan:
     """Returns the scan as a panel without lag would have recorded it; the scan itself if its lag is 0.
 
     Masks values at or below ``TRANSMISSION_FLOOR``, and values that need a masked pixel of this or the previous frame.
-    Photon noise returns to its level without lag; noise that was added after the panel grows by √(1 + λ²)/(1 − λ).
-    """
+    Photon noise returns to its level without lag; noise that was added after the panel grows by √(1 + λ²)/(1 − λ)."""
     if scan.lag == 0:
         return scan
     projections = np.empty(scan.projections.shape, np.float32)

@@ -36,8 +36,7 @@ def noise_level(line_integrals: NDArray[np.float32], valid: NDArray[np.bool_] | 
 
     It is the median of |second differences| along rows where values are above 0: structure is smooth compared with white
     noise, and a median ignores edges (Donoho and Johnstone, Biometrika 81 (1994) 425). Structure as fine as a pixel raises
-    it, noise correlated along rows lowers it. line_integrals (F, v, u); valid likewise, None: all.
-    """
+    it, noise correlated along rows lowers it. line_integrals (F, v, u); valid likewise, None: all."""
     if line_integrals.shape[-1] < 3:
         return 0.0
     left, middle, right = _along_rows(line_integrals)
@@ -57,8 +56,7 @@ def noise_rms(line_integrals: NDArray[np.float32], chosen: NDArray[np.bool_], va
 
     Noise grows with attenuation, so it is estimated by tenths of the line integrals and averaged as the chosen pixels lie.
     Each estimate is the median of |second differences along rows of those along columns|, which vanish at straight edges
-    along either (Immerkær, Comput. Vis. Image Underst. 64 (1996) 300). Panels of fewer than three rows use rows alone.
-    """
+    along either (Immerkær, Comput. Vis. Image Underst. 64 (1996) 300). Panels of fewer than three rows use rows alone."""
     usable, differences = valid, line_integrals
     means = line_integrals
     cuts = (_along_rows, _along_columns) if line_integrals.shape[-2] >= 3 else (_along_rows,)
@@ -100,8 +98,7 @@ def transmission_weights(
     """Returns weights exp(−p) of line integrals p (F, v, u), with mean 1 over the ``valid`` pixels (None: all).
 
     They are the least-squares weights of photon noise (Sauer and Bouman, IEEE Trans. Signal Process. 41 (1993) 534).
-    Negative line integrals count as air, because a pixel is not more precise for being bright by chance.
-    """
+    Negative line integrals count as air, because a pixel is not more precise for being bright by chance."""
     weights = np.exp(-np.maximum(line_integrals, 0)).astype(np.float32)
     if valid is None:
         mean = float(weights.mean(dtype=np.float64))
@@ -115,8 +112,7 @@ def find_saturation(frames: NDArray[np.generic], flat: NDArray[np.floating]) -> 
     """Returns the largest count of projections (P, v, u), and the fraction of their pixels clipped there.
 
     Only whole areas count as clipped. An area at the count of the mean ``flat`` (v, u) may be air without noise: it counts
-    only where the rest of the frames shows noise.
-    """
+    only where the rest of the frames shows noise."""
     level = float(np.fmax.reduce([np.fmax.reduce(frame, axis=None) for frame in frames]))
     share = clustered_share(frame == level for frame in frames)
     if share <= LEAST_SHARE or not (_flat_differs(frames, flat, level) or _shows_noise(frames, level)):

@@ -45,8 +45,7 @@ def tube_spectrum(kvp: float, filter_mm: float = FILTER_MM, anode_deg: float = 0
     """Returns the spectrum of a tube at ``kvp`` kV behind ``filter_mm`` of aluminium, for a panel that integrates energy.
 
     It is SpekPy's for a tungsten anode of ``anode_deg``, and follows Kramers' law at 0. Raises InputError for an anode
-    without the package spekpy.
-    """
+    without the package spekpy."""
     energy_kev, photons = _tungsten(kvp, anode_deg) if anode_deg else _kramers(kvp)
     light = photons * energy_kev * np.exp(-_at(energy_kev, _ALUMINIUM) * _ALUMINIUM_G_PER_CM3 * filter_mm / 10)
     weight = light / light.sum()

@@ -22,8 +22,7 @@ class Gaussians:
 
     mean (G, 3) and scale (G, 3) in one unit of length (mm outside the reconstruction), x y z; unit quaternion (G, 4) w x y
     z; density (G,) attenuation per that length. Raises InputError for other shapes, infinite values or NaN, and for scales
-    that are not above 0.
-    """
+    that are not above 0."""
 
     mean: np.ndarray
     scale: np.ndarray

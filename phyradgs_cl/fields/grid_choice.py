@@ -24,8 +24,7 @@ class GridChoice:
     of a cube, about the middle of the scan's grid. margin_mm: width (z, y, x), or on all sides, that methods reconstruct
     beyond this box and discard.
 
-    Raises InputError for other values, a box that ends before it begins, and all of size, voxel_mm and roi_mm.
-    """
+    Raises InputError for other values, a box that ends before it begins, and all of size, voxel_mm and roi_mm."""
 
     size: int | tuple[int, ...] | None = None
     voxel_mm: float | tuple[float, ...] | None = None
@@ -63,8 +62,7 @@ class GridChoice:
 
         A box alone takes the voxels of ``grid`` that it meets by more than a hundredth, continued beyond ``grid``: the
         volume is then a part of the one on ``grid``. A size alone keeps the box. A voxel alone keeps it too, with its sides
-        rounded up to whole voxels. Raises InputError for too many voxels.
-        """
+        rounded up to whole voxels. Raises InputError for too many voxels."""
         box_mm = self._box_mm(grid)
         sides_mm = box_mm[:, 1] - box_mm[:, 0]
         if self.size is not None:

@@ -27,8 +27,7 @@ class Grid:
     """A box of voxels centred at ``offset_mm``; all triples run (z, y, x) like the arrays.
 
     shape: counts. voxel_size_mm: sides of a voxel in mm. Raises InputError for counts below 1, for lengths that are not
-    finite, and for sides that are not above 0.
-    """
+    finite, and for sides that are not above 0."""
 
     shape: tuple[int, int, int]
     voxel_size_mm: tuple[float, float, float]

@@ -30,8 +30,7 @@ def aligned(volume: Values, grid: Grid, reference: Values, reference_grid: Grid)
     """Brings both volumes (nz, ny, nx) to one grid; None where no voxel centre of the reference lies in the volume's box.
 
     Where the volume's voxels are whole blocks of the reference's, the reference is averaged over the blocks. Any other
-    volume is resampled trilinearly onto the reference's voxels that lie in its box.
-    """
+    volume is resampled trilinearly onto the reference's voxels that lie in its box."""
     if grid.is_close(reference_grid):
         return Aligned(volume, reference, grid)
     if (blocks := _blocks(grid, reference_grid)) is not None:
@@ -101,8 +100,7 @@ def resampled(volume: NDArray[np.floating], grid: Grid, onto: Grid) -> tuple[NDA
     """Samples a volume (nz, ny, nx) trilinearly at the voxel centres of another grid, 0 outside its box.
 
     Between the outermost centres and the faces the value is that of the centres. The second result is the fraction of the
-    voxels of ``onto`` that lie in the box.
-    """
+    voxels of ``onto`` that lie in the box."""
     step = np.divide(onto.voxel_size_mm, grid.voxel_size_mm)
     first = np.subtract(onto.first_centre_mm, grid.first_centre_mm) / grid.voxel_size_mm
     values = scipy.ndimage.affine_transform(

@@ -71,8 +71,7 @@ def psnr(result: ArrayLike, reference: ArrayLike, data_range: float | None = Non
     """Returns 10 · log10(data_range² / mean squared error) in dB over all voxels, without clipping; infinity for equals.
 
     ``data_range``: by default the reference's maximum. Raises InputError for shapes that differ, NaN or infinity, and a
-    range that is not positive.
-    """
+    range that is not positive."""
     a, b, peak = checked_pair(result, reference, data_range)
     # A slice at a time: float64 copies of whole volumes would triple the memory.
     squares = sum(float(np.sum((p.astype(np.float64) - q) ** 2)) for p, q in zip(a, b, strict=True))
@@ -98,8 +97,7 @@ def ssim(result: ArrayLike, reference: ArrayLike, data_range: float | None = Non
     """Returns the mean structural similarity, at most 1, of two volumes (z, y, x); slices with an empty truth do not count.
 
     ``data_range``: L in C1 = (0.01 L)², C2 = (0.03 L)², by default the reference's maximum. Raises InputError for arrays
-    that are not 3D, shapes that differ, NaN or infinity, and a range that is not positive.
-    """
+    that are not 3D, shapes that differ, NaN or infinity, and a range that is not positive."""
     a, b, peak = checked_pair(result, reference, data_range)
     shape("reference", b, (None, None, None))
     return float(np.mean([_along_axis(a, b, peak, axis) for axis in range(3)]))

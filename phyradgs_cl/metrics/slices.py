@@ -28,8 +28,7 @@ def slices_png(
     Grey values run over the truth's range, so that a wrong gain shows. The difference has its own scale, symmetric about 0.
     result, reference: (z, y, x); without a reference there is one column. ``title``: the heading's first line. ``grid``: of
     both, for the scale bar. Raises InputError for arrays that are not 3D, shapes that differ, NaN and infinity, and
-    OutputError for a file that cannot be written.
-    """
+    OutputError for a file that cannot be written."""
     volume = np.asarray(result)
     shape("result", volume, (None, None, None))
     finite("result", volume)

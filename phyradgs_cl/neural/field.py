@@ -17,8 +17,7 @@ _ORDERS = ((0, 1, 2), (1, 2, 0), (2, 0, 1))  # of a volume's axes z, y, x
 class NeuralField(nn.Module):
     """Attenuation (P,) of positions (P, 3) x y z, in [−1, 1] along the longest side of the volume.
 
-    ``segment``: neighbours among the positions that belong together; 1 where every position stands for itself.
-    """
+    ``segment``: neighbours among the positions that belong together; 1 where every position stands for itself."""
 
     def __init__(self, encoding: HashEncoding, network: AttenuationNetwork, segment: int = 1) -> None:
         super().__init__()
@@ -34,8 +33,7 @@ def voxel_values(
     """The field in all voxels (nz, ny, nx) float32; ``grid`` in units of half the longest side, centred.
 
     A voxel is the mean over ``points``³ points, the centres of its equal parts. With segments a point's value depends on its
-    neighbours along the segment; it is then the mean over segments along x, y and z.
-    """
+    neighbours along the segment; it is then the mean over segments along x, y and z."""
     orders = _ORDERS if field.segment > 1 else _ORDERS[:1]
     values = np.zeros(grid.shape, np.float32)
     for order in orders:
@@ -52,8 +50,7 @@ def _in_rows(
 ) -> np.ndarray:
     """The voxels of a grid whose axes are z, y, x in another ``order``, with segments along its last.
 
-    A row's last segment is filled up beyond its end.
-    """
+    A row's last segment is filled up beyond its end."""
     fine = _divided(grid, points)
     slow, middle, fast = fine.axes_mm()
     filled = ceil_div(fast.size, field.segment) * field.segment
@@ -86,8 +83,7 @@ def _divided(grid: Grid, points: int) -> Grid:
 def first_field(options: NeuralOptions, longest_voxels: int, seed: int) -> NeuralField:
     """Returns SAX-NeRF's field for ``LineOptions``, else NAF's, for the voxels along a volume's longest side.
 
-    The same seed gives the same parameters on every device.
-    """
+    The same seed gives the same parameters on every device."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         encoding = HashEncoding(

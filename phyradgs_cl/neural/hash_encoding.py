@@ -15,8 +15,7 @@ _FIRST_FEATURES = 1e-4  # uniform in ± this (Müller et al., NAF)
 class HashEncoding(nn.Module):
     """Features (P, levels · features) of positions (P, 3) in [0, 1]³, interpolated linearly between a level's corners.
 
-    A level whose corners fit into 2^table_log2 entries has one for each, another shares entries by a hash.
-    """
+    A level whose corners fit into 2^table_log2 entries has one for each, another shares entries by a hash."""
 
     def __init__(
         self, levels: int, features: int, base_resolution: int, growth: float, table_log2: int

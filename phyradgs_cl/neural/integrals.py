@@ -14,8 +14,7 @@ def box_span(
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """(first distance, length) (R,) of rays (R, 3) in a box of ``half_sides`` (3,) about 0; length 0 where they miss it.
 
-    Directions have unit length; a ray begins at its source.
-    """
+    Directions have unit length; a ray begins at its source."""
     tiny = torch.finfo(direction.dtype).tiny
     slope = torch.where(direction.abs() < tiny, torch.full_like(direction, tiny), direction)
     one, other = (-half_sides - source) / slope, (half_sides - source) / slope
@@ -37,8 +36,7 @@ def line_integrals(
 ) -> torch.Tensor:
     """Integrals (R,) of a field along rays (R, 3), a sample in each of ``samples`` equal intervals inside the box.
 
-    ``shifts`` as from ``sample_shifts``. With shifts drawn uniformly the mean is the integral itself, for any field.
-    """
+    ``shifts`` as from ``sample_shifts``. With shifts drawn uniformly the mean is the integral itself, for any field."""
     first, length = box_span(source, direction, half_sides)
     step = length / samples
     number = torch.arange(samples, dtype=source.dtype, device=source.device)
@@ -57,8 +55,7 @@ def log_squares(integrals: torch.Tensor, measured: torch.Tensor, times: int) -> 
     """Squared errors (R,) of the mean over all ``times`` of a pixel, estimated from s of them, integrals (R, s).
 
     The square of a mean over a random subset is too large by the subset's variance, which (1/s − 1/K) times the spread
-    among the s samples estimates; less that, expectation and gradient are those of all K times.
-    """
+    among the s samples estimates; less that, expectation and gradient are those of all K times."""
     count = integrals.shape[1]
     squares = (integrals.mean(1) - measured) ** 2
     if count == times:

@@ -68,8 +68,7 @@ class AttenuationNetwork(nn.Module):
     """Attenuation (P,) from features (P, inputs), in the units of ``options.density_bound``.
 
     ``middle`` are the modules between the first and the last layer, ``skip`` the place among all layers where the
-    features come in again; leaky ReLU follows every layer but the last.
-    """
+    features come in again; leaky ReLU follows every layer but the last."""
 
     def __init__(self, inputs: int, middle: list[nn.Module], skip: int, options: NeuralOptions) -> None:
         super().__init__()

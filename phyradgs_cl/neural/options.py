@@ -35,8 +35,7 @@ class NeuralOptions:
     The network: layers, width, last_activation. A sigmoid has a density_bound, its largest value in units of FDK's 99.9th
     percentile, and a first_share of it at which the field starts everywhere. The rate of Adam is multiplied by rate_factor
     every rate_step passes; step 0 spreads one factor over the run. detector_model: which quantity the detector averages over
-    a line's times, or the model that the scan states (scan). torch_device: the device of PyTorch.
-    """
+    a line's times, or the model that the scan states (scan). torch_device: the device of PyTorch."""
 
     MOTIONS: ClassVar[tuple[Motion, ...]] = motions_for(RAYS)
 
@@ -94,8 +93,7 @@ class NeuralOptions:
         """Returns how many of the ``count`` times of a line a step uses.
 
         Raises InputError for a number that would bias the loss. One time gives no estimate of the variance that the square
-        adds, and the logarithm of a mean intensity is not the mean over subsets.
-        """
+        adds, and the logarithm of a mean intensity is not the mean over subsets."""
         if self.times == 0:
             return count
         if self.times < count and model == "intensity":
@@ -112,8 +110,7 @@ class LineOptions(NeuralOptions):
     """Options of a field with a transformer over line segments, and windows of pixels beside the scattered ones.
 
     segment: samples of a line segment. heads, head_width, blocks: of its attention. windows: per step, each of ``window``
-    by ``window`` pixels.
-    """
+    by ``window`` pixels."""
 
     segment: int = checks.ranged(2, 1, 256)
     heads: int = checks.ranged(8, 1, 256)

@@ -17,8 +17,7 @@ class ExposureRays:
     """The rays of one frame's pixels.
 
     pose (C, 12) in units of half the volume's longest side about the volume's centre; cell (K, lines), the cell of each
-    of a line's K times, which all weigh the same; axis: whether lines are rows or columns.
-    """
+    of a line's K times, which all weigh the same; axis: whether lines are rows or columns."""
 
     pose: np.ndarray
     cell: np.ndarray
@@ -28,8 +27,7 @@ class ExposureRays:
     def of_cells(cls, table: TimeCells, grid: Grid) -> "ExposureRays":
         """The rays of still cells in mm, for a volume on ``grid`` in mm.
 
-        Raises InputError for a table whose lines have different numbers of cells or different weights.
-        """
+        Raises InputError for a table whose lines have different numbers of cells or different weights."""
         centre, unit = np.array(grid.offset_mm[::-1]), grid.half_longest_mm
         pose = table.pose.copy()
         pose[:, :3] -= centre
@@ -94,8 +92,7 @@ def windows_and_scattered_pixels(
 ) -> np.ndarray:
     """Draws the pixels (R, 2) of ``windows`` windows of ``edge``² usable pixels, and ``count`` scattered ones outside them.
 
-    Windows tile the frame. There are fewer where fewer of them are usable throughout.
-    """
+    Windows tile the frame. There are fewer where fewer of them are usable throughout."""
     down, across = (n // edge for n in usable.shape)
     tiles = usable[: down * edge, : across * edge].reshape(down, edge, across, edge).all(axis=(1, 3))
     whole = np.flatnonzero(tiles)

@@ -13,8 +13,7 @@ from phyradgs_cl.errors import DeviceError
 def torch_device(name: str) -> torch.device:
     """``cpu``, ``cuda`` (ROCm too), ``mps``, or for ``auto`` the first available of cuda, mps, cpu.
 
-    Raises DeviceError for a device that this PyTorch does not have.
-    """
+    Raises DeviceError for a device that this PyTorch does not have."""
     is_available = {"cuda": torch.cuda.is_available(), "mps": torch.backends.mps.is_available(), "cpu": True}
     available = [device for device, is_there in is_available.items() if is_there]
     if name == "auto":
@@ -29,8 +28,7 @@ def torch_device(name: str) -> torch.device:
 def repeatable(device: torch.device) -> Iterator[None]:
     """Makes PyTorch use algorithms that give the same bits in every run.
 
-    On CPUs the sums of this room have a fixed order anyway, and the switch would only slow them down.
-    """
+    On CPUs the sums of this room have a fixed order anyway, and the switch would only slow them down."""
     if device.type != "cuda":
         yield
         return

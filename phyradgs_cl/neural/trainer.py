@@ -20,8 +20,7 @@ _POINTS_ON_CPU, _POINTS_ELSEWHERE = 2**14, 2**20  # at once: a cache's, a GPU's
 class Trainer:
     """A field, its optimiser and the random draws: the state that changes from step to step.
 
-    Lengths are in units of half the volume's longest side, attenuation in units of ``density_per_mm``.
-    """
+    Lengths are in units of half the volume's longest side, attenuation in units of ``density_per_mm``."""
 
     def __init__(
         self, scan: Scan, options: NeuralOptions, field: NeuralField, device: torch.device,

@@ -41,8 +41,7 @@ class DctProx:
     ) -> SameArray:
         """Maps a volume (z, y, x), float32; ``threshold`` of coefficients of the orthonormal transform, in its unit.
 
-        ``turn``, 0 to 3, chooses a quarter of the shifts. A device array gives a device array (``out``, if given).
-        """
+        ``turn``, 0 to 3, chooses a quarter of the shifts. A device array gives a device array (``out``, if given)."""
 
         def shrink(observed: DeviceArray, result: DeviceArray) -> None:
             self._map(observed, threshold, TURNS[turn], nonnegative, result)

@@ -50,8 +50,7 @@ class ImageLoss:
     ) -> DeviceArray:
         """Returns dL/drendered, valid until the next call; ``mask`` is 1 where a pixel counts, ``pixels`` its sum.
 
-        ``transmission`` weighs pixels in the Poisson term, and is needed where that term has a weight.
-        """
+        ``transmission`` weighs pixels in the Poisson term, and is needed where that term has a weight."""
         rt = self.rt
         poisson = 0.0 if transmission is None else self.poisson_weight
         weights = mask if transmission is None else transmission  # not read without a Poisson weight
@@ -164,8 +163,7 @@ def _axis_weights(shape: tuple[int, ...]) -> list[float]:
 class ParameterTerms:
     """Weights of the mean density and of mean relu(longest/shortest − ratio)² + mean relu(floor − shortest)².
 
-    ``shape_floor`` is in half-sides of the volume.
-    """
+    ``shape_floor`` is in half-sides of the volume."""
 
     density_weight: float = 0.001
     shape_weight: float = 0.0

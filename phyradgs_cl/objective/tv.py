@@ -47,8 +47,7 @@ class TvProx:
     ) -> SameArray:
         """Maps a volume (z, y, x), float32, by ``iterations`` from the last dual.
 
-        A device array gives a device array (``out``, if given).
-        """
+        A device array gives a device array (``out``, if given)."""
 
         def denoise(observed: DeviceArray, result: DeviceArray) -> None:
             self._map(observed, weight, iterations, nonnegative, result)

@@ -16,8 +16,7 @@ class Rates:
     """(first, last) rate of each kind of parameter, in internal units (half-sides of the volume).
 
     The default rates are two to ten times the published ones, which are made for 20,000 iterations and more: at
-    3,000 they leave 1 to 2 dB on the table (docs/results/settings.md).
-    """
+    3,000 they leave 1 to 2 dB on the table (docs/results/settings.md)."""
 
     position: tuple[float, float] = checks.ranged((2e-3, 2e-4), *_RANGE)
     scale: tuple[float, float] = checks.ranged((2e-2, 2e-3), *_RANGE)
@@ -48,8 +47,7 @@ EPSILON = 1e-15
 def folded_rates(rates: np.ndarray, step: int) -> np.ndarray:
     """Learning rates (11,) with both bias corrections of step ``step`` (from 1) folded in.
 
-    m̂/√v̂ = m/√v · √(1−β2^t)/(1−β1^t); ε is scaled along, which at 1e-15 is without effect.
-    """
+    m̂/√v̂ = m/√v · √(1−β2^t)/(1−β1^t); ε is scaled along, which at 1e-15 is without effect."""
     folded: np.ndarray = rates * np.sqrt(1 - BETA2**step) / (1 - BETA1**step)
     return folded
 

@@ -19,8 +19,7 @@ class DensityControl:
 
     ``every``: iterations between two rounds; 0 keeps the first population. Gaussians whose longest scale is more than
     ``prune_aspect`` times their shortest are removed (0: never). Such thin sheets and needles lie between the rays, where no
-    measurement constrains them, and are visible in the volume.
-    """
+    measurement constrains them, and are visible in the volume."""
 
     every: int = checks.ranged(100, 0, 1_000_000_000)
     start_iteration: int = checks.ranged(500, 0, 1_000_000_000)
@@ -69,8 +68,7 @@ def control_density(
 ) -> Population:
     """Does one round of density control.
 
-    statistic (G,) mean gradient norm; box (2, 3): lowest and highest corner x y z; centres outside are removed.
-    """
+    statistic (G,) mean gradient norm; box (2, 3): lowest and highest corner x y z; centres outside are removed."""
     rows = activation.apply(population.raw)
     room = max(control.max_gaussians - statistic.size, 0)
     has_large_gradient = _strongest(statistic, control.threshold, room)

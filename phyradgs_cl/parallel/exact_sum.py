@@ -19,8 +19,7 @@ _BLOCK_VALUES = 1 << 20
 def exact_sum(ranks: Communicator, parts: Sequence[np.ndarray], shape: tuple[int, int], terms: int) -> np.ndarray:
     """Sums all ranks' ``parts``, each of ``shape`` (rows, n) float32; ``terms`` counts them over all ranks.
 
-    Returns the sum (rows, n) float32 on every rank. Rows with a non-finite number become NaN. ``parts`` may be empty.
-    """
+    Returns the sum (rows, n) float32 on every rank. Rows with a non-finite number become NaN. ``parts`` may be empty."""
     exponents = _largest_exponents(ranks, parts, shape[0])
     not_finite = exponents >= _NOT_FINITE
     shift = _BITS - max(terms - 1, 0).bit_length() - np.where(not_finite, 0, exponents)

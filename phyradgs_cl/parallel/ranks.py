@@ -63,8 +63,7 @@ class Communicator:
     """``size`` processes (ranks) with one scan; this class itself is a single process.
 
     All ranks call every method except the last two, in the same order. ``sent_bytes`` counts what this rank has given to
-    sums and gathers.
-    """
+    sums and gathers."""
 
     rank, size, local_rank, local_size = 0, 1, 0, 1
     sent_bytes = 0
@@ -72,8 +71,7 @@ class Communicator:
     def allreduce_sum(self, values: np.ndarray) -> None:
         """Sums contiguous ``values`` over all ranks, in place: integers, or numbers that are 0 on all ranks except one.
 
-        Both are exact in any order of summation; for other values there is ``exact_sum``.
-        """
+        Both are exact in any order of summation; for other values there is ``exact_sum``."""
 
     def allreduce_max(self, values: np.ndarray) -> None:
         """Replaces contiguous ``values`` by their maxima over all ranks, in place."""
@@ -159,8 +157,7 @@ class Mpi(Communicator):
 def launched_ranks(launch: Launch | None = None) -> Communicator:
     """Returns the ranks that this process was launched with, or a single process.
 
-    Raises InputError where mpi4py is missing, or belongs to another MPI than the launcher.
-    """
+    Raises InputError where mpi4py is missing, or belongs to another MPI than the launcher."""
     start = launched() if launch is None else launch
     if start.size == 1:
         return Communicator()
@@ -181,8 +178,7 @@ def launched_ranks(launch: Launch | None = None) -> Communicator:
 def failing_together(ranks: Communicator, report_error: Callable[[BaseException], int]) -> Iterator[None]:
     """Raises an exception of the body where all ranks have one; if only some fail, reports it and ends all ranks.
 
-    The others would wait for a failed rank for ever. ``report_error`` prints the error and returns the exit status.
-    """
+    The others would wait for a failed rank for ever. ``report_error`` prints the error and returns the exit status."""
     try:
         yield
     except BaseException as error:

@@ -73,8 +73,7 @@ def make_phantom(name: str, half_size_mm: float, resolution: int = 128, seed: in
     """Returns the phantom of a name, a key of ``PHANTOMS``, in a cube of side 2 · ``half_size_mm`` about the origin.
 
     Voxel phantoms have ``resolution`` voxels per side; ``seed`` draws the shape and texture of procedural ones. Raises
-    InputError for an unknown name, and for a size or count that is not positive.
-    """
+    InputError for an unknown name, and for a size or count that is not positive."""
     one_of("phantom", name, PHANTOMS)
     positive("half_size_mm", half_size_mm)
     positive("resolution", resolution)

@@ -34,8 +34,7 @@ class Ellipsoid:
     """One solid ellipsoid, whose attenuation adds to that of other bodies.
 
     Centre (x, y, z); semi-axes along the columns of the 3x3 ``rotation``. A negative ``attenuation_per_mm`` carves a hole.
-    Raises InputError for semi-axes that are not positive, values that are not finite, and a matrix that is no rotation.
-    """
+    Raises InputError for semi-axes that are not positive, values that are not finite, and a matrix that is no rotation."""
 
     centre_mm: Triple
     semi_axes_mm: Triple
@@ -177,8 +176,7 @@ class EllipsoidPhantom:
         """Integrates attenuation from ``source`` to ``target``, world points (..., 3) in mm, x y z, that broadcast.
 
         Returns (...) float64, dimensionless; 0 for a segment that misses or has no length. Raises InputError for a last axis
-        that is not 3, and for shapes that do not broadcast.
-        """
+        that is not 3, and for shapes that do not broadcast."""
         start, end = _broadcast_points(source, target)
         result = np.zeros(start.shape[:-1])
         flat = result.reshape(-1)

@@ -72,8 +72,7 @@ def find_sparks(
 
     They lie below the median of 5 × 5 pixels by ``least`` and by ``threshold`` deviations (from the median of 9 × 9 absolute
     differences), are sharp in every direction, and form groups of at most ``pixels``. A feature that both the previous and
-    the next frame show nearby, at least half as high, is a gap of the object that moves on, and stays.
-    """
+    the next frame show nearby, at least half as high, is a gap of the object that moves on, and stays."""
     sparks = np.stack([_sparks_of(frame, threshold, least, pixels) for frame in frames])
     for f in np.flatnonzero(sparks.any(axis=(1, 2))) if len(frames) > 2 else ():
         height = _height(frames[f])
@@ -139,8 +138,7 @@ def find_dead(
     A pixel is dead if it never changes while its neighbours do. It is also dead if it exceeds all its neighbours in 70 % of
     the frames and differs from the median of 3 × 3 pixels by more than ``deviations`` of the panel's pixels. Near
     ``axis_column`` small parts of the object stand still on the panel: there a dead pixel has to be sharper than these. A
-    row or column that exceeds its two neighbours over nearly all its length is dead as a whole.
-    """
+    row or column that exceeds its two neighbours over nearly all its length is dead as a whole."""
     if len(frames) < LEAST_FRAMES:
         return np.zeros(frames.shape[1:], bool)
     numbers = np.unique(np.linspace(0, len(frames) - 1, _MOST_FRAMES).round().astype(int))

@@ -152,8 +152,7 @@ def find_bone(
     """Finds the candidate with which line integrals (F, v, u) explain themselves best.
 
     Returns the fractions of the densest up to which all is soft and from which all is bone (infinite: water alone; None: no
-    correction is best), and the unexplained rest of each alternative. Raises InputError where there is no object.
-    """
+    correction is best), and the unexplained rest of each alternative. Raises InputError where there is no object."""
 
     def rest_of(clean: np.ndarray) -> float:
         return unexplained(clean, model.volume(clean), inside, model)
@@ -195,8 +194,7 @@ def fit_polynomial(frames: np.ndarray, model: Model) -> Polynomial:
     """Fits the polynomial for ``straighten``, p² alone, to line integrals (F, v, u) of one material and their paths.
 
     The bend that the same fit finds in straight line integrals of that volume is subtracted. Raises InputError for an object
-    of several materials.
-    """
+    of several materials."""
     path, level, bend, rest = _bend(frames, model)
     if rest > _UNIFORM:
         found = f"{100 * rest:.2g} % of the line integrals that the path through one material does not explain"

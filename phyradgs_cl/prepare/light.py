@@ -35,8 +35,7 @@ def flat_correction(way: str) -> ToAttenuation:
     """Returns the function by which ``read_scan`` converts counts, with flats as ``way`` says.
 
     It takes data (F, v, u), image_key (F,) and the quantity, and returns line integrals (P, v, u) and bad pixels. It raises
-    InputError for other quantities and for too few flats.
-    """
+    InputError for other quantities and for too few flats."""
     checks.one_of("flats", way, WAYS)
     return counts_to_attenuation if way == "mean" else partial(_with_changing_flats, way)
 
@@ -134,8 +133,7 @@ def find_air(frames: np.ndarray, *, below: float = 0.05) -> np.ndarray:
     """Returns the pixels of line integrals (F, v, u) that no object covers, bool (F, v, u).
 
     They are below the share ``below`` of the largest line integral, connected with the first or last column, and at least
-    two pixels away from all others.
-    """
+    two pixels away from all others."""
     limit = below * float(np.percentile(frames, 99.9))
     air = np.empty(frames.shape, bool)
     for f, frame in enumerate(frames):

@@ -70,8 +70,7 @@ def retrieve_phase(
 
     pixel_mm (v, u) and distance_mm: those of a parallel beam. A cone beam that magnifies M times has pixels of pitch/M and a
     distance of R₁R₂/(R₁ + R₂), from source to object R₁ and from object to panel R₂. delta_beta: δ/β of the material; with
-    0, or at a distance of 0, the frames themselves are returned. Frames continue with the values at their edges.
-    """
+    0, or at a distance of 0, the frames themselves are returned. Frames continue with the values at their edges."""
     reach_mm = filter_reach_mm(distance_mm, energy_kev, delta_beta)
     if reach_mm == 0:
         return frames

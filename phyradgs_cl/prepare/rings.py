@@ -65,8 +65,7 @@ def ring_strength(frames: np.ndarray, *, axis_column: float | None = None, full_
 
     Its variance is the robust covariance of two sets of views in second differences along rows, taken of the difference
     between mirrored columns. The sets are the even and the odd views; on an arc (``full_turn`` False) its halves, which see
-    the object differently. ``axis_column``: the mirror, None: the middle.
-    """
+    the object differently. ``axis_column``: the mirror, None: the middle."""
     return _strength(_means(frames, full_turn), axis_column)
 
 

@@ -22,8 +22,7 @@ class Model:
     """The scan's own reconstruction and forward projection on its grid, for steps that need the object.
 
     volume: frames (F, v, u) to (z, y, x). frames: the forward projection. regularised: a slower reconstruction with a weak
-    total-variation prior.
-    """
+    total-variation prior."""
 
     volume: Callable[[np.ndarray], np.ndarray]
     frames: Callable[[np.ndarray], np.ndarray]
@@ -102,8 +101,7 @@ def unexplained(frames: np.ndarray, volume: np.ndarray, inside: np.ndarray, mode
     """Returns the relative RMS of the smooth residual of line integrals (F, v, u) and their reprojected ``volume``.
 
     Only voxels ``inside`` the object count. The residual that the same reprojection leaves is subtracted: that part comes
-    from the grid and the number of views. The rest comes from hardening, scatter and the like.
-    """
+    from the grid and the number of views. The rest comes from hardening, scatter and the like."""
 
     def reprojected(values: np.ndarray) -> np.ndarray:
         return model.frames(np.where(inside, np.maximum(values, 0), 0).astype(np.float32))

@@ -31,8 +31,7 @@ class FusedOptions:
     """iterations: of the splats; voxel_iterations: passes of ``fista`` before them.
 
     splat_weight: share of the splats' volume in the result. prior_weight: as in ``fista``. motion: static, or exact (lines
-    at their own times for the voxels, moving splats).
-    """
+    at their own times for the voxels, moving splats)."""
 
     MOTIONS: ClassVar[tuple[Motion, ...]] = (Static(), Exact())
 
@@ -67,8 +66,7 @@ def fused(scan: Scan, options: FusedOptions, rt: Runtime, **arguments: Any) -> R
     """Returns the weighted mean of both volumes in 1/mm, with the Gaussians. ``arguments``: the other ``MethodInputs``.
 
     ``disagreement`` maps where the volumes differ; it is None before there are splats. The fact ``disagreement_per_mm`` is
-    half the RMS of their difference.
-    """
+    half the RMS of their difference."""
     inputs = MethodInputs(scan, options, rt, **arguments)
     halves: dict[str, np.ndarray] = {}
 

@@ -62,8 +62,7 @@ class Loop:
     """Runs a method. ``stopped_by`` is ``iterations``, ``interrupt``, or the method's own reason.
 
     record_every, report_every: iterations between lines of the record, and between reports, which come sooner for slow
-    iterations. started: the ``time.perf_counter`` from which seconds count.
-    """
+    iterations. started: the ``time.perf_counter`` from which seconds count."""
 
     def __init__(
         self, method: Stepwise, ranks: Communicator, report: ProgressReport, started: float,
@@ -78,8 +77,7 @@ class Loop:
 
     def run(self, resume: State | None) -> None:
         """Makes all steps after the state ``resume``. Ctrl-C, or a report that raises KeyboardInterrupt, ends the run after
-        the present step, unless that is the last.
-        """
+        the present step, unless that is the last."""
         method = self.method
         if resume is not None:
             method.restore(resume)

@@ -32,8 +32,7 @@ class Method:
     """A reconstruction method: its function, and its presets of options, of which the first is the default.
 
     is_resumable: it has checkpoints. is_shared: several ranks can share its work. takes_initial: it can start from a volume.
-    ends_anywhere: its short runs are the beginnings of its long ones.
-    """
+    ends_anywhere: its short runs are the beginnings of its long ones."""
 
     run: Callable[..., Reconstruction]
     presets: Mapping[str, Any]
@@ -53,8 +52,7 @@ class OwnOptions:
 def own_method(name: str, function: Any) -> Method:
     """Returns the user's function as a method, whose options are the defaults of their class.
 
-    Raises InputError for anything but such a function, and for options without defaults.
-    """
+    Raises InputError for anything but such a function, and for options without defaults."""
     subject = f"--method {name}"
     try:
         parameters = inspect.signature(function).parameters

@@ -41,8 +41,7 @@ def reconstruct_neural(
     """Returns the volume of a neural field. The seed draws first parameters, frames, pixels and samples.
 
     ``rt`` computes the FDK volume that sets the unit of attenuation; PyTorch does the rest. ``resume`` continues an
-    interrupted run of the same scan and options from its state. Raises InputError where PyTorch is not installed.
-    """
+    interrupted run of the same scan and options from its state. Raises InputError where PyTorch is not installed."""
     require_torch(f"--method {method}")
     from phyradgs_cl.neural.field import first_field
     from phyradgs_cl.neural.tensors import torch_device

@@ -28,8 +28,7 @@ def method_options(
 
     ``motion``, ``strips``, ``sub_intervals``, ``segments`` and ``time_error`` change the motion model together; ``motion``
     may be the user's own model. tune: the request to tune an option. Raises InputError for a name that the method lacks,
-    so that no option is ignored.
-    """
+    so that no option is ignored."""
     name, presets = method_name(method), method_of(method).presets
     chosen = next(iter(presets)) if preset is None else preset
     if not isinstance(chosen, str) or chosen not in presets:
@@ -99,8 +98,7 @@ def _motion(method: str, options: Any, motion: Any, counts: dict[str, Any]) -> M
 def _implied_motion(usual: str, counts: Mapping[str, Any], models: Mapping[str, Any]) -> str:
     """Returns the name of the usual model, or of the only model with the given counts.
 
-    A method whose usual model is static stays static unless ``motion`` is given.
-    """
+    A method whose usual model is static stays static unless ``motion`` is given."""
     if usual.startswith("static") or all(_has(models[usual], key) for key in counts):
         return usual
     having = [name for name, model in models.items() if all(_has(model, key) for key in counts)]

@@ -84,8 +84,7 @@ def plan_run(
     """Returns the plan of a run: ``values`` by name over the method's preset.
 
     A name that both the method and the preprocessing have is the method's, except those in ``of_preprocessing``.
-    Raises InputError for a method, preset, option or value that does not exist.
-    """
+    Raises InputError for a method, preset, option or value that does not exist."""
     own = dict(values or {})
     names = [*preprocessing_names(method, preset), *of_preprocessing]
     preprocessing = preprocessing_of({name: own.pop(name) for name in names if name in own})

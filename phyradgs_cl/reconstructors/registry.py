@@ -58,8 +58,7 @@ METHODS = _Methods({
 def method_name(method: object) -> str:
     """Returns the name of a method: a key of METHODS, given in any case, or ``package.module:name`` of the user's own.
 
-    Raises InputError for anything else.
-    """
+    Raises InputError for anything else."""
     if isinstance(method, str) and method.lower() in METHODS:
         return method.lower()
     if callable(method):
@@ -73,8 +72,7 @@ def method_name(method: object) -> str:
 def method_of(method: object) -> Method:
     """Returns the method of that name, or the user's own function, given as such or as ``package.module:name``.
 
-    Raises InputError for anything else, and for a function that cannot be imported.
-    """
+    Raises InputError for anything else, and for a function that cannot be imported."""
     name = method_name(method)
     if name in METHODS:
         return METHODS[name]

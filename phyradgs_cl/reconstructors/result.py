@@ -38,8 +38,7 @@ class Reconstruction:
     gaussians: the cloud in mm, for methods that have one; record: the convergence record, one dict per report;
     facts: what is needed to make it again (method, options, scales, seconds); state: how to go on, where a run
     was interrupted; disagreement: how far two estimates are from each other near every voxel, (nz, ny, nx) float32 in 1/mm,
-    of ``fused``. Raises InputError for arrays that are not the grid's.
-    """
+    of ``fused``. Raises InputError for arrays that are not the grid's."""
 
     volume: np.ndarray
     grid: Grid
@@ -87,8 +86,7 @@ class Reconstruction:
         scan: the result's; then also a frame, its residual and, where the scan has a reference (nz, ny, nx) in 1/mm, the
         truth and the difference. device: what projects the volume for the residual.
 
-        Raises InputError for what is no scan, or a frame that it does not have.
-        """
+        Raises InputError for what is no scan, or a frame that it does not have."""
         from phyradgs_cl.reconstructors.plot import plot_result
 
         note = ", without the margin" if MARGIN_MM in self.facts else ""
@@ -98,8 +96,7 @@ class Reconstruction:
 def interrupted(partial: Reconstruction | None) -> KeyboardInterrupt:
     """Returns a KeyboardInterrupt whose attribute ``partial`` is the result so far, or None if there is no volume yet.
 
-    Not a subclass: only for KeyboardInterrupt itself does Python end by the signal, so that shells stop too.
-    """
+    Not a subclass: only for KeyboardInterrupt itself does Python end by the signal, so that shells stop too."""
     at = None if partial is None else partial.facts.get("interrupted_at")
     when = "at its end" if at is None else f"after iteration {at}"
     kept = f"{when}; the volume so far is the error's partial"
@@ -114,8 +111,7 @@ class Progress:
 
     loss: the dimensionless measure that ``quantity`` names. gaussians: their number, or 0. state: returns the state from
     which the run can resume. volume: returns the present volume (nz, ny, nx) in 1/mm and its grid. Both may be called during
-    the report only. A report that raises KeyboardInterrupt ends the run as Ctrl-C does.
-    """
+    the report only. A report that raises KeyboardInterrupt ends the run as Ctrl-C does."""
 
     iteration: int
     iterations: int

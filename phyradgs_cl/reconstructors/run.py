@@ -50,8 +50,7 @@ def reconstruct(
 ) -> Reconstruction:
     """Runs a plan on a scan. resume: the state of an interrupted run of the same plan.
 
-    The plan's first volume is resampled onto the scan's grid.
-    """
+    The plan's first volume is resampled onto the scan's grid."""
     preprocessing, options, report = plan.preprocessing, plan.options, Report.of(report)
     if rt.ranks.size > 1:
         _check_ranks(plan.method_name, rt)
@@ -162,8 +161,7 @@ def _check_ranks(method: str, rt: Runtime) -> None:
 def naming_size_that_fits(rt: Runtime, scan: Scan, method: str, options: Any) -> Iterator[None]:
     """Adds the ``--size`` that fits, if one does, to a shortage of memory in the body.
 
-    Raises OutOfMemoryError at once for a volume that this machine cannot hold.
-    """
+    Raises OutOfMemoryError at once for a volume that this machine cannot hold."""
     size = _size_that_fits(rt, scan, method, options)
     try:
         volume_bytes, most_bytes = 4 * math.prod(scan.grid.shape), HOST_SHARE * host_bytes()

@@ -27,8 +27,7 @@ class SimulationOptions:
     time_samples: midpoint samples in the exposure of a line; with 0 the volume's edge moves at most half a voxel of ``grid``
     between two (docs/mathematics.md). dose: photons of a pixel without object, on a line that sees the whole pulse.
     lag (λ), rings, sparks, drift, scatter: of detector/effects.py, 0 without. kvp: of detector/spectrum.py, 0 for a beam of
-    one energy.
-    """
+    one energy."""
 
     protocol: Protocol = Protocol()
     readout_axis: str = "rows"

@@ -40,8 +40,7 @@ def simulated_scan(
     """Returns a scanner's scan of a phantom, given by name or as an object, or of a volume; the truth is its reference.
 
     name: of the volume. size: voxels along the longest side of grid and reference; None takes the scanner's or the volume's.
-    pixel_samples: rays along each side of a pixel. Warns of an inverse crime.
-    """
+    pixel_samples: rays along each side of a pixel. Warns of an inverse crime."""
     if size is not None:
         checks.within("--size", size, 1 if isinstance(of, Volume) else _SMALLEST_PHANTOM, _LARGEST_GRID)
     where, axis = (scanner.geometry, scanner.grid), options.readout_axis

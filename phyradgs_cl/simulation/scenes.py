@@ -125,8 +125,7 @@ def phantom_scene(
     """Returns the scene of a phantom, or of one by its name, in the scanner's box, with ``size`` voxels per side.
 
     Closed forms are integrated exactly. Procedural phantoms are projected at twice ``size``, and the truth is their block
-    mean. Pixels average ``pixel_samples``² rays over their area.
-    """
+    mean. Pixels average ``pixel_samples``² rays over their area."""
     half_size_mm = min(box.size_mm) / 2
     phantom = make_phantom(of, half_size_mm, 2 * size, seed) if isinstance(of, str) else of
     if isinstance(phantom, EllipsoidPhantom):
@@ -150,8 +149,7 @@ def volume_scene(
     """Returns the scene of a volume, called ``name``, at its own resolution with ``pixel_samples``² rays per pixel.
 
     A volume with a grid keeps it and its unit 1/mm. A bare array is fitted into the scanner's box; its values are
-    attenuation per half of the longest side.
-    """
+    attenuation per half of the longest side."""
     volume, fine = loaded.values, loaded.grid
     if fine is None:
         voxel_mm = min(side / n for side, n in zip(box.size_mm, volume.shape, strict=True))

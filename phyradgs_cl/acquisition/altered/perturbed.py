@@ -17,8 +17,7 @@ class GeometryCorrection:
     Offsets move the panel along its own columns and rows. Roll turns it in its plane, tilts about v and u through its
     middle. Distances move source and panel away from the axis. Times lengthen readout and exposure, or start frames later.
     lag adds to the fraction of each frame that the next one repeats. drift is the logarithm of the beam's gain from the
-    first frame to the last. turn_rad turns all views about the axis, which no frame can distinguish from a turned object.
-    """
+    first frame to the last. turn_rad turns all views about the axis, which no frame can distinguish from a turned object."""
 
     offset_u_mm: float = 0.0
     offset_v_mm: float = 0.0

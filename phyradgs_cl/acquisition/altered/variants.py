@@ -28,8 +28,7 @@ class AlteredTrajectory:
     is_reversed: the gantry turns the other way (a mirror image, whose columns run backwards); offset_u_mm of the panel stays
     on its side. shift_px: the panel moves along u, in its own columns. images: maps poses (..., 12) to those of frames that
     lie otherwise on the panel; None: as stated. blocks: rows and columns per block of pixels. frames (F,): the frames of
-    ``base`` in use; None: all.
-    """
+    ``base`` in use; None: all."""
 
     base: Trajectory
     panel: tuple[int, int]

@@ -29,8 +29,7 @@ class Preprocessing(PrepareOptions, GridChoice):
 
     median_filter: edge of its window in pixels, 0 for none. holdout: percentage of the pixels that the method does not use,
     for a measure of quality. tune: the option of the method that such pixels choose (``tune/``). steps and a table for each:
-    as in ``PrepareOptions``.
-    """
+    as in ``PrepareOptions``."""
 
     ignore_lag: bool = False
     median_filter: int = 0
@@ -69,8 +68,7 @@ class Preprocessing(PrepareOptions, GridChoice):
 def prepared(scan: Scan, options: Preprocessing, rt: Runtime | None = None) -> Scan:
     """Returns the scan for a method, on a grid with its margin; the scan itself if there is nothing to do.
 
-    ``rt``: the device of steps that reconstruct and project.
-    """
+    ``rt``: the device of steps that reconstruct and project."""
     scan = prepare(regrid_and_remove_lag(scan, options), options, partial(_model, rt))
     if options.median_filter > 0:
         scan = replace(scan, projections=median_frames(scan, options.median_filter))
@@ -102,8 +100,7 @@ def _model(rt: Runtime | None, scan: Scan) -> Model:
 def median_frames(scan: Scan, edge: int) -> np.ndarray:
     """Returns line integrals (F, rows, columns) float32, each the median of ``edge`` × ``edge`` pixels of its frame.
 
-    Masked pixels are filled in from their row first, so that their values do not reach their neighbours.
-    """
+    Masked pixels are filled in from their row first, so that their values do not reach their neighbours."""
     frames = unmasked_frames(scan)
     smooth = [scipy.ndimage.median_filter(frame, size=edge, mode="nearest") for frame in frames]
     return np.stack(smooth).astype(np.float32)

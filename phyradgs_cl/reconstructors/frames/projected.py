@@ -54,8 +54,7 @@ def _rms(values: NDArray[np.floating]) -> float:
 def frame_pairs(rt: Runtime, scan: Scan, volume: np.ndarray, grid: Grid, frames: Sequence[int]) -> list[FramePair]:
     """Returns some frames of a scan with those of a volume (nz, ny, nx) in 1/mm, under the scan's true motion.
 
-    For a detector that averages intensity the computed frames do so too.
-    """
+    For a detector that averages intensity the computed frames do so too."""
     motion = PerRow(sub_intervals=TIMES_PER_LINE)
     tables = [motion.cells(scan, frame) for frame in frames]
     operator = RayOperator(rt, grid, scan.geometry.detector_shape, tables)
@@ -83,8 +82,7 @@ def holdout_errors(rt: Runtime, scan: Scan, held: np.ndarray, volume: np.ndarray
     """Returns the RMS residual of a volume (nz, ny, nx) in 1/mm at held-out pixels (F, v, u), the part of it that is their
     own noise, and their number.
 
-    No reconstruction can have a smaller true error than the noise. Both are dimensionless, as line integrals are.
-    """
+    No reconstruction can have a smaller true error than the noise. Both are dimensionless, as line integrals are."""
     squares = 0.0
     for first in range(0, scan.frames, _HOLDOUT_FRAMES):
         frames = range(first, min(first + _HOLDOUT_FRAMES, scan.frames))

@@ -50,8 +50,7 @@ def reconstruct_splats(
     """Runs a splatting method under its name ``phyradgs`` or ``r2``.
 
     ``resume`` continues an interrupted run of the same scan and options from its state. The cloud is drawn from ``initial``
-    (nz, ny, nx) in 1/mm, or else from an FDK volume.
-    """
+    (nz, ny, nx) in 1/mm, or else from an FDK volume."""
     started = time.perf_counter()
     # rank 0 alone makes the first volume
     scale, population, rng = rt.ranks.bcast(first_cloud(rt, scan, options, seed, initial) if rt.ranks.rank == 0 else None)

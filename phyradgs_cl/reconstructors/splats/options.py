@@ -24,8 +24,7 @@ class SplatOptions:
     pixel_footprint: pixels average over their area.
 
     iterations: frames, with a step of Adam every ``batch`` of them (0: as many as there are ranks) at rates × √batch. The
-    same batch gives the same bits on any number of ranks (docs/cluster.md).
-    """
+    same batch gives the same bits on any number of ranks (docs/cluster.md)."""
 
     MOTIONS: ClassVar[tuple[Motion, ...]] = motions_for(SPLATS)
 

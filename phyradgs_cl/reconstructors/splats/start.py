@@ -56,8 +56,7 @@ def initial_cloud(
 
     volume (nz, ny, nx) and everything else in internal units. Density is ``density_share`` of the voxel's value;
     the scale is ``scale_factor`` × the RMS distance to the three nearest others. An empty volume still gives
-    one faint Gaussian in the middle, so that there is something to optimise.
-    """
+    one faint Gaussian in the middle, so that there is something to optimise."""
     candidates = np.flatnonzero(volume.ravel() > threshold)
     if candidates.size == 0:
         log.warning(

@@ -40,8 +40,7 @@ class TuningRequest:
 def check_tuning(text: str, method: str, options: Any, changes: Mapping[str, Any], ends_anywhere: bool) -> None:
     """Raises InputError for an option that cannot be chosen, or that the user has set.
 
-    ends_anywhere: whether the method's short runs are the beginnings of its long ones.
-    """
+    ends_anywhere: whether the method's short runs are the beginnings of its long ones."""
     request = TuningRequest.parse(text)
     name = request.option
     numbers = [f.name for f in fields(options) if checks.is_number(getattr(options, f.name))]

@@ -57,8 +57,7 @@ def tuned(
     """Runs a method with the number that its trials on ``scan`` choose.
 
     The facts and the state hold the choice; a resumed run takes it from the state. Raises KeyboardInterrupt for a trial that
-    is stopped.
-    """
+    is stopped."""
     request = TuningRequest.parse(text)
     if resume is None:
         tuning = _choose(_Trials(request, run, scan, rt, report, extra), options)
@@ -129,8 +128,7 @@ class _Trials:
         """Measures the errors of runs at the requested values, or at some around the present one.
 
         The latter are extended where the choice is at an end, but not for whole numbers, with which runs may take longer.
-        Trials of weights are shorter: a weight is as good there, which does not hold for a relaxation.
-        """
+        Trials of weights are shorter: a weight is as good there, which does not hold for a relaxation."""
         if self.option in _WEIGHTS and hasattr(options, "iterations"):
             options = replace(options, iterations=ceil_div(options.iterations, _SHORTER))
         present = getattr(options, self.option)

@@ -25,8 +25,7 @@ class AsdPocsOptions(SartOptions):
 
     tv_reduction: factor of that length when TV moves the volume by more than ``tv_ratio`` (r_max) of the SART pass's change
     and the residual is above ε. residual_share: ε over the residual of the FDK volume. prior_share: weight of the total
-    variation of the difference to the run's first volume, 0 to 1 (PICCS).
-    """
+    variation of the difference to the run's first volume, 0 to 1 (PICCS)."""
 
     iterations: int = 10
     relaxation_reduction: float = 0.9999

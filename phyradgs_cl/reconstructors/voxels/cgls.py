@@ -27,8 +27,7 @@ class Cgls(Algorithm):
     """Minimises ‖p − A x‖ over the Krylov spaces of AᵀA from x = 0. The residual is that after the step.
 
     In the intensity model the residual is p − I(x), and J replaces A. Directions then combine as in nonlinear conjugate
-    gradients (Polak and Ribière 1969), which is the same iteration where I is linear.
-    """
+    gradients (Polak and Ribière 1969), which is the same iteration where I is linear."""
 
     ARRAYS = ("volume", "residual", "direction", "gradient")
     NUMBERS = ("gamma",)

@@ -49,8 +49,7 @@ class FistaOptions(IterativeOptions):
 
     subvoxels: parts of a voxel's side in the last 3/7 of the passes; 0: 2 up to 90³ voxels where memory allows, else 1.
     subsets: of the frames, with one step each; subsets whose steps diverge are joined two by two.
-    tv_iterations: dual iterations per proximal map of TV. transmission_weights: as in ``fista-tv``.
-    """
+    tv_iterations: dual iterations per proximal map of TV. transmission_weights: as in ``fista-tv``."""
 
     FUNCTIONS: ClassVar[tuple[str, ...]] = ("prior",)
     """Options that may be a function."""
@@ -77,8 +76,7 @@ class FistaOptions(IterativeOptions):
 class Accelerated(Algorithm):
     """A proximal gradient method with FISTA's momentum, restarted where it points uphill.
 
-    The restart is the gradient scheme of O'Donoghue and Candès, Found. Comput. Math. 15 (2015) 715.
-    """
+    The restart is the gradient scheme of O'Donoghue and Candès, Found. Comput. Math. 15 (2015) 715."""
 
     ARRAYS: ClassVar[tuple[str, ...]] = ("volume", "previous")
     NUMBERS = ("momentum",)

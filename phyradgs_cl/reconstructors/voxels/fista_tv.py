@@ -19,8 +19,7 @@ class FistaTvOptions(IterativeOptions):
     """tv_weight: λ as a share of the largest value of Aᵀp, so that it holds for any unit and dose.
 
     tv_iterations: dual iterations per proximal map, which starts from the last dual. transmission_weights: least
-    squares weighted by transmission (PWLS), ½ Σ t (p − A x)², with λ a share of the largest value of Aᵀ t p.
-    """
+    squares weighted by transmission (PWLS), ½ Σ t (p − A x)², with λ a share of the largest value of Aᵀ t p."""
 
     iterations: int = 100
     tv_weight: float = ranged(0.001, 0, 1e6)
@@ -32,8 +31,7 @@ class FistaTv(Accelerated):
     """The residual is that of the new volume. A is linear, so A y follows from A xₖ and A xₖ₋₁ without a projection.
 
     The intensity model replaces A x by I(x) and Aᵀ by Jᵀ at x. I is not linear along the momentum's line; that error
-    vanishes with the steps.
-    """
+    vanishes with the steps."""
 
     ARRAYS = ("volume", "previous", "projected", "projected_previous")
 

@@ -24,8 +24,7 @@ _LEAST = 1e-4  # of the largest value of Aᵀp: the weight of frames without noi
 class FrameError:
     """The error of a pixel that no volume on the grid explains.
 
-    noise: its noise, dimensionless. edges_mm: the discretisation error at edges, over the density there in 1/mm.
-    """
+    noise: its noise, dimensionless. edges_mm: the discretisation error at edges, over the density there in 1/mm."""
 
     noise: float
     edges_mm: float = 0.0
@@ -55,8 +54,7 @@ class AdjointResponse:
     """Response of Aᵀ in the middle half of a volume, in mm.
 
     noise_mm: the standard deviation for independent unit noise per ray. common_mm: the mean for a unit error common to all
-    rays.
-    """
+    rays."""
 
     noise_mm: float
     common_mm: float

@@ -28,8 +28,7 @@ _NONLOCAL_STEP = 0.01  # length of a step down the nonlocal quadratic
 class PriorInputs:
     """The arguments of a prior: device, grid, and for piccs its image (nz, ny, nx) in 1/mm and the weight of the change.
 
-    tv_iterations: dual iterations per map. passes: over all frames, of the run.
-    """
+    tv_iterations: dual iterations per map. passes: over all frames, of the run."""
 
     rt: Runtime
     grid: Grid
@@ -54,8 +53,7 @@ class PriorInputs:
 class Prior:
     """A map x → argmin ½‖x' − x‖² + weight R(x'), x' ≥ 0 if asked, or an approximation of it.
 
-    A subclass that starts from its last result keeps it in ``state``. This class is the prior none: x ≥ 0 alone.
-    """
+    A subclass that starts from its last result keeps it in ``state``. This class is the prior none: x ≥ 0 alone."""
 
     VOLUMES: ClassVar[int] = 0
     """How many more volumes the prior holds than ``dct``."""
@@ -116,8 +114,7 @@ class Nonlocal(Prior):
     """A step down a nonlocal quadratic, then another prior.
 
     The quadratic's weights come from the volume after a quarter and after half of the passes. Weights that kept following
-    the volume would sharpen structures that are not in the data.
-    """
+    the volume would sharpen structures that are not in the data."""
 
     VOLUMES = NonlocalStep.VOLUMES
 
@@ -155,8 +152,7 @@ class Nonlocal(Prior):
 class Piccs(Prior):
     """(1 − share) TV(x) + share TV(x − image), as one map after the other.
 
-    Prior image constrained compressed sensing: Chen, Tang and Leng, Med. Phys. 35 (2008) 660.
-    """
+    Prior image constrained compressed sensing: Chen, Tang and Leng, Med. Phys. 35 (2008) 660."""
 
     def __init__(self, inputs: PriorInputs) -> None:
         if inputs.image is None:
@@ -216,8 +212,7 @@ PRIORS: dict[str, Callable[[PriorInputs], Prior]] = {
 def prior_of(prior: str | Denoiser, inputs: PriorInputs) -> Prior:
     """Returns a prior by its name in ``PRIORS``, or a user's function, itself or by ``package.module:function``.
 
-    Raises InputError for a name that is no function, and for piccs without an image.
-    """
+    Raises InputError for a name that is no function, and for piccs without an image."""
     if isinstance(prior, str) and prior in PRIORS:
         return PRIORS[prior](inputs)
     own = imported(prior, "--prior") if isinstance(prior, str) else prior

@@ -40,8 +40,7 @@ class IterativeOptions:
     motion: static, micro-views, or per-row (every line at its own times). iterations: passes over all frames.
     nonnegative: clip the volume at 0 after every update. tolerance: stop when an iteration changes the volume by
     less than this share of its norm; 0 runs all iterations. detector_model: which quantity the detector averages over a
-    line's times, line integrals (log) or intensity, or the model that the scan states (scan).
-    """
+    line's times, line integrals (log) or intensity, or the model that the scan states (scan)."""
 
     transmission_weights: ClassVar[bool] = False
     """Weights pixels by their transmission. Some methods have an option of this name."""
@@ -66,8 +65,7 @@ class IterativeOptions:
 class Algorithm:
     """One iterative method on one system. ``volume`` (nz, ny, nx) in 1/mm is an array of the system's space.
 
-    A subclass writes ``step``, and names its running state: attributes that are arrays of the space, and numbers.
-    """
+    A subclass writes ``step``, and names its running state: attributes that are arrays of the space, and numbers."""
 
     ARRAYS: ClassVar[tuple[str, ...]] = ("volume",)
     NUMBERS: ClassVar[tuple[str, ...]] = ()
@@ -121,8 +119,7 @@ def run_iterations(
 
     The method holds ``volumes`` volumes and ``frames`` stacks of all frames at one time, its tables included. They stay on
     the device where it has room for them. The record has a line per iteration: the residual ‖p − A x‖/‖p‖, the change
-    ‖x − x'‖/‖x‖, and the seconds since the start.
-    """
+    ‖x − x'‖/‖x‖, and the seconds since the start."""
     started = time.perf_counter()
     scan, options, rt = inputs.scan, inputs.options, inputs.rt
     system = System.of_scan(rt, scan, options.motion, options.detector_model)

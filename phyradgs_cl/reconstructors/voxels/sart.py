@@ -29,8 +29,7 @@ class SartOptions(IterativeOptions):
     (neighbours in time far apart in angle), ``random`` (from the seed), ``ordered`` (as recorded).
     transmission_weights: transmission-weighted (PWLS), W = t/(A 1) and V = 1/(Aᵀ t).
     noise_stop: the run ends when the residual falls to this many times the estimated noise of the measurement (discrepancy
-    principle, Morozov 1966); further iterations fit the noise. 0 runs all iterations.
-    """
+    principle, Morozov 1966); further iterations fit the noise. 0 runs all iterations."""
 
     relaxation: float = checks.ranged(1.0, 1e-6, 2)
     relaxation_reduction: float = checks.ranged(0.999, 1e-6, 1)
@@ -51,8 +50,7 @@ class Sart(Algorithm):
     """x ← x + λ V Aᵢᵀ W (pᵢ − Aᵢ x) over subsets i, W = 1/(Aᵢ 1), V = 1/(Aᵢᵀ 1).
 
     The intensity model replaces Aᵢᵀ by Jᵢᵀ and Aᵢ x by Iᵢ(x). The residual is that of the pass: of every subset just before
-    its correction.
-    """
+    its correction."""
 
     NUMBERS = ("relaxation", "passes")
 

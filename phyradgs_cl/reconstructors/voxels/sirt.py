@@ -19,8 +19,7 @@ class SirtOptions(IterativeOptions):
 class Sirt(Algorithm):
     """x ← x + λ C Aᵀ R (p − A x), R = 1/(A 1), C = 1/(Aᵀ 1). The intensity model replaces Aᵀ by Jᵀ and A x by I(x).
 
-    The residual is that before the correction, of which √R ‖·‖ falls in every step.
-    """
+    The residual is that before the correction, of which √R ‖·‖ falls in every step."""
 
     def __init__(self, system: System, options: SirtOptions) -> None:
         super().__init__(system)

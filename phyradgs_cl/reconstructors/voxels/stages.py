@@ -36,8 +36,7 @@ def _last_volume(volume: np.ndarray, before: np.ndarray | None) -> np.ndarray:
 class Stage:
     """One stage: its number of iterations and a function that runs them.
 
-    ``merge`` combines the stage's volume and that of the stages before it to the result of the whole run (nz, ny, nx).
-    """
+    ``merge`` combines the stage's volume and that of the stages before it to the result of the whole run (nz, ny, nx)."""
 
     name: str
     iterations: int
@@ -85,8 +84,7 @@ def run_stages(stages: Sequence[Stage], inputs: MethodInputs) -> Reconstruction:
     """Runs one stage after the other as one run, which is reported, stopped and resumed as such.
 
     Iterations, seconds and the record are those of all stages; the other facts are the last stage's. The fact ``stages``
-    lists the iterations and seconds of each.
-    """
+    lists the iterations and seconds of each."""
     progress, stage_facts, grid = StageProgress(inputs.initial), {}, inputs.scan.grid
     resume = None if inputs.resume is None else progress.restore(inputs.resume, stages, grid)
     report, total = Report.of(inputs.report), sum(stage.iterations for stage in stages)

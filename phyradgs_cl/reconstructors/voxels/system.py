@@ -34,8 +34,7 @@ class System:
     ``measured`` and in every residual, as if A had no rows for them.
     intensity: set where the detector averages intensity. The measurement is then compared with I(x) in place of A x, and
     residuals go back through Jᵀ in place of Aᵀ; J is the derivative of I at the volume of the last comparison.
-    transmission: (F, rows, columns) weights of pixels by their transmission, mean 1; None: equal weights.
-    """
+    transmission: (F, rows, columns) weights of pixels by their transmission, mean 1; None: equal weights."""
 
     operator: LinearOperator
     measured: Any
@@ -65,8 +64,7 @@ class System:
     def resident(self, rt: Runtime, volumes: int, frames: int) -> "System":
         """Returns the system on the device, if it has room for the operators, the volumes, and stacks of all frames.
 
-        Otherwise the system stays on the host. It always does in bricks and on several ranks, which sum there.
-        """
+        Otherwise the system stays on the host. It always does in bricks and on several ranks, which sum there."""
         operators = [o for o in (self.operator, self.intensity) if isinstance(o, (RayOperator, IntensityOperator))]
         if len(operators) < 1 + (self.intensity is not None):
             return self
@@ -178,8 +176,7 @@ def row_weights(system: System) -> Any:
 
     A ray shorter than a tenth of the longest path counts as that long. A ray that only grazes an edge of the volume would
     otherwise put its noise on one or two voxels, and corners of the volume become bright. TIGRE measures the paths in a box
-    that is a tenth larger, for the same reason.
-    """
+    that is a tenth larger, for the same reason."""
     return system.apply_weights(system.space.reciprocal(system.row_sums(), _SHORTEST_PATH))
 
 
@@ -192,8 +189,7 @@ class SharedOperator:
     """A ``LinearOperator`` whose frames the ranks share; ``whole`` has all frames.
 
     Volumes and frames are complete on every rank, so that methods do the same on each. Sums of volumes do not depend on
-    their order, only on the number of frames per rank.
-    """
+    their order, only on the number of frames per rank."""
 
     def __init__(self, ranks: Communicator, whole: LinearOperator) -> None:
         self.ranks, self.whole = ranks, whole
