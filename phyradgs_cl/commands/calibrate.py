@@ -13,14 +13,14 @@ from phyradgs_cl.commands.console import AsJson, file_option, option, say
 from phyradgs_cl.commands.options import Device, Scan
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.importers import load_beads
-from phyradgs_cl.io import check_writable, only_run, written_beside
+from phyradgs_cl.io import only_run, written_beside
 from phyradgs_cl.io.scan.copy import copy_with_motion
 from phyradgs_cl.progress import Ticker
 from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.settings import device_wish
 from phyradgs_cl.signals import finish_despite_interrupt
 from phyradgs_cl.text import to_digits_of
-from phyradgs_cl.workflow.files import load_scan, refuse_foreign_suffix, refuse_overwriting
+from phyradgs_cl.workflow.files import check_output, check_picture, load_scan
 
 EXAMPLES = {"calibrate": "Example: phyradgs calibrate scan.h5 -o calibrated.h5"}
 GROUPS = {
@@ -57,7 +57,10 @@ def calibrate_command(
     """
     wish = device_wish(device)
     picture = picture or (output and output.with_suffix(".png"))
-    _check_outputs(output, picture, [path for path in (scan, other, phantom) if path is not None])
+    if output is not None:
+        check_output(output, scan, other, phantom)
+    if picture is not None:
+        check_picture(picture, scan, other, phantom)
     with Ticker("pass") as ticker:
         ticker.stage(f"reading {scan}")
         shape = None if phantom is None else load_beads(phantom)
@@ -81,17 +84,6 @@ def calibrate_command(
         say(f"{output}: {', '.join(one.name for one in result.corrected) or 'nothing'} corrected")
     if picture is not None:
         say(f"{picture}: residuals before and after")
-
-
-def _check_outputs(output: Path | None, picture: Path | None, inputs: list[Path]) -> None:
-    if output is not None:
-        refuse_foreign_suffix(output)
-    if picture is not None and picture.suffix.lower() != ".png":
-        raise InputError("--picture", str(picture), "a file name that ends in .png")
-    for flag, target in (("-o", output), ("--picture", picture)):
-        if target is not None:
-            refuse_overwriting(flag, target, *inputs)
-            check_writable(target)
 
 
 def _check_storable(scan: Loaded, names: list[str]) -> None:

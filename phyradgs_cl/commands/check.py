@@ -9,13 +9,13 @@ from phyradgs_cl.check import CANNOT_TELL, CENTRE, CheckResult, CountReader, che
 from phyradgs_cl.commands.console import AsJson, file_option, option, say
 from phyradgs_cl.commands.options import Device, Scan
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.io import check_writable, only_run, read_scan
+from phyradgs_cl.io import only_run, read_scan
 from phyradgs_cl.io.scan.copy import copy_with_offset
 from phyradgs_cl.progress import Ticker
 from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.settings import device_wish
 from phyradgs_cl.signals import finish_despite_interrupt
-from phyradgs_cl.workflow.files import expecting, refuse_foreign_suffix, refuse_overwriting
+from phyradgs_cl.workflow.files import check_output, expecting
 
 EXAMPLES = {"check": "Example: phyradgs check scan.h5"}
 SUSPICIOUS_STATUS = 10
@@ -38,7 +38,11 @@ def check_command(
     is suspicious, or if --fix-offset has corrected the only suspicious answer; 10 otherwise.
     """
     wish = device_wish(device)
-    target = _checked_output(scan, fix_offset, output)
+    if fix_offset != (output is not None):
+        combination = "--fix-offset without -o" if fix_offset else "-o without --fix-offset"
+        raise InputError("check", combination, "both or neither", "write for example --fix-offset -o fixed.h5")
+    if output is not None:
+        check_output(output, scan)
     counts = CountReader()
     with Ticker("question") as ticker:
         ticker.stage(f"reading {scan.name}")
@@ -47,21 +51,10 @@ def check_command(
         result = check(loaded, Runtime(wish), counts, lambda done, total, name: ticker.show(done, total, f"  {name}"))
     say(_as_json(result, scan) if as_json else _as_text(result))
     suspicious = {finding.question for finding in result.suspicious}
-    if target is not None:
-        _write_copy(scan, target, result, quiet=as_json)
+    if output is not None:
+        _write_copy(scan, output, result, quiet=as_json)
         suspicious.discard(CENTRE)
     return SUSPICIOUS_STATUS if suspicious else 0
-
-
-def _checked_output(scan: Path, fix_offset: bool, output: Path | None) -> Path | None:
-    if fix_offset != (output is not None):
-        combination = "--fix-offset without -o" if fix_offset else "-o without --fix-offset"
-        raise InputError("check", combination, "both or neither", "write for example --fix-offset -o fixed.h5")
-    if output is not None:
-        refuse_overwriting("-o", output, scan)
-        refuse_foreign_suffix(output)
-        check_writable(output)
-    return output
 
 
 def _write_copy(scan: Path, target: Path, result: CheckResult, quiet: bool) -> None:

@@ -24,9 +24,9 @@ from phyradgs_cl.fields import GridChoice
 from phyradgs_cl.importers import FORMATS, ImportOptions, import_scan, recognise
 from phyradgs_cl.importers.formats.tiff_template import template_of
 from phyradgs_cl.importers.options import FIELDS, WORDS, option_name
-from phyradgs_cl.io import check_writable, file_kind, only_run, write_scan
+from phyradgs_cl.io import file_kind, only_run, write_scan
 from phyradgs_cl.signals import finish_despite_interrupt
-from phyradgs_cl.workflow.files import refuse_foreign_suffix
+from phyradgs_cl.workflow.files import check_output
 
 EXAMPLES = {
     "import": (
@@ -104,8 +104,7 @@ def import_command(
     options = ImportOptions(**given, named=option_name)
     grid = GridChoice(size, voxel_mm, roi_mm)
     _refuse_overwriting(source, output)
-    refuse_foreign_suffix(output)
-    check_writable(output)
+    check_output(output)
     format_name = form or recognise(source)
     with only_run(output):
         stored = import_scan(source, options, format_name)

@@ -8,12 +8,12 @@ from phyradgs_cl import checks
 from phyradgs_cl.errors import InputError, OutputError
 from phyradgs_cl.fields import Grid, triple
 from phyradgs_cl.fields.grid_choice import voxel_sides_mm
-from phyradgs_cl.io import check_writable, written_beside
+from phyradgs_cl.io import written_beside
 from phyradgs_cl.io.volume import interruption
 from phyradgs_cl.metrics import VOXEL_BY_VOXEL, Aligned, aligned, compare, in_words, slices_png
 from phyradgs_cl.signals import finish_despite_interrupt
 from phyradgs_cl.text import plain_text
-from phyradgs_cl.workflow.files import load_reference, load_result, refuse_overwriting
+from phyradgs_cl.workflow.files import check_picture, load_reference, load_result
 
 
 @np.errstate(all="ignore")
@@ -23,10 +23,7 @@ def run_evaluation(
     """Compares a volume with a scan's reference or another volume, by the rule of ``metrics.aligned``, and writes the
     picture of slices. A volume without a scale is compared voxel by voxel. ``reference_voxel_mm``: sides of the voxels of a
     reference without a scale, one length or (z, y, x). InputError: no such sides; files that do not fit each other."""
-    refuse_overwriting("--picture", picture, volume_path, reference_path)
-    if picture.suffix.lower() != ".png":
-        raise InputError("--picture", str(picture), "a file name that ends in .png")
-    check_writable(picture)
+    check_picture(picture, volume_path, reference_path)
     result, stored = load_result(volume_path), load_reference(reference_path)
     volume, grid, provenance = result.values, result.grid, result.provenance
     reference, stored_grid = stored.values, stored.grid

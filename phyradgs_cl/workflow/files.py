@@ -9,7 +9,7 @@ from phyradgs_cl import importers
 from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.exporters import foreign_suffix
-from phyradgs_cl.io import Volume, file_kind, read_scan, scan_summary, volume_summary
+from phyradgs_cl.io import Volume, check_writable, file_kind, read_scan, scan_summary, volume_summary
 from phyradgs_cl.io.hdf5.source import open_hdf5
 from phyradgs_cl.prepare import flat_correction
 
@@ -58,17 +58,28 @@ def _is_foreign_scan(path: Path) -> bool:
         return False
 
 
-def refuse_overwriting(option: str, output: Path, *inputs: Path) -> None:
-    """Raises InputError for an output that is one of the inputs."""
-    for path in inputs:
-        if Path(output).resolve() == Path(path).resolve():
-            raise InputError(option, f"the input file {path} itself", "another file to write")
-
-
-def refuse_foreign_suffix(output: Path, remedy: str = "write scan.h5") -> None:
-    """Raises InputError for an HDF5 output with another format's suffix, which would mislead other programs."""
+def check_output(output: Path, *inputs: Path | None, remedy: str = "write scan.h5") -> None:
+    """Raises InputError for an HDF5 output that is one of the inputs or has another format's suffix, which would mislead
+    other programs; OutputError where it cannot be written."""
+    refuse_overwriting("-o", output, *inputs)
     if (ending := foreign_suffix(output)) is not None:
         raise InputError("-o", f"the suffix {ending} of another format", "an HDF5 file, as NAME.h5", remedy)
+    check_writable(output)
+
+
+def check_picture(picture: Path, *inputs: Path | None) -> None:
+    """Raises InputError for a picture that is one of the inputs or no PNG, OutputError where it cannot be written."""
+    refuse_overwriting("--picture", picture, *inputs)
+    if picture.suffix.lower() != ".png":
+        raise InputError("--picture", str(picture), "a file name that ends in .png")
+    check_writable(picture)
+
+
+def refuse_overwriting(option: str, output: Path, *inputs: Path | None) -> None:
+    """Raises InputError for an output that is one of the inputs."""
+    for path in inputs:
+        if path is not None and output.resolve() == path.resolve():
+            raise InputError(option, f"the input file {path} itself", "another file to write")
 
 
 def load_result(path: Path) -> Volume:

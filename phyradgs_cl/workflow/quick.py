@@ -8,7 +8,7 @@ from phyradgs_cl.io.output import make_folder
 from phyradgs_cl.reconstructors import usual_preset
 from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.simulation import scanner_for, scanner_options
-from phyradgs_cl.workflow.simulate import SimulationJob, run_simulation
+from phyradgs_cl.workflow.scans import SimulationJob, run_simulation
 from phyradgs_cl.workflow.sweep.grid import Setting, SweepGrid, Table
 
 PHANTOMS, VOXELS, PIXELS, ITERATIONS = ("foot", "jaw"), 32, 64, 600

@@ -18,7 +18,6 @@ from phyradgs_cl.acquisition import MicroViews, Scan
 from phyradgs_cl.acquisition.geometry import cuts
 from phyradgs_cl.errors import InputError, OutputError, PhyradgsError, naming_host_memory
 from phyradgs_cl.io import (
-    check_writable,
     checkpoint_path,
     former_checkpoint_path,
     hashing,
@@ -46,7 +45,7 @@ from phyradgs_cl.reconstructors.run import check_resumable
 from phyradgs_cl.runtime import Runtime, profile_text
 from phyradgs_cl.signals import finish_despite_interrupt, keep_finished_work
 from phyradgs_cl.text import plain_text
-from phyradgs_cl.workflow.files import load_scan, refuse_foreign_suffix, refuse_overwriting
+from phyradgs_cl.workflow.files import check_output, load_scan, refuse_overwriting
 
 log = logging.getLogger(__name__)
 
@@ -131,10 +130,8 @@ def run_reconstruction(
         check_resumable(plan)
     if leads:
         export = f"write volume.h5, then 'phyradgs export volume.h5 -o {plain_text(output.name)}'"
-        refuse_foreign_suffix(output, export)
-        check_writable(output)
-    for path in (output, partial_path(output)):
-        refuse_overwriting("-o", path, scan, *inputs)
+        check_output(output, scan, *inputs, remedy=export)
+        refuse_overwriting("-o", partial_path(output), scan, *inputs)
     with only_run(output) if leads else nullcontext():
         return _reconstructed(plan, _Files(scan, output), make_runtime, report, resume, checkpoint_every_s)
 

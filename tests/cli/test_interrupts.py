@@ -110,7 +110,7 @@ PROCESSES = {
     "while the output is half written": """
         import h5py
         h5py.Group.require_group = h5py.Group.create_group = press
-        import phyradgs_cl.workflow.simulate as w
+        import phyradgs_cl.workflow.scans as w
         w.finish_despite_interrupt = contextlib.nullcontext  # as in a command that does not make signals wait
     """,
 }

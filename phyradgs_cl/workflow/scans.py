@@ -1,22 +1,26 @@
-"""From a phantom or volume to a scan file."""
+"""To a scan file: from a phantom or a volume, and from a scan without the effects of panel and beam."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from phyradgs_cl import checks
+from phyradgs_cl import __version__, checks
 from phyradgs_cl.acquisition import PROTOCOLS, Scan
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.importers import load_attenuation, load_beads
-from phyradgs_cl.io import Scanner, Volume, check_writable, only_run, write_scan
+from phyradgs_cl.io import Scanner, Volume, hashing, only_run, write_scan
 from phyradgs_cl.phantoms import PHANTOMS, EllipsoidPhantom
+from phyradgs_cl.prepare import PREPARED_KEY, STEPS
+from phyradgs_cl.reconstructors import Preprocessing
+from phyradgs_cl.reconstructors.frames.preprocess import prepared
 from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.signals import finish_despite_interrupt
 from phyradgs_cl.simulation import SimulationOptions, simulated_scan
 from phyradgs_cl.text import suggest_name
-from phyradgs_cl.workflow.files import expecting, refuse_foreign_suffix, refuse_overwriting
+from phyradgs_cl.workflow.files import check_output, expecting, load_scan
 
 _TOML = ".toml"
 
@@ -66,15 +70,10 @@ def run_simulation(
     report: Callable[[int, int], None],
 ) -> Scan:
     """Simulates and writes a scan file; everything is checked before any work."""
-    if job.volume is not None:
-        if job.phantom is not None:
-            raise InputError("--volume", f"given together with --phantom {job.phantom}", "one of the two")
-        refuse_overwriting("-o", job.output, job.volume)
-    for described in (job.scanner, job.phantom or ""):
-        if described.endswith(_TOML):
-            refuse_overwriting("-o", job.output, Path(described))
-    refuse_foreign_suffix(job.output)
-    check_writable(job.output)
+    if job.volume is not None and job.phantom is not None:
+        raise InputError("--volume", f"given together with --phantom {job.phantom}", "one of the two")
+    described = [Path(name) for name in (job.scanner, job.phantom or "") if name.endswith(_TOML)]
+    check_output(job.output, job.volume, *described)
     with only_run(job.output):
         of: str | Volume | EllipsoidPhantom = phantom_of(job.phantom or "foot")
         if job.volume is not None:
@@ -87,3 +86,25 @@ def run_simulation(
         with finish_despite_interrupt():
             write_scan(job.output, scan)
         return scan
+
+
+@np.errstate(all="ignore")
+def run_preparation(
+    source: Path, output: Path, options: Preprocessing, make_runtime: Callable[[], Runtime], config: Path | None = None
+) -> list[dict[str, Any]]:
+    """Writes the scan ``source`` after the steps of ``options`` as line integrals; says what each did, in order. The file
+    says the same, and of which scan. Bad pixels are masked and filled in. Raises InputError and OutputError as any run."""
+    if not options.chosen and options.flats == "mean":
+        raise InputError("--steps", "none", f"some of {', '.join(STEPS)}", "leave it out for the usual ones")
+    options.check_written()
+    check_output(output, source, config)
+    with only_run(output):
+        with hashing(source) as hash_of:
+            scan = load_scan(source, options.flats)
+            origin = {"prepared_from": str(source), "prepared_from_sha256": hash_of()}
+        origin["prepared_by"] = f"phyradgs-cl {__version__}"
+        clean = prepared(scan, options, make_runtime())
+        with finish_despite_interrupt():
+            write_scan(output, replace(clean, provenance={**clean.provenance, **origin}))
+    step_facts: Any = clean.provenance.get(PREPARED_KEY, [])
+    return list(step_facts)
