@@ -1,6 +1,5 @@
 """Foreign files and folders: names that stay inside the folder, and texts and arrays bounded by the file's own size."""
 
-import json
 import math
 import re
 from collections.abc import Sequence
@@ -12,7 +11,7 @@ import numpy as np
 
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.io.files import HOST_SHARE, host_bytes, read_regular, regular_file
-from phyradgs_cl.io.tables import LARGEST
+from phyradgs_cl.io.tables import LARGEST, read_facts
 
 MOST_TEXT_BYTES = 64 << 20
 _MOST_FILES = 200_000
@@ -35,13 +34,7 @@ def read_bytes(path: Path) -> bytes:
 
 def read_json(path: Path) -> dict[str, object]:
     """Parses a JSON file that holds an object."""
-    try:
-        content = json.loads(read_bytes(path).decode("utf-8-sig"))
-    except (ValueError, RecursionError) as error:  # UnicodeDecodeError is a ValueError
-        raise InputError(str(path), f"text that is not JSON ({error})", "a JSON object") from error
-    if not isinstance(content, dict):
-        raise InputError(str(path), f"JSON {type(content).__name__}", "a JSON object")
-    return content
+    return read_facts(str(path), read_bytes(path).decode("utf-8-sig", "replace"), {})
 
 
 def read_numbers(path: Path, count: int, what: str) -> np.ndarray:
@@ -69,30 +62,15 @@ def read_npy(path: Path, ndim: int) -> np.ndarray:
     subject = str(path)
     regular_file(path, subject)
     try:
-        with open(path, "rb") as file:
-            version = np.lib.format.read_magic(file)
-            if version not in ((1, 0), (2, 0)):
-                raise InputError(subject, f"version {version}", "a .npy file of version 1.0 or 2.0")
-            read_header = getattr(np.lib.format, f"read_array_header_{version[0]}_0")
-            shape, is_fortran, dtype = read_header(file)
-            _check_array(subject, shape, dtype, path.stat().st_size - file.tell(), ndim)
-            values = np.fromfile(file, dtype, math.prod(shape))
-    except (InputError, MemoryError):
-        raise
+        values = np.load(path, mmap_mode="r", allow_pickle=False)  # maps no bytes that the file does not have
+        dtype, shape = values.dtype, values.shape
     except Exception as error:  # NumPy passes on any exception of Python's parser and tokeniser
         raise InputError(subject, f"a damaged .npy file ({error})", "a NumPy array") from error
-    return np.ascontiguousarray(values.reshape(shape, order="F" if is_fortran else "C"))
-
-
-def _check_array(subject: str, shape: tuple[int, ...], dtype: np.dtype, available_bytes: int, ndim: int) -> None:
-    if dtype.kind not in "iuf" or dtype.itemsize not in (1, 2, 4, 8):
+    if dtype.kind not in "iuf" or dtype.itemsize > 8:
         raise InputError(subject, f"type {dtype}", "plain real numbers")
-    if len(shape) != ndim or min(shape, default=0) < 1:
+    if len(shape) != ndim or 0 in shape:
         raise InputError(subject, f"shape {shape}", f"{ndim} axes, none of them empty")
-    needed = math.prod(shape) * dtype.itemsize
-    if needed > available_bytes:
-        found = f"shape {shape}, {needed} bytes, in {available_bytes} bytes of data"
-        raise InputError(subject, found, "as many bytes as its header announces", "copy the file again")
+    return np.array(values, order="C", subok=False)
 
 
 @dataclass(frozen=True)
