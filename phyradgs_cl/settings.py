@@ -10,19 +10,12 @@ from pathlib import Path
 from typing import Any
 
 from phyradgs_cl import checks
+from phyradgs_cl import reconstructors as methods
 from phyradgs_cl.errors import InputError, PhyradgsError
 from phyradgs_cl.importers import load_volume
 from phyradgs_cl.io import sha256_of
 from phyradgs_cl.io.tables import read_toml
 from phyradgs_cl.parallel import Communicator
-from phyradgs_cl.reconstructors import (
-    DEFAULT_METHOD,
-    InitialVolume,
-    Preprocessing,
-    RunPlan,
-    plan_run,
-    preprocessing_of,
-)
 from phyradgs_cl.runtime import Runtime, bytes_of
 
 if sys.version_info >= (3, 11):
@@ -42,24 +35,21 @@ class Settings:
     device: str | None = None
     memory: int | None = None
 
-    def plan(self, initial: Path | None = None) -> RunPlan:
+    def plan(self, initial: Path | None = None) -> methods.RunPlan:
         """Returns the checked plan of a run that starts from the volume file ``initial``, if any."""
         values = dict(self.values)
         method, preset = (self._word(values, name) for name in ("method", "preset"))
-        seed, volume = values.pop("seed", 0), None
-        if initial is not None:
-            volume = _initial_volume(initial)
+        run = {"seed": values.pop("seed", 0), "initial": None if initial is None else _initial_volume(initial)}
         # an option of the command line means what --help says, whatever the method calls its own
-        flags = [f.name for f in fields(Preprocessing) if self.origins.get(f.name) == _flag(f.name)]
-        with self.naming_origins(method or DEFAULT_METHOD):
-            return plan_run(
-                method or DEFAULT_METHOD, values, preset=preset, seed=seed, initial=volume, of_preprocessing=flags
-            )
+        flags = [f.name for f in fields(methods.Preprocessing) if self.origins.get(f.name) == _flag(f.name)]
+        method = method or methods.DEFAULT_METHOD
+        with self.naming_origins(method):
+            return methods.plan_run(method, values, preset=preset, of_preprocessing=flags, **run)
 
-    def preprocessing(self, defaults: Mapping[str, object]) -> Preprocessing:
+    def preprocessing(self, defaults: Mapping[str, object]) -> methods.Preprocessing:
         """Returns the checked preprocessing, of no method, with ``defaults`` for what nobody gave."""
         with self.naming_origins():
-            return preprocessing_of({**defaults, **self.values})
+            return methods.preprocessing_of({**defaults, **self.values})
 
     def runtime(self, *, profile: bool = False, ranks: Communicator | None = None) -> Runtime:
         """Opens the device."""
@@ -109,11 +99,12 @@ def read_settings(
     return Settings(values, origins, config, device, memory)
 
 
-def _initial_volume(path: Path) -> InitialVolume:
+def _initial_volume(path: Path) -> methods.InitialVolume:
     volume = load_volume(path)
     if volume.grid is None:
         raise InputError("--initial", f"{path}, values without voxel sizes", "a volume with its grid in mm")
-    return InitialVolume(volume.values, volume.grid, {"initial": str(path), "initial_sha256": sha256_of(path)})
+    facts = {"initial": str(path), "initial_sha256": sha256_of(path)}
+    return methods.InitialVolume(volume.values, volume.grid, facts)
 
 
 def _flag(key: str) -> str:

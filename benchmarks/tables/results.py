@@ -5,8 +5,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from phyradgs_cl.io import json_lines
-from phyradgs_cl.io.json_lines import Line, append_line, refuse_irregular
+from phyradgs_cl.workflow.sweep.tables import Line, append_line, refuse_irregular
+from phyradgs_cl.workflow.sweep.tables import read_lines as sound_lines
 
 __all__ = ["KEY", "Line", "Present", "append_line", "key_of", "read_lines", "refuse_irregular"]
 
@@ -32,7 +32,7 @@ def read_lines(path: Path) -> list[Line]:
     Raises:
         InputError: a file that cannot be read, or that has content but no result.
     """
-    return json_lines.read_lines(path, _is_sound)
+    return sound_lines(path, _is_sound)
 
 
 def _is_sound(line: Line) -> bool:

@@ -14,7 +14,7 @@ from phyradgs_cl.commands.options import Device, Scan
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.importers import load_beads
 from phyradgs_cl.io import only_run, written_beside
-from phyradgs_cl.io.scan.copy import copy_with_motion
+from phyradgs_cl.io.scan.writer import copy_with_motion
 from phyradgs_cl.progress import Ticker
 from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.settings import device_wish

@@ -10,7 +10,7 @@ from phyradgs_cl.commands.console import AsJson, file_option, option, say
 from phyradgs_cl.commands.options import Device, Scan
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.io import only_run, read_scan
-from phyradgs_cl.io.scan.copy import copy_with_offset
+from phyradgs_cl.io.scan.writer import copy_with_offset
 from phyradgs_cl.progress import Ticker
 from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.settings import device_wish

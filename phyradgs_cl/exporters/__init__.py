@@ -8,16 +8,8 @@ import numpy as np
 
 from phyradgs_cl import checks
 from phyradgs_cl.errors import InputError
+from phyradgs_cl.exporters import writers
 from phyradgs_cl.exporters.dicom import DicomLabels, write_dicom
-from phyradgs_cl.exporters.writers import (
-    gaussians_of,
-    hounsfield,
-    write_image,
-    write_npy,
-    write_npz,
-    write_ply,
-    write_tiff,
-)
 from phyradgs_cl.io import Volume, read_volume
 
 __all__ = [
@@ -25,13 +17,13 @@ __all__ = [
 ]  # fmt: skip
 
 VOXELS: dict[str, Callable[[Path, Volume, str], None]] = {
-    "nii": write_image,
-    "mha": write_image,
-    "nrrd": write_image,
-    "tiff": write_tiff,
-    "npy": write_npy,
+    "nii": writers.write_image,
+    "mha": writers.write_image,
+    "nrrd": writers.write_image,
+    "tiff": writers.write_tiff,
+    "npy": writers.write_npy,
 }
-CLOUDS = {"ply": write_ply, "npz": write_npz}
+CLOUDS = {"ply": writers.write_ply, "npz": writers.write_npz}
 EXPORTS = (*VOXELS, "dicom", *CLOUDS)
 _SUFFIXES = {"nii": (".nii", ".nii.gz"), "tiff": (".tif", ".tiff"), "dicom": ()}
 
@@ -65,13 +57,13 @@ def export_stored(
 ) -> None:  # fmt: skip
     """Writes a volume as ``export_volume`` does; ``subject`` names it in messages."""
     if to in CLOUDS:
-        CLOUDS[to](target, gaussians_of(volume, subject))
+        CLOUDS[to](target, writers.gaussians_of(volume, subject))
         return
     if volume.grid is None:
         raise InputError(subject, "values without voxel sizes", "a volume with its grid", "see 'phyradgs info'")
     values, unit = np.ascontiguousarray(volume.values, np.float32), "1/mm"
     if mu_water_per_mm is not None:
-        values, unit = hounsfield(values, mu_water_per_mm), "HU"
+        values, unit = writers.hounsfield(values, mu_water_per_mm), "HU"
     volume = replace(volume, values=values)
     if to == "dicom":
         write_dicom(target, volume, unit, labels or DicomLabels())

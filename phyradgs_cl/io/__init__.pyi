@@ -1,12 +1,12 @@
-from .checkpoint import checkpoint_path as checkpoint_path
-from .checkpoint import former_checkpoint_path as former_checkpoint_path
-from .checkpoint import partial_path as partial_path
-from .checkpoint import read_checkpoint as read_checkpoint
-from .checkpoint import write_checkpoint as write_checkpoint
 from .files import hashing as hashing
 from .files import sha256_of as sha256_of
 from .output import check_writable as check_writable
+from .output import checkpoint_path as checkpoint_path
+from .output import former_checkpoint_path as former_checkpoint_path
 from .output import only_run as only_run
+from .output import partial_path as partial_path
+from .output import read_checkpoint as read_checkpoint
+from .output import write_checkpoint as write_checkpoint
 from .output import written_beside as written_beside
 from .scan.reader import ToAttenuation as ToAttenuation
 from .scan.reader import read_scan as read_scan

@@ -1,4 +1,7 @@
-"""Outputs that are whole or absent: written under another name, then renamed; one run per output by a lock file."""
+"""Outputs that are whole or absent: written under another name, then renamed; one run per output by a lock file.
+
+Checkpoints of interrupted runs are plain arrays in a NumPy archive, never a pickle.
+"""
 
 import errno
 import glob
@@ -9,13 +12,15 @@ import re
 import secrets
 import shutil
 import stat
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from functools import cache
 from pathlib import Path
 from zlib import crc32
 
-from phyradgs_cl.errors import OutputError
+import numpy as np
+
+from phyradgs_cl.errors import InputError, OutputError
 
 NO_SPACE = (errno.ENOSPC, errno.EFBIG, getattr(errno, "EDQUOT", errno.ENOSPC))
 """System errors for a lack of room: on the disk, for one file, of the user's quota."""
@@ -24,6 +29,8 @@ _LONGEST_BYTES = 255  # of a name, in all common file systems
 _SPARE_BYTES = 1 << 16  # for headers
 _WRITER = re.compile(r"\.([0-9a-f]{8})-(\d{1,9})-[0-9a-f]{8}\.part(\.[a-z.]+)?$")
 _TRY_EVERY_S = 0.2
+_FORMAT = 2
+_RESTART = "start without --resume"
 
 
 class BusyError(OutputError):
@@ -211,3 +218,42 @@ def beside(path: str | Path, ending: str, beginning: str = "") -> Path:
     room = _LONGEST_BYTES - len(os.fsencode(beginning + ending))
     path = Path(path)
     return path.with_name(f"{beginning}{shortened(path.name, room)}{ending}")
+
+
+def checkpoint_path(output: str | Path) -> Path:
+    """Returns the path of the checkpoint of a run that writes ``output``."""
+    return beside(output, ".checkpoint.npz")
+
+
+def former_checkpoint_path(output: str | Path) -> Path:
+    """Returns the path to which a new run moves the checkpoint of an earlier run of the same output."""
+    return beside(output, ".checkpoint.npz.bak")
+
+
+def partial_path(output: str | Path) -> Path:
+    """Returns the path of an interrupted run's result: NAME.partial.SUFFIX for ``output`` NAME.SUFFIX."""
+    path = Path(output)
+    return beside(path.with_suffix(""), f".partial{path.suffix}")
+
+
+def write_checkpoint(path: str | Path, state: Mapping[str, np.ndarray]) -> None:
+    """Writes the state of a run, complete or not at all."""
+    with written_beside(path) as temporary, open(temporary, "wb") as file:
+        np.savez(file, format=np.array(_FORMAT), **state)  # type: ignore[arg-type]
+
+
+def read_checkpoint(path: str | Path) -> dict[str, np.ndarray]:
+    """Returns the state in a checkpoint. Raises InputError for a missing or damaged file, or another version's."""
+    if not Path(path).is_file():
+        raise InputError("--resume", f"no checkpoint {path}", "one left by an interrupted run", _RESTART)
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            arrays = dict(archive)
+        if not all(isinstance(values, np.ndarray) for values in arrays.values()):
+            raise ValueError("no array")
+    except Exception as error:  # zipfile, zlib and NumPy's parser pass on errors of every kind
+        reason = f" ({error.strerror})" if isinstance(error, OSError) and error.strerror else ""
+        raise InputError(str(path), f"a damaged checkpoint{reason}", "a complete one", _RESTART) from error
+    if not np.array_equal(arrays.pop("format", None), _FORMAT):
+        raise InputError(str(path), "a checkpoint of another version", f"format {_FORMAT}", _RESTART)
+    return arrays

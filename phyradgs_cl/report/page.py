@@ -13,10 +13,9 @@ from phyradgs_cl.io import check_writable, written_beside
 from phyradgs_cl.metrics import printed
 from phyradgs_cl.reconstructors.frames.projected import FramePair
 from phyradgs_cl.report import sections
-from phyradgs_cl.report.comparisons import Change, computed_views, step_changes
 from phyradgs_cl.report.images import base64_of
 from phyradgs_cl.report.markup import Markup, element, joined, label, number, raw_text
-from phyradgs_cl.report.run import Run, load_run
+from phyradgs_cl.report.run import Change, Run, computed_views, load_run, step_changes
 from phyradgs_cl.runtime import Runtime
 
 DEFAULT_VIEWS = 3

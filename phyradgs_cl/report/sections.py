@@ -8,20 +8,10 @@ from phyradgs_cl.acquisition import Exact, LineMiddles, MicroViews, Motion, OwnT
 from phyradgs_cl.acquisition.motion import motion_facts
 from phyradgs_cl.prepare import PREPARED_KEY
 from phyradgs_cl.reconstructors.frames.projected import TIMES_PER_LINE, FramePair
+from phyradgs_cl.report import images
 from phyradgs_cl.report.charts import Chart, convergence_charts, histogram, tuning_chart, views_chart
-from phyradgs_cl.report.comparisons import Change
-from phyradgs_cl.report.images import (
-    Plane,
-    data_uri,
-    grey_png,
-    grey_range,
-    planes_of,
-    signed_png,
-    stills_of,
-    windows_of,
-)
 from phyradgs_cl.report.markup import Markup, element, flattened, joined, label, number, shown, unit
-from phyradgs_cl.report.run import Run
+from phyradgs_cl.report.run import Change, Run
 from phyradgs_cl.report.scan_charts import frames_chart, orbit_chart, shutter_chart, shutter_words, side_chart
 from phyradgs_cl.report.viewer import stills, viewer
 from phyradgs_cl.text import to_digits_of
@@ -39,8 +29,8 @@ _DISAGREEMENT = (
 def slices_section(run: Run) -> Markup:
     """The volume, together with the truth where the scan has one."""
     stored, grid = run.stored, run.stored.required_grid
-    windows = windows_of(stored.values, run.reference)
-    planes = planes_of(stored.values, run.reference, grid, windows)
+    windows = images.windows_of(stored.values, run.reference)
+    planes = images.planes_of(stored.values, run.reference, grid, windows)
     size = " × ".join(number(side) for side in grid.size_mm)
     words = f"{' × '.join(map(str, grid.shape))} voxels (z, y, x), {size} mm"
     if any(len(plane.indices) < plane.count for plane in planes):
@@ -48,14 +38,15 @@ def slices_section(run: Run) -> Markup:
     return _section("slices", "Slices", _note(words + "."), viewer(planes, windows), _disagreement(run, planes))
 
 
-def _disagreement(run: Run, planes: Sequence[Plane]) -> Markup | None:
+def _disagreement(run: Run, planes: Sequence[images.Plane]) -> Markup | None:
     """The middle slices of the difference between two estimates."""
     values = run.stored.disagreement
     if values is None:
         return None
-    high = grey_range(values)[1]
+    high = images.grey_range(values)[1]
     heading = element("h3", "Disagreement of voxels and splats", id="disagreement")
-    return joined(heading, _note(_DISAGREEMENT), stills(stills_of(planes, values, (0.0, high)), "disagreement", high))
+    pictures = images.stills_of(planes, values, (0.0, high))
+    return joined(heading, _note(_DISAGREEMENT), stills(pictures, "disagreement", high))
 
 
 def metrics_section(run: Run, views: Sequence[FramePair]) -> Markup | None:
@@ -130,9 +121,9 @@ def projections_section(scan: Scan, views: Sequence[FramePair]) -> Markup | None
     for view in views:
         residual = f"residual, RMS {number(view.rms)} ({number(100 * view.relative)} %)"
         pictures = [
-            ("measured", grey_png(view.measured, low, high)),
-            ("computed", grey_png(view.computed, low, high)),
-            (residual, signed_png(view.residual, limit)),
+            ("measured", images.grey_png(view.measured, low, high)),
+            ("computed", images.grey_png(view.computed, low, high)),
+            (residual, images.signed_png(view.residual, limit)),
         ]
         parts.append(_row(f"Frame {view.frame}", f"frame {view.frame}", pictures, style))
     return _section("projections", "Projections", _note(words), *parts)
@@ -155,9 +146,9 @@ def _change(change: Change) -> Markup:
         low, high, difference = float(before.min()), float(before.max()), after - before
         limit = float(np.percentile(np.abs(difference), 99.9)) or float(np.abs(difference).max()) or 1.0
         pictures = [
-            ("before", grey_png(before, low, high)),
-            ("after", grey_png(after, low, high)),
-            (f"difference, ±{number(limit)}", signed_png(difference, limit)),
+            ("before", images.grey_png(before, low, high)),
+            ("after", images.grey_png(after, low, high)),
+            (f"difference, ±{number(limit)}", images.signed_png(difference, limit)),
         ]
         parts.append(_row(f"{change.step}: {name}", f"{change.step}, {name}", pictures))
     caption = "Line integrals of all frames: dashed before, solid after."
@@ -255,7 +246,7 @@ def _row(heading: str, of: str, pictures: Sequence[tuple[str, bytes]], style: st
     """Pictures next to each other under a heading, each with its caption."""
     figures = []
     for words, png in pictures:
-        image = element("img", src=data_uri(png), alt=f"{of}, {words}", style=style)
+        image = element("img", src=images.data_uri(png), alt=f"{of}, {words}", style=style)
         figures.append(element("figure", element("div", image, class_="picture"), element("figcaption", words)))
     return element("div", element("h3", heading), *figures, class_="view")
 

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from phyradgs_cl import __version__, checks, signals
+from phyradgs_cl import reconstructors as methods
 from phyradgs_cl.acquisition import MicroViews, Scan
 from phyradgs_cl.acquisition.geometry import cuts
 from phyradgs_cl.errors import InputError, OutputError, PhyradgsError, naming_host_memory
@@ -29,17 +30,6 @@ from phyradgs_cl.io import (
 )
 from phyradgs_cl.metrics import VOXEL_BY_VOXEL, aligned, compare
 from phyradgs_cl.parallel import Communicator
-from phyradgs_cl.reconstructors import (
-    Progress,
-    ProgressReport,
-    Reconstruction,
-    Report,
-    RunPlan,
-    State,
-    ignore_progress,
-    method_of,
-    reconstruct,
-)
 from phyradgs_cl.reconstructors.result import COMPARED, HELD_OUT
 from phyradgs_cl.reconstructors.run import check_resumable
 from phyradgs_cl.runtime import Runtime, profile_text
@@ -76,13 +66,13 @@ class _Checkpoints:
         self.iteration: int | None = None
         """The iteration of the checkpoint that this run has written."""
 
-    def __call__(self, progress: Progress) -> None:
+    def __call__(self, progress: methods.Progress) -> None:
         is_due = self.every_s > 0 and time.monotonic() - self.last_s >= self.every_s
         if is_due and progress.state is not None and progress.iteration < progress.iterations:
             self.write(progress.state(), progress.iteration)
             self.last_s = time.monotonic()
 
-    def write(self, state: State, iteration: int) -> None:
+    def write(self, state: methods.State, iteration: int) -> None:
         try:
             write_checkpoint(self.path, state)
             self.iteration = iteration
@@ -106,17 +96,17 @@ class _Checkpoints:
 
 @np.errstate(all="ignore")
 def run_reconstruction(
-    plan: RunPlan,
+    plan: methods.RunPlan,
     scan: Path,
     output: Path,
     make_runtime: Callable[[], Runtime],
-    report: ProgressReport = ignore_progress,
+    report: methods.ProgressReport = methods.ignore_progress,
     *,
     resume: bool = False,
     checkpoint_every_s: float = 600.0,
     inputs: Sequence[Path] = (),
     ranks: Communicator | None = None,
-) -> tuple[Reconstruction, dict[str, float]]:
+) -> tuple[methods.Reconstruction, dict[str, float]]:
     """Reconstructs a scan file and writes a volume file; returns the result and its metrics.
 
     An interrupted run leaves ``output`` alone: it writes ``io.partial_path`` and a checkpoint, from which ``resume`` goes
@@ -137,13 +127,13 @@ def run_reconstruction(
 
 
 def _reconstructed(
-    plan: RunPlan,
+    plan: methods.RunPlan,
     files: _Files,
     make_runtime: Callable[[], Runtime],
-    report: ProgressReport,
+    report: methods.ProgressReport,
     resume: bool,
     checkpoint_every_s: float,
-) -> tuple[Reconstruction, dict[str, float]]:
+) -> tuple[methods.Reconstruction, dict[str, float]]:
     with hashing(files.scan) as scan_hash_of:
         scan = load_scan(files.scan, plan.preprocessing.flats)
         scan_hash = scan_hash_of()
@@ -155,12 +145,13 @@ def _reconstructed(
     elif leads:
         _set_aside(files.output)
     checkpoints = _Checkpoints(checkpoint_path(files.output), checkpoint_every_s)
-    result: Reconstruction | None = None
+    result: methods.Reconstruction | None = None
     metrics: dict[str, float] = {}
     try:
         with checkpoints.mentioned_in_errors(), keep_finished_work():
-            listeners = report.listeners if isinstance(report, Report) else (report,)
-            result = reconstruct(scan, plan, rt, report=Report(*listeners, checkpoints), resume=state)
+            listeners = report.listeners if isinstance(report, methods.Report) else (report,)
+            report = methods.Report(*listeners, checkpoints)
+            result = methods.reconstruct(scan, plan, rt, report=report, resume=state)
             if not leads:
                 return result, metrics
             with finish_despite_interrupt():
@@ -177,7 +168,7 @@ def _reconstructed(
     return result, metrics
 
 
-def _metrics(scan: Scan, result: Reconstruction) -> dict[str, float]:
+def _metrics(scan: Scan, result: methods.Reconstruction) -> dict[str, float]:
     """Returns the metrics against the scan's reference, by the rule of ``metrics.aligned``, and those on held-out pixels.
 
     The latter leave the result's facts. These get the way of comparison, if it is not voxel by voxel.
@@ -194,7 +185,7 @@ def _metrics(scan: Scan, result: Reconstruction) -> dict[str, float]:
     return {**compare(pair.volume, pair.reference), **held_out}
 
 
-def _warn_of_doubts(plan: RunPlan, path: Path, scan: Scan) -> None:
+def _warn_of_doubts(plan: methods.RunPlan, path: Path, scan: Scan) -> None:
     """Warns of a run that is possible, but hardly meant."""
     motion, preprocessing = getattr(plan.options, "motion", None), plan.preprocessing
     ignores_model = scan.detector_model == "intensity" and not hasattr(plan.options, "detector_model")
@@ -229,14 +220,14 @@ def _averages(scan: Scan, options: Any) -> bool:
     return cells.is_moving or cells.averages
 
 
-def profile_report(rt: Runtime, result: Reconstruction) -> str:
+def profile_report(rt: Runtime, result: methods.Reconstruction) -> str:
     """Returns a table of a run's device time by kernel; ``rt`` is the run's, opened with ``profile``."""
     pairs = {str(name): int(n) for name, n in result.facts.get("evaluated_pairs", {}).items()}
     return profile_text(rt.kernel_uses(), float(result.facts["seconds"]), rt.best_rates(), pairs)
 
 
 def _provenance(
-    result: Reconstruction, scan_hash: str, plan: RunPlan, scan: Path, rt: Runtime
+    result: methods.Reconstruction, scan_hash: str, plan: methods.RunPlan, scan: Path, rt: Runtime
 ) -> dict[str, object]:
     return {
         **result.facts,
@@ -263,7 +254,7 @@ def _set_aside(output: Path) -> None:
         log.warning("%s is of an earlier run and is kept as %s: %s", checkpoint, kept.name, remedy)
 
 
-def _keep_checkpoint(output: Path, result: Reconstruction) -> None:
+def _keep_checkpoint(output: Path, result: methods.Reconstruction) -> None:
     path = checkpoint_path(output)
     if result.state is None:
         for outdated in (path, partial_path(output)):
@@ -274,17 +265,17 @@ def _keep_checkpoint(output: Path, result: Reconstruction) -> None:
 
 
 def resume_or_restart(
-    plan: RunPlan,
+    plan: methods.RunPlan,
     scan: Path,
     output: Path,
     make_runtime: Callable[[], Runtime],
-    report: ProgressReport = ignore_progress,
+    report: methods.ProgressReport = methods.ignore_progress,
     checkpoint_every_s: float = 600.0,
-) -> tuple[Reconstruction, dict[str, float]]:
+) -> tuple[methods.Reconstruction, dict[str, float]]:
     """Resumes from the output's checkpoint; starts from the beginning without one, or with a damaged or another run's."""
     run = partial(run_reconstruction, plan, scan, output, make_runtime, report, checkpoint_every_s=checkpoint_every_s)
     checkpoint = checkpoint_path(output)
-    if checkpoint.is_file() and method_of(plan.method).is_resumable:
+    if checkpoint.is_file() and methods.method_of(plan.method).is_resumable:
         try:
             return run(resume=True)
         except InputError as error:
@@ -294,6 +285,6 @@ def resume_or_restart(
     return run(resume=False)
 
 
-def is_complete(result: Reconstruction) -> bool:
+def is_complete(result: methods.Reconstruction) -> bool:
     """True if the run came to its end; an interrupted run has left a checkpoint."""
     return result.facts.get("interrupted_at") is None

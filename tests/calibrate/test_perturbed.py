@@ -16,7 +16,7 @@ from phyradgs_cl.acquisition.altered.perturbed import (
     perturb,
 )
 from phyradgs_cl.io import write_scan
-from phyradgs_cl.io.scan.copy import copy_with_motion
+from phyradgs_cl.io.scan.writer import copy_with_motion
 from phyradgs_cl.workflow import load_scan
 
 NUMBERS = GeometryCorrection(offset_u_mm=0.3, offset_v_mm=-0.2, source_distance_mm=0.1, detector_distance_mm=-0.4)

@@ -11,9 +11,9 @@ import psutil
 from cluster.processes import free_port, stop, wait_until
 
 from phyradgs_cl.io import read_volume
-from phyradgs_cl.io.json_lines import Line, read_lines
 from phyradgs_cl.settings import read_config
 from phyradgs_cl.workflow.sweep import RESULTS, SweepJob, read_grid, run_sweep
+from phyradgs_cl.workflow.sweep.tables import Line, read_lines
 
 RUNS = 40
 

@@ -17,9 +17,9 @@ from phyradgs_cl.errors import InputError, OutputError
 from phyradgs_cl.io import Volume, read_volume, write_scan, write_volume
 from phyradgs_cl.reconstructors import plan_run
 from phyradgs_cl.report import Run, load_run, report_page, write_report
-from phyradgs_cl.report.comparisons import chosen_frames, computed_views
 from phyradgs_cl.report.images import Window
 from phyradgs_cl.report.markup import number
+from phyradgs_cl.report.run import chosen_frames, computed_views
 from phyradgs_cl.workflow import run_reconstruction
 
 ALL = {"slices", "metrics", "convergence", "projections", "scan", "geometry", "shutter", "provenance"}

@@ -9,12 +9,11 @@ import numpy as np
 import pytest
 
 from phyradgs_cl.io import read_volume, write_volume
-from phyradgs_cl.io.json_lines import read_lines
 from phyradgs_cl.io.tables import PROVENANCE, read_facts
 from phyradgs_cl.settings import read_config
 from phyradgs_cl.workflow.files import load_scan
 from phyradgs_cl.workflow.sweep import RESULTS, plan_sweep, read_grid
-from phyradgs_cl.workflow.sweep.tables import is_sound, write_tables
+from phyradgs_cl.workflow.sweep.tables import is_sound, read_lines, write_tables
 
 pytestmark = pytest.mark.usefixtures("fast_pictures")
 ABSURD = {

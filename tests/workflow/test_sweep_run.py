@@ -15,7 +15,6 @@ import tables.__main__ as tables_command
 from phyradgs_cl.cluster import Workers
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.io import only_run, read_volume
-from phyradgs_cl.io.json_lines import read_lines
 from phyradgs_cl.io.output import BusyError
 from phyradgs_cl.settings import read_config
 from phyradgs_cl.workflow.sweep import (
@@ -27,7 +26,7 @@ from phyradgs_cl.workflow.sweep import (
     run_sweep,
 )
 from phyradgs_cl.workflow.sweep import run as sweep_run
-from phyradgs_cl.workflow.sweep.tables import comma_separated, markdown
+from phyradgs_cl.workflow.sweep.tables import comma_separated, markdown, read_lines
 
 TEXT = """
 scans = ["*.h5"]

@@ -1,22 +1,35 @@
-"""Pickles of NAF and SAX-NeRF: a dictionary of geometry (mm), projections (dimensionless) and true volume (1/m)."""
+"""Pickles of NAF and SAX-NeRF: a dictionary of geometry (mm), projections (dimensionless) and true volume (1/m).
 
+They hold plain containers, numbers and NumPy arrays. Every other name in a pickle is refused, so nothing is executed.
+NumPy's own constructors are no substitute for the functions below: with types of Python objects, or with fields, they read
+memory at addresses that the file states.
+"""
+
+import io
+import math
+import pickle
+import re
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from phyradgs_cl import checks
 from phyradgs_cl.acquisition import Scan
+from phyradgs_cl.errors import InputError
 from phyradgs_cl.importers.assemble import assemble_scan
 from phyradgs_cl.importers.formats import r2_gaussian as tigre
 from phyradgs_cl.importers.motion import make_timing, turning
 from phyradgs_cl.importers.options import TIMING, ImportOptions
+from phyradgs_cl.importers.reading.files import check_room
 from phyradgs_cl.importers.reading.frames import line_integrals, oriented
-from phyradgs_cl.importers.reading.pickle import read_pickle
+from phyradgs_cl.io.files import read_regular, regular_file
 from phyradgs_cl.io.tables import Fields, described
 
 OPTIONS = (*TIMING, "detector_model", "part")
 _PER_MM = 1e-3  # of a density per metre
 _PARTS = {"train": ("train",), "test": ("val",), "all": ("train", "val")}
+_COPIES = 3  # arrays and line integrals, for every byte of the file
 
 
 def recognises(path: Path) -> bool:
@@ -70,3 +83,73 @@ def _array(table: Fields, key: str, ndim: int) -> np.ndarray:
     if 0 in values.shape:
         raise table.error(key, f"shape {values.shape}", "no empty axis")
     return np.asarray(values)
+
+
+def read_pickle(path: Path) -> object:
+    """Reads dicts, lists, tuples, text, numbers and NumPy arrays of plain numbers; InputError for anything else."""
+    subject = str(path)
+    size = regular_file(path, subject).st_size
+    check_room(subject, _COPIES * size)
+    data = read_regular(path, subject, size, "a pickle")
+    try:
+        return PlainUnpickler(io.BytesIO(data), encoding="latin1").load()  # Python 2 wrote the bytes of arrays as text
+    except InputError as error:
+        raise InputError(subject, error.found, error.expected, error.remedy) from error
+    except Exception as error:  # opcodes in any order raise any exception
+        found = f"a damaged pickle ({type(error).__name__}: {str(error)[:80]})"
+        raise InputError(subject, found, "a pickle of plain containers and NumPy arrays") from error
+
+
+class PlainUnpickler(pickle.Unpickler):
+    """Python's unpickler with an allow-list of names."""
+
+    def find_class(self, module: str, name: str) -> Any:
+        """Returns the function for a name of the list; InputError for any other name."""
+        functions: dict[str, Any] = {  # new for every name, since a pickle can set attributes of a function
+            "numpy.ndarray": object,  # an argument of _reconstruct
+            "numpy.dtype": lambda code, *_: _Type(code),
+            "numpy.core.multiarray._reconstruct": lambda *_: _Array((0,)),
+            "numpy.core.multiarray.scalar": lambda dtype, raw: _plain_array(raw, dtype, ()).item(),
+            "numpy.core.numeric._frombuffer": lambda *arguments: _plain_array(*arguments),
+            "_codecs.encode": lambda text, encoding: text.encode("latin1"),
+        }
+        full_name = f"{module.replace('numpy._core.', 'numpy.core.')}.{name}"  # NumPy 2 has renamed its core
+        if full_name not in functions:
+            found = f"a call of {full_name[:120]}"
+            raise InputError("pickle", found, "plain containers and NumPy arrays", "nothing was executed")
+        return functions[full_name]
+
+
+class _Type:
+    """A NumPy type of plain numbers. Its state sets the byte order."""
+
+    __slots__ = ("dtype",)
+
+    def __init__(self, code: object) -> None:
+        if not isinstance(code, str) or not re.fullmatch(r"[<>=|]?(b1|[iu][1248]|f[248])", code):
+            raise ValueError(f"NumPy type {str(code)[:20]!r}, where plain real numbers belong")
+        self.dtype = np.dtype(code)
+
+    def __setstate__(self, state: tuple[object, ...]) -> None:
+        self.dtype = self.dtype.newbyteorder(str(state[1]))  # type: ignore[arg-type]
+
+
+class _Array(np.ndarray):
+    """An array whose state is checked: exactly as many bytes as its shape needs."""
+
+    def __setstate__(self, state: Any) -> None:
+        _, shape, stated, is_fortran, raw = state
+        raw = raw.encode("latin1") if isinstance(raw, str) else raw
+        if not isinstance(stated, _Type) or not isinstance(raw, (bytes, bytearray)):
+            raise ValueError("an array without numbers")
+        if not isinstance(shape, tuple) or len(shape) > 8 or any(type(n) is not int or n < 0 for n in shape):
+            raise ValueError("an array with an impossible shape")
+        if math.prod(shape) * stated.dtype.itemsize != len(raw):
+            raise ValueError(f"an array of shape {shape} in {len(raw)} bytes")
+        super().__setstate__((1, shape, stated.dtype, bool(is_fortran), bytes(raw)))  # type: ignore[arg-type]
+
+
+def _plain_array(raw: object, dtype: object, shape: object, order: object = "C") -> np.ndarray:
+    array = _Array((0,))
+    array.__setstate__((1, shape, dtype, order == "F", raw))
+    return array

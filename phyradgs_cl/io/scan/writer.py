@@ -1,7 +1,10 @@
-"""Writes scan files: an NXtomo entry, which other programs read too."""
+"""Writes scan files, an NXtomo entry that other programs read too, and copies of them with another geometry or timing."""
 
 import json
 import logging
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import h5py
@@ -10,9 +13,12 @@ import numpy as np
 from phyradgs_cl import checks
 from phyradgs_cl.acquisition import PoseTable, Scan
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.io.hdf5.datasets import new_group, new_hdf5, write_grid, write_number
+from phyradgs_cl.io.hdf5 import datasets as h5
+from phyradgs_cl.io.hdf5.source import open_hdf5
+from phyradgs_cl.io.output import written_beside
 from phyradgs_cl.io.scan import schema
-from phyradgs_cl.io.scan.motion import storable, write_motion
+from phyradgs_cl.io.scan.header import read_header
+from phyradgs_cl.io.scan.motion import storable, write_motion, write_poses
 from phyradgs_cl.text import plain_text
 
 _log = logging.getLogger(__name__)
@@ -40,11 +46,11 @@ def write_scan(
         remedy = "give the exposure its real length"
         raise InputError("exposure_s", "0 in a fly-scan with a readout", "a time above 0 s", remedy)
     scan = storable(scan)
-    with new_hdf5(path, frames.nbytes) as file:
-        entry = new_group(file, "entry", "NXentry")
+    with h5.new_hdf5(path, frames.nbytes) as file:
+        entry = h5.new_group(file, "entry", "NXentry")
         entry.attrs["default"], entry.attrs["definition"] = "data", "NXtomo"
         entry["definition"], entry["title"] = "NXtomo", plain_text(scan.title)
-        new_group(entry, schema.SAMPLE, "NXsample")["name"] = plain_text(scan.title)
+        h5.new_group(entry, schema.SAMPLE, "NXsample")["name"] = plain_text(scan.title)
         # Frames between projections (flats, darks) get the values of the projection before them.
         frame_of = np.clip(np.cumsum(key == schema.PROJECTION) - 1, 0, None)
         _write_instrument(entry, scan, frames, key, quantity, frame_of)
@@ -77,22 +83,22 @@ def _checked_frames(
 def _write_instrument(
     entry: h5py.Group, scan: Scan, frames: np.ndarray, key: np.ndarray, quantity: str, frame_of: np.ndarray
 ) -> None:
-    geometry, instrument = scan.geometry, new_group(entry, "instrument", "NXinstrument")
-    source = new_group(instrument, "source", "NXsource")
-    write_number(source, "distance", -geometry.source_to_axis_mm, "mm")
-    detector = new_group(instrument, "detector", "NXdetector")
+    geometry, instrument = scan.geometry, h5.new_group(entry, "instrument", "NXinstrument")
+    source = h5.new_group(instrument, "source", "NXsource")
+    h5.write_number(source, "distance", -geometry.source_to_axis_mm, "mm")
+    detector = h5.new_group(instrument, "detector", "NXdetector")
     detector.create_dataset("data", data=frames).attrs.update(quantity=quantity, interpretation="image")
-    write_number(detector, "image_key", key.astype(np.int32))
+    h5.write_number(detector, "image_key", key.astype(np.int32))
     pitch_v_mm, pitch_u_mm = geometry.pixel_size_mm
-    write_number(detector, "x_pixel_size", pitch_u_mm, "mm")
-    write_number(detector, "y_pixel_size", pitch_v_mm, "mm")
-    write_number(detector, "distance", geometry.source_to_detector_mm - geometry.source_to_axis_mm, "mm")
+    h5.write_number(detector, "x_pixel_size", pitch_u_mm, "mm")
+    h5.write_number(detector, "y_pixel_size", pitch_v_mm, "mm")
+    h5.write_number(detector, "distance", geometry.source_to_detector_mm - geometry.source_to_axis_mm, "mm")
     exposure_s, readout_s = _stored_durations(scan)
     if exposure_s + readout_s < scan.shutter.span_s:
         _log.warning("a stop-and-shoot scan with a pose table is stored without exposure and readout times")
-    write_number(detector, "count_time", exposure_s, "s")
-    write_number(detector, "detector_readout_time", readout_s, "s")
-    write_number(detector, "frame_start_time", np.asarray(scan.frame_start_s, np.float64)[frame_of], "s")
+    h5.write_number(detector, "count_time", exposure_s, "s")
+    h5.write_number(detector, "detector_readout_time", readout_s, "s")
+    h5.write_number(detector, "frame_start_time", np.asarray(scan.frame_start_s, np.float64)[frame_of], "s")
     if scan.pixel_mask is not None:
         mask = np.asarray(scan.pixel_mask) != 0
         mask = (mask if mask.ndim == 2 else mask[frame_of]).astype(np.uint8)
@@ -108,34 +114,123 @@ def _stored_durations(scan: Scan) -> tuple[float, float]:
 
 
 def _write_extra(entry: h5py.Group, scan: Scan) -> None:
-    extra = new_group(entry, schema.EXTRA, "NXcollection")
+    extra = h5.new_group(entry, schema.EXTRA, "NXcollection")
     extra["readout_axis"] = scan.shutter.axis
-    write_number(extra, "readout_direction", scan.shutter.direction)
-    write_number(extra, "detector_offset", scan.geometry.detector_offset_mm, "mm")
+    h5.write_number(extra, "readout_direction", scan.shutter.direction)
+    h5.write_number(extra, "detector_offset", scan.geometry.detector_offset_mm, "mm")
     extra["detector_model"] = scan.detector_model
     if scan.lag > 0:
-        write_number(extra, "lag", scan.lag)
+        h5.write_number(extra, "lag", scan.lag)
     if scan.saturation is not None:
-        write_number(extra, "saturation_level", scan.saturation.level)
-        write_number(extra, "saturation_share", scan.saturation.share)
+        h5.write_number(extra, "saturation_level", scan.saturation.level)
+        h5.write_number(extra, "saturation_share", scan.saturation.share)
     if scan.shutter.pulse_s is not None and _stored_durations(scan)[0] > 0:
         start_s, length_s = scan.shutter.pulse_s
-        write_number(extra, "pulse_start", start_s, "s")
-        write_number(extra, "pulse_length", length_s, "s")
+        h5.write_number(extra, "pulse_start", start_s, "s")
+        h5.write_number(extra, "pulse_length", length_s, "s")
     if scan.provenance:
         extra["provenance"] = json.dumps(scan.provenance, default=str)
-    write_grid(extra, scan.grid)
+    h5.write_grid(extra, scan.grid)
     if scan.reference is not None:
         volume = np.asarray(scan.reference, np.float32)
-        group = new_group(extra, "reference", "NXcollection")
+        group = h5.new_group(extra, "reference", "NXcollection")
         dataset = group.create_dataset("volume", data=volume, compression="gzip", shuffle=True)
         dataset.attrs["units"] = "1/mm"
 
 
 def _write_links(entry: h5py.Group) -> None:
-    group = new_group(entry, "data", "NXdata")
+    group = h5.new_group(entry, "data", "NXdata")
     group.attrs["signal"] = "data"
     group.attrs["axes"] = ["rotation_angle", ".", "."]
     group["data"] = h5py.SoftLink(f"/entry/{schema.DETECTOR}/data")
     group["image_key"] = h5py.SoftLink(f"/entry/{schema.DETECTOR}/image_key")
     group["rotation_angle"] = h5py.SoftLink(f"/entry/{schema.SAMPLE}/rotation_angle")
+
+
+def copy_with_offset(source: str | Path, target: str | Path, shift_u_mm: float) -> None:
+    """Copies a scan file with its panel ``shift_u_mm`` further along u: changes detector_offset, and poses where it has
+    them. InputError for a file that is no scan, OutputError where the copy cannot be written."""
+    with open_hdf5(source) as opened:
+        header = read_header(opened)
+        poses = f"{header.entry}/{schema.POSES}/pose"
+        table = None if opened.optional(poses) is None else h5.read_array(opened, poses, (None, 12), h5.LENGTH)
+    offset_v_mm, offset_u_mm = header.scan.geometry.detector_offset_mm
+    with _copied(source, target, header.entry) as entry:
+        _replace(entry[schema.EXTRA], "detector_offset", np.array([offset_v_mm, offset_u_mm + shift_u_mm]), "mm")
+        if table is not None:
+            step = table[:, 6:9]
+            table[:, 3:6] += shift_u_mm * step / np.linalg.norm(step, axis=1, keepdims=True)
+            _replace(entry[schema.POSES], "pose", table, "mm")
+
+
+def copy_with_motion(source: str | Path, target: str | Path, scan: Scan) -> None:
+    """Copies a scan file with geometry, timing, lag, trajectory and provenance of ``scan``, which has its frames; equal
+    values are not touched. InputError for a file that is no scan, OutputError where the copy cannot be written."""
+    with open_hdf5(source) as opened:
+        header = read_header(opened)
+        start = f"{header.entry}/{schema.DETECTOR}/frame_start_time"
+        there = opened.optional(start) is not None
+        starts_s = h5.read_array(opened, start, header.image_key.shape, h5.TIME) if there else None
+    stated, scan = header.scan, storable(scan)
+    later_s = np.asarray(scan.frame_start_s) - np.asarray(stated.frame_start_s)
+    frame_of = np.clip(np.cumsum(header.image_key == schema.PROJECTION) - 1, 0, None)
+    with _copied(source, target, header.entry) as entry:
+        if scan.geometry != stated.geometry:
+            _replace_geometry(entry, scan)
+        if scan.shutter != stated.shutter or later_s.any():
+            detector = entry[schema.DETECTOR]
+            _replace(detector, "count_time", scan.shutter.exposure_s, "s")
+            _replace(detector, "detector_readout_time", scan.shutter.readout_s, "s")
+            if scan.shutter.direction != stated.shutter.direction:
+                _remove(entry[schema.EXTRA], "readout_direction")
+                h5.write_number(entry[schema.EXTRA], "readout_direction", scan.shutter.direction)
+            if starts_s is not None:
+                starts_s[header.image_key == schema.PROJECTION] += later_s
+                _replace(detector, "frame_start_time", starts_s, "s")
+            _remove(entry, f"{schema.SAMPLE}/rotation_angle", f"{schema.SAMPLE}/rotation_angle_end")
+            _remove(entry, schema.KINEMATICS, schema.POSES)
+            write_motion(entry, scan, frame_of)
+        elif isinstance(scan.trajectory, PoseTable):
+            _remove(entry, schema.POSES)
+            if not scan.is_fly:  # with poses and an exposure it would be read as moving; poses need the times of frames
+                detector = entry[schema.DETECTOR]
+                _replace(detector, "count_time", 0.0, "s")
+                _replace(detector, "detector_readout_time", 0.0, "s")
+                _replace(detector, "frame_start_time", np.asarray(scan.frame_start_s)[frame_of], "s")
+            write_poses(entry, scan)
+        if scan.lag != stated.lag:
+            _remove(entry[schema.EXTRA], "lag")
+            h5.write_number(entry[schema.EXTRA], "lag", scan.lag)
+        _remove(entry, f"{schema.EXTRA}/provenance")
+        entry[schema.EXTRA]["provenance"] = json.dumps(scan.provenance, default=str)
+
+
+@contextmanager
+def _copied(source: str | Path, target: str | Path, entry: str) -> Iterator[h5py.Group]:
+    """Yields the entry of a copy, with the package's own group; the copy replaces ``target`` after the body."""
+    with written_beside(target) as temporary:
+        shutil.copyfile(source, temporary)
+        with h5py.File(temporary, "r+") as file:
+            group = file[entry]
+            if schema.EXTRA not in group:
+                h5.new_group(group, schema.EXTRA, "NXcollection")
+            yield group
+
+
+def _replace_geometry(entry: h5py.Group, scan: Scan) -> None:
+    geometry = scan.geometry
+    behind_mm = geometry.source_to_detector_mm - geometry.source_to_axis_mm
+    _replace(entry[schema.EXTRA], "detector_offset", np.array(geometry.detector_offset_mm), "mm")
+    _replace(entry[schema.SOURCE], "distance", -geometry.source_to_axis_mm, "mm")
+    _replace(entry[schema.DETECTOR], "distance", behind_mm, "mm")
+
+
+def _remove(group: h5py.Group, *names: str) -> None:
+    for name in names:
+        if name in group:
+            del group[name]
+
+
+def _replace(group: h5py.Group, name: str, values: object, units: str) -> None:
+    _remove(group, name)
+    h5.write_number(group, name, values, units)

@@ -9,18 +9,11 @@ from pathlib import Path
 from typing import Any
 
 from phyradgs_cl import checks
+from phyradgs_cl import reconstructors as methods
 from phyradgs_cl.errors import InputError, PhyradgsError
 from phyradgs_cl.io.hdf5.source import open_hdf5
 from phyradgs_cl.io.scan.header import read_header
 from phyradgs_cl.io.tables import refuse_unknown
-from phyradgs_cl.reconstructors import (
-    DEFAULT_METHOD,
-    RunPlan,
-    method_name,
-    plan_run,
-    preprocessing_names,
-    usual_preset,
-)
 from phyradgs_cl.runtime import MEMORY_VARIABLE
 from phyradgs_cl.text import plain_text
 from phyradgs_cl.workflow.files import expecting
@@ -45,15 +38,15 @@ class Setting:
     changes: Table
     before: Table
 
-    def plan(self, seed: int = 0) -> RunPlan:
+    def plan(self, seed: int = 0) -> methods.RunPlan:
         """Returns the checked plan of a run."""
-        return plan_run(self.method, {**self.changes, **self.before}, preset=self.preset, seed=seed)
+        return methods.plan_run(self.method, {**self.changes, **self.before}, preset=self.preset, seed=seed)
 
     @property
     def label(self) -> str:
         """A short text: the method, the preset where it is not the usual one, options by dotted name."""
         words = [self.method]
-        if self.preset != usual_preset(self.method):
+        if self.preset != methods.usual_preset(self.method):
             words.append(f"preset={self.preset}")
         for name, value in flat({**self.before, **self.changes}):
             words.append(f"{name}={','.join(map(str, value)) if isinstance(value, list) else value}")
@@ -217,11 +210,13 @@ def _setting(values: dict[str, Any], where: str) -> Setting:
 
 def _checked(values: dict[str, Any]) -> Setting:
     changes = dict(values)
-    method, preset = method_name(changes.pop("method", DEFAULT_METHOD)), changes.pop("preset", None)
+    method = methods.method_name(changes.pop("method", methods.DEFAULT_METHOD))
+    preset = changes.pop("preset", None)
     for name, remedy in _ELSEWHERE.items():
         if name in changes:
             raise InputError(name, checks.short_repr(changes[name]), "no option of a run", remedy)
-    before = {name: changes.pop(name) for name in preprocessing_names(method, preset) if name in changes}
+    names = methods.preprocessing_names(method, preset)
+    before = {name: changes.pop(name) for name in names if name in changes}
     nested = _nested(changes)
-    plan_run(method, {**nested, **before}, preset=preset)
-    return Setting(method, usual_preset(method) if preset is None else preset, nested, before)
+    methods.plan_run(method, {**nested, **before}, preset=preset)
+    return Setting(method, methods.usual_preset(method) if preset is None else preset, nested, before)

@@ -18,7 +18,6 @@ from phyradgs_cl import __version__
 from phyradgs_cl.cluster import Lost, Pool, Workers, runtime_of_process
 from phyradgs_cl.errors import DeviceError, OutputError, PhyradgsError
 from phyradgs_cl.io import only_run, written_beside
-from phyradgs_cl.io.json_lines import Line, append_line, json_text, read_lines, refuse_irregular
 from phyradgs_cl.io.output import BusyError, make_folder, shortened
 from phyradgs_cl.reconstructors import Progress, ProgressReport, ignore_progress
 from phyradgs_cl.runtime.device import environment
@@ -26,7 +25,16 @@ from phyradgs_cl.signals import finish_despite_interrupt, keep_finished_work
 from phyradgs_cl.text import plain_text
 from phyradgs_cl.workflow.reconstruct import is_complete, resume_or_restart
 from phyradgs_cl.workflow.sweep.grid import Setting, SweepGrid
-from phyradgs_cl.workflow.sweep.tables import identity, is_sound, write_tables
+from phyradgs_cl.workflow.sweep.tables import (
+    Line,
+    append_line,
+    identity,
+    is_sound,
+    json_text,
+    read_lines,
+    refuse_irregular,
+    write_tables,
+)
 
 RESULTS, VOLUMES = "results.jsonl", "volumes"
 _STEM_BYTES = 80
