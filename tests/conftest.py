@@ -21,12 +21,10 @@ from guarded import guard  # noqa: E402
 from quick import is_quick  # noqa: E402
 
 from phyradgs_cl.__main__ import load_cli  # noqa: E402
-from phyradgs_cl.acquisition import ConeGeometry, make_protocol  # noqa: E402
+from phyradgs_cl.acquisition import ConeGeometry  # noqa: E402
 from phyradgs_cl.acquisition.time_cells import TimeCells  # noqa: E402
-from phyradgs_cl.fields import Grid  # noqa: E402
-from phyradgs_cl.io import write_scan  # noqa: E402
+from phyradgs_cl.api import save_scan, simulate  # noqa: E402
 from phyradgs_cl.runtime import Runtime  # noqa: E402
-from phyradgs_cl.simulation import SimulationOptions, phantom_scene, simulate  # noqa: E402
 
 Cloud = Callable[..., np.ndarray]
 
@@ -134,11 +132,8 @@ def simulated(cli, tmp_path_factory) -> Callable[..., Path]:
 @pytest.fixture(scope="session")
 def tiny_scan(rt: Runtime, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A scan of 10³ voxels with its truth, for runs of a moment."""
-    geometry = ConeGeometry(5.0, 7.0, (12, 12), (1 / 3, 1 / 3))
-    scene = phantom_scene(rt, "jaw", geometry, Grid.cube(10, 2.0), 10, "rows", 0)
-    options = SimulationOptions(protocol=make_protocol("rapid", views=4), time_samples=2)
     path = tmp_path_factory.mktemp("tiny") / "tiny.h5"
-    write_scan(path, simulate(scene.source, geometry, scene.grid, options, reference=scene.reference))
+    save_scan(path, simulate("jaw", size=10, detector=12, views=4, time_samples=2, device=rt))
     return path
 
 

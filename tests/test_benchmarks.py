@@ -98,24 +98,6 @@ def test_benchmarks_that_append_lines_are_resumed(tmp_path) -> None:
         assert lines.read_text() == first and first.count("\n") == count
 
 
-def test_what_is_not_there_is_said_in_a_line(tmp_path) -> None:
-    with h5py.File(tmp_path / "ball.h5", "w") as file:
-        file["volume"] = np.ones((4, 4, 4), np.float32)
-    for words, told in {
-        "check_faults.py {tmp} x --names jaw": "found 'jaw'; expected one of ball",
-        "check_faults.py {tmp} x --faults dad": "--faults: found dad; expected some of none",
-        "check_faults.py {tmp}": "the results file is missing",
-        "calibrate.py {tmp}/none x": "expected a folder",
-        "calibrate.py {tmp} x --cases panels": "--cases: found panels",
-        "calibrate.py --table {tmp}/none": "found no such file",
-        "check_answers.py {tmp} x": "manifest.jsonl: found no such file",
-        "prepare.py --effects spark": "invalid choice: 'spark'",
-    }.items():
-        command = [sys.executable, *words.format(tmp=tmp_path).split()]
-        done = subprocess.run(command, cwd=FOLDER, capture_output=True, text=True, check=False)
-        assert done.returncode and told in done.stderr and "Traceback" not in done.stderr, (words, done.stderr)
-
-
 def test_estimates_are_checked(tmp_path) -> None:
     facts = facts_of(tmp_path, "estimate_check.py", "--methods", "fdk", "--iterations", "2")
     (line,) = facts["runs"]

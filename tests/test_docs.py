@@ -17,10 +17,8 @@ import yaml
 
 from phyradgs_cl import __version__, api
 from phyradgs_cl.__main__ import load_cli
-from phyradgs_cl.acquisition import ConeGeometry, make_protocol
-from phyradgs_cl.fields import Grid
+from phyradgs_cl.acquisition import ConeGeometry
 from phyradgs_cl.reconstructors import METHODS, method_options, plan_run, reconstruct
-from phyradgs_cl.simulation import SimulationOptions, phantom_scene, simulate
 
 DOCS = Path(__file__).resolve().parent.parent / "docs"
 
@@ -68,10 +66,7 @@ def test_pages_and_docstrings_agree_on_integers_and_angles(cli, tmp_path) -> Non
 
 
 def test_the_worked_example_of_a_method_works(rt, monkeypatch) -> None:
-    geometry = ConeGeometry(5.0, 7.0, (16, 16), (0.25, 0.25))
-    scene = phantom_scene(rt, "jaw", geometry, Grid.cube(12, 2.0), 12, "rows", 0)
-    protocol = SimulationOptions(protocol=make_protocol("rapid", views=8, exposure_deg=45.0))
-    scan = simulate(scene.source, geometry, scene.grid, protocol, reference=scene.reference)
+    scan = api.simulate("jaw", size=12, detector=16, views=8, exposure_deg=45.0, device=rt)
     blocks = re.findall(r"```python\n(.*?)```", (DOCS / "methods.md").read_text(encoding="utf-8"), re.S)
     source = next(b for b in blocks if "class Landweber(" in b)
     module = ModuleType("landweber_of_the_docs")

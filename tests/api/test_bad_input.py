@@ -210,17 +210,11 @@ CASES: dict[str, list[tuple[str, Callable[[], object]]]] = {
     ],
     "ConeGeometry": [
         ("source_to_axis_mm", lambda: ConeGeometry("5", 7.0, (6, 8), (1.0, 1.0))),
-        ("source_to_detector_mm", lambda: ConeGeometry(5.0, -7.0, (6, 8), (1.0, 1.0))),
         ("source_to_detector_mm", lambda: ConeGeometry(7.0, 5.0, (6, 8), (1.0, 1.0))),
         ("detector_shape", lambda: ConeGeometry(5.0, 7.0, 6, (1.0, 1.0))),
         ("detector_shape", lambda: ConeGeometry(5.0, 7.0, (6, 8.5), (1.0, 1.0))),
-        ("pixel_size_mm", lambda: ConeGeometry(5.0, 7.0, (6, 8), (1.0, 0.0))),
-        ("detector_offset_mm", lambda: ConeGeometry(5.0, 7.0, (6, 8), (1.0, 1.0), (np.nan, 0))),
     ],
-    "Shutter": [
-        ("exposure_s", lambda: Shutter(-1.0)), ("exposure_s", lambda: Shutter("1")),
-        ("readout axis", lambda: Shutter(1.0, axis="lines")),
-    ],
+    "Shutter": [("exposure_s", lambda: Shutter("1"))],
     "CircularOrbit": [
         ("kinematics", lambda: CircularOrbit(CONE, 3.0)),
         ("geometry", lambda: CircularOrbit(5.0, ConstantSpeed(0.0, 1.0))),
@@ -228,13 +222,10 @@ CASES: dict[str, list[tuple[str, Callable[[], object]]]] = {
     "ConstantSpeed": [("speed_rad_per_s", lambda: ConstantSpeed(0.0, np.nan))],
     "SpeedRamp": [("acceleration_rad_per_s2", lambda: SpeedRamp(0.0, 1.0, "1"))],
     "EncoderTable": [
-        ("encoder table", lambda: EncoderTable([0.0, 1.0], [0.0])),
-        ("encoder table", lambda: EncoderTable([0.0, 0.0], [0.0, 1.0])),
         ("encoder table", lambda: EncoderTable([0.0, 1.0], [0.0, 1.0]).angle_rad(0, np.array([2.0]))),
     ],
     "FrameSweeps": [("angle_start_rad", lambda: FrameSweeps([0.0, 1.0], 1.0, [0.0], [1.0]))],
     "PoseTable": [
-        ("pose table", lambda: PoseTable([0.0, 1.0], POSES)),
         ("pose table", lambda: PoseTable([0.0, 1.0], np.zeros((2, 12)))),
         ("pose table", lambda: reconstruct(BACKWARDS, "fdk")),
     ],
@@ -249,7 +240,6 @@ CASES: dict[str, list[tuple[str, Callable[[], object]]]] = {
     ],
     "Grid": [
         ("grid shape", lambda: Grid(16, 1.0)), ("grid voxel_size", lambda: Grid((4, 4, 4), (1.0, 1.0))),
-        ("grid voxel_size", lambda: Grid((4, 4, 4), (1.0, 1.0, -1.0))),
         ("grid shape", lambda: Grid((1000000.0, 1000000.0, 1000000.0), (1, 1, 1))),
         ("count", lambda: Grid.cube(0, 2.0)),
     ],

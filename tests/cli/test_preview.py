@@ -16,7 +16,6 @@ GRID = Grid.cube(4, 2.0)
 @pytest.mark.parametrize(
     "words",
     [
-        "--method phyradgs --iterations 60 --gaussians 60",
         "--method phyradgs --iterations 60 --gaussians 60 --set pixel_footprint=true",
         "--method sirt --iterations 3",
     ],

@@ -68,20 +68,15 @@ def test_contradictions_are_refused_in_the_words_of_the_door(run, tmp_path, make
         ("--fps", "15", "--frame-time-s", "0.1"): "--fps: found 15 (every 0.06667 s) with --frame-time-s 0.1",
         ("--readout-ms", "62", "--readout-s", "62"): "--readout-ms: found 62 with --readout-s 62",
         ("--fps", "15"): "say --exposure-s",
-        ("--first", "top"): "--first: found no time from frame to frame",
-        ("--fps", "15", "--exposure-s", "0.06", "--readout-ms", "62000"): "--readout-ms: found readout of 62 s, 930 times",
     }.items():
         status, _, error = run(path, *words)
         assert status == 2 and error.count("\n") == 1 and said in error, (words, error)
     for number, (lines, said) in enumerate({
         '[readout]\nfirst = "left"\naxis = "rows"': "[readout] first: found 'left' with",
-        "[timing]\nexposure_s = 0.1\nframe_time_s = 2.0\n[readout]\nfps = 15": "[readout] fps: found 15",
         "[timing]\nexposure_s = 0.1\nstart_s = [0, 1, 2, 3, 4, 5]\n[readout]\nfps = 15": "[readout] fps: found 15 with",
         "[timing]\nexposure_s = 0.1\nreadout_s = 2.0\n[readout]\nreadout_ms = 62": "[readout] readout_ms: found 62 with",
-        "[readout]\nreadout_ms = 62\nratio = 0.9": "[readout] readout_ms: found 62 with ratio",
         "[readout]\nfps = 15": "say [timing] exposure_s",
         "[readout]\nreadout_ms = 62": "[readout] readout_ms: found no time",
-        "[timing]\nexposure_s = 0.06\n[readout]\nfps = 15\nreadout_ms = 62e3": "[readout] readout_ms: found readout of 62 s",
     }.items()):  # fmt: skip
         status, _, error = run(w.write_tiff(tmp_path / f"t{number}", truth, lines))
         assert status == 2 and error.count("\n") == 1 and said in error and "--" not in error, (lines, error)

@@ -146,8 +146,6 @@ def test_a_data_sheet_s_words(write) -> None:
         scanner_options(slow, "rapid")
     for lines, words in {
         'first = "top"\naxis = "columns"': r"\[readout\] first: found 'top' with axis 'columns'; expected 'rows'",
-        'first = "top"\ndirection = 1': r"\[readout\] first: found 'top' with direction 1; expected -1",
-        'first = "above"': r"\[readout\] first: found 'above'",
         "readout_ms = 62\nratio = 0.5": r"\[readout\] readout_ms: found 62 with ratio",
         "fps = 0": r"\[readout\] fps: found 0",
     }.items():

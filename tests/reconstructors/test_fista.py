@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from numpy.lib.stride_tricks import sliding_window_view
 
-from phyradgs_cl.acquisition import ConeGeometry, Motion, PerRow, Scan, Static, make_protocol
-from phyradgs_cl.api import simulate as simulated
+from phyradgs_cl.acquisition import Motion, PerRow, Scan, Static
+from phyradgs_cl.api import simulate
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.metrics import psnr
@@ -29,16 +29,11 @@ from phyradgs_cl.reconstructors.voxels.prior_weight import (
 )
 from phyradgs_cl.reconstructors.voxels.priors import OwnPrior, Prior, PriorInputs, prior_of
 from phyradgs_cl.reconstructors.voxels.system import System
-from phyradgs_cl.simulation import SimulationOptions, phantom_scene, simulate
 
 
 @pytest.fixture(scope="module")
 def scan(rt) -> Scan:
-    geometry = ConeGeometry(5.0, 7.0, (32, 32), (4 / 32, 4 / 32))
-    scene = phantom_scene(rt, "jaw", geometry, Grid.cube(24, 2.0), 24, "rows", 0)
-    protocol = make_protocol("rapid", views=20, exposure_deg=18.0)
-    options = SimulationOptions(protocol=protocol, noise="tigre")
-    return simulate(scene.source, geometry, scene.grid, options, reference=scene.reference)
+    return simulate("jaw", size=24, detector=32, views=20, exposure_deg=18.0, noise="tigre", device=rt)
 
 
 def run(rt, scan: Scan, method: str, **changes: object):
@@ -106,7 +101,7 @@ def test_a_prior_image_helps_where_it_is_right_and_costs_little_where_it_is_wron
 
 def test_subsets_that_pull_apart_slowly_are_joined_too(rt) -> None:
     """Their residual grows by less than a fifth from pass to pass, for ever."""
-    scan = simulated("jaw", device=rt, size=32, detector=48, views=120, exposure_deg=3.0, peak=3.0, noise="tigre")
+    scan = simulate("jaw", device=rt, size=32, detector=48, views=120, exposure_deg=3.0, peak=3.0, noise="tigre")
     options = method_options("fista", None, {"motion": "per-row", "iterations": 30})
     result = reconstruct(scan, RunPlan("fista", options), rt)
     residuals = [line["residual"] for line in result.record]

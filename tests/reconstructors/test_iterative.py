@@ -9,10 +9,10 @@ from scipy.optimize import nnls
 from scipy.sparse.linalg import lsqr
 from tolerances import CONVERGED, FLOAT32, ITERATIVE_TWIN, KRYLOV
 
-from phyradgs_cl.acquisition import ConeGeometry, PerRow, Scan, Static, make_protocol
+from phyradgs_cl.acquisition import ConeGeometry, PerRow, Scan, Static
+from phyradgs_cl.api import simulate
 from phyradgs_cl.detector import beer_lambert_noise
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.fields import Grid
 from phyradgs_cl.metrics import psnr
 from phyradgs_cl.objective import TvDescent, TvProx
 from phyradgs_cl.objective.tv import isotropic_tv, tv_gradient, tv_prox
@@ -29,7 +29,6 @@ from phyradgs_cl.reconstructors.voxels.sirt import Sirt, SirtOptions
 from phyradgs_cl.reconstructors.voxels.subsets import spread_order
 from phyradgs_cl.reconstructors.voxels.system import System
 from phyradgs_cl.runtime.algebra import norm
-from phyradgs_cl.simulation import SimulationOptions, phantom_scene, simulate
 
 ITERATIVE = ("sart", "os-sart", "sirt", "cgls", "asd-pocs", "fista", "fista-tv")
 VOLUME, FRAMES = (3, 4, 4), (6, 4, 5)
@@ -278,11 +277,8 @@ def test_frames_next_to_each_other_in_a_pass_are_far_apart() -> None:
 @pytest.fixture(scope="module")
 def fly_scan(rt) -> Scan:
     """A small noisy fly-scan whose motion matters: 12 frames of 30° over a whole turn."""
-    geometry = ConeGeometry(5.0, 7.0, (24, 24), (4 / 24, 4 / 24))
-    scene = phantom_scene(rt, "jaw", geometry, Grid.cube(16, 2.0), 16, "rows", 0)
-    protocol = make_protocol("rapid", views=12, exposure_deg=30.0)
-    options = SimulationOptions(protocol=protocol, noise="beer", dose=1e5, peak=3.0)
-    return simulate(scene.source, geometry, scene.grid, options, reference=scene.reference)
+    noise = {"noise": "beer", "dose": 1e5, "peak": 3.0}
+    return simulate("jaw", size=16, detector=24, views=12, exposure_deg=30.0, **noise, device=rt)
 
 
 def run(rt, scan: Scan, method: str, **changes: object):
