@@ -10,42 +10,18 @@ from functools import partial
 
 import numpy as np
 
+from phyradgs_cl import objective, operators
 from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, ConstantSpeed, Shutter
 from phyradgs_cl.acquisition.cells import common_time_cells, exact_cells, micro_view_cells, static_cells
 from phyradgs_cl.acquisition.time_cells import TimeCells
 from phyradgs_cl.errors import DeviceError, OutOfMemoryError
 from phyradgs_cl.fields import Activation, Grid
 from phyradgs_cl.fields.gaussians import DENSITY, MEAN, QUATERNION, SCALE
-from phyradgs_cl.objective import (
-    ImageLoss,
-    ParameterTerms,
-    TotalVariation,
-    image_loss,
-    parameter_loss,
-    total_variation,
-)
 from phyradgs_cl.objective.dct_prox import DctProx, dct_prox
 from phyradgs_cl.objective.nonlocal_step import LARGEST, NonlocalStep, likeness_of, nonlocal_step
 from phyradgs_cl.objective.tv import TvDescent, TvProx, tv_descent, tv_prox
-from phyradgs_cl.operators import (
-    DensityOperator,
-    DeviceCells,
-    IntensityOperator,
-    RayOperator,
-    SplatOperator,
-    SplatProjector,
-    Voxeliser,
-    backproject,
-    backproject_lines,
-)
 from phyradgs_cl.operators.splats.binning import TileLists
-from phyradgs_cl.operators.twins.rays import (
-    backprojection,
-    intensity_volume,
-    lines_backprojection,
-    ray_frame,
-    ray_volume,
-)
+from phyradgs_cl.operators.twins import rays as twins
 from phyradgs_cl.operators.twins.splat import moving_frame, splat_frame, splat_image, voxel_field
 from phyradgs_cl.optim import DeviceAdam, adam_step
 from phyradgs_cl.runtime import DeviceSpace, HostSpace, Runtime
@@ -165,9 +141,9 @@ def _layered_splats(rt: Runtime) -> Iterator[Comparison]:
 def _frame_and_gradients(
     rt: Runtime, table: TimeCells, twin: Callable[[np.ndarray], np.ndarray], **options: float | bool
 ) -> Iterator[Comparison]:
-    rows, h, cells = _cloud(), _noise(SHAPE, 2), DeviceCells.upload(rt, table)
+    rows, h, cells = _cloud(), _noise(SHAPE, 2), operators.DeviceCells.upload(rt, table)
     shape = table.readout.shape(SHAPE)
-    projector = SplatProjector(rt, *shape, cutoff_sigma=0.0, time_error=1e-6, **options)  # type: ignore[arg-type]
+    projector = operators.SplatProjector(rt, *shape, cutoff_sigma=0.0, time_error=1e-6, **options)  # type: ignore[arg-type]
     yield table.readout.frames(projector.project(rows, cells)), twin(rows), VALUE
     found = projector.project_adjoint(rows, cells, table.readout.frames(h))
     yield from _by_class(found, _differences(twin, rows, h))
@@ -178,20 +154,21 @@ def _plain_splats(rt: Runtime) -> Iterator[Comparison]:
     rows[QUATERNION] *= 1.7
     for axis in ("rows", "columns"):
         table = static_cells(ORBIT, Shutter(0.8, 0.6, axis), 0, 0.2, SHAPE[axis == "columns"])
-        operator = SplatOperator(rt, SHAPE, [table], 0.7, cutoff_sigma=0.0)
+        operator = operators.SplatOperator(rt, SHAPE, [table], 0.7, cutoff_sigma=0.0)
         point = operator.rows.enter(rt.upload(rows, np.float32))
         yield rt.download(operator.forward(point))[0], splat_frame(rows, table, SHAPE), VALUE
         found = rt.download(operator.back(point, rt.upload(h)))
         yield from _by_class(found, _differences(partial(splat_frame, table=table, detector_shape=SHAPE), rows, h))
     ones = rows.copy()
     ones[DENSITY] = 1
-    found = rt.download(DensityOperator(operator, point).forward(rt.upload(ones[DENSITY], np.float32)))
+    densities = rt.upload(ones[DENSITY], np.float32)
+    found = rt.download(operators.DensityOperator(operator, point).forward(densities))
     yield found[0], splat_frame(ones, table, SHAPE), VALUE
 
 
 def _voxels(rt: Runtime) -> Iterator[Comparison]:
     rows, h = _cloud(), _noise(GRID.shape, 4)
-    voxeliser = Voxeliser(rt, GRID.shape, cutoff_sigma=0.0)
+    voxeliser = operators.Voxeliser(rt, GRID.shape, cutoff_sigma=0.0)
     yield voxeliser.voxelise(rows, GRID), voxel_field(rows, *GRID.axes_mm()), VALUE
     found = voxeliser.voxelise_adjoint(rows, GRID, h)
     yield from _by_class(found, _differences(lambda r: voxel_field(r, *GRID.axes_mm()), rows, h))
@@ -208,15 +185,16 @@ def _rays(rt: Runtime) -> Iterator[Comparison]:
     leaning.pose[:, 9:12] += 0.02 * common.pose[:, 6:9]
     for cells, shape in ((still, SHAPE), (table, SHAPE), (upright, tall), (common, tall), (leaning, tall)):
         y = _noise((1, *shape), 6)
-        operator = RayOperator(rt, GRID, shape, [cells])
-        yield operator.forward(volume)[0], ray_frame(volume, GRID, cells, shape), VALUE
-        yield operator.adjoint(y), ray_volume(y[0], GRID, cells), VALUE
-    intensity = IntensityOperator(rt, GRID, SHAPE, [table])
+        operator = operators.RayOperator(rt, GRID, shape, [cells])
+        yield operator.forward(volume)[0], twins.ray_frame(volume, GRID, cells, shape), VALUE
+        yield operator.adjoint(y), twins.ray_volume(y[0], GRID, cells), VALUE
+    intensity = operators.IntensityOperator(rt, GRID, SHAPE, [table])
     on_device = rt.upload(volume)
-    yield rt.download(intensity.forward(on_device))[0], ray_frame(volume, GRID, table, SHAPE), VALUE  # at 0: the mean
-    yield rt.download(intensity.expected(on_device))[0], ray_frame(volume, GRID, table, SHAPE, "intensity"), VALUE
+    mean, averaged = (twins.ray_frame(volume, GRID, table, SHAPE, model) for model in ("log", "intensity"))
+    yield rt.download(intensity.forward(on_device))[0], mean, VALUE  # at 0: the mean
+    yield rt.download(intensity.expected(on_device))[0], averaged, VALUE
     found = rt.download(intensity.adjoint(rt.upload(frames)))
-    yield found, intensity_volume(frames[0], volume, GRID, table), VALUE
+    yield found, twins.intensity_volume(frames[0], volume, GRID, table), VALUE
 
 
 def _backprojections(rt: Runtime) -> Iterator[Comparison]:
@@ -224,29 +202,31 @@ def _backprojections(rt: Runtime) -> Iterator[Comparison]:
     for tilt in (0.0, 0.02, 0.6):
         pose = GEOMETRY.pose(angles)
         pose[:, 9:12] += tilt * pose[:, 6:9]
-        yield backproject(rt, frames, pose, weight, GRID), backprojection(frames, pose, weight, GRID), VALUE
+        seen = frames, pose, weight, GRID
+        yield operators.backproject(rt, *seen), twins.backprojection(*seen), VALUE
     lines = np.stack([GEOMETRY.pose(a + np.linspace(-0.1, 0.1, SHAPE[0])) for a in angles])
-    yield backproject_lines(rt, frames, lines, weight, GRID), lines_backprojection(frames, lines, weight, GRID), VALUE
+    seen = frames, lines, weight, GRID
+    yield operators.backproject_lines(rt, *seen), twins.lines_backprojection(*seen), VALUE
 
 
 def _image_terms(rt: Runtime) -> Iterator[Comparison]:
     rendered, measured, transmission = (_noise(SHAPE, seed) for seed in (8, 9, 10))
     mask = (_noise(SHAPE, 11) > 0.2).astype(np.float32)
     weights = 0.25, 1.0, 0.3
-    loss = ImageLoss(rt, *SHAPE, pitch_of(SHAPE[1]), *weights)
+    loss = objective.ImageLoss(rt, *SHAPE, pitch_of(SHAPE[1]), *weights)
     x, y, m, t = (rt.upload(pad_rows(image)) for image in (rendered, measured, mask, transmission))
     found = rt.download(loss.evaluate(x, y, m, float(mask.sum()), t))
     wide = rendered.astype(np.float64), measured.astype(np.float64), mask.astype(np.float64)
-    value, gradient = image_loss(*wide, *weights, transmission)
+    value, gradient = objective.image_loss(*wide, *weights, transmission)
     yield unpad_rows(found, SHAPE), gradient, VALUE
     yield np.array(loss.value()), np.array(value), VALUE
 
 
 def _variation(rt: Runtime) -> Iterator[Comparison]:
     volume = _noise(GRID.shape, 12)
-    term = TotalVariation(rt, GRID.shape, pitch_of(GRID.shape[2]))
+    term = objective.TotalVariation(rt, GRID.shape, pitch_of(GRID.shape[2]))
     gradient = rt.download(term.evaluate(rt.upload(pad_rows(volume))))
-    value, expected = total_variation(volume)
+    value, expected = objective.total_variation(volume)
     yield unpad_rows(gradient, GRID.shape), expected, VALUE
     yield np.array(term.value()), np.array(value), VALUE
     yield TvDescent(rt, GRID.shape)(volume, 0.1, 2), tv_descent(volume, 0.1, 2), VALUE
@@ -262,7 +242,7 @@ def _variation(rt: Runtime) -> Iterator[Comparison]:
 
 def _optimiser(rt: Runtime) -> Iterator[Comparison]:
     activation, stride, count = Activation(0.01, 0.6), 16, 16
-    terms = ParameterTerms(density_weight=0.3, shape_weight=0.7, shape_ratio=1.5, shape_floor=0.2)
+    terms = objective.ParameterTerms(density_weight=0.3, shape_weight=0.7, shape_ratio=1.5, shape_floor=0.2)
     raw = activation.invert(_cloud(count)).astype(np.float32).astype(np.float64)
     raw[QUATERNION] *= 1.7
     adam, on_device = DeviceAdam(rt, activation), rt.upload(raw, np.float32)
@@ -271,7 +251,8 @@ def _optimiser(rt: Runtime) -> Iterator[Comparison]:
     yield rt.download(parameters), activation.apply(raw), VALUE
     adam.chain(on_device, parameters, gradients, statistics, count, stride, **asdict(terms))
     found = rt.download(gradients)[:11]
-    yield found, _differences(lambda r: np.array(parameter_loss(activation.apply(r), terms)[0]), raw), GRADIENT
+    value = lambda rows: np.array(objective.parameter_loss(activation.apply(rows), terms)[0])  # noqa: E731
+    yield found, _differences(value, raw), GRADIENT
     rates, moments = np.linspace(0.01, 0.03, 11), rt.zeros((2, 11, stride))
     adam.step(on_device, gradients, moments, stride, rates, 1)
     expected = adam_step(raw, found.astype(np.float64), np.zeros((2, 11, stride)), rates, 1)

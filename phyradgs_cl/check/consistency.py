@@ -16,21 +16,11 @@ import numpy as np
 from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.acquisition.altered.coarse import some_frames
 from phyradgs_cl.acquisition.altered.variants import reversed_rotation, shifted
+from phyradgs_cl.check import hypotheses
 from phyradgs_cl.check.finding import CANNOT_TELL, FEWEST_COLUMNS, OK, SUSPICIOUS, Finding
-from phyradgs_cl.check.hypotheses import (
-    LEAST_REDUNDANCY,
-    Hypothesis,
-    hypotheses_of_frames,
-    hypotheses_of_scan,
-    stated_redundancy,
-)
+from phyradgs_cl.check.hypotheses import Hypothesis
 from phyradgs_cl.check.odd_frames import without_odd_frames, without_outliers
-from phyradgs_cl.reconstructors.fits.axis import (
-    AxisShift,
-    columns_per_block,
-    refined_axis_shift,
-    rough_axis_shift,
-)
+from phyradgs_cl.reconstructors.fits import axis
 from phyradgs_cl.reconstructors.fits.residuals import Fit, fit, fit_squares, t_statistic
 from phyradgs_cl.runtime import Runtime
 
@@ -108,7 +98,7 @@ def check_consistency(rt: Runtime, scan: Scan, as_stated: Scan) -> Consistency:
     hypothesis = _explanation(rt, some_frames(scan, frames), as_stated, coarse)
     if hypothesis is not None:
         return answer(SUSPICIOUS, hypothesis.text, hypothesis.advice, False)
-    if stated_redundancy(as_stated) < 0:
+    if hypotheses.stated_redundancy(as_stated) < 0:
         text = "detector_offset puts the axis of rotation beside the panel, where frames fit under any geometry"
         advice = "compare detector_offset and pixel sizes, and their units, with the scanner's log"
         return answer(SUSPICIOUS, text, advice, False)
@@ -123,14 +113,14 @@ def _best_sense(rt: Runtime, scan: Scan) -> tuple[Scan, Scan, float]:
 
     Returns the scan with the sense, the same with the shift, and the mean squared residual of the best rough fit."""
     senses = [scan, reversed_rotation(scan)]
-    roughs = [rough_axis_shift(rt, sense) for sense in senses]
+    roughs = [axis.rough_shift(rt, sense) for sense in senses]
     least_rough = min(float(rough.squares.mean()) for rough in roughs)
     turned = best = scan
     least = _CLEAR * fit_squares(rt, scan).sum()
     for sense, rough in zip(senses, roughs, strict=True):
         if rough.squares.mean() > _NEARLY * least_rough:  # in a narrow fan rough fits do not decide
             continue
-        shift = refined_axis_shift(rt, sense, rough)
+        shift = axis.refined_shift(rt, sense, rough)
         if not shift.is_found:
             continue
         other = shifted(sense, shift.pixels)
@@ -150,16 +140,16 @@ def _explanation(rt: Runtime, scan: Scan, as_stated: Scan, coarse: _CoarseFit) -
     """Returns the best hypothesis that fits far better than the stated scan does.
 
     A panel that sees few rays twice fits any geometry: then it is the first other size under which frames are consistent."""
-    is_one_sided = stated_redundancy(as_stated) < LEAST_REDUNDANCY
-    of_scan = _refined_hypotheses(rt, scan, as_stated, np.inf if is_one_sided else coarse.rough_mean_square)
+    is_one_sided = hypotheses.stated_redundancy(as_stated) < hypotheses.LEAST_REDUNDANCY
+    about_scan = _refined_hypotheses(rt, scan, as_stated, np.inf if is_one_sided else coarse.rough_mean_square)
     if is_one_sided:
-        sized = (hypothesis for hypothesis in of_scan if hypothesis.factor != 1)
+        sized = (hypothesis for hypothesis in about_scan if hypothesis.factor != 1)
         consistent = next((hypothesis for hypothesis in sized if _is_consistent(rt, hypothesis.scan())), None)
-        if consistent is not None or stated_redundancy(as_stated) < 0:
+        if consistent is not None or hypotheses.stated_redundancy(as_stated) < 0:
             return consistent
     most = min(_CLEAR * coarse.fitted.total, _LARGEST**2 * coarse.random_total)
-    of_frames = hypotheses_of_frames(coarse.turned, coarse.best, tries_orders=coarse.ratio > _DOUBTFUL)
-    return _best_below(rt, chain(of_scan, of_frames), coarse.fitted, most)
+    about_frames = hypotheses.of_frames(coarse.turned, coarse.best, tries_orders=coarse.ratio > _DOUBTFUL)
+    return _best_below(rt, chain(about_scan, about_frames), coarse.fitted, most)
 
 
 def _refined_hypotheses(rt: Runtime, scan: Scan, as_stated: Scan, most: float) -> list[Hypothesis]:
@@ -167,11 +157,11 @@ def _refined_hypotheses(rt: Runtime, scan: Scan, as_stated: Scan, most: float) -
 
     Both have to leave less than ``most`` (mean squared residual) in a rough fit. Large shifts count against a hypothesis; of
     hypotheses with the same factor of sizes the one with the smaller shift counts."""
-    tried: list[tuple[Hypothesis, Scan, AxisShift]] = []
-    for hypothesis in hypotheses_of_scan(scan, as_stated):
+    tried: list[tuple[Hypothesis, Scan, axis.AxisShift]] = []
+    for hypothesis in hypotheses.of_scan(scan, as_stated):
         other = hypothesis.scan()
-        tried.append((hypothesis, other, rough_axis_shift(rt, other)))
-    block = columns_per_block(scan)
+        tried.append((hypothesis, other, axis.rough_shift(rt, other)))
+    block = axis.columns_per_block(scan)
     tried.sort(key=lambda one: one[2].squares.sum() * _SHIFT_PENALTY ** (abs(one[2].pixels) / block))
     factors: set[float] = set()
     distinct = []
@@ -182,7 +172,7 @@ def _refined_hypotheses(rt: Runtime, scan: Scan, as_stated: Scan, most: float) -
     refined = []
     for hypothesis, other, rough in distinct[:_MOST_REFINED]:
         if rough.squares.mean() < most:
-            shift = refined_axis_shift(rt, other, rough)
+            shift = axis.refined_shift(rt, other, rough)
             pixels = shift.pixels if shift.is_found else rough.pixels
             refined.append(replace(hypothesis, scan=partial(shifted, other, pixels)))
     return refined
@@ -192,10 +182,10 @@ def _is_consistent(rt: Runtime, scan: Scan) -> bool:
     return bool(fit_squares(rt, scan).sum() < _LARGEST**2 * _random_order(rt, scan))
 
 
-def _best_below(rt: Runtime, hypotheses: Iterable[Hypothesis], stated: Fit, most: float) -> Hypothesis | None:
+def _best_below(rt: Runtime, candidates: Iterable[Hypothesis], stated: Fit, most: float) -> Hypothesis | None:
     """Returns the hypothesis with the least squared residual, if that is below ``most`` and four standard errors better."""
     best, least = None, most
-    for hypothesis in hypotheses:
+    for hypothesis in candidates:
         squares = fit_squares(rt, hypothesis.scan())
         if squares.sum() < least and t_statistic(stated.squares, squares) <= -_ERRORS:
             best, least = hypothesis, float(squares.sum())

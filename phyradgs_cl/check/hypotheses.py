@@ -7,17 +7,9 @@ from functools import partial
 import numpy as np
 
 from phyradgs_cl.acquisition import Scan
+from phyradgs_cl.acquisition.altered import variants
 from phyradgs_cl.acquisition.altered.angles import start_azimuths_rad, wrapped
 from phyradgs_cl.acquisition.altered.coarse import coarse_grid
-from phyradgs_cl.acquisition.altered.variants import (
-    altered_trajectory,
-    mirrored,
-    resized,
-    stretched,
-    transposed,
-    turned,
-    with_trajectory,
-)
 from phyradgs_cl.acquisition.geometry import default_grid
 from phyradgs_cl.check.finding import FEWEST_COLUMNS, MIRROR_U, MIRROR_V, PIXEL_SIZES
 from phyradgs_cl.fields import Grid
@@ -57,10 +49,10 @@ def stated_redundancy(scan: Scan) -> float:
 
 def frame_number(scan: Scan, frame: int) -> int:
     """Returns a frame's number in the file, from 0."""
-    return int(altered_trajectory(scan).frame_numbers(scan)[frame])
+    return int(variants.altered_trajectory(scan).frame_numbers(scan)[frame])
 
 
-def hypotheses_of_scan(scan: Scan, stated: Scan) -> Iterator[Hypothesis]:
+def of_scan(scan: Scan, stated: Scan) -> Iterator[Hypothesis]:
     """Yields hypotheses about the whole coarse ``scan``, which was made of ``stated``: sizes in another unit, frames
     mirrored or transposed."""
     yield from _other_units(scan, stated)
@@ -79,7 +71,7 @@ def _other_units(scan: Scan, stated: Scan) -> Iterator[Hypothesis]:
         correct_sizes, correct_distances = f"correct {PIXEL_SIZES}", "correct the distances"
         with_axis, with_offset = (partial(_with_sizes, scan, stated, factor, keeps_axis) for keeps_axis in (True, False))
         shift_px = offset_px * abs(1 - 1 / factor)
-        if (shift_px < _SAME_PLACE * np.array(altered_trajectory(scan).blocks)).all():
+        if (shift_px < _SAME_PLACE * np.array(variants.altered_trajectory(scan).blocks)).all():
             text = f"frames fit with {sizes}, or with {distances}: they do not tell which"
             yield Hypothesis(text, f"{correct_sizes}, or {correct_distances}", with_axis, factor)
             continue
@@ -100,10 +92,10 @@ def _with_sizes(scan: Scan, stated: Scan, factor: float, keeps_axis: bool) -> Sc
     off_v_mm, off_u_mm = (offset * (factor if keeps_axis else 1) for offset in stated.geometry.detector_offset_mm)
     pixel_size_mm = (factor * v_mm, factor * u_mm)
     geometry = replace(stated.geometry, pixel_size_mm=pixel_size_mm, detector_offset_mm=(off_v_mm, off_u_mm))
-    blocks = altered_trajectory(scan).blocks
+    blocks = variants.altered_trajectory(scan).blocks
     panel = replace(scan.geometry, pixel_size_mm=(blocks[0] * pixel_size_mm[0], blocks[1] * pixel_size_mm[1]))
     grid = coarse_grid(_matching_grid(stated, default_grid(geometry)), panel)
-    return replace(resized(scan, factor, keeps_axis), geometry=panel, grid=grid)
+    return replace(variants.resized(scan, factor, keeps_axis), geometry=panel, grid=grid)
 
 
 def _matching_grid(stated: Scan, panel_grid: Grid) -> Grid:
@@ -119,17 +111,17 @@ def _other_images(scan: Scan, stated: Scan) -> Iterator[Hypothesis]:
     offset_v_mm, offset_u_mm = stated.geometry.detector_offset_mm
     if offset_u_mm or stated.shutter.axis == "columns":
         text = "frames fit if they are mirrored in u (or with rotation, detector_offset and readout the other way)"
-        yield Hypothesis(text, advice.format(MIRROR_U), partial(mirrored, scan, "u"))
+        yield Hypothesis(text, advice.format(MIRROR_U), partial(variants.mirrored, scan, "u"))
     if offset_v_mm:
         text = "frames fit if they are mirrored in v (or with detector_offset along v and readout the other way)"
-        yield Hypothesis(text, advice.format(MIRROR_V), partial(mirrored, scan, "v"))
+        yield Hypothesis(text, advice.format(MIRROR_V), partial(variants.mirrored, scan, "v"))
     if scan.geometry.detector_shape[0] >= FEWEST_COLUMNS:
         text = "frames fit if they are transposed, rows and columns exchanged (or turned by 90°"
-        yield Hypothesis(f"{text})", _TRANSPOSED, partial(transposed, scan, False))
-        yield Hypothesis(f"{text}: more likely)", _TRANSPOSED, partial(transposed, scan, True))
+        yield Hypothesis(f"{text})", _TRANSPOSED, partial(variants.transposed, scan, False))
+        yield Hypothesis(f"{text}: more likely)", _TRANSPOSED, partial(variants.transposed, scan, True))
 
 
-def hypotheses_of_frames(scan: Scan, shifted_scan: Scan, tries_orders: bool) -> Iterator[Hypothesis]:
+def of_frames(scan: Scan, shifted_scan: Scan, tries_orders: bool) -> Iterator[Hypothesis]:
     """Yields other angle steps, sizes near the stated ones (with the panel shifted) and, with ``tries_orders``, other orders
     and missing or repeated frames."""
     yield from _other_steps(scan)
@@ -141,7 +133,7 @@ def hypotheses_of_frames(scan: Scan, shifted_scan: Scan, tries_orders: bool) -> 
 
 def _azimuths(scan: Scan) -> np.ndarray:
     """Returns each frame's angle from the first one's (F,): as stated, turns included, where the trajectory has angles."""
-    trajectory = altered_trajectory(scan)
+    trajectory = variants.altered_trajectory(scan)
     angle_rad = getattr(trajectory.base, "angle_rad", None)
     if angle_rad is None:
         angles = np.unwrap(start_azimuths_rad(scan))
@@ -153,7 +145,7 @@ def _azimuths(scan: Scan) -> np.ndarray:
 
 def _other_steps(scan: Scan) -> Iterator[Hypothesis]:
     from_first = _azimuths(scan)
-    sense = -1.0 if altered_trajectory(scan).is_reversed else 1.0
+    sense = -1.0 if variants.altered_trajectory(scan).is_reversed else 1.0
     total_deg = float(np.rad2deg(abs(from_first[-1])))
     radian_deg = float(np.degrees(1.0))
     steps = {
@@ -168,14 +160,15 @@ def _other_steps(scan: Scan) -> Iterator[Hypothesis]:
     for factor, text in steps.items():
         span = f"the frames span {factor * total_deg:.4g}°, not {total_deg:.4g}°"
         advice = f"{span}: correct rotation_angle, its unit or its step"
-        yield Hypothesis(text, advice, partial(turned, scan, sense * (factor - 1) * from_first, factor))
+        turns_rad = sense * (factor - 1) * from_first
+        yield Hypothesis(text, advice, partial(variants.turned, scan, turns_rad, factor))
 
 
 def _near_sizes(scan: Scan) -> Iterator[Hypothesis]:
     v, u = scan.geometry.pixel_size_mm
     if abs(v / u - 1) > 0.02:
         text, advice = "pixel sizes fit if v and u are exchanged", f"exchange {PIXEL_SIZES}"
-        yield Hypothesis(text, advice, partial(stretched, scan, u / v, v / u))
+        yield Hypothesis(text, advice, partial(variants.stretched, scan, u / v, v / u))
     for factor in _NEAR_SIZES:
         text = f"pixels over the distance of the panel fit if they are {factor:g} times as large"
         advice = f"correct {PIXEL_SIZES} (binning? unit?) or distances (unit? source to panel?)"
@@ -184,12 +177,13 @@ def _near_sizes(scan: Scan) -> Iterator[Hypothesis]:
 
 def nearly_sized(scan: Scan, factor: float) -> Scan:
     """Returns the scan with pixels ``factor`` times as large, the axis at its column, and the grid of ``stretched``."""
-    return replace(resized(scan, factor, keeps_axis=True), grid=stretched(scan, factor, factor).grid)
+    grid = variants.stretched(scan, factor, factor).grid
+    return replace(variants.resized(scan, factor, keeps_axis=True), grid=grid)
 
 
 def _name_orders(scan: Scan) -> Iterator[Hypothesis]:
     """The order of file names without leading zeros, counted from 0 or 1."""
-    numbers = altered_trajectory(scan).frame_numbers(scan)
+    numbers = variants.altered_trajectory(scan).frame_numbers(scan)
     count = int(numbers[-1]) + 1
     starts_s = np.interp(np.arange(count), numbers, scan.frame_start_s)
     for first in (0, 1):
@@ -202,19 +196,19 @@ def _name_orders(scan: Scan) -> Iterator[Hypothesis]:
 
 
 def _in_order(scan: Scan, numbers: np.ndarray, starts_s: np.ndarray) -> Scan:
-    return replace(with_trajectory(scan, frames=numbers), frame_start_s=starts_s)
+    return replace(variants.with_trajectory(scan, frames=numbers), frame_start_s=starts_s)
 
 
 def _missing_frames(scan: Scan) -> Iterator[Hypothesis]:
     """A missing or a repeated frame at fifteen places, later frames being one step further or less far."""
-    sense = -1.0 if altered_trajectory(scan).is_reversed else 1.0
+    sense = -1.0 if variants.altered_trajectory(scan).is_reversed else 1.0
     step = float(np.median(wrapped(np.diff(_azimuths(scan))))) * sense
     for at in np.unique(np.linspace(1, scan.frames - 1, _GAPS).round().astype(int)):
         later = (np.arange(scan.frames) >= at) * step
         number = frame_number(scan, int(at))
         text = f"a frame is missing near frame {number} (from 0): later frames fit one step further on"
         advice = "find the missing frame, or shift the angles behind it by a step"
-        yield Hypothesis(text, advice, partial(turned, scan, later))
+        yield Hypothesis(text, advice, partial(variants.turned, scan, later))
         text = f"a frame is there twice near frame {number} (from 0): later frames fit one step before"
         advice = "take the frame out, so that later ones get their own angles"
-        yield Hypothesis(text, advice, partial(turned, scan, -later))
+        yield Hypothesis(text, advice, partial(variants.turned, scan, -later))

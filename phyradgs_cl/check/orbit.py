@@ -20,13 +20,7 @@ from phyradgs_cl.check.finding import (
 )
 from phyradgs_cl.check.hypotheses import SIZE_FACTORS, nearly_sized, stated_redundancy
 from phyradgs_cl.check.timing import is_full_turn
-from phyradgs_cl.reconstructors.fits.axis import (
-    AxisShift,
-    columns_per_block,
-    refined_axis_shift,
-    rough_axis_shift,
-    with_best_shift,
-)
+from phyradgs_cl.reconstructors.fits import axis
 from phyradgs_cl.reconstructors.fits.residuals import fit_squares, residual_ratio, t_statistic
 from phyradgs_cl.runtime import Runtime
 
@@ -48,7 +42,7 @@ class Orbit:
 
     sign: Finding
     centre: Finding
-    shift: AxisShift = AxisShift(math.nan, math.nan, np.empty(0))
+    shift: axis.AxisShift = axis.AxisShift(math.nan, math.nan, np.empty(0))
     is_reversed: bool = False
 
     def corrected(self, scan: Scan) -> Scan:
@@ -64,16 +58,16 @@ def find_orbit(rt: Runtime, quick: Scan, as_stated: Scan, sees_angles: bool) -> 
         return Orbit(too_narrow(SIGN, "standard errors"), too_narrow(CENTRE, "pixels"))
     if not sees_angles:
         return Orbit(same_from_everywhere(SIGN), same_from_everywhere(CENTRE))
-    reverse, block = reversed_rotation(quick), columns_per_block(quick)
-    stated, other = rough_axis_shift(rt, quick), rough_axis_shift(rt, reverse)
+    reverse, block = reversed_rotation(quick), axis.columns_per_block(quick)
+    stated, other = axis.rough_shift(rt, quick), axis.rough_shift(rt, reverse)
     is_rough = is_clear(stated, other)
     if not is_rough:
-        stated, other = refined_axis_shift(rt, quick, stated), refined_axis_shift(rt, reverse, other)
+        stated, other = axis.refined_shift(rt, quick, stated), axis.refined_shift(rt, reverse, other)
     sign = check_rotation(stated, other)
     is_reversed = sign.verdict == SUSPICIOUS
     shift = other if is_reversed else stated
     if is_rough:
-        shift = refined_axis_shift(rt, reverse if is_reversed else quick, shift)
+        shift = axis.refined_shift(rt, reverse if is_reversed else quick, shift)
     shift, centre = centre_of(shift, block, as_stated)
     if is_reversed:
         stated_px = as_stated.geometry.detector_offset_mm[1] / as_stated.geometry.pixel_size_mm[1]
@@ -82,7 +76,7 @@ def find_orbit(rt: Runtime, quick: Scan, as_stated: Scan, sees_angles: bool) -> 
     return Orbit(sign, centre, shift, is_reversed)
 
 
-def check_rotation(stated: AxisShift, other: AxisShift) -> Finding:
+def check_rotation(stated: axis.AxisShift, other: axis.AxisShift) -> Finding:
     """Compares the residuals with the angles as stated and reversed, each with its own best shift of the panel.
 
     It takes four standard errors and 20 % of the squared residual, because a mirror image in a narrow fan fits as well.
@@ -98,7 +92,7 @@ def check_rotation(stated: AxisShift, other: AxisShift) -> Finding:
     return Finding(SIGN, CANNOT_TELL, *values, advice)
 
 
-def is_clear(stated: AxisShift, other: AxisShift) -> bool:
+def is_clear(stated: axis.AxisShift, other: axis.AxisShift) -> bool:
     """True where one of two rough fits is better by a factor of three: the other needs no closer look."""
     ratio = residual_ratio(stated.squares, other.squares)
     return max(ratio, 1 / max(ratio, 1e-30)) >= _CLEAR_RATIO
@@ -121,7 +115,7 @@ def with_cause(finding: Finding, shift_px: float, stated_px: float, tolerance_px
     return replace(finding, text=text, advice=f"{advice}, and check again")
 
 
-def centre_of(shift: AxisShift, block: int, scan: Scan) -> tuple[AxisShift, Finding]:
+def centre_of(shift: axis.AxisShift, block: int, scan: Scan) -> tuple[axis.AxisShift, Finding]:
     """Returns a shift found with blocks of ``block`` pixels, and the finding about it.
 
     The error of coarse pixels is added to its deviation, because the bootstrap over frames does not include it. It is far
@@ -134,7 +128,7 @@ def centre_of(shift: AxisShift, block: int, scan: Scan) -> tuple[AxisShift, Find
     return shift, check_centre(shift, block, pitch_mm, scan.geometry.detector_offset_mm[1] / pitch_mm)
 
 
-def check_centre(shift: AxisShift, block: int, pitch_mm: float, stated_px: float) -> Finding:
+def check_centre(shift: axis.AxisShift, block: int, pitch_mm: float, stated_px: float) -> Finding:
     """Compares the panel's shift with half a pixel, a fifth of a coarse pixel and four standard deviations.
 
     A stated offset that is wrong by the factor of a unit may be right in mm, with pixel sizes wrong by that factor."""
@@ -167,7 +161,7 @@ def check_distances(rt: Runtime, scan: Scan) -> Finding:
     Only the fan distinguishes these: the answer is ``ok`` where both fit worse, else ``cannot tell``. Sizes that fit far
     better make the frames inconsistent, which is another question's finding."""
     stated = fit_squares(rt, scan)
-    others = {factor: fit_squares(rt, with_best_shift(rt, nearly_sized(scan, factor))) for factor in _OTHER_SIZES}
+    others = {factor: fit_squares(rt, axis.with_best_shift(rt, nearly_sized(scan, factor))) for factor in _OTHER_SIZES}
     ratios = {factor: residual_ratio(stated, other) for factor, other in others.items()}
     best = min(ratios, key=lambda factor: ratios[factor])
     text = f"pixels over the panel's distance {best:g} times as large leave {ratios[best]:.3g} times the squared residual"

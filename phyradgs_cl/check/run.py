@@ -9,28 +9,8 @@ import numpy as np
 from phyradgs_cl import checks
 from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.acquisition.altered.coarse import FINE_COLUMNS, QUICK_COLUMNS, coarse, some_frames
-from phyradgs_cl.check.consistency import CONSISTENCY, check_consistency
-from phyradgs_cl.check.coverage import CUT_OFF, NO_OBJECT, OPAQUE, TOO_BRIGHT, check_coverage
-from phyradgs_cl.check.detector import (
-    GAIN,
-    OVERFLOW,
-    CountReader,
-    check_dead_pixels,
-    check_gain,
-    check_saturation,
-)
+from phyradgs_cl.check import consistency, coverage, detector, orbit, shutter, timing
 from phyradgs_cl.check.finding import CANNOT_TELL, OK, SUSPICIOUS, Finding, same_from_everywhere
-from phyradgs_cl.check.orbit import (
-    CENTRE,
-    DISTANCES,
-    OTHER_CAUSE,
-    SIGN,
-    UNVERIFIED,
-    check_distances,
-    find_orbit,
-)
-from phyradgs_cl.check.shutter import EXPOSURE, READOUT, check_exposure, check_readout
-from phyradgs_cl.check.timing import check_angles, check_timing
 from phyradgs_cl.detector import without_lag
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.runtime import Runtime
@@ -64,8 +44,8 @@ class _Answers:
         self._say()
 
     def add(self, finding: Finding) -> Finding:
-        if finding.question == DISTANCES and finding.verdict == CANNOT_TELL:
-            finding = replace(finding, text=f"{finding.text}; {UNVERIFIED}")
+        if finding.question == orbit.DISTANCES and finding.verdict == CANNOT_TELL:
+            finding = replace(finding, text=f"{finding.text}; {orbit.UNVERIFIED}")
         self.findings.append(finding)
         self._say()
         return finding
@@ -83,58 +63,61 @@ class _Answers:
 
 
 def check(
-    scan: Scan, rt: Runtime, counts: CountReader | None = None, report: Report = lambda done, total, question: None
+    scan: Scan, rt: Runtime, counts: detector.CountReader | None = None,
+    report: Report = lambda done, total, question: None,
 ) -> CheckResult:
     """Looks for what is wrong or suspicious in a scan. ``counts``: the reader of the scan's file, if it remembers counts.
 
     Raises InputError where every pixel is masked, and for NaN or infinity elsewhere."""
     scan = without_lag(_finite(scan))
-    questions = ["timing", "angles", "saturation", "dead pixels", "coverage", CONSISTENCY, SIGN, CENTRE, DISTANCES, GAIN]
+    questions = ["timing", "angles", "saturation", "dead pixels", "coverage", consistency.CONSISTENCY]
+    questions += [orbit.SIGN, orbit.CENTRE, orbit.DISTANCES, detector.GAIN]
     if scan.is_fly and scan.shutter.exposure_s + scan.shutter.readout_s > 0:
-        questions.append(READOUT)
+        questions.append(shutter.READOUT)
     if scan.shutter.exposure_s > 0:
-        questions.append(EXPOSURE)
+        questions.append(shutter.EXPOSURE)
     answers = _Answers(questions, report)
-    answers.add(check_timing(scan))
-    answers.add(check_angles(scan))
-    saturation = answers.add(check_saturation(scan, counts))
-    if saturation.unit == OVERFLOW:
+    answers.add(timing.check_timing(scan))
+    answers.add(timing.check_angles(scan))
+    saturation = answers.add(detector.check_saturation(scan, counts))
+    if saturation.unit == detector.OVERFLOW:
         return answers.stop()
-    finding, dead = check_dead_pixels(scan)
+    finding, dead = detector.check_dead_pixels(scan)
     if finding.verdict == SUSPICIOUS and saturation.verdict != OK:  # a saturated pixel is as constant as a dead one
         finding = replace(finding, verdict=CANNOT_TELL, text=f"rests on saturation: {saturation.verdict}", advice="")
     answers.add(finding)
     scan = _with_masked(scan, dead)
-    coverage = answers.add(check_coverage(scan))
-    if coverage.unit in (NO_OBJECT, OPAQUE, TOO_BRIGHT):
+    covered = answers.add(coverage.check_coverage(scan))
+    if covered.unit in (coverage.NO_OBJECT, coverage.OPAQUE, coverage.TOO_BRIGHT):
         return answers.stop()
     quick = coarse(scan, QUICK_COLUMNS)
-    consistency = check_consistency(rt, quick, scan)
-    answers.add(consistency.finding)
-    if not consistency.is_sound:
+    consistent = consistency.check_consistency(rt, quick, scan)
+    answers.add(consistent.finding)
+    if not consistent.is_sound:
         return answers.stop()
-    quick = some_frames(quick, consistency.frames)
-    orbit = find_orbit(rt, quick, scan, consistency.sees_angles)
-    answers.add(orbit.sign)
-    answers.add(orbit.centre)
-    quick = orbit.corrected(quick)
+    quick = some_frames(quick, consistent.frames)
+    turn = orbit.find_orbit(rt, quick, scan, consistent.sees_angles)
+    answers.add(turn.sign)
+    answers.add(turn.centre)
+    quick = turn.corrected(quick)
 
     def ask(question: str, check_question: Callable[[Runtime, Scan], Finding], coarse_scan: Scan) -> None:
-        answers.add(check_question(rt, coarse_scan) if consistency.sees_angles else same_from_everywhere(question))
+        answers.add(check_question(rt, coarse_scan) if consistent.sees_angles else same_from_everywhere(question))
 
-    ask(DISTANCES, check_distances, quick)
-    gain = check_gain(rt, quick)
-    if gain.verdict == SUSPICIOUS and coverage.unit == CUT_OFF:  # an object that leaves the panel changes the levels too
+    ask(orbit.DISTANCES, orbit.check_distances, quick)
+    gain = detector.check_gain(rt, quick)
+    if gain.verdict == SUSPICIOUS and covered.unit == coverage.CUT_OFF:  # such an object changes the levels too
         gain = replace(gain, verdict=CANNOT_TELL, text=f"{gain.text}, or the object does beyond the panel")
     answers.add(gain)
-    if READOUT in questions:
-        ask(READOUT, check_readout, orbit.corrected(some_frames(coarse(scan, FINE_COLUMNS), consistency.frames)))
-    if EXPOSURE in questions:
-        ask(EXPOSURE, check_exposure, quick)
-    if orbit.is_reversed or orbit.centre.unit == OTHER_CAUSE:  # the offset's sign or size depends on another correction
+    if shutter.READOUT in questions:
+        fine = some_frames(coarse(scan, FINE_COLUMNS), consistent.frames)
+        ask(shutter.READOUT, shutter.check_readout, turn.corrected(fine))
+    if shutter.EXPOSURE in questions:
+        ask(shutter.EXPOSURE, shutter.check_exposure, quick)
+    if turn.is_reversed or turn.centre.unit == orbit.OTHER_CAUSE:  # the offset depends on another correction
         return CheckResult(answers.findings, is_consistent=False)
     pitch_mm = scan.geometry.pixel_size_mm[1]
-    return CheckResult(answers.findings, orbit.shift.pixels * pitch_mm, orbit.shift.deviation * pitch_mm)
+    return CheckResult(answers.findings, turn.shift.pixels * pitch_mm, turn.shift.deviation * pitch_mm)
 
 
 def _finite(scan: Scan) -> Scan:

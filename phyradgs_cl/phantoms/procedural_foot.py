@@ -9,15 +9,8 @@ from itertools import pairwise
 import numpy as np
 
 from phyradgs_cl.checks import at_least
-from phyradgs_cl.phantoms.implicit import (
-    Capsule,
-    Field,
-    Lattice,
-    Point,
-    capsule_box,
-    capsule_union,
-    texture,
-)
+from phyradgs_cl.phantoms import implicit
+from phyradgs_cl.phantoms.implicit import Capsule, Field, Lattice, Point
 
 Bone = tuple[Capsule, ...]
 
@@ -65,8 +58,8 @@ def foot(grid_shape: int, seed: int) -> Field:
     bones += [_long_bone(base, head, 0.046 * thickness, rng) for base, head, thickness, _ in _RAYS]
     toes = [bone for _, head, thickness, z in _RAYS for bone in _toe(head, thickness, z, rng)]
     lattice = Lattice(int(grid_shape))
-    ripple = np.float32(0.004) * texture(lattice, (0.15, 0.4), 48, rng)
-    grain = texture(lattice, (0.035, 0.09), 160, rng)
+    ripple = np.float32(0.004) * implicit.texture(lattice, (0.15, 0.4), 48, rng)
+    grain = implicit.texture(lattice, (0.035, 0.09), 160, rng)
     # Toes carry less flesh than the rest, so that there is air between them.
     cover = [c.grown(0.06) for bone in bones for c in bone] + [c.grown(0.042) for toe in toes for c in toe]
     volume = _soft_tissue(lattice, cover, ripple, rng)
@@ -109,8 +102,8 @@ def _toe(head: Point, thickness: float, joints: tuple[float, ...], rng: np.rando
 
 def _soft_tissue(lattice: Lattice, cover: list[Capsule], ripple: Field, rng: np.random.Generator) -> Field:
     """Muscle, a layer of fat and the skin, stretched over `cover` and the flesh; air 0."""
-    distance = capsule_union(lattice, [*cover, *_FLESH], _SKIN_BLEND, lattice.everything) + ripple
-    muscle = np.float32(_MUSCLE) + np.float32(0.02) * texture(lattice, (0.12, 0.4), 48, rng)
+    distance = implicit.capsule_union(lattice, [*cover, *_FLESH], _SKIN_BLEND, lattice.everything) + ripple
+    muscle = np.float32(_MUSCLE) + np.float32(0.02) * implicit.texture(lattice, (0.12, 0.4), 48, rng)
     whole = lattice.coverage(distance)
     below_skin = lattice.coverage(distance + np.float32(_SKIN_DEPTH))
     below_fat = lattice.coverage(distance + np.float32(_FAT_DEPTH))
@@ -119,8 +112,8 @@ def _soft_tissue(lattice: Lattice, cover: list[Capsule], ripple: Field, rng: np.
 
 def _add_bone(volume: Field, lattice: Lattice, bone: Bone, ripple: Field, grain: Field) -> None:
     """Replace what is in `volume` by a bone: cortical shell, trabeculae, fatty marrow in the middle."""
-    box = capsule_box(lattice, bone, 0.05)
-    distance = capsule_union(lattice, bone, _JOINT_BLEND, box) + ripple[box]
+    box = implicit.capsule_box(lattice, bone, 0.05)
+    distance = implicit.capsule_union(lattice, bone, _JOINT_BLEND, box) + ripple[box]
     outer = lattice.coverage(distance)
     inner = lattice.coverage(distance + np.float32(_SHELL))
     depth = np.clip((-distance - _SHELL) / 0.05, 0.0, 1.0)

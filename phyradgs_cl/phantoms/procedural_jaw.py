@@ -10,20 +10,8 @@ from itertools import pairwise
 import numpy as np
 
 from phyradgs_cl.checks import at_least
-from phyradgs_cl.phantoms.implicit import (
-    Capsule,
-    Field,
-    Lattice,
-    Point,
-    add_to_union,
-    capsule_box,
-    capsule_distance,
-    capsule_union,
-    ellipsoid_distance,
-    ratio_distance,
-    texture,
-    union_distance,
-)
+from phyradgs_cl.phantoms import implicit
+from phyradgs_cl.phantoms.implicit import Capsule, Field, Lattice, Point
 
 _CORTICAL, _TRABECULAR, _NERVE = 0.85, 0.50, 0.28
 _ENAMEL, _DENTINE, _PULP = 1.0, 0.72, 0.30
@@ -69,7 +57,7 @@ def jaw(grid_shape: int, seed: int) -> Field:
     rng = np.random.default_rng(seed)
     teeth = _teeth(rng)
     lattice = Lattice(int(grid_shape))
-    ripple = np.float32(0.005) * texture(lattice, (0.15, 0.4), 48, rng)
+    ripple = np.float32(0.005) * implicit.texture(lattice, (0.15, 0.4), 48, rng)
     bone = _bone_distance(lattice) + ripple
     volume = _soft_tissue(lattice, bone, teeth, rng)
     _fill_bone(volume, lattice, bone, rng)
@@ -111,7 +99,7 @@ def _arc_distance(lattice: Lattice) -> Field:
     zero = np.zeros((1, 1), dtype=np.float32)
     for (x0, y0), (x1, y1) in pairwise(points):
         piece = Capsule((x0, y0, 0.0), (x1, y1, 0.0), 0.0, 0.0)
-        nearest = np.minimum(nearest, capsule_distance(piece, x, y, zero))
+        nearest = np.minimum(nearest, implicit.capsule_distance(piece, x, y, zero))
     return nearest[None]
 
 
@@ -138,32 +126,34 @@ def _rami() -> list[Capsule]:
 def _bone_distance(lattice: Lattice) -> Field:
     _, _, z = lattice.points(lattice.everything)
     section = (np.float32(_BODY_WIDTH), np.float32(_BODY_HEIGHT))
-    across = _arc_distance(lattice)
+    body = implicit.ratio_distance((_arc_distance(lattice), z - np.float32(_BODY_Z)), section)
     union = np.zeros((lattice.count,) * 3, dtype=np.float32)
-    add_to_union(union, lattice.everything, ratio_distance((across, z - np.float32(_BODY_Z)), section), _BONE_BLEND)
+    implicit.add_to_union(union, lattice.everything, body, _BONE_BLEND)
     front = _arc(0.0)[1]
     chin = Capsule((-0.08, front - 0.02, -0.38), (0.08, front - 0.02, -0.38), 0.10, 0.10)
     for capsule in [chin, *_rami()]:
-        box = capsule_box(lattice, [capsule], 5 * _BONE_BLEND)
-        add_to_union(union, box, capsule_distance(capsule, *lattice.points(box)), _BONE_BLEND)
-    return union_distance(union, _BONE_BLEND)
+        box = implicit.capsule_box(lattice, [capsule], 5 * _BONE_BLEND)
+        distance = implicit.capsule_distance(capsule, *lattice.points(box))
+        implicit.add_to_union(union, box, distance, _BONE_BLEND)
+    return implicit.union_distance(union, _BONE_BLEND)
 
 
 def _soft_tissue(lattice: Lattice, bone: Field, teeth: list[Tooth], rng: np.random.Generator) -> Field:
     """Gums, cheeks and the floor of the mouth with a layer of fat; the airway and the outside are 0."""
     x, y, z = lattice.points(lattice.everything)
     union = np.zeros_like(bone)
-    add_to_union(union, lattice.everything, bone - np.float32(0.075), _FLESH_BLEND)
+    implicit.add_to_union(union, lattice.everything, bone - np.float32(0.075), _FLESH_BLEND)
     for centre, axes in (
         ((0.0, -0.02, -0.28), (0.52, 0.56, 0.22)),  # floor of the mouth
         ((0.0, -0.12, -0.06), (0.30, 0.42, 0.20)),  # tongue
         ((0.0, 0.34, -0.10), (0.50, 0.34, 0.46)),  # throat
     ):
-        add_to_union(union, lattice.everything, ellipsoid_distance(centre, axes, x, y, z), _FLESH_BLEND)
-    distance = union_distance(union, _FLESH_BLEND)
+        distance = implicit.ellipsoid_distance(centre, axes, x, y, z)
+        implicit.add_to_union(union, lattice.everything, distance, _FLESH_BLEND)
+    distance = implicit.union_distance(union, _FLESH_BLEND)
     airway = Capsule((0.0, 0.36, -0.9), (0.0, 0.30, 0.9), 0.10, 0.12)
-    distance = np.maximum(distance, -capsule_distance(airway, x, y, z))
-    muscle = np.float32(_MUSCLE) + np.float32(0.02) * texture(lattice, (0.12, 0.4), 48, rng)
+    distance = np.maximum(distance, -implicit.capsule_distance(airway, x, y, z))
+    muscle = np.float32(_MUSCLE) + np.float32(0.02) * implicit.texture(lattice, (0.12, 0.4), 48, rng)
     whole = lattice.coverage(distance)
     below = lattice.coverage(distance + np.float32(_FAT_DEPTH))
     return _FAT * (whole - below) + muscle * below
@@ -174,7 +164,7 @@ def _fill_bone(volume: Field, lattice: Lattice, distance: Field, rng: np.random.
     _, _, z = lattice.points(lattice.everything)
     outer = lattice.coverage(distance)
     inner = lattice.coverage(distance + np.float32(_SHELL))
-    grain = np.float32(0.11) * texture(lattice, (0.04, 0.10), 160, rng)
+    grain = np.float32(0.11) * implicit.texture(lattice, (0.04, 0.10), 160, rng)
     spongy = np.clip(np.float32(_TRABECULAR) + grain, 0.2, 0.8)
     canal = np.sqrt(_arc_distance(lattice) ** 2 + (z - np.float32(_BODY_Z + 0.075 - 0.15)) ** 2) - 0.022
     inside_canal = lattice.coverage(canal)
@@ -186,15 +176,15 @@ def _add_tooth(volume: Field, lattice: Lattice, tooth: Tooth) -> None:
     middle = _GUM_Z + tooth.height / 2
     roots = _roots(tooth, 0.40 * tooth.depth, 0.016)
     crown = Capsule(_on(tooth, 0.0, middle), _on(tooth, 0.0, middle), tooth.depth, tooth.depth)
-    box = capsule_box(lattice, [*roots, crown], 0.03)
+    box = implicit.capsule_box(lattice, [*roots, crown], 0.03)
     x, y, z = lattice.points(box)
     dx, dy = x - np.float32(tooth.centre[0]), y - np.float32(tooth.centre[1])
     along = dx * tooth.along[0] + dy * tooth.along[1]
     across = dx * tooth.along[1] - dy * tooth.along[0]
     axes = (0.47 * tooth.width, 0.5 * tooth.depth, 0.58 * tooth.height)
-    cap = ratio_distance((along, across, z - np.float32(middle)), axes)
-    root = capsule_union(lattice, roots, 0.008, box)
-    canals = capsule_union(lattice, _roots(tooth, 0.014, 0.006), 0.004, box)
+    cap = implicit.ratio_distance((along, across, z - np.float32(middle)), axes)
+    root = implicit.capsule_union(lattice, roots, 0.008, box)
+    canals = implicit.capsule_union(lattice, _roots(tooth, 0.014, 0.006), 0.004, box)
     pulp = np.minimum(canals, cap + 0.36 * tooth.width)
     enamel, core = lattice.coverage(cap), lattice.coverage(cap + np.float32(_ENAMEL_DEPTH))
     dentine = np.maximum(lattice.coverage(root), core)

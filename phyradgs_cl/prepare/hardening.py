@@ -19,17 +19,8 @@ from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.detector import Spectrum, tube_spectrum
 from phyradgs_cl.detector.spectrum import FILTER_MM, HIGHEST_KVP, LOWEST_KVP
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.prepare.step import (
-    Facts,
-    MakeModel,
-    Model,
-    coarse_model,
-    densest,
-    object_in,
-    smooth,
-    unexplained,
-    unmasked_frames,
-)
+from phyradgs_cl.prepare import step
+from phyradgs_cl.prepare.step import Facts, MakeModel, Model
 
 log = logging.getLogger(__name__)
 
@@ -95,7 +86,7 @@ def correct_hardening(scan: Scan, options: HardeningOptions, make_model: MakeMod
     """Returns the scan with straight line integrals."""
     if options.kvp:
         return _by_voltage(scan, options, make_model)
-    frames, fitted = unmasked_frames(scan), not any(options.polynomial)
+    frames, fitted = step.unmasked_frames(scan), not any(options.polynomial)
     polynomial = fit_polynomial(frames, make_model(scan)) if fitted else options.polynomial
     _check_rising(polynomial, float(frames.max()))
     facts = {"polynomial": list(polynomial), "fitted": fitted}
@@ -113,19 +104,19 @@ def _check_rising(polynomial: Polynomial, largest: float) -> None:
 
 def _by_voltage(scan: Scan, options: HardeningOptions, make_model: MakeModel) -> tuple[Scan, Facts]:
     tube = (options.kvp, options.filter_mm, options.anode_deg)
-    frames = unmasked_frames(scan)
+    frames = step.unmasked_frames(scan)
     spectrum, water = tube_spectrum(*tube), water_polynomial(*tube)
     facts: Facts = {"kvp": options.kvp}
     bone_in = partial(_from, options.bone_per_mm)
     if not options.bone_per_mm:
-        model, blur = coarse_model(scan, make_model)
-        mixed, facts["unexplained"] = find_bone(smooth(frames, blur), spectrum, water, model)
+        model, blur = step.coarse_model(scan, make_model)
+        mixed, facts["unexplained"] = find_bone(step.smooth(frames, blur), spectrum, water, model)
         if mixed is None:
             log.warning("hardening: no correction at %g kV explains the frames better: they stay as they are", options.kvp)
             return scan, {**facts, "left_alone": True}
         bone_in = partial(_between, *mixed)
         facts |= dict(zip(("soft_to", "bone_from"), mixed, strict=True)) if np.isfinite(mixed[0]) else {}
-    fine = coarse_model(scan, make_model, _BONE_VOXELS)
+    fine = step.coarse_model(scan, make_model, _BONE_VOXELS)
     clean, facts["bone_share"] = _straighten_two(frames, spectrum, *fine, water, bone_in)
     return replace(scan, projections=clean), facts
 
@@ -137,7 +128,7 @@ def _straighten_two(
     Without bone in the volume they are corrected for water. blur: of frames for the model, in pixels."""
     clean, share = straighten(frames, water), 0.0
     for _ in range(_PASSES):
-        volume = model.regularised(smooth(clean, blur))
+        volume = model.regularised(step.smooth(clean, blur))
         bone = bone_in(volume)
         if not bone.any():
             break
@@ -155,13 +146,13 @@ def find_bone(
     correction is best), and the unexplained rest of each alternative. Raises InputError where there is no object."""
 
     def rest_of(clean: np.ndarray) -> float:
-        return unexplained(clean, model.volume(clean), inside, model)
+        return step.unexplained(clean, model.volume(clean), inside, model)
 
     clean = straighten(frames, water)
     first = model.volume(clean)
-    if densest(first) <= 0:
+    if step.densest(first) <= 0:
         raise _no_object()
-    inside = object_in(first)
+    inside = step.object_in(first)
     uncorrected, water_alone = rest_of(frames), rest_of(clean)
     volume = model.regularised(clean)
     bones = {pair: _between(*pair, volume) for pair in _BETWEEN}
@@ -183,10 +174,10 @@ def _with_bone(bone: np.ndarray, frames: np.ndarray, spectrum: Spectrum, model: 
 
 def _soft_beside(dense: np.ndarray, frames: np.ndarray, spectrum: Spectrum) -> np.ndarray:
     """Solves for the soft tissue that, with ``dense`` line integrals of bone, gives the measured ones (Newton's method)."""
-    soft, step = np.asarray(frames - dense, np.float64), 1e-3
+    soft, small = np.asarray(frames - dense, np.float64), 1e-3
     for _ in range(_NEWTON):
         now = spectrum.hardened(soft, dense)
-        soft = soft - step * (now - frames) / (spectrum.hardened(soft + step, dense) - now)
+        soft = soft - small * (now - frames) / (spectrum.hardened(soft + small, dense) - now)
     return soft
 
 
@@ -234,5 +225,5 @@ def _between(soft_to: float, bone_from: float, volume: np.ndarray) -> np.ndarray
     fractions of the densest voxel, which the correction makes denser."""
     if soft_to >= bone_from:
         return np.zeros_like(volume)
-    soft, bone = soft_to * densest(volume), bone_from * densest(volume)
+    soft, bone = soft_to * step.densest(volume), bone_from * step.densest(volume)
     return np.clip((volume - soft) * (bone / (bone - soft)), 0, np.maximum(volume, 0))

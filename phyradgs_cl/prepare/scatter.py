@@ -16,17 +16,9 @@ import scipy
 
 from phyradgs_cl import checks
 from phyradgs_cl.acquisition import Scan
+from phyradgs_cl.prepare import step
 from phyradgs_cl.prepare.light import enough_air, with_air_at_0
-from phyradgs_cl.prepare.step import (
-    Facts,
-    MakeModel,
-    Model,
-    coarse_model,
-    object_in,
-    smooth,
-    unexplained,
-    unmasked_frames,
-)
+from phyradgs_cl.prepare.step import Facts, MakeModel, Model
 
 Kernel = Mapping[tuple[float, int], float]
 """{(standard deviation as a fraction of the panel's longer side, power of the line integral): height}"""
@@ -57,13 +49,14 @@ class ScatterOptions:
 
 def subtract_scatter(scan: Scan, options: ScatterOptions, make_model: MakeModel) -> tuple[Scan, Facts]:
     """Returns the scan without scatter."""
-    frames = unmasked_frames(scan)
+    frames = step.unmasked_frames(scan)
     if options.to_primary > 0:
         reach = options.reach or _USUAL_REACH
         kernel: Kernel = {(reach, 1): _height_for(frames, options.to_primary, reach)}
     else:
         air = enough_air(frames, 0.05, 0.01, "scatter", "state scatter.to_primary")
-        kernel = raised(fit_scatter(frames, air, options.reach), frames, air, *coarse_model(scan, make_model))
+        fitted = fit_scatter(frames, air, options.reach)
+        kernel = raised(fitted, frames, air, *step.coarse_model(scan, make_model))
     clean = remove_scatter(frames, kernel)
     terms = {"reach": [reach for reach, _ in kernel], "power": [power for _, power in kernel]}
     facts = {**terms, "height": list(kernel.values()), "to_primary": _ratio(frames, clean)}
@@ -99,12 +92,12 @@ def raised(kernel: Kernel, frames: np.ndarray, air: np.ndarray, model: Model, bl
     frames: line integrals (F, v, u), blurred by ``blur`` pixels for the model; each frame's ``air`` is shifted to 0."""
     if not kernel:
         return kernel
-    coarse = smooth(frames, blur)
-    inside = object_in(model.volume(coarse))
+    coarse = step.smooth(frames, blur)
+    inside = step.object_in(model.volume(coarse))
 
     def rest(height: float) -> float:
         clean = with_air_at_0(remove_scatter(coarse, times(height)), air)[0]
-        return unexplained(clean, model.volume(clean), inside, model)
+        return step.unexplained(clean, model.volume(clean), inside, model)
 
     def times(height: float) -> Kernel:
         return {term: height * value for term, value in kernel.items()}

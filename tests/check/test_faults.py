@@ -93,10 +93,9 @@ def test_both_senses_are_looked_at_where_few_iterations_do_not_tell(rt, clean, m
     monkeypatch.setattr(consistency, "reversed_rotation", lambda scan: other)
     monkeypatch.setattr(consistency, "shifted", lambda scan, pixels: (scan, pixels))
     first = {id(clean): 1.1, id(other): 1.0}
-    monkeypatch.setattr(
-        consistency, "rough_axis_shift", lambda rt, scan: AxisShift(2.0, np.nan, np.array([first[id(scan)]]))
-    )
-    monkeypatch.setattr(consistency, "refined_axis_shift", lambda rt, scan, rough: AxisShift(2.5, 0.1, rough.squares))
+    rough = lambda rt, scan: AxisShift(2.0, np.nan, np.array([first[id(scan)]]))  # noqa: E731
+    monkeypatch.setattr(consistency.axis, "rough_shift", rough)
+    monkeypatch.setattr(consistency.axis, "refined_shift", lambda rt, scan, rough: AxisShift(2.5, 0.1, rough.squares))
     left = {id(clean): 0.1, id(other): 0.6}
     monkeypatch.setattr(
         consistency, "fit_squares", lambda rt, way: np.array([left[id(way[0])] if isinstance(way, tuple) else 2.0])

@@ -30,7 +30,7 @@ class AxisShift:
         return math.isfinite(self.pixels)
 
 
-def rough_axis_shift(rt: Runtime, scan: Scan) -> AxisShift:
+def rough_shift(rt: Runtime, scan: Scan) -> AxisShift:
     """Returns the best of five shifts, one coarse pixel apart, after a few iterations; without a deviation (NaN)."""
     block = columns_per_block(scan)
     trials = [fit_squares(rt, shifted(scan, block * shift), _ROUGH_ITERATIONS) for shift in _ROUGH_SHIFTS]
@@ -38,7 +38,7 @@ def rough_axis_shift(rt: Runtime, scan: Scan) -> AxisShift:
     return AxisShift(block * _ROUGH_SHIFTS[best], math.nan, trials[best])
 
 
-def refined_axis_shift(rt: Runtime, scan: Scan, rough: AxisShift) -> AxisShift:
+def refined_shift(rt: Runtime, scan: Scan, rough: AxisShift) -> AxisShift:
     """Returns the shift near ``rough`` with the least residual, from a parabola through three neighbouring shifts."""
     block = columns_per_block(scan)
     centre = rough.pixels / block
@@ -62,7 +62,7 @@ def refined_axis_shift(rt: Runtime, scan: Scan, rough: AxisShift) -> AxisShift:
 
 def axis_shift(rt: Runtime, scan: Scan) -> AxisShift:
     """Returns the panel's shift under which a coarse scan fits best, within a few coarse pixels of the stated one."""
-    return refined_axis_shift(rt, scan, rough_axis_shift(rt, scan))
+    return refined_shift(rt, scan, rough_shift(rt, scan))
 
 
 def with_best_shift(rt: Runtime, scan: Scan) -> Scan:
