@@ -1,7 +1,6 @@
 """The parts that all figures share, of notebooks, reports and the documentation: colours, axes, curves, images.
 
-matplotlib is imported when something is drawn.
-"""
+matplotlib is imported when something is drawn."""
 
 import importlib
 import math
@@ -68,8 +67,7 @@ def draw_image(
 ) -> None:
     """Draws an image (rows, columns), row 0 at the bottom, with a colour bar.
 
-    size_mm: height and width, for a scale bar. how: further arguments of ``imshow``.
-    """
+    size_mm: height and width, for a scale bar. how: further arguments of ``imshow``."""
     rows, columns = image.shape
     height, width = (rows, columns) if size_mm is None else size_mm
     drawn = axes.imshow(image, origin="lower", extent=(0, width, 0, height), **how)

@@ -1,7 +1,6 @@
 """The package's exceptions. Each message is one line: subject, found value, expected value, remedy.
 
-Scripts distinguish exit statuses (docs/trouble.md). Status 1 is Python's own, for a defect of this program.
-"""
+Scripts distinguish exit statuses (docs/trouble.md). Status 1 is Python's own, for a defect of this program."""
 
 import re
 from collections.abc import Iterator
@@ -17,8 +16,7 @@ class PhyradgsError(Exception):
     """Base of every error that this package raises on purpose.
 
     subject: an option, a file with its HDF5 path, a device. found: the wrong value or state. expected: a right one.
-    remedy: an imperative. ``exit_code``: the command line's exit status.
-    """
+    remedy: an imperative. ``exit_code``: the command line's exit status."""
 
     exit_code = 2
 

@@ -1,8 +1,7 @@
 """Time and memory of a reconstruction, from a few iterations of it.
 
 Two short runs of different length give the time per iteration and the time of everything else. A cloud of Gaussians grows
-under density control, so its short runs go through the whole schedule in fewer iterations.
-"""
+under density control, so its short runs go through the whole schedule in fewer iterations."""
 
 import resource
 import sys
@@ -32,8 +31,7 @@ class Estimate:
     """seconds, host_bytes and device_bytes of a whole run; the iterations and seconds that the trials took.
 
     around_s: the part of ``seconds`` outside the method: reading, comparing, writing. host_bytes: the process's largest
-    resident memory, with its buffers on a CPU device. device_bytes: the most memory in buffers at one time.
-    """
+    resident memory, with its buffers on a CPU device. device_bytes: the most memory in buffers at one time."""
 
     seconds: float
     host_bytes: int
@@ -64,8 +62,7 @@ def estimate(
     """Returns the time and memory of a plan, from short runs of it; a method without iterations runs once as a whole.
 
     ``around`` returns the seconds that a run spends outside the method, from a result of it. The first trial builds the
-    kernels, as the run will.
-    """
+    kernels, as the run will."""
     started = time.perf_counter()
     trials, total = _Trials(scan, plan, rt), getattr(plan.options, "iterations", None)
     few, more = _SPLAT_TRIALS if isinstance(plan.options, SplatOptions) else _TRIALS

@@ -70,8 +70,7 @@ class Ticker:
     def show(self, done: int, total: int, more: str = "", share: float | None = None) -> None:
         """Shows ``done`` of ``total`` and ``more``, unless the last line is too recent.
 
-        share: the fraction of the work that is done, where the counted things differ in length.
-        """
+        share: the fraction of the work that is done, where the counted things differ in length."""
         now = time.monotonic()
         if share is None:
             share = done / total if total else 0.0

@@ -80,8 +80,7 @@ class Settings:
 def read_settings(
     config: Path | None, given: Mapping[str, object], assignments: Sequence[str] = ()
 ) -> Settings:
-    """Reads a configuration file. ``assignments`` NAME=VALUE win over it, and options ``given`` (not None) win over both.
-    """
+    """Reads a configuration file. ``assignments`` NAME=VALUE win over it, and options ``given`` (not None) win over both."""
     values = read_config(config)
     origins = {key: f"config {config}: {key}" for key in values}
     for text in assignments:

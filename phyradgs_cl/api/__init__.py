@@ -3,8 +3,7 @@
     scan = simulate("foot", size=32)
     result = reconstruct(scan, method="phyradgs", iterations=500)
 
-Everything is documented with runnable examples in docs/api.md. ``device`` is what ``--device`` takes, or a Runtime.
-"""
+Everything is documented with runnable examples in docs/api.md. ``device`` is what ``--device`` takes, or a Runtime."""
 
 from phyradgs_cl.acquisition import (
     CircularOrbit,

@@ -32,8 +32,7 @@ def _runtime_by_name(name: str | None) -> Runtime:
 def to_operator_array(rt: Runtime, name: str, values: Any, shape: Sequence[int | None]) -> Values:
     """Returns a user's array as float32 in C order, on the host or the device where it is; copied only if it must be.
 
-    Raises InputError about ``name`` for anything but an array of numbers, and for another shape.
-    """
+    Raises InputError about ``name`` for anything but an array of numbers, and for another shape."""
     array = adopted(name, values, rt.queue) if is_cl_array(values) else on_host(name, values)
     checks.shape(name, array, shape)  # type: ignore[arg-type]
     return array

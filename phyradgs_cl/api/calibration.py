@@ -24,13 +24,8 @@ _STEP_PX = 0.25  # at the image's edge: a smaller step is lost in voxels, a larg
 
 @naming_arguments()
 def calibrate(
-    scan: Scan,
-    what: str | None = None,
-    *,
-    others: Sequence[Scan] = (),
-    phantom: str | Path | None = None,
-    splines: int = 0,
-    device: Device = None,
+    scan: Scan, what: str | None = None, *, others: Sequence[Scan] = (), phantom: str | Path | None = None,
+    splines: int = 0, device: Device = None,
 ) -> Calibration:
     """Estimates geometry and timing from the frames (docs/calibrate.md). Values that frames cannot show stay as stated.
 
@@ -47,8 +42,7 @@ def calibrate(
     ``per_view()``, the corrections of every view by name and unit (F,); and ``plot()``, a figure of all that.
 
     Raises InputError for unknown names, the timing of a gantry that stops, and fewer than 8 frames or 12 columns; also for
-    other scans that do not fit the first, and a phantom that the frames do not show.
-    """
+    other scans that do not fit the first, and a phantom that the frames do not show."""
     check_scan(scan)
     scan.check_timing()
     if not (what is None or isinstance(what, str)):
@@ -70,8 +64,7 @@ def move_views(scan: Scan, views: np.ndarray, *, without_gauges: bool = False) -
     ``views`` that a turned or shifted object explains as well (docs/calibrate.md). A file has one pose at a time: where
     frames overlap in time, ``save_scan`` refuses the result.
 
-    Raises InputError for anything but a Scan, and for other shapes.
-    """
+    Raises InputError for anything but a Scan, and for other shapes."""
     check_scan(scan)
     checks.numbers("views", views, (scan.frames, 3))
     numbers = np.asarray(views, np.float64)
@@ -82,11 +75,7 @@ def move_views(scan: Scan, views: np.ndarray, *, without_gauges: bool = False) -
 
 @naming_arguments()
 def pose_gradient(
-    scan: Scan,
-    x: Gaussians | np.ndarray,
-    by_frames: np.ndarray,
-    motion: str | Motion | None = None,
-    *,
+    scan: Scan, x: Gaussians | np.ndarray, by_frames: np.ndarray, motion: str | Motion | None = None, *,
     device: Device = None,
 ) -> np.ndarray:
     """Returns dL/dviews (F, 3) float64 for ``move_views``, per rad and mm, from dL/dframes (F, rows, columns).
@@ -96,8 +85,7 @@ def pose_gradient(
     less those of the scan; line integrals are averaged, whatever the detector. motion: that of ``splat_operator`` or
     ``ray_operator``, with their defaults. device: what ``--device`` takes, or a Runtime. After Choi et al. 2026.
 
-    Raises InputError as the operators do.
-    """
+    Raises InputError as the operators do."""
     check_scan(scan)
     pitch_mm = np.array(scan.geometry.pixel_size_mm)
     checks.numbers("by_frames", by_frames, scan.projections.shape)

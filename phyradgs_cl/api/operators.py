@@ -32,19 +32,13 @@ class Operator:
     Runtime; domain and range_ are (name, shape); at maps x to (y, the function from dL/dy to dL/dx); frames and intensity
     make the operators of some frames and of averaged photons, where they exist.
 
-    Raises InputError, before anything is computed, for arrays of another shape, type or device.
-    """
+    Raises InputError, before anything is computed, for arrays of another shape, type or device."""
 
     _instead = "vjp has the derivative"
 
     def __init__(
-        self,
-        rt: Runtime,
-        domain: tuple[str, Shape],
-        range_: tuple[str, Shape],
-        at: "Callable[[Values], tuple[Values, Map]]",
-        *,
-        frames: Callable[[list[int]], Any] | None = None,
+        self, rt: Runtime, domain: tuple[str, Shape], range_: tuple[str, Shape],
+        at: "Callable[[Values], tuple[Values, Map]]", *, frames: Callable[[list[int]], Any] | None = None,
         intensity: "Callable[[], Operator] | None" = None,
     ) -> None:
         self.rt = rt
@@ -112,8 +106,7 @@ class Operator:
     def frames(self, chosen: Sequence[int]) -> Any:
         """Returns the operator of some of the frames, by their numbers from 0 and in this order; it shares all memory.
 
-        Raises InputError for numbers of missing frames, for no number, and for an operator without frames.
-        """
+        Raises InputError for numbers of missing frames, for no number, and for an operator without frames."""
         if self._frames is None:
             raise InputError("frames", repr(self), "an operator from something to frames")
         count = self._range[1][0] or 0
@@ -127,8 +120,7 @@ class Operator:
         """The operator of a detector that averages photons over an exposure: −ln Σ w exp(−p) over a line's times.
 
         Without it a line is Σ w p. ``T`` of the result is the transpose of the derivative at its last x. Raises InputError
-        where it does not exist (transposes, voxels).
-        """
+        where it does not exist (transposes, voxels)."""
         if self._intensity is None:
             raise InputError("intensity", repr(self), "an operator from something to line integrals")
         return self._intensity()
@@ -157,16 +149,10 @@ class LinearOperator(Operator, ScipyOperator):
     float32, in C order: ``scipy.sparse.linalg.lsqr(A, y.ravel())``, ``A @ x.ravel()``, ``A.T @ A``.
 
     rt, domain, range_, parts: those of ``Operator``. forward, adjoint: the two functions of values. Raises InputError as
-    ``Operator`` does.
-    """
+    ``Operator`` does."""
 
     def __init__(
-        self,
-        rt: Runtime,
-        domain: tuple[str, Shape],
-        range_: tuple[str, Shape],
-        forward: Map,
-        adjoint: Map,
+        self, rt: Runtime, domain: tuple[str, Shape], range_: tuple[str, Shape], forward: Map, adjoint: Map,
         **parts: Any,
     ) -> None:
         Operator.__init__(self, rt, domain, range_, lambda x: (forward(x), adjoint), **parts)
@@ -200,8 +186,7 @@ def as_torch(operator: Operator) -> Callable[..., Any]:
     on the operator's device; float32 tensors on the host are not copied, by DLPack. Linear operators can be differentiated
     any number of times, others once, and ``backward`` renders nothing again.
 
-    Raises InputError where PyTorch is not installed, for anything but an operator or a tensor, and as the operator does.
-    """
+    Raises InputError where PyTorch is not installed, for anything but an operator or a tensor, and as the operator does."""
     torch: Any = checks.package("torch", "for as_torch", "torch")
     if not isinstance(operator, Operator):
         expected = "what ray_operator, splat_operator or voxel_operator gives"

@@ -51,8 +51,7 @@ def ray_operator(
     is the scan's grid. device: what ``--device`` takes, or a Runtime. ``intensity`` of the result is for detectors that
     average photons. Joseph, IEEE Trans. Med. Imaging 1 (1982) 192.
 
-    Raises InputError for anything but a Scan or a Grid, and for an unknown motion or one that moves within a cell.
-    """
+    Raises InputError for anything but a Scan or a Grid, and for an unknown motion or one that moves within a cell."""
     model, voxels = _checked(scan, motion, motions_for(RAYS)), scan.grid if grid is None else _a_grid(grid)
     rt = runtime_of(device)
     tables = [model.cells(scan, frame).still() for frame in range(scan.frames)]
@@ -94,13 +93,8 @@ def _in_new_memory(rt: Runtime, function: Callable[..., Any], values: Values, sh
 
 @naming_arguments()
 def splat_operator(
-    scan: Scan,
-    motion: str | Motion = "exact",
-    *,
-    affine: bool = False,
-    cutoff_sigma: float = DEFAULT_CUTOFF_SIGMA,
-    pixel_footprint: bool = False,
-    device: Device = None,
+    scan: Scan, motion: str | Motion = "exact", *, affine: bool = False,
+    cutoff_sigma: float = DEFAULT_CUTOFF_SIGMA, pixel_footprint: bool = False, device: Device = None,
 ) -> "SplatProjection":
     """Returns a scan's projector Φ (PhyRadGS, Eq. 3): ``Gaussians`` or rows (11, G) to frames (F, rows, columns).
 
@@ -109,8 +103,7 @@ def splat_operator(
     which a Gaussian ends; 0 never cuts. pixel_footprint: average over the area of a pixel. device: what ``--device``
     takes, or a Runtime. ``of_densities(gaussians)`` of the result is its linear part: densities (G,) to frames.
 
-    Raises InputError for anything but a Scan, for an unknown motion, and for a cutoff out of range.
-    """
+    Raises InputError for anything but a Scan, for an unknown motion, and for a cutoff out of range."""
     model = _checked(scan, motion, motions_for(RAYS, SPLATS))
     if isinstance(model, PerRow):  # splats have one weight for all lines of a cell
         model = OwnTimes(model.sub_intervals)
@@ -192,10 +185,7 @@ class SplatProjection(GaussianOperator):
 
 def _densities(rt: Runtime, engine: DensityOperator, count: int, frames_shape: Shape) -> LinearOperator:
     return LinearOperator(
-        rt,
-        (_DENSITY, (count,)),
-        (_FRAMES, frames_shape),
-        partial(computed, rt, True, engine.forward),
+        rt, (_DENSITY, (count,)), (_FRAMES, frames_shape), partial(computed, rt, True, engine.forward),
         partial(computed, rt, True, engine.adjoint),
         frames=lambda few: _densities(rt, engine.subset(few), count, (len(few), *frames_shape[1:])),
     )
@@ -208,8 +198,7 @@ def voxel_operator(grid: Grid, *, cutoff_sigma: float = DEFAULT_CUTOFF_SIGMA, de
     The field is evaluated at the voxels' centres in mm, and the device holds the whole volume. cutoff_sigma, device: those
     of ``splat_operator``.
 
-    Raises InputError for anything but a Grid, and for a cutoff out of range.
-    """
+    Raises InputError for anything but a Grid, and for a cutoff out of range."""
     _check_cutoff(cutoff_sigma)
     engine = VoxelOperator(runtime_of(device), _a_grid(grid), cutoff_sigma=cutoff_sigma)
     return GaussianOperator(engine, (_VOLUME, grid.shape))
@@ -225,8 +214,7 @@ def voxelise(
     radius at which a Gaussian ends; 0 never cuts. device: what ``--device`` takes, or a Runtime. ``voxel_operator`` also
     has the gradient.
 
-    Raises InputError for anything but a cloud and a Grid, and for a cutoff out of range.
-    """
+    Raises InputError for anything but a cloud and a Grid, and for a cutoff out of range."""
     _check_cutoff(cutoff_sigma)
     length_mm = _a_grid(grid).half_longest_mm  # float32 kernels are most accurate for lengths near 1
     if not isinstance(gaussians, Gaussians):
@@ -242,8 +230,7 @@ def initial_gaussians(scan: Scan, count: int = 0, *, seed: int = 0, device: Devi
     count: their number; 0 derives it from the scan's grid, and there are fewer where too few voxels attenuate. seed: of
     the draw. The result has mean and scale (G, 3). device: what ``--device`` takes, or a Runtime.
 
-    Raises InputError for anything but a Scan, and for a count or a seed below 0.
-    """
+    Raises InputError for anything but a Scan, and for a count or a seed below 0."""
     check_scan(scan)
     checks.whole("count (0 chooses it from the grid)", count, 0, 100_000_000)
     checks.whole("seed", seed, 0, 2**63)

@@ -44,8 +44,7 @@ def load_scan(path: str | Path, flats: str = "mean") -> Scan:
     """Reads a scan file (docs/formats.md): line integrals (F, rows, columns), lengths in mm, times in s.
 
     path: the HDF5 file. flats: how flat fields correct a frame, by their ``mean``, by ``time`` or by ``pca``
-    (docs/prepare.md). Raises InputError, which names the HDF5 path of the wrong value.
-    """
+    (docs/prepare.md). Raises InputError, which names the HDF5 path of the wrong value."""
     scan = read_scan(_checked_path(path), flat_correction(flats))
     return scan if flats == "mean" else replace(scan, provenance={**scan.provenance, "flats": flats})
 
@@ -55,8 +54,7 @@ def save_scan(path: str | Path, scan: Scan) -> None:
 
     path: the HDF5 file; an existing one is replaced. scan: a trajectory of a class of yours is sampled into a table of
     poses. Raises InputError for anything but a Scan, and for a scan that the format cannot express; OutputError where
-    nothing can be written.
-    """
+    nothing can be written."""
     check_scan(scan)
     write_scan(_checked_path(path), scan)
 
@@ -66,8 +64,7 @@ def load_volume(path: str | Path) -> Reconstruction:
 
     A disagreement is in 1/mm, where the method has one; only an interrupted run has a state.
     path: the HDF5 file, or a file of ``phyradgs export`` (docs/export.md), which has a volume and a grid only. Raises
-    InputError, which names the HDF5 path of the wrong value.
-    """
+    InputError, which names the HDF5 path of the wrong value."""
     file = _checked_path(path)
     if foreign_volume(file) is not None:
         volume = load_voxels(file)
@@ -91,8 +88,7 @@ def save_volume(
     and .npz of the Gaussians) writes that format, which holds the volume or the Gaussians only. result: what
     ``reconstruct`` returns; the file of an interrupted run can be resumed. metrics: the result of ``compare``, stored too.
     Raises InputError for anything but a result, and for a suffix that cannot be written; OutputError where nothing can be
-    written.
-    """
+    written."""
     if not isinstance(result, Reconstruction):
         remedy = "for an array, Reconstruction(volume, grid)"
         raise InputError("result", checks.short_repr(result), "a Reconstruction", remedy)
@@ -112,17 +108,9 @@ def save_volume(
 
 @naming_arguments()
 def simulate(
-    phantom: str | Path = "foot",
-    *,
-    scanner: str = "r2",
-    protocol: str = "rapid",
-    size: int = 64,
-    detector: int | None = None,
-    detector_offset_mm: tuple[float, float] | None = None,
-    truncation: float = 0.0,
-    pixel_samples: int = 1,
-    device: Device = None,
-    **options: Any,
+    phantom: str | Path = "foot", *, scanner: str = "r2", protocol: str = "rapid", size: int = 64,
+    detector: int | None = None, detector_offset_mm: tuple[float, float] | None = None,
+    truncation: float = 0.0, pixel_samples: int = 1, device: Device = None, **options: Any,
 ) -> Scan:
     """Simulates a fly-scan of a phantom, or a stop-and-shoot scan with ``protocol="static"``; its truth is the reference.
 
@@ -134,8 +122,7 @@ def simulate(
     Runtime. options: those of ``phyradgs simulate`` with underscores (views, exposure_deg, readout_ratio, start_deg, pulse,
     readout_axis, noise, dose, detector_model, peak, lag, jitter_deg, seed …).
 
-    Raises InputError for unknown names and for values out of range.
-    """
+    Raises InputError for unknown names and for values out of range."""
     if not isinstance(phantom, str | Path):
         expected = "a name, or the path of a volume file"
         raise InputError("phantom", checks.short_repr(phantom), expected, "save_volume writes one")
@@ -165,8 +152,7 @@ def prepare(scan: Scan, steps: str = DEFAULT_STEPS, *, device: Device = None, **
     steps: the steps of docs/prepare.md, names with commas. device: what ``--device`` takes, or a Runtime. options: tables
     of options of a step (``rings={"window": 11}``), and the other options of preprocessing. The scan's provenance lists the
     facts of each step under ``prepared``. Raises InputError for an unknown step or option, and for a scan that does not
-    show what a step looks for.
-    """
+    show what a step looks for."""
     check_scan(scan)
     before = preprocessing_of({"steps": steps, **options})
     before.check_written()
@@ -175,17 +161,10 @@ def prepare(scan: Scan, steps: str = DEFAULT_STEPS, *, device: Device = None, **
 
 @naming_arguments()
 def reconstruct(
-    scan: Scan,
-    method: "str | Callable[..., Reconstruction | np.ndarray]" = DEFAULT_METHOD,
-    *,
-    preset: str | None = None,
-    grid: Grid | None = None,
-    seed: int = 0,
-    report: "ProgressReport | bool" = True,
-    resume: Reconstruction | None = None,
-    initial: "Reconstruction | np.ndarray | None" = None,
-    on_interrupt: str = "raise",
-    device: Device = None,
+    scan: Scan, method: "str | Callable[..., Reconstruction | np.ndarray]" = DEFAULT_METHOD, *,
+    preset: str | None = None, grid: Grid | None = None, seed: int = 0,
+    report: "ProgressReport | bool" = True, resume: Reconstruction | None = None,
+    initial: "Reconstruction | np.ndarray | None" = None, on_interrupt: str = "raise", device: Device = None,
     **options: Any,
 ) -> Reconstruction:
     """Reconstructs the volume (nz, ny, nx) of a scan in 1/mm, and with splats the Gaussians in mm.
@@ -214,8 +193,7 @@ def reconstruct(
     Raises:
         InputError: options that the method does not have, or anything but a scan, method, grid or partial result.
         NumericalError: numbers overflow.
-        KeyboardInterrupt: see ``on_interrupt``.
-    """
+        KeyboardInterrupt: see ``on_interrupt``."""
     _check_reconstruct(scan, grid, report, on_interrupt)
     scan.check_timing()
     scan = scan if grid is None else scan.on_grid(grid)

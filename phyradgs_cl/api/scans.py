@@ -33,24 +33,12 @@ _CLEAR_STEP_DEG = 90.0  # from frame to frame: below, angles say which way the g
 
 
 def fly_scan(
-    frames: "ArrayLike",
-    geometry: ConeGeometry,
-    angles_deg: "ArrayLike",
-    *,
-    exposure_deg: float | None = None,
-    readout_ratio: float | None = None,
-    readout: str | None = None,
-    readout_direction: int | None = None,
-    exposure_s: float | None = None,
-    first: str | None = None,
-    fps: float | None = None,
-    readout_ms: float | None = None,
-    flats: "ArrayLike | None" = None,
-    darks: "ArrayLike | None" = None,
-    mask: "ArrayLike | None" = None,
-    quantity: str | None = None,
-    grid: Grid | None = None,
-    **others: Any,
+    frames: "ArrayLike", geometry: ConeGeometry, angles_deg: "ArrayLike", *,
+    exposure_deg: float | None = None, readout_ratio: float | None = None, readout: str | None = None,
+    readout_direction: int | None = None, exposure_s: float | None = None, first: str | None = None,
+    fps: float | None = None, readout_ms: float | None = None, flats: "ArrayLike | None" = None,
+    darks: "ArrayLike | None" = None, mask: "ArrayLike | None" = None, quantity: str | None = None,
+    grid: Grid | None = None, **others: Any,
 ) -> Scan:
     """Returns a scan whose gantry never stops, from arrays.
 
@@ -72,8 +60,7 @@ def fly_scan(
     others: ``detector_model`` ("log", "intensity"), ``reference`` (z, y, x) in 1/mm, ``title``, ``lag``, as in ``Scan``.
 
     Raises InputError for shapes that do not fit, numbers out of range or implausible, contradictory arguments, and angles
-    whose sense differs from the exposure's.
-    """
+    whose sense differs from the exposure's."""
     check_others(others, _keywords(fly_scan))
     axis, direction = readout_order(first, readout, readout_direction, lambda name: _ARGUMENTS.get(name, name))
     readout, readout_direction = axis or "rows", 1 if direction is None else direction
@@ -114,24 +101,16 @@ def _warn_of_exposure(steps: np.ndarray) -> None:
 
 
 def static_scan(
-    frames: "ArrayLike",
-    geometry: ConeGeometry,
-    angles_deg: "ArrayLike",
-    *,
-    flats: "ArrayLike | None" = None,
-    darks: "ArrayLike | None" = None,
-    mask: "ArrayLike | None" = None,
-    quantity: str | None = None,
-    grid: Grid | None = None,
-    **others: Any,
+    frames: "ArrayLike", geometry: ConeGeometry, angles_deg: "ArrayLike", *, flats: "ArrayLike | None" = None,
+    darks: "ArrayLike | None" = None, mask: "ArrayLike | None" = None, quantity: str | None = None,
+    grid: Grid | None = None, **others: Any,
 ) -> Scan:
     """Returns a scan whose gantry stops for every frame, from arrays.
 
     frames: (F, rows, columns), row 0 the lowest. geometry: distances and pixels in mm. angles_deg: (F,) the gantry's angle
     from +x, counterclockwise seen from above. flats, darks, mask, quantity, grid, others: those of ``fly_scan``.
 
-    Raises InputError for shapes that do not fit and numbers out of range.
-    """
+    Raises InputError for shapes that do not fit and numbers out of range."""
     check_others(others, _keywords(static_scan))
     pixels = _pixels(frames, geometry, flats, darks, mask, quantity)
     angle_deg = checks.numbers("angles_deg", angles_deg, (len(pixels.values),))
@@ -154,12 +133,8 @@ def _keywords(function: Callable[..., Scan]) -> list[str]:
 
 
 def _pixels(
-    frames: "ArrayLike",
-    geometry: object,
-    flats: "ArrayLike | None",
-    darks: "ArrayLike | None",
-    mask: "ArrayLike | None",
-    quantity: str | None,
+    frames: "ArrayLike", geometry: object, flats: "ArrayLike | None", darks: "ArrayLike | None",
+    mask: "ArrayLike | None", quantity: str | None,
 ) -> LineIntegrals:
     """Returns frames of any quantity as line integrals, with the mask of unusable pixels."""
     if not isinstance(geometry, ConeGeometry):

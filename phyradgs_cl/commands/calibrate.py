@@ -47,14 +47,12 @@ def calibrate_command(
     phantom: Annotated[Path | None, file_option(_PHANTOM, "--phantom", default=False)] = None,
     splines: Annotated[int, option(_SPLINES, "0: every view by itself", metavar="N")] = 0,
     picture: Annotated[Path | None, file_option(_PICTURE, "--picture", default="OUTPUT with .png")] = None,
-    as_json: AsJson = False,
-    device: Device = None,
+    as_json: AsJson = False, device: Device = None,
 ) -> None:
     """Estimate a scan's true geometry and timing from its own frames, with standard deviations.
 
     Corrects the parameters that differ from the stated ones by three deviations. Parameters that the frames do not
-    determine stay as stated.
-    """
+    determine stay as stated."""
     wish = device_wish(device)
     picture = picture or (output and output.with_suffix(".png"))
     if output is not None:

@@ -35,8 +35,7 @@ def check_command(
     """Look for what is wrong or suspicious in a scan: timing, angles, pixels, coverage, order of frames, geometry, gain.
 
     Frames that do not fit the others are named, and further questions are answered without them. Exit status: 0 if nothing
-    is suspicious, or if --fix-offset has corrected the only suspicious answer; 10 otherwise.
-    """
+    is suspicious, or if --fix-offset has corrected the only suspicious answer; 10 otherwise."""
     wish = device_wish(device)
     if fix_offset != (output is not None):
         combination = "--fix-offset without -o" if fix_offset else "-o without --fix-offset"

@@ -118,8 +118,7 @@ def _value_of(parameter: Any, arguments: Sequence[str]) -> str | None:
 class GroupedCommand(TyperCommand):
     """A command whose help lists its options under the headings of ``groups``, heading: names of parameters.
 
-    ``help`` is the last option of the first group. Options without a group are listed under "Options".
-    """
+    ``help`` is the last option of the first group. Options without a group are listed under "Options"."""
 
     groups: Mapping[str, Sequence[str]] = {}
 

@@ -23,21 +23,16 @@ _SET = "An option of a step, as --set rings.window=11 (docs: prepare.md)."
 
 
 def prepare_command(
-    scan: Scan,
-    output: Output,
-    steps: Annotated[str | None, STEPS_OF_PREPARE] = None,
+    scan: Scan, output: Output, steps: Annotated[str | None, STEPS_OF_PREPARE] = None,
     config: Annotated[Path | None, file_option(_CONFIG, "--config")] = None,
     assignments: Annotated[list[str] | None, option(_SET, True, "--set", metavar="NAME=VALUE")] = None,
     ignore_lag: Annotated[bool, option("Leave the scan's lag in the frames.", True, "--ignore-lag")] = False,
-    as_json: AsJson = False,
-    device: Device = None,
-    memory: Memory = None,
+    as_json: AsJson = False, device: Device = None, memory: Memory = None,
 ) -> None:
     """Correct the effects of panel and beam in a scan: write line integrals and a mask, and print each step's numbers.
 
     The same steps are options of reconstruct; this command keeps the corrected scan. The default steps find out by
-    themselves whether there is something to correct.
-    """
+    themselves whether there is something to correct."""
     given = {"steps": steps, "ignore_lag": ignore_lag or None, "device": device, "memory": memory}
     settings = read_settings(config, given, assignments or [])
     preprocessing = settings.preprocessing({"steps": DEFAULT_STEPS})

@@ -65,15 +65,8 @@ def reconstruct_command(
             listeners.append(picture)
         inputs = [path for path in (settings.config, initial) if path is not None]
         result, metrics = run_reconstruction(
-            plan,
-            scan,
-            output,
-            runtime,
-            Report(*listeners),
-            resume=resume,
-            checkpoint_every_s=checkpoint_every,
-            inputs=inputs,
-            ranks=ranks,
+            plan, scan, output, runtime, Report(*listeners), resume=resume,
+            checkpoint_every_s=checkpoint_every, inputs=inputs, ranks=ranks,
         )
         if picture is not None and result.state is None and ranks.rank == 0:
             with finish_despite_interrupt():

@@ -20,11 +20,9 @@ _VIEWS = "Frames to compute from the volume and compare with the measurement."
 
 
 def report_command(
-    run: Annotated[Path, file_argument("RUN", "Volume file of a reconstruction.")],
-    output: Output,
+    run: Annotated[Path, file_argument("RUN", "Volume file of a reconstruction.")], output: Output,
     scan: Annotated[Path | None, file_option("Its scan.", "--scan", default=_SCAN_DEFAULT)] = None,
-    views: Annotated[int, option(_VIEWS, min=0, max=MOST_VIEWS)] = DEFAULT_VIEWS,
-    device: Device = None,
+    views: Annotated[int, option(_VIEWS, min=0, max=MOST_VIEWS)] = DEFAULT_VIEWS, device: Device = None,
 ) -> None:
     """Write one HTML page about a reconstruction: slices, convergence, projections, scan, provenance."""
     wish = device_wish(device)

@@ -70,8 +70,7 @@ def simulate_command(
     pulse: Annotated[
         Any,
         option(
-            "When the beam is on, in exposures after a frame's start.",
-            "scanner's: always on",
+            "When the beam is on, in exposures after a frame's start.", "scanner's: always on",
             parser=pair_parser("--pulse", "START,LENGTH as fractions of the exposure", "0.86,0.14"),
             metavar="START,LENGTH",
         ),

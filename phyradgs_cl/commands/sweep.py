@@ -37,8 +37,7 @@ _TABLES = ("table1", "table2", "phantom")
 def sweep_command(
     grid: Annotated[Path, file_argument("GRID", "TOML file: scans, settings and seeds (docs: cluster.md).")],
     output: Annotated[Path, option(_OUTPUT, True, "--output", "-o", metavar="DIR")],
-    scheduler: Scheduler = None,
-    workers: WorkerCount = None,
+    scheduler: Scheduler = None, workers: WorkerCount = None,
     checkpoint_every: Annotated[float, option(_CHECKPOINT, metavar="SECONDS")] = 600.0,
     device: Annotated[str | None, option(_DEVICES, "all GPUs, else the best device")] = None,
 ) -> None:

@@ -1,8 +1,7 @@
 """Voxels as NIfTI, NRRD and MetaImage (by SimpleITK), TIFF as ImageJ writes it and NumPy; Gaussians as PLY and NumPy.
 
 The world's x, y, z are left, posterior, superior (LPS, the frame of DICOM and ITK). So the rotation axis, z, is up in every
-viewer, and a slice looks the same in viewers that know directions and in those that show row 0 at the top.
-"""
+viewer, and a slice looks the same in viewers that know directions and in those that show row 0 at the top."""
 
 import json
 from pathlib import Path
@@ -68,14 +67,8 @@ def write_tiff(path: Path, volume: Volume, unit: str) -> None:
     is_small = volume.values.nbytes < _MOST_IMAGEJ_BYTES
     with written_beside(path) as temporary:
         tifffile.imwrite(
-            temporary,
-            volume.values,
-            imagej=is_small,
-            bigtiff=not is_small,
-            resolution=(1 / dx, 1 / dy),
-            resolutionunit="NONE",
-            metadata=facts,
-            photometric="minisblack",
+            temporary, volume.values, imagej=is_small, bigtiff=not is_small, resolution=(1 / dx, 1 / dy),
+            resolutionunit="NONE", metadata=facts, photometric="minisblack",
         )
 
 

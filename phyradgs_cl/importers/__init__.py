@@ -1,7 +1,6 @@
 """Scans and volumes in other programs' formats, checked and converted to this package's conventions.
 
-`import_scan` and `load_volume` read them; a format is a module of formats/.
-"""
+`import_scan` and `load_volume` read them; a format is a module of formats/."""
 
 import lazy_loader
 

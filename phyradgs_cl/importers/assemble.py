@@ -15,18 +15,9 @@ from phyradgs_cl.importers.reading.frames import LineIntegrals
 
 
 def assemble_scan(
-    integrals: LineIntegrals,
-    trajectory: CircularOrbit | PoseTable,
-    geometry: ConeGeometry,
-    timing: Timing,
-    options: ImportOptions,
-    *,
-    title: str,
-    source: str,
-    grid: Grid | None = None,
-    reference: np.ndarray | None = None,
-    lag: float = 0.0,
-    names: Mapping[str, str] | None = None,
+    integrals: LineIntegrals, trajectory: CircularOrbit | PoseTable, geometry: ConeGeometry, timing: Timing,
+    options: ImportOptions, *, title: str, source: str, grid: Grid | None = None,
+    reference: np.ndarray | None = None, lag: float = 0.0, names: Mapping[str, str] | None = None,
 ) -> Scan:
     """Returns the scan of line integrals with row 0 the lowest; without a grid it gets the cone's cube. ``names``: names in
     messages about implausible values that a file states. InputError for such values."""
@@ -61,12 +52,8 @@ def with_options(geometry: ConeGeometry, options: ImportOptions) -> ConeGeometry
 
 
 def cone(
-    options: ImportOptions,
-    to_axis_mm: float,
-    to_detector_mm: float,
-    panel: tuple[int, int],
-    pitch_mm: tuple[float, ...],
-    offset_mm: tuple[float, float],
+    options: ImportOptions, to_axis_mm: float, to_detector_mm: float, panel: tuple[int, int],
+    pitch_mm: tuple[float, ...], offset_mm: tuple[float, float],
 ) -> ConeGeometry:
     """Returns a geometry of a file's numbers, or the options' where they are given. InputError unless the panel stands
     behind the axis."""

@@ -36,8 +36,7 @@ class ImportOptions:
     millimetres; ``rotates``: gantry or sample; ``row_0``, ``column_0``: places of the first stored ones, seen from the
     source. Pixels: the stored ``quantity``; ``flat_value``: counts without an object, where there are no flat frames.
     ``part``: the projections of a benchmark folder; ``first_view``: the first view of this scan in a file of several.
-    ``named``: returns the name of a field in messages.
-    """
+    ``named``: returns the name of a field in messages."""
 
     exposure_s: float | None = None
     readout_s: float | None = None

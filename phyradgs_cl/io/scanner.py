@@ -94,16 +94,11 @@ def scanner_from(path: Path, content: dict[str, object]) -> Scanner:
     if readout.has("ratio") and readout_ms is not None:
         raise readout.error("readout_ms", f"{readout_ms:g} with ratio", "one of the two", "leave ratio out")
     return Scanner(
-        path.stem,
-        geometry,
-        _grid(tables["volume"]) if "volume" in content else default_grid(geometry),
-        axis,
+        path.stem, geometry, _grid(tables["volume"]) if "volume" in content else default_grid(geometry), axis,
         direction,
         readout.number("ratio", lowest=0.0, highest=LENGTH.largest) if readout.has("ratio") else None,
         _pulse(tables["beam"]) if "beam" in content else None,
-        tables["detector"].number("lag", 0.0, 0.0, LARGEST_LAG),
-        fps,
-        readout_ms,
+        tables["detector"].number("lag", 0.0, 0.0, LARGEST_LAG), fps, readout_ms,
     )
 
 
@@ -129,8 +124,7 @@ def _geometry(source: Fields, detector: Fields) -> ConeGeometry:
     if to_detector_mm <= to_axis_mm:
         raise source.error("to_detector_mm", f"{to_detector_mm:g}", f"more than to_axis_mm ({to_axis_mm:g})")
     return ConeGeometry(
-        to_axis_mm,
-        to_detector_mm,
+        to_axis_mm, to_detector_mm,
         (detector.count("rows", MOST_LINES), detector.count("columns", MOST_LINES)),
         (_length(detector, "pixel_size_v_mm"), _length(detector, "pixel_size_u_mm")),
         (_position(detector, "offset_v_mm"), _position(detector, "offset_u_mm")),

@@ -55,14 +55,9 @@ class Volume:
 
 
 def write_volume(
-    path: str | Path,
-    volume: np.ndarray,
-    grid: Grid,
-    provenance: Mapping[str, object],
-    gaussians: Gaussians | None = None,
-    metrics: Mapping[str, object] | None = None,
-    state: Mapping[str, np.ndarray] | None = None,
-    disagreement: np.ndarray | None = None,
+    path: str | Path, volume: np.ndarray, grid: Grid, provenance: Mapping[str, object],
+    gaussians: Gaussians | None = None, metrics: Mapping[str, object] | None = None,
+    state: Mapping[str, np.ndarray] | None = None, disagreement: np.ndarray | None = None,
 ) -> None:
     """Writes a volume (nz, ny, nx) in 1/mm, whole or not at all. ``provenance`` and ``metrics`` are stored as JSON, plain
     values also as attributes; ``gaussians`` as float32; ``state``: arrays and texts from which an interrupted run resumes;

@@ -23,11 +23,7 @@ DEFAULT_VIEWS = 3
 
 @np.errstate(all="ignore")  # a file may hold any values
 def write_report(
-    volume: Path,
-    output: Path,
-    make_runtime: Callable[[], Runtime],
-    *,
-    scan: Path | None = None,
+    volume: Path, output: Path, make_runtime: Callable[[], Runtime], *, scan: Path | None = None,
     views: int = DEFAULT_VIEWS,
 ) -> Run:
     """Writes the page ``output`` of a volume file, completely or not at all, and returns the run.
@@ -35,8 +31,7 @@ def write_report(
     scan: None is the file that the volume's provenance names, if it is unchanged. views: the number of frames that are
     computed from the volume, on the device of ``make_runtime``; without frames no device is needed. Raises InputError for
     files that cannot be read or are of another kind, and for an output that is one of them; OutputError where the page
-    cannot be written; DeviceError where no device can project.
-    """
+    cannot be written; DeviceError where no device can project."""
     check_writable(output)
     run = load_run(volume, scan)
     for path in (volume, run.scan_path):
@@ -72,8 +67,7 @@ def report_page(run: Run, views: Sequence[FramePair] = (), changes: Sequence[Cha
     links = [element("a", name.capitalize(), href=f"#{name}") for name in shown]
     skip = element("a", "To the content", href="#slices", class_="skip")
     body = joined(
-        skip,
-        element("header", *_top(run), element("nav", *links, aria_label="Sections")),
+        skip, element("header", *_top(run), element("nav", *links, aria_label="Sections")),
         element("main", *_arranged(shown)),
         element("footer", f"Written by phyradgs-cl {__version__} from {run.path.name}."),
     )
@@ -96,12 +90,10 @@ def _head(title: str) -> Markup:
     policy = f"default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'sha256-{digest}'"
     policy += "; base-uri 'none'; form-action 'none'"
     return element(
-        "head",
-        element("meta", charset="utf-8"),
+        "head", element("meta", charset="utf-8"),
         element("meta", http_equiv="Content-Security-Policy", content=policy),
         element("meta", name="viewport", content="width=device-width, initial-scale=1"),
-        element("meta", name="color-scheme", content="light dark"),
-        element("title", title),
+        element("meta", name="color-scheme", content="light dark"), element("title", title),
         raw_text("style", _file("page.css")),
     )
 

@@ -33,8 +33,7 @@ def write_preview(volume: NDArray[np.floating], grid: Grid, path: str | Path) ->
     """Writes a grey PNG of the middle slices of a volume (nz, ny, nx), in true proportions, completely or not at all.
 
     From left to right: axial (y up), coronal and sagittal (z up). Raises InputError for a volume that does not fit its
-    grid, NaN and infinity; OutputError where the file cannot be written.
-    """
+    grid, NaN and infinity; OutputError where the file cannot be written."""
     checks.shape("volume", volume, grid.shape)
     checks.finite("volume", volume)
     picture = png_bytes(preview_image(volume, grid))
@@ -54,8 +53,7 @@ def check_preview(path: Path, *others: Path) -> None:
 class Preview:
     """A listener to a running method that writes a picture of the present volume to ``io.partial_path`` of ``path``.
 
-    It writes at most every ``every_s`` seconds. A picture that cannot be written is a warning, once.
-    """
+    It writes at most every ``every_s`` seconds. A picture that cannot be written is a warning, once."""
 
     def __init__(self, path: Path, every_s: float = 5.0) -> None:
         self.path, self.partial, self.every_s = path, partial_path(path), every_s
@@ -119,8 +117,7 @@ _AXES = ("z", "y", "x")
 def view_volume(path: Path) -> None:
     """Opens a window with a volume file and returns when it is closed.
 
-    Raises InputError where napari is missing, and for anything but a volume file of phyradgs-cl.
-    """
+    Raises InputError where napari is missing, and for anything but a volume file of phyradgs-cl."""
     napari = checks.package("napari", "the package for this, 0.5.4 or later", "napari[all]")
     if (kind := file_kind(path)) != "volume":
         raise InputError(str(path), f"a {kind}", "a volume of phyradgs-cl")
@@ -131,14 +128,9 @@ def view_volume(path: Path) -> None:
 def add_volume(viewer: Any, stored: Volume, name: str) -> None:
     """Adds a volume to a viewer, in mm at its position, with axes z, y, x, y up, grey from 0."""
     viewer.add_image(
-        stored.values,
-        name=f"{name} (1/mm)",
-        scale=stored.required_grid.voxel_size_mm,
-        translate=stored.required_grid.first_centre_mm,
-        units=("mm", "mm", "mm"),
-        axis_labels=_AXES,
-        contrast_limits=grey_range(stored.values),
-        colormap="gray",
+        stored.values, name=f"{name} (1/mm)", scale=stored.required_grid.voxel_size_mm,
+        translate=stored.required_grid.first_centre_mm, units=("mm", "mm", "mm"), axis_labels=_AXES,
+        contrast_limits=grey_range(stored.values), colormap="gray",
     )
     viewer.dims.axis_labels = _AXES
     if hasattr(viewer.camera, "orientation2d"):  # since napari 0.6; before, y points down

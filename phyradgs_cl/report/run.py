@@ -37,8 +37,7 @@ class Run:
     """A reconstruction from its volume file and, where it is found, its scan.
 
     scan, scan_path, scan_facts: the scan, on the volume's grid. reference (nz, ny, nx) 1/mm: the truth on that grid.
-    metrics: by name. notes: remarks for the reader of the page. compared: how volume and truth were compared.
-    """
+    metrics: by name. notes: remarks for the reader of the page. compared: how volume and truth were compared."""
 
     path: Path
     stored: Volume
@@ -90,8 +89,7 @@ class Run:
 def load_run(path: Path, scan_path: Path | None = None) -> Run:
     """Reads a volume file and its scan: ``scan_path``, or the unchanged file that the provenance names.
 
-    Raises InputError for anything but a volume file of phyradgs-cl, and for a ``scan_path`` that cannot be read.
-    """
+    Raises InputError for anything but a volume file of phyradgs-cl, and for a ``scan_path`` that cannot be read."""
     kind = file_kind(path)
     if kind != "volume":
         raise InputError(str(path), f"a {kind}", "a volume of phyradgs-cl", "make one with 'phyradgs reconstruct'")
@@ -171,8 +169,7 @@ class Change:
 
     numbers: the facts that the step reports. pairs: images before and after, by name: the frame (rows, columns) and the
     sinogram (frames, columns) that changed most, and the middle slice (y, x) by FDK. counts (2, n): histograms of all line
-    integrals, before and after, between ``edges`` (n + 1,).
-    """
+    integrals, before and after, between ``edges`` (n + 1,)."""
 
     step: str
     numbers: Facts

@@ -34,8 +34,7 @@ def viewer(planes: list[Plane], windows: Mapping[str, Window]) -> Markup:
     first = windows["result"]
     legend = f"Black is {number(first.low, first.high)}, white {number(first.high)} 1/mm."
     return joined(
-        element("div", choice, *sliders, class_="tools"),
-        figures,
+        element("div", choice, *sliders, class_="tools"), figures,
         element("p", element("output", legend, id="reading"), class_="note"),
         element("p", _HELP, class_="note help"),
         json_block("slice-data", {"planes": data, "windows": layers, "colours": colours}),
@@ -56,8 +55,7 @@ def _figure(plane: Plane) -> Markup:
     places = {"min": 0, "max": len(plane.indices) - 1, "step": 1, "value": middle}
     slider = element("input", type="range", id=slider_id, **places, aria_describedby=place_id)
     caption = element(
-        "figcaption",
-        element("label", f"{name} ({plane.axis})", for_=slider_id),
+        "figcaption", element("label", f"{name} ({plane.axis})", for_=slider_id),
         element("output", _place(plane, middle), id=place_id, for_=slider_id),
     )
     picture = _picture(plane, "volume", has_controls=True)
@@ -79,11 +77,9 @@ def _picture(plane: Plane, of: str, *, has_controls: bool = False) -> Markup:
     """Returns a slice with the directions at its edges and a scale bar, and with cross lines if ``has_controls``."""
     width_mm, height_mm = plane.size_mm
     image = element(
-        "img",
-        src=data_uri(plane.still),
+        "img", src=data_uri(plane.still),
         alt=f"{plane.name.capitalize()} slice of the {of}, {plane.right} to the right, {plane.up} up",
-        style=f"aspect-ratio: {width_mm:.6g} / {height_mm:.6g}",
-        draggable="false",
+        style=f"aspect-ratio: {width_mm:.6g} / {height_mm:.6g}", draggable="false",
     )
     lines = [element("i", class_=way, aria_hidden="true") for way in ("across", "upwards")] if has_controls else []
     sheet = element("div", image, element("canvas", aria_hidden="true") if has_controls else None, class_="sheet")

@@ -39,18 +39,11 @@ class Runtime:
     from the device unless given. ``fp64`` false selects the fallback of float32 pairs. ``pixel_items`` selects the launch
     shape: a work-item per pixel in small groups (GPUs, needs ``lanes`` 1), or per band of lines (CPUs). ``memory`` (bytes,
     or text as 2GiB) limits the sum of its buffers. ``ranks``: the processes that work on the same scan, each with its own
-    Runtime; where a machine has several devices, each rank takes the next.
-    """
+    Runtime; where a machine has several devices, each rank takes the next."""
 
     def __init__(
-        self,
-        device: str | None = None,
-        *,
-        lanes: int | None = None,
-        fp64: bool | None = None,
-        pixel_items: bool | None = None,
-        profile: bool = False,
-        memory: str | int | None = None,
+        self, device: str | None = None, *, lanes: int | None = None, fp64: bool | None = None,
+        pixel_items: bool | None = None, profile: bool = False, memory: str | int | None = None,
         ranks: Communicator | None = None,
     ) -> None:
         limit_bytes = memory_limit(memory)
@@ -202,12 +195,7 @@ class Runtime:
 
     @naming_failures("a copy")
     def copy(
-        self,
-        source: DeviceArray,
-        target: DeviceArray,
-        *,
-        nbytes: int | None = None,
-        source_offset: int = 0,
+        self, source: DeviceArray, target: DeviceArray, *, nbytes: int | None = None, source_offset: int = 0,
         target_offset: int = 0,
     ) -> None:
         """Copies bytes of one device array to another: the whole source, or ``nbytes`` from and to the offsets."""
@@ -231,8 +219,7 @@ class Runtime:
     ) -> None:
         """Enqueues ``items`` work-items (kernels ignore those past the end) in groups of ``group``, other sides 1.
 
-        Python's whole numbers become int, its others float. A long is np.int64, a float that may be whole np.float32.
-        """
+        Python's whole numbers become int, its others float. A long is np.int64, a float that may be whole np.float32."""
         shape = (items,) if isinstance(items, (int, np.integer)) else items
         if min(shape) < 1:
             return
@@ -263,8 +250,7 @@ class Runtime:
     def shape_of_lines(self, width: int, *rows: int) -> tuple[tuple[int, ...], tuple[int, int], int]:
         """Returns work-items, group and number of groups of kernels that step along lines of ``width`` pixels.
 
-        A work-item takes a line on a CPU, and a pixel on a GPU.
-        """
+        A work-item takes a line on a CPU, and a pixel on a GPU."""
         items, group = ((width, *rows), self.tile()) if self.pixel_items else ((1, *rows), (1, 1))
         sides = (*group, *([1] * (len(rows) - 1)))
         return items, group, math.prod(ceil_div(n, side) for n, side in zip(items, sides, strict=True))

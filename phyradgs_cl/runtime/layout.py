@@ -1,8 +1,7 @@
 """The layout of images and volumes in device memory: rows with a pitch.
 
 GUARD floats, then (rows, pitch), where every row ends in at least GUARD zeros. A vector of pixels may therefore start or end
-outside a row without a test. In kernels GUARD is ``IMAGE_GUARD``.
-"""
+outside a row without a test. In kernels GUARD is ``IMAGE_GUARD``."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -39,12 +38,8 @@ class Strides:
 
 
 def move(
-    rt: Runtime,
-    source: tuple[DeviceArray, Strides],
-    target: tuple[DeviceArray, Strides],
-    shape: Sequence[int],
-    *,
-    turned: bool = False,
+    rt: Runtime, source: tuple[DeviceArray, Strides], target: tuple[DeviceArray, Strides],
+    shape: Sequence[int], *, turned: bool = False,
 ) -> None:
     """Copies (nz, ny, nx) floats from one layout to another on the device; ``turned``: to (nz, nx, ny)."""
     nz, ny, nx = (int(n) for n in shape)
@@ -65,8 +60,7 @@ def on_device(
 ) -> SameArray:
     """Runs ``function(volume, result)`` on the device; the result has the shape of ``volume`` and lies where it lies.
 
-    ``out``: the memory of a result on the device.
-    """
+    ``out``: the memory of a result on the device."""
     result = rt.empty(volume.shape) if out is None else out
     if isinstance(volume, DeviceArray):
         function(volume, result)

@@ -151,8 +151,7 @@ def naming_failures(work: str | None = None) -> Callable[[Callable[P, R]], Calla
     """Decorates a method of a runtime, so that OpenCL's errors become DeviceError or MemoryShortage.
 
     Drivers queue work: a launch may be refused at once, or fail later in any call that waits. ``work`` names the method's
-    work; None takes the name of the kernel, the first argument of a launch.
-    """
+    work; None takes the name of the kernel, the first argument of a launch."""
 
     def decorate(method: Callable[P, R]) -> Callable[P, R]:
         @wraps(method)
@@ -220,8 +219,7 @@ def is_cl_array(value: object) -> bool:
 def adopted(name: str, array: Any, queue: "cl.CommandQueue") -> DeviceArray:
     """Returns a float32 Array of pyopencl (C order) as a DeviceArray on the same memory; a view of another is copied.
 
-    Raises InputError, with ``name`` as its subject, for another context, queue or type.
-    """
+    Raises InputError, with ``name`` as its subject, for another context, queue or type."""
     remedy = "make it with the operator's to_device, or on its queue"
     if array.context != queue.context:
         raise InputError(name, "an Array of another OpenCL context", "the operator's context", remedy)

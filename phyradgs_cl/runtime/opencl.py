@@ -1,8 +1,7 @@
 """pyopencl, loaded when it is first used, and kernels with their sources.
 
 Sources are files of ``cl/`` with their headers pasted in, because an include path fails on a folder with a space.
-``#line`` marks keep file and line in the compiler's messages.
-"""
+``#line`` marks keep file and line in the compiler's messages."""
 
 import re
 from dataclasses import dataclass

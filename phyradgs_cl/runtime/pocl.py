@@ -5,8 +5,7 @@ family of x86 processors. LLVM inlines a function only where the caller has ever
 builds kernels for the name that LLVM 14 gives the host, which differs from the library's: an Ice Lake lacks CLWB in
 LLVM's list, so that every built-in stays a call, 3 times as slow. An unknown processor is "generic", which builds nothing
 (pocl/pocl issue 1049), and a Zen 4 is taken for a Zen 3 without AVX-512, on which LLVM aborts ("Cannot select: i64 = fma").
-PoCL has no setting for the name, but its device record points to it. The pointer is turned to the library's name here.
-"""
+PoCL has no setting for the name, but its device record points to it. The pointer is turned to the library's name here."""
 
 import contextlib
 import ctypes
@@ -57,8 +56,7 @@ def prepare_environment() -> None:
 
     PoCL names its cache after the LLVM target, so two unknown processors would share binaries. Without a writable cache
     PoCL has no device: then the cache lies in the temporary folder, and pyopencl's is switched off.
-    Raises InputError for a number of threads that PoCL would crash on or ignore.
-    """
+    Raises InputError for a number of threads that PoCL would crash on or ignore."""
     global _unwritable
     if platform.system() != "Linux":
         return
@@ -102,9 +100,7 @@ def warn_of_cache() -> None:
     if _unwritable is not None:
         log.warning(
             "PoCL's kernel cache %s cannot be written: kernels are kept in %s; set %s to a folder that can",
-            _unwritable,
-            os.environ.get(CACHE_VARIABLE),
-            CACHE_VARIABLE,
+            _unwritable, os.environ.get(CACHE_VARIABLE), CACHE_VARIABLE,
         )
         _unwritable = None
 
@@ -152,8 +148,7 @@ def use_library_target(device_address: int) -> str | None:
     """Names the library's processor in the record of a PoCL 3.0 CPU device, and returns that name.
 
     The record holds the target triple and, next to it, the processor's name. Nothing is changed, and None returned, where
-    the two are not found. From 3.1 on PoCL names the library's processor itself.
-    """
+    the two are not found. From 3.1 on PoCL names the library's processor itself."""
     target = library_target()
     if target is None or platform.system() != "Linux":
         return None

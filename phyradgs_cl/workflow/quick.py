@@ -29,8 +29,7 @@ def quick_grid(
 ) -> SweepGrid:
     """Simulates the missing scans in ``folder``/scans; returns a sweep of every method, with and without motion, over them.
 
-    seed: of noise, cloud and frame order. iterations: of splats. Raises OutputError for a folder that cannot be made.
-    """
+    seed: of noise, cloud and frame order. iterations: of splats. Raises OutputError for a folder that cannot be made."""
     checks.within("--iterations", iterations, 0, 10_000_000)
     settings = []
     for method, motion in _ROWS:

@@ -56,8 +56,7 @@ class _Files:
 class _Checkpoints:
     """A listener that writes a checkpoint at most every ``every_s`` seconds; 0: none. A kill leaves the last complete one.
 
-    A checkpoint that cannot be written is a warning, once, and no error.
-    """
+    A checkpoint that cannot be written is a warning, once, and no error."""
 
     def __init__(self, path: Path, every_s: float) -> None:
         self.path, self.every_s = path, every_s
@@ -96,24 +95,16 @@ class _Checkpoints:
 
 @np.errstate(all="ignore")
 def run_reconstruction(
-    plan: methods.RunPlan,
-    scan: Path,
-    output: Path,
-    make_runtime: Callable[[], Runtime],
-    report: methods.ProgressReport = methods.ignore_progress,
-    *,
-    resume: bool = False,
-    checkpoint_every_s: float = 600.0,
-    inputs: Sequence[Path] = (),
-    ranks: Communicator | None = None,
+    plan: methods.RunPlan, scan: Path, output: Path, make_runtime: Callable[[], Runtime],
+    report: methods.ProgressReport = methods.ignore_progress, *, resume: bool = False,
+    checkpoint_every_s: float = 600.0, inputs: Sequence[Path] = (), ranks: Communicator | None = None,
 ) -> tuple[methods.Reconstruction, dict[str, float]]:
     """Reconstructs a scan file and writes a volume file; returns the result and its metrics.
 
     An interrupted run leaves ``output`` alone: it writes ``io.partial_path`` and a checkpoint, from which ``resume`` goes
     on. A complete run removes both; a killed run leaves its last checkpoint. inputs: other files that the output must not
     overwrite. ranks: those of the runtime; rank 0 alone writes and has metrics. Raises OutputError while another run
-    writes the output.
-    """
+    writes the output."""
     check_interval(checkpoint_every_s)
     leads = ranks is None or ranks.rank == 0
     if resume:
@@ -127,12 +118,8 @@ def run_reconstruction(
 
 
 def _reconstructed(
-    plan: methods.RunPlan,
-    files: _Files,
-    make_runtime: Callable[[], Runtime],
-    report: methods.ProgressReport,
-    resume: bool,
-    checkpoint_every_s: float,
+    plan: methods.RunPlan, files: _Files, make_runtime: Callable[[], Runtime], report: methods.ProgressReport,
+    resume: bool, checkpoint_every_s: float,
 ) -> tuple[methods.Reconstruction, dict[str, float]]:
     with hashing(files.scan) as scan_hash_of:
         scan = load_scan(files.scan, plan.preprocessing.flats)
@@ -171,8 +158,7 @@ def _reconstructed(
 def _metrics(scan: Scan, result: methods.Reconstruction) -> dict[str, float]:
     """Returns the metrics against the scan's reference, by the rule of ``metrics.aligned``, and those on held-out pixels.
 
-    The latter leave the result's facts. These get the way of comparison, if it is not voxel by voxel.
-    """
+    The latter leave the result's facts. These get the way of comparison, if it is not voxel by voxel."""
     held_out = result.facts.pop(HELD_OUT, {})
     if scan.reference is None:
         return held_out
@@ -265,12 +251,8 @@ def _keep_checkpoint(output: Path, result: methods.Reconstruction) -> None:
 
 
 def resume_or_restart(
-    plan: methods.RunPlan,
-    scan: Path,
-    output: Path,
-    make_runtime: Callable[[], Runtime],
-    report: methods.ProgressReport = methods.ignore_progress,
-    checkpoint_every_s: float = 600.0,
+    plan: methods.RunPlan, scan: Path, output: Path, make_runtime: Callable[[], Runtime],
+    report: methods.ProgressReport = methods.ignore_progress, checkpoint_every_s: float = 600.0,
 ) -> tuple[methods.Reconstruction, dict[str, float]]:
     """Resumes from the output's checkpoint; starts from the beginning without one, or with a damaged or another run's."""
     run = partial(run_reconstruction, plan, scan, output, make_runtime, report, checkpoint_every_s=checkpoint_every_s)

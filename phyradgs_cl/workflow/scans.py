@@ -63,10 +63,7 @@ def phantom_of(name: str) -> str | EllipsoidPhantom:
 
 @np.errstate(all="ignore")  # what overflows is found in the result, and reported in one line
 def run_simulation(
-    job: SimulationJob,
-    scanner: Scanner,
-    options: SimulationOptions,
-    rt: Runtime,
+    job: SimulationJob, scanner: Scanner, options: SimulationOptions, rt: Runtime,
     report: Callable[[int, int], None],
 ) -> Scan:
     """Simulates and writes a scan file; everything is checked before any work."""

@@ -2,8 +2,7 @@
 
 They hold plain containers, numbers and NumPy arrays. Every other name in a pickle is refused, so nothing is executed.
 NumPy's own constructors are no substitute for the functions below: with types of Python objects, or with fields, they read
-memory at addresses that the file states.
-"""
+memory at addresses that the file states."""
 
 import io
 import math
@@ -52,14 +51,7 @@ def import_scan(path: Path, options: ImportOptions) -> Scan:
     integrals = line_integrals(str(path), frames, options, convention="attenuation")
     trajectory = turning(geometry, angle_rad, timing)
     return assemble_scan(
-        integrals,
-        trajectory,
-        geometry,
-        timing,
-        options,
-        title=path.stem,
-        source=str(path),
-        grid=grid,
+        integrals, trajectory, geometry, timing, options, title=path.stem, source=str(path), grid=grid,
         reference=reference,
     )
 

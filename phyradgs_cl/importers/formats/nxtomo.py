@@ -1,8 +1,7 @@
 """NXtomo files of other programs (HDF5). Values that this package's scan files must have may come from options.
 
 The format does not state which row is on top. Row 0 is taken as the lowest, with a warning, after the flips that the file
-declares in either way of the nxtomo package. The column of the rotation axis becomes a detector offset.
-"""
+declares in either way of the nxtomo package. The column of the rotation axis becomes a detector offset."""
 
 import logging
 from dataclasses import replace
@@ -159,8 +158,7 @@ def _motion(
     stored = StoredTiming(
         exposure_s=read_duration(source, f"{detector}/count_time", used, needed=False),
         readout_s=read_duration(source, f"{detector}/detector_readout_time", used, needed=False),
-        start_s=start_s,
-        angle_at="start" if sweeps else None,
+        start_s=start_s, angle_at="start" if sweeps else None,
     )
     timing = make_timing(source.name(entry), int(used.sum()), options, stored)
     if not sweeps:

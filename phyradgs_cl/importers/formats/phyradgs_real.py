@@ -2,8 +2,7 @@
 
 A view's ``detector`` is a 4×4 matrix from the panel to the world (mm): column 0 along the rows of the image, column 1
 down them, column 3 the panel's centre. It holds where the panel stands on its circle, else turned about +z by its
-angle. The first stored row is read first.
-"""
+angle. The first stored row is read first."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -155,11 +154,7 @@ def _timing(subject: str, detector: Circle, options: ImportOptions) -> Timing:
 
 
 def _all_poses(
-    views: list[Fields],
-    source: Circle,
-    detector: Circle,
-    timing: Timing,
-    panel: tuple[int, int],
+    views: list[Fields], source: Circle, detector: Circle, timing: Timing, panel: tuple[int, int],
     pitch: tuple[float, float],
 ) -> np.ndarray:
     """Returns poses (F, T, 12) of the stored images at T times of every frame's window."""
@@ -171,12 +166,8 @@ def _all_poses(
 
 
 def _view_poses(
-    view: Fields,
-    source_mm: np.ndarray,
-    detector: tuple[np.ndarray, np.ndarray],
-    centre: np.ndarray,
-    panel: tuple[int, int],
-    pitch: tuple[float, float],
+    view: Fields, source_mm: np.ndarray, detector: tuple[np.ndarray, np.ndarray], centre: np.ndarray,
+    panel: tuple[int, int], pitch: tuple[float, float],
 ) -> np.ndarray:
     """Returns poses (T, 12) of one view. The panel is turned about +z from the angle at which its matrix holds."""
     rotation, stands_at = _matrix(view)

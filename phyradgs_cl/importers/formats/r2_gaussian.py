@@ -1,7 +1,6 @@
 """Folders of R2-Gaussian: meta_data.json with .npy projections and the true volume; taken at rest.
 
-Its frame is TIGRE's, which PhyRadGS and NAF share: projections [v, u] with row 0 at +z, volumes [x, y, z].
-"""
+Its frame is TIGRE's, which PhyRadGS and NAF share: projections [v, u] with row 0 at +z, volumes [x, y, z]."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -83,14 +82,7 @@ class R2Folder:
         grid, reference = self.reference()
         integrals, title = self.projections(entries, options), path.resolve().name
         return assemble_scan(
-            integrals,
-            orbit,
-            self.geometry,
-            timing,
-            options,
-            title=title,
-            source=str(path),
-            grid=grid,
+            integrals, orbit, self.geometry, timing, options, title=title, source=str(path), grid=grid,
             reference=reference,
         )
 

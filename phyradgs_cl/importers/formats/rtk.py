@@ -1,8 +1,7 @@
 """Scans of RTK: a geometry file (RTKThreeDCircularGeometry, version 3) and a stack of projections as MetaImage.
 
 The geometry has nine numbers per projection. XML entities and external files are refused: of DOCTYPEs only the empty one of
-RTK's own files passes.
-"""
+RTK's own files passes."""
 
 import math
 import re

@@ -62,16 +62,9 @@ def import_scan(path: Path, options: ImportOptions) -> Scan:
     angle_rad = gantry_sign(combined, "gantry") * _angles_rad(folder, tables["angles"], frames)
     integrals = _line_integrals(stacks, combined, tables["frames"], str(description))
     return assemble_scan(
-        integrals,
-        turning(geometry, angle_rad, timing),
-        geometry,
-        timing,
-        options,
-        title=tables[""].word("title", default=folder.root.resolve().name),
-        source=str(path),
-        grid=scanner.grid if tables[""].has("volume") else None,
-        lag=scanner.lag,
-        names=_subjects(tables),
+        integrals, turning(geometry, angle_rad, timing), geometry, timing, options,
+        title=tables[""].word("title", default=folder.root.resolve().name), source=str(path),
+        grid=scanner.grid if tables[""].has("volume") else None, lag=scanner.lag, names=_subjects(tables),
     )
 
 
@@ -174,14 +167,11 @@ def _stored_timing(tables: dict[str, Fields], scanner: Scanner) -> StoredTiming:
     written = [timing.name(key) for key in names if timing.has(key)]
     written += [readout.name("readout_ms")] if readout.has("readout_ms") else []
     return StoredTiming(
-        exposure_s=exposure_s,
-        readout_s=readout_s,
-        frame_time_s=frame_time_s,
+        exposure_s=exposure_s, readout_s=readout_s, frame_time_s=frame_time_s,
         start_s=timing.numbers("start_s") if timing.has("start_s") else None,
         axis=scanner.readout_axis if readout.has("first") or readout.has("axis") else None,
         direction=scanner.readout_direction if readout.has("first") or readout.has("direction") else None,
-        pulse=scanner.pulse,
-        angle_at=angles.word("at", WORDS["angle_at"]) if angles.has("at") else None,
+        pulse=scanner.pulse, angle_at=angles.word("at", WORDS["angle_at"]) if angles.has("at") else None,
         written=(*written, *([angles.name("at")] if angles.has("at") else [])),
     )
 

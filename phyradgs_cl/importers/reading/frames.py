@@ -32,13 +32,8 @@ class LineIntegrals:
 
 
 def line_integrals(
-    subject: str,
-    frames: np.ndarray,
-    options: ImportOptions,
-    *,
-    flats: np.ndarray | None = None,
-    darks: np.ndarray | None = None,
-    convention: str | None = None,
+    subject: str, frames: np.ndarray, options: ImportOptions, *, flats: np.ndarray | None = None,
+    darks: np.ndarray | None = None, convention: str | None = None,
 ) -> LineIntegrals:
     """Converts ``frames`` (P, v, u) of any real type to line integrals. Masks clipped counts and values that no object has,
     with a warning. ``subject`` names the file; ``flats``, ``darks``: (n, v, u) or None. The quantity is that of the options,

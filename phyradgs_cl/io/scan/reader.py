@@ -29,8 +29,7 @@ def read_scan(path: str | Path, to_attenuation: ToAttenuation) -> Scan:
     dark and invalid frames are left out. The scan has projections (P, v, u) float32 and a bool ``pixel_mask`` or None, from
     the file and the conversion; values that are not finite must be masked.
 
-    Raises: InputError for a missing, damaged or incomplete file; its subject is "FILE:/hdf5/path".
-    """
+    Raises: InputError for a missing, damaged or incomplete file; its subject is "FILE:/hdf5/path"."""
     with open_hdf5(path) as source:
         header = read_header(source)
         mask = _read_mask(source, header)

@@ -25,11 +25,7 @@ _log = logging.getLogger(__name__)
 
 
 def write_scan(
-    path: str | Path,
-    scan: Scan,
-    *,
-    data: np.ndarray | None = None,
-    image_key: np.ndarray | None = None,
+    path: str | Path, scan: Scan, *, data: np.ndarray | None = None, image_key: np.ndarray | None = None,
     quantity: str = "attenuation",
 ) -> None:
     """Writes a scan file, whole or not at all, in place of an existing one.
@@ -39,8 +35,7 @@ def write_scan(
     dark, 3 invalid, with as many 0 as ``scan`` has frames. A user's own trajectory becomes a table of poses.
 
     Raises: InputError for arguments that contradict each other, or a scan that the format cannot express; OutputError where
-    the file cannot be written.
-    """
+    the file cannot be written."""
     frames, key = _checked_frames(scan, data, image_key, quantity)
     if scan.is_fly and scan.shutter.exposure_s == 0 and scan.shutter.readout_s > 0:  # in a file the gantry would stand
         remedy = "give the exposure its real length"

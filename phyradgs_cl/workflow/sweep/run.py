@@ -77,8 +77,7 @@ class SweepProgress:
     """The state of a sweep: finished runs, all runs, failed ones, and those that workers are making.
 
     line: of a run that has just finished. name, progress: of the run that this process is making. dashboard: the address
-    of Dask's page, once.
-    """
+    of Dask's page, once."""
 
     done: int
     total: int
@@ -123,8 +122,7 @@ def run_sweep(job: SweepJob, report: Report = lambda progress: None) -> tuple[li
     """Makes the missing runs, then the tables. Returns the written files and the number of runs that failed now.
 
     The next call makes failed runs again. An interruption (KeyboardInterrupt) loses no finished run. OutputError: the
-    folder cannot be written; BusyError while another sweep uses it. InputError: no scheduler, or a missing package.
-    """
+    folder cannot be written; BusyError while another sweep uses it. InputError: no scheduler, or a missing package."""
     results = _results_file(job.folder)
     with only_run(results):
         lines = read_lines(results, is_sound)
@@ -172,8 +170,7 @@ def make_run(run: SweepRun, report: ProgressReport = ignore_progress, device: st
     """Makes a run, in a worker or in this process, and returns its line, with the error where it fails.
 
     A finished run whose line was lost on its way is not made again. Raises KeyboardInterrupt for a run that was stopped,
-    OutputError where nothing can be written.
-    """
+    OutputError where nothing can be written."""
     try:
         with only_run(run.record, wait_s=_BUSY_S):  # a worker that lost its scheduler may still be making it
             return _recorded(run) or _reconstructed(run, report, device)
