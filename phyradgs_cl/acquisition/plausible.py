@@ -1,4 +1,4 @@
-"""Summarises a scan in two lines; refuses or warns of numbers that no scanner has, most often a wrong unit."""
+"""Summarises a scan in two or three lines, its blur among them; refuses or warns of numbers that no scanner has."""
 
 import logging
 import math
@@ -19,11 +19,43 @@ _SLOW_FPS, _LARGE_STEP_DEG = 2.0, 10.0  # a gantry that moves so far between fra
 _TIMES = 17  # of an exposure: between two of them no gantry turns by half a turn
 _SLACK = 1e-3  # relative: times and angles come rounded
 _MANY_FRAMES = 10  # fewer may lie within a few degrees on purpose
+_ASIDE = 0.1  # of the panel's width: a panel further off centre was put there for a wider field of view
 
 
 def summary(scan: Scan) -> str:
-    """Returns a line of the timing and a line of the sizes. Marks values that the provenance lists as assumed."""
-    return f"{_timing(scan)}\n{_sizes(scan)}"
+    """Returns a line of the timing, a line of the sizes, and a line of a fly-scan's blur. Marks values that the provenance
+    lists as assumed."""
+    return "\n".join(filter(None, (_timing(scan), _sizes(scan), blur_line(scan))))
+
+
+def blur_facts(scan: Scan) -> dict[str, float]:
+    """Returns ``blur_at_rim_px`` and ``blur_at_half_radius_px`` of a fly-scan, in columns; nothing of a scan at rest.
+
+    In an exposure of arc Δθ a point at radius r moves by r·Δθ, and blurs most where it moves at right angles to its ray. Its
+    image moves by M·r·Δθ, with the magnification M, and M·r is the image's largest distance from the axis. So the blur is
+    the arc times a radius on the panel, whatever M is. This is the first order in r/R, with R from source to axis: a point
+    nearer to the source is magnified up to R/(R − r) times as much, one nearer to the panel down to R/(R + r) times.
+
+    The arc is the median over frames, of the time that a line is open and the beam is on. The rim is the largest radius that
+    every view sees, up to the panel's nearer side. A panel more than a tenth of its width off centre was put there for a
+    wider field of view, which opposite views complete: its rim is the farther side.
+    """
+    if not scan.is_fly:
+        return {}
+    windows_s = scan.shutter.line_windows_s(scan.lines)
+    lit_s = windows_s[np.argmax(np.diff(windows_s)[:, 0])]
+    angle_rad = _source_angle_rad(scan, *lit_s)
+    arc_rad = abs(float(np.median(angle_rad[:, -1] - angle_rad[:, 0])))
+    columns = scan.geometry.detector_shape[1]
+    aside = abs(scan.geometry.detector_offset_mm[1] / scan.geometry.pixel_size_mm[1])
+    radius_px = columns / 2 - aside if aside <= _ASIDE * columns else columns / 2 + aside
+    return {"blur_at_rim_px": arc_rad * radius_px, "blur_at_half_radius_px": arc_rad * radius_px / 2}
+
+
+def blur_line(scan: Scan) -> str:
+    """Returns "blur at the rim: 1.4 px, at half radius 0.7 px" of a fly-scan; "" of a scan at rest."""
+    facts = blur_facts(scan)
+    return "blur at the rim: {:.2g} px, at half radius {:.2g} px".format(*facts.values()) if facts else ""
 
 
 def _cone_deg(geometry: ConeGeometry) -> tuple[float, float]:
@@ -40,9 +72,9 @@ def _frame_time_s(scan: Scan) -> float:
     return float(np.median(np.diff(scan.frame_start_s))) if scan.frames > 1 else math.nan
 
 
-def _source_angle_rad(scan: Scan) -> np.ndarray:
-    """Returns the source's angle (F, T) about the axis at T times of each frame's exposure, unwrapped within a frame."""
-    delay_s = np.linspace(0.0, scan.shutter.exposure_s, _TIMES)
+def _source_angle_rad(scan: Scan, first_s: float, last_s: float) -> np.ndarray:
+    """Returns the source's angle (F, T) about the axis at T times after each frame's start, unwrapped within a frame."""
+    delay_s = np.linspace(first_s, last_s, _TIMES)
     source = np.stack([scan.trajectory.pose(f, t + delay_s)[:, :2] for f, t in enumerate(scan.frame_start_s)])
     angle_rad: np.ndarray = np.unwrap(np.arctan2(source[..., 1], source[..., 0]))
     return angle_rad
@@ -65,7 +97,7 @@ def _timing(scan: Scan) -> str:
         parts.append(marked("all lines at once", "readout"))
     if "exposure" not in assumed and scan.frames > 1:
         parts.append(f"{1 / _frame_time_s(scan):.4g} fps")
-    angle_rad = _source_angle_rad(scan)
+    angle_rad = _source_angle_rad(scan, 0.0, shutter.exposure_s)
     arc_deg = abs(float(np.rad2deg(np.median(angle_rad[:, -1] - angle_rad[:, 0]))))
     parts.append(f"exposure {arc_deg:.4g}° in " + marked(f"{1000 * shutter.exposure_s:.4g} ms", "exposure"))
     if "angles" in assumed:
@@ -101,7 +133,7 @@ def check_plausible(scan: Scan, named: Named = str, is_timed: bool = True) -> No
     """
     _check_panel(scan.geometry, named("pixel_size_mm"))
     _check_voxels(scan.grid, scan.geometry, named("grid"))
-    angle_deg = np.rad2deg(np.unwrap(_source_angle_rad(scan)[:, 0]))
+    angle_deg = np.rad2deg(np.unwrap(_source_angle_rad(scan, 0.0, scan.shutter.exposure_s)[:, 0]))
     looks_like_radians = _warn_of_radians(angle_deg, named("angles"))
     if scan.is_fly and scan.frames > 1 and not looks_like_radians:
         _check_exposure(scan, named("exposure_s"))

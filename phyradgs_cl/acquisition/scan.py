@@ -175,7 +175,8 @@ class Scan:
         return astra_of_poses(poses, self.geometry.detector_shape)
 
     def summary(self) -> str:
-        """Returns a line of shutter, frame rate and exposure, and a line of field of view, voxels and line integrals."""
+        """Returns a line of shutter, frame rate and exposure, a line of field of view, voxels and line integrals, and of a
+        fly-scan a line of its blur."""
         from phyradgs_cl.acquisition.plausible import summary
 
         return summary(self)

@@ -5,6 +5,7 @@ import math
 from pathlib import Path
 from typing import Annotated
 
+from phyradgs_cl.acquisition.plausible import blur_facts, blur_line
 from phyradgs_cl.check import CANNOT_TELL, CENTRE, CheckResult, CountReader, check
 from phyradgs_cl.commands.console import AsJson, file_option, option, say
 from phyradgs_cl.commands.options import Device, Scan
@@ -48,7 +49,7 @@ def check_command(
         with expecting(scan, "scan"):
             loaded = read_scan(scan, counts)
         result = check(loaded, Runtime(wish), counts, lambda done, total, name: ticker.show(done, total, f"  {name}"))
-    say(_as_json(result, scan) if as_json else _as_text(result))
+    say(_as_json(result, scan, blur_facts(loaded)) if as_json else _as_text(result, blur_line(loaded)))
     suspicious = {finding.question for finding in result.suspicious}
     if output is not None:
         _write_copy(scan, output, result, quiet=as_json)
@@ -69,8 +70,8 @@ def _write_copy(scan: Path, target: Path, result: CheckResult, quiet: bool) -> N
         say(f"{target}: a copy with the panel moved {result.offset_mm:+.4g} mm along u")
 
 
-def _as_text(result: CheckResult) -> str:
-    """Returns a line per question with its advice below, and the totals."""
+def _as_text(result: CheckResult, blur: str) -> str:
+    """Returns a line per question with its advice below, the line of the blur, if any, and the totals."""
     lines: list[str] = []
     for finding in result.findings:
         lines.append(f"{finding.verdict:12s} {finding.question:19s} {finding.text}")
@@ -79,11 +80,12 @@ def _as_text(result: CheckResult) -> str:
     open_questions = [finding.question for finding in result.findings if finding.verdict == CANNOT_TELL]
     names = f": {', '.join(open_questions)}" if open_questions else ""
     suspicious = f"{len(result.suspicious)} of {len(result.findings)} questions suspicious"
+    lines += [blur] if blur else []
     return "\n".join([*lines, _NOT_ASKED, f"{suspicious}, {len(open_questions)} cannot be told{names}"])
 
 
-def _as_json(result: CheckResult, scan: Path) -> str:
+def _as_json(result: CheckResult, scan: Path, blur: dict[str, float]) -> str:
     offset = {"offset_mm": result.offset_mm, "offset_spread_mm": result.offset_spread_mm}
     finite = {key: value if math.isfinite(value) else None for key, value in offset.items()}
-    facts = {"scan": str(scan), "suspicious": len(result.suspicious), **finite}
+    facts = {"scan": str(scan), "suspicious": len(result.suspicious), **finite, **blur}
     return json.dumps({**facts, "findings": [finding.facts() for finding in result.findings]})

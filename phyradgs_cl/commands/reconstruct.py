@@ -8,6 +8,7 @@ import typer
 
 from phyradgs_cl import signals
 from phyradgs_cl.acquisition.motion import motion_facts
+from phyradgs_cl.acquisition.plausible import blur_line
 from phyradgs_cl.commands.console import complain, file_option, last_words, option, say, scores
 from phyradgs_cl.commands.options import RUN_GROUPS, Output, Scan, with_run_options
 from phyradgs_cl.estimate import duration, estimate, seconds_around
@@ -101,4 +102,4 @@ def estimate_command(scan: Scan, settings: Settings) -> None:
 
     values = estimate(loaded, plan, rt, around)
     say(f"{plan.method_name} on {rt.device.name}, from a trial of {duration(values.trial_seconds)}")
-    say(values.text())
+    say("\n".join(filter(None, (values.text(), blur_line(loaded)))))

@@ -122,9 +122,11 @@ def test_numbers_that_hardly_a_scanner_has_are_warned_of(caplog) -> None:
 
 def test_a_summary_shows_what_a_wrong_length_changes(rt) -> None:
     scan = simulate("spheres", size=8, detector=16, views=6, exposure_deg=60.0, device=rt)
-    timing, sizes = scan.summary().splitlines()
+    timing, sizes, blur = scan.summary().splitlines()
     assert timing == "timing: rows read in 860 ms, bottom first; 1 fps; exposure 60° in 1000 ms; averages line integrals"
     numbers = [float(n) for n in re.findall(r"[\d.]+", sizes)]
     largest = float(scan.projections.max())
     assert numbers == pytest.approx([3.642, 2.747, 2.747, 31.9, 31.9, 0.25, largest], rel=1e-3)
-    assert static_scan(FRAMES, CONE, TURN_DEG).summary().startswith("timing: every frame at rest\nsizes: ")
+    assert blur == "blur at the rim: 8.4 px, at half radius 4.2 px"  # π/3 · 8 columns
+    still = static_scan(FRAMES, CONE, TURN_DEG).summary().splitlines()
+    assert len(still) == 2 and still[0] == "timing: every frame at rest" and still[1].startswith("sizes: ")

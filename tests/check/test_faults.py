@@ -9,6 +9,7 @@ import pytest
 from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, PoseTable
 from phyradgs_cl.acquisition.altered.variants import reversed_rotation
 from phyradgs_cl.acquisition.geometry import default_grid
+from phyradgs_cl.acquisition.plausible import blur_facts, blur_line
 from phyradgs_cl.check import CANNOT_TELL, OK, SUSPICIOUS, check, consistency
 from phyradgs_cl.check.orbit import OTHER_CAUSE, check_centre
 from phyradgs_cl.check.shutter import check_exposure
@@ -287,11 +288,13 @@ def test_the_command_and_its_status(cli, clean, tmp_path, capsys) -> None:
     assert cli.run(["check", str(path)]) == 0
     text = capsys.readouterr().out
     assert text.count("\n") >= 12 and "not asked: which end of the panel is up" in text
+    assert f"\n{blur_line(clean)}\n" in text and blur_line(clean).startswith("blur at the rim: ")
     assert text.endswith("0 of 12 questions suspicious, 2 cannot be told: sign of readout, exposure\n")
     write_scan(path, negative(clean))
     assert cli.run(["check", str(path), "--json"]) == SUSPICIOUS_STATUS
     facts = json.loads(capsys.readouterr().out)
     assert facts["suspicious"] == 1 and len(facts["findings"]) == 12
+    assert {name: facts[name] for name in blur_facts(clean)} == pytest.approx(blur_facts(clean))
     assert {"question", "verdict", "value", "threshold", "unit", "text", "advice"} <= set(
         facts["findings"][0]
     )

@@ -122,6 +122,7 @@ def test_the_command_says_time_and_memory(cli, scan, capsys, method) -> None:
     text = capsys.readouterr().out
     assert text.startswith(f"{method} on ")
     assert re.search(r"^time +\S+ (s|min)", text, re.M) and re.search(r"^memory +\d+ MiB", text, re.M)
+    assert text.endswith("\nblur at the rim: 2 px, at half radius 1 px\n")  # 14.4° of 8 columns
 
 
 def test_the_words_of_reconstruct(cli, refused, scan, monkeypatch) -> None:

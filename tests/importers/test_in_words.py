@@ -50,6 +50,7 @@ def test_import_prints_what_it_took_and_what_it_assumed(run, tmp_path, make_trut
     arc = "exposure 8° in 1000 ms (assumed)"
     _, out, _ = run(blurred)
     assert f"timing: columns read in 750 ms, left first (assumed); {arc}; averages line integrals (assumed)\n" in out
+    assert "\nblur at the rim: 1.3 px, at half radius 0.66 px\n" in out  # 8° of 9.4 columns, off centre
     stated = w.write_tiff(tmp_path / "s", make_truth(fly=True), SHEET_TOML)
     order = "columns read in 300 ms, left first; 0.8 fps; exposure 8° in 400 ms"
     assumed = "angles as each frame opens (assumed); averages line integrals (assumed)"

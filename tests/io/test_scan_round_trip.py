@@ -23,6 +23,7 @@ from phyradgs_cl.acquisition import (
     Static,
 )
 from phyradgs_cl.acquisition.geometry import default_grid
+from phyradgs_cl.acquisition.plausible import blur_facts
 from phyradgs_cl.detector import counts_to_attenuation
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
@@ -336,6 +337,7 @@ def test_summary_tells_shape_timing_and_hash(path, make_scan) -> None:
     expected = {"projections": 4, "flats": 2, "darks": 2, "invalid": 1, "fly_scan": True, "reference": False}
     assert {name: facts[name] for name in expected} == expected
     assert facts["exposure_arc_deg"] == pytest.approx(3.0)
+    assert {name: facts[name] for name in blur_facts(scan)} == pytest.approx(blur_facts(scan)) and blur_facts(scan)
     assert facts["span_arc_deg"] == pytest.approx(3.0 * 1.1 / 0.8)
     assert facts["last_gantry_angle_deg"] == pytest.approx(58.0)
     assert facts["sha256"] == sha256_of(path) and len(sha256_of(path)) == 64

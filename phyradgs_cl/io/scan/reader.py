@@ -8,6 +8,7 @@ import numpy as np
 
 from phyradgs_cl import checks
 from phyradgs_cl.acquisition import CircularOrbit, EncoderTable, PoseTable, Scan
+from phyradgs_cl.acquisition.plausible import blur_facts
 from phyradgs_cl.acquisition.scan import APPLIED, applied_facts
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.io.files import sha256_of
@@ -76,8 +77,8 @@ def scan_summary(path: str | Path, sha256: str | None = None) -> dict[str, objec
 
 
 def _timing_facts(scan: Scan) -> dict[str, object]:
-    """Returns exposure, readout, and the arcs of the first frame where the gantry has an angle. A scan that stops has no
-    times unless its exposure is stated, since its frames' starts are only their order."""
+    """Returns exposure, readout, blur, and the arcs of the first frame where the gantry has an angle. A scan that stops has
+    no times unless its exposure is stated, since its frames' starts are only their order."""
     shutter = scan.shutter
     facts: dict[str, object] = {}
     if scan.is_fly or shutter.exposure_s > 0:
@@ -85,6 +86,7 @@ def _timing_facts(scan: Scan) -> dict[str, object]:
     if scan.is_fly:
         facts |= {"readout_axis": shutter.axis, "readout_direction": shutter.direction}
         facts["scan_s"] = float(np.ptp(scan.frame_start_s)) + shutter.span_s
+        facts |= blur_facts(scan)
     if isinstance(scan.trajectory, CircularOrbit):
         orbit, last = scan.trajectory, scan.frames - 1
         ends = [float(orbit.angle_rad(f, scan.frame_start_s[f : f + 1])[0]) for f in (0, last)]

@@ -1,0 +1,58 @@
+"""The blur of a fly-scan, by hand and by the paths of points on the panel."""
+
+import numpy as np
+import pytest
+
+from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, ConstantSpeed, Scan, Shutter
+from phyradgs_cl.acquisition.plausible import blur_facts, blur_line
+from phyradgs_cl.fields import Grid
+
+COLUMNS, PITCH_MM = 200, 0.5
+SPEED_DEG_PER_S = 10.0
+
+
+def scan_of(offset_mm: float = 0.0, pulse_s: tuple[float, float] | None = None, **changes: object) -> Scan:
+    """Ten frames of 4 × 200 pixels, 0.1 s each, at 10° per second: arcs of 1°."""
+    geometry = ConeGeometry(1000.0, 1500.0, (4, COLUMNS), PITCH_MM, (0.0, offset_mm))
+    orbit = CircularOrbit(geometry, ConstantSpeed(0.0, np.deg2rad(SPEED_DEG_PER_S)))
+    shutter = Shutter(0.1, 0.05, pulse_s=pulse_s)
+    start_s, grid = np.arange(10) * 0.2, Grid.cube(4, 10.0)
+    fields = {"is_fly": True, **changes}
+    return Scan(np.zeros((10, 4, COLUMNS), np.float32), geometry, orbit, shutter, start_s, grid, **fields)
+
+
+def test_an_arc_of_a_degree_on_two_hundred_columns() -> None:
+    """π/180 · 100 columns = 1.745."""
+    assert blur_facts(scan_of()) == pytest.approx({"blur_at_rim_px": 1.7453, "blur_at_half_radius_px": 0.8727}, rel=1e-4)
+    assert blur_line(scan_of()) == "blur at the rim: 1.7 px, at half radius 0.87 px"
+    assert blur_facts(scan_of(is_fly=False)) == {} and blur_line(scan_of(is_fly=False)) == ""
+
+
+@pytest.mark.parametrize(
+    ("offset_mm", "radius_px"), [(2.5, 95), (-2.5, 95), (10.0, 80), (12.5, 125), (-60.0, 220)]
+)
+def test_a_panel_off_centre(offset_mm, radius_px) -> None:
+    """By accident, up to 20 columns: the nearer side is the rim. On purpose: the farther one."""
+    assert blur_facts(scan_of(offset_mm))["blur_at_rim_px"] == pytest.approx(radius_px * np.pi / 180, rel=1e-6)
+
+
+def test_a_pulse_shortens_the_blur() -> None:
+    """Of the lines' windows 0 to 0.1 s, ..., 0.05 to 0.15 s the beam lights 20 ms: a fifth."""
+    assert blur_facts(scan_of(pulse_s=(0.06, 0.02)))["blur_at_rim_px"] == pytest.approx(1.7453 / 5, rel=1e-4)
+
+
+def test_points_move_so_far_on_the_panel() -> None:
+    """The longest of the paths of points all around, from their images at both ends of an exposure."""
+    scan = scan_of()
+    around_rad = np.linspace(0, 2 * np.pi, 720)
+    for name, share in (("blur_at_rim_px", 1.0), ("blur_at_half_radius_px", 0.5)):
+        radius_mm = share * COLUMNS / 2 * PITCH_MM / scan.geometry.magnification
+        points = radius_mm * np.stack([np.cos(around_rad), np.sin(around_rad), 0 * around_rad], -1)
+        ends = []
+        for pose in scan.trajectory.pose(0, np.array([0.0, 0.1])):
+            source, corner, step_u, step_v = pose.reshape(4, 3)
+            along = np.linalg.solve(np.stack([step_u, step_v, corner - source], axis=1), (points - source).T)
+            ends.append(along[0] / along[2])
+        longest = np.abs(ends[1] - ends[0]).max()
+        near = 1 / (1 - radius_mm / 1000.0)
+        assert blur_facts(scan)[name] <= longest <= 1.01 * near * blur_facts(scan)[name]
