@@ -1,3 +1,4 @@
+from .checkpoint import State as State
 from .frames.preprocess import Preprocessing as Preprocessing
 from .method import Method as Method
 from .options import method_options as method_options
@@ -15,7 +16,6 @@ from .result import Progress as Progress
 from .result import ProgressReport as ProgressReport
 from .result import Reconstruction as Reconstruction
 from .result import Report as Report
-from .result import State as State
 from .result import ignore_progress as ignore_progress
 from .result import interrupted as interrupted
 from .run import reconstruct as reconstruct

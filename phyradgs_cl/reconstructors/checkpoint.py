@@ -1,15 +1,16 @@
 """Checks of states from files, before a run resumes from them."""
 
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, TypeVar
 
 import numpy as np
 
 from phyradgs_cl import checks
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.reconstructors.result import State, state_arrays
 
+State = Mapping[str, np.ndarray]
+"""The state of an interrupted run as named arrays, from which it resumes. Each method has its own names."""
 RUN = "run"
 """The array of a state that holds the identity of its run, as JSON."""
 _REMEDY = "start without --resume"
@@ -40,6 +41,19 @@ def _differences(then: object, now: object, name: str = "") -> Iterator[str]:
             yield from _differences(then.get(key), now.get(key), f"{name}.{key}" if name else key)
     elif then != now:
         yield f"{name[:_LONGEST_NAME]} ({checks.short_repr(then)}, now {checks.short_repr(now)})"
+
+
+def state_arrays(state: State, names: Sequence[str]) -> list[np.ndarray]:
+    """Returns arrays of a state by name; raises InputError for a state that lacks one."""
+    missing = sorted(set(names) - set(state))
+    if missing:
+        raise InputError("checkpoint", f"no {', '.join(missing)}", "a whole checkpoint", _REMEDY)
+    return [state[name] for name in names]
+
+
+def history_arrays(record: Sequence[Mapping[str, float]], seconds: float) -> dict[str, np.ndarray]:
+    """Returns a convergence record and the seconds so far as arrays of a state."""
+    return {"record": np.array(json.dumps(list(record))), "seconds": np.array(seconds)}
 
 
 def check_like(state: State, like: Mapping[str, np.ndarray]) -> None:

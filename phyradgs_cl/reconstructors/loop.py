@@ -12,50 +12,42 @@ import numpy as np
 from phyradgs_cl.errors import NumericalError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.parallel import Communicator
-from phyradgs_cl.reconstructors.checkpoint import checked_history
-from phyradgs_cl.reconstructors.result import Progress, ProgressReport, State, history_arrays
+from phyradgs_cl.reconstructors.checkpoint import State, checked_history, history_arrays
+from phyradgs_cl.reconstructors.result import Progress, ProgressReport
 from phyradgs_cl.signals import stop_on_interrupt
 
 SILENT_S = 10.0
 
 
 class Stepwise(Protocol):
-    """An iterative method, between its start and its result."""
+    """An iterative method, between its start and its result. ``quantity``: the name of the measure of convergence, loss or
+    residual, which must stay finite; ``remedy``: advice where it does not; ``iterations``: to do."""
 
     quantity: str
-    """The name of the measure of convergence in ``measures``: loss or residual. It must stay finite."""
     remedy: str
-    """Advice for a run whose measure does not stay finite."""
     iterations: int
-    """Iterations to do."""
 
     @property
     def iteration(self) -> int:
         """Finished iterations. A step may make several, or a part of one."""
-        ...
 
     @property
     def finished(self) -> str | None:
         """The reason for which the method has ended before its last iteration, or None."""
-        ...
 
     def step(self) -> None: ...
 
     def measures(self) -> Mapping[str, float]:
         """Returns a line of the record: ``quantity`` and other numbers."""
-        ...
 
     def state(self) -> dict[str, np.ndarray]:
         """Returns the arrays from which ``restore`` continues with the next step."""
-        ...
 
     def restore(self, state: State) -> None:
         """Restores a state; raises InputError for one that this run cannot have written."""
-        ...
 
     def present_volume(self) -> tuple[np.ndarray, Grid]:
         """Returns the present volume (nz, ny, nx) in 1/mm, and its grid in mm."""
-        ...
 
 
 class Loop:
@@ -114,20 +106,23 @@ class Loop:
     def _tell(self, before: int) -> bool:
         """Records and reports the step from iteration ``before``; returns True if the report asks to stop."""
         is_recorded = self._reaches(self.record_every, before)
-        is_reported = self._reaches(self.report_every, before) or self._was_silent_long(before)
+        is_slow = time.perf_counter() - self._reported > SILENT_S and self.ranks.size == 1  # ranks do not agree on a time
+        is_reported = self._reaches(self.report_every, before) or (is_slow and self.method.iteration > before)
         if not (is_recorded or is_reported):
             return False
-        measures = self._checked_measures()
+        measures, name = self.method.measures(), self.method.quantity
         iteration, seconds = self.method.iteration, self.seconds
+        if not np.isfinite(measures[name]):
+            found = f"{measures[name]} at iteration {iteration}"
+            raise NumericalError(name, found, "a finite number", self.method.remedy)
         if is_recorded:
             self.record.append({"iteration": iteration, **measures, "seconds": seconds})
         if not is_reported or self.ranks.rank > 0:  # rank 0 reports for all
             return False
         self._reported = time.perf_counter()
         progress = Progress(
-            iteration, self.method.iterations, measures[self.method.quantity],
-            int(measures.get("gaussians", 0)), seconds, quantity=self.method.quantity, state=self.state,
-            volume=self.method.present_volume,
+            iteration, self.method.iterations, measures[name], int(measures.get("gaussians", 0)), seconds,
+            quantity=name, state=self.state, volume=self.method.present_volume,
         )
         try:
             self.report(progress)
@@ -140,14 +135,3 @@ class Loop:
         now = self.method.iteration
         return now // every > before // every or now == self.method.iterations
 
-    def _was_silent_long(self, before: int) -> bool:
-        """True if the last report is long ago. Ranks report by iteration only, as they would have to agree on a time."""
-        is_slow = time.perf_counter() - self._reported > SILENT_S
-        return is_slow and self.ranks.size == 1 and self.method.iteration > before
-
-    def _checked_measures(self) -> Mapping[str, float]:
-        measures, name = self.method.measures(), self.method.quantity
-        if not np.isfinite(measures[name]):
-            found = f"{measures[name]} at iteration {self.method.iteration}"
-            raise NumericalError(name, found, "a finite number", self.method.remedy)
-        return measures

@@ -15,18 +15,17 @@ from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.neural import LineOptions, NeuralOptions, require_torch
-from phyradgs_cl.reconstructors.checkpoint import check_array, count_of, restore_generator
+from phyradgs_cl.reconstructors.checkpoint import (
+    State,
+    check_array,
+    count_of,
+    restore_generator,
+    state_arrays,
+)
 from phyradgs_cl.reconstructors.fdk import static_fdk
 from phyradgs_cl.reconstructors.loop import Loop
 from phyradgs_cl.reconstructors.method import Method
-from phyradgs_cl.reconstructors.result import (
-    ProgressReport,
-    Reconstruction,
-    State,
-    ignore_progress,
-    option_facts,
-    state_arrays,
-)
+from phyradgs_cl.reconstructors.result import ProgressReport, Reconstruction, ignore_progress, option_facts
 from phyradgs_cl.reconstructors.splats.start import internal_scale
 from phyradgs_cl.runtime import Runtime
 

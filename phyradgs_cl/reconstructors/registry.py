@@ -1,7 +1,8 @@
 """The methods by name, and the user's own. A new method is a file with a METHOD, and a line in METHODS."""
 
-from collections.abc import Iterator, Mapping, MutableMapping
+from collections import UserDict
 from importlib import import_module
+from typing import Any
 
 from phyradgs_cl import checks
 from phyradgs_cl.errors import InputError
@@ -10,31 +11,16 @@ from phyradgs_cl.reconstructors.result import function_name
 from phyradgs_cl.text import suggest_name
 
 
-class _Methods(MutableMapping[str, Method]):
+class _Methods(UserDict[str, Any]):
     """Methods by name, each imported when it is first used: imports take time."""
 
-    def __init__(self, places: Mapping[str, str]) -> None:
-        self._entries: dict[str, str | Method] = dict(places)
-
     def __getitem__(self, name: str) -> Method:
-        entry = self._entries[name]
+        entry = self.data[name]
         if isinstance(entry, str):
             module, _, attribute = entry.partition(":")
             entry = getattr(import_module(f"phyradgs_cl.reconstructors.{module}"), attribute or "METHOD")
-            self._entries[name] = entry
+            self.data[name] = entry
         return entry
-
-    def __setitem__(self, name: str, method: Method) -> None:
-        self._entries[name] = method
-
-    def __delitem__(self, name: str) -> None:
-        del self._entries[name]
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._entries)
-
-    def __len__(self) -> int:
-        return len(self._entries)
 
 
 DEFAULT_METHOD = "fista"

@@ -1,7 +1,6 @@
 """The result of every method, and its progress reports."""
 
-import json
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
 from typing import TYPE_CHECKING, Any
@@ -12,6 +11,7 @@ from phyradgs_cl import checks
 from phyradgs_cl.acquisition.motion import motion_facts
 from phyradgs_cl.errors import InputError, naming_arguments
 from phyradgs_cl.fields import Gaussians, Grid
+from phyradgs_cl.reconstructors.checkpoint import State
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -19,8 +19,6 @@ if TYPE_CHECKING:
     from phyradgs_cl.acquisition import Scan
     from phyradgs_cl.runtime import Runtime
 
-State = Mapping[str, np.ndarray]
-"""The state of an interrupted run as named arrays, from which it resumes. Each method has its own names."""
 VolumeMap = Callable[[np.ndarray, Grid], tuple[np.ndarray, Grid]]
 """A function from a volume and its grid to others."""
 HELD_OUT = "held_out"
@@ -181,16 +179,3 @@ def option_facts(options: Any) -> dict[str, object]:
     given = {name: getattr(options, name) for name in getattr(options, "FUNCTIONS", ())}
     named = {name: function_name(value) for name, value in given.items() if callable(value)}
     return {**asdict(replace(options, **named) if named else options), **own}
-
-
-def state_arrays(state: State, names: Sequence[str]) -> list[np.ndarray]:
-    """Returns arrays of a state by name; raises InputError for a state that lacks one."""
-    missing = sorted(set(names) - set(state))
-    if missing:
-        raise InputError("checkpoint", f"no {', '.join(missing)}", "a whole checkpoint", "start without --resume")
-    return [state[name] for name in names]
-
-
-def history_arrays(record: Sequence[Mapping[str, float]], seconds: float) -> dict[str, np.ndarray]:
-    """Returns a convergence record and the seconds so far as arrays of a state."""
-    return {"record": np.array(json.dumps(list(record))), "seconds": np.array(seconds)}

@@ -17,7 +17,7 @@ from phyradgs_cl.io.files import HOST_SHARE, free_bytes, host_bytes
 from phyradgs_cl.metrics import resampled, shared_slices
 from phyradgs_cl.prepare import PREPARED_KEY
 from phyradgs_cl.prepare.step import with_masked
-from phyradgs_cl.reconstructors.checkpoint import with_identity, without_identity
+from phyradgs_cl.reconstructors.checkpoint import State, with_identity, without_identity
 from phyradgs_cl.reconstructors.frames.preprocess import Preprocessing, prepared
 from phyradgs_cl.reconstructors.frames.projected import held_out, holdout_errors
 from phyradgs_cl.reconstructors.plan import InitialVolume, RunPlan
@@ -29,7 +29,6 @@ from phyradgs_cl.reconstructors.result import (
     ProgressReport,
     Reconstruction,
     Report,
-    State,
     ignore_progress,
 )
 from phyradgs_cl.reconstructors.tune.trials import tuned

@@ -26,8 +26,7 @@ from phyradgs_cl.prepare import (
 from phyradgs_cl.prepare.hardening import find_bone
 from phyradgs_cl.prepare.scatter import raised
 from phyradgs_cl.reconstructors import Preprocessing, preprocessing_of
-from phyradgs_cl.reconstructors.frames.preprocess import prepared
-from phyradgs_cl.reconstructors.frames.reprojection import reprojection
+from phyradgs_cl.reconstructors.frames.preprocess import prepared, reprojection
 
 LOST_DB = 0.05
 # effect, step, its options, least share of the loss that FDK gets back on this small scan

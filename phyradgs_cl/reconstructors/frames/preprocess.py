@@ -8,7 +8,7 @@ import numpy as np
 import scipy
 
 from phyradgs_cl import checks
-from phyradgs_cl.acquisition import Scan
+from phyradgs_cl.acquisition import LineMiddles, PerRow, Scan
 from phyradgs_cl.detector import without_lag
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import GridChoice
@@ -69,7 +69,7 @@ def prepared(scan: Scan, options: Preprocessing, rt: Runtime | None = None) -> S
     """Returns the scan for a method, on a grid with its margin; the scan itself if there is nothing to do.
 
     ``rt``: the device of steps that reconstruct and project."""
-    scan = prepare(regrid_and_remove_lag(scan, options), options, partial(_model, rt))
+    scan = prepare(regrid_and_remove_lag(scan, options), options, partial(reprojection, rt))
     if options.median_filter > 0:
         scan = replace(scan, projections=median_frames(scan, options.median_filter))
     return scan
@@ -79,7 +79,7 @@ def stages(scan: Scan, options: Preprocessing, rt: Runtime) -> Iterator[tuple[st
     """Yields (name, scan, numbers) before the steps of ``options`` and after each of them."""
     scan = regrid_and_remove_lag(scan, options)
     yield "", scan, {}
-    yield from one_by_one(scan, options, partial(_model, rt))
+    yield from one_by_one(scan, options, partial(reprojection, rt))
 
 
 def regrid_and_remove_lag(scan: Scan, options: Preprocessing) -> Scan:
@@ -89,12 +89,28 @@ def regrid_and_remove_lag(scan: Scan, options: Preprocessing) -> Scan:
     return scan if options.ignore_lag else without_lag(scan)
 
 
-def _model(rt: Runtime | None, scan: Scan) -> Model:
+def reprojection(rt: Runtime | None, scan: Scan) -> Model:
+    """Returns FDK with every line at the middle of its own exposure, and projection at the same times."""
     if rt is None:
         raise InputError("--steps", "a step that reconstructs, without a device", "a Runtime", "pass one")
-    from phyradgs_cl.reconstructors.frames.reprojection import reprojection  # methods are slow to import
+    from phyradgs_cl.operators import RayOperator  # methods are slow to import
+    from phyradgs_cl.reconstructors.fdk import FdkOptions, fdk
+    from phyradgs_cl.reconstructors.voxels import fista_tv
 
-    return reprojection(rt, scan)
+    motion = LineMiddles()
+    fdk_options = FdkOptions(window="hann", motion=motion)
+    tv_options = fista_tv.FistaTvOptions(motion=PerRow(sub_intervals=2), iterations=30, tv_weight=0.002)
+    tables = [motion.cells(scan, frame).still() for frame in range(scan.frames)]
+    operator = RayOperator(rt, scan.grid, scan.geometry.detector_shape, tables)
+
+    def of(frames: np.ndarray) -> Scan:
+        return replace(scan, projections=np.asarray(frames, np.float32))
+
+    return Model(
+        volume=lambda frames: fdk(of(frames), fdk_options, rt).volume,
+        frames=operator.forward,
+        regularised=lambda frames: fista_tv.METHOD.run(of(frames), tv_options, rt).volume,
+    )
 
 
 def median_frames(scan: Scan, edge: int) -> np.ndarray:

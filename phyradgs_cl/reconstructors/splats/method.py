@@ -19,16 +19,11 @@ from phyradgs_cl.acquisition import Exact, Scan
 from phyradgs_cl.operators.splats.projector import PAIR_KERNELS
 from phyradgs_cl.operators.splats.work import Work
 from phyradgs_cl.optim import Population
+from phyradgs_cl.reconstructors.checkpoint import State
 from phyradgs_cl.reconstructors.fdk import static_fdk
 from phyradgs_cl.reconstructors.loop import Loop
 from phyradgs_cl.reconstructors.method import Method
-from phyradgs_cl.reconstructors.result import (
-    ProgressReport,
-    Reconstruction,
-    State,
-    ignore_progress,
-    option_facts,
-)
+from phyradgs_cl.reconstructors.result import ProgressReport, Reconstruction, ignore_progress, option_facts
 from phyradgs_cl.reconstructors.splats.device import Scale
 from phyradgs_cl.reconstructors.splats.options import PRESETS, R2_PUBLISHED, SplatOptions
 from phyradgs_cl.reconstructors.splats.run import SplatRun
@@ -36,11 +31,6 @@ from phyradgs_cl.reconstructors.splats.start import first_population, internal_s
 from phyradgs_cl.runtime import Runtime
 
 REPORT_EVERY, LEAST_RECORDED = 50, 20
-
-
-def record_interval(iterations: int) -> int:
-    """Returns the iterations per line of the record: as for reports, but fewer in short runs, to show their course."""
-    return max(1, min(REPORT_EVERY, iterations // LEAST_RECORDED))
 
 
 def reconstruct_splats(
@@ -56,7 +46,8 @@ def reconstruct_splats(
     scale, population, rng = rt.ranks.bcast(first_cloud(rt, scan, options, seed, initial) if rt.ranks.rank == 0 else None)
     first_count = population.count
     run = SplatRun(rt, scan, options, scale, population, rng)
-    loop = Loop(run, rt.ranks, report, started, record_interval(options.iterations), REPORT_EVERY)
+    record_every = max(1, min(REPORT_EVERY, options.iterations // LEAST_RECORDED))  # short runs show their course too
+    loop = Loop(run, rt.ranks, report, started, record_every, REPORT_EVERY)
     loop.run(resume)
     cloud = run.present_cloud()
     volume = run.present_volume()[0]
@@ -78,9 +69,10 @@ def reconstruct_splats(
         "ranks": rt.ranks.size,
     }
     if isinstance(options.motion, Exact):
-        facts |= time_facts(run)
-    if rt.profile:
-        facts["evaluated_pairs"] = evaluated_pairs(run)
+        # How the motion averaged over time: a frame's largest K, and the share of pairs by rule
+        facts |= {"segments": run.frames.most_cells, "time_rules": _first_frame_work(run).rule_shares()}
+    if rt.profile:  # the Gaussian-pixel pairs that each kernel evaluates for the last cloud in the first frame
+        facts["evaluated_pairs"] = dict.fromkeys(PAIR_KERNELS, _first_frame_work(run).evaluated)
     cloud = cloud.scaled(scale.length_mm, scale.density_per_mm)
     return Reconstruction(volume, scan.grid, cloud, loop.record, facts, loop.state_if_interrupted())
 
@@ -94,16 +86,6 @@ def first_cloud(
     rng = np.random.default_rng(seed)
     grid = scan.grid.scaled(1 / scale.length_mm)
     return scale, first_population(first / scale.density_per_mm, grid, options, rng), rng
-
-
-def time_facts(run: SplatRun) -> dict[str, object]:
-    """Returns how the motion ``exact`` averaged over time: a frame's largest K, and the share of pairs by rule."""
-    return {"segments": run.frames.most_cells, "time_rules": _first_frame_work(run).rule_shares()}
-
-
-def evaluated_pairs(run: SplatRun) -> dict[str, int]:
-    """Returns the Gaussian–pixel pairs that each kernel evaluates for the last cloud in the first frame."""
-    return dict.fromkeys(PAIR_KERNELS, _first_frame_work(run).evaluated)
 
 
 def _first_frame_work(run: SplatRun) -> Work:

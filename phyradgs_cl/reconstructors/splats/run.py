@@ -11,8 +11,13 @@ from phyradgs_cl.fields import Gaussians, Grid
 from phyradgs_cl.fields.gaussians import SCALE
 from phyradgs_cl.operators import voxelise
 from phyradgs_cl.optim import Population, control_density
-from phyradgs_cl.reconstructors.checkpoint import check_cloud, count_of, restore_generator
-from phyradgs_cl.reconstructors.result import State, state_arrays
+from phyradgs_cl.reconstructors.checkpoint import (
+    State,
+    check_cloud,
+    count_of,
+    restore_generator,
+    state_arrays,
+)
 from phyradgs_cl.reconstructors.splats.device import DeviceCloud, Scale
 from phyradgs_cl.reconstructors.splats.options import SplatOptions
 from phyradgs_cl.reconstructors.splats.start import box_of

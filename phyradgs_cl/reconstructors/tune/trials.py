@@ -19,14 +19,13 @@ from phyradgs_cl.checks import ceil_div
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.prepare.step import with_masked
-from phyradgs_cl.reconstructors.checkpoint import parsed
+from phyradgs_cl.reconstructors.checkpoint import State, parsed
 from phyradgs_cl.reconstructors.frames.projected import held_out, holdout_errors
 from phyradgs_cl.reconstructors.result import (
     Progress,
     ProgressReport,
     Reconstruction,
     Report,
-    State,
     ignore_progress,
 )
 from phyradgs_cl.reconstructors.tune import TUNED, TuningRequest, is_tuning, with_chosen, with_value

@@ -12,8 +12,8 @@ from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.checks import ranged
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.objective import TvDescent
+from phyradgs_cl.reconstructors.checkpoint import State, state_arrays
 from phyradgs_cl.reconstructors.fdk import static_fdk
-from phyradgs_cl.reconstructors.result import State, state_arrays
 from phyradgs_cl.reconstructors.voxels.run import Algorithm, MethodInputs, voxel_method
 from phyradgs_cl.reconstructors.voxels.sart import Sart, SartOptions, held_volumes
 from phyradgs_cl.reconstructors.voxels.system import System

@@ -18,8 +18,9 @@ from phyradgs_cl import checks
 from phyradgs_cl.acquisition import Motion, PerRow, Scan
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields.volume import MOST_VOXELS
+from phyradgs_cl.reconstructors.checkpoint import State, state_arrays
 from phyradgs_cl.reconstructors.method import Method
-from phyradgs_cl.reconstructors.result import Reconstruction, State, option_facts, state_arrays
+from phyradgs_cl.reconstructors.result import Reconstruction, option_facts
 from phyradgs_cl.reconstructors.voxels.prior_weight import PriorWeight, frame_error
 from phyradgs_cl.reconstructors.voxels.priors import (
     PRIORS,

@@ -13,9 +13,9 @@ from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.objective import DctProx, NonlocalStep, TvProx
 from phyradgs_cl.objective.dct_prox import TURNS
-from phyradgs_cl.reconstructors.checkpoint import count_of
+from phyradgs_cl.reconstructors.checkpoint import State, count_of, state_arrays
 from phyradgs_cl.reconstructors.method import imported
-from phyradgs_cl.reconstructors.result import State, function_name, state_arrays
+from phyradgs_cl.reconstructors.result import function_name
 from phyradgs_cl.runtime import Runtime, Space
 
 # shares of the prior's weight, by the prior (docs/results/settings.md)

@@ -15,17 +15,10 @@ from phyradgs_cl.acquisition import Motion, Scan, Static
 from phyradgs_cl.acquisition.motion import RAYS, check_motion, motions_for
 from phyradgs_cl.acquisition.scan import DETECTOR_MODELS
 from phyradgs_cl.fields import Grid
-from phyradgs_cl.reconstructors.checkpoint import check_like, count_of
+from phyradgs_cl.reconstructors.checkpoint import State, check_like, count_of, state_arrays
 from phyradgs_cl.reconstructors.loop import Loop
 from phyradgs_cl.reconstructors.method import Method
-from phyradgs_cl.reconstructors.result import (
-    ProgressReport,
-    Reconstruction,
-    State,
-    ignore_progress,
-    option_facts,
-    state_arrays,
-)
+from phyradgs_cl.reconstructors.result import ProgressReport, Reconstruction, ignore_progress, option_facts
 from phyradgs_cl.reconstructors.voxels.system import System
 from phyradgs_cl.runtime import Runtime
 

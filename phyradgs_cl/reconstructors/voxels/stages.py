@@ -12,15 +12,15 @@ from typing import Any
 import numpy as np
 
 from phyradgs_cl.fields import Grid
-from phyradgs_cl.reconstructors.checkpoint import check_array, checked_history, count_of
-from phyradgs_cl.reconstructors.result import (
-    Progress,
-    Reconstruction,
-    Report,
+from phyradgs_cl.reconstructors.checkpoint import (
     State,
+    check_array,
+    checked_history,
+    count_of,
     history_arrays,
     state_arrays,
 )
+from phyradgs_cl.reconstructors.result import Progress, Reconstruction, Report
 from phyradgs_cl.reconstructors.voxels.run import MethodInputs
 
 _STAGE, _VOLUME = "stage", "volume_before"  # entries of a state: the present stage, and the volume that it started from
