@@ -28,12 +28,6 @@ def test_every_error_is_a_phyradgs_error_with_its_exit_code() -> None:
         assert issubclass(kind, PhyradgsError) and kind.exit_code == code, name
 
 
-def test_errors_survive_pickling_as_worker_processes_need() -> None:
-    error = NumericalError("density", "NaN", "finite", "lower the learning rate")
-    copy = pickle.loads(pickle.dumps(error))
-    assert (type(copy), str(copy), copy.remedy) == (NumericalError, str(error), error.remedy)
-
-
 def test_in_python_errors_name_arguments_for_options() -> None:
     """But in commands and values, which are in quotes."""
     for text, told in (

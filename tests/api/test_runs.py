@@ -17,13 +17,6 @@ def test_every_exported_name_is_there() -> None:
     assert all(hasattr(api, name) for name in api.__all__)
 
 
-def test_a_scan_goes_to_a_file_and_back(scan, tmp_path) -> None:
-    api.save_scan(tmp_path / "scan.h5", scan)
-    again = api.load_scan(tmp_path / "scan.h5")
-    assert np.array_equal(again.projections, scan.projections)
-    assert np.array_equal(again.reference, scan.reference) and again.shutter == scan.shutter
-
-
 @pytest.mark.parametrize("method", ["sart", "phyradgs", "fused"])
 def test_a_reconstruction_goes_to_a_file_and_back(rt, scan, tmp_path, method) -> None:
     result = api.reconstruct(scan, method, iterations=2, device=rt)
@@ -111,13 +104,6 @@ def test_a_grid_is_given_or_described(rt, scan) -> None:
     assert described.grid == api.Grid(grid.shape, grid.voxel_size_mm)
     with pytest.raises(InputError, match="^roi_mm: "):
         api.reconstruct(scan, "fdk", roi_mm=(0, 1), device=rt)
-
-
-def test_a_simulation_takes_the_options_of_the_command(rt, scan) -> None:
-    assert scan.projections.shape == (6, 20, 20) and scan.grid.shape == (12, 12, 12)
-    noisy = api.simulate("jaw", size=12, detector=20, noise="beer", dose=100.0, seed=3, views=2, device=rt)
-    still = api.simulate("jaw", size=12, detector=20, protocol="static", views=3, device=rt)
-    assert len(noisy.projections) == 2 and noisy.is_fly and not still.is_fly
 
 
 def test_the_command_and_python_make_the_same_scan(rt, tmp_path) -> None:

@@ -347,11 +347,6 @@ def test_views_of_frames_that_overlap_have_no_place_in_a_file(refused, right, tm
     assert not (tmp_path / "out.h5").exists()
 
 
-def test_views_in_a_result_are_its_trajectory(right) -> None:
-    views = Views(np.zeros(15), np.zeros((15, 2)))
-    assert not isinstance(perturb(right, GeometryCorrection(), views).trajectory, CircularOrbit)
-
-
 def test_the_end_that_is_read_first_is_told_where_it_bends_the_object(cli, turned, tmp_path, capsys) -> None:
     """Columns bend it; rows twist it, which two turns tell and one does not."""
     words = ["--what", "direction", "--json"]

@@ -22,14 +22,6 @@ def run():
     return lambda *arguments: CliRunner().invoke(app, [str(a) for a in arguments])
 
 
-@pytest.mark.parametrize("to", EXPORTS)
-def test_every_format(run, volume_file, to) -> None:
-    done = run(volume_file, "--to", to)
-    assert done.exit_code == 0, done.output
-    assert to in done.output and done.output.count("\n") == 1
-    assert len(list(volume_file.parent.iterdir())) >= 2
-
-
 def test_the_output_s_suffix_says_the_format(run, volume_file, tmp_path) -> None:
     """An unknown one lists those that are known."""
     for name in ("a.nii.gz", "a.TIF", "a.mha", "a.ply"):

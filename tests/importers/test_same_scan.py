@@ -27,7 +27,7 @@ SAME = {
     "phyradgs by columns": ("phyradgs", {}, MOVING | {"direction": 1}, ImportOptions(exposure_s=0.4)),
     "phyradgs by rows": ("phyradgs", {}, MOVING | {"axis": "rows"}, ROWS),
     **{f"naf in {dtype}": ("naf", {"dtype": np.dtype(dtype)}, {}, ALL) for dtype in ("f8", ">f4", ">f8")},
-    **{f"naf, protocol {protocol}": ("naf", {"protocol": protocol}, {}, ALL) for protocol in range(6)},
+    "naf, protocol 2": ("naf", {"protocol": 2}, {}, ALL),
     **{
         f"rtk {name} {flip} {packed}": ("rtk", {"flip": flip, "compressed": packed, "name": name}, {}, None)
         for name in ("projections.mha", "projections.mhd") for flip in (False, True)

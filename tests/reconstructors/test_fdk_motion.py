@@ -18,7 +18,6 @@ from phyradgs_cl.acquisition import (
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.phantoms import Ellipsoid, EllipsoidPhantom
 from phyradgs_cl.reconstructors.fdk import FdkOptions, fdk, fdk_volume
-from phyradgs_cl.reconstructors.options import method_options
 
 VIEWS, PIXELS = 60, 48
 GRID = Grid.cube(36, 2.0)
@@ -104,10 +103,3 @@ def test_displaced_detectors_with_one_pose_per_line(rt, axis) -> None:
     static = fdk_volume(rt, frames, pose, GRID)
     per_row = fdk_volume(rt, frames, lines, GRID, axis=axis)
     np.testing.assert_allclose(per_row, static, rtol=0, atol=FLOAT32 * np.abs(static).max())
-
-
-def test_the_command_lines_names_reach_it() -> None:
-    options = method_options("fdk", "hann", {"motion": "per-row"})
-    assert options == FdkOptions("hann", options.motion)
-    assert options.motion.name == "per-row"
-    assert method_options("fdk", None, {"window": "cosine"}).window == "cosine"

@@ -84,13 +84,6 @@ def test_what_comes_back_is_the_gradient_of_the_misfit(rt, scan) -> None:
     assert by_derivative == pytest.approx(found, rel=1e-4)
 
 
-def test_masked_pixels_do_not_count(rt, scan, masked) -> None:
-    mask = np.zeros(GEOMETRY.detector_shape, np.uint8)
-    mask[5:9, 11] = 1
-    one, two = (run(rt, spoilt, "sart", "intensity", iterations=2) for spoilt in masked(scan, mask))
-    np.testing.assert_array_equal(one.volume, two.volume)
-
-
 def test_splats_on_a_gantry_at_rest_have_one_value_to_average(rt, scan) -> None:
     by_log, by_intensity = (
         run(rt, scan, "phyradgs exact", model, motion="static", iterations=3)

@@ -249,13 +249,6 @@ def test_files_of_another_kind_are_named_and_inputs_never_replaced(files, tmp_pa
     assert not list(tmp_path.iterdir())
 
 
-def test_the_command_writes_a_page_and_says_so(cli, files, tmp_path, capsys) -> None:
-    page = tmp_path / "p.html"
-    assert cli.run(["report", str(files[1]), "-o", str(page), "--views", "1"]) == 0
-    assert capsys.readouterr().out.startswith(f"{page}: ")
-    assert page.read_text(encoding="utf-8").count('class="view"') == 1
-
-
 def test_steps_before_the_method_are_shown(rt, small_scan, tmp_path, parse) -> None:
     """A frame, a sinogram and a slice before and after, their differences and a histogram for each; of a scan that was
     prepared already, its numbers."""
