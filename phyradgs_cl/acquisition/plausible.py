@@ -13,6 +13,7 @@ from phyradgs_cl.fields import Grid
 
 log = logging.getLogger(__name__)
 _WIDEST_DEG = 120.0  # of a panel seen from the source; dental scanners reach 30, nano-CT 60
+_LARGEST_PITCH_MM, _LEAST_DISTANCE_MM = 5.0, 10.0  # of a panel's pixel; from the source to a panel under a wide angle
 _WRONG_UNIT = 100.0  # readout over frame time: seconds given as milliseconds make it some hundreds
 _SHORT_READOUT_S, _MANY_LINES = 0.5e-3, 100  # real panels take some ms for hundreds of lines
 _SLOW_FPS, _LARGE_STEP_DEG = 2.0, 10.0  # a gantry that moves so far between frames takes them faster
@@ -125,13 +126,14 @@ def _joined(values: tuple[float, ...]) -> str:
 
 
 def check_plausible(scan: Scan, named: Named = str, is_timed: bool = True) -> None:
-    """Raises InputError for pixels, voxels and times that no scanner has.
+    """Raises InputError for pixels, voxels and times that no scanner has, and for line integrals that must be counts.
 
-    Warns of times most likely in a wrong unit, of angles that look like radians and of line integrals that look like
-    counts. ``named`` translates ``pixel_size_mm``, ``grid``, ``readout_s``, ``exposure_s``, ``frame_time_s``, ``angles`` and
-    ``quantity`` to the caller's names. ``is_timed``: False where nobody stated a time, so that a frame rate means nothing.
+    Warns of times most likely in a wrong unit, of angles that look like radians and of line integrals that may be counts.
+    ``named`` translates ``source_to_axis_mm``, ``source_to_detector_mm``, ``pixel_size_mm``, ``grid``, ``readout_s``,
+    ``exposure_s``, ``frame_time_s``, ``angles`` and ``quantity`` to the caller's names. ``is_timed``: False where nobody
+    stated a time, so that a frame rate means nothing.
     """
-    _check_panel(scan.geometry, named("pixel_size_mm"))
+    _check_panel(scan.geometry, named)
     _check_voxels(scan.grid, scan.geometry, named("grid"))
     angle_deg = np.rad2deg(np.unwrap(_source_angle_rad(scan, 0.0, scan.shutter.exposure_s)[:, 0]))
     looks_like_radians = _warn_of_radians(angle_deg, named("angles"))
@@ -140,10 +142,23 @@ def check_plausible(scan: Scan, named: Named = str, is_timed: bool = True) -> No
         _check_readout(scan, named("readout_s"))
         if is_timed:
             _warn_of_slow_frames(_frame_time_s(scan), angle_deg, named("frame_time_s"))
-    opaque = sum(np.count_nonzero(frame[valid] > OPAQUE) for frame, valid in zip(scan.projections, scan.valid, strict=True))
+    _check_opaque(scan, named("quantity"))
+
+
+def _check_opaque(scan: Scan, subject: str) -> None:
+    """Raises InputError where most pixels are darker than a panel can measure: these are counts, whose air is bright. Warns
+    where some pixels are."""
+    pairs = zip(scan.projections, scan.valid, strict=True)
+    counts = [(np.count_nonzero(frame[valid] > OPAQUE), np.count_nonzero(valid)) for frame, valid in pairs]
+    opaque, valid_pixels = np.sum(counts, axis=0).tolist()
+    largest = _largest(scan)
+    if opaque > valid_pixels / 2:
+        found = f"line integrals of up to {largest:.3g}, most above {OPAQUE:g}"
+        remedy = "say counts, with flats; line integrals in another unit: divide them by it first"
+        raise InputError(subject, found, "−ln(counts / flats), which is below 20 behind most objects", remedy)
     if opaque > FEW * scan.projections.size:
         text = "line integrals of up to %.3g: no panel sees through more than %g; are they counts? say %s"
-        log.warning(text, _largest(scan), OPAQUE, named("quantity"))
+        log.warning(text, largest, OPAQUE, subject)
 
 
 def _warn_of_radians(angle_deg: np.ndarray, subject: str) -> bool:
@@ -156,13 +171,22 @@ def _warn_of_radians(angle_deg: np.ndarray, subject: str) -> bool:
     return looks_so
 
 
-def _check_panel(geometry: ConeGeometry, subject: str) -> None:
+def _check_panel(geometry: ConeGeometry, named: Named) -> None:
+    """Raises InputError for a panel seen under a wide angle. Names the distances where they are too short for any panel
+    and the pixels are not too large, else the pixels."""
     widest_deg = max(_cone_deg(geometry))
-    if widest_deg > _WIDEST_DEG:
-        pitch_mm = " × ".join(f"{pitch:g}" for pitch in geometry.pixel_size_mm)
-        found = f"pixels of {pitch_mm} mm, a panel seen under {widest_deg:.0f}°"
-        remedy = "give the pitch of one pixel in mm: not in µm, and not the panel's width"
-        raise InputError(subject, found, f"less than {_WIDEST_DEG:.0f}°", remedy)
+    if widest_deg <= _WIDEST_DEG:
+        return
+    subject = named("pixel_size_mm")
+    found = f"pixels of {' × '.join(f'{pitch:g}' for pitch in geometry.pixel_size_mm)} mm"
+    remedy = "give the pitch of one pixel in mm: not in µm, and not the panel's width"
+    are_pixels_real = max(geometry.pixel_size_mm) <= _LARGEST_PITCH_MM
+    if are_pixels_real and geometry.source_to_detector_mm < _LEAST_DISTANCE_MM:
+        subject = f"{named('source_to_axis_mm')}, {named('source_to_detector_mm')}"
+        found = f"{geometry.source_to_axis_mm:g} and {geometry.source_to_detector_mm:g} mm"
+        remedy = "give distances in mm: not in m or cm"
+    found += f", a panel seen under {widest_deg:.0f}°"
+    raise InputError(subject, found, f"less than {_WIDEST_DEG:.0f}°", remedy)
 
 
 def _check_voxels(grid: Grid, geometry: ConeGeometry, subject: str) -> None:

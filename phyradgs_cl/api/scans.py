@@ -26,6 +26,7 @@ log = logging.getLogger(__name__)
 # the arguments of ``fly_scan`` that have another name in a Scan
 _ARGUMENTS = {
     "angles": "angles_deg", "exposure_s": "exposure_deg", "readout_s": "readout_ratio", "readout_axis": "readout",
+    "source_to_axis_mm": "geometry.source_to_axis_mm", "source_to_detector_mm": "geometry.source_to_detector_mm",
 }  # fmt: skip
 _SLACK = 1e-3  # relative: angles come rounded
 _AIR_SLACK = 0.2  # of a transmission, with noise

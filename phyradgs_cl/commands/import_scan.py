@@ -7,6 +7,8 @@ from typing import Annotated, Any, Literal
 import numpy as np
 import typer
 
+from phyradgs_cl.acquisition import Scan
+from phyradgs_cl.acquisition.scan import APPLIED
 from phyradgs_cl.commands.console import file_argument, file_option, option, remark, say
 from phyradgs_cl.commands.options import (
     DETECTOR_OFFSET,
@@ -119,8 +121,17 @@ def import_command(
     unusable = [] if bad.ndim < 3 else np.flatnonzero(bad.all((1, 2))).tolist()
     if unusable:
         remark(f"no pixel can be used in {len(unusable)} frames (from 0): {', '.join(map(str, unusable[:10]))}")
-    kind = "fly-scan" if scan.is_fly else "at rest"
-    say(f"{output}: {format_name}, {frames} frames of {rows}×{columns}, {kind}, {masked} pixels masked\n{scan.summary()}")
+    facts = [f"{frames} frames of {rows}×{columns}", *_applied_in_words(scan), "fly-scan" if scan.is_fly else "at rest"]
+    say(f"{output}: {format_name}, {', '.join(facts)}, {masked} pixels masked\n{scan.summary()}")
+
+
+def _applied_in_words(scan: Scan) -> list[str]:
+    """Returns the numbers of flats and darks that were applied, as ["10 flats and 5 darks applied"]; [] without any."""
+    counts = [scan.provenance.get(key, 0) for key in APPLIED]
+    if not any(counts):
+        return []
+    words = [f"{count} {name}{'' if count == 1 else 's'}" for count, name in zip(counts, ("flat", "dark"), strict=True)]
+    return [f"{' and '.join(words)} applied"]
 
 
 def _refuse_overwriting(source: Path, output: Path) -> None:

@@ -38,10 +38,10 @@ def assemble_scan(
         lag=lag,
         saturation=integrals.saturation,
     )
-    scan.warn_of_near_panel()
     subjects = {"grid": f"{source} grid", "angles": f"{source} angles", **(names or {})}
     is_timed = "exposure" not in assumed  # by convention an exposure of 1 s: the frame rate means nothing then
     check_plausible(scan, lambda name: subjects.get(name) or options.called(name), is_timed)
+    scan.warn_of_near_panel()
     return scan
 
 

@@ -75,8 +75,15 @@ def test_words_that_contradict_each_other_are_refused_in_one_line() -> None:
 
 def test_numbers_that_no_scanner_has_are_refused() -> None:
     wide = ConeGeometry(300.0, 800.0, (6, 8), (1560.0, 1560.0))
+    in_metres = ConeGeometry(0.5, 0.8, (6, 8), (0.4, 0.4))
     assert_refused({
         "^pixel_size_mm: found pixels of 1560 × 1560 mm.*µm": lambda: static_scan(FRAMES, wide, TURN_DEG),
+        "^geometry.source_to_axis_mm, geometry.source_to_detector_mm: found 0.5 and 0.8 mm, .*not in m": lambda: static_scan(
+            FRAMES, in_metres, TURN_DEG
+        ),
+        "^quantity: found line integrals of up to 3e.04, most above 50; .*say counts, with flats": lambda: static_scan(
+            np.full_like(FRAMES, 30_000.0), CONE, TURN_DEG, quantity="attenuation"
+        ),
         "^grid: found 1×1×1 voxels of 585 mm; expected voxels of about 0.25": lambda: static_scan(
             FRAMES, CONE, TURN_DEG, grid=Grid((1, 1, 1), (585.0,) * 3)
         ),
@@ -98,7 +105,8 @@ def _tall() -> tuple[np.ndarray, ConeGeometry]:
 
 
 def test_numbers_that_hardly_a_scanner_has_are_warned_of(caplog) -> None:
-    opaque = np.full_like(FRAMES, 60.0)
+    opaque = FRAMES.copy()
+    opaque[..., :2] = 60.0
     for words, make in {
         "^angles_deg: 12 frames within 5.76°: are they radians": lambda: static_scan(FRAMES, CONE, np.deg2rad(TURN_DEG)),
         "line integrals of up to 60: .* counts": lambda: static_scan(opaque, CONE, TURN_DEG, quantity="attenuation"),

@@ -46,11 +46,12 @@ def test_clipped_counts_are_masked_in_their_own_frames(caplog) -> None:
     noise = np.random.default_rng(0).normal(0, 60, (3, 40, 40))
     frames = np.minimum(30000 + 500 * np.arange(40) + noise, 40000).round().astype(np.uint16)
     frames[2] -= 11000  # this one is dark enough
-    found = line_integrals("f", frames, ImportOptions(flat_value=50000.0))
+    darks = np.zeros((1, 40, 40))
+    found = line_integrals("f", frames, ImportOptions(flat_value=50000.0), darks=darks)
     np.testing.assert_array_equal(found.mask, frames == 40000)
     share = np.mean(frames == 40000)
     assert found.saturation == Saturation(40000.0, share) and not found.mask[2].any()
-    same = line_integrals("f", frames, ImportOptions(flat_value=40000.0))
+    same = line_integrals("f", frames, ImportOptions(flat_value=40000.0), darks=darks)
     assert same.mask is None and same.saturation == found.saturation and (same.values[frames == 40000] == 0).all()
     text = f"f: {100 * share:.3g} % of the projections' pixels are clipped at 40000 counts: "
     assert caplog.messages == [

@@ -116,6 +116,49 @@ def test_absurd_sizes_are_refused_at_import(run, tmp_path, make_truth, caplog) -
     assert "[angles]: 12 frames within 5.8°: are they radians?" in caplog.text
 
 
+def test_distances_in_metres_are_blamed_and_not_the_pixels(run, tmp_path, make_truth, caplog) -> None:
+    data = w.write_data_exchange(tmp_path / "dx.h5", make_truth())
+    status, _, error = run(data, "--source-to-axis-mm", "0.5", "--source-to-detector-mm", "0.8")
+    assert status == 2 and error.count("\n") == 1 and "the panel stands" not in caplog.text
+    assert "--source-to-axis-mm, --source-to-detector-mm: found 0.5 and 0.8 mm, a panel seen under" in error
+    folder = w.write_tiff(tmp_path / "tiff", make_truth())
+    text = re.sub(r"to_(axis|detector)_mm = (\d)00.0", r"to_\1_mm = 0.\2", (folder / "scan.toml").read_text())
+    (folder / "scan.toml").write_text(re.sub(r"\[volume\](\n.* = .*)*", "", text))
+    assert "[source] to_axis_mm, [source] to_detector_mm: found 0.5 and 0.8 mm" in run(folder)[2]
+
+
+def test_import_says_which_flats_and_darks_it_applied_and_warns_of_none(run, tmp_path, make_truth, caplog) -> None:
+    folder = w.write_tiff(tmp_path / "tiff", make_truth())
+    assert "6 frames of 10×14, 2 flats and 3 darks applied, at rest, 0 pixels masked" in run(folder)[1]
+    assert not caplog.messages
+    assert "0 flats and 3 darks applied" in run(folder, "--flat-value", "5e4")[1]
+    run(folder, "--quantity", "transmission")
+    assert "flats and darks are left out, because the projections hold transmission" in caplog.text
+    caplog.clear()
+    text = (folder / "scan.toml").read_text()
+    (folder / "scan.toml").write_text(text.replace('darks = "dark_*.tif"', ""))
+    assert "2 flats and 0 darks applied" in run(folder)[1]
+    assert "scan.toml: counts without darks: an offset of the panel stays" in caplog.text
+    assert "applied" not in run(w.write_r2(tmp_path / "r", make_truth()))[1]
+
+
+def test_counts_called_attenuation_are_refused(run, tmp_path, make_truth) -> None:
+    status, _, error = run(w.write_tiff(tmp_path / "tiff", make_truth()), "--quantity", "attenuation")
+    assert status == 2 and error.count("\n") == 1 and "--quantity: found line integrals of up to" in error
+
+
+def test_the_model_of_the_panel_may_stand_in_the_toml(run, tmp_path, make_truth) -> None:
+    truth = make_truth(fly=True)
+    sheet = SHEET_TOML.replace("[readout]", 'detector_model = "intensity"\n[readout]').replace('"left"', '"bottom"')
+    folder = w.write_tiff(tmp_path / "a", truth, sheet)
+    _, out, _ = run(folder)
+    assert "averages intensity\n" in out
+    assert read_scan(tmp_path / "scan.h5", counts_to_attenuation).detector_model == "intensity"
+    assert import_scan(folder, ImportOptions(detector_model="log")).detector_model == "log"
+    bad = w.write_tiff(tmp_path / "b", truth, sheet.replace("intensity", "intensty"))
+    assert "[timing] detector_model: found 'intensty'" in run(bad)[2]
+
+
 def test_distances_and_pulses_are_named_by_the_door(run, tmp_path, make_truth) -> None:
     data = w.write_data_exchange(tmp_path / "dx.h5", make_truth())
     words = ("--source-to-axis-mm", "800", "--source-to-detector-mm", "500")

@@ -25,7 +25,7 @@ FLY = ImportOptions(exposure_s=0.5, readout_s=0.25, frame_time_s=1.0)
 @pytest.fixture
 def rtk_folder(tmp_path) -> Path:
     shutil.copy(RTK_FILE, tmp_path / "geometry.xml")
-    stack = sitk.GetImageFromArray(np.arange(3 * 10 * 14, dtype=np.float32).reshape(3, 10, 14))
+    stack = sitk.GetImageFromArray(np.arange(3 * 10 * 14, dtype=np.float32).reshape(3, 10, 14) / 64)
     stack.SetSpacing((*SPACING, 1.0))
     stack.SetOrigin((*ORIGIN, 0.0))
     sitk.WriteImage(stack, str(tmp_path / "stack.mha"))
@@ -50,7 +50,7 @@ def test_rtk_s_own_matrices_see_points_where_our_poses_do(rtk_folder) -> None:
             pose = scan.trajectory.pose(frame, np.array([at]))[0]
             expected = rtk_pixels(matrix, WORLD_POINTS)
             np.testing.assert_allclose(projected(pose, WORLD_POINTS), expected, atol=1e-6)
-    np.testing.assert_array_equal(scan.projections[1, 2, :3], 140 + 28 + np.arange(3))
+    np.testing.assert_array_equal(scan.projections[1, 2, :3], (140 + 28 + np.arange(3)) / 64)
 
 
 def test_rtk_s_poses_move_through_the_frames(rtk_folder) -> None:
@@ -75,13 +75,15 @@ def real_truth(make_truth):
     return make_truth(fly=True, axis="rows", direction=-1, geometry=REAL_GEOMETRY)
 
 
-def test_phyradgs_real(tmp_path, real_truth, assert_same) -> None:
+def test_phyradgs_real(tmp_path, real_truth, assert_same, caplog) -> None:
     path = write_phyradgs_real(tmp_path / "real", real_truth)
     assert recognise(path) == "phyradgs-real"
     scan = import_scan(path, REAL)
     # counts of 16 bits: half a count of 50,000 · exp(−1.5) is 5e-5
     assert_same(scan, real_truth, grid=False, pixels=1e-4)
+    assert "counts without flats" not in caplog.text
     brightest = import_scan(path, replace(REAL, flat_value=None))
+    assert "counts without flats: the brightest pixel, 50000 counts, is taken as air; else say flat_value" in caplog.text
     np.testing.assert_allclose(brightest.projections, scan.projections, atol=1e-4)
 
 

@@ -4,6 +4,7 @@ A view's ``detector`` is a 4×4 matrix from the panel to the world (mm): column 
 down them, column 3 the panel's centre. It holds where the panel stands on its circle, else turned about +z by its
 angle. The first stored row is read first."""
 
+import logging
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -23,6 +24,7 @@ from phyradgs_cl.importers.reading.files import SafeFolder, check_numbering, rea
 from phyradgs_cl.importers.reading.frames import line_integrals
 from phyradgs_cl.io.tables import Fields
 
+_log = logging.getLogger(__name__)
 OPTIONS = (
     *("exposure_s", "readout_axis", "readout_direction", "pixel_size_mm", "quantity", "flat_value", "detector_model"),
     "first_view",
@@ -94,7 +96,7 @@ def import_scan(path: Path, options: ImportOptions) -> Scan:
     poses = turn.poses(poses, panel)
     times = timing.start_s[:, None] + np.linspace(0, shutter.span_s, _TIMES_A_FRAME)
     integrals = line_integrals(
-        str(description), turn.frames(frames), _with_flat(options, frames), convention="counts"
+        str(description), turn.frames(frames), _with_flat(str(description), options, frames), convention="counts"
     )
     trajectory = PoseTable(times.ravel(), poses.reshape(-1, 12), f"{description} views")
     plain = plain_geometry(poses[:, 0], panel)
@@ -123,13 +125,15 @@ def _frames_and_views(
     return frames, views
 
 
-def _with_flat(options: ImportOptions, frames: np.ndarray) -> ImportOptions:
+def _with_flat(subject: str, options: ImportOptions, frames: np.ndarray) -> ImportOptions:
     """Takes the brightest pixel of all frames for air where no flat value is given, as the published code does."""
     if options.flat_value is not None or options.quantity not in (None, "counts"):
         return options
     brightest = float(frames.max())
     if not brightest > 0:
         raise InputError("frames", "nothing but zeros", "counts")
+    text = "%s: counts without flats: the brightest pixel, %g counts, is taken as air; else say %s"
+    _log.warning(text, subject, brightest, options.named("flat_value"))
     return replace(options, flat_value=brightest)
 
 

@@ -25,7 +25,7 @@ from phyradgs_cl.io.tables import Fields, read_toml, refuse_unknown
 OWN_TABLES = {
     "frames": ("projections", "flats", "darks", "mask", "quantity", "flat_value", "row_0", "column_0"),
     "angles": ("first_deg", "last_deg", "step_deg", "values_deg", "file", "unit", "rotates", "at"),
-    "timing": ("exposure_s", "readout_s", "frame_time_s", "start_s"),
+    "timing": ("exposure_s", "readout_s", "frame_time_s", "start_s", "detector_model"),
 }
 _TO_RAD = {"deg": np.pi / 180, "rad": 1.0}
 _PER_FRAME, _ANGLES = ("values_deg", "file"), ("step_deg", "last_deg", "values_deg", "file")
@@ -34,7 +34,8 @@ _KEYS = {  # by option: where the file states the same
     **{name: f"[readout] {name}" for name in ("first", "fps", "readout_ms")},
     **{name: f"[frames] {name}" for name in ("quantity", "flat_value", "row_0", "column_0")},
     **{"readout_axis": "[readout] axis", "readout_direction": "[readout] direction"},
-    **{"angle_at": "[angles] at", "rotates": "[angles] rotates"},
+    **{"angle_at": "[angles] at", "rotates": "[angles] rotates", "detector_model": "[timing] detector_model"},
+    **{"source_to_axis_mm": "[source] to_axis_mm", "source_to_detector_mm": "[source] to_detector_mm"},
     "pixel_size_mm": "[detector] pixel_size_v_mm, pixel_size_u_mm",
 }
 _SCANNER = ("title", "source", "detector", "volume", "readout", "beam")
@@ -52,7 +53,7 @@ def import_scan(path: Path, options: ImportOptions) -> Scan:
     description = path if path.is_file() else folder.only("description of the scan", ".toml")
     tables = _tables(description)
     options = in_words_of_file(options)
-    combined = _with_file(options, tables["frames"], tables["angles"])
+    combined = _with_file(options, tables)
     stacks = _stacks(folder, tables["frames"], tables["angles"])
     frames, rows, columns = stacks["projections"].shape
     scanner = _scanner(description, tables[""], (rows, columns))
@@ -62,7 +63,7 @@ def import_scan(path: Path, options: ImportOptions) -> Scan:
     angle_rad = gantry_sign(combined, "gantry") * _angles_rad(folder, tables["angles"], frames)
     integrals = _line_integrals(stacks, combined, tables["frames"], str(description))
     return assemble_scan(
-        integrals, turning(geometry, angle_rad, timing), geometry, timing, options,
+        integrals, turning(geometry, angle_rad, timing), geometry, timing, combined,
         title=tables[""].word("title", default=folder.root.resolve().name), source=str(path),
         grid=scanner.grid if tables[""].has("volume") else None, lag=scanner.lag, names=_subjects(tables),
     )
@@ -95,10 +96,12 @@ def in_words_of_file(options: ImportOptions) -> ImportOptions:
     return replace(options, named=named)
 
 
-def _with_file(options: ImportOptions, frames: Fields, angles: Fields) -> ImportOptions:
+def _with_file(options: ImportOptions, tables: dict[str, Fields]) -> ImportOptions:
     """Returns the options, completed by values of the file with the same names."""
-    tables = {"quantity": frames, "row_0": frames, "column_0": frames, "rotates": angles}
-    combined: dict[str, Any] = {k: t.word(k, WORDS[k]) for k, t in tables.items() if t.has(k)}
+    frames = tables["frames"]
+    table_of = {"quantity": frames, "row_0": frames, "column_0": frames}
+    table_of |= {"rotates": tables["angles"], "detector_model": tables["timing"]}
+    combined: dict[str, Any] = {k: t.word(k, WORDS[k]) for k, t in table_of.items() if t.has(k)}
     if frames.has("flat_value"):
         combined["flat_value"] = frames.length("flat_value")
     return replace(options, **{k: v for k, v in combined.items() if not getattr(options, k)})

@@ -54,6 +54,7 @@ _TABLES: dict[str, dict[str, tuple[object, str]]] = {
         "readout_s": (0.062, "s, in place of readout_ms"),
         "frame_time_s": (0.0667, "s from frame to frame, in place of fps"),
         "start_s": ([0.0, 0.0667], "s, start of each frame, in place of fps"),
+        "detector_model": ("intensity", "what an exposure averages: intensity, as real panels do, or log (line integrals)"),
     },
     "readout": {
         "fps": (15.0, "frames per second of a gantry that never stops; without it every frame is taken at rest"),
@@ -91,7 +92,6 @@ def template_of(path: Path) -> str:
     }
     head = [
         f"# {frames} frames of {rows} × {columns} pixels. Fill in what says FILL IN, remove the # of a line that applies.",
-        "# A real panel averages intensity over an exposure: import with --detector-model intensity.",
         f"title = {_toml(path.resolve().name)}",
     ]
     return "\n".join([*head, *(line for name in _TABLES for line in _table(name, stated.get(name, {})))])

@@ -44,7 +44,9 @@ def line_integrals(
         remedy = f"say {options.named('quantity')} attenuation, transmission or counts"
         raise InputError(f"{subject} quantity", "nothing that says it", "what the pixels hold", remedy)
     saturation = flat = None
-    if quantity == "counts":
+    if quantity != "counts":
+        _warn_of_unused(subject, quantity, flats, darks)
+    else:
         if options.flat_value is not None or flats is None or len(flats) == 0:
             flats = _constant_flat(subject, frames, options)
         for stack in (flats, darks):
@@ -54,15 +56,24 @@ def line_integrals(
         with np.errstate(over="ignore", invalid="ignore"):
             flat = flats.mean(axis=0, dtype=np.float64)
             saturation = find_saturation(frames, flat)
+        if darks is None or len(darks) == 0:
+            _log.warning("%s: counts without darks: an offset of the panel stays in the line integrals", subject)
     integrals, unusable = frames_to_attenuation(frames, quantity, flats, darks, LARGEST_LINE_INTEGRAL)
     if quantity == "attenuation" and unusable.any():
         text = "%s: %d line integrals are not finite or beyond %g: masked"
         _log.warning(text, subject, np.count_nonzero(unusable), LARGEST_LINE_INTEGRAL)
     if flat is not None and saturation is not None and saturation.share > 0:
         _mask_clipped(subject, frames, flat, saturation, unusable)
-    is_divided = quantity == "counts" and options.flat_value is None
-    counts = [len(stack) if is_divided and stack is not None else 0 for stack in (flats, darks)]
+    are_applied = (quantity == "counts" and options.flat_value is None, quantity == "counts")
+    stacks = zip(are_applied, (flats, darks), strict=True)
+    counts = [len(stack) if applied and stack is not None else 0 for applied, stack in stacks]
     return LineIntegrals(integrals, compact(unusable), saturation, applied_facts(*counts))
+
+
+def _warn_of_unused(subject: str, quantity: str, flats: np.ndarray | None, darks: np.ndarray | None) -> None:
+    names = [name for name, stack in (("flats", flats), ("darks", darks)) if stack is not None and len(stack)]
+    if names:
+        _log.warning("%s: %s are left out, because the projections hold %s", subject, " and ".join(names), quantity)
 
 
 def _mask_clipped(
