@@ -148,17 +148,15 @@ class Pool:
                     seen_s = time.monotonic()
                 while waiting and len(running) < devices:
                     name = waiting.popleft()
-                    running[self._submit(function, name, arguments[name])] = name
+                    key = f"{name}-{time.time_ns():x}"  # unique: the scheduler must not return an earlier result
+                    how = {"key": key, "resources": {RESOURCE: 1}, "pure": False}
+                    running[self._client.submit(function, arguments[name], **how)] = name
                 report(len(running), devices)
                 for future in self._wait(running):
                     yield running.pop(future), self._result(future)
         finally:
             if self._client.status == "running":
                 self._client.cancel(list(running))
-
-    def _submit(self, function: Callable[[Any], Any], name: str, argument: Any) -> Any:
-        key = f"{name}-{time.time_ns():x}"  # unique: the scheduler must not return an earlier result
-        return self._client.submit(function, argument, key=key, resources={RESOURCE: 1}, pure=False)
 
     def _wait(self, running: Mapping[Any, str]) -> set[Any]:
         """Returns the futures that have finished, after at most ``_WAIT_S``."""

@@ -87,18 +87,13 @@ def fly_scan(
     first_rad = np.deg2rad(start_deg)
     last_rad = first_rad + np.deg2rad(exposure_deg)
     orbit = CircularOrbit(geometry, FrameSweeps(start_s, exposure_s, first_rad, last_rad))
-    _warn_of_exposure(steps)
+    least_step = steps.min(initial=np.inf)
+    if np.rad2deg(1 - _SLACK) < least_step < np.inf:
+        log.warning("exposure_deg: 1/%.3g of the step between frames: is it in radians? np.rad2deg(exposure)", least_step)
     called = {**_ARGUMENTS, "frame_time_s": "exposure_s" if fps is None else "fps"}
     called |= {"readout_s": "readout_ms"} if readout_ms is not None else {}
     called |= {"exposure_s": "exposure_s"} if has_exposure_s else {}
     return _scan(pixels, orbit, shutter, start_s, grid, True, others, called, has_exposure_s or fps is not None)
-
-
-def _warn_of_exposure(steps: np.ndarray) -> None:
-    """Warns of steps (F − 1,), in exposures, that suggest an exposure in radians."""
-    least_step = steps.min(initial=np.inf)
-    if np.rad2deg(1 - _SLACK) < least_step < np.inf:
-        log.warning("exposure_deg: 1/%.3g of the step between frames: is it in radians? np.rad2deg(exposure)", least_step)
 
 
 def static_scan(

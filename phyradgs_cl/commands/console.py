@@ -22,9 +22,6 @@ SHARED_BY_RANKS = ("reconstruct",)
 """Commands whose work ranks share; rank 0 alone runs the others."""
 
 
-# --- options and arguments --------------------------------------------------------------------------------------------
-
-
 def option(help: str, default: bool | str = True, *flags: str, **more: Any) -> Any:
     """An option with its help; ``default`` replaces the value in the help where it is text."""
     return typer.Option(*flags, help=help, show_default=default, **more)
@@ -49,9 +46,6 @@ def file_parser(subject: str) -> Callable[[str], Path]:
         return Path(text)
 
     return file
-
-
-# --- lines and statuses -----------------------------------------------------------------------------------------------
 
 
 def say(text: str) -> None:
@@ -112,9 +106,6 @@ def _value_of(parameter: Any, arguments: Sequence[str]) -> str | None:
     return None
 
 
-# --- help -------------------------------------------------------------------------------------------------------------
-
-
 class GroupedCommand(TyperCommand):
     """A command whose help lists its options under the headings of ``groups``, heading: names of parameters.
 
@@ -135,9 +126,6 @@ class GroupedCommand(TyperCommand):
             if records:
                 with formatter.section(name):
                     formatter.write_dl(records)
-
-
-# --- ranks under mpiexec ----------------------------------------------------------------------------------------------
 
 
 def takes_part(arguments: Sequence[str]) -> bool:

@@ -43,18 +43,15 @@ GROUPS = {
 ProtocolName = Literal[tuple(PROTOCOLS)]  # type: ignore[valid-type]
 Noise = Literal["none", "tigre", "beer"]
 _PHANTOM = f"Built-in phantom ({', '.join(PHANTOMS)}) or a TOML file of beads and wires."
+_NAMES = lambda incomplete: [name for name in PHANTOMS if name.startswith(incomplete)]  # noqa: E731
 _VOLUME = "Volume file: HDF5 with /volume (z, y, x), mha, nii, nrrd, npy or tiff."
 _PROTOCOL = "rapid: 25 frames of 14.4°; standard: 50 of 7.2°; static: rapid with a gantry that stops."
-
-
-def _phantoms(incomplete: str) -> list[str]:
-    return [name for name in PHANTOMS if name.startswith(incomplete)]
 
 
 def simulate_command(
     context: typer.Context,
     output: Output,
-    phantom: Annotated[str | None, option(_PHANTOM, "foot, without --volume", autocompletion=_phantoms)] = None,
+    phantom: Annotated[str | None, option(_PHANTOM, "foot, without --volume", autocompletion=_NAMES)] = None,
     volume: Annotated[Path | None, file_option(_VOLUME, "--volume")] = None,
     scanner: Annotated[str, option("Scanner by name (r2, carm) or a TOML file.")] = "r2",
     protocol: Annotated[ProtocolName, option(_PROTOCOL)] = "rapid",  # type: ignore[valid-type]

@@ -42,7 +42,11 @@ def export_volume(
     checks.one_of("--to", to, EXPORTS)
     path = Path(path)
     target = default_output(path, to) if output is None else Path(output)
-    _check_name(target, to, path)
+    suffixes = _suffixes(to)  # programs go by the suffix
+    if suffixes and not target.name.lower().endswith(suffixes):
+        raise InputError(f"output of --to {to}", str(target), f"a name that ends in {' or '.join(suffixes)}")
+    if target.resolve() == path.resolve():
+        raise InputError("output", f"the input {path} itself", "another name")
     if to in CLOUDS and mu_water_per_mm is not None:
         raise InputError("--mu-water-per-mm", f"with --to {to}", "voxels", "Gaussians stay in 1/mm")
     if to != "dicom" and labels is not None and labels.given:
@@ -95,12 +99,3 @@ def format_of(output: str | Path | None, subject: str = "--to") -> str:
 
 def _suffixes(to: str) -> tuple[str, ...]:
     return _SUFFIXES.get(to, (f".{to}",))
-
-
-def _check_name(target: Path, to: str, source: Path) -> None:
-    """Refuses a suffix of another format, since programs go by the suffix, and the input itself."""
-    suffixes = _suffixes(to)
-    if suffixes and not target.name.lower().endswith(suffixes):
-        raise InputError(f"output of --to {to}", str(target), f"a name that ends in {' or '.join(suffixes)}")
-    if target.resolve() == source.resolve():
-        raise InputError("output", f"the input {source} itself", "another name")

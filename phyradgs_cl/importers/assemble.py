@@ -45,12 +45,6 @@ def assemble_scan(
     return scan
 
 
-def with_options(geometry: ConeGeometry, options: ImportOptions) -> ConeGeometry:
-    """Returns the geometry with the distances, pixel sizes and offset of the options in place of the file's."""
-    own = geometry.source_to_axis_mm, geometry.source_to_detector_mm
-    return cone(options, *own, geometry.detector_shape, geometry.pixel_size_mm, geometry.detector_offset_mm)
-
-
 def cone(
     options: ImportOptions, to_axis_mm: float, to_detector_mm: float, panel: tuple[int, int],
     pitch_mm: tuple[float, ...], offset_mm: tuple[float, float],

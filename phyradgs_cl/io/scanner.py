@@ -13,8 +13,7 @@ from phyradgs_cl.acquisition.shutter import AXES
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid, triple
 from phyradgs_cl.fields.volume import MOST_VOXELS
-from phyradgs_cl.io.hdf5.datasets import LENGTH
-from phyradgs_cl.io.tables import Fields, described, read_toml, refuse_unknown
+from phyradgs_cl.io.tables import LARGEST_LENGTH, Fields, described, read_toml, refuse_unknown
 from phyradgs_cl.text import suggest_name
 
 TABLES: dict[str, tuple[str, ...]] = {
@@ -96,7 +95,7 @@ def scanner_from(path: Path, content: dict[str, object]) -> Scanner:
     return Scanner(
         path.stem, geometry, _grid(tables["volume"]) if "volume" in content else default_grid(geometry), axis,
         direction,
-        readout.number("ratio", lowest=0.0, highest=LENGTH.largest) if readout.has("ratio") else None,
+        readout.number("ratio", lowest=0.0, highest=LARGEST_LENGTH) if readout.has("ratio") else None,
         _pulse(tables["beam"]) if "beam" in content else None,
         tables["detector"].number("lag", 0.0, 0.0, LARGEST_LAG), fps, readout_ms,
     )
@@ -120,29 +119,19 @@ def _order(readout: Fields) -> tuple[str, int]:
 
 
 def _geometry(source: Fields, detector: Fields) -> ConeGeometry:
-    to_axis_mm, to_detector_mm = _length(source, "to_axis_mm"), _length(source, "to_detector_mm")
+    to_axis_mm, to_detector_mm = source.length("to_axis_mm"), source.length("to_detector_mm")
     if to_detector_mm <= to_axis_mm:
         raise source.error("to_detector_mm", f"{to_detector_mm:g}", f"more than to_axis_mm ({to_axis_mm:g})")
     return ConeGeometry(
         to_axis_mm, to_detector_mm,
         (detector.count("rows", MOST_LINES), detector.count("columns", MOST_LINES)),
-        (_length(detector, "pixel_size_v_mm"), _length(detector, "pixel_size_u_mm")),
-        (_position(detector, "offset_v_mm"), _position(detector, "offset_u_mm")),
+        (detector.length("pixel_size_v_mm"), detector.length("pixel_size_u_mm")),
+        (detector.position("offset_v_mm"), detector.position("offset_u_mm")),
     )
 
 
-def _length(table: Fields, key: str) -> float:
-    if (value := table.number(key, highest=LENGTH.largest)) < 1 / LENGTH.largest:
-        raise table.error(key, f"{value:g}", "a length above 0")
-    return value
-
-
-def _position(table: Fields, key: str) -> float:
-    return table.number(key, 0.0, -LENGTH.largest, LENGTH.largest)
-
-
 def _pulse(beam: Fields) -> tuple[float, float]:
-    start, length = (beam.number(key, highest=LENGTH.largest) for key in ("pulse_start", "pulse_length"))
+    start, length = (beam.number(key, highest=LARGEST_LENGTH) for key in ("pulse_start", "pulse_length"))
     if length <= 0:
         raise beam.error("pulse_length", f"{length:g}", "a share of the exposure above 0")
     return start, length
@@ -155,12 +144,12 @@ def _grid(volume: Fields) -> Grid:
         raise volume.error("shape", str(list(shape)), "three counts of at least 1 (z, y, x)")
     if math.prod(shape) > MOST_VOXELS:
         raise volume.error("shape", checks.short_repr(list(shape)), f"at most {MOST_VOXELS:.3g} voxels")
-    if min(size_mm) < 1 / LENGTH.largest:
+    if min(size_mm) < 1 / LARGEST_LENGTH:
         raise volume.error("size_mm", str(list(size_mm)), "three lengths above 0 (z, y, x)")
     voxel_mm = triple(side / n for side, n in zip(size_mm, shape, strict=True))
     return Grid(triple(int(n) for n in shape), voxel_mm, offset_mm)
 
 
 def _triple(volume: Fields, key: str) -> tuple[float, float, float]:
-    z, y, x = volume.numbers(key, 3, LENGTH.largest).tolist()
+    z, y, x = volume.numbers(key, 3, LARGEST_LENGTH).tolist()
     return z, y, x

@@ -19,7 +19,8 @@ if sys.version_info >= (3, 11):
 else:
     import tomli as tomllib
 
-LARGEST = 1e12  # of any length, angle or time that makes sense; keeps sums finite
+LARGEST = 1e12  # of any angle, time or count that makes sense; keeps sums finite
+LARGEST_LENGTH = 1e9
 _MOST_TOML_BYTES = 16 << 20
 _COUNTS = {2: "two", 3: "three"}
 _log = logging.getLogger(__name__)
@@ -123,11 +124,15 @@ class Fields:
         return value
 
     def length(self, key: str) -> float:
-        """Returns a number above zero."""
-        value = self.number(key)
-        if value <= 0:
+        """Returns a number above zero, of a size that a scanner may have."""
+        value = self.number(key, highest=LARGEST_LENGTH)
+        if value < 1 / LARGEST_LENGTH:
             raise self.error(key, f"{value:g}", "a number above 0")
         return value
+
+    def position(self, key: str) -> float:
+        """Returns a number of a size that a scanner may have; 0 where the table has none."""
+        return self.number(key, 0.0, -LARGEST_LENGTH, LARGEST_LENGTH)
 
     def numbers(self, key: str, count: int | None = None, largest: float = LARGEST) -> np.ndarray:
         """Returns the finite numbers of a list or an array, (count,) float64, of size ``largest`` at most."""

@@ -92,7 +92,10 @@ def read_volume(path: str | Path) -> Volume:
     and of a run that was interrupted."""
     with open_hdf5(path) as source:
         if isinstance(source.find(_BARE), h5py.Dataset):
-            return Volume(_read_bare(source), None)
+            dataset, subject = source.dataset(_BARE), source.name(_BARE)
+            if dataset.ndim != 3 or 0 in dataset.shape:
+                raise InputError(subject, f"shape {dataset.shape}", "three axes (z, y, x), none of them empty")
+            return Volume(finite_float32(subject, shares_of_maximum(h5.read_values(source, _BARE, dataset))), None)
         if not isinstance(source.find(_DATA), h5py.Group):
             found = "root members " + (", ".join(sorted(source.file)[:10]) or "none")
             raise InputError(str(path), found, f"a 3D dataset {_BARE} or {_VOLUME}")
@@ -254,13 +257,6 @@ def _read_attenuation(source: Hdf5Source, address: str, dataset: h5py.Dataset) -
     values = h5.read_values(source, address, dataset)
     checks.finite(source.name(address), values)
     return h5.in_unit(source, address, values, h5.ATTENUATION).astype(np.float32)
-
-
-def _read_bare(source: Hdf5Source) -> np.ndarray:
-    dataset, subject = source.dataset(_BARE), source.name(_BARE)
-    if dataset.ndim != 3 or 0 in dataset.shape:
-        raise InputError(subject, f"shape {dataset.shape}", "three axes (z, y, x), none of them empty")
-    return finite_float32(subject, shares_of_maximum(h5.read_values(source, _BARE, dataset)))
 
 
 def shares_of_maximum(values: np.ndarray) -> np.ndarray:

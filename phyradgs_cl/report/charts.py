@@ -70,9 +70,6 @@ def _inline(svg: str) -> str:
     return content
 
 
-# --- curves -------------------------------------------------------------------------------------------------
-
-
 def convergence_charts(record: Sequence[Mapping[str, float]]) -> list[Chart]:
     """Returns a chart over the iterations for each quantity of a convergence record that changes."""
     names = dict.fromkeys(key for line in record for key in line if key not in ("iteration", "seconds"))

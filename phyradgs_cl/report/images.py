@@ -81,9 +81,6 @@ def grey_range(volume: NDArray[np.floating]) -> tuple[float, float]:
     return low, high if high > low else low + 1.0
 
 
-# --- slices of a volume ----------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True)
 class Window:
     """The first values of black and white, ``low`` and ``high``, and the values ``least`` to ``most`` of 256 grey levels.

@@ -63,9 +63,6 @@ def _plain(value: object) -> str:
     return f"{value:.2f}".rstrip("0").rstrip(".") if isinstance(value, float) else plain_text(str(value))
 
 
-# --- facts -----------------------------------------------------------------------------------------------
-
-
 def flattened(facts: Mapping[str, object], prefix: str = "") -> Iterator[tuple[str, object]]:
     """Yields (key, value) of all facts; keys of nested tables are dotted."""
     for key, value in facts.items():

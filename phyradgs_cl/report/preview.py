@@ -108,9 +108,6 @@ def _shown_axes(grid: Grid) -> list[int]:
     return [axis for axis in range(3) if across[axis] > 1] or [0, 1, 2]
 
 
-# --- a window --------------------------------------------------------------------------------------------
-
-
 _AXES = ("z", "y", "x")
 
 

@@ -185,16 +185,12 @@ def step_changes(run: Run, rt: Runtime) -> list[Change]:
     changes: list[Change] = []
     former: tuple[np.ndarray, Image] | None = None
     for name, scan, numbers in stages(run.scan, run.preprocessing, rt):
-        now = scan.projections, static_fdk(rt, scan.on_grid(_middle(scan.grid)))[0]
+        middle = Grid((1, *scan.grid.shape[1:]), scan.grid.voxel_size_mm, scan.grid.offset_mm)
+        now = scan.projections, static_fdk(rt, scan.on_grid(middle))[0]
         if former is not None:
             changes.append(_change(name, numbers, former, now))
         former = now
     return changes
-
-
-def _middle(grid: Grid) -> Grid:
-    """Returns the middle slice of a grid, across the axis."""
-    return Grid((1, *grid.shape[1:]), grid.voxel_size_mm, grid.offset_mm)
 
 
 def _change(name: str, numbers: Facts, former: tuple[np.ndarray, Image], now: tuple[np.ndarray, Image]) -> Change:

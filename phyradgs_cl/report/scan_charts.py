@@ -32,9 +32,6 @@ _ROOM = 0.06  # next to the data, relative to them
 Points = NDArray[np.float64]
 
 
-# --- geometry -----------------------------------------------------------------------------------------------
-
-
 def orbit_chart(scan: Scan) -> Markup:
     """Returns the scanner from above: all source positions, the first frame's arc, rays, panel and volume."""
     middles, words = source_positions(scan), f"{scan.frames} source positions; the first frame's rays, panel and volume"
@@ -131,9 +128,6 @@ def _box_corners(scan: Scan) -> Points:
     half, centre = np.array(scan.grid.size_mm[::-1]) / 2, np.array(scan.grid.offset_mm[::-1])
     around = [(-1, -1), (1, -1), (1, 1), (-1, 1)]
     return np.array([centre + half * (x, y, z) for z in (-1, 1) for x, y in around])
-
-
-# --- shutter ------------------------------------------------------------------------------------------------
 
 
 def shutter_chart(scan: Scan, motion: Motion | None) -> Markup:

@@ -74,8 +74,6 @@ class Runtime:
         self._programs: dict[tuple[str, tuple[str, ...]], cl.Program] = {}
         self._kernels: dict[tuple[str, str, tuple[str, ...]], Kernel] = {}
 
-    # --- programs -----------------------------------------------------------------------------------
-
     def kernel(self, program: str, name: str, **defines: int | float | bool) -> Kernel:
         """Declares the kernel ``name`` of ``cl/<program>.cl``; the first launch builds it, once for all its declarations."""
         merged: dict[str, int | float | bool] = {"LANES": self.lanes, "FP64": int(self.fp64), **defines}
@@ -110,8 +108,6 @@ class Runtime:
             raise DeviceError(subject, message, "a program that builds", remedy) from error
         log.debug("built %s in %.2f s", program, time.perf_counter() - started)
         return built
-
-    # --- memory -------------------------------------------------------------------------------------
 
     def empty(self, shape: int | Sequence[int], dtype: np.typing.DTypeLike = np.float32) -> DeviceArray:
         """Returns uninitialised memory. Raises MemoryShortage where the device, or the limit, has too little."""
@@ -211,8 +207,6 @@ class Runtime:
         """Returns local memory of a work-group, as an argument of a launch."""
         return cl.LocalMemory(nbytes)
 
-    # --- launches -----------------------------------------------------------------------------------
-
     @naming_failures()
     def launch(
         self, kernel: Kernel, items: int | tuple[int, ...], *args: Any, group: int | tuple[int, ...] = 1
@@ -259,8 +253,6 @@ class Runtime:
     def finish(self) -> None:
         self.queue.finish()
         self.traffic.count()
-
-    # --- profile ------------------------------------------------------------------------------------
 
     def _record(self, name: str, event: "cl.Event", nbytes: int) -> None:
         if self.profile:

@@ -115,7 +115,9 @@ def _wished(wish: str, source: str, devices: list[DeviceInfo]) -> tuple[DeviceIn
 
 def _describe(index: int, of: "cl.Platform", device: "cl.Device") -> DeviceInfo:
     is_pocl = "portable computing language" in of.name.lower()
-    kind = _kind(device)
+    # device types are bit fields: PoCL answers ALL | CPU
+    kind = "gpu" if device.type & cl.device_type.GPU else "accelerator"
+    kind = "cpu" if device.type & cl.device_type.CPU else kind
     if is_pocl:
         pocl.warn_of_cache()
     if is_pocl and kind == "cpu" and device.int_ptr not in _targets:
@@ -139,13 +141,6 @@ def _describe(index: int, of: "cl.Platform", device: "cl.Device") -> DeviceInfo:
         handle=device,
         target=_targets.get(device.int_ptr),
     )
-
-
-def _kind(device: "cl.Device") -> str:
-    # device types are bit fields: PoCL answers ALL | CPU
-    if device.type & cl.device_type.CPU:
-        return "cpu"
-    return "gpu" if device.type & cl.device_type.GPU else "accelerator"
 
 
 def environment(device: DeviceInfo) -> dict[str, Any]:

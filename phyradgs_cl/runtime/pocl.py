@@ -65,7 +65,8 @@ def prepare_environment() -> None:
     if not _can_write(_caches() / "pyopencl"):
         os.environ.setdefault(_NO_CACHE_VARIABLE, "1")
     wish = os.environ.get(CACHE_VARIABLE)
-    folder = Path(wish) if wish else _own_cache()
+    own = _caches() / "phyradgs-cl" / f"pocl-{library_target() or platform.machine()}"
+    folder = Path(wish) if wish else own
     if not _can_write(folder):
         _unwritable = folder
         try:
@@ -98,15 +99,9 @@ def warn_of_cache() -> None:
     """Warns once that kernels are kept in the temporary folder. To be called where PoCL is used."""
     global _unwritable
     if _unwritable is not None:
-        log.warning(
-            "PoCL's kernel cache %s cannot be written: kernels are kept in %s; set %s to a folder that can",
-            _unwritable, os.environ.get(CACHE_VARIABLE), CACHE_VARIABLE,
-        )
+        text = "PoCL's kernel cache %s cannot be written: kernels are kept in %s; set %s to a folder that can"
+        log.warning(text, _unwritable, os.environ.get(CACHE_VARIABLE), CACHE_VARIABLE)
         _unwritable = None
-
-
-def _own_cache() -> Path:
-    return _caches() / "phyradgs-cl" / f"pocl-{library_target() or platform.machine()}"
 
 
 def _caches() -> Path:

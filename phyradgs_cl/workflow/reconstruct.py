@@ -6,7 +6,6 @@ import platform
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext, suppress
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -43,14 +42,6 @@ log = logging.getLogger(__name__)
 def check_interval(seconds: float) -> None:
     """Raises InputError for an impossible time between checkpoints."""
     checks.within("--checkpoint-every (seconds)", seconds, 0, 1e9)
-
-
-@dataclass(frozen=True)
-class _Files:
-    """The scan to read and the volume to write."""
-
-    scan: Path
-    output: Path
 
 
 class _Checkpoints:
@@ -114,24 +105,24 @@ def run_reconstruction(
         check_output(output, scan, *inputs, remedy=export)
         refuse_overwriting("-o", partial_path(output), scan, *inputs)
     with only_run(output) if leads else nullcontext():
-        return _reconstructed(plan, _Files(scan, output), make_runtime, report, resume, checkpoint_every_s)
+        return _reconstructed(plan, scan, output, make_runtime, report, resume, checkpoint_every_s)
 
 
 def _reconstructed(
-    plan: methods.RunPlan, files: _Files, make_runtime: Callable[[], Runtime], report: methods.ProgressReport,
-    resume: bool, checkpoint_every_s: float,
+    plan: methods.RunPlan, path: Path, output: Path, make_runtime: Callable[[], Runtime],
+    report: methods.ProgressReport, resume: bool, checkpoint_every_s: float,
 ) -> tuple[methods.Reconstruction, dict[str, float]]:
-    with hashing(files.scan) as scan_hash_of:
-        scan = load_scan(files.scan, plan.preprocessing.flats)
+    with hashing(path) as scan_hash_of:
+        scan = load_scan(path, plan.preprocessing.flats)
         scan_hash = scan_hash_of()
-    _warn_of_doubts(plan, files.scan, scan)
+    _warn_of_doubts(plan, path, scan)
     rt = make_runtime()
     leads, state = rt.ranks.rank == 0, None
     if resume:
-        state = rt.ranks.bcast(read_checkpoint(checkpoint_path(files.output)) if leads else None)
+        state = rt.ranks.bcast(read_checkpoint(checkpoint_path(output)) if leads else None)
     elif leads:
-        _set_aside(files.output)
-    checkpoints = _Checkpoints(checkpoint_path(files.output), checkpoint_every_s)
+        _set_aside(output)
+    checkpoints = _Checkpoints(checkpoint_path(output), checkpoint_every_s)
     result: methods.Reconstruction | None = None
     metrics: dict[str, float] = {}
     try:
@@ -143,11 +134,11 @@ def _reconstructed(
                 return result, metrics
             with finish_despite_interrupt():
                 metrics = _metrics(scan, result)
-                path = files.output if result.state is None else partial_path(files.output)
-                provenance = _provenance(result, scan_hash, plan, files.scan, rt)
+                target = output if result.state is None else partial_path(output)
+                provenance = _provenance(result, scan_hash, plan, path, rt)
                 parts = result.volume, result.grid, provenance, result.gaussians, metrics or None
-                write_volume(path, *parts, disagreement=result.disagreement)
-                _keep_checkpoint(files.output, result)
+                write_volume(target, *parts, disagreement=result.disagreement)
+                _keep_checkpoint(output, result)
     except signals.InterruptedAfterwards:
         # After a complete run the signal takes effect; an interrupted run reports it.
         if result is None or result.state is None:

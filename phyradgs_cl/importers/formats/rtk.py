@@ -10,6 +10,7 @@ from pathlib import Path
 from xml.etree import ElementTree
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from phyradgs_cl import checks
 from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, PoseTable, Scan
@@ -182,16 +183,8 @@ def _along(values: np.ndarray, position: np.ndarray) -> np.ndarray:
 def _rotations(at: dict[str, np.ndarray]) -> np.ndarray:
     """Returns (T, 3, 3) from the gantry's to RTK's fixed frame: the inverse of Rz(−in plane) Rx(−out of plane)
     Ry(−gantry)."""
-    y, x, z = (at[name] for name in ("GantryAngle", "OutOfPlaneAngle", "InPlaneAngle"))
-    zero, one = np.zeros_like(y), np.ones_like(y)
-
-    def matrix(*rows: np.ndarray) -> np.ndarray:
-        return np.stack(rows, -1).reshape(*y.shape, 3, 3)
-
-    about_y = matrix(np.cos(y), zero, np.sin(y), zero, one, zero, -np.sin(y), zero, np.cos(y))
-    about_x = matrix(one, zero, zero, zero, np.cos(x), -np.sin(x), zero, np.sin(x), np.cos(x))
-    about_z = matrix(np.cos(z), -np.sin(z), zero, np.sin(z), np.cos(z), zero, zero, zero, one)
-    return about_y @ about_x @ about_z
+    angles_rad = np.stack([at[name] for name in ("GantryAngle", "OutOfPlaneAngle", "InPlaneAngle")], -1)
+    return Rotation.from_euler("YXZ", angles_rad).as_matrix()
 
 
 def _root(path: Path) -> ElementTree.Element:

@@ -3,7 +3,7 @@
 The TOML has the tables of a scanner file, and [frames], [angles] and [timing]. Row 0 is the top, column 0 the left,
 seen from the source. """
 
-from dataclasses import replace
+from dataclasses import astuple, replace
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -12,7 +12,7 @@ import numpy as np
 from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.acquisition.readout import frame_time_of, readout_of
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.importers.assemble import assemble_scan, with_options
+from phyradgs_cl.importers.assemble import assemble_scan, cone
 from phyradgs_cl.importers.motion import StoredTiming, make_timing, turning
 from phyradgs_cl.importers.options import FIELDS, OF_BARE_FRAMES, WORDS, ImportOptions
 from phyradgs_cl.importers.reading import tiff
@@ -57,7 +57,7 @@ def import_scan(path: Path, options: ImportOptions) -> Scan:
     stacks = _stacks(folder, tables["frames"], tables["angles"])
     frames, rows, columns = stacks["projections"].shape
     scanner = _scanner(description, tables[""], (rows, columns))
-    geometry = with_options(scanner.geometry, options)
+    geometry = cone(options, *astuple(scanner.geometry))
     stored = _stored_timing(tables, scanner)
     timing = make_timing(str(description), frames, options, stored)
     angle_rad = gantry_sign(combined, "gantry") * _angles_rad(folder, tables["angles"], frames)

@@ -48,7 +48,10 @@ def line_integrals(
         _warn_of_unused(subject, quantity, flats, darks)
     else:
         if options.flat_value is not None or flats is None or len(flats) == 0:
-            flats = _constant_flat(subject, frames, options)
+            if options.flat_value is None:
+                remedy = f"add flat frames, or say {options.named('flat_value')}"
+                raise InputError(f"{subject} flats", "none", "flat frames to divide counts by", remedy)
+            flats = np.full((1, *frames.shape[1:]), options.flat_value, np.float32)
         for stack in (flats, darks):
             if stack is not None and len(stack) and stack.shape[1:] != frames.shape[1:]:
                 found = f"flats or darks of {stack.shape[1:]}"
@@ -108,13 +111,6 @@ def oriented(array: np.ndarray, options: ImportOptions, row_0: str, column_0: st
     if (options.column_0 or column_0) == "right":
         array = array[..., ::-1]
     return array
-
-
-def _constant_flat(subject: str, frames: np.ndarray, options: ImportOptions) -> np.ndarray:
-    if options.flat_value is None:
-        remedy = f"add flat frames, or say {options.named('flat_value')}"
-        raise InputError(f"{subject} flats", "none", "flat frames to divide counts by", remedy)
-    return np.full((1, *frames.shape[1:]), options.flat_value, np.float32)
 
 
 def read_frames(source: Hdf5Source, address: str, panel: tuple[int, int] | None = None) -> np.ndarray:

@@ -85,9 +85,12 @@ def read_values(source: Hdf5Source, address: str, dataset: h5py.Dataset, kinds: 
 
 
 def read_array(
-    source: Hdf5Source, address: str, shape: Sequence[int | None], quantity: Quantity | None = None
+    source: Hdf5Source, address: str, shape: Sequence[int | None], quantity: Quantity | None = None,
+    default: np.ndarray | None = None,
 ) -> np.ndarray:
-    """Reads a required numeric dataset as finite float64, in the package's unit of ``quantity``."""
+    """Reads a numeric dataset as finite float64, in the package's unit of ``quantity``; required without a ``default``."""
+    if default is not None and source.optional(address) is None:
+        return default
     dataset = source.dataset(address)
     checks.shape(source.name(address), dataset, shape)
     values = read_values(source, address, dataset).astype(np.float64)
@@ -95,8 +98,13 @@ def read_array(
     return in_unit(source, address, values, quantity) if quantity else values
 
 
-def read_number(source: Hdf5Source, address: str, quantity: Quantity | None = None) -> float:
-    """Reads a required finite number, in the package's unit of ``quantity``. Datasets of one element are accepted."""
+def read_number(
+    source: Hdf5Source, address: str, quantity: Quantity | None = None, default: float | None = None
+) -> float:
+    """Reads a finite number, in the package's unit of ``quantity``; required without a ``default``. Datasets of one element
+    are accepted."""
+    if default is not None and source.optional(address) is None:
+        return default
     dataset = source.dataset(address)
     if dataset.size != 1:
         raise source.error(address, f"shape {dataset.shape}", "one number")
@@ -120,8 +128,12 @@ def read_integers(source: Hdf5Source, address: str, shape: Sequence[int | None])
     return read_values(source, address, dataset, kinds="iu").astype(np.int64)
 
 
-def read_word(source: Hdf5Source, address: str, allowed: Collection[str] | None = None) -> str:
-    """Reads a required string, one of ``allowed`` where that is given."""
+def read_word(
+    source: Hdf5Source, address: str, allowed: Collection[str] | None = None, default: str | None = None
+) -> str:
+    """Reads a string, one of ``allowed`` where that is given; required without a ``default``."""
+    if default is not None and source.optional(address) is None:
+        return default
     dataset = source.dataset(address)
     if dataset.size != 1:  # a million entries may share one long text, which the file's size does not bound
         raise source.error(address, f"shape {dataset.shape}", "a string")
@@ -198,9 +210,7 @@ def read_grid(source: Hdf5Source, address: str) -> Grid:
     """Reads the voxel grid in the group at ``address``: shape, voxel_size and offset, each (z, y, x)."""
     shape = read_integers(source, f"{address}/shape", (3,))
     voxel_size_mm = read_array(source, f"{address}/voxel_size", (3,), LENGTH)
-    offset_mm = np.zeros(3)
-    if source.optional(f"{address}/offset") is not None:
-        offset_mm = read_array(source, f"{address}/offset", (3,), LENGTH)
+    offset_mm = read_array(source, f"{address}/offset", (3,), LENGTH, default=np.zeros(3))
     if shape.min() < 1:
         raise source.error(f"{address}/shape", str(shape.tolist()), "three counts of at least 1")
     if math.prod(shape.tolist()) > MOST_VOXELS:

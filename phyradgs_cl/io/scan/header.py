@@ -50,8 +50,10 @@ def read_header(source: Hdf5Source) -> ScanHeader:
     shutter.check_resolved(start_s, source.name(f"{entry}/{schema.DETECTOR}/count_time"))
     trajectory = read_trajectory(source, entry, geometry, used, start_s, shutter.exposure_s)
     grid, has_grid = _read_or_derive_grid(source, entry, geometry)
-    model, provenance = (f"{entry}/{schema.EXTRA}/{name}" for name in ("detector_model", "provenance"))
-    has_model, has_provenance = source.optional(model) is not None, source.optional(provenance) is not None
+    extra = f"{entry}/{schema.EXTRA}"
+    provenance = read_word(source, f"{extra}/provenance", default="{}")
+    lag = read_number(source, f"{extra}/lag", default=0.0)
+    checks.within(source.name(f"{extra}/lag"), lag, 0, LARGEST_LAG)
     scan = Scan(
         projections=np.broadcast_to(np.float32(0), (int(used.sum()), *data.shape[1:])),
         geometry=geometry,
@@ -60,10 +62,10 @@ def read_header(source: Hdf5Source) -> ScanHeader:
         frame_start_s=start_s,
         grid=grid,
         is_fly=is_fly,
-        detector_model=read_word(source, model, DETECTOR_MODELS) if has_model else "log",
+        detector_model=read_word(source, f"{extra}/detector_model", DETECTOR_MODELS, default="log"),
         title=read_title(source, f"{entry}/title", "cone-beam scan"),
-        provenance=read_facts(source.name(provenance), read_word(source, provenance), {}) if has_provenance else {},
-        lag=_read_lag(source, entry),
+        provenance=read_facts(source.name(f"{extra}/provenance"), provenance, {}),
+        lag=lag,
         saturation=_read_saturation(source, entry),
     )
     scan.check_timing()
@@ -101,15 +103,6 @@ def _read_or_derive_grid(source: Hdf5Source, entry: str, geometry: ConeGeometry)
         remedy = "correct the geometry, or store the grid"
         raise source.error(address, "no grid, and none that follows", error.expected, remedy) from error
     return grid, False
-
-
-def _read_lag(source: Hdf5Source, entry: str) -> float:
-    address = f"{entry}/{schema.EXTRA}/lag"
-    if source.optional(address) is None:
-        return 0.0
-    lag = read_number(source, address)
-    checks.within(source.name(address), lag, 0, LARGEST_LAG)
-    return lag
 
 
 def _read_saturation(source: Hdf5Source, entry: str) -> Saturation | None:

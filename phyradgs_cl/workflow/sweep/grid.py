@@ -101,9 +101,6 @@ def _nested(values: Table) -> dict[str, Any]:
     return tables
 
 
-# --- scans and seeds ------------------------------------------------------------------------------------------
-
-
 def _scans(patterns: Any, path: Path) -> tuple[Path, ...]:
     subject = f"{path}: scans"
     if not _is_list_of(str, patterns):
@@ -149,16 +146,13 @@ def _limit_runs(subject: str, count: int) -> None:
         raise InputError(subject, f"{count} runs", f"at most {MOST_RUNS}", "split the file into several")
 
 
-# --- settings -------------------------------------------------------------------------------------------------
-
-
 def _settings(document: Table, path: Path) -> tuple[Setting, ...]:
     """Returns the settings of [[grid]] and [[runs]] without repetitions."""
     shared = dict(flat(_table(document.get("options", {}), f"{path}: [options]")))
     settings: dict[str, Setting] = {}
-    for key, expand in (("grid", _product), ("runs", _single)):
+    for key in ("grid", "runs"):
         for where, table in _tables(document, key, path):
-            for values in expand(table, where):
+            for values in _product(table, where) if key == "grid" else [dict(flat(table))]:
                 setting = _setting({**shared, **values}, where)
                 settings.setdefault(repr(setting), setting)
     if not settings:
@@ -180,10 +174,6 @@ def _table(table: Any, where: str) -> Table:
     if not isinstance(table, Mapping):
         raise InputError(where, checks.short_repr(table), "a table")
     return table
-
-
-def _single(table: Table, where: str) -> Iterator[dict[str, Any]]:
-    yield dict(flat(table))
 
 
 def _product(table: Table, where: str) -> Iterator[dict[str, Any]]:
