@@ -63,7 +63,7 @@ def test_a_named_option_wins_over_set_and_set_over_the_file(config: Path) -> Non
         ("roi_mm = [-inf, inf, 0, 1, 0, 1]", "roi_mm: "),
         ("median_filter = 4", "median_filter: "),
         ("method = 'phyradgs'\nrates = 3", "rates: "),
-        ("method = 'phyradgs'\n[rates]\nposition = [nan, 1e-4]", "rates.position: "),
+        *((f"method = 'phyradgs'\n[rates]\nposition = {value}", "rates.position: ") for value in ("[nan, 1e-4]", "3")),
         ("method = 'phyradgs'\n[control]\nthreshold = -1", "control.threshold: "),
         ("method = 'phyradgs'\n[control]\nevry = 3", "control.evry: found no such option of --method phyradgs"),
         ("method = 'fdk'\nwindow = 'round'", "window: "),

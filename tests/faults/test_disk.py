@@ -17,6 +17,7 @@ from phyradgs_cl.errors import OutputError
 from phyradgs_cl.exporters import export_stored
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.io import Volume, read_checkpoint, write_checkpoint, write_scan, write_volume
+from phyradgs_cl.workflow.sweep.tables import append_line, read_lines
 
 ARRAYS = {"volume": np.arange(5000, dtype=np.float32), "iteration": np.array(3)}
 GRID = Grid.cube(4, 2.0)
@@ -74,6 +75,18 @@ def test_no_room_at_any_call_leaves_the_old_file_or_the_new_one(tmp_path, monkey
             assert "no room left" in str(error) or "No space left" in str(error)
             assert target.read_bytes() == old and (kind != "checkpoint" or read_checkpoint(target))
         assert kit.names(tmp_path) == [kind]
+
+
+def test_results_keep_their_lines_when_there_is_no_room(tmp_path, monkeypatch) -> None:
+    results = tmp_path / "results.jsonl"
+    full = FullAt(monkeypatch)
+    append_line(results, {"run": "one"})
+    for at in range(1, full.made + 1):
+        full.arm(at)
+        with pytest.raises(OutputError, match="No space left"):
+            append_line(results, {"run": "two"})
+        full.arm(None)
+        assert read_lines(results)[0] == {"run": "one"}
 
 
 def can_mount() -> bool:

@@ -397,6 +397,7 @@ TIFF: dict[str, tuple[Damage, tuple[str, ...]]] = {
     "a frame that is a link": (symlinked("proj_1.tif"), ("symbolic link",)),
     "a frame that is no TIFF": (filled("proj_1.tif", b"GIF89a" + b"\0" * 100), ("proj_1.tif",)),
     "an empty frame": (filled("proj_1.tif", b""), ("proj_1.tif",)),
+    "a frame without a page": (filled("proj_1.tif", b"II*\0\0\0\0\0"), ("proj_1.tif",)),
     "a truncated frame": (truncated("proj_1.tif"), ("proj_1.tif",)),
     "a colour frame": (lambda p: tifffile.imwrite(p / "proj_1.tif", np.zeros((10, 14, 3), np.uint8)), ("shape",)),
     "a turned frame": (lambda p: tifffile.imwrite(p / "proj_1.tif", np.zeros((10, 14)), extratags=TURNED), ("Orientation",)),

@@ -95,6 +95,7 @@ WRONG = {
         "to_detector_mm = 1000.0", "to_detector_mm = 400", "[source] to_detector_mm", "500",
     ),
     "two counts": ("shape = [10, 20, 40]", "shape = [10, 20]", "[volume] shape", "three"),
+    "no list": ("shape = [10, 20, 40]", "shape = 10", "[volume] shape", "three"),
     "zero voxels": ("shape = [10, 20, 40]", "shape = [10, 0, 40]", "[volume] shape", "at least 1"),
     "flat volume": ("[10.0, 20.0, 80.0]", "[10.0, 0, 80.0]", "[volume] size_mm", "above 0"),
     "axis": ('axis = "columns"', 'axis = "cols"', "[readout] axis", "'rows'"),
