@@ -255,7 +255,6 @@ def dask_setup(worker: Any) -> None:
 
 
 def has_dask() -> bool:
-    """True where dask.distributed is installed."""
     return importlib.util.find_spec("distributed") is not None
 
 

@@ -43,7 +43,6 @@ class Estimate:
     around_s: float = 0.0
 
     def text(self) -> str:
-        """Two lines: time, and memory."""
         parts = []
         if self.seconds_per_iteration > 0:
             parts.append(f"{self.iterations} iterations of {1e3 * self.seconds_per_iteration:.3g} ms")

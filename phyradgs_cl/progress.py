@@ -63,7 +63,6 @@ class Ticker:
         self.is_open = self.is_counting = False
 
     def progress(self, p: Progress) -> None:
-        """Shows the progress of a method."""
         cloud = f"  {p.gaussians} Gaussians" if p.gaussians else ""
         self.show(p.iteration, p.iterations, f"  {p.quantity} {p.loss:.5f}{cloud}")
 

@@ -52,7 +52,6 @@ class Settings:
             return methods.preprocessing_of({**defaults, **self.values})
 
     def runtime(self, *, profile: bool = False, ranks: Communicator | None = None) -> Runtime:
-        """Opens the device."""
         with self.naming_origins():
             return Runtime(self.device, profile=profile, memory=self.memory, ranks=ranks)
 

@@ -231,7 +231,6 @@ def _checked_path(path: object) -> Path:
 
 
 def check_scan(scan: object, subject: str = "scan") -> None:
-    """Raises InputError for anything but a Scan."""
     if not isinstance(scan, Scan):
         remedy = "read a file with load_scan, or make one with fly_scan or static_scan"
         raise InputError(subject, checks.short_repr(scan), "a Scan", remedy)
@@ -260,7 +259,6 @@ def _reporting(report: ProgressReport | bool) -> Iterator[tuple[ProgressReport, 
 
 
 def _state_of(partial: object) -> State:
-    """Returns the state of an interrupted result."""
     if not isinstance(partial, Reconstruction) or partial.state is None:
         found = "a result that is complete" if isinstance(partial, Reconstruction) else checks.short_repr(partial)
         raise InputError("resume", found, "the partial result of an interrupted run")

@@ -124,7 +124,6 @@ def _warn_of_transmission(frames: np.ndarray) -> None:
 
 
 def _keywords(function: Callable[..., Scan]) -> list[str]:
-    """Returns the names of a function's keyword-only arguments."""
     return [one.name for one in signature(function).parameters.values() if one.kind is one.KEYWORD_ONLY]
 
 

@@ -28,12 +28,10 @@ def option(help: str, default: bool | str = True, *flags: str, **more: Any) -> A
 
 
 def file_option(help: str, *flags: str, default: bool | str = True) -> Any:
-    """An option that takes a file name."""
     return option(help, default, *flags, parser=file_parser(flags[-1]), metavar="FILE")
 
 
 def file_argument(name: str, help: str) -> Any:
-    """An argument that is a file name."""
     return typer.Argument(parser=file_parser(name), metavar=name, help=help)
 
 
@@ -67,7 +65,6 @@ def complain(text: str, status: int = 2) -> int:
 
 
 def remark(text: str) -> None:
-    """Prints a line on stderr."""
     with suppress(OSError):
         typer.echo(plain_text(text), err=True)
 

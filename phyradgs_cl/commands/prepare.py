@@ -46,7 +46,6 @@ def prepare_command(
 
 
 def _line(step: dict[str, Any]) -> str:
-    """Returns the numbers of a step as a line."""
     numbers = {key: value for key, value in step.items() if key not in ("step", "options")}
     return f"{step['step']:12s} " + ", ".join(f"{key.replace('_', ' ')} {_short(value)}" for key, value in numbers.items())
 

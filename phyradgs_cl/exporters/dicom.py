@@ -46,7 +46,6 @@ class DicomLabels:
 
     @property
     def given(self) -> dict[str, object]:
-        """Returns the stated labels by name."""
         return {one.name: value for one in fields(self) if (value := getattr(self, one.name)) is not None}
 
     @property
@@ -57,7 +56,6 @@ class DicomLabels:
             return None
 
     def write(self, image: Any) -> None:
-        """Writes the labels into a DICOM data set."""
         if self.patient is not None:
             image.PatientName = image.PatientID = self.patient
         if self.title is not None:

@@ -93,7 +93,6 @@ class ImportOptions:
             object.__setattr__(self, name, value)
 
     def given(self, among: tuple[str, ...]) -> list[str]:
-        """Returns the fields of ``among`` that the user gave."""
         return [name for name in among if getattr(self, name) != _DEFAULTS[name]]
 
     def called(self, name: str) -> str:

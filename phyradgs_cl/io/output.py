@@ -173,7 +173,6 @@ def _is_dead(process: int) -> bool:
 
 
 def _discard(path: Path) -> None:
-    """Removes a file or a folder, if it can be removed."""
     try:
         path.unlink()
     except OSError:  # a folder, or removed by another process
@@ -219,7 +218,6 @@ def beside(path: str | Path, ending: str, beginning: str = "") -> Path:
 
 
 def checkpoint_path(output: str | Path) -> Path:
-    """Returns the path of the checkpoint of a run that writes ``output``."""
     return beside(output, ".checkpoint.npz")
 
 
@@ -235,7 +233,6 @@ def partial_path(output: str | Path) -> Path:
 
 
 def write_checkpoint(path: str | Path, state: Mapping[str, np.ndarray]) -> None:
-    """Writes the state of a run, complete or not at all."""
     with written_beside(path) as temporary, open(temporary, "wb") as file:
         np.savez(file, format=np.array(_FORMAT), **state)  # type: ignore[arg-type]
 

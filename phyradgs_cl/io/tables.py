@@ -90,11 +90,9 @@ class Fields:
         self._joint = " " if allowed is not None or subject.endswith(":") else "."
 
     def name(self, key: str) -> str:
-        """Returns the name of a value in messages."""
         return f"{self.subject}{self._joint}{key}"
 
     def error(self, key: str, found: str, expected: str, remedy: str = "") -> InputError:
-        """Returns an InputError about a value of the table."""
         return InputError(self.name(key), found, expected, remedy)
 
     def has(self, key: str) -> bool:
@@ -102,13 +100,11 @@ class Fields:
         return self.values.get(key) is not None
 
     def get(self, key: str) -> object:
-        """Returns a required value of any type."""
         if not self.has(key):
             raise self.error(key, "nothing", "a value", "add it to the file")
         return self.values[key]
 
     def table(self, key: str) -> "Fields":
-        """Returns a required table inside this one."""
         return Fields(self.name(key), self.get(key))
 
     def number(

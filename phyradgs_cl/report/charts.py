@@ -86,7 +86,6 @@ def convergence_charts(record: Sequence[Mapping[str, float]]) -> list[Chart]:
 
 
 def draw_convergence(axes: "Axes", points: Sequence[tuple[float, float]], words: str) -> None:
-    """Draws a quantity over the iterations, and marks its last value."""
     x, y = zip(*points, strict=True)
     draw_curve(axes, x, y, "iteration", words)
     axes.plot(x[-1], y[-1], "o", color=ACCENT)

@@ -37,7 +37,6 @@ def data_uri(png: bytes) -> str:
 
 
 def base64_of(content: bytes) -> str:
-    """Returns bytes as text."""
     return base64.b64encode(content).decode("ascii")
 
 
@@ -127,7 +126,6 @@ class Plane:
         return len(self.indices) // 2
 
     def position_mm(self, k: int) -> float:
-        """Returns the position of the ``k``-th slice of the page."""
         return self.first_mm + self.indices[k] * self.step_mm
 
 

@@ -39,7 +39,6 @@ def slices_section(run: Run) -> Markup:
 
 
 def _disagreement(run: Run, planes: Sequence[images.Plane]) -> Markup | None:
-    """The middle slices of the difference between two estimates."""
     values = run.stored.disagreement
     if values is None:
         return None
@@ -72,7 +71,6 @@ def convergence_section(run: Run) -> Markup | None:
 
 
 def tuning_section(run: Run) -> Markup | None:
-    """The trials that chose an option."""
     return _section("tuning", "Tuning", _charts([tuning_chart(run.tuned)])) if run.tuned else None
 
 
@@ -210,7 +208,6 @@ def provenance_section(run: Run) -> Markup:
 
 
 def facts_table(facts: Mapping[str, object]) -> Markup:
-    """A row per fact: name, value with unit."""
     cells = [(label(key), shown(value, unit(key))) for key, value in list(flattened(facts))[:_MOST_ROWS]]
     lines = [element("tr", element("th", name, scope="row"), element("td", value)) for name, value in cells]
     return element("table", element("tbody", *lines))

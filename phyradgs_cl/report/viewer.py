@@ -91,7 +91,6 @@ def _picture(plane: Plane, of: str, *, has_controls: bool = False) -> Markup:
 
 
 def _place(plane: Plane, k: int) -> str:
-    """Returns the position of a slice, in the words of the page's script."""
     where = number(plane.position_mm(k), plane.step_mm)
     return f"{plane.axis} = {where} mm, {plane.indices[k] + 1} of {plane.count}"
 

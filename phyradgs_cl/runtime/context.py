@@ -134,7 +134,6 @@ class Runtime:
         return self.ledger.peak_bytes
 
     def reset_peak(self) -> None:
-        """Restarts ``peak_bytes`` from the memory in use now."""
         self.ledger.peak_bytes = self.ledger.held_bytes
 
     def zeros(self, shape: int | Sequence[int], dtype: np.typing.DTypeLike = np.float32) -> DeviceArray:
@@ -204,7 +203,6 @@ class Runtime:
 
     @staticmethod
     def local(nbytes: int) -> "cl.LocalMemory":
-        """Returns local memory of a work-group, as an argument of a launch."""
         return cl.LocalMemory(nbytes)
 
     @naming_failures()

@@ -33,7 +33,6 @@ class Strides:
         return cls((first[0] * ny + first[1]) * nx + first[2], ny * nx, nx)
 
     def vector(self) -> np.ndarray:
-        """Returns the strides as kernels take them."""
         return np.array([self.start, self.row, self.slice, 0], np.int64)
 
 

@@ -81,7 +81,6 @@ class Traffic:
     blocking: int = 0
 
     def count(self, up: int = 0, down: int = 0) -> None:
-        """One call that waits."""
         self.bytes_up += up
         self.bytes_down += down
         self.blocking += 1
@@ -195,7 +194,6 @@ def bytes_of(wish: str | int, subject: str) -> int:
 
 
 def mebibytes(nbytes: int) -> str:
-    """Formats a size: 12 MiB, 0.3 MiB."""
     size = nbytes / 2**20
     return f"{size:.0f} MiB" if size >= 10 else f"{size:.2g} MiB"
 

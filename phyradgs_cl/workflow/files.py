@@ -83,13 +83,11 @@ def refuse_overwriting(option: str, output: Path, *inputs: Path | None) -> None:
 
 
 def load_result(path: Path) -> Volume:
-    """Reads a volume file of any format."""
     with expecting(path, "volume", "plain-volume"):
         return importers.load_volume(path)
 
 
 def load_reference(path: Path) -> Volume:
-    """Reads the reference in a scan, or a volume file of any format."""
     if importers.foreign_volume(path) is None and file_kind(path) == "scan":
         scan = load_scan(path)
         if scan.reference is None:
@@ -100,7 +98,6 @@ def load_reference(path: Path) -> Volume:
 
 
 def summary(path: Path) -> dict[str, object]:
-    """Returns facts about a scan or volume file."""
     if (form := importers.foreign_volume(path)) is not None:
         return {"kind": f"volume ({form})", **_voxel_facts(path)}
     with expecting(path, "scan", "volume", "plain-volume"):

@@ -40,7 +40,6 @@ log = logging.getLogger(__name__)
 
 
 def check_interval(seconds: float) -> None:
-    """Raises InputError for an impossible time between checkpoints."""
     checks.within("--checkpoint-every (seconds)", seconds, 0, 1e9)
 
 

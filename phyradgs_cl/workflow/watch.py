@@ -247,7 +247,6 @@ class _Watch:
             return False
 
     def _discard(self, arrival: Arrival) -> None:
-        """Removes everything that a run has left in ``.work``."""
         work = self._work(arrival)
         for path in (work, partial_path(work), checkpoint_path(work), former_checkpoint_path(work)):
             path.unlink(missing_ok=True)

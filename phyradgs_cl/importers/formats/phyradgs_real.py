@@ -46,7 +46,6 @@ class Circle:
 
     @classmethod
     def read(cls, common: Fields, views: list[Fields], body: str) -> "Circle":
-        """Reads the circle of "source" or "detector"."""
         circle = common.table(body)
         tables = [view.table("rolling_shutter").table(body) for view in views]
         angles = np.deg2rad([[table.number(key) for key in _ANGLES] for table in tables])

@@ -116,7 +116,6 @@ class RtkGeometry:
 
     @property
     def frames(self) -> int:
-        """The number of projections."""
         return len(self.values["GantryAngle"])
 
     @property
@@ -150,7 +149,6 @@ class RtkGeometry:
 
 
 def read_rtk_xml(path: Path) -> RtkGeometry:
-    """Reads all projections of a geometry file."""
     root = _root(path)
     common, projections = _numbers(path, root), [_numbers(path, e) for e in root.iterfind("Projection")]
     if not projections:

@@ -33,7 +33,6 @@ def read_bytes(path: Path) -> bytes:
 
 
 def read_json(path: Path) -> dict[str, object]:
-    """Parses a JSON file that holds an object."""
     return read_facts(str(path), read_bytes(path).decode("utf-8-sig", "replace"), {})
 
 
@@ -96,7 +95,6 @@ class SafeFolder:
         return path
 
     def exists(self, name: str) -> bool:
-        """True for an entry of this name, of any kind."""
         return (self.root / name).exists() or (self.root / name).is_symlink()
 
     def glob(self, pattern: str) -> list[Path]:

@@ -230,7 +230,6 @@ def new_hdf5(path: str | Path, size_bytes: int) -> Iterator[h5py.File]:
 
 
 def write_grid(parent: h5py.Group, grid: Grid) -> None:
-    """Writes the group ``grid`` of ``parent``."""
     group = new_group(parent, "grid", "NXcollection")
     write_number(group, "shape", grid.shape)
     write_number(group, "voxel_size", grid.voxel_size_mm, "mm")
@@ -240,7 +239,6 @@ def write_grid(parent: h5py.Group, grid: Grid) -> None:
 def write_number(
     group: h5py.Group, name: str, values: object, units: str | None = None, **attributes: str
 ) -> h5py.Dataset:
-    """Writes a small dataset with its units attribute."""
     dataset = group.create_dataset(name, data=values)
     if units is not None:
         dataset.attrs["units"] = units
@@ -249,7 +247,6 @@ def write_number(
 
 
 def new_group(parent: h5py.Group, name: str, nx_class: str) -> h5py.Group:
-    """Creates a group with its NeXus class."""
     group = parent.create_group(name)
     group.attrs["NX_class"] = nx_class
     return group

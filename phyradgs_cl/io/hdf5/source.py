@@ -69,7 +69,6 @@ class Hdf5Source:
         return f"{self.path}:{address}"
 
     def error(self, address: str, found: str, expected: str, remedy: str = "") -> InputError:
-        """Returns an InputError about an object of the file."""
         return InputError(self.name(address), found, expected, remedy)
 
     def find(self, address: str) -> h5py.Group | h5py.Dataset | None:

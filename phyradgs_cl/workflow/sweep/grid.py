@@ -39,7 +39,6 @@ class Setting:
     before: Table
 
     def plan(self, seed: int = 0) -> methods.RunPlan:
-        """Returns the checked plan of a run."""
         return methods.plan_run(self.method, {**self.changes, **self.before}, preset=self.preset, seed=seed)
 
     @property

@@ -146,7 +146,6 @@ def run_sweep(job: SweepJob, report: Report = lambda progress: None) -> tuple[li
 
 
 def _lines(job: SweepJob, runs: Sequence[SweepRun], say: Callable[..., None]) -> Iterator[Line]:
-    """Makes the runs and yields their lines as they finish."""
     if not runs:
         return
     if job.workers is not None:
