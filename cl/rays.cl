@@ -46,8 +46,8 @@ __kernel void rays_forward(
             const index_t sa = axis == 0 ? 1 : (axis == 1 ? sy : sz), sb = axis == 0 ? sy : 1, sc = axis == 2 ? sy : sz;
             for (int i = w.lo; i <= w.hi; ++i) {
                 vf wb, wc, v00, v10, v01, v11;
-                const vi j = sample_at(w.gb, w.sb, (float)i - w.sa, w.b_first, w.b_last, &wb);
-                const vi k = sample_at(w.gc, w.sc, (float)i - w.sa, w.c_first, w.c_last, &wc);
+                const vi j = sample_at(w.gb, START_OF(w.sb, i), AHEAD_OF(w.sa, i), w.b_first, w.b_last, &wb);
+                const vi k = sample_at(w.gc, START_OF(w.sc, i), AHEAD_OF(w.sa, i), w.c_first, w.c_last, &wc);
                 vindex at = V_INDEX(j - w.b_first) * sb + V_INDEX(k - w.c_first) * sc;
                 __global const float *plane = body + (i - w.a_first) * sa;
                 #pragma unroll

@@ -28,8 +28,8 @@ RAY_INLINE void line_onto(__global const float *cell, __global const float *row,
             __local float *body = tile + (1 - w.a_first) * sa + (1 - w.b_first) * sb + (1 - w.c_first) * sc;
             for (int i = w.lo; i <= w.hi; ++i) {
                 vf wb, wc;
-                const vi j = sample_at(w.gb, w.sb, (float)i - w.sa, w.b_first, w.b_last, &wb);
-                const vi k = sample_at(w.gc, w.sc, (float)i - w.sa, w.c_first, w.c_last, &wc);
+                const vi j = sample_at(w.gb, START_OF(w.sb, i), AHEAD_OF(w.sa, i), w.b_first, w.b_last, &wb);
+                const vi k = sample_at(w.gc, START_OF(w.sc, i), AHEAD_OF(w.sa, i), w.c_first, w.c_last, &wc);
                 const vf h = V_PICK(0.0f, value, (w.first <= i) & (w.last >= i));
                 const vf far = h * wc, near = h - far;
                 vf h10 = near * wb, h11 = far * wb, h00 = near - h10, h01 = far - h11;

@@ -14,11 +14,13 @@ static inline float ray_weight(const rays_t r, __global const float *cell, const
     const float i = (float)(a == 0 ? voxel.x : (a == 1 ? voxel.y : voxel.z));
     const float j = (float)(a == 0 ? voxel.y : voxel.x), k = (float)(a == 2 ? voxel.y : voxel.z);
     const float sa = cell[RAY_SOURCE + a];
+#if !RAY_PARALLEL
     if (i < min(sa, sa + da) || i > max(sa, sa + da))
         return 0.0f;
+#endif
     const float inv = 1.0f / da;
-    const float wb = 1.0f - fabs(fma(db * inv, i - sa, cell[RAY_SOURCE + b]) - j);
-    const float wc = 1.0f - fabs(fma(dc * inv, i - sa, cell[RAY_SOURCE + c]) - k);
+    const float wb = 1.0f - fabs(fma(db * inv, AHEAD_OF(sa, i), START_OF(cell[RAY_SOURCE + b], i)) - j);
+    const float wc = 1.0f - fabs(fma(dc * inv, AHEAD_OF(sa, i), START_OF(cell[RAY_SOURCE + c], i)) - k);
     return wb > 0.0f && wc > 0.0f ? wb * wc * r.step_mm : 0.0f;
 }
 

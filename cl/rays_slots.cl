@@ -105,9 +105,9 @@ __kernel void split_slots(
             sum += weights_at(weights, share, by_row, u, v) * y;
         }
         const vi inside = (VI_IOTA + v) < slot[SLOT_V_STOP];
-        V_STORE(V_PICK(0.0f, sum * column_steps_mm(d, pitch_mm), inside), column + own);
+        V_STORE(V_PICK(0.0f, sum * column_steps_mm(cell, d, pitch_mm), inside), column + own);
 #if LEAN
-        V_STORE(d.z / V_PICK(d.y, d.x, column_along_x(d) == 1), column + slots_floats + own);
+        V_STORE(d.z / V_PICK(d.y, d.x, column_along_x(cell, d) == 1), column + slots_floats + own);
 #endif
     }
 }

@@ -60,6 +60,17 @@ RAY_INLINE planes_t planes_of(__global const float *cell, const int along_x, con
     return r;
 }
 
+/* The same, as plane i sees it: the source of a parallel beam differs from plane to plane. */
+RAY_INLINE planes_t planes_from(planes_t r, const int i)
+{
+#if RAY_PARALLEL
+    r.sa = (float)i - AHEAD_OF(r.sa, i);
+    r.sb = START_OF(r.sb, i);
+    r.sc = START_OF(r.sc, i);
+#endif
+    return r;
+}
+
 /* The voxel at or below a position on the clamped axis of a box from `first` to `last`. */
 RAY_INLINE int voxel_below(const float at, const int last) { return min((int)(at + 1.0f) - 1, last); }
 
@@ -219,11 +230,11 @@ __kernel void rays_upright(
         __global const float *plane = columns + IMAGE_GUARD + (long)(planes.x - r.a_first + BORDER) * r.stride_a
                                       - (long)(r.b_first - BORDER) * r.stride_b - r.c_first;
         for (int i = planes.x; i <= planes.y; ++i, plane += r.stride_a)
-            sample_plane(plane, r, i, gb, gc, count, p, blended);
+            sample_plane(plane, planes_from(r, i), i, gb, gc, count, p, blended);
         for (int k = 0; k < count; k += LANES) {
             const column_rays_t d = column_rays(cell, u, start + k);
-            const vf part = V_LOAD(p + k) * column_steps_mm(d, pitch_mm);
-            V_STORE(V_PICK(turn ? V_LOAD(total + k) : (vf)(0.0f), part, column_along_x(d) == along_x),
+            const vf part = V_LOAD(p + k) * column_steps_mm(cell, d, pitch_mm);
+            V_STORE(V_PICK(turn ? V_LOAD(total + k) : (vf)(0.0f), part, column_along_x(cell, d) == along_x),
                     total + k);
         }
     }

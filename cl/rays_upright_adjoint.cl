@@ -332,8 +332,11 @@ __kernel void rays_upright_adjoint(
                 const float b_first = (float)(along_x ? origin.y + y_first : origin.x + x_first);
                 const float sa = cell[RAY_SOURCE + !along_x];
                 const int2 planes = planes_between(cell, u, along_x, a_first, along_x ? nx : ny);
+                const float sb = r.sb, sc = r.sc;
                 for (int i = planes.x; i <= planes.y; ++i) {
-                    const float ahead = (float)i - sa, at = fma(r.across, ahead, r.sb) - b_first;
+                    r.sb = START_OF(sb, i);
+                    r.sc = START_OF(sc, i);
+                    const float ahead = AHEAD_OF(sa, i), at = fma(r.across, ahead, r.sb) - b_first;
                     const float at0 = fma(r.along * r.first, ahead, at), at1 = fma(r.along * r.last, ahead, at);
                     if (fmax(at0, at1) <= -1.0f || fmin(at0, at1) >= (float)nb)
                         continue;

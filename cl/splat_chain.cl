@@ -110,8 +110,9 @@ __kernel void splat_chain(
         const vf inv_z = 1.0f / z;
         const vf u0 = wide_value(wide_dot(m, mean.x, mean.y, mean.z)) * inv_z;
         const vf v0 = wide_value(wide_dot(m + 4, mean.x, mean.y, mean.z)) * inv_z;
-        const v3 from_source = v3_make(mean.x - cell[CELL_SOURCE], mean.y - cell[CELL_SOURCE + 1],
-                                       mean.z - cell[CELL_SOURCE + 2]);
+        const v3 end = PARALLEL ? v3_make(zero, zero, zero) : mean;
+        const v3 from_source = v3_make(end.x - cell[CELL_SOURCE], end.y - cell[CELL_SOURCE + 1],
+                                       end.z - cell[CELL_SOURCE + 2]);
         const v3 ray = to_local(axes, v3_make(V_PICK((vf)(1.0f), from_source.x, is_in_view),
                                               V_PICK((vf)(0.0f), from_source.y, is_in_view),
                                               V_PICK((vf)(0.0f), from_source.z, is_in_view)));
@@ -191,7 +192,9 @@ __kernel void splat_chain(
         by_u0 += g_u0;
         by_v0 += g_v0;
 
+#if !PARALLEL
         by_mean = v3_add(by_mean, to_world(axes, by_ray));
+#endif
 #if MOVING
         /* the centre is the mean of the path's parabola, (end 0 + 4 middle + end 1) / 6; the path end 1 - end 0 */
         add_by_centre(&by_mean, m, u0, v0, inv_z, 0.66666666667f * g_u0, 0.66666666667f * g_v0, by_z);

@@ -11,7 +11,7 @@ from functools import partial
 import numpy as np
 
 from phyradgs_cl import objective, operators
-from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, ConstantSpeed, Shutter
+from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, ConstantSpeed, ParallelGeometry, Shutter
 from phyradgs_cl.acquisition.cells import common_time_cells, exact_cells, micro_view_cells, static_cells
 from phyradgs_cl.acquisition.time_cells import TimeCells
 from phyradgs_cl.errors import DeviceError, OutOfMemoryError
@@ -31,6 +31,7 @@ VALUE, GRADIENT = 1e-4, 1e-3  # relative to the largest number; float32 leaves a
 SHAPE, GRID = (9, 12), Grid((5, 7, 6), (0.3, 0.24, 0.28), (0.1, -0.05, 0.1))
 GEOMETRY = ConeGeometry(5.0, 7.5, SHAPE, (3.9 / 9, 4.1 / 12), (0.1, 0.2))
 ORBIT = CircularOrbit(GEOMETRY, ConstantSpeed(0.3, 0.5))
+PARALLEL = CircularOrbit(ParallelGeometry(SHAPE, (2.6 / 9, 2.7 / 12), (0.1, 0.2)), ConstantSpeed(0.3, 0.5))
 UNIT = 2.0  # line integral that is 1 in images of the intensity model
 STEP = 1e-6  # of central differences
 Comparison = tuple[np.ndarray, np.ndarray, float]
@@ -119,7 +120,7 @@ def _binning(rt: Runtime) -> Iterator[Comparison]:
 
 
 def _splats(rt: Runtime) -> Iterator[Comparison]:
-    for table in _tables():
+    for table in (*_tables(), *_tables(PARALLEL)):
         frame = splat_frame if table.end_poses is None else moving_frame
         for affine in (False, True):
             twin = partial(frame, table=table, detector_shape=SHAPE, affine=affine)
@@ -183,7 +184,12 @@ def _rays(rt: Runtime) -> Iterator[Comparison]:
     common = common_time_cells(orbit, Shutter(0.8, 0.6), 0, np.array([0.2]), tall[0], 3)
     leaning = replace(common, pose=common.pose.copy())
     leaning.pose[:, 9:12] += 0.02 * common.pose[:, 6:9]
-    for cells, shape in ((still, SHAPE), (table, SHAPE), (upright, tall), (common, tall), (leaning, tall)):
+    parallel = CircularOrbit(ParallelGeometry(tall, (2.6 / 32, 2.7 / 5)), ConstantSpeed(0.3, 0.5))
+    along = common_time_cells(parallel, Shutter(0.8, 0.6), 0, np.array([0.2]), tall[0], 3)
+    inclined = replace(along, pose=along.pose.copy())
+    inclined.pose[:, 9:12] += 0.02 * along.pose[:, 6:9]
+    of_tall = ((cells, tall) for cells in (upright, common, leaning, along, inclined))
+    for cells, shape in ((still, SHAPE), (table, SHAPE), (_tables(PARALLEL)[1], SHAPE), *of_tall):
         y = _noise((1, *shape), 6)
         operator = operators.RayOperator(rt, GRID, shape, [cells])
         yield operator.forward(volume)[0], twins.ray_frame(volume, GRID, cells, shape), VALUE
@@ -285,10 +291,10 @@ def _cloud(count: int = 3) -> np.ndarray:
     return np.concatenate(parts).astype(np.float32).astype(np.float64)
 
 
-def _tables() -> tuple[TimeCells, TimeCells, TimeCells]:
+def _tables(orbit: CircularOrbit = ORBIT) -> tuple[TimeCells, TimeCells, TimeCells]:
     """One pose, micro-views, and lines that integrate while the gantry moves."""
-    rolling = ORBIT, Shutter(0.8, 0.6, "columns", -1), 0, 0.2, SHAPE[1]
-    still = static_cells(ORBIT, Shutter(0.8, 0.6), 0, 0.2, SHAPE[0])
+    rolling = orbit, Shutter(0.8, 0.6, "columns", -1), 0, 0.2, SHAPE[1]
+    still = static_cells(orbit, Shutter(0.8, 0.6), 0, 0.2, SHAPE[0])
     return still, micro_view_cells(*rolling, 3, 2), exact_cells(*rolling, 3)
 
 

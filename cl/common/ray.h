@@ -1,6 +1,9 @@
 /* Joseph's samples along LANES rays of one detector line, for the projector and both shapes of its adjoint.
    Everything is in voxel indices (x, y, z). All of them take axis, planes and weights from here, and fma fixes
-   the rounding: a ray has the same samples in all kernels. */
+   the rounding: a ray has the same samples in all kernels.
+   RAY_PARALLEL: the rays of a cell have one direction. RAY_SOURCE is this direction over its main component, and RAY_D00,
+   RAY_EU, RAY_EV give where rays cut the plane 0 of the main axis, with 1, 0, 0 along it. On a plane i these are the rays
+   of a cone beam whose source lies at the direction times i, a plane before (START_OF, AHEAD_OF). */
 #include "common/lanes.h"
 
 #define RAY_CELL 16    /* floats per cell */
@@ -8,6 +11,17 @@
 #define RAY_D00 3      /* from source to pixel (0, 0) */
 #define RAY_EU 6
 #define RAY_EV 9
+
+#ifndef RAY_PARALLEL
+#define RAY_PARALLEL 0
+#endif
+#if RAY_PARALLEL
+#define START_OF(start, i) ((start) * (float)(i))
+#define AHEAD_OF(start, i) 1.0f
+#else
+#define START_OF(start, i) (start)
+#define AHEAD_OF(start, i) ((float)(i) - (start))
+#endif
 
 #define BORDER 1       /* zero voxels around a volume in y and z; in x the rows' padding does */
 #define CLIP_MARGIN 0.01f /* planes: more than the rounding of a clipped end; samples outside weigh nothing anyway */
@@ -77,14 +91,20 @@ RAY_INLINE rays_t rays_through(__global const float *cell, const float4 pitch_mm
     r.x = fma(u, (vf)(cell[RAY_EU]), (vf)(fma(v, cell[RAY_EV], cell[RAY_D00])));
     r.y = fma(u, (vf)(cell[RAY_EU + 1]), (vf)(fma(v, cell[RAY_EV + 1], cell[RAY_D00 + 1])));
     r.z = fma(u, (vf)(cell[RAY_EU + 2]), (vf)(fma(v, cell[RAY_EV + 2], cell[RAY_D00 + 2])));
-    const vf ax = fabs(r.x), ay = fabs(r.y), az = fabs(r.z);
+#if RAY_PARALLEL
+    const vf dx = (vf)(cell[RAY_SOURCE]), dy = (vf)(cell[RAY_SOURCE + 1]), dz = (vf)(cell[RAY_SOURCE + 2]);
+#else
+    const vf dx = r.x, dy = r.y, dz = r.z;
+#endif
+    const vf ax = fabs(dx), ay = fabs(dy), az = fabs(dz);
     r.axis = VI_PICK(VI_PICK(2, 1, ay >= az), 0, (ax >= ay) & (ax >= az));
-    const vf lx = r.x * pitch_mm.x, ly = r.y * pitch_mm.y, lz = r.z * pitch_mm.z;
+    const vf lx = dx * pitch_mm.x, ly = dy * pitch_mm.y, lz = dz * pitch_mm.z;
     r.step_mm = sqrt(lx * lx + ly * ly + lz * lz) / max(max(ax, ay), az);
     return r;
 }
 
-/* Rays along one main axis a through a box of voxels: position on plane i is s_b + g_b (i - s_a), likewise c. */
+/* Rays along one main axis a through a box of voxels: position on plane i is s_b + g_b (i - s_a), likewise c; with s_b i for
+   s_b and 1 for i - s_a in a parallel beam. */
 typedef struct {
     float sa, sb, sc;
     vf gb, gc;
@@ -93,13 +113,20 @@ typedef struct {
     int lo, hi;                                    /* planes of any of them */
 } walk_t;
 
-/* narrows [lo, hi] to the planes where the other coordinate lies in (below, above) */
+/* narrows [lo, hi] to the planes where the other coordinate, sb + g (i - sa), lies in (below, above) */
 RAY_INLINE void clip_planes(const vf g, const float sa, const float sb, const float below, const float above,
                         vf *lo, vf *hi)
 {
-    const vi oblique = fabs(g) > 1e-9f;
-    const vf per = 1.0f / V_PICK(1.0f, g, oblique);
-    const vf p = sa + (below - sb) * per, q = sa + (above - sb) * per;
+#if RAY_PARALLEL
+    const vf slope = (vf)(sb), start = g;
+    const float origin = 0.0f;
+#else
+    const vf slope = g, start = (vf)(sb);
+    const float origin = sa;
+#endif
+    const vi oblique = fabs(slope) > 1e-9f;
+    const vf per = 1.0f / V_PICK(1.0f, slope, oblique);
+    const vf p = origin + (below - start) * per, q = origin + (above - start) * per;
     *lo = V_PICK(*lo, max(*lo, min(p, q) - CLIP_MARGIN), oblique);
     *hi = V_PICK(*hi, min(*hi, max(p, q) + CLIP_MARGIN), oblique);
 }
@@ -125,7 +152,11 @@ RAY_INLINE int rays_enter(const rays_t r, __global const float *cell, const int 
     w->gb = V_PICK(0.0f, db * inv, own);
     w->gc = V_PICK(0.0f, dc * inv, own);
     /* planes between source and detector, then those where both other coordinates touch the box */
-    vf lo = max((vf)(a0), min((vf)(w->sa), w->sa + da)), hi = min((vf)(a0 + na - 1), max((vf)(w->sa), w->sa + da));
+    vf lo = (vf)(a0), hi = (vf)(a0 + na - 1);
+#if !RAY_PARALLEL
+    lo = max(lo, min((vf)(w->sa), w->sa + da));
+    hi = min(hi, max((vf)(w->sa), w->sa + da));
+#endif
     clip_planes(w->gb, w->sa, w->sb, (float)(w->b_first - 1), (float)(w->b_last + 1), &lo, &hi);
     clip_planes(w->gc, w->sa, w->sc, (float)(w->c_first - 1), (float)(w->c_last + 1), &lo, &hi);
     lo = min(lo, (float)(a0 + na));

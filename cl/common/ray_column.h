@@ -34,16 +34,32 @@ RAY_INLINE column_rays_t column_rays(__global const float *cell, const int u, co
 }
 
 /* a main axis is x or y here: rays that are steeper along z take the general kernel */
-RAY_INLINE vi column_along_x(const column_rays_t d) { return VI_PICK(0, 1, fabs(d.x) >= fabs(d.y)); }
+RAY_INLINE vi column_along_x(__global const float *cell, const column_rays_t d)
+{
+#if RAY_PARALLEL
+    return (vi)(fabs(cell[RAY_SOURCE]) >= fabs(cell[RAY_SOURCE + 1]));
+#else
+    return VI_PICK(0, 1, fabs(d.x) >= fabs(d.y));
+#endif
+}
 
 RAY_INLINE int is_along_x(__global const float *cell, const int u, const int v)
 {
+#if RAY_PARALLEL
+    return fabs(cell[RAY_SOURCE]) >= fabs(cell[RAY_SOURCE + 1]);
+#else
     return fabs(ray_component(cell, 0, u, v)) >= fabs(ray_component(cell, 1, u, v));
+#endif
 }
 
 /* length of each ray from one plane to the next */
-RAY_INLINE vf column_steps_mm(const column_rays_t d, const float4 pitch_mm)
+RAY_INLINE vf column_steps_mm(__global const float *cell, column_rays_t d, const float4 pitch_mm)
 {
+#if RAY_PARALLEL
+    d.x = (vf)(cell[RAY_SOURCE]);
+    d.y = (vf)(cell[RAY_SOURCE + 1]);
+    d.z = (vf)(cell[RAY_SOURCE + 2]);
+#endif
     const vf lx = d.x * pitch_mm.x, ly = d.y * pitch_mm.y, lz = d.z * pitch_mm.z;
     return sqrt(lx * lx + ly * ly + lz * lz) / max(fabs(d.x), fabs(d.y));
 }
@@ -52,7 +68,7 @@ RAY_INLINE vf column_steps_mm(const column_rays_t d, const float4 pitch_mm)
    whole volume does, as operators/rays/upright.py sees to. */
 RAY_INLINE int2 planes_between(__global const float *cell, const int u, const int along_x, const int first, const int count)
 {
-#if LEAN
+#if LEAN || RAY_PARALLEL
     return (int2)(first, first + count - 1);
 #else
     const float sa = cell[RAY_SOURCE + !along_x], end = sa + ray_component(cell, !along_x, u, 0);
@@ -66,11 +82,16 @@ RAY_INLINE int2 planes_between(__global const float *cell, const int u, const in
 RAY_INLINE int2 planes_within(const int2 planes, const float sa, const float sb, const float g0, const float g1,
                               const float below, const float above)
 {
+#if RAY_PARALLEL /* b = g + sb i */
+    const float per = 1.0f / (fabs(sb) > 1e-9f ? sb : 1e-9f), p = (below - fmax(g0, g1)) * per, q = (above - fmin(g0, g1)) * per;
+    const float low = fmin(p, q) - CLIP_MARGIN, high = fmax(p, q) + CLIP_MARGIN;
+#else
     if (g0 * g1 <= 0.0f || (sa > (float)planes.x && sa < (float)planes.y))
         return planes;
     const float p0 = (below - sb) / g0, p1 = (below - sb) / g1, q0 = (above - sb) / g0, q1 = (above - sb) / g1;
     const float low = sa + fmin(fmin(p0, p1), fmin(q0, q1)) - CLIP_MARGIN;
     const float high = sa + fmax(fmax(p0, p1), fmax(q0, q1)) + CLIP_MARGIN;
+#endif
     return (int2)(max(planes.x, (int)ceil(clamp(low, (float)planes.x, (float)planes.y + 1.0f))),
                   min(planes.y, (int)floor(clamp(high, (float)planes.x - 1.0f, (float)planes.y))));
 }

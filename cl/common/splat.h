@@ -9,6 +9,10 @@
    The affine (R2-Gaussian) splat is Q = 1 and |d| of the central ray. */
 #include "common/falling_exp2.h"
 
+#ifndef PARALLEL
+#define PARALLEL 0 /* rays of a cell have one direction; AFFINE, which is exact then, must be 1 */
+#endif
+
 #ifndef SPLAT_SPACE
 #define SPLAT_SPACE __global /* where records and constants of cells are read from */
 #endif
@@ -57,7 +61,7 @@
 
 /* constants of a cell, floats */
 #define CELL 24
-#define CELL_SOURCE 0     /* 3 */
+#define CELL_SOURCE 0     /* 3; PARALLEL: the direction of the rays, reversed */
 #define CELL_EU 3         /* 3: step to the next pixel across the lines */
 #define CELL_EV 6         /* 3: step to the next line */
 #define CELL_VOLUME 9     /* (eu x ev) . (first pixel - source) */

@@ -45,8 +45,9 @@ ALWAYS_INLINE splat_view view_splat(const gaussian g, __global const float *cell
 {
     splat_view s;
     const vf inv_det = g.inv_scale.x * g.inv_scale.y * g.inv_scale.z;
-    const v3 ray = to_local(g.axes, v3_make(g.mean.x - cell[CELL_SOURCE], g.mean.y - cell[CELL_SOURCE + 1],
-                                            g.mean.z - cell[CELL_SOURCE + 2]));
+    const v3 end = PARALLEL ? v3_make((vf)(0.0f), (vf)(0.0f), (vf)(0.0f)) : g.mean;
+    const v3 ray = to_local(g.axes, v3_make(end.x - cell[CELL_SOURCE], end.y - cell[CELL_SOURCE + 1],
+                                            end.z - cell[CELL_SOURCE + 2]));
     const v3 eu = to_local(g.axes, v3_make((vf)(cell[CELL_EU]), (vf)(cell[CELL_EU + 1]), (vf)(cell[CELL_EU + 2])));
     const v3 ev = to_local(g.axes, v3_make((vf)(cell[CELL_EV]), (vf)(cell[CELL_EV + 1]), (vf)(cell[CELL_EV + 2])));
     const v3 white = v3_mul(ray, g.inv_scale);

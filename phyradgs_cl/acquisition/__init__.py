@@ -1,6 +1,6 @@
 """The acquisition: geometry, trajectory, shutter, time cells, motion models, and the scan that holds them."""
 
-from phyradgs_cl.acquisition.geometry import ConeGeometry, pixel_centres, transpose_pose
+from phyradgs_cl.acquisition.geometry import ConeGeometry, ParallelGeometry, pixel_centres, transpose_pose
 from phyradgs_cl.acquisition.motion import (
     MOTIONS,
     Exact,
@@ -27,7 +27,7 @@ from phyradgs_cl.acquisition.trajectory import (
 )
 
 __all__ = [
-    "MOTIONS", "PROTOCOLS", "CircularOrbit", "ConeGeometry", "ConstantSpeed", "EncoderTable",
+    "MOTIONS", "PROTOCOLS", "ParallelGeometry", "CircularOrbit", "ConeGeometry", "ConstantSpeed", "EncoderTable",
     "Exact", "FrameSweeps", "LineMiddles", "MicroViews", "Motion", "OwnTimes", "PerRow", "PoseTable",
     "Protocol", "Saturation", "Scan", "Shutter", "SpeedRamp", "Static", "StaticStart", "TimeCells",
     "Trajectory", "make_protocol", "pixel_centres", "transpose_pose"

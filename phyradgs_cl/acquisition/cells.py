@@ -6,7 +6,7 @@ import numpy as np
 
 from phyradgs_cl.acquisition.shutter import Shutter
 from phyradgs_cl.acquisition.time_cells import TimeCells
-from phyradgs_cl.acquisition.trajectory import Trajectory
+from phyradgs_cl.acquisition.trajectory import Trajectory, is_parallel
 from phyradgs_cl.errors import InputError
 
 _SAME_TIME = 1e-6  # of a cell: how exactly a frame has to begin on the grid of the first one
@@ -229,4 +229,5 @@ def cell_table(
         weight=weight[order].astype(np.float64),
         lines=lines,
         axis=shutter.axis,
+        is_parallel=is_parallel(trajectory),
     )

@@ -1,12 +1,14 @@
-"""Cone-beam geometry: positions of source and detector at a gantry angle, and the field of view.
+"""Geometry of cone and parallel beams: positions of source and detector at a gantry angle, and the field of view.
 
 A *pose* is 12 numbers in world coordinates (mm): source, centre of pixel (0, 0), the step from column to column (û·du)
-and from row to row (v̂·dv). Operators take poses, never angles.
+and from row to row (v̂·dv). A parallel beam has the rays' direction, towards the panel, in place of the source. Operators
+take poses, never angles.
 """
 
 import math
 from dataclasses import dataclass, replace
 from numbers import Real
+from typing import Any
 
 import numpy as np
 
@@ -39,56 +41,103 @@ class ConeGeometry:
         if self.source_to_detector_mm < self.source_to_axis_mm:
             expected = f"at least source_to_axis_mm ({self.source_to_axis_mm:g}): the panel stands behind the axis"
             raise InputError("source_to_detector_mm", f"{self.source_to_detector_mm:g}", expected, "are they exchanged?")
-        counts = checks.numbers("detector_shape", self.detector_shape, (2,))
-        if (counts < 1).any() or (counts != np.floor(counts)).any():
-            raise InputError("detector_shape", str(self.detector_shape), "two counts (rows, columns) of at least 1")
-        object.__setattr__(self, "detector_shape", (int(counts[0]), int(counts[1])))
-        if isinstance(self.pixel_size_mm, Real):
-            object.__setattr__(self, "pixel_size_mm", (self.pixel_size_mm, self.pixel_size_mm))
-        _positive_mm("pixel_size_mm", self.pixel_size_mm, (2,))
-        for name in ("pixel_size_mm", "detector_offset_mm"):  # tuples whatever was given: geometries are compared
-            object.__setattr__(self, name, tuple(checks.numbers(name, getattr(self, name), (2,)).tolist()))
+        _check_panel(self)
 
     def pose(self, angle_rad: np.ndarray | float) -> np.ndarray:
         """Returns poses (..., 12) float64 at gantry angles (...): the source is at (DSO cos θ, DSO sin θ, 0)."""
-        angle = np.asarray(angle_rad, dtype=np.float64)
-        cos, sin, zero = np.cos(angle), np.sin(angle), np.zeros_like(angle)
-        radial = np.stack([cos, sin, zero], -1)
-        u_hat = np.stack([-sin, cos, zero], -1)
-        v_hat = np.stack([zero, zero, zero + 1.0], -1)
-        (nv, nu), (dv, du), (off_v, off_u) = self.detector_shape, self.pixel_size_mm, self.detector_offset_mm
-        behind_axis_mm = self.source_to_detector_mm - self.source_to_axis_mm
-        first_pixel = (
-            -behind_axis_mm * radial
-            + (off_u - (nu - 1) / 2 * du) * u_hat
-            + (off_v - (nv - 1) / 2 * dv) * v_hat
-        )
-        return np.concatenate([self.source_to_axis_mm * radial, first_pixel, du * u_hat, dv * v_hat], -1)
+        radial, panel = _panel_at(self, angle_rad)
+        panel[..., :3] -= (self.source_to_detector_mm - self.source_to_axis_mm) * radial
+        return np.concatenate([self.source_to_axis_mm * radial, panel], -1)
 
     def scaled(self, factor: float) -> "ConeGeometry":
         """Returns the geometry with every length multiplied by ``factor``."""
-        dv, du = self.pixel_size_mm
-        off_v, off_u = self.detector_offset_mm
-        return replace(
-            self,
-            source_to_axis_mm=self.source_to_axis_mm * factor,
-            source_to_detector_mm=self.source_to_detector_mm * factor,
-            pixel_size_mm=(dv * factor, du * factor),
-            detector_offset_mm=(off_v * factor, off_u * factor),
-        )
+        distances = {name: getattr(self, name) * factor for name in ("source_to_axis_mm", "source_to_detector_mm")}
+        return replace(self, **distances, **_scaled_panel(self, factor))
 
     def finer(self, factor: int) -> "ConeGeometry":
         """Returns the geometry with every pixel cut into ``factor`` by ``factor``."""
-        rows, columns = self.detector_shape
-        dv, du = self.pixel_size_mm
-        return replace(
-            self, detector_shape=(rows * factor, columns * factor), pixel_size_mm=(dv / factor, du / factor)
-        )
+        return replace(self, **_finer_panel(self, factor))
 
     @property
     def magnification(self) -> float:
         """The size of an object's image on the detector over its size, at the axis."""
         return self.source_to_detector_mm / self.source_to_axis_mm
+
+
+@dataclass(frozen=True)
+class ParallelGeometry:
+    """A circular parallel-beam orbit about +z with a flat panel across the rays, in mm.
+
+    Distances do not matter: the panel's plane is put through the axis. ``detector_shape`` counts (rows, columns).
+    ``pixel_size_mm`` is (dv, du); one number stands for square pixels. ``detector_offset_mm`` (v, u) shifts the panel's
+    centre from the ray through the axis, as in ``ConeGeometry``: u > 0 to higher columns, right seen against the rays'
+    origin. Raises InputError for lengths and counts that are not above 0.
+    """
+
+    detector_shape: tuple[int, int]
+    pixel_size_mm: tuple[float, float]
+    detector_offset_mm: tuple[float, float] = (0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        _check_panel(self)
+
+    def pose(self, angle_rad: np.ndarray | float) -> np.ndarray:
+        """Returns poses (..., 12) float64 at gantry angles (...): rays run along (−cos θ, −sin θ, 0), from where a cone
+        beam has its source."""
+        radial, panel = _panel_at(self, angle_rad)
+        return np.concatenate([-radial, panel], -1)
+
+    def scaled(self, factor: float) -> "ParallelGeometry":
+        """Returns the geometry with every length multiplied by ``factor``."""
+        return replace(self, **_scaled_panel(self, factor))
+
+    def finer(self, factor: int) -> "ParallelGeometry":
+        """Returns the geometry with every pixel cut into ``factor`` by ``factor``."""
+        return replace(self, **_finer_panel(self, factor))
+
+    @property
+    def magnification(self) -> float:
+        """1: parallel rays do not magnify."""
+        return 1.0
+
+
+Geometry = ConeGeometry | ParallelGeometry
+GEOMETRIES = (ConeGeometry, ParallelGeometry)
+
+
+def _check_panel(geometry: Geometry) -> None:
+    """Checks a geometry's panel, and makes its fields tuples: geometries are compared. Raises InputError."""
+    counts = checks.numbers("detector_shape", geometry.detector_shape, (2,))
+    if (counts < 1).any() or (counts != np.floor(counts)).any():
+        raise InputError("detector_shape", str(geometry.detector_shape), "two counts (rows, columns) of at least 1")
+    object.__setattr__(geometry, "detector_shape", (int(counts[0]), int(counts[1])))
+    if isinstance(geometry.pixel_size_mm, Real):
+        object.__setattr__(geometry, "pixel_size_mm", (geometry.pixel_size_mm, geometry.pixel_size_mm))
+    _positive_mm("pixel_size_mm", geometry.pixel_size_mm, (2,))
+    for name in ("pixel_size_mm", "detector_offset_mm"):
+        object.__setattr__(geometry, name, tuple(checks.numbers(name, getattr(geometry, name), (2,)).tolist()))
+
+
+def _panel_at(geometry: Geometry, angle_rad: np.ndarray | float) -> tuple[np.ndarray, np.ndarray]:
+    """Returns the unit vector from the axis to the source (..., 3), and pixel (0, 0) and the steps (..., 9) of a panel
+    whose plane contains the axis."""
+    angle = np.asarray(angle_rad, dtype=np.float64)
+    cos, sin, zero = np.cos(angle), np.sin(angle), np.zeros_like(angle)
+    u_hat = np.stack([-sin, cos, zero], -1)
+    v_hat = np.stack([zero, zero, zero + 1.0], -1)
+    (nv, nu), (dv, du), (off_v, off_u) = geometry.detector_shape, geometry.pixel_size_mm, geometry.detector_offset_mm
+    first_pixel = (off_u - (nu - 1) / 2 * du) * u_hat + (off_v - (nv - 1) / 2 * dv) * v_hat
+    return np.stack([cos, sin, zero], -1), np.concatenate([first_pixel, du * u_hat, dv * v_hat], -1)
+
+
+def _scaled_panel(geometry: Geometry, factor: float) -> dict[str, Any]:
+    (dv, du), (off_v, off_u) = geometry.pixel_size_mm, geometry.detector_offset_mm
+    return {"pixel_size_mm": (dv * factor, du * factor), "detector_offset_mm": (off_v * factor, off_u * factor)}
+
+
+def _finer_panel(geometry: Geometry, factor: int) -> dict[str, Any]:
+    (rows, columns), (dv, du) = geometry.detector_shape, geometry.pixel_size_mm
+    return {"detector_shape": (rows * factor, columns * factor), "pixel_size_mm": (dv / factor, du / factor)}
 
 
 def _positive_mm(name: str, value: object, shape: tuple[int, ...]) -> None:
@@ -106,20 +155,28 @@ def pixel_centres(pose: np.ndarray, detector_shape: tuple[int, int]) -> np.ndarr
     return pose[..., 3:6] + columns * pose[..., 6:9] + rows * pose[..., 9:12]
 
 
-def plain_geometry(pose: np.ndarray, panel: tuple[int, int]) -> ConeGeometry:
+def plain_geometry(pose: np.ndarray, panel: tuple[int, int], is_parallel: bool = False) -> Geometry:
     """Returns the circular geometry nearest to poses (F, 12), by mean distances and offsets. The detector's distance is that
-    of its plane, its offset that of its middle from the source's foot on the plane."""
+    of its plane, its offset that of its middle from the foot of the source, or of the axis in a parallel beam, on it."""
     source, first, step_u, step_v = (pose[:, i : i + 3] for i in (0, 3, 6, 9))
     pitch_u, pitch_v = (np.linalg.norm(step, axis=1, keepdims=True) for step in (step_u, step_v))
     u_hat, v_hat = step_u / pitch_u, step_v / pitch_v
     centre = first + (panel[1] - 1) / 2 * step_u + (panel[0] - 1) / 2 * step_v
     normal = np.cross(u_hat, v_hat)
-    ray = centre - source
+    ray = centre - (0 * source if is_parallel else source)
     offset_v, offset_u, away = (np.einsum("ij,ij->i", ray, axis) for axis in (v_hat, u_hat, normal))
     to_axis = np.linalg.norm(source[:, :2], axis=1)
     means = [float(np.mean(x)) for x in (to_axis, np.abs(away), pitch_v, pitch_u, offset_v, offset_u)]
+    if is_parallel:
+        return ParallelGeometry(panel, (means[2], means[3]), (means[4], means[5]))
     to_detector = max(means[:2])  # a panel that does not turn with the source may have its plane nearer than the axis
     return ConeGeometry(means[0], to_detector, panel, (means[2], means[3]), (means[4], means[5]))
+
+
+def towards_source(pose: np.ndarray, is_parallel: bool) -> np.ndarray:
+    """Returns vectors (..., 3) from the axis towards where rays come from, for poses (..., 12): of length 1 in a parallel
+    beam, else to the source."""
+    return -pose[..., :3] if is_parallel else pose[..., :3]
 
 
 def transpose_pose(pose: np.ndarray) -> np.ndarray:
@@ -127,21 +184,23 @@ def transpose_pose(pose: np.ndarray) -> np.ndarray:
     return np.concatenate([pose[..., :6], pose[..., 9:12], pose[..., 6:9]], -1)
 
 
-def field_of_view_mm(geometry: ConeGeometry) -> tuple[float, float, float]:
-    """Returns half the sides (z, y, x) of the box about the origin that the cones of a full turn fill.
+def field_of_view_mm(geometry: Geometry) -> tuple[float, float, float]:
+    """Returns half the sides (z, y, x) of the box about the origin that the beams of a full turn fill.
 
     The radius is DSO·sin(atan(half width/DSD)), with the far edge of a shifted panel; the height is the cone's, behind the
-    axis at that radius.
+    axis at that radius. A parallel beam fills half the panel's width and height, to its far edges.
     """
     sides = zip(geometry.detector_shape, geometry.pixel_size_mm, geometry.detector_offset_mm, strict=True)
     half_height_mm, half_width_mm = (count * pitch / 2 + abs(offset) for count, pitch, offset in sides)
+    if isinstance(geometry, ParallelGeometry):
+        return half_height_mm, half_width_mm, half_width_mm
     half_fan_rad = math.atan2(half_width_mm, geometry.source_to_detector_mm)
     radius_mm = geometry.source_to_axis_mm * math.sin(half_fan_rad)
     behind_mm = geometry.source_to_axis_mm + radius_mm
     return half_height_mm * behind_mm / geometry.source_to_detector_mm, radius_mm, radius_mm
 
 
-def default_grid(geometry: ConeGeometry) -> Grid:
+def default_grid(geometry: Geometry) -> Grid:
     """Returns the cube as wide as a full turn's field of view, in voxels of one pixel pitch at the axis. It is lower where
     the panel has few rows."""
     half_height_mm, radius_mm, _ = field_of_view_mm(geometry)
@@ -151,15 +210,19 @@ def default_grid(geometry: ConeGeometry) -> Grid:
     return Grid((high, wide, wide), (voxel_mm,) * 3)
 
 
-def misses(grid: Grid, geometry: ConeGeometry) -> bool:
+def misses(grid: Grid, geometry: Geometry) -> bool:
     """Returns whether no voxel of ``grid`` lies in the field of view."""
     low_mm, high_mm = grid.box_mm.T
     half_mm = np.array(field_of_view_mm(geometry))
     return bool(np.any((low_mm >= half_mm) | (high_mm <= -half_mm)))
 
 
-def hidden(grid: Grid, pose: np.ndarray, detector_shape: tuple[int, int]) -> str:
+def hidden(grid: Grid, pose: np.ndarray, detector_shape: tuple[int, int], is_parallel: bool = False) -> str:
     """Returns where a grid lies that no ray of a pose (12,) meets, "behind the panel" or "beside the rays"; else ""."""
+    if is_parallel:
+        at = grid_on_panel(grid, pose)[:2]
+        last = np.array(detector_shape[::-1])[:, None] - 0.5
+        return "beside the rays" if ((at < -0.5).all(1) | (at > last).all(1)).any() else ""
     source, first, step_u, step_v = pose.reshape(4, 3)
     rows, columns = detector_shape
     edges = [(-0.5, -0.5), (columns - 0.5, -0.5), (columns - 0.5, rows - 0.5), (-0.5, rows - 0.5)]
@@ -175,6 +238,14 @@ def hidden(grid: Grid, pose: np.ndarray, detector_shape: tuple[int, int]) -> str
     return "beside the rays" if (corners @ planes.T < 0).all(axis=0).any() else ""
 
 
+def grid_on_panel(grid: Grid, pose: np.ndarray) -> np.ndarray:
+    """Returns columns, rows and depths (3, 8) of a grid's corners in the parallel beam of a pose (12,)."""
+    corners = np.stack(np.meshgrid(*grid.box_mm[::-1], indexing="ij"), -1).reshape(-1, 3)
+    basis = np.stack([pose[6:9], pose[9:12], pose[0:3]], -1)
+    position: np.ndarray = np.linalg.solve(basis, (corners - pose[3:6]).T)
+    return position
+
+
 def panel_behind_mm(grid: Grid, pose: np.ndarray) -> float:
     """Returns how far behind the middle of ``grid`` the panel of a pose (12,) stands. A panel less than half the grid's
     width behind stands inside it, and rays end there."""
@@ -184,7 +255,7 @@ def panel_behind_mm(grid: Grid, pose: np.ndarray) -> float:
     return float((first - np.array(grid.offset_mm)[::-1]) @ away)
 
 
-def cuts(grid: Grid, whole: Grid, geometry: ConeGeometry) -> bool:
+def cuts(grid: Grid, whole: Grid, geometry: Geometry) -> bool:
     """Returns whether ``grid`` ends, by more than a voxel, inside the visible part of the box of ``whole``."""
     half_mm = np.array(field_of_view_mm(geometry))
     low_mm, high_mm = np.clip(whole.box_mm.T, -half_mm, half_mm)

@@ -5,7 +5,7 @@ import math
 
 import numpy as np
 
-from phyradgs_cl.acquisition.geometry import ConeGeometry, field_of_view_mm
+from phyradgs_cl.acquisition.geometry import Geometry, ParallelGeometry, field_of_view_mm, towards_source
 from phyradgs_cl.acquisition.readout import Named
 from phyradgs_cl.acquisition.scan import FEW, OPAQUE, Scan
 from phyradgs_cl.errors import InputError
@@ -59,8 +59,10 @@ def blur_line(scan: Scan) -> str:
     return "blur at the rim: {:.2g} px, at half radius {:.2g} px".format(*facts.values()) if facts else ""
 
 
-def _cone_deg(geometry: ConeGeometry) -> tuple[float, float]:
-    """Returns the full angles (cone along v, fan along u) in degrees that the panel spans at the source."""
+def _cone_deg(geometry: Geometry) -> tuple[float, float]:
+    """Returns the full angles (cone along v, fan along u) in degrees that the panel spans at the source; 0 for none."""
+    if isinstance(geometry, ParallelGeometry):
+        return 0.0, 0.0
     sides = zip(geometry.detector_shape, geometry.pixel_size_mm, geometry.detector_offset_mm, strict=True)
     ends_mm = [[offset - count * pitch / 2, offset + count * pitch / 2] for count, pitch, offset in sides]
     low, high = np.rad2deg(np.arctan2(ends_mm, geometry.source_to_detector_mm)).T
@@ -76,7 +78,8 @@ def _frame_time_s(scan: Scan) -> float:
 def _source_angle_rad(scan: Scan, first_s: float, last_s: float) -> np.ndarray:
     """Returns the source's angle (F, T) about the axis at T times after each frame's start, unwrapped within a frame."""
     delay_s = np.linspace(first_s, last_s, _TIMES)
-    source = np.stack([scan.trajectory.pose(f, t + delay_s)[:, :2] for f, t in enumerate(scan.frame_start_s)])
+    poses = np.stack([scan.trajectory.pose(f, t + delay_s) for f, t in enumerate(scan.frame_start_s)])
+    source = towards_source(poses, scan.is_parallel)
     angle_rad: np.ndarray = np.unwrap(np.arctan2(source[..., 1], source[..., 0]))
     return angle_rad
 
@@ -111,8 +114,9 @@ def _sizes(scan: Scan) -> str:
     cone, fan = _cone_deg(scan.geometry)
     seen_mm = tuple(2 * half for half in field_of_view_mm(scan.geometry))
     voxel_mm = scan.grid.voxel_size_mm
+    beam = "parallel beam" if scan.is_parallel else f"fan {fan:.3g}°, cone {cone:.3g}°"
     return (
-        f"sizes: field of view {_joined(seen_mm)} mm (z, y, x), fan {fan:.3g}°, cone {cone:.3g}°, voxels "
+        f"sizes: field of view {_joined(seen_mm)} mm (z, y, x), {beam}, voxels "
         f"{_joined(voxel_mm[:1] if len(set(voxel_mm)) == 1 else voxel_mm)} mm, largest line integral {_largest(scan):.3g}"
     )
 
@@ -171,11 +175,11 @@ def _warn_of_radians(angle_deg: np.ndarray, subject: str) -> bool:
     return looks_so
 
 
-def _check_panel(geometry: ConeGeometry, named: Named) -> None:
+def _check_panel(geometry: Geometry, named: Named) -> None:
     """Raises InputError for a panel seen under a wide angle. Names the distances where they are too short for any panel
     and the pixels are not too large, else the pixels."""
     widest_deg = max(_cone_deg(geometry))
-    if widest_deg <= _WIDEST_DEG:
+    if isinstance(geometry, ParallelGeometry) or widest_deg <= _WIDEST_DEG:
         return
     subject = named("pixel_size_mm")
     found = f"pixels of {' × '.join(f'{pitch:g}' for pitch in geometry.pixel_size_mm)} mm"
@@ -189,7 +193,7 @@ def _check_panel(geometry: ConeGeometry, named: Named) -> None:
     raise InputError(subject, found, f"less than {_WIDEST_DEG:.0f}°", remedy)
 
 
-def _check_voxels(grid: Grid, geometry: ConeGeometry, subject: str) -> None:
+def _check_voxels(grid: Grid, geometry: Geometry, subject: str) -> None:
     half_mm = field_of_view_mm(geometry)[1]
     columns = geometry.detector_shape[1]
     if columns > 2 and min(grid.voxel_size_mm) > half_mm:

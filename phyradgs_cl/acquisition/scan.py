@@ -10,8 +10,10 @@ from numpy.typing import ArrayLike
 
 from phyradgs_cl import checks
 from phyradgs_cl.acquisition.geometry import (
+    GEOMETRIES,
     POSE_LENGTH,
-    ConeGeometry,
+    Geometry,
+    ParallelGeometry,
     default_grid,
     field_of_view_mm,
     hidden,
@@ -20,8 +22,15 @@ from phyradgs_cl.acquisition.geometry import (
     plain_geometry,
 )
 from phyradgs_cl.acquisition.shutter import Shutter
-from phyradgs_cl.acquisition.toolkits import astra_of_poses, poses_of_astra, poses_of_tigre
-from phyradgs_cl.acquisition.trajectory import CircularOrbit, Trajectory, checked_poses, resting_trajectory
+from phyradgs_cl.acquisition.toolkits import astra_of_poses, is_parallel_tigre, poses_of_astra, poses_of_tigre
+from phyradgs_cl.acquisition.trajectory import (
+    CircularOrbit,
+    Trajectory,
+    checked_poses,
+    is_parallel,
+    resting_trajectory,
+    unit_directions,
+)
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid, GridChoice
 from phyradgs_cl.text import suggest_name
@@ -64,7 +73,7 @@ class Scan:
     """
 
     projections: np.ndarray
-    geometry: ConeGeometry
+    geometry: Geometry
     trajectory: Trajectory
     shutter: Shutter
     frame_start_s: np.ndarray
@@ -79,11 +88,16 @@ class Scan:
     saturation: Saturation | None = None
 
     def __post_init__(self) -> None:
-        for name, kind in {"geometry": ConeGeometry, "shutter": Shutter, "grid": Grid}.items():
-            if not isinstance(getattr(self, name), kind):
-                raise InputError(name, checks.short_repr(getattr(self, name)), f"a {kind.__name__}")
+        for name, kinds in {"geometry": GEOMETRIES, "shutter": (Shutter,), "grid": (Grid,)}.items():
+            if not isinstance(getattr(self, name), kinds):
+                wanted = " or ".join(f"a {kind.__name__}" for kind in kinds)
+                raise InputError(name, checks.short_repr(getattr(self, name)), wanted)
         if not callable(getattr(self.trajectory, "pose", None)):
             raise InputError("trajectory", checks.short_repr(self.trajectory), "anything with pose(frame, time_s)")
+        if self.is_parallel != isinstance(self.geometry, ParallelGeometry):
+            beam, other = ("parallel", "cone") if self.is_parallel else ("cone", "parallel")
+            remedy = "make both of one kind; a trajectory of parallel beams has is_parallel = True"
+            raise InputError("trajectory", f"a {beam} beam", f"a {other} beam, as the geometry", remedy)
         object.__setattr__(self, "projections", _line_integrals(self.projections, self.pixel_mask))
         frames = len(self.projections)
         expected = (frames, *self.geometry.detector_shape)
@@ -104,6 +118,11 @@ class Scan:
             raise InputError("pixel_mask", f"shape {np.shape(self.pixel_mask)}", f"{expected[1:]} or {expected}")
         self._mask_dark_lines()
 
+    @property
+    def is_parallel(self) -> bool:
+        """True for a parallel beam: poses begin with the direction of the rays."""
+        return is_parallel(self.trajectory)
+
     def __repr__(self) -> str:
         rows, columns = self.geometry.detector_shape
         voxels, sides = (" × ".join(f"{n:g}" for n in three) for three in (self.grid.shape, self.grid.size_mm))
@@ -113,12 +132,15 @@ class Scan:
         return f"Scan({self.title!r}, {self.frames} frames of {rows} × {columns}, {taken}, grid {voxels} in {sides} mm)"
 
     @classmethod
-    def from_poses(cls, frames: "ArrayLike", poses: "ArrayLike", grid: Grid | None = None, **others: Any) -> "Scan":
+    def from_poses(
+        cls, frames: "ArrayLike", poses: "ArrayLike", grid: Grid | None = None, *, is_parallel: bool = False, **others: Any
+    ) -> "Scan":
         """Makes a stop-and-shoot scan with one pose for every frame.
 
         frames (F, rows, columns): line integrals. poses (F, 12) in mm: source, centre of pixel (0, 0), step to the next
-        column, step to the next row, x y z each. grid: None takes the field of view of a full turn. others: the fields
-        detector_model, pixel_mask, reference, title, lag and provenance of ``Scan``.
+        column, step to the next row, x y z each; with ``is_parallel`` the direction of the rays, of any length, in place of
+        the source. grid: None takes the field of view of a full turn. others: the fields detector_model, pixel_mask,
+        reference, title, lag and provenance of ``Scan``.
 
         Raises InputError for shapes that do not fit, and for poses from which no ray meets the grid.
         """
@@ -128,7 +150,9 @@ class Scan:
         if (np.linalg.norm(np.cross(table[:, 6:9], table[:, 9:12]), axis=1) <= 0).any():
             raise InputError("poses", "parallel pixel steps", "steps along columns and rows that span a panel")
         panel = (values.shape[1], values.shape[2])
-        geometry = plain_geometry(table, panel)
+        if is_parallel:
+            table = unit_directions("poses", table)
+        geometry = plain_geometry(table, panel, is_parallel)
         shutter, start_s = Shutter(0.0), np.arange(len(values), dtype=np.float64)
         trajectory = resting_trajectory(geometry, table, start_s)
         check_others(others)
@@ -137,11 +161,14 @@ class Scan:
         return scan
 
     @classmethod
-    def from_astra(cls, frames: "ArrayLike", vectors: "ArrayLike", grid: Grid | None = None, **others: Any) -> "Scan":
+    def from_astra(
+        cls, frames: "ArrayLike", vectors: "ArrayLike", grid: Grid | None = None, *, is_parallel: bool = False, **others: Any
+    ) -> "Scan":
         """Makes a stop-and-shoot scan from the vectors of an ASTRA geometry ``cone_vec``; ``astra_vectors`` inverts it.
 
         frames (F, rows, columns): line integrals. ASTRA's order is (rows, F, columns): give ``sinogram.swapaxes(0, 1)``.
-        vectors (F, 12) in mm: source, centre of the panel, step from column to column, from row to row. grid, others: as in
+        vectors (F, 12) in mm: source, centre of the panel, step from column to column, from row to row. With
+        ``is_parallel`` they are those of ``parallel3d_vec``, which begin with the direction of the rays. grid, others: as in
         ``from_poses``. Raises InputError for shapes that do not fit.
         """
         values, table = _uncounted(frames, others.get("pixel_mask")), np.asarray(vectors)
@@ -150,7 +177,8 @@ class Scan:
             remedy = "ASTRA's order is (rows, frames, columns): give frames.swapaxes(0, 1)"
             raise InputError("frames", f"shape {values.shape}", f"({len(table)}, rows, columns)", remedy)
         checks.shape("frames", values, (len(table), None, None))
-        return cls.from_poses(values, poses_of_astra(table, (values.shape[1], values.shape[2])), grid, **others)
+        panel = values.shape[1], values.shape[2]
+        return cls.from_poses(values, poses_of_astra(table, panel), grid, is_parallel=is_parallel, **others)
 
     @classmethod
     def from_tigre(cls, geo: Any, angles: "ArrayLike", frames: "ArrayLike", **others: Any) -> "Scan":
@@ -160,16 +188,21 @@ class Scan:
         optionally offDetector (v, u), offOrigin (z, y, x) and COR, each one value for all frames or one per frame.
         angles (F,) in radians. frames (F, v, u): line integrals as TIGRE's ``Ax`` gives them. others: fields of ``Scan``.
 
-        Raises InputError for parallel beams, a turned panel, and attributes that are missing or do not fit.
+        With geo.mode "parallel" the distances are not needed.
+
+        Raises InputError for a turned panel, and attributes that are missing or do not fit.
         """
         check_others(others)
         poses, panel, grid = poses_of_tigre(geo, angles)
         checks.shape("frames", frames, (len(poses), *panel))
-        return cls.from_poses(frames, poses, grid, **others)
+        return cls.from_poses(frames, poses, grid, is_parallel=is_parallel_tigre(geo), **others)
 
     def astra_vectors(self) -> np.ndarray:
-        """Returns ASTRA's ``cone_vec`` (F, 12) in mm, each frame at the middle of its lit window; ``from_astra`` inverts it.
-        ASTRA stacks frames as (rows, F, columns): ``scan.projections.swapaxes(0, 1)``. Its volumes are (z, y, x) too."""
+        """Returns ASTRA's ``cone_vec`` or ``parallel3d_vec`` (F, 12) in mm, each frame at the middle of its lit window.
+
+        ``from_astra`` inverts it. ASTRA stacks frames as (rows, F, columns): ``scan.projections.swapaxes(0, 1)``. Its
+        volumes are (z, y, x) too.
+        """
         times_s = self.frame_start_s + self.shutter.middle_s
         poses = np.stack([self.trajectory.pose(f, np.array(t)) for f, t in enumerate(times_s)])
         return astra_of_poses(poses, self.geometry.detector_shape)
@@ -241,11 +274,13 @@ class Scan:
 
     def warn_of_near_panel(self) -> None:
         """Warns where the panel stands inside the grid as the first frame opens: no ray sees the part behind it."""
+        if self.is_parallel:  # rays do not end at the panel
+            return
         (pose,) = checked_poses(self.trajectory, 0, np.array(self.frame_start_s[:1]))
         behind_mm, half_mm = panel_behind_mm(self.grid, pose), min(self.grid.size_mm[1:]) / 2
         if 0 <= behind_mm < half_mm:
-            text = "the panel stands %.4g mm behind the middle of the grid, inside of it: rays end there. %s"
-            log.warning(text, behind_mm, "Of a parallel beam state distances that clear the object")
+            text = "the panel stands %.4g mm behind the middle of the grid, inside of it: rays end there"
+            log.warning(text, behind_mm)
 
     def check_sight(self) -> None:
         """Raises InputError for a grid that no ray meets as any frame opens: its volume would be 0. Warns of a panel inside
@@ -254,7 +289,7 @@ class Scan:
         places = set()
         for frame, start_s in enumerate(self.frame_start_s):
             (pose,) = checked_poses(self.trajectory, frame, np.array([start_s]))
-            place = hidden(self.grid, pose, self.geometry.detector_shape)
+            place = hidden(self.grid, pose, self.geometry.detector_shape, self.is_parallel)
             if not place:
                 return
             places.add(place)

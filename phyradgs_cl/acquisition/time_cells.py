@@ -10,6 +10,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from phyradgs_cl.acquisition.geometry import POSE_LENGTH
 from phyradgs_cl.acquisition.readout import Readout
 from phyradgs_cl.errors import InputError
 
@@ -26,7 +27,7 @@ class TimeCells:
     Moving cells are segments of the frame, of ``weight`` 1. ``end_poses`` (C, 2, 12) are the poses at their ends.
     ``line_times`` (C, 3, lines) describes the part of each line's window in the segment: its middle and half its length, in
     units of the segment's length from its mid-time, and its fraction of the whole window. Methods raise InputError for
-    user-defined cells that do not fit the scan.
+    user-defined cells that do not fit the scan. is_parallel: poses begin with the direction of parallel rays.
     """
 
     pose: np.ndarray
@@ -39,6 +40,7 @@ class TimeCells:
     end_poses: np.ndarray | None = None
     line_times: "NDArray[np.float64] | None" = None
     line_share: "NDArray[np.float64] | None" = None
+    is_parallel: bool = False
 
     @property
     def count(self) -> int:
@@ -82,8 +84,11 @@ class TimeCells:
 
     def scaled(self, factor: float) -> "TimeCells":
         """Returns the cells with all lengths multiplied by ``factor``."""
-        ends = None if self.end_poses is None else self.end_poses * factor
-        return replace(self, pose=self.pose * factor, end_poses=ends)
+        factors = np.full(POSE_LENGTH, factor)
+        if self.is_parallel:
+            factors[:3] = 1  # a direction
+        ends = None if self.end_poses is None else self.end_poses * factors
+        return replace(self, pose=self.pose * factors, end_poses=ends)
 
     def finer(self, factor: int) -> "TimeCells":
         """Returns still cells for pixels cut into ``factor`` by ``factor``; the parts of a line share its times."""

@@ -1,6 +1,7 @@
 """Converts geometries of ASTRA and TIGRE to poses and back, without either package.
 
-ASTRA's ``cone_vec`` (F, 12) is source, centre of the panel, step from column to column, step from row to row, x y z each.
+ASTRA's ``cone_vec`` (F, 12) is source, centre of the panel, step from column to column, step from row to row, x y z each;
+``parallel3d_vec`` begins with the direction of the rays.
 TIGRE's cone equals ours: source at (DSO cos α, DSO sin α, 0), columns along the turn, row 0 the lowest. Its pairs run (v,
 u), its triples (z, y, x), and ``COR`` shifts source and panel along the columns. Both put the rotation axis along z.
 """
@@ -12,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from phyradgs_cl import checks
-from phyradgs_cl.acquisition.geometry import POSE_LENGTH, ConeGeometry
+from phyradgs_cl.acquisition.geometry import POSE_LENGTH, ConeGeometry, ParallelGeometry
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid, triple
 
@@ -44,11 +45,11 @@ def _to_middle(pose: np.ndarray, panel: tuple[int, int]) -> np.ndarray:
 def poses_of_tigre(geo: Any, angles_rad: ArrayLike) -> tuple[np.ndarray, tuple[int, int], Grid]:
     """Returns poses (F, 12), the panel (rows, columns) and the grid of a TIGRE geometry.
 
-    angles_rad: (F,), or Euler angles (F, 3). Raises InputError for geometries that a scan cannot hold: parallel beams, a
-    turned panel, a second or third Euler angle, a volume that moves; and for attributes that are missing or not numbers.
+    angles_rad: (F,), or Euler angles (F, 3). Raises InputError for geometries that a scan cannot hold: a turned panel, a
+    second or third Euler angle, a volume that moves; and for attributes that are missing or not numbers.
     """
-    if getattr(geo, "mode", None) not in (None, "cone"):
-        raise InputError("geo.mode", checks.short_repr(geo.mode), "'cone'", "parallel beams have no source distance")
+    if getattr(geo, "mode", None) not in (None, "cone", "parallel"):
+        raise InputError("geo.mode", checks.short_repr(geo.mode), "'cone' or 'parallel'")
     angles = np.asarray(angles_rad)
     angles = checks.numbers("angles", angles_rad, (None, 3) if angles.ndim == 2 else (None,))
     if angles.ndim == 2:
@@ -65,14 +66,25 @@ def poses_of_tigre(geo: Any, angles_rad: ArrayLike) -> tuple[np.ndarray, tuple[i
     counts, voxel_mm = _counts(geo, "nVoxel", 3), checks.numbers("geo.dVoxel", _of(geo, "dVoxel"), (3,))
     grid = Grid(triple(int(n) for n in counts), triple(voxel_mm.tolist()), triple(offset_mm[0].tolist()))
     pitch_v, pitch_u = checks.numbers("geo.dDetector", _of(geo, "dDetector"), (2,)).tolist()
-    to_axis, to_panel, shift = (_each(geo, name, frames, 1, 0.0)[:, 0] for name in ("DSO", "DSD", "COR"))
+    shift = _each(geo, "COR", frames, 1, 0.0)[:, 0]
     offset_v, offset_u = _each(geo, "offDetector", frames, 2, 0.0).T
     poses = np.empty((frames, POSE_LENGTH))
+    if is_parallel_tigre(geo):
+        for i, angle in enumerate(angles):
+            offset = float(offset_v[i]), float(offset_u[i]) + float(shift[i])
+            poses[i] = ParallelGeometry((rows, columns), (pitch_v, pitch_u), offset).pose(angle)
+        return poses, (rows, columns), grid
+    to_axis, to_panel = (_each(geo, name, frames, 1, 0.0)[:, 0] for name in ("DSO", "DSD"))
     for i, angle in enumerate(angles):
         lengths, offset = (float(to_axis[i]), float(to_panel[i])), (float(offset_v[i]), float(offset_u[i]))
         poses[i] = ConeGeometry(*lengths, (rows, columns), (pitch_v, pitch_u), offset).pose(angle)
         poses[i, :6] += np.tile(shift[i] * poses[i, 6:9] / pitch_u, 2)
     return poses, (rows, columns), grid
+
+
+def is_parallel_tigre(geo: Any) -> bool:
+    """True for a TIGRE geometry of parallel beams."""
+    return bool(getattr(geo, "mode", None) == "parallel")
 
 
 def _of(geo: Any, name: str) -> Any:

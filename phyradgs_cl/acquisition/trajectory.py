@@ -8,23 +8,30 @@ import scipy
 from numpy.typing import NDArray
 
 from phyradgs_cl import checks
-from phyradgs_cl.acquisition.geometry import POSE_LENGTH, ConeGeometry
+from phyradgs_cl.acquisition.geometry import GEOMETRIES, POSE_LENGTH, Geometry, ParallelGeometry
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.text import repr_of_changes
 
 _LEAST_SPAN_S = 1e-6  # for frames of no duration
 _MOST_SAMPLES = 1024  # per frame
+_LEAST_INCIDENCE = 1e-6  # sine of the angle between rays and panel
 _SAME_PLACE = 1e-9  # of the longest distance: rounding of an orbit in float64
 
 
 class Trajectory(Protocol):
     """The interface of a trajectory: poses (..., 12) in mm of a frame at times (...) in seconds. A user-defined class with
-    this method works in every reconstruction method; ``save_scan`` samples it into a table."""
+    this method works in every reconstruction method; ``save_scan`` samples it into a table. A parallel beam's trajectory
+    has an attribute ``is_parallel`` that is True."""
 
     def pose(self, frame: int, time_s: np.ndarray) -> np.ndarray:
         """Returns poses (..., 12) in mm of frame number ``frame`` at times (...) s. A pose is source, centre of pixel (0,
-        0), step to the next column, step to the next row, x y z each."""
+        0), step to the next column, step to the next row, x y z each; a parallel beam's begins with the rays' direction."""
         ...
+
+
+def is_parallel(trajectory: Trajectory) -> bool:
+    """True for poses that begin with the direction of parallel rays; a trajectory says so by ``is_parallel``."""
+    return bool(getattr(trajectory, "is_parallel", False))
 
 
 class Kinematics(Protocol):
@@ -130,14 +137,19 @@ class CircularOrbit:
     """A circular ``geometry`` in mm, with ``kinematics`` that give its angle: anything with angle_rad(frame, time_s). Raises
     InputError for other objects."""
 
-    geometry: ConeGeometry
+    geometry: Geometry
     kinematics: Kinematics
 
     def __post_init__(self) -> None:
-        if not isinstance(self.geometry, ConeGeometry):
-            raise InputError("geometry", checks.short_repr(self.geometry), "a ConeGeometry")
+        if not isinstance(self.geometry, GEOMETRIES):
+            raise InputError("geometry", checks.short_repr(self.geometry), "a ConeGeometry or a ParallelGeometry")
         if not callable(getattr(self.kinematics, "angle_rad", None)):
             raise InputError("kinematics", checks.short_repr(self.kinematics), "anything with angle_rad(frame, time_s)")
+
+    @property
+    def is_parallel(self) -> bool:
+        """True for a parallel beam."""
+        return isinstance(self.geometry, ParallelGeometry)
 
     def pose(self, frame: int, time_s: np.ndarray) -> np.ndarray:
         """Returns poses (..., 12) in mm of frame number ``frame`` at times (...) s."""
@@ -152,7 +164,8 @@ class CircularOrbit:
 class PoseTable:
     """An arbitrary trajectory: poses ``table`` (T, 12) in mm at ``time_s`` (T,) in s, interpolated as a rigid body.
 
-    A pose is source, centre of pixel (0, 0), step to the next column, step to the next row, x y z each.
+    A pose is source, centre of pixel (0, 0), step to the next column, step to the next row, x y z each. With
+    ``is_parallel`` it begins with the direction of the rays, of any length, in place of the source.
     Rotations are interpolated by slerp, and the other numbers linearly in the body's own frame: a linear interpolation in
     world coordinates would shrink an orbit (by 1 mm at 1 m over 5°).
     Raises InputError for times that do not increase, steps that span no panel, and times beyond the table.
@@ -161,6 +174,7 @@ class PoseTable:
     time_s: np.ndarray
     table: np.ndarray
     subject: str = "pose table"
+    is_parallel: bool = False
     _frames: np.ndarray = field(init=False, repr=False)
 
     __repr__ = repr_of_changes
@@ -172,6 +186,8 @@ class PoseTable:
         if np.any(np.linalg.norm(normal, axis=1) <= 0):
             raise InputError(self.subject, "parallel pixel steps", "û·du and v̂·dv that span a plane")
         object.__setattr__(self, "time_s", time_s)
+        if self.is_parallel:
+            table = unit_directions(self.subject, table)
         object.__setattr__(self, "table", table)
         object.__setattr__(self, "_frames", _body_frames(table))
 
@@ -188,20 +204,35 @@ class PoseTable:
         return turned.reshape(*t.shape, POSE_LENGTH)
 
 
-def resting_poses(poses: np.ndarray, middle_s: np.ndarray, span_s: float, subject: str = "poses") -> PoseTable:
+def unit_directions(subject: str, poses: np.ndarray) -> np.ndarray:
+    """Returns a parallel beam's poses (F, 12) with directions of length 1. Raises InputError for rays within the panel."""
+    length = np.linalg.norm(poses[:, :3], axis=1)
+    across = np.cross(poses[:, 6:9], poses[:, 9:12])
+    towards = np.abs(np.einsum("ci,ci->c", across, poses[:, :3]))
+    if (towards <= _LEAST_INCIDENCE * length * np.linalg.norm(across, axis=1)).any():
+        found = "a direction of rays that runs along the panel, or of length 0"
+        raise InputError(subject, found, "rays that cross the panel")
+    return np.concatenate([poses[:, :3] / length[:, None], poses[:, 3:]], 1)
+
+
+def resting_poses(
+    poses: np.ndarray, middle_s: np.ndarray, span_s: float, subject: str = "poses", is_parallel: bool = False
+) -> PoseTable:
     """Returns a table for a gantry that stops for every frame. It holds each pose (F, 12) for ``span_s`` about its frame's
     middle (F,) in s."""
     half_s = max(span_s / 2, 0.25) * (1 - 1e-10)  # two frames in a row must not share a time
     time_s = np.stack([middle_s - half_s, middle_s + half_s], -1).ravel()
-    return PoseTable(time_s, np.repeat(poses, 2, axis=0), subject)
+    return PoseTable(time_s, np.repeat(poses, 2, axis=0), subject, is_parallel)
 
 
-def resting_trajectory(geometry: ConeGeometry, poses: np.ndarray, middle_s: np.ndarray) -> CircularOrbit | PoseTable:
+def resting_trajectory(geometry: Geometry, poses: np.ndarray, middle_s: np.ndarray) -> CircularOrbit | PoseTable:
     """Returns a circular orbit where the poses (F, 12) of a gantry at rest are those of ``geometry``, else a table."""
-    angle_rad = np.arctan2(poses[:, 1], poses[:, 0])
-    if np.allclose(geometry.pose(angle_rad), poses, rtol=0, atol=_SAME_PLACE * geometry.source_to_detector_mm):
+    is_parallel = isinstance(geometry, ParallelGeometry)
+    side = -1 if is_parallel else 1  # rays run away from where a source would be
+    angle_rad = np.arctan2(side * poses[:, 1], side * poses[:, 0])
+    if np.allclose(geometry.pose(angle_rad), poses, rtol=0, atol=_SAME_PLACE * np.abs(poses).max()):
         return CircularOrbit(geometry, FrameSweeps(middle_s, 0.0, angle_rad, angle_rad))
-    return resting_poses(poses, middle_s, 0.0)
+    return resting_poses(poses, middle_s, 0.0, is_parallel=is_parallel)
 
 
 _AS_TABLE = "give it as a PoseTable"
@@ -216,7 +247,7 @@ def sampled(trajectory: Trajectory, frame_start_s: np.ndarray, span_s: float, er
         times = np.asarray(frame_start_s, np.float64)[:, None] + offsets_s
         poses = np.concatenate([checked_poses(trajectory, f, t) for f, t in enumerate(times)])
         time_s, at = np.unique(times.ravel(), return_index=True)  # frames may overlap in time
-        table = PoseTable(time_s, poses[at], "trajectory")
+        table = PoseTable(time_s, poses[at], "trajectory", is_parallel(trajectory))
         between = (time_s[:-1] + time_s[1:]) / 2  # of all samples, those of overlapping frames included
         inside = [between[(t[0] < between) & (between < t[-1])] for t in times]
         errors = (np.abs(table.pose(f, t) - trajectory.pose(f, t)).max(initial=0.0) for f, t in enumerate(inside))

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from phyradgs_cl.acquisition import Scan
+from phyradgs_cl.acquisition import ConeGeometry, Scan
 from phyradgs_cl.acquisition.altered.angles import exposure_arc_rad
 from phyradgs_cl.acquisition.altered.perturbed import GeometryCorrection
 from phyradgs_cl.errors import InputError
@@ -71,7 +71,14 @@ def _edge_pixels(scan: Scan, factor: float = 1.0) -> float:
 
 def _tilt_pixels(axis: int) -> Callable[[Scan], float]:
     """A tilt magnifies one side: points move outwards by the square of their distance from the tilt's axis."""
-    return lambda scan: _half_mm(scan, axis) ** 2 / scan.geometry.source_to_detector_mm / _pitch_mm(scan)
+    return lambda scan: _half_mm(scan, axis) ** 2 / _cone(scan).source_to_detector_mm / _pitch_mm(scan)
+
+
+def _cone(scan: Scan) -> ConeGeometry:
+    """Returns the geometry of a cone beam. Raises InputError for a parallel beam, which has no such parameter."""
+    if isinstance(scan.geometry, ConeGeometry):
+        return scan.geometry
+    raise InputError("--what", "a distance or a tilt in a parallel beam", "offset-u, offset-v or roll")
 
 
 def _timing_pixels(scan: Scan) -> float:
@@ -102,12 +109,12 @@ PARAMETERS = {
         Parameter("tilt-u", "tilt_u_rad", "deg", "an object wider at one end", lambda s: 0.0, _tilt_pixels(0), _DEGREES),
         Parameter(
             "source-distance", "source_distance_mm", "mm", _SCALE,
-            lambda s: s.geometry.source_to_axis_mm, lambda s: _edge_pixels(s, 1 / s.geometry.source_to_axis_mm),
+            lambda s: _cone(s).source_to_axis_mm, lambda s: _edge_pixels(s, 1 / _cone(s).source_to_axis_mm),
         ),
         Parameter(
             "detector-distance", "detector_distance_mm", "mm", _SCALE,
-            lambda s: s.geometry.source_to_detector_mm - s.geometry.source_to_axis_mm,
-            lambda s: _edge_pixels(s, 1 / s.geometry.source_to_detector_mm),
+            lambda s: _cone(s).source_to_detector_mm - _cone(s).source_to_axis_mm,
+            lambda s: _edge_pixels(s, 1 / _cone(s).source_to_detector_mm),
         ),
         Parameter(
             "readout", "readout_s", "s", "an object twisted about the axis",

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from phyradgs_cl.acquisition import Scan
+from phyradgs_cl.acquisition import ParallelGeometry, Scan
 from phyradgs_cl.acquisition.geometry import field_of_view_mm
 from phyradgs_cl.check.finding import FEWEST_COLUMNS, OK, SUSPICIOUS, Finding, too_narrow
 from phyradgs_cl.detector import noise_level
@@ -91,6 +91,8 @@ def _width_mm(scan: Scan, p: np.ndarray, valid: np.ndarray, threshold: float) ->
     """Returns the object's usual width at the axis: the columns in which a tenth of the rows is above ``threshold``."""
     geometry = scan.geometry
     columns = float(np.median((((p > threshold) & valid).mean(1) > _COVERED).sum(1)))
+    if isinstance(geometry, ParallelGeometry):
+        return columns * geometry.pixel_size_mm[1]
     half_fan_rad = math.atan2(columns * geometry.pixel_size_mm[1] / 2, geometry.source_to_detector_mm)
     return 2 * geometry.source_to_axis_mm * math.sin(half_fan_rad)
 

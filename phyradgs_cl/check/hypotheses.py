@@ -6,7 +6,7 @@ from functools import partial
 
 import numpy as np
 
-from phyradgs_cl.acquisition import Scan
+from phyradgs_cl.acquisition import ParallelGeometry, Scan
 from phyradgs_cl.acquisition.altered import variants
 from phyradgs_cl.acquisition.altered.angles import start_azimuths_rad, wrapped
 from phyradgs_cl.acquisition.altered.coarse import coarse_grid
@@ -62,6 +62,8 @@ def of_scan(scan: Scan, stated: Scan) -> Iterator[Hypothesis]:
 def _other_units(scan: Scan, stated: Scan) -> Iterator[Hypothesis]:
     """Sizes and distances enter the fan alone, as a ratio. Only the panel's offset, which is in mm, may distinguish them."""
     geometry = stated.geometry
+    if isinstance(geometry, ParallelGeometry):
+        return  # sizes scale with the object
     fan = geometry.detector_shape[1] * geometry.pixel_size_mm[1] / geometry.source_to_detector_mm
     offset_px = np.abs(np.array(geometry.detector_offset_mm) / geometry.pixel_size_mm)
     for factor in SIZE_FACTORS:

@@ -4,7 +4,14 @@ import math
 
 import numpy as np
 
-from phyradgs_cl.acquisition import CircularOrbit, EncoderTable, FrameSweeps, PoseTable, Scan
+from phyradgs_cl.acquisition import (
+    CircularOrbit,
+    EncoderTable,
+    FrameSweeps,
+    ParallelGeometry,
+    PoseTable,
+    Scan,
+)
 from phyradgs_cl.acquisition.altered.angles import azimuth_rad, start_azimuths_rad, wrapped
 from phyradgs_cl.check.finding import OK, SUSPICIOUS, Finding
 
@@ -140,6 +147,8 @@ def _steps_deg(scan: Scan) -> np.ndarray:
 def _half_fan_deg(scan: Scan) -> float:
     """Returns half the fan of the reconstruction's box, at most half that of the panel."""
     geometry = scan.geometry
+    if isinstance(geometry, ParallelGeometry):
+        return 0.0
     half_width_mm = geometry.detector_shape[1] * geometry.pixel_size_mm[1] / 2
     panel_rad = math.atan2(half_width_mm, geometry.source_to_detector_mm)
     radius_mm = max(scan.grid.size_mm[1:]) / 2

@@ -4,8 +4,8 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, PoseTable, Scan
-from phyradgs_cl.acquisition.geometry import default_grid
+from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, ParallelGeometry, PoseTable, Scan
+from phyradgs_cl.acquisition.geometry import Geometry, default_grid
 from phyradgs_cl.acquisition.plausible import check_plausible
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
@@ -15,7 +15,7 @@ from phyradgs_cl.importers.reading.frames import LineIntegrals
 
 
 def assemble_scan(
-    integrals: LineIntegrals, trajectory: CircularOrbit | PoseTable, geometry: ConeGeometry, timing: Timing,
+    integrals: LineIntegrals, trajectory: CircularOrbit | PoseTable, geometry: Geometry, timing: Timing,
     options: ImportOptions, *, title: str, source: str, grid: Grid | None = None,
     reference: np.ndarray | None = None, lag: float = 0.0, names: Mapping[str, str] | None = None,
 ) -> Scan:
@@ -45,10 +45,21 @@ def assemble_scan(
     return scan
 
 
+def parallel(
+    options: ImportOptions, panel: tuple[int, int], pitch_mm: tuple[float, float], offset_mm: tuple[float, float]
+) -> ParallelGeometry:
+    """Returns a parallel beam of a file's numbers, or the options' where they are given. InputError for distances."""
+    for name in ("source_to_axis_mm", "source_to_detector_mm"):
+        if getattr(options, name) is not None:
+            expected, remedy = "no distance: this file has a parallel beam", "leave it out"
+            raise InputError(options.named(name), f"{getattr(options, name):g}", expected, remedy)
+    return ParallelGeometry(panel, options.pixel_size_mm or pitch_mm, options.detector_offset_mm or offset_mm)
+
+
 def cone(
     options: ImportOptions, to_axis_mm: float, to_detector_mm: float, panel: tuple[int, int],
     pitch_mm: tuple[float, ...], offset_mm: tuple[float, float],
-) -> ConeGeometry:
+) -> Geometry:
     """Returns a geometry of a file's numbers, or the options' where they are given. InputError unless the panel stands
     behind the axis."""
     to_axis_mm = options.source_to_axis_mm or to_axis_mm

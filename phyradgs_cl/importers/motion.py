@@ -8,7 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from phyradgs_cl import checks
-from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, FrameSweeps, PoseTable, Shutter
+from phyradgs_cl.acquisition import CircularOrbit, FrameSweeps, PoseTable, Shutter
+from phyradgs_cl.acquisition.geometry import Geometry
 from phyradgs_cl.acquisition.trajectory import resting_poses
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.importers.options import ImportOptions
@@ -88,7 +89,7 @@ def make_timing(
     return Timing(shutter, start_s, True, angle_at, assumed)
 
 
-def turning(geometry: ConeGeometry, angle_rad: np.ndarray, timing: Timing) -> CircularOrbit:
+def turning(geometry: Geometry, angle_rad: np.ndarray, timing: Timing) -> CircularOrbit:
     """Returns a circular orbit through gantry angles (F,). Each frame turns at the slope of the angles over time, one-sided
     at both ends; a frame at rest does not turn."""
     angle_rad = np.asarray(angle_rad, np.float64)

@@ -27,13 +27,15 @@ _MOST_LEAN = 0.25  # columns per row along z: beyond it the general kernel is fa
 _Arguments = tuple[DeviceArray, DeviceArray, DeviceArray, np.int32, np.int32, np.int32, np.int32, np.int64]
 
 
-def backproject(rt: Runtime, frames: SameArray, pose: np.ndarray, weight: np.ndarray, grid: Grid) -> SameArray:
+def backproject(
+    rt: Runtime, frames: SameArray, pose: np.ndarray, weight: np.ndarray, grid: Grid, *, is_parallel: bool = False
+) -> SameArray:
     """Returns Σ_f weight_f / z² · frame_f(u, v) at every voxel centre; z is the voxel's depth relative to the detector's.
 
-    frames (F, rows, columns), bilinear and zero outside; pose (F, 12) mm; weight (F,). The result (z, y, x) float32 is on
-    the device if the frames are.
+    frames (F, rows, columns), bilinear and zero outside; pose (F, 12) mm; weight (F,). z is 1 in a parallel beam. The
+    result (z, y, x) float32 is on the device if the frames are.
     """
-    matrices = voxel_matrices(pose, grid)
+    matrices = voxel_matrices(pose, grid, is_parallel)
     block, leans = (0, False) if rt.pixel_items else _upright_block(matrices, grid)
     views = _Views(frames, bool(block), matrices, weight)
     if block:
@@ -45,7 +47,8 @@ def backproject(rt: Runtime, frames: SameArray, pose: np.ndarray, weight: np.nda
 
 
 def backproject_lines(
-    rt: Runtime, frames: SameArray, pose: np.ndarray, weight: np.ndarray, grid: Grid, axis: str = "rows"
+    rt: Runtime, frames: SameArray, pose: np.ndarray, weight: np.ndarray, grid: Grid, axis: str = "rows", *,
+    is_parallel: bool = False,
 ) -> SameArray:
     """Backprojects frames in which every line has its own pose: pose (F, lines, 12) mm, lines along ``axis``.
 
@@ -55,7 +58,7 @@ def backproject_lines(
     """
     readout = Readout(axis)
     pose = readout.poses(pose)
-    matrices = voxel_matrices(pose.reshape(-1, 12), grid).reshape(len(pose), -1)
+    matrices = voxel_matrices(pose.reshape(-1, 12), grid, is_parallel).reshape(len(pose), -1)
     across = np.int32(axis == "columns")
     views = _Views(frames, axis == "columns", matrices, weight)
     return cast(SameArray, _in_bricks(rt, views, grid, 1, lambda *where: _lines(rt, across, *where)))

@@ -16,7 +16,7 @@ import numpy as np
 import scipy
 
 from phyradgs_cl import checks
-from phyradgs_cl.acquisition import Scan
+from phyradgs_cl.acquisition import ParallelGeometry, Scan
 from phyradgs_cl.detector.attenuation import TRANSMISSION_FLOOR
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.prepare.step import Facts, MakeModel, unmasked_frames
@@ -98,8 +98,13 @@ def retrieve(scan: Scan, options: PhaseOptions, make_model: MakeModel) -> tuple[
     """Returns the scan with line integrals of attenuation alone."""
     (energy_kev, delta_beta), geometry = options.stated(), scan.geometry
     pixel_mm = (geometry.pixel_size_mm[0] / geometry.magnification, geometry.pixel_size_mm[1] / geometry.magnification)
-    behind_mm = geometry.source_to_detector_mm - geometry.source_to_axis_mm
-    distance_mm = (behind_mm if options.distance_mm is None else options.distance_mm) / geometry.magnification
+    distance_mm = options.distance_mm
+    if distance_mm is None:
+        if isinstance(geometry, ParallelGeometry):
+            expected = "the distance from the object to the panel in mm: a parallel beam states none"
+            raise InputError("phase.distance_mm", "nothing", expected)
+        distance_mm = geometry.source_to_detector_mm - geometry.source_to_axis_mm
+    distance_mm /= geometry.magnification
     clean = retrieve_phase(unmasked_frames(scan), pixel_mm, distance_mm, energy_kev, delta_beta)
     reach_px = filter_reach_mm(distance_mm, energy_kev, delta_beta) / pixel_mm[1]
     facts = {"effective_distance_mm": distance_mm, "delta_beta": delta_beta, "reach_px": reach_px}

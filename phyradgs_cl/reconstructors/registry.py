@@ -38,6 +38,7 @@ METHODS = _Methods({
     "sax-nerf": "neural:SAX_NERF",
     "fused": "fused",
     "fdk": "fdk",
+    "fbp": "fdk:FBP_METHOD",
 })
 
 

@@ -6,7 +6,7 @@ import numpy as np
 from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
 
-from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, ConstantSpeed, Shutter
+from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, ConstantSpeed, ParallelGeometry, Shutter
 from phyradgs_cl.acquisition.cells import micro_view_cells, per_line_cells, static_cells
 from phyradgs_cl.acquisition.time_cells import TimeCells
 from phyradgs_cl.fields import Grid
@@ -28,7 +28,8 @@ def tables(draw: st.DrawFn) -> tuple[tuple[int, int], list[TimeCells]]:
     side = 3.0 * magnification
     offset = (draw(st.floats(-0.4, 0.4)), draw(st.floats(-0.4, 0.4)))
     pitch = (side / shape[0] * draw(st.floats(0.5, 1.5)), side / shape[1] * draw(st.floats(0.5, 1.5)))
-    geometry = ConeGeometry(distance, distance * magnification, shape, pitch, offset)
+    cone = ConeGeometry(distance, distance * magnification, shape, pitch, offset)
+    geometry = ParallelGeometry(shape, pitch, offset) if draw(st.booleans()) else cone
     orbit = CircularOrbit(geometry, ConstantSpeed(draw(st.floats(-7, 7)), draw(st.floats(-2, 2))))
     axis, direction = draw(st.sampled_from(["rows", "columns"])), draw(st.sampled_from([1, -1]))
     shutter = Shutter(draw(st.floats(0.01, 1.0)), draw(st.floats(0.0, 1.0)), axis, direction)

@@ -7,7 +7,7 @@ import numpy as np
 from scipy.ndimage import gaussian_filter
 
 from phyradgs_cl.acquisition.altered.variants import altered_trajectory, with_trajectory
-from phyradgs_cl.acquisition.geometry import ConeGeometry
+from phyradgs_cl.acquisition.geometry import Geometry
 from phyradgs_cl.acquisition.scan import Scan
 from phyradgs_cl.acquisition.shutter import Shutter
 from phyradgs_cl.fields import Grid
@@ -99,7 +99,7 @@ def binned(scan: Scan, block: int) -> Scan:
     )
 
 
-def coarse_grid(grid: Grid, geometry: ConeGeometry) -> Grid:
+def coarse_grid(grid: Grid, geometry: Geometry) -> Grid:
     """Returns the same box with a margin of one voxel, in voxels of about a pixel at the axis, never finer than ``grid``."""
     height_mm, width_mm = (pitch / geometry.magnification for pitch in geometry.pixel_size_mm)
     least_mm = max(max(grid.size_mm) / _MOST_VOXELS, min(grid.voxel_size_mm))
@@ -110,7 +110,7 @@ def coarse_grid(grid: Grid, geometry: ConeGeometry) -> Grid:
     return Grid((nz, ny, nx), (voxel[0], voxel[1], voxel[2]), grid.offset_mm)
 
 
-def _binned_panel(geometry: ConeGeometry, height: int, width: int) -> ConeGeometry:
+def _binned_panel(geometry: Geometry, height: int, width: int) -> Geometry:
     """Returns the panel of the whole blocks; pixels dropped at the far end move its middle."""
     (rows, columns), (pitch_v_mm, pitch_u_mm) = geometry.detector_shape, geometry.pixel_size_mm
     offset_v_mm, offset_u_mm = geometry.detector_offset_mm

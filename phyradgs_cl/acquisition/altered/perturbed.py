@@ -6,6 +6,7 @@ import numpy as np
 from scipy.interpolate import BSpline
 from scipy.spatial.transform import Rotation
 
+from phyradgs_cl.acquisition.geometry import ConeGeometry
 from phyradgs_cl.acquisition.scan import LARGEST_LAG, Scan
 from phyradgs_cl.acquisition.trajectory import CircularOrbit, Trajectory
 
@@ -131,11 +132,13 @@ def perturb(scan: Scan, correction: GeometryCorrection, views: Views | Sway | No
     shutter, geometry, trajectory = scan.shutter, scan.geometry, scan.trajectory
     source_mm = correction.source_distance_mm
     offset_v_mm, offset_u_mm = geometry.detector_offset_mm
-    geometry = replace(
-        geometry, source_to_axis_mm=geometry.source_to_axis_mm + source_mm,
-        source_to_detector_mm=geometry.source_to_detector_mm + source_mm + correction.detector_distance_mm,
-        detector_offset_mm=(offset_v_mm + correction.offset_v_mm, offset_u_mm + correction.offset_u_mm),
-    )
+    offset_mm = (offset_v_mm + correction.offset_v_mm, offset_u_mm + correction.offset_u_mm)
+    geometry = replace(geometry, detector_offset_mm=offset_mm)
+    if isinstance(geometry, ConeGeometry):
+        geometry = replace(
+            geometry, source_to_axis_mm=geometry.source_to_axis_mm + source_mm,
+            source_to_detector_mm=geometry.source_to_detector_mm + source_mm + correction.detector_distance_mm,
+        )
     turns = any((correction.roll_rad, correction.tilt_v_rad, correction.tilt_u_rad, correction.turn_rad))
     of_poses = replace(correction, readout_s=0.0, exposure_s=0.0, start_s=0.0, lag=0.0, drift=0.0)
     if isinstance(trajectory, CircularOrbit) and not turns and views is None:

@@ -7,7 +7,8 @@ from pathlib import Path
 
 import h5py
 
-from phyradgs_cl.acquisition import ConeGeometry, Scan
+from phyradgs_cl.acquisition import Scan
+from phyradgs_cl.acquisition.geometry import Geometry
 from phyradgs_cl.importers.assemble import assemble_scan, cone
 from phyradgs_cl.importers.motion import StoredTiming, make_timing, turning
 from phyradgs_cl.importers.options import OF_BARE_FRAMES, ImportOptions, needed
@@ -50,7 +51,7 @@ def import_scan(path: Path, options: ImportOptions) -> Scan:
     return assemble_scan(integrals, trajectory, geometry, timing, options, title=title, source=str(path))
 
 
-def _geometry(source: Hdf5Source, panel: tuple[int, int], options: ImportOptions) -> ConeGeometry:
+def _geometry(source: Hdf5Source, panel: tuple[int, int], options: ImportOptions) -> Geometry:
     address = f"{_INSTRUMENT}/source/distance"
     to_axis = options.source_to_axis_mm or reading.optional_length(source, address)
     to_axis = needed(to_axis, "source_to_axis_mm", source.name(address), options.named)

@@ -10,7 +10,8 @@ from pathlib import Path
 import h5py
 import numpy as np
 
-from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, FrameSweeps, Scan
+from phyradgs_cl.acquisition import CircularOrbit, FrameSweeps, Scan
+from phyradgs_cl.acquisition.geometry import Geometry
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.importers.assemble import assemble_scan, cone
 from phyradgs_cl.importers.motion import StoredTiming, Timing, Turned, make_timing, turning
@@ -115,7 +116,7 @@ def _mask(source: Hdf5Source, detector: str, shape: tuple[int, ...], used: np.nd
 
 def _geometry(
     source: Hdf5Source, entry: str, panel: tuple[int, int], turn: Turned, options: ImportOptions
-) -> ConeGeometry:
+) -> Geometry:
     detector, where = f"{entry}/{schema.DETECTOR}", f"{entry}/{schema.SOURCE}/distance"
     to_axis = options.source_to_axis_mm
     if to_axis is None and source.find(where) is not None:
@@ -146,7 +147,7 @@ def _axis_offset(
 
 
 def _motion(
-    source: Hdf5Source, entry: str, used: np.ndarray, geometry: ConeGeometry, options: ImportOptions
+    source: Hdf5Source, entry: str, used: np.ndarray, geometry: Geometry, options: ImportOptions
 ) -> tuple[Timing, CircularOrbit]:
     """Reads timing and orbit. With ``rotation_angle_end`` every frame has its own sweep; else the angles give the speed."""
     detector, sample = f"{entry}/{schema.DETECTOR}", f"{entry}/{schema.SAMPLE}"

@@ -13,8 +13,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from phyradgs_cl import checks
-from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, PoseTable, Scan
-from phyradgs_cl.acquisition.geometry import plain_geometry
+from phyradgs_cl.acquisition import CircularOrbit, PoseTable, Scan
+from phyradgs_cl.acquisition.geometry import Geometry, plain_geometry
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.importers.assemble import assemble_scan
 from phyradgs_cl.importers.motion import Timing, Turned, make_timing, table_over_time, turn_of, turning
@@ -89,7 +89,7 @@ def _read_stack(path: Path) -> _Stack:
 
 def _trajectory(
     rtk: "RtkGeometry", stack: _Stack, timing: Timing, subject: str
-) -> tuple[CircularOrbit | PoseTable, ConeGeometry, Turned]:
+) -> tuple[CircularOrbit | PoseTable, Geometry, Turned]:
     """Returns a circular orbit where one describes the file, else a table of poses, with a plain geometry and the flips."""
     panel = (stack.frames.shape[1], stack.frames.shape[2])
 

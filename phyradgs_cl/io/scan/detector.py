@@ -1,16 +1,21 @@
 """The detector's part of a scan file: frames, keys, geometry, shutter and mask, without the pixels."""
 
+import logging
+
 import h5py
 import numpy as np
 
 from phyradgs_cl import checks
-from phyradgs_cl.acquisition import ConeGeometry, Shutter
+from phyradgs_cl.acquisition import ConeGeometry, ParallelGeometry, Shutter
+from phyradgs_cl.acquisition.geometry import Geometry
 from phyradgs_cl.acquisition.shutter import AXES
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.io.hdf5 import datasets as h5
 from phyradgs_cl.io.hdf5.datasets import LENGTH, TIME
 from phyradgs_cl.io.hdf5.source import Hdf5Source
 from phyradgs_cl.io.scan import schema
+
+_log = logging.getLogger(__name__)
 
 
 def read_data_kind(source: Hdf5Source, entry: str) -> tuple[h5py.Dataset, str]:
@@ -47,20 +52,39 @@ def read_image_key(source: Hdf5Source, entry: str, frames: int) -> np.ndarray:
     return image_key
 
 
-def read_geometry(source: Hdf5Source, entry: str, detector_shape: tuple[int, int]) -> ConeGeometry:
-    """Reads the circular geometry from distances, pixel sizes and offset."""
+def read_geometry(source: Hdf5Source, entry: str, detector_shape: tuple[int, int]) -> Geometry:
+    """Reads the circular geometry from distances, pixel sizes and offset. A parallel beam has no distances."""
     detector, address = f"{entry}/{schema.DETECTOR}", f"{entry}/{schema.SOURCE}/distance"
-    to_axis_mm = abs(h5.read_number(source, address, LENGTH))  # NeXus gives it a minus sign
-    if to_axis_mm == 0:
-        raise source.error(address, "0", "a length other than 0", "correct the value")
     pitch_v_mm = h5.read_length(source, f"{detector}/y_pixel_size", LENGTH)
     pitch_u_mm = h5.read_length(source, f"{detector}/x_pixel_size", LENGTH)
-    to_detector_mm = to_axis_mm + h5.read_length(source, f"{detector}/distance", LENGTH)
     offset = f"{entry}/{schema.EXTRA}/detector_offset"
     offset_mm = (0.0, 0.0)
     if source.optional(offset) is not None:
         offset_mm = tuple(h5.read_array(source, offset, (2,), LENGTH).tolist())
+    if _is_parallel(source, entry):
+        return ParallelGeometry(detector_shape, (pitch_v_mm, pitch_u_mm), offset_mm)
+    to_axis_mm = abs(h5.read_number(source, address, LENGTH))  # NeXus gives it a minus sign
+    if to_axis_mm == 0:
+        remedy = f"correct the value, or store 'parallel' as {entry}/{schema.BEAM} and no distance"
+        raise source.error(address, "0", "a length other than 0", remedy)
+    to_detector_mm = to_axis_mm + h5.read_length(source, f"{detector}/distance", LENGTH)
     return ConeGeometry(to_axis_mm, to_detector_mm, detector_shape, (pitch_v_mm, pitch_u_mm), offset_mm)
+
+
+def _is_parallel(source: Hdf5Source, entry: str) -> bool:
+    """Reads which beam a file has. A file of another program without a source distance has a parallel beam."""
+    beam, distance = f"{entry}/{schema.BEAM}", f"{entry}/{schema.SOURCE}/distance"
+    has_distance = source.optional(distance) is not None
+    if source.optional(beam) is not None:
+        is_parallel = h5.read_word(source, beam, schema.BEAMS) == "parallel"
+        if is_parallel and has_distance:
+            expected = "no source distance in a file with a parallel beam"
+            raise source.error(distance, "a distance", expected, f"remove it, or {entry}/{schema.BEAM}")
+        return is_parallel
+    if has_distance or source.find(f"{entry}/{schema.EXTRA}") is not None:
+        return False
+    _log.info("%s: none, so the beam is taken as parallel", source.name(distance))
+    return True
 
 
 def read_shutter(source: Hdf5Source, entry: str, used: np.ndarray, moving: bool) -> Shutter:

@@ -7,8 +7,8 @@ import h5py
 import numpy as np
 
 from phyradgs_cl import checks
-from phyradgs_cl.acquisition import ConeGeometry, Saturation, Scan
-from phyradgs_cl.acquisition.geometry import default_grid
+from phyradgs_cl.acquisition import Saturation, Scan
+from phyradgs_cl.acquisition.geometry import Geometry, default_grid
 from phyradgs_cl.acquisition.scan import DETECTOR_MODELS, LARGEST_LAG
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
@@ -93,7 +93,7 @@ def find_entry(source: Hdf5Source) -> str:
     raise source.error("/entry", found, "a group 'entry'", source.misspelling("/", "entry"))
 
 
-def _read_or_derive_grid(source: Hdf5Source, entry: str, geometry: ConeGeometry) -> tuple[Grid, bool]:
+def _read_or_derive_grid(source: Hdf5Source, entry: str, geometry: Geometry) -> tuple[Grid, bool]:
     address = f"{entry}/{schema.GRID}"
     if source.optional_group(address) is not None:
         return read_grid(source, address), True

@@ -9,13 +9,14 @@ import numpy as np
 
 from phyradgs_cl.acquisition import (
     CircularOrbit,
-    ConeGeometry,
     EncoderTable,
     FrameSweeps,
+    ParallelGeometry,
     PoseTable,
     Scan,
     SpeedRamp,
 )
+from phyradgs_cl.acquisition.geometry import Geometry, towards_source
 from phyradgs_cl.acquisition.trajectory import ConstantSpeed, sampled
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.io.hdf5.datasets import (
@@ -48,7 +49,7 @@ def has_motion(source: Hdf5Source, entry: str) -> bool:
 def read_trajectory(
     source: Hdf5Source,
     entry: str,
-    geometry: ConeGeometry,
+    geometry: Geometry,
     used: np.ndarray,
     start_s: np.ndarray,
     exposure_s: float,
@@ -59,7 +60,7 @@ def read_trajectory(
     if source.optional_group(poses) is not None:
         time_s = _read_table_times(source, f"{poses}/time_s")
         table_mm = read_array(source, f"{poses}/pose", (len(time_s), 12), LENGTH)
-        return PoseTable(time_s, table_mm, source.name(f"{poses}/pose"))
+        return PoseTable(time_s, table_mm, source.name(f"{poses}/pose"), isinstance(geometry, ParallelGeometry))
     if source.optional_group(kinematics) is not None:
         time_s = _read_table_times(source, f"{kinematics}/time_s")
         address = f"{kinematics}/angle_deg"
@@ -134,8 +135,8 @@ def _exposure_angles(scan: Scan) -> tuple[np.ndarray, np.ndarray]:
 def _angles(scan: Scan, frame: int, time_s: np.ndarray) -> np.ndarray:
     if isinstance(scan.trajectory, CircularOrbit):
         return scan.trajectory.angle_rad(frame, time_s)
-    pose = scan.trajectory.pose(frame, time_s)  # the source's azimuth, for other programs
-    return np.unwrap(np.arctan2(pose[:, 1], pose[:, 0]))
+    source = towards_source(scan.trajectory.pose(frame, time_s), scan.is_parallel)  # its azimuth, for other programs
+    return np.unwrap(np.arctan2(source[:, 1], source[:, 0]))
 
 
 def _angle_table(scan: Scan, kinematics: EncoderTable | SpeedRamp) -> tuple[np.ndarray, np.ndarray]:

@@ -5,6 +5,7 @@ DATA, MASK = f"{DETECTOR}/data", f"{DETECTOR}/pixel_mask"
 SOURCE = "instrument/source"
 SAMPLE = "sample"
 EXTRA = "phyradgs"
+BEAM = f"{EXTRA}/beam"
 KINEMATICS = f"{EXTRA}/kinematics"
 POSES = f"{EXTRA}/poses"
 GRID = f"{EXTRA}/grid"
@@ -14,6 +15,7 @@ TRUTH = f"{REFERENCE}/volume"
 PROJECTION, FLAT, DARK, INVALID = 0, 1, 2, 3
 QUANTITIES = ("attenuation", "transmission", "counts")
 ROTATES = ("gantry", "sample")
+BEAMS = ("cone", "parallel")
 
 # Standard fields that change the geometry and that this package does not read.
 IGNORED = (

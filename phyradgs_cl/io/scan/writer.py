@@ -11,7 +11,7 @@ import h5py
 import numpy as np
 
 from phyradgs_cl import checks
-from phyradgs_cl.acquisition import PoseTable, Scan
+from phyradgs_cl.acquisition import ConeGeometry, PoseTable, Scan
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.io.hdf5 import datasets as h5
 from phyradgs_cl.io.hdf5.source import open_hdf5
@@ -80,14 +80,16 @@ def _write_instrument(
 ) -> None:
     geometry, instrument = scan.geometry, h5.new_group(entry, "instrument", "NXinstrument")
     source = h5.new_group(instrument, "source", "NXsource")
-    h5.write_number(source, "distance", -geometry.source_to_axis_mm, "mm")
+    if isinstance(geometry, ConeGeometry):
+        h5.write_number(source, "distance", -geometry.source_to_axis_mm, "mm")
     detector = h5.new_group(instrument, "detector", "NXdetector")
     detector.create_dataset("data", data=frames).attrs.update(quantity=quantity, interpretation="image")
     h5.write_number(detector, "image_key", key.astype(np.int32))
     pitch_v_mm, pitch_u_mm = geometry.pixel_size_mm
     h5.write_number(detector, "x_pixel_size", pitch_u_mm, "mm")
     h5.write_number(detector, "y_pixel_size", pitch_v_mm, "mm")
-    h5.write_number(detector, "distance", geometry.source_to_detector_mm - geometry.source_to_axis_mm, "mm")
+    if isinstance(geometry, ConeGeometry):
+        h5.write_number(detector, "distance", geometry.source_to_detector_mm - geometry.source_to_axis_mm, "mm")
     exposure_s, readout_s = _stored_durations(scan)
     if exposure_s + readout_s < scan.shutter.span_s:
         _log.warning("a stop-and-shoot scan with a pose table is stored without exposure and readout times")
@@ -110,6 +112,8 @@ def _stored_durations(scan: Scan) -> tuple[float, float]:
 
 def _write_extra(entry: h5py.Group, scan: Scan) -> None:
     extra = h5.new_group(entry, schema.EXTRA, "NXcollection")
+    if scan.is_parallel:
+        extra["beam"] = "parallel"
     extra["readout_axis"] = scan.shutter.axis
     h5.write_number(extra, "readout_direction", scan.shutter.direction)
     h5.write_number(extra, "detector_offset", scan.geometry.detector_offset_mm, "mm")
@@ -214,8 +218,10 @@ def _copied(source: str | Path, target: str | Path, entry: str) -> Iterator[h5py
 
 def _replace_geometry(entry: h5py.Group, scan: Scan) -> None:
     geometry = scan.geometry
-    behind_mm = geometry.source_to_detector_mm - geometry.source_to_axis_mm
     _replace(entry[schema.EXTRA], "detector_offset", np.array(geometry.detector_offset_mm), "mm")
+    if not isinstance(geometry, ConeGeometry):
+        return
+    behind_mm = geometry.source_to_detector_mm - geometry.source_to_axis_mm
     _replace(entry[schema.SOURCE], "distance", -geometry.source_to_axis_mm, "mm")
     _replace(entry[schema.DETECTOR], "distance", behind_mm, "mm")
 

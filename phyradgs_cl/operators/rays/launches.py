@@ -36,7 +36,7 @@ def launch_forward(
     ``add`` adds line integrals to those in ``frames``, as several bricks of a volume need it; for ``log`` alone.
     """
     blocks = ceil_div(layout.width, rt.lanes)
-    kernel = rt.kernel("rays", "rays_forward", AVERAGE=AVERAGES.index(average), **_defines(layout))
+    kernel = rt.kernel("rays", "rays_forward", AVERAGE=AVERAGES.index(average), **_defines(layout, cells))
     for first, stop in _parts(rt, frame_list.size, layout.lines * layout.width * max(layout.brick.shape)):
         rt.launch(
             kernel,
@@ -62,10 +62,10 @@ def launch_adjoint(
 ) -> None:
     """Backprojects the listed frames into a padded volume; ``add`` keeps the sums that are in it."""
     if rt.pixel_items:
-        owned, program, defines = (_BLOCK,) * 3, "rays_adjoint_gpu", _defines(layout)
+        owned, program, defines = (_BLOCK,) * 3, "rays_adjoint_gpu", _defines(layout, cells)
     else:
         owned, program = brick_of(rt), "rays_adjoint_cpu"
-        defines = _defines(layout) | dict(zip(("BRICK_X", "BRICK_Y", "BRICK_Z"), owned, strict=True))
+        defines = _defines(layout, cells) | dict(zip(("BRICK_X", "BRICK_Y", "BRICK_Z"), owned, strict=True))
     nz, ny, nx = layout.brick.shape
     columns, rows, slices = (ceil_div(n, side) for n, side in zip((nx, ny, nz), owned, strict=True))
     group = rt.group(on_cpu=1, on_gpu=_BLOCK**3)
@@ -105,5 +105,6 @@ def owner_steps(rt: Runtime) -> tuple[int, int]:
     return (_BLOCK, _BLOCK) if rt.pixel_items else (z, y)
 
 
-def _defines(layout: RayLayout) -> dict[str, int]:
-    return {"IMAGE_GUARD": GUARD, "RAY_LONG": int(layout.volume_floats >= _LONG_FROM)}
+def _defines(layout: RayLayout, cells: RayCells) -> dict[str, int]:
+    is_long = layout.volume_floats >= _LONG_FROM
+    return {"IMAGE_GUARD": GUARD, "RAY_LONG": int(is_long), "RAY_PARALLEL": int(cells.is_parallel)}

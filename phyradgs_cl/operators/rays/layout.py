@@ -127,6 +127,7 @@ class RayCells:
     frame_cells: DeviceArray
     weights: DeviceArray
     weight_at: DeviceArray
+    is_parallel: bool
 
     @classmethod
     def upload(cls, rt: Runtime, grid: Grid, tables: Sequence[TimeCells]) -> "RayCells":
@@ -136,11 +137,11 @@ class RayCells:
         weights = [table.weights_of(cell) for table in tables for cell in range(table.count)]
         ranges = [np.stack([table.line_start, table.line_stop], -1) for table in tables]
         served = [table.line_cells() + start for table, start in zip(tables, starts[:-1], strict=True)]
-        matrices, stride = matrix_table(pose, grid)
+        matrices, stride = matrix_table(pose, grid, tables[0].is_parallel)
         cell_lines = np.zeros((stride, 2), np.int32)
         cell_lines[: starts[-1]] = np.concatenate(ranges)
         return cls(
-            cells=rt.upload(ray_constants(pose, grid)),
+            cells=rt.upload(ray_constants(pose, grid, tables[0].is_parallel)),
             cell_lines=rt.upload(cell_lines),
             line_cells=rt.upload(np.stack(served), np.int32),
             matrices=rt.upload(matrices, np.float32),
@@ -148,19 +149,22 @@ class RayCells:
             frame_cells=rt.upload(starts, np.int32),
             weights=rt.upload(np.concatenate(weights), np.float32),
             weight_at=rt.upload(np.concatenate([[0], np.cumsum([len(w) for w in weights])]), np.int32),
+            is_parallel=tables[0].is_parallel,
         )
 
 
-def matrix_table(pose: np.ndarray, grid: Grid) -> tuple[np.ndarray, int]:
+def matrix_table(pose: np.ndarray, grid: Grid, is_parallel: bool = False) -> tuple[np.ndarray, int]:
     """Returns ``voxel_matrices`` of poses (C, 12) as (12, stride), and the stride. Vectors may read past C."""
     stride = len(pose) + _WIDEST
     matrices = np.zeros((12, stride))
-    matrices[:, : len(pose)] = voxel_matrices(pose, grid).T
+    matrices[:, : len(pose)] = voxel_matrices(pose, grid, is_parallel).T
     return matrices, stride
 
 
-def ray_constants(pose: np.ndarray, grid: Grid) -> np.ndarray:
+def ray_constants(pose: np.ndarray, grid: Grid, is_parallel: bool = False) -> np.ndarray:
     """Converts poses (C, 12) to voxel indices: the (C, 16) float32 table of cl/common/ray.h."""
+    if is_parallel:
+        return _parallel_constants(pose, grid)
     first = np.array(grid.first_centre_mm[::-1])
     pitch = np.array(grid.voxel_size_mm[::-1])
     constants = np.zeros((len(pose), _RAY_CELL_FLOATS))
@@ -171,9 +175,25 @@ def ray_constants(pose: np.ndarray, grid: Grid) -> np.ndarray:
     return constants.astype(np.float32)
 
 
-def voxel_matrices(pose: np.ndarray, grid: Grid) -> np.ndarray:
-    """Returns the rows (C, 12) that map a voxel index (x, y, z) to (u·z, v·z, z)."""
-    matrix = projection_matrices(pose).reshape(-1, 3, 4)
+def _parallel_constants(pose: np.ndarray, grid: Grid) -> np.ndarray:
+    """The same for parallel beams: direction over its main component, and where rays cut the plane 0 of the main axis."""
+    first = np.array(grid.first_centre_mm[::-1])
+    pitch = np.array(grid.voxel_size_mm[::-1])
+    direction, panel = pose[:, 0:3] / pitch, pose[:, 3:].reshape(-1, 3, 3) / pitch
+    panel[:, 0] -= first / pitch
+    main = np.argmax(np.abs(direction), axis=1)  # the first of equal ones, as in the kernels
+    cell = np.arange(len(pose))
+    direction /= direction[cell, main][:, None]
+    panel -= panel[cell, :, main][:, :, None] * direction[:, None]
+    panel[cell, 0, main] = 1
+    constants = np.zeros((len(pose), _RAY_CELL_FLOATS))
+    constants[:, :12] = np.concatenate([direction, panel.reshape(-1, 9)], 1)
+    return constants.astype(np.float32)
+
+
+def voxel_matrices(pose: np.ndarray, grid: Grid, is_parallel: bool = False) -> np.ndarray:
+    """Returns the rows (C, 12) that map a voxel index (x, y, z) to (u·z, v·z, z); z is 1 in a parallel beam."""
+    matrix = projection_matrices(pose, is_parallel).reshape(-1, 3, 4)
     first = np.array(grid.first_centre_mm[::-1])
     pitch = np.array(grid.voxel_size_mm[::-1])
     shift = np.einsum("cij,j->ci", matrix[:, :, :3], first) + matrix[:, :, 3]

@@ -35,20 +35,21 @@ class UprightPoses:
     frame_cells: np.ndarray
     is_plain: bool  # one cell with all lines for each frame, of weight 1
     axis: str
+    is_parallel: bool
 
     @classmethod
     def upload(cls, rt: Runtime, grid: Grid, tables: Sequence[TimeCells]) -> "UprightPoses":
         poses = np.concatenate([table.pose for table in tables])
         scale = np.abs(poses).max() or 1.0
         _, where, pose_of = np.unique(np.round(poses / scale, _SAME_POSE), axis=0, return_index=True, return_inverse=True)
-        matrices, stride = matrix_table(poses[where], grid)
+        matrices, stride = matrix_table(poses[where], grid, tables[0].is_parallel)
         weights = np.concatenate([table.weights_of(c) for table in tables for c in range(table.count)])
         counts = [table.count for table in tables]
         first = np.concatenate([table.line_start for table in tables])
         stop = np.concatenate([table.line_stop for table in tables])
         whole = all(n == 1 for n in counts) and (stop - first == tables[0].lines).all()
         return cls(
-            cells=rt.upload(ray_constants(poses[where], grid)),
+            cells=rt.upload(ray_constants(poses[where], grid, tables[0].is_parallel)),
             matrices=rt.upload(matrices, np.float32),
             matrix_stride=stride,
             pose_of=pose_of.reshape(-1),
@@ -57,6 +58,7 @@ class UprightPoses:
             frame_cells=np.concatenate([[0], np.cumsum(counts)]),
             is_plain=bool(whole and (weights == 1).all()),
             axis=tables[0].axis,
+            is_parallel=tables[0].is_parallel,
         )
 
     def floats_per_frame(self, detector_shape: tuple[int, int], leans: bool) -> int:
@@ -95,6 +97,7 @@ class UprightPoses:
             rows=int((table[:, 4] - table[:, 3]).max()),
             is_plain=self.is_plain and len(order) == len(frames),
             leans=leans,
+            is_parallel=self.is_parallel,
         )
 
     def _shares(self, cells: np.ndarray, of: np.ndarray) -> np.ndarray:
@@ -118,6 +121,7 @@ class Slots:
     rows: int
     is_plain: bool
     leans: bool
+    is_parallel: bool
 
     @property
     def pitch(self) -> int:
@@ -136,7 +140,7 @@ class Slots:
 
     @property
     def defines(self) -> dict[str, int]:
-        return {"IMAGE_GUARD": GUARD, "RAY_LONG": 0, "LEAN": int(self.leans)}
+        return {"IMAGE_GUARD": GUARD, "RAY_LONG": 0, "LEAN": int(self.leans), "RAY_PARALLEL": int(self.is_parallel)}
 
 
 def merge_slots(

@@ -28,10 +28,11 @@ _TURN = 16  # voxels along x and z that are turned at a time; as in cl/rays_upri
 
 @dataclass(frozen=True)
 class Upright:
-    """Lines of a detector column per work-item of the upright kernels, and whether columns lean."""
+    """Lines of a detector column per work-item of the upright kernels, and whether columns lean and rays are parallel."""
 
     block: int
     leans: bool
+    is_parallel: bool
 
 
 def upright_of(
@@ -40,7 +41,7 @@ def upright_of(
     """Returns how the upright kernels project these cells; None if the general kernel is needed.
 
     The upright kernels need poses that serve several lines each, rays with main axis x or y, and columns nearly along z. If
-    columns lean, the volume must lie between source and panel.
+    columns lean, the volume must lie between source and panel, as it always does in a parallel beam.
     """
     served = sum(int((table.line_stop - table.line_start).sum()) for table in tables)
     lines = tables[0].lines
@@ -48,18 +49,29 @@ def upright_of(
     if served < fewest * sum(table.count for table in tables):
         return None
     rows, columns = detector_shape
-    cells = ray_constants(np.concatenate([table.pose for table in tables]), grid).astype(np.float64)
+    is_parallel = tables[0].is_parallel
+    cells = ray_constants(np.concatenate([table.pose for table in tables]), grid, is_parallel).astype(np.float64)
     source, d00, eu, ev = cells[:, 0:3], cells[:, 3:6], cells[:, 6:9], cells[:, 9:12]
     leans = bool(np.abs(ev[:, :2]).max() * rows > _UPRIGHT or np.abs(eu[:, 2]).max() * columns > _UPRIGHT)
     across = np.linalg.norm(ev[:, :2], axis=1)
-    ends_z = [np.abs(d00 + u * eu + v * ev)[:, 2] for u in (0, columns - 1) for v in (0, rows - 1)]
-    nearest = _least_horizontal(d00[:, :2], eu[:, :2], columns) - across * rows
-    if (np.max(ends_z, axis=0) > nearest / np.sqrt(2)).any():
-        return None
-    if leans and ((across > _MOST_LEAN * np.abs(ev[:, 2])).any() or not _lies_between(grid, source, d00, eu, ev)):
+    if leans and (across > _MOST_LEAN * np.abs(ev[:, 2])).any():
         return None
     block = int(min(_LINES, rows, (_VOXELS - 4) // max(np.abs(ev[:, 2]).max(), 1e-3)))
-    return Upright(block, leans) if block >= lanes else None
+    steep = (np.abs(source[:, 2]) == 1).any() if is_parallel else _is_steep(cells, rows, columns)
+    if steep or block < lanes:
+        return None
+    if leans and not is_parallel and not _lies_between(grid, source, d00, eu, ev):
+        return None
+    return Upright(block, leans, is_parallel)
+
+
+def _is_steep(cells: np.ndarray, rows: int, columns: int) -> bool:
+    """Whether a ray of these cells (C, 16) may have the main axis z."""
+    d00, eu, ev = cells[:, 3:6], cells[:, 6:9], cells[:, 9:12]
+    across = np.linalg.norm(ev[:, :2], axis=1)
+    ends_z = [np.abs(d00 + u * eu + v * ev)[:, 2] for u in (0, columns - 1) for v in (0, rows - 1)]
+    nearest = _least_horizontal(d00[:, :2], eu[:, :2], columns) - across * rows
+    return bool((np.max(ends_z, axis=0) > nearest / np.sqrt(2)).any())
 
 
 def _least_horizontal(d00: np.ndarray, eu: np.ndarray, width: int) -> np.ndarray:
@@ -156,10 +168,10 @@ def turn_volume(
     nz, ny, nx = layout.grid.shape
     shape, *_ = layout.constants()
     size = (ceil_div(nx, _TURN), ny, ceil_div(nz, _TURN))
-    kernel = rt.kernel("rays_upright", "turn_upright", **_defines(Upright(_LINES, False)))
+    kernel = rt.kernel("rays_upright", "turn_upright", **_defines(Upright(_LINES, False, False)))
     rt.launch(kernel, size, volume[0], volume[1].vector(), shape, np.int32(pitch_of(nz)), columns, group=1)
 
 
 def _defines(how: Upright) -> dict[str, int]:
     sizes = {"UPRIGHT_LINES": _LINES, "UPRIGHT_VOXELS": _VOXELS}
-    return {"IMAGE_GUARD": GUARD, "RAY_LONG": 0, "LEAN": int(how.leans), **sizes}
+    return {"IMAGE_GUARD": GUARD, "RAY_LONG": 0, "LEAN": int(how.leans), "RAY_PARALLEL": int(how.is_parallel), **sizes}

@@ -74,6 +74,7 @@ class DeviceCells:
     lines: int
     layers: int
     moving: bool = False
+    is_parallel: bool = False
 
     @property
     def time_pitch(self) -> int:
@@ -92,8 +93,8 @@ class DeviceCells:
         ranges = np.stack([table.line_start, table.line_stop], -1).astype(np.int32)
         weights = table.layer_weights
         return cls(
-            cells=rt.upload(cell_constants(pose, table.weight, table.layer_numbers)),
-            matrices=split_coefficients(rt, projection_matrices(poses)),
+            cells=rt.upload(cell_constants(pose, table.weight, table.layer_numbers, table.is_parallel)),
+            matrices=split_coefficients(rt, projection_matrices(poses, table.is_parallel)),
             cell_lines=rt.upload(ranges),
             line_cells=rt.upload(table.line_cells(), np.int32),
             line_times=rt.upload(times),
@@ -102,14 +103,22 @@ class DeviceCells:
             lines=table.lines,
             layers=len(weights),
             moving=table.is_moving,
+            is_parallel=table.is_parallel,
         )
 
 
-def projection_matrices(pose: np.ndarray) -> np.ndarray:
+def projection_matrices(pose: np.ndarray, is_parallel: bool = False) -> np.ndarray:
     """Returns the rows (C, 12) that map a world point x to (u·z, v·z, z): pixel column, line and depth of its ray.
 
-    x − source = z (d00 + u·eu + v·ev), with d00 from the source to pixel (0, 0).
+    x − source = z (d00 + u·eu + v·ev), with d00 from the source to pixel (0, 0). In a parallel beam x is on the ray through
+    (u, v): x − pixel (0, 0) = u·eu + v·ev + t·direction; z is 1.
     """
+    if is_parallel:
+        inverse = np.linalg.inv(np.stack([pose[:, 6:9], pose[:, 9:12], pose[:, 0:3]], -1))
+        shift = -np.einsum("cij,cj->ci", inverse, pose[:, 3:6])
+        matrix = np.concatenate([inverse, shift[:, :, None]], -1)
+        matrix[:, 2] = [0, 0, 0, 1]
+        return matrix.reshape(-1, 12)
     source, first = pose[:, 0:3], pose[:, 3:6]
     basis = np.stack([pose[:, 6:9], pose[:, 9:12], first - source], -1)  # columns eu, ev, d00
     inverse = np.linalg.inv(basis)
@@ -117,8 +126,12 @@ def projection_matrices(pose: np.ndarray) -> np.ndarray:
     return np.concatenate([inverse, shift[:, :, None]], -1).reshape(len(pose), 12)
 
 
-def cell_constants(pose: np.ndarray, weight: np.ndarray, layer: np.ndarray) -> np.ndarray:
+def cell_constants(
+    pose: np.ndarray, weight: np.ndarray, layer: np.ndarray, is_parallel: bool = False
+) -> np.ndarray:
     """Returns the (C, 24) float32 table of cl/common/splat.h."""
+    if is_parallel:  # a ray from the "source", less the direction, to the origin
+        pose = np.concatenate([-pose[:, 0:3], np.zeros((len(pose), 3)), pose[:, 6:]], 1)
     source, d00 = pose[:, 0:3], pose[:, 3:6] - pose[:, 0:3]
     eu, ev = pose[:, 6:9], pose[:, 9:12]
     table = np.zeros((len(pose), CELL_FLOATS))

@@ -104,7 +104,7 @@ class SplatOperator:
             turn, along, across = by_pose(rows[:, : cloud.count], by_rows)
             shifts = [across / (self._projector.lines / 2), along / (self._projector.width / 2)]
             found[number] = turn, *(shifts[::-1] if self._images.turned else shifts)
-            if not self._affine:  # in that model all rays have the length of the central ray
+            if not (self._affine or cells.is_parallel):  # there all rays have the length of the central ray
                 found[number, 1:] += by_length(pose, weighed[number])
         return found
 

@@ -103,8 +103,12 @@ class SplatProjector:
         self._records = rt.empty(1)
         self._is_visible = rt.empty(1, np.uint8)
         self._extents = rt.empty(1, np.int32)
-        options = {"AFFINE": affine, "FOOTPRINT": pixel_footprint, "LAYERED": self._layers is not None}
-        self._kernels = {moving: _Kernels.declare(rt, moving, **options) for moving in (False, True)}
+        options = {"FOOTPRINT": pixel_footprint, "LAYERED": self._layers is not None}
+        self._kernels = {
+            (moving, parallel): _Kernels.declare(rt, moving, AFFINE=affine or parallel, PARALLEL=parallel, **options)
+            for moving in (False, True)
+            for parallel in (False, True)
+        }
 
     # --- device to device: the reconstruction's loop --------------------------------------------------
 
@@ -121,7 +125,7 @@ class SplatProjector:
         drawn = self.image if self._layers is None else self._layers.images(cells)
         items = (self.width, self.lines) if self.by_pixel else self.lists.total
         rt.launch(
-            self._kernels[cells.moving].forward,
+            self._kernels[cells.moving, cells.is_parallel].forward,
             items,
             self._records,
             self._is_visible,
@@ -164,7 +168,7 @@ class SplatProjector:
         rt = self.rt
         items, group = items_by_gaussian(rt, gaussians.count)
         by_images = by_image if self._layers is None else self._layers.split(cells, by_image)
-        kernels = self._kernels[cells.moving]
+        kernels = self._kernels[cells.moving, cells.is_parallel]
         rt.launch(
             kernels.backward,
             items,
@@ -231,7 +235,7 @@ class SplatProjector:
             self._extents = rt.empty(6 * gaussians.stride, np.int32)
         times = (cells.line_times, np.int32(cells.time_pitch)) if cells.moving else ()
         rt.launch(
-            self._kernels[cells.moving].prepare,
+            self._kernels[cells.moving, cells.is_parallel].prepare,
             gaussians.stride // rt.lanes,
             gaussians.rows, np.int32(gaussians.count), np.int32(gaussians.stride),
             cells.cells, cells.matrices, cells.cell_lines, np.int32(cells.count),

@@ -15,21 +15,21 @@ from phyradgs_cl.fields import Grid
 
 
 def joseph_image(
-    volume: np.ndarray, grid: Grid, pose: np.ndarray, detector_shape: tuple[int, int]
+    volume: np.ndarray, grid: Grid, pose: np.ndarray, detector_shape: tuple[int, int], is_parallel: bool = False
 ) -> np.ndarray:
     """Line integrals (nv, nu) of a volume (z, y, x) from one pose (12,)."""
     image = np.zeros(detector_shape)
     padded = np.pad(volume.astype(np.float64), 1)
-    for index, points, step_mm in _rays(grid, pose, detector_shape, np.ones(detector_shape, bool)):
+    for index, points, step_mm in _rays(grid, pose, np.ones(detector_shape, bool), is_parallel):
         samples = map_coordinates(padded, points[:, ::-1].T + 1, order=1, mode="constant")
         image[index] = samples.sum() * step_mm
     return image
 
 
-def joseph_adjoint(image: np.ndarray, grid: Grid, pose: np.ndarray) -> np.ndarray:
+def joseph_adjoint(image: np.ndarray, grid: Grid, pose: np.ndarray, is_parallel: bool = False) -> np.ndarray:
     """The transpose of ``joseph_image``: pixels (nv, nu) onto a volume (z, y, x), a corner of each sample at a time."""
     padded = np.zeros([n + 2 for n in grid.shape])
-    for index, points, step_mm in _rays(grid, pose, image.shape, image != 0):
+    for index, points, step_mm in _rays(grid, pose, image != 0, is_parallel):
         touching = np.all((points > -1) & (points < grid.shape[::-1]), axis=1)
         whole = np.floor(points[touching])
         rest = points[touching] - whole
@@ -46,7 +46,7 @@ def ray_frame(
     """Returns the merged frame (rows, columns) of a volume (z, y, x): the weighted lines of each cell's image, added up."""
     frame = np.zeros(detector_shape)
     for cell in range(table.count):
-        image = joseph_image(volume, grid, table.pose[cell], detector_shape)
+        image = joseph_image(volume, grid, table.pose[cell], detector_shape, table.is_parallel)
         where = _lines(table, cell)
         seen = np.exp(-image[where]) if model == "intensity" else image[where]
         frame[where] += table.readout.spread(table.weights_of(cell)) * seen
@@ -60,7 +60,7 @@ def ray_volume(frame: np.ndarray, grid: Grid, table: TimeCells) -> np.ndarray:
         image = np.zeros(frame.shape)
         where = _lines(table, cell)
         image[where] = table.readout.spread(table.weights_of(cell)) * frame[where]
-        volume += joseph_adjoint(image, grid, table.pose[cell])
+        volume += joseph_adjoint(image, grid, table.pose[cell], table.is_parallel)
     return volume
 
 
@@ -70,7 +70,7 @@ def intensity_change(
     """Derivative (rows, columns) of ``ray_frame`` with the intensity model at ``volume`` along ``change`` (z, y, x)."""
     frame = np.zeros(detector_shape)
     for cell, share in _shares(volume, grid, table, detector_shape):
-        frame += share * joseph_image(change, grid, table.pose[cell], detector_shape)
+        frame += share * joseph_image(change, grid, table.pose[cell], detector_shape, table.is_parallel)
     return frame
 
 
@@ -78,7 +78,7 @@ def intensity_volume(frame: np.ndarray, volume: np.ndarray, grid: Grid, table: T
     """The transpose of ``intensity_change``: a frame (rows, columns) onto a volume (z, y, x)."""
     result = np.zeros(grid.shape)
     for cell, share in _shares(volume, grid, table, frame.shape):
-        result += joseph_adjoint(share * frame, grid, table.pose[cell])
+        result += joseph_adjoint(share * frame, grid, table.pose[cell], table.is_parallel)
     return result
 
 
@@ -90,7 +90,7 @@ def _shares(
     total = np.exp(-ray_frame(volume, grid, table, shape, "intensity"))
     for cell in range(table.count):
         share, where = np.zeros(shape), _lines(table, cell)
-        light = np.exp(-joseph_image(volume, grid, table.pose[cell], shape)[where])
+        light = np.exp(-joseph_image(volume, grid, table.pose[cell], shape, table.is_parallel)[where])
         share[where] = table.readout.spread(table.weights_of(cell)) * light / total[where]
         yield cell, share
 
@@ -101,35 +101,39 @@ def _lines(table: TimeCells, cell: int) -> tuple[slice, slice]:
 
 
 def _rays(
-    grid: Grid, pose: np.ndarray, detector_shape: tuple[int, int], wanted: np.ndarray
+    grid: Grid, pose: np.ndarray, wanted: np.ndarray, is_parallel: bool
 ) -> Iterator[tuple[tuple[int, ...], np.ndarray, float]]:
     """(pixel, sample points (n, 3) as voxel indices x y z, length of ray per sample in mm) of the wanted pixels."""
     pitch, first = np.array(grid.voxel_size_mm[::-1]), np.array(grid.first_centre_mm[::-1])
+    pixels = (pixel_centres(pose, wanted.shape) - first) / pitch
     source = (pose[:3] - first) / pitch
-    to_pixel = (pixel_centres(pose, detector_shape) - pose[:3]) / pitch
     for index in zip(*np.nonzero(wanted), strict=True):
-        d = to_pixel[index]
+        d = pose[:3] / pitch if is_parallel else pixels[index] - source
         axis = int(np.argmax(np.abs(d)))
-        ends = np.sort([source[axis], source[axis] + d[axis]])
         planes = np.arange(grid.shape[2 - axis])
-        planes = planes[(planes >= ends[0]) & (planes <= ends[1])]
-        points = source + np.outer((planes - source[axis]) / d[axis], d)
+        if not is_parallel:
+            ends = np.sort([source[axis], pixels[index][axis]])
+            planes = planes[(planes >= ends[0]) & (planes <= ends[1])]
+        points = pixels[index] + np.outer((planes - pixels[index][axis]) / d[axis], d)
         points[:, axis] = planes
         yield index, points, float(np.linalg.norm(d * pitch) / abs(d[axis]))
 
 
-def backprojection(frames: np.ndarray, pose: np.ndarray, weight: np.ndarray, grid: Grid) -> np.ndarray:
+def backprojection(
+    frames: np.ndarray, pose: np.ndarray, weight: np.ndarray, grid: Grid, is_parallel: bool = False
+) -> np.ndarray:
     """Σ_f weight_f / z² · frame_f(u, v); frames (F, rows, columns), pose (F, 12) mm, weight (F,) → (z, y, x)."""
     volume = np.zeros(grid.shape)
     for frame, one, share in zip(frames.astype(np.float64), pose, weight, strict=True):
-        u, v, depth = detector_position(one, grid)
+        u, v, depth = detector_position(one, grid, is_parallel)
         inside = (depth > 0) & _on(u, frame.shape[1]) & _on(v, frame.shape[0])
         volume[inside] += share / depth[inside] ** 2 * _bilinear(frame, v[inside], u[inside])
     return volume
 
 
 def lines_backprojection(
-    frames: np.ndarray, pose: np.ndarray, weight: np.ndarray, grid: Grid, axis: str = "rows"
+    frames: np.ndarray, pose: np.ndarray, weight: np.ndarray, grid: Grid, axis: str = "rows",
+    is_parallel: bool = False,
 ) -> np.ndarray:
     """The same with one pose per line, pose (F, lines, 12) mm: by definition, see ``backproject_lines``."""
     power = 2 if axis == "columns" else 1
@@ -139,7 +143,7 @@ def lines_backprojection(
     volume = np.zeros(grid.shape)
     for frame, poses, share in zip(frames.astype(np.float64), pose, weight, strict=True):
         u, v, depth = (
-            np.stack(parts) for parts in zip(*(detector_position(p, grid) for p in poses), strict=True)
+            np.stack(parts) for parts in zip(*(detector_position(p, grid, is_parallel) for p in poses), strict=True)
         )
         ahead = v - np.arange(lines)[:, None, None, None]  # falls through zero where the voxel is seen
         for index in np.ndindex(*grid.shape):
@@ -148,9 +152,16 @@ def lines_backprojection(
     return volume
 
 
-def detector_position(pose: np.ndarray, grid: Grid) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Pixel column, row and depth (z, y, x) of all voxel centres: x − s = depth (d00 + u eu + v ev), solved."""
+def detector_position(
+    pose: np.ndarray, grid: Grid, is_parallel: bool = False
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Pixel column, row and depth (z, y, x) of all voxel centres: x − s = depth (d00 + u eu + v ev), solved. In a parallel
+    beam x − first pixel = u eu + v ev + t direction, and the depth is 1."""
     z, y, x = np.meshgrid(*grid.axes_mm(), indexing="ij")
+    if is_parallel:
+        offset = np.stack([x, y, z]).reshape(3, -1) - pose[3:6, None]
+        u, v, t = np.linalg.solve(np.stack([pose[6:9], pose[9:12], pose[0:3]], -1), offset).reshape(3, *grid.shape)
+        return u, v, np.ones_like(t)
     offset = np.stack([x, y, z]).reshape(3, -1) - pose[0:3, None]
     basis = np.stack([pose[6:9], pose[9:12], pose[3:6] - pose[0:3]], -1)
     u, v, depth = np.linalg.solve(basis, offset).reshape(3, *grid.shape)

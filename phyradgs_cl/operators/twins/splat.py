@@ -32,9 +32,14 @@ def splat_image(
     detector_shape: tuple[int, int],
     cutoff_sigma: float = 0.0,
     affine: bool = False,
+    is_parallel: bool = False,
 ) -> np.ndarray:
     """One static projection (nv, nu) of parameter rows (11, G) from one pose (12,)."""
     image = np.zeros(detector_shape)
+    if is_parallel:
+        for row, precision in zip(rows.T, precision_matrices(rows), strict=True):
+            image += _in_parallel(row, precision, pose, detector_shape, cutoff_sigma)
+        return image
     to_pixel = pixel_centres(pose, detector_shape) - pose[:3]
     for row, precision in zip(rows.T, precision_matrices(rows), strict=True):
         image += (
@@ -65,6 +70,18 @@ def _exact(
             return np.zeros_like(value)
         value = np.where(q <= cutoff_sigma**2, value, 0.0)
     return value
+
+
+def _in_parallel(
+    row: np.ndarray, precision: np.ndarray, pose: np.ndarray, detector_shape: tuple[int, int], cutoff_sigma: float
+) -> np.ndarray:
+    """The exact line integrals along parallel rays: density sqrt(2π/a) exp(−q/2) with q the smallest along the ray."""
+    offset = pixel_centres(pose, detector_shape) - row[:3]
+    a = pose[:3] @ precision @ pose[:3]
+    b = np.einsum("vui,ij,j->vu", offset, precision, pose[:3])
+    q = np.einsum("vui,ij,vuj->vu", offset, precision, offset) - b**2 / a
+    value = row[10] * np.sqrt(2 * np.pi / a) * np.exp(-q / 2)
+    return np.where(q <= cutoff_sigma**2, value, 0.0) if cutoff_sigma > 0 else value
 
 
 def _affine(
@@ -103,7 +120,8 @@ def splat_frame(
     frame = np.zeros(detector_shape)
     for cell in range(table.count):
         lines = slice(int(table.line_start[cell]), int(table.line_stop[cell]))
-        image = table.weight[cell] * splat_image(rows, table.pose[cell], detector_shape, cutoff_sigma, affine)
+        like = detector_shape, cutoff_sigma, affine, table.is_parallel
+        image = table.weight[cell] * splat_image(rows, table.pose[cell], *like)
         if table.axis == "rows":
             frame[lines] += image[lines]
         else:
@@ -160,23 +178,26 @@ def moving_frame(
     for pose, ends, times in zip(turn(table.pose), turn(table.end_poses), table.line_times, strict=True):
         for row, precision in zip(rows.T, precision_matrices(rows), strict=True):
             frame += _segment_image(
-                row, precision, pose, ends, times, shape, cutoff_sigma, affine, pixel_variance
+                row, precision, pose, ends, times, shape, cutoff_sigma, affine, pixel_variance, table.is_parallel
             )
     return frame.T if by_column else frame
 
 
-def seen_at(pose: np.ndarray, point: np.ndarray) -> np.ndarray:
-    """(u, v, depth) of a world point, u and v in pixels."""
+def seen_at(pose: np.ndarray, point: np.ndarray, is_parallel: bool = False) -> np.ndarray:
+    """(u, v, depth) of a world point, u and v in pixels; the depth is 1 in a parallel beam."""
+    if is_parallel:
+        p = np.linalg.solve(np.stack([pose[6:9], pose[9:12], pose[:3]], -1), point - pose[3:6])
+        return np.array([p[0], p[1], 1.0])
     p = np.linalg.solve(np.stack([pose[6:9], pose[9:12], pose[3:6] - pose[:3]], -1), point - pose[:3])
     return np.array([p[0] / p[2], p[1] / p[2], p[2]])
 
 
 def _segment(
-    row: np.ndarray, precision: np.ndarray, pose: np.ndarray, ends: np.ndarray, pixel_variance: float
+    row: np.ndarray, precision: np.ndarray, pose: np.ndarray, ends: np.ndarray, pixel_variance: float, is_parallel: bool
 ) -> _Segment:
-    u, v, z = seen_at(pose, row[:3])
-    first, last = (seen_at(end, row[:3])[:2] for end in ends)
-    d0, steps = (row[:3] - pose[:3]) / z, np.stack([pose[6:9], pose[9:12]], -1)
+    u, v, z = seen_at(pose, row[:3], is_parallel)
+    first, last = (seen_at(end, row[:3], is_parallel)[:2] for end in ends)
+    d0, steps = pose[:3] if is_parallel else (row[:3] - pose[:3]) / z, np.stack([pose[6:9], pose[9:12]], -1)
     alpha = d0 @ precision @ d0
     b, c = steps.T @ precision @ d0 / alpha, steps.T @ precision @ steps / alpha
     sharp = z * z * alpha * (c - np.outer(b, b))
@@ -202,16 +223,18 @@ def _segment_image(
     cutoff_sigma: float,
     affine: bool,
     pixel_variance: float,
+    is_parallel: bool,
 ) -> np.ndarray:
-    if min(seen_at(p, row[:3])[2] for p in (pose, *ends)) <= 0:
+    if min(seen_at(p, row[:3], is_parallel)[2] for p in (pose, *ends)) <= 0:
         return np.zeros(shape)
-    s = _segment(row, precision, pose, ends, pixel_variance)
+    s = _segment(row, precision, pose, ends, pixel_variance, is_parallel)
     v, u = np.mgrid[: shape[0], : shape[1]]
     delta = np.stack([u, v], -1) - s.centre
-    big_q = np.ones(shape) if affine else 1 + 2 * delta @ s.b + np.einsum("...i,ij,...j", delta, s.c, delta)
+    big_q = np.ones(shape) if affine or is_parallel else 1 + 2 * delta @ s.b + np.einsum("...i,ij,...j", delta, s.c, delta)
     ray = pose[3:6] - pose[:3] + u[..., None] * pose[6:9] + v[..., None] * pose[9:12]
-    mid = seen_at(pose, row[:3])
-    length = np.linalg.norm((row[:3] - pose[:3]) / mid[2] if affine else ray, axis=-1)
+    if affine:
+        ray = (row[:3] - pose[:3]) / seen_at(pose, row[:3])[2]
+    length = np.linalg.norm(pose[:3] if is_parallel else ray, axis=-1)
     mean = np.zeros(shape)
     for share, weight in zip(*_nodes(), strict=True):
         at = times[0] + share * times[1]

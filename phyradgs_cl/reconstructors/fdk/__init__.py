@@ -1,4 +1,5 @@
-"""FDK (Feldkamp, Davis and Kress 1984): ray weights, ramp filter, distance-weighted backprojection.
+"""FDK (Feldkamp, Davis and Kress 1984), and filtered backprojection of parallel beams, FBP, in the same steps: ray weights,
+ramp filter, backprojection, which FDK weights by distance.
 
 The ramp filter is Ram-Lak's in its space-domain form, with windows on its spectrum: A. C. Kak and M. Slaney, Principles of
 Computerized Tomographic Imaging, IEEE Press 1988, Eq. 61 of chapter 3.
@@ -25,7 +26,7 @@ from phyradgs_cl.reconstructors.fdk import weights
 from phyradgs_cl.reconstructors.fdk.beyond_panel import WAYS, extrapolated, reprojected, whole_object
 from phyradgs_cl.reconstructors.fdk.views import (
     RayWeight,
-    check_orbit,
+    check_beam,
     pose_of_pixels,
     ray_weight,
     view_angles,
@@ -79,22 +80,40 @@ def fdk(
 
     Logs a warning for an orbit that is not a circle about z, and raises InputError for one that is far from it.
     """
+    return _filtered_backprojection("fdk", scan, options, rt, report)
+
+
+def fbp(
+    scan: Scan, options: FdkOptions, rt: Runtime, *, seed: int = 0, report: ProgressReport = ignore_progress
+) -> Reconstruction:
+    """Returns the filtered backprojection of a parallel beam in 1/mm: half turns, full turns, and full turns with the axis
+    near the panel's edge. ``seed`` is part of the common signature and not used.
+
+    Logs a warning for incomplete turns, and raises InputError for rays that are not at right angles to the axis.
+    """
+    return _filtered_backprojection("fbp", scan, options, rt, report)
+
+
+def _filtered_backprojection(
+    method: str, scan: Scan, options: FdkOptions, rt: Runtime, report: ProgressReport
+) -> Reconstruction:
     started = time.perf_counter()
     frames, numbers = _measured_frames(scan)
     poses = [options.motion.cells(scan, f).still().line_poses() for f in numbers]
     lines = max(map(len, poses))
     pose = np.concatenate(poses) if lines == 1 else np.stack([np.broadcast_to(p, (lines, 12)) for p in poses])
-    check_orbit(pose)
+    check_beam(method, pose, scan.is_parallel)
     whole = partial(whole_object, scan, options.motion, rt, report)
     volume = fdk_volume(
         rt, frames, pose, scan.grid, window=options.window, axis=scan.shutter.axis,
-        extrapolate=options.extrapolate, whole=whole,
+        extrapolate=options.extrapolate, whole=whole, is_parallel=scan.is_parallel,
     )  # fmt: skip
-    facts = {"method": "fdk", "options": option_facts(options), "seconds": time.perf_counter() - started}
+    facts = {"method": method, "options": option_facts(options), "seconds": time.perf_counter() - started}
     return Reconstruction(volume, scan.grid, facts=facts)
 
 
 METHOD = Method(fdk, {window: FdkOptions(window) for window in WINDOWS}, is_resumable=False)
+FBP_METHOD = Method(fbp, {window: FdkOptions(window) for window in WINDOWS}, is_resumable=False)
 
 
 def fdk_volume(
@@ -107,8 +126,9 @@ def fdk_volume(
     axis: str = "rows",
     extrapolate: str = "none",
     whole: Callable[[], np.ndarray] | None = None,
+    is_parallel: bool = False,
 ) -> np.ndarray:
-    """Returns FDK of line integrals (F, rows, columns) on ``grid``, (z, y, x) float32 in 1/mm.
+    """Returns FDK, or FBP of parallel beams, of line integrals (F, rows, columns) on ``grid``, (z, y, x) float32 in 1/mm.
 
     pose (F, 12) mm, or (F, lines, 12) with a pose for every line along ``axis``. Displaced detectors (full turns) and short
     scans are recognised and weighted. Logs a warning where data are missing. ``whole`` reconstructs the object (z, y, x) in
@@ -122,23 +142,24 @@ def fdk_volume(
     canonical = weights.turned_back(by_pixel, angle_rad)
     if np.ptp(canonical, axis=0).max() <= _SAME_POSE * np.abs(canonical).max():
         canonical = canonical[:1]
-    arc, fan = view_arc(angle_rad), weights.measured_fan(canonical, shape)
+    arc, fan = view_arc(angle_rad), weights.measured_fan(canonical, shape, is_parallel)
     if extrapolate != "none" and fan.is_put_aside:
         log.warning("FDK: the rows of a displaced detector are not extrapolated")
     elif extrapolate != "none":
         if extrapolate == "reprojected" and whole is not None:
-            wide, count = reprojected(rt, frames, pose, axis, whole(), grid)
+            wide, count = reprojected(rt, frames, pose, axis, whole(), grid, is_parallel)
         else:
             wide, count = extrapolated(frames, extrapolate)
-        return fdk_volume(rt, wide, widened(pose, axis, (count, count)), grid, window=window, axis=axis)
-    warn_if_incomplete(arc, fan, canonical, grid)
+        wider = widened(pose, axis, (count, count))
+        return fdk_volume(rt, wide, wider, grid, window=window, axis=axis, is_parallel=is_parallel)
+    warn_if_incomplete(arc, fan, canonical, grid, is_parallel)
     missing = fan.missing_columns if arc.is_full else (0, 0)
-    filtered = _filtered(frames, ray_weight(canonical, shape, arc, fan), missing, window)
+    filtered = _filtered(frames, ray_weight(canonical, shape, arc, fan, is_parallel), missing, window)
     pose = widened(pose, axis, missing)
     share = 0.5 * arc.gap_rad  # every ray is measured twice
     if pose.ndim == 2:
-        return backproject(rt, filtered, pose, share, grid)
-    return backproject_lines(rt, filtered, pose, share, grid, axis)
+        return backproject(rt, filtered, pose, share, grid, is_parallel=is_parallel)
+    return backproject_lines(rt, filtered, pose, share, grid, axis, is_parallel=is_parallel)
 
 
 def _filtered(frames: np.ndarray, weight: RayWeight, missing: tuple[int, int], window: str) -> np.ndarray:
@@ -185,10 +206,11 @@ def ramp_filter(rows: np.ndarray, spacing_mm: float, window: str = "ram-lak") ->
 
 
 def static_fdk(rt: Runtime, scan: Scan) -> np.ndarray:
-    """Returns FDK (z, y, x) in 1/mm at the mid-window poses, as a start or a reference of other methods."""
+    """Returns FDK, or FBP of a parallel beam, (z, y, x) in 1/mm at the mid-window poses: a start or a reference of other
+    methods."""
     frames, numbers = _measured_frames(scan)
     pose = np.concatenate([Static().cells(scan, f).pose for f in numbers])
-    return fdk_volume(rt, frames, pose, scan.grid)
+    return fdk_volume(rt, frames, pose, scan.grid, is_parallel=scan.is_parallel)
 
 
 def _measured_frames(scan: Scan) -> tuple[np.ndarray, np.ndarray]:

@@ -89,37 +89,43 @@ def whole_object(scan: Scan, motion: Motion, rt: Runtime, report: ProgressReport
 
 
 def reprojected(
-    rt: Runtime, frames: np.ndarray, pose: np.ndarray, axis: str, volume: np.ndarray, grid: Grid
+    rt: Runtime, frames: np.ndarray, pose: np.ndarray, axis: str, volume: np.ndarray, grid: Grid, is_parallel: bool
 ) -> tuple[np.ndarray, int]:
     """Returns line integrals (F, v, u + 2 n) float32, ``frames`` (F, v, u) continued by the projections of a volume, and n.
 
     volume (nz, ny, nx) in 1/mm; pose (F, 12) or (F, lines, 12) in mm, with a pose for every line along ``axis``.
     """
     rows, columns = frames.shape[1:]
-    count = _columns_beyond(pose.reshape(-1, 12), columns, grid)
+    count = _columns_beyond(pose.reshape(-1, 12), columns, grid, is_parallel)
     wide = widened(pose, axis, (count, count))
     by_line = wide[:, None] if wide.ndim == 2 else wide
     shape = rows, columns + 2 * count
-    operator = RayOperator(rt, grid, shape, [_cells(poses, shape[axis == "columns"], axis) for poses in by_line])
+    lines = shape[axis == "columns"]
+    operator = RayOperator(rt, grid, shape, [_cells(poses, lines, axis, is_parallel) for poses in by_line])
     continued = operator.forward(np.ascontiguousarray(volume, np.float32))
     continued[..., count : count + columns] = frames
     return continued, count
 
 
-def _cells(pose: np.ndarray, lines: int, axis: str) -> TimeCells:
+def _cells(pose: np.ndarray, lines: int, axis: str, is_parallel: bool) -> TimeCells:
     """Returns a pose (1, 12) of all lines, or (lines, 12) of each, as still cells."""
     ends = np.linspace(0, lines, len(pose) + 1).round().astype(np.int32)
-    return TimeCells(pose, np.zeros(len(pose)), ends[:-1], ends[1:], np.ones(len(pose)), lines, axis)
+    weight = np.ones(len(pose))
+    return TimeCells(pose, 0 * weight, ends[:-1], ends[1:], weight, lines, axis, is_parallel=is_parallel)
 
 
-def _columns_beyond(pose: np.ndarray, columns: int, grid: Grid) -> int:
+def _columns_beyond(pose: np.ndarray, columns: int, grid: Grid, is_parallel: bool) -> int:
     """Returns how many more columns at a side panels of poses (n, 12) need to see the grid's whole box."""
     source, first, step_u, step_v = (pose[:, None, i : i + 3] for i in (0, 3, 6, 9))
     corners = np.stack(np.meshgrid(*grid.box_mm[::-1], indexing="ij"), -1).reshape(1, 8, 3)
     normal = np.cross(step_u, step_v)
-    depth = ((corners - source) * normal).sum(-1) / ((first - source) * normal).sum(-1)  # 1 on the panel, 0 at the source
+    if is_parallel:  # the first three numbers are a direction, along which the corners go to the panel
+        ahead = ((first - corners) * normal).sum(-1) / (source * normal).sum(-1)
+        hit = corners + ahead[..., None] * source - first
+    else:
+        depth = ((corners - source) * normal).sum(-1) / ((first - source) * normal).sum(-1)  # 1 on the panel
+        hit = (corners - source) / np.maximum(depth, 1e-6)[..., None] - (first - source)
     across = np.cross(step_v, normal)
-    hit = (corners - source) / np.maximum(depth, 1e-6)[..., None] - (first - source)
     column = (hit * across).sum(-1) / (step_u * across).sum(-1)
     beyond = max(-float(column.min()), float(column.max()) - (columns - 1))
     return int(np.clip(np.ceil(beyond), 0, round(_MOST * columns)))

@@ -76,6 +76,7 @@ log = logging.getLogger(__name__)
 
 _CIRCLE, _NO_CIRCLE = 0.05, 0.5  # of the way from source to panel: from here FDK loses decibels, or the object
 _PLANE_DEG, _NO_PLANE_DEG = 10.0, 45.0
+_LEAN_DEG, _NO_LEAN_DEG = 0.5, 10.0  # of a parallel beam
 _TOLERATED_RAD = np.deg2rad(0.5)  # the fan of rays that are nearly parallel: half a turn is enough
 RayWeight = Callable[[int], np.ndarray]
 
@@ -95,15 +96,18 @@ def view_angles(by_pixel: np.ndarray) -> np.ndarray:
     return (first + turned.mean(axis=(1, 2), keepdims=True))[:, 0, 0]
 
 
-def ray_weight(canonical: np.ndarray, shape: tuple[int, int], arc: Arc, fan: weights.Fan) -> RayWeight:
+def ray_weight(
+    canonical: np.ndarray, shape: tuple[int, int], arc: Arc, fan: weights.Fan, is_parallel: bool = False
+) -> RayWeight:
     """Returns a function from a view's index to its pixels' weights (rows, columns) before filtering, in 1/mm."""
     rows, columns = np.arange(shape[0]), np.arange(shape[1])
 
     def geometry(view: int) -> tuple[np.ndarray, np.ndarray]:
         pose = canonical[view]
-        rays = weights.pixel_rays(pose, rows, columns)
+        rays = weights.pixel_rays(pose, rows, columns, is_parallel)
         pitch_mm = np.linalg.norm(pose[..., 6:9], axis=-1)
-        return weights.ray_measure(pose, rays) / pitch_mm, _redundancy_angle(pose, rays, arc)
+        measure = weights.ray_measure(pose, rays, is_parallel) / pitch_mm
+        return measure, _redundancy_angle(pose, rays, arc, is_parallel)
 
     first = geometry(0)
     if arc.is_full and len(canonical) == 1:
@@ -123,13 +127,16 @@ def _redundancy(view: int, angle_rad: np.ndarray, arc: Arc, fan: weights.Fan) ->
     return weights.displaced_weight(angle_rad, fan) if fan.is_displaced else 1.0
 
 
-def _redundancy_angle(pose: np.ndarray, rays: np.ndarray, arc: Arc) -> np.ndarray:
-    """Returns the fan angle (rows, columns) that determines a ray's opposite.
+def _redundancy_angle(pose: np.ndarray, rays: np.ndarray, arc: Arc, is_parallel: bool) -> np.ndarray:
+    """Returns the fan angle (rows, columns) that determines a ray's opposite. In a parallel beam's short scan it is 0, and
+    in its full turn a distance from the axis.
 
     Where columns are read out one after the other, the arc of a short scan begins at another angle for every column,
     and a ray's opposite lies on another column: their lags behind the frame, whose own angle is 0 here, add up.
     """
-    angle_rad = weights.fan_angle(pose, rays)
+    angle_rad = weights.fan_angle(pose, rays, is_parallel)
+    if is_parallel and not arc.is_full:
+        angle_rad = np.zeros_like(angle_rad)
     if arc.is_full or pose.shape[1] == 1:
         return angle_rad
     return angle_rad + azimuth_rad(pose)
@@ -146,11 +153,35 @@ def widened(pose: np.ndarray, axis: str, missing: tuple[int, int]) -> np.ndarray
     return moved
 
 
-def check_orbit(pose: np.ndarray) -> None:
-    """Logs how far poses (F, 12) or (F, lines, 12) are from one circle about z in its plane, if FDK then loses accuracy.
+def check_beam(method: str, pose: np.ndarray, is_parallel: bool) -> None:
+    """Raises InputError for ``fdk`` in a parallel beam and ``fbp`` in a cone, and for orbits that they cannot reconstruct.
 
-    Raises InputError where FDK could not reconstruct the object.
+    Logs how far poses (F, 12) or (F, lines, 12) are from one circle about z, if the method then loses accuracy.
     """
+    if is_parallel != (method == "fbp"):
+        found, expected, remedy = ("parallel", "cone", "fbp") if is_parallel else ("cone", "parallel", "fdk")
+        raise InputError(f"--method {method}", f"a {found} beam", f"a {expected} beam", f"take --method {remedy}")
+    if is_parallel:
+        _check_directions(pose)
+    else:
+        _check_orbit(pose)
+
+
+def _check_directions(pose: np.ndarray) -> None:
+    """Checks that parallel rays run nearly at right angles to the axis, as no filter along detector rows is right else."""
+    rise_deg = np.rad2deg(np.arcsin(np.clip(np.abs(pose[..., 2]), 0, 1)))
+    lean_deg = np.rad2deg(np.arctan2(np.abs(pose[..., 8]), np.linalg.norm(pose[..., 6:8], axis=-1)))
+    worst_deg = float(max(rise_deg.max(), lean_deg.max()))
+    remedy = "take an iterative or splatting method: they take any orbit"
+    if worst_deg > _NO_LEAN_DEG:
+        found = f"rays or detector rows {worst_deg:.1f}° off the plane of the rotation (laminography?)"
+        raise InputError("--method fbp", found, f"at most {_NO_LEAN_DEG:.0f}°", remedy)
+    if worst_deg > _LEAN_DEG:
+        text = "FBP: rays or detector rows %.2f° off the plane of the rotation: the volume is an approximation; %s"
+        log.warning(text, worst_deg, remedy)
+
+
+def _check_orbit(pose: np.ndarray) -> None:
     middle = pose if pose.ndim == 2 else pose[:, pose.shape[1] // 2]
     canonical = weights.turned_back(middle, azimuth_rad(middle)).reshape(-1, 4, 3)
     source, corner = canonical[:, 0], canonical[:, 1]
@@ -177,7 +208,9 @@ def check_orbit(pose: np.ndarray) -> None:
         log.warning(text, found, "iterative and splatting methods take any orbit")
 
 
-def warn_if_incomplete(arc: Arc, fan: weights.Fan, canonical: np.ndarray, grid: Grid) -> None:
+def warn_if_incomplete(
+    arc: Arc, fan: weights.Fan, canonical: np.ndarray, grid: Grid, is_parallel: bool = False
+) -> None:
     if np.unique(arc.progress_rad).size == 1:
         log.warning("FDK: all views are from one angle: the volume is a single backprojection")
         return
@@ -189,6 +222,11 @@ def warn_if_incomplete(arc: Arc, fan: weights.Fan, canonical: np.ndarray, grid: 
         return
     if fan.is_put_aside:
         log.warning("FDK: a displaced detector needs a full turn; one side of the volume is not measured")
+    if is_parallel:
+        if arc.coverage_rad < np.pi - _TOLERATED_RAD:
+            text = "FBP: the views cover %.1f°, complete data of a parallel beam need 180°"
+            log.warning(text, np.rad2deg(arc.coverage_rad))
+        return
     _, y_mm, x_mm = grid.axes_mm()
     radius_mm = np.hypot(np.abs(x_mm).max(), np.abs(y_mm).max())
     source_mm = float(np.hypot(canonical[..., 0], canonical[..., 1]).min())

@@ -26,21 +26,25 @@ def turned_back(pose: np.ndarray, angle_rad: np.ndarray) -> np.ndarray:
     return np.einsum("fij,fkj->fki", turn, vectors).reshape(pose.shape)
 
 
-def pixel_rays(pose: np.ndarray, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
-    """Vectors (..., v, u, 3) mm from source to pixels of the given rows (v,) and columns (u,).
+def pixel_rays(pose: np.ndarray, rows: np.ndarray, columns: np.ndarray, is_parallel: bool = False) -> np.ndarray:
+    """Vectors (..., v, u, 3) mm from source, or the origin in a parallel beam, to pixels of rows (v,) and columns (u,).
 
     pose broadcasts to (..., v, u, 12): one for all pixels (1, 1, 12), one per row (v, 1, 12), one per column (1, u, 12).
     """
-    corner = pose[..., 3:6] - pose[..., 0:3]
+    corner = pose[..., 3:6] if is_parallel else pose[..., 3:6] - pose[..., 0:3]
     return corner + columns[:, None] * pose[..., 6:9] + rows[:, None, None] * pose[..., 9:12]
 
 
-def ray_measure(pose: np.ndarray, rays: np.ndarray) -> np.ndarray:
+def ray_measure(pose: np.ndarray, rays: np.ndarray, is_parallel: bool = False) -> np.ndarray:
     """The measure (v, u) of each ray per radian of gantry angle and mm of detector, over the filter's own 1/mm².
 
     |ȧ·n| / D with ȧ the source's motion per radian, n the ray's normal in the plane of ray and detector row, D the
-    distance of the row from the source. For a flat panel facing the source it is DSO / |ray|: FDK's cosine.
+    distance of the row from the source. For a flat panel facing the source it is DSO / |ray|: FDK's cosine. In a parallel
+    beam it is the sine of the angle between rays and row: 1 for a panel across the rays.
     """
+    if is_parallel:
+        across = np.cross(pose[..., 0:3], pose[..., 6:9]) / np.linalg.norm(pose[..., 6:9], axis=-1, keepdims=True)
+        return np.linalg.norm(across, axis=-1)
     row = pose[..., 6:9] / np.linalg.norm(pose[..., 6:9], axis=-1, keepdims=True)
     motion = np.stack([-pose[..., 1], pose[..., 0], np.zeros(pose.shape[:-1])], -1)
     length = np.linalg.norm(rays, axis=-1)
@@ -50,15 +54,20 @@ def ray_measure(pose: np.ndarray, rays: np.ndarray) -> np.ndarray:
     return np.abs(normal_motion) / (length * (1 - cosine**2))
 
 
-def fan_angle(pose: np.ndarray, rays: np.ndarray) -> np.ndarray:
-    """Angle (v, u) of each ray about +z from the source's view of the axis, radians, counter-clockwise positive."""
+def fan_angle(pose: np.ndarray, rays: np.ndarray, is_parallel: bool = False) -> np.ndarray:
+    """Angle (v, u) of each ray about +z from the source's view of the axis, radians, counter-clockwise positive. In a
+    parallel beam: the distance in mm at which it passes the axis, positive on the same side."""
+    if is_parallel:
+        along = pose[..., 0:2] / np.linalg.norm(pose[..., 0:2], axis=-1, keepdims=True)
+        return along[..., 0] * rays[..., 1] - along[..., 1] * rays[..., 0]
     x, y = -pose[..., 0], -pose[..., 1]
     return np.arctan2(x * rays[..., 1] - y * rays[..., 0], x * rays[..., 0] + y * rays[..., 1])
 
 
 @dataclass(frozen=True)
 class Fan:
-    """The fan angles that every view sees, and how far the detector is off centre, in columns at its two ends."""
+    """The fan angles, or distances from the axis in a parallel beam (see ``fan_angle``), that every view sees, and how far
+    the detector is off centre, in columns at its two ends."""
 
     low_rad: float
     high_rad: float
@@ -83,20 +92,20 @@ class Fan:
         return max(self.high_rad, -self.low_rad)
 
 
-def measured_fan(pose: np.ndarray, shape: tuple[int, int]) -> Fan:
+def measured_fan(pose: np.ndarray, shape: tuple[int, int], is_parallel: bool = False) -> Fan:
     """What views with poses as in ``pixel_rays``, (F, ..., 12), see on a detector of ``shape`` (rows, columns).
 
     ``missing_columns`` would make the detector reach equally far on both sides of the axis.
     """
     rows, columns = np.arange(shape[0]), np.arange(shape[1])
     outer = pose[:, :, [0, -1]] if pose.shape[2] > 1 else pose
-    ends = np.sort(fan_angle(outer, pixel_rays(outer, rows, columns[[0, -1]])), axis=-1)
+    ends = np.sort(fan_angle(outer, pixel_rays(outer, rows, columns[[0, -1]], is_parallel), is_parallel), axis=-1)
     low, high = float(ends[..., 0].max()), float(ends[..., 1].min())
     overhang = abs(high + low) * max(shape[1] - 1, 1)
     if shape[1] == 1 or overhang <= _SYMMETRIC * (high - low):
         return Fan(low, high)
     middle = pose[0, [pose.shape[1] // 2]]
-    across = fan_angle(middle, pixel_rays(middle, rows[[shape[0] // 2]], columns))[0]
+    across = fan_angle(middle, pixel_rays(middle, rows[[shape[0] // 2]], columns, is_parallel), is_parallel)[0]
     axis = float(np.interp(0.0, across if across[-1] > across[0] else -across, columns))
     missing = max(1, int(np.ceil(abs(shape[1] - 1 - 2 * axis) - 1e-6)))
     return Fan(low, high, (missing, 0) if axis < (shape[1] - 1) / 2 else (0, missing))

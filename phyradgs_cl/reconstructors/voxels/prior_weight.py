@@ -43,7 +43,9 @@ def _blur_mm(scan: Scan, motion: Motion) -> float:
     line = cells.lines // 2
     serving = [c for c, lines in enumerate(cells.ranges) if lines.start <= line < lines.stop]
     weights = np.array([cells.weights_of(c)[line - cells.line_start[c]] for c in serving])
-    sources_mm = cells.pose[serving, :3] - scan.grid.offset_mm[::-1]
+    sources_mm = cells.pose[serving, :3]  # a direction of length 1 in a parallel beam
+    if not scan.is_parallel:
+        sources_mm = sources_mm - scan.grid.offset_mm[::-1]
     apart_mm = sources_mm - weights @ sources_mm / weights.sum()
     turn_rad = _SPREAD * np.sqrt(weights @ (apart_mm**2).sum(1) / weights.sum()) / np.linalg.norm(sources_mm[0])
     return float(turn_rad * max(scan.grid.size_mm[1:]) / 4)

@@ -1,0 +1,149 @@
+"""Parallel beams: float64 twins, a cone whose source goes to infinity, closed forms, in every build of the kernels."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+from kernel_kit import assert_near
+from ray_tables import noise
+from tolerances import ADJOINT, RAYS, RAYS_BACK, SPLAT_AFFINE, SPLAT_MOVING
+
+from phyradgs_cl.acquisition import (
+    CircularOrbit,
+    ConeGeometry,
+    ConstantSpeed,
+    ParallelGeometry,
+    Shutter,
+    pixel_centres,
+)
+from phyradgs_cl.acquisition.cells import (
+    common_time_cells,
+    exact_cells,
+    micro_view_cells,
+    per_line_cells,
+    static_cells,
+)
+from phyradgs_cl.acquisition.time_cells import TimeCells
+from phyradgs_cl.fields import Grid
+from phyradgs_cl.operators import RayOperator, backproject, backproject_lines
+from phyradgs_cl.operators.splats.layout import DeviceCells
+from phyradgs_cl.operators.splats.projector import SplatProjector
+from phyradgs_cl.operators.twins.rays import backprojection, lines_backprojection, ray_frame, ray_volume
+from phyradgs_cl.operators.twins.splat import moving_frame, splat_frame
+from phyradgs_cl.phantoms import Ellipsoid, EllipsoidPhantom, rotation_about_z
+
+SHAPE = (24, 13)
+GRID = Grid((12, 14, 11), (0.16, 0.13, 0.16), (0.1, -0.05, 0.2))
+GEOMETRY = ParallelGeometry(SHAPE, (2.4 / 24, 2.6 / 13), (0.03, -0.04))
+
+
+@dataclass(frozen=True)
+class Leaning:
+    """An orbit whose panel is rolled and whose rays rise: laminography for a large rise."""
+
+    roll_rad: float
+    rise_rad: float
+    is_parallel = True
+
+    def pose(self, frame: int, time_s: np.ndarray) -> np.ndarray:
+        pose = CircularOrbit(GEOMETRY, ConstantSpeed(0.3, 0.9)).pose(frame, time_s).reshape(*np.shape(time_s), 4, 3)
+        across, up = pose[..., 2, :].copy(), pose[..., 3, :] * GEOMETRY.pixel_size_mm[1] / GEOMETRY.pixel_size_mm[0]
+        pose[..., 2, :] = np.cos(self.roll_rad) * across + np.sin(self.roll_rad) * up
+        pose[..., 3, :] += np.tan(self.roll_rad) * -across * GEOMETRY.pixel_size_mm[0] / GEOMETRY.pixel_size_mm[1]
+        pose[..., 0, :] = np.cos(self.rise_rad) * pose[..., 0, :] + [0, 0, np.sin(self.rise_rad)]
+        return pose.reshape(*np.shape(time_s), 12)
+
+
+BEAMS = {
+    "upright": Leaning(0.0, 0.0),
+    "rolled": Leaning(0.03, 0.0),
+    "rising": Leaning(0.02, -0.2),
+    "laminography": Leaning(0.0, 1.0),
+}
+
+
+def cells_of(trajectory, motion: str, axis: str = "rows", shape: tuple[int, int] = SHAPE) -> list[TimeCells]:
+    shutter, start_s = Shutter(0.4, 0.3, axis), np.array([0.1, 1.6])
+    lines, builders = shutter.lines(shape), {"micro-views": (micro_view_cells, 3, 2), "own": (per_line_cells, 2)}
+    tables = []
+    for frame in range(2):
+        where = trajectory, shutter, frame
+        if motion == "common":
+            tables.append(common_time_cells(*where, start_s, lines, 2))
+        else:
+            build, *counts = builders.get(motion, (exact_cells, 3) if motion == "exact" else (static_cells,))
+            tables.append(build(*where, start_s[frame], lines, *counts))
+    return tables
+
+
+CASES = [(beam, motion, axis) for motion, axis in (("static", "rows"), ("common", "columns")) for beam in BEAMS]
+
+
+@pytest.mark.parametrize(("beam", "motion", "axis"), [*CASES, ("rising", "own", "rows"), ("upright", "common", "rows")])
+def test_rays_and_their_adjoint_are_the_twins(any_rt, beam: str, motion: str, axis: str) -> None:
+    tables, volume, frames = cells_of(BEAMS[beam], motion, axis), noise(GRID.shape, 1), noise((2, *SHAPE), 2)
+    operator = RayOperator(any_rt, GRID, SHAPE, tables)
+    there, back = operator.forward(volume), operator.adjoint(frames)
+    assert_near(there, np.stack([ray_frame(volume, GRID, table, SHAPE) for table in tables]), RAYS)
+    assert_near(back, sum(ray_volume(y, GRID, table) for y, table in zip(frames, tables, strict=True)), RAYS_BACK)
+    forward, backward = (float((a.astype(np.float64) * b).sum()) for a, b in ((there, frames), (volume, back)))
+    assert abs(forward - backward) <= ADJOINT * forward
+
+
+def test_panels_of_parallel_beams_take_the_upright_kernels(banded_rt) -> None:
+    kinds = {name: RayOperator(banded_rt, GRID, SHAPE, cells_of(beam, "static"))._upright for name, beam in BEAMS.items()}
+    assert kinds["laminography"] is None
+    leans = [kinds[name].leans for name in ("upright", "rolled", "rising")]
+    assert leans == [False, True, True]
+
+
+def test_the_cone_beam_comes_closer_with_its_distance(rt) -> None:
+    """The difference falls as 1/distance."""
+    volume, off = noise(GRID.shape, 3), []
+    (parallel,) = cells_of(CircularOrbit(GEOMETRY, ConstantSpeed(0.3, 0.9)), "static")[:1]
+    expected = RayOperator(rt, GRID, SHAPE, [parallel]).forward(volume)
+    for distance_mm in (100.0, 200.0, 400.0):
+        cone = ConeGeometry(distance_mm, distance_mm + 3, SHAPE, GEOMETRY.pixel_size_mm, GEOMETRY.detector_offset_mm)
+        (cells,) = cells_of(CircularOrbit(cone, ConstantSpeed(0.3, 0.9)), "static")[:1]
+        off.append(np.linalg.norm(RayOperator(rt, GRID, SHAPE, [cells]).forward(volume) - expected))
+    assert 1.7 < off[0] / off[1] < 2.3 and 1.7 < off[1] / off[2] < 2.3
+
+
+def test_an_ellipsoids_projection_halves_its_error_with_the_voxel(rt) -> None:
+    body = Ellipsoid((0.1, -0.05, 0.08), (0.7, 0.5, 0.6), 1.0, rotation_about_z(0.4))
+    phantom, errors = EllipsoidPhantom((body,), "one"), []
+    (cells,) = cells_of(CircularOrbit(GEOMETRY, ConstantSpeed(0.3, 0.9)), "static")[:1]
+    pixels, along = pixel_centres(cells.pose[0], SHAPE), 5 * cells.pose[0, :3]
+    exact = phantom.line_integrals(pixels - along, pixels + along)
+    for n in (24, 48):
+        grid = Grid((n, n, n), (2 / n,) * 3)
+        frame = RayOperator(rt, grid, SHAPE, [cells]).forward(phantom.voxelise(grid, 4))[0]
+        errors.append(np.linalg.norm(frame - exact) / np.linalg.norm(exact))
+    assert errors[1] < 0.04 and errors[1] < 0.65 * errors[0]
+
+
+@pytest.mark.parametrize(
+    ("beam", "motion"), [("laminography", "static"), ("upright", "micro-views"), ("rolled", "exact"), ("rising", "exact")]
+)
+def test_splats_and_their_gradients_are_the_twins(any_rt, make_cloud, beam: str, motion: str) -> None:
+    rows, (table, _), h = make_cloud(4), cells_of(BEAMS[beam], motion), noise(SHAPE, 5)
+    projector = SplatProjector(any_rt, *SHAPE, cutoff_sigma=0.0, time_error=1e-6)
+    cells, twin = DeviceCells.upload(any_rt, table), moving_frame if motion == "exact" else splat_frame
+    limit = SPLAT_MOVING if motion == "exact" else SPLAT_AFFINE
+    assert_near(projector.project(rows, cells), twin(rows, table, SHAPE), limit)
+    by_rows = projector.project_adjoint(rows, cells, h)
+    step = 1e-5 * np.random.default_rng(6).normal(size=rows.shape)
+    change = ((twin(rows + step, table, SHAPE) - twin(rows - step, table, SHAPE)) * h).sum()
+    size = np.abs(2 * by_rows * step).sum()
+    assert abs((2 * by_rows * step).sum() - change) <= 2e-5 * size
+
+
+def test_backprojections_are_the_twins(any_rt) -> None:
+    frames, weight, angles = noise((3, *SHAPE), 7), np.array([0.5, 0.8, 1.0]), np.array([0.0, 1.3, 2.9])
+    pose = GEOMETRY.pose(angles)
+    expected = backprojection(frames, pose, weight, GRID, True)
+    assert_near(backproject(any_rt, frames, pose, weight, GRID, is_parallel=True), expected, RAYS_BACK)
+    for axis, lines in (("rows", SHAPE[0]), ("columns", SHAPE[1])):
+        poses = np.stack([GEOMETRY.pose(a + np.linspace(-0.1, 0.1, lines)) for a in angles])
+        expected = lines_backprojection(frames, poses, weight, GRID, axis, True)
+        assert_near(backproject_lines(any_rt, frames, poses, weight, GRID, axis, is_parallel=True), expected, RAYS_BACK)
