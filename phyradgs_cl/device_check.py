@@ -10,13 +10,14 @@ from functools import partial
 
 import numpy as np
 
-from phyradgs_cl import objective, operators
+from phyradgs_cl import operators
 from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, ConstantSpeed, ParallelGeometry, Shutter
 from phyradgs_cl.acquisition.cells import common_time_cells, exact_cells, micro_view_cells, static_cells
 from phyradgs_cl.acquisition.time_cells import TimeCells
 from phyradgs_cl.errors import DeviceError, OutOfMemoryError
 from phyradgs_cl.fields import Activation, Grid
 from phyradgs_cl.fields.gaussians import DENSITY, MEAN, QUATERNION, SCALE
+from phyradgs_cl.objective import terms
 from phyradgs_cl.objective.dct_prox import DctProx, dct_prox
 from phyradgs_cl.objective.nonlocal_step import LARGEST, NonlocalStep, likeness_of, nonlocal_step
 from phyradgs_cl.objective.tv import TvDescent, TvProx, tv_descent, tv_prox
@@ -219,20 +220,20 @@ def _image_terms(rt: Runtime) -> Iterator[Comparison]:
     rendered, measured, transmission = (_noise(SHAPE, seed) for seed in (8, 9, 10))
     mask = (_noise(SHAPE, 11) > 0.2).astype(np.float32)
     weights = 0.25, 1.0, 0.3
-    loss = objective.ImageLoss(rt, *SHAPE, pitch_of(SHAPE[1]), *weights)
+    loss = terms.ImageLoss(rt, *SHAPE, pitch_of(SHAPE[1]), *weights)
     x, y, m, t = (rt.upload(pad_rows(image)) for image in (rendered, measured, mask, transmission))
     found = rt.download(loss.evaluate(x, y, m, float(mask.sum()), t))
     wide = rendered.astype(np.float64), measured.astype(np.float64), mask.astype(np.float64)
-    value, gradient = objective.image_loss(*wide, *weights, transmission)
+    value, gradient = terms.image_loss(*wide, *weights, transmission)
     yield unpad_rows(found, SHAPE), gradient, VALUE
     yield np.array(loss.value()), np.array(value), VALUE
 
 
 def _variation(rt: Runtime) -> Iterator[Comparison]:
     volume = _noise(GRID.shape, 12)
-    term = objective.TotalVariation(rt, GRID.shape, pitch_of(GRID.shape[2]))
+    term = terms.TotalVariation(rt, GRID.shape, pitch_of(GRID.shape[2]))
     gradient = rt.download(term.evaluate(rt.upload(pad_rows(volume))))
-    value, expected = objective.total_variation(volume)
+    value, expected = terms.total_variation(volume)
     yield unpad_rows(gradient, GRID.shape), expected, VALUE
     yield np.array(term.value()), np.array(value), VALUE
     yield TvDescent(rt, GRID.shape)(volume, 0.1, 2), tv_descent(volume, 0.1, 2), VALUE
@@ -248,16 +249,16 @@ def _variation(rt: Runtime) -> Iterator[Comparison]:
 
 def _optimiser(rt: Runtime) -> Iterator[Comparison]:
     activation, stride, count = Activation(0.01, 0.6), 16, 16
-    terms = objective.ParameterTerms(density_weight=0.3, shape_weight=0.7, shape_ratio=1.5, shape_floor=0.2)
+    weights = terms.ParameterTerms(density_weight=0.3, shape_weight=0.7, shape_ratio=1.5, shape_floor=0.2)
     raw = activation.invert(_cloud(count)).astype(np.float32).astype(np.float64)
     raw[QUATERNION] *= 1.7
     adam, on_device = DeviceAdam(rt, activation), rt.upload(raw, np.float32)
     parameters, gradients, statistics = (rt.zeros((n, stride)) for n in (11, 13, 2))
     adam.activate(on_device, parameters, count, stride)
     yield rt.download(parameters), activation.apply(raw), VALUE
-    adam.chain(on_device, parameters, gradients, statistics, count, stride, **asdict(terms))
+    adam.chain(on_device, parameters, gradients, statistics, count, stride, **asdict(weights))
     found = rt.download(gradients)[:11]
-    value = lambda rows: np.array(objective.parameter_loss(activation.apply(rows), terms)[0])  # noqa: E731
+    value = lambda rows: np.array(terms.parameter_loss(activation.apply(rows), weights)[0])  # noqa: E731
     yield found, _differences(value, raw), GRADIENT
     rates, moments = np.linspace(0.01, 0.03, 11), rt.zeros((2, 11, stride))
     adam.step(on_device, gradients, moments, stride, rates, 1)

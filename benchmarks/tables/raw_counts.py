@@ -4,7 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from phyradgs_cl.detector import counts_to_attenuation, sample_counts
+from phyradgs_cl.detector import counts_to_attenuation
+from phyradgs_cl.detector.effects import sample_counts
 
 CALIBRATION_FRAMES = 10
 _FULL_SCALE = 65_535

@@ -6,7 +6,7 @@ from difflib import get_close_matches
 from typing import Any
 
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.neural import NeuralOptions, has_accelerator, has_torch
+from phyradgs_cl.neural import NeuralOptions, has_torch
 from phyradgs_cl.reconstructors import METHODS, method_options
 from phyradgs_cl.reconstructors.splats.options import SplatOptions
 
@@ -73,7 +73,9 @@ class Row:
             return ""
         if not has_torch():
             return "needs PyTorch"
-        return "needs a GPU" if voxels > _MOST_NEURAL_VOXELS and not has_accelerator() else ""
+        from phyradgs_cl.neural.tensors import torch_device
+
+        return "needs a GPU" if voxels > _MOST_NEURAL_VOXELS and torch_device("auto").type == "cpu" else ""
 
     def _has(self, options: type) -> bool:
         method = METHODS.get(self.method)

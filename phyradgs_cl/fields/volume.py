@@ -101,6 +101,10 @@ class Grid:
             return None
         return triple(slice(int(s), int(s) + n) for s, n in zip(start, self.shape, strict=True))
 
+    def finer(self, parts: int) -> "Grid":
+        """Returns the same box with every voxel divided into ``parts`` along each axis."""
+        return Grid(triple(parts * n for n in self.shape), triple(d / parts for d in self.voxel_size_mm), self.offset_mm)
+
     def scaled(self, factor: float) -> "Grid":
         """Returns the grid with every length multiplied by ``factor``."""
         return Grid(self.shape, triple(d * factor for d in self.voxel_size_mm), triple(o * factor for o in self.offset_mm))

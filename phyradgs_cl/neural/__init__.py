@@ -8,22 +8,13 @@ import importlib.util
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.neural.options import LineOptions, NeuralOptions
 
-__all__ = ["INSTALL", "LineOptions", "NeuralOptions", "has_accelerator", "has_torch", "require_torch"]
+__all__ = ["INSTALL", "LineOptions", "NeuralOptions", "has_torch", "require_torch"]
 INSTALL = 'pip install "phyradgs-cl[neural]"'
 
 
 def has_torch() -> bool:
     """Whether the package torch can be imported."""
     return importlib.util.find_spec("torch") is not None
-
-
-def has_accelerator() -> bool:
-    """Whether PyTorch is there and has something faster than a CPU."""
-    if not has_torch():
-        return False
-    from phyradgs_cl.neural.tensors import torch_device
-
-    return torch_device("auto").type != "cpu"
 
 
 def require_torch(subject: str) -> None:

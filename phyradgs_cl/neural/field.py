@@ -7,7 +7,7 @@ from torch import nn
 from phyradgs_cl.checks import ceil_div
 from phyradgs_cl.fields import Grid, triple
 from phyradgs_cl.neural.hash_encoding import HashEncoding
-from phyradgs_cl.neural.networks import AttenuationNetwork, naf_network, sax_network
+from phyradgs_cl.neural.networks import AttenuationNetwork, network_of
 from phyradgs_cl.neural.options import LineOptions, NeuralOptions
 from phyradgs_cl.neural.tensors import to_array, to_tensor
 
@@ -51,7 +51,7 @@ def _in_rows(
     """The voxels of a grid whose axes are z, y, x in another ``order``, with segments along its last.
 
     A row's last segment is filled up beyond its end."""
-    fine = _divided(grid, points)
+    fine = grid.finer(points)
     slow, middle, fast = fine.axes_mm()
     filled = ceil_div(fast.size, field.segment) * field.segment
     fast = np.concatenate([fast, fast[-1] + fine.voxel_size_mm[2] * np.arange(1, filled - fast.size + 1)])
@@ -73,13 +73,6 @@ def _in_rows(
     return values.reshape(grid.shape)
 
 
-def _divided(grid: Grid, points: int) -> Grid:
-    """The same box with every voxel cut into ``points`` along each side."""
-    (nz, ny, nx), (dz, dy, dx) = grid.shape, grid.voxel_size_mm
-    counts = (points * nz, points * ny, points * nx)
-    return Grid(counts, (dz / points, dy / points, dx / points), grid.offset_mm)
-
-
 def first_field(options: NeuralOptions, longest_voxels: int, seed: int) -> NeuralField:
     """Returns SAX-NeRF's field for ``LineOptions``, else NAF's, for the voxels along a volume's longest side.
 
@@ -90,6 +83,5 @@ def first_field(options: NeuralOptions, longest_voxels: int, seed: int) -> Neura
             options.levels_for(longest_voxels), options.features, options.base_resolution,
             options.level_growth, options.table_log2,
         )
-        if isinstance(options, LineOptions):
-            return NeuralField(encoding, sax_network(encoding.width, options), options.segment)
-        return NeuralField(encoding, naf_network(encoding.width, options))
+        segment = options.segment if isinstance(options, LineOptions) else 1
+        return NeuralField(encoding, network_of(encoding.width, options), segment)

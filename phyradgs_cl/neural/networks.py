@@ -93,28 +93,14 @@ class AttenuationNetwork(nn.Module):
         return nn.functional.leaky_relu(values)
 
 
-def skip_layer(layers: int) -> int:
-    """The middle one, where the encoding comes in again: the third of NAF's four; 0, which is none, below three."""
-    return layers // 2 if layers > 2 else 0
-
-
-def naf_network(inputs: int, options: NeuralOptions) -> AttenuationNetwork:
-    """Linear layers only."""
-    skip, width = skip_layer(options.layers), options.width
-    middle: list[nn.Module] = [
-        nn.Linear(width + inputs if number == skip else width, width)
-        for number in range(1, options.layers - 1)
-    ]
-    return AttenuationNetwork(inputs, middle, skip, options)
-
-
-def sax_network(inputs: int, options: LineOptions) -> AttenuationNetwork:
-    """Line-segment attention in the place of every linear layer in the middle but the one after the skip."""
-    skip, width = skip_layer(options.layers), options.width
-    middle: list[nn.Module] = [
-        nn.Linear(width + inputs, width)
-        if number == skip
-        else LineAttentionBlocks(width, options.segment, options.heads, options.head_width, options.blocks)
-        for number in range(1, options.layers - 1)
-    ]
+def network_of(inputs: int, options: NeuralOptions) -> AttenuationNetwork:
+    """Returns NAF's linear layers; for ``LineOptions`` line-segment attention takes the place of every one in the middle but
+    the one after the skip. There, in the middle of three and more layers, the encoding comes in again."""
+    skip, width = options.layers // 2 if options.layers > 2 else 0, options.width
+    middle: list[nn.Module] = []
+    for number in range(1, options.layers - 1):
+        if isinstance(options, LineOptions) and number != skip:
+            middle.append(LineAttentionBlocks(width, options.segment, options.heads, options.head_width, options.blocks))
+        else:
+            middle.append(nn.Linear(width + inputs if number == skip else width, width))
     return AttenuationNetwork(inputs, middle, skip, options)

@@ -67,10 +67,10 @@ class ExposureRays:
         matrix = np.stack(np.broadcast_arrays(to_corner, -steps[..., :3], -steps[..., 3:]), -1)
         try:
             place = np.linalg.solve(matrix, np.broadcast_to(origin, to_corner.shape)[..., None])[..., 0]
-        except np.linalg.LinAlgError:  # a corner that the panel cannot see
-            return slice(0, detector_shape[0]), slice(0, detector_shape[1])
+        except np.linalg.LinAlgError:
+            place = np.full(to_corner.shape, np.nan)
         scale, column, row = np.moveaxis(place, -1, 0)
-        if np.any(scale <= 0) or not np.all(np.isfinite(scale)):
+        if np.any(scale <= 0) or not np.all(np.isfinite(scale)):  # a corner that the panel cannot see
             return slice(0, detector_shape[0]), slice(0, detector_shape[1])
         return _within(row, detector_shape[0]), _within(column, detector_shape[1])
 

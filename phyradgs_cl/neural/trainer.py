@@ -55,17 +55,13 @@ class Trainer:
         return self.steps // self.scan.frames
 
     @property
-    def is_between_passes(self) -> bool:
-        return self.steps % self.scan.frames == 0
-
-    @property
     def parameters(self) -> int:
         """Number of fitted parameters."""
         return sum(p.numel() for p in self.field.parameters())
 
     def step(self) -> None:
         """Draws pixels of one frame, steps down the gradient of their squared error, and appends the loss to ``losses``."""
-        if self.is_between_passes:
+        if self.steps % self.scan.frames == 0:
             self.losses = []
         frame = self.queue.pop()
         pixels = self._pixels(frame)

@@ -91,13 +91,8 @@ def fused(scan: Scan, options: FusedOptions, rt: Runtime, **arguments: Any) -> R
         return result
     squares = np.square(halves["difference"], dtype=np.float64)
     result.facts["disagreement_per_mm"] = float(np.sqrt(squares.mean()) / 2)
-    return replace(result, disagreement=_half_local_rms(squares))
-
-
-def _half_local_rms(squares: np.ndarray) -> np.ndarray:
-    """Half the RMS over neighbouring voxels, from squares (nz, ny, nx), float32."""
     means = np.maximum(uniform_filter(squares, _NEIGHBOURHOOD, mode="nearest"), 0)  # rounding may make a mean negative
-    return (np.sqrt(means) / 2).astype(np.float32)
+    return replace(result, disagreement=(np.sqrt(means) / 2).astype(np.float32))
 
 
 METHOD = Method(fused, {"default": FusedOptions()}, takes_initial=True)

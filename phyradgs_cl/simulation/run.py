@@ -9,16 +9,7 @@ from phyradgs_cl import __version__, checks
 from phyradgs_cl.acquisition import ConeGeometry, Protocol, Scan
 from phyradgs_cl.acquisition.cells import per_line_cells, static_cells
 from phyradgs_cl.acquisition.time_cells import TimeCells
-from phyradgs_cl.detector import (
-    add_scatter,
-    add_sparks,
-    beer_lambert_noise,
-    drifting_light,
-    lagged,
-    pixel_gains,
-    tigre_noise,
-    tube_spectrum,
-)
+from phyradgs_cl.detector import effects, tube_spectrum
 from phyradgs_cl.errors import InputError, NumericalError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.io import Scanner, Volume
@@ -56,8 +47,8 @@ def simulated_scan(
         reference=scene.reference, title=title, report=report,
         bone=scene.bone() if options.kvp and scene.bone is not None else None,
     )  # fmt: skip
-    effects = [name for name in ("rings", "sparks", "drift", "scatter", "kvp") if getattr(options, name)]
-    stated = {key: getattr(options, key) for key in ("seed", "noise", "dose", "electronic_noise", *effects)}
+    added = [name for name in ("rings", "sparks", "drift", "scatter", "kvp") if getattr(options, name)]
+    stated = {key: getattr(options, key) for key in ("seed", "noise", "dose", "electronic_noise", *added)}
     facts = {"program": f"phyradgs-cl {__version__}", "simulated": scene.title, "pixel_samples": pixel_samples}
     scan.provenance.update(facts | stated)
     return scan
@@ -132,23 +123,23 @@ def default_time_samples(protocol: Protocol, grid: Grid) -> int:
 def _recorded(frames: np.ndarray, options: SimulationOptions, light: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """Adds scatter, drifting light, noise, gains and sparks to frames (F, v, u), as the options say."""
     if options.scatter > 0:
-        frames = add_scatter(frames, options.scatter).astype(np.float32)
+        frames = effects.add_scatter(frames, options.scatter).astype(np.float32)
     if options.drift > 0:
-        frames = frames - np.log(drifting_light(len(frames), options.drift, rng)).astype(np.float32)[:, None, None]
+        frames = frames - np.log(effects.drifting_light(len(frames), options.drift, rng)).astype(np.float32)[:, None, None]
     frames = _with_noise(frames, options, light, rng)
     if options.rings > 0:
-        frames = frames - np.log(pixel_gains(frames.shape[1:], options.rings, rng)).astype(np.float32)
+        frames = frames - np.log(effects.pixel_gains(frames.shape[1:], options.rings, rng)).astype(np.float32)
     if options.sparks > 0:
-        frames = add_sparks(frames, options.sparks, rng)[0].astype(np.float32)
+        frames = effects.add_sparks(frames, options.sparks, rng)[0].astype(np.float32)
     return frames
 
 
 def _with_noise(frames: np.ndarray, options: SimulationOptions, light: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """Adds lag and noise to frames (F, v, u). TIGRE's counts are no real intensities, so there the lag comes first."""
     if options.noise == "beer":
-        return beer_lambert_noise(frames, options.dose, options.electronic_noise, rng, light, options.lag)
+        return effects.beer_lambert_noise(frames, options.dose, options.electronic_noise, rng, light, options.lag)
     if options.lag > 0:
-        frames = lagged(frames, options.lag).astype(np.float32)
+        frames = effects.lagged(frames, options.lag).astype(np.float32)
     if options.noise == "tigre":
-        return tigre_noise(frames, options.dose, options.electronic_noise, rng, light)
+        return effects.tigre_noise(frames, options.dose, options.electronic_noise, rng, light)
     return frames

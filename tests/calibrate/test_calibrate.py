@@ -17,7 +17,7 @@ from phyradgs_cl.calibrate.reduced import Reduced
 from phyradgs_cl.calibrate.search import Search
 from phyradgs_cl.calibrate.stages import PassCounter, Stage
 from phyradgs_cl.calibrate.views import estimate_views
-from phyradgs_cl.detector import lagged
+from phyradgs_cl.detector.effects import lagged
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.io import write_scan

@@ -92,13 +92,3 @@ def test_a_detector_never_sees_more_attenuation_than_the_mean() -> None:
         assert np.allclose(average(p + shift, w, "intensity"), average(p, w, "intensity") + shift, atol=1e-11)
     light = (np.exp(-1) + np.exp(-2)) / 2
     assert average([-5000.0, 1.0, 2.0], [0.0, 0.5, 0.5], "intensity") == pytest.approx(-np.log(light))
-
-
-def test_wrong_averages_are_refused() -> None:
-    p, w = _samples()
-    calls = {
-        "detector model": (p, w, "linear"), "weight: found shape": (p, w[:-1], "log"),
-        "weight: found sum 2": (p, 2 * w, "log"), "not negative": ([1.0, 1.0], [1.5, -0.5], "log"),
-        "at least one time": (np.zeros((0, 3)), [], "log"),
-    }  # fmt: skip
-    assert_refused({words: partial(average, *call) for words, call in calls.items()})

@@ -8,7 +8,7 @@ from refusals import assert_refused
 from tolerances import FLOAT32
 
 from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, ConstantSpeed, Scan, Shutter
-from phyradgs_cl.detector import (
+from phyradgs_cl.detector.effects import (
     add_lag,
     beer_lambert_counts,
     beer_lambert_noise,

@@ -5,14 +5,8 @@ from itertools import product
 import numpy as np
 import pytest
 
-from phyradgs_cl.detector import (
-    beer_lambert_noise,
-    find_saturation,
-    noise_behind,
-    noise_level,
-    noise_rms,
-    transmission_weights,
-)
+from phyradgs_cl.detector import find_saturation, noise_behind, noise_level, noise_rms, transmission_weights
+from phyradgs_cl.detector.effects import beer_lambert_noise
 
 
 def smooth_frames(noise: float, seed: int = 0) -> np.ndarray:

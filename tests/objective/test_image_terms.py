@@ -6,8 +6,7 @@ from kernel_kit import assert_near
 from skimage.metrics import structural_similarity
 from tolerances import IMAGE_GRADIENT, IMAGE_VALUE, SSIM_REFERENCE, TWIN_GRADIENT
 
-from phyradgs_cl.objective import ImageLoss, image_loss
-from phyradgs_cl.objective.terms import C1, C2, WINDOW
+from phyradgs_cl.objective.terms import C1, C2, WINDOW, ImageLoss, image_loss
 from phyradgs_cl.runtime.layout import pad_rows, pitch_of, unpad_rows
 
 SHAPES = [(24, 31), (17, 5), (1, 1), (1, 40), (33, 1), (12, 16)]

@@ -8,7 +8,7 @@ from kernel_kit import assert_near
 from tolerances import FLOAT32, FLOAT64, PARAMETER_GRADIENT, TWIN_GRADIENT
 
 from phyradgs_cl.fields import Activation
-from phyradgs_cl.objective import ParameterTerms, parameter_loss
+from phyradgs_cl.objective.terms import ParameterTerms, parameter_loss
 from phyradgs_cl.optim import DeviceAdam
 
 TERMS = ParameterTerms(density_weight=0.3, shape_weight=0.7, shape_ratio=3.0, shape_floor=0.08)

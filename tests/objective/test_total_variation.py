@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from tolerances import FLOAT64, TV_GRADIENT, TV_VALUE, TWIN_GRADIENT
 
-from phyradgs_cl.objective import TotalVariation, total_variation
+from phyradgs_cl.objective.terms import TotalVariation, total_variation
 from phyradgs_cl.runtime.layout import pad_rows, pitch_of, unpad_rows
 
 SHAPES = [(5, 6, 7), (4, 3, 33), (1, 8, 16), (8, 1, 5), (6, 7, 1), (1, 1, 1)]

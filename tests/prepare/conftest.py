@@ -8,7 +8,7 @@ import pytest
 
 from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, FrameSweeps, Protocol, Scan, pixel_centres
 from phyradgs_cl.api import simulate
-from phyradgs_cl.detector import pixel_gains, tigre_noise
+from phyradgs_cl.detector.effects import pixel_gains, tigre_noise
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.phantoms import Ellipsoid, EllipsoidPhantom
 

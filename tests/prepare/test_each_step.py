@@ -8,7 +8,8 @@ import pytest
 
 from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.api import prepare
-from phyradgs_cl.detector import add_scatter, beer_lambert_noise, drifting_light, tube_spectrum
+from phyradgs_cl.detector import tube_spectrum
+from phyradgs_cl.detector.effects import add_scatter, beer_lambert_noise, drifting_light
 from phyradgs_cl.prepare import PREPARED_KEY, water_polynomial
 
 Make = Callable[..., Scan]

@@ -11,7 +11,7 @@ from tolerances import CONVERGED, FLOAT32, ITERATIVE_TWIN, KRYLOV
 
 from phyradgs_cl.acquisition import ConeGeometry, PerRow, Scan, Static
 from phyradgs_cl.api import simulate
-from phyradgs_cl.detector import beer_lambert_noise
+from phyradgs_cl.detector.effects import beer_lambert_noise
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.metrics import psnr
 from phyradgs_cl.objective import TvDescent, TvProx

@@ -7,7 +7,7 @@ import pytest
 from tolerances import FLOAT32
 
 from phyradgs_cl.acquisition import ConeGeometry, Protocol, Scan
-from phyradgs_cl.detector import lagged
+from phyradgs_cl.detector.effects import lagged
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.phantoms import shepp_logan

@@ -16,7 +16,7 @@ from phyradgs_cl.acquisition.time_cells import TimeCells
 from phyradgs_cl.detector import transmission_weights
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.fields.gaussians import MEAN
-from phyradgs_cl.objective import ParameterTerms, image_loss, parameter_loss, total_variation
+from phyradgs_cl.objective.terms import ParameterTerms, image_loss, parameter_loss, total_variation
 from phyradgs_cl.operators.twins.splat import splat_frame, voxel_field
 from phyradgs_cl.optim import DensityControl, Population
 from phyradgs_cl.reconstructors.splats.device import Scale

@@ -37,7 +37,6 @@ def test_options_are_checked_all_the_same() -> None:
     assert method_options("naf", None, {"motion": "per-row"}).motion.name == "per-row"
     with pytest.raises(InputError, match="--motion"):
         method_options("naf", None, {"motion": "exact"})
-    assert not neural.has_accelerator()
 
 
 def test_pytorch_is_there_where_it_is_found() -> None:

@@ -31,7 +31,7 @@ from phyradgs_cl.reconstructors.voxels.priors import (
     volumes_of,
 )
 from phyradgs_cl.reconstructors.voxels.run import Algorithm, IterativeOptions, MethodInputs, run_iterations
-from phyradgs_cl.reconstructors.voxels.stages import Stage, finer, merge_subvoxels, repeated, run_stages
+from phyradgs_cl.reconstructors.voxels.stages import Stage, merge_subvoxels, repeated, run_stages
 from phyradgs_cl.reconstructors.voxels.subsets import OrderedSubsets
 from phyradgs_cl.reconstructors.voxels.system import System
 from phyradgs_cl.runtime import Runtime
@@ -181,7 +181,7 @@ def fista_stages(inputs: MethodInputs) -> list[Stage]:
 
 def _run(inputs: MethodInputs, options: FistaOptions, image: np.ndarray | None, parts: int = 1) -> Reconstruction:
     """Runs one stage, with every voxel divided into ``parts`` along each side. ``image``: the prior image of piccs."""
-    scan, rt = replace(inputs.scan, grid=finer(inputs.scan.grid, parts), reference=None), inputs.rt
+    scan, rt = replace(inputs.scan, grid=inputs.scan.grid.finer(parts), reference=None), inputs.rt
     image, initial = repeated(image, parts), repeated(inputs.initial, parts)
 
     def make(system: System) -> Fista:

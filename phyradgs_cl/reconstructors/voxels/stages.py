@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from phyradgs_cl.fields import Grid
+from phyradgs_cl.metrics.align import block_means
 from phyradgs_cl.reconstructors.checkpoint import (
     State,
     check_array,
@@ -117,13 +118,6 @@ def _of_whole_run(stage: Stage, done: StageProgress, total: int, grid: Grid, pro
     )
 
 
-def finer(grid: Grid, parts: int) -> Grid:
-    """Returns the same box with every voxel divided into ``parts`` along each axis."""
-    z, y, x = grid.shape
-    dz, dy, dx = grid.voxel_size_mm
-    return replace(grid, shape=(parts * z, parts * y, parts * x), voxel_size_mm=(dz / parts, dy / parts, dx / parts))
-
-
 def repeated(volume: np.ndarray | None, parts: int) -> np.ndarray | None:
     """Returns a volume with every voxel repeated ``parts`` times along each axis; None stays None."""
     return None if volume is None else volume.repeat(parts, 0).repeat(parts, 1).repeat(parts, 2)
@@ -132,7 +126,4 @@ def repeated(volume: np.ndarray | None, parts: int) -> np.ndarray | None:
 def merge_subvoxels(volume: np.ndarray, before: np.ndarray | None, parts: int) -> np.ndarray:
     """Returns the weighted mean of ``before`` (nz, ny, nx) and the means of ``volume`` over blocks of ``parts``³ voxels."""
     assert before is not None
-    nz, ny, nx = before.shape
-    blocks = volume.reshape(nz, parts, ny, parts, nx, parts)
-    means = blocks.mean((1, 3, 5), dtype=np.float64).astype(np.float32)
-    return before + _SUBVOXEL_SHARE * (means - before)
+    return before + _SUBVOXEL_SHARE * (block_means(volume, (parts,) * 3) - before)
