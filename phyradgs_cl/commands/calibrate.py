@@ -25,8 +25,7 @@ from phyradgs_cl.workflow.files import check_output, check_picture, load_scan
 EXAMPLES = {"calibrate": "Example: phyradgs calibrate scan.h5 -o calibrated.h5"}
 GROUPS = {
     "calibrate": {
-        "Basics": ("output", "what", "other", "phantom", "picture"),
-        "Run": ("splines", "as_json", "device"),
+        "Basics": ("output", "what", "other", "phantom", "picture"), "Run": ("splines", "as_json", "device")
     }
 }
 _WHAT = f"Parameters to estimate, with commas: {', '.join(NAMES)}."

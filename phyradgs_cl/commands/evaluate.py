@@ -21,8 +21,7 @@ _PICTURE = "PNG of slices: result, truth, difference."
 
 def evaluate_command(
     volume: Annotated[Path, file_argument("VOLUME", "Volume file: ours, or mha, nii, nrrd, npy, tiff.")],
-    reference: Annotated[Path, file_option(_REFERENCE, "--reference")],
-    as_json: AsJson = False,
+    reference: Annotated[Path, file_option(_REFERENCE, "--reference")], as_json: AsJson = False,
     reference_voxel_mm: Annotated[Any, option(_VOXEL, "the file's", parser=numbers, metavar="D|Z,Y,X")] = None,
     picture: Annotated[Path | None, file_option(_PICTURE, "--picture", default="v.evaluated.png for v.h5")] = None,
 ) -> None:

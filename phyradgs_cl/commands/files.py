@@ -15,8 +15,7 @@ EXAMPLES = {
 }
 GROUPS = {
     "export": {
-        "Basics": ("output", "to", "mu_water_per_mm"),
-        "DICOM": ("patient", "title", "description", "date"),
+        "Basics": ("output", "to", "mu_water_per_mm"), "DICOM": ("patient", "title", "description", "date")
     }
 }
 _LONGEST = 2000

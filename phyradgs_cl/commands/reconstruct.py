@@ -38,9 +38,7 @@ _PREVIEW = "PNG of the three middle slices; during the run NAME.partial.png, eve
 
 @with_run_options()
 def reconstruct_command(
-    scan: Scan,
-    output: Output,
-    settings: Settings,
+    scan: Scan, output: Output, settings: Settings,
     initial: Annotated[Path | None, file_option("Volume to start from.", "--initial")] = None,
     resume: Annotated[bool, option("Continue an interrupted run from its checkpoint.", True, "--resume")] = False,
     checkpoint_every: Annotated[float, option(_CHECKPOINT, metavar="SECONDS")] = 600.0,

@@ -28,8 +28,7 @@ _SETTLE = "Time for which a file must not have changed; a file renamed into plac
 @with_run_options("batch")
 def watch_command(
     folder: Annotated[Path, file_argument("FOLDER", "Folder in which scans arrive, as *.h5.")],
-    output: Annotated[Path, option(_OUTPUT, True, "--output", "-o", metavar="DIR")],
-    settings: Settings,
+    output: Annotated[Path, option(_OUTPUT, True, "--output", "-o", metavar="DIR")], settings: Settings,
     once: Annotated[bool, option(_ONCE, True, "--once")] = False,
     poll_s: Annotated[float, option("Interval between looks at the folder.", True, "--poll-s", metavar="SECONDS")] = 2.0,
     settle_s: Annotated[float, option(_SETTLE, True, "--settle-s", metavar="SECONDS")] = 5.0,

@@ -75,11 +75,9 @@ def write_tiff(path: Path, volume: Volume, unit: str) -> None:
 def write_npy(path: Path, volume: Volume, unit: str) -> None:
     """Writes the values (z, y, x) float32 to ``path``, and their grid to a .json file of the same name."""
     facts = {
-        "axes": ["z", "y", "x"],
-        "shape": list(volume.values.shape),
+        "axes": ["z", "y", "x"], "shape": list(volume.values.shape),
         "voxel_size_mm": list(volume.required_grid.voxel_size_mm),
-        "first_centre_mm": list(volume.required_grid.first_centre_mm),
-        "values": unit,
+        "first_centre_mm": list(volume.required_grid.first_centre_mm), "values": unit,
     }
     with written_beside(path.with_suffix(".json")) as temporary:
         temporary.write_text(json.dumps(facts, indent=1) + "\n", encoding="utf-8")

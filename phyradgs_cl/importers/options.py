@@ -84,8 +84,7 @@ class ImportOptions:
         """Converts the words of a data sheet to the fields that every format reads."""
         axis, direction = readout_order(self.first, self.readout_axis, self.readout_direction, self.named)
         stated = {
-            "readout_axis": axis,
-            "readout_direction": direction,
+            "readout_axis": axis, "readout_direction": direction,
             "frame_time_s": frame_time_of(self.fps, self.frame_time_s, self.named),
             "readout_s": readout_of(self.readout_ms, self.readout_s, self.named),
         }

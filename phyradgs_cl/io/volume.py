@@ -140,11 +140,8 @@ def volume_summary(path: str | Path) -> dict[str, Any]:
         _, grid = _dataset_and_grid(source)
         means = source.optional(f"{_GAUSSIANS}/mean") if source.optional_group(_GAUSSIANS) else None
         return {
-            "shape": grid.shape,
-            "voxel_size_mm": grid.voxel_size_mm,
-            "offset_mm": grid.offset_mm,
-            "provenance": _read_provenance(source),
-            "metrics": _read_metrics(source),
+            "shape": grid.shape, "voxel_size_mm": grid.voxel_size_mm, "offset_mm": grid.offset_mm,
+            "provenance": _read_provenance(source), "metrics": _read_metrics(source),
             "gaussians": means.shape[0] if means is not None and means.ndim else 0,
             "disagreement": None if source.optional(_DISAGREEMENT) is None else _DISAGREEMENT,
             "sha256": sha256_of(path),

@@ -146,17 +146,10 @@ def _describe(index: int, of: "cl.Platform", device: "cl.Device") -> DeviceInfo:
 def environment(device: DeviceInfo) -> dict[str, Any]:
     """Returns the versions of program, interpreter and libraries, the device, and the time."""
     return {
-        "version": __version__,
-        "python": platform.python_version(),
-        "numpy": np.__version__,
-        "pyopencl": _installed("pyopencl"),
-        "pocl": _installed("pocl-binary-distribution"),
-        "platform": device.platform,
-        "device": device.name,
-        "device_version": device.version,
-        "compute_units": device.compute_units,
-        "host_cores": os.cpu_count(),
-        "processor": pocl.cpu_name(),
+        "version": __version__, "python": platform.python_version(), "numpy": np.__version__,
+        "pyopencl": _installed("pyopencl"), "pocl": _installed("pocl-binary-distribution"),
+        "platform": device.platform, "device": device.name, "device_version": device.version,
+        "compute_units": device.compute_units, "host_cores": os.cpu_count(), "processor": pocl.cpu_name(),
         "finished": datetime.now(timezone.utc).isoformat(timespec="seconds"),
     }
 

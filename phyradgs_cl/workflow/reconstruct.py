@@ -206,17 +206,10 @@ def _provenance(
     result: methods.Reconstruction, scan_hash: str, plan: methods.RunPlan, scan: Path, rt: Runtime
 ) -> dict[str, object]:
     return {
-        **result.facts,
-        "program": f"phyradgs-cl {__version__}",
-        "python": platform.python_version(),
-        "device": rt.device.name,
-        "device_version": rt.device.version,
-        "seed": plan.seed,
-        "input": plan.preprocessing.facts(),
-        "scan": str(scan),
-        "scan_sha256": scan_hash,
-        **(plan.initial.facts if plan.initial else {}),
-        "record": result.record,
+        **result.facts, "program": f"phyradgs-cl {__version__}", "python": platform.python_version(),
+        "device": rt.device.name, "device_version": rt.device.version, "seed": plan.seed,
+        "input": plan.preprocessing.facts(), "scan": str(scan), "scan_sha256": scan_hash,
+        **(plan.initial.facts if plan.initial else {}), "record": result.record,
     }
 
 

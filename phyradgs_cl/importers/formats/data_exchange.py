@@ -9,8 +9,7 @@ import h5py
 
 from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.acquisition.geometry import Geometry
-from phyradgs_cl.importers.assemble import assemble_scan, cone
-from phyradgs_cl.importers.motion import StoredTiming, make_timing, turning
+from phyradgs_cl.importers.assemble import StoredTiming, assemble_scan, cone, make_timing, turning
 from phyradgs_cl.importers.options import OF_BARE_FRAMES, ImportOptions, needed
 from phyradgs_cl.importers.reading import frames as reading
 from phyradgs_cl.importers.reading.frames import line_integrals, oriented

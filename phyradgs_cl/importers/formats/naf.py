@@ -16,9 +16,8 @@ import numpy as np
 from phyradgs_cl import checks
 from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.importers.assemble import assemble_scan
+from phyradgs_cl.importers.assemble import assemble_scan, make_timing, turning
 from phyradgs_cl.importers.formats import r2_gaussian as tigre
-from phyradgs_cl.importers.motion import make_timing, turning
 from phyradgs_cl.importers.options import TIMING, ImportOptions
 from phyradgs_cl.importers.reading.files import check_room
 from phyradgs_cl.importers.reading.frames import line_integrals, oriented

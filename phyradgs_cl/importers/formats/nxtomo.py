@@ -13,8 +13,15 @@ import numpy as np
 from phyradgs_cl.acquisition import CircularOrbit, FrameSweeps, Scan
 from phyradgs_cl.acquisition.geometry import Geometry
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.importers.assemble import assemble_scan, cone
-from phyradgs_cl.importers.motion import StoredTiming, Timing, Turned, make_timing, turning
+from phyradgs_cl.importers.assemble import (
+    StoredTiming,
+    Timing,
+    Turned,
+    assemble_scan,
+    cone,
+    make_timing,
+    turning,
+)
 from phyradgs_cl.importers.options import OF_BARE_FRAMES, ImportOptions, needed
 from phyradgs_cl.importers.reading import frames as reading
 from phyradgs_cl.importers.reading.frames import line_integrals, oriented

@@ -14,10 +14,9 @@ from phyradgs_cl import checks
 from phyradgs_cl.acquisition import PoseTable, Scan, Shutter
 from phyradgs_cl.acquisition.geometry import plain_geometry
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.importers.assemble import assemble_scan
+from phyradgs_cl.importers.assemble import Timing, assemble_scan, turn_of
 from phyradgs_cl.importers.formats import phyradgs_synthetic as synthetic
 from phyradgs_cl.importers.formats.r2_gaussian import META, META_WITH_TIMES
-from phyradgs_cl.importers.motion import Timing, turn_of
 from phyradgs_cl.importers.options import ImportOptions
 from phyradgs_cl.importers.reading import tiff
 from phyradgs_cl.importers.reading.files import SafeFolder, check_numbering, read_json

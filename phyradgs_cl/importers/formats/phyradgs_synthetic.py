@@ -8,8 +8,8 @@ import numpy as np
 
 from phyradgs_cl.acquisition import CircularOrbit, FrameSweeps, Scan, Shutter
 from phyradgs_cl.errors import InputError
+from phyradgs_cl.importers.assemble import Timing
 from phyradgs_cl.importers.formats.r2_gaussian import META_WITH_TIMES, R2Folder, entries_of
-from phyradgs_cl.importers.motion import Timing
 from phyradgs_cl.importers.options import ImportOptions
 from phyradgs_cl.io.tables import Fields
 

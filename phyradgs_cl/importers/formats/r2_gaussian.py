@@ -12,8 +12,7 @@ from phyradgs_cl.acquisition import CircularOrbit, Scan
 from phyradgs_cl.acquisition.geometry import ConeGeometry
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid, triple
-from phyradgs_cl.importers.assemble import assemble_scan
-from phyradgs_cl.importers.motion import Timing, make_timing, turning
+from phyradgs_cl.importers.assemble import Timing, assemble_scan, make_timing, turning
 from phyradgs_cl.importers.options import TIMING, ImportOptions
 from phyradgs_cl.importers.reading.files import SafeFolder, read_json, read_npy
 from phyradgs_cl.importers.reading.frames import LineIntegrals, line_integrals, oriented

@@ -16,8 +16,15 @@ from phyradgs_cl import checks
 from phyradgs_cl.acquisition import CircularOrbit, PoseTable, Scan
 from phyradgs_cl.acquisition.geometry import Geometry, plain_geometry
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.importers.assemble import assemble_scan
-from phyradgs_cl.importers.motion import Timing, Turned, make_timing, table_over_time, turn_of, turning
+from phyradgs_cl.importers.assemble import (
+    Timing,
+    Turned,
+    assemble_scan,
+    make_timing,
+    table_over_time,
+    turn_of,
+    turning,
+)
 from phyradgs_cl.importers.options import TIMING, ImportOptions
 from phyradgs_cl.importers.reading.files import SafeFolder, read_bytes
 from phyradgs_cl.importers.reading.frames import line_integrals

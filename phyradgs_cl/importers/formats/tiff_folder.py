@@ -12,8 +12,7 @@ import numpy as np
 from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.acquisition.readout import frame_time_of, readout_of
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.importers.assemble import assemble_scan, cone
-from phyradgs_cl.importers.motion import StoredTiming, make_timing, turning
+from phyradgs_cl.importers.assemble import StoredTiming, assemble_scan, cone, make_timing, turning
 from phyradgs_cl.importers.options import FIELDS, OF_BARE_FRAMES, WORDS, ImportOptions
 from phyradgs_cl.importers.reading import tiff
 from phyradgs_cl.importers.reading.files import SafeFolder, check_numbering, checked_name, read_numbers

@@ -18,8 +18,7 @@ _FILL_IN, _LONGEST = 0.0, 44
 _TABLES: dict[str, dict[str, tuple[object, str]]] = {
     "frames": {
         "projections": ("*.tif", "frames, in natural order of their names"),
-        "flats": ("flat_*.tif", "frames without an object"),
-        "darks": ("dark_*.tif", "frames without a beam"),
+        "flats": ("flat_*.tif", "frames without an object"), "darks": ("dark_*.tif", "frames without a beam"),
         "mask": ("mask.tif", "non-zero: do not use the pixel"),
         "quantity": ("counts", "or attenuation (line integrals), transmission"),
         "flat_value": (50000.0, "counts without an object, in place of flats"),
@@ -31,8 +30,7 @@ _TABLES: dict[str, dict[str, tuple[object, str]]] = {
         "to_detector_mm": (_FILL_IN, "mm, FILL IN: source to detector"),
     },
     "detector": {
-        "rows": (1, "of the images"),
-        "columns": (1, "of the images"),
+        "rows": (1, "of the images"), "columns": (1, "of the images"),
         "pixel_size_v_mm": (_FILL_IN, "mm, FILL IN: height of a pixel, along the axis"),
         "pixel_size_u_mm": (_FILL_IN, "mm, FILL IN: width of a pixel"),
         "offset_v_mm": (0.0, "mm, panel's middle above the central ray"),
@@ -43,15 +41,13 @@ _TABLES: dict[str, dict[str, tuple[object, str]]] = {
         "first_deg": (0.0, "degrees, angle of the first frame"),
         "step_deg": (1.0, "degrees from frame to frame; FILL IN this, last_deg, values_deg or file"),
         "last_deg": (359.0, "degrees, angle of the last frame"),
-        "values_deg": ([0.0, 1.0], "degrees, one for each frame"),
-        "file": ("angles.txt", "one angle a line"),
+        "values_deg": ([0.0, 1.0], "degrees, one for each frame"), "file": ("angles.txt", "one angle a line"),
         "unit": ("deg", "or rad: of the file"),
         "rotates": ("gantry", "or sample: what turns, counterclockwise seen from above"),
         "at": ("start", "or middle of the exposure of the frame's first line"),
     },
     "timing": {
-        "exposure_s": (0.06, "s, exposure of one line"),
-        "readout_s": (0.062, "s, in place of readout_ms"),
+        "exposure_s": (0.06, "s, exposure of one line"), "readout_s": (0.062, "s, in place of readout_ms"),
         "frame_time_s": (0.0667, "s from frame to frame, in place of fps"),
         "start_s": ([0.0, 0.0667], "s, start of each frame, in place of fps"),
         "detector_model": ("intensity", "what an exposure averages: intensity, as real panels do, or log (line integrals)"),
@@ -86,8 +82,7 @@ def template_of(path: Path) -> str:
     projections = in_natural_order([file for file in tiffs if file.match(patterns["projections"])])
     frames, rows, columns = tiff.stack_shape(projections)
     stated: dict[str, dict[str, object]] = {
-        "frames": dict(patterns),
-        "detector": {"rows": rows, "columns": columns},
+        "frames": dict(patterns), "detector": {"rows": rows, "columns": columns},
         "angles": _angles(path, frames),
     }
     head = [

@@ -55,17 +55,11 @@ def read_header(source: Hdf5Source) -> ScanHeader:
     lag = read_number(source, f"{extra}/lag", default=0.0)
     checks.within(source.name(f"{extra}/lag"), lag, 0, LARGEST_LAG)
     scan = Scan(
-        projections=np.broadcast_to(np.float32(0), (int(used.sum()), *data.shape[1:])),
-        geometry=geometry,
-        trajectory=trajectory,
-        shutter=shutter,
-        frame_start_s=start_s,
-        grid=grid,
-        is_fly=is_fly,
+        projections=np.broadcast_to(np.float32(0), (int(used.sum()), *data.shape[1:])), geometry=geometry,
+        trajectory=trajectory, shutter=shutter, frame_start_s=start_s, grid=grid, is_fly=is_fly,
         detector_model=read_word(source, f"{extra}/detector_model", DETECTOR_MODELS, default="log"),
         title=read_title(source, f"{entry}/title", "cone-beam scan"),
-        provenance=read_facts(source.name(f"{extra}/provenance"), provenance, {}),
-        lag=lag,
+        provenance=read_facts(source.name(f"{extra}/provenance"), provenance, {}), lag=lag,
         saturation=_read_saturation(source, entry),
     )
     scan.check_timing()

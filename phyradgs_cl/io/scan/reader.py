@@ -58,21 +58,12 @@ def scan_summary(path: str | Path, sha256: str | None = None) -> dict[str, objec
         applied = {name: scan.provenance.get(name) for name in APPLIED}
         counts |= {name: count for name, count in applied.items() if isinstance(count, int)}
     return {
-        "title": scan.title,
-        **counts,
-        "data": f"{header.data_type} {header.quantity}",
-        "fly_scan": scan.is_fly,
-        "trajectory": _trajectory_word(scan),
-        **vars(scan.geometry),
-        **_timing_facts(scan),
-        "detector_model": scan.detector_model,
-        **_panel_facts(scan),
-        "pixel_mask": header.mask_shape is not None,
-        "grid_shape": scan.grid.shape,
-        "grid_voxel_size_mm": scan.grid.voxel_size_mm,
-        "grid_stored": header.has_grid,
-        "reference": header.has_reference,
-        "sha256": sha256 or sha256_of(path),
+        "title": scan.title, **counts, "data": f"{header.data_type} {header.quantity}",
+        "fly_scan": scan.is_fly, "trajectory": _trajectory_word(scan), **vars(scan.geometry),
+        **_timing_facts(scan), "detector_model": scan.detector_model, **_panel_facts(scan),
+        "pixel_mask": header.mask_shape is not None, "grid_shape": scan.grid.shape,
+        "grid_voxel_size_mm": scan.grid.voxel_size_mm, "grid_stored": header.has_grid,
+        "reference": header.has_reference, "sha256": sha256 or sha256_of(path),
     }
 
 

@@ -99,14 +99,9 @@ def plan_sweep(grid: SweepGrid, folder: Path, checkpoint_every_s: float = 600.0)
         stat = scan.stat()
         for setting in grid.settings:
             shared = {
-                "scan": str(scan),
-                "scan_bytes": stat.st_size,
-                "scan_mtime_ns": stat.st_mtime_ns,
-                "method": setting.method,
-                "preset": setting.preset,
-                "label": setting.label,
-                "changes": _as_json(setting.changes),
-                "input": _as_json(setting.before),
+                "scan": str(scan), "scan_bytes": stat.st_size, "scan_mtime_ns": stat.st_mtime_ns,
+                "method": setting.method, "preset": setting.preset, "label": setting.label,
+                "changes": _as_json(setting.changes), "input": _as_json(setting.before),
                 "options": _as_json(asdict(setting.plan().options)),
             }
             for seed in grid.seeds:
