@@ -161,7 +161,9 @@ def requested(what: str | None, scan: Scan, knows_shape: bool = False) -> Reques
 
     InputError: an unknown name, wobble together with motion, timing of a gantry that stands still."""
     if what is None:
-        what = _usual(scan) + (",distance" if knows_shape else "")
+        is_rolling = _turns(scan) and scan.shutter.readout_s > 0
+        what = "offset,roll,tilt,readout,exposure" if is_rolling else "offset,roll,tilt"
+        what += ",distance" if knows_shape else ""
     names: list[str] = []
     for word in (word.strip() for word in what.split(",")):
         if word not in NAMES:
@@ -185,11 +187,6 @@ def requested(what: str | None, scan: Scan, knows_shape: bool = False) -> Reques
 
 def _turns(scan: Scan) -> bool:
     return scan.is_fly and scan.shutter.exposure_s > 0 and exposure_arc_rad(scan) > 0
-
-
-def _usual(scan: Scan) -> str:
-    is_rolling = _turns(scan) and scan.shutter.readout_s > 0
-    return "offset,roll,tilt,readout,exposure" if is_rolling else "offset,roll,tilt"
 
 
 def correction_of(values: Mapping[str, float]) -> GeometryCorrection:

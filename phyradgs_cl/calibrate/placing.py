@@ -59,7 +59,8 @@ def placements(phantom: EllipsoidPhantom, volume: np.ndarray, grid: Grid) -> lis
     for count, _, place in matches:
         if -count < most - 1 or len(best) == _MOST:
             break
-        if all(_turn_between(place, other) > _APART for other in best):
+        turn = Rotation.from_rotvec(place[:3])
+        if all((turn.inv() * Rotation.from_rotvec(other[:3])).magnitude() > _APART for other in best):
             best.append(place)
     return best
 
@@ -105,7 +106,3 @@ def _rigid(points: np.ndarray, targets: np.ndarray) -> np.ndarray:
 
 def _moved(place: np.ndarray, points: np.ndarray) -> np.ndarray:
     return Rotation.from_rotvec(place[:3]).apply(points) + place[3:]
-
-
-def _turn_between(one: np.ndarray, other: np.ndarray) -> float:
-    return float((Rotation.from_rotvec(one[:3]).inv() * Rotation.from_rotvec(other[:3])).magnitude())

@@ -141,12 +141,6 @@ def least_share(problem: CoarseProblem, at: Mapping[str, float], volume: np.ndar
     return max(LEAST_SHARE, _GAUGE_FACTOR * min(gauge, _MOST_GAUGE))
 
 
-def identifiable(problem: Reduced, least: float) -> tuple[str, ...]:
-    """Returns the parameters of which ``least`` remains with all others free. The error of a parameter that stays as stated
-    would otherwise pass to them."""
-    return tuple(name for name, share in zip(problem.names, problem.shares, strict=True) if share >= least)
-
-
 def indistinguishable(problem: Reduced, least: float) -> list[dict[str, float]]:
     """Returns combinations of parameters, as weights by name, of which an object explains all but ``least``."""
     values, vectors = scipy.linalg.eigh(problem.gram, problem.whole_gram + _TINY * np.eye(len(problem.names)))

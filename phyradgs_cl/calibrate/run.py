@@ -97,7 +97,8 @@ class _Calibrator:
     def __post_init__(self) -> None:
         self.placement = np.zeros(0)
         self.stated = self.ready  # ``ready`` may get the other readout direction
-        self.stages = _different(STAGES if self.phantom is None else BEAD_STAGES, self.scan)
+        stages = {one.block(self.scan): one for one in reversed(STAGES if self.phantom is None else BEAD_STAGES)}
+        self.stages = list(stages.values())[::-1]  # of a small panel several have the same blocks
         self.per_view: PerViewParameters | None = None
         if self.request.per_view == WOBBLE:
             self.per_view = WobbleParameters.of(self.ready[0], self.splines)
@@ -124,10 +125,10 @@ class _Calibrator:
             estimate = self._estimate_views(correction)
             views, views_table = estimate.views, estimate.table
         self.passes.begin("residuals", "residuals")
-        problem = self._problem(self.ready, self.stages[-1], MOST_FRAMES if views is None else self.scan.frames)
-        as_stated = problem
-        if self.stated is not self.ready:
-            as_stated = self._problem(self.stated, self.stages[-1], MOST_FRAMES if views is None else self.scan.frames)
+        most_frames = MOST_FRAMES if views is None else self.scan.frames
+        problem = self._problem(self.ready, self.stages[-1], most_frames)
+        is_as_stated = self.stated is self.ready
+        as_stated = problem if is_as_stated else self._problem(self.stated, self.stages[-1], most_frames)
         before = self._residual(as_stated, self.stages[-1], GeometryCorrection())
         after = self._residual(problem, self.stages[-1], correction, views)
         if views is None and rms(after) > rms(before):  # a correction that explains the frames worse is none
@@ -266,11 +267,6 @@ class _Calibrator:
 
     def _passes(self, stage: Stage, count: int, most_frames: int = MOST_FRAMES) -> Passes:
         return count, count * pass_cost(self.ready, stage.columns, most_frames)
-
-
-def _different(stages: Sequence[Stage], scan: Scan) -> list[Stage]:
-    """Returns the stages whose grids differ: a small panel has the same blocks on several."""
-    return [stage for k, stage in enumerate(stages) if k == 0 or stage.block(scan) < stages[k - 1].block(scan)]
 
 
 def _in_short(one: ParameterEstimate) -> str:

@@ -17,7 +17,6 @@ from phyradgs_cl.calibrate.problem import CoarseProblem
 from phyradgs_cl.calibrate.reduced import (
     LEAST_SHARE_OF_BEADS,
     Reduced,
-    identifiable,
     indistinguishable,
     least_share,
     reduced,
@@ -86,7 +85,7 @@ class Search:
         least = LEAST_SHARE_OF_BEADS
         if isinstance(problem, CoarseProblem):
             least = least_share(problem, self.at, volume, stage.project)
-        names = identifiable(linear, least)
+        names = tuple(name for name, share in zip(linear.names, linear.shares, strict=True) if share >= least)
         deviations = linear.only(names).deviations() if names else ()
         self.determined = tuple(n for n, d in zip(names, deviations, strict=True) if PARAMETERS[n].is_known(float(d)))
         self.shares = dict(zip(linear.names, linear.shares.tolist(), strict=True))

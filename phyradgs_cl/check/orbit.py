@@ -60,7 +60,8 @@ def find_orbit(rt: Runtime, quick: Scan, as_stated: Scan, sees_angles: bool) -> 
         return Orbit(same_from_everywhere(SIGN), same_from_everywhere(CENTRE))
     reverse, block = reversed_rotation(quick), axis.columns_per_block(quick)
     stated, other = axis.rough_shift(rt, quick), axis.rough_shift(rt, reverse)
-    is_rough = is_clear(stated, other)
+    ratio = residual_ratio(stated.squares, other.squares)
+    is_rough = max(ratio, 1 / max(ratio, 1e-30)) >= _CLEAR_RATIO  # the other sense needs no closer look
     if not is_rough:
         stated, other = axis.refined_shift(rt, quick, stated), axis.refined_shift(rt, reverse, other)
     sign = check_rotation(stated, other)
@@ -90,12 +91,6 @@ def check_rotation(stated: axis.AxisShift, other: axis.AxisShift) -> Finding:
         return Finding(SIGN, SUSPICIOUS, *values)
     advice = "look for a feature whose side is known: a mirror image would fit as well"
     return Finding(SIGN, CANNOT_TELL, *values, advice)
-
-
-def is_clear(stated: axis.AxisShift, other: axis.AxisShift) -> bool:
-    """True where one of two rough fits is better by a factor of three: the other needs no closer look."""
-    ratio = residual_ratio(stated.squares, other.squares)
-    return max(ratio, 1 / max(ratio, 1e-30)) >= _CLEAR_RATIO
 
 
 def with_cause(finding: Finding, shift_px: float, stated_px: float, tolerance_px: float) -> Finding:

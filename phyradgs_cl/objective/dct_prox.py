@@ -10,6 +10,7 @@ Kamilov, Bostan and Unser, IEEE Signal Process. Lett. 21 (2014) 1326).
 
 import itertools
 from collections.abc import Sequence
+from functools import partial
 
 import numpy as np
 import scipy
@@ -43,13 +44,11 @@ class DctProx:
 
         ``turn``, 0 to 3, chooses a quarter of the shifts. A device array gives a device array (``out``, if given)."""
 
-        def shrink(observed: DeviceArray, result: DeviceArray) -> None:
-            self._map(observed, threshold, TURNS[turn], nonnegative, result)
-
-        return on_device(self.rt, shrink, volume, out)
+        map_to = partial(self._map, threshold, TURNS[turn], nonnegative)
+        return on_device(self.rt, map_to, volume, out)
 
     def _map(
-        self, volume: DeviceArray, threshold: float, turn: Sequence[int], nonnegative: bool, result: DeviceArray
+        self, threshold: float, turn: Sequence[int], nonnegative: bool, volume: DeviceArray, result: DeviceArray
     ) -> None:
         rt, (nz, ny, nx) = self.rt, self.shape
         voxels, by_voxel = (nx, ny, nz), rt.group(on_cpu=16)

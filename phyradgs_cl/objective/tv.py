@@ -9,6 +9,7 @@ Tang and Leng, Med. Phys. 35 (2008) 660).
 """
 
 from collections.abc import Callable
+from functools import partial
 from typing import cast
 
 import numpy as np
@@ -49,13 +50,11 @@ class TvProx:
 
         A device array gives a device array (``out``, if given)."""
 
-        def denoise(observed: DeviceArray, result: DeviceArray) -> None:
-            self._map(observed, weight, iterations, nonnegative, result)
-
-        return on_device(self.rt, denoise, volume, out)
+        map_to = partial(self._map, weight, iterations, nonnegative)
+        return on_device(self.rt, map_to, volume, out)
 
     def _map(
-        self, observed: DeviceArray, weight: float, iterations: int, nonnegative: bool, result: DeviceArray
+        self, weight: float, iterations: int, nonnegative: bool, observed: DeviceArray, result: DeviceArray
     ) -> None:
         if weight <= 0:
             self._primal(observed, self._dual, 0.0, nonnegative, result)

@@ -107,7 +107,7 @@ def _by_voltage(scan: Scan, options: HardeningOptions, make_model: MakeModel) ->
     frames = step.unmasked_frames(scan)
     spectrum, water = tube_spectrum(*tube), water_polynomial(*tube)
     facts: Facts = {"kvp": options.kvp}
-    bone_in = partial(_from, options.bone_per_mm)
+    bone_in: BoneIn = lambda volume: np.where(volume >= options.bone_per_mm, volume, 0)  # noqa: E731
     if not options.bone_per_mm:
         model, blur = step.coarse_model(scan, make_model)
         mixed, facts["unexplained"] = find_bone(step.smooth(frames, blur), spectrum, water, model)
@@ -213,11 +213,6 @@ def _bend(frames: np.ndarray, model: Model) -> tuple[np.ndarray, float, float, f
 
 def _no_object() -> InputError:
     return InputError("--steps hardening", "nothing in the volume", "an object", "leave the step out")
-
-
-def _from(bone_per_mm: float, volume: np.ndarray) -> np.ndarray:
-    """Returns the bone of voxels (z, y, x) that are either soft tissue or bone."""
-    return np.where(volume >= bone_per_mm, volume, 0)
 
 
 def _between(soft_to: float, bone_from: float, volume: np.ndarray) -> np.ndarray:

@@ -7,6 +7,7 @@ Reconstruction", CVPR 2024: attention along line segments, and windows of rays b
 
 import time
 from functools import partial
+from importlib.metadata import version
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -66,7 +67,7 @@ def reconstruct_neural(
         "times": trainer.times,
         "iterations": trainer.passes,
         "torch_device": str(device),
-        "torch_version": _torch_version(),
+        "torch_version": version("torch"),
         "seconds": loop.seconds,
         "interrupted_at": loop.interrupted_at,
     }
@@ -114,12 +115,6 @@ class _Passes:
 
     def present_volume(self) -> tuple[np.ndarray, Grid]:
         return self.trainer.volume(self.trainer.scan.grid), self.trainer.scan.grid
-
-
-def _torch_version() -> str:
-    from importlib.metadata import version
-
-    return version("torch")
 
 
 # Paper, section 3, and the released configuration chest_50: 192 samples for 128 voxels per side

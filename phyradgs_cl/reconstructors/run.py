@@ -181,16 +181,13 @@ def _size_that_fits(rt: Runtime, scan: Scan, method: str, options: Any) -> int:
     voxels = (free - scan.projections.nbytes) / (4 * _OF_OTHERS)
     if held is not None:
         free = min(free, _DEVICE_SHARE * rt.ledger.limit_bytes)
-        held += _of_prior(options.prior) if hasattr(options, "prior") else 0
+        if hasattr(options, "prior"):
+            from phyradgs_cl.reconstructors.voxels.priors import volumes_of  # which loads SciPy
+
+            held += volumes_of(options.prior)
         voxels = (free - _STACKS * scan.projections.nbytes) / (4 * held)
         voxels = min(voxels, rt.device.largest_allocation_bytes / (4 * _ONE_BUFFER))
     if not 0 < voxels < math.inf:
         return 0
     size = int(max(scan.grid.shape) * (voxels / math.prod(scan.grid.shape)) ** (1 / 3))
     return size - size % _ROUND if size > 2 * _ROUND else size
-
-
-def _of_prior(prior: Any) -> int:
-    from phyradgs_cl.reconstructors.voxels.priors import volumes_of  # which loads SciPy
-
-    return volumes_of(prior)

@@ -61,20 +61,16 @@ def tuned(
     if resume is None:
         tuning = _choose(_Trials(request, run, scan, rt, report, extra), options)
     else:
-        tuning = _restored(resume, request.option)
+        tuning = parsed(resume, TUNED, dict)
+        if not is_tuning(tuning) or tuning["option"] != request.option:
+            expected, remedy = "what a run has written", "start without --resume"
+            raise InputError(f"checkpoint, array {TUNED}", "no choice", expected, remedy)
         extra["resume"] = {name: array for name, array in resume.items() if name != TUNED}
     tuning_state = {TUNED: np.array(json.dumps(tuning))}
     with report.through(lambda progress: progress.mapped(state=lambda state: {**state, **tuning_state})):
         result = run(scan, with_chosen(options, tuning), report=report, **extra)
     result.facts[TUNED] = tuning
     return result if result.state is None else replace(result, state={**result.state, **tuning_state})
-
-
-def _restored(state: State, option: str) -> dict[str, Any]:
-    tuning = parsed(state, TUNED, dict)
-    if not is_tuning(tuning) or tuning["option"] != option:
-        raise InputError(f"checkpoint, array {TUNED}", "no choice", "what a run has written", "start without --resume")
-    return tuning
 
 
 def _choose(trials: "_Trials", options: Any) -> dict[str, Any]:

@@ -4,11 +4,9 @@ Sidky and Pan, Phys. Med. Biol. 53 (2008) 4777, with the step control of TIGRE (
 """
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
-from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.checks import ranged
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.objective import TvDescent
@@ -88,9 +86,8 @@ def _started(system: System, options: AsdPocsOptions, inputs: MethodInputs) -> A
     return AsdPocs(system, options, inputs.seed, descend, epsilon)
 
 
-def _held_volumes(scan: Scan, options: Any) -> int:
-    """Those of SART, four of the steps, and with a prior image two more: the image and the difference to it."""
-    return held_volumes(scan, options) + 4 + (2 if options.prior_share > 0 else 0)
-
-
-METHOD = voxel_method("asd-pocs", AsdPocsOptions(), _started, volumes=_held_volumes, frames=2)
+METHOD = voxel_method(
+    "asd-pocs", AsdPocsOptions(), _started, frames=2,
+    # those of SART, four of the steps, and with a prior image two more: the image and the difference to it
+    volumes=lambda scan, options: held_volumes(scan, options) + (6 if options.prior_share > 0 else 4),
+)

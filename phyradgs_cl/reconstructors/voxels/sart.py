@@ -74,18 +74,15 @@ class Sart(Algorithm):
     def _corrections(self) -> Iterator[Any]:
         """Corrects for all subsets. Yields the residual of each just before its correction."""
         space, clip = self.system.space, self.options.nonnegative
-        for index in self._subset_order():
+        order: Any = range(len(self.subsets))
+        if self.options.order == "random":
+            order = np.random.default_rng([self.seed, self.passes]).permutation(len(order)).tolist()
+        for index in order:
             subset, columns = self.subsets[index], self._columns(index)
             residual = subset.residual(self.volume)
             yield residual
             update = subset.back(space.multiply(residual, self._row_weights[index]))
             self.volume = space.add_product(self.volume, columns, update, self.relaxation, nonnegative=clip)
-
-    def _subset_order(self) -> list[int]:
-        count = len(self.subsets)
-        if self.options.order != "random":
-            return list(range(count))
-        return np.random.default_rng([self.seed, self.passes]).permutation(count).tolist()
 
     def _columns(self, index: int) -> Any:
         """Column weights of a subset, computed in every pass where the cache has no room for them."""

@@ -29,10 +29,6 @@ _HISTORY = {"record": "record_before", "seconds": "seconds_before"}
 _SUBVOXEL_SHARE = np.float32(2 / 3)  # of the result (docs/results/settings.md)
 
 
-def _last_volume(volume: np.ndarray, before: np.ndarray | None) -> np.ndarray:
-    return volume
-
-
 @dataclass(frozen=True)
 class Stage:
     """One stage: its number of iterations and a function that runs them.
@@ -42,7 +38,7 @@ class Stage:
     name: str
     iterations: int
     run: Callable[[MethodInputs], Reconstruction]
-    merge: Callable[[np.ndarray, np.ndarray | None], np.ndarray] = _last_volume
+    merge: Callable[[np.ndarray, np.ndarray | None], np.ndarray] = lambda volume, before: volume
 
 
 @dataclass
