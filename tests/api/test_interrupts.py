@@ -57,10 +57,7 @@ def test_a_script_stops_with_the_partial_volume(tmp_path, method, iterations) ->
     # by the signal, as shells want it
     assert status == -signal.SIGINT and "the next line" not in lines
     (told,) = [line for line in lines if line.startswith("partial")]
-    assert (
-        errors.rstrip().split("\n")[-1].endswith("the volume so far is the error's partial")
-
-    )
+    assert errors.rstrip().split("\n")[-1].endswith("the volume so far is the error's partial")
     assert "direct cause" not in errors  # one traceback, from the reconstruction
     kept = api.load_volume(tmp_path / "partial.h5")
     assert kept.facts["interrupted_at"] == int(told.split()[1]) > 0
@@ -83,9 +80,8 @@ def test_the_partial_result_goes_on_to_the_bits_of_the_whole(rt, scan, tmp_path,
     with pytest.raises(KeyboardInterrupt) as stopped:
         reconstruct(scan, **options, report=pressing_at(2 if method == "sart" else 50))
     partial = stopped.value.partial
-    assert "interrupted at iteration" in repr(
-        partial
-    ) and f"after iteration {partial.facts['interrupted_at']}" in str(stopped.value)
+    assert "interrupted at iteration" in repr(partial)
+    assert f"after iteration {partial.facts['interrupted_at']}" in str(stopped.value)
     whole = reconstruct(scan, **options, report=False)
     api.save_volume(tmp_path / "partial.h5", partial)
     for so_far in (partial, api.load_volume(tmp_path / "partial.h5")):
@@ -126,9 +122,7 @@ def test_another_run_is_not_gone_on_with(rt, scan) -> None:
 def test_who_asks_for_the_result_gets_it(rt, scan) -> None:
     result = reconstruct(scan, "sirt", iterations=9, report=pressing_at(3), on_interrupt="return", device=rt)
     assert result.facts["interrupted_at"] == 3 and result.state is not None
-    at_the_end = reconstruct(
-        scan, "sirt", iterations=3, report=pressing_at(3), on_interrupt="return", device=rt
-    )
+    at_the_end = reconstruct(scan, "sirt", iterations=3, report=pressing_at(3), on_interrupt="return", device=rt)
     assert at_the_end.facts["interrupted_at"] is None
 
 

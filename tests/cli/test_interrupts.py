@@ -14,7 +14,7 @@ from phyradgs_cl import signals
 from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.signals import finish_despite_interrupt, stop_on_interrupt
 from phyradgs_cl.simulation import options as simulation_options
-from phyradgs_cl.workflow import evaluate, reconstruct, simulate
+from phyradgs_cl.workflow import evaluate, reconstruct, scans
 
 NOTHING = "phyradgs: interrupted, nothing written\n"
 COMPLETE = "phyradgs: interrupted, the output is complete\n"
@@ -38,8 +38,8 @@ COMMANDS = {
 }
 STAGES = [
     ("simulate", simulation_options, "load_scanner"),
-    ("simulate", simulate, "check_writable"),
-    ("simulate", simulate, "simulated_scan"),
+    ("simulate", scans, "check_output"),
+    ("simulate", scans, "simulated_scan"),
     ("reconstruct", reconstruct, "load_scan"),
     ("reconstruct", reconstruct, "hashing"),
     ("fdk", Runtime, "launch"),
@@ -61,7 +61,7 @@ def test_before_the_output_there_is_nothing(cli, scan, tmp_path, capfd, monkeypa
 @pytest.mark.parametrize(
     ("command", "owner", "step"),
     [
-        ("simulate", simulate, "write_scan"),
+        ("simulate", scans, "write_scan"),
         ("reconstruct", reconstruct, "compare"),
         ("reconstruct", reconstruct, "write_volume"),
         ("evaluate", evaluate, "slices_png"),
@@ -177,9 +177,9 @@ def test_a_loop_is_saved_beside_the_output_and_goes_on(cli, scan, tmp_path, caps
     facts = json.loads(capsys.readouterr().out)
     assert (facts["interrupted_at"], facts["iterations_asked"]) == (at, int(iterations))
     (tmp_path / "volume.partial.evaluated.png").unlink()
-    assert run_process([*command, str(output), "--resume", "--preview", str(tmp_path / "now.png")], "").returncode == 0
+    assert cli.run([*command, str(output), "--resume", "--preview", str(tmp_path / "now.png")]) == 0
     assert {path.name for path in tmp_path.iterdir()} == {"volume.h5", "now.png"}
-    assert run_process([*command, str(whole)], "").returncode == 0
+    assert cli.run([*command, str(whole)]) == 0
     with h5py.File(output) as a, h5py.File(whole) as b:
         name = "entry/reconstruction/volume"
         np.testing.assert_array_equal(a[name][()], b[name][()])
