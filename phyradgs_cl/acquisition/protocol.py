@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from phyradgs_cl import checks
-from phyradgs_cl.acquisition.geometry import ConeGeometry
+from phyradgs_cl.acquisition.geometry import Geometry
 from phyradgs_cl.acquisition.readout import Named
 from phyradgs_cl.acquisition.shutter import Shutter
 from phyradgs_cl.acquisition.trajectory import CircularOrbit, EncoderTable, FrameSweeps
@@ -76,7 +76,7 @@ class Protocol:
         return start_rad
 
     def orbit(
-        self, geometry: ConeGeometry, jitter_deg: float = 0.0, rng: np.random.Generator | None = None
+        self, geometry: Geometry, jitter_deg: float = 0.0, rng: np.random.Generator | None = None
     ) -> CircularOrbit:
         """Returns the trajectory. Stop-and-shoot rests at the mid-window angles of the same fly-scan. Jitter is a smooth
         wander of the gantry, with standard deviation ``jitter_deg`` and one knot per frame, which the encoder records."""

@@ -73,7 +73,7 @@ class Scan:
     """
 
     projections: np.ndarray
-    geometry: Geometry
+    geometry: "Geometry"
     trajectory: Trajectory
     shutter: Shutter
     frame_start_s: np.ndarray

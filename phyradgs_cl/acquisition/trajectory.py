@@ -137,7 +137,7 @@ class CircularOrbit:
     """A circular ``geometry`` in mm, with ``kinematics`` that give its angle: anything with angle_rad(frame, time_s). Raises
     InputError for other objects."""
 
-    geometry: Geometry
+    geometry: "Geometry"
     kinematics: Kinematics
 
     def __post_init__(self) -> None:

@@ -16,6 +16,7 @@ from phyradgs_cl.acquisition import (
     MicroViews,
     Motion,
     OwnTimes,
+    ParallelGeometry,
     PerRow,
     PoseTable,
     Scan,
@@ -54,7 +55,7 @@ from phyradgs_cl.reconstructors import Progress, Reconstruction
 __all__ = [
     "Calibration", "CircularOrbit", "ConeGeometry", "ConstantSpeed", "EncoderTable", "Exact",
     "FrameSweeps", "Gaussians", "Grid", "InputError", "LineMiddles", "LinearOperator", "MicroViews",
-    "Motion", "Operator", "OwnTimes", "PerRow", "PhyradgsError", "PoseTable", "Progress",
+    "Motion", "Operator", "OwnTimes", "ParallelGeometry", "PerRow", "PhyradgsError", "PoseTable", "Progress",
     "Reconstruction", "Scan", "Shutter", "SpeedRamp", "Static", "StaticStart", "TimeCells", "Trajectory",
     "as_torch", "calibrate", "compare", "fly_scan", "initial_gaussians", "load_scan", "load_volume",
     "move_views", "pose_gradient", "prepare", "ray_operator", "reconstruct", "save_scan", "save_volume",

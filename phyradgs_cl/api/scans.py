@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from phyradgs_cl import checks
-from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, FrameSweeps, Scan, Shutter
-from phyradgs_cl.acquisition.geometry import default_grid
+from phyradgs_cl.acquisition import CircularOrbit, FrameSweeps, Scan, Shutter
+from phyradgs_cl.acquisition.geometry import GEOMETRIES, Geometry, default_grid
 from phyradgs_cl.acquisition.plausible import check_plausible
 from phyradgs_cl.acquisition.readout import exposure_of, readout_order, readout_ratio_of
 from phyradgs_cl.acquisition.scan import check_not_counts, check_others
@@ -34,7 +34,7 @@ _CLEAR_STEP_DEG = 90.0  # from frame to frame: below, angles say which way the g
 
 
 def fly_scan(
-    frames: "ArrayLike", geometry: ConeGeometry, angles_deg: "ArrayLike", *,
+    frames: "ArrayLike", geometry: "Geometry", angles_deg: "ArrayLike", *,
     exposure_deg: float | None = None, readout_ratio: float | None = None, readout: str | None = None,
     readout_direction: int | None = None, exposure_s: float | None = None, first: str | None = None,
     fps: float | None = None, readout_ms: float | None = None, flats: "ArrayLike | None" = None,
@@ -44,7 +44,7 @@ def fly_scan(
     """Returns a scan whose gantry never stops, from arrays.
 
     frames: (F, rows, columns), row 0 the lowest: line integrals, or raw counts together with ``flats``.
-    geometry: distances and pixels in mm.
+    geometry: of a cone or a parallel beam, in mm.
     angles_deg: (F,) the gantry's angle in degrees when a frame's first line opens; 0 with the source on +x,
     counterclockwise seen from above (+z). A sample that turns has the opposite sign.
     exposure_deg: the arc of one line's exposure, below 0 for a clockwise gantry; None takes it from fps and exposure_s.
@@ -97,14 +97,15 @@ def fly_scan(
 
 
 def static_scan(
-    frames: "ArrayLike", geometry: ConeGeometry, angles_deg: "ArrayLike", *, flats: "ArrayLike | None" = None,
+    frames: "ArrayLike", geometry: "Geometry", angles_deg: "ArrayLike", *, flats: "ArrayLike | None" = None,
     darks: "ArrayLike | None" = None, mask: "ArrayLike | None" = None, quantity: str | None = None,
     grid: Grid | None = None, **others: Any,
 ) -> Scan:
     """Returns a scan whose gantry stops for every frame, from arrays.
 
-    frames: (F, rows, columns), row 0 the lowest. geometry: distances and pixels in mm. angles_deg: (F,) the gantry's angle
-    from +x, counterclockwise seen from above. flats, darks, mask, quantity, grid, others: those of ``fly_scan``.
+    frames: (F, rows, columns), row 0 the lowest. geometry: of a cone or a parallel beam, in mm. angles_deg: (F,) the
+    gantry's angle from +x, counterclockwise seen from above. flats, darks, mask, quantity, grid, others: those of
+    ``fly_scan``.
 
     Raises InputError for shapes that do not fit and numbers out of range."""
     check_others(others, _keywords(static_scan))
@@ -132,8 +133,8 @@ def _pixels(
     mask: "ArrayLike | None", quantity: str | None,
 ) -> LineIntegrals:
     """Returns frames of any quantity as line integrals, with the mask of unusable pixels."""
-    if not isinstance(geometry, ConeGeometry):
-        raise InputError("geometry", checks.short_repr(geometry), "a ConeGeometry")
+    if not isinstance(geometry, GEOMETRIES):
+        raise InputError("geometry", checks.short_repr(geometry), "a ConeGeometry or a ParallelGeometry")
     panel = geometry.detector_shape
     values = _stack("frames", frames, panel)
     flat = None if flats is None else _stack("flats", flats, panel)

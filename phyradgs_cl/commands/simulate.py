@@ -53,7 +53,7 @@ def simulate_command(
     output: Output,
     phantom: Annotated[str | None, option(_PHANTOM, "foot, without --volume", autocompletion=_NAMES)] = None,
     volume: Annotated[Path | None, file_option(_VOLUME, "--volume")] = None,
-    scanner: Annotated[str, option("Scanner by name (r2, carm) or a TOML file.")] = "r2",
+    scanner: Annotated[str, option("Scanner by name (r2, carm, parallel) or a TOML file.")] = "r2",
     protocol: Annotated[ProtocolName, option(_PROTOCOL)] = "rapid",  # type: ignore[valid-type]
     views: Annotated[int | None, option("Frames in the turn.", "protocol's")] = None,
     exposure_deg: Annotated[float | None, option("Arc of one exposure, degrees.", "protocol's")] = None,

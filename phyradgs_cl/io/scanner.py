@@ -5,19 +5,20 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from phyradgs_cl import checks
-from phyradgs_cl.acquisition import ConeGeometry
-from phyradgs_cl.acquisition.geometry import default_grid
+from phyradgs_cl.acquisition import ConeGeometry, ParallelGeometry
+from phyradgs_cl.acquisition.geometry import Geometry, default_grid
 from phyradgs_cl.acquisition.readout import readout_order
 from phyradgs_cl.acquisition.scan import LARGEST_LAG
 from phyradgs_cl.acquisition.shutter import AXES
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid, triple
 from phyradgs_cl.fields.volume import MOST_VOXELS
+from phyradgs_cl.io.scan.schema import BEAMS
 from phyradgs_cl.io.tables import LARGEST_LENGTH, Fields, described, read_toml, refuse_unknown
 from phyradgs_cl.text import suggest_name
 
 TABLES: dict[str, tuple[str, ...]] = {
-    "source": ("to_axis_mm", "to_detector_mm"),
+    "source": ("beam", "to_axis_mm", "to_detector_mm"),
     "detector": (
         *("rows", "columns", "pixel_size_v_mm", "pixel_size_u_mm", "offset_v_mm", "offset_u_mm"), "lag"
     ),
@@ -36,7 +37,7 @@ class Scanner:
     panel's λ. ``fps``, ``readout_ms``: frame rate and readout of the data sheet."""
 
     name: str
-    geometry: ConeGeometry
+    geometry: Geometry
     grid: Grid
     readout_axis: str = "rows"
     readout_direction: int = 1
@@ -54,7 +55,7 @@ def load_scanner(name_or_path: str | Path, data_dir: Path) -> Scanner:
     return scanner_from(path, read_toml(path))
 
 
-def with_detector_count(geometry: ConeGeometry, rows: int, columns: int) -> ConeGeometry:
+def with_detector_count(geometry: Geometry, rows: int, columns: int) -> Geometry:
     """Returns the same panel, of the same size and place, with another number of pixels."""
     if min(rows, columns) < 1:
         raise InputError("detector count", f"{rows} × {columns}", "at least 1 row and 1 column")
@@ -118,12 +119,21 @@ def _order(readout: Fields) -> tuple[str, int]:
     return order[0] or axis, order[1] or stated
 
 
-def _geometry(source: Fields, detector: Fields) -> ConeGeometry:
+def _geometry(source: Fields, detector: Fields) -> Geometry:
+    if source.word("beam", BEAMS, default="cone") == "parallel":
+        for key in filter(source.has, ("to_axis_mm", "to_detector_mm")):
+            found, remedy = described(source.get(key)), "leave one of the two out"
+            raise source.error(key, found, "no distance: beam is 'parallel'", remedy)
+        return ParallelGeometry(*_panel(detector))
     to_axis_mm, to_detector_mm = source.length("to_axis_mm"), source.length("to_detector_mm")
     if to_detector_mm <= to_axis_mm:
         raise source.error("to_detector_mm", f"{to_detector_mm:g}", f"more than to_axis_mm ({to_axis_mm:g})")
-    return ConeGeometry(
-        to_axis_mm, to_detector_mm,
+    return ConeGeometry(to_axis_mm, to_detector_mm, *_panel(detector))
+
+
+def _panel(detector: Fields) -> tuple[tuple[int, int], tuple[float, float], tuple[float, float]]:
+    """Returns a panel's counts, pixel sizes in mm and offset in mm, each (v, u)."""
+    return (
         (detector.count("rows", MOST_LINES), detector.count("columns", MOST_LINES)),
         (detector.length("pixel_size_v_mm"), detector.length("pixel_size_u_mm")),
         (detector.position("offset_v_mm"), detector.position("offset_u_mm")),

@@ -6,8 +6,9 @@ from collections.abc import Callable
 import numpy as np
 
 from phyradgs_cl import __version__, checks
-from phyradgs_cl.acquisition import ConeGeometry, Protocol, Scan
+from phyradgs_cl.acquisition import Protocol, Scan
 from phyradgs_cl.acquisition.cells import per_line_cells, static_cells
+from phyradgs_cl.acquisition.geometry import Geometry
 from phyradgs_cl.acquisition.time_cells import TimeCells
 from phyradgs_cl.detector import effects, tube_spectrum
 from phyradgs_cl.errors import InputError, NumericalError
@@ -55,7 +56,7 @@ def simulated_scan(
 
 
 def simulate(
-    source: FrameSource, geometry: ConeGeometry, grid: Grid, options: SimulationOptions, *,
+    source: FrameSource, geometry: Geometry, grid: Grid, options: SimulationOptions, *,
     reference: np.ndarray | None = None, title: str = "simulated scan",
     report: Callable[[int, int], None] = lambda done, total: None, bone: FrameSource | None = None
 ) -> Scan:

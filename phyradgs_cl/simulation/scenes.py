@@ -8,7 +8,8 @@ from typing import Protocol
 import numpy as np
 
 from phyradgs_cl import checks
-from phyradgs_cl.acquisition import ConeGeometry, TimeCells, pixel_centres
+from phyradgs_cl.acquisition import TimeCells, pixel_centres
+from phyradgs_cl.acquisition.geometry import Geometry
 from phyradgs_cl.detector import average
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
@@ -33,7 +34,7 @@ class FrameSource(Protocol):
 class VolumeSource:
     """Frames of a voxel volume (z, y, x) in 1/mm by the ray-driven projector."""
 
-    def __init__(self, rt: Runtime, volume: np.ndarray, grid: Grid, geometry: ConeGeometry, axis: str) -> None:
+    def __init__(self, rt: Runtime, volume: np.ndarray, grid: Grid, geometry: Geometry, axis: str) -> None:
         self._rt, self._grid, self._detector_shape = rt, grid, geometry.detector_shape
         self._memory = RayMemory(rt, RayLayout.of_scan(grid, geometry.detector_shape, axis), 1)
         self._volume = volume
@@ -60,7 +61,7 @@ class VolumeSource:
 class AnalyticSource:
     """Frames of a phantom with closed-form line integrals, in float64."""
 
-    def __init__(self, phantom: EllipsoidPhantom, geometry: ConeGeometry) -> None:
+    def __init__(self, phantom: EllipsoidPhantom, geometry: Geometry) -> None:
         self._phantom, self._geometry = phantom, geometry
 
     def frame(self, cells: TimeCells, model: str, factor: float) -> np.ndarray:
@@ -69,10 +70,19 @@ class AnalyticSource:
         for start, stop, members in line_groups(cells):
             pixels = pixel_centres(cells.pose[members], self._geometry.detector_shape)
             target = pixels[:, start:stop] if by_row else pixels[:, :, start:stop]
-            p = factor * self._phantom.line_integrals(cells.pose[members][:, None, None, :3], target)
+            origin = cells.pose[members][:, None, None, :3]
+            if cells.is_parallel:  # from before the phantom to behind it, along the rays' direction
+                along = (_reach_mm(self._phantom) + np.linalg.norm(target, axis=-1, keepdims=True)) * origin
+                origin, target = target - along, target + along
+            p = factor * self._phantom.line_integrals(origin, target)
             mean = average(p, cells.weight[members], model)
             frame[(slice(start, stop),) if by_row else (slice(None), slice(start, stop))] = mean
         return frame.astype(np.float32)
+
+
+def _reach_mm(phantom: EllipsoidPhantom) -> float:
+    """Returns the radius of a ball about the origin that holds every body of a phantom."""
+    return max(float(np.linalg.norm(body.ends_mm, axis=1).max()) + body.reach_mm for body in phantom.ellipsoids)
 
 
 class PixelAreaSource:
@@ -119,7 +129,7 @@ class Scene:
 
 
 def phantom_scene(
-    rt: Runtime, of: str | EllipsoidPhantom, geometry: ConeGeometry, box: Grid, size: int, axis: str,
+    rt: Runtime, of: str | EllipsoidPhantom, geometry: Geometry, box: Grid, size: int, axis: str,
     seed: int, pixel_samples: int = 1
 ) -> Scene:
     """Returns the scene of a phantom, or of one by its name, in the scanner's box, with ``size`` voxels per side.
@@ -143,7 +153,7 @@ def phantom_scene(
 
 
 def volume_scene(
-    rt: Runtime, loaded: Volume, name: str, geometry: ConeGeometry, box: Grid, size: int | None, axis: str,
+    rt: Runtime, loaded: Volume, name: str, geometry: Geometry, box: Grid, size: int | None, axis: str,
     pixel_samples: int = 1
 ) -> Scene:
     """Returns the scene of a volume, called ``name``, at its own resolution with ``pixel_samples``² rays per pixel.
@@ -161,7 +171,7 @@ def volume_scene(
 
 
 def _voxel_sources(
-    rt: Runtime, volume: np.ndarray, grid: Grid, geometry: ConeGeometry, axis: str, pixel_samples: int
+    rt: Runtime, volume: np.ndarray, grid: Grid, geometry: Geometry, axis: str, pixel_samples: int
 ) -> tuple[FrameSource, Callable[[], FrameSource]]:
     """Returns the source of a volume's frames, and a function that makes the source of its bone."""
 
@@ -198,7 +208,7 @@ def _resized(grid: Grid, count: int) -> Grid:
     return Grid((shape[0], shape[1], shape[2]), (voxel[0], voxel[1], voxel[2]), grid.offset_mm)
 
 
-def _on_panel(geometry: ConeGeometry, pixel_samples: int, make: Callable[[ConeGeometry], FrameSource]) -> FrameSource:
+def _on_panel(geometry: Geometry, pixel_samples: int, make: Callable[[Geometry], FrameSource]) -> FrameSource:
     """Makes a source for the panel; with several samples per pixel for a finer panel, averaged over its pixels."""
     checks.within("--pixel-samples", pixel_samples, 1, 32)
     if pixel_samples == 1:

@@ -30,6 +30,7 @@ from phyradgs_cl.api import (
     MicroViews,
     Operator,
     OwnTimes,
+    ParallelGeometry,
     PerRow,
     PoseTable,
     Reconstruction,
@@ -193,7 +194,7 @@ CASES: dict[str, list[tuple[str, Callable[[], object]]]] = {
         ("frames", lambda: static_scan(FRAMES + 40000.0, CONE, ANGLES)),
     ],
     "Scan": [
-        ("geo.mode", lambda: from_tigre(geometry(mode="parallel"))), ("geo.DSD", lambda: from_tigre(geometry(DSD=None))),
+        ("geo.mode", lambda: from_tigre(geometry(mode="fan"))), ("geo.DSD", lambda: from_tigre(geometry(DSD=None))),
         ("geo.rotDetector", lambda: from_tigre(geometry(rotDetector=np.array([0.1, 0, 0])))),
         ("geo.DSO", lambda: from_tigre(geometry(DSO=np.ones(3)))),
         ("geo.nVoxel", lambda: from_tigre(geometry(nVoxel=[8, 8.5, 8]))),
@@ -213,6 +214,11 @@ CASES: dict[str, list[tuple[str, Callable[[], object]]]] = {
         ("source_to_detector_mm", lambda: ConeGeometry(7.0, 5.0, (6, 8), (1.0, 1.0))),
         ("detector_shape", lambda: ConeGeometry(5.0, 7.0, 6, (1.0, 1.0))),
         ("detector_shape", lambda: ConeGeometry(5.0, 7.0, (6, 8.5), (1.0, 1.0))),
+    ],
+    "ParallelGeometry": [
+        ("pixel_size_mm", lambda: ParallelGeometry((6, 8), 0.0)),
+        ("detector_shape", lambda: ParallelGeometry((6, 0), 1.0)),
+        ("trajectory", lambda: replace(GOOD, geometry=ParallelGeometry((6, 8), 0.2))),
     ],
     "Shutter": [("exposure_s", lambda: Shutter("1"))],
     "CircularOrbit": [

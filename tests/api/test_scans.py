@@ -8,6 +8,7 @@ import pytest
 from phyradgs_cl.api import (
     ConeGeometry,
     Grid,
+    ParallelGeometry,
     PerRow,
     fly_scan,
     initial_gaussians,
@@ -41,6 +42,25 @@ def test_a_fly_scan_from_arrays_is_the_simulated_one(rt, axis, direction) -> Non
     np.testing.assert_allclose(scan.frame_start_s, made.frame_start_s, atol=1e-12)
     np.testing.assert_allclose(poses(scan), poses(made), atol=1e-12)
     np.testing.assert_array_equal(scan.projections, made.projections)
+
+
+def test_scans_of_a_parallel_beam_from_arrays_are_the_simulated_ones(rt) -> None:
+    for protocol in ("rapid", "static"):
+        options = {"scanner": "parallel", "protocol": protocol, "views": 6, "exposure_deg": 30.0}
+        made = simulate("jaw", size=8, detector=12, **options, device=rt)
+        assert made.geometry == ParallelGeometry((12, 12), 2.56 / 12)
+        middle_deg = 30.0 * 1.86 / 2
+        if protocol == "rapid":
+            how = {"exposure_deg": 30.0, "readout_ratio": 0.86, "grid": made.grid}
+            scan = fly_scan(made.projections, made.geometry, 60.0 * np.arange(6), **how)
+            np.testing.assert_allclose(poses(scan), poses(made), atol=1e-12)
+        else:
+            scan = static_scan(made.projections, made.geometry, middle_deg + 60.0 * np.arange(6), grid=made.grid)
+            np.testing.assert_allclose(poses(scan)[:, 0], poses(made)[:, 0], atol=1e-12)
+        assert scan.is_parallel and scan.is_fly == (protocol == "rapid") and scan.grid == made.grid
+        assert "parallel beam" in scan.summary()
+    scan = fly_scan(made.projections, made.geometry, range(0, 60, 10), exposure_deg=10.0)
+    assert scan.grid.size_mm[1] == pytest.approx(2.56)  # the panel's width
 
 
 def test_a_gantry_that_turns_clockwise_has_a_negative_exposure() -> None:

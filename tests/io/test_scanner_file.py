@@ -1,10 +1,10 @@
-"""Scanner files: the two that come with the project, and messages about others."""
+"""Scanner files: the three that come with the project, and messages about others."""
 
 from pathlib import Path
 
 import pytest
 
-from phyradgs_cl.acquisition import ConeGeometry, pixel_centres
+from phyradgs_cl.acquisition import ConeGeometry, ParallelGeometry, pixel_centres
 from phyradgs_cl.acquisition.geometry import default_grid
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
@@ -51,6 +51,9 @@ def test_the_scanners_that_come_with_the_project() -> None:
     assert (arm.geometry.source_to_axis_mm, arm.geometry.source_to_detector_mm) == (785, 1200)
     assert arm.grid.size_mm == pytest.approx((200, 200, 200))
     assert min(default_grid(arm.geometry).size_mm) > 200  # the inscribed cylinder
+    beamline = load_scanner("parallel", DATA)
+    assert beamline.geometry == ParallelGeometry((512, 512), 0.005)
+    assert beamline.grid.size_mm[1] * 2**0.5 < 512 * 0.005
 
 
 def test_all_fields(write) -> None:
@@ -65,6 +68,17 @@ def test_all_fields(write) -> None:
     scanner = load_scanner(write(GOOD.split("[volume]")[0]), DATA)
     assert scanner.grid == default_grid(scanner.geometry)
     assert (scanner.readout_axis, scanner.readout_direction, scanner.readout_ratio) == ("rows", 1, None)
+
+
+def test_a_parallel_beam_has_no_distance(write) -> None:
+    distances, parallel = "to_axis_mm = 500\nto_detector_mm = 1000.0", 'beam = "parallel"'
+    scanner = load_scanner(write(GOOD.replace(distances, parallel)), DATA)
+    assert scanner.geometry == ParallelGeometry((40, 60), (2.0, 1.0), (0.0, 3.5))
+    assert load_scanner(write(GOOD.replace("[source]", '[source]\nbeam = "cone"')), DATA).geometry.source_to_axis_mm == 500
+    both = r"\[source\] to_axis_mm: found 500; expected no distance: beam is 'parallel'"
+    for text, words in ((f"{parallel}\n{distances}", both), ('beam = "fan"', r"\[source\] beam: found 'fan'")):
+        with pytest.raises(InputError, match=words):
+            load_scanner(write(GOOD.replace(distances, text)), DATA)
 
 
 def test_pulse_and_lag_of_a_scanner(write) -> None:

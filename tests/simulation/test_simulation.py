@@ -7,12 +7,12 @@ import pytest
 from kernel_kit import assert_near
 from tolerances import ANALYTIC_FRAME, FLOAT32, TIME_SAMPLING, VOXEL_SOURCE
 
-from phyradgs_cl.acquisition import ConeGeometry, Protocol, make_protocol, pixel_centres
+from phyradgs_cl.acquisition import ConeGeometry, ParallelGeometry, Protocol, make_protocol, pixel_centres
 from phyradgs_cl.acquisition.cells import per_line_cells
 from phyradgs_cl.detector import average
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
-from phyradgs_cl.phantoms import EllipsoidPhantom, shepp_logan
+from phyradgs_cl.phantoms import Ellipsoid, EllipsoidPhantom, shepp_logan
 from phyradgs_cl.simulation import (
     AnalyticSource,
     SimulationOptions,
@@ -26,6 +26,7 @@ from phyradgs_cl.simulation.scenes import bone_from
 
 SHAPE = (14, 18)
 GEOMETRY = ConeGeometry(5.0, 7.5, SHAPE, (3.9 / 14, 3.9 / 18))
+PARALLEL = ParallelGeometry(SHAPE, (2.8 / 14, 2.8 / 18), (0.05, -0.04))
 GRID = Grid.cube(16, 2.0)
 PHANTOM = shepp_logan(1.0)
 FLY = Protocol(views=3, exposure_deg=12.0, readout_ratio=0.5)
@@ -58,6 +59,34 @@ def test_every_line_averages_over_its_own_window(axis, direction, model) -> None
         where = (line, slice(None)) if axis == "rows" else (slice(None), line)
         expected[where] = mean[where]
     assert_near(found, expected, ANALYTIC_FRAME)
+
+
+@pytest.mark.parametrize(("axis", "direction"), [("rows", -1), ("columns", 1)])
+@pytest.mark.parametrize("model", ["log", "intensity"])
+def test_parallel_rays_of_a_line_average_over_its_own_window(axis, direction, model) -> None:
+    """A ball far from the axis, whose chord follows from its column and row: no ray's ends are needed."""
+    samples, frame, centre, radius = 4, 2, (0.7, -0.4, 0.3), 0.6
+    ball = EllipsoidPhantom((Ellipsoid(centre, (radius,) * 3, 0.9),), "ball")
+    options = SimulationOptions(FLY, axis, direction, model, time_samples=samples)
+    frames = simulate(AnalyticSource(ball, PARALLEL), PARALLEL, GRID, options).projections[frame]
+    v_mm, u_mm = (
+        (np.arange(count) - (count - 1) / 2) * pitch + offset
+        for count, pitch, offset in zip(SHAPE, PARALLEL.pixel_size_mm, PARALLEL.detector_offset_mm, strict=True)
+    )
+    lines = SHAPE[0] if axis == "rows" else SHAPE[1]
+    expected = np.zeros(SHAPE)
+    for line in range(lines):
+        order = line if direction > 0 else lines - 1 - line
+        delay_deg = order / (lines - 1) * 0.5 * 12.0
+        angles = np.deg2rad(frame * 120.0 + delay_deg + (np.arange(samples) + 0.5) / samples * 12.0)
+        column_mm = centre[1] * np.cos(angles) - centre[0] * np.sin(angles)
+        off = (u_mm[None, None] - column_mm[:, None, None]) ** 2 + (v_mm[None, :, None] - centre[2]) ** 2
+        chords = 0.9 * 2 * np.sqrt(np.maximum(radius**2 - off, 0))
+        mean = chords.mean(axis=0) if model == "log" else -np.log(np.exp(-chords).mean(axis=0))
+        where = (line, slice(None)) if axis == "rows" else (slice(None), line)
+        expected[where] = mean[where]
+    assert expected.max() > 0.9
+    assert_near(frames, expected, ANALYTIC_FRAME)
 
 
 def test_stop_and_shoot_stands_at_the_middle_of_the_fly_scans_window() -> None:
@@ -96,12 +125,13 @@ def test_default_time_samples_follow_arc_and_voxels() -> None:
     assert run(SimulationOptions(FLY)).provenance["time_samples"] == 8
 
 
-def test_voxels_and_closed_form_meet(rt) -> None:
+@pytest.mark.parametrize("geometry", [GEOMETRY, PARALLEL], ids=["cone", "parallel"])
+def test_voxels_and_closed_form_meet(rt, geometry) -> None:
     grid = Grid.cube(64, 2.0)
-    source = VolumeSource(rt, PHANTOM.voxelise(grid, 3), grid, GEOMETRY, "columns")
+    source = VolumeSource(rt, PHANTOM.voxelise(grid, 3), grid, geometry, "columns")
     options = SimulationOptions(FLY, "columns", time_samples=4)
-    voxels = simulate(source, GEOMETRY, grid, options).projections
-    exact = run(options).projections
+    voxels = simulate(source, geometry, grid, options).projections
+    exact = simulate(AnalyticSource(PHANTOM, geometry), geometry, grid, options).projections
     assert np.linalg.norm(voxels - exact) <= VOXEL_SOURCE * np.linalg.norm(exact)
 
 

@@ -59,7 +59,8 @@ def scan_summary(path: str | Path, sha256: str | None = None) -> dict[str, objec
         counts |= {name: count for name, count in applied.items() if isinstance(count, int)}
     return {
         "title": scan.title, **counts, "data": f"{header.data_type} {header.quantity}",
-        "fly_scan": scan.is_fly, "trajectory": _trajectory_word(scan), **vars(scan.geometry),
+        "fly_scan": scan.is_fly, "trajectory": _trajectory_word(scan),
+        **({"geometry": "parallel beam"} if scan.is_parallel else {}), **vars(scan.geometry),
         **_timing_facts(scan), "detector_model": scan.detector_model, **_panel_facts(scan),
         "pixel_mask": header.mask_shape is not None, "grid_shape": scan.grid.shape,
         "grid_voxel_size_mm": scan.grid.voxel_size_mm, "grid_stored": header.has_grid,
