@@ -46,13 +46,8 @@ class BeadProblem(CoarseFrames):
         fewer = [fewer_frames(scan, most_frames) for scan in scans]
         measured, valid = measured_blocks([binned(scan, block) for scan in fewer])
         return cls(
-            scans=[without_pixels(scan) for scan in fewer],
-            block=block,
-            measured=measured,
-            valid=valid,
-            phantom=phantom,
-            start=start,
-            clipped_noise=_clipped_noise(fewer),
+            scans=[without_pixels(scan) for scan in fewer], block=block, measured=measured, valid=valid,
+            phantom=phantom, start=start, clipped_noise=_clipped_noise(fewer),
         )
 
     def operator(self, correction: GeometryCorrection, views: Views | Sway | None = None) -> BeadOperator:

@@ -6,15 +6,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from phyradgs_cl.acquisition import PerRow, Scan
+from phyradgs_cl.acquisition.altered import coarse
 from phyradgs_cl.acquisition.altered.angles import exposure_steps
-from phyradgs_cl.acquisition.altered.coarse import (
-    MOST_FRAMES,
-    SMOOTHING,
-    binned,
-    coarse_grid,
-    fewer_frames,
-    smooth,
-)
 from phyradgs_cl.acquisition.altered.perturbed import GeometryCorrection, Sway, Views, perturb, scan_course
 from phyradgs_cl.calibrate.stages import Stage
 from phyradgs_cl.detector import noise_level
@@ -73,22 +66,24 @@ class CoarseProblem(CoarseFrames):
 
     @classmethod
     def of(
-        cls, rt: Runtime, asks_lag: bool, scans: Sequence[Scan], stage: Stage, most_frames: int = MOST_FRAMES
+        cls, rt: Runtime, asks_lag: bool, scans: Sequence[Scan], stage: Stage,
+        most_frames: int = coarse.MOST_FRAMES,
     ) -> "CoarseProblem":
         """Makes the scans as coarse as the stage says."""
         block = stage.block(scans[0])
 
         def shrink(scan: Scan) -> Scan:
-            return binned(smooth(fewer_frames(scan, most_frames), _smoothing_px(scan, block)), block)
+            fewer = coarse.fewer_frames(scan, most_frames)
+            return coarse.binned(coarse.smooth(fewer, _smoothing_px(scan, block)), block)
 
-        fewer = [fewer_frames(scan, most_frames) for scan in scans]
+        fewer = [coarse.fewer_frames(scan, most_frames) for scan in scans]
         small = [shrink(scan) for scan in scans]
         measured, valid = measured_blocks(small)
         problem = cls(
             rt=rt,
             scans=[without_pixels(scan) for scan in fewer],
             block=block,
-            grid=coarse_grid(scans[0].grid, small[0].geometry),
+            grid=coarse.coarse_grid(scans[0].grid, small[0].geometry),
             measured=measured,
             valid=valid,
             course=np.concatenate([scan_course(scan) for scan in fewer]),
@@ -110,7 +105,7 @@ class CoarseProblem(CoarseFrames):
         """Returns A of all frames after a correction."""
         tables = []
         for scan in self.scans:
-            small = binned(perturb(scan, correction, views), self.block)
+            small = coarse.binned(perturb(scan, correction, views), self.block)
             times = exposure_steps(scan, max(self.grid.shape[1:]), _VOXELS_PER_TIME, _MOST_TIMES)
             tables += [PerRow(sub_intervals=times).cells(small, frame) for frame in range(small.frames)]
         return RayOperator(self.rt, self.grid, small.geometry.detector_shape, tables)
@@ -169,7 +164,7 @@ def _smoothing_px(scan: Scan, block: int) -> float | tuple[float, float]:
     if block == 1:
         return 0.0
     is_rolling = scan.shutter.readout_s > 0 and scan.shutter.axis == "rows"
-    return 0.0 if is_rolling else SMOOTHING * block, SMOOTHING * block
+    return 0.0 if is_rolling else coarse.SMOOTHING * block, coarse.SMOOTHING * block
 
 
 def _transmission_before(scan: Scan, shrink: Callable[[Scan], Scan]) -> np.ndarray:

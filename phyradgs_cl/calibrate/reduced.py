@@ -108,13 +108,9 @@ def reduced(
     sizes = np.maximum(np.linalg.norm(whole, axis=1), 1e-30)
     unit = whole / sizes[:, None]
     return Reduced(
-        names=tuple(one.name for one in parameters),
-        mismatch=np.array([one.mismatch for one in parameters]),
-        jacobian=np.array([one.ravel() for one in jacobian], np.float64),
-        sizes=sizes,
-        whole_gram=unit @ unit.T,
-        residual=residual.ravel().astype(np.float64),
-        frames=len(residual),
+        names=tuple(one.name for one in parameters), mismatch=np.array([one.mismatch for one in parameters]),
+        jacobian=np.array([one.ravel() for one in jacobian], np.float64), sizes=sizes,
+        whole_gram=unit @ unit.T, residual=residual.ravel().astype(np.float64), frames=len(residual),
         noise=problem.noise(residual),
     )
 

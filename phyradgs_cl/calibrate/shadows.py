@@ -38,9 +38,7 @@ class BeadOperator:
         places, steps = pose[:, :2] - placement[3:DENSITY], pose[:, 2:]
         is_rows = self.tables[0].axis == "rows"
         panel_lines = _PanelLines(
-            source=places[:, 0] @ turn,
-            first=places[:, 1] @ turn,
-            line_step=steps[:, int(is_rows)] @ turn,
+            source=places[:, 0] @ turn, first=places[:, 1] @ turn, line_step=steps[:, int(is_rows)] @ turn,
             pixel_step=steps[:, 1 - int(is_rows)] @ turn,
             line=np.tile(np.repeat(np.arange(lines), samples), frames),
             pixels=self.shape[1] if is_rows else self.shape[0],

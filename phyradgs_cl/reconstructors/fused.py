@@ -51,9 +51,7 @@ class FusedOptions:
         """The options of the first half."""
         motion: Motion = PerRow() if isinstance(self.motion, Exact) else self.motion
         return FistaOptions(
-            motion=motion,
-            iterations=self.voxel_iterations,
-            detector_model=self.detector_model,
+            motion=motion, iterations=self.voxel_iterations, detector_model=self.detector_model,
             prior_weight=self.prior_weight,
         )
 

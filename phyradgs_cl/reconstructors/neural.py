@@ -16,13 +16,8 @@ from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.neural import LineOptions, NeuralOptions, require_torch
-from phyradgs_cl.reconstructors.checkpoint import (
-    State,
-    check_array,
-    count_of,
-    restore_generator,
-    state_arrays,
-)
+from phyradgs_cl.reconstructors import checkpoint
+from phyradgs_cl.reconstructors.checkpoint import State
 from phyradgs_cl.reconstructors.fdk import static_fdk
 from phyradgs_cl.reconstructors.loop import Loop
 from phyradgs_cl.reconstructors.method import Method
@@ -100,18 +95,18 @@ class _Passes:
     def restore(self, state: State) -> None:
         trainer, frames = self.trainer, self.trainer.scan.frames
         names = ("parameters", "moments", "queue", "losses")
-        parameters, moments, queue, losses = state_arrays(state, names)
-        check_array("parameters", parameters, (trainer.parameters,), np.float32)
-        check_array("moments", moments, (2, trainer.parameters), np.float32)
-        steps = count_of(state, "steps", self.iterations * frames)
-        check_array("queue", queue, (frames - steps % frames,), np.int64)
+        parameters, moments, queue, losses = checkpoint.state_arrays(state, names)
+        checkpoint.check_array("parameters", parameters, (trainer.parameters,), np.float32)
+        checkpoint.check_array("moments", moments, (2, trainer.parameters), np.float32)
+        steps = checkpoint.count_of(state, "steps", self.iterations * frames)
+        checkpoint.check_array("queue", queue, (frames - steps % frames,), np.int64)
         if not 0 <= queue.min() <= queue.max() < frames:
             found, expected = f"{queue.min()} to {queue.max()}", f"frames from 0 to {frames - 1}"
             raise InputError("checkpoint, array queue", found, expected, "start without --resume")
-        check_array("losses", losses, (steps % frames or min(steps, frames),), np.float64)
-        restore_generator(trainer.rng, state)
+        checkpoint.check_array("losses", losses, (steps % frames or min(steps, frames),), np.float64)
+        checkpoint.restore_generator(trainer.rng, state)
         trainer.steps, trainer.queue, trainer.losses = steps, queue.tolist(), losses.tolist()
-        trainer.restore(parameters, moments, count_of(state, "updates", steps))
+        trainer.restore(parameters, moments, checkpoint.count_of(state, "updates", steps))
 
     def present_volume(self) -> tuple[np.ndarray, Grid]:
         return self.trainer.volume(self.trainer.scan.grid), self.trainer.scan.grid
@@ -119,18 +114,8 @@ class _Passes:
 
 # Paper, section 3, and the released configuration chest_50: 192 samples for 128 voxels per side
 NAF_PUBLISHED = NeuralOptions(
-    iterations=1500,
-    rays=1024,
-    jitter="sample",
-    positive_only=True,
-    voxel_points=1,
-    levels=16,
-    base_resolution=16,
-    table_log2=19,
-    density_bound=1.0,
-    first_share=0.5,
-    rate=1e-3,
-    rate_factor=0.1,
+    iterations=1500, rays=1024, jitter="sample", positive_only=True, voxel_points=1, levels=16,
+    base_resolution=16, table_log2=19, density_bound=1.0, first_share=0.5, rate=1e-3, rate_factor=0.1,
     rate_step=1500,
 )
 NAF_PRESETS = {"default": NeuralOptions(), "published": NAF_PUBLISHED}

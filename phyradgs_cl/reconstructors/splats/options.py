@@ -90,30 +90,19 @@ class SplatOptions:
 
 PUBLISHED_CONTROL = DensityControl(threshold=5e-5, prune_aspect=0.0)
 _PAPER = SplatOptions(
-    motion=MicroViews(8, 5),
-    gaussians=50_000,
-    iterations=20_000,
-    rates=PUBLISHED_RATES,
+    motion=MicroViews(8, 5), gaussians=50_000, iterations=20_000, rates=PUBLISHED_RATES,
     control=PUBLISHED_CONTROL,
 )
 _RELEASED = replace(_PAPER, ssim_weight=0.25, tv_weight=0.05, density_weight=0.01, shape_weight=0.02)
 # a sixth of the iterations, the schedule scaled with them, and two or three segments per frame
 _QUICK = SplatOptions(
-    motion=Exact(time_error=0.02),
-    iterations=500,
-    parameter_terms_from=80,
+    motion=Exact(time_error=0.02), iterations=500, parameter_terms_from=80,
     control=DensityControl(every=20, start_iteration=80),
 )
 
 PRESETS = {"default": SplatOptions(), "quick": _QUICK, "paper": _PAPER, "released": _RELEASED}
 # R2-Gaussian's constants; its 30,000 iterations are cut to ours unless asked for, rates decay over the run
 R2_PUBLISHED = SplatOptions(
-    motion=Static(),
-    affine=True,
-    gaussians=50_000,
-    ssim_weight=0.25,
-    tv_weight=0.05,
-    density_weight=0.0,
-    rates=PUBLISHED_RATES,
-    control=PUBLISHED_CONTROL,
+    motion=Static(), affine=True, gaussians=50_000, ssim_weight=0.25, tv_weight=0.05, density_weight=0.0,
+    rates=PUBLISHED_RATES, control=PUBLISHED_CONTROL,
 )

@@ -11,13 +11,8 @@ from phyradgs_cl.fields import Gaussians, Grid
 from phyradgs_cl.fields.gaussians import SCALE
 from phyradgs_cl.operators import voxelise
 from phyradgs_cl.optim import Population, control_density
-from phyradgs_cl.reconstructors.checkpoint import (
-    State,
-    check_cloud,
-    count_of,
-    restore_generator,
-    state_arrays,
-)
+from phyradgs_cl.reconstructors import checkpoint
+from phyradgs_cl.reconstructors.checkpoint import State
 from phyradgs_cl.reconstructors.splats.device import DeviceCloud, Scale
 from phyradgs_cl.reconstructors.splats.options import SplatOptions
 from phyradgs_cl.reconstructors.splats.start import box_of
@@ -102,12 +97,13 @@ class SplatRun:
 
     def restore(self, state: State) -> None:
         """Continues from ``state``, on any number of ranks up to the batch."""
-        check_cloud(state, self.frames.count)
-        raw, moments, statistics, queue = state_arrays(state, ("raw", "moments", "statistics", "queue"))
-        self.iteration = count_of(state, "iteration", self.iterations)
-        self.batch = max(count_of(state, "batch", self.frames.count), 1)
+        checkpoint.check_cloud(state, self.frames.count)
+        names = ("raw", "moments", "statistics", "queue")
+        raw, moments, statistics, queue = checkpoint.state_arrays(state, names)
+        self.iteration = checkpoint.count_of(state, "iteration", self.iterations)
+        self.batch = max(checkpoint.count_of(state, "batch", self.frames.count), 1)
         self.sharing = sharing_of(self.rt.ranks, self.batch)
-        restore_generator(self.rng, state)
+        checkpoint.restore_generator(self.rng, state)
         self._load(Population(raw, moments))
         self.cloud.write_statistics(statistics)
         self._queue = [int(f) for f in queue]

@@ -30,13 +30,8 @@ def first_population(
     activation = options.activation(grid)
     requested = options.gaussians_for(grid)
     cloud = initial_cloud(
-        volume,
-        grid,
-        requested,
-        threshold=options.initial_threshold,
-        density_share=options.initial_density,
-        scale_bounds=(activation.scale_min, activation.scale_max),
-        scale_factor=options.initial_scale,
+        volume, grid, requested, threshold=options.initial_threshold, density_share=options.initial_density,
+        scale_bounds=(activation.scale_min, activation.scale_max), scale_factor=options.initial_scale,
         rng=rng,
     )
     if options.asks_for_gaussians and cloud.count < requested:

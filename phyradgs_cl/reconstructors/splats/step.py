@@ -44,14 +44,9 @@ class FrameStep:
         self.frames = DeviceFrames(rt, scan, options, scale)
         lines, width = self.frames.lines, self.frames.width
         self.projector = SplatProjector(
-            rt,
-            lines,
-            width,
-            affine=options.affine,
-            cutoff_sigma=options.cutoff_sigma,
+            rt, lines, width, affine=options.affine, cutoff_sigma=options.cutoff_sigma,
             time_error=getattr(options.motion, "time_error", DEFAULT_TIME_ERROR),
-            pixel_footprint=options.pixel_footprint,
-            intensity_unit=self.frames.intensity_unit,
+            pixel_footprint=options.pixel_footprint, intensity_unit=self.frames.intensity_unit,
         )
         weights = options.ssim_weight, options.l1_weight, options.poisson_weight
         self.loss = ImageLoss(rt, lines, width, self.projector.pitch, *weights)
@@ -82,15 +77,9 @@ class FrameStep:
             by_volume = self.tv.evaluate(self.crop.forward(gaussians, self.grid, corner))
             self.crop.backward(gaussians, self.grid, by_volume, by_cloud, add=True, weight=options.tv_weight)
         self.adam.chain(
-            cloud.raw,
-            gaussians.rows,
-            by_cloud,
-            statistics,
-            cloud.count,
-            gaussians.stride,
+            cloud.raw, gaussians.rows, by_cloud, statistics, cloud.count, gaussians.stride,
             density_weight=options.density_weight if late else 0.0,
-            shape_weight=options.shape_weight if late else 0.0,
-            shape_ratio=options.shape_ratio,
+            shape_weight=options.shape_weight if late else 0.0, shape_ratio=options.shape_ratio,
             shape_floor=options.shape_floor,
         )
 

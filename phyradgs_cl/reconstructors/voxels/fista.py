@@ -21,15 +21,9 @@ from phyradgs_cl.fields.volume import MOST_VOXELS
 from phyradgs_cl.reconstructors.checkpoint import State, state_arrays
 from phyradgs_cl.reconstructors.method import Method
 from phyradgs_cl.reconstructors.result import Reconstruction, option_facts
+from phyradgs_cl.reconstructors.voxels import priors
 from phyradgs_cl.reconstructors.voxels.prior_weight import PriorWeight, frame_error
-from phyradgs_cl.reconstructors.voxels.priors import (
-    PRIORS,
-    Denoiser,
-    Prior,
-    PriorInputs,
-    prior_of,
-    volumes_of,
-)
+from phyradgs_cl.reconstructors.voxels.priors import Denoiser, Prior
 from phyradgs_cl.reconstructors.voxels.run import Algorithm, IterativeOptions, MethodInputs, run_iterations
 from phyradgs_cl.reconstructors.voxels.stages import Stage, merge_subvoxels, repeated, run_stages
 from phyradgs_cl.reconstructors.voxels.subsets import OrderedSubsets
@@ -68,7 +62,7 @@ class FistaOptions(IterativeOptions):
     def __post_init__(self) -> None:
         super().__post_init__()
         if not (callable(self.prior) or ":" in self.prior):
-            checks.one_of("prior", self.prior, (*PRIORS, "package.module:function"))
+            checks.one_of("prior", self.prior, (*priors.PRIORS, "package.module:function"))
         if self.prior != "piccs" and self.prior_share != FistaOptions.prior_share:
             found = f"{self.prior_share:g} with the prior {self.prior}"
             raise InputError("prior_share", found, "the prior piccs", "set prior=piccs, or leave prior_share out")
@@ -185,12 +179,13 @@ def _run(inputs: MethodInputs, options: FistaOptions, image: np.ndarray | None, 
     image, initial = repeated(image, parts), repeated(inputs.initial, parts)
 
     def make(system: System) -> Fista:
-        prior_inputs = PriorInputs(rt, scan.grid, options.tv_iterations, options.iterations, image, options.prior_share)
+        of_grid = rt, scan.grid, options.tv_iterations, options.iterations
+        prior = priors.prior_of(options.prior, priors.PriorInputs(*of_grid, image, options.prior_share))
         weight = PriorWeight(system, frame_error(scan, options.motion), options.prior_weight)
-        return Fista(system, options, prior_of(options.prior, prior_inputs), weight)
+        return Fista(system, options, prior, weight)
 
     stage_inputs = replace(inputs, scan=scan, options=options, initial=initial)
-    volumes = _VOLUMES + volumes_of(options.prior)
+    volumes = _VOLUMES + priors.volumes_of(options.prior)
     return run_iterations("fista", make, stage_inputs, volumes=volumes, frames=_FRAMES)
 
 
@@ -200,6 +195,6 @@ def _gains_from_subvoxels(inputs: MethodInputs, parts: int) -> bool:
     if coarse_voxels > _MOST_DIVIDED:
         return False
     voxels = coarse_voxels * parts**3
-    sizes_bytes = *[4 * voxels] * (_VOLUMES + 2), 4 * voxels * volumes_of(inputs.options.prior)
+    sizes_bytes = *[4 * voxels] * (_VOLUMES + 2), 4 * voxels * priors.volumes_of(inputs.options.prior)
     has_room = voxels <= MOST_VOXELS and rt.room().holds(*sizes_bytes)
     return not rt.ranks.any(not has_room)

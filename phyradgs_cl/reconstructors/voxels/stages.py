@@ -13,14 +13,8 @@ import numpy as np
 
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.metrics.align import block_means
-from phyradgs_cl.reconstructors.checkpoint import (
-    State,
-    check_array,
-    checked_history,
-    count_of,
-    history_arrays,
-    state_arrays,
-)
+from phyradgs_cl.reconstructors import checkpoint
+from phyradgs_cl.reconstructors.checkpoint import State
 from phyradgs_cl.reconstructors.result import Progress, Reconstruction, Report
 from phyradgs_cl.reconstructors.voxels.run import MethodInputs
 
@@ -53,20 +47,20 @@ class StageProgress:
 
     def state(self, stage_state: State) -> State:
         """Returns the state of the present stage as one of the whole run."""
-        history = history_arrays(self.record, self.seconds)
+        history = checkpoint.history_arrays(self.record, self.seconds)
         volume = {} if self.index == 0 or self.volume is None else {_VOLUME: self.volume}
         history = {_HISTORY[name]: array for name, array in history.items()}
         return {**stage_state, **volume, **history, _STAGE: np.array(self.index)}
 
     def restore(self, state: State, stages: Sequence[Stage], grid: Grid) -> State:
         """Continues from ``state``. Returns the present stage's own. Raises InputError for one that does not fit the run."""
-        self.index = count_of(state, _STAGE, len(stages) - 1)
+        self.index = checkpoint.count_of(state, _STAGE, len(stages) - 1)
         if self.index:
-            (volume,) = state_arrays(state, [_VOLUME])
-            check_array(_VOLUME, volume, grid.shape, np.float32)
+            (volume,) = checkpoint.state_arrays(state, [_VOLUME])
+            checkpoint.check_array(_VOLUME, volume, grid.shape, np.float32)
             self.volume = volume
-        history = dict(zip(_HISTORY, state_arrays(state, list(_HISTORY.values())), strict=True))
-        self.record, self.seconds = checked_history(history)
+        history = dict(zip(_HISTORY, checkpoint.state_arrays(state, list(_HISTORY.values())), strict=True))
+        self.record, self.seconds = checkpoint.checked_history(history)
         self.iterations = sum(stage.iterations for stage in stages[: self.index])
         return {name: array for name, array in state.items() if name not in (_STAGE, _VOLUME, *_HISTORY.values())}
 
@@ -106,10 +100,8 @@ def run_stages(stages: Sequence[Stage], inputs: MethodInputs) -> Reconstruction:
 def _of_whole_run(stage: Stage, done: StageProgress, total: int, grid: Grid, progress: Progress) -> Progress:
     """Returns the progress of one stage as that of the whole run."""
     return progress.mapped(
-        state=done.state,
-        volume=lambda volume, _: (stage.merge(volume, done.volume), grid),
-        iteration=done.iterations + progress.iteration,
-        iterations=total,
+        state=done.state, volume=lambda volume, _: (stage.merge(volume, done.volume), grid),
+        iteration=done.iterations + progress.iteration, iterations=total,
         seconds=done.seconds + progress.seconds,
     )
 

@@ -159,11 +159,8 @@ class System:
         if valid is not None and len(valid.shape) == 3:
             valid = self.space.take(valid, numbers)
         return replace(
-            self,
-            operator=self.operator.subset(numbers),
-            measured=self.space.take(self.measured, numbers),
-            valid=valid,
-            intensity=None if self.intensity is None else self.intensity.subset(numbers),
+            self, operator=self.operator.subset(numbers), measured=self.space.take(self.measured, numbers),
+            valid=valid, intensity=None if self.intensity is None else self.intensity.subset(numbers),
             transmission=None if self.transmission is None else self.space.take(self.transmission, numbers),
         )
 
