@@ -5,26 +5,25 @@
 
 Everything is documented with runnable examples in docs/api.md. ``device`` is what ``--device`` takes, or a Runtime."""
 
-from phyradgs_cl.acquisition import (
-    CircularOrbit,
-    ConeGeometry,
-    ConstantSpeed,
-    EncoderTable,
+from phyradgs_cl.acquisition import ConeGeometry, Scan, Shutter, TimeCells
+from phyradgs_cl.acquisition.motion import (
     Exact,
-    FrameSweeps,
     LineMiddles,
     MicroViews,
     Motion,
     OwnTimes,
     ParallelGeometry,
     PerRow,
-    PoseTable,
-    Scan,
-    Shutter,
-    SpeedRamp,
     Static,
     StaticStart,
-    TimeCells,
+)
+from phyradgs_cl.acquisition.trajectory import (
+    CircularOrbit,
+    ConstantSpeed,
+    EncoderTable,
+    FrameSweeps,
+    PoseTable,
+    SpeedRamp,
     Trajectory,
 )
 from phyradgs_cl.api.calibration import calibrate, move_views, pose_gradient

@@ -23,16 +23,10 @@ from phyradgs_cl.api.runs import check_scan
 from phyradgs_cl.errors import InputError, naming_arguments
 from phyradgs_cl.fields import Gaussians, Grid
 from phyradgs_cl.fields.gaussians import QUATERNION, ROWS, SCALE
-from phyradgs_cl.operators import (
-    DEFAULT_CUTOFF_SIGMA,
-    DensityOperator,
-    IntensityOperator,
-    RayOperator,
-    SplatOperator,
-    VoxelOperator,
-)
+from phyradgs_cl.operators import DensityOperator, RayOperator, SplatOperator, VoxelOperator
 from phyradgs_cl.operators import voxelise as voxelise_rows
-from phyradgs_cl.operators.splats.projector import DEFAULT_TIME_ERROR
+from phyradgs_cl.operators.rays.intensity import IntensityOperator
+from phyradgs_cl.operators.splats.projector import DEFAULT_CUTOFF_SIGMA, DEFAULT_TIME_ERROR
 from phyradgs_cl.reconstructors.splats.device import tables_of
 from phyradgs_cl.reconstructors.splats.method import first_cloud
 from phyradgs_cl.reconstructors.splats.options import SplatOptions

@@ -21,19 +21,11 @@ from phyradgs_cl.io import Volume, read_scan, read_state, read_volume, write_sca
 from phyradgs_cl.phantoms import PHANTOMS
 from phyradgs_cl.prepare import DEFAULT_STEPS, flat_correction
 from phyradgs_cl.progress import Ticker, has_reader
-from phyradgs_cl.reconstructors import (
-    DEFAULT_METHOD,
-    InitialVolume,
-    ProgressReport,
-    Reconstruction,
-    State,
-    ignore_progress,
-    interrupted,
-    plan_run,
-    preprocessing_of,
-)
+from phyradgs_cl.reconstructors import DEFAULT_METHOD, Reconstruction, State, preprocessing_of
 from phyradgs_cl.reconstructors import reconstruct as run_method
 from phyradgs_cl.reconstructors.frames.preprocess import prepared
+from phyradgs_cl.reconstructors.plan import InitialVolume, plan_run
+from phyradgs_cl.reconstructors.result import ProgressReport, ignore_progress, interrupted
 from phyradgs_cl.signals import keep_finished_work
 from phyradgs_cl.simulation import OPTION_NAMES, scanner_for, scanner_options, simulated_scan
 from phyradgs_cl.text import suggest_name

@@ -8,16 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from phyradgs_cl import checks
-from phyradgs_cl.acquisition import (
-    CircularOrbit,
-    ConeGeometry,
-    FrameSweeps,
-    ParallelGeometry,
-    PoseTable,
-    Scan,
-    Shutter,
-)
-from phyradgs_cl.acquisition.geometry import Geometry, default_grid
+from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, FrameSweeps, PoseTable, Scan, Shutter
+from phyradgs_cl.acquisition.geometry import Geometry, ParallelGeometry, default_grid
 from phyradgs_cl.acquisition.plausible import check_plausible
 from phyradgs_cl.acquisition.trajectory import resting_poses
 from phyradgs_cl.errors import InputError

@@ -13,14 +13,7 @@ from numpy.typing import NDArray
 from phyradgs_cl import checks
 from phyradgs_cl.errors import InputError, PhyradgsError
 from phyradgs_cl.fields import Grid
-from phyradgs_cl.io import (
-    Volume,
-    check_writable,
-    file_kind,
-    partial_path,
-    read_volume,
-    written_beside,
-)
+from phyradgs_cl.io import Volume, check_writable, file_kind, partial_path, read_volume, written_beside
 from phyradgs_cl.reconstructors import Progress
 from phyradgs_cl.report.images import bytes_of, grey_range, png_bytes, top_row_first
 

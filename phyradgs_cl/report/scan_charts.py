@@ -6,16 +6,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from phyradgs_cl.acquisition import (
-    CircularOrbit,
-    LineMiddles,
-    MicroViews,
-    Motion,
-    OwnTimes,
-    PerRow,
-    Scan,
-    StaticStart,
-)
+from phyradgs_cl.acquisition import CircularOrbit, Scan
+from phyradgs_cl.acquisition.motion import LineMiddles, MicroViews, Motion, OwnTimes, PerRow, StaticStart
 from phyradgs_cl.acquisition.plot import draw_windows
 from phyradgs_cl.drawing import ACCENT, BOX, EDGE, INK, SAMPLE, SOFT, round_length
 from phyradgs_cl.report.charts import SIZE, chart, note

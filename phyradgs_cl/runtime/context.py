@@ -14,16 +14,8 @@ from phyradgs_cl.checks import ceil_div
 from phyradgs_cl.errors import DeviceError
 from phyradgs_cl.parallel import Communicator
 from phyradgs_cl.runtime.device import DeviceInfo, choose_device
-from phyradgs_cl.runtime.memory import (
-    DeviceArray,
-    LaterItem,
-    MemoryLedger,
-    Room,
-    Traffic,
-    memory_limit,
-    naming_failures,
-)
-from phyradgs_cl.runtime.opencl import Kernel, cl, kernel_source
+from phyradgs_cl.runtime.memory import DeviceArray, LaterItem, MemoryLedger, Room, Traffic, memory_limit
+from phyradgs_cl.runtime.opencl import Kernel, cl, kernel_source, naming_failures
 from phyradgs_cl.runtime.profile import KernelUse, Profile, Rates, measure_rates
 
 log = logging.getLogger(__name__)

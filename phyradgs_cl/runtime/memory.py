@@ -7,8 +7,7 @@ import sys
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
-from functools import wraps
-from typing import Any, ParamSpec, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -25,7 +24,6 @@ for _power, _letter in enumerate("KMGT", start=1):
 log = logging.getLogger(__name__)
 # mem object allocation failure, out of resources, out of host memory, invalid buffer size
 _MEMORY_CODES = (-4, -5, -6, -61)
-P = ParamSpec("P")
 R = TypeVar("R")
 
 
@@ -144,26 +142,6 @@ class MemoryLedger:
         found = f"{work} failed ({' '.join(str(error).split())[:300] or type(error).__name__})"
         remedy = "see the system's log, or try another --device"
         return DeviceError(f"device {self.device.name}", found, "a device that works", remedy)
-
-
-def naming_failures(work: str | None = None) -> Callable[[Callable[P, R]], Callable[P, R]]:
-    """Decorates a method of a runtime, so that OpenCL's errors become DeviceError or MemoryShortage.
-
-    Drivers queue work: a launch may be refused at once, or fail later in any call that waits. ``work`` names the method's
-    work; None takes the name of the kernel, the first argument of a launch."""
-
-    def decorate(method: Callable[P, R]) -> Callable[P, R]:
-        @wraps(method)
-        def named(*args: P.args, **kwargs: P.kwargs) -> R:
-            try:
-                return method(*args, **kwargs)
-            except cl.Error as error:
-                what = work or f"a launch of {args[1].function_name}"  # type: ignore[attr-defined]
-                raise args[0].ledger.error(what, error) from error  # type: ignore[attr-defined]
-
-        return named
-
-    return decorate
 
 
 def reported_bytes(device: DeviceInfo) -> int:

@@ -4,14 +4,15 @@ Sources are files of ``cl/`` with their headers pasted in, because an include pa
 ``#line`` marks keep file and line in the compiler's messages."""
 
 import re
+from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cache
-from typing import TYPE_CHECKING, Any
+from functools import cache, wraps
+from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar
 
 from phyradgs_cl import resource
 from phyradgs_cl.runtime import pocl
 
-__all__ = ["Kernel", "cl", "kernel_source"]
+__all__ = ["Kernel", "cl", "kernel_source", "naming_failures"]
 
 if TYPE_CHECKING:
     import pyopencl as cl
@@ -28,6 +29,8 @@ else:
 
     cl = _WhenUsed()
 
+P = ParamSpec("P")
+R = TypeVar("R")
 _INCLUDE = re.compile(r'^\s*#include\s+"([^"]+)"\s*$')
 
 
@@ -62,3 +65,23 @@ def _expand(relative: str, pasted: set[str]) -> list[str]:
         else:
             lines.append("")  # keeps the line numbers
     return lines
+
+
+def naming_failures(work: str | None = None) -> Callable[[Callable[P, R]], Callable[P, R]]:
+    """Decorates a method of a runtime, so that OpenCL's errors become DeviceError or MemoryShortage.
+
+    Drivers queue work: a launch may be refused at once, or fail later in any call that waits. ``work`` names the method's
+    work; None takes the name of the kernel, the first argument of a launch."""
+
+    def decorate(method: Callable[P, R]) -> Callable[P, R]:
+        @wraps(method)
+        def named(*args: P.args, **kwargs: P.kwargs) -> R:
+            try:
+                return method(*args, **kwargs)
+            except cl.Error as error:
+                what = work or f"a launch of {args[1].function_name}"  # type: ignore[attr-defined]
+                raise args[0].ledger.error(what, error) from error  # type: ignore[attr-defined]
+
+        return named
+
+    return decorate

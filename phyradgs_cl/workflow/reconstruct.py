@@ -17,16 +17,8 @@ from phyradgs_cl import reconstructors as methods
 from phyradgs_cl.acquisition import MicroViews, Scan
 from phyradgs_cl.acquisition.geometry import cuts
 from phyradgs_cl.errors import InputError, OutputError, PhyradgsError, naming_host_memory
-from phyradgs_cl.io import (
-    checkpoint_path,
-    former_checkpoint_path,
-    hashing,
-    only_run,
-    partial_path,
-    read_checkpoint,
-    write_checkpoint,
-    write_volume,
-)
+from phyradgs_cl.io import hashing, only_run, partial_path, read_checkpoint, write_checkpoint, write_volume
+from phyradgs_cl.io.output import checkpoint_path, former_checkpoint_path
 from phyradgs_cl.metrics import VOXEL_BY_VOXEL, aligned, compare
 from phyradgs_cl.parallel import Communicator
 from phyradgs_cl.reconstructors.result import COMPARED, HELD_OUT

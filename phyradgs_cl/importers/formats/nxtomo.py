@@ -13,15 +13,7 @@ import numpy as np
 from phyradgs_cl.acquisition import CircularOrbit, FrameSweeps, Scan
 from phyradgs_cl.acquisition.geometry import Geometry
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.importers.assemble import (
-    StoredTiming,
-    Timing,
-    Turned,
-    assemble_scan,
-    cone,
-    make_timing,
-    turning,
-)
+from phyradgs_cl.importers import assemble
 from phyradgs_cl.importers.options import OF_BARE_FRAMES, ImportOptions, needed
 from phyradgs_cl.importers.reading import frames as reading
 from phyradgs_cl.importers.reading.frames import line_integrals, oriented
@@ -80,7 +72,8 @@ def import_scan(path: Path, options: ImportOptions) -> Scan:
     if mask is not None:
         mask = oriented(turn.frames(mask), options, "bottom")
         integrals = replace(integrals, mask=united(mask, integrals.mask))
-    return assemble_scan(integrals, trajectory, geometry, timing, options, title=title, source=str(path))
+    parts = integrals, trajectory, geometry, timing, options
+    return assemble.assemble_scan(*parts, title=title, source=str(path))
 
 
 def _image_key(source: Hdf5Source, detector: str, frames: int) -> np.ndarray:
@@ -94,7 +87,7 @@ def _image_key(source: Hdf5Source, detector: str, frames: int) -> np.ndarray:
     return np.full(frames, schema.PROJECTION)
 
 
-def _turned(source: Hdf5Source, detector: str) -> Turned:
+def _turned(source: Hdf5Source, detector: str) -> assemble.Turned:
     """Reads the flips that the file declares: half turns of the detector about its x axis (rows) and y axis (columns)."""
     flips = [False, False]
     for index, address in enumerate((f"{detector}/y_flipped", f"{detector}/x_flipped")):
@@ -107,7 +100,7 @@ def _turned(source: Hdf5Source, detector: str) -> Turned:
             if abs(half_turns - round(half_turns)) > 1e-6:
                 raise source.error(address, f"{half_turns * 180:g}°", "0° or 180°: a flip")
             flips[index] ^= bool(round(half_turns) % 2)
-    return Turned(rows=flips[0], columns=flips[1])
+    return assemble.Turned(rows=flips[0], columns=flips[1])
 
 
 def _mask(source: Hdf5Source, detector: str, shape: tuple[int, ...], used: np.ndarray) -> np.ndarray | None:
@@ -122,7 +115,7 @@ def _mask(source: Hdf5Source, detector: str, shape: tuple[int, ...], used: np.nd
 
 
 def _geometry(
-    source: Hdf5Source, entry: str, panel: tuple[int, int], turn: Turned, options: ImportOptions
+    source: Hdf5Source, entry: str, panel: tuple[int, int], turn: assemble.Turned, options: ImportOptions
 ) -> Geometry:
     detector, where = f"{entry}/{schema.DETECTOR}", f"{entry}/{schema.SOURCE}/distance"
     to_axis = options.source_to_axis_mm
@@ -134,11 +127,11 @@ def _geometry(
     stored = reading.stored_pitch
     pitch = options.pixel_size_mm or (stored(source, options, v), stored(source, options, u))
     offset = options.detector_offset_mm or _axis_offset(source, detector, pitch, turn, options)
-    return cone(options, to_axis, to_detector, panel, pitch, offset)
+    return assemble.cone(options, to_axis, to_detector, panel, pitch, offset)
 
 
 def _axis_offset(
-    source: Hdf5Source, detector: str, pitch: tuple[float, ...], turn: Turned, options: ImportOptions
+    source: Hdf5Source, detector: str, pitch: tuple[float, ...], turn: assemble.Turned, options: ImportOptions
 ) -> tuple[float, float]:
     """Reads the detector offset (v, u) in mm from the axis's column, which nxtomo counts from the panel's middle."""
     for name in ("x_rotation_axis_pixel_position", "estimated_cor_from_motor"):
@@ -155,7 +148,7 @@ def _axis_offset(
 
 def _motion(
     source: Hdf5Source, entry: str, used: np.ndarray, geometry: Geometry, options: ImportOptions
-) -> tuple[Timing, CircularOrbit]:
+) -> tuple[assemble.Timing, CircularOrbit]:
     """Reads timing and orbit. With ``rotation_angle_end`` every frame has its own sweep; else the angles give the speed."""
     detector, sample = f"{entry}/{schema.DETECTOR}", f"{entry}/{schema.SAMPLE}"
     rotates = h5.read_attribute(source, f"{sample}/rotation_angle", "rotates") or "sample"
@@ -163,14 +156,14 @@ def _motion(
     angle = sign * h5.read_array(source, f"{sample}/rotation_angle", used.shape, ANGLE)[used]
     sweeps = source.find(f"{sample}/rotation_angle_end") is not None and options.frame_time_s is None
     start_s = h5.read_array(source, f"{detector}/frame_start_time", used.shape, TIME)[used] if sweeps else None
-    stored = StoredTiming(
+    stored = assemble.StoredTiming(
         exposure_s=read_duration(source, f"{detector}/count_time", used, needed=False),
         readout_s=read_duration(source, f"{detector}/detector_readout_time", used, needed=False),
         start_s=start_s, angle_at="start" if sweeps else None,
     )
-    timing = make_timing(source.name(entry), int(used.sum()), options, stored)
+    timing = assemble.make_timing(source.name(entry), int(used.sum()), options, stored)
     if not sweeps:
-        return timing, turning(geometry, angle, timing)
+        return timing, assemble.turning(geometry, angle, timing)
     last = sign * h5.read_array(source, f"{sample}/rotation_angle_end", used.shape, ANGLE)[used]
     sweep = FrameSweeps(timing.start_s, timing.shutter.exposure_s, angle, last)
     return timing, CircularOrbit(geometry, sweep)

@@ -16,15 +16,7 @@ from phyradgs_cl import checks
 from phyradgs_cl.acquisition import CircularOrbit, PoseTable, Scan
 from phyradgs_cl.acquisition.geometry import Geometry, plain_geometry
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.importers.assemble import (
-    Timing,
-    Turned,
-    assemble_scan,
-    make_timing,
-    table_over_time,
-    turn_of,
-    turning,
-)
+from phyradgs_cl.importers import assemble
 from phyradgs_cl.importers.options import TIMING, ImportOptions
 from phyradgs_cl.importers.reading.files import SafeFolder, read_bytes
 from phyradgs_cl.importers.reading.frames import line_integrals
@@ -75,12 +67,13 @@ def import_scan(path: Path, options: ImportOptions) -> Scan:
     if len(stack.frames) != rtk.frames:
         found = f"{len(stack.frames)} frames, {rtk.frames} projections in {description.name}"
         raise InputError(str(stack_path), found, "one frame per projection")
-    timing = make_timing(str(description), rtk.frames, options)
+    timing = assemble.make_timing(str(description), rtk.frames, options)
     trajectory, geometry, turn = _trajectory(rtk, stack, timing, str(description))
     convention = "attenuation" if stack.frames.dtype.kind == "f" and options.flat_value is None else None
     integrals = line_integrals(str(stack_path), turn.frames(stack.frames), options, convention=convention)
     title = description.stem
-    return assemble_scan(integrals, trajectory, geometry, timing, options, title=title, source=str(path))
+    parts = integrals, trajectory, geometry, timing, options
+    return assemble.assemble_scan(*parts, title=title, source=str(path))
 
 
 def _read_stack(path: Path) -> _Stack:
@@ -95,15 +88,15 @@ def _read_stack(path: Path) -> _Stack:
 
 
 def _trajectory(
-    rtk: "RtkGeometry", stack: _Stack, timing: Timing, subject: str
-) -> tuple[CircularOrbit | PoseTable, Geometry, Turned]:
+    rtk: "RtkGeometry", stack: _Stack, timing: assemble.Timing, subject: str
+) -> tuple[CircularOrbit | PoseTable, Geometry, assemble.Turned]:
     """Returns a circular orbit where one describes the file, else a table of poses, with a plain geometry and the flips."""
     panel = (stack.frames.shape[1], stack.frames.shape[2])
 
     def stored(position: np.ndarray) -> np.ndarray:
         return rtk.poses(position, stack.origin_mm, stack.step_u_mm, stack.step_v_mm)
 
-    turn = turn_of(stored(np.zeros(1))[0])
+    turn = assemble.turn_of(stored(np.zeros(1))[0])
 
     def poses(position: np.ndarray) -> np.ndarray:
         return turn.poses(stored(position), panel)
@@ -111,8 +104,8 @@ def _trajectory(
     at_frames = poses(np.arange(rtk.frames, dtype=np.float64))
     geometry = plain_geometry(at_frames, panel)
     if rtk.is_circular and stack.step_u_mm[1] == stack.step_v_mm[0] == 0:
-        return turning(geometry, rtk.values["GantryAngle"], timing), geometry, turn
-    return table_over_time(poses, timing, subject), geometry, turn
+        return assemble.turning(geometry, rtk.values["GantryAngle"], timing), geometry, turn
+    return assemble.table_over_time(poses, timing, subject), geometry, turn
 
 
 @dataclass(frozen=True, eq=False)

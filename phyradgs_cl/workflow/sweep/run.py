@@ -24,17 +24,9 @@ from phyradgs_cl.runtime.device import environment
 from phyradgs_cl.signals import finish_despite_interrupt, keep_finished_work
 from phyradgs_cl.text import plain_text
 from phyradgs_cl.workflow.reconstruct import is_complete, resume_or_restart
+from phyradgs_cl.workflow.sweep import tables
 from phyradgs_cl.workflow.sweep.grid import Setting, SweepGrid
-from phyradgs_cl.workflow.sweep.tables import (
-    Line,
-    append_line,
-    identity,
-    is_sound,
-    json_text,
-    read_lines,
-    refuse_irregular,
-    write_tables,
-)
+from phyradgs_cl.workflow.sweep.tables import Line
 
 RESULTS, VOLUMES = "results.jsonl", "volumes"
 _STEM_BYTES = 80
@@ -120,10 +112,10 @@ def run_sweep(job: SweepJob, report: Report = lambda progress: None) -> tuple[li
     folder cannot be written; BusyError while another sweep uses it. InputError: no scheduler, or a missing package."""
     results = _results_file(job.folder)
     with only_run(results):
-        lines = read_lines(results, is_sound)
+        lines = tables.read_lines(results, tables.is_sound)
         plan = plan_sweep(job.grid, job.folder, job.checkpoint_every_s)
-        finished = {identity(line) for line in lines if "error" not in line}
-        missing = [run for run in plan if identity(run.facts) not in finished]
+        finished = {tables.identity(line) for line in lines if "error" not in line}
+        missing = [run for run in plan if tables.identity(run.facts) not in finished]
         done, failed = len(plan) - len(missing), 0
 
         def say(**more: Any) -> None:
@@ -131,13 +123,13 @@ def run_sweep(job: SweepJob, report: Report = lambda progress: None) -> tuple[li
 
         for line in _lines(job, missing, say):
             with finish_despite_interrupt():
-                append_line(results, line)
+                tables.append_line(results, line)
                 lines.append(line)
             done += 1
             failed += "error" in line
             say(line=line)
         with finish_despite_interrupt():
-            return [results, *write_tables(job.folder, lines, [run.facts for run in plan])], failed
+            return [results, *tables.write_tables(job.folder, lines, [run.facts for run in plan])], failed
 
 
 def _lines(job: SweepJob, runs: Sequence[SweepRun], say: Callable[..., None]) -> Iterator[Line]:
@@ -197,7 +189,7 @@ def _reconstructed(run: SweepRun, report: ProgressReport, device: str | None) ->
         "host": platform.node(),
     }
     with written_beside(run.record) as temporary:
-        temporary.write_text(json_text(line), encoding="utf-8")
+        temporary.write_text(tables.json_text(line), encoding="utf-8")
     return line
 
 
@@ -209,7 +201,7 @@ def _recorded(run: SweepRun) -> Line | None:
         line = json.loads(run.record.read_text(encoding="utf-8"))
     except (OSError, ValueError):
         return None
-    return line if is_sound(line) and identity(line) == identity(run.facts) else None
+    return line if tables.is_sound(line) and tables.identity(line) == tables.identity(run.facts) else None
 
 
 def failed_line(run: SweepRun, error: str) -> Line:
@@ -222,7 +214,7 @@ def failed_line(run: SweepRun, error: str) -> Line:
 def _results_file(folder: Path) -> Path:
     path = folder / RESULTS
     make_folder(folder / VOLUMES, folder)
-    refuse_irregular(path)
+    tables.refuse_irregular(path)
     try:
         path.open("ab").close()
     except OSError as error:
@@ -238,6 +230,6 @@ def _as_json(value: Any) -> Any:
 
 def _name(scan: Path, setting: Setting, seed: int) -> str:
     """Joins the scan's name, the method, a digest that tells equal names apart, and the seed."""
-    identity = [str(scan), setting.method, setting.preset, _as_json(setting.changes), _as_json(setting.before)]
-    digest = hashlib.sha256(json.dumps(identity, sort_keys=True).encode()).hexdigest()[:10]
+    parts = [str(scan), setting.method, setting.preset, _as_json(setting.changes), _as_json(setting.before)]
+    digest = hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()[:10]
     return f"{shortened(plain_text(scan.stem), _STEM_BYTES)}_{setting.method}_{digest}_s{seed}"
