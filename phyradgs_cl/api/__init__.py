@@ -5,27 +5,12 @@
 
 Everything is documented with runnable examples in docs/api.md. ``device`` is what ``--device`` takes, or a Runtime."""
 
-from phyradgs_cl.acquisition import ConeGeometry, Scan, Shutter, TimeCells
-from phyradgs_cl.acquisition.motion import (
-    Exact,
-    LineMiddles,
-    MicroViews,
-    Motion,
-    OwnTimes,
-    ParallelGeometry,
-    PerRow,
-    Static,
-    StaticStart,
-)
-from phyradgs_cl.acquisition.trajectory import (
-    CircularOrbit,
-    ConstantSpeed,
-    EncoderTable,
-    FrameSweeps,
-    PoseTable,
-    SpeedRamp,
-    Trajectory,
-)
+from phyradgs_cl.acquisition import ConeGeometry, ConstantSpeed, ParallelGeometry, SpeedRamp, StaticStart
+from phyradgs_cl.acquisition.motion import Exact, LineMiddles, MicroViews, Motion, OwnTimes, PerRow, Static
+from phyradgs_cl.acquisition.scan import Scan
+from phyradgs_cl.acquisition.shutter import Shutter
+from phyradgs_cl.acquisition.time_cells import TimeCells
+from phyradgs_cl.acquisition.trajectory import CircularOrbit, EncoderTable, FrameSweeps, PoseTable, Trajectory
 from phyradgs_cl.api.calibration import calibrate, move_views, pose_gradient
 from phyradgs_cl.api.operators import LinearOperator, Operator, as_torch
 from phyradgs_cl.api.projectors import (

@@ -21,7 +21,6 @@ from phyradgs_cl.reconstructors.tune import TUNED, tuning_line
 from phyradgs_cl.report import Preview, check_preview
 from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.settings import Settings
-from phyradgs_cl.signals import finish_despite_interrupt
 from phyradgs_cl.workflow import load_scan, profile_report, run_reconstruction
 
 EXAMPLES = {
@@ -68,7 +67,7 @@ def reconstruct_command(
             checkpoint_every_s=checkpoint_every, inputs=inputs, ranks=ranks,
         )
         if picture is not None and result.state is None and ranks.rank == 0:
-            with finish_despite_interrupt():
+            with signals.finish_despite_interrupt():
                 picture.finish(result.volume, result.grid)
     written = output if result.state is None else partial_path(output)
     used_s = time.process_time()  # of the command so far, with its start; other programs do not change it

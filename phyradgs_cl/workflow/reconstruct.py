@@ -24,7 +24,6 @@ from phyradgs_cl.parallel import Communicator
 from phyradgs_cl.reconstructors.result import COMPARED, HELD_OUT
 from phyradgs_cl.reconstructors.run import check_resumable
 from phyradgs_cl.runtime import Runtime, profile_text
-from phyradgs_cl.signals import finish_despite_interrupt, keep_finished_work
 from phyradgs_cl.text import plain_text
 from phyradgs_cl.workflow.files import check_output, load_scan, refuse_overwriting
 
@@ -117,13 +116,13 @@ def _reconstructed(
     result: methods.Reconstruction | None = None
     metrics: dict[str, float] = {}
     try:
-        with checkpoints.mentioned_in_errors(), keep_finished_work():
+        with checkpoints.mentioned_in_errors(), signals.keep_finished_work():
             listeners = report.listeners if isinstance(report, methods.Report) else (report,)
             report = methods.Report(*listeners, checkpoints)
             result = methods.reconstruct(scan, plan, rt, report=report, resume=state)
             if not leads:
                 return result, metrics
-            with finish_despite_interrupt():
+            with signals.finish_despite_interrupt():
                 metrics = _metrics(scan, result)
                 target = output if result.state is None else partial_path(output)
                 provenance = _provenance(result, scan_hash, plan, path, rt)

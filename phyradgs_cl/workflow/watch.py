@@ -17,7 +17,6 @@ from phyradgs_cl.io import checkpoint_path, former_checkpoint_path, only_run, pa
 from phyradgs_cl.io.output import beside, make_folder
 from phyradgs_cl.reconstructors import ProgressReport, Reconstruction, RunPlan, ignore_progress
 from phyradgs_cl.runtime import Runtime
-from phyradgs_cl.signals import finish_despite_interrupt
 from phyradgs_cl.text import plain_text
 from phyradgs_cl.workflow.reconstruct import check_interval, is_complete, resume_or_restart
 
@@ -212,7 +211,7 @@ class _Watch:
 
     def _publish(self, arrival: Arrival) -> bool:
         """Moves the volume to its place; False for a scan that has changed during its run, which is repeated."""
-        with finish_despite_interrupt():
+        with signals.finish_despite_interrupt():
             if not arrival.is_unchanged():
                 log.warning("%s changed while it was reconstructed: once more when it is complete", arrival.path)
                 self._discard(arrival)
@@ -228,7 +227,7 @@ class _Watch:
             return False
         message = str(error) if isinstance(error, PhyradgsError) else f"{type(error).__name__}: {error}"
         text = f"{plain_text(message)}\n\nThe scan is tried again when it changes, or when this file is removed.\n"
-        with finish_despite_interrupt():
+        with signals.finish_despite_interrupt():
             self._discard(arrival)
             work = beside(self._work(arrival), ".txt")
             with written_beside(work) as temporary:
