@@ -78,9 +78,6 @@ def _problem(check: Callable[[Runtime], Iterator[Comparison]], rt: Runtime, agre
     return ""
 
 
-# --- the checks --------------------------------------------------------------------------------------------------
-
-
 def _algebra(rt: Runtime) -> Iterator[Comparison]:
     """Also the kernel that measures rates."""
     host, there = HostSpace(), DeviceSpace(rt)
@@ -272,9 +269,6 @@ CHECKS = (
     _image_terms, _variation, _optimiser,
 )  # fmt: skip
 """Ordered by dependence: a kernel that has agreed is not suspected later."""
-
-
-# --- their data --------------------------------------------------------------------------------------------------
 
 
 def _noise(shape: tuple[int, ...], seed: int) -> np.ndarray:

@@ -41,7 +41,6 @@ class BeadProblem(CoarseFrames):
         cls, phantom: EllipsoidPhantom, start: np.ndarray, scans: Sequence[Scan], stage: Stage,
         most_frames: int = MOST_FRAMES,
     ) -> "BeadProblem":
-        """Makes the scans as coarse as the stage says."""
         block = stage.block(scans[0])
         fewer = [fewer_frames(scan, most_frames) for scan in scans]
         measured, valid = measured_blocks([binned(scan, block) for scan in fewer])
@@ -51,7 +50,6 @@ class BeadProblem(CoarseFrames):
         )
 
     def operator(self, correction: GeometryCorrection, views: Views | Sway | None = None) -> BeadOperator:
-        """Returns the operator of all frames after a correction."""
         tables: list[TimeCells] = []
         for scan in self.scans:
             small = binned(perturb(scan, correction, views), self.block)

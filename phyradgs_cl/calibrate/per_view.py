@@ -67,7 +67,6 @@ class PerViewParameters(ABC):
     def operator(
         self, problem: CoarseProblem, correction: GeometryCorrection, more: np.ndarray | float = 0.0
     ) -> RayOperator:
-        """Returns A after a correction and these values plus ``more``."""
         return problem.operator(correction, self.views_of(self.values + more))
 
 

@@ -239,7 +239,6 @@ class _Calibrator:
     def _residual(
         self, problem: Problem, stage: Stage, correction: GeometryCorrection, views: Views | Sway | None = None
     ) -> np.ndarray:
-        """Returns the residual of the frames (F, rows, columns) after a correction."""
         operator: Any = problem.operator(correction, views)
         corrected = problem.corrected(correction)
         return corrected.residual(operator, corrected.reconstruct(operator, None, stage.first))
@@ -261,7 +260,6 @@ class _Calibrator:
         }
 
     def _plan_of_stages(self, parameters: int, start: int) -> dict[str, Passes]:
-        """Returns the most passes of the stages from ``start`` on."""
         stages = list(enumerate(self.stages))[start:]
         return {f"stage {k}": self._passes(stage, stage.passes(parameters, k == 0)) for k, stage in stages}
 

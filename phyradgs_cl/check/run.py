@@ -133,7 +133,6 @@ def _finite(scan: Scan) -> Scan:
 
 
 def _with_masked(scan: Scan, dead: np.ndarray) -> Scan:
-    """Returns the scan with dead pixels (v, u) in its mask."""
     if not dead.any():
         return scan
     mask = dead if scan.pixel_mask is None else (np.asarray(scan.pixel_mask) != 0) | dead

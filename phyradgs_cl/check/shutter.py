@@ -62,7 +62,6 @@ def _compared(hypothesis: str, stated: np.ndarray, other: np.ndarray) -> tuple[s
 
 
 def _other_readouts(scan: Scan) -> dict[str, Scan]:
-    """Returns the scan under other readouts, by description."""
     shutter = scan.shutter
     other_axis = "columns" if shutter.axis == "rows" else "rows"
     if shutter.readout_s == 0:

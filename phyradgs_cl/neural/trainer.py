@@ -7,10 +7,9 @@ import torch
 
 from phyradgs_cl.acquisition import OwnTimes, PerRow, Scan
 from phyradgs_cl.fields import Grid
+from phyradgs_cl.neural import rays
 from phyradgs_cl.neural.field import NeuralField, voxel_values
-from phyradgs_cl.neural.integrals import intensity_average, line_integrals, log_squares, sample_shifts
 from phyradgs_cl.neural.options import LineOptions, NeuralOptions
-from phyradgs_cl.neural.rays import ExposureRays, chosen_times, scattered_pixels, windows_and_scattered_pixels
 from phyradgs_cl.neural.tensors import repeatable, to_array, to_tensor
 
 _BETAS, _EPSILON = (0.9, 0.999), 1e-8
@@ -35,7 +34,7 @@ class Trainer:
         if isinstance(motion, PerRow):  # the field evaluates single rays: common times would save nothing
             motion = OwnTimes(motion.sub_intervals)
         tables = [motion.cells(scan, frame).still() for frame in range(scan.frames)]
-        self.rays = [ExposureRays.of_cells(table, scan.grid) for table in tables]
+        self.rays = [rays.ExposureRays.of_cells(table, scan.grid) for table in tables]
         times = self.rays[0].times
         stated = scan.detector_model if options.detector_model == "scan" else options.detector_model
         self.model = stated if times > 1 else "log"  # of one value both are the mean
@@ -43,7 +42,7 @@ class Trainer:
         self.samples = options.samples_for(max(scan.grid.shape), times)
         self.points_at_once = _POINTS_ON_CPU if device.type == "cpu" else _POINTS_ELSEWHERE
         half_sides = np.array(scan.grid.size_mm[::-1]) / 2 / scan.grid.half_longest_mm
-        self._shadows = [rays.shadow(half_sides, scan.geometry.detector_shape) for rays in self.rays]
+        self._shadows = [one.shadow(half_sides, scan.geometry.detector_shape) for one in self.rays]
         self._half_sides = to_tensor(half_sides.astype(np.float32), device)
         self._adam = torch.optim.Adam(self.field.parameters(), options.rate, _BETAS, _EPSILON)
         self.steps, self.updates, self.queue = 0, 0, self._shuffled()
@@ -133,24 +132,24 @@ class Trainer:
         if options.positive_only:
             usable &= scan.projections[frame] > 0
         if isinstance(options, LineOptions):
-            return windows_and_scattered_pixels(
+            return rays.windows_and_scattered_pixels(
                 usable, options.rays, options.windows, options.window, self.rng
             )
-        return scattered_pixels(usable, options.rays, self.rng)
+        return rays.scattered_pixels(usable, options.rays, self.rng)
 
     def _loss_and_gradient(self, frame: int, pixels: np.ndarray) -> float:
         """The mean squared error in internal units; its gradient is added up in the parameters, a chunk at a time."""
-        rays = self.rays[frame]
-        times = chosen_times(len(pixels), rays.times, self.times, self.rng)
-        shifts = sample_shifts(times.size, self.samples, self.options.jitter, self.rng)
+        exposure = self.rays[frame]
+        times = rays.chosen_times(len(pixels), exposure.times, self.times, self.rng)
+        shifts = rays.sample_shifts(times.size, self.samples, self.options.jitter, self.rng)
         shifts = shifts.reshape(*times.shape, -1)
         measured = self.scan.projections[frame][tuple(pixels.T)].astype(np.float32) / np.float32(self.unit)
         at_once = max(self.points_at_once // (self.samples * self.times), 1)
         total = 0.0
         for start in range(0, len(pixels), at_once):
             part = slice(start, start + at_once)
-            source, direction = rays(pixels[part], times[part])
-            squares = self._squares(source, direction, shifts[part], measured[part], rays.times)
+            source, direction = exposure(pixels[part], times[part])
+            squares = self._squares(source, direction, shifts[part], measured[part], exposure.times)
             loss = squares.sum() / len(pixels)
             loss.backward()
             total += float(loss.detach())
@@ -164,12 +163,12 @@ class Trainer:
             to_tensor(a.reshape(-1, a.shape[-1]).astype(np.float32), self.device)
             for a in (source, direction, shifts)
         )
-        integrals = line_integrals(self.field, from_, along, self._half_sides, self.samples, shift)
+        integrals = rays.line_integrals(self.field, from_, along, self._half_sides, self.samples, shift)
         integrals = integrals.reshape(source.shape[:2])
         wanted = to_tensor(measured, self.device)
         if self.model == "intensity":
-            return (intensity_average(integrals, self.unit) - wanted) ** 2
-        return log_squares(integrals, wanted, times)
+            return (rays.intensity_average(integrals, self.unit) - wanted) ** 2
+        return rays.log_squares(integrals, wanted, times)
 
     def _moments(self, parameter: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         state = self._adam.state.get(parameter)

@@ -83,7 +83,6 @@ def water_polynomial(kvp: float, filter_mm: float = FILTER_MM, anode_deg: float 
 
 
 def correct_hardening(scan: Scan, options: HardeningOptions, make_model: MakeModel) -> tuple[Scan, Facts]:
-    """Returns the scan with straight line integrals."""
     if options.kvp:
         return _by_voltage(scan, options, make_model)
     frames, fitted = step.unmasked_frames(scan), not any(options.polynomial)

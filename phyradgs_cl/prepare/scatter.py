@@ -48,7 +48,6 @@ class ScatterOptions:
 
 
 def subtract_scatter(scan: Scan, options: ScatterOptions, make_model: MakeModel) -> tuple[Scan, Facts]:
-    """Returns the scan without scatter."""
     frames = step.unmasked_frames(scan)
     if options.to_primary > 0:
         reach = options.reach or _USUAL_REACH

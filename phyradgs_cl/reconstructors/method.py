@@ -107,7 +107,6 @@ def _plain(value: Any) -> Any:
 
 
 def _default_options(subject: str, function: Any, parameter: inspect.Parameter) -> Any:
-    """Returns the default options of a function."""
     try:
         kind = typing.get_type_hints(function).get(parameter.name)
     except (NameError, TypeError):  # annotations of names that do not exist at run time
@@ -121,7 +120,6 @@ def _default_options(subject: str, function: Any, parameter: inspect.Parameter) 
 
 
 def _result(subject: str, made: object, scan: Scan) -> Reconstruction:
-    """Returns the checked result of the user's function."""
     if not isinstance(made, Reconstruction):
         if not isinstance(made, np.ndarray) or made.shape != scan.grid.shape:
             found = f"an array of shape {made.shape}" if isinstance(made, np.ndarray) else f"a {type(made).__name__}"

@@ -1,6 +1,6 @@
 """Options of a method and of the preprocessing by name: a preset with checked changes."""
 
-import math
+import sys
 from collections.abc import Callable, Mapping
 from dataclasses import fields, is_dataclass, replace
 from typing import Any
@@ -106,7 +106,6 @@ def _implied_motion(usual: str, counts: Mapping[str, Any], models: Mapping[str, 
 
 
 def _motion_options(options: Any) -> list[str]:
-    """Returns the option names that change the motion of ``options``."""
     if not hasattr(options, "motion"):
         return []
     return ["motion", *(key for key in _COUNTS if any(_has(m, key) for m in _models(options).values()))]
@@ -160,12 +159,7 @@ def _converted(current: Any, value: Any, subject: str) -> Any:
 
 def _is_number(value: Any) -> bool:
     """True for a finite number that a float can hold."""
-    if isinstance(value, bool) or not isinstance(value, (int, float)):
-        return False
-    try:
-        return math.isfinite(value)
-    except OverflowError:  # whole numbers have no bounds
-        return False
+    return checks.is_number(value) and abs(value) <= sys.float_info.max
 
 
 _EXPECTED: dict[type, tuple[str, Callable[[Any], bool]]] = {

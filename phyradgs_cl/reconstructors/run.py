@@ -18,7 +18,7 @@ from phyradgs_cl.metrics import resampled, shared_slices
 from phyradgs_cl.prepare import PREPARED_KEY
 from phyradgs_cl.prepare.step import with_masked
 from phyradgs_cl.reconstructors.checkpoint import State, with_identity, without_identity
-from phyradgs_cl.reconstructors.frames.preprocess import Preprocessing, prepared
+from phyradgs_cl.reconstructors.frames.preprocess import prepared
 from phyradgs_cl.reconstructors.frames.projected import held_out, holdout_errors
 from phyradgs_cl.reconstructors.plan import InitialVolume, RunPlan
 from phyradgs_cl.reconstructors.registry import METHODS, method_of
@@ -75,8 +75,7 @@ def reconstruct(
         progress = progress.mapped(state=lambda state: with_identity(state, identity()))
         return progress if box is None else progress.mapped(volume=lambda volume, grid: _within(volume, grid, box))
 
-    fitting = naming_size_that_fits(rt, ready, plan.method_name, options)
-    with report.through(hook), _naming_margin(preprocessing, ready.grid), fitting, naming_host_memory():
+    with report.through(hook), _naming_size_that_fits(rt, ready, plan), naming_host_memory():
         if preprocessing.tune:
             result = tuned(preprocessing.tune, run, visible, options, rt, report, **more)
         else:
@@ -130,18 +129,6 @@ def _within(volume: np.ndarray, grid: Grid, box: Grid) -> tuple[np.ndarray, Grid
     return inner, grid.part(triple(one.start for one in part), triple(inner.shape))
 
 
-@contextmanager
-def _naming_margin(preprocessing: Preprocessing, grid: Grid) -> Iterator[None]:
-    """Adds the size of the grid with its margin to a shortage of memory in the body."""
-    try:
-        yield
-    except OutOfMemoryError as error:
-        if preprocessing.margin_mm is not None:
-            voxels = " × ".join(map(str, grid.shape[::-1]))
-            error.remedy += f", as by a narrower --margin-mm (with it the grid has {voxels} voxels)"
-        raise
-
-
 def _check_ranks(method: str, rt: Runtime) -> None:
     """Raises InputError for a method that ranks cannot share, and for ranks on different devices."""
     if method not in METHODS or not METHODS[method].is_shared:
@@ -150,18 +137,16 @@ def _check_ranks(method: str, rt: Runtime) -> None:
         raise InputError(f"--method {method}", found, f"one, or one of {names}", "start it without mpiexec")
     device, first = rt.device.name, rt.ranks.bcast(rt.device.name)
     if device != first:
-        subject = f"device of rank {rt.ranks.rank}"
-        raise InputError(
-            subject, device, f"that of rank 0, {first}", "choose devices of one kind with --device"
-        )
+        expected, remedy = f"that of rank 0, {first}", "choose devices of one kind with --device"
+        raise InputError(f"device of rank {rt.ranks.rank}", device, expected, remedy)
 
 
 @contextmanager
-def naming_size_that_fits(rt: Runtime, scan: Scan, method: str, options: Any) -> Iterator[None]:
-    """Adds the ``--size`` that fits, if one does, to a shortage of memory in the body.
+def _naming_size_that_fits(rt: Runtime, scan: Scan, plan: RunPlan) -> Iterator[None]:
+    """Adds the ``--size`` that fits, if one does, and the size of the grid with its margin to a shortage of memory.
 
     Raises OutOfMemoryError at once for a volume that this machine cannot hold."""
-    size = _size_that_fits(rt, scan, method, options)
+    size = _size_that_fits(rt, scan, plan.method_name, plan.options)
     try:
         volume_bytes, most_bytes = 4 * math.prod(scan.grid.shape), HOST_SHARE * host_bytes()
         if volume_bytes > most_bytes:
@@ -172,6 +157,9 @@ def naming_size_that_fits(rt: Runtime, scan: Scan, method: str, options: Any) ->
     except OutOfMemoryError as error:
         if 0 < size < max(scan.grid.shape):
             error.remedy = "; ".join(part for part in (error.remedy, f"--size {size} fits") if part)
+        if plan.preprocessing.margin_mm is not None:
+            voxels = " × ".join(map(str, scan.grid.shape[::-1]))
+            error.remedy += f", as by a narrower --margin-mm (with it the grid has {voxels} voxels)"
         raise
 
 

@@ -11,8 +11,7 @@ from phyradgs_cl.acquisition import MicroViews, OwnTimes
 from phyradgs_cl.acquisition.geometry import pixel_centres
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.neural import NeuralOptions
-from phyradgs_cl.neural.integrals import box_span, line_integrals, sample_shifts
-from phyradgs_cl.neural.rays import ExposureRays
+from phyradgs_cl.neural.rays import ExposureRays, box_span, line_integrals, sample_shifts
 
 VOXELS = 64  # of the longest side; 96 samples per ray by default
 CENTRE, AXES = np.array([0.1, -0.2, 0.05]), np.array([0.45, 0.3, 0.5])

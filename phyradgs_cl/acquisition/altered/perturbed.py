@@ -86,7 +86,6 @@ class PerturbedTrajectory:
     views: "Views | Sway | None" = None
 
     def pose(self, frame: int, time_s: np.ndarray) -> np.ndarray:
-        """Returns poses (..., 12) at times (...)."""
         shift_v_mm, shift_u_mm, turn_rad = 0.0, 0.0, self.correction.turn_rad
         if isinstance(self.views, Views):
             shift_v_mm, shift_u_mm = self.views.shift_mm[frame]

@@ -40,7 +40,6 @@ class AlteredTrajectory:
     frames: np.ndarray | None = None
 
     def pose(self, frame: int, time_s: np.ndarray) -> np.ndarray:
-        """Returns poses (..., 12) at times (...)."""
         number = frame if self.frames is None else int(self.frames[frame])
         pose = np.array(self.base.pose(number, time_s))
         if self.is_reversed:
@@ -74,7 +73,6 @@ class MappedTrajectory:
     change: Callable[[int, np.ndarray], np.ndarray]
 
     def pose(self, frame: int, time_s: np.ndarray) -> np.ndarray:
-        """Returns poses (..., 12) at times (...)."""
         return self.change(frame, np.array(self.base.pose(frame, time_s)))
 
 

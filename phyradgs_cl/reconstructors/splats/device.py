@@ -44,7 +44,6 @@ class DeviceCloud:
         self.gaussians = DeviceGaussians(rt.zeros((11, stride)), self.count, stride)
 
     def activate(self, adam: DeviceAdam) -> None:
-        """Computes the parameters from the raw ones."""
         adam.activate(self.raw, self.gaussians.rows, self.count, self.gaussians.stride)
 
     def move(self, adam: DeviceAdam, rates: np.ndarray, step: int) -> None:
@@ -52,7 +51,6 @@ class DeviceCloud:
         adam.step(self.raw, self.gradients, self.moments, self.gaussians.stride, rates, step)
 
     def population(self) -> Population:
-        """Returns the present population."""
         count = self.count
         return Population(self.rt.download(self.raw)[:, :count], self.rt.download(self.moments)[:, :, :count])
 
@@ -88,7 +86,6 @@ class DeviceFrames:
             self._transmission = [rt.upload(pad_rows(readout.frames(w))) for w in weights]
 
     def cells(self, frame: int) -> DeviceCells:
-        """Returns the time cells of a frame."""
         return self._cells[frame]
 
     def transmission(self, frame: int) -> DeviceArray | None:

@@ -69,7 +69,6 @@ class SplatRun:
         return {"loss": self.sharing.loss(self.frame_step), "gaussians": self.cloud.count}
 
     def control_density(self) -> None:
-        """Does one round of density control."""
         sums = self.cloud.read_statistics().astype(np.float64)
         begun = time.perf_counter()  # the download has waited for the device
         statistic = sums[0] / np.maximum(sums[1], 1)

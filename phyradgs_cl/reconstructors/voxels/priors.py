@@ -38,15 +38,12 @@ class PriorInputs:
     share: float = 0.5
 
     def tv(self, share: float = 1.0) -> "TvPrior":
-        """Total variation, its weight multiplied by ``share``."""
         return TvPrior(TvProx(self.rt, self.grid.shape, axis_weights(self.grid)), self.tv_iterations, share)
 
     def tv_and_dct(self) -> "TvAndDct":
-        """Total variation, then block cosine transforms."""
         return TvAndDct(self.tv(_TV_BEFORE_DCT), DctProx(self.rt, self.grid.shape))
 
     def nonlocal_then(self, then: "Prior", h_share: float) -> "Nonlocal":
-        """A nonlocal step, then another prior."""
         return Nonlocal(then, NonlocalStep(self.rt, self.grid.shape), h_share, self.passes)
 
 
