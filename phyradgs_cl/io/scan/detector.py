@@ -28,13 +28,12 @@ def read_data_kind(source: Hdf5Source, entry: str) -> tuple[h5py.Dataset, str]:
         raise InputError(subject, f"type {data.dtype}", "float32 or uint16", "convert the frames")
     quantity = h5.read_attribute(source, address, "quantity")
     if quantity is None:
-        remedy = "add the attribute to the dataset"
         expected = "one of " + ", ".join(schema.QUANTITIES)
-        raise InputError(f"{subject} @quantity", "no attribute", expected, remedy)
+        raise InputError(f"{subject} @quantity", "no attribute", expected, "add the attribute to the dataset")
     checks.one_of(f"{subject} @quantity", quantity, schema.QUANTITIES)
     if quantity != "counts" and data.dtype.kind == "u":
-        remedy = "store float32, or counts as uint16"
-        raise InputError(subject, f"{quantity} as {data.dtype}", "float32", remedy)
+        found = f"{quantity} as {data.dtype}"
+        raise InputError(subject, found, "float32", "store float32, or counts as uint16")
     return data, quantity
 
 
@@ -58,9 +57,7 @@ def read_geometry(source: Hdf5Source, entry: str, detector_shape: tuple[int, int
     pitch_v_mm = h5.read_length(source, f"{detector}/y_pixel_size", LENGTH)
     pitch_u_mm = h5.read_length(source, f"{detector}/x_pixel_size", LENGTH)
     offset = f"{entry}/{schema.EXTRA}/detector_offset"
-    offset_mm = (0.0, 0.0)
-    if source.optional(offset) is not None:
-        offset_mm = tuple(h5.read_array(source, offset, (2,), LENGTH).tolist())
+    offset_mm = tuple(h5.read_array(source, offset, (2,), LENGTH, default=np.zeros(2)).tolist())
     if _is_parallel(source, entry):
         return ParallelGeometry(detector_shape, (pitch_v_mm, pitch_u_mm), offset_mm)
     to_axis_mm = abs(h5.read_number(source, address, LENGTH))  # NeXus gives it a minus sign
@@ -94,15 +91,11 @@ def read_shutter(source: Hdf5Source, entry: str, used: np.ndarray, moving: bool)
     readout_s = read_duration(source, f"{entry}/{schema.DETECTOR}/detector_readout_time", used, needed)
     axis, direction = f"{entry}/{schema.EXTRA}/readout_axis", f"{entry}/{schema.EXTRA}/readout_direction"
     rolling = needed and readout_s > 0  # only then the order of lines matters
-    word, way = "rows", 1
-    if rolling or source.optional(axis) is not None:
-        word = h5.read_word(source, axis, AXES)
-    if rolling or source.optional(direction) is not None:
-        number = h5.read_number(source, direction)
-        checks.one_of(source.name(direction), number, (1, -1))
-        way = int(number)
+    word = h5.read_word(source, axis, AXES, default=None if rolling else "rows")
+    number = h5.read_number(source, direction, default=None if rolling else 1.0)
+    checks.one_of(source.name(direction), number, (1, -1))
     pulse_s = _read_pulse(source, entry, exposure_s + readout_s)
-    return Shutter(exposure_s, readout_s, word, way, pulse_s)
+    return Shutter(exposure_s, readout_s, word, int(number), pulse_s)
 
 
 def _read_pulse(source: Hdf5Source, entry: str, span_s: float) -> tuple[float, float] | None:

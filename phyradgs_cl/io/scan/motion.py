@@ -7,27 +7,11 @@ from dataclasses import replace
 import h5py
 import numpy as np
 
-from phyradgs_cl.acquisition import (
-    CircularOrbit,
-    EncoderTable,
-    FrameSweeps,
-    ParallelGeometry,
-    PoseTable,
-    Scan,
-    SpeedRamp,
-)
-from phyradgs_cl.acquisition.geometry import Geometry, towards_source
+from phyradgs_cl.acquisition import CircularOrbit, EncoderTable, FrameSweeps, PoseTable, Scan, SpeedRamp
+from phyradgs_cl.acquisition.geometry import Geometry, ParallelGeometry, towards_source
 from phyradgs_cl.acquisition.trajectory import ConstantSpeed, sampled
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.io.hdf5.datasets import (
-    ANGLE,
-    LENGTH,
-    TIME,
-    new_group,
-    read_array,
-    read_attribute,
-    write_number,
-)
+from phyradgs_cl.io.hdf5 import datasets as h5
 from phyradgs_cl.io.hdf5.source import Hdf5Source
 from phyradgs_cl.io.scan import schema
 
@@ -47,11 +31,7 @@ def has_motion(source: Hdf5Source, entry: str) -> bool:
 
 
 def read_trajectory(
-    source: Hdf5Source,
-    entry: str,
-    geometry: Geometry,
-    used: np.ndarray,
-    start_s: np.ndarray,
+    source: Hdf5Source, entry: str, geometry: Geometry, used: np.ndarray, start_s: np.ndarray,
     exposure_s: float,
 ) -> CircularOrbit | PoseTable:
     """Reads the trajectory of the frames that the mask ``used`` (F,) selects and that open at ``start_s``."""
@@ -59,12 +39,12 @@ def read_trajectory(
     poses, kinematics = f"{entry}/{schema.POSES}", f"{entry}/{schema.KINEMATICS}"
     if source.optional_group(poses) is not None:
         time_s = _read_table_times(source, f"{poses}/time_s")
-        table_mm = read_array(source, f"{poses}/pose", (len(time_s), 12), LENGTH)
+        table_mm = h5.read_array(source, f"{poses}/pose", (len(time_s), 12), h5.LENGTH)
         return PoseTable(time_s, table_mm, source.name(f"{poses}/pose"), isinstance(geometry, ParallelGeometry))
     if source.optional_group(kinematics) is not None:
         time_s = _read_table_times(source, f"{kinematics}/time_s")
         address = f"{kinematics}/angle_deg"
-        angle_rad = read_array(source, address, (len(time_s),), ANGLE)
+        angle_rad = h5.read_array(source, address, (len(time_s),), h5.ANGLE)
         angle_rad = angle_rad * _sense(source, address, absent=1.0)
         _warn_if_apart(source, address, np.interp(start_s, time_s, angle_rad), first_rad)
         return CircularOrbit(geometry, EncoderTable(time_s, angle_rad, source.name(f"{kinematics}/time_s")))
@@ -77,7 +57,7 @@ def read_trajectory(
 def read_angles(source: Hdf5Source, entry: str, name: str, used: np.ndarray) -> np.ndarray:
     """Reads gantry angles in radians of the used frames, from rotation_angle or rotation_angle_end."""
     address = f"{entry}/{schema.SAMPLE}/{name}"
-    angle_rad = read_array(source, address, used.shape, ANGLE)[used]
+    angle_rad = h5.read_array(source, address, used.shape, h5.ANGLE)[used]
     # The end angle has the sense of the start angle unless it states its own.
     start = f"{entry}/{schema.SAMPLE}/rotation_angle"
     return angle_rad * _sense(source, address, absent=_sense(source, start, absent=-1.0))
@@ -97,16 +77,16 @@ def write_motion(entry: h5py.Group, scan: Scan, frame_of: np.ndarray) -> None:
     """Writes rotation angles and tables; row i of the (F,) arrays describes projection ``frame_of[i]``."""
     first_rad, last_rad = _exposure_angles(scan)
     sample = entry[schema.SAMPLE]
-    write_number(sample, "rotation_angle", np.rad2deg(first_rad)[frame_of], "degree", rotates="gantry")
+    h5.write_number(sample, "rotation_angle", np.rad2deg(first_rad)[frame_of], "degree", rotates="gantry")
     if scan.is_fly and scan.shutter.exposure_s > 0:
-        write_number(sample, "rotation_angle_end", np.rad2deg(last_rad)[frame_of], "degree", rotates="gantry")
+        h5.write_number(sample, "rotation_angle_end", np.rad2deg(last_rad)[frame_of], "degree", rotates="gantry")
     path = scan.trajectory
     if isinstance(path, PoseTable):
         write_poses(entry, scan)
     elif scan.is_fly and isinstance(path, CircularOrbit) and isinstance(path.kinematics, EncoderTable | SpeedRamp):
         time_s, angle_rad = _angle_table(scan, path.kinematics)
         group = _table_group(entry, "kinematics", time_s)
-        write_number(group, "angle_deg", np.rad2deg(angle_rad), "degree", rotates="gantry")
+        h5.write_number(group, "angle_deg", np.rad2deg(angle_rad), "degree", rotates="gantry")
 
 
 def write_poses(entry: h5py.Group, scan: Scan) -> None:
@@ -115,12 +95,12 @@ def write_poses(entry: h5py.Group, scan: Scan) -> None:
     assert isinstance(path, PoseTable)
     # a stop-and-shoot scan is stored without exposure, so its poses move to the frames' starts
     time_s = path.time_s - (0.0 if scan.is_fly else scan.shutter.middle_s)
-    write_number(_table_group(entry, "poses", time_s), "pose", path.table, "mm")
+    h5.write_number(_table_group(entry, "poses", time_s), "pose", path.table, "mm")
 
 
 def _table_group(entry: h5py.Group, name: str, time_s: np.ndarray) -> h5py.Group:
-    group = new_group(entry[schema.EXTRA], name, "NXcollection")
-    write_number(group, "time_s", time_s, "s")
+    group = h5.new_group(entry[schema.EXTRA], name, "NXcollection")
+    h5.write_number(group, "time_s", time_s, "s")
     return group
 
 
@@ -151,7 +131,7 @@ def _angle_table(scan: Scan, kinematics: EncoderTable | SpeedRamp) -> tuple[np.n
 
 
 def _read_table_times(source: Hdf5Source, address: str) -> np.ndarray:
-    time_s = read_array(source, address, (None,), TIME)
+    time_s = h5.read_array(source, address, (None,), h5.TIME)
     if len(time_s) < 2:
         raise source.error(address, f"{len(time_s)} samples", "at least 2")
     if np.any(np.diff(time_s) <= 0):
@@ -163,7 +143,7 @@ def _read_table_times(source: Hdf5Source, address: str) -> np.ndarray:
 
 def _sense(source: Hdf5Source, address: str, absent: float) -> float:
     """Returns +1 where the angle is the gantry's, −1 where it is the sample's."""
-    rotates = read_attribute(source, address, "rotates")
+    rotates = h5.read_attribute(source, address, "rotates")
     if rotates is None:
         return absent
     if rotates not in schema.ROTATES:
