@@ -14,6 +14,7 @@ from itertools import chain
 import numpy as np
 
 from phyradgs_cl.acquisition import Scan
+from phyradgs_cl.acquisition.altered.angles import has_opposite_views
 from phyradgs_cl.acquisition.altered.coarse import some_frames
 from phyradgs_cl.acquisition.altered.variants import reversed_rotation, shifted
 from phyradgs_cl.check import hypotheses
@@ -103,16 +104,20 @@ def check_consistency(rt: Runtime, scan: Scan, as_stated: Scan) -> Consistency:
         advice = "compare detector_offset and pixel sizes, and their units, with the scanner's log"
         return answer(SUSPICIOUS, text, advice, False)
     if ratio > _LARGEST:
-        advice = "compare order, angles, distances and pixel sizes, flats and the panel's tilt with the scanner's log"
+        doubtful = "distances and pixel sizes, flats and the panel's tilt"
+        if scan.is_parallel:
+            doubtful = "flats and the panel's roll"
+        advice = f"compare order, angles, {doubtful} with the scanner's log"
         return answer(SUSPICIOUS, f"frames do not fit together, cause not found: {text}", advice, False)
     return answer(SUSPICIOUS if notes else OK, text, about_frames, True)
 
 
 def _best_sense(rt: Runtime, scan: Scan) -> tuple[Scan, Scan, float]:
-    """Chooses the sense of rotation and the panel's shift, where they fit far better than as stated.
+    """Chooses the sense of rotation and the panel's shift, where they fit far better than as stated. Both senses fit
+    opposite views equally well.
 
     Returns the scan with the sense, the same with the shift, and the mean squared residual of the best rough fit."""
-    senses = [scan, reversed_rotation(scan)]
+    senses = [scan] if has_opposite_views(scan) else [scan, reversed_rotation(scan)]
     roughs = [axis.rough_shift(rt, sense) for sense in senses]
     least_rough = min(float(rough.squares.mean()) for rough in roughs)
     turned = best = scan

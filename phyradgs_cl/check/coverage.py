@@ -76,7 +76,8 @@ def _check_sides(scan: Scan, p: np.ndarray, valid: np.ndarray, largest: float, t
     panel_mm = 2 * field_of_view_mm(scan.geometry)[1]
     if grid_mm > _ANOTHER_SIZE * max(panel_mm, *scan.grid.voxel_size_mm) or width_mm > _ANOTHER_SIZE * grid_mm:
         text += f", and the panel sees {panel_mm:.3g} mm"
-        advice = "compare pixel sizes, distances and the grid, and their units, with the scanner's log"
+        distances = "" if scan.is_parallel else ", distances"
+        advice = f"compare pixel sizes{distances} and the grid, and their units, with the scanner's log"
         return Finding(_QUESTION, SUSPICIOUS, width_mm, grid_mm, "mm", text, advice)
     if level <= threshold:
         return Finding(_QUESTION, OK, level, threshold, "line integral", text)

@@ -167,6 +167,8 @@ def _other_steps(scan: Scan) -> Iterator[Hypothesis]:
 
 
 def _near_sizes(scan: Scan) -> Iterator[Hypothesis]:
+    if scan.is_parallel:
+        return  # an object of another size explains the frames as well
     v, u = scan.geometry.pixel_size_mm
     if abs(v / u - 1) > 0.02:
         text, advice = "pixel sizes fit if v and u are exchanged", f"exchange {PIXEL_SIZES}"

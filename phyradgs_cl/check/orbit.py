@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from phyradgs_cl.acquisition import Scan
+from phyradgs_cl.acquisition.altered.angles import has_opposite_views
 from phyradgs_cl.acquisition.altered.variants import reversed_rotation, shifted
 from phyradgs_cl.check.finding import (
     CANNOT_TELL,
@@ -21,6 +22,7 @@ from phyradgs_cl.check.finding import (
 from phyradgs_cl.check.hypotheses import SIZE_FACTORS, nearly_sized, stated_redundancy
 from phyradgs_cl.check.timing import is_full_turn
 from phyradgs_cl.reconstructors.fits import axis
+from phyradgs_cl.reconstructors.fits.opposite import opposite_shift
 from phyradgs_cl.reconstructors.fits.residuals import fit_squares, residual_ratio, t_statistic
 from phyradgs_cl.runtime import Runtime
 
@@ -32,7 +34,10 @@ _SIGN_RATIO, _CLEAR_RATIO = 1.2, 3.0
 _TOLERATED_BLOCKS, _TOLERATED_PX = 0.2, 0.5
 _DEVIATIONS = 4.0
 _BIAS_FULL_TURN, _BIAS_HALF_TURN = 0.003, 0.04  # coarse pixels: measured errors of the axis in coarse scans
+_WHOLE_PIXELS = 2  # blocks by which a shift from whole pixels is judged
 _LEAST_REDUNDANCY = 0.1  # of a panel that sees the axis at its edge
+_NO_SIGN = "parallel rays show an object that turns one way and its mirror image that turns the other way alike"
+_SIGN_ADVICE = "look for a feature whose side is known: a mirror image would fit as well"
 _OTHER_SIZES, _SIZE_RATIO = (0.8, 1.25), 1.05
 
 
@@ -58,7 +63,12 @@ def find_orbit(rt: Runtime, quick: Scan, as_stated: Scan, sees_angles: bool) -> 
         return Orbit(too_narrow(SIGN, "standard errors"), too_narrow(CENTRE, "pixels"))
     if not sees_angles:
         return Orbit(same_from_everywhere(SIGN), same_from_everywhere(CENTRE))
-    reverse, block = reversed_rotation(quick), axis.columns_per_block(quick)
+    block = axis.columns_per_block(quick)
+    if has_opposite_views(as_stated):
+        sign = Finding(SIGN, CANNOT_TELL, 0.0, -_ERRORS, "standard errors", _NO_SIGN, _SIGN_ADVICE)
+        shift, centre = centre_of(axis.axis_shift(rt, quick), block, as_stated)
+        return Orbit(sign, centre, shift)
+    reverse = reversed_rotation(quick)
     stated, other = axis.rough_shift(rt, quick), axis.rough_shift(rt, reverse)
     ratio = residual_ratio(stated.squares, other.squares)
     is_rough = max(ratio, 1 / max(ratio, 1e-30)) >= _CLEAR_RATIO  # the other sense needs no closer look
@@ -89,8 +99,7 @@ def check_rotation(stated: axis.AxisShift, other: axis.AxisShift) -> Finding:
         return Finding(SIGN, OK, *values)
     if errors <= -_ERRORS and ratio <= 1 / _SIGN_RATIO:
         return Finding(SIGN, SUSPICIOUS, *values)
-    advice = "look for a feature whose side is known: a mirror image would fit as well"
-    return Finding(SIGN, CANNOT_TELL, *values, advice)
+    return Finding(SIGN, CANNOT_TELL, *values, _SIGN_ADVICE)
 
 
 def with_cause(finding: Finding, shift_px: float, stated_px: float, tolerance_px: float) -> Finding:
@@ -114,11 +123,15 @@ def centre_of(shift: axis.AxisShift, block: int, scan: Scan) -> tuple[axis.AxisS
     """Returns a shift found with blocks of ``block`` pixels, and the finding about it.
 
     The error of coarse pixels is added to its deviation, because the bootstrap over frames does not include it. It is far
-    larger where ``scan`` measures few rays twice: a shift that leaves fewer of them fits better anyway."""
+    larger where ``scan`` measures few rays twice: a shift that leaves fewer of them fits better anyway. Opposite views of
+    parallel rays give the shift as well, from whole pixels: the answer with the smaller deviation counts."""
     twice = min(2 * stated_redundancy(scan), 1.0)
     is_whole = is_full_turn(scan) and twice == 1
     bias = _BIAS_FULL_TURN if is_whole else _BIAS_HALF_TURN / max(twice, _LEAST_REDUNDANCY)
     shift = replace(shift, deviation=math.hypot(shift.deviation, block * bias))
+    by_views = opposite_shift(scan)
+    if by_views.is_found and not by_views.deviation >= shift.deviation:
+        shift, block = by_views, min(block, _WHOLE_PIXELS)
     pitch_mm = scan.geometry.pixel_size_mm[1]
     return shift, check_centre(shift, block, pitch_mm, scan.geometry.detector_offset_mm[1] / pitch_mm)
 
@@ -145,7 +158,7 @@ def check_centre(shift: axis.AxisShift, block: int, pitch_mm: float, stated_px: 
         text += "; frames mirrored in u and turned the other way would look the same"
     advice = (
         f"add {shift_mm:.4g} mm to detector_offset along u: --fix-offset writes a copy of the scan; "
-        "'phyradgs calibrate' looks for roll and tilt as well"
+        "'phyradgs calibrate' looks for roll as well"
     )
     return Finding(CENTRE, SUSPICIOUS, shift.pixels, threshold, "pixels", text, advice, shift.deviation)
 

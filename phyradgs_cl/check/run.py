@@ -71,7 +71,7 @@ def check(
     Raises InputError where every pixel is masked, and for NaN or infinity elsewhere."""
     scan = without_lag(_finite(scan))
     questions = ["timing", "angles", "saturation", "dead pixels", "coverage", consistency.CONSISTENCY]
-    questions += [orbit.SIGN, orbit.CENTRE, orbit.DISTANCES, detector.GAIN]
+    questions += [orbit.SIGN, orbit.CENTRE, *([] if scan.is_parallel else [orbit.DISTANCES]), detector.GAIN]
     if scan.is_fly and scan.shutter.exposure_s + scan.shutter.readout_s > 0:
         questions.append(shutter.READOUT)
     if scan.shutter.exposure_s > 0:
@@ -104,7 +104,8 @@ def check(
     def ask(question: str, check_question: Callable[[Runtime, Scan], Finding], coarse_scan: Scan) -> None:
         answers.add(check_question(rt, coarse_scan) if consistent.sees_angles else same_from_everywhere(question))
 
-    ask(orbit.DISTANCES, orbit.check_distances, quick)
+    if not scan.is_parallel:
+        ask(orbit.DISTANCES, orbit.check_distances, quick)
     gain = detector.check_gain(rt, quick)
     if gain.verdict == SUSPICIOUS and covered.unit == coverage.CUT_OFF:  # such an object changes the levels too
         gain = replace(gain, verdict=CANNOT_TELL, text=f"{gain.text}, or the object does beyond the panel")

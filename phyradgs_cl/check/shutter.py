@@ -51,7 +51,8 @@ def check_readout(rt: Runtime, scan: Scan) -> Finding:
         text, errors, ratio = _compared(f"read {_OTHER_WAY}", stated, others[_OTHER_WAY])
         if errors >= _ERRORS and ratio >= _ORDER_RATIO:
             return Finding(READOUT, OK, errors, -_ERRORS, "standard errors", text)
-    advice = "ask which line the panel reads first: in a narrow cone the wrong order only twists the object"
+    beam = "a parallel beam" if scan.is_parallel else "a narrow cone"
+    advice = f"ask which line the panel reads first: in {beam} the wrong order only twists the object"
     return Finding(READOUT, CANNOT_TELL, errors, -_ERRORS, "standard errors", text, advice)
 
 

@@ -6,13 +6,20 @@ import numpy as np
 
 from phyradgs_cl.acquisition import (
     CircularOrbit,
+    ConeGeometry,
     EncoderTable,
     FrameSweeps,
     ParallelGeometry,
     PoseTable,
     Scan,
 )
-from phyradgs_cl.acquisition.altered.angles import azimuth_rad, start_azimuths_rad, wrapped
+from phyradgs_cl.acquisition.altered.angles import (
+    azimuth_rad,
+    has_opposite_views,
+    middle_poses,
+    start_azimuths_rad,
+    wrapped,
+)
 from phyradgs_cl.check.finding import OK, SUSPICIOUS, Finding
 
 _TIMING, _ANGLES = "timing", "angles"
@@ -105,23 +112,25 @@ def _speed(scan: Scan, starts_s: np.ndarray) -> Finding:
 def check_angles(scan: Scan) -> Finding:
     """Compares the largest gap between neighbouring views with three times the median one.
 
-    Views that cover half a turn and the fan, or more, may leave one gap. Less coverage is suspicious with any steps."""
-    steps_deg = _steps_deg(scan)
+    Views that cover half a turn and the fan, or more, may leave one gap. Less coverage is suspicious with any steps.
+    Parallel rays across the axis see the same after half a turn: their angles count modulo 180°. Rays that rise need a full
+    turn."""
+    turn_deg, needed_deg, of_needed = _needed_turn(scan)
+    steps_deg = _steps_deg(scan, turn_deg)
     if steps_deg.size < 3:
         count = max(steps_deg.size, 1)
         text = f"{count} different angle{'s' if count > 1 else ''}"
         advice = "check rotation_angle and its unit (degrees)"
         return Finding(_ANGLES, SUSPICIOUS, float(steps_deg.size), 3.0, "angles", text, advice)
-    usual_deg = float(np.median(steps_deg))
+    usual_deg = float(np.median(_steps_deg(scan)))
     widest = np.sort(steps_deg)[::-1]
     is_short = widest[0] > _WIDE * usual_deg
-    covered_deg = 360 - float(widest[0]) + (usual_deg if is_short else 0.0)  # half a step beyond the first and last view
-    needed_deg = 180 + 2 * _half_fan_deg(scan)
+    covered_deg = turn_deg - float(widest[0]) + (usual_deg if is_short else 0.0)  # half a step beyond the ends
     if is_short and covered_deg < needed_deg - _TOLERATED_DEG:
-        text = f"views cover {covered_deg:.4g}°; half a turn and the fan are {needed_deg:.4g}°"
+        text = f"views cover {covered_deg:.4g}°; {of_needed}"
         advice = "expect streaks along the missing directions; check rotation_angle, its unit and its sign"
         return Finding(_ANGLES, SUSPICIOUS, covered_deg, needed_deg, "degrees", text, advice)
-    gap_deg = float(widest[1] if is_short else widest[0])
+    gap_deg = float(widest[1] if is_short and not scan.is_parallel else widest[0])
     text = f"{steps_deg.size} angles over {covered_deg:.4g}°, usually {usual_deg:.3g}° apart, at most {gap_deg:.3g}°"
     if gap_deg <= _WIDE * usual_deg:
         return Finding(_ANGLES, OK, gap_deg, _WIDE * usual_deg, "degrees", text)
@@ -135,20 +144,27 @@ def is_full_turn(scan: Scan) -> bool:
     return steps_deg.size > 0 and float(steps_deg.max()) <= _WIDE * float(np.median(steps_deg))
 
 
-def _steps_deg(scan: Scan) -> np.ndarray:
-    """Returns the degrees from each different view angle to the next, around the turn."""
-    middle_s = np.asarray(scan.frame_start_s) + scan.shutter.middle_s
-    poses = np.stack([scan.trajectory.pose(f, middle_s[f : f + 1])[0] for f in range(scan.frames)])
-    angles_rad = np.sort(azimuth_rad(poses) % (2 * np.pi))
-    steps_deg = np.rad2deg(np.diff(angles_rad, append=angles_rad[0] + 2 * np.pi))
+def _needed_turn(scan: Scan) -> tuple[float, float, str]:
+    """Returns the degrees after which views repeat, the degrees that a volume needs, and those in words."""
+    geometry = scan.geometry
+    if isinstance(geometry, ParallelGeometry):
+        if has_opposite_views(scan):
+            return 180.0, 180.0, "parallel rays need half a turn"
+        return 360.0, 360.0, "parallel rays that rise need a full turn"
+    needed_deg = 180 + 2 * _half_fan_deg(scan, geometry)
+    return 360.0, needed_deg, f"half a turn and the fan are {needed_deg:.4g}°"
+
+
+def _steps_deg(scan: Scan, turn_deg: float = 360.0) -> np.ndarray:
+    """Returns the degrees from each different view angle to the next, around a turn of ``turn_deg``."""
+    angles_deg = np.rad2deg(azimuth_rad(middle_poses(scan))) % turn_deg
+    angles_deg = np.sort(angles_deg % turn_deg)  # a second time: -1e-16 % 360 is 360
+    steps_deg = np.diff(angles_deg, append=angles_deg[0] + turn_deg)
     return steps_deg[steps_deg > math.degrees(_SAME_RAD)]
 
 
-def _half_fan_deg(scan: Scan) -> float:
+def _half_fan_deg(scan: Scan, geometry: ConeGeometry) -> float:
     """Returns half the fan of the reconstruction's box, at most half that of the panel."""
-    geometry = scan.geometry
-    if isinstance(geometry, ParallelGeometry):
-        return 0.0
     half_width_mm = geometry.detector_shape[1] * geometry.pixel_size_mm[1] / 2
     panel_rad = math.atan2(half_width_mm, geometry.source_to_detector_mm)
     radius_mm = max(scan.grid.size_mm[1:]) / 2

@@ -1,20 +1,33 @@
-"""Angles of the source about the axis of rotation (+z), from poses or from a scan."""
+"""Angles of the source, or of parallel rays, about the axis of rotation (+z), from poses or from a scan."""
 
 import numpy as np
 
 from phyradgs_cl.acquisition.scan import Scan
 
+_ACROSS = 1e-3  # largest part along the axis of a ray that counts as across it
+
 
 def azimuth_rad(pose: np.ndarray) -> np.ndarray:
-    """Returns the source's angles (...) about +z of poses (..., 12), in (-π, π]."""
+    """Returns the angles (...) about +z of the source, or of the rays' direction, of poses (..., 12), in (-π, π]."""
     angle_rad: np.ndarray = np.arctan2(pose[..., 1], pose[..., 0])
     return angle_rad
 
 
 def start_azimuths_rad(scan: Scan) -> np.ndarray:
-    """Returns the source's angles (F,) about +z at the start of each frame."""
+    """Returns the angles (F,) of ``azimuth_rad`` at the start of each frame."""
     starts = [scan.trajectory.pose(f, scan.frame_start_s[f : f + 1]) for f in range(scan.frames)]
     return azimuth_rad(np.concatenate(starts))
+
+
+def middle_poses(scan: Scan) -> np.ndarray:
+    """Returns the poses (F, 12) in the middle of every frame's exposure."""
+    times_s = np.asarray(scan.frame_start_s) + scan.shutter.middle_s
+    return np.stack([scan.trajectory.pose(f, times_s[f : f + 1])[0] for f in range(scan.frames)])
+
+
+def has_opposite_views(scan: Scan) -> bool:
+    """True where views half a turn apart are mirror images, those of parallel rays across the axis."""
+    return scan.is_parallel and bool((np.abs(middle_poses(scan)[:, 2]) < _ACROSS).all())
 
 
 def exposure_arc_rad(scan: Scan) -> float:

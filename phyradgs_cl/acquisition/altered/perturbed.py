@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from phyradgs_cl.acquisition.geometry import ConeGeometry
 from phyradgs_cl.acquisition.scan import LARGEST_LAG, Scan
-from phyradgs_cl.acquisition.trajectory import CircularOrbit, Trajectory
+from phyradgs_cl.acquisition.trajectory import CircularOrbit, Trajectory, is_parallel
 
 
 @dataclass(frozen=True)
@@ -85,6 +85,11 @@ class PerturbedTrajectory:
     correction: GeometryCorrection
     views: "Views | Sway | None" = None
 
+    @property
+    def is_parallel(self) -> bool:
+        """True for a parallel beam, as in ``base``."""
+        return is_parallel(self.base)
+
     def pose(self, frame: int, time_s: np.ndarray) -> np.ndarray:
         shift_v_mm, shift_u_mm, turn_rad = 0.0, 0.0, self.correction.turn_rad
         if isinstance(self.views, Views):
@@ -94,11 +99,12 @@ class PerturbedTrajectory:
         about_z = Rotation.from_rotvec([0.0, 0.0, turn_rad]).as_matrix()
         vectors = [vector @ about_z.T for vector in vectors]
         if isinstance(self.views, Sway):
-            vectors = _seen_by(self.views.at(time_s), vectors)
+            vectors = _seen_by(self.views.at(time_s), vectors, 1 if self.is_parallel else 2)
         return np.concatenate(vectors, -1)
 
     def _with_moved_panel(self, pose: np.ndarray, shift_v_mm: float, shift_u_mm: float) -> list[np.ndarray]:
-        """Returns source, first pixel, column step and row step (..., 3) after the correction and shifts of one view."""
+        """Returns source (or direction), first pixel, column step and row step (..., 3) after the correction and shifts of
+        one view."""
         correction = self.correction
         source, first, column, row = np.moveaxis(pose.reshape(*pose.shape[:-1], 4, 3), -2, 0)
         pitch_u_mm, pitch_v_mm = (np.linalg.norm(step, axis=-1, keepdims=True) for step in (column, row))
@@ -111,16 +117,18 @@ class PerturbedTrajectory:
         turn = Rotation.from_rotvec([correction.tilt_u_rad, correction.tilt_v_rad, correction.roll_rad]).as_matrix()
         axes = np.stack([u_hat, v_hat, normal], -1)
         column, row = axes @ turn[:, 0] * pitch_u_mm, axes @ turn[:, 1] * pitch_v_mm
-        return [source + correction.source_distance_mm * normal, middle - half_u * column - half_v * row, column, row]
+        if not self.is_parallel:
+            source = source + correction.source_distance_mm * normal
+        return [source, middle - half_u * column - half_v * row, column, row]
 
 
-def _seen_by(motion: np.ndarray, vectors: list[np.ndarray]) -> list[np.ndarray]:
-    """Returns two places and two steps (..., 3) as an object sees them that has turned and shifted by ``motion`` (...,
-    6)."""
+def _seen_by(motion: np.ndarray, vectors: list[np.ndarray], places: int) -> list[np.ndarray]:
+    """Returns four vectors (..., 3) as an object sees them that has turned and shifted by ``motion`` (..., 6). The last two
+    are steps; before them one or two are ``places``, which shift."""
     back = Rotation.from_rotvec(motion[..., :3].reshape(-1, 3)).as_matrix().reshape(*motion.shape[:-1], 3, 3)
-    places, steps = np.stack(vectors[:2], -2), np.stack(vectors[2:], -2)
-    places = places - motion[..., None, 3:]
-    return list(np.moveaxis(np.concatenate([places @ back, steps @ back], -2), -2, 0))
+    shifted = np.stack(vectors, -2)
+    shifted[..., 2 - places : 2, :] -= motion[..., None, 3:]
+    return list(np.moveaxis(shifted @ back, -2, 0))
 
 
 def perturb(scan: Scan, correction: GeometryCorrection, views: Views | Sway | None = None) -> Scan:

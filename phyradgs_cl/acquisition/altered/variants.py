@@ -1,7 +1,7 @@
 """The same frames under another hypothesis: rotation or readout reversed, longer exposure, panel shifted or mirrored.
 
-Poses (..., 12) are four vectors: the source, the middle of the first pixel, the steps to the next column and the next
-row."""
+Poses (..., 12) are four vectors: the source (or the direction of parallel rays), the middle of the first pixel, the steps
+to the next column and the next row."""
 
 import math
 from collections.abc import Callable
@@ -14,7 +14,7 @@ import numpy as np
 from phyradgs_cl.acquisition.altered.angles import azimuth_rad, start_azimuths_rad, wrapped
 from phyradgs_cl.acquisition.geometry import transpose_pose
 from phyradgs_cl.acquisition.scan import Scan
-from phyradgs_cl.acquisition.trajectory import CircularOrbit, Trajectory
+from phyradgs_cl.acquisition.trajectory import CircularOrbit, Trajectory, is_parallel
 
 _MIRROR_Y = np.array([1.0, -1.0, 1.0] * 4)
 _FIRST, _COLUMN_STEP, _ROW_STEP = slice(3, 6), slice(6, 9), slice(9, 12)
@@ -38,6 +38,11 @@ class AlteredTrajectory:
     images: Callable[[np.ndarray], np.ndarray] | None = None
     blocks: tuple[int, int] = (1, 1)
     frames: np.ndarray | None = None
+
+    @property
+    def is_parallel(self) -> bool:
+        """True for a parallel beam, as in ``base``."""
+        return is_parallel(self.base)
 
     def pose(self, frame: int, time_s: np.ndarray) -> np.ndarray:
         number = frame if self.frames is None else int(self.frames[frame])
@@ -71,6 +76,11 @@ class MappedTrajectory:
 
     base: Trajectory
     change: Callable[[int, np.ndarray], np.ndarray]
+
+    @property
+    def is_parallel(self) -> bool:
+        """True for a parallel beam, as in ``base``."""
+        return is_parallel(self.base)
 
     def pose(self, frame: int, time_s: np.ndarray) -> np.ndarray:
         return self.change(frame, np.array(self.base.pose(frame, time_s)))
@@ -161,8 +171,8 @@ def transposed(scan: Scan, is_quarter_turn: bool) -> Scan:
 
 
 def resized(scan: Scan, factor: float, keeps_axis: bool) -> Scan:
-    """Returns the scan with pixels ``factor`` times as large. keeps_axis: the central ray stays at its pixel, as with
-    shorter distances; else the panel's offset stays in mm."""
+    """Returns a cone beam's scan with pixels ``factor`` times as large. keeps_axis: the central ray stays at its pixel, as
+    with shorter distances; else the panel's offset stays in mm."""
     trajectory = altered_trajectory(scan)
     rows, columns = trajectory.panel
 
