@@ -90,10 +90,8 @@ class Lost:
 
 
 class Pool:
-    """A connection to workers, used as a context. On leaving it, local workers end and others stay.
-
-    Raises InputError where no scheduler answers, or where dask.distributed is missing; DeviceError where local workers do
-    not start."""
+    """A connection to workers, used as a context. On leaving it, local workers end and others stay. Raises InputError where
+    no scheduler answers, or where dask.distributed is missing; DeviceError where local workers do not start."""
 
     def __init__(self, workers: Workers) -> None:
         self.workers = workers
@@ -128,11 +126,10 @@ class Pool:
         self, function: Callable[[Any], Any], arguments: Mapping[str, Any],
         report: Callable[[int, int], None] = lambda running, devices: None,
     ) -> Iterator[tuple[str, Any]]:
-        """Yields (name, ``function(argument)`` or Lost) of every argument, in the order in which they finish.
-
-        No more runs are submitted than the workers have devices: Dask also counts a worker's death against the runs
-        that wait there. ``report`` gets the numbers of running runs and of devices, several times a second.
-        Raises the first exception of ``function``, which ends the other runs, and InputError when the scheduler ends."""
+        """Yields (name, ``function(argument)`` or Lost) of every argument, in the order in which they finish. No more runs
+        are submitted than the workers have devices: Dask also counts a worker's death against the runs that wait there.
+        ``report`` gets the numbers of running runs and of devices, several times a second. Raises the first exception of
+        ``function``, which ends the other runs, and InputError when the scheduler ends."""
         waiting, running = deque(arguments), dict[Any, str]()
         seen_s = time.monotonic()
         try:
@@ -231,9 +228,8 @@ class Pool:
 
 
 def _local_cluster(dask: ModuleType, devices: list[str]) -> Any:
-    """Starts a worker per device on this machine. Dask replaces a worker that dies.
-
-    The workers have no limit of memory: Dask would kill a run that needs more than its share, again and again."""
+    """Starts a worker per device on this machine. Dask replaces a worker that dies. The workers have no limit of memory:
+    Dask would kill a run that needs more than its share, again and again."""
     return dask.LocalCluster(
         n_workers=len(devices), threads_per_worker=1, host=_HOST, dashboard_address=":0", memory_limit=None,
         resources={RESOURCE: 1}, env={_DEVICES_VARIABLE: ",".join(devices)}, preload=[__name__],
@@ -245,9 +241,8 @@ _DEVICES_VARIABLE = "PHYRADGS_LOCAL_WORKERS"
 
 
 def dask_setup(worker: Any) -> None:
-    """Dask calls this when a local worker starts: it takes its device, by its number, and ignores Ctrl-C.
-
-    In a terminal Ctrl-C reaches every process; the sweep answers it."""
+    """Dask calls this when a local worker starts: it takes its device, by its number, and ignores Ctrl-C. In a terminal
+    Ctrl-C reaches every process; the sweep answers it."""
     devices = os.environ[_DEVICES_VARIABLE].split(",")
     os.environ[DEVICE_VARIABLE] = devices[int(worker.name) % len(devices)]
     if threading.current_thread() is threading.main_thread():
@@ -271,6 +266,5 @@ def distributed() -> ModuleType:
 @functools.cache
 def runtime_of_process(device: str | None = None) -> Runtime:
     """Returns this process's runtime on a device; None is PHYRADGS_DEVICE's. Built kernels stay from run to run.
-
     ``runtime_of_process.cache_clear()`` makes the next run open its device again, after a failure of the device."""
     return Runtime(device)

@@ -1,6 +1,5 @@
-"""The parts that all figures share, of notebooks, reports and the documentation: colours, axes, curves, images.
-
-matplotlib is imported when something is drawn."""
+"""The parts that all figures share, of notebooks, reports and the documentation: colours, axes, curves, images. matplotlib
+is imported when something is drawn."""
 
 import importlib
 import math
@@ -65,9 +64,8 @@ def draw_curve(axes: "Axes", x: Sequence[float], y: Sequence[float], x_label: st
 def draw_image(
     axes: "Axes", image: np.ndarray, title: str, *, size_mm: tuple[float, float] | None = None, **how: Any
 ) -> None:
-    """Draws an image (rows, columns), row 0 at the bottom, with a colour bar.
-
-    size_mm: height and width, for a scale bar. how: further arguments of ``imshow``."""
+    """Draws an image (rows, columns), row 0 at the bottom, with a colour bar. size_mm: height and width, for a scale bar.
+    how: further arguments of ``imshow``."""
     rows, columns = image.shape
     height, width = (rows, columns) if size_mm is None else size_mm
     drawn = axes.imshow(image, origin="lower", extent=(0, width, 0, height), **how)

@@ -1,7 +1,6 @@
-"""Time and memory of a reconstruction, from a few iterations of it.
-
-Two short runs of different length give the time per iteration and the time of everything else. A cloud of Gaussians grows
-under density control, so its short runs go through the whole schedule in fewer iterations."""
+"""Time and memory of a reconstruction, from a few iterations of it. Two short runs of different length give the time per
+iteration and the time of everything else. A cloud of Gaussians grows under density control, so its short runs go through the
+whole schedule in fewer iterations."""
 
 import resource
 import sys
@@ -28,10 +27,9 @@ _FEWEST_BETWEEN = 5  # iterations from one round of density control to the next,
 
 @dataclass(frozen=True)
 class Estimate:
-    """seconds, host_bytes and device_bytes of a whole run; the iterations and seconds that the trials took.
-
-    around_s: the part of ``seconds`` outside the method: reading, comparing, writing. host_bytes: the process's largest
-    resident memory, with its buffers on a CPU device. device_bytes: the most memory in buffers at one time."""
+    """seconds, host_bytes and device_bytes of a whole run; the iterations and seconds that the trials took. around_s: the
+    part of ``seconds`` outside the method: reading, comparing, writing. host_bytes: the process's largest resident memory,
+    with its buffers on a CPU device. device_bytes: the most memory in buffers at one time."""
 
     seconds: float
     host_bytes: int
@@ -59,7 +57,6 @@ def estimate(
     scan: Scan, plan: RunPlan, rt: Runtime, around: Callable[[Reconstruction], float] | None = None
 ) -> Estimate:
     """Returns the time and memory of a plan, from short runs of it; a method without iterations runs once as a whole.
-
     ``around`` returns the seconds that a run spends outside the method, from a result of it. The first trial builds the
     kernels, as the run will."""
     started = time.perf_counter()

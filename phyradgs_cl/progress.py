@@ -67,9 +67,8 @@ class Ticker:
         self.show(p.iteration, p.iterations, f"  {p.quantity} {p.loss:.5f}{cloud}")
 
     def show(self, done: int, total: int, more: str = "", share: float | None = None) -> None:
-        """Shows ``done`` of ``total`` and ``more``, unless the last line is too recent.
-
-        share: the fraction of the work that is done, where the counted things differ in length."""
+        """Shows ``done`` of ``total`` and ``more``, unless the last line is too recent. share: the fraction of the work that
+        is done, where the counted things differ in length."""
         now = time.monotonic()
         if share is None:
             share = done / total if total else 0.0

@@ -32,13 +32,11 @@ def export_volume(
     path: str | Path, to: str, output: str | Path | None = None, mu_water_per_mm: float | None = None,
     labels: DicomLabels | None = None,
 ) -> Path:  # fmt: skip
-    """Writes a volume file in another format, whole or not at all, and returns the path of the output.
-
-    ``to``: one of ``EXPORTS``; ply and npz take the Gaussians, all others the voxels. ``output``: a file, or a folder
-    for dicom; None takes the folder of ``path``. ``mu_water_per_mm``: attenuation of water; the values are then
-    Hounsfield units. ``labels``: patient, study and series, for dicom alone. InputError: an unknown format, a damaged
-    volume or one without Gaussians, a suffix of another format, labels with another format. OutputError: the output
-    cannot be written. """
+    """Writes a volume file in another format, whole or not at all, and returns the path of the output. ``to``: one of
+    ``EXPORTS``; ply and npz take the Gaussians, all others the voxels. ``output``: a file, or a folder for dicom; None takes
+    the folder of ``path``. ``mu_water_per_mm``: attenuation of water; the values are then Hounsfield units. ``labels``:
+    patient, study and series, for dicom alone. InputError: an unknown format, a damaged volume or one without Gaussians, a
+    suffix of another format, labels with another format. OutputError: the output cannot be written."""
     checks.one_of("--to", to, EXPORTS)
     path = Path(path)
     target = default_output(path, to) if output is None else Path(output)

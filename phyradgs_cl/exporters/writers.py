@@ -1,6 +1,5 @@
-"""Voxels as NIfTI, NRRD and MetaImage (by SimpleITK), TIFF as ImageJ writes it and NumPy; Gaussians as PLY and NumPy.
-
-The world's x, y, z are left, posterior, superior (LPS, the frame of DICOM and ITK). So the rotation axis, z, is up in every
+"""Voxels as NIfTI, NRRD and MetaImage (by SimpleITK), TIFF as ImageJ writes it and NumPy; Gaussians as PLY and NumPy. The
+world's x, y, z are left, posterior, superior (LPS, the frame of DICOM and ITK). So the rotation axis, z, is up in every
 viewer, and a slice looks the same in viewers that know directions and in those that show row 0 at the top."""
 
 import json

@@ -1,6 +1,5 @@
-"""Scans and volumes in other programs' formats, checked and converted to this package's conventions.
-
-`import_scan` and `load_volume` read them; a format is a module of formats/."""
+"""Scans and volumes in other programs' formats, checked and converted to this package's conventions. `import_scan` and
+`load_volume` read them; a format is a module of formats/."""
 
 import lazy_loader
 

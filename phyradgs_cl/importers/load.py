@@ -42,9 +42,8 @@ _KEYS = {
 
 def import_scan(path: str | Path, options: ImportOptions | None = None, form: str | None = None) -> Scan:
     """Imports a file or folder of another program as a scan of line integrals, row 0 the lowest, in mm, s and radians.
-
     ``options``: values that the files do not state; ``form``: a key of ``FORMATS``, None recognises it. InputError: an
-    unknown format, damaged or incomplete files, options without use for the format. """
+    unknown format, damaged or incomplete files, options without use for the format."""
     path = Path(path)
     if not (path.is_dir() or path.is_file()):
         found = "something that is neither a file nor a folder" if path.exists() else "nothing there"

@@ -1,6 +1,5 @@
-"""Outputs that are whole or absent: written under another name, then renamed; one run per output by a lock file.
-
-Checkpoints of interrupted runs are plain arrays in a NumPy archive, never a pickle."""
+"""Outputs that are whole or absent: written under another name, then renamed; one run per output by a lock file. Checkpoints
+of interrupted runs are plain arrays in a NumPy archive, never a pickle."""
 
 import errno
 import glob
@@ -82,10 +81,9 @@ def only_run(output: str | Path, wait_s: float = 0.0) -> Iterator[None]:
 @contextmanager
 def written_beside(path: str | Path, size_bytes: int = 0, suffix: str = "") -> Iterator[Path]:
     """Yields a temporary path in the target's folder that replaces the target on success, in one step. After an error an
-    existing target has its old content, and system errors of the body become OutputError about ``path``.
-
-    ``size_bytes``: of the arrays to be written. Their room is reserved first, for libraries that crash on a full disk or do
-    not notice it. ``suffix``: the ending of the temporary name, for libraries that go by it."""
+    existing target has its old content, and system errors of the body become OutputError about ``path``. ``size_bytes``: of
+    the arrays to be written. Their room is reserved first, for libraries that crash on a full disk or do not notice it.
+    ``suffix``: the ending of the temporary name, for libraries that go by it."""
     target = _target(path)
     temporary = _create_beside(target, suffix)
     try:

@@ -83,7 +83,6 @@ def grey_range(volume: NDArray[np.floating]) -> tuple[float, float]:
 @dataclass(frozen=True)
 class Window:
     """The first values of black and white, ``low`` and ``high``, and the values ``least`` to ``most`` of 256 grey levels.
-
     All are in 1/mm. beyond: whether there are smaller values than ``least``, and larger ones than ``most``."""
 
     low: float
@@ -103,10 +102,9 @@ class Window:
 
 @dataclass(frozen=True)
 class Plane:
-    """The slices of one orientation: ``indices`` among ``count`` slices.
-
-    layers: PNGs in base64, by layer. first_mm, step_mm: the centre of slice 0 and the distance to the next. size_mm:
-    (width, height). still: a PNG of the middle slice, for browsers without scripts."""
+    """The slices of one orientation: ``indices`` among ``count`` slices. layers: PNGs in base64, by layer. first_mm,
+    step_mm: the centre of slice 0 and the distance to the next. size_mm: (width, height). still: a PNG of the middle slice,
+    for browsers without scripts."""
 
     name: str
     axis: str

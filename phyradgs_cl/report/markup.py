@@ -23,10 +23,8 @@ VOID = frozenset({"br", "img", "input", "link", "meta"})
 
 
 def element(name: str, /, *children: object, **attributes: object) -> Markup:
-    """Returns ``<name attributes>children</name>``; children that are no Markup are escaped.
-
-    Attributes that are None or False are left out, and True has no value. Underscores in names become dashes; one at the
-    end is removed (``class_``)."""
+    """Returns ``<name attributes>children</name>``; children that are no Markup are escaped. Attributes that are None or
+    False are left out, and True has no value. Underscores in names become dashes; one at the end is removed (``class_``)."""
     opening = f"<{name}{''.join(_attribute(key, value) for key, value in attributes.items())}>"
     return Markup(opening) if name in VOID else Markup(f"{opening}{joined(*children)}</{name}>")
 

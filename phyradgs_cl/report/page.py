@@ -26,12 +26,11 @@ def write_report(
     volume: Path, output: Path, make_runtime: Callable[[], Runtime], *, scan: Path | None = None,
     views: int = DEFAULT_VIEWS,
 ) -> Run:
-    """Writes the page ``output`` of a volume file, completely or not at all, and returns the run.
-
-    scan: None is the file that the volume's provenance names, if it is unchanged. views: the number of frames that are
-    computed from the volume, on the device of ``make_runtime``; without frames no device is needed. Raises InputError for
-    files that cannot be read or are of another kind, and for an output that is one of them; OutputError where the page
-    cannot be written; DeviceError where no device can project."""
+    """Writes the page ``output`` of a volume file, completely or not at all, and returns the run. scan: None is the file
+    that the volume's provenance names, if it is unchanged. views: the number of frames that are computed from the volume, on
+    the device of ``make_runtime``; without frames no device is needed. Raises InputError for files that cannot be read or
+    are of another kind, and for an output that is one of them; OutputError where the page cannot be written; DeviceError
+    where no device can project."""
     check_writable(output)
     run = load_run(volume, scan)
     for path in (volume, run.scan_path):

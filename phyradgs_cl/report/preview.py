@@ -23,10 +23,9 @@ log = logging.getLogger(__name__)
 
 
 def write_preview(volume: NDArray[np.floating], grid: Grid, path: str | Path) -> None:
-    """Writes a grey PNG of the middle slices of a volume (nz, ny, nx), in true proportions, completely or not at all.
-
-    From left to right: axial (y up), coronal and sagittal (z up). Raises InputError for a volume that does not fit its
-    grid, NaN and infinity; OutputError where the file cannot be written."""
+    """Writes a grey PNG of the middle slices of a volume (nz, ny, nx), in true proportions, completely or not at all. From
+    left to right: axial (y up), coronal and sagittal (z up). Raises InputError for a volume that does not fit its grid, NaN
+    and infinity; OutputError where the file cannot be written."""
     checks.shape("volume", volume, grid.shape)
     checks.finite("volume", volume)
     picture = png_bytes(preview_image(volume, grid))
@@ -44,9 +43,8 @@ def check_preview(path: Path, *others: Path) -> None:
 
 
 class Preview:
-    """A listener to a running method that writes a picture of the present volume to ``io.partial_path`` of ``path``.
-
-    It writes at most every ``every_s`` seconds. A picture that cannot be written is a warning, once."""
+    """A listener to a running method that writes a picture of the present volume to ``io.partial_path`` of ``path``. It
+    writes at most every ``every_s`` seconds. A picture that cannot be written is a warning, once."""
 
     def __init__(self, path: Path, every_s: float = 5.0) -> None:
         self.path, self.partial, self.every_s = path, partial_path(path), every_s
@@ -105,9 +103,8 @@ _AXES = ("z", "y", "x")
 
 
 def view_volume(path: Path) -> None:
-    """Opens a window with a volume file and returns when it is closed.
-
-    Raises InputError where napari is missing, and for anything but a volume file of phyradgs-cl."""
+    """Opens a window with a volume file and returns when it is closed. Raises InputError where napari is missing, and for
+    anything but a volume file of phyradgs-cl."""
     napari = checks.package("napari", "the package for this, 0.5.4 or later", "napari[all]")
     if (kind := file_kind(path)) != "volume":
         raise InputError(str(path), f"a {kind}", "a volume of phyradgs-cl")

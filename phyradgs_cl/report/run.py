@@ -34,10 +34,9 @@ Image = NDArray[np.float32]
 
 @dataclass(frozen=True, eq=False)
 class Run:
-    """A reconstruction from its volume file and, where it is found, its scan.
-
-    scan, scan_path, scan_facts: the scan, on the volume's grid. reference (nz, ny, nx) 1/mm: the truth on that grid.
-    metrics: by name. notes: remarks for the reader of the page. compared: how volume and truth were compared."""
+    """A reconstruction from its volume file and, where it is found, its scan. scan, scan_path, scan_facts: the scan, on the
+    volume's grid. reference (nz, ny, nx) 1/mm: the truth on that grid. metrics: by name. notes: remarks for the reader of
+    the page. compared: how volume and truth were compared."""
 
     path: Path
     stored: Volume
@@ -87,9 +86,8 @@ class Run:
 
 
 def load_run(path: Path, scan_path: Path | None = None) -> Run:
-    """Reads a volume file and its scan: ``scan_path``, or the unchanged file that the provenance names.
-
-    Raises InputError for anything but a volume file of phyradgs-cl, and for a ``scan_path`` that cannot be read."""
+    """Reads a volume file and its scan: ``scan_path``, or the unchanged file that the provenance names. Raises InputError
+    for anything but a volume file of phyradgs-cl, and for a ``scan_path`` that cannot be read."""
     kind = file_kind(path)
     if kind != "volume":
         raise InputError(str(path), f"a {kind}", "a volume of phyradgs-cl", "make one with 'phyradgs reconstruct'")
@@ -165,11 +163,9 @@ def computed_views(run: Run, rt: Runtime, count: int) -> list[FramePair]:
 
 @dataclass(frozen=True, eq=False)
 class Change:
-    """The effect of a preprocessing step.
-
-    numbers: the facts that the step reports. pairs: images before and after, by name: the frame (rows, columns) and the
-    sinogram (frames, columns) that changed most, and the middle slice (y, x) by FDK. counts (2, n): histograms of all line
-    integrals, before and after, between ``edges`` (n + 1,)."""
+    """The effect of a preprocessing step. numbers: the facts that the step reports. pairs: images before and after, by name:
+    the frame (rows, columns) and the sinogram (frames, columns) that changed most, and the middle slice (y, x) by FDK.
+    counts (2, n): histograms of all line integrals, before and after, between ``edges`` (n + 1,)."""
 
     step: str
     numbers: Facts

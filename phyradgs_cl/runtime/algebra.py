@@ -1,7 +1,6 @@
-"""Algebra of arrays with one interface: on the device by kernels (cl/algebra.cl), on the host by NumPy.
-
-A method is written once, over a ``Space``. Every function returns a new array or a number; only numbers come back from a
-device. Sums are deterministic: the same arrays on the same device give the same bits."""
+"""Algebra of arrays with one interface: on the device by kernels (cl/algebra.cl), on the host by NumPy. A method is written
+once, over a ``Space``. Every function returns a new array or a number; only numbers come back from a device. Sums are
+deterministic: the same arrays on the same device give the same bits."""
 
 import weakref
 from collections import defaultdict
@@ -260,9 +259,8 @@ def norm(values: np.ndarray) -> float:
 
 
 def inner(a: np.ndarray, b: np.ndarray) -> float:
-    """Inner product of two arrays of one shape on the host, summed in float64.
-
-    BLAS is avoided: its threads wait for cores that the device uses, which took most of a small run."""
+    """Inner product of two arrays of one shape on the host, summed in float64. BLAS is avoided: its threads wait for cores
+    that the device uses, which took most of a small run."""
     return float(np.einsum("i,i->", a.ravel(), b.ravel(), dtype=np.float64))
 
 

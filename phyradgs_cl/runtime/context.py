@@ -201,9 +201,8 @@ class Runtime:
     def launch(
         self, kernel: Kernel, items: int | tuple[int, ...], *args: Any, group: int | tuple[int, ...] = 1
     ) -> None:
-        """Enqueues ``items`` work-items (kernels ignore those past the end) in groups of ``group``, other sides 1.
-
-        Python's whole numbers become int, its others float. A long is np.int64, a float that may be whole np.float32."""
+        """Enqueues ``items`` work-items (kernels ignore those past the end) in groups of ``group``, other sides 1. Python's
+        whole numbers become int, its others float. A long is np.int64, a float that may be whole np.float32."""
         shape = (items,) if isinstance(items, (int, np.integer)) else items
         if min(shape) < 1:
             return
@@ -232,9 +231,8 @@ class Runtime:
         return self._tile
 
     def shape_of_lines(self, width: int, *rows: int) -> tuple[tuple[int, ...], tuple[int, int], int]:
-        """Returns work-items, group and number of groups of kernels that step along lines of ``width`` pixels.
-
-        A work-item takes a line on a CPU, and a pixel on a GPU."""
+        """Returns work-items, group and number of groups of kernels that step along lines of ``width`` pixels. A work-item
+        takes a line on a CPU, and a pixel on a GPU."""
         items, group = ((width, *rows), self.tile()) if self.pixel_items else ((1, *rows), (1, 1))
         sides = (*group, *([1] * (len(rows) - 1)))
         return items, group, math.prod(ceil_div(n, side) for n, side in zip(items, sides, strict=True))

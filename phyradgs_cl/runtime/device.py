@@ -62,11 +62,10 @@ def list_devices() -> list[DeviceInfo]:
 
 
 def choose_device(wish: str | None = None, turn: int = 0) -> tuple[DeviceInfo, str]:
-    """Returns the device to use and the reason in words.
-
-    ``wish`` (or the environment variable PHYRADGS_DEVICE) is an index, ``cpu``, ``gpu`` or a part of a device's or
-    platform's name, or several of these with commas. ``turn`` counts processes that share a machine: each takes the next of
-    the list, or, without a list or an index, the next device of the same name. Raises DeviceError where nothing fits."""
+    """Returns the device to use and the reason in words. ``wish`` (or the environment variable PHYRADGS_DEVICE) is an index,
+    ``cpu``, ``gpu`` or a part of a device's or platform's name, or several of these with commas. ``turn`` counts processes
+    that share a machine: each takes the next of the list, or, without a list or an index, the next device of the same name.
+    Raises DeviceError where nothing fits."""
     source = "--device"
     if not wish:
         wish, source = os.environ.get(DEVICE_VARIABLE), DEVICE_VARIABLE

@@ -1,7 +1,6 @@
-"""The layout of images and volumes in device memory: rows with a pitch.
-
-GUARD floats, then (rows, pitch), where every row ends in at least GUARD zeros. A vector of pixels may therefore start or end
-outside a row without a test. In kernels GUARD is ``IMAGE_GUARD``."""
+"""The layout of images and volumes in device memory: rows with a pitch. GUARD floats, then (rows, pitch), where every row
+ends in at least GUARD zeros. A vector of pixels may therefore start or end outside a row without a test. In kernels GUARD is
+``IMAGE_GUARD``."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -58,7 +57,6 @@ def on_device(
     rt: Runtime, function: Callable[[DeviceArray, DeviceArray], None], volume: SameArray, out: DeviceArray | None
 ) -> SameArray:
     """Runs ``function(volume, result)`` on the device; the result has the shape of ``volume`` and lies where it lies.
-
     ``out``: the memory of a result on the device."""
     result = rt.empty(volume.shape) if out is None else out
     if isinstance(volume, DeviceArray):

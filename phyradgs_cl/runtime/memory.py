@@ -193,9 +193,8 @@ def is_cl_array(value: object) -> bool:
 
 
 def adopted(name: str, array: Any, queue: "cl.CommandQueue") -> DeviceArray:
-    """Returns a float32 Array of pyopencl (C order) as a DeviceArray on the same memory; a view of another is copied.
-
-    Raises InputError, with ``name`` as its subject, for another context, queue or type."""
+    """Returns a float32 Array of pyopencl (C order) as a DeviceArray on the same memory; a view of another is copied. Raises
+    InputError, with ``name`` as its subject, for another context, queue or type."""
     remedy = "make it with the operator's to_device, or on its queue"
     if array.context != queue.context:
         raise InputError(name, "an Array of another OpenCL context", "the operator's context", remedy)

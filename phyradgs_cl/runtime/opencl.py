@@ -1,7 +1,6 @@
-"""pyopencl, loaded when it is first used, and kernels with their sources.
-
-Sources are files of ``cl/`` with their headers pasted in, because an include path fails on a folder with a space.
-``#line`` marks keep file and line in the compiler's messages."""
+"""pyopencl, loaded when it is first used, and kernels with their sources. Sources are files of ``cl/`` with their headers
+pasted in, because an include path fails on a folder with a space. ``#line`` marks keep file and line in the compiler's
+messages."""
 
 import re
 from collections.abc import Callable
@@ -68,10 +67,9 @@ def _expand(relative: str, pasted: set[str]) -> list[str]:
 
 
 def naming_failures(work: str | None = None) -> Callable[[Callable[P, R]], Callable[P, R]]:
-    """Decorates a method of a runtime, so that OpenCL's errors become DeviceError or MemoryShortage.
-
-    Drivers queue work: a launch may be refused at once, or fail later in any call that waits. ``work`` names the method's
-    work; None takes the name of the kernel, the first argument of a launch."""
+    """Decorates a method of a runtime, so that OpenCL's errors become DeviceError or MemoryShortage. Drivers queue work: a
+    launch may be refused at once, or fail later in any call that waits. ``work`` names the method's work; None takes the
+    name of the kernel, the first argument of a launch."""
 
     def decorate(method: Callable[P, R]) -> Callable[P, R]:
         @wraps(method)

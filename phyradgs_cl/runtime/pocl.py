@@ -52,11 +52,10 @@ _kept_alive: list[ctypes.Array[ctypes.c_char]] = []
 
 
 def prepare_environment() -> None:
-    """Gives PoCL a kernel cache for this processor, unless the user has chosen one. To be called before pyopencl loads.
-
-    PoCL names its cache after the LLVM target, so two unknown processors would share binaries. Without a writable cache
-    PoCL has no device: then the cache lies in the temporary folder, and pyopencl's is switched off.
-    Raises InputError for a number of threads that PoCL would crash on or ignore."""
+    """Gives PoCL a kernel cache for this processor, unless the user has chosen one. To be called before pyopencl loads. PoCL
+    names its cache after the LLVM target, so two unknown processors would share binaries. Without a writable cache PoCL has
+    no device: then the cache lies in the temporary folder, and pyopencl's is switched off. Raises InputError for a number of
+    threads that PoCL would crash on or ignore."""
     global _unwritable
     if platform.system() != "Linux":
         return
@@ -140,10 +139,9 @@ def library_target() -> str | None:
 
 
 def use_library_target(device_address: int) -> str | None:
-    """Names the library's processor in the record of a PoCL 3.0 CPU device, and returns that name.
-
-    The record holds the target triple and, next to it, the processor's name. Nothing is changed, and None returned, where
-    the two are not found. From 3.1 on PoCL names the library's processor itself."""
+    """Names the library's processor in the record of a PoCL 3.0 CPU device, and returns that name. The record holds the
+    target triple and, next to it, the processor's name. Nothing is changed, and None returned, where the two are not found.
+    From 3.1 on PoCL names the library's processor itself."""
     target = library_target()
     if target is None or platform.system() != "Linux":
         return None

@@ -1,7 +1,6 @@
-"""A run's device time by kernel: launches, seconds and bytes, compared with the device's best rates.
-
-Seconds are of OpenCL events. Bytes count each buffer of a launch once. The best rates are measured by copies of the driver
-and by a kernel of multiply-adds."""
+"""A run's device time by kernel: launches, seconds and bytes, compared with the device's best rates. Seconds are of OpenCL
+events. Bytes count each buffer of a launch once. The best rates are measured by copies of the driver and by a kernel of
+multiply-adds."""
 
 from collections import defaultdict
 from dataclasses import dataclass
@@ -63,9 +62,8 @@ class Rates:
 
 
 def profile_text(uses: dict[str, KernelUse], wall_s: float, rates: Rates, pairs: dict[str, int]) -> str:
-    """Formats a table of ``uses`` (Profile.uses) and the part of ``wall_s`` that kernels take.
-
-    ``pairs``: Gaussian–pixel pairs per launch of a kernel, where known."""
+    """Formats a table of ``uses`` (Profile.uses) and the part of ``wall_s`` that kernels take. ``pairs``: Gaussian–pixel
+    pairs per launch of a kernel, where known."""
     busy_s = sum(use.seconds for use in uses.values())
     heads = ("kernel", "launches", "seconds", "share", "ms each", "GB/s", "of copy", "Gpairs/s", "ns/pair")
     rows = [heads]

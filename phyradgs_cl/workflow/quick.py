@@ -28,7 +28,6 @@ def quick_grid(
     folder: Path, make_runtime: Callable[[], Runtime], *, seed: int = 0, iterations: int = ITERATIONS
 ) -> SweepGrid:
     """Simulates the missing scans in ``folder``/scans; returns a sweep of every method, with and without motion, over them.
-
     seed: of noise, cloud and frame order. iterations: of splats. Raises OutputError for a folder that cannot be made."""
     checks.within("--iterations", iterations, 0, 10_000_000)
     settings = []

@@ -35,9 +35,8 @@ def check_interval(seconds: float) -> None:
 
 
 class _Checkpoints:
-    """A listener that writes a checkpoint at most every ``every_s`` seconds; 0: none. A kill leaves the last complete one.
-
-    A checkpoint that cannot be written is a warning, once, and no error."""
+    """A listener that writes a checkpoint at most every ``every_s`` seconds; 0: none. A kill leaves the last complete one. A
+    checkpoint that cannot be written is a warning, once, and no error."""
 
     def __init__(self, path: Path, every_s: float) -> None:
         self.path, self.every_s = path, every_s
@@ -80,12 +79,10 @@ def run_reconstruction(
     report: methods.ProgressReport = methods.ignore_progress, *, resume: bool = False,
     checkpoint_every_s: float = 600.0, inputs: Sequence[Path] = (), ranks: Communicator | None = None,
 ) -> tuple[methods.Reconstruction, dict[str, float]]:
-    """Reconstructs a scan file and writes a volume file; returns the result and its metrics.
-
-    An interrupted run leaves ``output`` alone: it writes ``io.partial_path`` and a checkpoint, from which ``resume`` goes
-    on. A complete run removes both; a killed run leaves its last checkpoint. inputs: other files that the output must not
-    overwrite. ranks: those of the runtime; rank 0 alone writes and has metrics. Raises OutputError while another run
-    writes the output."""
+    """Reconstructs a scan file and writes a volume file; returns the result and its metrics. An interrupted run leaves
+    ``output`` alone: it writes ``io.partial_path`` and a checkpoint, from which ``resume`` goes on. A complete run removes
+    both; a killed run leaves its last checkpoint. inputs: other files that the output must not overwrite. ranks: those of
+    the runtime; rank 0 alone writes and has metrics. Raises OutputError while another run writes the output."""
     check_interval(checkpoint_every_s)
     leads = ranks is None or ranks.rank == 0
     if resume:
@@ -138,7 +135,6 @@ def _reconstructed(
 
 def _metrics(scan: Scan, result: methods.Reconstruction) -> dict[str, float]:
     """Returns the metrics against the scan's reference, by the rule of ``metrics.aligned``, and those on held-out pixels.
-
     The latter leave the result's facts. These get the way of comparison, if it is not voxel by voxel."""
     held_out = result.facts.pop(HELD_OUT, {})
     if scan.reference is None:

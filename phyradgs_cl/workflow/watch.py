@@ -1,6 +1,5 @@
-"""Reconstructs the scans of a folder as they arrive, each once. Its only state is the files that it writes.
-
-The folder is polled: network file systems send no notice of files that other machines write."""
+"""Reconstructs the scans of a folder as they arrive, each once. Its only state is the files that it writes. The folder is
+polled: network file systems send no notice of files that other machines write."""
 
 import logging
 import os
@@ -27,10 +26,9 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class WatchJob:
-    """The watched folder, and the plan by which its scans are reconstructed into ``output``.
-
-    poll_s: seconds between two looks at the folder. settle_s: how long a file must not have changed. once: return when
-    every complete scan has its volume or its error."""
+    """The watched folder, and the plan by which its scans are reconstructed into ``output``. poll_s: seconds between two
+    looks at the folder. settle_s: how long a file must not have changed. once: return when every complete scan has its
+    volume or its error."""
 
     folder: Path
     output: Path
@@ -60,11 +58,10 @@ def run_watch(
     job: WatchJob, make_runtime: Callable[[], Runtime], tell: Callable[[WatchEvent], None],
     report: Callable[[Path], ProgressReport] = lambda scan: ignore_progress,
 ) -> None:
-    """Looks, reconstructs, and looks again; returns only with ``once``.
-
-    A signal ends the run after its present iteration, as KeyboardInterrupt, with a checkpoint for the next start.
-    Raises InputError for a missing folder, or one that is also the output; OutputError where nothing can be written,
-    BusyError while another watch writes there; DeviceError where there is no device, or none any more."""
+    """Looks, reconstructs, and looks again; returns only with ``once``. A signal ends the run after its present iteration,
+    as KeyboardInterrupt, with a checkpoint for the next start. Raises InputError for a missing folder, or one that is also
+    the output; OutputError where nothing can be written, BusyError while another watch writes there; DeviceError where there
+    is no device, or none any more."""
     if not job.folder.is_dir():
         raise InputError(str(job.folder), "no folder", "the folder in which scans arrive", "make it first")
     if job.folder.resolve() == job.output.resolve():
@@ -100,11 +97,9 @@ class Arrival:
 
 
 class Arrivals:
-    """Finds the complete scans of a folder.
-
-    A file is complete when its size and times have not changed for ``settle_s``. A file that was renamed into place, or
-    copied with its times, is complete at once: its last change (ctime) is later than its last byte (mtime), both
-    by the clock of the file server."""
+    """Finds the complete scans of a folder. A file is complete when its size and times have not changed for ``settle_s``. A
+    file that was renamed into place, or copied with its times, is complete at once: its last change (ctime) is later than
+    its last byte (mtime), both by the clock of the file server."""
 
     def __init__(self, folder: Path, settle_s: float, now: Callable[[], float] = time.monotonic) -> None:
         self.folder, self.settle_s, self._now = folder, settle_s, now
@@ -171,9 +166,8 @@ class _Watch:
         return arrivals
 
     def _handle(self, arrival: Arrival) -> bool:
-        """Makes a scan's volume or its error; False for a file that another program has open, which waits.
-
-        After a failure of the device it is opened again, once. An error of a missing device ends the watch."""
+        """Makes a scan's volume or its error; False for a file that another program has open, which waits. After a failure
+        of the device it is opened again, once. An error of a missing device ends the watch."""
         try:
             return self._reconstruct(arrival)
         except OutOfMemoryError as error:

@@ -1,7 +1,6 @@
-"""Data Exchange files (HDF5) of synchrotron beamlines: /exchange with data, data_white, data_dark and theta.
-
-The format describes parallel beams: distances and pixel sizes usually come from the options. Angles are the sample's,
-in degrees unless units differ; row 0 is the top of the image."""
+"""Data Exchange files (HDF5) of synchrotron beamlines: /exchange with data, data_white, data_dark and theta. The format
+describes parallel beams: distances and pixel sizes usually come from the options. Angles are the sample's, in degrees unless
+units differ; row 0 is the top of the image."""
 
 from pathlib import Path
 

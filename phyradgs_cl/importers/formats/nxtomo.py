@@ -1,7 +1,6 @@
-"""NXtomo files of other programs (HDF5). Values that this package's scan files must have may come from options.
-
-The format does not state which row is on top. Row 0 is taken as the lowest, with a warning, after the flips that the file
-declares in either way of the nxtomo package. The column of the rotation axis becomes a detector offset."""
+"""NXtomo files of other programs (HDF5). Values that this package's scan files must have may come from options. The format
+does not state which row is on top. Row 0 is taken as the lowest, with a warning, after the flips that the file declares in
+either way of the nxtomo package. The column of the rotation axis becomes a detector offset."""
 
 import logging
 from dataclasses import replace

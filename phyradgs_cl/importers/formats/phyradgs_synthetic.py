@@ -1,6 +1,5 @@
-"""Synthetic folders of PhyRadGS: R2-Gaussian's layout, and for every frame the gantry angles of its first and last line.
-
-The exposure takes ``exposure_s`` (1 s unless given). The gantry's speed is the arc of an exposure over that time."""
+"""Synthetic folders of PhyRadGS: R2-Gaussian's layout, and for every frame the gantry angles of its first and last line. The
+exposure takes ``exposure_s`` (1 s unless given). The gantry's speed is the arc of an exposure over that time."""
 
 from pathlib import Path
 

@@ -1,6 +1,5 @@
-"""Folders of R2-Gaussian: meta_data.json with .npy projections and the true volume; taken at rest.
-
-Its frame is TIGRE's, which PhyRadGS and NAF share: projections [v, u] with row 0 at +z, volumes [x, y, z]."""
+"""Folders of R2-Gaussian: meta_data.json with .npy projections and the true volume; taken at rest. Its frame is TIGRE's,
+which PhyRadGS and NAF share: projections [v, u] with row 0 at +z, volumes [x, y, z]."""
 
 from dataclasses import dataclass
 from pathlib import Path

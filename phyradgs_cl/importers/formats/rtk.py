@@ -1,7 +1,6 @@
-"""Scans of RTK: a geometry file (RTKThreeDCircularGeometry, version 3) and a stack of projections as MetaImage.
-
-The geometry has nine numbers per projection. XML entities and external files are refused: of DOCTYPEs only the empty one of
-RTK's own files passes."""
+"""Scans of RTK: a geometry file (RTKThreeDCircularGeometry, version 3) and a stack of projections as MetaImage. The geometry
+has nine numbers per projection. XML entities and external files are refused: of DOCTYPEs only the empty one of RTK's own
+files passes."""
 
 import math
 import re
@@ -129,9 +128,8 @@ class RtkGeometry:
     def poses(
         self, position: np.ndarray, origin_mm: np.ndarray, step_u: np.ndarray, step_v: np.ndarray
     ) -> np.ndarray:
-        """Returns poses (T, 12) at frame positions (T,), linear between and beyond frames. ``origin_mm`` (2,): place
-        (u, v) of pixel (0, 0) in the image's plane; ``step_u``, ``step_v`` (2,): from column to column and row to
-        row."""
+        """Returns poses (T, 12) at frame positions (T,), linear between and beyond frames. ``origin_mm`` (2,): place (u, v)
+        of pixel (0, 0) in the image's plane; ``step_u``, ``step_v`` (2,): from column to column and row to row."""
         at = {
             name: _along(np.unwrap(v) if name in _ANGLES else v, position) for name, v in self.values.items()
         }

@@ -1,7 +1,5 @@
-"""A folder of TIFF frames and one TOML with their contents, geometry, angles and timing.
-
-The TOML has the tables of a scanner file, and [frames], [angles] and [timing]. Row 0 is the top, column 0 the left,
-seen from the source. """
+"""A folder of TIFF frames and one TOML with their contents, geometry, angles and timing. The TOML has the tables of a
+scanner file, and [frames], [angles] and [timing]. Row 0 is the top, column 0 the left, seen from the source."""
 
 from dataclasses import astuple, replace
 from pathlib import Path, PurePosixPath

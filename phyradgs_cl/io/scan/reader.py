@@ -23,14 +23,11 @@ ToAttenuation = Callable[[np.ndarray, np.ndarray, str], tuple[np.ndarray, np.nda
 
 
 def read_scan(path: str | Path, to_attenuation: ToAttenuation) -> Scan:
-    """Reads a scan file; ``to_attenuation`` converts the frames to line integrals.
-
-    It takes (data (F, v, u), image_key (F,), quantity) and returns line integrals (P, v, u) of the P projections, and a
-    mask (v, u) or (P, v, u) of unusable values or None. Everything but the pixels is checked before they are read. Flat,
-    dark and invalid frames are left out. The scan has projections (P, v, u) float32 and a bool ``pixel_mask`` or None, from
-    the file and the conversion; values that are not finite must be masked.
-
-    Raises: InputError for a missing, damaged or incomplete file; its subject is "FILE:/hdf5/path"."""
+    """Reads a scan file; ``to_attenuation`` converts the frames to line integrals. It takes (data (F, v, u), image_key (F,),
+    quantity) and returns line integrals (P, v, u) of the P projections, and a mask (v, u) or (P, v, u) of unusable values or
+    None. Everything but the pixels is checked before they are read. Flat, dark and invalid frames are left out. The scan has
+    projections (P, v, u) float32 and a bool ``pixel_mask`` or None, from the file and the conversion; values that are not
+    finite must be masked. Raises: InputError for a missing, damaged or incomplete file; its subject is "FILE:/hdf5/path"."""
     with open_hdf5(path) as source:
         header = read_header(source)
         mask = _read_mask(source, header)

@@ -28,14 +28,11 @@ def write_scan(
     path: str | Path, scan: Scan, *, data: np.ndarray | None = None, image_key: np.ndarray | None = None,
     quantity: str = "attenuation",
 ) -> None:
-    """Writes a scan file, whole or not at all, in place of an existing one.
-
-    Without ``data`` the line integrals of ``scan`` are written. ``data``: (F, v, u) float32 or uint16 raw frames with flats
-    and darks, whose ``quantity`` is "attenuation", "transmission" or "counts"; image_key (F,): 0 projection, 1 flat, 2
-    dark, 3 invalid, with as many 0 as ``scan`` has frames. A user's own trajectory becomes a table of poses.
-
-    Raises: InputError for arguments that contradict each other, or a scan that the format cannot express; OutputError where
-    the file cannot be written."""
+    """Writes a scan file, whole or not at all, in place of an existing one. Without ``data`` the line integrals of ``scan``
+    are written. ``data``: (F, v, u) float32 or uint16 raw frames with flats and darks, whose ``quantity`` is "attenuation",
+    "transmission" or "counts"; image_key (F,): 0 projection, 1 flat, 2 dark, 3 invalid, with as many 0 as ``scan`` has
+    frames. A user's own trajectory becomes a table of poses. Raises: InputError for arguments that contradict each other, or
+    a scan that the format cannot express; OutputError where the file cannot be written."""
     frames, key = _checked_frames(scan, data, image_key, quantity)
     if scan.is_fly and scan.shutter.exposure_s == 0 and scan.shutter.readout_s > 0:  # in a file the gantry would stand
         remedy = "give the exposure its real length"

@@ -62,10 +62,9 @@ class SweepGrid:
 
 
 def read_grid(document: Table, path: Path) -> SweepGrid:
-    """Returns the scans, settings and seeds of GRID.toml; its patterns start at the folder of ``path``.
-
-    Raises InputError for everything that would stop a run: unknown keys, values out of range, patterns that match
-    nothing, files that are no scans."""
+    """Returns the scans, settings and seeds of GRID.toml; its patterns start at the folder of ``path``. Raises InputError
+    for everything that would stop a run: unknown keys, values out of range, patterns that match nothing, files that are no
+    scans."""
     refuse_unknown(f"{path}:", document, _KEYS)
     settings = _settings(document, path)
     seeds = _seeds(document.get("seeds", [0]), path)

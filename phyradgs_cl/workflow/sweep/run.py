@@ -66,10 +66,8 @@ class SweepJob:
 
 @dataclass(frozen=True)
 class SweepProgress:
-    """The state of a sweep: finished runs, all runs, failed ones, and those that workers are making.
-
-    line: of a run that has just finished. name, progress: of the run that this process is making. dashboard: the address
-    of Dask's page, once."""
+    """The state of a sweep: finished runs, all runs, failed ones, and those that workers are making. line: of a run that has
+    just finished. name, progress: of the run that this process is making. dashboard: the address of Dask's page, once."""
 
     done: int
     total: int
@@ -106,10 +104,9 @@ def plan_sweep(grid: SweepGrid, folder: Path, checkpoint_every_s: float = 600.0)
 
 @np.errstate(all="ignore")
 def run_sweep(job: SweepJob, report: Report = lambda progress: None) -> tuple[list[Path], int]:
-    """Makes the missing runs, then the tables. Returns the written files and the number of runs that failed now.
-
-    The next call makes failed runs again. An interruption (KeyboardInterrupt) loses no finished run. OutputError: the
-    folder cannot be written; BusyError while another sweep uses it. InputError: no scheduler, or a missing package."""
+    """Makes the missing runs, then the tables. Returns the written files and the number of runs that failed now. The next
+    call makes failed runs again. An interruption (KeyboardInterrupt) loses no finished run. OutputError: the folder cannot
+    be written; BusyError while another sweep uses it. InputError: no scheduler, or a missing package."""
     results = _results_file(job.folder)
     with only_run(results):
         lines = tables.read_lines(results, tables.is_sound)
@@ -153,10 +150,9 @@ def _lines(job: SweepJob, runs: Sequence[SweepRun], say: Callable[..., None]) ->
 
 
 def make_run(run: SweepRun, report: ProgressReport = ignore_progress, device: str | None = None) -> Line:
-    """Makes a run, in a worker or in this process, and returns its line, with the error where it fails.
-
-    A finished run whose line was lost on its way is not made again. Raises KeyboardInterrupt for a run that was stopped,
-    OutputError where nothing can be written."""
+    """Makes a run, in a worker or in this process, and returns its line, with the error where it fails. A finished run whose
+    line was lost on its way is not made again. Raises KeyboardInterrupt for a run that was stopped, OutputError where
+    nothing can be written."""
     try:
         with only_run(run.record, wait_s=_BUSY_S):  # a worker that lost its scheduler may still be making it
             return _recorded(run) or _reconstructed(run, report, device)

@@ -28,9 +28,8 @@ _MOST_BYTES = 1 << 30
 
 
 def identity(line: Line) -> tuple[Any, ...]:
-    """Returns the values that equal lines of one run share: its name, and the size and time of the scan file.
-
-    Names are as a results file has them, where text that is no UTF-8 is replaced."""
+    """Returns the values that equal lines of one run share: its name, and the size and time of the scan file. Names are as a
+    results file has them, where text that is no UTF-8 is replaced."""
     values = (line.get(name) for name in ("run", "scan", "scan_bytes", "scan_mtime_ns"))
     return tuple(plain_text(value) if isinstance(value, str) else value for value in values)
 
