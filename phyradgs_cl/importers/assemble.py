@@ -3,7 +3,7 @@ times; these, line integrals, geometry and options make a scan."""
 
 import logging
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 
 import numpy as np
 
@@ -14,11 +14,13 @@ from phyradgs_cl.acquisition.plausible import check_plausible
 from phyradgs_cl.acquisition.trajectory import resting_poses
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
-from phyradgs_cl.importers.options import ImportOptions
-from phyradgs_cl.importers.reading.frames import LineIntegrals
+from phyradgs_cl.importers.options import ImportOptions, needed
+from phyradgs_cl.importers.reading.frames import LineIntegrals, distance_to_detector
+from phyradgs_cl.io.hdf5.source import Hdf5Source
 
 _log = logging.getLogger(__name__)
 _OF_A_TURN = ("exposure_s", "readout_s", "angle_at", "readout_axis", "readout_direction")
+_DISTANCES = ("source_to_axis_mm", "source_to_detector_mm")
 _SLACK = 1e-6  # of a span: how far a table extends beyond the times that are needed
 
 
@@ -207,14 +209,36 @@ def assemble_scan(
     return scan
 
 
+def stored_beam(
+    source: Hdf5Source, addresses: tuple[str, str], to_axis_mm: float | None, options: ImportOptions,
+    panel: tuple[int, int], pitch_mm: tuple[float, float], offset_mm: tuple[float, float] = (0.0, 0.0),
+) -> Geometry:
+    """Returns the geometry of an HDF5 file. ``addresses``: of the distances of source and detector; ``to_axis_mm``: the
+    source's, None without one. Where the options state no distance either, the beam is parallel, and a warning says so."""
+    of_source, of_detector = addresses
+    if to_axis_mm is None and not options.given(_DISTANCES):
+        _log.warning("%s: no source distance: a parallel beam", source.name(of_source))
+        return parallel(options, panel, pitch_mm, offset_mm)
+    stated_mm = options.source_to_axis_mm or to_axis_mm
+    to_axis_mm = needed(stated_mm, "source_to_axis_mm", source.name(of_source), options.named)
+    to_detector_mm = distance_to_detector(source, of_detector, to_axis_mm, options)
+    return cone(options, to_axis_mm, to_detector_mm, panel, pitch_mm, offset_mm)
+
+
+def with_options(options: ImportOptions, geometry: Geometry) -> Geometry:
+    """Returns a geometry with the options' lengths where they are given. InputError for distances of a parallel beam."""
+    if isinstance(geometry, ParallelGeometry):
+        return parallel(options, *astuple(geometry))
+    return cone(options, *astuple(geometry))
+
+
 def parallel(
     options: ImportOptions, panel: tuple[int, int], pitch_mm: tuple[float, float], offset_mm: tuple[float, float]
 ) -> ParallelGeometry:
     """Returns a parallel beam of a file's numbers, or the options' where they are given. InputError for distances."""
-    for name in ("source_to_axis_mm", "source_to_detector_mm"):
-        if getattr(options, name) is not None:
-            expected, remedy = "no distance: this file has a parallel beam", "leave it out"
-            raise InputError(options.named(name), f"{getattr(options, name):g}", expected, remedy)
+    for name in options.given(_DISTANCES):
+        expected, remedy = "no distance: this file has a parallel beam", "leave it out"
+        raise InputError(options.named(name), f"{getattr(options, name):g}", expected, remedy)
     return ParallelGeometry(panel, options.pixel_size_mm or pitch_mm, options.detector_offset_mm or offset_mm)
 
 

@@ -133,7 +133,5 @@ def option_name(field: str) -> str:
 def needed(value: float | None, field: str, subject: str, named: Named) -> float:
     """Returns a length that the file does not hold, from the options; InputError that asks for it where it is missing."""
     if value is None:
-        parallel = "; of a parallel beam a thousand panel widths, and one more to the detector"
-        remedy = f"say {named(field)}{parallel if field.startswith('source_to') else ''}"
-        raise InputError(subject, "nothing", "a length in mm", remedy)
+        raise InputError(subject, "nothing", "a length in mm", f"say {named(field)}")
     return value

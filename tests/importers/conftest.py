@@ -9,7 +9,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, FrameSweeps, Scan, Shutter, pixel_centres
+from phyradgs_cl.acquisition import (
+    CircularOrbit,
+    ConeGeometry,
+    FrameSweeps,
+    ParallelGeometry,
+    Scan,
+    Shutter,
+    pixel_centres,
+)
+from phyradgs_cl.acquisition.geometry import Geometry
 from phyradgs_cl.detector import counts_to_attenuation
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.io import read_scan, write_scan
@@ -41,20 +50,24 @@ class Truth:
     angle_rad: np.ndarray
 
 
-def projected(pose: np.ndarray, points: np.ndarray) -> np.ndarray:
+def projected(pose: np.ndarray, points: np.ndarray, is_parallel: bool = False) -> np.ndarray:
     """Pixels (n, 2) as (row, column) where world points (n, 3) fall for a pose (12,): plain linear algebra."""
     source, first, step_u, step_v = pose.reshape(4, 3)
     found = []
     for point in points:
-        # source + s (point − source) = first + c step_u + r step_v
-        _, column, row = np.linalg.solve(np.stack([point - source, -step_u, -step_v], 1), first - source)
+        # start + s ray = first + c step_u + r step_v
+        start, ray = (point, source) if is_parallel else (source, point - source)
+        _, column, row = np.linalg.solve(np.stack([ray, -step_u, -step_v], 1), first - start)
         found.append((row, column))
     return np.array(found)
 
 
-def image(geometry: ConeGeometry, angle_rad: float) -> np.ndarray:
+def image(geometry: Geometry, angle_rad: float) -> np.ndarray:
     """Line integrals (v, u) of the three balls."""
     pose = geometry.pose(angle_rad)
+    if isinstance(geometry, ParallelGeometry):
+        pixels = pixel_centres(pose, geometry.detector_shape)
+        return BALLS.line_integrals(pixels - 99 * pose[:3], pixels + 99 * pose[:3])
     return BALLS.line_integrals(pose[:3], pixel_centres(pose, geometry.detector_shape))
 
 
@@ -65,7 +78,7 @@ def make_truth() -> Callable[..., Truth]:
 
 
 def truth(
-    fly: bool = False, axis: str = "rows", direction: int = 1, geometry: ConeGeometry = GEOMETRY
+    fly: bool = False, axis: str = "rows", direction: int = 1, geometry: Geometry = GEOMETRY
 ) -> Truth:
     """A scan; ``fly`` turns the gantry on during the exposures (frames show its opening pose)."""
     angle_rad = np.deg2rad(10.0 + 25.0 * np.arange(FRAMES))
@@ -129,9 +142,10 @@ def pose_at(scan: Scan, frame: int, share: float) -> np.ndarray:
 
 def compare_poses(ours: Scan, native: Scan) -> None:
     """Where world points fall, at five shares of every frame's window."""
+    assert ours.is_parallel == native.is_parallel
     for frame in range(native.frames):
         for share in (0.0, 0.3, 0.5, 0.8, 1.0):
             our, their = pose_at(ours, frame, share), pose_at(native, frame, share)
-            seen = projected(our, WORLD_POINTS), projected(their, WORLD_POINTS)
+            seen = (projected(pose, WORLD_POINTS, native.is_parallel) for pose in (our, their))
             np.testing.assert_allclose(*seen, rtol=0, atol=RTOL)
             np.testing.assert_allclose(our, their, rtol=0, atol=1e-5)

@@ -154,7 +154,7 @@ R2: dict[str, tuple[Damage, tuple[str, ...]]] = {
     "a JSON list": (filled("meta_data.json", b"[]"), ("JSON list",)),
     "JSON that is too deep": (filled("meta_data.json", b"[" * 200_000), ("JSON",)),
     "no scanner": (in_json("meta_data.json", lambda m: m.pop("scanner")), ("scanner", "nothing")),
-    "parallel beams": (in_json("meta_data.json", lambda m: m["scanner"].update(mode="parallel")), ("mode",)),
+    "a fan beam": (in_json("meta_data.json", lambda m: m["scanner"].update(mode="fan")), ("mode", "'parallel'")),
     "a distance that is text": (in_json("meta_data.json", lambda m: m["scanner"].update(DSO="far")), ("DSO",)),
     "a distance that is NaN": (in_json("meta_data.json", lambda m: m["scanner"].update(DSO=float("nan"))), ("DSO",)),
     "a distance of many digits": (filled("meta_data.json", b'{"scanner": {"DSO": ' + b"9" * 4000 + b"}}"), ("DSO",)),
@@ -325,11 +325,12 @@ EXCHANGE: dict[str, tuple[Damage, tuple[str, ...]]] = {
 
 DETECTOR = "entry0000/instrument/detector"
 COUNT_TIME, MOVES = f"{DETECTOR}/count_time", "entry0000/sample/x_translation"
+DISTANCE = "entry0000/instrument/source/distance"
 NXTOMO: dict[str, tuple[Damage, tuple[str, ...]]] = {
     "truncated": (truncated(""), ("HDF5",)),
     "no data": (in_hdf5(lambda f: f.pop(f"{DETECTOR}/data")), ("detector/data",)),
     "data elsewhere": (in_hdf5(lambda f: linked(f, f"{DETECTOR}/data")), ("passwd",)),
-    "no distance": (in_hdf5(lambda f: f.pop("entry0000/instrument/source/distance")), ("source/distance", "in mm")),
+    "a distance of 0": (in_hdf5(lambda f: replaced(f, DISTANCE, 0.0, units="m")), ("source/distance", "found 0")),
     "no detector distance": (in_hdf5(lambda f: f.pop(f"{DETECTOR}/distance")), ("detector/distance", "in mm")),
     "no projections": (in_hdf5(lambda f: replaced(f, f"{DETECTOR}/image_key", np.ones(9, int))), ("image_key",)),
     "a key short": (in_hdf5(lambda f: replaced(f, f"{DETECTOR}/image_key", np.zeros(3, int))), ("image_key",)),

@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 import writers_of_importers as w
 
+from phyradgs_cl.acquisition import ConeGeometry, ParallelGeometry
+from phyradgs_cl.errors import InputError
 from phyradgs_cl.importers import ImportOptions, import_scan, recognise
 
 FLY = ImportOptions(0.4, 0.3, 1.25, readout_axis="columns", readout_direction=-1)
@@ -40,6 +42,50 @@ SAME = {
     "tiff, starts": ("tiff", {"timing": TIMED.format(STARTS), "angles": STEPS}, MOVING, None),
     "tiff, middles": ("tiff", {"timing": EVERY, "angles": MIDDLE}, MOVING, None),
 }  # fmt: skip
+
+
+SAID = "no source distance: a parallel beam"
+OFFSET = {"detector_offset_mm": (4.0, -6.0)}
+# (format, motion, options, whether a line says that no distance is a parallel beam)
+PARALLEL = {
+    "r2": ("r2", {}, ALL, False), "naf": ("naf", {}, ALL, False), "phyradgs": ("phyradgs", {"axis": "rows"}, ROWS, False),
+    "data-exchange": ("data-exchange", {}, ImportOptions(**OFFSET), True),
+    "data-exchange, moving": ("data-exchange", MOVING, replace(FLY, **OFFSET), True),
+    "nxtomo": ("nxtomo", {}, ImportOptions(row_0="bottom"), True),
+    "tiff": ("tiff", {}, None, False), "tiff, moving": ("tiff", MOVING, FLY, False),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", PARALLEL)
+def test_the_same_scan_of_a_parallel_beam(tmp_path, make_truth, assert_same, caplog, case) -> None:
+    """An axis off the panel's middle, in mm or in the columns of nxtomo, is the detector's offset."""
+    form, motion, options, is_said = PARALLEL[case]
+    fly = {"fly": True, "direction": -1, **motion} if form == "phyradgs" else motion
+    offset = (0.0, -6.0) if form == "nxtomo" else (4.0, -6.0)
+    truth = make_truth(**fly, geometry=ParallelGeometry((10, 14), (3.0, 2.5), offset))
+    writer, name = w.WRITERS[form]
+    scan = import_scan(writer(tmp_path / name, truth), options)
+    assert_same(scan, truth, grid=form in ("r2", "phyradgs", "naf"), timing=form != "nxtomo")
+    assert caplog.text.count(SAID) == is_said
+
+
+def test_distances_make_a_cone_of_a_file_that_states_none(tmp_path, make_truth, caplog) -> None:
+    """Microfocus scanners too write files without distances; one that says parallel stays so."""
+    truth = make_truth(geometry=ParallelGeometry((10, 14), (3.0, 2.5)))
+    for form in ("data-exchange", "nxtomo"):
+        path = w.write(form, tmp_path, lambda **_: truth)
+        scan = import_scan(path, ImportOptions(source_to_axis_mm=500.0, source_to_detector_mm=800.0))
+        assert scan.geometry == ConeGeometry(500.0, 800.0, (10, 14), (3.0, 2.5)) and SAID not in caplog.text
+        with pytest.raises(InputError, match="source_to_axis_mm"):
+            import_scan(path, ImportOptions(source_to_detector_mm=800.0))
+    path = w.write("tiff", tmp_path, lambda **_: truth)
+    with pytest.raises(InputError, match="^source_to_detector_mm: found 800; expected no distance: .* parallel beam"):
+        import_scan(path, ImportOptions(source_to_detector_mm=800.0))
+    with h5py.File(tmp_path / "dx.h5", "r+") as file:
+        file["measurement/instrument/source/distance"] = 0.0
+        file["measurement/instrument/source/distance"].attrs["units"] = "mm"
+    with pytest.raises(InputError, match="source/distance: found 0"):
+        import_scan(tmp_path / "dx.h5")
 
 
 @pytest.mark.parametrize("case", SAME)

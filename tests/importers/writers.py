@@ -16,6 +16,10 @@ from nxtomo.application import nxtomo
 AIR, DARK = 50000.0, 300.0
 
 
+def is_cone(truth: Any) -> bool:
+    return hasattr(truth.scan.geometry, "source_to_axis_mm")
+
+
 def scanner_table(truth: Any, unit_mm: float) -> dict[str, object]:
     """meta_data.json's scanner; lengths in scene units."""
     g, grid = truth.scan.geometry, truth.scan.grid
@@ -23,9 +27,11 @@ def scanner_table(truth: Any, unit_mm: float) -> dict[str, object]:
         "sDetector": np.multiply(g.detector_shape, g.pixel_size_mm), "sVoxel": grid.size_mm[::-1],
         "offOrigin": grid.offset_mm[::-1], "offDetector": g.detector_offset_mm[::-1],
     }  # fmt: skip
+    # R2-Gaussian writes distances of parallel scenes too, which TIGRE does not use
+    to_axis, to_detector = (g.source_to_axis_mm, g.source_to_detector_mm) if is_cone(truth) else (1.0, 1.0)
     return {
-        "mode": "cone", "accuracy": 0.5, "DSD": g.source_to_detector_mm / unit_mm,
-        "DSO": g.source_to_axis_mm / unit_mm,
+        "mode": "cone" if is_cone(truth) else "parallel", "accuracy": 0.5, "DSD": to_detector / unit_mm,
+        "DSO": to_axis / unit_mm,
         "nDetector": list(g.detector_shape), "nVoxel": list(grid.shape[::-1]),
         **{name: [float(one) / unit_mm for one in three] for name, three in lengths_mm.items()},
     }  # fmt: skip
@@ -73,7 +79,8 @@ def naf_dict(truth: Any, dtype: type = np.float32) -> dict[str, object]:
     g, grid, frames = truth.scan.geometry, truth.scan.grid, truth.scan.projections[:, ::-1].astype(dtype)
     count = len(frames) - 2
     return {
-        "numTrain": count, "numVal": 2, "DSD": g.source_to_detector_mm, "DSO": g.source_to_axis_mm,
+        "numTrain": count, "numVal": 2,
+        **({"DSD": g.source_to_detector_mm, "DSO": g.source_to_axis_mm} if is_cone(truth) else {"mode": "parallel"}),
         "nDetector": list(g.detector_shape), "dDetector": list(g.pixel_size_mm),
         "nVoxel": list(grid.shape[::-1]), "dVoxel": list(grid.voxel_size_mm[::-1]),
         "offOrigin": list(grid.offset_mm[::-1]), "offDetector": list(g.detector_offset_mm[::-1]),
@@ -203,13 +210,15 @@ def write_nxtomo(path: Path, truth: Any, flips: tuple[bool, bool] = (False, Fals
     detector.data = np.ascontiguousarray(stack.astype(np.float32))
     detector.image_key_control = [2, 1, *[0] * len(frames), 1]
     detector.y_pixel_size, detector.x_pixel_size = (pitch * units.mm for pitch in g.pixel_size_mm)
-    detector.distance = (g.source_to_detector_mm - g.source_to_axis_mm) / 1000 * units.m
+    behind_mm = g.source_to_detector_mm - g.source_to_axis_mm if is_cone(truth) else 12.0  # the way to the panel
+    detector.distance = behind_mm / 1000 * units.m
     detector.count_time = np.full(len(stack), 0.4) * units.s
     column = -g.detector_offset_mm[1] / g.pixel_size_mm[1]
     detector.x_rotation_axis_pixel_position = -column if flips[1] else column
     detector.set_transformation_from_ud_flipped(flips[0])
     detector.set_transformation_from_lr_flipped(flips[1])
-    tomo.instrument.source.distance = -g.source_to_axis_mm / 1000 * units.m
+    if is_cone(truth):
+        tomo.instrument.source.distance = -g.source_to_axis_mm / 1000 * units.m
     angle_deg = -np.rad2deg(truth.angle_rad)
     tomo.sample.rotation_angle = np.concatenate([[0, 0], angle_deg, [angle_deg[-1]]]) * units.degree
     tomo.save(str(path), "entry0000")
@@ -241,6 +250,7 @@ def write_tiff(folder: Path, truth: Any, timing: str = "", angles: str | None = 
             file = folder / f"{name}_{i}.tif"
             tifffile.imwrite(file, image[::-1].astype(np.float64), compression=options.get("compression"))
     g, grid = truth.scan.geometry, truth.scan.grid
+    distances = f"to_axis_mm = {g.source_to_axis_mm}\nto_detector_mm = {g.source_to_detector_mm}" if is_cone(truth) else ""
     angles = angles or f"values_deg = {np.rad2deg(truth.angle_rad).tolist()}"
     (folder / "scan.toml").write_text(
         f"""title = "tiff"
@@ -249,8 +259,7 @@ projections = "proj_*.tif"
 flats = "flat_*.tif"
 darks = "dark_*.tif"
 [source]
-to_axis_mm = {g.source_to_axis_mm}
-to_detector_mm = {g.source_to_detector_mm}
+{distances or 'beam = "parallel"'}
 [detector]
 pixel_size_v_mm = {g.pixel_size_mm[0]}
 pixel_size_u_mm = {g.pixel_size_mm[1]}

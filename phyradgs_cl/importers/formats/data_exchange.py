@@ -1,6 +1,6 @@
 """Data Exchange files (HDF5) of synchrotron beamlines: /exchange with data, data_white, data_dark and theta. The format
-describes parallel beams: distances and pixel sizes usually come from the options. Angles are the sample's, in degrees unless
-units differ; row 0 is the top of the image."""
+describes parallel beams, which files without a source distance have; distances from the options make a cone. Pixel sizes may
+come from the options too. Angles are the sample's, in degrees unless units differ; row 0 is the top of the image."""
 
 from pathlib import Path
 
@@ -8,8 +8,8 @@ import h5py
 
 from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.acquisition.geometry import Geometry
-from phyradgs_cl.importers.assemble import StoredTiming, assemble_scan, cone, make_timing, turning
-from phyradgs_cl.importers.options import OF_BARE_FRAMES, ImportOptions, needed
+from phyradgs_cl.importers.assemble import StoredTiming, assemble_scan, make_timing, stored_beam, turning
+from phyradgs_cl.importers.options import OF_BARE_FRAMES, ImportOptions
 from phyradgs_cl.importers.reading import frames as reading
 from phyradgs_cl.importers.reading.frames import line_integrals, oriented
 from phyradgs_cl.io.hdf5.datasets import ANGLE, TIME, read_array, read_title
@@ -51,11 +51,9 @@ def import_scan(path: Path, options: ImportOptions) -> Scan:
 
 def _geometry(source: Hdf5Source, panel: tuple[int, int], options: ImportOptions) -> Geometry:
     address = f"{_INSTRUMENT}/source/distance"
-    to_axis = options.source_to_axis_mm or reading.optional_length(source, address)
-    to_axis = needed(to_axis, "source_to_axis_mm", source.name(address), options.named)
-    to_detector = reading.distance_to_detector(source, f"{_DETECTOR}/distance", to_axis, options)
+    to_axis_mm = options.source_to_axis_mm or reading.optional_length(source, address)
     pitch = options.pixel_size_mm or (
         reading.stored_pitch(source, options, f"{_DETECTOR}/pixel_size_y", f"{_DETECTOR}/y_pixel_size"),
         reading.stored_pitch(source, options, f"{_DETECTOR}/pixel_size_x", f"{_DETECTOR}/x_pixel_size"),
     )
-    return cone(options, to_axis, to_detector, panel, pitch, (0.0, 0.0))
+    return stored_beam(source, (address, f"{_DETECTOR}/distance"), to_axis_mm, options, panel, pitch)

@@ -1,6 +1,7 @@
 """NXtomo files of other programs (HDF5). Values that this package's scan files must have may come from options. The format
 does not state which row is on top. Row 0 is taken as the lowest, with a warning, after the flips that the file declares in
-either way of the nxtomo package. The column of the rotation axis becomes a detector offset."""
+either way of the nxtomo package. The column of the rotation axis becomes a detector offset. Without a
+source distance the beam is parallel."""
 
 import logging
 from dataclasses import replace
@@ -13,7 +14,7 @@ from phyradgs_cl.acquisition import CircularOrbit, FrameSweeps, Scan
 from phyradgs_cl.acquisition.geometry import Geometry
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.importers import assemble
-from phyradgs_cl.importers.options import OF_BARE_FRAMES, ImportOptions, needed
+from phyradgs_cl.importers.options import OF_BARE_FRAMES, ImportOptions
 from phyradgs_cl.importers.reading import frames as reading
 from phyradgs_cl.importers.reading.frames import line_integrals, oriented
 from phyradgs_cl.io.hdf5 import datasets as h5
@@ -117,16 +118,17 @@ def _geometry(
     source: Hdf5Source, entry: str, panel: tuple[int, int], turn: assemble.Turned, options: ImportOptions
 ) -> Geometry:
     detector, where = f"{entry}/{schema.DETECTOR}", f"{entry}/{schema.SOURCE}/distance"
-    to_axis = options.source_to_axis_mm
-    if to_axis is None and source.find(where) is not None:
-        to_axis = abs(h5.read_number(source, where, LENGTH)) or None  # NeXus gives it a minus sign
-    to_axis = needed(to_axis, "source_to_axis_mm", source.name(where), options.named)
-    to_detector = reading.distance_to_detector(source, f"{detector}/distance", to_axis, options)
+    to_axis_mm = options.source_to_axis_mm
+    if to_axis_mm is None and source.find(where) is not None:
+        to_axis_mm = abs(h5.read_number(source, where, LENGTH))  # NeXus gives it a minus sign
+        if to_axis_mm == 0:
+            remedy = f"say {options.named('source_to_axis_mm')}, or remove it: without one the beam is parallel"
+            raise source.error(where, "0", "a length other than 0", remedy)
     v, u = f"{detector}/y_pixel_size", f"{detector}/x_pixel_size"
     stored = reading.stored_pitch
     pitch = options.pixel_size_mm or (stored(source, options, v), stored(source, options, u))
     offset = options.detector_offset_mm or _axis_offset(source, detector, pitch, turn, options)
-    return assemble.cone(options, to_axis, to_detector, panel, pitch, offset)
+    return assemble.stored_beam(source, (where, f"{detector}/distance"), to_axis_mm, options, panel, pitch, offset)
 
 
 def _axis_offset(

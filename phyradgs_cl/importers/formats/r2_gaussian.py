@@ -8,13 +8,14 @@ import numpy as np
 
 from phyradgs_cl import checks
 from phyradgs_cl.acquisition import CircularOrbit, Scan
-from phyradgs_cl.acquisition.geometry import ConeGeometry
+from phyradgs_cl.acquisition.geometry import ConeGeometry, Geometry, ParallelGeometry
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid, triple
 from phyradgs_cl.importers.assemble import Timing, assemble_scan, make_timing, turning
 from phyradgs_cl.importers.options import TIMING, ImportOptions
 from phyradgs_cl.importers.reading.files import SafeFolder, read_json, read_npy
 from phyradgs_cl.importers.reading.frames import LineIntegrals, line_integrals, oriented
+from phyradgs_cl.io.scan.schema import BEAMS
 from phyradgs_cl.io.tables import Fields
 
 META = "meta_data.json"
@@ -29,7 +30,7 @@ class R2Folder:
 
     folder: SafeFolder
     meta: Fields
-    geometry: ConeGeometry
+    geometry: Geometry
     unit_mm: float
 
     @classmethod
@@ -108,19 +109,24 @@ def import_scan(path: Path, options: ImportOptions) -> Scan:
     return opened.scan(path, entries, turning(opened.geometry, angle_rad, timing), timing, options)
 
 
-def read_geometry(scanner: Fields, unit_mm: float) -> ConeGeometry:
-    """Reads the cone of a scanner's table, lengths in ``unit_mm``; "Detector" values run [v, u], ``offDetector`` [u, v]."""
-    mode = scanner.word("mode", default="cone")
-    if mode != "cone":
-        raise scanner.error("mode", repr(mode), "'cone'", "parallel beams have no source distance")
-    to_axis, to_detector = scanner.length("DSO"), scanner.length("DSD")
-    if to_detector <= to_axis:
-        raise scanner.error("DSD", f"{to_detector:g}", f"more than DSO ({to_axis:g})")
+def read_geometry(scanner: Fields, unit_mm: float) -> Geometry:
+    """Reads the beam of a scanner's table, lengths in ``unit_mm``; "Detector" values run [v, u], ``offDetector`` [u, v].
+    TIGRE does not use the distances of mode "parallel"."""
+    is_parallel = scanner.word("mode", BEAMS, default="cone") == "parallel"
+    distances_mm = () if is_parallel else _distances_mm(scanner, unit_mm)
     rows, columns = scanner.counts("nDetector", 2)
     pitch_v, pitch_u = (float(p * unit_mm) for p in _pitches(scanner, "Detector", (rows, columns)))
     offset_u, offset_v = (float(o * unit_mm) for o in _offset(scanner, "offDetector", 2))
     sides = (rows, columns), (pitch_v, pitch_u), (offset_v, offset_u)
-    return ConeGeometry(to_axis * unit_mm, to_detector * unit_mm, *sides)
+    return ConeGeometry(distances_mm[0], distances_mm[1], *sides) if distances_mm else ParallelGeometry(*sides)
+
+
+def _distances_mm(scanner: Fields, unit_mm: float) -> tuple[float, float]:
+    """Reads the distances from the source to the axis and to the detector."""
+    to_axis, to_detector = scanner.length("DSO"), scanner.length("DSD")
+    if to_detector <= to_axis:
+        raise scanner.error("DSD", f"{to_detector:g}", f"more than DSO ({to_axis:g})")
+    return to_axis * unit_mm, to_detector * unit_mm
 
 
 def read_grid(scanner: Fields, unit_mm: float) -> Grid:

@@ -1,7 +1,7 @@
 """A folder of TIFF frames and one TOML with their contents, geometry, angles and timing. The TOML has the tables of a
 scanner file, and [frames], [angles] and [timing]. Row 0 is the top, column 0 the left, seen from the source."""
 
-from dataclasses import astuple, replace
+from dataclasses import replace
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -10,7 +10,7 @@ import numpy as np
 from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.acquisition.readout import frame_time_of, readout_of
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.importers.assemble import StoredTiming, assemble_scan, cone, make_timing, turning
+from phyradgs_cl.importers.assemble import StoredTiming, assemble_scan, make_timing, turning, with_options
 from phyradgs_cl.importers.options import FIELDS, OF_BARE_FRAMES, WORDS, ImportOptions
 from phyradgs_cl.importers.reading import tiff
 from phyradgs_cl.importers.reading.files import SafeFolder, check_numbering, checked_name, read_numbers
@@ -54,7 +54,7 @@ def import_scan(path: Path, options: ImportOptions) -> Scan:
     stacks = _stacks(folder, tables["frames"], tables["angles"])
     frames, rows, columns = stacks["projections"].shape
     scanner = _scanner(description, tables[""], (rows, columns))
-    geometry = cone(options, *astuple(scanner.geometry))
+    geometry = with_options(options, scanner.geometry)
     stored = _stored_timing(tables, scanner)
     timing = make_timing(str(description), frames, options, stored)
     angle_rad = gantry_sign(combined, "gantry") * _angles_rad(folder, tables["angles"], frames)

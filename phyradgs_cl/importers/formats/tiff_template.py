@@ -28,6 +28,7 @@ _TABLES: dict[str, dict[str, tuple[object, str]]] = {
     "source": {
         "to_axis_mm": (_FILL_IN, "mm, FILL IN: source to rotation axis"),
         "to_detector_mm": (_FILL_IN, "mm, FILL IN: source to detector"),
+        "beam": ("parallel", "in place of both distances: a beam without a source at a distance"),
     },
     "detector": {
         "rows": (1, "of the images"), "columns": (1, "of the images"),

@@ -80,7 +80,7 @@ def _is_parallel(source: Hdf5Source, entry: str) -> bool:
         return is_parallel
     if has_distance or source.find(f"{entry}/{schema.EXTRA}") is not None:
         return False
-    _log.info("%s: none, so the beam is taken as parallel", source.name(distance))
+    _log.warning("%s: no source distance: a parallel beam", source.name(distance))
     return True
 
 
