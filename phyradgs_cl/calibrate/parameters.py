@@ -75,10 +75,9 @@ def _tilt_pixels(axis: int) -> Callable[[Scan], float]:
 
 
 def _cone(scan: Scan) -> ConeGeometry:
-    """Returns the geometry of a cone beam. Raises InputError for a parallel beam, which has no such parameter."""
-    if isinstance(scan.geometry, ConeGeometry):
-        return scan.geometry
-    raise InputError("--what", "a distance or a tilt in a parallel beam", "offset-u, offset-v or roll")
+    """Returns the geometry of a cone beam; ``requested`` refuses tilts and distances of other beams."""
+    assert isinstance(scan.geometry, ConeGeometry)
+    return scan.geometry
 
 
 def _timing_pixels(scan: Scan) -> float:
@@ -138,6 +137,7 @@ PARAMETER_GROUPS = {
     "distance": ("source-distance", "detector-distance"),
     "timing": ("readout", "exposure", "start"),
 }
+_CONE_ONLY = (*PARAMETER_GROUPS["tilt"], *PARAMETER_GROUPS["distance"])
 WOBBLE, MOTION, DIRECTION = "wobble", "motion", "direction"
 NAMES = list(dict.fromkeys([*PARAMETER_GROUPS, *PARAMETERS, WOBBLE, MOTION, DIRECTION]))
 
@@ -157,19 +157,24 @@ class Request:
 
 def requested(what: str | None, scan: Scan, knows_shape: bool = False) -> Request:
     """Reads names separated by commas. None: offset, roll and tilt; of a fly-scan readout and exposure as well, of an object
-    of known shape distances as well.
+    of known shape distances as well. A parallel beam has neither tilt nor distances.
 
-    InputError: an unknown name, wobble together with motion, timing of a gantry that stands still."""
+    InputError: an unknown name, distances and tilts of a parallel beam, wobble together with motion, timing of a gantry that
+    stands still."""
     if what is None:
         is_rolling = _turns(scan) and scan.shutter.readout_s > 0
-        what = "offset,roll,tilt,readout,exposure" if is_rolling else "offset,roll,tilt"
-        what += ",distance" if knows_shape else ""
+        what = "offset,roll" if scan.is_parallel else "offset,roll,tilt"
+        what += ",readout,exposure" if is_rolling else ""
+        what += ",distance" if knows_shape and not scan.is_parallel else ""
     names: list[str] = []
     for word in (word.strip() for word in what.split(",")):
         if word not in NAMES:
             raise InputError("--what", repr(word), ", ".join(NAMES), suggest_name(word, NAMES, "name some of them"))
         names += PARAMETER_GROUPS.get(word, (word,))
     names = list(dict.fromkeys(names))
+    of_cone = [name for name in names if scan.is_parallel and name in _CONE_ONLY]
+    if of_cone:
+        raise InputError("--what", f"{of_cone[0]} of a parallel beam", "offset-u, offset-v or roll", "leave it out")
     if WOBBLE in names and MOTION in names:
         expected = "one of the two, because each explains the other"
         raise InputError("--what", f"{WOBBLE} and {MOTION}", expected, "run it twice")

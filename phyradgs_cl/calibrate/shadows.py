@@ -36,12 +36,15 @@ class BeadOperator:
         frames, lines, samples = weight.shape
         turn = Rotation.from_rotvec(placement[:3]).as_matrix()
         places, steps = pose[:, :2] - placement[3:DENSITY], pose[:, 2:]
+        if self.tables[0].is_parallel:
+            places[:, 0] = pose[:, 0]  # a direction
         is_rows = self.tables[0].axis == "rows"
         panel_lines = _PanelLines(
             source=places[:, 0] @ turn, first=places[:, 1] @ turn, line_step=steps[:, int(is_rows)] @ turn,
             pixel_step=steps[:, 1 - int(is_rows)] @ turn,
             line=np.tile(np.repeat(np.arange(lines), samples), frames),
             pixels=self.shape[1] if is_rows else self.shape[0],
+            is_parallel=self.tables[0].is_parallel,
         )
         total = np.zeros((frames, lines, panel_lines.pixels))
         for p in panel_lines.integrals(self.phantom, self.samples):
@@ -76,7 +79,7 @@ def _poses_by_line(tables: Sequence[TimeCells]) -> tuple[np.ndarray, np.ndarray]
 class _PanelLines:
     """N lines of a panel in the phantom's frame of reference, each at one time. source, first (N, 3): the source and the
     middle of the panel's first pixel, mm; line_step, pixel_step (N, 3): to the next line and to the next of its ``pixels``;
-    line (N,): the line's number."""
+    line (N,): the line's number. is_parallel: ``source`` is the rays' direction."""
 
     source: np.ndarray
     first: np.ndarray
@@ -84,6 +87,7 @@ class _PanelLines:
     pixel_step: np.ndarray
     line: np.ndarray
     pixels: int
+    is_parallel: bool
 
     def integrals(self, phantom: EllipsoidPhantom, samples: int) -> Iterator[np.ndarray]:
         """Yields line integrals (N, pixels), float32, for each of samples² points of a pixel's area."""
@@ -94,10 +98,14 @@ class _PanelLines:
             for body, lines, start, width in shadows:
                 pixel = start[:, None] + np.arange(width)
                 source = self.source[lines]
-                first = self.first[lines] + (self.line[lines, None] + across) * self.line_step[lines] - source
+                first = self.first[lines] + (self.line[lines, None] + across) * self.line_step[lines]
+                first = first if self.is_parallel else first - source
                 ray = first[:, None] + (pixel[..., None] + along) * self.pixel_step[lines][:, None]
-                rays = ray.reshape(-1, 3)
-                fraction = body.chord_fraction(np.repeat(source, width, axis=0), rays)
+                starts, rays = np.repeat(source, width, axis=0), ray.reshape(-1, 3)
+                if self.is_parallel:  # from one side of the body to the other
+                    reach = 2 * (np.abs(rays).max(initial=0.0) + np.abs(body.ends_mm).max() + body.reach_mm)
+                    starts, rays = rays - reach * starts, 2 * reach * starts
+                fraction = body.chord_fraction(starts, rays)
                 value = body.attenuation_per_mm * fraction * np.sqrt(np.einsum("ij,ij->i", rays, rays))
                 total[lines[:, None], pixel] += value.reshape(pixel.shape)
             yield total
@@ -105,12 +113,17 @@ class _PanelLines:
     @cached_property
     def _panel_axes(self) -> tuple[tuple[np.ndarray, ...], ...]:
         """Vectors (N, 3) whose inner products with a place are its distance from the source in panel distances, its line and
-        its pixel; each with that of the source and of the first pixel (N,), and its length (N,)."""
+        its pixel; each with that of the source and of the first pixel (N,), and its length (N,). In a parallel beam that
+        distance is 1, and lines and pixels are those that a ray through the place meets."""
         normal = np.cross(self.line_step, self.pixel_step)
-        height = np.sum(normal * (self.first - self.source), -1, keepdims=True)
-        vectors = [normal / height]
+        to_panel = self.source if self.is_parallel else self.first - self.source
+        vectors = [normal / np.sum(normal * to_panel, -1, keepdims=True)]
         vectors += [step / np.sum(step**2, -1, keepdims=True) for step in (self.line_step, self.pixel_step)]
+        if self.is_parallel:
+            vectors = [vector - np.sum(vector * self.source, -1, keepdims=True) * vectors[0] for vector in vectors]
         products = [[np.sum(vector * place, -1) for place in (self.source, self.first)] for vector in vectors]
+        if self.is_parallel:
+            products[0][0] = -np.ones(len(self.line))
         return tuple((v, *both, np.linalg.norm(v, axis=-1)) for v, both in zip(vectors, products, strict=True))
 
     def _shadow(self, ends_mm: np.ndarray, reach_mm: float) -> tuple[np.ndarray, np.ndarray, int]:

@@ -1,0 +1,115 @@
+"""Parallel beams: offset and roll by the same projection, no distance or tilt, views and motion, beads in closed form."""
+
+import itertools
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from parallel_kit import BODIES, SIDE, laminography_scan, line_integrals, parallel_scan
+
+from phyradgs_cl.acquisition import Shutter
+from phyradgs_cl.acquisition.altered.perturbed import GeometryCorrection, Sway, Views, perturb
+from phyradgs_cl.calibrate import AGREES, CANNOT_TELL, CORRECTED, calibrate
+from phyradgs_cl.calibrate.beads import BeadProblem
+from phyradgs_cl.calibrate.parameters import requested
+from phyradgs_cl.calibrate.stages import Stage
+from phyradgs_cl.errors import InputError
+from phyradgs_cl.io import write_scan
+from phyradgs_cl.io.scan.writer import copy_with_motion
+from phyradgs_cl.workflow.files import load_scan
+
+
+def seen_by(scan):
+    """The frames of the bodies that a scan's poses see."""
+    poses = [scan.trajectory.pose(f, np.array(t)) for f, t in enumerate(scan.frame_start_s)]
+    return np.stack([line_integrals(BODIES, pose, (SIDE, SIDE)) for pose in poses]).astype(np.float32)
+
+
+def test_directions_turn_and_never_shift() -> None:
+    scan = parallel_scan()
+    correction = GeometryCorrection(offset_u_mm=0.2, offset_v_mm=-0.1, roll_rad=0.1, turn_rad=0.3)
+    views = Views(np.linspace(0.0, 0.1, scan.frames), np.full((scan.frames, 2), 0.7))
+    sway = replace(Sway.none(scan, 7), coefficients=np.random.default_rng(1).normal(0, 0.3, (7, 6)))
+    for changed in (perturb(scan, correction), perturb(scan, correction, views), perturb(scan, correction, sway)):
+        assert changed.is_parallel
+        poses = np.stack([changed.trajectory.pose(f, np.array(t)) for f, t in enumerate(scan.frame_start_s)])
+        np.testing.assert_allclose(np.linalg.norm(poses[:, :3], axis=1), 1, rtol=1e-12)
+        np.testing.assert_allclose(np.einsum("fi,fi->f", poses[:, :3], poses[:, 6:9]), 0, atol=1e-12)
+    moved = perturb(scan, GeometryCorrection(), replace(sway, coefficients=np.tile([0, 0, 0, 0.2, -0.1, 0.3], (7, 1))))
+    before, after = (one.trajectory.pose(3, np.array(3.0)) for one in (scan, moved))
+    np.testing.assert_allclose(after - before, [0, 0, 0, -0.2, 0.1, -0.3, *[0] * 6], atol=1e-12)
+
+
+def test_tilts_and_distances_are_refused_and_not_asked_for() -> None:
+    scan, fly = parallel_scan(), parallel_scan(shutter=Shutter(0.1, 0.5))
+    assert requested(None, scan, knows_shape=True).names == ["offset-u", "offset-v", "roll"]
+    assert requested(None, fly).names == ["offset-u", "offset-v", "roll", "readout", "exposure"]
+    for word, name in (("tilt", "tilt-v"), ("distance", "source-distance"), ("detector-distance",) * 2):
+        with pytest.raises(InputError, match=f"{name} of a parallel beam"):
+            requested(f"roll,{word}", scan)
+
+
+@pytest.mark.parametrize(("views", "turn_deg"), [(30, 180.0), (60, 360.0)], ids=["half", "full"])
+def test_an_offset_and_a_roll_are_found(rt, views: int, turn_deg: float) -> None:
+    scan = parallel_scan(views, turn_deg, 1.5)
+    rolled = perturb(scan, GeometryCorrection(offset_u_mm=0.15, roll_rad=np.deg2rad(1.5)))
+    result = calibrate(replace(scan, projections=seen_by(rolled)), rt)
+    found = {one.name: one for one in result.parameters}
+    assert found["offset-u"].verdict == CORRECTED and abs(found["offset-u"].found - 0.15) < 0.01
+    assert found["roll"].verdict == CORRECTED and abs(found["roll"].found - 1.5) < 0.2
+    assert found["offset-v"].verdict == CANNOT_TELL  # an object further along the axis
+    assert result.residual_rms[1] < 0.5 * result.residual_rms[0]
+
+
+def test_a_right_scan_is_left_alone(rt) -> None:
+    result = calibrate(parallel_scan(), rt)
+    assert result.corrected == [] and result.parameters[0].verdict == AGREES
+
+
+def test_shifts_of_single_views_are_found(rt) -> None:
+    scan = parallel_scan(40, 360.0)
+    shifts_mm = np.random.default_rng(2).normal(0, 0.1, (scan.frames, 2))
+    truth = perturb(scan, GeometryCorrection(), Views(np.zeros(scan.frames), shifts_mm))
+    result = calibrate(replace(scan, projections=seen_by(truth)), rt, "wobble")
+    found = result.views.shift_mm - result.views.shift_mm.mean(0)
+    assert np.std(found[:, 0] - shifts_mm[:, 0]) < 0.25 * np.std(shifts_mm[:, 0])
+    assert result.residual_rms[1] < 0.5 * result.residual_rms[0]
+
+
+def test_a_motion_of_the_object_lowers_the_residual(rt) -> None:
+    scan = parallel_scan(40, 360.0)
+    course = np.linspace(-0.3, 0.3, 7)
+    truth = replace(Sway.none(scan, 7), coefficients=np.outer(course, [0, 0, 0, 0.3, -0.5, 1.0]))
+    moved = perturb(scan, GeometryCorrection(), truth)
+    result = calibrate(replace(scan, projections=seen_by(moved)), rt, "motion")
+    assert result.residual_rms[1] < 0.4 * result.residual_rms[0]
+    along = result.views.coefficients[:, 5]
+    assert abs(np.ptp(along) - 0.6) < 0.1
+
+
+def test_frames_of_beads_are_the_closed_form() -> None:
+    """Rays across the axis, and rays that rise, averaged over points of a pixel."""
+    place = [0.0, 0.0, 0.2, 0.1, -0.05, 0.02]
+    for scan in (parallel_scan(8), laminography_scan(8)):
+        operator = BeadProblem.of(BODIES, np.zeros(7), [scan], Stage(SIDE, 8, 4), 8).operator(GeometryCorrection())
+        moved = perturb(scan, GeometryCorrection(), replace(Sway.none(scan, 7), coefficients=np.tile(place, (7, 1))))
+        poses = np.stack([moved.trajectory.pose(f, np.array(t)) for f, t in enumerate(scan.frame_start_s)])
+        offsets = (np.arange(operator.samples) + 0.5) / operator.samples - 0.5
+        expected = np.zeros(scan.projections.shape)
+        for v, u in itertools.product(offsets, offsets):
+            points = poses.copy()
+            points[:, 3:6] += u * poses[:, 6:9] + v * poses[:, 9:12]
+            expected += np.stack([line_integrals(BODIES, pose, (SIDE, SIDE)) for pose in points]) / len(offsets) ** 2
+        np.testing.assert_allclose(operator.forward(np.array([*place, 1.0])), expected, rtol=0, atol=1e-5)
+
+
+def test_a_corrected_scan_is_stored_as_a_parallel_beam(tmp_path) -> None:
+    scan = parallel_scan(8)
+    write_scan(tmp_path / "scan.h5", scan)
+    for correction in (GeometryCorrection(offset_u_mm=0.1), GeometryCorrection(offset_u_mm=0.1, roll_rad=0.05)):
+        corrected = perturb(scan, correction)
+        copy_with_motion(tmp_path / "scan.h5", tmp_path / "copy.h5", corrected)
+        stored = load_scan(tmp_path / "copy.h5")
+        assert stored.is_parallel and stored.geometry.detector_offset_mm[1] == pytest.approx(0.1)
+        poses = [one.trajectory.pose(3, scan.frame_start_s[3:4]) for one in (corrected, stored)]
+        np.testing.assert_allclose(poses[1], poses[0], atol=1e-9)
