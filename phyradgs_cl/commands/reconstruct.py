@@ -22,6 +22,7 @@ from phyradgs_cl.report import Preview, check_preview
 from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.settings import Settings
 from phyradgs_cl.workflow import load_scan, profile_report, run_reconstruction
+from phyradgs_cl.workflow.slabs import Slabs, rows_of
 
 EXAMPLES = {
     "reconstruct": (
@@ -32,6 +33,8 @@ EXAMPLES = {
 }
 GROUPS = {"reconstruct": RUN_GROUPS, "estimate": RUN_GROUPS}
 _CHECKPOINT = "Seconds from checkpoint to checkpoint, for --resume; 0: on Ctrl-C only."
+_ROWS = "Detector rows of a parallel scan to read and reconstruct; row 0 is the lowest."
+_SLAB = "Rows of a parallel scan at a time: slabs, kept on disk as they are done."
 _PREVIEW = "PNG of the three middle slices; during the run NAME.partial.png, every five seconds."
 
 
@@ -43,6 +46,8 @@ def reconstruct_command(
     checkpoint_every: Annotated[float, option(_CHECKPOINT, metavar="SECONDS")] = 600.0,
     preview: Annotated[Path | None, file_option(_PREVIEW, "--preview")] = None,
     profile: Annotated[bool, option("Print the device's time by kernel.", True, "--profile")] = False,
+    rows: Annotated[str | None, option(_ROWS, "all", metavar="A:B")] = None,
+    slab: Annotated[int, option(_SLAB, "as memory allows", metavar="ROWS", min=0)] = 0,
 ) -> None:
     """Reconstruct a scan into a volume; print PSNR and SSIM if the scan carries the truth. Defaults are those of fista."""
     plan, ranks = settings.plan(initial), launched_ranks()
@@ -65,6 +70,7 @@ def reconstruct_command(
         result, metrics = run_reconstruction(
             plan, scan, output, runtime, Report(*listeners), resume=resume,
             checkpoint_every_s=checkpoint_every, inputs=inputs, ranks=ranks,
+            slabs=Slabs(None if rows is None else rows_of(rows), slab),
         )
         if picture is not None and result.state is None and ranks.rank == 0:
             with signals.finish_despite_interrupt():

@@ -10,6 +10,7 @@ from .output import write_checkpoint as write_checkpoint
 from .output import written_beside as written_beside
 from .scan.reader import ToAttenuation as ToAttenuation
 from .scan.reader import read_scan as read_scan
+from .scan.reader import read_scan_header as read_scan_header
 from .scan.reader import scan_summary as scan_summary
 from .scan.writer import write_scan as write_scan
 from .scanner import Scanner as Scanner

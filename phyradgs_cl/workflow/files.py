@@ -20,10 +20,10 @@ _KINDS = {
 }
 
 
-def load_scan(path: str | Path, flats: str = "mean") -> Scan:
-    """Reads a scan file as line integrals, with flats as in ``prepare.flats``; see ``io.read_scan``."""
+def load_scan(path: str | Path, flats: str = "mean", rows: tuple[int, int] | None = None) -> Scan:
+    """Reads a scan file, or some of its rows, as line integrals; flats as in ``prepare.flats``. See ``io.read_scan``."""
     with expecting(path, "scan"):
-        scan = read_scan(path, flat_correction(flats))
+        scan = read_scan(path, flat_correction(flats), rows)
     return scan if flats == "mean" else replace(scan, provenance={**scan.provenance, "flats": flats})
 
 

@@ -17,7 +17,15 @@ from phyradgs_cl import reconstructors as methods
 from phyradgs_cl.acquisition import MicroViews, Scan
 from phyradgs_cl.acquisition.geometry import cuts
 from phyradgs_cl.errors import InputError, OutputError, PhyradgsError, naming_host_memory
-from phyradgs_cl.io import hashing, only_run, partial_path, read_checkpoint, write_checkpoint, write_volume
+from phyradgs_cl.io import (
+    hashing,
+    only_run,
+    partial_path,
+    read_checkpoint,
+    read_scan_header,
+    write_checkpoint,
+    write_volume,
+)
 from phyradgs_cl.io.output import checkpoint_path, former_checkpoint_path
 from phyradgs_cl.metrics import VOXEL_BY_VOXEL, aligned, compare
 from phyradgs_cl.parallel import Communicator
@@ -25,9 +33,11 @@ from phyradgs_cl.reconstructors.result import COMPARED, HELD_OUT
 from phyradgs_cl.reconstructors.run import check_resumable
 from phyradgs_cl.runtime import Runtime, profile_text
 from phyradgs_cl.text import plain_text
-from phyradgs_cl.workflow.files import check_output, load_scan, refuse_overwriting
+from phyradgs_cl.workflow.files import check_output, expecting, load_scan, refuse_overwriting
+from phyradgs_cl.workflow.slabs import Slabs, reconstruct_slabs, remove_slabs
 
 log = logging.getLogger(__name__)
+_ALL_ROWS = Slabs()
 
 
 def check_interval(seconds: float) -> None:
@@ -78,21 +88,49 @@ def run_reconstruction(
     plan: methods.RunPlan, scan: Path, output: Path, make_runtime: Callable[[], Runtime],
     report: methods.ProgressReport = methods.ignore_progress, *, resume: bool = False,
     checkpoint_every_s: float = 600.0, inputs: Sequence[Path] = (), ranks: Communicator | None = None,
+    slabs: Slabs = _ALL_ROWS,
 ) -> tuple[methods.Reconstruction, dict[str, float]]:
-    """Reconstructs a scan file and writes a volume file; returns the result and its metrics. An interrupted run leaves
+    """Reconstructs a scan file and writes a volume file; returns the result and its metrics.
+
+    A parallel scan whose frames exceed half of this machine's memory is reconstructed in ``slabs`` of rows. An interrupted run leaves
     ``output`` alone: it writes ``io.partial_path`` and a checkpoint, from which ``resume`` goes on. A complete run removes
     both; a killed run leaves its last checkpoint. inputs: other files that the output must not overwrite. ranks: those of
     the runtime; rank 0 alone writes and has metrics. Raises OutputError while another run writes the output."""
     check_interval(checkpoint_every_s)
     leads = ranks is None or ranks.rank == 0
-    if resume:
+    parts = _slabs_of(slabs, scan, ranks)
+    if resume and not parts:
         check_resumable(plan)
     if leads:
         export = f"write volume.h5, then 'phyradgs export volume.h5 -o {plain_text(output.name)}'"
         check_output(output, scan, *inputs, remedy=export)
         refuse_overwriting("-o", partial_path(output), scan, *inputs)
     with only_run(output) if leads else nullcontext():
+        if parts:
+            return _in_slabs(plan, scan, output, parts, make_runtime(), report, resume)
         return _reconstructed(plan, scan, output, make_runtime, report, resume, checkpoint_every_s)
+
+
+def _slabs_of(slabs: Slabs, scan: Path, ranks: Communicator | None) -> list[tuple[int, int]]:
+    """Returns the slabs of a run, none for the whole scan at once. Raises InputError for slabs under several ranks."""
+    with expecting(scan, "scan"):
+        parts = slabs.of(read_scan_header(scan))
+    if parts and ranks is not None and ranks.size > 1:
+        raise InputError("--rows", f"slabs on {ranks.size} ranks", "one rank", "run a slab of rows on each machine")
+    return parts
+
+
+def _in_slabs(
+    plan: methods.RunPlan, path: Path, output: Path, slabs: list[tuple[int, int]], rt: Runtime,
+    report: methods.ProgressReport, resume: bool,
+) -> tuple[methods.Reconstruction, dict[str, float]]:
+    with hashing(path) as scan_hash_of, naming_host_memory():
+        result = reconstruct_slabs(plan, path, output, slabs, rt, report, resume=resume)
+        scan_hash = scan_hash_of()
+    with signals.finish_despite_interrupt():
+        write_volume(output, result.volume, result.grid, _provenance(result, scan_hash, plan, path, rt))
+    remove_slabs(output)
+    return result, {}
 
 
 def _reconstructed(

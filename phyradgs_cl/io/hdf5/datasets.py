@@ -67,16 +67,20 @@ ATTENUATION = _quantity("attenuation", "1/mm", 1e9, {
 })  # fmt: skip
 
 
-def read_values(source: Hdf5Source, address: str, dataset: h5py.Dataset, kinds: str = "iuf") -> np.ndarray:
-    """Reads a dataset in its own type. InputError unless NumPy's kind of that type is in ``kinds``."""
+def read_values(
+    source: Hdf5Source, address: str, dataset: h5py.Dataset, kinds: str = "iuf", rows: slice | None = None
+) -> np.ndarray:
+    """Reads a dataset in its own type, or some rows (..., v, u) of it. InputError unless NumPy's kind of that type is in
+    ``kinds``."""
     subject = source.name(address)
     try:
         if dataset.dtype.kind not in kinds:
             expected = "numbers" if "f" in kinds else "whole numbers"
             raise InputError(subject, f"type {dataset.dtype}", expected, "store them as plain HDF5 numbers")
-        if dataset.nbytes > HOST_SHARE * host_bytes():
+        share = 1 if rows is None else (rows.stop - rows.start) / dataset.shape[-2]
+        if share * dataset.nbytes > HOST_SHARE * host_bytes():
             raise MemoryError
-        return np.asarray(dataset[()])
+        return np.asarray(dataset[()] if rows is None else dataset[..., rows, :])
     except MemoryError as error:
         found = f"shape {dataset.shape}, {dataset.nbytes / 2**30:.3g} GiB"
         raise OutOfMemoryError(subject, found, "data that this machine's memory can hold") from error

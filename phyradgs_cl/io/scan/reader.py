@@ -10,6 +10,7 @@ from phyradgs_cl import checks
 from phyradgs_cl.acquisition import CircularOrbit, EncoderTable, PoseTable, Scan
 from phyradgs_cl.acquisition.plausible import blur_facts
 from phyradgs_cl.acquisition.scan import APPLIED, applied_facts
+from phyradgs_cl.acquisition.slabs import slab
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.io.files import sha256_of
 from phyradgs_cl.io.hdf5.datasets import ATTENUATION, in_unit, read_values
@@ -22,17 +23,29 @@ LARGEST_LINE_INTEGRAL = 1e6
 ToAttenuation = Callable[[np.ndarray, np.ndarray, str], tuple[np.ndarray, np.ndarray | None]]
 
 
-def read_scan(path: str | Path, to_attenuation: ToAttenuation) -> Scan:
-    """Reads a scan file; ``to_attenuation`` converts the frames to line integrals. It takes (data (F, v, u), image_key (F,),
+def read_scan_header(path: str | Path) -> Scan:
+    """Reads and checks everything of a scan file but its large arrays: the projections are zeros that take no memory."""
+    with open_hdf5(path) as source:
+        return read_header(source).scan
+
+
+def read_scan(path: str | Path, to_attenuation: ToAttenuation, rows: tuple[int, int] | None = None) -> Scan:
+    """Reads a scan file; ``to_attenuation`` converts the frames to line integrals. Of a parallel scan it can read detector
+    rows [first, stop) alone: the scan is then a ``slab`` on the whole grid.
+
+    ``to_attenuation`` takes (data (F, v, u), image_key (F,),
     quantity) and returns line integrals (P, v, u) of the P projections, and a mask (v, u) or (P, v, u) of unusable values or
     None. Everything but the pixels is checked before they are read. Flat, dark and invalid frames are left out. The scan has
     projections (P, v, u) float32 and a bool ``pixel_mask`` or None, from the file and the conversion; values that are not
     finite must be masked. Raises: InputError for a missing, damaged or incomplete file; its subject is "FILE:/hdf5/path"."""
     with open_hdf5(path) as source:
         header = read_header(source)
-        mask = _read_mask(source, header)
+        lines = None if rows is None else slice(*rows)
+        if rows is not None:
+            header = replace(header, scan=slab(header.scan, *rows))
+        mask = _read_mask(source, header, lines)
         reference = _read_reference(source, header)
-        data = _read_frames(source, header, mask)
+        data = _read_frames(source, header, mask, lines)
     projections, bad = _convert(source.name(f"{header.entry}/{schema.DATA}"), header, data, to_attenuation)
     used = header.image_key == schema.PROJECTION
     stored_mask = mask[used] if mask is not None and mask.ndim == 3 else mask
@@ -105,13 +118,13 @@ def _trajectory_word(scan: Scan) -> str:
     return "constant speed in each frame" if scan.is_fly else "one angle per frame"
 
 
-def _read_mask(source: Hdf5Source, header: ScanHeader) -> np.ndarray | None:
+def _read_mask(source: Hdf5Source, header: ScanHeader, rows: slice | None) -> np.ndarray | None:
     if header.mask_shape is None:
         return None
     address = f"{header.entry}/{schema.MASK}"
-    mask = read_values(source, address, source.dataset(address), kinds="biu") != 0
+    mask = read_values(source, address, source.dataset(address), "biu", rows) != 0
     used = mask if mask.ndim == 2 else mask[header.image_key == schema.PROJECTION]
-    if used.all():
+    if used.all() and rows is None:
         raise source.error(address, "every pixel masked", "at least one zero", "non-zero means: do not use")
     return mask
 
@@ -128,10 +141,13 @@ def _read_reference(source: Hdf5Source, header: ScanHeader) -> np.ndarray | None
     return in_unit(source, address, values, ATTENUATION).astype(np.float32)
 
 
-def _read_frames(source: Hdf5Source, header: ScanHeader, mask: np.ndarray | None) -> np.ndarray:
+def _read_frames(
+    source: Hdf5Source, header: ScanHeader, mask: np.ndarray | None, rows: slice | None
+) -> np.ndarray:
     """Reads all stored frames (F, v, u); InputError for a value that is neither finite nor masked in a frame that is
     used."""
-    data = read_values(source, f"{header.entry}/{schema.DATA}", source.dataset(f"{header.entry}/{schema.DATA}"))
+    address = f"{header.entry}/{schema.DATA}"
+    data = read_values(source, address, source.dataset(address), rows=rows)
     if data.dtype.kind == "f":
         for frame in np.flatnonzero(header.image_key != schema.INVALID):
             bad = ~np.isfinite(data[frame])
@@ -143,7 +159,7 @@ def _read_frames(source: Hdf5Source, header: ScanHeader, mask: np.ndarray | None
                     f"NaN or infinity in frame {frame} at ({row}, {column}), {int(bad.sum())} in this frame"
                 )
                 remedy = "set them, or mark them in pixel_mask"
-                raise source.error(f"{header.entry}/{schema.DATA}", found, "finite values", remedy)
+                raise source.error(address, found, "finite values", remedy)
     return data
 
 

@@ -1,0 +1,64 @@
+"""Slabs of a parallel scan: detector rows, and the slices of the volume that they see alone."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from phyradgs_cl.acquisition.geometry import ParallelGeometry
+from phyradgs_cl.acquisition.scan import Scan
+from phyradgs_cl.acquisition.trajectory import CircularOrbit
+from phyradgs_cl.errors import InputError
+from phyradgs_cl.fields import Grid, triple
+
+HALO_ROWS = 4
+"""Rows on each side of a slab that are read too: slices between two rows need both, and priors look at neighbours."""
+
+
+def check_rows(scan: Scan, first: int, stop: int) -> None:
+    """Raises InputError for rows [first, stop) that the panel does not have, and for scans whose slices need other rows."""
+    rows, found = scan.geometry.detector_shape[0], f"{first}:{stop}"
+    if not (isinstance(scan.geometry, ParallelGeometry) and isinstance(scan.trajectory, CircularOrbit)):
+        expected = "all rows: only in a parallel beam about z does a slice need few of them"
+        raise InputError("--rows", found, expected, "take --roi-mm, with --margin-mm")
+    if not 0 <= first < stop <= rows:
+        raise InputError("--rows", found, f"first row and the one after the last, 0:{rows} at most", "row 0 is the lowest")
+
+
+def slab(scan: Scan, first: int, stop: int) -> Scan:
+    """Returns the scan of detector rows [first, stop) alone, on the same grid. Its lines keep their times.
+
+    Raises InputError as ``check_rows``."""
+    check_rows(scan, first, stop)
+    geometry, shutter, rows = scan.geometry, scan.shutter, scan.geometry.detector_shape[0]
+    pitch_v_mm, (offset_v_mm, offset_u_mm) = geometry.pixel_size_mm[0], geometry.detector_offset_mm
+    offset_mm = (offset_v_mm + ((first + stop) - rows) / 2 * pitch_v_mm, offset_u_mm)
+    panel = replace(geometry, detector_shape=(stop - first, geometry.detector_shape[1]), detector_offset_mm=offset_mm)
+    later_s = 0.0
+    if shutter.axis == "rows":
+        line_s = shutter.readout_s / max(rows - 1, 1)
+        later_s = (first if shutter.direction > 0 else rows - stop) * line_s
+        pulse_s = shutter.pulse_s and (shutter.pulse_s[0] - later_s, shutter.pulse_s[1])
+        shutter = replace(shutter, readout_s=(stop - first - 1) * line_s, pulse_s=pulse_s)
+    mask = None if scan.pixel_mask is None else np.asarray(scan.pixel_mask)[..., first:stop, :]
+    assert isinstance(scan.trajectory, CircularOrbit)
+    return replace(
+        scan, projections=scan.projections[:, first:stop], geometry=panel, shutter=shutter, pixel_mask=mask,
+        trajectory=CircularOrbit(panel, scan.trajectory.kinematics), frame_start_s=scan.frame_start_s + later_s,
+    )
+
+
+def slices_of(scan: Scan, first: int, stop: int) -> slice:
+    """Returns the slices of the scan's grid whose centres lie on detector rows [first, stop); together all rows have all."""
+    rows, pitch_mm = scan.geometry.detector_shape[0], scan.geometry.pixel_size_mm[0]
+    z_mm = scan.grid.axes_mm()[0]
+    row = (z_mm - scan.geometry.detector_offset_mm[0]) / pitch_mm + (rows - 1) / 2
+    number = np.clip(np.floor(row + 0.5), 0, rows - 1)
+    inside = np.flatnonzero((number >= first) & (number < stop))
+    return slice(int(inside[0]), int(inside[-1]) + 1) if inside.size else slice(0, 0)
+
+
+def part_of(grid: Grid, slices: slice) -> Grid:
+    """Returns the grid of some slices; of all slices ``grid`` itself."""
+    if slices == slice(0, grid.shape[0]):
+        return grid
+    return grid.part(triple((slices.start, 0, 0)), triple((slices.stop - slices.start, *grid.shape[1:])))

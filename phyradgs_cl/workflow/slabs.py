@@ -1,0 +1,160 @@
+"""Reconstruction of a parallel scan slab by slab: rows of one slab at a time are read, reconstructed and kept on disk.
+
+A slab's frames are those of its own rows: ``static`` takes the middle of their times, not of the whole frame's."""
+
+import logging
+import shutil
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from phyradgs_cl import reconstructors as methods
+from phyradgs_cl.acquisition import Scan
+from phyradgs_cl.acquisition.slabs import HALO_ROWS, check_rows, part_of, slices_of
+from phyradgs_cl.errors import InputError
+from phyradgs_cl.io import read_scan_header
+from phyradgs_cl.io.files import host_bytes
+from phyradgs_cl.io.output import beside, written_beside
+from phyradgs_cl.reconstructors.result import option_facts
+from phyradgs_cl.runtime import Runtime
+from phyradgs_cl.workflow.files import load_scan
+
+log = logging.getLogger(__name__)
+_HOST_SHARE = 0.5  # of this machine's memory, for the frames of a slab and what methods make of them
+_COPIES = 4  # arrays of a slab's frames that a method holds on the host
+
+
+@dataclass(frozen=True)
+class Slabs:
+    """Which rows of the panel to reconstruct, all by default, and how many at a time: rows_at_a_time 0 takes as many as half
+    of this machine's memory holds."""
+
+    rows: tuple[int, int] | None = None
+    rows_at_a_time: int = 0
+
+    def of(self, scan: Scan) -> list[tuple[int, int]]:
+        """Returns the slabs [first, stop) of a scan, of which only the header is needed; an empty list for the whole scan at
+        once. Raises InputError for rows that the scan does not have, and for slabs of anything but a parallel beam."""
+        rows = scan.geometry.detector_shape[0]
+        first, stop = self.rows or (0, rows)
+        at_a_time = self.rows_at_a_time
+        if self.rows is None and not at_a_time:
+            fit = int(_HOST_SHARE * host_bytes() / (_COPIES * 4 * scan.frames * scan.geometry.detector_shape[1]))
+            if fit >= rows or not scan.is_parallel:
+                return []
+            at_a_time = max(fit - 2 * HALO_ROWS, 1)
+        check_rows(scan, first, stop)
+        return [(a, min(a + (at_a_time or stop - first), stop)) for a in range(first, stop, at_a_time or stop - first)]
+
+
+def rows_of(text: str) -> tuple[int, int]:
+    """Parses ``A:B``. Raises InputError for other text."""
+    first, colon, stop = text.partition(":")
+    if not (colon and first.strip().isdigit() and stop.strip().isdigit()):
+        raise InputError("--rows", repr(text), "A:B, the first detector row and the one after the last", "write 0:256")
+    return int(first), int(stop)
+
+
+def reconstruct_slabs(
+    plan: methods.RunPlan, path: Path, output: Path, slabs: list[tuple[int, int]], rt: Runtime,
+    report: methods.ProgressReport, *, resume: bool,
+) -> methods.Reconstruction:
+    """Returns the volume of all slabs. Each is written beside ``output`` once it is whole; ``resume`` takes it from there.
+
+    The volume is mapped from a file. Raises InputError for slabs that are of another run, and
+    KeyboardInterrupt where a slab is interrupted."""
+    header = read_scan_header(path)
+    grid = header.with_grid(plan.preprocessing).grid
+    whole = header.on_grid(grid)
+    plan = replace(plan, preprocessing=replace(plan.preprocessing, size=None, voxel_mm=None, roi_mm=None))
+    store = _Store(output, f"{plan!r} {grid!r} {slabs!r} {path.resolve()} {path.stat().st_mtime_ns}", resume)
+    parts: list[np.ndarray] = []
+    facts: dict[str, object] = {}
+    seconds, chosen = 0.0, []
+    for number, (first, stop) in enumerate(slabs):
+        if (slices := slices_of(whole, first, stop)).start == slices.stop:
+            continue
+        chosen.append(slices)
+        if (kept := store.slab(first, stop)) is None:
+            result = _slab(plan, path, whole, (first, stop), rt, _named(report, number, len(slabs), (first, stop)))
+            facts, seconds = result.facts, seconds + float(result.facts["seconds"])
+            kept = store.keep(first, stop, result.volume)
+        parts.append(kept)
+    if not parts:
+        raise InputError("--rows", f"{slabs[0][0]}:{slabs[-1][1]}", "rows that see a slice of the grid")
+    of_rows = part_of(grid, slice(chosen[0].start, chosen[-1].stop))
+    volume = store.joined(parts, of_rows.shape)
+    about = {"method": plan.method_name, "options": option_facts(plan.options), "interrupted_at": None}
+    return methods.Reconstruction(volume, of_rows, facts={**about, **facts, "seconds": seconds, "slabs": len(slabs)})
+
+
+def _slab(
+    plan: methods.RunPlan, path: Path, whole: Scan, rows: tuple[int, int], rt: Runtime, report: methods.ProgressReport
+) -> methods.Reconstruction:
+    """Reconstructs the slices of some rows, from these and a few more on each side."""
+    count, (first, stop) = whole.geometry.detector_shape[0], rows
+    near = max(first - HALO_ROWS, 0), min(stop + HALO_ROWS, count)
+    scan = load_scan(path, plan.preprocessing.flats, near).on_grid(part_of(whole.grid, slices_of(whole, *rows)))
+    if hasattr(plan.options, "iterations"):  # what explains frames needs the slices of all their rows
+        z_mm, *across_mm = np.broadcast_to(plan.preprocessing.margin_mm or 0.0, 3).tolist()
+        margin_mm = (max(z_mm, HALO_ROWS * whole.geometry.pixel_size_mm[0]), *across_mm)
+        plan = replace(plan, preprocessing=replace(plan.preprocessing, margin_mm=margin_mm))
+    result = methods.reconstruct(scan, plan, rt, report=report)
+    if result.facts.get("interrupted_at") is not None:
+        log.warning("interrupted in rows %d:%d; the slabs before are kept: repeat with --resume to continue", first, stop)
+        raise KeyboardInterrupt
+    return result
+
+
+def _named(
+    report: methods.ProgressReport, number: int, count: int, rows: tuple[int, int]
+) -> Callable[[methods.Progress], None]:
+    """Returns a report that names the slab."""
+    label = f"slab {number + 1} of {count}, rows {rows[0]}:{rows[1]}: "
+
+    def passed_on(progress: methods.Progress) -> None:
+        report(replace(progress, quantity=label + progress.quantity, state=None))
+
+    return passed_on
+
+
+class _Store:
+    """The finished slabs of a run, a .npy file each, in a folder beside the output, with the run that they are of."""
+
+    def __init__(self, output: Path, identity: str, resume: bool) -> None:
+        self.folder = beside(output, ".slabs")
+        note = self.folder / "run.txt"
+        if self.folder.exists() and not resume:
+            shutil.rmtree(self.folder)
+        self.folder.mkdir(exist_ok=True)
+        if note.exists() and note.read_text(encoding="utf-8") != identity:
+            expected = "slabs of the same scan, options and rows"
+            raise InputError("--resume", f"other slabs in {self.folder}", expected, "leave --resume out to start anew")
+        note.write_text(identity, encoding="utf-8")
+
+    def slab(self, first: int, stop: int) -> np.ndarray | None:
+        """Returns a finished slab (z, y, x), mapped from its file, or None."""
+        path = self.folder / f"{first}-{stop}.npy"
+        return np.load(path, mmap_mode="r") if path.exists() else None
+
+    def keep(self, first: int, stop: int, volume: np.ndarray) -> np.ndarray:
+        """Writes a finished slab and returns it mapped from its file."""
+        with written_beside(self.folder / f"{first}-{stop}.npy") as temporary, open(temporary, "wb") as file:
+            np.save(file, volume)
+        return np.load(self.folder / f"{first}-{stop}.npy", mmap_mode="r")
+
+    def joined(self, parts: list[np.ndarray], shape: tuple[int, int, int]) -> np.ndarray:
+        """Returns all slabs as one volume (z, y, x), mapped from a file."""
+        volume = np.lib.format.open_memmap(self.folder / "volume.npy", "w+", np.float32, shape)
+        at = 0
+        for part in parts:
+            volume[at : at + len(part)] = part
+            at += len(part)
+        return volume
+
+
+def remove_slabs(output: Path) -> None:
+    """Removes the finished slabs of a run whose volume is written."""
+    shutil.rmtree(beside(output, ".slabs"), ignore_errors=True)

@@ -1,0 +1,116 @@
+"""Slabs of a parallel scan: the volume of the whole scan, rows read alone, an interrupted run that continues."""
+
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from tolerances import FLOAT32
+
+from phyradgs_cl.acquisition import (
+    CircularOrbit,
+    ConstantSpeed,
+    LineMiddles,
+    ParallelGeometry,
+    PerRow,
+    Scan,
+    Shutter,
+)
+from phyradgs_cl.acquisition.slabs import slab, slices_of
+from phyradgs_cl.errors import InputError
+from phyradgs_cl.fields import Grid
+from phyradgs_cl.io import read_volume, write_scan
+from phyradgs_cl.operators import RayOperator
+from phyradgs_cl.phantoms import shepp_logan
+from phyradgs_cl.reconstructors.plan import plan_run
+from phyradgs_cl.workflow import load_scan, run_reconstruction
+from phyradgs_cl.workflow.slabs import Slabs, rows_of
+
+ROWS, SIDE, VIEWS = 26, 24, 30
+GRID = Grid((24, SIDE, SIDE), (0.08, 0.08, 0.08), (0.02, 0.0, 0.0))
+
+
+@pytest.fixture(scope="module")
+def path(rt, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A fly-scan whose rows are read over most of a frame, last row first."""
+    geometry = ParallelGeometry((ROWS, SIDE), 0.08, (0.03, 0.01))
+    orbit, shutter = CircularOrbit(geometry, ConstantSpeed(0.2, np.pi / VIEWS)), Shutter(0.4, 0.5, "rows", -1)
+    start_s, path = np.arange(float(VIEWS)), tmp_path_factory.mktemp("slabs") / "scan.h5"
+    scan = Scan(np.zeros((VIEWS, ROWS, SIDE), np.float32), geometry, orbit, shutter, start_s, GRID)
+    tables = [PerRow().cells(scan, f) for f in range(VIEWS)]
+    frames = RayOperator(rt, GRID, (ROWS, SIDE), tables).forward(shepp_logan(0.9).voxelise(GRID))
+    write_scan(path, Scan(frames, geometry, orbit, shutter, start_s, GRID))
+    return path
+
+
+def test_a_slab_has_the_windows_and_poses_of_its_rows(path: Path) -> None:
+    whole = load_scan(path)
+    part = load_scan(path, rows=(5, 13))
+    np.testing.assert_array_equal(part.projections, whole.projections[:, 5:13])
+    windows = [s.frame_start_s[3] + s.shutter.line_windows_s(s.lines) for s in (whole, part)]
+    np.testing.assert_allclose(windows[1], windows[0][5:13], rtol=0, atol=1e-12)
+    poses = [s.trajectory.pose(3, np.array(3.3)) for s in (whole, part)]
+    np.testing.assert_allclose(poses[1][3:6], poses[0][3:6] + 5 * poses[0][9:12], rtol=0, atol=1e-12)
+
+
+def test_slabs_share_the_slices_out() -> None:
+    geometry = ParallelGeometry((ROWS, SIDE), 0.08, (0.03, 0.01))
+    orbit = CircularOrbit(geometry, ConstantSpeed(0.2, 0.1))
+    scan = Scan(np.zeros((1, ROWS, SIDE), np.float32), geometry, orbit, Shutter(0.0), np.zeros(1), GRID, False)
+    parts = [slices_of(scan, a, b) for a, b in ((0, 7), (7, 8), (8, ROWS))]
+    assert [part.start for part in parts[1:]] == [part.stop for part in parts[:-1]]
+    assert (parts[0].start, parts[-1].stop) == (0, 24)
+
+
+@pytest.mark.parametrize(
+    ("method", "options", "limit"), [("fbp", {"motion": LineMiddles()}, FLOAT32), ("fista", {"iterations": 6}, 0.03)]
+)
+def test_slabs_make_up_the_volume_of_the_whole_scan(rt, path: Path, tmp_path: Path, method, options, limit) -> None:
+    """FBP: the same. ``fista``: the prior's weight and the subsets' order follow the noise of the rows that are read."""
+    plan, volumes = plan_run(method, options), []
+    for name, slabs in {"whole": Slabs(), "slabs": Slabs(None, 9), "rows": Slabs((9, 18), 0)}.items():
+        run_reconstruction(plan, path, tmp_path / f"{name}.h5", lambda: rt, slabs=slabs)
+        volumes.append(read_volume(tmp_path / f"{name}.h5"))
+    whole, joined, rows = volumes
+    peak = whole.values.max()
+    assert joined.grid == whole.grid and np.abs(joined.values - whole.values).max() <= limit * peak
+    part = rows.grid.slices_in(whole.grid)
+    assert part is not None and np.abs(rows.values - whole.values[part]).max() <= limit * peak
+    assert not list(tmp_path.glob("*.slabs"))
+
+
+def test_an_interrupted_run_continues_with_the_slabs_that_it_lacks(rt, path: Path, tmp_path: Path) -> None:
+    plan, output, seen = plan_run("sirt", {"iterations": 3}), tmp_path / "v.h5", []
+
+    def stop_in_the_second(progress) -> None:
+        seen.append(progress.quantity)
+        if "slab 2" in progress.quantity and len(seen) < 100:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        run_reconstruction(plan, path, output, lambda: rt, stop_in_the_second, slabs=Slabs(None, 9))
+    assert [one.name for one in (tmp_path / "v.h5.slabs").glob("*.npy")] == ["0-9.npy"] and not output.exists()
+    seen.extend([""] * 100)
+    with pytest.raises(InputError, match="other slabs"):
+        run_reconstruction(plan, path, output, lambda: rt, resume=True, slabs=Slabs(None, 8))
+    run_reconstruction(plan, path, output, lambda: rt, stop_in_the_second, resume=True, slabs=Slabs(None, 9))
+    assert not any("slab 1" in quantity for quantity in seen[100:])
+    run_reconstruction(plan, path, tmp_path / "w.h5", lambda: rt, slabs=Slabs(None, 9))
+    np.testing.assert_array_equal(read_volume(output).values, read_volume(tmp_path / "w.h5").values)
+
+
+def test_rows_are_read_without_the_others(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    taken, own = [], h5py.Dataset.__getitem__
+    monkeypatch.setattr(h5py.Dataset, "__getitem__", lambda self, key: (taken.append((self.name, key)), own(self, key))[1])
+    load_scan(path, rows=(4, 6))
+    frames = [key for name, key in taken if name.endswith("detector/data")]
+    assert frames == [(..., slice(4, 6), slice(None))], frames
+
+
+def test_bad_rows_are_refused(path: Path) -> None:
+    scan = load_scan(path)
+    for first, stop in ((5, 5), (-1, 3), (3, 27)):
+        with pytest.raises(InputError, match="--rows"):
+            slab(scan, first, stop)
+    with pytest.raises(InputError, match="--rows"):
+        rows_of("3-9")
