@@ -92,7 +92,9 @@ def run_reconstruction(
 ) -> tuple[methods.Reconstruction, dict[str, float]]:
     """Reconstructs a scan file and writes a volume file; returns the result and its metrics.
 
-    A parallel scan whose frames exceed half of this machine's memory is reconstructed in ``slabs`` of rows. An interrupted run leaves
+    A parallel scan whose frames exceed half of this machine's memory is reconstructed in ``slabs`` of rows.
+
+    An interrupted run leaves
     ``output`` alone: it writes ``io.partial_path`` and a checkpoint, from which ``resume`` goes on. A complete run removes
     both; a killed run leaves its last checkpoint. inputs: other files that the output must not overwrite. ranks: those of
     the runtime; rank 0 alone writes and has metrics. Raises OutputError while another run writes the output."""
