@@ -1,8 +1,6 @@
-"""Ctrl-C and SIGTERM: they raise KeyboardInterrupt, except in blocks that finish their work first.
-
-Each block installs its own handler for the time that it is open, so nothing is kept in the module. Signals belong to the
-main thread; in other threads the blocks do nothing. A signal that the user has set to be ignored stays ignored.
-"""
+"""Ctrl-C and SIGTERM: they raise KeyboardInterrupt, except in blocks that finish their work first. Each block installs its
+own handler for the time that it is open, so nothing is kept in the module. Signals belong to the main thread; in other
+threads the blocks do nothing. A signal that the user has set to be ignored stays ignored."""
 
 import signal
 import threading
@@ -79,10 +77,8 @@ def stop_on_interrupt() -> Iterator[SignalHandler]:
 
 @contextmanager
 def keep_finished_work() -> Iterator[None]:
-    """For a loop and the writing of its result: signals wait from the end of the first loop in the body on.
-
-    A signal that has waited becomes InterruptedAfterwards at the end.
-    """
+    """For a loop and the writing of its result: signals wait from the end of the first loop in the body on. A signal that
+    has waited becomes InterruptedAfterwards at the end."""
     with _handling(_Answer.RAISE) as handler:
         handler.keeps_finished_work = True
         yield
@@ -114,10 +110,8 @@ def farewell() -> str:
 @contextmanager
 def _handling(answer: _Answer, takes_default: bool = False) -> Iterator[SignalHandler]:
     """Installs a handler; what it has heard passes to the handler around it. takes_default: for SIGTERM, which otherwise
-    ends the process as it always does.
-
-    A device that fails after a signal has only lost its compiler, which gets the signal too: that is KeyboardInterrupt.
-    """
+    ends the process as it always does. A device that fails after a signal has only lost its compiler, which gets the signal
+    too: that is KeyboardInterrupt."""
     handler = SignalHandler(answer)
     if threading.current_thread() is not threading.main_thread():
         yield handler
