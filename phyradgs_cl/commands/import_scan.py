@@ -1,31 +1,21 @@
 """import: a scan of another program to a scan file."""
 
 from contextlib import suppress
+from dataclasses import Field, fields
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-import typer
 
 from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.acquisition.scan import APPLIED
 from phyradgs_cl.commands.console import file_argument, file_option, option, remark, say
-from phyradgs_cl.commands.options import (
-    DETECTOR_OFFSET,
-    Axis,
-    DetectorModel,
-    First,
-    RoiMm,
-    Size,
-    VoxelMm,
-    lengths,
-    pitches,
-)
+from phyradgs_cl.commands.options import RoiMm, Size, VoxelMm, lengths, pitches, with_options
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import GridChoice
 from phyradgs_cl.importers import FORMATS, ImportOptions, import_scan, recognise
 from phyradgs_cl.importers.formats.tiff_template import template_of
-from phyradgs_cl.importers.options import FIELDS, WORDS, option_name
+from phyradgs_cl.importers.options import WORDS, option_name
 from phyradgs_cl.io import file_kind, only_run, write_scan
 from phyradgs_cl.signals import finish_despite_interrupt
 from phyradgs_cl.workflow.files import check_output
@@ -39,17 +29,7 @@ EXAMPLES = {
 }
 
 FormatName = Literal[tuple(FORMATS)]  # type: ignore[valid-type]
-AngleAt = Literal[WORDS["angle_at"]]  # type: ignore[name-defined, valid-type]
-Part = Literal[WORDS["part"]]  # type: ignore[name-defined, valid-type]
-Quantity = Literal[WORDS["quantity"]]  # type: ignore[name-defined, valid-type]
-Rotates = Literal[WORDS["rotates"]]  # type: ignore[name-defined, valid-type]
-Row0 = Literal[WORDS["row_0"]]  # type: ignore[name-defined, valid-type]
-Column0 = Literal[WORDS["column_0"]]  # type: ignore[name-defined, valid-type]
-
 _TEMPLATE = "Print a TOML to fill in for a folder of TIFFs, and write nothing."
-_DIRECTION = "1 reads row 0 (lowest) or column 0 (left) first, -1 last."
-_MODEL = "An exposure averages line integrals (log) or intensity."
-_FILE, _FORMAT = "the file's", "the format's"
 GROUPS = {
     "import": {
         "Basics": (
@@ -64,46 +44,36 @@ GROUPS = {
 }
 
 
+def _annotated(one: Field[Any]) -> tuple[Any, Any]:
+    """Returns the kind of an option of imports, for Typer, and its default."""
+    flag, words = option_name(one.name), (one.metadata["help"], one.metadata["usual"])
+    if one.name in _PAIRS:
+        return Annotated[Any, _PAIRS[one.name](flag, *words)], None
+    kind: Any = Literal[WORDS[one.name]] if one.name in WORDS else one.type
+    return Annotated[kind if one.default is not None else kind | None, option(*words, flag)], one.default
+
+
+_PAIRS = {"pixel_size_mm": pitches, "detector_offset_mm": lengths}
+_OPTIONS = {one.name: _annotated(one) for one in fields(ImportOptions) if one.name != "named"}
+
+
+@with_options("options", _OPTIONS, lambda given: ImportOptions(**given, named=option_name))
 def import_command(
-    context: typer.Context,
     source: Annotated[Path, file_argument("SRC", "File or folder of another program (docs: import.md).")],
+    options: ImportOptions,
     output: Annotated[Path | None, file_option("Scan file to write; an existing one is replaced.", "--output", "-o")] = None,
     template: Annotated[bool, option(_TEMPLATE, True, "--template")] = False,
     form: Annotated[FormatName | None, option("Format of SRC.", "recognised", "--format")] = None,  # type: ignore[valid-type]
-    exposure_s: Annotated[float | None, option("Exposure of a line, s.", _FILE)] = None,
-    readout_ms: Annotated[float | None, option("From the first line's opening to the last line's, ms.", _FILE)] = None,
-    readout_s: Annotated[float | None, option("--readout-ms in s.", _FILE)] = None,
-    fps: Annotated[float | None, option("Frames per second of a gantry that never stops.", f"{_FILE}, else at rest")] = None,
-    frame_time_s: Annotated[float | None, option("From frame to frame, s: in place of --fps.", f"{_FILE}")] = None,
-    angle_at: Annotated[AngleAt | None, option("A frame's angle: at its first line's start or middle.", "start")] = None,
-    first: Annotated[First | None, option("Line that is read first, seen from the source.", _FORMAT)] = None,
-    readout_axis: Annotated[Axis | None, option("Lines of the readout: rows or columns.", _FORMAT, "--readout")] = None,
-    readout_direction: Annotated[int | None, option(_DIRECTION, _FORMAT)] = None,
-    source_to_axis_mm: Annotated[float | None, option("Source to rotation axis, mm.", _FILE)] = None,
-    source_to_detector_mm: Annotated[float | None, option("Source to detector, mm.", _FILE)] = None,
-    pixel_size_mm: Annotated[Any, pitches("--pixel-size-mm", "Pixel's side, or height and width, mm.", _FILE)] = None,
-    detector_offset_mm: Annotated[Any, lengths("--detector-offset", DETECTOR_OFFSET, _FILE)] = None,
-    unit_mm: Annotated[float, option("Length of a scene unit in mm (r2, phyradgs).")] = 1.0,
-    rotates: Annotated[Rotates | None, option("The part that the stored angles turn.", _FORMAT)] = None,
-    row_0: Annotated[Row0 | None, option("Place of the first stored row.", _FORMAT, "--row-0")] = None,
-    column_0: Annotated[Column0 | None, option("Place of the first stored column.", "left", "--column-0")] = None,
-    quantity: Annotated[Quantity | None, option("Quantity in the pixels.", _FILE)] = None,
-    flat_value: Annotated[float | None, option("Counts without an object, in place of flat frames.", _FILE)] = None,
-    detector_model: Annotated[DetectorModel | None, option(_MODEL, "log")] = None,
-    part: Annotated[Part, option("Projections of a benchmark folder (r2, phyradgs, naf).")] = "train",
-    first_view: Annotated[int | None, option("First view of this scan in a JSON of several (phyradgs-real).", "all")] = None,
     size: Size = None,
     voxel_mm: VoxelMm = None,
     roi_mm: RoiMm = None,
 ) -> None:
     """Import a scan of another program: R2-Gaussian, PhyRadGS, NAF, RTK, Data Exchange, NXtomo, TIFF."""
-    given = {name: value for name, value in context.params.items() if name in FIELDS}
     if template:
         say(template_of(source))
         return
     if output is None:
         raise InputError("--output", "nothing", "a scan file to write", "say -o scan.h5")
-    options = ImportOptions(**given, named=option_name)
     grid = GridChoice(size, voxel_mm, roi_mm)
     _refuse_overwriting(source, output)
     check_output(output)

@@ -3,7 +3,7 @@
 import functools
 import inspect
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args
 
@@ -16,10 +16,9 @@ from phyradgs_cl.errors import InputError
 from phyradgs_cl.prepare import DEFAULT_STEPS, STEPS
 from phyradgs_cl.reconstructors import DEFAULT_METHOD, METHODS
 from phyradgs_cl.runtime import DEVICE_VARIABLE, MEMORY_VARIABLE
-from phyradgs_cl.settings import read_settings
+from phyradgs_cl.settings import Settings, read_settings
 
 LARGEST_MM = 1e6
-DETECTOR_OFFSET = "Shift V,U of the panel's centre, mm: V > 0 up (rows), U > 0 right (columns), seen from the source."
 Axis = Literal[AXES]  # type: ignore[valid-type]
 First = Literal[SIDES]  # type: ignore[valid-type]
 DetectorModel = Literal[DETECTOR_MODELS]  # type: ignore[valid-type]
@@ -40,7 +39,7 @@ Scheduler = Annotated[str | None, option(_SCHEDULER, metavar="ADDRESS|local")]
 WorkerCount = Annotated[int | None, option("Local workers, each a process.", "one per device", metavar="N")]
 
 
-def pair_parser(
+def pair_of(
     flag: str, form: str, example: str, largest: float = math.inf
 ) -> Callable[[str], tuple[float, float]]:
     """Returns a parser of two finite numbers with a comma between, ``form``, of absolute value at most ``largest``."""
@@ -68,13 +67,13 @@ def numbers(text: str) -> float | list[float] | str:
 
 def lengths(flag: str, help: str, default: str) -> Any:
     """An option that takes two lengths V,U."""
-    parser = pair_parser(flag, "V,U in mm", "0,12.5", LARGEST_MM)
+    parser = pair_of(flag, "V,U in mm", "0,12.5", LARGEST_MM)
     return option(help, default, flag, parser=parser, metavar="V,U")
 
 
 def pitches(flag: str, help: str, default: str) -> Any:
     """An option that takes the pitches of a pixel V,U, or one for square pixels."""
-    pair = pair_parser(flag, "V,U in mm, or one for square pixels", "0.148 or 0.3,0.15", LARGEST_MM)
+    pair = pair_of(flag, "V,U in mm, or one for square pixels", "0.148 or 0.3,0.15", LARGEST_MM)
     return option(help, default, flag, parser=lambda text: pair(text if "," in text else f"{text},{text}"), metavar="D|V,U")
 
 
@@ -145,35 +144,39 @@ RUN_OPTIONS: dict[str, Any] = {
 }
 
 
-def with_run_options(*without: str) -> Callable[[Callable[..., None]], Callable[..., None]]:
-    """Gives a command the options of a reconstruction, except ``without``, in place of its parameter ``settings``.
+def with_run_options(*without: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+    """Gives a command the options of a reconstruction, except ``without``, in place of its parameter ``settings``."""
 
-    Typer reads a command's signature, so the signature lists the options; the command gets the ``Settings`` that they make.
-    """
-    names = [name for name in RUN_OPTIONS if name not in without]
+    def settings(options: dict[str, Any]) -> Settings:
+        given = {name: None if value is False else value for name, value in options.items()}  # False: a flag not given
+        config, assignments = given.pop("config"), given.pop("assignments") or []
+        return read_settings(config, given, assignments)
 
-    def decorated(command: Callable[..., None]) -> Callable[..., None]:
+    kinds = {name: kind for name, kind in RUN_OPTIONS.items() if name not in without}
+    options = {name: (kind, False if get_args(kind)[0] is bool else None) for name, kind in kinds.items()}
+    return with_options("settings", options, settings)
+
+
+def with_options(
+    slot: str, options: Mapping[str, tuple[Any, Any]], make: Callable[[dict[str, Any]], Any]
+) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+    """Gives a command ``options``, each (annotation, default), in place of its parameter ``slot``. Typer reads a command's
+    signature, so the signature lists the options; the command gets what ``make`` makes of their values."""
+
+    def decorated(command: Callable[..., Any]) -> Callable[..., Any]:
         @functools.wraps(command)
-        def called(**values: Any) -> None:
-            options = {name: values.pop(name) for name in names}
-            given = {name: None if value is False else value for name, value in options.items()}  # False: a flag not given
-            config, assignments = given.pop("config"), given.pop("assignments") or []
-            command(settings=read_settings(config, given, assignments), **values)
+        def called(**values: Any) -> Any:
+            made = make({name: values.pop(name) for name in options})
+            return command(**{slot: made}, **values)
 
-        called.__signature__ = _signature(command, names)  # type: ignore[attr-defined]
+        own = inspect.signature(command, eval_str=True).parameters.values()
+        keyword = inspect.Parameter.KEYWORD_ONLY
+        parameters = [one.replace(kind=keyword) for one in own if one.name != slot]
+        place = [one.name for one in own].index(slot)
+        parameters[place:place] = [
+            inspect.Parameter(name, keyword, default=default, annotation=kind) for name, (kind, default) in options.items()
+        ]
+        called.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
         return called
 
     return decorated
-
-
-def _signature(command: Callable[..., None], names: list[str]) -> inspect.Signature:
-    """Returns the command's signature with the options of a reconstruction in place of ``settings``."""
-    parameters: list[inspect.Parameter] = []
-    for own in inspect.signature(command, eval_str=True).parameters.values():
-        if own.name == "settings":
-            for name in names:
-                default = False if get_args(kind := RUN_OPTIONS[name])[0] is bool else None
-                parameters.append(inspect.Parameter(name, own.KEYWORD_ONLY, default=default, annotation=kind))
-        else:
-            parameters.append(own.replace(kind=own.KEYWORD_ONLY))
-    return inspect.Signature(parameters)

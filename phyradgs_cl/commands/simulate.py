@@ -7,17 +7,8 @@ import typer
 
 from phyradgs_cl.acquisition import PROTOCOLS
 from phyradgs_cl.commands.console import file_option, option, say
-from phyradgs_cl.commands.options import (
-    DETECTOR_OFFSET,
-    Axis,
-    DetectorModel,
-    Device,
-    First,
-    Memory,
-    Output,
-    lengths,
-    pair_parser,
-)
+from phyradgs_cl.commands.options import Axis, DetectorModel, Device, First, Memory, Output, lengths, pair_of
+from phyradgs_cl.importers.options import DETECTOR_OFFSET
 from phyradgs_cl.phantoms import PHANTOMS
 from phyradgs_cl.progress import Ticker
 from phyradgs_cl.runtime import Runtime
@@ -68,7 +59,7 @@ def simulate_command(
         Any,
         option(
             "When the beam is on, in exposures after a frame's start.", "scanner's: always on",
-            parser=pair_parser("--pulse", "START,LENGTH as fractions of the exposure", "0.86,0.14"),
+            parser=pair_of("--pulse", "START,LENGTH as fractions of the exposure", "0.86,0.14"),
             metavar="START,LENGTH",
         ),
     ] = None,

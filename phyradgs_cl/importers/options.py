@@ -1,6 +1,7 @@
 """Options of an import: values that a foreign scan's files do not state, or that replace theirs."""
 
 from dataclasses import dataclass, field, fields
+from typing import Any
 
 from phyradgs_cl import checks
 from phyradgs_cl.acquisition.readout import SIDES, Named, frame_time_of, readout_of, readout_order
@@ -23,43 +24,45 @@ _POSITIVE = ("frame_time_s", "source_to_axis_mm", "source_to_detector_mm", "flat
 _TIMES = ("exposure_s", "readout_s")
 
 
+_FILE, _FORMAT = "the file's", "the format's"
+DETECTOR_OFFSET = "Shift V,U of the panel's centre, mm: V > 0 up (rows), U > 0 right (columns), seen from the source."
+_FIRST_VIEW = "First view of this scan in a JSON of several (phyradgs-real)."
+
+
+def _option(help: str, usual: str | bool = _FILE, default: Any = None) -> Any:
+    """Returns a field with its help, and with the words for the value of an option that is not given."""
+    return field(default=default, metadata={"help": help, "usual": usual})
+
+
 @dataclass(frozen=True)
 class ImportOptions:
-    """Options of an import. None leaves a value to the file or to the format's convention.
+    """Options of an import. None leaves a value to the file or to the format's convention. Readout axis and direction are
+    those of the imported scan: row 0 the lowest, column 0 on the left, seen from the source. ``first``, ``fps`` and
+    ``readout_ms`` are the words of a data sheet; contradictions are refused. ``named``: returns the name of a field in
+    messages."""
 
-    Timing: ``exposure_s`` and ``readout_s`` of a frame; ``frame_time_s`` from one opening to the next, of a gantry that
-    turned without a stop; ``angle_at``: a frame's angle is that of its first line's opening ("start") or mid-exposure
-    ("middle"). Readout axis and direction are those of the imported scan: row 0 the lowest, column 0 on the left, seen from
-    the source. In a data sheet's words: ``first`` ("top", "bottom", "left", "right") is the line that is read first and
-    states axis and direction; ``fps`` states the frame time, ``readout_ms`` the readout. Contradictions are refused.
-    Geometry: distances, pixel size and detector offset (v, u) in mm; ``unit_mm``: length of a scene unit of formats without
-    millimetres; ``rotates``: gantry or sample; ``row_0``, ``column_0``: places of the first stored ones, seen from the
-    source. Pixels: the stored ``quantity``; ``flat_value``: counts without an object, where there are no flat frames.
-    ``part``: the projections of a benchmark folder; ``first_view``: the first view of this scan in a file of several.
-    ``named``: returns the name of a field in messages."""
-
-    exposure_s: float | None = None
-    readout_s: float | None = None
-    frame_time_s: float | None = None
-    angle_at: str | None = None
-    readout_axis: str | None = None
-    readout_direction: int | None = None
-    source_to_axis_mm: float | None = None
-    source_to_detector_mm: float | None = None
-    pixel_size_mm: tuple[float, float] | None = None
-    detector_offset_mm: tuple[float, float] | None = None
-    unit_mm: float = 1.0
-    rotates: str | None = None
-    row_0: str | None = None
-    column_0: str | None = None
-    quantity: str | None = None
-    flat_value: float | None = None
-    detector_model: str | None = None
-    part: str = "train"
-    first_view: int | None = None
-    first: str | None = None
-    fps: float | None = None
-    readout_ms: float | None = None
+    exposure_s: float | None = _option("Exposure of a line, s.")
+    readout_s: float | None = _option("--readout-ms in s.")
+    frame_time_s: float | None = _option("From frame to frame, s: in place of --fps.")
+    angle_at: str | None = _option("A frame's angle: at its first line's start or middle.", "start")
+    readout_axis: str | None = _option("Lines of the readout: rows or columns.", _FORMAT)
+    readout_direction: int | None = _option("1 reads row 0 (lowest) or column 0 (left) first, -1 last.", _FORMAT)
+    source_to_axis_mm: float | None = _option("Source to rotation axis, mm.")
+    source_to_detector_mm: float | None = _option("Source to detector, mm.")
+    pixel_size_mm: tuple[float, float] | None = _option("Pixel's side, or height and width, mm.")
+    detector_offset_mm: tuple[float, float] | None = _option(DETECTOR_OFFSET)
+    unit_mm: float = _option("Length of a scene unit in mm (r2, phyradgs).", True, 1.0)
+    rotates: str | None = _option("The part that the stored angles turn.", _FORMAT)
+    row_0: str | None = _option("Place of the first stored row.", _FORMAT)
+    column_0: str | None = _option("Place of the first stored column.", "left")
+    quantity: str | None = _option("Quantity in the pixels.")
+    flat_value: float | None = _option("Counts without an object, in place of flat frames.")
+    detector_model: str | None = _option("An exposure averages line integrals (log) or intensity.", "log")
+    part: str = _option("Projections of a benchmark folder (r2, phyradgs, naf).", True, "train")
+    first_view: int | None = _option(_FIRST_VIEW, "all")
+    first: str | None = _option("Line that is read first, seen from the source.", _FORMAT)
+    fps: float | None = _option("Frames per second of a gantry that never stops.", f"{_FILE}, else at rest")
+    readout_ms: float | None = _option("From the first line's opening to the last line's, ms.")
     named: Named = field(default=str, repr=False, compare=False)
 
     def __post_init__(self) -> None:
