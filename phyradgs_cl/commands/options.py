@@ -105,8 +105,9 @@ RUN_GROUPS = {
 }
 _METHOD = "fdk: analytic; phyradgs, r2: splats; naf, sax-nerf: neural fields; the others: voxels (docs: methods.md)."
 _MOTION = (
-    "Poses of a frame: one (static, static-start), M×N micro-views, one per line (per-row), or, for splats, integrals "
-    "over time (exact)."
+    "Leave it out with fista, fused and phyradgs, which take the scan's motion; with others say per-row. Poses of a "
+    "frame: one (static, static-start), M×N micro-views, one per line (per-row), or, for splats, integrals over time "
+    "(exact)."
 )
 _PRIOR = "Prior, for fista: dct, tv, nonlocal, nonlocal+dct, piccs or none; MODULE:NAME: a denoiser of your own."
 _PRESET = "Constants: default, quick, paper, released (phyradgs); published (r2, naf, sax-nerf); a window (fdk)."

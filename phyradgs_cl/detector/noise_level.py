@@ -56,7 +56,8 @@ def noise_rms(line_integrals: NDArray[np.float32], chosen: NDArray[np.bool_], va
 
     Noise grows with attenuation, so it is estimated by tenths of the line integrals and averaged as the chosen pixels lie.
     Each estimate is the median of |second differences along rows of those along columns|, which vanish at straight edges
-    along either (Immerkær, Comput. Vis. Image Underst. 64 (1996) 300). Panels of fewer than three rows use rows alone."""
+    along either (Immerkær, Comput. Vis. Image Underst. 64 (1996) 300). Detail as fine as a pixel raises it: by up to 70 %
+    on panels of 64² with noise of 0.5 %. Panels of fewer than three rows use rows alone."""
     usable, differences = valid, line_integrals
     means = line_integrals
     cuts = (_along_rows, _along_columns) if line_integrals.shape[-2] >= 3 else (_along_rows,)

@@ -5,6 +5,7 @@ from phyradgs_cl.metrics.align import (
     Aligned,
     aligned,
     in_words,
+    overlap,
     reference_on,
     resampled,
     shared_slices,
@@ -13,6 +14,6 @@ from phyradgs_cl.metrics.quality import HELD_OUT, METRICS, compare, printed, psn
 from phyradgs_cl.metrics.slices import slices_png
 
 __all__ = [
-    "HELD_OUT", "METRICS", "VOXEL_BY_VOXEL", "Aligned", "aligned", "compare", "in_words", "printed", "psnr",
+    "HELD_OUT", "METRICS", "VOXEL_BY_VOXEL", "Aligned", "aligned", "compare", "in_words", "overlap", "printed", "psnr",
     "reference_on", "resampled", "shared_slices", "slices_png", "ssim", "ssim_map",
 ]  # fmt: skip

@@ -49,6 +49,13 @@ def aligned(volume: Values, grid: Grid, reference: Values, reference_grid: Grid)
     return Aligned(resampled(volume, grid, onto)[0], part_of_reference, onto, how + _of(share), share)
 
 
+def overlap(one: Grid, other: Grid) -> tuple[float, float]:
+    """Returns the volume that two boxes share, as a fraction of each."""
+    low, high = np.maximum(one.box_mm[:, 0], other.box_mm[:, 0]), np.minimum(one.box_mm[:, 1], other.box_mm[:, 1])
+    shared_mm3 = float(np.prod(np.maximum(high - low, 0)))
+    return shared_mm3 / math.prod(one.size_mm), shared_mm3 / math.prod(other.size_mm)
+
+
 def reference_on(grid: Grid, reference: Values, reference_grid: Grid) -> Values | None:
     """Returns the reference (nz, ny, nx) on ``grid`` by the rule of ``aligned``; None where that resamples the volume."""
     if grid.is_close(reference_grid):

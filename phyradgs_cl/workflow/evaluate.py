@@ -1,5 +1,6 @@
 """From two volumes to numbers and a picture."""
 
+import logging
 from pathlib import Path
 
 import numpy as np
@@ -10,10 +11,13 @@ from phyradgs_cl.fields import Grid, triple
 from phyradgs_cl.fields.grid_choice import voxel_sides_mm
 from phyradgs_cl.io import written_beside
 from phyradgs_cl.io.volume import interruption
-from phyradgs_cl.metrics import VOXEL_BY_VOXEL, Aligned, aligned, compare, in_words, slices_png
+from phyradgs_cl.metrics import VOXEL_BY_VOXEL, Aligned, aligned, compare, in_words, overlap, slices_png
 from phyradgs_cl.signals import finish_despite_interrupt
 from phyradgs_cl.text import plain_text
 from phyradgs_cl.workflow.files import check_picture, load_reference, load_result
+
+log = logging.getLogger(__name__)
+_LITTLE = 0.5 - 1e-6  # of either box: less in common is most often a wrong size or offset
 
 
 @np.errstate(all="ignore")
@@ -56,7 +60,7 @@ def _grid_of(path: Path, reference: np.ndarray, grid: Grid | None, voxel_mm: obj
         return Grid(triple(reference.shape), voxel_sides_mm("--reference-voxel-mm", voxel_mm))
     if grid is None:
         found, expected = "voxels without a scale", f"a reference that says where they lie, as {volume_path} does"
-        remedy = "give the sides of its voxels by --reference-voxel-mm, for a volume that is centred on the axis"
+        remedy = "say --reference-voxel-mm and the side of its voxels in mm, if it is centred on the axis"
         raise InputError(str(path), found, expected, remedy)
     return grid
 
@@ -72,4 +76,9 @@ def _on_one_grid(
     if not pair.reference.max() > 0:
         found = f"nothing in the {100 * pair.share:.3g} % of it that lie in {volume_path}"
         raise InputError(str(reference_path), found, "an object in the part that is compared")
+    of_volume, of_reference = overlap(result[1], truth[1])
+    if min(of_volume, of_reference) < _LITTLE:
+        text = "%s and %s share %.3g %% of the first box and %.3g %% of the second: unless one is a part on purpose, "
+        text += "correct voxel size or offset"
+        log.warning(text, volume_path, reference_path, 100 * of_volume, 100 * of_reference)
     return pair

@@ -44,6 +44,28 @@ def test_evaluate_has_one_answer_for_all_formats(cli, files, tmp_path, capsys) -
     assert json.loads(capsys.readouterr().out)["ssim"] == 1
 
 
+def test_boxes_with_little_in_common_are_warned_of(cli, files, tmp_path, capsys, caplog) -> None:
+    scan, volume, values, grid = files
+    small, aside = (Grid(grid.shape, tuple(factor * side for side in grid.voxel_size_mm), offset) for factor, offset in (
+        (0.7, grid.offset_mm), (1.0, (0.0, 0.0, 0.4 * grid.size_mm[2])),
+    ))  # fmt: skip
+    for name, other, first, second in (("small", small, 100, 34.3), ("aside", aside, 60, 60)):
+        caplog.clear()
+        write_volume(tmp_path / f"{name}.h5", values, other, {})
+        assert cli.run(["evaluate", str(tmp_path / f"{name}.h5"), "--reference", str(scan)]) == 0
+        said = f"share {first} % of the first box and {second} % of the second" in caplog.text
+        assert said == (min(first, second) < 50), (name, caplog.text)
+    bare = tmp_path / "bare.h5"
+    with h5py.File(bare, "w") as file:
+        file["volume"] = values
+    capsys.readouterr()
+    assert cli.run(["evaluate", str(volume), "--reference", str(bare)]) == 2
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1 and "say --reference-voxel-mm and the side of its voxels in mm" in error
+    sides = ",".join(f"{side:.9g}" for side in grid.voxel_size_mm)
+    assert cli.run(["evaluate", str(volume), "--reference", str(bare), "--reference-voxel-mm", sides]) == 0
+
+
 def test_how_another_grid_is_compared_is_said_in_the_line_and_the_json(cli, files, tmp_path, capsys) -> None:
     def said(name: str) -> str:
         assert cli.run(["evaluate", str(tmp_path / name), "--reference", str(scan)]) == 0
