@@ -9,7 +9,8 @@ from scipy.ndimage import median_filter
 from phyradgs_cl.acquisition import Saturation, Scan
 from phyradgs_cl.acquisition.altered.angles import start_azimuths_rad
 from phyradgs_cl.check.finding import CANNOT_TELL, OK, SUSPICIOUS, Finding
-from phyradgs_cl.detector import clustered_share, counts_to_attenuation
+from phyradgs_cl.detector import counts_to_attenuation
+from phyradgs_cl.detector.noise_level import clustered_share
 from phyradgs_cl.prepare.bad_pixels import LEAST_FRAMES, axis_column, find_dead
 from phyradgs_cl.reconstructors.fits.residuals import fit
 from phyradgs_cl.runtime import Runtime

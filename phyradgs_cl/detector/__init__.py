@@ -1,25 +1,11 @@
 """The detector: counts and line integrals, averages over an exposure, noise and other effects, estimates of them."""
 
-from phyradgs_cl.detector.attenuation import (
-    average,
-    counts_to_attenuation,
-    frames_to_attenuation,
-    intensity_average,
-)
+from phyradgs_cl.detector.attenuation import average, counts_to_attenuation, intensity_average
 from phyradgs_cl.detector.effects import without_lag
-from phyradgs_cl.detector.noise_level import (
-    clustered_share,
-    find_saturation,
-    noise_behind,
-    noise_level,
-    noise_rms,
-    robust_deviation,
-    transmission_weights,
-)
+from phyradgs_cl.detector.noise_level import noise_level, noise_rms, robust_deviation, transmission_weights
 from phyradgs_cl.detector.spectrum import Spectrum, tube_spectrum
 
 __all__ = [
-    "Spectrum", "average", "clustered_share", "counts_to_attenuation", "find_saturation", "frames_to_attenuation",
-    "intensity_average", "noise_behind", "noise_level", "noise_rms", "robust_deviation", "transmission_weights",
-    "tube_spectrum", "without_lag",
+    "Spectrum", "average", "counts_to_attenuation", "intensity_average", "noise_level", "noise_rms",
+    "robust_deviation", "transmission_weights", "tube_spectrum", "without_lag",
 ]

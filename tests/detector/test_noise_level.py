@@ -5,8 +5,9 @@ from itertools import product
 import numpy as np
 import pytest
 
-from phyradgs_cl.detector import find_saturation, noise_behind, noise_level, noise_rms, transmission_weights
+from phyradgs_cl.detector import noise_level, noise_rms, transmission_weights
 from phyradgs_cl.detector.effects import beer_lambert_noise
+from phyradgs_cl.detector.noise_level import find_saturation, noise_behind
 
 
 def smooth_frames(noise: float, seed: int = 0) -> np.ndarray:

@@ -8,7 +8,8 @@ import numpy as np
 
 from phyradgs_cl.acquisition import Saturation
 from phyradgs_cl.acquisition.scan import applied_facts
-from phyradgs_cl.detector import find_saturation, frames_to_attenuation
+from phyradgs_cl.detector.attenuation import frames_to_attenuation
+from phyradgs_cl.detector.noise_level import find_saturation
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.importers.options import ImportOptions, needed
 from phyradgs_cl.io.hdf5.datasets import LENGTH, Quantity, read_length, read_values

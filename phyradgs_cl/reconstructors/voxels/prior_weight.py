@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from phyradgs_cl.acquisition import Motion, Scan
-from phyradgs_cl.detector import noise_behind
+from phyradgs_cl.detector.noise_level import noise_behind
 from phyradgs_cl.reconstructors.voxels.system import System
 from phyradgs_cl.runtime import Space
 
