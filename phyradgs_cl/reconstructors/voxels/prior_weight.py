@@ -51,25 +51,15 @@ def _blur_mm(scan: Scan, motion: Motion) -> float:
     return float(turn_rad * max(scan.grid.size_mm[1:]) / 4)
 
 
-@dataclass(frozen=True)
-class AdjointResponse:
-    """Response of Aᵀ in the middle half of a volume, in mm.
-
-    noise_mm: the standard deviation for independent unit noise per ray. common_mm: the mean for a unit error common to all
-    rays."""
-
-    noise_mm: float
-    common_mm: float
-
-    @classmethod
-    def of(cls, system: System) -> "AdjointResponse":
-        """Measures the response by two applications of Aᵀ."""
-        noise = np.random.default_rng(0).standard_normal(system.measured.shape, np.float32)
-        by_noise = system.adjoint(system.masked(system.apply_weights(system.space.array(noise))))
-        by_ones = system.column_sums()
-        middle = tuple(slice(n // 4, n - n // 4) for n in system.volume_shape)
-        in_noise, in_ones = (system.space.numpy(volume)[middle] for volume in (by_noise, by_ones))
-        return cls(float(in_noise.std(dtype=np.float64)), float(in_ones.mean(dtype=np.float64)))
+def adjoint_response(system: System) -> tuple[float, float]:
+    """Returns the response of Aᵀ in the middle half of a volume, in mm: the standard deviation for independent unit noise
+    per ray, and the mean for a unit error common to all rays."""
+    noise = np.random.default_rng(0).standard_normal(system.measured.shape, np.float32)
+    by_noise = system.adjoint(system.masked(system.apply_weights(system.space.array(noise))))
+    by_ones = system.column_sums()
+    middle = tuple(slice(n // 4, n - n // 4) for n in system.volume_shape)
+    in_noise, in_ones = (system.space.numpy(volume)[middle] for volume in (by_noise, by_ones))
+    return float(in_noise.std(dtype=np.float64)), float(in_ones.mean(dtype=np.float64))
 
 
 class PriorWeight:
@@ -79,12 +69,12 @@ class PriorWeight:
         self.space, self.error, self.strength = system.space, error, strength
         gradient = system.adjoint(system.apply_weights(system.measured))
         self.least = _LEAST * system.space.largest(gradient, absolute=True)
-        self.response = AdjointResponse.of(system)
+        self.noise_mm, self.common_mm = adjoint_response(system)
 
     def at(self, volume: Any) -> float:
         """Returns the weight at a volume, in the unit of the gradient."""
-        by_noise = self.error.noise * self.response.noise_mm
-        by_edges = self.error.edges_mm * _density(self.space, volume) * self.response.common_mm
+        by_noise = self.error.noise * self.noise_mm
+        by_edges = self.error.edges_mm * _density(self.space, volume) * self.common_mm
         return max(self.strength * math.hypot(by_noise, by_edges), self.least)
 
 
