@@ -43,6 +43,7 @@ DETECTOR_MODELS = ("log", "intensity")
 APPLIED = ("flats_applied", "darks_applied")
 """Keys of the provenance for the numbers of flats and darks that were applied to the counts."""
 _OTHERS = ("detector_model", "pixel_mask", "reference", "title", "lag", "provenance")
+_TITLE = "cone-beam scan"
 OPAQUE, FEW = 50.0, 0.01  # largest line integral that a panel can measure; fraction of pixels that may be broken
 LARGEST_LAG = 0.9  # far beyond any panel; towards 1 a frame holds hardly any new information
 
@@ -82,7 +83,7 @@ class Scan:
     detector_model: str = "log"
     pixel_mask: np.ndarray | None = None
     reference: np.ndarray | None = None
-    title: str = "cone-beam scan"
+    title: str = _TITLE
     provenance: dict[str, object] = field(default_factory=dict)
     lag: float = 0.0
     saturation: Saturation | None = None
@@ -109,6 +110,8 @@ class Scan:
         object.__setattr__(self, "frame_start_s", checks.numbers("frame_start_s", self.frame_start_s, (frames,)))
         if not isinstance(self.title, str):
             raise InputError("title", checks.short_repr(self.title), "text")
+        if self.is_parallel and self.title == _TITLE:
+            object.__setattr__(self, "title", "parallel-beam scan")
         if self.detector_model not in DETECTOR_MODELS:
             raise InputError("detector_model", repr(self.detector_model), "'log' or 'intensity'")
         checks.within("lag", self.lag, 0, LARGEST_LAG)

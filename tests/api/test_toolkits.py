@@ -9,6 +9,7 @@ from phyradgs_cl.acquisition import CircularOrbit, PoseTable
 from phyradgs_cl.api import (
     ConeGeometry,
     Gaussians,
+    ParallelGeometry,
     Scan,
     load_scan,
     reconstruct,
@@ -142,6 +143,43 @@ def test_points_fall_where_astra_puts_them_and_the_vectors_come_back(rt, tmp_pat
     np.testing.assert_allclose(scan.astra_vectors(), vectors, atol=1e-9)
     save_scan(tmp_path / "s.h5", scan)
     np.testing.assert_allclose(load_scan(tmp_path / "s.h5").astra_vectors(), vectors, atol=1e-6)
+
+
+def test_points_fall_where_astra_s_parallel_rays_put_them_and_the_vectors_come_back(rt, tmp_path) -> None:
+    """``parallel3d_vec``: rays of any length that rise, and panels that lean and lie anywhere along them."""
+    vectors = astra_vectors()
+    vectors[:, :3] = [[-2 * np.cos(a), -2 * np.sin(a), 0.01 * i] for i, a in enumerate(ANGLES)]
+    scan = Scan.from_astra(FRAMES, vectors, is_parallel=True)
+    assert scan.is_parallel and isinstance(scan.geometry, ParallelGeometry) and isinstance(scan.trajectory, PoseTable)
+    expected = np.zeros((4, 4, 2))
+    for i, v in enumerate(vectors):
+        for k, point in enumerate(POINTS):  # point + t·ray = panel + a·u + b·v
+            a, b, _ = np.linalg.solve(np.stack([v[6:9], v[9:12], -v[:3]], 1), point - v[3:6])
+            expected[i, k] = b + (PANEL[0] - 1) / 2, a + (PANEL[1] - 1) / 2
+    assert np.abs(drawn_pixels(scan, rt) - expected).max() < PIXEL
+    vectors[:, :3] /= np.linalg.norm(vectors[:, :3], axis=1, keepdims=True)
+    np.testing.assert_allclose(scan.astra_vectors(), vectors, atol=1e-9)
+    save_scan(tmp_path / "s.h5", scan)
+    stored = load_scan(tmp_path / "s.h5")
+    np.testing.assert_allclose(stored.astra_vectors(), vectors, atol=1e-6)
+    assert stored.is_parallel
+
+
+def test_tigre_s_parallel_mode_is_astra_s_parallel_geometry(rt, tmp_path) -> None:
+    """On a circle, which files hold as angles; distances are not used, and COR moves the panel."""
+    geo = tigre(mode="parallel", DSO=None, DSD=None, COR=1.5)
+    scan = Scan.from_tigre(geo, ANGLES, FRAMES)
+    assert isinstance(scan.trajectory, CircularOrbit) and scan.title == "parallel-beam scan"
+    assert scan.geometry.detector_offset_mm == pytest.approx((5.0, -2.5))
+    v = POINTS[:, 2] - 5.0
+    for i, angle in enumerate(ANGLES):
+        u = np.cos(angle) * POINTS[:, 1] - np.sin(angle) * POINTS[:, 0] + 2.5
+        expected = np.stack([v / 4.0 + (PANEL[0] - 1) / 2, u / 3.5 + (PANEL[1] - 1) / 2], -1)
+        assert np.abs(drawn_pixels(scan, rt)[i] - expected).max() < PIXEL
+    back = Scan.from_astra(FRAMES, scan.astra_vectors(), scan.grid, is_parallel=True)
+    assert back.geometry.pixel_size_mm == pytest.approx((4.0, 3.5)) and isinstance(back.trajectory, CircularOrbit)
+    save_scan(tmp_path / "s.h5", back)
+    np.testing.assert_allclose(load_scan(tmp_path / "s.h5").astra_vectors(), scan.astra_vectors(), atol=1e-9)
 
 
 def test_rows_may_run_down(rt, scan) -> None:

@@ -1,0 +1,104 @@
+"""A parallel beam through the commands: from a simulated scan to its quality, and what is refused in one line."""
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+
+from phyradgs_cl.api import load_scan
+
+FLY = "--scanner parallel --phantom jaw --size 16 --detector 24 --views 20 --exposure-deg 12 --time-samples 4"
+
+
+@pytest.fixture(scope="module")
+def parallel(simulated) -> Path:
+    return simulated(*FLY.split())
+
+
+def test_from_a_simulated_scan_to_its_quality(cli, parallel, tmp_path, fast_pictures, capsys) -> None:
+    """Lines' own times help, most of all the default method."""
+    assert cli.run(["info", str(parallel)]) == 0
+    facts = capsys.readouterr().out
+    assert "parallel beam" in facts and "source to" not in facts and "(0.106667, 0.106667)" in facts
+    psnr_db = {}
+    for words in ("--method fbp", "--method fbp --motion per-row", "--motion static", ""):
+        volume = tmp_path / "volume.h5"
+        assert cli.run(["reconstruct", str(parallel), *words.split(), "-o", str(volume)]) == 0
+        capsys.readouterr()
+        assert cli.run(["evaluate", str(volume), "--reference", str(parallel), "--json"]) == 0
+        psnr_db[words] = json.loads(capsys.readouterr().out)["psnr_db"]
+    assert psnr_db["--method fbp"] > 26 and psnr_db["--method fbp --motion per-row"] > psnr_db["--method fbp"]
+    assert psnr_db[""] > 33.5 and psnr_db[""] > psnr_db["--motion static"] + 1
+
+
+@pytest.mark.parametrize("options", ["--phantom foot", "--phantom shepp-logan --noise beer", "--protocol static"])
+def test_noise_scanner_and_protocol_are_those_of_cones(cli, tmp_path, options) -> None:
+    toml, output = tmp_path / "mine.toml", tmp_path / "scan.h5"
+    toml.write_text(
+        '[source]\nbeam = "parallel"\n[detector]\nrows = 8\ncolumns = 10\npixel_size_v_mm = 0.02\npixel_size_u_mm = 0.03\n'
+        'offset_u_mm = 0.01\n[readout]\nfirst = "left"\nfps = 20\nreadout_ms = 30\n'
+    )
+    words = [*options.split(), "--scanner", str(toml), "--size", "8", "--views", "6", "--time-samples", "2"]
+    assert cli.run(["simulate", *words, "--peak", "2", "-o", str(output)]) == 0
+    scan = load_scan(output)
+    assert scan.is_parallel and scan.geometry.pixel_size_mm == (0.02, 0.03) and scan.geometry.detector_offset_mm == (0, 0.01)
+    assert scan.is_fly == ("static" not in options)
+    if scan.is_fly:
+        assert scan.shutter.first == "left" and np.allclose(np.diff(scan.frame_start_s), 1 / 20)
+    assert 1.5 < scan.projections.max() < 3 and scan.reference is not None
+
+
+def changed(path: Path, change: Callable[[h5py.Group], object]) -> Path:
+    with h5py.File(path, "r+") as file:
+        change(file["entry"])
+    return path
+
+
+def stated(file: h5py.Group, distance: float) -> None:
+    file["instrument/source/distance"] = distance
+
+
+def without_beam(file: h5py.Group) -> None:
+    del file["phyradgs/beam"]
+    stated(file, 0.0)
+
+
+def along_the_panel(file: h5py.Group) -> None:
+    pose = np.tile([0, 1.0, 0, 0, -1, -1, 0, 0.1, 0, 0, 0, 0.1], (2, 1))
+    file["phyradgs/poses/time_s"], file["phyradgs/poses/pose"] = [0.0, 100.0], pose
+
+
+# what the file has wrong, words of the line
+FILES: dict[str, tuple[Callable[[h5py.Group], object], str]] = {
+    "a source distance": (lambda file: stated(file, 5.0), "source/distance: found a distance; expected no source distance"),
+    "a distance of 0": (without_beam, "source/distance: found 0; expected a length other than 0"),
+    "neither": (lambda file: file.pop("phyradgs/beam"), "source/distance"),
+    "another beam": (lambda file: file["phyradgs/beam"].write_direct(np.array(b"fan", object)), "beam: found 'fan'"),
+    "rays along the panel": (along_the_panel, "rays that cross the panel"),
+}
+
+
+@pytest.mark.parametrize("case", FILES)
+def test_files_that_contradict_themselves_are_refused(refused, parallel, tmp_path, case) -> None:
+    change, words = FILES[case]
+    path = changed(Path(shutil.copy(parallel, tmp_path / "scan.h5")), change)
+    for command in (["info", path], ["reconstruct", path, "--method", "fbp", "-o", tmp_path / "volume.h5"]):
+        refused(command, words)
+    assert not (tmp_path / "volume.h5").exists()
+
+
+def test_each_beam_has_its_methods_and_numbers(refused, parallel, scan, tmp_path) -> None:
+    output = ["-o", tmp_path / "out.h5"]
+    refused(["reconstruct", parallel, "--method", "fdk", *output], "--method fdk: found a parallel beam", "--method fbp")
+    refused(["reconstruct", scan, "--method", "fbp", *output], "--method fbp: found a cone beam", "--method fdk")
+    refused(["calibrate", parallel, "--what", "source-distance", *output], "--what", "parallel beam")
+    refused(["prepare", parallel, "--steps", "phase", "--set", "phase.energy_kev=25", *output], "phase.")
+    toml = tmp_path / "mine.toml"
+    toml.write_text('[source]\nbeam = "parallel"\nto_axis_mm = 5\n[detector]\n')
+    refused(["simulate", "--scanner", toml, *output], "[source] to_axis_mm: found 5; expected no distance")
+    refused(["import", parallel, "--source-to-axis-mm", "5", *output], "a scan file of this package")
+    assert not (tmp_path / "out.h5").exists()
