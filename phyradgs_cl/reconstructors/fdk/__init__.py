@@ -17,6 +17,7 @@ import scipy
 
 from phyradgs_cl import checks
 from phyradgs_cl.acquisition import Motion, Scan, Static
+from phyradgs_cl.acquisition.altered.angles import azimuth_rad
 from phyradgs_cl.acquisition.motion import LINE_POSES, check_motion, motions_for
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
@@ -24,6 +25,7 @@ from phyradgs_cl.operators import backproject, backproject_lines
 from phyradgs_cl.prepare.step import unmasked_frames
 from phyradgs_cl.reconstructors.fdk import weights
 from phyradgs_cl.reconstructors.fdk.beyond_panel import WAYS, extrapolated, reprojected, whole_object
+from phyradgs_cl.reconstructors.fdk.deblur import deblurred
 from phyradgs_cl.reconstructors.fdk.views import (
     RayWeight,
     check_beam,
@@ -73,6 +75,18 @@ class FdkOptions:
         check_motion(self.motion, self.MOTIONS)
 
 
+@dataclass(frozen=True)
+class FbpOptions(FdkOptions):
+    """deblur: sharpen a fly-scan along the angle, with this power of noise over that of the signal, as 0.01; 0 does not. The
+    other options are those of FDK."""
+
+    deblur: float = 0.0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        checks.within("option deblur", self.deblur, 0, 1)
+
+
 def fdk(
     scan: Scan, options: FdkOptions, rt: Runtime, *, seed: int = 0, report: ProgressReport = ignore_progress
 ) -> Reconstruction:
@@ -84,7 +98,7 @@ def fdk(
 
 
 def fbp(
-    scan: Scan, options: FdkOptions, rt: Runtime, *, seed: int = 0, report: ProgressReport = ignore_progress
+    scan: Scan, options: FbpOptions, rt: Runtime, *, seed: int = 0, report: ProgressReport = ignore_progress
 ) -> Reconstruction:
     """Returns the filtered backprojection of a parallel beam in 1/mm: half turns, full turns, and full turns with the axis
     near the panel's edge. ``seed`` is part of the common signature and not used.
@@ -103,6 +117,9 @@ def _filtered_backprojection(
     lines = max(map(len, poses))
     pose = np.concatenate(poses) if lines == 1 else np.stack([np.broadcast_to(p, (lines, 12)) for p in poses])
     check_beam(method, pose, scan.is_parallel)
+    if isinstance(options, FbpOptions) and options.deblur > 0:
+        middles = np.stack([p[len(p) // 2] for p in poses])
+        frames = deblurred(scan, frames, azimuth_rad(middles), options.deblur)
     whole = partial(whole_object, scan, options.motion, rt, report)
     volume = fdk_volume(
         rt, frames, pose, scan.grid, window=options.window, axis=scan.shutter.axis,
@@ -113,7 +130,7 @@ def _filtered_backprojection(
 
 
 METHOD = Method(fdk, {window: FdkOptions(window) for window in WINDOWS}, is_resumable=False)
-FBP_METHOD = Method(fbp, {window: FdkOptions(window) for window in WINDOWS}, is_resumable=False)
+FBP_METHOD = Method(fbp, {window: FbpOptions(window) for window in WINDOWS}, is_resumable=False)
 
 
 def fdk_volume(
