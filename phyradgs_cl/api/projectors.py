@@ -47,9 +47,8 @@ def ray_operator(
 
     Raises InputError for anything but a Scan or a Grid, and for an unknown motion or one that moves within a cell."""
     model, voxels = _checked(scan, motion, motions_for(RAYS)), scan.grid if grid is None else _a_grid(grid)
-    rt = runtime_of(device)
     tables = [model.cells(scan, frame).still() for frame in range(scan.frames)]
-    return _rays(RayOperator(rt, voxels, scan.geometry.detector_shape, tables))
+    return _rays(RayOperator(runtime_of(device), voxels, scan.geometry.detector_shape, tables))
 
 
 def _rays(engine: RayOperator) -> LinearOperator:

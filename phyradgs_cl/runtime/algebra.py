@@ -81,8 +81,7 @@ class HostSpace:
         return np.full(shape, value, np.float32)
 
     def apply(self, function: Callable[..., Any], x: np.ndarray, shape: Shape) -> np.ndarray:
-        result: np.ndarray = function(x)
-        return result
+        return function(x)
 
     def take(self, x: np.ndarray, chosen: Sequence[int]) -> np.ndarray:
         return x[list(chosen)]
@@ -94,8 +93,7 @@ class HostSpace:
         return np.maximum(result, 0, out=result) if nonnegative else result
 
     def extrapolate(self, x: np.ndarray, y: np.ndarray, scale: float) -> np.ndarray:
-        result: np.ndarray = x + np.float32(scale) * (x - y)
-        return result
+        return x + np.float32(scale) * (x - y)
 
     def add_product(
         self, x: np.ndarray, y: np.ndarray, z: np.ndarray, scale: float = 1.0, *, nonnegative: bool = False
@@ -157,8 +155,7 @@ class DeviceSpace:
         return array
 
     def apply(self, function: Callable[..., Any], x: DeviceArray, shape: Shape) -> DeviceArray:
-        result: DeviceArray = function(x, out=self.empty(shape))
-        return result
+        return function(x, out=self.empty(shape))
 
     def take(self, x: DeviceArray, chosen: Sequence[int]) -> DeviceArray:
         result = self.empty((len(chosen), *x.shape[1:]))
@@ -184,8 +181,7 @@ class DeviceSpace:
         return self._each("multiply", x, y, period=y.size)
 
     def reciprocal(self, x: DeviceArray, share: float) -> DeviceArray:
-        least = share * max(self.largest(x), 0.0) or 1.0
-        return self._each("reciprocal", x, np.float32(least))
+        return self._each("reciprocal", x, np.float32(share * max(self.largest(x), 0.0) or 1.0))
 
     def descend(self, x: DeviceArray, y: DeviceArray, step: float) -> DeviceArray:
         """x − ``step`` y/‖y‖, and x where y is 0; no number comes back."""

@@ -88,9 +88,8 @@ def choose_device(wish: str | None = None, turn: int = 0) -> tuple[DeviceInfo, s
     if not eligible:
         found = f"only {', '.join(d.name for d in devices)}"
         raise DeviceError("OpenCL", found, "a real device", "name one with --device to use it")
-    best = max(eligible, key=lambda d: d.rank)
     reason = f"best of {len(eligible)} by capability (GPU before CPU, then memory, vector width, units)"
-    return _next_of_name(best, devices, turn), reason
+    return _next_of_name(max(eligible, key=lambda d: d.rank), devices, turn), reason
 
 
 def _next_of_name(first: DeviceInfo, devices: list[DeviceInfo], turn: int) -> DeviceInfo:

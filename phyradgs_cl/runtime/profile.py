@@ -70,31 +70,20 @@ def profile_text(uses: dict[str, KernelUse], wall_s: float, rates: Rates, pairs:
     for name, use in uses.items():
         speed = use.bytes / use.seconds if use.seconds > 0 else 0.0
         evaluated = pairs.get(name, 0) * use.launches
-        rows.append(
-            (
-                name,
-                str(use.launches),
-                f"{use.seconds:.3f}",
-                f"{use.seconds / max(busy_s, 1e-12):.1%}",
-                f"{1e3 * use.seconds / use.launches:.3f}",
-                f"{speed / 1e9:.1f}",
-                f"{speed / rates.copy_bytes_per_s:.0%}",
-                f"{evaluated / use.seconds / 1e9:.2f}" if evaluated else "",
-                f"{1e9 * use.seconds / evaluated:.3f}" if evaluated else "",
-            )
-        )
-    widths = [max(len(row[k]) for row in rows) for k in range(len(heads))]
-    lines = [
-        "  ".join(
-            [row[0].ljust(widths[0]), *(cell.rjust(w) for cell, w in zip(row[1:], widths[1:], strict=True))]
-        )
-        for row in rows
-    ]
+        share, each_ms = use.seconds / max(busy_s, 1e-12), 1e3 * use.seconds / use.launches
+        times = str(use.launches), f"{use.seconds:.3f}", f"{share:.1%}", f"{each_ms:.3f}"
+        speeds = f"{speed / 1e9:.1f}", f"{speed / rates.copy_bytes_per_s:.0%}"
+        of_pairs = ("", "")
+        if evaluated:
+            of_pairs = f"{evaluated / use.seconds / 1e9:.2f}", f"{1e9 * use.seconds / evaluated:.3f}"
+        rows.append((name, *times, *speeds, *of_pairs))
+    first, *others = (max(map(len, column)) for column in zip(*rows, strict=True))
+    lines = ["  ".join([row[0].ljust(first), *map(str.rjust, row[1:], others)]).rstrip() for row in rows]
     lines.append(
         f"kernels {busy_s:.2f} s of {wall_s:.2f} s ({busy_s / max(wall_s, 1e-12):.0%}); best measured here: "
         f"copy {rates.copy_bytes_per_s / 1e9:.1f} GB/s, multiply-add {rates.flops_per_s / 1e9:.0f} Gflop/s"
     )
-    return "\n".join(line.rstrip() for line in lines)
+    return "\n".join(lines)
 
 
 def measure_rates(

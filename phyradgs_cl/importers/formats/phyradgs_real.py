@@ -151,8 +151,7 @@ def _timing(subject: str, detector: Circle, options: ImportOptions) -> Timing:
     shutter = Shutter(exposure_s, ratio * exposure_s)
     start_s = synthetic.start_times_s(np.unwrap(first), np.unwrap(first) + closed - first, exposure_s)
     least_s = shutter.span_s * (1 + _GAP)
-    steps_s = np.maximum(np.diff(start_s), least_s)
-    return Timing(shutter, np.concatenate([[0.0], np.cumsum(steps_s)]), True)
+    return Timing(shutter, np.concatenate([[0.0], np.cumsum(np.maximum(np.diff(start_s), least_s))]), True)
 
 
 def _all_poses(

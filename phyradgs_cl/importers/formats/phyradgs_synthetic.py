@@ -43,11 +43,10 @@ def timing_of_marks(subject: Fields, marks_rad: np.ndarray, options: ImportOptio
     axis = options.readout_axis or "columns"
     convention = 1 if axis == "columns" else -1
     direction = convention if options.readout_direction is None else options.readout_direction
-    shutter = Shutter(exposure_s, ratio * exposure_s, axis, direction)
     unstated = {"exposure": options.exposure_s, "axis": options.readout_axis, "first": options.readout_direction}
     assumed = tuple(name for name, value in unstated.items() if value is None)
     start_s = start_times_s(marks_rad[:, 0], marks_rad[:, 1], exposure_s)
-    return Timing(shutter, start_s, True, assumed=assumed)
+    return Timing(Shutter(exposure_s, ratio * exposure_s, axis, direction), start_s, True, assumed=assumed)
 
 
 def exposure_of_blurred_s(options: ImportOptions) -> float:

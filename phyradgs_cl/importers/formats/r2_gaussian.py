@@ -71,8 +71,7 @@ class R2Folder:
         if not self.meta.has("vol"):
             return grid, None
         path = self.folder.file(self.meta.word("vol"), self.meta.name("vol"))
-        volume = read_npy(path, 3)
-        return grid, turned_volume(str(path), volume, grid, 1 / self.unit_mm)
+        return grid, turned_volume(str(path), read_npy(path, 3), grid, 1 / self.unit_mm)
 
     def scan(
         self, path: Path, entries: list[Fields], orbit: CircularOrbit, timing: Timing, options: ImportOptions

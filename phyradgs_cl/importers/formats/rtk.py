@@ -70,9 +70,8 @@ def import_scan(path: Path, options: ImportOptions) -> Scan:
     trajectory, geometry, turn = _trajectory(rtk, stack, timing, str(description))
     convention = "attenuation" if stack.frames.dtype.kind == "f" and options.flat_value is None else None
     integrals = line_integrals(str(stack_path), turn.frames(stack.frames), options, convention=convention)
-    title = description.stem
     parts = integrals, trajectory, geometry, timing, options
-    return assemble.assemble_scan(*parts, title=title, source=str(path))
+    return assemble.assemble_scan(*parts, title=description.stem, source=str(path))
 
 
 def _read_stack(path: Path) -> _Stack:

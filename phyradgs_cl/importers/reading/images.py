@@ -58,8 +58,7 @@ def read_image_volume(path: Path) -> Volume:
     sitk = checks.package("SimpleITK", "the package that reads this file", "phyradgs-cl[formats]")
     header = _text_header(path)[0] if _suffix(path) == ".nrrd" else {}
     if header and not {"space directions", "spacings"} & set(header):
-        values = sitk.GetArrayFromImage(image)
-        return Volume(finite_float32(subject, shares_of_maximum(values)), None)
+        return Volume(finite_float32(subject, shares_of_maximum(sitk.GetArrayFromImage(image))), None)
     unit_mm = _nrrd_unit_mm(subject, header)
     image = sitk.DICOMOrient(image, "LPS")
     if not np.allclose(np.reshape(image.GetDirection(), (3, 3)), np.eye(3), rtol=0, atol=_OBLIQUE):

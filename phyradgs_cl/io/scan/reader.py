@@ -158,8 +158,7 @@ def _read_frames(
                 found = (
                     f"NaN or infinity in frame {frame} at ({row}, {column}), {int(bad.sum())} in this frame"
                 )
-                remedy = "set them, or mark them in pixel_mask"
-                raise source.error(address, found, "finite values", remedy)
+                raise source.error(address, found, "finite values", "set them, or mark them in pixel_mask")
     return data
 
 
