@@ -14,8 +14,8 @@ from phyradgs_cl.errors import InputError
 from phyradgs_cl.progress import Ticker
 from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.settings import device_wish, read_config
-from phyradgs_cl.workflow.quick import ITERATIONS, PIXELS, VOXELS, quick_grid
 from phyradgs_cl.workflow.sweep import RESULTS, SweepJob, SweepProgress, read_grid, run_sweep
+from phyradgs_cl.workflow.sweep.grid import ITERATIONS, PIXELS, VOXELS, quick_grid
 
 _REPEAT = "The command makes only the runs that its results file lacks: interrupt and repeat it at will."
 EXAMPLES = {

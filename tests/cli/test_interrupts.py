@@ -237,7 +237,7 @@ def test_a_signal_in_the_last_iteration_is_not_lost(scan, tmp_path):
 
 def test_a_benchmark_ends_with_its_own_line(tmp_path):
     body = """
-        import phyradgs_cl.workflow.quick as r
+        import phyradgs_cl.workflow.sweep.grid as r
         r.run_simulation = lambda *_, **__: signal.raise_signal(signal.SIGTERM)
     """
     done = run_process(["bench", "quick", "-o", str(tmp_path)], body)

@@ -46,8 +46,8 @@ def write_foreign(path: Path) -> None:
 def test_every_command_does_its_work(cli, tmp_path, monkeypatch, capsys) -> None:
     windows = []
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("phyradgs_cl.workflow.quick.VOXELS", 8)
-    monkeypatch.setattr("phyradgs_cl.workflow.quick.PIXELS", 12)
+    monkeypatch.setattr("phyradgs_cl.workflow.sweep.grid.VOXELS", 8)
+    monkeypatch.setattr("phyradgs_cl.workflow.sweep.grid.PIXELS", 12)
     monkeypatch.setattr("phyradgs_cl.commands.report.view_volume", windows.append)
     write_foreign(tmp_path / "foreign.h5")
     (tmp_path / "grid.toml").write_text(GRID)

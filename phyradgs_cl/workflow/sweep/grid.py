@@ -1,9 +1,10 @@
-"""The file of a sweep: scans by pattern, settings by product and one by one, seeds. It is checked before any run."""
+"""The file of a sweep: scans by pattern, settings by product and one by one, seeds, all checked before any run. Also a first
+comparison of methods, over fly-scans of two built-in phantoms, in a minute or two."""
 
 import itertools
 import math
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,11 +13,14 @@ from phyradgs_cl import checks
 from phyradgs_cl import reconstructors as methods
 from phyradgs_cl.errors import InputError, PhyradgsError
 from phyradgs_cl.io.hdf5.source import open_hdf5
+from phyradgs_cl.io.output import make_folder
 from phyradgs_cl.io.scan.header import read_header
 from phyradgs_cl.io.tables import refuse_unknown
-from phyradgs_cl.runtime import MEMORY_VARIABLE
+from phyradgs_cl.runtime import MEMORY_VARIABLE, Runtime
+from phyradgs_cl.simulation import scanner_for, scanner_options
 from phyradgs_cl.text import plain_text
 from phyradgs_cl.workflow.files import expecting
+from phyradgs_cl.workflow.scans import SimulationJob, run_simulation
 
 MOST_RUNS = 100_000
 _LARGEST_SEED = 2**63
@@ -27,6 +31,17 @@ _ELSEWHERE = {
     "memory": f"say it as {MEMORY_VARIABLE} in the environment of the workers",
 }
 Table = Mapping[str, Any]
+PHANTOMS, VOXELS, PIXELS, ITERATIONS = ("foot", "jaw"), 32, 64, 600
+_ROWS: tuple[tuple[str, Table], ...] = (
+    ("fdk", {"motion": "static"}),
+    ("fista-tv", {"motion": "per-row"}),
+    ("fista", {"motion": "static"}),
+    ("fista", {"motion": "per-row"}),
+    ("r2", {"motion": "static"}),
+    ("phyradgs", {"motion": "static"}),
+    ("phyradgs", {"motion": "micro-views", "strips": 8, "sub_intervals": 5}),
+    ("phyradgs", {"motion": "exact"}),
+)
 
 
 @dataclass(frozen=True)
@@ -207,3 +222,26 @@ def _checked(values: dict[str, Any]) -> Setting:
     nested = _nested(changes)
     methods.plan_run(method, {**nested, **before}, preset=preset)
     return Setting(method, methods.usual_preset(method) if preset is None else preset, nested, before)
+
+
+def quick_grid(
+    folder: Path, make_runtime: Callable[[], Runtime], *, seed: int = 0, iterations: int = ITERATIONS
+) -> SweepGrid:
+    """Simulates the missing scans in ``folder``/scans; returns a sweep of every method, with and without motion, over them.
+    seed: of noise, cloud and frame order. iterations: of splats. Raises OutputError for a folder that cannot be made."""
+    checks.within("--iterations", iterations, 0, 10_000_000)
+    settings = []
+    for method, motion in _ROWS:
+        splats = {"iterations": iterations} if method in ("r2", "phyradgs") else {}
+        settings.append(Setting(method, methods.usual_preset(method), {**motion, **splats}, {}))
+    scans = {name: folder / "scans" / f"{name}_seed{seed}.h5" for name in PHANTOMS}
+    missing = [name for name, path in scans.items() if not path.exists()]
+    if missing:
+        make_folder(folder / "scans", folder)
+        rt = make_runtime()
+        for name in missing:
+            scanner = scanner_for("r2", PIXELS)
+            options = scanner_options(scanner, "rapid", noise="tigre", seed=seed)
+            job = SimulationJob(scans[name], phantom=name, size=VOXELS)
+            run_simulation(job, scanner, options, rt, lambda done, total: None)
+    return SweepGrid(tuple(scans.values()), tuple(settings), (seed,))
