@@ -1,8 +1,7 @@
 """Compares every kernel on a device with float64 on the host, on small problems.
 
 Gradients are compared with central differences of the twins. Limits are several times the rounding of float32 on a
-conforming device, and far below the error of a wrong kernel.
-"""
+conforming device, and far below the error of a wrong kernel."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, replace

@@ -1,8 +1,7 @@
 """Parameters of single views (a wobble), or of an object that moves slowly (a motion), by splines of time.
 
 A view's parameters change its own frame only, so their signals are images of that frame. CGLS solves the normal equations of
-a Gauss–Newton step for the volume and all parameters together, so that parameters explain only what the volume cannot.
-"""
+a Gauss–Newton step for the volume and all parameters together, so that parameters explain only what the volume cannot."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence

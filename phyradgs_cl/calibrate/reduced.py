@@ -3,8 +3,7 @@
 Variable projection (Golub and Pereyra, SIAM J. Numer. Anal. 10 (1973) 413) in Kaufman's form: with A the operator at the
 parameters θ, x the volume and P the projector onto A's range, the Jacobian is J = (I − P) ∂A/∂θ x. Each parameter's signal
 ∂A/∂θ x is a central difference. CGLS removes from it the part that some volume explains. The remaining signals and the
-remaining residual give the step, its standard deviations, and the parameters that the frames determine at all.
-"""
+remaining residual give the step, its standard deviations, and the parameters that the frames determine at all."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace

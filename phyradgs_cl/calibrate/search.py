@@ -1,8 +1,7 @@
 """The search for the parameters that all views share: Gauss–Newton steps from coarse to fine grids.
 
 On each grid a volume is reconstructed, the signals that a volume explains are removed (``reduced``), and the
-parameters step, until the steps are small. On the first grid each step decides which parameters the frames determine.
-"""
+parameters step, until the steps are small. On the first grid each step decides which parameters the frames determine."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field

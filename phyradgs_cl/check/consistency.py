@@ -3,8 +3,7 @@
 A coarse reconstruction of consistent frames leaves a far smaller residual than one of the same frames in a random order.
 Where it does not, or where another hypothesis leaves at most half the squared residual, something stated is wrong. The
 steps: remove odd frames; choose the sense of rotation and the panel's shift (``orbit.py`` reports them); remove outliers;
-compare with random orders; try hypotheses.
-"""
+compare with random orders; try hypotheses."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace

@@ -8,8 +8,7 @@ of them are separate functions: counts = Poisson(expected) + N(0, electronic_noi
 - Beer-Lambert: expected = dose · exp(−p), the physics.
 
 Lag is one exponential from frame to frame: y_f = (1 − λ) x_f + λ y_(f−1), with y = 0 before the first frame. For its
-effect on reconstructions see Tilley et al., arXiv:1805.11631.
-"""
+effect on reconstructions see Tilley et al., arXiv:1805.11631."""
 
 from dataclasses import replace
 

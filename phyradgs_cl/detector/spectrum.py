@@ -2,8 +2,7 @@
 
 The spectrum follows Kramers' law (Phil. Mag. 46 (1923) 836), or SpekPy's tungsten anode (Poludniowski et al., Med. Phys. 48
 (2021) 3630), behind aluminium. Attenuation is interpolated in the logarithms of NIST's tables (Hubbell and Seltzer, NISTIR
-5632). Both materials attenuate as stated in the thinnest layer; thicker layers attenuate less per length.
-"""
+5632). Both materials attenuate as stated in the thinnest layer; thicker layers attenuate less per length."""
 
 from dataclasses import dataclass
 

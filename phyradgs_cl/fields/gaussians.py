@@ -1,7 +1,6 @@
 """Radiative Gaussians: parameters with units, and the unconstrained ("raw") numbers that are optimised.
 
-Field of one Gaussian: ρ exp(−½ (x−μ)ᵀ Σ⁻¹ (x−μ)), Σ = R diag(s²) Rᵀ (paper, section 2).
-"""
+Field of one Gaussian: ρ exp(−½ (x−μ)ᵀ Σ⁻¹ (x−μ)), Σ = R diag(s²) Rᵀ (paper, section 2)."""
 
 from dataclasses import dataclass
 

@@ -2,8 +2,7 @@
 
 SSIM (Z. Wang et al., IEEE Trans. Image Process. 13(4), 600-612, 2004) is taken in 2D with an 11×11 Gaussian window of sigma
 1.5 and zeros beyond the border. It is averaged over the slices of each axis whose truth is not empty, then over the axes, as
-in the published tables of radiative Gaussian splatting.
-"""
+in the published tables of radiative Gaussian splatting."""
 
 import math
 from collections.abc import Iterator, Mapping

@@ -1,7 +1,6 @@
 """Attenuation as a neural field: hash encoding, networks, rays over an exposure, training. The only room built on PyTorch.
 
-PyTorch is an optional package: this module and ``options`` load without it, the others need it.
-"""
+PyTorch is an optional package: this module and ``options`` load without it, the others need it."""
 
 import importlib.util
 

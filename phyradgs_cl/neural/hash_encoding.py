@@ -1,7 +1,6 @@
 """Multi-resolution hash encoding of positions.
 
-Müller, Evans, Schied, Keller, ACM Trans. Graph. 41 (2022) 102; in NAF (Zha, Zhang, Li, MICCAI 2022) in three dimensions.
-"""
+Müller, Evans, Schied, Keller, ACM Trans. Graph. 41 (2022) 102; in NAF (Zha, Zhang, Li, MICCAI 2022) in three dimensions."""
 
 from typing import Any
 

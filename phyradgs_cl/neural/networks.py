@@ -1,8 +1,7 @@
 """The networks from a position's features to its attenuation: NAF's, and SAX-NeRF's with attention along line segments.
 
 Zha, Zhang, Li, "NAF: Neural Attenuation Fields for Sparse-View CBCT Reconstruction", MICCAI 2022. Cai, Wang, Yuille, Zhou,
-Wang, "Structure-Aware Sparse-View X-ray 3D Reconstruction", CVPR 2024.
-"""
+Wang, "Structure-Aware Sparse-View X-ray 3D Reconstruction", CVPR 2024."""
 
 import math
 

@@ -1,7 +1,6 @@
 """The rays of a step: which pixels and times it takes, their rays over the exposure, and a field's integrals along them.
 
-Scattered pixels and windows: the masked local–global sampling of SAX-NeRF (Cai et al., CVPR 2024).
-"""
+Scattered pixels and windows: the masked local–global sampling of SAX-NeRF (Cai et al., CVPR 2024)."""
 
 import math
 from collections.abc import Callable

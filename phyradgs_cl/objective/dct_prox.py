@@ -5,8 +5,7 @@ Soft threshold of an overcomplete transform: B_sᵀ T(B_s v), averaged over the 
 not shrunk. Near faces the average is over the blocks inside the volume.
 
 A map takes a quarter of the shifts, the next map the next quarter: over iterations the average is the same (cycle spinning;
-Kamilov, Bostan and Unser, IEEE Signal Process. Lett. 21 (2014) 1326).
-"""
+Kamilov, Bostan and Unser, IEEE Signal Process. Lett. 21 (2014) 1326)."""
 
 import itertools
 from collections.abc import Sequence

@@ -4,8 +4,7 @@ A gradient step of the quadratic nonlocal functional ½ Σ w_ij (x_i − x_j)² 
 Multiscale Model. Simul. 6 (2007) 595). w_ij = l_ij min(1/S_i, 1/S_j), S_i = Σ_j l_ij, with the likeness l_ij = exp(−d_ij/h²)
 of nonlocal means (Buades, Coll and Morel, Multiscale Model. Simul. 4 (2005) 490), d_ij the mean square between 3³ patches
 about i and j of a guide, which is continued by its outermost voxels. The weights are symmetric and no row of them sums to
-more than 1: a step of at most 1 gives weighted means, one of at most ½ is the proximal map of a convex function.
-"""
+more than 1: a step of at most 1 gives weighted means, one of at most ½ is the proximal map of a convex function."""
 
 import itertools
 

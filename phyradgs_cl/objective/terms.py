@@ -6,8 +6,7 @@ SSIM is that of Wang et al. 2004 (IEEE Trans. Image Process. 13, 600): 11-tap Ga
 C1 = 0.01², C2 = 0.03².
 
 Total variation is anisotropic, as in R2-Gaussian: the mean absolute difference between neighbouring voxels along z, y and
-x, added up.
-"""
+x, added up."""
 
 import math
 from dataclasses import dataclass

@@ -5,8 +5,7 @@ and Teboulle, IEEE Trans. Image Process. 18 (2009) 2419). Axis weights scale the
 
 ``TvDescent`` takes steps of a fixed length, as ASD-POCS does (Sidky and Pan, Phys. Med. Biol. 53 (2008) 4777). Backward
 differences and their floor are those of TIGRE. With a prior image i it descends (1 − share) TV(x) + share TV(x − i) (Chen,
-Tang and Leng, Med. Phys. 35 (2008) 660).
-"""
+Tang and Leng, Med. Phys. 35 (2008) 660)."""
 
 from collections.abc import Callable
 from functools import partial

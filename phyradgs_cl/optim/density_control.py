@@ -1,8 +1,7 @@
 """Adaptive density control: clone and split Gaussians with a large image gradient, prune faint and thin ones.
 
 After Kerbl et al. 2023 in R2-Gaussian's radiative form: the statistic is the mean norm of the gradient by the
-projected centre in normalised detector units; both halves of a clone or split keep half the density.
-"""
+projected centre in normalised detector units; both halves of a clone or split keep half the density."""
 
 from dataclasses import dataclass
 

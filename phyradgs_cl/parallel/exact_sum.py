@@ -2,8 +2,7 @@
 
 Every row is scaled by a power of two and rounded to integers of 64 bits, with the largest scale for which the sum cannot
 overflow. Adding integers is exact and associative. For 64 terms the parts of a float32 below 2⁻³⁷ of its row's largest
-are rounded off.
-"""
+are rounded off."""
 
 from collections.abc import Sequence
 

@@ -1,7 +1,6 @@
 """The processes (ranks) that work on the same scan: their launch, communication, shares of work; failing together.
 
-mpi4py is imported only where several processes were launched.
-"""
+mpi4py is imported only where several processes were launched."""
 
 import os
 import time

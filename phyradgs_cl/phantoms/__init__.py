@@ -2,8 +2,7 @@
 
 All have ``name``, ``kind`` and ``voxelise(grid)``. An "analytic" phantom also has ``line_integrals(source, target)`` in
 closed form, a "voxel" one ``volume`` and ``grid``. Attenuation scales with 1 / half-size, so that line integrals do not
-depend on the size.
-"""
+depend on the size."""
 
 from collections.abc import Callable
 from dataclasses import dataclass

@@ -2,8 +2,7 @@
 
 Shepp-Logan: A. C. Kak and M. Slaney, Principles of Computerized Tomographic Imaging, IEEE Press 1988, table 3.2 with the
 authors' errata, as in TIGRE and RTK. "kak-slaney" has the table's own contrasts (details of 1-2 %), "toft" tens of per
-cent, after P. Toft's PhD thesis, DTU 1996, in the values of H. Yu, Y. Ye and G. Wang (Proc. SPIE 5535, 550-557, 2004).
-"""
+cent, after P. Toft's PhD thesis, DTU 1996, in the values of H. Yu, Y. Ye and G. Wang (Proc. SPIE 5535, 550-557, 2004)."""
 
 import numpy as np
 

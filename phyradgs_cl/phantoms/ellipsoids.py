@@ -1,8 +1,7 @@
 """Phantoms of additive ellipsoids and cylinders, with line integrals in closed form.
 
 An affine map takes an ellipsoid to the unit ball and a ray to a ray, so the chord follows from the ray's distance to the
-centre (Kak and Slaney, Principles of Computerized Tomographic Imaging, IEEE Press 1988, section 3.1).
-"""
+centre (Kak and Slaney, Principles of Computerized Tomographic Imaging, IEEE Press 1988, section 3.1)."""
 
 from dataclasses import dataclass
 from typing import ClassVar

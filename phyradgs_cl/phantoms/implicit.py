@@ -1,8 +1,7 @@
 """Implicit bodies for procedural phantoms: signed distances, smooth unions, band-limited texture.
 
 They are functions of position in the cube [-1, 1]^3, averaged over voxels, so that every resolution samples the same object.
-Distances are positive outside. Points run (x, y, z), arrays (z, y, x), float32.
-"""
+Distances are positive outside. Points run (x, y, z), arrays (z, y, x), float32."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,8 +1,7 @@
 """A foot-like voxel phantom: tarsals, metatarsals and phalanges in soft tissue, drawn from scratch.
 
 Tapered capsules with a cortical shell and a trabecular inside. Toes point to +z, the big one to -x, the sole to -y.
-Lengths are in units of half the cube's side.
-"""
+Lengths are in units of half the cube's side."""
 
 from itertools import pairwise
 

@@ -1,8 +1,7 @@
 """A jaw-like voxel phantom: a mandible with its rami and a row of teeth in soft tissue, drawn from scratch.
 
 The body is an elliptic section swept along a horizontal arc; rami and roots are tapered capsules, crowns small
-ellipsoids with an enamel cap. The chin points to -y, the teeth to +z. Lengths are in units of half the cube's side.
-"""
+ellipsoids with an enamel cap. The chin points to -y, the teeth to +z. Lengths are in units of half the cube's side."""
 
 from dataclasses import dataclass
 from itertools import pairwise

@@ -2,8 +2,7 @@
 
 Sparks (zingers) come from X-rays, cosmic rays or noise. As with cosmic rays on astronomers' panels, a feature that is
 sharper than the optics allow in every direction is no object: van Dokkum, Publ. Astron. Soc. Pac. 113 (2001) 1420.
-Dead pixels never change, or differ from their neighbours in nearly every frame.
-"""
+Dead pixels never change, or differ from their neighbours in nearly every frame."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass

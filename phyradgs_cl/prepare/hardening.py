@@ -4,8 +4,7 @@ Polynomial: the user measured it with a wedge. Tube voltage: bone in the scan's 
 gives the soft tissue that remains (Joseph and Spital, J. Comput. Assist. Tomogr. 2 (1978) 100); this is repeated with the
 better volume. The user states the attenuation from which a voxel is bone, or candidates are tried: the frames that their own
 reprojection explains best win, uncorrected frames and a correction for water alone included. One material: line integrals
-against the path through the segmented volume give the polynomial (Krumm, Kasperl and Franz, NDT & E Int. 41 (2008) 242).
-"""
+against the path through the segmented volume give the polynomial (Krumm, Kasperl and Franz, NDT & E Int. 41 (2008) 242)."""
 
 import logging
 from collections.abc import Callable

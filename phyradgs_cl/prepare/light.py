@@ -3,8 +3,7 @@
 Flats are interpolated in time or combined. time: linearly between the means of flats that were taken together, in the order
 of the stored frames. pca: each frame takes the combination of their principal components that leaves the least total
 variation, in logarithms (Van Nieuwenhove et al., Opt. Express 23 (2015) 27975). The amount of light in each frame comes from
-the step ``air``: pixels beside the object, as in nabu and in algotom's ROI normalisation.
-"""
+the step ``air``: pixels beside the object, as in nabu and in algotom's ROI normalisation."""
 
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace

@@ -6,8 +6,7 @@ refractive index 1 − δ + iβ, thickness T) the transport-of-intensity equatio
 (1 − d δ/μ ∇²) exp(−μT), with μ = 4πβ/λ. Its inverse is a division by 1 + π λ d (δ/β) f² at the frequency f, in 1/mm.
 
 The filter is linear in the intensity, so it may follow the average over an exposure that a panel records. Rows that a
-rolling shutter reads later see the object turned further; the filter ignores that within its reach of some pixels.
-"""
+rolling shutter reads later see the object turned further; the filter ignores that within its reach of some pixels."""
 
 import math
 from dataclasses import dataclass, replace

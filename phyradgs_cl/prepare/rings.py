@@ -5,8 +5,7 @@ difference between a column and its mirror image is therefore an error of the pa
 sets of views tells whether there are rings and how strong they are; without rings the frames stay unchanged.
 ``mean`` takes the pattern from the mean over views: it denoises the mean in overlapping blocks of cosines with the measured
 strength, and coefficients above the noise belong to the object. ``fitted`` also adds the mean residual of a reconstruction
-with a weak total-variation prior (after Paleo and Mirone, J. Synchrotron Radiat. 22 (2015) 1268).
-"""
+with a weak total-variation prior (after Paleo and Mirone, J. Synchrotron Radiat. 22 (2015) 1268)."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace

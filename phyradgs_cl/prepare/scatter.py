@@ -4,8 +4,7 @@ Ohnesorge, Flohr and Klingenbeck-Regn, Eur. Radiol. 9 (1999) 563. The square let
 ones, for which Sun and Star-Lack (Phys. Med. Biol. 55 (2010) 6695) take several kernels. The user states the ratio of
 scatter to primary light and the width, or they are fitted: a non-negative sum of Gaussians explains the light beside the
 object beyond that of the flats, while each frame's light may vary. Such a fit may underestimate scatter behind the object.
-The kernel is therefore raised as long as the corrected frames explain themselves equally well.
-"""
+The kernel is therefore raised as long as the corrected frames explain themselves equally well."""
 
 import itertools
 from collections.abc import Mapping

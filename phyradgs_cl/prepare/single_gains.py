@@ -1,8 +1,7 @@
 """Single columns and pixels with a wrong gain: outliers of the mean over views on one side of the axis only.
 
 The mean over a full turn is symmetric about the axis for every object, on an arc for a round one. A wrong gain therefore
-shows as a deviation that neither its neighbours nor their mirror images have, in two independent sets of views.
-"""
+shows as a deviation that neither its neighbours nor their mirror images have, in two independent sets of views."""
 
 from dataclasses import dataclass
 

@@ -1,8 +1,7 @@
 """The weighted mean of a voxel and a splat reconstruction of one scan, which is nearer to the truth than either.
 
 Two estimates with equal errors that correlate by ρ have a mean that is 10 log10(2/(1 + ρ)) dB better. ``fista`` runs first;
-Gaussians then start from its volume. Half the difference of the two volumes maps their disagreement.
-"""
+Gaussians then start from its volume. Half the difference of the two volumes maps their disagreement."""
 
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar

@@ -1,7 +1,6 @@
 """The loop of every iterative method: progress, convergence record, Ctrl-C, stopping, resuming.
 
-A method is a class with the attributes of ``Stepwise``. ``Loop`` runs it, in one process or in ranks that do the same.
-"""
+A method is a class with the attributes of ``Stepwise``. ``Loop`` runs it, in one process or in ranks that do the same."""
 
 import time
 from collections.abc import Mapping

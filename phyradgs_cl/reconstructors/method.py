@@ -2,8 +2,7 @@
 
 A user's function needs only ``(scan, options, rt)``. If ``options`` is annotated with a dataclass, its fields are the
 options of ``--set`` and ``reconstruct``. The function returns a ``Reconstruction``, or a volume (nz, ny, nx) in 1/mm on the
-scan's grid.
-"""
+scan's grid."""
 
 import importlib
 import inspect

@@ -2,8 +2,7 @@
 
 NAF: R. Zha, Y. Zhang, H. Li, "NAF: Neural Attenuation Fields for Sparse-View CBCT Reconstruction", MICCAI 2022: a hash
 encoding and a small network. SAX-NeRF: Y. Cai, J. Wang, A. Yuille, Z. Zhou, A. Wang, "Structure-Aware Sparse-View X-ray 3D
-Reconstruction", CVPR 2024: attention along line segments, and windows of rays beside scattered ones.
-"""
+Reconstruction", CVPR 2024: attention along line segments, and windows of rays beside scattered ones."""
 
 import time
 from functools import partial

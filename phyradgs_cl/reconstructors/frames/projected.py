@@ -1,8 +1,7 @@
 """Frames computed from a volume: beside the measured ones, at held-out pixels, and for steps of ``prepare``.
 
 Held-out pixels measure quality without a true volume: cross-validation over pixels (as of one parameter in Golub, Heath and
-Wahba, Technometrics 21 (1979) 215). They are the same for every method, option and seed, so that errors can be compared.
-"""
+Wahba, Technometrics 21 (1979) 215). They are the same for every method, option and seed, so that errors can be compared."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

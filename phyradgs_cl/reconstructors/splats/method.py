@@ -5,8 +5,7 @@ phyradgs is the paper's method, exact splats that follow the gantry's motion; wi
 make it the paper's "R2 w/ ST".
 
 Inside, lengths are divided by half the volume's longest side and densities by a reference (FDK's 99.9th percentile), so that
-rates, thresholds and SSIM's constants hold for every scan.
-"""
+rates, thresholds and SSIM's constants hold for every scan."""
 
 import time
 from dataclasses import replace

@@ -1,8 +1,7 @@
 """The gradient of one step: render a frame, compare, go back, total variation, chain rule; and its sum over ranks.
 
 ``FrameStep.gradient`` is the only place where these parts meet. Ranks have all Gaussians each, and some frames of the batch;
-their gradients sum to bits that depend on the batch, not on the number of ranks.
-"""
+their gradients sum to bits that depend on the batch, not on the number of ranks."""
 
 from dataclasses import dataclass
 

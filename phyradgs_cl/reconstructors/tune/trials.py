@@ -3,8 +3,7 @@
 This is cross-validation (``projected.py``) on the scan's own grid, because a coarser grid has another best weight. Held-out
 pixels belong to angles that the method has seen: with few views their error is least before the volume is smooth enough.
 Of smoothing weights the strongest is therefore chosen whose error is not far above the least. Breiman et al. (Classification
-and Regression Trees, 1984) allow a standard error there; this module allows a ratio (docs/results/settings.md).
-"""
+and Regression Trees, 1984) allow a standard error there; this module allows a ratio (docs/results/settings.md)."""
 
 import json
 import time

@@ -1,7 +1,6 @@
 """ASD-POCS: a SART pass, then a few descent steps of the total variation, with the two lengths kept in balance.
 
-Sidky and Pan, Phys. Med. Biol. 53 (2008) 4777, with the step control of TIGRE (Biguri et al. 2016).
-"""
+Sidky and Pan, Phys. Med. Biol. 53 (2008) 4777, with the step control of TIGRE (Biguri et al. 2016)."""
 
 from dataclasses import dataclass
 

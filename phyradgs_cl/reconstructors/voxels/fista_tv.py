@@ -1,7 +1,6 @@
 """FISTA-TV: min ½‖p − A x‖² + λ TV(x), x ≥ 0, by accelerated proximal gradients.
 
-Beck and Teboulle, IEEE Trans. Image Process. 18 (2009) 2419, on all frames at once; the momentum is that of ``fista.py``.
-"""
+Beck and Teboulle, IEEE Trans. Image Process. 18 (2009) 2419, on all frames at once; the momentum is that of ``fista.py``."""
 
 from dataclasses import dataclass
 from typing import Any

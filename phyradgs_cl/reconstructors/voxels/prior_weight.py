@@ -1,8 +1,7 @@
 """The weight of a prior, relative to the error of the data term's gradient.
 
 A pixel of a frame differs from that of the best volume by its noise and by the discretisation error of voxels at edges. Both
-reach the gradient through Aᵀ. The constants are fitted (docs/results/settings.md).
-"""
+reach the gradient through Aᵀ. The constants are fitted (docs/results/settings.md)."""
 
 import math
 from dataclasses import dataclass

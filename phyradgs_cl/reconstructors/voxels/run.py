@@ -1,7 +1,6 @@
 """Runs an iterative voxel method on a scan: its options, its inputs, its convergence, the facts of its result.
 
-A method is a subclass of ``Algorithm``. ``voxel_method`` makes it an entry of the registry; ``run_iterations`` runs it.
-"""
+A method is a subclass of ``Algorithm``. ``voxel_method`` makes it an entry of the registry; ``run_iterations`` runs it."""
 
 import time
 from collections.abc import Callable

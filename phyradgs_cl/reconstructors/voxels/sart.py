@@ -1,7 +1,6 @@
 """SART and OS-SART: the volume is corrected after every frame, or after every few frames.
 
-Andersen and Kak, Ultrasonic Imaging 6 (1984) 81; ordered subsets: Wang and Jiang, J. X-Ray Sci. Technol. 12 (2004) 169.
-"""
+Andersen and Kak, Ultrasonic Imaging 6 (1984) 81; ordered subsets: Wang and Jiang, J. X-Ray Sci. Technol. 12 (2004) 169."""
 
 import math
 from collections.abc import Iterator

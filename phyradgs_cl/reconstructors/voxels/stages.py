@@ -1,8 +1,7 @@
 """Runs of several stages: each stage starts from the volume of the stage before it.
 
 ``fista`` reconstructs voxels, then subvoxels; ``fused`` adds splats. Coarse voxels cannot represent edges. The last passes
-therefore run on voxels half as large; their block means make up two thirds of the result.
-"""
+therefore run on voxels half as large; their block means make up two thirds of the result."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace

@@ -1,7 +1,6 @@
 """Ordered subsets of a scan's frames, which methods correct for one after the other.
 
-H. M. Hudson and R. S. Larkin, IEEE Trans. Med. Imaging 13 (1994) 601.
-"""
+H. M. Hudson and R. S. Larkin, IEEE Trans. Med. Imaging 13 (1994) 601."""
 
 from collections.abc import Iterator
 

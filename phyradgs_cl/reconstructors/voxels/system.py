@@ -1,8 +1,7 @@
 """The linear system A x = p of a scan under a motion model, for the iterative methods.
 
 Its arrays stay on the device where everything fits there (``resident``), else on the host. A method computes with either
-through the system's ``space``. Over several ranks each projects its own frames; frames are gathered, volumes summed.
-"""
+through the system's ``space``. Over several ranks each projects its own frames; frames are gathered, volumes summed."""
 
 import logging
 import math
