@@ -224,7 +224,12 @@ def test_a_wobble_does_not_pass_for_a_roll(rt, monkeypatch) -> None:
     np.testing.assert_allclose(found.per_view()["shift_v_mm"], planted[:, 1], atol=0.01)
     asked: list[GeometryCorrection] = []
     counted = "phyradgs_cl.calibrate.run.estimate_views"
-    monkeypatch.setattr(counted, lambda *args: asked.append(args[4]) or estimate_views(*args))
+
+    def coarse(rt, scan, of, stages, correction, *more):
+        asked.append(correction)
+        return estimate_views(rt, scan, of, stages[:1], correction, *more)
+
+    monkeypatch.setattr(counted, coarse)
     again = calibrate(found.scan, rt, "roll,wobble", splines=6)
     assert by_name(again)["roll"].verdict == AGREES
     now = again.scan.provenance

@@ -70,11 +70,12 @@ def test_classical_methods_come_to_the_same_volume(on_ranks, scan, method, model
     changes = {"iterations": 6, "motion": "per-row", "detector_model": model}
     options = method_options(method, None, changes)
     one = reconstruct(scan, RunPlan(method, options), Runtime()).volume
-    for size in (2, 3, 4):
-        volumes, again = ([found.volume for found in on_ranks(size, method, options)] for _ in range(2))
+    first: dict[int, np.ndarray] = {}
+    for size in (2, 3, 4, 3):  # and once more
+        volumes = [found.volume for found in on_ranks(size, method, options)]
         assert np.linalg.norm(volumes[0] - one) <= RANK_VOLUME * np.linalg.norm(one)
-        for volume in (*volumes, *again):
-            np.testing.assert_array_equal(volume, volumes[0])
+        for volume in volumes:
+            np.testing.assert_array_equal(volume, first.setdefault(size, volumes[0]))
 
 
 @pytest.mark.parametrize("method, wish", [("sirt", "relaxation=0.5,1,1.5"), ("cgls", "iterations")])
