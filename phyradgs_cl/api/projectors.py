@@ -9,14 +9,7 @@ import numpy as np
 
 from phyradgs_cl import checks
 from phyradgs_cl.acquisition import Motion, OwnTimes, PerRow, Scan
-from phyradgs_cl.acquisition.motion import (
-    RAYS,
-    SPLATS,
-    check_motion,
-    check_own_motion,
-    motion_of,
-    motions_for,
-)
+from phyradgs_cl.acquisition import motion as models
 from phyradgs_cl.api.arrays import Device, Values, computed, moved_to, runtime_of
 from phyradgs_cl.api.operators import LinearOperator, Map, Operator, Shape
 from phyradgs_cl.api.runs import check_scan
@@ -46,7 +39,7 @@ def ray_operator(
     average photons. Joseph, IEEE Trans. Med. Imaging 1 (1982) 192.
 
     Raises InputError for anything but a Scan or a Grid, and for an unknown motion or one that moves within a cell."""
-    model, voxels = _checked(scan, motion, motions_for(RAYS)), scan.grid if grid is None else _a_grid(grid)
+    model, voxels = _checked(scan, motion, models.RAYS), scan.grid if grid is None else _a_grid(grid)
     tables = [model.cells(scan, frame).still() for frame in range(scan.frames)]
     return _rays(RayOperator(runtime_of(device), voxels, scan.geometry.detector_shape, tables))
 
@@ -97,7 +90,7 @@ def splat_operator(
     takes, or a Runtime. ``of_densities(gaussians)`` of the result is its linear part: densities (G,) to frames.
 
     Raises InputError for anything but a Scan, for an unknown motion, and for a cutoff out of range."""
-    model = _checked(scan, motion, motions_for(RAYS, SPLATS))
+    model = _checked(scan, motion, models.RAYS, models.SPLATS)
     if isinstance(model, PerRow):  # splats have one weight for all lines of a cell
         model = OwnTimes(model.sub_intervals)
     _check_cutoff(cutoff_sigma)
@@ -106,15 +99,9 @@ def splat_operator(
     def engine(detector: str, chosen: Sequence[int]) -> SplatOperator:
         tables, merges = tables_of(scan, model, detector)
         return SplatOperator(
-            rt,
-            scan.geometry.detector_shape,
-            [tables[f] for f in chosen],
-            scan.grid.half_longest_mm,
-            intensity=merges,
-            affine=affine,
-            cutoff_sigma=cutoff_sigma,
-            time_error=getattr(model, "time_error", DEFAULT_TIME_ERROR),
-            pixel_footprint=pixel_footprint,
+            rt, scan.geometry.detector_shape, [tables[f] for f in chosen], scan.grid.half_longest_mm,
+            intensity=merges, affine=affine, cutoff_sigma=cutoff_sigma,
+            time_error=getattr(model, "time_error", DEFAULT_TIME_ERROR), pixel_footprint=pixel_footprint,
         )
 
     everything = range(scan.frames)
@@ -153,8 +140,7 @@ class SplatProjection(GaussianOperator):
         """Takes an engine for the ``chosen`` frames; ``intensity`` makes one that averages photons in given frames."""
         self._splats = engine
         super().__init__(
-            engine,
-            (_FRAMES, engine.frames_shape),
+            engine, (_FRAMES, engine.frames_shape),
             frames=lambda few: SplatProjection(engine.subset(few), [chosen[f] for f in few], intensity),
             intensity=None if intensity is None else lambda: SplatProjection(intensity(chosen), chosen, None),
         )
@@ -233,12 +219,12 @@ def initial_gaussians(scan: Scan, count: int = 0, *, seed: int = 0, device: Devi
     return Gaussians.from_rows(rows).scaled(scale.length_mm, scale.density_per_mm)
 
 
-def _checked(scan: Scan, motion: str | Motion, taken: tuple[Motion, ...]) -> Motion:
+def _checked(scan: Scan, motion: str | Motion, *kinds: str) -> Motion:
     """Returns the model of a motion, checked against the scan."""
     check_scan(scan)
-    model = motion_of(motion)
-    check_motion(model, taken)
-    check_own_motion(model, scan)
+    model = models.motion_of(motion)
+    models.check_motion(model, models.motions_for(*kinds))
+    models.check_own_motion(model, scan)
     return model
 
 

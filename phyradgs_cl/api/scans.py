@@ -34,12 +34,11 @@ _CLEAR_STEP_DEG = 90.0  # from frame to frame: below, angles say which way the g
 
 
 def fly_scan(
-    frames: "ArrayLike", geometry: "Geometry", angles_deg: "ArrayLike", *,
-    exposure_deg: float | None = None, readout_ratio: float | None = None, readout: str | None = None,
-    readout_direction: int | None = None, exposure_s: float | None = None, first: str | None = None,
-    fps: float | None = None, readout_ms: float | None = None, flats: "ArrayLike | None" = None,
-    darks: "ArrayLike | None" = None, mask: "ArrayLike | None" = None, quantity: str | None = None,
-    grid: Grid | None = None, **others: Any,
+    frames: "ArrayLike", geometry: "Geometry", angles_deg: "ArrayLike", *, exposure_deg: float | None = None,
+    readout_ratio: float | None = None, readout: str | None = None, readout_direction: int | None = None,
+    exposure_s: float | None = None, first: str | None = None, fps: float | None = None,
+    readout_ms: float | None = None, flats: "ArrayLike | None" = None, darks: "ArrayLike | None" = None,
+    mask: "ArrayLike | None" = None, quantity: str | None = None, grid: Grid | None = None, **others: Any,
 ) -> Scan:
     """Returns a scan whose gantry never stops, from arrays.
 

@@ -125,18 +125,12 @@ def _describe(index: int, of: "cl.Platform", device: "cl.Device") -> DeviceInfo:
     text = f"{of.name} {of.vendor} {device.name}".lower()
     usable = bool(device.available and device.compiler_available)
     return DeviceInfo(
-        index=index,
-        name=" ".join(device.name.split()),
-        platform=of.name,
-        version=device.version.strip(),
-        kind=kind,
-        compute_units=device.max_compute_units,
-        memory_bytes=device.global_mem_size,
+        index=index, name=" ".join(device.name.split()), platform=of.name, version=device.version.strip(),
+        kind=kind, compute_units=device.max_compute_units, memory_bytes=device.global_mem_size,
         largest_allocation_bytes=device.max_mem_alloc_size,
         vector_width=max(1, device.native_vector_width_float),
         has_fp64=device.native_vector_width_double > 0 or "cl_khr_fp64" in device.extensions,
-        by_default=usable and not any(word in text for word in _NEVER_BY_DEFAULT),
-        handle=device,
+        by_default=usable and not any(word in text for word in _NEVER_BY_DEFAULT), handle=device,
         target=_targets.get(device.int_ptr),
     )
 
