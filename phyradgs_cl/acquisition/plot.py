@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from phyradgs_cl import checks
+from phyradgs_cl.acquisition.geometry import towards_source
 from phyradgs_cl.acquisition.shutter import Shutter
 from phyradgs_cl.drawing import ACCENT, EDGE, EXPOSED, FAINT, SAMPLE, SOFT, draw_image, new_figure, style_axes
 
@@ -64,6 +65,6 @@ def _outline(first_s: np.ndarray, last_s: np.ndarray, line: np.ndarray) -> tuple
 def _turned_deg(scan: "Scan", frame: int) -> tuple[float, float]:
     """Returns the source's azimuth when a frame's first line opens and when its last line closes."""
     times_s = scan.frame_start_s[frame] + np.array([0.0, scan.shutter.span_s])
-    pose = scan.trajectory.pose(frame, times_s)
-    first, last = np.rad2deg(np.unwrap(np.arctan2(pose[:, 1], pose[:, 0])))
+    source = towards_source(scan.trajectory.pose(frame, times_s), scan.is_parallel)
+    first, last = np.rad2deg(np.unwrap(np.arctan2(source[:, 1], source[:, 0])))
     return float(first), float(last)

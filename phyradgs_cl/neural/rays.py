@@ -13,6 +13,7 @@ from phyradgs_cl.acquisition.time_cells import TimeCells
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
 
+_BEYOND_VOLUME = 2.0  # half-sides: further than a corner of the volume
 Field = Callable[[torch.Tensor], torch.Tensor]
 
 
@@ -21,11 +22,13 @@ class ExposureRays:
     """The rays of one frame's pixels.
 
     pose (C, 12) in units of half the volume's longest side about the volume's centre; cell (K, lines), the cell of each
-    of a line's K times, which all weigh the same; axis: whether lines are rows or columns."""
+    of a line's K times, which all weigh the same; axis: whether lines are rows or columns; is_parallel: poses begin with
+    the rays' direction."""
 
     pose: np.ndarray
     cell: np.ndarray
     axis: str
+    is_parallel: bool = False
 
     @classmethod
     def of_cells(cls, table: TimeCells, grid: Grid) -> "ExposureRays":
@@ -34,7 +37,8 @@ class ExposureRays:
         Raises InputError for a table whose lines have different numbers of cells or different weights."""
         centre, unit = np.array(grid.offset_mm[::-1]), grid.half_longest_mm
         pose = table.pose.copy()
-        pose[:, :3] -= centre
+        if not table.is_parallel:
+            pose[:, :3] -= centre
         pose[:, 3:6] -= centre
         weight = table.layer_weights
         if not np.allclose(weight, 1 / len(weight)):
@@ -45,7 +49,7 @@ class ExposureRays:
             zip(table.layer_numbers, table.line_start, table.line_stop, strict=True)
         ):
             cell[layer, start:stop] = number
-        return cls(pose / unit, cell, table.axis)
+        return cls(pose / unit, cell, table.axis, table.is_parallel)
 
     @property
     def times(self) -> int:
@@ -53,28 +57,34 @@ class ExposureRays:
         return len(self.cell)
 
     def __call__(self, pixels: np.ndarray, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Sources and directions (R, s, 3), unit length, of pixels (R, 2) row, column at some of their times (R, s)."""
+        """Sources and directions (R, s, 3), unit length, of pixels (R, 2) row, column at some of their times (R, s).
+        Parallel rays begin in front of the volume."""
         rows, columns = pixels.T
         line = rows if self.axis == "rows" else columns
         pose = self.pose[self.cell[times, line[:, None]]]  # (R, s, 12)
         along_row, down = columns[:, None, None], rows[:, None, None]
         centre = pose[..., 3:6] + along_row * pose[..., 6:9] + down * pose[..., 9:12]
-        direction = centre - pose[..., :3]
-        direction /= np.linalg.norm(direction, axis=-1, keepdims=True)
+        direction = pose[..., :3] if self.is_parallel else centre - pose[..., :3]
+        direction = direction / np.linalg.norm(direction, axis=-1, keepdims=True)
+        if self.is_parallel:
+            depth = np.einsum("rsi,rsi->rs", centre, direction)[..., None]
+            return centre - (depth + _BEYOND_VOLUME) * direction, direction
         return pose[..., :3], direction
 
     def shadow(self, half_sides: np.ndarray, detector_shape: tuple[int, int]) -> tuple[slice, slice]:
         """Rows and columns within which every pixel lies whose rays meet a box of ``half_sides`` (x, y, z) about 0."""
         corners = np.array(np.meshgrid(*[(-h, h) for h in half_sides], indexing="ij")).reshape(3, -1).T
-        steps, origin = self.pose[:, None, 6:12], self.pose[:, None, 3:6] - self.pose[:, None, :3]
-        to_corner = corners - self.pose[:, None, :3]  # (C, 8, 3)
-        matrix = np.stack(np.broadcast_arrays(to_corner, -steps[..., :3], -steps[..., 3:]), -1)
+        source, first, steps = self.pose[:, None, :3], self.pose[:, None, 3:6], self.pose[:, None, 6:12]
+        to_corner = corners - source  # (C, 8, 3)
+        along, to_first = (source, first - corners) if self.is_parallel else (to_corner, first - source)
+        matrix = np.stack(np.broadcast_arrays(along, -steps[..., :3], -steps[..., 3:]), -1)
         try:
-            place = np.linalg.solve(matrix, np.broadcast_to(origin, to_corner.shape)[..., None])[..., 0]
+            place = np.linalg.solve(matrix, to_first[..., None])[..., 0]
         except np.linalg.LinAlgError:
             place = np.full(to_corner.shape, np.nan)
         scale, column, row = np.moveaxis(place, -1, 0)
-        if np.any(scale <= 0) or not np.all(np.isfinite(scale)):  # a corner that the panel cannot see
+        is_behind = not self.is_parallel and np.any(scale <= 0)
+        if is_behind or not np.all(np.isfinite(scale)):  # a corner that the panel cannot see
             return slice(0, detector_shape[0]), slice(0, detector_shape[1])
         return _within(row, detector_shape[0]), _within(column, detector_shape[1])
 

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from phyradgs_cl.acquisition import CircularOrbit, Scan
+from phyradgs_cl.acquisition.altered.angles import middle_poses
 from phyradgs_cl.acquisition.motion import LineMiddles, MicroViews, Motion, OwnTimes, PerRow, StaticStart
 from phyradgs_cl.acquisition.plot import draw_windows
 from phyradgs_cl.drawing import ACCENT, BOX, EDGE, INK, SAMPLE, SOFT, round_length
@@ -20,13 +21,16 @@ _MOST_FRAMES = 180  # marks on the orbit
 _ARC_SAMPLES = 24
 _FIRST_FRAMES = 4
 _MOST_DOTS, _MOST_CELLS, _LINES_WITH_DOTS = 600, 100_000, 12
+_BESIDE = 0.75  # of the volume's diagonal, from its middle: where rays begin and panels stand that have no distance
 _ROOM = 0.06  # next to the data, relative to them
 Points = NDArray[np.float64]
 
 
 def orbit_chart(scan: Scan) -> Markup:
-    """Returns the scanner from above: all source positions, the first frame's arc, rays, panel and volume."""
-    middles, words = source_positions(scan), f"{scan.frames} source positions; the first frame's rays, panel and volume"
+    """Returns the scanner from above: all source positions, the first frame's arc, rays, panel and volume. The arc of a
+    parallel beam is where its middle ray comes from."""
+    places = "directions of parallel rays" if scan.is_parallel else "source positions"
+    middles, words = source_positions(scan), f"{scan.frames} {places}; the first frame's rays, panel and volume"
     arc = _first_arc(scan)
     first, last = (panel_corners(pose, scan.geometry.detector_shape)[:, :2] for pose in arc[[0, -1]])
     panel, later = (np.array([c[[0, 1]].mean(0), c[[2, 3]].mean(0)]) for c in (first, last))
@@ -35,24 +39,23 @@ def orbit_chart(scan: Scan) -> Markup:
     def draw(axes: "Axes") -> None:
         axes.fill(*box.T, facecolor=BOX, edgecolor=SOFT)
         axes.plot(*middles[:: max(1, len(middles) // _MOST_FRAMES), :2].T, ".", color=SOFT, ms=4)
-        axes.plot(*np.array([panel[0], arc[0, :2], panel[1]]).T, color=ACCENT, alpha=0.55, lw=1)
+        _draw_rays(axes, panel, arc[0, :2], scan.is_parallel)
         axes.plot(*panel.T, color=INK, lw=4)
         if scan.is_fly:
             axes.plot(*later.T, color=INK, lw=4, alpha=0.3)
             axes.plot(*arc[:, :2].T, color=EDGE, lw=6, alpha=0.75)
-        axes.plot(*arc[0, :2], "o", color=ACCENT, ms=9)
         axes.plot(0, 0, "o", color=INK, ms=4)
         way = arc[0, :2] - arc[-1, :2]
         length = float(np.linalg.norm(way))
         shift = (0, 10) if length == 0 else (20 * way[0] / length, 20 * way[1] / length)
-        note(axes, "source", arc[0, :2], shift)
+        _draw_source(axes, arc[0, :2], shift, scan.is_parallel)
         note(axes, "panel", panel[panel[:, 1].argmax()], (0, 8))
 
     return _plan(draw, (middles[:, :2], arc[:, :2], panel, later, box), "Geometry from above", words)
 
 
 def side_chart(scan: Scan) -> Markup:
-    """Returns the scanner from the side, in the plane of its axis and central ray: source, cone, panel and volume."""
+    """Returns the scanner from the side, in the plane of its axis and central ray: source, rays, panel and volume."""
     pose = _first_arc(scan)[0]
     corners = panel_corners(pose, scan.geometry.detector_shape)
     across = (corners.mean(0) - pose[:3])[:2]
@@ -66,15 +69,28 @@ def side_chart(scan: Scan) -> Markup:
     def draw(axes: "Axes") -> None:
         axes.fill(*box.T, facecolor=BOX, edgecolor=SOFT)
         axes.plot(*axis.T, "-.", color=SOFT, lw=1)
-        axes.plot(*np.array([low, source, high]).T, color=ACCENT, alpha=0.55, lw=1)
+        _draw_rays(axes, np.array([low, high]), source, scan.is_parallel)
         axes.plot(*np.array([low, high]).T, color=INK, lw=4)
-        axes.plot(*source, "o", color=ACCENT, ms=9)
-        note(axes, "source", source, (0, 10))
+        _draw_source(axes, source, (0, 10), scan.is_parallel)
         note(axes, "panel", high, (0, 8))
         note(axes, "axis", axis[1], (0, 3))
 
     points = (source[None], low[None], high[None], box, axis)
-    return _plan(draw, points, "Geometry from the side", "source, axis, volume and panel")
+    beam = "parallel rays" if scan.is_parallel else "source"
+    return _plan(draw, points, "Geometry from the side", f"{beam}, axis, volume and panel")
+
+
+def _draw_rays(axes: "Axes", panel: Points, source: Points, is_parallel: bool) -> None:
+    """Draws the rays to a panel's two ends (2, 2): from the source, or as long as the middle one of a parallel beam."""
+    starts = panel + source - panel.mean(0) if is_parallel else (source, source)
+    for start, end in zip(starts, panel, strict=True):
+        axes.plot(*np.array([start, end]).T, color=ACCENT, alpha=0.55, lw=1)
+
+
+def _draw_source(axes: "Axes", source: Points, shift: tuple[float, float], is_parallel: bool) -> None:
+    if not is_parallel:
+        axes.plot(*source, "o", color=ACCENT, ms=9)
+    note(axes, "parallel rays" if is_parallel else "source", source, shift)
 
 
 def _plan(draw: "Callable[[Axes], None]", points: Sequence[Points], title: str, words: str) -> Markup:
@@ -97,22 +113,36 @@ def _plan(draw: "Callable[[Axes], None]", points: Sequence[Points], title: str, 
 
 
 def source_positions(scan: Scan) -> Points:
-    """Returns the poses (F, 12) in the middle of every frame's exposure; a pose begins with the source in mm."""
-    times_s = np.asarray(scan.frame_start_s) + scan.shutter.middle_s
-    return np.stack([scan.trajectory.pose(f, times_s[f : f + 1])[0] for f in range(scan.frames)])
+    """Returns the poses (F, 12) of ``_with_sources`` in the middle of every frame's exposure."""
+    return _with_sources(scan, middle_poses(scan))
+
+
+def _with_sources(scan: Scan, poses: Points) -> Points:
+    """Returns poses (..., 12) that begin with the source in mm. A parallel beam has a place on its middle ray instead, in
+    front of the volume. Its panel, whose distance does not matter, is then behind the volume."""
+    if not scan.is_parallel:
+        return poses
+    away = poses[..., :3]
+    middle = panel_corners(poses, scan.geometry.detector_shape).mean(0)
+    reach_mm = _BESIDE * float(np.linalg.norm(scan.grid.size_mm))
+    depth_mm = np.sum(middle * away, -1, keepdims=True)
+    source, first = middle - (depth_mm + reach_mm) * away, poses[..., 3:6] + (reach_mm - depth_mm) * away
+    return np.concatenate([source, first, poses[..., 6:]], -1)
 
 
 def panel_corners(pose: Points, detector_shape: tuple[int, int]) -> Points:
-    """Returns the panel's corners (4, 3) mm at a pose (12,): (low, left), (high, left), (low, right), (high, right)."""
+    """Returns the panel's corners (4, ..., 3) in mm at poses (..., 12): (low, left), (high, left), (low, right), (high,
+    right)."""
     rows, columns = detector_shape
     u, v = np.array([-0.5, columns - 0.5]), np.array([-0.5, rows - 0.5])
-    return np.array([pose[3:6] + a * pose[6:9] + b * pose[9:12] for a in u for b in v])
+    return np.array([pose[..., 3:6] + a * pose[..., 6:9] + b * pose[..., 9:12] for a in u for b in v])
 
 
 def _first_arc(scan: Scan) -> Points:
     """Returns poses (T, 12) of the first frame, from first light to last."""
     first_s, last_s = scan.shutter.lit_span_s if scan.is_fly else (scan.shutter.middle_s,) * 2
-    return scan.trajectory.pose(0, scan.frame_start_s[0] + np.linspace(first_s, last_s, _ARC_SAMPLES))
+    times_s = scan.frame_start_s[0] + np.linspace(first_s, last_s, _ARC_SAMPLES)
+    return _with_sources(scan, scan.trajectory.pose(0, times_s))
 
 
 def _box_corners(scan: Scan) -> Points:

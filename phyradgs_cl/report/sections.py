@@ -80,9 +80,10 @@ def scan_section(run: Run) -> Markup:
 
 
 def geometry_section(scan: Scan) -> Markup:
-    above = "From above: the source in the middle of every frame"
+    source, beam = ("where the rays come from", "parallel rays") if scan.is_parallel else ("the source", "cone")
+    above = f"From above: {source} in the middle of every frame"
     above += ", and its arc in the first frame; grey, the panel at the end of the arc." if scan.is_fly else "."
-    side = "From the side: the cone of the first frame."
+    side = f"From the side: the {beam} of the first frame."
     return _section("geometry", "Geometry", _charts([(above, orbit_chart(scan)), (side, side_chart(scan))]))
 
 

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from parallel_kit import BODIES, parallel_scan
 
 from phyradgs_cl.__main__ import load_cli
 from phyradgs_cl.api import Scan, compare, reconstruct, save_scan, simulate
@@ -191,3 +192,10 @@ def test_from_file_to_file(rt, scan, method, tmp_path, capsys) -> None:
     assert not checkpoint_path(tmp_path / "volume.h5").exists()
     assert load_cli().run(["report", str(tmp_path / "volume.h5"), "-o", str(tmp_path / "page.html")]) == 0
     assert load_cli().run(["info", str(tmp_path / "volume.h5")]) == 0
+
+
+def test_a_parallel_scan_is_reconstructed(rt) -> None:
+    scan = parallel_scan(12)
+    result = reconstruct(scan, "naf", device=rt, **{**SHORT["naf"], "iterations": 8})
+    truth = BODIES.voxelise(scan.grid, 2)
+    assert np.linalg.norm(result.volume - truth) < 0.8 * np.linalg.norm(truth)

@@ -5,13 +5,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from parallel_kit import SIDE, laminography_scan, parallel_scan
 from tolerances import FLOAT32, RAY_SAMPLES, RAY_SAMPLES_SHARP
 
-from phyradgs_cl.acquisition import MicroViews, OwnTimes
+from phyradgs_cl.acquisition import MicroViews, OwnTimes, Static
 from phyradgs_cl.acquisition.geometry import pixel_centres
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.neural import NeuralOptions
 from phyradgs_cl.neural.rays import ExposureRays, box_span, line_integrals, sample_shifts
+from phyradgs_cl.operators import RayOperator
 
 VOXELS = 64  # of the longest side; 96 samples per ray by default
 CENTRE, AXES = np.array([0.1, -0.2, 0.05]), np.array([0.45, 0.3, 0.5])
@@ -163,3 +165,29 @@ def test_the_shadow_of_the_volume_holds_every_ray_that_meets_it(scan) -> None:
     assert meets.any() and not np.any(meets & ~inside)
     assert inside.sum() < 0.5 * inside.size
     assert exposure.shadow([10.0, 10.0, 10.0], shape) == (slice(0, shape[0]), slice(0, shape[1]))
+
+
+@pytest.mark.parametrize("make", [parallel_scan, laminography_scan])
+def test_parallel_rays_are_those_of_the_projector(rt, make) -> None:
+    """Chords of the box, and integrals of a smooth volume, against the ray projector's."""
+    full = make(6)
+    scan = replace(full, grid=Grid((64, 64, 64), (0.05, 0.05, 0.05), (0.1, -0.2, 0.05)))
+    table = Static().cells(scan, 2)
+    exposure = ExposureRays.of_cells(table, scan.grid)
+    pixels = np.stack(np.meshgrid(np.arange(SIDE), np.arange(SIDE), indexing="ij"), -1).reshape(-1, 2)
+    source, direction = (a.reshape(-1, 3) for a in exposure(pixels, np.zeros((len(pixels), 1), int)))
+    np.testing.assert_allclose(direction, np.broadcast_to(table.pose[0, :3], direction.shape), atol=1e-12)
+    half = scan.grid.half_longest_mm
+    x, y, z = np.meshgrid(*(axis / half for axis in scan.grid.axes_mm()[::-1]), indexing="ij")
+    centred = np.stack([x, y, z], -1).reshape(-1, 3) - np.array(scan.grid.offset_mm[::-1]) / half
+    volume = gaussian(torch.tensor(centred)).numpy().reshape(64, 64, 64).transpose(2, 1, 0).astype(np.float32)
+    projected = RayOperator(rt, scan.grid, (SIDE, SIDE), [table]).forward(volume)[0].ravel()
+    found = half * integrals(gaussian, (source, direction), "none")
+    assert np.abs(found - projected).max() <= 0.02 * projected.max()  # the projector interpolates voxels
+    assert np.abs(half * through_gaussian((source, direction)) - found).max() <= RAY_SAMPLES * found.max()
+    box = torch.tensor([0.45, 0.4, 0.25])
+    rows, columns = exposure.shadow(box.numpy(), (SIDE, SIDE))
+    meets = (box_span(torch.tensor(source), torch.tensor(direction), box)[1] > 0).numpy().reshape(SIDE, SIDE)
+    inside = np.zeros((SIDE, SIDE), bool)
+    inside[rows, columns] = True
+    assert meets.any() and not np.any(meets & ~inside) and inside.sum() < 0.5 * inside.size

@@ -9,8 +9,10 @@ import pytest
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Polygon
+from parallel_kit import SIDE, laminography_scan, parallel_scan
 
 from phyradgs_cl.acquisition import MicroViews, PoseTable, Shutter, make_protocol
+from phyradgs_cl.acquisition.altered.angles import middle_poses
 from phyradgs_cl.acquisition.motion import MODELS
 from phyradgs_cl.drawing import SAMPLE
 from phyradgs_cl.report import charts, scan_charts
@@ -88,6 +90,26 @@ def test_the_orbit_is_that_of_the_scan_and_the_panel_ends_half_a_pixel_beyond_it
     corners = scan_charts.panel_corners(small_scan.geometry.pose(0.0), small_scan.geometry.detector_shape)
     assert np.allclose(corners.mean(axis=0), [-2, 0, 0])
     assert np.allclose(np.ptp(corners, axis=0), [0, 14 * 0.25, 16 * 0.25])
+
+
+def test_parallel_rays_come_from_their_direction_and_have_no_source() -> None:
+    for scan in (parallel_scan(12, shutter=Shutter(0.1, 0.5)), laminography_scan(12)):
+        from_above, from_the_side = scan_charts.orbit_chart(scan), scan_charts.side_chart(scan)
+        for drawing in (from_above, from_the_side):
+            assert drawing.startswith("<svg") and "nan" not in drawing and "source" not in drawing
+        assert "12 directions of parallel rays" in from_above
+        pose, drawn_pose = (of(scan)[3] for of in (middle_poses, scan_charts.source_positions))
+        middle, reach_mm = scan_charts.panel_corners(drawn_pose, (SIDE, SIDE)).mean(0), np.linalg.norm(scan.grid.size_mm) / 2
+        assert np.allclose(np.cross(middle - drawn_pose[:3], pose[:3]), 0)  # the middle ray
+        assert drawn_pose[:3] @ pose[:3] < -reach_mm < reach_mm < middle @ pose[:3]  # the volume between both
+        axes = drawn(scan_charts._draw_rays, np.array([[0.0, 1.0], [0.0, -1.0]]), np.array([-5.0, 0.0]), True)
+        assert [line.get_xydata().tolist() for line in axes.lines] == [[[-5, 1], [0, 1]], [[-5, -1], [0, -1]]]
+
+
+def test_a_parallel_scan_is_plotted_at_its_gantry_angles() -> None:
+    axes = parallel_scan(12, shutter=Shutter(0.0, 0.5)).plot(2).axes[1]
+    first_deg = np.rad2deg(0.3) + 30
+    assert axes.get_title() == f"gantry from {first_deg:.1f}° to {first_deg + 7.5:.1f}°"
 
 
 def test_a_record_becomes_a_chart_for_each_quantity_that_changes() -> None:
