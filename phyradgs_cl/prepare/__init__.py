@@ -8,9 +8,10 @@ from phyradgs_cl.prepare.phase import retrieve_phase
 from phyradgs_cl.prepare.rings import ring_pattern, ring_strength
 from phyradgs_cl.prepare.scatter import fit_scatter, remove_scatter
 from phyradgs_cl.prepare.step import Model
+from phyradgs_cl.prepare.stripes import remove_stripes
 
 __all__ = [
     "DEFAULT_STEPS", "PREPARED_KEY", "STEPS", "STEP_FIELDS", "Model", "PrepareOptions", "find_air", "find_dead",
-    "find_sparks", "fit_polynomial", "fit_scatter", "flat_correction", "prepare", "remove_scatter", "retrieve_phase",
-    "ring_pattern", "ring_strength", "straighten", "water_polynomial"
+    "find_sparks", "fit_polynomial", "fit_scatter", "flat_correction", "prepare", "remove_scatter", "remove_stripes",
+    "retrieve_phase", "ring_pattern", "ring_strength", "straighten", "water_polynomial"
 ]  # fmt: skip

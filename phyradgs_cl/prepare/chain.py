@@ -15,6 +15,7 @@ from phyradgs_cl.prepare.phase import PhaseOptions, retrieve
 from phyradgs_cl.prepare.rings import RingOptions, remove_rings
 from phyradgs_cl.prepare.scatter import ScatterOptions, subtract_scatter
 from phyradgs_cl.prepare.step import Facts, MakeModel, Step
+from phyradgs_cl.prepare.stripes import StripeOptions, correct_stripes
 from phyradgs_cl.text import suggest_name
 
 log = logging.getLogger(__name__)
@@ -26,6 +27,7 @@ STEPS: Mapping[str, Step] = {
     "air": normalise_air,
     "hardening": correct_hardening,
     "rings": remove_rings,
+    "stripes": correct_stripes,
     "phase": retrieve,
 }
 """In the order in which they run, whatever the order in which the user names them."""
@@ -47,6 +49,7 @@ class PrepareOptions:
     air: AirOptions = AirOptions()
     hardening: HardeningOptions = HardeningOptions()
     rings: RingOptions = RingOptions()
+    stripes: StripeOptions = StripeOptions()
     phase: PhaseOptions = PhaseOptions()
 
     def __post_init__(self) -> None:

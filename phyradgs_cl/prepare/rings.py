@@ -93,7 +93,7 @@ def remove_rings(scan: Scan, options: RingOptions, make_model: MakeModel) -> tup
         expected = f"no more than the panel's {frames.shape[2]} columns"
         raise InputError("rings.window", str(options.window), expected, "state fewer pixels")
     column, full_turn = axis_column(scan), is_full_turn(scan)
-    means, mirrored = _means(frames, full_turn), _mirror(frames.shape[2], column)
+    means, mirrored = _means(frames, full_turn), mirror_columns(frames.shape[2], column)
     usable = np.full(frames.shape[1:], scan.frames >= _LEAST_FRAMES) & (scan.valid.mean(axis=0) > 0.5)
     single = find_single_gains(means, mirrored, usable, full_turn)
     facts: Facts = {"result": "nothing to do"}
@@ -138,7 +138,7 @@ def _pattern(frames: np.ndarray, strength: Strength, window: int, axis_column: f
     mean = frames.mean(axis=0, dtype=np.float64)
     if not strength.is_certain:
         return np.zeros(mean.shape, np.float32)
-    mirrored = _mirror(mean.shape[1], axis_column)
+    mirrored = mirror_columns(mean.shape[1], axis_column)
     whole = len(mirrored) == mean.shape[1]
     parts = [(mean + mean[:, mirrored]) / 2, (mean - mean[:, mirrored]) / 2] if whole else [mean]
     variances = np.array([strength.pattern - strength.column, strength.column]) / len(parts)
@@ -192,7 +192,7 @@ def _joined(blocks: np.ndarray) -> np.ndarray:
     return blocks.swapaxes(1, 2).reshape(rows * window, columns * window)
 
 
-def _mirror(columns: int, axis_column: float | None) -> np.ndarray:
+def mirror_columns(columns: int, axis_column: float | None) -> np.ndarray:
     """Returns the mirror images about the axis, for the columns that have one, in descending order."""
     twice = columns - 1 if axis_column is None else 2 * axis_column
     if not abs(twice) < 2 * columns:
@@ -204,7 +204,7 @@ def _mirror(columns: int, axis_column: float | None) -> np.ndarray:
 def _antisymmetric(mean: np.ndarray, axis_column: float | None) -> np.ndarray:
     """Returns the difference of a mean over views (v, u) from its mirror image, over √2: white noise keeps its variance.
     Where few columns have a mirror image it returns the mean itself."""
-    mirrored = _mirror(mean.shape[1], axis_column)
+    mirrored = mirror_columns(mean.shape[1], axis_column)
     if len(mirrored) < _LEAST_PAIRS * mean.shape[1]:
         return mean
     return (mean[:, mirrored[::-1]] - mean[:, mirrored]) / np.sqrt(2)

@@ -1,0 +1,118 @@
+"""Stripes in the sinograms of many views: columns that fluctuate, do not respond, or are wrong in all or some of the views.
+
+Vo, Atwood and Drakopoulos, Opt. Express 26 (2018) 28396. Neighbouring columns of a sinogram (view, column) record nearly the
+same values, in another order of views. So columns that are sorted by value hardly differ, and a median across them gives
+the values that a column should have recorded: put back in the order of its views, they replace the column. Columns without an order, because
+they fluctuate or do not respond, are interpolated from their neighbours before.
+
+The paper sorts and replaces every column, which blurs a scan of a few hundred columns. Here a column is replaced if it
+deviates from the sorted medians much more than the columns at both its sides do, and than its mirror image about the axis.
+An edge of the object spreads over many columns, shows at one side only, or has a mirror image.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import scipy
+
+from phyradgs_cl import checks
+from phyradgs_cl.acquisition import Scan
+from phyradgs_cl.errors import InputError
+from phyradgs_cl.prepare.bad_pixels import axis_column
+from phyradgs_cl.prepare.rings import mirror_columns
+from phyradgs_cl.prepare.step import Facts, MakeModel, unmasked_frames
+
+_LEAST_VIEWS = 60  # with fewer, neighbouring columns record other values
+_LEAST = 2e-3  # in line integrals: gains that are 0.2 % off
+_NEAR = 5  # columns of the median that stands for one side of a column
+_FLUCTUATING = 3.0  # times the fluctuation of the columns at both sides
+_UNRESPONSIVE = 10.0  # times less spread over the views than the columns at both sides
+_MIRRORED = 2.0  # times the deviation of the mirror image and of its neighbours
+_SMALLEST = 1e-6  # spread in line integrals: a stuck pixel has none
+
+
+@dataclass(frozen=True)
+class StripeOptions:
+    """width: of the median, in columns; stripes are narrower than half of it. ratio: least deviation of a stripe over those
+    of the columns at both sides; 0 replaces every column, as the paper does."""
+
+    width: int = 5
+    ratio: float = checks.ranged(3.0, 0, 100)
+
+    def __post_init__(self) -> None:
+        checks.whole("stripes.width", self.width, 3, 999)
+        checks.fields_within("stripes.", self)
+
+
+def remove_stripes(
+    frames: np.ndarray, *, width: int = 5, ratio: float = 3.0, axis_column: float | None = None
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Returns line integrals (F, v, u) float32 without stripes, and the pixels (v, u) bool that were interpolated, and
+    that were replaced after sorting.
+
+    width, ratio: as in ``StripeOptions``. axis_column: the mirror, None: the middle. Every detector row is filtered by
+    itself."""
+    mirrored = mirror_columns(frames.shape[2], axis_column)
+    clean = np.array(frames, np.float32)
+    interpolated, replaced = (np.zeros(frames.shape[1:], bool) for _ in range(2))
+    for row in range(frames.shape[1]):
+        sinogram = clean[:, row]
+        interpolated[row] = _stand_out(_fluctuation(sinogram), _FLUCTUATING, mirrored)
+        interpolated[row] |= _stand_out(1 / np.maximum(_spread(sinogram), _SMALLEST), _UNRESPONSIVE, mirrored)
+        _interpolate(sinogram, interpolated[row])
+        order = np.argsort(sinogram, axis=0, kind="stable")
+        ranked = np.take_along_axis(sinogram, order, axis=0)
+        smooth = scipy.ndimage.median_filter(ranked, (1, width))
+        replaced[row] = _stand_out(np.abs(ranked - smooth).mean(axis=0), ratio, mirrored)
+        columns = np.flatnonzero(replaced[row])
+        sinogram[order[:, columns], columns] = smooth[:, columns]
+    return clean, interpolated, replaced
+
+
+def _fluctuation(sinogram: np.ndarray) -> np.ndarray:
+    """Returns the median change (u,) from view to view of a sinogram (F, u), in second differences: an object passes in a
+    few views, or changes slowly."""
+    return np.median(np.abs(np.diff(sinogram, 2, axis=0)), axis=0) / np.sqrt(6)
+
+
+def _spread(sinogram: np.ndarray) -> np.ndarray:
+    """Returns the distance (u,) between the quartiles of a sinogram's columns (F, u)."""
+    low, high = np.percentile(sinogram, (25, 75), axis=0)
+    return np.asarray(high - low)
+
+
+def _stand_out(values: np.ndarray, ratio: float, mirrored: np.ndarray) -> np.ndarray:
+    """Returns which columns have values (u,) above ``ratio`` times those at both sides, and clearly above those of their
+    images, if they have one in ``mirrored``; all of them for a ratio of 0."""
+    if ratio == 0:
+        return np.ones(len(values), bool)
+    columns, usual = np.arange(len(values)), scipy.ndimage.median_filter(values, _NEAR)
+    left, right = (usual[np.clip(columns + side, 0, len(values) - 1)] for side in (-_NEAR + 1, _NEAR - 1))
+    stands_out = values > np.maximum(ratio * np.maximum(left, right), _LEAST)
+    stands_out[mirrored[::-1]] &= values[mirrored[::-1]] > _MIRRORED * scipy.ndimage.maximum_filter(values, 3)[mirrored]
+    return stands_out
+
+
+def _interpolate(sinogram: np.ndarray, bad: np.ndarray) -> None:
+    """Replaces the columns ``bad`` (u,) of a sinogram (F, u), in place, between the nearest others."""
+    if bad.any() and not bad.all():
+        good = np.flatnonzero(~bad)
+        at = np.interp(np.flatnonzero(bad), good, np.arange(len(good)))
+        low, share = np.floor(at).astype(int), at - np.floor(at)
+        high = np.minimum(low + 1, len(good) - 1)
+        sinogram[:, bad] = (1 - share) * sinogram[:, good[low]] + share * sinogram[:, good[high]]
+
+
+def correct_stripes(scan: Scan, options: StripeOptions, make_model: MakeModel) -> tuple[Scan, Facts]:
+    """Returns the scan without stripes; unchanged if there are none. Raises InputError for few views or a narrow panel."""
+    if scan.frames < _LEAST_VIEWS:
+        expected = f"at least {_LEAST_VIEWS}, in which neighbouring columns record the same values"
+        raise InputError("--steps stripes", f"{scan.frames} views", expected, "leave the step out: rings needs fewer")
+    if options.width > scan.projections.shape[2]:
+        expected = f"no more than the panel's {scan.projections.shape[2]} columns"
+        raise InputError("stripes.width", str(options.width), expected, "state fewer columns")
+    clean, interpolated, replaced = remove_stripes(
+        unmasked_frames(scan), width=options.width, ratio=options.ratio, axis_column=axis_column(scan)
+    )
+    facts: Facts = {"interpolated": int(np.count_nonzero(interpolated)), "replaced": int(np.count_nonzero(replaced))}
+    return (replace(scan, projections=clean) if (interpolated | replaced).any() else scan), facts
