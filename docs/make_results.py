@@ -265,6 +265,17 @@ def clean_scans() -> str:
     return markdown(heads, text)
 
 
+def stripes() -> str:
+    """PSNR with stripes, and after steps of ``prepare``; of the clean scan in the rows "none"."""
+    cells: dict[tuple[str, str, str], dict[str, float]] = {}
+    for line in lines_of("stripes.jsonl"):
+        cells.setdefault((line["stripes"], line["object"], str(line["views"])), {})[line["steps"]] = line["psnr_db"]
+    steps = ["", "dead,rings", "stripes", "dead,rings,stripes", "every column"]
+    text = [[*key, *(f"{by_steps[name]:.2f}" for name in steps)] for key, by_steps in cells.items()]
+    heads = ["stripes", "object", "views", "no step", *(f"`{name}`" for name in steps[1:4]), "`stripes`, `ratio=0`"]
+    return markdown(heads, text)
+
+
 def calibrated_parameters() -> str:
     """The worst error of every parameter with two runs or more, the stated σ, and how often 2 σ held the truth."""
     cells: dict[tuple[Any, ...], list[dict[str, Any]]] = {}
@@ -319,6 +330,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "prepare_fresh": lambda: prepared("prepare_fresh.jsonl"),
     "prepare_64": lambda: prepared("prepare_64.jsonl"),
     "prepare_clean": clean_scans,
+    "stripes": stripes,
     "calibrated_parameters": calibrated_parameters,
     "calibrated_psnr": calibrated_psnr,
 }

@@ -2,8 +2,8 @@
 
 Vo, Atwood and Drakopoulos, Opt. Express 26 (2018) 28396. Neighbouring columns of a sinogram (view, column) record nearly the
 same values, in another order of views. So columns that are sorted by value hardly differ, and a median across them gives
-the values that a column should have recorded: put back in the order of its views, they replace the column. Columns without an order, because
-they fluctuate or do not respond, are interpolated from their neighbours before.
+the values that a column should have recorded. Put back in the order of its views, they replace the column. Columns without
+an order, because they fluctuate or do not respond, are interpolated from their neighbours before.
 
 The paper sorts and replaces every column, which blurs a scan of a few hundred columns. Here a column is replaced if it
 deviates from the sorted medians much more than the columns at both its sides do, and than its mirror image about the axis.

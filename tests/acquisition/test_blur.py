@@ -1,9 +1,18 @@
 """The blur of a fly-scan, by hand and by the paths of points on the panel."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, ConstantSpeed, Scan, Shutter
+from phyradgs_cl.acquisition import (
+    CircularOrbit,
+    ConeGeometry,
+    ConstantSpeed,
+    ParallelGeometry,
+    Scan,
+    Shutter,
+)
 from phyradgs_cl.acquisition.plausible import blur_facts, blur_line
 from phyradgs_cl.fields import Grid
 
@@ -34,6 +43,14 @@ def test_an_arc_of_a_degree_on_two_hundred_columns() -> None:
 def test_a_panel_off_centre(offset_mm, radius_px) -> None:
     """By accident, up to 20 columns: the nearer side is the rim. On purpose: the farther one."""
     assert blur_facts(scan_of(offset_mm))["blur_at_rim_px"] == pytest.approx(radius_px * np.pi / 180, rel=1e-6)
+
+
+def test_a_parallel_beam_blurs_as_much() -> None:
+    cone = scan_of()
+    geometry = ParallelGeometry((4, COLUMNS), PITCH_MM)
+    orbit = CircularOrbit(geometry, cone.trajectory.kinematics)
+    parallel = replace(cone, geometry=geometry, trajectory=orbit)
+    assert blur_facts(parallel) == pytest.approx(blur_facts(cone), rel=1e-9)
 
 
 def test_a_pulse_shortens_the_blur() -> None:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
-from phyradgs_cl.acquisition import ConeGeometry, Scan
+from phyradgs_cl.acquisition import ConeGeometry, ParallelGeometry, Scan
 from phyradgs_cl.api import prepare
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.prepare import PREPARED_KEY, retrieve_phase
@@ -87,6 +87,16 @@ def test_the_step_takes_a_cones_distances_from_its_geometry(material) -> None:
     stated = {"energy_kev": ENERGY_KEV, "distance_mm": 2 * 3 * DISTANCE_MM, **material}
     further = prepare(scan, "phase", phase=stated).provenance[PREPARED_KEY][0]
     assert further["effective_distance_mm"] == pytest.approx(2 * DISTANCE_MM)
+
+
+def test_a_parallel_beam_needs_a_stated_distance() -> None:
+    seen = line_integrals(transported(gaussian_filter(np.exp(-MU_PER_MM * thickness_mm()), FINE)))
+    geometry, options = ParallelGeometry((PIXELS, PIXELS), PIXEL_MM), {"energy_kev": ENERGY_KEV, "delta_beta": DELTA_BETA}
+    scan = Scan.from_poses(seen, geometry.pose(np.zeros(1)), is_parallel=True)
+    prepared = prepare(scan, "phase", phase={**options, "distance_mm": DISTANCE_MM})
+    np.testing.assert_allclose(prepared.projections[0], MU_PER_MM * retrieved_mm(seen), atol=1e-5)
+    with pytest.raises(InputError, match="phase.distance_mm"):
+        prepare(scan, "phase", phase=options)
 
 
 def test_without_a_phase_or_a_distance_nothing_changes() -> None:
