@@ -58,7 +58,7 @@ class Saturation:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Scan:
-    """One cone-beam scan in line integrals.
+    """One scan of a cone or a parallel beam, in line integrals.
 
     - projections (F, nv, nu) float32: −ln(I/I0), dimensionless. Row 0 is the lowest.
     - geometry and grid in mm, shutter in s. trajectory: anything with ``pose(frame, time_s)``, a user-defined class too.
