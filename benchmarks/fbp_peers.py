@@ -8,7 +8,6 @@ Shepp-Logan in Kak and Slaney's table, in closed form, half a turn. Differences:
 rows; peers reconstruct slice by slice, so they get a single row, and their times count sixteenfold.
 """
 
-import json
 import subprocess
 import tempfile
 import time
@@ -94,8 +93,8 @@ def main() -> None:
     fastest = {key: min(float(times[name][key]) for name in PEERS) for key in ("wall_s", "processor_s")}  # type: ignore[arg-type]
     ratios = {key: value / float(times["ours"][key]) for key, value in fastest.items()}  # type: ignore[arg-type]
     size = {"columns": columns, "views": views, "rows": rows}
-    facts = {**where(rt), "differences": differences(rt, args.peer_python), **size, "times": times, "fastest_over_ours": ratios}
-    finish(json.loads(json.dumps(facts)), args.json)
+    found = {"differences": differences(rt, args.peer_python), "times": times, "fastest_over_ours": ratios}
+    finish({**where(rt), **size, **found}, args.json)
 
 
 if __name__ == "__main__":
