@@ -311,8 +311,6 @@ def test_the_offset_goes_into_a_copy(cli, clean, tmp_path, capsys, kind) -> None
     path, fixed = tmp_path / "scan.h5", tmp_path / "fixed.h5"
     write_scan(path, wrong)
     before = path.read_bytes()
-    assert cli.run(["check", str(path), "--json"]) == SUSPICIOUS_STATUS
-    capsys.readouterr()
     assert cli.run(["check", str(path), "--fix-offset", "-o", str(fixed), "--json"]) == 0  # corrected, nothing else wrong
     facts = json.loads(capsys.readouterr().out)
     shift_mm = facts["offset_mm"]
