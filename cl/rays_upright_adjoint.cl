@@ -4,7 +4,20 @@
 #include "common/ray_column.h"
 
 #define LINE_MARGIN 0.01f /* lines: more than the rounding of where they lie; beyond a voxel's neighbours they weigh nothing */
+#define PLANES ((ADJOINT_X > ADJOINT_Y ? ADJOINT_X : ADJOINT_Y) + LANES) /* of a box, in whole vectors */
 #define LEAST_SLOPE 1e-6f /* voxels per line: smaller near the source, where all lines have one height */
+
+/* floor and ceil of what an int holds: PoCL's take ten times as long */
+RAY_INLINE int whole_below(const float at)
+{
+    const int whole = (int)at;
+    return whole - ((float)whole > at);
+}
+RAY_INLINE int whole_above(const float at)
+{
+    const int whole = (int)at;
+    return whole + ((float)whole < at);
+}
 
 /* Detector columns (first, last) whose rays may touch a box of voxels. */
 static inline int2 columns_of_box(__global const float *matrix, const int stride, const float4 first, const float4 last,
@@ -22,8 +35,8 @@ static inline int2 columns_of_box(__global const float *matrix, const int stride
         least = fmin(least, u);
         most = fmax(most, u);
     }
-    return (int2)(max(u_first, (int)ceil(clamp(least - LINE_MARGIN, -1.0f, (float)u_stop))),
-                  min(u_stop - 1, (int)floor(clamp(most + LINE_MARGIN, -1.0f, (float)u_stop))));
+    return (int2)(max(u_first, whole_above(clamp(least - LINE_MARGIN, -1.0f, (float)u_stop))),
+                  min(u_stop - 1, whole_below(clamp(most + LINE_MARGIN, -1.0f, (float)u_stop))));
 }
 
 /* Lines [first, stop) of a slot's column whose main axis is x, or y: all, none, or those on one side of a border. */
@@ -53,6 +66,7 @@ typedef struct {
     int v_first, v_stop, last_start; /* last_start: where two vectors may begin at most */
     float sb, sc, da, ea, dz, ez;
     float inv;                      /* 1 / da; of a column that leans one over its turn in the rays' plane */
+    float bend, per_along;          /* 4 |ea / da|, 1 / |along| */
     float across, along;
     float first, last;              /* slope (dz + v ez) / (da + v ea) of the first and the last line */
     float dense;                    /* largest number of lines to a voxel, times ahead */
@@ -77,6 +91,8 @@ RAY_INLINE column_t column_of(__global const float *cell, const int u, const int
     r.inv = 1.0f / (r.da * r.ez - r.dz * r.ea);
     r.across = (db * r.ez - r.dz * eb) * r.inv;
     r.along = (r.da * eb - db * r.ea) * r.inv;
+    r.bend = 4.0f * fabs(r.ea / r.da);
+    r.per_along = 1.0f / fmax(fabs(r.along), LEAST_SLOPE);
     r.first = over_first / near;
     r.last = over_last / far;
     r.dense = fmax(near * near, far * far) * fabs(r.inv);
@@ -88,13 +104,6 @@ RAY_INLINE column_t column_of(__global const float *cell, const int u, const int
     r.last = over_last * r.inv;
 #endif
     return r;
-}
-
-/* the line, not whole, that passes at a height */
-RAY_INLINE float line_at(const column_t r, const float ahead, const float height)
-{
-    const float over = height - r.sc;
-    return (over * r.da - ahead * r.dz) / (ahead * r.ez - over * r.ea);
 }
 
 /* Where LANES voxels of a column find their lines: `most` from `first` on. */
@@ -190,60 +199,123 @@ RAY_INLINE void add_across(const column_t r, const near_lines_t lines, const int
 }
 #endif
 
-/* Adds a detector column at plane i to columns of voxels that begin at voxel z_first and have nz. Column j of them is
-   sums + j step for 0 <= j < nb and `beyond` elsewhere; b_zero: where the column's rays pass at the source's height, b0, b1:
-   at its first and its last line, all from column 0 on. */
-RAY_INLINE void lines_onto(const column_t r, const float ahead, const int z_first, const int nz, const float b_zero,
-                           const float b0, const float b1, const int nb, float *sums, const int step, float *beyond)
-{
-    const float h0 = fma(r.first, ahead, r.sc) - (float)z_first, h1 = fma(r.last, ahead, r.sc) - (float)z_first;
-    const int from = (int)clamp(floor(fmin(h0, h1) - LINE_MARGIN), 0.0f, (float)nz);
-    const int stop = (int)clamp(ceil(fmax(h0, h1) + LINE_MARGIN) + 1.0f, 0.0f, (float)nz);
-#define COLUMN(j) ((j) < 0 || (j) >= nb ? beyond : sums + (j) * step)
-    const int j = (int)floor(fmin(b0, b1));
+/* What a detector column meets on each plane of a box. */
+typedef struct {
+    int from[PLANES], stop[PLANES]; /* voxels along z that its lines may touch; none where it misses the box */
+    int first[PLANES];              /* column of voxels at or below the lower of its first and last line */
+    int most[PLANES];               /* lines that may touch a voxel */
+    float reach[PLANES];            /* lines from a voxel to the farthest of them */
+    float ahead[PLANES];            /* of the source */
+    float at[PLANES];               /* where the rays' plane passes at the source's height */
 #if LEAN
-    /* lines within a voxel of a height; a little more where lines beyond the ends are denser */
-    const float per = r.dense / fmax(fabs(ahead), LEAST_SLOPE);
-    float reach = per * (1.0f + 4.0f * fabs(r.ea / r.da) * per) + LINE_MARGIN;
-    /* lines are spaced nearly evenly */
-    const float bottom = (float)(z_first + from), top = (float)(z_first + stop);
-    const float line0 = line_at(r, ahead, bottom), line1 = line_at(r, ahead, top);
-    reach += 1.2f * fabs(line_at(r, ahead, 0.5f * (bottom + top)) - 0.5f * (line0 + line1));
-    const float per_voxel = (line1 - line0) / fmax(top - bottom, 1.0f), line_zero = line0 - bottom * per_voxel;
-    const int most = (int)fmin(2.0f * reach, (float)(r.v_stop - r.v_first - 1)) + 1;
-    if (j == (int)floor(fmax(b0, b1))) {
-        float *low = COLUMN(j), *high = COLUMN(j + 1);
-        for (int z = from; z < stop; z += LANES) {
-            const vf height = V_IOTA + (float)(z_first + z), over = height - r.sc;
-            const near_lines_t lines = near_lines(r, fma(height, (vf)(per_voxel), (vf)(line_zero)), reach, most);
-            if (lines.some)
-                add_between(r, lines, most, ahead, over, fma(over, (vf)(r.along), (vf)(b_zero - (float)j)), low + z, high + z);
-        }
-        return;
+    int is_between[PLANES];                      /* whether all lines pass between the first column and the next */
+    float per_voxel[PLANES], line_zero[PLANES]; /* lines to a voxel, and the line, not whole, at height 0 */
+#else
+    float slope[PLANES], at_zero[PLANES], per_slope[PLANES]; /* voxels to a line, the height of line 0, lines to a voxel */
+#endif
+} planes_t;
+
+RAY_INLINE vi whole_below_all(const vf at)
+{
+    const vi whole = V_INT(at);
+    return whole - VI_PICK(0, 1, V_FLOAT(whole) > at);
+}
+
+/* LANES planes at a time, which share divisions. sa: the source's place among planes. The box has columns from b_first to
+   b_stop and nz voxels from z_first on. */
+RAY_INLINE void meet_planes(const column_t r, const float sa, const int2 between, const int z_first, const int nz,
+                            const int b_first, const int b_stop, planes_t *planes)
+{
+    for (int p = 0; p <= between.y - between.x; p += LANES) {
+        const vf i = V_IOTA + (float)(between.x + p);
+#if RAY_PARALLEL
+        const vf ahead = (vf)(1.0f), sb = r.sb * i, sc = r.sc * i;
+#else
+        const vf ahead = i - sa, sb = (vf)(r.sb), sc = (vf)(r.sc);
+#endif
+        const vf h0 = fma((vf)(r.first), ahead, sc) - (float)z_first, h1 = fma((vf)(r.last), ahead, sc) - (float)z_first;
+        const vf at = fma((vf)(r.across), ahead, sb);
+        const vf at0 = LEAN ? fma((vf)(r.along * r.first), ahead, at) : at;
+        const vf at1 = LEAN ? fma((vf)(r.along * r.last), ahead, at) : at;
+        const vi misses = (max(at0, at1) <= (float)(b_first - 1)) | (min(at0, at1) >= (float)b_stop);
+        const vi from = V_INT(min(max(min(h0, h1) - LINE_MARGIN, 0.0f), (float)nz));
+        const vi above = whole_below_all(min(max(max(h0, h1) + LINE_MARGIN, -1.0f), (float)nz)) + 2;
+        const vi stop = VI_PICK(min(above, nz), from, misses);
+        const vi column = whole_below_all(max(min(at0, at1), (float)(b_first - 2)));
+#if LEAN
+        /* lines within a voxel of a height; a little more where lines beyond the ends are denser */
+        const vf per = r.dense / max(fabs(ahead), LEAST_SLOPE);
+        /* lines at both ends; between them they are spaced nearly evenly, and how much they turn bounds the error */
+        const vf over0 = V_FLOAT(from + z_first) - sc, over1 = V_FLOAT(stop + z_first) - sc;
+        const vf turn0 = ahead * r.ez - over0 * r.ea, turn1 = ahead * r.ez - over1 * r.ea;
+        const vf per_turns = 1.0f / (turn0 * turn1);
+        const vf line0 = (over0 * r.da - ahead * r.dz) * turn1 * per_turns;
+        const vf line1 = (over1 * r.da - ahead * r.dz) * turn0 * per_turns;
+        const vf error = 0.15f * fabs((line1 - line0) * (turn1 - turn0) * (turn1 + turn0) * per_turns);
+        const vf reach = per * (1.0f + r.bend * per) + error + LINE_MARGIN;
+        const vf per_voxel = (line1 - line0) / V_FLOAT(max(stop - from, 1));
+        V_STORE(per_voxel, planes->per_voxel + p);
+        V_STORE(line0 - V_FLOAT(from + z_first) * per_voxel, planes->line_zero + p);
+        VI_STORE(VI_PICK(0, 1, column == whole_below_all(min(max(at0, at1), (float)(b_stop + 1)))), planes->is_between + p);
+#else
+        const vf slope = r.ez * r.inv * ahead;
+        const vf per_slope = 1.0f / V_PICK(LEAST_SLOPE, slope, fabs(slope) > LEAST_SLOPE);
+        const vf reach = fabs(per_slope) + LINE_MARGIN;
+        V_STORE(slope, planes->slope + p);
+        V_STORE(per_slope, planes->per_slope + p);
+        V_STORE(fma((vf)(r.dz * r.inv), ahead, sc), planes->at_zero + p);
+#endif
+        VI_STORE(from, planes->from + p);
+        VI_STORE(stop, planes->stop + p);
+        VI_STORE(column, planes->first + p);
+        VI_STORE(V_INT(min(2.0f * reach, (float)(r.v_stop - r.v_first - 1))) + 1, planes->most + p);
+        V_STORE(reach, planes->reach + p);
+        V_STORE(ahead, planes->ahead + p);
+        V_STORE(at, planes->at + p);
     }
+}
+
+/* Adds a detector column at plane p to columns of voxels that begin at voxel z_first. Column j of them is
+   sums + (j - b_first) step for b_first <= j < b_stop and `beyond` elsewhere. */
+RAY_INLINE void lines_onto(const column_t r, const planes_t *planes, const int p, const int z_first, const int b_first,
+                           const int b_stop, float *sums, const int step, float *beyond)
+{
+    const int from = planes->from[p], stop = planes->stop[p], j = planes->first[p], most = planes->most[p];
+    const float reach = planes->reach[p], b_zero = planes->at[p];
+#define COLUMN(j) ((j) < b_first || (j) >= b_stop ? beyond : sums + ((j) - b_first) * step)
+#if LEAN
+    const float ahead = planes->ahead[p], per_voxel = planes->per_voxel[p], line_zero = planes->line_zero[p];
+    int j0 = j, j1 = j, next_look = planes->is_between[p] ? stop : from; /* until then lines pass between j0 and the next */
+    float *low = COLUMN(j), *high = COLUMN(j + 1);
     for (int z = from; z < stop; z += LANES) {
         const vf height = V_IOTA + (float)(z_first + z), over = height - r.sc;
-        const float at0 = fma(r.along, (float)(z_first + z - 1) - r.sc, b_zero);
-        const float at1 = fma(r.along, (float)(z_first + z + LANES) - r.sc, b_zero);
-        const int j0 = (int)floor(fmin(at0, at1)), j1 = (int)floor(fmax(at0, at1));
-        if (j1 < -1 || j0 >= nb)
+        if (z >= next_look) {
+            const float at0 = fma(r.along, (float)(z_first + z - 1) - r.sc, b_zero);
+            const float at1 = fma(r.along, (float)(z_first + z + LANES) - r.sc, b_zero);
+            j0 = whole_below(fmin(at0, at1));
+            j1 = whole_below(fmax(at0, at1));
+            low = COLUMN(j0);
+            high = COLUMN(j0 + 1);
+            const float room = r.along > 0.0f ? (float)(j1 + 1) - at1 : at1 - (float)j0; /* to the next column */
+            if (j0 == j1)
+                next_look = z + (int)fmin(0.99f * room * r.per_along, (float)(ADJOINT_Z + LANES));
+        }
+        if (j1 < b_first - 1 || j0 >= b_stop)
             continue;
         const near_lines_t lines = near_lines(r, fma(height, (vf)(per_voxel), (vf)(line_zero)), reach, most);
         if (!lines.some)
             continue;
-        const vf b = fma(over, (vf)(r.along), (vf)(b_zero));
+        const vf b = fma(over, (vf)(r.along), (vf)(b_zero - (float)j0));
         if (j0 == j1)
-            add_between(r, lines, most, ahead, over, b - (float)j0, COLUMN(j0) + z, COLUMN(j0 + 1) + z);
+            add_between(r, lines, most, ahead, over, b, low + z, high + z);
         else
-            for (int k = max(j0, 0); k <= min(j1 + 1, nb - 1); ++k)
-                add_across(r, lines, most, ahead, over, b - (float)k, sums + k * step + z);
+            for (int k = max(j0, b_first); k <= min(j1 + 1, b_stop - 1); ++k)
+                add_across(r, lines, most, ahead, over, b - (float)(k - j0), COLUMN(k) + z);
     }
 #else
     const float far_share = b_zero - (float)j, near_share = 1.0f - far_share;
     float *low = COLUMN(j), *high = COLUMN(j + 1);
-    const float slope = r.ez * r.inv * ahead, at_zero = fma(r.dz * r.inv, ahead, r.sc);
-    const float per_slope = 1.0f / (fabs(slope) > LEAST_SLOPE ? slope : LEAST_SLOPE), reach = fabs(per_slope) + LINE_MARGIN;
-    const int most = (int)fmin(2.0f * reach, (float)(r.v_stop - r.v_first - 1)) + 1;
+    const float slope = planes->slope[p], at_zero = planes->at_zero[p], per_slope = planes->per_slope[p];
     for (int z = from; z < stop; z += LANES) {
         const vf height = V_IOTA + (float)(z_first + z), below = at_zero - height;
         const near_lines_t lines = near_lines(r, below * -per_slope, reach, most);
@@ -303,7 +375,8 @@ __kernel void rays_upright_adjoint(
     const int nx = min(ADJOINT_X, shape.x - x_first), ny = min(ADJOINT_Y, shape.y - y_first);
     const int nz = min(ADJOINT_Z, shape.z - z_first);
     __global float *voxels = volume + to.x + z_first * to.z + y_first * to.y + x_first;
-    float sums[ADJOINT_Y][ADJOINT_X][ADJOINT_Z + LANES], beyond[ADJOINT_Z + LANES]; /* a vector may begin at any voxel */
+    float sums[ADJOINT_Y][ADJOINT_X][ADJOINT_Z + LANES] WIDE_ALIGNED; /* a vector may begin at any voxel */
+    float beyond[ADJOINT_Z + LANES] WIDE_ALIGNED;
     for (int z = 0; z < ADJOINT_Z + LANES; ++z) {
         beyond[z] = 0.0f;
         for (int y = 0; y < ADJOINT_Y; ++y)
@@ -327,21 +400,20 @@ __kernel void rays_upright_adjoint(
                 r.slopes = r.values + slots_floats;
                 r.is_cut = lines.y < slots[SLOT_V_STOP];
                 r.last_start = slots[SLOT_V] + slot_pitch - 2 * LANES;
-                const int nb = along_x ? ny : nx, step = (along_x ? ADJOINT_X : 1) * (ADJOINT_Z + LANES);
+                const int b_first = along_x ? origin.y + y_first : origin.x + x_first;
+                const int b_stop = b_first + (along_x ? ny : nx);
                 const int a_first = along_x ? origin.x + x_first : origin.y + y_first;
-                const float b_first = (float)(along_x ? origin.y + y_first : origin.x + x_first);
-                const float sa = cell[RAY_SOURCE + !along_x];
+                const int step = (along_x ? ADJOINT_X : 1) * (ADJOINT_Z + LANES); /* from a column along b, and along a, */
+                const int step_a = (along_x ? 1 : ADJOINT_X) * (ADJOINT_Z + LANES); /* to the next */
                 const int2 planes = planes_between(cell, u, along_x, a_first, along_x ? nx : ny);
-                const float sb = r.sb, sc = r.sc;
-                for (int i = planes.x; i <= planes.y; ++i) {
-                    r.sb = START_OF(sb, i);
-                    r.sc = START_OF(sc, i);
-                    const float ahead = AHEAD_OF(sa, i), at = fma(r.across, ahead, r.sb) - b_first;
-                    const float at0 = fma(r.along * r.first, ahead, at), at1 = fma(r.along * r.last, ahead, at);
-                    if (fmax(at0, at1) <= -1.0f || fmin(at0, at1) >= (float)nb)
-                        continue;
-                    float *own = along_x ? sums[0][i - a_first] : sums[i - a_first][0];
-                    lines_onto(r, ahead, origin.z + z_first, nz, at, at0, at1, nb, own, step, beyond);
+                planes_t met;
+                meet_planes(r, cell[RAY_SOURCE + !along_x], planes, origin.z + z_first, nz, b_first, b_stop, &met);
+                const float sc = r.sc;
+                for (int p = 0; p <= planes.y - planes.x; ++p) {
+                    r.sc = START_OF(sc, planes.x + p);
+                    if (met.from[p] < met.stop[p])
+                        lines_onto(r, &met, p, origin.z + z_first, b_first, b_stop,
+                                   sums[0][0] + (planes.x + p - a_first) * step_a, step, beyond);
                 }
             }
         }

@@ -13,6 +13,7 @@
 #if LANES == 1
 typedef float vf;
 typedef int vi;
+#define WIDE_ALIGNED
 #define V_LOAD(p) (*(p))
 #define V_STORE(v, p) (*(p) = (v))
 #define VI_LOAD(p) (*(p))
@@ -31,8 +32,24 @@ static inline float v_sum(vf v) { return v; }
 #define LANE_TYPE(a, b) LANE_PASTE(a, b)
 typedef LANE_TYPE(float, LANES) vf;
 typedef LANE_TYPE(int, LANES) vi;
+#ifdef __clang__
+/* PoCL's vloadn and vstoren take a vector in up to four parts, which a load of the whole soon after has to wait for. */
+typedef LANE_TYPE(float, LANES) __attribute__((aligned(4))) vf_anywhere;
+#define WIDE_ALIGNED __attribute__((aligned(64))) /* a vector at a multiple of LANES lies in one line of the cache */
+#define V_OVERLOAD ALWAYS_INLINE __attribute__((overloadable))
+V_OVERLOAD vf v_load(__private const float *p) { return *(__private const vf_anywhere *)p; }
+V_OVERLOAD vf v_load(__global const float *p) { return *(__global const vf_anywhere *)p; }
+V_OVERLOAD vf v_load(__local const float *p) { return *(__local const vf_anywhere *)p; }
+V_OVERLOAD void v_store(const vf v, __private float *p) { *(__private vf_anywhere *)p = v; }
+V_OVERLOAD void v_store(const vf v, __global float *p) { *(__global vf_anywhere *)p = v; }
+V_OVERLOAD void v_store(const vf v, __local float *p) { *(__local vf_anywhere *)p = v; }
+#define V_LOAD(p) v_load(p)
+#define V_STORE(v, p) v_store((v), (p))
+#else
+#define WIDE_ALIGNED
 #define V_LOAD(p) LANE_TYPE(vload, LANES)(0, (p))
 #define V_STORE(v, p) LANE_TYPE(vstore, LANES)((v), 0, (p))
+#endif
 #define VI_LOAD(p) LANE_TYPE(vload, LANES)(0, (p))
 #define VI_STORE(v, p) LANE_TYPE(vstore, LANES)((v), 0, (p))
 #define V_PICK(no, yes, condition) select((vf)(no), (vf)(yes), (condition))

@@ -35,6 +35,7 @@ from phyradgs_cl.operators import (
 )
 from phyradgs_cl.reconstructors import METHODS, plan_run, reconstruct
 from phyradgs_cl.runtime import DeviceArray, Runtime
+from phyradgs_cl.runtime.opencl import cl, kernel_source
 from phyradgs_cl.simulation import SimulationOptions, VolumeSource, simulate
 
 KERNELS = Path(__file__).resolve().parents[2] / "cl"
@@ -43,6 +44,7 @@ GEOMETRY = ConeGeometry(5.0, 7.5, SHAPE, (3.9 / 5, 4.1 / 7), (0.1, 0.2))
 SPLATTING = ("phyradgs", "r2")
 NEURAL = ("naf", "sax-nerf")  # PyTorch, no kernel of ours
 FREEZES = ("a GPU's", "a GPU's without float64")  # builds, and cases, in which unwritten memory cannot be looked for
+NOT_INLINED = ("splat_prepare",)
 VECTORS_OR_FREEZES = ("asd-pocs", "fista", "fused", "phyradgs", "r2", "nothing", "operators")
 BUILDS = {
     "lanes 1": {"lanes": 1}, "a GPU's": {"lanes": 1, "pixel_items": True},
@@ -66,6 +68,17 @@ def copied_by_host(
     taken = self.download(source).reshape(-1).view(np.uint8)[source_offset : source_offset + count]
     values.reshape(-1).view(np.uint8)[target_offset : target_offset + count] = taken
     self.write(target, values)
+
+
+build = Runtime._build
+
+
+def built_for_oclgrind(self: Runtime, program: str, options: tuple[str, ...]) -> "cl.Program":
+    """Of these programs Oclgrind refuses the marks (llvm.experimental.noalias.scope.decl) that inlining leaves in loops."""
+    if program not in NOT_INLINED:
+        return build(self, program, options)
+    source = kernel_source(program).replace("__attribute__((always_inline))", "")
+    return cl.Program(self.context, source).build(options=[*options, "-cl-opt-disable"])
 
 
 def cloud(count: int) -> np.ndarray:
@@ -169,7 +182,7 @@ def run_one(build: str, case: str) -> int:
         launch(self, kernel, *args, **options)  # type: ignore[arg-type]
 
     Runtime.launch, Runtime.fill = noted, filled_by_copy  # type: ignore[method-assign,assignment]
-    Runtime.copy = copied_by_host  # type: ignore[method-assign]
+    Runtime.copy, Runtime._build = copied_by_host, built_for_oclgrind  # type: ignore[method-assign]
     cases()[case](Runtime("oclgrind", **BUILDS[build]))  # type: ignore[arg-type]
     print(" ".join(sorted(launched)))
     return 0

@@ -4,6 +4,7 @@ The rays of such a column share most of their work. Each pose is projected once,
 frames are weighted averages of slots (``slots.py``). Samples are the same as those of ``launches.py``.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -20,7 +21,9 @@ from phyradgs_cl.runtime.layout import GUARD, Strides, pitch_of
 _LINES = 128  # of a detector column per work-item
 _FEWEST_LINES = 8  # per pose: with fewer, slots cost more than they save
 _VOXELS = 512  # of a volume's column that the lines of a work-item may meet in one slice
-_OWNED = (8, 4, 128)  # voxels (x, y, z) of a work-item of the adjoint: neighbouring columns share rays
+# Voxels (x, y, z) of a work-item of the adjoint: neighbouring columns share rays. The bits do not depend on them.
+_OWNED = ((16, 16, 128), (8, 8, 128), (8, 4, 128))
+_ITEMS_PER_UNIT = 4  # work-items that a compute unit should have at least, so that none waits long for the last
 _UPRIGHT = 1e-6  # voxels: how far a column, or a row, may lean over the whole detector
 _MOST_LEAN = 0.25  # voxels across per voxel along z: beyond it the general kernel is faster
 _TURN = 16  # voxels along x and z that are turned at a time; as in cl/rays_upright.cl
@@ -137,12 +140,11 @@ def launch_upright_adjoint(
     add: bool = False,
 ) -> None:
     """Backprojects slots, as ``split_slots`` writes them, into a volume with these strides."""
-    nz, ny, nx = layout.brick.shape
     shape, origin, *_ = layout.constants()
-    x, y, z = _OWNED
+    (x, y, z), items = _owned(layout.brick.shape, rt.device.compute_units)
     rt.launch(
         rt.kernel("rays_upright_adjoint", "rays_upright_adjoint", ADJOINT_X=x, ADJOINT_Y=y, ADJOINT_Z=z, **slots.defines),
-        tuple(ceil_div(n, own) for n, own in zip((nx, ny, nz), _OWNED, strict=True)),
+        items,
         values,
         np.int32(slots.columns),
         np.int32(slots.pitch),
@@ -159,6 +161,15 @@ def launch_upright_adjoint(
         target[0],
         group=1,
     )
+
+
+def _owned(shape: tuple[int, int, int], units: int) -> tuple[tuple[int, int, int], tuple[int, ...]]:
+    """Returns the voxels (x, y, z) of a work-item and the number of work-items: the largest that keep all units busy."""
+    for owned in _OWNED:
+        items = tuple(ceil_div(n, own) for n, own in zip(shape[::-1], owned, strict=True))
+        if math.prod(items) >= _ITEMS_PER_UNIT * units:
+            break
+    return owned, items
 
 
 def turn_volume(
