@@ -2,8 +2,8 @@
 
     PEER/bin/python fbp_peer.py IN.npz OUT.npz skimage|astra|silx
 
-IN: sino (rows, views, columns) and angle_rad (views,). OUT: volume (rows, y, x), wall_s and processor_s of the second of two
-runs.
+IN: sino (rows, views, columns) and angle_rad (views,). OUT: volume (rows, y, x), wall_s and processor_s of a run after a
+short one.
 """
 
 import sys
@@ -55,11 +55,12 @@ def silx(sino: np.ndarray, angle_rad: np.ndarray) -> Callable[[], np.ndarray]:
 
 def main() -> None:
     given = np.load(sys.argv[1])
-    run = {"skimage": skimage, "astra": astra, "silx": silx}[sys.argv[3]](given["sino"], given["angle_rad"])
-    for _ in range(2):
-        wall_s, processor_s = time.perf_counter(), time.process_time()
-        volume = run()
-        wall_s, processor_s = time.perf_counter() - wall_s, time.process_time() - processor_s
+    make, sino, angle_rad = {"skimage": skimage, "astra": astra, "silx": silx}[sys.argv[3]], given["sino"], given["angle_rad"]
+    make(sino[:, :8], angle_rad[:8])()  # imports and kernels
+    run = make(sino, angle_rad)
+    wall_s, processor_s = time.perf_counter(), time.process_time()
+    volume = run()
+    wall_s, processor_s = time.perf_counter() - wall_s, time.process_time() - processor_s
     np.savez(sys.argv[2], volume=volume, wall_s=wall_s, processor_s=processor_s)
 
 

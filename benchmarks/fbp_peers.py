@@ -37,14 +37,14 @@ def sinogram(columns: int, views: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def ours(rt: Runtime, lines: np.ndarray, angle_rad: np.ndarray, rows: int) -> tuple[np.ndarray, Facts]:
-    """Returns the volume (rows, y, x) of ``rows`` equal rows, and the times of the second of two runs."""
+    """Returns the volume (rows, y, x) of ``rows`` equal rows, and the times of a run after a short one."""
     views, columns = lines.shape
     pose, frames = ParallelGeometry((rows, columns), 1.0).pose(angle_rad), np.repeat(lines[:, None], rows, 1)
     grid = Grid((rows, columns, columns), (1.0, 1.0, 1.0))
-    for _ in range(2):
-        wall_s, processor_s = time.perf_counter(), time.process_time()
-        volume = fdk_volume(rt, frames, pose, grid, is_parallel=True)
-        wall_s, processor_s = time.perf_counter() - wall_s, time.process_time() - processor_s
+    fdk_volume(rt, frames[:: views // 8], pose[:: views // 8], grid, is_parallel=True)  # builds the kernels
+    wall_s, processor_s = time.perf_counter(), time.process_time()
+    volume = fdk_volume(rt, frames, pose, grid, is_parallel=True)
+    wall_s, processor_s = time.perf_counter() - wall_s, time.process_time() - processor_s
     return volume, {"wall_s": wall_s, "processor_s": processor_s}
 
 
