@@ -55,7 +55,8 @@ def silx(sino: np.ndarray, angle_rad: np.ndarray) -> Callable[[], np.ndarray]:
 
 def main() -> None:
     given = np.load(sys.argv[1])
-    make, sino, angle_rad = {"skimage": skimage, "astra": astra, "silx": silx}[sys.argv[3]], given["sino"], given["angle_rad"]
+    make = {"skimage": skimage, "astra": astra, "silx": silx}[sys.argv[3]]
+    sino, angle_rad = given["sino"], given["angle_rad"]
     make(sino[:, :8], angle_rad[:8])()  # imports and kernels
     run = make(sino, angle_rad)
     wall_s, processor_s = time.perf_counter(), time.process_time()
