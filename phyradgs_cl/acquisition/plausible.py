@@ -2,16 +2,20 @@
 
 import logging
 import math
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from phyradgs_cl.acquisition.geometry import Geometry, ParallelGeometry, field_of_view_mm, towards_source
 from phyradgs_cl.acquisition.readout import Named
-from phyradgs_cl.acquisition.scan import FEW, OPAQUE, Scan
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
 
+if TYPE_CHECKING:
+    from phyradgs_cl.acquisition.scan import Scan
+
 log = logging.getLogger(__name__)
+OPAQUE, FEW = 50.0, 0.01  # largest line integral that a panel can measure; fraction of pixels that may be broken
 _WIDEST_DEG = 120.0  # of a panel seen from the source; dental scanners reach 30, nano-CT 60
 _LARGEST_PITCH_MM, _LEAST_DISTANCE_MM = 5.0, 10.0  # of a panel's pixel; from the source to a panel under a wide angle
 _WRONG_UNIT = 100.0  # readout over frame time: seconds given as milliseconds make it some hundreds
@@ -23,13 +27,13 @@ _MANY_FRAMES = 10  # fewer may lie within a few degrees on purpose
 _ASIDE = 0.1  # of the panel's width: a panel further off centre was put there for a wider field of view
 
 
-def summary(scan: Scan) -> str:
+def summary(scan: "Scan") -> str:
     """Returns a line of the timing, a line of the sizes, and a line of a fly-scan's blur. Marks values that the provenance
     lists as assumed."""
     return "\n".join(filter(None, (_timing(scan), _sizes(scan), blur_line(scan))))
 
 
-def blur_facts(scan: Scan) -> dict[str, float]:
+def blur_facts(scan: "Scan") -> dict[str, float]:
     """Returns ``blur_at_rim_px`` and ``blur_at_half_radius_px`` of a fly-scan, in columns; nothing of a scan at rest.
 
     In an exposure of arc Δθ a point at radius r moves by r·Δθ, and blurs most where it moves at right angles to its ray. Its
@@ -53,7 +57,7 @@ def blur_facts(scan: Scan) -> dict[str, float]:
     return {"blur_at_rim_px": arc_rad * radius_px, "blur_at_half_radius_px": arc_rad * radius_px / 2}
 
 
-def blur_line(scan: Scan) -> str:
+def blur_line(scan: "Scan") -> str:
     """Returns "blur at the rim: 1.4 px, at half radius 0.7 px" of a fly-scan; "" of a scan at rest."""
     facts = blur_facts(scan)
     return "blur at the rim: {:.2g} px, at half radius {:.2g} px".format(*facts.values()) if facts else ""
@@ -70,12 +74,12 @@ def _cone_deg(geometry: Geometry) -> tuple[float, float]:
     return cone, fan
 
 
-def _frame_time_s(scan: Scan) -> float:
+def _frame_time_s(scan: "Scan") -> float:
     """Returns the median time from frame to frame; NaN for a single frame."""
     return float(np.median(np.diff(scan.frame_start_s))) if scan.frames > 1 else math.nan
 
 
-def _source_angle_rad(scan: Scan, first_s: float, last_s: float) -> np.ndarray:
+def _source_angle_rad(scan: "Scan", first_s: float, last_s: float) -> np.ndarray:
     """Returns the source's angle (F, T) about the axis at T times after each frame's start, unwrapped within a frame."""
     delay_s = np.linspace(first_s, last_s, _TIMES)
     poses = np.stack([scan.trajectory.pose(f, t + delay_s) for f, t in enumerate(scan.frame_start_s)])
@@ -84,7 +88,7 @@ def _source_angle_rad(scan: Scan, first_s: float, last_s: float) -> np.ndarray:
     return angle_rad
 
 
-def _timing(scan: Scan) -> str:
+def _timing(scan: "Scan") -> str:
     if not scan.is_fly:
         return "timing: every frame at rest"
     assumed = scan.provenance.get("assumed")
@@ -110,7 +114,7 @@ def _timing(scan: Scan) -> str:
     return "timing: " + "; ".join([*parts, marked(f"averages {averaged}", "average")])
 
 
-def _sizes(scan: Scan) -> str:
+def _sizes(scan: "Scan") -> str:
     cone, fan = _cone_deg(scan.geometry)
     seen_mm = tuple(2 * half for half in field_of_view_mm(scan.geometry))
     voxel_mm = scan.grid.voxel_size_mm
@@ -121,7 +125,7 @@ def _sizes(scan: Scan) -> str:
     )
 
 
-def _largest(scan: Scan) -> float:
+def _largest(scan: "Scan") -> float:
     return float(np.max(scan.projections, where=scan.valid, initial=-np.inf))
 
 
@@ -129,7 +133,7 @@ def _joined(values: tuple[float, ...]) -> str:
     return " × ".join(f"{value:.4g}" for value in values)
 
 
-def check_plausible(scan: Scan, named: Named = str, is_timed: bool = True) -> None:
+def check_plausible(scan: "Scan", named: Named = str, is_timed: bool = True) -> None:
     """Raises InputError for pixels, voxels and times that no scanner has, and for line integrals that must be counts.
 
     Warns of times most likely in a wrong unit, of angles that look like radians and of line integrals that may be counts.
@@ -149,7 +153,7 @@ def check_plausible(scan: Scan, named: Named = str, is_timed: bool = True) -> No
     _check_opaque(scan, named("quantity"))
 
 
-def _check_opaque(scan: Scan, subject: str) -> None:
+def _check_opaque(scan: "Scan", subject: str) -> None:
     """Raises InputError where most pixels are darker than a panel can measure: these are counts, whose air is bright. Warns
     where some pixels are."""
     pairs = zip(scan.projections, scan.valid, strict=True)
@@ -203,13 +207,13 @@ def _check_voxels(grid: Grid, geometry: Geometry, subject: str) -> None:
         raise InputError(subject, found, expected, "correct the number of voxels, or the unit of a length")
 
 
-def _check_exposure(scan: Scan, subject: str) -> None:
+def _check_exposure(scan: "Scan", subject: str) -> None:
     exposure_s, frame_s = scan.shutter.exposure_s, _frame_time_s(scan)
     if exposure_s > (1 + _SLACK) * frame_s:
         raise _longer_than_a_frame(subject, f"exposure of {exposure_s:.4g} s", exposure_s, frame_s)
 
 
-def _check_readout(scan: Scan, subject: str) -> None:
+def _check_readout(scan: "Scan", subject: str) -> None:
     readout_s, frame_s = scan.shutter.readout_s, _frame_time_s(scan)
     refusal = _longer_than_a_frame(subject, f"readout of {readout_s:.4g} s", readout_s, frame_s)
     if readout_s > _WRONG_UNIT * frame_s:

@@ -21,6 +21,8 @@ from phyradgs_cl.acquisition.geometry import (
     panel_behind_mm,
     plain_geometry,
 )
+from phyradgs_cl.acquisition.plausible import FEW, OPAQUE, summary
+from phyradgs_cl.acquisition.plot import plot_frame
 from phyradgs_cl.acquisition.shutter import Shutter
 from phyradgs_cl.acquisition.toolkits import astra_of_poses, is_parallel_tigre, poses_of_astra, poses_of_tigre
 from phyradgs_cl.acquisition.trajectory import (
@@ -44,7 +46,6 @@ APPLIED = ("flats_applied", "darks_applied")
 """Keys of the provenance for the numbers of flats and darks that were applied to the counts."""
 _OTHERS = ("detector_model", "pixel_mask", "reference", "title", "lag", "provenance")
 _TITLE = "cone-beam scan"
-OPAQUE, FEW = 50.0, 0.01  # largest line integral that a panel can measure; fraction of pixels that may be broken
 LARGEST_LAG = 0.9  # far beyond any panel; towards 1 a frame holds hardly any new information
 
 
@@ -213,15 +214,11 @@ class Scan:
     def summary(self) -> str:
         """Returns a line of shutter, frame rate and exposure, a line of field of view, voxels and line integrals, and of a
         fly-scan a line of its blur."""
-        from phyradgs_cl.acquisition.plausible import summary
-
         return summary(self)
 
     def plot(self, frame: int = 0) -> "Figure":
         """Returns a figure of one frame (rows, columns), and of the times and gantry angles at which its lines are open.
         Raises InputError for a frame number out of range."""
-        from phyradgs_cl.acquisition.plot import plot_frame
-
         return plot_frame(self, frame)
 
     def _mask_dark_lines(self) -> None:
