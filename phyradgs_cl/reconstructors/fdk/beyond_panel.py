@@ -89,7 +89,8 @@ def whole_object(scan: Scan, motion: Motion, rt: Runtime, report: ProgressReport
 
 
 def reprojected(
-    rt: Runtime, frames: np.ndarray, pose: np.ndarray, axis: str, volume: np.ndarray, grid: Grid, is_parallel: bool
+    rt: Runtime, frames: np.ndarray, pose: np.ndarray, axis: str, volume: np.ndarray, grid: Grid,
+    is_parallel: bool = False,
 ) -> tuple[np.ndarray, int]:
     """Returns line integrals (F, v, u + 2 n) float32, ``frames`` (F, v, u) continued by the projections of a volume, and n.
 
