@@ -16,21 +16,32 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 
-from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, ConstantSpeed, Protocol, Scan, Shutter
-from phyradgs_cl.acquisition.cells import exact_cells, micro_view_cells, static_cells
+from phyradgs_cl.acquisition import (
+    CircularOrbit,
+    ConeGeometry,
+    ConstantSpeed,
+    ParallelGeometry,
+    Protocol,
+    Scan,
+    Shutter,
+)
+from phyradgs_cl.acquisition.cells import common_time_cells, exact_cells, micro_view_cells, static_cells
 from phyradgs_cl.acquisition.time_cells import TimeCells
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.operators import (
     DensityOperator,
     DeviceCells,
+    RayOperator,
     SplatOperator,
     SplatProjector,
     VoxelOperator,
+    backproject,
     voxelise,
 )
 from phyradgs_cl.reconstructors import METHODS, plan_run, reconstruct
@@ -131,24 +142,42 @@ def nothing(rt: Runtime) -> None:
     rt.launch(rt.kernel("rates", "multiply_add"), 4, np.int32(3), np.float32(0.5), rt.zeros(4))
 
 
-def tiny_scan(rt: Runtime, model: str) -> Scan:
+def upright(rt: Runtime, beam: str) -> None:
+    """Detector columns of many rows, as CPUs project and backproject them: parallel to the axis, and leaning a little."""
+    tall = (18, 3)
+    cone, rays = ConeGeometry(5.0, 7.5, tall, (3.9 / 18, 4.1 / 3)), ParallelGeometry(tall, (2.6 / 18, 2.7 / 3))
+    orbit = CircularOrbit(cone if beam == "cone" else rays, ConstantSpeed(0.3, 0.5))
+    start_s, is_parallel = np.array([0.2, 1.7]), beam == "parallel"
+    tables = [common_time_cells(orbit, Shutter(0.8, 0.6), f, start_s, tall[0], 2) for f in (0, 1)]
+    leaning = [replace(table, pose=table.pose.copy()) for table in tables]
+    for table in leaning:
+        table.pose[:, 9:12] += 0.02 * table.pose[:, 6:9]
+    frames = np.ones((2, *tall), np.float32)
+    for some in (tables, leaning):
+        operator = RayOperator(rt, GRID, tall, some)
+        operator.adjoint(operator.forward(np.ones(GRID.shape, np.float32)))
+        backproject(rt, frames, np.stack([table.pose[0] for table in some]), np.ones(2), GRID, is_parallel=is_parallel)
+
+
+def tiny_scan(rt: Runtime, model: str, geometry: ConeGeometry | ParallelGeometry) -> Scan:
     volume = np.random.default_rng(0).uniform(0, 1, GRID.shape).astype(np.float32)
     axis = "rows" if model == "log" else "columns"
-    source = VolumeSource(rt, volume, GRID, GEOMETRY, axis)
+    source = VolumeSource(rt, volume, GRID, geometry, axis)
     protocol = Protocol(views=3, exposure_deg=20.0)
     options = SimulationOptions(protocol, axis, detector_model=model, time_samples=2)
-    return simulate(source, GEOMETRY, GRID, options)
+    return simulate(source, geometry, GRID, options)
 
 
 def method(rt: Runtime, name: str, motion: str, **more: object) -> None:
     """A method on a scan of three frames, in the intensity model where it follows the motion."""
-    scan = tiny_scan(rt, "log" if motion == "static" else "intensity")
+    geometry = ParallelGeometry(SHAPE, (2.6 / 5, 2.7 / 7)) if name == "fbp" else GEOMETRY
+    scan = tiny_scan(rt, "log" if motion == "static" else "intensity", geometry)
     changes: dict[str, object] = {"motion": motion}
     if name in SPLATTING:
         control = {"every": 2, "start_iteration": 0, "threshold": 1e-9}
         changes |= {"gaussians": 6, "tv_edge": 4, "parameter_terms_from": 0, "shape_weight": 0.1}
         changes |= {"iterations": 3, "poisson_weight": 0.1, "control": control}
-    elif name != "fdk":
+    elif name not in ("fdk", "fbp"):
         changes |= {"iterations": 1, **({"sub_intervals": 2} if motion == "per-row" else {})}
         changes |= {"voxel_iterations": 1} if name == "fused" else {}
     reconstruct(scan, plan_run(name, {**changes, **more}), rt)
@@ -156,6 +185,7 @@ def method(rt: Runtime, name: str, motion: str, **more: object) -> None:
 
 def cases() -> dict[str, Callable[[Runtime], None]]:
     found: dict[str, Callable[[Runtime], None]] = {"nothing": nothing, "operators": operators}
+    found |= {f"upright {beam}": partial(upright, beam=beam) for beam in ("cone", "parallel")}
     for model in MODELS:
         for options in OPTIONS:
             found[f"splats {model} {options}"] = partial(splats, model=model, options=options)
