@@ -34,7 +34,7 @@ from phyradgs_cl.reconstructors.run import check_resumable
 from phyradgs_cl.runtime import Runtime, profile_text
 from phyradgs_cl.text import plain_text
 from phyradgs_cl.workflow.files import check_output, expecting, load_scan, refuse_overwriting
-from phyradgs_cl.workflow.slabs import Slabs, reconstruct_slabs, remove_slabs
+from phyradgs_cl.workflow.slabs import Slabs, reconstruct_slabs, remove_slabs, surely_fits
 
 log = logging.getLogger(__name__)
 _ALL_ROWS = Slabs()
@@ -94,19 +94,19 @@ def run_reconstruction(
 
     A parallel scan whose frames exceed half of this machine's memory is reconstructed in ``slabs`` of rows.
 
-    An interrupted run leaves
-    ``output`` alone: it writes ``io.partial_path`` and a checkpoint, from which ``resume`` goes on. A complete run removes
-    both; a killed run leaves its last checkpoint. inputs: other files that the output must not overwrite. ranks: those of
-    the runtime; rank 0 alone writes and has metrics. Raises OutputError while another run writes the output."""
+    An interrupted run leaves ``output`` alone: it writes ``io.partial_path`` and a checkpoint, from which ``resume`` goes
+    on. A complete run removes both; a killed run leaves its last checkpoint. inputs: other files that the output must not
+    overwrite. ranks: those of the runtime; rank 0 alone writes and has metrics. Raises OutputError while another run writes
+    the output."""
     check_interval(checkpoint_every_s)
     leads = ranks is None or ranks.rank == 0
-    parts = _slabs_of(slabs, scan, ranks)
-    if resume and not parts:
-        check_resumable(plan)
     if leads:
         export = f"write volume.h5, then 'phyradgs export volume.h5 -o {plain_text(output.name)}'"
         check_output(output, scan, *inputs, remedy=export)
         refuse_overwriting("-o", partial_path(output), scan, *inputs)
+    parts = _slabs_of(slabs, scan, ranks)
+    if resume and not parts:
+        check_resumable(plan)
     with only_run(output) if leads else nullcontext():
         if parts:
             return _in_slabs(plan, scan, output, parts, make_runtime(), report, resume)
@@ -115,6 +115,8 @@ def run_reconstruction(
 
 def _slabs_of(slabs: Slabs, scan: Path, ranks: Communicator | None) -> list[tuple[int, int]]:
     """Returns the slabs of a run, none for the whole scan at once. Raises InputError for slabs under several ranks."""
+    if slabs == _ALL_ROWS and surely_fits(scan):
+        return []
     with expecting(scan, "scan"):
         parts = slabs.of(read_scan_header(scan))
     if parts and ranks is not None and ranks.size > 1:

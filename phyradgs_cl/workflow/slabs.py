@@ -49,6 +49,11 @@ class Slabs:
         return [(a, min(a + (at_a_time or stop - first), stop)) for a in range(first, stop, at_a_time or stop - first)]
 
 
+def surely_fits(path: Path) -> bool:
+    """True for a file so small that its frames, if they are counts of two bytes, are far from half of the memory."""
+    return not path.is_file() or 2 * _COPIES * path.stat().st_size < _HOST_SHARE * host_bytes()
+
+
 def rows_of(text: str) -> tuple[int, int]:
     """Parses ``A:B``. Raises InputError for other text."""
     first, colon, stop = text.partition(":")

@@ -24,7 +24,7 @@ from phyradgs_cl.operators import RayOperator
 from phyradgs_cl.phantoms import shepp_logan
 from phyradgs_cl.reconstructors.plan import plan_run
 from phyradgs_cl.workflow import load_scan, run_reconstruction
-from phyradgs_cl.workflow.slabs import Slabs, rows_of
+from phyradgs_cl.workflow.slabs import Slabs, rows_of, surely_fits
 
 ROWS, SIDE, VIEWS = 26, 24, 30
 GRID = Grid((24, SIDE, SIDE), (0.08, 0.08, 0.08), (0.02, 0.0, 0.0))
@@ -114,3 +114,10 @@ def test_bad_rows_are_refused(path: Path) -> None:
             slab(scan, first, stop)
     with pytest.raises(InputError, match="--rows"):
         rows_of("3-9")
+
+
+def test_a_scan_beyond_the_memory_is_cut_by_itself(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    scan = load_scan(path)
+    assert Slabs().of(scan) == []
+    monkeypatch.setattr("phyradgs_cl.workflow.slabs.host_bytes", lambda: 2 * 4 * 4 * VIEWS * SIDE * 20)  # 20 rows of 26
+    assert Slabs().of(scan) == [(0, 12), (12, 24), (24, 26)] and not surely_fits(path)

@@ -33,11 +33,13 @@ def read_scan(path: str | Path, to_attenuation: ToAttenuation, rows: tuple[int, 
     """Reads a scan file; ``to_attenuation`` converts the frames to line integrals. Of a parallel scan it can read detector
     rows [first, stop) alone: the scan is then a ``slab`` on the whole grid.
 
-    ``to_attenuation`` takes (data (F, v, u), image_key (F,),
-    quantity) and returns line integrals (P, v, u) of the P projections, and a mask (v, u) or (P, v, u) of unusable values or
-    None. Everything but the pixels is checked before they are read. Flat, dark and invalid frames are left out. The scan has
-    projections (P, v, u) float32 and a bool ``pixel_mask`` or None, from the file and the conversion; values that are not
-    finite must be masked. Raises: InputError for a missing, damaged or incomplete file; its subject is "FILE:/hdf5/path"."""
+    ``to_attenuation`` takes (data (F, v, u), image_key (F,), quantity) and returns line integrals (P, v, u) of the P
+    projections. It also returns a mask (v, u) or (P, v, u) of unusable values, or None. Flat, dark and invalid frames are
+    left out. The scan has projections (P, v, u) float32 and a bool ``pixel_mask`` or None, from the file and the
+    conversion; values that are not finite must be masked.
+
+    Everything but the pixels is checked before they are read. Raises InputError for a missing, damaged or incomplete file;
+    its subject is "FILE:/hdf5/path"."""
     with open_hdf5(path) as source:
         header = read_header(source)
         lines = None if rows is None else slice(*rows)

@@ -66,8 +66,9 @@ def fan_angle(pose: np.ndarray, rays: np.ndarray, is_parallel: bool = False) -> 
 
 @dataclass(frozen=True)
 class Fan:
-    """The fan angles, or distances from the axis in a parallel beam (see ``fan_angle``), that every view sees, and how far
-    the detector is off centre, in columns at its two ends."""
+    """The fan angles that every view sees; in a parallel beam distances from the axis (see ``fan_angle``).
+
+    missing_columns: how far the detector is off centre, in columns at its two ends."""
 
     low_rad: float
     high_rad: float
