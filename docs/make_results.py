@@ -309,6 +309,33 @@ def calibrated_psnr() -> str:
     return markdown(["case", "voxels, views", "stated", "calibrated", "right", "worst difference", "runs"], text)
 
 
+def fbp_peers() -> str:
+    """Filtered backprojection beside its peers: differences, PSNR, seconds."""
+    found = json.loads((RESULTS / "fbp_peers.json").read_text(encoding="utf-8"))
+    rows = []
+    for name in ("ours", "skimage", "astra", "silx"):
+        one, times = found["differences"][name], found["times"][name]
+        off = f"{100 * one['relative_rms']:.2g} %" if "relative_rms" in one else ""
+        label = {"ours": "**`fbp`**", "skimage": "scikit-image", "astra": "ASTRA", "silx": "silx"}[name]
+        rows.append([label, off, f"{one['psnr_db']:.2f}", f"{times['wall_s']:.1f}", f"{times['processor_s']:.1f}"])
+    table = markdown(["", "difference", "PSNR, dB", "wall, s", "processor, s"], rows)
+    wall, processor = (found["fastest_over_ours"][key] for key in ("wall_s", "processor_s"))
+    size = f"{found['columns']} columns, {found['views']} views, {found['rows']} rows"
+    faster = f"{wall:.1f} times as fast as the fastest (processor {processor:.1f})"
+    return f"{table}\n{size}: {faster}; {found['device'].removeprefix('pthread-')}.\n"
+
+
+def parallel_fly() -> str:
+    """Modulation at rim and centre of fly-scans with parallel beams."""
+    rows = [
+        [f"{one['blur_px']:g}", str(one["views"]), f"`{one['method']}`", one["motion"], f"{one['psnr_db']:.2f}"]
+        + [f"{one[place]:.2f}" for place in ("rim", "centre")] + [f"{one['processor_s']:.0f}"]
+        for one in lines_of("parallel_fly.jsonl")
+    ]
+    heads = ["blur", "views", "method", "motion", "PSNR, dB", "modulation, rim", "centre", "processor, s"]
+    return markdown(heads, rows)
+
+
 TABLES: dict[str, Callable[[], str]] = {
     "table1_S_rapid": lambda: quality("table1_S.csv", "rapid"),
     "table1_S_standard": lambda: quality("table1_S.csv", "standard"),
@@ -333,6 +360,8 @@ TABLES: dict[str, Callable[[], str]] = {
     "stripes": stripes,
     "calibrated_parameters": calibrated_parameters,
     "calibrated_psnr": calibrated_psnr,
+    "fbp_peers": fbp_peers,
+    "parallel_fly": parallel_fly,
 }
 
 
