@@ -1,4 +1,4 @@
-"""Filtered backprojection by scikit-image, ASTRA's CPU or silx's OpenCL, in a Python of its own, for fbp_peers.py.
+"""Filtered backprojection by scikit-image, ASTRA's CPU or silx's OpenCL, in a separate Python, for fbp_peers.py.
 
     PEER/bin/python fbp_peer.py IN.npz OUT.npz skimage|astra|silx
 

@@ -1,4 +1,4 @@
-"""Filtered backprojection beside scikit-image's, ASTRA's (CPU) and silx's (OpenCL) on the same sinograms.
+"""Compares filtered backprojection with scikit-image's, ASTRA's (CPU) and silx's (OpenCL) on the same sinograms.
 
     python -m venv PEER && PEER/bin/pip install astra-toolbox silx scikit-image "pyopencl[pocl]"
     python benchmarks/fbp_peers.py --peer-python PEER/bin/python [--json docs/results/fbp_peers.json] [--quick]

@@ -1,6 +1,8 @@
 """The simulator: each line over its own window, sampled finely enough, with scaling, noise and refusals."""
 
+from collections.abc import Iterator
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -41,6 +43,16 @@ def integrals(angle_rad: float) -> np.ndarray:
     return PHANTOM.line_integrals(pose[:3], pixel_centres(pose, SHAPE))
 
 
+def times_of_lines(axis: str, direction: int, frame: int, samples: int) -> Iterator[tuple[Any, np.ndarray]]:
+    """Where each line lies in a frame, and the angles (samples,) in rad that it averages over."""
+    lines = SHAPE[0] if axis == "rows" else SHAPE[1]
+    for line in range(lines):
+        order = line if direction > 0 else lines - 1 - line
+        delay_deg = order / (lines - 1) * 0.5 * 12.0
+        angles = np.deg2rad(frame * 120.0 + delay_deg + (np.arange(samples) + 0.5) / samples * 12.0)
+        yield ((line, slice(None)) if axis == "rows" else (slice(None), line)), angles
+
+
 @pytest.mark.parametrize(("axis", "direction"), [("rows", 1), ("columns", -1)])
 @pytest.mark.parametrize("model", ["log", "intensity"])
 def test_every_line_averages_over_its_own_window(axis, direction, model) -> None:
@@ -48,15 +60,10 @@ def test_every_line_averages_over_its_own_window(axis, direction, model) -> None
     samples, frame = 5, 1
     options = SimulationOptions(FLY, axis, direction, model, time_samples=samples)
     found = run(options).projections[frame]
-    lines = SHAPE[0] if axis == "rows" else SHAPE[1]
     expected = np.zeros(SHAPE)
-    for line in range(lines):
-        order = line if direction > 0 else lines - 1 - line
-        delay_deg = order / (lines - 1) * 0.5 * 12.0
-        angles = np.deg2rad(frame * 120.0 + delay_deg + (np.arange(samples) + 0.5) / samples * 12.0)
+    for where, angles in times_of_lines(axis, direction, frame, samples):
         stack = np.stack([integrals(a) for a in angles])
         mean = stack.mean(axis=0) if model == "log" else -np.log(np.exp(-stack).mean(axis=0))
-        where = (line, slice(None)) if axis == "rows" else (slice(None), line)
         expected[where] = mean[where]
     assert_near(found, expected, ANALYTIC_FRAME)
 
@@ -73,17 +80,12 @@ def test_parallel_rays_of_a_line_average_over_its_own_window(axis, direction, mo
         (np.arange(count) - (count - 1) / 2) * pitch + offset
         for count, pitch, offset in zip(SHAPE, PARALLEL.pixel_size_mm, PARALLEL.detector_offset_mm, strict=True)
     )
-    lines = SHAPE[0] if axis == "rows" else SHAPE[1]
     expected = np.zeros(SHAPE)
-    for line in range(lines):
-        order = line if direction > 0 else lines - 1 - line
-        delay_deg = order / (lines - 1) * 0.5 * 12.0
-        angles = np.deg2rad(frame * 120.0 + delay_deg + (np.arange(samples) + 0.5) / samples * 12.0)
+    for where, angles in times_of_lines(axis, direction, frame, samples):
         column_mm = centre[1] * np.cos(angles) - centre[0] * np.sin(angles)
         off = (u_mm[None, None] - column_mm[:, None, None]) ** 2 + (v_mm[None, :, None] - centre[2]) ** 2
         chords = 0.9 * 2 * np.sqrt(np.maximum(radius**2 - off, 0))
         mean = chords.mean(axis=0) if model == "log" else -np.log(np.exp(-chords).mean(axis=0))
-        where = (line, slice(None)) if axis == "rows" else (slice(None), line)
         expected[where] = mean[where]
     assert expected.max() > 0.9
     assert_near(frames, expected, ANALYTIC_FRAME)
