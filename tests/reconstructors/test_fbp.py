@@ -55,6 +55,24 @@ def test_a_disc_comes_out_with_its_density(rt, views: int, turn_deg: float, offs
     assert error_of(fbp(scan_of(views, turn_deg, offset_mm, columns), FbpOptions(), rt).volume) < 0.03
 
 
+@pytest.mark.parametrize(
+    ("views", "turn_deg", "offset_mm", "columns", "radius_mm"),
+    [(90, 180, 0.0, 48, 24.0), (180, 360, 0.0, 48, 24.0), (180, 360, 10.0, 40, 30.0)],
+    ids=["half", "full", "half-acquisition"],
+)
+def test_the_volume_ends_at_the_circle_of_the_field_of_view(
+    rt, views: int, turn_deg: float, offset_mm: float, columns: int, radius_mm: float
+) -> None:
+    """Half-acquisition keeps the wider circle, which a full turn measures; rows that are continued keep the corners."""
+    scan, (_, y, x) = scan_of(views, turn_deg, offset_mm, columns), np.meshgrid(*GRID.axes_mm(), indexing="ij")
+    cut, whole = (fbp(scan, FbpOptions(circle=circle), rt).volume for circle in (True, False))
+    inside = np.hypot(x, y) <= radius_mm
+    np.testing.assert_array_equal(cut, np.where(inside, whole, 0))
+    assert np.abs(whole[~inside]).max() > 1e-4
+    if offset_mm == 0:
+        assert np.abs(fbp(scan, FbpOptions(extrapolate="cosine"), rt).volume[~inside]).max() > 1e-4
+
+
 def test_lines_are_backprojected_at_their_own_angles(rt) -> None:
     """A readout of nearly a frame's time: lines lie up to 5 degrees from the frame's middle."""
     scan, (_, y, x) = scan_of(36, 360, shutter=Shutter(0.02, 0.95)), np.meshgrid(*GRID.axes_mm(), indexing="ij")

@@ -77,10 +77,12 @@ class FdkOptions:
 
 @dataclass(frozen=True)
 class FbpOptions(FdkOptions):
-    """deblur: sharpen a fly-scan along the angle, with this power of noise over that of the signal, as 0.01; 0 does not. The
-    other options are those of FDK."""
+    """deblur: sharpen a fly-scan along the angle, with this power of noise over that of the signal, as 0.01; 0 does not.
+    circle: set voxels outside of the circle that the panel's wider side reaches to 0, unless rows are extrapolated.
+    The other options are those of FDK."""
 
     deblur: float = 0.0
+    circle: bool = True
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -124,6 +126,7 @@ def _filtered_backprojection(
     volume = fdk_volume(
         rt, frames, pose, scan.grid, window=options.window, axis=scan.shutter.axis,
         extrapolate=options.extrapolate, whole=whole, is_parallel=scan.is_parallel,
+        circle=isinstance(options, FbpOptions) and options.circle,
     )  # fmt: skip
     facts = {"method": method, "options": option_facts(options), "seconds": time.perf_counter() - started}
     return Reconstruction(volume, scan.grid, facts=facts)
@@ -144,12 +147,14 @@ def fdk_volume(
     extrapolate: str = "none",
     whole: Callable[[], np.ndarray] | None = None,
     is_parallel: bool = False,
+    circle: bool = False,
 ) -> np.ndarray:
     """Returns FDK, or FBP of parallel beams, of line integrals (F, rows, columns) on ``grid``, (z, y, x) float32 in 1/mm.
 
     pose (F, 12) mm, or (F, lines, 12) with a pose for every line along ``axis``. Displaced detectors (full turns) and short
     scans are recognised and weighted. Logs a warning where data are missing. ``whole`` reconstructs the object (z, y, x) in
-    1/mm on ``grid``, for ``reprojected``. Raises InputError for a source on the rotation axis.
+    1/mm on ``grid``, for ``reprojected``. ``circle``, for parallel beams: as in ``FbpOptions``. Raises InputError for a
+    source on the rotation axis.
     """
     shape = (frames.shape[1], frames.shape[2])
     by_pixel = pose_of_pixels(pose, axis)
@@ -175,8 +180,14 @@ def fdk_volume(
     pose = widened(pose, axis, missing)
     share = 0.5 * arc.gap_rad  # every ray is measured twice
     if pose.ndim == 2:
-        return backproject(rt, filtered, pose, share, grid, is_parallel=is_parallel)
-    return backproject_lines(rt, filtered, pose, share, grid, axis, is_parallel=is_parallel)
+        volume = backproject(rt, filtered, pose, share, grid, is_parallel=is_parallel)
+    else:
+        volume = backproject_lines(rt, filtered, pose, share, grid, axis, is_parallel=is_parallel)
+    if circle:
+        _, y_mm, x_mm = grid.axes_mm()
+        radius_mm = fan.half_rad + np.linalg.norm(canonical[0, 0, 0, 6:9]) / 2  # to the edge of the last pixel
+        volume[:, np.hypot(y_mm[:, None], x_mm) > radius_mm] = 0
+    return volume
 
 
 def _filtered(frames: np.ndarray, weight: RayWeight, missing: tuple[int, int], window: str) -> np.ndarray:
