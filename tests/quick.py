@@ -15,6 +15,7 @@ QUICK = (
     "calibrate/test_perturbed.py", "calibrate/test_beads.py::test_frames_are", "calibrate/test_beads.py::test_files_of",
     "check/test_plain_questions.py", "check/test_variants.py", "reconstructors/test_fits.py",
     "io/test_atomic.py", "io/test_checkpoint_file.py", "io/test_scan_round_trip.py", "io/test_volume_file.py",
+    "io/test_deformation_file.py",
     *(f"prepare/test_each_step.py::test_{step}" for step in ("sparks", "dead", "air", "rings")),
     # every command; a kill and a resume; a full disk; hostile files of each kind
     "cli/test_smoke.py", "cli/test_settings.py", "cli/test_startup.py",

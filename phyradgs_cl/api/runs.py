@@ -14,10 +14,19 @@ from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.api.arrays import Device, runtime_of
 from phyradgs_cl.errors import InputError, naming_arguments
 from phyradgs_cl.exporters import export_stored, foreign_suffix, format_of
-from phyradgs_cl.fields import Grid
+from phyradgs_cl.fields import Deformation, Grid
 from phyradgs_cl.importers import foreign_volume, load_attenuation, load_beads
 from phyradgs_cl.importers import load_volume as load_voxels
-from phyradgs_cl.io import Volume, read_scan, read_state, read_volume, write_scan, write_volume
+from phyradgs_cl.io import (
+    Volume,
+    read_deformation,
+    read_scan,
+    read_state,
+    read_volume,
+    write_deformation,
+    write_scan,
+    write_volume,
+)
 from phyradgs_cl.phantoms import PHANTOMS
 from phyradgs_cl.prepare import DEFAULT_STEPS, flat_correction
 from phyradgs_cl.progress import Ticker, has_reader
@@ -68,6 +77,25 @@ def load_volume(path: str | Path) -> Reconstruction:
     record: Any = facts.pop("record", [])
     state = read_state(file)
     return Reconstruction(stored.values, stored.required_grid, stored.gaussians, record, facts, state, stored.disagreement)
+
+
+@naming_arguments()
+def load_deformation(path: str | Path) -> Deformation:
+    """Reads how an object moves from a file (docs/formats.md), or from a scan simulated with a motion of its object.
+
+    path: the HDF5 file. Raises InputError, which names the HDF5 path of the wrong value, also where matter would fold."""
+    return read_deformation(_checked_path(path))
+
+
+@naming_arguments()
+def save_deformation(path: str | Path, deformation: Deformation) -> None:
+    """Writes how an object moves to a file, whole or not at all.
+
+    path: of the HDF5 file. deformation: the value. Raises InputError for something else, OutputError where the file cannot
+    be written."""
+    if not isinstance(deformation, Deformation):
+        raise InputError("deformation", checks.short_repr(deformation), "a Deformation")
+    write_deformation(_checked_path(path), deformation)
 
 
 @naming_arguments()

@@ -1,7 +1,8 @@
-"""The attenuation field: a voxel volume on a grid, or a cloud of radiative Gaussians."""
+"""The attenuation field: a voxel volume on a grid, or a cloud of radiative Gaussians; how it deforms in time."""
 
+from phyradgs_cl.fields.deformation import Deformation, control_points
 from phyradgs_cl.fields.gaussians import Activation, Gaussians
 from phyradgs_cl.fields.grid_choice import GridChoice
 from phyradgs_cl.fields.volume import Grid, triple
 
-__all__ = ["Activation", "Gaussians", "Grid", "GridChoice", "triple"]
+__all__ = ["Activation", "Deformation", "Gaussians", "Grid", "GridChoice", "control_points", "triple"]

@@ -1,3 +1,5 @@
+from .deformation import read_deformation as read_deformation
+from .deformation import write_deformation as write_deformation
 from .files import hashing as hashing
 from .files import sha256_of as sha256_of
 from .output import check_writable as check_writable

@@ -14,6 +14,7 @@ import numpy as np
 from phyradgs_cl import checks
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Gaussians, Grid, triple
+from phyradgs_cl.io.deformation import DEFORMATION
 from phyradgs_cl.io.files import sha256_of
 from phyradgs_cl.io.hdf5 import datasets as h5
 from phyradgs_cl.io.hdf5.source import Hdf5Source, open_hdf5
@@ -149,7 +150,8 @@ def volume_summary(path: str | Path) -> dict[str, Any]:
 
 
 def file_kind(path: str | Path) -> str:
-    """Returns the kind of an HDF5 file: "scan", "volume" or "plain-volume" (a bare dataset /volume), else InputError."""
+    """Returns the kind of an HDF5 file: "scan", "volume", "plain-volume" (a bare dataset /volume) or "deformation", else
+    InputError."""
     with open_hdf5(path) as source:
         if isinstance(source.find(_DATA), h5py.Group):
             return "volume"
@@ -157,8 +159,10 @@ def file_kind(path: str | Path) -> str:
             return "plain-volume"
         if any(source.find(f"{group}/instrument") is not None for group in source.root_groups()):
             return "scan"
+        if isinstance(source.find(DEFORMATION), h5py.Group):
+            return "deformation"
         members = ", ".join(sorted(source.file)) or "nothing"
-    expected = "a scan (/entry/instrument), a volume (/entry/reconstruction) or a dataset /volume"
+    expected = "a scan (/entry/instrument), a volume (/entry/reconstruction), a dataset /volume or /entry/deformation"
     raise InputError(f"{path}:/", f"members: {members}", expected, "check the path")
 
 

@@ -1,0 +1,206 @@
+"""A deforming object as a value: displacement fields of low rank in time, on tensor cubic B-splines in space.
+
+    w(y, t) = Σ_r φ_r(t) U_r(y),   U_r(y) = Σ_c control_c,r β³((y − origin) / spacing − c)
+
+Pull convention: at time t the object has, at point y, the attenuation that the reference volume has at y + w(y, t).
+D. Rueckert et al., Nonrigid registration using free-form deformations, IEEE Trans. Med. Imaging 18, 712-721 (1999)."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy
+from numpy.typing import ArrayLike
+
+from phyradgs_cl import checks
+from phyradgs_cl.errors import InputError
+from phyradgs_cl.fields.volume import Grid
+
+_LEVELS = 64  # steps of a weight's range among which the folding check tells states apart
+_MOST_STEPS = 200  # of the fixed point: enough for a contraction of 0.93
+_CLOSE = 1e-6  # of the smallest control spacing: where the fixed point ends
+
+
+@dataclass(frozen=True, eq=False)
+class Deformation:
+    """How an object moves and deforms during a scan.
+
+    control_mm: (R, nz, ny, nx, 3) coefficients of the fields U_r, components x, y, z. Coefficients outside of the array are
+    0, so the field falls smoothly to 0 within two spacings beyond the outermost control points.
+    origin_mm: the control point (0, 0, 0), x, y, z. spacing_mm: of the control points, one length or three (x, y, z).
+    times_s: (T,) rising, on the clock of ``Scan.frame_start_s``. weights: (T, R) φ_r at these times, linear between two of
+    them, constant before the first and after the last. A field of unit weight has its displacements in mm.
+
+    Raises InputError for other shapes, values that are not finite, lengths that are not above 0, and times that do not
+    rise."""
+
+    control_mm: np.ndarray
+    origin_mm: tuple[float, float, float]
+    spacing_mm: float | tuple[float, float, float]
+    times_s: np.ndarray
+    weights: np.ndarray
+
+    def __post_init__(self) -> None:
+        control_mm = checks.numbers("deformation control_mm", self.control_mm, (None, None, None, None, 3))
+        if 0 in control_mm.shape:
+            raise InputError("deformation control_mm", f"shape {control_mm.shape}", "at least one field and control point")
+        origin_mm = checks.numbers("deformation origin_mm", self.origin_mm, (3,))
+        spacing_mm = checks.numbers("deformation spacing_mm", np.broadcast_to(self.spacing_mm, 3), (3,))
+        if (spacing_mm <= 0).any():
+            raise InputError("deformation spacing_mm", str(self.spacing_mm), "lengths above 0")
+        times_s = checks.numbers("deformation times_s", self.times_s, (None,))
+        if len(times_s) == 0 or (np.diff(times_s) <= 0).any():
+            raise InputError("deformation times_s", checks.short_repr(times_s.tolist()), "at least one time, rising")
+        weights = checks.numbers("deformation weights", self.weights, (len(times_s), len(control_mm)))
+        object.__setattr__(self, "control_mm", control_mm)
+        object.__setattr__(self, "origin_mm", tuple(origin_mm.tolist()))
+        object.__setattr__(self, "spacing_mm", tuple(spacing_mm.tolist()))
+        object.__setattr__(self, "times_s", times_s)
+        object.__setattr__(self, "weights", weights)
+
+    def __repr__(self) -> str:
+        rank, nz, ny, nx, _ = self.control_mm.shape
+        return f"Deformation(rank {rank}, {nz} x {ny} x {nx} control points, {len(self.times_s)} times)"
+
+    @property
+    def rank(self) -> int:
+        """The number of fields R."""
+        return len(self.control_mm)
+
+    @property
+    def reach_mm(self) -> np.ndarray:
+        """Bounds (R,) of the displacements of fields of unit weight: the longest control vector of each."""
+        return np.asarray(np.linalg.norm(self.control_mm, axis=-1).max(axis=(1, 2, 3)))
+
+    def weights_at(self, times_s: "ArrayLike") -> np.ndarray:
+        """Returns φ_r (n, R) at times (n,) in s."""
+        times = np.atleast_1d(np.asarray(times_s, np.float64))
+        return np.stack([np.interp(times, self.times_s, column) for column in self.weights.T], -1)
+
+    def displacement_mm(self, points_mm: "ArrayLike", weights: "ArrayLike") -> np.ndarray:
+        """Returns w (n, 3) float64 in mm at points (n, 3), x y z, for one state's weights (R,)."""
+        control_mm = self._state(weights)
+        place = self._in_spacings(np.asarray(points_mm, np.float64)).T[::-1]
+        components = [
+            scipy.ndimage.map_coordinates(control_mm[..., i], place, order=3, prefilter=False, mode="grid-constant")
+            for i in range(3)
+        ]
+        return np.stack(components, -1)
+
+    def jacobian(self, points_mm: "ArrayLike", weights: "ArrayLike") -> np.ndarray:
+        """Returns ∂w_i/∂y_j (n, 3, 3) at points (n, 3), x y z, for one state's weights (R,)."""
+        control_mm = self._state(weights)
+        place = self._in_spacings(np.asarray(points_mm, np.float64))
+        first = np.floor(place).astype(np.int64) - 1  # of the four control points along an axis that reach the point
+        bases = [[_cubic(place - first - k), _cubic_slope(place - first - k) / self.spacing_mm] for k in range(4)]
+        shape = np.array(control_mm.shape[2::-1])  # x, y, z
+        result = np.zeros((len(place), 3, 3))
+        for taps in np.ndindex(4, 4, 4):  # of x, y, z
+            index = first + taps
+            inside = ((index >= 0) & (index < shape)).all(axis=1)
+            x, y, z = np.where(inside[:, None], index, 0).T
+            vectors = control_mm[z, y, x] * inside[:, None]
+            for j in range(3):
+                factors = [bases[taps[i]][int(i == j)][:, i] for i in range(3)]
+                result[:, :, j] += vectors * np.prod(factors, axis=0)[:, None]
+        return result
+
+    def on_grid_mm(self, grid: Grid, weights: "ArrayLike") -> np.ndarray:
+        """Returns w (nz, ny, nx, 3) float32 in mm at the voxel centres of ``grid``, components x, y, z, for one state."""
+        along_z, along_y, along_x = self._bases(grid)
+        rows = np.einsum("zk,kyxi->zyxi", along_z, self._state(weights), optimize=True)
+        planes = np.einsum("yk,zkxi->zyxi", along_y, rows, optimize=True).astype(np.float32)
+        return np.einsum("xk,zyki->zyxi", along_x.astype(np.float32), planes, optimize=True)
+
+    def inverse_on_grid_mm(self, grid: Grid, weights: "ArrayLike") -> np.ndarray:
+        """Returns u (nz, ny, nx, 3) float32 in mm with u(x) = −w(x + u(x)): matter at x of the reference is at x + u(x).
+
+        Fixed point from u = 0. Raises InputError where it does not converge, for example
+        because the field folds."""
+        points_mm = _centres_mm(grid)
+        moved_mm = np.zeros_like(points_mm)
+        for _ in range(_MOST_STEPS):
+            next_mm = -self.displacement_mm(points_mm + moved_mm, weights)
+            change_mm, moved_mm = np.abs(next_mm - moved_mm).max(), next_mm
+            if change_mm < _CLOSE * np.min(self.spacing_mm):
+                return moved_mm.reshape(*grid.shape, 3).astype(np.float32)
+        found = f"no inverse: its points still move {change_mm:.3g} mm after {_MOST_STEPS} steps"
+        raise InputError("deformation", found, "a field whose gradient stays below 1", "use a smoother or smaller field")
+
+    def smallest_determinant(self, grid: Grid | None = None) -> float:
+        """Returns the smallest det(I + ∂w/∂y) over the voxel centres of ``grid`` and the states of ``times_s``; matter folds
+        where it is not above 0. Without a grid: points at half the spacing of the control points. Weights are rounded to a
+        64th of each field's largest."""
+        grid = grid or self._half_spacing_grid()
+        slopes = np.stack([self._slopes(grid, control_mm) for control_mm in self.control_mm])  # (R, 3, 3, n)
+        step = np.maximum(np.abs(self.weights).max(axis=0) / _LEVELS, np.finfo(float).tiny)
+        states = np.unique(np.round(self.weights / step), axis=0) * step
+        smallest = np.inf
+        for weights in states:
+            smallest = min(smallest, float(_determinant(np.tensordot(weights, slopes, 1)).min()))
+        return smallest
+
+    def _state(self, weights: "ArrayLike") -> np.ndarray:
+        """Returns the control vectors (nz, ny, nx, 3) of the state with these weights (R,)."""
+        return np.tensordot(checks.numbers("weights", weights, (self.rank,)), self.control_mm, 1)
+
+    def _in_spacings(self, points_mm: np.ndarray) -> np.ndarray:
+        return (points_mm - self.origin_mm) / self.spacing_mm
+
+    def _bases(self, grid: Grid, slope_along: int | None = None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Returns β³ (voxels, control points) along z, y and x; its slope in 1/mm along ``slope_along`` (0: z)."""
+        matrices = []
+        spacing_mm = np.broadcast_to(self.spacing_mm, 3)
+        for axis, centres_mm in enumerate(grid.axes_mm()):
+            origin_mm, step_mm = self.origin_mm[2 - axis], float(spacing_mm[2 - axis])
+            count = self.control_mm.shape[1 + axis]
+            offset = (centres_mm[:, None] - origin_mm) / step_mm - np.arange(count)
+            matrices.append(_cubic_slope(offset) / step_mm if axis == slope_along else _cubic(offset))
+        return matrices[0], matrices[1], matrices[2]
+
+    def _slopes(self, grid: Grid, control_mm: np.ndarray) -> np.ndarray:
+        """Returns ∂U_i/∂y_j (3, 3, n) at the voxel centres of a grid, for one field's control vectors."""
+        result = np.empty((3, 3, int(np.prod(grid.shape))), np.float32)
+        for j in range(3):
+            along = self._bases(grid, 2 - j)
+            values = np.einsum("zk,yl,xm,klmi->izyx", *along, control_mm, optimize=True)
+            result[:, j] = values.reshape(3, -1)
+        return result
+
+    def _half_spacing_grid(self) -> Grid:
+        spacing_mm = np.broadcast_to(self.spacing_mm, 3)[::-1]
+        counts = np.array(self.control_mm.shape[1:4])
+        shape = 2 * (counts + 3) + 1  # two more spacings on either side, where the field falls to 0
+        centre_mm = np.array(self.origin_mm)[::-1] + spacing_mm * (counts - 1) / 2
+        return Grid(tuple(shape.tolist()), tuple((spacing_mm / 2).tolist()), tuple(centre_mm.tolist()))
+
+
+def control_points(grid: Grid, spacing_mm: float) -> tuple[tuple[float, float, float], tuple[int, int, int]]:
+    """Returns origin x, y, z in mm and counts (nz, ny, nx) of control points that cover a grid: the outermost stand at least
+    one spacing outside of it, so that four of them along each axis reach every point."""
+    counts = [int(np.ceil(side_mm / spacing_mm)) + 3 for side_mm in grid.size_mm]
+    first_mm = [middle - (n - 1) / 2 * spacing_mm for middle, n in zip(grid.offset_mm, counts, strict=True)]
+    return (first_mm[2], first_mm[1], first_mm[0]), (counts[0], counts[1], counts[2])
+
+
+def _centres_mm(grid: Grid) -> np.ndarray:
+    """Returns the voxel centres (n, 3), x y z, of a grid in the order of its array."""
+    z, y, x = np.meshgrid(*grid.axes_mm(), indexing="ij")
+    return np.stack([x.ravel(), y.ravel(), z.ravel()], -1)
+
+
+def _cubic(offset: np.ndarray) -> np.ndarray:
+    """Returns the centred cubic B-spline β³ at offsets in spacings; 0 beyond ±2."""
+    size = np.abs(offset)
+    return np.asarray(np.maximum(2 - size, 0) ** 3 - 4 * np.maximum(1 - size, 0) ** 3) / 6
+
+
+def _cubic_slope(offset: np.ndarray) -> np.ndarray:
+    """Returns the derivative of β³ at offsets in spacings."""
+    size = np.abs(offset)
+    return np.asarray(-np.sign(offset) * (np.maximum(2 - size, 0) ** 2 - 4 * np.maximum(1 - size, 0) ** 2)) / 2
+
+
+def _determinant(slopes: np.ndarray) -> np.ndarray:
+    """Returns det(I + slopes) (n,) of slopes (3, 3, n)."""
+    (a, b, c), (d, e, f), (g, h, i) = slopes + np.eye(3)[:, :, None]
+    return np.asarray(a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g))

@@ -1,0 +1,64 @@
+"""Files of deformations: how an object moves, in a separate HDF5 file or inside a scan file."""
+
+from pathlib import Path
+
+import h5py
+
+from phyradgs_cl.errors import InputError
+from phyradgs_cl.fields import Deformation, triple
+from phyradgs_cl.io.hdf5 import datasets as h5
+from phyradgs_cl.io.hdf5.source import Hdf5Source, open_hdf5
+
+DEFORMATION = "/entry/deformation"
+_MEANS = "at time t the object has, at point y, the attenuation of the reference volume at y + sum_r weights_r(t) U_r(y)"
+
+
+def write_deformation(path: str | Path, deformation: Deformation) -> None:
+    """Writes a file with one deformation, whole or not at all. OutputError: the file cannot be written."""
+    with h5.new_hdf5(path, deformation.control_mm.nbytes + deformation.weights.nbytes) as file:
+        write_deformation_group(h5.new_group(file, "entry", "NXentry"), deformation)
+
+
+def read_deformation(path: str | Path) -> Deformation:
+    """Reads a deformation file, or the true deformation of a simulated scan. Raises InputError, about the HDF5
+    path, for missing values, shapes that do not fit, unknown units, values that are not finite, and matter that folds."""
+    with open_hdf5(path) as source:
+        places = [name for name in (DEFORMATION, *_in_scans(source)) if source.find(name) is not None]
+        if not places:
+            expected = f"a group {DEFORMATION}, or a scan simulated with --motion-of-object"
+            raise source.error("/", "members: " + (", ".join(sorted(source.file)) or "nothing"), expected)
+        return read_deformation_group(source, places[0])
+
+
+def write_deformation_group(parent: h5py.Group, deformation: Deformation) -> None:
+    """Writes a group ``deformation`` with the control points' vectors, their place, times and weights."""
+    group = h5.new_group(parent, "deformation", "NXcollection")
+    group.attrs["description"] = _MEANS
+    h5.write_number(group, "control", deformation.control_mm, "mm", axes="field, z, y, x, component (x y z)")
+    h5.write_number(group, "origin", deformation.origin_mm, "mm", axes="x, y, z")
+    h5.write_number(group, "spacing", deformation.spacing_mm, "mm", axes="x, y, z")
+    h5.write_number(group, "times", deformation.times_s, "s")
+    h5.write_number(group, "weights", deformation.weights, axes="time, field")
+
+
+def read_deformation_group(source: Hdf5Source, address: str) -> Deformation:
+    """Reads and checks the group at ``address``."""
+    source.group(address)
+    control_mm = h5.read_array(source, f"{address}/control", (None, None, None, None, 3), h5.LENGTH)
+    origin_mm = h5.read_array(source, f"{address}/origin", (3,), h5.LENGTH)
+    spacing_mm = h5.read_array(source, f"{address}/spacing", (3,), h5.LENGTH)
+    times_s = h5.read_array(source, f"{address}/times", (None,), h5.TIME)
+    weights = h5.read_array(source, f"{address}/weights", (len(times_s), len(control_mm)))
+    try:
+        deformation = Deformation(control_mm, triple(origin_mm.tolist()), triple(spacing_mm.tolist()), times_s, weights)
+    except InputError as error:
+        raise source.error(address, f"{error.subject}: {error.found}", error.expected, error.remedy) from error
+    determinant = deformation.smallest_determinant()
+    if not determinant > 0:
+        found = f"matter that folds (the smallest determinant of the map is {determinant:.3g})"
+        raise source.error(address, found, "determinants above 0", "use a smoother or smaller field")
+    return deformation
+
+
+def _in_scans(source: Hdf5Source) -> list[str]:
+    return [f"{name}/phyradgs/reference/deformation" for name in source.root_groups()]

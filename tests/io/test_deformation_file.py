@@ -1,0 +1,82 @@
+"""Files of deformations: the same values back, and one line about the HDF5 path of any damage."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+
+from phyradgs_cl.errors import InputError
+from phyradgs_cl.fields import Deformation
+from phyradgs_cl.io import file_kind, read_deformation, write_deformation
+
+GROUP = "/entry/deformation"
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    control_mm = np.random.default_rng(0).normal(size=(2, 3, 4, 5, 3)) * 0.1
+    field = Deformation(control_mm, (1.0, 2.0, 3.0), (4.0, 5.0, 6.0), np.array([0.0, 1.5, 9.0]), np.eye(3, 2))
+    write_deformation(tmp_path / "field.h5", field)
+    return tmp_path / "field.h5"
+
+
+def test_values_come_back_in_mm_and_s(path: Path) -> None:
+    before = read_deformation(path)
+    with h5py.File(path, "r+") as file:
+        times = file[f"{GROUP}/times"]
+        times[...], times.attrs["units"] = times[...] * 1000, "ms"
+        spacing = file[f"{GROUP}/spacing"]
+        spacing[...], spacing.attrs["units"] = spacing[...] / 10, "cm"
+    after = read_deformation(path)
+    assert file_kind(path) == "deformation"
+    assert after.origin_mm == (1.0, 2.0, 3.0)
+    for name in ("control_mm", "spacing_mm", "times_s", "weights"):
+        np.testing.assert_allclose(getattr(after, name), getattr(before, name), rtol=1e-15)
+
+
+def _without(name: str) -> Callable[[h5py.Group], None]:
+    return lambda group: group.__delitem__(name)
+
+
+def _with(name: str, value: object) -> Callable[[h5py.Group], None]:
+    def change(group: h5py.Group) -> None:
+        attributes = dict(group[name].attrs)
+        del group[name]
+        group[name] = value
+        group[name].attrs.update(attributes)
+
+    return change
+
+
+def _folded(group: h5py.Group) -> None:
+    group["control"][0, 1, 1, 1] = [0.0, 0.0, 60.0]
+
+
+@pytest.mark.parametrize(("damage", "subject", "found"), [
+    (_without("control"), "/control", "nothing there"),
+    (_without("weights"), "/weights", "nothing there"),
+    (_with("control", np.zeros((2, 3, 4, 5))), "/control", "shape"),
+    (_with("origin", np.zeros(2)), "/origin", "shape"),
+    (_with("spacing", np.array([4.0, 0.0, 6.0])), "deformation", "spacing_mm"),
+    (_with("times", np.array([0.0, 3.0, 1.0])), "deformation", "times_s"),
+    (_with("weights", np.zeros((2, 2))), "/weights", "shape"),
+    (_with("weights", np.full((3, 2), np.nan)), "/weights", "NaN"),
+    (lambda group: group["times"].attrs.modify("units", "mm"), "/times @units", "'mm'"),
+    (_folded, "deformation", "folds"),
+])  # fmt: skip
+def test_damage_is_named_in_one_line(path: Path, damage: Callable[[h5py.Group], None], subject: str, found: str) -> None:
+    with h5py.File(path, "r+") as file:
+        damage(file[GROUP])
+    with pytest.raises(InputError) as caught:
+        read_deformation(path)
+    assert caught.value.subject.endswith(subject)
+    assert found in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_other_files_are_no_deformation(tmp_path: Path) -> None:
+    with h5py.File(tmp_path / "other.h5", "w") as file:
+        file["volume"] = np.ones((2, 2, 2))
+    with pytest.raises(InputError, match="expected a group /entry/deformation"):
+        read_deformation(tmp_path / "other.h5")
