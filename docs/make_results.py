@@ -51,7 +51,7 @@ def rows_of(name: str) -> dict[tuple[str, str, str], Row]:
         return {(row["protocol"], row["row"], row["acquisition"]): row for row in csv.DictReader(file)}
 
 
-def quality(name: str, protocol: str) -> str:
+def quality(name: str, protocol: str, with_seconds: bool = False) -> str:
     """PSNR and SSIM of every method: motion ignored, motion known, and of a scan that stops for each projection."""
     rows = rows_of(name)
     text = []
@@ -63,9 +63,9 @@ def quality(name: str, protocol: str) -> str:
         gain = f"{number(cells[1]) - number(cells[0]):+.2f}" if comparable else "–"
         bound = rows.get((protocol, still, "stop-and-shoot"))
         seconds = " / ".join(seconds_of(cell) for cell in cells)
-        text.append([label, *(both(cell) for cell in cells), gain, both(bound), seconds])
-    heads = ["method", "motion ignored", "motion known", "gain", "stop-and-shoot", "processor s ignored / known"]
-    return markdown(heads, text)
+        text.append([label, *(both(cell) for cell in cells), gain, both(bound), *([seconds] if with_seconds else [])])
+    heads = ["method", "motion ignored", "motion known", "gain", "stop-and-shoot"]
+    return markdown([*heads, "processor s ignored / known"] if with_seconds else heads, text)
 
 
 def number(row: Row, name: str = "psnr_db") -> float:
@@ -77,7 +77,7 @@ def both(row: Row | None) -> str:
     """PSNR and SSIM as the pages print them, with the spread of the PSNR over seeds where there is one."""
     if row is None:
         return "–"
-    few = f" ({row['volumes']} volumes)" if row["volumes"] == "2" and row["size"] == "M" else ""
+    few = "†" if row["volumes"] == "2" and row["size"] == "M" else ""
     spread = f" ± {float(row['psnr_db_spread']):.2f}" if row["psnr_db_spread"] else ""
     return f"{number(row):.2f}{spread} / {number(row, 'ssim'):.3f}{few}"
 
@@ -149,7 +149,7 @@ def detector_models() -> str:
 
 
 def sweep(name: str, held_out: bool) -> str:
-    """PSNR with the default of an option, with the best one factor for all volumes, and with each volume's own best."""
+    """PSNR with the default of an option, and with the best one factor for all volumes; means over volumes."""
     scans: dict[tuple[Any, ...], dict[str, dict[float, dict[str, Any]]]] = {}
     for line in lines_of(name):
         key = (line["kind"], line["views"], int(line["dose"]), line["size"], line["pixels"])
@@ -160,14 +160,13 @@ def sweep(name: str, held_out: bool) -> str:
         volumes = {name: by for name, by in volumes.items() if len(by) == len(factors)}  # a sweep may be half made
         of_factor = {factor: mean(by[factor]["psnr_db"] for by in volumes.values()) for factor in factors}
         best = max(of_factor, key=of_factor.__getitem__)
-        own = mean(max(by[factor]["psnr_db"] for factor in factors) for by in volumes.values())
-        cells = [kind, str(views), str(dose), f"{size}³, {pixels}²", str(len(volumes)), f"{of_factor[1.0]:.2f}"]
-        cells += [f"{of_factor[best]:.2f} (×{best:g})", f"{own:.2f}"]
+        cells = [kind, str(views), str(dose), f"{size}³, {pixels}²", f"{of_factor[1.0]:.2f}"]
+        cells.append(f"{of_factor[best]:.2f} (×{best:g})")
         if held_out:
             least = [min(by.values(), key=lambda line: line["holdout_rms"])["psnr_db"] for by in volumes.values()]
             cells.append(f"{mean(least):.2f}")
         text.append(cells)
-    heads = ["scan", "views", "photons", "voxels, pixels", "volumes", "default", "best factor for all", "each volume's best"]
+    heads = ["scan", "views", "photons", "voxels, pixels", "default", "best factor for all"]
     return markdown([*heads, "least held-out error"] if held_out else heads, text)
 
 
@@ -203,50 +202,76 @@ def ray_motions() -> str:
     return markdown(["motion", "EPYC: forward", "adjoint", "Xeon: forward", "adjoint"], text)
 
 
-def before_after() -> str:
-    """Methods and splats before and after the fast kernels of fly-scans and inlined built-ins."""
+def whole_runs() -> str:
+    """Processor time and PSNR of methods, and an iteration of splats."""
     text = []
     for x in lines_of("before_after_intel.jsonl"):
         (kind,) = {key for key in x["before"] if key != "psnr_db"}
-        unit = "ms an iteration" if kind == "iteration_ms" else "processor s"
-        cells = []
-        for when in ("before", "after"):
-            quality_db = x[when].get("psnr_db")
-            cells.append(f"{x[when][kind]:.1f}" + (f" ({quality_db:.2f} dB)" if quality_db is not None else ""))
-        text.append([x["case"], unit, *cells, f"{x['times_as_fast']:.1f}"])
-    return markdown(["run", "unit", "before", "now", "times as fast"], text)
+        time = f"{x['after'][kind]:.1f} " + ("ms an iteration" if kind == "iteration_ms" else "s")
+        text.append([x["case"], time, f"{x['after']['psnr_db']:.2f}" if "psnr_db" in x["after"] else ""])
+    return markdown(["run", "processor time", "PSNR, dB"], text)
 
 
 def estimates() -> str:
-    """What ``estimate`` said over what the run then took."""
+    """Time and memory that ``estimate`` said, over those that the run then took."""
     text = []
     for run in json.loads((RESULTS / "estimates.json").read_text())["runs"]:
         ratio = run["ratio"]
         shares = [f"{ratio[key]:.2f}" for key in ("seconds", "host_bytes", "device_bytes")]
-        text.append([run["method"], f"{run['said']['seconds']:.1f}", f"{run['happened']['seconds']:.1f}", *shares])
-    return markdown(["method", "estimate, s", "taken, s", "ratio", "host memory", "device buffers"], text)
+        text.append([run["method"], f"{run['happened']['seconds']:.1f}", *shares])
+    return markdown(["method", "taken, s", "time", "host memory", "device buffers"], text)
 
 
-def prepared(name: str) -> str:
-    """What the steps of ``prepare`` give back: decibels that an effect costs, and the part of them that returns."""
-    lines = [line for line in lines_of(name) if "regained" in line and not line["effect"].startswith("a third")]
-    methods = [method for method in ("fdk", "fista-tv", "phyradgs") if any(line["method"] == method for line in lines)]
-    cells: dict[tuple[str, str], dict[str, dict[str, Any]]] = {}
-    for line in lines:
-        cells.setdefault((line["effect"], line["phantom"]), {})[line["method"]] = line
+def prepared() -> str:
+    """What the steps of ``prepare`` give back, by effect and size: decibels lost, and the part of them that returns.
+
+    Both from the least to the most of all volumes."""
+    cells: dict[tuple[str, int], dict[str, list[dict[str, Any]]]] = {}
+    for line in _prepared_lines():
+        by_method = cells.setdefault((line["effect"], line["size"]), {})
+        by_method.setdefault(line["method"], []).append(line)
     text = []
-    for (effect, phantom), by_method in cells.items():
-        shown = [_regained(by_method.get(method)) for method in methods]
-        text.append([effect, phantom.removesuffix("_128"), *shown])
-    return markdown(["effect", "volume", *methods], text)
+    for (effect, size), by_method in sorted(cells.items()):
+        volumes = len({line["phantom"] for lines in by_method.values() for line in lines})
+        shown = [_losses(by_method.get(method, [])) for method in PREPARED_METHODS]
+        text.append([effect, f"{size}³", str(volumes), *shown])
+    return markdown(["effect", "voxels", "volumes", *PREPARED_METHODS], text)
 
 
-def _regained(line: dict[str, Any] | None) -> str:
+def prepared_hardening() -> str:
+    """The part of the decibels lost by hardening that returns, of every volume."""
+    cells: dict[tuple[str, int], dict[str, str]] = {}
+    for line in _prepared_lines():
+        if line["effect"] == "120 kVp, bone":
+            cells.setdefault((line["phantom"].removesuffix("_128"), line["size"]), {})[line["method"]] = _losses([line])
+    text = [[name, f"{size}³", *(by[method] for method in PREPARED_METHODS)] for (name, size), by in sorted(cells.items())]
+    return markdown(["volume", "voxels", *PREPARED_METHODS], text)
+
+
+PREPARED_METHODS = ("fdk", "fista-tv", "phyradgs")
+
+
+def _prepared_lines() -> list[dict[str, Any]]:
+    """The lines of all runs of ``prepare``, each with the size of its volume."""
+    found = []
+    for name in ("prepare", "prepare_volumes", "prepare_fresh", "prepare_64"):
+        head, *lines = lines_of(f"{name}.jsonl")
+        found += [line | {"size": head["size"]} for line in lines if "regained" in line]
+    return [line for line in found if not line["effect"].startswith("a third")]
+
+
+def _losses(lines: Sequence[dict[str, Any]]) -> str:
     """The loss in dB and the part of it that returns; the part of a loss below 0.1 dB says nothing."""
-    if line is None:
+    if not lines:
         return ""
-    lost_db = line["clean"] - line["spoilt"]
-    return f"{lost_db:.2f}" + (f", {100 * line['regained']:.0f} %" if lost_db > 0.1 else "")
+    losses_db = [line["clean"] - line["spoilt"] for line in lines]
+    parts = [100 * line["regained"] for line, lost_db in zip(lines, losses_db, strict=True) if lost_db > 0.1]
+    return _range(losses_db, ".2f") + (f"; {_range(parts, '.0f')} %" if parts else "")
+
+
+def _range(values: Sequence[float], form: str) -> str:
+    least, most = (f"{value:{form}}" for value in (min(values), max(values)))
+    return least if least == most else f"{least} to {most}" if min(values) < 0 else f"{least}–{most}"
 
 
 def clean_scans() -> str:
@@ -266,23 +291,32 @@ def clean_scans() -> str:
 
 
 def stripes() -> str:
-    """PSNR with stripes, and after steps of ``prepare``; of the clean scan in the rows "none"."""
-    cells: dict[tuple[str, str, str], dict[str, float]] = {}
-    for line in lines_of("stripes.jsonl"):
-        cells.setdefault((line["stripes"], line["object"], str(line["views"])), {})[line["steps"]] = line["psnr_db"]
+    """PSNR with stripes, and after steps of ``prepare``; of the clean scan in the rows "none". At most views recorded."""
+    cells: dict[tuple[str, str], dict[str, float]] = {}
+    lines = lines_of("stripes.jsonl")
+    views = max(line["views"] for line in lines)
+    for line in lines:
+        if line["views"] == views:
+            cells.setdefault((line["stripes"], line["object"]), {})[line["steps"]] = line["psnr_db"]
     steps = ["", "dead,rings", "stripes", "dead,rings,stripes", "every column"]
     text = [[*key, *(f"{by_steps[name]:.2f}" for name in steps)] for key, by_steps in cells.items()]
-    heads = ["stripes", "object", "views", "no step", *(f"`{name}`" for name in steps[1:4]), "`stripes`, `ratio=0`"]
-    return markdown(heads, text)
+    return markdown(["stripes", "object", "no step", *(f"`{name}`" for name in steps[1:4]), "`stripes`, `ratio=0`"], text)
+
+
+def calibrate_lines() -> list[dict[str, Any]]:
+    """The recorded calibrations of every case on its finest grid."""
+    lines = lines_of("calibrate.jsonl")
+    finest = {line["case"]: max(other["size"] for other in lines if other["case"] == line["case"]) for line in lines}
+    return [line for line in lines if line["size"] == finest[line["case"]]]
 
 
 def calibrated_parameters() -> str:
     """The worst error of every parameter with two runs or more, the stated σ, and how often 2 σ held the truth."""
     cells: dict[tuple[Any, ...], list[dict[str, Any]]] = {}
-    for line in lines_of("calibrate.jsonl"):
+    for line in calibrate_lines():
         for one in line["parameters"]:
             if one.get("error") is not None:
-                key = (line["case"], f"{line['size']}, {line['views']}", one["name"], one["unit"])
+                key = (line["case"], line["size"], one["name"], one["unit"])
                 cells.setdefault(key, []).append(one)
     text = []
     for (case, size, name, unit), found in cells.items():
@@ -291,14 +325,14 @@ def calibrated_parameters() -> str:
         worst = max(abs(one["error"]) for one in found)
         inside = sum(abs(one["z"]) <= 2 for one in found)
         sigma = mean(one["deviation"] for one in found)
-        text.append([case, size, name, f"{worst:.2g} {unit}", f"{sigma:.2g}", f"{inside} of {len(found)}"])
-    return markdown(["case", "voxels, views", "parameter", "worst error", "σ stated", "within 2 σ"], text)
+        text.append([case, f"{size}³", name, f"{worst:.2g} {unit}", f"{sigma:.2g}", f"{inside} of {len(found)}"])
+    return markdown(["case", "voxels", "parameter", "worst error", "σ stated", "within 2 σ"], text)
 
 
 def calibrated_psnr() -> str:
     """PSNR with the stated, the calibrated and the right geometry."""
     cells: dict[tuple[Any, ...], list[dict[str, Any]]] = {}
-    for line in lines_of("calibrate.jsonl"):
+    for line in calibrate_lines():
         if "stated" in line.get("psnr_db", {}) and not line["case"].startswith("draw"):
             cells.setdefault((line["case"], f"{line['size']}, {line['views']}"), []).append(line["psnr_db"])
     text = []
@@ -337,7 +371,7 @@ def parallel_fly() -> str:
 
 
 TABLES: dict[str, Callable[[], str]] = {
-    "table1_S_rapid": lambda: quality("table1_S.csv", "rapid"),
+    "table1_S_rapid": lambda: quality("table1_S.csv", "rapid", with_seconds=True),
     "table1_S_standard": lambda: quality("table1_S.csv", "standard"),
     "table1_S_columns": lambda: quality("table1_S_columns.csv", "rapid"),
     "table1_M_rapid": lambda: quality("table1_M.csv", "rapid"),
@@ -350,12 +384,10 @@ TABLES: dict[str, Callable[[], str]] = {
     "passes": lambda: sweep("passes.jsonl", held_out=True),
     "beside_rtk": beside_rtk,
     "ray_motions": ray_motions,
-    "before_after": before_after,
+    "whole_runs": whole_runs,
     "estimates": estimates,
-    "prepare": lambda: prepared("prepare.jsonl"),
-    "prepare_volumes": lambda: prepared("prepare_volumes.jsonl"),
-    "prepare_fresh": lambda: prepared("prepare_fresh.jsonl"),
-    "prepare_64": lambda: prepared("prepare_64.jsonl"),
+    "prepare": prepared,
+    "prepare_hardening": prepared_hardening,
     "prepare_clean": clean_scans,
     "stripes": stripes,
     "calibrated_parameters": calibrated_parameters,
