@@ -17,7 +17,7 @@ from phyradgs_cl.errors import DeviceError, OutOfMemoryError
 from phyradgs_cl.fields import Activation, Grid
 from phyradgs_cl.fields.gaussians import DENSITY, MEAN, QUATERNION, SCALE
 from phyradgs_cl.objective import terms
-from phyradgs_cl.objective.dct_prox import DctProx, dct_prox
+from phyradgs_cl.objective.dct_prox import FREQUENCY_CLASSES, Curves, DctProx, dct_prox
 from phyradgs_cl.objective.nonlocal_step import LARGEST, NonlocalStep, likeness_of, nonlocal_step
 from phyradgs_cl.objective.tv import TvDescent, TvProx, tv_descent, tv_prox
 from phyradgs_cl.operators.splats.binning import TileLists
@@ -236,6 +236,9 @@ def _variation(rt: Runtime) -> Iterator[Comparison]:
     found = TvProx(rt, GRID.shape)(volume, 0.2, 4, nonnegative=True)
     yield found, tv_prox(volume, 0.2, 4, nonnegative=True), VALUE
     yield DctProx(rt, GRID.shape)(volume, 0.2, 1, nonnegative=True), dct_prox(volume, 0.2, 1, nonnegative=True), VALUE
+    curves = Curves(np.array([1.0, 4.0]), np.linspace(-0.5, 1, 2 * FREQUENCY_CLASSES).reshape(-1, 2))
+    shrunk = DctProx(rt, GRID.shape, curves)(volume, 0.2, 2, nonnegative=False)
+    yield shrunk, dct_prox(volume, 0.2, 2, nonnegative=False, curves=curves), VALUE
     smooth = NonlocalStep(rt, GRID.shape)
     smooth.learn(volume, 0.5)
     likeness = smooth.likeness

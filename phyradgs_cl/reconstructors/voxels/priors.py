@@ -95,7 +95,7 @@ class TvAndDct(Prior):
 
     def __call__(self, space: Space[Any], volume: Any, weight: float, *, nonnegative: bool) -> Any:
         smooth = self.tv(space, volume, weight, nonnegative=nonnegative)
-        shrink = partial(self.shrink, threshold=_DCT * weight, turn=self.turn, nonnegative=nonnegative)
+        shrink = partial(self.shrink, unit=_DCT * weight, turn=self.turn, nonnegative=nonnegative)
         self.turn = (self.turn + 1) % len(TURNS)
         return space.apply(shrink, smooth, self.tv.prox.shape)
 
