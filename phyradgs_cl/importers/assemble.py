@@ -165,13 +165,15 @@ def turn_of(pose: np.ndarray) -> Turned:
     return Turned(rows=bool(step_v[2] < 0), columns=bool(step_u @ right < 0))
 
 
-def table_over_time(pose_at: Callable[[np.ndarray], np.ndarray], timing: Timing, subject: str) -> PoseTable:
+def table_over_time(
+    pose_at: Callable[[np.ndarray], np.ndarray], timing: Timing, subject: str, is_parallel: bool = False
+) -> PoseTable:
     """Returns a pose table that covers every frame's window. ``pose_at``: poses (T, 12) at frame positions (T,), where 2.5
     is halfway from frame 2 to 3. A gantry at rest has each frame's pose at its middle."""
     if not timing.is_fly:
         at_s = np.asarray(timing.start_s) + timing.shutter.middle_s
         poses = pose_at(np.arange(len(at_s), dtype=np.float64))
-        return resting_poses(poses, at_s, timing.shutter.span_s, f"{subject} poses")
+        return resting_poses(poses, at_s, timing.shutter.span_s, f"{subject} poses", is_parallel)
     at_s = timing.angle_time_s
     span_s = timing.shutter.span_s
     before, after = at_s[0] - timing.start_s[0] + _SLACK * span_s, timing.start_s[-1] + span_s - at_s[-1]
@@ -183,7 +185,7 @@ def table_over_time(pose_at: Callable[[np.ndarray], np.ndarray], timing: Timing,
         np.arange(len(at_s)),
         [len(at_s) - 1 + (last - at_s[-1]) / (at_s[-1] - at_s[-2])],
     ])  # fmt: skip
-    return PoseTable(time_s, pose_at(position), f"{subject} poses")
+    return PoseTable(time_s, pose_at(position), f"{subject} poses", is_parallel)
 
 
 def assemble_scan(

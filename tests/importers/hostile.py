@@ -255,6 +255,7 @@ EXTERNAL = """<!DOCTYPE RTKGEOMETRY [<!ENTITY x SYSTEM "file:///etc/passwd">]>""
 DOCTYPE = "<!DOCTYPE RTKGEOMETRY>"
 SID, CURVED = "SourceToIsocenterDistance", "<RadiusCylindricalDetector>9</RadiusCylindricalDetector>"
 ONE_MORE = "<Projection><GantryAngle>1</GantryAngle></Projection>"
+PARALLEL = ONE_MORE.replace("</P", "<SourceToDetectorDistance>0</SourceToDetectorDistance></P")
 XML, MHA = "geometry.xml", "projections.mha"
 RTK: dict[str, tuple[Damage, tuple[str, ...]]] = {
     "entities": (in_text(XML, DOCTYPE, ENTITIES), ("DOCTYPE",)),
@@ -267,6 +268,7 @@ RTK: dict[str, tuple[Damage, tuple[str, ...]]] = {
     "no distance": (in_text(XML, f"{SID}>500.0</{SID}>", "X>1</X>"), (SID,)),
     "a distance of 0": (in_text(XML, "Distance>500.0<", "Distance>0<"), ("SourceToIsocenterDistance",)),
     "a detector before the axis": (in_text(XML, "Distance>800.0<", "Distance>80<"), ("SourceToDetectorDistance",)),
+    "a parallel beam in one projection": (in_text(XML, "</RTKThree", f"{PARALLEL}</RTKThree"), ("or 0 in all projections",)),
     "an angle that is text": (in_text(XML, "<GantryAngle>", "<GantryAngle>ten "), ("GantryAngle",)),
     "an infinite angle": (in_text(XML, "<GantryAngle>", "<GantryAngle>1e999"), ("GantryAngle",)),
     "a curved detector": (in_text(XML, "<Projection>", f"{CURVED}<Projection>"), ("Radius",)),

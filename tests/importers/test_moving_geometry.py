@@ -17,7 +17,8 @@ from phyradgs_cl.errors import InputError
 from phyradgs_cl.importers import ImportOptions, import_scan, recognise
 
 # Written by RTK 2.7: three projections, the third tilted about all axes with every offset in use.
-RTK_FILE = Path(__file__).with_name("data") / "rtk_tilted.xml"
+DATA = Path(__file__).with_name("data")
+RTK_FILE, RTK_PARALLEL = DATA / "rtk_tilted.xml", DATA / "rtk_parallel.xml"
 SPACING, ORIGIN = (2.5, 3.0), (-14.0, -16.5)
 FLY = ImportOptions(exposure_s=0.5, readout_s=0.25, frame_time_s=1.0)
 
@@ -39,17 +40,19 @@ def rtk_pixels(matrix: np.ndarray, points: np.ndarray) -> np.ndarray:
     return np.stack([(v / w - ORIGIN[1]) / SPACING[1], (u / w - ORIGIN[0]) / SPACING[0]], -1)
 
 
-def test_rtk_s_own_matrices_see_points_where_our_poses_do(rtk_folder) -> None:
+@pytest.mark.parametrize("file", [RTK_FILE, RTK_PARALLEL], ids=["cone", "parallel"])
+def test_rtk_s_own_matrices_see_points_where_our_poses_do(rtk_folder, file) -> None:
+    shutil.copy(file, rtk_folder / "geometry.xml")
     scan = import_scan(rtk_folder)
-    assert isinstance(scan.trajectory, PoseTable) and not scan.is_fly
-    texts = re.findall(r"<Matrix>(.*?)</Matrix>", RTK_FILE.read_text(), re.S)
+    assert isinstance(scan.trajectory, PoseTable) and not scan.is_fly and scan.is_parallel == (file == RTK_PARALLEL)
+    texts = re.findall(r"<Matrix>(.*?)</Matrix>", file.read_text(), re.S)
     for frame, text in enumerate(texts):
         matrix = np.array(text.split(), float).reshape(3, 4)
         for share in (0.0, 0.5, 1.0):
             at = scan.frame_start_s[frame] + share * scan.shutter.middle_s
             pose = scan.trajectory.pose(frame, np.array([at]))[0]
             expected = rtk_pixels(matrix, WORLD_POINTS)
-            np.testing.assert_allclose(projected(pose, WORLD_POINTS), expected, atol=1e-6)
+            np.testing.assert_allclose(projected(pose, WORLD_POINTS, scan.is_parallel), expected, atol=1e-6)
     np.testing.assert_array_equal(scan.projections[1, 2, :3], (140 + 28 + np.arange(3)) / 64)
 
 

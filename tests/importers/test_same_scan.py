@@ -44,7 +44,7 @@ SAME = {
 }  # fmt: skip
 
 
-SAID = "no source distance: a parallel beam"
+SAID = ": a parallel beam"
 OFFSET = {"detector_offset_mm": (4.0, -6.0)}
 # (format, motion, options, whether a line says that no distance is a parallel beam)
 PARALLEL = {
@@ -52,6 +52,7 @@ PARALLEL = {
     "data-exchange": ("data-exchange", {}, ImportOptions(**OFFSET), True),
     "data-exchange, moving": ("data-exchange", MOVING, replace(FLY, **OFFSET), True),
     "nxtomo": ("nxtomo", {}, ImportOptions(row_0="bottom"), True),
+    "rtk": ("rtk", {}, None, True), "rtk, moving": ("rtk", MOVING, FLY, True),
     "tiff": ("tiff", {}, None, False), "tiff, moving": ("tiff", MOVING, FLY, False),
 }  # fmt: skip
 

@@ -140,7 +140,8 @@ def write_phyradgs_real(folder: Path, truth: Any, centre_mm: tuple[float, float]
 def write_rtk(
     folder: Path, truth: Any, flip: bool = False, compressed: bool = False, name: str = "projections.mha"
 ) -> Path:
-    """RTK's XML with its constants at the top, and a stack by SimpleITK; ``flip`` stores rows from the top."""
+    """RTK's XML with its constants at the top, of a parallel beam without distances, and a stack by SimpleITK; ``flip``
+    stores rows from the top."""
     folder.mkdir()
     g = truth.scan.geometry
     (nv, nu), (dv, du), (off_v, off_u) = g.detector_shape, g.pixel_size_mm, g.detector_offset_mm
@@ -148,12 +149,14 @@ def write_rtk(
         f"  <Projection>\n    <GantryAngle>{np.rad2deg(a):.15g}</GantryAngle>\n  </Projection>\n"
         for a in truth.angle_rad
     )
+    distances = "" if truth.scan.is_parallel else (
+        f"  <SourceToIsocenterDistance>{g.source_to_axis_mm}</SourceToIsocenterDistance>\n"
+        f"  <SourceToDetectorDistance>{g.source_to_detector_mm}</SourceToDetectorDistance>\n"
+    )
     # a part of the offset in the geometry, the rest in the stack's own origin
     (folder / "geometry.xml").write_text(
         '<?xml version="1.0"?>\n<!DOCTYPE RTKGEOMETRY>\n<RTKThreeDCircularGeometry version="3">\n'
-        f"  <SourceToIsocenterDistance>{g.source_to_axis_mm}</SourceToIsocenterDistance>\n"
-        f"  <SourceToDetectorDistance>{g.source_to_detector_mm}</SourceToDetectorDistance>\n"
-        f"  <ProjectionOffsetX>{off_u}</ProjectionOffsetX>\n{angles}</RTKThreeDCircularGeometry>\n"
+        f"{distances}  <ProjectionOffsetX>{off_u}</ProjectionOffsetX>\n{angles}</RTKThreeDCircularGeometry>\n"
     )
     frames = truth.scan.projections
     stack = sitk.GetImageFromArray(np.ascontiguousarray(frames[:, ::-1] if flip else frames))

@@ -1,7 +1,9 @@
 """Scans of RTK: a geometry file (RTKThreeDCircularGeometry, version 3) and a stack of projections as MetaImage. The geometry
-has nine numbers per projection. XML entities and external files are refused: of DOCTYPEs only the empty one of RTK's own
-files passes."""
+has nine numbers per projection. A SourceToDetectorDistance of 0 is a parallel beam, in which RTK ignores source distance and
+source offsets; its writer leaves out numbers that are 0 everywhere. XML entities and external files are refused: of DOCTYPEs
+only the empty one of RTK's own files passes."""
 
+import logging
 import math
 import re
 from dataclasses import dataclass
@@ -13,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from phyradgs_cl import checks
 from phyradgs_cl.acquisition import CircularOrbit, PoseTable, Scan
-from phyradgs_cl.acquisition.geometry import Geometry, plain_geometry
+from phyradgs_cl.acquisition.geometry import Geometry, plain_geometry, towards_source
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.importers import assemble
 from phyradgs_cl.importers.options import TIMING, ImportOptions
@@ -21,6 +23,7 @@ from phyradgs_cl.importers.reading.files import SafeFolder, read_bytes
 from phyradgs_cl.importers.reading.frames import line_integrals
 from phyradgs_cl.importers.reading.images import STACKS, read_image
 
+_log = logging.getLogger(__name__)
 OPTIONS = (*TIMING, "quantity", "flat_value", "detector_model")
 ROOT = "RTKThreeDCircularGeometry"
 NAMES = (
@@ -28,14 +31,13 @@ NAMES = (
     *("SourceOffsetX", "SourceOffsetY", "ProjectionOffsetX", "ProjectionOffsetY"),
     *("InPlaneAngle", "OutOfPlaneAngle"),
 )
-_REQUIRED = ("SourceToIsocenterDistance", "SourceToDetectorDistance", "GantryAngle")
+_TO_AXIS, _TO_DETECTOR, _ANGLE = NAMES[:3]
 _ANGLES = ("GantryAngle", "InPlaneAngle", "OutOfPlaneAngle")
 _RADIUS = "RadiusCylindricalDetector"
 _DECLARATIONS = re.compile(rb"<!DOCTYPE[^>]*(SYSTEM|PUBLIC|\[)")
 _LARGEST = 1e9
 # RTK's axes (X, Y, Z) are (y, z, x) here: the same right-handed frame under other names.
 _TO_WORLD = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
-
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,16 +96,17 @@ def _trajectory(
     def stored(position: np.ndarray) -> np.ndarray:
         return rtk.poses(position, stack.origin_mm, stack.step_u_mm, stack.step_v_mm)
 
-    turn = assemble.turn_of(stored(np.zeros(1))[0])
+    first = stored(np.zeros(1))[0]
+    turn = assemble.turn_of(np.concatenate([towards_source(first, rtk.is_parallel), first[3:]]))
 
     def poses(position: np.ndarray) -> np.ndarray:
         return turn.poses(stored(position), panel)
 
     at_frames = poses(np.arange(rtk.frames, dtype=np.float64))
-    geometry = plain_geometry(at_frames, panel)
+    geometry = plain_geometry(at_frames, panel, rtk.is_parallel)
     if rtk.is_circular and stack.step_u_mm[1] == stack.step_v_mm[0] == 0:
-        return assemble.turning(geometry, rtk.values["GantryAngle"], timing), geometry, turn
-    return assemble.table_over_time(poses, timing, subject), geometry, turn
+        return assemble.turning(geometry, rtk.values[_ANGLE], timing), geometry, turn
+    return assemble.table_over_time(poses, timing, subject, rtk.is_parallel), geometry, turn
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,14 +117,20 @@ class RtkGeometry:
 
     @property
     def frames(self) -> int:
-        return len(self.values["GantryAngle"])
+        return len(self.values[_ANGLE])
+
+    @property
+    def is_parallel(self) -> bool:
+        """True for a parallel beam."""
+        return not self.values[_TO_DETECTOR].any()
 
     @property
     def is_circular(self) -> bool:
         """True where all projections are on one untilted circle with one panel."""
-        steady = [v for name, v in self.values.items() if name != "GantryAngle"]
+        of_source = (_TO_AXIS, "SourceOffsetX", "SourceOffsetY") if self.is_parallel else ()
+        steady = [v for name, v in self.values.items() if name not in (_ANGLE, *of_source)]
         still = all(np.ptp(v) <= 1e-9 * (1 + np.abs(v).max()) for v in steady)
-        tilts = ("SourceOffsetX", "SourceOffsetY", "InPlaneAngle", "OutOfPlaneAngle")
+        tilts = {"SourceOffsetX", "SourceOffsetY", "InPlaneAngle", "OutOfPlaneAngle"} - set(of_source)
         return still and all(np.all(self.values[name] == 0) for name in tilts)
 
     def poses(
@@ -133,10 +142,13 @@ class RtkGeometry:
             name: _along(np.unwrap(v) if name in _ANGLES else v, position) for name, v in self.values.items()
         }
         turn = _rotations(at)
-        to_detector = at["SourceToIsocenterDistance"] - at["SourceToDetectorDistance"]
+        zero = np.zeros(position.shape)
+        offsets = [at["SourceOffsetX"], at["SourceOffsetY"], at[_TO_AXIS]]
+        to_detector = at[_TO_AXIS] - at[_TO_DETECTOR]
+        if self.is_parallel:  # the direction of the rays, and a panel through the axis
+            offsets, to_detector = [zero, zero, zero - 1], zero
         shift = np.stack([at["ProjectionOffsetX"], at["ProjectionOffsetY"], to_detector], -1)
         first = shift + np.array([*origin_mm, 0.0])
-        offsets = [at["SourceOffsetX"], at["SourceOffsetY"], at["SourceToIsocenterDistance"]]
         steps = [np.broadcast_to([*step, 0.0], first.shape) for step in (step_u, step_v)]
         parts = [
             np.einsum("tij,tj->ti", turn, part) @ _TO_WORLD.T
@@ -146,24 +158,31 @@ class RtkGeometry:
 
 
 def read_rtk_xml(path: Path) -> RtkGeometry:
+    """Reads a geometry file. A warning says that a file without SourceToDetectorDistance has a parallel beam. Raises
+    InputError for numbers that are missing or that no scanner has."""
     root = _root(path)
     common, projections = _numbers(path, root), [_numbers(path, e) for e in root.iterfind("Projection")]
     if not projections:
         raise InputError(str(path), "no Projection", "at least one")
-    columns = {}
-    for name in NAMES:
-        column = [projection.get(name, common.get(name)) for projection in projections]
-        if name in _REQUIRED and None in column:
-            found = f"no {name} for projection {column.index(None)}"
+    stored = {name: [one.get(name, common.get(name)) for one in projections] for name in NAMES}
+    is_parallel = not any(stored[_TO_DETECTOR])
+    for name in (_ANGLE,) if is_parallel else (_ANGLE, _TO_AXIS, _TO_DETECTOR):
+        if None in stored[name]:
+            found = f"no {name} for projection {stored[name].index(None)}"
             raise InputError(str(path), found, "one, in the projection or above all of them")
-        values = np.array([0.0 if value is None else value for value in column])
-        columns[name] = np.deg2rad(values) if name in _ANGLES else values
-    for name in _REQUIRED[:2]:
+    columns = {name: np.array([0.0 if value is None else value for value in column]) for name, column in stored.items()}
+    columns |= {name: np.deg2rad(columns[name]) for name in _ANGLES}
+    if is_parallel:
+        if None in stored[_TO_DETECTOR]:
+            _log.warning("%s: no %s, which RTK takes for 0: a parallel beam", path, _TO_DETECTOR)
+        return RtkGeometry(columns)
+    for name in (_TO_AXIS, _TO_DETECTOR):
         if columns[name].min() <= 0:
-            raise InputError(f"{path} {name}", f"{columns[name].min():g}", "a length above 0")
-    if np.any(columns[_REQUIRED[1]] <= columns[_REQUIRED[0]]):
+            expected = "a length above 0" + (", or 0 in all projections" if name == _TO_DETECTOR else "")
+            raise InputError(f"{path} {name}", f"{columns[name].min():g}", expected)
+    if np.any(columns[_TO_DETECTOR] <= columns[_TO_AXIS]):
         expected = "more than SourceToIsocenterDistance"
-        raise InputError(f"{path} {_REQUIRED[1]}", f"{columns[_REQUIRED[1]].min():g}", expected)
+        raise InputError(f"{path} {_TO_DETECTOR}", f"{columns[_TO_DETECTOR].min():g}", expected)
     return RtkGeometry(columns)
 
 
