@@ -30,6 +30,7 @@ FORMATS = {
     "data-exchange": "data_exchange",
     "nxtomo": "nxtomo",
     "tiff": "tiff_folder",
+    "nikon": "laboratory.nikon",
 }
 _MOST_BODIES = 1000
 _LARGEST_MM, _LARGEST_PER_MM = 1e5, 1e5

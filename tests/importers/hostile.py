@@ -466,3 +466,36 @@ def circular_pages(path: Path) -> None:
 TIFF["a frame declared huge"] = (declared_huge, ("bytes",))
 TIFF["a strip that inflates"] = (inflated_strip, ("a strip of more than",))
 TIFF["pages in a circle"] = (circular_pages, ())
+
+
+XTEK = "scan.xtekct"
+
+
+def linked_folder(path: Path) -> None:
+    (path.parent / "elsewhere").mkdir()
+    os.symlink(path.parent / "elsewhere", path / "frames")
+    in_text(XTEK, "FolderName=", "FolderName=frames")(path)
+
+
+NIKON: dict[str, tuple[Damage, tuple[str, ...]]] = {
+    "an empty description": (filled(XTEK, b""), ("Projections", "nothing")),
+    "no text": (filled(XTEK, b"\xff\xfe\0" * 99), ("Projections",)),
+    "no number of projections": (in_text(XTEK, "Projections=6", "Projection=6"), ("Projections",)),
+    "half a projection": (in_text(XTEK, "Projections=6", "Projections=6.5"), ("Projections",)),
+    "too many projections": (in_text(XTEK, "Projections=6", "Projections=1e30"), ("Projections",)),
+    "projections that are not there": (in_text(XTEK, "Projections=6", "Projections=7"), ("7", "6 files")),
+    "pixels that are not there": (in_text(XTEK, "PixelsX=14", "PixelsX=15"), ("(6, 10, 15)",)),
+    "no white level": (in_text(XTEK, "WhiteLevel", "Level"), ("WhiteLevel",)),
+    "a white level of 0": (in_text(XTEK, "WhiteLevel=60000.0", "WhiteLevel=0"), ("WhiteLevel",)),
+    "a distance of text": (in_text(XTEK, "SrcToObject=500.0", "SrcToObject=far"), ("SrcToObject", "'far'")),
+    "a distance of many digits": (in_text(XTEK, "SrcToObject=500.0", "SrcToObject=" + "9" * 400), ("SrcToObject",)),
+    "a panel before the axis": (in_text(XTEK, "SrcToDetector=800.0", "SrcToDetector=400"), ("source_to_detector_mm",)),
+    "no step": (in_text(XTEK, "AngularStep", "Step"), ("AngularStep",)),
+    "an axis that lies down": (in_text(XTEK, "ObjectRoll=0", "ObjectRoll=90"), ("ObjectRoll",)),
+    "frames outside": (in_text(XTEK, "FolderName=", "FolderName=../in"), ("InputFolderName", "inside")),
+    "frames over a link": (linked_folder, ("InputFolderName", "symbolic link")),
+    "a frame that is a link": (symlinked("scan_0001.tif"), ("symbolic link",)),
+    "a missing frame": (removed("scan_0003.tif"), ("5 files",)),
+    "a truncated frame": (truncated("scan_0001.tif"), ("scan_0001.tif",)),
+    "a name that is a pattern": (in_text(XTEK, "Name=scan", "Name=(.*)+$"), ("0 files",)),
+}  # fmt: skip

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import h5py
+import laboratory_of_importers as lab
 import numpy as np
 import pint
 import SimpleITK as sitk
@@ -287,13 +288,18 @@ WRITERS = {
     "naf": (write_naf, "chest.pickle"), "rtk": (write_rtk, "rtk"),
     "data-exchange": (write_data_exchange, "dx.h5"),
     "nxtomo": (write_nxtomo, "nx.h5"), "tiff": (write_tiff, "tiff"),
+    "nikon": (lab.write_nikon, "nikon"),
 }  # fmt: skip
+
+
+OFFSETS_MM = {"phyradgs-real": (4.0, 0.0), "nikon": (0.0, 0.0)}  # of the panel, where a format cannot state all
 
 
 def write(form: str, folder: Path, make_truth: Any) -> Path:
     """A good one in a folder, of a scan that the format can hold; real views have source and panel face each other."""
-    truth = make_truth(fly=form.startswith("phyradgs"))
-    if form == "phyradgs-real":
-        truth = make_truth(fly=True, geometry=replace(truth.scan.geometry, detector_offset_mm=(4.0, 0.0)))
+    is_fly = form.startswith("phyradgs")
+    truth = make_truth(fly=is_fly)
+    if form in OFFSETS_MM:
+        truth = make_truth(fly=is_fly, geometry=replace(truth.scan.geometry, detector_offset_mm=OFFSETS_MM[form]))
     writer, name = WRITERS[form]
     return writer(folder / name, truth)

@@ -22,6 +22,7 @@ from phyradgs_cl.importers.options import TIMING, ImportOptions
 from phyradgs_cl.importers.reading.files import SafeFolder, read_bytes
 from phyradgs_cl.importers.reading.frames import line_integrals
 from phyradgs_cl.importers.reading.images import STACKS, read_image
+from phyradgs_cl.importers.stage import along
 
 _log = logging.getLogger(__name__)
 OPTIONS = (*TIMING, "quantity", "flat_value", "detector_model")
@@ -139,7 +140,7 @@ class RtkGeometry:
         """Returns poses (T, 12) at frame positions (T,), linear between and beyond frames. ``origin_mm`` (2,): place (u, v)
         of pixel (0, 0) in the image's plane; ``step_u``, ``step_v`` (2,): from column to column and row to row."""
         at = {
-            name: _along(np.unwrap(v) if name in _ANGLES else v, position) for name, v in self.values.items()
+            name: along(np.unwrap(v) if name in _ANGLES else v, position) for name, v in self.values.items()
         }
         turn = _rotations(at)
         zero = np.zeros(position.shape)
@@ -184,14 +185,6 @@ def read_rtk_xml(path: Path) -> RtkGeometry:
         expected = "more than SourceToIsocenterDistance"
         raise InputError(f"{path} {_TO_DETECTOR}", f"{columns[_TO_DETECTOR].min():g}", expected)
     return RtkGeometry(columns)
-
-
-def _along(values: np.ndarray, position: np.ndarray) -> np.ndarray:
-    """Returns values (F,) at positions (T,), linear between frames and beyond them."""
-    if len(values) == 1:
-        return np.full(position.shape, values[0])
-    left = np.clip(np.floor(position).astype(int), 0, len(values) - 2)
-    return values[left] + (position - left) * (values[left + 1] - values[left])
 
 
 def _rotations(at: dict[str, np.ndarray]) -> np.ndarray:

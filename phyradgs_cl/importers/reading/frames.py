@@ -34,11 +34,12 @@ class LineIntegrals:
 
 def line_integrals(
     subject: str, frames: np.ndarray, options: ImportOptions, *, flats: np.ndarray | None = None,
-    darks: np.ndarray | None = None, convention: str | None = None,
+    darks: np.ndarray | None = None, convention: str | None = None, is_corrected: bool = False,
 ) -> LineIntegrals:
     """Converts ``frames`` (P, v, u) of any real type to line integrals. Masks clipped counts and values that no object has,
     with a warning. ``subject`` names the file; ``flats``, ``darks``: (n, v, u) or None. The quantity is that of the options,
-    else ``convention``, of the format or file; without either, frames with flats are counts and others are refused."""
+    else ``convention``, of the format or file; without either, frames with flats are counts and others are refused.
+    ``is_corrected``: the scanner has subtracted the darks."""
     has_flats = (flats is not None and len(flats) > 0) or options.flat_value is not None
     quantity = options.quantity or convention or ("counts" if has_flats else None)
     if quantity is None:
@@ -60,7 +61,7 @@ def line_integrals(
         with np.errstate(over="ignore", invalid="ignore"):
             flat = flats.mean(axis=0, dtype=np.float64)
             saturation = find_saturation(frames, flat)
-        if darks is None or len(darks) == 0:
+        if not is_corrected and (darks is None or len(darks) == 0):
             _log.warning("%s: counts without darks: an offset of the panel stays in the line integrals", subject)
     integrals, unusable = frames_to_attenuation(frames, quantity, flats, darks, LARGEST_LINE_INTEGRAL)
     if quantity == "attenuation" and unusable.any():

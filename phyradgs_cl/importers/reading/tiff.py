@@ -2,6 +2,7 @@
 
 import logging
 import math
+import re
 import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -13,7 +14,7 @@ import numpy as np
 
 from phyradgs_cl import checks
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.importers.reading.files import check_room
+from phyradgs_cl.importers.reading.files import SafeFolder, check_numbering, check_room
 from phyradgs_cl.io.files import regular_file
 
 SUFFIXES = (".tif", ".tiff")
@@ -54,6 +55,24 @@ def read_tiffs(paths: list[Path]) -> np.ndarray:
                 page.asarray(maxworkers=1, out=stack[at : at + images].reshape(page.shape))
                 at += images
     return stack
+
+
+def read_series(
+    folder: SafeFolder, prefix: str, shape: tuple[int, ...], subject: str, pattern: str = r"\d+"
+) -> np.ndarray:
+    """Reads the TIFFs of a folder whose names are ``prefix`` and a number: frames (F, v, u) of ``shape``, in the numbers'
+    order. ``pattern``: what stands for the number; ``subject`` names the description that states the shape."""
+    name = re.compile(re.escape(prefix) + pattern, re.I)
+    paths = [path for path in folder.matching(*SUFFIXES) if name.fullmatch(path.stem)]
+    if len(paths) != shape[0]:
+        found = f"{shape[0]}, and {len(paths)} files {prefix}*.tif in {folder.root}"
+        raise InputError(subject, found, "a file for every projection", "copy the missing files")
+    check_numbering(paths, "copy the missing files")
+    frames, rows, columns = stack_shape(paths)
+    if (frames, rows, columns) != shape:
+        expected = f"{shape}, as {subject.partition(': ')[0]} says"
+        raise InputError(str(paths[0]), f"{frames} images of {rows} × {columns} pixels", expected)
+    return read_tiffs(paths)
 
 
 def stack_shape(paths: list[Path]) -> tuple[int, int, int]:

@@ -1,0 +1,98 @@
+"""Scans of Nikon's XT H systems: a .xtekct file and 16-bit TIFFs of counts, corrected for darks and flats by the scanner.
+
+The signs are those that the readers of CIL and TIGRE agree on: row 0 on top, column 0 on the right seen from the source,
+a sample that turns clockwise seen from above. An axis off the middle stands to the left for ObjectOffsetX above 0, or for
+the mean of CentreOfRotationTop and CentreOfRotationBottom, which are places on the panel. The axis' top leans to the right
+for ObjectRoll above 0, and towards the panel for ObjectTilt above 0. Lengths are in mm, angles in degrees."""
+
+import logging
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from phyradgs_cl.acquisition import Scan
+from phyradgs_cl.acquisition.geometry import ConeGeometry
+from phyradgs_cl.importers.assemble import assemble_scan, cone, make_timing
+from phyradgs_cl.importers.options import OF_BARE_FRAMES, ImportOptions
+from phyradgs_cl.importers.reading.files import SafeFolder, checked_name
+from phyradgs_cl.importers.reading.frames import gantry_sign, line_integrals, oriented
+from phyradgs_cl.importers.reading.settings import read_settings, say_missing
+from phyradgs_cl.importers.reading.tiff import read_series
+from phyradgs_cl.importers.stage import RotaryStage
+from phyradgs_cl.io.tables import Fields
+
+_log = logging.getLogger(__name__)
+_ENDS = ("CentreOfRotationTop", "CentreOfRotationBottom")
+_NAMES = (
+    *("Name", "InputSeparator", "InputFolderName", "Projections", "WhiteLevel", "SrcToObject", "SrcToDetector"),
+    *("DetectorPixelsX", "DetectorPixelsY", "DetectorPixelSizeX", "DetectorPixelSizeY", "DetectorOffsetX"),
+    *("DetectorOffsetY", "InitialAngle", "AngularStep", "ObjectOffsetX", "ObjectRoll", "ObjectTilt", *_ENDS),
+)
+_MOST_FRAMES = 1_000_000
+
+
+def recognises(path: Path) -> bool:
+    """True for a .xtekct file, and for a folder with one."""
+    return bool(SafeFolder(path).matching(".xtekct")) if path.is_dir() else path.suffix.lower() == ".xtekct"
+
+
+def import_scan(path: Path, options: ImportOptions) -> Scan:
+    """Imports a folder with one .xtekct and its TIFFs, or the .xtekct with the TIFFs in its folder."""
+    options.refuse_unused("nikon", OF_BARE_FRAMES)
+    folder = SafeFolder(path if path.is_dir() else path.parent)
+    description = path if path.is_file() else folder.only("description of the scan", ".xtekct")
+    scan = read_settings(description, _NAMES)
+    count = scan.count("Projections", _MOST_FRAMES)
+    panel = tuple(scan.count(f"DetectorPixels{axis}", _MOST_FRAMES) for axis in "YX")
+    prefix = scan.word("Name", default="") + scan.word("InputSeparator", default="_")
+    frames = read_series(_folder_of_frames(folder, scan), prefix, (count, *panel), scan.name("Projections"))
+    stage = _stage(scan, (panel[0], panel[1]), options)
+    first_deg, step_deg = scan.number("InitialAngle", 0.0), scan.number("AngularStep")
+    angle_rad = -gantry_sign(options, "sample") * np.deg2rad(first_deg + step_deg * np.arange(count))
+    timing = make_timing(str(description), count, options)
+    trajectory, geometry = stage.turned(angle_rad, timing, str(description))
+    say_missing(scan, {"InitialAngle": "0"})
+    combined = replace(options, flat_value=options.flat_value or scan.length("WhiteLevel"))
+    turned = oriented(frames, options, "top", "right")
+    integrals = line_integrals(str(description), turned, combined, convention="counts", is_corrected=True)
+    title = description.stem
+    return assemble_scan(integrals, trajectory, geometry, timing, options, title=title, source=str(path))
+
+
+def _folder_of_frames(folder: SafeFolder, scan: Fields) -> SafeFolder:
+    """Returns the folder that InputFolderName names inside the description's own; that folder itself where it is none."""
+    name = scan.word("InputFolderName", default="")
+    if not name or not folder.exists(name.split("\\")[0].split("/")[0]):
+        return folder  # often the place on the scanner's own disk
+    inner = folder.root / checked_name(name, scan.name("InputFolderName"))
+    if any(part.is_symlink() for part in (inner, *inner.parents) if folder.root in part.parents):
+        raise scan.error("InputFolderName", f"{name[:60]!r}, which leads over a symbolic link", "a plain folder")
+    return SafeFolder(inner)
+
+
+def _stage(scan: Fields, panel: tuple[int, int], options: ImportOptions) -> RotaryStage:
+    """Returns the stage of the description; options replace its lengths."""
+    pitch_mm = (scan.length("DetectorPixelSizeY"), scan.length("DetectorPixelSizeX"))
+    to_axis_mm, to_detector_mm = scan.length("SrcToObject"), scan.length("SrcToDetector")
+    geometry = cone(options, to_axis_mm, to_detector_mm, panel, pitch_mm, (0.0, 0.0))
+    for name in ("DetectorOffsetX", "DetectorOffsetY"):
+        if scan.position(name) and options.detector_offset_mm is None:
+            text = "%s is %g and not used, for its sign is not documented; say %s if the panel was moved"
+            _log.warning(text, scan.name(name), scan.position(name), options.named("detector_offset_mm"))
+    top_mm, bottom_mm = (scan.position(name) for name in _ENDS)
+    assert isinstance(geometry, ConeGeometry)
+    if scan.has("ObjectOffsetX"):
+        offset_mm = scan.position("ObjectOffsetX")
+    else:
+        offset_mm = (top_mm + bottom_mm) / 2 / geometry.magnification
+        if not any(map(scan.has, _ENDS)):
+            remedy = f"the axis in the middle: {options.named('detector_offset_mm')}, or calibrate"
+            say_missing(scan, {"ObjectOffsetX": remedy})
+    height_mm = panel[0] * pitch_mm[0]
+    roll_rad = math.radians(scan.number("ObjectRoll", lowest=-45, highest=45)) if scan.has("ObjectRoll") else (
+        -math.atan2(top_mm - bottom_mm, height_mm)
+    )  # fmt: skip
+    tilt_rad = math.radians(scan.number("ObjectTilt", 0.0, lowest=-45, highest=45))
+    return RotaryStage(geometry, -offset_mm, roll_rad, tilt_rad)

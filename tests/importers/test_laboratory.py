@@ -1,0 +1,117 @@
+"""Scanners whose sample turns: their files against geometry by hand, their pixels, and reconstructions to the bit."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import laboratory_of_importers as lab
+import numpy as np
+import pytest
+from conftest_of_importers import WORLD_POINTS, Truth, pose_at, projected
+
+from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, PoseTable, make_protocol
+from phyradgs_cl.api import reconstruct
+from phyradgs_cl.check import check
+from phyradgs_cl.detector import counts_to_attenuation
+from phyradgs_cl.errors import InputError
+from phyradgs_cl.fields import Grid
+from phyradgs_cl.importers import ImportOptions, import_scan, recognise
+from phyradgs_cl.io import read_scan, write_scan
+from phyradgs_cl.simulation import SimulationOptions, phantom_scene, simulate
+
+CENTRED = ConeGeometry(500.0, 800.0, (10, 14), (3.0, 2.5))
+WRITERS: dict[str, tuple[Callable[..., Path], ConeGeometry]] = {
+    "nikon": (lab.write_nikon, CENTRED),
+}
+
+
+@pytest.mark.parametrize("form", WRITERS)
+def test_pixels_and_geometry_are_those_of_the_scan_that_was_written(tmp_path, make_truth, assert_same, form) -> None:
+    """To the bit after a reconstruction; for a turning sample the times come from the options."""
+    writer, geometry = WRITERS[form]
+    truth = make_truth(geometry=geometry)
+    path = writer(tmp_path / form, truth)
+    assert recognise(path) == form
+    scan = import_scan(path)
+    assert_same(scan, truth, grid=False, pixels=1e-3)
+    assert isinstance(scan.trajectory, CircularOrbit)
+    values = lab.line_integrals_of(lab.counts16(truth))
+    np.testing.assert_array_equal(scan.projections, values)
+    ours = replace(truth.scan, projections=values, reference=None, grid=scan.grid)
+    write_scan(tmp_path / "ours.h5", ours)
+    volumes = [reconstruct(one, "fdk").volume for one in (scan, read_scan(tmp_path / "ours.h5", counts_to_attenuation))]
+    np.testing.assert_array_equal(*volumes)
+    fly = make_truth(fly=True, direction=-1, geometry=geometry)
+    options = ImportOptions(exposure_s=0.4, fps=0.8, readout_ms=300.0, first="top")
+    assert_same(import_scan(writer(tmp_path / "fly", fly), options), fly, grid=False, pixels=1e-3)
+
+
+@pytest.fixture(scope="session")
+def jaw(rt) -> Callable[[ConeGeometry], Truth]:
+    """A jaw's projections at rest at 20 angles."""
+
+    def make(geometry: ConeGeometry) -> Truth:
+        geometry = replace(
+            geometry, detector_shape=(24, 24), pixel_size_mm=(8.0, 8.0), detector_offset_mm=(0.0, 0.0)
+        )
+        scene = phantom_scene(rt, "jaw", geometry, Grid.cube(24, 80.0), 24, "rows", 0)
+        protocol = make_protocol("static", views=20)
+        scan = simulate(scene.source, geometry, scene.grid, SimulationOptions(protocol, "rows"))
+        return Truth(scan, scan.trajectory.kinematics.angle_start_rad)
+
+    return make
+
+
+@pytest.mark.parametrize("form", WRITERS)
+def test_check_finds_nothing_suspicious(tmp_path, jaw, rt, form) -> None:
+    """Neither the sense of the turn, nor sides of the images, nor distances."""
+    writer, geometry = WRITERS[form]
+    scan = import_scan(writer(tmp_path / form, jaw(geometry)))
+    assert not check(scan, rt).suspicious
+
+
+def falls_where(scan: Any, angle_rad: np.ndarray, geometry: Any, **stage: float) -> None:
+    """Compares the imported poses with the room's own geometry, frame by frame."""
+    for frame, angle in enumerate(angle_rad):
+        expected = lab.lab_pixels(WORLD_POINTS, angle, geometry, **stage)
+        np.testing.assert_allclose(projected(pose_at(scan, frame, 0.5), WORLD_POINTS), expected, atol=1e-6)
+
+
+def test_nikon_s_axis_is_offset_and_leans(tmp_path, make_truth, caplog) -> None:
+    """ObjectOffsetX moves it to the left; without it the two places on the panel say where it is, and how it leans."""
+    truth = make_truth(geometry=CENTRED)
+    path = lab.write_nikon(tmp_path / "a", truth, ObjectOffsetX=2.5, ObjectRoll=1.5, ObjectTilt=-0.8)
+    scan = import_scan(path)
+    assert isinstance(scan.trajectory, PoseTable) and scan.geometry.detector_shape == (10, 14)
+    falls_where(scan, truth.angle_rad, CENTRED, axis_mm=-2.5, roll_rad=np.deg2rad(1.5), tilt_rad=np.deg2rad(-0.8))
+    ends = {"ObjectOffsetX": None, "ObjectRoll": None, "CentreOfRotationTop": 5.0, "CentreOfRotationBottom": 2.0}
+    scan = import_scan(lab.write_nikon(tmp_path / "b", truth, **ends))
+    falls_where(scan, truth.angle_rad, CENTRED, axis_mm=-3.5 / 1.6, roll_rad=-np.arctan(3 / 30))
+    fly = import_scan(path, ImportOptions(exposure_s=0.4, fps=0.8))
+    for frame in range(6):  # at the start of its exposure a frame's pose is the stated one
+        stated = lab.lab_pixels(
+            WORLD_POINTS, truth.angle_rad[frame], CENTRED, -2.5, np.deg2rad(1.5), np.deg2rad(-0.8)
+        )
+        np.testing.assert_allclose(projected(pose_at(fly, frame, 0.0), WORLD_POINTS), stated, atol=1e-6)
+    assert not caplog.text.count("ObjectOffsetX")
+    path = lab.write_nikon(tmp_path / "c", truth, ObjectOffsetX=None, InitialAngle=None, DetectorOffsetY=3)
+    import_scan(path)
+    assert "scan.xtekct: no ObjectOffsetX (the axis in the middle: detector_offset_mm, or calibrate)" in caplog.text
+    assert "no InitialAngle (0)" in caplog.text and "DetectorOffsetY is 3 and not used" in caplog.text
+
+
+def test_nikon_s_frames_may_lie_in_a_folder_of_their_own(tmp_path, make_truth) -> None:
+    """A folder on the scanner's own disk is not looked for."""
+    for name in ("frames", r"C:\scans\mine"):
+        path = lab.write_nikon(tmp_path / str(len(name)), make_truth(geometry=CENTRED), InputFolderName=name)
+        if name == "frames":
+            (path / "frames").mkdir()
+            for file in path.glob("*.tif"):
+                file.rename(path / "frames" / file.name)
+        assert import_scan(path).frames == 6
+    with pytest.raises(InputError, match="Projections: found 6, and 0 files"):
+        (path / "inner").mkdir()
+        text = (path / "scan.xtekct").read_text().replace(r"C:\scans\mine", "inner")
+        (path / "scan.xtekct").write_text(text)
+        import_scan(path)
