@@ -10,7 +10,7 @@
 #define POSES 3
 #else
 #define TURNED 0
-#define POSES 1
+#define POSES (1 + FIXED_CONIC)
 #endif
 
 /* from the gradient by (u0, v0) and by the depth z to that by the mean: u0 = (row 0 . x) / z, v0 = (row 1 . x) / z */
@@ -208,6 +208,13 @@ __kernel void splat_chain(
                           wide_value(wide_dot(n + 4, mean.x, mean.y, mean.z)) * inv, inv,
                           0.16666666667f * g_u0 + sign * g_path_u, 0.16666666667f * g_v0 + sign * g_path_v, zero);
         }
+#elif FIXED_CONIC
+        /* the second pose places the centre, the first one has the depth of the conic and of the density */
+        __global const coefficient *n = m + 12;
+        const vf inv = 1.0f / V_PICK((vf)(1.0f), wide_value(wide_dot(n + 8, mean.x, mean.y, mean.z)), is_in_view);
+        add_by_centre(&by_mean, n, wide_value(wide_dot(n, mean.x, mean.y, mean.z)) * inv,
+                      wide_value(wide_dot(n + 4, mean.x, mean.y, mean.z)) * inv, inv, g_u0, g_v0, zero);
+        add_by_centre(&by_mean, m, zero, zero, inv_z, zero, zero, by_z);
 #else
         add_by_centre(&by_mean, m, u0, v0, inv_z, g_u0, g_v0, by_z);
 #endif

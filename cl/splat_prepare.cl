@@ -1,7 +1,7 @@
 /* Projects every Gaussian from every time cell of a frame, in one launch. A work-item takes LANES Gaussians and loops over
    the cells. For each cell it writes one record per Gaussian (common/splat.h): the splat and the box of its pixels. At the
    end it writes the box around each Gaussian's splats in all cells, from which binning.cl makes the lists of the tiles.
-   splat_prepare: a cell is one pose. splat_prepare_moving: a cell is a segment of the frame, in which the centre moves from
+   splat_prepare: a cell is one pose, which with FIXED_CONIC places the centre only. splat_prepare_moving: a cell is a segment of the frame, in which the centre moves from
    one end to the other (common/splat_moving.h). Twin: operators/twins/splat.py. */
 #include "common/splat_view.h"
 #include "common/splat_moving.h"
@@ -11,6 +11,7 @@
 #define FIELDS 12
 #else
 #define FIELDS COMMON_FIELDS
+#define POSES (1 + FIXED_CONIC) /* of a cell: the one that the constants of `cells` are of, and that of the centre */
 #endif
 
 /* The fields that both kinds of record share. fields (FIELDS, LANES); bounds (6, LANES): centre, u lo hi, v lo hi. */
@@ -69,7 +70,7 @@ __kernel void splat_prepare(
     __global const float *gaussians,      /* (11, stride) */
     const int count, const int stride,
     __global const float *cells,          /* (C, CELL) */
-    __global const coefficient *matrices, /* (C, 12): rows give u z, v z and z of a world point */
+    __global const coefficient *matrices, /* (C, POSES, 12): rows give u z, v z and z of a world point */
     __global const int *cell_lines,       /* (C, 2): first line, line after the last */
     const int cell_count,
     const int width,                      /* pixels of a line */
@@ -85,9 +86,16 @@ __kernel void splat_prepare(
     const vi exists = V_INT((vf)(first) + V_IOTA) < count;
     pixel_box extent = empty_box();
     for (int c = 0; c < cell_count; ++c) {
+#if FIXED_CONIC
+        const vf depth = project_centre(matrices + c * POSES * 12, g.mean).depth;
+        const splat_centre centre = project_centre(matrices + (c * POSES + 1) * 12, g.mean);
+        const splat_view s = view_splat(g, cells + c * CELL, depth);
+        vi is_drawn = exists & s.is_drawn & (centre.depth > NEAREST);
+#else
         const splat_centre centre = project_centre(matrices + c * 12, g.mean);
         const splat_view s = view_splat(g, cells + c * CELL, centre.depth);
         vi is_drawn = exists & s.is_drawn;
+#endif
         pixel_box box = {(vi)(0), (vi)(width - 1), (vi)(cell_lines[2 * c]), (vi)(cell_lines[2 * c + 1] - 1)};
         if (cutoff2 > 0.0f) {
             const cutoff_ellipse e = ellipse_of(s, cutoff2);

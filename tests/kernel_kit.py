@@ -7,6 +7,7 @@ import pytest
 
 from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, ConstantSpeed, Shutter
 from phyradgs_cl.acquisition.cells import (
+    centre_cells,
     exact_cells,
     micro_view_cells,
     per_line_cells,
@@ -22,6 +23,7 @@ MODELS = pytest.mark.parametrize("affine", [False, True], ids=["exact", "affine"
 READOUTS = [("rows", 1), ("rows", -1), ("columns", 1), ("columns", -1)]
 CELLS = {
     "static": (static_cells, ()), "micro-views": (micro_view_cells, (4, 3)), "exact": (exact_cells, (4,)),
+    "centres": (centre_cells, (4, 3)),
     "per-row": (per_line_cells, (3,)),
 }  # fmt: skip
 ROLLING = Shutter(0.8, 0.6)

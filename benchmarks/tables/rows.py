@@ -12,13 +12,14 @@ from phyradgs_cl.reconstructors.splats.options import SplatOptions
 
 _MOST_NEURAL_VOXELS = 128  # per side, on a CPU: beyond it a run takes hours
 KINDS = ("table1", "table2", "phantom")
+_WITH_COUNTS = ("micro-views", "centres")
 
 
 @dataclass(frozen=True)
 class Row:
     """One row: a method with a motion model.
 
-    strips and sub_intervals matter to micro-views; ``still`` is the label of the same method with a static
+    strips and sub_intervals matter to ``_WITH_COUNTS``; ``still`` is the label of the same method with a static
     model, which is what a stop-and-shoot scan is reconstructed with; ``changes`` are further options, told apart
     by ``variant``.
     """
@@ -35,7 +36,7 @@ class Row:
     @property
     def run(self) -> str:
         """What is computed, whatever it is called: rows of two tables with one run share its result."""
-        counts = f"{self.strips}x{self.sub_intervals}" if self.motion == "micro-views" else ""
+        counts = f"{self.strips}x{self.sub_intervals}" if self.motion in _WITH_COUNTS else ""
         return " ".join(part for part in (self.method, self.motion, counts, self.variant) if part)
 
     def static(self) -> "Row":
@@ -52,7 +53,7 @@ class Row:
                 "choose other rows with --rows",
             )
         changes: dict[str, Any] = {"motion": self.motion, **self.changes}
-        if self.motion == "micro-views":
+        if self.motion in _WITH_COUNTS:
             changes |= {"strips": self.strips, "sub_intervals": self.sub_intervals}
         if self.is_splatting:
             changes |= {"gaussians": gaussians, "iterations": iterations}
@@ -86,6 +87,7 @@ def _micro_views(label: str, method: str, strips: int, sub_intervals: int, still
     return Row(label, method, "micro-views", strips, sub_intervals, still)
 
 
+_CENTRES = Row("PhyRadGS, centres only (as GS-on-the-Move)", "phyradgs", "centres", 8, 5, "PhyRadGS w/o ST")
 _ITERATIVE = {
     "SART": "sart",
     "OS-SART": "os-sart",
@@ -107,6 +109,7 @@ _SPLATTING = (
     Row("PhyRadGS w/o ST", "phyradgs"),
     _micro_views("PhyRadGS", "phyradgs", 8, 5, "PhyRadGS w/o ST"),
     Row("PhyRadGS exact in time", "phyradgs", "exact", still="PhyRadGS w/o ST"),
+    _CENTRES,
 )
 _FUSED = (
     Row("FISTA with DCT", "fista"),
@@ -159,7 +162,7 @@ def _others(known: Set[str]) -> tuple[Row, ...]:
 
 def _table2() -> tuple[Row, ...]:
     counts = [(m, 5) for m in (1, 4, 8, 16)] + [(8, n) for n in (1, 3, 7)]
-    return tuple(_micro_views(f"M={m} N={n}", "phyradgs", m, n, "PhyRadGS w/o ST") for m, n in counts)
+    return (*(_micro_views(f"M={m} N={n}", "phyradgs", m, n, "PhyRadGS w/o ST") for m, n in counts), _CENTRES)
 
 
 def rows_of(kind: str) -> tuple[Row, ...]:

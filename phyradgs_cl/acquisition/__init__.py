@@ -3,6 +3,7 @@
 from phyradgs_cl.acquisition.geometry import ConeGeometry, ParallelGeometry, pixel_centres, transpose_pose
 from phyradgs_cl.acquisition.motion import (
     MOTIONS,
+    Centres,
     Exact,
     LineMiddles,
     MicroViews,
@@ -27,7 +28,7 @@ from phyradgs_cl.acquisition.trajectory import (
 )
 
 __all__ = [
-    "MOTIONS", "PROTOCOLS", "ParallelGeometry", "CircularOrbit", "ConeGeometry", "ConstantSpeed", "EncoderTable",
+    "MOTIONS", "PROTOCOLS", "Centres", "ParallelGeometry", "CircularOrbit", "ConeGeometry", "ConstantSpeed", "EncoderTable",
     "Exact", "FrameSweeps", "LineMiddles", "MicroViews", "Motion", "OwnTimes", "PerRow", "PoseTable",
     "Protocol", "Saturation", "Scan", "Shutter", "SpeedRamp", "Static", "StaticStart", "TimeCells",
     "Trajectory", "make_protocol", "pixel_centres", "transpose_pose"

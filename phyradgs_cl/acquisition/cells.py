@@ -53,6 +53,15 @@ def micro_view_cells(
     return cell_table(trajectory, shutter, frame, time_s, line_start, line_stop, weight, lines)
 
 
+def centre_cells(
+    trajectory: Trajectory, shutter: Shutter, frame: int, start_s: float, lines: int, strips: int,
+    sub_intervals: int
+) -> TimeCells:
+    """Returns the cells of ``micro_view_cells`` with the pose of ``static_cells`` as their ``conic_pose``."""
+    table = micro_view_cells(trajectory, shutter, frame, start_s, lines, strips, sub_intervals)
+    return replace(table, conic_pose=static_cells(trajectory, shutter, frame, start_s, lines).pose[0])
+
+
 def per_line_cells(
     trajectory: Trajectory, shutter: Shutter, frame: int, start_s: float, lines: int, samples: int
 ) -> TimeCells:

@@ -82,6 +82,23 @@ class MicroViews:
 
 
 @dataclass(frozen=True)
+class Centres(MicroViews):
+    """``MicroViews`` in which only the centres of splats move, as in GS-on-the-Move (the paper's reference 21).
+
+    Conics, extents and densities on the panel are those of the middle of the frame's lit span. Raises InputError for counts
+    below 1."""
+
+    operators: ClassVar = (SPLATS,)
+    name: str = field(default="centres", init=False, repr=False)
+
+    def cells(self, scan: Scan, frame: int) -> TimeCells:
+        """Returns the ``TimeCells`` of one frame: strips × sub-intervals cells with one ``conic_pose``."""
+        if not scan.is_fly:
+            return Static().cells(scan, frame)
+        return cells.centre_cells(*_place(scan, frame), self.strips, self.sub_intervals)
+
+
+@dataclass(frozen=True)
 class PerRow:
     """Every line averages over its own window; all lines of a frame share their times, ``sub_intervals`` to an exposure. The
     weight of a line in a cell is the fraction of its window that lies there. Raises InputError for a count below 1."""
@@ -158,7 +175,7 @@ class Exact:
         return cells.exact_cells(*where, segments)
 
 
-MODELS = (Static, StaticStart, MicroViews, PerRow, OwnTimes, Exact, LineMiddles)
+MODELS = (Static, StaticStart, MicroViews, Centres, PerRow, OwnTimes, Exact, LineMiddles)
 MOTIONS = tuple(dict.fromkeys(model.name for model in MODELS))
 """The names of the models."""
 

@@ -28,6 +28,9 @@ class TimeCells:
     ``line_times`` (C, 3, lines) describes the part of each line's window in the segment: its middle and half its length, in
     units of the segment's length from its mid-time, and its fraction of the whole window. Methods raise InputError for
     user-defined cells that do not fit the scan. is_parallel: poses begin with the direction of parallel rays.
+
+    ``conic_pose`` (12,), only for splats: the poses of the cells then place the centres of Gaussians; their shapes and
+    densities on the panel are those of this pose.
     """
 
     pose: np.ndarray
@@ -41,6 +44,7 @@ class TimeCells:
     line_times: "NDArray[np.float64] | None" = None
     line_share: "NDArray[np.float64] | None" = None
     is_parallel: bool = False
+    conic_pose: np.ndarray | None = None
 
     @property
     def count(self) -> int:
@@ -87,8 +91,8 @@ class TimeCells:
         factors = np.full(POSE_LENGTH, factor)
         if self.is_parallel:
             factors[:3] = 1  # a direction
-        ends = None if self.end_poses is None else self.end_poses * factors
-        return replace(self, pose=self.pose * factors, end_poses=ends)
+        ends, conic = (None if p is None else p * factors for p in (self.end_poses, self.conic_pose))
+        return replace(self, pose=self.pose * factors, end_poses=ends, conic_pose=conic)
 
     def finer(self, factor: int) -> "TimeCells":
         """Returns still cells for pixels cut into ``factor`` by ``factor``; the parts of a line share its times."""
@@ -100,9 +104,11 @@ class TimeCells:
         return replace(self, pose=pose, line_share=share, **lines)
 
     def still(self) -> "TimeCells":
-        """Returns these cells, for operators without motion within a cell. Raises InputError for moving cells."""
+        """Returns these cells, for operators on rays. Raises InputError for cells that only splats support."""
         if self.is_moving:
             raise InputError("--motion", "cells with motion", "still cells: only splats move", "take --motion per-row")
+        if self.conic_pose is not None:
+            raise InputError("--motion", "cells with a conic pose", "cells without one: only splats have conics", "take micro-views")
         return self
 
     def line_poses(self) -> np.ndarray:

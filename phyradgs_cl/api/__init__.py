@@ -5,7 +5,14 @@
 
 Everything is documented with runnable examples in docs/api.md. ``device`` is what ``--device`` takes, or a Runtime."""
 
-from phyradgs_cl.acquisition import ConeGeometry, ConstantSpeed, ParallelGeometry, SpeedRamp, StaticStart
+from phyradgs_cl.acquisition import (
+    Centres,
+    ConeGeometry,
+    ConstantSpeed,
+    ParallelGeometry,
+    SpeedRamp,
+    StaticStart,
+)
 from phyradgs_cl.acquisition.motion import Exact, LineMiddles, MicroViews, Motion, OwnTimes, PerRow, Static
 from phyradgs_cl.acquisition.scan import Scan
 from phyradgs_cl.acquisition.shutter import Shutter
@@ -39,8 +46,8 @@ from phyradgs_cl.metrics import compare
 from phyradgs_cl.reconstructors import Progress, Reconstruction
 
 __all__ = [
-    "Calibration", "CircularOrbit", "ConeGeometry", "ConstantSpeed", "Deformation", "EncoderTable", "Exact",
-    "FrameSweeps", "Gaussians", "Grid", "InputError", "LineMiddles", "LinearOperator", "MicroViews",
+    "Calibration", "Centres", "CircularOrbit", "ConeGeometry", "ConstantSpeed", "Deformation", "EncoderTable",
+    "Exact", "FrameSweeps", "Gaussians", "Grid", "InputError", "LineMiddles", "LinearOperator", "MicroViews",
     "Motion", "Operator", "OwnTimes", "ParallelGeometry", "PerRow", "PhyradgsError", "PoseTable", "Progress",
     "Reconstruction", "Scan", "Shutter", "SpeedRamp", "Static", "StaticStart", "TimeCells", "Trajectory",
     "as_torch", "calibrate", "compare", "fly_scan", "initial_gaussians", "load_deformation", "load_scan",

@@ -107,7 +107,7 @@ _METHOD = "fdk: analytic; phyradgs, r2: splats; naf, sax-nerf: neural fields; th
 _MOTION = (
     "Leave it out with fista, fused and phyradgs, which take the scan's motion; with others say per-row. Poses of a "
     "frame: one (static, static-start), M×N micro-views, one per line (per-row), or, for splats, integrals over time "
-    "(exact)."
+    "(exact), or M×N that move only centres (centres)."
 )
 _PRIOR = "Prior, for fista: dct, tv, nonlocal, nonlocal+dct, piccs or none; MODULE:NAME: a denoiser of your own."
 _PRESET = "Constants: default, quick, paper, released (phyradgs); published (r2, naf, sax-nerf); a window (fdk)."

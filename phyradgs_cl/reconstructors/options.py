@@ -9,7 +9,7 @@ import numpy as np
 
 from phyradgs_cl import checks
 from phyradgs_cl.acquisition import Motion
-from phyradgs_cl.acquisition.motion import MODELS, RAYS, SPLATS, motions_for
+from phyradgs_cl.acquisition.motion import MODELS, RAYS, SPLATS, Centres, motions_for
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.reconstructors.frames.preprocess import Preprocessing
 from phyradgs_cl.reconstructors.registry import METHODS, method_name, method_of
@@ -96,12 +96,12 @@ def _motion(method: str, options: Any, motion: Any, counts: dict[str, Any]) -> M
 
 
 def _implied_motion(usual: str, counts: Mapping[str, Any], models: Mapping[str, Any]) -> str:
-    """Returns the name of the usual model, or of the only model with the given counts.
+    """Returns the name of the usual model, or of the only model with the given counts; ``centres`` is chosen by name only.
 
     A method whose usual model is static stays static unless ``motion`` is given."""
     if usual.startswith("static") or all(_has(models[usual], key) for key in counts):
         return usual
-    having = [name for name, model in models.items() if all(_has(model, key) for key in counts)]
+    having = [name for name, m in models.items() if name != Centres.name and all(_has(m, key) for key in counts)]
     return having[0] if len(having) == 1 else usual
 
 

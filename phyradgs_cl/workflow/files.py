@@ -128,7 +128,7 @@ def _options_in_words(options: object) -> dict[str, object]:
     motion = options.get("motion")
     if isinstance(motion, Mapping):
         strips, sub_intervals = motion.get("strips"), motion.get("sub_intervals")
-        counts = {"micro-views": f" {strips} × {sub_intervals}"}
+        counts = dict.fromkeys(("micro-views", "centres"), f" {strips} × {sub_intervals}")
         if sub_intervals is not None:  # FDK has one time per line
             counts["per-row"] = f", {sub_intervals} times per exposure"
             counts["own-times"] = f", {sub_intervals} times per line"

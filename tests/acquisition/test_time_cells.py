@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from phyradgs_cl.acquisition import (
+    Centres,
     CircularOrbit,
     ConeGeometry,
     ConstantSpeed,
@@ -143,8 +144,8 @@ def scan(is_fly: bool) -> Scan:
 
 def test_motion_models_of_fly_and_stop_and_shoot_scans() -> None:
     counts = {
-        Static(): 1, StaticStart(): 1, MicroViews(4, 3): 12, PerRow(sub_intervals=3): 5, OwnTimes(sub_intervals=3): 30,
-        Exact(segments=5): 5, LineMiddles(): 10,
+        Static(): 1, StaticStart(): 1, MicroViews(4, 3): 12, Centres(4, 3): 12, PerRow(sub_intervals=3): 5,
+        OwnTimes(sub_intervals=3): 30, Exact(segments=5): 5, LineMiddles(): 10,
     }
     assert (MicroViews(), PerRow(), Exact()) == (MicroViews(8, 5), PerRow(5), Exact(0, 0.005))
     for motion, count in counts.items():
@@ -165,9 +166,14 @@ def test_motion_models_of_fly_and_stop_and_shoot_scans() -> None:
 def test_a_model_states_the_operators_that_take_it() -> None:
     still = [Static(), StaticStart(), MicroViews(), PerRow(), OwnTimes()]
     assert list(motions_for(RAYS)) == still and list(motions_for(LINE_POSES)) == [Static(), StaticStart(), LineMiddles()]
-    assert list(motions_for(SPLATS)) == [Static(), StaticStart(), MicroViews(), Exact()]
+    assert list(motions_for(SPLATS)) == [Static(), StaticStart(), MicroViews(), Centres(), Exact()]
     for motion in MODELS:  # rays and lines need cells that stand still
-        assert motion().cells(scan(True), 1).is_moving is (motion.operators == (SPLATS,))
+        cells = motion().cells(scan(True), 1)
+        if motion.operators == (SPLATS,):
+            with pytest.raises(InputError, match="--motion"):
+                cells.still()
+        else:
+            assert cells.still() is cells
 
 
 def test_facts_of_a_model_are_the_model() -> None:

@@ -86,7 +86,7 @@ def test_a_function_is_run_with_its_options_and_what_it_takes(rt, scan) -> None:
     assert seen == [(Options(MicroViews(2, 5), 0.5), 4)] and [p.iteration for p in reports] == [1, 2, 3]
     assert result.volume.max() == 0.5 and result.facts["steps"] == 3
     assert result.facts["method"].endswith("landweber") and result.facts["options"]["motion"]["strips"] == 2
-    assert motions_of(landweber) == ("static", "static-start", "micro-views", "per-row", "own-times", "exact")
+    assert motions_of(landweber) == ("static", "static-start", "micro-views", "centres", "per-row", "own-times", "exact")
     with pytest.raises(InputError, match="did you mean 'gain'"):
         reconstruct(scan, landweber, gian=0.5, device=rt)
     with pytest.raises(InputError, match="option steps: found 1.5; expected a whole number"):

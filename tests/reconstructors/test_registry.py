@@ -157,14 +157,15 @@ def test_errors_about_motion_offer_what_the_method_has() -> None:
             method_options(method, None, {"motion": "wobble"})
         assert refused.value.expected == f"one of {', '.join(own)} for --method {method}"
     for method in ("phyradgs", "r2"):
-        assert motions_of(method) == ("static", "static-start", "micro-views", "exact")
+        assert motions_of(method) == ("static", "static-start", "micro-views", "centres", "exact")
     for method in ("sirt", "fdk"):
         assert "exact" not in motions_of(method)
     assert "micro-views" not in motions_of("fdk")
 
 
 def test_counts_belong_to_the_motions_that_have_them() -> None:
-    models = {"strips": {"micro-views"}, "sub_intervals": {"micro-views", "per-row", "own-times"}, "segments": {"exact"}}
+    strips = {"micro-views", "centres"}
+    models = {"strips": strips, "sub_intervals": {*strips, "per-row", "own-times"}, "segments": {"exact"}}
     pairs = [(method, name) for method in METHODS for name in motions_of(method)]
     for (method, name), (key, having) in product(pairs, models.items()):
         changes = {"motion": name, key: 3}
@@ -181,7 +182,7 @@ def test_strips_mean_micro_views_where_the_motion_is_exact() -> None:
     for given, expected in [
         ({}, "exact"), ({"strips": 4}, "micro-views"), ({"sub_intervals": 3}, "micro-views"),
         ({"strips": 4, "sub_intervals": 3}, "micro-views"), ({"segments": 3}, "exact"),
-        ({"time_error": 0.01}, "exact"), ({"motion": "static"}, "static"),
+        ({"motion": "centres", "strips": 4}, "centres"), ({"time_error": 0.01}, "exact"), ({"motion": "static"}, "static"),
     ]:  # fmt: skip
         motion = method_options("phyradgs", None, given).motion
         assert motion.name == expected

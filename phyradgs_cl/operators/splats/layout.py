@@ -61,7 +61,8 @@ class DeviceCells:
     A frame read out along columns is projected as its transpose: only the poses' pixel steps are exchanged. With motion,
     ``matrices`` has three poses per cell (middle, both ends) and ``line_times`` (C, 3, time_pitch) the integration times of
     the lines; without motion ``line_times`` has one element. The intensity model draws cells into ``layers`` images in
-    which no line has two cells; ``layer_weights`` (layers, lines) are the cells' shares of a line's window.
+    which no line has two cells; ``layer_weights`` (layers, lines) are the cells' shares of a line's window. With
+    ``fixed_conic``, ``cells`` are of the conic's pose, and ``matrices`` have two poses per cell, its own one last.
     """
 
     cells: DeviceArray
@@ -74,6 +75,7 @@ class DeviceCells:
     lines: int
     layers: int
     moving: bool = False
+    fixed_conic: bool = False
     is_parallel: bool = False
 
     @property
@@ -90,6 +92,9 @@ class DeviceCells:
             poses = np.concatenate([pose[:, None], table.readout.poses(table.end_poses)], 1).reshape(-1, pose.shape[1])
             times = np.zeros((table.count, 3, pitch_of(table.lines)), np.float32)
             times[:, :, : table.lines] = table.line_times
+        if table.conic_pose is not None:
+            pose = np.broadcast_to(table.readout.poses(table.conic_pose[None]), pose.shape)
+            poses = np.stack([pose, poses], 1).reshape(-1, pose.shape[1])
         ranges = np.stack([table.line_start, table.line_stop], -1).astype(np.int32)
         weights = table.layer_weights
         return cls(
@@ -103,6 +108,7 @@ class DeviceCells:
             lines=table.lines,
             layers=len(weights),
             moving=table.is_moving,
+            fixed_conic=table.conic_pose is not None,
             is_parallel=table.is_parallel,
         )
 

@@ -47,7 +47,7 @@ def path_limits(time_error: float) -> tuple[float, float, float]:
 
 @dataclass(frozen=True)
 class _Kernels:
-    """The four passes, compiled for cells with or without motion."""
+    """The four passes, compiled for cells with or without motion, or with motion of the centres only."""
 
     prepare: Kernel
     forward: Kernel
@@ -55,16 +55,18 @@ class _Kernels:
     chain: Kernel
 
     @classmethod
-    def declare(cls, rt: Runtime, moving: bool, **options: bool) -> "_Kernels":
+    def declare(cls, rt: Runtime, moving: bool, fixed_conic: bool, **options: bool) -> "_Kernels":
         by_pixel = rt.pixel_items
         defines = {"IMAGE_GUARD": GUARD, "MOVING": moving, **options}
         forward = "splat_forward_pixels" if by_pixel else "splat_forward_rows"
         backward = "splat_backward_group" if by_pixel else "splat_backward_rows"
         return cls(
-            prepare=rt.kernel("splat_prepare", "splat_prepare_moving" if moving else "splat_prepare", **defines),
+            prepare=rt.kernel(
+                "splat_prepare", "splat_prepare_moving" if moving else "splat_prepare", FIXED_CONIC=fixed_conic, **defines
+            ),
             forward=rt.kernel("splat_forward", forward, BLOCK_PIXEL=by_pixel, **defines),
             backward=rt.kernel("splat_backward", backward, **GROUP_DEFINES[by_pixel], **defines),
-            chain=rt.kernel("splat_chain", "splat_chain", **defines),
+            chain=rt.kernel("splat_chain", "splat_chain", FIXED_CONIC=fixed_conic, **defines),
         )
 
 
@@ -105,8 +107,10 @@ class SplatProjector:
         self._extents = rt.empty(1, np.int32)
         options = {"FOOTPRINT": pixel_footprint, "LAYERED": self._layers is not None}
         self._kernels = {
-            (moving, parallel): _Kernels.declare(rt, moving, AFFINE=affine or parallel, PARALLEL=parallel, **options)
-            for moving in (False, True)
+            (moving, fixed, parallel): _Kernels.declare(
+                rt, moving, fixed, AFFINE=affine or parallel, PARALLEL=parallel, **options
+            )
+            for moving, fixed in ((False, False), (False, True), (True, False))
             for parallel in (False, True)
         }
 
@@ -125,7 +129,7 @@ class SplatProjector:
         drawn = self.image if self._layers is None else self._layers.images(cells)
         items = (self.width, self.lines) if self.by_pixel else self.lists.total
         rt.launch(
-            self._kernels[cells.moving, cells.is_parallel].forward,
+            self._kernels[cells.moving, cells.fixed_conic, cells.is_parallel].forward,
             items,
             self._records,
             self._is_visible,
@@ -168,7 +172,7 @@ class SplatProjector:
         rt = self.rt
         items, group = items_by_gaussian(rt, gaussians.count)
         by_images = by_image if self._layers is None else self._layers.split(cells, by_image)
-        kernels = self._kernels[cells.moving, cells.is_parallel]
+        kernels = self._kernels[cells.moving, cells.fixed_conic, cells.is_parallel]
         rt.launch(
             kernels.backward,
             items,
@@ -235,7 +239,7 @@ class SplatProjector:
             self._extents = rt.empty(6 * gaussians.stride, np.int32)
         times = (cells.line_times, np.int32(cells.time_pitch)) if cells.moving else ()
         rt.launch(
-            self._kernels[cells.moving, cells.is_parallel].prepare,
+            self._kernels[cells.moving, cells.fixed_conic, cells.is_parallel].prepare,
             gaussians.stride // rt.lanes,
             gaussians.rows, np.int32(gaussians.count), np.int32(gaussians.stride),
             cells.cells, cells.matrices, cells.cell_lines, np.int32(cells.count),

@@ -10,7 +10,7 @@ mean projected by the segment's two end poses; its middle is the mean of the par
 Conic and Q come from the plain difference C − b bᵀ, which loses digits that float64 has to spare and float32 has not.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -166,21 +166,32 @@ def moving_frame(
     affine: bool = False,
     pixel_variance: float = 0.0,
 ) -> np.ndarray:
-    """The merged frame (nv, nu) of parameter rows (11, G) over cells with motion.
+    """The merged frame (nv, nu) of parameter rows (11, G) over cells with motion, or over cells with a ``conic_pose``.
 
-    ``pixel_variance`` (pixels²) is added to the covariance of every splat on the detector, mass kept.
+    ``pixel_variance`` (pixels²) is added to the covariance of every splat on the detector, mass kept. A cell with a
+    ``conic_pose`` is a segment without a path: the splat of that pose, with its centre where the cell's pose has it.
     """
-    assert table.end_poses is not None and table.line_times is not None
+    moved = table.conic_pose is not None
+    poses, end_poses, line_times = _centre_segments(table) if moved else (table.pose, table.end_poses, table.line_times)
+    assert end_poses is not None and line_times is not None
     by_column = table.axis == "columns"
     shape = detector_shape[::-1] if by_column else detector_shape
     turn = transpose_pose if by_column else np.asarray
     frame = np.zeros(shape)
-    for pose, ends, times in zip(turn(table.pose), turn(table.end_poses), table.line_times, strict=True):
+    for pose, ends, times in zip(turn(poses), turn(end_poses), line_times, strict=True):
         for row, precision in zip(rows.T, precision_matrices(rows), strict=True):
             frame += _segment_image(
-                row, precision, pose, ends, times, shape, cutoff_sigma, affine, pixel_variance, table.is_parallel
+                row, precision, pose, ends, times, shape, cutoff_sigma, affine, pixel_variance, table.is_parallel, moved
             )
     return frame.T if by_column else frame
+
+
+def _centre_segments(table: TimeCells) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The conic's pose (C, 12), each cell's own pose twice (C, 2, 12), and lines that see one time (C, 3, lines)."""
+    times = np.zeros((table.count, 3, table.lines))
+    for cell, lines in enumerate(table.ranges):
+        times[cell, 2, lines] = table.weight[cell]
+    return np.broadcast_to(table.conic_pose, table.pose.shape), np.stack([table.pose, table.pose], 1), times
 
 
 def seen_at(pose: np.ndarray, point: np.ndarray, is_parallel: bool = False) -> np.ndarray:
@@ -224,10 +235,13 @@ def _segment_image(
     affine: bool,
     pixel_variance: float,
     is_parallel: bool,
+    moved: bool,
 ) -> np.ndarray:
     if min(seen_at(p, row[:3], is_parallel)[2] for p in (pose, *ends)) <= 0:
         return np.zeros(shape)
     s = _segment(row, precision, pose, ends, pixel_variance, is_parallel)
+    if moved:
+        s = replace(s, centre=seen_at(ends[0], row[:3], is_parallel)[:2])
     v, u = np.mgrid[: shape[0], : shape[1]]
     delta = np.stack([u, v], -1) - s.centre
     big_q = np.ones(shape) if affine or is_parallel else 1 + 2 * delta @ s.b + np.einsum("...i,ij,...j", delta, s.c, delta)
