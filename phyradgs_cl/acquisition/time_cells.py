@@ -108,7 +108,7 @@ class TimeCells:
         if self.is_moving:
             raise InputError("--motion", "cells with motion", "still cells: only splats move", "take --motion per-row")
         if self.conic_pose is not None:
-            raise InputError("--motion", "cells with a conic pose", "cells without one: only splats have conics", "take micro-views")
+            raise InputError("--motion", "cells with a conic pose", "none: only splats have conics", "take micro-views")
         return self
 
     def line_poses(self) -> np.ndarray:
