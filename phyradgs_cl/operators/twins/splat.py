@@ -191,7 +191,7 @@ def _centre_segments(table: TimeCells) -> tuple[np.ndarray, np.ndarray, np.ndarr
     times = np.zeros((table.count, 3, table.lines))
     for cell, lines in enumerate(table.ranges):
         times[cell, 2, lines] = table.weight[cell]
-    return np.broadcast_to(table.conic_pose, table.pose.shape), np.stack([table.pose, table.pose], 1), times
+    return np.broadcast_to(np.asarray(table.conic_pose), table.pose.shape), np.stack([table.pose, table.pose], 1), times
 
 
 def seen_at(pose: np.ndarray, point: np.ndarray, is_parallel: bool = False) -> np.ndarray:
