@@ -85,8 +85,8 @@ class MicroViews:
 class Centres(MicroViews):
     """``MicroViews`` in which only the centres of splats move, as in GS-on-the-Move (the paper's reference 21).
 
-    ``strips`` of lines × ``sub_intervals`` poses per frame move them; conics, extents and densities on the panel are those of
-    the middle of the frame's lit span. Raises InputError for counts below 1."""
+    ``strips`` of lines × ``sub_intervals`` poses per frame move them; conics, extents and densities on the panel are
+    those of the middle of the frame's lit span. Raises InputError for counts below 1."""
 
     operators: ClassVar = (SPLATS,)  # type: ignore[assignment]
     name: str = field(default="centres", init=False, repr=False)
