@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from phyradgs_cl.acquisition import Scan
+    from phyradgs_cl.reconstructors.frames.projected import FramePair
     from phyradgs_cl.runtime import Runtime
 
 VolumeMap = Callable[[np.ndarray, Grid], tuple[np.ndarray, Grid]]
@@ -108,8 +109,9 @@ class Progress:
     """One report of a running method: ``iteration`` of ``iterations`` is finished, after ``seconds`` in s.
 
     loss: the dimensionless measure that ``quantity`` names. gaussians: their number, or 0. state: returns the state from
-    which the run can resume. volume: returns the present volume (nz, ny, nx) in 1/mm and its grid. Both may be called during
-    the report only. A report that raises KeyboardInterrupt ends the run as Ctrl-C does."""
+    which the run can resume. volume: returns the present volume (nz, ny, nx) in 1/mm and its grid. frames: returns so
+    many measured frames, spread evenly, with those computed from the present volume. All three may be called during the
+    report only. A report that raises KeyboardInterrupt ends the run as Ctrl-C does."""
 
     iteration: int
     iterations: int
@@ -119,6 +121,7 @@ class Progress:
     quantity: str = "loss"
     state: "Callable[[], State] | None" = None
     volume: "Callable[[], tuple[np.ndarray, Grid]] | None" = None
+    frames: "Callable[[int], list[FramePair]] | None" = None
 
     def mapped(
         self, state: "Callable[[State], State] | None" = None, volume: "VolumeMap | None" = None, **changes: Any

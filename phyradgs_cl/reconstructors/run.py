@@ -1,7 +1,7 @@
 """Runs a plan on a scan: preprocessing, first volume, margin, tuning, held-out pixels, and the method."""
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import cache, partial
@@ -19,7 +19,13 @@ from phyradgs_cl.prepare import PREPARED_KEY
 from phyradgs_cl.prepare.step import with_masked
 from phyradgs_cl.reconstructors.checkpoint import State, with_identity, without_identity
 from phyradgs_cl.reconstructors.frames.preprocess import prepared
-from phyradgs_cl.reconstructors.frames.projected import held_out, holdout_errors
+from phyradgs_cl.reconstructors.frames.projected import (
+    FramePair,
+    frame_pairs,
+    held_out,
+    holdout_errors,
+    spread_frames,
+)
 from phyradgs_cl.reconstructors.plan import InitialVolume, RunPlan
 from phyradgs_cl.reconstructors.registry import METHODS, method_of
 from phyradgs_cl.reconstructors.result import (
@@ -71,8 +77,12 @@ def reconstruct(
     box = None if preprocessing.margin_mm is None else preprocessing.of(scan.grid)
 
     def hook(progress: Progress) -> Progress:
-        """Adds the run's identity to its states, and takes the margin from its volumes."""
+        """Adds the run's identity to its states, and frames; takes the margin from its volumes."""
         progress = progress.mapped(state=lambda state: with_identity(state, identity()))
+        if progress.volume is not None and rt.ranks.size == 1:  # ranks project together
+            whole = cache(progress.volume)
+            pairs = partial(_spread_pairs, rt, ready, whole)
+            progress = replace(progress, volume=whole, frames=pairs)
         return progress if box is None else progress.mapped(volume=lambda volume, grid: _within(volume, grid, box))
 
     with report.through(hook), _naming_size_that_fits(rt, ready, plan), naming_host_memory():
@@ -90,6 +100,12 @@ def reconstruct(
         return result
     result.facts[MARGIN_MM] = preprocessing.margin_mm
     return result.within(box)
+
+
+def _spread_pairs(
+    rt: Runtime, scan: Scan, volume: Callable[[], tuple[np.ndarray, Grid]], count: int
+) -> list[FramePair]:
+    return frame_pairs(rt, scan, *volume(), spread_frames(scan.frames, count))
 
 
 def check_resumable(plan: RunPlan) -> None:

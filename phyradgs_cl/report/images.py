@@ -146,17 +146,32 @@ def planes_of(volume: Volume, reference: Volume | None, grid: Grid, windows: Map
     planes = []
     for (name, axis, letter, right, up), count in zip(PLANES, counts, strict=True):
         indices = np.unique(np.linspace(0, volume.shape[axis] - 1, count).round().astype(int)).tolist()
-        place = grid.first_centre_mm[axis], grid.voxel_size_mm[axis]
-        height_mm, width_mm = (side for a, side in enumerate(grid.size_mm) if a != axis)
         pictures = {
             key: [base64_of(_picture(v, axis, i, windows[key].least, windows[key].most)) for i in indices]
             for key, v in layers.items()
         }
         first = windows["result"]
         still = _picture(volume, axis, indices[len(indices) // 2], first.low, first.high)
-        size_mm, slices = (width_mm, height_mm), volume.shape[axis]
-        planes.append(Plane(name, letter, right, up, slices, indices, *place, size_mm, pictures, still))
+        slices = volume.shape[axis]
+        planes.append(Plane(name, letter, right, up, slices, indices, *_extent(grid, axis), pictures, still))
     return planes
+
+
+def middle_planes(slices: Sequence[Volume], grid: Grid, window: tuple[float, float]) -> list[Plane]:
+    """Returns planes with nothing but the stills of three middle slices (axial, coronal, sagittal) of a volume on ``grid``;
+    ``window`` is the values of black and white."""
+    planes = []
+    for (name, axis, letter, right, up), image in zip(PLANES, slices, strict=True):
+        still = grey_png(block_means(image, LONGEST_EDGE), *window)
+        middle = grid.shape[axis] // 2
+        planes.append(Plane(name, letter, right, up, grid.shape[axis], [middle], *_extent(grid, axis), {}, still))
+    return planes
+
+
+def _extent(grid: Grid, axis: int) -> tuple[float, float, tuple[float, float]]:
+    """Returns the first slice's centre and the distance to the next, and (width, height) of a slice, all in mm."""
+    height_mm, width_mm = (side for a, side in enumerate(grid.size_mm) if a != axis)
+    return grid.first_centre_mm[axis], grid.voxel_size_mm[axis], (width_mm, height_mm)
 
 
 def stills_of(planes: Sequence[Plane], volume: Volume, window: tuple[float, float]) -> list[Plane]:
@@ -174,16 +189,14 @@ def _slice_counts(shape: tuple[int, ...], layers: int) -> list[int]:
 
 
 def _picture(volume: Volume, axis: int, index: int, low: float, high: float) -> bytes:
-    return grey_png(_reduced(np.take(volume, index, axis=axis)), low, high)
+    return grey_png(block_means(np.take(volume, index, axis=axis), LONGEST_EDGE), low, high)
 
 
-def _reduced(image: Volume) -> Volume:
-    """Returns means over blocks of pixels, where an image (rows, columns) is longer than ``LONGEST_EDGE``."""
-    for axis in (0, 1):
-        edge = image.shape[axis]
-        if edge > LONGEST_EDGE:
-            starts = (np.arange(LONGEST_EDGE) * edge) // LONGEST_EDGE
-            sums = np.add.reduceat(image.astype(np.float64), starts, axis=axis)
-            lengths = np.diff([*starts, edge])
-            image = sums / (lengths[:, None] if axis == 0 else lengths)
-    return image
+def block_means(values: Volume, most_edge: int) -> Volume:
+    """Returns means over blocks of an array of any shape, along every axis that is longer than ``most_edge``."""
+    for axis, edge in enumerate(values.shape):
+        if edge > most_edge:
+            starts = (np.arange(most_edge) * edge) // most_edge
+            lengths = np.diff([*starts, edge]).reshape([-1 if a == axis else 1 for a in range(values.ndim)])
+            values = np.add.reduceat(values, starts, axis=axis, dtype=np.float64) / lengths
+    return values

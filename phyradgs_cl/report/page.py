@@ -2,6 +2,7 @@
 
 import hashlib
 from collections.abc import Callable, Sequence
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +20,8 @@ from phyradgs_cl.report.run import Change, Run, computed_views, load_run, step_c
 from phyradgs_cl.runtime import Runtime
 
 DEFAULT_VIEWS = 3
+_SCRIPT = ("common", "shaders", "render", "space", "slices")  # in this order: space.js hears of the window from slices.js
+_SCRIPTED = ("volume",)  # sections that the script reveals
 
 
 @np.errstate(all="ignore")  # a file may hold any values
@@ -56,6 +59,7 @@ def report_page(run: Run, views: Sequence[FramePair] = (), changes: Sequence[Cha
     }  # fmt: skip
     parts = {
         "slices": sections.slices_section(run),
+        "volume": sections.volume_section(run),
         "metrics": sections.metrics_section(run, views),
         "convergence": sections.convergence_section(run),
         "tuning": sections.tuning_section(run),
@@ -63,7 +67,7 @@ def report_page(run: Run, views: Sequence[FramePair] = (), changes: Sequence[Cha
         "provenance": sections.provenance_section(run),
     }
     shown = {name: part for name, part in parts.items() if part is not None}
-    links = [element("a", name.capitalize(), href=f"#{name}") for name in shown]
+    links = [element("a", name.capitalize(), href=f"#{name}", hidden=name in _SCRIPTED) for name in shown]
     skip = element("a", "To the content", href="#slices", class_="skip")
     body = joined(
         skip, element("header", *_top(run), element("nav", *links, aria_label="Sections")),
@@ -71,8 +75,9 @@ def report_page(run: Run, views: Sequence[FramePair] = (), changes: Sequence[Cha
         element("footer", f"Written by phyradgs-cl {__version__} from {run.path.name}."),
     )
     title = f"{run.path.name} – {run.stored.provenance.get('method', 'volume')}"
-    page = element("body", body, raw_text("script", _file("page.js")))
-    return "<!doctype html>\n" + element("html", _head(title), page, lang="en") + "\n"
+    script = web_script(*_SCRIPT)
+    page = element("body", body, raw_text("script", script))
+    return "<!doctype html>\n" + element("html", head(title, script), page, lang="en") + "\n"
 
 
 def _arranged(shown: dict[str, Markup]) -> list[Markup]:
@@ -83,9 +88,10 @@ def _arranged(shown: dict[str, Markup]) -> list[Markup]:
     return [wide[0], pair, *wide[1:]]
 
 
-def _head(title: str) -> Markup:
-    """Returns the styles, and a policy that permits no network and no script except the page's own."""
-    digest = base64_of(hashlib.sha256(_file("page.js").encode()).digest())
+def head(title: str, script: str, reload_s: int | None = None) -> Markup:
+    """Returns the styles, and a policy that permits no network and no script except ``script``. reload_s: after how many
+    seconds a browser without scripts loads the page again."""
+    digest = base64_of(hashlib.sha256(script.encode()).digest())
     policy = f"default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'sha256-{digest}'"
     policy += "; base-uri 'none'; form-action 'none'"
     return element(
@@ -93,7 +99,8 @@ def _head(title: str) -> Markup:
         element("meta", http_equiv="Content-Security-Policy", content=policy),
         element("meta", name="viewport", content="width=device-width, initial-scale=1"),
         element("meta", name="color-scheme", content="light dark"), element("title", title),
-        raw_text("style", _file("page.css")),
+        raw_text("style", _web("page.css")),
+        None if reload_s is None else element("noscript", element("meta", http_equiv="refresh", content=str(reload_s))),
     )
 
 
@@ -122,5 +129,11 @@ def _tiles(run: Run) -> list[tuple[str, str]]:
     return tiles
 
 
-def _file(name: str) -> str:
-    return Path(__file__).with_name(name).read_text(encoding="utf-8")
+def web_script(*names: str) -> str:
+    """Returns files of the folder ``web`` as one script."""
+    return "".join(_web(f"{name}.js") for name in names)
+
+
+@cache
+def _web(name: str) -> str:
+    return (Path(__file__).parent / "web" / name).read_text(encoding="utf-8")

@@ -22,7 +22,7 @@ from phyradgs_cl.prepare.step import Facts
 from phyradgs_cl.reconstructors import Preprocessing, preprocessing_of
 from phyradgs_cl.reconstructors.fdk import static_fdk
 from phyradgs_cl.reconstructors.frames.preprocess import prepared, stages
-from phyradgs_cl.reconstructors.frames.projected import FramePair, frame_pairs
+from phyradgs_cl.reconstructors.frames.projected import FramePair, frame_pairs, spread_frames
 from phyradgs_cl.reconstructors.tune import TUNED, is_tuning
 from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.text import plain_text
@@ -148,17 +148,12 @@ def _scan_of(path: Path, provenance: Mapping[str, object], notes: list[str]) -> 
     return None
 
 
-def chosen_frames(frames: int, count: int) -> list[int]:
-    """Returns ``count`` frame numbers spread evenly over the scan, with the first."""
-    return sorted({(k * frames) // count for k in range(min(count, frames))})
-
-
 def computed_views(run: Run, rt: Runtime, count: int) -> list[FramePair]:
     """Returns ``count`` frames of the scan after the run's preprocessing, with those computed from its volume."""
     if run.scan is None or count < 1:
         return []
     scan = prepared(run.scan, run.preprocessing, rt)
-    return frame_pairs(rt, scan, run.stored.values, run.stored.required_grid, chosen_frames(scan.frames, count))
+    return frame_pairs(rt, scan, run.stored.values, run.stored.required_grid, spread_frames(scan.frames, count))
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,6 +9,7 @@ from phyradgs_cl.acquisition.motion import motion_facts
 from phyradgs_cl.prepare import PREPARED_KEY
 from phyradgs_cl.reconstructors.frames.projected import TIMES_PER_LINE, FramePair
 from phyradgs_cl.report import images
+from phyradgs_cl.report.atlas import space
 from phyradgs_cl.report.charts import Chart, convergence_charts, histogram, tuning_chart, views_chart
 from phyradgs_cl.report.markup import Markup, element, flattened, joined, label, number, shown, unit
 from phyradgs_cl.report.run import Change, Run
@@ -35,7 +36,15 @@ def slices_section(run: Run) -> Markup:
     words = f"{' × '.join(map(str, grid.shape))} voxels (z, y, x), {size} mm"
     if any(len(plane.indices) < plane.count for plane in planes):
         words += "; the page has evenly chosen slices of them"
-    return _section("slices", "Slices", _note(words + "."), viewer(planes, windows), _disagreement(run, planes))
+    return section("slices", "Slices", note(words + "."), viewer(planes, windows), _disagreement(run, planes))
+
+
+def volume_section(run: Run) -> Markup | None:
+    """The volume in 3D, which the script reveals where the browser can draw it."""
+    stored = run.stored
+    window = images.windows_of(stored.values, run.reference)["result"]
+    picture = space(stored.values, stored.required_grid, window, stored.gaussians)
+    return None if picture is None else section("volume", "Volume in 3D", picture, hidden=True)
 
 
 def _disagreement(run: Run, planes: Sequence[images.Plane]) -> Markup | None:
@@ -45,7 +54,7 @@ def _disagreement(run: Run, planes: Sequence[images.Plane]) -> Markup | None:
     high = images.grey_range(values)[1]
     heading = element("h3", "Disagreement of voxels and splats", id="disagreement")
     pictures = images.stills_of(planes, values, (0.0, high))
-    return joined(heading, _note(_DISAGREEMENT), stills(pictures, "disagreement", high))
+    return joined(heading, note(_DISAGREEMENT), stills(pictures, "disagreement", high))
 
 
 def metrics_section(run: Run, views: Sequence[FramePair]) -> Markup | None:
@@ -62,21 +71,21 @@ def metrics_section(run: Run, views: Sequence[FramePair]) -> Markup | None:
     words = f"Against the reference of the scan, {run.compared}. " if run.compared else ""
     if "holdout_rms" in facts:
         words += "Holdout: RMS error of line integrals that the method did not see, and the RMS of their noise."
-    return _section("metrics", "Metrics", words and _note(words), facts_table(facts))
+    return section("metrics", "Metrics", words and note(words), facts_table(facts))
 
 
 def convergence_section(run: Run) -> Markup | None:
     charts = convergence_charts(run.record)
-    return _section("convergence", "Convergence", _charts(charts)) if charts else None
+    return section("convergence", "Convergence", _charts(charts)) if charts else None
 
 
 def tuning_section(run: Run) -> Markup | None:
-    return _section("tuning", "Tuning", _charts([tuning_chart(run.tuned)])) if run.tuned else None
+    return section("tuning", "Tuning", _charts([tuning_chart(run.tuned)])) if run.tuned else None
 
 
 def scan_section(run: Run) -> Markup:
     facts = {k: v for k, v in run.scan_facts.items() if k != "sha256"}
-    return _section("scan", "Scan", element("div", facts_table(facts), class_="columns"))
+    return section("scan", "Scan", element("div", facts_table(facts), class_="columns"))
 
 
 def geometry_section(scan: Scan) -> Markup:
@@ -84,7 +93,7 @@ def geometry_section(scan: Scan) -> Markup:
     above = f"From above: {source} in the middle of every frame"
     above += ", and its arc in the first frame; grey, the panel at the end of the arc." if scan.is_fly else "."
     side = f"From the side: the {beam} of the first frame."
-    return _section("geometry", "Geometry", _charts([(above, orbit_chart(scan)), (side, side_chart(scan))]))
+    return section("geometry", "Geometry", _charts([(above, orbit_chart(scan)), (side, side_chart(scan))]))
 
 
 def shutter_section(run: Run, scan: Scan) -> Markup | None:
@@ -98,24 +107,29 @@ def shutter_section(run: Run, scan: Scan) -> Markup | None:
     charts = [(caption, shutter_chart(scan, run.motion))]
     if scan.is_fly:
         charts.append(("The first frames on one axis of time.", frames_chart(scan)))
-    return _section("shutter", "Shutter in space and time", _charts(charts))
+    return section("shutter", "Shutter in space and time", _charts(charts))
 
 
 def projections_section(scan: Scan, views: Sequence[FramePair]) -> Markup | None:
     """Measured, computed and residual frames, with one range of grey values and one of residuals."""
     if not views:
         return None
+    (rows, columns), (dv_mm, du_mm) = scan.geometry.detector_shape, scan.geometry.pixel_size_mm
+    words, parts = frame_pictures(views, f"aspect-ratio: {columns * du_mm:.6g} / {rows * dv_mm:.6g}")
+    if scan.is_fly:
+        words += f" Every line is computed from the volume at {TIMES_PER_LINE} times of its own exposure."
+    else:
+        words += " Every frame is computed from its one pose."
+    return section("projections", "Projections", note(words), *parts)
+
+
+def frame_pictures(views: Sequence[FramePair], style: str | None = None) -> tuple[str, list[Markup]]:
+    """Returns the legend of frames and their pictures, a row each. ``style``: of a picture, where pixels are not square."""
     low = min(0.0, *(float(v.measured.min()) for v in views))
     high = max(float(v.measured.max()) for v in views)
     limit = max(float(np.percentile(np.abs(v.residual), 99.5)) for v in views) or 1.0
-    (rows, columns), (dv_mm, du_mm) = scan.geometry.detector_shape, scan.geometry.pixel_size_mm
     words = f"Line integrals, black {number(low)}, white {number(high)}; residuals, measured less computed, "
-    words += f"blue −{number(limit)}, red +{number(limit)}. "
-    if scan.is_fly:
-        words += f"Every line is computed from the volume at {TIMES_PER_LINE} times of its own exposure."
-    else:
-        words += "Every frame is computed from its one pose."
-    style = f"aspect-ratio: {columns * du_mm:.6g} / {rows * dv_mm:.6g}"
+    words += f"blue −{number(limit)}, red +{number(limit)}."
     parts = []
     for view in views:
         residual = f"residual, RMS {number(view.rms)} ({number(100 * view.relative)} %)"
@@ -125,7 +139,7 @@ def projections_section(scan: Scan, views: Sequence[FramePair]) -> Markup | None
             (residual, images.signed_png(view.residual, limit)),
         ]
         parts.append(_row(f"Frame {view.frame}", f"frame {view.frame}", pictures, style))
-    return _section("projections", "Projections", _note(words), *parts)
+    return words, parts
 
 
 def preparation_section(run: Run, changes: Sequence[Change]) -> Markup | None:
@@ -136,7 +150,7 @@ def preparation_section(run: Run, changes: Sequence[Change]) -> Markup | None:
         return None
     words = "The frame and the sinogram (a line per frame) that each step changed most, and the middle slice. Before and "
     words += "after have one range of grey values; the difference is after less before."
-    return _section("preparation", "Preparation", changes and _note(words), *earlier, *map(_change, changes))
+    return section("preparation", "Preparation", changes and note(words), *earlier, *map(_change, changes))
 
 
 def _change(change: Change) -> Markup:
@@ -162,7 +176,7 @@ def calibration_section(scan: Scan) -> Markup | None:
         return None
     words = "Parameters of the scan were estimated from its frames"
     words += f", {len(calibrations)} times, each from the result before." if len(calibrations) > 1 else "."
-    return _section("calibration", "Calibration", _note(words), *parts)
+    return section("calibration", "Calibration", note(words), *parts)
 
 
 def _calibration(calibration: Mapping[str, object], scan: Scan) -> list[Markup]:
@@ -182,7 +196,7 @@ def _calibration(calibration: Mapping[str, object], scan: Scan) -> list[Markup]:
     charts = [views_chart(k, v) for k, v in corrections if isinstance(v, list) and len(v) == scan.frames]
     return [
         element("table", element("thead", head), element("tbody", *rows)),
-        *map(_note, notes),
+        *map(note, notes),
         _charts(chart for chart in charts if chart is not None),
     ]
 
@@ -205,7 +219,7 @@ def provenance_section(run: Run) -> Markup:
     if isinstance(options, Mapping):
         summary = element("summary", "All options of the method")
         parts.append(element("details", summary, facts_table(options)))
-    return _section("provenance", "Provenance", *parts)
+    return section("provenance", "Provenance", *parts)
 
 
 def facts_table(facts: Mapping[str, object]) -> Markup:
@@ -254,11 +268,13 @@ def _charts(charts: Iterable[Chart]) -> Markup:
     return element("div", *figures, class_="charts")
 
 
-def _note(words: str) -> Markup:
+def note(words: str) -> Markup:
+    """Returns a paragraph of small letters."""
     return element("p", words, class_="note")
 
 
-def _section(identifier: str, heading: str, *content: object) -> Markup:
+def section(identifier: str, heading: str, *content: object, hidden: bool = False) -> Markup:
+    """Returns a section with its heading; content that is empty or None is left out."""
     title = element("h2", heading, id=f"{identifier}-heading")
     body = joined(*(part for part in content if part))
-    return element("section", title, body, id=identifier, aria_labelledby=f"{identifier}-heading")
+    return element("section", title, body, id=identifier, aria_labelledby=f"{identifier}-heading", hidden=hidden)

@@ -21,14 +21,14 @@ _HELP = (
 def viewer(planes: list[Plane], windows: Mapping[str, Window]) -> Markup:
     """Returns three pictures with a slider each, the choice of layers, window and zoom, and the data of the script."""
     sliders = [
-        _slider("black", "Black", 0, 255, 0, ""),
-        _slider("white", "White", 0, 255, 255, ""),
-        _slider("zoom", "Zoom", 1, _MOST_ZOOM, 1, "1×", 0.5),
+        slider("black", "Black", 0, 255, 0, ""),
+        slider("white", "White", 0, 255, 255, ""),
+        slider("zoom", "Zoom", 1, _MOST_ZOOM, 1, "1×", 0.5),
         element("button", "Reset", type="button", id="reset"),
     ]
     choice = _choice(list(windows)) if len(windows) > 1 else None
     figures = element("div", *(_figure(plane) for plane in planes), class_="slices")
-    layers = {key: {**vars(w), "decimals": _decimals((w.most - w.least) / 255)} for key, w in windows.items()}
+    layers = {key: {**vars(w), "decimals": decimals_of((w.most - w.least) / 255)} for key, w in windows.items()}
     colours = base64_of(diverging().tobytes()) if "difference" in windows else None
     data = {plane.name: _plane_data(plane) for plane in planes}
     first = windows["result"]
@@ -41,7 +41,8 @@ def viewer(planes: list[Plane], windows: Mapping[str, Window]) -> Markup:
     )
 
 
-def _slider(name: str, words: str, low: float, high: float, value: float, shown: str, step: float = 1) -> Markup:
+def slider(name: str, words: str, low: float, high: float, value: float, shown: str, step: float = 1) -> Markup:
+    """Returns a slider with its name and its value in words, which the script keeps."""
     control = element(
         "input", type="range", id=name, min=low, max=high, step=step, value=value, aria_describedby=f"{name}-value"
     )
@@ -109,8 +110,9 @@ def _plane_data(plane: Plane) -> dict[str, object]:
     places = [_place(plane, k) for k in range(len(plane.indices))]
     names = ("axis", "right", "up", "count", "indices", "first_mm", "step_mm", "layers")
     facts = {name: getattr(plane, name) for name in names}
-    return {**facts, "width_mm": plane.size_mm[0], "decimals": _decimals(plane.step_mm) + 1, "places": places}
+    return {**facts, "width_mm": plane.size_mm[0], "decimals": decimals_of(plane.step_mm) + 1, "places": places}
 
 
-def _decimals(step: float) -> int:
+def decimals_of(step: float) -> int:
+    """Returns the decimals that tell values apart whose distance is ``step``."""
     return int(min(20, max(0, math.ceil(-math.log10(step))))) if step > 0 else 0

@@ -8,29 +8,24 @@ PHYRADGS_CHROMIUM names the browser's program if it is not on the path; PHYRADGS
 
 import os
 import re
-import shutil
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from playwright.sync_api import Browser, Page, sync_playwright
+from playwright.sync_api import Browser, Page
+from report.browser import POOR_CONTRAST, SOFTWARE, launched, watched
 
 from phyradgs_cl.io import read_volume, write_scan, write_volume
 from phyradgs_cl.report import write_report
 
 WIDTHS = (1280, 390)
-PROGRAMS = ("chromium", "chromium-browser", "google-chrome")
 
 
 @pytest.fixture(scope="module")
 def browser() -> Iterator[Browser]:
-    program = os.environ.get("PHYRADGS_CHROMIUM") or next(filter(None, map(shutil.which, PROGRAMS)), None)
-    assert program, f"no browser: install one of {PROGRAMS}, or name its program by PHYRADGS_CHROMIUM"
-    with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=program, args=["--no-sandbox"])
+    with launched(*SOFTWARE) as browser:
         yield browser
-        browser.close()
 
 
 @pytest.fixture(scope="module")
@@ -43,12 +38,9 @@ def address(rt, files, tmp_path_factory) -> str:
 @pytest.fixture(params=WIDTHS)
 def page(request, browser, address) -> Iterator[Page]:
     """The page at a desktop's and a phone's width; anything that it complains of or asks for fails the test."""
-    page = browser.new_page(viewport={"width": request.param, "height": 800})
     trouble: list[str] = []
-    page.on("console", lambda message: trouble.append(message.text))
-    page.on("pageerror", lambda error: trouble.append(str(error)))
-    page.on("request", lambda asked: asked.url.startswith(("data:", address)) or trouble.append(asked.url))
-    page.goto(address)
+    page = watched(browser.new_page(viewport={"width": request.param, "height": 800}), address, trouble)
+    page.wait_for_selector("#space[data-drawn]")
     yield page
     page.close()
     assert not trouble
@@ -221,14 +213,15 @@ def test_tab_reaches_every_control(page) -> None:
     for _ in range(30):
         page.keyboard.press("Tab")
         reached.append(page.evaluate("document.activeElement.id || document.activeElement.tagName"))
-    sliders = {"slider-axial", "slider-coronal", "slider-sagittal", "black", "white", "zoom"}
-    assert sliders | {"reset", "layer-result", "SUMMARY"} <= set(reached)
+    sliders = {"slider-axial", "slider-coronal", "slider-sagittal", "black", "white", "zoom", "turn", "tilt", "space-zoom"}
+    assert sliders | {"reset", "layer-result", "space", "space-maximum", "space-reset", "SUMMARY"} <= set(reached)
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 def test_both_schemes_have_their_colours(browser, address, scheme) -> None:
     page = browser.new_page(color_scheme=scheme)
     page.goto(address)
+    assert page.evaluate(POOR_CONTRAST) == []
     ground = page.evaluate("getComputedStyle(document.body).backgroundColor")
     assert ground == {"light": "rgb(246, 247, 249)", "dark": "rgb(18, 22, 28)"}[scheme]
     page.close()
@@ -238,7 +231,7 @@ def test_without_script_the_middle_slices_stay(browser, address) -> None:
     page = browser.new_context(java_script_enabled=False).new_page()
     page.goto(address)
     assert page.locator("#plane-axial img").is_visible()
-    assert not page.locator("#slider-axial").is_visible() and not page.locator(".tools").is_visible()
+    assert not page.locator("#slider-axial").is_visible() and not page.locator(".tools").first.is_visible()
     assert page.locator("#plane-axial .bar").is_visible() and "Black is 0, white" in reading(page)
     page.close()
 

@@ -19,10 +19,10 @@ from phyradgs_cl.reconstructors import plan_run
 from phyradgs_cl.report import Run, load_run, report_page, write_report
 from phyradgs_cl.report.images import Window
 from phyradgs_cl.report.markup import number
-from phyradgs_cl.report.run import chosen_frames, computed_views
+from phyradgs_cl.report.run import computed_views, spread_frames
 from phyradgs_cl.workflow import run_reconstruction
 
-ALL = {"slices", "metrics", "convergence", "projections", "scan", "geometry", "shutter", "provenance"}
+ALL = {"slices", "volume", "metrics", "convergence", "projections", "scan", "geometry", "shutter", "provenance"}
 HOSTILE = "</title></script><script>alert(1)</script><img src=x onerror='alert(2)'>\"'&amp;"
 
 
@@ -66,7 +66,7 @@ def test_a_page_is_whole_and_asks_nothing_of_the_world(page, page_text) -> None:
     policy = next(m["content"] for m in page.all("meta") if "http-equiv" in m)
     digest = base64.b64encode(hashlib.sha256(page.texts["script"][-1].encode()).digest()).decode()
     assert f"script-src 'sha256-{digest}'" in policy and "default-src 'none'" in policy
-    assert [s.get("type", "") for s in page.all("script")] == ["application/json", ""]
+    assert [s.get("type", "") for s in page.all("script")] == ["application/json", "application/json", ""]
 
 
 def test_metrics_and_convergence_are_those_of_the_file(page, files) -> None:
@@ -130,7 +130,7 @@ def test_a_window_has_room_for_overshoots_and_says_what_lies_beyond() -> None:
 def test_the_shown_frames_are_close_to_the_measured_ones(rt, files, page) -> None:
     run = load_run(files[1])
     views = computed_views(run, rt, 3)
-    assert [view.frame for view in views] == [0, 2, 5] == chosen_frames(8, 3)
+    assert [view.frame for view in views] == [0, 2, 5] == spread_frames(8, 3)
     assert all(view.relative < 0.2 for view in views)
     images = [image for image in page.all("img") if image["alt"].startswith("frame ")]
     assert len(images) == 9
@@ -169,7 +169,7 @@ def test_what_files_say_is_never_a_part_of_the_page(rt, files, small_scan, tmp_p
     write_report(volume_path, tmp_path / "p.html", lambda: rt, scan=scan_path)
     text = (tmp_path / "p.html").read_text(encoding="utf-8")
     page = parse(text)
-    assert not page.open and len(page.all("script")) == 2 and len(page.all("title")) == 1
+    assert not page.open and len(page.all("script")) == 3 and len(page.all("title")) == 1
     assert not any(key.startswith("on") for _, attributes in page.elements for key in attributes)
     assert not [image for image in page.all("img") if image["src"] == "x"]
     assert "alert(1)" in page.words  # it is shown, as text
@@ -182,7 +182,7 @@ def test_a_run_without_its_scan_still_shows_the_volume(files, tmp_path, parse, c
     run = write_report(volume, tmp_path / "p.html", no_runtime)
     assert run.scan is None and "--scan" in run.notes[0] and "gone.h5" in caplog.text
     page = parse((tmp_path / "p.html").read_text(encoding="utf-8"))
-    assert set(page.ids) & ALL == {"slices", "metrics", "convergence", "provenance"}
+    assert set(page.ids) & ALL == {"slices", "volume", "metrics", "convergence", "provenance"}
     assert not [i for i in page.ids if i.startswith("layer-")]
 
 
@@ -214,7 +214,7 @@ def test_a_bare_result_is_a_picture_of_the_volume(any_volume, tmp_path, parse) -
     volume, grid = any_volume
     write_volume(tmp_path / "v.h5", volume, grid, {})
     page = parse(report_page(load_run(tmp_path / "v.h5")))
-    assert set(page.ids) & ALL == {"slices", "provenance"}
+    assert set(page.ids) & ALL == {"slices", "volume", "provenance"}
     sizes = {image["style"] for image in page.all("img")}
     assert len(sizes) == 3 and "aspect-ratio: 0.8 / 1.2" in sizes
 

@@ -50,6 +50,11 @@ def _rms(values: NDArray[np.floating]) -> float:
     return float(np.sqrt(np.mean(values.astype(np.float64) ** 2))) if values.size else 0.0
 
 
+def spread_frames(frames: int, count: int) -> list[int]:
+    """Returns ``count`` frame numbers spread evenly over the scan, with the first."""
+    return sorted({(k * frames) // count for k in range(min(count, frames))})
+
+
 def frame_pairs(rt: Runtime, scan: Scan, volume: np.ndarray, grid: Grid, frames: Sequence[int]) -> list[FramePair]:
     """Returns some frames of a scan with those of a volume (nz, ny, nx) in 1/mm, under the scan's true motion.
 

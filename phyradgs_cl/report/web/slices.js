@@ -1,10 +1,9 @@
-"use strict";
 // Slices, window, zoom and values of the three planes. Without this script the page shows the middle slices.
 (() => {
-  const block = document.getElementById("slice-data");
-  if (!block) return;
-  const { planes, windows, colours } = JSON.parse(block.textContent);
-  const palette = colours && Uint8Array.from(atob(colours), (c) => c.charCodeAt(0));
+  const data = dataOf("slice-data");
+  if (!data) return;
+  const { planes, windows, colours } = data;
+  const palette = colours && bytesOf(colours);
   const black = document.getElementById("black"), white = document.getElementById("white");
   const zoom = document.getElementById("zoom"), reading = document.getElementById("reading");
   const ends = {}; // first and last of the 256 steps that are shown, by window
@@ -12,8 +11,6 @@
   const origin = {}; // by axis: the fraction at which the picture stays fixed under zoom
   let layer = "result", pointed = null, armed = null;
 
-  const clamp = (value, low, high) => Math.min(Math.max(value, low), high);
-  const inWords = (value, decimals) => value.toFixed(decimals).replace(/^-(?=[0.]*$)/, "").replace("-", "−");
   const isGrey = () => layer !== "difference";
   const kind = () => (isGrey() ? "result" : "difference"); // the truth has the result's window
   const valueOf = (step) => windows[layer].least + (step / 255) * (windows[layer].most - windows[layer].least);
@@ -87,6 +84,7 @@
       slider.setAttribute("aria-valuetext", inPerMm(step));
     }
     Object.values(parts).forEach(paint);
+    document.dispatchEvent(new CustomEvent("grey-window", { detail: ends.result }));
   }
 
   function moveWindow(slider) {
@@ -110,10 +108,7 @@
       across.style.top = 100 - seen(plane.up) + "%";
       sheet.style.transform = `scale(${times})`;
       sheet.style.transformOrigin = `${100 * origin[plane.right]}% ${100 - 100 * origin[plane.up]}%`;
-      const most = (0.3 * plane.width_mm) / times, power = 10 ** Math.floor(Math.log10(most));
-      const length = power * ([5, 2].find((factor) => factor * power <= most * (1 + 1e-9)) || 1);
-      bar.style.width = (100 * length * times) / plane.width_mm + "%";
-      bar.textContent = Number(length.toPrecision(1)) + " mm";
+      setBar(bar, plane.width_mm / times);
     }
   }
 
