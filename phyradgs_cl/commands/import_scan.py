@@ -68,7 +68,7 @@ def import_command(
     voxel_mm: VoxelMm = None,
     roi_mm: RoiMm = None,
 ) -> None:
-    """Import a scan of another program: R2-Gaussian, PhyRadGS, NAF, RTK, Data Exchange, NXtomo, TIFF, Nikon."""
+    """Import a scan: R2-Gaussian, PhyRadGS, NAF, RTK, Data Exchange, NXtomo, TIFF, Nikon, SkyScan, FleX-ray."""
     if template:
         say(template_of(source))
         return

@@ -31,6 +31,8 @@ FORMATS = {
     "nxtomo": "nxtomo",
     "tiff": "tiff_folder",
     "nikon": "laboratory.nikon",
+    "skyscan": "laboratory.skyscan",
+    "flexray": "laboratory.flexray",
 }
 _MOST_BODIES = 1000
 _LARGEST_MM, _LARGEST_PER_MM = 1e5, 1e5

@@ -483,8 +483,8 @@ NIKON: dict[str, tuple[Damage, tuple[str, ...]]] = {
     "no number of projections": (in_text(XTEK, "Projections=6", "Projection=6"), ("Projections",)),
     "half a projection": (in_text(XTEK, "Projections=6", "Projections=6.5"), ("Projections",)),
     "too many projections": (in_text(XTEK, "Projections=6", "Projections=1e30"), ("Projections",)),
-    "projections that are not there": (in_text(XTEK, "Projections=6", "Projections=7"), ("7", "6 files")),
-    "pixels that are not there": (in_text(XTEK, "PixelsX=14", "PixelsX=15"), ("(6, 10, 15)",)),
+    "projections that are not there": (in_text(XTEK, "Projections=6", "Projections=7"), ("expected 7", "6 files")),
+    "pixels that are not there": (in_text(XTEK, "PixelsX=14", "PixelsX=15"), ("6 × 10 × 15",)),
     "no white level": (in_text(XTEK, "WhiteLevel", "Level"), ("WhiteLevel",)),
     "a white level of 0": (in_text(XTEK, "WhiteLevel=60000.0", "WhiteLevel=0"), ("WhiteLevel",)),
     "a distance of text": (in_text(XTEK, "SrcToObject=500.0", "SrcToObject=far"), ("SrcToObject", "'far'")),
@@ -498,4 +498,41 @@ NIKON: dict[str, tuple[Damage, tuple[str, ...]]] = {
     "a missing frame": (removed("scan_0003.tif"), ("5 files",)),
     "a truncated frame": (truncated("scan_0001.tif"), ("scan_0001.tif",)),
     "a name that is a pattern": (in_text(XTEK, "Name=scan", "Name=(.*)+$"), ("0 files",)),
+}  # fmt: skip
+
+LOG = "scan_.log"
+SKYSCAN: dict[str, tuple[Damage, tuple[str, ...]]] = {
+    "an empty log": (filled(LOG, b""), ("Number of Files",)),
+    "another section": (in_text(LOG, "[Acquisition]", "[User]"), ("Number of Files",)),
+    "no prefix": (in_text(LOG, "Filename Prefix=scan_", ""), ("Filename Prefix",)),
+    "a prefix that leaves the folder": (in_text(LOG, "Prefix=scan_", "Prefix=../in/scan_"), ("0 files",)),
+    "too many files": (in_text(LOG, "Files= 6", "Files= 99999999"), ("Number of Files",)),
+    "files that are not there": (in_text(LOG, "Files= 6", "Files= 9"), ("expected 9", "6 files")),
+    "a path that is no circle": (in_text(LOG, "ROUND", "SPIRAL"), ("Scanning Trajectory", "SPIRAL")),
+    "no correction": (in_text(LOG, "Correction=ON", "Correction=OFF"), ("Flat Field Correction", "flat_value")),
+    "a pixel of no size": (in_text(LOG, "Size (um)=1562.5", "Size (um)=0"), ("Image Pixel Size (um)",)),
+    "a pixel without a ratio": (in_text(LOG, "X/Y Ratio=", "X/Y Ratio=-"), ("Camera X/Y Ratio",)),
+    "an axis at infinity": (in_text(LOG, "(line)=", "(line)=1e9"), ("Optical Axis (line)",)),
+    "a camera before the object": (in_text(LOG, "Camera to Source (mm)=800", "Camera to Source (mm)=8"), ("detector",)),
+    "a step of text": (in_text(LOG, "Step (deg)=25.0", "Step (deg)=small"), ("Rotation Step (deg)", "'small'")),
+    "bits without end": (in_text(LOG, "=16\r\nReference Intensity", "=1e9\r\nR"), ("Depth (bits)",)),
+    "a frame that is a link": (symlinked("scan_00000001.tif"), ("symbolic link",)),
+    "a hole in the numbering": (lambda p: (p / "scan_00000005.tif").rename(p / "scan_00000007.tif"), ("a hole",)),
+}  # fmt: skip
+
+SETTINGS = "scan settings.txt"
+FLEXRAY: dict[str, tuple[Damage, tuple[str, ...]]] = {
+    "empty settings": (filled(SETTINGS, b"SOD SDD"), ("SOD", "nothing")),
+    "no distance": (in_text(SETTINGS, "SDD", "SD"), ("SDD",)),
+    "a panel before the axis": (in_text(SETTINGS, "SDD : 800.0", "SDD : 80"), ("source_to_detector_mm",)),
+    "no pixel": (in_text(SETTINGS, "Binned pixel size : 3.0", "Binned pixel size : none"), ("Binned pixel size", "'none'")),
+    "a window of three": (in_text(SETTINGS, "0,0,1943,1535", "0,0,1943"), ("ROI (LTRB)", "four")),
+    "a window of words": (in_text(SETTINGS, "0,0,1943,1535", "a,b,c,d"), ("ROI (LTRB)",)),
+    "a window of many digits": (in_text(SETTINGS, "0,0,1943,1535", "0,0,1," + "9" * 5000), ("ROI (LTRB)",)),
+    "a place of text": (in_text(SETTINGS, "tra_obj : 0.0;", "tra_obj : left"), ("tra_obj", "'left'")),
+    "no last angle": (in_text(SETTINGS, "Last angle", "Angle"), ("Last angle",)),
+    "no flats": (lambda p: [(p / f"io00000{i}.tif").unlink() for i in (0, 1)], ("io", "at least one")),
+    "flats of another panel": (lambda p: tifffile.imwrite(p / "io000000.tif", np.zeros((9, 14), np.uint16)), ("io000000",)),
+    "a truncated frame": (truncated("scan_000002.tif"), ("scan_000002.tif",)),
+    "a dark that is a link": (symlinked("di000000.tif"), ("symbolic link",)),
 }  # fmt: skip

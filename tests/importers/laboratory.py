@@ -66,3 +66,49 @@ def write_nikon(folder: Path, truth: Any, **lines: object) -> Path:
     for i, image in enumerate(counts16(truth), start=1):
         tifffile.imwrite(folder / f"scan_{i:04d}.tif", image[::-1, ::-1])
     return folder
+
+
+def write_skyscan(folder: Path, truth: Any, **lines: object) -> Path:
+    """A SkyScan's scan_.log with its TIFFs and a preview: rows from the top, the right column first. Lines are counted from
+    the bottom line's lower edge."""
+    folder.mkdir()
+    g, (first_deg, step_deg) = truth.scan.geometry, steps_deg(truth)
+    values: dict[str, object] = {
+        "Filename Prefix": "scan_", "Number Of Files": f" {truth.scan.frames}", "Number Of Rows": f" {g.detector_shape[0]}",
+        "Number Of Columns": g.detector_shape[1], "Camera binning": "1x1", "Image Rotation": "0.0000",
+        "Optical Axis (line)": g.detector_shape[0] / 2 - g.detector_offset_mm[0] / g.pixel_size_mm[0],
+        "Camera to Source (mm)": g.source_to_detector_mm, "Object to Source (mm)": g.source_to_axis_mm,
+        "Image Pixel Size (um)": g.pixel_size_mm[1] / g.magnification * 1000, "Depth (bits)": 16,
+        "Reference Intensity": int(WHITE), "Exposure (ms)": 200, "Frame Averaging": "ON (2)",
+        "Scanning Start Angle": first_deg, "Rotation Step (deg)": step_deg, "Rotation Direction": "CW",
+        "Flat Field Correction": "ON", "Type of Detector Motion": "STEP AND SHOOT", "Scanning Trajectory": "ROUND", **lines,
+    }  # fmt: skip
+    text = "".join(f"{name}={value}\r\n" for name, value in values.items() if value is not None)
+    ratio = g.pixel_size_mm[1] / g.pixel_size_mm[0]
+    system = f"[System]\r\nScanner=SkyScan1272\r\nCamera X/Y Ratio={ratio}\r\n"
+    (folder / "scan_.log").write_text(f"{system}[Acquisition]\r\n{text}[Reconstruction]\r\nFilename Prefix=rec\r\n")
+    for i, image in enumerate(counts16(truth)):
+        tifffile.imwrite(folder / f"scan_{i:08d}.tif", image[::-1, ::-1])
+    tifffile.imwrite(folder / "scan__spr.tif", image[:3])
+    return folder
+
+
+def write_flexray(folder: Path, truth: Any, **lines: object) -> Path:
+    """A FleX-ray's "scan settings.txt" with frames, two flats and a dark: rows from the top, the left column first."""
+    folder.mkdir()
+    g, angle_deg = truth.scan.geometry, np.rad2deg(truth.angle_rad).round(9)
+    values: dict[str, object] = {
+        "Sample name": "mine", "Voxel size": f"{g.pixel_size_mm[1] / g.magnification * 1000} um",
+        "SOD": g.source_to_axis_mm, "SDD": g.source_to_detector_mm, "ver_tube": "0.0; tube", "tra_tube": "0.0; tube",
+        "ver_det": f"{g.detector_offset_mm[0]}; panel", "tra_det": f"{g.detector_offset_mm[1]}; panel", "tra_obj": "0.0;",
+        "ROI (LTRB)": "0,0,1943,1535", "# projections": truth.scan.frames, "Binned pixel size": g.pixel_size_mm[0],
+        "Start angle": angle_deg[0], "Last angle": angle_deg[-1], **lines,
+    }  # fmt: skip
+    text = "".join(f"{name} : {value}\n" for name, value in values.items() if value is not None)
+    (folder / "scan settings.txt").write_text(f"[Scan settings]\n{text}")
+    flats, darks = np.full((2, *g.detector_shape), WHITE), np.zeros((1, *g.detector_shape))
+    for name, stack in (("scan_", counts16(truth)), ("io", flats), ("di", darks)):
+        for i, image in enumerate(stack):
+            tifffile.imwrite(folder / f"{name}{i:06d}.tif", np.asarray(image, np.uint16)[::-1])
+    return folder
+

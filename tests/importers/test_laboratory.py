@@ -23,6 +23,8 @@ from phyradgs_cl.simulation import SimulationOptions, phantom_scene, simulate
 CENTRED = ConeGeometry(500.0, 800.0, (10, 14), (3.0, 2.5))
 WRITERS: dict[str, tuple[Callable[..., Path], ConeGeometry]] = {
     "nikon": (lab.write_nikon, CENTRED),
+    "skyscan": (lab.write_skyscan, ConeGeometry(512.0, 1024.0, (10, 14), (2.5, 2.5), (2.5, 0.0))),
+    "flexray": (lab.write_flexray, ConeGeometry(500.0, 800.0, (10, 14), (2.5, 2.5), (4.0, -6.0))),
 }
 
 
@@ -110,8 +112,48 @@ def test_nikon_s_frames_may_lie_in_a_folder_of_their_own(tmp_path, make_truth) -
             for file in path.glob("*.tif"):
                 file.rename(path / "frames" / file.name)
         assert import_scan(path).frames == 6
-    with pytest.raises(InputError, match="Projections: found 6, and 0 files"):
+    with pytest.raises(InputError, match="Projections: found 0 files"):
         (path / "inner").mkdir()
         text = (path / "scan.xtekct").read_text().replace(r"C:\scans\mine", "inner")
         (path / "scan.xtekct").write_text(text)
         import_scan(path)
+
+
+def test_skyscan_s_log_has_pixels_that_are_not_square_and_a_sample_that_turns_the_other_way(
+    tmp_path, make_truth, caplog
+) -> None:
+    geometry = ConeGeometry(500.0, 800.0, (10, 14), (3.0, 2.5), (4.0, 0.0))
+    truth = make_truth(geometry=geometry)
+    lines = {"Image Rotation": 0.17, "Reference Intensity": None, "Optical Axis (line)": 5 - 4 / 3}
+    path = lab.write_skyscan(tmp_path / "a", truth, **lines)
+    scan = import_scan(path)
+    falls_where(scan, truth.angle_rad, geometry)
+    assert scan.geometry.pixel_size_mm == pytest.approx((3.0, 2.5))
+    for text in ("(air at 65535 counts; else say flat_value)", "Image Rotation is 0.17°", "check --fix-offset"):
+        assert text in caplog.text
+    assert "STEP" not in caplog.text and "an exposure" not in caplog.text
+    back = lab.write_skyscan(tmp_path / "b", truth, **{"Rotation Direction": "CC", "Type of Detector Motion": None})
+    scan = import_scan(back)
+    falls_where(scan, -truth.angle_rad, geometry)
+    assert "an exposure of 0.4 s and no time from frame to frame" in caplog.text  # two frames of 200 ms
+    fly = import_scan(path, ImportOptions(fps=0.8, flat_value=lab.WHITE))
+    assert fly.is_fly and fly.shutter.exposure_s == 0.4
+    np.testing.assert_array_equal(fly.projections, lab.line_integrals_of(lab.counts16(truth)))
+
+
+def test_flexray_s_tube_stage_and_panel_stand_anywhere(tmp_path, make_truth, caplog) -> None:
+    """Places are in one frame; a window lower on the panel is as flexdata has it."""
+    geometry = ConeGeometry(500.0, 800.0, (10, 14), (2.5, 2.5))
+    places = {"ver_tube": 1.0, "tra_tube": -2.0, "ver_det": 6.5, "tra_det": 3.25, "tra_obj": -0.5}
+    window = {"ROI (LTRB)": "10, 20, 1953, 1555", "Exposure time (ms)": 100, "Number of averages": 3}
+    truth = make_truth(geometry=geometry)
+    path = lab.write_flexray(tmp_path / "a", truth, **places, **window)
+    scan = import_scan(path / "scan settings.txt")
+    moved = replace(geometry, detector_offset_mm=(6.5 - 1.0 + 20 * 0.0748, 3.25 + 2.0 + 10 * 0.0748))
+    falls_where(scan, truth.angle_rad, moved, axis_mm=1.5)
+    assert "without a correction profile of flexdata" in caplog.text and "(0)" not in caplog.text
+    assert import_scan(path, ImportOptions(fps=1.0)).shutter.exposure_s == pytest.approx(0.3)
+    bare = {"Binned pixel size": None, "tra_obj": None, "ROI (LTRB)": None, "Start angle": None}
+    scan = import_scan(lab.write_flexray(tmp_path / "b", truth, **bare))
+    falls_where(scan, np.deg2rad(np.linspace(0, 135, 6)), geometry)
+    assert "no tra_obj (0), no Start angle (0), no ROI (LTRB) (the whole panel)" in caplog.text

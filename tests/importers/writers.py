@@ -288,11 +288,13 @@ WRITERS = {
     "naf": (write_naf, "chest.pickle"), "rtk": (write_rtk, "rtk"),
     "data-exchange": (write_data_exchange, "dx.h5"),
     "nxtomo": (write_nxtomo, "nx.h5"), "tiff": (write_tiff, "tiff"),
-    "nikon": (lab.write_nikon, "nikon"),
+    "nikon": (lab.write_nikon, "nikon"), "skyscan": (lab.write_skyscan, "skyscan"),
+    "flexray": (lab.write_flexray, "flexray"),
 }  # fmt: skip
 
 
-OFFSETS_MM = {"phyradgs-real": (4.0, 0.0), "nikon": (0.0, 0.0)}  # of the panel, where a format cannot state all
+# of the panel, where a format cannot state all
+OFFSETS_MM = {"phyradgs-real": (4.0, 0.0), "nikon": (0.0, 0.0), "skyscan": (4.0, 0.0)}
 
 
 def write(form: str, folder: Path, make_truth: Any) -> Path:

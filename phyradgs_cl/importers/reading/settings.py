@@ -10,7 +10,7 @@ from phyradgs_cl.importers.reading.files import read_bytes
 from phyradgs_cl.io.tables import Fields
 
 _log = logging.getLogger(__name__)
-_NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?(?=$|[\s;,])")
+_NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?(?=$|[\s;])")
 
 
 def read_settings(
@@ -19,7 +19,7 @@ def read_settings(
     """Reads the lines NAME ``separator`` VALUE whose name is one of ``names``, in any case; other lines are not looked at.
 
     A value that begins with a number is that number; other text stays text. ``sections``: the only [sections] that count,
-    in any case; () takes all. Of a name that comes twice the first counts; "#" and ";" begin lines of comment."""
+    in any case; () takes all. Of a name that comes twice the first counts."""
     spelt = {name.lower(): name for name in names}
     wanted = {section.lower() for section in sections}
     values: dict[str, object] = {}
@@ -31,7 +31,7 @@ def read_settings(
             continue
         key, sign, text = line.partition(separator)
         name = spelt.get(key.strip().lower())
-        if is_inside and sign and name and line[0] not in ";#" and text.strip():
+        if is_inside and sign and name and text.strip():
             values.setdefault(name, _value(text.strip()))
     return Fields(f"{path}:", values)
 

@@ -58,20 +58,21 @@ def read_tiffs(paths: list[Path]) -> np.ndarray:
 
 
 def read_series(
-    folder: SafeFolder, prefix: str, shape: tuple[int, ...], subject: str, pattern: str = r"\d+"
+    folder: SafeFolder, prefix: str, shape: tuple[int | None, ...], subject: str, pattern: str = r"\d+"
 ) -> np.ndarray:
     """Reads the TIFFs of a folder whose names are ``prefix`` and a number: frames (F, v, u) of ``shape``, in the numbers'
-    order. ``pattern``: what stands for the number; ``subject`` names the description that states the shape."""
+    order; None is any size. ``pattern``: a number in the names; ``subject`` names the description that states the shape."""
     name = re.compile(re.escape(prefix) + pattern, re.I)
     paths = [path for path in folder.matching(*SUFFIXES) if name.fullmatch(path.stem)]
-    if len(paths) != shape[0]:
-        found = f"{shape[0]}, and {len(paths)} files {prefix}*.tif in {folder.root}"
-        raise InputError(subject, found, "a file for every projection", "copy the missing files")
+    if not paths or shape[0] not in (None, len(paths)):
+        found = f"{len(paths)} files {prefix[:60]}*.tif in {folder.root}"
+        expected = f"{shape[0]}, one for every projection" if shape[0] else "at least one"
+        raise InputError(subject, found, expected, "copy the missing files")
     check_numbering(paths, "copy the missing files")
-    frames, rows, columns = stack_shape(paths)
-    if (frames, rows, columns) != shape:
-        expected = f"{shape}, as {subject.partition(': ')[0]} says"
-        raise InputError(str(paths[0]), f"{frames} images of {rows} × {columns} pixels", expected)
+    sizes = stack_shape(paths)
+    if any(stated not in (None, size) for size, stated in zip(sizes, shape, strict=True)):
+        found = f"{sizes[0]} images of {sizes[1]} × {sizes[2]} pixels"
+        raise InputError(str(paths[0]), found, " × ".join(str(n or "any") for n in shape), f"see {subject}")
     return read_tiffs(paths)
 
 

@@ -50,7 +50,7 @@ def import_scan(path: Path, options: ImportOptions) -> Scan:
     frames = read_series(_folder_of_frames(folder, scan), prefix, (count, *panel), scan.name("Projections"))
     stage = _stage(scan, (panel[0], panel[1]), options)
     first_deg, step_deg = scan.number("InitialAngle", 0.0), scan.number("AngularStep")
-    angle_rad = -gantry_sign(options, "sample") * np.deg2rad(first_deg + step_deg * np.arange(count))
+    angle_rad = gantry_sign(options, "gantry") * np.deg2rad(first_deg + step_deg * np.arange(count))
     timing = make_timing(str(description), count, options)
     trajectory, geometry = stage.turned(angle_rad, timing, str(description))
     say_missing(scan, {"InitialAngle": "0"})

@@ -1,0 +1,92 @@
+"""Scans of TESCAN's FleX-ray scanners: "scan settings.txt" with TIFFs of counts, flats (io*) and darks (di*).
+
+Offsets have the signs of flexdata: ver_ up, tra_ to the right seen from the source, in mm; a window ROI (LTRB) of the panel
+moves its middle. The sample turns clockwise seen from above, row 0 is on top, column 0 on the left. flexdata's corrections
+for the scanner of CWI are not applied, since they belong to that scanner and its dates."""
+
+import logging
+from pathlib import Path
+
+import numpy as np
+
+from phyradgs_cl.acquisition import Scan
+from phyradgs_cl.importers.assemble import StoredTiming, assemble_scan, cone, make_timing
+from phyradgs_cl.importers.options import OF_BARE_FRAMES, ImportOptions
+from phyradgs_cl.importers.reading.files import SafeFolder
+from phyradgs_cl.importers.reading.frames import gantry_sign, line_integrals, oriented
+from phyradgs_cl.importers.reading.settings import head_has, read_settings, say_missing
+from phyradgs_cl.importers.reading.tiff import read_series
+from phyradgs_cl.importers.stage import RotaryStage
+from phyradgs_cl.io.tables import Fields
+
+_log = logging.getLogger(__name__)
+_FILE = "scan settings.txt"
+_PLACES = ("ver_tube", "tra_tube", "ver_det", "tra_det", "tra_obj")
+_NAMES = (
+    *("SOD", "SDD", *_PLACES, "Start angle", "Last angle", "ROI (LTRB)", "Binned pixel size", "Voxel size"),
+    *("Exposure time (ms)", "Number of averages"),
+)
+_WHOLE_MIDDLE, _WHOLE_PITCH_MM = (971, 767), 0.0748  # of the panel without binning: column, row, size of a pixel
+
+
+def recognises(path: Path) -> bool:
+    """True for a folder with "scan settings.txt", and for that file."""
+    file = path / _FILE if path.is_dir() else path
+    return file.name.lower() == _FILE and head_has(file, b"sod", b"sdd")
+
+
+def import_scan(path: Path, options: ImportOptions) -> Scan:
+    """Imports a folder with settings and frames, or the settings with the frames in their folder."""
+    options.refuse_unused("flexray", OF_BARE_FRAMES)
+    folder = SafeFolder(path if path.is_dir() else path.parent)
+    description = path if path.is_file() else folder.file(_FILE, str(path / _FILE))
+    scan = read_settings(description, _NAMES, ":")
+    frames = read_series(folder, "scan_", (None, None, None), str(folder.root / "scan_*.tif"))
+    panel = (frames.shape[1], frames.shape[2])
+    stacks = {
+        name: oriented(read_series(folder, prefix, (None, *panel), str(folder.root / f"{prefix}*.tif")), options, "top")
+        for name, prefix in (("flats", "io"), ("darks", "di"))
+    }
+    stage = _stage(scan, panel, options)
+    between = np.linspace(scan.number("Start angle", 0.0), scan.number("Last angle"), len(frames))
+    angle_rad = gantry_sign(options, "gantry") * np.deg2rad(between)
+    exposure_s = scan.length("Exposure time (ms)") / 1000 if scan.has("Exposure time (ms)") else None
+    if exposure_s is not None:
+        exposure_s *= scan.length("Number of averages") if scan.has("Number of averages") else 1
+    timing = make_timing(str(description), len(frames), options, StoredTiming(exposure_s=exposure_s))
+    trajectory, geometry = stage.turned(angle_rad, timing, str(description))
+    turned = oriented(frames, options, "top")
+    integrals = line_integrals(str(description), turned, options, convention="counts", **stacks)
+    title = folder.root.resolve().name
+    return assemble_scan(integrals, trajectory, geometry, timing, options, title=title, source=str(path))
+
+
+def _stage(scan: Fields, panel: tuple[int, int], options: ImportOptions) -> RotaryStage:
+    """Returns the stage of the settings, in a frame whose origin is as high as the source."""
+    to_axis_mm, to_detector_mm = scan.length("SOD"), scan.length("SDD")
+    if scan.has("Binned pixel size"):
+        pitch_mm = scan.length("Binned pixel size")
+    else:
+        pitch_mm = scan.length("Voxel size") / 1000 * (to_detector_mm / to_axis_mm)
+    place_mm = {name: scan.position(name) for name in _PLACES}
+    right_mm, up_mm = _window_mm(scan)
+    off_v = place_mm["ver_det"] + up_mm - place_mm["ver_tube"]
+    off_u = place_mm["tra_det"] + right_mm - place_mm["tra_tube"]
+    say_missing(scan, {**dict.fromkeys(_PLACES, "0"), "Start angle": "0", "ROI (LTRB)": "the whole panel"})
+    if options.detector_offset_mm is None:
+        text = "%s places are as stated, without a correction profile of flexdata: say %s, or calibrate"
+        _log.warning(text, scan.subject, options.named("detector_offset_mm"))
+    geometry = cone(options, to_axis_mm, to_detector_mm, panel, (pitch_mm, pitch_mm), (off_v, off_u))
+    return RotaryStage(geometry, place_mm["tra_obj"] - place_mm["tra_tube"])
+
+
+def _window_mm(scan: Fields) -> tuple[float, float]:
+    """Returns how far (right, up) of the panel's own middle the middle of its window is."""
+    if not scan.has("ROI (LTRB)"):
+        return 0.0, 0.0
+    words = scan.word("ROI (LTRB)").replace(" ", "").split(",")
+    if len(words) != 4 or not all(word.isascii() and word.isdecimal() and len(word) < 7 for word in words):
+        raise scan.error("ROI (LTRB)", repr(scan.word("ROI (LTRB)")[:40]), "four whole numbers: left, top, right, bottom")
+    left, top, right, bottom = map(int, words)
+    middle = ((left + right) // 2 - _WHOLE_MIDDLE[0], (top + bottom) // 2 - _WHOLE_MIDDLE[1])
+    return middle[0] * _WHOLE_PITCH_MM, middle[1] * _WHOLE_PITCH_MM
