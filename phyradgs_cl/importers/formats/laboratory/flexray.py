@@ -43,10 +43,10 @@ def import_scan(path: Path, options: ImportOptions) -> Scan:
     scan = read_settings(description, _NAMES, ":")
     frames = read_series(folder, "scan_", (None, None, None), str(folder.root / "scan_*.tif"))
     panel = (frames.shape[1], frames.shape[2])
-    stacks = {
-        name: oriented(read_series(folder, prefix, (None, *panel), str(folder.root / f"{prefix}*.tif")), options, "top")
-        for name, prefix in (("flats", "io"), ("darks", "di"))
-    }
+    flats, darks = (
+        oriented(read_series(folder, prefix, (None, *panel), str(folder.root / f"{prefix}*.tif")), options, "top")
+        for prefix in ("io", "di")
+    )
     stage = _stage(scan, panel, options)
     between = np.linspace(scan.number("Start angle", 0.0), scan.number("Last angle"), len(frames))
     angle_rad = gantry_sign(options, "gantry") * np.deg2rad(between)
@@ -56,7 +56,8 @@ def import_scan(path: Path, options: ImportOptions) -> Scan:
     timing = make_timing(str(description), len(frames), options, StoredTiming(exposure_s=exposure_s))
     trajectory, geometry = stage.turned(angle_rad, timing, str(description))
     turned = oriented(frames, options, "top")
-    integrals = line_integrals(str(description), turned, options, convention="counts", **stacks)
+    subject = str(description)
+    integrals = line_integrals(subject, turned, options, flats=flats, darks=darks, convention="counts")
     title = folder.root.resolve().name
     return assemble_scan(integrals, trajectory, geometry, timing, options, title=title, source=str(path))
 
