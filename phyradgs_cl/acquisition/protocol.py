@@ -15,7 +15,7 @@ from phyradgs_cl.errors import InputError
 
 @dataclass(frozen=True)
 class Protocol:
-    """``views`` frames of a turn at constant speed, each exposing an arc of ``exposure_deg`` (paper, section 3.1).
+    """``views`` frames of ``turns`` turns at constant speed, each exposing an arc of ``exposure_deg`` (paper, section 3.1).
     ``readout_ratio`` is T_ro/T_exp. ``pulse``: when the beam is on, (start, length) in exposures; None always."""
 
     views: int = 25
@@ -25,10 +25,12 @@ class Protocol:
     exposure_s: float = 1.0
     is_fly: bool = True
     pulse: tuple[float, float] | None = None
+    turns: float = 1.0
 
     def __post_init__(self) -> None:
         checks.whole("--views", self.views, 1, 100_000)
         object.__setattr__(self, "views", int(self.views))
+        checks.within("--turns", self.turns, 1e-3, 10_000)
         checks.within("--start-deg", self.start_deg, -1e6, 1e6)
         checks.within("--exposure-deg", self.exposure_deg, 0, 3600)
         checks.within("--readout-ratio", self.readout_ratio, 0, 1000)
@@ -44,7 +46,7 @@ class Protocol:
 
     @property
     def step_deg(self) -> float:
-        return 360.0 / self.views
+        return 360.0 * self.turns / self.views
 
     def at_rate(self, fps: float, readout_ms: float | None = None, named: Named = str) -> "Protocol":
         """Returns the protocol with exposure time and readout ratio from frames per second and a readout in ms. Raises
@@ -70,6 +72,11 @@ class Protocol:
         if self.exposure_deg == 0:
             return np.arange(self.views) * self.shutter().span_s
         return np.arange(self.views) * self.step_deg / self.exposure_deg * self.exposure_s
+
+    def window_s(self) -> tuple[float, float]:
+        """Returns when the first line opens, and when the last one closes, in s."""
+        start_s = self.frame_start_s()
+        return float(start_s[0]), float(start_s[-1]) + self.shutter().span_s
 
     def angle_start_rad(self) -> np.ndarray:
         start_rad: np.ndarray = np.deg2rad(self.start_deg + np.arange(self.views) * self.step_deg)

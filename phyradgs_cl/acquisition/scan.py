@@ -34,7 +34,7 @@ from phyradgs_cl.acquisition.trajectory import (
     unit_directions,
 )
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.fields import Grid, GridChoice
+from phyradgs_cl.fields import Grid, GridChoice, MovingTruth
 from phyradgs_cl.text import suggest_name
 
 if TYPE_CHECKING:
@@ -67,7 +67,8 @@ class Scan:
     - is_fly: False for stop-and-shoot scans, whatever the exposure time.
     - detector_model: quantity that the detector averages over an exposure, "log" (line integrals) or "intensity".
     - pixel_mask (nv, nu) or (F, nv, nu): non-zero for pixels not to be used; lines that a pulsed beam misses are added.
-    - reference (nz, ny, nx): the true volume in 1/mm on ``grid``.
+    - reference (nz, ny, nx): the true volume in 1/mm on ``grid``. moving_truth: of a simulated object that moves, its true
+      states on ``grid`` and its deformation.
     - lag: share λ of the recorded intensity that stems from earlier frames (detector/effects.py), still in the projections.
     - saturation: None where raw counts were not examined. title and provenance are stored in files.
 
@@ -88,6 +89,7 @@ class Scan:
     provenance: dict[str, object] = field(default_factory=dict)
     lag: float = 0.0
     saturation: Saturation | None = None
+    moving_truth: MovingTruth | None = None
 
     def __post_init__(self) -> None:
         for name, kinds in {"geometry": GEOMETRIES, "shutter": (Shutter,), "grid": (Grid,)}.items():
@@ -118,6 +120,9 @@ class Scan:
         checks.within("lag", self.lag, 0, LARGEST_LAG)
         if self.reference is not None and self.reference.shape != self.grid.shape:
             raise InputError("reference", f"shape {self.reference.shape}", f"the grid's {self.grid.shape}")
+        if self.moving_truth is not None and self.moving_truth.volumes.shape[1:] != self.grid.shape:
+            found = f"states of shape {self.moving_truth.volumes.shape[1:]}"
+            raise InputError("moving_truth", found, f"the grid's {self.grid.shape}")
         if self.pixel_mask is not None and np.shape(self.pixel_mask) not in (expected, expected[1:]):
             raise InputError("pixel_mask", f"shape {np.shape(self.pixel_mask)}", f"{expected[1:]} or {expected}")
         self._mask_dark_lines()
@@ -246,14 +251,18 @@ class Scan:
         return self.shutter.lines(self.geometry.detector_shape)
 
     def on_grid(self, grid: Grid) -> "Scan":
-        """Returns the scan with another grid. A reference stays where the old grid contains the new one."""
+        """Returns the scan with another grid. A truth stays where the old grid contains the new one."""
         if grid == self.grid:
             return self
-        reference = self.reference
-        if reference is not None:
-            part = grid.slices_in(self.grid)
-            reference = None if part is None else reference[part]
-        return replace(self, grid=grid, reference=reference)
+        part = grid.slices_in(self.grid)
+        if part is None:
+            return replace(self, grid=grid, reference=None, moving_truth=None)
+        reference, moving = self.reference, self.moving_truth
+        reference = None if reference is None else reference[part]
+        if moving is not None:
+            along_z, along_y, along_x = part
+            moving = replace(moving, volumes=moving.volumes[:, along_z, along_y, along_x])
+        return replace(self, grid=grid, reference=reference, moving_truth=moving)
 
     def with_grid(self, choice: GridChoice) -> "Scan":
         """Returns the scan with the chosen grid. Raises InputError for one outside the field of view of an orbit."""

@@ -21,6 +21,7 @@ GROUPS = {
     "simulate": {
         "Basics": ("output", "phantom", "volume", "scanner", "protocol", "size", "detector", "noise", "dose", "seed"),
         "Timing": (
+            *("turns", "motion_of_object"),
             *("views", "exposure_deg", "fps", "readout_ms", "readout_ratio", "first", "readout_axis", "readout_direction"),
             *("start_deg", "jitter_deg", "pulse"),
         ),
@@ -34,6 +35,7 @@ GROUPS = {
 ProtocolName = Literal[tuple(PROTOCOLS)]  # type: ignore[valid-type]
 Noise = Literal["none", "tigre", "beer"]
 _PHANTOM = f"Built-in phantom ({', '.join(PHANTOMS)}) or a TOML file of beads and wires."
+_MOTION = "TOML file of how the object moves: breathing, drying or sliding; the truth of some states is stored."
 _NAMES = lambda incomplete: [name for name in PHANTOMS if name.startswith(incomplete)]  # noqa: E731
 _VOLUME = "Volume file: HDF5 with /volume (z, y, x), mha, nii, nrrd, npy or tiff."
 _PROTOCOL = "rapid: 25 frames of 14.4°; standard: 50 of 7.2°; static: rapid with a gantry that stops."
@@ -46,7 +48,8 @@ def simulate_command(
     volume: Annotated[Path | None, file_option(_VOLUME, "--volume")] = None,
     scanner: Annotated[str, option("Scanner by name (r2, carm, parallel) or a TOML file.")] = "r2",
     protocol: Annotated[ProtocolName, option(_PROTOCOL)] = "rapid",  # type: ignore[valid-type]
-    views: Annotated[int | None, option("Frames in the turn.", "protocol's")] = None,
+    views: Annotated[int | None, option("Frames of the scan.", "protocol's")] = None,
+    turns: Annotated[float | None, option("Turns of the gantry, over which the frames are spread.", "1")] = None,
     exposure_deg: Annotated[float | None, option("Arc of one exposure, degrees.", "protocol's")] = None,
     readout_ratio: Annotated[float | None, option("Readout over exposure time.", "0.86")] = None,
     fps: Annotated[float | None, option("Frames per second; states the times of the arcs.", "scanner's")] = None,
@@ -76,6 +79,7 @@ def simulate_command(
     kvp: Annotated[float | None, option("Tube voltage, kV: a beam that hardens.", "0: one energy")] = None,
     truncation: Annotated[float, option("Fraction of the panel's columns cut off, half at each side.")] = 0.0,
     jitter_deg: Annotated[float | None, option("Wander of the gantry (std, degrees), in the encoder table.", "0")] = None,
+    motion_of_object: Annotated[Path | None, file_option(_MOTION, "--motion-of-object")] = None,
     detector: Annotated[int | None, option("Detector columns, rows in proportion; same size.", "scanner's")] = None,
     detector_offset: Annotated[Any, lengths("--detector-offset", DETECTOR_OFFSET, "scanner's")] = None,
     size: Annotated[int | None, option("Voxels along the longest side of the truth.", "scanner's or the file's")] = None,
@@ -92,7 +96,7 @@ def simulate_command(
     wish = device_wish(device)
     described = scanner_for(scanner, detector, detector_offset, truncation)
     options = scanner_options(described, protocol, **given)
-    job = SimulationJob(output, phantom, volume, scanner, size, pixel_samples)
+    job = SimulationJob(output, phantom, volume, scanner, size, pixel_samples, motion_of_object)
     with Ticker("frame") as ticker:
         scan = run_simulation(job, described, options, Runtime(wish, memory=memory), ticker.show)
     frames, rows, columns = scan.projections.shape

@@ -3,6 +3,10 @@
 from phyradgs_cl.fields.deformation import Deformation, control_points
 from phyradgs_cl.fields.gaussians import Activation, Gaussians
 from phyradgs_cl.fields.grid_choice import GridChoice
+from phyradgs_cl.fields.states import MovingTruth
 from phyradgs_cl.fields.volume import Grid, triple
+from phyradgs_cl.fields.warp import deformed
 
-__all__ = ["Activation", "Deformation", "Gaussians", "Grid", "GridChoice", "control_points", "triple"]
+__all__ = [
+    "Activation", "Deformation", "Gaussians", "Grid", "GridChoice", "MovingTruth", "control_points", "deformed", "triple"
+]

@@ -15,8 +15,9 @@ from phyradgs_cl import checks
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields.volume import Grid
 
-_LEVELS = 64  # steps of a weight's range among which the folding check tells states apart
+_LEVELS = 16  # steps of a weight's range among which the folding check tells states apart
 _MOST_STEPS = 200  # of the fixed point: enough for a contraction of 0.93
+_FLAT = 1e-4  # slopes without which a point's determinant is 1
 _CLOSE = 1e-6  # of the smallest control spacing: where the fixed point ends
 
 
@@ -65,6 +66,11 @@ class Deformation:
     def rank(self) -> int:
         """The number of fields R."""
         return len(self.control_mm)
+
+    @property
+    def is_still(self) -> bool:
+        """Whether no state displaces anything."""
+        return not np.any(self.reach_mm * np.abs(self.weights).max(axis=0))
 
     @property
     def reach_mm(self) -> np.ndarray:
@@ -129,12 +135,17 @@ class Deformation:
     def smallest_determinant(self, grid: Grid | None = None) -> float:
         """Returns the smallest det(I + ∂w/∂y) over the voxel centres of ``grid`` and the states of ``times_s``; matter folds
         where it is not above 0. Without a grid: points at half the spacing of the control points. Weights are rounded to a
-        64th of each field's largest."""
+        16th of each field's largest, and slopes below 1e-4 are taken as 0."""
         grid = grid or self._half_spacing_grid()
         slopes = np.stack([self._slopes(grid, control_mm) for control_mm in self.control_mm])  # (R, 3, 3, n)
-        step = np.maximum(np.abs(self.weights).max(axis=0) / _LEVELS, np.finfo(float).tiny)
+        largest = np.abs(self.weights).max(axis=0)
+        step = np.maximum(largest / _LEVELS, np.finfo(float).tiny)
         states = np.unique(np.round(self.weights / step), axis=0) * step
-        smallest = np.inf
+        varies = (np.abs(slopes).max(axis=(1, 2)) * largest[:, None]).sum(0) > _FLAT
+        slopes = slopes[..., varies]
+        smallest = np.inf if varies.all() else 1.0
+        if not varies.any():
+            return smallest
         for weights in states:
             smallest = min(smallest, float(_determinant(np.tensordot(weights, slopes, 1)).min()))
         return smallest
@@ -174,10 +185,12 @@ class Deformation:
         return Grid(tuple(shape.tolist()), tuple((spacing_mm / 2).tolist()), tuple(centre_mm.tolist()))
 
 
-def control_points(grid: Grid, spacing_mm: float) -> tuple[tuple[float, float, float], tuple[int, int, int]]:
-    """Returns origin x, y, z in mm and counts (nz, ny, nx) of control points that cover a grid: the outermost stand at least
-    one spacing outside of it, so that four of them along each axis reach every point."""
-    counts = [int(np.ceil(side_mm / spacing_mm)) + 3 for side_mm in grid.size_mm]
+def control_points(
+    grid: Grid, spacing_mm: float, margin_mm: float = 0.0
+) -> tuple[tuple[float, float, float], tuple[int, int, int]]:
+    """Returns origin x, y, z in mm and counts (nz, ny, nx) of control points that cover a grid and ``margin_mm`` around it.
+    The outermost stand at least one spacing further out, so that four of them along each axis reach every point."""
+    counts = [int(np.ceil((side_mm + 2 * margin_mm) / spacing_mm)) + 3 for side_mm in grid.size_mm]
     first_mm = [middle - (n - 1) / 2 * spacing_mm for middle, n in zip(grid.offset_mm, counts, strict=True)]
     return (first_mm[2], first_mm[1], first_mm[0]), (counts[0], counts[1], counts[2])
 

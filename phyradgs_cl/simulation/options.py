@@ -1,6 +1,7 @@
 """Options of a simulation and their ranges, with the scanner's values as defaults."""
 
 from dataclasses import dataclass, fields, replace
+from pathlib import Path
 from typing import Any
 
 from phyradgs_cl import checks, resource
@@ -10,13 +11,14 @@ from phyradgs_cl.acquisition.scan import LARGEST_LAG
 from phyradgs_cl.detector.spectrum import HIGHEST_KVP, LOWEST_KVP
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.io import Scanner, load_scanner, with_detector_count
+from phyradgs_cl.simulation.object_motion import ObjectMotion, load_object_motion
 
 _NOISES = ("none", "tigre", "beer")
 # Far beyond any scanner, and far below an overflow of float32 or a sampler.
 _LARGEST_PEAK, _LARGEST_NOISE = 1e4, 1e9
 _SMALLEST_DOSE, _LARGEST_DOSE = 1e-3, 1e12
 _LARGEST_DETECTOR = 32_000
-_TIMING = ("views", "exposure_deg", "readout_ratio", "start_deg", "pulse")
+_TIMING = ("views", "exposure_deg", "readout_ratio", "start_deg", "pulse", "turns")
 _DATA_SHEET = ("first", "fps", "readout_ms")
 
 
@@ -27,7 +29,7 @@ class SimulationOptions:
     time_samples: midpoint samples in the exposure of a line; with 0 the volume's edge moves at most half a voxel of ``grid``
     between two (docs/mathematics.md). dose: photons of a pixel without object, on a line that sees the whole pulse.
     lag (λ), rings, sparks, drift, scatter: of detector/effects.py, 0 without. kvp: of detector/spectrum.py, 0 for a beam of
-    one energy."""
+    one energy. motion_of_object: how the object moves during the scan; None: it rests."""
 
     protocol: Protocol = Protocol()
     readout_axis: str = "rows"
@@ -46,11 +48,15 @@ class SimulationOptions:
     drift: float = checks.ranged(0.0, 0, 0.5)
     scatter: float = checks.ranged(0.0, 0, 10)
     kvp: float = 0.0
+    motion_of_object: ObjectMotion | None = None
 
     def __post_init__(self) -> None:
         if self.noise not in _NOISES:
             raise InputError("--noise", repr(self.noise), f"one of {', '.join(_NOISES)}")
         checks.fields_within("--", self)
+        if not isinstance(self.motion_of_object, ObjectMotion | None):
+            expected = "an ObjectMotion, or the path of a TOML file"
+            raise InputError("--motion-of-object", checks.short_repr(self.motion_of_object), expected)
         if self.kvp != 0:
             checks.within("--kvp (kV)", self.kvp, LOWEST_KVP, HIGHEST_KVP)
 
@@ -104,6 +110,8 @@ def scanner_options(scanner: Scanner, protocol: str, **given: Any) -> Simulation
     timed = make_protocol(protocol, **timing)
     if sheet["fps"] is not None:
         timed = timed.at_rate(sheet["fps"], sheet["readout_ms"], named)
+    if isinstance(values.get("motion_of_object"), str | Path):
+        values["motion_of_object"] = load_object_motion(values["motion_of_object"])
     return SimulationOptions(protocol=timed, **values)
 
 

@@ -2,6 +2,7 @@
 
 import logging
 from collections.abc import Callable
+from dataclasses import asdict, replace
 
 import numpy as np
 
@@ -12,12 +13,13 @@ from phyradgs_cl.acquisition.geometry import Geometry
 from phyradgs_cl.acquisition.time_cells import TimeCells
 from phyradgs_cl.detector import effects, tube_spectrum
 from phyradgs_cl.errors import InputError, NumericalError
-from phyradgs_cl.fields import Grid
+from phyradgs_cl.fields import Grid, MovingTruth
 from phyradgs_cl.io import Scanner, Volume
 from phyradgs_cl.phantoms import EllipsoidPhantom
 from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.simulation.options import SimulationOptions
-from phyradgs_cl.simulation.scenes import FrameSource, phantom_scene, volume_scene
+from phyradgs_cl.simulation.scenes import phantom_scene, volume_scene
+from phyradgs_cl.simulation.sources import FrameSource
 
 _LARGEST_GRID = 4096
 _SMALLEST_PHANTOM = 2  # procedural phantoms need 4 voxels and are drawn on twice as many
@@ -36,11 +38,13 @@ def simulated_scan(
     if size is not None:
         checks.within("--size", size, 1 if isinstance(of, Volume) else _SMALLEST_PHANTOM, _LARGEST_GRID)
     where, axis = (scanner.geometry, scanner.grid), options.readout_axis
+    motion, window_s = options.motion_of_object, options.protocol.window_s()
+    moves = None if motion is None else lambda box: motion.deformation(box, *window_s)
     if not isinstance(of, Volume):
         count = size or max(scanner.grid.shape)
-        scene = phantom_scene(rt, of, *where, count, axis, options.seed, pixel_samples)
+        scene = phantom_scene(rt, of, *where, count, axis, options.seed, pixel_samples, moves)
     else:
-        scene = volume_scene(rt, of, name, *where, size, axis, pixel_samples)
+        scene = volume_scene(rt, of, name, *where, size, axis, pixel_samples, moves)
     scene.warn_of_inverse_crime()
     title = f"simulated scan of {scene.title}"
     scan = simulate(
@@ -52,7 +56,13 @@ def simulated_scan(
     stated = {key: getattr(options, key) for key in ("seed", "noise", "dose", "electronic_noise", *added)}
     facts = {"program": f"phyradgs-cl {__version__}", "simulated": scene.title, "pixel_samples": pixel_samples}
     scan.provenance.update(facts | stated)
-    return scan
+    if motion is None or scene.state is None:
+        return scan
+    scan.provenance["motion_of_object"] = asdict(motion)
+    times_s = motion.state_times_s(*window_s)
+    volumes = np.stack([scene.state(time_s) for time_s in times_s])
+    volumes *= np.float32(scan.provenance["attenuation_factor"])  # type: ignore[arg-type]
+    return replace(scan, moving_truth=MovingTruth(times_s, volumes, scene.deformation))
 
 
 def simulate(

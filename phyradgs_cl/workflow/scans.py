@@ -27,7 +27,8 @@ _TOML = ".toml"
 
 @dataclass(frozen=True)
 class SimulationJob:
-    """What to simulate, a phantom by name or TOML file or a volume file, on which scanner; voxels and rays per pixel."""
+    """What to simulate, a phantom by name or TOML file or a volume file, on which scanner; voxels and rays per pixel; the
+    file of the object's motion, which must not be overwritten."""
 
     output: Path
     phantom: str | None = None
@@ -35,6 +36,7 @@ class SimulationJob:
     scanner: str = "r2"
     size: int | None = None
     pixel_samples: int = 1
+    motion_of_object: Path | None = None
 
 
 def refuse_jitter(protocol: str, jitter_deg: float | None) -> None:
@@ -70,6 +72,7 @@ def run_simulation(
     if job.volume is not None and job.phantom is not None:
         raise InputError("--volume", f"given together with --phantom {job.phantom}", "one of the two")
     described = [Path(name) for name in (job.scanner, job.phantom or "") if name.endswith(_TOML)]
+    described += [] if job.motion_of_object is None else [job.motion_of_object]
     check_output(job.output, job.volume, *described)
     with only_run(job.output):
         of: str | Volume | EllipsoidPhantom = phantom_of(job.phantom or "foot")

@@ -19,6 +19,7 @@ COMMANDS = (
     ("info scan.h5", ""),
     ("check scan.h5", ""),
     (f"simulate {SCAN} --views 8 -o eight.h5", "eight.h5"),
+    (f"simulate {SCAN} --turns 2 --motion-of-object breathing.toml -o moving.h5", "moving.h5"),
     ("calibrate eight.h5 --what offset -o calibrated.h5", "calibrated.png"),
     ("prepare scan.h5 -o clean.h5", "clean.h5"),
     ("estimate scan.h5 --method sirt", ""),
@@ -51,6 +52,7 @@ def test_every_command_does_its_work(cli, tmp_path, monkeypatch, capsys) -> None
     monkeypatch.setattr("phyradgs_cl.commands.report.view_volume", windows.append)
     write_foreign(tmp_path / "foreign.h5")
     (tmp_path / "grid.toml").write_text(GRID)
+    (tmp_path / "breathing.toml").write_text('kind = "breathing"')
     (tmp_path / "incoming").mkdir()
     for line, output in COMMANDS:
         if line.startswith("watch"):

@@ -7,9 +7,11 @@ import h5py
 import numpy as np
 import pytest
 
+from phyradgs_cl.acquisition import Scan
+from phyradgs_cl.detector import counts_to_attenuation
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.fields import Deformation
-from phyradgs_cl.io import file_kind, read_deformation, write_deformation
+from phyradgs_cl.fields import Deformation, Grid, MovingTruth
+from phyradgs_cl.io import file_kind, read_deformation, read_scan, scan_summary, write_deformation, write_scan
 
 GROUP = "/entry/deformation"
 
@@ -73,6 +75,42 @@ def test_damage_is_named_in_one_line(path: Path, damage: Callable[[h5py.Group], 
         read_deformation(path)
     assert caught.value.subject.endswith(subject)
     assert found in str(caught.value) and "\n" not in str(caught.value)
+
+
+def a_moving_scan(make_scan: Callable[..., Scan]) -> Scan:
+    states = np.random.default_rng(3).uniform(0, 1, (2, *make_scan().grid.shape)).astype(np.float32)
+    field = Deformation(np.full((1, 2, 2, 2, 3), 0.1), (0.0, 0.0, 0.0), 4.0, np.array([0.0, 5.0]), np.array([[0.0], [1.0]]))
+    truth = MovingTruth(np.array([1.0, 2.5]), states, field)
+    return make_scan(reference=states[0], moving_truth=truth)
+
+
+def test_a_scan_holds_states_and_how_they_came_about(tmp_path: Path, make_scan: Callable[..., Scan]) -> None:
+    scan, path = a_moving_scan(make_scan), tmp_path / "scan.h5"
+    write_scan(path, scan)
+    again = read_scan(path, counts_to_attenuation).moving_truth
+    np.testing.assert_array_equal(again.volumes, scan.moving_truth.volumes)
+    np.testing.assert_array_equal(again.times_s, [1.0, 2.5])
+    for field in (again.deformation, read_deformation(path)):
+        np.testing.assert_array_equal(field.control_mm, scan.moving_truth.deformation.control_mm)
+    assert scan_summary(path)["true_states"] == 2
+    part = scan.on_grid(scan.grid.part((0, 1, 1), (2, 2, 2))).moving_truth
+    np.testing.assert_array_equal(part.volumes, scan.moving_truth.volumes[:, :, 1:, 1:3])
+    assert scan.on_grid(Grid.cube(3, 90.0)).moving_truth is None
+
+
+@pytest.mark.parametrize(("damage", "subject"), [
+    (_without("states"), "/states"), (_without("state_times"), "/state_times"),
+    (_with("states", np.ones((3, 2, 3, 4))), "/states"), (_with("states", np.zeros((2, 2, 3, 4))), "/states"),
+    (_with("state_times", np.full(2, np.nan)), "/state_times"), (_without("deformation/control"), "/deformation/control"),
+])  # fmt: skip
+def test_damaged_states_are_named(tmp_path, make_scan, damage, subject) -> None:
+    path = tmp_path / "scan.h5"
+    write_scan(path, a_moving_scan(make_scan))
+    with h5py.File(path, "r+") as file:
+        damage(file["/entry/phyradgs/reference"])
+    with pytest.raises(InputError) as caught:
+        read_scan(path, counts_to_attenuation)
+    assert caught.value.subject.endswith(f"reference{subject}")
 
 
 def test_other_files_are_no_deformation(tmp_path: Path) -> None:

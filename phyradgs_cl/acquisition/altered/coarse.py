@@ -76,7 +76,7 @@ def binned(scan: Scan, block: int) -> Scan:
     A block is the mean of its valid pixels, masked where less than half are valid. Rows and columns that fill no block are
     dropped at the far end. A block of lines opens at the mean of its lines' times."""
     if block == 1:
-        return replace(scan, reference=None)
+        return replace(scan, reference=None, moving_truth=None)
     height, width = blocks = tuple(min(block, count) for count in scan.geometry.detector_shape)
     rows, columns = scan.geometry.detector_shape[0] // height, scan.geometry.detector_shape[1] // width
     shape = (scan.frames, rows, height, columns, width)
@@ -96,6 +96,7 @@ def binned(scan: Scan, block: int) -> Scan:
         frame_start_s=np.asarray(scan.frame_start_s) + later_s,
         pixel_mask=is_masked if is_masked.any() else None,
         reference=None,
+        moving_truth=None,
     )
 
 

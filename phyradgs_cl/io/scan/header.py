@@ -16,6 +16,7 @@ from phyradgs_cl.io.hdf5.datasets import read_attribute, read_grid, read_number,
 from phyradgs_cl.io.hdf5.source import Hdf5Source
 from phyradgs_cl.io.scan import detector, schema
 from phyradgs_cl.io.scan.motion import has_motion, read_trajectory
+from phyradgs_cl.io.scan.truth import check_truth
 from phyradgs_cl.io.tables import read_facts
 
 _log = logging.getLogger(__name__)
@@ -24,7 +25,8 @@ _log = logging.getLogger(__name__)
 @dataclass(frozen=True, eq=False)
 class ScanHeader:
     """A checked scan without its arrays: ``scan.projections`` are zeros that take no memory. ``entry``: address of the
-    NXtomo group; image_key (F,) of all stored frames; ``mask_shape``, ``has_reference``: optional arrays."""
+    NXtomo group; image_key (F,) of all stored frames; ``mask_shape``, ``has_reference``, ``states`` (their number): optional
+    arrays."""
 
     scan: Scan
     entry: str
@@ -33,6 +35,7 @@ class ScanHeader:
     data_type: str
     mask_shape: tuple[int, ...] | None
     has_reference: bool
+    states: int
     has_grid: bool
 
 
@@ -64,14 +67,14 @@ def read_header(source: Hdf5Source) -> ScanHeader:
     )
     scan.check_timing()
     mask_shape = detector.check_mask(source, entry, data.shape)
-    has_reference = _check_reference(source, entry, grid)
+    has_reference, states = check_truth(source, entry, grid)
     if not has_grid:
         where, size = source.name(f"{entry}/{schema.GRID}"), " × ".join(str(n) for n in grid.shape)
         _log.warning("%s: no grid; %s voxels of %.4g mm taken", where, size, grid.voxel_size_mm[0])
     for address in (f"{entry}/{name}" for name in schema.IGNORED):
         if source.find(address) is not None:
             _log.warning("%s: not read by this package", source.name(address))
-    return ScanHeader(scan, entry, image_key, quantity, str(data.dtype), mask_shape, has_reference, has_grid)
+    return ScanHeader(scan, entry, image_key, quantity, str(data.dtype), mask_shape, has_reference, states, has_grid)
 
 
 def find_entry(source: Hdf5Source) -> str:
@@ -106,14 +109,3 @@ def _read_saturation(source: Hdf5Source, entry: str) -> Saturation | None:
     found = Saturation(read_number(source, level), read_number(source, share))
     checks.within(source.name(share), found.share, 0, 1)
     return found
-
-
-def _check_reference(source: Hdf5Source, entry: str, grid: Grid) -> bool:
-    if source.optional_group(f"{entry}/{schema.REFERENCE}") is None:
-        return False
-    address = f"{entry}/{schema.REFERENCE}/volume"
-    volume = source.dataset(address)
-    if volume.shape != grid.shape:
-        remedy = f"store the reference's own grid in {entry}/{schema.GRID}"
-        raise source.error(address, f"shape {volume.shape}", f"the grid's {grid.shape}", remedy)
-    return True

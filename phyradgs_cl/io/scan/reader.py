@@ -13,10 +13,11 @@ from phyradgs_cl.acquisition.scan import APPLIED, applied_facts
 from phyradgs_cl.acquisition.slabs import slab
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.io.files import sha256_of
-from phyradgs_cl.io.hdf5.datasets import ATTENUATION, in_unit, read_values
+from phyradgs_cl.io.hdf5.datasets import read_values
 from phyradgs_cl.io.hdf5.source import Hdf5Source, open_hdf5
 from phyradgs_cl.io.scan import schema
 from phyradgs_cl.io.scan.header import ScanHeader, read_header
+from phyradgs_cl.io.scan.truth import read_moving_truth, read_reference
 
 LARGEST_LINE_INTEGRAL = 1e6
 # (data (F, v, u), image_key (F,), quantity) -> line integrals (P, v, u) of the projections, bad pixels.
@@ -46,7 +47,8 @@ def read_scan(path: str | Path, to_attenuation: ToAttenuation, rows: tuple[int, 
         if rows is not None:
             header = replace(header, scan=slab(header.scan, *rows))
         mask = _read_mask(source, header, lines)
-        reference = _read_reference(source, header)
+        reference = read_reference(source, header.entry) if header.has_reference else None
+        moving = read_moving_truth(source, header.entry) if header.states else None
         data = _read_frames(source, header, mask, lines)
     projections, bad = _convert(source.name(f"{header.entry}/{schema.DATA}"), header, data, to_attenuation)
     used = header.image_key == schema.PROJECTION
@@ -56,7 +58,8 @@ def read_scan(path: str | Path, to_attenuation: ToAttenuation, rows: tuple[int, 
         stored = (int(np.count_nonzero(header.image_key == kind)) for kind in (schema.FLAT, schema.DARK))
         provenance = {**provenance, **applied_facts(*stored)}
     mask = united(stored_mask, bad)
-    return replace(header.scan, projections=projections, pixel_mask=mask, reference=reference, provenance=provenance)
+    scan = replace(header.scan, projections=projections, pixel_mask=mask, provenance=provenance)
+    return replace(scan, reference=reference, moving_truth=moving)
 
 
 def scan_summary(path: str | Path, sha256: str | None = None) -> dict[str, object]:
@@ -76,7 +79,8 @@ def scan_summary(path: str | Path, sha256: str | None = None) -> dict[str, objec
         **_timing_facts(scan), "detector_model": scan.detector_model, **_panel_facts(scan),
         "pixel_mask": header.mask_shape is not None, "grid_shape": scan.grid.shape,
         "grid_voxel_size_mm": scan.grid.voxel_size_mm, "grid_stored": header.has_grid,
-        "reference": header.has_reference, "sha256": sha256 or sha256_of(path),
+        "reference": header.has_reference, **({"true_states": header.states} if header.states else {}),
+        "sha256": sha256 or sha256_of(path),
     }
 
 
@@ -129,18 +133,6 @@ def _read_mask(source: Hdf5Source, header: ScanHeader, rows: slice | None) -> np
     if used.all() and rows is None:
         raise source.error(address, "every pixel masked", "at least one zero", "non-zero means: do not use")
     return mask
-
-
-def _read_reference(source: Hdf5Source, header: ScanHeader) -> np.ndarray | None:
-    if not header.has_reference:
-        return None
-    address = f"{header.entry}/{schema.TRUTH}"
-    values = read_values(source, address, source.dataset(address))
-    checks.finite(source.name(address), values)
-    if values.max() <= 0:
-        found = f"no voxel above 0 (the largest is {values.max() + 0.0:g})"
-        raise source.error(address, found, "a truth to compare with", "take the reference out of the file")
-    return in_unit(source, address, values, ATTENUATION).astype(np.float32)
 
 
 def _read_frames(

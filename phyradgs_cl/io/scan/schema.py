@@ -11,6 +11,8 @@ POSES = f"{EXTRA}/poses"
 GRID = f"{EXTRA}/grid"
 REFERENCE = f"{EXTRA}/reference"
 TRUTH = f"{REFERENCE}/volume"
+STATES, STATE_TIMES = f"{REFERENCE}/states", f"{REFERENCE}/state_times"
+DEFORMATION = f"{REFERENCE}/deformation"
 
 PROJECTION, FLAT, DARK, INVALID = 0, 1, 2, 3
 QUANTITIES = ("attenuation", "transmission", "counts")

@@ -19,6 +19,7 @@ from phyradgs_cl.io.output import written_beside
 from phyradgs_cl.io.scan import schema
 from phyradgs_cl.io.scan.header import read_header
 from phyradgs_cl.io.scan.motion import storable, write_motion, write_poses
+from phyradgs_cl.io.scan.truth import write_truth
 from phyradgs_cl.text import plain_text
 
 _log = logging.getLogger(__name__)
@@ -127,11 +128,7 @@ def _write_extra(entry: h5py.Group, scan: Scan) -> None:
     if scan.provenance:
         extra["provenance"] = json.dumps(scan.provenance, default=str)
     h5.write_grid(extra, scan.grid)
-    if scan.reference is not None:
-        volume = np.asarray(scan.reference, np.float32)
-        group = h5.new_group(extra, "reference", "NXcollection")
-        dataset = group.create_dataset("volume", data=volume, compression="gzip", shuffle=True)
-        dataset.attrs["units"] = "1/mm"
+    write_truth(extra, scan)
 
 
 def _write_links(entry: h5py.Group) -> None:

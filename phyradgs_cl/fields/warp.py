@@ -1,0 +1,34 @@
+"""Volumes of a deforming object at any state, on the host."""
+
+from collections.abc import Sequence
+
+import numpy as np
+import scipy
+
+from phyradgs_cl.fields.deformation import Deformation
+from phyradgs_cl.fields.volume import Grid, triple
+
+_SLAB_VOXELS = 1 << 21  # displaced at a time: their coordinates take six times the memory of the volume
+
+
+def deformed(volume: np.ndarray, grid: Grid, deformation: Deformation, weights: Sequence[float] | np.ndarray) -> np.ndarray:
+    """Returns the object (nz, ny, nx) float32 at one state's weights (R,): v(y + w(y)) at every voxel centre y, trilinear
+    between the voxels of the reference ``volume`` on ``grid``, 0 outside of it. A state at rest is the volume itself."""
+    reference = np.asarray(volume, np.float32)
+    if not np.any(deformation.reach_mm * np.abs(weights)):
+        return reference
+    nz, ny, nx = grid.shape
+    result = np.empty(grid.shape, np.float32)
+    voxel_mm = np.array(grid.voxel_size_mm, np.float32)
+    index = [np.arange(n, dtype=np.float32) for n in (ny, nx)]
+    slices = max(1, _SLAB_VOXELS // (ny * nx))
+    for first in range(0, nz, slices):
+        count = min(slices, nz - first)
+        shift = deformation.on_grid_mm(grid.part(triple((first, 0, 0)), triple((count, ny, nx))), weights)
+        z = np.arange(first, first + count, dtype=np.float32)[:, None, None] + shift[..., 2] / voxel_mm[0]
+        y = index[0][:, None] + shift[..., 1] / voxel_mm[1]
+        x = index[1] + shift[..., 0] / voxel_mm[2]
+        scipy.ndimage.map_coordinates(
+            reference, (z, y, x), output=result[first : first + count], order=1, mode="grid-constant", prefilter=False
+        )
+    return result
