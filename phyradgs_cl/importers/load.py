@@ -32,6 +32,7 @@ FORMATS = {
     "tiff": "tiff_folder",
     "nikon": "laboratory.nikon",
     "skyscan": "laboratory.skyscan",
+    "zeiss": "laboratory.zeiss",
     "flexray": "laboratory.flexray",
 }
 _MOST_BODIES = 1000

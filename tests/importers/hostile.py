@@ -4,12 +4,15 @@ import json
 import os
 import pickle
 import struct
+import sys
 import zlib
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import h5py
+import laboratory_of_importers as lab
 import numpy as np
 import tifffile
 
@@ -535,4 +538,62 @@ FLEXRAY: dict[str, tuple[Damage, tuple[str, ...]]] = {
     "flats of another panel": (lambda p: tifffile.imwrite(p / "io000000.tif", np.zeros((9, 14), np.uint16)), ("io000000",)),
     "a truncated frame": (truncated("scan_000002.tif"), ("scan_000002.tif",)),
     "a dark that is a link": (symlinked("di000000.tif"), ("symbolic link",)),
+}  # fmt: skip
+
+
+def streams(**changes: object) -> Damage:
+    """A .txrm written again with other streams, "/" as "__" in their names."""
+
+    def damage(path: Path) -> None:
+        truth = sys.modules["conftest_of_importers"].truth(geometry=lab_geometry())
+        lab.write_zeiss(path, truth, **{name.replace("__", "/"): value for name, value in changes.items()})
+
+    return damage
+
+
+def lab_geometry() -> Any:
+    conftest = sys.modules["conftest_of_importers"]
+    return replace(conftest.GEOMETRY, detector_offset_mm=(0.0, 0.0))
+
+
+def huge_stream(path: Path) -> None:
+    """The size of the first image, in its directory entry, raised to 2 GB."""
+    data = bytearray(path.read_bytes())
+    at = data.index("Image1\0".encode("utf-16-le"))
+    struct.pack_into("<Q", data, at + 120, 1 << 31)
+    path.write_bytes(data)
+
+
+def circular_chain(path: Path) -> None:
+    """Every sector of the file allocation table points at sector 0."""
+    data = bytearray(path.read_bytes())
+    fat = 512 * (1 + struct.unpack_from("<I", data, 76)[0])
+    data[fat : fat + 512] = bytes(512)
+    path.write_bytes(data)
+
+
+ZEISS: dict[str, tuple[Damage, tuple[str, ...]]] = {
+    "an empty file": (filled("", b""), ("container",)), "no container": (filled("", b"PK\3\4" * 999), ("container",)),
+    "a truncated file": (truncated("", 0.5), ("txrm",)), "a header alone": (truncated("", 0.05), ("txrm",)),
+    "a stream of 2 GB": (huge_stream, ("txrm",)), "a chain in a circle": (circular_chain, ("txrm",)),
+    "no number of images": (streams(ImageInfo__NoOfImages=None), ("NoOfImages", "nothing")),
+    "a number without bytes": (streams(ImageInfo__NoOfImages=np.int8(6)), ("NoOfImages", "0 numbers")),
+    "no images": (streams(ImageInfo__NoOfImages=np.int32(0)), ("NoOfImages", "found 0")),
+    "two milliards of images": (streams(ImageInfo__NoOfImages=np.int32(2**31 - 1)), ("NoOfImages",)),
+    "a million images": (streams(ImageInfo__NoOfImages=np.int32(999_999)), ("NoOfImages", "999999")),
+    "a thousand images": (streams(ImageInfo__NoOfImages=np.int32(1000)), ("as many as the file can hold",)),
+    "a missing image": (streams(ImageData1__Image4=None), ("ImageData1/Image4", "nothing")),
+    "an image that is too short": (streams(ImageData1__Image4=np.zeros(99, np.uint16)), ("Image4", "99 pixels")),
+    "an image that is too long": (streams(ImageData1__Image4=np.zeros(999, np.uint16)), ("Image4", "at most")),
+    "pixels of another type": (streams(ImageInfo__DataType=np.int32(7)), ("DataType", "found 7")),
+    "no angles": (streams(ImageInfo__Angles=None), ("Angles",)),
+    "too few angles": (streams(ImageInfo__Angles=np.zeros(3, np.float32)), ("Angles", "3 numbers")),
+    "an angle that is NaN": (streams(ImageInfo__Angles=np.full(6, np.nan, np.float32)), ("Angles", "nan")),
+    "a source that moves": (streams(ImageInfo__StoRADistance=np.float32([500, 510] * 3)), ("StoRADistance", "10")),
+    "a source in the axis": (streams(ImageInfo__StoRADistance=np.zeros(6, np.float32)), ("StoRADistance",)),
+    "a pixel of no size": (streams(ImageInfo__PixelSize=np.float32(0)), ("PixelSize",)),
+    "shifts for some": (streams(**{"Alignment__X-Shifts": np.ones(2, np.float32)}), ("Alignment/X-Shifts", "2 numbers")),
+    "no reference": (streams(ReferenceData__Image=None), ("flats", "flat_value")),
+    "half a reference": (streams(ReferenceData__Image=np.ones(70, np.float32)), ("ReferenceData/Image", "70 pixels")),
+    "a reference of text": (streams(ReferenceData__DataType=np.int32(3)), ("ReferenceData/DataType", "found 3")),
 }  # fmt: skip

@@ -1,5 +1,6 @@
 """Scans written as laboratory scanners write them, by their formats' descriptions; nothing of the importers is used here."""
 
+import struct
 from pathlib import Path
 from typing import Any
 
@@ -112,3 +113,90 @@ def write_flexray(folder: Path, truth: Any, **lines: object) -> Path:
             tifffile.imwrite(folder / f"{name}{i:06d}.tif", np.asarray(image, np.uint16)[::-1])
     return folder
 
+
+
+SECTOR, MINI, CUTOFF = 512, 64, 4096
+FREE, END, FAT = 0xFFFFFFFF, 0xFFFFFFFE, 0xFFFFFFFD
+
+
+def write_ole(path: Path, streams: dict[str, bytes]) -> None:
+    """An OLE2 container by [MS-CFB]: version 3, small streams in the mini stream, siblings as a chain to the right."""
+    sectors: list[bytes] = []
+    fat: list[int] = []
+
+    def put(data: bytes) -> int:
+        """The first sector of a chain with the data; END for none."""
+        count = -(-len(data) // SECTOR)
+        first = len(sectors)
+        sectors.extend(data[i * SECTOR : (i + 1) * SECTOR].ljust(SECTOR, b"\0") for i in range(count))
+        fat.extend([*range(first + 1, first + count), END][:count])
+        return first if count else END
+
+    mini, mini_fat = b"", []
+    entries = [["Root Entry", 5, FREE, FREE, END, 0]]  # name, kind, right sibling, child, first sector, size
+    storages: dict[str, int] = {}
+    last_child: dict[int, int] = {}
+
+    def add(parent: int, entry: list[Any]) -> int:
+        entries.append(entry)
+        if parent in last_child:
+            entries[last_child[parent]][2] = len(entries) - 1
+        else:
+            entries[parent][3] = len(entries) - 1
+        last_child[parent] = len(entries) - 1
+        return len(entries) - 1
+
+    # siblings are in the order of [MS-CFB]: shorter names first, then by their letters
+    for full in sorted(streams, key=lambda name: [(len(part), part.upper()) for part in name.split("/")]):
+        folder, data = full.split("/")[0], streams[full]
+        if folder not in storages:
+            storages[folder] = add(0, [folder, 1, FREE, FREE, 0, 0])
+        if len(data) >= CUTOFF:
+            first = put(data)
+        else:
+            count = -(-len(data) // MINI)
+            first = len(mini_fat) if count else END
+            mini_fat += [*range(first + 1, first + count), END][:count]
+            mini += data.ljust(count * MINI, b"\0")
+        add(storages[folder], [full.split("/")[1], 2, FREE, FREE, first, len(data)])
+    entries[0][4:] = [put(mini), len(mini)]
+    first_mini = put(struct.pack(f"<{len(mini_fat)}I", *mini_fat).ljust(-(-len(mini_fat) // 128) * SECTOR, b"\xff"))
+    directory = b""
+    for name, kind, right, child, first, size in entries:
+        text = (name + "\0").encode("utf-16-le")
+        directory += struct.pack("<64sHBBIII", text, len(text), kind, 1, FREE, right, child)
+        directory += bytes(16 + 4 + 16) + struct.pack("<IQ", first, size)
+    first_directory = put(directory.ljust(-(-len(directory) // SECTOR) * SECTOR, b"\0"))
+    own = next(n for n in range(1, 109) if n * 128 >= len(sectors) + n)  # sectors of the FAT, which lists itself
+    places = range(len(sectors), len(sectors) + own)
+    fat += [FAT] * own + [FREE] * (own * 128 - len(sectors) - own)
+    header = b"\xd0\xcf\x11\xe0\xa1\xb1\x1a\xe1" + bytes(16) + struct.pack("<HHHHH6x", 0x3E, 3, 0xFFFE, 9, 6)
+    header += struct.pack("<IIIIIIIII", 0, own, first_directory, 0, CUTOFF, first_mini, -(-len(mini_fat) // 128), END, 0)
+    header += struct.pack("<109I", *places, *[FREE] * (109 - own))
+    path.write_bytes(header + b"".join(sectors) + struct.pack(f"<{len(fat)}I", *fat))
+
+
+def zeiss_streams(truth: Any, **streams: Any) -> dict[str, Any]:
+    """The streams of a .txrm as arrays, with room for one image more, as Zeiss leaves it."""
+    g, angle_deg = truth.scan.geometry, np.rad2deg(truth.angle_rad).round(9)
+    count = truth.scan.frames
+    info = {
+        "NoOfImages": np.int32(count), "ImageWidth": np.int32(g.detector_shape[1]),
+        "ImageHeight": np.int32(g.detector_shape[0]), "DataType": np.int32(5), "XrayGeometry": np.int32(1),
+        "PixelSize": np.float32(g.pixel_size_mm[1] / g.magnification * 1000),
+        "Angles": np.float32([*-angle_deg, 0]), "StoRADistance": np.float32([-g.source_to_axis_mm] * count + [0]),
+        "DtoRADistance": np.float32([g.source_to_detector_mm - g.source_to_axis_mm] * count + [0]),
+    }  # fmt: skip
+    images = {f"ImageData{i // 100 + 1}/Image{i + 1}": image for i, image in enumerate(counts16(truth))}
+    return {
+        **{f"ImageInfo/{name}": value for name, value in info.items()}, **images,
+        "Alignment/X-Shifts": np.zeros(count, np.float32), "Alignment/Y-Shifts": np.zeros(count, np.float32),
+        "ReferenceData/Image": np.full(g.detector_shape, WHITE, np.float32), **streams,
+    }  # fmt: skip
+
+
+def write_zeiss(path: Path, truth: Any, **streams: Any) -> Path:
+    """A .txrm: row 0 the lowest, angles of a sample that turns counterclockwise; a stream of None is left out."""
+    path = path.with_suffix(".txrm")
+    write_ole(path, {k: v.tobytes() for k, v in zeiss_streams(truth, **streams).items() if v is not None})
+    return path

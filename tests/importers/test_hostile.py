@@ -29,7 +29,7 @@ OPTIONS = {"phyradgs-real": REAL, "data-exchange": CONE}
 FORMS: dict[str, dict[str, Any]] = {
     "r2": hostile.R2, "phyradgs": hostile.PHYRADGS, "phyradgs-real": hostile.REAL, "naf": hostile.NAF,
     "rtk": hostile.RTK, "data-exchange": hostile.EXCHANGE, "nxtomo": hostile.NXTOMO, "tiff": hostile.TIFF,
-    "nikon": hostile.NIKON, "skyscan": hostile.SKYSCAN, "flexray": hostile.FLEXRAY,
+    "nikon": hostile.NIKON, "zeiss": hostile.ZEISS, "skyscan": hostile.SKYSCAN, "flexray": hostile.FLEXRAY,
 }  # fmt: skip
 CASES = [(form, case) for form, cases in FORMS.items() for case in cases]
 HARMLESS = {("tiff", "pages in a circle")}  # may be read, once, as well as refused
@@ -175,7 +175,7 @@ def test_options_are_checked() -> None:
 FUZZED = [
     ("r2", "meta_data.json"), ("r2", "proj_train/0000.npy"), ("phyradgs-real", hostile.GEO), ("rtk", hostile.XML),
     ("rtk", hostile.MHA), ("tiff", "proj_1.tif"), ("tiff", hostile.TOML), ("naf", ""), ("scanner", ""),
-    ("nikon", hostile.XTEK), ("skyscan", hostile.LOG), ("flexray", hostile.SETTINGS),
+    ("nikon", hostile.XTEK), ("skyscan", hostile.LOG), ("flexray", hostile.SETTINGS), ("zeiss", ""),
     ("configuration", ""),
 ]  # fmt: skip
 CONFIG = "method = 'phyradgs'\nstrips = 2\ntv_weight = 0.02\n[rates]\nposition = [2e-4, 2e-5]\n[control]\nevery = 100\n"

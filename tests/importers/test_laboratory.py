@@ -24,6 +24,7 @@ CENTRED = ConeGeometry(500.0, 800.0, (10, 14), (3.0, 2.5))
 WRITERS: dict[str, tuple[Callable[..., Path], ConeGeometry]] = {
     "nikon": (lab.write_nikon, CENTRED),
     "skyscan": (lab.write_skyscan, ConeGeometry(512.0, 1024.0, (10, 14), (2.5, 2.5), (2.5, 0.0))),
+    "zeiss": (lab.write_zeiss, ConeGeometry(512.0, 1024.0, (10, 14), (2.5, 2.5))),
     "flexray": (lab.write_flexray, ConeGeometry(500.0, 800.0, (10, 14), (2.5, 2.5), (4.0, -6.0))),
 }
 
@@ -157,3 +158,42 @@ def test_flexray_s_tube_stage_and_panel_stand_anywhere(tmp_path, make_truth, cap
     scan = import_scan(lab.write_flexray(tmp_path / "b", truth, **bare))
     falls_where(scan, np.deg2rad(np.linspace(0, 135, 6)), geometry)
     assert "no tra_obj (0), no Start angle (0), no ROI (LTRB) (the whole panel)" in caplog.text
+
+
+def test_zeiss_s_shifts_move_the_panel(tmp_path, make_truth, caplog) -> None:
+    """An image that is to be moved to the right by a column was taken by a panel a column further to the left."""
+    geometry = ConeGeometry(512.0, 1024.0, (10, 14), (2.5, 2.5))
+    truth = make_truth(geometry=geometry)
+    shifts = {"Alignment/X-Shifts": [0, 1, -2, 0.5, 0, 0, 9], "Alignment/Y-Shifts": [0, 0, 0, -1.5, 2, 0, 9]}
+    streams = {name: np.float32(values) for name, values in shifts.items()}
+    path = lab.write_zeiss(tmp_path / "a", truth, **streams, **{"ReconSettings/CenterShift": np.float32(3.5)})
+    scan = import_scan(path)
+    for frame, (columns, rows) in enumerate(zip(*shifts.values(), strict=True)):
+        if frame < 6:
+            expected = lab.lab_pixels(WORLD_POINTS, truth.angle_rad[frame], geometry) - [rows, columns]
+            np.testing.assert_allclose(projected(pose_at(scan, frame, 0.5), WORLD_POINTS), expected, atol=1e-4)
+    assert "ReconSettings/CenterShift is 3.5 pixels and not used" in caplog.text and "no Alignment" not in caplog.text
+    streams = {"ImageInfo/XrayGeometry": None, "Alignment/X-Shifts": None, "ReferenceData/Image": None}
+    path = lab.write_zeiss(tmp_path / "b", truth, **streams, **{"ImageInfo/ExpTimes": np.float32([0.5] * 6)})
+    with pytest.raises(InputError, match="flats: found none; .* say flat_value"):
+        import_scan(path)
+    fly = import_scan(path, ImportOptions(flat_value=lab.WHITE, fps=0.8))
+    assert fly.shutter.exposure_s == 0.5 and fly.is_fly
+    assert "no Alignment/X-Shifts (0), no ImageInfo/XrayGeometry (a cone)" in caplog.text
+    flat = lab.write_zeiss(tmp_path / "c", truth, **{"ImageInfo/XrayGeometry": np.int32(0)})
+    assert import_scan(flat).geometry.pixel_size_mm == (1.25, 1.25)
+
+
+def test_a_zeiss_file_with_images_in_two_folders_and_in_float(tmp_path, make_truth) -> None:
+    """A hundred images a folder; images of 4096 bytes or more lie in sectors of their own."""
+    images = {f"ImageData{i // 100 + 1}/Image{i + 1}": np.full((40, 60), i / 16, np.float32) for i in range(102)}
+    facts = {
+        "ImageHeight": np.int32(40), "ImageWidth": np.int32(60),
+        "NoOfImages": np.int32(102), "DataType": np.int32(10), "Angles": np.arange(102, dtype=np.float32),
+        "StoRADistance": np.full(102, 500, np.float32), "DtoRADistance": np.full(102, 300, np.float32),
+    }  # fmt: skip
+    streams = {f"ImageInfo/{name}": value for name, value in facts.items()} | images
+    without = {"Alignment/X-Shifts": None, "Alignment/Y-Shifts": None, "ReferenceData/Image": None}
+    path = lab.write_zeiss(tmp_path / "a", make_truth(geometry=CENTRED), **streams, **without)
+    scan = import_scan(path, ImportOptions(quantity="attenuation"))
+    np.testing.assert_array_equal(scan.projections[:, 3, 4], np.arange(102) / 16)

@@ -289,12 +289,12 @@ WRITERS = {
     "data-exchange": (write_data_exchange, "dx.h5"),
     "nxtomo": (write_nxtomo, "nx.h5"), "tiff": (write_tiff, "tiff"),
     "nikon": (lab.write_nikon, "nikon"), "skyscan": (lab.write_skyscan, "skyscan"),
-    "flexray": (lab.write_flexray, "flexray"),
+    "flexray": (lab.write_flexray, "flexray"), "zeiss": (lab.write_zeiss, "sample.txrm"),
 }  # fmt: skip
 
 
 # of the panel, where a format cannot state all
-OFFSETS_MM = {"phyradgs-real": (4.0, 0.0), "nikon": (0.0, 0.0), "skyscan": (4.0, 0.0)}
+OFFSETS_MM = {"phyradgs-real": (4.0, 0.0), "nikon": (0.0, 0.0), "zeiss": (0.0, 0.0), "skyscan": (4.0, 0.0)}
 
 
 def write(form: str, folder: Path, make_truth: Any) -> Path:

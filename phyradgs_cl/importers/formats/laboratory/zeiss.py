@@ -1,0 +1,119 @@
+"""Scans of Zeiss Xradia microscopes: a .txrm file, whose streams an OLE2 container holds.
+
+As in the readers of DXchange, CIL and MBIRJAX: distances in mm without their signs, angles in degrees of a sample that turns
+counterclockwise seen from above, row 0 the lowest, column 0 on the left. PixelSize in µm is a pixel's at the sample. Each
+image is divided by the reference image. Alignment shifts, in columns and rows, move the images, and here the panel instead.
+CenterShift is not used: calibrate finds the axis."""
+
+import logging
+from pathlib import Path
+
+import numpy as np
+
+from phyradgs_cl.acquisition import Scan
+from phyradgs_cl.importers.assemble import StoredTiming, assemble_scan, cone, make_timing, parallel
+from phyradgs_cl.importers.options import OF_BARE_FRAMES, ImportOptions
+from phyradgs_cl.importers.reading.frames import gantry_sign, line_integrals, oriented
+from phyradgs_cl.importers.reading.ole import open_ole, read_images, read_stream
+from phyradgs_cl.importers.reading.settings import say_missing
+from phyradgs_cl.importers.stage import RotaryStage
+from phyradgs_cl.io.tables import Fields
+
+_log = logging.getLogger(__name__)
+_INFO, _REFERENCE = "ImageInfo", "ReferenceData/Image"
+_WHOLE = ("NoOfImages", "ImageWidth", "ImageHeight", "DataType", "XrayGeometry")
+_REAL = ("PixelSize", "Angles", "StoRADistance", "DtoRADistance", "ExpTimes")
+_STREAMS = {
+    **{f"{_INFO}/{name}": "<i4" for name in _WHOLE}, **{f"{_INFO}/{name}": "<f4" for name in _REAL},
+    "Alignment/X-Shifts": "<f4", "Alignment/Y-Shifts": "<f4", "ReconSettings/CenterShift": "<f4",
+    "ReferenceData/DataType": "<i4",
+}  # fmt: skip
+_TYPES = {5: "<u2", 10: "<f4"}
+_MOST_VALUES, _PER_FOLDER = 1 << 22, 100
+_STEADY = 1e-3  # relative: how far the distances of single images may differ
+
+
+def recognises(path: Path) -> bool:
+    """True for a .txrm file."""
+    return path.is_file() and path.suffix.lower() == ".txrm"
+
+
+def import_scan(path: Path, options: ImportOptions) -> Scan:
+    """Imports the images of a .txrm file."""
+    options.refuse_unused("zeiss", OF_BARE_FRAMES)
+    with open_ole(path) as ole:
+        stored = {name: dtype for name, dtype in _STREAMS.items() if ole.exists(name)}
+        values = {name: read_stream(ole, path, name, dtype, _MOST_VALUES).tolist() for name, dtype in stored.items()}
+        scan = Fields(f"{path}:", values)
+        count, rows, columns = (_whole(scan, name, path) for name in ("NoOfImages", "ImageHeight", "ImageWidth"))
+        names = [f"ImageData{i // _PER_FOLDER + 1}/Image{i + 1}" for i in range(count)]
+        frames, white = read_images(ole, path, names, _type(scan, f"{_INFO}/DataType"), (rows, columns)), None
+        if ole.exists(_REFERENCE):
+            white = read_images(ole, path, [_REFERENCE], _type(scan, "ReferenceData/DataType", 10), (rows, columns))
+    angle_rad = gantry_sign(options, "sample") * np.deg2rad(_numbers(scan, f"{_INFO}/Angles", count))
+    exposure_s = _first(scan, f"{_INFO}/ExpTimes") if scan.has(f"{_INFO}/ExpTimes") else None
+    timing = make_timing(str(path), count, options, StoredTiming(exposure_s=exposure_s or None))
+    trajectory, geometry = _stage(scan, (count, rows, columns), options).turned(angle_rad, timing, str(path))
+    flats = None if white is None else oriented(white, options, "bottom")
+    turned = oriented(frames, options, "bottom")
+    integrals = line_integrals(str(path), turned, options, flats=flats, convention="counts", is_corrected=True)
+    parts = integrals, trajectory, geometry, timing, options
+    return assemble_scan(*parts, title=path.stem, source=str(path))
+
+
+def _type(scan: Fields, name: str, default: float | None = None) -> str:
+    """Returns the type of an image's pixels; without a default the stream must be there."""
+    number = _first(scan, name) if default is None or scan.has(name) else default
+    if number not in _TYPES:
+        raise scan.error(name, f"{number:g}", "5 (16 bits) or 10 (float32)")
+    return _TYPES[int(number)]
+
+
+def _stage(scan: Fields, shape: tuple[int, int, int], options: ImportOptions) -> RotaryStage:
+    """Returns a stage whose panel is shifted in every image as the alignment says."""
+    to_axis_mm, behind_mm = (_steady(scan, f"{_INFO}/{name}") for name in ("StoRADistance", "DtoRADistance"))
+    is_cone = not scan.has(f"{_INFO}/XrayGeometry") or _first(scan, f"{_INFO}/XrayGeometry") == 1
+    pixel_mm = _first(scan, f"{_INFO}/PixelSize") / 1000
+    if not 0 < pixel_mm < 1e3:
+        raise scan.error(f"{_INFO}/PixelSize", f"{1000 * pixel_mm:g}", "a size above 0 µm")
+    say_missing(scan, {"Alignment/X-Shifts": "0", "Alignment/Y-Shifts": "0", f"{_INFO}/XrayGeometry": "a cone"})
+    if scan.has("ReconSettings/CenterShift") and (shift := _first(scan, "ReconSettings/CenterShift")):
+        text = "%s is %g pixels and not used, for its sign is not documented: check --fix-offset or calibrate find the axis"
+        _log.warning(text, scan.name("ReconSettings/CenterShift"), shift)
+    if is_cone:
+        pitch_mm = pixel_mm * (to_axis_mm + behind_mm) / to_axis_mm
+        geometry = cone(options, to_axis_mm, to_axis_mm + behind_mm, shape[1:], (pitch_mm, pitch_mm), (0.0, 0.0))
+    else:
+        geometry = parallel(options, shape[1:], (pixel_mm, pixel_mm), (0.0, 0.0))
+    names = ("Alignment/Y-Shifts", "Alignment/X-Shifts")
+    shifts = np.stack([_numbers(scan, name, shape[0]) if scan.has(name) else np.zeros(shape[0]) for name in names], -1)
+    return RotaryStage(geometry, shift_mm=shifts * geometry.pixel_size_mm if shifts.any() else None)
+
+
+def _numbers(scan: Fields, name: str, count: int) -> np.ndarray:
+    """Returns the first ``count`` numbers (count,) of a stream, which may have room for more."""
+    values = scan.numbers(name)
+    if len(values) < count:
+        raise scan.error(name, f"{len(values)} numbers", f"{count}, one for each image")
+    return values[:count]
+
+
+def _first(scan: Fields, name: str) -> float:
+    return float(_numbers(scan, name, 1)[0])
+
+
+def _whole(scan: Fields, name: str, path: Path) -> int:
+    """Returns a count of at most the bytes of the file."""
+    value, most = _first(scan, f"{_INFO}/{name}"), path.stat().st_size
+    if not 1 <= value <= most:
+        raise scan.error(f"{_INFO}/{name}", f"{value:g}", f"a whole number from 1 to {most}")
+    return int(value)
+
+
+def _steady(scan: Fields, name: str) -> float:
+    """Returns a distance above 0 that is the same for all images, without its sign."""
+    lengths = np.abs(scan.numbers(name))
+    lengths = lengths[lengths > 0]  # streams may have room for more images than were taken
+    if not len(lengths) or np.ptp(lengths) > _STEADY * lengths[0]:
+        raise scan.error(name, f"{np.ptp(lengths):g} between images" if len(lengths) else "0", "one length above 0 mm")
+    return float(lengths[0])
