@@ -155,7 +155,7 @@ test-spectrum: $(VENV)-spectrum/.installed
 
 test-browser: export PHYRADGS_PICTURES = $(abspath $(VENV)-browser/pictures)
 test-browser: $(VENV)-browser/.installed
-	$(call tested,$(VENV)-browser,tests/report/browser_page.py tests/report/browser_space.py)
+	$(call tested,$(VENV)-browser,tests/report/browser_page.py tests/report/browser_space.py tests/report/browser_live.py)
 
 test-cluster: $(VENV)-cluster/.installed
 	$(call tested,$(VENV)-cluster,tests/cluster)

@@ -100,7 +100,7 @@ RUN_GROUPS = {
     "Quality": (
         *("prior", "preset", "assignments", "tune", "holdout", "steps", "median_filter", "ignore_lag", "gaussians", "seed"),
     ),
-    "Run": ("device", "memory", "config", "preview", "resume", "checkpoint_every", "profile"),
+    "Run": ("device", "memory", "config", "preview", "live", "resume", "checkpoint_every", "profile"),
     "Under mpiexec (docs: cluster.md)": ("batch",),
 }
 _METHOD = "fdk: analytic; phyradgs, r2: splats; naf, sax-nerf: neural fields; the others: voxels (docs: methods.md)."

@@ -1,6 +1,7 @@
 """reconstruct: a scan file to a volume file; estimate: the time and memory that this takes."""
 
 import time
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Annotated
 
@@ -15,10 +16,10 @@ from phyradgs_cl.estimate import duration, estimate, seconds_around
 from phyradgs_cl.io import partial_path
 from phyradgs_cl.parallel import failing_together, launched_ranks
 from phyradgs_cl.progress import Ticker
-from phyradgs_cl.reconstructors import ProgressReport, Reconstruction, Report
-from phyradgs_cl.reconstructors.result import COMPARED
+from phyradgs_cl.reconstructors import ProgressReport, Reconstruction, Report, RunPlan
+from phyradgs_cl.reconstructors.result import COMPARED, option_facts
 from phyradgs_cl.reconstructors.tune import TUNED, tuning_line
-from phyradgs_cl.report import Preview, check_preview
+from phyradgs_cl.report import LivePage, Preview, check_live, check_preview, write_report
 from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.settings import Settings
 from phyradgs_cl.workflow import load_scan, profile_report, run_reconstruction
@@ -35,6 +36,7 @@ GROUPS = {"reconstruct": RUN_GROUPS, "estimate": RUN_GROUPS}
 _CHECKPOINT = "Seconds from checkpoint to checkpoint, for --resume; 0: on Ctrl-C only."
 _ROWS = "Detector rows of a parallel scan to read and reconstruct; row 0 is the lowest."
 _SLAB = "Rows of a parallel scan at a time: slabs, kept on disk as they are done."
+_LIVE = "HTML page of the run, written again every five seconds; after the run it is the report."
 _PREVIEW = "PNG of the three middle slices; during the run NAME.partial.png, every five seconds."
 
 
@@ -45,6 +47,7 @@ def reconstruct_command(
     resume: Annotated[bool, option("Continue an interrupted run from its checkpoint.", True, "--resume")] = False,
     checkpoint_every: Annotated[float, option(_CHECKPOINT, metavar="SECONDS")] = 600.0,
     preview: Annotated[Path | None, file_option(_PREVIEW, "--preview")] = None,
+    live: Annotated[Path | None, file_option(_LIVE, "--live")] = None,
     profile: Annotated[bool, option("Print the device's time by kernel.", True, "--profile")] = False,
     rows: Annotated[str | None, option(_ROWS, "all", metavar="A:B")] = None,
     slab: Annotated[int, option(_SLAB, "as memory allows", metavar="ROWS", min=0)] = 0,
@@ -53,20 +56,31 @@ def reconstruct_command(
     plan, ranks = settings.plan(initial), launched_ranks()
     ticker, runtimes = Ticker("iteration"), list[Runtime]()
 
+    def stage(text: str) -> None:
+        ticker.stage(text)
+        if page is not None:
+            page.stage(text)
+
     def runtime() -> Runtime:
         runtimes.append(settings.runtime(profile=profile, ranks=ranks))
-        ticker.stage("building kernels")
+        stage("building kernels")
         return runtimes[-1]
 
-    with failing_together(ranks, last_words), ticker:
-        ticker.stage(f"reading {scan}")
-        listeners: list[ProgressReport] = [ticker.progress]
+    inputs = [path for path in (settings.config, initial) if path is not None]
+    listeners: list[ProgressReport] = [ticker.progress]
+    with failing_together(ranks, last_words), ticker, ExitStack() as stack:
+        page = None
+        if live is not None:
+            check_live(live, scan, output, partial_path(output), *inputs)
+            if ranks.rank == 0:
+                page = stack.enter_context(LivePage(live, output.name, _settings_of(plan, scan)))
+                listeners.append(page)
+        stage(f"reading {scan}")
         picture = None
         if preview is not None:
             check_preview(preview, scan, output, partial_path(output))
             picture = Preview(preview)
             listeners.append(picture)
-        inputs = [path for path in (settings.config, initial) if path is not None]
         result, metrics = run_reconstruction(
             plan, scan, output, runtime, Report(*listeners), resume=resume,
             checkpoint_every_s=checkpoint_every, inputs=inputs, ranks=ranks,
@@ -75,6 +89,8 @@ def reconstruct_command(
         if picture is not None and result.state is None and ranks.rank == 0:
             with signals.finish_despite_interrupt():
                 picture.finish(result.volume, result.grid)
+        if page is not None:
+            _finish(page, result, scan, output, runtimes[-1])
     written = output if result.state is None else partial_path(output)
     used_s = time.process_time()  # of the command so far, with its start; other programs do not change it
     motion = getattr(plan.options, "motion", None)
@@ -90,6 +106,24 @@ def reconstruct_command(
         at, asked = result.facts["interrupted_at"], result.facts["options"]["iterations"]
         complain(f"interrupted at iteration {at} of {asked}: repeat the command with --resume to continue")
         raise typer.Exit(signals.exit_status())
+
+
+def _settings_of(plan: RunPlan, scan: Path) -> dict[str, object]:
+    """Returns the settings that a live page shows."""
+    about = {"scan": str(scan), "method": plan.method_name, "seed": plan.seed, "input": plan.preprocessing.facts()}
+    return {**about, "options": option_facts(plan.options)}
+
+
+def _finish(page: LivePage, result: Reconstruction, scan: Path, output: Path, rt: Runtime) -> None:
+    """Makes the live page of a complete run its report. The frames of a run in slabs may exceed the memory."""
+    if result.state is not None:
+        at, asked = result.facts["interrupted_at"], result.facts["options"]["iterations"]
+        page.end(f"Interrupted at iteration {at} of {asked}: repeat the command with --resume to continue.")
+    elif "slabs" in result.facts:
+        page.end("The run is complete.")
+    else:
+        with signals.finish_despite_interrupt():
+            page.become(lambda path: write_report(output, path, lambda: rt, scan=scan))
 
 
 @with_run_options("seed", "tune")

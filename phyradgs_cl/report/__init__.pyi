@@ -1,3 +1,5 @@
+from .live import LivePage as LivePage
+from .live import check_live as check_live
 from .page import report_page as report_page
 from .page import write_report as write_report
 from .preview import Preview as Preview

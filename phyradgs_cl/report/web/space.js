@@ -49,9 +49,9 @@
     return values;
   }
 
-  // Returns how many milliseconds the picture took.
+  // Returns how many milliseconds the picture took, or null where nothing is drawn.
   function draw(ofPixels) {
-    if (!renderer || !isVisible) return Infinity;
+    if (!renderer || !isVisible) return null;
     const level = showsSurface() ? threshold.valueAsNumber : null;
     const took_ms = renderer.draw({ camera, ends, threshold: level, points: centres && centres.checked, share: ofPixels });
     setBar(bar, 2 * renderer.extent_mm(camera.zoom)[0]);
@@ -62,13 +62,15 @@
   function drawMoving() {
     asked = 0;
     const took_ms = draw(share), times = took_ms > 1.3 * TURNING_MS ? 0.8 : took_ms < 0.6 * TURNING_MS ? 1.25 : 1;
+    if (took_ms === null) return;
     share = clamp(share * times, LEAST_SHARE, 1);
+    resting = setTimeout(refine, REST_AFTER_MS, Math.min(1, 2 * share));
   }
 
   // Draws the picture at rest finer and finer, as long as the next one does not take more milliseconds than the patience.
   function refine(ofPixels) {
     const took_ms = draw(ofPixels);
-    if (ofPixels < 1 && 4 * took_ms < Number(canvas.dataset.patience)) resting = setTimeout(refine, 0, Math.min(1, 2 * ofPixels));
+    if (took_ms !== null && ofPixels < 1 && 4 * took_ms < Number(canvas.dataset.patience)) resting = setTimeout(refine, 0, Math.min(1, 2 * ofPixels));
   }
 
   // The letters of the axes, at the ends of the three edges that are the strongest.
@@ -86,7 +88,6 @@
   function redraw() {
     asked = asked || requestAnimationFrame(drawMoving);
     clearTimeout(resting);
-    resting = setTimeout(refine, REST_AFTER_MS, Math.min(1, 2 * share));
   }
 
   function say(slider, value, words) {

@@ -1,0 +1,53 @@
+"""--live: a page of the run under way, which changes nothing about the run, ends as its report, and survives a kill."""
+
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+
+from phyradgs_cl.io import partial_path, read_volume
+
+
+def test_a_run_with_a_page_is_the_same_run_and_ends_as_its_report(cli, scan, tmp_path) -> None:
+    page, seen, plain = tmp_path / "run.html", tmp_path / "seen.h5", tmp_path / "plain.h5"
+    for output, more in ((seen, ["--live", str(page)]), (plain, [])):
+        assert cli.run(["reconstruct", str(scan), "-o", str(output), "--method", "sirt", "--iterations", "3", *more]) == 0
+    np.testing.assert_array_equal(read_volume(seen).values, read_volume(plain).values)
+    text = page.read_text(encoding="utf-8")
+    assert 'id="provenance"' in text and 'id="projections"' in text and "live-data" not in text
+    assert {path.name for path in tmp_path.iterdir()} == {"run.html", "seen.h5", "plain.h5"}
+
+
+def test_an_error_of_the_run_stands_on_its_page(cli, scan, tmp_path) -> None:
+    page = tmp_path / "run.html"
+    command = ["reconstruct", str(scan), "-o", str(tmp_path / "v.h5"), "--method", "fdk", "--resume", "--live", str(page)]
+    assert cli.run(command) == 2
+    assert "Stopped by an error: --resume" in page.read_text(encoding="utf-8")
+
+
+def test_a_killed_run_leaves_a_whole_page_that_knows_its_age(scan, tmp_path) -> None:
+    page, output = tmp_path / "run.html", tmp_path / "v.h5"
+    words = ["reconstruct", str(scan), "-o", str(output), "--method", "sirt", "--iterations", "100000", "--live", str(page)]
+    command = [sys.executable, "-m", "phyradgs_cl", *words]
+    run = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    deadline = time.monotonic() + 120
+    while not (page.exists() and "of 100000" in page.read_text(encoding="utf-8")) and time.monotonic() < deadline:
+        assert run.poll() is None
+        time.sleep(0.05)
+    os.kill(run.pid, signal.SIGKILL)
+    run.wait()
+    text = page.read_text(encoding="utf-8")
+    assert text.endswith("</html>\n") and "of 100000" in text and 'id="slices"' in text
+    written = float(re.search(r'"written":([\d.]+)', text)[1])
+    assert 0 <= time.time() - written < 60 and '"late_s":30' in text and '"is_over":false' in text
+
+
+def test_the_page_does_not_replace_what_matters(refused, scan, tmp_path) -> None:
+    output, before = tmp_path / "volume.html", scan.read_bytes()
+    for page in (scan, output, partial_path(output), tmp_path / "page.txt"):
+        refused(["reconstruct", scan, "-o", output, "--live", page], "--live")
+    assert scan.read_bytes() == before
