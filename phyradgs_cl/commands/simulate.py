@@ -34,7 +34,7 @@ GROUPS = {
 }
 ProtocolName = Literal[tuple(PROTOCOLS)]  # type: ignore[valid-type]
 Noise = Literal["none", "tigre", "beer"]
-_PHANTOM = f"Built-in phantom ({', '.join(PHANTOMS)}) or a TOML file of beads and wires."
+_PHANTOM = f"{', '.join(PHANTOMS)}; or a TOML file of beads and wires."
 _MOTION = "TOML file of how the object moves: breathing, drying or sliding; the truth of some states is stored."
 _NAMES = lambda incomplete: [name for name in PHANTOMS if name.startswith(incomplete)]  # noqa: E731
 _VOLUME = "Volume file: HDF5 with /volume (z, y, x), mha, nii, nrrd, npy or tiff."

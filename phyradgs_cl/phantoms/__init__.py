@@ -1,8 +1,8 @@
 """Phantoms: objects of known attenuation, for simulations and as the truth of comparisons; ``make_phantom`` makes one.
 
 All have ``name``, ``kind`` and ``voxelise(grid)``. An "analytic" phantom also has ``line_integrals(source, target)`` in
-closed form, a "voxel" one ``volume`` and ``grid``. Attenuation scales with 1 / half-size, so that line integrals do not
-depend on the size."""
+closed form, a "moving" one has them at any time, a "voxel" one has ``volume`` and ``grid``. Attenuation scales with
+1 / half-size, so that line integrals do not depend on the size."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -16,12 +16,13 @@ from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.phantoms.closed_form import shepp_logan, sphere_phantom
 from phyradgs_cl.phantoms.ellipsoids import Cylinder, Ellipsoid, EllipsoidPhantom, rotation_about_z
+from phyradgs_cl.phantoms.moving import MovingBody, MovingPhantom, moving_sphere
 from phyradgs_cl.phantoms.procedural_foot import foot
 from phyradgs_cl.phantoms.procedural_jaw import jaw
 
 __all__ = [
-    "PHANTOMS", "Cylinder", "Ellipsoid", "EllipsoidPhantom", "Phantom", "VoxelPhantom", "foot", "jaw",
-    "make_phantom", "rotation_about_z", "shepp_logan", "sphere_phantom"
+    "PHANTOMS", "Cylinder", "Ellipsoid", "EllipsoidPhantom", "MovingBody", "MovingPhantom", "Phantom", "VoxelPhantom",
+    "foot", "jaw", "make_phantom", "moving_sphere", "rotation_about_z", "shepp_logan", "sphere_phantom"
 ]  # fmt: skip
 
 
@@ -47,7 +48,7 @@ class VoxelPhantom:
         return self.volume
 
 
-Phantom = EllipsoidPhantom | VoxelPhantom
+Phantom = EllipsoidPhantom | MovingPhantom | VoxelPhantom
 # (half_size_mm, resolution, seed) -> phantom; closed forms ignore the last two.
 Factory = Callable[[float, int, int], Phantom]
 
@@ -65,6 +66,7 @@ PHANTOMS: dict[str, Factory] = {
     "jaw": _from_voxels("jaw", jaw),
     "shepp-logan": lambda half_size_mm, resolution, seed: shepp_logan(half_size_mm),
     "spheres": lambda half_size_mm, resolution, seed: sphere_phantom(half_size_mm),
+    "moving-sphere": lambda half_size_mm, resolution, seed: moving_sphere(half_size_mm),
 }
 
 

@@ -171,6 +171,11 @@ class EllipsoidPhantom:
     def __post_init__(self) -> None:
         object.__setattr__(self, "ellipsoids", tuple(self.ellipsoids))
 
+    @property
+    def reach_mm(self) -> float:
+        """Radius of a ball about the origin that holds every body."""
+        return max(float(np.linalg.norm(body.ends_mm, axis=1).max()) + body.reach_mm for body in self.ellipsoids)
+
     def line_integrals(self, source: ArrayLike, target: ArrayLike) -> Array:
         """Integrates attenuation from ``source`` to ``target``, world points (..., 3) in mm, x y z, that broadcast.
 

@@ -15,7 +15,7 @@ from phyradgs_cl.detector import effects, tube_spectrum
 from phyradgs_cl.errors import InputError, NumericalError
 from phyradgs_cl.fields import Grid, MovingTruth
 from phyradgs_cl.io import Scanner, Volume
-from phyradgs_cl.phantoms import EllipsoidPhantom
+from phyradgs_cl.phantoms import EllipsoidPhantom, MovingPhantom
 from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.simulation.options import SimulationOptions
 from phyradgs_cl.simulation.scenes import phantom_scene, volume_scene
@@ -23,11 +23,12 @@ from phyradgs_cl.simulation.sources import FrameSource
 
 _LARGEST_GRID = 4096
 _SMALLEST_PHANTOM = 2  # procedural phantoms need 4 voxels and are drawn on twice as many
+_STATES = 8  # of a phantom whose bodies move
 log = logging.getLogger(__name__)
 
 
 def simulated_scan(
-    rt: Runtime, of: str | Volume | EllipsoidPhantom, scanner: Scanner, options: SimulationOptions, *,
+    rt: Runtime, of: str | Volume | EllipsoidPhantom | MovingPhantom, scanner: Scanner, options: SimulationOptions, *,
     size: int | None = None, pixel_samples: int = 1, name: str = "volume",
     report: Callable[[int, int], None] = lambda done, total: None
 ) -> Scan:
@@ -56,10 +57,13 @@ def simulated_scan(
     stated = {key: getattr(options, key) for key in ("seed", "noise", "dose", "electronic_noise", *added)}
     facts = {"program": f"phyradgs-cl {__version__}", "simulated": scene.title, "pixel_samples": pixel_samples}
     scan.provenance.update(facts | stated)
-    if motion is None or scene.state is None:
+    if scene.state is None or (motion is None and scene.period_s is None):
         return scan
-    scan.provenance["motion_of_object"] = asdict(motion)
-    times_s = motion.state_times_s(*window_s)
+    if motion is not None:
+        scan.provenance["motion_of_object"] = asdict(motion)
+        times_s = motion.state_times_s(*window_s)
+    else:
+        times_s = _in_one_cycle_s(scene.period_s or 1.0, *window_s)
     volumes = np.stack([scene.state(time_s) for time_s in times_s])
     volumes *= np.float32(scan.provenance["attenuation_factor"])  # type: ignore[arg-type]
     return replace(scan, moving_truth=MovingTruth(times_s, volumes, scene.deformation))
@@ -123,6 +127,12 @@ def simulate(
         title=title,
         provenance={"attenuation_factor": factor, "time_samples": samples},
     )
+
+
+def _in_one_cycle_s(period_s: float, first_s: float, last_s: float) -> np.ndarray:
+    """Returns the times (8,) of a phantom's true states: eighths of a cycle, the one about the middle of the scan."""
+    cycle = np.floor((first_s + last_s) / 2 / period_s)
+    return np.asarray((cycle + np.arange(_STATES) / _STATES) * period_s)
 
 
 def default_time_samples(protocol: Protocol, grid: Grid) -> int:

@@ -12,7 +12,7 @@ from phyradgs_cl.fields import Deformation, Grid, deformed
 from phyradgs_cl.io import Volume
 from phyradgs_cl.operators.rays.layout import RayLayout
 from phyradgs_cl.operators.rays.memory import RayMemory
-from phyradgs_cl.phantoms import EllipsoidPhantom, make_phantom
+from phyradgs_cl.phantoms import EllipsoidPhantom, MovingPhantom, make_phantom
 from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.simulation.deformed import DeformedSource
 from phyradgs_cl.simulation.sources import AnalyticSource, FrameSource, VolumeSource, on_panel
@@ -28,7 +28,8 @@ Moves = Callable[[Grid], Deformation]
 class Scene:
     """An object to scan: a source of frames, the grid to reconstruct, and the truth (nz, ny, nx) on it. source_shape: voxels
     (z, y, x) of a source that is a user's volume. bone: makes the source of its dense part. deformation: how the object
-    moves. state: returns the truth at a time in s, of an object that moves."""
+    moves. state: returns the truth at a time in s, of an object that moves. period_s: of one that moves without a
+    deformation."""
 
     source: FrameSource
     grid: Grid
@@ -38,6 +39,7 @@ class Scene:
     bone: Callable[[], FrameSource] | None = None
     deformation: Deformation | None = None
     state: Callable[[float], np.ndarray] | None = None
+    period_s: float | None = None
 
     def warn_of_inverse_crime(self) -> None:
         """Warns where the projected voxels are no finer than the grid, which makes reconstructions look too good."""
@@ -50,7 +52,7 @@ class Scene:
 
 
 def phantom_scene(
-    rt: Runtime, of: str | EllipsoidPhantom, geometry: Geometry, box: Grid, size: int, axis: str,
+    rt: Runtime, of: str | EllipsoidPhantom | MovingPhantom, geometry: Geometry, box: Grid, size: int, axis: str,
     seed: int, pixel_samples: int = 1, moves: Moves | None = None
 ) -> Scene:
     """Returns the scene of a phantom, or of one by its name, in the scanner's box, with ``size`` voxels per side.
@@ -59,6 +61,10 @@ def phantom_scene(
     their block mean. Pixels average ``pixel_samples``² rays over their area."""
     half_size_mm = min(box.size_mm) / 2
     phantom = make_phantom(of, half_size_mm, 2 * size, seed) if isinstance(of, str) else of
+    if isinstance(phantom, MovingPhantom):
+        if moves is not None:
+            raise InputError("--motion-of-object", f"given for the phantom {phantom.name}", "an object that rests by itself")
+        return _moving_scene(phantom, _resized(box, size), geometry, pixel_samples)
     if isinstance(phantom, EllipsoidPhantom):
         grid, title = _resized(box, size), f"phantom {phantom.name}"
         deformation = None if moves is None else moves(grid)
@@ -76,6 +82,16 @@ def phantom_scene(
     deformation = None if moves is None else moves(grid)
     volume = phantom.voxelise(fine)
     return _voxel_scene(rt, volume, fine, grid, f"phantom {of}", deformation, geometry, axis, pixel_samples)
+
+
+def _moving_scene(phantom: MovingPhantom, grid: Grid, geometry: Geometry, pixel_samples: int) -> Scene:
+    """Returns the scene of a phantom whose bodies move. Its reference is the state at time 0."""
+
+    def state(time_s: float) -> np.ndarray:
+        return phantom.at(time_s).voxelise(grid, 4)
+
+    source = on_panel(geometry, pixel_samples, lambda panel: AnalyticSource(phantom, panel))
+    return Scene(source, grid, state(0.0), f"phantom {phantom.name}", state=state, period_s=phantom.period_s)
 
 
 def volume_scene(

@@ -13,7 +13,7 @@ from phyradgs_cl.fields import Grid
 from phyradgs_cl.operators import RayOperator
 from phyradgs_cl.operators.rays.layout import RayLayout
 from phyradgs_cl.operators.rays.memory import RayMemory
-from phyradgs_cl.phantoms import EllipsoidPhantom
+from phyradgs_cl.phantoms import EllipsoidPhantom, MovingPhantom
 from phyradgs_cl.runtime import DeviceArray, MemoryShortage, Runtime
 
 
@@ -53,9 +53,9 @@ class VolumeSource:
 
 
 class AnalyticSource:
-    """Frames of a phantom with closed-form line integrals, in float64."""
+    """Frames of a phantom with closed-form line integrals, in float64, with moving bodies at the times of cells."""
 
-    def __init__(self, phantom: EllipsoidPhantom, geometry: Geometry) -> None:
+    def __init__(self, phantom: EllipsoidPhantom | MovingPhantom, geometry: Geometry) -> None:
         self._phantom, self._geometry = phantom, geometry
 
     def frame(self, cells: TimeCells, model: str, factor: float) -> np.ndarray:
@@ -66,17 +66,15 @@ class AnalyticSource:
             target = pixels[:, start:stop] if by_row else pixels[:, :, start:stop]
             origin = cells.pose[members][:, None, None, :3]
             if cells.is_parallel:  # from before the phantom to behind it, along the rays' direction
-                along = (_reach_mm(self._phantom) + np.linalg.norm(target, axis=-1, keepdims=True)) * origin
+                along = (self._phantom.reach_mm + np.linalg.norm(target, axis=-1, keepdims=True)) * origin
                 origin, target = target - along, target + along
-            p = factor * self._phantom.line_integrals(origin, target)
+            if isinstance(self._phantom, MovingPhantom):
+                p = factor * self._phantom.line_integrals(origin, target, cells.time_s[members])
+            else:
+                p = factor * self._phantom.line_integrals(origin, target)
             mean = average(p, cells.weight[members], model)
             frame[(slice(start, stop),) if by_row else (slice(None), slice(start, stop))] = mean
         return frame.astype(np.float32)
-
-
-def _reach_mm(phantom: EllipsoidPhantom) -> float:
-    """Returns the radius of a ball about the origin that holds every body of a phantom."""
-    return max(float(np.linalg.norm(body.ends_mm, axis=1).max()) + body.reach_mm for body in phantom.ellipsoids)
 
 
 class PixelAreaSource:

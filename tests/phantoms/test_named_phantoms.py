@@ -88,7 +88,7 @@ def test_registry_makes_every_phantom_with_its_kind() -> None:
     grid = Grid.cube(16, 60.0)
     for name in PHANTOMS:
         phantom = make_phantom(name, 30.0, resolution=16, seed=1)
-        assert phantom.name == name and phantom.kind in ("analytic", "voxel")
+        assert phantom.name == name and phantom.kind in ("analytic", "moving", "voxel")
         volume = phantom.voxelise(grid)
         assert volume.shape == grid.shape and volume.dtype == np.float32 and volume.max() > 0
         assert volume.max() * 30.0 <= 1.001
@@ -96,7 +96,7 @@ def test_registry_makes_every_phantom_with_its_kind() -> None:
 
 
 def test_unknown_names_and_sizes_are_refused() -> None:
-    named = "'hand'; expected one of 'foot', 'jaw', 'shepp-logan', 'spheres'"
+    named = "'hand'; expected one of 'foot', 'jaw', 'shepp-logan', 'spheres', 'moving-sphere'"
     assert_refused({
         named: lambda: make_phantom("hand", 1.0), "half_size_mm": lambda: make_phantom("foot", -1.0),
         "resolution": lambda: make_phantom("foot", 1.0, 0), "variant": lambda: shepp_logan(1.0, "tofu"),

@@ -8,12 +8,13 @@ import pytest
 from kernel_kit import assert_near
 from tolerances import FLOAT32, MOVING_FRAME
 
-from phyradgs_cl.acquisition import ConeGeometry, Protocol, Scan, pixel_centres
+from phyradgs_cl.acquisition import ConeGeometry, ParallelGeometry, Protocol, Scan, pixel_centres
 from phyradgs_cl.acquisition.cells import per_line_cells
 from phyradgs_cl.detector import average
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Deformation, Grid, control_points, deformed
 from phyradgs_cl.io import Scanner, Volume
+from phyradgs_cl.phantoms import moving_sphere
 from phyradgs_cl.simulation import (
     DeformedSource,
     ObjectMotion,
@@ -161,8 +162,8 @@ def test_drying_never_returns_and_sliding_leaves_the_surroundings() -> None:
     inside, outside = sliding.displacement_mm([[0.3, 0.0, 0.5], [0.75, 0.0, 0.5]], [1.0])
     assert inside == pytest.approx([0, 0, 0.3], abs=0.01) and not outside.any()
     assert {np.sign(w) for w in sliding.weights.ravel().round(9)} == {-1, 0, 1}
-    for kind in ("breathing", "drying", "sliding"):
-        assert ObjectMotion(kind, amplitude=0.4).deformation(BOX, 0.0, 30.0).smallest_determinant() > 0.3
+    for kind, amplitude in (("breathing", 0.4), ("drying", 0.4), ("sliding", 0.1)):
+        assert ObjectMotion(kind, amplitude=amplitude).deformation(BOX, 0.0, 30.0).smallest_determinant() > 0.3
 
 
 def test_states_stand_in_one_breath_or_over_the_whole_scan() -> None:
@@ -204,3 +205,27 @@ def test_two_turns_see_every_angle_twice() -> None:
     np.testing.assert_allclose(np.rad2deg(twice.angle_start_rad()), np.arange(8) * 90.0)
     assert twice.window_s() == (0.0, pytest.approx(14.0 + 1.86))
     assert twice.at_rate(2.0).exposure_s == pytest.approx(0.25)
+
+
+@pytest.mark.parametrize("beam", ["cone", "parallel"])
+def test_lines_see_a_moving_sphere_where_it_is(rt, beam) -> None:
+    """RTK's sphere, written out line by line; its states are those of the frames of a cycle."""
+    panel = GEOMETRY if beam == "cone" else ParallelGeometry(SHAPE, (2.8 / 12, 2.8 / 16))
+    scanner = replace(SCANNER, geometry=panel)
+    options = scanner_options(scanner, "rapid", views=12, exposure_deg=30.0, time_samples=2)
+    scan = simulated_scan(rt, "moving-sphere", scanner, options, size=16)
+    phantom = moving_sphere(1.0)
+    for frame, line in [(0, 0), (5, 6), (7, 11)]:
+        rays = []
+        for share in (0.25, 0.75):
+            time_s = frame + line / (SHAPE[0] - 1) * 0.86 + share
+            pose = panel.pose(np.deg2rad(30.0 * time_s))
+            pixels = pixel_centres(pose, SHAPE)[line]
+            start = pose[:3] if beam == "cone" else pixels - 10 * pose[:3]
+            rays.append(phantom.at(time_s).line_integrals(start, pixels if beam == "cone" else pixels + 10 * pose[:3]))
+        np.testing.assert_allclose(scan.projections[frame, line], np.mean(rays, axis=0), atol=FLOAT32)
+    np.testing.assert_allclose(scan.moving_truth.times_s, np.arange(8))
+    np.testing.assert_array_equal(scan.moving_truth.volumes[3], phantom.at(3.0).voxelise(scan.grid, 4))
+    assert scan.moving_truth.deformation is None
+    with pytest.raises(InputError, match="--motion-of-object"):
+        scan_of(rt, "moving-sphere", motion_of_object=ObjectMotion("drying"))
