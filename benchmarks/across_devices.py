@@ -17,12 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, ConstantSpeed, Scan, Shutter
-from phyradgs_cl.acquisition.cells import (
-    exact_cells,
-    micro_view_cells,
-    per_line_cells,
-    static_cells,
-)
+from phyradgs_cl.acquisition.cells import exact_cells, micro_view_cells, per_line_cells, static_cells
 from phyradgs_cl.acquisition.time_cells import TimeCells
 from phyradgs_cl.api import simulate
 from phyradgs_cl.fields import Activation, Grid

@@ -6,7 +6,6 @@ over the true one, less 1; that of the total is of the whole volume.
 """
 
 import argparse
-import json
 from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
@@ -68,33 +67,13 @@ def run(rt: Runtime, case: PhantomCase, scan: Scan, trial: Trial) -> dict[str, f
     }
 
 
-def table(lines: list[dict]) -> str:
-    text = ["| data and changes | method | PSNR (dB) | bias of beads (%) | of the total (%) | rise (mm) |"]
-    text.append("| --- " * 6 + "|")
-    for line in lines:
-        biases = f"{100 * line['bias_balls']:+.1f} | {100 * line['bias_total']:+.2f}"
-        text.append(
-            f"| {line['trial']} | {line['method']} | {line['psnr_db']:.2f} | {biases} | {line['edge_rise_mm']:.2f} |"
-        )
-    return "\n".join(text)
-
-
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("results", type=Path, help="JSON lines; runs that it holds are not made again")
     parser.add_argument("--size", default="S", help="of benchmarks/tables")
     parser.add_argument("--trials", default="", help="beginnings of their names, with commas; all without it")
-    parser.add_argument("--table", action="store_true", help="print the table, run nothing")
     parser.add_argument("--device")
     arguments = parser.parse_args()
-    if not arguments.table:
-        run_all(arguments)
-    print(table(read_lines(arguments.results)))
-
-
-def run_all(arguments: argparse.Namespace) -> None:
     rt = Runtime(arguments.device)
     case = PhantomCase(rt, bench_size(arguments.size), RAPID, "rows", 0, lambda: case.truth)
     models = {CLEAN: "intensity", LINEAR: "log"}
@@ -106,11 +85,8 @@ def run_all(arguments: argparse.Namespace) -> None:
     done = {(line["size"], line["trial"], line["method"]) for line in read_lines(arguments.results)}
     for trial in TRIALS:
         facts = {"size": arguments.size, "trial": trial.name, "method": trial.method}
-        if tuple(facts.values()) in done or not trial.name.startswith(tuple(arguments.trials.split(","))):
-            continue
-        line = {**facts, **run(rt, case, scan_of(trial.data), trial)}
-        print(json.dumps(line), flush=True)
-        append(arguments.results, line)
+        if tuple(facts.values()) not in done and trial.name.startswith(tuple(arguments.trials.split(","))):
+            append(arguments.results, {**facts, **run(rt, case, scan_of(trial.data), trial)})
 
 
 if __name__ == "__main__":

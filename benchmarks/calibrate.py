@@ -1,8 +1,8 @@
 """What `phyradgs calibrate` finds of planted errors, and what that does for the volume: one line of JSON per run, resumable.
 
     python benchmarks/calibrate.py FOLDER RESULTS.jsonl [--cases panel,...] [--only NAME,...] [--size 32] [--views 25]
-    python benchmarks/calibrate.py --table RESULTS.jsonl
 
+docs/make_results.py makes the tables of docs/results/calibrate.md from the lines.
 FOLDER holds volumes as benchmarks/tables takes them; --only spheres is the sphere phantom, in closed form. Scans are
 R2-Gaussian's scanner with TIGRE's noise, detectors twice as wide as the volume; the volume is fista-tv's, every line at its
 own times. Cases:
@@ -23,15 +23,13 @@ own times. Cases:
     draw_rows  the same, rows read: readout and exposure are not to be known
 """
 
-import argparse
 import time
-from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from scans import append, chosen, files_of, lines_of, read_lines
+from scans import append, chosen, files_of, read_lines, runs_parser
 from scipy.spatial.transform import Rotation
 from tables.case import FLY, SyntheticCase
 
@@ -305,54 +303,6 @@ def score(rt: Runtime, scan: Scan) -> float:
     return round(psnr(volume, scan.reference), 3)
 
 
-def table(path: Path) -> str:
-    """Markdown: a row per case, size, views and parameter."""
-    lines = lines_of(path)
-    text = [
-        "| case | volume³, views | parameter | truth | error: mean, worst | σ stated | largest error/σ | within 2 σ "
-        "| verdicts | runs |",
-        "| --- | --- | --- | --- | --- | --- | --- | --- | --- | --- |",
-    ]
-    groups: dict[tuple[object, ...], list[dict]] = {}
-    for run in lines:
-        for one in run["parameters"]:
-            groups.setdefault((run["case"], run["size"], run["views"], one["name"]), []).append(one)
-    for (case, size, views, name), found in groups.items():
-        known = [one for one in found if one["error"] is not None]
-        verdicts = ", ".join(f"{v} {n}" for v, n in Counter(one["verdict"] for one in found).items())
-        cells = ["-"] * 4
-        if known:
-            errors = [abs(one["error"]) for one in known]
-            cells[0] = f"{np.mean([one['error'] for one in known]):+.2g}, {max(errors):.2g} {known[0]['unit']}"
-            cells[1] = f"{np.mean([one['deviation'] for one in known]):.2g}"
-            cells[2] = f"{max(abs(one['z']) for one in known):.1f}"
-            cells[3] = f"{sum(abs(one['z']) <= 2 for one in known)} of {len(known)}"
-        is_drawn = np.ptp([one["truth"] for one in found]) > 1e-9
-        shown = f"{'drawn' if is_drawn else format(found[0]['truth'], '.4g')} {found[0]['unit']}"
-        text.append(f"| {case} | {size}, {views} | {name} | {shown} | {' | '.join(cells)} | {verdicts} | {len(found)} |")
-    text += ["", "| case | volume³, views | PSNR stated | calibrated | right | worst calibrated - right | seconds |"]
-    text.append("| --- | --- | --- | --- | --- | --- | --- |")
-    runs: dict[tuple[object, ...], list[dict]] = {}
-    for run in (run for run in lines if run["psnr_db"]):
-        runs.setdefault((run["case"], run["size"], run["views"]), []).append(run)
-    for (case, size, views), some in runs.items():
-        mean = {key: np.mean([run["psnr_db"][key] for run in some]) for key in ("stated", "calibrated", "right")}
-        worst = min(run["psnr_db"]["calibrated"] - run["psnr_db"]["right"] for run in some)
-        values = " | ".join(f"{value:.2f}" for value in mean.values())
-        seconds = np.mean([run["cpu_seconds"] for run in some])
-        text.append(f"| {case} | {size}, {views} | {values} | {worst:+.3f} | {seconds:.0f} |")
-    shaken = [run for run in lines if "turn_left_deg" in run]
-    if shaken:
-        text += ["", "| case, views of | turn planted, left (RMS, deg) | shift planted, left (RMS, pixels) |"]
-        text.append("| --- | --- | --- |")
-    for run in shaken:
-        kinds = ("turn", "deg"), ("shift", "px")
-        turn, shift = (f"{run[f'{k}_planted_{u}']:.2f}, {run[f'{k}_left_{u}']:.3f}" for k, u in kinds)
-        of = f"{run['case']}, {run['volume']} {run['size']}³, {run['views']} views, seed {run['seed']}"
-        text.append(f"| {of} | {turn} | {shift} |")
-    return "\n".join(text)
-
-
 def volumes_of(folder: Path, names: str | None, size: int) -> dict[str, Path | None]:
     """Files of volumes; none for the sphere phantom."""
     given = names.split(",") if names else []
@@ -362,35 +312,22 @@ def volumes_of(folder: Path, names: str | None, size: int) -> dict[str, Path | N
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("folder", type=Path, help="folder of volumes")
-    parser.add_argument("results", type=Path, nargs="?", help="JSON lines, appended to")
+    parser = runs_parser(__doc__, names="--only", seeds="0,1")
     parser.add_argument("--cases", default=",".join(CASES), help="with commas")
-    parser.add_argument("--only", default=None, help="volumes' names, with commas")
     parser.add_argument("--size", type=int, default=32)
     parser.add_argument("--views", type=int, default=25)
-    parser.add_argument("--seeds", type=int, default=2)
-    parser.add_argument("--first-seed", type=int, default=0)
-    parser.add_argument("--device", default=None)
-    parser.add_argument("--table", action="store_true", help="print the tables of the results file given as FOLDER")
-    arguments = parser.parse_args()
-    if arguments.table:
-        print(table(arguments.folder))
-        return
-    if arguments.results is None:
-        parser.error("the results file is missing")
-    cases, volumes = chosen("--cases", arguments.cases, CASES), volumes_of(arguments.folder, arguments.only, arguments.size)
-    rt = Runtime(arguments.device)
+    asked = parser.parse_args()
+    cases, volumes = chosen("--cases", asked.cases, CASES), volumes_of(asked.volumes, asked.names, asked.size)
+    rt = Runtime(asked.device)
     key = ("case", "volume", "size", "views", "seed")
-    done = {tuple(run[k] for k in key) for run in read_lines(arguments.results)}
-    for seed in range(arguments.first_seed, arguments.first_seed + arguments.seeds):
+    done = {tuple(run[k] for k in key) for run in read_lines(asked.results)}
+    for seed in asked.seeds:
         for case in cases:
             for name, path in ({case: None} if case == "beads" else volumes).items():
-                what = (case, name, arguments.size, arguments.views, seed)
+                what = (case, name, asked.size, asked.views, seed)
                 if what not in done:
-                    result = run_one(rt, CASES[case](maker(rt, path, arguments.size, arguments.views), seed))
-                    append(arguments.results, dict(zip(key, what, strict=True)) | result)
-    print(table(arguments.results))
+                    result = run_one(rt, CASES[case](maker(rt, path, asked.size, asked.views), seed))
+                    append(asked.results, dict(zip(key, what, strict=True)) | result)
 
 
 if __name__ == "__main__":

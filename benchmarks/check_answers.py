@@ -1,7 +1,7 @@
 """Asks `phyradgs check` about a folder of good scans and of scans with planted faults: one line of JSON per scan, resumable.
 
     python benchmarks/check_answers.py FOLDER RESULTS.jsonl [--only PART,...]
-    python benchmarks/check_answers.py --table RESULTS.jsonl
+    python benchmarks/check_answers.py FOLDER RESULTS.jsonl --table
 
 FOLDER is what benchmarks/check_scans/make_scans.py writes: scans, and ``manifest.jsonl``, one line per scan, which says what
 is planted, which questions may rightly be suspicious (``right``), and, where nothing can tell it, why (``undecidable``).
@@ -96,17 +96,14 @@ def table(path: Path) -> str:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path, help="folder of scans")
-    parser.add_argument("results", type=Path, nargs="?", help="JSON lines, appended to")
+    parser.add_argument("results", type=Path, help="JSON lines, appended to")
     parser.add_argument("--only", default="", help="comma-separated parts of file names")
     parser.add_argument("--device", default=None)
-    parser.add_argument("--table", action="store_true", help="print the table of the results file given as FOLDER")
-    arguments = parser.parse_args()
-    if arguments.table:
-        print(table(arguments.folder))
-    elif arguments.results is None:
-        parser.error("the results file is missing")
-    else:
-        run_all(arguments.folder, arguments.results, arguments.only.split(","), arguments.device)
+    parser.add_argument("--table", action="store_true", help="print the table of the results, run nothing")
+    asked = parser.parse_args()
+    if not asked.table:
+        run_all(asked.folder, asked.results, asked.only.split(","), asked.device)
+    print(table(asked.results))
 
 
 if __name__ == "__main__":

@@ -1,7 +1,7 @@
 """Plants faults in scans of a folder of volumes and asks `phyradgs check` about them: one line of JSON per scan, resumable.
 
     python benchmarks/check_faults.py VOLUMES RESULTS.jsonl [--names a,b] [--size 64] [--seeds 7] [--faults none,rotation]
-    python benchmarks/check_faults.py --table RESULTS.jsonl
+    python benchmarks/check_faults.py VOLUMES RESULTS.jsonl --table
 
 Scans are those of benchmarks/scans.py: 25 views of the rapid protocol, TIGRE's noise at 1e4 photons and σ 10. Some
 faults need scans of their own: `short exposure` one that exposes half of the time between frames, so that twice the
@@ -19,7 +19,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from scans import RAPID, append, chosen, files_of, lines_of, make_scan, read_lines
+from scans import RAPID, append, chosen, files_of, lines_of, make_scan, read_lines, runs_parser
 
 from phyradgs_cl import __version__
 from phyradgs_cl.acquisition import CircularOrbit, FrameSweeps, Protocol, Scan, make_protocol
@@ -176,10 +176,10 @@ for name, fault in WHOLE.items():
 
 def run_all(arguments: argparse.Namespace) -> None:
     volumes = files_of(arguments.volumes, arguments.names, arguments.size)
-    faults, results = chosen("--faults", arguments.faults, FAULTS), Path(arguments.results)
+    faults, results = chosen("--faults", arguments.faults, FAULTS), arguments.results
     rt = Runtime(arguments.device)
     done = {key_of(line) for line in read_lines(results)}
-    for seed in (int(s) for s in arguments.seeds.split(",")):
+    for seed in arguments.seeds:
         for name, path in volumes.items():
             scans: dict[tuple[Protocol, float, float], Scan] = {}
             for fault in faults:
@@ -222,70 +222,34 @@ def is_right(planted: Fault, findings: list[dict[str, object]]) -> bool:
 def table(path: Path) -> str:
     """Markdown: a row for each planted fault, then every scan that was answered wrong."""
     lines = lines_of(path)
-    text = [
-        "| planted | scans | answered rightly | not | other questions suspicious |",
-        "| --- | --- | --- | --- | --- |",
-    ]
+    text = ["| planted | scans | answered rightly | other questions suspicious |", "| --- | --- | --- | --- |"]
     wrong: list[str] = []
-    for fault, planted in FAULTS.items():
-        chosen = [line for line in lines if line["fault"] == fault]
-        if not chosen:
+    for name, fault in FAULTS.items():
+        planted = [line for line in lines if line["fault"] == name]
+        if not planted:
             continue
-        questions = planted.questions
-        verdicts = [{f["question"]: f["verdict"] for f in line["findings"]} for line in chosen]
-        hits = [is_right(planted, line["findings"]) for line in chosen]
-        others = [
-            [q for q, verdict in v.items() if verdict == SUSPICIOUS and q not in questions] for v in verdicts
-        ]
-        silent = sum(not o for o in others)
-        count = (
-            f"{sum(hits)} | {len(hits) - sum(hits)}"
-            if questions
-            else f"silent on {silent} | {len(hits) - silent}"
-        )
-        text.append(f"| {fault} | {len(hits)} | {count} | {sum(map(len, others))} |")
-        for line, hit, other, verdict in zip(chosen, hits, others, verdicts, strict=True):
-            if not hit or other:
-                said = "; ".join(
-                    [f"{q}: {verdict.get(q, 'not asked')}" for q in questions if not hit]
-                    + [f"{q}: suspicious" for q in other]
-                )
-                wrong.append(f"- {fault}, {line['volume']}, seed {line['seed']}: {said}")
-    clean = [line for line in lines if line["fault"] == "none"]
-    unsure = sorted(
-        {
-            f"{line['volume']}: {f['question']}"
-            for line in clean
-            for f in line["findings"]
-            if f["verdict"] == CANNOT_TELL
-        }
-    )
-    text += ["", "Answered wrongly, or beside the point:", "", *(wrong or ["- none"])]
-    text += ["", f"`cannot tell` on clean scans: {', '.join(unsure) or 'none'}"]
-    return "\n".join(text)
+        hits = [is_right(fault, line["findings"]) for line in planted]
+        verdicts = [{f["question"]: f["verdict"] for f in line["findings"]} for line in planted]
+        others = [[q for q, v in said.items() if v == SUSPICIOUS and q not in fault.questions] for said in verdicts]
+        rightly = sum(hits) if fault.questions else f"silent on {sum(not other for other in others)}"
+        text.append(f"| {name} | {len(hits)} | {rightly} | {sum(map(len, others))} |")
+        for line, hit, other, said in zip(planted, hits, others, verdicts, strict=True):
+            answers = [] if hit else [f"{q}: {said.get(q, 'not asked')}" for q in fault.questions]
+            if answers or other:
+                facts = "; ".join([*answers, *(f"{q}: suspicious" for q in other)])
+                wrong.append(f"- {name}, {line['volume']}, seed {line['seed']}: {facts}")
+    return "\n".join([*text, "", "Answered wrongly, or beside the point:", "", *(wrong or ["- none"])])
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("volumes", help="folder of volumes")
-    parser.add_argument("results", nargs="?", help="JSON lines, appended to")
-    parser.add_argument("--names", default="", help="comma-separated; all in the folder by default")
+    parser = runs_parser(__doc__, seeds="7")
     parser.add_argument("--faults", default=",".join(FAULTS))
     parser.add_argument("--size", type=int, default=64)
-    parser.add_argument("--seeds", default="7")
-    parser.add_argument("--device", default=None)
-    parser.add_argument(
-        "--table", action="store_true", help="print the table of the results file given as VOLUMES"
-    )
-    arguments = parser.parse_args()
-    if arguments.table:
-        print(table(Path(arguments.volumes)))
-    elif arguments.results is None:
-        parser.error("the results file is missing")
-    else:
-        run_all(arguments)
+    parser.add_argument("--table", action="store_true", help="print the table of the results, run nothing")
+    asked = parser.parse_args()
+    if not asked.table:
+        run_all(asked)
+    print(table(asked.results))
 
 
 if __name__ == "__main__":

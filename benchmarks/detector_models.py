@@ -14,12 +14,10 @@ weighted by their transmission), pixel-area (a pixel is 4 by 4 rays; modelled: s
 """
 
 import argparse
-import json
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-import numpy as np
 from scans import append, read_lines
 
 from phyradgs_cl.acquisition import ConeGeometry, Scan, make_protocol
@@ -131,40 +129,20 @@ def rows(rt: Runtime, name: str, seed: int, wanted: tuple[str, ...], done: set[t
             }
 
 
-def table(lines: list[Row]) -> str:
-    """Markdown: modelled, ignored and gain in dB, mean ± standard deviation over seeds where there are several."""
-    text = ["| object | effect | method | modelled | ignored | gain |", "|---" * 6 + "|"]
-    groups: dict[tuple, list[Row]] = {}
-    for line in lines:
-        groups.setdefault((line["object"], line["effect"], line["method"]), []).append(line)
-    for key, runs in groups.items():
-        pairs = np.array([(run["modelled_db"], run["ignored_db"]) for run in runs], float)
-        gain = pairs[:, 0] - pairs[:, 1]
-        spread = f" ± {gain.std(ddof=1):.2f}" if len(gain) > 1 else ""
-        means = " | ".join(f"{v:.2f}" for v in pairs.mean(axis=0))
-        text.append(f"| {' | '.join(map(str, key))} | {means} | {gain.mean():+.2f}{spread} |")
-    return "\n".join(text)
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("results", type=Path)
     parser.add_argument("--names", default="shepp-logan", help="phantoms and volume files, with commas")
     parser.add_argument("--effects", default="", help="beginnings of the effects' names, with commas")
     parser.add_argument("--seeds", default="0")
-    parser.add_argument("--table", action="store_true", help="print the table, run nothing")
     parser.add_argument("--device")
     arguments = parser.parse_args()
     lines = read_lines(arguments.results)
-    if arguments.table:
-        print(table(lines))
-        return
     rt, wanted = Runtime(arguments.device), tuple(arguments.effects.split(","))
     done = {(line["object"], line["effect"], line["method"], line["seed"]) for line in lines}
     for seed in (int(s) for s in arguments.seeds.split(",")):
         for name in arguments.names.split(","):
             for line in rows(rt, name, seed, wanted, done):
-                print(json.dumps(line), flush=True)
                 append(arguments.results, line)
 
 

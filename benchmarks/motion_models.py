@@ -2,7 +2,6 @@
 
     python benchmarks/motion_models.py run VOLUMES RESULTS.jsonl [--size 64] [--names a,b] [--motions 8x5,static]
     python benchmarks/motion_models.py cost COST.json [--size 64]
-    python benchmarks/motion_models.py table RESULTS.jsonl
     python benchmarks/motion_models.py figure RESULTS.jsonl COST.json TIME_EXACT.json FIGURE.png
 
 Motions: static, MxN (micro-views), "exact BOUND". ``run`` scans the volumes as benchmarks/scans.py does (rapid, rows,
@@ -14,12 +13,13 @@ is what benchmarks/time_exact.py writes: errors of one frame.
 import argparse
 import json
 import statistics
+import sys
 import time
 from argparse import Namespace
 from pathlib import Path
 
 import numpy as np
-from scans import append, files_of, make_scan, read_lines
+from scans import append, files_of, make_scan, read_lines, runs_parser
 
 from phyradgs_cl.acquisition import ConeGeometry, Scan, make_protocol
 from phyradgs_cl.fields import Grid
@@ -52,11 +52,11 @@ def motion_of(name: str) -> dict[str, object]:
 
 def run(arguments: Namespace) -> None:
     rt = Runtime(arguments.device)
-    results = Path(arguments.results)
+    results = arguments.results
     volumes = files_of(arguments.volumes, arguments.names, arguments.size)
     done = {key_of(line) for line in read_lines(results)}
     for motion in arguments.motions.split(","):
-        for seed in (int(s) for s in arguments.seeds.split(",")):
+        for seed in arguments.seeds:
             for name, path in volumes.items():
                 facts: Line = {
                     "volume": name,
@@ -68,9 +68,7 @@ def run(arguments: Namespace) -> None:
                 if key_of(facts) in done:
                     continue
                 scan = make_scan(rt, path, arguments.size, seed)
-                line = {**facts, **run_one(rt, scan, motion, arguments.iterations, seed)}
-                append(results, line)
-                print(json.dumps(line), flush=True)
+                append(results, {**facts, **run_one(rt, scan, motion, arguments.iterations, seed)})
 
 
 def run_one(rt: Runtime, scan: Scan, motion: str, iterations: int, seed: int) -> Line:
@@ -101,28 +99,6 @@ def means(lines: list[Line], size: int) -> dict[str, dict[str, tuple[float, floa
         motion: {volume: tuple(np.mean(runs, axis=0)) for volume, runs in volumes.items()}
         for motion, volumes in groups.items()
     }  # type: ignore[return-value]
-
-
-def table(lines: list[Line]) -> str:
-    """Markdown: volumes by motions, PSNR dB / SSIM, for every size; the mean is of the volumes that all motions have."""
-    text = []
-    for size in sorted({int(line["size"]) for line in lines}):  # type: ignore[call-overload]
-        found = means(lines, size)
-        volumes = sorted({v for by_volume in found.values() for v in by_volume})
-        text += [
-            f"\n**{size}³**\n",
-            "| volume | " + " | ".join(found) + " |",
-            "|---" * (len(found) + 1) + "|",
-        ]
-        for volume in volumes:
-            cells = ("{:.2f} / {:.3f}".format(*f[volume]) if volume in f else "–" for f in found.values())
-            text.append(f"| {volume} | " + " | ".join(cells) + " |")
-        shared = [v for v in volumes if all(v in f for f in found.values())]
-        if shared:
-            mean = (np.mean([f[v] for v in shared], axis=0) for f in found.values())
-            cells = ("{:.2f} / {:.3f}".format(*m) for m in mean)
-            text.append(f"| **mean of {len(shared)}** | " + " | ".join(cells) + " |")
-    return "\n".join(text)
 
 
 # --- cost -------------------------------------------------------------------------------------------------------
@@ -216,31 +192,28 @@ def psnrs(found: dict, volumes: list[str]) -> dict[str, float]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("what", choices=("run", "cost", "table", "figure"))
-    parser.add_argument("paths", nargs="+")
-    parser.add_argument("--size", type=int, default=64)
-    parser.add_argument("--names")
-    parser.add_argument("--motions", default=MOTIONS)
-    parser.add_argument("--seeds", default="0")
-    parser.add_argument("--iterations", type=int, default=3000)
-    parser.add_argument("--rounds", type=int, default=9)
-    parser.add_argument("--steps", type=int, default=10)
-    parser.add_argument("--device")
-    arguments = parser.parse_args()
-    paths = [Path(p) for p in arguments.paths]
-    if arguments.what == "run":
-        arguments.volumes, arguments.results = paths
-        run(arguments)
-    elif arguments.what == "cost":
-        paths[0].write_text(json.dumps(cost(arguments), indent=1) + "\n", encoding="utf-8")
-    elif arguments.what == "table":
-        print(table(read_lines(paths[0])))
+    what = sys.argv.pop(1) if len(sys.argv) > 1 else ""
+    if what == "run":
+        parser = runs_parser(__doc__)
+        parser.add_argument("--iterations", type=int, default=3000)
     else:
-        lines, costs, errors = read_lines(paths[0]), *(json.loads(p.read_text()) for p in paths[1:3])
-        figure(lines, costs, errors, paths[3])
+        parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+        parser.add_argument("paths", type=Path, nargs="+")
+        parser.add_argument("--rounds", type=int, default=9)
+        parser.add_argument("--steps", type=int, default=10)
+        parser.add_argument("--device")
+    parser.add_argument("--size", type=int, default=64)
+    parser.add_argument("--motions", default=MOTIONS)
+    asked = parser.parse_args()
+    if what == "run":
+        run(asked)
+    elif what == "cost":
+        asked.paths[0].write_text(json.dumps(cost(asked), indent=1) + "\n", encoding="utf-8")
+    elif what == "figure":
+        costs, errors = (json.loads(path.read_text()) for path in asked.paths[1:3])
+        figure(read_lines(asked.paths[0]), costs, errors, asked.paths[3])
+    else:
+        parser.error(f"found {what!r}; expected run, cost or figure")
 
 
 if __name__ == "__main__":

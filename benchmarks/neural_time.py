@@ -12,12 +12,14 @@ call: FDK and kernel builds are in them. A run is in the file once it is done; w
 import argparse
 import os
 import platform
+import sys
 import time
 from collections.abc import Sequence
+from itertools import product
 from pathlib import Path
 
 import numpy as np
-from scans import append, files_of, make_scan, read_lines
+from scans import append, files_of, make_scan, read_lines, runs_parser
 
 from phyradgs_cl import __version__
 from phyradgs_cl.acquisition import Scan
@@ -48,11 +50,7 @@ class Scores:
     def __call__(self, progress: Progress) -> None:
         begun = time.process_time()
         seconds = begun - self._started - self._scoring_s
-        if (
-            seconds >= self._due_s
-            and progress.volume is not None
-            and progress.iteration < progress.iterations
-        ):
+        if seconds >= self._due_s and progress.volume is not None and progress.iteration < progress.iterations:
             self._add(progress.iteration, seconds, progress.volume()[0])
             self._due_s = _SPACING * seconds
         self._scoring_s += time.process_time() - begun
@@ -92,19 +90,16 @@ def run_all(arguments: argparse.Namespace) -> None:
     for variable in ("POCL_MAX_PTHREAD_COUNT", "OMP_NUM_THREADS"):  # OpenCL's on a CPU, and PyTorch's
         os.environ[variable] = str(arguments.threads)
     rt = Runtime(arguments.device)
-    results = Path(arguments.results)
-    done = {tuple(line[name] for name in KEY) for line in read_lines(results)}
-    for name, path in files_of(arguments.volumes, arguments.names, arguments.size).items():
+    done = {tuple(line[name] for name in KEY) for line in read_lines(arguments.results)}
+    volumes = files_of(arguments.volumes, arguments.names, arguments.size)
+    for (name, path), seed in product(volumes.items(), arguments.seeds):
         scan: Scan | None = None
-        for label in arguments.methods.split(","):
-            for factor in (float(text) for text in arguments.factors.split(",")):
-                values = (name, label, arguments.size, arguments.seed, factor)
-                if values in done:
-                    continue
-                scan = scan or make_scan(rt, path, arguments.size, arguments.seed)
-                facts = dict(zip(KEY, values, strict=True))
-                facts["threads"] = arguments.threads
-                append(results, {**facts, **run_one(rt, scan, label, factor, arguments.seed)})
+        for label, factor in product(arguments.methods.split(","), map(float, arguments.factors.split(","))):
+            values = (name, label, arguments.size, seed, factor)
+            if values not in done:
+                scan = scan or make_scan(rt, path, arguments.size, seed)
+                facts = {**dict(zip(KEY, values, strict=True)), "threads": arguments.threads}
+                append(arguments.results, {**facts, **run_one(rt, scan, label, factor, seed)})
 
 
 def draw(lines: Sequence[dict], path: Path) -> None:
@@ -129,14 +124,8 @@ def draw(lines: Sequence[dict], path: Path) -> None:
                 is_static = METHODS[label][1].get("motion", "static") == "static"
                 is_longest = run["factor"] == max(run["factor"] for run in runs)
                 style = "--" if is_static else "-"
-                panel.plot(
-                    seconds,
-                    psnr,
-                    style,
-                    color=colour,
-                    alpha=1.0 if is_longest else 0.4,
-                    label=label if is_longest else None,
-                )
+                legend = {"alpha": 1.0, "label": label} if is_longest else {"alpha": 0.4}
+                panel.plot(seconds, psnr, style, color=colour, **legend)
                 panel.plot(seconds[-1], psnr[-1], "o", color=colour, ms=4)
         panel.set(xscale="log", xlabel="processor seconds", ylabel="PSNR (dB)", title=name)
         panel.grid(alpha=0.3)
@@ -145,27 +134,19 @@ def draw(lines: Sequence[dict], path: Path) -> None:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    commands = parser.add_subparsers(required=True)
-    run = commands.add_parser("run")
-    run.add_argument("volumes", help="folder of volumes")
-    run.add_argument("results", help="JSON lines, appended to")
-    run.add_argument("--names", default="cthead,walnut")
-    run.add_argument("--methods", default=",".join(METHODS))
-    run.add_argument("--factors", default="1", help="iterations as multiples of the defaults, e.g. 0.25,1,4")
-    run.add_argument("--size", type=int, default=64)
-    run.add_argument("--seed", type=int, default=0)
-    run.add_argument("--device", default=None)
-    run.add_argument("--threads", type=int, default=1)
-    run.set_defaults(do=run_all)
-    picture = commands.add_parser("draw")
-    picture.add_argument("results")
-    picture.add_argument("figure")
-    picture.set_defaults(do=lambda a: draw(read_lines(Path(a.results)), Path(a.figure)))
-    arguments = parser.parse_args()
-    arguments.do(arguments)
+    what = sys.argv.pop(1) if len(sys.argv) > 1 else ""
+    if what == "draw":
+        draw(read_lines(Path(sys.argv[1])), Path(sys.argv[2]))
+        return
+    parser = runs_parser(__doc__)
+    parser.add_argument("--methods", default=",".join(METHODS))
+    parser.add_argument("--factors", default="1", help="iterations as multiples of the defaults, e.g. 0.25,1,4")
+    parser.add_argument("--size", type=int, default=64)
+    parser.add_argument("--threads", type=int, default=1)
+    asked = parser.parse_args()
+    if what != "run":
+        parser.error(f"found {what!r}; expected run or draw")
+    run_all(asked)
 
 
 if __name__ == "__main__":

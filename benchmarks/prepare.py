@@ -9,7 +9,6 @@ A line per effect, volume and method: ``clean``, ``clean_prepared`` (the step on
 """
 
 import argparse
-import json
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from functools import cache
@@ -187,7 +186,6 @@ def main() -> None:
         name = Path(phantom).stem
         missing = {effect: [m for m in given.methods if (effect, name, m) not in done] for effect in given.effects}
         for line in lines(rt, phantom, usual, {effect: methods for effect, methods in missing.items() if methods}):
-            print(json.dumps(line), flush=True)
             append(given.results, line)
 
 

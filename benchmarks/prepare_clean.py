@@ -1,21 +1,19 @@
 """What the usual steps of ``prepare`` cost clean scans, and what ``rings`` gives back where there are some.
 
     python benchmarks/prepare_clean.py docs/results/prepare_clean.jsonl --phantoms VOLUMES/cthead_128.h5 ...
-    python benchmarks/prepare_clean.py docs/results/prepare_clean.jsonl --table
 
 A line per volume, views, method and cell: a step on the clean scan, or rings of some percent. ``lost_db`` is 0 without a run
 where the step leaves the frames bit for bit. Lines that are there are not made again. docs/results/prepare.md has the table.
 """
 
 import argparse
-import json
 from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scans import append, lines_of, read_lines
+from scans import append, read_lines
 
 from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.api import compare, prepare, reconstruct, simulate
@@ -53,20 +51,6 @@ def ringed_cells(
         yield {"steps": f"rings {spread}", **{key: round(value, 3) for key, value in values.items()}}
 
 
-def table(lines: list[dict[str, Any]]) -> str:
-    """Markdown: a row per method and number of views; the worst volume of each cell."""
-    text = ["| method | views | volumes | clean: frames changed, most lost | 1 % regained | 2 % | 5 % |", "| --- " * 7 + "|"]
-    for method, views in sorted({(line["method"], line["views"]) for line in lines}):
-        of = [line for line in lines if (line["method"], line["views"]) == (method, views)]
-        clean = [line for line in of if "lost_db" in line]
-        changed, lost = sum(not line["unchanged"] for line in clean), max((line["lost_db"] for line in clean), default=0)
-        shares = [[line["regained"] for line in of if line["steps"] == f"rings {spread}"] for spread in RINGS]
-        cells = [f"{100 * min(s):.0f} to {100 * max(s):.0f} %" if s else "" for s in shares]
-        volumes = len({line["phantom"] for line in of})
-        text.append(f"| {method} | {views} | {volumes} | {changed} of {len(clean)}, {lost:.3f} dB | {' | '.join(cells)} |")
-    return "\n".join(text)
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("results", type=Path, help="a file of one line of JSON per run")
@@ -76,11 +60,7 @@ def main() -> None:
     parser.add_argument("--views", type=int, nargs="+", default=VIEWS)
     parser.add_argument("--rings", type=float, nargs="*", default=RINGS, help="spreads of gains; none: clean scans alone")
     parser.add_argument("--methods", nargs="+", default=["fdk"])
-    parser.add_argument("--table", action="store_true", help="print the table, run nothing")
     given = parser.parse_args()
-    if given.table:
-        print(table(lines_of(given.results)))
-        return
     rt = Runtime()
     for views in given.views:
         for phantom in given.phantoms:
@@ -99,7 +79,6 @@ def main() -> None:
                 cells = [] if set(STEPS) <= done else [clean_cells(clean, method, rt)]
                 cells.append(ringed_cells(clean, method, rt, usual, spreads))
                 for line in (line for cell in cells for line in cell):
-                    print(json.dumps({**place, **line}), flush=True)
                     append(given.results, {**place, **line})
 
 

@@ -22,6 +22,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
+from measuring import finish
 
 from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, ConstantSpeed, Shutter, Trajectory
 from phyradgs_cl.acquisition.cells import common_time_cells, micro_view_cells, per_line_cells, static_cells
@@ -185,25 +186,6 @@ def by_motion(rt: Runtime, grid: Grid, volume: np.ndarray, repeats: int) -> dict
     return {motion: {step: least(times) for step, times in steps.items()} for motion, steps in runs.items()}
 
 
-def print_tables(facts: dict[str, dict]) -> None:
-    print("| operator | ours, s | RTK, s | times as fast | by processor time | relative RMS difference |")
-    print("| --- | --- | --- | --- | --- | --- |")
-    for name in ("forward", "adjoint") if facts["beside_rtk"] else ():
-        r = facts["beside_rtk"][name]
-        print(
-            f"| {name} | {r['ours']['wall_s']:.3f} | {r['rtk']['wall_s']:.3f} | {r['times_as_fast_wall']:.1f} "
-            f"| {r['times_as_fast_processor']:.1f} | {r['relative_rms_difference']:.1e} |"
-        )
-    static = facts["by_motion"]["static"]
-    print("\n| motion | forward, s | of static | adjoint, s | of static |\n| --- | --- | --- | --- | --- |")
-    for motion, steps in facts["by_motion"].items():
-        cells = [
-            f"{steps[s]['wall_s']:.3f} | {steps[s]['processor_s'] / static[s]['processor_s']:.2f}"
-            for s in steps
-        ]
-        print(f"| {motion} | {' | '.join(cells)} |")
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
@@ -228,8 +210,7 @@ def main() -> None:
         "beside_rtk": beside_rtk(rt, grid, volume, peer, arguments.repeats) if peer else {},
         "by_motion": by_motion(rt, grid, volume, arguments.repeats),
     }
-    arguments.json.write_text(json.dumps(facts, indent=1) + "\n")
-    print_tables(facts)
+    finish(facts, arguments.json)
 
 
 if __name__ == "__main__":

@@ -11,7 +11,6 @@ outside that field of view.
 """
 
 import argparse
-import json
 import subprocess
 import tempfile
 import time
@@ -20,6 +19,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from measuring import finish
 
 from phyradgs_cl.acquisition import ConeGeometry, pixel_centres
 from phyradgs_cl.fields import Grid
@@ -130,8 +130,7 @@ def compare(rt: Runtime, python: str, case: Case) -> dict[str, Any]:
     ours = fdk_volume(rt, frames, pose, GRID).astype(np.float64)
     theirs, _, version = run_peer(python, case.task(frames, 1))
     seen, truth = (
-        field_of_view(case, pose),
-        PHANTOM.density(*np.meshgrid(*GRID.axes_mm(), indexing="ij")[::-1]),
+        field_of_view(case, pose), PHANTOM.density(*np.meshgrid(*GRID.axes_mm(), indexing="ij")[::-1])
     )
     difference = np.sqrt(
         np.mean((ours[seen] - theirs[seen]) ** 2) / np.mean(theirs[seen].astype(np.float64) ** 2)
@@ -180,28 +179,6 @@ def speed(rt: Runtime, python: str, rounds: int) -> dict[str, Any]:
     }
 
 
-def table(rows: list[dict[str, Any]], times: dict[str, Any]) -> str:
-    lines = [
-        "| case | views | relative RMS to RTK | PSNR dB | RTK PSNR dB | whole cube dB | RTK's limit dB |",
-        "|---|--:|--:|--:|--:|--:|--:|",
-    ]
-    for r in rows:
-        limit = "" if r["limit_db"] is None else f"{r['limit_db']:.0f}"
-        lines.append(
-            f"| {r['case']} | {r['views']} | {r['relative_rms']:.1e} | {r['psnr_db']:.2f} "
-            f"| {r['rtk_psnr_db']:.2f} | {r['psnr_whole_cube_db']:.2f} | {limit} |"
-        )
-    return "\n".join([*lines, "", speed_line(times)])
-
-
-def speed_line(times: dict[str, Any]) -> str:
-    return (
-        "128^3 from 90 views of 128^2: {seconds:.3f} s, RTK {rtk_seconds:.3f} s, {ratio:.1f} times as fast "
-        "(medians {median_ratio:.1f}); processor time {processor_seconds:.2f} s, RTK "
-        "{rtk_processor_seconds:.2f} s, {processor_ratio:.1f} times less"
-    ).format(**times)
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
@@ -214,9 +191,7 @@ def main() -> None:
     rt = Runtime(options.device)
     rows = [compare(rt, options.peer_python, case) for case in CASES]
     times = speed(rt, options.peer_python, options.rounds)
-    options.json.parent.mkdir(parents=True, exist_ok=True)
-    options.json.write_text(json.dumps({"cases": rows, "speed": times}, indent=1) + "\n")
-    print(table(rows, times))
+    finish({"cases": rows, "speed": times}, options.json)
 
 
 if __name__ == "__main__":

@@ -1,5 +1,6 @@
 """What the benchmarks of whole reconstructions share: scans of a folder's volumes, and files of one line of JSON per run."""
 
+import argparse
 import json
 from collections.abc import Iterable
 from pathlib import Path
@@ -61,5 +62,23 @@ def read_lines(path: Path) -> list[dict[str, object]]:
 
 
 def append(path: Path, line: dict[str, object]) -> None:
+    """Prints a line, and adds it to a file of lines."""
+    text = json.dumps(line)
+    print(text, flush=True)
     with open(path, "a") as file:
-        file.write(json.dumps(line) + "\n")
+        file.write(text + "\n")
+
+
+def runs_parser(text: str | None, names: str = "--names", seeds: str = "0") -> argparse.ArgumentParser:
+    """A parser with a folder of volumes, a file of lines, names of volumes, seeds, a device."""
+    parser = argparse.ArgumentParser(description=text, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("volumes", type=Path, help="folder of volumes")
+    parser.add_argument("results", type=Path, help="JSON lines, appended to; runs that it has are not made again")
+    parser.add_argument(names, dest="names", default=None, help="volumes, with commas; all in the folder by default")
+    parser.add_argument("--seeds", type=_numbers, default=_numbers(seeds), help="with commas")
+    parser.add_argument("--device", default=None)
+    return parser
+
+
+def _numbers(text: str) -> list[int]:
+    return [int(word) for word in text.split(",")]

@@ -11,10 +11,10 @@ benchmarks/tables but for ``--dose`` and ``--views``; weights are swept with 30 
 """
 
 import argparse
-import json
+from itertools import product
 from pathlib import Path
 
-from scans import files_of, read_lines
+from scans import append, files_of, read_lines, runs_parser
 
 from phyradgs_cl.acquisition import PerRow, Scan, Static
 from phyradgs_cl.api import compare, reconstruct, simulate
@@ -36,14 +36,14 @@ def scan_of(rt: Runtime, path: Path, size: int, pixels: int, kind: str, views: i
 
 
 def run(given: argparse.Namespace) -> None:
-    rt = Runtime()
-    there = {_key(line) for line in read_lines(given.lines)}
+    rt = Runtime(given.device)
+    there = {_key(line) for line in read_lines(given.results)}
     for name, path in files_of(given.volumes, given.names, given.size).items():
-        for kind, views, dose in ((k, v, d) for k in given.kinds for v in given.views for d in given.doses):
+        for kind, views, dose, seed in product(given.kinds, given.views, given.doses, given.seeds):
             of_scan = dict(zip(SCAN, (kind, views, dose, given.size, given.pixels), strict=True))
-            facts = {"volume": name, **of_scan, "seed": given.seed}
+            facts = {"volume": name, **of_scan, "seed": seed}
             left = [f for f in given.factors if _key({**facts, "factor": f}) not in there]
-            scan = scan_of(rt, path, given.size, given.pixels, kind, views, dose, given.seed) if left else None
+            scan = scan_of(rt, path, given.size, given.pixels, kind, views, dose, seed) if left else None
             for factor in left:
                 usual = getattr(FistaOptions(), given.option)
                 chosen = {**USUAL[given.option], given.option: type(usual)(factor * usual), "motion": MOTIONS[kind]}
@@ -52,9 +52,7 @@ def run(given: argparse.Namespace) -> None:
                 scores = compare(result.volume, scan.reference)  # type: ignore[union-attr]
                 line = {**facts, "factor": factor, "psnr_db": scores["psnr_db"], "ssim": scores["ssim"]}
                 line.update(result.facts.get("held_out", {}))
-                with given.lines.open("a") as file:
-                    file.write(json.dumps(line) + "\n")
-                print(*line.values(), flush=True)
+                append(given.results, line)
 
 
 def _key(line: dict[str, object]) -> tuple[object, ...]:
@@ -62,10 +60,7 @@ def _key(line: dict[str, object]) -> tuple[object, ...]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("volumes")
-    parser.add_argument("lines", type=Path, help="a file of one line of JSON per run")
-    parser.add_argument("--names", help="with commas; all")
+    parser = runs_parser(__doc__)
     parser.add_argument("--size", type=int, default=64, help="voxels per side; up to 48 far fewer than what is projected")
     parser.add_argument("--pixels", type=int, help="per side of the detector; twice --size")
     parser.add_argument("--kinds", nargs="+", default=["still"], choices=list(MOTIONS))
@@ -74,7 +69,6 @@ def main() -> None:
     parser.add_argument("--factors", nargs="+", type=float, default=[0.5, 0.71, 1.0, 1.41, 2.0])
     parser.add_argument("--option", choices=list(USUAL), default="prior_weight")
     parser.add_argument("--holdout", type=float, default=0.0, help="percent of the pixels")
-    parser.add_argument("--seed", type=int, default=0)
     given = parser.parse_args()
     if "fly" in given.kinds and not set(given.views) <= set(PROTOCOLS):
         parser.error("fly-scans have --views 25 or 50")

@@ -115,11 +115,7 @@ def stack_origin(setup: Setup) -> tuple[float, float, float]:
     roll = np.deg2rad(setup.roll_deg)  # a rolled panel is shifted along its own axes
     u = np.cos(roll) * setup.offset_u_mm + np.sin(roll) * setup.offset_v_mm
     v = np.cos(roll) * setup.offset_v_mm - np.sin(roll) * setup.offset_u_mm
-    return (
-        u - (setup.columns - 1) / 2 * setup.pitch_u_mm,
-        v - (setup.rows - 1) / 2 * setup.pitch_v_mm,
-        0.0,
-    )
+    return (u - (setup.columns - 1) / 2 * setup.pitch_u_mm, v - (setup.rows - 1) / 2 * setup.pitch_v_mm, 0.0)
 
 
 def line_integrals(setup: Setup, angles_deg: np.ndarray, density: np.ndarray | None) -> np.ndarray:

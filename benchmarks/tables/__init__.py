@@ -5,7 +5,6 @@ from tables.rows import KINDS, Row, choose_rows, rows_of
 from tables.run import RESULTS, remake_tables, run_bench
 from tables.sizes import SIZES, BenchSize
 from tables.words import listed, listed_seeds, result_text
-from tables.workers import run_bench_at_workers
 
 __all__ = [
     "KINDS",
@@ -23,5 +22,4 @@ __all__ = [
     "result_text",
     "rows_of",
     "run_bench",
-    "run_bench_at_workers",
 ]

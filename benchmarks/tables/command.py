@@ -7,9 +7,8 @@ from typing import Annotated
 import typer
 
 from phyradgs_cl import signals
-from phyradgs_cl.cluster import LOCAL, Workers
-from phyradgs_cl.commands.console import complain, file_parser, remark, say
-from phyradgs_cl.commands.options import Axis, Device, Scheduler, WorkerCount
+from phyradgs_cl.commands.console import complain, file_parser, say
+from phyradgs_cl.commands.options import Axis, Device
 from phyradgs_cl.progress import Ticker
 from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.settings import device_wish
@@ -24,7 +23,6 @@ from tables import (
     remake_tables,
     result_text,
     run_bench,
-    run_bench_at_workers,
 )
 
 EXAMPLE = (
@@ -73,10 +71,7 @@ def bench_command(
             show_default="S; M for phantom",
         ),
     ] = None,
-    names: Annotated[
-        str | None,
-        typer.Option(help="Volumes, with commas.", show_default="all"),
-    ] = None,
+    names: Annotated[str | None, typer.Option(help="Volumes, with commas.", show_default="all")] = None,
     rows: Annotated[
         str | None,
         typer.Option(
@@ -108,8 +103,6 @@ def bench_command(
             help="Make tables and figures from the results file, of --names and --seeds or all; run nothing.",
         ),
     ] = False,
-    scheduler: Scheduler = None,
-    workers: WorkerCount = None,
     device: Device = None,
 ) -> None:
     """Compare methods on volumes: a resumable results file, tables in Markdown and CSV, figures of slices."""
@@ -127,29 +120,17 @@ def bench_command(
         readout,
     )
     wish = device_wish(device)
-    pool = None
-    if scheduler is not None or workers is not None:
-        pool = Workers(LOCAL if scheduler is None else scheduler, workers, wish)
     interrupted = (
         f"interrupted: finished runs are in {job.output / RESULTS}; repeat the command to continue, "
         "with --table-only for their tables"
     )
     try:
-        if table_only:
-            written = remake_tables(job, chosen_seeds)
-        elif pool is not None:
-            written = run_bench_at_workers(job, pool, BenchTicker(), _tell_dashboard)
-        else:
-            written = run_bench(job, lambda: Runtime(wish), BenchTicker())
+        written = remake_tables(job, chosen_seeds) if table_only else run_bench(job, lambda: Runtime(wish), BenchTicker())
     except KeyboardInterrupt:
         complain(interrupted)
         raise typer.Exit(signals.exit_status()) from None
     for path in written:
         say(str(path))
-
-
-def _tell_dashboard(address: str) -> None:
-    remark(f"Dask's dashboard: {address}")
 
 
 class BenchTicker:

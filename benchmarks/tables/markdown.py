@@ -1,9 +1,8 @@
-"""The Markdown of a benchmark's tables: means of every row, what a model of the motion gives, volumes one by one."""
+"""The Markdown of a benchmark's tables: means of every row, and volumes one by one."""
 
 from collections.abc import Callable, Sequence
 
 from tables.case import FLY, STILL
-from tables.gains import Gain, gain_over_static
 from tables.job import PHANTOM, BenchJob
 from tables.published import published
 from tables.results import Line
@@ -17,16 +16,12 @@ def markdown(job: BenchJob, lines: Sequence[Line]) -> str:
     """A block for each protocol: the means of every row, and the volumes one by one."""
     size = job.bench_size
     text = [
-        f"# {_TITLES[job.kind]}: {size.voxels}³ voxels, {size.pixels}² pixels",
-        "",
-        *_notes(job, lines),
-        "",
+        f"# {_TITLES[job.kind]}: {size.voxels}³ voxels, {size.pixels}² pixels", "", *_notes(job, lines), ""
     ]
     for protocol in job.chosen_protocols:
         block = [line for line in lines if line["protocol"] == protocol]
         if block:
             text += [f"## {protocol}: {block[0]['views']} views", "", *_means(job, protocol, block), ""]
-            text += _motion_block(job, protocol, block)
             volumes = sorted({line["volume"] for line in block})
             if len(volumes) > 1:
                 text += [*_by_volume(job, block, volumes), ""]
@@ -106,43 +101,6 @@ def _row_cells(
     if still is not None and summary is not None and still.volumes < summary.volumes:
         bound += f" ({still.volumes} of {most} volumes)"
     return [label, *cells, bound]
-
-
-def _motion_block(job: BenchJob, protocol: str, lines: Sequence[Line]) -> list[str]:
-    """What a model of the motion gives each method; nothing where no method was run both ways."""
-    gains = [(row, gain_over_static(lines, protocol, row)) for row in job.chosen_rows]
-    rows = [_gain_row(row, gain) for row, gain in gains if gain is not None]
-    if not rows:
-        return []
-    heads = [
-        "with the motion",
-        "static PSNR / SSIM",
-        "with the motion PSNR / SSIM",
-        "gain (dB)",
-        "least and greatest of the volumes (dB)",
-        "volumes",
-        "stop-and-shoot PSNR / SSIM",
-        "processor s, static and moving",
-    ]
-    title = (
-        "Each method with a model of the motion beside its static one, on the same scans, against the truth:"
-    )
-    return [title, "", _row_text(heads), "|---" * len(heads) + "|", *rows, ""]
-
-
-def _gain_row(row: Row, gain: Gain) -> str:
-    seconds = [summary.mean.get("processor_s") for summary in (gain.static, gain.moving)]
-    cells = [
-        row.label,
-        _both(gain.static),
-        _both(gain.moving),
-        f"{gain.mean_db:+.2f}",
-        f"{gain.least_db:+.2f}, {gain.greatest_db:+.2f}",
-        str(gain.volumes),
-        _both(gain.still) if gain.still is not None else "–",
-        ", ".join(f"{value:.1f}" if value is not None else "–" for value in seconds),
-    ]
-    return _row_text(cells)
 
 
 def _both(summary: Summary) -> str:

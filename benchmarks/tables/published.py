@@ -30,10 +30,7 @@ TABLE1: dict[str, dict[str, Published]] = {
         "standard": Published(30.96, 0.844, 12.30),
         "phantom": Published(27.52, 0.779, 163.60),
     },
-    "SAX-NeRF": {
-        "rapid": Published(28.02, 0.773, 61.39),
-        "standard": Published(30.62, 0.849, 115.84),
-    },
+    "SAX-NeRF": {"rapid": Published(28.02, 0.773, 61.39), "standard": Published(30.62, 0.849, 115.84)},
     "R2-Gaussian": {
         "rapid": Published(28.93, 0.828, 7.95),
         "standard": Published(32.12, 0.889, 7.99),

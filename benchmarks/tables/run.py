@@ -4,7 +4,6 @@ import logging
 import math
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
 
@@ -57,16 +56,6 @@ def run_bench(
         OutputError: the folder cannot be written.
     """
 
-    def here(work: Work) -> None:
-        batch = _Here(job, work, report, make_runtime())
-        for _, group in groupby(work.missing, key=lambda run: run.case):
-            batch.run_case(list(group))
-
-    return complete_bench(job, here)
-
-
-def complete_bench(job: BenchJob, make: "Callable[[Work], None]") -> list[Path]:
-    """Checks the job, has ``make`` make what its results file lacks, if anything, and writes tables and figures."""
     plan = plan_runs(job)
     _name_rows_left_out(job)
     results = _results_file(job.output)
@@ -77,7 +66,9 @@ def complete_bench(job: BenchJob, make: "Callable[[Work], None]") -> list[Path]:
         missing = [run for run in plan if not present.has(run.facts)]
         _check_volumes(missing)
         if missing:
-            make(Work(results, lines, missing, len(plan)))
+            batch = Batch(job, results, lines, missing, len(plan), report, make_runtime())
+            for _, group in groupby(missing, key=lambda run: run.case):
+                batch.run_case(list(group))
         return _write_tables_and_figures(job, lines)
 
 
@@ -110,23 +101,16 @@ def _name_rows_left_out(job: BenchJob) -> None:
         log.warning("left out: %s (%s)", ", ".join(left_out), INSTALL)
 
 
-@dataclass(frozen=True, eq=False)
-class Work:
-    """What is to be made: the runs that a results file lacks, of ``total``; ``lines`` are the file's, and grow."""
-
-    results: Path
-    lines: list[Line]
-    missing: Sequence[PlannedRun]
-    total: int
-
-
 class Batch:
-    """The runs that are made now, and what is known about the time that they take."""
+    """The ``missing`` runs of ``total``, a case after the other. ``lines`` are those of the results file, and grow."""
 
-    def __init__(self, job: BenchJob, work: Work, report: Report) -> None:
-        self.job, self.results, self.report = job, work.results, report
-        self.lines, self.present = work.lines, Present(work.lines)
-        self.left, self.total = list(work.missing), work.total
+    def __init__(
+        self, job: BenchJob, results: Path, lines: list[Line], missing: Sequence[PlannedRun], total: int,
+        report: Report, rt: Runtime,
+    ) -> None:
+        self.job, self.results, self.report, self.rt = job, results, report, rt
+        self.lines, self.present = lines, Present(lines)
+        self.left, self.total = list(missing), total
         self.warned: set[str] = set()
 
     def keep(self, line: Line) -> None:
@@ -136,13 +120,11 @@ class Batch:
         self.present.add(line)
         self.lines.append(line)
 
-    def finish(self, run: PlannedRun, line: Line, at_once: int = 1) -> None:
-        """Says what a run gave, and how long the others will take where ``at_once`` are made at a time."""
+    def finish(self, run: PlannedRun, line: Line) -> None:
+        """Says what a run gave, and how long the others will take."""
         number = self.total - len(self.left) + 1
         self.left.remove(run)
-        left_s = self._left_s()
-        left_s = None if left_s is None else left_s / at_once
-        self.report(BenchProgress(number, self.total, run.title, line=line, left_s=left_s))
+        self.report(BenchProgress(number, self.total, run.title, line=line, left_s=self._left_s()))
 
     def _left_s(self) -> float | None:
         """Seconds that the missing runs will take, by what the same runs took on other objects; None if unknown."""
@@ -153,14 +135,6 @@ class Batch:
                 return None
             total += float(np.mean(like))
         return total
-
-
-class _Here(Batch):
-    """Runs made in this process, a case after the other."""
-
-    def __init__(self, job: BenchJob, work: Work, report: Report, rt: Runtime) -> None:
-        super().__init__(job, work, report)
-        self.rt = rt
 
     def run_case(self, runs: Sequence[PlannedRun]) -> None:
         """All missing runs of one case."""

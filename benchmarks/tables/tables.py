@@ -99,15 +99,7 @@ def _record(job: BenchJob, protocol: str, row: Row, acquisition: str, summary: S
     size = job.bench_size
     iterations = size.iterations if row.is_splatting else None
     facts = (
-        job.study,
-        size.name,
-        size.voxels,
-        size.pixels,
-        iterations,
-        job.axis,
-        protocol,
-        row.label,
-        acquisition,
+        job.study, size.name, size.voxels, size.pixels, iterations, job.axis, protocol, row.label, acquisition
     )
     paper = published(row.label, job.paper_column(protocol)) if acquisition == FLY else None
     numbers = {name: summary.mean.get(name) for name in METRICS}

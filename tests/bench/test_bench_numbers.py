@@ -1,14 +1,9 @@
 """The numbers of the benchmarks' tables, against values that are known."""
 
-from typing import Any
-
 import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 from scipy.special import erfc
-from tables import Row, rows_of
-from tables.case import FLY, STILL
-from tables.gains import gain_over_static
 from tables.metrics import Bead, roundness
 from tables.metrics.edge import RISE_PER_SIGMA, bead_edge, blurred_ball
 from tables.metrics.roundness import bead_sections
@@ -18,8 +13,6 @@ from phyradgs_cl.phantoms import Ellipsoid, EllipsoidPhantom
 
 GRID = Grid.cube(64, 32.0)  # half a millimetre per voxel
 CENTRE = (0.3, -0.2, 0.4)
-ROWS = {row.label: row for row in rows_of("table1")}
-MOVING, STATIC = ROWS["SART per-row"], ROWS["SART"]
 
 
 def drawn(axes_mm: tuple[float, float, float], sigma_mm: float = 0.0) -> np.ndarray:
@@ -48,23 +41,3 @@ def test_round_beads_are_round_and_an_ellipsoid_is_out_of_round_by_its_axes() ->
         # radii of an ellipse run between the axes as a cosine: RMS is the amplitude over √2
         assert sections[name].rms == pytest.approx(0.3 / 6.3 / np.sqrt(2), abs=0.006)
     assert np.isnan(roundness(np.zeros(GRID.shape), GRID, [Bead(CENTRE, 6.0)])["roundness"])
-
-
-def line(row: Row, volume: str, seed: int, psnr_db: float, **others: Any) -> dict[str, Any]:
-    """A line of a results file with the fields that a gain reads."""
-    facts = {"run": row.run, "protocol": "rapid", "acquisition": FLY, "processor_s": 2.0, **others}
-    return {**facts, "volume": volume, "seed": seed, "metrics": {"psnr_db": psnr_db, "ssim": 0.5}}
-
-
-def test_a_gain_is_the_mean_over_volumes_of_pairs_of_the_same_seed() -> None:
-    lines = [line(STATIC, *of) for of in (("a", 0, 20.0), ("a", 1, 22.0), ("b", 0, 30.0))]
-    lines += [line(MOVING, *of) for of in (("a", 0, 21.0), ("a", 1, 25.0), ("b", 0, 30.5))]
-    gain = gain_over_static(lines, "rapid", MOVING)
-    assert gain is not None and (gain.least_db, gain.greatest_db, gain.volumes) == (0.5, 2.0, 2)
-    assert gain.mean_db == pytest.approx(1.25)
-    alone = [line(STATIC, "c", 0, 90.0), line(MOVING, "a", 2, 90.0), line(MOVING, "d", 0, 90.0)]
-    assert gain_over_static([*lines, *alone], "rapid", MOVING) == gain
-    assert gain_over_static(lines, "rapid", STATIC) is None
-    still = [line(STATIC, volume, 0, psnr, acquisition=STILL) for volume, psnr in (("a", 40.0), ("c", 90.0))]
-    with_still = gain_over_static([*lines, *still], "rapid", MOVING)
-    assert with_still is not None and with_still.still is not None and with_still.still.mean["psnr_db"] == 40.0

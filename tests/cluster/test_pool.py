@@ -7,17 +7,12 @@ import time
 from pathlib import Path
 
 import pytest
-import tables.__main__ as tables_command
 from cluster.processes import free_port, wait_until
-from tables import RESULTS, BenchJob, BenchSize, run_bench_at_workers
-from tables.results import read_lines
 
 from phyradgs_cl import cluster as cluster_module
 from phyradgs_cl.cluster import Lost, Pool, Workers
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.runtime import DEVICE_VARIABLE
-
-TINY = BenchSize("T", 12, 16, 8)
 
 
 def device_of(number: int) -> tuple[int, str, int]:
@@ -55,19 +50,13 @@ def test_a_run_that_kills_every_worker_is_given_up_and_the_others_are_made() -> 
             list(pool.results(refuse, {"run": 7}))
 
 
-def test_no_scheduler_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    options = ["table1", "--rows", "FDK", "--size", "XS", "-o", str(tmp_path / "out")]
+def test_no_scheduler_is_one_line(cli, tiny_scan, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    grid = tmp_path / "grid.toml"
+    grid.write_text(f'scans = ["{tiny_scan}"]\n[[runs]]\nmethod = "fdk"\n')
     for where in (f"tcp://127.0.0.1:{free_port()}", str(tmp_path / "none.json"), "nonsense://x"):
-        assert tables_command.run([*options, "--scheduler", where]) == 2
+        assert cli.run(["sweep", str(grid), "-o", str(tmp_path / "out"), "--scheduler", where]) == 2
         error = capsys.readouterr().err
         assert error.count("\n") == 1 and f"--scheduler {where}: found no answer" in error
-
-
-def test_the_phantoms_pseudo_truth_is_made_by_one_worker(tmp_path: Path) -> None:
-    job = BenchJob("phantom", tmp_path / "out", size=BenchSize("T", 40, 32, 8), rows=["FDK", "PhyRadGS"])
-    run_bench_at_workers(job, Workers(count=2, device="cpu"))
-    found = [(line["label"], line["acquisition"]) for line in read_lines(job.output / RESULTS)]
-    assert len(found) == 6 == len(set(found)) and len(list(job.output.glob("pseudo_truth_*.h5"))) == 1
 
 
 def test_workers_without_the_resource_are_waited_for(sweep_folder, start, tmp_path) -> None:
