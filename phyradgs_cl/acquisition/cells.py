@@ -1,6 +1,7 @@
 """Builders of ``TimeCells``, one for each motion model."""
 
 from dataclasses import replace
+from functools import lru_cache
 
 import numpy as np
 
@@ -17,6 +18,10 @@ _TURN_SAMPLES = 32
 _TURN_FACTOR = 0.32  # relative error per squared radian
 _HARMLESS_PEAK = 4.0  # line integral
 _MOST_SEGMENTS = 1000
+
+
+Served = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
+"""Used cells, their first lines and their last ones, and the order of the first lines."""
 
 
 def static_cells(trajectory: Trajectory, shutter: Shutter, frame: int, start_s: float, lines: int) -> TimeCells:
@@ -97,16 +102,27 @@ def common_time_cells(
     step_s = length_s / samples
     if length_s <= 0 or last_s - first_s > lines * step_s:
         return per_line_cells(trajectory, shutter, frame, start_s, lines, samples if length_s > 0 else 1)
-    edges_s = first_s + step_s * np.arange(np.ceil((last_s - first_s) / step_s - _SAME_TIME) + 1)
-    share = _shares(windows_s, edges_s)
-    used, line_start, line_stop, order = _served_lines(share > 0)
+    edges_s, share, (used, line_start, line_stop, order) = _common_shares(windows_s.tobytes(), samples)
     latest_s = float(np.max(frame_start_s)) + last_s - step_s / 2  # a trajectory may end with the scan
     middle_s = np.minimum(_middles_s(frame_start_s, frame, edges_s), latest_s)[used]
     table = cell_table(trajectory, shutter, frame, middle_s, line_start, line_stop, np.ones(used.size), lines)
     return replace(table, line_share=share[used][order])
 
 
-def _served_lines(served: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+@lru_cache(maxsize=8)  # all frames of a scan have the same
+def _common_shares(windows: bytes, samples: int) -> tuple[np.ndarray, np.ndarray, Served]:
+    """Returns edges (K + 1,) of cells, the share (K, lines) of each line's window in each cell, and ``_served_lines`` of it.
+
+    windows: bytes of the windows (lines, 2) in s after a frame's start. Do not write to the arrays."""
+    windows_s = np.frombuffer(windows, np.float64).reshape(-1, 2)
+    first_s, last_s = float(windows_s.min()), float(windows_s.max())
+    step_s = float(np.ptp(windows_s, axis=1).max()) / samples
+    edges_s = first_s + step_s * np.arange(np.ceil((last_s - first_s) / step_s - _SAME_TIME) + 1)
+    share = _shares(windows_s, edges_s)
+    return edges_s, share, _served_lines(share > 0)
+
+
+def _served_lines(served: np.ndarray) -> Served:
     """Returns for lines served by K cells, bool (K, lines): the used cells, their first and last lines, and the order."""
     used = np.flatnonzero(served.any(axis=1))
     line_start = served[used].argmax(axis=1)

@@ -15,6 +15,7 @@ from phyradgs_cl.detector.attenuation import TRANSMISSION_FLOOR
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.objective import TvProx
 from phyradgs_cl.operators.rays.operator import RayOperator
+from phyradgs_cl.operators.rays.upright import FEWEST_LINES
 from phyradgs_cl.reconstructors.voxels.cgls import Cgls
 from phyradgs_cl.reconstructors.voxels.fista_tv import FistaTv, FistaTvOptions
 from phyradgs_cl.reconstructors.voxels.priors import axis_weights
@@ -108,7 +109,7 @@ class CoarseProblem(CoarseFrames):
             small = coarse.binned(perturb(scan, correction, views), self.block)
             times = exposure_steps(scan, max(self.grid.shape[1:]), _VOXELS_PER_TIME, _MOST_TIMES)
             tables += [PerRow(sub_intervals=times).cells(small, frame) for frame in range(small.frames)]
-        return RayOperator(self.rt, self.grid, small.geometry.detector_shape, tables)
+        return RayOperator(self.rt, self.grid, small.geometry.detector_shape, tables, fewest_lines=FEWEST_LINES)
 
     def line_integrals(self, operator: RayOperator, volume: np.ndarray) -> np.ndarray:
         """Returns the measurement as mean line integrals. A detector that averages intensity lowers them at edges; the

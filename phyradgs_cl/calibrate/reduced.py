@@ -95,11 +95,11 @@ class Reduced:
 
 
 def reduced(
-    problem: CoarseProblem | BeadProblem, parameters: Sequence[Parameter], at: Mapping[str, float],
+    problem: CoarseProblem | BeadProblem, operator: Any, parameters: Sequence[Parameter], at: Mapping[str, float],
     volume: np.ndarray, iterations: int,
 ) -> Reduced:
-    """Linearises the frames about the parameters' values ``at`` (by name) and the object ``volume``."""
-    operator: Any = problem.operator(correction_of(at))  # of the kind that takes the problem's objects
+    """Linearises the frames about the parameters' values ``at`` (by name) and the object ``volume``. operator: the
+    problem's at these values."""
     signals = [_signal(problem, one, at, volume) for one in parameters]
     images = [*signals, problem.corrected(correction_of(at)).residual(operator, volume)]
     *jacobian, residual = problem.beyond_object(operator, volume, images, iterations)
@@ -127,12 +127,12 @@ def _signal(
     return problem.masked((ends[0] - ends[1]) / np.float32(2 * step))
 
 
-def least_share(problem: CoarseProblem, at: Mapping[str, float], volume: np.ndarray, iterations: int) -> float:
-    """Returns the least share that has to remain of a parameter's signal.
+def least_share(problem: Reduced) -> float:
+    """Returns the least share that has to remain of a parameter's signal, of a problem with ``GAUGE``.
 
     It exceeds the one that remains of a turn of all views. No frame distinguishes that turn from a turned object; voxels do
     not follow it exactly, and leave as much of any other signal."""
-    gauge = float(reduced(problem, [GAUGE], at, volume, iterations).shares[0])
+    gauge = float(problem.only([GAUGE.name]).shares[0])
     return max(LEAST_SHARE, _GAUGE_FACTOR * min(gauge, _MOST_GAUGE))
 
 

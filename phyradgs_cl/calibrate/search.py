@@ -11,7 +11,7 @@ import numpy as np
 
 from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.calibrate.beads import BeadProblem
-from phyradgs_cl.calibrate.parameters import PARAMETERS, Parameter, correction_of, in_words
+from phyradgs_cl.calibrate.parameters import GAUGE, PARAMETERS, Parameter, correction_of, in_words
 from phyradgs_cl.calibrate.problem import CoarseProblem
 from phyradgs_cl.calibrate.reduced import (
     LEAST_SHARE_OF_BEADS,
@@ -71,19 +71,19 @@ class Search:
             correction = correction_of(self.at)
             operator: Any = problem.operator(correction)
             volume = problem.corrected(correction).reconstruct(operator, volume, stage.again if number else stage.first)
-            linear = reduced(problem, parameters, self.at, volume, stage.project)
+            more = [GAUGE] if asks and isinstance(problem, CoarseProblem) else []
+            linear = reduced(problem, operator, [*parameters, *more], self.at, volume, stage.project)
             if asks:
-                self._decide_determined(problem, stage, linear, volume)
+                self._decide_determined(linear)
             assert self.determined is not None
             self.reduced = linear.relative_to_stated(self.at).only(self.determined)
             if not self.determined or self._step(problem):
                 return
 
-    def _decide_determined(self, problem: Problem, stage: Stage, linear: Reduced, volume: np.ndarray) -> None:
+    def _decide_determined(self, linear: Reduced) -> None:
         """Decides which parameters the frames determine: those with a large enough share, and a useful deviation."""
-        least = LEAST_SHARE_OF_BEADS
-        if isinstance(problem, CoarseProblem):
-            least = least_share(problem, self.at, volume, stage.project)
+        least = least_share(linear) if GAUGE.name in linear.names else LEAST_SHARE_OF_BEADS
+        linear = linear.only([one.name for one in self.parameters])
         names = tuple(name for name, share in zip(linear.names, linear.shares, strict=True) if share >= least)
         deviations = linear.only(names).deviations() if names else ()
         self.determined = tuple(n for n, d in zip(names, deviations, strict=True) if PARAMETERS[n].is_known(float(d)))

@@ -1,6 +1,7 @@
 """A scan with corrected or planted errors of its panel, distances, timing and single views."""
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from scipy.interpolate import BSpline
@@ -90,14 +91,24 @@ class PerturbedTrajectory:
         """True for a parallel beam, as in ``base``."""
         return is_parallel(self.base)
 
+    @cached_property
+    def _turn(self) -> np.ndarray:
+        """The turned u, v and normal as columns (3, 3), in components along u, v and normal."""
+        correction = self.correction
+        turn: np.ndarray = Rotation.from_rotvec(
+            [correction.tilt_u_rad, correction.tilt_v_rad, correction.roll_rad]
+        ).as_matrix()
+        return turn
+
     def pose(self, frame: int, time_s: np.ndarray) -> np.ndarray:
         shift_v_mm, shift_u_mm, turn_rad = 0.0, 0.0, self.correction.turn_rad
         if isinstance(self.views, Views):
             shift_v_mm, shift_u_mm = self.views.shift_mm[frame]
             turn_rad += float(self.views.turn_rad[frame])
         vectors = self._with_moved_panel(np.array(self.base.pose(frame, time_s)), shift_v_mm, shift_u_mm)
-        about_z = Rotation.from_rotvec([0.0, 0.0, turn_rad]).as_matrix()
-        vectors = [vector @ about_z.T for vector in vectors]
+        if turn_rad:
+            about_z = Rotation.from_rotvec([0.0, 0.0, turn_rad]).as_matrix()
+            vectors = [vector @ about_z.T for vector in vectors]
         if isinstance(self.views, Sway):
             vectors = _seen_by(self.views.at(time_s), vectors, 1 if self.is_parallel else 2)
         return np.concatenate(vectors, -1)
@@ -113,10 +124,8 @@ class PerturbedTrajectory:
         half_v, half_u = ((n - 1) / 2 for n in self.shape)
         middle = first + half_u * column + half_v * row - correction.detector_distance_mm * normal
         middle = middle + (correction.offset_u_mm + shift_u_mm) * u_hat + (correction.offset_v_mm + shift_v_mm) * v_hat
-        # The columns of ``turn`` are the turned u, v and normal, as components along u, v and normal.
-        turn = Rotation.from_rotvec([correction.tilt_u_rad, correction.tilt_v_rad, correction.roll_rad]).as_matrix()
         axes = np.stack([u_hat, v_hat, normal], -1)
-        column, row = axes @ turn[:, 0] * pitch_u_mm, axes @ turn[:, 1] * pitch_v_mm
+        column, row = axes @ self._turn[:, 0] * pitch_u_mm, axes @ self._turn[:, 1] * pitch_v_mm
         if not self.is_parallel:
             source = source + correction.source_distance_mm * normal
         return [source, middle - half_u * column - half_v * row, column, row]

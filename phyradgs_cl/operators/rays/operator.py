@@ -57,6 +57,7 @@ class RayOperator:
     an array of the same kind, receives the result. detector_shape is (rows, columns); ``tables`` has the time cells of each
     frame, all read out along one axis. An operator shares its tables and buffers with its subsets, and with operators that
     were given the same ``memory``: use them one at a time. A volume that does not fit is projected in bricks.
+    fewest_lines: as in ``upright_of``; ``FEWEST_LINES`` is fastest for panels of few lines, and rounds differently.
 
     Joseph, IEEE Trans. Med. Imaging 1 (1982) 192. Raises InputError for tables that do not fit the detector.
     """
@@ -69,6 +70,7 @@ class RayOperator:
         tables: Sequence[TimeCells],
         *,
         memory: RayMemory | None = None,
+        fewest_lines: int | None = None,
     ) -> None:
         _check_tables(tables, detector_shape)
         self.rt, self.grid, self.detector_shape = rt, grid, detector_shape
@@ -78,7 +80,7 @@ class RayOperator:
         # Upright kernels and their slots (``upright.py``, ``slots.py``) are for CPUs: on a GPU neighbouring pixels of the
         # general kernel read neighbouring addresses already.
         may_use_slots = not rt.pixel_items and (memory is None or memory.slot_floats > 0)
-        self._upright = upright_of(grid, tables, detector_shape, rt.lanes) if may_use_slots else None
+        self._upright = upright_of(grid, tables, detector_shape, rt.lanes, fewest_lines) if may_use_slots else None
         self._poses: UprightPoses | None = None
         self.slot_floats = 0
         if self._upright is not None:

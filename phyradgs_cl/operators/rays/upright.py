@@ -19,7 +19,7 @@ from phyradgs_cl.runtime import DeviceArray, Runtime
 from phyradgs_cl.runtime.layout import GUARD, Strides, pitch_of
 
 _LINES = 128  # of a detector column per work-item
-_FEWEST_LINES = 8  # per pose: with fewer, slots cost more than they save
+FEWEST_LINES = 8  # per pose: with fewer, slots cost more than they save
 _VOXELS = 512  # of a volume's column that the lines of a work-item may meet in one slice
 # Voxels (x, y, z) of a work-item of the adjoint: neighbouring columns share rays. The bits do not depend on them.
 _OWNED = ((16, 16, 128), (8, 8, 128), (8, 4, 128))
@@ -39,16 +39,19 @@ class Upright:
 
 
 def upright_of(
-    grid: Grid, tables: Sequence[TimeCells], detector_shape: tuple[int, int], lanes: int
+    grid: Grid, tables: Sequence[TimeCells], detector_shape: tuple[int, int], lanes: int, fewest_lines: int | None = None
 ) -> Upright | None:
     """Returns how the upright kernels project these cells; None if the general kernel is needed.
 
     The upright kernels need poses that serve several lines each, rays with main axis x or y, and columns nearly along z. If
-    columns lean, the volume must lie between source and panel, as it always does in a parallel beam.
+    columns lean, the volume must lie between source and panel, as it always does in a parallel beam. fewest_lines: lines
+    read one after the other that a pose must serve on average, by default a whole vector of them.
     """
     served = sum(int((table.line_stop - table.line_start).sum()) for table in tables)
     lines = tables[0].lines
-    fewest = max(lanes, _FEWEST_LINES) if tables[0].axis == "rows" else min(_FEWEST_LINES, lines)
+    fewest = fewest_lines or max(lanes, FEWEST_LINES)
+    if tables[0].axis == "columns":
+        fewest = min(FEWEST_LINES, lines)
     if served < fewest * sum(table.count for table in tables):
         return None
     rows, columns = detector_shape

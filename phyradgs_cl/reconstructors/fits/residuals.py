@@ -6,6 +6,7 @@ import numpy as np
 
 from phyradgs_cl.acquisition import PerRow, Scan
 from phyradgs_cl.acquisition.altered.angles import exposure_steps
+from phyradgs_cl.operators.rays.upright import FEWEST_LINES
 from phyradgs_cl.reconstructors.fits.augmented import AugmentedOperator, FlatErrors
 from phyradgs_cl.reconstructors.voxels.cgls import Cgls
 from phyradgs_cl.reconstructors.voxels.system import System
@@ -33,7 +34,8 @@ class Fit:
 def fit(rt: Runtime, scan: Scan, iterations: int = _ITERATIONS) -> Fit:
     """Reconstructs a coarse scan by CGLS, each line at its own times, together with errors of its flats."""
     across = max(scan.grid.shape[1:])
-    system = System.of_scan(rt, scan, PerRow(sub_intervals=exposure_steps(scan, across, 1.0, _MOST_TIMES)))
+    motion = PerRow(sub_intervals=exposure_steps(scan, across, 1.0, _MOST_TIMES))
+    system = System.of_scan(rt, scan, motion, fewest_lines=FEWEST_LINES)
     flats = FlatErrors.beside(system.operator)
     augmented = AugmentedOperator(system.operator, flats)
     method = Cgls(augmented.system(system.measured, system.valid))

@@ -43,15 +43,19 @@ class System:
     space: Space[Any] = HostSpace()
 
     @classmethod
-    def of_scan(cls, rt: Runtime, scan: Scan, motion: Motion, detector_model: str = "log") -> "System":
-        """Returns the system of a scan under ``motion``. detector_model: log, intensity, or scan for the stated one."""
+    def of_scan(
+        cls, rt: Runtime, scan: Scan, motion: Motion, detector_model: str = "log", fewest_lines: int | None = None
+    ) -> "System":
+        """Returns the system of a scan under ``motion``. detector_model: log, intensity, or scan for the stated one.
+        fewest_lines: as in ``RayOperator``."""
         tables = [motion.cells(scan, f).still() for f in range(scan.frames)]
-        operator: LinearOperator = RayOperator(rt, scan.grid, scan.geometry.detector_shape, tables)
+        shape = scan.geometry.detector_shape
+        operator: LinearOperator = RayOperator(rt, scan.grid, shape, tables, fewest_lines=fewest_lines)
         measured = np.asarray(scan.projections, np.float32)
         model = scan.detector_model if detector_model == "scan" else detector_model
         intensity: IntensityOperator | SharedIntensity | None = None
         if model == "intensity" and any(table.averages for table in tables):  # both models agree on a single value
-            alone = IntensityOperator(rt, scan.grid, scan.geometry.detector_shape, tables)
+            alone = IntensityOperator(rt, scan.grid, shape, tables)
             intensity = SharedIntensity(rt.ranks, alone) if rt.ranks.size > 1 else alone
         if rt.ranks.size > 1:
             operator = SharedOperator(rt.ranks, operator)
