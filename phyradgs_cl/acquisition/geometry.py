@@ -202,11 +202,13 @@ def field_of_view_mm(geometry: Geometry) -> tuple[float, float, float]:
 
 def default_grid(geometry: Geometry) -> Grid:
     """Returns the cube as wide as a full turn's field of view, in voxels of one pixel pitch at the axis. It is lower where
-    the panel has few rows."""
+    the panel has few rows. In a parallel beam it is as high as the panel."""
     half_height_mm, radius_mm, _ = field_of_view_mm(geometry)
     voxel_mm = min(geometry.pixel_size_mm) / geometry.magnification
     wide = max(1, math.ceil(2 * radius_mm / voxel_mm))
-    high = max(1, min(wide, round(2 * half_height_mm / voxel_mm)))
+    high = max(1, round(2 * half_height_mm / voxel_mm))
+    if isinstance(geometry, ConeGeometry):
+        high = min(wide, high)
     return Grid((high, wide, wide), (voxel_mm,) * 3)
 
 

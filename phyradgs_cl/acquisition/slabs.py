@@ -14,12 +14,22 @@ HALO_ROWS = 4
 """Rows on each side of a slab that are read too: slices between two rows need both, and priors look at neighbours."""
 
 
+def check_has_slabs(scan: Scan, subject: str, found: str) -> None:
+    """Raises InputError about the option ``subject`` and its value ``found`` for scans whose slices need other rows."""
+    if not has_slabs(scan):
+        expected = "all rows: only in a parallel beam about z does a slice need few of them"
+        raise InputError(subject, found, expected, "take --roi-mm, with --margin-mm")
+
+
+def has_slabs(scan: Scan) -> bool:
+    """True for a parallel beam about z, in which few detector rows see a slice."""
+    return isinstance(scan.geometry, ParallelGeometry) and isinstance(scan.trajectory, CircularOrbit)
+
+
 def check_rows(scan: Scan, first: int, stop: int) -> None:
     """Raises InputError for rows [first, stop) that the panel does not have, and for scans whose slices need other rows."""
     rows, found = scan.geometry.detector_shape[0], f"{first}:{stop}"
-    if not (isinstance(scan.geometry, ParallelGeometry) and isinstance(scan.trajectory, CircularOrbit)):
-        expected = "all rows: only in a parallel beam about z does a slice need few of them"
-        raise InputError("--rows", found, expected, "take --roi-mm, with --margin-mm")
+    check_has_slabs(scan, "--rows", found)
     if not 0 <= first < stop <= rows:
         raise InputError("--rows", found, f"first row and the one after the last, 0:{rows} at most", "row 0 is the lowest")
 

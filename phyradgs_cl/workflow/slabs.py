@@ -12,7 +12,14 @@ import numpy as np
 
 from phyradgs_cl import reconstructors as methods
 from phyradgs_cl.acquisition import Scan
-from phyradgs_cl.acquisition.slabs import HALO_ROWS, check_rows, part_of, slices_of
+from phyradgs_cl.acquisition.slabs import (
+    HALO_ROWS,
+    check_has_slabs,
+    check_rows,
+    has_slabs,
+    part_of,
+    slices_of,
+)
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.io import read_scan_header
 from phyradgs_cl.io.files import host_bytes
@@ -42,9 +49,11 @@ class Slabs:
         at_a_time = self.rows_at_a_time
         if self.rows is None and not at_a_time:
             fit = int(_HOST_SHARE * host_bytes() / (_COPIES * 4 * scan.frames * scan.geometry.detector_shape[1]))
-            if fit >= rows or not scan.is_parallel:
+            if fit >= rows or not has_slabs(scan):
                 return []
             at_a_time = max(fit - 2 * HALO_ROWS, 1)
+        if self.rows is None:
+            check_has_slabs(scan, "--slab", str(at_a_time))
         check_rows(scan, first, stop)
         return [(a, min(a + (at_a_time or stop - first), stop)) for a in range(first, stop, at_a_time or stop - first)]
 

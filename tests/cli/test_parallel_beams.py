@@ -95,6 +95,8 @@ def test_each_beam_has_its_methods_and_numbers(refused, parallel, scan, tmp_path
     output = ["-o", tmp_path / "out.h5"]
     refused(["reconstruct", parallel, "--method", "fdk", *output], "--method fdk: found a parallel beam", "--method fbp")
     refused(["reconstruct", scan, "--method", "fbp", *output], "--method fbp: found a cone beam", "--method fdk")
+    refused(["reconstruct", scan, "--rows", "2:5", *output], "--rows: found 2:5; expected all rows", "--roi-mm")
+    refused(["reconstruct", scan, "--slab", "4", *output], "--slab: found 4; expected all rows", "--roi-mm")
     refused(["calibrate", parallel, "--what", "source-distance", *output], "--what", "parallel beam")
     refused(["prepare", parallel, "--steps", "phase", "--set", "phase.energy_kev=25", *output], "phase.")
     toml = tmp_path / "mine.toml"

@@ -22,7 +22,7 @@ from phyradgs_cl.acquisition import (
     SpeedRamp,
     Static,
 )
-from phyradgs_cl.acquisition.geometry import default_grid
+from phyradgs_cl.acquisition.geometry import ParallelGeometry, default_grid
 from phyradgs_cl.acquisition.plausible import blur_facts
 from phyradgs_cl.detector import counts_to_attenuation
 from phyradgs_cl.errors import InputError
@@ -316,6 +316,7 @@ def test_default_grid_is_what_the_cone_covers() -> None:
     assert default_grid(replace(geometry, detector_offset_mm=(0.0, 30.0))).shape[1:] > grid.shape[1:]
     assert default_grid(replace(geometry, detector_shape=(90, 60))).shape == (wide,) * 3
     assert default_grid(replace(geometry, detector_shape=(1, 60))).shape == (1, wide, wide)
+    assert default_grid(ParallelGeometry((90, 60), 2.0)).shape == (90, 60, 60)  # each row sees slices of its own
 
 
 def test_another_entry_name_and_inner_links_are_followed(path, make_scan) -> None:

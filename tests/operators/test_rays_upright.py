@@ -182,6 +182,19 @@ def test_frames_without_gaps_share_their_poses(cpu_rt, monkeypatch) -> None:
     np.testing.assert_allclose(operator.subset([2, 0]).forward(x), frames[[2, 0]], rtol=0, atol=RAYS * frames.max())
 
 
+def test_slots_stay_within_their_memory_where_lines_far_apart_share_a_pose(cpu_rt) -> None:
+    """The last lines of a frame and the first of the next are exposed together: a slot of both would have all lines."""
+    shape = (85, 4)
+    cells, x, y = tables("overlapping", shape, frames=2), noise(GRID.shape, 117), noise((2, *shape), 118)
+    operator = RayOperator(cpu_rt, GRID, shape, cells)
+    frames = operator.forward(x)
+    assert operator._slots[(0, 2)].floats <= 2 * operator.slot_floats
+    expected = np.stack([ray_frame(x, GRID, table, shape) for table in cells])
+    assert np.abs(frames - expected).max() <= RAYS * expected.max()
+    back = adjoint_of_twins(cells, GRID, y)
+    assert np.abs(operator.adjoint(y) - back).max() <= RAYS_BACK * back.max()
+
+
 def adjoint_of_twins(cells: list[TimeCells], grid: Grid, y: np.ndarray) -> np.ndarray:
     return sum(ray_volume(frame, grid, table) for frame, table in zip(y, cells, strict=True))
 

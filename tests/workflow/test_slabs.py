@@ -121,3 +121,6 @@ def test_a_scan_beyond_the_memory_is_cut_by_itself(path: Path, monkeypatch: pyte
     assert Slabs().of(scan) == []
     monkeypatch.setattr("phyradgs_cl.workflow.slabs.host_bytes", lambda: 2 * 4 * 4 * VIEWS * SIDE * 20)  # 20 rows of 26
     assert Slabs().of(scan) == [(0, 12), (12, 24), (24, 26)] and not surely_fits(path)
+    poses = np.concatenate([scan.trajectory.pose(f, scan.frame_start_s[[f]]) for f in range(VIEWS)])
+    poses[::2, 5] += 0.01
+    assert Slabs().of(Scan.from_poses(scan.projections, poses, GRID, is_parallel=True)) == []  # slices may need other rows

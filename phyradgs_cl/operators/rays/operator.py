@@ -167,7 +167,9 @@ class RayOperator:
             key = first, min(first + self.memory.slot_frames, part.stop)
             if key not in self._slots:
                 chosen = self._chosen[slice(*key)]
-                self._slots[key] = self._poses.slots(self.rt, chosen, self.detector_shape, self._upright.leans)
+                most_floats = self.memory.slot_frames * self.memory.slot_floats
+                like = self.detector_shape, self._upright.leans, most_floats
+                self._slots[key] = self._poses.slots(self.rt, chosen, *like)
             yield first - part.start, self._slots[key]
 
     def _project_layers(self, volume: Array, average: str, result: Array) -> None:

@@ -68,42 +68,66 @@ class UprightPoses:
         each = columns * pitch_of(widest) if self.axis == "rows" else widest * pitch_of(rows)
         return int(np.diff(self.frame_cells).max()) * each * (2 if leans else 1)
 
-    def slots(self, rt: Runtime, frames: np.ndarray, detector_shape: tuple[int, int], leans: bool) -> "Slots":
-        """Returns the slots of some frames, in the order of their first use."""
-        rows, columns = detector_shape
+    def slots(
+        self, rt: Runtime, frames: np.ndarray, detector_shape: tuple[int, int], leans: bool, most_floats: int
+    ) -> "Slots":
+        """Returns the slots of some frames, in the order of their first use, in at most ``most_floats`` floats. These are at
+        least ``floats_per_frame`` for each of the frames."""
         cells = np.concatenate([np.arange(self.frame_cells[f], self.frame_cells[f + 1]) for f in frames])
         of_frame = np.repeat(np.arange(len(frames)), np.diff(self.frame_cells)[frames])
         _, appears, slot = np.unique(self.pose_of[cells], return_index=True, return_inverse=True)
         order = np.argsort(appears)
-        slot = np.argsort(order)[slot.reshape(-1)]
-        first, stop = np.full(len(order), 2**31 - 1), np.zeros(len(order), np.int64)
-        np.minimum.at(first, slot, self.first[cells])
-        np.maximum.at(stop, slot, self.stop[cells])
-        table = np.zeros((len(order), _SLOT_INTS), np.int32)
-        table[:, 0] = self.pose_of[cells][appears[order]]
-        table[:, 2], table[:, 4] = columns, rows
-        along = (3, 4) if self.axis == "rows" else (1, 2)
-        table[:, along] = np.stack([first, stop], -1)
+        appears, slot = appears[order], np.argsort(order)[slot.reshape(-1)]
+        table = self._table(cells, appears, slot, detector_shape)
+        values = 2 if leans else 1
+        if values * len(table) * _columns_of(table) * pitch_of(_rows_of(table)) > most_floats:
+            # lines of one frame and of the next that share a pose lie far apart: a slot would have all lines between them
+            appears = slot = np.arange(len(cells))
+            table = self._table(cells, appears, slot, detector_shape)
         by_slot = np.argsort(slot, kind="stable")
         return Slots(
             slots=rt.upload(table),
             frame_shares=rt.upload(np.concatenate([[0], np.cumsum(np.diff(self.frame_cells)[frames])]), np.int32),
             shares=rt.upload(self._shares(cells, slot), np.int32),
-            slot_shares=rt.upload(np.searchsorted(slot[by_slot], np.arange(len(order) + 1)), np.int32),
+            slot_shares=rt.upload(np.searchsorted(slot[by_slot], np.arange(len(table) + 1)), np.int32),
             shares_by_slot=rt.upload(self._shares(cells[by_slot], of_frame[by_slot]), np.int32),
-            count=len(order),
+            count=len(table),
             frames=len(frames),
-            columns=int((table[:, 2] - table[:, 1]).max()),
-            rows=int((table[:, 4] - table[:, 3]).max()),
-            is_plain=self.is_plain and len(order) == len(frames),
+            columns=_columns_of(table),
+            rows=_rows_of(table),
+            is_plain=self.is_plain and len(table) == len(frames),
             leans=leans,
             is_parallel=self.is_parallel,
         )
+
+    def _table(
+        self, cells: np.ndarray, appears: np.ndarray, slot: np.ndarray, detector_shape: tuple[int, int]
+    ) -> np.ndarray:
+        """Returns slots (S, 8) int32. appears (S,): the first cell of each slot; slot (E,): the slot of each cell."""
+        first, stop = np.full(len(appears), 2**31 - 1), np.zeros(len(appears), np.int64)
+        np.minimum.at(first, slot, self.first[cells])
+        np.maximum.at(stop, slot, self.stop[cells])
+        table = np.zeros((len(appears), _SLOT_INTS), np.int32)
+        table[:, 0] = self.pose_of[cells][appears]
+        table[:, 2], table[:, 4] = detector_shape[1], detector_shape[0]
+        along = (3, 4) if self.axis == "rows" else (1, 2)
+        table[:, along] = np.stack([first, stop], -1)
+        return table
 
     def _shares(self, cells: np.ndarray, of: np.ndarray) -> np.ndarray:
         """Returns (E, 4): slot or frame, lines [first, stop), and the index of the first weight in ``RayCells``."""
         begins = np.concatenate([[0], np.cumsum(self.stop - self.first)])
         return np.stack([of, self.first[cells], self.stop[cells], begins[cells]], -1)
+
+
+def _columns_of(table: np.ndarray) -> int:
+    """Returns the columns of the widest slot."""
+    return int((table[:, 2] - table[:, 1]).max())
+
+
+def _rows_of(table: np.ndarray) -> int:
+    """Returns the rows of the highest slot."""
+    return int((table[:, 4] - table[:, 3]).max())
 
 
 @dataclass(frozen=True, eq=False)
