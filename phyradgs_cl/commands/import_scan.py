@@ -68,7 +68,7 @@ def import_command(
     voxel_mm: VoxelMm = None,
     roi_mm: RoiMm = None,
 ) -> None:
-    """Import a scan: R2-Gaussian, PhyRadGS, NAF, RTK, Data Exchange, NXtomo, TIFF, Nikon, SkyScan, Zeiss, FleX-ray."""
+    """Import a scan: TIFF, Nikon, SkyScan, Zeiss, FleX-ray, NXtomo, Data Exchange, RTK, LEAP, TIGRE, NAF, R2-Gaussian."""
     if template:
         say(template_of(source))
         return

@@ -34,6 +34,8 @@ FORMATS = {
     "skyscan": "laboratory.skyscan",
     "zeiss": "laboratory.zeiss",
     "flexray": "laboratory.flexray",
+    "leap": "toolkits.leap",
+    "tigre": "toolkits.tigre",
 }
 _MOST_BODIES = 1000
 _LARGEST_MM, _LARGEST_PER_MM = 1e5, 1e5

@@ -15,6 +15,7 @@ import h5py
 import laboratory_of_importers as lab
 import numpy as np
 import tifffile
+import toolkits_of_importers as kits
 
 Damage = Callable[[Path], None]
 SECRET = np.full((10, 14), 7.0, np.float32)
@@ -596,4 +597,69 @@ ZEISS: dict[str, tuple[Damage, tuple[str, ...]]] = {
     "no reference": (streams(ReferenceData__Image=None), ("flats", "flat_value")),
     "half a reference": (streams(ReferenceData__Image=np.ones(70, np.float32)), ("ReferenceData/Image", "70 pixels")),
     "a reference of text": (streams(ReferenceData__DataType=np.int32(3)), ("ReferenceData/DataType", "found 3")),
+}  # fmt: skip
+
+PARAMS = "params.txt"
+LEAP: dict[str, tuple[Damage, tuple[str, ...]]] = {
+    "no parameters": (filled(PARAMS, b"hello"), ("0 files of LEAP",)),
+    "parameters twice": (lambda p: (p / "b.cfg").write_bytes((p / PARAMS).read_bytes()), ("2 files of LEAP",)),
+    "a fan beam": (in_text(PARAMS, "geometry = cone", "geometry = fan"), ("geometry", "'modular'")),
+    "a curved panel": (in_text(PARAMS, "tau", "detectorType = curved\ntau"), ("detectorType", "curved")),
+    "a helix": (in_text(PARAMS, "helicalPitch = 0.0", "helicalPitch = 2"), ("helicalPitch", "convert_to_modularbeam")),
+    "a tilted panel": (in_text(PARAMS, "tiltAngle = 0.0", "tiltAngle = 1"), ("tiltAngle",)),
+    "no number of angles": (in_text(PARAMS, "numAngles = 6", "numAngles = none"), ("numAngles", "'none'")),
+    "another number of frames": (in_text(PARAMS, "numAngles = 6", "numAngles = 7"), ("(7, 10, 14)",)),
+    "too few angles": (in_text(PARAMS, "phis = 100.0, ", "phis = "), ("phis", "5 values")),
+    "an angle of text": (in_text(PARAMS, "phis = 100.0", "phis = east"), ("phis", "no number")),
+    "an angle that is NaN": (in_text(PARAMS, "phis = 100.0", "phis = nan"), ("phis", "nan")),
+    "a pixel of no size": (in_text(PARAMS, "pixelWidth = 2.5", "pixelWidth = 0"), ("pixelWidth",)),
+    "no distance": (in_text(PARAMS, "sdd = 800.0", ""), ("sdd", "nothing")),
+    "a huge volume": (in_text(PARAMS, "numZ = 7\nnumY = 9", "numZ = 99999\nnumY = 99999"), ("grid", "at most")),
+    "a modular beam without vectors": (in_text(PARAMS, "geometry = cone", "geometry = modular"), ("sourcePositions",)),
+    "no frames": (removed("g.npy"), ("no .npy and no TIFF",)), "a truncated array": (truncated("g.npy"), ("damaged .npy",)),
+    "an object array": (filled("g.npy", npy_header("(6, 10, 14)", "'|O'")), ("damaged .npy", "object")),
+    "an array that is a link": (symlinked("g.npy"), ("symbolic link",)),
+}  # fmt: skip
+
+
+def tigre(change: Callable[[Any, Path], object] = lambda geo, path: None, **attributes: object) -> Damage:
+    """The pickle of a geometry with other attributes."""
+
+    def damage(path: Path) -> None:
+        truth = sys.modules["conftest_of_importers"].truth()
+        geo = kits.tigre_geometry(truth, **attributes)
+        content = change(geo, path) or (truth.scan.projections, geo, truth.angle_rad)
+        path.write_bytes(pickle.dumps(content))
+
+    return damage
+
+
+def tuple_bomb_attribute(path: Path) -> None:
+    """DSO is a tuple of a tuple of ..., in a pickle of protocol 4 by hand."""
+    name = b"\x8c\x18tigre.utilities.geometry\x94\x8c\x08Geometry\x94\x93\x94)\x81\x94}\x94\x8c\x03DSO"
+    path.write_bytes(b"\x80\x04K\x00\x94" + name + doubled(60) + b"sbK\x00\x87.")
+
+
+TIGRE: dict[str, tuple[Damage, tuple[str, ...]]] = {
+    "not a pickle": (filled("", b"tigre.utilities.geometry"), ("damaged pickle",)),
+    "a truncated pickle": (truncated("", 0.9), ("damaged pickle",)),
+    "a command": (tigre(lambda geo, path: (Bomb(path.parent / "canary"), geo, 0)), ("a call of", "nothing was executed")),
+    "a command in the geometry": (
+        tigre(lambda geo, path: setattr(geo, "DSO", Bomb(path.parent / "canary"))), ("a call of", "nothing was executed")
+    ),
+    "another class of TIGRE's": (
+        lambda p: p.write_bytes(p.read_bytes().replace(b"\x08Geometry", b"\x08Gpu_xxxx")), ("a call of tigre",)
+    ),
+    "a dictionary": (tigre(lambda geo, path: {"geometry": geo}), ("tuple (projections, geometry, angles)",)),
+    "no array": (tigre(lambda geo, path: ([1.0], geo, np.zeros(6))), ("projections", "a list of 1")),
+    "no angles": (tigre(lambda geo, path: (np.zeros((6, 10, 14)), geo, None)), ("angles",)),
+    "another number of angles": (
+        tigre(lambda geo, path: (np.zeros((6, 10, 14)), geo, np.zeros(5))), ("projections", "(5, 10, 14)")
+    ),
+    "a distance of text": (tigre(DSO="far"), ("DSO",)),
+    "a distance in lists": (tigre(DSO=[[500.0]]), ("geometry.DSO", "numbers")),
+    "no distance": (tigre(DSD=None), ("DSD",)), "a turned panel": (tigre(rotDetector=np.ones(3)), ("rotDetector",)),
+    "half a pixel": (tigre(nDetector=np.array([10, 13.5])), ("nDetector",)),
+    "a huge grid": (tigre(nVoxel=np.array([10**6] * 3)), ("grid", "at most")),
+    "a tuple without end": (tuple_bomb_attribute, ("pickle",)),
 }  # fmt: skip

@@ -30,6 +30,7 @@ FORMS: dict[str, dict[str, Any]] = {
     "r2": hostile.R2, "phyradgs": hostile.PHYRADGS, "phyradgs-real": hostile.REAL, "naf": hostile.NAF,
     "rtk": hostile.RTK, "data-exchange": hostile.EXCHANGE, "nxtomo": hostile.NXTOMO, "tiff": hostile.TIFF,
     "nikon": hostile.NIKON, "zeiss": hostile.ZEISS, "skyscan": hostile.SKYSCAN, "flexray": hostile.FLEXRAY,
+    "leap": hostile.LEAP, "tigre": hostile.TIGRE,
 }  # fmt: skip
 CASES = [(form, case) for form, cases in FORMS.items() for case in cases]
 HARMLESS = {("tiff", "pages in a circle")}  # may be read, once, as well as refused
@@ -176,6 +177,7 @@ FUZZED = [
     ("r2", "meta_data.json"), ("r2", "proj_train/0000.npy"), ("phyradgs-real", hostile.GEO), ("rtk", hostile.XML),
     ("rtk", hostile.MHA), ("tiff", "proj_1.tif"), ("tiff", hostile.TOML), ("naf", ""), ("scanner", ""),
     ("nikon", hostile.XTEK), ("skyscan", hostile.LOG), ("flexray", hostile.SETTINGS), ("zeiss", ""),
+    ("leap", hostile.PARAMS), ("tigre", ""),
     ("configuration", ""),
 ]  # fmt: skip
 CONFIG = "method = 'phyradgs'\nstrips = 2\ntv_weight = 0.02\n[rates]\nposition = [2e-4, 2e-5]\n[control]\nevery = 100\n"

@@ -12,6 +12,7 @@ import numpy as np
 import pint
 import SimpleITK as sitk
 import tifffile
+import toolkits_of_importers as kits
 from nxtomo.application import nxtomo
 
 AIR, DARK = 50000.0, 300.0
@@ -290,6 +291,7 @@ WRITERS = {
     "nxtomo": (write_nxtomo, "nx.h5"), "tiff": (write_tiff, "tiff"),
     "nikon": (lab.write_nikon, "nikon"), "skyscan": (lab.write_skyscan, "skyscan"),
     "flexray": (lab.write_flexray, "flexray"), "zeiss": (lab.write_zeiss, "sample.txrm"),
+    "leap": (kits.write_leap, "leap"), "tigre": (kits.write_tigre, "tigre.pickle"),
 }  # fmt: skip
 
 

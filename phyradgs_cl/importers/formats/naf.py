@@ -6,6 +6,7 @@ memory at addresses that the file states."""
 
 import io
 import math
+import os
 import pickle
 import re
 from pathlib import Path
@@ -27,12 +28,21 @@ from phyradgs_cl.io.tables import Fields, described
 OPTIONS = (*TIMING, "detector_model", "part")
 _PER_MM = 1e-3  # of a density per metre
 _PARTS = {"train": ("train",), "test": ("val",), "all": ("train", "val")}
+TIGRE_MODULE, _END_BYTES = "tigre.utilities.geometry", 1 << 18
 _COPIES = 3  # arrays and line integrals, for every byte of the file
 
 
 def recognises(path: Path) -> bool:
-    """True for the suffix of a pickle."""
-    return path.is_file() and path.suffix.lower() in (".pickle", ".pkl")
+    """True for the suffix of a pickle without a geometry of TIGRE."""
+    return path.is_file() and path.suffix.lower() in (".pickle", ".pkl") and not names_tigre(path)
+
+
+def names_tigre(path: Path) -> bool:
+    """True for a file that names TIGRE's geometry in its first or last bytes, where a pickle has its small parts."""
+    with open(path, "rb") as file:
+        head = file.read(_END_BYTES)
+        file.seek(max(0, os.fstat(file.fileno()).st_size - _END_BYTES))
+        return TIGRE_MODULE.encode() in head or TIGRE_MODULE.encode() in file.read(_END_BYTES)
 
 
 def import_scan(path: Path, options: ImportOptions) -> Scan:
@@ -76,14 +86,16 @@ def _array(table: Fields, key: str, ndim: int) -> np.ndarray:
     return np.asarray(values)
 
 
-def read_pickle(path: Path) -> object:
-    """Reads dicts, lists, tuples, text, numbers and NumPy arrays of plain numbers; InputError for anything else."""
+def read_pickle(path: Path, unpickler: "type[PlainUnpickler] | None" = None) -> object:
+    """Reads dicts, lists, tuples, text, numbers and NumPy arrays of plain numbers; InputError for anything that the
+    unpickler, ``PlainUnpickler`` by default, refuses."""
     subject = str(path)
     size = regular_file(path, subject).st_size
     check_room(subject, _COPIES * size)
     data = read_regular(path, subject, size, "a pickle")
     try:
-        return PlainUnpickler(io.BytesIO(data), encoding="latin1").load()  # Python 2 wrote the bytes of arrays as text
+        kind = unpickler or PlainUnpickler
+        return kind(io.BytesIO(data), encoding="latin1").load()  # Python 2 wrote the bytes of arrays as text
     except InputError as error:
         raise InputError(subject, error.found, error.expected, error.remedy) from error
     except Exception as error:  # opcodes in any order raise any exception

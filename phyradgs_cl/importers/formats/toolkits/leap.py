@@ -1,0 +1,122 @@
+"""Scans of LEAP: the text file that its ``save_parameters`` writes, with line integrals as .npy (F, v, u) or TIFFs.
+
+LEAP's cone equals ours a quarter turn back: at φ = 0° the source stands at −y. Columns run along the turn, row 0 is the
+lowest. The ray through the origin falls on centerRow and centerCol; ``tau`` moves source and panel against the columns. A
+modular beam is a table of sources, panel centres and directions of rows and columns. Lengths in mm, angles in degrees."""
+
+from pathlib import Path
+
+import numpy as np
+
+from phyradgs_cl.acquisition import CircularOrbit, PoseTable, Scan
+from phyradgs_cl.acquisition.geometry import Geometry, ParallelGeometry, plain_geometry
+from phyradgs_cl.errors import InputError
+from phyradgs_cl.fields import Grid, triple
+from phyradgs_cl.importers import assemble
+from phyradgs_cl.importers.formats.toolkits.leap_names import OLD_NAMES
+from phyradgs_cl.importers.options import OF_BARE_FRAMES, TIMING, ImportOptions
+from phyradgs_cl.importers.reading.files import SafeFolder, read_npy
+from phyradgs_cl.importers.reading.frames import gantry_sign, line_integrals, oriented
+from phyradgs_cl.importers.reading.settings import head_has, read_settings, say_missing
+from phyradgs_cl.importers.reading.tiff import SUFFIXES, read_tiffs
+from phyradgs_cl.importers.stage import RotaryStage, along
+from phyradgs_cl.io.tables import Fields
+
+_VECTORS = ("sourcePositions", "moduleCenters", "colVectors", "rowVectors")
+_BEAMS, _MOST, _ENDS = ("cone", "parallel", "modular"), 1_000_000, (".txt", ".cfg")
+_OF_TABLES = (*TIMING, "row_0", "column_0", "quantity", "flat_value", "detector_model")
+
+
+def recognises(path: Path) -> bool:
+    """True for a text file of LEAP's parameters, and for a folder with one."""
+    return bool(_descriptions(path))
+
+
+def _descriptions(path: Path) -> list[Path]:
+    files = SafeFolder(path).matching(*_ENDS) if path.is_dir() else [path]
+    marks = ((b"numAngles", b"numCols"), (b"proj_nangles", b"proj_ncols"))
+    return [file for file in files if file.suffix.lower() in _ENDS and any(head_has(file, *both) for both in marks)]
+
+
+def import_scan(path: Path, options: ImportOptions) -> Scan:
+    """Imports a folder with one file of parameters and its frames, or the parameters with the frames in their folder."""
+    options.refuse_unused("leap", OF_BARE_FRAMES)
+    folder, descriptions = SafeFolder(path if path.is_dir() else path.parent), _descriptions(path)
+    if len(descriptions) != 1:
+        raise InputError(str(path), f"{len(descriptions)} files of LEAP's parameters", "one", "name the file itself")
+    description = descriptions[0]
+    stored = read_settings(description, [*OLD_NAMES, *OLD_NAMES.values()])
+    scan = Fields(stored.subject, {new: stored.values.get(new, stored.values.get(old)) for new, old in OLD_NAMES.items()})
+    count, rows, columns = (scan.count(name, _MOST) for name in ("numAngles", "numRows", "numCols"))
+    arrays, images = folder.matching(".npy"), folder.matching(*SUFFIXES)
+    if not arrays and not images:
+        raise InputError(str(folder.root), "no .npy and no TIFF", "the line integrals")
+    frames = read_npy(folder.only("stack", ".npy"), 3) if arrays else read_tiffs(images)
+    if frames.shape != (count, rows, columns):
+        expected = f"{(count, rows, columns)}, as {description.name} says"
+        raise InputError(str((arrays or images)[0]), f"frames {frames.shape}", expected)
+    timing = assemble.make_timing(str(description), count, options)
+    beam = scan.word("geometry", _BEAMS)
+    trajectory, geometry = (_modular if beam == "modular" else _turning)(scan, (count, rows, columns), options, timing)
+    turned = oriented(frames, options, "bottom")
+    integrals = line_integrals(str(folder.root), turned, options, convention="attenuation")
+    parts = integrals, trajectory, geometry, timing, options
+    return assemble.assemble_scan(*parts, title=description.stem, source=str(path), grid=_grid(scan))
+
+
+def _turning(
+    scan: Fields, shape: tuple[int, int, int], options: ImportOptions, timing: assemble.Timing
+) -> tuple[CircularOrbit | PoseTable, Geometry]:
+    """Returns the trajectory of a cone or parallel beam about the z axis."""
+    for name in ("helicalPitch", "tiltAngle"):
+        if scan.number(name, 0.0):
+            raise scan.error(name, f"{scan.number(name):g}", "0", "write it with convert_to_modularbeam()")
+    if scan.word("detectorType", default="flat").lower() != "flat":
+        raise scan.error("detectorType", scan.word("detectorType")[:40], "flat")
+    pitch_mm = (scan.length("pixelHeight"), scan.length("pixelWidth"))
+    centre = (scan.number("centerRow"), scan.number("centerCol"))
+    sizes = zip(shape[1:], centre, pitch_mm, strict=True)
+    off_v, off_u = (((size - 1) / 2 - ray) * pitch for size, ray, pitch in sizes)
+    if scan.word("geometry") == "parallel":
+        geometry: Geometry = assemble.parallel(options, shape[1:], pitch_mm, (off_v, off_u))
+    else:
+        geometry = assemble.cone(options, scan.length("sod"), scan.length("sdd"), shape[1:], pitch_mm, (off_v, off_u))
+    if scan.has("phis"):
+        phi_deg = _list(scan, "phis", shape[0])
+    else:
+        say_missing(scan, {"phis": "angularRange in equal steps from 0°"})
+        phi_deg = np.arange(shape[0]) * (scan.number("angularRange") / shape[0])
+    angle_rad = gantry_sign(options, "gantry") * np.deg2rad(phi_deg - 90)
+    tau_mm = 0.0 if isinstance(geometry, ParallelGeometry) else scan.position("tau")
+    return RotaryStage(geometry, tau_mm).turned(angle_rad, timing, scan.subject)
+
+
+def _modular(
+    scan: Fields, shape: tuple[int, int, int], options: ImportOptions, timing: assemble.Timing
+) -> tuple[PoseTable, Geometry]:
+    """Returns the table of poses of a modular beam."""
+    options.refuse_unused("leap, which states every view", _OF_TABLES)
+    source, centre, right, up = (_list(scan, name, 3 * shape[0]).reshape(-1, 3) for name in _VECTORS)
+    step_u, step_v = right * scan.length("pixelWidth"), up * scan.length("pixelHeight")
+    first = centre - (shape[2] - 1) / 2 * step_u - (shape[1] - 1) / 2 * step_v
+    poses = np.concatenate([source, first, step_u, step_v], -1)
+    geometry = plain_geometry(poses, (shape[1], shape[2]))
+    return assemble.table_over_time(lambda position: along(poses, position), timing, scan.subject), geometry
+
+
+def _list(scan: Fields, name: str, count: int) -> np.ndarray:
+    """Returns the numbers (count,) of a line, which commas separate."""
+    try:
+        values = [float(word) for word in str(scan.get(name)).split(",")]
+    except ValueError as error:
+        raise scan.error(name, "a word that is no number", f"{count} numbers") from error
+    return Fields(scan.subject, {name: values}).numbers(name, count)
+
+
+def _grid(scan: Fields) -> Grid | None:
+    """Returns LEAP's volume where the file states one."""
+    if not all(map(scan.has, ("numX", "numY", "numZ", "voxelWidth", "voxelHeight"))):
+        return None
+    width_mm, height_mm = scan.length("voxelWidth"), scan.length("voxelHeight")
+    counts = triple(scan.count(f"num{axis}", _MOST) for axis in "ZYX")
+    return Grid(counts, (height_mm, width_mm, width_mm), triple(scan.position(f"offset{axis}") for axis in "ZYX"))

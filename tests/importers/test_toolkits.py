@@ -1,0 +1,103 @@
+"""Geometries of TIGRE and LEAP: each against its own formula, and reconstructions to the bit."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tifffile
+import toolkits_of_importers as kits
+from conftest_of_importers import GEOMETRY, WORLD_POINTS, pose_at, projected
+
+from phyradgs_cl.acquisition import CircularOrbit, ParallelGeometry, PoseTable
+from phyradgs_cl.api import reconstruct
+from phyradgs_cl.detector import counts_to_attenuation
+from phyradgs_cl.errors import InputError
+from phyradgs_cl.importers import ImportOptions, import_scan, recognise
+from phyradgs_cl.io import read_scan, write_scan
+
+SQUARE = replace(GEOMETRY, detector_offset_mm=(3.0, -5.0))  # whole and half pixels, which text keeps to the bit
+WRITERS: dict[str, tuple[Callable[..., Path], str]] = {
+    "leap": (kits.write_leap, "leap"), "tigre": (kits.write_tigre, "scan.pickle"),
+}  # fmt: skip
+FLAT = ParallelGeometry((10, 14), (3.0, 2.5), (3.0, -5.0))
+
+
+@pytest.mark.parametrize("geometry", [SQUARE, FLAT], ids=["cone", "parallel"])
+@pytest.mark.parametrize("form", WRITERS)
+def test_pixels_and_geometry_are_those_of_the_scan_that_was_written(
+    tmp_path, make_truth, assert_same, form, geometry
+) -> None:
+    writer, name = WRITERS[form]
+    truth = make_truth(geometry=geometry)
+    truth = replace(truth, scan=replace(truth.scan, grid=replace(truth.scan.grid, voxel_size_mm=(2.0, 1.5, 1.5))))
+    path = writer(tmp_path / name, truth)
+    assert recognise(path) == form
+    scan = import_scan(path)
+    assert isinstance(scan.trajectory, CircularOrbit) and scan.geometry == geometry and scan.grid == truth.scan.grid
+    assert_same(scan, truth, grid=False, pixels=0)
+    write_scan(tmp_path / "ours.h5", replace(truth.scan, reference=None))
+    ours = read_scan(tmp_path / "ours.h5", counts_to_attenuation)
+    volumes = [reconstruct(one, "cgls", iterations=2).volume for one in (scan, ours)]
+    np.testing.assert_array_equal(*volumes)
+
+
+def leap_pixels(points: np.ndarray, phi_deg: float, values: dict[str, float]) -> np.ndarray:
+    """(row, column) of points by LEAP's formula: u = (x · θ⊥ + τ) / (R − x · θ), v = x_z / (R − x · θ)."""
+    phi = np.deg2rad(phi_deg) - np.pi / 2
+    theta, across = np.array([np.cos(phi), np.sin(phi), 0]), np.array([-np.sin(phi), np.cos(phi), 0])
+    depth = values["sod"] - points @ theta
+    u, v = (values["sdd"] * part / depth for part in (points @ across + values["tau"], points[:, 2]))
+    column = u / values["pixelWidth"] + values["centerCol"]
+    return np.stack([v / values["pixelHeight"] + values["centerRow"], column], -1)
+
+
+def test_leap_s_formula_sees_points_where_our_poses_do(tmp_path, make_truth, caplog) -> None:
+    """τ above 0 moves source and panel against the columns; equal steps begin at 0°; the names of 2023 are known."""
+    truth = make_truth()
+    path = kits.write_leap(tmp_path / "a", truth, tau=2.5, phis=None, angularRange=-300.0)
+    values = {**kits.leap_values(truth), "tau": 2.5}
+    scan = import_scan(path / "params.txt")
+    for frame in range(6):
+        expected = leap_pixels(WORLD_POINTS, -50.0 * frame, values)
+        np.testing.assert_allclose(projected(pose_at(scan, frame, 0.5), WORLD_POINTS), expected, atol=1e-6)
+    assert "no phis (angularRange in equal steps from 0°)" in caplog.text
+    old = {"numAngles": "proj_nangles", "numCols": "proj_ncols", "sod": "proj_sod", "phis": "proj_phis"}
+    text = (kits.write_leap(tmp_path / "b", truth) / "params.txt").read_text()
+    for new, name in old.items():
+        text = text.replace(f"{new} =", f"{name} =")
+    (tmp_path / "b" / "params.txt").write_text(text)
+    (tmp_path / "b" / "g.npy").unlink()
+    for i, image in enumerate(truth.scan.projections):
+        tifffile.imwrite(tmp_path / "b" / f"g_{i}.tif", image)
+    assert recognise(tmp_path / "b") == "leap"
+    np.testing.assert_array_equal(import_scan(tmp_path / "b").projections, truth.scan.projections)
+
+
+def test_leap_s_modular_beam_is_a_table_of_views(tmp_path, make_truth, assert_same) -> None:
+    truth = make_truth()
+    poses = GEOMETRY.pose(truth.angle_rad).reshape(-1, 4, 3)
+    source, first, step_u, step_v = poses.swapaxes(0, 1)
+    centre = first + 6.5 * step_u + 4.5 * step_v
+    vectors = {"sourcePositions": source, "moduleCenters": centre, "rowVectors": step_v / 3.0, "colVectors": step_u / 2.5}
+    lines = {name: ", ".join(map(repr, table.ravel().tolist())) for name, table in vectors.items()}
+    path = kits.write_leap(tmp_path / "a", truth, **{**lines, "geometry": "modular", "phis": None})
+    scan = import_scan(path)
+    assert isinstance(scan.trajectory, PoseTable)
+    assert_same(scan, truth, grid=False)
+    with pytest.raises(InputError, match="rotates with format leap, which states every view"):
+        import_scan(path, ImportOptions(rotates="sample"))
+
+
+def test_tigre_s_centre_of_rotation_and_values_per_frame(tmp_path, make_truth) -> None:
+    truth = make_truth(geometry=SQUARE)
+    offsets = np.tile([3.0, -5.0], (6, 1)) + np.arange(6)[:, None] * [0.5, 0.25]
+    scan = import_scan(kits.write_tigre(tmp_path / "a.pkl", truth, COR=1.5, offDetector=offsets))
+    assert isinstance(scan.trajectory, PoseTable)
+    for frame in range(6):
+        geometry = replace(SQUARE, detector_offset_mm=tuple(offsets[frame].tolist()))
+        pose = geometry.pose(truth.angle_rad[frame])
+        pose[:6] += np.tile(1.5 * pose[6:9] / 2.5, 2)
+        expected = projected(pose, WORLD_POINTS)
+        np.testing.assert_allclose(projected(pose_at(scan, frame, 0.5), WORLD_POINTS), expected, atol=1e-6)
