@@ -6,29 +6,21 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, Protocol
-from phyradgs_cl.acquisition.altered.perturbed import GeometryCorrection, Sway, Views, perturb, without_drift
+from phyradgs_cl.acquisition import CircularOrbit
+from phyradgs_cl.acquisition.altered.perturbed import GeometryCorrection, perturb, without_drift
 from phyradgs_cl.api import simulate
-from phyradgs_cl.calibrate import AGREES, CANNOT_TELL, CORRECTED, Calibration, calibrate
+from phyradgs_cl.calibrate import AGREES, CANNOT_TELL, CORRECTED, calibrate
 from phyradgs_cl.calibrate.parameters import in_words
-from phyradgs_cl.calibrate.per_view import SPLINES, MotionParameters, WobbleParameters
 from phyradgs_cl.calibrate.problem import CoarseProblem
 from phyradgs_cl.calibrate.reduced import Reduced
 from phyradgs_cl.calibrate.search import Search
-from phyradgs_cl.calibrate.stages import PassCounter, Stage
-from phyradgs_cl.calibrate.views import estimate_views
+from phyradgs_cl.calibrate.stages import Stage
 from phyradgs_cl.detector.effects import lagged
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.fields import Grid
 from phyradgs_cl.io import write_scan
-from phyradgs_cl.phantoms import Ellipsoid, EllipsoidPhantom
-from phyradgs_cl.simulation import SimulationOptions, phantom_scene
-from phyradgs_cl.simulation import simulate as simulate_frames
 from phyradgs_cl.workflow import load_scan
 
 OFFSET_MM, ROLL_DEG = 0.3, 0.8
-
-SILENT = PassCounter(lambda *progress: None, {})
 
 
 @pytest.fixture(scope="module")
@@ -152,158 +144,6 @@ def test_a_detector_that_adds_photons(rt, turned) -> None:
     assert abs(found.found) < 3 * found.deviation < 0.03 and found.verdict == CORRECTED
 
 
-def test_shifts_of_views_are_found_and_turns_too_small_for_these_voxels_left(rt, right) -> None:
-    rng = np.random.default_rng(1)
-    planted = WobbleParameters.of(right).without_gauges(np.array([0.0, 0.125, 0.125]) * rng.normal(size=(15, 3)))
-    off = perturb(right, GeometryCorrection(), WobbleParameters.of(right).views_of(-planted))
-    stages = [Stage(16, 30, 10), Stage(32, 30, 10)]
-    found = estimate_views(rt, off, WobbleParameters.of(off), stages, GeometryCorrection(), SILENT)
-    assert [one.verdict for one in found.table][1:] == [CORRECTED, CORRECTED]
-    left_mm = found.views.shift_mm - planted[:, 1:]
-    assert np.sqrt(np.mean(left_mm**2)) < 0.1 * np.sqrt(np.mean(planted[:, 1:] ** 2))
-
-
-def test_turns_of_a_smooth_object_on_which_levels_differ_are_left(rt) -> None:
-    """0.7° (RMS) that go round twice per turn: frames of two balls look the same, and what is found has the wrong sign."""
-    balls = Ellipsoid((0, 0, 0), (0.83, 0.67, 0.75), 1.2), Ellipsoid((0.2, 0.2, -0.1), (0.25,) * 3, 2.4)
-    geometry, grid = ConeGeometry(5.0, 7.0, (48, 48), (4.0 / 48,) * 2), Grid.cube(24, 2.0)
-    plan = Protocol(views=40, exposure_deg=7.2, readout_ratio=0.2)
-    scene = phantom_scene(rt, EllipsoidPhantom(balls, "balls"), geometry, grid, 24, "rows", 0)
-    scan = simulate_frames(scene.source, geometry, scene.grid, SimulationOptions(plan, noise="beer", dose=1e5))
-    planted = np.zeros((40, 3))
-    planted[:, 0] = np.radians(np.sin(4 * np.pi * np.arange(40) / 40))
-    wobbling = perturb(scan, GeometryCorrection(), WobbleParameters.of(scan).views_of(planted))
-    stages = [Stage(24, 40, 15), Stage(48, 40, 12)]
-    found = estimate_views(rt, wobbling, WobbleParameters.of(scan), stages, GeometryCorrection(), SILENT)
-    turn = found.table[0]
-    assert turn.verdict == AGREES and found.views is None, found.table
-
-
-def test_a_slow_wobble_by_splines_of_time(cli, rt, tmp_path, capsys) -> None:
-    """Better than view by view, with what was corrected in the answer, the picture and the report of a volume."""
-    how = {"size": 24, "detector": 36, "views": 40, "exposure_deg": 3.0, "readout_ratio": 0.5, "noise": "tigre", "dose": 1e5}
-    scan = simulate("foot", **how, device=rt)
-    parameters = WobbleParameters.of(scan, 6)
-    drawn = np.array([np.deg2rad(3.0), 0.1, 0.1]) * np.random.default_rng(1).normal(size=(6, 3))
-    values = parameters.without_gauges(drawn)
-    np.testing.assert_allclose(parameters.without_gauges(values), values, atol=1e-12)
-    planted = parameters.basis @ values
-    off = perturb(scan, GeometryCorrection(), parameters.views_of(-values))
-    stages = [Stage(18, 40, 15), Stage(36, 40, 12)]
-    by_view = estimate_views(rt, off, WobbleParameters.of(off), stages, GeometryCorrection(), SILENT).views
-    path, out, volume, page = (tmp_path / name for name in ("scan.h5", "out.h5", "volume.h5", "page.html"))
-    write_scan(path, off)
-    assert cli.run(["calibrate", str(path), "--what", "wobble", "--splines", "6", "-o", str(out), "--json"]) == 0
-    views = json.loads(capsys.readouterr().out)["views"]
-    assert list(views) == ["turn_deg", "shift_v_mm", "shift_u_mm"] and len(views["turn_deg"]) == 40
-    by_splines = np.c_[np.deg2rad(views["turn_deg"]), views["shift_v_mm"], views["shift_u_mm"]]
-    left, size = (np.sqrt(np.mean(values**2, axis=-2)) for values in (
-        np.stack([np.c_[by_view.turn_rad, by_view.shift_mm], by_splines]) - planted, planted))  # fmt: skip
-    assert np.all(left[1] < [0.4, 0.05, 0.05] * size) and np.all(left[1] < 0.8 * left[0]), left / size
-    assert load_scan(out).provenance["calibration"]["views"] == views
-    assert cli.run(["reconstruct", str(out), "--method", "fdk", "-o", str(volume)]) == 0
-    assert cli.run(["report", str(volume), "-o", str(page)]) == 0
-    section = page.read_text(encoding="utf-8").split('id="calibration"')[1].split("</section>")[0]
-    assert section.count("corrected</td>") == 3 and section.count("<svg") == 3
-
-
-def test_a_wobble_does_not_pass_for_a_roll(rt, monkeypatch) -> None:
-    """Asked together with what all views share, which is found beside it; found again, it is what is left, beside what had
-    been found before."""
-    how = {"size": 24, "detector": 36, "views": 30, "exposure_deg": 6.0, "noise": "tigre", "dose": 1e5}
-    scan = simulate("jaw", **how, device=rt)
-    course = np.cos(np.pi * np.linspace(0, 1, 30))
-    parameters = WobbleParameters.of(scan)
-    planted = parameters.without_gauges(np.stack([0 * course, 0.1 * course**2, 0.15 * course], -1))
-    offset_mm = 0.2
-    off = perturb(scan, GeometryCorrection(offset_u_mm=-offset_mm), parameters.views_of(-planted))
-    found = calibrate(off, rt, "offset-u,roll,wobble", splines=6)
-    lines = by_name(found)
-    assert lines["roll"].verdict == AGREES and lines["offset-u"].verdict == CORRECTED
-    assert abs(lines["offset-u"].found) < 0.02
-    np.testing.assert_allclose(found.per_view()["shift_v_mm"], planted[:, 1], atol=0.01)
-    asked: list[GeometryCorrection] = []
-    counted = "phyradgs_cl.calibrate.run.estimate_views"
-
-    def coarse(rt, scan, of, stages, correction, *more):
-        asked.append(correction)
-        return estimate_views(rt, scan, of, stages[:1], correction, *more)
-
-    monkeypatch.setattr(counted, coarse)
-    again = calibrate(found.scan, rt, "roll,wobble", splines=6)
-    assert by_name(again)["roll"].verdict == AGREES
-    now = again.scan.provenance
-    assert now["calibrated_before"] == [found.scan.provenance["calibration"]]
-    assert [one["name"] for one in now["calibration"]["parameters"]] == list(by_name(again))
-    assert asked == [GeometryCorrection()]  # nothing that all views share was off: they are not solved for again
-
-
-def test_a_figure_has_a_curve_for_each_number_of_a_view(right) -> None:
-    images = np.zeros((15, 4, 5), np.float32)
-    alone = Calibration(right, [], [], (1.0, 0.5), images, images)
-    sway = Sway.none(right, 7)
-    moving = replace(alone, views=replace(sway, coefficients=np.ones((7, 6))))
-    shifted = replace(alone, views=Views(np.zeros(15), np.ones((15, 2))))
-    left = replace(alone, views=Views(np.zeros(15), np.zeros((15, 2))))
-    count = [len(found.plot().axes) for found in (alone, shifted, moving, left)]
-    assert alone.per_view() == {} and alone.facts()["views"] == {}
-    assert repr(alone) == "Calibration(; residual 1, then 0.5)"
-    assert count[1] == count[0] + 1 and count[2] == count[0] + 2 and count[3] == count[0]  # a kind that is 0 was left alone
-    assert list(shifted.per_view()) == ["shift_v_mm", "shift_u_mm"]
-    last = moving.plot().axes[-1]
-    assert [line.get_label() for line in last.get_lines()] == ["shift x", "shift y", "shift z"]
-
-
-def test_an_object_that_moves_is_followed_and_the_file_has_its_poses(cli, rt, right, tmp_path, capsys) -> None:
-    """Frames that overlap in time are no hindrance: a motion is of time alone."""
-    parameters = MotionParameters.of(right)
-    course = np.zeros((SPLINES, 6))
-    course[:, 3:] = 0.15 * np.random.default_rng(2).normal(size=(SPLINES, 3))
-    planted = parameters.without_gauges(course)
-    path, out = tmp_path / "scan.h5", tmp_path / "out.h5"
-    write_scan(path, perturb(right, GeometryCorrection(), parameters.views_of(-planted)))
-    assert cli.run(["calibrate", str(path), "--what", "motion", "-o", str(out), "--json"]) == 0
-    lines = {one["name"]: one for one in json.loads(capsys.readouterr().out)["parameters"]}
-    sizes_mm = np.std(parameters.basis @ planted, 0)
-    for kind, axis in enumerate("xyz"):
-        one = lines[f"shift along {axis} of the object"]
-        assert one["verdict"] == CORRECTED and one["unit"] == "mm"
-        assert one["found"] == pytest.approx(sizes_mm[3 + kind], rel=0.2)
-    times_s = right.frame_start_s + right.shutter.middle_s
-    truth, stated, found = (
-        np.array([scan.trajectory.pose(f, t) for f, t in enumerate(times_s)])
-        for scan in (right, load_scan(path), load_scan(out))
-    )
-    assert np.std((found - truth)[:, :3]) < 0.25 * np.std((stated - truth)[:, :3])
-
-
-def test_a_still_object_stays_still(rt, right) -> None:
-    stages = [Stage(16, 30, 10), Stage(32, 30, 10)]
-    found = estimate_views(rt, right, MotionParameters.of(right), stages, GeometryCorrection(), SILENT)
-    shifts_mm = np.zeros(1) if found.views is None else found.views.coefficients[:, 3:]
-    assert np.abs(shifts_mm).max() < 0.02
-
-
-def test_gauges_of_a_motion_are_an_object_elsewhere_and_a_larger_one(right) -> None:
-    parameters = MotionParameters.of(right)
-    angle = np.deg2rad(24 * np.arange(15))
-    towards = np.linalg.lstsq(parameters.basis, np.stack([np.cos(angle), np.sin(angle)], -1), rcond=None)[0]
-    gauges = np.tile(np.arange(6.0), (SPLINES, 1))
-    gauges[:, 3:5] += towards
-    np.testing.assert_allclose(parameters.without_gauges(gauges), 0, atol=1e-9)
-    once = parameters.without_gauges(np.random.default_rng(0).normal(size=(SPLINES, 6)))
-    np.testing.assert_allclose(parameters.without_gauges(once), once, atol=1e-12)
-
-
-def test_gauges_of_views_are_what_another_object_looks_like(right) -> None:
-    angle = np.deg2rad(24 * np.arange(15))
-    gauges = np.stack([np.full(15, 0.1), np.full(15, 0.2), 0.3 * np.cos(angle) - 0.1 * np.sin(angle)], -1)
-    np.testing.assert_allclose(WobbleParameters.of(right).without_gauges(gauges), 0, atol=1e-12)
-    offset = np.zeros((15, 3))
-    offset[:, 2] = 0.2  # the panel's, which shows
-    np.testing.assert_allclose(WobbleParameters.of(right).without_gauges(offset), offset, atol=1e-12)
-
-
 def test_a_combination_in_words() -> None:
     said = in_words({"readout": 0.2, "exposure": -0.9, "start": 0.8, "roll": 0.01})
     assert said == "exposure against start: looks like an object turned about the axis, and smoother or sharper"
@@ -330,12 +170,6 @@ def test_what_cannot_be_asked_is_refused(rt, right, what, change, others, said) 
     with pytest.raises(InputError) as refused:
         calibrate(change(right), rt, what, [other(right) for other in others])
     assert said in str(refused.value)
-
-
-def test_splines_are_of_a_wobble(rt, right) -> None:
-    for what, splines, said in (("roll", 6, "with --what wobble"), ("wobble", 3, "from 4"), ("wobble", 16, "to 15")):
-        with pytest.raises(InputError, match=f"--splines: found {splines}; expected .*{said}"):
-            calibrate(right, rt, what, splines=splines)
 
 
 def test_views_of_frames_that_overlap_have_no_place_in_a_file(refused, right, tmp_path) -> None:

@@ -1,0 +1,140 @@
+"""Wrong sizes, units, orders and mirrored images of whole scans are named, and nothing else is blamed."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from check_kit import stated, suspected, verdicts
+
+from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry
+from phyradgs_cl.acquisition.altered.variants import reversed_rotation
+from phyradgs_cl.acquisition.geometry import default_grid
+from phyradgs_cl.check import CANNOT_TELL, SUSPICIOUS, check, consistency
+from phyradgs_cl.reconstructors.fits.axis import AxisShift
+
+
+def test_both_senses_are_looked_at_where_few_iterations_do_not_tell(rt, clean, monkeypatch) -> None:
+    """A scan turned the other way may fit a little better at first, and not in the end."""
+    other = reversed_rotation(clean)
+    monkeypatch.setattr(consistency, "reversed_rotation", lambda scan: other)
+    monkeypatch.setattr(consistency, "shifted", lambda scan, pixels: (scan, pixels))
+    first = {id(clean): 1.1, id(other): 1.0}
+    rough = lambda rt, scan: AxisShift(2.0, np.nan, np.array([first[id(scan)]]))  # noqa: E731
+    monkeypatch.setattr(consistency.axis, "rough_shift", rough)
+    monkeypatch.setattr(consistency.axis, "refined_shift", lambda rt, scan, rough: AxisShift(2.5, 0.1, rough.squares))
+    left = {id(clean): 0.1, id(other): 0.6}
+    monkeypatch.setattr(
+        consistency, "fit_squares", lambda rt, way: np.array([left[id(way[0])] if isinstance(way, tuple) else 2.0])
+    )
+    assert consistency._best_sense(rt, clean) == (clean, (clean, 2.5), 1.0)
+
+
+@pytest.fixture(scope="module", params=[0.0, 0.375])
+def aside(request, scan_of):
+    """A scan whose panel stands in its place, and one whose panel stands three pixels beside it, as stated."""
+    geometry = ConeGeometry(5.0, 7.0, (32, 32), (0.125, 0.125), (0.0, request.param))
+    return scan_of(geometry, views=15, exposure_deg=24.0, readout_ratio=0.5)
+
+
+def imported(scan, change=None, **geometry):
+    """Changed frames with another geometry stated, and the grid that an import makes of it."""
+    scan = scan if change is None else replace(scan, projections=np.ascontiguousarray(change(scan.projections)))
+    scan = stated(scan, **geometry)
+    return replace(scan, grid=default_grid(scan.geometry))
+
+
+def only_alarm(found):
+    """The only suspicious answer; the offset is then no matter."""
+    assert len(found.suspicious) == 1, found.suspicious
+    assert verdicts(found)["centre of rotation"] == CANNOT_TELL
+    assert not found.is_consistent and np.isnan(found.offset_mm)
+    return f"{found.suspicious[0].text} -> {found.suspicious[0].advice}"
+
+
+@pytest.mark.parametrize("factor", [0.1, 1000.0])
+def test_sizes_in_another_unit_are_no_offset(rt, aside, factor) -> None:
+    """Ten times too small, the panel has its axis beside it, where frames fit under any geometry."""
+    said = only_alarm(check(imported(aside, pixel_size_mm=(factor * 0.125,) * 2), rt))
+    assert f"pixel sizes {1 / factor:g} times as large" in said
+    assert ("they do not tell which" in said) == (aside.geometry.detector_offset_mm[1] == 0)
+
+
+@pytest.mark.parametrize("factor", [0.1, 10.0])
+def test_distances_in_another_unit_are_no_offset(rt, aside, factor) -> None:
+    far = {"source_to_axis_mm": 5.0 * factor, "source_to_detector_mm": 7.0 * factor}
+    said = only_alarm(check(imported(aside, **far), rt))
+    assert f"distances {1 / factor:g} times as large" in said and "pixel sizes" in said
+
+
+def test_frames_that_are_transposed_or_mirrored(rt, aside) -> None:
+    """A mirror in u turns the offset round, and that is no second finding."""
+    in_the_middle = aside.geometry.detector_offset_mm[1] == 0
+    change = (lambda p: p.swapaxes(1, 2)) if in_the_middle else (lambda p: np.rot90(p, axes=(1, 2)))
+    said = only_alarm(check(imported(aside, change), rt))
+    assert "transposed" in said and "one gives a mirror image" in said and "whose side is known" in said
+    said = only_alarm(check(imported(aside, lambda p: p[:, :, ::-1]), rt))
+    assert "mirrored in u" in said and "--column-0" in said
+    assert ("look the same" in said) == in_the_middle
+    found = check(imported(aside, lambda p: p[:, ::-1]), rt)
+    assert set(suspected(found)) <= {"sign of readout"}
+
+
+def test_a_grid_of_another_size_than_the_object(rt, clean) -> None:
+    small = stated(clean, pixel_size_mm=(0.0125, 0.0125))
+    finding = next(f for f in check(small, rt).findings if f.question == "coverage")
+    assert finding.verdict == SUSPICIOUS and "the grid 2 mm, and the panel sees 0.2" in finding.text
+
+
+def black(p):
+    p[7] = 10.0
+    return p
+
+
+def elsewhere(p):
+    p[9] = np.roll(p[9], 7, axis=1)
+    return p
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (black, "frame 7 is unlike all others"), (elsewhere, "frame 9 "),
+        (lambda p: p[[*range(6), 5, *range(7, 15)]], "frame 6 is frame 5 recorded twice"),
+        (lambda p: p[[0, 1, 2, 10, *range(4, 10), 3, *range(11, 15)]], "frames 3 and 10 (from 0) fit if"),
+        (lambda p: p[sorted(range(15), key=str)], "names without leading zeros"),
+        (lambda p: p[np.random.default_rng(3).permutation(15)], "cause not found"),
+    ],
+)
+def test_frames_that_do_not_fit_together_are_named(rt, clean, change, said) -> None:
+    """And nothing else is blamed: a black frame moves no panel."""
+    found = check(replace(clean, projections=change(clean.projections.copy())), rt)
+    assert "consistency" in suspected(found) and len(found.suspicious) <= 1 + (change is black)
+    assert said in found.suspicious[-1].text and found.suspicious[-1].advice
+
+
+@pytest.mark.parametrize(("factor", "said"), [(np.pi / 180, "radians"), (0.972, "% larger"), (1.03, "% smaller")])
+def test_a_step_of_the_angles_that_is_stated_wrong(rt, clean, factor, said) -> None:
+    sweeps = clean.trajectory.kinematics
+    scaled = replace(sweeps, angle_start_rad=factor * sweeps.angle_start_rad, angle_end_rad=factor * sweeps.angle_end_rad)
+    found = check(replace(clean, trajectory=CircularOrbit(clean.geometry, scaled)), rt)
+    finding = next(f for f in found.suspicious if f.question == "consistency")
+    assert said in finding.text and "354" not in finding.text
+    assert {f.question for f in found.suspicious} <= {"consistency", "angles"}
+
+
+def test_counts_that_begin_again_at_zero(rt, clean) -> None:
+    counts = np.round(7e4 * np.exp(-clean.projections)) % 65536
+    wrapped = np.log(7e4 / np.maximum(counts, 0.5)).astype(np.float32)
+    found = check(replace(clean, projections=wrapped), rt)
+    assert suspected(found) == ["saturation"] and "overflow" in found.suspicious[0].advice
+    assert verdicts(found)["centre of rotation"] == CANNOT_TELL and not found.is_consistent
+
+
+def test_an_object_that_looks_the_same_from_every_angle_raises_no_alarm(rt, clean) -> None:
+    """Noise that flats share is not independent from frame to frame, and a cylinder has nothing else to show."""
+    u = (np.arange(32) - 15.5) * 0.125 * 5 / 7
+    disc = np.sqrt(np.maximum(0.7**2 - u**2, 0)) * np.ones((32, 1))
+    rng = np.random.default_rng(5)
+    p = disc + 0.01 * rng.normal(size=(32, 32)) + 0.01 * rng.normal(size=clean.projections.shape)
+    found = check(replace(clean, projections=p.astype(np.float32)), rt)
+    assert found.suspicious == [] and verdicts(found)["sign of rotation"] == CANNOT_TELL
