@@ -20,7 +20,8 @@ from phyradgs_cl.report.run import Change, Run, computed_views, load_run, step_c
 from phyradgs_cl.runtime import Runtime
 
 DEFAULT_VIEWS = 3
-_SCRIPT = ("common", "shaders", "render", "space", "slices")  # in this order: space.js hears of the window from slices.js
+# space.js hears of the window from slices.js, and therefore comes before it
+_SCRIPT = ("common", "shaders", "render", "space", "slices", "rows")
 _SCRIPTED = ("volume",)  # sections that the script reveals
 
 

@@ -34,7 +34,7 @@ def orbit_chart(scan: Scan) -> Markup:
     arc = _first_arc(scan)
     first, last = (panel_corners(pose, scan.geometry.detector_shape)[:, :2] for pose in arc[[0, -1]])
     panel, later = (np.array([c[[0, 1]].mean(0), c[[2, 3]].mean(0)]) for c in (first, last))
-    box = _box_corners(scan)[:4, :2]
+    box = box_corners(scan)[:4, :2]
 
     def draw(axes: "Axes") -> None:
         axes.fill(*box.T, facecolor=BOX, edgecolor=SOFT)
@@ -62,7 +62,7 @@ def side_chart(scan: Scan) -> Markup:
     across = across / (np.linalg.norm(across) or 1.0)
     plane = np.array([[*across, 0.0], [0.0, 0.0, 1.0]]).T
     source, low, high = pose[:3] @ plane, corners[[0, 2]].mean(0) @ plane, corners[[1, 3]].mean(0) @ plane
-    (left, bottom), (right, top) = (f(_box_corners(scan) @ plane, axis=0) for f in (np.min, np.max))
+    (left, bottom), (right, top) = (f(box_corners(scan) @ plane, axis=0) for f in (np.min, np.max))
     box = np.array([[left, bottom], [right, bottom], [right, top], [left, top]])
     axis = np.array([[0.0, bottom], [0.0, top]]) * 1.25
 
@@ -113,11 +113,11 @@ def _plan(draw: "Callable[[Axes], None]", points: Sequence[Points], title: str, 
 
 
 def source_positions(scan: Scan) -> Points:
-    """Returns the poses (F, 12) of ``_with_sources`` in the middle of every frame's exposure."""
-    return _with_sources(scan, middle_poses(scan))
+    """Returns the poses (F, 12) of ``with_sources`` in the middle of every frame's exposure."""
+    return with_sources(scan, middle_poses(scan))
 
 
-def _with_sources(scan: Scan, poses: Points) -> Points:
+def with_sources(scan: Scan, poses: Points) -> Points:
     """Returns poses (..., 12) that begin with the source in mm. A parallel beam has a place on its middle ray instead, in
     front of the volume. Its panel, whose distance does not matter, is then behind the volume."""
     if not scan.is_parallel:
@@ -142,10 +142,10 @@ def _first_arc(scan: Scan) -> Points:
     """Returns poses (T, 12) of the first frame, from first light to last."""
     first_s, last_s = scan.shutter.lit_span_s if scan.is_fly else (scan.shutter.middle_s,) * 2
     times_s = scan.frame_start_s[0] + np.linspace(first_s, last_s, _ARC_SAMPLES)
-    return _with_sources(scan, scan.trajectory.pose(0, times_s))
+    return with_sources(scan, scan.trajectory.pose(0, times_s))
 
 
-def _box_corners(scan: Scan) -> Points:
+def box_corners(scan: Scan) -> Points:
     """Returns the corners (8, 3) x y z mm of the grid: the lower four in a circle, then the upper four."""
     half, centre = np.array(scan.grid.size_mm[::-1]) / 2, np.array(scan.grid.offset_mm[::-1])
     around = [(-1, -1), (1, -1), (1, 1), (-1, 1)]

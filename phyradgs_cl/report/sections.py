@@ -12,6 +12,7 @@ from phyradgs_cl.report import images
 from phyradgs_cl.report.atlas import space
 from phyradgs_cl.report.charts import Chart, convergence_charts, histogram, tuning_chart, views_chart
 from phyradgs_cl.report.markup import Markup, element, flattened, joined, label, number, shown, unit
+from phyradgs_cl.report.rows import frame_in_motion
 from phyradgs_cl.report.run import Change, Run
 from phyradgs_cl.report.scan_charts import frames_chart, orbit_chart, shutter_chart, shutter_words, side_chart
 from phyradgs_cl.report.viewer import stills, viewer
@@ -104,10 +105,11 @@ def shutter_section(run: Run, scan: Scan) -> Markup | None:
     caption = f"{words[0].upper()}{words[1:]}."
     if run.motion is not None:
         caption += f" {_motion_words(run.motion)}"
-    charts = [(caption, shutter_chart(scan, run.motion))]
+    charts, motion = [(caption, shutter_chart(scan, run.motion))], None
     if scan.is_fly:
         charts.append(("The first frames on one axis of time.", frames_chart(scan)))
-    return section("shutter", "Shutter in space and time", _charts(charts))
+        motion = element("div", frame_in_motion(scan), class_="scripted-only")
+    return section("shutter", "Shutter in space and time", _charts(charts), motion)
 
 
 def projections_section(scan: Scan, views: Sequence[FramePair]) -> Markup | None:

@@ -13,7 +13,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from playwright.sync_api import Browser, Page
+from playwright.sync_api import Browser, Page, expect
 from report.browser import POOR_CONTRAST, SOFTWARE, launched, watched
 
 from phyradgs_cl.io import read_volume, write_scan, write_volume
@@ -210,11 +210,12 @@ def test_zoom_keeps_the_crossing_in_sight_and_the_bar_true(page) -> None:
 
 def test_tab_reaches_every_control(page) -> None:
     reached = []
-    for _ in range(30):
+    for _ in range(40):
         page.keyboard.press("Tab")
         reached.append(page.evaluate("document.activeElement.id || document.activeElement.tagName"))
     sliders = {"slider-axial", "slider-coronal", "slider-sagittal", "black", "white", "zoom", "turn", "tilt", "space-zoom"}
-    assert sliders | {"reset", "layer-result", "space", "space-maximum", "space-reset", "SUMMARY"} <= set(reached)
+    others = {"reset", "layer-result", "space", "space-maximum", "space-reset", "rows", "rows-play", "rows-time", "SUMMARY"}
+    assert sliders | others <= set(reached)
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
@@ -247,3 +248,34 @@ def test_pictures_for_the_documentation(browser, address, tmp_path: Path) -> Non
             page.screenshot(path=folder / name, full_page=whole)
             assert (folder / name).stat().st_size > 10_000
         page.close()
+
+
+def test_the_frame_in_motion_plays_once_and_has_keys(page) -> None:
+    """It plays when it is first seen, and ends with all lines read; the slider and the button go anywhere by keys."""
+    canvas, time, play = page.locator("#rows"), page.locator("#rows-time"), page.locator("#rows-play")
+    canvas.scroll_into_view_if_needed()
+    expect(play).to_have_text("Pause")
+    play.focus()
+    page.keyboard.press("Enter")
+    expect(play).to_have_text("Play")
+    time.focus()
+    page.keyboard.press("Home")
+    expect(page.locator("#rows-reading")).to_contain_text("0 % read")
+    before = canvas.evaluate("canvas => canvas.toDataURL()")
+    page.keyboard.press("End")
+    expect(page.locator("#rows-reading")).to_contain_text("0 % of the rows exposed, 100 % read")
+    assert time.get_attribute("aria-valuetext") == page.locator("#rows-reading").inner_text().rstrip(".")
+    after = canvas.evaluate("canvas => canvas.toDataURL()")
+    canvas.focus()
+    page.keyboard.press("ArrowLeft")
+    page.wait_for_timeout(100)
+    assert len({before, after, canvas.evaluate("canvas => canvas.toDataURL()")}) == 3
+
+
+def test_nothing_moves_for_readers_who_want_no_motion(browser, address) -> None:
+    page = browser.new_page(reduced_motion="reduce")
+    page.goto(address)
+    page.locator("#rows").scroll_into_view_if_needed()
+    page.wait_for_timeout(500)
+    assert page.locator("#rows-play").inner_text() == "Play" and page.locator("#rows-time").input_value() == "500"
+    page.close()

@@ -21,9 +21,8 @@
     const image = new Image(), [nx, ny, nz] = data.counts;
     image.src = "data:image/png;base64," + data.atlas;
     await image.decode();
-    const sheet = document.createElement("canvas");
-    sheet.width = image.naturalWidth;
-    sheet.height = image.naturalHeight;
+    const { naturalWidth: width, naturalHeight: height } = image;
+    const sheet = Object.assign(document.createElement("canvas"), { width, height });
     const context = sheet.getContext("2d", { willReadFrequently: true });
     context.drawImage(image, 0, 0);
     const bytes = new Uint8Array(nx * ny * nz);
