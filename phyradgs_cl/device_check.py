@@ -14,7 +14,7 @@ from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, ConstantSpeed, 
 from phyradgs_cl.acquisition.cells import common_time_cells, exact_cells, micro_view_cells, static_cells
 from phyradgs_cl.acquisition.time_cells import TimeCells
 from phyradgs_cl.errors import DeviceError, OutOfMemoryError
-from phyradgs_cl.fields import Activation, Grid
+from phyradgs_cl.fields import Activation, Deformation, Grid
 from phyradgs_cl.fields.gaussians import DENSITY, MEAN, QUATERNION, SCALE
 from phyradgs_cl.objective import terms
 from phyradgs_cl.objective.dct_prox import FREQUENCY_CLASSES, Curves, DctProx, dct_prox
@@ -23,6 +23,10 @@ from phyradgs_cl.objective.tv import TvDescent, TvProx, tv_descent, tv_prox
 from phyradgs_cl.operators.splats.binning import TileLists
 from phyradgs_cl.operators.twins import rays as twins
 from phyradgs_cl.operators.twins.splat import moving_frame, splat_frame, splat_image, voxel_field
+from phyradgs_cl.operators.twins.warp import warp_adjoint, warp_forward
+from phyradgs_cl.operators.warp.operator import WarpedOperator
+from phyradgs_cl.operators.warp.states import MotionStates
+from phyradgs_cl.operators.warp.volume import VolumeWarp
 from phyradgs_cl.optim import DeviceAdam, adam_step
 from phyradgs_cl.runtime import DeviceSpace, HostSpace, Runtime
 from phyradgs_cl.runtime.layout import pad_rows, pitch_of, unpad_rows
@@ -200,6 +204,36 @@ def _rays(rt: Runtime) -> Iterator[Comparison]:
     yield found, twins.intensity_volume(frames[0], volume, GRID, table), VALUE
 
 
+def _warps(rt: Runtime) -> Iterator[Comparison]:
+    """A field that moves neighbours together, and one that moves them apart."""
+    volume, times_s = _noise(GRID.shape, 22), np.array([0.0, 1.0, 2.0])
+    for size_mm in (0.1, 3.0):
+        control_mm = size_mm * (_noise((2, 5, 5, 5, 3), 20) - 0.5)
+        weights = np.array([[1.0, 0.5], [0.3, -1.0], [0.0, 0.2]])
+        states = MotionStates.of_times(Deformation(control_mm, (-1.0,) * 3, 0.5, times_s, weights), GRID, times_s)
+        warp, fields = VolumeWarp(rt, states), states.fields_mm / GRID.voxel_size_mm[::-1]
+        for state, weights in enumerate(states.weights):
+            displacement = np.tensordot(weights, fields, 1)
+            moved = rt.download(warp.forward(state, warp.source(rt.upload(volume))))
+            yield moved, warp_forward(volume, displacement), VALUE
+            rt.write(warp.moved(), moved)
+            total, back = warp.zeros(), rt.empty(GRID.shape)
+            warp.adjoint(state, warp.moved(), total)
+            warp.read(total, back)
+            yield rt.download(back), warp_adjoint(moved, displacement), VALUE
+    tables = [static_cells(ORBIT, Shutter(0.8, 0.6), 0, start_s, SHAPE[0]) for start_s in (0.2, 1.2)]
+    operator = WarpedOperator(rt, GRID, SHAPE, tables, warp=VolumeWarp(rt, states))
+    shares = states.shares(np.concatenate([table.time_s for table in tables]))
+    expected = [
+        sum(
+            share * twins.ray_frame(warp_forward(volume, np.tensordot(weights, fields, 1)), GRID, table, SHAPE)
+            for share, weights in zip(of_states, states.weights, strict=True)
+        )
+        for of_states, table in zip(shares, tables, strict=True)
+    ]
+    yield operator.forward(volume), np.stack(expected), VALUE
+
+
 def _backprojections(rt: Runtime) -> Iterator[Comparison]:
     frames, weight, angles = _noise((3, *SHAPE), 7), np.array([0.5, 0.8, 1.0]), np.array([0.0, 1.3, 2.9])
     for tilt in (0.0, 0.02, 0.6):
@@ -267,7 +301,7 @@ def _optimiser(rt: Runtime) -> Iterator[Comparison]:
 
 
 CHECKS = (
-    _algebra, _binning, _splats, _layered_splats, _plain_splats, _voxels, _rays, _backprojections,
+    _algebra, _binning, _splats, _layered_splats, _plain_splats, _voxels, _rays, _warps, _backprojections,
     _image_terms, _variation, _optimiser,
 )  # fmt: skip
 """Ordered by dependence: a kernel that has agreed is not suspected later."""

@@ -13,7 +13,7 @@ from phyradgs_cl import checks
 from phyradgs_cl import reconstructors as methods
 from phyradgs_cl.errors import InputError, PhyradgsError
 from phyradgs_cl.importers import load_volume
-from phyradgs_cl.io import sha256_of
+from phyradgs_cl.io import read_deformation, sha256_of
 from phyradgs_cl.io.tables import read_toml
 from phyradgs_cl.parallel import Communicator
 from phyradgs_cl.runtime import Runtime, bytes_of
@@ -35,11 +35,15 @@ class Settings:
     device: str | None = None
     memory: int | None = None
 
-    def plan(self, initial: Path | None = None) -> methods.RunPlan:
-        """Returns the checked plan of a run that starts from the volume file ``initial``, if any."""
+    def plan(self, initial: Path | None = None, object_motion: Path | None = None) -> methods.RunPlan:
+        """Returns the checked plan of a run that starts from the volume file ``initial``, if any, of an object that moves as
+        the file ``object_motion`` says, if any."""
         values = dict(self.values)
         method, preset = (self._word(values, name) for name in ("method", "preset"))
-        run = {"seed": values.pop("seed", 0), "initial": None if initial is None else _initial_volume(initial)}
+        run = {
+            "seed": values.pop("seed", 0), "initial": None if initial is None else _initial_volume(initial),
+            "object_motion": None if object_motion is None else _object_motion(object_motion),
+        }  # fmt: skip
         # an option of the command line means what --help says, whatever the method calls its own
         flags = [f.name for f in fields(methods.Preprocessing) if self.origins.get(f.name) == _flag(f.name)]
         method = method or methods.DEFAULT_METHOD
@@ -103,6 +107,11 @@ def _initial_volume(path: Path) -> methods.InitialVolume:
         raise InputError("--initial", f"{path}, values without voxel sizes", "a volume with its grid in mm")
     facts = {"initial": str(path), "initial_sha256": sha256_of(path)}
     return methods.InitialVolume(volume.values, volume.grid, facts)
+
+
+def _object_motion(path: Path) -> methods.ObjectMotion:
+    facts = {"object_motion": str(path), "object_motion_sha256": sha256_of(path)}
+    return methods.ObjectMotion(read_deformation(path), facts)
 
 
 def _flag(key: str) -> str:

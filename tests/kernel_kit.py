@@ -30,6 +30,7 @@ ROLLING = Shutter(0.8, 0.6)
 CPU_ONLY = {
     "backproject_leaning", "backproject_upright", "bin_count", "bin_fill", "bin_starts", "bin_within", "rays_upright",
     "rays_upright_adjoint", "splat_backward_rows", "splat_forward_rows", "turn_upright", "merge_slots", "split_slots",
+    "warp_adjoint_rows",
 }  # fmt: skip
 
 

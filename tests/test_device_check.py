@@ -14,6 +14,7 @@ from phyradgs_cl.runtime.opencl import kernel_source
 KERNELS = Path(__file__).resolve().parent.parent / "cl"
 GPU_ONLY = {"splat_forward_pixels", "splat_backward_group"}
 GPU_ONLY |= {"bin_count_group", "bin_within_group", "bin_starts_group", "bin_fill_group"}
+GPU_ONLY |= {"warp_adjoint_fixed", "warp_adjoint_sum"}
 SHAPES = {"CPU": ({"pixel_items": False}, GPU_ONLY), "GPU": ({"lanes": 1, "pixel_items": True}, CPU_ONLY)}
 
 

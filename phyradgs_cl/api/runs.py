@@ -30,7 +30,7 @@ from phyradgs_cl.io import (
 from phyradgs_cl.phantoms import PHANTOMS
 from phyradgs_cl.prepare import DEFAULT_STEPS, flat_correction
 from phyradgs_cl.progress import Ticker, has_reader
-from phyradgs_cl.reconstructors import DEFAULT_METHOD, Reconstruction, State, preprocessing_of
+from phyradgs_cl.reconstructors import DEFAULT_METHOD, ObjectMotion, Reconstruction, State, preprocessing_of
 from phyradgs_cl.reconstructors import reconstruct as run_method
 from phyradgs_cl.reconstructors.frames.preprocess import prepared
 from phyradgs_cl.reconstructors.plan import InitialVolume, plan_run
@@ -184,8 +184,8 @@ def reconstruct(
     scan: Scan, method: "str | Callable[..., Reconstruction | np.ndarray]" = DEFAULT_METHOD, *,
     preset: str | None = None, grid: Grid | None = None, seed: int = 0,
     report: "ProgressReport | bool" = True, resume: Reconstruction | None = None,
-    initial: "Reconstruction | np.ndarray | None" = None, on_interrupt: str = "raise", device: Device = None,
-    **options: Any,
+    initial: "Reconstruction | np.ndarray | None" = None, object_motion: Deformation | None = None,
+    on_interrupt: str = "raise", device: Device = None, **options: Any,
 ) -> Reconstruction:
     """Reconstructs the volume (nz, ny, nx) of a scan in 1/mm, and with splats the Gaussians in mm.
 
@@ -206,6 +206,7 @@ def reconstruct(
     resume: the partial result of an interrupted run of the same scan, options, seed and first volume.
     initial: the volume from which an iterative or splatting method starts: a result, resampled to this grid, or an array
     (nz, ny, nx) in 1/mm on the scan's grid.
+    object_motion: how the object moves, for methods of voxels and fdk; the volume is its reference (docs/moving.md).
     on_interrupt: what Ctrl-C or a notebook's stop button does after the present iteration: "raise" a KeyboardInterrupt
     whose attribute ``partial`` is the result so far, or None; "return" that result.
     device: what ``--device`` takes, or a Runtime.
@@ -220,6 +221,10 @@ def reconstruct(
     plan = plan_run(method, options, preset=preset, seed=seed)
     if initial is not None:
         plan = replace(plan, initial=_first_volume(initial, scan.with_grid(plan.preprocessing).grid))
+    if object_motion is not None:
+        if not isinstance(object_motion, Deformation):
+            raise InputError("object_motion", checks.short_repr(object_motion), "a Deformation")
+        plan = replace(plan, object_motion=ObjectMotion(object_motion))
     state = None if resume is None else _state_of(resume)
     result: Reconstruction | None = None
     try:

@@ -30,6 +30,9 @@ Device = Annotated[str | None, option(_DEVICE, "best by capability")]
 _MEMORY = f"Limit of device memory, such as 2GiB; larger volumes are cut into bricks (large.md). Also ${MEMORY_VARIABLE}."
 Memory = Annotated[str | None, option(_MEMORY, "what the device has", metavar="SIZE")]
 
+_OBJECT_MOTION = "Deformation file, or simulated scan, with the motion of the object during the scan (docs: moving.md)."
+ObjectMotion = Annotated[Path | None, file_option(_OBJECT_MOTION, "--object-motion")]
+
 _STEPS = f"Corrections of the frames, of {', '.join(STEPS)} (docs: prepare.md)."
 STEPS_OF_PREPARE = option(_STEPS, DEFAULT_STEPS, metavar="NAME,...")
 Steps = Annotated[str | None, option(_STEPS, "none", metavar="NAME,...")]
@@ -96,7 +99,7 @@ _MARGIN = "Width around the box, mm, that is reconstructed and discarded: for ob
 RUN_GROUPS = {
     "Basics": ("output", "method", "motion", "size", "iterations"),
     "Volume": ("voxel_mm", "roi_mm", "margin_mm", "initial", "rows", "slab"),
-    "Motion": ("strips", "sub_intervals", "segments", "time_error", "detector_model"),
+    "Motion": ("object_motion", "strips", "sub_intervals", "segments", "time_error", "detector_model"),
     "Quality": (
         *("prior", "preset", "assignments", "tune", "holdout", "steps", "median_filter", "ignore_lag", "gaussians", "seed"),
     ),

@@ -11,7 +11,7 @@ from phyradgs_cl import signals
 from phyradgs_cl.acquisition.motion import motion_facts
 from phyradgs_cl.acquisition.plausible import blur_line
 from phyradgs_cl.commands.console import complain, file_option, last_words, option, say, scores
-from phyradgs_cl.commands.options import RUN_GROUPS, Output, Scan, with_run_options
+from phyradgs_cl.commands.options import RUN_GROUPS, ObjectMotion, Output, Scan, with_run_options
 from phyradgs_cl.estimate import duration, estimate, seconds_around
 from phyradgs_cl.io import partial_path
 from phyradgs_cl.parallel import failing_together, launched_ranks
@@ -44,6 +44,7 @@ _PREVIEW = "PNG of the three middle slices; during the run NAME.partial.png, eve
 def reconstruct_command(
     scan: Scan, output: Output, settings: Settings,
     initial: Annotated[Path | None, file_option("Volume to start from.", "--initial")] = None,
+    object_motion: ObjectMotion = None,
     resume: Annotated[bool, option("Continue an interrupted run from its checkpoint.", True, "--resume")] = False,
     checkpoint_every: Annotated[float, option(_CHECKPOINT, metavar="SECONDS")] = 600.0,
     preview: Annotated[Path | None, file_option(_PREVIEW, "--preview")] = None,
@@ -53,7 +54,7 @@ def reconstruct_command(
     slab: Annotated[int, option(_SLAB, "as memory allows", metavar="ROWS", min=0)] = 0,
 ) -> None:
     """Reconstruct a scan into a volume; print PSNR and SSIM if the scan carries the truth. Defaults are those of fista."""
-    plan, ranks = settings.plan(initial), launched_ranks()
+    plan, ranks = settings.plan(initial, object_motion), launched_ranks()
     ticker, runtimes = Ticker("iteration"), list[Runtime]()
 
     def stage(text: str) -> None:
@@ -66,7 +67,7 @@ def reconstruct_command(
         stage("building kernels")
         return runtimes[-1]
 
-    inputs = [path for path in (settings.config, initial) if path is not None]
+    inputs = [path for path in (settings.config, initial, object_motion) if path is not None]
     listeners: list[ProgressReport] = [ticker.progress]
     with failing_together(ranks, last_words), ticker, ExitStack() as stack:
         page = None
@@ -127,9 +128,9 @@ def _finish(page: LivePage, result: Reconstruction, scan: Path, output: Path, rt
 
 
 @with_run_options("seed", "tune")
-def estimate_command(scan: Scan, settings: Settings) -> None:
+def estimate_command(scan: Scan, settings: Settings, object_motion: ObjectMotion = None) -> None:
     """Estimate the time and memory of a reconstruction, from a few iterations of it."""
-    plan = settings.plan()
+    plan = settings.plan(object_motion=object_motion)
     loaded = load_scan(scan, plan.preprocessing.flats)
     rt = settings.runtime()
     before_s = time.process_time()  # a run will start, and read the scan, as this command did

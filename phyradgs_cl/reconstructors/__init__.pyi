@@ -1,6 +1,7 @@
 from .checkpoint import State as State
 from .frames.preprocess import Preprocessing as Preprocessing
 from .method import Method as Method
+from .object_motion import ObjectMotion as ObjectMotion
 from .options import method_options as method_options
 from .options import preprocessing_names as preprocessing_names
 from .options import preprocessing_of as preprocessing_of

@@ -10,10 +10,12 @@ import numpy as np
 
 from phyradgs_cl import checks
 from phyradgs_cl.acquisition import Scan
-from phyradgs_cl.fields import Grid
+from phyradgs_cl.errors import InputError
+from phyradgs_cl.fields import Deformation, Grid
 from phyradgs_cl.reconstructors.frames.preprocess import Preprocessing
+from phyradgs_cl.reconstructors.object_motion import ObjectMotion
 from phyradgs_cl.reconstructors.options import method_options, preprocessing_names, preprocessing_of
-from phyradgs_cl.reconstructors.registry import DEFAULT_METHOD, method_name
+from phyradgs_cl.reconstructors.registry import DEFAULT_METHOD, METHODS, method_name, method_of
 from phyradgs_cl.reconstructors.result import option_facts
 
 LARGEST_SEED = 2**63
@@ -32,16 +34,30 @@ class InitialVolume:
 @dataclass(frozen=True, eq=False)
 class RunPlan:
     """What to run on a scan. method: a name as from ``method_name``, or a function of the user's own. options: the method's,
-    checked. preprocessing: what happens to the frames first. Raises InputError for a seed out of range."""
+    checked. preprocessing: what happens to the frames first. Raises InputError for a seed out of range, and for an object
+    that moves with a method that takes it to be at rest."""
 
     method: "str | Callable[..., Any]"
     options: Any
     preprocessing: Preprocessing = Preprocessing()
     seed: int = 0
     initial: InitialVolume | None = None
+    object_motion: ObjectMotion | None = None
 
     def __post_init__(self) -> None:
         checks.whole("--seed", self.seed, 0, LARGEST_SEED)
+        if self.object_motion is not None:
+            self._check_object_motion()
+
+    def _check_object_motion(self) -> None:
+        if not method_of(self.method).takes_deformation:
+            names = ", ".join(name for name, method in METHODS.items() if method.takes_deformation)
+            expected = f"a method whose object may move: {names}"
+            raise InputError("--object-motion", f"--method {self.method_name}", expected, "choose one of them")
+        for name in ("holdout", "tune"):
+            if getattr(self.preprocessing, name):
+                found = f"--{name}, which compares frames of an object at rest"
+                raise InputError("--object-motion", found, "one of the two", f"leave --{name} out")
 
     @property
     def method_name(self) -> str:
@@ -59,6 +75,7 @@ class RunPlan:
             "input": self.preprocessing.facts(),
             **option_facts(self.options),
             "initial": None if self.initial is None else _digest(self.initial.values.astype(np.float32)),
+            **({} if self.object_motion is None else {"object_motion": _deformation_digest(self.object_motion.deformation)}),
         }
 
 
@@ -70,6 +87,10 @@ def _geometry(scan: Scan) -> Iterator[np.ndarray]:
         yield np.round(scan.trajectory.pose(frame, start_s + span_s), _DECIMALS) + 0.0  # + 0.0 makes a 0 of a -0
 
 
+def _deformation_digest(one: Deformation) -> str:
+    return _digest(one.control_mm, np.array([one.origin_mm, one.spacing_mm]), one.times_s, one.weights)
+
+
 def _digest(*arrays: np.ndarray) -> str:
     digest = hashlib.sha256()
     for array in arrays:
@@ -79,7 +100,8 @@ def _digest(*arrays: np.ndarray) -> str:
 
 def plan_run(
     method: object = DEFAULT_METHOD, values: Mapping[str, Any] | None = None, *, preset: str | None = None,
-    seed: int = 0, initial: InitialVolume | None = None, of_preprocessing: Collection[str] = (),
+    seed: int = 0, initial: InitialVolume | None = None, object_motion: ObjectMotion | None = None,
+    of_preprocessing: Collection[str] = (),
 ) -> RunPlan:
     """Returns the plan of a run: ``values`` by name over the method's preset.
 
@@ -90,4 +112,5 @@ def plan_run(
     preprocessing = preprocessing_of({name: own.pop(name) for name in names if name in own})
     options = method_options(method, preset, own, preprocessing.tune)
     checks.whole("--seed", seed, 0, LARGEST_SEED)
-    return RunPlan(method if callable(method) else method_name(method), options, preprocessing, int(seed), initial)
+    named = method if callable(method) else method_name(method)
+    return RunPlan(named, options, preprocessing, int(seed), initial, object_motion)

@@ -26,6 +26,7 @@ from phyradgs_cl.reconstructors.frames.projected import (
     holdout_errors,
     spread_frames,
 )
+from phyradgs_cl.reconstructors.object_motion import check_object_motion
 from phyradgs_cl.reconstructors.plan import InitialVolume, RunPlan
 from phyradgs_cl.reconstructors.registry import METHODS, method_of
 from phyradgs_cl.reconstructors.result import (
@@ -71,6 +72,9 @@ def reconstruct(
     check_own_motion(getattr(options, "motion", None), ready)
     if plan.initial is not None:
         more["initial"] = _initial(plan, plan.initial, ready.grid)
+    if plan.object_motion is not None:
+        check_object_motion(plan.object_motion.deformation, ready)
+        more["deformation"] = plan.object_motion.deformation
     hidden = held_out(ready, preprocessing.holdout) if preprocessing.holdout else None
     visible = ready if hidden is None else with_masked(ready, hidden)
     run = partial(method_of(plan.method).run, rt=rt, seed=plan.seed)

@@ -104,7 +104,7 @@ def run_reconstruction(
         export = f"write volume.h5, then 'phyradgs export volume.h5 -o {plain_text(output.name)}'"
         check_output(output, scan, *inputs, remedy=export)
         refuse_overwriting("-o", partial_path(output), scan, *inputs)
-    parts = _slabs_of(slabs, scan, ranks)
+    parts = _slabs_of(plan, slabs, scan, ranks)
     if resume and not parts:
         check_resumable(plan)
     with only_run(output) if leads else nullcontext():
@@ -113,12 +113,15 @@ def run_reconstruction(
         return _reconstructed(plan, scan, output, make_runtime, report, resume, checkpoint_every_s)
 
 
-def _slabs_of(slabs: Slabs, scan: Path, ranks: Communicator | None) -> list[tuple[int, int]]:
+def _slabs_of(plan: methods.RunPlan, slabs: Slabs, scan: Path, ranks: Communicator | None) -> list[tuple[int, int]]:
     """Returns the slabs of a run, none for the whole scan at once. Raises InputError for slabs under several ranks."""
     if slabs == _ALL_ROWS and surely_fits(scan):
         return []
     with expecting(scan, "scan"):
         parts = slabs.of(read_scan_header(scan))
+    if parts and plan.object_motion is not None:
+        expected, remedy = "all rows at a time: matter moves from slab to slab", "leave --rows and --slab out"
+        raise InputError("--object-motion", "slabs of rows", expected, remedy)
     if parts and ranks is not None and ranks.size > 1:
         raise InputError("--rows", f"slabs on {ranks.size} ranks", "one rank", "run a slab of rows on each machine")
     return parts
@@ -238,7 +241,8 @@ def _provenance(
         **result.facts, "program": f"phyradgs-cl {__version__}", "python": platform.python_version(),
         "device": rt.device.name, "device_version": rt.device.version, "seed": plan.seed,
         "input": plan.preprocessing.facts(), "scan": str(scan), "scan_sha256": scan_hash,
-        **(plan.initial.facts if plan.initial else {}), "record": result.record,
+        **(plan.initial.facts if plan.initial else {}), **(plan.object_motion.facts if plan.object_motion else {}),
+        "record": result.record,
     }
 
 

@@ -5,7 +5,7 @@ s_k = w_k exp(−p_k) / Σ_j w_j exp(−p_j). Jᵀ y = Σ_k A_kᵀ (s_k y). This
 cell of a line; together they cost as much as one launch over all cells. Twin: ``intensity_frame`` in twins/rays.py.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from copy import copy
 from typing import Any
 
@@ -26,20 +26,21 @@ class IntensityOperator:
     """I(x), and J and Jᵀ at the last volume given to ``expected`` (A and Aᵀ before the first).
 
     Arguments are those of ``RayOperator``, as is the rule for NumPy and device arrays. The operator stores one stack of
-    frames (F, rows, columns) of softmax weights for each cell of a line.
+    frames (F, rows, columns) of softmax weights for each cell of a line. ``projector`` makes the A_k.
     """
 
     def __init__(
-        self, rt: Runtime, grid: Grid, detector_shape: tuple[int, int], tables: Sequence[TimeCells]
+        self, rt: Runtime, grid: Grid, detector_shape: tuple[int, int], tables: Sequence[TimeCells],
+        projector: Callable[..., Any] = RayOperator,
     ) -> None:
         ones, weights = layered(tables)
         self.volume_shape = grid.shape
         self.frames_shape = (len(tables), *detector_shape)
-        self._operators: list[RayOperator] = []
+        self._operators: list[Any] = []
         # One memory for all layers, which run one after the other. The operator over all cells needs the largest.
         memory = RayOperator(rt, grid, detector_shape, tables).memory
         for part in ones:
-            self._operators.append(RayOperator(rt, grid, detector_shape, part, memory=memory))
+            self._operators.append(projector(rt, grid, detector_shape, part, memory=memory))
         self._by_row = tables[0].axis == "rows"
         self._device = DeviceSpace(rt)
         self._shares: list[Any] = []
@@ -48,7 +49,8 @@ class IntensityOperator:
     @property
     def memory(self) -> RayMemory:
         """The memory that the projectors of all layers share."""
-        return self._operators[0].memory
+        memory: RayMemory = self._operators[0].memory
+        return memory
 
     @property
     def holds(self) -> tuple[int, int]:

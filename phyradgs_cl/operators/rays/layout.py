@@ -203,7 +203,7 @@ def voxel_matrices(pose: np.ndarray, grid: Grid, is_parallel: bool = False) -> n
 def layers(table: TimeCells) -> list[TimeCells]:
     """Splits the cells of a frame into tables in which no line has more than one cell. Keeps their order."""
     numbers = table.layer_numbers
-    return [_some(table, np.flatnonzero(numbers == k)) for k in range(int(numbers.max()) + 1)]
+    return [some_cells(table, np.flatnonzero(numbers == k)) for k in range(int(numbers.max()) + 1)]
 
 
 def layered(tables: Sequence[TimeCells]) -> tuple[list[list[TimeCells]], list[np.ndarray]]:
@@ -235,7 +235,8 @@ def averaged(integrals: Sequence[np.ndarray], weights: Sequence[np.ndarray], ave
     return frames.astype(np.float32)
 
 
-def _some(table: TimeCells, cells: Sequence[int] | np.ndarray) -> TimeCells:
+def some_cells(table: TimeCells, cells: Sequence[int] | np.ndarray) -> TimeCells:
+    """Returns the table of some still cells."""
     names = ["pose", "time_s", "line_start", "line_stop", "weight"]
     names += [] if table.line_share is None else ["line_share"]
     return replace(table, **{name: getattr(table, name)[cells] for name in names})
@@ -243,5 +244,5 @@ def _some(table: TimeCells, cells: Sequence[int] | np.ndarray) -> TimeCells:
 
 def _empty(table: TimeCells) -> TimeCells:
     """Returns a table with one cell that serves no line: a table must not be empty."""
-    one = _some(table, [0])
+    one = some_cells(table, [0])
     return replace(one, line_stop=one.line_start.copy(), weight=np.zeros(1))

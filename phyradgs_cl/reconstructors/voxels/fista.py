@@ -156,7 +156,7 @@ def fista(scan: Scan, options: FistaOptions, rt: Runtime, **arguments: Any) -> R
     return result
 
 
-METHOD = Method(fista, {"default": FistaOptions()}, is_shared=True, takes_initial=True)
+METHOD = Method(fista, {"default": FistaOptions()}, is_shared=True, takes_initial=True, takes_deformation=True)
 
 
 def fista_stages(inputs: MethodInputs) -> list[Stage]:

@@ -13,7 +13,7 @@ from phyradgs_cl import checks
 from phyradgs_cl.acquisition import Motion, Scan, Static
 from phyradgs_cl.acquisition.motion import RAYS, check_motion, motions_for
 from phyradgs_cl.acquisition.scan import DETECTOR_MODELS
-from phyradgs_cl.fields import Grid
+from phyradgs_cl.fields import Deformation, Grid
 from phyradgs_cl.reconstructors.checkpoint import State, check_like, count_of, state_arrays
 from phyradgs_cl.reconstructors.loop import Loop
 from phyradgs_cl.reconstructors.method import Method
@@ -93,7 +93,8 @@ class Algorithm:
 
 @dataclass(frozen=True, eq=False)
 class MethodInputs:
-    """The arguments of one run: scan, options, device, seed, report, the state to resume from, the first volume in 1/mm."""
+    """The arguments of one run: scan, options, device, seed, report, the state to resume from, the first volume in 1/mm, and
+    how the object moves."""
 
     scan: Scan
     options: Any
@@ -102,6 +103,7 @@ class MethodInputs:
     report: ProgressReport = ignore_progress
     resume: State | None = None
     initial: np.ndarray | None = None
+    deformation: Deformation | None = None
 
 
 def run_iterations(
@@ -114,7 +116,7 @@ def run_iterations(
     ‖x − x'‖/‖x‖, and the seconds since the start."""
     started = time.perf_counter()
     scan, options, rt = inputs.scan, inputs.options, inputs.rt
-    system = System.of_scan(rt, scan, options.motion, options.detector_model)
+    system = System.of_scan(rt, scan, options.motion, options.detector_model, deformation=inputs.deformation)
     if options.transmission_weights:
         system = system.transmission_weighted()
     system = system.resident(rt, volumes + 2, frames + _SYSTEM_FRAMES)
@@ -151,7 +153,9 @@ def voxel_method(
             name, lambda system: make(system, options, inputs), inputs, volumes=held, frames=frames
         )
 
-    return Method(run, {"default": default}, is_shared=True, takes_initial=True, ends_anywhere=True)
+    return Method(
+        run, {"default": default}, is_shared=True, takes_initial=True, ends_anywhere=True, takes_deformation=True
+    )
 
 
 class _Iterations:

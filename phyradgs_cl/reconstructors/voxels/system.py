@@ -13,8 +13,10 @@ import numpy as np
 
 from phyradgs_cl.acquisition import Motion, Scan
 from phyradgs_cl.detector import noise_level, transmission_weights
+from phyradgs_cl.fields import Deformation
 from phyradgs_cl.operators.rays.intensity import IntensityOperator
 from phyradgs_cl.operators.rays.operator import LinearOperator, RayOperator
+from phyradgs_cl.operators.warp.operator import WarpedOperator, projector_of
 from phyradgs_cl.parallel import Communicator, exact_sum, span
 from phyradgs_cl.runtime import DeviceSpace, HostSpace, MemoryShortage, Runtime, Space
 
@@ -44,18 +46,22 @@ class System:
 
     @classmethod
     def of_scan(
-        cls, rt: Runtime, scan: Scan, motion: Motion, detector_model: str = "log", fewest_lines: int | None = None
-    ) -> "System":
-        """Returns the system of a scan under ``motion``. detector_model: log, intensity, or scan for the stated one.
-        fewest_lines: as in ``RayOperator``."""
+        cls, rt: Runtime, scan: Scan, motion: Motion, detector_model: str = "log", *, fewest_lines: int | None = None,
+        deformation: Deformation | None = None,
+    ) -> "System":  # fmt: skip
+        """Returns the system of a scan under ``motion``, of an object that moves as ``deformation`` does.
+
+        detector_model: log, intensity, or scan for the stated one. fewest_lines: as in ``RayOperator``, for objects at rest."""
         tables = [motion.cells(scan, f).still() for f in range(scan.frames)]
         shape = scan.geometry.detector_shape
-        operator: LinearOperator = RayOperator(rt, scan.grid, shape, tables, fewest_lines=fewest_lines)
+        projector = projector_of(rt, scan.grid, tables, deformation)
+        lines = {} if fewest_lines is None else {"fewest_lines": fewest_lines}
+        operator: LinearOperator = projector(rt, scan.grid, shape, tables, **lines)
         measured = np.asarray(scan.projections, np.float32)
         model = scan.detector_model if detector_model == "scan" else detector_model
         intensity: IntensityOperator | SharedIntensity | None = None
         if model == "intensity" and any(table.averages for table in tables):  # both models agree on a single value
-            alone = IntensityOperator(rt, scan.grid, shape, tables)
+            alone = IntensityOperator(rt, scan.grid, shape, tables, projector)
             intensity = SharedIntensity(rt.ranks, alone) if rt.ranks.size > 1 else alone
         if rt.ranks.size > 1:
             operator = SharedOperator(rt.ranks, operator)
@@ -68,12 +74,14 @@ class System:
         """Returns the system on the device, if it has room for the operators, the volumes, and stacks of all frames.
 
         Otherwise the system stays on the host. It always does in bricks and on several ranks, which sum there."""
-        operators = [o for o in (self.operator, self.intensity) if isinstance(o, (RayOperator, IntensityOperator))]
+        kinds = RayOperator, WarpedOperator, IntensityOperator
+        operators = [o for o in (self.operator, self.intensity) if isinstance(o, kinds)]
         if len(operators) < 1 + (self.intensity is not None):
             return self
-        if isinstance(self.intensity, IntensityOperator):
-            more_volumes, more_frames = self.intensity.holds
-            volumes, frames = volumes + more_volumes, frames + more_frames
+        for operator in operators:
+            if not isinstance(operator, RayOperator):
+                more_volumes, more_frames = operator.holds
+                volumes, frames = volumes + more_volumes, frames + more_frames
         volume_bytes, frames_bytes = 4 * math.prod(self.operator.volume_shape), self.measured.nbytes
         sizes_bytes = [volume_bytes] * volumes + [frames_bytes] * frames
         try:

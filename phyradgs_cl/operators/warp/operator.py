@@ -1,0 +1,152 @@
+"""The system matrix of a moving object: A x = Σ_k P_k W_k x over the states k, and its exact transpose.
+
+W_k warps the volume to a state. P_k projects it to the time cells of that state, each with its share of it: a cell between
+two states is a blend of both (``states.py``)."""
+
+from collections.abc import Callable, Sequence
+from copy import copy
+from dataclasses import replace
+from functools import partial
+from typing import cast
+
+import numpy as np
+
+from phyradgs_cl.acquisition.time_cells import TimeCells
+from phyradgs_cl.errors import OutOfMemoryError
+from phyradgs_cl.fields import Deformation, Grid
+from phyradgs_cl.operators.rays.layout import some_cells
+from phyradgs_cl.operators.rays.memory import RayMemory
+from phyradgs_cl.operators.rays.operator import RayOperator
+from phyradgs_cl.operators.warp.states import MotionStates
+from phyradgs_cl.operators.warp.volume import VolumeWarp
+from phyradgs_cl.runtime import DeviceArray, Runtime, SameArray
+
+
+class WarpedOperator:
+    """Ray-driven projector of an object that moves as the states of ``warp`` do; a ``LinearOperator``.
+
+    Arguments and arrays are those of ``RayOperator``. The volume must fit on the device as a whole. ``forward`` warps the
+    volume once for each state that the operator's frames use. Operators of one ``warp`` or ``memory`` share buffers: use
+    them one at a time. Raises OutOfMemoryError for a volume in bricks."""
+
+    def __init__(
+        self, rt: Runtime, grid: Grid, detector_shape: tuple[int, int], tables: Sequence[TimeCells], *, warp: VolumeWarp,
+        memory: RayMemory | None = None,
+    ) -> None:  # fmt: skip
+        self.rt, self.grid, self.warp = rt, grid, warp
+        self.volume_shape, self.detector_shape = grid.shape, detector_shape
+        self.memory = memory or RayOperator(rt, grid, detector_shape, tables).memory
+        self._parts = [
+            _Part(rt, state, frames, RayOperator(rt, grid, detector_shape, shared, memory=self.memory))
+            for state, (frames, shared) in enumerate(_tables_by_state(tables, warp))
+            if shared
+        ]
+        self._set_frames(len(tables))
+
+    def _set_frames(self, count: int) -> None:
+        self.frames_shape = (count, *self.detector_shape)
+
+    def forward(self, volume: SameArray, out: SameArray | None = None) -> SameArray:
+        """Returns A x for a volume (nz, ny, nx) in 1/mm: frames (F, rows, columns) float32."""
+        return self._on_device(self._forward, volume, self.frames_shape, out)
+
+    def _forward(self, volume: DeviceArray, frames: DeviceArray) -> None:
+        self.rt.fill(frames, 0)
+        source, stack = self.warp.source(volume), self.warp.stack
+        for part in self._parts:
+            moved = volume if self.warp.is_still(part.state) else self.warp.forward(part.state, source)
+            part.operator.forward(moved, out=stack.of(len(part.frames), self.detector_shape))
+            stack.add(part.places, frames)
+
+    def adjoint(self, frames: SameArray, out: SameArray | None = None) -> SameArray:
+        """Returns Aᵀ y for frames (F, rows, columns): a volume (nz, ny, nx) float32."""
+        return self._on_device(self._adjoint, frames, self.volume_shape, out)
+
+    def _adjoint(self, frames: DeviceArray, volume: DeviceArray) -> None:
+        total = self.warp.zeros()
+        for part in self._parts:
+            moved = part.operator.adjoint(self.warp.stack.take(frames, part.frames), out=self.warp.moved())
+            self.warp.adjoint(part.state, moved, total)
+        self.warp.read(total, volume)
+
+    def _on_device(
+        self, function: Callable[[DeviceArray, DeviceArray], None], values: SameArray, shape: tuple[int, ...],
+        out: SameArray | None,
+    ) -> SameArray:  # fmt: skip
+        """Runs ``function(values, result)`` on the device; the result lies where the values lie."""
+        if (bricks := len(self.memory.plan())) > 1:
+            found = f"room for the volume in {bricks} bricks"
+            expected = "room for the whole volume, which an object that moves needs"
+            raise OutOfMemoryError("device memory", found, expected, "allow more with --memory")
+        is_there = isinstance(values, DeviceArray)
+        result = out if isinstance(out, DeviceArray) else self.rt.empty(shape)
+        function(values if isinstance(values, DeviceArray) else self.rt.upload(values, np.float32), result)
+        if is_there:
+            return cast(SameArray, result)
+        on_host = self.rt.download(result)
+        if out is None:
+            return cast(SameArray, on_host)
+        np.copyto(cast(np.ndarray, out), on_host)
+        return out
+
+    def subset(self, frames: Sequence[int]) -> "WarpedOperator":
+        """Returns the operator of some of the frames, in this order. Keep it if you use it again: it keeps its tables."""
+        chosen = np.asarray(frames, np.int64)
+        part = copy(self)
+        part._parts = [piece for each in self._parts if (piece := each.subset(self.rt, chosen)) is not None]
+        part._set_frames(len(chosen))
+        return part
+
+    @property
+    def holds(self) -> tuple[int, int]:
+        """Volumes and stacks of frames on the device besides ``memory`` and the fields."""
+        return self.warp.volumes, 1
+
+
+class _Part:
+    """The projector P_k of one state, for the frames (n,) of the stack that use it."""
+
+    def __init__(self, rt: Runtime, state: int, frames: np.ndarray, operator: RayOperator) -> None:
+        self.state, self.frames, self.operator = state, frames, operator
+        self.places = rt.upload(frames, np.int32)
+
+    def subset(self, rt: Runtime, chosen: np.ndarray) -> "_Part | None":
+        """Returns the part of the ``chosen`` frames of the stack; None where none of them uses the state."""
+        position = np.full(max(int(chosen.max()), int(self.frames.max())) + 1, -1)
+        position[self.frames] = np.arange(len(self.frames))
+        own = position[chosen]
+        uses = np.flatnonzero(own >= 0)
+        return _Part(rt, self.state, uses, self.operator.subset(own[uses])) if uses.size else None
+
+
+def projector_of(
+    rt: Runtime, grid: Grid, tables: Sequence[TimeCells], deformation: Deformation | None
+) -> Callable[..., RayOperator | WarpedOperator]:
+    """Returns what makes the projector of an object that moves as ``deformation`` does at the times of ``tables``.
+
+    It takes the arguments of ``RayOperator``, which it is for an object at rest."""
+    if deformation is None:
+        return RayOperator
+    states = MotionStates.of_times(deformation, grid, np.concatenate([table.time_s for table in tables]))
+    return RayOperator if states.is_at_rest else partial(WarpedOperator, warp=VolumeWarp(rt, states))
+
+
+def _tables_by_state(
+    tables: Sequence[TimeCells], warp: VolumeWarp
+) -> list[tuple[np.ndarray, list[TimeCells]]]:
+    """Returns for each state the frames that use it, and their tables of cells with its share of their weights."""
+    ends = np.cumsum([table.count for table in tables])[:-1]
+    shares = np.split(warp.states.shares(np.concatenate([table.time_s for table in tables])), ends)
+    by_state = []
+    for state in range(warp.states.count):
+        shared = [_with_share(table, share[:, state]) for table, share in zip(tables, shares, strict=True)]
+        frames = np.flatnonzero([table is not None for table in shared])
+        by_state.append((frames, [table for table in shared if table is not None]))
+    return by_state
+
+
+def _with_share(table: TimeCells, share: np.ndarray) -> TimeCells | None:
+    cells = np.flatnonzero((share > 0) & (table.line_stop > table.line_start))
+    if cells.size == 0:
+        return None
+    return replace(some_cells(table, cells), weight=table.weight[cells] * share[cells])

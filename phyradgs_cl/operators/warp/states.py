@@ -1,0 +1,94 @@
+"""Representative states of a moving object. Operators warp a volume to each state once, and blend two for each time."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from phyradgs_cl.fields import Deformation, Grid
+
+MOST_STATES = 20
+_SPACING = 0.6  # voxels, RMS where the object moves, between a time and its nearest state
+_MOVES = 0.1  # of the largest squared displacement: voxels that move as much count in that RMS
+
+
+@dataclass(frozen=True, eq=False)
+class MotionStates:
+    """States of ``deformation``, and how times are blended of two of them.
+
+    fields_mm: (R, nz, ny, nx, 3) displacements of unit weight on ``grid``, components x, y, z. weights: (K, R) of each
+    state. metric: (R, R); the distance of two weights is √(dᵀ metric d), an RMS displacement in voxels."""
+
+    deformation: Deformation
+    grid: Grid
+    fields_mm: np.ndarray
+    weights: np.ndarray
+    metric: np.ndarray
+
+    @classmethod
+    def of_times(cls, deformation: Deformation, grid: Grid, times_s: np.ndarray) -> "MotionStates":
+        """Chooses states for times (T,) in s: each next one is the time furthest from the states so far."""
+        units = np.eye(deformation.rank)
+        fields_mm = np.stack([deformation.on_grid_mm(grid, unit) for unit in units])
+        voxel_mm = min(grid.voxel_size_mm)
+        moving = np.square(fields_mm).sum((0, -1))
+        moves = moving >= _MOVES * moving.max(initial=0.0)
+        parts = fields_mm[:, moves].reshape(len(units), -1).astype(np.float64) / voxel_mm
+        metric = parts @ parts.T / max(np.count_nonzero(moves), 1)
+        seen = np.unique(deformation.weights_at(times_s), axis=0)
+        chosen = [int(np.argmin(_length(seen - seen.mean(0), metric)))]
+        while len(chosen) < MOST_STATES:
+            distance = np.min([_length(seen - seen[k], metric) for k in chosen], axis=0)
+            furthest = int(np.argmax(distance))
+            if distance[furthest] <= (_SPACING if len(chosen) > 1 else 0.0):
+                break
+            chosen.append(furthest)
+        return cls(deformation, grid, fields_mm, seen[chosen], metric)
+
+    @property
+    def count(self) -> int:
+        """The number of states K."""
+        return len(self.weights)
+
+    @property
+    def is_at_rest(self) -> bool:
+        """Whether the object stays where the reference volume has it."""
+        return self.count == 1 and self.is_still(0)
+
+    def is_still(self, state: int) -> bool:
+        """Whether nothing is displaced in a state."""
+        return not np.any(self._has_effect & (self.weights[state] != 0))
+
+    @cached_property
+    def _has_effect(self) -> np.ndarray:
+        """Whether a field displaces anything (R,)."""
+        return np.array([field.any() for field in self.fields_mm])
+
+    def shares(self, times_s: np.ndarray | Sequence[float]) -> np.ndarray:
+        """Returns the share of each state (T, K) at times (T,); at most two of a row are above 0, and their sum is 1.
+
+        The pair has the smallest error, in voxels: the distance of the time's weights from the line between the two states,
+        and the blur of blending two volumes that are displaced against each other."""
+        wanted = self.deformation.weights_at(times_s)
+        shares, least = np.zeros((len(wanted), self.count)), np.full(len(wanted), np.inf)
+        for first in range(self.count):
+            from_first = wanted - self.weights[first]
+            for second in range(first, self.count):
+                line = self.weights[second] - self.weights[first]
+                squared = float(line @ self.metric @ line)
+                share = np.clip(from_first @ self.metric @ line / squared, 0, 1) if squared > 0 else np.zeros(len(wanted))
+                error = _length(from_first - share[:, None] * line, self.metric) + share * (1 - share) * squared / 2
+                better = np.flatnonzero(error < least)
+                least[better] = error[better]
+                shares[better] = 0
+                shares[better, second] = share[better]
+                shares[better, first] += 1 - share[better]
+        return shares
+
+
+def _length(difference: np.ndarray, metric: np.ndarray) -> np.ndarray:
+    """Returns the distances (T,) of weights (T, R)."""
+    squared: np.ndarray = np.einsum("tr,rs,ts->t", difference, metric, difference)
+    result: np.ndarray = np.sqrt(np.maximum(squared, 0))
+    return result

@@ -1,0 +1,152 @@
+"""Warps of a volume on the device, W_k of each state k, and their exact transposes (cl/warp.cl)."""
+
+import numpy as np
+
+from phyradgs_cl.checks import ceil_div
+from phyradgs_cl.operators.bricks import whole
+from phyradgs_cl.operators.rays.layout import RayLayout
+from phyradgs_cl.operators.warp.states import MotionStates
+from phyradgs_cl.runtime import DeviceArray, DeviceSpace, Kernel, Runtime
+from phyradgs_cl.runtime.layout import GUARD, Strides, move
+
+_MOST_OWNED = 8  # slices of the result that a CPU's work-item owns; it repeats the voxels that reach another's too
+_ITEMS_PER_UNIT = 4
+_HEADROOM = 64  # by which a sum of one voxel's shares may exceed 1, as where the field contracts by 4 along each axis
+_ROUNDING = 1e-3  # voxels
+
+
+class VolumeWarp:
+    """(W_k v)(y) = v(y + w_k(y)), trilinear, 0 outside the volume, for the states of ``states``.
+
+    Holds 3 R volumes on the device for the R fields; a state's displacement is their weighted sum, made where it is used.
+    Results have the same bits in every run: no sum depends on the order of work-items."""
+
+    def __init__(self, rt: Runtime, states: MotionStates) -> None:
+        self.rt, self.states, self.shape = rt, states, states.grid.shape
+        fields = np.stack([states.fields_mm[..., i] / states.grid.voxel_size_mm[2 - i] for i in range(3)], 1)
+        self._fields = rt.upload(np.pad(fields.ravel(), (0, GUARD)), np.float32)
+        self._shares = [rt.upload(weights, np.float32) for weights in states.weights]
+        layout = RayLayout(states.grid, 1, 1, whole(self.shape))
+        self._floats, self._strides = layout.volume_floats, layout.volume_strides
+        self._source: DeviceArray | None = None
+        self._total: DeviceArray | None = None
+        self._moved: DeviceArray | None = None
+        self._sums: DeviceArray | None = None
+        self._space = DeviceSpace(rt)
+        self.stack = FrameStack(rt, self.kernel("add_frames"))
+        self._reaches = [] if rt.pixel_items else [self._reach(fields[:, 2], k) for k in range(states.count)]
+
+    volumes = 4  # that it holds besides the fields, at most
+
+    def is_still(self, state: int) -> bool:
+        """Whether W_k is the identity."""
+        return self.states.is_still(state)
+
+    def source(self, volume: DeviceArray) -> DeviceArray:
+        """Returns a volume (nz, ny, nx) in the layout of ``forward``'s; the next call overwrites it."""
+        if self._source is None:
+            self._source = self.rt.zeros(self._floats)
+        move(self.rt, (volume, Strides.plain(self.shape)), (self._source, self._strides), self.shape)
+        return self._source
+
+    def forward(self, state: int, source: DeviceArray) -> DeviceArray:
+        """Returns W_k v (nz, ny, nx); the next call overwrites it."""
+        nz, ny, nx = self.shape
+        result, blocks = self.moved(), ceil_div(nx, self.rt.lanes)
+        self.rt.launch(
+            self.kernel("warp_forward"), (blocks, ny, nz), source, self._strides.vector(), self._fields,
+            self._shares[state], self._size(), result, group=self.rt.group(on_cpu=min(blocks, 8)),
+        )  # fmt: skip
+        return result
+
+    def moved(self) -> DeviceArray:
+        """Returns memory for a volume (nz, ny, nx) of one state; zeros follow its last voxel."""
+        if self._moved is None:
+            self._moved = self.rt.zeros(int(np.prod(self.shape)) + GUARD)
+        return DeviceArray(self._moved.buffer, self.shape, self._moved.dtype)
+
+    def zeros(self) -> DeviceArray:
+        """Returns zeros in the layout of ``adjoint``'s sum; the next call overwrites it."""
+        if self._total is None:
+            self._total = self.rt.empty(self._floats)
+        self.rt.fill(self._total, 0)
+        return self._total
+
+    def adjoint(self, state: int, moved: DeviceArray, total: DeviceArray) -> None:
+        """Adds W_kᵀ v to ``total`` for a volume v in the memory of ``moved``."""
+        if self.rt.pixel_items:
+            self._adjoint_fixed(state, moved, total)
+            return
+        slices, rows = self._reaches[state]
+        owned = min(max(self.shape[0] // (_ITEMS_PER_UNIT * self.rt.device.compute_units), 1), _MOST_OWNED)
+        self.rt.launch(
+            self.kernel("warp_adjoint_rows"), ceil_div(self.shape[0], owned), moved, self._fields, self._shares[state],
+            self._size(), slices, rows, owned, self._strides.vector(), total,
+        )  # fmt: skip
+
+    def read(self, total: DeviceArray, result: DeviceArray) -> None:
+        """Copies a sum to a volume (nz, ny, nx)."""
+        move(self.rt, (total, self._strides), (result, Strides.plain(self.shape)), self.shape)
+
+    def _adjoint_fixed(self, state: int, moved: DeviceArray, total: DeviceArray) -> None:
+        """Adds integers: 2³¹ / ``_HEADROOM`` is the largest voxel, so that rounding is that of float32."""
+        largest = self._space.largest(moved, absolute=True)
+        if not largest > 0:
+            return
+        nz, ny, nx = self.shape
+        if self._sums is None:
+            self._sums = self.rt.empty(self.shape, np.int32)
+        self.rt.fill(self._sums, 0)
+        unit, group = largest * _HEADROOM / 2**31, self.rt.group(on_cpu=1)
+        kernel = self.kernel("warp_adjoint_fixed")
+        self.rt.launch(
+            kernel, (nx, ny, nz), moved, self._fields, self._shares[state], self._size(), np.float32(1 / unit),
+            self._sums, group=group,
+        )  # fmt: skip
+        sums = self._sums, np.float32(unit), self._size(), self._strides.vector(), total
+        self.rt.launch(self.kernel("warp_adjoint_sum"), (nx, ny, nz), *sums, group=group)
+
+    def kernel(self, name: str) -> Kernel:
+        """Returns a kernel of cl/warp.cl."""
+        return self.rt.kernel("warp", name, RANK=len(self.states.fields_mm))
+
+    def _size(self) -> np.ndarray:
+        return np.array([*self.shape[::-1], 0], np.int32)
+
+    def _reach(self, fields_z: np.ndarray, state: int) -> tuple[DeviceArray, DeviceArray]:
+        """Returns the least and largest displacement along z of every slice (nz, 2) and row (nz, ny, 2), in voxels."""
+        along_z = np.tensordot(self.states.weights[state].astype(np.float32), fields_z.astype(np.float32), 1)
+        rows = np.stack([along_z.min(-1) - _ROUNDING, along_z.max(-1) + _ROUNDING], -1)
+        slices = np.stack([rows[..., 0].min(1), rows[..., 1].max(1)], -1)
+        return self.rt.upload(slices, np.float32), self.rt.upload(rows, np.float32)
+
+
+class FrameStack:
+    """Memory for the frames of one state at a time on the device."""
+
+    def __init__(self, rt: Runtime, add: Kernel) -> None:
+        self.rt, self._add = rt, add
+        self._memory: DeviceArray | None = None
+        self._shape: tuple[int, ...] = ()
+
+    def of(self, count: int, detector_shape: tuple[int, int]) -> DeviceArray:
+        """Returns memory for ``count`` frames; the next call overwrites it."""
+        self._shape = (count, *detector_shape)
+        if self._memory is None or self._memory.size < np.prod(self._shape):
+            self._memory = self.rt.empty(self._shape)
+        return DeviceArray(self._memory.buffer, self._shape, self._memory.dtype)
+
+    def take(self, frames: DeviceArray, chosen: np.ndarray) -> DeviceArray:
+        """Returns some of the frames (F, rows, columns)."""
+        taken = self.of(len(chosen), (frames.shape[1], frames.shape[2]))
+        each = taken.nbytes // len(chosen)
+        for k, frame in enumerate(chosen.tolist()):
+            self.rt.copy(frames, taken, nbytes=each, source_offset=frame * each, target_offset=k * each)
+        return taken
+
+    def add(self, places: DeviceArray, frames: DeviceArray) -> None:
+        """Adds the frames that were asked for last to those at ``places`` (n,) of ``frames``."""
+        assert self._memory is not None
+        count, pixels = self._shape[0], int(np.prod(self._shape[1:]))
+        group = self.rt.group(on_cpu=min(pixels, 64))
+        self.rt.launch(self._add, (pixels, count), self._memory, places, pixels, frames, group=group)

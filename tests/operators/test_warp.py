@@ -1,0 +1,170 @@
+"""Warps of a volume and projectors of a moving object: twins, transposes, and the same bits where nothing moves."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from kernel_kit import assert_near
+from tolerances import ADJOINT, FLOAT32, RAYS
+
+from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, ConstantSpeed, Shutter
+from phyradgs_cl.acquisition.cells import common_time_cells, static_cells
+from phyradgs_cl.acquisition.time_cells import TimeCells
+from phyradgs_cl.errors import OutOfMemoryError
+from phyradgs_cl.fields import Deformation, Grid, control_points
+from phyradgs_cl.operators import IntensityOperator, RayOperator
+from phyradgs_cl.operators.bricks import whole
+from phyradgs_cl.operators.rays.memory import RayMemory
+from phyradgs_cl.operators.twins.warp import warp_adjoint, warp_forward
+from phyradgs_cl.operators.warp.operator import WarpedOperator, projector_of
+from phyradgs_cl.operators.warp.states import MOST_STATES, MotionStates
+from phyradgs_cl.operators.warp.volume import VolumeWarp
+from phyradgs_cl.runtime import Runtime
+
+GRID = Grid((11, 9, 21), (0.2, 0.25, 0.1), (0.1, -0.05, 0.0))
+SHAPE = (12, 16)
+GEOMETRY = ConeGeometry(5.0, 7.5, SHAPE, (0.35, 0.3))
+TIMES_S = np.linspace(0.0, 6.0, 25)
+
+
+def deformation(size_mm: float, rank: int = 2, seed: int = 0) -> Deformation:
+    """A smooth random field, and weights on a loop."""
+    origin_mm, counts = control_points(GRID, 0.6)
+    control_mm = np.random.default_rng(seed).normal(scale=size_mm, size=(rank, *counts, 3))
+    phases = 2 * np.pi * (TIMES_S[:, None] / 4.0 - np.arange(rank) / (2 * rank))
+    return Deformation(control_mm, origin_mm, 0.6, TIMES_S, np.cos(phases))
+
+
+def tables(frames: int = 4) -> list[TimeCells]:
+    orbit, shutter = CircularOrbit(GEOMETRY, ConstantSpeed(0.3, 1.0)), Shutter(0.8, 0.6)
+    start_s = 1.2 * np.arange(frames)
+    return [common_time_cells(orbit, shutter, f, start_s, SHAPE[0], 3) for f in range(frames)]
+
+
+def noise(shape: tuple[int, ...], seed: int = 1) -> np.ndarray:
+    return np.random.default_rng(seed).uniform(0.0, 1.0, shape).astype(np.float32)
+
+
+def states_of(one: Deformation) -> MotionStates:
+    return MotionStates.of_times(one, GRID, TIMES_S)
+
+
+def adjoint(warp: VolumeWarp, state: int, values: np.ndarray) -> np.ndarray:
+    warp.rt.write(warp.moved(), values)
+    total, result = warp.zeros(), warp.rt.empty(GRID.shape)
+    warp.adjoint(state, warp.moved(), total)
+    warp.read(total, result)
+    return warp.rt.download(result)
+
+
+@pytest.mark.parametrize("size_mm", [0.02, 0.3, 5.0])  # neighbours that move together, that part, far outside
+def test_warps_are_their_twins(any_rt, size_mm) -> None:
+    states = states_of(deformation(size_mm))
+    warp, volume = VolumeWarp(any_rt, states), noise(GRID.shape)
+    displacement = np.tensordot(states.weights[1], states.fields_mm, 1) / GRID.voxel_size_mm[::-1]
+    moved = any_rt.download(warp.forward(1, warp.source(any_rt.upload(volume))))
+    assert_near(moved, warp_forward(volume, displacement), FLOAT32)
+    assert_near(adjoint(warp, 1, volume), warp_adjoint(volume, displacement), FLOAT32)
+
+
+def test_warps_have_exact_transposes(rt) -> None:
+    """Also of values of either sign, whose sums nearly cancel."""
+    warp = VolumeWarp(rt, states_of(deformation(0.3)))
+    x, y = noise(GRID.shape, 2) - np.float32(0.5), noise(GRID.shape, 3) - np.float32(0.5)
+    forward = rt.download(warp.forward(0, warp.source(rt.upload(x)))).astype(np.float64)
+    size = np.linalg.norm(forward) * np.linalg.norm(y)
+    assert abs(np.vdot(forward, y) - np.vdot(x.astype(np.float64), adjoint(warp, 0, y))) <= ADJOINT * size
+
+
+def test_sums_repeat(rt) -> None:
+    warp, values = VolumeWarp(rt, states_of(deformation(0.3))), noise(GRID.shape)
+    np.testing.assert_array_equal(adjoint(warp, 0, values), adjoint(warp, 0, values))
+
+
+def warped(rt: Runtime, one: Deformation, cells: list[TimeCells]) -> WarpedOperator:
+    operator = projector_of(rt, GRID, cells, one)(rt, GRID, SHAPE, cells)
+    assert isinstance(operator, WarpedOperator)
+    return operator
+
+
+def test_the_projector_is_the_sum_over_states_and_has_its_transpose(rt) -> None:
+    cells = tables()
+    operator = warped(rt, deformation(0.1), cells)
+    states, x, y = operator.warp.states, noise(GRID.shape), noise((4, *SHAPE), 2)
+    forward, backward = operator.forward(x), operator.adjoint(y)
+    one, other = np.vdot(forward.astype(np.float64), y), np.vdot(x.astype(np.float64), backward)
+    assert abs(one - other) <= ADJOINT * abs(one)
+    fields = states.fields_mm / GRID.voxel_size_mm[::-1]
+    moved = [warp_forward(x, np.tensordot(w, fields, 1)).astype(np.float32) for w in states.weights]
+    for frame, table in enumerate(cells):
+        shares, expected = states.shares(table.time_s), np.zeros(SHAPE)
+        for cell in range(table.count):
+            alone = TimeCells(
+                table.pose[[cell]], table.time_s[[cell]], table.line_start[[cell]], table.line_stop[[cell]],
+                table.weight[[cell]], table.lines, line_share=table.line_share[[cell]],
+            )  # fmt: skip
+            of_cell = RayOperator(rt, GRID, SHAPE, [alone])
+            expected += sum(share * of_cell.forward(v)[0] for share, v in zip(shares[cell], moved, strict=True) if share)
+        assert_near(forward[frame], expected, 2 * RAYS)
+
+
+def test_subsets_are_rows_and_devices_agree_with_the_host(rt) -> None:
+    operator, x, y = warped(rt, deformation(0.1), tables()), noise(GRID.shape), noise((2, *SHAPE))
+    part = operator.subset([3, 1])
+    np.testing.assert_array_equal(part.forward(x), operator.forward(x)[[3, 1]])
+    again = part.subset([1])
+    np.testing.assert_array_equal(again.forward(x), operator.forward(x)[[1]])
+    np.testing.assert_array_equal(rt.download(part.forward(rt.upload(x))), part.forward(x))
+    np.testing.assert_array_equal(rt.download(part.adjoint(rt.upload(y))), part.adjoint(y))
+
+
+def test_an_object_at_rest_has_the_bits_of_today(rt) -> None:
+    """Also one that has moved by zero before it is projected."""
+    cells, x, y = tables(), noise(GRID.shape), noise((4, *SHAPE))
+    plain, at_rest = RayOperator(rt, GRID, SHAPE, cells), deformation(0.0)
+    assert isinstance(projector_of(rt, GRID, cells, at_rest)(rt, GRID, SHAPE, cells), RayOperator)
+    operator = WarpedOperator(rt, GRID, SHAPE, cells, warp=VolumeWarp(rt, states_of(at_rest)))
+    np.testing.assert_array_equal(operator.forward(x), plain.forward(x))
+    np.testing.assert_array_equal(operator.adjoint(y), plain.adjoint(y))
+
+
+def test_a_rigid_field_is_a_moved_scanner(rt) -> None:
+    """Of whole voxels: the object at y is what the reference has at y + w, as a scanner sees it that is w further."""
+    shift_mm = np.array([3 * 0.1, -0.25, 2 * 0.2])  # x, y, z
+    control_mm = np.broadcast_to(shift_mm, (1, 11, 11, 11, 3))
+    one = Deformation(control_mm, (-2.5,) * 3, 0.5, np.zeros(1), np.ones((1, 1)))
+    inner = np.zeros(GRID.shape, np.float32)
+    inner[3:-3, 2:-2, 4:-4] = noise(GRID.shape)[3:-3, 2:-2, 4:-4]
+    cells = [static_cells(CircularOrbit(GEOMETRY, ConstantSpeed(0.3, 1.0)), Shutter(0.8, 0.6), 0, 0.5, SHAPE[0])]
+    moved_pose = cells[0].pose + np.concatenate([shift_mm, shift_mm, np.zeros(6)])
+    expected = RayOperator(rt, GRID, SHAPE, [replace(cells[0], pose=moved_pose)]).forward(inner)
+    assert_near(warped(rt, one, cells).forward(inner), expected, 2 * RAYS)
+
+
+def test_intensity_follows_the_object(rt) -> None:
+    """With one cell per line both detector models are the same; with several the softmax weights sum to 1."""
+    cells, x = tables(), noise(GRID.shape) * np.float32(0.1)
+    one = deformation(0.1)
+    projector = projector_of(rt, GRID, cells, one)
+    mean = projector(rt, GRID, SHAPE, cells).forward(x)
+    intensity = IntensityOperator(rt, GRID, SHAPE, cells, projector)
+    assert_near(intensity.forward(x), mean, 2 * RAYS)  # at a volume of zeros
+    expected = intensity.expected(x)
+    assert np.all(expected <= mean + RAYS * mean.max()) and np.abs(expected - mean).max() > 1e-4 * mean.max()
+
+
+def test_states_cover_the_motion(rt) -> None:
+    states = states_of(deformation(0.3))
+    shares = states.shares(TIMES_S)
+    assert 2 < states.count <= MOST_STATES
+    np.testing.assert_allclose(shares.sum(1), 1, atol=1e-12)
+    assert (shares > 0).sum(1).max() == 2
+    off = shares @ states.weights - states.deformation.weights_at(TIMES_S)
+    assert np.sqrt(np.einsum("tr,rs,ts->t", off, states.metric, off)).max() < 1.0  # voxels
+
+
+def test_a_volume_in_bricks_is_refused(rt, monkeypatch) -> None:
+    operator = warped(rt, deformation(0.1), tables())
+    monkeypatch.setattr(RayMemory, "plan", lambda self, share=1.0: [whole(GRID.shape)] * 2)
+    with pytest.raises(OutOfMemoryError, match="2 bricks"):
+        operator.forward(noise(GRID.shape))

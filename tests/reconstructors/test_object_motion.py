@@ -1,0 +1,133 @@
+"""Reconstructions of an object whose motion is known: nearer to its reference than without, resumed to the same bits."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, ConstantSpeed, PerRow, Scan, Shutter
+from phyradgs_cl.errors import InputError
+from phyradgs_cl.fields import Deformation, Grid, control_points
+from phyradgs_cl.io import read_volume, write_deformation, write_scan
+from phyradgs_cl.operators.warp.operator import projector_of
+from phyradgs_cl.phantoms import shepp_logan
+from phyradgs_cl.reconstructors import METHODS, ObjectMotion, RunPlan, method_options, plan_run, reconstruct
+from phyradgs_cl.reconstructors.result import Progress
+from phyradgs_cl.runtime import Runtime
+
+GRID, SHAPE, FRAMES = Grid.cube(16, 2.0), (24, 24), 30
+MOVING = [name for name, method in METHODS.items() if method.takes_deformation]
+ITERATIVE = [name for name in MOVING if name not in ("fdk", "fbp")]
+
+
+def breathing(amplitude_mm: float = 0.25, rank: int = 2) -> Deformation:
+    """The upper part rises and falls, and moves along y a little later."""
+    origin_mm, counts = control_points(GRID, 0.5)
+    z_mm = origin_mm[2] + 0.5 * np.arange(counts[0])
+    share = np.clip((z_mm + 1) / 2, 0, 1)[:, None, None]
+    control_mm = np.zeros((rank, *counts, 3))
+    control_mm[0, ..., 2], control_mm[-1, ..., 1] = amplitude_mm * share, -amplitude_mm / 3 * share
+    times_s = np.linspace(0, 13, 100)
+    phases = [1 - np.cos(np.pi * (times_s - 0.4 * r) / 4) ** 4 for r in range(rank)]
+    return Deformation(control_mm, origin_mm, 0.5, times_s, np.stack(phases, -1))
+
+
+@pytest.fixture(scope="module")
+def scan(rt) -> Scan:
+    """Frames of a fine volume that moves, as a rolling shutter sees it from a gantry that turns."""
+    geometry = ConeGeometry(5.0, 7.0, SHAPE, (4 / 24, 4 / 24))
+    fine, start_s = GRID.finer(2), 0.4 * np.arange(FRAMES)
+    orbit, shutter = CircularOrbit(geometry, ConstantSpeed(0.0, 2 * np.pi / 12)), Shutter(0.4, 0.3)
+    truth = shepp_logan(0.9).voxelise(fine)
+    empty = Scan(np.zeros((FRAMES, *SHAPE), np.float32), geometry, orbit, shutter, start_s, GRID)
+    tables = [PerRow(6).cells(empty, f) for f in range(FRAMES)]
+    frames = projector_of(rt, fine, tables, breathing())(rt, fine, SHAPE, tables).forward(truth)
+    reference = truth.reshape(16, 2, 16, 2, 16, 2).mean((1, 3, 5))
+    return replace(empty, projections=frames, reference=reference)
+
+
+def plan_of(method: str, moves: bool = True, **changes: object) -> RunPlan:
+    motion = {} if method in ("fdk", "fbp") else {"motion": "per-row", "sub_intervals": 2}
+    options = method_options(method, None, {**motion, **changes})
+    return RunPlan(method, options, object_motion=ObjectMotion(breathing()) if moves else None)
+
+
+def error(scan: Scan, volume: np.ndarray) -> float:
+    return float(np.sqrt(np.mean((volume - scan.reference) ** 2)))
+
+
+@pytest.mark.parametrize("method", ["fista-tv", "fista", "os-sart"])
+def test_the_reference_is_nearer(rt, scan, method) -> None:
+    changes = {"iterations": 12}
+    moved, ignored = (reconstruct(scan, plan_of(method, moves, **changes), rt).volume for moves in (True, False))
+    assert error(scan, moved) < 0.7 * error(scan, ignored)
+
+
+@pytest.mark.parametrize("method", ITERATIVE)
+def test_runs_resume_to_the_same_bits(rt, scan, method) -> None:
+    plan = plan_of(method, iterations=3, **({"subvoxels": 1} if method == "fista" else {}))
+
+    def stop(progress: Progress) -> None:
+        if progress.iteration == 2:
+            raise KeyboardInterrupt
+
+    whole = reconstruct(scan, plan, rt)
+    partial = reconstruct(scan, plan, rt, report=stop)
+    assert partial.state is not None
+    np.testing.assert_array_equal(reconstruct(scan, plan, rt, resume=partial.state).volume, whole.volume)
+    other = replace(plan, object_motion=ObjectMotion(breathing(0.2)))
+    with pytest.raises(InputError, match="object_motion"):
+        reconstruct(scan, other, rt, resume=partial.state)
+
+
+def test_an_object_at_rest_has_the_bits_of_no_field(rt, scan) -> None:
+    plan = plan_of("fista", iterations=3)
+    at_rest = replace(plan, object_motion=ObjectMotion(breathing(0.0)))
+    plain = reconstruct(scan, replace(plan, object_motion=None), rt)
+    np.testing.assert_array_equal(reconstruct(scan, at_rest, rt).volume, plain.volume)
+
+
+def test_intensity_and_a_gpu_follow_too(scan) -> None:
+    """Volumes of a GPU's launch shape, with sums of integers, are those of a CPU's."""
+    averages = replace(scan, detector_model="intensity")
+    plan = plan_of("sirt", iterations=2)
+    volumes = [
+        reconstruct(averages, plan, rt).volume for rt in (Runtime(pixel_items=False), Runtime(lanes=1, pixel_items=True))
+    ]
+    np.testing.assert_allclose(*volumes, atol=1e-4 * volumes[0].max())
+
+
+def test_methods_of_objects_at_rest_refuse(scan) -> None:
+    for method in sorted(set(METHODS) - set(MOVING)):
+        with pytest.raises(InputError, match=f"--method {method}"):
+            plan_run(method, object_motion=ObjectMotion(breathing()))
+
+
+UP_AND_DOWN = 4 * (-1.0) ** np.arange(7)[:, None, None, None]  # from one control point along z to the next
+BAD = {
+    "elsewhere": (lambda one: replace(one, origin_mm=(50.0, 0.0, 0.0)), "moves nothing in the scan's grid"),
+    "too large": (lambda one: replace(one, control_mm=1000 * one.control_mm), "displacements of up to"),
+    "folds": (lambda one: replace(one, control_mm=one.control_mm * UP_AND_DOWN), "matter that folds"),
+    "milliseconds": (lambda one: replace(one, times_s=1000 * one.times_s + 1e5), "times from"),
+}
+
+
+@pytest.mark.parametrize(("change", "found"), BAD.values(), ids=BAD)
+def test_a_field_that_does_not_fit_is_refused(rt, scan, change, found) -> None:
+    plan = replace(plan_of("sirt", iterations=1), object_motion=ObjectMotion(change(breathing())))
+    with pytest.raises(InputError, match=f"--object-motion.*{found}"):
+        reconstruct(scan, plan, rt)
+
+
+def test_the_command(cli, refused, scan, tmp_path) -> None:
+    """The file is part of the provenance; estimates count its memory."""
+    scan_file, field, output = (tmp_path / name for name in ("scan.h5", "field.h5", "volume.h5"))
+    write_scan(scan_file, scan)
+    write_deformation(field, breathing())
+    run = ["reconstruct", scan_file, "-o", output, "--iterations", "2", "--method", "sirt", "--object-motion", field]
+    assert cli.run([str(word) for word in run]) == 0
+    assert read_volume(output).provenance["object_motion"] == str(field)
+    refused([*run[:-3], "phyradgs", *run[-2:]], "--object-motion", "--method phyradgs", "fista")
+    refused([*run, "--holdout", "1"], "--object-motion", "--holdout")
+    refused([*run[:-1], scan_file], "/entry/deformation")
+    refused([*run, "--rows", "0:8"], "--rows")
