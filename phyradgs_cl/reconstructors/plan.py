@@ -46,18 +46,10 @@ class RunPlan:
 
     def __post_init__(self) -> None:
         checks.whole("--seed", self.seed, 0, LARGEST_SEED)
-        if self.object_motion is not None:
-            self._check_object_motion()
-
-    def _check_object_motion(self) -> None:
-        if not method_of(self.method).takes_deformation:
+        if self.object_motion is not None and not method_of(self.method).takes_deformation:
             names = ", ".join(name for name, method in METHODS.items() if method.takes_deformation)
             expected = f"a method whose object may move: {names}"
             raise InputError("--object-motion", f"--method {self.method_name}", expected, "choose one of them")
-        for name in ("holdout", "tune"):
-            if getattr(self.preprocessing, name):
-                found = f"--{name}, which compares frames of an object at rest"
-                raise InputError("--object-motion", found, "one of the two", f"leave --{name} out")
 
     @property
     def method_name(self) -> str:

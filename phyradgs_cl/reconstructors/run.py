@@ -12,7 +12,7 @@ import numpy as np
 from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.acquisition.motion import check_own_motion
 from phyradgs_cl.errors import InputError, OutOfMemoryError, naming_host_memory
-from phyradgs_cl.fields import Grid, triple
+from phyradgs_cl.fields import Deformation, Grid, triple
 from phyradgs_cl.io.files import HOST_SHARE, free_bytes, host_bytes
 from phyradgs_cl.metrics import resampled, shared_slices
 from phyradgs_cl.prepare import PREPARED_KEY
@@ -72,9 +72,10 @@ def reconstruct(
     check_own_motion(getattr(options, "motion", None), ready)
     if plan.initial is not None:
         more["initial"] = _initial(plan, plan.initial, ready.grid)
-    if plan.object_motion is not None:
-        check_object_motion(plan.object_motion.deformation, ready)
-        more["deformation"] = plan.object_motion.deformation
+    deformation = None if plan.object_motion is None else plan.object_motion.deformation
+    if deformation is not None:
+        check_object_motion(deformation, ready)
+        more["deformation"] = deformation
     hidden = held_out(ready, preprocessing.holdout) if preprocessing.holdout else None
     visible = ready if hidden is None else with_masked(ready, hidden)
     run = partial(method_of(plan.method).run, rt=rt, seed=plan.seed)
@@ -85,7 +86,7 @@ def reconstruct(
         progress = progress.mapped(state=lambda state: with_identity(state, identity()))
         if progress.volume is not None and rt.ranks.size == 1:  # ranks project together
             whole = cache(progress.volume)
-            pairs = partial(_spread_pairs, rt, ready, whole)
+            pairs = partial(_spread_pairs, rt, ready, deformation, whole)
             progress = replace(progress, volume=whole, frames=pairs)
         return progress if box is None else progress.mapped(volume=lambda volume, grid: _within(volume, grid, box))
 
@@ -97,7 +98,7 @@ def reconstruct(
     if result.state is not None:
         result = replace(result, state=with_identity(result.state, identity()))
     if hidden is not None and rt.ranks.rank == 0:
-        result.facts[HELD_OUT] = holdout_errors(rt, ready, hidden, result.volume, result.grid)
+        result.facts[HELD_OUT] = holdout_errors(rt, ready, hidden, result.volume, result.grid, deformation)
     if PREPARED_KEY in ready.provenance:
         result.facts[PREPARED_KEY] = ready.provenance[PREPARED_KEY]
     if box is None:
@@ -107,9 +108,9 @@ def reconstruct(
 
 
 def _spread_pairs(
-    rt: Runtime, scan: Scan, volume: Callable[[], tuple[np.ndarray, Grid]], count: int
+    rt: Runtime, scan: Scan, deformation: Deformation | None, volume: Callable[[], tuple[np.ndarray, Grid]], count: int
 ) -> list[FramePair]:
-    return frame_pairs(rt, scan, *volume(), spread_frames(scan.frames, count))
+    return frame_pairs(rt, scan, *volume(), spread_frames(scan.frames, count), deformation)
 
 
 def check_resumable(plan: RunPlan) -> None:

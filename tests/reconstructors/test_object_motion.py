@@ -11,8 +11,16 @@ from phyradgs_cl.fields import Deformation, Grid, control_points
 from phyradgs_cl.io import read_volume, write_deformation, write_scan
 from phyradgs_cl.operators.warp.operator import projector_of
 from phyradgs_cl.phantoms import shepp_logan
-from phyradgs_cl.reconstructors import METHODS, ObjectMotion, RunPlan, method_options, plan_run, reconstruct
-from phyradgs_cl.reconstructors.result import Progress
+from phyradgs_cl.reconstructors import (
+    METHODS,
+    ObjectMotion,
+    Preprocessing,
+    RunPlan,
+    method_options,
+    plan_run,
+    reconstruct,
+)
+from phyradgs_cl.reconstructors.result import HELD_OUT, Progress
 from phyradgs_cl.runtime import Runtime
 
 GRID, SHAPE, FRAMES = Grid.cube(16, 2.0), (24, 24), 30
@@ -97,6 +105,15 @@ def test_intensity_and_a_gpu_follow_too(scan) -> None:
     np.testing.assert_allclose(*volumes, atol=1e-4 * volumes[0].max())
 
 
+def test_held_out_pixels_are_compared_with_the_object_as_it_was(rt, scan) -> None:
+    hidden = Preprocessing(holdout=2.0)
+    moved, ignored = (
+        reconstruct(scan, replace(plan_of("fista", moves, iterations=7), preprocessing=hidden), rt).facts[HELD_OUT]
+        for moves in (True, False)
+    )
+    assert moved["holdout_rms"] < 0.75 * ignored["holdout_rms"]
+
+
 def test_methods_of_objects_at_rest_refuse(scan) -> None:
     for method in sorted(set(METHODS) - set(MOVING)):
         with pytest.raises(InputError, match=f"--method {method}"):
@@ -128,6 +145,5 @@ def test_the_command(cli, refused, scan, tmp_path) -> None:
     assert cli.run([str(word) for word in run]) == 0
     assert read_volume(output).provenance["object_motion"] == str(field)
     refused([*run[:-3], "phyradgs", *run[-2:]], "--object-motion", "--method phyradgs", "fista")
-    refused([*run, "--holdout", "1"], "--object-motion", "--holdout")
     refused([*run[:-1], scan_file], "/entry/deformation")
     refused([*run, "--rows", "0:8"], "--rows")

@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 from phyradgs_cl.acquisition import PerRow, Scan
 from phyradgs_cl.detector import noise_rms
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.fields import Grid
-from phyradgs_cl.operators import RayOperator
+from phyradgs_cl.fields import Deformation, Grid
+from phyradgs_cl.operators import IntensityOperator, RayOperator
+from phyradgs_cl.operators.warp.operator import projector_of
 from phyradgs_cl.runtime import Runtime
 
 TIMES_PER_LINE = 16  # samples of a line's exposure, whose error is far below the noise
@@ -55,16 +56,23 @@ def spread_frames(frames: int, count: int) -> list[int]:
     return sorted({(k * frames) // count for k in range(min(count, frames))})
 
 
-def frame_pairs(rt: Runtime, scan: Scan, volume: np.ndarray, grid: Grid, frames: Sequence[int]) -> list[FramePair]:
-    """Returns some frames of a scan with those of a volume (nz, ny, nx) in 1/mm, under the scan's true motion.
+def frame_pairs(
+    rt: Runtime, scan: Scan, volume: np.ndarray, grid: Grid, frames: Sequence[int], deformation: Deformation | None = None
+) -> list[FramePair]:
+    """Returns some frames of a scan with those of a volume (nz, ny, nx) in 1/mm, under the scan's true motion and that of
+    the object.
 
     For a detector that averages intensity the computed frames do so too."""
     motion = PerRow(sub_intervals=TIMES_PER_LINE)
     tables = [motion.cells(scan, frame) for frame in frames]
-    operator = RayOperator(rt, grid, scan.geometry.detector_shape, tables)
-    computed = operator.forward(volume)
-    if scan.detector_model == "intensity":
-        computed = computed - operator.intensity_correction(volume)
+    projector = projector_of(rt, grid, tables, deformation)
+    operator = projector(rt, grid, scan.geometry.detector_shape, tables)
+    if scan.detector_model != "intensity":
+        computed = operator.forward(volume)
+    elif isinstance(operator, RayOperator):
+        computed = operator.forward(volume) - operator.intensity_correction(volume)
+    else:
+        computed = IntensityOperator(rt, grid, scan.geometry.detector_shape, tables, projector).expected(volume)
     pairs = []
     for frame, image in zip(frames, computed, strict=True):
         valid = scan.valid[frame]
@@ -82,7 +90,9 @@ def held_out(scan: Scan, percent: float, seed: int = _HOLDOUT_SEED, subject: str
     return held
 
 
-def holdout_errors(rt: Runtime, scan: Scan, held: np.ndarray, volume: np.ndarray, grid: Grid) -> dict[str, float]:
+def holdout_errors(
+    rt: Runtime, scan: Scan, held: np.ndarray, volume: np.ndarray, grid: Grid, deformation: Deformation | None = None
+) -> dict[str, float]:
     """Returns the RMS residual of a volume (nz, ny, nx) in 1/mm at held-out pixels (F, v, u), the part of it that is their
     own noise, and their number.
 
@@ -90,7 +100,7 @@ def holdout_errors(rt: Runtime, scan: Scan, held: np.ndarray, volume: np.ndarray
     squares = 0.0
     for first in range(0, scan.frames, _HOLDOUT_FRAMES):
         frames = range(first, min(first + _HOLDOUT_FRAMES, scan.frames))
-        for pair in frame_pairs(rt, scan, volume, grid, frames):
+        for pair in frame_pairs(rt, scan, volume, grid, frames, deformation):
             squares += float(np.sum(np.square(pair.residual[held[pair.frame]], dtype=np.float64)))
     count = int(held.sum())
     noise = noise_rms(scan.projections, held, scan.valid)

@@ -181,7 +181,7 @@ class _Trials:
             return self.run(self.visible, options, report=self.report, **self.extra)
 
     def _measure(self, value: float, volume: np.ndarray, grid: Grid) -> None:
-        errors = holdout_errors(self.rt, self.scan, self.held, volume, grid)
+        errors = holdout_errors(self.rt, self.scan, self.held, volume, grid, self.extra.get("deformation"))
         self.errors[value], self.noise_rms = errors["holdout_rms"], errors["holdout_noise_rms"]
 
 

@@ -51,7 +51,7 @@ class System:
     ) -> "System":  # fmt: skip
         """Returns the system of a scan under ``motion``, of an object that moves as ``deformation`` does.
 
-        detector_model: log, intensity, or scan for the stated one. fewest_lines: as in ``RayOperator``, for objects at rest."""
+        detector_model: log, intensity, or scan for the stated one. fewest_lines: as in ``RayOperator``, without a motion."""
         tables = [motion.cells(scan, f).still() for f in range(scan.frames)]
         shape = scan.geometry.detector_shape
         projector = projector_of(rt, scan.grid, tables, deformation)
