@@ -614,7 +614,7 @@ LEAP: dict[str, tuple[Damage, tuple[str, ...]]] = {
     "an angle that is NaN": (in_text(PARAMS, "phis = 100.0", "phis = nan"), ("phis", "nan")),
     "a pixel of no size": (in_text(PARAMS, "pixelWidth = 2.5", "pixelWidth = 0"), ("pixelWidth",)),
     "no distance": (in_text(PARAMS, "sdd = 800.0", ""), ("sdd", "nothing")),
-    "a huge volume": (in_text(PARAMS, "numZ = 7\nnumY = 9", "numZ = 99999\nnumY = 99999"), ("grid", "at most")),
+    "a huge volume": (in_text(PARAMS, "numZ = 7\nnumY = 9", "numZ = 999999\nnumY = 999999"), ("grid", "at most")),
     "a modular beam without vectors": (in_text(PARAMS, "geometry = cone", "geometry = modular"), ("sourcePositions",)),
     "no frames": (removed("g.npy"), ("no .npy and no TIFF",)), "a truncated array": (truncated("g.npy"), ("damaged .npy",)),
     "an object array": (filled("g.npy", npy_header("(6, 10, 14)", "'|O'")), ("damaged .npy", "object")),
