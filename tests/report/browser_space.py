@@ -63,6 +63,7 @@ def look(page: Page, turn: int, tilt: int) -> None:
 def picture(page: Page) -> np.ndarray:
     """The picture at rest (rows, columns, 3) 0 to 1, once it is at full size, and the same twice."""
     canvas, last = page.locator("#space"), None
+    canvas.scroll_into_view_if_needed()  # what is out of sight is not drawn
     page.wait_for_timeout(300)
     page.wait_for_function("() => document.querySelector('#space').width === document.querySelector('#space').clientWidth")
     while (now := canvas.evaluate("canvas => canvas.toDataURL()")) != last:
