@@ -26,6 +26,7 @@ COMMANDS = {
     "evaluate": ("evaluate", "Measure a volume against the truth."),
     "report": ("report", "Write one HTML page about a reconstruction."),
     "view": ("report", "Look at a volume in napari."),
+    "splat": ("splat", "Fit Gaussians to a volume."),
     "export": ("files", "Write a volume for 3D Slicer, ImageJ, napari and others."),
     "bench": ("sweep", "Compare methods on two built-in phantoms."),
     "sweep": ("sweep", "Reconstruct many scans with many settings."),

@@ -9,3 +9,4 @@ from .scans import refuse_jitter as refuse_jitter
 from .scans import refuse_noise_options as refuse_noise_options
 from .scans import run_preparation as run_preparation
 from .scans import run_simulation as run_simulation
+from .splat import run_splat_fit as run_splat_fit

@@ -27,6 +27,7 @@ COMMANDS = (
     ("evaluate volume.h5 --reference scan.h5 --json", "volume.evaluated.png"),
     ("report volume.h5 --scan scan.h5 --views 2 -o page.html", "page.html"),
     ("view volume.h5", ""),
+    ("splat volume.h5 -o cloud.ply --gaussians 50 --iterations 2", "cloud.ply"),
     ("export volume.h5 --to nrrd -o volume.nrrd", "volume.nrrd"),
     (f"import foreign.h5 --format data-exchange {CONE} -o imported.h5", "imported.h5"),
     ("sweep grid.toml -o swept", "swept/results.csv"),

@@ -63,14 +63,14 @@ def initial_cloud(
     z, y, x = np.unravel_index(voxels, grid.shape)
     axis_z, axis_y, axis_x = grid.axes_mm()
     mean = np.stack([axis_x[x], axis_y[y], axis_z[z]], -1)
-    spacing = _neighbour_distance(mean, max(grid.voxel_size_mm)) * scale_factor
+    spacing = neighbour_distance(mean, max(grid.voxel_size_mm)) * scale_factor
     scale = np.repeat(np.clip(spacing, *scale_bounds)[:, None], 3, axis=1)
     density = np.maximum(volume.ravel()[voxels], threshold) * density_share
     quaternion = np.tile([1.0, 0.0, 0.0, 0.0], (len(mean), 1))
     return Gaussians(mean, scale, quaternion, density.astype(np.float64))
 
 
-def _neighbour_distance(points: np.ndarray, fallback: float) -> np.ndarray:
+def neighbour_distance(points: np.ndarray, fallback: float) -> np.ndarray:
     """Returns the RMS distance (G,) from each point to its three nearest others."""
     neighbours = min(4, len(points))
     if neighbours < 2:
