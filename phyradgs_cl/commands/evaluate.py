@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 from phyradgs_cl.commands.console import AsJson, file_argument, file_option, option, say
 from phyradgs_cl.commands.options import numbers
-from phyradgs_cl.metrics import printed
+from phyradgs_cl.metrics import METRICS, printed
 from phyradgs_cl.workflow import run_evaluation
 
 EXAMPLES = {"evaluate": "Example: phyradgs evaluate volume.h5 --reference scan.h5 --json"}
@@ -16,6 +16,7 @@ _REFERENCE = (
     "VOLUME is resampled onto the reference's (linear)."
 )
 _VOXEL = "Sides of the voxels of a reference without a scale, mm; it is centred on the axis."
+_MOTION = "Deformation of the object: VOLUME is compared with the truth of every state."
 _PICTURE = "PNG of slices: result, truth, difference."
 
 
@@ -23,14 +24,34 @@ def evaluate_command(
     volume: Annotated[Path, file_argument("VOLUME", "Volume file: ours, or mha, nii, nrrd, npy, tiff.")],
     reference: Annotated[Path, file_option(_REFERENCE, "--reference")], as_json: AsJson = False,
     reference_voxel_mm: Annotated[Any, option(_VOXEL, "the file's", parser=numbers, metavar="D|Z,Y,X")] = None,
+    object_motion: Annotated[Path | None, file_option(_MOTION, "--object-motion")] = None,
     picture: Annotated[Path | None, file_option(_PICTURE, "--picture", default="v.evaluated.png for v.h5")] = None,
 ) -> None:
     """Measure a volume against the truth: 3D PSNR and SSIM, and a picture of slices."""
     stem = volume.stem if volume.suffix in ("", ".h5") else volume.name  # v.h5 and v.nii may lie in one folder
     usual = volume.with_name(f"{stem}.evaluated.png")  # v.png may be the preview of the run
-    facts = run_evaluation(volume, reference, picture or usual, reference_voxel_mm)
+    facts = run_evaluation(volume, reference, picture or usual, reference_voxel_mm, object_motion)
     if as_json:
-        say(json.dumps({key: None if value == math.inf else value for key, value in facts.items()}))  # JSON has no infinity
-    else:
-        words = [f"{title} {value}" for title, value in printed(facts)]
-        say("   ".join([*words, str(facts["compared"]), f"picture {facts['picture']}"]))
+        say(json.dumps(_without_infinity(facts)))
+        return
+    words = [f"{title} {value}" for title, value in printed(facts)]
+    say("   ".join([*words, str(facts["compared"]), f"picture {facts['picture']}"]))
+    states: Any = facts.get("states", [])
+    for state in states:
+        say("   ".join([f"at {state['time_s']:.4g} s", *(f"{title} {value}" for title, value in printed(state))]))
+    if states:
+        means = {name: facts[f"mean_{name}"] for name in METRICS}
+        words = [f"mean of {len(states)} states", *(f"{title} {value}" for title, value in printed(means))]
+        if "mean_motion_error_mm" in facts:
+            mean_mm, high_mm = facts["mean_motion_error_mm"], facts["p95_motion_error_mm"]
+            words.append(f"motion wrong by {mean_mm:.3g} mm (95 % below {high_mm:.3g})")
+        say("   ".join(words))
+
+
+def _without_infinity(value: Any) -> Any:
+    """Returns facts with None for infinity, which JSON does not have."""
+    if isinstance(value, dict):
+        return {key: _without_infinity(part) for key, part in value.items()}
+    if isinstance(value, list):
+        return [_without_infinity(part) for part in value]
+    return None if value == math.inf else value

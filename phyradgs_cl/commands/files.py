@@ -5,7 +5,18 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from phyradgs_cl.commands.console import AsJson, file_argument, file_option, option, say
-from phyradgs_cl.exporters import CLOUDS, EXPORTS, DicomLabels, export_volume, format_of
+from phyradgs_cl.commands.options import pair_of
+from phyradgs_cl.errors import InputError
+from phyradgs_cl.exporters import (
+    CLOUDS,
+    EXPORTS,
+    DicomLabels,
+    export_states,
+    export_volume,
+    format_of,
+    state_times_s,
+)
+from phyradgs_cl.io import read_deformation
 from phyradgs_cl.signals import finish_despite_interrupt
 from phyradgs_cl.workflow.files import expecting, summary
 
@@ -15,9 +26,14 @@ EXAMPLES = {
 }
 GROUPS = {
     "export": {
-        "Basics": ("output", "to", "mu_water_per_mm"), "DICOM": ("patient", "title", "description", "date")
+        "Basics": ("output", "to", "mu_water_per_mm"),
+        "Objects that move": ("object_motion", "states", "during"),
+        "DICOM": ("patient", "title", "description", "date")
     }
 }
+_MOTION = "Deformation of the object: the volume is written at several states."
+_STATES = "Number of states, at the middles of equal parts of the time; nii has them in one file."
+_DURING = "Time that the states cover, s."
 _LONGEST = 2000
 _OUTPUT = "File to write, or for dicom a new folder; nii.gz is compressed."
 _TO = "nii, mha, nrrd, tiff, npy, dicom (a folder): the voxels; ply, npz: the Gaussians."
@@ -45,6 +61,14 @@ def export_command(
     ] = None,
     to: Annotated[Literal[EXPORTS] | None, option(_TO, "by the output's suffix", "--to")] = None,  # type: ignore[valid-type]
     mu_water_per_mm: Annotated[float | None, option(_WATER, "none: values in 1/mm")] = None,
+    object_motion: Annotated[Path | None, file_option(_MOTION, "--object-motion")] = None,
+    states: Annotated[int | None, option(_STATES, "10")] = None,
+    during: Annotated[
+        Any,
+        option(
+            _DURING, "the deformation's", parser=pair_of("--during", "START,STOP in s", "8,12"), metavar="START,STOP"
+        ),
+    ] = None,
     patient: Annotated[str | None, option("The patient's name and ID, as Family^Given.", metavar="NAME")] = None,
     title: Annotated[str | None, option("The study's description.", metavar="TEXT")] = None,
     description: Annotated[str | None, option("The series' description.", "the unit", metavar="TEXT")] = None,
@@ -52,10 +76,19 @@ def export_command(
 ) -> None:
     """Export a volume, upright and to scale, for 3D Slicer, ITK-SNAP, ImageJ, napari and others."""
     form, labels = to or format_of(output), DicomLabels(patient, title, description, date)
+    if object_motion is None and (states is not None or during is not None):
+        raise InputError("--during" if states is None else "--states", "no motion", "--object-motion FILE with it")
     with finish_despite_interrupt(), expecting(volume, "volume"):
-        written = export_volume(volume, form, output, mu_water_per_mm, labels)
+        if object_motion is None:
+            written: object = export_volume(volume, form, output, mu_water_per_mm, labels)
+        else:
+            field = read_deformation(object_motion)
+            times_s = state_times_s(field, 10 if states is None else states, during)
+            paths = export_states(volume, field, times_s, form, output, mu_water_per_mm, labels)
+            written = paths[0] if len(paths) == 1 else f"{paths[0]} … {paths[-1]}"
     unit = "" if form in CLOUDS else ", HU" if mu_water_per_mm is not None else ", 1/mm"
-    say(f"{written}: {form}{unit}")
+    moving = "" if object_motion is None else f", {len(times_s)} states from {times_s[0]:.4g} to {times_s[-1]:.4g} s"
+    say(f"{written}: {form}{unit}{moving}")
 
 
 def _short(value: Any, is_inside: bool = False) -> str:

@@ -1,6 +1,6 @@
 """Volumes in other programs' formats, with spacing, origin and directions: `export_volume`."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,10 +10,12 @@ from phyradgs_cl import checks
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.exporters import writers
 from phyradgs_cl.exporters.dicom import DicomLabels, write_dicom
+from phyradgs_cl.fields import Deformation, deformed
 from phyradgs_cl.io import Volume, read_volume
 
 __all__ = [
-    "CLOUDS", "EXPORTS", "DicomLabels", "default_output", "export_stored", "export_volume", "foreign_suffix", "format_of",
+    "CLOUDS", "EXPORTS", "DicomLabels", "default_output", "export_states", "export_stored", "export_volume",
+    "foreign_suffix", "format_of", "state_times_s",
 ]  # fmt: skip
 
 VOXELS: dict[str, Callable[[Path, Volume, str], None]] = {
@@ -37,8 +39,16 @@ def export_volume(
     the folder of ``path``. ``mu_water_per_mm``: attenuation of water; the values are then Hounsfield units. ``labels``:
     patient, study and series, for dicom alone. InputError: an unknown format, a damaged volume or one without Gaussians, a
     suffix of another format, labels with another format. OutputError: the output cannot be written."""
+    target = _checked_target(Path(path), to, output, mu_water_per_mm, labels)
+    export_stored(read_volume(path), to, target, str(path), mu_water_per_mm, labels)
+    return target
+
+
+def _checked_target(
+    path: Path, to: str, output: str | Path | None, mu_water_per_mm: float | None, labels: DicomLabels | None
+) -> Path:
+    """Returns the path to write; InputError for options that do not fit the format."""
     checks.one_of("--to", to, EXPORTS)
-    path = Path(path)
     target = default_output(path, to) if output is None else Path(output)
     suffixes = _suffixes(to)  # programs go by the suffix
     if suffixes and not target.name.lower().endswith(suffixes):
@@ -49,8 +59,53 @@ def export_volume(
         raise InputError("--mu-water-per-mm", f"with --to {to}", "voxels", "Gaussians stay in 1/mm")
     if to != "dicom" and labels is not None and labels.given:
         raise InputError(f"--{next(iter(labels.given))}", f"with --to {to}", "--to dicom", "leave it out")
-    export_stored(read_volume(path), to, target, str(path), mu_water_per_mm, labels)
     return target
+
+
+def _in_unit(values: np.ndarray, mu_water_per_mm: float | None) -> tuple[np.ndarray, str]:
+    """Returns values (z, y, x) in 1/mm, or in Hounsfield units where water's attenuation is given, and the unit."""
+    plain = np.ascontiguousarray(values, np.float32)
+    return (plain, "1/mm") if mu_water_per_mm is None else (writers.hounsfield(plain, mu_water_per_mm), "HU")
+
+
+def state_times_s(deformation: Deformation, count: int, during_s: tuple[float, float] | None = None) -> list[float]:
+    """Returns the middles (count,) in s of equal parts of a time, by default that of the deformation. InputError: a count
+    that is not from 1 to 1000, a time that ends before it begins."""
+    checks.whole("--states", count, 1, 1000)
+    first_s, last_s = during_s or (deformation.times_s[0], deformation.times_s[-1])
+    if during_s is not None and not first_s < last_s:
+        raise InputError("--during", f"{first_s:g},{last_s:g}", "a start before the stop")
+    middles_s: list[float] = (first_s + (np.arange(count) + 0.5) / count * (last_s - first_s)).tolist()
+    return middles_s
+
+
+def export_states(
+    path: str | Path, deformation: Deformation, times_s: Sequence[float], to: str, output: str | Path | None = None,
+    mu_water_per_mm: float | None = None, labels: DicomLabels | None = None,
+) -> list[Path]:  # fmt: skip
+    """Writes a volume file as it is at each of evenly spaced times, and returns the paths. NIfTI holds all states in one
+    file of four dimensions. The other formats get a file, or a folder, for each state: NAME_01.SUFFIX and so on. Arguments
+    and errors are those of ``export_volume``; InputError also for a format of Gaussians."""
+    if to in CLOUDS:
+        raise InputError("--states", f"with --to {to}", "a format of voxels", "use nii, mha, nrrd, tiff, npy or dicom")
+    target, volume = _checked_target(Path(path), to, output, mu_water_per_mm, labels), read_volume(path)
+    grid = volume.required_grid
+    states = [
+        replace(volume, values=deformed(volume.values, grid, deformation, weights))
+        for weights in deformation.weights_at(times_s)
+    ]
+    if to == "nii":
+        values = [_in_unit(state.values, mu_water_per_mm) for state in states]
+        stack = [replace(volume, values=value) for value, _ in values]
+        writers.write_image(target, stack[0], values[0][1], times_s, stack)
+        return [target]
+    suffix = next((s for s in _suffixes(to) if target.name.lower().endswith(s)), "")
+    stem, digits = target.name[: len(target.name) - len(suffix)], max(2, len(str(len(states))))
+    numbers = range(1, len(states) + 1)
+    targets = [target.with_name(f"{stem}_{number:0{digits}d}{target.name[len(stem) :]}") for number in numbers]
+    for state, one in zip(states, targets, strict=True):
+        export_stored(state, to, one, str(path), mu_water_per_mm, labels)
+    return targets
 
 
 def export_stored(
@@ -63,9 +118,7 @@ def export_stored(
         return
     if volume.grid is None:
         raise InputError(subject, "values without voxel sizes", "a volume with its grid", "see 'phyradgs info'")
-    values, unit = np.ascontiguousarray(volume.values, np.float32), "1/mm"
-    if mu_water_per_mm is not None:
-        values, unit = writers.hounsfield(values, mu_water_per_mm), "HU"
+    values, unit = _in_unit(volume.values, mu_water_per_mm)
     volume = replace(volume, values=values)
     if to == "dicom":
         write_dicom(target, volume, unit, labels or DicomLabels())

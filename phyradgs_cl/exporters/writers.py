@@ -3,6 +3,7 @@ world's x, y, z are left, posterior, superior (LPS, the frame of DICOM and ITK).
 viewer, and a slice looks the same in viewers that know directions and in those that show row 0 at the top."""
 
 import json
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -30,17 +31,22 @@ def hounsfield(values: np.ndarray, mu_water_per_mm: float) -> np.ndarray:
     return hu
 
 
-def write_image(path: Path, volume: Volume, unit: str) -> None:
-    """Writes NIfTI, NRRD or MetaImage, by the suffix; ``unit`` of the values: "1/mm" or "HU"."""
+def write_image(path: Path, volume: Volume, unit: str, times_s: Sequence[float] = (), states: Sequence[Volume] = ()) -> None:
+    """Writes NIfTI, NRRD or MetaImage, by the suffix; ``unit`` of the values: "1/mm" or "HU". ``states``: volumes that make
+    one of four dimensions in place of ``volume``, at evenly spaced ``times_s``."""
     sitk = checks.package("SimpleITK", "the package that this export needs", "phyradgs-cl[formats]")
     suffix = next(suffix for suffix in reversed(_WRITERS) if path.name.lower().endswith(suffix))
     if suffix.startswith(".nii") and max(volume.values.shape) > _MOST_NIFTI_VOXELS:
         raise InputError("--to nii", f"{max(volume.values.shape)} voxels", f"at most {_MOST_NIFTI_VOXELS}", "use --to nrrd")
-    image = sitk.GetImageFromArray(volume.values)
-    image.SetSpacing(volume.required_grid.voxel_size_mm[::-1])
-    image.SetOrigin(volume.required_grid.first_centre_mm[::-1])
+    images = [sitk.GetImageFromArray(each.values) for each in states or (volume,)]
+    for image in images:
+        image.SetSpacing(volume.required_grid.voxel_size_mm[::-1])
+        image.SetOrigin(volume.required_grid.first_centre_mm[::-1])
+    if states:
+        step_s = float(times_s[1] - times_s[0]) if len(times_s) > 1 else 1.0
+        image = sitk.JoinSeries(images, float(times_s[0]), step_s)
     image.SetMetaData("ITK_FileNotes", f"values in {unit}")
-    with written_beside(path, volume.values.nbytes, suffix) as temporary:
+    with written_beside(path, len(images) * volume.values.nbytes, suffix) as temporary:
         writer = sitk.ImageFileWriter()
         writer.SetImageIO(_WRITERS[suffix])
         writer.SetFileName(str(temporary))

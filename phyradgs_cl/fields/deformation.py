@@ -122,13 +122,16 @@ class Deformation:
 
         Fixed point from u = 0. Raises InputError where it does not converge, for example
         because the field folds."""
-        points_mm = _centres_mm(grid)
+        return self.inverse_mm(_centres_mm(grid), weights).reshape(*grid.shape, 3).astype(np.float32)
+
+    def inverse_mm(self, points_mm: np.ndarray, weights: "ArrayLike") -> np.ndarray:
+        """Returns the same u (n, 3) float64 in mm at points (n, 3), x y z."""
         moved_mm = np.zeros_like(points_mm)
         for _ in range(_MOST_STEPS):
             next_mm = -self.displacement_mm(points_mm + moved_mm, weights)
             change_mm, moved_mm = np.abs(next_mm - moved_mm).max(), next_mm
             if change_mm < _CLOSE * np.min(self.spacing_mm):
-                return moved_mm.reshape(*grid.shape, 3).astype(np.float32)
+                return moved_mm
         found = f"no inverse: its points still move {change_mm:.3g} mm after {_MOST_STEPS} steps"
         raise InputError("deformation", found, "a field whose gradient stays below 1", "use a smoother or smaller field")
 

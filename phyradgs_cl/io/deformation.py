@@ -3,9 +3,11 @@
 from pathlib import Path
 
 import h5py
+import numpy as np
 
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Deformation, triple
+from phyradgs_cl.io.files import sha256_of
 from phyradgs_cl.io.hdf5 import datasets as h5
 from phyradgs_cl.io.hdf5.source import Hdf5Source, open_hdf5
 
@@ -28,6 +30,19 @@ def read_deformation(path: str | Path) -> Deformation:
             expected = f"a group {DEFORMATION}, or a scan simulated with --motion-of-object"
             raise source.error("/", "members: " + (", ".join(sorted(source.file)) or "nothing"), expected)
         return read_deformation_group(source, places[0])
+
+
+def deformation_summary(path: str | Path) -> dict[str, object]:
+    """Returns facts about a deformation file, checked as when it is read."""
+    field = read_deformation(path)
+    rank, nz, ny, nx, _ = field.control_mm.shape
+    return {
+        "fields": rank, "control_points": (nz, ny, nx), "control_spacing_mm": field.spacing_mm,
+        "first_control_point_mm": field.origin_mm, "times": len(field.times_s),
+        "first_s": float(field.times_s[0]), "last_s": float(field.times_s[-1]),
+        "displacements_below_mm": float((np.abs(field.weights) @ field.reach_mm).max()),
+        "smallest_determinant": field.smallest_determinant(), "sha256": sha256_of(path),
+    }
 
 
 def write_deformation_group(parent: h5py.Group, deformation: Deformation) -> None:

@@ -10,10 +10,12 @@ from phyradgs_cl.metrics.align import (
     resampled,
     shared_slices,
 )
+from phyradgs_cl.metrics.motion import edge_points_mm, motion_error_mm
 from phyradgs_cl.metrics.quality import HELD_OUT, METRICS, compare, printed, psnr, ssim, ssim_map
 from phyradgs_cl.metrics.slices import slices_png
 
 __all__ = [
-    "HELD_OUT", "METRICS", "VOXEL_BY_VOXEL", "Aligned", "aligned", "compare", "in_words", "overlap", "printed", "psnr",
-    "reference_on", "resampled", "shared_slices", "slices_png", "ssim", "ssim_map",
+    "HELD_OUT", "METRICS", "VOXEL_BY_VOXEL", "Aligned", "aligned", "compare", "edge_points_mm", "in_words",
+    "motion_error_mm", "overlap", "printed", "psnr", "reference_on", "resampled", "shared_slices", "slices_png", "ssim",
+    "ssim_map",
 ]  # fmt: skip

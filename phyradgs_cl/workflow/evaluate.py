@@ -7,11 +7,22 @@ import numpy as np
 
 from phyradgs_cl import checks
 from phyradgs_cl.errors import InputError, OutputError
-from phyradgs_cl.fields import Grid, triple
+from phyradgs_cl.fields import Deformation, Grid, MovingTruth, deformed, triple
 from phyradgs_cl.fields.grid_choice import voxel_sides_mm
-from phyradgs_cl.io import written_beside
+from phyradgs_cl.io import Volume, read_deformation, written_beside
 from phyradgs_cl.io.volume import interruption
-from phyradgs_cl.metrics import VOXEL_BY_VOXEL, Aligned, aligned, compare, in_words, overlap, slices_png
+from phyradgs_cl.metrics import (
+    METRICS,
+    VOXEL_BY_VOXEL,
+    Aligned,
+    aligned,
+    compare,
+    edge_points_mm,
+    in_words,
+    motion_error_mm,
+    overlap,
+    slices_png,
+)
 from phyradgs_cl.signals import finish_despite_interrupt
 from phyradgs_cl.text import plain_text
 from phyradgs_cl.workflow.files import check_picture, load_reference, load_result
@@ -22,13 +33,19 @@ _LITTLE = 0.5 - 1e-6  # of either box: less in common is most often a wrong size
 
 @np.errstate(all="ignore")
 def run_evaluation(
-    volume_path: Path, reference_path: Path, picture: Path, reference_voxel_mm: object = None
+    volume_path: Path, reference_path: Path, picture: Path, reference_voxel_mm: object = None,
+    object_motion: Path | None = None,
 ) -> dict[str, object]:
     """Compares a volume with a scan's reference or another volume, by the rule of ``metrics.aligned``, and writes the
     picture of slices. A volume without a scale is compared voxel by voxel. ``reference_voxel_mm``: sides of the voxels of a
-    reference without a scale, one length or (z, y, x). InputError: no such sides; files that do not fit each other."""
-    check_picture(picture, volume_path, reference_path)
-    result, stored = load_result(volume_path), load_reference(reference_path)
+    reference without a scale, one length or (z, y, x). ``object_motion``: the file of a deformation, which shows the volume
+    at each true state of a scan. InputError: no such sides; files that do not fit each other."""
+    check_picture(picture, volume_path, reference_path, object_motion)
+    field = None if object_motion is None else read_deformation(object_motion)
+    result, (stored, moving) = load_result(volume_path), load_reference(reference_path)
+    if field is not None and (moving is None or result.grid is None):
+        expected = "a scan simulated with --motion-of-object, and a volume with a scale"
+        raise InputError("--object-motion", "no true states to compare with", expected, "leave it out")
     volume, grid, provenance = result.values, result.grid, result.provenance
     reference, stored_grid = stored.values, stored.grid
     how, share = f"{VOXEL_BY_VOXEL}, as {plain_text(volume_path.name)} has no scale", 1.0
@@ -39,6 +56,9 @@ def run_evaluation(
     if reference.shape != volume.shape:
         raise InputError(str(reference_path), f"shape {reference.shape}", f"shape {volume.shape} of {volume_path}")
     metrics = compare(volume, reference)
+    states = {}
+    if moving is not None and grid is not None and stored_grid is not None:
+        states = compared_states(result, field, moving, stored_grid)
     title = f"{provenance.get('method', 'volume')}: {volume_path.name}"
     with finish_despite_interrupt(), written_beside(picture) as temporary:
         try:
@@ -48,7 +68,27 @@ def run_evaluation(
     known: dict[str, object] = {key: provenance[key] for key in ("method", "seconds", "gaussians") if key in provenance}
     files = {"volume": str(volume_path), "reference": str(reference_path), "picture": str(picture)}
     compared: dict[str, object] = {"compared": how, "share_of_reference_covered": share}
-    return {**metrics, **known, **interruption(provenance), **compared, **files}
+    return {**metrics, **states, **known, **interruption(provenance), **compared, **files}
+
+
+def compared_states(result: Volume, field: Deformation | None, truth: MovingTruth, truth_grid: Grid) -> dict[str, object]:
+    """Returns PSNR and SSIM of a volume at each true state, and their means. ``field`` deforms the volume to the states'
+    times; without one the volume is taken as it is. Where both deformations are known the error of the motion follows."""
+    grid = result.required_grid
+    rows: list[dict[str, float]] = []
+    for time_s, state in zip(truth.times_s, truth.volumes, strict=True):
+        values = result.values if field is None else deformed(result.values, grid, field, field.weights_at(time_s)[0])
+        pair = aligned(values, grid, state, truth_grid)
+        if pair is None or not pair.reference.max() > 0:
+            found = "nothing of the object in the part that is compared"
+            raise InputError(f"state at {time_s:.4g} s", found, "volumes in one place")
+        rows.append({"time_s": float(time_s), **compare(pair.volume, pair.reference)})
+    means = {f"mean_{name}": float(np.mean([row[name] for row in rows])) for name in METRICS}
+    if field is None or truth.deformation is None or len(rows) < 2:
+        return {"states": rows, **means}
+    points_mm = edge_points_mm(truth.volumes[0], truth_grid)
+    mean_mm, high_mm = motion_error_mm(field, truth.deformation, points_mm, truth.times_s)
+    return {"states": rows, **means, "mean_motion_error_mm": mean_mm, "p95_motion_error_mm": high_mm}
 
 
 def _grid_of(path: Path, reference: np.ndarray, grid: Grid | None, voxel_mm: object, volume_path: Path) -> Grid:

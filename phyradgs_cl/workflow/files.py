@@ -9,7 +9,16 @@ from phyradgs_cl import importers
 from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.exporters import foreign_suffix
-from phyradgs_cl.io import Volume, check_writable, file_kind, read_scan, scan_summary, volume_summary
+from phyradgs_cl.fields import MovingTruth
+from phyradgs_cl.io import (
+    Volume,
+    check_writable,
+    deformation_summary,
+    file_kind,
+    read_scan,
+    scan_summary,
+    volume_summary,
+)
 from phyradgs_cl.io.hdf5.source import open_hdf5
 from phyradgs_cl.prepare import flat_correction
 
@@ -17,6 +26,7 @@ _KINDS = {
     "scan": "a scan",
     "volume": "a volume of phyradgs-cl",
     "plain-volume": "a bare volume (dataset /volume)",
+    "deformation": "how an object moves (/entry/deformation)",
 }
 
 
@@ -87,23 +97,26 @@ def load_result(path: Path) -> Volume:
         return importers.load_volume(path)
 
 
-def load_reference(path: Path) -> Volume:
+def load_reference(path: Path) -> tuple[Volume, MovingTruth | None]:
+    """Returns the true volume of a scan, or a volume, and the true states of a simulated object that moves."""
     if importers.foreign_volume(path) is None and file_kind(path) == "scan":
         scan = load_scan(path)
         if scan.reference is None:
             expected = "a scan with a known truth"
             raise InputError(f"{path}:/entry/phyradgs/reference/volume", "no reference", expected)
-        return Volume(scan.reference, scan.grid)
-    return load_result(path)
+        return Volume(scan.reference, scan.grid), scan.moving_truth
+    return load_result(path), None
 
 
 def summary(path: Path) -> dict[str, object]:
     if (form := importers.foreign_volume(path)) is not None:
         return {"kind": f"volume ({form})", **_voxel_facts(path)}
-    with expecting(path, "scan", "volume", "plain-volume"):
+    with expecting(path, "scan", "volume", "plain-volume", "deformation"):
         kind = file_kind(path)
         if kind == "scan":
             return {"kind": "scan", **scan_summary(path)}
+        if kind == "deformation":
+            return {"kind": "deformation", **deformation_summary(path)}
     if kind == "volume":
         facts = volume_summary(path)
         provenance = dict(facts.pop("provenance", None) or {})

@@ -1,0 +1,90 @@
+"""A moving object from its simulation to its states: evaluate, export and info with a deformation."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from phyradgs_cl.fields import deformed
+from phyradgs_cl.io import read_deformation, read_volume, write_deformation, write_volume
+from phyradgs_cl.workflow import load_scan
+
+MOTION = 'kind = "breathing"\namplitude = 0.3\nperiod_s = 2.0\nstates = 3\n'
+SCAN = "--phantom jaw --size 16 --detector 12 --views 4 --time-samples 1 --protocol static"
+
+
+@pytest.fixture(scope="module")
+def folder(cli, tmp_path_factory) -> Path:
+    """A scan of a moving object, its reference as a result, and its deformation."""
+    path = tmp_path_factory.mktemp("moving")
+    (path / "motion.toml").write_text(MOTION)
+    line = f"simulate {SCAN} --motion-of-object {path / 'motion.toml'} -o {path / 'scan.h5'}"
+    assert cli.run(line.split()) == 0
+    scan = load_scan(path / "scan.h5")
+    write_volume(path / "volume.h5", scan.reference, scan.grid, {"method": "made up"})
+    write_deformation(path / "field.h5", scan.moving_truth.deformation)
+    return path
+
+
+def facts_of(cli, capsys, line: str) -> dict:
+    capsys.readouterr()
+    assert cli.run(line.split()) == 0
+    return json.loads(capsys.readouterr().out)
+
+
+def test_a_volume_is_compared_with_every_state(cli, capsys, folder) -> None:
+    line = f"evaluate {folder}/volume.h5 --reference {folder}/scan.h5"
+    still, moving = (facts_of(cli, capsys, f"{line} --json {more}") for more in ("", f"--object-motion {folder}/field.h5"))
+    assert still["psnr_db"] is None and len(still["states"]) == len(moving["states"]) == 3
+    assert moving["mean_psnr_db"] > still["mean_psnr_db"] + 3
+    assert moving["mean_motion_error_mm"] == 0 and "mean_motion_error_mm" not in still
+    assert cli.run(line.split()) == 0
+    printed = capsys.readouterr().out
+    assert printed.count("\nat ") == 3 and "mean of 3 states" in printed
+    capsys.readouterr()
+    line = f"evaluate {folder}/volume.h5 --reference {folder}/volume.h5 --object-motion {folder}/field.h5"
+    assert cli.run(line.split()) == 2 and "--object-motion" in capsys.readouterr().err
+
+
+def test_states_go_into_one_nifti_of_four_dimensions(cli, folder) -> None:
+    sitk = pytest.importorskip("SimpleITK")
+    line = f"export {folder}/volume.h5 --object-motion {folder}/field.h5 --states 4 --during 1,5 -o {folder}/states.nii"
+    assert cli.run(line.split()) == 0
+    image, field, volume = sitk.ReadImage(str(folder / "states.nii")), read_deformation(folder / "field.h5"), None
+    volume = read_volume(folder / "volume.h5")
+    assert image.GetDimension() == 4 and image.GetSpacing() == pytest.approx((*volume.grid.voxel_size_mm, 1.0))
+    for values, time_s in zip(sitk.GetArrayFromImage(image), (1.5, 2.5, 3.5, 4.5), strict=True):
+        expected = deformed(volume.values, volume.grid, field, field.weights_at(time_s)[0])
+        np.testing.assert_array_equal(values, expected)
+    assert np.ptp(sitk.GetArrayFromImage(image), axis=0).max() > 0.1
+
+
+def test_other_formats_get_a_file_for_each_state(cli, folder) -> None:
+    line = f"export {folder}/volume.h5 --object-motion {folder}/field.h5 --states 2 -o {folder}/state.npy"
+    assert cli.run(line.split()) == 0
+    first, second = (np.load(folder / f"state_0{number}.npy") for number in (1, 2))
+    assert first.shape == second.shape and np.abs(first - second).max() > 0.1
+    assert not (folder / "state.npy").exists() and (folder / "state_02.json").exists()
+
+
+@pytest.mark.parametrize(("options", "subject"), [
+    ("--states 4", "--states"), ("--during 1,2", "--during"), ("--object-motion field.h5 --states 0", "--states"),
+    ("--object-motion field.h5 --during 2,1", "--during"), ("--object-motion field.h5 --to ply", "--states"),
+    ("--object-motion volume.h5", "volume.h5:/"),
+])  # fmt: skip
+def test_wrong_wishes_are_one_line(cli, capsys, folder, monkeypatch, options, subject) -> None:
+    monkeypatch.chdir(folder)
+    to = "" if "--to" in options else " --to npy"
+    assert cli.run(f"export volume.h5 {options}{to}".split()) == 2
+    error = capsys.readouterr().err
+    assert subject in error and error.count("\n") == 1
+
+
+def test_info_describes_a_deformation_and_the_states_of_a_scan(cli, capsys, folder) -> None:
+    facts = facts_of(cli, capsys, f"info {folder}/field.h5 --json")
+    assert facts["kind"] == "deformation" and facts["fields"] == 2 and 0 < facts["smallest_determinant"] < 1
+    assert facts["displacements_below_mm"] == pytest.approx(0.3, abs=0.12)
+    assert facts_of(cli, capsys, f"info {folder}/scan.h5 --json")["true_states"] == 3
+    assert cli.run(f"reconstruct {folder}/field.h5 -o {folder}/x.h5".split()) == 2
+    assert "how an object moves" in capsys.readouterr().err
