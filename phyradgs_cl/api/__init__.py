@@ -41,7 +41,7 @@ from phyradgs_cl.api.runs import (
 from phyradgs_cl.api.scans import fly_scan, static_scan
 from phyradgs_cl.calibrate import Calibration
 from phyradgs_cl.errors import InputError, PhyradgsError
-from phyradgs_cl.fields import Deformation, Gaussians, Grid
+from phyradgs_cl.fields import Deformation, Gaussians, Grid, deformed
 from phyradgs_cl.metrics import compare
 from phyradgs_cl.reconstructors import Progress, Reconstruction
 
@@ -50,7 +50,7 @@ __all__ = [
     "Exact", "FrameSweeps", "Gaussians", "Grid", "InputError", "LineMiddles", "LinearOperator", "MicroViews",
     "Motion", "Operator", "OwnTimes", "ParallelGeometry", "PerRow", "PhyradgsError", "PoseTable", "Progress",
     "Reconstruction", "Scan", "Shutter", "SpeedRamp", "Static", "StaticStart", "TimeCells", "Trajectory",
-    "as_torch", "calibrate", "compare", "fly_scan", "initial_gaussians", "load_deformation", "load_scan",
+    "as_torch", "calibrate", "compare", "deformed", "fly_scan", "initial_gaussians", "load_deformation", "load_scan",
     "load_volume", "move_views", "pose_gradient", "prepare", "ray_operator", "reconstruct", "save_deformation",
     "save_scan", "save_volume", "simulate", "splat_operator", "static_scan", "voxel_operator", "voxelise",
 ]  # fmt: skip

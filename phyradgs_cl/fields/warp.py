@@ -5,6 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 import scipy
 
+from phyradgs_cl import checks
 from phyradgs_cl.fields.deformation import Deformation
 from phyradgs_cl.fields.volume import Grid, triple
 
@@ -12,8 +13,11 @@ _SLAB_VOXELS = 1 << 21  # displaced at a time: their coordinates take six times 
 
 
 def deformed(volume: np.ndarray, grid: Grid, deformation: Deformation, weights: Sequence[float] | np.ndarray) -> np.ndarray:
-    """Returns the object (nz, ny, nx) float32 at one state's weights (R,): v(y + w(y)) at every voxel centre y, trilinear
-    between the voxels of the reference ``volume`` on ``grid``, 0 outside of it. A state at rest is the volume itself."""
+    """Returns the object (nz, ny, nx) float32 in 1/mm at one state's weights (R,), as ``deformation.weights_at`` gives them.
+
+    It is v(y + w(y)) at every voxel centre y, trilinear between the voxels of the reference ``volume`` (nz, ny, nx) in 1/mm
+    on ``grid``, 0 outside of it. A state at rest is the volume itself. Raises InputError for shapes that do not fit."""
+    checks.shape("volume", volume, grid.shape)
     reference = np.asarray(volume, np.float32)
     if not np.any(deformation.reach_mm * np.abs(weights)):
         return reference

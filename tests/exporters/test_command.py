@@ -4,6 +4,7 @@ import re
 import shlex
 from pathlib import Path
 
+import numpy as np
 import pydicom
 import pytest
 import typer
@@ -13,6 +14,8 @@ from phyradgs_cl.api import save_scan, simulate
 from phyradgs_cl.commands.files import EXAMPLES, export_command
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.exporters import EXPORTS
+from phyradgs_cl.fields import Deformation
+from phyradgs_cl.io import write_deformation
 
 
 @pytest.fixture
@@ -71,6 +74,8 @@ def test_the_documentation_s_examples_run(run, volume_file, monkeypatch) -> None
     text = DOCS.read_text(encoding="utf-8")
     assert not [to for to in EXPORTS if f"| `{to}` |" not in text]
     monkeypatch.chdir(volume_file.parent)
+    field = Deformation(np.ones((1, 2, 2, 2, 3)), (10.0, -4.0, 3.0), 5.0, np.array([0.0, 9.0]), np.array([[0.0], [1.0]]))
+    write_deformation(Path("field.h5"), field)
     for block in re.findall(r"```python\n(.*?)```", text, re.S):
         exec(compile(block, str(DOCS), "exec"), {})
     for line in re.findall(r"^phyradgs export (.*)$", text, re.M):
