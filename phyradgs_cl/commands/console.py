@@ -1,5 +1,6 @@
 """The console side of commands: options and arguments, output lines, exit statuses, help, and ranks under mpiexec."""
 
+import math
 import os
 import sys
 import traceback
@@ -33,6 +34,23 @@ def file_option(help: str, *flags: str, default: bool | str = True) -> Any:
 
 def file_argument(name: str, help: str) -> Any:
     return typer.Argument(parser=file_parser(name), metavar=name, help=help)
+
+
+def pair_of(
+    flag: str, form: str, example: str, largest: float = math.inf
+) -> Callable[[str], tuple[float, float]]:
+    """Returns a parser of two finite numbers with a comma between, ``form``, of absolute value at most ``largest``."""
+
+    def pair(text: str) -> tuple[float, float]:
+        try:
+            first, second = (float(part) for part in text.split(","))
+        except ValueError:
+            raise InputError(flag, repr(text), f"two numbers {form}", f"write for example {example}") from None
+        if not all(math.isfinite(x) and abs(x) <= largest for x in (first, second)):
+            raise InputError(flag, repr(text), f"two numbers {form}, of at most {largest:g}")
+        return first, second
+
+    return pair
 
 
 def file_parser(subject: str) -> Callable[[str], Path]:

@@ -2,7 +2,6 @@
 
 import functools
 import inspect
-import math
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args
@@ -11,8 +10,7 @@ from phyradgs_cl.acquisition import MOTIONS
 from phyradgs_cl.acquisition.readout import SIDES
 from phyradgs_cl.acquisition.scan import DETECTOR_MODELS
 from phyradgs_cl.acquisition.shutter import AXES
-from phyradgs_cl.commands.console import file_argument, file_option, option
-from phyradgs_cl.errors import InputError
+from phyradgs_cl.commands.console import file_argument, file_option, option, pair_of
 from phyradgs_cl.prepare import DEFAULT_STEPS, STEPS
 from phyradgs_cl.reconstructors import DEFAULT_METHOD, METHODS
 from phyradgs_cl.runtime import DEVICE_VARIABLE, MEMORY_VARIABLE
@@ -40,23 +38,6 @@ Steps = Annotated[str | None, option(_STEPS, "none", metavar="NAME,...")]
 _SCHEDULER = "Dask scheduler for the runs: its address or its JSON file; local starts workers here."
 Scheduler = Annotated[str | None, option(_SCHEDULER, metavar="ADDRESS|local")]
 WorkerCount = Annotated[int | None, option("Local workers, each a process.", "one per device", metavar="N")]
-
-
-def pair_of(
-    flag: str, form: str, example: str, largest: float = math.inf
-) -> Callable[[str], tuple[float, float]]:
-    """Returns a parser of two finite numbers with a comma between, ``form``, of absolute value at most ``largest``."""
-
-    def pair(text: str) -> tuple[float, float]:
-        try:
-            first, second = (float(part) for part in text.split(","))
-        except ValueError:
-            raise InputError(flag, repr(text), f"two numbers {form}", f"write for example {example}") from None
-        if not all(math.isfinite(x) and abs(x) <= largest for x in (first, second)):
-            raise InputError(flag, repr(text), f"two numbers {form}, of at most {largest:g}")
-        return first, second
-
-    return pair
 
 
 def numbers(text: str) -> float | list[float] | str:

@@ -6,8 +6,8 @@ from typing import Annotated, Any, Literal
 import typer
 
 from phyradgs_cl.acquisition import PROTOCOLS
-from phyradgs_cl.commands.console import file_option, option, say
-from phyradgs_cl.commands.options import Axis, DetectorModel, Device, First, Memory, Output, lengths, pair_of
+from phyradgs_cl.commands.console import file_option, option, pair_of, say
+from phyradgs_cl.commands.options import Axis, DetectorModel, Device, First, Memory, Output, lengths
 from phyradgs_cl.importers.options import DETECTOR_OFFSET
 from phyradgs_cl.phantoms import PHANTOMS
 from phyradgs_cl.progress import Ticker
