@@ -375,7 +375,6 @@ TABLES: dict[str, Callable[[], str]] = {
     "table1_S_standard": lambda: quality("table1_S.csv", "standard"),
     "table1_S_columns": lambda: quality("table1_S_columns.csv", "rapid"),
     "table1_M_rapid": lambda: quality("table1_M.csv", "rapid"),
-    "table1_M_standard": lambda: quality("table1_M.csv", "standard"),
     "table2_S": strips,
     "phantom_M": phantom,
     "motion_models": motion_models,
