@@ -7,7 +7,7 @@ import pytest
 import ray_tables
 from kernel_kit import assert_near
 from remembered import remembered
-from tolerances import ADJOINT, FLOAT32, RAYS, RAYS_BACK
+from tolerances import FLOAT32, RAYS, RAYS_BACK
 
 from phyradgs_cl.acquisition.time_cells import TimeCells
 from phyradgs_cl.fields import Grid
@@ -68,18 +68,6 @@ def test_the_twins_derivative_is_that_of_finite_differences(motion) -> None:
     assert np.linalg.norm(found - expected) <= GRADIENT * np.linalg.norm(expected)
     by_log = ray_frame(d, GRID, table, SHAPE)
     assert np.linalg.norm(found - by_log) > 1e-2 * np.linalg.norm(by_log)
-
-
-@AXES
-@BUSY
-def test_adjoint(any_rt, motion, axis) -> None:
-    operator = IntensityOperator(any_rt, GRID, SHAPE, tables(motion, axis))
-    operator.expected(noise(GRID.shape, 7))
-    d, y = noise(GRID.shape, 8), noise((2, *SHAPE), 9)
-    forward = float(np.vdot(operator.forward(d).astype(np.float64), y))
-    backward = float(np.vdot(operator.adjoint(y).astype(np.float64), d))
-    # the weights are rounded to float32 on both ways
-    assert abs(forward - backward) <= 10 * ADJOINT * forward
 
 
 def test_before_any_volume_it_is_the_linear_operator(rt) -> None:

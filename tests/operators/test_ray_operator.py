@@ -40,14 +40,6 @@ def check_twins(operator: RayOperator) -> None:
     assert np.abs(operator.adjoint(y) - expected).max() <= RAYS_BACK * expected.max()
 
 
-@pytest.mark.parametrize("axis", ["rows", "columns"])
-@pytest.mark.parametrize("motion", MOTIONS)
-def test_adjoint_of_every_motion(any_rt, motion, axis) -> None:
-    for direction in (1, -1):
-        operator = RayOperator(any_rt, GRID, SHAPE, tables(motion, SHAPE, axis, direction))
-        assert mismatch(operator) <= ADJOINT, direction
-
-
 @pytest.mark.parametrize("motion", MOTIONS)
 def test_frames_and_volumes_are_the_twins(any_rt, motion) -> None:
     check_twins(RayOperator(any_rt, GRID, SHAPE, tables(motion, SHAPE, "columns", -1, frames=2)))

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from kernel_kit import note_launches
 from memory_limits import room_for
-from ray_tables import noise, tables
+from ray_tables import leaning, noise, tables
 from remembered import remembered
 from tolerances import RAYS, RAYS_BACK
 
@@ -118,25 +118,6 @@ def test_intensities(cpu_rt, motion) -> None:
     assert np.abs(found - expected).max() <= RAYS * expected.max()
     np.testing.assert_allclose(operator.intensity_correction(x), operator.forward(x) - found, atol=1e-5)
     assert operator.intensity_correction(x).max() > 1e-3
-
-
-def leaning(cells: list[TimeCells], roll_deg: float, tilt_deg: float) -> list[TimeCells]:
-    """The same frames on a panel turned about its middle: in its plane, and about its rows."""
-    made = []
-    for table in cells:
-        pose = table.pose.copy()
-        eu, ev = pose[:, 6:9], pose[:, 9:12]
-        lines = (table.lines - 1) / 2
-        middle = pose[:, 3:6] + lines * ev + 3 * eu
-        du, dv = np.linalg.norm(eu, axis=1, keepdims=True), np.linalg.norm(ev, axis=1, keepdims=True)
-        u_hat, v_hat, normal = eu / du, ev / dv, np.cross(eu / du, ev / dv)
-        roll, tilted = np.deg2rad(roll_deg), np.deg2rad(tilt_deg)
-        v_hat = np.cos(tilted) * v_hat + np.sin(tilted) * normal
-        pose[:, 6:9] = du * (np.cos(roll) * u_hat + np.sin(roll) * v_hat)
-        pose[:, 9:12] = dv * (np.cos(roll) * v_hat - np.sin(roll) * u_hat)
-        pose[:, 3:6] = middle - lines * pose[:, 9:12] - 3 * pose[:, 6:9]
-        made.append(replace(table, pose=pose))
-    return made
 
 
 @pytest.mark.parametrize("motion, axis", [("static", "rows"), ("common", "rows"), ("common", "columns")])

@@ -69,12 +69,6 @@ def test_fused_equals_unfused(rt, make_cloud, orbit, axis, direction) -> None:
         assert_near(splat_frame(rows, table, SHAPE), expected, FLOAT64, 1.0)
 
 
-def test_fused_in_every_build(any_rt, make_cloud, orbit) -> None:
-    rows, shutter = make_cloud(4, 32), Shutter(0.5, 0.4, "columns", -1)
-    table = micro_view_cells(orbit, shutter, 0, START_S, SHAPE[1], 7, 3)
-    assert_near(render(any_rt, rows, table), unfused(rows, orbit, shutter, 7, 3), MERGED_FRAME)
-
-
 @AXES
 def test_no_exposure_and_no_readout_is_static(rt, make_cloud, orbit, axis) -> None:
     rows, shutter = make_cloud(4, 33), Shutter(0.0, 0.0, axis)

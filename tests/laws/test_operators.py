@@ -1,0 +1,272 @@
+"""Laws of every operator: adjoint, linear, additive over frames and time cells, moved and scaled with all space."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from kernel_kit import assert_near, frame_cells, splat, splat_gradients
+from laws_kit import cloud, grids, many, seeds, tables
+from ray_tables import leaning, noise
+from ray_tables import tables as ray_tables
+from tolerances import ADJOINT, FLOAT32, RAYS_BACK
+
+from phyradgs_cl.acquisition.time_cells import TimeCells
+from phyradgs_cl.fields import Grid
+from phyradgs_cl.fields.gaussians import DENSITY, MEAN, SCALE
+from phyradgs_cl.objective import TvProx
+from phyradgs_cl.objective.dct_prox import DctProx
+from phyradgs_cl.operators import RayOperator, Voxeliser
+from phyradgs_cl.operators.rays.intensity import IntensityOperator
+from phyradgs_cl.runtime import Runtime
+
+GRID, SHAPE = Grid((12, 15, 13), (0.16, 0.13, 0.15), (0.1, -0.05, 0.2)), (40, 18)
+STEPS = np.array([1, -2, 1])  # whole voxels along z, y, x
+INSIDE = np.s_[2:-2, 3:-3, 2:-2]  # what stays in the volume then
+NEAR = 2 * RAYS_BACK  # of the largest: two ways whose sums are rounded in other orders
+
+
+Shapes = tuple[tuple[int, ...], tuple[int, ...]]  # of x and of y
+
+
+@dataclass(frozen=True)
+class Operator:
+    """An operator on the device; ``cells``: of its frames, if it has any."""
+
+    rt: Runtime
+    cells: Sequence[TimeCells] = ()
+
+    def moved(self) -> "Operator":
+        """The operator and all else moved by whole voxels."""
+        moved = (STEPS * GRID.voxel_size_mm)[::-1]
+        cells = []
+        for table in self.cells:
+            poses = {n: getattr(table, n).copy() for n in ("pose", "end_poses") if getattr(table, n) is not None}
+            for pose in poses.values():
+                pose[..., 3:6] += moved
+                pose[..., :3] += 0 if table.is_parallel else moved
+            cells.append(replace(table, **poses))
+        return replace(self, cells=cells)
+
+    def larger(self) -> "Operator":
+        """The operator with all lengths twice as long."""
+        return replace(self, cells=[table.scaled(2.0) for table in self.cells])
+
+
+@dataclass(frozen=True)
+class Rays(Operator):
+    grid: Grid = GRID
+    shape: tuple[int, int] = SHAPE
+    factor = 2.0  # of values, where lengths are twice as long
+
+    @property
+    def made(self) -> RayOperator:
+        return RayOperator(self.rt, self.grid, self.shape, self.cells)
+
+    def forward(self, x: np.ndarray) -> np.ndarray:
+        return self.made.forward(x)
+
+    def adjoint(self, y: np.ndarray) -> np.ndarray:
+        return self.made.adjoint(y)
+
+    @property
+    def shapes(self) -> Shapes:
+        return self.grid.shape, (len(self.cells), *self.shape)
+
+    def larger(self) -> "Rays":
+        return replace(super().larger(), grid=self.grid.scaled(2.0))
+
+
+class Intensities(Rays):
+    """The derivative of averaged intensities at a volume."""
+
+    @property
+    def made(self) -> RayOperator:
+        operator = IntensityOperator(self.rt, self.grid, self.shape, self.cells)
+        operator.expected(noise(self.grid.shape, 7))
+        return operator
+
+
+@dataclass(frozen=True)
+class Densities(Operator):
+    """Densities of Gaussians to frames, all of every Gaussian. rows (11, G): without their densities."""
+
+    rows: np.ndarray | None = None
+    shape: tuple[int, int] = SHAPE
+    factor = 2.0
+
+    def of(self, densities: np.ndarray) -> np.ndarray:
+        rows = self.rows.copy()
+        rows[DENSITY] = densities
+        return rows
+
+    def forward(self, x: np.ndarray) -> np.ndarray:
+        return np.stack([splat(self.rt, self.of(x), table, self.shape, cutoff_sigma=0.0) for table in self.cells])
+
+    def adjoint(self, y: np.ndarray) -> np.ndarray:
+        pairs = zip(self.cells, y, strict=True)
+        return sum(splat_gradients(self.rt, self.of(1.0), c, h, cutoff_sigma=0.0)[DENSITY] for c, h in pairs)
+
+    @property
+    def shapes(self) -> Shapes:
+        return (self.rows.shape[1],), (len(self.cells), *self.shape)
+
+    def moved(self) -> "Densities":
+        rows = self.rows.copy()
+        rows[MEAN] += (STEPS * GRID.voxel_size_mm)[::-1, None]
+        return replace(super().moved(), rows=rows)
+
+    def larger(self) -> "Densities":
+        rows = self.rows.copy()
+        rows[MEAN], rows[SCALE] = 2 * rows[MEAN], 2 * rows[SCALE]
+        return replace(super().larger(), rows=rows)
+
+
+@dataclass(frozen=True)
+class Voxels(Densities):
+    """Densities of Gaussians to voxels."""
+
+    grid: Grid = GRID
+    factor = 1.0
+
+    def forward(self, x: np.ndarray) -> np.ndarray:
+        return Voxeliser(self.rt, self.grid.shape, cutoff_sigma=0.0).voxelise(self.of(x), self.grid)
+
+    def adjoint(self, y: np.ndarray) -> np.ndarray:
+        return Voxeliser(self.rt, self.grid.shape, cutoff_sigma=0.0).voxelise_adjoint(self.of(1.0), self.grid, y)[DENSITY]
+
+    @property
+    def shapes(self) -> Shapes:
+        return (self.rows.shape[1],), self.grid.shape
+
+    def larger(self) -> "Voxels":
+        return replace(super().larger(), grid=self.grid.scaled(2.0))
+
+
+def is_adjoint(operator: Operator, seed: int = 0) -> None:
+    """⟨Ax, y⟩ = ⟨x, Aᵀy⟩ relative to both, for arrays that are nowhere negative."""
+    x, y = (noise(shape, seed + n) for n, shape in enumerate(operator.shapes))
+    there, back = operator.forward(x).astype(np.float64), operator.adjoint(y).astype(np.float64)
+    assert np.isfinite(there).all() and np.isfinite(back).all()
+    one, other = np.vdot(there, y), np.vdot(back, x)
+    weight = 10 if isinstance(operator, Intensities) else 1  # its weights are rounded on both ways
+    assert abs(one - other) <= weight * ADJOINT * max(abs(one), abs(other))
+
+
+def is_linear(operator: Operator, seed: int = 0) -> None:
+    a, b = np.random.default_rng(seed).uniform(0.1, 3, 2).astype(np.float32)
+    for apply, shape in zip((operator.forward, operator.adjoint), operator.shapes, strict=True):
+        x, y = noise(shape, seed), noise(shape, seed + 1)
+        expected = a * apply(x) + b * apply(y)
+        assert_near(apply(a * x + b * y), expected, 10 * FLOAT32, max(expected.max(), 1e-6))
+
+
+def adds_frames_and_cells(operator: Operator) -> None:
+    """Frames are those of operators of one frame; a frame is the sum of those of its cells; Aᵀ is the sum of theirs."""
+    x, y = (noise(shape, n) for n, shape in enumerate(operator.shapes))
+    there, back = operator.forward(x), operator.adjoint(y)
+    assert there.any() and back.any()
+    frames = [replace(operator, cells=[table]) for table in operator.cells]
+    assert_near(np.concatenate([one.forward(x) for one in frames]), there, NEAR)
+    assert_near(sum(one.adjoint(y[f : f + 1]) for f, one in enumerate(frames)), back, NEAR)
+    cells = [replace(operator, cells=[only(operator.cells[0], k)]) for k in range(operator.cells[0].count)]
+    assert_near(sum(one.forward(x) for one in cells), there[:1], NEAR)
+    assert_near(sum(one.adjoint(y[:1]) for one in cells), frames[0].adjoint(y[:1]), NEAR)
+
+
+def only(table: TimeCells, cell: int) -> TimeCells:
+    arrays = {f.name: v for f in fields(table) if isinstance(v := getattr(table, f.name), np.ndarray)}
+    return replace(table, **{name: values[cell : cell + 1] for name, values in arrays.items()})
+
+
+def moves_and_scales(operator: Operator) -> None:
+    """Whole voxels further, the same is seen; of lengths twice as long, line integrals are."""
+    x = noise(operator.shapes[0], 5)
+    moved = x
+    if len(x.shape) == 3:
+        x, moved = np.zeros_like(x), np.zeros_like(x)
+        x[INSIDE] = noise(x[INSIDE].shape, 5)
+        moved = np.roll(x, STEPS, (0, 1, 2))
+    seen = operator.forward(x)
+    expected, found = seen, operator.moved().forward(moved)
+    if isinstance(operator, Voxels):
+        expected, found = np.roll(seen, STEPS, (0, 1, 2))[INSIDE], found[INSIDE]
+    assert seen.any()
+    assert_near(found, expected, NEAR)
+    assert_near(operator.larger().forward(x), operator.factor * seen, NEAR)
+
+
+RAYS = {
+    "static": ("static", "rows", "cone"), "per-row": ("common", "rows", "cone"), "leaning": ("static", "rows", "leaning"),
+    "leaning per-row": ("common", "rows", "leaning"), "parallel": ("static", "rows", "parallel"),
+    "parallel per-row": ("common", "columns", "parallel"), "intensities": ("common", "rows", "cone"),
+    "own times": ("per line", "columns", "cone"), "micro-views": ("micro-views", "columns", "cone"),
+}  # fmt: skip
+SPLATS = ("static", "micro-views", "exact", "per-row")
+
+
+NAMES = [*RAYS, *(f"splats {motion}" for motion in SPLATS), "voxels"]
+
+
+@pytest.fixture
+def make(make_geometry, make_cloud) -> Callable[[str, Runtime], Operator]:
+    def make(name: str, rt: Runtime) -> Operator:
+        if name in RAYS:
+            motion, axis, beam = RAYS[name]
+            cells = ray_tables(motion, SHAPE, axis, -1, 2, beam="cone" if beam == "leaning" else beam)
+            cells = leaning(cells, 2.0, 3.0) if beam == "leaning" else cells
+            return (Intensities if name == "intensities" else Rays)(rt, cells)
+        rows = make_cloud(3, 5, scale=(0.15, 0.3))
+        if name == "voxels":
+            return Voxels(rt, (), rows)
+        cells = [frame_cells(name.removeprefix("splats "), make_geometry(*SHAPE), speed=speed) for speed in (0.5, 0.7)]
+        return Densities(rt, cells, rows)
+
+    return make
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_every_operator_is_linear_and_has_its_adjoint(any_rt, make, name) -> None:
+    is_adjoint(make(name, any_rt))
+    is_linear(make(name, any_rt))
+
+
+@pytest.mark.parametrize("name", [name for name in NAMES if name != "intensities"])
+def test_frames_and_time_cells_add_up_and_space_may_move_and_grow(rt, make, name) -> None:
+    operator = make(name, rt)
+    if operator.cells:
+        adds_frames_and_cells(operator)
+    moves_and_scales(operator)
+
+
+@many
+@given(scanner=tables(), grid=grids(), seed=seeds)
+def test_rays_of_random_scanners(rt, scanner, grid, seed) -> None:
+    shape, cells = scanner
+    is_adjoint(Rays(rt, cells, grid, shape), seed)
+    is_linear(Rays(rt, cells, grid, shape), seed)
+
+
+@many
+@given(scanner=tables(), seed=seeds)
+def test_splats_of_random_scanners(rt, scanner, seed) -> None:
+    shape, cells = scanner
+    is_adjoint(Densities(rt, cells[:1], cloud(seed), shape), seed)
+    is_linear(Densities(rt, cells[:1], cloud(seed), shape), seed)
+
+
+@pytest.mark.parametrize("name", ["total variation", "cosine blocks"])
+def test_proximal_maps_are_odd_homogeneous_and_bring_no_two_volumes_apart(any_rt, name) -> None:
+    """And a constant passes through them."""
+    if name == "total variation":
+        prox = lambda x, weight: TvProx(any_rt, GRID.shape, (1.0, 1.0, 1.0))(x, weight, 15, nonnegative=False)  # noqa: E731
+    else:
+        prox = lambda x, weight: DctProx(any_rt, GRID.shape)(x, weight, 0, nonnegative=False)  # noqa: E731
+    x, y = noise(GRID.shape, 1), noise(GRID.shape, 2)
+    mapped = prox(x, 0.1)
+    assert np.abs(mapped - x).max() > 0.05
+    assert_near(prox(-x, 0.1), -mapped, FLOAT32)
+    assert_near(prox(2 * x, 0.2), 2 * mapped, FLOAT32)
+    assert_near(prox(x + 3, 0.1), mapped + 3, FLOAT32)
+    assert np.linalg.norm(mapped - prox(y, 0.1)) <= np.linalg.norm(x - y)
