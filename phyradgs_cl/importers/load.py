@@ -34,6 +34,7 @@ FORMATS = {
     "skyscan": "laboratory.skyscan",
     "zeiss": "laboratory.zeiss",
     "flexray": "laboratory.flexray",
+    "rtk-projections": "toolkits.rtk_projections",
     "leap": "toolkits.leap",
     "tigre": "toolkits.tigre",
 }

@@ -24,6 +24,7 @@ from phyradgs_cl.fields import Grid
 from phyradgs_cl.io import read_scan, write_scan
 from phyradgs_cl.phantoms import Ellipsoid, EllipsoidPhantom
 
+collect_ignore = [] if importlib.util.find_spec("itk") else ["test_rtk_projections.py"]
 # With import-mode importlib nothing in this folder has a name of its own: tests import the helpers by these.
 sys.modules["conftest_of_importers"] = sys.modules[__name__]
 for _helper in ("laboratory", "toolkits", "writers", "hostile"):

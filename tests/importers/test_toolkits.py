@@ -1,5 +1,6 @@
 """Geometries of TIGRE and LEAP: each against its own formula, and reconstructions to the bit."""
 
+import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -101,3 +102,18 @@ def test_tigre_s_centre_of_rotation_and_values_per_frame(tmp_path, make_truth) -
         pose[:6] += np.tile(1.5 * pose[6:9] / 2.5, 2)
         expected = projected(pose, WORLD_POINTS)
         np.testing.assert_allclose(projected(pose_at(scan, frame, 0.5), WORLD_POINTS), expected, atol=1e-6)
+
+
+RAW = {"_Frames.xml": "1.his", "ProjectionInfo.xml": "1.hnd", "Scan.xml": "1.xim", "a.ora.xml": "b.ora.xml"}
+
+
+def test_raw_projections_are_recognised_and_name_the_package_that_reads_them(tmp_path, monkeypatch) -> None:
+    monkeypatch.setitem(sys.modules, "itk", None)
+    for description, projection in RAW.items():
+        folder = tmp_path / projection
+        folder.mkdir()
+        for name in (description, projection):
+            (folder / name).write_bytes(b"")
+        assert recognise(folder) == recognise(folder / description) == "rtk-projections"
+        with pytest.raises(InputError, match=r"phyradgs-cl\[rtk\]"):
+            import_scan(folder)

@@ -37,12 +37,13 @@ _ANGLES = ("GantryAngle", "InPlaneAngle", "OutOfPlaneAngle")
 _RADIUS = "RadiusCylindricalDetector"
 _DECLARATIONS = re.compile(rb"<!DOCTYPE[^>]*(SYSTEM|PUBLIC|\[)")
 _LARGEST = 1e9
+_RAW, _ORA = (".his", ".hnd", ".hnc", ".xim"), ".ora.xml"  # what rtk_projections reads
 # RTK's axes (X, Y, Z) are (y, z, x) here: the same right-handed frame under other names.
 _TO_WORLD = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
 
 
 @dataclass(frozen=True, eq=False)
-class _Stack:
+class Stack:
     """Projections (F, v, u); origin and steps along u and v, each (2,): (x, y) in the image's plane in mm."""
 
     frames: np.ndarray
@@ -52,11 +53,12 @@ class _Stack:
 
 
 def recognises(path: Path) -> bool:
-    """True for an .xml file, and for a folder with one and a MetaImage."""
+    """True for an .xml file that has no raw projections beside it, and for a folder with one and a MetaImage."""
+    folder = SafeFolder(path if path.is_dir() else path.parent)
     if not path.is_dir():
-        return path.suffix.lower() == ".xml"
-    folder = SafeFolder(path)
-    return bool(folder.matching(".xml") and folder.matching(*STACKS))
+        return path.suffix.lower() == ".xml" and not path.name.lower().endswith(_ORA) and not folder.matching(*_RAW)
+    descriptions = [file for file in folder.matching(".xml") if not file.name.lower().endswith(_ORA)]
+    return bool(descriptions and folder.matching(*STACKS))
 
 
 def import_scan(path: Path, options: ImportOptions) -> Scan:
@@ -66,30 +68,45 @@ def import_scan(path: Path, options: ImportOptions) -> Scan:
     description = path if path.is_file() else folder.only("geometry", ".xml")
     stack_path = folder.only("stack of projections", *STACKS)
     rtk, stack = read_rtk_xml(description), _read_stack(stack_path)
+    return scan_of(rtk, stack, options, (str(description), str(stack_path)), description.stem, str(path))
+
+
+def scan_of(
+    rtk: "RtkGeometry", stack: Stack, options: ImportOptions, subjects: tuple[str, str], title: str, source: str
+) -> Scan:
+    """Returns the scan of a geometry and its projections, which ``subjects`` name in messages."""
+    described, stored = subjects
     if len(stack.frames) != rtk.frames:
-        found = f"{len(stack.frames)} frames, {rtk.frames} projections in {description.name}"
-        raise InputError(str(stack_path), found, "one frame per projection")
-    timing = assemble.make_timing(str(description), rtk.frames, options)
-    trajectory, geometry, turn = _trajectory(rtk, stack, timing, str(description))
+        found = f"{len(stack.frames)} frames, {rtk.frames} projections in {Path(described).name}"
+        raise InputError(stored, found, "one frame per projection")
+    timing = assemble.make_timing(described, rtk.frames, options)
+    trajectory, geometry, turn = _trajectory(rtk, stack, timing, described)
     convention = "attenuation" if stack.frames.dtype.kind == "f" and options.flat_value is None else None
-    integrals = line_integrals(str(stack_path), turn.frames(stack.frames), options, convention=convention)
-    parts = integrals, trajectory, geometry, timing, options
-    return assemble.assemble_scan(*parts, title=description.stem, source=str(path))
+    integrals = line_integrals(stored, turn.frames(stack.frames), options, convention=convention)
+    return assemble.assemble_scan(integrals, trajectory, geometry, timing, options, title=title, source=source)
 
 
-def _read_stack(path: Path) -> _Stack:
-    """Reads a MetaImage of projections. InputError unless its third axis, the frames, is perpendicular to the others."""
+def _read_stack(path: Path) -> Stack:
     image = read_image(path)
-    steps_mm = np.reshape(image.GetDirection(), (3, 3)) * image.GetSpacing()  # columns: along u, v and the frames
+    frames = checks.package("SimpleITK", "the package that reads this file", "phyradgs-cl[formats]").GetArrayFromImage(image)
+    direction = np.reshape(image.GetDirection(), (3, 3))
+    return stack_of(frames, image.GetOrigin(), image.GetSpacing(), direction, f"{path} TransformMatrix")
+
+
+def stack_of(
+    frames: np.ndarray, origin_mm: tuple[float, ...], spacing_mm: tuple[float, ...], direction: np.ndarray, subject: str
+) -> Stack:
+    """Returns the projections (F, v, u) of an image of ITK with its origin and spacing (3,) and direction (3, 3). InputError
+    unless its third axis, the frames, is perpendicular to the others."""
+    steps_mm = direction * spacing_mm  # columns: along u, v and the frames
     if np.abs([*steps_mm[:2, 2], *steps_mm[2, :2]]).max() > 1e-9 * np.abs(steps_mm).max():
         found = str(steps_mm.tolist())[:80]
-        raise InputError(f"{path} TransformMatrix", found, "axes of a stack: columns, rows, frames")
-    frames = checks.package("SimpleITK", "the package that reads this file", "phyradgs-cl[formats]").GetArrayFromImage(image)
-    return _Stack(frames, np.array(image.GetOrigin()[:2]), steps_mm[:2, 0], steps_mm[:2, 1])
+        raise InputError(subject, found, "axes of a stack: columns, rows, frames")
+    return Stack(frames, np.array(origin_mm[:2]), steps_mm[:2, 0], steps_mm[:2, 1])
 
 
 def _trajectory(
-    rtk: "RtkGeometry", stack: _Stack, timing: assemble.Timing, subject: str
+    rtk: "RtkGeometry", stack: Stack, timing: assemble.Timing, subject: str
 ) -> tuple[CircularOrbit | PoseTable, Geometry, assemble.Turned]:
     """Returns a circular orbit where one describes the file, else a table of poses, with a plain geometry and the flips."""
     panel = (stack.frames.shape[1], stack.frames.shape[2])
