@@ -31,6 +31,11 @@ Memory = Annotated[str | None, option(_MEMORY, "what the device has", metavar="S
 _OBJECT_MOTION = "Deformation file, or simulated scan, with the motion of the object during the scan (docs: moving.md)."
 ObjectMotion = Annotated[Path | None, file_option(_OBJECT_MOTION, "--object-motion")]
 
+IgnoreLag = Annotated[bool, option("Leave the scan's lag in the frames.", True, "--ignore-lag")]
+_CHECKPOINT = "Seconds from checkpoint to checkpoint of a run, which continues from its last; 0: on Ctrl-C only."
+CheckpointEvery = Annotated[float, option(_CHECKPOINT, metavar="SECONDS")]
+CHECKPOINT_EVERY_S = 600.0
+
 _STEPS = f"Corrections of the frames, of {', '.join(STEPS)} (docs: prepare.md)."
 STEPS_OF_PREPARE = option(_STEPS, DEFAULT_STEPS, metavar="NAME,...")
 Steps = Annotated[str | None, option(_STEPS, "none", metavar="NAME,...")]
@@ -119,7 +124,7 @@ RUN_OPTIONS: dict[str, Any] = {
     "config": Annotated[Path | None, file_option(_CONFIG, "--config")],
     "assignments": Annotated[list[str] | None, option(_SET, True, "--set", metavar="NAME=VALUE")],
     "detector_model": _asked(DetectorModel, "An exposure averages line integrals (log) or intensity.", "the scan's"),
-    "ignore_lag": Annotated[bool, option("Leave the scan's lag in the frames.", True, "--ignore-lag")],
+    "ignore_lag": IgnoreLag,
     "steps": Steps,
     "holdout": _asked(float, _HOLDOUT, "0", metavar="PERCENT"),
     "tune": _asked(str, _TUNE, "none", metavar="NAME[=VALUES]"),

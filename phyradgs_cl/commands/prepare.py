@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from phyradgs_cl.commands.console import AsJson, file_option, option, say
-from phyradgs_cl.commands.options import STEPS_OF_PREPARE, Device, Memory, Output, Scan
+from phyradgs_cl.commands.options import STEPS_OF_PREPARE, Device, IgnoreLag, Memory, Output, Scan
 from phyradgs_cl.prepare import DEFAULT_STEPS
 from phyradgs_cl.progress import Ticker
 from phyradgs_cl.settings import read_settings
@@ -26,7 +26,7 @@ def prepare_command(
     scan: Scan, output: Output, steps: Annotated[str | None, STEPS_OF_PREPARE] = None,
     config: Annotated[Path | None, file_option(_CONFIG, "--config")] = None,
     assignments: Annotated[list[str] | None, option(_SET, True, "--set", metavar="NAME=VALUE")] = None,
-    ignore_lag: Annotated[bool, option("Leave the scan's lag in the frames.", True, "--ignore-lag")] = False,
+    ignore_lag: IgnoreLag = False,
     as_json: AsJson = False, device: Device = None, memory: Memory = None,
 ) -> None:
     """Correct the effects of panel and beam in a scan: write line integrals and a mask, and print each step's numbers.

@@ -11,7 +11,15 @@ from phyradgs_cl import signals
 from phyradgs_cl.acquisition.motion import motion_facts
 from phyradgs_cl.acquisition.plausible import blur_line
 from phyradgs_cl.commands.console import complain, file_option, last_words, option, say, scores
-from phyradgs_cl.commands.options import RUN_GROUPS, ObjectMotion, Output, Scan, with_run_options
+from phyradgs_cl.commands.options import (
+    CHECKPOINT_EVERY_S,
+    RUN_GROUPS,
+    CheckpointEvery,
+    ObjectMotion,
+    Output,
+    Scan,
+    with_run_options,
+)
 from phyradgs_cl.estimate import duration, estimate, seconds_around
 from phyradgs_cl.io import partial_path
 from phyradgs_cl.parallel import failing_together, launched_ranks
@@ -33,7 +41,6 @@ EXAMPLES = {
     "estimate": "Example: phyradgs estimate scan.h5 --method fista-tv --motion per-row",
 }
 GROUPS = {"reconstruct": RUN_GROUPS, "estimate": RUN_GROUPS}
-_CHECKPOINT = "Seconds from checkpoint to checkpoint, for --resume; 0: on Ctrl-C only."
 _ROWS = "Detector rows of a parallel scan to read and reconstruct; row 0 is the lowest."
 _SLAB = "Rows of a parallel scan at a time: slabs, kept on disk as they are done."
 _LIVE = "HTML page of the run, written again every five seconds; after the run it is the report."
@@ -46,7 +53,7 @@ def reconstruct_command(
     initial: Annotated[Path | None, file_option("Volume to start from.", "--initial")] = None,
     object_motion: ObjectMotion = None,
     resume: Annotated[bool, option("Continue an interrupted run from its checkpoint.", True, "--resume")] = False,
-    checkpoint_every: Annotated[float, option(_CHECKPOINT, metavar="SECONDS")] = 600.0,
+    checkpoint_every: CheckpointEvery = CHECKPOINT_EVERY_S,
     preview: Annotated[Path | None, file_option(_PREVIEW, "--preview")] = None,
     live: Annotated[Path | None, file_option(_LIVE, "--live")] = None,
     profile: Annotated[bool, option("Print the device's time by kernel.", True, "--profile")] = False,

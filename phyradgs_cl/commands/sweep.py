@@ -9,7 +9,7 @@ import typer
 from phyradgs_cl import signals
 from phyradgs_cl.cluster import LOCAL, Workers, has_dask
 from phyradgs_cl.commands.console import complain, file_argument, file_parser, option, remark, say, scores
-from phyradgs_cl.commands.options import Device, Scheduler, WorkerCount
+from phyradgs_cl.commands.options import CHECKPOINT_EVERY_S, CheckpointEvery, Device, Scheduler, WorkerCount
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.progress import Ticker
 from phyradgs_cl.runtime import Runtime
@@ -28,7 +28,6 @@ EXAMPLES = {
 GROUPS = {"sweep": {"Basics": ("output", "checkpoint_every"), "Workers": ("scheduler", "workers", "device")}}
 GROUPS["bench"] = {"Basics": ("output", "seed", "iterations"), "Workers": GROUPS["sweep"]["Workers"]}
 _OUTPUT = f"Folder for {RESULTS} (one line per run), volumes and tables."
-_CHECKPOINT = "Interval between the checkpoints of a run; a lost run continues from its last."
 _DEVICES = "Devices of local workers, with commas: indices, cpu, gpu or parts of names."
 _KIND = f"quick: methods with and without motion on two phantoms of {VOXELS}³ from {PIXELS}², a minute or two."
 _TABLES = ("table1", "table2", "phantom")
@@ -38,7 +37,7 @@ def sweep_command(
     grid: Annotated[Path, file_argument("GRID", "TOML file: scans, settings and seeds (docs: cluster.md).")],
     output: Annotated[Path, option(_OUTPUT, True, "--output", "-o", metavar="DIR")],
     scheduler: Scheduler = None, workers: WorkerCount = None,
-    checkpoint_every: Annotated[float, option(_CHECKPOINT, metavar="SECONDS")] = 600.0,
+    checkpoint_every: CheckpointEvery = CHECKPOINT_EVERY_S,
     device: Annotated[str | None, option(_DEVICES, "all GPUs, else the best device")] = None,
 ) -> None:
     """Reconstruct many scans with many settings: a results file, volumes, and tables."""

@@ -7,7 +7,7 @@ import typer
 
 from phyradgs_cl import signals
 from phyradgs_cl.commands.console import complain, file_argument, option, say, scores
-from phyradgs_cl.commands.options import RUN_GROUPS, with_run_options
+from phyradgs_cl.commands.options import CHECKPOINT_EVERY_S, RUN_GROUPS, CheckpointEvery, with_run_options
 from phyradgs_cl.progress import Ticker
 from phyradgs_cl.reconstructors import ProgressReport
 from phyradgs_cl.settings import Settings
@@ -32,7 +32,7 @@ def watch_command(
     once: Annotated[bool, option(_ONCE, True, "--once")] = False,
     poll_s: Annotated[float, option("Interval between looks at the folder.", True, "--poll-s", metavar="SECONDS")] = 2.0,
     settle_s: Annotated[float, option(_SETTLE, True, "--settle-s", metavar="SECONDS")] = 5.0,
-    checkpoint_every: Annotated[float, option("Interval between checkpoints of a run.", metavar="SECONDS")] = 600.0,
+    checkpoint_every: CheckpointEvery = CHECKPOINT_EVERY_S,
 ) -> None:
     """Reconstruct the scans of a folder as they arrive, each once. A scan that fails leaves its error."""
     job = WatchJob(folder, output, settings.plan(), poll_s, settle_s, once, checkpoint_every)

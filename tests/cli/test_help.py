@@ -50,6 +50,17 @@ def test_help_is_whole_everywhere(cli, told, monkeypatch) -> None:
         assert "--batch" in at_the_end and "--batch" not in usual and "--help" in usual
 
 
+def test_options_that_commands_share_are_declared_once(cli) -> None:
+    """All but what is written, a file or a folder, and a sweep's devices say the same in every command."""
+    commands = typer.main.get_command(cli.app).commands
+    help_of: dict[str, str] = {}
+    for name in ("reconstruct", "estimate", "watch", "sweep"):
+        for parameter in commands[name].params:
+            is_own = parameter.name == "output" or (name, parameter.name) == ("sweep", "device")
+            if parameter.param_type_name == "option" and not is_own:
+                assert help_of.setdefault(parameter.name, parameter.help) == parameter.help, f"{name}: {parameter.name}"
+
+
 def test_every_option_has_a_group_and_the_basics_fit_a_screen(cli, told, monkeypatch) -> None:
     monkeypatch.setenv("COLUMNS", "80")
     commands = typer.main.get_command(cli.app).commands
