@@ -24,6 +24,7 @@ from phyradgs_cl.operators.splats.binning import TileLists
 from phyradgs_cl.operators.twins import rays as twins
 from phyradgs_cl.operators.twins.splat import moving_frame, splat_frame, splat_image, voxel_field
 from phyradgs_cl.operators.twins.warp import warp_adjoint, warp_forward
+from phyradgs_cl.operators.warp.backproject import MovingBackprojector
 from phyradgs_cl.operators.warp.operator import WarpedOperator
 from phyradgs_cl.operators.warp.states import MotionStates
 from phyradgs_cl.operators.warp.volume import VolumeWarp
@@ -32,6 +33,7 @@ from phyradgs_cl.runtime import DeviceSpace, HostSpace, Runtime
 from phyradgs_cl.runtime.layout import pad_rows, pitch_of, unpad_rows
 
 VALUE, GRADIENT = 1e-4, 1e-3  # relative to the largest number; float32 leaves a tenth of them in tests
+_GRIDDED = 5e-3  # where an inverse is computed from a field's values at voxels
 SHAPE, GRID = (9, 12), Grid((5, 7, 6), (0.3, 0.24, 0.28), (0.1, -0.05, 0.1))
 GEOMETRY = ConeGeometry(5.0, 7.5, SHAPE, (3.9 / 9, 4.1 / 12), (0.1, 0.2))
 ORBIT = CircularOrbit(GEOMETRY, ConstantSpeed(0.3, 0.5))
@@ -246,6 +248,24 @@ def _backprojections(rt: Runtime) -> Iterator[Comparison]:
     yield operators.backproject_lines(rt, *seen), twins.lines_backprojection(*seen), VALUE
 
 
+def _moving_backprojections(rt: Runtime) -> Iterator[Comparison]:
+    frames, weight, angles = _noise((3, *SHAPE), 7), np.array([0.5, 0.8, 1.0]), np.array([0.0, 1.3, 2.9])
+    control_mm, times_s = 0.2 * (_noise((2, 6, 6, 6, 3), 23) - 0.5), np.array([0.0, 1.0, 2.0])
+    phases = np.array([[1.0, 0.0], [0.4, 0.3], [-0.5, 0.7]])
+    states = MotionStates.of_times(Deformation(control_mm, (-2.0,) * 3, 0.8, times_s, phases), GRID, times_s)
+    between = np.array([0.0, 0.5, 1.4])
+    shares = states.shares(between)
+    inverse_mm = [states.deformation.inverse_on_grid_mm(GRID, weights) for weights in states.weights]
+    push_mm = np.tensordot(shares, inverse_mm, 1)
+    moving = MovingBackprojector(rt, states, shares)
+    pose = GEOMETRY.pose(angles)
+    expected = twins.backprojection(frames, pose, weight, GRID, push_mm=push_mm)
+    yield moving(frames, pose, weight, GRID), expected, _GRIDDED
+    lines = np.stack([GEOMETRY.pose(a + np.linspace(-0.1, 0.1, SHAPE[0])) for a in angles])
+    expected = twins.lines_backprojection(frames, lines, weight, GRID, push_mm=push_mm)
+    yield moving(frames, lines, weight, GRID), expected, _GRIDDED
+
+
 def _image_terms(rt: Runtime) -> Iterator[Comparison]:
     rendered, measured, transmission = (_noise(SHAPE, seed) for seed in (8, 9, 10))
     mask = (_noise(SHAPE, 11) > 0.2).astype(np.float32)
@@ -302,7 +322,7 @@ def _optimiser(rt: Runtime) -> Iterator[Comparison]:
 
 CHECKS = (
     _algebra, _binning, _splats, _layered_splats, _plain_splats, _voxels, _rays, _warps, _backprojections,
-    _image_terms, _variation, _optimiser,
+    _moving_backprojections, _image_terms, _variation, _optimiser,
 )  # fmt: skip
 """Ordered by dependence: a kernel that has agreed is not suspected later."""
 

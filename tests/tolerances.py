@@ -57,6 +57,8 @@ VOXEL = 1e-5  # of the largest density: float32 rounding of the exponent (1e-6)
 VOXEL_NEEDLE = 2e-4  # aspect 1000: float32 centres and factors move a needle by a share of its width
 RAYS = 1e-5  # of the peak: some tens of float32 samples, positions to 1e-6 of a voxel
 # of the peak: a voxel has few samples, whose positions (1e-5 of a voxel, 200 away from the source) do not average out
+# of the peak, where an inverse field is found from the field's values at voxels (7e-4)
+GRIDDED_FIELD = 5e-3
 COMMON_TIMES = 1e-3  # relative RMS of 5 times to an exposure of 14.4 degrees; measured up to 7e-4
 RAYS_BACK = 3e-5  # measured 1.2e-5
 BRICKS = 2e-6  # of the largest: a ray's samples are summed brick by brick, in another order (4e-7)

@@ -24,7 +24,7 @@ _BLOCK_VOXELS = 128  # along z per work-item of the upright kernel
 _COLUMN_ROWS = 512  # detector rows that such a block may project to
 _UPRIGHT = 1e-7  # change of u or depth over the volume's height, relative to the depth
 _MOST_LEAN = 0.25  # columns per row along z: beyond it the general kernel is faster
-_Arguments = tuple[DeviceArray, DeviceArray, DeviceArray, np.int32, np.int32, np.int32, np.int32, np.int64]
+Arguments = tuple[DeviceArray, DeviceArray, DeviceArray, np.int32, np.int32, np.int32, np.int32, np.int64]
 
 
 def backproject(
@@ -37,12 +37,12 @@ def backproject(
     """
     matrices = voxel_matrices(pose, grid, is_parallel)
     block, leans = (0, False) if rt.pixel_items else _upright_block(matrices, grid)
-    views = _Views(frames, bool(block), matrices, weight)
+    views = Views(frames, bool(block), matrices, weight)
     if block:
         name = "backproject_leaning" if leans else "backproject_upright"
-        volume = _in_bricks(rt, views, grid, block, lambda *where: _upright(rt, name, block, *where))
+        volume = in_bricks(rt, views, grid, block, lambda *where: _upright(rt, name, block, *where))
     else:
-        volume = _in_bricks(rt, views, grid, 1, lambda *where: _general(rt, *where))
+        volume = in_bricks(rt, views, grid, 1, lambda *where: _general(rt, *where))
     return cast(SameArray, volume)
 
 
@@ -60,12 +60,12 @@ def backproject_lines(
     pose = readout.poses(pose)
     matrices = voxel_matrices(pose.reshape(-1, 12), grid, is_parallel).reshape(len(pose), -1)
     across = np.int32(axis == "columns")
-    views = _Views(frames, axis == "columns", matrices, weight)
-    return cast(SameArray, _in_bricks(rt, views, grid, 1, lambda *where: _lines(rt, across, *where)))
+    views = Views(frames, axis == "columns", matrices, weight)
+    return cast(SameArray, in_bricks(rt, views, grid, 1, lambda *where: _lines(rt, across, *where)))
 
 
 @dataclass(frozen=True, eq=False)
-class _Views:
+class Views:
     """Frames (F, rows, columns), whether their columns become rows, their matrices (F, …) and weights (F,)."""
 
     frames: Array
@@ -109,10 +109,10 @@ class _Views:
             yield slice(first, min(first + count, len(self.matrices)))
 
 
-_Launch = Callable[["_Arguments", Brick, DeviceArray], None]
+_Launch = Callable[[Arguments, Brick, DeviceArray], None]
 
 
-def _in_bricks(rt: Runtime, views: _Views, grid: Grid, step: int, launch: _Launch) -> Array:
+def in_bricks(rt: Runtime, views: Views, grid: Grid, step: int, launch: _Launch) -> Array:
     """Returns the volume (z, y, x), computed in bricks of a multiple of ``step`` voxels along z if it does not fit."""
 
     is_resident = isinstance(views.frames, DeviceArray)
@@ -135,7 +135,7 @@ def _in_bricks(rt: Runtime, views: _Views, grid: Grid, step: int, launch: _Launc
 
 
 def _backprojected(
-    rt: Runtime, views: _Views, parts: list[slice], brick: Brick, launch: _Launch
+    rt: Runtime, views: Views, parts: list[slice], brick: Brick, launch: _Launch
 ) -> DeviceArray:
     """Returns a brick in the padded layout."""
     nz, ny, nx = brick.shape
@@ -147,27 +147,27 @@ def _backprojected(
     return volume
 
 
-def _general(rt: Runtime, images: _Arguments, brick: Brick, volume: DeviceArray) -> None:
+def _general(rt: Runtime, images: Arguments, brick: Brick, volume: DeviceArray) -> None:
     nz, ny, nx = brick.shape
     kernel = rt.kernel("backproject", "backproject", IMAGE_GUARD=GUARD)
-    rt.launch(kernel, (ceil_div(nx, rt.lanes), ny, nz), *images, *_volume_shape(brick), volume, group=rt.group())
+    rt.launch(kernel, (ceil_div(nx, rt.lanes), ny, nz), *images, *volume_shape(brick), volume, group=rt.group())
 
 
-def _lines(rt: Runtime, across: np.int32, images: _Arguments, brick: Brick, volume: DeviceArray) -> None:
+def _lines(rt: Runtime, across: np.int32, images: Arguments, brick: Brick, volume: DeviceArray) -> None:
     nz, ny, nx = brick.shape
     kernel = rt.kernel("backproject", "backproject_lines", IMAGE_GUARD=GUARD)
     group = rt.group(on_cpu=16)
-    rt.launch(kernel, (nx, ny, nz), *images, *_volume_shape(brick), across, volume, group=group)
+    rt.launch(kernel, (nx, ny, nz), *images, *volume_shape(brick), across, volume, group=group)
 
 
-def _upright(rt: Runtime, name: str, block: int, images: _Arguments, brick: Brick, volume: DeviceArray) -> None:
+def _upright(rt: Runtime, name: str, block: int, images: Arguments, brick: Brick, volume: DeviceArray) -> None:
     """Launches an upright kernel. ``images`` are transposed: their width is the number of detector rows."""
     nz, ny, nx = brick.shape
     defines = {"IMAGE_GUARD": GUARD, "BLOCK_VOXELS": _BLOCK_VOXELS, "COLUMN_ROWS": _COLUMN_ROWS}
     kernel = rt.kernel("backproject", name, **defines)
     image, table, weights, views, columns, rows, *rest = images
     data = (image, table, weights, views, rows, columns, *rest)
-    rt.launch(kernel, (nx, ny, ceil_div(nz, block)), *data, *_volume_shape(brick), np.int32(block), volume)
+    rt.launch(kernel, (nx, ny, ceil_div(nz, block)), *data, *volume_shape(brick), np.int32(block), volume)
 
 
 def _upright_block(matrices: np.ndarray, grid: Grid) -> tuple[int, bool]:
@@ -192,7 +192,7 @@ def _upright_block(matrices: np.ndarray, grid: Grid) -> tuple[int, bool]:
     return int(min(_BLOCK_VOXELS, nz, (_COLUMN_ROWS - 4) // max(rows_per_voxel, 1e-3))), leans
 
 
-def _images(rt: Runtime, views: _Views, part: slice) -> _Arguments:
+def _images(rt: Runtime, views: Views, part: slice) -> Arguments:
     """Returns the kernels' first arguments: padded images on the device, matrices, weights, and their sizes."""
     images, (rows, width) = views.padded(rt, part), views.shape
     count, each = images.shape
@@ -201,7 +201,7 @@ def _images(rt: Runtime, views: _Views, part: slice) -> _Arguments:
     return (images, *tables, *sizes)
 
 
-def _volume_shape(brick: Brick) -> tuple[np.ndarray, np.ndarray, np.int32]:
+def volume_shape(brick: Brick) -> tuple[np.ndarray, np.ndarray, np.int32]:
     nz, ny, nx = brick.shape
     shape, origin = np.array([nx, ny, nz, 0], np.int32), np.array([*brick.start[::-1], 0], np.int32)
     return shape, origin, np.int32(pitch_of(nx))

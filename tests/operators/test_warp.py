@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from kernel_kit import assert_near
-from tolerances import ADJOINT, FLOAT32, RAYS
+from tolerances import ADJOINT, FLOAT32, GRIDDED_FIELD, RAYS
 
 from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, ConstantSpeed, Shutter
 from phyradgs_cl.acquisition.cells import common_time_cells, static_cells
@@ -15,7 +15,9 @@ from phyradgs_cl.fields import Deformation, Grid, control_points
 from phyradgs_cl.operators import IntensityOperator, RayOperator
 from phyradgs_cl.operators.bricks import whole
 from phyradgs_cl.operators.rays.memory import RayMemory
+from phyradgs_cl.operators.twins.rays import backprojection
 from phyradgs_cl.operators.twins.warp import warp_adjoint, warp_forward
+from phyradgs_cl.operators.warp.backproject import MovingBackprojector
 from phyradgs_cl.operators.warp.operator import WarpedOperator, projector_of
 from phyradgs_cl.operators.warp.states import MOST_STATES, MotionStates
 from phyradgs_cl.operators.warp.volume import VolumeWarp
@@ -151,6 +153,24 @@ def test_intensity_follows_the_object(rt) -> None:
     assert_near(intensity.forward(x), mean, 2 * RAYS)  # at a volume of zeros
     expected = intensity.expected(x)
     assert np.all(expected <= mean + RAYS * mean.max()) and np.abs(expected - mean).max() > 1e-4 * mean.max()
+
+
+def test_backprojection_follows_matter(rt) -> None:
+    """From one pose per frame and per line; a state alone has the backprojection of the object where it then is."""
+    states = states_of(deformation(0.05))
+    times_s = np.array([0.0, 1.1, 2.3])
+    shares = states.shares(times_s)
+    frames, weight = noise((3, *SHAPE)), np.array([0.5, 0.8, 1.0])
+    pose = GEOMETRY.pose(np.array([0.0, 1.3, 2.9]))
+    inverse_mm = [states.deformation.inverse_on_grid_mm(GRID, weights) for weights in states.weights]
+    push_mm = np.tensordot(shares, inverse_mm, 1)
+    moving = MovingBackprojector(rt, states, shares)
+    expected = backprojection(frames, pose, weight, GRID, push_mm=push_mm)
+    assert_near(moving(frames, pose, weight, GRID), expected, GRIDDED_FIELD)
+    still = backprojection(frames, pose, weight, GRID)
+    assert np.abs(expected - still).max() > 10 * GRIDDED_FIELD * np.abs(expected).max()
+    lines = np.repeat(pose[:, None], SHAPE[0], axis=1)
+    assert_near(moving(frames, lines, weight, GRID), expected, GRIDDED_FIELD)
 
 
 def test_states_cover_the_motion(rt) -> None:

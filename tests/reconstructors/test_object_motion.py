@@ -71,6 +71,17 @@ def test_the_reference_is_nearer(rt, scan, method) -> None:
     assert error(scan, moved) < 0.7 * error(scan, ignored)
 
 
+@pytest.mark.parametrize("motion", ["static", "per-row"])
+def test_fdk_takes_voxels_where_their_matter_is(rt, scan, motion) -> None:
+    moved, ignored = (reconstruct(scan, plan_of("fdk", moves, motion=motion), rt).volume for moves in (True, False))
+    assert error(scan, moved) < 0.8 * error(scan, ignored)
+    plan = plan_of("fdk", motion=motion)
+    at_rest = replace(plan, object_motion=ObjectMotion(breathing(0.0)))
+    np.testing.assert_array_equal(reconstruct(scan, at_rest, rt).volume, ignored)
+    with pytest.raises(InputError, match="extrapolate=reprojected"):
+        reconstruct(scan, plan_of("fdk", motion=motion, extrapolate="reprojected"), rt)
+
+
 @pytest.mark.parametrize("method", ITERATIVE)
 def test_runs_resume_to_the_same_bits(rt, scan, method) -> None:
     plan = plan_of(method, iterations=3, **({"subvoxels": 1} if method == "fista" else {}))

@@ -4,7 +4,7 @@ The projector sums Joseph's samples one ray at a time. The backprojections solve
 per line they search all lines for the one on which the voxel falls.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 
 import numpy as np
 from scipy.ndimage import map_coordinates
@@ -120,12 +120,16 @@ def _rays(
 
 
 def backprojection(
-    frames: np.ndarray, pose: np.ndarray, weight: np.ndarray, grid: Grid, is_parallel: bool = False
+    frames: np.ndarray, pose: np.ndarray, weight: np.ndarray, grid: Grid, is_parallel: bool = False,
+    push_mm: np.ndarray | None = None,
 ) -> np.ndarray:
-    """Σ_f weight_f / z² · frame_f(u, v); frames (F, rows, columns), pose (F, 12) mm, weight (F,) → (z, y, x)."""
+    """Σ_f weight_f / z² · frame_f(u, v); frames (F, rows, columns), pose (F, 12) mm, weight (F,) → (z, y, x).
+
+    push_mm: (F, z, y, x, 3) displacement, components x, y, z, of the matter of each voxel at the time of a frame."""
     volume = np.zeros(grid.shape)
-    for frame, one, share in zip(frames.astype(np.float64), pose, weight, strict=True):
-        u, v, depth = detector_position(one, grid, is_parallel)
+    pushes: Iterable[np.ndarray | float] = [0.0] * len(frames) if push_mm is None else push_mm
+    for frame, one, share, moved in zip(frames.astype(np.float64), pose, weight, pushes, strict=True):
+        u, v, depth = detector_position(one, grid, is_parallel, moved)
         inside = (depth > 0) & _on(u, frame.shape[1]) & _on(v, frame.shape[0])
         volume[inside] += share / depth[inside] ** 2 * _bilinear(frame, v[inside], u[inside])
     return volume
@@ -133,7 +137,7 @@ def backprojection(
 
 def lines_backprojection(
     frames: np.ndarray, pose: np.ndarray, weight: np.ndarray, grid: Grid, axis: str = "rows",
-    is_parallel: bool = False,
+    is_parallel: bool = False, push_mm: np.ndarray | None = None,
 ) -> np.ndarray:
     """The same with one pose per line, pose (F, lines, 12) mm: by definition, see ``backproject_lines``."""
     power = 2 if axis == "columns" else 1
@@ -141,10 +145,10 @@ def lines_backprojection(
         frames, pose = frames.transpose(0, 2, 1), transpose_pose(pose)
     lines = frames.shape[1]
     volume = np.zeros(grid.shape)
-    for frame, poses, share in zip(frames.astype(np.float64), pose, weight, strict=True):
-        u, v, depth = (
-            np.stack(parts) for parts in zip(*(detector_position(p, grid, is_parallel) for p in poses), strict=True)
-        )
+    pushes: Iterable[np.ndarray | float] = [0.0] * len(frames) if push_mm is None else push_mm
+    for frame, poses, share, moved in zip(frames.astype(np.float64), pose, weight, pushes, strict=True):
+        positions = [detector_position(p, grid, is_parallel, moved) for p in poses]
+        u, v, depth = (np.stack(parts) for parts in zip(*positions, strict=True))
         ahead = v - np.arange(lines)[:, None, None, None]  # falls through zero where the voxel is seen
         for index in np.ndindex(*grid.shape):
             at = (slice(None), *index)
@@ -153,11 +157,15 @@ def lines_backprojection(
 
 
 def detector_position(
-    pose: np.ndarray, grid: Grid, is_parallel: bool = False
+    pose: np.ndarray, grid: Grid, is_parallel: bool = False, push_mm: np.ndarray | float = 0.0
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Pixel column, row and depth (z, y, x) of all voxel centres: x − s = depth (d00 + u eu + v ev), solved. In a parallel
+    """Pixel column, row and depth (z, y, x) of voxel centres, displaced by ``push_mm`` (z, y, x, 3) in mm.
+
+    x − s = depth (d00 + u eu + v ev), solved. In a parallel
     beam x − first pixel = u eu + v ev + t direction, and the depth is 1."""
     z, y, x = np.meshgrid(*grid.axes_mm(), indexing="ij")
+    if isinstance(push_mm, np.ndarray):
+        x, y, z = x + push_mm[..., 0], y + push_mm[..., 1], z + push_mm[..., 2]
     if is_parallel:
         offset = np.stack([x, y, z]).reshape(3, -1) - pose[3:6, None]
         u, v, t = np.linalg.solve(np.stack([pose[6:9], pose[9:12], pose[0:3]], -1), offset).reshape(3, *grid.shape)

@@ -20,8 +20,10 @@ from phyradgs_cl.acquisition import Motion, Scan, Static
 from phyradgs_cl.acquisition.altered.angles import azimuth_rad
 from phyradgs_cl.acquisition.motion import LINE_POSES, check_motion, motions_for
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.fields import Grid
+from phyradgs_cl.fields import Deformation, Grid
 from phyradgs_cl.operators import backproject, backproject_lines
+from phyradgs_cl.operators.warp.backproject import MovingBackprojector
+from phyradgs_cl.operators.warp.states import MotionStates
 from phyradgs_cl.prepare.step import unmasked_frames
 from phyradgs_cl.reconstructors.fdk import weights
 from phyradgs_cl.reconstructors.fdk.beyond_panel import WAYS, extrapolated, reprojected, whole_object
@@ -90,30 +92,37 @@ class FbpOptions(FdkOptions):
 
 
 def fdk(
-    scan: Scan, options: FdkOptions, rt: Runtime, *, seed: int = 0, report: ProgressReport = ignore_progress
+    scan: Scan, options: FdkOptions, rt: Runtime, *, seed: int = 0, report: ProgressReport = ignore_progress,
+    deformation: Deformation | None = None,
 ) -> Reconstruction:
-    """Returns the FDK volume of a scan in 1/mm. ``seed`` is part of the common signature and not used.
+    """Returns the FDK volume of a scan in 1/mm; of an object that moves, that of the reference.
+
+    ``seed`` is part of the common signature and not used.
 
     Logs a warning for an orbit that is not a circle about z, and raises InputError for one that is far from it.
     """
-    return _filtered_backprojection("fdk", scan, options, rt, report)
+    return _filtered_backprojection("fdk", scan, options, rt, report, deformation)
 
 
 def fbp(
-    scan: Scan, options: FbpOptions, rt: Runtime, *, seed: int = 0, report: ProgressReport = ignore_progress
+    scan: Scan, options: FbpOptions, rt: Runtime, *, seed: int = 0, report: ProgressReport = ignore_progress,
+    deformation: Deformation | None = None,
 ) -> Reconstruction:
     """Returns the filtered backprojection of a parallel beam in 1/mm: half turns, full turns, and full turns with the axis
     near the panel's edge. ``seed`` is part of the common signature and not used.
 
     Logs a warning for incomplete turns, and raises InputError for rays that are not at right angles to the axis.
     """
-    return _filtered_backprojection("fbp", scan, options, rt, report)
+    return _filtered_backprojection("fbp", scan, options, rt, report, deformation)
 
 
 def _filtered_backprojection(
-    method: str, scan: Scan, options: FdkOptions, rt: Runtime, report: ProgressReport
+    method: str, scan: Scan, options: FdkOptions, rt: Runtime, report: ProgressReport, deformation: Deformation | None
 ) -> Reconstruction:
     started = time.perf_counter()
+    if deformation is not None and options.extrapolate == "reprojected":
+        expected, remedy = "another way of rows beyond the panel", "leave extrapolate out"
+        raise InputError("--object-motion", "extrapolate=reprojected, of an object at rest", expected, remedy)
     frames, numbers = _measured_frames(scan)
     poses = [options.motion.cells(scan, f).still().line_poses() for f in numbers]
     lines = max(map(len, poses))
@@ -126,14 +135,25 @@ def _filtered_backprojection(
     volume = fdk_volume(
         rt, frames, pose, scan.grid, window=options.window, axis=scan.shutter.axis,
         extrapolate=options.extrapolate, whole=whole, is_parallel=scan.is_parallel,
+        moving=None if deformation is None else _moving(rt, scan, options.motion, numbers, deformation),
         circle=isinstance(options, FbpOptions) and options.circle,
     )  # fmt: skip
     facts = {"method": method, "options": option_facts(options), "seconds": time.perf_counter() - started}
     return Reconstruction(volume, scan.grid, facts=facts)
 
 
-METHOD = Method(fdk, {window: FdkOptions(window) for window in WINDOWS}, is_resumable=False)
-FBP_METHOD = Method(fbp, {window: FbpOptions(window) for window in WINDOWS}, is_resumable=False)
+def _moving(
+    rt: Runtime, scan: Scan, motion: Motion, numbers: np.ndarray, deformation: Deformation
+) -> MovingBackprojector | None:
+    """Returns the backprojector of an object that moves, by each frame's mean time; None for one at rest."""
+    times_s = np.array([motion.cells(scan, f).time_s.mean() for f in numbers])
+    states = MotionStates.of_times(deformation, scan.grid, times_s)
+    return None if states.is_at_rest else MovingBackprojector(rt, states, states.shares(times_s))
+
+
+_KIND = {"is_resumable": False, "takes_deformation": True}
+METHOD = Method(fdk, {window: FdkOptions(window) for window in WINDOWS}, **_KIND)
+FBP_METHOD = Method(fbp, {window: FbpOptions(window) for window in WINDOWS}, **_KIND)
 
 
 def fdk_volume(
@@ -148,13 +168,14 @@ def fdk_volume(
     whole: Callable[[], np.ndarray] | None = None,
     is_parallel: bool = False,
     circle: bool = False,
+    moving: MovingBackprojector | None = None,
 ) -> np.ndarray:
     """Returns FDK, or FBP of parallel beams, of line integrals (F, rows, columns) on ``grid``, (z, y, x) float32 in 1/mm.
 
     pose (F, 12) mm, or (F, lines, 12) with a pose for every line along ``axis``. Displaced detectors (full turns) and short
     scans are recognised and weighted. Logs a warning where data are missing. ``whole`` reconstructs the object (z, y, x) in
-    1/mm on ``grid``, for ``reprojected``. ``circle``, for parallel beams: as in ``FbpOptions``. Raises InputError for a
-    source on the rotation axis.
+    1/mm on ``grid``, for ``reprojected``. ``circle``, for parallel beams: as in ``FbpOptions``. ``moving`` backprojects an
+    object that moves. Raises InputError for a source on the rotation axis.
     """
     shape = (frames.shape[1], frames.shape[2])
     by_pixel = pose_of_pixels(pose, axis)
@@ -173,13 +194,15 @@ def fdk_volume(
         else:
             wide, count = extrapolated(frames, extrapolate)
         wider = widened(pose, axis, (count, count))
-        return fdk_volume(rt, wide, wider, grid, window=window, axis=axis, is_parallel=is_parallel)
+        return fdk_volume(rt, wide, wider, grid, window=window, axis=axis, is_parallel=is_parallel, moving=moving)
     warn_if_incomplete(arc, fan, canonical, grid, is_parallel)
     missing = fan.missing_columns if arc.is_full else (0, 0)
     filtered = _filtered(frames, ray_weight(canonical, shape, arc, fan, is_parallel), missing, window)
     pose = widened(pose, axis, missing)
     share = 0.5 * arc.gap_rad  # every ray is measured twice
-    if pose.ndim == 2:
+    if moving is not None:
+        volume = moving(filtered, pose, share, grid, axis, is_parallel=is_parallel)
+    elif pose.ndim == 2:
         volume = backproject(rt, filtered, pose, share, grid, is_parallel=is_parallel)
     else:
         volume = backproject_lines(rt, filtered, pose, share, grid, axis, is_parallel=is_parallel)

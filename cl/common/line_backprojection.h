@@ -1,0 +1,57 @@
+/* What a voxel receives from a view whose lines have their own poses: backproject.cl and backproject_moving.cl. */
+
+#define LINE_STEPS 6
+#define LEAST_SPEED 0.1f
+
+static inline float line_position(__global const float *m, const float x, const float y, const float z, float *depth)
+{
+    *depth = m[8] * x + m[9] * y + m[10] * z + m[11];
+    return (m[4] * x + m[5] * y + m[6] * z + m[7]) / *depth;
+}
+
+static inline float line_sample(__global const float *line, const float u, const int width)
+{
+    if (!(u >= 0.0f && u <= (float)(width - 1)))
+        return 0.0f;
+    const int column = min((int)u, max(width - 2, 0));
+    return line[column] + (u - column) * (line[column + (width > 1)] - line[column]);
+}
+
+/* A voxel is seen by the line that is open where it stands: v(pose of line r) = r, solved by Newton's method on the
+   piecewise linear v between lines. */
+static inline float line_added(
+    const float sum, /* to which the voxel's value is added */
+    __global const float *table, /* (lines, 12) */
+    __global const float *image, const int lines, const int width, const int image_pitch,
+    const float x, const float y, const float z,
+    const float weight, const int filtered_across)
+{
+    const int last = max(lines - 2, 0), step = lines > 1 ? 12 : 0;
+    __global const float *m = table;
+    int line = last / 2;
+    float t = 0.0f, speed = 1.0f, depth = 1.0f, next_depth = 1.0f;
+    for (int k = 0; k < LINE_STEPS; ++k) {
+        m = table + (size_t)line * 12;
+        const float v = line_position(m, x, y, z, &depth), next_v = line_position(m + step, x, y, z, &next_depth);
+        if (!(depth > 0.0f && next_depth > 0.0f))
+            break;
+        speed = fmax(1.0f - (next_v - v), LEAST_SPEED);
+        t = (v - (float)line) / speed;
+        const int better = (int)clamp(floor((float)line + t), 0.0f, (float)last);
+        if (better == line)
+            break;
+        line = k + 1 < LINE_STEPS ? better : line;
+    }
+    const float position = (float)line + t;
+    if (!(depth > 0.0f && next_depth > 0.0f && position >= 0.0f && position <= (float)(lines - 1)))
+        return sum;
+    __global const float *n = m + step;
+    __global const float *pixels = image + (size_t)line * image_pitch;
+    const float u = (m[0] * x + m[1] * y + m[2] * z + m[3]) / depth;
+    const float next_u = (n[0] * x + n[1] * y + n[2] * z + n[3]) / next_depth;
+    const float here = line_sample(pixels, u, width);
+    const float there = line_sample(pixels + (step ? image_pitch : 0), next_u, width);
+    const float middle = depth + t * (next_depth - depth);
+    const float scale = filtered_across ? speed * speed : speed;
+    return sum + weight / (middle * middle * scale) * (here + t * (there - here));
+}

@@ -1,0 +1,115 @@
+"""FDK's backprojection of an object that moves: every voxel is taken where its matter is at the time of a view.
+
+The displacement of a view is blended of those of two states. S. Rit et al., Comparison of analytic and algebraic methods for
+motion-compensated cone-beam CT reconstruction of the thorax, IEEE Trans. Med. Imaging 28 (2009) 1513."""
+
+from functools import lru_cache
+
+import numpy as np
+
+from phyradgs_cl.acquisition.readout import Readout
+from phyradgs_cl.checks import ceil_div
+from phyradgs_cl.errors import InputError
+from phyradgs_cl.fields import Grid
+from phyradgs_cl.operators.backproject import Arguments, Views, in_bricks, volume_shape
+from phyradgs_cl.operators.bricks import Brick
+from phyradgs_cl.operators.rays.layout import voxel_matrices
+from phyradgs_cl.operators.warp.states import MotionStates
+from phyradgs_cl.runtime import DeviceArray, Runtime
+from phyradgs_cl.runtime.layout import GUARD
+
+_MOST_STEPS = 100  # of the fixed point
+_PROBED = 500  # voxels at which an inverse is checked
+_WRONG = 0.1  # of a voxel
+_HELD_STATES = 3  # whose displacements are on the device
+
+
+class MovingBackprojector:
+    """FDK's backprojection for the states of an object that moves.
+
+    shares (F, K): of the states in each frame, at most two above 0. Holds up to nine volumes on the device.
+    Raises InputError where a field has no inverse."""
+
+    def __init__(self, rt: Runtime, states: MotionStates, shares: np.ndarray) -> None:
+        self.rt, self.states, self.shares = rt, states, shares
+        self._push = lru_cache(_HELD_STATES)(self._push_of)
+
+    def __call__(
+        self, frames: np.ndarray, pose: np.ndarray, weight: np.ndarray, grid: Grid, axis: str = "rows", *,
+        is_parallel: bool = False,
+    ) -> np.ndarray:  # fmt: skip
+        """Returns the backprojection (nz, ny, nx) float32 as ``backproject`` or, with a pose for every line,
+        ``backproject_lines`` of an object at rest. frames (F, rows, columns), weight (F,)."""
+        volume, pairs = np.zeros(grid.shape, np.float32), _pairs(self.shares)
+        for first, second in np.unique(pairs, axis=0).tolist():
+            views = np.flatnonzero((pairs == (first, second)).all(1))
+            weights = np.stack([weight[views], self.shares[views, second]], -1)
+            volume += self._of_pair((first, second), frames[views], pose[views], weights, grid, axis, is_parallel)
+        return volume
+
+    def _of_pair(
+        self, pair: tuple[int, int], frames: np.ndarray, pose: np.ndarray, weights: np.ndarray, grid: Grid, axis: str,
+        is_parallel: bool,
+    ) -> np.ndarray:  # fmt: skip
+        """Backprojects the frames between two states; weights (F, 2): FDK's, and the share of the second."""
+        rt, fields = self.rt, [self._push(state) for state in pair]
+        size, by_lines = np.array([*grid.shape[::-1], 0], np.int32), pose.ndim == 3
+        turned = by_lines and axis == "columns"
+        if by_lines:
+            pose = Readout(axis).poses(pose)
+        matrices = voxel_matrices(pose.reshape(-1, 12), grid, is_parallel).reshape(len(pose), -1)
+        name, group = ("backproject_lines_moving", 16) if by_lines else ("backproject_moving", 1)
+        kernel = rt.kernel("backproject_moving", name, IMAGE_GUARD=GUARD)
+
+        def launch(images: Arguments, brick: Brick, volume: DeviceArray) -> None:
+            nz, ny, nx = brick.shape
+            across = (np.int32(turned),) if by_lines else ()
+            items = (nx if by_lines else ceil_div(nx, rt.lanes), ny, nz)
+            arguments = *images, *volume_shape(brick), *across, *fields, size, volume
+            rt.launch(kernel, items, *arguments, group=rt.group(on_cpu=group))
+
+        result: np.ndarray = in_bricks(rt, Views(frames, turned, matrices, weights), grid, 1, launch)  # type: ignore[assignment]
+        return result
+
+    def _push_of(self, state: int) -> DeviceArray:
+        """Returns u (3, nz, ny, nx) in voxels, components x, y, z, of a state."""
+        rt, grid = self.rt, self.states.grid
+        pull_mm, wide, margin = self._wide_pull_mm(state)
+        spacing_mm = np.array(grid.voxel_size_mm[::-1])
+        pull = rt.upload(np.pad(np.moveaxis(pull_mm / spacing_mm, -1, 0).ravel(), (0, GUARD)), np.float32)
+        push = rt.zeros(3 * int(np.prod(grid.shape)) + GUARD)
+        nz, ny, nx = grid.shape
+        sizes = (np.array([*triple[::-1], 0], np.int32) for triple in (wide.shape, margin, grid.shape))
+        kernel = rt.kernel("backproject_moving", "push_displacement", IMAGE_GUARD=GUARD)
+        rt.launch(kernel, (ceil_div(nx, rt.lanes), ny, nz), pull, *sizes, _MOST_STEPS, push, group=rt.group())
+        self._check_inverse(state, rt.download(push)[:-GUARD].reshape(3, -1).T * spacing_mm)
+        return push
+
+    def _wide_pull_mm(self, state: int) -> tuple[np.ndarray, Grid, tuple[int, int, int]]:
+        """Returns w on a grid as wide as matter of the grid moves, that grid, and its voxels before the grid's first."""
+        grid, weights = self.states.grid, self.states.weights[state]
+        reach_mm = np.abs(np.tensordot(weights, self.states.fields_mm, 1)).max((0, 1, 2))[::-1]
+        margin = np.ceil(1.5 * reach_mm / grid.voxel_size_mm).astype(int) + 1
+        z, y, x = (int(n) for n in margin)
+        nz, ny, nx = grid.shape
+        wide = Grid((nz + 2 * z, ny + 2 * y, nx + 2 * x), grid.voxel_size_mm, grid.offset_mm)
+        return self.states.deformation.on_grid_mm(wide, weights), wide, (z, y, x)
+
+    def _check_inverse(self, state: int, push_mm: np.ndarray) -> None:
+        """Compares some voxels with the deformation itself."""
+        grid = self.states.grid
+        probed = np.linspace(0, len(push_mm) - 1, min(_PROBED, len(push_mm))).astype(int)
+        z, y, x = (axis[i] for axis, i in zip(grid.axes_mm(), np.unravel_index(probed, grid.shape), strict=True))
+        there_mm = np.stack([x, y, z], -1) + push_mm[probed]
+        off_mm = push_mm[probed] + self.states.deformation.displacement_mm(there_mm, self.states.weights[state])
+        if (worst := float(np.abs(off_mm / grid.voxel_size_mm[::-1]).max())) > _WRONG:
+            found = f"a field without an inverse: it is wrong by {worst:.2g} voxels"
+            raise InputError("--object-motion", found, f"at most {_WRONG:g}", "use a smoother or smaller field")
+
+
+def _pairs(shares: np.ndarray) -> np.ndarray:
+    """Returns the two states (F, 2) of every frame, twice the same where it has one."""
+    largest = np.argsort(-shares, axis=1, kind="stable")
+    second = largest[:, min(1, shares.shape[1] - 1)]
+    has_two = shares[np.arange(len(shares)), second] > 0
+    return np.sort(np.stack([largest[:, 0], np.where(has_two, second, largest[:, 0])], -1), axis=1)
