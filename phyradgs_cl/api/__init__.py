@@ -44,11 +44,12 @@ from phyradgs_cl.errors import InputError, PhyradgsError
 from phyradgs_cl.fields import Deformation, Gaussians, Grid, deformed
 from phyradgs_cl.metrics import compare
 from phyradgs_cl.reconstructors import Progress, Reconstruction
+from phyradgs_cl.simulation import ObjectMotion
 
 __all__ = [
     "Calibration", "Centres", "CircularOrbit", "ConeGeometry", "ConstantSpeed", "Deformation", "EncoderTable",
     "Exact", "FrameSweeps", "Gaussians", "Grid", "InputError", "LineMiddles", "LinearOperator", "MicroViews",
-    "Motion", "Operator", "OwnTimes", "ParallelGeometry", "PerRow", "PhyradgsError", "PoseTable", "Progress",
+    "Motion", "ObjectMotion", "Operator", "OwnTimes", "ParallelGeometry", "PerRow", "PhyradgsError", "PoseTable", "Progress",
     "Reconstruction", "Scan", "Shutter", "SpeedRamp", "Static", "StaticStart", "TimeCells", "Trajectory",
     "as_torch", "calibrate", "compare", "deformed", "fly_scan", "initial_gaussians", "load_deformation", "load_scan",
     "load_volume", "move_views", "pose_gradient", "prepare", "ray_operator", "reconstruct", "save_deformation",

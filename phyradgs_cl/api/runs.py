@@ -141,6 +141,7 @@ def simulate(
     of it at each side. pixel_samples: number of rays along each side of a pixel. device: what ``--device`` takes, or a
     Runtime. options: those of ``phyradgs simulate`` with underscores (views, exposure_deg, readout_ratio, start_deg, pulse,
     readout_axis, noise, dose, detector_model, peak, lag, jitter_deg, seed …).
+    motion_of_object: an ``ObjectMotion``, or the path of its TOML file; the scan then has ``moving_truth``, true states.
 
     Raises InputError for unknown names and for values out of range."""
     if not isinstance(phantom, str | Path):

@@ -77,6 +77,12 @@ class Deformation:
         """Bounds (R,) of the displacements of fields of unit weight: the longest control vector of each."""
         return np.asarray(np.linalg.norm(self.control_mm, axis=-1).max(axis=(1, 2, 3)))
 
+    @property
+    def fastest_mm_per_s(self) -> float:
+        """A bound of the speed at which any point's displacement changes."""
+        rates_per_s = np.abs(np.diff(self.weights, axis=0)) / np.diff(self.times_s)[:, None]
+        return float((rates_per_s @ self.reach_mm).max(initial=0.0))
+
     def weights_at(self, times_s: "ArrayLike") -> np.ndarray:
         """Returns φ_r (n, R) at times (n,) in s."""
         times = np.atleast_1d(np.asarray(times_s, np.float64))

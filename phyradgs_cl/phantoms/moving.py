@@ -72,6 +72,11 @@ class MovingPhantom:
         ends = [body.at(part * body.period_s) for body in self.moving for part in (0.0, 0.5)]
         return EllipsoidPhantom((*self.resting, *ends), self.name).reach_mm
 
+    @property
+    def fastest_mm_per_s(self) -> float:
+        """The speed of the fastest body."""
+        return max(4 * float(np.linalg.norm(body.swing_mm)) / body.period_s for body in self.moving)
+
     def at(self, time_s: float) -> EllipsoidPhantom:
         """Returns the phantom as it is at a time."""
         return EllipsoidPhantom((*self.resting, *(body.at(time_s) for body in self.moving)), self.name)

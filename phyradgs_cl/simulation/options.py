@@ -27,7 +27,8 @@ class SimulationOptions:
     """Options of a simulation. ``peak`` > 0 scales attenuation so that the largest line integral is ``peak``.
 
     time_samples: midpoint samples in the exposure of a line; with 0 the volume's edge moves at most half a voxel of ``grid``
-    between two (docs/mathematics.md). dose: photons of a pixel without object, on a line that sees the whole pulse.
+    between two (docs/mathematics.md), and so does a moving object. dose: photons of a pixel without object, on a line that
+    sees the whole pulse.
     lag (λ), rings, sparks, drift, scatter: of detector/effects.py, 0 without. kvp: of detector/spectrum.py, 0 for a beam of
     one energy. motion_of_object: how the object moves during the scan; None: it rests."""
 

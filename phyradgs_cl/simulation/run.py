@@ -47,6 +47,9 @@ def simulated_scan(
     else:
         scene = volume_scene(rt, of, name, *where, size, axis, pixel_samples, moves)
     scene.warn_of_inverse_crime()
+    if options.time_samples == 0 and scene.fastest_mm_per_s > 0:
+        samples = default_time_samples(options.protocol, scene.grid, scene.fastest_mm_per_s)
+        options = replace(options, time_samples=samples)
     title = f"simulated scan of {scene.title}"
     scan = simulate(
         scene.source, scanner.geometry, scene.grid, options,
@@ -135,9 +138,11 @@ def _in_one_cycle_s(period_s: float, first_s: float, last_s: float) -> np.ndarra
     return np.asarray((cycle + np.arange(_STATES) / _STATES) * period_s)
 
 
-def default_time_samples(protocol: Protocol, grid: Grid) -> int:
-    """Returns samples per line so that the volume's edge moves at most half a voxel from one to the next; at least 8."""
+def default_time_samples(protocol: Protocol, grid: Grid, fastest_mm_per_s: float = 0.0) -> int:
+    """Returns samples per line so that the volume's edge, or the fastest part of an object that moves, goes at most half a
+    voxel from one to the next; at least 8."""
     path_mm = np.deg2rad(protocol.exposure_deg) * max(grid.size_mm[1:]) / 2
+    path_mm = max(path_mm, fastest_mm_per_s * protocol.exposure_s)
     return int(np.clip(np.ceil(2 * path_mm / min(grid.voxel_size_mm)), 8, 128))
 
 

@@ -29,7 +29,7 @@ class Scene:
     """An object to scan: a source of frames, the grid to reconstruct, and the truth (nz, ny, nx) on it. source_shape: voxels
     (z, y, x) of a source that is a user's volume. bone: makes the source of its dense part. deformation: how the object
     moves. state: returns the truth at a time in s, of an object that moves. period_s: of one that moves without a
-    deformation."""
+    deformation. fastest_mm_per_s: a bound of the speed of its parts."""
 
     source: FrameSource
     grid: Grid
@@ -40,6 +40,7 @@ class Scene:
     deformation: Deformation | None = None
     state: Callable[[float], np.ndarray] | None = None
     period_s: float | None = None
+    fastest_mm_per_s: float = 0.0
 
     def warn_of_inverse_crime(self) -> None:
         """Warns where the projected voxels are no finer than the grid, which makes reconstructions look too good."""
@@ -91,7 +92,8 @@ def _moving_scene(phantom: MovingPhantom, grid: Grid, geometry: Geometry, pixel_
         return phantom.at(time_s).voxelise(grid, 4)
 
     source = on_panel(geometry, pixel_samples, lambda panel: AnalyticSource(phantom, panel))
-    return Scene(source, grid, state(0.0), f"phantom {phantom.name}", state=state, period_s=phantom.period_s)
+    truth, title, fastest = state(0.0), f"phantom {phantom.name}", phantom.fastest_mm_per_s
+    return Scene(source, grid, truth, title, state=state, period_s=phantom.period_s, fastest_mm_per_s=fastest)
 
 
 def volume_scene(
@@ -140,8 +142,11 @@ def _voxel_scene(
         return block_mean(deformed(volume, fine, deformation, deformation.weights_at(time_s)[0]), grid.shape)
 
     moving = None if deformation is None else state
-    truth = block_mean(volume, grid.shape)
-    return Scene(source_of(volume), grid, truth, title, bone=bone, deformation=deformation, state=moving)
+    truth, fastest = block_mean(volume, grid.shape), 0.0 if deformation is None else deformation.fastest_mm_per_s
+    source = source_of(volume)
+    return Scene(
+        source, grid, truth, title, bone=bone, deformation=deformation, state=moving, fastest_mm_per_s=fastest
+    )
 
 
 def bone_from(volume: np.ndarray) -> float:

@@ -20,6 +20,7 @@ from phyradgs_cl.simulation import (
     ObjectMotion,
     SimulationOptions,
     VolumeSource,
+    default_time_samples,
     load_object_motion,
     scanner_for,
     scanner_options,
@@ -198,6 +199,17 @@ def test_files_say_what_they_mean(tmp_path: Path) -> None:
         SimulationOptions(motion_of_object="breathing")
     with pytest.raises(InputError, match="amplitude_mm"):
         ObjectMotion("breathing", amplitude_mm=1.5).deformation(BOX, 0.0, 4.0)
+
+
+def test_objects_that_move_fast_are_sampled_finely() -> None:
+    slow, fast = (ObjectMotion("sliding", amplitude_mm=0.3, period_s=period_s) for period_s in (40.0, 0.4))
+    rapid = Protocol(exposure_deg=14.4)
+    counts = [
+        default_time_samples(rapid, BOX, motion.deformation(BOX, 0.0, 4.0).fastest_mm_per_s) for motion in (slow, fast)
+    ]
+    path_mm = 0.3 * 2 * np.pi / 0.4  # of the fastest second, in steps of half a voxel of 0.125 mm
+    assert counts == [8, pytest.approx(path_mm / 0.0625, rel=0.03)]
+    assert moving_sphere(1.0, period_s=2.0).fastest_mm_per_s == pytest.approx(0.25)
 
 
 def test_two_turns_see_every_angle_twice() -> None:
