@@ -15,6 +15,7 @@ import tempfile
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from browser_pictures import SECTION
 from matplotlib.figure import Figure
 
 from phyradgs_cl.io import read_volume
@@ -29,8 +30,9 @@ HEAD = """# Gallery
 **Use this when** you look for a command that does what you need. **Run** `python docs/gallery.py`, which makes this page
 from its commands. **Trust it if** your scan resembles the phantom: [real scans](real.md) gain less.
 
-Twelve results on small phantoms of the package. Each picture shows one slice of the truth and of the volumes, on one grey
-scale, with their PSNR. Seconds are processor seconds of all commands of a result, on two cores of a shared machine.
+Twelve results on small phantoms of the package, and the report in a browser. Each picture of a result shows one slice of the
+truth and of the volumes, on one grey scale, with their PSNR. Seconds are processor seconds of all commands of a result, on
+two cores of a shared machine.
 """
 
 
@@ -259,7 +261,7 @@ def write(name: str, seconds: float) -> None:
         f"![{result.title}](images/gallery/{name}.png)\n\n"
     )
     ordered = [f"## {one.title}\n{sections[one.title].rstrip()}\n" for one in RESULTS.values() if one.title in sections]
-    PAGE.write_text("\n".join([HEAD, *ordered]), encoding="utf-8")
+    PAGE.write_text("\n".join([HEAD, *ordered, SECTION]), encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -152,7 +152,7 @@ def _tiles(status: Status, now: float) -> list[tuple[str, str]]:
         if p.gaussians:
             tiles.append(("Gaussians", f"{p.gaussians:,}".replace(",", "\N{NARROW NO-BREAK SPACE}")))
         if (per_s := status.per_s) is not None:
-            tiles.append(("iterations per minute", number(60 * per_s)))
+            tiles.append(("per minute", number(60 * per_s)))
         if (left_s := status.left_s(now)) is not None and not status.ended:
             tiles.append(("time left", _clock(left_s)))
     return [*tiles, ("time so far", _clock(now - status.started))]

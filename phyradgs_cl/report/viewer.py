@@ -71,7 +71,7 @@ def stills(planes: list[Plane], of: str, high: float) -> Markup:
         figures.append(element("figure", _picture(plane, of), element("figcaption", words)))
     ramp = data_uri(png_bytes(np.arange(256, dtype=np.uint8)[None]))
     bar = "0", element("img", src=ramp, alt="from black to white"), f"{number(high)} 1/mm and above"
-    return joined(element("div", *figures, class_="slices"), element("p", *bar, class_="values"))
+    return joined(element("div", *figures, class_="slices stills"), element("p", *bar, class_="values"))
 
 
 def _picture(plane: Plane, of: str, *, has_controls: bool = False) -> Markup:

@@ -10,6 +10,7 @@ import time
 import numpy as np
 
 from phyradgs_cl.io import partial_path, read_volume
+from phyradgs_cl.progress import Ticker
 
 
 def test_a_run_with_a_page_is_the_same_run_and_ends_as_its_report(cli, scan, tmp_path) -> None:
@@ -27,6 +28,21 @@ def test_an_error_of_the_run_stands_on_its_page(cli, scan, tmp_path) -> None:
     command = ["reconstruct", str(scan), "-o", str(tmp_path / "v.h5"), "--method", "fdk", "--resume", "--live", str(page)]
     assert cli.run(command) == 2
     assert "Stopped by an error: --resume" in page.read_text(encoding="utf-8")
+
+
+def test_an_interrupted_run_says_how_to_go_on(cli, scan, tmp_path, monkeypatch) -> None:
+    def press(ticker: Ticker, done: int, total: int, *more: object) -> None:
+        if done == 2:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(Ticker, "show", press)
+    page, words = tmp_path / "run.html", ["--method", "sirt", "--iterations", "5"]
+    command = ["reconstruct", str(scan), "-o", str(tmp_path / "v.h5"), *words, "--live", str(page)]
+    assert cli.run(command) == 130
+    text = page.read_text(encoding="utf-8")
+    assert "Interrupted at iteration 2 of 5: repeat the command with --resume to continue." in text and '"is_over":true' in text
+    monkeypatch.undo()
+    assert cli.run([*command, "--resume"]) == 0 and 'id="provenance"' in page.read_text(encoding="utf-8")
 
 
 def test_a_killed_run_leaves_a_whole_page_that_knows_its_age(scan, tmp_path) -> None:

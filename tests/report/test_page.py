@@ -17,6 +17,7 @@ from phyradgs_cl.errors import InputError, OutputError
 from phyradgs_cl.io import Volume, read_volume, write_scan, write_volume
 from phyradgs_cl.reconstructors import plan_run
 from phyradgs_cl.report import Run, load_run, report_page, write_report
+from phyradgs_cl.report import page as page_module
 from phyradgs_cl.report.images import Window
 from phyradgs_cl.report.markup import number
 from phyradgs_cl.report.run import computed_views, spread_frames
@@ -285,3 +286,8 @@ def test_what_a_calibration_says_of_itself_may_be_anything(rt, small_scan, tmp_p
         assert (section.count("<tr>") - section.count("<thead>"), section.count("<svg")) == (rows, charts)
         assert ("0.50 ± 0.10" in section) == ("a against b" in section) == bool(rows) and "<i>" not in section + text
         assert not parse(text).open
+
+
+def test_the_script_stays_small() -> None:
+    folder = Path(page_module.__file__).parent / "web"
+    assert sum(len(path.read_text(encoding="utf-8").splitlines()) for path in folder.glob("*.js")) <= 900
