@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from phyradgs_cl import signals
+from phyradgs_cl import report, signals
 from phyradgs_cl.acquisition.motion import motion_facts
 from phyradgs_cl.acquisition.plausible import blur_line
 from phyradgs_cl.commands.console import complain, file_option, last_words, option, say, scores
@@ -27,7 +27,6 @@ from phyradgs_cl.progress import Ticker
 from phyradgs_cl.reconstructors import ProgressReport, Reconstruction, Report, RunPlan
 from phyradgs_cl.reconstructors.result import COMPARED, option_facts
 from phyradgs_cl.reconstructors.tune import TUNED, tuning_line
-from phyradgs_cl.report import LivePage, Preview, check_live, check_preview, write_report
 from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.settings import Settings
 from phyradgs_cl.workflow import load_scan, profile_report, run_reconstruction
@@ -79,15 +78,15 @@ def reconstruct_command(
     with failing_together(ranks, last_words), ticker, ExitStack() as stack:
         page = None
         if live is not None:
-            check_live(live, scan, output, partial_path(output), *inputs)
+            report.check_live(live, scan, output, partial_path(output), *inputs)
             if ranks.rank == 0:
-                page = stack.enter_context(LivePage(live, output.name, _settings_of(plan, scan)))
+                page = stack.enter_context(report.LivePage(live, output.name, _settings_of(plan, scan)))
                 listeners.append(page)
         stage(f"reading {scan}")
         picture = None
         if preview is not None:
-            check_preview(preview, scan, output, partial_path(output))
-            picture = Preview(preview)
+            report.check_preview(preview, scan, output, partial_path(output))
+            picture = report.Preview(preview)
             listeners.append(picture)
         result, metrics = run_reconstruction(
             plan, scan, output, runtime, Report(*listeners), resume=resume,
@@ -122,7 +121,7 @@ def _settings_of(plan: RunPlan, scan: Path) -> dict[str, object]:
     return {**about, "options": option_facts(plan.options)}
 
 
-def _finish(page: LivePage, result: Reconstruction, scan: Path, output: Path, rt: Runtime) -> None:
+def _finish(page: "report.LivePage", result: Reconstruction, scan: Path, output: Path, rt: Runtime) -> None:
     """Makes the live page of a complete run its report. The frames of a run in slabs may exceed the memory."""
     if result.state is not None:
         at, asked = result.facts["interrupted_at"], result.facts["options"]["iterations"]
@@ -131,7 +130,7 @@ def _finish(page: LivePage, result: Reconstruction, scan: Path, output: Path, rt
         page.end("The run is complete.")
     else:
         with signals.finish_despite_interrupt():
-            page.become(lambda path: write_report(output, path, lambda: rt, scan=scan))
+            page.become(lambda path: report.write_report(output, path, lambda: rt, scan=scan))
 
 
 @with_run_options("seed", "tune")

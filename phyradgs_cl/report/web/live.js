@@ -20,7 +20,7 @@
 
   function showPause() {
     pause.setAttribute("aria-pressed", String(!!kept.isPaused));
-    pause.textContent = kept.isPaused ? "Reload again" : "Pause reloading";
+    pause.textContent = kept.isPaused ? "Resume reloading" : "Pause reloading";
   }
 
   function tick() {
