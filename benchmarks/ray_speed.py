@@ -12,7 +12,6 @@ rolling shutter that exposes for half a view and reads for the other half; ``gap
 lean are rolled by 0.3 degrees and tilted by 0.5.
 """
 
-import argparse
 import json
 import subprocess
 import tempfile
@@ -22,7 +21,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
-from measuring import finish
+from measuring import finish, parser_of
 
 from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, ConstantSpeed, Shutter, Trajectory
 from phyradgs_cl.acquisition.cells import common_time_cells, micro_view_cells, per_line_cells, static_cells
@@ -187,15 +186,9 @@ def by_motion(rt: Runtime, grid: Grid, volume: np.ndarray, repeats: int) -> dict
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument(
-        "--peer-python", default=None, help="a Python that has itk-rtk; without it, no comparison"
-    )
-    parser.add_argument("--json", type=Path, default=Path("docs/results/ray_speed.json"))
+    parser = parser_of(__doc__)
+    parser.add_argument("--peer-python", default=None, help="a Python that has itk-rtk; without it, no comparison")
     parser.add_argument("--repeats", type=int, default=5)
-    parser.add_argument("--device", default=None)
     arguments = parser.parse_args()
     rt = Runtime(arguments.device)
     grid = Grid.cube(VOXELS, VOXELS * VOXEL_MM)

@@ -10,7 +10,6 @@ pair sees), against the phantom at the voxels' centres; and as RTK's tests count
 outside that field of view.
 """
 
-import argparse
 import subprocess
 import tempfile
 import time
@@ -19,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from measuring import finish
+from measuring import finish, parser_of
 
 from phyradgs_cl.acquisition import ConeGeometry, pixel_centres
 from phyradgs_cl.fields import Grid
@@ -180,13 +179,9 @@ def speed(rt: Runtime, python: str, rounds: int) -> dict[str, Any]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = parser_of(__doc__)
     parser.add_argument("--peer-python", required=True, help="a Python that has itk-rtk")
-    parser.add_argument("--json", type=Path, default=Path("docs/results/rtk_fdk.json"))
     parser.add_argument("--rounds", type=int, default=4, help="alternations of the speed comparison")
-    parser.add_argument("--device")
     options = parser.parse_args()
     rt = Runtime(options.device)
     rows = [compare(rt, options.peer_python, case) for case in CASES]

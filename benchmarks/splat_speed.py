@@ -6,14 +6,12 @@
 of the cutoff ellipses, "useful" ones inside the ellipses (pi/4 of the box).
 """
 
-import argparse
-import json
 import resource
 import statistics
 import time
-from pathlib import Path
 
 import numpy as np
+from measuring import finish, parser_of
 
 from phyradgs_cl.acquisition import ConeGeometry, MicroViews, Scan, Static, make_protocol
 from phyradgs_cl.fields import Grid
@@ -112,14 +110,10 @@ def iteration_shares(rt: Runtime, scan: Scan, count: int, iterations: int) -> di
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = parser_of(__doc__)
     parser.add_argument("--detector", type=int, default=256)
     parser.add_argument("--gaussians", type=int, default=50_000)
     parser.add_argument("--repeats", type=int, default=7)
-    parser.add_argument("--device", default=None)
-    parser.add_argument("--json", type=Path, default=None)
     arguments = parser.parse_args()
     rt = Runtime(arguments.device, profile=True)
     scan = fly_scan(rt, arguments.detector)
@@ -136,10 +130,7 @@ def main() -> None:
     iteration: dict[str, dict[str, float]] = facts["iteration"]  # type: ignore[assignment]
     facts["projector_overhead"] = projector["micro-views 8x5"]["all_ms"] / projector["static"]["all_ms"]
     facts["iteration_overhead"] = iteration["micro-views 8x5"]["wall_ms"] / iteration["static"]["wall_ms"]
-    text = json.dumps(facts, indent=1)
-    print(text)
-    if arguments.json:
-        arguments.json.write_text(text + "\n")
+    finish(facts, arguments.json)
 
 
 if __name__ == "__main__":

@@ -6,18 +6,15 @@ One frame of the rapid protocol (14.4° of exposure, readout 0.86 of it). Errors
 that takes every row at --samples times of its own exposure: the mean over single random Gaussians with scales of 0.5 to
 4 % of the half-width, and that of a Shepp-Logan cloud. Costs are of another cloud, of scales of 0.8 to 3 %: pairs of
 Gaussian and pixel that are walked and evaluated (whole vectors), and the smallest time of several runs in turn, of all
-kernels forward and backward: on CPUs processor time, which other programs disturb little, on GPUs the kernels'. "Of swept"
-are pairs over those of pixels that an ellipse covers at any time of their line, which blur itself asks for.
+kernels forward and backward: on CPUs processor time, which other programs disturb little, on GPUs the kernels'.
 """
 
-import argparse
-import json
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
+from measuring import finish, parser_of
 
 from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, make_protocol
 from phyradgs_cl.acquisition.cells import (
@@ -30,7 +27,6 @@ from phyradgs_cl.acquisition.cells import (
 from phyradgs_cl.acquisition.time_cells import TimeCells
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.operators import DeviceCells, DeviceGaussians, SplatProjector
-from phyradgs_cl.operators.twins.splat import precision_matrices
 from phyradgs_cl.reconstructors.splats.start import initial_cloud
 from phyradgs_cl.runtime import DeviceArray, Runtime
 from phyradgs_cl.runtime.layout import pad_rows
@@ -81,16 +77,8 @@ def shepp_logan_cloud(rt: Runtime, geometry: ConeGeometry, count: int, edge: int
     """Gaussians (11, G) drawn from a voxelised Shepp-Logan head as the first cloud of a reconstruction is."""
     grid = Grid.cube(edge, 2.0)
     scene = phantom_scene(rt, "shepp-logan", geometry, grid, edge, "rows", 0)
-    cloud = initial_cloud(
-        scene.reference,
-        grid,
-        count,
-        threshold=0.05,
-        density_share=0.15,
-        scale_bounds=(0.001, 1.0),
-        scale_factor=1.0,
-        rng=np.random.default_rng(0),
-    )
+    usual = {"threshold": 0.05, "density_share": 0.15, "scale_bounds": (0.001, 1.0), "scale_factor": 1.0}
+    cloud = initial_cloud(scene.reference, grid, count, **usual, rng=np.random.default_rng(0))
     rows = cloud.rows()
     return rows[:, np.argsort(rows[2])]
 
@@ -183,77 +171,14 @@ def costs(rt: Runtime, models: list[Model], count: int, repeats: int) -> dict[st
     return result
 
 
-def swept_pairs(rows: np.ndarray, reference: TimeCells, cutoff_sigma: float) -> int:
-    """Pixels that the Gaussians' ellipses cover at any of the reference's times, summed over rows (11, G).
-
-    No model of the exposure can draw fewer pairs: what it has beyond them is its own doing. ``reference`` has the same
-    number of times for every line, line after line.
-    """
-    lines = width = reference.lines
-    times = reference.count // lines
-    precisions, total = precision_matrices(rows), 0
-    for line in range(lines):
-        cells = np.flatnonzero((reference.line_start <= line) & (line < reference.line_stop))
-        assert cells.size == times
-        to_pixel = np.stack([row_directions(reference.pose[c], line, width) for c in cells])  # (T, width, 3)
-        centre = rows[:3].T[:, None] - reference.pose[cells, :3]  # (G, T, 3)
-        turned = np.einsum("gij,gtj->gti", precisions, centre)
-        b = np.einsum("tui,gti->gtu", to_pixel, turned)
-        pairs = to_pixel[..., [0, 1, 2, 0, 0, 1]] * to_pixel[..., [0, 1, 2, 1, 2, 2]]  # (T, width, 6)
-        six = precisions[:, [0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]] * [1, 1, 1, 2, 2, 2]
-        a = np.einsum("tuk,gk->gtu", pairs, six)
-        kappa = np.einsum("gti,gti->gt", centre, turned)
-        total += int(np.any(kappa[..., None] - b**2 / a <= cutoff_sigma**2, axis=1).sum())
-    return total
-
-
-def row_directions(pose: np.ndarray, line: int, width: int) -> np.ndarray:
-    """Vectors (width, 3) from the source to the pixels of one line."""
-    return pose[3:6] - pose[:3] + pose[9:12] * line + np.arange(width)[:, None] * pose[6:9]
-
-
-def blur_limit(
-    rt: Runtime, models: list[Model], where: tuple, count: int, times: int = 48
-) -> dict[str, float]:
-    """Pairs over those that blur itself asks for, by model, on an even sample of the cloud that is timed."""
-    rows = random_cloud(count, SCALES, np.random.default_rng(2))[:, :: max(count // 100, 1)]
-    gaussians, lines = DeviceGaussians.upload(rt, rows), where[-1]
-    found = {}
-    for model in models:
-        projector = SplatProjector(rt, lines, lines, time_error=model.time_error)
-        cells = DeviceCells.upload(rt, model.table)
-        projector.forward(gaussians, cells)
-        found[model.name] = float(projector.work(gaussians, cells).pairs)
-    least = swept_pairs(rows, per_line_cells(*where, times), float(projector.cutoff2) ** 0.5)
-    return {name: pairs / least for name, pairs in found.items()}
-
-
-def print_table(rows: dict[str, dict]) -> None:
-    paper = rows["micro-views 8x5"]
-    whole = paper["forward_ms"] + paper["backward_ms"]
-    heads = ("model", "poses", "Gaussians", "S-L cloud", "pairs/M", "of swept", "fwd/ms", "bwd/ms", "time")
-    print("{:22} {:>5} {:>10} {:>10} {:>8} {:>8} {:>8} {:>8} {:>6}".format(*heads))
-    for name, row in rows.items():
-        total = (row["forward_ms"] + row["backward_ms"]) / whole
-        print(
-            f"{name:22} {row['poses']:5d} {row['error_gaussians']:10.3%} {row['error_shepp_logan']:10.3%} "
-            f"{row['pairs'] / 1e6:8.1f} {row['pairs_over_swept']:8.2f} "
-            f"{row['forward_ms']:8.1f} {row['backward_ms']:8.1f} {total:6.2f}"
-        )
-
-
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = parser_of(__doc__)
     parser.add_argument("--detector", type=int, default=512)
     parser.add_argument("--gaussians", type=int, default=20_000)
     parser.add_argument("--singles", type=int, default=24, help="random Gaussians whose errors are averaged")
     parser.add_argument("--cloud", type=int, default=2000, help="Gaussians of the Shepp-Logan cloud")
     parser.add_argument("--samples", type=int, default=200, help="times per row of the reference")
     parser.add_argument("--repeats", type=int, default=7)
-    parser.add_argument("--device", default=None)
-    parser.add_argument("--json", type=Path, default=None)
     arguments = parser.parse_args()
     rt = Runtime(arguments.device, profile=True)
     n = arguments.detector
@@ -266,19 +191,11 @@ def main() -> None:
     by_gaussian = errors(rt, models, reference, list(singles.T[..., None]))
     by_cloud = errors(rt, models, reference, [shepp_logan_cloud(rt, geometry, arguments.cloud)])
     rows = costs(rt, models, arguments.gaussians, arguments.repeats)
-    over = blur_limit(rt, models, where, arguments.gaussians)
     for name, row in rows.items():
-        row |= {
-            "error_gaussians": by_gaussian[name],
-            "error_shepp_logan": by_cloud[name],
-            "pairs_over_swept": over[name],
-        }
-    print_table(rows)
-    facts = {"device": rt.device.name, "lanes": rt.lanes, **vars(arguments), "models": rows}
-    if arguments.json:
-        arguments.json.write_text(
-            json.dumps({k: v for k, v in facts.items() if k != "json"}, indent=1) + "\n"
-        )
+        row |= {"error_gaussians": by_gaussian[name], "error_shepp_logan": by_cloud[name]}
+    path = arguments.json
+    facts = {name: value for name, value in vars(arguments).items() if name not in ("json", "quick")}
+    finish({"device": rt.device.name, "lanes": rt.lanes, **facts, "models": rows}, path)
 
 
 if __name__ == "__main__":

@@ -162,12 +162,17 @@ def sweep(name: str, held_out: bool) -> str:
         best = max(of_factor, key=of_factor.__getitem__)
         cells = [kind, str(views), str(dose), f"{size}³, {pixels}²", f"{of_factor[1.0]:.2f}"]
         cells.append(f"{of_factor[best]:.2f} (×{best:g})")
+        if best == 1.0 and not held_out:
+            continue
         if held_out:
             least = [min(by.values(), key=lambda line: line["holdout_rms"])["psnr_db"] for by in volumes.values()]
             cells.append(f"{mean(least):.2f}")
         text.append(cells)
     heads = ["scan", "views", "photons", "voxels, pixels", "default", "best factor for all"]
-    return markdown([*heads, "least held-out error"] if held_out else heads, text)
+    if held_out:
+        return markdown([*heads, "least held-out error"], text)
+    others = len(scans) - len(text)
+    return markdown(heads, text) + f"\nOf the other {others} kinds of scans the default is the best factor.\n"
 
 
 def beside_rtk() -> str:

@@ -89,12 +89,7 @@ class BenchJob:
         """How the names of tables and figures begin: one for each set of results that is summed up together."""
         size = self.bench_size
         own = self.iterations in (None, replace(self, iterations=None).bench_size.iterations)
-        parts = (
-            self.kind,
-            size.name,
-            "" if own else f"i{size.iterations}",
-            "" if self.axis == "rows" else self.axis,
-        )
+        parts = self.kind, size.name, "" if own else f"i{size.iterations}", "" if self.axis == "rows" else self.axis
         return "_".join(part for part in parts if part)
 
     def with_all(self, lines: Sequence[Line]) -> "BenchJob":
@@ -195,14 +190,7 @@ def _with_options(job: BenchJob) -> list[tuple[str, Row, Any]]:
 
 
 def _facts(
-    job: BenchJob,
-    volume: str,
-    source: Path | None,
-    protocol: str,
-    seed: int,
-    acquisition: str,
-    row: Row,
-    options: Any,
+    job: BenchJob, volume: str, source: Path | None, protocol: str, seed: int, acquisition: str, row: Row, options: Any
 ) -> Line:
     size = job.bench_size
     return {

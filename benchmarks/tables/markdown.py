@@ -134,26 +134,17 @@ def _notes(job: BenchJob, lines: Sequence[Line]) -> list[str]:
     machines = sorted({f"{line['device']} ({line['platform']})" for line in lines})
     return [
         f"{scan} Readout along {job.axis}. Seeds {', '.join(map(str, seeds))}: numbers are means over volumes, ± is "
-        "the standard deviation over seeds of the mean over those volumes that were run with all of them.",
+        "the standard deviation over seeds of the mean over those volumes that were run with all of them. "
+        "What the columns are: docs/benchmarks.md.",
         "",
         f"All splatting rows start with {job.gaussians:,} Gaussians (or one for every voxel that attenuates, where "
-        f"those are fewer) and run {size.iterations:,} iterations of one frame each; {_FAIRNESS}",
+        f"those are fewer) and run {size.iterations:,} iterations of one frame each.",
         "",
         f"Device {', '.join(machines)}; phyradgs-cl {last['version']}, Python {last['python']}, NumPy {last['numpy']}, "
         f"pyopencl {last['pyopencl']}, PoCL {last['pocl'] or 'none'}.",
     ]
 
 
-_FAIRNESS = (
-    "the other methods run as many as their own defaults say. Rows of R2-Gaussian keep its published learning rates and "
-    'weights, made for 30,000 iterations; the row "R2-Gaussian (settings of PhyRadGS)" (--rows) has ours. The column '
-    "stop-and-shoot is the same method with a static model on a scan from the mid-window angles of the fly-scan: what "
-    "motion correction could reach at best, unless noise stops the method, which blur averages. "
-    "Processor seconds are of all threads of a reconstruction, kernel builds of a "
-    "first run included, and can be compared where other work ran beside; lines of early versions have none. 2D numbers "
-    "compare projections with noise-free ones half-way between the training angles, at true scale. "
-    "The paper's numbers are of other volumes, sizes and hardware."
-)
 _SYNTHETIC_NOTE = (
     "Volumes projected at their own resolution on R2-Gaussian's scanner (DSO 5, DSD 7, panel 4 × 4, box 2³), TIGRE's "
     "noise with 10,000 photons and σ 10."
@@ -161,8 +152,5 @@ _SYNTHETIC_NOTE = (
 _PHANTOM_NOTE = (
     "Double-layer sphere phantom in a 200 mm box on a C-arm (DSO 785 mm, DSD 1200 mm, shifted panel), averaged in "
     "intensity, raw counts with 50,000 photons and σ 10, corrected by flats and darks; the gantry wanders by 0.1° and "
-    "the encoder knows. The pseudo-truth is R2-Gaussian from 64 stop-and-shoot projections. Out of round is "
-    "(r_max − r_min)/r_mean of the half-level contours in three sections of every bead; rise is the 10–90 % distance of "
-    "the beads' edges; shift is how far contours are displaced; bias is that of means inside. Stop-and-shoot numbers "
-    "compare with the truth, the paper's with a pseudo-truth of its own."
+    "the encoder knows. The pseudo-truth is R2-Gaussian from 64 stop-and-shoot projections."
 )

@@ -12,18 +12,8 @@ __all__ = ["KEY", "Line", "Present", "append_line", "key_of", "read_lines", "ref
 
 # What makes a run the same run; its options are compared besides.
 KEY = (
-    "study",
-    "volume",
-    "source",
-    "run",
-    "acquisition",
-    "voxels",
-    "pixels",
-    "protocol",
-    "axis",
-    "seed",
-    "iterations",
-)
+    "study", "volume", "source", "run", "acquisition", "voxels", "pixels", "protocol", "axis", "seed", "iterations",
+)  # fmt: skip
 
 
 def read_lines(path: Path) -> list[Line]:

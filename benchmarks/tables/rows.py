@@ -1,7 +1,7 @@
 """Rows of the tables: a label, and the method with the motion model behind it."""
 
-from collections.abc import Mapping, Sequence, Set
-from dataclasses import asdict, dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from difflib import get_close_matches
 from typing import Any
 
@@ -46,12 +46,8 @@ class Row:
     def options(self, gaussians: int, iterations: int) -> Any:
         """The method's options; splatting methods all get the same first cloud and iterations."""
         if self.method not in METHODS:
-            raise InputError(
-                f"row {self.label!r}",
-                f"the method {self.method!r}",
-                f"one of {', '.join(METHODS)}",
-                "choose other rows with --rows",
-            )
+            expected = f"one of {', '.join(METHODS)}"
+            raise InputError(f"row {self.label!r}", f"the method {self.method!r}", expected, "choose others with --rows")
         changes: dict[str, Any] = {"motion": self.motion, **self.changes}
         if self.motion in _WITH_COUNTS:
             changes |= {"strips": self.strips, "sub_intervals": self.sub_intervals}
@@ -88,14 +84,7 @@ def _micro_views(label: str, method: str, strips: int, sub_intervals: int, still
 
 
 _CENTRES = Row("PhyRadGS, centres only (as GS-on-the-Move)", "phyradgs", "centres", 8, 5, "PhyRadGS w/o ST")
-_ITERATIVE = {
-    "SART": "sart",
-    "OS-SART": "os-sart",
-    "SIRT": "sirt",
-    "CGLS": "cgls",
-    "ASD-POCS": "asd-pocs",
-    "FISTA-TV": "fista-tv",
-}
+_ITERATIVE = {name.upper(): name for name in ("sart", "os-sart", "sirt", "cgls", "asd-pocs", "fista-tv")}
 _FDK = (Row("FDK", "fdk"), Row("FDK per-row", "fdk", "per-row", still="FDK"))
 _NEURAL = (
     Row("NAF", "naf"),
@@ -123,12 +112,6 @@ _FUSED = (
 )
 
 
-def _our_settings() -> dict[str, Any]:
-    """PhyRadGS's default rates, weights and density control, as changes to R2-Gaussian's constants."""
-    shared = ("ssim_weight", "tv_weight", "density_weight", "rates", "control")
-    return {name: value for name, value in asdict(SplatOptions()).items() if name in shared}
-
-
 def _table1() -> tuple[Row, ...]:
     static = tuple(Row(label, method) for label, method in _ITERATIVE.items())
     exact = tuple(
@@ -139,25 +122,10 @@ def _table1() -> tuple[Row, ...]:
 
 def _extras() -> tuple[Row, ...]:
     """Rows that are run only when they are asked for by name."""
-    strips = tuple(
-        _micro_views(f"{label} micro-views", method, 8, 5, label) for label, method in _ITERATIVE.items()
-    )
-    tuned = "R2-Gaussian (settings of PhyRadGS)"
-    same: dict[str, Any] = {"variant": "tuned", "changes": _our_settings()}
-    both = (
-        Row(tuned, "r2", **same),
-        Row("R2-Gaussian w/ ST (settings of PhyRadGS)", "r2", "micro-views", 8, 5, tuned, **same),
-    )
-    rows = (*strips, *both, *_FUSED)
-    return (*rows, *_others({row.method for row in (*_table1(), *rows)}))
-
-
-def _others(known: Set[str]) -> tuple[Row, ...]:
-    """Rows under their own name for methods that somebody has added to the registry."""
-    others = [name for name in METHODS if name not in known]
-    static = tuple(Row(name, name) for name in others)
-    exact = tuple(Row(f"{name} per-row", name, "per-row", still=name) for name in others)
-    return (*static, *exact)
+    known = {row.method for row in (*_table1(), *_FUSED)}
+    others = [name for name in METHODS if name not in known]  # methods that somebody has added to the registry
+    per_row = [Row(f"{name} per-row", name, "per-row", still=name) for name in others]
+    return (*_FUSED, *(Row(name, name) for name in others), *per_row)
 
 
 def _table2() -> tuple[Row, ...]:

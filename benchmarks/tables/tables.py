@@ -9,7 +9,7 @@ from pathlib import Path
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.io import written_beside
 from tables.case import FLY, STILL
-from tables.job import PHANTOM, SYNTHETIC, BenchJob
+from tables.job import BenchJob
 from tables.markdown import markdown
 from tables.published import published
 from tables.results import Line
@@ -36,12 +36,9 @@ def write_tables(job: BenchJob, lines: Sequence[Line]) -> list[Path]:
     chosen = lines_of(job, lines)
     size = job.bench_size
     if not chosen:
-        remedy = f"choose --size {_size_names(lines)} and --iterations as in the runs, or another benchmark"
+        held = sorted({f"{line.get('study')} {line.get('size')}, {line.get('iterations')} iterations" for line in lines})
         wanted = f"runs for {job.kind} at {size.voxels}³, of splats with {size.iterations} iterations"
-        raise InputError(str(job.output), f"only {'; '.join(_held(lines))}", wanted, remedy)
-    if others := _other_iterations(job, chosen, lines):
-        text = "%s: the table is for splats with %s iterations; those with %s have one of their own (--iterations)"
-        log.warning(text, job.output, size.iterations, others)
+        raise InputError(str(job.output), "; ".join(held), wanted, "choose --size and --iterations as in the runs")
     written = {
         job.output / f"{job.stem}.md": markdown(job, chosen),
         job.output / f"{job.stem}.csv": comma_separated(job, chosen),
@@ -50,31 +47,6 @@ def write_tables(job: BenchJob, lines: Sequence[Line]) -> list[Path]:
         with written_beside(path) as temporary:
             temporary.write_text(text, encoding="utf-8", newline="")
     return list(written)
-
-
-def _other_iterations(job: BenchJob, chosen: Sequence[Line], lines: Sequence[Line]) -> str:
-    """With how many iterations the file has splatting runs of this size, where it has none with the job's."""
-    size = job.bench_size
-    if any(line.get("iterations") == size.iterations for line in chosen):
-        return ""
-    of_table = (job.study, size.voxels, size.pixels, job.axis)
-    same = [x for x in lines if tuple(x.get(n) for n in ("study", "voxels", "pixels", "axis")) == of_table]
-    return ", ".join(sorted({str(x["iterations"]) for x in same if x.get("iterations") is not None}))
-
-
-def _held(lines: Sequence[Line]) -> list[str]:
-    """The runs of a results file in words, a phrase for each benchmark, size and number of iterations."""
-    kinds = {SYNTHETIC: "volumes", PHANTOM: "the sphere phantom"}
-    held = set()
-    for line in lines:
-        iterations = line.get("iterations")
-        ending = f" with {iterations} iterations of splats" if iterations is not None else ""
-        held.add(f"{kinds.get(str(line.get('study')), 'others')} at {line.get('voxels')}³{ending}")
-    return sorted(held)
-
-
-def _size_names(lines: Sequence[Line]) -> str:
-    return " or ".join(sorted({str(line.get("size")) for line in lines}))
 
 
 def comma_separated(job: BenchJob, lines: Sequence[Line]) -> str:

@@ -89,7 +89,7 @@ def test_lines_and_tables_have_what_the_page_needs(made: BenchJob, rt: Runtime) 
 
 def test_rows_are_the_papers_and_a_plan_runs_over_seeds_volumes_and_protocols(tmp_path: Path) -> None:
     labels = {kind: [row.label for row in rows_of(kind)] for kind in KINDS}
-    assert set(TABLE1) <= set(labels["table1"]) and set(TABLE2) == set(labels["table2"])
+    assert set(TABLE1) <= set(labels["table1"]) and set(TABLE2) <= set(labels["table2"])
     rows = ["PhyRadGS", "PhyRadGS w/o ST", "R2-Gaussian w/ ST"]
     job = BenchJob("table1", tmp_path, rows=rows, names=["foot"], protocols=["rapid"], iterations=7)
     planned = [(run.acquisition, run.row.label) for run in plan_runs(job)]
