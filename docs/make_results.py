@@ -15,6 +15,7 @@ from typing import Any
 
 RESULTS = Path(__file__).resolve().parent / "results"
 BLOCK = re.compile(r"(<!-- table: (\S+) -->\n).*?(<!-- end of table -->)", re.S)
+CENTRES = "PhyRadGS, centres only (as GS-on-the-Move)"
 METHODS = (
     # label of the page, row with the motion ignored, row with the motion known, row of the still scan
     ("FDK", "FDK", "FDK per-row", "FDK"),
@@ -30,6 +31,7 @@ METHODS = (
     ("R2-Gaussian", "R2-Gaussian", "R2-Gaussian w/ ST", "R2-Gaussian"),
     ("PhyRadGS, 8 × 5 (the paper's)", "PhyRadGS w/o ST", "PhyRadGS", "PhyRadGS w/o ST"),
     ("PhyRadGS, exact in time", "PhyRadGS w/o ST", "PhyRadGS exact in time", "PhyRadGS w/o ST"),
+    (CENTRES, "PhyRadGS w/o ST", CENTRES, "PhyRadGS w/o ST"),
 )
 Row = dict[str, str]
 
@@ -107,7 +109,7 @@ def phantom() -> str:
             continue
         for kind, name in (("ignored", ignored), ("known", known)):
             row = rows.get(("rapid", name, "fly-scan"))
-            if row is None or (label.startswith("PhyRadGS, exact") and kind == "ignored"):
+            if row is None or (label.startswith(("PhyRadGS, exact", CENTRES)) and kind == "ignored"):
                 continue
             shape = [f"{100 * number(row, 'roundness'):.1f}", f"{number(row, 'centre_shift_mm'):.2f}"]
             shape += [f"{number(row, 'edge_rise_mm'):.2f}", f"{100 * number(row, 'bias_balls'):.1f}"]
@@ -132,6 +134,32 @@ def motion_models() -> str:
     means = [[mean(by[model][key] for by in whole.values()) for key in ("psnr_db", "ssim")] for model in models]
     text.append([f"**mean of {len(whole)}**", *(f"{psnr:.2f} / {ssim:.3f}" for psnr, ssim in means)])
     return markdown(["PSNR in dB / SSIM", "static", "8 × 5", "exact, bound 0.005"], text)
+
+
+def centres_only(key: str, heads: tuple[str, str]) -> str:
+    """Errors of a frame by motion model, of lines with a key: single Gaussians by distance, or whole objects."""
+    models = {"static": "static", "centres": "centres", "8x5": "8 × 5", "exact": "exact"}
+    lines = [line for line in lines_of("centres_only.jsonl") if key in line]
+    second = "distance" if key == "gaussians" else "protocol"
+    text = [[line[key], str(line[second]), *(f"{100 * line[name]:.2g} %" for name in models)] for line in lines]
+    return markdown([*heads, *models.values()], text)
+
+
+def fitted_volumes() -> str:
+    """Gaussians fitted to volumes: error, compression and processor time, with the mean of each number of Gaussians."""
+    by_count: dict[int, list[dict[str, Any]]] = {}
+    for line in lines_of("splat_volumes.jsonl"):
+        by_count.setdefault(line["gaussians"], []).append(line)
+    text = []
+    for count, lines in by_count.items():
+        keys = ("psnr_db", "ssim", "processor_s")
+        lines = [*sorted(lines, key=lambda line: str(line["volume"])), {"volume": f"**mean of {len(lines)}**"} | {
+            key: mean(line[key] for line in lines) for key in (*keys, "compression")
+        }]  # fmt: skip
+        for x in lines:
+            numbers = [f"{x['psnr_db']:.1f}", f"{x['ssim']:.3f}", f"{x['compression']:.2f}", f"{x['processor_s']:.0f}"]
+            text.append([x["volume"], f"{count:,}", *numbers])
+    return markdown(["volume", "Gaussians", "PSNR, dB", "SSIM", "voxels / parameters", "processor, s"], text)
 
 
 def detector_models() -> str:
@@ -383,6 +411,9 @@ TABLES: dict[str, Callable[[], str]] = {
     "table2_S": strips,
     "phantom_M": phantom,
     "motion_models": motion_models,
+    "centres_distance": lambda: centres_only("gaussians", ("Gaussians", "distance")),
+    "centres_object": lambda: centres_only("volume", ("object", "protocol")),
+    "fitted_volumes": fitted_volumes,
     "detector_models": detector_models,
     "prior_weight": lambda: sweep("prior_weight.jsonl", held_out=False),
     "passes": lambda: sweep("passes.jsonl", held_out=True),

@@ -41,7 +41,7 @@ class VolumeFitOptions:
     RATES: ClassVar = Rates(position=(0.13, 0.013), scale=(3e-2, 3e-3))
 
     gaussians: int = checks.ranged(0, 0, 100_000_000, "--gaussians (0 chooses from the grid)")
-    iterations: int = checks.ranged(300, 0, 1_000_000, "--iterations")
+    iterations: int = checks.ranged(200, 0, 1_000_000, "--iterations")
 
     def __post_init__(self) -> None:
         checks.fields_within("", self)

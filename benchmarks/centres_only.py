@@ -1,0 +1,96 @@
+"""What the covariance is worth: errors of frames in which only the centres of Gaussians move.
+
+    python benchmarks/centres_only.py docs/results/centres_only.jsonl [VOLUMES]
+
+Relative RMS of one frame, 128². By distance from the axis (half-sides of the box): mean of eight Gaussians of random turns,
+against 60 times of every row's own; long ones are 0.08 by 0.02 by 0.02, round ones 0.03. By object: 20,000 Gaussians fitted
+to each 128³ volume of the folder VOLUMES, averaged to 64³, against 20 segments of their exact motion.
+"""
+
+import json
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+from time_exact import reference_frame, relative
+
+from phyradgs_cl.acquisition import ConeGeometry, TimeCells, make_protocol
+from phyradgs_cl.acquisition.cells import (
+    centre_cells,
+    exact_cells,
+    micro_view_cells,
+    per_line_cells,
+    static_cells,
+)
+from phyradgs_cl.fields import Grid
+from phyradgs_cl.importers import load_attenuation
+from phyradgs_cl.operators import DeviceCells, SplatProjector
+from phyradgs_cl.reconstructors.splats.volume_fit import VolumeFitOptions, fit_volume
+from phyradgs_cl.runtime import Runtime
+
+PIXELS, COUNT, TIMES, FITTED, FRAME = 128, 8, 60, 20_000, 3
+SCALES = {"round": (0.03, 0.03, 0.03), "long": (0.08, 0.02, 0.02)}
+Line = dict[str, object]
+
+
+def frame_of(protocol_name: str) -> tuple:
+    """Returns trajectory, shutter, frame, start in seconds and lines."""
+    protocol, side = make_protocol(protocol_name), 4.0 / PIXELS
+    geometry = ConeGeometry(5.0, 7.0, (PIXELS, PIXELS), (side, side))
+    return protocol.orbit(geometry), protocol.shutter("rows"), FRAME, float(protocol.frame_start_s()[FRAME]), PIXELS
+
+
+def models_of(where: tuple) -> dict[str, TimeCells]:
+    return {
+        "static": static_cells(*where), "centres": centre_cells(*where, 8, 5), "8x5": micro_view_cells(*where, 8, 5),
+        "exact": exact_cells(*where, 4),
+    }  # fmt: skip
+
+
+def errors(rt: Runtime, where: tuple, rows: np.ndarray, expected: np.ndarray) -> dict[str, float]:
+    projector = SplatProjector(rt, PIXELS, PIXELS)
+    frames = {name: projector.project(rows, DeviceCells.upload(rt, table)) for name, table in models_of(where).items()}
+    return {name: relative(frame, expected) for name, frame in frames.items()}
+
+
+def gaussians(distance: float, scale: tuple[float, float, float], rng: np.random.Generator) -> np.ndarray:
+    """Returns rows (11, COUNT) on a circle about the axis."""
+    turn, angle = rng.normal(size=(4, COUNT)), rng.uniform(0, 2 * np.pi, COUNT)
+    place = np.stack([distance * np.cos(angle), distance * np.sin(angle), rng.uniform(-0.5, 0.5, COUNT)])
+    sizes = np.repeat(np.array(scale)[:, None], COUNT, axis=1)
+    return np.concatenate([place, sizes, turn / np.linalg.norm(turn, axis=0), np.ones((1, COUNT))])
+
+
+def by_distance(rt: Runtime) -> Iterator[Line]:
+    where, rng = frame_of("rapid"), np.random.default_rng(0)
+    reference = per_line_cells(*where, TIMES)
+    for kind, scale in SCALES.items():
+        for distance in (0.0, 0.2, 0.4, 0.6, 0.8):
+            rows = gaussians(distance, scale, rng).T[..., None]
+            each = [errors(rt, where, row, reference_frame(rt, row, reference, PIXELS)) for row in rows]
+            means = {name: float(np.mean([found[name] for found in each])) for name in each[0]}
+            yield {"gaussians": kind, "distance": distance, **means}
+
+
+def by_object(rt: Runtime, volumes: Path) -> Iterator[Line]:
+    for path in sorted(volumes.glob("*_128.h5")):
+        values = load_attenuation(path).values.reshape(64, 2, 64, 2, 64, 2).mean((1, 3, 5))
+        cloud = fit_volume(rt, values, Grid.cube(64, 2.0), VolumeFitOptions(FITTED)).gaussians
+        rows = cloud.rows()[:, np.argsort(cloud.mean[:, 2])]
+        for protocol in ("rapid", "standard"):
+            where = frame_of(protocol)
+            fine = SplatProjector(rt, PIXELS, PIXELS, time_error=1e-4)
+            expected = fine.project(rows, DeviceCells.upload(rt, exact_cells(*where, 20)))
+            name = path.stem.removesuffix("_128")
+            yield {"volume": name, "protocol": protocol, **errors(rt, where, rows, expected.astype(np.float64))}
+
+
+def main() -> None:
+    rt = Runtime()
+    lines = [*by_distance(rt), *(by_object(rt, Path(sys.argv[2])) if len(sys.argv) > 2 else ())]
+    Path(sys.argv[1]).write_text("".join(json.dumps(line) + "\n" for line in lines), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
