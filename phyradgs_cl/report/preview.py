@@ -3,6 +3,7 @@
 import logging
 import math
 import time
+from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -11,9 +12,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from phyradgs_cl import checks
+from phyradgs_cl.detector import counts_to_attenuation
 from phyradgs_cl.errors import InputError, PhyradgsError
 from phyradgs_cl.fields import Grid
-from phyradgs_cl.io import Volume, check_writable, file_kind, partial_path, read_volume, written_beside
+from phyradgs_cl.io import (
+    Volume,
+    check_writable,
+    file_kind,
+    partial_path,
+    read_scan,
+    read_volume,
+    written_beside,
+)
 from phyradgs_cl.reconstructors import Progress
 from phyradgs_cl.report.images import bytes_of, grey_range, png_bytes, top_row_first
 
@@ -100,6 +110,7 @@ def _shown_axes(grid: Grid) -> list[int]:
 
 
 _AXES = ("z", "y", "x")
+Layer = tuple[np.ndarray, dict[str, Any], str]
 
 
 def view_volume(path: Path) -> None:
@@ -114,14 +125,47 @@ def view_volume(path: Path) -> None:
 
 def add_volume(viewer: Any, stored: Volume, name: str) -> None:
     """Adds a volume to a viewer, in mm at its position, with axes z, y, x, y up, grey from 0."""
-    viewer.add_image(
-        stored.values, name=f"{name} (1/mm)", scale=stored.required_grid.voxel_size_mm,
-        translate=stored.required_grid.first_centre_mm, units=("mm", "mm", "mm"), axis_labels=_AXES,
-        contrast_limits=grey_range(stored.values), colormap="gray",
-    )
+    viewer.add_image(stored.values, **_look_of_volume(stored, name))
     viewer.dims.axis_labels = _AXES
     if hasattr(viewer.camera, "orientation2d"):  # since napari 0.6; before, y points down
         viewer.camera.orientation2d = ("up", "right")
     # napari 0.9 has moved its overlays
     overlays = viewer.canvas.overlays if hasattr(viewer, "canvas") else viewer
     overlays.scale_bar.visible = True
+
+
+def napari_reader(path: str | list[str]) -> Callable[[str | list[str]], list[Layer]] | None:
+    """Returns the function that reads a file for napari, which calls this for every .h5 file; None for what is neither a
+    volume nor a scan of phyradgs-cl."""
+    paths = [path] if isinstance(path, str) else path
+    with suppress(PhyradgsError):
+        if all(file_kind(one) in ("volume", "scan") for one in paths):
+            return lambda path: [napari_layer(Path(one)) for one in ([path] if isinstance(path, str) else path)]
+    return None
+
+
+def napari_layer(path: Path) -> Layer:
+    """Returns (values, arguments of add_image, "image") of a volume (z, y, x) in mm, or of a scan (projection, v, u), whose
+    rows and columns are in mm from the central ray; row 0 is the lowest."""
+    if file_kind(path) == "volume":
+        stored = read_volume(path)
+        return stored.values, _look_of_volume(stored, path.stem), "image"
+    scan = read_scan(path, counts_to_attenuation)
+    sides = zip(scan.geometry.detector_shape, scan.geometry.pixel_size_mm, scan.geometry.detector_offset_mm, strict=True)
+    first_mm = [offset - (count - 1) / 2 * pitch for count, pitch, offset in sides]
+    values = np.asarray(scan.projections)
+    look = {
+        "name": f"{path.stem} (line integrals)", "scale": (1.0, *scan.geometry.pixel_size_mm), "translate": (0.0, *first_mm),
+        "units": ("pixel", "mm", "mm"), "axis_labels": ("projection", "v", "u"),
+        "contrast_limits": grey_range(values), "colormap": "gray",
+    }  # fmt: skip
+    return values, look, "image"
+
+
+def _look_of_volume(stored: Volume, name: str) -> dict[str, Any]:
+    """Returns the arguments of napari's add_image for a volume."""
+    grid = stored.required_grid
+    return {
+        "name": f"{name} (1/mm)", "scale": grid.voxel_size_mm, "translate": grid.first_centre_mm,
+        "units": ("mm", "mm", "mm"), "axis_labels": _AXES, "contrast_limits": grey_range(stored.values), "colormap": "gray",
+    }  # fmt: skip

@@ -1,5 +1,6 @@
 """A small fly-scan with its truth, and a reconstruction of it, as files."""
 
+import importlib.util
 from collections.abc import Callable
 from html.parser import HTMLParser
 from pathlib import Path
@@ -14,6 +15,7 @@ from phyradgs_cl.reconstructors import plan_run
 from phyradgs_cl.simulation import SimulationOptions, phantom_scene, simulate
 from phyradgs_cl.workflow import run_reconstruction
 
+collect_ignore = [] if importlib.util.find_spec("napari") else ["test_napari.py"]
 VOID = {"br", "img", "input", "link", "meta"}
 
 

@@ -1,12 +1,18 @@
 """The picture of a run under way, and the window of a finished one."""
 
+import importlib
 import sys
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import yaml
 from skimage import io
 
+import phyradgs_cl
+from phyradgs_cl.acquisition import pixel_centres
+from phyradgs_cl.api import save_scan, simulate
 from phyradgs_cl.errors import InputError, OutputError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.io import write_volume
@@ -90,3 +96,27 @@ def test_the_window_has_the_volume_in_millimetres(cli, refused, any_volume, tmp_
     assert opened[-1].camera.orientation2d == ("up", "right")
     monkeypatch.setitem(sys.modules, "napari", None)
     refused(["view", tmp_path / "v.h5"], "pip install 'napari")
+
+
+def test_napari_reads_volumes_and_scans_by_the_manifest(any_volume, tmp_path) -> None:
+    """What the manifest names exists; values, scale, position and units are the file's. Other files are left to others."""
+    volume, grid = any_volume
+    write_volume(tmp_path / "v.h5", volume, grid, {})
+    manifest = yaml.safe_load((Path(phyradgs_cl.__file__).parent / "napari.yaml").read_text(encoding="utf-8"))
+    (command,), (reader,) = (manifest["contributions"][key] for key in ("commands", "readers"))
+    assert reader["command"] == command["id"] and reader["filename_patterns"] == ["*.h5"]
+    module, _, name = command["python_name"].partition(":")
+    choose = getattr(importlib.import_module(module), name)
+    ((values, how, kind),) = choose(str(tmp_path / "v.h5"))(str(tmp_path / "v.h5"))
+    assert np.array_equal(values, volume) and kind == "image"
+    assert (how["scale"], how["translate"], how["units"]) == (grid.voxel_size_mm, grid.first_centre_mm, ("mm", "mm", "mm"))
+    scan = simulate("jaw", size=8, detector=12, views=5, protocol="static", detector_offset_mm=(0.25, -0.5))
+    save_scan(tmp_path / "s.h5", scan)
+    both = [str(tmp_path / "v.h5"), str(tmp_path / "s.h5")]
+    _, (values, how, _) = choose(both)(both)
+    assert np.array_equal(values, scan.projections) and how["axis_labels"] == ("projection", "v", "u")
+    pixel = np.array(how["translate"]) + np.array(how["scale"]) * [3, 0, 11]  # the last column of the lowest row
+    expected = pixel_centres(scan.geometry.pose(0.0), scan.geometry.detector_shape)[0, 11]
+    np.testing.assert_allclose(pixel, [3, expected[2], expected[1]], atol=1e-12)
+    (tmp_path / "other.h5").write_bytes(b"no HDF5")
+    assert choose(str(tmp_path / "other.h5")) is None and choose([*both, str(tmp_path / "other.h5")]) is None
