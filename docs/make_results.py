@@ -406,7 +406,6 @@ def parallel_fly() -> str:
 TABLES: dict[str, Callable[[], str]] = {
     "table1_S_rapid": lambda: quality("table1_S.csv", "rapid", with_seconds=True),
     "table1_S_standard": lambda: quality("table1_S.csv", "standard"),
-    "table1_S_columns": lambda: quality("table1_S_columns.csv", "rapid"),
     "table1_M_rapid": lambda: quality("table1_M.csv", "rapid"),
     "table2_S": strips,
     "phantom_M": phantom,
