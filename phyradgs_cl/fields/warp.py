@@ -6,6 +6,7 @@ import numpy as np
 import scipy
 
 from phyradgs_cl import checks
+from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields.deformation import Deformation
 from phyradgs_cl.fields.volume import Grid, triple
 
@@ -17,9 +18,11 @@ def deformed(volume: np.ndarray, grid: Grid, deformation: Deformation, weights: 
 
     It is v(y + w(y)) at every voxel centre y, trilinear between the voxels of the reference ``volume`` (nz, ny, nx) in 1/mm
     on ``grid``, 0 outside of it. A state at rest is the volume itself. Raises InputError for shapes that do not fit."""
-    checks.shape("volume", volume, grid.shape)
-    reference = np.asarray(volume, np.float32)
-    if not np.any(deformation.reach_mm * np.abs(weights)):
+    if not isinstance(deformation, Deformation):
+        raise InputError("deformation", checks.short_repr(deformation), "a Deformation")
+    checks.shape("volume", checks.real_array("volume", volume), grid.shape)
+    reference, shares = np.asarray(volume, np.float32), checks.numbers("weights", weights, (deformation.rank,))
+    if not np.any(deformation.reach_mm * np.abs(shares)):
         return reference
     nz, ny, nx = grid.shape
     result = np.empty(grid.shape, np.float32)
@@ -28,7 +31,7 @@ def deformed(volume: np.ndarray, grid: Grid, deformation: Deformation, weights: 
     slices = max(1, _SLAB_VOXELS // (ny * nx))
     for first in range(0, nz, slices):
         count = min(slices, nz - first)
-        shift = deformation.on_grid_mm(grid.part(triple((first, 0, 0)), triple((count, ny, nx))), weights)
+        shift = deformation.on_grid_mm(grid.part(triple((first, 0, 0)), triple((count, ny, nx))), shares)
         z = np.arange(first, first + count, dtype=np.float32)[:, None, None] + shift[..., 2] / voxel_mm[0]
         y = index[0][:, None] + shift[..., 1] / voxel_mm[1]
         x = index[1] + shift[..., 0] / voxel_mm[2]

@@ -180,6 +180,16 @@ ARGUMENTS: list[tuple[str, Callable[..., object], dict[str, list[Any]]]] = [
     ("initial_gaussians", partial(api.initial_gaussians, GOOD), {"seed": [-1]}),
 ]
 """Of a name: a call, and wrong values of its arguments, which the error is about."""
+GRID = Grid.cube(4, 2.0)
+
+
+def still(**changes: Any) -> api.Deformation:
+    """A deformation that displaces nothing."""
+    times_s, control_mm = np.array([0.0, 1.0]), np.zeros((1, 2, 2, 2, 3))
+    values = {"control_mm": control_mm, "origin_mm": (0, 0, 0), "spacing_mm": 1.0, "times_s": times_s}
+    return api.Deformation(**{**values, "weights": np.zeros((2, 1)), **changes})
+
+
 CASES: dict[str, list[tuple[str, Callable[[], object]]]] = {
     "fly_scan": [
         ("frames", lambda: fly(FRAMES[0])), ("frames", lambda: fly(FRAMES[:0])), ("pixels", lambda: fly(NAN)),
@@ -250,6 +260,26 @@ CASES: dict[str, list[tuple[str, Callable[[], object]]]] = {
         ("grid shape", lambda: Grid(16, 1.0)), ("grid voxel_size", lambda: Grid((4, 4, 4), (1.0, 1.0))),
         ("grid shape", lambda: Grid((1000000.0, 1000000.0, 1000000.0), (1, 1, 1))),
         ("count", lambda: Grid.cube(0, 2.0)),
+    ],
+    "Deformation": [
+        ("deformation control_mm", lambda: still(control_mm=np.zeros((1, 2, 2, 2)))),
+        ("deformation spacing_mm", lambda: still(spacing_mm=0.0)), ("deformation times_s", lambda: still(times_s=[1, 1])),
+        ("deformation weights", lambda: still(weights=np.full((2, 1), np.nan))),
+        ("weights", lambda: still().displacement_mm(np.zeros((1, 3)), [1.0, 2.0])),
+    ],
+    "deformed": [
+        ("volume", lambda: api.deformed(FRAMES, GRID, still(), [1.0])),
+        ("weights", lambda: api.deformed(np.zeros(GRID.shape), GRID, still(), [1.0, 2.0])),
+        ("deformation", lambda: api.deformed(np.zeros(GRID.shape), GRID, "field.h5", [1.0])),
+    ],
+    "load_deformation": [("nowhere.h5", lambda: api.load_deformation("nowhere.h5"))],
+    "save_deformation": [("deformation", lambda: api.save_deformation("field.h5", GRID))],
+    "ObjectMotion": [
+        ("motion of the object: kind", lambda: api.ObjectMotion("walking")),
+        ("motion of the object: states", lambda: api.ObjectMotion("drying", states=2.5)),
+        ("motion of the object: amplitude_mm", lambda: api.ObjectMotion("sliding", 2.0).deformation(GRID, 0.0, 1.0)),
+        ("motion_of_object", lambda: api.simulate("foot", size=8, views=3, motion_of_object=3)),
+        ("nowhere.toml", lambda: api.simulate("foot", size=8, views=3, motion_of_object="nowhere.toml")),
     ],
     "Gaussians": [
         ("rows", lambda: Gaussians.from_rows(np.zeros((10, 5)))),

@@ -48,7 +48,8 @@ def read_scan(path: str | Path, to_attenuation: ToAttenuation, rows: tuple[int, 
             header = replace(header, scan=slab(header.scan, *rows))
         mask = _read_mask(source, header, lines)
         reference = read_reference(source, header.entry) if header.has_reference else None
-        moving = read_moving_truth(source, header.entry) if header.states else None
+        has_states = header.states > 0 and rows is None  # slabs are compared with their part of the reference alone
+        moving = read_moving_truth(source, header.entry) if has_states else None
         data = _read_frames(source, header, mask, lines)
     projections, bad = _convert(source.name(f"{header.entry}/{schema.DATA}"), header, data, to_attenuation)
     used = header.image_key == schema.PROJECTION
