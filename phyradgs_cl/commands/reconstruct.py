@@ -127,7 +127,7 @@ def _finish(page: "report.LivePage", result: Reconstruction, scan: Path, output:
         at, asked = result.facts["interrupted_at"], result.facts["options"]["iterations"]
         page.end(f"Interrupted at iteration {at} of {asked}: repeat the command with --resume to continue.")
     elif "slabs" in result.facts:
-        page.end("The run is complete.")
+        page.end("The run is complete. 'phyradgs report' makes its report.", is_complete=True)
     else:
         with signals.finish_despite_interrupt():
             page.become(lambda path: report.write_report(output, path, lambda: rt, scan=scan))

@@ -89,7 +89,7 @@ def draw_convergence(axes: "Axes", points: Sequence[tuple[float, float]], words:
     x, y = zip(*points, strict=True)
     draw_curve(axes, x, y, "iteration", words)
     axes.plot(x[-1], y[-1], "o", color=ACCENT)
-    note(axes, number(y[-1]), (x[-1], y[-1]), (-4, 8), ha="right", weight="semibold")
+    note(axes, number(y[-1]), (x[-1], y[-1]), (-4, 8), ha="right", weight="bold")
     if axes.get_yscale() == "linear" and 0 <= min(y) < 0.5 * max(y):
         axes.set_ylim(bottom=0)
 
@@ -109,7 +109,7 @@ def draw_tuning(axes: "Axes", tuned: Mapping[str, Any]) -> None:
     axes.plot(values, errors, "o-", color=ACCENT, ms=4)
     axes.plot([chosen, chosen], [min(errors), error], "--", color=ACCENT)
     axes.plot(chosen, error, "o", color=ACCENT, ms=9)
-    note(axes, number(chosen), (chosen, error), (0, 10), weight="semibold")
+    note(axes, number(chosen), (chosen, error), (0, 10), weight="bold")
     if is_log:
         axes.set_xscale("log")
     style_axes(axes, name, "held-out RMS")

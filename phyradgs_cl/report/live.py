@@ -54,8 +54,9 @@ class LivePage:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
-        reason = f"Stopped by an error: {error}" if isinstance(error, Exception) else "Interrupted."
-        self.end("The run is complete." if error is None else reason)
+        if error is None:
+            self.end("The run is complete.", is_complete=True)
+        self.end(f"Stopped by an error: {error}" if isinstance(error, Exception) else "Interrupted.")
 
     def stage(self, text: str) -> None:
         """Says what the run does before its first iteration."""
@@ -70,11 +71,11 @@ class LivePage:
         self._pictured_s = time.monotonic() - self._started_s
         self.spent_s += self._pictured_s - used_s
 
-    def end(self, reason: str) -> None:
+    def end(self, reason: str, is_complete: bool = False) -> None:
         """Writes the page a last time, which says why there is no more news; later calls do nothing."""
         if not self._is_over.is_set():
             self._stop()
-            self.status = replace(self.status, ended=reason)
+            self.status = replace(self.status, ended=reason, is_complete=is_complete)
             self._write()
 
     def become(self, write_report: Callable[[Path], object]) -> None:
@@ -85,7 +86,7 @@ class LivePage:
             self._stop()
         except PhyradgsError as error:
             self._warn(f"no report: {error}")
-            self.end("The run is complete. 'phyradgs report' makes its report.")
+            self.end("The run is complete. 'phyradgs report' makes its report.", is_complete=True)
 
     def _snapshot(self, progress: Progress, used_s: float) -> Snapshot:
         """Returns the present slices and frames. Frames that the device cannot compute are left out."""

@@ -57,7 +57,8 @@ class Snapshot:
 @dataclass(frozen=True, eq=False)
 class Status:
     """What a page says of a run. settings: facts by name. Times are seconds since 1970. stage: what the run does before its
-    first iteration; ended: the reason for which there will be no news. points: (iteration, measure of convergence)."""
+    first iteration; ended: the reason for which there will be no news, no warning if ``is_complete``. points: (iteration,
+    measure of convergence)."""
 
     title: str
     settings: Mapping[str, object]
@@ -65,6 +66,7 @@ class Status:
     started: float
     stage: str = ""
     ended: str = ""
+    is_complete: bool = False
     progress: Progress | None = None
     points: tuple[tuple[int, float], ...] = ()
     first: tuple[int, float] = (0, 0.0)
@@ -123,7 +125,9 @@ def live_page(status: Status, now: float) -> str:
 def _tab(status: Status) -> str:
     """Returns the title in the browser's tab, which begins with how far the run is."""
     p = status.progress
-    share = "stopped" if status.ended else "starting" if p is None else f"{100 * p.iteration // max(p.iterations, 1)} %"
+    share = "starting" if p is None else f"{100 * p.iteration // max(p.iterations, 1)} %"
+    if status.ended:
+        share = "complete" if status.is_complete else "stopped"
     return f"{share} – {status.title}"
 
 
@@ -131,7 +135,8 @@ def _top(status: Status, now: float) -> list[Markup]:
     at = time.strftime("%H:%M:%S", time.localtime(now))
     words = f"Written at {at}. " + ("" if status.ended else f"A run that is alive writes every {status.every_s:g} s.")
     state = status.ended or (f"{status.stage[:1].upper()}{status.stage[1:]}." if status.stage else "")
-    news = element("p", state, id="news", role="status", class_="warning" if status.ended else None, hidden=not state)
+    kind = "warning" if status.ended and not status.is_complete else None
+    news = element("p", state, id="news", role="status", class_=kind, hidden=not state)
     controls = []
     if not status.ended:
         button = element("button", "Pause reloading", type="button", id="pause", aria_pressed="false")

@@ -184,7 +184,7 @@ def frames_chart(scan: Scan) -> Markup:
     def draw(axes: "Axes") -> None:
         for frame, first_s in enumerate(start_s):
             draw_windows(axes, scan.shutter, scan.lines, float(first_s))
-            axes.text(first_s + middle_s, scan.lines / 2, str(frame), ha="center", weight="semibold", color=INK)
+            axes.text(first_s + middle_s, scan.lines / 2, str(frame), ha="center", weight="bold", color=INK)
         axes.set_xlabel("time (s)")
 
     return chart(draw, f"Exposure windows of the first {len(start_s)} frames", shutter_words(scan))

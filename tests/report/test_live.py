@@ -121,7 +121,8 @@ def test_a_thread_keeps_the_page_fresh_and_ends_with_the_run(tmp_path) -> None:
         assert "Building kernels." in path.read_text(encoding="utf-8") and "starting – v.h5" in first
         live(report(3))
     last = path.read_text(encoding="utf-8")
-    assert "The run is complete." in last and '"is_over":true' in last and 'http-equiv="refresh"' not in last
+    assert "The run is complete." in last and "complete – v.h5" in last and 'class="warning"' not in last
+    assert '"is_over":true' in last and 'http-equiv="refresh"' not in last
     assert not live._writer.is_alive() and [one.name for one in tmp_path.iterdir()] == ["p.html"]
 
 
