@@ -8,7 +8,13 @@ import numpy as np
 
 from phyradgs_cl import checks
 from phyradgs_cl.acquisition import Scan
-from phyradgs_cl.acquisition.altered.coarse import FINE_COLUMNS, QUICK_COLUMNS, coarse, some_frames
+from phyradgs_cl.acquisition.altered.coarse import (
+    FINE_COLUMNS,
+    QUICK_COLUMNS,
+    around_object,
+    coarse,
+    some_frames,
+)
 from phyradgs_cl.check import consistency, coverage, detector, orbit, shutter, timing
 from phyradgs_cl.check.finding import CANNOT_TELL, OK, SUSPICIOUS, Finding, same_from_everywhere
 from phyradgs_cl.detector import without_lag
@@ -99,7 +105,7 @@ def check(
     turn = orbit.find_orbit(rt, quick, scan, consistent.sees_angles)
     answers.add(turn.sign)
     answers.add(turn.centre)
-    quick = turn.corrected(quick)
+    quick = around_object(turn.corrected(quick))
 
     def ask(question: str, check_question: Callable[[Runtime, Scan], Finding], coarse_scan: Scan) -> None:
         answers.add(check_question(rt, coarse_scan) if consistent.sees_angles else same_from_everywhere(question))
@@ -112,7 +118,7 @@ def check(
     answers.add(gain)
     if shutter.READOUT in questions:
         fine = some_frames(coarse(scan, FINE_COLUMNS), consistent.frames)
-        ask(shutter.READOUT, shutter.check_readout, turn.corrected(fine))
+        ask(shutter.READOUT, shutter.check_readout, around_object(turn.corrected(fine)))
     if shutter.EXPOSURE in questions:
         ask(shutter.EXPOSURE, shutter.check_exposure, quick)
     if turn.is_reversed or turn.centre.unit == orbit.OTHER_CAUSE:  # the offset depends on another correction

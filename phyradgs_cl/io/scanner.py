@@ -106,7 +106,8 @@ def _order(readout: Fields) -> tuple[str, int]:
     """Returns readout axis and direction, from ``first`` or their own keys; rows from the lowest up by default."""
     direction = readout.get("direction") if readout.has("direction") else 1
     if isinstance(direction, bool) or direction not in (1, -1):
-        raise readout.error("direction", described(direction), "1 (index 0 first) or -1 (index 0 last)")
+        expected, remedy = "1 (index 0 first) or -1 (index 0 last)", 'a side in words goes into first, as first = "top"'
+        raise readout.error("direction", described(direction), expected, remedy)
     axis, stated = readout.word("axis", AXES, default=AXES[0]), 1 if direction == 1 else -1
     if not readout.has("first"):
         return axis, stated

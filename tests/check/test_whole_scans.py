@@ -51,6 +51,12 @@ def only_alarm(found):
     return f"{found.suspicious[0].text} -> {found.suspicious[0].advice}"
 
 
+def test_a_panel_far_beside_the_axis_raises_no_false_alarm(rt, scan_of) -> None:
+    """A derived grid is wider than the panel; the object once fitted better with pixels twice as large, in finer voxels."""
+    far = ConeGeometry(5.0, 7.0, (32, 32), (0.125, 0.125), (0.0, 1.2))
+    assert suspected(check(imported(scan_of(far, views=15, exposure_deg=24.0, readout_ratio=0.5)), rt)) == []
+
+
 @pytest.mark.parametrize("factor", [0.1, 1000.0])
 def test_sizes_in_another_unit_are_no_offset(rt, aside, factor) -> None:
     """Ten times too small, the panel has its axis beside it, where frames fit under any geometry."""

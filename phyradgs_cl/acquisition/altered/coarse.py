@@ -7,7 +7,7 @@ import numpy as np
 from scipy.ndimage import gaussian_filter
 
 from phyradgs_cl.acquisition.altered.variants import altered_trajectory, with_trajectory
-from phyradgs_cl.acquisition.geometry import Geometry
+from phyradgs_cl.acquisition.geometry import ConeGeometry, Geometry
 from phyradgs_cl.acquisition.scan import Scan
 from phyradgs_cl.acquisition.shutter import Shutter
 from phyradgs_cl.fields import Grid
@@ -18,6 +18,7 @@ SMOOTHING = 0.8  # blocks: standard deviation
 _LEAST_VALID = 0.5  # of a block's pixels
 _MOST_VOXELS = 64  # per side
 _MARGIN = 1  # voxels around the box: an object that fills it would fit better with a smaller size
+_OBJECT_SHARE = 0.02  # of the largest line integral: columns above it show the object
 _LEAST_COLUMNS = 12  # of blocks, where the panel has that many
 _NARROW = 3  # times the columns, on a panel lower than a block: a row of few blocks holds little
 
@@ -109,6 +110,29 @@ def coarse_grid(grid: Grid, geometry: Geometry) -> Grid:
     voxel = [side / n for side, n in zip(grid.size_mm, shape, strict=True)]
     nz, ny, nx = (n + 2 * _MARGIN for n in shape)
     return Grid((nz, ny, nx), (voxel[0], voxel[1], voxel[2]), grid.offset_mm)
+
+
+def around_object(scan: Scan) -> Scan:
+    """Returns a coarse scan with its grid about the axis cut to the object that the frames show.
+
+    With few frames, voxels of air let a wrong hypothesis fit better than the right one. A grid derived from the panel has
+    many."""
+    geometry, grid = scan.geometry, scan.grid
+    columns = np.where(scan.valid, scan.projections, 0).max((0, 1))
+    shown = np.flatnonzero(columns > _OBJECT_SHARE * columns.max())
+    if any(grid.offset_mm[1:]) or not shown.size:
+        return scan
+    pitch_mm, offset_mm = geometry.pixel_size_mm[1], geometry.detector_offset_mm[1]
+    edges_mm = (shown[[0, -1]] - (columns.size - 1) / 2) * pitch_mm + offset_mm
+    radius_mm = float(np.abs(edges_mm).max()) + pitch_mm / 2
+    if isinstance(geometry, ConeGeometry):
+        radius_mm = geometry.source_to_axis_mm * math.sin(math.atan2(radius_mm, geometry.source_to_detector_mm))
+    nz, *sides = grid.shape
+    ny, nx = (
+        min(count, math.ceil(2 * radius_mm / voxel_mm) + 2 * _MARGIN)
+        for count, voxel_mm in zip(sides, grid.voxel_size_mm[1:], strict=True)
+    )
+    return replace(scan, grid=replace(grid, shape=(nz, ny, nx)))
 
 
 def _binned_panel(geometry: Geometry, height: int, width: int) -> Geometry:
