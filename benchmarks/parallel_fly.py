@@ -43,6 +43,7 @@ class Trial:
 TRIALS = (
     Trial("fbp", "ignored", {"motion": "static"}),
     Trial("fbp", "deblurred", {"motion": "static", "deblur": 0.03}),
+    Trial("fbp", "deblurred ten times", {"motion": "static", "deblur": 0.003}),
     Trial("sirt", "ignored", {"motion": "static", "iterations": 100}),
     Trial("sirt", "known", {"motion": "per-row", "iterations": 100}),
     Trial("fista", "ignored", {"motion": "static"}),
@@ -95,16 +96,9 @@ def make_scan(rt: Runtime, views: int, blur_px: float, dose: float, seed: int) -
     """Returns a fly-scan and the truth (SIDE, SIDE)."""
     speed, arc_rad = 2 * math.pi * turns_for(views, blur_px) / views, blur_px / RADIUS
     shutter = Shutter(arc_rad / speed)
-    fine = ParallelGeometry((1, SIDE * FINER), 1 / FINER)
-    orbit = CircularOrbit(fine, ConstantSpeed(0.1, speed))
+    orbit = CircularOrbit(ParallelGeometry((1, SIDE * FINER), 1 / FINER), ConstantSpeed(0.1, speed))
     grid = Grid((1, SIDE * FINER, SIDE * FINER), (1 / FINER,) * 3)
-    field, light = phantom(SIDE * FINER)[None].astype(np.float32), np.empty((views, SIDE))
-    for view in range(views):
-        cells = per_line_cells(orbit, shutter, view, float(view), 1, TIMES)
-        each = (slice(k, k + 1) for k in range(TIMES))
-        tables = [replace(cells, pose=cells.pose[k], time_s=cells.time_s[k], **_one_line()) for k in each]
-        frames = RayOperator(rt, grid, (1, SIDE * FINER), tables).forward(field)[:, 0]
-        light[view] = np.exp(-frames).mean(0).reshape(SIDE, FINER).mean(1)
+    light = mean_light(rt, orbit, shutter, np.arange(float(views)), grid, phantom(SIDE * FINER), TIMES, FINER)
     rng = np.random.default_rng(seed)
     counts = rng.poisson(np.repeat(light[:, None], ROWS, 1) * dose)
     frames = -np.log(np.maximum(counts, 0.5) / dose)
@@ -115,8 +109,21 @@ def make_scan(rt: Runtime, views: int, blur_px: float, dose: float, seed: int) -
     return scan, phantom(SIDE * 8).reshape(SIDE, 8, SIDE, 8).mean((1, 3))
 
 
-def _one_line() -> dict[str, np.ndarray]:
-    return {"line_start": np.zeros(1, np.int32), "line_stop": np.ones(1, np.int32), "weight": np.ones(1)}
+def mean_light(
+    rt: Runtime, orbit: CircularOrbit, shutter: Shutter, start_s: np.ndarray, grid: Grid, field: np.ndarray, times: int,
+    finer: int,
+) -> np.ndarray:
+    """Returns the light (views, columns) behind a slice (y, x), as a share of that without it: the mean of ``times`` times
+    of an exposure and of ``finer`` pixels, of a panel of one row."""
+    columns, light = orbit.geometry.detector_shape[1], []
+    one_line = {"line_start": np.zeros(1, np.int32), "line_stop": np.ones(1, np.int32), "weight": np.ones(1)}
+    for view, at_s in enumerate(start_s):
+        cells = per_line_cells(orbit, shutter, view, float(at_s), 1, times)
+        each = (slice(k, k + 1) for k in range(times))
+        tables = [replace(cells, pose=cells.pose[k], time_s=cells.time_s[k], **one_line) for k in each]
+        frames = RayOperator(rt, grid, (1, columns), tables).forward(field[None].astype(np.float32))[:, 0]
+        light.append(np.exp(-frames).mean(0).reshape(columns // finer, finer).mean(1))
+    return np.array(light)
 
 
 def main() -> None:

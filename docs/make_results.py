@@ -393,14 +393,30 @@ def fbp_peers() -> str:
 
 
 def parallel_fly() -> str:
-    """Modulation at rim and centre of fly-scans with parallel beams."""
-    rows = [
-        [f"{one['blur_px']:g}", str(one["views"]), f"`{one['method']}`", one["motion"], f"{one['psnr_db']:.2f}"]
-        + [f"{one[place]:.2f}" for place in ("rim", "centre")] + [f"{one['processor_s']:.0f}"]
-        for one in lines_of("parallel_fly.jsonl")
+    """PSNR and modulation at rim and centre of fly-scans with parallel beams: a line per scan, a column per method."""
+    cells: dict[tuple[Any, ...], dict[tuple[str, str], str]] = {}
+    for one in lines_of("parallel_fly.jsonl"):
+        scan = cells.setdefault((one["views"], one["blur_px"], one["dose"]), {})
+        scan[one["method"], one["motion"]] = f"{one['psnr_db']:.1f}, {one['rim']:.2f}, {one['centre']:.2f}"
+    columns = [("fbp", "ignored"), ("fbp", "deblurred"), ("fbp", "deblurred ten times")]
+    columns += [(method, motion) for method in ("sirt", "fista", "phyradgs") for motion in ("ignored", "known")]
+    text = [
+        [str(views), f"{blur:g}", f"{dose:g}", *(by.get(column, "–") for column in columns)]
+        for (views, blur, dose), by in sorted(cells.items())
     ]
-    heads = ["blur", "views", "method", "motion", "PSNR, dB", "modulation, rim", "centre", "processor, s"]
-    return markdown(heads, rows)
+    labels = {"deblurred": "`deblur=0.03`", "deblurred ten times": "`deblur=0.003`"}
+    heads = (f"`{method}`, {labels.get(motion, motion)}" for method, motion in columns)
+    return markdown(["views", "blur", "photons", *heads], text)
+
+
+def fan_fly() -> str:
+    """NMSE of a fan beam's fly-scan."""
+    rows = [
+        [f"{one['side']}²", f"`{one['method']}`", one["model"]]
+        + [f"{one['nmse']:.4f}", f"{one['best']:.4f} ({one['best_at']})"]
+        for one in lines_of("fan_fly.jsonl")
+    ]
+    return markdown(["voxels", "method", "motion", "NMSE", "smallest (pass)"], rows)
 
 
 TABLES: dict[str, Callable[[], str]] = {
@@ -428,6 +444,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "calibrated_psnr": calibrated_psnr,
     "fbp_peers": fbp_peers,
     "parallel_fly": parallel_fly,
+    "fan_fly": fan_fly,
 }
 
 

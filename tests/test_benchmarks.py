@@ -89,6 +89,7 @@ def test_benchmarks_that_append_lines_are_resumed(tmp_path) -> None:
     for name, words, facts in (
         ("calibrate.py", "{tmp} {lines} --cases wobble --size 16 --views 8 --seeds 1", {"case": "wobble", "seed": 1}),
         ("bead_bias.py", "{lines} --size XS --trials stop-and-shoot", {"trial": "stop-and-shoot", "method": "fista-tv"}),
+        ("fan_fly.py", "{lines} --side 28 --iterations 2 --trials 1", {"side": 28, "method": "fdk", "model": "ignored"}),
     ):
         lines = tmp_path / f"{name}.jsonl"
         asked = [word.format(tmp=tmp_path, lines=lines) for word in words.split()]
