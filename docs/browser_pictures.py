@@ -1,4 +1,4 @@
-"""Takes the pictures of the report and of the live page in a real browser, for docs/gallery.md:
+"""Takes the pictures of the report and of the live page in a real browser, for docs/gallery.md and docs/report.md:
 
     python docs/browser_pictures.py [FOLDER]
 
@@ -116,7 +116,11 @@ def shown_iteration(page_file: Path) -> int:
 
 def take_report(browser: Any, page_file: Path, *, has_webgl: bool) -> None:
     desktop = opened(browser, page_file, DESKTOP)
-    if not has_webgl:
+    if has_webgl:
+        for name, width, height in (("../report_desktop", 1280, 1330), ("../report_phone", 390, 1250)):  # of docs/report.md
+            page = opened(browser, page_file, {"width": width, "height": 800})
+            save(name, page.screenshot(clip={"x": 0, "y": 0, "width": width, "height": height}, full_page=True))
+    else:
         save("report_without_webgl", desktop.screenshot(clip={"x": 0, "y": 0, "width": 1000, "height": 900}, full_page=True))
         return
     at_rest(desktop, "space-surface")
