@@ -6,7 +6,7 @@
 # make coverage   which lines the tests run, with PyTorch, Dask and MPI in one environment; fails below 95 %
 # make mutants    small defects put into three rooms, one after the other: which do their tests not notice?
 # make test-intel     the tests on Intel's OpenCL runtime for CPUs (x86-64 Linux; another 300 MB; SHAPE=--gpu-shape: as GPUs run)
-# make test-neural    the tests of naf and sax-nerf, with PyTorch in an environment of its own
+# make test-neural    the tests of naf and sax-nerf, and of deepinv, with PyTorch in an environment of its own
 # make test-browser   the page of a run in this machine's Chromium or Chrome; pictures in .venv-browser/pictures
 # make test-cluster   workers killed at random, schedulers restarted: the tests of Dask, in an environment of its own
 # make test-mpi       one reconstruction on 1 to 4 ranks, killed and resumed: the tests of MPI, in an environment of its own
@@ -87,7 +87,7 @@ PACKAGES_intel   := intel-opencl-rt intel-cmplr-lib-rt
 EXTRAS_mpi       := cpu,test,mpi
 EXTRAS_neural    := cpu,test,neural
 # An index may have other builds of PyTorch than the one for CUDA, of several GB: PIP_EXTRA_INDEX_URL chooses among them.
-PACKAGES_neural   = "$(TORCH)"
+PACKAGES_neural   = "$(TORCH)" "deepinv>=0.5"
 EXTRAS_package   := test
 EXTRAS_spectrum  := cpu,test,spectrum
 EXTRAS_oclgrind  := cpu

@@ -14,10 +14,13 @@ from phyradgs_cl import api
 
 ROOT = Path(__file__).resolve().parent.parent
 EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
-TORCH = importlib.util.find_spec("torch") is not None
-RUN = [path for path in EXAMPLES if TORCH or "import torch" not in path.read_text(encoding="utf-8")]
+LACKING = [name for name in ("torch", "deepinv") if importlib.util.find_spec(name) is None]  # `make test-neural` has both
+RUN = [
+    path for path in EXAMPLES if not any(f"import {name}\n" in path.read_text(encoding="utf-8") for name in LACKING)
+]
 MOST_LINES, LONGEST_S = 60, 300  # under a minute on two cores that have nothing else to do
 SAID = {
+    "deepinv_physics": r"FISTA of deepinv: (?P<more>2\d\.\d+) dB",
     "own_arrays": r"still: (?P<less>[\d.]+) dB.*\nmoving: (?P<more>[\d.]+) dB",
     "own_motion": r"readout takes 0\.86 of an exposure\nlevel: (?P<more>[\d.]+) dB\nsagging: (?P<less>[\d.]+) dB\nPoseTable",
     "own_poses": r"stated: (?P<less>[\d.]+) dB\nfound: (?P<more>[\d.]+) dB\ncalibrated: ",
