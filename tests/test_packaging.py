@@ -21,7 +21,7 @@ def tracked(folder: str, pattern: str) -> set[str]:
     return {f"{folder}/{path.relative_to(root).as_posix()}" for path in root.rglob(pattern)}
 
 
-NEEDED = tracked("cl", "*.cl") | tracked("cl", "*.h") | tracked("data", "*.toml") | {"cli.py"}
+NEEDED = tracked("cl", "*.cl") | tracked("cl", "*.h") | tracked("data", "*.*") | {"cli.py"}
 
 
 def build(target: str, folder: Path) -> Path:

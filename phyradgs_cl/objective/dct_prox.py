@@ -9,13 +9,15 @@ A map takes a quarter of the shifts, the next map the next quarter: over iterati
 Kamilov, Bostan and Unser, IEEE Signal Process. Lett. 21 (2014) 1326)."""
 
 import itertools
+import json
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import cache, partial
 
 import numpy as np
 import scipy
 
+from phyradgs_cl import resource
 from phyradgs_cl.checks import ceil_div
 from phyradgs_cl.runtime import DeviceArray, Runtime, SameArray
 from phyradgs_cl.runtime.layout import GUARD, on_device, padded_zeros, pitch_of
@@ -53,6 +55,13 @@ class Curves:
         for m, knot in enumerate(unit * self.knots.astype(np.float64)):
             losses += weights[..., m] * np.clip(coefficients, -knot, knot)
         return losses
+
+
+@cache
+def learned_curves() -> Curves:
+    """Returns the curves of ``data/curves.json``, whose unit is the deviation of noise (benchmarks/train_curves.py)."""
+    stored = json.loads((resource("data") / "curves.json").read_text(encoding="utf-8"))
+    return Curves(np.array(stored["knots"], np.float32), np.array(stored["weights"], np.float32))
 
 
 SOFT = Curves(np.ones(1, np.float32), np.ones((FREQUENCY_CLASSES, 1), np.float32))

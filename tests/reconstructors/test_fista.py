@@ -47,7 +47,7 @@ def quality(scan: Scan, volume: np.ndarray) -> float:
 def test_each_prior_is_better_than_none_and_subsets_are_quicker(rt, scan) -> None:
     found = {
         prior: quality(scan, run(rt, scan, "fista", motion="per-row", iterations=40, prior=prior).volume)
-        for prior in ("none", "tv", "dct", "nonlocal", "nonlocal+dct")
+        for prior in ("none", "tv", "dct", "curves", "nonlocal", "nonlocal+dct")
     }
     without = found.pop("none")
     assert min(found.values()) > without + 0.5, (found, without)
@@ -203,7 +203,7 @@ def test_fused_is_the_mean_of_both(rt, scan) -> None:
     assert run(rt, scan, "fista", iterations=1).disagreement is None
 
 
-@pytest.mark.parametrize(("at", "prior"), [(2, "dct"), (5, "dct"), (1, "nonlocal"), (3, "nonlocal+dct"), (6, "nonlocal")])
+@pytest.mark.parametrize(("at", "prior"), [(2, "dct"), (5, "curves"), (1, "nonlocal"), (3, "nonlocal+dct"), (6, "nonlocal")])
 def test_fista_goes_on_with_the_same_bits_from_either_grid(rt, scan, at, prior) -> None:
     options = method_options("fista", None, {"iterations": 7, "subvoxels": 2, "prior": prior})
 

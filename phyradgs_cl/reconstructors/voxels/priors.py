@@ -11,7 +11,7 @@ import numpy as np
 from phyradgs_cl import checks
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
-from phyradgs_cl.objective import DctProx, NonlocalStep, TvProx
+from phyradgs_cl.objective import DctProx, NonlocalStep, TvProx, learned_curves
 from phyradgs_cl.objective.dct_prox import TURNS
 from phyradgs_cl.reconstructors.checkpoint import State, count_of, state_arrays
 from phyradgs_cl.reconstructors.method import imported
@@ -20,6 +20,7 @@ from phyradgs_cl.runtime import Runtime, Space
 
 # shares of the prior's weight, by the prior (docs/results/settings.md)
 _TV_ALONE, _TV_BEFORE_DCT, _DCT = 1.6, 0.8, 1.5
+_TV_BEFORE_CURVES, _CURVES_NOISE, _CURVES = 0.5, 50.0, 3.0  # noise that the curves assume, and strength of their step
 _NONLOCAL, _NONLOCAL_BEFORE_DCT = 300.0, 100.0  # of the filtering parameter h
 _NONLOCAL_STEP = 0.01  # length of a step down the nonlocal quadratic
 
@@ -41,7 +42,11 @@ class PriorInputs:
         return TvPrior(TvProx(self.rt, self.grid.shape, axis_weights(self.grid)), self.tv_iterations, share)
 
     def tv_and_dct(self) -> "TvAndDct":
-        return TvAndDct(self.tv(_TV_BEFORE_DCT), DctProx(self.rt, self.grid.shape))
+        return TvAndDct(self.tv(_TV_BEFORE_DCT), DctProx(self.rt, self.grid.shape), _DCT)
+
+    def tv_and_curves(self) -> "TvAndDct":
+        curves = learned_curves().scaled(_CURVES / _CURVES_NOISE)
+        return TvAndDct(self.tv(_TV_BEFORE_CURVES), DctProx(self.rt, self.grid.shape, curves), _CURVES_NOISE)
 
     def nonlocal_then(self, then: "Prior", h_share: float) -> "Nonlocal":
         return Nonlocal(then, NonlocalStep(self.rt, self.grid.shape), h_share, self.passes)
@@ -88,14 +93,16 @@ class TvPrior(Prior):
 
 
 class TvAndDct(Prior):
-    """Total variation, then a shrinkage of block cosine transforms, which follows best from a smooth volume."""
+    """Total variation, then a shrinkage of block cosine transforms, which follows best from a smooth volume.
 
-    def __init__(self, tv: TvPrior, shrink: DctProx) -> None:
-        self.tv, self.shrink, self.turn = tv, shrink, 0
+    unit: of the shrinkage, over the prior's weight."""
+
+    def __init__(self, tv: TvPrior, shrink: DctProx, unit: float) -> None:
+        self.tv, self.shrink, self.unit, self.turn = tv, shrink, unit, 0
 
     def __call__(self, space: Space[Any], volume: Any, weight: float, *, nonnegative: bool) -> Any:
         smooth = self.tv(space, volume, weight, nonnegative=nonnegative)
-        shrink = partial(self.shrink, unit=_DCT * weight, turn=self.turn, nonnegative=nonnegative)
+        shrink = partial(self.shrink, unit=self.unit * weight, turn=self.turn, nonnegative=nonnegative)
         self.turn = (self.turn + 1) % len(TURNS)
         return space.apply(shrink, smooth, self.tv.prox.shape)
 
@@ -197,6 +204,7 @@ class OwnPrior(Prior):
 
 
 PRIORS: dict[str, Callable[[PriorInputs], Prior]] = {
+    "curves": PriorInputs.tv_and_curves,
     "dct": PriorInputs.tv_and_dct,
     "tv": lambda inputs: inputs.tv(_TV_ALONE),
     "nonlocal": lambda inputs: inputs.nonlocal_then(inputs.tv(_TV_ALONE), _NONLOCAL),

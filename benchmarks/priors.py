@@ -1,0 +1,71 @@
+"""Priors of ``fista`` beside each other, in the default's own protocol: a line per volume, scan, seed and prior.
+
+    python benchmarks/priors.py VOLUMES docs/results/priors.jsonl --priors dct curves
+    python docs/make_results.py      # the tables
+
+Scans are those of benchmarks/tables but for ``--dose`` and ``--views``. Fly-scans of other than 25 and 50 views expose as
+large a share of a turn. ``numbers`` of a line names what the curves were trained on. Runs that are in the file are not
+made again."""
+
+import argparse
+import json
+import time
+from pathlib import Path
+
+from scans import append, files_of, read_lines
+
+from phyradgs_cl.acquisition import PerRow, Scan, Static
+from phyradgs_cl.api import compare, reconstruct, simulate
+from phyradgs_cl.runtime import Runtime
+
+MOTIONS = {"still": Static(), "fly": PerRow()}
+KEYS = ("volume", "kind", "views", "dose", "size", "seed", "prior", "numbers")
+NUMBERS = {"curves": "procedural"}  # what the curves were trained on
+ARC_DEG = 360.0  # exposed by all views of a fly-scan together
+
+
+def scan_of(rt: Runtime, path: Path, facts: dict[str, object]) -> Scan:
+    size, views, kind = int(facts["size"]), int(facts["views"]), facts["kind"]  # type: ignore[call-overload]
+    usual = {"size": size, "detector": 2 * size, "noise": "tigre", "dose": facts["dose"], "seed": facts["seed"]}
+    if kind == "still":
+        return simulate(path, protocol="static", views=views, device=rt, **usual)  # type: ignore[arg-type]
+    usual |= {"protocol": {25: "rapid", 50: "standard"}[views]} if views in (25, 50) else {
+        "protocol": "rapid", "views": views, "exposure_deg": ARC_DEG / views,
+    }
+    return simulate(path, device=rt, **usual)  # type: ignore[arg-type]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("volumes")
+    parser.add_argument("lines", type=Path)
+    parser.add_argument("--priors", nargs="+", default=["dct", "curves"])
+    parser.add_argument("--names", help="with commas; all")
+    parser.add_argument("--size", type=int, default=64)
+    parser.add_argument("--kinds", nargs="+", default=["still", "fly"], choices=list(MOTIONS))
+    parser.add_argument("--views", nargs="+", type=int, default=[25, 50])
+    parser.add_argument("--doses", nargs="+", type=float, default=[1e4])
+    parser.add_argument("--seeds", nargs="+", type=int, default=[0])
+    given = parser.parse_args()
+    rt, there = Runtime(), {tuple(line[key] for key in KEYS) for line in read_lines(given.lines)}
+    cases = [
+        {"volume": name, "kind": kind, "views": views, "dose": dose, "size": given.size, "seed": seed}
+        for seed in given.seeds for dose in given.doses for views in given.views for kind in given.kinds
+        for name in files_of(given.volumes, given.names, given.size)
+    ]  # fmt: skip
+    for case in cases:
+        rows = [{**case, "prior": prior, "numbers": NUMBERS.get(prior)} for prior in given.priors]
+        rows = [row for row in rows if tuple(row[key] for key in KEYS) not in there]
+        scan = scan_of(rt, files_of(given.volumes, None, given.size)[str(case["volume"])], case) if rows else None
+        for row in rows:
+            before_s = time.process_time()
+            motion, prior = MOTIONS[str(case["kind"])], row["prior"]
+            volume = reconstruct(scan, "fista", prior=prior, motion=motion, device=rt, report=False).volume
+            scores = compare(volume, scan.reference)
+            row |= {"psnr_db": scores["psnr_db"], "ssim": scores["ssim"], "processor_s": time.process_time() - before_s}
+            append(given.lines, row)
+            print(json.dumps(row), flush=True)
+
+
+if __name__ == "__main__":
+    main()
