@@ -147,6 +147,14 @@ def test_what_is_not_recognised_is_said(tmp_path) -> None:
             import_scan(tmp_path / case / "what")
 
 
+def test_notes_and_logs_that_are_links_or_folders_do_not_matter(tmp_path, make_truth) -> None:
+    """Files that any folder may have, and that some formats describe their scans with."""
+    path = w.write_tiff(tmp_path / "tiff", make_truth())
+    (path / "notes.txt").symlink_to(tmp_path / "nowhere")
+    (path / "run.log").mkdir()
+    assert import_scan(path).frames == 6
+
+
 def test_what_the_user_names_is_the_user_s_business(tmp_path, make_truth) -> None:
     """A link, unlike one that a file names; a description under another name; an option without use."""
     path = w.write_r2(tmp_path / "r2", make_truth())

@@ -56,7 +56,7 @@ def recognises(path: Path) -> bool:
     """True for an .xml file that has no raw projections beside it, and for a folder with one and a MetaImage."""
     folder = SafeFolder(path if path.is_dir() else path.parent)
     if not path.is_dir():
-        return path.suffix.lower() == ".xml" and not path.name.lower().endswith(_ORA) and not folder.matching(*_RAW)
+        return path.suffix.lower() == ".xml" and not path.name.lower().endswith(_ORA) and not folder.plain(*_RAW)
     descriptions = [file for file in folder.matching(".xml") if not file.name.lower().endswith(_ORA)]
     return bool(descriptions and folder.matching(*STACKS))
 

@@ -106,6 +106,11 @@ class SafeFolder:
         paths = [path for path in self._paths("[!.]*") if path.suffix.lower() in suffixes]
         return in_natural_order([self.file(path.name, str(path)) for path in paths])
 
+    def plain(self, *suffixes: str) -> list[Path]:
+        """Returns the same without links and folders, which ``matching`` refuses: of suffixes that any folder may have."""
+        paths = [path for path in self._paths("[!.]*") if path.suffix.lower() in suffixes]
+        return in_natural_order([path for path in paths if path.is_file() and not path.is_symlink()])
+
     def _paths(self, pattern: str) -> list[Path]:
         paths = list(islice(self.root.glob(pattern), _MOST_FILES + 1))
         if len(paths) > _MOST_FILES:

@@ -35,7 +35,7 @@ _MOST = 1_000_000
 
 def recognises(path: Path) -> bool:
     """True for a .log file of a SkyScan, and for a folder with one."""
-    paths = SafeFolder(path).matching(".log") if path.is_dir() else [path]
+    paths = SafeFolder(path).plain(".log") if path.is_dir() else [path]
     return any(file.suffix.lower() == ".log" and head_has(file, b"[system]", b"scanner=") for file in paths)
 
 

@@ -33,7 +33,7 @@ def recognises(path: Path) -> bool:
 
 
 def _descriptions(path: Path) -> list[Path]:
-    files = SafeFolder(path).matching(*_ENDS) if path.is_dir() else [path]
+    files = SafeFolder(path).plain(*_ENDS) if path.is_dir() else [path]
     marks = ((b"numAngles", b"numCols"), (b"proj_nangles", b"proj_ncols"))
     return [file for file in files if file.suffix.lower() in _ENDS and any(head_has(file, *both) for both in marks)]
 
