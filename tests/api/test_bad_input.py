@@ -248,7 +248,7 @@ CASES: dict[str, list[tuple[str, Callable[[], object]]]] = {
     ],
     "TimeCells": [("motion OnePose: pose", lambda: reconstruct(GOOD, "sirt", motion=OnePose()))],
     "MicroViews": [("strips", lambda: MicroViews(2.5))],
-    "Centres": [("strips", lambda: Centres(0)), ("--motion", lambda: reconstruct(GOOD, "sirt", motion=Centres()))],
+    "Centres": [("strips", lambda: Centres(0)), ("motion", lambda: reconstruct(GOOD, "sirt", motion=Centres()))],
     "OwnTimes": [("sub_intervals", lambda: OwnTimes(0))],
     "PerRow": [("sub_intervals", lambda: PerRow(0))],
     "StaticStart": [("strips", lambda: reconstruct(GOOD, "fdk", motion="static-start", strips=3))],
