@@ -14,8 +14,16 @@ from phyradgs_cl import checks
 from phyradgs_cl.acquisition import Motion, Scan
 from phyradgs_cl.acquisition.motion import motion_from_facts
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.fields import Grid
-from phyradgs_cl.io import Volume, file_kind, read_scan, read_volume, scan_summary, sha256_of
+from phyradgs_cl.fields import Deformation, Grid
+from phyradgs_cl.io import (
+    Volume,
+    file_kind,
+    read_deformation,
+    read_scan,
+    read_volume,
+    scan_summary,
+    sha256_of,
+)
 from phyradgs_cl.metrics import METRICS, aligned, compare
 from phyradgs_cl.prepare import flat_correction
 from phyradgs_cl.prepare.step import Facts
@@ -152,8 +160,27 @@ def computed_views(run: Run, rt: Runtime, count: int) -> list[FramePair]:
     """Returns ``count`` frames of the scan after the run's preprocessing, with those computed from its volume."""
     if run.scan is None or count < 1:
         return []
-    scan = prepared(run.scan, run.preprocessing, rt)
-    return frame_pairs(rt, scan, run.stored.values, run.stored.required_grid, spread_frames(scan.frames, count))
+    provenance = run.stored.provenance
+    deformation = _deformation_of(run.path, provenance)
+    if deformation is None and "object_motion" in provenance:
+        found = plain_text(str(provenance["object_motion"]))
+        log.warning("no computed projections: the motion of the object %s was not found, or has changed since", found)
+        return []
+    scan, volume = prepared(run.scan, run.preprocessing, rt), run.stored
+    chosen = spread_frames(scan.frames, count)
+    return frame_pairs(rt, scan, volume.values, volume.required_grid, chosen, deformation)
+
+
+def _deformation_of(path: Path, provenance: Mapping[str, object]) -> Deformation | None:
+    """Returns how the object moved, from the file that the provenance names, if it has the stored hash."""
+    name, sha256 = provenance.get("object_motion"), provenance.get("object_motion_sha256")
+    if not isinstance(name, str) or not name:
+        return None
+    for place in (Path(name), path.parent / name, path.parent / Path(name).name):
+        with suppress(InputError, OSError):
+            if sha256_of(place) == sha256:
+                return read_deformation(place)
+    return None
 
 
 @dataclass(frozen=True, eq=False)

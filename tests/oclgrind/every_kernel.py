@@ -33,7 +33,7 @@ from phyradgs_cl.acquisition import (
 )
 from phyradgs_cl.acquisition.cells import common_time_cells, exact_cells, micro_view_cells, static_cells
 from phyradgs_cl.acquisition.time_cells import TimeCells
-from phyradgs_cl.fields import Grid
+from phyradgs_cl.fields import Deformation, Grid
 from phyradgs_cl.operators import (
     DensityOperator,
     DeviceCells,
@@ -44,7 +44,7 @@ from phyradgs_cl.operators import (
     backproject,
     voxelise,
 )
-from phyradgs_cl.reconstructors import METHODS, plan_run, reconstruct
+from phyradgs_cl.reconstructors import METHODS, ObjectMotion, plan_run, reconstruct
 from phyradgs_cl.runtime import DeviceArray, Runtime
 from phyradgs_cl.runtime.opencl import cl, kernel_source
 from phyradgs_cl.simulation import SimulationOptions, VolumeSource, simulate
@@ -183,6 +183,15 @@ def method(rt: Runtime, name: str, motion: str, **more: object) -> None:
     reconstruct(scan, plan_run(name, {**changes, **more}), rt)
 
 
+def moving(rt: Runtime, name: str, motion: str) -> None:
+    """A method on a scan of an object that moves: every frame between two states."""
+    control_mm = 0.1 * np.random.default_rng(0).normal(size=(2, 5, 5, 5, 3))
+    times_s = np.array([0.0, 14.0])
+    one = Deformation(control_mm, (-1.2,) * 3, 0.6, times_s, np.array([[1.0, 0.0], [0.0, 1.0]]))
+    changes: dict[str, object] = {"motion": motion, **({} if name == "fdk" else {"iterations": 1, "sub_intervals": 2})}
+    reconstruct(tiny_scan(rt, "log", GEOMETRY), plan_run(name, changes, object_motion=ObjectMotion(one)), rt)
+
+
 def cases() -> dict[str, Callable[[Runtime], None]]:
     found: dict[str, Callable[[Runtime], None]] = {"nothing": nothing, "operators": operators}
     found |= {f"upright {beam}": partial(upright, beam=beam) for beam in ("cone", "parallel")}
@@ -192,6 +201,8 @@ def cases() -> dict[str, Callable[[Runtime], None]]:
     for name in [name for name in METHODS if name not in NEURAL]:
         for motion in ("static", "exact" if name in (*SPLATTING, "fused") else "per-row"):
             found[f"{name} {motion}"] = partial(method, name=name, motion=motion)
+    for name, motion in (("fdk", "static"), ("fdk", "per-row"), ("sirt", "per-row")):
+        found[f"moving {name} {motion}"] = partial(moving, name=name, motion=motion)
     few: dict[str, object] = {"iterations": 3, "subvoxels": 1}  # weights after the first
     found["fista nonlocal"] = partial(method, name="fista", motion="static", prior="nonlocal", **few)
     return found

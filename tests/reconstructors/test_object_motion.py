@@ -20,7 +20,9 @@ from phyradgs_cl.reconstructors import (
     plan_run,
     reconstruct,
 )
+from phyradgs_cl.reconstructors.frames.projected import frame_pairs, spread_frames
 from phyradgs_cl.reconstructors.result import HELD_OUT, Progress
+from phyradgs_cl.report.run import computed_views, load_run
 from phyradgs_cl.runtime import Runtime
 
 GRID, SHAPE, FRAMES = Grid.cube(16, 2.0), (24, 24), 30
@@ -147,7 +149,7 @@ def test_a_field_that_does_not_fit_is_refused(rt, scan, change, found) -> None:
         reconstruct(scan, plan, rt)
 
 
-def test_the_command(cli, refused, scan, tmp_path) -> None:
+def test_the_command(rt, cli, refused, scan, tmp_path) -> None:
     """The file is part of the provenance; estimates count its memory."""
     scan_file, field, output = (tmp_path / name for name in ("scan.h5", "field.h5", "volume.h5"))
     write_scan(scan_file, scan)
@@ -155,6 +157,12 @@ def test_the_command(cli, refused, scan, tmp_path) -> None:
     run = ["reconstruct", scan_file, "-o", output, "--iterations", "2", "--method", "sirt", "--object-motion", field]
     assert cli.run([str(word) for word in run]) == 0
     assert read_volume(output).provenance["object_motion"] == str(field)
+    assert [pair.rms for pair in computed_views(load_run(output), rt, 2)] == [
+        pair.rms for pair in frame_pairs(rt, scan, read_volume(output).values, GRID, spread_frames(FRAMES, 2), breathing())
+    ]
+    field.rename(tmp_path / "lost.h5")
+    assert computed_views(load_run(output), rt, 2) == []
+    (tmp_path / "lost.h5").rename(field)
     refused([*run[:-3], "phyradgs", *run[-2:]], "--object-motion", "--method phyradgs", "fista")
     refused([*run[:-1], scan_file], "/entry/deformation")
     refused([*run, "--rows", "0:8"], "--rows")
