@@ -5,7 +5,7 @@
 
 own test: the scan is imported from RTK's geometry file and stack; a field file says how the inner sphere moves, and the
 command line reconstructs. Mean absolute error and PSNR (range 2) against the spheres in the middle. RTK's limits are 0.05
-and 22 dB.
+and 22 dB. Also PSNR within 20 mm of the middle, because FDK's error elsewhere hides the motion.
 same field: a smooth random displacement at both ends of the cycle, for both programs. Largest difference of the volumes over
 their peak, and processor seconds of the best of three runs, of FDK as a whole."""
 
@@ -33,6 +33,7 @@ from phyradgs_cl.runtime import Runtime
 
 FRAMES, VOXEL_MM = 128, 2.0  # as in rtk_moving_peer.py
 GRID = Grid((32, 64, 64), (VOXEL_MM,) * 3)  # z, y, x are RTK's Y, X, Z
+NEAR_MM = 20.0  # of the middle, where the inner sphere moves
 PHASE = np.abs((4 + np.arange(FRAMES)) % 8 - 4) / 4  # 0 where the sphere is at -8 mm, 1 at 8 mm
 
 
@@ -50,7 +51,9 @@ def figures(volume: np.ndarray) -> dict[str, float]:
     spheres = [Ellipsoid((0.0, 0.0, 0.0), (r, r, r), mu) for r, mu in ((60.0, 2.0), (8.0, -1.0))]
     z, y, x = np.meshgrid(*GRID.axes_mm(), indexing="ij")
     error = volume - EllipsoidPhantom(tuple(spheres), "spheres").density(x, y, z)
-    return {"mean_error": float(np.abs(error).mean()), "psnr_db": float(10 * np.log10(4 / np.mean(error**2)))}
+    near = x**2 + y**2 + z**2 < NEAR_MM**2
+    psnr_db, near_db = (float(10 * np.log10(4 / np.mean(part**2))) for part in (error, error[near]))
+    return {"mean_error": float(np.abs(error).mean()), "psnr_db": psnr_db, "near_psnr_db": near_db}
 
 
 def imported(folder: Path) -> Scan:
@@ -87,7 +90,8 @@ def same_field(rt: Runtime, python: str, folder: Path) -> dict[str, object]:
     """Both take the displacement of a view as a blend of those at both ends of the cycle."""
     coarse = np.random.default_rng(0).normal(scale=4.0, size=(2, 5, 5, 5, 3))
     push_mm = np.stack([zoom(end, [n / 5 for n in GRID.shape] + [1], order=3) for end in coarse])  # z, y, x; x, y, z
-    theirs, their_seconds = run_peer(python, folder, push_mm.transpose(0, 3, 1, 2, 4)[..., [1, 2, 0]], VOXEL_MM, 3)
+    wide_mm = np.pad(push_mm, ((0, 0), *[(4, 4)] * 3, (0, 0)), mode="edge")  # RTK's displacements are 0 from the outermost on
+    theirs, their_seconds = run_peer(python, folder, wide_mm.transpose(0, 3, 1, 2, 4)[..., [1, 2, 0]], VOXEL_MM, 3)
     scan = imported(folder)
     at_rest = Deformation(np.zeros((1, 4, 4, 4, 3)), (0.0,) * 3, 8.0, np.zeros(1), np.zeros((1, 1)))
     moving = MovingBackprojector(rt, MotionStates.of_times(at_rest, GRID, np.zeros(1)), np.stack([1 - PHASE, PHASE], -1))
@@ -100,9 +104,8 @@ def same_field(rt: Runtime, python: str, folder: Path) -> dict[str, object]:
         ours = fdk_volume(rt, scan.projections, pose, GRID, moving=moving)
         seconds.append(time.process_time() - started)
     off = np.abs(ours - theirs)
-    inner = tuple(slice(2, -2) for _ in range(3))  # RTK's displacements end at the centres of its outermost voxels
     return {
-        "case": "same field", "largest_difference": float(off[inner].max() / np.abs(theirs).max()),
+        "case": "same field", "largest_difference": float(off.max() / np.abs(theirs).max()),
         "mean_difference": float(off.mean() / np.abs(theirs).max()), "seconds": min(seconds), "rtk_seconds": their_seconds,
         "device": rt.device.name,
     }

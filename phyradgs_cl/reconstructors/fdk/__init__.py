@@ -256,12 +256,13 @@ def ramp_filter(rows: np.ndarray, spacing_mm: float, window: str = "ram-lak") ->
     return filtered[..., :width].astype(np.float32, copy=False)
 
 
-def static_fdk(rt: Runtime, scan: Scan) -> np.ndarray:
+def static_fdk(rt: Runtime, scan: Scan, deformation: Deformation | None = None) -> np.ndarray:
     """Returns FDK, or FBP of a parallel beam, (z, y, x) in 1/mm at the mid-window poses: a start or a reference of other
-    methods."""
+    methods. deformation: how the object moves."""
     frames, numbers = _measured_frames(scan)
     pose = np.concatenate([Static().cells(scan, f).pose for f in numbers])
-    return fdk_volume(rt, frames, pose, scan.grid, is_parallel=scan.is_parallel)
+    moving = None if deformation is None else _moving(rt, scan, Static(), numbers, deformation)
+    return fdk_volume(rt, frames, pose, scan.grid, is_parallel=scan.is_parallel, moving=moving)
 
 
 def _measured_frames(scan: Scan) -> tuple[np.ndarray, np.ndarray]:

@@ -79,7 +79,7 @@ def _started(system: System, options: AsdPocsOptions, inputs: MethodInputs) -> A
     if options.prior_share > 0 and inputs.initial is None:
         found, remedy = f"{options.prior_share:g} without a prior image", "say --initial, or leave prior_share out"
         raise InputError("prior_share", found, "a volume to start from", remedy)
-    start = system.space.array(static_fdk(inputs.rt, inputs.scan))
+    start = system.space.array(static_fdk(inputs.rt, inputs.scan, inputs.deformation))
     epsilon = options.residual_share * system.space.norm(system.residual(start))
     descend = TvDescent(inputs.rt, inputs.scan.grid.shape, inputs.initial, options.prior_share)
     return AsdPocs(system, options, inputs.seed, descend, epsilon)
