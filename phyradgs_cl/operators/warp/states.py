@@ -8,7 +8,7 @@ import numpy as np
 
 from phyradgs_cl.fields import Deformation, Grid
 
-MOST_STATES = 20
+MOST_STATES = 12
 _SPACING = 0.6  # voxels, RMS where the object moves, between a time and its nearest state
 _MOVES = 0.1  # of the largest squared displacement: voxels that move as much count in that RMS
 
