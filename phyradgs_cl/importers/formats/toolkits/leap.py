@@ -53,13 +53,11 @@ def import_scan(path: Path, options: ImportOptions) -> Scan:
         raise InputError(str(folder.root), "no .npy and no TIFF", "the line integrals")
     frames = read_npy(folder.only("stack", ".npy"), 3) if arrays else read_tiffs(images)
     if frames.shape != (count, rows, columns):
-        expected = f"{(count, rows, columns)}, as {description.name} says"
-        raise InputError(str((arrays or images)[0]), f"frames {frames.shape}", expected)
+        raise InputError(str((arrays or images)[0]), f"frames {frames.shape}", f"{(count, rows, columns)} of {description.name}")
     timing = assemble.make_timing(str(description), count, options)
-    beam = scan.word("geometry", _BEAMS)
-    trajectory, geometry = (_modular if beam == "modular" else _turning)(scan, (count, rows, columns), options, timing)
-    turned = oriented(frames, options, "bottom")
-    integrals = line_integrals(str(folder.root), turned, options, convention="attenuation")
+    read = _modular if scan.word("geometry", _BEAMS) == "modular" else _turning
+    trajectory, geometry = read(scan, (count, rows, columns), options, timing)
+    integrals = line_integrals(str(folder.root), oriented(frames, options, "bottom"), options, convention="attenuation")
     parts = integrals, trajectory, geometry, timing, options
     return assemble.assemble_scan(*parts, title=description.stem, source=str(path), grid=_grid(scan))
 
@@ -117,6 +115,6 @@ def _grid(scan: Fields) -> Grid | None:
     """Returns LEAP's volume where the file states one."""
     if not all(map(scan.has, ("numX", "numY", "numZ", "voxelWidth", "voxelHeight"))):
         return None
-    width_mm, height_mm = scan.length("voxelWidth"), scan.length("voxelHeight")
+    sizes_mm = triple(scan.length(name) for name in ("voxelHeight", "voxelWidth", "voxelWidth"))
     counts = triple(scan.count(f"num{axis}", _MOST) for axis in "ZYX")
-    return Grid(counts, (height_mm, width_mm, width_mm), triple(scan.position(f"offset{axis}") for axis in "ZYX"))
+    return Grid(counts, sizes_mm, triple(scan.position(f"offset{axis}") for axis in "ZYX"))
