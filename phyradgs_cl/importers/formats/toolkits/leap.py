@@ -47,16 +47,16 @@ def import_scan(path: Path, options: ImportOptions) -> Scan:
     description = descriptions[0]
     stored = read_settings(description, [*OLD_NAMES, *OLD_NAMES.values()])
     scan = Fields(stored.subject, {new: stored.values.get(new, stored.values.get(old)) for new, old in OLD_NAMES.items()})
-    count, rows, columns = (scan.count(name, _MOST) for name in ("numAngles", "numRows", "numCols"))
+    shape = triple(scan.count(name, _MOST) for name in ("numAngles", "numRows", "numCols"))
     arrays, images = folder.matching(".npy"), folder.matching(*SUFFIXES)
     if not arrays and not images:
         raise InputError(str(folder.root), "no .npy and no TIFF", "the line integrals")
     frames = read_npy(folder.only("stack", ".npy"), 3) if arrays else read_tiffs(images)
-    if frames.shape != (count, rows, columns):
-        raise InputError(str((arrays or images)[0]), f"frames {frames.shape}", f"{(count, rows, columns)} of {description.name}")
-    timing = assemble.make_timing(str(description), count, options)
+    if frames.shape != shape:
+        raise InputError(str((arrays or images)[0]), f"frames {frames.shape}", f"{shape} of {description.name}")
+    timing = assemble.make_timing(str(description), shape[0], options)
     read = _modular if scan.word("geometry", _BEAMS) == "modular" else _turning
-    trajectory, geometry = read(scan, (count, rows, columns), options, timing)
+    trajectory, geometry = read(scan, shape, options, timing)
     integrals = line_integrals(str(folder.root), oriented(frames, options, "bottom"), options, convention="attenuation")
     parts = integrals, trajectory, geometry, timing, options
     return assemble.assemble_scan(*parts, title=description.stem, source=str(path), grid=_grid(scan))
