@@ -4,8 +4,8 @@ import logging
 import os
 import re
 import sys
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
@@ -108,14 +108,24 @@ class MemoryLedger:
         self.limit_bytes = reported_bytes(device) if limit_bytes is None else limit_bytes
         self.held_bytes = 0
         self.peak_bytes = 0
+        self.reserved_bytes = 0
 
     def count(self, nbytes: int) -> None:
         self.held_bytes += nbytes
         self.peak_bytes = max(self.peak_bytes, self.held_bytes)
 
+    @contextmanager
+    def reserved(self, nbytes: int) -> Iterator[None]:
+        """Plans made in the body leave this many bytes for later."""
+        self.reserved_bytes += nbytes
+        try:
+            yield
+        finally:
+            self.reserved_bytes -= nbytes
+
     def room(self, largest_bytes: int) -> Room:
         """Returns nine tenths of the rest of the limit, in buffers of at most ``largest_bytes``."""
-        free_bytes = max(self.limit_bytes - self.held_bytes, 0)
+        free_bytes = max(self.limit_bytes - self.held_bytes - self.reserved_bytes, 0)
         return Room(int(_PLANNED * free_bytes), min(largest_bytes, self.limit_bytes))
 
     def check(self, nbytes: int, largest_bytes: int) -> None:

@@ -5,8 +5,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from numpy.lib.stride_tricks import sliding_window_view
+from tolerances import RAYS
 
-from phyradgs_cl.acquisition import Motion, PerRow, Scan, Static
+from phyradgs_cl.acquisition import (
+    CircularOrbit,
+    ConstantSpeed,
+    Motion,
+    ParallelGeometry,
+    PerRow,
+    Scan,
+    Shutter,
+    Static,
+)
 from phyradgs_cl.api import simulate
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
@@ -20,7 +30,7 @@ from phyradgs_cl.reconstructors import (
     plan_run,
     reconstruct,
 )
-from phyradgs_cl.reconstructors.voxels.fista import Fista, FistaOptions
+from phyradgs_cl.reconstructors.voxels.fista import Fista, FistaOptions, fista
 from phyradgs_cl.reconstructors.voxels.prior_weight import (
     FrameError,
     PriorWeight,
@@ -29,6 +39,7 @@ from phyradgs_cl.reconstructors.voxels.prior_weight import (
 )
 from phyradgs_cl.reconstructors.voxels.priors import OwnPrior, Prior, PriorInputs, prior_of
 from phyradgs_cl.reconstructors.voxels.system import System
+from phyradgs_cl.runtime import Runtime
 
 
 @pytest.fixture(scope="module")
@@ -229,3 +240,16 @@ def test_a_prior_is_found_by_its_name(rt, scan, tmp_path, monkeypatch) -> None:
         run(rt, scan, "fista", prior="own_priors:nobody", iterations=2)
     with pytest.raises(InputError, match="--prior own_priors:<lambda>: found shape"):
         run(rt, scan, "fista", prior="own_priors:less", iterations=2)
+
+
+@pytest.mark.parametrize("volumes", [14.4, 12.8, 11.5])
+def test_operators_leave_the_device_s_memory_to_the_prior(volumes) -> None:
+    """13 volumes are a slab of 1024² × 40 voxels in 2 GiB: the prior's arrays, with bricks beside them."""
+    panel, grid = ParallelGeometry((40, 64), 1.0), Grid((40, 64, 64), (1.0, 1.0, 1.0))
+    frames = np.random.default_rng(0).uniform(0, 1, (16, *panel.detector_shape)).astype(np.float32)
+    orbit = CircularOrbit(panel, ConstantSpeed(0.0, np.pi / 16))
+    scan = Scan(frames, panel, orbit, Shutter(0.0), np.arange(16.0), grid, False)
+    options, limit = FistaOptions(iterations=1, subvoxels=1), int(volumes * 4 * 40 * 64 * 64)
+    small, large = Runtime(memory=limit), Runtime()
+    result, expected = (fista(scan, options, rt).volume for rt in (small, large))
+    assert np.abs(result - expected).max() <= RAYS * expected.max() and small.peak_bytes <= limit

@@ -43,10 +43,23 @@ class RayMemory:
     def plan(self, share: float = 1.0) -> list[Brick]:
         """Returns the bricks. A share below 1 plans again, with that share of the free memory."""
         if not self._bricks or share < 1:
-            self._volume = self._frames = self._columns = self._slots = None
-            self._padded.clear()
+            self.release()
             self._bricks, self._batch = self._planned(share)
         return self._bricks
+
+    @property
+    def planned_bytes(self) -> int:
+        """The bytes of all buffers, allocated or not; 0 before there is a plan."""
+        if not self._bricks:
+            return 0
+        floats = self.layout.of(self._bricks[0]).volume_floats + self._frames_floats(self._batch) + self._slots_floats
+        return 4 * floats + self._columns_bytes
+
+    def release(self) -> None:
+        """Frees the buffers. The next use plans them for the memory that is then free."""
+        self._volume = self._frames = self._columns = self._slots = None
+        self._padded.clear()
+        self._bricks = []
 
     def _planned(self, share: float) -> tuple[list[Brick], int]:
         layout, room = self.layout, self.rt.room()

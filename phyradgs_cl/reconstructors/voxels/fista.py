@@ -28,8 +28,10 @@ from phyradgs_cl.reconstructors.voxels.stages import Stage, merge_subvoxels, rep
 from phyradgs_cl.reconstructors.voxels.subsets import OrderedSubsets
 from phyradgs_cl.reconstructors.voxels.system import System
 from phyradgs_cl.runtime import Runtime
+from phyradgs_cl.runtime.algebra import HostSpace
 
 _VOLUMES, _FRAMES = 16, 3  # in memory at one time, with the prior `dct`
+_HELD, _COPIES = 9, 2  # volumes that a prior holds on the device, and more while it maps a volume of the host
 _SUBVOXEL_PASSES = 3 / 7  # share of the passes on smaller voxels (docs/results/settings.md)
 _MOST_DIVIDED = 90**3  # voxels of a grid: smaller voxels are worth their time at 64³, not at 128³
 
@@ -179,10 +181,14 @@ def _run(inputs: MethodInputs, options: FistaOptions, image: np.ndarray | None, 
     image, initial = repeated(image, parts), repeated(inputs.initial, parts)
 
     def make(system: System) -> Fista:
+        volume_bytes = 4 * math.prod(scan.grid.shape)
+        is_on_host = isinstance(system.space, HostSpace)
+        is_short = is_on_host and system.leave_room(rt, (_HELD + _COPIES) * volume_bytes)
         of_grid = rt, scan.grid, options.tv_iterations, options.iterations
         prior = priors.prior_of(options.prior, priors.PriorInputs(*of_grid, image, options.prior_share))
-        weight = PriorWeight(system, frame_error(scan, options.motion), options.prior_weight)
-        return Fista(system, options, prior, weight)
+        with rt.ledger.reserved(_COPIES * volume_bytes if is_short else 0):
+            weight = PriorWeight(system, frame_error(scan, options.motion), options.prior_weight)
+            return Fista(system, options, prior, weight)
 
     stage_inputs = replace(inputs, scan=scan, options=options, initial=initial)
     volumes = _VOLUMES + priors.volumes_of(options.prior)

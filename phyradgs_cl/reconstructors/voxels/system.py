@@ -95,6 +95,17 @@ class System:
         valid, transmission = (None if a is None else space.array(a) for a in (self.valid, self.transmission))
         return replace(self, measured=space.array(self.measured), valid=valid, transmission=transmission, space=space)
 
+    def leave_room(self, rt: Runtime, nbytes: int) -> bool:
+        """Frees the buffers of the ray operators if they leave less than ``nbytes`` of the device, and returns whether they
+        did. They plan again when they are next used."""
+        operators = [o for o in (self.operator, self.intensity) if isinstance(o, RayOperator | IntensityOperator)]
+        planned_bytes = sum(operator.memory.planned_bytes for operator in operators)
+        if rt.ledger.limit_bytes - max(planned_bytes, rt.ledger.held_bytes) >= nbytes:
+            return False
+        for operator in operators:
+            operator.memory.release()
+        return True
+
     @property
     def frames(self) -> int:
         return int(self.measured.shape[0])
