@@ -462,6 +462,16 @@ def moving_rtk() -> str:
     return f"{table}\nOn the same field: {off}; {faster} of processor time.\n"
 
 
+def parallel_memory() -> str:
+    """The memory of parallel scans within a limit."""
+    rows = [
+        [f"`{one['method']}`", f"{one['columns']} × {one['rows']} × {one['views']}", one["limit"]]
+        + [f"{one[key] / 2**30:.2f} GiB" for key in ("buffer_bytes", "host_bytes")] + [str(one["processor_s"])]
+        for one in lines_of("parallel_memory.jsonl")
+    ]
+    return markdown(["method", "columns × rows × views", "limit", "buffers", "resident", "processor, s"], rows)
+
+
 TABLES: dict[str, Callable[[], str]] = {
     "table1_S_rapid": lambda: quality("table1_S.csv", "rapid", with_seconds=True),
     "table1_S_standard": lambda: quality("table1_S.csv", "standard"),
@@ -489,6 +499,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "fbp_peers": fbp_peers,
     "parallel_fly": parallel_fly,
     "fan_fly": fan_fly,
+    "parallel_memory": parallel_memory,
     "moving_rtk": moving_rtk,
 }
 
