@@ -9,8 +9,8 @@ from kernel_kit import CPU_ONLY, note_launches
 from tolerances import LAUNCH_SHAPE
 
 from phyradgs_cl.acquisition import ConeGeometry, Protocol, Scan
-from phyradgs_cl.fields import Grid
-from phyradgs_cl.reconstructors import plan_run, reconstruct
+from phyradgs_cl.fields import Deformation, Grid
+from phyradgs_cl.reconstructors import ObjectMotion, RunPlan, plan_run, reconstruct
 from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.simulation import SimulationOptions, VolumeSource, simulate
 
@@ -31,7 +31,20 @@ RUNS = [
     ("fista-tv", {"iterations": 2, "motion": "static"}),
     ("fista-tv", {"iterations": 1, "motion": "per-row"}), ("fista", {"iterations": 1, "motion": "per-row"}),
     ("fista", {"iterations": 4, "motion": "static", "prior": "nonlocal+dct"}),
+    ("sirt", {"iterations": 2, "motion": "per-row", "moving": True}),
+    ("fdk", {"motion": "static", "moving": True}), ("fdk", {"motion": "per-row", "moving": True}),
 ]
+# An object that moves between two states during the scan.
+FIELD = Deformation(
+    0.1 * np.random.default_rng(0).normal(size=(2, 6, 6, 6, 3)), (-1.5,) * 3, 0.6, np.array([0.0, 16.0]), np.eye(2)
+)
+
+
+def plan(name: str, changes: dict[str, object]) -> RunPlan:
+    method = {key: value for key, value in changes.items() if key != "moving"}
+    return plan_run(name, method, object_motion=ObjectMotion(FIELD) if "moving" in changes else None)
+
+
 @pytest.fixture(scope="module")
 def gpu_shaped(scan) -> tuple[list[np.ndarray], set[str]]:
     """The volumes of ``RUNS``, and the kernels that made them."""
@@ -40,7 +53,7 @@ def gpu_shaped(scan) -> tuple[list[np.ndarray], set[str]]:
         launched = note_launches(patch)
         assert rt.best_rates().flops_per_s > 0  # launches multiply_add by itself
         volumes = [
-            reconstruct(scan, plan_run(name, changes), rt).volume for name, changes in RUNS
+            reconstruct(scan, plan(name, changes), rt).volume for name, changes in RUNS
         ]
     return volumes, set(launched)
 
@@ -56,7 +69,7 @@ def scan(rt) -> Scan:
 
 def test_methods(rt, gpu_shaped, scan) -> None:
     for (name, changes), found in zip(RUNS, gpu_shaped[0], strict=True):
-        expected = reconstruct(scan, plan_run(name, changes), rt).volume
+        expected = reconstruct(scan, plan(name, changes), rt).volume
         error = np.linalg.norm(found - expected) / np.linalg.norm(expected)
         assert error <= LAUNCH_SHAPE, (name, changes["motion"])
 
