@@ -35,7 +35,8 @@ class LivePage:
 
     A thread writes the page every ``every_s`` seconds, so that an older page is that of a run that was killed. Pictures are
     taken between two iterations, as long as their time is below ``SHARE`` of the run's. An error, or Ctrl-C, leaves its
-    reason on the page. A page that cannot be written is a warning, once, and no error."""
+    reason on the page. A file that was there before is replaced from the first iteration on: a run that is refused leaves it
+    alone. A page that cannot be written is a warning, once, and no error."""
 
     def __init__(self, path: Path, title: str, settings: Mapping[str, object], every_s: float = EVERY_S) -> None:
         self.path, self.every_s = path, every_s
@@ -43,19 +44,28 @@ class LivePage:
         self.spent_s = 0.0
         """Seconds that the run has waited for pictures."""
         self._pictured_s = -every_s
+        self._waits = False  # for the first iteration
         self._started_s = time.monotonic()
         self._is_over = threading.Event()
         self._writer = threading.Thread(target=self._keep_writing, name="live page", daemon=True)
         self._warnings: set[str] = set()
 
     def __enter__(self) -> "LivePage":
+        self._waits = self.path.exists()
+        if not self._waits:
+            self._begin()
+        return self
+
+    def _begin(self) -> None:
+        self._waits = False
         self._write()
         self._writer.start()
-        return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
         if error is None:
             self.end("The run is complete.", is_complete=True)
+        elif self._waits:
+            return
         self.end(f"Stopped by an error: {error}" if isinstance(error, Exception) else "Interrupted.")
 
     def stage(self, text: str) -> None:
@@ -64,6 +74,8 @@ class LivePage:
 
     def __call__(self, progress: Progress) -> None:
         self.status = self.status.after(progress, time.time())
+        if self._waits:
+            self._begin()
         used_s = time.monotonic() - self._started_s
         if progress.volume is None or used_s - self._pictured_s < self.every_s or self.spent_s > SHARE * used_s:
             return

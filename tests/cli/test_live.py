@@ -30,6 +30,14 @@ def test_an_error_of_the_run_stands_on_its_page(cli, scan, tmp_path) -> None:
     assert "Stopped by an error: --resume" in page.read_text(encoding="utf-8")
 
 
+def test_a_run_that_is_refused_leaves_an_earlier_page_alone(refused, scan, tmp_path) -> None:
+    page, output = tmp_path / "run.html", tmp_path / "v.h5"
+    page.write_text("an earlier report", encoding="utf-8")
+    refused(["reconstruct", scan, "-o", output, "--method", "fdk", "--resume", "--live", page], "--resume")
+    refused(["reconstruct", scan, "-o", output, "--size", "100000", "--live", page], "100000")
+    assert page.read_text(encoding="utf-8") == "an earlier report"
+
+
 def test_an_interrupted_run_says_how_to_go_on(cli, scan, tmp_path, monkeypatch) -> None:
     def press(ticker: Ticker, done: int, total: int, *more: object) -> None:
         if done == 2:
