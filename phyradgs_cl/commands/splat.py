@@ -42,5 +42,6 @@ def splat_command(
         say(json.dumps(facts, default=float))
         return
     words = ", ".join(f"{title} {value}" for title, value in printed(facts))
-    cloud = f"{facts['gaussians']} Gaussians, voxels / parameters {facts['compression']:.3g}"
+    asked = f" of {gaussians}, as many as there are places" if gaussians > int(str(facts["gaussians"])) else ""
+    cloud = f"{facts['gaussians']} Gaussians{asked}, voxels / parameters {facts['compression']:.3g}"
     say(f"{output}: {cloud}, {words}, {facts['seconds']:.1f} s")

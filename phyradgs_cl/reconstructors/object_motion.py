@@ -1,5 +1,6 @@
 """An object that moves during the scan, as an input of a run: the deformation, and whether it fits the scan."""
 
+import logging
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
@@ -12,7 +13,8 @@ from phyradgs_cl.fields import Deformation, Grid, triple
 _SUBJECT = "--object-motion"
 _MOST_VOXELS = 24  # along a side of the grid on which a deformation is looked at
 _LEAST_DETERMINANT = 0.05
-_LEAST_COVERED = 0.5  # of the scan, by the times of a deformation
+_LEAST_COVERED, _MOSTLY_COVERED = 0.5, 0.98  # of the scan, by the times of a deformation: below the first it is refused
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,9 +54,11 @@ def _check_times(deformation: Deformation, scan: Scan) -> None:
         return
     first_s, last_s = float(scan.frame_start_s.min()), float(scan.frame_start_s.max() + scan.shutter.span_s)
     covered_s = min(times_s[-1], last_s) - max(times_s[0], first_s)
+    found = f"times from {times_s[0]:.4g} to {times_s[-1]:.4g} s for a scan from {first_s:.4g} to {last_s:.4g} s"
     if covered_s < _LEAST_COVERED * (last_s - first_s):
-        found = f"times from {times_s[0]:.4g} to {times_s[-1]:.4g} s for a scan from {first_s:.4g} to {last_s:.4g} s"
         raise InputError(_SUBJECT, found, "times that cover the scan", "check their unit and where they begin")
+    if covered_s < _MOSTLY_COVERED * (last_s - first_s):
+        log.warning("%s: found %s; before and after its times the object rests", _SUBJECT, found)
 
 
 def _coarse(grid: Grid) -> Grid:

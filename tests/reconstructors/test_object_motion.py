@@ -21,6 +21,7 @@ from phyradgs_cl.reconstructors import (
     reconstruct,
 )
 from phyradgs_cl.reconstructors.frames.projected import frame_pairs, spread_frames
+from phyradgs_cl.reconstructors.object_motion import check_object_motion
 from phyradgs_cl.reconstructors.result import HELD_OUT, Progress
 from phyradgs_cl.report.run import computed_views, load_run
 from phyradgs_cl.runtime import Runtime
@@ -147,6 +148,14 @@ def test_a_field_that_does_not_fit_is_refused(rt, scan, change, found) -> None:
     plan = replace(plan_of("sirt", iterations=1), object_motion=ObjectMotion(change(breathing())))
     with pytest.raises(InputError, match=f"--object-motion.*{found}"):
         reconstruct(scan, plan, rt)
+
+
+@pytest.mark.parametrize(("share", "is_warned"), [(0.7, True), (1.0, False)])
+def test_a_field_of_a_part_of_the_scan_is_a_warning(scan, caplog, share, is_warned) -> None:
+    one = breathing()
+    end_s = one.times_s[0] + share * (scan.frame_start_s.max() + scan.shutter.span_s - one.times_s[0])
+    check_object_motion(replace(one, times_s=np.linspace(one.times_s[0], end_s, len(one.times_s))), scan)
+    assert ("the object rests" in caplog.text) == is_warned
 
 
 def test_the_command(rt, cli, refused, scan, tmp_path) -> None:
