@@ -70,11 +70,14 @@ def _in_unit(values: np.ndarray, mu_water_per_mm: float | None) -> tuple[np.ndar
 
 def state_times_s(deformation: Deformation, count: int, during_s: tuple[float, float] | None = None) -> list[float]:
     """Returns the middles (count,) in s of equal parts of a time, by default that of the deformation. InputError: a count
-    that is not from 1 to 1000, a time that ends before it begins."""
+    that is not from 1 to 1000, a time that ends before it begins, or lies beside the deformation's."""
     checks.whole("--states", count, 1, 1000)
     first_s, last_s = during_s or (deformation.times_s[0], deformation.times_s[-1])
     if during_s is not None and not first_s < last_s:
         raise InputError("--during", f"{first_s:g},{last_s:g}", "a start before the stop")
+    begin_s, end_s = float(deformation.times_s[0]), float(deformation.times_s[-1])
+    if begin_s < end_s and (last_s <= begin_s or first_s >= end_s):
+        raise InputError("--during", f"{first_s:g},{last_s:g} s", f"a part of the deformation's {begin_s:g} to {end_s:g} s")
     middles_s: list[float] = (first_s + (np.arange(count) + 0.5) / count * (last_s - first_s)).tolist()
     return middles_s
 
@@ -90,6 +93,10 @@ def export_states(
         raise InputError("--states", f"with --to {to}", "a format of voxels", "use nii, mha, nrrd, tiff, npy or dicom")
     target, volume = _checked_target(Path(path), to, output, mu_water_per_mm, labels), read_volume(path)
     grid = volume.required_grid
+    moves = any(deformation.on_grid_mm(grid, unit).any() for unit in np.eye(deformation.rank))
+    if deformation.control_mm.any() and not moves:
+        found = "a deformation that moves nothing in the volume's grid"
+        raise InputError("--object-motion", found, "one of this volume", "check origin and unit of its control points")
     states = [
         replace(volume, values=deformed(volume.values, grid, deformation, weights))
         for weights in deformation.weights_at(times_s)

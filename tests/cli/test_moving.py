@@ -1,6 +1,7 @@
 """A moving object from its simulation to its states: evaluate, export and info with a deformation."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -70,11 +71,13 @@ def test_other_formats_get_a_file_for_each_state(cli, folder) -> None:
 
 @pytest.mark.parametrize(("options", "subject"), [
     ("--states 4", "--states"), ("--during 1,2", "--during"), ("--object-motion field.h5 --states 0", "--states"),
-    ("--object-motion field.h5 --during 2,1", "--during"), ("--object-motion field.h5 --to ply", "--states"),
+    ("--object-motion field.h5 --during 2,1", "--during"), ("--object-motion field.h5 --during 100,200", "--during"),
+    ("--object-motion far.h5", "moves nothing"), ("--object-motion field.h5 --to ply", "--states"),
     ("--object-motion volume.h5", "volume.h5:/"),
 ])  # fmt: skip
 def test_wrong_wishes_are_one_line(cli, capsys, folder, monkeypatch, options, subject) -> None:
     monkeypatch.chdir(folder)
+    write_deformation("far.h5", replace(read_deformation("field.h5"), origin_mm=(100.0, 0.0, 0.0)))
     to = "" if "--to" in options else " --to npy"
     assert cli.run(f"export volume.h5 {options}{to}".split()) == 2
     error = capsys.readouterr().err
