@@ -227,6 +227,11 @@ def stored_beam(
     return cone(options, to_axis_mm, to_detector_mm, panel, pitch_mm, offset_mm)
 
 
+def names_in_file(options: ImportOptions, names: Mapping[str, str]) -> dict[str, str]:
+    """Returns the file's names of those values that no option replaces, for messages."""
+    return {field: name for field, name in names.items() if getattr(options, field, None) is None}
+
+
 def with_options(options: ImportOptions, geometry: Geometry) -> Geometry:
     """Returns a geometry with the options' lengths where they are given. InputError for distances of a parallel beam."""
     if isinstance(geometry, ParallelGeometry):
@@ -246,15 +251,17 @@ def parallel(
 
 def cone(
     options: ImportOptions, to_axis_mm: float, to_detector_mm: float, panel: tuple[int, int],
-    pitch_mm: tuple[float, ...], offset_mm: tuple[float, float],
+    pitch_mm: tuple[float, ...], offset_mm: tuple[float, float], names: Mapping[str, str] | None = None,
 ) -> Geometry:
-    """Returns a geometry of a file's numbers, or the options' where they are given. InputError unless the panel stands
-    behind the axis."""
+    """Returns a geometry of a file's numbers, or the options' where they are given. ``names``: what the file calls them, see
+    ``names_in_file``. InputError unless the panel stands behind the axis."""
     to_axis_mm = options.source_to_axis_mm or to_axis_mm
     to_detector_mm = options.source_to_detector_mm or to_detector_mm
     if to_detector_mm <= to_axis_mm:
-        expected = f"more than {options.named('source_to_axis_mm')} ({to_axis_mm:g})"
-        subject = options.named("source_to_detector_mm")
-        raise InputError(subject, f"{to_detector_mm:g}", expected, "are the two exchanged?")
+        axis, detector = ((names or {}).get(name) or options.named(name) for name in _DISTANCES)
+        remedy = "are the two exchanged?"
+        if names and not names.keys().isdisjoint(_DISTANCES):
+            remedy += f" Correct the file, or say {' and '.join(map(options.named, _DISTANCES))}"
+        raise InputError(detector, f"{to_detector_mm:g}", f"more than {axis} ({to_axis_mm:g})", remedy)
     dv, du = options.pixel_size_mm or pitch_mm
     return ConeGeometry(to_axis_mm, to_detector_mm, panel, (dv, du), options.detector_offset_mm or offset_mm)

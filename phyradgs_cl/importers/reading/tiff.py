@@ -4,7 +4,7 @@ import logging
 import math
 import re
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -58,21 +58,25 @@ def read_tiffs(paths: list[Path]) -> np.ndarray:
 
 
 def read_series(
-    folder: SafeFolder, prefix: str, shape: tuple[int | None, ...], subject: str, pattern: str = r"\d+"
+    folder: SafeFolder, prefix: str, shape: tuple[int | None, ...], subject: str | Sequence[str], pattern: str = r"\d+"
 ) -> np.ndarray:
     """Reads the TIFFs of a folder whose names are ``prefix`` and a number: frames (F, v, u) of ``shape``, in the numbers'
-    order; None is any size. ``pattern``: a number in the names; ``subject`` names the description that states the shape."""
+    order; None is any size. ``pattern``: a number in the names; ``subject`` names what states the shape, or each of its
+    three sizes."""
+    subjects = [subject] * 3 if isinstance(subject, str) else subject
     name = re.compile(re.escape(prefix) + pattern, re.I)
     paths = [path for path in folder.matching(*SUFFIXES) if name.fullmatch(path.stem)]
     if not paths or shape[0] not in (None, len(paths)):
         found = f"{len(paths)} files {prefix[:60]}*.tif in {folder.root}"
         expected = f"{shape[0]}, one for every projection" if shape[0] else "at least one"
-        raise InputError(subject, found, expected, "copy the missing files")
+        raise InputError(subjects[0], found, expected, "copy the missing files")
     check_numbering(paths, "copy the missing files")
     sizes = stack_shape(paths)
-    if any(stated not in (None, size) for size, stated in zip(sizes, shape, strict=True)):
+    sides = zip(subjects, sizes, shape, strict=True)
+    if wrong := [name for name, size, stated in sides if stated not in (None, size)]:
         found = f"{sizes[0]} images of {sizes[1]} × {sizes[2]} pixels"
-        raise InputError(str(paths[0]), found, " × ".join(str(n or "any") for n in shape), f"see {subject}")
+        expected = " × ".join(str(n or "any") for n in shape)
+        raise InputError(str(paths[0]), found, expected, f"see {', '.join(dict.fromkeys(wrong))}")
     return read_tiffs(paths)
 
 

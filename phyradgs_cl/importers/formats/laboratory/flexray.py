@@ -10,11 +10,11 @@ from pathlib import Path
 import numpy as np
 
 from phyradgs_cl.acquisition import Scan
-from phyradgs_cl.importers.assemble import StoredTiming, assemble_scan, cone, make_timing
+from phyradgs_cl.importers.assemble import StoredTiming, assemble_scan, cone, make_timing, names_in_file
 from phyradgs_cl.importers.options import OF_BARE_FRAMES, ImportOptions
 from phyradgs_cl.importers.reading.files import SafeFolder
 from phyradgs_cl.importers.reading.frames import gantry_sign, line_integrals, oriented
-from phyradgs_cl.importers.reading.settings import head_has, read_settings, say_missing
+from phyradgs_cl.importers.reading.settings import differing, head_has, read_settings, say_missing
 from phyradgs_cl.importers.reading.tiff import read_series
 from phyradgs_cl.importers.stage import RotaryStage
 from phyradgs_cl.io.tables import Fields
@@ -47,9 +47,14 @@ def import_scan(path: Path, options: ImportOptions) -> Scan:
         oriented(read_series(folder, prefix, (None, *panel), str(folder.root / f"{prefix}*.tif")), options, "top")
         for prefix in ("io", "di")
     )
-    stage = _stage(scan, panel, options)
+    names = names_in_file(options, {
+        "source_to_axis_mm": scan.name("SOD"), "source_to_detector_mm": scan.name("SDD"),
+        "pixel_size_mm": scan.name("Binned pixel size" if scan.has("Binned pixel size") else "Voxel size"),
+        "angles": scan.name("Last angle"), "exposure_s": scan.name("Exposure time (ms)"),
+    })  # fmt: skip
+    stage = _stage(scan, panel, options, names)
     between = np.linspace(scan.number("Start angle", 0.0), scan.number("Last angle"), len(frames))
-    angle_rad = gantry_sign(options, "gantry") * np.deg2rad(between)
+    angle_rad = gantry_sign(options, "gantry") * differing(scan, "Last angle", between)
     exposure_s = scan.length("Exposure time (ms)") / 1000 if scan.has("Exposure time (ms)") else None
     if exposure_s is not None:
         exposure_s *= scan.length("Number of averages") if scan.has("Number of averages") else 1
@@ -59,10 +64,10 @@ def import_scan(path: Path, options: ImportOptions) -> Scan:
     subject = str(description)
     integrals = line_integrals(subject, turned, options, flats=flats, darks=darks, convention="counts")
     title = folder.root.resolve().name
-    return assemble_scan(integrals, trajectory, geometry, timing, options, title=title, source=str(path))
+    return assemble_scan(integrals, trajectory, geometry, timing, options, title=title, source=str(path), names=names)
 
 
-def _stage(scan: Fields, panel: tuple[int, int], options: ImportOptions) -> RotaryStage:
+def _stage(scan: Fields, panel: tuple[int, int], options: ImportOptions, names: dict[str, str]) -> RotaryStage:
     """Returns the stage of the settings, in a frame whose origin is as high as the source."""
     to_axis_mm, to_detector_mm = scan.length("SOD"), scan.length("SDD")
     if scan.has("Binned pixel size"):
@@ -73,11 +78,12 @@ def _stage(scan: Fields, panel: tuple[int, int], options: ImportOptions) -> Rota
     right_mm, up_mm = _window_mm(scan)
     off_v = place_mm["ver_det"] + up_mm - place_mm["ver_tube"]
     off_u = place_mm["tra_det"] + right_mm - place_mm["tra_tube"]
-    say_missing(scan, {**dict.fromkeys(_PLACES, "0"), "Start angle": "0", "ROI (LTRB)": "the whole panel"})
+    assumed = {"Start angle": "0", "ROI (LTRB)": "the whole panel", "Exposure time (ms)": "none", "Number of averages": "1"}
+    say_missing(scan, {**dict.fromkeys(_PLACES, "0"), **assumed})
     if options.detector_offset_mm is None:
         text = "%s places are as stated, without a correction profile of flexdata: say %s, or calibrate"
         _log.warning(text, scan.subject, options.named("detector_offset_mm"))
-    geometry = cone(options, to_axis_mm, to_detector_mm, panel, (pitch_mm, pitch_mm), (off_v, off_u))
+    geometry = cone(options, to_axis_mm, to_detector_mm, panel, (pitch_mm, pitch_mm), (off_v, off_u), names)
     return RotaryStage(geometry, place_mm["tra_obj"] - place_mm["tra_tube"])
 
 

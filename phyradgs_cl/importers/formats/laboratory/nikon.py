@@ -14,11 +14,11 @@ import numpy as np
 
 from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.acquisition.geometry import ConeGeometry
-from phyradgs_cl.importers.assemble import assemble_scan, cone, make_timing
+from phyradgs_cl.importers.assemble import assemble_scan, cone, make_timing, names_in_file
 from phyradgs_cl.importers.options import OF_BARE_FRAMES, ImportOptions
 from phyradgs_cl.importers.reading.files import SafeFolder, checked_name
 from phyradgs_cl.importers.reading.frames import gantry_sign, line_integrals, oriented
-from phyradgs_cl.importers.reading.settings import read_settings, say_missing
+from phyradgs_cl.importers.reading.settings import differing, read_settings, say_missing, white_level
 from phyradgs_cl.importers.reading.tiff import read_series
 from phyradgs_cl.importers.stage import RotaryStage
 from phyradgs_cl.io.tables import Fields
@@ -28,7 +28,7 @@ _ENDS = ("CentreOfRotationTop", "CentreOfRotationBottom")
 _NAMES = (
     *("Name", "InputSeparator", "InputFolderName", "Projections", "WhiteLevel", "SrcToObject", "SrcToDetector"),
     *("DetectorPixelsX", "DetectorPixelsY", "DetectorPixelSizeX", "DetectorPixelSizeY", "DetectorOffsetX"),
-    *("DetectorOffsetY", "InitialAngle", "AngularStep", "ObjectOffsetX", "ObjectRoll", "ObjectTilt", *_ENDS),
+    *("DetectorOffsetY", "InitialAngle", "AngularStep", "ObjectOffsetX", "ObjectRoll", "ObjectTilt", "Units", *_ENDS),
 )
 _MOST_FRAMES = 1_000_000
 
@@ -44,21 +44,28 @@ def import_scan(path: Path, options: ImportOptions) -> Scan:
     folder = SafeFolder(path if path.is_dir() else path.parent)
     description = path if path.is_file() else folder.only("description of the scan", ".xtekct")
     scan = read_settings(description, _NAMES)
-    count = scan.count("Projections", _MOST_FRAMES)
-    panel = tuple(scan.count(f"DetectorPixels{axis}", _MOST_FRAMES) for axis in "YX")
+    if (unit := scan.word("Units", default="mm")).lower() != "mm":
+        raise scan.error("Units", repr(unit[:40]), "mm", "convert the lengths to mm")
+    sizes = ("Projections", "DetectorPixelsY", "DetectorPixelsX")
+    count, *panel = (scan.count(name, _MOST_FRAMES) for name in sizes)
     prefix = scan.word("Name", default="") + scan.word("InputSeparator", default="_")
-    frames = read_series(_folder_of_frames(folder, scan), prefix, (count, *panel), scan.name("Projections"))
-    stage = _stage(scan, (panel[0], panel[1]), options)
+    frames = read_series(_folder_of_frames(folder, scan), prefix, (count, *panel), [*map(scan.name, sizes)])
+    names = names_in_file(options, {
+        "source_to_axis_mm": scan.name("SrcToObject"), "source_to_detector_mm": scan.name("SrcToDetector"),
+        "pixel_size_mm": f"{scan.name('DetectorPixelSizeX')}, DetectorPixelSizeY", "angles": scan.name("AngularStep"),
+    })  # fmt: skip
+    stage = _stage(scan, (panel[0], panel[1]), options, names)
     first_deg, step_deg = scan.number("InitialAngle", 0.0), scan.number("AngularStep")
-    angle_rad = gantry_sign(options, "gantry") * np.deg2rad(first_deg + step_deg * np.arange(count))
+    angle_rad = gantry_sign(options, "gantry") * differing(scan, "AngularStep", first_deg + step_deg * np.arange(count))
     timing = make_timing(str(description), count, options)
     trajectory, geometry = stage.turned(angle_rad, timing, str(description))
-    say_missing(scan, {"InitialAngle": "0"})
-    combined = replace(options, flat_value=options.flat_value or scan.length("WhiteLevel"))
+    say_missing(scan, {"InitialAngle": "0", "ObjectTilt": "0", "Units": "mm"})
+    remedy = f"correct it, or say {options.named('flat_value')}"
+    combined = replace(options, flat_value=options.flat_value or white_level(scan, "WhiteLevel", frames, remedy))
     turned = oriented(frames, options, "top", "right")
     integrals = line_integrals(str(description), turned, combined, convention="counts", is_corrected=True)
     title = description.stem
-    return assemble_scan(integrals, trajectory, geometry, timing, options, title=title, source=str(path))
+    return assemble_scan(integrals, trajectory, geometry, timing, options, title=title, source=str(path), names=names)
 
 
 def _folder_of_frames(folder: SafeFolder, scan: Fields) -> SafeFolder:
@@ -72,11 +79,11 @@ def _folder_of_frames(folder: SafeFolder, scan: Fields) -> SafeFolder:
     return SafeFolder(inner)
 
 
-def _stage(scan: Fields, panel: tuple[int, int], options: ImportOptions) -> RotaryStage:
+def _stage(scan: Fields, panel: tuple[int, int], options: ImportOptions, names: dict[str, str]) -> RotaryStage:
     """Returns the stage of the description; options replace its lengths."""
     pitch_mm = (scan.length("DetectorPixelSizeY"), scan.length("DetectorPixelSizeX"))
     to_axis_mm, to_detector_mm = scan.length("SrcToObject"), scan.length("SrcToDetector")
-    geometry = cone(options, to_axis_mm, to_detector_mm, panel, pitch_mm, (0.0, 0.0))
+    geometry = cone(options, to_axis_mm, to_detector_mm, panel, pitch_mm, (0.0, 0.0), names)
     for name in ("DetectorOffsetX", "DetectorOffsetY"):
         if scan.position(name) and options.detector_offset_mm is None:
             text = "%s is %g and not used, for its sign is not documented; say %s if the panel was moved"
@@ -90,6 +97,11 @@ def _stage(scan: Fields, panel: tuple[int, int], options: ImportOptions) -> Rota
         if not any(map(scan.has, _ENDS)):
             remedy = f"the axis in the middle: {options.named('detector_offset_mm')}, or calibrate"
             say_missing(scan, {"ObjectOffsetX": remedy})
+    half_mm = panel[1] / 2 * geometry.pixel_size_mm[1]
+    if abs(offset_mm * geometry.magnification + geometry.detector_offset_mm[1]) > half_mm:
+        name = "ObjectOffsetX" if scan.has("ObjectOffsetX") else _ENDS[0]
+        found = f"{offset_mm:g} mm, {abs(offset_mm * geometry.magnification):.4g} mm from the middle of the panel"
+        raise scan.error(name, found, f"an axis that the panel of {2 * half_mm:.4g} mm sees")
     height_mm = panel[0] * pitch_mm[0]
     roll_rad = math.radians(scan.number("ObjectRoll", lowest=-45, highest=45)) if scan.has("ObjectRoll") else (
         -math.atan2(top_mm - bottom_mm, height_mm)

@@ -11,11 +11,18 @@ from pathlib import Path
 import numpy as np
 
 from phyradgs_cl.acquisition import Scan
-from phyradgs_cl.importers.assemble import StoredTiming, assemble_scan, cone, make_timing, parallel
+from phyradgs_cl.importers.assemble import (
+    StoredTiming,
+    assemble_scan,
+    cone,
+    make_timing,
+    names_in_file,
+    parallel,
+)
 from phyradgs_cl.importers.options import OF_BARE_FRAMES, ImportOptions
 from phyradgs_cl.importers.reading.frames import gantry_sign, line_integrals, oriented
 from phyradgs_cl.importers.reading.ole import open_ole, read_images, read_stream
-from phyradgs_cl.importers.reading.settings import say_missing
+from phyradgs_cl.importers.reading.settings import differing, say_missing
 from phyradgs_cl.importers.stage import RotaryStage
 from phyradgs_cl.io.tables import Fields
 
@@ -50,15 +57,23 @@ def import_scan(path: Path, options: ImportOptions) -> Scan:
         frames, white = read_images(ole, path, names, _type(scan, f"{_INFO}/DataType"), (rows, columns)), None
         if ole.exists(_REFERENCE):
             white = read_images(ole, path, [_REFERENCE], _type(scan, "ReferenceData/DataType", 10), (rows, columns))
-    angle_rad = gantry_sign(options, "sample") * np.deg2rad(_numbers(scan, f"{_INFO}/Angles", count))
+    angles = f"{_INFO}/Angles"
+    angle_rad = gantry_sign(options, "sample") * differing(scan, angles, _numbers(scan, angles, count))
+    in_file = names_in_file(options, {
+        "source_to_axis_mm": scan.name(f"{_INFO}/StoRADistance"), "angles": scan.name(angles),
+        "source_to_detector_mm": scan.name(f"{_INFO}/DtoRADistance"), "exposure_s": scan.name(f"{_INFO}/ExpTimes"),
+        "pixel_size_mm": scan.name(f"{_INFO}/PixelSize"),
+    })  # fmt: skip
     exposure_s = _first(scan, f"{_INFO}/ExpTimes") if scan.has(f"{_INFO}/ExpTimes") else None
+    if exposure_s is not None and exposure_s < 0:
+        raise scan.error(f"{_INFO}/ExpTimes", f"{exposure_s:g}", "a time of at least 0 s")
     timing = make_timing(str(path), count, options, StoredTiming(exposure_s=exposure_s or None))
     trajectory, geometry = _stage(scan, (count, rows, columns), options).turned(angle_rad, timing, str(path))
     flats = None if white is None else oriented(white, options, "bottom")
     turned = oriented(frames, options, "bottom")
     integrals = line_integrals(str(path), turned, options, flats=flats, convention="counts", is_corrected=True)
     parts = integrals, trajectory, geometry, timing, options
-    return assemble_scan(*parts, title=path.stem, source=str(path))
+    return assemble_scan(*parts, title=path.stem, source=str(path), names=in_file)
 
 
 def _type(scan: Fields, name: str, default: float | None = None) -> str:
@@ -76,7 +91,8 @@ def _stage(scan: Fields, shape: tuple[int, int, int], options: ImportOptions) ->
     pixel_mm = _first(scan, f"{_INFO}/PixelSize") / 1000
     if not 0 < pixel_mm < 1e3:
         raise scan.error(f"{_INFO}/PixelSize", f"{1000 * pixel_mm:g}", "a size above 0 µm")
-    say_missing(scan, {"Alignment/X-Shifts": "0", "Alignment/Y-Shifts": "0", f"{_INFO}/XrayGeometry": "a cone"})
+    say_missing(scan, {"Alignment/X-Shifts": "0", "Alignment/Y-Shifts": "0", f"{_INFO}/XrayGeometry": "a cone",
+                       f"{_INFO}/ExpTimes": "none"})  # fmt: skip
     if scan.has("ReconSettings/CenterShift") and (shift := _first(scan, "ReconSettings/CenterShift")):
         text = "%s is %g pixels and not used, for its sign is not documented: check --fix-offset or calibrate find the axis"
         _log.warning(text, scan.name("ReconSettings/CenterShift"), shift)
