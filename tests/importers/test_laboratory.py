@@ -251,6 +251,10 @@ def test_skyscan_s_random_movement_and_missing_lines_are_said(tmp_path, make_tru
     import_scan(lab.write_skyscan(tmp_path / "scan", make_truth(geometry=WRITERS["skyscan"][1]), **lines))
     assert "Random Movement is ON (10): the log states no shifts" in caplog.text
     assert "no Exposure (ms) (none), no Frame Averaging (OFF)" in caplog.text
+    caplog.clear()
+    lines = {"Random Movement": "OFF (30)", "Frame Averaging": "OFF (4)"}
+    import_scan(lab.write_skyscan(tmp_path / "off", make_truth(geometry=WRITERS["skyscan"][1]), **lines))
+    assert "Random Movement" not in caplog.text and "Frame Averaging" not in caplog.text
 
 
 @pytest.mark.parametrize(("form", "line", "value", "texts"), [

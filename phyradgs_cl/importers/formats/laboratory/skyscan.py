@@ -44,6 +44,7 @@ _NAMES = (
     *("Reference Intensity", "Image Rotation", "Flat Field Correction", "Type of Detector Motion", "Type of Motion"),
     "Random Movement",
 )
+_OFF = re.compile(r"OFF( *\(.*\))?", re.I)  # the log keeps the number that would hold if it were on
 _SENSES = {"CC": 1, "CCW": 1, "CW": -1, "C": -1}
 _ASSUMED = {
     "Rotation Direction": "CC", "Optical Axis (line)": "the middle", "Scanning Start Angle": "0",
@@ -86,7 +87,7 @@ def import_scan(path: Path, options: ImportOptions) -> Scan:
     timing = make_timing(str(description), count, options, _timing(scan, options))
     say_missing(scan, _ASSUMED)
     movement = str(scan.values.get("Random Movement", "OFF"))
-    if movement.upper() != "OFF":
+    if not _OFF.fullmatch(movement):
         text = "%s is %s: the log states no shifts, so none are used; details blur where the scanner has not undone them"
         _log.warning(text, scan.name("Random Movement"), movement[:40])
     if roll_deg := scan.number("Image Rotation", 0.0):
@@ -116,8 +117,8 @@ def _timing(scan: Fields, options: ImportOptions) -> StoredTiming:
     """Returns the exposure of all averaged frames; none for a scanner that stopped for each and options without a rate."""
     motion = next((scan.word(name) for name in ("Type of Detector Motion", "Type of Motion") if scan.has(name)), "")
     averaging = str(scan.values.get("Frame Averaging", "OFF"))
-    averaged = re.fullmatch(r"ON ?\(([1-9]\d{0,5})\)", averaging, re.I)
-    if not averaged and averaging.upper() != "OFF":
+    averaged = re.fullmatch(r"ON *\(([1-9]\d{0,5})\)", averaging, re.I)
+    if not averaged and not _OFF.fullmatch(averaging):
         raise scan.error("Frame Averaging", repr(averaging[:40]), "OFF, or ON and a count of frames, as ON (4)")
     exposure_s = scan.length("Exposure (ms)") / 1000 if scan.has("Exposure (ms)") else None
     if exposure_s is None or ("STEP" in motion.upper() and options.frame_time_s is None):
