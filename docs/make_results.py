@@ -15,7 +15,7 @@ from typing import Any
 
 RESULTS = Path(__file__).resolve().parent / "results"
 BLOCK = re.compile(r"(<!-- table: (\S+) -->\n).*?(<!-- end of table -->)", re.S)
-CENTRES = "PhyRadGS, centres only (as GS-on-the-Move)"
+CENTRES = "PhyRadGS centres only (as GS-on-the-Move)"
 METHODS = (
     # label of the page, row with the motion ignored, row with the motion known, row of the still scan
     ("FDK", "FDK", "FDK per-row", "FDK"),

@@ -83,7 +83,7 @@ def _micro_views(label: str, method: str, strips: int, sub_intervals: int, still
     return Row(label, method, "micro-views", strips, sub_intervals, still)
 
 
-_CENTRES = Row("PhyRadGS, centres only (as GS-on-the-Move)", "phyradgs", "centres", 8, 5, "PhyRadGS w/o ST")
+_CENTRES = Row("PhyRadGS centres only (as GS-on-the-Move)", "phyradgs", "centres", 8, 5, "PhyRadGS w/o ST")
 _ITERATIVE = {name.upper(): name for name in ("sart", "os-sart", "sirt", "cgls", "asd-pocs", "fista-tv")}
 _FDK = (Row("FDK", "fdk"), Row("FDK per-row", "fdk", "per-row", still="FDK"))
 _NEURAL = (
