@@ -55,7 +55,7 @@ def main() -> None:
         print(f"{method:8s}  {motion:7s}  {metrics['psnr_db']:9.2f}  {metrics['ssim']:6.4f}  {used_s:17.1f}")
     print(f"{'all, with the simulation':35s}  {total_s:17.1f}")
     picture = given.folder / "demo.png"
-    truth = load_reference(scan).values
+    truth = load_reference(scan)[0].values
     ignored, known = (rows[list(RUNS).index(name)][2].values for name in ("static", "moving"))
     draw(truth, {"motion ignored": ignored, "motion known": known}, picture)
     print(f"picture: {picture}")

@@ -228,7 +228,7 @@ def api_figures() -> None:
 def motion_figure() -> None:
     """One slice of `make demo`; a line sweeps over it, and behind the line the motion is known."""
     folder = Path(os.environ.get("DEMO", IMAGES.parents[1] / "demo"))
-    truth = load_reference(folder / "scan.h5").values
+    truth = load_reference(folder / "scan.h5")[0].values
     ignored, known = (read_volume(folder / name).values for name in ("static.h5", "moving.h5"))
     part = round(0.28 * len(truth)), slice(round(0.28 * truth.shape[1]), None), slice(round(0.3 * truth.shape[2]), -18)
     names = f"motion ignored: {psnr(ignored, truth):.1f} dB", f"motion known: {psnr(known, truth):.1f} dB"

@@ -229,7 +229,7 @@ def run(commands: str, folder: Path) -> float:
 
 def draw(result: Result, folder: Path, path: Path) -> None:
     """Draws one slice of the truth and of every volume, on the grey scale of the truth."""
-    truth = load_reference(folder / result.scan).values
+    truth = load_reference(folder / result.scan)[0].values
     y0, y1, x0, x1 = result.detail
     shape = truth.shape
     part = (

@@ -10,7 +10,6 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
-import tables.__main__ as tables_command
 
 from phyradgs_cl.cluster import Workers
 from phyradgs_cl.errors import InputError
@@ -182,10 +181,6 @@ def test_the_command_needs_no_dask_for_one_run_after_the_other(cli, job, no_dask
     refused(["sweep", grid.with_name("none.toml"), "-o", job.folder])
     grid.write_text(TEXT.replace("iterations", "iteration"))
     refused(command)
-    bench = ["table1", "--rows", "FDK", "--size", "XS", "--scheduler", "local"]
-    assert tables_command.run([*bench, "-o", str(job.folder / "bench")]) == 2
-    error = capfd.readouterr().err
-    assert error.count("\n") == 1 and install in error
 
 
 def test_failed_runs_show_in_the_status(cli, job, no_dask, monkeypatch, capsys) -> None:

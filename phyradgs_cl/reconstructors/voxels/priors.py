@@ -204,8 +204,8 @@ class OwnPrior(Prior):
 
 
 PRIORS: dict[str, Callable[[PriorInputs], Prior]] = {
-    "curves": PriorInputs.tv_and_curves,
     "dct": PriorInputs.tv_and_dct,
+    "curves": PriorInputs.tv_and_curves,
     "tv": lambda inputs: inputs.tv(_TV_ALONE),
     "nonlocal": lambda inputs: inputs.nonlocal_then(inputs.tv(_TV_ALONE), _NONLOCAL),
     "nonlocal+dct": lambda inputs: inputs.nonlocal_then(inputs.tv_and_dct(), _NONLOCAL_BEFORE_DCT),
