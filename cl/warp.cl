@@ -1,10 +1,10 @@
 /* A volume seen through a displacement, (W v)(y) = v(y + w(y)), trilinear and zero outside the volume, and its exact
    transpose. The displacement of a state is w = sum of shares[r] * fields[r], in voxels. Twin: operators/twins/warp.py.
-     warp_forward       a work-item takes LANES voxels along x
-     warp_adjoint_rows  CPUs: a work-item owns some slices of the result, to which it adds every voxel that reaches them
-     warp_adjoint_fixed GPUs: a work-item adds its voxel to eight integers, whose sums do not depend on their order
-     warp_adjoint_sum   adds such integers to the result
-     add_frames         adds the frames of a state to some of a stack
+     warp_forward       a work-item takes LANES voxels along x.
+     warp_adjoint_rows  CPUs: a work-item owns some slices of the result, to which it adds every voxel that reaches them.
+     warp_adjoint_fixed GPUs: a work-item adds its voxel to eight integers, whose sums do not depend on their order.
+     warp_adjoint_sum   adds such integers to the result.
+     add_frames         adds the frames of a state to some of a stack.
    Near voxels move together. So LANES voxels meet a few more samples than one voxel does, and each sample is a vector of the
    volume with a hat-shaped weight. Voxels that part more than MOST_SAMPLES allows are taken one by one. */
 #include "common/lanes.h"

@@ -145,8 +145,9 @@ def napari_reader(path: str | list[str]) -> Callable[[str | list[str]], list[Lay
 
 
 def napari_layer(path: Path) -> Layer:
-    """Returns (values, arguments of add_image, "image") of a volume (z, y, x) in mm, or of a scan (projection, v, u), whose
-    rows and columns are in mm from the central ray; row 0 is the lowest."""
+    """Returns (values, arguments of add_image, "image") of a volume (z, y, x) in mm, or of a scan (projection, v, u).
+
+    Rows and columns of a scan are in mm from the central ray; row 0 is the lowest."""
     if file_kind(path) == "volume":
         stored = read_volume(path)
         return stored.values, _look_of_volume(stored, path.stem), "image"
