@@ -31,9 +31,12 @@ def run_splat_fit(
     without a scale. Raises InputError for volumes without a scale, and for outputs of another kind."""
     refuse_overwriting("-o", output, path)
     to = None if foreign_suffix(output) is None else format_of(output, "-o")
+    expected = "a name that ends in .h5, .ply or .npz"
     if to is not None and to not in CLOUDS:
-        found, expected = f"output {output}, which has no place for Gaussians", "a name that ends in .h5, .ply or .npz"
-        raise InputError("-o", found, expected, f"write cloud.h5, then 'phyradgs export cloud.h5 --to {to}'")
+        remedy = f"write cloud.h5, then 'phyradgs export cloud.h5 --to {to}'"
+        raise InputError("-o", f"output {output}, which has no place for Gaussians", expected, remedy)
+    if to is None and output.suffix.lower() not in (".h5", ".hdf5"):
+        raise InputError("-o", f"output {output}", expected)
     check_writable(output)
     with hashing(path) as hash_of, expecting(path, "volume", "plain-volume"):
         volume = load_attenuation(path)
