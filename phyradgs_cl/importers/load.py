@@ -1,6 +1,6 @@
 """Scans and objects of other programs: a module per format of scans, volumes by their suffix, beads and wires in TOML."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from importlib import import_module
 from pathlib import Path
 from types import ModuleType
@@ -14,7 +14,7 @@ from phyradgs_cl.fields import Grid, triple
 from phyradgs_cl.importers.options import ImportOptions
 from phyradgs_cl.importers.reading import tiff
 from phyradgs_cl.importers.reading.files import SafeFolder, read_json, read_npy
-from phyradgs_cl.importers.reading.images import read_image_volume
+from phyradgs_cl.importers.reading.images import image_times_s, read_image_volume
 from phyradgs_cl.io.tables import Fields, read_toml, refuse_unknown
 from phyradgs_cl.io.volume import Volume, check_attenuation, finite_float32, read_volume, shares_of_maximum
 from phyradgs_cl.phantoms import Cylinder, Ellipsoid, EllipsoidPhantom
@@ -106,6 +106,15 @@ def load_volume(path: str | Path) -> Volume:
     InputError: a damaged file, oblique axes, Hounsfield units, NaN or infinity."""
     reader = _reader(path)
     return reader[1](Path(path)) if reader else read_volume(path)
+
+
+def load_states(path: str | Path) -> Iterator[tuple[float, Volume]]:
+    """Yields (time in s, volume) for each of the volumes of a NIfTI, NRRD or MetaImage file with four axes, else nothing.
+    InputError: as of ``load_volume``."""
+    reader = _reader(path)
+    if reader is not None and reader[1] is read_image_volume:
+        for state, time_s in enumerate(image_times_s(Path(path))):
+            yield time_s, read_image_volume(Path(path), state)
 
 
 def load_attenuation(path: str | Path, *, warn: bool = True) -> Volume:

@@ -120,8 +120,12 @@ def read_state(path: str | Path) -> dict[str, np.ndarray] | None:
 
 def check_attenuation(subject: str, volume: Volume, *, warn: bool = True) -> Volume:
     """Returns ``volume`` if rays can be sent through it. InputError about ``subject`` where the negative values outweigh
-    the positive ones, as in Hounsfield units; a warning where they are more than a tenth."""
+    the positive ones, as in Hounsfield units, and for values that no file of ours may hold; a warning where the negative
+    values are more than a tenth."""
     values = volume.values
+    if (size := float(np.abs(values).max())) > h5.ATTENUATION.largest:
+        expected = f"attenuation of at most {h5.ATTENUATION.largest:g} 1/mm"
+        raise InputError(subject, f"a value of size {size:.3g}", expected, "correct the value or its unit")
     positive = float(np.sum(values, where=values > 0, dtype=np.float64))
     negative = float(-np.sum(values, where=values < 0, dtype=np.float64))
     found = f"values from {values.min():g} to {values.max():g}"

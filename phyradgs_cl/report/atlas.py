@@ -25,7 +25,7 @@ _HELP = (
 def space(volume: NDArray[np.floating], grid: Grid, window: Window, gaussians: Gaussians | None) -> Markup | None:
     """Returns a picture in 3D of a volume (nz, ny, nx), its controls and the data of the script; None for fewer than two
     voxels along a side. ``window`` is that of the slices of the result; lengths of ``gaussians`` are in mm."""
-    if min(volume.shape) < 2:
+    if not has_depth(volume):
         return None
     cloud = None if gaussians is None or not gaussians.count else gaussians
     centres = None if cloud is None else _centres(cloud, grid)
@@ -46,6 +46,11 @@ def space(volume: NDArray[np.floating], grid: Grid, window: Window, gaussians: G
         element("p", element("output", id="space-reading"), class_="note"),
         element("p", _HELP, class_="note help", id="space-help"), json_block("volume-data", data),
     )
+
+
+def has_depth(volume: NDArray[np.floating]) -> bool:
+    """Whether every side has at least two voxels, so that there is something to show in 3D."""
+    return min(volume.shape) >= 2
 
 
 def _stage() -> Markup:

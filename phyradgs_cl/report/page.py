@@ -33,13 +33,16 @@ def write_report(
     """Writes the page ``output`` of a volume file, completely or not at all, and returns the run. scan: None is the file
     that the volume's provenance names, if it is unchanged. views: the number of frames that are computed from the volume, on
     the device of ``make_runtime``; without frames no device is needed. Raises InputError for files that cannot be read or
-    are of another kind, and for an output that is one of them; OutputError where the page cannot be written; DeviceError
-    where no device can project."""
+    are of another kind, and for an output that is one of them or no page; OutputError where the page cannot be written;
+    DeviceError where no device can project."""
     check_writable(output)
     run = load_run(volume, scan)
     for path in (volume, run.scan_path):
         if path is not None and Path(output).resolve() == path.resolve():
             raise InputError("-o", f"the input file {path} itself", "another file to write")
+    if Path(output).suffix.lower() not in ("", ".html", ".htm"):
+        found, remedy = f"the suffix {Path(output).suffix}", "a browser prints the page to a PDF"
+        raise InputError("-o", found, "an HTML page, as NAME.html", remedy)
     shown = computed_views(run, make_runtime(), views) if run.scan is not None and views > 0 else []
     changes = step_changes(run, make_runtime()) if shown else []
     page = report_page(run, shown, changes)
@@ -60,9 +63,9 @@ def report_page(run: Run, views: Sequence[FramePair] = (), changes: Sequence[Cha
     }  # fmt: skip
     parts = {
         "slices": sections.slices_section(run),
-        "volume": sections.volume_section(run),
         "metrics": sections.metrics_section(run, views),
         "convergence": sections.convergence_section(run),
+        "volume": sections.volume_section(run),
         "tuning": sections.tuning_section(run),
         **of_scan,
         "provenance": sections.provenance_section(run),

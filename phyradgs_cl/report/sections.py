@@ -9,7 +9,7 @@ from phyradgs_cl.acquisition.motion import motion_facts
 from phyradgs_cl.prepare import PREPARED_KEY
 from phyradgs_cl.reconstructors.frames.projected import TIMES_PER_LINE, FramePair
 from phyradgs_cl.report import images
-from phyradgs_cl.report.atlas import space
+from phyradgs_cl.report.atlas import has_depth, space
 from phyradgs_cl.report.charts import Chart, convergence_charts, histogram, tuning_chart, views_chart
 from phyradgs_cl.report.markup import Markup, element, flattened, joined, label, number, shown, unit
 from phyradgs_cl.report.rows import frame_in_motion
@@ -37,6 +37,8 @@ def slices_section(run: Run) -> Markup:
     words = f"{' × '.join(map(str, grid.shape))} voxels (z, y, x), {size} mm"
     if any(len(plane.indices) < plane.count for plane in planes):
         words += "; the page has evenly chosen slices of them"
+    if not has_depth(stored.values):
+        words += "; there is no picture in 3D of a volume one voxel thick"
     return section("slices", "Slices", note(words + "."), viewer(planes, windows), _disagreement(run, planes))
 
 

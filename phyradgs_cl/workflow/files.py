@@ -4,6 +4,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from phyradgs_cl import importers
 from phyradgs_cl.acquisition import Scan
@@ -110,7 +111,10 @@ def load_reference(path: Path) -> tuple[Volume, MovingTruth | None]:
 
 def summary(path: Path) -> dict[str, object]:
     if (form := importers.foreign_volume(path)) is not None:
-        return {"kind": f"volume ({form})", **_voxel_facts(path)}
+        states = [(time_s, _voxel_facts(volume)) for time_s, volume in importers.load_states(path)]
+        if states:
+            return {"kind": f"volumes of an object that moves ({form})", **_facts_of_states(states)}
+        return {"kind": f"volume ({form})", **_voxel_facts(importers.load_volume(path))}
     with expecting(path, "scan", "volume", "plain-volume", "deformation"):
         kind = file_kind(path)
         if kind == "scan":
@@ -123,11 +127,18 @@ def summary(path: Path) -> dict[str, object]:
         provenance.pop("record", None)
         options = provenance.pop("options", None)
         return {"kind": "volume", **facts, **_options_in_words(options), **provenance}
-    return {"kind": "bare volume", **_voxel_facts(path)}
+    return {"kind": "bare volume", **_voxel_facts(importers.load_volume(path))}
 
 
-def _voxel_facts(path: Path) -> dict[str, object]:
-    volume = importers.load_volume(path)
+def _facts_of_states(states: list[tuple[float, dict[str, Any]]]) -> dict[str, object]:
+    """Returns the number of states, their times and extremes, and what else is true of the first of them."""
+    times = {"states": len(states), "first_s": states[0][0], "last_s": states[-1][0]}
+    lowest = min(facts["minimum"] for _, facts in states)
+    highest = max(facts["maximum"] for _, facts in states)
+    return {**times, **states[0][1], "minimum": lowest, "maximum": highest}
+
+
+def _voxel_facts(volume: Volume) -> dict[str, object]:
     values, grid = volume.values, volume.grid
     where = {} if grid is None else {"voxel_size_mm": grid.voxel_size_mm, "offset_mm": grid.offset_mm}
     return {"shape": values.shape, **where, "minimum": float(values.min()), "maximum": float(values.max())}

@@ -48,7 +48,7 @@ def test_a_volume_is_compared_with_every_state(cli, capsys, folder) -> None:
     assert cli.run(line.split()) == 2 and "--object-motion" in capsys.readouterr().err
 
 
-def test_states_go_into_one_nifti_of_four_dimensions(cli, folder) -> None:
+def test_states_go_into_one_nifti_of_four_dimensions_which_info_describes(cli, capsys, folder) -> None:
     sitk = pytest.importorskip("SimpleITK")
     line = f"export {folder}/volume.h5 --object-motion {folder}/field.h5 --states 4 --during 1,5 -o {folder}/states.nii"
     assert cli.run(line.split()) == 0
@@ -59,6 +59,12 @@ def test_states_go_into_one_nifti_of_four_dimensions(cli, folder) -> None:
         expected = deformed(volume.values, volume.grid, field, field.weights_at(time_s)[0])
         np.testing.assert_array_equal(values, expected)
     assert np.ptp(sitk.GetArrayFromImage(image), axis=0).max() > 0.1
+    facts = facts_of(cli, capsys, f"info {folder}/states.nii --json")
+    assert "moves (NIfTI)" in facts["kind"] and facts["shape"] == list(volume.grid.shape)
+    assert (facts["states"], facts["first_s"], facts["last_s"]) == (4, 1.5, pytest.approx(4.5))
+    assert facts["maximum"] == pytest.approx(float(sitk.GetArrayFromImage(image).max()))
+    assert cli.run(f"splat {folder}/states.nii -o {folder}/cloud.h5".split()) == 2
+    assert "three axes, none of them empty; 'phyradgs info'" in capsys.readouterr().err
 
 
 def test_other_formats_get_a_file_for_each_state(cli, folder) -> None:

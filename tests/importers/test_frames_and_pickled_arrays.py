@@ -55,8 +55,10 @@ def test_clipped_counts_are_masked_in_their_own_frames(caplog) -> None:
     assert same.mask is None and same.saturation == found.saturation and (same.values[frames == 40000] == 0).all()
     text = f"f: {100 * share:.3g} % of the projections' pixels are clipped at 40000 counts: "
     assert caplog.messages == [
-        text + "masked, each in its own frame", text + "taken as air, for the flats are clipped too",
+        text + "masked, each in its own frame", text + "taken as air, for flat_value is no brighter",
     ]
+    line_integrals("f", frames, ImportOptions(), flats=np.full((2, 40, 40), 40000.0), darks=darks)
+    assert caplog.messages[-1] == text + "taken as air, for the flats are clipped too"
 
 
 def test_masks() -> None:

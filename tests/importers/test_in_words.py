@@ -133,7 +133,7 @@ def test_import_says_which_flats_and_darks_it_applied_and_warns_of_none(run, tmp
     assert not caplog.messages
     assert "0 flats and 3 darks applied" in run(folder, "--flat-value", "5e4")[1]
     run(folder, "--quantity", "transmission")
-    assert "flats and darks are left out, because the projections hold transmission" in caplog.text
+    assert "2 flats and 3 darks are left out, because the projections hold transmission" in caplog.text
     caplog.clear()
     text = (folder / "scan.toml").read_text()
     (folder / "scan.toml").write_text(text.replace('darks = "dark_*.tif"', ""))

@@ -85,13 +85,16 @@ def test_what_the_command_refuses_is_one_line(cli, volume_file, tmp_path, capsys
     with h5py.File(tmp_path / "bare.h5", "w") as file:
         file["volume"] = two_balls()
     out = ["-o", str(tmp_path / "c.h5"), "--iterations", "1", "--gaussians", "20"]
-    bare = str(tmp_path / "bare.h5")
+    bare, hot = str(tmp_path / "bare.h5"), two_balls()
+    hot[5, 5, 5] = 1e30
+    np.save(tmp_path / "hot.npy", hot)
     for words, message in (
         ([str(volume_file), "-o", str(tmp_path / "c.nii")], "no place for Gaussians"),
         ([str(volume_file), "-o", str(tmp_path / "c.obj")], "ends in .h5, .ply or .npz"),
         ([str(volume_file), "-o", str(volume_file)], "the input file"), ([bare, *out], "--voxel-mm"),
         ([str(volume_file), *out, "--voxel-mm", "1"], "a volume without a scale"),
         ([str(volume_file), *out, "--iterations", "-1"], "--iterations"), ([str(tmp_path / "no.h5"), *out], "no.h5"),
+        ([str(tmp_path / "hot.npy"), *out, "--voxel-mm", "1"], "hot.npy: found a value of size 1e+30"),
     ):  # fmt: skip
         assert cli.run(["splat", *words]) == 2
         errors = capsys.readouterr().err

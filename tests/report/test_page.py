@@ -14,6 +14,7 @@ from skimage import io
 
 from phyradgs_cl.acquisition import CircularOrbit, FrameSweeps, Shutter
 from phyradgs_cl.errors import InputError, OutputError
+from phyradgs_cl.fields import Grid
 from phyradgs_cl.io import Volume, read_volume, write_scan, write_volume
 from phyradgs_cl.reconstructors import plan_run
 from phyradgs_cl.report import Run, load_run, report_page, write_report
@@ -23,6 +24,7 @@ from phyradgs_cl.report.markup import number
 from phyradgs_cl.report.run import computed_views, spread_frames
 from phyradgs_cl.workflow import run_reconstruction
 
+DOCS = Path(__file__).resolve().parents[2] / "docs" / "report.md"
 ALL = {"slices", "volume", "metrics", "convergence", "projections", "scan", "geometry", "shutter", "provenance"}
 HOSTILE = "</title></script><script>alert(1)</script><img src=x onerror='alert(2)'>\"'&amp;"
 
@@ -68,6 +70,26 @@ def test_a_page_is_whole_and_asks_nothing_of_the_world(page, page_text) -> None:
     digest = base64.b64encode(hashlib.sha256(page.texts["script"][-1].encode()).digest()).decode()
     assert f"script-src 'sha256-{digest}'" in policy and "default-src 'none'" in policy
     assert [s.get("type", "") for s in page.all("script")] == [*3 * ["application/json"], ""]
+
+
+def test_sections_links_and_the_documentation_have_one_order(page) -> None:
+    sections = [part["id"] for part in page.all("section")]
+    assert [link["href"][1:] for link in page.all("a")[1:]] == sections  # the first one skips them
+    rows = re.findall(r"^\| ([A-Z][\w ,]+) \|", DOCS.read_text(encoding="utf-8"), re.MULTILINE)
+    names = [name.lower() for row in rows for name in row.replace("Volume in 3D", "Volume").split(", ")]
+    assert [name for name in names if name in sections] == sections
+
+
+def test_a_page_has_the_suffix_of_one(files, tmp_path) -> None:
+    with pytest.raises(InputError, match=r"^-o: found the suffix \.pdf; expected an HTML page"):
+        write_report(files[1], tmp_path / "page.pdf", no_runtime)
+
+
+def test_a_slice_says_why_there_is_no_picture_in_3d(tmp_path, parse) -> None:
+    thin = tmp_path / "thin.h5"
+    write_volume(thin, np.ones((1, 8, 8), np.float32), Grid((1, 8, 8), (1.0, 1.0, 1.0)), {})
+    page = parse(report_page(load_run(thin)))
+    assert "no picture in 3D of a volume one voxel thick" in page.words and "volume" not in page.ids
 
 
 def test_metrics_and_convergence_are_those_of_the_file(page, files) -> None:

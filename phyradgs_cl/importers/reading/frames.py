@@ -68,7 +68,8 @@ def line_integrals(
         text = "%s: %d line integrals are not finite or beyond %g: masked"
         _log.warning(text, subject, np.count_nonzero(unusable), LARGEST_LINE_INTEGRAL)
     if flat is not None and saturation is not None and saturation.share > 0:
-        _mask_clipped(subject, frames, flat, saturation, unusable)
+        air = "the flats are clipped too" if options.flat_value is None else f"{options.named('flat_value')} is no brighter"
+        _mask_clipped(subject, frames, flat, saturation, unusable, air)
     are_applied = (quantity == "counts" and options.flat_value is None, quantity == "counts")
     stacks = zip(are_applied, (flats, darks), strict=True)
     counts = [len(stack) if applied and stack is not None else 0 for applied, stack in stacks]
@@ -76,21 +77,22 @@ def line_integrals(
 
 
 def _warn_of_unused(subject: str, quantity: str, flats: np.ndarray | None, darks: np.ndarray | None) -> None:
-    names = [name for name, stack in (("flats", flats), ("darks", darks)) if stack is not None and len(stack)]
+    stacks = (("flats", flats), ("darks", darks))
+    names = [f"{len(stack)} {name}" for name, stack in stacks if stack is not None and len(stack)]
     if names:
         _log.warning("%s: %s are left out, because the projections hold %s", subject, " and ".join(names), quantity)
 
 
 def _mask_clipped(
-    subject: str, frames: np.ndarray, flat: np.ndarray, saturation: Saturation, unusable: np.ndarray
+    subject: str, frames: np.ndarray, flat: np.ndarray, saturation: Saturation, unusable: np.ndarray, air: str
 ) -> None:
     """Masks each frame's clipped pixels where the flat is brighter, since even air would read as an object there. Where the
     flat is clipped too, the integral is 0, which is right for air. Masking those pixels as well would leave no air, and the
-    reconstruction would be 2 to 3 times further off than with thin parts lost."""
+    reconstruction would be 2 to 3 times further off than with thin parts lost. ``air``: why such pixels are air."""
     brighter = flat > saturation.level * (1 + _SAME)
     for frame, bad in zip(frames, unusable, strict=True):
         bad |= (frame == saturation.level) & brighter
-    fate = "masked, each in its own frame" if brighter.any() else "taken as air, for the flats are clipped too"
+    fate = "masked, each in its own frame" if brighter.any() else f"taken as air, for {air}"
     text = "%s: %.3g %% of the projections' pixels are clipped at %g counts: %s"
     _log.warning(text, subject, 100 * saturation.share, saturation.level, fate)
 

@@ -31,30 +31,54 @@ _NIFTI_START = 352  # the first byte of voxels
 _OBLIQUE = 1e-3  # largest sine of an angle between an axis and the world's
 
 
-def read_image(path: Path) -> Any:
-    """Reads a SimpleITK image of three axes with one real number per voxel. InputError: a damaged file, other axes or
-    voxels, a size that the file cannot hold, data in a file outside of the folder, Hounsfield units."""
+def read_image(path: Path, state: int | None = None) -> Any:
+    """Reads a SimpleITK image of three axes with one real number per voxel; ``state``: the place along a fourth axis.
+    InputError: a damaged file, other axes or voxels, a size that the file cannot hold, data in a file outside of the folder,
+    Hounsfield units."""
     subject = str(path)
     regular_file(path, subject)
+    sitk, reader = _reader_of(path)
+    available = _available_bytes(path)
+    try:
+        reader.ReadImageInformation()
+        _check_header(sitk, subject, reader, available, state)
+        return reader.Execute()
+    except RuntimeError as error:
+        raise _damage(subject, error) from error
+
+
+def image_times_s(path: Path) -> list[float]:
+    """Returns the times of the volumes along the fourth axis of a file; [] for three axes. InputError: a damaged file."""
+    regular_file(path, str(path))
+    _, reader = _reader_of(path)
+    try:
+        reader.ReadImageInformation()
+    except RuntimeError as error:
+        raise _damage(str(path), error) from error
+    if reader.GetDimension() < 4 or reader.GetSize()[3] == 1:
+        return []
+    return [reader.GetOrigin()[3] + k * reader.GetSpacing()[3] for k in range(reader.GetSize()[3])]
+
+
+def _reader_of(path: Path) -> tuple[Any, Any]:
+    """Returns SimpleITK and its reader of a file."""
     sitk = checks.package("SimpleITK", "the package that reads NIfTI, NRRD and MetaImage", "phyradgs-cl[formats]")
     sitk.ProcessObject.SetGlobalWarningDisplay(False)
     reader = sitk.ImageFileReader()
-    reader.SetFileName(subject)
+    reader.SetFileName(str(path))
     reader.SetImageIO(_READERS[_suffix(path)])
-    available_bytes, is_exact = _available_bytes(path)
-    try:
-        reader.ReadImageInformation()
-        _check_header(sitk, subject, reader, available_bytes, is_exact)
-        return reader.Execute()
-    except RuntimeError as error:
-        reason = re.sub(r"^\w+\(0x\w+\): ", "", str(error).rpartition("ERROR: ")[2].strip()).replace(subject, "")[:100]
-        raise InputError(subject, f"a damaged file ({reason})", "an image of three axes") from error
+    return sitk, reader
 
 
-def read_image_volume(path: Path) -> Volume:
+def _damage(subject: str, error: RuntimeError) -> InputError:
+    reason = re.sub(r"^\w+\(0x\w+\): ", "", str(error).rpartition("ERROR: ")[2].strip()).replace(subject, "")[:100]
+    return InputError(subject, f"a damaged file ({reason})", "an image of three axes")
+
+
+def read_image_volume(path: Path, state: int | None = None) -> Volume:
     """Reads a volume with its axes turned to rise with the world's, which are LPS. A NRRD file without voxel sizes has no
-    grid; its integers are divided by the maximum of their type. InputError: see ``read_image``; oblique axes."""
-    subject, image = str(path), read_image(path)
+    grid; its integers are divided by the maximum of their type. ``state``, InputError: see ``read_image``; oblique axes."""
+    subject, image = str(path), read_image(path, state)
     sitk = checks.package("SimpleITK", "the package that reads this file", "phyradgs-cl[formats]")
     header = _text_header(path)[0] if _suffix(path) == ".nrrd" else {}
     if header and not {"space directions", "spacings"} & set(header):
@@ -81,13 +105,16 @@ def _suffix(path: Path) -> str:
     return next(suffix for suffix in _READERS if path.name.lower().endswith(suffix))
 
 
-def _check_header(sitk: Any, subject: str, reader: Any, available_bytes: int, is_exact: bool) -> None:
-    """Refuses images without three axes or larger than their file. Axes of one voxel beyond the third are dropped."""
-    counts, axes = reader.GetSize(), reader.GetDimension()
-    if axes < 3 or any(count != 1 for count in counts[3:]) or min(counts) < 1:
-        raise InputError(f"{subject}: shape", str(counts), "three axes, none of them empty")
+def _check_header(sitk: Any, subject: str, reader: Any, available: tuple[int, bool], state: int | None) -> None:
+    """Refuses images without three axes or larger than their file: ``available`` is its bytes, and whether the image must
+    fill them. Axes of one voxel beyond the third are dropped; ``state`` chooses along a longer fourth one."""
+    (available_bytes, is_exact), counts, axes = available, reader.GetSize(), reader.GetDimension()
+    if axes < 3 or any(count != 1 for count in counts[3 if state is None else 4 :]) or min(counts) < 1:
+        remedy = "'phyradgs info' reads volumes at several times" if axes == 4 else ""
+        raise InputError(f"{subject}: shape", str(counts), "three axes, none of them empty", remedy)
     if axes > 3:
         reader.SetExtractSize([*counts[:3], *[0] * (axes - 3)])
+        reader.SetExtractIndex([0, 0, 0, state or 0, *[0] * (axes - 4)])
     bytes_of = {getattr(sitk, f"sitk{name}"): size for name, size in _BYTES.items()}
     voxel_bytes = bytes_of.get(reader.GetPixelIDValue())
     if voxel_bytes is None or reader.GetNumberOfComponents() != 1:
@@ -103,7 +130,7 @@ def _check_header(sitk: Any, subject: str, reader: Any, available_bytes: int, is
     if needed > available_bytes or (is_exact and needed != available_bytes):
         found = f"shape {counts}, {needed} bytes, in {available_bytes} bytes of data"
         raise InputError(subject, found, "as many bytes as its header announces", "copy the file again")
-    check_room(subject, math.prod(counts) * voxel_bytes)
+    check_room(subject, math.prod(counts[:3]) * voxel_bytes)
 
 
 def _available_bytes(path: Path) -> tuple[int, bool]:

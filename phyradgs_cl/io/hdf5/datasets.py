@@ -192,7 +192,7 @@ def in_unit(source: Hdf5Source, address: str, values: np.ndarray, quantity: Quan
     values = values * _unit_factor(source, address, quantity)
     size = np.abs(values).max(initial=0.0)
     if size > quantity.largest:
-        expected = f"at most {quantity.largest:g} of the package's unit for a {quantity.name}"
+        expected = f"at most {quantity.largest:g} of the package's unit of {quantity.name}"
         raise source.error(address, f"a value of size {size:.6g}", expected, "correct the value or its unit")
     return values
 
