@@ -58,6 +58,7 @@ _FEWEST_FRAMES, _FEWEST_COLUMNS = 8, 12
 _FEWEST_SPLINES = 4  # of a cubic spline
 _LEAST_EXPLAINED = 0.3  # of the frames' variance, by a phantom in its best place before any correction
 _ORDER_ERRORS, _ORDER_RATIO = 4.0, 1.04  # of the other readout direction's residual, as in ``check``
+_EXPECTED_SHARE = 0.4  # of the most passes of a stage: few parameters are determined, and steps become small early
 
 
 def calibrate(
@@ -259,8 +260,11 @@ class _Calibrator:
         }
 
     def _plan_of_stages(self, parameters: int, start: int) -> dict[str, Passes]:
-        stages = list(enumerate(self.stages))[start:]
-        return {f"stage {k}": self._passes(stage, stage.passes(parameters, k == 0)) for k, stage in stages}
+        plan = {}
+        for k, stage in list(enumerate(self.stages))[start:]:
+            passes, cost = self._passes(stage, stage.passes(parameters, k == 0))
+            plan[f"stage {k}"] = passes, _EXPECTED_SHARE * cost
+        return plan
 
     def _passes(self, stage: Stage, count: int, most_frames: int = MOST_FRAMES) -> Passes:
         return count, count * pass_cost(self.ready, stage.columns, most_frames)

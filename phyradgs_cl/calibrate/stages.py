@@ -8,8 +8,9 @@ from phyradgs_cl.checks import ceil_div
 
 Report = Callable[[int, int, str, float], None]
 """Takes passes done, passes in all, the phase, and the share of the time that has passed."""
+_LEAST_SHARE = 0.1  # of the most passes to come, which are expected where a phase takes longer than expected
 Passes = tuple[int, float]
-"""Number of passes to come, and their cost together."""
+"""The most passes to come, and the cost that they are expected to have together."""
 
 
 @dataclass(frozen=True)
@@ -41,8 +42,8 @@ def pass_cost(scans: Sequence[Scan], columns: int, most_frames: int) -> float:
 
 
 class PassCounter:
-    """Counts passes and reports them. ``plan``: the most passes of each phase, in order. Passes that turn out not to be
-    needed are removed, so that the total falls and the time left stays true."""
+    """Counts passes and reports them. ``plan``: the passes of each phase, in order. Passes that turn out not to be needed
+    are removed, so that the total falls."""
 
     def __init__(self, report: Report, plan: Mapping[str, Passes]) -> None:
         self.plan = dict(plan)
@@ -63,7 +64,7 @@ class PassCounter:
         def count() -> None:
             passes, remaining = self._current
             self._done, self._spent = self._done + 1, self._spent + cost
-            self._current = max(passes - 1, 0), max(remaining - cost, 0.0)
+            self._current = max(passes - 1, 0), max(remaining - cost, _LEAST_SHARE * max(passes - 1, 0) * cost)
             self._say()
 
         return count
