@@ -52,9 +52,11 @@ def test_bricks_are_the_volume_once(shape) -> None:
     )  # the largest buffer counts too
 
 
-@pytest.mark.parametrize("axis", ["rows", "columns"])
-@pytest.mark.parametrize("motion", ["static", "per line"])
-@pytest.mark.parametrize("nbytes", [Z_ONLY, Z_AND_Y])
+@pytest.mark.parametrize(
+    ("motion", "axis", "nbytes"),
+    [("static", "rows", Z_ONLY), ("static", "columns", Z_AND_Y),
+     ("per line", "columns", Z_ONLY), ("per line", "rows", Z_AND_Y)],
+)
 def test_rays(any_rt, motion, axis, nbytes) -> None:
     cells = tables(motion, SHAPE, axis, frames=5)
     operator = RayOperator(any_rt, TALL, SHAPE, cells)

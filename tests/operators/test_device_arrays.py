@@ -32,8 +32,11 @@ def on_device(rt, call, values: np.ndarray) -> np.ndarray:
     return rt.download(found)
 
 
-@AXES
-@pytest.mark.parametrize(("motion", "grid"), [("static", UPRIGHT), ("per line", TALL), ("micro-views", TALL)])
+@pytest.mark.parametrize(
+    ("motion", "grid", "axis"),
+    [("static", UPRIGHT, "rows"), ("static", UPRIGHT, "columns"),
+     ("per line", TALL, "columns"), ("micro-views", TALL, "rows")],
+)
 def test_rays(any_rt, motion, grid, axis) -> None:
     operator = RayOperator(any_rt, grid, SHAPE, tables(motion, SHAPE, axis, frames=4))
     for part in (operator, operator.subset([2, 0])):

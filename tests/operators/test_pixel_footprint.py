@@ -58,8 +58,7 @@ def test_every_build_is_the_twin(any_rt, make_cloud, make_table, motion, affine)
     assert np.abs(sharp - wide).max() > 0.1 * expected.max()
 
 
-@MODELS
-@MOTIONS
+@pytest.mark.parametrize(("motion", "affine"), [("exact", False), ("static", True)])
 def test_gradients(any_rt, make_cloud, make_table, finite_differences, motion, affine) -> None:
     rows, table, h = make_cloud(3, 52, scale=(0.02, 0.3)), make_table(motion), random_weights(SHAPE)
     wide, cells = projector(any_rt, affine=affine, pixel_footprint=True), DeviceCells.upload(any_rt, table)

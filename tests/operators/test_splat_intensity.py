@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from kernel_kit import MODELS, assert_classes, assert_near, frame_cells, note_launches, random_weights
+from kernel_kit import assert_classes, assert_near, frame_cells, note_launches, random_weights
 from remembered import remembered
 from tolerances import GRADIENT, INTENSITY_FRAME, SPLAT_CLOUD
 
@@ -75,8 +75,10 @@ def test_every_build_is_the_twin(any_rt, make_cloud, make_table, motion, axis, d
     assert (gap.max() > 0.02) == (motion != "static")
 
 
-@MOTIONS
-@MODELS
+@pytest.mark.parametrize(
+    ("motion", "affine"),
+    [("static", False), ("micro-views", True), ("exact", False), ("exact", True), ("per-row", False)],
+)
 def test_gradients(any_rt, make_cloud, make_table, finite_differences, motion, affine) -> None:
     """Shares depend on all Gaussians together, so that differences are taken of the whole cloud."""
     rows, table, h = make_cloud(2, 62, scale=(0.08, 0.3)), make_table(motion), random_weights(SHAPE)

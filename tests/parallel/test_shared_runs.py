@@ -41,7 +41,7 @@ def test_same_bits_on_1_to_4_ranks(on_ranks, scan, name) -> None:
     options = DIVIDED[name]
     one = reconstruct(scan, RunPlan("phyradgs", options, seed=1), Runtime())
     assert one.gaussians.count != one.facts["gaussians_first"]  # density control has acted
-    for size in (2, 3, 4):
+    for size in (2, 3, 4) if options is OPTIONS else (2, 3):
         found = on_ranks(size, "phyradgs", options, seed=1)
         np.testing.assert_array_equal(found[0].volume, one.volume)
         for result in found:
@@ -64,8 +64,10 @@ def test_a_batch_s_gradient_is_the_sum_of_its_frames(scan) -> None:
     np.testing.assert_allclose(statistics, download(single)[:, : run.cloud.count], rtol=RANK_GRADIENT)
 
 
-@pytest.mark.parametrize("method", ["sart", "os-sart", "sirt", "cgls", "asd-pocs", "fista-tv"])
-@pytest.mark.parametrize("model", ["log", "intensity"])
+CLASSICAL = ["sart", "os-sart", "sirt", "cgls", "asd-pocs", "fista-tv"]
+
+
+@pytest.mark.parametrize("method, model", [*((name, "intensity") for name in CLASSICAL), ("sart", "log"), ("cgls", "log")])
 def test_classical_methods_come_to_the_same_volume(on_ranks, scan, method, model) -> None:
     changes = {"iterations": 6, "motion": "per-row", "detector_model": model}
     options = method_options(method, None, changes)

@@ -16,7 +16,7 @@ from phyradgs_cl.simulation import AnalyticSource, SimulationOptions, simulate
 
 ITERATIONS = {
     "sart": 6, "os-sart": 8, "sirt": 25, "cgls": 8, "asd-pocs": 6, "fista": 12, "fista-tv": 25,
-    "phyradgs exact": 500, "phyradgs micro-views": 500,
+    "phyradgs exact": 500,
 }  # fmt: skip
 VOXELS = [method for method in ITERATIONS if "phyradgs" not in method]
 GEOMETRY = ConeGeometry(5.0, 7.0, (24, 24), (4 / 24, 4 / 24))
