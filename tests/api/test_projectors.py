@@ -2,7 +2,6 @@
 
 import gc
 import sys
-from collections.abc import Callable
 
 import numpy as np
 import pyopencl
@@ -13,30 +12,24 @@ from scipy.sparse.linalg import cg, lsqr
 from tolerances import FLOAT32
 
 from phyradgs_cl.api import (
-    Gaussians,
     MicroViews,
     Operator,
     OwnTimes,
     PerRow,
-    Scan,
     as_torch,
-    initial_gaussians,
     ray_operator,
     splat_operator,
     voxel_operator,
     voxelise,
 )
-from phyradgs_cl.detector import intensity_average
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.operators import SplatProjector
-from phyradgs_cl.operators.rays.layout import layered
 from phyradgs_cl.operators.twins.splat import splat_frame
 from phyradgs_cl.runtime import Runtime
 
 VOXELS = 5e-3  # of the peak: linear between voxels of a quarter σ and less: 0.3 % measured
 ADJOINT = 1e-4  # float32 sums in two orders
-Make = Callable[[], tuple[Operator, np.ndarray]]
 
 
 @pytest.fixture(params=["rays", "ray intensity", "splats", "splat intensity", "voxels", "densities"])
@@ -124,27 +117,6 @@ def test_splats_are_the_twin_in_millimetres(rt, scan, cloud) -> None:
     assert np.abs(frames - expected).max() <= FLOAT32 * expected.max()
 
 
-def test_intensity_is_what_the_detector_averages(rt, scan, cloud) -> None:
-    motion = OwnTimes(3)
-    volume = voxelise(cloud, scan.grid, device=rt) * 20
-    ones, weights = layered([motion.cells(scan, f) for f in range(scan.frames)])
-    parts = [ray_operator(scan, _Given(tables), device=rt)(volume) for tables in ones]
-    expected = intensity_average(parts, weights)[0]
-    found = ray_operator(scan, motion, device=rt).intensity(volume)
-    assert np.allclose(found, expected, atol=FLOAT32 * expected.max())
-    assert np.abs(ray_operator(scan, motion, device=rt)(volume) - found).max() > 0.01
-
-
-class _Given:
-    """A motion whose cells are given."""
-
-    def __init__(self, tables) -> None:
-        self.tables = tables
-
-    def cells(self, scan: Scan, frame: int):
-        return self.tables[frame]
-
-
 def test_a_gradient_renders_nothing_again(rt, scan, cloud, monkeypatch) -> None:
     calls: list[str] = []
     for name in ("draw", "prepare"):
@@ -183,15 +155,6 @@ def test_scipy_solves_for_densities(rt, scan, cloud) -> None:
     frames, matrix = splats(cloud), splats.of_densities(cloud)
     assert np.allclose(lsqr(matrix, frames.ravel(), iter_lim=30)[0], cloud.density, rtol=1e-3)
     assert np.allclose(cg(matrix.T @ matrix, matrix.T @ frames.ravel())[0], cloud.density, rtol=1e-2)
-
-
-def test_the_first_cloud_is_that_of_the_method(rt, scan) -> None:
-    cloud = initial_gaussians(scan, 40, seed=2, device=rt)
-    assert cloud.count == 40 and cloud.density.min() > 0
-    assert np.array_equal(cloud.rows(), initial_gaussians(scan, 40, seed=2, device=rt).rows())
-    volume = voxelise(cloud, scan.grid, device=rt)
-    assert np.corrcoef(volume.ravel(), scan.reference.ravel())[0, 1] > 0.5
-    assert initial_gaussians(scan, device=rt).count > 40
 
 
 class _Foreign:
@@ -233,12 +196,6 @@ def test_arrays_of_the_device_may_be_parts_and_are_counted(rt, scan) -> None:
     del frames
     gc.collect()
     assert rt.ledger.held_bytes == before
-
-
-def test_an_empty_cloud_makes_empty_frames(rt, scan) -> None:
-    nothing = Gaussians(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 4)), np.zeros(0))
-    splats = splat_operator(scan, device=rt)
-    assert not splats(nothing).any() and splats.T(np.ones(splats.range_shape)).shape == (11, 0)
 
 
 def test_without_pytorch_its_installation_is_named(rt, scan, monkeypatch) -> None:

@@ -85,13 +85,6 @@ def test_seconds_of_the_processor_are_printed(scan, reconstructed, capsys):
     assert before_s - 0.05 <= float(said[1]) <= time.process_time() + 0.05  # rounded to a tenth
 
 
-def test_the_line_of_the_result_names_the_motion(scan, reconstructed, capsys):
-    """FDK ignores a fly-scan's motion unless it is told otherwise."""
-    for words, motion in (((), "static"), (("--motion", "per-row"), "per-row")):
-        reconstructed(scan, "--method", "fdk", *words)
-        assert f"volume.h5: fdk, motion {motion}, " in capsys.readouterr().out
-
-
 def test_a_method_that_ends_by_itself_says_when_and_why(scan, reconstructed, capsys):
     words = ["--method", "sirt", "--iterations", "9"]
     reconstructed(scan, *words, "--set", "tolerance=0.9")

@@ -4,16 +4,13 @@ import os
 import subprocess
 import sys
 from pathlib import Path
-from types import SimpleNamespace
 
 import h5py
 import numpy as np
 import pytest
 
-from phyradgs_cl.acquisition import Exact, LineMiddles, MicroViews, Static
-from phyradgs_cl.errors import InputError, OutputError
+from phyradgs_cl.errors import InputError
 from phyradgs_cl.runtime import device, pocl
-from phyradgs_cl.workflow import evaluate, load_scan, reconstruct
 
 
 @pytest.fixture(scope="module")
@@ -54,20 +51,6 @@ def test_doubtful_frames_are_said(cli, warned, scan, tiny, tmp_path) -> None:
     assert "frame 2 starts no later than frame 1" in warned("--method", "fdk", scan=swapped)
 
 
-def test_detector_models_differ_only_where_poses_are_averaged(scan) -> None:
-    """A method of one's own without the intensity model is warned of there; of one pose per line both are the same."""
-    loaded = load_scan(scan)
-    for motion, is_fly, expected in (
-        (MicroViews(), True, True),
-        (Exact(), True, True),
-        (Static(), True, False),
-        (LineMiddles(), True, False),
-        (MicroViews(), False, False),
-    ):
-        object.__setattr__(loaded, "is_fly", is_fly)
-        assert reconstruct._averages(loaded, SimpleNamespace(motion=motion)) == expected, (motion, is_fly)
-
-
 def test_files_of_another_kind_are_called_by_their_kind(refused, scan, volume, tmp_path) -> None:
     bare, output = tmp_path / "bare.h5", ["-o", tmp_path / "out.h5"]
     with h5py.File(bare, "w") as file:
@@ -82,20 +65,6 @@ def test_files_of_another_kind_are_called_by_their_kind(refused, scan, volume, t
         (["reconstruct", scan, *output, "--resume"], "found a damaged checkpoint; expected a complete one"),
     ):
         refused(words, expected)
-
-
-def test_a_picture_without_room_is_not_left_in_part(refused, scan, volume, tmp_path, monkeypatch) -> None:
-    picture = tmp_path / "p.png"
-    picture.write_bytes(b"an older picture")
-
-    def full(path: Path, *_: object) -> None:
-        Path(path).write_bytes(b"the beginning")
-        raise OutputError(str(path), "no room") from OSError(28, "No space left on device")
-
-    monkeypatch.setattr(evaluate, "slices_png", full)
-    words = ["evaluate", volume, "--reference", scan, "--picture", picture]
-    refused(words, f"phyradgs: {picture}: found no room left in folder", status=4)
-    assert picture.read_bytes() == b"an older picture" and list(tmp_path.iterdir()) == [picture]
 
 
 def test_no_device_for_want_of_a_cache_is_said(refused, monkeypatch) -> None:

@@ -256,14 +256,6 @@ def test_a_spoilt_chunk_is_named(tmp_path, good) -> None:
     refuses(good, DATA, ("cannot read",))
 
 
-def test_every_cut_of_a_file_is_refused_or_read(good, tmp_path) -> None:
-    content = good.read_bytes()
-    for size in range(0, len(content), max(1, len(content) // 60)):
-        (tmp_path / "cut.h5").write_bytes(content[:size])
-        with pytest.raises(InputError):
-            read_scan(tmp_path / "cut.h5", counts_to_attenuation)
-
-
 def test_damage_is_found_before_the_pixels_are_read(good) -> None:
     with h5py.File(good, "r+") as file:
         replaced("linear")(file, f"{EXTRA}/detector_model")

@@ -12,7 +12,6 @@ from tolerances import FLOAT32, RAYS, RAYS_BACK
 from phyradgs_cl.acquisition.time_cells import TimeCells
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.operators import IntensityOperator, RayOperator
-from phyradgs_cl.operators.rays.layout import layers
 from phyradgs_cl.operators.twins.rays import intensity_change, intensity_volume, ray_frame
 
 intensity_change, intensity_volume, ray_frame = map(remembered, (intensity_change, intensity_volume, ray_frame))
@@ -101,18 +100,6 @@ def test_very_opaque_volumes_stay_finite(rt) -> None:
     assert expected.max() > 300
     assert np.isfinite(operator.expected(x)).all() and np.isfinite(operator.adjoint(expected)).all()
     assert np.isfinite(RayOperator(rt, GRID, SHAPE, cells).intensity_correction(x)).all()
-
-
-@pytest.mark.parametrize("motion", MOTIONS)
-def test_layers_have_every_cell_once_and_a_line_no_more_than_once(motion) -> None:
-    table = tables(motion)[0]
-    parts = layers(table)
-    assert sum(part.count for part in parts) == table.count
-    total = np.sum([part.line_weights() for part in parts], axis=0)
-    np.testing.assert_allclose(total, table.line_weights())
-    for part in parts:
-        assert np.all(part.line_start[1:] >= part.line_stop[:-1])
-    assert len(parts) == {"static": 1, "micro-views": 2, "per line": 3}[motion]
 
 
 def test_frames_with_fewer_cells_and_lines_without_any(rt) -> None:

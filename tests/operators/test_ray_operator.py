@@ -10,7 +10,6 @@ from remembered import remembered
 from tolerances import ADJOINT, FLOAT32, RAYS, RAYS_BACK
 
 from phyradgs_cl.acquisition.time_cells import TimeCells
-from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.operators import LinearOperator, RayOperator
 from phyradgs_cl.operators.rays import launches as rays
@@ -186,17 +185,3 @@ def test_bricks_for_little_local_memory(rt, monkeypatch) -> None:
     usual = operator.adjoint(y)
     monkeypatch.setattr(rays, "_BRICK", (10**6, 1, 1))
     np.testing.assert_allclose(operator.adjoint(y), usual, rtol=FLOAT32, atol=1e-6)
-
-
-def test_refusals(rt) -> None:
-    cells = tables("static")
-    operator = RayOperator(rt, GRID, SHAPE, cells)
-    wrong = {
-        "volume": lambda: operator.forward(np.zeros((9, 14, 12), np.float32)),
-        "frames": lambda: operator.adjoint(np.zeros((2, *SHAPE), np.float32)),
-        "subset": lambda: operator.subset([]), "tables": lambda: RayOperator(rt, GRID, SHAPE, []),
-        "frame 3": lambda: RayOperator(rt, GRID, SHAPE, [*cells, *tables("static", axis="columns")]),
-    }
-    for subject, call in wrong.items():
-        with pytest.raises(InputError, match=subject):
-            call()

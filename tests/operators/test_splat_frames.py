@@ -5,8 +5,6 @@ import pytest
 from kernel_kit import assert_near, note_launches, splat
 from tolerances import (
     BRUTE_FORCE,
-    FLOAT64,
-    MERGED_FRAME,
     MICRO_VIEWS_FINE,
     MICRO_VIEWS_ORDER,
     STANDING_PICTURE,
@@ -21,7 +19,7 @@ from phyradgs_cl.acquisition.cells import (
 )
 from phyradgs_cl.acquisition.time_cells import TimeCells
 from phyradgs_cl.operators import DeviceCells, SplatProjector
-from phyradgs_cl.operators.twins.splat import splat_frame, splat_image
+from phyradgs_cl.operators.twins.splat import splat_image
 from phyradgs_cl.runtime import Runtime
 
 SHAPE = (13, 18)
@@ -37,54 +35,6 @@ def orbit(make_geometry) -> CircularOrbit:
 
 def render(rt: Runtime, rows: np.ndarray, table: TimeCells, cutoff_sigma: float = 0.0) -> np.ndarray:
     return splat(rt, rows, table, SHAPE, cutoff_sigma=cutoff_sigma)
-
-
-def unfused(
-    rows: np.ndarray, orbit: CircularOrbit, shutter: Shutter, strips: int, sub_intervals: int
-) -> np.ndarray:
-    """Eq. 2 and 3 with loops: render every micro-view, average over k, cut line r out of strip ⌊r·M/H⌋."""
-    lines = shutter.lines(SHAPE)
-    frame = np.zeros(SHAPE)
-    for j in range(strips):
-        mean = np.zeros(SHAPE)
-        for k in range(sub_intervals):
-            delay_s = (j + 0.5) / strips * shutter.readout_s + (k + 0.5) / sub_intervals * shutter.exposure_s
-            mean += splat_image(rows, orbit.pose(0, np.array(START_S + delay_s)), SHAPE) / sub_intervals
-        for order in range(lines):
-            if order * strips // lines == j:
-                line = order if shutter.direction > 0 else lines - 1 - order
-                where = (line, slice(None)) if shutter.axis == "rows" else (slice(None), line)
-                frame[where] = mean[where]
-    return frame
-
-
-@AXES
-@DIRECTIONS
-def test_fused_equals_unfused(rt, make_cloud, orbit, axis, direction) -> None:
-    rows, shutter = make_cloud(4, 31), Shutter(0.5, 0.4, axis, direction)
-    for counts in [(1, 1), (4, 3), (13, 1), (5, 2), (25, 2), (1, 4)]:
-        table = micro_view_cells(orbit, shutter, 0, START_S, shutter.lines(SHAPE), *counts)
-        expected = unfused(rows, orbit, shutter, *counts)
-        assert_near(render(rt, rows, table), expected, MERGED_FRAME)
-        assert_near(splat_frame(rows, table, SHAPE), expected, FLOAT64, 1.0)
-
-
-@AXES
-def test_no_exposure_and_no_readout_is_static(rt, make_cloud, orbit, axis) -> None:
-    rows, shutter = make_cloud(4, 33), Shutter(0.0, 0.0, axis)
-    where = (orbit, shutter, 0, START_S, shutter.lines(SHAPE))
-    assert_near(
-        render(rt, rows, micro_view_cells(*where, 5, 3)), render(rt, rows, static_cells(*where)),
-        STANDING_PICTURE,
-    )
-
-
-def test_without_readout_strips_do_not_matter(rt, make_cloud, orbit) -> None:
-    rows, where = make_cloud(4, 34), (orbit, Shutter(0.7, 0.0), 0, START_S, SHAPE[0])
-    one, many = (render(rt, rows, micro_view_cells(*where, strips, 4)) for strips in (1, 6))
-    assert_near(many, one, STANDING_PICTURE)
-    static = render(rt, rows, static_cells(*where))
-    assert np.abs(one - static).max() > 0.01 * one.max()  # the exposure does matter
 
 
 @AXES

@@ -184,12 +184,6 @@ def test_a_third_of_the_micro_views_error_with_a_tenth_of_their_poses(rt, make_c
     assert np.mean(exact) <= EXACT_OVER_MICRO_VIEWS * np.mean(micro)
 
 
-def test_results_repeat_bit_for_bit(any_rt) -> None:
-    rows, table, h = fast_cloud(51, 40), table_of(fast_geometry(), Shutter(0.8, 0.6), 0.5, 3), weights(WIDE)
-    for call in (lambda: render(any_rt, rows, table, WIDE), lambda: gradients(any_rt, rows, table, h)):
-        np.testing.assert_array_equal(call(), call())
-
-
 def test_slow_motion_is_almost_the_static_picture(rt, make_cloud, make_geometry) -> None:
     """And a gantry at rest is one static cell."""
     rows, slow = make_cloud(5, 52), table_of(make_geometry(*SHAPE), Shutter(0.8, 0.6), 1e-6, 2)

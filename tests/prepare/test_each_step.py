@@ -10,7 +10,7 @@ from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.api import prepare
 from phyradgs_cl.detector import tube_spectrum
 from phyradgs_cl.detector.effects import add_scatter, beer_lambert_noise, drifting_light
-from phyradgs_cl.prepare import PREPARED_KEY, water_polynomial
+from phyradgs_cl.prepare import PREPARED_KEY, find_dead, water_polynomial
 
 Make = Callable[..., Scan]
 
@@ -45,8 +45,9 @@ def test_dead_pixels(rt, clean) -> None:
     frames = clean.projections.copy()
     frames[:, 9, 20], frames[:, 14, 6], frames[:, 25], frames[:, :, 11] = 0.4, 5.0, 6.0, -0.3
     prepared = prepare(with_frames(clean, frames), "dead", device=rt)
-    bad = ~prepared.valid.all(axis=0)
+    bad, facts = ~prepared.valid.all(axis=0), prepared.provenance[PREPARED_KEY][0]
     assert bad[9, 20] and bad[14, 6] and bad[25].all() and bad[:, 11].all() and bad.sum() == 32 + 31 + 2
+    assert (facts["step"], facts["rows"], facts["columns"]) == ("dead", 1, 1) and not find_dead(frames[:4]).any()
     assert rms(prepared.projections - clean.projections) < 0.1 * rms(frames - clean.projections)
 
 

@@ -13,7 +13,6 @@ from skimage import io
 import phyradgs_cl
 from phyradgs_cl.acquisition import pixel_centres
 from phyradgs_cl.api import save_scan, simulate
-from phyradgs_cl.errors import InputError, OutputError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.io import write_volume
 from phyradgs_cl.report import write_preview
@@ -53,18 +52,6 @@ def test_black_is_nothing_and_white_is_nearly_the_most(tmp_path) -> None:
     picture = preview_image(volume, Grid.cube(16, 2.0))
     assert set(np.unique(picture)) == {0, 255}
     assert not preview_image(np.zeros((4, 4, 4), np.float32), Grid.cube(4, 1.0)).any()
-
-
-def test_a_preview_replaces_the_last_one_whole(any_volume, tmp_path) -> None:
-    volume, grid = any_volume
-    write_preview(volume, grid, tmp_path / "p.png")
-    write_preview(volume[::-1], grid, tmp_path / "p.png")
-    assert [path.name for path in tmp_path.iterdir()] == ["p.png"]
-    for wrong, said in ((np.full(grid.shape, np.nan), "NaN"), (volume[1:], "shape")):
-        with pytest.raises(InputError, match=said):
-            write_preview(wrong, grid, tmp_path / "p.png")
-    with pytest.raises(OutputError):
-        write_preview(volume, grid, tmp_path / "none" / "p.png")
 
 
 class FakeViewer(SimpleNamespace):

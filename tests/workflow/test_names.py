@@ -1,6 +1,5 @@
 """Names that no program's author thought of: bytes that are no UTF-8, as long as a file system allows, a NUL in a title."""
 
-import json
 import os
 import shutil
 import sys
@@ -49,34 +48,6 @@ def test_a_scan_and_a_volume_of_that_name(tiny_scan, tmp_path, cli, stem, capfd)
     assert sorted(output.parent.iterdir()) == [output]
     assert "was not found" not in (tmp_path / "page.html").read_text()
     assert "Traceback" not in capfd.readouterr().err
-
-
-def test_watch_makes_volumes_of_all_and_sets_aside_what_fails(tiny_scan, tmp_path, cli, capfd) -> None:
-    incoming, out = tmp_path / "in", tmp_path / "out"
-    incoming.mkdir()
-    for stem in (BAD, "v" * 252):
-        shutil.copy(tiny_scan, incoming / f"{stem}.h5")
-    for stem in (f"broken{BAD}", "w" * 252):
-        (incoming / f"{stem}.h5").write_bytes(b"no scan")
-    words = ["watch", str(incoming), "-o", str(out), "--once", "--settle-s", "0", "--poll-s", "0.05", *FAST]
-    assert cli.run(words) == 0
-    volumes, errors = sorted(out.glob("*.h5")), sorted(out.glob("*.error.txt"))
-    assert [path.stem for path in volumes] == [BAD, "v" * 252] and len(errors) == 2
-    assert all("not HDF5" in path.read_text(encoding="utf-8") for path in errors)
-    assert cli.run(words) == 0  # all is settled
-    assert capfd.readouterr().err.count("set aside") == 2
-
-
-def test_a_sweep_over_such_scans_is_made_once(tiny_scan, tmp_path, cli, capfd) -> None:
-    for stem in (BAD, os.fsdecode(b"bad\xfe"), "v" * 252, "ä" * 100):
-        shutil.copy(tiny_scan, tmp_path / f"{stem}.h5")
-    (tmp_path / "grid.toml").write_text('scans = ["*.h5"]\n[[runs]]\nmethod = "sirt"\niterations = 1\n')
-    words = ["sweep", str(tmp_path / "grid.toml"), "-o", str(tmp_path / "out"), "--device", "cpu"]
-    for _ in range(2):
-        assert cli.run(words) == 0
-        lines = [json.loads(line) for line in (tmp_path / "out/results.jsonl").read_text().splitlines()]
-        assert len(lines) == 4 and not any("error" in line for line in lines)
-    assert "\ufffd" in (tmp_path / "out/results.csv").read_text(encoding="utf-8")
 
 
 def test_a_title_with_a_nul_is_written_and_comes_back(tiny_scan, tmp_path) -> None:

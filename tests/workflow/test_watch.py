@@ -95,16 +95,6 @@ def test_a_file_that_another_program_has_open_for_writing_waits(job, drop, rt) -
     assert [event.error for event in watched(job, rt)] == [""]
 
 
-def test_half_a_file_is_set_aside_and_the_whole_taken(job, drop, rt, tiny_scan) -> None:
-    whole = tiny_scan.read_bytes()
-    scan = job.folder / "slow.h5"
-    scan.write_bytes(whole[: len(whole) // 2])  # its copying has stopped for longer than the settle time
-    assert "truncated" in watched(job, rt)[0].error
-    with open(scan, "ab") as file:
-        file.write(whole[len(whole) // 2 :])
-    assert [event.error for event in watched(job, rt)] == [""] and outputs(job) == ["slow.h5"]
-
-
 def test_a_scan_that_changes_during_its_run_is_made_again(job, drop, rt, monkeypatch) -> None:
     scan = drop("a.h5")
     original, runs = watch_module.resume_or_restart, []
