@@ -97,14 +97,15 @@ def simulate(
     tables = [table(frame) for frame in range(protocol.views)]
     factor = 1.0
     if options.peak > 0:
-        largest = max(float(source.frame(t, "log", 1.0).max()) for t in tables)
+        largest = max(float(frame.max()) for frame in source.frames(tables, "log", 1.0))
         if largest <= 0:
             raise InputError("--peak", "an empty object", "something that attenuates")
         factor = options.peak / largest
     spectrum = tube_spectrum(options.kvp) if options.kvp else None
     frames = np.empty((protocol.views, *geometry.detector_shape), np.float32)
-    for frame, cells in enumerate(tables):
-        frames[frame] = source.frame(cells, options.detector_model, factor)
+    projected = source.frames(tables, options.detector_model, factor)
+    for frame, (cells, projection) in enumerate(zip(tables, projected, strict=True)):
+        frames[frame] = projection
         if spectrum is not None and bone is not None:
             dense = bone.frame(cells, options.detector_model, factor)
             frames[frame] = spectrum.hardened(np.maximum(frames[frame] - dense, 0), dense)

@@ -1,7 +1,7 @@
 """Sources of frames: voxel volumes and phantoms in closed form, projected from the poses of a frame's time cells."""
 
-from collections.abc import Callable, Iterator
-from typing import Protocol
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 
@@ -17,13 +17,18 @@ from phyradgs_cl.phantoms import EllipsoidPhantom, MovingPhantom
 from phyradgs_cl.runtime import DeviceArray, MemoryShortage, Runtime
 
 
-class FrameSource(Protocol):
-    """The interface of objects that can be projected to the frame of a cell table, attenuation multiplied by ``factor``."""
+class FrameSource(ABC):
+    """An object that can be projected to the frame of a cell table, attenuation multiplied by ``factor``."""
 
+    @abstractmethod
     def frame(self, cells: TimeCells, model: str, factor: float) -> np.ndarray: ...
 
+    def frames(self, tables: Sequence[TimeCells], model: str, factor: float) -> Iterator[np.ndarray]:
+        """Yields the frame of each table."""
+        return (self.frame(cells, model, factor) for cells in tables)
 
-class VolumeSource:
+
+class VolumeSource(FrameSource):
     """Frames of a voxel volume (z, y, x) in 1/mm by the ray-driven projector."""
 
     def __init__(
@@ -52,7 +57,7 @@ class VolumeSource:
             return volume
 
 
-class AnalyticSource:
+class AnalyticSource(FrameSource):
     """Frames of a phantom with closed-form line integrals, in float64, with moving bodies at the times of cells."""
 
     def __init__(self, phantom: EllipsoidPhantom | MovingPhantom, geometry: Geometry) -> None:
@@ -77,15 +82,21 @@ class AnalyticSource:
         return frame.astype(np.float32)
 
 
-class PixelAreaSource:
+class PixelAreaSource(FrameSource):
     """Frames whose pixels average over their area, from ``samples`` by ``samples`` rays of a finer panel."""
 
     def __init__(self, finer: FrameSource, samples: int) -> None:
         self._finer, self._samples = finer, samples
 
     def frame(self, cells: TimeCells, model: str, factor: float) -> np.ndarray:
+        return self._averaged(self._finer.frame(cells.finer(self._samples), model, factor), model)
+
+    def frames(self, tables: Sequence[TimeCells], model: str, factor: float) -> Iterator[np.ndarray]:
+        fine = self._finer.frames([cells.finer(self._samples) for cells in tables], model, factor)
+        return (self._averaged(frame, model) for frame in fine)
+
+    def _averaged(self, fine: np.ndarray, model: str) -> np.ndarray:
         n = self._samples
-        fine = self._finer.frame(cells.finer(n), model, factor)
         rows, columns = fine.shape[0] // n, fine.shape[1] // n
         rays = fine.reshape(rows, n, columns, n).transpose(1, 3, 0, 2).reshape(n * n, rows, columns)
         return average(rays, np.full(n * n, 1 / n**2), model).astype(np.float32)

@@ -17,6 +17,7 @@ from phyradgs_cl.fields import Grid
 from phyradgs_cl.phantoms import Ellipsoid, EllipsoidPhantom, shepp_logan
 from phyradgs_cl.simulation import (
     AnalyticSource,
+    FrameSource,
     SimulationOptions,
     VolumeSource,
     default_time_samples,
@@ -219,7 +220,7 @@ def test_line_groups_cover_every_line_once() -> None:
     options = SimulationOptions(FLY, "columns", -1, time_samples=3)
     tables = []
 
-    class Recorder:
+    class Recorder(FrameSource):
         def frame(self, cells, model, factor):
             tables.append(cells)
             return np.zeros(SHAPE, np.float32)
