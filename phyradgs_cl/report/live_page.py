@@ -13,10 +13,10 @@ from phyradgs_cl.fields import Grid
 from phyradgs_cl.reconstructors import Progress
 from phyradgs_cl.reconstructors.frames.projected import FramePair
 from phyradgs_cl.report.images import grey_range, middle_planes
+from phyradgs_cl.report.interactive.viewer import stills
 from phyradgs_cl.report.markup import Markup, element, joined, json_block, label, number, raw_text
 from phyradgs_cl.report.page import head, web_script
 from phyradgs_cl.report.sections import facts_table, frame_pictures, note, section
-from phyradgs_cl.report.viewer import stills
 
 _MOST_POINTS = 400  # of the convergence
 _SAMPLES = 64  # along a side, for the grey values

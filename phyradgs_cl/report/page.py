@@ -20,8 +20,8 @@ from phyradgs_cl.report.run import Change, Run, computed_views, load_run, step_c
 from phyradgs_cl.runtime import Runtime
 
 DEFAULT_VIEWS = 3
-# space.js hears of the window from slices.js, and therefore comes before it
-_SCRIPT = ("common", "shaders", "render", "space", "slices", "rows")
+# space.js and motion.js hear of the window from slices.js, and therefore come before it
+_SCRIPT = ("common", "shaders", "render", "space", "motion", "slices", "rows")
 _SCRIPTED = ("volume",)  # sections that the script reveals
 
 
@@ -65,6 +65,7 @@ def report_page(run: Run, views: Sequence[FramePair] = (), changes: Sequence[Cha
         "slices": sections.slices_section(run),
         "metrics": sections.metrics_section(run, views),
         "convergence": sections.convergence_section(run),
+        "motion": sections.motion_section(run),
         "volume": sections.volume_section(run),
         "tuning": sections.tuning_section(run),
         **of_scan,
@@ -79,7 +80,7 @@ def report_page(run: Run, views: Sequence[FramePair] = (), changes: Sequence[Cha
         element("footer", f"Written by phyradgs-cl {__version__} from {run.path.name}."),
     )
     title = f"{run.path.name} – {run.stored.provenance.get('method', 'volume')}"
-    script = web_script(*_SCRIPT)
+    script = web_script(*(part for part in _SCRIPT if part != "motion" or part in shown))
     page = element("body", body, raw_text("script", script))
     return "<!doctype html>\n" + element("html", head(title, script), page, lang="en") + "\n"
 

@@ -24,6 +24,8 @@ from phyradgs_cl.io import (
     scan_summary,
     sha256_of,
 )
+from phyradgs_cl.io.deformation import DEFORMATION, read_deformation_group
+from phyradgs_cl.io.hdf5.source import open_hdf5
 from phyradgs_cl.metrics import METRICS, aligned, compare
 from phyradgs_cl.prepare import flat_correction
 from phyradgs_cl.prepare.step import Facts
@@ -44,7 +46,8 @@ Image = NDArray[np.float32]
 class Run:
     """A reconstruction from its volume file and, where it is found, its scan. scan, scan_path, scan_facts: the scan, on the
     volume's grid. reference (nz, ny, nx) 1/mm: the truth on that grid. metrics: by name. notes: remarks for the reader of
-    the page. compared: how volume and truth were compared."""
+    the page. compared: how volume and truth were compared. deformation: how the object moved, where the run knew or found
+    it."""
 
     path: Path
     stored: Volume
@@ -55,6 +58,7 @@ class Run:
     metrics: Mapping[str, object] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
     compared: str = ""
+    deformation: Deformation | None = None
 
     @property
     def motion(self) -> Motion | None:
@@ -101,7 +105,7 @@ def load_run(path: Path, scan_path: Path | None = None) -> Run:
         raise InputError(str(path), f"a {kind}", "a volume of phyradgs-cl", "make one with 'phyradgs reconstruct'")
     notes: list[str] = []
     stored = read_volume(path)
-    run = Run(path, stored, metrics=stored.metrics or {})
+    run = Run(path, stored, metrics=stored.metrics or {}, deformation=_deformation_of(path, stored.provenance, notes))
     named = scan_path or _scan_of(path, stored.provenance, notes)
     if named is not None:
         run = _with_scan(run, named, scan_path is not None, notes)
@@ -160,19 +164,19 @@ def computed_views(run: Run, rt: Runtime, count: int) -> list[FramePair]:
     """Returns ``count`` frames of the scan after the run's preprocessing, with those computed from its volume."""
     if run.scan is None or count < 1:
         return []
-    provenance = run.stored.provenance
-    deformation = _deformation_of(run.path, provenance)
-    if deformation is None and "object_motion" in provenance:
-        found = plain_text(str(provenance["object_motion"]))
-        log.warning("no computed projections: the motion of the object %s was not found, or has changed since", found)
+    if run.deformation is None and "object_motion" in run.stored.provenance:
         return []
     scan, volume = prepared(run.scan, run.preprocessing, rt), run.stored
     chosen = spread_frames(scan.frames, count)
-    return frame_pairs(rt, scan, volume.values, volume.required_grid, chosen, deformation)
+    return frame_pairs(rt, scan, volume.values, volume.required_grid, chosen, run.deformation)
 
 
-def _deformation_of(path: Path, provenance: Mapping[str, object]) -> Deformation | None:
-    """Returns how the object moved, from the file that the provenance names, if it has the stored hash."""
+def _deformation_of(path: Path, provenance: Mapping[str, object], notes: list[str]) -> Deformation | None:
+    """Returns how the object moved: from the volume file itself, or the file that the provenance names, if it has the stored
+    hash. A file that is missing is a remark."""
+    with open_hdf5(path) as source:
+        if source.find(DEFORMATION) is not None:
+            return read_deformation_group(source, DEFORMATION)
     name, sha256 = provenance.get("object_motion"), provenance.get("object_motion_sha256")
     if not isinstance(name, str) or not name:
         return None
@@ -180,6 +184,8 @@ def _deformation_of(path: Path, provenance: Mapping[str, object]) -> Deformation
         with suppress(InputError, OSError):
             if sha256_of(place) == sha256:
                 return read_deformation(place)
+    words = f"The motion of the object {plain_text(name)} was not found, or has changed since: "
+    notes.append(words + "there are no computed projections, and no motion.")
     return None
 
 

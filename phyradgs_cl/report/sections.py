@@ -9,13 +9,14 @@ from phyradgs_cl.acquisition.motion import motion_facts
 from phyradgs_cl.prepare import PREPARED_KEY
 from phyradgs_cl.reconstructors.frames.projected import TIMES_PER_LINE, FramePair
 from phyradgs_cl.report import images
-from phyradgs_cl.report.atlas import has_depth, space
 from phyradgs_cl.report.charts import Chart, convergence_charts, histogram, tuning_chart, views_chart
+from phyradgs_cl.report.interactive.atlas import has_depth, space
+from phyradgs_cl.report.interactive.motion import object_in_motion
+from phyradgs_cl.report.interactive.rows import frame_in_motion
+from phyradgs_cl.report.interactive.viewer import stills, viewer
 from phyradgs_cl.report.markup import Markup, element, flattened, joined, label, number, shown, unit
-from phyradgs_cl.report.rows import frame_in_motion
 from phyradgs_cl.report.run import Change, Run
 from phyradgs_cl.report.scan_charts import frames_chart, orbit_chart, shutter_chart, shutter_words, side_chart
-from phyradgs_cl.report.viewer import stills, viewer
 from phyradgs_cl.text import to_digits_of
 
 _MOST_ROWS = 400  # of a table
@@ -40,6 +41,21 @@ def slices_section(run: Run) -> Markup:
     if not has_depth(stored.values):
         words += "; there is no picture in 3D of a volume one voxel thick"
     return section("slices", "Slices", note(words + "."), viewer(planes, windows), _disagreement(run, planes))
+
+
+def motion_section(run: Run) -> Markup | None:
+    """The object at any time of the scan, where it is known how it moved."""
+    if run.deformation is None or not has_depth(run.stored.values):
+        return None
+    stored, grid, field = run.stored, run.stored.required_grid, run.deformation
+    span_s = float(field.times_s[0]), float(field.times_s[-1])
+    if run.scan is not None:
+        starts_s = run.scan.frame_start_s
+        span_s = float(starts_s[0]), float(starts_s[-1]) + run.scan.shutter.lit_span_s[1]
+    limit_mm = float((np.abs(field.weights) @ field.reach_mm).max())
+    words = f"The volume is one state of the object, the reference. Matter moves by less than {number(limit_mm)} mm from it."
+    window = images.windows_of(stored.values, run.reference)["result"]
+    return section("motion", "Motion", note(words), object_in_motion(stored.values, grid, window, field, span_s))
 
 
 def volume_section(run: Run) -> Markup | None:

@@ -7,11 +7,12 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 from PIL import Image
-from playwright.sync_api import Browser, Page
+from playwright.sync_api import Browser, Page, expect
 from report.browser import SOFTWARE, WITHOUT_WEBGL, launch, launched, watched
 
-from phyradgs_cl.fields import Gaussians, Grid
-from phyradgs_cl.io import write_volume
+from phyradgs_cl.fields import Deformation, Gaussians, Grid, deformed
+from phyradgs_cl.fields.deformation import control_points
+from phyradgs_cl.io import sha256_of, write_deformation, write_volume
 from phyradgs_cl.report import write_report
 
 EDGE, SIDE_MM, RADIUS_MM = 24, 12.0, 4.0
@@ -182,3 +183,75 @@ def test_without_webgl_the_page_is_that_of_the_slices(browser, address) -> None:
     assert f" 1 of {EDGE}" in page.locator("#place-axial").inner_text()
     assert not trouble
     without.close()
+
+
+@pytest.fixture(scope="module")
+def field() -> Deformation:
+    """All matter goes to +x and −z by up to two voxels, and turns a little."""
+    origin_mm, counts = control_points(Grid.cube(EDGE, SIDE_MM), 4.0)
+    random = np.random.default_rng(3).normal(0, 0.15, (1, *counts, 3)) + [-1.0, 0.0, 0.8]
+    return Deformation(random, origin_mm, 4.0, np.array([0.0, 4.0]), np.array([[0.3], [1.0]]))
+
+
+@pytest.fixture(scope="module")
+def moving(ball, field, tmp_path_factory) -> str:
+    folder = tmp_path_factory.mktemp("moving")
+    write_deformation(folder / "field.h5", field)
+    facts = {"object_motion": "field.h5", "object_motion_sha256": sha256_of(folder / "field.h5")}
+    write_volume(folder / "ball.h5", ball, Grid.cube(EDGE, SIDE_MM), facts)
+    write_report(folder / "ball.h5", folder / "page.html", lambda: None)
+    return (folder / "page.html").as_uri()
+
+
+def state(page: Page, axis: str) -> np.ndarray:
+    """A slice of the moving object as the page draws it (rows from below, columns), 0 to 255."""
+    page.evaluate("() => new Promise((done) => requestAnimationFrame(() => setTimeout(done, 50)))")
+    text = page.locator(f"#motion-{axis} canvas").first.evaluate("canvas => canvas.toDataURL()")
+    return np.asarray(Image.open(io.BytesIO(base64.b64decode(text.partition(",")[2]))).convert("L"), float)[::-1]
+
+
+def test_any_time_of_a_moving_object_is_drawn_as_deformed_says(browser, moving, ball, field) -> None:
+    """By keys alone: the time, the slices, the length of the arrows."""
+    trouble: list[str] = []
+    page = watched(browser.new_page(viewport={"width": 900, "height": 700}), moving, trouble)
+    expect(page.locator("#motion-arrows-value")).to_have_text("1×")
+    grid, high = Grid.cube(EDGE, SIDE_MM), float(np.percentile(ball, 99.9))
+    for presses, time_s in ((0, 0.0), (50, 1.0), (150, 4.0)):
+        page.locator("#motion-time").focus()
+        for _ in range(presses):
+            page.keyboard.press("ArrowRight")
+        expect(page.locator("#motion-time-value")).to_have_text(f"{time_s:.2f} s")
+        expected = 255 * np.clip(deformed(ball, grid, field, field.weights_at(time_s)[0]) / high, 0, 1)
+        for axis, middle in (("z", expected[12]), ("y", expected[:, 12]), ("x", expected[:, :, 12])):
+            assert np.abs(state(page, axis) - middle).max() <= 3, (time_s, axis)  # steps of 8 bit, here 1.2 of the picture's
+    page.locator("#motion-slice-z").focus()
+    page.keyboard.press("ArrowLeft")
+    assert np.abs(state(page, "z") - expected[11]).max() <= 3
+    overlay = page.locator("#motion-z canvas").nth(1)
+    inked = "a => a.getContext('2d').getImageData(0, 0, a.width, a.height).data.filter((value) => value > 99).length"
+    with_arrows = overlay.evaluate(inked)
+    page.locator("#motion-arrows").focus()
+    page.keyboard.press("Home")
+    expect(page.locator("#motion-arrows-value")).to_have_text("none")
+    assert overlay.evaluate(inked) == 0 < with_arrows
+    page.locator("#motion-play").focus()
+    page.keyboard.press("Enter")
+    page.wait_for_function("() => document.querySelector('#motion-time').valueAsNumber < 180")
+    page.locator("#motion-reset").click()
+    assert page.locator("#motion-time").input_value() == "0" and page.locator("#motion-play").inner_text() == "Play"
+    page.close()
+    assert not trouble
+
+
+def test_a_page_without_scripts_or_webgl_shows_the_moving_object(browser, moving) -> None:
+    plain = browser.new_context(java_script_enabled=False).new_page()
+    plain.goto(moving)
+    assert plain.locator("#motion-z img").is_visible() and not plain.locator("#motion-time").is_visible()
+    assert plain.locator("#motion-reading").inner_text() == "The object at 0 s, the first of 4 s."
+    plain.close()
+    other = launch(browser.browser_type, *WITHOUT_WEBGL)
+    page = other.new_page()
+    page.goto(moving)
+    expect(page.locator("#motion-arrows-value")).to_have_text("1×")
+    assert state(page, "z").max() > 100 and not page.locator("#volume").is_visible()
+    other.close()

@@ -10,6 +10,58 @@ function dataOf(id) {
   return block && JSON.parse(block.textContent);
 }
 
+// The bytes of the voxels, x fastest, from a picture that has the slices z side by side.
+function voxelsOf(data) {
+  return (voxelsOf.bytes ??= decodedVoxels(data));
+}
+
+async function decodedVoxels({ counts: [nx, ny, nz], atlas, columns }) {
+  const image = new Image();
+  image.src = "data:image/png;base64," + atlas;
+  await image.decode();
+  const { naturalWidth: width, naturalHeight: height } = image;
+  const sheet = Object.assign(document.createElement("canvas"), { width, height });
+  const context = sheet.getContext("2d", { willReadFrequently: true });
+  context.drawImage(image, 0, 0);
+  const bytes = new Uint8Array(nx * ny * nz);
+  for (let z = 0; z < nz; z++) {
+    const left = nx * (z % columns), top = ny * Math.floor(z / columns);
+    const { data: pixels } = context.getImageData(left, top, nx, ny);
+    for (let k = 0; k < nx * ny; k++) bytes[z * nx * ny + k] = pixels[4 * k];
+  }
+  return bytes;
+}
+
+// Lets a button play a slider to its end in so many milliseconds; ``show`` draws its present place.
+function makePlayer(button, slider, lasts_ms, show) {
+  let playing = 0, started = 0;
+  const share = () => slider.valueAsNumber / Number(slider.max);
+
+  function stop() {
+    cancelAnimationFrame(playing);
+    playing = 0;
+    button.textContent = "Play";
+  }
+
+  function step(now) {
+    slider.value = ((now - started) / lasts_ms) * Number(slider.max);
+    show();
+    if (share() < 1) playing = requestAnimationFrame(step);
+    else stop();
+  }
+
+  function start() {
+    if (share() >= 1) slider.value = 0;
+    started = performance.now() - share() * lasts_ms;
+    button.textContent = "Pause";
+    playing = requestAnimationFrame(step);
+  }
+
+  button.addEventListener("click", () => (playing ? stop() : start()));
+  slider.addEventListener("input", stop);
+  return { start, stop, isPlaying: () => playing !== 0 };
+}
+
 // The largest of 1, 2, 5, 10, ... that is at most this.
 function roundLength(most) {
   const power = 10 ** Math.floor(Math.log10(most));

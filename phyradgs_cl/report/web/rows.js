@@ -8,7 +8,7 @@
   const [rows, columns] = data.shape, isRows = data.axis === "rows", count = isRows ? rows : columns;
   const [first_s, last_s] = data.times_s, LASTS_MS = 7000;
   const isStill = matchMedia("(prefers-reduced-motion: reduce)");
-  let playing = 0, started = 0, wasSeen = false, asked = 0;
+  let wasSeen = false, asked = 0;
 
   // A value at a time, between those of a list that covers the frame.
   function between(list, time_s) {
@@ -106,30 +106,10 @@
     asked = asked || requestAnimationFrame(draw);
   }
 
-  function step(now) {
-    time.value = ((now - started) / LASTS_MS) * data.steps;
-    draw();
-    if (time.valueAsNumber < data.steps) playing = requestAnimationFrame(step);
-    else stop();
-  }
-
-  function stop() {
-    cancelAnimationFrame(playing);
-    playing = 0;
-    play.textContent = "Play";
-  }
-
-  function start() {
-    if (time.valueAsNumber >= data.steps) time.value = 0;
-    started = performance.now() - (time.valueAsNumber / data.steps) * LASTS_MS;
-    play.textContent = "Pause";
-    playing = requestAnimationFrame(step);
-  }
-
-  play.addEventListener("click", () => (playing ? stop() : start()));
-  time.addEventListener("input", () => (stop(), redraw()));
+  const player = makePlayer(play, time, LASTS_MS, draw);
+  time.addEventListener("input", redraw);
   find("rows-reset").addEventListener("click", () => {
-    stop();
+    player.stop();
     camera.reset();
     time.value = data.steps;
     redraw();
@@ -139,8 +119,8 @@
   new ResizeObserver(redraw).observe(canvas.parentElement);
   // It moves once, when it is first seen, unless the reader wants no motion.
   new IntersectionObserver(([entry]) => {
-    if (entry.isIntersecting && !wasSeen && !isStill.matches) start();
+    if (entry.isIntersecting && !wasSeen && !isStill.matches) player.start();
     wasSeen = wasSeen || entry.isIntersecting;
-    if (!entry.isIntersecting && playing) stop();
+    if (!entry.isIntersecting && player.isPlaying()) player.stop();
   }, { threshold: 0.5 }).observe(canvas);
 })();

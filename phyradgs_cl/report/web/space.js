@@ -16,24 +16,6 @@
   const showsSurface = () => find("space-surface").checked;
   const show = (isShown) => [section, ...links].forEach((part) => (part.hidden = !isShown));
 
-  // The bytes of the voxels, from a picture that has the slices z side by side.
-  async function voxels() {
-    const image = new Image(), [nx, ny, nz] = data.counts;
-    image.src = "data:image/png;base64," + data.atlas;
-    await image.decode();
-    const { naturalWidth: width, naturalHeight: height } = image;
-    const sheet = Object.assign(document.createElement("canvas"), { width, height });
-    const context = sheet.getContext("2d", { willReadFrequently: true });
-    context.drawImage(image, 0, 0);
-    const bytes = new Uint8Array(nx * ny * nz);
-    for (let z = 0; z < nz; z++) {
-      const left = nx * (z % data.columns), top = ny * Math.floor(z / data.columns);
-      const { data: pixels } = context.getImageData(left, top, nx, ny);
-      for (let k = 0; k < nx * ny; k++) bytes[z * nx * ny + k] = pixels[4 * k];
-    }
-    return bytes;
-  }
-
   // Centres as (x, y, z, weight) in mm about the middle of the box.
   function points() {
     if (!data.centres) return null;
@@ -141,7 +123,7 @@
 
   async function start() {
     try {
-      renderer = new VolumeRenderer(canvas, { counts: data.counts, bytes: await voxels(), size_mm: data.size_mm, points: points() });
+      renderer = new VolumeRenderer(canvas, { counts: data.counts, bytes: await voxelsOf(data), size_mm: data.size_mm, points: points() });
     } catch {
       return; // the slices show the volume too
     }

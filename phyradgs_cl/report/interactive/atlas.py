@@ -7,8 +7,8 @@ from numpy.typing import NDArray
 
 from phyradgs_cl.fields import Gaussians, Grid
 from phyradgs_cl.report.images import Window, base64_of, block_means, bytes_of, png_bytes
+from phyradgs_cl.report.interactive.viewer import decimals_of, slider
 from phyradgs_cl.report.markup import Markup, element, joined, json_block, number
-from phyradgs_cl.report.viewer import decimals_of, slider
 
 MOST_EDGE = 128  # voxels along a side
 MOST_TEXT = 2_000_000  # characters of base64, for voxels and centres together

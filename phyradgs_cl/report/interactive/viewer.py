@@ -57,33 +57,34 @@ def _figure(plane: Plane) -> Markup:
     slider = element("input", type="range", id=slider_id, **places, aria_describedby=place_id)
     caption = element(
         "figcaption", element("label", f"{name} ({plane.axis})", for_=slider_id),
-        element("output", _place(plane, middle), id=place_id, for_=slider_id),
+        element("output", place(plane, middle), id=place_id, for_=slider_id),
     )
-    picture = _picture(plane, "volume", has_controls=True)
-    return element("figure", picture, caption, slider, id=f"plane-{plane.name}")
+    shown = picture(plane, "volume", canvases=1, has_lines=True)
+    return element("figure", shown, caption, slider, id=f"plane-{plane.name}")
 
 
 def stills(planes: list[Plane], of: str, high: float) -> Markup:
     """Returns pictures without controls, black 0 and white ``high`` in 1/mm or more, and a bar of these values."""
     figures = []
     for plane in planes:
-        words = f"{plane.name.capitalize()} slice ({_place(plane, plane.middle)})"
-        figures.append(element("figure", _picture(plane, of), element("figcaption", words)))
+        words = f"{plane.name.capitalize()} slice ({place(plane, plane.middle)})"
+        figures.append(element("figure", picture(plane, of), element("figcaption", words)))
     ramp = data_uri(png_bytes(np.arange(256, dtype=np.uint8)[None]))
     bar = "0", element("img", src=ramp, alt="from black to white"), f"{number(high)} 1/mm and above"
     return joined(element("div", *figures, class_="slices stills"), element("p", *bar, class_="values"))
 
 
-def _picture(plane: Plane, of: str, *, has_controls: bool = False) -> Markup:
-    """Returns a slice with the directions at its edges and a scale bar, and with cross lines if ``has_controls``."""
+def picture(plane: Plane, of: str, *, canvases: int = 0, has_lines: bool = False) -> Markup:
+    """Returns a slice with the directions at its edges and a scale bar. ``canvases`` for the script lie above it, and lines
+    that cross if ``has_lines``."""
     width_mm, height_mm = plane.size_mm
     image = element(
         "img", src=data_uri(plane.still),
         alt=f"{plane.name.capitalize()} slice of the {of}, {plane.right} to the right, {plane.up} up",
         style=f"aspect-ratio: {width_mm:.6g} / {height_mm:.6g}", draggable="false",
     )
-    lines = [element("i", class_=way, aria_hidden="true") for way in ("across", "upwards")] if has_controls else []
-    sheet = element("div", image, element("canvas", aria_hidden="true") if has_controls else None, class_="sheet")
+    lines = [element("i", class_=way, aria_hidden="true") for way in ("across", "upwards")] if has_lines else []
+    sheet = element("div", image, *canvases * [element("canvas", aria_hidden="true")], class_="sheet")
     ways = {"left": f"−{plane.right}", "right": f"+{plane.right}", "top": f"+{plane.up}", "bottom": f"−{plane.up}"}
     marks = (element("b", way, class_=edge, aria_hidden="true") for edge, way in ways.items())
     bar_mm = round_length(_BAR * width_mm)
@@ -91,7 +92,8 @@ def _picture(plane: Plane, of: str, *, has_controls: bool = False) -> Markup:
     return element("div", sheet, *lines, *marks, bar, class_="picture")
 
 
-def _place(plane: Plane, k: int) -> str:
+def place(plane: Plane, k: int) -> str:
+    """Returns the place of the slice ``plane.indices[k]`` in words."""
     where = number(plane.position_mm(k), plane.step_mm)
     return f"{plane.axis} = {where} mm, {plane.indices[k] + 1} of {plane.count}"
 
@@ -107,7 +109,7 @@ def _choice(layers: list[str]) -> Markup:
 
 
 def _plane_data(plane: Plane) -> dict[str, object]:
-    places = [_place(plane, k) for k in range(len(plane.indices))]
+    places = [place(plane, k) for k in range(len(plane.indices))]
     names = ("axis", "right", "up", "count", "indices", "first_mm", "step_mm", "layers")
     facts = {name: getattr(plane, name) for name in names}
     return {**facts, "width_mm": plane.size_mm[0], "decimals": decimals_of(plane.step_mm) + 1, "places": places}

@@ -3,9 +3,9 @@
 import numpy as np
 
 from phyradgs_cl.acquisition import CircularOrbit, Scan
+from phyradgs_cl.report.interactive.viewer import slider
 from phyradgs_cl.report.markup import Markup, element, joined, json_block, number
 from phyradgs_cl.report.scan_charts import box_corners, with_sources
-from phyradgs_cl.report.viewer import slider
 
 _TIMES = 49  # at which the scanner's pose is given; the script interpolates
 _MOST_LINES = 64

@@ -1,0 +1,104 @@
+"""An object that moves as a part of the page: its slices at any time of the scan, with arrows of the displacement.
+
+The page has the voxels once, as the picture in 3D has them, and the deformation as control points. Its script makes the
+states: v(y + w(y, t)), trilinear, as ``fields.deformed`` does."""
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import spline_filter1d
+
+from phyradgs_cl.fields import Deformation, Grid, deformed, triple
+from phyradgs_cl.fields.deformation import control_points
+from phyradgs_cl.report.images import Plane, Window, base64_of, block_means, middle_planes
+from phyradgs_cl.report.interactive.atlas import MOST_EDGE
+from phyradgs_cl.report.interactive.viewer import decimals_of, picture, place, slider
+from phyradgs_cl.report.markup import Markup, element, joined, json_block, number
+
+MOST_VALUES = 150_000  # of control points; 2 bytes each
+_MOST_TIMES = 2000
+_STEPS = 200  # of the slider of the time
+_MOST_LENGTH = 10  # by which arrows are made longer
+_LARGEST = 32767  # of 16 bits
+_HELP = (
+    "An arrow ends where matter is, and begins where the same matter is in the reference volume; black parts have none. "
+    "Play, or arrow keys on the slider of the time, go through the scan. A click in a picture moves the other two slices."
+)
+
+
+def object_in_motion(
+    volume: NDArray[np.floating], grid: Grid, window: Window, deformation: Deformation, span_s: tuple[float, float]
+) -> Markup:
+    """Returns three slices of the object at the first time of ``span_s``, their controls and the data of the script, which
+    shows any time of the span. ``volume`` (nz, ny, nx) is the reference, with at least two voxels along every side."""
+    means = block_means(volume, MOST_EDGE)
+    sides_mm = (side / count for side, count in zip(grid.size_mm, means.shape, strict=True))
+    small = Grid(triple(means.shape), triple(sides_mm), grid.offset_mm)
+    first = deformed(means, small, deformation, deformation.weights_at(span_s[0])[0])
+    middles = [np.take(first, count // 2, axis=axis) for axis, count in enumerate(first.shape)]
+    planes = middle_planes(middles, small, (window.low, window.high))
+    controls = [
+        element("button", "Play", type="button", id="motion-play"),
+        element("button", "Reset", type="button", id="motion-reset"),
+        slider("motion-time", "Time", 0, _STEPS, 0, f"{number(span_s[0])} s"),
+        slider("motion-arrows", "Arrows", 0, _MOST_LENGTH, 1, "1×"),
+    ]
+    legend = f"The object at {number(span_s[0])} s, the first of {number(span_s[1] - span_s[0])} s."
+    data = _data(fitting(deformation, small), small, span_s)
+    return joined(
+        element("div", *controls, class_="tools"), element("div", *map(_figure, planes), class_="slices"),
+        element("p", element("output", legend, id="motion-reading"), class_="note"),
+        element("p", _HELP, class_="note help"), json_block("motion-data", data),
+    )
+
+
+def fitting(deformation: Deformation, grid: Grid) -> Deformation:
+    """Returns the deformation with at most ``MOST_VALUES`` numbers: where it has more, control points at larger distances,
+    at which it stays as it is."""
+    spacing_mm = float(np.max(deformation.spacing_mm))
+    reduced = deformation
+    while reduced.control_mm.size > MOST_VALUES and spacing_mm < 2 * max(grid.size_mm):
+        spacing_mm *= 1.25
+        origin_mm, counts = control_points(grid, spacing_mm)
+        axes_mm = [
+            np.clip(first_mm + spacing_mm * np.arange(n), centres_mm[0], centres_mm[-1])  # fields may end beyond the box
+            for first_mm, n, centres_mm in zip(origin_mm[::-1], counts, grid.axes_mm(), strict=True)
+        ]
+        points_mm = np.stack(np.meshgrid(*axes_mm, indexing="ij")[::-1], -1).reshape(-1, 3)
+        units = np.eye(deformation.rank)
+        control_mm = np.stack([deformation.displacement_mm(points_mm, unit).reshape(*counts, 3) for unit in units])
+        for axis in (1, 2, 3):
+            control_mm = spline_filter1d(control_mm, axis=axis)
+        reduced = Deformation(control_mm, origin_mm, spacing_mm, deformation.times_s, deformation.weights)
+    return reduced
+
+
+def _data(deformation: Deformation, grid: Grid, span_s: tuple[float, float]) -> dict[str, object]:
+    """Returns the deformation for the script: control points in 16 bit of each field's largest, axes in x, y, z."""
+    control_mm = deformation.control_mm
+    largest_mm = np.abs(control_mm).max(axis=(1, 2, 3, 4))
+    units_mm = np.where(largest_mm > 0, largest_mm, 1.0) / _LARGEST
+    whole = np.rint(control_mm / units_mm[:, None, None, None, None]).astype("<i2")
+    times_s = deformation.times_s
+    if len(times_s) > _MOST_TIMES:
+        times_s = np.linspace(*span_s, _MOST_TIMES)
+    weights = deformation.weights_at(times_s)
+    return {
+        "control": base64_of(whole.tobytes()), "units_mm": units_mm.tolist(), "shape": control_mm.shape[3:0:-1],
+        "origin_mm": deformation.origin_mm, "spacing_mm": deformation.spacing_mm,
+        "times_s": [float(f"{time_s:.9g}") for time_s in times_s],
+        "weights": [[float(f"{weight:.6g}") for weight in row] for row in weights],
+        "first_mm": grid.first_centre_mm[::-1], "step_mm": grid.voxel_size_mm[::-1], "span_s": span_s,
+        "decimals": decimals_of(min(grid.voxel_size_mm)) + 1,
+    }  # fmt: skip
+
+
+def _figure(plane: Plane) -> Markup:
+    middle, slice_id, place_id = plane.indices[0], f"motion-slice-{plane.axis}", f"motion-place-{plane.axis}"
+    caption = element(
+        "figcaption", element("label", f"{plane.name.capitalize()} slice ({plane.axis})", for_=slice_id),
+        element("output", place(plane, 0), id=place_id, for_=slice_id),
+    )
+    places = {"min": 0, "max": plane.count - 1, "value": middle}
+    control = element("input", type="range", id=slice_id, **places, aria_describedby=place_id)
+    shown = picture(plane, "moving object", canvases=2)
+    return element("figure", shown, caption, control, id=f"motion-{plane.axis}", data_right=plane.right, data_up=plane.up)
