@@ -118,7 +118,7 @@ class Deformation:
 
     def on_grid_mm(self, grid: Grid, weights: "ArrayLike") -> np.ndarray:
         """Returns w (nz, ny, nx, 3) float32 in mm at the voxel centres of ``grid``, components x, y, z, for one state."""
-        along_z, along_y, along_x = self._bases(grid)
+        along_z, along_y, along_x = self.bases(grid)
         rows = np.einsum("zk,kyxi->zyxi", along_z, self._state(weights), optimize=True)
         planes = np.einsum("yk,zkxi->zyxi", along_y, rows, optimize=True).astype(np.float32)
         return np.einsum("xk,zyki->zyxi", along_x.astype(np.float32), planes, optimize=True)
@@ -166,8 +166,9 @@ class Deformation:
     def _in_spacings(self, points_mm: np.ndarray) -> np.ndarray:
         return (points_mm - self.origin_mm) / self.spacing_mm
 
-    def _bases(self, grid: Grid, slope_along: int | None = None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Returns β³ (voxels, control points) along z, y and x; its slope in 1/mm along ``slope_along`` (0: z)."""
+    def bases(self, grid: Grid, slope_along: int | None = None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Returns β³ (voxels, control points) along z, y and x at the voxel centres of ``grid``; its slope in 1/mm along
+        ``slope_along`` (0: z)."""
         matrices = []
         spacing_mm = np.broadcast_to(self.spacing_mm, 3)
         for axis, centres_mm in enumerate(grid.axes_mm()):
@@ -181,7 +182,7 @@ class Deformation:
         """Returns ∂U_i/∂y_j (3, 3, n) at the voxel centres of a grid, for one field's control vectors."""
         result = np.empty((3, 3, int(np.prod(grid.shape))), np.float32)
         for j in range(3):
-            along = self._bases(grid, 2 - j)
+            along = self.bases(grid, 2 - j)
             values = np.einsum("zk,yl,xm,klmi->izyx", *along, control_mm, optimize=True)
             result[:, j] = values.reshape(3, -1)
         return result

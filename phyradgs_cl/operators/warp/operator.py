@@ -3,7 +3,7 @@
 W_k warps the volume to a state. P_k projects it to the time cells of that state, each with its share of it: a cell between
 two states is a blend of both (``states.py``)."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from copy import copy
 from dataclasses import replace
 from functools import partial
@@ -51,12 +51,27 @@ class WarpedOperator:
         return self._on_device(self._forward, volume, self.frames_shape, out)
 
     def _forward(self, volume: DeviceArray, frames: DeviceArray) -> None:
+        source = self.warp.source(volume)
+        self.project(lambda k: volume if self.warp.is_still(k) else self.warp.forward(k, source), frames)
+
+    def project(self, volume_of: Callable[[int], DeviceArray], frames: DeviceArray) -> None:
+        """Writes Σ_k P_k v_k to frames (F, rows, columns), for volumes v_k (nz, ny, nx) of the states ``states``."""
         self.rt.fill(frames, 0)
-        source, stack = self.warp.source(volume), self.warp.stack
         for part in self._parts:
-            moved = volume if self.warp.is_still(part.state) else self.warp.forward(part.state, source)
-            part.operator.forward(moved, out=stack.of(len(part.frames), self.detector_shape))
-            stack.add(part.places, frames)
+            part.operator.forward(volume_of(part.state), out=self.warp.stack.of(len(part.frames), self.detector_shape))
+            self.warp.stack.add(part.places, frames)
+
+    def backprojections(self, frames: DeviceArray) -> Iterator[tuple[int, DeviceArray]]:
+        """Yields each state k that frames use, and P_kᵀ y (nz, ny, nx) of frames (F, rows, columns); the next one overwrites
+        it."""
+        for part in self._parts:
+            taken = self.warp.stack.take(frames, part.frames)
+            yield part.state, part.operator.adjoint(taken, out=self.warp.moved())
+
+    @property
+    def states(self) -> list[int]:
+        """The states that frames use."""
+        return [part.state for part in self._parts]
 
     def adjoint(self, frames: SameArray, out: SameArray | None = None) -> SameArray:
         """Returns Aᵀ y for frames (F, rows, columns): a volume (nz, ny, nx) float32."""
@@ -64,9 +79,8 @@ class WarpedOperator:
 
     def _adjoint(self, frames: DeviceArray, volume: DeviceArray) -> None:
         total = self.warp.zeros()
-        for part in self._parts:
-            moved = part.operator.adjoint(self.warp.stack.take(frames, part.frames), out=self.warp.moved())
-            self.warp.adjoint(part.state, moved, total)
+        for state, moved in self.backprojections(frames):
+            self.warp.adjoint(state, moved, total)
         self.warp.read(total, volume)
 
     def _on_device(

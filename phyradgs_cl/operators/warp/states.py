@@ -27,8 +27,13 @@ class MotionStates:
     metric: np.ndarray
 
     @classmethod
-    def of_times(cls, deformation: Deformation, grid: Grid, times_s: np.ndarray) -> "MotionStates":
-        """Chooses states for times (T,) in s: each next one is the time furthest from the states so far."""
+    def of_times(
+        cls, deformation: Deformation, grid: Grid, times_s: np.ndarray, least_voxels: float = 0.0
+    ) -> "MotionStates":
+        """Chooses states for times (T,) in s: each next one is the time furthest from the states so far.
+
+        least_voxels: displacement of a unit of every weight that is assumed beside the fields' own, so that fields of zeros
+        have several states too."""
         units = np.eye(deformation.rank)
         fields_mm = np.stack([deformation.on_grid_mm(grid, unit) for unit in units])
         voxel_mm = min(grid.voxel_size_mm)
@@ -36,6 +41,7 @@ class MotionStates:
         moves = moving >= _MOVES * moving.max(initial=0.0)
         parts = fields_mm[:, moves].reshape(len(units), -1).astype(np.float64) / voxel_mm
         metric = parts @ parts.T / max(np.count_nonzero(moves), 1)
+        metric += least_voxels**2 * units
         seen = np.unique(deformation.weights_at(times_s), axis=0)
         chosen = [int(np.argmin(_length(seen - seen.mean(0), metric)))]
         while len(chosen) < MOST_STATES:
