@@ -160,7 +160,7 @@ def _tables_by_state(
 
 
 def _with_share(table: TimeCells, share: np.ndarray) -> TimeCells | None:
-    cells = np.flatnonzero((share > 0) & (table.line_stop > table.line_start))
+    cells = np.flatnonzero((share > 0) & (table.weight != 0) & (table.line_stop > table.line_start))
     if cells.size == 0:
         return None
     return replace(some_cells(table, cells), weight=table.weight[cells] * share[cells])

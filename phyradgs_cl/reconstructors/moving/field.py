@@ -1,0 +1,231 @@
+"""Steps of Gauss-Newton on the displacement field of a moving object, at a given volume.
+
+    min over U, φ of ‖p − Σ_k P_k W_k v‖² + γ bending(U) + β roughness(φ)
+
+The control vectors of U and the temporal coefficients of φ are improved in turn. A step is taken only where it lowers the
+sum and matter does not fold."""
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from phyradgs_cl.acquisition import Motion, Scan
+from phyradgs_cl.acquisition.time_cells import TimeCells
+from phyradgs_cl.fields import Deformation, control_points
+from phyradgs_cl.operators.warp.derivative import FieldDerivative
+from phyradgs_cl.operators.warp.operator import WarpedOperator
+from phyradgs_cl.operators.warp.states import MotionStates
+from phyradgs_cl.operators.warp.volume import VolumeWarp
+from phyradgs_cl.reconstructors.moving.splines import Bending, TemporalSplines
+from phyradgs_cl.runtime import Runtime
+
+_CG_STEPS = 8
+_DAMPING = 1e-3  # of the mean squared response of a control vector's component
+_ROUGHNESS = 1e-2  # of the same of a temporal coefficient
+_SHORTER = (1.0, 0.5, 0.25)
+_LEAST_DETERMINANT = 0.1
+_LEAST_VOXELS = 1.0  # by which states differ at least for a unit of weight
+_SUPPORT = 4  # intervals of a temporal spline
+
+
+@dataclass(frozen=True, eq=False)
+class MotionField:
+    """A displacement field in the form in which it is sought. control_mm: (R, cz, cy, cx, 3) as in ``Deformation``.
+    temporal: (count, R) coefficients of the weights."""
+
+    control_mm: np.ndarray
+    origin_mm: tuple[float, float, float]
+    spacing_mm: float
+    splines: TemporalSplines
+    temporal: np.ndarray
+
+    @classmethod
+    def at_rest(cls, scan: Scan, spacing_mm: float, splines: TemporalSplines, temporal: np.ndarray) -> "MotionField":
+        """Returns zeros over the scan's grid, with weights of mean 0 whose largest size is 1."""
+        origin_mm, counts = control_points(scan.grid, spacing_mm)
+        centred = temporal - splines.at(splines.node_times_s).mean(0) @ temporal  # splines sum to 1
+        control_mm = np.zeros((temporal.shape[1], *counts, 3))
+        return cls(control_mm, origin_mm, spacing_mm, splines, centred).scaled()
+
+    def deformation(self) -> Deformation:
+        times_s = self.splines.node_times_s
+        weights = self.splines.at(times_s) @ self.temporal
+        return Deformation(self.control_mm, self.origin_mm, self.spacing_mm, times_s, weights)
+
+    def scaled(self) -> "MotionField":
+        """Returns the same displacements with weights whose largest size is 1."""
+        largest = np.abs(self.splines.at(self.splines.node_times_s) @ self.temporal).max(0)
+        factor = np.where(largest > 0, largest, 1.0)
+        control_mm = self.control_mm * factor[:, None, None, None, None]
+        return replace(self, control_mm=control_mm, temporal=self.temporal / factor)
+
+    def refined(self, scan: Scan, spacing_mm: float) -> "MotionField":
+        """Returns the field on control points that are closer to each other: those that follow its values best."""
+        origin_mm, counts = control_points(scan.grid, spacing_mm)
+        fine = Deformation(np.zeros((1, *counts, 3)), origin_mm, spacing_mm, np.zeros(1), np.zeros((1, 1)))
+        inverses = [np.linalg.pinv(matrix, rcond=1e-3) for matrix in fine.bases(scan.grid)]
+        coarse = self.deformation()
+        control_mm = np.stack([
+            np.einsum("kz,ly,mx,zyxi->klmi", *inverses, coarse.on_grid_mm(scan.grid, unit).astype(np.float64), optimize=True)
+            for unit in np.eye(len(self.control_mm))
+        ])  # fmt: skip
+        return replace(self, control_mm=control_mm, origin_mm=origin_mm, spacing_mm=spacing_mm)
+
+
+@dataclass(eq=False)
+class FieldProblem:
+    """The frames of a scan under a motion model, as a function of the field. bending: γ, relative to the response of the
+    frames to a control vector."""
+
+    rt: Runtime
+    scan: Scan
+    motion: Motion
+    bending: float
+    tables: list[TimeCells] = field(init=False)
+    times_s: np.ndarray = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.tables = [self.motion.cells(self.scan, f).still() for f in range(self.scan.frames)]
+        self.times_s = np.concatenate([table.time_s for table in self.tables])
+
+    @property
+    def measured(self) -> np.ndarray:
+        """The frames (F, rows, columns), 0 at pixels that are not valid."""
+        return self._masked(self.scan.projections)
+
+    def operator(
+        self, one: MotionField, tables: list[TimeCells] | None = None, warp: VolumeWarp | None = None
+    ) -> WarpedOperator:
+        """Returns the projector of a field; of other ``tables`` of the same times with its ``warp``."""
+        if warp is None:
+            states = MotionStates.of_times(one.deformation(), self.scan.grid, self.times_s, _LEAST_VOXELS)
+            warp = VolumeWarp(self.rt, states)
+        shape = self.scan.geometry.detector_shape
+        return WarpedOperator(self.rt, self.scan.grid, shape, tables or self.tables, warp=warp)
+
+    def residual(self, one: MotionField, volume: np.ndarray) -> np.ndarray:
+        """Returns p − A v (F, rows, columns) at the valid pixels, 0 elsewhere."""
+        return self._masked(self.scan.projections - self.operator(one).forward(volume))
+
+    def space_step(self, one: MotionField, volume: np.ndarray) -> MotionField:
+        """Returns the field after a step on its control vectors, or the field itself."""
+        operator = self.operator(one)
+        residual = self._masked(self.scan.projections - operator.forward(volume))
+        derivative = FieldDerivative(operator, volume)
+
+        def normal(change: np.ndarray) -> np.ndarray:
+            return derivative.adjoint(self._masked(derivative.forward(change)))
+
+        probe = np.random.default_rng(0).choice([-1.0, 1.0], one.control_mm.shape)
+        response = float(np.vdot(probe, normal(probe))) / probe.size
+        if not response > 0:
+            return one
+        bend, weight = Bending(one.control_mm.shape[1:4]), self.bending * response
+
+        def system(change: np.ndarray) -> np.ndarray:
+            return normal(change) + weight * bend(change) + _DAMPING * response * change
+
+        def penalty(other: MotionField) -> float:
+            return weight * float(np.vdot(other.control_mm, bend(other.control_mm)))
+
+        downhill = derivative.adjoint(residual) - weight * bend(one.control_mm)
+        step = conjugate_gradients(system, downhill, _CG_STEPS)
+        candidates = (replace(one, control_mm=one.control_mm + share * step) for share in _SHORTER)
+        return self._first_better(one, residual, candidates, volume, penalty)
+
+    def time_step(self, one: MotionField, volume: np.ndarray) -> MotionField:
+        """Returns the field after a step on the coefficients of its weights, or the field itself."""
+        operator = self.operator(one)
+        residual = self._masked(self.scan.projections - operator.forward(volume))
+        hessian, downhill = self._temporal_equations(one, operator, volume, residual)
+        count, rank = one.temporal.shape
+        responses = [float(np.trace(hessian[:, r, :, r])) / count for r in range(rank)]
+        if not min(responses) > 0:
+            return one
+        smooth, rough = np.zeros_like(hessian), one.splines.roughness()
+        for r, response in enumerate(responses):
+            smooth[:, r, :, r] = _ROUGHNESS * response * rough
+        damping = np.diag(np.tile(_DAMPING * np.array(responses), count))
+        square, size = smooth.reshape(count * rank, -1), count * rank
+        now = one.temporal.ravel()
+        step = np.linalg.solve(hessian.reshape(size, size) + square + damping, downhill.ravel() - square @ now)
+
+        def penalty(other: MotionField) -> float:
+            return float(other.temporal.ravel() @ square @ other.temporal.ravel())
+
+        candidates = (replace(one, temporal=one.temporal + share * step.reshape(count, rank)) for share in _SHORTER)
+        return self._first_better(one, residual, candidates, volume, penalty).scaled()
+
+    def _temporal_equations(
+        self, one: MotionField, operator: WarpedOperator, volume: np.ndarray, residual: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Returns JᵀJ (count, R, count, R) and Jᵀ r (count, R) of the temporal coefficients.
+
+        Splines that no frame sees together are projected together: every ``colours``-th one."""
+        count, rank = one.temporal.shape
+        spans_s = max(float(np.ptp(table.time_s)) for table in self.tables)
+        colours = min(count, _SUPPORT + int(np.ceil(spans_s / one.splines.step_s)) + 1)
+        values = [one.splines.at(table.time_s) for table in self.tables]
+        derivative = FieldDerivative(operator, volume)
+        frames = np.empty((colours, rank, *residual.shape), np.float32)
+        owners = np.full((self.scan.frames, colours), -1)
+        for colour in range(colours):
+            members = np.arange(colour, count, colours)
+            tables = [
+                replace(table, weight=table.weight * value[:, members].sum(1))
+                for table, value in zip(self.tables, values, strict=True)
+            ]
+            for f, value in enumerate(values):
+                seen = members[value[:, members].any(0)]
+                owners[f, colour] = seen[0] if seen.size else -1
+            derivative.operator = self.operator(one, tables, operator.warp)
+            frames[colour] = [self._masked(each) for each in derivative.by_weights()]
+        hessian, downhill = np.zeros((count, rank, count, rank)), np.zeros((count, rank))
+        for f in range(self.scan.frames):
+            chosen = np.flatnonzero(owners[f] >= 0)
+            places, responses = owners[f, chosen], frames[chosen, :, f].astype(np.float64)
+            products = np.einsum("arvu,bsvu->abrs", responses, responses, optimize=True)
+            for row, a in enumerate(places):
+                downhill[a] += np.einsum("rvu,vu->r", responses[row], residual[f])
+                for column, b in enumerate(places):
+                    hessian[a, :, b] += products[row, column]
+        return hessian, downhill
+
+    def _first_better(
+        self, one: MotionField, residual: np.ndarray, candidates: Iterable[MotionField], volume: np.ndarray,
+        penalty: Callable[[MotionField], float],
+    ) -> MotionField:  # fmt: skip
+        """Returns the first candidate whose misfit and penalty are smaller than those of ``one``, else ``one``."""
+        before = sum_squares(residual) + penalty(one)
+        for candidate in candidates:
+            if candidate.deformation().smallest_determinant() < _LEAST_DETERMINANT:
+                continue
+            if sum_squares(self.residual(candidate, volume)) + penalty(candidate) < before:
+                return candidate
+        return one
+
+    def _masked(self, frames: np.ndarray) -> np.ndarray:
+        return np.asarray(np.where(self.scan.valid, frames, np.float32(0)))
+
+
+def sum_squares(values: np.ndarray) -> float:
+    """Returns Σ x² in float64."""
+    return float(np.square(values, dtype=np.float64).sum())
+
+
+def conjugate_gradients(apply: Callable[[np.ndarray], np.ndarray], right: np.ndarray, steps: int) -> np.ndarray:
+    """Returns an approximate solution of A x = b after so many steps from 0, fewer where the residual falls to 1 %."""
+    solution, residual = np.zeros_like(right), right.copy()
+    direction, squares = residual.copy(), sum_squares(residual)
+    least = 1e-4 * squares
+    for _ in range(steps):
+        if not squares > least:
+            break
+        applied = apply(direction)
+        share = squares / float(np.vdot(direction, applied))
+        solution += share * direction
+        residual -= share * applied
+        before, squares = squares, sum_squares(residual)
+        direction = residual + squares / before * direction
+    return solution

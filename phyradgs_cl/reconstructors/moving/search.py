@@ -1,0 +1,163 @@
+"""The search for the displacement field of a moving object: rounds that improve the volume, the field, and its weights.
+
+Each round makes a few passes of ``fista`` with the present field, then a Gauss-Newton step on the field, and one on its
+weights (``field.py``). It works on a coarse copy of the scan. Motion and image together: J. Wang and X. Gu, Simultaneous
+motion estimation and image reconstruction (SMEIR) for 4D cone-beam CT, Med. Phys. 40, 101912 (2013)."""
+
+import math
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from phyradgs_cl.acquisition import Motion, Scan
+from phyradgs_cl.acquisition.altered.coarse import SMOOTHING, binned, fewer_frames, smooth
+from phyradgs_cl.fields import Deformation, Grid, triple
+from phyradgs_cl.reconstructors.checkpoint import State, check_like, count_of
+from phyradgs_cl.reconstructors.moving.field import FieldProblem, MotionField, sum_squares
+from phyradgs_cl.reconstructors.moving.signal import MotionSignal
+from phyradgs_cl.reconstructors.moving.splines import TemporalSplines
+from phyradgs_cl.reconstructors.voxels.fista import FistaOptions, fista_stages
+from phyradgs_cl.reconstructors.voxels.run import MethodInputs
+from phyradgs_cl.runtime import Runtime
+
+_MOST_COLUMNS, _MOST_VOXELS, _MOST_FRAMES = 64, 32, 600  # of the coarse scan
+_FIRST_PASSES, _PASSES = 8, 3  # of fista, at rest and in a round
+_COARSE_SPACINGS, _FINE_SPACINGS = 2, 4  # of control points along the box's longest side
+_FINE_BENDING = (_FINE_SPACINGS / _COARSE_SPACINGS) ** 4  # times as stiff in terms of coefficients is as stiff in mm
+_COARSE_SHARE = 0.6  # of the rounds
+_KNOTS_PER_PERIOD, _FREE_KNOTS = 6, 6
+_LEAST_GAIN = 0.02  # of the squared residual: less does not show a motion
+_AT_REST = "no motion found"
+
+
+def coarse_scan(scan: Scan) -> Scan:
+    """Returns the scan with blocks of pixels, few voxels in the same box, and at most 600 frames."""
+    block = math.ceil(max(scan.geometry.detector_shape) / _MOST_COLUMNS)
+    small = binned(smooth(fewer_frames(scan, _MOST_FRAMES), SMOOTHING * block if block > 1 else 0.0), block)
+    sides_mm, longest_mm = scan.grid.size_mm, max(scan.grid.size_mm)
+    least_mm = max(longest_mm / _MOST_VOXELS, min(scan.grid.voxel_size_mm))
+    shape = triple(max(1, round(side / least_mm)) for side in sides_mm)
+    grid = Grid(shape, triple(side / n for side, n in zip(sides_mm, shape, strict=True)), scan.grid.offset_mm)
+    return replace(small, grid=grid)
+
+
+def initial_field(scan: Scan, signal: MotionSignal, last_s: float, first_s: float) -> MotionField:
+    """Returns a field at rest whose weights follow the signal where it repeats, else go on steadily."""
+    spacing_mm = max(scan.grid.size_mm) / _COARSE_SPACINGS
+    if signal.period_s is not None:
+        between_s = float(np.median(np.diff(signal.times_s)))
+        splines = TemporalSplines.of_step(first_s, last_s, max(signal.period_s / _KNOTS_PER_PERIOD, between_s))
+        return MotionField.at_rest(scan, spacing_mm, splines, splines.fit(signal.times_s, signal.pair()))
+    splines = TemporalSplines.of_step(first_s, last_s, (last_s - first_s) / _FREE_KNOTS)
+    times_s = splines.node_times_s
+    line = np.linspace(-1, 1, len(times_s))
+    return MotionField.at_rest(scan, spacing_mm, splines, splines.fit(times_s, np.stack([line, line**2], -1)))
+
+
+@dataclass(frozen=True)
+class Finding:
+    """What the search has found. deformation: None of an object at rest. gain: by how much the squared residual falls when
+    the object may move."""
+
+    deformation: Deformation | None
+    gain: float
+
+
+class FieldSearch:
+    """The search as a ``Stepwise`` of so many rounds on a scan made coarse. bending: as in ``FieldProblem``."""
+
+    quantity, remedy = "residual", "check the scan for extreme values"
+
+    def __init__(
+        self, rt: Runtime, scan: Scan, motion: Motion, signal: MotionSignal, rounds: int, bending: float
+    ) -> None:
+        self.rt, self.scan, self.iterations, self.iteration = rt, coarse_scan(scan), rounds, 0
+        self.motion = motion
+        self.problem = FieldProblem(rt, self.scan, motion, bending)
+        times_s = self.problem.times_s
+        self.field = initial_field(self.scan, signal, float(times_s.max()), float(times_s.min()))
+        self.volume = np.zeros(self.scan.grid.shape, np.float32)
+        self.relative, self.change = 0.0, 0.0
+        self._coarse_rounds = math.ceil(_COARSE_SHARE * rounds)
+
+    @property
+    def finished(self) -> str | None:
+        """The first rounds of an object at rest find no step that lowers the residual."""
+        return _AT_REST if self.iteration >= 2 and not self.field.control_mm.any() else None
+
+    def step(self) -> None:
+        if self.iteration == 0:
+            self.volume = self._reconstructed(self.field, None, _FIRST_PASSES)
+        elif self.field.control_mm.any():
+            self.volume = self._reconstructed(self.field, self.volume, _PASSES)
+        if self.iteration == self._coarse_rounds:
+            self._refine()
+        before = self.field
+        self.field = self.problem.space_step(self.field, self.volume)
+        if self.iteration > 0 and self.field.control_mm.any():
+            self.field = self.problem.time_step(self.field, self.volume)
+        self.change = _difference(self.field, before)
+        self.relative = self._misfit(self.field, self.volume) / max(sum_squares(self.problem.measured), 1e-30)
+        self.iteration += 1
+
+    def _refine(self) -> None:
+        self.field = self.field.refined(self.scan, max(self.scan.grid.size_mm) / _FINE_SPACINGS)
+        self.problem.bending *= _FINE_BENDING
+
+    def measures(self) -> dict[str, float]:
+        return {"residual": self.relative**0.5, "change": self.change}
+
+    def state(self) -> dict[str, np.ndarray]:
+        one = self.field
+        return {
+            "control_mm": one.control_mm, "temporal": one.temporal, "coarse_volume": self.volume,
+            "fit": np.array([self.relative, self.change]), "iteration": np.array(self.iteration),
+        }  # fmt: skip
+
+    def restore(self, state: State) -> None:
+        iteration = count_of(state, "iteration", self.iterations)
+        if iteration > self._coarse_rounds:
+            self._refine()
+        check_like(state, self.state())
+        self.field = replace(self.field, control_mm=state["control_mm"], temporal=state["temporal"])
+        self.volume, self.iteration = state["coarse_volume"], iteration
+        self.relative, self.change = state["fit"].tolist()
+
+    def present_volume(self) -> tuple[np.ndarray, Grid]:
+        return self.volume, self.scan.grid
+
+    def finding(self) -> Finding:
+        """Compares the residual with that of an object at rest after the same passes, and returns the field if it is shown.
+
+        A gain must exceed what as many free numbers would explain in noise."""
+        if not self.field.control_mm.any():
+            return Finding(None, 0.0)
+        moving = self._reconstructed(self.field, self.volume, _PASSES)
+        resting_field = replace(self.field, control_mm=np.zeros_like(self.field.control_mm))
+        resting = self._reconstructed(resting_field, None, _FIRST_PASSES + _PASSES * self.iteration)
+        ratio: float = self._misfit(self.field, moving) / self._misfit(resting_field, resting)
+        gain = 1 - ratio
+        numbers = self.field.control_mm.size + self.field.temporal.size
+        least = max(_LEAST_GAIN, 2 * numbers / max(int(np.count_nonzero(self.scan.valid)), 1))
+        return Finding(self.field.deformation() if gain > least else None, gain)
+
+    def _misfit(self, one: MotionField, volume: np.ndarray) -> float:
+        return sum_squares(self.problem.residual(one, volume))
+
+    def _reconstructed(self, one: MotionField, volume: np.ndarray | None, passes: int) -> np.ndarray:
+        """Returns the volume after so many passes of ``fista`` on the coarse scan."""
+        options = FistaOptions(motion=self.motion, iterations=passes, subvoxels=1)
+        deformation = one.deformation() if one.control_mm.any() else None
+        inputs = MethodInputs(self.scan, options, self.rt, initial=volume, deformation=deformation)
+        (stage,) = fista_stages(inputs)
+        return stage.run(inputs).volume
+
+
+def _difference(one: MotionField, other: MotionField) -> float:
+    """Returns the change of the control vectors and weights between two rounds, relative to their size."""
+    pairs = [(one.control_mm, other.control_mm), (one.temporal, other.temporal)]
+    parts: list[Any] = [
+        sum_squares(new - old) / sum_squares(new) for new, old in pairs if new.shape == old.shape and new.any()
+    ]
+    return float(sum(parts)) ** 0.5
