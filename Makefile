@@ -4,7 +4,6 @@
 # make docs     the documentation as a site, in site/
 # make stress     runs killed fifty times each, injected faults, hostile files, laws on random scanners (hours)
 # make coverage   which lines the tests run, with PyTorch, Dask and MPI in one environment; fails below 95 %
-# make mutants    small defects put into three rooms, one after the other: which do their tests not notice?
 # make test-intel     the tests on Intel's OpenCL runtime for CPUs (x86-64 Linux; another 300 MB; SHAPE=--gpu-shape: as GPUs run)
 # make test-neural    the tests of naf and sax-nerf, and of deepinv, with PyTorch in an environment of its own
 # make test-browser   the page of a run in this machine's Chromium or Chrome; pictures in .venv-browser/pictures
@@ -26,7 +25,7 @@ TORCH  ?= torch==2.13.0
 BIN      := $(VENV)/bin
 PHYRADGS := $(BIN)/phyradgs
 
-.PHONY: demo test test-all docs stress coverage mutants test-browser test-cluster test-gpu-build gpu test-intel test-mpi test-neural test-oclgrind test-pocl-package test-spectrum clean
+.PHONY: demo test test-all docs stress coverage test-browser test-cluster test-gpu-build gpu test-intel test-mpi test-neural test-oclgrind test-pocl-package test-spectrum clean
 .DELETE_ON_ERROR:
 
 $(BIN)/python:
@@ -106,9 +105,6 @@ coverage: $(VENV)-coverage/.installed
 	$(VENV)-coverage/bin/python -m coverage run -m pytest
 	$(VENV)-coverage/bin/python -m coverage combine --quiet
 	$(VENV)-coverage/bin/python -m coverage report --fail-under=95
-
-mutants: $(VENV)/.installed-test
-	for room in acquisition objective optim; do $(BIN)/python -m tests.mutation $$room || exit 1; done
 
 # Wheels do not register with the OpenCL loader: a file that names the library does.
 $(VENV)-intel/vendors/intel.icd: $(VENV)-intel/.installed

@@ -4,7 +4,7 @@ import numpy as np
 
 import phyradgs_cl.api as phy
 
-PASSES, BATCH, LOGS = 20, 6, [3, 4, 5, 10]
+PASSES, BATCH, LOGS = 14, 6, [3, 4, 5, 10]
 RATES = np.repeat([0.004, 0.03, 0.02, 0.03], [3, 3, 4, 1])[:, None]  # of mean (mm), log scale, quaternion, log density
 
 
@@ -17,7 +17,7 @@ def adam(values, gradient, moments, rate, step):
 
 def refine(scan, pixels):
     """Fits Gaussians and views (F, 3) together; ``pixels`` (3,): turn and shifts that move a frame by about a pixel."""
-    rng, raw, views = np.random.default_rng(0), phy.initial_gaussians(scan, 1200).rows(), np.zeros((scan.frames, 3))
+    rng, raw, views = np.random.default_rng(0), phy.initial_gaussians(scan, 600).rows(), np.zeros((scan.frames, 3))
     raw[LOGS] = np.log(raw[LOGS])
     moments, of_views = np.zeros((2, *raw.shape)), np.zeros((2, *views.shape))
     units = pixels / (1, *scan.geometry.pixel_size_mm)
@@ -38,7 +38,7 @@ def refine(scan, pixels):
 
 
 if __name__ == "__main__":
-    scan = phy.simulate("foot", size=24, detector=48, views=60, exposure_deg=4.8)
+    scan = phy.simulate("foot", size=16, detector=32, views=48, exposure_deg=6.0)
     pitch_mm = scan.geometry.pixel_size_mm[0]
     pixels = np.array([2 * pitch_mm / scan.grid.size_mm[0], pitch_mm, pitch_mm])
     wrong = np.random.default_rng(1).normal(size=(scan.frames, 3)) * pixels

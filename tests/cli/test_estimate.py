@@ -116,7 +116,7 @@ def test_memory_is_what_a_run_holds(rt, estimated) -> None:
     assert found.device_bytes > before and found.host_bytes > 10_000_000
 
 
-@pytest.mark.parametrize("method", ["phyradgs", "fista-tv", "fdk"])
+@pytest.mark.parametrize("method", ["fista-tv", "fdk"])
 def test_the_command_says_time_and_memory(cli, scan, capsys, method) -> None:
     assert cli.run(["estimate", str(scan), "--method", method]) == 0
     text = capsys.readouterr().out
