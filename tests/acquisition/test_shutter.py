@@ -1,6 +1,5 @@
 """Times at which lines open, strips, and pulses: a line sees the part of its window in the pulse."""
 
-import math
 from dataclasses import replace
 from itertools import product
 
@@ -50,13 +49,6 @@ def test_strip_of_a_line_is_floor_r_times_m_over_h(direction) -> None:
             strip_of[start:stop] = strip
         order = np.arange(lines) if direction > 0 else np.arange(lines)[::-1]
         np.testing.assert_array_equal(strip_of, order * strips // lines)
-
-
-def test_nonsense_is_refused() -> None:
-    bad = (-1.0,), (math.nan,), (1.0, -0.1), (1.0, math.inf), (1.0, 0.1, "row"), (1.0, 0.1, "rows", 0)
-    for arguments in bad:
-        with pytest.raises(InputError):
-            Shutter(*arguments)
 
 
 SHAPE = (7, 10)

@@ -124,18 +124,6 @@ def test_without_exposure_and_readout_every_cell_is_the_static_one(strips, sub_i
         np.testing.assert_array_equal(cells.pose, np.broadcast_to(static.pose, cells.pose.shape))
 
 
-def test_counts_below_one_are_refused() -> None:
-    for strips, sub_intervals in ((0, 1), (1, 0), (-1, 5)):
-        with pytest.raises(InputError, match="strips|sub.intervals"):
-            micro_view_cells(ORBIT, Shutter(1.0), 0, 0.0, 7, strips, sub_intervals)
-        with pytest.raises(InputError, match="strips|sub.intervals"):
-            MicroViews(strips, sub_intervals)
-    with pytest.raises(InputError, match="time samples"):
-        per_line_cells(ORBIT, Shutter(1.0), 0, 0.0, 7, 0)
-    with pytest.raises(InputError, match="segments"):
-        exact_cells(ORBIT, Shutter(1.0), 0, 0.0, 7, 0)
-
-
 def scan(is_fly: bool) -> Scan:
     shutter, start_s = Shutter(0.8, 0.3, "columns"), np.array([0.0, START_S])
     frames = np.zeros((2, *SHAPE), np.float32)

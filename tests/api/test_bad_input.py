@@ -151,10 +151,14 @@ ARGUMENTS: list[tuple[str, Callable[..., object], dict[str, list[Any]]]] = [
     ("static_scan", partial(static_scan, FRAMES, CONE, ANGLES), {"exposure_deg": [3.0], "flat": [1], "lag": [2.0]}),
     ("Scan", partial(replace, GOOD), {
         "projections": [NAN, [[1], [1, 2]]], "trajectory": [3], "shutter": [1.0], "frame_start_s": [[0.0]],
-        "pixel_mask": [np.ones(6)], "title": [3], "reference": [np.ones((2, 2, 2))],
+        "pixel_mask": [np.ones(6)], "title": [3], "reference": [np.ones((2, 2, 2))], "lag": [-0.001, 0.901, np.nan],
     }),
     ("Scan", partial(Scan.from_poses, FRAMES, POSES), {"is_fly": [True]}),
-    ("Shutter", partial(Shutter, 1.0), {"pulse_s": [(3.0, 1.0), 3.0]}),
+    ("Shutter", partial(Shutter, 1.0), {"pulse_s": [(3.0, 1.0), 3.0], "readout_s": [-0.1, np.inf]}),
+    ("ConeGeometry", partial(replace, CONE), {
+        "source_to_axis_mm": [0.0, np.nan], "source_to_detector_mm": [0.0, -1.0], "detector_shape": [(0, 5)],
+        "pixel_size_mm": [(0.5, 0.0), (0.5,), 0.0], "detector_offset_mm": [(np.inf, 0.0)],
+    }),
     ("Exact", Exact, {"segments": [1.5], "time_error": [0]}),
     ("LineMiddles", partial(reconstruct, GOOD, "sirt"), {"motion": [api.LineMiddles()]}),
     ("Static", partial(reconstruct, GOOD, "sirt"), {"motion": [api.Static]}),
@@ -231,7 +235,9 @@ CASES: dict[str, list[tuple[str, Callable[[], object]]]] = {
         ("detector_shape", lambda: ParallelGeometry((6, 0), 1.0)),
         ("trajectory", lambda: replace(GOOD, geometry=ParallelGeometry((6, 8), 0.2))),
     ],
-    "Shutter": [("exposure_s", lambda: Shutter("1"))],
+    "Shutter": [
+        ("", partial(Shutter, *given)) for given in (("1",), (-1.0,), (np.nan,), (1.0, 0.1, "row"), (1.0, 0.1, "rows", 0))
+    ],
     "CircularOrbit": [
         ("kinematics", lambda: CircularOrbit(CONE, 3.0)),
         ("geometry", lambda: CircularOrbit(5.0, ConstantSpeed(0.0, 1.0))),
@@ -239,15 +245,21 @@ CASES: dict[str, list[tuple[str, Callable[[], object]]]] = {
     "ConstantSpeed": [("speed_rad_per_s", lambda: ConstantSpeed(0.0, np.nan))],
     "SpeedRamp": [("acceleration_rad_per_s2", lambda: SpeedRamp(0.0, 1.0, "1"))],
     "EncoderTable": [
+        *(("encoder table", partial(EncoderTable, *given)) for given in (
+            ([0.0], [0.0]), ([0.0, 1.0], [0.0]), ([0.0, 0.0], [0.0, 1.0]), ([1.0, 0.0], [0.0, 1.0]), ([0.0, np.nan], [0, 1]),
+        )),
         ("encoder table", lambda: EncoderTable([0.0, 1.0], [0.0, 1.0]).angle_rad(0, np.array([2.0]))),
     ],
     "FrameSweeps": [("angle_start_rad", lambda: FrameSweeps([0.0, 1.0], 1.0, [0.0], [1.0]))],
     "PoseTable": [
         ("pose table", lambda: PoseTable([0.0, 1.0], np.zeros((2, 12)))),
+        *(("pose table", partial(PoseTable, *given)) for given in (
+            ([0.0, 1.0], POSES), (range(4), POSES[:, :11]), ([0, 1, 1, 2], POSES), (range(4), POSES * np.nan),
+        )),
         ("pose table", lambda: reconstruct(BACKWARDS, "fdk")),
     ],
     "TimeCells": [("motion OnePose: pose", lambda: reconstruct(GOOD, "sirt", motion=OnePose()))],
-    "MicroViews": [("strips", lambda: MicroViews(2.5))],
+    "MicroViews": [("", partial(MicroViews, *given)) for given in ((2.5,), (0, 1), (1, 0), (-1, 5))],
     "Centres": [("strips", lambda: Centres(0)), ("motion", lambda: reconstruct(GOOD, "sirt", motion=Centres()))],
     "OwnTimes": [("sub_intervals", lambda: OwnTimes(0))],
     "PerRow": [("sub_intervals", lambda: PerRow(0))],
@@ -260,11 +272,18 @@ CASES: dict[str, list[tuple[str, Callable[[], object]]]] = {
         ("grid shape", lambda: Grid(16, 1.0)), ("grid voxel_size", lambda: Grid((4, 4, 4), (1.0, 1.0))),
         ("grid shape", lambda: Grid((1000000.0, 1000000.0, 1000000.0), (1, 1, 1))),
         ("count", lambda: Grid.cube(0, 2.0)),
+        *(("grid", partial(Grid, *given)) for given in (
+            ((0, 3, 4), (1, 1, 1)), ((3, 4), (1, 1, 1)), ((2, 3, 4), (1, 0, 1)), ((2, 3, 4), (1, np.nan, 1)),
+            ((2, 3, 4), (1, 1, 1), (0, np.inf, 0)),
+        )),
     ],
     "Deformation": [
-        ("deformation control_mm", lambda: still(control_mm=np.zeros((1, 2, 2, 2)))),
-        ("deformation spacing_mm", lambda: still(spacing_mm=0.0)), ("deformation times_s", lambda: still(times_s=[1, 1])),
-        ("deformation weights", lambda: still(weights=np.full((2, 1), np.nan))),
+        *((f"deformation {name}", partial(still, **{name: value})) for name, value in (
+            ("control_mm", np.zeros((1, 2, 2, 2))), ("control_mm", np.zeros((0, 2, 2, 2, 3))), ("times_s", []),
+            ("control_mm", np.full((1, 2, 2, 2, 3), np.nan)), ("origin_mm", (0.0, 1.0)), ("spacing_mm", 0.0),
+            ("spacing_mm", (1.0, -1.0, 1.0)), ("times_s", [1, 1]), ("weights", np.zeros((3, 1))),
+            ("weights", np.full((2, 1), np.nan)),
+        )),
         ("weights", lambda: still().displacement_mm(np.zeros((1, 3)), [1.0, 2.0])),
     ],
     "deformed": [
@@ -286,6 +305,7 @@ CASES: dict[str, list[tuple[str, Callable[[], object]]]] = {
         ("Gaussians' quaternion", lambda: Gaussians(np.zeros((2, 3)), np.ones((2, 3)), np.ones((2, 3)), np.ones(2))),
         ("Gaussians' mean", lambda: Gaussians(np.zeros(3), ONE, ONE, ONE)),
         ("Gaussians' scale", lambda: cloud(scale=np.full((1, 3), -2.0))),
+        *(("Gaussians'", partial(cloud, **{name: np.ones((5, 2))})) for name in ("mean", "scale", "quaternion", "density")),
         ("Gaussians' density", lambda: cloud(density=np.array([np.inf]))),
     ],
     "Reconstruction": [
@@ -324,6 +344,7 @@ CASES: dict[str, list[tuple[str, Callable[[], object]]]] = {
         ("phantom", lambda: api.simulate(np.ones((2, 2, 2)))),
         ("jitter_deg", lambda: api.simulate("foot", size=8, detector=8, jitter_deg=-1)),
         ("noise", lambda: api.simulate("foot", size=8, noise="loud")),
+        ("peak", lambda: api.simulate("foot", size=8, peak=-1.0)),
     ],
     "load_scan": [("nowhere.h5", lambda: api.load_scan("nowhere.h5")), ("path", lambda: api.load_scan(3))],
     "load_volume": [("nowhere.h5", lambda: api.load_volume("nowhere.h5"))],

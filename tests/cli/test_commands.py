@@ -119,21 +119,6 @@ def test_columns_intensity_jitter_pulse_and_lag_are_simulated(cli, reconstructed
     assert "averages intensity" not in caplog.text  # none of these merges poses without a model of intensity
 
 
-def test_switches_win_over_assignments_and_both_over_the_file(scan, reconstructed, tmp_path):
-    config = tmp_path / "run.toml"
-    config.write_text(
-        "method = 'phyradgs'\niterations = 7.0\ngaussians = 50\nseed = 3.0\ndevice = 0\nstrips = 2.0\nsub_intervals = 3\n"
-        "ssim_weight = 0.1\n[rates]\nposition = [1e-3, 1e-4]\ndensity = [1e-2, 1e-3]\n"
-    )
-    given = ["--set", "rates.position=[2e-3, 2e-4]", "--set", "ssim_weight=0.3", "--set", "iterations=5"]
-    facts = facts_of(reconstructed(scan, "--config", str(config), *given, "--iterations", "2"))
-    options, motion = facts["options"], facts["options"]["motion"]
-    found = [options[name] for name in ("iterations", "ssim_weight", "gaussians")]
-    assert (*found, facts["seed"]) == (2, 0.3, 50, 3)
-    assert (motion["name"], motion["strips"], motion["sub_intervals"]) == ("micro-views", 2, 3)
-    assert (options["rates"]["position"], options["rates"]["density"]) == ([2e-3, 2e-4], [1e-2, 1e-3])
-
-
 def test_more_gaussians_than_voxels_are_said_and_kept(scan, reconstructed, caplog):
     facts = facts_of(reconstructed(scan, "--method", "phyradgs", "--iterations", "1", "--gaussians", "100000"))
     assert facts["gaussians_asked"] == 100_000 and 0 < facts["gaussians_first"] < 16**3

@@ -78,16 +78,3 @@ def test_smallest_determinant_is_that_of_the_worst_state() -> None:
     assert field.smallest_determinant() == pytest.approx(expected, abs=0.5)
     assert a_deformation(0.0).smallest_determinant() == 1
     assert a_deformation(20.0).smallest_determinant() < 0
-
-
-@pytest.mark.parametrize(("name", "value"), [
-    ("control_mm", np.zeros((1, 2, 2, 2))), ("control_mm", np.zeros((0, 2, 2, 2, 3))),
-    ("control_mm", np.full((2, 2, 2, 2, 3), np.nan)), ("origin_mm", (0.0, 1.0)), ("spacing_mm", 0.0),
-    ("spacing_mm", (1.0, -1.0, 1.0)), ("times_s", np.array([0.0, 2.0, 2.0])), ("times_s", np.zeros(0)),
-    ("weights", np.zeros((3, 1))), ("weights", np.full((3, 2), np.inf)),
-])  # fmt: skip
-def test_wrong_values_are_refused(name: str, value: object) -> None:
-    field = a_deformation()
-    values = {key: getattr(field, key) for key in ("control_mm", "origin_mm", "spacing_mm", "times_s", "weights")}
-    with pytest.raises(InputError, match=f"deformation {name}"):
-        Deformation(**(values | {name: value}))

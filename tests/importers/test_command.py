@@ -15,7 +15,7 @@ from typer.testing import CliRunner
 from phyradgs_cl.acquisition import Shutter
 from phyradgs_cl.commands.import_scan import EXAMPLES, import_command
 from phyradgs_cl.detector import counts_to_attenuation
-from phyradgs_cl.errors import InputError, OutputError
+from phyradgs_cl.errors import InputError
 from phyradgs_cl.importers import FORMATS, import_scan
 from phyradgs_cl.importers.options import FIELDS, option_name
 from phyradgs_cl.io import read_scan
@@ -67,18 +67,6 @@ def test_timing_and_geometry_by_options(run, imported, tmp_path, make_truth) -> 
     cone = ["--source-to-axis-mm", "500", "--source-to-detector-mm", "800", "--detector-offset", "4,-6"]
     run(path, *cone, "--pixel-size-mm", "3,2.5", "--rotates", "sample", "--row-0", "top")
     np.testing.assert_allclose(imported().projections, make_truth().scan.projections, atol=1e-5)
-
-
-def test_an_existing_output_survives_an_error(run, tmp_path, make_truth) -> None:
-    """And the input is not overwritten."""
-    path, out = w.write_r2(tmp_path / "r2", make_truth()), tmp_path / "scan.h5"
-    out.write_bytes(b"precious")
-    (path / "proj_train" / "0000.npy").unlink()
-    assert isinstance(run(path, ok=False).exception, InputError)
-    assert out.read_bytes() == b"precious" and not list(tmp_path.glob(".*"))
-    path = w.write_data_exchange(tmp_path / "dx.h5", make_truth())
-    assert isinstance(run(path, out=path, ok=False).exception, InputError)
-    assert isinstance(run(path, out=tmp_path / "none" / "scan.h5", ok=False).exception, OutputError)
 
 
 def test_formats_and_options_are_described() -> None:

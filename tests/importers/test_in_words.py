@@ -97,36 +97,6 @@ def test_what_a_file_lacks_is_asked_for_in_the_words_of_the_door(run, tmp_path, 
         import_scan(w.write_rtk(tmp_path / "rtk", make_truth()), ImportOptions(exposure_s=0.4))
 
 
-def test_absurd_sizes_are_refused_at_import(run, tmp_path, make_truth, caplog) -> None:
-    data = w.write_data_exchange(tmp_path / "dx.h5", make_truth())
-    cone = ("--source-to-axis-mm", "500", "--source-to-detector-mm", "800")
-    assert "--pixel-size-mm: found pixels of 1560 × 1560 mm" in run(data, *cone, "--pixel-size-mm", "1560")[2]
-    folder = w.write_tiff(tmp_path / "tiff", make_truth())
-    good = (folder / "scan.toml").read_text()
-    for pattern, replacement, said in (
-        (r"pixel_size_u_mm = .*", "pixel_size_u_mm = 1560", "[detector] pixel_size_v_mm, pixel_size_u_mm: found"),
-        (r"shape = .*\nsize_mm = .*", "shape = [1, 1, 1]\nsize_mm = [585, 585, 585]", "[volume]: found 1×1×1 voxels"),
-    ):
-        (folder / "scan.toml").write_text(re.sub(pattern, replacement, good))
-        assert said in run(folder)[2]
-    many = w.write_tiff(tmp_path / "many", make_truth(), angles=f"values_deg = {np.linspace(0, 5.8, 12).tolist()}")
-    for i in range(6, 12):
-        tifffile.imwrite(many / f"proj_{i}.tif", tifffile.imread(many / "proj_0.tif"))
-    run(many)
-    assert "[angles]: 12 frames within 5.8°: are they radians?" in caplog.text
-
-
-def test_distances_in_metres_are_blamed_and_not_the_pixels(run, tmp_path, make_truth, caplog) -> None:
-    data = w.write_data_exchange(tmp_path / "dx.h5", make_truth())
-    status, _, error = run(data, "--source-to-axis-mm", "0.5", "--source-to-detector-mm", "0.8")
-    assert status == 2 and error.count("\n") == 1 and "the panel stands" not in caplog.text
-    assert "--source-to-axis-mm, --source-to-detector-mm: found 0.5 and 0.8 mm, a panel seen under" in error
-    folder = w.write_tiff(tmp_path / "tiff", make_truth())
-    text = re.sub(r"to_(axis|detector)_mm = (\d)00.0", r"to_\1_mm = 0.\2", (folder / "scan.toml").read_text())
-    (folder / "scan.toml").write_text(re.sub(r"\[volume\](\n.* = .*)*", "", text))
-    assert "[source] to_axis_mm, [source] to_detector_mm: found 0.5 and 0.8 mm" in run(folder)[2]
-
-
 def test_import_says_which_flats_and_darks_it_applied_and_warns_of_none(run, tmp_path, make_truth, caplog) -> None:
     folder = w.write_tiff(tmp_path / "tiff", make_truth())
     assert "6 frames of 10×14, 2 flats and 3 darks applied, at rest, 0 pixels masked" in run(folder)[1]
@@ -140,11 +110,6 @@ def test_import_says_which_flats_and_darks_it_applied_and_warns_of_none(run, tmp
     assert "2 flats and 0 darks applied" in run(folder)[1]
     assert "scan.toml: counts without darks: an offset of the panel stays" in caplog.text
     assert "applied" not in run(w.write_r2(tmp_path / "r", make_truth()))[1]
-
-
-def test_counts_called_attenuation_are_refused(run, tmp_path, make_truth) -> None:
-    status, _, error = run(w.write_tiff(tmp_path / "tiff", make_truth()), "--quantity", "attenuation")
-    assert status == 2 and error.count("\n") == 1 and "--quantity: found line integrals of up to" in error
 
 
 def test_the_model_of_the_panel_may_stand_in_the_toml(run, tmp_path, make_truth) -> None:

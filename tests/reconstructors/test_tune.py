@@ -16,7 +16,7 @@ from phyradgs_cl.reconstructors import Preprocessing, Progress, RunPlan, method_
 from phyradgs_cl.reconstructors import reconstruct as run_method
 from phyradgs_cl.reconstructors.frames.projected import held_out
 from phyradgs_cl.reconstructors.result import HELD_OUT
-from phyradgs_cl.reconstructors.tune import TUNED, trials
+from phyradgs_cl.reconstructors.tune import TUNED
 from phyradgs_cl.report.page import report_page
 from phyradgs_cl.report.run import load_run
 
@@ -75,13 +75,6 @@ def test_the_choice_is_where_the_curve_is_least(rt, scan) -> None:
     last = reconstruct(scan, "cgls", device=rt, **{**SOME, "iterations": int(values[-1])}, noise_stop=0.0)
     least = reconstruct(scan, "cgls", device=rt, **{**SOME, "iterations": int(best)}, noise_stop=0.0)
     assert psnr_db(followed, scan) > psnr_db(least, scan) > psnr_db(last, scan)
-
-
-@pytest.mark.parametrize("errors, expected", [([4.0, 2.0, 1.0, 2.0, 4.0], 4.0), ([3.0, 2.0, 1.0, 1.0, 2.0], 4 * 2**0.5)])
-def test_between_values_a_parabola_is_least(errors, expected) -> None:
-    values = np.array([1.0, 2.0, 4.0, 8.0, 16.0])
-    assert trials._parabola_minimum(values, np.array(errors)) == pytest.approx(expected)
-    assert trials._parabola_minimum(values[:3], np.array(errors[:3])) == 4.0
 
 
 def test_a_run_that_goes_on_does_not_choose_again(rt, scan, file, cli, tmp_path, capsys) -> None:

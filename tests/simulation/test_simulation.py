@@ -17,11 +17,9 @@ from phyradgs_cl.fields import Grid
 from phyradgs_cl.phantoms import Ellipsoid, EllipsoidPhantom, shepp_logan
 from phyradgs_cl.simulation import (
     AnalyticSource,
-    FrameSource,
     SimulationOptions,
     VolumeSource,
     default_time_samples,
-    line_groups,
     phantom_scene,
     simulate,
 )
@@ -214,35 +212,6 @@ def test_jitter_moves_the_true_gantry_and_is_recorded() -> None:
     wander = shaken.trajectory.angle_rad(1, time_s) - steady.trajectory.angle_rad(1, time_s)
     assert 0 < np.abs(wander).max() < np.deg2rad(10)
     shaken.check_timing()  # the encoder covers every frame's window
-
-
-def test_line_groups_cover_every_line_once() -> None:
-    options = SimulationOptions(FLY, "columns", -1, time_samples=3)
-    tables = []
-
-    class Recorder(FrameSource):
-        def frame(self, cells, model, factor):
-            tables.append(cells)
-            return np.zeros(SHAPE, np.float32)
-
-    simulate(Recorder(), GEOMETRY, GRID, options)
-    groups = list(line_groups(tables[0]))
-    assert [(start, stop) for start, stop, _ in groups] == [(line, line + 1) for line in range(SHAPE[1])]
-    assert sorted(np.concatenate([members for _, _, members in groups])) == list(range(tables[0].count))
-    seen: list[tuple[int, int]] = []
-    run(SimulationOptions(FLY), report=lambda done, total: seen.append((done, total)))
-    assert seen == [(1, 3), (2, 3), (3, 3)]
-
-
-def test_impossible_options_are_named(rt) -> None:
-    for option, value in [
-        ("noise", "white"), ("peak", -1.0), ("peak", np.nan), ("dose", 0.0), ("electronic_noise", -1.0),
-        ("jitter_deg", np.inf), ("lag", 0.95), ("lag", np.nan), ("time_samples", -1),
-    ]:  # fmt: skip
-        with pytest.raises(InputError, match=f"--{option.replace('_', '-')}"):
-            SimulationOptions(**{option: value})
-    with pytest.raises(InputError, match="--pixel-samples"):
-        phantom_scene(rt, "shepp-logan", GEOMETRY, GRID, 16, "rows", 0, pixel_samples=0)
 
 
 def test_a_box_that_a_procedural_phantom_does_not_fill_is_said(rt, caplog) -> None:

@@ -5,14 +5,12 @@ import shutil
 import sys
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.io import checkpoint_path, read_volume, write_scan
+from phyradgs_cl.io import checkpoint_path, read_volume
 from phyradgs_cl.io.output import beside, shortened
 from phyradgs_cl.text import plain_text
-from phyradgs_cl.workflow.files import load_scan
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="file systems that take any bytes")
 BAD = os.fsdecode(b"bad\xff")
@@ -48,13 +46,3 @@ def test_a_scan_and_a_volume_of_that_name(tiny_scan, tmp_path, cli, stem, capfd)
     assert sorted(output.parent.iterdir()) == [output]
     assert "was not found" not in (tmp_path / "page.html").read_text()
     assert "Traceback" not in capfd.readouterr().err
-
-
-def test_a_title_with_a_nul_is_written_and_comes_back(tiny_scan, tmp_path) -> None:
-    from dataclasses import replace
-
-    scan = replace(load_scan(tiny_scan), title="a\0b\udcff", provenance={"imported_from": BAD})
-    write_scan(tmp_path / "scan.h5", scan)
-    again = load_scan(tmp_path / "scan.h5")
-    assert again.title == "a\ufffdb\ufffd" and again.provenance["imported_from"] == BAD
-    assert np.array_equal(again.projections, scan.projections)
