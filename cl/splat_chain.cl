@@ -2,7 +2,7 @@
    rotation and density. A work-item takes LANES Gaussians and walks the cells in a fixed order. */
 #include "common/precise.h"
 #include "common/gradient.h"
-#include "common/splat.h"
+#include "common/splat_state.h"
 #include "common/splat_sums.h"
 
 #if MOVING
@@ -39,6 +39,39 @@ static inline v3 torque_of(const v3 forth, const v3 back, const v3 s, const v3 i
                    torque_about(forth.z, back.z, s.x, s.y, inv.x, inv.y));
 }
 
+#if DEFORMED
+#define BY_PLACE by_place /* what a cell or the end of a segment adds to is a state's own */
+
+static inline void add_vector(__global float *rows, const int row, const int stride, const v3 by)
+{
+    __global float *at = rows + (size_t)row * stride;
+    V_STORE(V_LOAD(at) + by.x, at);
+    V_STORE(V_LOAD(at + stride) + by.y, at + stride);
+    V_STORE(V_LOAD(at + 2 * (size_t)stride) + by.z, at + 2 * (size_t)stride);
+}
+
+/* adds dL by G, of which the vectors ray, eu and ev in the Gaussian's own frame are R' G (from_source, eu, ev); by_log_det:
+   dL by log det G, whose derivative by G has G's cofactors over its determinant */
+static inline void add_by_pull(__global float *by_state, __global const float *state, const int stride, const frame3 axes,
+                               const v3 from_source, __global const float *cell, const v3 by_ray, const v3 by_eu, const v3 by_ev,
+                               const vf by_log_det)
+{
+    const v3 x = to_world(axes, by_ray), u = to_world(axes, by_eu), v = to_world(axes, by_ev);
+    const v3 eu = v3_make((vf)(cell[CELL_EU]), (vf)(cell[CELL_EU + 1]), (vf)(cell[CELL_EU + 2]));
+    const v3 ev = v3_make((vf)(cell[CELL_EV]), (vf)(cell[CELL_EV + 1]), (vf)(cell[CELL_EV + 2]));
+    const v3 a = state_vector(state, 3, stride), b = state_vector(state, 6, stride), c = state_vector(state, 9, stride);
+    const vf per = by_log_det / v3_dot(a, v3_cross(b, c));
+    add_vector(by_state, 3, stride, v3_add(v3_scale(v3_cross(b, c), per), v3_add(v3_scale(from_source, x.x),
+               v3_add(v3_scale(eu, u.x), v3_scale(ev, v.x)))));
+    add_vector(by_state, 6, stride, v3_add(v3_scale(v3_cross(c, a), per), v3_add(v3_scale(from_source, x.y),
+               v3_add(v3_scale(eu, u.y), v3_scale(ev, v.y)))));
+    add_vector(by_state, 9, stride, v3_add(v3_scale(v3_cross(a, b), per), v3_add(v3_scale(from_source, x.z),
+               v3_add(v3_scale(eu, u.z), v3_scale(ev, v.z)))));
+}
+#else
+#define BY_PLACE by_mean
+#endif
+
 __kernel void splat_chain(
     __global const float *gaussians,      /* (11, stride) */
     __global const float *cells,          /* (C, CELL) */
@@ -47,14 +80,16 @@ __kernel void splat_chain(
     __global const uchar *is_visible,     /* (stride, C) */
     const int cell_count, const int count, const int stride,
     const float half_width, const float half_lines,
-    __global float *gradients)            /* (13, stride) */
+    __global float *gradients,            /* (13, stride); DEFORMED: without the rows of the mean */
+    __global const float *states,         /* DEFORMED: (S, STATE_ROWS, stride) */
+    __global const int *cell_states,      /* (C, POSES) */
+    __global float *by_states)            /* DEFORMED: as states, zeros to which dL by them is added */
 {
     const int first = (int)get_global_id(0) * LANES;
     if (first >= stride)
         return;
     const gaussian g = gaussian_load(gaussians, first, stride);
-    const v3 mean = g.mean, scale = g.scale, inv_scale = g.inv_scale;
-    const frame3 axes = g.axes;
+    const v3 scale = g.scale, inv_scale = g.inv_scale;
     const vf det = scale.x * scale.y * scale.z;
 
     const vf zero = (vf)(0.0f);
@@ -102,6 +137,10 @@ __kernel void splat_chain(
 #endif
         const vf s_b = V_LOAD(fields + SUM_B * LANES), by_b1 = V_LOAD(fields + SUM_BU * LANES), by_b2 = V_LOAD(fields + SUM_BV * LANES);
 
+        __global const float *state = states + STATE_AT(cell_states[c * POSES], first, stride);
+        const gaussian seen = gaussian_in_state(g, state, stride);
+        const v3 mean = seen.mean;
+        const frame3 axes = seen.axes;
         __global const float *cell = cells + c * CELL;
         __global const coefficient *m = matrices + c * POSES * 12;
         /* lanes that are not drawn have sums of 0, and may be at the source: any other place keeps them from 0/0 */
@@ -113,9 +152,9 @@ __kernel void splat_chain(
         const v3 end = PARALLEL ? v3_make(zero, zero, zero) : mean;
         const v3 from_source = v3_make(end.x - cell[CELL_SOURCE], end.y - cell[CELL_SOURCE + 1],
                                        end.z - cell[CELL_SOURCE + 2]);
-        const v3 ray = to_local(axes, v3_make(V_PICK((vf)(1.0f), from_source.x, is_in_view),
-                                              V_PICK((vf)(0.0f), from_source.y, is_in_view),
-                                              V_PICK((vf)(0.0f), from_source.z, is_in_view)));
+        const v3 straight = v3_make(V_PICK((vf)(1.0f), from_source.x, is_in_view), V_PICK((vf)(0.0f), from_source.y, is_in_view),
+                                    V_PICK((vf)(0.0f), from_source.z, is_in_view));
+        const v3 ray = to_local(axes, straight);
         const v3 eu = to_local(axes, v3_make((vf)(cell[CELL_EU]), (vf)(cell[CELL_EU + 1]), (vf)(cell[CELL_EU + 2])));
         const v3 ev = to_local(axes, v3_make((vf)(cell[CELL_EV]), (vf)(cell[CELL_EV + 1]), (vf)(cell[CELL_EV + 2])));
         const v3 white = v3_mul(ray, inv_scale);
@@ -130,7 +169,8 @@ __kernel void splat_chain(
         vf drawn11 = s11, drawn12 = s12, drawn22 = s22, t_det = zero; /* S as drawn; derivative by log det S */
 #if FOOTPRINT
         /* S is drawn as (S + E det S) / delta and the amplitude over sqrt(delta): see widen_by_pixel */
-        const vf root_det = z * z * z * fabs((vf)(cell[CELL_VOLUME])) * rsqrt(kappa) / det;
+        const vf pulled_det = DEFORMED ? det / fabs(v3_dot(axes.a, v3_cross(axes.b, axes.c))) : det;
+        const vf root_det = z * z * z * fabs((vf)(cell[CELL_VOLUME])) * rsqrt(kappa) / pulled_det;
         const vf det_s = root_det * root_det;
         const vf inv_delta = 1.0f / (1.0f + PIXEL_VARIANCE * ((s11 + s22) + PIXEL_VARIANCE * det_s));
         drawn11 = (s11 + PIXEL_VARIANCE * det_s) * inv_delta;
@@ -175,7 +215,14 @@ __kernel void splat_chain(
         by_ray = v3_add(by_ray, by_white_s);
         forth = v3_add(forth, v3_add(turning(by_ray, ray), v3_add(turning(by_eu, eu), turning(by_ev, ev))));
         back = v3_add(back, v3_add(turning(ray, by_ray), v3_add(turning(eu, by_eu), turning(ev, by_ev))));
-#if AFFINE
+#if DEFORMED
+        v3 by_place = v3_make(zero, zero, zero);
+        __global float *by_state = by_states + (state - states);
+        add_by_pull(by_state, state, stride, g.axes, straight, cell, by_ray, by_eu, by_ev, 2.0f * t_det);
+#if AFFINE && !PARALLEL
+        by_place = v3_scale(straight, w / v3_dot(straight, straight)); /* a length, which the object's motion leaves alone */
+#endif
+#elif AFFINE
         by_ray = v3_add(by_ray, v3_scale(ray, w / v3_dot(ray, ray))); /* a length, which no turn changes */
 #endif
         by_s = v3_add(by_s, v3_scale(v3_mul(by_white_s, white), -1.0f));
@@ -193,20 +240,30 @@ __kernel void splat_chain(
         by_v0 += g_v0;
 
 #if !PARALLEL
-        by_mean = v3_add(by_mean, to_world(axes, by_ray));
+        BY_PLACE = v3_add(BY_PLACE, to_world(axes, by_ray));
 #endif
 #if MOVING
         /* the centre is the mean of the path's parabola, (end 0 + 4 middle + end 1) / 6; the path end 1 - end 0 */
-        add_by_centre(&by_mean, m, u0, v0, inv_z, 0.66666666667f * g_u0, 0.66666666667f * g_v0, by_z);
+        add_by_centre(&BY_PLACE, m, u0, v0, inv_z, 0.66666666667f * g_u0, 0.66666666667f * g_v0, by_z);
         const vf g_path_u = -2.0f * (along_u * s_tz + across_u * s_tc);
         const vf g_path_v = -2.0f * (along_v * s_tz + across_v * s_tc);
         for (int end = 0; end < 2; ++end) {
             __global const coefficient *n = m + 12 * (end + 1);
             const float sign = end ? 1.0f : -1.0f;
-            const vf inv = 1.0f / V_PICK((vf)(1.0f), wide_value(wide_dot(n + 8, mean.x, mean.y, mean.z)), is_in_view);
-            add_by_centre(&by_mean, n, wide_value(wide_dot(n, mean.x, mean.y, mean.z)) * inv,
-                          wide_value(wide_dot(n + 4, mean.x, mean.y, mean.z)) * inv, inv,
+            const size_t end_state = STATE_AT(cell_states[c * POSES + 1 + end], first, stride);
+            const v3 at = MEAN_IN_STATE(seen, states + end_state, stride);
+            const vf inv = 1.0f / V_PICK((vf)(1.0f), wide_value(wide_dot(n + 8, at.x, at.y, at.z)), is_in_view);
+#if DEFORMED
+            v3 by_end = v3_make(zero, zero, zero);
+#else
+#define by_end by_mean
+#endif
+            add_by_centre(&by_end, n, wide_value(wide_dot(n, at.x, at.y, at.z)) * inv,
+                          wide_value(wide_dot(n + 4, at.x, at.y, at.z)) * inv, inv,
                           0.16666666667f * g_u0 + sign * g_path_u, 0.16666666667f * g_v0 + sign * g_path_v, zero);
+#if DEFORMED
+            add_vector(by_states + end_state, 0, stride, by_end);
+#endif
         }
 #elif FIXED_CONIC
         /* the second pose places the centre, the first one has the depth of the conic and of the density */
@@ -216,7 +273,10 @@ __kernel void splat_chain(
                       wide_value(wide_dot(n + 4, mean.x, mean.y, mean.z)) * inv, inv, g_u0, g_v0, zero);
         add_by_centre(&by_mean, m, zero, zero, inv_z, zero, zero, by_z);
 #else
-        add_by_centre(&by_mean, m, u0, v0, inv_z, g_u0, g_v0, by_z);
+        add_by_centre(&BY_PLACE, m, u0, v0, inv_z, g_u0, g_v0, by_z);
+#endif
+#if DEFORMED
+        add_vector(by_state, 0, stride, by_place);
 #endif
     }
     __global float *out = gradients + first;

@@ -4,6 +4,7 @@
    splat_prepare: a cell is one pose, which with FIXED_CONIC places the centre only. splat_prepare_moving: a cell is a segment of the frame, in which the centre moves from
    one end to the other (common/splat_moving.h). Twin: operators/twins/splat.py. */
 #include "common/splat_view.h"
+#include "common/splat_state.h"
 #include "common/splat_moving.h"
 
 #define COMMON_FIELDS 9 /* floats of a record before its six ints; those of a moving splat follow them */
@@ -77,15 +78,18 @@ __kernel void splat_prepare(
     const float cutoff2,                  /* squared Mahalanobis radius; 0 = no cutoff */
     __global float *records,              /* (stride, C, RECORD), not changed where nothing is visible */
     __global uchar *is_visible,           /* (stride, C): 1 where a record was written */
-    __global int *extents)                /* (6, stride): u lo hi, v lo hi, 0 0 over all cells */
+    __global int *extents,                /* (6, stride): u lo hi, v lo hi, 0 0 over all cells */
+    __global const float *states,         /* DEFORMED: (S, STATE_ROWS, stride) */
+    __global const int *cell_states)      /* (C,): the state of each cell */
 {
     const int first = (int)get_global_id(0) * LANES;
     if (first >= stride)
         return;
-    const gaussian g = gaussian_load(gaussians, first, stride);
+    const gaussian reference = gaussian_load(gaussians, first, stride);
     const vi exists = V_INT((vf)(first) + V_IOTA) < count;
     pixel_box extent = empty_box();
     for (int c = 0; c < cell_count; ++c) {
+        const gaussian g = gaussian_in_state(reference, states + STATE_AT(cell_states[c], first, stride), stride);
 #if FIXED_CONIC
         const vf depth = project_centre(matrices + c * POSES * 12, g.mean).depth;
         const splat_centre centre = project_centre(matrices + (c * POSES + 1) * 12, g.mean);
@@ -127,13 +131,13 @@ typedef struct { vf u, v; vi is_in_front; } centre_path;
 
 /* Finds the path, and shifts the centre at mid-time so that the straight path is right in the mean: over t from -1/2 to 1/2
    a path bent by s t^2 has the mean s/12, a sixth of the sum of its ends. */
-ALWAYS_INLINE centre_path path_of(__global const coefficient *end_matrices, const v3 mean, splat_centre *middle)
+ALWAYS_INLINE centre_path path_of(__global const coefficient *end_matrices, const v3 means[2], splat_centre *middle)
 {
     centre_path path;
     vf u[2], v[2];
     path.is_in_front = (vi)(-1);
     for (int end = 0; end < 2; ++end) {
-        const splat_centre at = project_centre(end_matrices + 12 * end, mean);
+        const splat_centre at = project_centre(end_matrices + 12 * end, means[end]);
         u[end] = (at.u_whole - middle->u_whole) + (at.u_rest - middle->u_rest);
         v[end] = (at.v_whole - middle->v_whole) + (at.v_rest - middle->v_rest);
         path.is_in_front &= at.depth > 0.0f;
@@ -193,19 +197,24 @@ __kernel void splat_prepare_moving(
     __global const coefficient *matrices, /* (C, POSES, 12) */
     __global const int *cell_lines, const int cell_count, const int width, const float cutoff2,
     __global float *records, __global uchar *is_visible, __global int *extents,
+    __global const float *states,
+    __global const int *cell_states,      /* (C, POSES) */
     __global const float *line_times,     /* (C, TIME_ROWS, time_pitch) */
     const int time_pitch)
 {
     const int first = (int)get_global_id(0) * LANES;
     if (first >= stride)
         return;
-    const gaussian g = gaussian_load(gaussians, first, stride);
+    const gaussian reference = gaussian_load(gaussians, first, stride);
     const vi exists = V_INT((vf)(first) + V_IOTA) < count;
     pixel_box extent = empty_box();
     for (int c = 0; c < cell_count; ++c) {
+        const gaussian g = gaussian_in_state(reference, states + STATE_AT(cell_states[c * POSES], first, stride), stride);
+        const v3 end_means[2] = {MEAN_IN_STATE(g, states + STATE_AT(cell_states[c * POSES + 1], first, stride), stride),
+                                 MEAN_IN_STATE(g, states + STATE_AT(cell_states[c * POSES + 2], first, stride), stride)};
         __global const coefficient *matrix = matrices + c * POSES * 12;
         splat_centre centre = project_centre(matrix, g.mean);
-        const centre_path path = path_of(matrix + 12, g.mean, &centre);
+        const centre_path path = path_of(matrix + 12, end_means, &centre);
         const splat_view s = view_splat(g, cells + c * CELL, centre.depth);
         vi is_drawn = exists & s.is_drawn & path.is_in_front;
         /* the path in widths of the splat: its length and direction */

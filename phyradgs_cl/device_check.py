@@ -21,8 +21,10 @@ from phyradgs_cl.objective.dct_prox import FREQUENCY_CLASSES, Curves, DctProx, d
 from phyradgs_cl.objective.nonlocal_step import LARGEST, NonlocalStep, likeness_of, nonlocal_step
 from phyradgs_cl.objective.tv import TvDescent, TvProx, tv_descent, tv_prox
 from phyradgs_cl.operators.splats.binning import TileLists
+from phyradgs_cl.operators.splats.states import CloudStates, states_of
 from phyradgs_cl.operators.twins import rays as twins
 from phyradgs_cl.operators.twins.splat import moving_frame, splat_frame, splat_image, voxel_field
+from phyradgs_cl.operators.twins.splat_states import deformed_frame
 from phyradgs_cl.operators.twins.warp import warp_adjoint, warp_forward
 from phyradgs_cl.operators.warp.backproject import MovingBackprojector
 from phyradgs_cl.operators.warp.operator import WarpedOperator
@@ -130,6 +132,14 @@ def _splats(rt: Runtime) -> Iterator[Comparison]:
             yield from _frame_and_gradients(rt, table, twin, affine=affine)
 
 
+def _splats_of_moving_objects(rt: Runtime) -> Iterator[Comparison]:
+    control, times_s = 0.2 * (_noise((2, 4, 4, 4, 3), 24) - 0.5), np.array([0.0, 2.0])
+    one = Deformation(control, (-0.8,) * 3, 0.5, times_s, np.array([[1.0, 0.5], [-0.5, 1.0]]))
+    for table in _tables()[1:]:
+        twin = partial(deformed_frame, table=table, detector_shape=SHAPE, deformation=one)
+        yield from _frame_and_gradients(rt, table, twin, one)
+
+
 def _layered_splats(rt: Runtime) -> Iterator[Comparison]:
     table = _tables()[1]
 
@@ -143,11 +153,15 @@ def _layered_splats(rt: Runtime) -> Iterator[Comparison]:
 
 
 def _frame_and_gradients(
-    rt: Runtime, table: TimeCells, twin: Callable[[np.ndarray], np.ndarray], **options: float | bool
+    rt: Runtime, table: TimeCells, twin: Callable[[np.ndarray], np.ndarray], deformation: Deformation | None = None,
+    **options: float | bool,
 ) -> Iterator[Comparison]:
-    rows, h, cells = _cloud(), _noise(SHAPE, 2), operators.DeviceCells.upload(rt, table)
-    shape = table.readout.shape(SHAPE)
-    projector = operators.SplatProjector(rt, *shape, cutoff_sigma=0.0, time_error=1e-6, **options)  # type: ignore[arg-type]
+    rows, h, shape = _cloud(3 if deformation is None else 1), _noise(SHAPE, 2), table.readout.shape(SHAPE)
+    states = None if deformation is None else CloudStates(rt, deformation)
+    of_cells = None if deformation is None else states_of(table, deformation)
+    cells = operators.DeviceCells.upload(rt, table, of_cells)
+    exactly = {"cutoff_sigma": 0.0, "time_error": 1e-6, **options}
+    projector = operators.SplatProjector(rt, *shape, states=states, **exactly)  # type: ignore[arg-type]
     yield table.readout.frames(projector.project(rows, cells)), twin(rows), VALUE
     found = projector.project_adjoint(rows, cells, table.readout.frames(h))
     yield from _by_class(found, _differences(twin, rows, h))
@@ -321,8 +335,8 @@ def _optimiser(rt: Runtime) -> Iterator[Comparison]:
 
 
 CHECKS = (
-    _algebra, _binning, _splats, _layered_splats, _plain_splats, _voxels, _rays, _warps, _backprojections,
-    _moving_backprojections, _image_terms, _variation, _optimiser,
+    _algebra, _binning, _splats, _splats_of_moving_objects, _layered_splats, _plain_splats, _voxels, _rays, _warps,
+    _backprojections, _moving_backprojections, _image_terms, _variation, _optimiser,
 )  # fmt: skip
 """Ordered by dependence: a kernel that has agreed is not suspected later."""
 

@@ -13,6 +13,10 @@
 #define PARALLEL 0 /* rays of a cell have one direction; AFFINE, which is exact then, must be 1 */
 #endif
 
+#ifndef DEFORMED
+#define DEFORMED 0 /* Gaussians are in a state of an object that moves: common/splat_state.h */
+#endif
+
 #ifndef SPLAT_SPACE
 #define SPLAT_SPACE __global /* where records and constants of cells are read from */
 #endif

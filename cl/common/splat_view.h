@@ -46,8 +46,8 @@ ALWAYS_INLINE splat_view view_splat(const gaussian g, __global const float *cell
     splat_view s;
     const vf inv_det = g.inv_scale.x * g.inv_scale.y * g.inv_scale.z;
     const v3 end = PARALLEL ? v3_make((vf)(0.0f), (vf)(0.0f), (vf)(0.0f)) : g.mean;
-    const v3 ray = to_local(g.axes, v3_make(end.x - cell[CELL_SOURCE], end.y - cell[CELL_SOURCE + 1],
-                                            end.z - cell[CELL_SOURCE + 2]));
+    const v3 from_source = v3_make(end.x - cell[CELL_SOURCE], end.y - cell[CELL_SOURCE + 1], end.z - cell[CELL_SOURCE + 2]);
+    const v3 ray = to_local(g.axes, from_source);
     const v3 eu = to_local(g.axes, v3_make((vf)(cell[CELL_EU]), (vf)(cell[CELL_EU + 1]), (vf)(cell[CELL_EU + 2])));
     const v3 ev = to_local(g.axes, v3_make((vf)(cell[CELL_EV]), (vf)(cell[CELL_EV + 1]), (vf)(cell[CELL_EV + 2])));
     const v3 white = v3_mul(ray, g.inv_scale);
@@ -64,9 +64,13 @@ ALWAYS_INLINE splat_view view_splat(const gaussian g, __global const float *cell
     s.l11 = gu_length * factor;
     s.l12 = v3_dot(gu, gv) / gu_length * factor;
     s.l22 = z * z * z * fabs((vf)(cell[CELL_VOLUME])) * inv_det * root / s.l11;
+#if DEFORMED
+    s.l22 *= fabs(v3_dot(g.axes.a, v3_cross(g.axes.b, g.axes.c)));
+#endif
 #if AFFINE
     s.b1 = s.b2 = s.inv_kappa = (vf)(0.0f);
-    const vf ray_length = sqrt(v3_dot(ray, ray)) / z;
+    const v3 length_of = DEFORMED ? from_source : ray;
+    const vf ray_length = sqrt(v3_dot(length_of, length_of)) / z;
 #else
     s.b1 = z * inv_kappa * v3_dot(white, v3_mul(eu, g.inv_scale));
     s.b2 = z * inv_kappa * v3_dot(white, v3_mul(ev, g.inv_scale));

@@ -175,7 +175,7 @@ def exact_cells(
     end_poses = trajectory.pose(frame, ends_s)
     if np.all(end_poses == table.pose[0]) and np.all(table.pose == table.pose[0]):
         return static_cells(trajectory, shutter, frame, start_s, lines)
-    return replace(table, end_poses=end_poses, line_times=times[used][order])
+    return replace(table, end_poses=end_poses, end_times_s=ends_s, line_times=times[used][order])
 
 
 def _line_times(windows_s: np.ndarray, edges_s: np.ndarray) -> np.ndarray:

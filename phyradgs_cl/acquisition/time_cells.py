@@ -24,7 +24,8 @@ class TimeCells:
     (C, lines) multiplies the weight of a still cell by the fraction of each line's window that lies in the cell; None: 1 for
     every line of the cell.
 
-    Moving cells are segments of the frame, of ``weight`` 1. ``end_poses`` (C, 2, 12) are the poses at their ends.
+    Moving cells are segments of the frame, of ``weight`` 1. ``end_poses`` (C, 2, 12) are the poses at their ends, at
+    ``end_times_s`` (C, 2), which objects that move need.
     ``line_times`` (C, 3, lines) describes the part of each line's window in the segment: its middle and half its length, in
     units of the segment's length from its mid-time, and its fraction of the whole window. Methods raise InputError for
     user-defined cells that do not fit the scan. is_parallel: poses begin with the direction of parallel rays.
@@ -45,6 +46,7 @@ class TimeCells:
     line_share: "NDArray[np.float64] | None" = None
     is_parallel: bool = False
     conic_pose: np.ndarray | None = None
+    end_times_s: np.ndarray | None = None
 
     @property
     def count(self) -> int:

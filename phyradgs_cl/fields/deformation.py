@@ -5,7 +5,7 @@
 Pull convention: at time t the object has, at point y, the attenuation that the reference volume has at y + w(y, t).
 D. Rueckert et al., Nonrigid registration using free-form deformations, IEEE Trans. Med. Imaging 18, 712-721 (1999)."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy
@@ -83,6 +83,11 @@ class Deformation:
         rates_per_s = np.abs(np.diff(self.weights, axis=0)) / np.diff(self.times_s)[:, None]
         return float((rates_per_s @ self.reach_mm).max(initial=0.0))
 
+    def scaled(self, factor: float) -> "Deformation":
+        """Returns the deformation with all lengths multiplied by ``factor``."""
+        origin, spacing = (tuple(np.multiply(factor, three).tolist()) for three in (self.origin_mm, self.spacing_mm))
+        return replace(self, control_mm=factor * self.control_mm, origin_mm=origin, spacing_mm=spacing)
+
     def weights_at(self, times_s: "ArrayLike") -> np.ndarray:
         """Returns φ_r (n, R) at times (n,) in s."""
         times = np.atleast_1d(np.asarray(times_s, np.float64))
@@ -100,21 +105,16 @@ class Deformation:
 
     def jacobian(self, points_mm: "ArrayLike", weights: "ArrayLike") -> np.ndarray:
         """Returns ∂w_i/∂y_j (n, 3, 3) at points (n, 3), x y z, for one state's weights (R,)."""
-        control_mm = self._state(weights)
-        place = self._in_spacings(np.asarray(points_mm, np.float64))
-        first = np.floor(place).astype(np.int64) - 1  # of the four control points along an axis that reach the point
-        bases = [[_cubic(place - first - k), _cubic_slope(place - first - k) / self.spacing_mm] for k in range(4)]
-        shape = np.array(control_mm.shape[2::-1])  # x, y, z
-        result = np.zeros((len(place), 3, 3))
-        for taps in np.ndindex(4, 4, 4):  # of x, y, z
-            index = first + taps
-            inside = ((index >= 0) & (index < shape)).all(axis=1)
-            x, y, z = np.where(inside[:, None], index, 0).T
-            vectors = control_mm[z, y, x] * inside[:, None]
-            for j in range(3):
-                factors = [bases[taps[i]][int(i == j)][:, i] for i in range(3)]
-                result[:, :, j] += vectors * np.prod(factors, axis=0)[:, None]
-        return result
+        control_mm = np.pad(self._state(weights), [(1, 1)] * 3 + [(0, 0)])
+        place = self._in_spacings(np.asarray(points_mm, np.float64))[..., None]
+        taps = np.floor(place).astype(np.int64) + np.arange(-1, 3)  # (n, 3, 4): all control points that reach the points
+        values, slopes = _cubic(place - taps), _cubic_slope(place - taps) / np.reshape(self.spacing_mm, (3, 1))
+        last = np.reshape(control_mm.shape[2::-1], (3, 1)) - 1
+        x, y, z = np.moveaxis(np.clip(taps + 1, 0, last), 1, 0)
+        vectors = control_mm[z[:, :, None, None], y[:, None, :, None], x[:, None, None, :]]
+        factors = [[(slopes if i == j else values)[:, i] for i in (2, 1, 0)] for j in range(3)]
+        along = [np.einsum("na,nb,nc,nabci->ni", *three, vectors) for three in factors]
+        return np.stack(along, -1)
 
     def on_grid_mm(self, grid: Grid, weights: "ArrayLike") -> np.ndarray:
         """Returns w (nz, ny, nx, 3) float32 in mm at the voxel centres of ``grid``, components x, y, z, for one state."""
@@ -135,7 +135,7 @@ class Deformation:
         moved_mm = np.zeros_like(points_mm)
         for _ in range(_MOST_STEPS):
             next_mm = -self.displacement_mm(points_mm + moved_mm, weights)
-            change_mm, moved_mm = np.abs(next_mm - moved_mm).max(), next_mm
+            change_mm, moved_mm = np.abs(next_mm - moved_mm).max(initial=0.0), next_mm
             if change_mm < _CLOSE * np.min(self.spacing_mm):
                 return moved_mm
         found = f"no inverse: its points still move {change_mm:.3g} mm after {_MOST_STEPS} steps"

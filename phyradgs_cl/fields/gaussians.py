@@ -2,7 +2,7 @@
 
 Field of one Gaussian: ρ exp(−½ (x−μ)ᵀ Σ⁻¹ (x−μ)), Σ = R diag(s²) Rᵀ (paper, section 2)."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy
@@ -58,6 +58,14 @@ class Gaussians:
         checks.shape("rows", rows, (11, None))
         return cls(rows[MEAN].T.copy(), rows[SCALE].T.copy(), rows[QUATERNION].T.copy(), rows[DENSITY].copy())
 
+    @classmethod
+    def of_covariance(cls, mean: np.ndarray, covariance: np.ndarray, density: np.ndarray) -> "Gaussians":
+        """Makes a cloud from means (G, 3), covariances (G, 3, 3) and densities (G,)."""
+        variance, axes = np.linalg.eigh(covariance)
+        axes[:, :, 0] *= np.sign(np.linalg.det(axes))[:, None]  # a turn, not a mirror
+        x, y, z, w = scipy.spatial.transform.Rotation.from_matrix(axes).as_quat().T
+        return cls(mean, np.sqrt(variance), np.stack([w, x, y, z], -1), density)
+
     def scaled(self, length: float, density: float) -> "Gaussians":
         """Returns the cloud with lengths multiplied by ``length`` and densities by ``density``."""
         return Gaussians(self.mean * length, self.scale * length, self.quaternion, self.density * density)
@@ -69,12 +77,9 @@ class Gaussians:
             return self
         turn = scipy.spatial.transform.Rotation.from_quat(self.quaternion[:, [1, 2, 3, 0]]).as_matrix()
         covariance = np.einsum("gij,gj,gkj->gik", turn, self.scale.astype(np.float64) ** 2, turn)
-        variance, axes = np.linalg.eigh(covariance + np.diag(np.square(box)) / 12)
-        axes[:, :, 0] *= np.sign(np.linalg.det(axes))[:, None]  # a turn, not a mirror
-        scale = np.sqrt(variance)
-        x, y, z, w = scipy.spatial.transform.Rotation.from_matrix(axes).as_quat().T
-        density = self.density * np.prod(self.scale, axis=1) / np.prod(scale, axis=1)
-        return Gaussians(self.mean, scale, np.stack([w, x, y, z], -1), density)
+        wider = Gaussians.of_covariance(self.mean, covariance + np.diag(np.square(box)) / 12, self.density)
+        density = self.density * np.prod(self.scale, axis=1) / np.prod(wider.scale, axis=1)
+        return replace(wider, density=density)
 
 
 @dataclass(frozen=True)

@@ -72,7 +72,7 @@ def fused(scan: Scan, options: FusedOptions, rt: Runtime, **arguments: Any) -> R
         start = np.maximum(stage.initial, 0)
         return reconstruct_splats(
             scan, options.splats(), rt, method="phyradgs",
-            seed=stage.seed, report=stage.report, resume=stage.resume, initial=start,
+            seed=stage.seed, report=stage.report, resume=stage.resume, initial=start, deformation=stage.deformation,
         )  # fmt: skip
 
     def mean_of_both(volume: np.ndarray, before: np.ndarray | None) -> np.ndarray:
@@ -92,4 +92,4 @@ def fused(scan: Scan, options: FusedOptions, rt: Runtime, **arguments: Any) -> R
     return replace(result, disagreement=(np.sqrt(means) / 2).astype(np.float32))
 
 
-METHOD = Method(fused, {"default": FusedOptions()}, takes_initial=True)
+METHOD = Method(fused, {"default": FusedOptions()}, takes_initial=True, takes_deformation=True)

@@ -189,7 +189,10 @@ def moving(rt: Runtime, name: str, motion: str) -> None:
     control_mm = 0.1 * np.random.default_rng(0).normal(size=(2, 5, 5, 5, 3))
     times_s = np.array([0.0, 14.0])
     one = Deformation(control_mm, (-1.2,) * 3, 0.6, times_s, np.array([[1.0, 0.0], [0.0, 1.0]]))
-    changes: dict[str, object] = {"motion": motion, **({} if name == "fdk" else {"iterations": 1, "sub_intervals": 2})}
+    more: dict[str, object] = {"phyradgs": {"iterations": 2, "gaussians": 6, "tv_edge": 4}, "fdk": {}}.get(
+        name, {"iterations": 1, "sub_intervals": 2}
+    )  # fmt: skip
+    changes: dict[str, object] = {"motion": motion, **more}
     reconstruct(tiny_scan(rt, "log", GEOMETRY), plan_run(name, changes, object_motion=ObjectMotion(one)), rt)
 
 
@@ -202,7 +205,7 @@ def cases() -> dict[str, Callable[[Runtime], None]]:
     for name in [name for name in METHODS if name not in NEURAL]:
         for motion in ("static", "exact" if name in (*SPLATTING, "fused") else "per-row"):
             found[f"{name} {motion}"] = partial(method, name=name, motion=motion)
-    for name, motion in (("fdk", "static"), ("fdk", "per-row"), ("sirt", "per-row")):
+    for name, motion in (("fdk", "static"), ("fdk", "per-row"), ("sirt", "per-row"), ("phyradgs", "exact")):
         found[f"moving {name} {motion}"] = partial(moving, name=name, motion=motion)
     few: dict[str, object] = {"iterations": 3, "subvoxels": 1}  # weights after the first
     found["fista nonlocal"] = partial(method, name="fista", motion="static", prior="nonlocal", **few)

@@ -28,7 +28,8 @@ from phyradgs_cl.runtime import Runtime
 
 GRID, SHAPE, FRAMES = Grid.cube(16, 2.0), (24, 24), 30
 MOVING = [name for name, method in METHODS.items() if method.takes_deformation]
-ITERATIVE = [name for name in MOVING if name not in ("fdk", "fbp")]
+SPLATS = ("phyradgs", "r2", "fused")
+ITERATIVE = [name for name in MOVING if name not in ("fdk", "fbp", "r2")]
 
 
 def breathing(amplitude_mm: float = 0.25, rank: int = 2) -> Deformation:
@@ -58,7 +59,7 @@ def scan(rt) -> Scan:
 
 
 def plan_of(method: str, moves: bool = True, **changes: object) -> RunPlan:
-    motion = {} if method in ("fdk", "fbp") else {"motion": "per-row", "sub_intervals": 2}
+    motion = {} if method in ("fdk", "fbp", *SPLATS) else {"motion": "per-row", "sub_intervals": 2}
     options = method_options(method, None, {**motion, **changes})
     return RunPlan(method, options, object_motion=ObjectMotion(breathing()) if moves else None)
 
@@ -74,6 +75,17 @@ def test_the_reference_is_nearer(rt, scan, method) -> None:
     assert error(scan, moved) < 0.7 * error(scan, ignored)
 
 
+@pytest.mark.parametrize(("method", "iterations", "share"), [("phyradgs", 240, 0.75), ("r2", 150, 0.97)])
+def test_gaussians_move(rt, scan, method, iterations, share) -> None:
+    """And have the bits of today where the field moves nothing."""
+    changes = {"iterations": iterations, "gaussians": 600}
+    moved, ignored = (reconstruct(scan, plan_of(method, moves, **changes), rt) for moves in (True, False))
+    assert error(scan, moved.volume) < share * error(scan, ignored.volume)
+    at_rest = replace(plan_of(method, **changes), object_motion=ObjectMotion(breathing(0.0)))
+    np.testing.assert_array_equal(reconstruct(scan, at_rest, rt).volume, ignored.volume)
+    assert moved.gaussians is not None and moved.gaussians.count > 300
+
+
 @pytest.mark.parametrize("motion", ["static", "per-row"])
 def test_fdk_takes_voxels_where_their_matter_is(rt, scan, motion) -> None:
     moved, ignored = (reconstruct(scan, plan_of("fdk", moves, motion=motion), rt).volume for moves in (True, False))
@@ -87,10 +99,12 @@ def test_fdk_takes_voxels_where_their_matter_is(rt, scan, motion) -> None:
 
 @pytest.mark.parametrize("method", ITERATIVE)
 def test_runs_resume_to_the_same_bits(rt, scan, method) -> None:
-    plan = plan_of(method, iterations=3, **({"subvoxels": 1} if method == "fista" else {}))
+    more = {"fista": {"subvoxels": 1}, "fused": {"voxel_iterations": 1}, "phyradgs": {"gaussians": 200}}
+    last = 50 if method in SPLATS else 2  # splats report every 50 iterations
+    plan = plan_of(method, iterations=last + 1, **more.get(method, {}))
 
     def stop(progress: Progress) -> None:
-        if progress.iteration == 2:
+        if progress.iteration >= last:
             raise KeyboardInterrupt
 
     whole = reconstruct(scan, plan, rt)
@@ -172,6 +186,6 @@ def test_the_command(rt, cli, refused, scan, tmp_path) -> None:
     field.rename(tmp_path / "lost.h5")
     assert computed_views(load_run(output), rt, 2) == []
     (tmp_path / "lost.h5").rename(field)
-    refused([*run[:-3], "phyradgs", *run[-2:]], "--object-motion", "--method phyradgs", "fista")
+    refused([*run[:-3], "phyradgs", *run[-2:], "--motion", "centres"], "--object-motion", "--motion centres", "exact")
     refused([*run[:-1], scan_file], "/entry/deformation")
     refused([*run, "--rows", "0:8"], "--rows")

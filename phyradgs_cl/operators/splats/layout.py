@@ -63,6 +63,8 @@ class DeviceCells:
     the lines; without motion ``line_times`` has one element. The intensity model draws cells into ``layers`` images in
     which no line has two cells; ``layer_weights`` (layers, lines) are the cells' shares of a line's window. With
     ``fixed_conic``, ``cells`` are of the conic's pose, and ``matrices`` have two poses per cell, its own one last.
+    Of an object that moves, ``shares`` (S, R) are the weights of its states, and ``cell_states`` (C, poses) the state of
+    every pose; else both have one element.
     """
 
     cells: DeviceArray
@@ -71,6 +73,8 @@ class DeviceCells:
     line_cells: DeviceArray
     line_times: DeviceArray
     layer_weights: DeviceArray
+    shares: DeviceArray
+    cell_states: DeviceArray
     count: int
     lines: int
     layers: int
@@ -83,7 +87,11 @@ class DeviceCells:
         return pitch_of(self.lines)
 
     @classmethod
-    def upload(cls, rt: Runtime, table: TimeCells) -> "DeviceCells":
+    def upload(
+        cls, rt: Runtime, table: TimeCells, states: tuple[np.ndarray, np.ndarray] | None = None
+    ) -> "DeviceCells":
+        """Uploads a frame's cells; ``states`` as from ``operators.splats.states.states_of``."""
+        shares, cell_states = (np.zeros(1), np.zeros(1)) if states is None else states
         if table.line_share is not None:
             raise InputError("--motion", "cells with a weight for each line", "cells with one weight", "take micro-views")
         pose = table.readout.poses(table.pose)
@@ -104,6 +112,8 @@ class DeviceCells:
             line_cells=rt.upload(table.line_cells(), np.int32),
             line_times=rt.upload(times),
             layer_weights=rt.upload(weights, np.float32),
+            shares=rt.upload(shares, np.float32),
+            cell_states=rt.upload(cell_states, np.int32),
             count=table.count,
             lines=table.lines,
             layers=len(weights),

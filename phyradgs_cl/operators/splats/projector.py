@@ -14,6 +14,7 @@ import numpy as np
 from phyradgs_cl.checks import ceil_div
 from phyradgs_cl.operators.splats.binning import TileLists
 from phyradgs_cl.operators.splats.layout import DeviceCells, DeviceGaussians, Layers
+from phyradgs_cl.operators.splats.states import CloudStates
 from phyradgs_cl.operators.splats.work import UNSEEN, Work, moving_work, still_work
 from phyradgs_cl.runtime import DeviceArray, Kernel, Runtime
 from phyradgs_cl.runtime.layout import GUARD, pad_rows, padded_zeros, pitch_of, unpad_rows
@@ -77,7 +78,7 @@ class SplatProjector:
     radius beyond which a Gaussian is not drawn; 0 draws all of it. ``time_error`` (relative, RMS) bounds the error of
     averages over time in cells with motion. ``pixel_footprint`` averages splats over the area of a pixel.
     ``intensity_unit`` is the line integral that is 1 in the image of a detector that averages intensities over a line's
-    cells; with None line integrals are averaged.
+    cells; with None line integrals are averaged. ``states`` moves the cloud to the states of cells uploaded with them.
     """
 
     def __init__(
@@ -91,6 +92,7 @@ class SplatProjector:
         time_error: float = DEFAULT_TIME_ERROR,
         pixel_footprint: bool = False,
         intensity_unit: float | None = None,
+        states: CloudStates | None = None,
     ) -> None:
         self.rt, self.lines, self.width = rt, lines, width
         self.pitch = pitch_of(width)
@@ -105,7 +107,8 @@ class SplatProjector:
         self._records = rt.empty(1)
         self._is_visible = rt.empty(1, np.uint8)
         self._extents = rt.empty(1, np.int32)
-        options = {"FOOTPRINT": pixel_footprint, "LAYERED": self._layers is not None}
+        self.states, self._cloud = states, rt.empty(1)
+        options = {"FOOTPRINT": pixel_footprint, "LAYERED": self._layers is not None, "DEFORMED": states is not None}
         self._kernels = {
             (moving, fixed, parallel): _Kernels.declare(
                 rt, moving, fixed, AFFINE=affine or parallel, PARALLEL=parallel, **options
@@ -190,6 +193,7 @@ class SplatProjector:
             self.cutoff2,
             group=group,
         )
+        by_states = self._cloud if self.states is None else self.states.zeros(gaussians, cells)
         rt.launch(
             kernels.chain,
             gaussians.stride // rt.lanes,
@@ -204,8 +208,13 @@ class SplatProjector:
             np.float32(self.width / 2),
             np.float32(self.lines / 2),
             gradients,
+            self._cloud,
+            cells.cell_states,
+            by_states,
             group=rt.group(),
         )
+        if self.states is not None:
+            self.states.back(gaussians, cells, gradients)
 
     def count_pairs(self, gaussians: DeviceGaussians, cells: DeviceCells) -> tuple[int, int, int]:
         """Counts, for a ``forward``: Gaussian–pixel pairs, evaluated pairs (complete vectors), Gaussian–cell footprints."""
@@ -237,6 +246,8 @@ class SplatProjector:
             self._is_visible = rt.empty(footprints, np.uint8)
         if self._extents.size < 6 * gaussians.stride:
             self._extents = rt.empty(6 * gaussians.stride, np.int32)
+        if self.states is not None:
+            self._cloud = self.states.forward(gaussians, cells)
         times = (cells.line_times, np.int32(cells.time_pitch)) if cells.moving else ()
         rt.launch(
             self._kernels[cells.moving, cells.fixed_conic, cells.is_parallel].prepare,
@@ -244,7 +255,7 @@ class SplatProjector:
             gaussians.rows, np.int32(gaussians.count), np.int32(gaussians.stride),
             cells.cells, cells.matrices, cells.cell_lines, np.int32(cells.count),
             np.int32(self.width), self.cutoff2,
-            self._records, self._is_visible, self._extents,
+            self._records, self._is_visible, self._extents, self._cloud, cells.cell_states,
             *times,
             group=rt.group(),
         )  # fmt: skip

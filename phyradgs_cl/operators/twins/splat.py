@@ -10,6 +10,7 @@ mean projected by the segment's two end poses; its middle is the mean of the par
 Conic and Q come from the plain difference C − b bᵀ, which loses digits that float64 has to spare and float32 has not.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -165,11 +166,13 @@ def moving_frame(
     cutoff_sigma: float = 0.0,
     affine: bool = False,
     pixel_variance: float = 0.0,
+    cloud_at: Callable[[float], np.ndarray] | None = None,
 ) -> np.ndarray:
     """The merged frame (nv, nu) of parameter rows (11, G) over cells with motion, or over cells with a ``conic_pose``.
 
     ``pixel_variance`` (pixels²) is added to the covariance of every splat on the detector, mass kept. A cell with a
     ``conic_pose`` is a segment without a path: the splat of that pose, with its centre where the cell's pose has it.
+    ``cloud_at`` gives the rows at a time in s, of an object that moves.
     """
     moved = table.conic_pose is not None
     poses, end_poses, line_times = _centre_segments(table) if moved else (table.pose, table.end_poses, table.line_times)
@@ -178,11 +181,16 @@ def moving_frame(
     shape = detector_shape[::-1] if by_column else detector_shape
     turn = transpose_pose if by_column else np.asarray
     frame = np.zeros(shape)
-    for pose, ends, times in zip(turn(poses), turn(end_poses), line_times, strict=True):
-        for row, precision in zip(rows.T, precision_matrices(rows), strict=True):
+    for cell, (pose, ends, times) in enumerate(zip(turn(poses), turn(end_poses), line_times, strict=True)):
+        clouds = [rows] * 3
+        if cloud_at is not None and table.end_times_s is not None:
+            clouds = [cloud_at(time_s) for time_s in (table.time_s[cell], *table.end_times_s[cell])]
+        means = np.stack([cloud[:3] for cloud in clouds[1:]]).transpose(2, 0, 1)  # (G, 2, 3)
+        for row, precision, end_means in zip(clouds[0].T, precision_matrices(clouds[0]), means, strict=True):
             frame += _segment_image(
-                row, precision, pose, ends, times, shape, cutoff_sigma, affine, pixel_variance, table.is_parallel, moved
-            )
+                row, precision, pose, ends, end_means, times, shape, cutoff_sigma, affine, pixel_variance, table.is_parallel,
+                moved,
+            )  # fmt: skip
     return frame.T if by_column else frame
 
 
@@ -204,10 +212,11 @@ def seen_at(pose: np.ndarray, point: np.ndarray, is_parallel: bool = False) -> n
 
 
 def _segment(
-    row: np.ndarray, precision: np.ndarray, pose: np.ndarray, ends: np.ndarray, pixel_variance: float, is_parallel: bool
+    row: np.ndarray, precision: np.ndarray, pose: np.ndarray, ends: np.ndarray, end_means: np.ndarray, pixel_variance: float,
+    is_parallel: bool
 ) -> _Segment:
     u, v, z = seen_at(pose, row[:3], is_parallel)
-    first, last = (seen_at(end, row[:3], is_parallel)[:2] for end in ends)
+    first, last = (seen_at(end, mean, is_parallel)[:2] for end, mean in zip(ends, end_means, strict=True))
     d0, steps = pose[:3] if is_parallel else (row[:3] - pose[:3]) / z, np.stack([pose[6:9], pose[9:12]], -1)
     alpha = d0 @ precision @ d0
     b, c = steps.T @ precision @ d0 / alpha, steps.T @ precision @ steps / alpha
@@ -229,6 +238,7 @@ def _segment_image(
     precision: np.ndarray,
     pose: np.ndarray,
     ends: np.ndarray,
+    end_means: np.ndarray,
     times: np.ndarray,
     shape: tuple[int, int],
     cutoff_sigma: float,
@@ -237,9 +247,9 @@ def _segment_image(
     is_parallel: bool,
     moved: bool,
 ) -> np.ndarray:
-    if min(seen_at(p, row[:3], is_parallel)[2] for p in (pose, *ends)) <= 0:
+    if min(seen_at(p, m, is_parallel)[2] for p, m in zip((pose, *ends), (row[:3], *end_means), strict=True)) <= 0:
         return np.zeros(shape)
-    s = _segment(row, precision, pose, ends, pixel_variance, is_parallel)
+    s = _segment(row, precision, pose, ends, end_means, pixel_variance, is_parallel)
     if moved:
         s = replace(s, centre=seen_at(ends[0], row[:3], is_parallel)[:2])
     v, u = np.mgrid[: shape[0], : shape[1]]

@@ -7,8 +7,10 @@ import numpy as np
 
 from phyradgs_cl.acquisition import Exact, Motion, Scan, TimeCells
 from phyradgs_cl.detector import transmission_weights
+from phyradgs_cl.fields import Deformation
 from phyradgs_cl.operators import DeviceCells, DeviceGaussians
 from phyradgs_cl.operators.splats.layout import pad_columns, stride_of
+from phyradgs_cl.operators.splats.states import states_of
 from phyradgs_cl.optim import DeviceAdam, Population
 from phyradgs_cl.reconstructors.splats.options import SplatOptions
 from phyradgs_cl.runtime import DeviceArray, Runtime
@@ -66,15 +68,19 @@ class DeviceCloud:
 
 
 class DeviceFrames:
-    """Time cells, measurement in internal units and mask of every frame."""
+    """Time cells, with the states of an object that moves, measurement in internal units and mask of every frame."""
 
-    def __init__(self, rt: Runtime, scan: Scan, options: SplatOptions, scale: Scale) -> None:
+    def __init__(
+        self, rt: Runtime, scan: Scan, options: SplatOptions, scale: Scale, deformation: Deformation | None = None
+    ) -> None:
         self.count = scan.frames
         readout = scan.shutter.readout
         self.lines, self.width = readout.shape(scan.geometry.detector_shape)
         model = scan.detector_model if options.detector_model == "scan" else options.detector_model
         tables, merges = tables_of(scan, options.motion, model)
-        self._cells = [DeviceCells.upload(rt, table.scaled(1 / scale.length_mm)) for table in tables]
+        states = [None if deformation is None else states_of(table, deformation) for table in tables]
+        scaled = (table.scaled(1 / scale.length_mm) for table in tables)
+        self._cells = [DeviceCells.upload(rt, table, own) for table, own in zip(scaled, states, strict=True)]
         self.intensity_unit = scale.line_integral if merges else None
         measured = (frame / np.float32(scale.line_integral) for frame in scan.projections)
         self._measured = [rt.upload(pad_rows(readout.frames(m))) for m in measured]

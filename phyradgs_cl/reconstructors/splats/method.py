@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from phyradgs_cl.acquisition import Exact, Scan
+from phyradgs_cl.fields import Deformation
 from phyradgs_cl.operators.splats.projector import PAIR_KERNELS
 from phyradgs_cl.operators.splats.work import Work
 from phyradgs_cl.optim import Population
@@ -35,16 +36,21 @@ REPORT_EVERY, LEAST_RECORDED = 50, 20
 def reconstruct_splats(
     scan: Scan, options: SplatOptions, rt: Runtime, *, method: str, seed: int = 0,
     report: ProgressReport = ignore_progress, resume: State | None = None, initial: np.ndarray | None = None,
+    deformation: Deformation | None = None,
 ) -> Reconstruction:
     """Runs a splatting method under its name ``phyradgs`` or ``r2``.
 
     ``resume`` continues an interrupted run of the same scan and options from its state. The cloud is drawn from ``initial``
-    (nz, ny, nx) in 1/mm, or else from an FDK volume."""
+    (nz, ny, nx) in 1/mm, or else from an FDK volume. The cloud and the volume are the reference of ``deformation``, of an
+    object that moves."""
     started = time.perf_counter()
+    if deformation is not None and deformation.is_still:
+        deformation = None
     # rank 0 alone makes the first volume
-    scale, population, rng = rt.ranks.bcast(first_cloud(rt, scan, options, seed, initial) if rt.ranks.rank == 0 else None)
+    of_reference = (rt, scan, options, seed, initial, deformation)
+    scale, population, rng = rt.ranks.bcast(first_cloud(*of_reference) if rt.ranks.rank == 0 else None)
     first_count = population.count
-    run = SplatRun(rt, scan, options, scale, population, rng)
+    run = SplatRun(rt, scan, options, scale, population, rng, deformation)
     record_every = max(1, min(REPORT_EVERY, options.iterations // LEAST_RECORDED))  # short runs show their course too
     loop = Loop(run, rt.ranks, report, started, record_every, REPORT_EVERY)
     loop.run(resume)
@@ -77,10 +83,11 @@ def reconstruct_splats(
 
 
 def first_cloud(
-    rt: Runtime, scan: Scan, options: SplatOptions, seed: int, initial: np.ndarray | None = None
+    rt: Runtime, scan: Scan, options: SplatOptions, seed: int, initial: np.ndarray | None = None,
+    deformation: Deformation | None = None,
 ) -> tuple[Scale, Population, np.random.Generator]:
     """Returns internal units, the first cloud, and the generator that drew it, from an ``initial`` volume or FDK's."""
-    first = static_fdk(rt, scan) if initial is None else initial
+    first = static_fdk(rt, scan, deformation) if initial is None else initial
     scale = internal_scale(first, scan.grid)
     rng = np.random.default_rng(seed)
     grid = scan.grid.scaled(1 / scale.length_mm)
@@ -97,5 +104,6 @@ def _r2(scan: Scan, options: SplatOptions, rt: Runtime, **arguments: Any) -> Rec
     return reconstruct_splats(scan, replace(options, affine=True), rt, method="r2", **arguments)
 
 
-PHYRADGS = Method(partial(reconstruct_splats, method="phyradgs"), PRESETS, is_shared=True, takes_initial=True)
-R2 = Method(_r2, {"published": R2_PUBLISHED}, is_shared=True, takes_initial=True)
+_KIND = {"is_shared": True, "takes_initial": True, "takes_deformation": True}
+PHYRADGS = Method(partial(reconstruct_splats, method="phyradgs"), PRESETS, **_KIND)
+R2 = Method(_r2, {"published": R2_PUBLISHED}, **_KIND)

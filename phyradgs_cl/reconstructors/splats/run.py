@@ -7,7 +7,7 @@ import numpy as np
 
 from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.checks import ceil_div
-from phyradgs_cl.fields import Gaussians, Grid
+from phyradgs_cl.fields import Deformation, Gaussians, Grid
 from phyradgs_cl.fields.gaussians import SCALE
 from phyradgs_cl.operators import voxelise
 from phyradgs_cl.optim import Population, control_density
@@ -27,14 +27,14 @@ class SplatRun:
 
     def __init__(
         self, rt: Runtime, scan: Scan, options: SplatOptions, scale: Scale, population: Population,
-        rng: np.random.Generator,
+        rng: np.random.Generator, deformation: Deformation | None = None,
     ) -> None:
         self.rt, self.options, self.scale, self.rng = rt, options, scale, rng
         self.grid = scan.grid.scaled(1 / scale.length_mm)
         self.activation = options.activation(self.grid)
         self.batch = options.batch_for(scan.frames, rt.ranks.size)
         self.sharing = sharing_of(rt.ranks, self.batch)
-        self.frame_step = FrameStep(rt, scan, options, scale, self.grid)
+        self.frame_step = FrameStep(rt, scan, options, scale, self.grid, deformation)
         self.frames, self.adam = self.frame_step.frames, self.frame_step.adam
         self.iteration, self.iterations = 0, options.iterations
         self.control_seconds, self.control_rounds = 0.0, 0

@@ -9,10 +9,11 @@ import numpy as np
 
 from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.fields import Grid
+from phyradgs_cl.fields import Deformation, Grid
 from phyradgs_cl.objective import ImageLoss, TotalVariation
 from phyradgs_cl.operators import SplatProjector, Voxeliser
 from phyradgs_cl.operators.splats.projector import DEFAULT_TIME_ERROR
+from phyradgs_cl.operators.splats.states import CloudStates
 from phyradgs_cl.optim import DeviceAdam
 from phyradgs_cl.parallel import Communicator, exact_sum
 from phyradgs_cl.reconstructors.splats.device import DeviceCloud, DeviceFrames, Scale
@@ -36,16 +37,23 @@ class Batch:
 
 
 class FrameStep:
-    """Frames, projector, loss, total variation and optimiser of a scan, in internal units; ``grid`` is the volume's."""
+    """Frames, projector, loss, total variation and optimiser of a scan, in internal units; ``grid`` is the volume's.
+    ``deformation``, in mm, moves the object."""
 
-    def __init__(self, rt: Runtime, scan: Scan, options: SplatOptions, scale: Scale, grid: Grid) -> None:
+    def __init__(
+        self, rt: Runtime, scan: Scan, options: SplatOptions, scale: Scale, grid: Grid,
+        deformation: Deformation | None = None,
+    ) -> None:
         self.rt, self.options, self.grid = rt, options, grid
-        self.frames = DeviceFrames(rt, scan, options, scale)
+        self.frames = DeviceFrames(rt, scan, options, scale, deformation)
+        states = None if deformation is None else CloudStates(rt, deformation.scaled(1 / scale.length_mm))
+        if states is not None:
+            states.check_inverse(grid)
         lines, width = self.frames.lines, self.frames.width
         self.projector = SplatProjector(
             rt, lines, width, affine=options.affine, cutoff_sigma=options.cutoff_sigma,
             time_error=getattr(options.motion, "time_error", DEFAULT_TIME_ERROR),
-            pixel_footprint=options.pixel_footprint, intensity_unit=self.frames.intensity_unit,
+            pixel_footprint=options.pixel_footprint, intensity_unit=self.frames.intensity_unit, states=states,
         )
         weights = options.ssim_weight, options.l1_weight, options.poisson_weight
         self.loss = ImageLoss(rt, lines, width, self.projector.pitch, *weights)

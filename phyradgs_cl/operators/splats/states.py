@@ -1,0 +1,98 @@
+"""A cloud in the states of an object that moves, and its gradients back to the reference (cl/splat_states.cl).
+
+The object at y is the reference at y + w(y). A Gaussian of the reference at m lies at the y with y + w(y) = m. Its
+covariance is G⁻¹ Σ G⁻ᵀ with G = I + ∂w/∂y. Its density stays, because the field moves attenuation, not mass."""
+
+import numpy as np
+
+from phyradgs_cl.acquisition.time_cells import TimeCells
+from phyradgs_cl.errors import InputError
+from phyradgs_cl.fields import Deformation, Grid
+from phyradgs_cl.operators.splats.layout import DeviceCells, DeviceGaussians, stride_of
+from phyradgs_cl.runtime import DeviceArray, Kernel, Runtime
+
+STATE_ROWS = 12  # of a Gaussian in a state: its place x y z, and the rows of G
+_PROBED_SIDE, _PROBED_STATES = 9, 16
+_WRONG = 0.01  # of a voxel
+
+
+class CloudStates:
+    """Moves clouds as ``deformation`` does, in the clouds' unit of length, to the states of a frame's cells."""
+
+    def __init__(self, rt: Runtime, deformation: Deformation) -> None:
+        self.rt, self.deformation = rt, deformation
+        control = np.pad(deformation.control_mm, [(0, 0)] * 4 + [(0, 1)])
+        spacing = np.broadcast_to(deformation.spacing_mm, 3)
+        self._field = (
+            rt.upload(control, np.float32), np.array([*control.shape[3:0:-1], 0], np.int32),
+            np.array([*deformation.origin_mm, 0], np.float32), np.array([*1 / spacing, 0], np.float32),
+        )  # fmt: skip
+        self._states, self._by_states = rt.empty(1), rt.empty(1)
+
+    def forward(self, gaussians: DeviceGaussians, cells: DeviceCells) -> DeviceArray:
+        """Returns the cloud in the states of the cells (S, 12, stride), valid until the next call."""
+        return self._forward(gaussians, cells.shares)
+
+    def _forward(self, gaussians: DeviceGaussians, shares: DeviceArray) -> DeviceArray:
+        rt, count, stride = self.rt, shares.shape[0], gaussians.stride
+        if self._states.size < count * STATE_ROWS * stride:
+            self._states = rt.empty(1)  # frees the old memory before it allocates the new
+            self._states = rt.empty((count, STATE_ROWS, stride))
+        kernel, field = self._kernel("splat_states"), (*self._field, shares, np.int32(count))
+        rt.launch(kernel, stride, gaussians.rows, np.int32(stride), *field, self._states, group=rt.group(on_cpu=16))
+        return self._states
+
+    def zeros(self, gaussians: DeviceGaussians, cells: DeviceCells) -> DeviceArray:
+        """Returns memory (S, 12, stride) of zeros for gradients by the states, valid until the next call."""
+        floats = cells.shares.shape[0] * STATE_ROWS * gaussians.stride
+        if self._by_states.size < floats:
+            self._by_states = self.rt.empty(1)
+            self._by_states = self.rt.empty(floats)
+        self.rt.fill(self._by_states, 0)
+        return self._by_states
+
+    def back(self, gaussians: DeviceGaussians, cells: DeviceCells, gradients: DeviceArray) -> None:
+        """Writes dL/dmean into ``gradients`` (13, stride) from dL/dstates, in the memory of ``zeros``; ``forward`` of the
+        same cloud and cells was the last one."""
+        rt, count = self.rt, cells.shares.shape[0]
+        kernel, field = self._kernel("splat_states_back"), (*self._field, cells.shares, np.int32(count))
+        rt.launch(
+            kernel, gaussians.stride, self._states, np.int32(gaussians.stride), *field, self._by_states, gradients,
+            group=rt.group(on_cpu=16),
+        )  # fmt: skip
+
+    def check_inverse(self, grid: Grid) -> None:
+        """Raises InputError where the place of some points of ``grid`` is not found in some states."""
+        rt, (z, y, x) = self.rt, (np.linspace(axis[0], axis[-1], _PROBED_SIDE) for axis in grid.axes_mm())
+        mean = np.stack(np.meshgrid(x, y, z, indexing="ij")).reshape(3, -1)
+        rows = np.ones((11, mean.shape[1]))
+        rows[:3] = mean
+        ends = np.concatenate([self.deformation.weights.argmax(0), self.deformation.weights.argmin(0)])
+        chosen = np.linspace(0, len(self.deformation.times_s) - 1, _PROBED_STATES).astype(int)
+        weights = self.deformation.weights[np.unique([*ends, *chosen])]
+        moved = rt.download(self._forward(DeviceGaussians.upload(rt, rows), rt.upload(weights, np.float32)))
+        moved = moved.ravel()[: len(weights) * STATE_ROWS * stride_of(rows.shape[1])].reshape(len(weights), STATE_ROWS, -1)
+        places = moved[:, :3, : rows.shape[1]].astype(np.float64)
+        for place, one in zip(places, weights, strict=True):
+            off = place.T + self.deformation.displacement_mm(place.T, one) - mean.T
+            if not (worst := float(np.abs(off / grid.voxel_size_mm[::-1]).max())) <= _WRONG:
+                found = f"a field without an inverse: it is wrong by {worst:.2g} voxels"
+                raise InputError("--object-motion", found, f"at most {_WRONG:g}", "use a smoother or smaller field")
+
+    def _kernel(self, name: str) -> Kernel:
+        return self.rt.kernel("splat_states", name, RANK=self.deformation.rank)
+
+
+def states_of(table: TimeCells, deformation: Deformation) -> tuple[np.ndarray, np.ndarray]:
+    """Returns the weights (S, R) of the states that the cells of a frame see, in the order of time, and the state (C, poses)
+    of every pose of a cell. Raises InputError for cells whose shapes do not move, and without the times of their ends."""
+    if table.conic_pose is not None:
+        expected = "one in which also the shapes of splats move"
+        raise InputError("--object-motion", "--motion centres", expected, "take exact or micro-views")
+    times_s = table.time_s[:, None]
+    if table.is_moving:
+        if table.end_times_s is None:
+            raise InputError("--object-motion", "cells with motion without end_times_s", "the times of both ends")
+        times_s = np.concatenate([times_s, table.end_times_s], axis=1)
+    distinct_s, places = np.unique(times_s, return_inverse=True)
+    return deformation.weights_at(distinct_s), places.reshape(times_s.shape)
