@@ -14,15 +14,12 @@ import tempfile
 import time
 from pathlib import Path
 
-from measuring import Facts, child, finish, median, parser_of, where
+from measuring import Facts, child, finish, foot_scan, median, parser_of, where
 
-from phyradgs_cl.acquisition import ConeGeometry, make_protocol
 from phyradgs_cl.api import save_scan
 from phyradgs_cl.estimate import estimate, peak_host_bytes, seconds_around
-from phyradgs_cl.fields import Grid
 from phyradgs_cl.reconstructors import plan_run
 from phyradgs_cl.runtime import Runtime
-from phyradgs_cl.simulation import SimulationOptions, phantom_scene, simulate
 from phyradgs_cl.workflow import load_scan, run_reconstruction
 
 RUNS: dict[str, tuple[str, Facts]] = {
@@ -38,14 +35,6 @@ RUNS: dict[str, tuple[str, Facts]] = {
     "phyradgs 8x5": ("phyradgs", {"motion": "micro-views"}),
     "phyradgs": ("phyradgs", {}),
 }
-
-
-def make_scan(path: Path, size: int, device: str | None) -> None:
-    rt, detector = Runtime(device), 2 * size
-    geometry = ConeGeometry(5.0, 7.0, (detector, detector), (4.0 / detector,) * 2)
-    scene = phantom_scene(rt, "foot", geometry, Grid.cube(size, 2.0), size, "rows", 0)
-    options = SimulationOptions(protocol=make_protocol("rapid"), noise="tigre")
-    save_scan(path, simulate(scene.source, geometry, scene.grid, options, reference=scene.reference))
 
 
 def said(scan: Path, name: str, device: str | None, iterations: int | None) -> Facts:
@@ -119,7 +108,7 @@ def main() -> None:
     facts = where(Runtime(arguments.device)) | {"size": arguments.size}
     with tempfile.TemporaryDirectory() as folder:
         scan = Path(folder) / "scan.h5"
-        make_scan(scan, arguments.size, arguments.device)
+        save_scan(scan, foot_scan(Runtime(arguments.device), arguments.size))
         lines = [one(name, scan, words, arguments.estimates == "yes") for name in names]
     facts["runs"] = lines
     if arguments.estimates == "yes":

@@ -15,15 +15,14 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-from iteration import make_run
-from measuring import Facts, finish, parser_of, where
-from splat_speed import fly_scan
+from measuring import Facts, finish, foot_scan, parser_of, splat_run, where
 
 from phyradgs_cl.acquisition import ConeGeometry, Exact, Scan, make_protocol
 from phyradgs_cl.device_check import check_device
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.operators import backproject
 from phyradgs_cl.reconstructors import RunPlan, method_options, reconstruct
+from phyradgs_cl.reconstructors.splats.options import SplatOptions
 from phyradgs_cl.runtime import DEVICE_VARIABLE, Runtime, choose_device
 from phyradgs_cl.simulation import SimulationOptions, phantom_scene, simulate
 
@@ -52,7 +51,7 @@ def trust(device: str, shape: dict[str, object]) -> Facts:
 
 def same_bits(rt: Runtime, quick: bool) -> Facts:
     """Whether two runs of every kind of method give the same bits."""
-    scan, count = fly_scan(rt, 24 if quick else 128), 200 if quick else 5000
+    scan, count = foot_scan(rt, 12 if quick else 64), 200 if quick else 5000
     different = []
     runs: dict[str, dict[str, object]] = {
         "phyradgs": {"gaussians": count, "iterations": count // 50},
@@ -69,7 +68,7 @@ def same_bits(rt: Runtime, quick: bool) -> Facts:
 def splats(rt: Runtime, quick: bool) -> Facts:
     """Exact motion, 512² and 50,000 Gaussians: milliseconds of an iteration with the kernels' shares, seconds of 3,000."""
     pixels, count = (32, 300) if quick else (512, 50_000)
-    run = make_run(rt, fly_scan(rt, pixels), Exact(), count)
+    run = splat_run(rt, foot_scan(rt, pixels // 2), SplatOptions(motion=Exact(), gaussians=count))
     for _ in range(5):
         run.step()
     rt.kernel_uses()

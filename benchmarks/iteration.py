@@ -9,15 +9,11 @@ round of it, on the host, and counts with a hundredth per iteration (control.eve
 
 import time
 
-import numpy as np
-from measuring import Facts, finish, median, parser_of, where
-from splat_speed import fly_scan
+from measuring import Facts, finish, foot_scan, median, parser_of, splat_run, where
 
-from phyradgs_cl.acquisition import Exact, MicroViews, Motion, Scan, Static
-from phyradgs_cl.reconstructors.fdk import static_fdk
+from phyradgs_cl.acquisition import Exact, MicroViews, Static
 from phyradgs_cl.reconstructors.splats.options import SplatOptions
 from phyradgs_cl.reconstructors.splats.run import SplatRun
-from phyradgs_cl.reconstructors.splats.start import first_population, internal_scale
 from phyradgs_cl.runtime import Runtime
 
 MOTIONS = {"static": Static(), "8x5": MicroViews(8, 5), "exact": Exact()}
@@ -30,15 +26,6 @@ STAGES = {
     "tv": ("voxel_prepare", "voxel_forward", "total_variation", "voxel_backward", "voxel_chain"),
     "adam": ("activate", "chain_activations", "adam_step"),
 }
-
-
-def make_run(rt: Runtime, scan: Scan, motion: Motion, count: int) -> SplatRun:
-    fdk = static_fdk(rt, scan)
-    scale = internal_scale(fdk, scan.grid)
-    grid = scan.grid.scaled(1 / scale.length_mm)
-    options, rng = SplatOptions(motion=motion, gaussians=count), np.random.default_rng(0)
-    population = first_population(fdk / scale.density_per_mm, grid, options, rng)
-    return SplatRun(rt, scan, options, scale, population, rng)
 
 
 def one_round(rt: Runtime, run: SplatRun, iterations: int) -> dict[str, float]:
@@ -79,8 +66,9 @@ def main() -> None:
         arguments.size, arguments.gaussians, arguments.rounds, arguments.iterations = 24, 800, 1, 2
     rt = Runtime(arguments.device, profile=True)
     facts: Facts = where(rt) | {"size": arguments.size, "gaussians": arguments.gaussians}
-    scan = fly_scan(rt, 2 * arguments.size)
-    runs = {name: make_run(rt, scan, motion, arguments.gaussians) for name, motion in MOTIONS.items()}
+    scan = foot_scan(rt, arguments.size)
+    options = {name: SplatOptions(motion=motion, gaussians=arguments.gaussians) for name, motion in MOTIONS.items()}
+    runs = {name: splat_run(rt, scan, one) for name, one in options.items()}
     for run in runs.values():
         one_round(rt, run, 3)
     rounds: dict[str, list[dict[str, float]]] = {name: [] for name in runs}

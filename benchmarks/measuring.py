@@ -1,4 +1,4 @@
-"""What the benchmarks share: where they ran, medians, exponents, children in processes of their own, results as JSON."""
+"""What the benchmarks share: where they ran, runs of splats, medians, exponents, children in processes, results as JSON."""
 
 import argparse
 import json
@@ -13,6 +13,12 @@ from pathlib import Path
 import numpy as np
 
 from phyradgs_cl import __version__
+from phyradgs_cl.acquisition import Scan
+from phyradgs_cl.api import simulate
+from phyradgs_cl.reconstructors.fdk import static_fdk
+from phyradgs_cl.reconstructors.splats.options import SplatOptions
+from phyradgs_cl.reconstructors.splats.run import SplatRun
+from phyradgs_cl.reconstructors.splats.start import first_population, internal_scale
 from phyradgs_cl.runtime import Runtime
 
 Facts = dict[str, object]
@@ -49,6 +55,28 @@ def finish(facts: Facts, path: Path | None) -> None:
     print(text)
     if path is not None:
         path.write_text(text + "\n", encoding="utf-8")
+
+
+def foot_scan(rt: Runtime, size: int) -> Scan:
+    """The foot phantom by a rapid protocol, ``size`` voxels per side from twice as many pixels."""
+    return simulate("foot", size=size, detector=2 * size, noise="tigre", device=rt)
+
+
+def splat_run(rt: Runtime, scan: Scan, options: SplatOptions) -> SplatRun:
+    """A reconstruction before its first step, from FDK's cloud."""
+    fdk, rng = static_fdk(rt, scan), np.random.default_rng(0)
+    scale = internal_scale(fdk, scan.grid)
+    grid = scan.grid.scaled(1 / scale.length_mm)
+    return SplatRun(rt, scan, options, scale, first_population(fdk / scale.density_per_mm, grid, options, rng), rng)
+
+
+def random_cloud(count: int, scale: tuple[float, float], rng: np.random.Generator) -> np.ndarray:
+    """Random Gaussians (11, G) in a cube of half the volume, sorted by height as a reconstruction keeps them."""
+    quaternion = rng.normal(size=(4, count))
+    place, size = rng.uniform(-0.55, 0.55, (3, count)), rng.uniform(*scale, (3, count))
+    turn, density = quaternion / np.linalg.norm(quaternion, axis=0), rng.uniform(0.1, 1.0, (1, count))
+    rows = np.concatenate([place, size, turn, density])
+    return rows[:, np.argsort(rows[2])]
 
 
 def median(values: Sequence[float]) -> float:

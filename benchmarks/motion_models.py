@@ -19,17 +19,14 @@ from argparse import Namespace
 from pathlib import Path
 
 import numpy as np
+from measuring import foot_scan, splat_run
 from scans import append, files_of, make_scan, read_lines, runs_parser
 
-from phyradgs_cl.acquisition import ConeGeometry, Scan, make_protocol
-from phyradgs_cl.fields import Grid
+from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.metrics import compare
 from phyradgs_cl.reconstructors import RunPlan, method_options, reconstruct
-from phyradgs_cl.reconstructors.fdk import static_fdk
 from phyradgs_cl.reconstructors.splats.run import SplatRun
-from phyradgs_cl.reconstructors.splats.start import first_population, internal_scale
 from phyradgs_cl.runtime import Runtime
-from phyradgs_cl.simulation import SimulationOptions, phantom_scene, simulate
 
 MOTIONS = "static,4x3,8x5,16x7,exact 0.02,exact 0.01,exact 0.005,exact 0.002"
 REFERENCE = "8x5"
@@ -122,21 +119,10 @@ def cost(arguments: Namespace) -> dict[str, object]:
     return {"device": rt.device.name, "size": arguments.size, "motions": rows}
 
 
-def foot_scan(rt: Runtime, size: int) -> Scan:
-    geometry = ConeGeometry(5.0, 7.0, (2 * size, 2 * size), (2.0 / size,) * 2)
-    scene = phantom_scene(rt, "foot", geometry, Grid.cube(size, 2.0), size, "rows", 0)
-    options = SimulationOptions(protocol=make_protocol("rapid"), noise="tigre")
-    return simulate(scene.source, geometry, scene.grid, options, reference=scene.reference)
-
-
 def fresh_run(rt: Runtime, scan: Scan, name: str) -> SplatRun:
     """A reconstruction after its first 200 iterations, from where its cost hardly changes."""
     options = method_options("phyradgs", None, motion_of(name))
-    fdk = static_fdk(rt, scan)
-    scale = internal_scale(fdk, scan.grid)
-    grid, rng = scan.grid.scaled(1 / scale.length_mm), np.random.default_rng(0)
-    population = first_population(fdk / scale.density_per_mm, grid, options, rng)
-    started = SplatRun(rt, scan, options, scale, population, rng)
+    started = splat_run(rt, scan, options)
     for _ in range(200):
         started.step()
     return started

@@ -27,18 +27,16 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from measuring import Facts, finish, median, parser_of, where
+from measuring import Facts, finish, median, parser_of, splat_run, where
 
 from phyradgs_cl.acquisition import ConeGeometry, make_protocol
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.optim import DensityControl
 from phyradgs_cl.parallel import launched_ranks
 from phyradgs_cl.phantoms import shepp_logan
-from phyradgs_cl.reconstructors.fdk import static_fdk
 from phyradgs_cl.reconstructors.splats import step as splat_step
 from phyradgs_cl.reconstructors.splats.options import SplatOptions
 from phyradgs_cl.reconstructors.splats.run import SplatRun
-from phyradgs_cl.reconstructors.splats.start import first_population, internal_scale
 from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.simulation import AnalyticSource, SimulationOptions, simulate
 
@@ -69,12 +67,7 @@ def started(rt: Runtime, gaussians: int, pixels: int, batch: int) -> SplatRun:
     splats = SplatOptions(
         gaussians=gaussians, batch=batch, iterations=10**6, control=DensityControl(every=0), tv_edge=32
     )
-    fdk = static_fdk(rt, scan)
-    scale = internal_scale(fdk, scan.grid)
-    rng = np.random.default_rng(0)
-    internal = scan.grid.scaled(1 / scale.length_mm)
-    population = first_population(fdk / scale.density_per_mm, internal, splats, rng)
-    return SplatRun(rt, scan, splats, scale, population, rng)
+    return splat_run(rt, scan, splats)
 
 
 class Clock:

@@ -14,7 +14,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from measuring import finish, parser_of
+from measuring import finish, parser_of, random_cloud
 
 from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, make_protocol
 from phyradgs_cl.acquisition.cells import (
@@ -58,19 +58,6 @@ def models_of(where: tuple) -> list[Model]:
         found.append(Model(f"exact, bound {bound:g}", table, bound))
     found += [Model(f"exact, K = {k}", exact_cells(*where, k), FINE_BOUND) for k in SEGMENTS]
     return found
-
-
-def random_cloud(count: int, scale: tuple[float, float], rng: np.random.Generator) -> np.ndarray:
-    """Random Gaussians (11, G) in a cube of half the volume, sorted by height as a reconstruction keeps them."""
-    quaternion = rng.normal(size=(4, count))
-    parts = [
-        rng.uniform(-0.55, 0.55, (3, count)),
-        rng.uniform(*scale, (3, count)),
-        quaternion / np.linalg.norm(quaternion, axis=0),
-        rng.uniform(0.1, 1.0, (1, count)),
-    ]
-    rows = np.concatenate(parts)
-    return rows[:, np.argsort(rows[2])]
 
 
 def shepp_logan_cloud(rt: Runtime, geometry: ConeGeometry, count: int, edge: int = 64) -> np.ndarray:

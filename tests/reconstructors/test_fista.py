@@ -57,7 +57,7 @@ def quality(scan: Scan, volume: np.ndarray) -> float:
 
 def test_each_prior_is_better_than_none_and_subsets_are_quicker(rt, scan) -> None:
     found = {
-        prior: quality(scan, run(rt, scan, "fista", motion="per-row", iterations=40, prior=prior).volume)
+        prior: quality(scan, run(rt, scan, "fista", motion="per-row", iterations=20, prior=prior).volume)
         for prior in ("none", "tv", "dct", "curves", "nonlocal", "nonlocal+dct")
     }
     without = found.pop("none")
