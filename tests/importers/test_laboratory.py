@@ -10,15 +10,12 @@ import numpy as np
 import pytest
 from conftest_of_importers import WORLD_POINTS, Truth, pose_at, projected
 
-from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, PoseTable, make_protocol
+from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, PoseTable
 from phyradgs_cl.api import reconstruct
-from phyradgs_cl.check import check
 from phyradgs_cl.detector import counts_to_attenuation
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.fields import Grid
 from phyradgs_cl.importers import ImportOptions, import_scan, recognise
 from phyradgs_cl.io import read_scan, write_scan
-from phyradgs_cl.simulation import SimulationOptions, phantom_scene, simulate
 
 CENTRED = ConeGeometry(500.0, 800.0, (10, 14), (3.0, 2.5))
 WRITERS: dict[str, tuple[Callable[..., Path], ConeGeometry]] = {
@@ -48,30 +45,6 @@ def test_pixels_and_geometry_are_those_of_the_scan_that_was_written(tmp_path, ma
     fly = make_truth(fly=True, direction=-1, geometry=geometry)
     options = ImportOptions(exposure_s=0.4, fps=0.8, readout_ms=300.0, first="top")
     assert_same(import_scan(writer(tmp_path / "fly", fly), options), fly, grid=False, pixels=1e-3)
-
-
-@pytest.fixture(scope="session")
-def jaw(rt) -> Callable[[ConeGeometry], Truth]:
-    """A jaw's projections at rest at 20 angles."""
-
-    def make(geometry: ConeGeometry) -> Truth:
-        geometry = replace(
-            geometry, detector_shape=(24, 24), pixel_size_mm=(8.0, 8.0), detector_offset_mm=(0.0, 0.0)
-        )
-        scene = phantom_scene(rt, "jaw", geometry, Grid.cube(24, 80.0), 24, "rows", 0)
-        protocol = make_protocol("static", views=20)
-        scan = simulate(scene.source, geometry, scene.grid, SimulationOptions(protocol, "rows"))
-        return Truth(scan, scan.trajectory.kinematics.angle_start_rad)
-
-    return make
-
-
-@pytest.mark.parametrize("form", WRITERS)
-def test_check_finds_nothing_suspicious(tmp_path, jaw, rt, form) -> None:
-    """Neither the sense of the turn, nor sides of the images, nor distances."""
-    writer, geometry = WRITERS[form]
-    scan = import_scan(writer(tmp_path / form, jaw(geometry)))
-    assert not check(scan, rt).suspicious
 
 
 def falls_where(scan: Any, angle_rad: np.ndarray, geometry: Any, **stage: float) -> None:

@@ -14,7 +14,7 @@ from phyradgs_cl.acquisition.cells import per_line_cells
 from phyradgs_cl.detector import average
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
-from phyradgs_cl.phantoms import Ellipsoid, EllipsoidPhantom, shepp_logan
+from phyradgs_cl.phantoms import EllipsoidPhantom, shepp_logan
 from phyradgs_cl.simulation import (
     AnalyticSource,
     SimulationOptions,
@@ -65,37 +65,6 @@ def test_every_line_averages_over_its_own_window(axis, direction, model) -> None
         mean = stack.mean(axis=0) if model == "log" else -np.log(np.exp(-stack).mean(axis=0))
         expected[where] = mean[where]
     assert_near(found, expected, ANALYTIC_FRAME)
-
-
-@pytest.mark.parametrize(("axis", "direction"), [("rows", -1), ("columns", 1)])
-@pytest.mark.parametrize("model", ["log", "intensity"])
-def test_parallel_rays_of_a_line_average_over_its_own_window(axis, direction, model) -> None:
-    """A ball far from the axis, whose chord follows from its column and row: no ray's ends are needed."""
-    samples, frame, centre, radius = 4, 2, (0.7, -0.4, 0.3), 0.6
-    ball = EllipsoidPhantom((Ellipsoid(centre, (radius,) * 3, 0.9),), "ball")
-    options = SimulationOptions(FLY, axis, direction, model, time_samples=samples)
-    frames = simulate(AnalyticSource(ball, PARALLEL), PARALLEL, GRID, options).projections[frame]
-    v_mm, u_mm = (
-        (np.arange(count) - (count - 1) / 2) * pitch + offset
-        for count, pitch, offset in zip(SHAPE, PARALLEL.pixel_size_mm, PARALLEL.detector_offset_mm, strict=True)
-    )
-    expected = np.zeros(SHAPE)
-    for where, angles in times_of_lines(axis, direction, frame, samples):
-        column_mm = centre[1] * np.cos(angles) - centre[0] * np.sin(angles)
-        off = (u_mm[None, None] - column_mm[:, None, None]) ** 2 + (v_mm[None, :, None] - centre[2]) ** 2
-        chords = 0.9 * 2 * np.sqrt(np.maximum(radius**2 - off, 0))
-        mean = chords.mean(axis=0) if model == "log" else -np.log(np.exp(-chords).mean(axis=0))
-        expected[where] = mean[where]
-    assert expected.max() > 0.9
-    assert_near(frames, expected, ANALYTIC_FRAME)
-
-
-def test_stop_and_shoot_stands_at_the_middle_of_the_fly_scans_window() -> None:
-    still = run(SimulationOptions(replace(FLY, is_fly=False)))
-    assert not still.is_fly
-    for frame in range(3):
-        expected = integrals(np.deg2rad(frame * 120.0 + 12.0 * 1.5 / 2))
-        assert_near(still.projections[frame], expected, ANALYTIC_FRAME)
 
 
 @pytest.mark.parametrize("protocol", ["rapid", "standard"])
