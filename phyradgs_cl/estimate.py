@@ -61,7 +61,7 @@ def estimate(
     kernels, as the run will."""
     started = time.perf_counter()
     trials, total = _Trials(scan, plan, rt), getattr(plan.options, "iterations", None)
-    few, more = _SPLAT_TRIALS if isinstance(plan.options, SplatOptions) else _TRIALS
+    few, more = getattr(plan.options, "TRIALS", _SPLAT_TRIALS if isinstance(plan.options, SplatOptions) else _TRIALS)
     if total is None or not method_of(plan.method).is_resumable:
         seconds, each_s, total = trials.run(None), 0.0, 0
     elif total <= few:

@@ -61,7 +61,8 @@ def save_scan(path: str | Path, scan: Scan) -> None:
 
 
 def load_volume(path: str | Path) -> Reconstruction:
-    """Reads a volume file: volume (nz, ny, nx) in 1/mm, grid, Gaussians, record, facts, disagreement (nz, ny, nx), state.
+    """Reads a volume file: volume (nz, ny, nx) in 1/mm, grid, Gaussians, record, facts, disagreement (nz, ny, nx), state,
+    deformation.
 
     A disagreement is in 1/mm, where the method has one; only an interrupted run has a state.
     path: the HDF5 file, or a file of ``phyradgs export`` (docs/export.md), which has a volume and a grid only. Raises
@@ -76,7 +77,8 @@ def load_volume(path: str | Path) -> Reconstruction:
     facts = dict(stored.provenance)
     record: Any = facts.pop("record", [])
     state = read_state(file)
-    return Reconstruction(stored.values, stored.required_grid, stored.gaussians, record, facts, state, stored.disagreement)
+    of_file = stored.gaussians, record, facts, state, stored.disagreement, stored.deformation
+    return Reconstruction(stored.values, stored.required_grid, *of_file)
 
 
 @naming_arguments()
@@ -122,7 +124,8 @@ def save_volume(
         return
     facts = {**result.facts, "program": f"phyradgs-cl {__version__}", "record": result.record}
     write_volume(
-        file, result.volume, result.grid, facts, result.gaussians, metrics, result.state, result.disagreement
+        file, result.volume, result.grid, facts, result.gaussians, metrics, result.state, result.disagreement,
+        result.deformation,
     )
 
 

@@ -15,7 +15,7 @@ from phyradgs_cl.exporters import (
     format_of,
     state_times_s,
 )
-from phyradgs_cl.io import read_deformation
+from phyradgs_cl.io import holds_deformation, read_deformation
 from phyradgs_cl.signals import finish_despite_interrupt
 from phyradgs_cl.workflow.files import expecting, summary
 
@@ -75,18 +75,20 @@ def export_command(
 ) -> None:
     """Export a volume, upright and to scale, for 3D Slicer, ITK-SNAP, ImageJ, napari and others."""
     form, labels = to or format_of(output), DicomLabels(patient, title, description, date)
-    if object_motion is None and (states is not None or during is not None):
-        raise InputError("--during" if states is None else "--states", "no motion", "--object-motion FILE with it")
+    moves = object_motion is not None or states is not None or during is not None
     with finish_despite_interrupt(), expecting(volume, "volume"):
-        if object_motion is None:
+        if object_motion is None and moves and not holds_deformation(volume):
+            expected = "--object-motion FILE with it, or a volume of --method moving"
+            raise InputError("--during" if states is None else "--states", "no motion", expected)
+        if not moves:
             written: object = export_volume(volume, form, output, mu_water_per_mm, labels)
         else:
-            field = read_deformation(object_motion)
+            field = read_deformation(object_motion or volume)
             times_s = state_times_s(field, 10 if states is None else states, during)
             paths = export_states(volume, field, times_s, form, output, mu_water_per_mm, labels)
             written = paths[0] if len(paths) == 1 else f"{paths[0]} … {paths[-1]}"
     unit = "" if form in CLOUDS else ", HU" if mu_water_per_mm is not None else ", 1/mm"
-    moving = "" if object_motion is None else f", {len(times_s)} states from {times_s[0]:.4g} to {times_s[-1]:.4g} s"
+    moving = "" if not moves else f", {len(times_s)} states from {times_s[0]:.4g} to {times_s[-1]:.4g} s"
     say(f"{written}: {form}{unit}{moving}")
 
 

@@ -25,7 +25,8 @@ from phyradgs_cl.io import partial_path
 from phyradgs_cl.parallel import failing_together, launched_ranks
 from phyradgs_cl.progress import Ticker
 from phyradgs_cl.reconstructors import ProgressReport, Reconstruction, Report, RunPlan
-from phyradgs_cl.reconstructors.result import COMPARED, option_facts
+from phyradgs_cl.reconstructors.moving import motion_line
+from phyradgs_cl.reconstructors.result import COMPARED, MOTION_FOUND, option_facts
 from phyradgs_cl.reconstructors.tune import TUNED, tuning_line
 from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.settings import Settings
@@ -105,6 +106,8 @@ def reconstruct_command(
     how = f"{method}{result.early_stop}, {result.facts['seconds']:.1f} s ({used_s:.1f} s of processor time)"
     compared = f" ({result.facts[COMPARED]})" if COMPARED in result.facts else ""
     say(f"{written}: {how}{scores(metrics)}{compared}")
+    if MOTION_FOUND in result.facts and result.state is None:
+        say(motion_line(result.facts[MOTION_FOUND]))
     if TUNED in result.facts:
         say(tuning_line(result.facts[TUNED]))
     if profile:

@@ -1,4 +1,5 @@
 from .deformation import deformation_summary as deformation_summary
+from .deformation import holds_deformation as holds_deformation
 from .deformation import read_deformation as read_deformation
 from .deformation import write_deformation as write_deformation
 from .files import hashing as hashing

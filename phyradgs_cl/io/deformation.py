@@ -32,6 +32,12 @@ def read_deformation(path: str | Path) -> Deformation:
         return read_deformation_group(source, places[0])
 
 
+def holds_deformation(path: str | Path) -> bool:
+    """Returns whether a file, such as a volume of an object that moves, has a deformation of its own."""
+    with open_hdf5(path) as source:
+        return source.find(DEFORMATION) is not None
+
+
 def deformation_summary(path: str | Path) -> dict[str, object]:
     """Returns facts about a deformation file, checked as when it is read."""
     field = read_deformation(path)

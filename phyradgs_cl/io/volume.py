@@ -13,8 +13,8 @@ import numpy as np
 
 from phyradgs_cl import checks
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.fields import Gaussians, Grid, triple
-from phyradgs_cl.io.deformation import DEFORMATION
+from phyradgs_cl.fields import Deformation, Gaussians, Grid, triple
+from phyradgs_cl.io.deformation import DEFORMATION, read_deformation_group, write_deformation_group
 from phyradgs_cl.io.files import sha256_of
 from phyradgs_cl.io.hdf5 import datasets as h5
 from phyradgs_cl.io.hdf5.source import Hdf5Source, open_hdf5
@@ -38,7 +38,8 @@ log = logging.getLogger(__name__)
 class Volume:
     """Values (nz, ny, nx) float32 in 1/mm and their grid; None for a bare array. A volume file also holds ``provenance``
     (types as in ``tables.PROVENANCE``), ``gaussians`` float32 in mm and 1/mm, ``metrics`` by name and ``disagreement``: half
-    the RMS difference of two estimates (nz, ny, nx) float32 in 1/mm."""
+    the RMS difference of two estimates (nz, ny, nx) float32 in 1/mm. deformation: how the object moves whose reference the
+    volume is."""
 
     values: np.ndarray
     grid: Grid | None
@@ -46,6 +47,7 @@ class Volume:
     gaussians: Gaussians | None = None
     metrics: dict[str, object] | None = None
     disagreement: np.ndarray | None = None
+    deformation: Deformation | None = None
 
     @property
     def required_grid(self) -> Grid:
@@ -59,11 +61,12 @@ def write_volume(
     path: str | Path, volume: np.ndarray, grid: Grid, provenance: Mapping[str, object],
     gaussians: Gaussians | None = None, metrics: Mapping[str, object] | None = None,
     state: Mapping[str, np.ndarray] | None = None, disagreement: np.ndarray | None = None,
+    deformation: Deformation | None = None,
 ) -> None:
     """Writes a volume (nz, ny, nx) in 1/mm, whole or not at all. ``provenance`` and ``metrics`` are stored as JSON, plain
     values also as attributes; ``gaussians`` as float32; ``state``: arrays and texts from which an interrupted run resumes;
-    ``disagreement`` (nz, ny, nx) in 1/mm. InputError: an array that is not finite or does not fit the grid. OutputError:
-    the file cannot be written."""
+    ``disagreement`` (nz, ny, nx) in 1/mm; ``deformation``: how the object moves. InputError: an array that is not
+    finite or does not fit the grid. OutputError: the file cannot be written."""
     for name, values in (("volume", volume), ("disagreement", disagreement)):
         if values is not None:
             checks.shape(name, values, grid.shape)
@@ -81,6 +84,8 @@ def write_volume(
             group = h5.new_group(entry, "gaussians", "NXcollection")
             for name in _CLOUD:
                 group.create_dataset(name, data=np.asarray(getattr(gaussians, name), np.float32))
+        if deformation is not None:
+            write_deformation_group(entry, deformation)
         if state is not None:
             group = h5.new_group(entry, "state", "NXcollection")
             for name, values in state.items():
@@ -103,7 +108,9 @@ def read_volume(path: str | Path) -> Volume:
         dataset, grid = _dataset_and_grid(source)
         values = _read_attenuation(source, _VOLUME, dataset)
         provenance, gaussians, metrics = _read_provenance(source), _read_gaussians(source), _read_metrics(source)
-        return Volume(values, grid, provenance, gaussians, metrics, _read_disagreement(source, grid.shape))
+        deformation = None if source.find(DEFORMATION) is None else read_deformation_group(source, DEFORMATION)
+        disagreement = _read_disagreement(source, grid.shape)
+        return Volume(values, grid, provenance, gaussians, metrics, disagreement, deformation)
 
 
 def read_state(path: str | Path) -> dict[str, np.ndarray] | None:

@@ -31,7 +31,8 @@ class Method:
     """A reconstruction method: its function, and its presets of options, of which the first is the default.
 
     is_resumable: it has checkpoints. is_shared: several ranks can share its work. takes_initial: it can start from a volume.
-    ends_anywhere: its short runs are the beginnings of its long ones. takes_deformation: its object may move."""
+    ends_anywhere: its short runs are the beginnings of its long ones. takes_deformation: its object may move.
+    finds_deformation: it finds how the object moves."""
 
     run: Callable[..., Reconstruction]
     presets: Mapping[str, Any]
@@ -40,6 +41,7 @@ class Method:
     takes_initial: bool = False
     ends_anywhere: bool = False
     takes_deformation: bool = False
+    finds_deformation: bool = False
 
 
 @dataclass(frozen=True)

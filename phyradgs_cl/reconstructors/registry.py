@@ -37,6 +37,7 @@ METHODS = _Methods({
     "naf": "neural:NAF",
     "sax-nerf": "neural:SAX_NERF",
     "fused": "fused",
+    "moving": "moving.method",
     "fdk": "fdk",
     "fbp": "fdk:FBP_METHOD",
 })

@@ -10,7 +10,7 @@ import numpy as np
 from phyradgs_cl import checks
 from phyradgs_cl.acquisition.motion import motion_facts
 from phyradgs_cl.errors import InputError, naming_arguments
-from phyradgs_cl.fields import Gaussians, Grid
+from phyradgs_cl.fields import Deformation, Gaussians, Grid
 from phyradgs_cl.reconstructors.checkpoint import State
 
 if TYPE_CHECKING:
@@ -26,6 +26,8 @@ HELD_OUT = "held_out"
 """The key, in a result's facts, of its error on held-out pixels."""
 COMPARED = "compared"
 """The key of the way in which the volume was compared with the scan's reference, if not voxel by voxel."""
+MOTION_FOUND = "motion_found"
+"""The key of what a method has found about the motion of the object."""
 MARGIN_MM = "margin_mm"
 """The key of the width (z, y, x) of the discarded margin."""
 
@@ -37,7 +39,8 @@ class Reconstruction:
     gaussians: the cloud in mm, for methods that have one; record: the convergence record, one dict per report;
     facts: what is needed to make it again (method, options, scales, seconds); state: how to go on, where a run
     was interrupted; disagreement: how far two estimates are from each other near every voxel, (nz, ny, nx) float32 in 1/mm,
-    of ``fused``. Raises InputError for arrays that are not the grid's."""
+    of ``fused``; deformation: how the object moves, of ``moving``, whose volume is its reference. Raises InputError for
+    arrays that are not the grid's."""
 
     volume: np.ndarray
     grid: Grid
@@ -46,6 +49,7 @@ class Reconstruction:
     facts: dict[str, Any] = field(default_factory=dict)
     state: State | None = None
     disagreement: np.ndarray | None = None
+    deformation: Deformation | None = None
 
     def __post_init__(self) -> None:
         if not isinstance(self.grid, Grid):
@@ -111,7 +115,8 @@ class Progress:
     loss: the dimensionless measure that ``quantity`` names. gaussians: their number, or 0. state: returns the state from
     which the run can resume. volume: returns the present volume (nz, ny, nx) in 1/mm and its grid. frames: returns so
     many measured frames, spread evenly, with those computed from the present volume. All three may be called during the
-    report only. A report that raises KeyboardInterrupt ends the run as Ctrl-C does."""
+    report only. deformation: how the object moves, where the method has found it. A report that raises
+    KeyboardInterrupt ends the run as Ctrl-C does."""
 
     iteration: int
     iterations: int
@@ -122,6 +127,7 @@ class Progress:
     state: "Callable[[], State] | None" = None
     volume: "Callable[[], tuple[np.ndarray, Grid]] | None" = None
     frames: "Callable[[int], list[FramePair]] | None" = None
+    deformation: Deformation | None = None
 
     def mapped(
         self, state: "Callable[[State], State] | None" = None, volume: "VolumeMap | None" = None, **changes: Any

@@ -43,7 +43,8 @@ from phyradgs_cl.runtime import Runtime
 
 # Volumes that voxel methods hold at one time at most (docs/large.md), with two of the intensity model; they hold stacks of
 # all frames too, and one buffer of three volumes.
-_HELD = {"sirt": 8, "sart": 28, "os-sart": 28, "cgls": 11, "asd-pocs": 32, "fista-tv": 16, "fista": 20, "fused": 20}
+_HELD = {"sirt": 8, "sart": 28, "os-sart": 28, "cgls": 11, "asd-pocs": 32, "fista-tv": 16}
+_HELD |= {"fista": 20, "fused": 20, "moving": 28}
 _STACKS, _ONE_BUFFER = 12, 3
 _OF_OTHERS = 4  # volumes: the result, and copies in which it is made, checked and written
 _DEVICE_SHARE = 0.9
@@ -86,7 +87,7 @@ def reconstruct(
         progress = progress.mapped(state=lambda state: with_identity(state, identity()))
         if progress.volume is not None and rt.ranks.size == 1:  # ranks project together
             whole = cache(progress.volume)
-            pairs = partial(_spread_pairs, rt, ready, deformation, whole)
+            pairs = partial(_spread_pairs, rt, ready, progress.deformation or deformation, whole)
             progress = replace(progress, volume=whole, frames=pairs)
         return progress if box is None else progress.mapped(volume=lambda volume, grid: _within(volume, grid, box))
 
@@ -98,7 +99,8 @@ def reconstruct(
     if result.state is not None:
         result = replace(result, state=with_identity(result.state, identity()))
     if hidden is not None and rt.ranks.rank == 0:
-        result.facts[HELD_OUT] = holdout_errors(rt, ready, hidden, result.volume, result.grid, deformation)
+        moving = result.deformation or deformation
+        result.facts[HELD_OUT] = holdout_errors(rt, ready, hidden, result.volume, result.grid, moving)
     if PREPARED_KEY in ready.provenance:
         result.facts[PREPARED_KEY] = ready.provenance[PREPARED_KEY]
     if box is None:

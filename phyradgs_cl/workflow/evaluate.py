@@ -39,13 +39,15 @@ def run_evaluation(
     """Compares a volume with a scan's reference or another volume, by the rule of ``metrics.aligned``, and writes the
     picture of slices. A volume without a scale is compared voxel by voxel. ``reference_voxel_mm``: sides of the voxels of a
     reference without a scale, one length or (z, y, x). ``object_motion``: the file of a deformation, which shows the volume
-    at each true state of a scan. InputError: no such sides; files that do not fit each other."""
+    at each true state of a scan; None takes the volume's own, if it has one. InputError: no such sides;
+    files that do not fit each other."""
     check_picture(picture, volume_path, reference_path, object_motion)
     field = None if object_motion is None else read_deformation(object_motion)
     result, (stored, moving) = load_result(volume_path), load_reference(reference_path)
     if field is not None and (moving is None or result.grid is None):
         expected = "a scan simulated with --motion-of-object, and a volume with a scale"
         raise InputError("--object-motion", "no true states to compare with", expected, "leave it out")
+    field = field or result.deformation
     volume, grid, provenance = result.values, result.grid, result.provenance
     reference, stored_grid = stored.values, stored.grid
     how, share = f"{VOXEL_BY_VOXEL}, as {plain_text(volume_path.name)} has no scale", 1.0

@@ -119,9 +119,10 @@ def _slabs_of(plan: methods.RunPlan, slabs: Slabs, scan: Path, ranks: Communicat
         return []
     with expecting(scan, "scan"):
         parts = slabs.of(read_scan_header(scan))
-    if parts and plan.object_motion is not None:
+    finds = methods.method_of(plan.method).finds_deformation
+    if parts and (finds or plan.object_motion is not None):
         expected, remedy = "all rows at a time: matter moves from slab to slab", "leave --rows and --slab out"
-        raise InputError("--object-motion", "slabs of rows", expected, remedy)
+        raise InputError(f"--method {plan.method_name}" if finds else "--object-motion", "slabs of rows", expected, remedy)
     if parts and ranks is not None and ranks.size > 1:
         raise InputError("--rows", f"slabs on {ranks.size} ranks", "one rank", "run a slab of rows on each machine")
     return parts
@@ -169,7 +170,7 @@ def _reconstructed(
                 target = output if result.state is None else partial_path(output)
                 provenance = _provenance(result, scan_hash, plan, path, rt)
                 parts = result.volume, result.grid, provenance, result.gaussians, metrics or None
-                write_volume(target, *parts, disagreement=result.disagreement)
+                write_volume(target, *parts, disagreement=result.disagreement, deformation=result.deformation)
                 _keep_checkpoint(output, result)
     except signals.InterruptedAfterwards:
         # After a complete run the signal takes effect; an interrupted run reports it.

@@ -48,6 +48,18 @@ def test_a_volume_is_compared_with_every_state(cli, capsys, folder) -> None:
     assert cli.run(line.split()) == 2 and "--object-motion" in capsys.readouterr().err
 
 
+def test_a_volume_with_its_own_deformation_needs_no_other(cli, capsys, folder, tmp_path) -> None:
+    """As ``--method moving`` writes it: for evaluate, export, and as the motion of another run."""
+    scan = load_scan(folder / "scan.h5")
+    field, own = scan.moving_truth.deformation, tmp_path / "own.h5"
+    write_volume(own, scan.reference, scan.grid, {"method": "moving"}, deformation=field)
+    np.testing.assert_array_equal(read_volume(own).deformation.control_mm, field.control_mm)
+    facts = facts_of(cli, capsys, f"evaluate {own} --reference {folder}/scan.h5 --json")
+    assert facts["mean_motion_error_mm"] == 0 and facts["mean_psnr_db"] > facts["psnr_db"]
+    assert cli.run(f"export {own} --states 2 -o {tmp_path}/state.npy".split()) == 0
+    assert "2 states from" in capsys.readouterr().out and (tmp_path / "state_02.npy").exists()
+
+
 def test_states_go_into_one_nifti_of_four_dimensions_which_info_describes(cli, capsys, folder) -> None:
     sitk = pytest.importorskip("SimpleITK")
     line = f"export {folder}/volume.h5 --object-motion {folder}/field.h5 --states 4 --during 1,5 -o {folder}/states.nii"

@@ -5,9 +5,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, ConstantSpeed, Scan, Shutter
-from phyradgs_cl.fields import Grid
-from phyradgs_cl.reconstructors.moving.signal import motion_signal
+from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, ConstantSpeed, PerRow, Scan, Shutter
+from phyradgs_cl.errors import InputError
+from phyradgs_cl.fields import Deformation, Grid, MovingTruth, control_points, deformed
+from phyradgs_cl.metrics import compare
+from phyradgs_cl.operators.warp.operator import projector_of
+from phyradgs_cl.phantoms import shepp_logan
+from phyradgs_cl.reconstructors import ObjectMotion, Reconstruction, plan_run, reconstruct
+from phyradgs_cl.reconstructors.moving.signal import load_signal, motion_signal
+from phyradgs_cl.reconstructors.moving.splines import Bending, TemporalSplines
+from phyradgs_cl.reconstructors.result import MOTION_FOUND, Progress
 
 FRAMES, PERIOD_S, STEP_S = 90, 3.1, 0.5
 
@@ -52,3 +59,110 @@ def test_masked_pixels_do_not_matter() -> None:
     mask[3, 5] = 1
     masked = replace(scan, projections=frames, pixel_mask=mask)
     assert motion_signal(masked).period_s == pytest.approx(PERIOD_S, rel=0.03)
+
+
+GRID, SHAPE = Grid.cube(16, 2.0), (24, 24)
+ITERATIONS = 12  # two rounds of the search, and ten passes
+
+
+def breathing_scan(rt, amplitude_mm: float) -> Scan:
+    """Forty frames of an object whose top rises and falls, of other angles than those of its breaths."""
+    origin_mm, counts = control_points(GRID, 0.5)
+    share = np.clip((origin_mm[2] + 0.5 * np.arange(counts[0]) + 1) / 2, 0, 1)[:, None, None]
+    control_mm = np.zeros((1, *counts, 3))
+    control_mm[0, ..., 2] = amplitude_mm * share
+    times_s = np.linspace(0, 17, 171)
+    truth = Deformation(control_mm, origin_mm, 0.5, times_s, np.cos(2 * np.pi * times_s / 2.3)[:, None])
+    geometry, start_s = ConeGeometry(5.0, 7.0, SHAPE, (4 / 24, 4 / 24)), 0.4 * np.arange(40)
+    orbit, fine = CircularOrbit(geometry, ConstantSpeed(0.0, 2 * np.pi / 16)), GRID.finer(2)
+    empty = Scan(np.zeros((40, *SHAPE), np.float32), geometry, orbit, Shutter(0.3), start_s, GRID)
+    tables, volume = [PerRow(3).cells(empty, f) for f in range(40)], shepp_logan(0.9).voxelise(fine)
+    frames = projector_of(rt, fine, tables, truth)(rt, fine, SHAPE, tables).forward(volume)
+    frames += np.random.default_rng(0).normal(0, 0.005, frames.shape).astype(np.float32)
+    reference = volume.reshape(16, 2, 16, 2, 16, 2).mean((1, 3, 5))
+    at_s = 7 + 2.3 * np.arange(4) / 4
+    states = np.stack([deformed(reference, GRID, truth, truth.weights_at(time_s)[0]) for time_s in at_s])
+    return replace(empty, projections=frames, reference=reference, moving_truth=MovingTruth(at_s, states, truth))
+
+
+def run(rt, scan: Scan, method: str = "moving", iterations: int = ITERATIONS, motion=None, **more) -> Reconstruction:
+    return reconstruct(scan, plan_run(method, {"iterations": iterations}, object_motion=motion), rt, **more)
+
+
+def mean_psnr_db(result: Reconstruction, scan: Scan) -> float:
+    """Over the true states, of which the volume shows those that its deformation says."""
+    field, truth = result.deformation, scan.moving_truth
+    shown = [
+        result.volume if field is None else deformed(result.volume, GRID, field, field.weights_at(time_s)[0])
+        for time_s in truth.times_s
+    ]
+    return float(np.mean([compare(one, true)["psnr_db"] for one, true in zip(shown, truth.volumes, strict=True)]))
+
+
+@pytest.fixture(scope="module")
+def scan(rt) -> Scan:
+    return breathing_scan(rt, 0.3)
+
+
+@pytest.fixture(scope="module")
+def result(rt, scan) -> Reconstruction:
+    return run(rt, scan)
+
+
+def test_an_unknown_motion_is_found_and_taken_out(rt, scan, result) -> None:
+    found, passes = result.facts[MOTION_FOUND], ITERATIONS - 2
+    assert found["moves"] and found["period_s"] == pytest.approx(2.3, rel=0.05) and found["gain"] > 0.2
+    assert mean_psnr_db(result, scan) > mean_psnr_db(run(rt, scan, "fista", passes), scan) + 2.25
+    again = run(rt, scan, "fista", passes, ObjectMotion(result.deformation))
+    np.testing.assert_array_equal(result.volume, again.volume)
+
+
+@pytest.mark.parametrize("at", [1, 6])
+def test_it_resumes_with_the_same_bits_from_the_search_and_from_the_passes(rt, scan, result, at) -> None:
+    def stop(progress: Progress) -> None:
+        assert progress.iterations == ITERATIONS
+        assert progress.volume()[0].shape == GRID.shape
+        if progress.iteration >= at:
+            raise KeyboardInterrupt
+
+    part = run(rt, scan, report=stop)
+    assert part.facts["interrupted_at"] == at and (part.deformation is None) == (at < 2)
+    rest = run(rt, scan, resume=part.state)
+    np.testing.assert_array_equal(rest.volume, result.volume)
+    np.testing.assert_array_equal(rest.deformation.control_mm, result.deformation.control_mm)
+    assert rest.facts[MOTION_FOUND] == result.facts[MOTION_FOUND]
+    with pytest.raises(InputError, match="checkpoint"):
+        run(rt, scan, resume={**part.state, "field_control" if at > 1 else "control_mm": np.zeros(3)})
+
+
+def test_an_object_at_rest_stays_at_rest(rt) -> None:
+    still = breathing_scan(rt, 0.0)
+    result, plain = run(rt, still), run(rt, still, "fista", ITERATIONS - 2)
+    assert not result.facts[MOTION_FOUND]["moves"] and result.deformation.is_still
+    np.testing.assert_array_equal(result.volume, plain.volume)
+
+
+def test_a_signal_of_a_file_is_followed_and_others_are_refused(scan, tmp_path) -> None:
+    times_s = np.linspace(-1, 22, 200)
+    path = tmp_path / "breath.csv"
+    path.write_text("time_s,height\n" + "\n".join(f"{t},{5 + np.cos(2 * np.pi * t / 2.3)}" for t in times_s))
+    signal = load_signal(str(path), scan)
+    assert signal.period_s == pytest.approx(2.3, rel=0.03) and np.abs(signal.values).max() == pytest.approx(1)
+    for text in ("", "time_s,height\n", "0,1\n1,2\n2,3\n3,4\n", "0\n40\n", "0,nan\n1,1\n2,2\n40,1\n", "a,b\nc,d\n"):
+        path.write_text(text)
+        with pytest.raises(InputError, match="gating"):
+            load_signal(str(path), scan)
+    with pytest.raises(InputError, match="gating"):
+        plan_run("moving", {"gating": "breaths"})
+
+
+def test_splines_sum_to_one_and_bending_is_none_of_a_rigid_motion() -> None:
+    splines = TemporalSplines.of_step(1.0, 8.0, 0.9)
+    times_s = np.linspace(1, 8, 50)
+    np.testing.assert_allclose(splines.at(times_s).sum(1), 1)
+    curve = np.stack([times_s, np.cos(times_s)], -1)
+    np.testing.assert_allclose(splines.at(times_s) @ splines.fit(times_s, curve), curve, atol=0.02)
+    bend, rigid = Bending((5, 4, 6)), np.ones((2, 5, 4, 6, 3))
+    np.testing.assert_allclose(bend(rigid), 0, atol=1e-12)
+    x, y = np.random.default_rng(0).normal(size=(2, 2, 5, 4, 6, 3))
+    assert np.vdot(bend(x), y) == pytest.approx(np.vdot(x, bend(y))) and np.vdot(bend(x), x) > 0

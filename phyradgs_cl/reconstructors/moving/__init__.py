@@ -1,1 +1,14 @@
 """Reconstruction of an object that moves in an unknown way: its signal in time, its displacement field, its volume."""
+
+from collections.abc import Mapping
+from typing import Any
+
+
+def motion_line(found: Mapping[str, Any]) -> str:
+    """Returns one line on what was found about the motion of the object."""
+    period_s = found["period_s"]
+    follows = "free in time" if period_s is None else f"following a signal with a period of {period_s:.3g} s"
+    gain = f"squared residual {100 * found['gain']:.2g} % below that at rest"
+    if not found["moves"]:
+        return f"object at rest: no motion shown ({gain}, {follows})"
+    return f"object moves by {found['rms_mm']:.3g} mm RMS, {follows}; {gain}"

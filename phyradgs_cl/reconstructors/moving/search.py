@@ -5,7 +5,7 @@ weights (``field.py``). It works on a coarse copy of the scan. Motion and image 
 motion estimation and image reconstruction (SMEIR) for 4D cone-beam CT, Med. Phys. 40, 101912 (2013)."""
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -13,6 +13,7 @@ import numpy as np
 from phyradgs_cl.acquisition import Motion, Scan
 from phyradgs_cl.acquisition.altered.coarse import SMOOTHING, binned, fewer_frames, smooth
 from phyradgs_cl.fields import Deformation, Grid, triple
+from phyradgs_cl.metrics import resampled
 from phyradgs_cl.reconstructors.checkpoint import State, check_like, count_of
 from phyradgs_cl.reconstructors.moving.field import FieldProblem, MotionField, sum_squares
 from phyradgs_cl.reconstructors.moving.signal import MotionSignal
@@ -55,15 +56,6 @@ def initial_field(scan: Scan, signal: MotionSignal, last_s: float, first_s: floa
     return MotionField.at_rest(scan, spacing_mm, splines, splines.fit(times_s, np.stack([line, line**2], -1)))
 
 
-@dataclass(frozen=True)
-class Finding:
-    """What the search has found. deformation: None of an object at rest. gain: by how much the squared residual falls when
-    the object may move."""
-
-    deformation: Deformation | None
-    gain: float
-
-
 class FieldSearch:
     """The search as a ``Stepwise`` of so many rounds on a scan made coarse. bending: as in ``FieldProblem``."""
 
@@ -72,8 +64,8 @@ class FieldSearch:
     def __init__(
         self, rt: Runtime, scan: Scan, motion: Motion, signal: MotionSignal, rounds: int, bending: float
     ) -> None:
-        self.rt, self.scan, self.iterations, self.iteration = rt, coarse_scan(scan), rounds, 0
-        self.motion = motion
+        self.rt, self.grid, self.motion = rt, scan.grid, motion
+        self.scan, self.iterations, self.iteration = coarse_scan(scan), rounds, 0
         self.problem = FieldProblem(rt, self.scan, motion, bending)
         times_s = self.problem.times_s
         self.field = initial_field(self.scan, signal, float(times_s.max()), float(times_s.min()))
@@ -125,14 +117,13 @@ class FieldSearch:
         self.relative, self.change = state["fit"].tolist()
 
     def present_volume(self) -> tuple[np.ndarray, Grid]:
-        return self.volume, self.scan.grid
+        return resampled(self.volume, self.scan.grid, self.grid)[0], self.grid
 
-    def finding(self) -> Finding:
-        """Compares the residual with that of an object at rest after the same passes, and returns the field if it is shown.
-
-        A gain must exceed what as many free numbers would explain in noise."""
+    def finding(self) -> tuple[Deformation, float]:
+        """Returns the field, and by which share the squared residual is smaller than that of an object at rest after as many
+        passes. The field is zeros unless the share exceeds 2 % and what as many free numbers would explain in noise."""
         if not self.field.control_mm.any():
-            return Finding(None, 0.0)
+            return self.field.deformation(), 0.0
         moving = self._reconstructed(self.field, self.volume, _PASSES)
         resting_field = replace(self.field, control_mm=np.zeros_like(self.field.control_mm))
         resting = self._reconstructed(resting_field, None, _FIRST_PASSES + _PASSES * self.iteration)
@@ -140,7 +131,7 @@ class FieldSearch:
         gain = 1 - ratio
         numbers = self.field.control_mm.size + self.field.temporal.size
         least = max(_LEAST_GAIN, 2 * numbers / max(int(np.count_nonzero(self.scan.valid)), 1))
-        return Finding(self.field.deformation() if gain > least else None, gain)
+        return (self.field if gain > least else resting_field).deformation(), gain
 
     def _misfit(self, one: MotionField, volume: np.ndarray) -> float:
         return sum_squares(self.problem.residual(one, volume))

@@ -10,12 +10,14 @@ import numpy as np
 from scipy.signal import hilbert
 
 from phyradgs_cl.acquisition import Scan
+from phyradgs_cl.errors import InputError
 
 _HARMONICS = 4  # of the gantry's angle, which the object at rest explains
 _FEWEST_CYCLES = 5  # in the scan: slower motion is taken as free in time
 _BAND = 0.25  # on either side of the most frequent rate: breaths differ in length
 _PERIODIC_SHARE = 0.5  # of the power in that band, beyond what white noise has there
 _FEWEST_FRAMES = 16
+_SHORTEST = 4  # lines of a file
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,6 +44,34 @@ def motion_signal(scan: Scan) -> MotionSignal:
     rest = rows - explained @ np.linalg.lstsq(explained, rows, rcond=None)[0]
     values = _scaled(np.linalg.svd(rest, full_matrices=False)[0][:, 0])
     return MotionSignal(times_s, values, period_of(times_s, values))
+
+
+def load_signal(path: str, scan: Scan) -> MotionSignal:
+    """Loads a signal from a file with lines ``time in s, value``, a heading allowed. Its period is that of its spectrum, or
+    the time of six frames where no rate dominates. Raises InputError for other files, and times that miss the scan."""
+    try:
+        with open(path, encoding="utf-8") as file:
+            lines = [line.strip() for line in file if line.strip()]
+        numbers = np.array([[float(word) for word in line.split(",")] for line in lines[not _is_number(lines[0]) :]])
+    except (OSError, ValueError, IndexError) as error:
+        raise InputError(f"gating {path}", str(error) or "no lines", "a file with lines: time in s, value") from error
+    if numbers.ndim != 2 or numbers.shape[1] != 2 or len(numbers) < _SHORTEST or not np.isfinite(numbers).all():
+        found, expected = f"an array of shape {numbers.shape}", f"at least {_SHORTEST} lines: time in s, value"
+        raise InputError(f"gating {path}", found, expected)
+    times_s, values = numbers[np.argsort(numbers[:, 0], kind="stable")].T
+    first_s, last_s = float(np.min(scan.frame_start_s)), float(np.max(scan.frame_start_s))
+    if (np.diff(times_s) <= 0).any() or times_s[0] > first_s + scan.shutter.span_s or times_s[-1] < last_s:
+        found = f"{len(times_s)} times from {times_s[0]:.4g} to {times_s[-1]:.4g} s"
+        raise InputError(f"gating {path}", found, f"times that rise and cover the scan, {first_s:.4g} to {last_s:.4g} s")
+    step_s = float(np.median(np.diff(np.sort(scan.frame_start_s)))) if scan.frames > 1 else 1.0
+    return MotionSignal(times_s, _scaled(values), period_of(times_s, values) or 6 * step_s)
+
+
+def _is_number(line: str) -> bool:
+    try:
+        return bool(np.isfinite(float(line.split(",")[0])))
+    except ValueError:
+        return False
 
 
 def middle_times_s(scan: Scan) -> np.ndarray:
