@@ -37,8 +37,8 @@ def breathing_scan(rt: Runtime, path: Path, size: int, views: int, amplitude: fl
 
 def run_case(rt: Runtime, scan: Scan, case: str, method: str) -> dict[str, float]:
     """PSNR, SSIM, seconds and MiB in buffers of one reconstruction."""
-    motion = {"motion": "per-row"}
-    plan = RunPlan(method, method_options(method, None, motion))
+    motion = "exact" if method in ("phyradgs", "fused") else "per-row"
+    plan = RunPlan(method, method_options(method, None, {"motion": motion}))
     if case == "known":
         plan = replace(plan, object_motion=ObjectMotion(scan.moving_truth.deformation))
     rt.reset_peak()

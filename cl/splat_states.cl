@@ -173,10 +173,10 @@ __kernel void splat_states_back(
             pull[i] = vector_of(states + at, 3 + 3 * i, stride);
             by_pull[i] = vector_of(by_states + at, 3 + 3 * i, stride);
         }
+        const float4 place = vector_of(states + at, 0, stride);
         float4 by_place = vector_of(by_states + at, 0, stride);
         if (any((by_pull[0] != 0.0f) | (by_pull[1] != 0.0f) | (by_pull[2] != 0.0f))) /* not at the ends of a segment */
-            by_place += by_curvature(controls, counts, origin, per_spacing, shares + s * RANK, vector_of(states + at, 0, stride),
-                                     by_pull);
+            by_place += by_curvature(controls, counts, origin, per_spacing, shares + s * RANK, place, by_pull);
         /* dy/dm = 1/G, whose transpose has the rows of G's cofactors */
         const float4 x = cross(pull[1], pull[2]), y = cross(pull[2], pull[0]), z = cross(pull[0], pull[1]);
         by_mean += (float4)(dot(x, by_place), dot(y, by_place), dot(z, by_place), 0.0f) / dot(pull[0], x);

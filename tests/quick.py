@@ -24,7 +24,10 @@ QUICK = (
     "importers/test_hostile.py", "io/test_scan_damaged.py::test_damage",
     "api/test_bad_input.py", "api/test_docstrings.py", "test_gate.py", "test_layers.py", "test_errors.py",
 )  # fmt: skip
-LATER = ("operators/test_bricks.py", "operators/test_device_arrays.py", "acquisition/test_orbit_recipes.py")
+LATER = (
+    "operators/test_bricks.py", "operators/test_device_arrays.py", "acquisition/test_orbit_recipes.py",
+    *(f"operators/test_splat_states.py::test_{one}" for one in ("frames_and_gradients", "parallel_rays", "pixels_average")),
+)  # fmt: skip
 """The same kernels on parts of volumes, and arrays of the device: with the slow tests."""
 
 

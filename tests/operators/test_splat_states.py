@@ -14,7 +14,7 @@ from phyradgs_cl.acquisition.time_cells import TimeCells
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Deformation, Grid
 from phyradgs_cl.operators import DeviceCells, DeviceGaussians, SplatProjector
-from phyradgs_cl.operators.splats.states import STATE_ROWS, CloudStates, states_of
+from phyradgs_cl.operators.splats.states import STATE_ROWS, CloudStates, segments_for_object, states_of
 from phyradgs_cl.operators.twins.splat_states import deformed_frame
 from phyradgs_cl.runtime import Runtime
 
@@ -132,6 +132,18 @@ def test_motion_within_an_exposure_is_followed(rt, make_cloud, make_geometry) ->
     many = render(rt, rows, per_line_cells(*where, 30), steady)
     still = render(rt, rows, static_cells(*where), steady)
     assert np.linalg.norm(one - many) <= 0.1 * np.linalg.norm(still - many)
+
+
+def test_an_object_on_bent_paths_gets_more_segments(rt, make_cloud, make_geometry) -> None:
+    orbit, times_s = CircularOrbit(make_geometry(*SHAPE), ConstantSpeed(0.3, 1e-3)), np.linspace(0, 2, 81)
+    swing = Deformation(0.2 * np.ones((1, 11, 11, 11, 3)), (-2.5,) * 3, 0.5, times_s, np.cos(4 * times_s)[:, None])
+    lit_s = 0.2 + np.array([0.0, 1.4])
+    assert segments_for_object(deformation(0.0), lit_s, 0.1) == 1
+    count = segments_for_object(swing, lit_s, 0.1)
+    where, rows = (orbit, Shutter(0.8, 0.6), 0, 0.2, SHAPE[0]), make_cloud(8, 47)
+    many = render(rt, rows, per_line_cells(*where, 30), swing)
+    one, several = (np.linalg.norm(render(rt, rows, exact_cells(*where, n), swing) - many) for n in (1, count))
+    assert count > 2 and several < 0.1 * one
 
 
 def test_results_repeat_bit_for_bit(any_rt, make_cloud, make_geometry) -> None:

@@ -14,6 +14,7 @@ from phyradgs_cl.runtime import DeviceArray, Kernel, Runtime
 STATE_ROWS = 12  # of a Gaussian in a state: its place x y z, and the rows of G
 _PROBED_SIDE, _PROBED_STATES = 9, 16
 _WRONG = 0.01  # of a voxel
+_BEND, _MOST_SEGMENTS = 0.25, 32  # of a voxel: a parabola that is bent by so much blurs by 0.3 of it
 
 
 class CloudStates:
@@ -81,6 +82,17 @@ class CloudStates:
 
     def _kernel(self, name: str) -> Kernel:
         return self.rt.kernel("splat_states", name, RANK=self.deformation.rank)
+
+
+def segments_for_object(deformation: Deformation, lit_s: np.ndarray, voxel_mm: float) -> int:
+    """Returns the segments of a frame that is lit from lit_s[0] to lit_s[1], in each of which the path of any point of the
+    object is bent by at most a quarter of a voxel. Splats follow its mean place, and a straight path about it."""
+    for count in range(1, _MOST_SEGMENTS):
+        weights = deformation.weights_at(np.linspace(lit_s[0], lit_s[1], 2 * count + 1))
+        bend_mm = np.abs(weights[1::2] - (weights[:-1:2] + weights[2::2]) / 2) @ deformation.reach_mm
+        if bend_mm.max() <= _BEND * voxel_mm:
+            return count
+    return _MOST_SEGMENTS
 
 
 def states_of(table: TimeCells, deformation: Deformation) -> tuple[np.ndarray, np.ndarray]:

@@ -1,6 +1,6 @@
 """The device arrays of a splatting run: the Gaussians with their gradients and moments, and the scan's frames."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
@@ -10,7 +10,7 @@ from phyradgs_cl.detector import transmission_weights
 from phyradgs_cl.fields import Deformation
 from phyradgs_cl.operators import DeviceCells, DeviceGaussians
 from phyradgs_cl.operators.splats.layout import pad_columns, stride_of
-from phyradgs_cl.operators.splats.states import states_of
+from phyradgs_cl.operators.splats.states import segments_for_object, states_of
 from phyradgs_cl.optim import DeviceAdam, Population
 from phyradgs_cl.reconstructors.splats.options import SplatOptions
 from phyradgs_cl.runtime import DeviceArray, Runtime
@@ -77,7 +77,7 @@ class DeviceFrames:
         readout = scan.shutter.readout
         self.lines, self.width = readout.shape(scan.geometry.detector_shape)
         model = scan.detector_model if options.detector_model == "scan" else options.detector_model
-        tables, merges = tables_of(scan, options.motion, model)
+        tables, merges = tables_of(scan, options.motion, model, deformation)
         states = [None if deformation is None else states_of(table, deformation) for table in tables]
         scaled = (table.scaled(1 / scale.length_mm) for table in tables)
         self._cells = [DeviceCells.upload(rt, table, own) for table, own in zip(scaled, states, strict=True)]
@@ -109,11 +109,21 @@ class DeviceFrames:
         return self._cells[frame], self._measured[frame], self._mask[mask], self._pixels[mask]
 
 
-def tables_of(scan: Scan, motion: Motion, model: str) -> tuple[list[TimeCells], bool]:
-    """Returns the time cells of every frame in mm, and whether the detector model averages intensities over them."""
+def tables_of(
+    scan: Scan, motion: Motion, model: str, deformation: Deformation | None = None
+) -> tuple[list[TimeCells], bool]:
+    """Returns the time cells of every frame in mm, and whether the detector model averages intensities over them.
+
+    Where ``exact`` chooses the segments, an object that moves gets as many as its paths need."""
     peak = float(np.percentile(scan.projections, _PEAK_PERCENTILE)) if model == "intensity" else 0.0
     cells = partial(motion.cells, intensity_peak=peak) if isinstance(motion, Exact) else motion.cells
     tables = [cells(scan, frame) for frame in range(scan.frames)]
+    if deformation is not None and isinstance(motion, Exact) and motion.segments == 0 and scan.is_fly:
+        voxel_mm, lit_s = min(scan.grid.voxel_size_mm), np.array(scan.shutter.lit_span_s)
+        for frame, start_s in enumerate(scan.frame_start_s):
+            needed = segments_for_object(deformation, start_s + lit_s, voxel_mm)
+            if needed > tables[frame].count:
+                tables[frame] = replace(motion, segments=needed).cells(scan, frame)
     # both models agree on a single value
     return tables, model == "intensity" and any(table.averages for table in tables)
 
