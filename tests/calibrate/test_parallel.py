@@ -49,9 +49,8 @@ def test_tilts_and_distances_are_refused_and_not_asked_for() -> None:
             requested(f"roll,{word}", scan)
 
 
-@pytest.mark.parametrize(("views", "turn_deg"), [(30, 180.0), (60, 360.0)], ids=["half", "full"])
-def test_an_offset_and_a_roll_are_found(rt, views: int, turn_deg: float) -> None:
-    scan = parallel_scan(views, turn_deg, 1.5)
+def test_an_offset_and_a_roll_are_found_in_half_a_turn(rt) -> None:
+    scan = parallel_scan(30, 180.0, 1.5)
     rolled = perturb(scan, GeometryCorrection(offset_u_mm=0.15, roll_rad=np.deg2rad(1.5)))
     result = calibrate(replace(scan, projections=seen_by(rolled)), rt)
     found = {one.name: one for one in result.parameters}

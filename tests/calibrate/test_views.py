@@ -86,9 +86,9 @@ def test_a_slow_wobble_by_splines_of_time(cli, rt, tmp_path, capsys) -> None:
 def test_a_wobble_does_not_pass_for_a_roll(rt, monkeypatch) -> None:
     """Asked together with what all views share, which is found beside it; found again, it is what is left, beside what had
     been found before."""
-    how = {"size": 24, "detector": 36, "views": 30, "exposure_deg": 6.0, "noise": "tigre", "dose": 1e5}
+    how = {"size": 16, "detector": 24, "views": 24, "exposure_deg": 7.5, "noise": "tigre", "dose": 1e5}
     scan = simulate("jaw", **how, device=rt)
-    course = np.cos(np.pi * np.linspace(0, 1, 30))
+    course = np.cos(np.pi * np.linspace(0, 1, 24))
     parameters = WobbleParameters.of(scan)
     planted = parameters.without_gauges(np.stack([0 * course, 0.1 * course**2, 0.15 * course], -1))
     offset_mm = 0.2

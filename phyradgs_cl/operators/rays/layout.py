@@ -95,11 +95,6 @@ class RayLayout:
         padded = flat[GUARD:-GUARD].reshape(nz + 2 * BORDER, ny + 2 * BORDER, pitch_of(nx))
         return padded[BORDER:-BORDER, BORDER:-BORDER, :nx]
 
-    def pad_volume(self, volume: np.ndarray) -> np.ndarray:
-        flat = np.zeros(self.volume_floats, np.float32)
-        self.inside(flat)[...] = volume
-        return flat
-
     def constants(self) -> tuple[np.ndarray | np.int32, ...]:
         """The kernels' arguments: voxels, first voxel, pitch, voxel size, lines, width, pitch of the frames."""
         nz, ny, nx = self.brick.shape
