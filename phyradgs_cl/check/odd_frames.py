@@ -76,7 +76,8 @@ def without_outliers(rt: Runtime, scan: Scan, stated: Fit) -> tuple[np.ndarray, 
     if not outliers or len(outliers) >= _MOST_OUTLIERS * scan.frames:
         return np.arange(scan.frames), stated, []
     numbers = sorted(frame_number(scan, f) for f in outliers)
-    note = f"frame{'s' if len(outliers) > 1 else ''} {', '.join(map(str, numbers))} (from 0) do not fit the others"
+    frames, do = ("frames", "do") if len(outliers) > 1 else ("frame", "does")
+    note = f"{frames} {', '.join(map(str, numbers))} (from 0) {do} not fit the others"
     if len(outliers) == 2:
         order = np.arange(scan.frames)
         order[outliers] = order[outliers[::-1]]

@@ -102,6 +102,7 @@ def test_levels_bound_pixels_and_voxels(clean) -> None:
     small = coarse(replace(clean, projections=clean.projections), 16)
     assert small.geometry.detector_shape == (16, 16)
     assert coarse(of_rows(clean, 1), 16).projections.shape[1:] == (1, 32)
+    assert coarse(of_rows(clean, 3), 16).projections.shape[1:] == (3, 32)  # not one row of 16 blocks
     around = 2 * np.array(small.grid.voxel_size_mm)
     assert max(small.grid.shape) <= 26 and small.grid.size_mm - around == pytest.approx(clean.grid.size_mm)
 

@@ -56,6 +56,15 @@ def test_rtk_s_own_matrices_see_points_where_our_poses_do(rtk_folder, file) -> N
     np.testing.assert_array_equal(scan.projections[1, 2, :3], (140 + 28 + np.arange(3)) / 64)
 
 
+def test_of_two_stacks_the_named_one_is_read(rtk_folder) -> None:
+    stack = next(rtk_folder.glob("*.mha"))
+    scan = import_scan(rtk_folder)
+    shutil.copy(stack, rtk_folder / "truth.mha")
+    with pytest.raises(InputError, match="name the file itself"):
+        import_scan(rtk_folder)
+    np.testing.assert_array_equal(import_scan(stack).projections, scan.projections)
+
+
 def test_rtk_s_poses_move_through_the_frames(rtk_folder) -> None:
     """With times the poses of the file are met as each exposure starts, or in its middle; every window is covered."""
     still = import_scan(rtk_folder)

@@ -20,7 +20,7 @@ _MOST_VOXELS = 64  # per side
 _MARGIN = 1  # voxels around the box: an object that fills it would fit better with a smaller size
 _OBJECT_SHARE = 0.02  # of the largest line integral: columns above it show the object
 _LEAST_COLUMNS = 12  # of blocks, where the panel has that many
-_NARROW = 3  # times the columns, on a panel lower than a block: a row of few blocks holds little
+_NARROW = 3  # times the columns, on a panel lower than two blocks: a row of few blocks holds little
 
 
 def coarse(scan: Scan, columns: int) -> Scan:
@@ -29,8 +29,8 @@ def coarse(scan: Scan, columns: int) -> Scan:
     The detector's longer side has at most ``columns`` blocks."""
     shape = scan.geometry.detector_shape
     block = min(math.ceil(max(shape) / columns), max(1, shape[1] // _LEAST_COLUMNS))
-    if block > shape[0]:
-        block = max(shape[0], math.ceil(block / _NARROW))
+    if 2 * block > shape[0]:
+        block = math.ceil(block / _NARROW)
     small = binned(smooth(fewer_frames(scan, MOST_FRAMES), SMOOTHING * block), block)
     return replace(small, grid=coarse_grid(scan.grid, small.geometry))
 

@@ -53,20 +53,22 @@ class Stack:
 
 
 def recognises(path: Path) -> bool:
-    """True for an .xml file that has no raw projections beside it, and for a folder with one and a MetaImage."""
+    """True for an .xml file that has no raw projections beside it, for a folder with one and a MetaImage, and for a
+    MetaImage in such a folder."""
     folder = SafeFolder(path if path.is_dir() else path.parent)
-    if not path.is_dir():
+    if path.is_file() and path.suffix.lower() not in STACKS:
         return path.suffix.lower() == ".xml" and not path.name.lower().endswith(_ORA) and not folder.plain(*_RAW)
     descriptions = [file for file in folder.matching(".xml") if not file.name.lower().endswith(_ORA)]
     return bool(descriptions and folder.matching(*STACKS))
 
 
 def import_scan(path: Path, options: ImportOptions) -> Scan:
-    """Imports a folder with one .xml and one .mha (or .mhd), or an .xml with the stack in its folder."""
+    """Imports a folder with one .xml and one .mha (or .mhd); or one of the two files, with the other in its folder."""
     options.refuse_unused("rtk", OPTIONS)
     folder = SafeFolder(path if path.is_dir() else path.parent)
-    description = path if path.is_file() else folder.only("geometry", ".xml")
-    stack_path = folder.only("stack of projections", *STACKS)
+    is_stack = path.suffix.lower() in STACKS and path.is_file()
+    description = path if path.is_file() and not is_stack else folder.only("geometry", ".xml")
+    stack_path = path if is_stack else folder.only("stack of projections", *STACKS)
     rtk, stack = read_rtk_xml(description), _read_stack(stack_path)
     return scan_of(rtk, stack, options, (str(description), str(stack_path)), description.stem, str(path))
 
