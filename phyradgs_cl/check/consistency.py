@@ -116,15 +116,17 @@ def _best_sense(rt: Runtime, scan: Scan) -> tuple[Scan, Scan, float]:
     opposite views equally well.
 
     Returns the scan with the sense, the same with the shift, and the mean squared residual of the best rough fit."""
-    senses = [scan] if has_opposite_views(scan) else [scan, reversed_rotation(scan)]
-    roughs = [axis.rough_shift(rt, sense) for sense in senses]
+    senses, limits_px = [scan], [axis.ANYWHERE]
+    if not has_opposite_views(scan):
+        senses, limits_px = [scan, reversed_rotation(scan)], [axis.ANYWHERE, hypotheses.shifts_for_sense_px(scan)]
+    roughs = [axis.rough_shift(rt, sense, limits) for sense, limits in zip(senses, limits_px, strict=True)]
     least_rough = min(float(rough.squares.mean()) for rough in roughs)
     turned = best = scan
     least = _CLEAR * fit_squares(rt, scan).sum()
-    for sense, rough in zip(senses, roughs, strict=True):
+    for sense, rough, limits in zip(senses, roughs, limits_px, strict=True):
         if rough.squares.mean() > _NEARLY * least_rough:  # in a narrow fan rough fits do not decide
             continue
-        shift = axis.refined_shift(rt, sense, rough)
+        shift = axis.refined_shift(rt, sense, rough, limits)
         if not shift.is_found:
             continue
         other = shifted(sense, shift.pixels)

@@ -13,6 +13,7 @@ from phyradgs_cl.acquisition.altered.coarse import coarse_grid
 from phyradgs_cl.acquisition.geometry import default_grid
 from phyradgs_cl.check.finding import FEWEST_COLUMNS, MIRROR_U, MIRROR_V, PIXEL_SIZES
 from phyradgs_cl.fields import Grid
+from phyradgs_cl.reconstructors.fits import axis
 
 SIZE_FACTORS = (10.0, 0.1, 1e3, 1e-3)
 LEAST_REDUNDANCY = 0.5  # of the columns: with fewer rays measured twice, frames fit any size
@@ -45,6 +46,21 @@ def stated_redundancy(scan: Scan) -> float:
     panel."""
     geometry = scan.geometry
     return 1 - 2 * abs(geometry.detector_offset_mm[1]) / (geometry.pixel_size_mm[1] * geometry.detector_shape[1])
+
+
+def has_axis_near_edge(scan: Scan) -> bool:
+    """Whether the panel stands so far beside the axis, which it still sees, that it sees few rays twice."""
+    return 0 <= stated_redundancy(scan) < LEAST_REDUNDANCY
+
+
+def shifts_for_sense_px(scan: Scan) -> tuple[float, float]:
+    """Returns the limits of the panel's shift with which senses of rotation are compared, in pixels of the recorded scan. A
+    panel beside the axis does not go further off: rays that are measured once fit under any angles."""
+    offset_mm, pitch_mm = scan.geometry.detector_offset_mm[1], scan.geometry.pixel_size_mm[1]
+    if not has_axis_near_edge(scan):
+        return axis.ANYWHERE
+    across_px = 2 * abs(offset_mm) / pitch_mm * variants.altered_trajectory(scan).blocks[1]
+    return (-across_px, 0.0) if offset_mm > 0 else (0.0, across_px)
 
 
 def frame_number(scan: Scan, frame: int) -> int:

@@ -19,7 +19,12 @@ from phyradgs_cl.check.finding import (
     same_from_everywhere,
     too_narrow,
 )
-from phyradgs_cl.check.hypotheses import SIZE_FACTORS, nearly_sized, stated_redundancy
+from phyradgs_cl.check.hypotheses import (
+    SIZE_FACTORS,
+    nearly_sized,
+    shifts_for_sense_px,
+    stated_redundancy,
+)
 from phyradgs_cl.check.timing import is_full_turn
 from phyradgs_cl.reconstructors.fits import axis
 from phyradgs_cl.reconstructors.fits.opposite import opposite_shift
@@ -68,16 +73,17 @@ def find_orbit(rt: Runtime, quick: Scan, as_stated: Scan, sees_angles: bool) -> 
         sign = Finding(SIGN, CANNOT_TELL, 0.0, -_ERRORS, "standard errors", _NO_SIGN, _SIGN_ADVICE)
         shift, centre = centre_of(axis.axis_shift(rt, quick), block, as_stated)
         return Orbit(sign, centre, shift)
-    reverse = reversed_rotation(quick)
-    stated, other = axis.rough_shift(rt, quick), axis.rough_shift(rt, reverse)
+    reverse, limits_px = reversed_rotation(quick), shifts_for_sense_px(quick)
+    stated, other = (axis.rough_shift(rt, sense, limits_px) for sense in (quick, reverse))
     ratio = residual_ratio(stated.squares, other.squares)
     is_rough = max(ratio, 1 / max(ratio, 1e-30)) >= _CLEAR_RATIO  # the other sense needs no closer look
     if not is_rough:
-        stated, other = axis.refined_shift(rt, quick, stated), axis.refined_shift(rt, reverse, other)
+        stated = axis.refined_shift(rt, quick, stated, limits_px)
+        other = axis.refined_shift(rt, reverse, other, limits_px)
     sign = check_rotation(stated, other)
     is_reversed = sign.verdict == SUSPICIOUS
     shift = other if is_reversed else stated
-    if is_rough:
+    if is_rough or limits_px != axis.ANYWHERE:
         shift = axis.refined_shift(rt, reverse if is_reversed else quick, shift)
     shift, centre = centre_of(shift, block, as_stated)
     if is_reversed:

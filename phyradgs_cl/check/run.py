@@ -17,10 +17,12 @@ from phyradgs_cl.acquisition.altered.coarse import (
 )
 from phyradgs_cl.check import consistency, coverage, detector, orbit, shutter, timing
 from phyradgs_cl.check.finding import CANNOT_TELL, OK, SUSPICIOUS, Finding, same_from_everywhere
+from phyradgs_cl.check.hypotheses import has_axis_near_edge
 from phyradgs_cl.detector import without_lag
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.runtime import Runtime
 
+_SPARE_COLUMNS = 2.0  # coarse ones, by which a stated offset may be wrong and the object still fits into the grid
 Report = Callable[[int, int, str], None]
 """Takes how many questions are answered, how many there are, and the next one."""
 
@@ -96,7 +98,7 @@ def check(
     covered = answers.add(coverage.check_coverage(scan))
     if covered.unit in (coverage.NO_OBJECT, coverage.OPAQUE, coverage.TOO_BRIGHT):
         return answers.stop()
-    quick = coarse(scan, QUICK_COLUMNS)
+    quick = quick_scan(scan)
     consistent = consistency.check_consistency(rt, quick, scan)
     answers.add(consistent.finding)
     if not consistent.is_sound:
@@ -125,6 +127,13 @@ def check(
         return CheckResult(answers.findings, is_consistent=False)
     pitch_mm = scan.geometry.pixel_size_mm[1]
     return CheckResult(answers.findings, turn.shift.pixels * pitch_mm, turn.shift.deviation * pitch_mm)
+
+
+def quick_scan(scan: Scan) -> Scan:
+    """Returns the coarse scan of the questions about angles and the axis. Of a panel far beside the axis its grid is cut to
+    the object: the grid of the panel's view has so many voxels that few frames fit under other angles, too."""
+    quick = coarse(scan, QUICK_COLUMNS)
+    return around_object(quick, _SPARE_COLUMNS) if has_axis_near_edge(scan) else quick
 
 
 def _finite(scan: Scan) -> Scan:

@@ -4,13 +4,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from check_kit import stated, suspected, verdicts
+from check_kit import negative, stated, suspected, verdicts
 
 from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry
 from phyradgs_cl.acquisition.altered.variants import reversed_rotation
 from phyradgs_cl.acquisition.geometry import default_grid
-from phyradgs_cl.check import CANNOT_TELL, SUSPICIOUS, check, consistency
+from phyradgs_cl.check import CANNOT_TELL, OK, SUSPICIOUS, check, consistency
 from phyradgs_cl.check.coverage import check_coverage
+from phyradgs_cl.check.orbit import find_orbit
+from phyradgs_cl.check.run import quick_scan
 from phyradgs_cl.reconstructors.fits.axis import AxisShift
 
 
@@ -20,9 +22,9 @@ def test_both_senses_are_looked_at_where_few_iterations_do_not_tell(rt, clean, m
     monkeypatch.setattr(consistency, "reversed_rotation", lambda scan: other)
     monkeypatch.setattr(consistency, "shifted", lambda scan, pixels: (scan, pixels))
     first = {id(clean): 1.1, id(other): 1.0}
-    rough = lambda rt, scan: AxisShift(2.0, np.nan, np.array([first[id(scan)]]))  # noqa: E731
+    rough = lambda rt, scan, limits_px: AxisShift(2.0, np.nan, np.array([first[id(scan)]]))  # noqa: E731
     monkeypatch.setattr(consistency.axis, "rough_shift", rough)
-    monkeypatch.setattr(consistency.axis, "refined_shift", lambda rt, scan, rough: AxisShift(2.5, 0.1, rough.squares))
+    monkeypatch.setattr(consistency.axis, "refined_shift", lambda rt, scan, rough, _: AxisShift(2.5, 0.1, rough.squares))
     left = {id(clean): 0.1, id(other): 0.6}
     monkeypatch.setattr(
         consistency, "fit_squares", lambda rt, way: np.array([left[id(way[0])] if isinstance(way, tuple) else 2.0])
@@ -56,6 +58,15 @@ def test_a_panel_far_beside_the_axis_raises_no_false_alarm(rt, scan_of) -> None:
     """A derived grid is wider than the panel; the object once fitted better with pixels twice as large, in finer voxels."""
     far = ConeGeometry(5.0, 7.0, (32, 32), (0.125, 0.125), (0.0, 1.2))
     assert suspected(check(imported(scan_of(far, views=15, exposure_deg=24.0, readout_ratio=0.5)), rt)) == []
+
+
+def test_few_views_of_a_panel_far_beside_the_axis_fit_other_angles_no_better(rt, scan_of) -> None:
+    """In the grid of the panel's view half the step fitted, and the other sense with the axis off the panel."""
+    far = ConeGeometry(5.0, 7.0, (32, 32), (0.125, 0.125), (0.0, 1.5))
+    foot, jaw = (imported(scan_of(far, phantom, views=25)) for phantom in ("foot", "jaw"))
+    assert consistency.check_consistency(rt, quick_scan(foot), foot).finding.verdict == OK
+    for scan, verdict in ((jaw, OK), (negative(jaw), SUSPICIOUS)):
+        assert find_orbit(rt, quick_scan(scan), scan, True).sign.verdict == verdict
 
 
 def test_sizes_in_another_unit_are_no_offset(rt, aside) -> None:

@@ -112,8 +112,9 @@ def coarse_grid(grid: Grid, geometry: Geometry) -> Grid:
     return Grid((nz, ny, nx), (voxel[0], voxel[1], voxel[2]), grid.offset_mm)
 
 
-def around_object(scan: Scan) -> Scan:
-    """Returns a coarse scan with its grid about the axis cut to the object that the frames show.
+def around_object(scan: Scan, spare_columns: float = 0.0) -> Scan:
+    """Returns a coarse scan with its grid about the axis cut to the object that the frames show, and to so many columns more
+    as the axis may be off.
 
     With few frames, voxels of air let a wrong hypothesis fit better than the right one. A grid derived from the panel has
     many."""
@@ -124,7 +125,7 @@ def around_object(scan: Scan) -> Scan:
         return scan
     pitch_mm, offset_mm = geometry.pixel_size_mm[1], geometry.detector_offset_mm[1]
     edges_mm = (shown[[0, -1]] - (columns.size - 1) / 2) * pitch_mm + offset_mm
-    radius_mm = float(np.abs(edges_mm).max()) + pitch_mm / 2
+    radius_mm = float(np.abs(edges_mm).max()) + (0.5 + spare_columns) * pitch_mm
     if isinstance(geometry, ConeGeometry):
         radius_mm = geometry.source_to_axis_mm * math.sin(math.atan2(radius_mm, geometry.source_to_detector_mm))
     nz, *sides = grid.shape

@@ -14,6 +14,7 @@ _ROUGH_SHIFTS = (-2.0, -1.0, 0.0, 1.0, 2.0)  # coarse pixels
 _ROUGH_ITERATIONS = 8
 _STEP = 0.25  # coarse pixels
 _MOST_STEPS = 8
+ANYWHERE = (-math.inf, math.inf)
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,16 +31,20 @@ class AxisShift:
         return math.isfinite(self.pixels)
 
 
-def rough_shift(rt: Runtime, scan: Scan) -> AxisShift:
-    """Returns the best of five shifts, one coarse pixel apart, after a few iterations; without a deviation (NaN)."""
+def rough_shift(rt: Runtime, scan: Scan, limits_px: tuple[float, float] = ANYWHERE) -> AxisShift:
+    """Returns the best of five shifts within limits, one coarse pixel apart, after a few iterations; without a deviation."""
     block = columns_per_block(scan)
-    trials = [fit_squares(rt, shifted(scan, block * shift), _ROUGH_ITERATIONS) for shift in _ROUGH_SHIFTS]
+    shifts_px = [block * shift for shift in _ROUGH_SHIFTS if limits_px[0] <= block * shift <= limits_px[1]]
+    trials = [fit_squares(rt, shifted(scan, shift_px), _ROUGH_ITERATIONS) for shift_px in shifts_px]
     best = int(np.argmin([squares.sum() for squares in trials]))
-    return AxisShift(block * _ROUGH_SHIFTS[best], math.nan, trials[best])
+    return AxisShift(shifts_px[best], math.nan, trials[best])
 
 
-def refined_shift(rt: Runtime, scan: Scan, rough: AxisShift) -> AxisShift:
-    """Returns the shift near ``rough`` with the least residual, from a parabola through three neighbouring shifts."""
+def refined_shift(
+    rt: Runtime, scan: Scan, rough: AxisShift, limits_px: tuple[float, float] = ANYWHERE
+) -> AxisShift:
+    """Returns the shift near ``rough`` with the least residual, from a parabola through three neighbouring shifts. Where it
+    lies outside of the limits, that is ``rough``, fitted with all iterations and without a deviation."""
     block = columns_per_block(scan)
     centre = rough.pixels / block
     trials: dict[float, np.ndarray] = {}
@@ -57,6 +62,8 @@ def refined_shift(rt: Runtime, scan: Scan, rough: AxisShift) -> AxisShift:
         centre = neighbours[lowest]
     around = np.array([centre - _STEP, centre, centre + _STEP])
     best, deviation = vertex(around, np.stack([squares_at(shift) for shift in around]))
+    if math.isfinite(best) and not limits_px[0] <= block * best <= limits_px[1]:
+        return AxisShift(rough.pixels, math.nan, squares_at(rough.pixels / block))
     return AxisShift(block * best, block * deviation, squares_at(centre))
 
 
