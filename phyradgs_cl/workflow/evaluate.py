@@ -34,19 +34,21 @@ _LITTLE = 0.5 - 1e-6  # of either box: less in common is most often a wrong size
 @np.errstate(all="ignore")
 def run_evaluation(
     volume_path: Path, reference_path: Path, picture: Path, reference_voxel_mm: object = None,
-    object_motion: Path | None = None,
+    object_motion: Path | None = None, reference_of_rtk: bool = False,
 ) -> dict[str, object]:
     """Compares a volume with a scan's reference or another volume, by the rule of ``metrics.aligned``, and writes the
     picture of slices. A volume without a scale is compared voxel by voxel. ``reference_voxel_mm``: sides of the voxels of a
     reference without a scale, one length or (z, y, x). ``object_motion``: the file of a deformation, which shows the volume
-    at each true state of a scan; None takes the volume's own, if it has one. InputError: no such sides;
-    files that do not fit each other."""
+    at each true state of a scan; None takes the volume's own, if it has one. ``reference_of_rtk``: the
+    reference has RTK's axes. InputError: no such sides; files that do not fit each other."""
     check_picture(picture, volume_path, reference_path, object_motion)
     field = None if object_motion is None else read_deformation(object_motion)
     result, (stored, moving) = load_result(volume_path), load_reference(reference_path)
     if field is not None and (moving is None or result.grid is None):
         expected = "a scan simulated with --motion-of-object, and a volume with a scale"
         raise InputError("--object-motion", "no true states to compare with", expected, "leave it out")
+    if reference_of_rtk:
+        stored, moving = _with_our_axes(stored), None
     field = field or result.deformation
     volume, grid, provenance = result.values, result.grid, result.provenance
     reference, stored_grid = stored.values, stored.grid
@@ -91,6 +93,16 @@ def compared_states(result: Volume, field: Deformation | None, truth: MovingTrut
     points_mm = edge_points_mm(truth.volumes[0], truth_grid)
     mean_mm, high_mm = motion_error_mm(field, truth.deformation, points_mm, truth.times_s)
     return {"states": rows, **means, "mean_motion_error_mm": mean_mm, "p95_motion_error_mm": high_mm}
+
+
+def _with_our_axes(volume: Volume) -> Volume:
+    """Returns a volume of RTK, whose (x, y, z) are (y, z, x) here."""
+    z, y, x = 1, 2, 0  # the places of our axes in RTK's (z, y, x)
+    grid = volume.grid
+    if grid is not None:
+        shape, size_mm, at_mm = grid.shape, grid.voxel_size_mm, grid.offset_mm
+        grid = Grid((shape[z], shape[y], shape[x]), (size_mm[z], size_mm[y], size_mm[x]), (at_mm[z], at_mm[y], at_mm[x]))
+    return Volume(volume.values.transpose(z, y, x), grid)
 
 
 def _grid_of(path: Path, reference: np.ndarray, grid: Grid | None, voxel_mm: object, volume_path: Path) -> Grid:

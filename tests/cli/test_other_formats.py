@@ -8,6 +8,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
+import SimpleITK as sitk
 
 from phyradgs_cl.api import compare, load_scan, simulate
 from phyradgs_cl.exporters import export_volume
@@ -108,6 +109,26 @@ def test_how_another_grid_is_compared_is_said_in_the_line_and_the_json(cli, file
     told = capsys.readouterr().err
     assert told.count("\n") == 1 and "no voxel of the reference" in told and "(1000, 0, 0)" in told
     assert not (tmp_path / "away.evaluated.png").exists()
+
+
+def test_volumes_of_rtk_turn_about_y(cli, files, tmp_path, capfd) -> None:
+    scan, _, volume, grid = files
+    inner = [3, 4, 1], [5, 6, 8]
+    part = grid.part(*inner)
+    start, stop = inner[0], np.add(*inner)
+    truth = load_scan(scan).reference[tuple(map(slice, start, stop))]
+    image = sitk.GetImageFromArray(truth.transpose(2, 0, 1))  # RTK's (z, y, x) are our (x, z, y)
+    z, y, x = part.voxel_size_mm
+    image.SetSpacing((y, z, x))
+    lowest = [c - (n - 1) / 2 * v for c, n, v in zip(part.offset_mm, part.shape, part.voxel_size_mm, strict=True)]
+    image.SetOrigin((lowest[1], lowest[0], lowest[2]))
+    sitk.WriteImage(image, str(tmp_path / "rtk.mha"))
+    write_volume(tmp_path / "inner.h5", volume[tuple(map(slice, start, stop))], part, {})
+    command = ["evaluate", str(tmp_path / "inner.h5"), "--reference", str(tmp_path / "rtk.mha"), "--json", "--rtk-reference"]
+    assert cli.run(command) == 0
+    found = json.loads(capfd.readouterr().out)
+    assert found["compared"] == "voxel by voxel"
+    assert found["psnr_db"] == pytest.approx(20 * np.log10(truth.max() / 0.01), abs=1e-3)
 
 
 def test_a_reference_without_a_scale_is_placed_or_refused(cli, refused, files, tmp_path, capfd) -> None:
