@@ -1,11 +1,14 @@
-"""Objects that breathe during a scan, reconstructed at rest, with the true field, and as if they rested.
+"""Objects that breathe during a scan, reconstructed at rest, with the true field, as if they rested, and with a field that
+``moving`` finds.
 
     python benchmarks/moving.py VOLUMES RESULTS.jsonl [--names a,b] [--views 75,150] [--method fista] [--size 64]
+        [--cases rest,known,ignored,unknown]
 
 Volumes and scanner as benchmarks/scans.py has them: TIGRE's noise at 1e4 photons, a gantry that turns without stopping,
 exposures without gaps. A turn takes a minute. The breath has a period of 4 s, jittered by 10 %, and an amplitude of 15 % of
-half the box. PSNR and SSIM against the reference volume; seconds of processor time. A run goes on where it was interrupted:
-a line for each volume, number of views, method and case."""
+half the box. PSNR and SSIM against the reference volume; seconds of processor time. The case unknown has means over ten true
+states, of the method ``moving`` and of the volume that --method makes as if the object rested. A run goes on where it was
+interrupted: a line for each volume, number of views, method and case."""
 
 import argparse
 import json
@@ -13,17 +16,20 @@ import time
 from dataclasses import replace
 from pathlib import Path
 
-from scans import append, files_of, read_lines
+from scans import append, chosen, files_of, read_lines
 
 from phyradgs_cl import api
 from phyradgs_cl.acquisition import Scan
+from phyradgs_cl.io import Volume
 from phyradgs_cl.metrics import compare
-from phyradgs_cl.reconstructors import ObjectMotion, RunPlan, method_options, reconstruct
+from phyradgs_cl.reconstructors import ObjectMotion, Reconstruction, RunPlan, method_options, reconstruct
+from phyradgs_cl.reconstructors.result import MOTION_FOUND
 from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.simulation.object_motion import ObjectMotion as Breathing
+from phyradgs_cl.workflow.evaluate import compared_states
 
 TURN_S = 60.0
-CASES = ("rest", "known", "ignored")
+CASES = ("rest", "known", "ignored", "unknown")
 
 
 def breathing_scan(rt: Runtime, path: Path, size: int, views: int, amplitude: float) -> Scan:
@@ -35,10 +41,14 @@ def breathing_scan(rt: Runtime, path: Path, size: int, views: int, amplitude: fl
     )  # fmt: skip
 
 
+def plan_of(method: str) -> RunPlan:
+    motion = "exact" if method in ("phyradgs", "fused") else "per-row"
+    return RunPlan(method, method_options(method, None, {"motion": motion}))
+
+
 def run_case(rt: Runtime, scan: Scan, case: str, method: str) -> dict[str, float]:
     """PSNR, SSIM, seconds and MiB in buffers of one reconstruction."""
-    motion = "exact" if method in ("phyradgs", "fused") else "per-row"
-    plan = RunPlan(method, method_options(method, None, {"motion": motion}))
+    plan = plan_of(method)
     if case == "known":
         plan = replace(plan, object_motion=ObjectMotion(scan.moving_truth.deformation))
     rt.reset_peak()
@@ -46,6 +56,25 @@ def run_case(rt: Runtime, scan: Scan, case: str, method: str) -> dict[str, float
     result = reconstruct(scan, plan, rt)
     seconds = time.process_time() - started
     return {**compare(result.volume, scan.reference), "seconds": round(seconds, 1), "device_mib": rt.peak_bytes >> 20}
+
+
+def run_unknown(rt: Runtime, scan: Scan, method: str) -> dict[str, object]:
+    """Means over the true states of ``moving`` and of ``method`` as if the object rested, the error of the field in mm."""
+    lines: dict[str, object] = {}
+    for name, label in ((method, "static_"), ("moving", "")):
+        rt.reset_peak()
+        started = time.process_time()
+        result = reconstruct(scan, plan_of(name), rt)
+        lines[f"{label}seconds"] = round(time.process_time() - started, 1)
+        lines |= {label + key: value for key, value in means_over_states(result, scan).items()}
+    found = result.facts[MOTION_FOUND]
+    return {**lines, "device_mib": rt.peak_bytes >> 20, "moves": found["moves"], "period_s": found["period_s"]}
+
+
+def means_over_states(result: Reconstruction, scan: Scan) -> dict[str, object]:
+    field = result.deformation
+    states = compared_states(Volume(result.volume, result.grid), field, scan.moving_truth, scan.grid)
+    return {key: value for key, value in states.items() if key.startswith(("mean_", "p95_"))}
 
 
 def main() -> None:
@@ -56,20 +85,23 @@ def main() -> None:
     parser.add_argument("--views", default="75")
     parser.add_argument("--method", default="fista")
     parser.add_argument("--size", type=int, default=64)
+    parser.add_argument("--cases", default=",".join(CASES))
     parser.add_argument("--device")
     arguments = parser.parse_args()
     rt, done = Runtime(arguments.device), {key_of(line) for line in read_lines(arguments.results)}
     for name, path in files_of(arguments.volumes, arguments.names, arguments.size).items():
         for views in (int(n) for n in arguments.views.split(",")):
             scans: dict[bool, Scan] = {}
-            for case in CASES:
+            for case in chosen("--cases", arguments.cases, CASES):
                 facts = {"volume": name, "views": views, "method": arguments.method, "case": case, "size": arguments.size}
                 if key_of(facts) in done:
                     continue
                 moves = case != "rest"
                 if moves not in scans:
                     scans[moves] = breathing_scan(rt, path, arguments.size, views, 0.15 if moves else 0.0)
-                line = {**facts, **run_case(rt, scans[moves], case, arguments.method), "device": rt.device.name}
+                run = run_unknown(rt, scans[moves], arguments.method) if case == "unknown" else None
+                run = run or run_case(rt, scans[moves], case, arguments.method)
+                line = {**facts, **run, "device": rt.device.name}
                 append(arguments.results, line)
                 print(json.dumps(line), flush=True)
 

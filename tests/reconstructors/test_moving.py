@@ -12,6 +12,8 @@ from phyradgs_cl.metrics import compare
 from phyradgs_cl.operators.warp.operator import projector_of
 from phyradgs_cl.phantoms import shepp_logan
 from phyradgs_cl.reconstructors import ObjectMotion, Reconstruction, plan_run, reconstruct
+from phyradgs_cl.reconstructors.moving.field import MotionField
+from phyradgs_cl.reconstructors.moving.search import coarse_scan
 from phyradgs_cl.reconstructors.moving.signal import load_signal, motion_signal
 from phyradgs_cl.reconstructors.moving.splines import Bending, TemporalSplines
 from phyradgs_cl.reconstructors.result import MOTION_FOUND, Progress
@@ -166,3 +168,31 @@ def test_splines_sum_to_one_and_bending_is_none_of_a_rigid_motion() -> None:
     np.testing.assert_allclose(bend(rigid), 0, atol=1e-12)
     x, y = np.random.default_rng(0).normal(size=(2, 2, 5, 4, 6, 3))
     assert np.vdot(bend(x), y) == pytest.approx(np.vdot(x, bend(y))) and np.vdot(bend(x), x) > 0
+
+
+def test_the_search_has_blocks_of_pixels_and_large_voxels_in_the_same_box() -> None:
+    geometry, start_s = ConeGeometry(5.0, 7.0, (128, 100), (0.03, 0.03)), np.arange(3.0)
+    frames = np.random.default_rng(0).uniform(size=(3, 128, 100)).astype(np.float32)
+    orbit, grid = CircularOrbit(geometry, ConstantSpeed(0.0, 0.1)), Grid((64, 48, 48), (0.04,) * 3, (0.1, 0.0, 0.0))
+    whole = Scan(frames, geometry, orbit, Shutter(0.4, 0.5), start_s, grid)
+    small = coarse_scan(whole)
+    assert small.projections.shape == (3, 64, 50) and small.grid.shape == (32, 24, 24)
+    np.testing.assert_allclose(small.grid.size_mm, grid.size_mm)
+    assert small.grid.offset_mm == grid.offset_mm
+    assert small.projections.mean() == pytest.approx(frames.mean(), rel=0.01)
+    line_s = 0.5 / 127
+    np.testing.assert_allclose(small.frame_start_s, start_s + line_s / 2)
+    assert small.shutter.readout_s == pytest.approx(0.5 - line_s)
+
+
+def test_closer_control_points_carry_the_same_field(scan) -> None:
+    splines = TemporalSplines.of_step(0.0, 16.0, 1.0)
+    weights = np.random.default_rng(1).normal(size=(splines.count, 2))
+    coarse = MotionField.at_rest(scan, 1.0, splines, weights)
+    coarse = replace(coarse, control_mm=np.random.default_rng(2).normal(scale=0.1, size=coarse.control_mm.shape))
+    fine = coarse.refined(scan, 0.5)
+    assert fine.control_mm.size > 2 * coarse.control_mm.size
+    before, after = (one.deformation().on_grid_mm(GRID, (1.0, -0.5)) for one in (coarse, fine))
+    np.testing.assert_allclose(after, before, atol=0.02 * np.abs(before).max())
+    scaled = replace(coarse, temporal=3 * coarse.temporal, control_mm=coarse.control_mm / 3).scaled()
+    np.testing.assert_allclose(scaled.control_mm, coarse.scaled().control_mm)

@@ -12,7 +12,7 @@ from scipy.signal import hilbert
 from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.errors import InputError
 
-_HARMONICS = 4  # of the gantry's angle, which the object at rest explains
+_HARMONICS = 6  # of the gantry's angle, which the object at rest explains
 _FEWEST_CYCLES = 5  # in the scan: slower motion is taken as free in time
 _BAND = 0.25  # on either side of the most frequent rate: breaths differ in length
 _PERIODIC_SHARE = 0.5  # of the power in that band, beyond what white noise has there
