@@ -477,15 +477,15 @@ def parallel_memory() -> str:
 
 def moving_known() -> str:
     """Breathing volumes at rest, with the known field, and with the motion ignored."""
-    by_volume: dict[tuple[str, int], dict[str, dict[str, Any]]] = {}
+    by_volume: dict[tuple[str, int, str], dict[str, dict[str, Any]]] = {}
     for one in lines_of("moving.jsonl"):
         if one["case"] in ("rest", "known", "ignored"):
-            by_volume.setdefault((one["volume"], one["size"]), {})[one["case"]] = one
+            by_volume.setdefault((one["volume"], one["size"], one["method"]), {})[one["case"]] = one
     rows = []
-    for (volume, size), of in by_volume.items():
+    for (volume, size, method), of in by_volume.items():
         scores = [f"{of[case]['psnr_db']:.2f} / {of[case]['ssim']:.3f}" for case in ("rest", "known", "ignored")]
-        rows.append([volume, f"{size}³", *scores, f"{of['known']['seconds'] / of['rest']['seconds']:.1f}"])
-    return markdown(["volume", "voxels", "at rest", "known field", "ignored", "time, of that at rest"], rows)
+        rows.append([volume, f"{size}³", f"`{method}`", *scores, f"{of['known']['seconds'] / of['rest']['seconds']:.1f}"])
+    return markdown(["volume", "voxels", "method", "at rest", "known field", "ignored", "time, of that at rest"], rows)
 
 
 def moving_unknown() -> str:
