@@ -29,6 +29,12 @@ SHOWN_FROM = 300  # iterations of the live page
 GAP = 12  # pixels between pictures
 SIMULATE = "simulate --phantom foot --size 64 --detector 96 --noise tigre -o scan.h5"
 RECONSTRUCT = "reconstruct scan.h5 --method phyradgs --iterations 600 -o volume.h5"
+BREATHING = 'kind = "breathing"\nperiod_s = 4.0\n'
+SIMULATE_MOVING = (
+    "simulate --phantom foot --size 40 --detector 60 --views 60 --turns 3 --fps 6 --exposure-deg 4 "
+    "--motion-of-object breathing.toml -o moving.h5"
+)
+RECONSTRUCT_MOVING = "reconstruct moving.h5 --object-motion moving.h5 --method fdk -o reference.h5"
 SECTION = f"""## The report and the live page in a browser
 
 A run of the paper's method: its live page, and the report that this page becomes. `python docs/browser_pictures.py` takes
@@ -48,6 +54,15 @@ The volume in 3D as a surface; as a maximum with the Gaussians' centres, on a ph
 A browser without WebGL2 shows the slices.
 
 ![Without WebGL2](images/gallery/report_without_webgl.png)
+
+An object that breathes, at one time of its scan: arrows from where matter is in the reference volume, twice as long.
+
+```sh
+phyradgs {SIMULATE_MOVING}
+phyradgs {RECONSTRUCT_MOVING}
+```
+
+![An object that moves](images/gallery/report_motion.png)
 
 The live page of the run; on a phone; and after a kill.
 
@@ -78,6 +93,8 @@ def main() -> None:
         for arguments in (SOFTWARE, ["--disable-3d-apis"]):
             browser = launch(*arguments)
             take_report(browser, folder / "report.html", has_webgl=arguments is SOFTWARE)
+            if arguments is SOFTWARE:
+                take_motion(browser, folder)
             browser.close()
 
 
@@ -130,6 +147,21 @@ def take_report(browser: Any, page_file: Path, *, has_webgl: bool) -> None:
     space = phone.locator("#volume").screenshot()
     phone.locator("#rows-time").fill("330")
     save("report_phone", space, phone.locator("#shutter .scripted-only").screenshot())
+
+
+def take_motion(browser: Any, folder: Path) -> None:
+    """Takes the picture of an object that moves, in the middle of a breath."""
+    (folder / "breathing.toml").write_text(BREATHING)
+    if not (folder / "reference.h5").exists():
+        start(SIMULATE_MOVING, folder).wait()
+        start(RECONSTRUCT_MOVING, folder).wait()
+    start("report reference.h5 -o motion.html --views 0", folder).wait()
+    page = opened(browser, folder / "motion.html", DESKTOP)
+    page.locator("#motion-time").fill("40")
+    page.locator("#motion-arrows").fill("2")
+    page.locator("#motion").scroll_into_view_if_needed()
+    page.wait_for_timeout(3000)
+    save("report_motion", page.locator("#motion").screenshot())
 
 
 def opened(browser: Any, page_file: Path, size: dict[str, int], scheme: str = "light") -> Any:

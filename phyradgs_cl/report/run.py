@@ -24,8 +24,6 @@ from phyradgs_cl.io import (
     scan_summary,
     sha256_of,
 )
-from phyradgs_cl.io.deformation import DEFORMATION, read_deformation_group
-from phyradgs_cl.io.hdf5.source import open_hdf5
 from phyradgs_cl.metrics import METRICS, aligned, compare
 from phyradgs_cl.prepare import flat_correction
 from phyradgs_cl.prepare.step import Facts
@@ -105,7 +103,8 @@ def load_run(path: Path, scan_path: Path | None = None) -> Run:
         raise InputError(str(path), f"a {kind}", "a volume of phyradgs-cl", "make one with 'phyradgs reconstruct'")
     notes: list[str] = []
     stored = read_volume(path)
-    run = Run(path, stored, metrics=stored.metrics or {}, deformation=_deformation_of(path, stored.provenance, notes))
+    deformation = stored.deformation or _named_deformation(path, stored.provenance, notes)
+    run = Run(path, stored, metrics=stored.metrics or {}, deformation=deformation)
     named = scan_path or _scan_of(path, stored.provenance, notes)
     if named is not None:
         run = _with_scan(run, named, scan_path is not None, notes)
@@ -171,12 +170,9 @@ def computed_views(run: Run, rt: Runtime, count: int) -> list[FramePair]:
     return frame_pairs(rt, scan, volume.values, volume.required_grid, chosen, run.deformation)
 
 
-def _deformation_of(path: Path, provenance: Mapping[str, object], notes: list[str]) -> Deformation | None:
-    """Returns how the object moved: from the volume file itself, or the file that the provenance names, if it has the stored
-    hash. A file that is missing is a remark."""
-    with open_hdf5(path) as source:
-        if source.find(DEFORMATION) is not None:
-            return read_deformation_group(source, DEFORMATION)
+def _named_deformation(path: Path, provenance: Mapping[str, object], notes: list[str]) -> Deformation | None:
+    """Returns how the object moved, from the file that the provenance names, if it has the stored hash. A file that is
+    missing is a remark."""
     name, sha256 = provenance.get("object_motion"), provenance.get("object_motion_sha256")
     if not isinstance(name, str) or not name:
         return None
