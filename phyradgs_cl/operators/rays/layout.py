@@ -176,7 +176,9 @@ def _parallel_constants(pose: np.ndarray, grid: Grid) -> np.ndarray:
     pitch = np.array(grid.voxel_size_mm[::-1])
     direction, panel = pose[:, 0:3] / pitch, pose[:, 3:].reshape(-1, 3, 3) / pitch
     panel[:, 0] -= first / pitch
-    main = np.argmax(np.abs(direction), axis=1)  # the first of equal ones, as in the kernels
+    size = np.abs(direction)
+    # the first of those that float32 cannot tell apart, as in the kernels: at 135° the two differ in the last bit
+    main = np.argmax((size / size.max(axis=1, keepdims=True)).astype(np.float32), axis=1)
     cell = np.arange(len(pose))
     direction /= direction[cell, main][:, None]
     panel -= panel[cell, :, main][:, :, None] * direction[:, None]
