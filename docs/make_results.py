@@ -9,6 +9,7 @@ import json
 import re
 import sys
 from collections.abc import Callable, Iterable, Sequence
+from functools import partial
 from pathlib import Path
 from statistics import mean
 from typing import Any
@@ -215,8 +216,8 @@ def sweep(name: str, held_out: bool) -> str:
     return markdown(heads, text) + f"\nOf the other {others} kinds of scans the default is the best factor.\n"
 
 
-def curves() -> str:
-    """PSNR and SSIM with the priors dct and curves; runs with dct are also those of bench_s.jsonl."""
+def beside_dct(other: str) -> str:
+    """PSNR and SSIM with the priors dct and ``other``; runs with dct are also those of bench_s.jsonl."""
     scans: dict[tuple[Any, ...], dict[tuple[str, int], dict[str, dict[str, float]]]] = {}
 
     def add(line: dict[str, Any], kind: str, dose: float, size: int, prior: str, scores: dict[str, float]) -> None:
@@ -231,17 +232,17 @@ def curves() -> str:
         add(line, line["kind"], line["dose"], line["size"], line["prior"], line)
     text = []
     for (kind, _, views, dose, size), runs in sorted(scans.items(), reverse=True):
-        pairs = {key: by for key, by in runs.items() if {"dct", "curves"} <= set(by)}
+        pairs = {key: by for key, by in runs.items() if {"dct", other} <= set(by)}
         if not pairs:
             continue
         names = ", ".join(sorted({name.partition("_")[0] for name, _ in pairs}))
         cells = [f"{kind}, {names}", str(views), str(dose), f"{size}³"]
-        for prior in ("dct", "curves"):
+        for prior in ("dct", other):
             psnr, ssim = (mean(by[prior][metric] for by in pairs.values()) for metric in ("psnr_db", "ssim"))
             cells.append(f"{psnr:.2f} / {ssim:.4f}")
-        gains = [by["curves"]["psnr_db"] - by["dct"]["psnr_db"] for by in pairs.values()]
+        gains = [by[other]["psnr_db"] - by["dct"]["psnr_db"] for by in pairs.values()]
         text.append([*cells, f"{mean(gains):+.2f}", f"{min(gains):+.2f}"])
-    return markdown(["scan", "views", "photons", "voxels", "`dct`", "`curves`", "mean gain", "least"], text)
+    return markdown(["scan", "views", "photons", "voxels", "`dct`", f"`{other}`", "mean gain", "least"], text)
 
 
 def beside_rtk() -> str:
@@ -517,7 +518,8 @@ TABLES: dict[str, Callable[[], str]] = {
     "detector_models": detector_models,
     "prior_weight": lambda: sweep("prior_weight.jsonl", held_out=False),
     "passes": lambda: sweep("passes.jsonl", held_out=True),
-    "curves": curves,
+    "curves": partial(beside_dct, "curves"),
+    "firm": partial(beside_dct, "firm"),
     "beside_rtk": beside_rtk,
     "ray_motions": ray_motions,
     "whole_runs": whole_runs,

@@ -214,7 +214,10 @@ def test_fused_is_the_mean_of_both(rt, scan) -> None:
     assert run(rt, scan, "fista", iterations=1).disagreement is None
 
 
-@pytest.mark.parametrize(("at", "prior"), [(2, "dct"), (5, "curves"), (1, "nonlocal"), (3, "nonlocal+dct"), (6, "nonlocal")])
+@pytest.mark.parametrize(
+    ("at", "prior"),
+    [(2, "dct"), (5, "curves"), (5, "firm"), (1, "nonlocal"), (3, "nonlocal+dct"), (6, "nonlocal")],
+)
 def test_fista_goes_on_with_the_same_bits_from_either_grid(rt, scan, at, prior) -> None:
     options = method_options("fista", None, {"iterations": 7, "subvoxels": 2, "prior": prior})
 
@@ -229,6 +232,15 @@ def test_fista_goes_on_with_the_same_bits_from_either_grid(rt, scan, at, prior) 
     rest = reconstruct(scan, RunPlan("fista", options), rt, resume=part.state)
     np.testing.assert_array_equal(rest.volume, whole.volume)
     assert [line["iteration"] for line in rest.record] == [line["iteration"] for line in whole.record] == list(range(1, 8))
+
+
+def test_the_firm_prior_differs_from_dct_on_smaller_voxels_alone(rt, scan) -> None:
+    for parts in (1, 2):
+        firm, soft = (
+            run(rt, scan, "fista", motion="per-row", subvoxels=parts, prior=prior).volume for prior in ("firm", "dct")
+        )
+        assert np.array_equal(firm, soft) == (parts == 1)
+    assert quality(scan, firm) > quality(scan, soft)
 
 
 def test_a_prior_is_found_by_its_name(rt, scan, tmp_path, monkeypatch) -> None:

@@ -185,7 +185,7 @@ def _run(inputs: MethodInputs, options: FistaOptions, image: np.ndarray | None, 
         is_on_host = isinstance(system.space, HostSpace)
         is_short = is_on_host and system.leave_room(rt, (_HELD + _COPIES) * volume_bytes)
         of_grid = rt, scan.grid, options.tv_iterations, options.iterations
-        prior = priors.prior_of(options.prior, priors.PriorInputs(*of_grid, image, options.prior_share))
+        prior = priors.prior_of(options.prior, priors.PriorInputs(*of_grid, image, options.prior_share, parts))
         with rt.ledger.reserved(_COPIES * volume_bytes if is_short else 0):
             weight = PriorWeight(system, frame_error(scan, options.motion), options.prior_weight)
             return Fista(system, options, prior, weight)
