@@ -1,15 +1,18 @@
-/* A volume seen through a displacement, (W v)(y) = v(y + w(y)), trilinear and zero outside the volume, and its exact
+/* A volume seen through a displacement, (W v)(y) = v(y + w(y)), interpolated and zero outside the volume, and its exact
    transpose. The displacement of a state is w = sum of shares[r] * fields[r], in voxels. Twin: operators/twins/warp.py.
+   REACH 1 interpolates trilinearly. REACH 2 takes cubic convolution along each axis: R. G. Keys, IEEE Trans. Acoustics,
+   Speech, Signal Processing 29, 1153-1160 (1981), a = -1/2.
      warp_forward       a work-item takes LANES voxels along x.
      warp_adjoint_rows  CPUs: a work-item owns some slices of the result, to which it adds every voxel that reaches them.
-     warp_adjoint_fixed GPUs: a work-item adds its voxel to eight integers, whose sums do not depend on their order.
+     warp_adjoint_fixed GPUs: a work-item adds its voxel to integers, whose sums do not depend on their order.
      warp_adjoint_sum   adds such integers to the result.
      add_frames         adds the frames of a state to some of a stack.
    Near voxels move together. So LANES voxels meet a few more samples than one voxel does, and each sample is a vector of the
-   volume with a hat-shaped weight. Voxels that part more than MOST_SAMPLES allows are taken one by one. */
+   volume with its weights. Voxels that part more than MOST_TAPS along an axis allows are taken one by one. */
 #include "common/lanes.h"
 
-#define MOST_SAMPLES 48
+#define TAPS (2 * REACH)
+#define MOST_TAPS (TAPS + 2)
 
 #if LANES == 1
 #define VI_LEAST(v) (v)
@@ -33,14 +36,40 @@ static inline int vi_least(const vi v)
 }
 #endif
 
+/* The weight of a sample at a distance of its voxels; 0 from REACH on. */
+static inline vf tap(const vf distance)
+{
+#if REACH == 1
+    return fmax(1.0f - fabs(distance), (vf)(0.0f));
+#else
+    const vf x = fmin(fabs(distance), (vf)(2.0f));
+    const vf near = (1.5f * x - 2.5f) * x * x + 1.0f, far = ((2.5f - 0.5f * x) * x - 4.0f) * x + 2.0f;
+    return V_PICK(far, near, x < 1.0f);
+#endif
+}
+
+static inline float one_tap(const float distance)
+{
+#if REACH == 1
+    return fmax(1.0f - fabs(distance), 0.0f);
+#else
+    const float x = fmin(fabs(distance), 2.0f);
+    return x < 1.0f ? (1.5f * x - 2.5f) * x * x + 1.0f : ((2.5f - 0.5f * x) * x - 4.0f) * x + 2.0f;
+#endif
+}
+
+static inline int first_tap(const float at, const int length)
+{
+    return clamp((int)floor(at) + 1 - REACH, -REACH, length - 1);
+}
+
 /* Where LANES voxels look in the volume, and the samples around them: `count` of them along an axis from `first` on, which
-   along x moves with the lane. */
+   along x moves with the lane, with the weights of the first MOST_TAPS. */
 typedef struct {
     vf at;
     int first, count;
+    vf weights[MOST_TAPS];
 } Samples;
-
-static inline vf hat(const vf distance) { return fmax(1.0f - fabs(distance), (vf)(0.0f)); }
 
 static inline vf displacement(
     __global const float *fields, __global const float *shares, const size_t voxels, const int axis, const size_t voxel)
@@ -55,12 +84,16 @@ static inline vf displacement(
 static inline Samples samples_of(const vf position, const vi lane, const int length)
 {
     Samples s;
-    s.at = clamp(position, -1.0f, (float)length);
-    const vi below = min(V_INT(floor(s.at)), length - 1) - lane;
-    s.first = VI_LEAST(below);
-    s.count = VI_MOST(below) - s.first + 2;
+    s.at = clamp(position, (float)-REACH, (float)(length - 1 + REACH));
+    const vi first = clamp(V_INT(floor(s.at)) + 1 - REACH, -REACH, length - 1) - lane;
+    s.first = VI_LEAST(first);
+    s.count = VI_MOST(first) - s.first + TAPS;
+    for (int i = 0; i < MOST_TAPS; ++i)
+        s.weights[i] = tap(s.at - V_FLOAT(lane + s.first + i));
     return s;
 }
+
+#define IS_TOGETHER (max(sx.count, max(sy.count, sz.count)) <= MOST_TAPS)
 
 #define WARP_SAMPLES(y_, z_)                                                                                    \
     const vi lane = V_INT(V_IOTA);                                                                              \
@@ -70,7 +103,7 @@ static inline Samples samples_of(const vf position, const vi lane, const int len
     const Samples sz = samples_of((float)(z_) + displacement(fields, shares, voxels, 2, voxel), 0, shape.z);
 
 __kernel void warp_forward(
-    __global const float *volume, /* rows with a pitch, in a border of zeros; `strides`: start, row, slice */
+    __global const float *volume, /* rows with a pitch, in a border of 2 REACH zeros; `strides`: start, row, slice */
     const long4 strides,
     __global const float *fields, /* (RANK, 3: x y z, nz, ny, nx) voxels, and zeros for a vector's end */
     __global const float *shares, /* (RANK,) of the state */
@@ -84,16 +117,15 @@ __kernel void warp_forward(
     WARP_SAMPLES(y, z)
     __global const float *origin = volume + strides.x;
     vf sum = 0.0f;
-    if (sx.count * sy.count * sz.count <= MOST_SAMPLES) {
-        for (int k = 0; k < sz.count; ++k) {
-            const vf along_z = hat(sz.at - (float)(sz.first + k));
+    if (IS_TOGETHER) {
+        for (int k = 0; k < sz.count; ++k)
             for (int j = 0; j < sy.count; ++j) {
-                const vf across = along_z * hat(sy.at - (float)(sy.first + j));
                 __global const float *row = origin + (sz.first + k) * strides.z + (sy.first + j) * strides.y + sx.first;
-                for (int i = 0; i < sx.count; ++i)
-                    sum += across * hat(sx.at - (V_IOTA + (float)(sx.first + i))) * V_LOAD(row + i);
+                vf along_x = sx.weights[0] * V_LOAD(row);
+                for (int i = 1; i < sx.count; ++i)
+                    along_x += sx.weights[i] * V_LOAD(row + i);
+                sum += sz.weights[k] * sy.weights[j] * along_x;
             }
-        }
     }
 #if LANES > 1
     else {
@@ -102,13 +134,15 @@ __kernel void warp_forward(
         V_STORE(sy.at, ys);
         V_STORE(sz.at, zs);
         for (int l = 0; l < LANES; ++l) {
-            const int ix = min((int)floor(xs[l]), shape.x - 1), iy = min((int)floor(ys[l]), shape.y - 1);
-            const int iz = min((int)floor(zs[l]), shape.z - 1);
-            const float fx = xs[l] - ix, fy = ys[l] - iy, fz = zs[l] - iz;
-            __global const float *a = origin + iz * strides.z + iy * strides.y + ix, *b = a + strides.z;
-            const float low = (1 - fy) * ((1 - fx) * a[0] + fx * a[1]) + fy * ((1 - fx) * a[strides.y] + fx * a[strides.y + 1]);
-            const float high = (1 - fy) * ((1 - fx) * b[0] + fx * b[1]) + fy * ((1 - fx) * b[strides.y] + fx * b[strides.y + 1]);
-            sums[l] = (1 - fz) * low + fz * high;
+            const int ix = first_tap(xs[l], shape.x), iy = first_tap(ys[l], shape.y), iz = first_tap(zs[l], shape.z);
+            sums[l] = 0.0f;
+            for (int k = iz; k < iz + TAPS; ++k)
+                for (int j = iy; j < iy + TAPS; ++j) {
+                    __global const float *row = origin + k * strides.z + j * strides.y;
+                    const float across = one_tap(zs[l] - k) * one_tap(ys[l] - j);
+                    for (int i = ix; i < ix + TAPS; ++i)
+                        sums[l] += across * one_tap(xs[l] - i) * row[i];
+                }
         }
         sum = V_LOAD(sums);
     }
@@ -130,7 +164,7 @@ __kernel void warp_adjoint_rows(
     __global const float2 *rows,   /* (nz, ny) in a row */
     const int owned,               /* slices of a work-item */
     const long4 strides,
-    __global float *result)        /* as the volume of warp_forward: the sums begin with what is in it */
+    __global float *result)        /* as the volume of warp_forward: sums begin with what is in it; its border is unused */
 {
     const int z_start = (int)get_global_id(0) * owned, z_stop = min(z_start + owned, shape.z);
     if (z_start >= shape.z)
@@ -138,24 +172,23 @@ __kernel void warp_adjoint_rows(
     const size_t voxels = (size_t)shape.x * shape.y * shape.z;
     __global float *origin = result + strides.x;
     for (int z = 0; z < shape.z; ++z) {
-        if (z + slices[z].y <= (float)(z_start - 1) || z + slices[z].x >= (float)z_stop)
+        if (z + slices[z].y <= (float)(z_start - REACH) || z + slices[z].x >= (float)(z_stop - 1 + REACH))
             continue;
         for (int y = 0; y < shape.y; ++y) {
             const float2 reach = (float)z + rows[(size_t)z * shape.y + y];
-            if (reach.y <= (float)(z_start - 1) || reach.x >= (float)z_stop)
+            if (reach.y <= (float)(z_start - REACH) || reach.x >= (float)(z_stop - 1 + REACH))
                 continue;
             for (int first = 0; first < shape.x; first += LANES) {
                 WARP_SAMPLES(y, z)
                 const vf value = V_PICK(0.0f, V_LOAD(values + voxel), V_IOTA < (float)(shape.x - first));
-                if (sx.count * sy.count * sz.count <= MOST_SAMPLES) {
+                if (IS_TOGETHER) {
                     for (int i = 0; i < sx.count; ++i) {
-                        const vf along_x = value * hat(sx.at - (V_IOTA + (float)(sx.first + i)));
+                        const vf along_x = value * sx.weights[i];
                         for (int k = max(sz.first, z_start); k < min(sz.first + sz.count, z_stop); ++k) {
-                            const vf plane = along_x * hat(sz.at - (float)k);
-                            for (int j = max(sy.first, 0); j < min(sy.first + sy.count, shape.y); ++j) {
-                                __global float *at = origin + k * strides.z + j * strides.y + sx.first + i;
-                                V_STORE(V_LOAD(at) + plane * hat(sy.at - (float)j), at);
-                            }
+                            const vf plane = along_x * sz.weights[k - sz.first];
+                            __global float *at = origin + k * strides.z + sy.first * strides.y + sx.first + i;
+                            for (int j = 0; j < sy.count; ++j, at += strides.y)
+                                V_STORE(V_LOAD(at) + plane * sy.weights[j], at);
                         }
                     }
                     continue;
@@ -167,14 +200,13 @@ __kernel void warp_adjoint_rows(
                 V_STORE(sz.at, zs);
                 V_STORE(value, each);
                 for (int l = 0; l < min(LANES, shape.x - first); ++l) {
-                    const int ix = min((int)floor(xs[l]), shape.x - 1), iy = min((int)floor(ys[l]), shape.y - 1);
-                    const int iz = min((int)floor(zs[l]), shape.z - 1);
-                    for (int k = max(iz, z_start); k < min(iz + 2, z_stop); ++k)
-                        for (int j = max(iy, 0); j < min(iy + 2, shape.y); ++j) {
-                            __global float *at = origin + k * strides.z + j * strides.y + ix;
-                            const float part = each[l] * (1 - fabs(zs[l] - k)) * (1 - fabs(ys[l] - j));
-                            at[0] += part * (1 - (xs[l] - ix));
-                            at[1] += part * (xs[l] - ix);
+                    const int ix = first_tap(xs[l], shape.x), iy = first_tap(ys[l], shape.y), iz = first_tap(zs[l], shape.z);
+                    for (int k = max(iz, z_start); k < min(iz + TAPS, z_stop); ++k)
+                        for (int j = iy; j < iy + TAPS; ++j) {
+                            __global float *row = origin + k * strides.z + j * strides.y;
+                            const float part = each[l] * one_tap(zs[l] - k) * one_tap(ys[l] - j);
+                            for (int i = ix; i < ix + TAPS; ++i)
+                                row[i] += part * one_tap(xs[l] - i);
                         }
                 }
 #endif
@@ -195,10 +227,11 @@ __kernel void warp_adjoint_fixed(
     const size_t voxels = (size_t)shape.x * shape.y * shape.z;
     WARP_SAMPLES(y, z)
     const float value = scale * values[voxel];
-    for (int k = max(sz.first, 0); k < min(sz.first + 2, shape.z); ++k)
-        for (int j = max(sy.first, 0); j < min(sy.first + 2, shape.y); ++j)
-            for (int i = max(sx.first, 0); i < min(sx.first + 2, shape.x); ++i) {
-                const float part = value * hat(sz.at - (float)k) * hat(sy.at - (float)j) * hat(sx.at - (float)i);
+    for (int k = max(sz.first, 0); k < min(sz.first + TAPS, shape.z); ++k)
+        for (int j = max(sy.first, 0); j < min(sy.first + TAPS, shape.y); ++j)
+            for (int i = max(sx.first, 0); i < min(sx.first + TAPS, shape.x); ++i) {
+                const float across = sz.weights[k - sz.first] * sy.weights[j - sy.first];
+                const float part = value * across * sx.weights[i - sx.first];
                 atomic_add(result + ((size_t)k * shape.y + j) * shape.x + i, convert_int_rte(part));
             }
 }

@@ -18,6 +18,7 @@ TINY = ["--phantom", "jaw", "--size", "12", "--detector", "16", "--views", "4", 
 RUNS = {
     "phyradgs": ["--method", "phyradgs", "--iterations", "400", "--gaussians", "60", "--set", "control.start_iteration=50"],
     "sirt": ["--method", "sirt", "--motion", "per-row", "--iterations", "300"],
+    "known field": ["--method", "fista", "--iterations", "30", "--set", "subvoxels=1"],
 }
 # STRESS=50 is what `make stress` sets
 KILLS = int(os.environ.get("STRESS", "1"))
@@ -26,6 +27,14 @@ KILLS = int(os.environ.get("STRESS", "1"))
 @pytest.fixture(scope="module")
 def scan(simulated) -> Path:
     return simulated(*TINY, "--noise", "tigre")
+
+
+@pytest.fixture(scope="module")
+def moving_scan(simulated, tmp_path_factory) -> Path:
+    """A scan of an object that breathes, and the true field."""
+    motion = tmp_path_factory.mktemp("motion") / "breathing.toml"
+    motion.write_text('kind = "breathing"\nperiod_s = 2.5\n')
+    return simulated(*TINY, "--motion-of-object", str(motion))
 
 
 def command(scan: Path, output: Path, options: list[str]) -> list[str]:
@@ -54,17 +63,19 @@ def kill_in_the_middle(run: list[str], output: Path, after_s: float) -> None:
 
 
 @pytest.mark.parametrize("name", RUNS)
-def test_killed_runs_end_with_the_bits_of_one_that_was_not(scan, tmp_path, name) -> None:
-    whole, killed = tmp_path / "whole.h5", tmp_path / "killed.h5"
-    subprocess.run(command(scan, whole, RUNS[name]), check=True, capture_output=True)
+def test_killed_runs_end_with_the_bits_of_one_that_was_not(scan, moving_scan, tmp_path, name) -> None:
+    whole, killed, options = tmp_path / "whole.h5", tmp_path / "killed.h5", RUNS[name]
+    if name == "known field":
+        scan, options = moving_scan, [*options, "--object-motion", str(moving_scan)]
+    subprocess.run(command(scan, whole, options), check=True, capture_output=True)
     assert list(tmp_path.iterdir()) == [whole]
     rng = np.random.default_rng(len(name))
-    run = command(scan, killed, RUNS[name])
+    run = command(scan, killed, options)
     for kill in range(KILLS):
         kill_in_the_middle(run if kill == 0 else [*run, "--resume"], killed, float(rng.uniform(0, 0.05)))
         if killed.exists():  # it was too fast: from the start again
             killed.unlink()
-            run = command(scan, killed, RUNS[name])
+            run = command(scan, killed, options)
             checkpoint_path(killed).unlink(missing_ok=True)
             kill_in_the_middle(run, killed, 0.0)
     resume = ["--resume"] if checkpoint_path(killed).exists() else []

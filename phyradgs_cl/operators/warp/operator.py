@@ -1,7 +1,7 @@
 """The system matrix of a moving object: A x = Σ_k P_k W_k x over the states k, and its exact transpose.
 
-W_k warps the volume to a state. P_k projects it to the time cells of that state, each with its share of it: a cell between
-two states is a blend of both (``states.py``)."""
+W_k warps the volume to a state. P_k projects it to the time cells that the state stands for (``states.py``). A cell may also
+be a blend of two states."""
 
 from collections.abc import Callable, Iterator, Sequence
 from copy import copy
@@ -138,11 +138,13 @@ def projector_of(
 ) -> Callable[..., RayOperator | WarpedOperator]:
     """Returns what makes the projector of an object that moves as ``deformation`` does at the times of ``tables``.
 
-    It takes the arguments of ``RayOperator``, which it is for an object at rest."""
+    The nearest state stands for a cell: a blend of two would blur, and project every cell twice. Warps are cubic. The result
+    takes the arguments of ``RayOperator``, which it is for an object at rest."""
     if deformation is None:
         return RayOperator
-    states = MotionStates.of_times(deformation, grid, np.concatenate([table.time_s for table in tables]))
-    return RayOperator if states.is_at_rest else partial(WarpedOperator, warp=VolumeWarp(rt, states))
+    times_s = np.concatenate([table.time_s for table in tables])
+    states = MotionStates.of_times(deformation, grid, times_s, blends=False)
+    return RayOperator if states.is_at_rest else partial(WarpedOperator, warp=VolumeWarp(rt, states, is_cubic=True))
 
 
 def _tables_by_state(

@@ -1,4 +1,5 @@
-"""Representative states of a moving object. Operators warp a volume to each state once, and blend two for each time."""
+"""Representative states of a moving object. Operators warp a volume to each state once, and take for each time the nearest
+state or a blend of two."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -10,25 +11,28 @@ from phyradgs_cl.fields import Deformation, Grid
 
 MOST_STATES = 12
 _SPACING = 0.6  # voxels, RMS where the object moves, between a time and its nearest state
+_SPACING_OF_NEAREST = 0.3  # the same where the nearest state stands for a time
 _MOVES = 0.1  # of the largest squared displacement: voxels that move as much count in that RMS
 
 
 @dataclass(frozen=True, eq=False)
 class MotionStates:
-    """States of ``deformation``, and how times are blended of two of them.
+    """States of ``deformation``, and which of them stand for a time.
 
     fields_mm: (R, nz, ny, nx, 3) displacements of unit weight on ``grid``, components x, y, z. weights: (K, R) of each
-    state. metric: (R, R); the distance of two weights is √(dᵀ metric d), an RMS displacement in voxels."""
+    state. metric: (R, R); the distance of two weights is √(dᵀ metric d), an RMS displacement in voxels. blends: whether two
+    states are blended for a time between them; else the nearest one stands for it."""
 
     deformation: Deformation
     grid: Grid
     fields_mm: np.ndarray
     weights: np.ndarray
     metric: np.ndarray
+    blends: bool = True
 
     @classmethod
     def of_times(
-        cls, deformation: Deformation, grid: Grid, times_s: np.ndarray, least_voxels: float = 0.0
+        cls, deformation: Deformation, grid: Grid, times_s: np.ndarray, least_voxels: float = 0.0, blends: bool = True
     ) -> "MotionStates":
         """Chooses states for times (T,) in s: each next one is the time furthest from the states so far.
 
@@ -44,13 +48,14 @@ class MotionStates:
         metric += least_voxels**2 * units
         seen = np.unique(deformation.weights_at(times_s), axis=0)
         chosen = [int(np.argmin(_length(seen - seen.mean(0), metric)))]
+        spacing = _SPACING if blends else _SPACING_OF_NEAREST
         while len(chosen) < MOST_STATES:
             distance = np.min([_length(seen - seen[k], metric) for k in chosen], axis=0)
             furthest = int(np.argmax(distance))
-            if distance[furthest] <= (_SPACING if len(chosen) > 1 else 0.0):
+            if distance[furthest] <= (spacing if len(chosen) > 1 else 0.0):
                 break
             chosen.append(furthest)
-        return cls(deformation, grid, fields_mm, seen[chosen], metric)
+        return cls(deformation, grid, fields_mm, seen[chosen], metric, blends)
 
     @property
     def count(self) -> int:
@@ -74,9 +79,12 @@ class MotionStates:
     def shares(self, times_s: np.ndarray | Sequence[float]) -> np.ndarray:
         """Returns the share of each state (T, K) at times (T,); at most two of a row are above 0, and their sum is 1.
 
-        The pair has the smallest error, in voxels: the distance of the time's weights from the line between the two states,
-        and the blur of blending two volumes that are displaced against each other."""
+        The pair of a blend has the smallest error, in voxels: the distance of the time's weights from the line between the
+        two states, and the blur of blending two volumes that are displaced against each other."""
         wanted = self.deformation.weights_at(times_s)
+        if not self.blends:
+            distances = np.stack([_length(wanted - weights, self.metric) for weights in self.weights], -1)
+            return np.asarray(np.eye(self.count)[distances.argmin(-1)])
         shares, least = np.zeros((len(wanted), self.count)), np.full(len(wanted), np.inf)
         for first in range(self.count):
             from_first = wanted - self.weights[first]

@@ -3,11 +3,9 @@
 import numpy as np
 
 from phyradgs_cl.checks import ceil_div
-from phyradgs_cl.operators.bricks import whole
-from phyradgs_cl.operators.rays.layout import RayLayout
 from phyradgs_cl.operators.warp.states import MotionStates
 from phyradgs_cl.runtime import DeviceArray, DeviceSpace, Kernel, Runtime
-from phyradgs_cl.runtime.layout import GUARD, Strides, move
+from phyradgs_cl.runtime.layout import GUARD, Strides, move, pitch_of
 
 _MOST_OWNED = 8  # slices of the result that a CPU's work-item owns; it repeats the voxels that reach another's too
 _ITEMS_PER_UNIT = 4
@@ -16,18 +14,19 @@ _ROUNDING = 1e-3  # voxels
 
 
 class VolumeWarp:
-    """(W_k v)(y) = v(y + w_k(y)), trilinear, 0 outside the volume, for the states of ``states``.
+    """(W_k v)(y) = v(y + w_k(y)), 0 outside the volume, for the states of ``states``.
 
+    Trilinear, or by cubic convolution with ``is_cubic``, which hardly blurs.
     Holds 3 R volumes on the device for the R fields; a state's displacement is their weighted sum, made where it is used.
     Results have the same bits in every run: no sum depends on the order of work-items."""
 
-    def __init__(self, rt: Runtime, states: MotionStates) -> None:
+    def __init__(self, rt: Runtime, states: MotionStates, is_cubic: bool = False) -> None:
+        self._reach_voxels = 2 if is_cubic else 1
         self.rt, self.states, self.shape = rt, states, states.grid.shape
         fields = np.stack([states.fields_mm[..., i] / states.grid.voxel_size_mm[2 - i] for i in range(3)], 1)
         self._fields = rt.upload(np.pad(fields.ravel(), (0, GUARD)), np.float32)
         self._shares = [rt.upload(weights, np.float32) for weights in states.weights]
-        layout = RayLayout(states.grid, 1, 1, whole(self.shape))
-        self._floats, self._strides = layout.volume_floats, layout.volume_strides
+        self._floats, self._strides = self._layout()
         self._source: DeviceArray | None = None
         self._total: DeviceArray | None = None
         self._moved: DeviceArray | None = None
@@ -108,7 +107,14 @@ class VolumeWarp:
 
     def kernel(self, name: str) -> Kernel:
         """Returns a kernel of cl/warp.cl."""
-        return self.rt.kernel("warp", name, RANK=len(self.states.fields_mm))
+        return self.rt.kernel("warp", name, RANK=len(self.states.fields_mm), REACH=self._reach_voxels)
+
+    def _layout(self) -> tuple[int, Strides]:
+        """Returns the floats and strides of volumes with a border of zeros, which samples beyond a face read."""
+        (nz, ny, nx), border = self.shape, 2 * self._reach_voxels
+        slice_ = (ny + 2 * border) * pitch_of(nx)
+        strides = Strides(GUARD + border * (slice_ + pitch_of(nx)), slice_, pitch_of(nx))
+        return 2 * GUARD + (nz + 2 * border) * slice_, strides
 
     def _size(self) -> np.ndarray:
         return np.array([*self.shape[::-1], 0], np.int32)
