@@ -3,6 +3,7 @@
 
     python benchmarks/moving.py VOLUMES RESULTS.jsonl [--names a,b] [--views 75,150] [--method fista] [--size 64]
         [--cases rest,known,ignored,unknown]
+    python benchmarks/moving.py --insert VOLUMES RESULTS.jsonl [--size 64]: how far off the centre of a ball in a body is
 
 Volumes and scanner as benchmarks/scans.py has them: TIGRE's noise at 1e4 photons, a gantry that turns without stopping,
 exposures without gaps. A turn takes a minute. The breath has a period of 4 s, jittered by 10 %, and an amplitude of 15 % of
@@ -12,16 +13,21 @@ interrupted: a line for each volume, number of views, method and case."""
 
 import argparse
 import json
+import tempfile
 import time
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 from scans import append, chosen, files_of, read_lines
 
 from phyradgs_cl import api
 from phyradgs_cl.acquisition import Scan
-from phyradgs_cl.io import Volume
+from phyradgs_cl.fields import Grid
+from phyradgs_cl.io import Volume, write_volume
 from phyradgs_cl.metrics import compare
+from phyradgs_cl.phantoms import Ellipsoid, EllipsoidPhantom
 from phyradgs_cl.reconstructors import ObjectMotion, Reconstruction, RunPlan, method_options, reconstruct
 from phyradgs_cl.reconstructors.result import MOTION_FOUND
 from phyradgs_cl.runtime import Runtime
@@ -58,6 +64,32 @@ def run_case(rt: Runtime, scan: Scan, case: str, method: str) -> dict[str, float
     return {**compare(result.volume, scan.reference), "seconds": round(seconds, 1), "device_mib": rt.peak_bytes >> 20}
 
 
+def run_insert(rt: Runtime, size: int, folder: Path) -> Iterator[dict[str, object]]:
+    """Yields by how many mm the centre of a ball in a breathing body is off its place in the reference, and how far it
+    moved, with the true field and without."""
+    body, ball = Ellipsoid((0.0, 0.0, 0.0), (0.7, 0.6, 0.85), 0.4), Ellipsoid((0.1, 0.0, 0.35), (0.2, 0.2, 0.2), 0.4)
+    fine = Grid.cube(2 * size, 2.0)
+    write_volume(folder / "insert.h5", EllipsoidPhantom((body, ball), "insert").voxelise(fine, 4), fine, {})
+    scan = breathing_scan(rt, folder / "insert.h5", size, 75, 0.15)
+    field = scan.moving_truth.deformation
+    places_mm = [field.inverse_mm(np.array([ball.centre_mm]), state)[0] for state in field.weights[::4]]
+    moved_mm = float(np.linalg.norm(np.ptp(places_mm, axis=0)))
+    for case in ("known", "ignored"):
+        plan = replace(plan_of("fista"), object_motion=ObjectMotion(field) if case == "known" else None)
+        volume = reconstruct(scan, plan, rt).volume
+        off_mm = np.linalg.norm(centre_mm(volume, scan.grid, ball) - centre_mm(scan.reference, scan.grid, ball))
+        yield {"case": "insert", "motion": case, "size": size, "off_mm": float(off_mm), "moved_mm": moved_mm}
+
+
+def centre_mm(volume: np.ndarray, grid: Grid, ball: Ellipsoid) -> np.ndarray:
+    """The centre of what is denser than halfway between body and ball, within two radii of where the ball rests."""
+    z, y, x = np.meshgrid(*grid.axes_mm(), indexing="ij")
+    places_mm = np.stack([x, y, z], -1)
+    near = np.linalg.norm(places_mm - ball.centre_mm, axis=-1) < 2 * ball.reach_mm
+    dense = np.clip(volume[near] - 1.5 * ball.attenuation_per_mm, 0, None)
+    return np.average(places_mm[near], axis=0, weights=dense)
+
+
 def run_unknown(rt: Runtime, scan: Scan, method: str) -> dict[str, object]:
     """Means over the true states of ``moving`` and of ``method`` as if the object rested, the error of the field in mm."""
     lines: dict[str, object] = {}
@@ -87,8 +119,14 @@ def main() -> None:
     parser.add_argument("--size", type=int, default=64)
     parser.add_argument("--cases", default=",".join(CASES))
     parser.add_argument("--device")
+    parser.add_argument("--insert", action="store_true")
     arguments = parser.parse_args()
-    rt, done = Runtime(arguments.device), {key_of(line) for line in read_lines(arguments.results)}
+    if arguments.insert:
+        with tempfile.TemporaryDirectory() as folder:
+            for line in run_insert(Runtime(arguments.device), arguments.size, Path(folder)):
+                append(arguments.results, line)
+        return
+    rt, done = Runtime(arguments.device), {key_of(line) for line in read_lines(arguments.results) if "volume" in line}
     for name, path in files_of(arguments.volumes, arguments.names, arguments.size).items():
         for views in (int(n) for n in arguments.views.split(",")):
             scans: dict[bool, Scan] = {}
