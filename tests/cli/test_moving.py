@@ -55,7 +55,7 @@ def test_a_volume_with_its_own_deformation_needs_no_other(cli, capsys, folder, t
     write_volume(own, scan.reference, scan.grid, {"method": "moving"}, deformation=field)
     np.testing.assert_array_equal(read_volume(own).deformation.control_mm, field.control_mm)
     facts = facts_of(cli, capsys, f"evaluate {own} --reference {folder}/scan.h5 --json")
-    assert facts["mean_motion_error_mm"] == 0 and facts["mean_psnr_db"] > facts["psnr_db"]
+    assert facts["mean_motion_error_mm"] == 0  # which nothing has without a field
     assert cli.run(f"export {own} --states 2 -o {tmp_path}/state.npy".split()) == 0
     assert "2 states from" in capsys.readouterr().out and (tmp_path / "state_02.npy").exists()
 
