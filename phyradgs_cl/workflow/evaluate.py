@@ -62,6 +62,9 @@ def run_evaluation(
     metrics = compare(volume, reference)
     states = {}
     if moving is not None and grid is not None and stored_grid is not None:
+        if field is None and "object_motion" in provenance:
+            text = "%s was reconstructed with --object-motion %s: add it here, else the volume is compared as if it rested"
+            log.warning(text, volume_path, plain_text(str(provenance["object_motion"])))
         states = compared_states(result, field, moving, stored_grid)
     title = f"{provenance.get('method', 'volume')}: {volume_path.name}"
     with finish_despite_interrupt(), written_beside(picture) as temporary:

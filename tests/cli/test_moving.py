@@ -60,6 +60,15 @@ def test_a_volume_with_its_own_deformation_needs_no_other(cli, capsys, folder, t
     assert "2 states from" in capsys.readouterr().out and (tmp_path / "state_02.npy").exists()
 
 
+def test_evaluate_names_the_field_that_a_volume_was_reconstructed_with(cli, caplog, folder, tmp_path) -> None:
+    scan, path = load_scan(folder / "scan.h5"), tmp_path / "with_field.h5"
+    write_volume(path, scan.reference, scan.grid, {"method": "fista", "object_motion": f"{folder}/field.h5"})
+    for more, warned in (("", True), (f" --object-motion {folder}/field.h5", False)):
+        caplog.clear()
+        assert cli.run(f"evaluate {path} --reference {folder}/scan.h5{more}".split()) == 0
+        assert (f"reconstructed with --object-motion {folder}/field.h5: add it" in caplog.text) == warned
+
+
 def test_states_go_into_one_nifti_of_four_dimensions_which_info_describes(cli, capsys, folder) -> None:
     sitk = pytest.importorskip("SimpleITK")
     line = f"export {folder}/volume.h5 --object-motion {folder}/field.h5 --states 4 --during 1,5 -o {folder}/states.nii"

@@ -12,6 +12,7 @@ from phyradgs_cl.metrics import compare
 from phyradgs_cl.operators.warp.operator import projector_of
 from phyradgs_cl.phantoms import shepp_logan
 from phyradgs_cl.reconstructors import ObjectMotion, Reconstruction, plan_run, reconstruct
+from phyradgs_cl.reconstructors.moving import motion_line
 from phyradgs_cl.reconstructors.moving.field import MotionField
 from phyradgs_cl.reconstructors.moving.search import coarse_scan
 from phyradgs_cl.reconstructors.moving.signal import load_signal, motion_signal
@@ -144,16 +145,28 @@ def test_an_object_at_rest_stays_at_rest(rt) -> None:
     np.testing.assert_array_equal(result.volume, plain.volume)
 
 
+def test_a_gain_that_coefficients_explain_is_said_to_show_no_motion() -> None:
+    few, none = ({"moves": False, "period_s": None, "gain": gain} for gain in (0.32, 0.01))
+    assert "32 % below that at rest, which a field's coefficients can explain" in motion_line(few)
+    assert "coefficients" not in motion_line(none) and motion_line({**few, "moves": True, "rms_mm": 0.1}).endswith("rest")
+
+
 def test_a_signal_of_a_file_is_followed_and_others_are_refused(scan, tmp_path) -> None:
     times_s = np.linspace(-1, 22, 200)
     path = tmp_path / "breath.csv"
     path.write_text("time_s,height\n" + "\n".join(f"{t},{5 + np.cos(2 * np.pi * t / 2.3)}" for t in times_s))
     signal = load_signal(str(path), scan)
     assert signal.period_s == pytest.approx(2.3, rel=0.03) and np.abs(signal.values).max() == pytest.approx(1)
-    for text in ("", "time_s,height\n", "0,1\n1,2\n2,3\n3,4\n", "0\n40\n", "0,nan\n1,1\n2,2\n40,1\n", "a,b\nc,d\n"):
+    for text, found in {
+        "": "0 lines of numbers", "time_s,height\n": "0 lines", "0,1\n1,2\n2,3\n3,4\n": "4 times from 0 to 3 s",
+        "0\n1\n2\n40\n": "not two numbers", "0,1\n1,1,7\n2,2\n40,1\n": "not two numbers", "0,1\n40,2\n": "2 lines",
+        "0,nan\n1,1\n2,2\n40,1\n": "1 lines with NaN", "a,b\nc,d\n": "'c'", "0,5\n1,5\n2,5\n40,5\n": "the same value 5",
+    }.items():  # fmt: skip
         path.write_text(text)
-        with pytest.raises(InputError, match="gating"):
+        with pytest.raises(InputError, match=f"gating .*{found}"):
             load_signal(str(path), scan)
+    with pytest.raises(InputError, match=r"No such file.*check the path"):
+        load_signal(str(tmp_path / "none.csv"), scan)
     with pytest.raises(InputError, match="gating"):
         plan_run("moving", {"gating": "breaths"})
 

@@ -15,6 +15,7 @@ from phyradgs_cl.acquisition.altered.coarse import SMOOTHING, binned, fewer_fram
 from phyradgs_cl.fields import Deformation, Grid, triple
 from phyradgs_cl.metrics import resampled
 from phyradgs_cl.reconstructors.checkpoint import State, check_like, count_of
+from phyradgs_cl.reconstructors.moving import LEAST_GAIN
 from phyradgs_cl.reconstructors.moving.field import FieldProblem, MotionField, sum_squares
 from phyradgs_cl.reconstructors.moving.signal import MotionSignal
 from phyradgs_cl.reconstructors.moving.splines import TemporalSplines
@@ -28,7 +29,6 @@ _COARSE_SPACINGS, _FINE_SPACINGS = 2, 4  # of control points along the box's lon
 _FINE_BENDING = (_FINE_SPACINGS / _COARSE_SPACINGS) ** 4  # times as stiff in terms of coefficients is as stiff in mm
 _COARSE_SHARE = 0.6  # of the rounds
 _KNOTS_PER_PERIOD, _FREE_KNOTS = 6, 6
-_LEAST_GAIN = 0.02  # of the squared residual: less does not show a motion
 _AT_REST = "no motion found"
 
 
@@ -130,7 +130,7 @@ class FieldSearch:
         ratio: float = self._misfit(self.field, moving) / self._misfit(resting_field, resting)
         gain = 1 - ratio
         numbers = self.field.control_mm.size + self.field.temporal.size
-        least = max(_LEAST_GAIN, 2 * numbers / max(int(np.count_nonzero(self.scan.valid)), 1))
+        least = max(LEAST_GAIN, 2 * numbers / max(int(np.count_nonzero(self.scan.valid)), 1))
         return (self.field if gain > least else resting_field).deformation(), gain
 
     def _misfit(self, one: MotionField, volume: np.ndarray) -> float:

@@ -49,29 +49,41 @@ def motion_signal(scan: Scan) -> MotionSignal:
 def load_signal(path: str, scan: Scan) -> MotionSignal:
     """Loads a signal from a file with lines ``time in s, value``, a heading allowed. Its period is that of its spectrum, or
     the time of six frames where no rate dominates. Raises InputError for other files, and times that miss the scan."""
+    subject, expected = f"gating {path}", f"at least {_SHORTEST} lines: time in s, value"
     try:
         with open(path, encoding="utf-8") as file:
             lines = [line.strip() for line in file if line.strip()]
-        numbers = np.array([[float(word) for word in line.split(",")] for line in lines[not _is_number(lines[0]) :]])
-    except (OSError, ValueError, IndexError) as error:
-        raise InputError(f"gating {path}", str(error) or "no lines", "a file with lines: time in s, value") from error
-    if numbers.ndim != 2 or numbers.shape[1] != 2 or len(numbers) < _SHORTEST or not np.isfinite(numbers).all():
-        found, expected = f"an array of shape {numbers.shape}", f"at least {_SHORTEST} lines: time in s, value"
-        raise InputError(f"gating {path}", found, expected)
+        rows = [[float(word) for word in line.split(",")] for line in lines[_headings(lines) :]]
+    except OSError as error:
+        raise InputError(subject, str(error.strerror), expected, "check the path") from error
+    except ValueError as error:
+        raise InputError(subject, str(error), expected) from error
+    if len(rows) < _SHORTEST:
+        raise InputError(subject, f"{len(rows)} lines of numbers", expected)
+    if any(len(row) != 2 for row in rows):
+        raise InputError(subject, "a line that is not two numbers", expected)
+    numbers = np.array(rows)
+    if not np.isfinite(numbers).all():
+        raise InputError(subject, f"{int((~np.isfinite(numbers)).any(1).sum())} lines with NaN or infinity", expected)
     times_s, values = numbers[np.argsort(numbers[:, 0], kind="stable")].T
+    if np.ptp(values) == 0:
+        remedy = "take --set gating=auto, which needs no file"
+        raise InputError(subject, f"the same value {values[0]:.4g} in every line", "a signal that changes", remedy)
     first_s, last_s = float(np.min(scan.frame_start_s)), float(np.max(scan.frame_start_s))
     if (np.diff(times_s) <= 0).any() or times_s[0] > first_s + scan.shutter.span_s or times_s[-1] < last_s:
         found = f"{len(times_s)} times from {times_s[0]:.4g} to {times_s[-1]:.4g} s"
-        raise InputError(f"gating {path}", found, f"times that rise and cover the scan, {first_s:.4g} to {last_s:.4g} s")
+        raise InputError(subject, found, f"times that rise and cover the scan, {first_s:.4g} to {last_s:.4g} s")
     step_s = float(np.median(np.diff(np.sort(scan.frame_start_s)))) if scan.frames > 1 else 1.0
     return MotionSignal(times_s, _scaled(values), period_of(times_s, values) or 6 * step_s)
 
 
-def _is_number(line: str) -> bool:
+def _headings(lines: list[str]) -> int:
+    """Returns 1 if the first line does not begin with a number, else 0."""
     try:
-        return bool(np.isfinite(float(line.split(",")[0])))
+        float(lines[0].split(",")[0]) if lines else 0.0
     except ValueError:
-        return False
+        return 1
+    return 0
 
 
 def middle_times_s(scan: Scan) -> np.ndarray:
