@@ -159,3 +159,21 @@ def test_orbits_that_are_no_circle_about_z_are_told_and_refused(rt, caplog) -> N
             fdk(scan, FdkOptions(), rt)
             text = caplog.text
         assert tuple(words for words in (off, above) if words in text) == wrong.get(name, ()), (name, text)
+
+
+def test_rows_along_the_axis_are_refused(rt, caplog) -> None:
+    """FDK filters along detector rows: of a panel on its side the volume was zero, without a word."""
+    circle = ConeGeometry(6.0, 9.0, (12, 12), 0.5).pose(np.linspace(0, 2 * np.pi, 20, endpoint=False)).reshape(-1, 4, 3)
+    middle = circle[:, 1] + 5.5 * (circle[:, 2] + circle[:, 3])
+    for roll_deg, worst in ((1.0, 0), (5.0, 1), (45.0, 2), (90.0, 2), (180.0, 0), (-90.0, 2)):
+        caplog.clear()
+        c, s = np.cos(np.deg2rad(roll_deg)), np.sin(np.deg2rad(roll_deg))
+        u, v = c * circle[:, 2] + s * circle[:, 3], c * circle[:, 3] - s * circle[:, 2]
+        poses = np.stack([circle[:, 0], middle - 5.5 * (u + v), u, v], 1).reshape(-1, 12)
+        scan = Scan.from_poses(np.ones((20, 12, 12), np.float32), poses, Grid.cube(8, 1.0))
+        if worst == 2:
+            with pytest.raises(InputError, match="detector rows .* off the plane of the rotation"):
+                fdk(scan, FdkOptions(), rt)
+        else:
+            fdk(scan, FdkOptions(), rt)
+            assert ("detector rows" in caplog.text) == (worst == 1), roll_deg

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from tolerances import FDK_MEAN, FDK_PARTIAL, FLOAT64
 
-from phyradgs_cl.acquisition import ConeGeometry, pixel_centres
+from phyradgs_cl.acquisition import ConeGeometry, ParallelGeometry, pixel_centres
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.phantoms import Ellipsoid, EllipsoidPhantom
@@ -109,6 +109,28 @@ def test_a_ray_and_its_opposite_on_a_displaced_detector_count_two(offset_mm) -> 
     unseen = (angle < fan.low_rad) | (angle > fan.high_rad)
     np.testing.assert_allclose(weight[unseen], 0.0, atol=FLOAT64)
     assert sum(fan.missing_columns) == int(np.ceil(2 * abs(offset_mm) / 0.075 - 1e-6))
+
+
+@pytest.mark.parametrize("side", [1, -1])
+@pytest.mark.parametrize("beyond", [-1.5, -0.75, -0.4, -0.1, 0.0, 0.1, 0.5])
+def test_a_full_turn_sees_all_of_a_row_once_where_the_axis_is_at_the_panels_edge(side, beyond) -> None:
+    """``beyond``: pixels from the axis to the panel's first or last pixel. Both views together weigh the seen width."""
+    geometry = ParallelGeometry((1, 24), 0.25, (0.0, side * (11.5 + beyond) * 0.25))
+    pose = geometry.pose(np.zeros(1))[:, None, None]
+    fan = weights.measured_fan(pose, (1, 24), is_parallel=True)
+    rays = weights.pixel_rays(pose[0], np.arange(1), np.arange(24), is_parallel=True)
+    weight = weights.displaced_weight(weights.fan_angle(pose[0], rays, is_parallel=True), fan)
+    assert fan.sees_axis == (beyond < 0.5)
+    assert weight.sum() == pytest.approx(2 * (23 + beyond + 0.5), rel=FLOAT64)
+
+
+def test_the_middle_of_a_volume_where_the_axis_is_the_panels_first_pixel(rt) -> None:
+    """Its density was 1.7 while that pixel counted twice."""
+    ball = EllipsoidPhantom((Ellipsoid((0.0, 0.0, 0.0), (0.5,) * 3, 1.0),), "ball")
+    geometry, grid = ConeGeometry(6.0, 9.0, (8, 24), 0.075, (0.0, 11.5 * 0.075)), Grid((1, 7, 7), (0.05,) * 3)
+    pose = geometry.pose(turn(90))
+    frames = ball.line_integrals(pose[:, None, None, :3], pixel_centres(pose, (8, 24))).astype(np.float32)
+    assert fdk_volume(rt, frames, pose, grid).mean() == pytest.approx(1.0, abs=FDK_PARTIAL)
 
 
 @pytest.mark.parametrize("offset_mm", [0.0188, 0.45, 0.9, -0.9])

@@ -68,11 +68,13 @@ def fan_angle(pose: np.ndarray, rays: np.ndarray, is_parallel: bool = False) -> 
 class Fan:
     """The fan angles that every view sees; in a parallel beam distances from the axis (see ``fan_angle``).
 
-    missing_columns: how far the detector is off centre, in columns at its two ends."""
+    missing_columns: how far the detector is off centre, in columns at its two ends. pixel_rad: the width of the pixel at its
+    short end."""
 
     low_rad: float
     high_rad: float
     missing_columns: tuple[int, int] = (0, 0)
+    pixel_rad: float = 0.0
 
     @property
     def is_displaced(self) -> bool:
@@ -85,7 +87,8 @@ class Fan:
 
     @property
     def sees_axis(self) -> bool:
-        return self.low_rad < 0 < self.high_rad
+        """Whether the axis is seen, by a pixel's centre or by its outer half."""
+        return self.low_rad - self.pixel_rad / 2 < 0 < self.high_rad + self.pixel_rad / 2
 
     @property
     def half_rad(self) -> float:
@@ -109,18 +112,24 @@ def measured_fan(pose: np.ndarray, shape: tuple[int, int], is_parallel: bool = F
     across = fan_angle(middle, pixel_rays(middle, rows[[shape[0] // 2]], columns, is_parallel), is_parallel)[0]
     axis = float(np.interp(0.0, across if across[-1] > across[0] else -across, columns))
     missing = max(1, int(np.ceil(abs(shape[1] - 1 - 2 * axis) - 1e-6)))
-    return Fan(low, high, (missing, 0) if axis < (shape[1] - 1) / 2 else (0, missing))
+    is_low = axis < (shape[1] - 1) / 2
+    pixel_rad = float(np.ptp(across[:2] if is_low else across[-2:]))
+    return Fan(low, high, (missing, 0) if is_low else (0, missing), pixel_rad)
 
 
 def displaced_weight(angle_rad: np.ndarray, fan: Fan) -> np.ndarray:
     """1 ± sin over what the fan sees on both sides of the axis, 0 and 2 beyond; angle_rad of any shape.
 
-    Where the axis itself is not seen every ray is measured once, and counts 2.
+    Where the axis itself is not seen every ray is measured once, and counts 2. Where it falls into the panel's outermost
+    pixel there is no room for a transition: a pixel counts by the part of its width on the axis' long side.
     """
     if not fan.sees_axis:
         return np.full(angle_rad.shape, 2.0)
     short = min(fan.high_rad, -fan.low_rad)
     sign = 1.0 if fan.high_rad > -fan.low_rad else -1.0
+    if short < fan.pixel_rad / 2:
+        weight: np.ndarray = 1 + sign * np.clip(2 * angle_rad / fan.pixel_rad, -1, 1)
+        return weight
     width = min(short, TRANSITION * (fan.half_rad - short))
     into = np.clip((np.abs(angle_rad) - (short - width)) / width, 0, 1)
     return 1 + sign * np.sign(angle_rad) * np.sin(np.pi / 2 * into)
