@@ -96,7 +96,7 @@ def test_a_grid_and_a_method_in_any_case(config: Path) -> None:
 
 def test_a_prior_is_for_methods_that_have_one() -> None:
     assert plan_of(None, {"prior": "tv"}, ["prior=dct"]).options.prior == "tv"
-    with pytest.raises(InputError, match="^--prior: found no such option of --method sirt.*--method fista has it$"):
+    with pytest.raises(InputError, match="^--prior: found no such option of --method sirt.*fista or moving has it$"):
         plan_of(None, {"prior": "tv", "method": "sirt"})
 
 
