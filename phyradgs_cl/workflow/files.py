@@ -16,6 +16,7 @@ from phyradgs_cl.io import (
     check_writable,
     deformation_summary,
     file_kind,
+    holds_deformation,
     read_scan,
     scan_summary,
     volume_summary,
@@ -29,6 +30,7 @@ _KINDS = {
     "plain-volume": "a bare volume (dataset /volume)",
     "deformation": "how an object moves (/entry/deformation)",
 }
+_OF_MOTION = ("fields", "control_points", "displacements_below_mm", "smallest_determinant")  # shown of a volume that moves
 
 
 def load_scan(path: str | Path, flats: str = "mean", rows: tuple[int, int] | None = None) -> Scan:
@@ -126,7 +128,9 @@ def summary(path: Path) -> dict[str, object]:
         provenance = dict(facts.pop("provenance", None) or {})
         provenance.pop("record", None)
         options = provenance.pop("options", None)
-        return {"kind": "volume", **facts, **_options_in_words(options), **provenance}
+        moves = deformation_summary(path) if holds_deformation(path) else {}
+        motion = {f"motion_{key}": moves[key] for key in _OF_MOTION if key in moves}
+        return {"kind": "volume", **facts, **motion, **_options_in_words(options), **provenance}
     return {"kind": "bare volume", **_voxel_facts(importers.load_volume(path))}
 
 

@@ -56,6 +56,8 @@ def test_a_volume_with_its_own_deformation_needs_no_other(cli, capsys, folder, t
     np.testing.assert_array_equal(read_volume(own).deformation.control_mm, field.control_mm)
     facts = facts_of(cli, capsys, f"evaluate {own} --reference {folder}/scan.h5 --json")
     assert facts["mean_motion_error_mm"] == 0  # which nothing has without a field
+    facts, of_field = (facts_of(cli, capsys, f"info {path} --json") for path in (own, folder / "field.h5"))
+    assert facts["motion_displacements_below_mm"] == of_field["displacements_below_mm"] > 0
     assert cli.run(f"export {own} --states 2 -o {tmp_path}/state.npy".split()) == 0
     assert "2 states from" in capsys.readouterr().out and (tmp_path / "state_02.npy").exists()
 

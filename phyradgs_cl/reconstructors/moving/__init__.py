@@ -8,11 +8,11 @@ LEAST_GAIN = 0.02  # of the squared residual: less does not show a motion
 
 def motion_line(found: Mapping[str, Any]) -> str:
     """Returns one line on what was found about the motion of the object."""
-    period_s = found["period_s"]
-    follows = "free in time" if period_s is None else f"following a signal with a period of {period_s:.3g} s"
     gain = f"squared residual {100 * found['gain']:.2g} % below that at rest"
     if not found["moves"]:
         if found["gain"] > LEAST_GAIN:
             gain += ", which a field's coefficients can explain without motion: take more views"
-        return f"object at rest: no motion shown ({gain}, {follows})"
+        return f"object at rest: no motion shown ({gain})"
+    period_s = found["period_s"]
+    follows = "free in time" if period_s is None else f"following a signal with a period of {period_s:.3g} s"
     return f"object moves by {found['rms_mm']:.3g} mm RMS, {follows}; {gain}"
