@@ -38,7 +38,7 @@ RUNS: dict[str, tuple[str, Facts]] = {
 
 
 def said(scan: Path, name: str, device: str | None, iterations: int | None) -> Facts:
-    """What an estimate says, in this process."""
+    """Returns an estimate, made in this process."""
     method, changes = changed(name, iterations)
     loaded, rt = load_scan(scan), Runtime(device)
     before_s = time.process_time()
@@ -53,7 +53,7 @@ def said(scan: Path, name: str, device: str | None, iterations: int | None) -> F
 
 
 def happened(scan: Path, name: str, device: str | None, iterations: int | None) -> Facts:
-    """What a run takes, in this process."""
+    """Returns the time and memory of a run in this process."""
     method, changes = changed(name, iterations)
     rt = Runtime(device)
     result, metrics = run_reconstruction(plan_run(method, changes), scan, scan.with_name("volume.h5"), lambda: rt)

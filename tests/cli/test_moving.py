@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import SimpleITK as sitk
 
 from phyradgs_cl.fields import deformed
 from phyradgs_cl.io import read_deformation, read_volume, write_deformation, write_volume
@@ -72,7 +73,6 @@ def test_evaluate_names_the_field_that_a_volume_was_reconstructed_with(cli, capl
 
 
 def test_states_go_into_one_nifti_of_four_dimensions_which_info_describes(cli, capsys, folder) -> None:
-    sitk = pytest.importorskip("SimpleITK")
     line = f"export {folder}/volume.h5 --object-motion {folder}/field.h5 --states 4 --during 1,5 -o {folder}/states.nii"
     assert cli.run(line.split()) == 0
     image, field, volume = sitk.ReadImage(str(folder / "states.nii")), read_deformation(folder / "field.h5"), None
