@@ -1,4 +1,4 @@
-"""Tests and times the program on a GPU in at most ten minutes: `make gpu`. Tests on it, trust, the same bits twice, and speed.
+"""Tests and times the program on a GPU in at most ten minutes: `make gpu`. Tests, trust, the same bits twice, and speed.
 
     python benchmarks/gpu.py [--device gpu] [--quick] [--json FILE] [--table FILE]
 
