@@ -1,15 +1,16 @@
-"""Objects that breathe during a scan, reconstructed at rest, with the true field, as if they rested, and with a field that
+"""Objects that move during a scan, reconstructed at rest, with the true field, as if they rested, and with a field that
 ``moving`` finds.
 
     python benchmarks/moving.py VOLUMES RESULTS.jsonl [--names a,b] [--views 75,150] [--method fista] [--size 64]
-        [--cases rest,known,ignored,unknown]
+        [--cases rest,known,ignored,unknown,still] [--motion breathing]
     python benchmarks/moving.py --insert VOLUMES RESULTS.jsonl [--size 64]: how far off the centre of a ball in a body is
 
 Volumes and scanner as benchmarks/scans.py has them: TIGRE's noise at 1e4 photons, a gantry that turns without stopping,
 exposures without gaps. A turn takes a minute. The breath has a period of 4 s, jittered by 10 %, and an amplitude of 15 % of
-half the box. PSNR and SSIM against the reference volume; seconds of processor time. The case unknown has means over ten true
-states, of the method ``moving`` and of the volume that --method makes as if the object rested. A run goes on where it was
-interrupted: a line for each volume, number of views, method and case."""
+half the box; --motion takes another preset with its own defaults. PSNR and SSIM against the reference volume; seconds of
+processor time. The case unknown has means over ten true states, of the method ``moving`` and of the volume that --method
+makes as if the object rested; the case still has ``moving`` and --method on an object at rest. A run goes on where it was
+interrupted: a line for each volume, number of views, method, case and motion."""
 
 import argparse
 import json
@@ -31,16 +32,18 @@ from phyradgs_cl.phantoms import Ellipsoid, EllipsoidPhantom
 from phyradgs_cl.reconstructors import ObjectMotion, Reconstruction, RunPlan, method_options, reconstruct
 from phyradgs_cl.reconstructors.result import MOTION_FOUND
 from phyradgs_cl.runtime import Runtime
-from phyradgs_cl.simulation.object_motion import ObjectMotion as Breathing
+from phyradgs_cl.simulation.object_motion import ObjectMotion as PresetMotion
 from phyradgs_cl.workflow.evaluate import compared_states
 
 TURN_S = 60.0
-CASES = ("rest", "known", "ignored", "unknown")
+CASES = ("rest", "known", "ignored", "unknown", "still")
 
 
-def breathing_scan(rt: Runtime, path: Path, size: int, views: int, amplitude: float) -> Scan:
+def moving_scan(
+    rt: Runtime, path: Path, size: int, views: int, amplitude: float, kind: str = "breathing"
+) -> Scan:
     """The scan of a volume file; with an amplitude of 0 the same scan of the object at rest."""
-    motion = Breathing("breathing", amplitude=amplitude)
+    motion = PresetMotion(kind, amplitude=amplitude)
     return api.simulate(
         str(path), size=size, detector=2 * size, views=views, exposure_deg=360 / views, fps=views / TURN_S, noise="tigre",
         dose=1e4, motion_of_object=motion, device=rt,
@@ -70,7 +73,7 @@ def run_insert(rt: Runtime, size: int, folder: Path) -> Iterator[dict[str, objec
     body, ball = Ellipsoid((0.0, 0.0, 0.0), (0.7, 0.6, 0.85), 0.4), Ellipsoid((0.1, 0.0, 0.35), (0.2, 0.2, 0.2), 0.4)
     fine = Grid.cube(2 * size, 2.0)
     write_volume(folder / "insert.h5", EllipsoidPhantom((body, ball), "insert").voxelise(fine, 4), fine, {})
-    scan = breathing_scan(rt, folder / "insert.h5", size, 75, 0.15)
+    scan = moving_scan(rt, folder / "insert.h5", size, 75, 0.15)
     field = scan.moving_truth.deformation
     places_mm = [field.inverse_mm(np.array([ball.centre_mm]), state)[0] for state in field.weights[::4]]
     moved_mm = float(np.linalg.norm(np.ptp(places_mm, axis=0)))
@@ -103,6 +106,18 @@ def run_unknown(rt: Runtime, scan: Scan, method: str) -> dict[str, object]:
     return {**lines, "device_mib": rt.peak_bytes >> 20, "moves": found["moves"], "period_s": found["period_s"]}
 
 
+def run_still(rt: Runtime, scan: Scan, method: str) -> dict[str, object]:
+    """What ``moving`` makes of an object at rest, by how many dB it differs from ``method``, and its field in voxels."""
+    volumes = {name: reconstruct(scan, plan_of(name), rt) for name in (method, "moving")}
+    psnr_db = {name: compare(result.volume, scan.reference)["psnr_db"] for name, result in volumes.items()}
+    found = volumes["moving"].facts[MOTION_FOUND]
+    rms_voxels = found.get("rms_mm", 0.0) / scan.grid.voxel_size_mm[0]
+    return {
+        "psnr_db": psnr_db["moving"], "static_psnr_db": psnr_db[method], "field_rms_voxels": rms_voxels,
+        "moves": found["moves"], "gain": found["gain"],
+    }  # fmt: skip
+
+
 def means_over_states(result: Reconstruction, scan: Scan) -> dict[str, object]:
     field = result.deformation
     states = compared_states(Volume(result.volume, result.grid), field, scan.moving_truth, scan.grid)
@@ -118,6 +133,7 @@ def main() -> None:
     parser.add_argument("--method", default="fista")
     parser.add_argument("--size", type=int, default=64)
     parser.add_argument("--cases", default=",".join(CASES))
+    parser.add_argument("--motion", default="breathing", choices=("breathing", "drying", "sliding"))
     parser.add_argument("--device")
     parser.add_argument("--insert", action="store_true")
     arguments = parser.parse_args()
@@ -132,20 +148,23 @@ def main() -> None:
             scans: dict[bool, Scan] = {}
             for case in chosen("--cases", arguments.cases, CASES):
                 facts = {"volume": name, "views": views, "method": arguments.method, "case": case, "size": arguments.size}
+                facts |= {} if arguments.motion == "breathing" else {"motion": arguments.motion}
                 if key_of(facts) in done:
                     continue
-                moves = case != "rest"
+                moves = case not in ("rest", "still")
                 if moves not in scans:
-                    scans[moves] = breathing_scan(rt, path, arguments.size, views, 0.15 if moves else 0.0)
-                run = run_unknown(rt, scans[moves], arguments.method) if case == "unknown" else None
-                run = run or run_case(rt, scans[moves], case, arguments.method)
+                    scans[moves] = moving_scan(rt, path, arguments.size, views, 0.15 if moves else 0.0, arguments.motion)
+                if case in ("unknown", "still"):
+                    run = (run_unknown if case == "unknown" else run_still)(rt, scans[moves], arguments.method)
+                else:
+                    run = run_case(rt, scans[moves], case, arguments.method)
                 line = {**facts, **run, "device": rt.device.name}
                 append(arguments.results, line)
                 print(json.dumps(line), flush=True)
 
 
 def key_of(line: dict[str, object]) -> tuple[object, ...]:
-    return tuple(line[key] for key in ("volume", "views", "method", "case", "size"))
+    return tuple(line.get(key, "breathing") for key in ("volume", "views", "method", "case", "size", "motion"))
 
 
 if __name__ == "__main__":

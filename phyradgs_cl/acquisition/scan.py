@@ -34,7 +34,7 @@ from phyradgs_cl.acquisition.trajectory import (
     unit_directions,
 )
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.fields import Grid, GridChoice, MovingTruth
+from phyradgs_cl.fields import Gating, Grid, GridChoice, MovingTruth
 from phyradgs_cl.text import suggest_name
 
 if TYPE_CHECKING:
@@ -69,6 +69,7 @@ class Scan:
     - pixel_mask (nv, nu) or (F, nv, nu): non-zero for pixels not to be used; lines that a pulsed beam misses are added.
     - reference (nz, ny, nx): the true volume in 1/mm on ``grid``. moving_truth: of a simulated object that moves, its true
       states on ``grid`` and its deformation.
+    - gating: a signal or a phase that was recorded beside the frames, of an object that moves.
     - lag: share λ of the recorded intensity that stems from earlier frames (detector/effects.py), still in the projections.
     - saturation: None where raw counts were not examined. title and provenance are stored in files.
 
@@ -90,9 +91,11 @@ class Scan:
     lag: float = 0.0
     saturation: Saturation | None = None
     moving_truth: MovingTruth | None = None
+    gating: Gating | None = None
 
     def __post_init__(self) -> None:
-        for name, kinds in {"geometry": GEOMETRIES, "shutter": (Shutter,), "grid": (Grid,)}.items():
+        kinds_of = {"geometry": GEOMETRIES, "shutter": (Shutter,), "grid": (Grid,), "gating": (Gating, type(None))}
+        for name, kinds in kinds_of.items():
             if not isinstance(getattr(self, name), kinds):
                 wanted = " or ".join(f"a {kind.__name__}" for kind in kinds)
                 raise InputError(name, checks.short_repr(getattr(self, name)), wanted)

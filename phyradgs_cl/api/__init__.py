@@ -41,14 +41,14 @@ from phyradgs_cl.api.runs import (
 from phyradgs_cl.api.scans import fly_scan, static_scan
 from phyradgs_cl.calibrate import Calibration
 from phyradgs_cl.errors import InputError, PhyradgsError
-from phyradgs_cl.fields import Deformation, Gaussians, Grid, deformed
+from phyradgs_cl.fields import Deformation, Gating, Gaussians, Grid, deformed
 from phyradgs_cl.metrics import compare
 from phyradgs_cl.reconstructors import Progress, Reconstruction
 from phyradgs_cl.simulation import ObjectMotion
 
 __all__ = [
     "Calibration", "Centres", "CircularOrbit", "ConeGeometry", "ConstantSpeed", "Deformation", "EncoderTable",
-    "Exact", "FrameSweeps", "Gaussians", "Grid", "InputError", "LineMiddles", "LinearOperator", "MicroViews",
+    "Exact", "FrameSweeps", "Gating", "Gaussians", "Grid", "InputError", "LineMiddles", "LinearOperator", "MicroViews",
     "Motion", "ObjectMotion", "Operator", "OwnTimes", "ParallelGeometry", "PerRow", "PhyradgsError", "PoseTable", "Progress",
     "Reconstruction", "Scan", "Shutter", "SpeedRamp", "Static", "StaticStart", "TimeCells", "Trajectory",
     "as_torch", "calibrate", "compare", "deformed", "fly_scan", "initial_gaussians", "load_deformation", "load_scan",

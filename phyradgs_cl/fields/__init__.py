@@ -1,6 +1,7 @@
 """The attenuation field: a voxel volume on a grid, or a cloud of radiative Gaussians; how it deforms in time."""
 
 from phyradgs_cl.fields.deformation import Deformation, control_points
+from phyradgs_cl.fields.gating import Gating
 from phyradgs_cl.fields.gaussians import Activation, Gaussians
 from phyradgs_cl.fields.grid_choice import GridChoice
 from phyradgs_cl.fields.states import MovingTruth
@@ -8,5 +9,6 @@ from phyradgs_cl.fields.volume import Grid, triple
 from phyradgs_cl.fields.warp import deformed
 
 __all__ = [
-    "Activation", "Deformation", "Gaussians", "Grid", "GridChoice", "MovingTruth", "control_points", "deformed", "triple"
-]
+    "Activation", "Deformation", "Gating", "Gaussians", "Grid", "GridChoice", "MovingTruth", "control_points", "deformed",
+    "triple"
+]  # fmt: skip

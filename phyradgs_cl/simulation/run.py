@@ -13,12 +13,12 @@ from phyradgs_cl.acquisition.geometry import Geometry
 from phyradgs_cl.acquisition.time_cells import TimeCells
 from phyradgs_cl.detector import effects, tube_spectrum
 from phyradgs_cl.errors import InputError, NumericalError
-from phyradgs_cl.fields import Grid, MovingTruth
+from phyradgs_cl.fields import Gating, Grid, MovingTruth
 from phyradgs_cl.io import Scanner, Volume
 from phyradgs_cl.phantoms import EllipsoidPhantom, MovingPhantom
 from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.simulation.options import SimulationOptions
-from phyradgs_cl.simulation.scenes import phantom_scene, volume_scene
+from phyradgs_cl.simulation.scenes import Scene, phantom_scene, volume_scene
 from phyradgs_cl.simulation.sources import FrameSource
 
 _LARGEST_GRID = 4096
@@ -69,7 +69,7 @@ def simulated_scan(
         times_s = _in_one_cycle_s(scene.period_s or 1.0, *window_s)
     volumes = np.stack([scene.state(time_s) for time_s in times_s])
     volumes *= np.float32(scan.provenance["attenuation_factor"])  # type: ignore[arg-type]
-    return replace(scan, moving_truth=MovingTruth(times_s, volumes, scene.deformation))
+    return replace(scan, moving_truth=MovingTruth(times_s, volumes, scene.deformation), gating=_gating(scan, scene))
 
 
 def simulate(
@@ -131,6 +131,14 @@ def simulate(
         title=title,
         provenance={"attenuation_factor": factor, "time_samples": samples},
     )
+
+
+def _gating(scan: Scan, scene: Scene) -> Gating:
+    """Returns the weight of the first field in the middle of every frame, or the phase of what moves without a field."""
+    middle_s = np.asarray(scan.frame_start_s) + scan.shutter.span_s / 2
+    if scene.deformation is not None:
+        return Gating(middle_s, scene.deformation.weights_at(middle_s)[:, 0])
+    return Gating(middle_s, middle_s / (scene.period_s or 1.0) % 1.0, is_phase=True)
 
 
 def _in_one_cycle_s(period_s: float, first_s: float, last_s: float) -> np.ndarray:

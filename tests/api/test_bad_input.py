@@ -277,6 +277,12 @@ CASES: dict[str, list[tuple[str, Callable[[], object]]]] = {
             ((2, 3, 4), (1, 1, 1), (0, np.inf, 0)),
         )),
     ],
+    "Gating": [
+        ("gating times_s", lambda: api.Gating(np.zeros(3), np.zeros(3))), ("gating times_s", lambda: api.Gating([], [])),
+        ("gating values", lambda: api.Gating(np.arange(3.0), np.zeros(2))),
+        ("gating values", lambda: api.Gating(np.arange(3.0), np.full(3, np.nan))),
+        ("gating", lambda: replace(GOOD, gating=np.zeros(4))),
+    ],
     "Deformation": [
         *((f"deformation {name}", partial(still, **{name: value})) for name, value in (
             ("control_mm", np.zeros((1, 2, 2, 2))), ("control_mm", np.zeros((0, 2, 2, 2, 3))), ("times_s", []),

@@ -117,6 +117,9 @@ def test_info_describes_a_deformation_and_the_states_of_a_scan(cli, capsys, fold
     facts = facts_of(cli, capsys, f"info {folder}/field.h5 --json")
     assert facts["kind"] == "deformation" and facts["fields"] == 2 and 0 < facts["smallest_determinant"] < 1
     assert facts["displacements_below_mm"] == pytest.approx(0.3, abs=0.12)
-    assert facts_of(cli, capsys, f"info {folder}/scan.h5 --json")["true_states"] == 3
+    of_scan, scan = facts_of(cli, capsys, f"info {folder}/scan.h5 --json"), load_scan(folder / "scan.h5")
+    assert of_scan["true_states"] == 3 and of_scan["gating"] == "a signal"
+    weights = scan.moving_truth.deformation.weights_at(scan.gating.times_s)
+    np.testing.assert_array_equal(scan.gating.values, weights[:, 0])
     assert cli.run(f"reconstruct {folder}/field.h5 -o {folder}/x.h5".split()) == 2
     assert "how an object moves" in capsys.readouterr().err

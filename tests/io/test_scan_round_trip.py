@@ -26,7 +26,7 @@ from phyradgs_cl.acquisition.geometry import ParallelGeometry, default_grid
 from phyradgs_cl.acquisition.plausible import blur_facts
 from phyradgs_cl.detector import counts_to_attenuation
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.fields import Grid
+from phyradgs_cl.fields import Gating, Grid
 from phyradgs_cl.io import file_kind, read_scan, scan_summary, sha256_of, write_scan
 
 ANGLE_TOLERANCE_RAD = 1e-12  # degrees in the file: two roundings of angles of order 1
@@ -81,6 +81,45 @@ def test_fields_come_back(path, make_scan) -> None:
         ours, theirs = getattr(scan.geometry, field.name), getattr(again.geometry, field.name)
         np.testing.assert_allclose(theirs, ours, rtol=1e-15, err_msg=field.name)
     same_poses(scan, again)
+
+
+@pytest.mark.parametrize("is_phase", [False, True])
+def test_a_signal_or_a_phase_of_each_frame_comes_back(path, make_scan, is_phase) -> None:
+    scan = make_scan()
+    middle_s = np.asarray(scan.frame_start_s) + scan.shutter.span_s / 2
+    values = np.random.default_rng(3).uniform(size=scan.frames)
+    key = np.array([1, *[0] * scan.frames, 2])
+    data = np.full((len(key), *scan.geometry.detector_shape), 500, np.uint16)
+    data[-1] = 10
+    gated = replace(scan, gating=Gating(middle_s, values, is_phase))
+    again = again_of(path, gated, data=data, image_key=key, quantity="counts")
+    assert again.gating.is_phase == is_phase and scan_summary(path)["gating"] == ("a phase" if is_phase else "a signal")
+    np.testing.assert_array_equal(again.gating.times_s, middle_s)
+    np.testing.assert_array_equal(again.gating.values, values)
+    with h5py.File(path, "r+") as file:
+        group = file["entry/phyradgs/gating"]
+        group["phase" if not is_phase else "signal"] = np.zeros(len(key))
+    with pytest.raises(InputError, match="gating/signal: found a signal beside a phase"):
+        again_of(path)
+
+
+def test_gating_that_is_damaged_is_named(path, make_scan) -> None:
+    scan = make_scan()
+    middle_s = np.asarray(scan.frame_start_s) + scan.shutter.span_s / 2
+    for values, words in (
+        (np.full(scan.frames, np.nan), "NaN"), (np.zeros(scan.frames + 1), "shape"),
+        (np.zeros(scan.frames, "S4"), "numbers"),
+    ):  # fmt: skip
+        write_scan(path, replace(scan, gating=Gating(middle_s, np.arange(scan.frames))))
+        with h5py.File(path, "r+") as file:
+            del file["entry/phyradgs/gating/signal"]
+            file["entry/phyradgs/gating/signal"] = values
+        with pytest.raises(InputError, match=f"phyradgs/gating/signal.*{words}"):
+            again_of(path)
+    with h5py.File(path, "r+") as file:
+        file.move("entry/phyradgs/gating/signal", "entry/phyradgs/gating/phases")
+    with pytest.raises(InputError, match="rename 'phases' to 'phase'"):
+        again_of(path)
 
 
 WANDER = np.cumsum(np.random.default_rng(1).uniform(0, 0.02, 60))

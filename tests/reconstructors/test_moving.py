@@ -7,15 +7,16 @@ import pytest
 
 from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, ConstantSpeed, PerRow, Scan, Shutter
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.fields import Deformation, Grid, MovingTruth, control_points, deformed
+from phyradgs_cl.fields import Deformation, Gating, Grid, MovingTruth, control_points, deformed
 from phyradgs_cl.metrics import compare
 from phyradgs_cl.operators.warp.operator import projector_of
 from phyradgs_cl.phantoms import shepp_logan
 from phyradgs_cl.reconstructors import ObjectMotion, Reconstruction, plan_run, reconstruct
 from phyradgs_cl.reconstructors.moving import motion_line
 from phyradgs_cl.reconstructors.moving.field import MotionField
-from phyradgs_cl.reconstructors.moving.search import coarse_scan
-from phyradgs_cl.reconstructors.moving.signal import load_signal, motion_signal
+from phyradgs_cl.reconstructors.moving.gating import load_gating, signal_of
+from phyradgs_cl.reconstructors.moving.search import coarse_scan, initial_field
+from phyradgs_cl.reconstructors.moving.signal import middle_times_s, motion_signal
 from phyradgs_cl.reconstructors.moving.splines import Bending, TemporalSplines
 from phyradgs_cl.reconstructors.result import MOTION_FOUND, Progress
 
@@ -88,8 +89,11 @@ def breathing_scan(rt, amplitude_mm: float) -> Scan:
     return replace(empty, projections=frames, reference=reference, moving_truth=MovingTruth(at_s, states, truth))
 
 
-def run(rt, scan: Scan, method: str = "moving", iterations: int = ITERATIONS, motion=None, **more) -> Reconstruction:
-    return reconstruct(scan, plan_run(method, {"iterations": iterations}, object_motion=motion), rt, **more)
+def run(
+    rt, scan: Scan, method: str = "moving", iterations: int = ITERATIONS, motion=None, options=None, **more
+) -> Reconstruction:
+    plan = plan_run(method, {"iterations": iterations, **(options or {})}, object_motion=motion)
+    return reconstruct(scan, plan, rt, **more)
 
 
 def mean_psnr_db(result: Reconstruction, scan: Scan) -> float:
@@ -151,24 +155,48 @@ def test_a_gain_that_coefficients_explain_is_said_to_show_no_motion() -> None:
     assert "coefficients" not in motion_line(none) and motion_line({**few, "moves": True, "rms_mm": 0.1}).endswith("rest")
 
 
+def loaded(path, scan: Scan):
+    return signal_of(load_gating(str(path), scan), scan, f"gating {path}")
+
+
 def test_a_signal_of_a_file_is_followed_and_others_are_refused(scan, tmp_path) -> None:
     times_s = np.linspace(-1, 22, 200)
     path = tmp_path / "breath.csv"
     path.write_text("time_s,height\n" + "\n".join(f"{t},{5 + np.cos(2 * np.pi * t / 2.3)}" for t in times_s))
-    signal = load_signal(str(path), scan)
+    signal = loaded(path, scan)
     assert signal.period_s == pytest.approx(2.3, rel=0.03) and np.abs(signal.values).max() == pytest.approx(1)
     for text, found in {
         "": "0 lines of numbers", "time_s,height\n": "0 lines", "0,1\n1,2\n2,3\n3,4\n": "4 times from 0 to 3 s",
-        "0\n1\n2\n40\n": "not two numbers", "0,1\n1,1,7\n2,2\n40,1\n": "not two numbers", "0,1\n40,2\n": "2 lines",
+        "0\n1\n2\n40\n": "4 values without times",
+        "0,1\n1,1\n1,2\n40,1\n": "some are equal", "0,1\n1,1,7\n2,2\n40,1\n": "not two numbers", "0,1\n40,2\n": "2 lines",
         "0,nan\n1,1\n2,2\n40,1\n": "1 lines with NaN", "a,b\nc,d\n": "'c'", "0,5\n1,5\n2,5\n40,5\n": "the same value 5",
     }.items():  # fmt: skip
         path.write_text(text)
         with pytest.raises(InputError, match=f"gating .*{found}"):
-            load_signal(str(path), scan)
+            loaded(path, scan)
     with pytest.raises(InputError, match=r"No such file.*check the path"):
-        load_signal(str(tmp_path / "none.csv"), scan)
+        loaded(tmp_path / "none.csv", scan)
     with pytest.raises(InputError, match="gating"):
         plan_run("moving", {"gating": "breaths"})
+
+
+def test_phases_of_a_file_or_of_the_scan_are_followed(rt, scan, tmp_path) -> None:
+    """One a frame, in cycles, which wrap around."""
+    phase = (0.1 + middle_times_s(scan) / 2.3) % 1
+    stated = replace(scan, gating=Gating(middle_times_s(scan), phase, is_phase=True))
+    path = tmp_path / "phase.csv"
+    path.write_text("phase\n" + "\n".join(str(float(one)) for one in phase))
+    for signal in (loaded(path, scan), signal_of(stated.gating, stated, "gating scan")):
+        assert signal.period_s == pytest.approx(2.3)
+        field = initial_field(scan, signal, 16.0, 0.0)
+        weights = field.deformation().weights_at(signal.times_s)
+        for column, wave in zip(weights.T, (np.cos, np.sin), strict=True):
+            assert np.corrcoef(column, wave(2 * np.pi * phase))[0, 1] > 0.98
+    path.write_text("phase\n" + "0.5\n" * scan.frames)
+    with pytest.raises(InputError, match=r"phase\.csv: found the same value 0\.5 throughout"):
+        loaded(path, scan)
+    with pytest.raises(InputError, match="gating: found scan, which states neither"):
+        run(rt, scan, options={"gating": "scan"})
 
 
 def test_splines_sum_to_one_and_bending_is_none_of_a_rigid_motion() -> None:

@@ -24,6 +24,7 @@ _KNOWN = frozenset((
     *("kinematics", "poses", "time_s", "angle_deg", "pose", "grid", "shape", "voxel_size", "offset"),
     *("reconstruction", "metrics", "gaussians", "mean", "scale", "quaternion", "density"),
     *("deformation", "control", "origin", "spacing", "times", "weights", "states", "state_times"),
+    *("gating", "signal", "phase"),
 ))
 # Compression shrinks masks of zeros a thousandfold and frames hardly at all. Small files may expand by _FREE_BYTES.
 _MOST_EXPANSION = 100

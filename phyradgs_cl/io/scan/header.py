@@ -15,6 +15,7 @@ from phyradgs_cl.fields import Grid
 from phyradgs_cl.io.hdf5.datasets import read_attribute, read_grid, read_number, read_title, read_word
 from phyradgs_cl.io.hdf5.source import Hdf5Source
 from phyradgs_cl.io.scan import detector, schema
+from phyradgs_cl.io.scan.gating import read_gating
 from phyradgs_cl.io.scan.motion import has_motion, read_trajectory
 from phyradgs_cl.io.scan.truth import check_truth
 from phyradgs_cl.io.tables import read_facts
@@ -64,6 +65,7 @@ def read_header(source: Hdf5Source) -> ScanHeader:
         title=read_title(source, f"{entry}/title", "cone-beam scan"),
         provenance=read_facts(source.name(f"{extra}/provenance"), provenance, {}), lag=lag,
         saturation=_read_saturation(source, entry),
+        gating=read_gating(source, entry, used, start_s + shutter.span_s / 2),
     )
     scan.check_timing()
     mask_shape = detector.check_mask(source, entry, data.shape)

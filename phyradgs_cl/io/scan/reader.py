@@ -81,6 +81,7 @@ def scan_summary(path: str | Path, sha256: str | None = None) -> dict[str, objec
         "pixel_mask": header.mask_shape is not None, "grid_shape": scan.grid.shape,
         "grid_voxel_size_mm": scan.grid.voxel_size_mm, "grid_stored": header.has_grid,
         "reference": header.has_reference, **({"true_states": header.states} if header.states else {}),
+        **({"gating": "a phase" if scan.gating.is_phase else "a signal"} if scan.gating else {}),
         "sha256": sha256 or sha256_of(path),
     }
 

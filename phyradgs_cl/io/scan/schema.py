@@ -13,6 +13,8 @@ REFERENCE = f"{EXTRA}/reference"
 TRUTH = f"{REFERENCE}/volume"
 STATES, STATE_TIMES = f"{REFERENCE}/states", f"{REFERENCE}/state_times"
 DEFORMATION = f"{REFERENCE}/deformation"
+GATING = f"{EXTRA}/gating"
+SIGNAL, PHASE = f"{GATING}/signal", f"{GATING}/phase"
 
 PROJECTION, FLAT, DARK, INVALID = 0, 1, 2, 3
 QUANTITIES = ("attenuation", "transmission", "counts")

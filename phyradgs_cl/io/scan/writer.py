@@ -17,6 +17,7 @@ from phyradgs_cl.io.hdf5 import datasets as h5
 from phyradgs_cl.io.hdf5.source import open_hdf5
 from phyradgs_cl.io.output import written_beside
 from phyradgs_cl.io.scan import schema
+from phyradgs_cl.io.scan.gating import write_gating
 from phyradgs_cl.io.scan.header import read_header
 from phyradgs_cl.io.scan.motion import storable, write_motion, write_poses
 from phyradgs_cl.io.scan.truth import write_truth
@@ -47,7 +48,7 @@ def write_scan(
         # Frames between projections (flats, darks) get the values of the projection before them.
         frame_of = np.clip(np.cumsum(key == schema.PROJECTION) - 1, 0, None)
         _write_instrument(entry, scan, frames, key, quantity, frame_of)
-        _write_extra(entry, scan)
+        _write_extra(entry, scan, frame_of)
         write_motion(entry, scan, frame_of)
         _write_links(entry)
 
@@ -108,7 +109,7 @@ def _stored_durations(scan: Scan) -> tuple[float, float]:
     return scan.shutter.exposure_s, scan.shutter.readout_s
 
 
-def _write_extra(entry: h5py.Group, scan: Scan) -> None:
+def _write_extra(entry: h5py.Group, scan: Scan, frame_of: np.ndarray) -> None:
     extra = h5.new_group(entry, schema.EXTRA, "NXcollection")
     if scan.is_parallel:
         extra["beam"] = "parallel"
@@ -129,6 +130,8 @@ def _write_extra(entry: h5py.Group, scan: Scan) -> None:
         extra["provenance"] = json.dumps(scan.provenance, default=str)
     h5.write_grid(extra, scan.grid)
     write_truth(extra, scan)
+    if scan.gating is not None:
+        write_gating(extra, scan.gating, (np.asarray(scan.frame_start_s) + scan.shutter.span_s / 2)[frame_of])
 
 
 def _write_links(entry: h5py.Group) -> None:

@@ -19,8 +19,9 @@ from phyradgs_cl.fields import Deformation, triple
 from phyradgs_cl.reconstructors.checkpoint import State, check_array, state_arrays
 from phyradgs_cl.reconstructors.loop import Loop
 from phyradgs_cl.reconstructors.method import Method
+from phyradgs_cl.reconstructors.moving.gating import gating_of_scan, load_gating, signal_of
 from phyradgs_cl.reconstructors.moving.search import FieldSearch
-from phyradgs_cl.reconstructors.moving.signal import MotionSignal, load_signal, motion_signal
+from phyradgs_cl.reconstructors.moving.signal import MotionSignal, motion_signal
 from phyradgs_cl.reconstructors.result import MOTION_FOUND, Progress, Reconstruction, Report, option_facts
 from phyradgs_cl.reconstructors.voxels.fista import FistaOptions, fista_stages
 from phyradgs_cl.reconstructors.voxels.run import MethodInputs
@@ -35,8 +36,8 @@ _STORED = ("field_control", "field_place", "field_times", "field_weights", "fiel
 class MovingOptions(FistaOptions):
     """iterations: rounds of the search for the field, a sixth of them, and passes of ``fista`` after it. bending: stiffness
     of the field, relative to how strongly frames respond to it. gating: what the motion follows at first: ``auto`` (the
-    signal of the frames, where it repeats), ``free`` (any smooth curve in time), or a file of a signal, NAME.csv, with lines
-    time in s, value. The other options are those of ``fista``."""
+    signal of the frames, where it repeats), ``free`` (any smooth curve in time), ``scan`` (the signal or phase that the scan
+    states), or a file, NAME.csv (``load_gating``). The other options are those of ``fista``."""
 
     TRIALS: ClassVar[tuple[int, int]] = (1, 7)
     """Iterations of the short runs of ``estimate``: one round alone, two rounds with five passes."""
@@ -48,7 +49,7 @@ class MovingOptions(FistaOptions):
     def __post_init__(self) -> None:
         super().__post_init__()
         if not self.gating.endswith(".csv"):
-            checks.one_of("gating", self.gating, ("auto", "free", "NAME.csv"))
+            checks.one_of("gating", self.gating, ("auto", "free", "scan", "NAME.csv"))
         if self.prior == "piccs":
             raise InputError("prior", "piccs with --method moving", "a prior without an image", "leave it out")
 
@@ -122,9 +123,11 @@ METHOD = Method(moving, {"default": MovingOptions()}, finds_deformation=True)
 
 
 def _signal_of(scan: Scan, gating: str) -> MotionSignal:
-    """Returns the signal of a file, or that of the frames; ``free`` has no period."""
+    """Returns the signal of the scan, of a file, or that of the frames; ``free`` has no period."""
+    if gating == "scan":
+        return signal_of(gating_of_scan(scan), scan, "gating scan")
     if gating.endswith(".csv"):
-        return load_signal(gating, scan)
+        return signal_of(load_gating(gating, scan), scan, f"gating {gating}")
     signal = motion_signal(scan)
     return replace(signal, period_s=None) if gating == "free" else signal
 

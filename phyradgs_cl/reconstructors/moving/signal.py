@@ -10,29 +10,29 @@ import numpy as np
 from scipy.signal import hilbert
 
 from phyradgs_cl.acquisition import Scan
-from phyradgs_cl.errors import InputError
 
 _HARMONICS = 6  # of the gantry's angle, which the object at rest explains
 _FEWEST_CYCLES = 5  # in the scan: slower motion is taken as free in time
 _BAND = 0.25  # on either side of the most frequent rate: breaths differ in length
 _PERIODIC_SHARE = 0.5  # of the power in that band, beyond what white noise has there
 _FEWEST_FRAMES = 16
-_SHORTEST = 4  # lines of a file
 
 
 @dataclass(frozen=True, eq=False)
 class MotionSignal:
     """How the object's motion goes on in time. times_s (F,): the middles of the frames, rising. values (F,): mean 0, largest
-    size 1, without a unit or a sign. period_s: mean length of a cycle, or None where no cycle repeats."""
+    size 1, without a unit or a sign. period_s: mean length of a cycle, or None where no cycle repeats. later (F,): the
+    quadrature, a quarter of a cycle later; None derives it from ``values``."""
 
     times_s: np.ndarray
     values: np.ndarray
     period_s: float | None = None
+    later: np.ndarray | None = None
 
     def pair(self) -> np.ndarray:
         """Returns the signal and its quadrature (F, 2), a quarter of a cycle later; both together follow hysteresis."""
-        later = np.imag(hilbert(self.values))
-        return np.stack([self.values, _scaled(later)], -1)
+        later = np.imag(hilbert(self.values)) if self.later is None else self.later
+        return np.stack([self.values, scaled(later)], -1)
 
 
 def motion_signal(scan: Scan) -> MotionSignal:
@@ -42,48 +42,8 @@ def motion_signal(scan: Scan) -> MotionSignal:
     times_s, rows = times_s[order], _shroud(scan)[order]
     explained = _gantry(scan, times_s, order)
     rest = rows - explained @ np.linalg.lstsq(explained, rows, rcond=None)[0]
-    values = _scaled(np.linalg.svd(rest, full_matrices=False)[0][:, 0])
+    values = scaled(np.linalg.svd(rest, full_matrices=False)[0][:, 0])
     return MotionSignal(times_s, values, period_of(times_s, values))
-
-
-def load_signal(path: str, scan: Scan) -> MotionSignal:
-    """Loads a signal from a file with lines ``time in s, value``, a heading allowed. Its period is that of its spectrum, or
-    the time of six frames where no rate dominates. Raises InputError for other files, and times that miss the scan."""
-    subject, expected = f"gating {path}", f"at least {_SHORTEST} lines: time in s, value"
-    try:
-        with open(path, encoding="utf-8") as file:
-            lines = [line.strip() for line in file if line.strip()]
-        rows = [[float(word) for word in line.split(",")] for line in lines[_headings(lines) :]]
-    except OSError as error:
-        raise InputError(subject, str(error.strerror), expected, "check the path") from error
-    except ValueError as error:
-        raise InputError(subject, str(error), expected) from error
-    if len(rows) < _SHORTEST:
-        raise InputError(subject, f"{len(rows)} lines of numbers", expected)
-    if any(len(row) != 2 for row in rows):
-        raise InputError(subject, "a line that is not two numbers", expected)
-    numbers = np.array(rows)
-    if not np.isfinite(numbers).all():
-        raise InputError(subject, f"{int((~np.isfinite(numbers)).any(1).sum())} lines with NaN or infinity", expected)
-    times_s, values = numbers[np.argsort(numbers[:, 0], kind="stable")].T
-    if np.ptp(values) == 0:
-        remedy = "take --set gating=auto, which needs no file"
-        raise InputError(subject, f"the same value {values[0]:.4g} in every line", "a signal that changes", remedy)
-    first_s, last_s = float(np.min(scan.frame_start_s)), float(np.max(scan.frame_start_s))
-    if (np.diff(times_s) <= 0).any() or times_s[0] > first_s + scan.shutter.span_s or times_s[-1] < last_s:
-        found = f"{len(times_s)} times from {times_s[0]:.4g} to {times_s[-1]:.4g} s"
-        raise InputError(subject, found, f"times that rise and cover the scan, {first_s:.4g} to {last_s:.4g} s")
-    step_s = float(np.median(np.diff(np.sort(scan.frame_start_s)))) if scan.frames > 1 else 1.0
-    return MotionSignal(times_s, _scaled(values), period_of(times_s, values) or 6 * step_s)
-
-
-def _headings(lines: list[str]) -> int:
-    """Returns 1 if the first line does not begin with a number, else 0."""
-    try:
-        float(lines[0].split(",")[0]) if lines else 0.0
-    except ValueError:
-        return 1
-    return 0
 
 
 def middle_times_s(scan: Scan) -> np.ndarray:
@@ -130,7 +90,7 @@ def _gantry(scan: Scan, times_s: np.ndarray, order: np.ndarray) -> np.ndarray:
     return np.stack([np.ones(len(times_s)), drift, *harmonics][:most], -1)
 
 
-def _scaled(values: np.ndarray) -> np.ndarray:
+def scaled(values: np.ndarray) -> np.ndarray:
     """Returns a signal of mean 0 and largest size 1; zeros stay zeros."""
     centred = values - values.mean()
     largest = np.abs(centred).max(initial=0.0)
