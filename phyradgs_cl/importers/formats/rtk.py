@@ -38,6 +38,8 @@ _RADIUS = "RadiusCylindricalDetector"
 _DECLARATIONS = re.compile(rb"<!DOCTYPE[^>]*(SYSTEM|PUBLIC|\[)")
 _LARGEST = 1e9
 _RAW, _ORA = (".his", ".hnd", ".hnc", ".xim"), ".ora.xml"  # what rtk_projections reads
+XIM_BELOW = "Acquisitions/*/*.xim"
+"""Where Varian's TrueBeam puts projections, below its Scan.xml."""
 # RTK's axes (X, Y, Z) are (y, z, x) here: the same right-handed frame under other names.
 _TO_WORLD = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
 
@@ -57,7 +59,8 @@ def recognises(path: Path) -> bool:
     MetaImage in such a folder."""
     folder = SafeFolder(path if path.is_dir() else path.parent)
     if path.is_file() and path.suffix.lower() not in STACKS:
-        return path.suffix.lower() == ".xml" and not path.name.lower().endswith(_ORA) and not folder.plain(*_RAW)
+        is_xml = path.suffix.lower() == ".xml" and not path.name.lower().endswith(_ORA)
+        return is_xml and not folder.plain(*_RAW) and not folder.glob(XIM_BELOW)
     descriptions = [file for file in folder.matching(".xml") if not file.name.lower().endswith(_ORA)]
     return bool(descriptions and folder.matching(*STACKS))
 

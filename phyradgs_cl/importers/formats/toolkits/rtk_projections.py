@@ -1,14 +1,13 @@
 """Raw projections that the package itk-rtk reads: Elekta XVI 5, Varian OBI and ProBeam (TrueBeam), and ORA of medPhoton.
 
-RTK's readers give the geometry, and line integrals after its own corrections for each maker: Elekta's images lose their
-rim, Varian's are divided by their air. The makers' files go to RTK as they are, which checks less than the readers of other
-formats here: import files of people whom you trust."""
+RTK reads the geometry and the line integrals, and cuts off the rim of Elekta's images. The counts of air are its constants
+unless the options state them; ORA's files hold the transmission. RTK checks less than the other readers here: import files
+of people whom you trust."""
 
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
-from functools import partial
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,8 +16,8 @@ import numpy as np
 from phyradgs_cl import checks
 from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.importers.formats.rtk import OPTIONS, read_rtk_xml, scan_of, stack_of
-from phyradgs_cl.importers.options import ImportOptions
+from phyradgs_cl.importers.formats.rtk import XIM_BELOW, read_rtk_xml, scan_of, stack_of
+from phyradgs_cl.importers.options import TIMING, ImportOptions
 from phyradgs_cl.importers.reading.files import SafeFolder, check_room
 
 _COPIES = 12  # bytes of memory for every byte of the files: RTK's images, packed by some makers, and line integrals
@@ -26,45 +25,40 @@ _COPIES = 12  # bytes of memory for every byte of the files: RTK's images, packe
 
 @dataclass(frozen=True)
 class _Maker:
-    """Ends of the names of the geometry's file and of projections; ``read``(RTK, file, projections) -> RTK's geometry."""
+    """Ends of the names of the description and of projections, RTK's reader of the geometry, the options that are used.
+    ``below``: where the projections are, if not in the description's folder."""
 
     description: str
     suffixes: tuple[str, ...]
-    read: Callable[[Any, str, list[str]], Any]
-
-
-def _elekta(rtk: Any, description: str, names: list[str]) -> Any:
-    reader = rtk.ElektaXVI5GeometryXMLFileReader.New()
-    reader.SetFilename(description)
-    reader.GenerateOutputInformation()
-    return reader.GetOutputObject()
-
-
-def _varian(kind: str, rtk: Any, description: str, names: list[str]) -> Any:
-    reader = getattr(rtk, kind).New()
-    reader.SetXMLFileName(description)
-    reader.SetProjectionsFileNames(names)
-    reader.UpdateOutputData()
-    return reader.GetOutputObject()
-
-
-def _ora(rtk: Any, description: str, names: list[str]) -> Any:
-    reader = rtk.OraGeometryReader.New()
-    reader.SetProjectionsFileNames(names)
-    reader.UpdateOutputData()
-    return reader.GetOutputObject()
+    reader: str
+    below: str | None = None
+    options: tuple[str, ...] = (*TIMING, "detector_model", "flat_value")
 
 
 _MAKERS = (
-    _Maker("_frames.xml", (".his",), _elekta),
-    _Maker("projectioninfo.xml", (".hnd", ".hnc"), partial(_varian, "VarianObiGeometryReader")),
-    _Maker("scan.xml", (".xim",), partial(_varian, "VarianProBeamGeometryReader")),
-    _Maker(".ora.xml", (".ora.xml",), _ora),
+    _Maker("_frames.xml", (".his",), "ElektaXVI5GeometryXMLFileReader"),
+    _Maker("projectioninfo.xml", (".hnd", ".hnc"), "VarianObiGeometryReader"),
+    _Maker("scan.xml", (".xim",), "VarianProBeamGeometryReader", XIM_BELOW),
+    _Maker(".ora.xml", (".ora.xml",), "OraGeometryReader", options=(*TIMING, "detector_model")),
 )
 
 
+def _read_geometry(rtk: Any, reader_name: str, description: str, names: list[str]) -> Any:
+    """Returns RTK's geometry of a description and of projections, whose headers hold angles and places."""
+    reader = getattr(rtk, reader_name).New()
+    if hasattr(reader, "SetFilename"):  # Elekta's description has all
+        reader.SetFilename(description)
+        reader.GenerateOutputInformation()
+        return reader.GetOutputObject()
+    if hasattr(reader, "SetXMLFileName"):
+        reader.SetXMLFileName(description)
+    reader.SetProjectionsFileNames(names)
+    reader.UpdateOutputData()
+    return reader.GetGeometry()
+
+
 def recognises(path: Path) -> bool:
-    """True for a folder, or a description, of one of the makers, with projections beside the description."""
+    """True for a folder, or a description, of one of the makers, with its projections."""
     return _located(path) is not None
 
 
@@ -76,6 +70,8 @@ def _located(path: Path) -> tuple[_Maker, Path, list[Path]] | None:
         matching = [file for file in descriptions if file.name.lower().endswith(maker.description)]
         last = {suffix[suffix.rindex(".") :] for suffix in maker.suffixes}
         projections = [file for file in folder.matching(*last) if file.name.lower().endswith(maker.suffixes)]
+        if matching and not projections and maker.below:
+            projections = folder.glob(maker.below)
         if matching and projections:
             return maker, matching[0], projections
     return None
@@ -83,28 +79,32 @@ def _located(path: Path) -> tuple[_Maker, Path, list[Path]] | None:
 
 def import_scan(path: Path, options: ImportOptions) -> Scan:
     """Imports a maker's folder, or its description with the projections in its folder."""
-    options.refuse_unused("rtk-projections", OPTIONS)
     if (located := _located(path)) is None:
         expected = ", ".join(f"*{maker.description} with *{maker.suffixes[0]}" for maker in _MAKERS)
         raise InputError(str(path), "no description with projections", expected)
     maker, description, projections = located
+    options.refuse_unused("rtk-projections", maker.options)
+    if len({file.parent for file in projections}) > 1:
+        raise InputError(str(path), "projections of several acquisitions", "one", f"copy {description.name} into its folder")
     check_room(str(path), _COPIES * sum(file.stat().st_size for file in projections))
     itk = checks.package("itk", "the package whose RTK reads these files", "phyradgs-cl[rtk]")
     names = [str(file) for file in projections]
     with _as_input_error(path), tempfile.TemporaryDirectory() as folder:
         from itk import RTK
 
-        target = Path(folder) / "geometry.xml"
-        RTK.write_geometry(maker.read(RTK, str(description), names), str(target))
-        geometry = read_rtk_xml(target)
+        written = Path(folder) / "geometry.xml"
+        RTK.write_geometry(_read_geometry(RTK, maker.reader, str(description), names), str(written))
+        geometry = read_rtk_xml(written)
         reader = RTK.ProjectionsReader[itk.Image[itk.F, 3]].New(FileNames=names)
+        if options.flat_value is not None:
+            reader.SetI0(options.flat_value)
         reader.Update()
         image = reader.GetOutput()
-        frames = np.array(itk.array_from_image(image))
         direction = np.asarray(itk.array_from_matrix(image.GetDirection()))
-        first_index = image.GetLargestPossibleRegion().GetIndex()  # above 0 where RTK has cut off a rim
-        origin_mm = tuple(image.TransformIndexToPhysicalPoint(first_index))
-        stack = stack_of(frames, origin_mm, tuple(image.GetSpacing()), direction, str(path))
+        index = image.GetLargestPossibleRegion().GetIndex()  # above 0 where RTK has cut off a rim
+        places_mm = tuple(image.TransformIndexToPhysicalPoint(index)), tuple(image.GetSpacing())
+        stack = stack_of(np.array(itk.array_from_image(image)), *places_mm, direction, str(path))
+    options = replace(options, flat_value=None)  # RTK has divided by it
     return scan_of(geometry, stack, options, (str(description), str(path)), description.stem, str(path))
 
 
