@@ -2,7 +2,11 @@
 
 from phyradgs_cl.objective.dct_prox import DctProx, firm_curves, learned_curves
 from phyradgs_cl.objective.nonlocal_step import NonlocalStep
+from phyradgs_cl.objective.ridge import RidgeStep, learned_ridge
 from phyradgs_cl.objective.terms import ImageLoss, TotalVariation
 from phyradgs_cl.objective.tv import TvDescent, TvProx
 
-__all__ = ["DctProx", "ImageLoss", "NonlocalStep", "TotalVariation", "TvDescent", "TvProx", "firm_curves", "learned_curves"]
+__all__ = [
+    "DctProx", "ImageLoss", "NonlocalStep", "RidgeStep", "TotalVariation", "TvDescent", "TvProx", "firm_curves",
+    "learned_curves", "learned_ridge",
+]

@@ -1,0 +1,150 @@
+/* The gradient of a weakly convex ridge regulariser, Wᵀ g(W v), and a step down it (Goujon, Neumayer and Unser 2024).
+
+   W is a chain of correlations of 3³: CHANNELS filters of the volume, then FILTERS of those channels. Only windows inside the
+   volume count: channels have n − 2 elements along an axis, responses n − 4, each at the first voxel of its window. A response
+   t becomes slope_up clamp(t, ±σ knot_up) − slope_down clamp(t, ±σ knot_down). ``table`` holds the filters (3, 3, 3, CHANNELS),
+   the second ones (CHANNELS, 3, 3, 3, FILTERS) and (3, 3, 3, FILTERS, CHANNELS), then slopes and knots of up and down.
+
+   Between kernels are RING slices of all channels: (RING, channels, ny, pitch), slice z in place z % RING, zeros past a row.
+   A work-item takes a row, in vectors, or a voxel. Twin: objective/ridge.py. */
+#include "common/lanes.h"
+
+#define CHANNELS 4
+#define FILTERS 16
+#define TAPS 27
+#define SECOND (TAPS * CHANNELS)
+#define SECOND_BACK (SECOND + TAPS * CHANNELS * FILTERS)
+#define CURVES (SECOND_BACK + TAPS * CHANNELS * FILTERS)
+
+#if BLOCK_PIXEL
+#define FOR_X(x, width) const int x = (int)get_global_id(0); if (x < width)
+#else
+#define FOR_X(x, width) for (int x = 0; x < width; x += LANES)
+#endif
+
+/* Voxel 0 of a row of a channel of a ring. */
+static inline size_t row_of(const int4 shape, const int pitch, const int channels, const int c, const int y, const int z)
+{
+    return IMAGE_GUARD + (((size_t)(z % RING) * channels + c) * shape.y + y) * pitch;
+}
+
+static inline vf inside(const vf value, const int x, const int width)
+{
+    return V_PICK(0.0f, value, (vf)(x) + V_IOTA < (float)width);
+}
+
+/* Channels of the padded volume; z counts from ``first``, as in all kernels here. */
+__kernel void ridge_channels(
+    __global const float *volume, const int4 shape, const int pitch, const int first, __constant const float *table,
+    __global float *channels)
+{
+    const int y = (int)get_global_id(1), z = first + (int)get_global_id(2);
+    const size_t slice = (size_t)shape.y * pitch;
+    volume += IMAGE_GUARD + z * slice + (size_t)y * pitch;
+    FOR_X(x, shape.x - 2)
+    {
+        vf sums[CHANNELS];
+        for (int c = 0; c < CHANNELS; c++)
+            sums[c] = (vf)(0.0f);
+        for (int tap = 0; tap < TAPS; tap++) {
+            const vf value = V_LOAD(volume + (tap / 9) * slice + (size_t)(tap / 3 % 3) * pitch + tap % 3 + x);
+            for (int c = 0; c < CHANNELS; c++)
+                sums[c] = mad((vf)(table[tap * CHANNELS + c]), value, sums[c]);
+        }
+        for (int c = 0; c < CHANNELS; c++)
+            V_STORE(inside(sums[c], x, shape.x - 2), channels + row_of(shape, pitch, CHANNELS, c, y, z) + x);
+    }
+}
+
+/* Responses of the filters, bent. */
+__kernel void ridge_responses(
+    __global const float *channels, const int4 shape, const int pitch, const int first, __constant const float *table,
+    const float sigma, __global float *responses)
+{
+    const int y = (int)get_global_id(1), z = first + (int)get_global_id(2);
+    FOR_X(x, shape.x - 4)
+    {
+        vf sums[FILTERS];
+        for (int i = 0; i < FILTERS; i++)
+            sums[i] = (vf)(0.0f);
+        for (int c = 0; c < CHANNELS; c++)
+            for (int row = 0; row < 9; row++) {
+                __global const float *line = channels + row_of(shape, pitch, CHANNELS, c, y + row % 3, z + row / 3) + x;
+                for (int k = 0; k < 3; k++) {
+                    __constant const float *weights = table + SECOND + (c * TAPS + row * 3 + k) * FILTERS;
+                    const vf value = V_LOAD(line + k);
+                    for (int i = 0; i < FILTERS; i++)
+                        sums[i] = mad((vf)(weights[i]), value, sums[i]);
+                }
+            }
+        for (int i = 0; i < FILTERS; i++) {
+            __constant const float *curve = table + CURVES + i;
+            const vf up = (vf)(sigma * curve[FILTERS]), down = (vf)(sigma * curve[3 * FILTERS]);
+            const vf bent = curve[0] * clamp(sums[i], -up, up) - curve[2 * FILTERS] * clamp(sums[i], -down, down);
+            V_STORE(inside(bent, x, shape.x - 4), responses + row_of(shape, pitch, FILTERS, i, y, z) + x);
+        }
+    }
+}
+
+/* The transpose of the second filters. */
+__kernel void ridge_channels_back(
+    __global const float *responses, const int4 shape, const int pitch, const int first, __constant const float *table,
+    __global float *channels)
+{
+    const int y = (int)get_global_id(1), z = first + (int)get_global_id(2);
+    FOR_X(x, shape.x - 2)
+    {
+        vf sums[CHANNELS];
+        for (int c = 0; c < CHANNELS; c++)
+            sums[c] = (vf)(0.0f);
+        for (int row = 0; row < 9; row++) {
+            const int from_y = y - row % 3, from_z = z - row / 3;
+            if (from_y < 0 || from_y >= shape.y - 4 || from_z < 0 || from_z >= shape.z - 4)
+                continue;
+            for (int i = 0; i < FILTERS; i++) {
+                __global const float *line = responses + row_of(shape, pitch, FILTERS, i, from_y, from_z) + x;
+                for (int k = 0; k < 3; k++) {
+                    __constant const float *weights = table + SECOND_BACK + ((row * 3 + k) * FILTERS + i) * CHANNELS;
+                    const vf value = V_LOAD(line - k);
+                    for (int c = 0; c < CHANNELS; c++)
+                        sums[c] = mad((vf)(weights[c]), value, sums[c]);
+                }
+            }
+        }
+        for (int c = 0; c < CHANNELS; c++)
+            V_STORE(inside(sums[c], x, shape.x - 2), channels + row_of(shape, pitch, CHANNELS, c, y, z) + x);
+    }
+}
+
+/* The transpose of the first filters is the gradient; v − step times it, plain. */
+__kernel void ridge_step(
+    __global const float *volume, __global const float *channels, const int4 shape, const int pitch, const int first,
+    __constant const float *table, const float step, const int nonnegative, __global float *result)
+{
+    const int y = (int)get_global_id(1), z = first + (int)get_global_id(2);
+    volume += IMAGE_GUARD + ((size_t)z * shape.y + y) * pitch;
+    result += ((size_t)z * shape.y + y) * shape.x;
+    FOR_X(x, shape.x)
+    {
+        vf sums[CHANNELS];
+        for (int c = 0; c < CHANNELS; c++)
+            sums[c] = (vf)(0.0f);
+        for (int row = 0; row < 9; row++) {
+            const int from_y = y - row % 3, from_z = z - row / 3;
+            if (from_y < 0 || from_y >= shape.y - 2 || from_z < 0 || from_z >= shape.z - 2)
+                continue;
+            for (int k = 0; k < 3; k++)
+                for (int c = 0; c < CHANNELS; c++)
+                    sums[c] = mad((vf)(table[(row * 3 + k) * CHANNELS + c]),
+                        V_LOAD(channels + row_of(shape, pitch, CHANNELS, c, from_y, from_z) + x - k), sums[c]);
+        }
+        const vf moved = V_LOAD(volume + x) - step * ((sums[0] + sums[1]) + (sums[2] + sums[3]));
+        const vf value = nonnegative ? max(moved, (vf)(0.0f)) : moved;
+        const int count = min(LANES, shape.x - x);
+        if (count == LANES)
+            V_STORE(value, result + x);
+        else
+            for (int k = 0; k < count; k++)
+                result[x + k] = ((const float *)&value)[k];
+    }
+}

@@ -1,0 +1,138 @@
+"""A step down a learned weakly convex ridge regulariser R(x) = Σ_i Σ_p ψ_i((W_i x)_p): a prior for texture and anatomy.
+
+Goujon, Neumayer and Unser, "Learning weakly convex regularizers for convergent image-reconstruction algorithms", SIAM J.
+Imaging Sci. 17 (2024) 91, in 3D. The 16 filters W_i of 5³ are a chain: 4 correlations with 3³, then 16 with their results.
+Only windows inside the volume count. ψ_i' is a difference of two clamps whose knots are in units of the noise σ. It rises
+near 0 and may fall beyond, but R is ρ-weakly convex with ρ ≤ 1. ½‖x − v‖² + step R(x) is therefore convex for step ≤ 1."""
+
+import json
+from dataclasses import dataclass
+from functools import cache, partial
+
+import numpy as np
+
+from phyradgs_cl import resource
+from phyradgs_cl.runtime import DeviceArray, Kernel, Runtime, SameArray
+from phyradgs_cl.runtime.layout import GUARD, Strides, move, on_device, padded_zeros, pitch_of
+
+EDGE = 5
+"""Voxels along a side of a filter."""
+_SLICES = 4  # of channels and responses that are computed at a time
+_RING = _SLICES + 2  # slices of them in memory: a correlation needs three
+
+
+@dataclass(frozen=True, eq=False)
+class Ridge:
+    """The numbers of a regulariser, float32. first (4, 3, 3, 3) and second (16, 4, 3, 3, 3): filters, axes z, y, x.
+
+    ψ_i'(t) = slope_up[i] clip(t, ±σ knot_up[i]) − slope_down[i] clip(t, ±σ knot_down[i]), each (16,) and not below 0."""
+
+    first: np.ndarray
+    second: np.ndarray
+    slope_up: np.ndarray
+    knot_up: np.ndarray
+    slope_down: np.ndarray
+    knot_down: np.ndarray
+
+    def table(self) -> np.ndarray:
+        """Returns the kernels' table, float32."""
+        filters = np.moveaxis(self.first, 0, -1), np.moveaxis(self.second, 0, -1), np.moveaxis(self.second, (0, 1), (-2, -1))
+        curves = self.slope_up, self.knot_up, self.slope_down, self.knot_down
+        return np.concatenate([part.ravel() for part in (*filters, *curves)]).astype(np.float32)
+
+    def bend(self, responses: np.ndarray, sigma: float) -> np.ndarray:
+        """Returns ψ' of responses (16, z, y, x)."""
+        columns = (self.slope_up, self.knot_up, self.slope_down, self.knot_down)
+        up, knot_up, down, knot_down = (values.astype(np.float64)[:, None, None, None] for values in columns)
+        knot_up, knot_down = sigma * knot_up, sigma * knot_down
+        bent: np.ndarray = up * np.clip(responses, -knot_up, knot_up) - down * np.clip(responses, -knot_down, knot_down)
+        return bent
+
+
+@cache
+def learned_ridge() -> Ridge:
+    """Returns the regulariser of ``data/ridge.json`` (benchmarks/train_ridge.py)."""
+    stored = json.loads((resource("data") / "ridge.json").read_text(encoding="utf-8"))
+    return Ridge(*(np.array(stored[name], np.float32) for name in Ridge.__dataclass_fields__))
+
+
+class RidgeStep:
+    """The step for volumes of a fixed ``shape`` (z, y, x); it does not change a volume thinner than a filter."""
+
+    VOLUMES = 3
+    """Volumes of floats that it holds beyond those of ``DctProx``, with 40 slices or more."""
+
+    def __init__(self, rt: Runtime, shape: tuple[int, int, int], ridge: Ridge) -> None:
+        self.rt, self.shape = rt, shape
+        nz, ny, nx = shape
+        self._layout = np.array([nx, ny, nz, 0], np.int32), np.int32(pitch_of(nx))
+        defines = {"IMAGE_GUARD": GUARD, "BLOCK_PIXEL": rt.pixel_items, "RING": _RING}
+        names = "ridge_channels", "ridge_responses", "ridge_channels_back", "ridge_step"
+        self._channels_of, self._bent, self._back, self._step = (rt.kernel("ridge", name, **defines) for name in names)
+        self._table = rt.upload(ridge.table())
+        channels, filters = len(ridge.first), len(ridge.second)
+        self._padded = padded_zeros(rt, nz * ny, nx)
+        self._channels, self._responses, self._channels_back = (
+            padded_zeros(rt, _RING * count * ny, nx) for count in (channels, filters, channels)
+        )
+
+    def __call__(
+        self, volume: SameArray, sigma: float, step: float, *, nonnegative: bool, out: DeviceArray | None = None
+    ) -> SameArray:
+        """Returns v − ``step`` ∇R(v), float32, not below 0 if asked; ``sigma``: of the noise, in the unit of v (z, y, x).
+
+        A device array gives a device array (``out``, if given, which may be the volume)."""
+
+        return on_device(self.rt, partial(self._descend, sigma, step, nonnegative), volume, out)
+
+    def _descend(self, sigma: float, step: float, nonnegative: bool, volume: DeviceArray, result: DeviceArray) -> None:
+        nz, ny, nx = self.shape
+        padded = self._padded, Strides(GUARD, ny * pitch_of(nx), pitch_of(nx))
+        move(self.rt, (volume, Strides.plain(self.shape)), padded, self.shape)
+        is_thin = min(self.shape) < EDGE  # the channels of the gradient stay 0
+        end = np.float32(step), np.int32(nonnegative), result
+        # A response needs three slices of the channels: it follows two slices behind them
+        for first in range(0, nz + 2, _SLICES):
+            if not is_thin:
+                self._launch(self._channels_of, first, 2, self._padded, ends=(self._channels,))
+                self._launch(self._bent, first - 2, 4, self._channels, ends=(np.float32(sigma), self._responses))
+                self._launch(self._back, first - 2, 2, self._responses, ends=(self._channels_back,))
+            self._launch(self._step, first - 2, 0, self._padded, self._channels_back, ends=end)
+
+    def _launch(self, kernel: Kernel, first: int, less: int, *sources: DeviceArray, ends: tuple[object, ...]) -> None:
+        """Runs a kernel on ``_SLICES`` slices from ``first`` on, where its result is ``less`` smaller than the volume."""
+        nz, ny, nx = (count - less for count in self.shape)
+        start, stop = max(first, 0), min(first + _SLICES, nz)
+        if start < stop:
+            items = nx if self.rt.pixel_items else 1, ny, stop - start
+            arguments = *sources, *self._layout, np.int32(start), self._table, *ends
+            self.rt.launch(kernel, items, *arguments, group=self.rt.group())
+
+
+def ridge_gradient(volume: np.ndarray, sigma: float, ridge: Ridge) -> np.ndarray:
+    """Returns ∇R of a volume (z, y, x), float64."""
+    volume = np.asarray(volume, np.float64)
+    if min(volume.shape) < EDGE:
+        return np.zeros_like(volume)
+    bent = ridge.bend(correlated(correlated(volume[None], ridge.first[:, None]), ridge.second), sigma)
+    gradient: np.ndarray = correlated_back(correlated_back(bent, ridge.second), ridge.first[:, None])[0]
+    return gradient
+
+
+def ridge_step(volume: np.ndarray, sigma: float, step: float, *, ridge: Ridge, nonnegative: bool) -> np.ndarray:
+    """Float64 twin of ``RidgeStep``."""
+    moved: np.ndarray = np.asarray(volume, np.float64) - step * ridge_gradient(volume, sigma, ridge)
+    return np.maximum(moved, 0) if nonnegative else moved
+
+
+def correlated(channels: np.ndarray, filters: np.ndarray) -> np.ndarray:
+    """Correlates channels (c, z, y, x) with filters (i, c, 3, 3, 3): (i, z − 2, y − 2, x − 2), where windows are inside."""
+    windows = np.lib.stride_tricks.sliding_window_view(channels, (3, 3, 3), axis=(1, 2, 3))
+    results: np.ndarray = np.einsum("czyxkji,fckji->fzyx", windows, filters.astype(np.float64), optimize=True)
+    return results
+
+
+def correlated_back(responses: np.ndarray, filters: np.ndarray) -> np.ndarray:
+    """The transpose of ``correlated``: (i, z, y, x) to (c, z + 2, y + 2, x + 2)."""
+    padded = np.pad(responses, ((0, 0), (2, 2), (2, 2), (2, 2)))
+    return correlated(padded, filters.swapaxes(0, 1)[..., ::-1, ::-1, ::-1])
