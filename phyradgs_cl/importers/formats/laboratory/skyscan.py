@@ -14,24 +14,11 @@ import numpy as np
 
 from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.acquisition.geometry import Geometry
-from phyradgs_cl.importers.assemble import (
-    StoredTiming,
-    assemble_scan,
-    cone,
-    make_timing,
-    names_in_file,
-    turning,
-)
+from phyradgs_cl.importers import assemble
 from phyradgs_cl.importers.options import OF_BARE_FRAMES, ImportOptions
+from phyradgs_cl.importers.reading import settings
 from phyradgs_cl.importers.reading.files import SafeFolder
 from phyradgs_cl.importers.reading.frames import gantry_sign, line_integrals, oriented
-from phyradgs_cl.importers.reading.settings import (
-    differing,
-    head_has,
-    read_settings,
-    say_missing,
-    white_level,
-)
 from phyradgs_cl.importers.reading.tiff import read_series
 from phyradgs_cl.io.tables import Fields
 
@@ -50,13 +37,12 @@ _ASSUMED = {
     "Rotation Direction": "CC", "Optical Axis (line)": "the middle", "Scanning Start Angle": "0",
     "Exposure (ms)": "none", "Frame Averaging": "OFF", "Scanning Trajectory": "ROUND", "Flat Field Correction": "ON",
 }  # fmt: skip
-_MOST = 1_000_000
 
 
 def recognises(path: Path) -> bool:
     """True for a .log file of a SkyScan, and for a folder with one."""
     paths = SafeFolder(path).plain(".log") if path.is_dir() else [path]
-    return any(file.suffix.lower() == ".log" and head_has(file, b"[system]", b"scanner=") for file in paths)
+    return any(file.suffix.lower() == ".log" and settings.head_has(file, b"[system]", b"scanner=") for file in paths)
 
 
 def import_scan(path: Path, options: ImportOptions) -> Scan:
@@ -64,56 +50,52 @@ def import_scan(path: Path, options: ImportOptions) -> Scan:
     options.refuse_unused("skyscan", OF_BARE_FRAMES)
     folder = SafeFolder(path if path.is_dir() else path.parent)
     description = path if path.is_file() else folder.only("log of the scan", ".log")
-    scan = read_settings(description, _NAMES, sections=("System", "Acquisition"))
+    scan = settings.read_settings(description, _NAMES, sections=("System", "Acquisition"))
     sizes = [f"Number of {what}" for what in ("Files", "Rows", "Columns")]
-    count, rows, columns = (scan.count(name, _MOST) for name in sizes)
+    count, rows, columns = (scan.count(name, 1_000_000) for name in sizes)
     if scan.word("Scanning Trajectory", default="ROUND").upper() != "ROUND":
         raise scan.error("Scanning Trajectory", scan.word("Scanning Trajectory")[:40], "ROUND, a circle")
-    frames = read_series(
-        folder, str(scan.get("Filename Prefix")), (count, rows, columns), [*map(scan.name, sizes)], r"\d{4,8}"
-    )
-    names = names_in_file(options, {
+    prefix, stated = str(scan.get("Filename Prefix")), [scan.name(name) for name in sizes]
+    frames = read_series(folder, prefix, (count, rows, columns), stated, r"\d{4,8}")
+    names = assemble.names_in_file(options, {
         "source_to_axis_mm": scan.name("Object to Source (mm)"), "exposure_s": scan.name("Exposure (ms)"),
         "source_to_detector_mm": scan.name("Camera to Source (mm)"), "angles": scan.name("Rotation Step (deg)"),
         "pixel_size_mm": scan.name("Image Pixel Size (um)"),
     })  # fmt: skip
     geometry = _geometry(scan, (rows, columns), options, names)
     step_deg, first_deg = scan.number("Rotation Step (deg)"), scan.number("Scanning Start Angle", 0.0)
-    direction = scan.word("Rotation Direction", default="CC").upper()
-    if direction not in _SENSES:
+    if (direction := scan.word("Rotation Direction", default="CC").upper()) not in _SENSES:
         raise scan.error("Rotation Direction", repr(direction[:40]), "CC or CW")
-    turned_rad = differing(scan, "Rotation Step (deg)", first_deg + step_deg * np.arange(count))
+    turned_rad = settings.differing(scan, "Rotation Step (deg)", first_deg + step_deg * np.arange(count))
     angle_rad = gantry_sign(options, "sample") * _SENSES[direction] * turned_rad
-    timing = make_timing(str(description), count, options, _timing(scan, options))
-    say_missing(scan, _ASSUMED)
-    movement = str(scan.values.get("Random Movement", "OFF"))
-    if not _OFF.fullmatch(movement):
+    timing = assemble.make_timing(str(description), count, options, _timing(scan, options))
+    settings.say_missing(scan, _ASSUMED)
+    if not _OFF.fullmatch(movement := str(scan.values.get("Random Movement", "OFF"))):
         text = "%s is %s: the log states no shifts, so none are used; details blur where the scanner has not undone them"
         _log.warning(text, scan.name("Random Movement"), movement[:40])
     if roll_deg := scan.number("Image Rotation", 0.0):
         _log.warning("%s is %g° and not used: calibrate finds the panel's roll", scan.name("Image Rotation"), roll_deg)
     combined = replace(options, flat_value=options.flat_value or _white(scan, frames, options))
-    turned = oriented(frames, options, "top", "right")
-    integrals = line_integrals(str(description), turned, combined, convention="counts", is_corrected=True)
-    parts = integrals, turning(geometry, angle_rad, timing), geometry, timing, options
-    return assemble_scan(*parts, title=description.stem, source=str(path), names=names)
+    frames = oriented(frames, options, "top", "right")
+    integrals = line_integrals(str(description), frames, combined, convention="counts", is_corrected=True)
+    parts = integrals, assemble.turning(geometry, angle_rad, timing), geometry, timing, options
+    return assemble.assemble_scan(*parts, title=description.stem, source=str(path), names=names)
 
 
 def _geometry(scan: Fields, panel: tuple[int, int], options: ImportOptions, names: dict[str, str]) -> Geometry:
     to_axis_mm, to_detector_mm = scan.length("Object to Source (mm)"), scan.length("Camera to Source (mm)")
     width_mm = scan.length("Image Pixel Size (um)") / 1000 * (to_detector_mm / to_axis_mm)
-    ratio = next((scan.length(name) for name in _RATIOS if scan.has(name)), 1.0)
-    pitch_mm = (width_mm / ratio, width_mm)
+    pitch_mm = (width_mm / next((scan.length(name) for name in _RATIOS if scan.has(name)), 1.0), width_mm)
     # a window of the camera may leave the central ray outside, by at most its own height
     line = scan.number("Optical Axis (line)", panel[0] / 2, -panel[0], 2 * panel[0])
     up_mm = (panel[0] / 2 - line) * pitch_mm[0]
     if options.detector_offset_mm is None:
         text = "%s no place of the axis across the panel: taken in the middle; check --fix-offset or calibrate find it"
         _log.warning(text, scan.subject)
-    return cone(options, to_axis_mm, to_detector_mm, panel, pitch_mm, (up_mm, 0.0), names)
+    return assemble.cone(options, to_axis_mm, to_detector_mm, panel, pitch_mm, (up_mm, 0.0), names)
 
 
-def _timing(scan: Fields, options: ImportOptions) -> StoredTiming:
+def _timing(scan: Fields, options: ImportOptions) -> assemble.StoredTiming:
     """Returns the exposure of all averaged frames; none for a scanner that stopped for each and options without a rate."""
     motion = next((scan.word(name) for name in ("Type of Detector Motion", "Type of Motion") if scan.has(name)), "")
     averaging = str(scan.values.get("Frame Averaging", "OFF"))
@@ -122,17 +104,17 @@ def _timing(scan: Fields, options: ImportOptions) -> StoredTiming:
         raise scan.error("Frame Averaging", repr(averaging[:40]), "OFF, or ON and a count of frames, as ON (4)")
     exposure_s = scan.length("Exposure (ms)") / 1000 if scan.has("Exposure (ms)") else None
     if exposure_s is None or ("STEP" in motion.upper() and options.frame_time_s is None):
-        return StoredTiming()
-    return StoredTiming(exposure_s=exposure_s * int(averaged[1] if averaged else 1))
+        return assemble.StoredTiming()
+    return assemble.StoredTiming(exposure_s=exposure_s * int(averaged[1] if averaged else 1))
 
 
 def _white(scan: Fields, frames: np.ndarray, options: ImportOptions) -> float:
     """Returns the counts of air: Reference Intensity, else the largest number of Depth (bits)."""
+    remedy = f"say {options.named('flat_value')}"
     if scan.word("Flat Field Correction", default="ON").upper() == "OFF":
-        remedy = f"say {options.named('flat_value')}"
         raise scan.error("Flat Field Correction", "OFF", "frames that the scanner has corrected", remedy)
     if scan.has("Reference Intensity"):
-        return white_level(scan, "Reference Intensity", frames, f"correct it, or say {options.named('flat_value')}")
-    bits = int(scan.number("Depth (bits)", 16, 1, 32))
-    say_missing(scan, {"Reference Intensity": f"air at {2**bits - 1} counts; else say {options.named('flat_value')}"})
-    return float(2**bits - 1)
+        return settings.white_level(scan, "Reference Intensity", frames, f"correct it, or {remedy}")
+    most = 2 ** int(scan.number("Depth (bits)", 16, 1, 32)) - 1
+    settings.say_missing(scan, {"Reference Intensity": f"air at {most} counts; else {remedy}"})
+    return float(most)

@@ -11,27 +11,21 @@ from pathlib import Path
 import numpy as np
 
 from phyradgs_cl.acquisition import Scan
-from phyradgs_cl.importers.assemble import (
-    StoredTiming,
-    assemble_scan,
-    cone,
-    make_timing,
-    names_in_file,
-    parallel,
-)
+from phyradgs_cl.importers import assemble
 from phyradgs_cl.importers.options import OF_BARE_FRAMES, ImportOptions
 from phyradgs_cl.importers.reading.frames import gantry_sign, line_integrals, oriented
 from phyradgs_cl.importers.reading.ole import open_ole, read_images, read_stream
 from phyradgs_cl.importers.reading.settings import differing, say_missing
 from phyradgs_cl.importers.stage import RotaryStage
-from phyradgs_cl.io.tables import Fields
+from phyradgs_cl.io.tables import LARGEST, Fields
 
 _log = logging.getLogger(__name__)
 _INFO, _REFERENCE = "ImageInfo", "ReferenceData/Image"
-_WHOLE = ("NoOfImages", "ImageWidth", "ImageHeight", "DataType", "XrayGeometry")
+_COUNTS = ("NoOfImages", "ImageHeight", "ImageWidth")
 _REAL = ("PixelSize", "Angles", "StoRADistance", "DtoRADistance", "ExpTimes")
 _STREAMS = {
-    **{f"{_INFO}/{name}": "<i4" for name in _WHOLE}, **{f"{_INFO}/{name}": "<f4" for name in _REAL},
+    **{f"{_INFO}/{name}": "<i4" for name in (*_COUNTS, "DataType", "XrayGeometry")},
+    **{f"{_INFO}/{name}": "<f4" for name in _REAL},
     "Alignment/X-Shifts": "<f4", "Alignment/Y-Shifts": "<f4", "ReconSettings/CenterShift": "<f4",
     "ReferenceData/DataType": "<i4",
 }  # fmt: skip
@@ -52,28 +46,27 @@ def import_scan(path: Path, options: ImportOptions) -> Scan:
         stored = {name: dtype for name, dtype in _STREAMS.items() if ole.exists(name)}
         values = {name: read_stream(ole, path, name, dtype, _MOST_VALUES).tolist() for name, dtype in stored.items()}
         scan = Fields(f"{path}:", values)
-        count, rows, columns = (_whole(scan, name, path) for name in ("NoOfImages", "ImageHeight", "ImageWidth"))
+        counts = (_first(scan, f"{_INFO}/{name}", 1, path.stat().st_size) for name in _COUNTS)
+        count, rows, columns = map(int, counts)
         names = [f"ImageData{i // _PER_FOLDER + 1}/Image{i + 1}" for i in range(count)]
         frames, white = read_images(ole, path, names, _type(scan, f"{_INFO}/DataType"), (rows, columns)), None
         if ole.exists(_REFERENCE):
             white = read_images(ole, path, [_REFERENCE], _type(scan, "ReferenceData/DataType", 10), (rows, columns))
     angles = f"{_INFO}/Angles"
     angle_rad = gantry_sign(options, "sample") * differing(scan, angles, _numbers(scan, angles, count))
-    in_file = names_in_file(options, {
+    in_file = assemble.names_in_file(options, {
         "source_to_axis_mm": scan.name(f"{_INFO}/StoRADistance"), "angles": scan.name(angles),
         "source_to_detector_mm": scan.name(f"{_INFO}/DtoRADistance"), "exposure_s": scan.name(f"{_INFO}/ExpTimes"),
         "pixel_size_mm": scan.name(f"{_INFO}/PixelSize"),
     })  # fmt: skip
-    exposure_s = _first(scan, f"{_INFO}/ExpTimes") if scan.has(f"{_INFO}/ExpTimes") else None
-    if exposure_s is not None and exposure_s < 0:
-        raise scan.error(f"{_INFO}/ExpTimes", f"{exposure_s:g}", "a time of at least 0 s")
-    timing = make_timing(str(path), count, options, StoredTiming(exposure_s=exposure_s or None))
+    exposure_s = _first(scan, f"{_INFO}/ExpTimes", 0) if scan.has(f"{_INFO}/ExpTimes") else None
+    timing = assemble.make_timing(str(path), count, options, assemble.StoredTiming(exposure_s=exposure_s or None))
     trajectory, geometry = _stage(scan, (count, rows, columns), options).turned(angle_rad, timing, str(path))
     flats = None if white is None else oriented(white, options, "bottom")
     turned = oriented(frames, options, "bottom")
     integrals = line_integrals(str(path), turned, options, flats=flats, convention="counts", is_corrected=True)
     parts = integrals, trajectory, geometry, timing, options
-    return assemble_scan(*parts, title=path.stem, source=str(path), names=in_file)
+    return assemble.assemble_scan(*parts, title=path.stem, source=str(path), names=in_file)
 
 
 def _type(scan: Fields, name: str, default: float | None = None) -> str:
@@ -88,9 +81,7 @@ def _stage(scan: Fields, shape: tuple[int, int, int], options: ImportOptions) ->
     """Returns a stage whose panel is shifted in every image as the alignment says."""
     to_axis_mm, behind_mm = (_steady(scan, f"{_INFO}/{name}") for name in ("StoRADistance", "DtoRADistance"))
     is_cone = not scan.has(f"{_INFO}/XrayGeometry") or _first(scan, f"{_INFO}/XrayGeometry") == 1
-    pixel_mm = _first(scan, f"{_INFO}/PixelSize") / 1000
-    if not 0 < pixel_mm < 1e3:
-        raise scan.error(f"{_INFO}/PixelSize", f"{1000 * pixel_mm:g}", "a size above 0 µm")
+    pixel_mm = _first(scan, f"{_INFO}/PixelSize", 1e-6, 1e6) / 1000
     say_missing(scan, {"Alignment/X-Shifts": "0", "Alignment/Y-Shifts": "0", f"{_INFO}/XrayGeometry": "a cone",
                        f"{_INFO}/ExpTimes": "none"})  # fmt: skip
     if scan.has("ReconSettings/CenterShift") and (shift := _first(scan, "ReconSettings/CenterShift")):
@@ -98,9 +89,9 @@ def _stage(scan: Fields, shape: tuple[int, int, int], options: ImportOptions) ->
         _log.warning(text, scan.name("ReconSettings/CenterShift"), shift)
     if is_cone:
         pitch_mm = pixel_mm * (to_axis_mm + behind_mm) / to_axis_mm
-        geometry = cone(options, to_axis_mm, to_axis_mm + behind_mm, shape[1:], (pitch_mm, pitch_mm), (0.0, 0.0))
+        geometry = assemble.cone(options, to_axis_mm, to_axis_mm + behind_mm, shape[1:], (pitch_mm, pitch_mm), (0.0, 0.0))
     else:
-        geometry = parallel(options, shape[1:], (pixel_mm, pixel_mm), (0.0, 0.0))
+        geometry = assemble.parallel(options, shape[1:], (pixel_mm, pixel_mm), (0.0, 0.0))
     names = ("Alignment/Y-Shifts", "Alignment/X-Shifts")
     shifts = np.stack([_numbers(scan, name, shape[0]) if scan.has(name) else np.zeros(shape[0]) for name in names], -1)
     return RotaryStage(geometry, shift_mm=shifts * geometry.pixel_size_mm if shifts.any() else None)
@@ -114,16 +105,9 @@ def _numbers(scan: Fields, name: str, count: int) -> np.ndarray:
     return values[:count]
 
 
-def _first(scan: Fields, name: str) -> float:
-    return float(_numbers(scan, name, 1)[0])
-
-
-def _whole(scan: Fields, name: str, path: Path) -> int:
-    """Returns a count of at most the bytes of the file."""
-    value, most = _first(scan, f"{_INFO}/{name}"), path.stat().st_size
-    if not 1 <= value <= most:
-        raise scan.error(f"{_INFO}/{name}", f"{value:g}", f"a whole number from 1 to {most}")
-    return int(value)
+def _first(scan: Fields, name: str, lowest: float = -LARGEST, highest: float = LARGEST) -> float:
+    """Returns the first number of a stream, which is between two bounds."""
+    return Fields(scan.subject, {name: float(_numbers(scan, name, 1)[0])}).number(name, lowest=lowest, highest=highest)
 
 
 def _steady(scan: Fields, name: str) -> float:
