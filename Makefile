@@ -25,23 +25,28 @@ TORCH  ?= torch==2.13.0
 BIN      := $(VENV)/bin
 PHYRADGS := $(BIN)/phyradgs
 
-.PHONY: demo test test-all docs stress coverage test-browser test-cluster test-gpu-build gpu test-intel test-mpi test-neural test-oclgrind test-pocl-package test-spectrum clean
+.PHONY: demo test test-all docs stress coverage types test-quick test-browser test-cluster test-gpu-build gpu test-intel test-mpi test-neural test-oclgrind test-pocl-package test-spectrum clean
 .DELETE_ON_ERROR:
 
 $(BIN)/python:
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 10))' \
 		|| { echo "$(PYTHON) is older than 3.10: choose another with make PYTHON=..." >&2; exit 1; }
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --upgrade pip
 
-# Both installs are editable, so that the code that runs is the code in this folder.
+# Editable, so that the code that runs is the code in this folder. Python compiles what it imports: most modules it does not.
+INSTALL := -m pip install --quiet --no-compile --disable-pip-version-check --editable
+
 $(VENV)/.installed-cpu: pyproject.toml | $(BIN)/python
-	$(BIN)/python -m pip install --quiet --editable ".[cpu]"
+	$(BIN)/python $(INSTALL) ".[cpu]"
 	@touch $@
 
 $(VENV)/.installed-test: pyproject.toml | $(BIN)/python
-	$(BIN)/python -m pip install --quiet --editable ".[cpu,test]"
+	$(BIN)/python $(INSTALL) ".[cpu,test]"
 	@touch $@ $(VENV)/.installed-cpu
+
+$(VENV)/.installed-test-all: pyproject.toml | $(BIN)/python
+	$(BIN)/python $(INSTALL) ".[cpu,test-all]"
+	@touch $@ $(VENV)/.installed-cpu $(VENV)/.installed-test
 
 demo: $(VENV)/.installed-cpu
 	$(PHYRADGS) devices
@@ -58,30 +63,35 @@ PARALLEL := -n auto --dist loadfile --no-loadscope-reorder
 
 test: $(VENV)/.installed-test
 	$(BIN)/ruff check .
+	@$(MAKE) --no-print-directory --jobs=2 types test-quick
+
+types: $(VENV)/.installed-test
 	@if $(BIN)/python -c 'import sys; sys.exit(sys.version_info < (3, 11))'; then \
 		echo $(BIN)/mypy phyradgs_cl cli.py; $(BIN)/mypy phyradgs_cl cli.py; \
 	else echo "types: left out before Python 3.11, whose NumPy states too few"; fi
+
+test-quick: $(VENV)/.installed-test
 	$(call tested,$(VENV),-m quick $(PARALLEL))
 
-test-all: test
+test-all: test $(VENV)/.installed-test-all
 	$(call tested,$(VENV),-m "not quick" $(PARALLEL))
 
-docs: $(VENV)/.installed-test
+docs: $(VENV)/.installed-test-all
 	$(BIN)/python docs/make_reference.py
 	$(BIN)/mkdocs build --strict --site-dir site
 
-stress: $(VENV)/.installed-test
+stress: $(VENV)/.installed-test-all
 	STRESS=50 $(BIN)/python -m pytest tests/cli/test_kills.py tests/workflow/test_watch_kills.py tests/faults tests/importers tests/laws tests/test_built_ins.py
 
 # Environments beside the first, one per target: what each has beside pytest, and the extras of pyproject.toml.
 EXTRAS_browser   := cpu,test
 PACKAGES_browser := playwright
 EXTRAS_cluster   := cpu,test,cluster
-EXTRAS_coverage  := cpu,test,neural,cluster,mpi
+EXTRAS_coverage  := cpu,test-all,neural,cluster,mpi
 PACKAGES_coverage = "coverage>=7.10" "$(TORCH)"
 EXTRAS_gpu       := cpu
 PACKAGES_gpu     := nvidia-cuda-nvcc-cu12
-EXTRAS_intel     := cpu,test
+EXTRAS_intel     := cpu,test-all
 PACKAGES_intel   := intel-opencl-rt intel-cmplr-lib-rt
 EXTRAS_mpi       := cpu,test,mpi
 EXTRAS_neural    := cpu,test,neural
@@ -95,8 +105,7 @@ ENVIRONMENTS     := browser cluster coverage gpu intel mpi neural oclgrind packa
 
 $(ENVIRONMENTS:%=$(VENV)-%/.installed): $(VENV)-%/.installed: pyproject.toml
 	$(PYTHON) -m venv $(VENV)-$*
-	$(VENV)-$*/bin/python -m pip install --quiet --upgrade pip
-	$(VENV)-$*/bin/python -m pip install --quiet --editable ".[$(EXTRAS_$*)]" $(PACKAGES_$*)
+	$(VENV)-$*/bin/python $(INSTALL) ".[$(EXTRAS_$*)]" $(PACKAGES_$*)
 	@touch $@
 
 # The tests of all rooms run, those in processes of their own and under mpiexec too.

@@ -18,7 +18,7 @@ if "PYTEST_XDIST_WORKER" in os.environ:  # a process per core: each has one thre
     os.environ.setdefault("POCL_MAX_PTHREAD_COUNT", "1")
 
 from guarded import guard  # noqa: E402
-from quick import is_quick  # noqa: E402
+from quick import collects, is_quick  # noqa: E402
 
 from phyradgs_cl.__main__ import load_cli  # noqa: E402
 from phyradgs_cl.acquisition import ConeGeometry  # noqa: E402
@@ -40,6 +40,13 @@ def pytest_configure(config: pytest.Config) -> None:
     if config.getoption("--gpu-shape"):
         own, shape = Runtime.__init__, {"lanes": 1, "pixel_items": True}
         Runtime.__init__ = lambda *args, **given: own(*args, **(given if "lanes" in given else shape | given))  # type: ignore
+
+
+def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
+    """Leaves out files without a test that ``-m`` chooses: every process of a run imports what it collects."""
+    file = collection_path.relative_to(HERE).as_posix()
+    left_out = collection_path.suffix == ".py" and not collects(file, config.getoption("markexpr"))
+    return True if left_out else None
 
 
 @pytest.hookimpl(tryfirst=True)  # before -m chooses

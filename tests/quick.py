@@ -27,13 +27,23 @@ QUICK = (
 LATER = (
     "operators/test_bricks.py", "operators/test_device_arrays.py", "acquisition/test_orbit_recipes.py",
     *(f"operators/test_splat_states.py::test_{one}" for one in ("frames_and_gradients", "parallel_rays", "pixels_average")),
+    "importers/test_hostile.py::test_refused[nxtomo",
+    "importers/test_hostile.py::test_good_files_pass_and_what_is_not_there_is_not_looked_for_elsewhere[nxtomo",
 )  # fmt: skip
-"""The same kernels on parts of volumes, and arrays of the device: with the slow tests."""
+"""The same kernels on parts of volumes, arrays of the device, files by packages of `test-all`: with the slow tests."""
 
 
 def is_quick(node: str) -> bool:
     """Whether a test, by its name from tests/ on, is one of them."""
     return node.startswith(QUICK) and not node.startswith(LATER)
+
+
+def collects(file: str, expression: str) -> bool:
+    """Whether a file, by its name from tests/ on, may have tests that this expression of ``-m`` chooses."""
+    parts = [entry for entry in QUICK + LATER if "::" in entry and entry.startswith(file)]
+    if expression == "quick":
+        return is_quick(file) or bool(parts)
+    return expression != "not quick" or not is_quick(file) or bool(parts)
 
 
 def exists(entry: str) -> bool:

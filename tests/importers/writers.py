@@ -9,11 +9,9 @@ from typing import Any
 import h5py
 import laboratory_of_importers as lab
 import numpy as np
-import pint
 import SimpleITK as sitk
 import tifffile
 import toolkits_of_importers as kits
-from nxtomo.application import nxtomo
 
 AIR, DARK = 50000.0, 300.0
 
@@ -202,6 +200,9 @@ def write_data_exchange(path: Path, truth: Any, dead: tuple[int, int] | None = N
 
 def write_nxtomo(path: Path, truth: Any, flips: tuple[bool, bool] = (False, False)) -> Path:
     """By the nxtomo package: flats and darks among the frames, no timing; flips (up-down, left-right) declared."""
+    import pint  # quick tests, which import this module, do without both packages
+    from nxtomo.application import nxtomo
+
     units, g = pint.get_application_registry(), truth.scan.geometry
     frames, flats, darks = counts(truth)
     stack = np.concatenate([darks[:1], flats[:1], frames, flats[1:]])
