@@ -14,7 +14,7 @@ from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, PoseTable
 from phyradgs_cl.api import reconstruct
 from phyradgs_cl.detector import counts_to_attenuation
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.importers import ImportOptions, import_scan, recognise
+from phyradgs_cl.importers import ImportOptions, formats, import_scan, recognise
 from phyradgs_cl.io import read_scan, write_scan
 
 CENTRED = ConeGeometry(500.0, 800.0, (10, 14), (3.0, 2.5))
@@ -240,3 +240,9 @@ def test_skyscan_s_random_movement_and_missing_lines_are_said(tmp_path, make_tru
 ])  # fmt: skip
 def test_other_scanners_wrong_fields_are_named(tmp_path, make_truth, form, line, value, texts) -> None:
     refused(form, tmp_path / "scan", make_truth(geometry=WRITERS[form][1]), line, value, *texts)
+
+
+def test_the_readers_of_scanners_and_toolkits_stay_small() -> None:
+    for folder in ("laboratory", "toolkits"):
+        for path in (Path(formats.__file__).parent / folder).glob("*.py"):
+            assert len(path.read_text(encoding="utf-8").splitlines()) <= 120, path.name
