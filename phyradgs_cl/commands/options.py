@@ -99,7 +99,8 @@ _MOTION = (
     "(exact), or M×N that move only centres (centres)."
 )
 _PRIOR = (
-    "Prior, for fista: dct, firm, curves, tv, nonlocal, nonlocal+dct, piccs or none; MODULE:NAME: a denoiser of your own."
+    "Prior, for fista: dct, firm, curves, ridge, tv, nonlocal, nonlocal+dct, piccs or none; MODULE:NAME: a denoiser of "
+    "your own."
 )
 _PRESET = "Constants: default, quick, paper, released (phyradgs); published (r2, naf, sax-nerf); a window (fdk)."
 _CONFIG = "TOML file of options, with underscores for dashes (docs: formats.md); the command line wins."

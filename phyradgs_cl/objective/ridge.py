@@ -59,8 +59,8 @@ def learned_ridge() -> Ridge:
 class RidgeStep:
     """The step for volumes of a fixed ``shape`` (z, y, x); it does not change a volume thinner than a filter."""
 
-    VOLUMES = 3
-    """Volumes of floats that it holds beyond those of ``DctProx``, with 40 slices or more."""
+    VOLUMES = 6
+    """Volumes of floats that it holds in memory, with 40 slices or more of 64 voxels in a row or more."""
 
     def __init__(self, rt: Runtime, shape: tuple[int, int, int], ridge: Ridge) -> None:
         self.rt, self.shape = rt, shape

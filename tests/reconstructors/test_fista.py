@@ -39,7 +39,7 @@ from phyradgs_cl.reconstructors.voxels.prior_weight import (
 )
 from phyradgs_cl.reconstructors.voxels.priors import OwnPrior, Prior, PriorInputs, prior_of
 from phyradgs_cl.reconstructors.voxels.system import System
-from phyradgs_cl.runtime import Runtime
+from phyradgs_cl.runtime import DeviceSpace, Runtime
 
 
 @pytest.fixture(scope="module")
@@ -58,7 +58,7 @@ def quality(scan: Scan, volume: np.ndarray) -> float:
 def test_each_prior_is_better_than_none_and_subsets_are_quicker(rt, scan) -> None:
     found = {
         prior: quality(scan, run(rt, scan, "fista", motion="per-row", iterations=20, prior=prior).volume)
-        for prior in ("none", "tv", "dct", "curves", "nonlocal", "nonlocal+dct")
+        for prior in ("none", "tv", "dct", "curves", "ridge", "nonlocal", "nonlocal+dct")
     }
     without = found.pop("none")
     assert min(found.values()) > without + 0.5, (found, without)
@@ -216,7 +216,7 @@ def test_fused_is_the_mean_of_both(rt, scan) -> None:
 
 @pytest.mark.parametrize(
     ("at", "prior"),
-    [(2, "dct"), (5, "curves"), (5, "firm"), (1, "nonlocal"), (3, "nonlocal+dct"), (6, "nonlocal")],
+    [(2, "dct"), (5, "curves"), (5, "firm"), (3, "ridge"), (1, "nonlocal"), (3, "nonlocal+dct"), (6, "nonlocal")],
 )
 def test_fista_goes_on_with_the_same_bits_from_either_grid(rt, scan, at, prior) -> None:
     options = method_options("fista", None, {"iterations": 7, "subvoxels": 2, "prior": prior})
@@ -232,6 +232,22 @@ def test_fista_goes_on_with_the_same_bits_from_either_grid(rt, scan, at, prior) 
     rest = reconstruct(scan, RunPlan("fista", options), rt, resume=part.state)
     np.testing.assert_array_equal(rest.volume, whole.volume)
     assert [line["iteration"] for line in rest.record] == [line["iteration"] for line in whole.record] == list(range(1, 8))
+
+
+def test_a_ridge_step_follows_every_fifth_map_and_resumes_between_them(rt, scan) -> None:
+    volume, space = np.random.default_rng(0).uniform(size=scan.grid.shape).astype(np.float32), DeviceSpace(rt)
+    first, resumed, dct = (prior_of(name, PriorInputs(rt, scan.grid, 5, 12)) for name in ("ridge", "ridge", "dct"))
+
+    def maps(prior: Prior, count: int) -> list[np.ndarray]:
+        arrays = [prior(space, space.array(volume), 0.01, nonnegative=True) for _ in range(count)]
+        return [space.numpy(array) for array in arrays]
+
+    results, expected = maps(first, 5), maps(dct, 5)
+    assert [np.array_equal(*pair) for pair in zip(results, expected, strict=True)] == [True] * 4 + [False]
+    results += maps(first, 3)
+    resumed.restore(first.state())
+    for continued, again in zip(maps(first, 3), maps(resumed, 3), strict=True):
+        np.testing.assert_array_equal(continued, again)
 
 
 def test_the_firm_prior_differs_from_dct_on_smaller_voxels_alone(rt, scan) -> None:
@@ -254,14 +270,14 @@ def test_a_prior_is_found_by_its_name(rt, scan, tmp_path, monkeypatch) -> None:
         run(rt, scan, "fista", prior="own_priors:less", iterations=2)
 
 
-@pytest.mark.parametrize("volumes", [14.4, 12.8, 11.5])
-def test_operators_leave_the_device_s_memory_to_the_prior(volumes) -> None:
+@pytest.mark.parametrize(("volumes", "prior"), [(14.4, "dct"), (12.8, "dct"), (11.5, "dct"), (17.4, "ridge")])
+def test_operators_leave_the_device_s_memory_to_the_prior(volumes, prior) -> None:
     """13 volumes are a slab of 1024² × 40 voxels in 2 GiB: the prior's arrays, with bricks beside them."""
     panel, grid = ParallelGeometry((40, 64), 1.0), Grid((40, 64, 64), (1.0, 1.0, 1.0))
     frames = np.random.default_rng(0).uniform(0, 1, (16, *panel.detector_shape)).astype(np.float32)
     orbit = CircularOrbit(panel, ConstantSpeed(0.0, np.pi / 16))
     scan = Scan(frames, panel, orbit, Shutter(0.0), np.arange(16.0), grid, False)
-    options, limit = FistaOptions(iterations=1, subvoxels=1), int(volumes * 4 * 40 * 64 * 64)
+    options, limit = FistaOptions(iterations=1, subvoxels=1, prior=prior), int(volumes * 4 * 40 * 64 * 64)
     small, large = Runtime(memory=limit), Runtime()
     result, expected = (fista(scan, options, rt).volume for rt in (small, large))
     assert np.abs(result - expected).max() <= RAYS * expected.max() and small.peak_bytes <= limit

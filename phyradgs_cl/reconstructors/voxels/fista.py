@@ -31,7 +31,7 @@ from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.runtime.algebra import HostSpace
 
 _VOLUMES, _FRAMES = 16, 3  # in memory at one time, with the prior `dct`
-_HELD, _COPIES = 9, 2  # volumes that a prior holds on the device, and more while it maps a volume of the host
+_HELD, _COPIES = 9, 2  # volumes that ``dct`` holds on the device, and more while a prior maps a volume of the host
 _SUBVOXEL_PASSES = 3 / 7  # share of the passes on smaller voxels (docs/results/settings.md)
 _MOST_DIVIDED = 90**3  # voxels of a grid: smaller voxels are worth their time at 64³, not at 128³
 
@@ -183,7 +183,8 @@ def _run(inputs: MethodInputs, options: FistaOptions, image: np.ndarray | None, 
     def make(system: System) -> Fista:
         volume_bytes = 4 * math.prod(scan.grid.shape)
         is_on_host = isinstance(system.space, HostSpace)
-        is_short = is_on_host and system.leave_room(rt, (_HELD + _COPIES) * volume_bytes)
+        held = _HELD + priors.volumes_of(options.prior)
+        is_short = is_on_host and system.leave_room(rt, (held + _COPIES) * volume_bytes)
         of_grid = rt, scan.grid, options.tv_iterations, options.iterations
         prior = priors.prior_of(options.prior, priors.PriorInputs(*of_grid, image, options.prior_share, parts))
         with rt.ledger.reserved(_COPIES * volume_bytes if is_short else 0):

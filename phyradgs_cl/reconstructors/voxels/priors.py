@@ -11,7 +11,15 @@ import numpy as np
 from phyradgs_cl import checks
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
-from phyradgs_cl.objective import DctProx, NonlocalStep, TvProx, firm_curves, learned_curves
+from phyradgs_cl.objective import (
+    DctProx,
+    NonlocalStep,
+    RidgeStep,
+    TvProx,
+    firm_curves,
+    learned_curves,
+    learned_ridge,
+)
 from phyradgs_cl.objective.dct_prox import TURNS
 from phyradgs_cl.reconstructors.checkpoint import State, count_of, state_arrays
 from phyradgs_cl.reconstructors.method import imported
@@ -21,6 +29,7 @@ from phyradgs_cl.runtime import Runtime, Space
 # shares of the prior's weight, by the prior (docs/results/settings.md)
 _TV_ALONE, _TV_BEFORE_DCT, _DCT = 1.6, 0.8, 1.5
 _TV_BEFORE_CURVES, _CURVES_NOISE, _CURVES = 0.5, 50.0, 3.0  # noise that the curves assume, and strength of their step
+_RIDGE_NOISE, _RIDGE_LENGTH, _RIDGE_EVERY = 50.0, 0.1, 5  # noise that the step assumes, its length, and maps for each step
 _NONLOCAL, _NONLOCAL_BEFORE_DCT = 300.0, 100.0  # of the filtering parameter h
 _NONLOCAL_STEP = 0.01  # length of a step down the nonlocal quadratic
 
@@ -54,6 +63,9 @@ class PriorInputs:
     def tv_and_curves(self) -> "TvAndDct":
         curves = learned_curves().scaled(_CURVES / _CURVES_NOISE)
         return TvAndDct(self.tv(_TV_BEFORE_CURVES), DctProx(self.rt, self.grid.shape, curves), _CURVES_NOISE)
+
+    def dct_then_ridge(self) -> "ThenRidge":
+        return ThenRidge(self.tv_and_dct(), RidgeStep(self.rt, self.grid.shape, learned_ridge()))
 
     def nonlocal_then(self, then: "Prior", h_share: float) -> "Nonlocal":
         return Nonlocal(then, NonlocalStep(self.rt, self.grid.shape), h_share, self.passes)
@@ -119,6 +131,30 @@ class TvAndDct(Prior):
     def restore(self, state: State) -> None:
         self.tv.restore(state)
         self.turn = count_of(state, "turn", len(TURNS) - 1)
+
+
+class ThenRidge(Prior):
+    """Another prior, and after every fifth of its maps a step down the learned ridge regulariser."""
+
+    VOLUMES = RidgeStep.VOLUMES
+
+    def __init__(self, before: Prior, ridge: RidgeStep) -> None:
+        self.before, self.ridge, self.maps = before, ridge, 0  # maps: since the last step
+
+    def __call__(self, space: Space[Any], volume: Any, weight: float, *, nonnegative: bool) -> Any:
+        volume = self.before(space, volume, weight, nonnegative=nonnegative)
+        self.maps = (self.maps + 1) % _RIDGE_EVERY
+        if self.maps:
+            return volume
+        step = partial(self.ridge, sigma=_RIDGE_NOISE * weight, step=_RIDGE_LENGTH, nonnegative=nonnegative)
+        return space.apply(step, volume, self.ridge.shape)
+
+    def state(self) -> dict[str, np.ndarray]:
+        return {**self.before.state(), "maps": np.array(self.maps)}
+
+    def restore(self, state: State) -> None:
+        self.before.restore(state)
+        self.maps = count_of(state, "maps", _RIDGE_EVERY - 1)
 
 
 class Nonlocal(Prior):
@@ -214,6 +250,7 @@ PRIORS: dict[str, Callable[[PriorInputs], Prior]] = {
     "dct": PriorInputs.tv_and_dct,
     "firm": PriorInputs.tv_and_firm,
     "curves": PriorInputs.tv_and_curves,
+    "ridge": PriorInputs.dct_then_ridge,
     "tv": lambda inputs: inputs.tv(_TV_ALONE),
     "nonlocal": lambda inputs: inputs.nonlocal_then(inputs.tv(_TV_ALONE), _NONLOCAL),
     "nonlocal+dct": lambda inputs: inputs.nonlocal_then(inputs.tv_and_dct(), _NONLOCAL_BEFORE_DCT),
@@ -236,7 +273,8 @@ def prior_of(prior: str | Denoiser, inputs: PriorInputs) -> Prior:
 
 def volumes_of(prior: str | Denoiser) -> int:
     """Returns how many more volumes a prior holds than ``dct``."""
-    return Nonlocal.VOLUMES if prior in ("nonlocal", "nonlocal+dct") else 0
+    held = {"nonlocal": Nonlocal.VOLUMES, "nonlocal+dct": Nonlocal.VOLUMES, "ridge": ThenRidge.VOLUMES}
+    return held.get(prior, 0) if isinstance(prior, str) else 0
 
 
 def axis_weights(grid: Grid) -> tuple[float, float, float]:
