@@ -478,15 +478,21 @@ def parallel_memory() -> str:
 
 def moving_known() -> str:
     """Breathing volumes at rest, with the known field, and with the motion ignored."""
-    by_volume: dict[tuple[str, int, str], dict[str, dict[str, Any]]] = {}
+    by_volume: dict[tuple[str, int, int, str], dict[str, dict[str, Any]]] = {}
     for one in lines_of("moving.jsonl"):
         if one["case"] in ("rest", "known", "ignored"):
-            by_volume.setdefault((one["volume"], one["size"], one["method"]), {})[one["case"]] = one
+            key = (one["volume"], one["size"], one["views"], one["method"])
+            by_volume.setdefault(key, {})[one["case"]] = one
     rows = []
-    for (volume, size, method), of in by_volume.items():
-        scores = [f"{of[case]['psnr_db']:.2f} / {of[case]['ssim']:.3f}" for case in ("rest", "known", "ignored")]
-        rows.append([volume, f"{size}³", f"`{method}`", *scores, f"{of['known']['seconds'] / of['rest']['seconds']:.1f}"])
-    return markdown(["volume", "voxels", "method", "at rest", "known field", "ignored", "time, of that at rest"], rows)
+    for (volume, size, views, method), of in by_volume.items():
+        scores = [
+            f"{of[case]['psnr_db']:.2f} / {of[case]['ssim']:.3f}" if case in of else "–"
+            for case in ("rest", "known", "ignored")
+        ]
+        times = f"{of['known']['seconds'] / of['rest']['seconds']:.1f}" if "rest" in of else "–"
+        rows.append([volume, f"{size}³", str(views), f"`{method}`", *scores, f"{of['known']['seconds']:.0f}", times])
+    heads = ["volume", "voxels", "views", "method", "at rest", "known field", "ignored", "known field, s", "of that at rest"]
+    return markdown(heads, rows)
 
 
 def moving_unknown() -> str:
@@ -497,22 +503,26 @@ def moving_unknown() -> str:
             means = [one["static_mean_psnr_db"], one["mean_psnr_db"]]
             voxels = [one[key] * one["size"] / BOX_MM for key in ("mean_motion_error_mm", "p95_motion_error_mm")]
             rows.append(
-                [one["volume"], f"{one['size']}³", *(f"{mean:.2f}" for mean in means), f"{means[1] - means[0]:+.2f}"]
-                + [f"{voxels[0]:.2f} ({voxels[1]:.2f})", f"{one['period_s']:.2f}"]
+                [one["volume"], f"{one['size']}³", str(one["views"]), *(f"{mean:.2f}" for mean in means)]
+                + [f"{means[1] - means[0]:+.2f}", f"{voxels[0]:.2f} ({voxels[1]:.2f})", f"{one['period_s']:.2f}"]
                 + [f"{one['static_seconds']:.0f}", f"{one['seconds']:.0f}"]
             )
-    heads = ["volume", "voxels", "as if at rest, dB", "`moving`, dB", "gain, dB", "field wrong by, voxels", "period, s"]
-    return markdown([*heads, "`fista`, s", "`moving`, s"], rows)
+    heads = ["volume", "voxels", "views", "as if at rest, dB", "`moving`, dB", "gain, dB", "field wrong by, voxels"]
+    return markdown([*heads, "period, s", "`fista`, s", "`moving`, s"], rows)
 
 
 def moving_insert() -> str:
-    """The centre of a ball in a breathing body, with the true field and with the motion ignored."""
+    """The centre of a ball in a breathing body, with the true field, with the motion ignored, and with a field found."""
     rows = []
     for one in lines_of("moving.jsonl"):
         if one["case"] == "insert":
-            off, moved = one["off_mm"], one["moved_mm"]
-            rows.append([one["motion"], f"{one['size']}³", f"{moved:.3f}", f"{off:.4f}", f"{10 * off / moved:.2f}"])
-    return markdown(["field", "voxels", "motion, mm", "centre off by, mm", "of 10 mm"], rows)
+            pairs = [
+                [f"{one[key]:.4f}", f"{10 * one[key] / one['moved_mm']:.2f}"] if key in one else ["–", "–"]
+                for key in ("off_mm", "states_off_mm")
+            ]
+            rows.append([one["motion"], f"{one['size']}³", f"{one['moved_mm']:.3f}", *pairs[0], *pairs[1]])
+    heads = ["field", "voxels", "motion, mm", "reference off by, mm", "of 10 mm", "states off by, mm", "of 10 mm"]
+    return markdown(heads, rows)
 
 
 TABLES: dict[str, Callable[[], str]] = {
