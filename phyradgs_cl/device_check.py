@@ -19,7 +19,7 @@ from phyradgs_cl.fields.gaussians import DENSITY, MEAN, QUATERNION, SCALE
 from phyradgs_cl.objective import terms
 from phyradgs_cl.objective.dct_prox import FREQUENCY_CLASSES, Curves, DctProx, dct_prox
 from phyradgs_cl.objective.nonlocal_step import LARGEST, NonlocalStep, likeness_of, nonlocal_step
-from phyradgs_cl.objective.ridge import Ridge, RidgeStep, ridge_step
+from phyradgs_cl.objective.ridge import RidgeStep, learned_ridge, ridge_step
 from phyradgs_cl.objective.tv import TvDescent, TvProx, tv_descent, tv_prox
 from phyradgs_cl.operators.splats.binning import TileLists
 from phyradgs_cl.operators.splats.states import CloudStates, states_of
@@ -315,10 +315,8 @@ def _variation(rt: Runtime) -> Iterator[Comparison]:
     likeness = smooth.likeness
     yield likeness, likeness_of(volume, 0.5), 1 / LARGEST
     yield smooth(volume, 0.4), nonlocal_step(volume, likeness, 0.4), VALUE
-    filters = _noise((4, 3, 3, 3), 13) - np.float32(0.5), _noise((16, 4, 3, 3, 3), 14) - np.float32(0.5)
-    ridge = Ridge(*filters, *_noise((4, 16), 15))
-    descended = RidgeStep(rt, GRID.shape, ridge)(volume, 1.5, 0.1, nonnegative=False)
-    yield descended, ridge_step(volume, 1.5, 0.1, ridge=ridge, nonnegative=False), VALUE
+    descended = RidgeStep(rt, GRID.shape, learned_ridge())(volume, 0.1, 0.3, nonnegative=False)
+    yield descended, ridge_step(volume, 0.1, 0.3, ridge=learned_ridge(), nonnegative=False), VALUE
 
 
 def _optimiser(rt: Runtime) -> Iterator[Comparison]:

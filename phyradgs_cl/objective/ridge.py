@@ -51,9 +51,14 @@ class Ridge:
 
 @cache
 def learned_ridge() -> Ridge:
-    """Returns the regulariser of ``data/ridge.json`` (benchmarks/train_ridge.py)."""
+    """Returns the regulariser of ``data/ridge.json``, in thousandths (benchmarks/train_ridge.py)."""
     stored = json.loads((resource("data") / "ridge.json").read_text(encoding="utf-8"))
-    return Ridge(*(np.array(stored[name], np.float32) for name in Ridge.__dataclass_fields__))
+    first, second, *curves = (np.array(stored[name]) / 1000 for name in Ridge.__dataclass_fields__)
+    first, second = first.reshape(-1, 3, 3, 3), second.reshape(len(curves[0]), -1, 3, 3, 3)
+    # Rounding leaves the filters of the chain small sums
+    sums = first.sum((1, 2, 3))
+    second -= np.multiply.outer(second.sum((2, 3, 4)) @ sums, sums / (27 * sums @ sums))[..., None, None, None]
+    return Ridge(*(values.astype(np.float32) for values in (first, second, *curves)))
 
 
 class RidgeStep:
