@@ -134,6 +134,18 @@ static inline vf lerp_lookup(const vf lower, const vf upper, const vi place, con
 static inline vf lerp_of(const vf low, const vf high, const vf share) { return fma(share, high - low, low); }
 #endif
 
+#define EVEN_DEPTH 0.02f   /* change of the depth along a block of voxels, relative to the depth */
+#define VOXEL_MARGIN 0.01f /* voxels: more than the rounding of where a column of voxels enters or leaves a view */
+
+/* Narrows the z between low and high to those where start + per_z z >= 0. */
+static inline float2 narrowed(const float2 within, const float start, const float per_z)
+{
+    const float root = -start / per_z;
+    if (per_z == 0.0f)
+        return start < 0.0f ? (float2)(MAXFLOAT, -MAXFLOAT) : within;
+    return per_z > 0.0f ? (float2)(fmax(within.x, root), within.y) : (float2)(within.x, fmin(within.y, root));
+}
+
 /* As backproject_upright, where the detector column, the depth and the rows change a little along z: LANES voxels lie between
    two detector columns, or pass from one to the next. */
 __kernel void backproject_leaning(
@@ -149,6 +161,8 @@ __kernel void backproject_leaning(
     const int below = (int)get_global_id(2) * block, first = below + origin.z, count = min(block, shape.z - below);
     const size_t slice = (size_t)shape.y * volume_pitch;
     __global float *target = volume + IMAGE_GUARD + below * slice + get_global_id(1) * volume_pitch + get_global_id(0);
+    const float u_most = (float)(width - 1), v_most = (float)(rows - 1);
+    const int last_column = max(width - 2, 0), last_row = max(rows - 2, 0);
     float sum[BLOCK_VOXELS + LANES];
     for (int z = 0; z < count; ++z)
         sum[z] = target[z * slice];
@@ -156,36 +170,65 @@ __kernel void backproject_leaning(
         __global const float *m = matrices + (size_t)f * 12;
         const float depth_0 = m[8] * x + (m[9] * y + m[10] * first + m[11]);
         const float u_0 = m[0] * x + (m[1] * y + m[2] * first + m[3]), v_0 = m[4] * x + (m[5] * y + m[6] * first + m[7]);
+        float2 seen = narrowed((float2)(-1.0f, (float)(count + LANES)), u_0, m[2]);
+        seen = narrowed(seen, fma(u_most, depth_0, -u_0), fma(u_most, m[10], -m[2]));
+        seen = narrowed(narrowed(seen, v_0, m[6]), fma(v_most, depth_0, -v_0), fma(v_most, m[10], -m[6]));
+        if (seen.x > seen.y + 2.0f * VOXEL_MARGIN)
+            continue;
+        const int start = (int)clamp(seen.x - VOXEL_MARGIN, 0.0f, (float)count) / LANES * LANES;
+        const int stop = (int)clamp(seen.y + VOXEL_MARGIN + 1.0f, 0.0f, (float)count);
         __global const float *image = projections + f * image_step + IMAGE_GUARD;
-        for (int k = 0; k < count; k += LANES) {
-            const vf z = V_IOTA + (float)k, inv = 1.0f / fma(z, (vf)(m[10]), (vf)(depth_0));
+        /* where the depth hardly changes its inverse is nearly linear, and a Newton step leaves 1e-8 of it */
+        const float inv_0 = 1.0f / depth_0, per_z = (1.0f / fma((float)count, m[10], depth_0) - inv_0) / (float)count;
+        const int is_even = fabs((float)count * m[10]) <= EVEN_DEPTH * depth_0;
+        int own = 0;         /* vectors that end before `until` lie between this detector column and the next */
+        float until = -1.0f;
+        for (int k = start; k < stop; k += LANES) {
+            const float end = (float)(k + LANES - 1);
+            const vf z = V_IOTA + (float)k, depth = fma(z, (vf)(m[10]), (vf)(depth_0));
+            vf inv;
+            if (is_even) {
+                const vf guess = fma(z, (vf)(per_z), (vf)(inv_0));
+                inv = fma(guess, fma(-depth, guess, (vf)(1.0f)), guess);
+            } else
+                inv = 1.0f / depth;
             const vf u = fma(z, (vf)(m[2]), (vf)(u_0)) * inv, v = fma(z, (vf)(m[6]), (vf)(v_0)) * inv;
-            const vi inside = (u >= 0.0f) & (u <= (float)(width - 1)) & (v >= 0.0f) & (v <= (float)(rows - 1)) & (inv > 0.0f);
-            if (!V_ANY(inside))
-                continue;
-            const vf vs = V_PICK(0.0f, v, inside);
-            const vi row = min(V_INT(vs), max(rows - 2, 0));
-            const vf wv = vs - V_FLOAT(row), weight = weights[f] * inv * inv;
-            const float u0 = clamp(V_FIRST(u), 0.0f, (float)(width - 1)), u1 = clamp(V_LAST(u), 0.0f, (float)(width - 1));
-            const int from = min((int)fmin(u0, u1), max(width - 2, 0)), to = min((int)fmax(u0, u1), max(width - 2, 0));
-            const float v0 = V_FIRST(v), v1 = V_LAST(v);
-            const int fits = fabs(v1 - v0) < (float)(2 * LANES - 3);
-            const int least = clamp((int)clamp(fmin(v0, v1), 0.0f, (float)rows), 0, max(rows + 1 - 2 * LANES, 0));
-            const vi place = fits ? max(row, least) : row;
-            __global const float *a = image + (size_t)from * image_pitch, *b = a + (width > 1 ? image_pitch : 0);
-            const vf low = COLUMN_SAMPLES(a, least, place, wv, fits);
-            vf value, high = COLUMN_SAMPLES(b, least, place, wv, fits);
-            if (from == to)
-                value = fma(u - (float)from, high - low, low);
+            const int is_inside = (float)k >= seen.x + VOXEL_MARGIN && end <= seen.y - VOXEL_MARGIN;
+            vi inside = (vi)(0);
+            vf vs = v;
+            if (!is_inside) {
+                inside = (u >= 0.0f) & (u <= u_most) & (v >= 0.0f) & (v <= v_most) & (inv > 0.0f);
+                vs = V_PICK(V_PICK(0.0f, v_most, v > v_most), v, (v >= 0.0f) & (v <= v_most));
+            }
+            const vi row = min(V_INT(vs), last_row);
+            const vf wv = vs - V_FLOAT(row);
+            int column = own, to = own;
+            if (end >= until) {
+                const float u0 = clamp(V_FIRST(u), 0.0f, u_most), u1 = clamp(V_LAST(u), 0.0f, u_most);
+                own = min((int)u1, last_column);
+                column = min(own, (int)u0);
+                to = max(own, min((int)u0, last_column));
+                const int border = own + (u1 > u0);
+                until = fma(-(float)border, depth_0, u_0) / fma((float)border, m[10], -m[2]) - VOXEL_MARGIN;
+            }
+            const int v0 = V_FIRST(row), v1 = V_LAST(row), fits = abs(v1 - v0) <= 2 * LANES - 2;
+            const int least = min(min(v0, v1), max(rows + 1 - 2 * LANES, 0));
+            __global const float *a = image + (size_t)column * image_pitch, *b = a + (width > 1 ? image_pitch : 0);
+            const vf low = COLUMN_SAMPLES(a, least, row, wv, fits);
+            vf value, high = COLUMN_SAMPLES(b, least, row, wv, fits);
+            if (column == to)
+                value = fma(u - (float)column, high - low, low);
             else {
-                value = max(1.0f - fabs(u - (float)from), 0.0f) * low + max(1.0f - fabs(u - (float)(from + 1)), 0.0f) * high;
-                for (int column = from + 2; column <= to + 1; ++column) {
+                value = max(1.0f - fabs(u - (float)column), 0.0f) * low;
+                value += max(1.0f - fabs(u - (float)(column + 1)), 0.0f) * high;
+                for (int i = column + 2; i <= to + 1; ++i) {
                     b += image_pitch;
-                    high = COLUMN_SAMPLES(b, least, place, wv, fits);
-                    value += max(1.0f - fabs(u - (float)column), 0.0f) * high;
+                    high = COLUMN_SAMPLES(b, least, row, wv, fits);
+                    value += max(1.0f - fabs(u - (float)i), 0.0f) * high;
                 }
             }
-            V_STORE(V_LOAD(sum + k) + V_PICK(0.0f, weight * value, inside), sum + k);
+            value *= weights[f] * inv * inv;
+            V_STORE(V_LOAD(sum + k) + (is_inside ? value : V_PICK(0.0f, value, inside)), sum + k);
         }
     }
     for (int z = 0; z < count; ++z)

@@ -96,25 +96,28 @@ RAY_INLINE void sample_plane(__global const float *plane, const planes_t r, cons
 #ifdef V_LOOKUP
     const int is_dense = FIT_TWO_VECTORS(gc, ahead) && FIT_TWO_VECTORS(gc + last + 1 - LANES, ahead);
     const int top = max(r.c_last + 2 - 2 * LANES, r.c_first - 1);
-    const int j = voxel_below(fmin(b0, b1), r.b_last);
-    if (is_dense && fmin(b0, b1) >= lowest && fmax(b0, b1) < fmin((float)(j + 1), highest)) {
-        /* all lines between the same two columns of voxels */
-        __global const float *near = plane + j * (long)r.stride_b, *far = near + r.stride_b;
-        const float sb = r.sb - (float)j;
-        for (int k = 0; k < count; k += LANES) {
+    /* b rises or falls from line to line: a vector lies between two columns of voxels if its last line and that before its
+       first do */
+    int j = voxel_below(clamp(b0, lowest, highest), r.b_last), is_between = is_dense && b0 >= lowest && b0 < highest;
+#endif
+    for (int k = 0; k < count; k += LANES) {
+#ifdef V_LOOKUP
+        const float end = fma(gb[k + LANES - 1], ahead, r.sb);
+        if (is_between && end >= (float)j && end < (float)(j + 1)) {
+            __global const float *near = plane + j * (long)r.stride_b, *far = near + r.stride_b;
             vf wc;
             const vi z = sample_at(V_LOAD(gc + k), r.sc, ahead, r.c_first, r.c_last, &wc);
             const int base = min(min(V_FIRST(z), V_LAST(z)), top);
             const vi own = z - base;
             const vf first = BETWEEN(V_LOAD(near + base), V_LOAD(near + base + LANES), own, wc);
             const vf second = BETWEEN(V_LOAD(far + base), V_LOAD(far + base + LANES), own, wc);
-            const vf wb = fma(V_LOAD(gb + k), (vf)(ahead), (vf)(sb));
+            const vf wb = fma(V_LOAD(gb + k), (vf)(ahead), (vf)(r.sb - (float)j));
             V_STORE(V_LOAD(p + k) + fma(wb, second - first, first), p + k);
+            continue;
         }
-        return;
-    }
+        j = voxel_below(clamp(end, lowest, highest), r.b_last);
+        is_between = is_dense && end >= lowest && end < highest;
 #endif
-    for (int k = 0; k < count; k += LANES) {
         const float from = clamp(fma(gb[k], ahead, r.sb), lowest, highest);
         const float to = clamp(fma(gb[k + LANES - 1], ahead, r.sb), lowest, highest);
         const int j0 = voxel_below(fmin(from, to), r.b_last), j1 = voxel_below(fmax(from, to), r.b_last);

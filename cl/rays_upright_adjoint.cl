@@ -114,11 +114,11 @@ typedef struct {
     int dense; /* whether two vectors hold them */
 } near_lines_t;
 
-RAY_INLINE near_lines_t near_lines(const column_t r, const vf line, const float reach, const int most)
+RAY_INLINE near_lines_t near_lines(const column_t r, const vi first, const int most)
 {
     near_lines_t found;
-    found.first = V_INT(min(max(line - reach, (float)(r.v_first - 1)), (float)r.v_stop) + 1.0f);
-    const int begin = V_FIRST(found.first), end = V_LAST(found.first), lowest = min(begin, end);
+    found.first = first;
+    const int begin = V_FIRST(first), end = V_LAST(first), lowest = min(begin, end);
     found.some = lowest < r.v_stop;
     found.base = min(lowest, r.last_start);
     found.dense = max(begin, end) + most - found.base <= 2 * LANES;
@@ -152,49 +152,54 @@ RAY_INLINE int2 bases_of_halves(const column_t r, const near_lines_t lines, cons
         v1 = V_PICK(0.0f, v1, VI_IOTA + (lines.base + LANES) < r.v_stop);                                  \
     }
 
-/* LANES voxels of two columns between which all their lines pass. over: heights from the source on; b: where the rays' plane
+/* Runs `body` with value and off, a line's value and its height above the voxel's, for all lines that may touch LANES voxels. */
+#define OF_LINES(value_of, slope_of, next, body)                                                           \
+    for (int m = 0; m < most; ++m, next) {                                                                 \
+        const vf value = value_of, off = fma(slope_of, (vf)(ahead), under);                                \
+        body                                                                                               \
+    }
+#ifdef V_LOOKUP
+#define EACH_LINE(body)                                                                                    \
+    if (lines.dense) {                                                                                     \
+        LINE_VECTORS                                                                                       \
+        OF_LINES(V_LOOKUP(v0, v1, place), V_LOOKUP(c0, c1, place), place += 1, body)                       \
+    } else                                                                                                 \
+        OF_LINES(GATHER_VALUE(m), GATHER_SLOPE(m), (void)0, body)
+#else
+#define EACH_LINE(body) OF_LINES(GATHER_VALUE(m), GATHER_SLOPE(m), (void)0, body)
+#endif
+
+/* LANES voxels of two columns between which all their lines pass. under: heights up to the source; b: where the rays' plane
    passes at these heights, from the first of the columns on. */
-RAY_INLINE void add_between(const column_t r, const near_lines_t lines, const int most, const float ahead, const vf over,
+RAY_INLINE void add_between(const column_t r, const near_lines_t lines, const int most, const float ahead, const vf under,
                             const vf b, float *low, float *high)
 {
     vf sum = (vf)(0.0f), moment = (vf)(0.0f);
-#define ADD(value, slope, next)                                                                                 \
-    for (int m = 0; m < most; ++m, next) {                                                                 \
-        const vf off = fma(slope, (vf)(ahead), -over), part = (value) * max(1.0f - fabs(off), 0.0f);       \
-        sum += part;                                                                                       \
-        moment = fma(part, off, moment);                                                                   \
-    }
-#ifdef V_LOOKUP
-    if (lines.dense) {
-        LINE_VECTORS
-        ADD(V_LOOKUP(v0, v1, place), V_LOOKUP(c0, c1, place), place += 1)
-    } else
-#endif
-        ADD(GATHER_VALUE(m), GATHER_SLOPE(m), (void)0)
-#undef ADD
+    EACH_LINE(const vf part = value * max(1.0f - fabs(off), 0.0f); sum += part; moment = fma(part, off, moment);)
     const vf far = fma(b, sum, r.along * moment);
     V_STORE(V_LOAD(low) + (sum - far), low);
     V_STORE(V_LOAD(high) + far, high);
 }
 
+/* LANES voxels of three columns, where lines pass the second. b: from the second column on. */
+RAY_INLINE void add_around(const column_t r, const near_lines_t lines, const int most, const float ahead, const vf under,
+                           const vf b, float *low, float *middle, float *high)
+{
+    vf sum = (vf)(0.0f), before = (vf)(0.0f), after = (vf)(0.0f);
+    EACH_LINE(const vf part = value * max(1.0f - fabs(off), 0.0f); const vf across = fma(off, (vf)(r.along), b);
+              sum += part; before = fma(part, max(-across, 0.0f), before); after = fma(part, max(across, 0.0f), after);)
+    V_STORE(V_LOAD(low) + before, low);
+    V_STORE(V_LOAD(middle) + (sum - before - after), middle);
+    V_STORE(V_LOAD(high) + after, high);
+}
+
 /* LANES voxels of one column, where lines pass from one column to the next. b: from this column on. */
-RAY_INLINE void add_across(const column_t r, const near_lines_t lines, const int most, const float ahead, const vf over,
+RAY_INLINE void add_across(const column_t r, const near_lines_t lines, const int most, const float ahead, const vf under,
                            const vf b, float *own)
 {
     vf sum = (vf)(0.0f);
-#define ADD(value, slope, next)                                                                                 \
-    for (int m = 0; m < most; ++m, next) {                                                                 \
-        const vf off = fma(slope, (vf)(ahead), -over), across = fma(off, (vf)(r.along), b);                \
-        sum += (value) * max(1.0f - fabs(off), 0.0f) * max(1.0f - fabs(across), 0.0f);                     \
-    }
-#ifdef V_LOOKUP
-    if (lines.dense) {
-        LINE_VECTORS
-        ADD(V_LOOKUP(v0, v1, place), V_LOOKUP(c0, c1, place), place += 1)
-    } else
-#endif
-        ADD(GATHER_VALUE(m), GATHER_SLOPE(m), (void)0)
-#undef ADD
+    EACH_LINE(const vf across = fma(off, (vf)(r.along), b);
+              sum += value * max(1.0f - fabs(off), 0.0f) * max(1.0f - fabs(across), 0.0f);)
     V_STORE(V_LOAD(own) + sum, own);
 }
 #endif
@@ -204,13 +209,14 @@ typedef struct {
     int from[PLANES], stop[PLANES]; /* voxels along z that its lines may touch; none where it misses the box */
     int first[PLANES];              /* column of voxels at or below the lower of its first and last line */
     int most[PLANES];               /* lines that may touch a voxel */
-    float reach[PLANES];            /* lines from a voxel to the farthest of them */
     float ahead[PLANES];            /* of the source */
     float at[PLANES];               /* where the rays' plane passes at the source's height */
 #if LEAN
     int is_between[PLANES];                      /* whether all lines pass between the first column and the next */
-    float per_voxel[PLANES], line_zero[PLANES]; /* lines to a voxel, and the line, not whole, at height 0 */
+    /* the first of these lines, not whole, is first_line + (per_voxel + bend z) z for voxel z of the box */
+    float first_line[PLANES], per_voxel[PLANES], bend[PLANES];
 #else
+    float reach[PLANES];            /* lines from a voxel to the farthest of them */
     float slope[PLANES], at_zero[PLANES], per_slope[PLANES]; /* voxels to a line, the height of line 0, lines to a voxel */
 #endif
 } planes_t;
@@ -245,17 +251,20 @@ RAY_INLINE void meet_planes(const column_t r, const float sa, const int2 between
 #if LEAN
         /* lines within a voxel of a height; a little more where lines beyond the ends are denser */
         const vf per = r.dense / max(fabs(ahead), LEAST_SLOPE);
-        /* lines at both ends; between them they are spaced nearly evenly, and how much they turn bounds the error */
+        /* lines at both ends; between them a parabola, and how much they turn bounds its error */
         const vf over0 = V_FLOAT(from + z_first) - sc, over1 = V_FLOAT(stop + z_first) - sc;
         const vf turn0 = ahead * r.ez - over0 * r.ea, turn1 = ahead * r.ez - over1 * r.ea;
         const vf per_turns = 1.0f / (turn0 * turn1);
         const vf line0 = (over0 * r.da - ahead * r.dz) * turn1 * per_turns;
         const vf line1 = (over1 * r.da - ahead * r.dz) * turn0 * per_turns;
-        const vf error = 0.15f * fabs((line1 - line0) * (turn1 - turn0) * (turn1 + turn0) * per_turns);
-        const vf reach = per * (1.0f + r.bend * per) + error + LINE_MARGIN;
-        const vf per_voxel = (line1 - line0) / V_FLOAT(max(stop - from, 1));
-        V_STORE(per_voxel, planes->per_voxel + p);
-        V_STORE(line0 - V_FLOAT(from + z_first) * per_voxel, planes->line_zero + p);
+        const vf turn = 0.5f * (turn1 - turn0) * (turn1 + turn0) * per_turns;
+        const vf reach = per * (1.0f + r.bend * per) + 0.15f * fabs(line1 - line0) * turn * turn + LINE_MARGIN;
+        const vf bottom = V_FLOAT(from), top = V_FLOAT(stop);
+        const vf per_height = 1.0f / max(top - bottom, 1.0f), per_voxel = (line1 - line0) * per_height;
+        const vf bend = -turn * per_voxel * per_height; /* at share t of the way turn (line1 - line0) t (1 - t) is added */
+        V_STORE(line0 - (per_voxel - bend * top) * bottom - reach + 1.0f, planes->first_line + p);
+        V_STORE(per_voxel - bend * (bottom + top), planes->per_voxel + p);
+        V_STORE(bend, planes->bend + p);
         VI_STORE(VI_PICK(0, 1, column == whole_below_all(min(max(at0, at1), (float)(b_stop + 1)))), planes->is_between + p);
 #else
         const vf slope = r.ez * r.inv * ahead;
@@ -264,12 +273,12 @@ RAY_INLINE void meet_planes(const column_t r, const float sa, const int2 between
         V_STORE(slope, planes->slope + p);
         V_STORE(per_slope, planes->per_slope + p);
         V_STORE(fma((vf)(r.dz * r.inv), ahead, sc), planes->at_zero + p);
+        V_STORE(reach, planes->reach + p);
 #endif
         VI_STORE(from, planes->from + p);
         VI_STORE(stop, planes->stop + p);
         VI_STORE(column, planes->first + p);
         VI_STORE(V_INT(min(2.0f * reach, (float)(r.v_stop - r.v_first - 1))) + 1, planes->most + p);
-        V_STORE(reach, planes->reach + p);
         V_STORE(ahead, planes->ahead + p);
         V_STORE(at, planes->at + p);
     }
@@ -281,44 +290,51 @@ RAY_INLINE void lines_onto(const column_t r, const planes_t *planes, const int p
                            const int b_stop, float *sums, const int step, float *beyond)
 {
     const int from = planes->from[p], stop = planes->stop[p], j = planes->first[p], most = planes->most[p];
-    const float reach = planes->reach[p], b_zero = planes->at[p];
+    const float b_zero = planes->at[p];
 #define COLUMN(j) ((j) < b_first || (j) >= b_stop ? beyond : sums + ((j) - b_first) * step)
 #if LEAN
-    const float ahead = planes->ahead[p], per_voxel = planes->per_voxel[p], line_zero = planes->line_zero[p];
+    const float ahead = planes->ahead[p], first_line = planes->first_line[p], per_voxel = planes->per_voxel[p];
+    const float bend = planes->bend[p], start = r.sc - (float)z_first; /* of the source, among the box's voxels */
     int j0 = j, j1 = j, next_look = planes->is_between[p] ? stop : from; /* until then lines pass between j0 and the next */
-    float *low = COLUMN(j), *high = COLUMN(j + 1);
-    for (int z = from; z < stop; z += LANES) {
-        const vf height = V_IOTA + (float)(z_first + z), over = height - r.sc;
+    float *low = COLUMN(j), *high = COLUMN(j + 1), b_from = b_zero - (float)j;
+    vf at = V_IOTA + (float)from;
+    for (int z = from; z < stop; z += LANES, at += (float)LANES) {
         if (z >= next_look) {
-            const float at0 = fma(r.along, (float)(z_first + z - 1) - r.sc, b_zero);
-            const float at1 = fma(r.along, (float)(z_first + z + LANES) - r.sc, b_zero);
+            const float at0 = fma(r.along, (float)(z - 1) - start, b_zero);
+            const float at1 = fma(r.along, (float)(z + LANES) - start, b_zero);
             j0 = whole_below(fmin(at0, at1));
             j1 = whole_below(fmax(at0, at1));
             low = COLUMN(j0);
             high = COLUMN(j0 + 1);
+            b_from = b_zero - (float)j0;
             const float room = r.along > 0.0f ? (float)(j1 + 1) - at1 : at1 - (float)j0; /* to the next column */
             if (j0 == j1)
                 next_look = z + (int)fmin(0.99f * room * r.per_along, (float)(ADJOINT_Z + LANES));
         }
         if (j1 < b_first - 1 || j0 >= b_stop)
             continue;
-        const near_lines_t lines = near_lines(r, fma(height, (vf)(per_voxel), (vf)(line_zero)), reach, most);
+        const vf first = fma(at, fma(at, (vf)(bend), (vf)(per_voxel)), (vf)(first_line));
+        const near_lines_t lines = near_lines(r, V_INT(min(max(first, (float)r.v_first), (float)(r.v_stop + 1))), most);
         if (!lines.some)
             continue;
-        const vf b = fma(over, (vf)(r.along), (vf)(b_zero - (float)j0));
+        const vf under = start - at, b = fma(under, (vf)(-r.along), (vf)(b_from));
         if (j0 == j1)
-            add_between(r, lines, most, ahead, over, b, low + z, high + z);
+            add_between(r, lines, most, ahead, under, b, low + z, high + z);
+        else if (j1 == j0 + 1)
+            add_around(r, lines, most, ahead, under, b - 1.0f, low + z, high + z, COLUMN(j0 + 2) + z);
         else
             for (int k = max(j0, b_first); k <= min(j1 + 1, b_stop - 1); ++k)
-                add_across(r, lines, most, ahead, over, b - (float)(k - j0), COLUMN(k) + z);
+                add_across(r, lines, most, ahead, under, b - (float)(k - j0), COLUMN(k) + z);
     }
 #else
     const float far_share = b_zero - (float)j, near_share = 1.0f - far_share;
     float *low = COLUMN(j), *high = COLUMN(j + 1);
+    const float reach = planes->reach[p];
     const float slope = planes->slope[p], at_zero = planes->at_zero[p], per_slope = planes->per_slope[p];
     for (int z = from; z < stop; z += LANES) {
         const vf height = V_IOTA + (float)(z_first + z), below = at_zero - height;
-        const near_lines_t lines = near_lines(r, below * -per_slope, reach, most);
+        const vf before = min(max(below * -per_slope - reach, (float)(r.v_first - 1)), (float)r.v_stop);
+        const near_lines_t lines = near_lines(r, V_INT(before + 1.0f), most);
         if (!lines.some)
             continue;
         vf sum = (vf)(0.0f), v = V_FLOAT(lines.first);

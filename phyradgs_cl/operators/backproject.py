@@ -24,6 +24,7 @@ _BLOCK_VOXELS = 128  # along z per work-item of the upright kernel
 _COLUMN_ROWS = 512  # detector rows that such a block may project to
 _UPRIGHT = 1e-7  # change of u or depth over the volume's height, relative to the depth
 _MOST_LEAN = 0.25  # columns per row along z: beyond it the general kernel is faster
+_WIDEST = 16  # voxels of a vector, which may run past the last one
 Arguments = tuple[DeviceArray, DeviceArray, DeviceArray, np.int32, np.int32, np.int32, np.int32, np.int64]
 
 
@@ -174,10 +175,10 @@ def _upright_block(matrices: np.ndarray, grid: Grid) -> tuple[int, bool]:
     """Returns the voxels along z per work-item of the upright kernels, 0 if they do not apply, and whether columns lean.
 
     In upright columns u and depth (rows 0 and 2 of a matrix) do not change with z. All voxels must lie in front of the
-    source.
+    source, and the rest of a column's last vector too.
     """
     nz, ny, nx = grid.shape
-    corners = np.array([[x, y, z, 1] for x in (0, nx - 1) for y in (0, ny - 1) for z in (0, nz - 1)])
+    corners = np.array([[x, y, z, 1] for x in (0, nx - 1) for y in (0, ny - 1) for z in (0, nz - 1 + _WIDEST)])
     depth = matrices[:, 8:12] @ corners.T
     if depth.min() <= 0:
         return 0, False
