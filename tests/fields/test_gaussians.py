@@ -67,10 +67,12 @@ def test_samples_are_the_means_over_voxels(scale, limit) -> None:
     """Voxels of 0.1; a Gaussian of half a voxel, one voxel and three."""
     rows = np.array([[0.013, -0.02, 0.03, scale, scale, scale, 1, 0, 0, 0, 1.0]]).T
     fine, voxel = 9, 0.1
-    centres = (np.arange(21) - 10) * voxel
+    reach = max(4, round(3.3 * scale / voxel))  # of voxels, on each side
+    side = 2 * reach + 1
+    centres = (np.arange(side) - reach) * voxel
     points = (centres[:, None] + ((np.arange(fine) - fine // 2) / fine * voxel)[None]).ravel()
     dense = voxel_field(rows, points, points, points)
-    means = dense.reshape(21, fine, 21, fine, 21, fine).mean(axis=(1, 3, 5))
+    means = dense.reshape(side, fine, side, fine, side, fine).mean(axis=(1, 3, 5))
     averaged = Gaussians.from_rows(rows).averaged((voxel,) * 3)
     found, sampled = (voxel_field(r, centres, centres, centres) for r in (averaged.rows(), rows))
     error, before = (np.linalg.norm(f - means) / np.linalg.norm(means) for f in (found, sampled))
