@@ -1,7 +1,7 @@
 /* A volume seen through a displacement, (W v)(y) = v(y + w(y)), interpolated and zero outside the volume, and its exact
    transpose. The displacement of a state is w = sum of shares[r] * fields[r], in voxels. Twin: operators/twins/warp.py.
-   REACH 1 interpolates trilinearly. REACH 2 takes cubic convolution along each axis: R. G. Keys, IEEE Trans. Acoustics,
-   Speech, Signal Processing 29, 1153-1160 (1981), a = -1/2.
+   It interpolates by cubic convolution along each axis: R. G. Keys, IEEE Trans. Acoustics, Speech, Signal Processing 29,
+   1153-1160 (1981), a = -1/2.
      warp_forward       a work-item takes LANES voxels along x.
      warp_adjoint_rows  CPUs: a work-item owns some slices of the result, to which it adds every voxel that reaches them.
      warp_adjoint_fixed GPUs: a work-item adds its voxel to integers, whose sums do not depend on their order.
@@ -11,6 +11,7 @@
    volume with its weights. Voxels that part more than MOST_TAPS along an axis allows are taken one by one. */
 #include "common/lanes.h"
 
+#define REACH 2 /* voxels: as far as a sample counts */
 #define TAPS (2 * REACH)
 #define MOST_TAPS (TAPS + 2)
 
@@ -39,23 +40,15 @@ static inline int vi_least(const vi v)
 /* The weight of a sample at a distance of its voxels; 0 from REACH on. */
 static inline vf tap(const vf distance)
 {
-#if REACH == 1
-    return fmax(1.0f - fabs(distance), (vf)(0.0f));
-#else
     const vf x = fmin(fabs(distance), (vf)(2.0f));
     const vf near = (1.5f * x - 2.5f) * x * x + 1.0f, far = ((2.5f - 0.5f * x) * x - 4.0f) * x + 2.0f;
     return V_PICK(far, near, x < 1.0f);
-#endif
 }
 
 static inline float one_tap(const float distance)
 {
-#if REACH == 1
-    return fmax(1.0f - fabs(distance), 0.0f);
-#else
     const float x = fmin(fabs(distance), 2.0f);
     return x < 1.0f ? (1.5f * x - 2.5f) * x * x + 1.0f : ((2.5f - 0.5f * x) * x - 4.0f) * x + 2.0f;
-#endif
 }
 
 static inline int first_tap(const float at, const int length)

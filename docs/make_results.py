@@ -495,16 +495,17 @@ def moving_known() -> str:
     return markdown(heads, rows)
 
 
-def moving_unknown() -> str:
-    """Breathing volumes as if they rested, and with the field that ``moving`` finds."""
+def moving_unknown(motion: str) -> str:
+    """Moving volumes as if they rested, and with the field that ``moving`` finds."""
     rows = []
     for one in lines_of("moving.jsonl"):
-        if one["case"] == "unknown":
+        if one["case"] == "unknown" and one.get("motion", "breathing") == motion:
             means = [one["static_mean_psnr_db"], one["mean_psnr_db"]]
             voxels = [one[key] * one["size"] / BOX_MM for key in ("mean_motion_error_mm", "p95_motion_error_mm")]
             rows.append(
                 [one["volume"], f"{one['size']}³", str(one["views"]), *(f"{mean:.2f}" for mean in means)]
-                + [f"{means[1] - means[0]:+.2f}", f"{voxels[0]:.2f} ({voxels[1]:.2f})", f"{one['period_s']:.2f}"]
+                + [f"{means[1] - means[0]:+.2f}", f"{voxels[0]:.2f} ({voxels[1]:.2f})"]
+                + [f"{one['period_s']:.2f}" if one["period_s"] else "none"]
                 + [f"{one['static_seconds']:.0f}", f"{one['seconds']:.0f}"]
             )
     heads = ["volume", "voxels", "views", "as if at rest, dB", "`moving`, dB", "gain, dB", "field wrong by, voxels"]
@@ -556,7 +557,8 @@ TABLES: dict[str, Callable[[], str]] = {
     "moving_rtk": moving_rtk,
     "moving_known": moving_known,
     "moving_insert": moving_insert,
-    "moving_unknown": moving_unknown,
+    "moving_unknown": lambda: moving_unknown("breathing"),
+    "moving_drying": lambda: moving_unknown("drying"),
 }
 
 

@@ -229,17 +229,16 @@ def _warps(rt: Runtime) -> Iterator[Comparison]:
         weights = np.array([[1.0, 0.5], [0.3, -1.0], [0.0, 0.2]])
         states = MotionStates.of_times(Deformation(control_mm, (-1.0,) * 3, 0.5, times_s, weights), GRID, times_s)
         fields = states.fields_mm / GRID.voxel_size_mm[::-1]
-        for reach in (1, 2):
-            warp = VolumeWarp(rt, states, is_cubic=reach == 2)
-            for state, weights in enumerate(states.weights):
-                displacement = np.tensordot(weights, fields, 1)
-                moved = rt.download(warp.forward(state, warp.source(rt.upload(volume))))
-                yield moved, warp_forward(volume, displacement, reach), VALUE
-                rt.write(warp.moved(), moved)
-                total, back = warp.zeros(), rt.empty(GRID.shape)
-                warp.adjoint(state, warp.moved(), total)
-                warp.read(total, back)
-                yield rt.download(back), warp_adjoint(moved, displacement, reach), VALUE
+        warp = VolumeWarp(rt, states)
+        for state, weights in enumerate(states.weights):
+            displacement = np.tensordot(weights, fields, 1)
+            moved = rt.download(warp.forward(state, warp.source(rt.upload(volume))))
+            yield moved, warp_forward(volume, displacement), VALUE
+            rt.write(warp.moved(), moved)
+            total, back = warp.zeros(), rt.empty(GRID.shape)
+            warp.adjoint(state, warp.moved(), total)
+            warp.read(total, back)
+            yield rt.download(back), warp_adjoint(moved, displacement), VALUE
     tables = [static_cells(ORBIT, Shutter(0.8, 0.6), 0, start_s, SHAPE[0]) for start_s in (0.2, 1.2)]
     operator = WarpedOperator(rt, GRID, SHAPE, tables, warp=VolumeWarp(rt, states))
     shares = states.shares(np.concatenate([table.time_s for table in tables]))

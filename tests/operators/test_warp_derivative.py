@@ -16,7 +16,7 @@ from phyradgs_cl.operators.warp.volume import VolumeWarp
 
 GRID = Grid((9, 7, 12), (0.2, 0.25, 0.15), (0.1, -0.05, 0.0))
 TIMES_S = np.linspace(0.0, 4.0, 13)
-_STEP = 1e-5  # voxels, or of a unit of weight: hardly a point passes a voxel's plane
+_STEP = 1e-5  # voxels, or of a unit of weight
 
 
 def deformation(size_mm: float) -> Deformation:
@@ -41,8 +41,8 @@ def difference(volume: np.ndarray, displacement: np.ndarray, change: np.ndarray)
     return (ahead - behind) / (2 * _STEP)
 
 
-@pytest.mark.parametrize("size", [0.4, 30.0])  # voxels; far outside of the volume
-def test_slopes_are_those_of_the_trilinear_volume(size) -> None:
+@pytest.mark.parametrize("size", [0.0, 0.4, 30.0])  # voxels; at rest, far outside of the volume
+def test_slopes_are_those_of_the_cubic_volume(size) -> None:
     rng, volume = np.random.default_rng(0), noise(GRID.shape)
     displacement, direction = rng.normal(scale=size, size=(*GRID.shape, 3)), rng.normal(size=(*GRID.shape, 3))
     along = (warp_slopes(volume, displacement) * direction).sum(-1)

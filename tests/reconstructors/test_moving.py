@@ -5,7 +5,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, ConstantSpeed, PerRow, Scan, Shutter
+from phyradgs_cl.acquisition import (
+    CircularOrbit,
+    ConeGeometry,
+    ConstantSpeed,
+    ParallelGeometry,
+    PerRow,
+    Scan,
+    Shutter,
+)
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Deformation, Gating, Grid, MovingTruth, control_points, deformed
 from phyradgs_cl.metrics import compare
@@ -69,7 +77,7 @@ GRID, SHAPE = Grid.cube(16, 2.0), (24, 24)
 ITERATIONS = 12  # two rounds of the search, and ten passes
 
 
-def breathing_scan(rt, amplitude_mm: float) -> Scan:
+def breathing_scan(rt, amplitude_mm: float, is_parallel: bool = False) -> Scan:
     """Forty frames of an object whose top rises and falls, of other angles than those of its breaths."""
     origin_mm, counts = control_points(GRID, 0.5)
     share = np.clip((origin_mm[2] + 0.5 * np.arange(counts[0]) + 1) / 2, 0, 1)[:, None, None]
@@ -77,7 +85,8 @@ def breathing_scan(rt, amplitude_mm: float) -> Scan:
     control_mm[0, ..., 2] = amplitude_mm * share
     times_s = np.linspace(0, 17, 171)
     truth = Deformation(control_mm, origin_mm, 0.5, times_s, np.cos(2 * np.pi * times_s / 2.3)[:, None])
-    geometry, start_s = ConeGeometry(5.0, 7.0, SHAPE, (4 / 24, 4 / 24)), 0.4 * np.arange(40)
+    cone, parallel = ConeGeometry(5.0, 7.0, SHAPE, (4 / 24, 4 / 24)), ParallelGeometry(SHAPE, (2.8 / 24, 2.8 / 24))
+    geometry, start_s = parallel if is_parallel else cone, 0.4 * np.arange(40)
     orbit, fine = CircularOrbit(geometry, ConstantSpeed(0.0, 2 * np.pi / 16)), GRID.finer(2)
     empty = Scan(np.zeros((40, *SHAPE), np.float32), geometry, orbit, Shutter(0.3), start_s, GRID)
     tables, volume = [PerRow(3).cells(empty, f) for f in range(40)], shepp_logan(0.9).voxelise(fine)
@@ -122,6 +131,13 @@ def test_an_unknown_motion_is_found_and_taken_out(rt, scan, result) -> None:
     assert mean_psnr_db(result, scan) > mean_psnr_db(run(rt, scan, "fista", passes), scan) + 2.25
     again = run(rt, scan, "fista", passes, ObjectMotion(result.deformation))
     np.testing.assert_array_equal(result.volume, again.volume)
+
+
+def test_parallel_beams_show_an_unknown_motion_too(rt) -> None:
+    scan = breathing_scan(rt, 0.3, is_parallel=True)
+    result = run(rt, scan)
+    assert result.facts[MOTION_FOUND]["moves"] and result.facts[MOTION_FOUND]["period_s"] == pytest.approx(2.3, rel=0.05)
+    assert mean_psnr_db(result, scan) > mean_psnr_db(run(rt, scan, "fista", ITERATIONS - 2), scan) + 2.25
 
 
 @pytest.mark.parametrize("at", [1, 6])

@@ -11,12 +11,20 @@ import pytest
 from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.api import compare, load_volume, prepare, reconstruct, save_scan, save_volume, simulate
 from phyradgs_cl.errors import InputError
+from phyradgs_cl.fields import Deformation
 from phyradgs_cl.io import checkpoint_path
-from phyradgs_cl.reconstructors import Preprocessing, Progress, RunPlan, method_options, plan_run
+from phyradgs_cl.reconstructors import (
+    Preprocessing,
+    Progress,
+    Reconstruction,
+    RunPlan,
+    method_options,
+    plan_run,
+)
 from phyradgs_cl.reconstructors import reconstruct as run_method
 from phyradgs_cl.reconstructors.frames.projected import held_out
-from phyradgs_cl.reconstructors.result import HELD_OUT
-from phyradgs_cl.reconstructors.tune import TUNED
+from phyradgs_cl.reconstructors.result import HELD_OUT, Report
+from phyradgs_cl.reconstructors.tune import TUNED, trials
 from phyradgs_cl.report.page import report_page
 from phyradgs_cl.report.run import load_run
 
@@ -53,6 +61,23 @@ def test_a_bad_weight_is_mended_by_the_scan(rt, scan) -> None:
         assert psnr_db(mended, scan) > max(lost + 1, usual - 0.5), (factor, found)
     told = reconstruct(scan, **given, tv_weight=found["chosen"])
     np.testing.assert_array_equal(told.volume, mended.volume)
+
+
+def test_a_trial_is_measured_with_the_motion_that_it_found(rt, scan, monkeypatch) -> None:
+    field = Deformation(np.ones((1, 2, 2, 2, 3)), (0.0,) * 3, 1.0, np.zeros(1), np.ones((1, 1)))
+    measured_with = []
+
+    def errors(*arguments: object) -> dict[str, float]:
+        measured_with.append(arguments[-1])
+        return {"holdout_rms": 1.0, "holdout_noise_rms": 0.5, "holdout_pixels": 1}
+
+    def run(scan: Scan, options: object, report: object) -> Reconstruction:
+        return Reconstruction(np.zeros(scan.grid.shape, np.float32), scan.grid, deformation=field)
+
+    monkeypatch.setattr(trials, "holdout_errors", errors)
+    report = Report.of(lambda progress: None)
+    result = trials.tuned("bending=0.01,0.02,0.04", run, scan, method_options("moving"), rt, report)
+    assert measured_with == [field] * 3 and result.facts[TUNED]["option"] == "bending"
 
 
 def test_the_choice_is_where_the_curve_is_least(rt, scan) -> None:

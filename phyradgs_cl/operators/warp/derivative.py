@@ -1,5 +1,5 @@
 """Derivatives of a moving object's frames A v by its displacement field w = Σ_r φ_r U_r: by the coefficients of the fields
-U_r, and by the weights φ_r. With w_k of the state k and the slope ∇v of the trilinear volume:
+U_r, and by the weights φ_r. With w_k of the state k and the slope ∇v of the cubic volume:
 
     J d = Σ_k P_k (∇v(y + w_k) · Σ_r φ_r,k B d_r),    Jᵀ y = Bᵀ Σ_k φ_r,k ∇v(y + w_k) P_kᵀ y"""
 
@@ -10,6 +10,8 @@ import numpy as np
 
 from phyradgs_cl.operators.warp.operator import WarpedOperator
 from phyradgs_cl.runtime import DeviceArray
+
+_REACH = 2  # voxels: as far as a sample of cl/warp.cl counts
 
 
 class FieldDerivative:
@@ -70,28 +72,37 @@ def _same_for_all(field_mm: np.ndarray, state: int) -> np.ndarray:
 
 
 def warp_slopes(volume: np.ndarray, displacement: np.ndarray) -> np.ndarray:
-    """Returns ∇v(y + w(y)) (nz, ny, nx, 3) float32 per voxel, x y z, of the trilinear volume (nz, ny, nx), 0 outside, for w
-    (nz, ny, nx, 3) in voxels. At a voxel's plane it is the slope on the far side."""
-    padded = np.pad(np.asarray(volume, np.float32), 1)
-    sides = np.array(volume.shape)
-    below, share, is_inside = [], [], np.ones(volume.shape, bool)
-    for axis in range(3):
-        index = np.arange(sides[axis], dtype=np.float32).reshape([-1 if a == axis else 1 for a in range(3)])
-        place = index + displacement[..., 2 - axis].astype(np.float32)
-        is_inside &= (place >= -1) & (place < sides[axis])
-        first = np.clip(np.floor(place), -1, sides[axis] - 1)
-        below.append(first.astype(np.int64) + 1)
-        share.append(np.clip(place - first, 0, 1))
-    _, ny, nx = padded.shape
-    flat, strides = padded.ravel(), (ny * nx, nx, 1)
-    corner = sum(first * stride for first, stride in zip(below, strides, strict=True))
-    c = {bits: flat[corner + np.dot(bits, strides)] for bits in np.ndindex(2, 2, 2)}
-    sz, sy, sx = share
-    rows = {(j, k): (1 - sx) * c[j, k, 0] + sx * c[j, k, 1] for j, k in np.ndindex(2, 2)}
-    planes = [(1 - sy) * rows[j, 0] + sy * rows[j, 1] for j in (0, 1)]
-    along_z = planes[1] - planes[0]
-    along_y = (1 - sz) * (rows[0, 1] - rows[0, 0]) + sz * (rows[1, 1] - rows[1, 0])
-    along_x = sum(
-        (sz if j else 1 - sz) * (sy if k else 1 - sy) * (c[j, k, 1] - c[j, k, 0]) for j, k in np.ndindex(2, 2)
-    )
-    return np.stack([along_x, along_y, along_z], -1) * is_inside[..., None]
+    """Returns ∇v(y + w(y)) (nz, ny, nx, 3) float32 per voxel, x y z, of the volume (nz, ny, nx) by cubic convolution, 0
+    outside, for w (nz, ny, nx, 3) in voxels."""
+    padded = np.pad(np.asarray(volume, np.float32), 2 * _REACH)
+    strides = (padded.shape[1] * padded.shape[2], padded.shape[2], 1)
+    corner, weights, slopes = np.int64(0), [], []
+    for axis, (side, stride) in enumerate(zip(volume.shape, strides, strict=True)):
+        index = np.arange(side, dtype=np.float32).reshape([-1 if a == axis else 1 for a in range(3)])
+        place = np.clip(index + displacement[..., 2 - axis].astype(np.float32), -_REACH, side - 1 + _REACH)
+        first = np.clip(np.floor(place) + 1 - _REACH, -_REACH, side - 1)
+        corner = corner + (first.astype(np.int64) + 2 * _REACH) * stride
+        distances = [place - first - tap for tap in range(2 * _REACH)]
+        weights.append([_weight(distance) for distance in distances])
+        slopes.append([_slope(distance) for distance in distances])
+    flat, (wz, wy, wx), (dz, dy, dx) = padded.ravel(), weights, slopes
+    total = np.zeros((3, *volume.shape), np.float32)
+    for k, j in np.ndindex(2 * _REACH, 2 * _REACH):
+        row = [flat[corner + np.dot((k, j, i), strides)] for i in range(2 * _REACH)]
+        value = sum(weight * sample for weight, sample in zip(wx, row, strict=True))
+        total[0] += wz[k] * wy[j] * sum(slope * sample for slope, sample in zip(dx, row, strict=True))
+        total[1] += wz[k] * dy[j] * value
+        total[2] += dz[k] * wy[j] * value
+    return np.moveaxis(total, 0, -1)
+
+
+def _weight(distance: np.ndarray) -> np.ndarray:
+    """Returns Keys' weight of samples at signed distances (…) in voxels; 0 from 2 voxels on."""
+    x = np.minimum(np.abs(distance), _REACH)
+    return np.asarray(np.where(x < 1, (1.5 * x - 2.5) * x * x + 1, ((2.5 - 0.5 * x) * x - 4) * x + 2))
+
+
+def _slope(distance: np.ndarray) -> np.ndarray:
+    """Returns the derivative of ``_weight``."""
+    x = np.minimum(np.abs(distance), _REACH)
+    return np.asarray(np.where(x < 1, (4.5 * x - 5) * x, (5 - 1.5 * x) * x - 4) * np.sign(distance))

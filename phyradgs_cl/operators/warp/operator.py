@@ -138,13 +138,13 @@ def projector_of(
 ) -> Callable[..., RayOperator | WarpedOperator]:
     """Returns what makes the projector of an object that moves as ``deformation`` does at the times of ``tables``.
 
-    The nearest state stands for a cell: a blend of two would blur, and project every cell twice. Warps are cubic. The result
-    takes the arguments of ``RayOperator``, which it is for an object at rest."""
+    The nearest state stands for a cell: a blend of two would blur, and project every cell twice. The result takes the
+    arguments of ``RayOperator``, which it is for an object at rest."""
     if deformation is None:
         return RayOperator
     times_s = np.concatenate([table.time_s for table in tables])
     states = MotionStates.of_times(deformation, grid, times_s, blends=False)
-    return RayOperator if states.is_at_rest else partial(WarpedOperator, warp=VolumeWarp(rt, states, is_cubic=True))
+    return RayOperator if states.is_at_rest else partial(WarpedOperator, warp=VolumeWarp(rt, states))
 
 
 def _tables_by_state(

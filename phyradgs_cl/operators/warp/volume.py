@@ -7,6 +7,7 @@ from phyradgs_cl.operators.warp.states import MotionStates
 from phyradgs_cl.runtime import DeviceArray, DeviceSpace, Kernel, Runtime
 from phyradgs_cl.runtime.layout import GUARD, Strides, move, pitch_of
 
+_BORDER = 4  # voxels of zeros: twice REACH of cl/warp.cl
 _MOST_OWNED = 8  # slices of the result that a CPU's work-item owns; it repeats the voxels that reach another's too
 _ITEMS_PER_UNIT = 4
 _HEADROOM = 64  # by which a sum of one voxel's shares may exceed 1, as where the field contracts by 4 along each axis
@@ -16,12 +17,11 @@ _ROUNDING = 1e-3  # voxels
 class VolumeWarp:
     """(W_k v)(y) = v(y + w_k(y)), 0 outside the volume, for the states of ``states``.
 
-    Trilinear, or by cubic convolution with ``is_cubic``, which hardly blurs.
+    Cubic convolution hardly blurs, and has a slope everywhere, at voxel planes too, where an object at rest is sampled.
     Holds 3 R volumes on the device for the R fields; a state's displacement is their weighted sum, made where it is used.
     Results have the same bits in every run: no sum depends on the order of work-items."""
 
-    def __init__(self, rt: Runtime, states: MotionStates, is_cubic: bool = False) -> None:
-        self._reach_voxels = 2 if is_cubic else 1
+    def __init__(self, rt: Runtime, states: MotionStates) -> None:
         self.rt, self.states, self.shape = rt, states, states.grid.shape
         fields = np.stack([states.fields_mm[..., i] / states.grid.voxel_size_mm[2 - i] for i in range(3)], 1)
         self._fields = rt.upload(np.pad(fields.ravel(), (0, GUARD)), np.float32)
@@ -107,14 +107,14 @@ class VolumeWarp:
 
     def kernel(self, name: str) -> Kernel:
         """Returns a kernel of cl/warp.cl."""
-        return self.rt.kernel("warp", name, RANK=len(self.states.fields_mm), REACH=self._reach_voxels)
+        return self.rt.kernel("warp", name, RANK=len(self.states.fields_mm))
 
     def _layout(self) -> tuple[int, Strides]:
         """Returns the floats and strides of volumes with a border of zeros, which samples beyond a face read."""
-        (nz, ny, nx), border = self.shape, 2 * self._reach_voxels
-        slice_ = (ny + 2 * border) * pitch_of(nx)
-        strides = Strides(GUARD + border * (slice_ + pitch_of(nx)), slice_, pitch_of(nx))
-        return 2 * GUARD + (nz + 2 * border) * slice_, strides
+        nz, ny, nx = self.shape
+        slice_ = (ny + 2 * _BORDER) * pitch_of(nx)
+        strides = Strides(GUARD + _BORDER * (slice_ + pitch_of(nx)), slice_, pitch_of(nx))
+        return 2 * GUARD + (nz + 2 * _BORDER) * slice_, strides
 
     def _size(self) -> np.ndarray:
         return np.array([*self.shape[::-1], 0], np.int32)
