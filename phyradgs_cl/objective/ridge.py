@@ -17,8 +17,8 @@ from phyradgs_cl.runtime.layout import GUARD, Strides, move, on_device, padded_z
 
 EDGE = 5
 """Voxels along a side of a filter."""
-_SLICES = 4  # of channels and responses that are computed at a time
-_RING = _SLICES + 2  # slices of them in memory: a correlation needs three
+_SLICES = 4  # of channels and responses, computed at a time
+_RING = _SLICES + 2  # in memory: a correlation needs three
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,8 +44,8 @@ class Ridge:
         """Returns ψ' of responses (16, z, y, x)."""
         columns = (self.slope_up, self.knot_up, self.slope_down, self.knot_down)
         up, knot_up, down, knot_down = (values.astype(np.float64)[:, None, None, None] for values in columns)
-        knot_up, knot_down = sigma * knot_up, sigma * knot_down
-        bent: np.ndarray = up * np.clip(responses, -knot_up, knot_up) - down * np.clip(responses, -knot_down, knot_down)
+        rising, falling = (np.clip(responses, -sigma * knot, sigma * knot) for knot in (knot_up, knot_down))
+        bent: np.ndarray = up * rising - down * falling
         return bent
 
 
@@ -84,10 +84,7 @@ class RidgeStep:
     def __call__(
         self, volume: SameArray, sigma: float, step: float, *, nonnegative: bool, out: DeviceArray | None = None
     ) -> SameArray:
-        """Returns v − ``step`` ∇R(v), float32, not below 0 if asked; ``sigma``: of the noise, in the unit of v (z, y, x).
-
-        A device array gives a device array (``out``, if given, which may be the volume)."""
-
+        """Returns v − ``step`` ∇R(v), float32; ``sigma`` in the unit of v (z, y, x). ``out``: as of ``DctProx``."""
         return on_device(self.rt, partial(self._descend, sigma, step, nonnegative), volume, out)
 
     def _descend(self, sigma: float, step: float, nonnegative: bool, volume: DeviceArray, result: DeviceArray) -> None:
@@ -96,7 +93,7 @@ class RidgeStep:
         move(self.rt, (volume, Strides.plain(self.shape)), padded, self.shape)
         is_thin = min(self.shape) < EDGE  # the channels of the gradient stay 0
         end = np.float32(step), np.int32(nonnegative), result
-        # A response needs three slices of the channels: it follows two slices behind them
+        # Responses follow two slices behind the channels, of which they need three
         for first in range(0, nz + 2, _SLICES):
             if not is_thin:
                 self._launch(self._channels_of, first, 2, self._padded, ends=(self._channels,))
@@ -105,7 +102,7 @@ class RidgeStep:
             self._launch(self._step, first - 2, 0, self._padded, self._channels_back, ends=end)
 
     def _launch(self, kernel: Kernel, first: int, less: int, *sources: DeviceArray, ends: tuple[object, ...]) -> None:
-        """Runs a kernel on ``_SLICES`` slices from ``first`` on, where its result is ``less`` smaller than the volume."""
+        """Runs a kernel on slices from ``first`` on. Its result is ``less`` smaller than the volume."""
         nz, ny, nx = (count - less for count in self.shape)
         start, stop = max(first, 0), min(first + _SLICES, nz)
         if start < stop:
