@@ -20,7 +20,7 @@ from phyradgs_cl.runtime import Runtime
 
 MOTIONS = {"still": Static(), "fly": PerRow()}
 KEYS = ("volume", "kind", "views", "dose", "size", "seed", "prior", "numbers")
-NUMBERS = {"curves": "procedural"}  # what the curves were trained on
+NUMBERS = {"curves": "procedural", "ridge": "procedural"}  # what the numbers were trained on
 ARC_DEG = 360.0  # exposed by all views of a fly-scan together
 
 

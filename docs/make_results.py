@@ -541,6 +541,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "passes": lambda: sweep("passes.jsonl", held_out=True),
     "curves": partial(beside_dct, "curves"),
     "firm": partial(beside_dct, "firm"),
+    "ridge": partial(beside_dct, "ridge"),
     "beside_rtk": beside_rtk,
     "ray_motions": ray_motions,
     "whole_runs": whole_runs,

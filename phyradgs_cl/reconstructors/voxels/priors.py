@@ -27,9 +27,9 @@ from phyradgs_cl.reconstructors.result import function_name
 from phyradgs_cl.runtime import Runtime, Space
 
 # shares of the prior's weight, by the prior (docs/results/settings.md)
-_TV_ALONE, _TV_BEFORE_DCT, _DCT = 1.6, 0.8, 1.5
+_TV_ALONE, _TV_BEFORE_DCT, _TV_BEFORE_RIDGE, _DCT = 1.6, 0.8, 0.5, 1.5
 _TV_BEFORE_CURVES, _CURVES_NOISE, _CURVES = 0.5, 50.0, 3.0  # noise that the curves assume, and strength of their step
-_RIDGE_NOISE, _RIDGE_LENGTH, _RIDGE_EVERY = 50.0, 0.1, 5  # noise that the step assumes, its length, and maps for each step
+_RIDGE_NOISE, _RIDGE_LENGTH, _RIDGE_EVERY = 15.0, 0.5, 5  # noise that the step assumes, its length, and maps for each step
 _NONLOCAL, _NONLOCAL_BEFORE_DCT = 300.0, 100.0  # of the filtering parameter h
 _NONLOCAL_STEP = 0.01  # length of a step down the nonlocal quadratic
 
@@ -51,8 +51,8 @@ class PriorInputs:
     def tv(self, share: float = 1.0) -> "TvPrior":
         return TvPrior(TvProx(self.rt, self.grid.shape, axis_weights(self.grid)), self.tv_iterations, share)
 
-    def tv_and_dct(self) -> "TvAndDct":
-        return TvAndDct(self.tv(_TV_BEFORE_DCT), DctProx(self.rt, self.grid.shape), _DCT)
+    def tv_and_dct(self, tv_share: float = _TV_BEFORE_DCT) -> "TvAndDct":
+        return TvAndDct(self.tv(tv_share), DctProx(self.rt, self.grid.shape), _DCT)
 
     def tv_and_firm(self) -> "TvAndDct":
         """On the scan's own voxels, which blur edges, as ``tv_and_dct``: a firm threshold sharpens edges too far there."""
@@ -65,7 +65,7 @@ class PriorInputs:
         return TvAndDct(self.tv(_TV_BEFORE_CURVES), DctProx(self.rt, self.grid.shape, curves), _CURVES_NOISE)
 
     def dct_then_ridge(self) -> "ThenRidge":
-        return ThenRidge(self.tv_and_dct(), RidgeStep(self.rt, self.grid.shape, learned_ridge()))
+        return ThenRidge(self.tv_and_dct(_TV_BEFORE_RIDGE), RidgeStep(self.rt, self.grid.shape, learned_ridge()))
 
     def nonlocal_then(self, then: "Prior", h_share: float) -> "Nonlocal":
         return Nonlocal(then, NonlocalStep(self.rt, self.grid.shape), h_share, self.passes)

@@ -1,0 +1,160 @@
+"""The numbers of the prior ``ridge``: one step down a weakly convex ridge regulariser, with the least error on smooth noise.
+
+    python benchmarks/train_ridge.py data/ridge.json
+    python benchmarks/train_ridge.py other.json --volumes A.h5 B.h5
+
+The step takes G(v) = Wᵀ g(W v) from a volume v (Goujon, Neumayer and Unser, SIAM J. Imaging Sci. 17 (2024) 91). W is two
+convolutions of 3³, from 1 to 4 to 16 channels, whose product has zero mean. At noise of deviation σ
+g_i(t) = a_i clip(t, ± σ k_i) − b_i clip(t, ± σ l_i), with Σ b_i |Ŵ_i|² ≤ 1 at all frequencies: the regulariser plus ½‖x‖² is
+convex. Every cube counts by the logarithm of its squared error. The noise is smooth, as on the smaller voxels of ``fista``,
+which the pixels do not resolve. Without ``--volumes``, cubes come from procedural volumes, as for ``curves``
+(train_curves.py). Needs PyTorch, which the extra ``neural`` installs."""
+
+import argparse
+import json
+import time
+from pathlib import Path
+
+import numpy as np
+import torch
+from train_curves import CUBE, NOISES, cubes_of, file_volumes, procedural_volumes
+
+MIDDLE, FILTERS = 4, 16  # channels
+TAPS = 3  # along an axis, of either convolution
+RIM = 2 * (TAPS - 1)  # voxels at a cube's faces that lack some filters
+FREQUENCIES = 16, 48  # along an axis, where the gains of filters are computed: in training, for the file
+NOISE_WIDTH = 0.8  # voxels, of the Gaussian that smooths the noise
+MARGIN = 0.97  # share of b in the file: rounding and more frequencies keep the bound
+BATCH, RATE = 8, 0.01  # cubes of a step, and Adam's first rate
+
+
+class Ridge(torch.nn.Module):
+    """The map v → v − G(v) of cubes (n, 1, CUBE, CUBE, CUBE), inside the rim."""
+
+    def __init__(self, seed: int) -> None:
+        super().__init__()
+        draw = torch.Generator().manual_seed(seed)
+        self.first = torch.nn.Parameter(torch.randn(MIDDLE, 1, TAPS, TAPS, TAPS, generator=draw) / 5)
+        self.second = torch.nn.Parameter(torch.randn(FILTERS, MIDDLE, TAPS, TAPS, TAPS, generator=draw) / 10)
+        self.log_slopes = torch.nn.Parameter(torch.tensor([[1.0], [0.5]]).log().repeat(1, FILTERS))
+        knots = torch.tensor([[1.0], [3.0]]) * torch.linspace(0.5, 1.5, FILTERS)
+        self.log_knots = torch.nn.Parameter(knots.log())
+
+    def numbers(self) -> dict[str, torch.Tensor]:
+        """Returns the numbers of the file: filters of zero mean, and slopes within the bound."""
+        sums = self.first.sum((1, 2, 3, 4))
+        along = self.second.sum((2, 3, 4)) @ sums / (sums @ sums)
+        second = self.second - along[:, None, None, None, None] * sums[:, None, None, None] / TAPS**3
+        slopes, knots = self.log_slopes.exp(), self.log_knots.exp()
+        down = slopes[1] / bound(gains(self.first, second, FREQUENCIES[0]), slopes[1]).clamp(min=1)
+        curves = {"slope_up": slopes[0], "knot_up": knots[0], "slope_down": down, "knot_down": knots[1]}
+        return {"first": self.first, "second": second, **curves}
+
+    def forward(self, volumes: torch.Tensor, sigma: torch.Tensor) -> torch.Tensor:
+        numbers, conv = self.numbers(), torch.nn.functional.conv3d
+        first, second = numbers["first"], numbers["second"]
+        responses = conv(conv(volumes, first), second)
+        forces = []
+        for way in ("up", "down"):
+            slope, knot = (numbers[f"{kind}_{way}"][:, None, None, None] for kind in ("slope", "knot"))
+            forces.append(slope * torch.maximum(torch.minimum(responses, sigma * knot), -sigma * knot))
+        taken = conv(conv(forces[0] - forces[1], transposed(second)), transposed(first))
+        return inside(volumes) - taken
+
+
+def inside(volumes: torch.Tensor) -> torch.Tensor:
+    return volumes[(..., *[slice(RIM, -RIM)] * 3)]
+
+
+def transposed(filters: torch.Tensor) -> torch.Tensor:
+    """Returns the filters of the transposed convolution."""
+    return filters.transpose(0, 1).flip(2, 3, 4)
+
+
+def gains(first: torch.Tensor, second: torch.Tensor, count: int) -> torch.Tensor:
+    """Returns |Ŵ_i|² (FILTERS, frequencies) at ``count`` frequencies along each axis."""
+    by_first, by_second = (torch.fft.rfftn(filters, (count,) * 3, (2, 3, 4)) for filters in (first, second))
+    return torch.einsum("cozyx,iczyx->izyx", by_first, by_second).abs().square().flatten(1)
+
+
+def bound(gain: torch.Tensor, slopes: torch.Tensor) -> torch.Tensor:
+    """Returns the largest Σ slope_i |Ŵ_i|²."""
+    return (slopes @ gain).max()
+
+
+def train(ridge: Ridge, cubes: torch.Tensor, steps: int, draw: torch.Generator) -> None:
+    """Minimises the mean logarithm of squared errors by Adam, whose rate falls along half a cosine."""
+    optimiser = torch.optim.Adam(ridge.parameters(), RATE)
+    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, steps)
+    low, high = np.log(NOISES[0]), np.log(NOISES[-1])
+    for step in range(steps):
+        batch = cubes[torch.randint(len(cubes), (BATCH,), generator=draw)]
+        batch = batch.permute(0, 1, *(2 + torch.randperm(3, generator=draw)).tolist())
+        sigma = torch.exp(low + (high - low) * torch.rand(BATCH, 1, 1, 1, 1, generator=draw))
+        loss = errors(ridge, batch, sigma, draw).log().mean()
+        optimiser.zero_grad()
+        loss.backward()
+        optimiser.step()
+        schedule.step()
+        if step % 100 == 99:
+            print(step + 1, f"{loss.item():.3f}", flush=True)
+
+
+def errors(ridge: Ridge, cubes: torch.Tensor, sigma: torch.Tensor, draw: torch.Generator) -> torch.Tensor:
+    """Returns the mean square errors of cubes with noise, in σ²."""
+    noisy = cubes + sigma * smooth_noise(cubes.shape, draw)
+    return ((ridge(noisy, sigma) - inside(cubes)) / sigma).square().mean((1, 2, 3, 4))
+
+
+def smooth_noise(shape: torch.Size, draw: torch.Generator) -> torch.Tensor:
+    """Returns periodic noise of deviation 1."""
+    along = torch.exp(-2 * (torch.pi * NOISE_WIDTH * torch.fft.fftfreq(CUBE)) ** 2)
+    spectrum = torch.fft.rfftn(torch.randn(shape, generator=draw), dim=(2, 3, 4))
+    spectrum *= along[:, None, None] * along[:, None] * along[: CUBE // 2 + 1]
+    smooth = torch.fft.irfftn(spectrum, (CUBE,) * 3, dim=(2, 3, 4))
+    return smooth / smooth.std()
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("output", type=Path)
+    parser.add_argument("--volumes", type=Path, nargs="*", help="HDF5 files instead of procedural volumes")
+    parser.add_argument("--cubes", type=int, default=24, help="of a volume")
+    parser.add_argument("--sets", type=int, default=2, help="of procedural volumes")
+    parser.add_argument("--steps", type=int, default=600)
+    parser.add_argument("--seed", type=int, default=0)
+    given = parser.parse_args()
+    before_s, rng = time.process_time(), np.random.default_rng(given.seed)
+    torch.set_num_threads(1)
+    draw = torch.Generator().manual_seed(given.seed)
+    seeds = range(given.seed, given.seed + given.sets)
+    sets = [file_volumes(given.volumes)] if given.volumes else [procedural_volumes(seed) for seed in seeds]
+    drawn = [cube for volumes in sets for volume in volumes for cube in cubes_of(volume, given.cubes, rng)]
+    cubes = torch.from_numpy(np.array(drawn, np.float32))[:, None]
+    print(f"{len(cubes)} cubes, {time.process_time() - before_s:.0f} s", flush=True)
+    ridge = Ridge(given.seed)
+    train(ridge, cubes, given.steps, draw)
+    origin = ", ".join(path.stem for path in given.volumes) if given.volumes else "procedural volumes"
+    write(given.output, ridge, f"benchmarks/train_ridge.py, seed {given.seed}, {origin}")
+    with torch.no_grad():
+        for noise in NOISES:
+            left = errors(ridge, cubes[::10], torch.full((len(cubes[::10]), 1, 1, 1, 1), noise), draw)
+            print(f"noise {noise}: error {left.log().mean().exp():.4f} σ²")
+    print(f"{time.process_time() - before_s:.0f} s")
+
+
+def write(path: Path, ridge: Ridge, origin: str) -> None:
+    """Writes the numbers in thousandths, with the bounds of the curvature of the regulariser from above and below."""
+    with torch.no_grad():
+        numbers = ridge.numbers()
+        numbers["slope_down"] = MARGIN * numbers["slope_down"]
+        gain = gains(numbers["first"], numbers["second"], FREQUENCIES[1])
+        largest = torch.maximum(numbers["slope_up"], numbers["slope_down"])
+        bounds = {"lipschitz": bound(gain, largest), "convexity": bound(gain, numbers["slope_down"])}
+    text = {"trained_on": origin} | {name: round(float(value), 5) for name, value in bounds.items()}
+    text |= {name: np.rint(1000 * values.detach().numpy()).astype(int).ravel().tolist() for name, values in numbers.items()}
+    path.write_text(json.dumps(text, separators=(",", ":")), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
