@@ -526,6 +526,16 @@ def moving_insert() -> str:
     return markdown(heads, rows)
 
 
+def moving_mace4d() -> str:
+    """The rack and pinion of mbirtorch's demonstration, by its MACE4D and by ``moving``."""
+    rows = [
+        [one["program"], f"{one['mean_psnr_db']:.2f}", f"{one['least_psnr_db']:.2f}", f"{one['mean_ssim']:.3f}"]
+        + [f"{one['seconds']:.1f}"]
+        for one in lines_of("moving.jsonl") if one["case"] == "rack and pinion"
+    ]
+    return markdown(["", "mean PSNR, dB", "least PSNR, dB", "mean SSIM", "processor, s"], rows)
+
+
 TABLES: dict[str, Callable[[], str]] = {
     "table1_S_rapid": lambda: quality("table1_S.csv", "rapid", with_seconds=True),
     "table1_S_standard": lambda: quality("table1_S.csv", "standard"),
@@ -560,6 +570,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "moving_insert": moving_insert,
     "moving_unknown": lambda: moving_unknown("breathing"),
     "moving_drying": lambda: moving_unknown("drying"),
+    "moving_mace4d": moving_mace4d,
 }
 
 

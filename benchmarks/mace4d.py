@@ -1,0 +1,86 @@
+"""``moving`` compared with MACE4D of mbirtorch, on the scan of mbirtorch's own 4D demonstration: a rack and pinion.
+
+    python -m venv PEER && PEER/bin/pip install mbirtorch
+    python benchmarks/mace4d.py --peer-python PEER/bin/python RESULTS.jsonl [--size 32] [--views 120] [--device D]
+
+Both find the states of the object from line integrals without noise, with their default options (MACE4D: those of the
+demonstration). PSNR, its mean and least, and mean SSIM against the true state in the middle of each of MACE4D's windows;
+processor seconds. Also FBP of each window alone, and ``fista`` as if the object rested. A pixel is taken as 1 mm. With
+TORCHDYNAMO_DISABLE=1 mbirtorch runs without the compiler of PyTorch."""
+
+import argparse
+import subprocess
+import tempfile
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+from moving import plan_of
+from scans import append
+
+from phyradgs_cl.acquisition import ParallelGeometry, Scan
+from phyradgs_cl.fields import Grid, deformed
+from phyradgs_cl.metrics import METRICS, compare
+from phyradgs_cl.reconstructors import Reconstruction, reconstruct
+from phyradgs_cl.runtime import Runtime
+
+
+def run_peer(python: str, size: int, views: int, path: Path) -> dict[str, np.ndarray]:
+    script = Path(__file__).with_name("mace4d_peer.py")
+    subprocess.run([python, str(script), str(size), str(views), str(path)], check=True, stdout=subprocess.DEVNULL)
+    with np.load(path) as result:
+        return dict(result)
+
+
+def in_our_axes(volumes: np.ndarray) -> np.ndarray:
+    """Returns volumes (n, row, column, slice) as (n, z, y, x): at angle 0 rays run along the rows."""
+    return np.ascontiguousarray(volumes.transpose(0, 3, 2, 1), np.float32)
+
+
+def states_of(result: Reconstruction, views: np.ndarray, scan: Scan) -> np.ndarray:
+    """Returns the volumes (n, z, y, x) of a result at the times of views (n,)."""
+    field = result.deformation
+    if field is None:
+        return np.broadcast_to(result.volume, (len(views), *result.volume.shape))
+    weights = field.weights_at(scan.frame_start_s[views])
+    return np.stack([deformed(result.volume, result.grid, field, one) for one in weights])
+
+
+def scores(volumes: np.ndarray, truth: np.ndarray) -> dict[str, float]:
+    rows = [compare(np.ascontiguousarray(one), state) for one, state in zip(volumes, truth, strict=True)]
+    averages = {f"mean_{name}": float(np.mean([row[name] for row in rows])) for name in METRICS}
+    return {**averages, "least_psnr_db": min(row["psnr_db"] for row in rows)}
+
+
+def run(rt: Runtime, python: str, size: int, views: int, folder: Path) -> Iterator[dict[str, object]]:
+    peer = run_peer(python, size, views, folder / "peer.npz")
+    truth, facts = in_our_axes(peer["truth"]), {"case": "rack and pinion", "size": size, "views": views}
+    for name, label in (("fbp", "FBP of each window"), ("mace4d", f"MACE4D, mbirtorch {peer['version']}")):
+        volumes, seconds = in_our_axes(peer[name]), round(float(peer[f"{name}_seconds"]), 1)
+        yield {**facts, "program": label, **scores(volumes, truth), "seconds": seconds}
+    poses = ParallelGeometry((size, size), (1.0, 1.0)).pose(peer["angles"])
+    scan = Scan.from_poses(peer["frames"], poses, Grid.cube(size, float(size)), is_parallel=True)
+    for method in ("fista", "moving"):
+        started = time.process_time()
+        result = reconstruct(scan, plan_of(method), rt)
+        seconds = round(time.process_time() - started, 1)
+        states = states_of(result, peer["middles"], scan)
+        yield {**facts, "program": f"`{method}`", **scores(states, truth), "seconds": seconds, "device": rt.device.name}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("results", type=Path)
+    parser.add_argument("--peer-python", required=True)
+    parser.add_argument("--size", type=int, default=32)
+    parser.add_argument("--views", type=int, default=120)
+    parser.add_argument("--device")
+    arguments = parser.parse_args()
+    with tempfile.TemporaryDirectory() as name:
+        for line in run(Runtime(arguments.device), arguments.peer_python, arguments.size, arguments.views, Path(name)):
+            append(arguments.results, line)
+
+
+if __name__ == "__main__":
+    main()
