@@ -181,6 +181,7 @@ __kernel void backproject_leaning(
         /* where the depth hardly changes its inverse is nearly linear, and a Newton step leaves 1e-8 of it */
         const float inv_0 = 1.0f / depth_0, per_z = (1.0f / fma((float)count, m[10], depth_0) - inv_0) / (float)count;
         const int is_even = fabs((float)count * m[10]) <= EVEN_DEPTH * depth_0;
+        const int rises = m[2] * depth_0 > u_0 * m[10]; /* u along z */
         int own = 0;         /* vectors that end before `until` lie between this detector column and the next */
         float until = -1.0f;
         for (int k = start; k < stop; k += LANES) {
@@ -203,13 +204,13 @@ __kernel void backproject_leaning(
             const vi row = min(V_INT(vs), last_row);
             const vf wv = vs - V_FLOAT(row);
             int column = own, to = own;
-            if (end >= until) {
+            if (LANES == 1 || end >= until) { /* without a memory of the last column a compiler makes its own vectors */
                 const float u0 = clamp(V_FIRST(u), 0.0f, u_most), u1 = clamp(V_LAST(u), 0.0f, u_most);
                 own = min((int)u1, last_column);
                 column = min(own, (int)u0);
                 to = max(own, min((int)u0, last_column));
-                const int border = own + (u1 > u0);
-                until = fma(-(float)border, depth_0, u_0) / fma((float)border, m[10], -m[2]) - VOXEL_MARGIN;
+                const float border = (float)(own + rises);
+                until = fma(-border, depth_0, u_0) / fma(border, m[10], -m[2]) - VOXEL_MARGIN;
             }
             const int v0 = V_FIRST(row), v1 = V_LAST(row), fits = abs(v1 - v0) <= 2 * LANES - 2;
             const int least = min(min(v0, v1), max(rows + 1 - 2 * LANES, 0));
