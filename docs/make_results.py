@@ -175,6 +175,17 @@ def fitted_volumes() -> str:
     return markdown(["Gaussians", "PSNR, dB", "SSIM (least)", "voxels / parameters", "processor, s"], text)
 
 
+def splat_starts() -> str:
+    """PSNR and SSIM of phyradgs from two starts, volume by volume, and the mean processor time."""
+    lines, text = lines_of("splat_starts.jsonl"), []
+    for start in dict.fromkeys(line["start"] for line in lines):
+        runs = [line for line in lines if line["start"] == start]
+        names = [f"{run['volume']}, {run['size']}³" for run in runs]
+        quality = [f"{run['psnr_db']:.2f} / {run['ssim']:.3f}" for run in runs]
+        text.append([start, *quality, f"{mean(run['processor_s'] for run in runs):.0f}"])
+    return markdown(["start", *names, "processor, s"], text)
+
+
 def detector_models() -> str:
     """What modelling an effect of the detector gives each method: modelled PSNR, and the gain over ignoring it."""
     lines = lines_of("detector_models.jsonl")
@@ -546,6 +557,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "centres_distance": centres_distance,
     "centres_object": centres_object,
     "fitted_volumes": fitted_volumes,
+    "splat_starts": splat_starts,
     "detector_models": detector_models,
     "prior_weight": lambda: sweep("prior_weight.jsonl", held_out=False),
     "passes": lambda: sweep("passes.jsonl", held_out=True),
