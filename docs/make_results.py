@@ -11,7 +11,7 @@ import sys
 from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 from pathlib import Path
-from statistics import mean
+from statistics import mean, stdev
 from typing import Any
 
 BOX_MM = 2.0  # of the volumes that breathe
@@ -228,7 +228,9 @@ def sweep(name: str, held_out: bool) -> str:
 
 
 def beside_dct(other: str) -> str:
-    """PSNR and SSIM with the priors dct and ``other``; runs with dct are also those of bench_s.jsonl."""
+    """PSNR and SSIM with the priors dct and ``other``; runs with dct are also those of bench_s.jsonl.
+
+    ±: standard deviation over seeds of the mean gain."""
     scans: dict[tuple[Any, ...], dict[tuple[str, int], dict[str, dict[str, float]]]] = {}
 
     def add(line: dict[str, Any], kind: str, dose: float, size: int, prior: str, scores: dict[str, float]) -> None:
@@ -251,8 +253,10 @@ def beside_dct(other: str) -> str:
         for prior in ("dct", other):
             psnr, ssim = (mean(by[prior][metric] for by in pairs.values()) for metric in ("psnr_db", "ssim"))
             cells.append(f"{psnr:.2f} / {ssim:.4f}")
-        gains = [by[other]["psnr_db"] - by["dct"]["psnr_db"] for by in pairs.values()]
-        text.append([*cells, f"{mean(gains):+.2f}", f"{min(gains):+.2f}"])
+        gains = {key: by[other]["psnr_db"] - by["dct"]["psnr_db"] for key, by in pairs.items()}
+        by_seed = [mean(gain for (_, of), gain in gains.items() if of == seed) for seed in {seed for _, seed in gains}]
+        spread = f" ± {stdev(by_seed):.2f}, {len(by_seed)} seeds" if len(by_seed) > 1 else ""
+        text.append([*cells, f"{mean(gains.values()):+.2f}{spread}", f"{min(gains.values()):+.2f}"])
     return markdown(["scan", "views", "photons", "voxels", "`dct`", f"`{other}`", "mean gain", "least"], text)
 
 

@@ -250,6 +250,18 @@ def test_a_ridge_step_follows_every_fifth_map_and_resumes_between_them(rt, scan)
         np.testing.assert_array_equal(continued, again)
 
 
+def test_ridge_follows_the_maps_of_dct_on_a_fly_scan_and_less_total_variation_at_rest(rt, scan) -> None:
+    volume, space = np.random.default_rng(0).uniform(size=scan.grid.shape).astype(np.float32), DeviceSpace(rt)
+    inputs = PriorInputs(rt, scan.grid, 5, 12)
+    priors = prior_of("dct", inputs), prior_of("ridge", replace(inputs, is_fly=True)), prior_of("ridge", inputs)
+    dct, fly, still = (space.numpy(prior(space, space.array(volume), 0.01, nonnegative=True)) for prior in priors)
+    np.testing.assert_array_equal(dct, fly)
+    assert still.std() > 1.001 * dct.std(), (still.std(), dct.std())
+    scans = scan, replace(scan, is_fly=False)
+    turned, at_rest = (run(rt, scan, "fista", motion="static", iterations=4, prior="ridge").volume for scan in scans)
+    assert not np.array_equal(turned, at_rest)
+
+
 def test_the_firm_prior_differs_from_dct_on_smaller_voxels_alone(rt, scan) -> None:
     for parts in (1, 2):
         firm, soft = (

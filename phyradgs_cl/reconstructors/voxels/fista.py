@@ -186,7 +186,8 @@ def _run(inputs: MethodInputs, options: FistaOptions, image: np.ndarray | None, 
         held = _HELD + priors.volumes_of(options.prior)
         is_short = is_on_host and system.leave_room(rt, (held + _COPIES) * volume_bytes)
         of_grid = rt, scan.grid, options.tv_iterations, options.iterations
-        prior = priors.prior_of(options.prior, priors.PriorInputs(*of_grid, image, options.prior_share, parts))
+        of_scan = image, options.prior_share, parts, scan.is_fly
+        prior = priors.prior_of(options.prior, priors.PriorInputs(*of_grid, *of_scan))
         with rt.ledger.reserved(_COPIES * volume_bytes if is_short else 0):
             weight = PriorWeight(system, frame_error(scan, options.motion), options.prior_weight)
             return Fista(system, options, prior, weight)

@@ -38,7 +38,8 @@ _NONLOCAL_STEP = 0.01  # length of a step down the nonlocal quadratic
 class PriorInputs:
     """The arguments of a prior: device, grid, and for piccs its image (nz, ny, nx) in 1/mm and the weight of the change.
 
-    tv_iterations: dual iterations per map. passes: over all frames, of the run. parts: of a voxel's side, on this grid."""
+    tv_iterations: dual iterations per map. passes: over all frames, of the run. parts: of a voxel's side, on this grid.
+    is_fly: of the scan, whose frames expose for an arc."""
 
     rt: Runtime
     grid: Grid
@@ -47,6 +48,7 @@ class PriorInputs:
     image: np.ndarray | None = None
     share: float = 0.5
     parts: int = 1
+    is_fly: bool = False
 
     def tv(self, share: float = 1.0) -> "TvPrior":
         return TvPrior(TvProx(self.rt, self.grid.shape, axis_weights(self.grid)), self.tv_iterations, share)
@@ -65,7 +67,9 @@ class PriorInputs:
         return TvAndDct(self.tv(_TV_BEFORE_CURVES), DctProx(self.rt, self.grid.shape, curves), _CURVES_NOISE)
 
     def dct_then_ridge(self) -> "ThenRidge":
-        return ThenRidge(self.tv_and_dct(_TV_BEFORE_RIDGE), RidgeStep(self.rt, self.grid.shape, learned_ridge()))
+        """Less total variation sharpens scans at rest; on a fly-scan flat bodies lose by it."""
+        before = self.tv_and_dct() if self.is_fly else self.tv_and_dct(_TV_BEFORE_RIDGE)
+        return ThenRidge(before, RidgeStep(self.rt, self.grid.shape, learned_ridge()))
 
     def nonlocal_then(self, then: "Prior", h_share: float) -> "Nonlocal":
         return Nonlocal(then, NonlocalStep(self.rt, self.grid.shape), h_share, self.passes)
