@@ -8,15 +8,16 @@ from functools import cache
 from pathlib import Path
 from types import ModuleType
 
-import numpy as np
 import pytest
 
 HERE = Path(__file__).resolve().parent
 sys.path[:0] = [str(HERE), str(HERE.parent / "benchmarks")]
 
-if "PYTEST_XDIST_WORKER" in os.environ:  # a process per core: each has one thread of PoCL's, as what it starts has
-    os.environ.setdefault("POCL_MAX_PTHREAD_COUNT", "1")
+if "PYTEST_XDIST_WORKER" in os.environ:  # a process per core: each has one thread, as what it starts has
+    for threads in ("POCL_MAX_PTHREAD_COUNT", "OPENBLAS_NUM_THREADS"):  # before NumPy loads OpenBLAS, whose threads spin
+        os.environ.setdefault(threads, "1")
 
+import numpy as np  # noqa: E402
 from guarded import guard  # noqa: E402
 from quick import collects, is_quick  # noqa: E402
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import cache
 
 import pytest
 
@@ -19,8 +20,9 @@ class Backwards(Protocol):
 
 @pytest.fixture(scope="session")
 def turned(rt) -> Callable[..., Scan]:
-    """The scan with the gantry turning on or back, and this detector model."""
+    """The scan with the gantry turning on or back, and this detector model; made once and not to be written to."""
 
+    @cache
     def make(back: bool = False, model: str = "log", axis: str = "rows") -> Scan:
         geometry = ConeGeometry(5.0, 7.0, (32, 32), (0.125, 0.125))
         scene = phantom_scene(rt, "jaw", geometry, Grid.cube(24, 2.0), 24, axis, 0)

@@ -48,6 +48,7 @@ def write_foreign(path: Path) -> None:
 def test_every_command_does_its_work(cli, tmp_path, monkeypatch, capsys) -> None:
     windows = []
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("phyradgs_cl.workflow.sweep.grid.PHANTOMS", ("jaw",))
     monkeypatch.setattr("phyradgs_cl.workflow.sweep.grid.VOXELS", 8)
     monkeypatch.setattr("phyradgs_cl.workflow.sweep.grid.PIXELS", 12)
     monkeypatch.setattr("phyradgs_cl.commands.report.view_volume", windows.append)
