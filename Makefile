@@ -34,6 +34,8 @@ $(BIN)/python:
 	$(PYTHON) -m venv $(VENV)
 
 # Editable, so that the code that runs is the code in this folder. Python compiles what it imports: most modules it does not.
+# It must keep what it has compiled, or every process compiles again.
+unexport PYTHONDONTWRITEBYTECODE
 INSTALL := -m pip install --quiet --no-compile --disable-pip-version-check --editable
 
 $(VENV)/.installed-cpu: pyproject.toml | $(BIN)/python
