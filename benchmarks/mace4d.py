@@ -3,10 +3,10 @@
     python -m venv PEER && PEER/bin/pip install mbirtorch
     python benchmarks/mace4d.py --peer-python PEER/bin/python RESULTS.jsonl [--size 32] [--views 120] [--device D]
 
-Both find the states of the object from line integrals without noise, with their default options (MACE4D: those of the
-demonstration). PSNR, its mean and least, and mean SSIM against the true state in the middle of each of MACE4D's windows;
-processor seconds. Also FBP of each window alone, and ``fista`` as if the object rested. A pixel is taken as 1 mm. With
-TORCHDYNAMO_DISABLE=1 mbirtorch runs without the compiler of PyTorch."""
+Both find the states of the object from line integrals without noise. ``moving`` has its default options, MACE4D those of the
+demonstration. A line has the mean and the least PSNR, the mean SSIM and processor seconds. The truth is the state in the
+middle of each of MACE4D's windows. FBP of each window alone and ``fista``, as if the object rested, are measured too. A pixel
+is taken as 1 mm. With TORCHDYNAMO_DISABLE=1 mbirtorch runs without the compiler of PyTorch."""
 
 import argparse
 import subprocess

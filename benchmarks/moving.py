@@ -9,8 +9,8 @@ Volumes and scanner as benchmarks/scans.py has them: TIGRE's noise at 1e4 photon
 exposures without gaps. A turn takes a minute. The breath has a period of 4 s, jittered by 10 %, and an amplitude of 15 % of
 half the box; --motion takes another preset with its own defaults. PSNR and SSIM against the reference volume; seconds of
 processor time. The case unknown has means over ten true states, of the method ``moving`` and of the volume that --method
-makes as if the object rested; the case still has ``moving`` and --method on an object at rest. A run goes on where it was
-interrupted: a line for each volume, number of views, method, case and motion."""
+makes as if the object rested; the case still has ``moving`` and --method on an object at rest. A run that was
+interrupted continues: a line for each volume, number of views, method, case and motion."""
 
 import argparse
 import json
@@ -108,7 +108,7 @@ def ball_at(ball: Ellipsoid, field: Deformation, weights: np.ndarray) -> Ellipso
 
 
 def centre_mm(volume: np.ndarray, grid: Grid, ball: Ellipsoid) -> np.ndarray:
-    """The centre of what is denser than halfway between body and ball, within two radii of the ball's centre."""
+    """Returns the centre of the voxels near the ball that are denser than the mean of body and ball: within two radii."""
     z, y, x = np.meshgrid(*grid.axes_mm(), indexing="ij")
     places_mm = np.stack([x, y, z], -1)
     near = np.linalg.norm(places_mm - ball.centre_mm, axis=-1) < 2 * ball.reach_mm

@@ -3,9 +3,9 @@
     python benchmarks/priors.py VOLUMES docs/results/priors.jsonl --priors dct curves
     python docs/make_results.py      # the tables
 
-Scans are those of benchmarks/tables but for ``--dose`` and ``--views``. Fly-scans of other than 25 and 50 views expose as
-large a share of a turn. ``numbers`` of a line names what the curves were trained on. Runs that are in the file are not
-made again."""
+Scans are those of benchmarks/tables, with the photons of ``--doses`` and the numbers of ``--views``. All exposures of a
+fly-scan together cover one turn, unless it has 25 or 50 views. ``numbers`` of a line names what the prior was trained on. Runs that
+are in the file are not made again."""
 
 import argparse
 import json

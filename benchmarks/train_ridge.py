@@ -5,7 +5,7 @@
 
 The step takes G(v) = Wᵀ g(W v) from a volume v (Goujon, Neumayer and Unser, SIAM J. Imaging Sci. 17 (2024) 91). W is two
 convolutions of 3³, from 1 to 4 to 16 channels, whose product has zero mean. At noise of deviation σ
-g_i(t) = a_i clip(t, ± σ k_i) − b_i clip(t, ± σ l_i), with Σ b_i |Ŵ_i|² ≤ 1 at all frequencies: the regulariser plus ½‖x‖² is
+g_i(t) = a_i clip(t, ± σ k_i) − b_i clip(t, ± σ l_i). Σ b_i |Ŵ_i|² ≤ 1 at all frequencies, so the regulariser plus ½‖x‖² is
 convex. Every cube counts by the logarithm of its squared error. The noise is smooth, as on the smaller voxels of ``fista``,
 which the pixels do not resolve. Without ``--volumes``, cubes come from procedural volumes, as for ``curves``
 (train_curves.py). Needs PyTorch, which the extra ``neural`` installs."""
