@@ -5,8 +5,8 @@
 
 Both find the states of the object from line integrals without noise. ``moving`` has its default options, MACE4D those of the
 demonstration. A line has the mean and the least PSNR, the mean SSIM and processor seconds. The truth is the state in the
-middle of each of MACE4D's windows. FBP of each window alone and ``fista``, as if the object rested, are measured too. A pixel
-is taken as 1 mm. With TORCHDYNAMO_DISABLE=1 mbirtorch runs without the compiler of PyTorch."""
+middle of each of MACE4D's windows. FBP of each window alone and ``fista``, as if the object rested, are measured too. A
+pixel is taken as 1 mm. With TORCHDYNAMO_DISABLE=1 mbirtorch runs without the compiler of PyTorch."""
 
 import argparse
 import subprocess

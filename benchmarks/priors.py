@@ -4,8 +4,8 @@
     python docs/make_results.py      # the tables
 
 Scans are those of benchmarks/tables, with the photons of ``--doses`` and the numbers of ``--views``. All exposures of a
-fly-scan together cover one turn, unless it has 25 or 50 views. ``numbers`` of a line names what the prior was trained on. Runs that
-are in the file are not made again."""
+fly-scan together cover one turn, unless it has 25 or 50 views. ``numbers`` of a line names what the prior was trained on.
+Runs that are in the file are not made again."""
 
 import argparse
 import json
