@@ -132,6 +132,9 @@ def test_distances_and_pulses_are_named_by_the_door(run, tmp_path, make_truth) -
     assert "[beam] pulse_start: found 2 to 2.4 s" in run(w.write_tiff(tmp_path / "tiff", make_truth(), beam))[2]
     negative = SHEET_TOML.replace("0.4", "-0.4")
     assert "[timing] exposure_s: found -0.4" in run(w.write_tiff(tmp_path / "other", make_truth(), negative))[2]
+    long = w.write_tiff(tmp_path / "long", make_truth(), SHEET_TOML.replace("0.4", "40.0"))
+    assert f"{long}/scan.toml [timing] exposure_s: found exposure of 40 s, 32 times" in run(long)[2]
+    assert "phyradgs: --exposure-s: found exposure of 50 s" in run(long, "--exposure-s", "50")[2]
 
 
 def test_one_pixel_size_means_square_pixels(run, tmp_path, make_truth) -> None:

@@ -10,7 +10,14 @@ import numpy as np
 from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.acquisition.readout import frame_time_of, readout_of
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.importers.assemble import StoredTiming, assemble_scan, make_timing, turning, with_options
+from phyradgs_cl.importers.assemble import (
+    StoredTiming,
+    assemble_scan,
+    make_timing,
+    names_in_file,
+    turning,
+    with_options,
+)
 from phyradgs_cl.importers.options import FIELDS, OF_BARE_FRAMES, WORDS, ImportOptions
 from phyradgs_cl.importers.reading import tiff
 from phyradgs_cl.importers.reading.files import SafeFolder, check_numbering, checked_name, read_numbers
@@ -62,16 +69,19 @@ def import_scan(path: Path, options: ImportOptions) -> Scan:
     return assemble_scan(
         integrals, turning(geometry, angle_rad, timing), geometry, timing, combined,
         title=tables[""].word("title", default=folder.root.resolve().name), source=str(path),
-        grid=scanner.grid if tables[""].has("volume") else None, lag=scanner.lag, names=_subjects(tables),
+        grid=scanner.grid if tables[""].has("volume") else None, lag=scanner.lag, names=_subjects(tables, options),
     )
 
 
-def _subjects(tables: dict[str, Fields]) -> dict[str, str]:
-    """Returns the names in messages of values that the file states and that are no options."""
-    subjects = {"grid": tables[""].name("[volume]"), "angles": tables["angles"].subject}
+def _subjects(tables: dict[str, Fields], options: ImportOptions) -> dict[str, str]:
+    """Returns the names in messages of the values that the file states and no option replaces."""
+    keys = {"exposure_s": ("timing", "exposure_s"), "readout_s": ("timing", "readout_s")}
     if tables["readout"].has("readout_ms"):
-        subjects["readout_s"] = tables["readout"].name("readout_ms")
-    return subjects
+        keys["readout_s"] = ("readout", "readout_ms")
+    stated = {field: tables[table].name(key) for field, (table, key) in keys.items() if tables[table].has(key)}
+    return {
+        "grid": tables[""].name("[volume]"), "angles": tables["angles"].subject, **names_in_file(options, stated)
+    }
 
 
 def _tables(path: Path) -> dict[str, Fields]:
