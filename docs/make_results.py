@@ -1,4 +1,4 @@
-"""Fills the tables of docs/results/*.md from the recorded runs beside them: python docs/make_results.py [--check]
+"""Fills the tables of docs/results/*.md from the recorded runs in that folder: python docs/make_results.py [--check]
 
 A table stands between ``<!-- table: NAME -->`` and ``<!-- end of table -->``; NAME is a key of ``TABLES``. With
 ``--check`` nothing is written, and the exit status is 1 where a page differs from its data.
@@ -69,7 +69,9 @@ def quality(name: str, protocol: str, with_seconds: bool = False) -> str:
         seconds = " / ".join(seconds_of(cell) for cell in cells)
         text.append([label, *(both(cell) for cell in cells), gain, both(bound), *([seconds] if with_seconds else [])])
     heads = ["method", "motion ignored", "motion known", "gain", "stop-and-shoot"]
-    return markdown([*heads, "processor s ignored / known"] if with_seconds else heads, text)
+    table = markdown([*heads, "processor s ignored / known"] if with_seconds else heads, text)
+    spreads_db = [float(row["psnr_db_spread"]) for key, row in rows.items() if key[0] == protocol and row["psnr_db_spread"]]
+    return table + (f"\nStandard deviation over seeds: at most {max(spreads_db):.2f} dB.\n" if spreads_db else "")
 
 
 def number(row: Row, name: str = "psnr_db") -> float:
@@ -78,12 +80,11 @@ def number(row: Row, name: str = "psnr_db") -> float:
 
 
 def both(row: Row | None) -> str:
-    """PSNR and SSIM as the pages print them, with the spread of the PSNR over seeds where there is one."""
+    """PSNR and SSIM as the pages print them."""
     if row is None:
         return "–"
     few = "†" if row["volumes"] == "2" and row["size"] == "M" else ""
-    spread = f" ± {float(row['psnr_db_spread']):.2f}" if row["psnr_db_spread"] else ""
-    return f"{number(row):.2f}{spread} / {number(row, 'ssim'):.3f}{few}"
+    return f"{number(row):.2f} / {number(row, 'ssim'):.3f}{few}"
 
 
 def seconds_of(row: Row | None) -> str:
@@ -156,7 +157,7 @@ def centres_object() -> str:
     text = []
     for protocol in ("rapid", "standard"):
         errors = {name: [100 * line[name] for line in lines if line["protocol"] == protocol] for name in ONE_FRAME}
-        text.append([protocol, *(f"{min(of):.2g} to {max(of):.2g} %" for of in errors.values())])
+        text.append([protocol, *(f"{min(of):.2g}–{max(of):.2g} %" for of in errors.values())])
     return markdown(["protocol", *ONE_FRAME.values()], text)
 
 
@@ -261,7 +262,7 @@ def beside_dct(other: str) -> str:
 
 
 def beside_rtk() -> str:
-    """FDK, projector and adjoint beside RTK's, on two processors."""
+    """FDK, projector and adjoint compared with RTK's, on two processors."""
     text = []
     for processor, suffix in (("AMD EPYC", ""), ("Intel Xeon", "_intel")):
         fdk = json.loads((RESULTS / f"rtk_fdk{suffix}.json").read_text())["speed"]
@@ -363,7 +364,7 @@ def clean_scans() -> str:
         clean = [line for line in cell if "lost_db" in line]
         changed = sum(not line["unchanged"] for line in clean)
         rings = [[line["regained"] for line in cell if line["steps"] == f"rings {spread}"] for spread in (0.01, 0.02, 0.05)]
-        ranges = [f"{100 * min(parts):.0f} to {100 * max(parts):.0f} %" if parts else "" for parts in rings]
+        ranges = [f"{100 * min(parts):.0f}–{100 * max(parts):.0f} %" if parts else "" for parts in rings]
         lost = f"{changed} of {len(clean)}, {max((line['lost_db'] for line in clean), default=0):.3f} dB"
         text.append([method, str(views), str(len({line["phantom"] for line in cell})), lost, *ranges])
     heads = ["method", "views", "volumes", "clean: changed, most lost", "rings of 1 %", "2 %", "5 %"]
@@ -405,7 +406,7 @@ def calibrated_parameters() -> str:
         worst = max(abs(one["error"]) for one in found)
         inside = sum(abs(one["z"]) <= 2 for one in found)
         sigma = mean(one["deviation"] for one in found)
-        text.append([case, f"{size}³", name, f"{worst:.2g} {unit}", f"{sigma:.2g}", f"{inside} of {len(found)}"])
+        text.append([case, f"{size}³", name, f"{worst:.2g} {unit}", f"{sigma:.2g}", f"{inside}/{len(found)}"])
     return markdown(["case", "voxels", "parameter", "worst error", "σ stated", "within 2 σ"], text)
 
 
@@ -424,7 +425,7 @@ def calibrated_psnr() -> str:
 
 
 def fbp_peers() -> str:
-    """Filtered backprojection beside its peers: differences, PSNR, seconds."""
+    """Filtered backprojection compared with its peers: differences, PSNR, seconds."""
     found = json.loads((RESULTS / "fbp_peers.json").read_text(encoding="utf-8"))
     rows = []
     for name in ("ours", "skimage", "astra", "silx"):
@@ -591,7 +592,7 @@ TABLES: dict[str, Callable[[], str]] = {
 
 
 def filled(text: str) -> str:
-    """A page with its tables made anew from the data."""
+    """A page with its tables made from the data."""
     return BLOCK.sub(lambda block: block[1] + TABLES[block[2]]() + block[3], text)
 
 
