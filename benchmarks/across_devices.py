@@ -3,9 +3,9 @@
     python benchmarks/across_devices.py store FILE.npz [--device D]
     python benchmarks/across_devices.py compare FILE.npz [--device D] [--json FILE]
 
-Inputs are drawn by NumPy from fixed seeds and made without a device, so that both see the same bits. What is printed is the
-largest difference: of images and volumes relative to the largest number, of gradients the norm of the difference over
-the norm, worst of place, scale, rotation and density.
+NumPy draws the inputs from fixed seeds, so that both devices see the same bits. The largest differences are printed: of
+images and volumes relative to the largest number, of gradients the norm of the difference over the norm. Of place, scale,
+rotation and density the worst counts.
 """
 
 import argparse

@@ -2,25 +2,26 @@
 
     python benchmarks/calibrate.py FOLDER RESULTS.jsonl [--cases panel,...] [--only NAME,...] [--size 32] [--views 25]
 
-docs/make_results.py makes the tables of docs/results/calibrate.md from the lines.
-FOLDER holds volumes as benchmarks/tables takes them; --only spheres is the sphere phantom, in closed form. Scans are
-R2-Gaussian's scanner with TIGRE's noise, detectors twice as wide as the volume; the volume is fista-tv's, every line at its
-own times. Cases:
+docs/make_results.py makes the tables of docs/results/calibrate.md from the lines. FOLDER holds volumes as benchmarks/tables
+takes them; --only spheres is the sphere phantom, in closed form. The scanner is R2-Gaussian's with TIGRE's noise and a panel
+twice as wide as the volume. Volumes are those of fista-tv, every line at its own times.
 
-    panel      offset of 2.5 pixels, roll of 0.5°, tilt about v of 1°, all at once
-    right      nothing wrong; everything that may be asked for by itself is
-    columns    readout 20 % longer than stated, columns read
-    rows       the same, rows read: not to be known from such a scan
-    turned     readout and exposure 20 % longer than stated, rows read, and a second scan turned the other way
-    wobble     0.3° and 1 pixel (RMS) per view
-    slow       the same by six splines of time, and asked for so
-    kaist      0.03 rad and 1 voxel (RMS) per view, the noise of Choi et al. (2026), for --views 75
-    motion     the object turns by up to 2° and moves by up to 2 voxels while it is scanned, about and along all axes
-    beads      a phantom of known shape, which lies anyhow: readout, exposure, offset, roll, tilt and both distances off at
-               once, drawn by the seed, rows read (of no volume)
-    draw       columns read; offset to 2.5 pixels, roll to 0.5°, tilt about v to 1°, readout to 20 %, drawn by the
-               seed: how often the stated intervals hold the truth (no volumes are scored)
-    draw_rows  the same, rows read: readout and exposure are not to be known
+Cases:
+
+    panel      offset of 2.5 pixels, roll of 0.5°, tilt about v of 1°, all at once.
+    right      nothing wrong; every parameter is estimated.
+    columns    readout 20 % longer than stated, columns read.
+    rows       the same, rows read: such a scan does not determine it.
+    turned     readout and exposure 20 % longer than stated, rows read, and a second scan turned the other way.
+    wobble     0.3° and 1 pixel (RMS) per view.
+    slow       the same by six splines of time, and estimated so.
+    kaist      0.03 rad and 1 voxel (RMS) per view, the noise of Choi et al. (2026), for --views 75.
+    motion     the object turns by up to 2° and moves by up to 2 voxels during the scan, about and along all axes.
+    beads      a phantom of known shape at any place, rows read. The seed draws readout, exposure, offset, roll, tilt and
+               both distances. No volume is scored.
+    draw       columns read. The seed draws the offset to 2.5 pixels, roll to 0.5°, tilt about v to 1°, readout to 20 %.
+               Counts how often the stated intervals hold the truth; no volume is scored.
+    draw_rows  the same, rows read, which do not determine readout and exposure.
 """
 
 import time

@@ -1,12 +1,11 @@
-"""What it is worth to model the detector: every effect modelled and ignored, several methods, mean over seeds.
+"""Measures the gain from modelling the detector: every effect modelled and ignored, several methods, mean over seeds.
 
     python benchmarks/detector_models.py RESULTS.jsonl [--names shepp-logan,VOLUME.h5] [--effects lag,pulse] [--seeds 0]
     python benchmarks/detector_models.py RESULTS.jsonl --table
 
-Rapid fly-scans (25 frames of 14.4 degrees, rows read out) of 48 cubed voxels on 72 squared pixels, counts of 1e5 photons
-and electronic noise of 10 unless an effect says otherwise. Iterative methods take every line at 5 times of its own;
-phyradgs is exact in time, and with micro-views (8x5) where that is said. Results are one line per run: the command goes on
-where it was interrupted.
+Rapid fly-scans: 25 frames of 14.4 degrees, rows read out, 48 cubed voxels, 72 squared pixels. Counts are of 1e5 photons
+with electronic noise of 10, unless an effect says otherwise. Iterative methods take every line at its own 5 times. phyradgs
+is exact in time, or has micro-views (8x5) by name. Results are one line per run, and the command resumes.
 
 Effects: intensity (peak line integral 4 and 6; ignored: line integrals are averaged), pulse (all lines share one flash;
 ignored: the beam is always on), lag (0.1 and 0.3; ignored: not undone), low-dose (300 photons; modelled: pixels are

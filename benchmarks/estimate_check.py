@@ -1,11 +1,10 @@
-"""Peak memory of host and device by method, and what `phyradgs estimate` says beside what then happens.
+"""Compares time and peak memory that `phyradgs estimate` predicts with those of the run, by method.
 
     python benchmarks/estimate_check.py [--quick] [--size 64] [--methods phyradgs,r2,sirt] [--device D] [--json FILE]
 
-Estimate and run are processes of their own, one after the other. Ratios are said over happened, for the wall time of the
-whole process (its start, reading, writing and comparing too), the largest resident memory, and the most that was held in
-device buffers.
-On a CPU the resident memory has the buffers in it. --estimates no measures the runs alone: memory by method.
+Estimate and run are separate processes, one after the other. Ratios are prediction over measurement. Time is the wall time
+of the whole process, with its start, reading, writing and comparing. Memory is the largest resident memory and the largest
+sum of device buffers. On a CPU the resident memory includes the buffers. --estimates no measures the runs alone.
 """
 
 import json

@@ -3,9 +3,9 @@
     python -m venv PEER && PEER/bin/pip install astra-toolbox silx scikit-image "pyopencl[pocl]"
     python benchmarks/fbp_peers.py --peer-python PEER/bin/python [--json docs/results/fbp_peers.json] [--quick]
 
-Shepp-Logan in Kak and Slaney's table, in closed form, half a turn. Differences: relative RMS inside the panel's circle, of
-129 columns and 180 views. PSNR: range 1, against the phantom at the pixels' centres. Speed: 2048 columns, 1800 views and 16
-rows; peers reconstruct slice by slice, so they get a single row, and their times count sixteenfold.
+The phantom is Shepp-Logan by Kak and Slaney's table, in closed form, over half a turn. Differences are relative RMS inside
+the panel's circle, of 129 columns and 180 views. PSNR has the range 1, against the phantom at the pixels' centres. Speed is
+of 2048 columns, 1800 views and 16 rows. Peers reconstruct slice by slice: they get one row, and times count sixteenfold.
 """
 
 import subprocess

@@ -3,10 +3,10 @@
     python benchmarks/large.py [--quick] [--voxels 256] [--detector 512] [--views 4] [--gaussians 50000] [--memory 64MiB]
                                [--device D] [--json FILE]
 
-The ray-driven operators, FDK's backprojection and the voxeliser, once with all of the device's memory and once with
-``--memory`` for their bricks. Differences are the largest, relative to the largest value: 0 is bit for bit. On a device with
-buffers of more than 8 GiB, ``--voxels 1300`` has more than 2^31 of them as a whole, so that 64-bit indices stand against
-32-bit ones.
+Runs the ray-driven operators, FDK's backprojection and the voxeliser twice. The first run has all of the device's memory,
+the second ``--memory`` for its bricks. Differences are the largest, relative to the largest value: 0 is bit for bit. On a
+device with buffers of more than 8 GiB, ``--voxels 1300`` has more than 2^31 of them as a whole: 64-bit indices are compared
+with 32-bit ones.
 """
 
 import time

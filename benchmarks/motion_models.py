@@ -4,10 +4,10 @@
     python benchmarks/motion_models.py cost COST.json [--size 64]
     python benchmarks/motion_models.py figure RESULTS.jsonl COST.json TIME_EXACT.json FIGURE.png
 
-Motions: static, MxN (micro-views), "exact BOUND". ``run`` scans the volumes as benchmarks/scans.py does (rapid, rows,
-TIGRE's noise at 1e4 photons and sigma 10) and goes on where it was interrupted. ``cost`` times whole iterations, density
-control left out, on one scan of the foot phantom: the median over rounds in which all motions take turns. TIME_EXACT.json
-is what benchmarks/time_exact.py writes: errors of one frame.
+Motions are static, MxN (micro-views) and "exact BOUND". ``run`` scans the volumes as benchmarks/scans.py does (rapid, rows,
+TIGRE's noise at 1e4 photons and sigma 10), and resumes. ``cost`` times whole iterations without density control on one scan
+of the foot phantom. It takes the median over rounds in which all motions take turns. benchmarks/time_exact.py writes
+TIME_EXACT.json, the errors of one frame.
 """
 
 import argparse

@@ -2,17 +2,17 @@
 
     python benchmarks/mpi_scaling.py [--quick] [--ranks 1,2,3,4] [--json docs/results/mpi_scaling.json]
 
-In an environment with the extra [mpi]. Every number of ranks is a run of mpiexec on this machine; where the device is its
-processor, a rank has one thread of PoCL, and times are seconds of the processor, not of the clock. Splats exact in time, 25
-frames. Strong: four frames per step whatever the ranks. Weak: one frame per rank. Of every part the least of the steps
-counts, on the rank for which it is largest. Waiting and whole steps are by the clock, waiting is a median; with more ranks
-than processors, or others at work on them, they say nothing.
+Needs the extra [mpi]. Every number of ranks is a run of mpiexec on this machine. Where the device is its processor, a rank
+has one thread of PoCL, and times are processor seconds. The splats are exact in time, on 25 frames. Strong runs have four
+frames per step whatever the ranks, weak ones one frame per rank. Of every part the least of the steps counts, on the rank
+for which it is largest. Waiting and whole steps are by the clock, waiting is a median. They mean nothing with more ranks
+than free processors.
 
-The model. A step of B frames on R ranks takes
+The model of a step of B frames on R ranks:
 
-    ceil(B / R) (kernels and host of a frame) + (kernels and host of a step) + sum of the gradients,
+    ceil(B / R) (kernels and host of a frame) + (kernels and host of a step) + sum of the gradients.
 
-the parts by least squares from the strong runs, and the sum is 13 rows x 8 bytes x Gaussians through Allreduce:
+The parts come from the strong runs by least squares. The sum is 13 rows x 8 bytes x Gaussians through Allreduce:
 2 log2(R) latencies and 2 (R - 1) / R times the bytes over the network's rate. The rate of this machine is measured.
 """
 

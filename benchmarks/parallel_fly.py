@@ -2,11 +2,11 @@
 
     python benchmarks/parallel_fly.py docs/results/parallel_fly.jsonl [--views 180 720] [--blur-px 0.5 5] [--dose 1e4]
 
-A disc of unit attenuation over its diameter holds four gratings of 4 pixels' period across the motion, three at 0.85 of the
-radius and one in the middle, and discs of other contrasts. 128 columns of 4 rows; views over as many turns as exposures of
-the stated blur need, at evenly spaced angles modulo a turn. Frames are averages of intensity over 24 times of an exposure,
-of the object on pixels half as large, with Poisson noise. The modulation is the amplitude of a grating in the volume over
-that in the truth. Runs that the results file has are not made again."""
+A disc of unit attenuation over its diameter holds discs of other contrasts and four gratings of 4 pixels' period across the
+motion. Three gratings lie at 0.85 of the radius, one in the middle. The panel has 128 columns of 4 rows. Views go over as
+many turns as exposures of the stated blur need, at evenly spaced angles modulo a turn. Frames are averages of intensity over
+24 times of an exposure, of the object on pixels half as large, with Poisson noise. The modulation is the amplitude of a
+grating in the volume over that in the truth. Runs that the results file has are not made again."""
 
 import argparse
 import json

@@ -1,4 +1,4 @@
-"""Priors of ``fista`` beside each other, in the default's own protocol: a line per volume, scan, seed and prior.
+"""Compares priors of ``fista`` in the protocol of the default: a line per volume, scan, seed and prior.
 
     python benchmarks/priors.py VOLUMES docs/results/priors.jsonl --priors dct curves
     python docs/make_results.py      # the tables

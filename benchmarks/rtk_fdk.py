@@ -1,13 +1,13 @@
-"""FDK beside RTK's on the same projections: difference, RTK's own quality limits, and speed as a ratio of one run.
+"""Compares FDK with RTK's on the same projections: difference, RTK's own quality limits, and speed as a ratio of one run.
 
     python -m venv PEER && PEER/bin/pip install itk-rtk numpy
     python benchmarks/rtk_fdk.py --peer-python PEER/bin/python [--json docs/results/rtk_fdk.json] [--device D]
 
-Shepp-Logan in Kak and Slaney's table, scaled by 116 mm, contrasts as they are (1/mm); source 600 mm from the axis and
-1200 mm from the detector, 128 x 128 pixels of 4 mm, 128^3 voxels of 2 mm: the set-up of RTK's own tests, whose limits
-the table names. PSNR: range 2, over the voxels that every view sees (displaced: that some view of every opposite
-pair sees), against the phantom at the voxels' centres; and as RTK's tests count it, over the whole cube with no error
-outside that field of view.
+The set-up is that of RTK's own tests, whose limits the table names: Shepp-Logan by Kak and Slaney's table, scaled by 116 mm,
+with its contrasts in 1/mm. The source is 600 mm from the axis and 1200 mm from the detector, with 128 x 128 pixels of 4 mm
+and 128^3 voxels of 2 mm. PSNR has the range 2, against the phantom at the voxels' centres. It counts the voxels that every
+view sees (displaced: that some view of every opposite pair sees). A second PSNR counts as RTK's tests do: over the whole
+cube, with no error outside that field of view.
 """
 
 import subprocess

@@ -4,10 +4,10 @@
     python benchmarks/sweep.py VOLUMES docs/results/passes.jsonl --option iterations --holdout 2
     python docs/make_results.py      # the tables of both in docs/results/settings.md
 
-A line per volume, scan and factor: PSNR in dB with ``factor`` times the default of the option, and with ``--holdout`` the
-error on so many percent of the pixels, which are kept from it. Runs that are there are not made again. Scans are those of
-benchmarks/tables but for ``--dose`` and ``--views``; weights are swept with 30 passes on the scan's own voxels
-(``subvoxels`` 1), passes as they are by default.
+Writes a line per volume, scan and factor: the PSNR in dB with ``factor`` times the default of the option. ``--holdout`` adds
+the error on that percentage of the pixels, which the run does not see. Runs of the file are not made again. Scans are those
+of benchmarks/tables with other ``--dose`` and ``--views``. Weights are swept with 30 passes on the scan's own voxels
+(``subvoxels`` 1), passes with the other defaults.
 """
 
 import argparse

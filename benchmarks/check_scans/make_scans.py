@@ -3,14 +3,14 @@
     python -m venv PEER && PEER/bin/pip install itk-rtk numpy h5py tifffile
     PEER/bin/python benchmarks/check_scans/make_scans.py OUT --volumes DIR [--only NAME] [--phyradgs CMD]
 
-Nothing here imports phyradgs_cl: line integrals come from RTK (Joseph's method in a voxel volume of 64^3, closed form for
-Shepp-Logan), rendered at moments 0.6 degrees apart; every line averages intensities over its own exposure; NumPy counts
-photons, flats and darks; h5py writes docs/formats.md by the letter. A few scans are TIFF folders or RTK's files, which
+Nothing here imports phyradgs_cl. RTK computes line integrals at moments 0.6 degrees apart: by Joseph's method in a volume of
+64^3 voxels, in closed form for Shepp-Logan. Every line averages intensities over its own exposure. NumPy counts photons,
+flats and darks; h5py writes docs/formats.md by the letter. A few scans are TIFF folders or RTK's files, which
 `phyradgs import` reads; the folders stay in OUT/source. DIR holds NAME_128.h5 with a dataset `volume` (z, y, x).
 
-OUT/good and OUT/fault get the scans, OUT/truth the attenuation (z, y, x) in 1/mm of each, OUT/manifest.jsonl one line each:
-file, group, kind, object, what was planted, which questions are right to alarm, which words `consistency` should say, why
-a fault cannot be decided. A scan that is in the manifest is not made again.
+OUT/good and OUT/fault get the scans, OUT/truth the attenuation (z, y, x) in 1/mm of each. OUT/manifest.jsonl has one line
+for each: file, group, kind, object and planted fault; the questions that should alarm, the words of `consistency`, and why a
+fault cannot be decided. A scan that is in the manifest is not made again.
 """
 
 import argparse
