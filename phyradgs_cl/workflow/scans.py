@@ -58,7 +58,7 @@ def phantom_of(name: str) -> str | EllipsoidPhantom:
     if name.endswith(_TOML):
         return load_beads(Path(name))
     if name not in PHANTOMS:
-        remedy = suggest_name(name, PHANTOMS, "or give the path of a .toml file")
+        remedy = suggest_name(name, PHANTOMS, "or give the path of a .toml file; voxels of a file are --volume")
         raise InputError("--phantom", checks.short_repr(name), f"one of {', '.join(PHANTOMS)}", remedy)
     return name
 

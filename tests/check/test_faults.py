@@ -69,6 +69,7 @@ def test_a_beam_without_a_fan_leaves_sizes_and_offset_open() -> None:
     assert found(-18.0).unit == OTHER_CAUSE and "pixel sizes were 10 times as large" in found(-18.0).text
     assert "--fix-offset" not in found(-18.0).advice and "--fix-offset" in found(-15.0).advice
     assert "mirrored in u" in found(-40.0).text and "mirrored" not in found(-15.0).text
+    assert found(0.49).verdict == SUSPICIOUS and found(0.3).verdict == OK  # an axis on pixel N/2 in place of (N-1)/2
 
 
 @pytest.mark.parametrize("pixels", [-0.5, 0.5])
