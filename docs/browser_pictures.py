@@ -37,8 +37,7 @@ SIMULATE_MOVING = (
 RECONSTRUCT_MOVING = "reconstruct moving.h5 --object-motion moving.h5 --method fdk -o reference.h5"
 SECTION = f"""## The report and the live page in a browser
 
-A run of the paper's method: its live page, and the report that this page becomes. `python docs/browser_pictures.py` takes
-the pictures in Chromium.
+A run of the paper's method: its live page, and the report that this page becomes (`python docs/browser_pictures.py`).
 
 ```sh
 phyradgs {SIMULATE}
@@ -55,7 +54,7 @@ A browser without WebGL2 shows the slices.
 
 ![Without WebGL2](images/gallery/report_without_webgl.png)
 
-An object that breathes, at one time of its scan: arrows from where matter is in the reference volume, twice as long.
+An object that breathes: arrows from where matter is in the reference volume, twice as long.
 
 ```sh
 phyradgs {SIMULATE_MOVING}
