@@ -30,8 +30,8 @@ HEAD = """# Gallery
 **Use this when** you look for a command that does what you need. **Run** `python docs/gallery.py`, which makes this page
 from its commands. **Trust it if** your scan resembles the phantom: [real scans](real.md) gain less.
 
-Each picture shows one slice of the truth and of the volumes, on one grey scale, with their PSNR. Seconds are processor seconds
-of all commands of a result, on two cores of a shared machine.
+Each picture shows one slice of the truth and of the volumes, on one grey scale, with their PSNR. Seconds are processor
+seconds of all commands of a result, on two cores of a shared machine.
 """
 
 
