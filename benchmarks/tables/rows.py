@@ -70,7 +70,7 @@ class Row:
             return ""
         if not has_torch():
             return "needs PyTorch"
-        from phyradgs_cl.neural.tensors import torch_device
+        from phyradgs_cl.neural.field import torch_device
 
         return "needs a GPU" if voxels > _MOST_NEURAL_VOXELS and torch_device("auto").type == "cpu" else ""
 

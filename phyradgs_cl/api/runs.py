@@ -32,8 +32,8 @@ from phyradgs_cl.prepare import DEFAULT_STEPS, flat_correction
 from phyradgs_cl.progress import Ticker, has_reader
 from phyradgs_cl.reconstructors import DEFAULT_METHOD, ObjectMotion, Reconstruction, State, preprocessing_of
 from phyradgs_cl.reconstructors import reconstruct as run_method
-from phyradgs_cl.reconstructors.frames.preprocess import prepared
 from phyradgs_cl.reconstructors.plan import InitialVolume, plan_run
+from phyradgs_cl.reconstructors.preprocess import prepared
 from phyradgs_cl.reconstructors.result import ProgressReport, ignore_progress, interrupted
 from phyradgs_cl.signals import keep_finished_work
 from phyradgs_cl.simulation import OPTION_NAMES, scanner_for, scanner_options, simulated_scan

@@ -16,7 +16,7 @@ from phyradgs_cl.acquisition.altered.perturbed import GeometryCorrection, Sway, 
 from phyradgs_cl.calibrate.problem import CoarseProblem
 from phyradgs_cl.detector import noise_level
 from phyradgs_cl.operators.rays.operator import RayOperator
-from phyradgs_cl.reconstructors.fits.augmented import AugmentedOperator, ViewParameters
+from phyradgs_cl.reconstructors.fits.residuals import AugmentedOperator, ViewParameters
 from phyradgs_cl.reconstructors.voxels.cgls import Cgls
 
 SPLINES = 7  # of a motion: about one per seventh of the scan

@@ -27,7 +27,7 @@ from phyradgs_cl.check.hypotheses import (
 )
 from phyradgs_cl.check.timing import is_full_turn
 from phyradgs_cl.reconstructors.fits import axis
-from phyradgs_cl.reconstructors.fits.opposite import opposite_shift
+from phyradgs_cl.reconstructors.fits.axis import opposite_shift
 from phyradgs_cl.reconstructors.fits.residuals import fit_squares, residual_ratio, t_statistic
 from phyradgs_cl.runtime import Runtime
 

@@ -1,12 +1,10 @@
 """The attenuation field: a voxel volume on a grid, or a cloud of radiative Gaussians; how it deforms in time."""
 
 from phyradgs_cl.fields.deformation import Deformation, control_points
-from phyradgs_cl.fields.gating import Gating
 from phyradgs_cl.fields.gaussians import Activation, Gaussians
 from phyradgs_cl.fields.grid_choice import GridChoice
-from phyradgs_cl.fields.states import MovingTruth
+from phyradgs_cl.fields.moving import Gating, MovingTruth, deformed
 from phyradgs_cl.fields.volume import Grid, triple
-from phyradgs_cl.fields.warp import deformed
 
 __all__ = [
     "Activation", "Deformation", "Gating", "Gaussians", "Grid", "GridChoice", "MovingTruth", "control_points", "deformed",

@@ -10,8 +10,17 @@ from phyradgs_cl.metrics.align import (
     resampled,
     shared_slices,
 )
-from phyradgs_cl.metrics.motion import edge_points_mm, motion_error_mm
-from phyradgs_cl.metrics.quality import HELD_OUT, METRICS, compare, printed, psnr, ssim, ssim_map
+from phyradgs_cl.metrics.quality import (
+    HELD_OUT,
+    METRICS,
+    compare,
+    edge_points_mm,
+    motion_error_mm,
+    printed,
+    psnr,
+    ssim,
+    ssim_map,
+)
 from phyradgs_cl.metrics.slices import slices_png
 
 __all__ = [

@@ -1,4 +1,4 @@
-"""How close a volume is to the truth: peak signal-to-noise ratio and structural similarity.
+"""How close a volume is to the truth: peak signal-to-noise ratio and structural similarity. How well a motion is known.
 
 SSIM (Z. Wang et al., IEEE Trans. Image Process. 13(4), 600-612, 2004) is taken in 2D with an 11×11 Gaussian window of sigma
 1.5 and zeros beyond the border. It is averaged over the slices of each axis whose truth is not empty, then over the axes, as
@@ -12,13 +12,16 @@ import numpy as np
 import scipy
 from numpy.typing import ArrayLike, NDArray
 
-from phyradgs_cl.checks import finite, positive, shape
+from phyradgs_cl import checks
 from phyradgs_cl.errors import InputError
+from phyradgs_cl.fields import Deformation, Grid
 
 Array = NDArray[np.float64]
 WINDOW, SIGMA = 11, 1.5
 K1, K2 = 0.01, 0.03
 _VOXELS_PER_BATCH = 1 << 20  # about ten float64 arrays of this size live at once: 80 MB
+_EDGE = 0.25  # of the steepest slope: voxels at which a displacement can be seen
+_MOST_POINTS = 2000
 
 
 @dataclass(frozen=True)
@@ -82,13 +85,13 @@ def checked_pair(
 ) -> tuple[NDArray[np.floating], NDArray[np.floating], float]:
     """Returns both arrays with at least one axis, and the data range. Raises InputError where they do not fit."""
     a, b = np.atleast_1d(np.asarray(result)), np.atleast_1d(np.asarray(reference))
-    shape("result", a, b.shape)
+    checks.shape("result", a, b.shape)
     if b.size == 0:
         raise InputError("reference", f"shape {b.shape}", "at least one voxel")
-    finite("result", a)
-    finite("reference", b)
+    checks.finite("result", a)
+    checks.finite("reference", b)
     peak = float(b.max()) if data_range is None else data_range
-    positive("data range (by default the reference's maximum)", peak)
+    checks.positive("data range (by default the reference's maximum)", peak)
     return a, b, peak
 
 
@@ -98,7 +101,7 @@ def ssim(result: ArrayLike, reference: ArrayLike, data_range: float | None = Non
     ``data_range``: L in C1 = (0.01 L)², C2 = (0.03 L)², by default the reference's maximum. Raises InputError for arrays
     that are not 3D, shapes that differ, NaN or infinity, and a range that is not positive."""
     a, b, peak = checked_pair(result, reference, data_range)
-    shape("reference", b, (None, None, None))
+    checks.shape("reference", b, (None, None, None))
     return float(np.mean([_along_axis(a, b, peak, axis) for axis in range(3)]))
 
 
@@ -133,3 +136,34 @@ def _blur(images: Array) -> Array:
     weights /= weights.sum()
     rows = scipy.ndimage.correlate1d(images, weights, axis=-2, mode="constant")
     return scipy.ndimage.correlate1d(rows, weights, axis=-1, mode="constant")
+
+
+def edge_points_mm(volume: np.ndarray, grid: Grid) -> np.ndarray:
+    """Returns centres (n, 3), x y z, of voxels of a volume (nz, ny, nx) at which it changes steeply, at most 2,000."""
+    axes = [axis for axis, count in enumerate(volume.shape) if count > 1]
+    slopes = [np.gradient(volume, grid.voxel_size_mm[axis], axis=axis) for axis in axes]
+    steepness = np.sqrt(np.sum(np.square(slopes), axis=0)) if axes else np.zeros(volume.shape)
+    where = np.argwhere(steepness >= _EDGE * steepness.max())
+    where = where[:: checks.ceil_div(len(where), _MOST_POINTS)]
+    return np.stack([axis[i] for axis, i in zip(grid.axes_mm(), where.T, strict=True)][::-1], -1)
+
+
+def displaced_mm(deformation: Deformation, points_mm: np.ndarray, times_s: np.ndarray) -> np.ndarray:
+    """Returns how far the matter at points (n, 3) at the first of K times has gone at the others, (K − 1, n, 3) in mm.
+
+    This does not depend on the state that the reference volume shows: two descriptions of one motion give the same."""
+    weights = deformation.weights_at(times_s)
+    reference_mm = points_mm + deformation.displacement_mm(points_mm, weights[0])
+    return np.stack([reference_mm + deformation.inverse_mm(reference_mm, other) - points_mm for other in weights[1:]])
+
+
+def motion_error_mm(
+    estimate: Deformation, truth: Deformation, points_mm: np.ndarray, times_s: np.ndarray
+) -> tuple[float, float]:
+    """Returns mean and 95th percentile of the distance, in mm, between where matter at ``points_mm`` at the first time is at
+    the other times, by both. Raises InputError for less than two times."""
+    if len(times_s) < 2:
+        raise InputError("states", str(len(times_s)), "at least two, between which the object moves")
+    error_mm = displaced_mm(estimate, points_mm, times_s) - displaced_mm(truth, points_mm, times_s)
+    distance_mm = np.linalg.norm(error_mm, axis=-1)
+    return float(distance_mm.mean()), float(np.percentile(distance_mm, 95))

@@ -8,9 +8,8 @@ import torch
 from phyradgs_cl.acquisition import OwnTimes, PerRow, Scan
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.neural import rays
-from phyradgs_cl.neural.field import NeuralField, voxel_values
+from phyradgs_cl.neural.field import NeuralField, repeatable, to_array, to_tensor, voxel_values
 from phyradgs_cl.neural.options import LineOptions, NeuralOptions
-from phyradgs_cl.neural.tensors import repeatable, to_array, to_tensor
 
 _BETAS, _EPSILON = (0.9, 0.999), 1e-8
 _POINTS_ON_CPU, _POINTS_ELSEWHERE = 2**14, 2**20  # at once: a cache's, a GPU's

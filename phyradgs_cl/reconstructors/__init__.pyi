@@ -1,13 +1,13 @@
 from .checkpoint import State as State
-from .frames.preprocess import Preprocessing as Preprocessing
 from .method import Method as Method
-from .object_motion import ObjectMotion as ObjectMotion
 from .options import method_options as method_options
 from .options import preprocessing_names as preprocessing_names
 from .options import preprocessing_of as preprocessing_of
 from .plan import InitialVolume as InitialVolume
+from .plan import ObjectMotion as ObjectMotion
 from .plan import RunPlan as RunPlan
 from .plan import plan_run as plan_run
+from .preprocess import Preprocessing as Preprocessing
 from .registry import DEFAULT_METHOD as DEFAULT_METHOD
 from .registry import METHODS as METHODS
 from .registry import method_name as method_name

@@ -37,8 +37,7 @@ def reconstruct_neural(
     ``rt`` computes the FDK volume that sets the unit of attenuation; PyTorch does the rest. ``resume`` continues an
     interrupted run of the same scan and options from its state. Raises InputError where PyTorch is not installed."""
     require_torch(f"--method {method}")
-    from phyradgs_cl.neural.field import first_field
-    from phyradgs_cl.neural.tensors import torch_device
+    from phyradgs_cl.neural.field import first_field, torch_device
     from phyradgs_cl.neural.trainer import Trainer
 
     started = time.perf_counter()

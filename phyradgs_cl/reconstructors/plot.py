@@ -12,7 +12,7 @@ from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.metrics import reference_on
 from phyradgs_cl.metrics.slices import draw_slices
-from phyradgs_cl.reconstructors.frames.projected import frame_pairs
+from phyradgs_cl.reconstructors.projected import frame_pairs
 from phyradgs_cl.runtime import Runtime
 
 if TYPE_CHECKING:

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from phyradgs_cl.acquisition import Scan
-    from phyradgs_cl.reconstructors.frames.projected import FramePair
+    from phyradgs_cl.reconstructors.projected import FramePair
     from phyradgs_cl.runtime import Runtime
 
 VolumeMap = Callable[[np.ndarray, Grid], tuple[np.ndarray, Grid]]

@@ -11,7 +11,7 @@ from types import TracebackType
 from phyradgs_cl.errors import InputError, PhyradgsError
 from phyradgs_cl.io import check_writable, written_beside
 from phyradgs_cl.reconstructors import Progress
-from phyradgs_cl.reconstructors.frames.projected import FramePair
+from phyradgs_cl.reconstructors.projected import FramePair
 from phyradgs_cl.report.live_page import Snapshot, Status, live_page
 
 EVERY_S = 5.0

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.reconstructors import Progress
-from phyradgs_cl.reconstructors.frames.projected import FramePair
+from phyradgs_cl.reconstructors.projected import FramePair
 from phyradgs_cl.report.images import grey_range, middle_planes
 from phyradgs_cl.report.interactive.viewer import stills
 from phyradgs_cl.report.markup import Markup, element, joined, json_block, label, number, raw_text

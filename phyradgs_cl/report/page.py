@@ -12,7 +12,7 @@ from phyradgs_cl.acquisition.motion import motion_facts
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.io import check_writable, written_beside
 from phyradgs_cl.metrics import printed
-from phyradgs_cl.reconstructors.frames.projected import FramePair
+from phyradgs_cl.reconstructors.projected import FramePair
 from phyradgs_cl.report import sections
 from phyradgs_cl.report.images import base64_of
 from phyradgs_cl.report.markup import Markup, element, joined, label, number, raw_text

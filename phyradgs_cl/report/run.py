@@ -29,8 +29,8 @@ from phyradgs_cl.prepare import flat_correction
 from phyradgs_cl.prepare.step import Facts
 from phyradgs_cl.reconstructors import Preprocessing, preprocessing_of
 from phyradgs_cl.reconstructors.fdk import static_fdk
-from phyradgs_cl.reconstructors.frames.preprocess import prepared, stages
-from phyradgs_cl.reconstructors.frames.projected import FramePair, frame_pairs, spread_frames
+from phyradgs_cl.reconstructors.preprocess import prepared, stages
+from phyradgs_cl.reconstructors.projected import FramePair, frame_pairs, spread_frames
 from phyradgs_cl.reconstructors.tune import TUNED, is_tuning
 from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.text import plain_text

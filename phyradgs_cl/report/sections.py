@@ -7,12 +7,11 @@ import numpy as np
 from phyradgs_cl.acquisition import Exact, LineMiddles, MicroViews, Motion, OwnTimes, PerRow, Scan
 from phyradgs_cl.acquisition.motion import motion_facts
 from phyradgs_cl.prepare import PREPARED_KEY
-from phyradgs_cl.reconstructors.frames.projected import TIMES_PER_LINE, FramePair
+from phyradgs_cl.reconstructors.projected import TIMES_PER_LINE, FramePair
 from phyradgs_cl.report import images
 from phyradgs_cl.report.charts import Chart, convergence_charts, histogram, tuning_chart, views_chart
 from phyradgs_cl.report.interactive.atlas import has_depth, space
-from phyradgs_cl.report.interactive.motion import object_in_motion
-from phyradgs_cl.report.interactive.rows import frame_in_motion
+from phyradgs_cl.report.interactive.motion import frame_in_motion, object_in_motion
 from phyradgs_cl.report.interactive.viewer import stills, viewer
 from phyradgs_cl.report.markup import Markup, element, flattened, joined, label, number, shown, unit
 from phyradgs_cl.report.run import Change, Run

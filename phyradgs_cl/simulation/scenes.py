@@ -14,8 +14,7 @@ from phyradgs_cl.operators.rays.layout import RayLayout
 from phyradgs_cl.operators.rays.memory import RayMemory
 from phyradgs_cl.phantoms import EllipsoidPhantom, MovingPhantom, make_phantom
 from phyradgs_cl.runtime import Runtime
-from phyradgs_cl.simulation.deformed import DeformedSource
-from phyradgs_cl.simulation.sources import AnalyticSource, FrameSource, VolumeSource, on_panel
+from phyradgs_cl.simulation.sources import AnalyticSource, DeformedSource, FrameSource, VolumeSource, on_panel
 
 _DENSE = 0.5  # of the largest attenuation: denser voxels may be bone in a beam of many energies
 _RARE = 0.2  # of the most common attenuation's voxels: a more common one is a material that no threshold may divide

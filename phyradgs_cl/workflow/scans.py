@@ -15,7 +15,7 @@ from phyradgs_cl.io import Scanner, Volume, hashing, only_run, write_scan
 from phyradgs_cl.phantoms import PHANTOMS, EllipsoidPhantom
 from phyradgs_cl.prepare import PREPARED_KEY, STEPS
 from phyradgs_cl.reconstructors import Preprocessing
-from phyradgs_cl.reconstructors.frames.preprocess import prepared
+from phyradgs_cl.reconstructors.preprocess import prepared
 from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.signals import finish_despite_interrupt
 from phyradgs_cl.simulation import SimulationOptions, simulated_scan

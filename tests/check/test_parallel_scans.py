@@ -22,8 +22,7 @@ from phyradgs_cl.check.shutter import READOUT
 from phyradgs_cl.check.timing import check_angles
 from phyradgs_cl.commands.check import check_command
 from phyradgs_cl.io import write_scan
-from phyradgs_cl.reconstructors.fits.axis import axis_shift
-from phyradgs_cl.reconstructors.fits.opposite import opposite_shift
+from phyradgs_cl.reconstructors.fits.axis import axis_shift, opposite_shift
 from phyradgs_cl.workflow.files import load_scan
 
 HALF_TURNS = [(30, 180.0, False), (31, 180.0, True), (60, 360.0, False), (45, 360.0, False), (40, 220.0, False)]

@@ -8,11 +8,9 @@ from tolerances import FLOAT32
 from phyradgs_cl.errors import DeviceError, InputError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.neural import LineOptions, NeuralOptions
-from phyradgs_cl.neural.field import first_field, voxel_values
-from phyradgs_cl.neural.hash_encoding import HashEncoding, corners, weighted_rows
-from phyradgs_cl.neural.networks import LineAttention
+from phyradgs_cl.neural.field import first_field, torch_device, voxel_values
+from phyradgs_cl.neural.networks import HashEncoding, LineAttention, corners, weighted_rows
 from phyradgs_cl.neural.rays import chosen_times, scattered_pixels, windows_and_scattered_pixels
-from phyradgs_cl.neural.tensors import torch_device
 
 CPU = torch.device("cpu")
 

@@ -9,7 +9,7 @@ from phyradgs_cl.errors import InputError
 from phyradgs_cl.io import write_scan
 from phyradgs_cl.prepare import flat_correction
 from phyradgs_cl.reconstructors import Preprocessing
-from phyradgs_cl.reconstructors.frames.preprocess import prepared
+from phyradgs_cl.reconstructors.preprocess import prepared
 
 DARK = 100.0
 

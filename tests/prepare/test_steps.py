@@ -22,7 +22,7 @@ from phyradgs_cl.prepare import (
 from phyradgs_cl.prepare.hardening import find_bone
 from phyradgs_cl.prepare.scatter import raised
 from phyradgs_cl.reconstructors import Preprocessing, preprocessing_of
-from phyradgs_cl.reconstructors.frames.preprocess import prepared, reprojection
+from phyradgs_cl.reconstructors.preprocess import prepared, reprojection
 
 # effect, step, its options, least share of the loss that FDK gets back on this small scan
 CASES = (

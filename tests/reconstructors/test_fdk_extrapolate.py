@@ -10,7 +10,7 @@ from phyradgs_cl.api import reconstruct, simulate
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.phantoms import Ellipsoid, EllipsoidPhantom
 from phyradgs_cl.reconstructors.fdk import fdk_volume
-from phyradgs_cl.reconstructors.fdk.beyond_panel import extrapolated, reprojected
+from phyradgs_cl.reconstructors.fdk.frames import extrapolated, reprojected
 
 BEYOND = 20  # pixels at each side of a panel of 41
 

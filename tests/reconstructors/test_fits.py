@@ -7,9 +7,8 @@ import pytest
 
 from phyradgs_cl.acquisition import ConeGeometry, PerRow, Protocol
 from phyradgs_cl.fields import Grid
-from phyradgs_cl.reconstructors.fits.augmented import AugmentedOperator, FlatErrors, ViewParameters
 from phyradgs_cl.reconstructors.fits.axis import axis_shift
-from phyradgs_cl.reconstructors.fits.residuals import fit
+from phyradgs_cl.reconstructors.fits.residuals import AugmentedOperator, FlatErrors, ViewParameters, fit
 from phyradgs_cl.reconstructors.voxels.system import System
 from phyradgs_cl.simulation import SimulationOptions, phantom_scene, simulate
 

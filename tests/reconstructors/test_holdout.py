@@ -9,7 +9,7 @@ from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.api import prepare, simulate
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.reconstructors import Preprocessing, RunPlan, method_options, reconstruct
-from phyradgs_cl.reconstructors.frames.projected import held_out, holdout_errors
+from phyradgs_cl.reconstructors.projected import held_out, holdout_errors
 from phyradgs_cl.reconstructors.result import HELD_OUT, Reconstruction
 
 

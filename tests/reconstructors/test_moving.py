@@ -22,9 +22,8 @@ from phyradgs_cl.phantoms import shepp_logan
 from phyradgs_cl.reconstructors import ObjectMotion, Reconstruction, plan_run, reconstruct
 from phyradgs_cl.reconstructors.moving import motion_line
 from phyradgs_cl.reconstructors.moving.field import MotionField
-from phyradgs_cl.reconstructors.moving.gating import load_gating, signal_of
 from phyradgs_cl.reconstructors.moving.search import coarse_scan, initial_field
-from phyradgs_cl.reconstructors.moving.signal import middle_times_s, motion_signal
+from phyradgs_cl.reconstructors.moving.signal import load_gating, middle_times_s, motion_signal, signal_of
 from phyradgs_cl.reconstructors.moving.splines import Bending, TemporalSplines
 from phyradgs_cl.reconstructors.result import MOTION_FOUND, Progress
 

@@ -20,8 +20,8 @@ from phyradgs_cl.reconstructors import (
     plan_run,
     reconstruct,
 )
-from phyradgs_cl.reconstructors.frames.projected import frame_pairs, spread_frames
-from phyradgs_cl.reconstructors.object_motion import check_object_motion
+from phyradgs_cl.reconstructors.plan import check_object_motion
+from phyradgs_cl.reconstructors.projected import frame_pairs, spread_frames
 from phyradgs_cl.reconstructors.result import HELD_OUT, Progress
 from phyradgs_cl.report.run import computed_views, load_run
 from phyradgs_cl.runtime import Runtime

@@ -12,7 +12,7 @@ from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.phantoms import shepp_logan
 from phyradgs_cl.reconstructors import Preprocessing, RunPlan, method_options, preprocessing_of, reconstruct
-from phyradgs_cl.reconstructors.frames.preprocess import prepared
+from phyradgs_cl.reconstructors.preprocess import prepared
 from phyradgs_cl.simulation import AnalyticSource, SimulationOptions, simulate
 
 GEOMETRY = ConeGeometry(5.0, 7.0, (16, 16), (0.25, 0.25))

@@ -22,7 +22,7 @@ from phyradgs_cl.reconstructors import (
     plan_run,
 )
 from phyradgs_cl.reconstructors import reconstruct as run_method
-from phyradgs_cl.reconstructors.frames.projected import held_out
+from phyradgs_cl.reconstructors.projected import held_out
 from phyradgs_cl.reconstructors.result import HELD_OUT, Report
 from phyradgs_cl.reconstructors.tune import TUNED, trials
 from phyradgs_cl.report.page import report_page

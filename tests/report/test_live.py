@@ -11,7 +11,7 @@ from skimage.io import imread
 from phyradgs_cl.errors import InputError, NumericalError, OutOfMemoryError, OutputError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.reconstructors import Progress
-from phyradgs_cl.reconstructors.frames.projected import FramePair
+from phyradgs_cl.reconstructors.projected import FramePair
 from phyradgs_cl.report import LivePage, check_live
 from phyradgs_cl.report.live import SHARE
 from phyradgs_cl.report.live_page import Snapshot, Status, live_page

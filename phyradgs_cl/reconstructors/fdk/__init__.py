@@ -26,8 +26,13 @@ from phyradgs_cl.operators.warp.backproject import MovingBackprojector
 from phyradgs_cl.operators.warp.states import MotionStates
 from phyradgs_cl.prepare.step import unmasked_frames
 from phyradgs_cl.reconstructors.fdk import weights
-from phyradgs_cl.reconstructors.fdk.beyond_panel import WAYS, extrapolated, reprojected, whole_object
-from phyradgs_cl.reconstructors.fdk.deblur import deblurred
+from phyradgs_cl.reconstructors.fdk.frames import (
+    WAYS,
+    deblurred,
+    extrapolated,
+    reprojected,
+    whole_object,
+)
 from phyradgs_cl.reconstructors.fdk.views import (
     RayWeight,
     check_beam,

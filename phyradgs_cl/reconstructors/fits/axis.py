@@ -1,11 +1,16 @@
-"""Where the axis of rotation is on the panel: the shift of the panel under which a coarse scan fits best."""
+"""Where the axis of rotation is on the panel. In any scan: the shift of the panel under which a coarse scan fits best. In a
+parallel beam: from views half a turn apart, which see mirror images."""
 
 import math
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.interpolate import CubicSpline
+from scipy.ndimage import gaussian_filter1d
+from scipy.signal import fftconvolve
 
 from phyradgs_cl.acquisition import Scan
+from phyradgs_cl.acquisition.altered.angles import azimuth_rad, has_opposite_views, middle_poses, wrapped
 from phyradgs_cl.acquisition.altered.variants import altered_trajectory, shifted
 from phyradgs_cl.reconstructors.fits.residuals import fit_squares, vertex
 from phyradgs_cl.runtime import Runtime
@@ -15,6 +20,14 @@ _ROUGH_ITERATIONS = 8
 _STEP = 0.25  # coarse pixels
 _MOST_STEPS = 8
 ANYWHERE = (-math.inf, math.inf)
+_MOST_VIEWS, _MOST_ROWS = 60, 64
+_BEYOND = 1.5  # steps between views, by which the opposite of a view may lie outside the scan
+_WIDEST_STEP_RAD = math.radians(10.0)  # between views that are interpolated
+_SMOOTHING_PX = 1.0  # interpolation lowers noise between pixels, which would draw the shift there
+_CORRELATED_PX = 2 * math.sqrt(math.pi) * _SMOOTHING_PX  # columns of smoothed noise per independent one
+_LEAST_OVERLAP, _LEAST_ENERGY = 0.25, 0.2  # of the columns, of the largest energy of an overlap
+_STEPS, _SETTLED_PX = 12, 1e-3
+_BIAS_PX = 0.02  # of views that are interpolated between their neighbours
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,6 +42,9 @@ class AxisShift:
     @property
     def is_found(self) -> bool:
         return math.isfinite(self.pixels)
+
+
+_NONE = AxisShift(math.nan, math.nan, np.empty(0))
 
 
 def rough_shift(rt: Runtime, scan: Scan, limits_px: tuple[float, float] = ANYWHERE) -> AxisShift:
@@ -85,3 +101,138 @@ def with_best_shift(rt: Runtime, scan: Scan) -> Scan:
 def columns_per_block(scan: Scan) -> int:
     """Returns how many columns of the recorded scan form one of the coarse scan."""
     return altered_trajectory(scan).blocks[1]
+
+
+@dataclass(frozen=True, eq=False)
+class _Pair:
+    """A view and the mirror image of its opposite (rows, columns), and by how many columns the stated axis lies further
+    right in the view than in the mirror image."""
+
+    view: np.ndarray
+    mirrored: np.ndarray
+    apart_px: float
+
+
+def opposite_shift(scan: Scan) -> AxisShift:
+    """Returns the panel's shift along u under which views half a turn apart are mirror images, with its deviation.
+
+    A view's opposite is interpolated between its two neighbours in angle, or extrapolated by a step: a half turn has
+    opposite views at its ends only. NaN for other beams, for panels that are rolled or move along the axis, and where no
+    views are opposite. NaN also for columns read one after the other, whose mirror images are seen from other angles."""
+    if not has_opposite_views(scan) or (scan.shutter.axis == "columns" and scan.shutter.readout_s > 0):
+        return _NONE
+    pairs = _pairs(scan)
+    if not pairs:
+        return _NONE
+    start_px = _rough_shift(pairs)
+    shifts, information = np.array([_refined_shift(pair, start_px) for pair in pairs]).T
+    is_found = np.isfinite(shifts) & (information > 0)
+    if not is_found.any():
+        return _NONE
+    shifts, weight = shifts[is_found], information[is_found] / information[is_found].sum()
+    shift = float(weight @ shifts)
+    noise, scatter = 1 / information[is_found].sum(), float(weight**2 @ (shifts - shift) ** 2)
+    return AxisShift(shift, math.sqrt(2 * max(noise, scatter) + _BIAS_PX**2), np.empty(0))  # 2: each pair is there twice
+
+
+def _pairs(scan: Scan) -> list[_Pair]:
+    poses, (rows, columns) = middle_poses(scan), scan.geometry.detector_shape
+    angle = azimuth_rad(poses)
+    across = np.stack([-np.sin(angle), np.cos(angle), np.zeros(scan.frames)], -1)
+    first, step_u, step_v = poses[:, 3:6], poses[:, 6:9], poses[:, 9:12]
+    pitch = np.einsum("fi,fi->f", step_u, across)
+    moved_rows = np.ptp(first[:, 2]) / np.linalg.norm(step_v, axis=1).min()
+    if moved_rows > 0.5 or (np.abs(pitch) < 0.9 * np.linalg.norm(step_u, axis=1)).any() or np.ptp(np.sign(pitch)) > 0:
+        return []
+    axis_px = -np.einsum("fi,fi->f", first + (rows - 1) / 2 * step_v, across) / pitch
+    pairs = []
+    for view in np.unique(np.linspace(0, scan.frames - 1, min(scan.frames, _MOST_VIEWS)).round().astype(int)):
+        opposite = _opposite(wrapped(angle - angle[view] - np.pi))
+        if opposite is None:
+            continue
+        frames, shares = opposite
+        mirrored = np.einsum("f,fvu->vu", shares, [_few_rows(scan, frame)[:, ::-1] for frame in frames])
+        mirrored_axis_px = columns - 1 - shares @ axis_px[frames]
+        pairs.append(_Pair(_few_rows(scan, view), mirrored, float(axis_px[view] - mirrored_axis_px)))
+    return pairs
+
+
+def _opposite(away: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
+    """Returns two frames and their shares, which sum to 1, that make up the view at angle 0 of frames at angles ``away``
+    (F,) in rad; None where none are near."""
+    order = np.argsort(away)
+    step = float(np.median(np.abs(np.diff(away[order])))) if len(away) > 1 else math.inf
+    above = int(np.searchsorted(away[order], 0.0))
+    two = order[np.clip([above - 1, above], 0, len(away) - 1)]
+    if two[0] == two[1] or np.ptp(away[two]) > min(_WIDEST_STEP_RAD, 2 * _BEYOND * step):
+        nearest = order[np.argsort(np.abs(away[order]), kind="stable")]
+        near = nearest[0]
+        same_side = [frame for frame in nearest[1:] if step / 2 < abs(away[frame] - away[near]) < _BEYOND * step]
+        if not same_side or abs(away[near]) > min(_WIDEST_STEP_RAD, _BEYOND * step):
+            return None
+        two = np.array([near, same_side[0]])
+    share = float(away[two[0]] / (away[two[0]] - away[two[1]]))
+    return two, np.array([1 - share, share])
+
+
+def _few_rows(scan: Scan, frame: int) -> np.ndarray:
+    """Returns a frame smoothed along its rows, of means of blocks of rows, float64; masked pixels are interpolated."""
+    image = np.asarray(scan.projections[frame], np.float64)
+    if scan.pixel_mask is not None:
+        columns = np.arange(image.shape[1])
+        image = np.array([
+            np.interp(columns, columns[valid], row[valid]) if valid.any() else 0 * row
+            for row, valid in zip(image, scan.valid[frame], strict=True)
+        ])
+    starts = np.unique(np.linspace(0, len(image), min(len(image), _MOST_ROWS), endpoint=False).astype(int))
+    means = np.add.reduceat(image, starts, axis=0) / np.diff(starts, append=len(image))[:, None]
+    smooth: np.ndarray = gaussian_filter1d(means, _SMOOTHING_PX, axis=1)
+    return smooth
+
+
+def _rough_shift(pairs: list[_Pair]) -> float:
+    """Returns the shift, in half columns, under which the squared difference of the overlap is the smallest part of its
+    energy."""
+    columns = pairs[0].view.shape[1]
+    lags = np.arange(1 - columns, columns)  # column of the mirror image less that of the view
+    twice_px = lags.astype(np.float64)
+    products, energies = np.zeros(lags.size), np.zeros(lags.size)
+    for pair in pairs:
+        ones = np.ones_like(pair.view)
+        product = _correlation(pair.mirrored, pair.view)
+        energy = _correlation(pair.mirrored**2, ones) + _correlation(ones, pair.view**2)
+        products += np.interp(twice_px - pair.apart_px, lags, product)
+        energies += np.interp(twice_px - pair.apart_px, lags, energy)
+    is_possible = (np.abs(lags) < (1 - _LEAST_OVERLAP) * columns) & (energies > _LEAST_ENERGY * energies.max())
+    difference = np.where(is_possible, 1 - 2 * products / np.maximum(energies, 1e-30), np.inf)
+    return float(twice_px[np.argmin(difference)] / 2)
+
+
+def _correlation(mirrored: np.ndarray, view: np.ndarray) -> np.ndarray:
+    correlation: np.ndarray = fftconvolve(mirrored, view[:, ::-1], axes=1).sum(0)
+    return correlation
+
+
+def _refined_shift(pair: _Pair, shift_px: float) -> tuple[float, float]:
+    """Returns the shift of least squares near ``shift_px`` by Gauss–Newton, NaN where it leads away, and one over its
+    variance."""
+    last = pair.view.shape[1] - 1
+    columns = np.arange(last + 1)
+    view, mirrored = (CubicSpline(columns, image, axis=1) for image in (pair.view, pair.mirrored))
+    start_px = shift_px
+    for _ in range(_STEPS):
+        half_lag = shift_px - pair.apart_px / 2
+        middle = columns[(columns - abs(half_lag) >= 0) & (columns + abs(half_lag) <= last)]
+        if middle.size < _LEAST_OVERLAP * columns.size:
+            return math.nan, 0.0
+        difference = view(middle - half_lag) - mirrored(middle + half_lag)
+        slope = -view(middle - half_lag, 1) - mirrored(middle + half_lag, 1)
+        squares = float((slope**2).sum())
+        step = -float((difference * slope).sum()) / max(squares, 1e-30)
+        shift_px += step
+        if abs(shift_px - start_px) > 2:
+            return math.nan, 0.0
+        if abs(step) < _SETTLED_PX:
+            break
+    variance = float((difference**2).mean()) * _CORRELATED_PX / max(squares, 1e-30)
+    return shift_px, 1 / max(variance, 1e-12)

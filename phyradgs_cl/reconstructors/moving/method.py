@@ -19,9 +19,14 @@ from phyradgs_cl.fields import Deformation, triple
 from phyradgs_cl.reconstructors.checkpoint import State, check_array, state_arrays
 from phyradgs_cl.reconstructors.loop import Loop
 from phyradgs_cl.reconstructors.method import Method
-from phyradgs_cl.reconstructors.moving.gating import gating_of_scan, load_gating, signal_of
 from phyradgs_cl.reconstructors.moving.search import FieldSearch
-from phyradgs_cl.reconstructors.moving.signal import MotionSignal, motion_signal
+from phyradgs_cl.reconstructors.moving.signal import (
+    MotionSignal,
+    gating_of_scan,
+    load_gating,
+    motion_signal,
+    signal_of,
+)
 from phyradgs_cl.reconstructors.result import MOTION_FOUND, Progress, Reconstruction, Report, option_facts
 from phyradgs_cl.reconstructors.voxels.fista import FistaOptions, fista_stages
 from phyradgs_cl.reconstructors.voxels.run import MethodInputs

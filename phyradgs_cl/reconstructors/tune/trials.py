@@ -19,7 +19,7 @@ from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Deformation, Grid
 from phyradgs_cl.prepare.step import with_masked
 from phyradgs_cl.reconstructors.checkpoint import State, parsed
-from phyradgs_cl.reconstructors.frames.projected import held_out, holdout_errors
+from phyradgs_cl.reconstructors.projected import held_out, holdout_errors
 from phyradgs_cl.reconstructors.result import (
     Progress,
     ProgressReport,

@@ -24,8 +24,8 @@ from phyradgs_cl.reconstructors.voxels import priors
 from phyradgs_cl.reconstructors.voxels.prior_weight import PriorWeight, frame_error
 from phyradgs_cl.reconstructors.voxels.priors import Denoiser, Prior
 from phyradgs_cl.reconstructors.voxels.run import Algorithm, IterativeOptions, MethodInputs, run_iterations
+from phyradgs_cl.reconstructors.voxels.sart import OrderedSubsets
 from phyradgs_cl.reconstructors.voxels.stages import Stage, merge_subvoxels, repeated, run_stages
-from phyradgs_cl.reconstructors.voxels.subsets import OrderedSubsets
 from phyradgs_cl.reconstructors.voxels.system import System
 from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.runtime.algebra import HostSpace

@@ -1,19 +1,31 @@
-"""An object that moves as a part of the page: its slices at any time of the scan, with arrows of the displacement.
+"""Motion as a part of the page: the lines of a fly-scan's frame at their own poses, and an object that moves, with its
+slices at any time of the scan and arrows of the displacement.
 
-The page has the voxels once, as the picture in 3D has them, and the deformation as control points. Its script makes the
-states: v(y + w(y, t)), trilinear, as ``fields.deformed`` does."""
+Of the object the page has the voxels once, as the picture in 3D has them, and the deformation as control points. Its script
+makes the states: v(y + w(y, t)), trilinear, as ``fields.deformed`` does."""
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import spline_filter1d
 
+from phyradgs_cl.acquisition import CircularOrbit, Scan
 from phyradgs_cl.fields import Deformation, Grid, deformed, triple
 from phyradgs_cl.fields.deformation import control_points
 from phyradgs_cl.report.images import Plane, Window, base64_of, block_means, middle_planes
 from phyradgs_cl.report.interactive.atlas import MOST_EDGE
 from phyradgs_cl.report.interactive.viewer import decimals_of, picture, place, slider
 from phyradgs_cl.report.markup import Markup, element, joined, json_block, number
+from phyradgs_cl.report.scan_charts import box_corners, with_sources
 
+_TIMES = 49  # at which the scanner's pose is given; the script interpolates
+_MOST_LINES = 64
+_FRAME_STEPS = 500  # of the slider
+_LOOK_DEG = 125  # from the source to the eye, about the axis: behind the panel, and to one side
+_TILT_DEG = 28
+_FRAME_HELP = (
+    "Lines that wait are thin and grey, exposed ones gold, with the rays of the first and the last. A line that has been "
+    "read is blue, and stays where the panel was in the middle of its exposure. Drag, or press arrow keys here, to turn."
+)
 MOST_VALUES = 150_000  # of control points; 2 bytes each
 _MOST_TIMES = 2000
 _STEPS = 200  # of the slider of the time
@@ -23,6 +35,47 @@ _HELP = (
     "An arrow ends where matter is, and begins where the same matter is in the reference volume; black parts have none. "
     "Play, or arrow keys on the slider of the time, go through the scan. A click in a picture moves the other two slices."
 )
+
+
+def frame_in_motion(scan: Scan) -> Markup:
+    """Returns a picture of the first frame of a fly-scan, a slider of its time and the data of the script."""
+    first_s, last_s = scan.shutter.lit_span_s
+    times_s = np.linspace(first_s, last_s, _TIMES)
+    poses = with_sources(scan, scan.trajectory.pose(0, scan.frame_start_s[0] + times_s))
+    lines = np.unique(np.linspace(0, scan.lines - 1, min(scan.lines, _MOST_LINES)).round().astype(int))
+    opens_s = scan.shutter.delay_s(scan.lines)[lines]
+    source = poses[0, :3]
+    facts = {
+        "poses": np.round(poses, 5).tolist(), "times_s": [first_s, last_s], "lines": lines.tolist(),
+        "opens_s": scan.shutter.in_pulse(opens_s).tolist(),
+        "closes_s": scan.shutter.in_pulse(opens_s + scan.shutter.exposure_s).tolist(),
+        "shape": scan.geometry.detector_shape, "axis": scan.shutter.axis, "angles_deg": _angles_deg(scan, times_s),
+        "box": np.round(box_corners(scan), 5).tolist(), "steps": _FRAME_STEPS, "is_parallel": scan.is_parallel,
+        "turn_deg": -90 - np.rad2deg(np.arctan2(source[1], source[0])) - _LOOK_DEG, "tilt_deg": _TILT_DEG,
+    }  # fmt: skip
+    words = f"The first frame in motion, {number(last_s - first_s)} s"
+    canvas = element(
+        "canvas", id="rows", tabindex=0, role="img", aria_label=words, aria_describedby="rows-help rows-reading"
+    )
+    controls = [
+        element("button", "Play", type="button", id="rows-play"),
+        element("button", "Reset", type="button", id="rows-reset"),
+        slider("rows-time", "Time", 0, _FRAME_STEPS, _FRAME_STEPS, ""),
+    ]
+    return joined(
+        element("h3", words), element("div", *controls, class_="tools"),
+        element("div", canvas, class_="rows"), element("p", element("output", id="rows-reading"), class_="note help"),
+        element("p", _FRAME_HELP, class_="note help", id="rows-help"), json_block("rows-data", facts),
+    )
+
+
+def _angles_deg(scan: Scan, times_s: np.ndarray) -> list[list[float]] | None:
+    """Returns the gantry's angle at times (T,) within the first frame as (T, 1), or None where it is on no circle."""
+    if not isinstance(scan.trajectory, CircularOrbit):
+        return None
+    angles_rad = scan.trajectory.angle_rad(0, scan.frame_start_s[0] + times_s)
+    angles_deg: list[list[float]] = np.rad2deg(angles_rad)[:, None].tolist()
+    return angles_deg
 
 
 def object_in_motion(

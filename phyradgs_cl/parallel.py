@@ -1,10 +1,13 @@
-"""The processes (ranks) that work on the same scan: their launch, communication, shares of work; failing together.
+"""The processes (ranks) that work on the same scan: their launch, communication, shares of work; failing together; sums of
+floats whose bits depend neither on the order nor on the number of ranks.
 
-mpi4py is imported only where several processes were launched."""
+mpi4py is imported only where several processes were launched. For a sum every row is scaled by a power of two and rounded to
+integers of 64 bits, with the largest scale for which the sum cannot overflow. Adding integers is exact and associative. For
+64 terms the parts of a float32 below 2⁻³⁷ of its row's largest are rounded off."""
 
 import os
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import lru_cache
@@ -25,6 +28,9 @@ _LAUNCHERS = (
 _PATIENCE_S = 5.0
 _LATER_S = 0.5
 _MOST_VALUES = 1 << 26  # of one call: counts of MPI before its version 4 end at 2³¹
+_BITS = 62
+_NOT_FINITE = 100_000  # more than any float's exponent
+_BLOCK_VALUES = 1 << 20
 
 
 @dataclass(frozen=True)
@@ -189,3 +195,44 @@ def failing_together(ranks: Communicator, report_error: Callable[[BaseException]
 def span(count: int, parts: int, part: int) -> range:
     """The ``part``-th of ``parts`` runs of 0 … count−1, whose lengths differ by at most one."""
     return range(part * count // parts, (part + 1) * count // parts)
+
+
+def exact_sum(ranks: Communicator, parts: Sequence[np.ndarray], shape: tuple[int, int], terms: int) -> np.ndarray:
+    """Sums all ranks' ``parts``, each of ``shape`` (rows, n) float32; ``terms`` counts them over all ranks.
+
+    Returns the sum (rows, n) float32 on every rank. Rows with a non-finite number become NaN. ``parts`` may be empty."""
+    exponents = _largest_exponents(ranks, parts, shape[0])
+    not_finite = exponents >= _NOT_FINITE
+    shift = _BITS - max(terms - 1, 0).bit_length() - np.where(not_finite, 0, exponents)
+    total = np.empty(shape, np.float32)
+    columns = max(_BLOCK_VALUES // max(shape[0], 1), 1)
+    for first in range(0, shape[1], columns):
+        block = slice(first, min(first + columns, shape[1]))
+        integers = np.zeros((shape[0], block.stop - first), np.int64)
+        for part in parts:
+            integers += as_integers(part[:, block], shift, not_finite)
+        ranks.allreduce_sum(integers)
+        total[:, block] = integers * np.ldexp(1.0, -shift)[:, None]
+    total[not_finite] = np.nan
+    return total
+
+
+def as_integers(values: np.ndarray, shift: np.ndarray, not_finite: np.ndarray) -> np.ndarray:
+    """Returns values (rows, n) times 2^shift (rows,), rounded to int64; 0 in rows that are not finite."""
+    wide = np.multiply(values, np.ldexp(1.0, shift)[:, None], dtype=np.float64)  # by a power of two: exact
+    if not_finite.any():
+        wide[not_finite] = 0
+    return np.rint(wide, out=wide).astype(np.int64)
+
+
+def _largest_exponents(ranks: Communicator, parts: Sequence[np.ndarray], rows: int) -> np.ndarray:
+    """Returns the least e with |values| < 2^e of every row over all ranks (int64); rows that are not finite have a mark."""
+    exponents = np.full(rows, -300, np.int64)
+    for part in parts:
+        largest = np.abs(part).max(axis=1, initial=0.0).astype(np.float64)  # NaN where there is one
+        finite = np.isfinite(largest)
+        part_exponents = np.frexp(np.where(finite, largest, 0.0))[1].astype(np.int64)
+        part_exponents[largest == 0] = -300
+        exponents = np.maximum(exponents, np.where(finite, part_exponents, _NOT_FINITE))
+    ranks.allreduce_max(exponents)
+    return exponents

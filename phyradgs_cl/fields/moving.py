@@ -1,0 +1,91 @@
+"""An object that moves: its true volume at some times, a gating signal, its volume in any state."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import scipy
+
+from phyradgs_cl import checks
+from phyradgs_cl.errors import InputError
+from phyradgs_cl.fields.deformation import Deformation
+from phyradgs_cl.fields.volume import Grid, triple
+
+_SLAB_VOXELS = 1 << 21  # displaced at a time: their coordinates take six times the memory of the volume
+
+
+@dataclass(frozen=True, eq=False)
+class MovingTruth:
+    """True volumes of a simulated object. times_s: (K,) in s on the clock of the scan's frames. volumes: (K, nz, ny, nx)
+    float32 in 1/mm at these times, on the scan's grid. deformation: how the scan's reference became them; None where no
+    field describes it. Raises InputError for shapes that do not fit, and values that are not finite."""
+
+    times_s: np.ndarray
+    volumes: np.ndarray
+    deformation: Deformation | None = None
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "times_s", checks.numbers("times of states", self.times_s, (None,)))
+        checks.shape("states", self.volumes, (len(self.times_s), None, None, None))
+        checks.finite("states", self.volumes)
+
+
+@dataclass(frozen=True, eq=False)
+class Gating:
+    """How far the object's motion is at some times. times_s: (n,) rising, on the clock of ``Scan.frame_start_s``.
+    values: (n,) of any unit and sign; with ``is_phase`` phases in cycles, which rise, and whose whole cycles do not count.
+
+    Raises InputError for shapes that differ, values that are not finite, and times that do not rise."""
+
+    times_s: np.ndarray
+    values: np.ndarray
+    is_phase: bool = False
+
+    def __post_init__(self) -> None:
+        times_s = checks.numbers("gating times_s", self.times_s, (None,))
+        if len(times_s) == 0 or (np.diff(times_s) <= 0).any():
+            raise InputError("gating times_s", checks.short_repr(times_s.tolist()), "at least one time, rising")
+        object.__setattr__(self, "times_s", times_s)
+        object.__setattr__(self, "values", checks.numbers("gating values", self.values, times_s.shape))
+
+    @property
+    def steps(self) -> np.ndarray:
+        """By how much each value (n − 1,) is exceeded by the next: from 0 to below 1 of phases."""
+        steps = np.diff(self.values)
+        return steps % 1.0 if self.is_phase else steps
+
+    def at(self, times_s: np.ndarray) -> np.ndarray:
+        """Returns the values (m,) at times (m,), straight between two stated ones; phases may be 1 or more."""
+        last = len(self.times_s) - 1
+        before = np.clip(np.searchsorted(self.times_s, times_s, "right") - 1, 0, last)
+        lengths_s, steps = np.append(np.diff(self.times_s), 1.0), np.append(self.steps, 0.0)
+        share = np.clip((np.asarray(times_s) - self.times_s[before]) / lengths_s[before], 0, 1)
+        return np.asarray(self.values[before] + share * steps[before])
+
+
+def deformed(volume: np.ndarray, grid: Grid, deformation: Deformation, weights: Sequence[float] | np.ndarray) -> np.ndarray:
+    """Returns the object (nz, ny, nx) float32 in 1/mm at one state's weights (R,), as ``deformation.weights_at`` gives them.
+
+    It is v(y + w(y)) at every voxel centre y, trilinear between the voxels of the reference ``volume`` (nz, ny, nx) in 1/mm
+    on ``grid``, 0 outside of it. A state at rest is the volume itself. Raises InputError for shapes that do not fit."""
+    if not isinstance(deformation, Deformation):
+        raise InputError("deformation", checks.short_repr(deformation), "a Deformation")
+    checks.shape("volume", checks.real_array("volume", volume), grid.shape)
+    reference, shares = np.asarray(volume, np.float32), checks.numbers("weights", weights, (deformation.rank,))
+    if not np.any(deformation.reach_mm * np.abs(shares)):
+        return reference
+    nz, ny, nx = grid.shape
+    result = np.empty(grid.shape, np.float32)
+    voxel_mm = np.array(grid.voxel_size_mm, np.float32)
+    index = [np.arange(n, dtype=np.float32) for n in (ny, nx)]
+    slices = max(1, _SLAB_VOXELS // (ny * nx))
+    for first in range(0, nz, slices):
+        count = min(slices, nz - first)
+        shift = deformation.on_grid_mm(grid.part(triple((first, 0, 0)), triple((count, ny, nx))), shares)
+        z = np.arange(first, first + count, dtype=np.float32)[:, None, None] + shift[..., 2] / voxel_mm[0]
+        y = index[0][:, None] + shift[..., 1] / voxel_mm[1]
+        x = index[1] + shift[..., 0] / voxel_mm[2]
+        scipy.ndimage.map_coordinates(
+            reference, (z, y, x), output=result[first : first + count], order=1, mode="grid-constant", prefilter=False
+        )
+    return result
