@@ -14,8 +14,7 @@ except PackageNotFoundError:  # run from a checkout that is not installed
 def resource(name: str) -> Path:
     """Returns the path of ``cl``, ``data`` or ``cli.py``: inside the package in a wheel, next to it in a checkout.
 
-    Raises FileNotFoundError where both are missing.
-    """
+    Raises FileNotFoundError where both are missing."""
     package = Path(__file__).resolve().parent
     for folder in (package, package.parent):
         if (folder / name).exists():

@@ -100,7 +100,7 @@ def _algebra(rt: Runtime) -> Iterator[Comparison]:
     yield np.array(there.largest(x, absolute=True)), np.array(host.largest(a, absolute=True)), VALUE
     yield there.numpy(there.descend(x, y, 0.7)), a - 0.7 * b / host.norm(b), VALUE
     out = rt.zeros(64)
-    rt.launch(rt.kernel("rates", "multiply_add"), 64, np.int32(3), np.float32(0.5), out, group=rt.group())
+    rt.launch(rt.kernel("rates", "multiply_add"), 64, 3, np.float32(0.5), out, group=rt.group())
     chains = 0.5**3 * (np.arange(64)[:, None] % 7 + np.arange(8)) + 1 - 0.5**3
     yield rt.download(out), rt.lanes * chains.sum(1), VALUE
 

@@ -43,8 +43,7 @@ def micro_view_cells(
     """Returns M strips × N sub-intervals at t = t_f + (j+½)/M·T_ro + (k+½)/N·T_exp (paper, Eq. 2).
 
     With a pulsed beam the N sub-intervals divide the lit part of the strip's window. Strips without a line, where M is above
-    the number of lines, have no cells.
-    """
+    the number of lines, have no cells."""
     if strips < 1 or sub_intervals < 1:
         raise InputError("strips × sub-intervals", f"{strips} × {sub_intervals}", "two counts of at least 1")
     share = (np.arange(sub_intervals) + 0.5) / sub_intervals
@@ -93,8 +92,7 @@ def common_time_cells(
 
     frame_start_s (F,): of all frames. Frames that begin on the grid of the first one, as in a scan without gaps between
     exposures, share poses where they overlap in time. An exposure of 0 s, and cells shorter than the readout of a line,
-    leave nothing to share: each line gets its own times.
-    """
+    leave nothing to share: each line gets its own times."""
     start_s = float(frame_start_s[frame])
     windows_s = shutter.line_windows_s(lines)
     length_s = float(np.ptp(windows_s, axis=1).max())
@@ -152,8 +150,7 @@ def _shares(windows_s: np.ndarray, edges_s: np.ndarray) -> np.ndarray:
     share[:, length_s <= 0] = 0
     share[moment[length_s <= 0], np.flatnonzero(length_s <= 0)] = 1
     share[share < _NOTHING] = 0
-    total: np.ndarray = share / share.sum(axis=0)
-    return total
+    return np.asarray(share / share.sum(axis=0))
 
 
 def exact_cells(
@@ -212,8 +209,7 @@ def segments_for(
 
     Both errors grow with the square of the view's turn in a segment. The factor was measured (benchmarks/time_exact.py) for
     Gaussians of 0.5 to 4 % of the half-width. intensity_peak: largest line integral where the detector averages intensities,
-    else 0. Half of their variance in a segment remains, which up to a peak of 4 is smaller than the other errors.
-    """
+    else 0. Half of their variance in a segment remains, which up to a peak of 4 is smaller than the other errors."""
     first_s, last_s = shutter.lit_span_s
     time_s = start_s + np.linspace(first_s, last_s, _TURN_SAMPLES + 1)
     pose = trajectory.pose(frame, time_s)
@@ -231,8 +227,7 @@ def _turns_rad(pose: np.ndarray) -> np.ndarray:
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
     source = pose[:, :3] / np.maximum(np.linalg.norm(pose[:, :3], axis=1, keepdims=True), 1e-300)
     chords = [np.linalg.norm(np.diff(x, axis=0), axis=1) for x in (u_hat, normal, source)]
-    largest: np.ndarray = np.max([2 * np.arcsin(chord.clip(0, 2) / 2) for chord in chords], axis=0)
-    return largest
+    return np.asarray(np.max([2 * np.arcsin(chord.clip(0, 2) / 2) for chord in chords], axis=0))
 
 
 def _single_cell(trajectory: Trajectory, shutter: Shutter, frame: int, time_s: float, lines: int) -> TimeCells:

@@ -2,8 +2,7 @@
 
 A *pose* is 12 numbers in world coordinates (mm): source, centre of pixel (0, 0), the step from column to column (û·du)
 and from row to row (v̂·dv). A parallel beam has the rays' direction, towards the panel, in place of the source. Operators
-take poses, never angles.
-"""
+take poses, never angles."""
 
 import math
 from dataclasses import dataclass, replace
@@ -26,8 +25,7 @@ class ConeGeometry:
     ``source_to_axis_mm`` and ``source_to_detector_mm`` are measured along the central ray. ``detector_shape`` counts (rows,
     columns). ``pixel_size_mm`` is (dv, du); one number stands for square pixels. ``detector_offset_mm`` (v, u) shifts the
     panel's centre from the central ray: v > 0 up, to higher rows; u > 0 to higher columns, right seen from the source.
-    Raises InputError for lengths and counts that are not above 0, and for a panel nearer to the source than the axis.
-    """
+    Raises InputError for lengths and counts that are not above 0, and for a panel nearer to the source than the axis."""
 
     source_to_axis_mm: float
     source_to_detector_mm: float
@@ -71,8 +69,7 @@ class ParallelGeometry:
     Distances do not matter: the panel's plane is put through the axis. ``detector_shape`` counts (rows, columns).
     ``pixel_size_mm`` is (dv, du); one number stands for square pixels. ``detector_offset_mm`` (v, u) shifts the panel's
     centre from the ray through the axis, as in ``ConeGeometry``: u > 0 to higher columns, right seen against the rays'
-    origin. Raises InputError for lengths and counts that are not above 0.
-    """
+    origin. Raises InputError for lengths and counts that are not above 0."""
 
     detector_shape: tuple[int, int]
     pixel_size_mm: tuple[float, float]
@@ -188,8 +185,7 @@ def field_of_view_mm(geometry: Geometry) -> tuple[float, float, float]:
     """Returns half the sides (z, y, x) of the box about the origin that the beams of a full turn fill.
 
     The radius is DSO·sin(atan(half width/DSD)), with the far edge of a shifted panel; the height is the cone's, behind the
-    axis at that radius. A parallel beam fills half the panel's width and height, to its far edges.
-    """
+    axis at that radius. A parallel beam fills half the panel's width and height, to its far edges."""
     sides = zip(geometry.detector_shape, geometry.pixel_size_mm, geometry.detector_offset_mm, strict=True)
     half_height_mm, half_width_mm = (count * pitch / 2 + abs(offset) for count, pitch, offset in sides)
     if isinstance(geometry, ParallelGeometry):
@@ -244,8 +240,7 @@ def grid_on_panel(grid: Grid, pose: np.ndarray) -> np.ndarray:
     """Returns columns, rows and depths (3, 8) of a grid's corners in the parallel beam of a pose (12,)."""
     corners = np.stack(np.meshgrid(*grid.box_mm[::-1], indexing="ij"), -1).reshape(-1, 3)
     basis = np.stack([pose[6:9], pose[9:12], pose[0:3]], -1)
-    position: np.ndarray = np.linalg.solve(basis, (corners - pose[3:6]).T)
-    return position
+    return np.asarray(np.linalg.solve(basis, (corners - pose[3:6]).T))
 
 
 def panel_behind_mm(grid: Grid, pose: np.ndarray) -> float:

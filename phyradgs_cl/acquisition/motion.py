@@ -1,8 +1,7 @@
 """Motion models: each turns a frame of a scan into time cells.
 
 A model is a frozen class with ``cells(scan, frame)``. A user-defined class works in every method (docs/methods.md).
-On a stop-and-shoot scan every model of this module gives one pose per frame.
-"""
+On a stop-and-shoot scan every model of this module gives one pose per frame."""
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields, is_dataclass
@@ -154,8 +153,7 @@ class Exact:
     """``segments`` per frame in which splats move; every line integrates over its own window.
 
     With 0 segments their number keeps the error of a frame below ``time_error``, relative to the frame's RMS. ``time_error``
-    also bounds the error of quadrature over time. Raises InputError for numbers out of range.
-    """
+    also bounds the error of quadrature over time. Raises InputError for numbers out of range."""
 
     operators: ClassVar = (SPLATS,)
     name: str = field(default="exact", init=False, repr=False)

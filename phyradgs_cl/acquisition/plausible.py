@@ -43,8 +43,7 @@ def blur_facts(scan: "Scan") -> dict[str, float]:
 
     The arc is the median over frames, of the time that a line is open and the beam is on. The rim is the largest radius that
     every view sees, up to the panel's nearer side. A panel more than a tenth of its width off centre was put there for a
-    wider field of view, which opposite views complete: its rim is the farther side.
-    """
+    wider field of view, which opposite views complete: its rim is the farther side."""
     if not scan.is_fly:
         return {}
     windows_s = scan.shutter.line_windows_s(scan.lines)
@@ -139,8 +138,7 @@ def check_plausible(scan: "Scan", named: Named = str, is_timed: bool = True) -> 
     Warns of times most likely in a wrong unit, of angles that look like radians and of line integrals that may be counts.
     ``named`` translates ``source_to_axis_mm``, ``source_to_detector_mm``, ``pixel_size_mm``, ``grid``, ``readout_s``,
     ``exposure_s``, ``frame_time_s``, ``angles`` and ``quantity`` to the caller's names. ``is_timed``: False where nobody
-    stated a time, so that a frame rate means nothing.
-    """
+    stated a time, so that a frame rate means nothing."""
     _check_panel(scan.geometry, named)
     _check_voxels(scan.grid, scan.geometry, named("grid"))
     angle_deg = np.rad2deg(np.unwrap(_source_angle_rad(scan, 0.0, scan.shutter.exposure_s)[:, 0]))

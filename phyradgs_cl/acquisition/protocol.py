@@ -79,8 +79,7 @@ class Protocol:
         return float(start_s[0]), float(start_s[-1]) + self.shutter().span_s
 
     def angle_start_rad(self) -> np.ndarray:
-        start_rad: np.ndarray = np.deg2rad(self.start_deg + np.arange(self.views) * self.step_deg)
-        return start_rad
+        return np.asarray(np.deg2rad(self.start_deg + np.arange(self.views) * self.step_deg))
 
     def orbit(
         self, geometry: Geometry, jitter_deg: float = 0.0, rng: np.random.Generator | None = None

@@ -78,8 +78,7 @@ def exposure_of(
     """Returns arc in degrees and time in s of an exposure.
 
     With ``fps`` either follows from the other by the median step of ``turned_deg`` (F,); without it the time is 1 s unless
-    given. Raises InputError where neither or both are given with ``fps``.
-    """
+    given. Raises InputError where neither or both are given with ``fps``."""
     if exposure_s is not None:
         checks.positive("exposure_s", exposure_s)
     if exposure_deg is not None:

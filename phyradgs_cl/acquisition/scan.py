@@ -73,8 +73,7 @@ class Scan:
     - lag: share λ of the recorded intensity that stems from earlier frames (detector/effects.py), still in the projections.
     - saturation: None where raw counts were not examined. title and provenance are stored in files.
 
-    Raises InputError for shapes that do not fit each other, and for line integrals that are not finite.
-    """
+    Raises InputError for shapes that do not fit each other, and for line integrals that are not finite."""
 
     projections: np.ndarray
     geometry: "Geometry"
@@ -154,8 +153,7 @@ class Scan:
         the source. grid: None takes the field of view of a full turn. others: the fields detector_model, pixel_mask,
         reference, title, lag and provenance of ``Scan``.
 
-        Raises InputError for shapes that do not fit, and for poses from which no ray meets the grid.
-        """
+        Raises InputError for shapes that do not fit, and for poses from which no ray meets the grid."""
         values = _uncounted(frames, others.get("pixel_mask"))
         checks.shape("frames", values, (None, None, None))
         table = checks.numbers("poses", poses, (len(values), POSE_LENGTH))
@@ -181,8 +179,7 @@ class Scan:
         frames (F, rows, columns): line integrals. ASTRA's order is (rows, F, columns): give ``sinogram.swapaxes(0, 1)``.
         vectors (F, 12) in mm: source, centre of the panel, step from column to column, from row to row. With
         ``is_parallel`` they are those of ``parallel3d_vec``, which begin with the direction of the rays. grid, others: as in
-        ``from_poses``. Raises InputError for shapes that do not fit.
-        """
+        ``from_poses``. Raises InputError for shapes that do not fit."""
         values, table = _uncounted(frames, others.get("pixel_mask")), np.asarray(vectors)
         checks.shape("vectors", table, (None, POSE_LENGTH))
         if values.ndim == 3 and len(values) != len(table) == values.shape[1]:
@@ -202,8 +199,7 @@ class Scan:
 
         With geo.mode "parallel" the distances are not needed.
 
-        Raises InputError for a turned panel, and attributes that are missing or do not fit.
-        """
+        Raises InputError for a turned panel, and attributes that are missing or do not fit."""
         check_others(others)
         poses, panel, grid = poses_of_tigre(geo, angles)
         checks.shape("frames", frames, (len(poses), *panel))
@@ -213,8 +209,7 @@ class Scan:
         """Returns ASTRA's ``cone_vec`` or ``parallel3d_vec`` (F, 12) in mm, each frame at the middle of its lit window.
 
         ``from_astra`` inverts it. ASTRA stacks frames as (rows, F, columns): ``scan.projections.swapaxes(0, 1)``. Its
-        volumes are (z, y, x) too.
-        """
+        volumes are (z, y, x) too."""
         times_s = self.frame_start_s + self.shutter.middle_s
         poses = np.stack([self.trajectory.pose(f, np.array(t)) for f, t in enumerate(times_s)])
         return astra_of_poses(poses, self.geometry.detector_shape)

@@ -20,8 +20,7 @@ class Shutter:
     Line r of H opens ``r/(H−1)·readout_s`` after the frame's start and stays open for ``exposure_s``. A readout of 0 is a
     global shutter. ``axis``: what one line is, "rows" or "columns". ``direction``: +1 reads index 0 first, −1 last.
     ``pulse_s`` (start after the frame's start, length): when the beam is on, None always. A line sees the part of its window
-    in the pulse. Raises InputError for times below 0, other words, and a pulse that meets no frame.
-    """
+    in the pulse. Raises InputError for times below 0, other words, and a pulse that meets no frame."""
 
     exposure_s: float
     readout_s: float = 0.0

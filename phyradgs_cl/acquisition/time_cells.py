@@ -1,8 +1,7 @@
 """Time cells: one table of (pose, lines, weight) for each frame, which drives every operator.
 
 A frame is a sum over cells: its pixel lines [line_start, line_stop) receive ``weight`` times the projection from the cell's
-pose. The weights of a line sum to 1. ``cells.py`` builds these tables.
-"""
+pose. The weights of a line sum to 1. ``cells.py`` builds these tables."""
 
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -31,8 +30,7 @@ class TimeCells:
     user-defined cells that do not fit the scan. is_parallel: poses begin with the direction of parallel rays.
 
     ``conic_pose`` (12,), only for splats: the poses of the cells then place the centres of Gaussians; their shapes and
-    densities on the panel are those of this pose.
-    """
+    densities on the panel are those of this pose."""
 
     pose: np.ndarray
     time_s: np.ndarray

@@ -3,8 +3,7 @@
 ASTRA's ``cone_vec`` (F, 12) is source, centre of the panel, step from column to column, step from row to row, x y z each;
 ``parallel3d_vec`` begins with the direction of the rays.
 TIGRE's cone equals ours: source at (DSO cos α, DSO sin α, 0), columns along the turn, row 0 the lowest. Its pairs run (v,
-u), its triples (z, y, x), and ``COR`` shifts source and panel along the columns. Both put the rotation axis along z.
-"""
+u), its triples (z, y, x), and ``COR`` shifts source and panel along the columns. Both put the rotation axis along z."""
 
 import logging
 from typing import Any
@@ -46,8 +45,7 @@ def poses_of_tigre(geo: Any, angles_rad: ArrayLike) -> tuple[np.ndarray, tuple[i
     """Returns poses (F, 12), the panel (rows, columns) and the grid of a TIGRE geometry.
 
     angles_rad: (F,), or Euler angles (F, 3). Raises InputError for geometries that a scan cannot hold: a turned panel, a
-    second or third Euler angle, a volume that moves; and for attributes that are missing or not numbers.
-    """
+    second or third Euler angle, a volume that moves; and for attributes that are missing or not numbers."""
     if getattr(geo, "mode", None) not in (None, "cone", "parallel"):
         raise InputError("geo.mode", checks.short_repr(geo.mode), "'cone' or 'parallel'")
     angles = np.asarray(angles_rad)

@@ -61,8 +61,7 @@ class ConstantSpeed:
 class SpeedRamp:
     """θ(t) = θ0 + ω t + ½ a t²: a gantry that speeds up or brakes by ``acceleration_rad_per_s2``.
 
-    ``angle_start_rad`` and ``speed_rad_per_s`` hold at time 0. Raises InputError for infinite values or NaN.
-    """
+    ``angle_start_rad`` and ``speed_rad_per_s`` hold at time 0. Raises InputError for infinite values or NaN."""
 
     angle_start_rad: float
     speed_rad_per_s: float
@@ -107,8 +106,7 @@ class FrameSweeps:
 
     The speed continues through the readout; equal angles are a gantry at rest (stop-and-shoot). ``start_s`` (F,) in s: when
     the first line opens. ``exposure_s``: of a line. ``angle_start_rad`` and ``angle_end_rad`` (F,) in rad.
-    Raises InputError for arrays of unequal length, infinite values and NaN.
-    """
+    Raises InputError for arrays of unequal length, infinite values and NaN."""
 
     start_s: np.ndarray
     exposure_s: float
@@ -168,8 +166,7 @@ class PoseTable:
     ``is_parallel`` it begins with the direction of the rays, of any length, in place of the source.
     Rotations are interpolated by slerp, and the other numbers linearly in the body's own frame: a linear interpolation in
     world coordinates would shrink an orbit (by 1 mm at 1 m over 5°).
-    Raises InputError for times that do not increase, steps that span no panel, and times beyond the table.
-    """
+    Raises InputError for times that do not increase, steps that span no panel, and times beyond the table."""
 
     time_s: np.ndarray
     table: np.ndarray

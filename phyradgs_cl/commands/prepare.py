@@ -26,8 +26,7 @@ def prepare_command(
     scan: Scan, output: Output, steps: Annotated[str | None, STEPS_OF_PREPARE] = None,
     config: Annotated[Path | None, file_option(_CONFIG, "--config")] = None,
     assignments: Annotated[list[str] | None, option(_SET, True, "--set", metavar="NAME=VALUE")] = None,
-    ignore_lag: IgnoreLag = False,
-    as_json: AsJson = False, device: Device = None, memory: Memory = None,
+    ignore_lag: IgnoreLag = False, as_json: AsJson = False, device: Device = None, memory: Memory = None,
 ) -> None:
     """Correct the effects of panel and beam in a scan: write line integrals and a mask, and print each step's numbers.
 

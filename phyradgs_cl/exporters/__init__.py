@@ -78,8 +78,7 @@ def state_times_s(deformation: Deformation, count: int, during_s: tuple[float, f
     begin_s, end_s = float(deformation.times_s[0]), float(deformation.times_s[-1])
     if begin_s < end_s and (last_s <= begin_s or first_s >= end_s):
         raise InputError("--during", f"{first_s:g},{last_s:g} s", f"a part of the deformation's {begin_s:g} to {end_s:g} s")
-    middles_s: list[float] = (first_s + (np.arange(count) + 0.5) / count * (last_s - first_s)).tolist()
-    return middles_s
+    return (first_s + (np.arange(count) + 0.5) / count * (last_s - first_s)).tolist()
 
 
 def export_states(

@@ -126,8 +126,7 @@ class Deformation:
     def inverse_on_grid_mm(self, grid: Grid, weights: "ArrayLike") -> np.ndarray:
         """Returns u (nz, ny, nx, 3) float32 in mm with u(x) = −w(x + u(x)): matter at x of the reference is at x + u(x).
 
-        Fixed point from u = 0. Raises InputError where it does not converge, for example
-        because the field folds."""
+        Fixed point from u = 0. Raises InputError where it does not converge, for example because the field folds."""
         return self.inverse_mm(_centres_mm(grid), weights).reshape(*grid.shape, 3).astype(np.float32)
 
     def inverse_mm(self, points_mm: np.ndarray, weights: "ArrayLike") -> np.ndarray:

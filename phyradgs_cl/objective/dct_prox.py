@@ -136,8 +136,7 @@ def dct_prox(
     """Float64 twin of ``DctProx``."""
     volume = np.asarray(volume, np.float64)
     if min(volume.shape) < EDGE:
-        same: np.ndarray = np.maximum(volume, 0) if nonnegative else volume
-        return same
+        return np.asarray(np.maximum(volume, 0) if nonnegative else volume)
     blocks = np.lib.stride_tricks.sliding_window_view(volume, (EDGE,) * 3)
     losses = curves.losses(scipy.fft.dctn(blocks, axes=(3, 4, 5), norm="ortho"), unit)
     back = scipy.fft.idctn(losses, axes=(3, 4, 5), norm="ortho")

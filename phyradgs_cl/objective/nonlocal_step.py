@@ -101,8 +101,7 @@ def nonlocal_step(volume: np.ndarray, likeness: np.ndarray, step: float) -> np.n
         weight = alike[here] / np.maximum(np.maximum(sums[here], sums[there]), 1e-300)
         pull[here] += weight * (volume[there] - volume[here])
         pull[there] += weight * (volume[here] - volume[there])
-    moved: np.ndarray = volume + step * pull
-    return moved
+    return np.asarray(volume + step * pull)
 
 
 def _ends(offset: tuple[int, ...], shape: tuple[int, ...]) -> tuple[tuple[slice, ...], tuple[slice, ...]]:

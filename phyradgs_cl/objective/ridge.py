@@ -45,8 +45,7 @@ class Ridge:
         columns = (self.slope_up, self.knot_up, self.slope_down, self.knot_down)
         up, knot_up, down, knot_down = (values.astype(np.float64)[:, None, None, None] for values in columns)
         rising, falling = (np.clip(responses, -sigma * knot, sigma * knot) for knot in (knot_up, knot_down))
-        bent: np.ndarray = up * rising - down * falling
-        return bent
+        return np.asarray(up * rising - down * falling)
 
 
 @cache
@@ -117,8 +116,7 @@ def ridge_gradient(volume: np.ndarray, sigma: float, ridge: Ridge) -> np.ndarray
     if min(volume.shape) < EDGE:
         return np.zeros_like(volume)
     bent = ridge.bend(correlated(correlated(volume[None], ridge.first[:, None]), ridge.second), sigma)
-    gradient: np.ndarray = correlated_back(correlated_back(bent, ridge.second), ridge.first[:, None])[0]
-    return gradient
+    return np.asarray(correlated_back(correlated_back(bent, ridge.second), ridge.first[:, None])[0])
 
 
 def ridge_step(volume: np.ndarray, sigma: float, step: float, *, ridge: Ridge, nonnegative: bool) -> np.ndarray:
@@ -130,8 +128,7 @@ def ridge_step(volume: np.ndarray, sigma: float, step: float, *, ridge: Ridge, n
 def correlated(channels: np.ndarray, filters: np.ndarray) -> np.ndarray:
     """Correlates channels (c, z, y, x) with filters (i, c, 3, 3, 3): (i, z − 2, y − 2, x − 2), where windows are inside."""
     windows = np.lib.stride_tricks.sliding_window_view(channels, (3, 3, 3), axis=(1, 2, 3))
-    results: np.ndarray = np.einsum("czyxkji,fckji->fzyx", windows, filters.astype(np.float64), optimize=True)
-    return results
+    return np.asarray(np.einsum("czyxkji,fckji->fzyx", windows, filters.astype(np.float64), optimize=True))
 
 
 def correlated_back(responses: np.ndarray, filters: np.ndarray) -> np.ndarray:

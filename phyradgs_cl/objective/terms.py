@@ -62,19 +62,18 @@ class ImageLoss:
         rt.launch(self._kernels["ssim_moments"], (vectors, self.lines), *images, *size, self._moments, group=group)
         rt.launch(
             self._kernels["ssim_map"], items, self._moments, *images, *size, np.float32(C1), np.float32(C2),
-            weights, np.int32(poisson != 0), self._partials, rt.local(16 * math.prod(tile)), self._sums,
-            group=tile,
-        )
+            weights, poisson != 0, self._partials, rt.local(16 * math.prod(tile)), self._sums, group=tile,
+        )  # fmt: skip
         rt.launch(
             self._kernels["ssim_spread"], (vectors, self.lines), self._partials, self._window, *size,
             self._spread, group=group,
-        )
+        )  # fmt: skip
         rt.launch(
             self._kernels["image_gradient"], rt.shape_of_lines(self.pitch, self.lines)[0], self._spread,
             *images, *size, np.float32(self.l1_weight / max(pixels, 1.0)),
             np.float32(self.ssim_weight / (self.lines * self.width)), weights,
             np.float32(poisson / max(pixels, 1.0)), self.gradient, group=tile,
-        )
+        )  # fmt: skip
         return self.gradient
 
     def value(self) -> float:
@@ -128,9 +127,9 @@ class TotalVariation:
         nz, ny, _ = self.shape
         items, tile, _ = self.rt.shape_of_lines(self.pitch, ny, nz)
         self.rt.launch(
-            self._kernel, items, volume, self._shape4, np.int32(self.pitch), self._weight4, self.gradient,
+            self._kernel, items, volume, self._shape4, self.pitch, self._weight4, self.gradient,
             self.rt.local(4 * math.prod(tile)), self._sums, group=tile,
-        )
+        )  # fmt: skip
         return self.gradient
 
     def value(self) -> float:

@@ -1,7 +1,6 @@
 """Operators between fields and frames: splats, voxels of splats, rays, and FDK's backprojection.
 
-An operator knows its domain, its range and its transpose. It knows no algorithm.
-"""
+An operator knows its domain, its range and its transpose. It knows no algorithm."""
 
 from phyradgs_cl.operators.backproject import backproject, backproject_lines
 from phyradgs_cl.operators.rays.intensity import IntensityOperator
@@ -12,18 +11,7 @@ from phyradgs_cl.operators.splats.projector import DEFAULT_CUTOFF_SIGMA, SplatPr
 from phyradgs_cl.operators.splats.voxelise import Voxeliser, voxelise
 
 __all__ = [
-    "DEFAULT_CUTOFF_SIGMA",
-    "DensityOperator",
-    "DeviceCells",
-    "DeviceGaussians",
-    "IntensityOperator",
-    "LinearOperator",
-    "RayOperator",
-    "SplatOperator",
-    "SplatProjector",
-    "VoxelOperator",
-    "Voxeliser",
-    "backproject",
-    "backproject_lines",
-    "voxelise",
+    "DEFAULT_CUTOFF_SIGMA", "DensityOperator", "DeviceCells", "DeviceGaussians", "IntensityOperator",
+    "LinearOperator", "RayOperator", "SplatOperator", "SplatProjector", "VoxelOperator", "Voxeliser",
+    "backproject", "backproject_lines", "voxelise",
 ]

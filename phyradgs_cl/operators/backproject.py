@@ -1,7 +1,6 @@
 """Voxel-driven backprojection with FDK's distance weight, from one pose per frame or one pose per line.
 
-If memory is short, the volume is computed in bricks and views are uploaded in smaller parts, with the same bits.
-"""
+If memory is short, the volume is computed in bricks and views are uploaded in smaller parts, with the same bits."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -34,8 +33,7 @@ def backproject(
     """Returns Σ_f weight_f / z² · frame_f(u, v) at every voxel centre; z is the voxel's depth relative to the detector's.
 
     frames (F, rows, columns), bilinear and zero outside; pose (F, 12) mm; weight (F,). z is 1 in a parallel beam. The
-    result (z, y, x) float32 is on the device if the frames are.
-    """
+    result (z, y, x) float32 is on the device if the frames are."""
     matrices = voxel_matrices(pose, grid, is_parallel)
     block, leans = (0, False) if rt.pixel_items else _upright_block(matrices, grid)
     views = Views(frames, bool(block), matrices, weight)
@@ -55,8 +53,7 @@ def backproject_lines(
 
     A voxel reads the line r whose pose projects the voxel onto r, interpolated between neighbouring lines. Its value is
     divided by the rate at which the voxel crosses lines: once for the angular step, and once more for the filter's scale
-    if frames were filtered across lines (``axis`` columns). See docs/mathematics.md.
-    """
+    if frames were filtered across lines (``axis`` columns). See docs/mathematics.md."""
     readout = Readout(axis)
     pose = readout.poses(pose)
     matrices = voxel_matrices(pose.reshape(-1, 12), grid, is_parallel).reshape(len(pose), -1)
@@ -168,15 +165,14 @@ def _upright(rt: Runtime, name: str, block: int, images: Arguments, brick: Brick
     kernel = rt.kernel("backproject", name, **defines)
     image, table, weights, views, columns, rows, *rest = images
     data = (image, table, weights, views, rows, columns, *rest)
-    rt.launch(kernel, (nx, ny, ceil_div(nz, block)), *data, *volume_shape(brick), np.int32(block), volume)
+    rt.launch(kernel, (nx, ny, ceil_div(nz, block)), *data, *volume_shape(brick), block, volume)
 
 
 def _upright_block(matrices: np.ndarray, grid: Grid) -> tuple[int, bool]:
     """Returns the voxels along z per work-item of the upright kernels, 0 if they do not apply, and whether columns lean.
 
     In upright columns u and depth (rows 0 and 2 of a matrix) do not change with z. All voxels must lie in front of the
-    source, and the rest of a column's last vector too.
-    """
+    source, and the rest of a column's last vector too."""
     nz, ny, nx = grid.shape
     corners = np.array([[x, y, z, 1] for x in (0, nx - 1) for y in (0, ny - 1) for z in (0, nz - 1 + _WIDEST)])
     depth = matrices[:, 8:12] @ corners.T

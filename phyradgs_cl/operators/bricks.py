@@ -29,18 +29,14 @@ def whole(shape: Shape) -> Brick:
 
 
 def cut(
-    shape: Shape,
-    steps: tuple[int, int],
-    needs: Callable[[Shape], tuple[int, ...]],
-    room: Room,
+    shape: Shape, steps: tuple[int, int], needs: Callable[[Shape], tuple[int, ...]], room: Room,
     share: float = 1.0,
 ) -> list[Brick]:
     """Returns bricks as large as ``share`` of the free memory allows, in the order z, y.
 
     Sides are multiples of ``steps`` (z, y), except the last along an axis. ``needs`` returns the bytes of all buffers for a
     brick of shape (z, y, x). The smallest brick may take all of the room if the share is too little. Raises
-    OutOfMemoryError if it does not fit then.
-    """
+    OutOfMemoryError if it does not fit then."""
     nz, ny, nx = shape
     smallest = (min(steps[0], nz), min(steps[1], ny), nx)
     if not room.holds(*needs(smallest)):

@@ -48,8 +48,7 @@ def folded_rates(rates: np.ndarray, step: int) -> np.ndarray:
     """Learning rates (11,) with both bias corrections of step ``step`` (from 1) folded in.
 
     m̂/√v̂ = m/√v · √(1−β2^t)/(1−β1^t); ε is scaled along, which at 1e-15 is without effect."""
-    folded: np.ndarray = rates * np.sqrt(1 - BETA2**step) / (1 - BETA1**step)
-    return folded
+    return np.asarray(rates * np.sqrt(1 - BETA2**step) / (1 - BETA1**step))
 
 
 def adam_step(
@@ -74,10 +73,10 @@ class DeviceAdam:
     def activate(self, raw: DeviceArray, parameters: DeviceArray, count: int, stride: int) -> None:
         """Parameter rows from raw rows."""
         self.rt.launch(
-            self._activate, stride // self.rt.lanes, raw, np.int32(count), np.int32(stride),
+            self._activate, stride // self.rt.lanes, raw, count, stride,
             np.float32(self.activation.scale_min), np.float32(self.activation.scale_max), parameters,
             group=self.rt.group(),
-        )
+        )  # fmt: skip
 
     def chain(
         self, raw: DeviceArray, parameters: DeviceArray, gradients: DeviceArray, statistics: DeviceArray,
@@ -87,11 +86,11 @@ class DeviceAdam:
         """dL/dparameters to dL/draw in place, with the parameter terms (means) added and the statistics gathered."""
         share = 1.0 / max(count, 1)
         self.rt.launch(
-            self._chain, stride // self.rt.lanes, raw, parameters, np.int32(count), np.int32(stride),
+            self._chain, stride // self.rt.lanes, raw, parameters, count, stride,
             np.float32(self.activation.scale_min), np.float32(self.activation.scale_max),
             np.float32(density_weight * share), np.float32(shape_weight * share), np.float32(shape_ratio),
             np.float32(shape_floor), gradients, statistics, group=self.rt.group(),
-        )
+        )  # fmt: skip
 
     def step(
         self, raw: DeviceArray, gradients: DeviceArray, moments: DeviceArray, stride: int, rates: np.ndarray,
@@ -101,6 +100,6 @@ class DeviceAdam:
         rates16 = np.zeros(16, np.float32)
         rates16[:11] = folded_rates(rates, step)
         self.rt.launch(
-            self._step, (stride // self.rt.lanes, 11), raw, gradients, moments, np.int32(stride), rates16,
+            self._step, (stride // self.rt.lanes, 11), raw, gradients, moments, stride, rates16,
             np.float32(BETA1), np.float32(BETA2), np.float32(EPSILON), group=self.rt.group(),
-        )
+        )  # fmt: skip

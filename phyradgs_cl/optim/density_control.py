@@ -37,8 +37,7 @@ class DensityControl:
         """Returns which of the scales (3, G) are not too thin."""
         if self.prune_aspect <= 0:
             return np.ones(scale.shape[1], bool)
-        allowed: np.ndarray = scale.max(0) <= self.prune_aspect * scale.min(0)
-        return allowed
+        return np.asarray(scale.max(0) <= self.prune_aspect * scale.min(0))
 
     def is_due(self, iteration: int, iterations: int) -> bool:
         """Whether to act after ``iteration`` (counted from 1)."""
@@ -121,5 +120,4 @@ def rotate(quaternion: np.ndarray, vector: np.ndarray) -> np.ndarray:
     """Vectors (3, S) turned by unit quaternions (4, S), w x y z."""
     w, axis = quaternion[0], quaternion[1:]
     cross = 2 * np.cross(axis, vector, axis=0)
-    turned: np.ndarray = vector + w * cross + np.cross(axis, cross, axis=0)
-    return turned
+    return np.asarray(vector + w * cross + np.cross(axis, cross, axis=0))

@@ -7,8 +7,7 @@ an order, because they fluctuate or do not respond, are interpolated from their 
 
 The paper sorts and replaces every column, which blurs a scan of a few hundred columns. Here a column is replaced if it
 deviates from the sorted medians much more than the columns at both its sides do, and than its mirror image about the axis.
-An edge of the object spreads over many columns, shows at one side only, or has a mirror image.
-"""
+An edge of the object spreads over many columns, shows at one side only, or has a mirror image."""
 
 from dataclasses import dataclass, replace
 

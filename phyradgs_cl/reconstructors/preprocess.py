@@ -107,8 +107,7 @@ def reprojection(rt: Runtime | None, scan: Scan) -> Model:
         return replace(scan, projections=np.asarray(frames, np.float32))
 
     return Model(
-        volume=lambda frames: fdk(of(frames), fdk_options, rt).volume,
-        frames=operator.forward,
+        volume=lambda frames: fdk(of(frames), fdk_options, rt).volume, frames=operator.forward,
         regularised=lambda frames: fista_tv.METHOD.run(of(frames), tv_options, rt).volume,
     )
 

@@ -180,5 +180,4 @@ def without_drift(scan: Scan, drift: float) -> Scan:
 def scan_course(scan: Scan) -> np.ndarray:
     """Returns where in the scan each frame (F,) begins, -1/2 to 1/2."""
     starts_s = np.asarray(scan.frame_start_s, np.float64)
-    course: np.ndarray = (starts_s - starts_s.min()) / max(np.ptp(starts_s), 1e-30) - 0.5
-    return course
+    return np.asarray((starts_s - starts_s.min()) / max(np.ptp(starts_s), 1e-30) - 0.5)

@@ -2,8 +2,7 @@
 
 A_k is the projector of the k-th cell of every line. J = Σ_k s_k A_k with each pixel's softmax weight
 s_k = w_k exp(−p_k) / Σ_j w_j exp(−p_j). Jᵀ y = Σ_k A_kᵀ (s_k y). This takes one launch of the linear projector for each
-cell of a line; together they cost as much as one launch over all cells. Twin: ``intensity_frame`` in twins/rays.py.
-"""
+cell of a line; together they cost as much as one launch over all cells. Twin: ``intensity_frame`` in twins/rays.py."""
 
 from collections.abc import Callable, Sequence
 from copy import copy
@@ -26,8 +25,7 @@ class IntensityOperator:
     """I(x), and J and Jᵀ at the last volume given to ``expected`` (A and Aᵀ before the first).
 
     Arguments are those of ``RayOperator``, as is the rule for NumPy and device arrays. The operator stores one stack of
-    frames (F, rows, columns) of softmax weights for each cell of a line. ``projector`` makes the A_k.
-    """
+    frames (F, rows, columns) of softmax weights for each cell of a line. ``projector`` makes the A_k."""
 
     def __init__(
         self, rt: Runtime, grid: Grid, detector_shape: tuple[int, int], tables: Sequence[TimeCells],

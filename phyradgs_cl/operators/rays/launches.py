@@ -3,8 +3,6 @@
 import math
 from collections.abc import Iterator
 
-import numpy as np
-
 from phyradgs_cl.checks import ceil_div
 from phyradgs_cl.operators.rays.layout import RayCells, RayLayout
 from phyradgs_cl.runtime import DeviceArray, Runtime
@@ -21,44 +19,25 @@ AVERAGES = ("log", "intensity", "correction")  # correction: log minus intensity
 
 
 def launch_forward(
-    rt: Runtime,
-    layout: RayLayout,
-    cells: RayCells,
-    frame_list: DeviceArray,
-    volume: DeviceArray,
-    frames: DeviceArray,
-    *,
-    average: str = "log",
-    add: bool = False,
+    rt: Runtime, layout: RayLayout, cells: RayCells, frame_list: DeviceArray, volume: DeviceArray,
+    frames: DeviceArray, *, average: str = "log", add: bool = False,
 ) -> None:
     """Projects a padded volume to the listed frames. ``average``, one of AVERAGES, is taken over the cells of a line.
 
-    ``add`` adds line integrals to those in ``frames``, as several bricks of a volume need it; for ``log`` alone.
-    """
+    ``add`` adds line integrals to those in ``frames``, as several bricks of a volume need it; for ``log`` alone."""
     blocks = ceil_div(layout.width, rt.lanes)
     kernel = rt.kernel("rays", "rays_forward", AVERAGE=AVERAGES.index(average), **_defines(layout, cells))
     for first, stop in _parts(rt, frame_list.size, layout.lines * layout.width * max(layout.brick.shape)):
         rt.launch(
-            kernel,
-            (blocks, layout.lines, stop - first),
-            volume,
-            cells.cells, cells.cell_lines, cells.line_cells, frame_list, cells.weights, cells.weight_at,
-            *layout.constants(),
-            np.int32(first), np.int32(add),
-            frames,
-            group=rt.group(on_cpu=min(blocks, 8)),
+            kernel, (blocks, layout.lines, stop - first), volume, cells.cells, cells.cell_lines,
+            cells.line_cells, frame_list, cells.weights, cells.weight_at, *layout.constants(), first, add,
+            frames, group=rt.group(on_cpu=min(blocks, 8)),
         )  # fmt: skip
 
 
 def launch_adjoint(
-    rt: Runtime,
-    layout: RayLayout,
-    cells: RayCells,
-    frame_list: DeviceArray,
-    frames: DeviceArray,
-    volume: DeviceArray,
-    *,
-    add: bool = False,
+    rt: Runtime, layout: RayLayout, cells: RayCells, frame_list: DeviceArray, frames: DeviceArray,
+    volume: DeviceArray, *, add: bool = False,
 ) -> None:
     """Backprojects the listed frames into a padded volume; ``add`` keeps the sums that are in it."""
     if rt.pixel_items:
@@ -73,16 +52,9 @@ def launch_adjoint(
     for first, stop in _parts(rt, frame_list.size, _SAMPLES_PER_VOXEL * nz * ny * nx):
         adds = add or first > 0  # a launch continues the sums of the launch before: the same bits as one launch
         rt.launch(
-            kernel,
-            (columns * group, rows, slices),
-            frames,
-            cells.cells, cells.cell_lines, cells.matrices, np.int32(cells.matrix_stride),
-            cells.frame_cells, frame_list, cells.weights, cells.weight_at,
-            np.int32(first), np.int32(stop),
-            *layout.constants(),
-            np.int32(adds),
-            volume,
-            group=group,
+            kernel, (columns * group, rows, slices), frames, cells.cells, cells.cell_lines, cells.matrices,
+            cells.matrix_stride, cells.frame_cells, frame_list, cells.weights, cells.weight_at, first, stop,
+            *layout.constants(), adds, volume, group=group,
         )  # fmt: skip
 
 

@@ -1,8 +1,7 @@
 """Layout of volumes, frames and time cells in device memory for the ray-driven projector (cl/common/ray.h).
 
 ``layered`` splits the cells of frames into layers in which no line has more than one cell. A detector averages intensities
-over the cells of a line, which needs separate line integrals for each cell.
-"""
+over the cells of a line, which needs separate line integrals for each cell."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -28,8 +27,7 @@ class RayLayout:
     """Layout of volumes (z, y, x) and of stacks of frames with ``lines`` × ``width`` pixels in device memory.
 
     ``brick`` selects the voxels of the grid that the volume holds. It has a border of zeros, so that the frames of all
-    bricks add up to the frames of the grid.
-    """
+    bricks add up to the frames of the grid."""
 
     grid: Grid
     lines: int
@@ -206,8 +204,7 @@ def layers(table: TimeCells) -> list[TimeCells]:
 def layered(tables: Sequence[TimeCells]) -> tuple[list[list[TimeCells]], list[np.ndarray]]:
     """Splits the cells of F frames: the tables of each layer with weights of 1, and the original weights.
 
-    Weights are float32, (F, lines, 1) or (F, 1, lines) by the readout's axis; 0 where a layer has no cell for a line.
-    """
+    Weights are float32, (F, lines, 1) or (F, 1, lines) by the readout's axis; 0 where a layer has no cell for a line."""
     split = [layers(table) for table in tables]
     ones, weights = [], []
     for k in range(max(len(parts) for parts in split)):
@@ -222,8 +219,7 @@ def averaged(integrals: Sequence[np.ndarray], weights: Sequence[np.ndarray], ave
     """Averages line integrals p of each layer, (F, rows, columns), with the weights of ``layered``; float32.
 
     ``intensity`` is −ln Σ w exp(−p); ``correction`` is Σ w p minus that. Lines without cells are 0; the weights of other
-    lines sum to 1. cl/rays.cl does the same where one launch has all cells of a line.
-    """
+    lines sum to 1. cl/rays.cl does the same where one launch has all cells of a line."""
     sums = np.sum(weights, axis=0, dtype=np.float64)  # 1 except for float32 rounding, which would show in a small correction
     exact = [np.divide(w, sums, out=np.zeros_like(sums), where=sums > 0) for w in weights]
     frames, _ = intensity_average(integrals, exact)

@@ -23,8 +23,7 @@ class RayMemory:
 
     A volume that does not fit is cut into bricks, as large as fit together with some frames. ``slot_floats`` is the size of
     the slots of one frame (``slots.py``), 0 without slots. With slots the volume is also stored with z along rows, if both
-    fit. Several operators may share one memory, one at a time: each call writes the buffers that it reads.
-    """
+    fit. Several operators may share one memory, one at a time: each call writes the buffers that it reads."""
 
     def __init__(self, rt: Runtime, layout: RayLayout, most_frames: int, slot_floats: int = 0) -> None:
         self.rt, self.layout, self.most_frames = rt, layout, most_frames
@@ -124,8 +123,7 @@ class RayMemory:
     def write_volume(self, volume: Array, brick: Brick) -> tuple[RayLayout, DeviceArray]:
         """Copies a brick of a volume (z, y, x) to the device, into the padded layout.
 
-        The padded host array is kept for the next call: new pages cost more than the copy.
-        """
+        The padded host array is kept for the next call: new pages cost more than the copy."""
         layout, on_device = self.volume(brick)
         if isinstance(volume, DeviceArray):
             if self._bordered != brick.shape:

@@ -6,8 +6,7 @@ one brick of the volume after the other if the volume does not fit on the device
 
 Two sets of kernels compute the same samples. The general ones follow each ray (``launches.py``). The upright ones serve
 CPUs and scans whose detector columns run nearly along z: they project each pose once, into a slot, and average slots to
-frames (``upright.py``, ``slots.py``).
-"""
+frames (``upright.py``, ``slots.py``)."""
 
 from collections.abc import Iterator, Sequence
 from copy import copy
@@ -59,18 +58,11 @@ class RayOperator:
     were given the same ``memory``: use them one at a time. A volume that does not fit is projected in bricks.
     fewest_lines: as in ``upright_of``; ``FEWEST_LINES`` is fastest for panels of few lines, and rounds differently.
 
-    Joseph, IEEE Trans. Med. Imaging 1 (1982) 192. Raises InputError for tables that do not fit the detector.
-    """
+    Joseph, IEEE Trans. Med. Imaging 1 (1982) 192. Raises InputError for tables that do not fit the detector."""
 
     def __init__(
-        self,
-        rt: Runtime,
-        grid: Grid,
-        detector_shape: tuple[int, int],
-        tables: Sequence[TimeCells],
-        *,
-        memory: RayMemory | None = None,
-        fewest_lines: int | None = None,
+        self, rt: Runtime, grid: Grid, detector_shape: tuple[int, int], tables: Sequence[TimeCells], *,
+        memory: RayMemory | None = None, fewest_lines: int | None = None,
     ) -> None:
         _check_tables(tables, detector_shape)
         self.rt, self.grid, self.detector_shape = rt, grid, detector_shape
@@ -176,8 +168,7 @@ class RayOperator:
         """Averages −ln Σ w exp(−p) of a volume in bricks, on the host.
 
         These need the whole line integral of every cell, of which a brick holds a part. So a layer (at most one cell per
-        line) is projected at a time.
-        """
+        line) is projected at a time."""
         ones, weights = layered(self.tables)
         like = (self.rt, self.grid, self.detector_shape)
         on_host = self.rt.download(volume) if isinstance(volume, DeviceArray) else volume
@@ -192,9 +183,7 @@ class RayOperator:
         """Returns Aᵀ y for frames (F, rows, columns): a volume (nz, ny, nx) float32."""
         _check_shape("frames", frames, self.frames_shape)
         result: SameArray = _room_for(self.rt, self.volume_shape, frames, out)
-        with_smaller_bricks(
-            "ray-driven backprojector", lambda share: self._adjoint(frames, share, result)
-        )
+        with_smaller_bricks("ray-driven backprojector", lambda share: self._adjoint(frames, share, result))
         return result
 
     def _adjoint(self, frames: Array, share: float, result: Array) -> None:

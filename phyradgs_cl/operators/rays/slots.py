@@ -1,8 +1,7 @@
 """Slots for the upright kernels: the projection of one pose onto the part of the panel that it serves.
 
 Frames are weighted averages of slots; each line of a frame has a weight in each of its slots. Neighbouring frames share
-poses where exposures follow each other without gaps: such a pose is projected once.
-"""
+poses where exposures follow each other without gaps: such a pose is projected once."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -23,8 +22,7 @@ _SAME_POSE = 10  # decimals relative to the longest distance: poses that agree t
 class UprightPoses:
     """The distinct poses of many frames on the device, and the pose of each cell.
 
-    For all E cells, frame after frame: pose_of (E,), and lines first, stop (E,); frame_cells (F + 1,) where frames begin.
-    """
+    For all E cells, frame after frame: pose_of (E,), and lines first, stop (E,); frame_cells (F + 1,) where frames begin."""
 
     cells: DeviceArray
     matrices: DeviceArray
@@ -168,69 +166,30 @@ class Slots:
 
 
 def merge_slots(
-    rt: Runtime,
-    cells: RayCells,
-    slots: Slots,
-    integrals: DeviceArray,
-    target: tuple[DeviceArray, np.ndarray],
-    detector_shape: tuple[int, int],
-    axis: str,
-    average: int,
+    rt: Runtime, cells: RayCells, slots: Slots, integrals: DeviceArray,
+    target: tuple[DeviceArray, np.ndarray], detector_shape: tuple[int, int], axis: str, average: int,
 ) -> None:
     """Averages slots to frames. ``target`` is an array and its strides (start, column, row, frame)."""
     rows, columns = detector_shape
     rt.launch(
         rt.kernel("rays_slots", "merge_slots", AVERAGE=average, **{**slots.defines, "LEAN": 0}),
-        (columns, slots.frames),
-        integrals,
-        np.int32(slots.columns),
-        np.int32(slots.pitch),
-        slots.slots,
-        slots.frame_shares,
-        slots.shares,
-        cells.weights,
-        np.int32(axis == "rows"),
-        np.int32(columns),
-        np.int32(rows),
-        target[1],
-        target[0],
+        (columns, slots.frames), integrals, slots.columns, slots.pitch, slots.slots, slots.frame_shares,
+        slots.shares, cells.weights, axis == "rows", columns, rows, target[1], target[0],
         group=min(columns, 8),
-    )
+    )  # fmt: skip
 
 
 def split_slots(
-    rt: Runtime,
-    cells: RayCells,
-    poses: UprightPoses,
-    slots: Slots,
-    turned: DeviceArray,
-    detector_shape: tuple[int, int],
-    pitch_mm: np.ndarray | np.int32,
-    start: int,
-    values: DeviceArray,
+    rt: Runtime, cells: RayCells, poses: UprightPoses, slots: Slots, turned: DeviceArray,
+    detector_shape: tuple[int, int], pitch_mm: np.ndarray | np.int32, start: int, values: DeviceArray,
 ) -> None:
     """Distributes frames to slots by weight, times each ray's length from plane to plane.
 
-    turned: frames (F, columns, rows), which begin at ``start`` floats.
-    """
+    turned: frames (F, columns, rows), which begin at ``start`` floats."""
     rows, columns = detector_shape
     rt.launch(
-        rt.kernel("rays_slots", "split_slots", AVERAGE=0, **slots.defines),
-        (slots.columns, slots.count),
-        turned,
-        np.int64(start),
-        np.int32(pitch_of(rows)),
-        poses.cells,
-        slots.slots,
-        slots.slot_shares,
-        slots.shares_by_slot,
-        cells.weights,
-        np.int32(poses.axis == "rows"),
-        np.int32(columns),
-        pitch_mm,
-        np.int32(slots.columns),
-        np.int32(slots.pitch),
-        np.int64(slots.floats),
-        values,
-        group=1,
-    )
+        rt.kernel("rays_slots", "split_slots", AVERAGE=0, **slots.defines), (slots.columns, slots.count),
+        turned, np.int64(start), pitch_of(rows), poses.cells, slots.slots, slots.slot_shares,
+        slots.shares_by_slot, cells.weights, poses.axis == "rows", columns, pitch_mm, slots.columns,
+        slots.pitch, np.int64(slots.floats), values, group=1,
+    )  # fmt: skip

@@ -1,8 +1,7 @@
 """The ray-driven projector for detector columns nearly parallel to the volume's z, and poses that serve many lines.
 
 The rays of such a column share most of their work. Each pose is projected once, into a slot for its part of the panel;
-frames are weighted averages of slots (``slots.py``). Samples are the same as those of ``launches.py``.
-"""
+frames are weighted averages of slots (``slots.py``). Samples are the same as those of ``launches.py``."""
 
 import math
 from collections.abc import Sequence
@@ -45,8 +44,7 @@ def upright_of(
 
     The upright kernels need poses that serve several lines each, rays with main axis x or y, and columns nearly along z. If
     columns lean, the volume must lie between source and panel, as it always does in a parallel beam. fewest_lines: lines
-    read one after the other that a pose must serve on average, by default a whole vector of them.
-    """
+    read one after the other that a pose must serve on average, by default a whole vector of them."""
     served = sum(int((table.line_stop - table.line_start).sum()) for table in tables)
     lines = tables[0].lines
     fewest = fewest_lines or max(lanes, FEWEST_LINES)
@@ -83,8 +81,7 @@ def _is_steep(cells: np.ndarray, rows: int, columns: int) -> bool:
 def _least_horizontal(d00: np.ndarray, eu: np.ndarray, width: int) -> np.ndarray:
     """Returns (C,) the smallest length of d00 + u eu for u in [0, width − 1]; arguments (C, 2)."""
     nearest = -np.sum(d00 * eu, 1) / np.maximum(np.sum(eu * eu, 1), 1e-30)
-    length: np.ndarray = np.linalg.norm(d00 + np.clip(nearest, 0, width - 1)[:, None] * eu, axis=1)
-    return length
+    return np.asarray(np.linalg.norm(d00 + np.clip(nearest, 0, width - 1)[:, None] * eu, axis=1))
 
 
 def _lies_between(grid: Grid, source: np.ndarray, d00: np.ndarray, eu: np.ndarray, ev: np.ndarray) -> bool:
@@ -103,12 +100,7 @@ def columns_floats(grid: Grid) -> int:
 
 
 def launch_upright(
-    rt: Runtime,
-    layout: RayLayout,
-    how: Upright,
-    poses: UprightPoses,
-    slots: Slots,
-    columns: DeviceArray,
+    rt: Runtime, layout: RayLayout, how: Upright, poses: UprightPoses, slots: Slots, columns: DeviceArray,
     target: tuple[DeviceArray, np.ndarray],
 ) -> None:
     """Projects a turned volume to slots: an array, with strides as in ``Slots.strides``."""
@@ -116,54 +108,25 @@ def launch_upright(
     array, strides = target
     rt.launch(
         rt.kernel("rays_upright", "rays_upright", **_defines(how)),
-        (slots.columns, ceil_div(slots.rows, how.block), slots.count),
-        columns,
-        poses.cells,
-        slots.slots,
-        shape,
-        origin,
-        np.int32(pitch_of(layout.grid.shape[0])),
-        pitch_mm,
-        np.int32(how.block),
-        strides,
-        array,
+        (slots.columns, ceil_div(slots.rows, how.block), slots.count), columns, poses.cells, slots.slots,
+        shape, origin, pitch_of(layout.grid.shape[0]), pitch_mm, how.block, strides, array,
         group=min(slots.columns, 8),
-    )
+    )  # fmt: skip
 
 
 def launch_upright_adjoint(
-    rt: Runtime,
-    layout: RayLayout,
-    how: Upright,
-    poses: UprightPoses,
-    slots: Slots,
-    values: DeviceArray,
-    target: tuple[DeviceArray, Strides],
-    *,
-    add: bool = False,
+    rt: Runtime, layout: RayLayout, how: Upright, poses: UprightPoses, slots: Slots, values: DeviceArray,
+    target: tuple[DeviceArray, Strides], *, add: bool = False,
 ) -> None:
     """Backprojects slots, as ``split_slots`` writes them, into a volume with these strides."""
     shape, origin, *_ = layout.constants()
     (x, y, z), items = _owned(layout.brick.shape, rt.device.compute_units)
     rt.launch(
         rt.kernel("rays_upright_adjoint", "rays_upright_adjoint", ADJOINT_X=x, ADJOINT_Y=y, ADJOINT_Z=z, **slots.defines),
-        items,
-        values,
-        np.int32(slots.columns),
-        np.int32(slots.pitch),
-        np.int64(slots.floats),
-        poses.cells,
-        slots.slots,
-        np.int32(slots.count),
-        poses.matrices,
-        np.int32(poses.matrix_stride),
-        shape,
-        origin,
-        target[1].vector(),
-        np.int32(add),
-        target[0],
+        items, values, slots.columns, slots.pitch, np.int64(slots.floats), poses.cells, slots.slots,
+        slots.count, poses.matrices, poses.matrix_stride, shape, origin, target[1].vector(), add, target[0],
         group=1,
-    )
+    )  # fmt: skip
 
 
 def _owned(shape: tuple[int, int, int], units: int) -> tuple[tuple[int, int, int], tuple[int, ...]]:
@@ -183,7 +146,7 @@ def turn_volume(
     shape, *_ = layout.constants()
     size = (ceil_div(nx, _TURN), ny, ceil_div(nz, _TURN))
     kernel = rt.kernel("rays_upright", "turn_upright", **_defines(Upright(_LINES, False, False)))
-    rt.launch(kernel, size, volume[0], volume[1].vector(), shape, np.int32(pitch_of(nz)), columns, group=1)
+    rt.launch(kernel, size, volume[0], volume[1].vector(), shape, pitch_of(nz), columns, group=1)
 
 
 def _defines(how: Upright) -> dict[str, int]:

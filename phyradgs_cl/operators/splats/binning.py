@@ -20,8 +20,7 @@ class TileLists:
     ``tile`` is a tile's size and ``tiles`` their number, along x, y, z. Lists keep the order of the splats, so that sums
     over them repeat bit for bit. The memory for indices follows the number needed by former builds. The host waits for this
     number if the count of splats is new or ``waits`` is set. Otherwise it reads the number later; until then kernels do not
-    use lists that did not fit (cl/common/tile.h).
-    """
+    use lists that did not fit (cl/common/tile.h)."""
 
     def __init__(self, rt: Runtime, tile: tuple[int, int, int], tiles: tuple[int, int, int]) -> None:
         self.rt = rt
@@ -42,8 +41,7 @@ class TileLists:
     def build(self, extents: DeviceArray, count: int, stride: int) -> None:
         """Fills ``tile_offsets`` (tiles + 1,) and ``splat_ids`` from extents (6, stride).
 
-        Raises MemoryShortage for 2^31 indices or more; smaller bricks of a volume may have fewer.
-        """
+        Raises MemoryShortage for 2^31 indices or more; smaller bricks of a volume may have fewer."""
         rt = self.rt
         chunk = chunk_of(rt, self.total, count)
         chunks = max(ceil_div(count, chunk), 1)
@@ -66,15 +64,9 @@ class TileLists:
             rt.fill(self._counts, 0)
         rt.launch(self._count, chunks * group, *domain, self._counts, *boxes, group=group)
         rt.launch(
-            self._within,
-            self.total * scan,
-            total,
-            np.int32(chunks),
-            self._counts,
-            self.tile_offsets,
-            *scratch,
+            self._within, self.total * scan, total, chunks, self._counts, self.tile_offsets, *scratch,
             group=scan,
-        )
+        )  # fmt: skip
         rt.launch(self._starts, scan, total, self.tile_offsets, *scratch, group=scan)
         if self.waits or count != self._count_seen:
             self._make_room(int(rt.read_item(self.tile_offsets, self.total)), 1.0)
@@ -83,16 +75,9 @@ class TileLists:
             self._make_room(int(self._needed.value), _NEAR)
             self._needed = None
         rt.launch(
-            self._fill,
-            chunks * group,
-            *domain,
-            self._counts,
-            self.tile_offsets,
-            self.splat_ids,
-            np.int32(self.splat_ids.size),
-            *boxes,
-            group=group,
-        )
+            self._fill, chunks * group, *domain, self._counts, self.tile_offsets, self.splat_ids,
+            self.splat_ids.size, *boxes, group=group,
+        )  # fmt: skip
         if not self.waits and self._needed is None:
             self._needed = rt.read_item_later(self.tile_offsets, self.total)
 

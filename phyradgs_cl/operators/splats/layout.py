@@ -1,8 +1,7 @@
 """Layout of Gaussians, time cells and layers of frames in device memory.
 
 A detector adds photons: the merged frame is −ln Σ w_k exp(−p_k) over the cells k of a line. The projector therefore draws
-w_k p_k into layer k. Merging also keeps the derivative by every layer, which the adjoint needs.
-"""
+w_k p_k into layer k. Merging also keeps the derivative by every layer, which the adjoint needs."""
 
 from dataclasses import dataclass
 
@@ -64,8 +63,7 @@ class DeviceCells:
     which no line has two cells; ``layer_weights`` (layers, lines) are the cells' shares of a line's window. With
     ``fixed_conic``, ``cells`` are of the conic's pose, and ``matrices`` have two poses per cell, its own one last.
     Of an object that moves, ``shares`` (S, R) are the weights of its states, and ``cell_states`` (C, poses) the state of
-    every pose; else both have one element.
-    """
+    every pose; else both have one element."""
 
     cells: DeviceArray
     matrices: DeviceArray
@@ -127,8 +125,7 @@ def projection_matrices(pose: np.ndarray, is_parallel: bool = False) -> np.ndarr
     """Returns the rows (C, 12) that map a world point x to (u·z, v·z, z): pixel column, line and depth of its ray.
 
     x − source = z (d00 + u·eu + v·ev), with d00 from the source to pixel (0, 0). In a parallel beam x is on the ray through
-    (u, v): x − pixel (0, 0) = u·eu + v·ev + t·direction; z is 1.
-    """
+    (u, v): x − pixel (0, 0) = u·eu + v·ev + t·direction; z is 1."""
     if is_parallel:
         inverse = np.linalg.inv(np.stack([pose[:, 6:9], pose[:, 9:12], pose[:, 0:3]], -1))
         shift = -np.einsum("cij,cj->ci", inverse, pose[:, 3:6])
@@ -184,9 +181,7 @@ class Layers:
     def merge(self, cells: DeviceCells, merged: DeviceArray) -> None:
         """Writes −ln Σ w exp(−p) of the layers drawn last into ``merged``."""
         self._launch(
-            self._merge,
-            (self._drawn, cells.layer_weights),
-            cells,
+            self._merge, (self._drawn, cells.layer_weights), cells,
             (np.float32(self.unit), self._shares, merged),
         )
 

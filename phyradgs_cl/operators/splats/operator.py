@@ -5,8 +5,7 @@ nothing: it projects the Gaussians again (``prepare``), unless ``forward`` has j
 without padding.
 
 ``by_pose`` turns gradients by Gaussians into gradients by the pose: a gantry that turns equals an object that turns the
-other way; a panel that moves equals centres that move the other way on it, and rays of other lengths.
-"""
+other way; a panel that moves equals centres that move the other way on it, and rays of other lengths."""
 
 from collections.abc import Sequence
 from copy import copy
@@ -28,21 +27,12 @@ class SplatOperator:
     """Maps parameter rows (11, G) to frames (F, rows, columns) of line integrals; ``intensity`` averages intensities.
 
     ``tables`` has the time cells of each frame in mm, all read out along one axis. ``length_mm`` is the kernels' unit of
-    length; the scene should have a size of about 1 in it. Subsets share all memory: use them one at a time.
-    """
+    length; the scene should have a size of about 1 in it. Subsets share all memory: use them one at a time."""
 
     def __init__(
-        self,
-        rt: Runtime,
-        detector_shape: tuple[int, int],
-        tables: Sequence[TimeCells],
-        length_mm: float,
-        *,
-        intensity: bool = False,
-        affine: bool = False,
-        cutoff_sigma: float = DEFAULT_CUTOFF_SIGMA,
-        time_error: float = DEFAULT_TIME_ERROR,
-        pixel_footprint: bool = False,
+        self, rt: Runtime, detector_shape: tuple[int, int], tables: Sequence[TimeCells], length_mm: float, *,
+        intensity: bool = False, affine: bool = False, cutoff_sigma: float = DEFAULT_CUTOFF_SIGMA,
+        time_error: float = DEFAULT_TIME_ERROR, pixel_footprint: bool = False,
     ) -> None:
         readout = tables[0].readout
         self.rt, self.is_layered, self._affine = rt, intensity, affine
@@ -192,8 +182,7 @@ class _Ready:
 def by_pose(rows: np.ndarray, gradients: np.ndarray) -> tuple[float, float, float]:
     """Returns dL by the gantry's turn about z (rad) and by the panel's shifts along and across a line.
 
-    Shifts are in halves of the detector's width and lines. From internal rows (11, G) and their gradients (13, G).
-    """
+    Shifts are in halves of the detector's width and lines. From internal rows (11, G) and their gradients (13, G)."""
     values, by = rows.astype(np.float64), gradients.astype(np.float64)
     (x, y, _), (by_x, by_y, _) = values[MEAN], by[MEAN]
     w, i, j, k = values[QUATERNION]
@@ -205,8 +194,7 @@ def by_pose(rows: np.ndarray, gradients: np.ndarray) -> tuple[float, float, floa
 def by_length(pose: np.ndarray, weighed: np.ndarray) -> np.ndarray:
     """Returns the part of dL by the panel's shifts (2,), along columns and rows (pixels), that comes from the rays' length.
 
-    Line integrals are proportional to it. From the ``pose`` (12,) and the frame times dL/dframe (rows, columns).
-    """
+    Line integrals are proportional to it. From the ``pose`` (12,) and the frame times dL/dframe (rows, columns)."""
     source, first, column, row = pose.reshape(4, 3)
     v, u = (np.arange(n, dtype=np.float64) for n in weighed.shape)
     ray = first - source + v[:, None, None] * row + u[:, None] * column

@@ -21,8 +21,7 @@ class SplatPoint:
 class PlainRows:
     """Converts parameter rows (11, G) in mm, quaternions of any length, to internal rows in units of ``length_mm``.
 
-    Internal densities are in 1/``length_mm`` for ``line_integrals``, which have no unit then, else in 1/mm.
-    """
+    Internal densities are in 1/``length_mm`` for ``line_integrals``, which have no unit then, else in 1/mm."""
 
     def __init__(self, rt: Runtime, length_mm: float, *, line_integrals: bool) -> None:
         self.rt = rt
@@ -45,17 +44,9 @@ class PlainRows:
         """Converts gradients (13, stride) by internal rows to gradients by plain rows (11, G); ``add`` adds to those."""
         rt, cloud = self.rt, point.gaussians
         rt.launch(
-            self._leave,
-            cloud.count,
-            gradients,
-            point.norms,
-            np.int32(cloud.count),
-            np.int32(cloud.stride),
-            *self._units,
-            np.int32(add),
-            rows,
-            group=rt.group(on_cpu=16),
-        )
+            self._leave, cloud.count, gradients, point.norms, cloud.count, cloud.stride, *self._units, add,
+            rows, group=rt.group(on_cpu=16),
+        )  # fmt: skip
 
 
     def with_densities(self, point: SplatPoint, density: DeviceArray) -> SplatPoint:
@@ -83,8 +74,7 @@ class PlainRows:
 class PlainImages:
     """Copies images (rows, columns) of a stack to one padded image of ``lines`` by ``width``, and back.
 
-    ``turned`` makes columns the lines. A volume (nz, ny, nx) counts as an image of nz · ny lines.
-    """
+    ``turned`` makes columns the lines. A volume (nz, ny, nx) counts as an image of nz · ny lines."""
 
     def __init__(self, rt: Runtime, lines: int, width: int, *, turned: bool = False) -> None:
         self.rt, self.turned = rt, turned

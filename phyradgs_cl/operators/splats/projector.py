@@ -4,8 +4,7 @@ This is the paper's *multi-pose batch rendering* (section 2.3): one launch per s
 ``splat_prepare`` projects every Gaussian from every pose. ``splat_forward`` accumulates micro-views and joins strips (Eq. 3)
 directly in the merged frame; no micro-view is stored. ``splat_backward`` and ``splat_chain`` are the adjoint.
 
-A detector that averages intensities needs the cells of a line separately: ``Layers`` merges a few layers of them.
-"""
+A detector that averages intensities needs the cells of a line separately: ``Layers`` merges a few layers of them."""
 
 from dataclasses import dataclass
 
@@ -39,8 +38,7 @@ def path_limits(time_error: float) -> tuple[float, float, float]:
 
     The rules' remainders for exp(−x²/2), whose 2nd, 4th and 6th derivatives are at most 1, 3 and 15, are path²/24,
     path⁴/1440 and path⁶/134400 of the peak. An error of twice ``time_error`` in the worst pixel is about half of that RMS.
-    Longer paths use the closed form, whose moments lose digits below 0.7.
-    """
+    Longer paths use the closed form, whose moments lose digits below 0.7."""
     worst = 2 * time_error
     one, two, three = (24 * worst) ** (1 / 2), (1440 * worst) ** (1 / 4), (134400 * worst) ** (1 / 6)
     return one, two, max(three, 0.7)
@@ -78,21 +76,12 @@ class SplatProjector:
     radius beyond which a Gaussian is not drawn; 0 draws all of it. ``time_error`` (relative, RMS) bounds the error of
     averages over time in cells with motion. ``pixel_footprint`` averages splats over the area of a pixel.
     ``intensity_unit`` is the line integral that is 1 in the image of a detector that averages intensities over a line's
-    cells; with None line integrals are averaged. ``states`` moves the cloud to the states of cells uploaded with them.
-    """
+    cells; with None line integrals are averaged. ``states`` moves the cloud to the states of cells uploaded with them."""
 
     def __init__(
-        self,
-        rt: Runtime,
-        lines: int,
-        width: int,
-        *,
-        affine: bool = False,
-        cutoff_sigma: float = DEFAULT_CUTOFF_SIGMA,
-        time_error: float = DEFAULT_TIME_ERROR,
-        pixel_footprint: bool = False,
-        intensity_unit: float | None = None,
-        states: CloudStates | None = None,
+        self, rt: Runtime, lines: int, width: int, *, affine: bool = False,
+        cutoff_sigma: float = DEFAULT_CUTOFF_SIGMA, time_error: float = DEFAULT_TIME_ERROR,
+        pixel_footprint: bool = False, intensity_unit: float | None = None, states: CloudStates | None = None,
     ) -> None:
         self.rt, self.lines, self.width = rt, lines, width
         self.pitch = pitch_of(width)
@@ -132,31 +121,13 @@ class SplatProjector:
         drawn = self.image if self._layers is None else self._layers.images(cells)
         items = (self.width, self.lines) if self.by_pixel else self.lists.total
         rt.launch(
-            self._kernels[cells.moving, cells.fixed_conic, cells.is_parallel].forward,
-            items,
-            self._records,
-            self._is_visible,
-            cells.cells,
-            cells.line_cells,
-            cells.line_times,
-            np.int32(cells.time_pitch),
-            self.path_limits,
-            self.lists.tile_offsets,
-            self.lists.splat_ids,
-            np.int32(self.lists.splat_ids.size),
-            np.int32(gaussians.count),
-            np.int32(cells.count),
-            np.int32(self.lines),
-            np.int32(self.width),
-            np.int32(self.pitch),
-            np.int32(self.tile_w),
-            np.int32(self.tile_h),
-            np.int32(ceil_div(self.width, self.tile_w)),
-            self.cutoff2,
-            np.int32(cells.layers),
-            drawn,
+            self._kernels[cells.moving, cells.fixed_conic, cells.is_parallel].forward, items, self._records,
+            self._is_visible, cells.cells, cells.line_cells, cells.line_times, cells.time_pitch,
+            self.path_limits, self.lists.tile_offsets, self.lists.splat_ids, self.lists.splat_ids.size,
+            gaussians.count, cells.count, self.lines, self.width, self.pitch, self.tile_w, self.tile_h,
+            ceil_div(self.width, self.tile_w), self.cutoff2, cells.layers, drawn,
             group=(self.tile_w, self.tile_h) if self.by_pixel else 1,
-        )
+        )  # fmt: skip
         return drawn
 
     def merge(self, cells: DeviceCells) -> DeviceArray:
@@ -170,49 +141,23 @@ class SplatProjector:
     ) -> None:
         """Writes dL/dparameters into ``gradients`` (13, stride), rows as in cl/common/gradient.h.
 
-        Call ``prepare`` or ``forward`` with the same Gaussians and cells before: the sums overwrite their records.
-        """
+        Call ``prepare`` or ``forward`` with the same Gaussians and cells before: the sums overwrite their records."""
         rt = self.rt
         items, group = items_by_gaussian(rt, gaussians.count)
         by_images = by_image if self._layers is None else self._layers.split(cells, by_image)
         kernels = self._kernels[cells.moving, cells.fixed_conic, cells.is_parallel]
         rt.launch(
-            kernels.backward,
-            items,
-            self._records,
-            self._is_visible,
-            cells.cells,
-            cells.line_times,
-            np.int32(cells.time_pitch),
-            self.path_limits,
-            by_images,
-            np.int32(gaussians.count),
-            np.int32(cells.count),
-            np.int32(self.lines),
-            np.int32(self.pitch),
-            self.cutoff2,
-            group=group,
-        )
+            kernels.backward, items, self._records, self._is_visible, cells.cells, cells.line_times,
+            cells.time_pitch, self.path_limits, by_images, gaussians.count, cells.count, self.lines,
+            self.pitch, self.cutoff2, group=group,
+        )  # fmt: skip
         by_states = self._cloud if self.states is None else self.states.zeros(gaussians, cells)
         rt.launch(
-            kernels.chain,
-            gaussians.stride // rt.lanes,
-            gaussians.rows,
-            cells.cells,
-            cells.matrices,
-            self._records,
-            self._is_visible,
-            np.int32(cells.count),
-            np.int32(gaussians.count),
-            np.int32(gaussians.stride),
-            np.float32(self.width / 2),
-            np.float32(self.lines / 2),
-            gradients,
-            self._cloud,
-            cells.cell_states,
-            by_states,
-            group=rt.group(),
-        )
+            kernels.chain, gaussians.stride // rt.lanes, gaussians.rows, cells.cells, cells.matrices,
+            self._records, self._is_visible, cells.count, gaussians.count, gaussians.stride,
+            np.float32(self.width / 2), np.float32(self.lines / 2), gradients, self._cloud, cells.cell_states,
+            by_states, group=rt.group(),
+        )  # fmt: skip
         if self.states is not None:
             self.states.back(gaussians, cells, gradients)
 
@@ -251,13 +196,9 @@ class SplatProjector:
         times = (cells.line_times, np.int32(cells.time_pitch)) if cells.moving else ()
         rt.launch(
             self._kernels[cells.moving, cells.fixed_conic, cells.is_parallel].prepare,
-            gaussians.stride // rt.lanes,
-            gaussians.rows, np.int32(gaussians.count), np.int32(gaussians.stride),
-            cells.cells, cells.matrices, cells.cell_lines, np.int32(cells.count),
-            np.int32(self.width), self.cutoff2,
-            self._records, self._is_visible, self._extents, self._cloud, cells.cell_states,
-            *times,
-            group=rt.group(),
+            gaussians.stride // rt.lanes, gaussians.rows, gaussians.count, gaussians.stride, cells.cells,
+            cells.matrices, cells.cell_lines, cells.count, self.width, self.cutoff2, self._records,
+            self._is_visible, self._extents, self._cloud, cells.cell_states, *times, group=rt.group(),
         )  # fmt: skip
 
     # --- arrays to arrays -----------------------------------------------------------------------------

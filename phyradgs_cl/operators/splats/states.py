@@ -40,7 +40,7 @@ class CloudStates:
             self._states = rt.empty(1)  # frees the old memory before it allocates the new
             self._states = rt.empty((count, STATE_ROWS, stride))
         kernel, field = self._kernel("splat_states"), (*self._field, shares, np.int32(count))
-        rt.launch(kernel, stride, gaussians.rows, np.int32(stride), *field, self._states, group=rt.group(on_cpu=16))
+        rt.launch(kernel, stride, gaussians.rows, stride, *field, self._states, group=rt.group(on_cpu=16))
         return self._states
 
     def zeros(self, gaussians: DeviceGaussians, cells: DeviceCells) -> DeviceArray:
@@ -58,7 +58,7 @@ class CloudStates:
         rt, count = self.rt, cells.shares.shape[0]
         kernel, field = self._kernel("splat_states_back"), (*self._field, cells.shares, np.int32(count))
         rt.launch(
-            kernel, gaussians.stride, self._states, np.int32(gaussians.stride), *field, self._by_states, gradients,
+            kernel, gaussians.stride, self._states, gaussians.stride, *field, self._by_states, gradients,
             group=rt.group(on_cpu=16),
         )  # fmt: skip
 

@@ -47,39 +47,22 @@ class Voxeliser:
     ) -> DeviceArray:
         """Returns the field on the voxels [start, start + shape) of ``grid``, in the padded layout, until the next call.
 
-        Lengths are in the Gaussians' unit; ``start`` is (z, y, x). A part has the same bits as the complete field.
-        """
+        Lengths are in the Gaussians' unit; ``start`` is (z, y, x). A part has the same bits as the complete field."""
         rt = self.rt
         self.prepare(gaussians, grid, start)
         self.lists.build(self._extents, gaussians.count, gaussians.stride)
         nz, ny, nx = self.shape
         rt.launch(
-            self._forward,
-            (nx, ny, ceil_div(nz, _TILE_ROWS)) if self.by_pixel else self.lists.total,
-            self._records,
-            self.lists.tile_offsets,
-            self.lists.splat_ids,
-            np.int32(self.lists.splat_ids.size),
-            np.int32(gaussians.count),
-            self._shape4,
-            np.int32(self.pitch),
-            self.tile,
-            self.lists.tiles,
-            self.cutoff2,
-            self.volume,
+            self._forward, (nx, ny, ceil_div(nz, _TILE_ROWS)) if self.by_pixel else self.lists.total,
+            self._records, self.lists.tile_offsets, self.lists.splat_ids, self.lists.splat_ids.size,
+            gaussians.count, self._shape4, self.pitch, self.tile, self.lists.tiles, self.cutoff2, self.volume,
             group=tuple(self.tile[:2].tolist()) if self.by_pixel else 1,
-        )
+        )  # fmt: skip
         return self.volume
 
     def backward(
-        self,
-        gaussians: DeviceGaussians,
-        grid: Grid,
-        by_volume: DeviceArray,
-        gradients: DeviceArray,
-        *,
-        add: bool,
-        weight: float = 1.0,
+        self, gaussians: DeviceGaussians, grid: Grid, by_volume: DeviceArray, gradients: DeviceArray, *,
+        add: bool, weight: float = 1.0,
     ) -> None:
         """Writes ``weight`` × dL/dparameters to ``gradients`` (13, stride), or adds it; call ``forward`` before."""
         rt = self.rt
@@ -87,29 +70,13 @@ class Voxeliser:
             self._sums = rt.zeros(gaussians.stride * SUM_FLOATS)
         items, group = items_by_gaussian(rt, gaussians.count)
         rt.launch(
-            self._backward,
-            items,
-            self._records,
-            by_volume,
-            self._shape4,
-            np.int32(self.pitch),
-            np.int32(gaussians.count),
-            self.cutoff2,
-            self._sums,
-            group=group,
-        )
+            self._backward, items, self._records, by_volume, self._shape4, self.pitch, gaussians.count,
+            self.cutoff2, self._sums, group=group,
+        )  # fmt: skip
         rt.launch(
-            self._chain,
-            gaussians.stride // rt.lanes,
-            gaussians.rows,
-            self._sums,
-            _pitch4(grid),
-            np.int32(gaussians.stride),
-            np.int32(add),
-            np.float32(weight),
-            gradients,
-            group=rt.group(),
-        )
+            self._chain, gaussians.stride // rt.lanes, gaussians.rows, self._sums, _pitch4(grid),
+            gaussians.stride, add, np.float32(weight), gradients, group=rt.group(),
+        )  # fmt: skip
 
     def prepare(self, gaussians: DeviceGaussians, grid: Grid, start: tuple[int, int, int]) -> None:
         """Projects every Gaussian onto the grid: the first step of ``forward``, whose records ``backward`` needs."""
@@ -118,20 +85,10 @@ class Voxeliser:
             self._records = rt.empty(stride * RECORD_FLOATS)
             self._extents = rt.empty(6 * stride, np.int32)
         rt.launch(
-            self._prepare,
-            stride // rt.lanes,
-            gaussians.rows,
-            self._index_of(grid),
-            _pitch4(grid),
-            np.array([*start[::-1], 0], np.int32),
-            self._shape4,
-            np.int32(gaussians.count),
-            np.int32(stride),
-            self.cutoff2,
-            self._records,
-            self._extents,
-            group=rt.group(),
-        )
+            self._prepare, stride // rt.lanes, gaussians.rows, self._index_of(grid), _pitch4(grid),
+            np.array([*start[::-1], 0], np.int32), self._shape4, gaussians.count, stride, self.cutoff2,
+            self._records, self._extents, group=rt.group(),
+        )  # fmt: skip
 
     def _index_of(self, grid: Grid) -> DeviceArray:
         """Returns ``index_matrix`` on the device, uploaded once per grid."""
@@ -154,17 +111,12 @@ class Voxeliser:
 
 
 def voxelise(
-    rt: Runtime,
-    rows: np.ndarray,
-    grid: Grid,
-    *,
-    cutoff_sigma: float = DEFAULT_CUTOFF_SIGMA,
+    rt: Runtime, rows: np.ndarray, grid: Grid, *, cutoff_sigma: float = DEFAULT_CUTOFF_SIGMA,
     brick_bytes: int = _DEFAULT_BRICK_BYTES,
 ) -> np.ndarray:
     """Returns the complete grid (z, y, x) float32, computed brick by brick with the same bits.
 
-    The device holds ``brick_bytes`` of voxels at a time, or less if memory is short.
-    """
+    The device holds ``brick_bytes`` of voxels at a time, or less if memory is short."""
 
     def attempt(share: float) -> np.ndarray:
         gaussians = DeviceGaussians.upload(rt, rows)

@@ -1,7 +1,6 @@
 """The work of a splat projector's launch: pairs of Gaussian and pixel, and the rules used to average over time.
 
-Computed from the records of cl/common/splat.h, which counts the iterations of cl/splat_forward.cl without running it.
-"""
+Computed from the records of cl/common/splat.h, which counts the iterations of cl/splat_forward.cl without running it."""
 
 from dataclasses import dataclass, field
 
@@ -18,8 +17,7 @@ RULES = ("1 time", "2 times", "3 times", "closed form")
 class Work:
     """``pairs`` of Gaussian and pixel; ``evaluated`` pairs, in complete vectors; ``footprints``, Gaussians in cells.
 
-    ``rules``: the pairs by rule of ``RULES``, for cells with motion.
-    """
+    ``rules``: the pairs by rule of ``RULES``, for cells with motion."""
 
     pairs: int
     evaluated: int

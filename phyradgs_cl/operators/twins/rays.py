@@ -1,8 +1,7 @@
 """Float64 twins in NumPy of the ray-driven projector, its transpose, and the voxel-driven backprojections.
 
 The projector sums Joseph's samples one ray at a time. The backprojections solve for the ray of every voxel; with one pose
-per line they search all lines for the one on which the voxel falls.
-"""
+per line they search all lines for the one on which the voxel falls."""
 
 from collections.abc import Iterable, Iterator
 
@@ -199,5 +198,4 @@ def _on(position: np.ndarray, count: int) -> np.ndarray:
 
 
 def _bilinear(frame: np.ndarray, v: np.ndarray, u: np.ndarray) -> np.ndarray:
-    values: np.ndarray = map_coordinates(frame, [v, u], order=1, mode="nearest")
-    return values
+    return np.asarray(map_coordinates(frame, [v, u], order=1, mode="nearest"))

@@ -7,8 +7,7 @@ kernel works in detector coordinates and shares no formula with it (docs/mathema
 A moving splat follows its definition by quadrature in time. Within a segment it keeps the conic, amplitude and perspective
 factor Q of the middle time, while its centre moves along a straight path at constant speed. The path's ends are the
 mean projected by the segment's two end poses; its middle is the mean of the parabola through both ends and the middle.
-Conic and Q come from the plain difference C − b bᵀ, which loses digits that float64 has to spare and float32 has not.
-"""
+Conic and Q come from the plain difference C − b bᵀ, which loses digits that float64 has to spare and float32 has not."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -23,17 +22,12 @@ from phyradgs_cl.acquisition.time_cells import TimeCells
 def precision_matrices(rows: np.ndarray) -> np.ndarray:
     """Σ⁻¹ (G, 3, 3) of parameter rows (11, G)."""
     turn = Rotation.from_quat(rows[[7, 8, 9, 6]].T).as_matrix()
-    matrices: np.ndarray = np.einsum("gij,gj,gkj->gik", turn, 1 / rows[3:6].T ** 2, turn)
-    return matrices
+    return np.asarray(np.einsum("gij,gj,gkj->gik", turn, 1 / rows[3:6].T ** 2, turn))
 
 
 def splat_image(
-    rows: np.ndarray,
-    pose: np.ndarray,
-    detector_shape: tuple[int, int],
-    cutoff_sigma: float = 0.0,
-    affine: bool = False,
-    is_parallel: bool = False,
+    rows: np.ndarray, pose: np.ndarray, detector_shape: tuple[int, int], cutoff_sigma: float = 0.0,
+    affine: bool = False, is_parallel: bool = False,
 ) -> np.ndarray:
     """One static projection (nv, nu) of parameter rows (11, G) from one pose (12,)."""
     image = np.zeros(detector_shape)
@@ -86,10 +80,7 @@ def _in_parallel(
 
 
 def _affine(
-    row: np.ndarray,
-    precision: np.ndarray,
-    pose: np.ndarray,
-    detector_shape: tuple[int, int],
+    row: np.ndarray, precision: np.ndarray, pose: np.ndarray, detector_shape: tuple[int, int],
     cutoff_sigma: float,
 ) -> np.ndarray:
     """R2-Gaussian's splat: covariance through the Jacobian at the centre, ray factor of the central ray."""
@@ -111,10 +102,7 @@ def _affine(
 
 
 def splat_frame(
-    rows: np.ndarray,
-    table: TimeCells,
-    detector_shape: tuple[int, int],
-    cutoff_sigma: float = 0.0,
+    rows: np.ndarray, table: TimeCells, detector_shape: tuple[int, int], cutoff_sigma: float = 0.0,
     affine: bool = False,
 ) -> np.ndarray:
     """Eq. 3 unfused: render every cell's whole projection, then weigh, cut into strips and add up."""
@@ -160,20 +148,14 @@ class _Segment:
 
 
 def moving_frame(
-    rows: np.ndarray,
-    table: TimeCells,
-    detector_shape: tuple[int, int],
-    cutoff_sigma: float = 0.0,
-    affine: bool = False,
-    pixel_variance: float = 0.0,
-    cloud_at: Callable[[float], np.ndarray] | None = None,
+    rows: np.ndarray, table: TimeCells, detector_shape: tuple[int, int], cutoff_sigma: float = 0.0,
+    affine: bool = False, pixel_variance: float = 0.0, cloud_at: Callable[[float], np.ndarray] | None = None,
 ) -> np.ndarray:
     """The merged frame (nv, nu) of parameter rows (11, G) over cells with motion, or over cells with a ``conic_pose``.
 
     ``pixel_variance`` (pixels²) is added to the covariance of every splat on the detector, mass kept. A cell with a
     ``conic_pose`` is a segment without a path: the splat of that pose, with its centre where the cell's pose has it.
-    ``cloud_at`` gives the rows at a time in s, of an object that moves.
-    """
+    ``cloud_at`` gives the rows at a time in s, of an object that moves."""
     moved = table.conic_pose is not None
     poses, end_poses, line_times = _centre_segments(table) if moved else (table.pose, table.end_poses, table.line_times)
     assert end_poses is not None and line_times is not None
@@ -234,18 +216,9 @@ def _segment(
 
 
 def _segment_image(
-    row: np.ndarray,
-    precision: np.ndarray,
-    pose: np.ndarray,
-    ends: np.ndarray,
-    end_means: np.ndarray,
-    times: np.ndarray,
-    shape: tuple[int, int],
-    cutoff_sigma: float,
-    affine: bool,
-    pixel_variance: float,
-    is_parallel: bool,
-    moved: bool,
+    row: np.ndarray, precision: np.ndarray, pose: np.ndarray, ends: np.ndarray, end_means: np.ndarray,
+    times: np.ndarray, shape: tuple[int, int], cutoff_sigma: float, affine: bool, pixel_variance: float,
+    is_parallel: bool, moved: bool,
 ) -> np.ndarray:
     if min(seen_at(p, m, is_parallel)[2] for p, m in zip((pose, *ends), (row[:3], *end_means), strict=True)) <= 0:
         return np.zeros(shape)
@@ -272,8 +245,7 @@ def _segment_image(
 def _exponent(s: _Segment, delta: np.ndarray, at: np.ndarray, big_q: np.ndarray) -> np.ndarray:
     """q (lines, width) when the centre has moved for times ``at`` (lines, 1 or width)."""
     moved = delta - at[..., None] * s.path
-    q: np.ndarray = np.einsum("...i,ij,...j", moved, s.conic, moved) / big_q
-    return q
+    return np.asarray(np.einsum("...i,ij,...j", moved, s.conic, moved) / big_q)
 
 
 def _nearest(s: _Segment, delta: np.ndarray, times: np.ndarray, big_q: np.ndarray) -> np.ndarray:

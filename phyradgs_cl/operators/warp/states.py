@@ -104,5 +104,4 @@ class MotionStates:
 def _length(difference: np.ndarray, metric: np.ndarray) -> np.ndarray:
     """Returns the distances (T,) of weights (T, R)."""
     squared: np.ndarray = np.einsum("tr,rs,ts->t", difference, metric, difference)
-    result: np.ndarray = np.sqrt(np.maximum(squared, 0))
-    return result
+    return np.asarray(np.sqrt(np.maximum(squared, 0)))

@@ -79,8 +79,8 @@ class VolumeWarp:
         slices, rows = self._reaches[state]
         owned = min(max(self.shape[0] // (_ITEMS_PER_UNIT * self.rt.device.compute_units), 1), _MOST_OWNED)
         self.rt.launch(
-            self.kernel("warp_adjoint_rows"), ceil_div(self.shape[0], owned), moved, self._fields, self._shares[state],
-            self._size(), slices, rows, owned, self._strides.vector(), total,
+            self.kernel("warp_adjoint_rows"), ceil_div(self.shape[0], owned), moved, self._fields,
+            self._shares[state], self._size(), slices, rows, owned, self._strides.vector(), total,
         )  # fmt: skip
 
     def read(self, total: DeviceArray, result: DeviceArray) -> None:
@@ -99,8 +99,8 @@ class VolumeWarp:
         unit, group = largest * _HEADROOM / 2**31, self.rt.group(on_cpu=1)
         kernel = self.kernel("warp_adjoint_fixed")
         self.rt.launch(
-            kernel, (nx, ny, nz), moved, self._fields, self._shares[state], self._size(), np.float32(1 / unit),
-            self._sums, group=group,
+            kernel, (nx, ny, nz), moved, self._fields, self._shares[state], self._size(),
+            np.float32(1 / unit), self._sums, group=group,
         )  # fmt: skip
         sums = self._sums, np.float32(unit), self._size(), self._strides.vector(), total
         self.rt.launch(self.kernel("warp_adjoint_sum"), (nx, ny, nz), *sums, group=group)

@@ -2,8 +2,7 @@
 ramp filter, backprojection, which FDK weights by distance.
 
 The ramp filter is Ram-Lak's in its space-domain form, with windows on its spectrum: A. C. Kak and M. Slaney, Principles of
-Computerized Tomographic Imaging, IEEE Press 1988, Eq. 61 of chapter 3.
-"""
+Computerized Tomographic Imaging, IEEE Press 1988, Eq. 61 of chapter 3."""
 
 import logging
 import time
@@ -67,8 +66,7 @@ class FdkOptions:
     """window: of the ramp filter, one of ``WINDOWS``. extrapolate: how rows continue beyond the panel, one of ``WAYS``.
 
     motion: static (one pose per frame, mid-window), static-start (the frame's first pose) or per-row (every line at the
-    middle of its own exposure). Of a model with more poses FDK uses a line's middle one.
-    """
+    middle of its own exposure). Of a model with more poses FDK uses a line's middle one."""
 
     MOTIONS: ClassVar[tuple[Motion, ...]] = motions_for(LINE_POSES)
 
@@ -104,8 +102,7 @@ def fdk(
 
     ``seed`` is part of the common signature and not used.
 
-    Logs a warning for an orbit that is not a circle about z, and raises InputError for one that is far from it.
-    """
+    Logs a warning for an orbit that is not a circle about z, and raises InputError for one that is far from it."""
     return _filtered_backprojection("fdk", scan, options, rt, report, deformation)
 
 
@@ -116,8 +113,7 @@ def fbp(
     """Returns the filtered backprojection of a parallel beam in 1/mm: half turns, full turns, and full turns with the axis
     near the panel's edge. ``seed`` is part of the common signature and not used.
 
-    Logs a warning for incomplete turns, and raises InputError for rays that are not at right angles to the axis.
-    """
+    Logs a warning for incomplete turns, and raises InputError for rays that are not at right angles to the axis."""
     return _filtered_backprojection("fbp", scan, options, rt, report, deformation)
 
 
@@ -162,26 +158,16 @@ FBP_METHOD = Method(fbp, {window: FbpOptions(window) for window in WINDOWS}, **_
 
 
 def fdk_volume(
-    rt: Runtime,
-    frames: np.ndarray,
-    pose: np.ndarray,
-    grid: Grid,
-    *,
-    window: str = "ram-lak",
-    axis: str = "rows",
-    extrapolate: str = "none",
-    whole: Callable[[], np.ndarray] | None = None,
-    is_parallel: bool = False,
-    circle: bool = False,
-    moving: MovingBackprojector | None = None,
+    rt: Runtime, frames: np.ndarray, pose: np.ndarray, grid: Grid, *, window: str = "ram-lak",
+    axis: str = "rows", extrapolate: str = "none", whole: Callable[[], np.ndarray] | None = None,
+    is_parallel: bool = False, circle: bool = False, moving: MovingBackprojector | None = None,
 ) -> np.ndarray:
     """Returns FDK, or FBP of parallel beams, of line integrals (F, rows, columns) on ``grid``, (z, y, x) float32 in 1/mm.
 
     pose (F, 12) mm, or (F, lines, 12) with a pose for every line along ``axis``. Displaced detectors (full turns) and short
     scans are recognised and weighted. Logs a warning where data are missing. ``whole`` reconstructs the object (z, y, x) in
     1/mm on ``grid``, for ``reprojected``. ``circle``, for parallel beams: as in ``FbpOptions``. ``moving`` backprojects an
-    object that moves. Raises InputError for a source on the rotation axis.
-    """
+    object that moves. Raises InputError for a source on the rotation axis."""
     shape = (frames.shape[1], frames.shape[2])
     by_pixel = pose_of_pixels(pose, axis)
     if np.any(np.hypot(by_pixel[..., 0], by_pixel[..., 1]) <= 0):
@@ -221,8 +207,7 @@ def fdk_volume(
 def _filtered(frames: np.ndarray, weight: RayWeight, missing: tuple[int, int], window: str) -> np.ndarray:
     """Returns weighted and filtered frames (F, rows, columns + missing) float32.
 
-    The rows of a displaced detector are widened to be symmetric, because the filter's response continues beyond them.
-    """
+    The rows of a displaced detector are widened to be symmetric, because the filter's response continues beyond them."""
     views, rows, columns = frames.shape
     width = columns + sum(missing)
     filtered = np.empty((views, rows, width), np.float32)
@@ -239,8 +224,7 @@ def _filtered(frames: np.ndarray, weight: RayWeight, missing: tuple[int, int], w
 def ramp_spectrum(length: int, window: str = "ram-lak") -> np.ndarray:
     """The filter's real spectrum (length // 2 + 1,) for a pitch of 1 and a period of ``length`` samples.
 
-    Sampling |frequency| instead would put a false constant under every row.
-    """
+    Sampling |frequency| instead would put a false constant under every row."""
     n = np.minimum(np.arange(length), length - np.arange(length))
     kernel = np.where(n % 2 == 1, -1.0 / (np.pi * np.maximum(n, 1)) ** 2, 0.0)
     kernel[0] = 0.25
@@ -251,8 +235,7 @@ def ramp_spectrum(length: int, window: str = "ram-lak") -> np.ndarray:
 def ramp_filter(rows: np.ndarray, spacing_mm: float, window: str = "ram-lak") -> np.ndarray:
     """The ramp filter along the last axis of (..., width), zero-padded so that nothing wraps around.
 
-    Returns the same shape in float32 and units of ``rows`` per mm. Float32 rows stay float32 throughout.
-    """
+    Returns the same shape in float32 and units of ``rows`` per mm. Float32 rows stay float32 throughout."""
     width = rows.shape[-1]
     length = scipy.fft.next_fast_len(2 * width, real=True)
     spectrum = scipy.fft.rfft(rows, length, axis=-1, workers=_WORKERS)
@@ -273,8 +256,7 @@ def static_fdk(rt: Runtime, scan: Scan, deformation: Deformation | None = None) 
 def _measured_frames(scan: Scan) -> tuple[np.ndarray, np.ndarray]:
     """Returns frames (F, v, u) with masked pixels filled in, and their numbers.
 
-    Frames that are masked completely are left out, so that their neighbours cover their angles.
-    """
+    Frames that are masked completely are left out, so that their neighbours cover their angles."""
     frames, numbers = unmasked_frames(scan), np.arange(scan.frames)
     if np.asarray(scan.pixel_mask).ndim == 3:
         measured = np.flatnonzero(scan.valid.any(axis=(1, 2)))

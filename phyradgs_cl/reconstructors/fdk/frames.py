@@ -62,8 +62,7 @@ def extrapolated(frames: np.ndarray, way: str) -> tuple[np.ndarray, int]:
 def _chords(edge: np.ndarray, slope: np.ndarray, curvature: np.ndarray, beyond: np.ndarray) -> np.ndarray:
     """Returns line integrals p (F, v, n): p² = edge² + 2 edge slope d − a d² at d pixels beyond the panel.
 
-    The slope does not rise, and the curvature a is large enough to reach 0 within the n pixels.
-    """
+    The slope does not rise, and the curvature a is large enough to reach 0 within the n pixels."""
     falling, reach = np.minimum(slope, 0), beyond[-1]
     widest = (edge**2 + 2 * reach * edge * falling) / reach**2
     squares = edge**2 + 2 * edge * falling * beyond - np.maximum(curvature, widest) * beyond**2
@@ -86,8 +85,7 @@ _MOST = 2.0  # of the panel's columns, added at each side
 def whole_object(scan: Scan, motion: Motion, rt: Runtime, report: ProgressReport) -> np.ndarray:
     """Returns a volume (nz, ny, nx) in 1/mm on the scan's grid that explains its frames.
 
-    Raises KeyboardInterrupt if it is stopped, because FDK has no checkpoints.
-    """
+    Raises KeyboardInterrupt if it is stopped, because FDK has no checkpoints."""
 
     def hook(progress: Progress) -> Progress:
         return replace(progress, quantity=f"rows beyond the panel: {progress.quantity}", state=None)
@@ -107,8 +105,7 @@ def reprojected(
 ) -> tuple[np.ndarray, int]:
     """Returns line integrals (F, v, u + 2 n) float32, ``frames`` (F, v, u) continued by the projections of a volume, and n.
 
-    volume (nz, ny, nx) in 1/mm; pose (F, 12) or (F, lines, 12) in mm, with a pose for every line along ``axis``.
-    """
+    volume (nz, ny, nx) in 1/mm; pose (F, 12) or (F, lines, 12) in mm, with a pose for every line along ``axis``."""
     rows, columns = frames.shape[1:]
     count = _columns_beyond(pose.reshape(-1, 12), columns, grid, is_parallel)
     wide = widened(pose, axis, (count, count))

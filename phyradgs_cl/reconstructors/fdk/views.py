@@ -22,8 +22,7 @@ class Arc:
     """The views' angular cells.
 
     gap_rad (F,) is each view's share of the arc; progress_rad (F,) its angle from the start of the arc, which
-    begins half a step before the first view and ends half a step behind the last. A full turn has no start.
-    """
+    begins half a step before the first view and ends half a step behind the last. A full turn has no start."""
 
     gap_rad: np.ndarray
     progress_rad: np.ndarray
@@ -133,8 +132,7 @@ def _redundancy_angle(pose: np.ndarray, rays: np.ndarray, arc: Arc, is_parallel:
     in its full turn a distance from the axis.
 
     Where columns are read out one after the other, the arc of a short scan begins at another angle for every column,
-    and a ray's opposite lies on another column: their lags behind the frame, whose own angle is 0 here, add up.
-    """
+    and a ray's opposite lies on another column: their lags behind the frame, whose own angle is 0 here, add up."""
     angle_rad = weights.fan_angle(pose, rays, is_parallel)
     if is_parallel and not arc.is_full:
         angle_rad = np.zeros_like(angle_rad)
@@ -157,8 +155,7 @@ def widened(pose: np.ndarray, axis: str, missing: tuple[int, int]) -> np.ndarray
 def check_beam(method: str, pose: np.ndarray, is_parallel: bool) -> None:
     """Raises InputError for ``fdk`` in a parallel beam and ``fbp`` in a cone, and for orbits that they cannot reconstruct.
 
-    Logs how far poses (F, 12) or (F, lines, 12) are from one circle about z, if the method then loses accuracy.
-    """
+    Logs how far poses (F, 12) or (F, lines, 12) are from one circle about z, if the method then loses accuracy."""
     if is_parallel != (method == "fbp"):
         found, expected, remedy = ("parallel", "cone", "fbp") if is_parallel else ("cone", "parallel", "fdk")
         raise InputError(f"--method {method}", f"a {found} beam", f"a {expected} beam", f"take --method {remedy}")
@@ -253,6 +250,5 @@ def warn_if_incomplete(
     if arc.coverage_rad < needed_rad - _TOLERATED_RAD:
         log.warning(
             "FDK: the views cover %.1f°, complete data need %.1f° (half a turn and the fan)",
-            np.rad2deg(arc.coverage_rad),
-            np.rad2deg(needed_rad),
+            np.rad2deg(arc.coverage_rad), np.rad2deg(needed_rad),
         )

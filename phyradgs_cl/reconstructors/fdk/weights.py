@@ -2,8 +2,7 @@
 
 The measure generalises FDK's cosine to any pose (docs/mathematics.md). Displaced detectors after G. Wang, Med. Phys. 29
 (2002) 1634, in the fan angle; short scans after D. L. Parker, Med. Phys. 9 (1982) 254, with M. D. Silver's margin for
-arcs beyond the least, Med. Phys. 27 (2000) 773. A ray and its opposite have redundancy weights that sum to 2.
-"""
+arcs beyond the least, Med. Phys. 27 (2000) 773. A ray and its opposite have redundancy weights that sum to 2."""
 
 from dataclasses import dataclass
 
@@ -29,8 +28,7 @@ def turned_back(pose: np.ndarray, angle_rad: np.ndarray) -> np.ndarray:
 def pixel_rays(pose: np.ndarray, rows: np.ndarray, columns: np.ndarray, is_parallel: bool = False) -> np.ndarray:
     """Vectors (..., v, u, 3) mm from source, or the origin in a parallel beam, to pixels of rows (v,) and columns (u,).
 
-    pose broadcasts to (..., v, u, 12): one for all pixels (1, 1, 12), one per row (v, 1, 12), one per column (1, u, 12).
-    """
+    pose broadcasts to (..., v, u, 12): one for all pixels (1, 1, 12), one per row (v, 1, 12), one per column (1, u, 12)."""
     corner = pose[..., 3:6] if is_parallel else pose[..., 3:6] - pose[..., 0:3]
     return corner + columns[:, None] * pose[..., 6:9] + rows[:, None, None] * pose[..., 9:12]
 
@@ -40,8 +38,7 @@ def ray_measure(pose: np.ndarray, rays: np.ndarray, is_parallel: bool = False) -
 
     |ȧ·n| / D with ȧ the source's motion per radian, n the ray's normal in the plane of ray and detector row, D the
     distance of the row from the source. For a flat panel facing the source it is DSO / |ray|: FDK's cosine. In a parallel
-    beam it is the sine of the angle between rays and row: 1 for a panel across the rays.
-    """
+    beam it is the sine of the angle between rays and row: 1 for a panel across the rays."""
     if is_parallel:
         across = np.cross(pose[..., 0:3], pose[..., 6:9]) / np.linalg.norm(pose[..., 6:9], axis=-1, keepdims=True)
         return np.linalg.norm(across, axis=-1)
@@ -99,8 +96,7 @@ class Fan:
 def measured_fan(pose: np.ndarray, shape: tuple[int, int], is_parallel: bool = False) -> Fan:
     """What views with poses as in ``pixel_rays``, (F, ..., 12), see on a detector of ``shape`` (rows, columns).
 
-    ``missing_columns`` would make the detector reach equally far on both sides of the axis.
-    """
+    ``missing_columns`` would make the detector reach equally far on both sides of the axis."""
     rows, columns = np.arange(shape[0]), np.arange(shape[1])
     outer = pose[:, :, [0, -1]] if pose.shape[2] > 1 else pose
     ends = np.sort(fan_angle(outer, pixel_rays(outer, rows, columns[[0, -1]], is_parallel), is_parallel), axis=-1)
@@ -121,15 +117,13 @@ def displaced_weight(angle_rad: np.ndarray, fan: Fan) -> np.ndarray:
     """1 ± sin over what the fan sees on both sides of the axis, 0 and 2 beyond; angle_rad of any shape.
 
     Where the axis itself is not seen every ray is measured once, and counts 2. Where it falls into the panel's outermost
-    pixel there is no room for a transition: a pixel counts by the part of its width on the axis' long side.
-    """
+    pixel there is no room for a transition: a pixel counts by the part of its width on the axis' long side."""
     if not fan.sees_axis:
         return np.full(angle_rad.shape, 2.0)
     short = min(fan.high_rad, -fan.low_rad)
     sign = 1.0 if fan.high_rad > -fan.low_rad else -1.0
     if short < fan.pixel_rad / 2:
-        weight: np.ndarray = 1 + sign * np.clip(2 * angle_rad / fan.pixel_rad, -1, 1)
-        return weight
+        return 1 + sign * np.clip(2 * angle_rad / fan.pixel_rad, -1, 1)
     width = min(short, TRANSITION * (fan.half_rad - short))
     into = np.clip((np.abs(angle_rad) - (short - width)) / width, 0, 1)
     return 1 + sign * np.sign(angle_rad) * np.sin(np.pi / 2 * into)
@@ -138,8 +132,7 @@ def displaced_weight(angle_rad: np.ndarray, fan: Fan) -> np.ndarray:
 def short_scan_weight(progress_rad: float, angle_rad: np.ndarray, coverage_rad: float) -> np.ndarray:
     """Parker's weight of rays at fan angles of any shape, for a view ``progress_rad`` into an arc.
 
-    Rays without an opposite in the arc count 2. Under half a turn there is no opposite at all.
-    """
+    Rays without an opposite in the arc count 2. Under half a turn there is no opposite at all."""
     margin = (coverage_rad - np.pi) / 2
     if margin <= 0:
         return np.full(angle_rad.shape, 2.0)

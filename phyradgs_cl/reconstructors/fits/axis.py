@@ -186,8 +186,7 @@ def _few_rows(scan: Scan, frame: int) -> np.ndarray:
         ])
     starts = np.unique(np.linspace(0, len(image), min(len(image), _MOST_ROWS), endpoint=False).astype(int))
     means = np.add.reduceat(image, starts, axis=0) / np.diff(starts, append=len(image))[:, None]
-    smooth: np.ndarray = gaussian_filter1d(means, _SMOOTHING_PX, axis=1)
-    return smooth
+    return gaussian_filter1d(means, _SMOOTHING_PX, axis=1)
 
 
 def _rough_shift(pairs: list[_Pair]) -> float:
@@ -209,8 +208,7 @@ def _rough_shift(pairs: list[_Pair]) -> float:
 
 
 def _correlation(mirrored: np.ndarray, view: np.ndarray) -> np.ndarray:
-    correlation: np.ndarray = fftconvolve(mirrored, view[:, ::-1], axes=1).sum(0)
-    return correlation
+    return fftconvolve(mirrored, view[:, ::-1], axes=1).sum(0)
 
 
 def _refined_shift(pair: _Pair, shift_px: float) -> tuple[float, float]:

@@ -38,11 +38,10 @@ _MOST_DIVIDED = 90**3  # voxels of a grid: smaller voxels are worth their time a
 
 @dataclass(frozen=True)
 class FistaOptions(IterativeOptions):
-    """prior: one of ``PRIORS``, a user's function, or its ``package.module:function``. A function takes
-    (volume (nz, ny, nx) in 1/mm, weight in 1/mm) and returns a volume; docs/methods.md says how to scale a denoiser. The
-    prior piccs is
-    (1 − prior_share) TV(x) + prior_share TV(x − first volume). prior_weight: threshold relative to two errors of the
-    gradient, added in squares: the noise of the frames, and edges inside large voxels.
+    """prior: one of ``PRIORS``, a user's function, or its ``package.module:function``. A function takes (volume (nz, ny, nx)
+    in 1/mm, weight in 1/mm) and returns a volume; docs/methods.md says how to scale a denoiser. The prior piccs is (1 −
+    prior_share) TV(x) + prior_share TV(x − first volume). prior_weight: threshold relative to two errors of the gradient,
+    added in squares: the noise of the frames, and edges inside large voxels.
 
     subvoxels: parts of a voxel's side in the last 3/7 of the passes; 0: 2 up to 90³ voxels where memory allows, else 1.
     subsets: of the frames, with one step each; subsets whose steps diverge are joined two by two.

@@ -74,8 +74,7 @@ def _angles_deg(scan: Scan, times_s: np.ndarray) -> list[list[float]] | None:
     if not isinstance(scan.trajectory, CircularOrbit):
         return None
     angles_rad = scan.trajectory.angle_rad(0, scan.frame_start_s[0] + times_s)
-    angles_deg: list[list[float]] = np.rad2deg(angles_rad)[:, None].tolist()
-    return angles_deg
+    return np.rad2deg(angles_rad)[:, None].tolist()
 
 
 def object_in_motion(
