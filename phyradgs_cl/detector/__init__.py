@@ -1,9 +1,14 @@
 """The detector: counts and line integrals, averages over an exposure, noise and other effects, estimates of them."""
 
-from phyradgs_cl.detector.attenuation import average, counts_to_attenuation, intensity_average
+from phyradgs_cl.detector.attenuation import (
+    Spectrum,
+    average,
+    counts_to_attenuation,
+    intensity_average,
+    tube_spectrum,
+)
 from phyradgs_cl.detector.effects import without_lag
 from phyradgs_cl.detector.noise_level import noise_level, noise_rms, robust_deviation, transmission_weights
-from phyradgs_cl.detector.spectrum import Spectrum, tube_spectrum
 
 __all__ = [
     "Spectrum", "average", "counts_to_attenuation", "intensity_average", "noise_level", "noise_rms",

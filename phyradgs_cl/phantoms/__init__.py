@@ -14,9 +14,14 @@ from numpy.typing import NDArray
 from phyradgs_cl.checks import finite, one_of, positive, shape
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
-from phyradgs_cl.phantoms.closed_form import shepp_logan, sphere_phantom
+from phyradgs_cl.phantoms.closed_form import (
+    MovingBody,
+    MovingPhantom,
+    moving_sphere,
+    shepp_logan,
+    sphere_phantom,
+)
 from phyradgs_cl.phantoms.ellipsoids import Cylinder, Ellipsoid, EllipsoidPhantom, rotation_about_z
-from phyradgs_cl.phantoms.moving import MovingBody, MovingPhantom, moving_sphere
 from phyradgs_cl.phantoms.procedural_foot import foot
 from phyradgs_cl.phantoms.procedural_jaw import jaw
 

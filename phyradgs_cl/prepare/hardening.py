@@ -16,7 +16,7 @@ import numpy as np
 from phyradgs_cl import checks
 from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.detector import Spectrum, tube_spectrum
-from phyradgs_cl.detector.spectrum import FILTER_MM, HIGHEST_KVP, LOWEST_KVP
+from phyradgs_cl.detector.attenuation import FILTER_MM, HIGHEST_KVP, LOWEST_KVP
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.prepare import step
 from phyradgs_cl.prepare.step import Facts, MakeModel, Model

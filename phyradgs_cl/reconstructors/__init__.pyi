@@ -1,5 +1,10 @@
 from .checkpoint import State as State
+from .method import DEFAULT_METHOD as DEFAULT_METHOD
+from .method import METHODS as METHODS
 from .method import Method as Method
+from .method import method_name as method_name
+from .method import method_of as method_of
+from .method import usual_preset as usual_preset
 from .options import method_options as method_options
 from .options import preprocessing_names as preprocessing_names
 from .options import preprocessing_of as preprocessing_of
@@ -8,11 +13,6 @@ from .plan import ObjectMotion as ObjectMotion
 from .plan import RunPlan as RunPlan
 from .plan import plan_run as plan_run
 from .preprocess import Preprocessing as Preprocessing
-from .registry import DEFAULT_METHOD as DEFAULT_METHOD
-from .registry import METHODS as METHODS
-from .registry import method_name as method_name
-from .registry import method_of as method_of
-from .registry import usual_preset as usual_preset
 from .result import Progress as Progress
 from .result import ProgressReport as ProgressReport
 from .result import Reconstruction as Reconstruction

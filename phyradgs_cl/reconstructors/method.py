@@ -1,8 +1,8 @@
-"""A method: a function ``(scan, options, rt, *, seed, report, resume)``, of the package or of the user.
+"""The methods by name, and the user's own. A new method is a file with a METHOD, and a line in METHODS.
 
-A user's function needs only ``(scan, options, rt)``. If ``options`` is annotated with a dataclass, its fields are the
-options of ``--set`` and ``reconstruct``. The function returns a ``Reconstruction``, or a volume (nz, ny, nx) in 1/mm on the
-scan's grid."""
+A method is a function ``(scan, options, rt, *, seed, report, resume)``. A user's function needs only ``(scan, options,
+rt)``. If ``options`` is annotated with a dataclass, its fields are the options of ``--set`` and ``reconstruct``. The
+function returns a ``Reconstruction``, or a volume (nz, ny, nx) in 1/mm on the scan's grid."""
 
 import importlib
 import inspect
@@ -11,8 +11,10 @@ import os
 import sys
 import time
 import typing
+from collections import UserDict
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, is_dataclass, replace
+from importlib import import_module
 from typing import Any
 
 import numpy as np
@@ -20,8 +22,9 @@ import numpy as np
 from phyradgs_cl import checks
 from phyradgs_cl.acquisition import Motion, Scan, Static
 from phyradgs_cl.errors import InputError, NumericalError
-from phyradgs_cl.reconstructors.result import Reconstruction, option_facts
+from phyradgs_cl.reconstructors.result import Reconstruction, function_name, option_facts
 from phyradgs_cl.runtime import Runtime
+from phyradgs_cl.text import suggest_name
 
 _FORM = "a function (scan, options, rt, …)"
 
@@ -131,3 +134,64 @@ def _result(subject: str, made: object, scan: Scan) -> Reconstruction:
     if not np.isfinite(made.volume).all():
         raise NumericalError(subject, "a volume with NaN or infinity", "finite numbers")
     return made
+
+
+class _Methods(UserDict[str, Any]):
+    """Methods by name, each imported when it is first used: imports take time."""
+
+    def __getitem__(self, name: str) -> Method:
+        entry = self.data[name]
+        if isinstance(entry, str):
+            module, _, attribute = entry.partition(":")
+            entry = getattr(import_module(f"phyradgs_cl.reconstructors.{module}"), attribute or "METHOD")
+            self.data[name] = entry
+        return entry
+
+
+DEFAULT_METHOD = "fista"
+METHODS = _Methods({
+    "phyradgs": "splats.method:PHYRADGS",
+    "r2": "splats.method:R2",
+    "sart": "voxels.sart",
+    "os-sart": "voxels.sart:OS_METHOD",
+    "sirt": "voxels.sart:SIRT_METHOD",
+    "cgls": "voxels.cgls",
+    "asd-pocs": "voxels.asd_pocs",
+    "fista": "voxels.fista",
+    "fista-tv": "voxels.fista_tv",
+    "naf": "neural:NAF",
+    "sax-nerf": "neural:SAX_NERF",
+    "fused": "fused",
+    "moving": "moving.method",
+    "fdk": "fdk",
+    "fbp": "fdk:FBP_METHOD",
+})
+
+
+def method_name(method: object) -> str:
+    """Returns the name of a method: a key of METHODS, given in any case, or ``package.module:name`` of the user's own.
+
+    Raises InputError for anything else."""
+    if isinstance(method, str) and method.lower() in METHODS:
+        return method.lower()
+    if callable(method):
+        return function_name(method)
+    if not isinstance(method, str) or ":" not in method:
+        expected = f"one of {', '.join(METHODS)}, or package.module:function of your own"
+        raise InputError("--method", checks.short_repr(method), expected, suggest_name(method, METHODS, ""))
+    return method
+
+
+def method_of(method: object) -> Method:
+    """Returns the method of that name, or the user's own function, given as such or as ``package.module:name``.
+
+    Raises InputError for anything else, and for a function that cannot be imported."""
+    name = method_name(method)
+    if name in METHODS:
+        return METHODS[name]
+    return own_method(name, imported(name) if isinstance(method, str) else method)
+
+
+def usual_preset(method: object) -> str:
+    """Returns the name of a method's default preset."""
+    return next(iter(method_of(method).presets))

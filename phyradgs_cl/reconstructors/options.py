@@ -11,8 +11,8 @@ from phyradgs_cl import checks
 from phyradgs_cl.acquisition import Motion
 from phyradgs_cl.acquisition.motion import MODELS, RAYS, SPLATS, Centres, motions_for
 from phyradgs_cl.errors import InputError
+from phyradgs_cl.reconstructors.method import METHODS, method_name, method_of
 from phyradgs_cl.reconstructors.preprocess import Preprocessing
-from phyradgs_cl.reconstructors.registry import METHODS, method_name, method_of
 from phyradgs_cl.reconstructors.tune import check_tuning
 from phyradgs_cl.text import suggest_name
 

@@ -13,9 +13,9 @@ from phyradgs_cl import checks
 from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Deformation, Grid, triple
+from phyradgs_cl.reconstructors.method import DEFAULT_METHOD, METHODS, method_name, method_of
 from phyradgs_cl.reconstructors.options import method_options, preprocessing_names, preprocessing_of
 from phyradgs_cl.reconstructors.preprocess import Preprocessing
-from phyradgs_cl.reconstructors.registry import DEFAULT_METHOD, METHODS, method_name, method_of
 from phyradgs_cl.reconstructors.result import option_facts
 
 LARGEST_SEED = 2**63

@@ -18,6 +18,7 @@ from phyradgs_cl.metrics import resampled, shared_slices
 from phyradgs_cl.prepare import PREPARED_KEY
 from phyradgs_cl.prepare.step import with_masked
 from phyradgs_cl.reconstructors.checkpoint import State, with_identity, without_identity
+from phyradgs_cl.reconstructors.method import METHODS, method_of
 from phyradgs_cl.reconstructors.plan import InitialVolume, RunPlan, check_object_motion
 from phyradgs_cl.reconstructors.preprocess import prepared
 from phyradgs_cl.reconstructors.projected import (
@@ -27,7 +28,6 @@ from phyradgs_cl.reconstructors.projected import (
     holdout_errors,
     spread_frames,
 )
-from phyradgs_cl.reconstructors.registry import METHODS, method_of
 from phyradgs_cl.reconstructors.result import (
     HELD_OUT,
     MARGIN_MM,

@@ -8,7 +8,7 @@ from phyradgs_cl import checks, resource
 from phyradgs_cl.acquisition import Protocol, make_protocol
 from phyradgs_cl.acquisition.readout import readout_order, readout_ratio_of
 from phyradgs_cl.acquisition.scan import LARGEST_LAG
-from phyradgs_cl.detector.spectrum import HIGHEST_KVP, LOWEST_KVP
+from phyradgs_cl.detector.attenuation import HIGHEST_KVP, LOWEST_KVP
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.io import Scanner, load_scanner, with_detector_count
 from phyradgs_cl.simulation.object_motion import ObjectMotion, load_object_motion
@@ -29,8 +29,8 @@ class SimulationOptions:
     time_samples: midpoint samples in the exposure of a line; with 0 the volume's edge moves at most half a voxel of ``grid``
     between two (docs/mathematics.md), and so does a moving object. dose: photons of a pixel without object, on a line that
     sees the whole pulse.
-    lag (λ), rings, sparks, drift, scatter: of detector/effects.py, 0 without. kvp: of detector/spectrum.py, 0 for a beam of
-    one energy. motion_of_object: how the object moves during the scan; None: it rests."""
+    lag (λ), rings, sparks, drift, scatter: of detector/effects.py, 0 without. kvp: of detector/attenuation.py, 0 for a beam
+    of one energy. motion_of_object: how the object moves during the scan; None: it rests."""
 
     protocol: Protocol = Protocol()
     readout_axis: str = "rows"

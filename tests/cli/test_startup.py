@@ -11,7 +11,7 @@ from phyradgs_cl.fields import Grid
 from phyradgs_cl.io import write_volume
 
 HEAVY = {"matplotlib", "pyopencl", "scipy.fft", "scipy.ndimage", "scipy.spatial", "scipy.special", "skimage", "torch"}
-REGISTRY = {"phyradgs_cl.reconstructors.registry"}
+REGISTRY = {"phyradgs_cl.reconstructors.method"}
 PROGRAM = """
 import sys
 from phyradgs_cl.__main__ import load_cli

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from phyradgs_cl.detector import Spectrum, tube_spectrum
-from phyradgs_cl.detector.spectrum import _ALUMINIUM, _ALUMINIUM_G_PER_CM3, _at
+from phyradgs_cl.detector.attenuation import _ALUMINIUM, _ALUMINIUM_G_PER_CM3, _at
 from phyradgs_cl.prepare import water_polynomial
 
 

@@ -11,7 +11,7 @@ import pytest
 from phyradgs_cl.errors import OutOfMemoryError
 from phyradgs_cl.objective import ImageLoss
 from phyradgs_cl.reconstructors.voxels import run as voxels
-from phyradgs_cl.reconstructors.voxels import sirt
+from phyradgs_cl.reconstructors.voxels import sart
 
 # In a process of its own that may map no more than so many MiB beyond what it has at the start.
 LIMITED = """
@@ -54,21 +54,21 @@ def test_memory_that_runs_out_leaves_the_checkpoint(run, scan, tmp_path, capfd, 
     words = ["--method", "sirt", "--iterations", "6", "--checkpoint-every", "1e-6"]
     assert run("reconstruct", scan, "-o", whole, *words) == 0
     steps: list[int] = []
-    step = sirt.Sirt.step
+    step = sart.Sirt.step
 
-    def failing(self: sirt.Sirt) -> float:
+    def failing(self: sart.Sirt) -> float:
         steps.append(1)
         if len(steps) == 4:
             raise MemoryError("Unable to allocate 9.0 GiB")
         return step(self)
 
-    monkeypatch.setattr(sirt.Sirt, "step", failing)
+    monkeypatch.setattr(sart.Sirt, "step", failing)
     capfd.readouterr()
     assert run("reconstruct", scan, "-o", output, *words) == OutOfMemoryError.exit_code
     line = capfd.readouterr().err.splitlines()[-1]
     assert line.startswith("phyradgs: memory of this machine: found too little (Unable to allocate 9.0 GiB)")
     assert line.endswith("--resume continues from iteration 3")
-    monkeypatch.setattr(sirt.Sirt, "step", step)
+    monkeypatch.setattr(sart.Sirt, "step", step)
     assert run("reconstruct", scan, "-o", output, *words, "--resume") == 0
     kit.same_bits(output, whole)
 

@@ -13,7 +13,7 @@ from phyradgs_cl.api import simulate
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.reconstructors import METHODS, method_options, plan_run, reconstruct
 from phyradgs_cl.reconstructors.options import motions_of
-from phyradgs_cl.reconstructors.voxels.sirt import SirtOptions
+from phyradgs_cl.reconstructors.voxels.sart import SirtOptions
 
 ABSURD = {
     "NaN": float("nan"), "infinite": float("inf"), "huge": 1e300, "far below 0": -1e300, "boolean": True,

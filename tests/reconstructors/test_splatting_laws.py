@@ -16,7 +16,7 @@ from phyradgs_cl.fields import Grid
 from phyradgs_cl.operators import voxelise
 from phyradgs_cl.optim import DensityControl
 from phyradgs_cl.phantoms import shepp_logan
-from phyradgs_cl.reconstructors.registry import METHODS
+from phyradgs_cl.reconstructors.method import METHODS
 from phyradgs_cl.reconstructors.result import Progress, Reconstruction
 from phyradgs_cl.reconstructors.splats import method as splatting
 from phyradgs_cl.reconstructors.splats.options import SplatOptions

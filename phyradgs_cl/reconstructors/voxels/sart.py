@@ -1,8 +1,8 @@
-"""SART and OS-SART: the volume is corrected after every frame, or after every few frames. Ordered subsets, also those of
-``fista``.
+"""SIRT, SART and OS-SART: the volume is corrected after all frames, after every frame, or after every few. Ordered subsets,
+also those of ``fista``.
 
-Andersen and Kak, Ultrasonic Imaging 6 (1984) 81; ordered subsets: H. M. Hudson and R. S. Larkin, IEEE Trans. Med. Imaging 13
-(1994) 601, Wang and Jiang, J. X-Ray Sci. Technol. 12 (2004) 169."""
+SIRT: Gilbert, J. Theor. Biol. 36 (1972) 105. SART: Andersen and Kak, Ultrasonic Imaging 6 (1984) 81. Ordered subsets: H. M.
+Hudson and R. S. Larkin, IEEE Trans. Med. Imaging 13 (1994) 601, Wang and Jiang, J. X-Ray Sci. Technol. 12 (2004) 169."""
 
 import math
 from collections.abc import Iterator
@@ -13,7 +13,7 @@ import numpy as np
 
 from phyradgs_cl import checks
 from phyradgs_cl.acquisition import Scan
-from phyradgs_cl.checks import ceil_div
+from phyradgs_cl.checks import ceil_div, ranged
 from phyradgs_cl.reconstructors.method import Method
 from phyradgs_cl.reconstructors.voxels.run import Algorithm, IterativeOptions, voxel_method
 from phyradgs_cl.reconstructors.voxels.system import System, column_weights, row_weights
@@ -143,3 +143,35 @@ def _method(name: str, default: SartOptions) -> Method:
 
 
 METHOD, OS_METHOD = _method("sart", SartOptions()), _method("os-sart", OS_SART)
+
+
+@dataclass(frozen=True)
+class SirtOptions(IterativeOptions):
+    """relaxation: λ between 0 and 2. transmission_weights: transmission-weighted (PWLS), R = t/(A 1), C = 1/(Aᵀ t)."""
+
+    iterations: int = 100
+    relaxation: float = ranged(1.0, 1e-6, 2)
+    transmission_weights: bool = False  # type: ignore[misc]
+
+
+class Sirt(Algorithm):
+    """x ← x + λ C Aᵀ R (p − A x), R = 1/(A 1), C = 1/(Aᵀ 1). The intensity model replaces Aᵀ by Jᵀ and A x by I(x).
+
+    The residual is that before the correction, of which √R ‖·‖ falls in every step."""
+
+    def __init__(self, system: System, options: SirtOptions) -> None:
+        super().__init__(system)
+        self.options = options
+        self._rows, self._columns = row_weights(system), column_weights(system)
+
+    def step(self) -> float:
+        space, options = self.system.space, self.options
+        residual = self.system.residual(self.volume)
+        update = self.system.back(space.multiply(residual, self._rows))
+        self.volume = space.add_product(
+            self.volume, self._columns, update, options.relaxation, nonnegative=options.nonnegative
+        )
+        return space.norm(residual)
+
+
+SIRT_METHOD = voxel_method("sirt", SirtOptions(), lambda system, options, _: Sirt(system, options), volumes=4, frames=1)
