@@ -41,8 +41,8 @@ def projector_rates(rt: Runtime, scan: Scan, count: int, repeats: int) -> dict[s
             projector.backward(gaussians, cells, by_image, gradients)
             kernels = rt.kernel_seconds()
             if repeat == 0:
-                box, evaluated, footprints = projector.count_pairs(gaussians, cells)
-                result[name] = {"box_pairs": box, "evaluated_pairs": evaluated, "footprints": footprints}
+                work = projector.work(gaussians, cells)
+                result[name] = {"box_pairs": work.pairs, "evaluated_pairs": work.evaluated, "footprints": work.footprints}
                 continue
             seconds[name]["forward"].append(kernels["splat_forward_rows"])
             seconds[name]["backward"].append(kernels["splat_backward_rows"])

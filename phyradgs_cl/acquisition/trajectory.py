@@ -50,7 +50,8 @@ class ConstantSpeed:
     speed_rad_per_s: float
 
     def __post_init__(self) -> None:
-        _check_finite(self)
+        for one in fields(self):
+            checks.numbers(one.name, getattr(self, one.name), ())
 
     def angle_rad(self, frame: int, time_s: np.ndarray) -> np.ndarray:
         """Returns angles (...) in rad at times (...) s, the same in every frame."""
@@ -58,22 +59,17 @@ class ConstantSpeed:
 
 
 @dataclass(frozen=True)
-class SpeedRamp:
+class SpeedRamp(ConstantSpeed):
     """θ(t) = θ0 + ω t + ½ a t²: a gantry that speeds up or brakes by ``acceleration_rad_per_s2``.
 
     ``angle_start_rad`` and ``speed_rad_per_s`` hold at time 0. Raises InputError for infinite values or NaN."""
 
-    angle_start_rad: float
-    speed_rad_per_s: float
     acceleration_rad_per_s2: float
-
-    def __post_init__(self) -> None:
-        _check_finite(self)
 
     def angle_rad(self, frame: int, time_s: np.ndarray) -> np.ndarray:
         """Returns angles (...) in rad at times (...) s, the same in every frame."""
         t = np.asarray(time_s, np.float64)
-        return self.angle_start_rad + self.speed_rad_per_s * t + 0.5 * self.acceleration_rad_per_s2 * t * t
+        return super().angle_rad(frame, t) + 0.5 * self.acceleration_rad_per_s2 * t * t
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -263,11 +259,6 @@ def checked_poses(trajectory: Trajectory, frame: int, time_s: np.ndarray) -> np.
     """Returns poses (T, 12) of a trajectory at times (T,) s. InputError: a user-defined one gives other shapes or NaN."""
     subject = f"trajectory {type(trajectory).__name__}"
     return checks.numbers(subject, trajectory.pose(frame, time_s), (*time_s.shape, POSE_LENGTH))
-
-
-def _check_finite(kinematics: ConstantSpeed | SpeedRamp) -> None:
-    for one in fields(kinematics):
-        checks.numbers(one.name, getattr(kinematics, one.name), ())
 
 
 def _checked_table(

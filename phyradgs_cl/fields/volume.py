@@ -101,6 +101,10 @@ class Grid:
             return None
         return triple(slice(int(s), int(s) + n) for s, n in zip(start, self.shape, strict=True))
 
+    def in_shape(self, shape: tuple[int, int, int]) -> "Grid":
+        """Returns the same box in ``shape`` (z, y, x) voxels."""
+        return Grid(shape, triple(side / n for side, n in zip(self.size_mm, shape, strict=True)), self.offset_mm)
+
     def finer(self, parts: int) -> "Grid":
         """Returns the same box with every voxel divided into ``parts`` along each axis."""
         return Grid(triple(parts * n for n in self.shape), triple(d / parts for d in self.voxel_size_mm), self.offset_mm)

@@ -15,6 +15,7 @@ import scipy
 
 from phyradgs_cl import checks
 from phyradgs_cl.acquisition import Scan
+from phyradgs_cl.acquisition.altered.angles import middle_poses
 from phyradgs_cl.detector import robust_deviation
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.prepare.bad_pixels import axis_column
@@ -119,8 +120,7 @@ def remove_rings(scan: Scan, options: RingOptions, make_model: MakeModel) -> tup
 
 def is_full_turn(scan: Scan) -> bool:
     """Returns whether the sources of all views lie evenly around a circle, that is equally far from their mean."""
-    times_s = scan.frame_start_s + scan.shutter.middle_s
-    sources = np.stack([scan.trajectory.pose(f, times_s[f : f + 1])[0][:3] for f in range(scan.frames)])
+    sources = middle_poses(scan)[:, :3]
     distance = np.linalg.norm(sources - sources.mean(axis=0), axis=1)
     return bool(distance.max() < _EQUALLY_FAR * distance.min())
 

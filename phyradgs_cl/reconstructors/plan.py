@@ -125,7 +125,7 @@ def check_object_motion(deformation: Deformation, scan: Scan) -> None:
     """Raises InputError for a deformation of another place, another time or another unit than the scan's, and where matter
     folds or is compressed to nothing."""
     _check_times(deformation, scan)
-    grid = _coarse(scan.grid)
+    grid = scan.grid.in_shape(triple(min(n, _MOST_VOXELS) for n in scan.grid.shape))
     if not deformation.control_mm.any():
         return
     fields_mm = np.stack([deformation.on_grid_mm(grid, unit) for unit in np.eye(deformation.rank)])
@@ -155,9 +155,3 @@ def _check_times(deformation: Deformation, scan: Scan) -> None:
         raise InputError(_SUBJECT, found, "times that cover the scan", "check their unit and where they begin")
     if covered_s < _MOSTLY_COVERED * (last_s - first_s):
         log.warning("%s: found %s; before and after its times the object rests", _SUBJECT, found)
-
-
-def _coarse(grid: Grid) -> Grid:
-    """Returns a grid of the same box with few voxels."""
-    shape = triple(min(n, _MOST_VOXELS) for n in grid.shape)
-    return Grid(shape, triple(side / n for side, n in zip(grid.size_mm, shape, strict=True)), grid.offset_mm)

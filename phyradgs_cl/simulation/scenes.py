@@ -8,7 +8,7 @@ import numpy as np
 
 from phyradgs_cl.acquisition.geometry import Geometry
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.fields import Deformation, Grid, deformed
+from phyradgs_cl.fields import Deformation, Grid, deformed, triple
 from phyradgs_cl.io import Volume
 from phyradgs_cl.operators.rays.layout import RayLayout
 from phyradgs_cl.operators.rays.memory import RayMemory
@@ -170,6 +170,4 @@ def block_mean(volume: np.ndarray, shape: tuple[int, int, int]) -> np.ndarray:
 def _resized(grid: Grid, count: int) -> Grid:
     if count < 1:
         raise InputError("--size", str(count), "at least 1 voxel")
-    shape = [max(1, round(n * count / max(grid.shape))) for n in grid.shape]
-    voxel = [side / n for side, n in zip(grid.size_mm, shape, strict=True)]
-    return Grid((shape[0], shape[1], shape[2]), (voxel[0], voxel[1], voxel[2]), grid.offset_mm)
+    return grid.in_shape(triple(max(1, round(n * count / max(grid.shape))) for n in grid.shape))

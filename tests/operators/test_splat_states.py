@@ -63,7 +63,7 @@ def test_a_cloud_in_every_state_is_its_twin(any_rt, make_cloud, make_geometry, c
     rows, one = make_cloud(count, 3, spread=1.5), deformation()
     table = frame_cells("micro-views", make_geometry(*SHAPE))
     cells, gaussians = DeviceCells.upload(any_rt, table, states_of(table, one)), DeviceGaussians.upload(any_rt, rows)
-    moved = any_rt.download(CloudStates(any_rt, one).forward(gaussians, cells))
+    moved = any_rt.download(CloudStates(any_rt, one).forward(gaussians, cells.shares))
     weights = one.weights_at(np.unique(table.time_s))
     assert moved.shape == (len(weights), STATE_ROWS, gaussians.stride)
     for state, expected in zip(moved[..., :count], weights, strict=True):

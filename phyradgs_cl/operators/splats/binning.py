@@ -48,26 +48,17 @@ class TileLists:
         if self._counts.size < self.total * chunks:
             self._counts = rt.empty(1, np.int32)  # frees the old memory before it allocates the new
             self._counts = rt.empty(self.total * chunks, np.int32)
-        domain = (
-            extents,
-            np.int32(stride),
-            np.int32(count),
-            np.int32(chunk),
-            np.int32(chunks),
-            self.tile,
-            self.tiles,
-        )
+        domain = extents, stride, count, chunk, chunks, self.tile, self.tiles
         group, scan = (chunk, _SCANNED) if rt.pixel_items else (1, 1)
         boxes, scratch = ([rt.local(24 * group)], [rt.local(8 * scan)]) if rt.pixel_items else ([], [])
-        total = np.int32(self.total)
         if rt.pixel_items:
             rt.fill(self._counts, 0)
         rt.launch(self._count, chunks * group, *domain, self._counts, *boxes, group=group)
         rt.launch(
-            self._within, self.total * scan, total, chunks, self._counts, self.tile_offsets, *scratch,
+            self._within, self.total * scan, self.total, chunks, self._counts, self.tile_offsets, *scratch,
             group=scan,
         )  # fmt: skip
-        rt.launch(self._starts, scan, total, self.tile_offsets, *scratch, group=scan)
+        rt.launch(self._starts, scan, self.total, self.tile_offsets, *scratch, group=scan)
         if self.waits or count != self._count_seen:
             self._make_room(int(rt.read_item(self.tile_offsets, self.total)), 1.0)
             self._count_seen, self._needed = count, None

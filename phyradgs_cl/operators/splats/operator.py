@@ -37,13 +37,8 @@ class SplatOperator:
         readout = tables[0].readout
         self.rt, self.is_layered, self._affine = rt, intensity, affine
         self._projector = SplatProjector(
-            rt,
-            *readout.shape(detector_shape),
-            affine=affine,
-            cutoff_sigma=cutoff_sigma,
-            time_error=time_error,
-            pixel_footprint=pixel_footprint,
-            intensity_unit=1.0 if intensity else None,
+            rt, *readout.shape(detector_shape), affine=affine, cutoff_sigma=cutoff_sigma, time_error=time_error,
+            pixel_footprint=pixel_footprint, intensity_unit=1.0 if intensity else None,
         )
         self.rows = PlainRows(rt, length_mm, line_integrals=True)
         self._images = PlainImages(rt, self._projector.lines, self._projector.width, turned=readout.axis != "rows")

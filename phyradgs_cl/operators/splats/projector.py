@@ -161,11 +161,6 @@ class SplatProjector:
         if self.states is not None:
             self.states.back(gaussians, cells, gradients)
 
-    def count_pairs(self, gaussians: DeviceGaussians, cells: DeviceCells) -> tuple[int, int, int]:
-        """Counts, for a ``forward``: Gaussian–pixel pairs, evaluated pairs (complete vectors), Gaussian–cell footprints."""
-        work = self.work(gaussians, cells)
-        return work.pairs, work.evaluated, work.footprints
-
     def work(self, gaussians: DeviceGaussians, cells: DeviceCells) -> Work:
         """Counts the work of a ``forward`` of these Gaussians and cells."""
         self.prepare(gaussians, cells)
@@ -192,7 +187,7 @@ class SplatProjector:
         if self._extents.size < 6 * gaussians.stride:
             self._extents = rt.empty(6 * gaussians.stride, np.int32)
         if self.states is not None:
-            self._cloud = self.states.forward(gaussians, cells)
+            self._cloud = self.states.forward(gaussians, cells.shares)
         times = (cells.line_times, np.int32(cells.time_pitch)) if cells.moving else ()
         rt.launch(
             self._kernels[cells.moving, cells.fixed_conic, cells.is_parallel].prepare,

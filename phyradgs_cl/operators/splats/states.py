@@ -30,11 +30,8 @@ class CloudStates:
         )  # fmt: skip
         self._states, self._by_states = rt.empty(1), rt.empty(1)
 
-    def forward(self, gaussians: DeviceGaussians, cells: DeviceCells) -> DeviceArray:
-        """Returns the cloud in the states of the cells (S, 12, stride), valid until the next call."""
-        return self._forward(gaussians, cells.shares)
-
-    def _forward(self, gaussians: DeviceGaussians, shares: DeviceArray) -> DeviceArray:
+    def forward(self, gaussians: DeviceGaussians, shares: DeviceArray) -> DeviceArray:
+        """Returns the cloud in states (S, 12, stride) of weights ``shares`` (S, R), valid until the next call."""
         rt, count, stride = self.rt, shares.shape[0], gaussians.stride
         if self._states.size < count * STATE_ROWS * stride:
             self._states = rt.empty(1)  # frees the old memory before it allocates the new
@@ -71,7 +68,7 @@ class CloudStates:
         ends = np.concatenate([self.deformation.weights.argmax(0), self.deformation.weights.argmin(0)])
         chosen = np.linspace(0, len(self.deformation.times_s) - 1, _PROBED_STATES).astype(int)
         weights = self.deformation.weights[np.unique([*ends, *chosen])]
-        moved = rt.download(self._forward(DeviceGaussians.upload(rt, rows), rt.upload(weights, np.float32)))
+        moved = rt.download(self.forward(DeviceGaussians.upload(rt, rows), rt.upload(weights, np.float32)))
         moved = moved.ravel()[: len(weights) * STATE_ROWS * stride_of(rows.shape[1])].reshape(len(weights), STATE_ROWS, -1)
         places = moved[:, :3, : rows.shape[1]].astype(np.float64)
         for place, one in zip(places, weights, strict=True):

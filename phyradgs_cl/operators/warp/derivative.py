@@ -4,7 +4,6 @@ U_r, and by the weights φ_r. With w_k of the state k and the slope ∇v of the 
     J d = Σ_k P_k (∇v(y + w_k) · Σ_r φ_r,k B d_r),    Jᵀ y = Bᵀ Σ_k φ_r,k ∇v(y + w_k) P_kᵀ y"""
 
 from collections.abc import Callable
-from functools import partial
 
 import numpy as np
 
@@ -49,7 +48,7 @@ class FieldDerivative:
 
     def by_weights(self) -> np.ndarray:
         """Returns the change of the frames (R, F, rows, columns) float32 for a unit of each weight at all times."""
-        return np.stack([self._projected(partial(_same_for_all, field)) for field in self._fields_mm])
+        return np.stack([self._projected(dict.fromkeys(self.slopes, field).__getitem__) for field in self._fields_mm])
 
     def _projected(self, field_of: Callable[[int], np.ndarray]) -> np.ndarray:
         rt = self.operator.rt
@@ -65,10 +64,6 @@ class FieldDerivative:
         along_z, along_y, along_x = self._bases
         values = np.einsum("zk,yl,xm,klmi->zyxi", along_z, along_y, along_x, control_mm.astype(np.float32), optimize=True)
         return np.asarray(values)
-
-
-def _same_for_all(field_mm: np.ndarray, state: int) -> np.ndarray:
-    return field_mm
 
 
 def warp_slopes(volume: np.ndarray, displacement: np.ndarray) -> np.ndarray:

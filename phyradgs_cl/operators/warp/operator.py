@@ -41,10 +41,7 @@ class WarpedOperator:
             for state, (frames, shared) in enumerate(_tables_by_state(tables, warp))
             if shared
         ]
-        self._set_frames(len(tables))
-
-    def _set_frames(self, count: int) -> None:
-        self.frames_shape = (count, *self.detector_shape)
+        self.frames_shape = (len(tables), *detector_shape)
 
     def forward(self, volume: SameArray, out: SameArray | None = None) -> SameArray:
         """Returns A x for a volume (nz, ny, nx) in 1/mm: frames (F, rows, columns) float32."""
@@ -108,7 +105,7 @@ class WarpedOperator:
         chosen = np.asarray(frames, np.int64)
         part = copy(self)
         part._parts = [piece for each in self._parts if (piece := each.subset(self.rt, chosen)) is not None]
-        part._set_frames(len(chosen))
+        part.frames_shape = (len(chosen), *self.detector_shape)
         return part
 
     @property

@@ -36,11 +36,8 @@ def coarse_scan(scan: Scan) -> Scan:
     """Returns the scan with blocks of pixels, few voxels in the same box, and at most 600 frames."""
     block = math.ceil(max(scan.geometry.detector_shape) / _MOST_COLUMNS)
     small = binned(smooth(fewer_frames(scan, _MOST_FRAMES), SMOOTHING * block if block > 1 else 0.0), block)
-    sides_mm, longest_mm = scan.grid.size_mm, max(scan.grid.size_mm)
-    least_mm = max(longest_mm / _MOST_VOXELS, min(scan.grid.voxel_size_mm))
-    shape = triple(max(1, round(side / least_mm)) for side in sides_mm)
-    grid = Grid(shape, triple(side / n for side, n in zip(sides_mm, shape, strict=True)), scan.grid.offset_mm)
-    return replace(small, grid=grid)
+    least_mm = max(max(scan.grid.size_mm) / _MOST_VOXELS, min(scan.grid.voxel_size_mm))
+    return replace(small, grid=scan.grid.in_shape(triple(max(1, round(side / least_mm)) for side in scan.grid.size_mm)))
 
 
 def initial_field(scan: Scan, signal: MotionSignal, last_s: float, first_s: float) -> MotionField:

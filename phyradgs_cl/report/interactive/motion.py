@@ -83,8 +83,7 @@ def object_in_motion(
     """Returns three slices of the object at the first time of ``span_s``, their controls and the data of the script, which
     shows any time of the span. ``volume`` (nz, ny, nx) is the reference, with at least two voxels along every side."""
     means = block_means(volume, MOST_EDGE)
-    sides_mm = (side / count for side, count in zip(grid.size_mm, means.shape, strict=True))
-    small = Grid(triple(means.shape), triple(sides_mm), grid.offset_mm)
+    small = grid.in_shape(triple(means.shape))
     first = deformed(means, small, deformation, deformation.weights_at(span_s[0])[0])
     middles = [np.take(first, count // 2, axis=axis) for axis, count in enumerate(first.shape)]
     planes = middle_planes(middles, small, (window.low, window.high))
