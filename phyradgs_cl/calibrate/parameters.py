@@ -27,7 +27,8 @@ class Parameter:
 
     scale: of the displayed unit per unit of the field. object_instead: the object that explains the frames as well, where
     they do not determine the parameter. pixels: how far a unit of the field moves the image at its edge. mismatch: measured
-    errors (docs/calibrate.md) over those of noise, because voxels do not represent the object exactly."""
+    errors (docs/calibrate.md) over those of noise, because voxels do not represent the object exactly. is_axial: the
+    parameter moves the image along the axis, like ``LIFT``; the others move it across the axis, like ``TURN``."""
 
     name: str
     field: str
@@ -38,6 +39,7 @@ class Parameter:
     scale: float = 1.0
     is_timing: bool = False
     mismatch: float = 2.0
+    is_axial: bool = False
 
     def step(self, scan: Scan) -> float:
         """Returns half the distance of a central difference, in the field's unit."""
@@ -98,14 +100,17 @@ PARAMETERS = {
         ),
         Parameter(
             "offset-v", "offset_v_mm", "mm", "an object further along the axis",
-            lambda s: s.geometry.detector_offset_mm[0], lambda s: 1 / _pitch_mm(s),
+            lambda s: s.geometry.detector_offset_mm[0], lambda s: 1 / _pitch_mm(s), is_axial=True,
         ),
         Parameter("roll", "roll_rad", "deg", "a sheared object", lambda s: 0.0, _edge_pixels, _DEGREES),
         Parameter(
             "tilt-v", "tilt_v_rad", "deg", "a shifted panel", lambda s: 0.0, _tilt_pixels(1), _DEGREES,
             mismatch=_SMALL_MISMATCH,
         ),
-        Parameter("tilt-u", "tilt_u_rad", "deg", "an object wider at one end", lambda s: 0.0, _tilt_pixels(0), _DEGREES),
+        Parameter(
+            "tilt-u", "tilt_u_rad", "deg", "an object wider at one end", lambda s: 0.0, _tilt_pixels(0), _DEGREES,
+            is_axial=True,
+        ),
         Parameter(
             "source-distance", "source_distance_mm", "mm", _SCALE,
             lambda s: _cone(s).source_to_axis_mm, lambda s: _edge_pixels(s, 1 / _cone(s).source_to_axis_mm),
@@ -129,8 +134,10 @@ PARAMETERS = {
     )
 }  # fmt: skip
 OFFSET_U, LAG, DRIFT = "offset-u", "lag", "drift"
-GAUGE = Parameter("all angles", "turn_rad", "deg", _TURN, lambda s: 0.0, _edge_pixels, _DEGREES)
-"""A parameter that no frame determines: its remaining signal is an error of the voxels."""
+TURN = Parameter("all angles", "turn_rad", "deg", _TURN, lambda s: 0.0, _edge_pixels, _DEGREES)
+LIFT = Parameter("all heights", "lift_mm", "mm", "a lower object", lambda s: 0.0, lambda s: 1 / _pitch_mm(s), is_axial=True)
+GAUGES = (TURN, LIFT)
+"""Parameters that no frame determines: their remaining signals are errors of the voxels."""
 PARAMETER_GROUPS = {
     "offset": (OFFSET_U, "offset-v"),
     "tilt": ("tilt-v", "tilt-u"),
@@ -196,7 +203,7 @@ def _turns(scan: Scan) -> bool:
 
 def correction_of(values: Mapping[str, float]) -> GeometryCorrection:
     """Returns the correction with these values by parameter name, in the fields' units."""
-    fields = {**PARAMETERS, GAUGE.name: GAUGE}
+    fields = {**PARAMETERS, **{gauge.name: gauge for gauge in GAUGES}}
     return GeometryCorrection(**{fields[name].field: float(value) for name, value in values.items()})
 
 

@@ -13,7 +13,7 @@ import numpy as np
 import scipy
 
 from phyradgs_cl.calibrate.beads import BeadProblem
-from phyradgs_cl.calibrate.parameters import GAUGE, Parameter, correction_of
+from phyradgs_cl.calibrate.parameters import GAUGES, PARAMETERS, Parameter, correction_of
 from phyradgs_cl.calibrate.problem import CoarseProblem
 
 LEAST_SHARE = 0.2  # of a signal, beyond what the object and the other parameters explain
@@ -127,16 +127,21 @@ def _signal(
     return problem.masked((ends[0] - ends[1]) / np.float32(2 * step))
 
 
-def least_share(problem: Reduced) -> float:
-    """Returns the least share that has to remain of a parameter's signal, of a problem with ``GAUGE``.
+def least_shares(problem: Reduced) -> dict[str, float]:
+    """Returns the least share that has to remain of each parameter's signal, by name, of a problem with ``GAUGES``.
 
-    It exceeds the one that remains of a turn of all views. No frame distinguishes that turn from a turned object; voxels do
-    not follow it exactly, and leave as much of any other signal."""
-    gauge = float(problem.only([GAUGE.name]).shares[0])
-    return max(LEAST_SHARE, _GAUGE_FACTOR * min(gauge, _MOST_GAUGE))
+    It exceeds the share that remains of a turn of all views, or of a lift for parameters that move the image along the
+    axis. No frame distinguishes a turn from a turned object; voxels do not follow it exactly, and leave as much of any
+    other signal."""
+    remaining = {gauge.is_axial: float(problem.only([gauge.name]).shares[0]) for gauge in GAUGES}
+    names = [name for name in problem.names if name in PARAMETERS]
+    gauge_shares = {name: min(remaining[PARAMETERS[name].is_axial], _MOST_GAUGE) for name in names}
+    return {name: max(LEAST_SHARE, _GAUGE_FACTOR * share) for name, share in gauge_shares.items()}
 
 
-def indistinguishable(problem: Reduced, least: float) -> list[dict[str, float]]:
-    """Returns combinations of parameters, as weights by name, of which an object explains all but ``least``."""
+def indistinguishable(problem: Reduced, least: Mapping[str, float]) -> list[dict[str, float]]:
+    """Returns combinations of parameters, as weights by name, of which an object explains all but ``least``: the least
+    share of the parameter with the largest weight."""
     values, vectors = scipy.linalg.eigh(problem.gram, problem.whole_gram + _TINY * np.eye(len(problem.names)))
-    return [dict(zip(problem.names, map(float, weights), strict=True)) for weights in vectors[:, values < least**2].T]
+    limits = np.array([least[problem.names[k]] for k in np.abs(vectors).argmax(0)])
+    return [dict(zip(problem.names, map(float, weights), strict=True)) for weights in vectors[:, values < limits**2].T]

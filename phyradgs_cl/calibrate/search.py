@@ -11,13 +11,13 @@ import numpy as np
 
 from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.calibrate.beads import BeadProblem
-from phyradgs_cl.calibrate.parameters import GAUGE, PARAMETERS, Parameter, correction_of, in_words
+from phyradgs_cl.calibrate.parameters import GAUGES, PARAMETERS, Parameter, correction_of, in_words
 from phyradgs_cl.calibrate.problem import CoarseProblem
 from phyradgs_cl.calibrate.reduced import (
     LEAST_SHARE_OF_BEADS,
     Reduced,
     indistinguishable,
-    least_share,
+    least_shares,
     reduced,
 )
 from phyradgs_cl.calibrate.result import AGREES, CANNOT_TELL, CORRECTED, ParameterEstimate
@@ -71,7 +71,7 @@ class Search:
             correction = correction_of(self.at)
             operator: Any = problem.operator(correction)
             volume = problem.corrected(correction).reconstruct(operator, volume, stage.again if number else stage.first)
-            more = [GAUGE] if asks and isinstance(problem, CoarseProblem) else []
+            more = GAUGES if asks and isinstance(problem, CoarseProblem) else ()
             linear = reduced(problem, operator, [*parameters, *more], self.at, volume, stage.project)
             if asks:
                 self._decide_determined(linear)
@@ -82,9 +82,10 @@ class Search:
 
     def _decide_determined(self, linear: Reduced) -> None:
         """Decides which parameters the frames determine: those with a large enough share, and a useful deviation."""
-        least = least_share(linear) if GAUGE.name in linear.names else LEAST_SHARE_OF_BEADS
+        has_gauges = GAUGES[0].name in linear.names
+        least = least_shares(linear) if has_gauges else dict.fromkeys(linear.names, LEAST_SHARE_OF_BEADS)
         linear = linear.only([one.name for one in self.parameters])
-        names = tuple(name for name, share in zip(linear.names, linear.shares, strict=True) if share >= least)
+        names = tuple(name for name, share in zip(linear.names, linear.shares, strict=True) if share >= least[name])
         deviations = linear.only(names).deviations() if names else ()
         self.determined = tuple(n for n, d in zip(names, deviations, strict=True) if PARAMETERS[n].is_known(float(d)))
         self.shares = dict(zip(linear.names, linear.shares.tolist(), strict=True))

@@ -31,7 +31,7 @@ class Stage:
 
     def passes(self, parameters: int, asks: bool) -> int:
         """Returns the most passes through the frames; ``asks``: it is tested which parameters the frames determine."""
-        return self.first - self.again + self.steps * (self.again + self.project * (parameters + (2 if asks else 1)))
+        return self.first - self.again + self.steps * (self.again + self.project * (parameters + (3 if asks else 1)))
 
 
 def pass_cost(scans: Sequence[Scan], columns: int, most_frames: int) -> float:

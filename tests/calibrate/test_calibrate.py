@@ -65,6 +65,13 @@ def test_a_right_scan_stays_as_it_is(rt, right) -> None:
     assert found.residual_rms[0] == found.residual_rms[1]
 
 
+def test_a_thin_object_leaves_open_what_voxels_follow_badly(rt) -> None:
+    """Coarse voxels do not follow a foot that is lifted: what remains of offset-v and tilt-u is their error."""
+    scan = simulate("foot", size=24, detector=32, noise="tigre", dose=28_000, device=rt)
+    verdicts = {name: one.verdict for name, one in by_name(calibrate(scan, rt, "offset,tilt")).items()}
+    assert verdicts == {"offset-u": AGREES, "offset-v": CANNOT_TELL, "tilt-v": AGREES, "tilt-u": CANNOT_TELL}
+
+
 @pytest.mark.parametrize("tilt, names", [(0.0, {"offset-u"}), (1.8, {"offset-u"}), (9.0, {"offset-u", "tilt-v"})])
 def test_what_differs_by_less_than_three_deviations_is_not_corrected_along(tilt, names) -> None:
     """Signals of an offset and a tilt that resemble each other, the tilt off by so many of its deviations."""

@@ -47,6 +47,13 @@ def test_turns_leave_the_middle_of_the_panel_where_it_is(right) -> None:
     np.testing.assert_allclose(np.linalg.norm(turned[0, 1] - turned[0, 0]), 0.125)
 
 
+def test_a_lift_raises_source_and_panel(right) -> None:
+    time_s = right.frame_start_s[3:4]
+    lifted = perturb(right, GeometryCorrection(lift_mm=0.3)).trajectory.pose(3, time_s)
+    expected = right.trajectory.pose(3, time_s) + np.array([0, 0, 0.3, 0, 0, 0.3, 0, 0, 0, 0, 0, 0])
+    np.testing.assert_allclose(lifted, expected, atol=1e-12)
+
+
 def test_views_move_by_themselves(right) -> None:
     views = Views(np.zeros(15), np.zeros((15, 2)))
     views.turn_rad[3], views.shift_mm[5] = 0.01, (0.2, 0.0)

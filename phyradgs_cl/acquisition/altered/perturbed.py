@@ -19,7 +19,8 @@ class GeometryCorrection:
     Offsets move the panel along its own columns and rows. Roll turns it in its plane, tilts about v and u through its
     middle. Distances move source and panel away from the axis. Times lengthen readout and exposure, or start frames later.
     lag adds to the fraction of each frame that the next one repeats. drift is the logarithm of the beam's gain from the
-    first frame to the last. turn_rad turns all views about the axis, which no frame can distinguish from a turned object."""
+    first frame to the last. turn_rad turns all views about the axis, lift_mm raises them along it: no frame can distinguish
+    these two from a turned or lowered object."""
 
     offset_u_mm: float = 0.0
     offset_v_mm: float = 0.0
@@ -34,6 +35,7 @@ class GeometryCorrection:
     lag: float = 0.0
     drift: float = 0.0
     turn_rad: float = 0.0
+    lift_mm: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,8 +128,10 @@ class PerturbedTrajectory:
         middle = middle + (correction.offset_u_mm + shift_u_mm) * u_hat + (correction.offset_v_mm + shift_v_mm) * v_hat
         axes = np.stack([u_hat, v_hat, normal], -1)
         column, row = axes @ self._turn[:, 0] * pitch_u_mm, axes @ self._turn[:, 1] * pitch_v_mm
+        lift_mm = np.array([0.0, 0.0, correction.lift_mm])
+        middle = middle + lift_mm
         if not self.is_parallel:
-            source = source + correction.source_distance_mm * normal
+            source = source + correction.source_distance_mm * normal + lift_mm
         return [source, middle - half_u * column - half_v * row, column, row]
 
 
@@ -155,9 +159,9 @@ def perturb(scan: Scan, correction: GeometryCorrection, views: Views | Sway | No
             geometry, source_to_axis_mm=geometry.source_to_axis_mm + source_mm,
             source_to_detector_mm=geometry.source_to_detector_mm + source_mm + correction.detector_distance_mm,
         )
-    turns = any((correction.roll_rad, correction.tilt_v_rad, correction.tilt_u_rad, correction.turn_rad))
+    turned = (correction.roll_rad, correction.tilt_v_rad, correction.tilt_u_rad, correction.turn_rad)
     of_poses = replace(correction, readout_s=0.0, exposure_s=0.0, start_s=0.0, lag=0.0, drift=0.0)
-    if isinstance(trajectory, CircularOrbit) and not turns and views is None:
+    if isinstance(trajectory, CircularOrbit) and not any((*turned, correction.lift_mm)) and views is None:
         trajectory = CircularOrbit(geometry, trajectory.kinematics)
     elif of_poses != GeometryCorrection() or views is not None:
         trajectory = PerturbedTrajectory(trajectory, geometry.detector_shape, correction, views)
