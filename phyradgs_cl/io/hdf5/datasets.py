@@ -55,9 +55,10 @@ LENGTH = _quantity("length", "mm", 1e9, {
     ("um", "\u00b5m", "\u03bcm", "micrometer", "micrometre", "micrometers", "micrometres"): 1e-3,
 })  # fmt: skip
 TIME = _quantity("time", "s", 1e12, {
-    ("s", "sec", "second", "seconds"): 1.0, ("ms", "millisecond", "milliseconds"): 1e-3,
+    ("s", "sec", "second", "seconds"): 1.0,
+    ("ms", "millisecond", "milliseconds"): 1e-3,
     ("us", "\u00b5s", "\u03bcs", "microsecond", "microseconds"): 1e-6,
-})
+})  # fmt: skip
 ANGLE = _quantity("angle", "deg", 1e8, {
     ("deg", "degree", "degrees", "\u00b0"): math.pi / 180, ("rad", "radian", "radians"): 1.0
 })  # fmt: skip
