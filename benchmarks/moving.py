@@ -33,7 +33,7 @@ from phyradgs_cl.reconstructors import ObjectMotion, Reconstruction, RunPlan, me
 from phyradgs_cl.reconstructors.result import MOTION_FOUND
 from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.simulation.object_motion import ObjectMotion as PresetMotion
-from phyradgs_cl.workflow.evaluate import compared_states
+from phyradgs_cl.workflow.volumes import compared_states
 
 TURN_S = 60.0
 CASES = ("rest", "known", "ignored", "unknown", "still")

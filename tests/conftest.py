@@ -121,7 +121,7 @@ def refused(cli, capfd) -> Callable[..., str]:
 @pytest.fixture
 def fast_pictures(monkeypatch) -> None:
     """`evaluate` draws nothing: a figure of nine panels takes a second, and tests/metrics looks at one."""
-    monkeypatch.setattr("phyradgs_cl.workflow.evaluate.slices_png", lambda path, *_: Path(path).write_bytes(b"\x89PNG"))
+    monkeypatch.setattr("phyradgs_cl.workflow.volumes.slices_png", lambda path, *_: Path(path).write_bytes(b"\x89PNG"))
 
 
 @pytest.fixture(scope="session")

@@ -1,4 +1,3 @@
-from .evaluate import run_evaluation as run_evaluation
 from .files import load_reference as load_reference
 from .files import load_scan as load_scan
 from .files import summary as summary
@@ -9,4 +8,5 @@ from .scans import refuse_jitter as refuse_jitter
 from .scans import refuse_noise_options as refuse_noise_options
 from .scans import run_preparation as run_preparation
 from .scans import run_simulation as run_simulation
-from .splat import run_splat_fit as run_splat_fit
+from .volumes import run_evaluation as run_evaluation
+from .volumes import run_splat_fit as run_splat_fit

@@ -14,7 +14,7 @@ from phyradgs_cl import signals
 from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.signals import finish_despite_interrupt, stop_on_interrupt
 from phyradgs_cl.simulation import options as simulation_options
-from phyradgs_cl.workflow import evaluate, reconstruct, scans
+from phyradgs_cl.workflow import reconstruct, scans, volumes
 
 NOTHING = "phyradgs: interrupted, nothing written\n"
 COMPLETE = "phyradgs: interrupted, the output is complete\n"
@@ -64,7 +64,7 @@ def test_before_the_output_there_is_nothing(cli, scan, tmp_path, capfd, monkeypa
         ("simulate", scans, "write_scan"),
         ("reconstruct", reconstruct, "compare"),
         ("reconstruct", reconstruct, "write_volume"),
-        ("evaluate", evaluate, "slices_png"),
+        ("evaluate", volumes, "slices_png"),
     ],
 )
 def test_what_is_being_written_is_finished(cli, scan, tmp_path, capfd, monkeypatch, command, owner, step):

@@ -23,8 +23,14 @@ from phyradgs_cl.reconstructors import ObjectMotion, Reconstruction, plan_run, r
 from phyradgs_cl.reconstructors.moving import motion_line
 from phyradgs_cl.reconstructors.moving.field import MotionField
 from phyradgs_cl.reconstructors.moving.search import coarse_scan, initial_field
-from phyradgs_cl.reconstructors.moving.signal import load_gating, middle_times_s, motion_signal, signal_of
-from phyradgs_cl.reconstructors.moving.splines import Bending, TemporalSplines
+from phyradgs_cl.reconstructors.moving.signal import (
+    Bending,
+    TemporalSplines,
+    load_gating,
+    middle_times_s,
+    motion_signal,
+    signal_of,
+)
 from phyradgs_cl.reconstructors.result import MOTION_FOUND, Progress
 
 FRAMES, PERIOD_S, STEP_S = 90, 3.1, 0.5

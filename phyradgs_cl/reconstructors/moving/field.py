@@ -17,7 +17,7 @@ from phyradgs_cl.operators.warp.derivative import FieldDerivative
 from phyradgs_cl.operators.warp.operator import WarpedOperator
 from phyradgs_cl.operators.warp.states import MotionStates
 from phyradgs_cl.operators.warp.volume import VolumeWarp
-from phyradgs_cl.reconstructors.moving.splines import Bending, TemporalSplines
+from phyradgs_cl.reconstructors.moving.signal import Bending, TemporalSplines
 from phyradgs_cl.runtime import Runtime
 
 _CG_STEPS = 8

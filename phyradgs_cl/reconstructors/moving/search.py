@@ -17,8 +17,7 @@ from phyradgs_cl.metrics import resampled
 from phyradgs_cl.reconstructors.checkpoint import State, check_like, count_of
 from phyradgs_cl.reconstructors.moving import LEAST_GAIN
 from phyradgs_cl.reconstructors.moving.field import FieldProblem, MotionField, sum_squares
-from phyradgs_cl.reconstructors.moving.signal import MotionSignal
-from phyradgs_cl.reconstructors.moving.splines import TemporalSplines
+from phyradgs_cl.reconstructors.moving.signal import MotionSignal, TemporalSplines
 from phyradgs_cl.reconstructors.voxels.fista import FistaOptions, fista_stages
 from phyradgs_cl.reconstructors.voxels.run import MethodInputs
 from phyradgs_cl.runtime import Runtime
