@@ -268,8 +268,7 @@ def _moving_backprojections(rt: Runtime) -> Iterator[Comparison]:
     control_mm, times_s = 0.2 * (_noise((2, 6, 6, 6, 3), 23) - 0.5), np.array([0.0, 1.0, 2.0])
     phases = np.array([[1.0, 0.0], [0.4, 0.3], [-0.5, 0.7]])
     states = MotionStates.of_times(Deformation(control_mm, (-2.0,) * 3, 0.8, times_s, phases), GRID, times_s)
-    between = np.array([0.0, 0.5, 1.4])
-    shares = states.shares(between)
+    shares = states.shares(np.array([0.0, 0.5, 1.4]))
     inverse_mm = [states.deformation.inverse_on_grid_mm(GRID, weights) for weights in states.weights]
     push_mm = np.tensordot(shares, inverse_mm, 1)
     moving = MovingBackprojector(rt, states, shares)

@@ -120,8 +120,7 @@ def _flag(key: str) -> str:
 
 def _origin_of(subject: str, origins: Mapping[str, str]) -> str | None:
     """Where the option that ``subject`` names stands, with the way into its table; None where nobody gave it."""
-    options = re.findall(r"option ([\w-]+)", subject)
-    words = options or re.sub(r"\(.*\)", "", subject).split()[-1:]
+    words = re.findall(r"option ([\w-]+)", subject) or re.sub(r"\(.*\)", "", subject).split()[-1:]
     first, *rest = [part for word in words for part in word.lstrip("-").split(".")] or [""]
     origin = origins.get(first.replace("-", "_"))
     if origin is None or origin.startswith("--"):

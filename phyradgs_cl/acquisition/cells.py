@@ -211,8 +211,7 @@ def segments_for(
     Gaussians of 0.5 to 4 % of the half-width. intensity_peak: largest line integral where the detector averages intensities,
     else 0. Half of their variance in a segment remains, which up to a peak of 4 is smaller than the other errors."""
     first_s, last_s = shutter.lit_span_s
-    time_s = start_s + np.linspace(first_s, last_s, _TURN_SAMPLES + 1)
-    pose = trajectory.pose(frame, time_s)
+    pose = trajectory.pose(frame, start_s + np.linspace(first_s, last_s, _TURN_SAMPLES + 1))
     fastest_rad = float(np.max(_turns_rad(pose))) * _TURN_SAMPLES
     contrast = np.sqrt(max(1.0, intensity_peak / _HARMLESS_PEAK))
     count = np.ceil(contrast * fastest_rad * np.sqrt(_TURN_FACTOR / time_error))

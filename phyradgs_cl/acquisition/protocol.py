@@ -101,8 +101,7 @@ class Protocol:
         return CircularOrbit(geometry, sweeps)
 
     def _wandering_encoder(self, jitter_rad: float, rng: np.random.Generator) -> EncoderTable:
-        start_s = self.frame_start_s()
-        end_s = start_s[-1] + self.shutter().span_s
+        end_s = self.window_s()[1]
         speed_rad_per_s = np.deg2rad(self.exposure_deg) / self.exposure_s
         knot_s = np.linspace(0.0, end_s, self.views + 1)
         time_s = np.linspace(0.0, end_s, 16 * self.views + 1)

@@ -60,8 +60,7 @@ def slab(scan: Scan, first: int, stop: int) -> Scan:
 def slices_of(scan: Scan, first: int, stop: int) -> slice:
     """Returns the slices of the scan's grid whose centres lie on detector rows [first, stop); together all rows have all."""
     rows, pitch_mm = scan.geometry.detector_shape[0], scan.geometry.pixel_size_mm[0]
-    z_mm = scan.grid.axes_mm()[0]
-    row = (z_mm - scan.geometry.detector_offset_mm[0]) / pitch_mm + (rows - 1) / 2
+    row = (scan.grid.axes_mm()[0] - scan.geometry.detector_offset_mm[0]) / pitch_mm + (rows - 1) / 2
     number = np.clip(np.floor(row + 0.5), 0, rows - 1)
     inside = np.flatnonzero((number >= first) & (number < stop))
     return slice(int(inside[0]), int(inside[-1]) + 1) if inside.size else slice(0, 0)

@@ -134,8 +134,7 @@ class TimeCells:
         """Returns for each line a range (lines, 2), [first, stop), that holds all its cells, and maybe others."""
         line = np.arange(self.lines)
         first = np.searchsorted(np.maximum.accumulate(self.line_stop), line, side="right")
-        stop = np.searchsorted(self.line_start, line, side="right")
-        return np.stack([first, stop], -1)
+        return np.stack([first, np.searchsorted(self.line_start, line, side="right")], -1)
 
     @cached_property
     def layer_numbers(self) -> np.ndarray:

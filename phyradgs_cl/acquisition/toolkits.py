@@ -101,8 +101,7 @@ def _counts(geo: Any, name: str, length: int) -> np.ndarray:
 
 def _each(geo: Any, name: str, frames: int, length: int, absent: float) -> np.ndarray:
     """Returns an attribute (F, length) for every frame, from one for all or one each; ``absent`` where it is missing."""
-    needed = name in ("DSO", "DSD")
-    value = _of(geo, name) if needed else getattr(geo, name, None)
+    value = _of(geo, name) if name in ("DSO", "DSD") else getattr(geo, name, None)
     table = checks.numbers(f"geo.{name}", absent if value is None else value)
     per_frame = (frames,) if length == 1 else (frames, length)
     if table.shape in ((), (1,), (length,)):

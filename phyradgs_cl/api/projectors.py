@@ -122,8 +122,7 @@ class GaussianOperator(Operator):
         return y, partial(computed, rt, True, partial(engine.back, point))
 
     def _to_array(self, side: tuple[str, Shape], values: Any) -> Values:
-        given = values.rows() if isinstance(values, Gaussians) else values
-        array = super()._to_array(side, given)
+        array = super()._to_array(side, values.rows() if isinstance(values, Gaussians) else values)
         if isinstance(array, np.ndarray) and side is self._domain:
             _check_rows(array)
         return array

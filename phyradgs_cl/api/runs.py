@@ -76,8 +76,7 @@ def load_volume(path: str | Path) -> Reconstruction:
     stored = read_volume(file)
     facts = dict(stored.provenance)
     record: Any = facts.pop("record", [])
-    state = read_state(file)
-    of_file = stored.gaussians, record, facts, state, stored.disagreement, stored.deformation
+    of_file = stored.gaussians, record, facts, read_state(file), stored.disagreement, stored.deformation
     return Reconstruction(stored.values, stored.required_grid, *of_file)
 
 

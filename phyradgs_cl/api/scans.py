@@ -109,8 +109,7 @@ def static_scan(
     Raises InputError for shapes that do not fit and numbers out of range."""
     check_others(others, _keywords(static_scan))
     pixels = _pixels(frames, geometry, flats, darks, mask, quantity)
-    angle_deg = checks.numbers("angles_deg", angles_deg, (len(pixels.values),))
-    angle_rad = np.deg2rad(angle_deg)
+    angle_rad = np.deg2rad(checks.numbers("angles_deg", angles_deg, (len(pixels.values),)))
     start_s = np.arange(len(angle_rad), dtype=np.float64)
     orbit = CircularOrbit(geometry, FrameSweeps(start_s, 0.0, angle_rad, angle_rad))
     return _scan(pixels, orbit, Shutter(0.0), start_s, grid, False, others)

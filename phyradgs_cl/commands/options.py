@@ -56,8 +56,7 @@ def numbers(text: str) -> float | list[float] | str:
 
 def lengths(flag: str, help: str, default: str) -> Any:
     """An option that takes two lengths V,U."""
-    parser = pair_of(flag, "V,U in mm", "0,12.5", LARGEST_MM)
-    return option(help, default, flag, parser=parser, metavar="V,U")
+    return option(help, default, flag, parser=pair_of(flag, "V,U in mm", "0,12.5", LARGEST_MM), metavar="V,U")
 
 
 def pitches(flag: str, help: str, default: str) -> Any:
@@ -159,8 +158,7 @@ def with_options(
     def decorated(command: Callable[..., Any]) -> Callable[..., Any]:
         @functools.wraps(command)
         def called(**values: Any) -> Any:
-            made = make({name: values.pop(name) for name in options})
-            return command(**{slot: made}, **values)
+            return command(**{slot: make({name: values.pop(name) for name in options})}, **values)
 
         own = inspect.signature(command, eval_str=True).parameters.values()
         keyword = inspect.Parameter.KEYWORD_ONLY

@@ -113,8 +113,7 @@ class Deformation:
         x, y, z = np.moveaxis(np.clip(taps + 1, 0, last), 1, 0)
         vectors = control_mm[z[:, :, None, None], y[:, None, :, None], x[:, None, None, :]]
         factors = [[(slopes if i == j else values)[:, i] for i in (2, 1, 0)] for j in range(3)]
-        along = [np.einsum("na,nb,nc,nabci->ni", *three, vectors) for three in factors]
-        return np.stack(along, -1)
+        return np.stack([np.einsum("na,nb,nc,nabci->ni", *three, vectors) for three in factors], -1)
 
     def on_grid_mm(self, grid: Grid, weights: "ArrayLike") -> np.ndarray:
         """Returns w (nz, ny, nx, 3) float32 in mm at the voxel centres of ``grid``, components x, y, z, for one state."""
@@ -181,8 +180,7 @@ class Deformation:
         """Returns ∂U_i/∂y_j (3, 3, n) at the voxel centres of a grid, for one field's control vectors."""
         result = np.empty((3, 3, int(np.prod(grid.shape))), np.float32)
         for j in range(3):
-            along = self.bases(grid, 2 - j)
-            values = np.einsum("zk,yl,xm,klmi->izyx", *along, control_mm, optimize=True)
+            values = np.einsum("zk,yl,xm,klmi->izyx", *self.bases(grid, 2 - j), control_mm, optimize=True)
             result[:, j] = values.reshape(3, -1)
         return result
 

@@ -85,8 +85,7 @@ class GridChoice:
         if self.margin_mm is None:
             return grid
         around = np.ceil(np.divide(self.margin_mm, grid.voxel_size_mm) - _TYPED)
-        shape = self._whole(grid.shape + 2 * around, "--margin-mm")
-        return grid.part(triple(int(-n) for n in around), shape)
+        return grid.part(triple(int(-n) for n in around), self._whole(grid.shape + 2 * around, "--margin-mm"))
 
     def _box_mm(self, grid: Grid) -> np.ndarray:
         """Returns the ends (3, 2) of the chosen box, else those of ``grid``."""

@@ -56,8 +56,7 @@ class Gating:
 
     def at(self, times_s: np.ndarray) -> np.ndarray:
         """Returns the values (m,) at times (m,), straight between two stated ones; phases may be 1 or more."""
-        last = len(self.times_s) - 1
-        before = np.clip(np.searchsorted(self.times_s, times_s, "right") - 1, 0, last)
+        before = np.clip(np.searchsorted(self.times_s, times_s, "right") - 1, 0, len(self.times_s) - 1)
         lengths_s, steps = np.append(np.diff(self.times_s), 1.0), np.append(self.steps, 0.0)
         share = np.clip((np.asarray(times_s) - self.times_s[before]) / lengths_s[before], 0, 1)
         return np.asarray(self.values[before] + share * steps[before])

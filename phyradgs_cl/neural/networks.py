@@ -189,6 +189,5 @@ class _Interpolate(torch.autograd.Function):
         first = (index * features).reshape(-1)
         gradient = by_features.new_zeros(ctx.entries * features)
         for number in range(features):
-            share = (weight * by_features[:, number, None]).reshape(-1)
-            gradient.scatter_add_(0, first + number, share)
+            gradient.scatter_add_(0, first + number, (weight * by_features[:, number, None]).reshape(-1))
         return gradient.reshape(ctx.entries, features), None, None

@@ -159,8 +159,7 @@ def line_integrals(
     number = torch.arange(samples, dtype=source.dtype, device=source.device)
     distance = first[:, None] + (number + shifts) * step[:, None]
     positions = source[:, None] + distance[..., None] * direction[:, None]
-    values = field(positions.reshape(-1, 3)).reshape(len(source), samples)
-    return values.sum(1) * step
+    return field(positions.reshape(-1, 3)).reshape(len(source), samples).sum(1) * step
 
 
 def intensity_average(integrals: torch.Tensor, unit: float) -> torch.Tensor:

@@ -108,8 +108,7 @@ class DctProx:
 
         ``turn``, 0 to 3, chooses a quarter of the shifts. A device array gives a device array (``out``, if given)."""
 
-        map_to = partial(self._map, unit, TURNS[turn], nonnegative)
-        return on_device(self.rt, map_to, volume, out)
+        return on_device(self.rt, partial(self._map, unit, TURNS[turn], nonnegative), volume, out)
 
     def _map(
         self, unit: float, turn: Sequence[int], nonnegative: bool, volume: DeviceArray, result: DeviceArray

@@ -100,8 +100,7 @@ def image_loss(
     weights = poisson_weight * (0.0 if transmission is None else transmission)
     data = (l1_weight * np.abs(x - y) + 0.5 * weights * (x - y) ** 2).sum() / pixels
     by_data = (l1_weight * np.sign(x - y) + weights * (x - y)) / pixels
-    loss = data + ssim_weight * (1 - ssim.mean())
-    return float(loss), mask * (by_data - ssim_weight * by_ssim / x.size)
+    return float(data + ssim_weight * (1 - ssim.mean())), mask * (by_data - ssim_weight * by_ssim / x.size)
 
 
 def _blur(image: np.ndarray) -> np.ndarray:

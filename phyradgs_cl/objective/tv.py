@@ -49,8 +49,7 @@ class TvProx:
 
         A device array gives a device array (``out``, if given)."""
 
-        map_to = partial(self._map, weight, iterations, nonnegative)
-        return on_device(self.rt, map_to, volume, out)
+        return on_device(self.rt, partial(self._map, weight, iterations, nonnegative), volume, out)
 
     def _map(
         self, weight: float, iterations: int, nonnegative: bool, observed: DeviceArray, result: DeviceArray

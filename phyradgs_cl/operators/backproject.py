@@ -54,8 +54,7 @@ def backproject_lines(
     A voxel reads the line r whose pose projects the voxel onto r, interpolated between neighbouring lines. Its value is
     divided by the rate at which the voxel crosses lines: once for the angular step, and once more for the filter's scale
     if frames were filtered across lines (``axis`` columns). See docs/mathematics.md."""
-    readout = Readout(axis)
-    pose = readout.poses(pose)
+    pose = Readout(axis).poses(pose)
     matrices = voxel_matrices(pose.reshape(-1, 12), grid, is_parallel).reshape(len(pose), -1)
     across = np.int32(axis == "columns")
     views = Views(frames, axis == "columns", matrices, weight)
@@ -154,8 +153,7 @@ def _general(rt: Runtime, images: Arguments, brick: Brick, volume: DeviceArray) 
 def _lines(rt: Runtime, across: np.int32, images: Arguments, brick: Brick, volume: DeviceArray) -> None:
     nz, ny, nx = brick.shape
     kernel = rt.kernel("backproject", "backproject_lines", IMAGE_GUARD=GUARD)
-    group = rt.group(on_cpu=16)
-    rt.launch(kernel, (nx, ny, nz), *images, *volume_shape(brick), across, volume, group=group)
+    rt.launch(kernel, (nx, ny, nz), *images, *volume_shape(brick), across, volume, group=rt.group(on_cpu=16))
 
 
 def _upright(rt: Runtime, name: str, block: int, images: Arguments, brick: Brick, volume: DeviceArray) -> None:

@@ -109,8 +109,7 @@ def _strongest(statistic: np.ndarray, threshold: float, room: int) -> np.ndarray
 def _children(rows: np.ndarray, control: DensityControl, rng: np.random.Generator) -> np.ndarray:
     """Draws one child from each Gaussian (11, S), smaller and half as dense."""
     child: np.ndarray = rows.copy()
-    local = rng.normal(size=(3, rows.shape[1])) * rows[g.SCALE]
-    child[g.MEAN] += rotate(rows[g.QUATERNION], local)
+    child[g.MEAN] += rotate(rows[g.QUATERNION], rng.normal(size=(3, rows.shape[1])) * rows[g.SCALE])
     child[g.SCALE] /= control.split_factor
     child[g.DENSITY] *= 0.5
     return child

@@ -56,8 +56,7 @@ class Ellipsoid:
     @property
     def to_unit_ball(self) -> Array:
         """Matrix (3, 3) that maps a world vector (x, y, z) in mm to the frame where the surface has radius 1."""
-        r = np.asarray(self.rotation)
-        return r.T / np.asarray(self.semi_axes_mm)[:, None]
+        return np.asarray(self.rotation).T / np.asarray(self.semi_axes_mm)[:, None]
 
     @property
     def half_box_mm(self) -> Array:

@@ -113,8 +113,7 @@ def capsule_union(lattice: Lattice, capsules: Sequence[Capsule], blend: float, b
     x, y, z = lattice.points(box)
     union = np.zeros((z.size, y.size, x.size), dtype=np.float32)
     for capsule in capsules:
-        part = capsule_box(lattice, [capsule], _REACH * blend)
-        inner = _intersect(part, box)
+        inner = _intersect(capsule_box(lattice, [capsule], _REACH * blend), box)
         local = (inner[0], inner[1], inner[2])
         xs, ys, zs = x[..., local[2]], y[:, local[1], :], z[local[0]]
         if xs.size and ys.size and zs.size:

@@ -91,8 +91,7 @@ def _sparks_of(frame: np.ndarray, threshold: float, least: float, pixels: int) -
     for sides in _opposite(frame):
         bright &= sides - frame > _SHARPNESS * height
     groups, count = scipy.ndimage.label(bright, _AROUND)
-    sizes = np.bincount(groups.ravel(), minlength=count + 1)
-    return bright & (sizes[groups] <= pixels)
+    return bright & (np.bincount(groups.ravel(), minlength=count + 1)[groups] <= pixels)
 
 
 def _height(frame: np.ndarray) -> np.ndarray:

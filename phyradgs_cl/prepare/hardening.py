@@ -189,8 +189,7 @@ def fit_polynomial(frames: np.ndarray, model: Model) -> Polynomial:
         found = f"{100 * rest:.2g} % of the line integrals that the path through one material does not explain"
         remedy = "state hardening.kvp or hardening.polynomial"
         raise InputError("--steps hardening", found, f"at most {100 * _UNIFORM:.2g} %", remedy)
-    straight = _bend(path * np.float32(level), model)[2]
-    return straight - bend, 0.0, 0.0
+    return _bend(path * np.float32(level), model)[2] - bend, 0.0, 0.0
 
 
 def _bend(frames: np.ndarray, model: Model) -> tuple[np.ndarray, float, float, float]:

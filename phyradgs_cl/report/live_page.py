@@ -180,8 +180,7 @@ def _settings(status: Status) -> Markup:
 
 def _curve(status: Status) -> Markup:
     """Returns the convergence as SVG. matplotlib draws the report's; here its import would cost more than the run allows."""
-    points = np.array(status.points, float)
-    x, y = points.T
+    x, y = np.array(status.points, float).T
     words = status.progress.quantity if status.progress is not None else ""
     is_log = 0 < _LOG_RATIO * y.min() < y.max()
     height = np.log(y) if is_log else y

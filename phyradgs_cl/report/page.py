@@ -44,8 +44,7 @@ def write_report(
         found, remedy = f"the suffix {Path(output).suffix}", "a browser prints the page to a PDF"
         raise InputError("-o", found, "an HTML page, as NAME.html", remedy)
     shown = computed_views(run, make_runtime(), views) if run.scan is not None and views > 0 else []
-    changes = step_changes(run, make_runtime()) if shown else []
-    page = report_page(run, shown, changes)
+    page = report_page(run, shown, step_changes(run, make_runtime()) if shown else [])
     with written_beside(output) as temporary:
         temporary.write_text(page, encoding="utf-8")
     return run

@@ -229,8 +229,7 @@ class DeviceSpace:
         groups = self._reduce(name, *arrays, scratch=8)
         group = self.rt.group(1, _GPU_GROUP)
         kernel = self.rt.kernel("algebra", "dot_whole")
-        scratch = self.rt.local(8 * group)
-        self.rt.launch(kernel, group, self._parts, groups, add, scratch, whole, group=group)
+        self.rt.launch(kernel, group, self._parts, groups, add, self.rt.local(8 * group), whole, group=group)
 
     def _reduce(self, name: str, *arguments: Any, scratch: int) -> int:
         """Launches the first level of a sum over the first array; returns the number of results in ``_parts``."""

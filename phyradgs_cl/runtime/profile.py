@@ -65,8 +65,7 @@ def profile_text(uses: dict[str, KernelUse], wall_s: float, rates: Rates, pairs:
     """Formats a table of ``uses`` (Profile.uses) and the part of ``wall_s`` that kernels take. ``pairs``: Gaussian–pixel
     pairs per launch of a kernel, where known."""
     busy_s = sum(use.seconds for use in uses.values())
-    heads = ("kernel", "launches", "seconds", "share", "ms each", "GB/s", "of copy", "Gpairs/s", "ns/pair")
-    rows = [heads]
+    rows = [("kernel", "launches", "seconds", "share", "ms each", "GB/s", "of copy", "Gpairs/s", "ns/pair")]
     for name, use in uses.items():
         speed = use.bytes / use.seconds if use.seconds > 0 else 0.0
         evaluated = pairs.get(name, 0) * use.launches

@@ -101,8 +101,7 @@ class ObjectMotion:
     def _sliding_mm(self, places: list[Array], height: Array) -> list[Array]:
         """Returns the control vectors of a cylinder about the z axis, whose edge is about three control points wide."""
         _, y, x = places
-        inside = (np.hypot(x, y) < self.radius).astype(float)
-        return [_vectors(z=inside)]
+        return [_vectors(z=(np.hypot(x, y) < self.radius).astype(float))]
 
     def _cycles_s(self, first_s: float, last_s: float) -> Array:
         """Returns the beginnings of all cycles that touch the scan, the first one at its first light or before."""

@@ -47,8 +47,7 @@ def smooth(scan: Scan, pixels: float | tuple[float, float]) -> Scan:
         return replace(scan, projections=gaussian_filter(p, sigma, truncate=3))
     valid = scan.valid.astype(np.float32)
     weight = gaussian_filter(valid, sigma, truncate=3)
-    mean = gaussian_filter(p * valid, sigma, truncate=3) / np.maximum(weight, 1e-6)
-    return replace(scan, projections=mean)
+    return replace(scan, projections=gaussian_filter(p * valid, sigma, truncate=3) / np.maximum(weight, 1e-6))
 
 
 def fewer_frames(scan: Scan, most: int) -> Scan:

@@ -137,8 +137,7 @@ def _read_table_times(source: Hdf5Source, address: str) -> np.ndarray:
     if len(time_s) < 2:
         raise source.error(address, f"{len(time_s)} samples", "at least 2")
     if np.any(np.diff(time_s) <= 0):
-        at = int(np.argmax(np.diff(time_s) <= 0)) + 1
-        found = f"times that do not increase at index {at}"
+        found = f"times that do not increase at index {int(np.argmax(np.diff(time_s) <= 0)) + 1}"
         raise source.error(address, found, "strictly increasing times", "sort the table by time")
     return time_s
 

@@ -124,8 +124,7 @@ class RayCells:
 
     @classmethod
     def upload(cls, rt: Runtime, grid: Grid, tables: Sequence[TimeCells]) -> "RayCells":
-        counts = np.array([table.count for table in tables])
-        starts = np.concatenate([[0], np.cumsum(counts)])
+        starts = np.concatenate([[0], np.cumsum([table.count for table in tables])])
         pose = np.concatenate([table.readout.poses(table.pose) for table in tables])
         weights = [table.weights_of(cell) for table in tables for cell in range(table.count)]
         ranges = [np.stack([table.line_start, table.line_stop], -1) for table in tables]

@@ -52,8 +52,7 @@ class SplatOperator:
         frames = self.rt.empty(self.frames_shape)
         self._ready.forget()
         for number, cells in enumerate(self._cells):
-            image = self._projector.forward(point.gaussians, cells)
-            self._images.leave(image, frames, number)
+            self._images.leave(self._projector.forward(point.gaussians, cells), frames, number)
         self._ready.note(point, self._cells[-1])
         return frames
 

@@ -119,8 +119,7 @@ def voxelise(
     The device holds ``brick_bytes`` of voxels at a time, or less if memory is short."""
 
     def attempt(share: float) -> np.ndarray:
-        gaussians = DeviceGaussians.upload(rt, rows)
-        return _in_bricks(rt, gaussians, grid, cutoff_sigma, brick_bytes, share)
+        return _in_bricks(rt, DeviceGaussians.upload(rt, rows), grid, cutoff_sigma, brick_bytes, share)
 
     return with_smaller_bricks("voxeliser", attempt)
 

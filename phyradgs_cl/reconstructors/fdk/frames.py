@@ -55,8 +55,7 @@ def extrapolated(frames: np.ndarray, way: str) -> tuple[np.ndarray, int]:
             sides.append(edge * np.cos(np.pi / 2 * beyond / count))
         else:
             sides.append(_chords(edge, slope, curvature, beyond))
-    wide = np.concatenate([sides[0][..., ::-1], frames, sides[1]], axis=-1)
-    return wide.astype(np.float32), count
+    return np.concatenate([sides[0][..., ::-1], frames, sides[1]], axis=-1).astype(np.float32), count
 
 
 def _chords(edge: np.ndarray, slope: np.ndarray, curvature: np.ndarray, beyond: np.ndarray) -> np.ndarray:

@@ -169,8 +169,7 @@ def check_beam(method: str, pose: np.ndarray, is_parallel: bool) -> None:
 def _check_directions(pose: np.ndarray) -> None:
     """Checks that parallel rays run nearly at right angles to the axis, as no filter along detector rows is right else."""
     rise_deg = np.rad2deg(np.arcsin(np.clip(np.abs(pose[..., 2]), 0, 1)))
-    lean_deg = _row_lean_deg(pose)
-    worst_deg = float(max(rise_deg.max(), lean_deg.max()))
+    worst_deg = float(max(rise_deg.max(), _row_lean_deg(pose).max()))
     remedy = "take an iterative or splatting method: they take any orbit"
     if worst_deg > _NO_LEAN_DEG:
         found = f"rays or detector rows {worst_deg:.1f}° off the plane of the rotation (laminography?)"

@@ -21,8 +21,7 @@ def turned_back(pose: np.ndarray, angle_rad: np.ndarray) -> np.ndarray:
     c, s = np.cos(angle_rad), np.sin(angle_rad)
     turn = np.zeros((len(angle_rad), 3, 3))
     turn[:, 0, 0], turn[:, 0, 1], turn[:, 1, 0], turn[:, 1, 1], turn[:, 2, 2] = c, s, -s, c, 1
-    vectors = pose.reshape(len(pose), -1, 3)
-    return np.einsum("fij,fkj->fki", turn, vectors).reshape(pose.shape)
+    return np.einsum("fij,fkj->fki", turn, pose.reshape(len(pose), -1, 3)).reshape(pose.shape)
 
 
 def pixel_rays(pose: np.ndarray, rows: np.ndarray, columns: np.ndarray, is_parallel: bool = False) -> np.ndarray:

@@ -129,8 +129,7 @@ class Fit:
 
 def fit(rt: Runtime, scan: Scan, iterations: int = _ITERATIONS) -> Fit:
     """Reconstructs a coarse scan by CGLS, each line at its own times, together with errors of its flats."""
-    across = max(scan.grid.shape[1:])
-    motion = PerRow(sub_intervals=exposure_steps(scan, across, 1.0, _MOST_TIMES))
+    motion = PerRow(sub_intervals=exposure_steps(scan, max(scan.grid.shape[1:]), 1.0, _MOST_TIMES))
     system = System.of_scan(rt, scan, motion, fewest_lines=FEWEST_LINES)
     flats = FlatErrors.beside(system.operator)
     augmented = AugmentedOperator(system.operator, flats)

@@ -158,8 +158,7 @@ def period_of(times_s: np.ndarray, values: np.ndarray) -> float | None:
 def _shroud(scan: Scan) -> np.ndarray:
     """Returns the mean of the valid pixels (F, rows) of every detector row."""
     valid = np.broadcast_to(scan.valid, scan.projections.shape)
-    count = np.maximum(valid.sum(2), 1)
-    return np.asarray((scan.projections * valid).sum(2, dtype=np.float64) / count)
+    return np.asarray((scan.projections * valid).sum(2, dtype=np.float64) / np.maximum(valid.sum(2), 1))
 
 
 def _gantry(scan: Scan, times_s: np.ndarray, order: np.ndarray) -> np.ndarray:

@@ -66,8 +66,7 @@ def initial_cloud(
     spacing = neighbour_distance(mean, max(grid.voxel_size_mm)) * scale_factor
     scale = np.repeat(np.clip(spacing, *scale_bounds)[:, None], 3, axis=1)
     density = np.maximum(volume.ravel()[voxels], threshold) * density_share
-    quaternion = np.tile([1.0, 0.0, 0.0, 0.0], (len(mean), 1))
-    return Gaussians(mean, scale, quaternion, density.astype(np.float64))
+    return Gaussians(mean, scale, np.tile([1.0, 0.0, 0.0, 0.0], (len(mean), 1)), density.astype(np.float64))
 
 
 def neighbour_distance(points: np.ndarray, fallback: float) -> np.ndarray:

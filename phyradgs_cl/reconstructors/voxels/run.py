@@ -183,8 +183,7 @@ class _Iterations:
         self.residual = self.algorithm.step() / self.measured_norm
         self.iteration += 1
         size = space.norm(self.algorithm.volume)
-        moved = space.add(self.algorithm.volume, before, -1.0)
-        self.change = space.norm(moved) / size if size else 0.0
+        self.change = space.norm(space.add(self.algorithm.volume, before, -1.0)) / size if size else 0.0
 
     def measures(self) -> dict[str, float]:
         return {"residual": self.residual, "change": self.change}

@@ -73,8 +73,7 @@ def _angles_deg(scan: Scan, times_s: np.ndarray) -> list[list[float]] | None:
     """Returns the gantry's angle at times (T,) within the first frame as (T, 1), or None where it is on no circle."""
     if not isinstance(scan.trajectory, CircularOrbit):
         return None
-    angles_rad = scan.trajectory.angle_rad(0, scan.frame_start_s[0] + times_s)
-    return np.rad2deg(angles_rad)[:, None].tolist()
+    return np.rad2deg(scan.trajectory.angle_rad(0, scan.frame_start_s[0] + times_s))[:, None].tolist()
 
 
 def object_in_motion(
