@@ -61,14 +61,11 @@ def write_tiff(path: Path, volume: Volume, unit: str) -> None:
     dx, dy, dz = volume.required_grid.voxel_size_mm[::-1]
     first_mm = volume.required_grid.first_centre_mm[::-1]
     facts = {
-        "axes": "ZYX",
-        "spacing": dz,
-        "unit": "mm",
-        "min": float(volume.values.min()),
+        "axes": "ZYX", "spacing": dz, "unit": "mm", "min": float(volume.values.min()),
         "max": float(volume.values.max()),
         **{f"{axis}origin": -place / step for axis, place, step in zip("xyz", first_mm, (dx, dy, dz), strict=True)},
         "Info": f"values in {unit}",
-    }
+    }  # fmt: skip
     is_small = volume.values.nbytes < _MOST_IMAGEJ_BYTES
     with written_beside(path) as temporary:
         tifffile.imwrite(

@@ -48,22 +48,13 @@ def reconstruct_neural(
     loop = Loop(_Passes(trainer, options.iterations), rt.ranks, report, started)
     loop.run(resume)
     facts: dict[str, object] = {
-        "method": method,
-        "options": option_facts(options),
-        "seed": seed,
-        "unit_length_mm": scale.length_mm,
-        "unit_density_per_mm": scale.density_per_mm,
-        "detector_model": trainer.model,
-        "parameters": trainer.parameters,
-        "levels": options.levels_for(max(scan.grid.shape)),
-        "samples": trainer.samples,
-        "times": trainer.times,
-        "iterations": trainer.passes,
-        "torch_device": str(device),
-        "torch_version": version("torch"),
-        "seconds": loop.seconds,
+        "method": method, "options": option_facts(options), "seed": seed, "unit_length_mm": scale.length_mm,
+        "unit_density_per_mm": scale.density_per_mm, "detector_model": trainer.model,
+        "parameters": trainer.parameters, "levels": options.levels_for(max(scan.grid.shape)),
+        "samples": trainer.samples, "times": trainer.times, "iterations": trainer.passes,
+        "torch_device": str(device), "torch_version": version("torch"), "seconds": loop.seconds,
         "interrupted_at": loop.interrupted_at,
-    }
+    }  # fmt: skip
     volume = trainer.volume(scan.grid)
     state = loop.state_if_interrupted()
     return Reconstruction(volume, scan.grid, record=loop.record, facts=facts, state=state)

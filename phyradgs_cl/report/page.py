@@ -55,21 +55,15 @@ def report_page(run: Run, views: Sequence[FramePair] = (), changes: Sequence[Cha
     of_scan = {} if run.scan is None else {
         "preparation": sections.preparation_section(run, changes),
         "projections": sections.projections_section(run.scan, views),
-        "calibration": sections.calibration_section(run.scan),
-        "scan": sections.scan_section(run),
-        "geometry": sections.geometry_section(run.scan),
-        "shutter": sections.shutter_section(run, run.scan),
+        "calibration": sections.calibration_section(run.scan), "scan": sections.scan_section(run),
+        "geometry": sections.geometry_section(run.scan), "shutter": sections.shutter_section(run, run.scan),
     }  # fmt: skip
     parts = {
-        "slices": sections.slices_section(run),
-        "metrics": sections.metrics_section(run, views),
-        "convergence": sections.convergence_section(run),
-        "motion": sections.motion_section(run),
-        "volume": sections.volume_section(run),
-        "tuning": sections.tuning_section(run),
-        **of_scan,
+        "slices": sections.slices_section(run), "metrics": sections.metrics_section(run, views),
+        "convergence": sections.convergence_section(run), "motion": sections.motion_section(run),
+        "volume": sections.volume_section(run), "tuning": sections.tuning_section(run), **of_scan,
         "provenance": sections.provenance_section(run),
-    }
+    }  # fmt: skip
     shown = {name: part for name, part in parts.items() if part is not None}
     links = [element("a", name.capitalize(), href=f"#{name}", hidden=name in _SCRIPTED) for name in shown]
     skip = element("a", "To the content", href="#slices", class_="skip")

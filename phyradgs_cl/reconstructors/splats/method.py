@@ -57,22 +57,14 @@ def reconstruct_splats(
     cloud = run.present_cloud()
     volume = run.present_volume()[0]
     facts = {
-        "method": method,
-        "options": option_facts(options),
-        "seed": seed,
-        "unit_length_mm": scale.length_mm,
-        "unit_density_per_mm": scale.density_per_mm,
-        "gaussians_asked": options.gaussians_for(run.grid),
-        "gaussians_first": first_count,
-        "gaussians": cloud.count,
-        "seconds": loop.seconds,
-        "density_control_seconds": run.control_seconds,
-        "density_control_rounds": run.control_rounds,
+        "method": method, "options": option_facts(options), "seed": seed, "unit_length_mm": scale.length_mm,
+        "unit_density_per_mm": scale.density_per_mm, "gaussians_asked": options.gaussians_for(run.grid),
+        "gaussians_first": first_count, "gaussians": cloud.count, "seconds": loop.seconds,
+        "density_control_seconds": run.control_seconds, "density_control_rounds": run.control_rounds,
         "interrupted_at": loop.interrupted_at,
-        "detector_model": "log" if run.frames.intensity_unit is None else "intensity",
-        "batch": run.batch,
+        "detector_model": "log" if run.frames.intensity_unit is None else "intensity", "batch": run.batch,
         "ranks": rt.ranks.size,
-    }
+    }  # fmt: skip
     if isinstance(options.motion, Exact):
         # How the motion averaged over time: a frame's largest K, and the share of pairs by rule
         facts |= {"segments": run.frames.most_cells, "time_rules": _first_frame_work(run).rule_shares()}

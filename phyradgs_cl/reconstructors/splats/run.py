@@ -85,14 +85,11 @@ class SplatRun:
         """Returns the arrays that the next step depends on."""
         population = self.cloud.population()
         return {
-            "raw": population.raw,
-            "moments": population.moments,
-            "statistics": self.cloud.read_statistics(),
-            "iteration": np.array(self.iteration),
-            "batch": np.array(self.batch),
+            "raw": population.raw, "moments": population.moments, "statistics": self.cloud.read_statistics(),
+            "iteration": np.array(self.iteration), "batch": np.array(self.batch),
             "queue": np.array(self._queue, np.int64),
             "rng": np.array(json.dumps(self.rng.bit_generator.state)),
-        }
+        }  # fmt: skip
 
     def restore(self, state: State) -> None:
         """Continues from ``state``, on any number of ranks up to the batch."""

@@ -81,14 +81,10 @@ def _choose(trials: "_Trials", options: Any) -> dict[str, Any]:
         trials.compare(options)
     values = sorted(trials.errors)
     return {
-        "option": trials.option,
-        "chosen": trials.choice,
-        "values": values,
-        "holdout_rms": [trials.errors[value] for value in values],
-        "holdout_noise_rms": trials.noise_rms,
-        "holdout_pixels": int(trials.held.sum()),
-        "seconds": time.perf_counter() - started,
-    }
+        "option": trials.option, "chosen": trials.choice, "values": values,
+        "holdout_rms": [trials.errors[value] for value in values], "holdout_noise_rms": trials.noise_rms,
+        "holdout_pixels": int(trials.held.sum()), "seconds": time.perf_counter() - started,
+    }  # fmt: skip
 
 
 class _Trials:

@@ -127,15 +127,11 @@ def run_iterations(
     loop = Loop(run, rt.ranks, inputs.report, started)
     loop.run(inputs.resume)
     facts: dict[str, object] = {
-        "method": method,
-        "options": option_facts(options),
-        "detector_model": "log" if system.intensity is None else "intensity",
-        "iterations": run.iteration,
-        "stopped_by": loop.stopped_by,
-        "seconds": loop.seconds,
-        "interrupted_at": loop.interrupted_at,
+        "method": method, "options": option_facts(options),
+        "detector_model": "log" if system.intensity is None else "intensity", "iterations": run.iteration,
+        "stopped_by": loop.stopped_by, "seconds": loop.seconds, "interrupted_at": loop.interrupted_at,
         "ranks": rt.ranks.size,
-    }
+    }  # fmt: skip
     (volume, _), state = run.present_volume(), loop.state_if_interrupted()
     return Reconstruction(volume, scan.grid, record=loop.record, facts=facts, state=state)
 
