@@ -7,7 +7,7 @@ import numpy as np
 
 from phyradgs_cl.acquisition.shutter import Shutter
 from phyradgs_cl.acquisition.time_cells import TimeCells
-from phyradgs_cl.acquisition.trajectory import Trajectory, is_parallel
+from phyradgs_cl.acquisition.trajectory import Trajectory, body_frames, is_parallel
 from phyradgs_cl.errors import InputError
 
 _SAME_TIME = 1e-6  # of a cell: how exactly a frame has to begin on the grid of the first one
@@ -135,6 +135,7 @@ def _middles_s(frame_start_s: np.ndarray, frame: int, edges_s: np.ndarray) -> np
     cells = (start_s - origin_s) / step_s
     number = np.arange(len(edges_s) - 1) + 0.5
     if abs(cells - round(cells)) < _SAME_TIME:
+        # counted from the first frame, the times of common cells have the same bits: operators project them once
         start_s, number = origin_s, round(cells) + number
     middles_s: np.ndarray = start_s + edges_s[0] + number * step_s
     return middles_s
@@ -146,6 +147,7 @@ def _shares(windows_s: np.ndarray, edges_s: np.ndarray) -> np.ndarray:
     length_s = closes - opens
     overlap = np.minimum(closes, edges_s[1:, None]) - np.maximum(opens, edges_s[:-1, None])
     share = np.maximum(overlap, 0) / np.where(length_s > 0, length_s, 1)
+    # a window of no length overlaps with nothing: the cell in which it lies has all of it
     moment = np.clip(np.searchsorted(edges_s, opens, side="right") - 1, 0, len(edges_s) - 2)
     share[:, length_s <= 0] = 0
     share[moment[length_s <= 0], np.flatnonzero(length_s <= 0)] = 1
@@ -165,6 +167,7 @@ def exact_cells(
         return static_cells(trajectory, shutter, frame, start_s, lines)
     edges_s = np.linspace(first_s, last_s, segments + 1)
     times = _line_times(shutter.line_windows_s(lines), edges_s)
+    # a cell that no line sees would be projected for nothing
     used, line_start, line_stop, order = _served_lines(times[:, 2] > 0)
     middle_s = start_s + (edges_s[:-1] + edges_s[1:])[used] / 2
     ends_s = start_s + np.stack([edges_s[:-1], edges_s[1:]], -1)[used][order]
@@ -221,9 +224,7 @@ def segments_for(
 def _turns_rad(pose: np.ndarray) -> np.ndarray:
     """Returns the angles (T − 1,) between successive poses (T, 12), of the source about the origin or of the detector. The
     larger of the two counts."""
-    u_hat = pose[:, 6:9] / np.linalg.norm(pose[:, 6:9], axis=1, keepdims=True)
-    normal = np.cross(u_hat, pose[:, 9:12])
-    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    u_hat, _, normal = np.moveaxis(body_frames(pose), -1, 0)
     source = pose[:, :3] / np.maximum(np.linalg.norm(pose[:, :3], axis=1, keepdims=True), 1e-300)
     chords = [np.linalg.norm(np.diff(x, axis=0), axis=1) for x in (u_hat, normal, source)]
     return np.asarray(np.max([2 * np.arcsin(chord.clip(0, 2) / 2) for chord in chords], axis=0))

@@ -182,12 +182,13 @@ class PoseTable:
         if self.is_parallel:
             table = unit_directions(self.subject, table)
         object.__setattr__(self, "table", table)
-        object.__setattr__(self, "_frames", _body_frames(table))
+        object.__setattr__(self, "_frames", body_frames(table))
 
     def pose(self, frame: int, time_s: np.ndarray) -> np.ndarray:
         """Returns poses (..., 12) in mm at times (...) s, the same in every frame. Raises InputError beyond the table."""
         t = np.asarray(time_s, np.float64)
         _check_covered(self.subject, frame, t, self.time_s)
+        # seen from the turning panel, the vectors of a pose hardly change: there straight lines between samples hold
         in_body = np.einsum("tji,tkj->tki", self._frames, self.table.reshape(-1, 4, 3)).reshape(-1, POSE_LENGTH)
         flat = np.clip(t.ravel(), self.time_s[0], self.time_s[-1])  # Slerp allows no slack
         body = np.stack([np.interp(flat, self.time_s, column) for column in in_body.T], -1).reshape(-1, 4, 3)
@@ -252,6 +253,7 @@ def sampled(trajectory: Trajectory, frame_start_s: np.ndarray, span_s: float, er
             overlap = np.any(np.sort(times[:, 0])[1:] < np.sort(times[:, -1])[:-1])
             remedy = "take frames that do not overlap in time: a file has one pose at a time" if overlap else _AS_TABLE
             raise InputError("trajectory", found, f"at most {error_mm:.3g} mm", remedy)
+        # the former samples are among the new ones
         samples = 2 * samples - 1
 
 
@@ -273,7 +275,7 @@ def _checked_table(
     return time_s, table
 
 
-def _body_frames(table: np.ndarray) -> np.ndarray:
+def body_frames(table: np.ndarray) -> np.ndarray:
     """Returns right-handed orthonormal frames (T, 3, 3), with columns û, v̂ and normal, of poses (T, 12)."""
     u_hat = table[:, 6:9] / np.linalg.norm(table[:, 6:9], axis=1, keepdims=True)
     normal = np.cross(u_hat, table[:, 9:12])

@@ -143,6 +143,7 @@ class Trainer:
         shifts = rays.sample_shifts(times.size, self.samples, self.options.jitter, self.rng)
         shifts = shifts.reshape(*times.shape, -1)
         measured = self.scan.projections[frame][tuple(pixels.T)].astype(np.float32) / np.float32(self.unit)
+        # the gradient of a sum is the sum of gradients: a part at a time needs a part of the memory
         at_once = max(self.points_at_once // (self.samples * self.times), 1)
         total = 0.0
         for start in range(0, len(pixels), at_once):

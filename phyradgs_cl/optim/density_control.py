@@ -79,8 +79,10 @@ def control_density(
     changed = population.raw.copy()
     changed[:, cloned] = activation.invert(rows[:, cloned])
     new_raw = activation.invert(np.concatenate([copies, first, second], axis=1))
+    # two children replace a Gaussian that is split; one that is cloned stays beside its copy
     remaining = np.setdiff1d(np.arange(population.count), split)
     raw = np.concatenate([changed[:, remaining], new_raw], axis=1)
+    # new Gaussians have no history of gradients
     fresh = np.zeros((2, g.ROWS, new_raw.shape[1]), population.moments.dtype)
     grown = Population(raw, np.concatenate([population.moments[:, :, remaining], fresh], axis=2))
     return prune(grown, activation, control, box)

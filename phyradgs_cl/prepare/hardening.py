@@ -156,6 +156,7 @@ def find_bone(
     bones = {pair: _between(*pair, volume) for pair in _BETWEEN}
     rest = {pair: rest_of(_with_bone(bone, frames, spectrum, model)) for pair, bone in bones.items()}
     least = min(rest.values())
+    # among candidates that explain the frames about as well, the one with the least bone
     good = [pair for pair in bones if rest[pair] <= least + _AS_WELL * max(water_alone - least, 0.0)]
     best = min(good, key=lambda pair: float(bones[pair].sum()))
     rests = {"as_they_are": uncorrected, "water": water_alone, "bone": rest[best]}
@@ -189,6 +190,7 @@ def fit_polynomial(frames: np.ndarray, model: Model) -> Polynomial:
         found = f"{100 * rest:.2g} % of the line integrals that the path through one material does not explain"
         remedy = "state hardening.kvp or hardening.polynomial"
         raise InputError("--steps hardening", found, f"at most {100 * _UNIFORM:.2g} %", remedy)
+    # the voxels themselves bend straight line integrals a little: that is no hardening
     return _bend(path * np.float32(level), model)[2] - bend, 0.0, 0.0
 
 

@@ -71,6 +71,7 @@ def ring_strength(frames: np.ndarray, *, axis_column: float | None = None, full_
 
 def _strength(means: np.ndarray, axis_column: float | None) -> Strength:
     one, other = (_rough(_antisymmetric(mean, axis_column)) for mean in means)
+    # the mean of half of the views has twice the variance, and the difference of two such means four times
     noise, rows = robust_deviation(one - other) ** 2 / 4, len(one) // 2
     least = noise * max(_LEAST_SHARE, _SURE / np.sqrt(one.size))
     pattern = _covariance(one, other)
@@ -143,6 +144,7 @@ def _pattern(frames: np.ndarray, strength: Strength, window: int, axis_column: f
     parts = [(mean + mean[:, mirrored]) / 2, (mean - mean[:, mirrored]) / 2] if whole else [mean]
     variances = np.array([strength.pattern - strength.column, strength.column]) / len(parts)
     rough = sum(part - _denoised(part, variances, window) for part in parts)
+    # of what the denoising removed, this share is the pattern, and the rest the noise of the mean
     return np.asarray(rough * strength.pattern / (strength.pattern + strength.noise), np.float32)
 
 
@@ -150,6 +152,7 @@ def _denoised(image: np.ndarray, variances: np.ndarray, window: int) -> np.ndarr
     """Removes noise with two ``variances``, of each pixel and common to a column, from an image (v, u). Coefficients of
     overlapping cosine blocks are thresholded first; that result guides a Wiener filter."""
     sigma = np.full((window, window), variances[0])
+    # an error common to a column is constant along it: only the first row of coefficients has it
     sigma[0] += window * variances[1]
     sigma = np.sqrt(np.maximum(sigma, 1e-30))
     first = _blockwise(image, image, lambda c: (np.abs(c) > _THRESHOLD * sigma).astype(np.float64), window)

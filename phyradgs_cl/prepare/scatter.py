@@ -81,6 +81,7 @@ def fit_scatter(frames: np.ndarray, air: np.ndarray, reach: float = 0.0) -> Kern
         kernel = dict(zip(terms, map(float, heights), strict=True))
         over = recorded / (1 + shapes @ heights)
         gain = np.array([np.median(frame[beside]) for frame, beside in zip(over, where, strict=True)])
+        # the tube's output may vary from frame to frame; its mean is that of the flats
         light = recorded / (gain / gain.mean())[:, None, None]
     return {term: height for term, height in kernel.items() if height > 0}
 
@@ -109,6 +110,7 @@ def raised(kernel: Kernel, frames: np.ndarray, air: np.ndarray, model: Model, bl
         height, least = _HEIGHT_STEP * height, min(least, higher)
     if least >= _BETTER * fitted:
         return kernel
+    # the minimum lies between the neighbours of the best height tried
     bounds = height / _HEIGHT_STEP, height * _HEIGHT_STEP
     best = scipy.optimize.minimize_scalar(rest, bounds=bounds, method="bounded", options={"maxiter": _TRIALS})
     return times(float(best.x))

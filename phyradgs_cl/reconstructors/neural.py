@@ -88,6 +88,7 @@ class _Passes:
         checkpoint.check_array("parameters", parameters, (trainer.parameters,), np.float32)
         checkpoint.check_array("moments", moments, (2, trainer.parameters), np.float32)
         steps = checkpoint.count_of(state, "steps", self.iterations * frames)
+        # the frames that the pass under way still has to see
         checkpoint.check_array("queue", queue, (frames - steps % frames,), np.int64)
         if not 0 <= queue.min() <= queue.max() < frames:
             found, expected = f"{queue.min()} to {queue.max()}", f"frames from 0 to {frames - 1}"

@@ -105,6 +105,7 @@ class HostSpace:
         return x * y
 
     def reciprocal(self, x: np.ndarray, share: float) -> np.ndarray:
+        # an array without a number above 0 has no scale; every result is 0
         least = share * max(self.largest(x), 0.0) or 1.0
         return np.where(x > 0, 1 / np.maximum(x, least), 0).astype(np.float32)
 
@@ -186,6 +187,7 @@ class DeviceSpace:
     def descend(self, x: DeviceArray, y: DeviceArray, step: float) -> DeviceArray:
         """x − ``step`` y/‖y‖, and x where y is 0; no number comes back."""
         self._sum("dot_parts", self._whole, y, y)
+        # the step as a high and a low float: not every device has float64
         high = np.float32(step)
         return self._each("descend", x, y, np.array([high, step - float(high)], np.float32), self._whole)
 

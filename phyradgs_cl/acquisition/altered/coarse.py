@@ -156,6 +156,7 @@ def _binned_shutter(scan: Scan, block: int) -> tuple[Shutter, float]:
     line_s = shutter.readout_s / max(lines - 1, 1)
     blocks = lines // block
     dropped = lines - blocks * block if shutter.direction < 0 else 0  # the far end is read first
+    # a block of lines opens at the mean of its lines
     later_s = (dropped + (block - 1) / 2) * line_s
     pulse_s = shutter.pulse_s and (shutter.pulse_s[0] - later_s, shutter.pulse_s[1])
     return replace(shutter, readout_s=(blocks - 1) * block * line_s, pulse_s=pulse_s), later_s

@@ -138,6 +138,7 @@ class PerturbedTrajectory:
 def _seen_by(motion: np.ndarray, vectors: list[np.ndarray], places: int) -> list[np.ndarray]:
     """Returns four vectors (..., 3) as an object sees them that has turned and shifted by ``motion`` (..., 6). The last two
     are steps; before them one or two are ``places``, which shift."""
+    # an object that turns and shifts sees the scanner shifted back, then turned back
     back = Rotation.from_rotvec(motion[..., :3].reshape(-1, 3)).as_matrix().reshape(*motion.shape[:-1], 3, 3)
     shifted = np.stack(vectors, -2)
     shifted[..., 2 - places : 2, :] -= motion[..., None, 3:]

@@ -65,6 +65,7 @@ class CloudStates:
         mean = np.stack(np.meshgrid(x, y, z, indexing="ij")).reshape(3, -1)
         rows = np.ones((11, mean.shape[1]))
         rows[:3] = mean
+        # the states in which each field moves most, and some at even times
         ends = np.concatenate([self.deformation.weights.argmax(0), self.deformation.weights.argmin(0)])
         chosen = np.linspace(0, len(self.deformation.times_s) - 1, _PROBED_STATES).astype(int)
         weights = self.deformation.weights[np.unique([*ends, *chosen])]

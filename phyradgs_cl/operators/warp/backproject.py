@@ -112,4 +112,5 @@ def _pairs(shares: np.ndarray) -> np.ndarray:
     largest = np.argsort(-shares, axis=1, kind="stable")
     second = largest[:, min(1, shares.shape[1] - 1)]
     has_two = shares[np.arange(len(shares)), second] > 0
+    # sorted, so that all frames between the same two states are backprojected together
     return np.sort(np.stack([largest[:, 0], np.where(has_two, second, largest[:, 0])], -1), axis=1)

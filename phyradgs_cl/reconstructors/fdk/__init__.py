@@ -126,6 +126,7 @@ def _filtered_backprojection(
         raise InputError("--object-motion", "extrapolate=reprojected, of an object at rest", expected, remedy)
     frames, numbers = _measured_frames(scan)
     poses = [options.motion.cells(scan, f).still().line_poses() for f in numbers]
+    # a frame at rest among frames with a pose for every line repeats its own
     lines = max(map(len, poses))
     pose = np.concatenate(poses) if lines == 1 else np.stack([np.broadcast_to(p, (lines, 12)) for p in poses])
     check_beam(method, pose, scan.is_parallel)
@@ -174,6 +175,7 @@ def fdk_volume(
         raise InputError("poses", "a source on the rotation axis", "a source beside it")
     angle_rad = view_angles(by_pixel)
     canonical = weights.turned_back(by_pixel, angle_rad)
+    # on a circle all views are the same but for a rotation: one set of weights serves all of them
     if np.ptp(canonical, axis=0).max() <= _SAME_POSE * np.abs(canonical).max():
         canonical = canonical[:1]
     arc, fan = view_arc(angle_rad), weights.measured_fan(canonical, shape, is_parallel)
@@ -184,9 +186,11 @@ def fdk_volume(
             wide, count = reprojected(rt, frames, pose, axis, whole(), grid, is_parallel)
         else:
             wide, count = extrapolated(frames, extrapolate)
+        # from here on the frames are those of a wider panel
         wider = widened(pose, axis, (count, count))
         return fdk_volume(rt, wide, wider, grid, window=window, axis=axis, is_parallel=is_parallel, moving=moving)
     warn_if_incomplete(arc, fan, canonical, grid, is_parallel)
+    # only a full turn has the opposite rays that complete a displaced detector
     missing = fan.missing_columns if arc.is_full else (0, 0)
     filtered = _filtered(frames, ray_weight(canonical, shape, arc, fan, is_parallel), missing, window)
     pose = widened(pose, axis, missing)
@@ -225,6 +229,7 @@ def ramp_spectrum(length: int, window: str = "ram-lak") -> np.ndarray:
     """The filter's real spectrum (length // 2 + 1,) for a pitch of 1 and a period of ``length`` samples.
 
     Sampling |frequency| instead would put a false constant under every row."""
+    # the distance from sample 0 on a circle: the second half stands for negative distances
     n = np.minimum(np.arange(length), length - np.arange(length))
     kernel = np.where(n % 2 == 1, -1.0 / (np.pi * np.maximum(n, 1)) ** 2, 0.0)
     kernel[0] = 0.25

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from phyradgs_cl.acquisition.altered.angles import azimuth_rad
+from phyradgs_cl.acquisition.altered.angles import azimuth_rad, wrapped
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.reconstructors.fdk import weights
@@ -40,6 +40,7 @@ def view_arc(angle_rad: np.ndarray) -> Arc:
         return Arc((gap / count)[cell], (centre - centre[0])[cell], 2 * np.pi, True)
     first = (int(np.argmax(ahead)) + 1) % ahead.size
     ahead, centre = np.roll(ahead, -first), np.roll(centre, -first)  # the gap is now the last
+    # the last view has no next one: its share is that of the view before
     ahead[-1] = ahead[-2]
     behind = np.concatenate([ahead[:1], ahead[:-1]])
     gap = (ahead + behind) / 2
@@ -92,8 +93,7 @@ def view_angles(by_pixel: np.ndarray) -> np.ndarray:
     """Returns each view's gantry angle (F,), the mean of its lines' angles, in radians."""
     angle_rad = azimuth_rad(by_pixel)
     first = angle_rad[:, :1, :1]
-    turned = np.mod(angle_rad - first + np.pi, 2 * np.pi) - np.pi
-    return (first + turned.mean(axis=(1, 2), keepdims=True))[:, 0, 0]
+    return (first + wrapped(angle_rad - first).mean(axis=(1, 2), keepdims=True))[:, 0, 0]
 
 
 def ray_weight(

@@ -141,6 +141,7 @@ def _pairs(scan: Scan) -> list[_Pair]:
     across = np.stack([-np.sin(angle), np.cos(angle), np.zeros(scan.frames)], -1)
     first, step_u, step_v = poses[:, 3:6], poses[:, 6:9], poses[:, 9:12]
     pitch = np.einsum("fi,fi->f", step_u, across)
+    # the same row must see the same slice from both sides: no roll, and no motion along the axis
     moved_rows = np.ptp(first[:, 2]) / np.linalg.norm(step_v, axis=1).min()
     if moved_rows > 0.5 or (np.abs(pitch) < 0.9 * np.linalg.norm(step_u, axis=1)).any() or np.ptp(np.sign(pitch)) > 0:
         return []
@@ -171,6 +172,7 @@ def _opposite(away: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
         if not same_side or abs(away[near]) > min(_WIDEST_STEP_RAD, _BEYOND * step):
             return None
         two = np.array([near, same_side[0]])
+    # linear in the angle: the two shares put the mean of the pair at angle 0, also outside of the two
     share = float(away[two[0]] / (away[two[0]] - away[two[1]]))
     return two, np.array([1 - share, share])
 
@@ -193,6 +195,7 @@ def _rough_shift(pairs: list[_Pair]) -> float:
     """Returns the shift, in half columns, under which the squared difference of the overlap is the smallest part of its
     energy."""
     columns = pairs[0].view.shape[1]
+    # a shift moves the view and the mirror image against each other, by twice its size
     lags = np.arange(1 - columns, columns)  # column of the mirror image less that of the view
     twice_px = lags.astype(np.float64)
     products, energies = np.zeros(lags.size), np.zeros(lags.size)
@@ -224,6 +227,7 @@ def _refined_shift(pair: _Pair, shift_px: float) -> tuple[float, float]:
         if middle.size < _LEAST_OVERLAP * columns.size:
             return math.nan, 0.0
         difference = view(middle - half_lag) - mirrored(middle + half_lag)
+        # the derivative of the difference by the shift, which moves the two against each other
         slope = -view(middle - half_lag, 1) - mirrored(middle + half_lag, 1)
         squares = float((slope**2).sum())
         step = -float((difference * slope).sum()) / max(squares, 1e-30)

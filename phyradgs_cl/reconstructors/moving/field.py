@@ -64,6 +64,7 @@ class MotionField:
         """Returns the field on control points that are closer to each other: those that follow its values best."""
         origin_mm, counts = control_points(scan.grid, spacing_mm)
         fine = Deformation(np.zeros((1, *counts, 3)), origin_mm, spacing_mm, np.zeros(1), np.zeros((1, 1)))
+        # least squares on the voxels, one axis after the other: the splines are a product
         inverses = [np.linalg.pinv(matrix, rcond=1e-3) for matrix in fine.bases(scan.grid)]
         coarse = self.deformation()
         control_mm = np.stack([
@@ -117,6 +118,7 @@ class FieldProblem:
         def normal(change: np.ndarray) -> np.ndarray:
             return derivative.adjoint(self._masked(derivative.forward(change)))
 
+        # Hutchinson: a vector of random signs estimates the mean of the diagonal of JᵀJ, to which the weights are relative
         probe = np.random.default_rng(0).choice([-1.0, 1.0], one.control_mm.shape)
         response = float(np.vdot(probe, normal(probe))) / probe.size
         if not response > 0:
@@ -165,6 +167,7 @@ class FieldProblem:
         Splines that no frame sees together are projected together: every ``colours``-th one."""
         count, rank = one.temporal.shape
         spans_s = max(float(np.ptp(table.time_s)) for table in self.tables)
+        # splines of one colour are so far apart that a frame sees at most one of them: one projection serves all
         colours = min(count, _SUPPORT + int(np.ceil(spans_s / one.splines.step_s)) + 1)
         values = [one.splines.at(table.time_s) for table in self.tables]
         derivative = FieldDerivative(operator, volume)
@@ -199,6 +202,7 @@ class FieldProblem:
         """Returns the first candidate whose misfit and penalty are smaller than those of ``one``, else ``one``."""
         before = sum_squares(residual) + penalty(one)
         for candidate in candidates:
+            # a field that folds has no inverse, however well its frames fit
             if candidate.deformation().smallest_determinant() < _LEAST_DETERMINANT:
                 continue
             if sum_squares(self.residual(candidate, volume)) + penalty(candidate) < before:

@@ -120,6 +120,7 @@ class SharedFrames(Alone):
             self._losses[place] = step.loss.value()
             own.append(np.concatenate([rt.download(cloud.gradients)[:_ROWS], rt.download(statistics)]))
         total = exact_sum(self.ranks, own, (_ROWS + _STATISTICS, stride), count)
+        # the gradients by the centre on the panel are in the statistics already
         rt.write(cloud.gradients, np.pad(total[:_ROWS], ((0, _DERIVED - _ROWS), (0, 0))))
         rt.write(cloud.statistics, rt.download(cloud.statistics) + total[_ROWS:])
 

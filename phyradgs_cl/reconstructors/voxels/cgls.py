@@ -48,6 +48,7 @@ class Cgls(Algorithm):
         space = self.system.space
         projected = self.system.derivative(self.direction)
         energy = space.inner(projected, projected)
+        # a gradient of 0, or a direction that no frame sees: nothing is left to minimise
         if self.gamma == 0 or energy == 0:
             self.finished = "exact solution"
             return space.norm(self.residual)

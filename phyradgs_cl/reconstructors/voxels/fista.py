@@ -101,6 +101,7 @@ class Accelerated(Algorithm):
 
     def accept(self, point: Any, volume: Any) -> None:
         """Takes the result of the step from ``point`` as the present volume."""
+        # the step leads back against the last movement: momentum carried the point past a minimum
         is_uphill = self.system.space.turn(point, volume, self.volume) > 0
         self.momentum = 1.0 if is_uphill else self.next_momentum
         self.previous, self.volume = self.volume, volume
@@ -124,6 +125,7 @@ class Fista(Accelerated):
     def step(self) -> float:
         weight = self.weight.at(self.volume)
         residual = self.system.space.sum_squares(self._update(subset, weight) for subset in self.subsets) ** 0.5
+        # larger subsets have another step length: momentum of the former ones would mislead
         if self.subsets.join_if_diverging(residual):
             self.momentum, self.previous = 1.0, self.volume
         self.prior.end_pass(self.system.space, self.volume)

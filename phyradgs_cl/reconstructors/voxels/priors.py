@@ -126,6 +126,7 @@ class TvAndDct(Prior):
     def __call__(self, space: Space[Any], volume: Any, weight: float, *, nonnegative: bool) -> Any:
         smooth = self.tv(space, volume, weight, nonnegative=nonnegative)
         shrink = partial(self.shrink, unit=self.unit * weight, turn=self.turn, nonnegative=nonnegative)
+        # the next map takes the next quarter of the shifts: four maps have all of them
         self.turn = (self.turn + 1) % len(TURNS)
         return space.apply(shrink, smooth, self.tv.prox.shape)
 
@@ -217,6 +218,7 @@ class Piccs(Prior):
             self._image_in_space = space.array(np.ascontiguousarray(self.image, np.float32))
         volume = self.plain(space, volume, (1 - self.share) * weight, nonnegative=nonnegative)
         change = space.add(volume, self._image_in_space, -1.0)
+        # a change may be negative; the sum below may not
         change = self.change(space, change, self.share * weight, nonnegative=False)
         return space.add(change, self._image_in_space, 1.0, nonnegative=nonnegative)
 

@@ -79,6 +79,7 @@ class System:
         if len(operators) < 1 + (self.intensity is not None):
             return self
         for operator in operators:
+            # operators of moving objects, and of intensities, hold volumes and frames of their own
             if not isinstance(operator, RayOperator):
                 more_volumes, more_frames = operator.holds
                 volumes, frames = volumes + more_volumes, frames + more_frames
