@@ -3,8 +3,8 @@
 Each subset S of M makes one step: xₖ = prox(yₖ + M/L · A_Sᵀ (p_S − A_S yₖ)), yₖ₊₁ = xₖ + βₖ₊₁ (xₖ − xₖ₋₁).
 The step and its momentum are FISTA's (Beck and Teboulle, SIAM J. Imaging Sci. 2 (2009) 183, Eqs. 4.1 to 4.3). The gradient
 of a subset, times the number of subsets, stands for that of all frames (Kim, Ramani and Fessler, IEEE Trans. Med. Imaging
-34 (2015) 167). L bounds the norm of AᵀA. The last 3/7 of
-the passes run on smaller voxels, whose means make up two thirds of the result (``stages.py``)."""
+34 (2015) 167). L bounds the norm of AᵀA. The last 3/7 of the passes run on smaller voxels, whose means make up two thirds
+of the result (``stages.py``)."""
 
 import math
 from dataclasses import dataclass, replace
