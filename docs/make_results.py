@@ -492,6 +492,23 @@ def parallel_memory() -> str:
     return markdown(["method", "columns × rows × views", "limit", "buffers", "resident", "processor, s"], rows)
 
 
+def times_per_exposure() -> str:
+    """PSNR and time of ``per-row`` by the number of times in an exposure."""
+    by_scan: dict[tuple[Any, ...], dict[int, dict[str, Any]]] = {}
+    for one in lines_of("times_per_exposure.jsonl"):
+        key = one["size"], one["views"], one["moved_voxels"], one["volume"], one["method"]
+        by_scan.setdefault(key, {})[one["times"]] = one
+    counts = (1, 2, 3, 5, 9, 17)
+    rows = []
+    for (size, views, moved, volume, method), runs in sorted(by_scan.items()):
+        cells = [
+            f"{runs[n]['psnr_db']:.2f}" + (f" ({runs[n]['processor_s']:.0f} s)" if runs[n]["processor_s"] else "")
+            if n in runs else "" for n in counts
+        ]  # fmt: skip
+        rows.append([f"{size}³", str(views), f"{moved:.1f}", volume, f"`{method}`", *cells])
+    return markdown(["voxels", "views", "rim moves", "volume", "method", *(f"N = {n}" for n in counts)], rows)
+
+
 def moving_known() -> str:
     """Breathing volumes at rest, with the known field, and with the motion ignored."""
     by_volume: dict[tuple[str, int, int, str], dict[str, dict[str, Any]]] = {}
@@ -571,6 +588,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "ridge": partial(beside_dct, "ridge"),
     "beside_rtk": beside_rtk,
     "ray_motions": ray_motions,
+    "times_per_exposure": times_per_exposure,
     "whole_runs": whole_runs,
     "estimates": estimates,
     "prepare": prepared,

@@ -3,6 +3,7 @@
 A model is a frozen class with ``cells(scan, frame)``. A user-defined class works in every method (docs/methods.md).
 On a stop-and-shoot scan every model of this module gives one pose per frame."""
 
+import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields, is_dataclass
 from typing import Any, ClassVar, Protocol
@@ -21,6 +22,9 @@ from phyradgs_cl.errors import InputError
 
 RAYS, SPLATS, LINE_POSES = "rays", "splats", "one pose per line"
 """The kinds of operator: ray projectors, splat projectors, and filtered backprojection."""
+_USUAL_TIMES, _MOST_TIMES = 5, 100  # of a line's exposure in the model ``PerRow``
+_SIDES = ((1, 0), (-1, 0), (0, 1), (0, -1))
+_FINE_STEP_VOXELS, _COARSE_STEP_VOXELS = 0.8, 3.6
 _WEIGHT_TOLERANCE = 1e-3  # of the sum of a line's weights in a model of the user's own
 
 
@@ -30,6 +34,25 @@ class Motion(Protocol):
     def cells(self, scan: Scan, frame: int) -> TimeCells:
         """Returns the time cells of one frame. The weights of every line sum to 1."""
         ...
+
+
+def rim_travel_mm(scan: Scan) -> float:
+    """Returns how far the grid's rim moves, seen from the panel, during a line's exposure in the middle frame.
+
+    The rim is the middles of the box's four sides around the axis. Their places relative to the panel move by r Δθ on a
+    circular orbit, and by the panel's shift where that does not turn."""
+    if not scan.is_fly:
+        return 0.0
+    frame = scan.frames // 2
+    start_s = float(scan.frame_start_s[frame])
+    pose = scan.trajectory.pose(frame, np.array([start_s, start_s + scan.shutter.exposure_s]))
+    panel, column, row = pose[:, 3:6], pose[:, 6:9], pose[:, 9:12]
+    u_hat, v_hat = (step / np.linalg.norm(step, axis=1, keepdims=True) for step in (column, row))
+    axes = np.stack([u_hat, v_hat, np.cross(u_hat, v_hat)], -1)
+    half_mm = np.array(scan.grid.size_mm[:0:-1]) / 2
+    rim = np.array(scan.grid.offset_mm[::-1]) + [[x * half_mm[0], y * half_mm[1], 0] for x, y in _SIDES]
+    places = np.einsum("tpk,tkl->tpl", rim - panel[:, None], axes)
+    return float(np.linalg.norm(places[1] - places[0], axis=-1).max())
 
 
 def _place(scan: Scan, frame: int) -> tuple[Trajectory, Shutter, int, float, int]:
@@ -99,22 +122,34 @@ class Centres(MicroViews):
 
 @dataclass(frozen=True)
 class PerRow:
-    """Every line averages over its own window; all lines of a frame share their times, ``sub_intervals`` to an exposure. The
-    weight of a line in a cell is the fraction of its window that lies there. Raises InputError for a count below 1."""
+    """Every line averages over its own window; all lines of a frame share their times, ``sub_intervals`` to an exposure (0:
+    as many as the scan's voxels need). The weight of a line in a cell is the fraction of its window that lies there. Raises
+    InputError for a count below 0."""
 
     operators: ClassVar = (RAYS,)
     name: str = field(default="per-row", init=False, repr=False)
-    sub_intervals: int = 5
+    sub_intervals: int = 0
 
     def __post_init__(self) -> None:
-        checks.whole("sub_intervals", self.sub_intervals, 1, 10_000)
+        checks.whole("sub_intervals", self.sub_intervals, 0, 10_000)
+
+    def of(self, scan: Scan) -> "PerRow":
+        """Returns the model with the number of times that this scan needs.
+
+        The grid's rim moves by at most 0.8 voxels from time to time, but 5 times do where it moves by less than 18 voxels
+        in an exposure, and beyond that one time to 3.6 voxels (measured in docs/results/settings.md)."""
+        if self.sub_intervals:
+            return self
+        moved_voxels = rim_travel_mm(scan) / min(scan.grid.voxel_size_mm)
+        fine, coarse = (math.ceil(moved_voxels / step) for step in (_FINE_STEP_VOXELS, _COARSE_STEP_VOXELS))
+        return PerRow(min(max(1, min(fine, _USUAL_TIMES), coarse), _MOST_TIMES))
 
     def cells(self, scan: Scan, frame: int) -> TimeCells:
         """Returns the ``TimeCells`` of one frame: cells of exposure / sub-intervals, from first light to last."""
         if not scan.is_fly:
             return Static().cells(scan, frame)
         where = scan.trajectory, scan.shutter, frame, scan.frame_start_s, scan.lines
-        return common_time_cells(*where, self.sub_intervals)
+        return common_time_cells(*where, self.of(scan).sub_intervals)
 
 
 @dataclass(frozen=True)

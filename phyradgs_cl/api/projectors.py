@@ -92,7 +92,7 @@ def splat_operator(
     Raises InputError for anything but a Scan, for an unknown motion, and for a cutoff out of range."""
     model = _checked(scan, motion, models.RAYS, models.SPLATS)
     if isinstance(model, PerRow):  # splats have one weight for all lines of a cell
-        model = OwnTimes(model.sub_intervals)
+        model = OwnTimes(model.of(scan).sub_intervals)
     _check_cutoff(cutoff_sigma)
     rt = runtime_of(device)
 

@@ -110,7 +110,7 @@ RUN_OPTIONS: dict[str, Any] = {
     "method": _asked(str, _METHOD, DEFAULT_METHOD, metavar=f"{'|'.join(METHODS)}|MODULE:NAME"),
     "motion": _asked(Literal[MOTIONS], _MOTION, "per-row"),
     "strips": _asked(int, "Strips M of a frame; means micro-views.", "8"),
-    "sub_intervals": _asked(int, "Sub-intervals N of an exposure; for phyradgs means micro-views.", "5"),
+    "sub_intervals": _asked(int, "Sub-intervals N of an exposure; for phyradgs means micro-views.", "by arc and voxels"),
     "segments": _asked(int, "Segments of a frame (exact); 0: by --time-error.", "0"),
     "time_error": _asked(float, "Relative error of averaging over time (exact).", "0.005"),
     "iterations": _asked(int, "Iterations: of voxels all frames each, of splats one frame (then 3000).", "35"),

@@ -31,7 +31,7 @@ class Trainer:
         self.rng = np.random.default_rng(seed)
         motion = options.motion
         if isinstance(motion, PerRow):  # the field evaluates single rays: common times would save nothing
-            motion = OwnTimes(motion.sub_intervals)
+            motion = OwnTimes(motion.of(scan).sub_intervals)
         tables = [motion.cells(scan, frame).still() for frame in range(scan.frames)]
         self.rays = [rays.ExposureRays.of_cells(table, scan.grid) for table in tables]
         times = self.rays[0].times

@@ -16,6 +16,7 @@ from phyradgs_cl.acquisition import (
     MicroViews,
     OwnTimes,
     PerRow,
+    PoseTable,
     Scan,
     Shutter,
     Static,
@@ -40,6 +41,7 @@ from phyradgs_cl.acquisition.motion import (
     motion_from_facts,
     motion_of,
     motions_for,
+    rim_travel_mm,
 )
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
@@ -135,7 +137,7 @@ def test_motion_models_of_fly_and_stop_and_shoot_scans() -> None:
         Static(): 1, StaticStart(): 1, MicroViews(4, 3): 12, Centres(4, 3): 12, PerRow(sub_intervals=3): 5,
         OwnTimes(sub_intervals=3): 30, Exact(segments=5): 5, LineMiddles(): 10,
     }
-    assert (MicroViews(), PerRow(), Exact()) == (MicroViews(8, 5), PerRow(5), Exact(0, 0.005))
+    assert (MicroViews(), PerRow(), Exact()) == (MicroViews(8, 5), PerRow(0), Exact(0, 0.005))
     for motion, count in counts.items():
         moving = motion.cells(scan(True), 1)
         assert moving.count == count and motion.cells(scan(False), 1).count == 1
@@ -149,6 +151,27 @@ def test_motion_models_of_fly_and_stop_and_shoot_scans() -> None:
         assert "name" not in repr(model())
         with pytest.raises(TypeError, match="name"):
             model(name="mine")
+
+
+@pytest.mark.parametrize(
+    ("size", "exposure_deg", "count"),
+    [(64, 14.4, 5), (128, 14.4, 5), (256, 14.4, 9), (64, 7.2, 5), (64, 2.0, 2), (64, 0.4, 1), (512, 0.16, 1)],
+)
+def test_the_rim_decides_on_the_times_of_an_exposure(size, exposure_deg, count) -> None:
+    speed = ConstantSpeed(0.3, np.deg2rad(exposure_deg) / 0.8)
+    fly = replace(scan(True), trajectory=CircularOrbit(GEOMETRY, speed), grid=Grid.cube(size, 2.0))
+    assert rim_travel_mm(fly) == pytest.approx(2 * np.sin(np.deg2rad(exposure_deg) / 2), rel=1e-9)
+    assert PerRow().of(fly) == PerRow(count) and PerRow(7).of(fly) == PerRow(7)
+    assert PerRow().cells(fly, 1).count == PerRow(count).cells(fly, 1).count
+    assert PerRow().of(replace(fly, is_fly=False)) == PerRow(1)
+
+
+def test_the_rim_moves_where_the_panel_slides() -> None:
+    poses = np.tile(ORBIT.pose(0, np.array([0.0])), (2, 1))
+    poses[1, [1, 4]] += 0.3  # source and panel along y
+    sliding = PoseTable(np.array([START_S, START_S + 0.8]), poses)
+    fly = replace(scan(True), trajectory=sliding, frame_start_s=np.array([START_S - 0.1, START_S]), shutter=Shutter(0.8))
+    assert rim_travel_mm(fly) == pytest.approx(0.3)
 
 
 def test_a_model_states_the_operators_that_take_it() -> None:

@@ -1,0 +1,50 @@
+"""Measures how many times of an exposure ``per-row`` needs: PSNR and processor seconds by ``--counts``.
+
+    python benchmarks/times_per_exposure.py VOLUMES docs/results/times_per_exposure.jsonl --counts 5 9 --names cthead
+    python docs/make_results.py      # the table
+
+Scans are those of ``priors.py``. A line per volume, scan, method and count; ``moved_voxels``: how far the rim moves in an
+exposure. Runs that are in the file are not made again."""
+
+import argparse
+import time
+from pathlib import Path
+
+from priors import scan_of
+from scans import append, files_of, read_lines
+
+from phyradgs_cl.acquisition import PerRow
+from phyradgs_cl.acquisition.motion import rim_travel_mm
+from phyradgs_cl.api import compare, reconstruct
+from phyradgs_cl.runtime import Runtime
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("volumes")
+    parser.add_argument("lines", type=Path)
+    parser.add_argument("--names", help="with commas; all")
+    parser.add_argument("--size", type=int, default=64)
+    parser.add_argument("--views", type=int, default=25)
+    parser.add_argument("--method", default="fista")
+    parser.add_argument("--counts", nargs="+", type=int, default=[5, 9])
+    given = parser.parse_args()
+    rt, there = Runtime(), read_lines(given.lines)
+    for name, path in files_of(given.volumes, given.names, given.size).items():
+        case = {"volume": name, "size": given.size, "views": given.views, "method": given.method}
+        facts = {**case, "kind": "fly", "dose": 1e4, "seed": 0}
+        counts = [n for n in given.counts if not any({**case, "times": n}.items() <= line.items() for line in there)]
+        scan = scan_of(rt, path, facts) if counts else None
+        for count in counts:
+            assert scan is not None
+            start_s = time.process_time()
+            result = reconstruct(scan, given.method, motion=PerRow(count), device=rt, report=False)
+            seconds = time.process_time() - start_s
+            psnr_db = float(compare(result.volume, scan.reference)["psnr_db"])
+            moved_voxels = rim_travel_mm(scan) / min(scan.grid.voxel_size_mm)
+            values = {"moved_voxels": moved_voxels, "psnr_db": psnr_db, "processor_s": seconds}
+            append(given.lines, {**case, "times": count, **{key: round(value, 3) for key, value in values.items()}})
+
+
+if __name__ == "__main__":
+    main()
