@@ -82,7 +82,7 @@ class Half:
     """A motion whose line weights sum to a half."""
 
     def cells(self, scan: Scan, frame: int) -> TimeCells:
-        whole = PerRow().cells(scan, frame)
+        whole = PerRow(5).cells(scan, frame)
         return replace(whole, weight=whole.weight / 2)
 
 
@@ -90,7 +90,7 @@ class OnePose:
     """A motion with fewer poses than cells."""
 
     def cells(self, scan: Scan, frame: int) -> TimeCells:
-        whole = PerRow().cells(scan, frame)
+        whole = PerRow(5).cells(scan, frame)
         return replace(whole, pose=whole.pose[:1])
 
 
@@ -262,7 +262,7 @@ CASES: dict[str, list[tuple[str, Callable[[], object]]]] = {
     "MicroViews": [("", partial(MicroViews, *given)) for given in ((2.5,), (0, 1), (1, 0), (-1, 5))],
     "Centres": [("strips", lambda: Centres(0)), ("motion", lambda: reconstruct(GOOD, "sirt", motion=Centres()))],
     "OwnTimes": [("sub_intervals", lambda: OwnTimes(0))],
-    "PerRow": [("sub_intervals", lambda: PerRow(0))],
+    "PerRow": [("sub_intervals", lambda: PerRow(-1))],
     "StaticStart": [("strips", lambda: reconstruct(GOOD, "fdk", motion="static-start", strips=3))],
     "Motion": [
         ("motion Half", lambda: reconstruct(GOOD, "sirt", motion=Half())),
