@@ -123,9 +123,7 @@ def _origin_of(subject: str, origins: Mapping[str, str]) -> str | None:
     words = re.findall(r"option ([\w-]+)", subject) or re.sub(r"\(.*\)", "", subject).split()[-1:]
     first, *rest = [part for word in words for part in word.lstrip("-").split(".")] or [""]
     origin = origins.get(first.replace("-", "_"))
-    if origin is None or origin.startswith("--"):
-        return origin
-    return ".".join([origin, *rest])
+    return origin if origin is None or origin.startswith("--") else ".".join([origin, *rest])
 
 
 def read_config(path: Path | None, option: str = "--config") -> dict[str, Any]:

@@ -242,12 +242,8 @@ def cell_table(
     """Returns cells at times (C,) s, sorted by their first lines."""
     order = np.argsort(line_start, kind="stable")
     return TimeCells(
-        pose=trajectory.pose(frame, time_s[order]),
-        time_s=time_s[order],
-        line_start=line_start[order].astype(np.int32),
-        line_stop=line_stop[order].astype(np.int32),
-        weight=weight[order].astype(np.float64),
-        lines=lines,
-        axis=shutter.axis,
+        pose=trajectory.pose(frame, time_s[order]), time_s=time_s[order],
+        line_start=line_start[order].astype(np.int32), line_stop=line_stop[order].astype(np.int32),
+        weight=weight[order].astype(np.float64), lines=lines, axis=shutter.axis,
         is_parallel=is_parallel(trajectory),
     )

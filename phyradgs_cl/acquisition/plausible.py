@@ -144,10 +144,12 @@ def check_plausible(scan: "Scan", named: Named = str, is_timed: bool = True) -> 
     angle_deg = np.rad2deg(np.unwrap(_source_angle_rad(scan, 0.0, scan.shutter.exposure_s)[:, 0]))
     looks_like_radians = _warn_of_radians(angle_deg, named("angles"))
     if scan.is_fly and scan.frames > 1 and not looks_like_radians:
-        _check_exposure(scan, named("exposure_s"))
+        exposure_s, frame_s = scan.shutter.exposure_s, _frame_time_s(scan)
+        if exposure_s > (1 + _SLACK) * frame_s:
+            raise _longer_than_a_frame(named("exposure_s"), f"exposure of {exposure_s:.4g} s", exposure_s, frame_s)
         _check_readout(scan, named("readout_s"))
         if is_timed:
-            _warn_of_slow_frames(_frame_time_s(scan), angle_deg, named("frame_time_s"))
+            _warn_of_slow_frames(frame_s, angle_deg, named("frame_time_s"))
     _check_opaque(scan, named("quantity"))
 
 
@@ -203,12 +205,6 @@ def _check_voxels(grid: Grid, geometry: Geometry, subject: str) -> None:
         found = f"{shape} voxels of {min(grid.voxel_size_mm):.4g} mm"
         expected = f"voxels of about {2 * half_mm / columns:.3g} mm, in a field of view of {2 * half_mm:.4g} mm"
         raise InputError(subject, found, expected, "correct the number of voxels, or the unit of a length")
-
-
-def _check_exposure(scan: "Scan", subject: str) -> None:
-    exposure_s, frame_s = scan.shutter.exposure_s, _frame_time_s(scan)
-    if exposure_s > (1 + _SLACK) * frame_s:
-        raise _longer_than_a_frame(subject, f"exposure of {exposure_s:.4g} s", exposure_s, frame_s)
 
 
 def _check_readout(scan: "Scan", subject: str) -> None:

@@ -126,7 +126,9 @@ class Deformation:
         """Returns u (nz, ny, nx, 3) float32 in mm with u(x) = −w(x + u(x)): matter at x of the reference is at x + u(x).
 
         Fixed point from u = 0. Raises InputError where it does not converge, for example because the field folds."""
-        return self.inverse_mm(_centres_mm(grid), weights).reshape(*grid.shape, 3).astype(np.float32)
+        z, y, x = np.meshgrid(*grid.axes_mm(), indexing="ij")
+        centres_mm = np.stack([x.ravel(), y.ravel(), z.ravel()], -1)
+        return self.inverse_mm(centres_mm, weights).reshape(*grid.shape, 3).astype(np.float32)
 
     def inverse_mm(self, points_mm: np.ndarray, weights: "ArrayLike") -> np.ndarray:
         """Returns the same u (n, 3) float64 in mm at points (n, 3), x y z."""
@@ -200,12 +202,6 @@ def control_points(
     counts = [int(np.ceil((side_mm + 2 * margin_mm) / spacing_mm)) + 3 for side_mm in grid.size_mm]
     first_mm = [middle - (n - 1) / 2 * spacing_mm for middle, n in zip(grid.offset_mm, counts, strict=True)]
     return (first_mm[2], first_mm[1], first_mm[0]), (counts[0], counts[1], counts[2])
-
-
-def _centres_mm(grid: Grid) -> np.ndarray:
-    """Returns the voxel centres (n, 3), x y z, of a grid in the order of its array."""
-    z, y, x = np.meshgrid(*grid.axes_mm(), indexing="ij")
-    return np.stack([x.ravel(), y.ravel(), z.ravel()], -1)
 
 
 def _cubic(offset: np.ndarray) -> np.ndarray:

@@ -174,6 +174,4 @@ def log_squares(integrals: torch.Tensor, measured: torch.Tensor, times: int) -> 
     among the s samples estimates; less that, expectation and gradient are those of all K times."""
     count = integrals.shape[1]
     squares = (integrals.mean(1) - measured) ** 2
-    if count == times:
-        return squares
-    return squares - (1 / count - 1 / times) * integrals.var(1, unbiased=True)
+    return squares if count == times else squares - (1 / count - 1 / times) * integrals.var(1, unbiased=True)

@@ -35,9 +35,7 @@ Step = Callable[[Scan, Any, MakeModel], tuple[Scan, Facts]]
 
 def unmasked_frames(scan: Scan) -> np.ndarray:
     """Returns the scan's line integrals (F, v, u) with masked pixels interpolated."""
-    if scan.pixel_mask is None:
-        return scan.projections
-    return fill_masked(scan.projections, ~scan.valid)
+    return scan.projections if scan.pixel_mask is None else fill_masked(scan.projections, ~scan.valid)
 
 
 def fill_masked(frames: np.ndarray, mask: np.ndarray) -> np.ndarray:

@@ -275,6 +275,4 @@ def _argument(value: Any) -> Any:
 
 
 def _literal(value: int | float | bool) -> str:
-    if isinstance(value, (bool, int, np.integer)):
-        return str(int(value))
-    return f"{float(value):.9e}f"
+    return str(int(value)) if isinstance(value, (bool, int, np.integer)) else f"{float(value):.9e}f"

@@ -66,7 +66,9 @@ def simulated_scan(
         scan.provenance["motion_of_object"] = asdict(motion)
         times_s = motion.state_times_s(*window_s)
     else:
-        times_s = _in_one_cycle_s(scene.period_s or 1.0, *window_s)
+        # eighths of the cycle about the middle of the scan
+        period_s = scene.period_s or 1.0
+        times_s = (np.floor(sum(window_s) / 2 / period_s) + np.arange(_STATES) / _STATES) * period_s
     volumes = np.stack([scene.state(time_s) for time_s in times_s])
     volumes *= np.float32(scan.provenance["attenuation_factor"])  # type: ignore[arg-type]
     return replace(scan, moving_truth=MovingTruth(times_s, volumes, scene.deformation), gating=_gating(scan, scene))
@@ -139,12 +141,6 @@ def _gating(scan: Scan, scene: Scene) -> Gating:
     if scene.deformation is not None:
         return Gating(middle_s, scene.deformation.weights_at(middle_s)[:, 0])
     return Gating(middle_s, middle_s / (scene.period_s or 1.0) % 1.0, is_phase=True)
-
-
-def _in_one_cycle_s(period_s: float, first_s: float, last_s: float) -> np.ndarray:
-    """Returns the times (8,) of a phantom's true states: eighths of a cycle, the one about the middle of the scan."""
-    cycle = np.floor((first_s + last_s) / 2 / period_s)
-    return np.asarray((cycle + np.arange(_STATES) / _STATES) * period_s)
 
 
 def default_time_samples(protocol: Protocol, grid: Grid, fastest_mm_per_s: float = 0.0) -> int:

@@ -88,15 +88,10 @@ def binned(scan: Scan, block: int) -> Scan:
     is_masked = valid_share < _LEAST_VALID
     shutter, later_s = _binned_shutter(scan, width if scan.shutter.axis == "columns" else height)
     return replace(
-        scan,
-        projections=mean.astype(np.float32),
-        geometry=_binned_panel(scan.geometry, height, width),
-        trajectory=with_trajectory(scan, blocks=blocks).trajectory,
-        shutter=shutter,
+        scan, projections=mean.astype(np.float32), geometry=_binned_panel(scan.geometry, height, width),
+        trajectory=with_trajectory(scan, blocks=blocks).trajectory, shutter=shutter,
         frame_start_s=np.asarray(scan.frame_start_s) + later_s,
-        pixel_mask=is_masked if is_masked.any() else None,
-        reference=None,
-        moving_truth=None,
+        pixel_mask=is_masked if is_masked.any() else None, reference=None, moving_truth=None,
     )
 
 

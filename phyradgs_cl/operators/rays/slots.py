@@ -48,14 +48,9 @@ class UprightPoses:
         whole = all(n == 1 for n in counts) and (stop - first == tables[0].lines).all()
         return cls(
             cells=rt.upload(ray_constants(poses[where], grid, tables[0].is_parallel)),
-            matrices=rt.upload(matrices, np.float32),
-            matrix_stride=stride,
-            pose_of=pose_of.reshape(-1),
-            first=first,
-            stop=stop,
-            frame_cells=np.concatenate([[0], np.cumsum(counts)]),
-            is_plain=bool(whole and (weights == 1).all()),
-            axis=tables[0].axis,
+            matrices=rt.upload(matrices, np.float32), matrix_stride=stride, pose_of=pose_of.reshape(-1),
+            first=first, stop=stop, frame_cells=np.concatenate([[0], np.cumsum(counts)]),
+            is_plain=bool(whole and (weights == 1).all()), axis=tables[0].axis,
             is_parallel=tables[0].is_parallel,
         )
 

@@ -206,10 +206,7 @@ def _segment(
     conic = np.linalg.inv(np.linalg.inv(sharp) + pixel_variance * np.eye(2))
     mass_kept = np.sqrt(np.linalg.det(conic) / np.linalg.det(sharp))
     return _Segment(
-        centre=(first + 4 * np.array([u, v]) + last) / 6,
-        path=last - first,
-        conic=conic,
-        b=b,
+        centre=(first + 4 * np.array([u, v]) + last) / 6, path=last - first, conic=conic, b=b,
         c=np.outer(b, b) + conic / (z * z * alpha),
         amplitude=float(mass_kept * row[10] * np.sqrt(2 * np.pi / alpha)),
     )

@@ -35,10 +35,11 @@ def space(volume: NDArray[np.floating], grid: Grid, window: Window, gaussians: G
     atlas, columns = _atlas_within(steps, room)
     size = " × ".join(map(str, volume.shape))
     reduced = "" if means.shape == volume.shape else f", means over blocks: {' × '.join(map(str, means.shape))}"
+    span = (window.most - window.least) or 1.0
     data = {
         "counts": steps.shape[::-1], "size_mm": grid.size_mm[::-1], "atlas": atlas, "columns": columns,
         "least": window.least, "most": window.most, "decimals": decimals_of((window.most - window.least) / 255),
-        "ends": [_step_of(value, window) for value in (window.low, window.high)],
+        "ends": [255 * (value - window.least) / span for value in (window.low, window.high)],
         "words": f"{size} voxels (z, y, x){reduced}", "centres": centres,
     }  # fmt: skip
     return joined(
@@ -125,7 +126,3 @@ def _between(steps: NDArray[np.uint8]) -> int:
     variance = np.nan_to_num(variance)
     best = np.flatnonzero(variance >= variance.max() * (1 - 1e-9))  # a run of steps, where none lies between the classes
     return int(np.clip(round(best.mean()) + 1, 1, 255))
-
-
-def _step_of(value: float, window: Window) -> float:
-    return 255 * (value - window.least) / ((window.most - window.least) or 1.0)
