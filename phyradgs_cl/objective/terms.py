@@ -1,7 +1,7 @@
 """Terms of the objective (paper, Eq. 4): image loss, total variation of a small volume, terms of the parameters.
 
 The image loss of one frame is L1 + λ (1 − SSIM). A term for photon noise, λ_P mean(½ t (x − y)²) with transmissions t
-(detector/transmission.py), is off by default. Eq. 4 prints "+ SSIM"; the paper minimises 1 − SSIM, and so does this module.
+(detector/noise_level.py), is off by default. Eq. 4 prints "+ SSIM"; the paper minimises 1 − SSIM, and so does this module.
 SSIM is that of Wang et al. 2004 (IEEE Trans. Image Process. 13, 600): 11-tap Gaussian window of σ 1.5, zero padding,
 C1 = 0.01², C2 = 0.03².
 

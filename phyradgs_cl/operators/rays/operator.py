@@ -51,12 +51,12 @@ class LinearOperator(Protocol):
 class RayOperator:
     """Joseph's projector and its matched adjoint over the cells of many frames; a ``LinearOperator``.
 
-    NumPy arrays give NumPy arrays. Device arrays (plain, float32) give device arrays; only averages of intensity
-    over a volume in bricks are made on the host. ``out``,
-    an array of the same kind, receives the result. detector_shape is (rows, columns); ``tables`` has the time cells of each
-    frame, all read out along one axis. An operator shares its tables and buffers with its subsets, and with operators that
-    were given the same ``memory``: use them one at a time. A volume that does not fit is projected in bricks.
-    fewest_lines: as in ``upright_of``; ``FEWEST_LINES`` is fastest for panels of few lines, and rounds differently.
+    NumPy arrays give NumPy arrays. Device arrays (plain, float32) give device arrays; only averages of intensity over a
+    volume in bricks are made on the host. ``out``, an array of the same kind, receives the result. detector_shape is (rows,
+    columns); ``tables`` has the time cells of each frame, all read out along one axis. An operator shares its tables and
+    buffers with its subsets, and with operators that were given the same ``memory``: use them one at a time. A volume that
+    does not fit is projected in bricks. fewest_lines: as in ``upright_of``; ``FEWEST_LINES`` is fastest for panels of few
+    lines, and rounds differently.
 
     Joseph, IEEE Trans. Med. Imaging 1 (1982) 192. Raises InputError for tables that do not fit the detector."""
 
