@@ -189,29 +189,18 @@ class RayMemory:
         turned = self.layout.turned_floats(count) if self.slot_floats else 0
         return max(self.layout.frames_floats(count), turned)
 
-    def write_frames(self, frames: Array, part: slice, axis: str) -> DeviceArray:
-        """Copies some frames (F, rows, columns) to the device, padded, with lines as rows; ``axis`` is the readout's."""
-        count = part.stop - part.start
-        on_device = self.frames(count)
+    def write_frames(self, frames: Array, part: slice, axis: str, *, turned: bool = False) -> DeviceArray:
+        """Copies some frames (F, rows, columns) to the device, padded, with lines as rows, or as columns where ``turned``;
+        ``axis`` is the readout's."""
+        count, layout = part.stop - part.start, self.layout
+        on_device = self._some_frames(layout.turned_floats(count)) if turned else self.frames(count)
         if isinstance(frames, DeviceArray):
-            plain = Strides.plain(frames.shape, (part.start, 0, 0))
-            shape = count, *frames.shape[1:]
-            padded = on_device, self.layout.frames_strides
-            move(self.rt, (frames, plain), padded, shape, turned=axis == "columns")
+            source = frames, Strides.plain(frames.shape, (part.start, 0, 0))
+            padded = on_device, layout.turned_strides if turned else layout.frames_strides
+            move(self.rt, source, padded, (count, *frames.shape[1:]), turned=turned != (axis == "columns"))
         else:
-            self.rt.write(on_device, pad_rows(Readout(axis).frames(frames[part])))
-        return on_device
-
-    def write_turned(self, frames: Array, part: slice, axis: str) -> DeviceArray:
-        """Copies some frames to the device as ``write_frames`` does, with lines as columns."""
-        count = part.stop - part.start
-        on_device = self._some_frames(self.layout.turned_floats(count))
-        if isinstance(frames, DeviceArray):
-            plain = Strides.plain(frames.shape, (part.start, 0, 0))
-            shape = count, *frames.shape[1:]
-            move(self.rt, (frames, plain), (on_device, self.layout.turned_strides), shape, turned=axis == "rows")
-        else:
-            self.rt.write(on_device, pad_rows(Readout(axis).frames(frames[part]).swapaxes(1, 2)))
+            lines = Readout(axis).frames(frames[part])
+            self.rt.write(on_device, pad_rows(lines.swapaxes(1, 2) if turned else lines))
         return on_device
 
     def read_frames(self, on_device: DeviceArray, result: Array, part: slice, axis: str) -> None:

@@ -198,8 +198,7 @@ class RayOperator:
                 add, axis = part.start > 0, self._readout.axis
                 if k == 0 or len(parts) > 1:
                     turns = self._is_upright and axis == "rows"
-                    write = self.memory.write_turned if turns else self.memory.write_frames
-                    there = write(frames, part, axis)
+                    there = self.memory.write_frames(frames, part, axis, turned=turns)
                 if self._is_upright:
                     self._adjoint_upright(layout, part, there, target, add)
                     continue
