@@ -158,8 +158,8 @@ def _options_in_words(options: object) -> dict[str, object]:
         strips, sub_intervals = motion.get("strips"), motion.get("sub_intervals")
         counts = dict.fromkeys(("micro-views", "centres"), f" {strips} × {sub_intervals}")
         if sub_intervals is not None:  # FDK has one time per line
-            counts["per-row"] = f", {sub_intervals} times per exposure"
-            counts["own-times"] = f", {sub_intervals} times per line"
+            times = f"{sub_intervals} time{'s' if sub_intervals != 1 else ''}"
+            counts |= {"per-row": f", {times} per exposure", "own-times": f", {times} per line"}
         told["motion"] = f"{motion.get('name')}{counts.get(str(motion.get('name')), '')}"
     if "iterations" in options:
         told["iterations_asked"] = options["iterations"]
