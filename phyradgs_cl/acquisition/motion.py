@@ -23,8 +23,7 @@ from phyradgs_cl.errors import InputError
 RAYS, SPLATS, LINE_POSES = "rays", "splats", "one pose per line"
 """The kinds of operator: ray projectors, splat projectors, and filtered backprojection."""
 _USUAL_TIMES, _MOST_TIMES = 5, 100  # of a line's exposure in the model ``PerRow``
-_SIDES = ((1, 0), (-1, 0), (0, 1), (0, -1))
-_FINE_STEP_VOXELS, _COARSE_STEP_VOXELS = 0.8, 3.6
+_FINE_STEP_VOXELS, _COARSE_STEP_VOXELS = 0.75, 3.6
 _WEIGHT_TOLERANCE = 1e-3  # of the sum of a line's weights in a model of the user's own
 
 
@@ -37,21 +36,27 @@ class Motion(Protocol):
 
 
 def rim_travel_mm(scan: Scan) -> float:
-    """Returns how far the grid's rim moves, seen from the panel, during a line's exposure in the middle frame.
+    """Returns how far the grid's rim moves, seen from the panel, during a line's exposure: the most in the first, middle and
+    last frame; 0 for a gantry at rest.
 
     The rim is the middles of the box's four sides around the axis. Their places relative to the panel move by r Δθ on a
     circular orbit, and by the panel's shift where that does not turn."""
     if not scan.is_fly:
         return 0.0
-    frame = scan.frames // 2
+    half_x_mm, half_y_mm = scan.grid.size_mm[2] / 2, scan.grid.size_mm[1] / 2
+    sides_mm = [(half_x_mm, 0, 0), (-half_x_mm, 0, 0), (0, half_y_mm, 0), (0, -half_y_mm, 0)]
+    rim_mm = np.array(sides_mm) + scan.grid.offset_mm[::-1]
+    return max(_travel_mm(scan, frame, rim_mm) for frame in {0, scan.frames // 2, scan.frames - 1})
+
+
+def _travel_mm(scan: Scan, frame: int, points_mm: np.ndarray) -> float:
+    """Returns how far the points (P, 3) move at most in the panel's coordinates during the first line's exposure."""
     start_s = float(scan.frame_start_s[frame])
     pose = scan.trajectory.pose(frame, np.array([start_s, start_s + scan.shutter.exposure_s]))
     panel, column, row = pose[:, 3:6], pose[:, 6:9], pose[:, 9:12]
     u_hat, v_hat = (step / np.linalg.norm(step, axis=1, keepdims=True) for step in (column, row))
     axes = np.stack([u_hat, v_hat, np.cross(u_hat, v_hat)], -1)
-    half_mm = np.array(scan.grid.size_mm[:0:-1]) / 2
-    rim = np.array(scan.grid.offset_mm[::-1]) + [[x * half_mm[0], y * half_mm[1], 0] for x, y in _SIDES]
-    places = np.einsum("tpk,tkl->tpl", rim - panel[:, None], axes)
+    places = np.einsum("tpk,tkl->tpl", points_mm - panel[:, None], axes)
     return float(np.linalg.norm(places[1] - places[0], axis=-1).max())
 
 
@@ -136,12 +141,12 @@ class PerRow:
     def of(self, scan: Scan) -> "PerRow":
         """Returns the model with the number of times that this scan needs.
 
-        The grid's rim moves by at most 0.8 voxels from time to time, but 5 times do where it moves by less than 18 voxels
-        in an exposure, and beyond that one time to 3.6 voxels (measured in docs/results/settings.md)."""
+        That is one time to 0.75 voxels by which the grid's rim moves in an exposure, at most 5 where it moves by less than
+        18 voxels, and beyond that one to 3.6 voxels (measured in docs/results/settings.md)."""
         if self.sub_intervals:
             return self
         moved_voxels = rim_travel_mm(scan) / min(scan.grid.voxel_size_mm)
-        fine, coarse = (math.ceil(moved_voxels / step) for step in (_FINE_STEP_VOXELS, _COARSE_STEP_VOXELS))
+        fine, coarse = int(moved_voxels / _FINE_STEP_VOXELS), math.ceil(moved_voxels / _COARSE_STEP_VOXELS)
         return PerRow(min(max(1, min(fine, _USUAL_TIMES), coarse), _MOST_TIMES))
 
     def cells(self, scan: Scan, frame: int) -> TimeCells:
