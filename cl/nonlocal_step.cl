@@ -1,4 +1,4 @@
-/* A step down the quadratic ½ Σ w_ij (x_i − x_j)² over the voxels of 5³ neighbourhoods, whose weights measure how similar
+/* A step down the quadratic ½ Σ w_ij (x_i − x_j)² over the voxels of 5³ neighbourhoods. The weights measure how similar
    the 3³ patches about i and j of another volume are, the guide (Buades, Coll and Morel 2005; Gilboa and Osher 2007).
 
    Likeness exp(−d/h²), d the mean square between patches, is kept in bytes (62, nz, ny, pitch), for one of each pair of

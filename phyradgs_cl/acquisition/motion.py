@@ -141,8 +141,8 @@ class PerRow:
     def of(self, scan: Scan) -> "PerRow":
         """Returns the model with the number of times that this scan needs.
 
-        That is one time to 0.75 voxels by which the grid's rim moves in an exposure, at most 5 where it moves by less than
-        18 voxels, and beyond that one to 3.6 voxels (measured in docs/results/settings.md)."""
+        One time serves 0.75 voxels of the way of the grid's rim in an exposure, but 5 times serve up to 18 voxels. Beyond
+        that one time serves 3.6 voxels (measured in docs/results/settings.md)."""
         if self.sub_intervals:
             return self
         moved_voxels = rim_travel_mm(scan) / min(scan.grid.voxel_size_mm)

@@ -1,6 +1,6 @@
 """Phantoms of additive ellipsoids and cylinders, with line integrals in closed form.
 
-An affine map takes an ellipsoid to the unit ball and a ray to a ray, so the chord follows from the ray's distance to the
+An affine map takes an ellipsoid to the unit ball and a ray to a ray. The chord follows from the ray's distance to the
 centre (Kak and Slaney, Principles of Computerized Tomographic Imaging, IEEE Press 1988, section 3.1)."""
 
 from dataclasses import dataclass

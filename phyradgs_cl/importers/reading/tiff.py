@@ -129,9 +129,9 @@ def _opened(path: Path) -> Iterator[Any]:
 
 
 def imagej_calibration(path: Path) -> tuple[np.ndarray | None, np.ndarray | None, str]:
-    """Returns the voxel sizes (x, y, z) in mm, the origin's place (x, y, z) in voxels and the text "Info" of a stack that
-    ImageJ wrote, or of a BigTIFF in which tifffile keeps the same values as JSON; None for missing values. Call
-    ``read_tiffs`` first."""
+    """Returns the voxel sizes (x, y, z) in mm, the origin's place (x, y, z) in voxels and the text "Info" of a stack.
+    ImageJ wrote the stack, or tifffile, which keeps the same values of a BigTIFF as JSON. None stands for missing values.
+    Call ``read_tiffs`` first."""
     tifffile = checks.package("tifffile", "the package that reads TIFF", "phyradgs-cl[formats]")
     try:
         with _quiet("tifffile"), tifffile.TiffFile(path) as tiff:

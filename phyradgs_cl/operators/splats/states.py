@@ -83,8 +83,8 @@ class CloudStates:
 
 
 def segments_for_object(deformation: Deformation, lit_s: np.ndarray, voxel_mm: float) -> int:
-    """Returns the segments of a frame that is lit from lit_s[0] to lit_s[1], in each of which the path of any point of the
-    object is bent by at most a quarter of a voxel. Splats follow its mean place, and a straight path about it."""
+    """Returns the number of segments of a frame that is lit from lit_s[0] to lit_s[1]. In a segment the path of any point of
+    the object is bent by at most a quarter of a voxel. Splats follow its mean place, and a straight path about it."""
     for count in range(1, _MOST_SEGMENTS):
         weights = deformation.weights_at(np.linspace(lit_s[0], lit_s[1], 2 * count + 1))
         bend_mm = np.abs(weights[1::2] - (weights[:-1:2] + weights[2::2]) / 2) @ deformation.reach_mm

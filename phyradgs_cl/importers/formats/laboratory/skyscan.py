@@ -1,7 +1,7 @@
 """Scans of Bruker's SkyScan systems: a .log file and 16-bit TIFFs, flat-field corrected by the scanner.
 
-The log has no description by its maker. Distances and pixels are as in TIGRE's reader: a pixel of the camera is Image
-Pixel Size times the magnification, X/Y Ratio is its width over its height, and the central ray falls on the line Optical
+The log has no description by its maker. Distances and pixels are as in TIGRE's reader. A pixel of the camera is Image
+Pixel Size times the magnification; X/Y Ratio is its width over its height. The central ray falls on the line Optical
 Axis, counted from the bottom. So are row 0 on top, and with it column 0 on the right seen from the source for a sample that
 turns counterclockwise seen from above, which the log calls CC. The log states no place of the axis across the panel."""
 
