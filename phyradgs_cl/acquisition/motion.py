@@ -23,7 +23,7 @@ from phyradgs_cl.errors import InputError
 RAYS, SPLATS, LINE_POSES = "rays", "splats", "one pose per line"
 """The kinds of operator: ray projectors, splat projectors, and filtered backprojection."""
 _USUAL_TIMES, _MOST_TIMES = 5, 100  # of a line's exposure in the model ``PerRow``
-_FINE_STEP_VOXELS, _COARSE_STEP_VOXELS = 0.75, 3.6
+_FINE_STEP_VOXELS, _COARSE_STEP_VOXELS = 0.3, 3.6
 _WEIGHT_TOLERANCE = 1e-3  # of the sum of a line's weights in a model of the user's own
 
 
@@ -141,12 +141,12 @@ class PerRow:
     def of(self, scan: Scan) -> "PerRow":
         """Returns the model with the number of times that this scan needs.
 
-        One time serves 0.75 voxels of the way of the grid's rim in an exposure, but 5 times serve up to 18 voxels. Beyond
+        One time serves 0.3 voxels of the way of the grid's rim in an exposure, but 5 times serve up to 18 voxels. Beyond
         that one time serves 3.6 voxels (measured in docs/results/settings.md)."""
         if self.sub_intervals:
             return self
         moved_voxels = rim_travel_mm(scan) / min(scan.grid.voxel_size_mm)
-        fine, coarse = int(moved_voxels / _FINE_STEP_VOXELS), math.ceil(moved_voxels / _COARSE_STEP_VOXELS)
+        fine, coarse = (math.ceil(moved_voxels / step) for step in (_FINE_STEP_VOXELS, _COARSE_STEP_VOXELS))
         return PerRow(min(max(1, min(fine, _USUAL_TIMES), coarse), _MOST_TIMES))
 
     def cells(self, scan: Scan, frame: int) -> TimeCells:
