@@ -169,7 +169,7 @@ def motion(make: Maker, seed: int) -> Case:
 
 
 def beads(make: Maker, seed: int) -> Case:
-    """Twelve beads and two wires; readout and exposure off by 10 to 20 %, the rest by up to what others draw."""
+    """Twelve beads and two wires; readout and exposure off by 10 to 20 %, the rest by up to the errors of ``draw``."""
     rng = np.random.default_rng(seed)
     known, lying = drawn_beads(rng)
     size = {

@@ -34,7 +34,7 @@ ITERATIONS = {
     "phyradgs": 2000, "phyradgs micro-views": 2000,
 }  # fmt: skip
 ALL = tuple(ITERATIONS)
-WEIGHTED = {"poisson_weight": 10.0}  # of splats, beside L1
+WEIGHTED = {"poisson_weight": 10.0}  # of splats, added to L1
 GEOMETRY = ConeGeometry(5.0, 7.0, (PIXELS, PIXELS), (4.0 / PIXELS, 4.0 / PIXELS))
 
 Row = dict[str, object]
@@ -42,7 +42,7 @@ Row = dict[str, object]
 
 @dataclass(frozen=True)
 class Effect:
-    """One effect: the scan that has it, and what the runs that model and ignore it are told."""
+    """One effect: the scan that has it, and the options of the runs that model it and ignore it."""
 
     name: str
     methods: tuple[str, ...]

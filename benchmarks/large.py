@@ -33,7 +33,7 @@ def calls(
     tables = [static_cells(orbit, Shutter(0.0), f, float(f), detector) for f in range(views)]
     pose = np.concatenate([table.pose for table in tables])
     z, y, x = (np.linspace(0, 1, voxels, dtype=np.float32).reshape(shape) for shape in _axes())
-    volume = np.sin(40 * x) * np.cos(30 * y) + z  # no two bricks alike
+    volume = np.sin(40 * x) * np.cos(30 * y) + z  # every brick differs
     frames = np.random.default_rng(0).uniform(0, 1, (views, detector, detector)).astype(np.float32)
     rows = cloud(gaussians)
     return {

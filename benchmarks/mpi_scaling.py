@@ -56,7 +56,7 @@ PREDICTED = (2, 4, 8, 16, 32, 64)
 
 
 def started(rt: Runtime, gaussians: int, pixels: int, batch: int) -> SplatRun:
-    """A run of about so many Gaussians that does not grow."""
+    """Returns a run of about this number of Gaussians, which stays constant."""
     geometry = ConeGeometry(5.0, 7.0, (pixels, pixels), (4.0 / pixels,) * 2)
     voxels = 16
     while voxels**3 < 8 * gaussians:  # enough that attenuate
@@ -71,8 +71,8 @@ def started(rt: Runtime, gaussians: int, pixels: int, batch: int) -> SplatRun:
 
 
 class Clock:
-    """Seconds of this rank by part. On a processor they are its own, of threads, which do not grow with what others do:
-    kernels are what all threads but this one did. On other devices kernels are timed by events and the rest by the clock.
+    """Seconds of this rank by part. On a processor they are seconds of its own threads, which other programs do not change:
+    kernels take those of all threads but this one. On other devices kernels are timed by events and the rest by the clock.
     """
 
     def __init__(self, rt: Runtime) -> None:
@@ -156,7 +156,7 @@ def be_a_rank(gaussians: int, pixels: int, batch: int, steps: int, device: str |
 
 
 def on_ranks(ranks: int, words: list[str]) -> Facts:
-    """What rank 0 of so many has written."""
+    """Returns the facts that rank 0 of ``ranks`` has written."""
     beside = Path(sys.executable).with_name("mpiexec")
     launcher = str(beside) if beside.exists() else "mpiexec"
     with tempfile.TemporaryDirectory() as folder:
