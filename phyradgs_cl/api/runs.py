@@ -106,9 +106,10 @@ def save_volume(
     """Writes a complete volume file, or nothing: volume (nz, ny, nx) in 1/mm, lengths in mm.
 
     path: the HDF5 file; an existing one is replaced. A suffix of ``phyradgs export`` (.nii, .mha, .nrrd, .tif, .npy; .ply
-    and .npz of the Gaussians) writes that format, which holds the volume or the Gaussians only. result: what ``reconstruct``
-    returns; the file of an interrupted run can be resumed. metrics: the result of ``compare``, stored too. Raises InputError
-    for anything but a result, and for a suffix that cannot be written; OutputError where nothing can be written."""
+    and .npz of the Gaussians) writes that format, which holds the volume or the Gaussians only. result: what
+    ``reconstruct`` returns; the file of an interrupted run can be resumed. metrics: the result of ``compare``, stored too.
+    Raises InputError for anything but a result, and for a suffix that cannot be written; OutputError where nothing can be
+    written."""
     if not isinstance(result, Reconstruction):
         remedy = "for an array, Reconstruction(volume, grid)"
         raise InputError("result", checks.short_repr(result), "a Reconstruction", remedy)
@@ -204,12 +205,14 @@ def reconstruct(
 
     report: a function that gets every ``Progress``: every iteration of voxels, and every 50 iterations or ten seconds of
     splats. True: a line with rate and remaining time, in a terminal or a notebook. False: nothing. A function that raises
-    KeyboardInterrupt ends the run like Ctrl-C. resume: the partial result of an interrupted run of the same scan, options,
-    seed and first volume. initial: the volume from which an iterative or splatting method starts: a result, resampled to
-    this grid, or an array (nz, ny, nx) in 1/mm on the scan's grid. object_motion: how the object moves, for methods of
-    voxels and fdk; the volume is its reference (docs/moving.md). on_interrupt: what Ctrl-C or a notebook's stop button does
-    after the present iteration: "raise" a KeyboardInterrupt whose attribute ``partial`` is the result so far, or None;
-    "return" that result. device: what ``--device`` takes, or a Runtime.
+    KeyboardInterrupt ends the run like Ctrl-C.
+    resume: the partial result of an interrupted run of the same scan, options, seed and first volume.
+    initial: the volume from which an iterative or splatting method starts: a result, resampled to this grid, or an array
+    (nz, ny, nx) in 1/mm on the scan's grid.
+    object_motion: how the object moves, for methods of voxels and fdk; the volume is its reference (docs/moving.md).
+    on_interrupt: what Ctrl-C or a notebook's stop button does after the present iteration: "raise" a KeyboardInterrupt
+    whose attribute ``partial`` is the result so far, or None; "return" that result.
+    device: what ``--device`` takes, or a Runtime.
 
     Raises:
         InputError: options that the method does not have, or anything but a scan, method, grid or partial result.

@@ -42,19 +42,22 @@ def fly_scan(
 ) -> Scan:
     """Returns a scan whose gantry never stops, from arrays.
 
-    frames: (F, rows, columns), row 0 the lowest: line integrals, or raw counts together with ``flats``. geometry: of a cone
-    or a parallel beam, in mm. angles_deg: (F,) the gantry's angle in degrees when a frame's first line opens; 0 with the
-    source on +x, counterclockwise seen from above (+z). A sample that turns has the opposite sign. exposure_deg: the arc of
-    one line's exposure, below 0 for a clockwise gantry; None takes it from fps and exposure_s. readout_ratio: readout over
-    exposure time, from the opening of the first line to that of the last; None is 0, a global shutter. readout: the lines
-    that are read one after the other, "rows" or "columns". readout_direction: 1 reads index 0 first, -1 last. exposure_s: of
-    one line, in s; None is 1, or follows from fps and exposure_deg. first, fps, readout_ms: the terms of data sheets. first:
-    the line that is read first, "top", "bottom", "left" or "right" seen from the source, in place of readout and
-    readout_direction. fps: frames per second. readout_ms: in place of readout_ratio. flats, darks: (n, rows, columns) counts
-    without an object, and without a beam (None is 0). mask: (rows, columns) or (F, rows, columns), non-zero for pixels that
-    must not be used. quantity: of ``frames``, "attenuation", "transmission" or "counts", where ``flats`` do not tell. grid:
-    None is the cube that a full turn sees, as high as the panel sees, in voxels of one pixel at the axis. others:
-    ``detector_model`` ("log", "intensity"), ``reference`` (z, y, x) in 1/mm, ``title``, ``lag``, as in ``Scan``.
+    frames: (F, rows, columns), row 0 the lowest: line integrals, or raw counts together with ``flats``.
+    geometry: of a cone or a parallel beam, in mm.
+    angles_deg: (F,) the gantry's angle in degrees when a frame's first line opens; 0 with the source on +x,
+    counterclockwise seen from above (+z). A sample that turns has the opposite sign.
+    exposure_deg: the arc of one line's exposure, below 0 for a clockwise gantry; None takes it from fps and exposure_s.
+    readout_ratio: readout over exposure time, from the opening of the first line to that of the last; None is 0, a global
+    shutter. readout: the lines that are read one after the other, "rows" or "columns". readout_direction: 1 reads index 0
+    first, -1 last. exposure_s: of one line, in s; None is 1, or follows from fps and exposure_deg.
+    first, fps, readout_ms: the terms of data sheets. first: the line that is read first, "top", "bottom", "left" or "right"
+    seen from the source, in place of readout and readout_direction. fps: frames per second. readout_ms: in place of
+    readout_ratio.
+    flats, darks: (n, rows, columns) counts without an object, and without a beam (None is 0).
+    mask: (rows, columns) or (F, rows, columns), non-zero for pixels that must not be used.
+    quantity: of ``frames``, "attenuation", "transmission" or "counts", where ``flats`` do not tell.
+    grid: None is the cube that a full turn sees, as high as the panel sees, in voxels of one pixel at the axis.
+    others: ``detector_model`` ("log", "intensity"), ``reference`` (z, y, x) in 1/mm, ``title``, ``lag``, as in ``Scan``.
 
     Raises InputError for shapes that do not fit, numbers out of range or implausible, contradictory arguments, and angles
     whose sense differs from the exposure's."""
