@@ -30,7 +30,7 @@ _DOUBTFUL = 0.1  # of that ratio: from here other orders and missing frames are 
 _RANDOM_ORDERS = 2
 _FEWEST_FRAMES, _FEWEST_PIXELS = 5, 32
 _CLEAR = 0.5  # squared residual of another hypothesis over the stated one's
-_NEARLY = 1.5  # squared residual of a rough fit over the best one's: up to here a sense of rotation is refined
+_NEARLY = 1.5  # squared residual of a rough fit over the best one's: up to here a hypothesis is refined
 _ERRORS = 4.0
 _SYMMETRIC = 2.0  # residual in a random order over the stated one's
 _SAME = 0.03  # residual in a random order over the frames' spread: below this and _SYMMETRIC, angles leave no trace
@@ -161,8 +161,9 @@ def _explanation(rt: Runtime, scan: Scan, as_stated: Scan, coarse: _CoarseFit) -
 def _refined_hypotheses(rt: Runtime, scan: Scan, as_stated: Scan, most: float) -> list[Hypothesis]:
     """Returns the best two hypotheses about the whole scan, the panel shifted to fit best.
 
-    Both have to leave less than ``most`` (mean squared residual) in a rough fit. Large shifts count against a hypothesis; of
-    hypotheses with the same factor of sizes the one with the smaller shift counts."""
+    A rough fit must nearly reach ``most`` (mean squared residual): an offset between two coarse pixels hides other
+    differences there. Large shifts count against a hypothesis; of hypotheses with the same factor of sizes the one with the
+    smaller shift counts."""
     tried: list[tuple[Hypothesis, Scan, axis.AxisShift]] = []
     for hypothesis in hypotheses.of_scan(scan, as_stated):
         other = hypothesis.scan()
@@ -177,7 +178,7 @@ def _refined_hypotheses(rt: Runtime, scan: Scan, as_stated: Scan, most: float) -
             factors.add(hypothesis.factor)
     refined = []
     for hypothesis, other, rough in distinct[:_MOST_REFINED]:
-        if rough.squares.mean() < most:
+        if rough.squares.mean() < _NEARLY * most:
             shift = axis.refined_shift(rt, other, rough)
             pixels = shift.pixels if shift.is_found else rough.pixels
             refined.append(replace(hypothesis, scan=partial(shifted, other, pixels)))

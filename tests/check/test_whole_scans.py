@@ -77,6 +77,15 @@ def test_sizes_in_another_unit_are_no_offset(rt, aside) -> None:
     assert ("they do not tell which" in said) == (aside.geometry.detector_offset_mm[1] == 0)
 
 
+def test_sizes_in_another_unit_are_no_offset_where_the_fan_is_narrow(rt, scan_of) -> None:
+    """The axis lies between two coarse pixels, where a rough fit of the right sizes is no better than that of the wrong."""
+    pitch_mm = 0.0625
+    narrow = ConeGeometry(25.0, 35.0, (64, 64), (pitch_mm, pitch_mm), (0.0, 2.6 * pitch_mm))
+    scan = scan_of(narrow, views=15, exposure_deg=24.0, readout_ratio=0.5)
+    wrong = imported(scan, pixel_size_mm=(pitch_mm / 1000,) * 2, detector_offset_mm=(0.0, 0.0))
+    assert "pixel sizes 1000 times as large" in only_alarm(check(wrong, rt))
+
+
 def test_distances_in_another_unit_are_no_offset(rt, aside) -> None:
     factor = 10.0 if aside.geometry.detector_offset_mm[1] == 0 else 0.1
     far = {"source_to_axis_mm": 5.0 * factor, "source_to_detector_mm": 7.0 * factor}
