@@ -44,13 +44,16 @@ __kernel void ridge_channels(
     FOR_X(x, shape.x - 2)
     {
         vf sums[CHANNELS];
+        #pragma unroll
         for (int c = 0; c < CHANNELS; c++)
             sums[c] = (vf)(0.0f);
         for (int tap = 0; tap < TAPS; tap++) {
             const vf value = V_LOAD(volume + (tap / 9) * slice + (size_t)(tap / 3 % 3) * pitch + tap % 3 + x);
+            #pragma unroll
             for (int c = 0; c < CHANNELS; c++)
-                sums[c] = mad((vf)(table[tap * CHANNELS + c]), value, sums[c]);
+                sums[c] += table[tap * CHANNELS + c] * value;
         }
+        #pragma unroll
         for (int c = 0; c < CHANNELS; c++)
             V_STORE(inside(sums[c], x, shape.x - 2), channels + row_of(shape, pitch, CHANNELS, c, y, z) + x);
     }
@@ -65,18 +68,22 @@ __kernel void ridge_responses(
     FOR_X(x, shape.x - 4)
     {
         vf sums[FILTERS];
+        #pragma unroll
         for (int i = 0; i < FILTERS; i++)
             sums[i] = (vf)(0.0f);
+        #pragma unroll
         for (int c = 0; c < CHANNELS; c++)
             for (int row = 0; row < 9; row++) {
                 __global const float *line = channels + row_of(shape, pitch, CHANNELS, c, y + row % 3, z + row / 3) + x;
                 for (int k = 0; k < 3; k++) {
                     __constant const float *weights = table + SECOND + (c * TAPS + row * 3 + k) * FILTERS;
                     const vf value = V_LOAD(line + k);
+                    #pragma unroll
                     for (int i = 0; i < FILTERS; i++)
-                        sums[i] = mad((vf)(weights[i]), value, sums[i]);
+                        sums[i] += weights[i] * value;
                 }
             }
+        #pragma unroll
         for (int i = 0; i < FILTERS; i++) {
             __constant const float *curve = table + CURVES + i;
             const vf up = (vf)(sigma * curve[FILTERS]), down = (vf)(sigma * curve[3 * FILTERS]);
@@ -86,7 +93,7 @@ __kernel void ridge_responses(
     }
 }
 
-/* The transpose of the second filters. */
+/* The transpose of the second filters. Sums of their own for each k do not wait for one another. */
 __kernel void ridge_channels_back(
     __global const float *responses, const int4 shape, const int pitch, const int first, __constant const float *table,
     __global float *channels)
@@ -94,25 +101,31 @@ __kernel void ridge_channels_back(
     const int y = (int)get_global_id(1), z = first + (int)get_global_id(2);
     FOR_X(x, shape.x - 2)
     {
-        vf sums[CHANNELS];
-        for (int c = 0; c < CHANNELS; c++)
-            sums[c] = (vf)(0.0f);
+        vf sums[3][CHANNELS];
+        #pragma unroll
+        for (int n = 0; n < 3 * CHANNELS; n++)
+            sums[n / CHANNELS][n % CHANNELS] = (vf)(0.0f);
         for (int row = 0; row < 9; row++) {
             const int from_y = y - row % 3, from_z = z - row / 3;
             if (from_y < 0 || from_y >= shape.y - 4 || from_z < 0 || from_z >= shape.z - 4)
                 continue;
             for (int i = 0; i < FILTERS; i++) {
                 __global const float *line = responses + row_of(shape, pitch, FILTERS, i, from_y, from_z) + x;
+                __constant const float *weights = table + SECOND_BACK + (row * 3 * FILTERS + i) * CHANNELS;
+                #pragma unroll
                 for (int k = 0; k < 3; k++) {
-                    __constant const float *weights = table + SECOND_BACK + ((row * 3 + k) * FILTERS + i) * CHANNELS;
                     const vf value = V_LOAD(line - k);
+                    #pragma unroll
                     for (int c = 0; c < CHANNELS; c++)
-                        sums[c] = mad((vf)(weights[c]), value, sums[c]);
+                        sums[k][c] += weights[k * FILTERS * CHANNELS + c] * value;
                 }
             }
         }
-        for (int c = 0; c < CHANNELS; c++)
-            V_STORE(inside(sums[c], x, shape.x - 2), channels + row_of(shape, pitch, CHANNELS, c, y, z) + x);
+        #pragma unroll
+        for (int c = 0; c < CHANNELS; c++) {
+            const vf sum = sums[0][c] + sums[1][c] + sums[2][c];
+            V_STORE(inside(sum, x, shape.x - 2), channels + row_of(shape, pitch, CHANNELS, c, y, z) + x);
+        }
     }
 }
 
@@ -127,6 +140,7 @@ __kernel void ridge_step(
     FOR_X(x, shape.x)
     {
         vf sums[CHANNELS];
+        #pragma unroll
         for (int c = 0; c < CHANNELS; c++)
             sums[c] = (vf)(0.0f);
         for (int row = 0; row < 9; row++) {
@@ -134,9 +148,10 @@ __kernel void ridge_step(
             if (from_y < 0 || from_y >= shape.y - 2 || from_z < 0 || from_z >= shape.z - 2)
                 continue;
             for (int k = 0; k < 3; k++)
+                #pragma unroll
                 for (int c = 0; c < CHANNELS; c++)
-                    sums[c] = mad((vf)(table[(row * 3 + k) * CHANNELS + c]),
-                        V_LOAD(channels + row_of(shape, pitch, CHANNELS, c, from_y, from_z) + x - k), sums[c]);
+                    sums[c] += table[(row * 3 + k) * CHANNELS + c]
+                        * V_LOAD(channels + row_of(shape, pitch, CHANNELS, c, from_y, from_z) + x - k);
         }
         const vf moved = V_LOAD(volume + x) - step * ((sums[0] + sums[1]) + (sums[2] + sums[3]));
         const vf value = nonnegative ? max(moved, (vf)(0.0f)) : moved;
