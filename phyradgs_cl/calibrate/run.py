@@ -58,7 +58,7 @@ _FEWEST_FRAMES, _FEWEST_COLUMNS = 8, 12
 _FEWEST_SPLINES = 4  # of a cubic spline
 _LEAST_EXPLAINED = 0.3  # of the frames' variance, by a phantom in its best place before any correction
 _ORDER_ERRORS, _ORDER_RATIO = 4.0, 1.04  # of the other readout direction's residual, as in ``check``
-_EXPECTED_SHARE = 0.4  # of the most passes of a stage: few parameters are determined, and steps become small early
+_EXPECTED_SHARE = 0.25  # of the most passes of a stage: few parameters are determined, and steps become small early
 
 
 def calibrate(

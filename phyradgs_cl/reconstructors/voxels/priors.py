@@ -27,9 +27,9 @@ from phyradgs_cl.reconstructors.result import function_name
 from phyradgs_cl.runtime import Runtime, Space
 
 # shares of the prior's weight, by the prior (docs/results/settings.md)
-_TV_ALONE, _TV_BEFORE_DCT, _TV_BEFORE_RIDGE, _DCT = 1.6, 0.8, 0.5, 1.5
+_TV_ALONE, _TV_BEFORE_DCT, _TV_BEFORE_RIDGE, _DCT = 1.6, 0.8, 0.4, 1.5
 _TV_BEFORE_CURVES, _CURVES_NOISE, _CURVES = 0.5, 50.0, 3.0  # noise that the curves assume, and strength of their step
-_RIDGE_NOISE, _RIDGE_LENGTH, _RIDGE_EVERY = 15.0, 0.5, 5  # noise that the step assumes, its length, and maps for each step
+_RIDGE_NOISE, _RIDGE_LENGTH, _RIDGE_EVERY = 15.0, 0.5, 4  # noise that the step assumes, its length, and maps for each step
 _NONLOCAL, _NONLOCAL_BEFORE_DCT = 300.0, 100.0  # of the filtering parameter h
 _NONLOCAL_STEP = 0.01  # length of a step down the nonlocal quadratic
 
@@ -139,7 +139,7 @@ class TvAndDct(Prior):
 
 
 class ThenRidge(Prior):
-    """Another prior, and after every fifth of its maps a step down the learned ridge regulariser."""
+    """Another prior, and after every fourth of its maps a step down the learned ridge regulariser."""
 
     VOLUMES = RidgeStep.VOLUMES
 
