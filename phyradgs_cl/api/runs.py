@@ -20,7 +20,6 @@ from phyradgs_cl.importers import load_volume as load_voxels
 from phyradgs_cl.io import (
     Volume,
     read_deformation,
-    read_scan,
     read_state,
     read_volume,
     write_deformation,
@@ -28,7 +27,8 @@ from phyradgs_cl.io import (
     write_volume,
 )
 from phyradgs_cl.phantoms import PHANTOMS
-from phyradgs_cl.prepare import DEFAULT_STEPS, flat_correction
+from phyradgs_cl.prepare import DEFAULT_STEPS
+from phyradgs_cl.prepare.light import read_corrected
 from phyradgs_cl.progress import Ticker, has_reader
 from phyradgs_cl.reconstructors import DEFAULT_METHOD, ObjectMotion, Reconstruction, State, preprocessing_of
 from phyradgs_cl.reconstructors import reconstruct as run_method
@@ -46,8 +46,7 @@ def load_scan(path: str | Path, flats: str = "mean") -> Scan:
 
     path: the HDF5 file. flats: how flat fields correct a frame, by their ``mean``, by ``time`` or by ``pca``
     (docs/prepare.md). Raises InputError, which names the HDF5 path of the wrong value."""
-    scan = read_scan(_checked_path(path), flat_correction(flats))
-    return scan if flats == "mean" else replace(scan, provenance={**scan.provenance, "flats": flats})
+    return read_corrected(_checked_path(path), flats)
 
 
 def save_scan(path: str | Path, scan: Scan) -> None:

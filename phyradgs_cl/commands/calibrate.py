@@ -57,7 +57,7 @@ def calibrate_command(
     if output is not None:
         check_output(output, scan, other, phantom)
     if picture is not None:
-        check_picture(picture, scan, other, phantom)
+        check_picture("--picture", picture, scan, other, phantom)
     with Ticker("pass") as ticker:
         ticker.stage(f"reading {scan}")
         shape = None if phantom is None else load_beads(phantom)

@@ -21,7 +21,7 @@ from phyradgs_cl.commands.options import (
     with_run_options,
 )
 from phyradgs_cl.estimate import duration, estimate, seconds_around
-from phyradgs_cl.io import partial_path
+from phyradgs_cl.io import partial_path, refuse_overwriting
 from phyradgs_cl.parallel import failing_together, launched_ranks
 from phyradgs_cl.progress import Ticker
 from phyradgs_cl.reconstructors import ProgressReport, Reconstruction, Report, RunPlan
@@ -31,6 +31,7 @@ from phyradgs_cl.reconstructors.tune import TUNED, tuning_line
 from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.settings import Settings
 from phyradgs_cl.workflow import load_scan, profile_report, run_reconstruction
+from phyradgs_cl.workflow.files import check_picture
 from phyradgs_cl.workflow.slabs import Slabs, rows_of
 
 EXAMPLES = {
@@ -75,18 +76,20 @@ def reconstruct_command(
         return runtimes[-1]
 
     inputs = [path for path in (settings.config, initial, object_motion) if path is not None]
+    files = scan, output, partial_path(output), *inputs
     listeners: list[ProgressReport] = [ticker.progress]
     with failing_together(ranks, last_words), ticker, ExitStack() as stack:
         page = None
         if live is not None:
-            report.check_live(live, scan, output, partial_path(output), *inputs)
+            check_picture("--live", live, *files, suffixes=(".html", ".htm"))
             if ranks.rank == 0:
                 page = stack.enter_context(report.LivePage(live, output.name, _settings_of(plan, scan)))
                 listeners.append(page)
         stage(f"reading {scan}")
         picture = None
         if preview is not None:
-            report.check_preview(preview, scan, output, partial_path(output))
+            check_picture("--preview", preview, *files)
+            refuse_overwriting("--preview", partial_path(preview), *files)
             picture = report.Preview(preview)
             listeners.append(picture)
         result, metrics = run_reconstruction(

@@ -11,7 +11,7 @@ from phyradgs_cl.errors import InputError
 from phyradgs_cl.exporters import writers
 from phyradgs_cl.exporters.dicom import DicomLabels, write_dicom
 from phyradgs_cl.fields import Deformation, deformed
-from phyradgs_cl.io import Volume, read_volume
+from phyradgs_cl.io import Volume, read_volume, refuse_overwriting
 
 __all__ = [
     "CLOUDS", "EXPORTS", "DicomLabels", "default_output", "export_states", "export_stored", "export_volume",
@@ -53,8 +53,7 @@ def _checked_target(
     suffixes = _suffixes(to)  # programs go by the suffix
     if suffixes and not target.name.lower().endswith(suffixes):
         raise InputError(f"output of --to {to}", str(target), f"a name that ends in {' or '.join(suffixes)}")
-    if target.resolve() == path.resolve():
-        raise InputError("output", f"the input {path} itself", "another name")
+    refuse_overwriting("output", target, path)
     if to in CLOUDS and mu_water_per_mm is not None:
         raise InputError("--mu-water-per-mm", f"with --to {to}", "voxels", "Gaussians stay in 1/mm")
     if to != "dicom" and labels is not None and labels.given:

@@ -10,6 +10,7 @@ from .output import former_checkpoint_path as former_checkpoint_path
 from .output import only_run as only_run
 from .output import partial_path as partial_path
 from .output import read_checkpoint as read_checkpoint
+from .output import refuse_overwriting as refuse_overwriting
 from .output import write_checkpoint as write_checkpoint
 from .output import written_beside as written_beside
 from .scan.reader import ToAttenuation as ToAttenuation

@@ -40,6 +40,13 @@ def check_writable(path: str | Path) -> None:
     _create_beside(_target(path)).unlink()
 
 
+def refuse_overwriting(option: str, output: str | Path, *others: Path | None) -> None:
+    """Raises InputError for an output that is one of the other files of a command."""
+    for path in others:
+        if path is not None and Path(output).resolve() == path.resolve():
+            raise InputError(option, f"{path}, which the command reads or writes", "another file to write")
+
+
 def make_folder(folder: Path, subject: Path) -> None:
     """Creates a folder and those above it; OutputError about ``subject`` where that fails."""
     try:

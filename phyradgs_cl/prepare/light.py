@@ -5,9 +5,10 @@ of the stored frames. pca: each frame takes the combination of their principal c
 variation, in logarithms (Van Nieuwenhove et al., Opt. Express 23 (2015) 27975). The amount of light in each frame comes from
 the step ``air``: pixels beside the object, as in nabu and in algotom's ROI normalisation."""
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from functools import partial
+from pathlib import Path
 
 import numpy as np
 import scipy
@@ -17,6 +18,7 @@ from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.detector import counts_to_attenuation
 from phyradgs_cl.detector.attenuation import DARK, FLAT, PROJECTION, TRANSMISSION_FLOOR, mean_dark, minus_log
 from phyradgs_cl.errors import InputError
+from phyradgs_cl.io import ToAttenuation, read_scan
 from phyradgs_cl.prepare.step import Facts, MakeModel, unmasked_frames
 
 WAYS = ("mean", "time", "pca")
@@ -27,7 +29,6 @@ _AROUND = np.ones((3, 3), bool)
 _MARGIN = 2  # pixels between air and the object's edge
 _PASSES = 3  # the threshold moves with the value of air
 Counts = np.ndarray
-ToAttenuation = Callable[[Counts, np.ndarray, str], tuple[np.ndarray, np.ndarray | None]]
 
 
 def flat_correction(way: str) -> ToAttenuation:
@@ -37,6 +38,12 @@ def flat_correction(way: str) -> ToAttenuation:
     InputError for other quantities and for too few flats."""
     checks.one_of("flats", way, WAYS)
     return counts_to_attenuation if way == "mean" else partial(_with_changing_flats, way)
+
+
+def read_corrected(path: str | Path, flats: str = "mean", rows: tuple[int, int] | None = None) -> Scan:
+    """Reads a scan file, or some of its rows, as line integrals by ``flat_correction``. See ``io.read_scan``."""
+    scan = read_scan(path, flat_correction(flats), rows)
+    return scan if flats == "mean" else replace(scan, provenance={**scan.provenance, "flats": flats})
 
 
 def _with_changing_flats(

@@ -1,9 +1,7 @@
 from .live import LivePage as LivePage
-from .live import check_live as check_live
 from .page import report_page as report_page
 from .page import write_report as write_report
 from .preview import Preview as Preview
-from .preview import check_preview as check_preview
 from .preview import view_volume as view_volume
 from .preview import write_preview as write_preview
 from .run import Run as Run

@@ -8,8 +8,8 @@ from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
 
-from phyradgs_cl.errors import InputError, PhyradgsError
-from phyradgs_cl.io import check_writable, written_beside
+from phyradgs_cl.errors import PhyradgsError
+from phyradgs_cl.io import written_beside
 from phyradgs_cl.reconstructors import Progress
 from phyradgs_cl.reconstructors.projected import FramePair
 from phyradgs_cl.report.live_page import Snapshot, Status, live_page
@@ -19,15 +19,6 @@ SHARE = 0.01  # of the run's time, at most, that pictures may cost it
 FRAMES = 2
 FRAMES_FROM_S = 60.0  # of runs that are expected to be shorter no frames are computed: the report has them soon
 log = logging.getLogger(__name__)
-
-
-def check_live(path: Path, *others: Path) -> None:
-    """Raises InputError or OutputError if the page cannot be written, or would replace one of ``others``."""
-    if path.suffix.lower() not in (".html", ".htm"):
-        raise InputError("--live", str(path), "a file name that ends in .html")
-    if path.resolve() in {other.resolve() for other in others}:
-        raise InputError("--live", f"{path}, which the run needs", "another file to write")
-    check_writable(path)
 
 
 class LivePage:

@@ -10,7 +10,7 @@ import numpy as np
 from phyradgs_cl import __version__
 from phyradgs_cl.acquisition.motion import motion_facts
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.io import check_writable, written_beside
+from phyradgs_cl.io import check_writable, refuse_overwriting, written_beside
 from phyradgs_cl.metrics import printed
 from phyradgs_cl.reconstructors.projected import FramePair
 from phyradgs_cl.report import sections
@@ -37,9 +37,7 @@ def write_report(
     DeviceError where no device can project."""
     check_writable(output)
     run = load_run(volume, scan)
-    for path in (volume, run.scan_path):
-        if path is not None and Path(output).resolve() == path.resolve():
-            raise InputError("-o", f"the input file {path} itself", "another file to write")
+    refuse_overwriting("-o", output, volume, run.scan_path)
     if Path(output).suffix.lower() not in ("", ".html", ".htm"):
         found, remedy = f"the suffix {Path(output).suffix}", "a browser prints the page to a PDF"
         raise InputError("-o", found, "an HTML page, as NAME.html", remedy)

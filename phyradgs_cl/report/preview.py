@@ -17,7 +17,6 @@ from phyradgs_cl.errors import InputError, PhyradgsError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.io import (
     Volume,
-    check_writable,
     file_kind,
     partial_path,
     read_scan,
@@ -41,15 +40,6 @@ def write_preview(volume: NDArray[np.floating], grid: Grid, path: str | Path) ->
     picture = png_bytes(preview_image(volume, grid))
     with written_beside(path) as temporary:
         temporary.write_bytes(picture)
-
-
-def check_preview(path: Path, *others: Path) -> None:
-    """Raises InputError or OutputError if the picture cannot be written, or would replace one of ``others``."""
-    if path.suffix.lower() != ".png":
-        raise InputError("--preview", str(path), "a file name that ends in .png")
-    if {one.resolve() for one in (path, partial_path(path))} & {other.resolve() for other in others}:
-        raise InputError("--preview", f"{path}, which the run needs", "another file to write")
-    check_writable(path)
 
 
 class Preview:

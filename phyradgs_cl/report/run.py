@@ -19,13 +19,12 @@ from phyradgs_cl.io import (
     Volume,
     file_kind,
     read_deformation,
-    read_scan,
     read_volume,
     scan_summary,
     sha256_of,
 )
 from phyradgs_cl.metrics import METRICS, aligned, compare
-from phyradgs_cl.prepare import flat_correction
+from phyradgs_cl.prepare.light import read_corrected
 from phyradgs_cl.prepare.step import Facts
 from phyradgs_cl.reconstructors import Preprocessing, preprocessing_of
 from phyradgs_cl.reconstructors.fdk import static_fdk
@@ -125,9 +124,7 @@ def _with_scan(run: Run, path: Path, is_given: bool, notes: list[str]) -> Run:
         notes.append("The scan shown here is not the file that this volume was reconstructed from: its hash differs.")
     if run.preprocessing.margin_mm is not None:
         notes.append("The filled margin around the box is discarded: frames computed from the volume lack it.")
-    flats = run.preprocessing.flats
-    scan = read_scan(path, flat_correction(flats))
-    scan = replace(scan, provenance={**scan.provenance, "flats": flats})
+    scan = read_corrected(path, run.preprocessing.flats)
     run = replace(run, scan=scan.on_grid(grid), scan_path=path, scan_facts=facts)
     if scan.reference is None:
         return run
@@ -150,12 +147,19 @@ def _scan_of(path: Path, provenance: Mapping[str, object], notes: list[str]) -> 
     if not isinstance(name, str) or not name:
         notes.append("The volume file names no scan.")
         return None
-    sha256 = provenance.get("scan_sha256")
+    place = _same_file(path, name, provenance.get("scan_sha256"))
+    if place is not None and file_kind(place) == "scan":
+        return place
+    notes.append(f"The scan {plain_text(name)} was not found, or has changed since; --scan names it.")
+    return None
+
+
+def _same_file(path: Path, name: str, sha256: object) -> Path | None:
+    """Returns the file ``name``, in the present or the volume's folder, if it has this hash."""
     for place in (Path(name), path.parent / name, path.parent / Path(name).name):
         with suppress(InputError):  # the name may be that of any file of this machine
-            if file_kind(place) == "scan" and sha256_of(place) == sha256:
+            if sha256_of(place) == sha256:
                 return place
-    notes.append(f"The scan {plain_text(name)} was not found, or has changed since; --scan names it.")
     return None
 
 
@@ -173,13 +177,12 @@ def computed_views(run: Run, rt: Runtime, count: int) -> list[FramePair]:
 def _named_deformation(path: Path, provenance: Mapping[str, object], notes: list[str]) -> Deformation | None:
     """Returns how the object moved, from the file that the provenance names, if it has the stored hash. A file that is
     missing is a remark."""
-    name, sha256 = provenance.get("object_motion"), provenance.get("object_motion_sha256")
+    name = provenance.get("object_motion")
     if not isinstance(name, str) or not name:
         return None
-    for place in (Path(name), path.parent / name, path.parent / Path(name).name):
-        with suppress(InputError, OSError):
-            if sha256_of(place) == sha256:
-                return read_deformation(place)
+    place = _same_file(path, name, provenance.get("object_motion_sha256"))
+    if place is not None:
+        return read_deformation(place)
     words = f"The motion of the object {plain_text(name)} was not found, or has changed since: "
     notes.append(words + "there are no computed projections, and no motion.")
     return None

@@ -1,8 +1,7 @@
 """Loads files by their kind: scans, references and volumes; summaries of their contents."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,12 +16,12 @@ from phyradgs_cl.io import (
     deformation_summary,
     file_kind,
     holds_deformation,
-    read_scan,
     scan_summary,
     volume_summary,
 )
 from phyradgs_cl.io.hdf5.source import open_hdf5
-from phyradgs_cl.prepare import flat_correction
+from phyradgs_cl.io.output import refuse_overwriting
+from phyradgs_cl.prepare.light import read_corrected
 
 _KINDS = {
     "scan": "a scan",
@@ -34,10 +33,9 @@ _OF_MOTION = ("fields", "control_points", "displacements_below_mm", "smallest_de
 
 
 def load_scan(path: str | Path, flats: str = "mean", rows: tuple[int, int] | None = None) -> Scan:
-    """Reads a scan file, or some of its rows, as line integrals; flats as in ``prepare.flats``. See ``io.read_scan``."""
+    """Reads a scan file, or some of its rows, as line integrals. See ``read_corrected``."""
     with expecting(path, "scan"):
-        scan = read_scan(path, flat_correction(flats), rows)
-    return scan if flats == "mean" else replace(scan, provenance={**scan.provenance, "flats": flats})
+        return read_corrected(path, flats, rows)
 
 
 @contextmanager
@@ -80,19 +78,13 @@ def check_output(output: Path, *inputs: Path | None, remedy: str = "write scan.h
     check_writable(output)
 
 
-def check_picture(picture: Path, *inputs: Path | None) -> None:
-    """Raises InputError for a picture that is one of the inputs or no PNG, OutputError where it cannot be written."""
-    refuse_overwriting("--picture", picture, *inputs)
-    if picture.suffix.lower() != ".png":
-        raise InputError("--picture", str(picture), "a file name that ends in .png")
+def check_picture(option: str, picture: Path, *others: Path | None, suffixes: Sequence[str] = (".png",)) -> None:
+    """Raises InputError for a picture or page that is one of the other files or has none of the suffixes, OutputError where
+    it cannot be written."""
+    refuse_overwriting(option, picture, *others)
+    if picture.suffix.lower() not in suffixes:
+        raise InputError(option, str(picture), f"a file name that ends in {suffixes[0]}")
     check_writable(picture)
-
-
-def refuse_overwriting(option: str, output: Path, *inputs: Path | None) -> None:
-    """Raises InputError for an output that is one of the inputs."""
-    for path in inputs:
-        if path is not None and output.resolve() == path.resolve():
-            raise InputError(option, f"the input file {path} itself", "another file to write")
 
 
 def load_result(path: Path) -> Volume:

@@ -26,14 +26,14 @@ from phyradgs_cl.io import (
     write_checkpoint,
     write_volume,
 )
-from phyradgs_cl.io.output import checkpoint_path, former_checkpoint_path
+from phyradgs_cl.io.output import checkpoint_path, former_checkpoint_path, refuse_overwriting
 from phyradgs_cl.metrics import VOXEL_BY_VOXEL, aligned, compare
 from phyradgs_cl.parallel import Communicator
 from phyradgs_cl.reconstructors.result import COMPARED, HELD_OUT
 from phyradgs_cl.reconstructors.run import check_resumable
 from phyradgs_cl.runtime import Runtime, profile_text
 from phyradgs_cl.text import plain_text
-from phyradgs_cl.workflow.files import check_output, expecting, load_scan, refuse_overwriting
+from phyradgs_cl.workflow.files import check_output, expecting, load_scan
 from phyradgs_cl.workflow.slabs import Slabs, reconstruct_slabs, remove_slabs, surely_fits
 
 log = logging.getLogger(__name__)

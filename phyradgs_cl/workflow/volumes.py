@@ -14,6 +14,7 @@ from phyradgs_cl.fields.gaussians import ROWS
 from phyradgs_cl.fields.grid_choice import voxel_sides_mm
 from phyradgs_cl.importers import load_attenuation
 from phyradgs_cl.io import Volume, check_writable, hashing, read_deformation, write_volume, written_beside
+from phyradgs_cl.io.output import refuse_overwriting
 from phyradgs_cl.io.volume import interruption
 from phyradgs_cl.metrics import (
     METRICS,
@@ -37,7 +38,6 @@ from phyradgs_cl.workflow.files import (
     expecting,
     load_reference,
     load_result,
-    refuse_overwriting,
 )
 
 log = logging.getLogger(__name__)
@@ -54,7 +54,7 @@ def run_evaluation(
     reference without a scale, one length or (z, y, x). ``object_motion``: the file of a deformation, which shows the volume
     at each true state of a scan; None takes the volume's own, if it has one. ``reference_of_rtk``: the
     reference has RTK's axes. InputError: no such sides; files that do not fit each other."""
-    check_picture(picture, volume_path, reference_path, object_motion)
+    check_picture("--picture", picture, volume_path, reference_path, object_motion)
     field = None if object_motion is None else read_deformation(object_motion)
     result, (stored, moving) = load_result(volume_path), load_reference(reference_path)
     if field is not None and (moving is None or result.grid is None):

@@ -191,5 +191,5 @@ def test_files_of_beads_are_checked(refused, file, tmp_path) -> None:
         assert old in BEADS
         refused(words, said)
     refused([*words[:6], tmp_path / "none.toml", *words[7:]], "none.toml")
-    refused([*words[:6], file, "-o", file], "the input file")
+    refused([*words[:6], file, "-o", file], "reads or writes")
 

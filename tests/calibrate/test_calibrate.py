@@ -184,7 +184,7 @@ def test_views_of_frames_that_overlap_have_no_place_in_a_file(refused, right, tm
     write_scan(path, replace(right, shutter=replace(right.shutter, readout_s=1.5)))
     refused(["calibrate", path, "--what", "wobble", "-o", tmp_path / "out.h5"], "do not overlap in time")
     refused(["calibrate", path, "--what", "offset, drift", "-o", tmp_path / "out.h5"], "prepare --steps air")
-    refused(["calibrate", path, "-o", path], "the input file")
+    refused(["calibrate", path, "-o", path], "reads or writes")
     refused(["calibrate", path, "-o", tmp_path / "out.png"], "the suffix .png of another format")
     for picture in ("out.h5", "out.jpg", "out"):
         refused(["calibrate", path, "-o", tmp_path / "out.h5", "--picture", tmp_path / picture], "ends in .png")

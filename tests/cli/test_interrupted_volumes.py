@@ -52,5 +52,5 @@ def test_a_partial_volume_has_a_name_of_its_own_where_no_scan_lies(refused, tmp_
         assert path.suffix in ("", Path(name).suffix) or not Path(name).suffix
     scan = tmp_path / "volume.partial.h5"
     scan.write_bytes(b"a scan")
-    refused(["reconstruct", scan, "-o", tmp_path / "volume.h5", "--method", "fdk"], "the input file")
+    refused(["reconstruct", scan, "-o", tmp_path / "volume.h5", "--method", "fdk"], "reads or writes")
     assert list(tmp_path.iterdir()) == [scan]

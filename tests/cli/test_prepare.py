@@ -65,7 +65,7 @@ def test_bad_input_is_one_line_and_loses_nothing(refused, simulated, tmp_path) -
         (["--steps", "rings", "--set", "rings.windows=3"], ("rings.windows", "did you mean 'window'")),
         (["--set", "iterations=3"], ("--set iterations=3", "no such option")),
         (["--set", "flats=time"], ("flats=time", "attenuation with 0 flats", "flats=mean")),
-        (["-o", source], ("-o", "the input file")),
+        (["-o", source], ("-o", "reads or writes")),
     ):
         refused(["prepare", source, "-o", output, *words], *parts)
     for step, part in (("air", "pixels of air"), ("scatter", "state scatter.to_primary"), ("hardening", "hardening")):

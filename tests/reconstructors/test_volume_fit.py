@@ -91,7 +91,7 @@ def test_what_the_command_refuses_is_one_line(cli, volume_file, tmp_path, capsys
     for words, message in (
         ([str(volume_file), "-o", str(tmp_path / "c.nii")], "no place for Gaussians"),
         ([str(volume_file), "-o", str(tmp_path / "c.obj")], "ends in .h5, .ply or .npz"),
-        ([str(volume_file), "-o", str(volume_file)], "the input file"), ([bare, *out], "--voxel-mm"),
+        ([str(volume_file), "-o", str(volume_file)], "reads or writes"), ([bare, *out], "--voxel-mm"),
         ([str(volume_file), *out, "--voxel-mm", "1"], "a volume without a scale"),
         ([str(volume_file), *out, "--iterations", "-1"], "--iterations"), ([str(tmp_path / "no.h5"), *out], "no.h5"),
         ([str(tmp_path / "hot.npy"), *out, "--voxel-mm", "1"], "hot.npy: found a value of size 1e+30"),

@@ -12,9 +12,10 @@ from phyradgs_cl.errors import InputError, NumericalError, OutOfMemoryError, Out
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.reconstructors import Progress
 from phyradgs_cl.reconstructors.projected import FramePair
-from phyradgs_cl.report import LivePage, check_live
+from phyradgs_cl.report import LivePage
 from phyradgs_cl.report.live import SHARE
 from phyradgs_cl.report.live_page import Snapshot, Status, live_page
+from phyradgs_cl.workflow.files import check_picture
 
 GRID = Grid.cube(6, 3.0)
 SETTINGS = {"scan": "scan.h5", "method": "sart", "options": {"relaxation": 0.7}}
@@ -182,8 +183,8 @@ def test_a_page_has_its_own_file(tmp_path) -> None:
         (tmp_path / "p.png", InputError), (tmp_path / "volume.html", InputError), (tmp_path / "none" / "p.html", OutputError)
     ):  # fmt: skip
         with pytest.raises(error):
-            check_live(path, tmp_path / "volume.html")
-    check_live(tmp_path / "p.html", tmp_path / "volume.html")
+            check_picture("--live", path, tmp_path / "volume.html", suffixes=(".html", ".htm"))
+    check_picture("--live", tmp_path / "p.html", tmp_path / "volume.html", suffixes=(".html", ".htm"))
     assert not list(tmp_path.iterdir())
 
 

@@ -264,8 +264,8 @@ def test_files_of_another_kind_are_named_and_inputs_never_replaced(files, tmp_pa
         ((scan, page), InputError, "found a scan"),
         ((volume, page, volume), InputError, "--scan.*found a volume"),
         ((volume, tmp_path / "nowhere" / "p.html"), OutputError, "nowhere"),
-        ((volume, volume), InputError, "itself"),
-        ((volume, scan), InputError, "itself"),
+        ((volume, volume), InputError, "reads or writes"),
+        ((volume, scan), InputError, "reads or writes"),
     ):
         with pytest.raises(error, match=said):
             write_report(*arguments[:2], no_runtime, scan=arguments[2] if len(arguments) > 2 else None)
