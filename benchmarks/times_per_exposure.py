@@ -14,7 +14,7 @@ from priors import scan_of
 from scans import append, files_of, read_lines
 
 from phyradgs_cl.acquisition import PerRow
-from phyradgs_cl.acquisition.motion import rim_travel_mm
+from phyradgs_cl.acquisition.motion import rim_travel_voxels
 from phyradgs_cl.api import compare, reconstruct
 from phyradgs_cl.runtime import Runtime
 
@@ -41,8 +41,7 @@ def main() -> None:
             result = reconstruct(scan, given.method, motion=PerRow(count), device=rt, report=False)
             seconds = time.process_time() - start_s
             psnr_db = float(compare(result.volume, scan.reference)["psnr_db"])
-            moved_voxels = rim_travel_mm(scan) / min(scan.grid.voxel_size_mm)
-            values = {"moved_voxels": moved_voxels, "psnr_db": psnr_db, "processor_s": seconds}
+            values = {"moved_voxels": rim_travel_voxels(scan), "psnr_db": psnr_db, "processor_s": seconds}
             append(given.lines, {**case, "times": count, **{key: round(value, 3) for key, value in values.items()}})
 
 

@@ -35,9 +35,9 @@ class Motion(Protocol):
         ...
 
 
-def rim_travel_mm(scan: Scan) -> float:
-    """Returns how far the grid's rim moves, seen from the panel, during a line's exposure: the most in the first, middle and
-    last frame; 0 for a gantry at rest.
+def rim_travel_voxels(scan: Scan) -> float:
+    """Returns how far the grid's rim moves, seen from the panel, during a line's exposure, in voxels of a slice (y, x): the
+    most in the first, middle and last frame; 0 for a gantry at rest.
 
     The rim is the middles of the box's four sides around the axis. Their places relative to the panel move by r Δθ on a
     circular orbit, and by the panel's shift where that does not turn."""
@@ -46,7 +46,8 @@ def rim_travel_mm(scan: Scan) -> float:
     half_x_mm, half_y_mm = scan.grid.size_mm[2] / 2, scan.grid.size_mm[1] / 2
     sides_mm = [(half_x_mm, 0, 0), (-half_x_mm, 0, 0), (0, half_y_mm, 0), (0, -half_y_mm, 0)]
     rim_mm = np.array(sides_mm) + scan.grid.offset_mm[::-1]
-    return max(_travel_mm(scan, frame, rim_mm) for frame in {0, scan.frames // 2, scan.frames - 1})
+    frames = {0, scan.frames // 2, scan.frames - 1}
+    return max(_travel_mm(scan, frame, rim_mm) for frame in frames) / min(scan.grid.voxel_size_mm[1:])
 
 
 def _travel_mm(scan: Scan, frame: int, points_mm: np.ndarray) -> float:
@@ -145,7 +146,7 @@ class PerRow:
         that one time serves 3.6 voxels (measured in docs/results/settings.md)."""
         if self.sub_intervals:
             return self
-        moved_voxels = rim_travel_mm(scan) / min(scan.grid.voxel_size_mm)
+        moved_voxels = rim_travel_voxels(scan)
         fine, coarse = (math.ceil(moved_voxels / step) for step in (_FINE_STEP_VOXELS, _COARSE_STEP_VOXELS))
         return PerRow(min(max(1, min(fine, _USUAL_TIMES), coarse), _MOST_TIMES))
 

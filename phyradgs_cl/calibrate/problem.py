@@ -1,5 +1,6 @@
 """The frames of one or two scans on one coarse grid, their operator after a correction, and the volume that fits them."""
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
@@ -7,8 +8,8 @@ import numpy as np
 
 from phyradgs_cl.acquisition import PerRow, Scan
 from phyradgs_cl.acquisition.altered import coarse
-from phyradgs_cl.acquisition.altered.angles import exposure_steps
 from phyradgs_cl.acquisition.altered.perturbed import GeometryCorrection, Sway, Views, perturb, scan_course
+from phyradgs_cl.acquisition.motion import rim_travel_voxels
 from phyradgs_cl.calibrate.stages import Stage
 from phyradgs_cl.detector import noise_level
 from phyradgs_cl.detector.attenuation import TRANSMISSION_FLOOR
@@ -107,8 +108,9 @@ class CoarseProblem(CoarseFrames):
         tables = []
         for scan in self.scans:
             small = coarse.binned(perturb(scan, correction, views), self.block)
-            times = exposure_steps(scan, max(self.grid.shape[1:]), _VOXELS_PER_TIME, _MOST_TIMES)
-            tables += [PerRow(sub_intervals=times).cells(small, frame) for frame in range(small.frames)]
+            moved_voxels = rim_travel_voxels(replace(small, grid=self.grid))
+            times = min(max(2, math.ceil(moved_voxels / _VOXELS_PER_TIME)), _MOST_TIMES)
+            tables += [PerRow(times).cells(small, frame) for frame in range(small.frames)]
         return RayOperator(self.rt, self.grid, small.geometry.detector_shape, tables, fewest_lines=FEWEST_LINES)
 
     def line_integrals(self, operator: RayOperator, volume: np.ndarray) -> np.ndarray:

@@ -101,11 +101,6 @@ def tv_prox(
     return _primal_of(b, dual, weight, nonnegative, axis_weights)
 
 
-def isotropic_tv(volume: np.ndarray, axis_weights: tuple[float, float, float] = (1.0, 1.0, 1.0)) -> float:
-    """Σ over voxels of the length of the forward difference of a volume (z, y, x)."""
-    return float(np.linalg.norm(differences(np.asarray(volume, np.float64), axis_weights), axis=0).sum())
-
-
 def differences(volume: np.ndarray, axis_weights: tuple[float, float, float]) -> np.ndarray:
     """Weighted forward differences (3, z, y, x) along z, y, x; 0 behind the last voxel."""
     result = np.zeros((3, *volume.shape))

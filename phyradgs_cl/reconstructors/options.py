@@ -58,11 +58,6 @@ def preprocessing_names(method: object, preset: str | None = None) -> list[str]:
     return [f.name for f in fields(Preprocessing) if f.name not in own]
 
 
-def motions_of(method: object) -> tuple[str, ...]:
-    """Returns the names of the motion models that a method accepts."""
-    return tuple(_models(next(iter(method_of(method).presets.values()))))
-
-
 def _models(options: Any) -> dict[str, Any]:
     """Returns the models of ``options`` by name; the preset's own model has the preset's counts."""
     own = [options.motion] if hasattr(options.motion, "name") else []

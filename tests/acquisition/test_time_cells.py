@@ -41,7 +41,7 @@ from phyradgs_cl.acquisition.motion import (
     motion_from_facts,
     motion_of,
     motions_for,
-    rim_travel_mm,
+    rim_travel_voxels,
 )
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
@@ -160,10 +160,12 @@ def test_motion_models_of_fly_and_stop_and_shoot_scans() -> None:
 def test_the_rim_decides_on_the_times_of_an_exposure(size, exposure_deg, count) -> None:
     speed = ConstantSpeed(0.3, np.deg2rad(exposure_deg) / 0.8)
     fly = replace(scan(True), trajectory=CircularOrbit(GEOMETRY, speed), grid=Grid.cube(size, 2.0))
-    assert rim_travel_mm(fly) == pytest.approx(2 * np.sin(np.deg2rad(exposure_deg) / 2), rel=1e-9)
+    assert rim_travel_voxels(fly) == pytest.approx(size * np.sin(np.deg2rad(exposure_deg) / 2), rel=1e-9)
     assert PerRow().of(fly) == PerRow(count) and PerRow(7).of(fly) == PerRow(7)
     assert PerRow().cells(fly, 1).count == PerRow(count).cells(fly, 1).count
     assert PerRow().of(replace(fly, is_fly=False)) == PerRow(1)
+    flat = replace(fly, grid=replace(fly.grid, voxel_size_mm=(0.1 / size, *fly.grid.voxel_size_mm[1:])))
+    assert PerRow().of(flat) == PerRow(count)  # the rim moves within slices
 
 
 def test_the_rim_moves_where_the_panel_slides() -> None:
@@ -171,7 +173,7 @@ def test_the_rim_moves_where_the_panel_slides() -> None:
     poses[1, [1, 4]] += 0.6  # source and panel along y
     sliding = PoseTable(np.array([START_S, START_S + 1.6]), poses)
     fly = replace(scan(True), trajectory=sliding, frame_start_s=START_S + np.array([0.0, 0.8]), shutter=Shutter(0.8))
-    assert rim_travel_mm(fly) == pytest.approx(0.3)
+    assert rim_travel_voxels(fly) == pytest.approx(0.3 / min(fly.grid.voxel_size_mm[1:]))
 
 
 def test_a_model_states_the_operators_that_take_it() -> None:

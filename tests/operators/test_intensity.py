@@ -12,13 +12,12 @@ from tolerances import FLOAT32, RAYS, RAYS_BACK
 from phyradgs_cl.acquisition.time_cells import TimeCells
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.operators import IntensityOperator, RayOperator
-from phyradgs_cl.operators.twins.rays import intensity_change, intensity_volume, ray_frame
+from phyradgs_cl.operators.twins.rays import intensity_volume, ray_frame
 
-intensity_change, intensity_volume, ray_frame = map(remembered, (intensity_change, intensity_volume, ray_frame))
+intensity_volume, ray_frame = map(remembered, (intensity_volume, ray_frame))
 GRID = Grid((5, 7, 6), (0.35, 0.26, 0.3), (0.1, -0.05, 0.1))
 SHAPE = (6, 7)
 DIFFERENCE = 1e-4  # step of finite differences in float64: their error is of its square
-GRADIENT = 1e-5
 MOTIONS = ("static", "micro-views", "per line")
 BUSY = pytest.mark.parametrize("motion", ["micro-views", "per line"])
 AXES = pytest.mark.parametrize("axis", ["rows", "columns"])
@@ -44,6 +43,13 @@ def test_what_is_expected_is_the_twin_and_the_projector(any_rt, motion, axis) ->
     assert_near(RayOperator(any_rt, GRID, SHAPE, cells).project(x, "intensity"), expected, RAYS)
 
 
+def derivative(x: np.ndarray, d: np.ndarray, table: TimeCells) -> np.ndarray:
+    """The derivative (rows, columns) of the twin's frame at x along d, by finite differences."""
+    x, d = x.astype(float), d.astype(float)
+    ahead, behind = (ray_frame(x + s * DIFFERENCE * d, GRID, table, SHAPE, "intensity") for s in (1.0, -1.0))
+    return (ahead - behind) / (2 * DIFFERENCE)
+
+
 @AXES
 @pytest.mark.parametrize("motion", MOTIONS)
 def test_derivative_and_transpose_are_the_twins(any_rt, motion, axis) -> None:
@@ -51,22 +57,18 @@ def test_derivative_and_transpose_are_the_twins(any_rt, motion, axis) -> None:
     x, d, y = noise(GRID.shape, 2), noise(GRID.shape, 3), noise((2, *SHAPE), 4)
     operator = IntensityOperator(any_rt, GRID, SHAPE, cells)
     operator.expected(x)
-    expected = np.stack([intensity_change(d, x, GRID, table, SHAPE) for table in cells])
+    expected = np.stack([derivative(x, d, table) for table in cells])
     assert_near(operator.forward(d), expected, 3 * RAYS)
     back = sum(intensity_volume(frame, x, GRID, table) for frame, table in zip(y, cells, strict=True))
     assert_near(operator.adjoint(y), back, 3 * RAYS_BACK)
 
 
 @BUSY
-def test_the_twins_derivative_is_that_of_finite_differences(motion) -> None:
+def test_the_derivative_is_not_that_of_line_integrals(motion) -> None:
     table = tables(motion)[0]
-    x, d = noise(GRID.shape, 5).astype(float), noise(GRID.shape, 6).astype(float)
-    ahead, behind = (ray_frame(x + s * DIFFERENCE * d, GRID, table, SHAPE, "intensity") for s in (1.0, -1.0))
-    expected = (ahead - behind) / (2 * DIFFERENCE)
-    found = intensity_change(d, x, GRID, table, SHAPE)
-    assert np.linalg.norm(found - expected) <= GRADIENT * np.linalg.norm(expected)
+    x, d = noise(GRID.shape, 5), noise(GRID.shape, 6)
     by_log = ray_frame(d, GRID, table, SHAPE)
-    assert np.linalg.norm(found - by_log) > 1e-2 * np.linalg.norm(by_log)
+    assert np.linalg.norm(derivative(x, d, table) - by_log) > 1e-2 * np.linalg.norm(by_log)
 
 
 def test_before_any_volume_it_is_the_linear_operator(rt) -> None:

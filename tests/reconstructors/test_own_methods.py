@@ -19,7 +19,6 @@ from phyradgs_cl.api import (
     reconstruct,
 )
 from phyradgs_cl.errors import InputError, NumericalError
-from phyradgs_cl.reconstructors.options import motions_of
 
 TINY = ["--phantom", "jaw", "--size", "8", "--detector", "12", "--views", "4", "--time-samples", "2"]
 MODULE = '''
@@ -86,7 +85,8 @@ def test_a_function_is_run_with_its_options_and_what_it_takes(rt, scan) -> None:
     assert seen == [(Options(MicroViews(2, 5), 0.5), 4)] and [p.iteration for p in reports] == [1, 2, 3]
     assert result.volume.max() == 0.5 and result.facts["steps"] == 3
     assert result.facts["method"].endswith("landweber") and result.facts["options"]["motion"]["strips"] == 2
-    assert motions_of(landweber) == ("static", "static-start", "micro-views", "centres", "per-row", "own-times", "exact")
+    with pytest.raises(InputError, match="one of static, static-start, micro-views, centres, per-row, own-times, exact for"):
+        reconstruct(scan, landweber, motion="wobble", device=rt)
     with pytest.raises(InputError, match="did you mean 'gain'"):
         reconstruct(scan, landweber, gian=0.5, device=rt)
     with pytest.raises(InputError, match="option steps: found 1.5; expected a whole number"):

@@ -12,7 +12,7 @@ from phyradgs_cl.acquisition import Exact, MicroViews, Scan, Static, TimeCells
 from phyradgs_cl.api import simulate
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.reconstructors import METHODS, method_options, plan_run, reconstruct
-from phyradgs_cl.reconstructors.options import motions_of
+from phyradgs_cl.reconstructors.options import _models
 from phyradgs_cl.reconstructors.voxels.sart import SirtOptions
 
 ABSURD = {
@@ -146,6 +146,10 @@ def test_a_motion_of_ones_own_has_cells_and_no_counts() -> None:
         SirtOptions(motion="per-row")
     with pytest.raises(InputError, match=r"one of Static\(\), .* or a class of your own"):
         SirtOptions(motion=Exact())
+
+
+def motions_of(method: str) -> tuple[str, ...]:
+    return tuple(_models(next(iter(METHODS[method].presets.values()))))
 
 
 def test_errors_about_motion_offer_what_the_method_has() -> None:

@@ -41,13 +41,6 @@ def exposure_arc_rad(scan: Scan) -> float:
     return abs(float(wrapped(ends[1:] - ends[:1])[0]))
 
 
-def exposure_steps(scan: Scan, voxels_across: int, voxels_per_step: float, most: int) -> int:
-    """Returns the number of times, 2 to ``most``, at which to sample an exposure: the edge of a volume of ``voxels_across``
-    voxels moves by ``voxels_per_step`` between two."""
-    moved_voxels = exposure_arc_rad(scan) * voxels_across / 2
-    return int(np.clip(np.ceil(moved_voxels / voxels_per_step), 2, most))
-
-
 def wrapped(angle: np.ndarray | float) -> np.ndarray:
     """Returns angles (...) in radians, in [-π, π)."""
     return (np.asarray(angle) + np.pi) % (2 * np.pi) - np.pi

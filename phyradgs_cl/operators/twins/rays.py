@@ -63,18 +63,9 @@ def ray_volume(frame: np.ndarray, grid: Grid, table: TimeCells) -> np.ndarray:
     return volume
 
 
-def intensity_change(
-    change: np.ndarray, volume: np.ndarray, grid: Grid, table: TimeCells, detector_shape: tuple[int, int]
-) -> np.ndarray:
-    """Derivative (rows, columns) of ``ray_frame`` with the intensity model at ``volume`` along ``change`` (z, y, x)."""
-    frame = np.zeros(detector_shape)
-    for cell, share in _shares(volume, grid, table, detector_shape):
-        frame += share * joseph_image(change, grid, table.pose[cell], detector_shape, table.is_parallel)
-    return frame
-
-
 def intensity_volume(frame: np.ndarray, volume: np.ndarray, grid: Grid, table: TimeCells) -> np.ndarray:
-    """The transpose of ``intensity_change``: a frame (rows, columns) onto a volume (z, y, x)."""
+    """The transpose of the derivative of ``ray_frame`` with the intensity model at ``volume``: a frame (rows, columns)
+    onto a volume (z, y, x)."""
     result = np.zeros(grid.shape)
     for cell, share in _shares(volume, grid, table, frame.shape):
         result += joseph_adjoint(share * frame, grid, table.pose[cell], table.is_parallel)

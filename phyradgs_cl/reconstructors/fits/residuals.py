@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from phyradgs_cl.acquisition import PerRow, Scan
-from phyradgs_cl.acquisition.altered.angles import exposure_steps
+from phyradgs_cl.acquisition.motion import rim_travel_voxels
 from phyradgs_cl.operators.rays.operator import LinearOperator
 from phyradgs_cl.operators.rays.upright import FEWEST_LINES
 from phyradgs_cl.reconstructors.voxels.cgls import Cgls
@@ -129,8 +129,8 @@ class Fit:
 
 def fit(rt: Runtime, scan: Scan, iterations: int = _ITERATIONS) -> Fit:
     """Reconstructs a coarse scan by CGLS, each line at its own times, together with errors of its flats."""
-    motion = PerRow(sub_intervals=exposure_steps(scan, max(scan.grid.shape[1:]), 1.0, _MOST_TIMES))
-    system = System.of_scan(rt, scan, motion, fewest_lines=FEWEST_LINES)
+    times = min(max(2, math.ceil(rim_travel_voxels(scan))), _MOST_TIMES)
+    system = System.of_scan(rt, scan, PerRow(times), fewest_lines=FEWEST_LINES)
     flats = FlatErrors.beside(system.operator)
     augmented = AugmentedOperator(system.operator, flats)
     method = Cgls(augmented.system(system.measured, system.valid))
