@@ -11,7 +11,7 @@ import numpy as np
 from phyradgs_cl.errors import NumericalError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.parallel import Communicator
-from phyradgs_cl.reconstructors.checkpoint import State, checked_history, history_arrays
+from phyradgs_cl.reconstructors.checkpoint import State, history_arrays, history_of
 from phyradgs_cl.reconstructors.result import Progress, ProgressReport
 from phyradgs_cl.signals import stop_on_interrupt
 
@@ -72,7 +72,7 @@ class Loop:
         method = self.method
         if resume is not None:
             method.restore(resume)
-            self.record, before_s = checked_history(resume)
+            self.record, before_s = history_of(resume)
             self._started -= before_s
         with stop_on_interrupt() as request:
             while method.iteration < method.iterations and self.stopped_by == "iterations":

@@ -4,6 +4,7 @@ NAF: R. Zha, Y. Zhang, H. Li, "NAF: Neural Attenuation Fields for Sparse-View CB
 encoding and a small network. SAX-NeRF: Y. Cai, J. Wang, A. Yuille, Z. Zhou, A. Wang, "Structure-Aware Sparse-View X-ray 3D
 Reconstruction", CVPR 2024: attention along line segments, and windows of rays beside scattered ones."""
 
+import json
 import time
 from functools import partial
 from importlib.metadata import version
@@ -12,10 +13,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from phyradgs_cl.acquisition import Scan
-from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.neural import LineOptions, NeuralOptions, require_torch
-from phyradgs_cl.reconstructors import checkpoint
 from phyradgs_cl.reconstructors.checkpoint import State
 from phyradgs_cl.reconstructors.fdk import static_fdk
 from phyradgs_cl.reconstructors.loop import Loop
@@ -82,21 +81,10 @@ class _Passes:
         return self.trainer.state()
 
     def restore(self, state: State) -> None:
-        trainer, frames = self.trainer, self.trainer.scan.frames
-        names = ("parameters", "moments", "queue", "losses")
-        parameters, moments, queue, losses = checkpoint.state_arrays(state, names)
-        checkpoint.check_array("parameters", parameters, (trainer.parameters,), np.float32)
-        checkpoint.check_array("moments", moments, (2, trainer.parameters), np.float32)
-        steps = checkpoint.count_of(state, "steps", self.iterations * frames)
-        # the frames that the pass under way still has to see
-        checkpoint.check_array("queue", queue, (frames - steps % frames,), np.int64)
-        if not 0 <= queue.min() <= queue.max() < frames:
-            found, expected = f"{queue.min()} to {queue.max()}", f"frames from 0 to {frames - 1}"
-            raise InputError("checkpoint, array queue", found, expected, "start without --resume")
-        checkpoint.check_array("losses", losses, (steps % frames or min(steps, frames),), np.float64)
-        checkpoint.restore_generator(trainer.rng, state)
-        trainer.steps, trainer.queue, trainer.losses = steps, queue.tolist(), losses.tolist()
-        trainer.restore(parameters, moments, checkpoint.count_of(state, "updates", steps))
+        trainer = self.trainer
+        trainer.rng.bit_generator.state = json.loads(str(state["rng"]))
+        trainer.steps, trainer.queue, trainer.losses = int(state["steps"]), state["queue"].tolist(), state["losses"].tolist()
+        trainer.restore(state["parameters"], state["moments"], int(state["updates"]))
 
     def present_volume(self) -> tuple[np.ndarray, Grid]:
         return self.trainer.volume(self.trainer.scan.grid), self.trainer.scan.grid

@@ -16,7 +16,7 @@ from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.checks import ceil_div
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Deformation, triple
-from phyradgs_cl.reconstructors.checkpoint import State, check_array, state_arrays
+from phyradgs_cl.reconstructors.checkpoint import State
 from phyradgs_cl.reconstructors.loop import Loop
 from phyradgs_cl.reconstructors.method import Method
 from phyradgs_cl.reconstructors.moving.search import FieldSearch
@@ -91,17 +91,9 @@ class _Field:
         """Takes the field from a state of the passes. Returns the other arrays."""
         if _STORED[0] not in state:
             return state
-        control_mm, place, times_s, weights, gain = state_arrays(state, _STORED)
-        check_array(_STORED[0], control_mm, control_mm.shape, np.float64)
-        check_array(_STORED[1], place, (2, 3), np.float64)
-        check_array(_STORED[4], gain, (), np.float64)
-        try:
-            origin_mm, spacing_mm = (triple(row.tolist()) for row in place)
-            self.deformation = Deformation(control_mm, origin_mm, spacing_mm, times_s, weights)
-        except InputError as error:
-            found = f"{error.subject}: {error.found}"
-            raise InputError("checkpoint", found, error.expected, "start without --resume") from error
-        self.gain = float(gain)
+        control_mm, place, times_s, weights, gain = (state[name] for name in _STORED)
+        origin_mm, spacing_mm = (triple(row.tolist()) for row in place)
+        self.deformation, self.gain = Deformation(control_mm, origin_mm, spacing_mm, times_s, weights), float(gain)
         return {name: array for name, array in state.items() if name not in _STORED}
 
 

@@ -11,7 +11,6 @@ from phyradgs_cl.fields import Deformation, Gaussians, Grid
 from phyradgs_cl.fields.gaussians import SCALE
 from phyradgs_cl.operators import voxelise
 from phyradgs_cl.optim import Population, control_density
-from phyradgs_cl.reconstructors import checkpoint
 from phyradgs_cl.reconstructors.checkpoint import State
 from phyradgs_cl.reconstructors.splats.device import DeviceCloud, Scale
 from phyradgs_cl.reconstructors.splats.options import SplatOptions
@@ -93,16 +92,12 @@ class SplatRun:
 
     def restore(self, state: State) -> None:
         """Continues from ``state``, on any number of ranks up to the batch."""
-        checkpoint.check_cloud(state, self.frames.count)
-        names = ("raw", "moments", "statistics", "queue")
-        raw, moments, statistics, queue = checkpoint.state_arrays(state, names)
-        self.iteration = checkpoint.count_of(state, "iteration", self.iterations)
-        self.batch = max(checkpoint.count_of(state, "batch", self.frames.count), 1)
+        self.iteration, self.batch = int(state["iteration"]), int(state["batch"])
         self.sharing = sharing_of(self.rt.ranks, self.batch)
-        checkpoint.restore_generator(self.rng, state)
-        self._load(Population(raw, moments))
-        self.cloud.write_statistics(statistics)
-        self._queue = [int(f) for f in queue]
+        self.rng.bit_generator.state = json.loads(str(state["rng"]))
+        self._load(Population(state["raw"], state["moments"]))
+        self.cloud.write_statistics(state["statistics"])
+        self._queue = state["queue"].tolist()
 
     def parameters(self) -> np.ndarray:
         """Returns parameter rows (11, G) float64 in internal units."""

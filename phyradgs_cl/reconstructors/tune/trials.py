@@ -18,7 +18,7 @@ from phyradgs_cl.checks import ceil_div
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Deformation, Grid
 from phyradgs_cl.prepare.step import with_masked
-from phyradgs_cl.reconstructors.checkpoint import State, parsed
+from phyradgs_cl.reconstructors.checkpoint import State
 from phyradgs_cl.reconstructors.projected import held_out, holdout_errors
 from phyradgs_cl.reconstructors.result import (
     Progress,
@@ -27,7 +27,7 @@ from phyradgs_cl.reconstructors.result import (
     Report,
     ignore_progress,
 )
-from phyradgs_cl.reconstructors.tune import TUNED, TuningRequest, is_tuning, with_chosen, with_value
+from phyradgs_cl.reconstructors.tune import TUNED, TuningRequest, with_chosen, with_value
 from phyradgs_cl.runtime import Runtime
 
 _PERCENT, _SEED = 2.0, 21  # of pixels; not those of --holdout
@@ -60,10 +60,7 @@ def tuned(
     if resume is None:
         tuning = _choose(_Trials(request, run, scan, rt, report, extra), options)
     else:
-        tuning = parsed(resume, TUNED, dict)
-        if not is_tuning(tuning) or tuning["option"] != request.option:
-            expected, remedy = "what a run has written", "start without --resume"
-            raise InputError(f"checkpoint, array {TUNED}", "no choice", expected, remedy)
+        tuning = json.loads(str(resume[TUNED]))
         extra["resume"] = {name: array for name, array in resume.items() if name != TUNED}
     tuning_state = {TUNED: np.array(json.dumps(tuning))}
     with report.through(lambda progress: progress.mapped(state=lambda state: {**state, **tuning_state})):

@@ -9,7 +9,7 @@ import numpy as np
 from phyradgs_cl.checks import ranged
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.objective import TvDescent
-from phyradgs_cl.reconstructors.checkpoint import State, state_arrays
+from phyradgs_cl.reconstructors.checkpoint import State
 from phyradgs_cl.reconstructors.fdk import static_fdk
 from phyradgs_cl.reconstructors.voxels.run import Algorithm, MethodInputs, voxel_method
 from phyradgs_cl.reconstructors.voxels.sart import Sart, SartOptions, held_volumes
@@ -72,8 +72,7 @@ class AsdPocs(Algorithm):
     def restore(self, state: State) -> None:
         self.sart.restore(state)
         self.volume = self.sart.volume
-        (tv_step,) = state_arrays(state, ["tv_step"])
-        self.tv_step = float(tv_step)
+        self.tv_step = float(state["tv_step"])
 
 
 def _started(system: System, options: AsdPocsOptions, inputs: MethodInputs) -> AsdPocs:

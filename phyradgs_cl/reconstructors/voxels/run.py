@@ -14,7 +14,7 @@ from phyradgs_cl.acquisition import Motion, Scan, Static
 from phyradgs_cl.acquisition.motion import RAYS, check_motion, motions_for
 from phyradgs_cl.acquisition.scan import DETECTOR_MODELS
 from phyradgs_cl.fields import Deformation, Grid
-from phyradgs_cl.reconstructors.checkpoint import State, check_like, count_of, state_arrays
+from phyradgs_cl.reconstructors.checkpoint import State
 from phyradgs_cl.reconstructors.loop import Loop
 from phyradgs_cl.reconstructors.method import Method
 from phyradgs_cl.reconstructors.result import ProgressReport, Reconstruction, ignore_progress, option_facts
@@ -84,10 +84,10 @@ class Algorithm:
 
     def restore(self, state: State) -> None:
         """Continues from ``state``; the derivative of the intensity model is again that at ``volume``."""
-        for name, array in zip(self.ARRAYS, state_arrays(state, self.ARRAYS), strict=True):
-            setattr(self, name, self.system.space.array(array))
-        for name, number in zip(self.NUMBERS, state_arrays(state, self.NUMBERS), strict=True):
-            setattr(self, name, number.item())
+        for name in self.ARRAYS:
+            setattr(self, name, self.system.space.array(state[name]))
+        for name in self.NUMBERS:
+            setattr(self, name, state[name].item())
         self.system.linearise_at(self.volume)
 
 
@@ -188,8 +188,7 @@ class _Iterations:
         return {**self.algorithm.state(), "iteration": np.array(self.iteration)}
 
     def restore(self, state: State) -> None:
-        check_like(state, self.algorithm.state())
-        self.iteration = count_of(state, "iteration", self.iterations)
+        self.iteration = int(state["iteration"])
         self.algorithm.restore(state)
 
     def present_volume(self) -> tuple[np.ndarray, Grid]:

@@ -12,8 +12,7 @@ import numpy as np
 
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.metrics.align import block_means
-from phyradgs_cl.reconstructors import checkpoint
-from phyradgs_cl.reconstructors.checkpoint import State
+from phyradgs_cl.reconstructors.checkpoint import State, history_arrays, history_of
 from phyradgs_cl.reconstructors.result import Progress, Reconstruction, Report
 from phyradgs_cl.reconstructors.voxels.run import MethodInputs
 
@@ -46,20 +45,17 @@ class StageProgress:
 
     def state(self, stage_state: State) -> State:
         """Returns the state of the present stage as one of the whole run."""
-        history = checkpoint.history_arrays(self.record, self.seconds)
+        history = history_arrays(self.record, self.seconds)
         volume = {} if self.index == 0 or self.volume is None else {_VOLUME: self.volume}
         history = {_HISTORY[name]: array for name, array in history.items()}
         return {**stage_state, **volume, **history, _STAGE: np.array(self.index)}
 
-    def restore(self, state: State, stages: Sequence[Stage], grid: Grid) -> State:
-        """Continues from ``state``. Returns the present stage's own. Raises InputError for one that does not fit the run."""
-        self.index = checkpoint.count_of(state, _STAGE, len(stages) - 1)
+    def restore(self, state: State, stages: Sequence[Stage]) -> State:
+        """Continues from ``state``. Returns the present stage's own."""
+        self.index = int(state[_STAGE])
         if self.index:
-            (volume,) = checkpoint.state_arrays(state, [_VOLUME])
-            checkpoint.check_array(_VOLUME, volume, grid.shape, np.float32)
-            self.volume = volume
-        history = dict(zip(_HISTORY, checkpoint.state_arrays(state, list(_HISTORY.values())), strict=True))
-        self.record, self.seconds = checkpoint.checked_history(history)
+            self.volume = state[_VOLUME]
+        self.record, self.seconds = history_of({name: state[stored] for name, stored in _HISTORY.items()})
         self.iterations = sum(stage.iterations for stage in stages[: self.index])
         return {name: array for name, array in state.items() if name not in (_STAGE, _VOLUME, *_HISTORY.values())}
 
@@ -76,7 +72,7 @@ def run_stages(stages: Sequence[Stage], inputs: MethodInputs) -> Reconstruction:
     Iterations, seconds and the record are those of all stages; the other facts are the last stage's. The fact ``stages``
     lists the iterations and seconds of each."""
     progress, stage_facts, grid = StageProgress(inputs.initial), {}, inputs.scan.grid
-    resume = None if inputs.resume is None else progress.restore(inputs.resume, stages, grid)
+    resume = None if inputs.resume is None else progress.restore(inputs.resume, stages)
     report, total = Report.of(inputs.report), sum(stage.iterations for stage in stages)
     for stage in stages[progress.index :]:
         with report.through(partial(_of_whole_run, stage, progress, total, grid)):
