@@ -27,7 +27,7 @@ _FEWEST_BETWEEN = 5  # iterations from one round of density control to the next,
 
 @dataclass(frozen=True)
 class Estimate:
-    """seconds, host_bytes and device_bytes of a whole run; the iterations and seconds that the trials took. around_s: the
+    """seconds, host_bytes and device_bytes of a whole run; the seconds that the trials took. around_s: the
     part of ``seconds`` outside the method: reading, comparing, writing. host_bytes: the process's largest resident memory,
     with its buffers on a CPU device. device_bytes: the most memory in buffers at one time."""
 
@@ -36,7 +36,6 @@ class Estimate:
     device_bytes: int
     iterations: int
     seconds_per_iteration: float
-    trial_iterations: int
     trial_seconds: float
     around_s: float = 0.0
 
@@ -72,22 +71,21 @@ def estimate(
     around_s = around(trials.result) if around else 0.0
     spent_s = time.perf_counter() - started
     return Estimate(
-        seconds + around_s, peak_host_bytes(), trials.device_bytes, total, each_s, trials.iterations, spent_s, around_s
+        seconds + around_s, peak_host_bytes(), trials.device_bytes, total, each_s, spent_s, around_s
     )
 
 
 class _Trials:
-    """Short runs of one plan. ``result`` and ``device_bytes`` are of the last and longest; ``iterations`` counts all."""
+    """Short runs of one plan. ``result`` and ``device_bytes`` are of the last and longest."""
 
     def __init__(self, scan: Scan, plan: RunPlan, rt: Runtime) -> None:
-        self.scan, self.rt, self.iterations = scan, rt, 0
+        self.scan, self.rt = scan, rt
         self.plan = replace(plan, preprocessing=replace(plan.preprocessing, tune=""))  # tuning would repeat in each trial
 
     def run(self, iterations: int | None) -> float:
         """Returns the seconds of a number of iterations, or of the method as a whole."""
         options = self.plan.options
         plan = self.plan if iterations is None else replace(self.plan, options=shortened(options, iterations))
-        self.iterations += iterations or 0
         self.rt.reset_peak()
         started = time.perf_counter()
         self.result = reconstruct(self.scan, plan, self.rt)

@@ -3,7 +3,7 @@
 import difflib
 import math
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import fields
 from typing import Any
 
@@ -21,6 +21,15 @@ def suggest_name(name: object, known_names: Iterable[str], otherwise: str) -> st
     """Returns the advice to use the known name that is most similar, or ``otherwise``."""
     close = difflib.get_close_matches(str(name)[:200], list(known_names), n=1)
     return f"did you mean {close[0]!r}?" if close else otherwise
+
+
+def flattened(table: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Yields (dotted name, value) of every value in nested tables."""
+    for name, value in table.items():
+        if isinstance(value, Mapping):
+            yield from flattened(value, f"{prefix}{name}.")
+        else:
+            yield prefix + name, value
 
 
 def repr_of_changes(thing: Any) -> str:

@@ -8,7 +8,6 @@ import numpy as np
 from phyradgs_cl.acquisition.shutter import Shutter
 from phyradgs_cl.acquisition.time_cells import TimeCells
 from phyradgs_cl.acquisition.trajectory import Trajectory, body_frames, is_parallel
-from phyradgs_cl.errors import InputError
 
 _SAME_TIME = 1e-6  # of a cell: how exactly a frame has to begin on the grid of the first one
 _NOTHING = 1e-9  # of a window: smaller shares are rounding
@@ -44,8 +43,6 @@ def micro_view_cells(
 
     With a pulsed beam the N sub-intervals divide the lit part of the strip's window. Strips without a line, where M is above
     the number of lines, have no cells."""
-    if strips < 1 or sub_intervals < 1:
-        raise InputError("strips × sub-intervals", f"{strips} × {sub_intervals}", "two counts of at least 1")
     share = (np.arange(sub_intervals) + 0.5) / sub_intervals
     ranges = np.array(shutter.strip_ranges(lines, strips))
     strip = np.flatnonzero(ranges[:, 1] > ranges[:, 0])
@@ -71,8 +68,6 @@ def per_line_cells(
 ) -> TimeCells:
     """Returns ``samples`` cells for every line, at times of its exposure by the midpoint rule. The error falls with
     samples⁻² for fields that are smooth along the motion of one step."""
-    if samples < 1:
-        raise InputError("time samples", str(samples), "at least 1")
     opens_s, closes_s = shutter.line_windows_s(lines).T
     share = (np.arange(samples) + 0.5) / samples
     times = (start_s + opens_s[:, None] + share * (closes_s - opens_s)[:, None]).ravel()
@@ -160,8 +155,6 @@ def exact_cells(
 ) -> TimeCells:
     """Returns ``segments`` equal segments of the frame's lit span, in which splats move (docs/mathematics.md). Every line
     integrates over its own window. A gantry at rest, or a span of 0 s, gives the cell of ``static_cells``."""
-    if segments < 1:
-        raise InputError("segments", str(segments), "at least 1")
     first_s, last_s = shutter.lit_span_s
     if last_s <= first_s:
         return static_cells(trajectory, shutter, frame, start_s, lines)

@@ -16,7 +16,7 @@ from phyradgs_cl.fields import GridChoice
 from phyradgs_cl.importers import FORMATS, ImportOptions, import_scan, recognise
 from phyradgs_cl.importers.formats.tiff_template import template_of
 from phyradgs_cl.importers.options import WORDS, option_name
-from phyradgs_cl.io import file_kind, only_run, write_scan
+from phyradgs_cl.io import file_kind, only_run, refuse_overwriting, write_scan
 from phyradgs_cl.signals import finish_despite_interrupt
 from phyradgs_cl.workflow.files import check_output
 
@@ -108,8 +108,7 @@ def _refuse_overwriting(source: Path, output: Path) -> None:
     """Raises InputError for an output that may belong to the input: an existing file in its folder that is no scan file."""
     target, origin = output.resolve(), source.resolve()
     folder = origin if origin.is_dir() else origin.parent
-    if target == origin:
-        raise InputError("--output", f"the input {source} itself", "another file to write")
+    refuse_overwriting("--output", output, source)
     if folder not in target.parents or not target.exists():
         return
     with suppress(InputError):

@@ -20,23 +20,16 @@ Image = NDArray[np.floating]
 _INCH, _DPI = 3.2, 110
 
 
-def slices_png(
-    path: str | Path, result: ArrayLike, reference: ArrayLike | None, title: str, grid: Grid | None = None
-) -> None:
+def slices_png(path: str | Path, result: ArrayLike, reference: ArrayLike, title: str) -> None:
     """Writes a PNG: a row for each middle slice, the columns result, truth and difference. z and y point up.
 
     Grey values run over the truth's range, so that a wrong gain shows. The difference has its own scale, symmetric about 0.
-    result, reference: (z, y, x); without a reference there is one column. ``title``: the heading's first line. ``grid``: of
-    both, for the scale bar. Raises InputError for arrays that are not 3D, shapes that differ, NaN and infinity, and
-    OutputError for a file that cannot be written."""
-    volume = np.asarray(result)
-    shape("result", volume, (None, None, None))
-    finite("result", volume)
-    truth = None if reference is None else np.asarray(reference)
-    figure = new_figure((1 if truth is None else 3) * _INCH * 1.25, 3 * _INCH + 0.6)
-    heading = plain_text(title if truth is None else f"{title}\n{_numbers(volume, truth)}")
-    figure.suptitle(heading, parse_math=False)  # a dollar in a file's name is one
-    draw_slices(figure, volume, truth, grid)
+    result, reference: (z, y, x). ``title``: the heading's first line. Raises InputError for shapes that differ, NaN and
+    infinity, and OutputError for a file that cannot be written."""
+    volume, truth = np.asarray(result), np.asarray(reference)
+    figure = new_figure(3 * _INCH * 1.25, 3 * _INCH + 0.6)
+    figure.suptitle(plain_text(f"{title}\n{_numbers(volume, truth)}"), parse_math=False)  # a dollar in a file's name is one
+    draw_slices(figure, volume, truth, None)
     try:
         figure.savefig(path, dpi=_DPI, format="png")
     except OSError as error:

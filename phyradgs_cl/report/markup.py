@@ -3,7 +3,6 @@
 import html
 import json
 import math
-from collections.abc import Iterator, Mapping
 
 from phyradgs_cl.text import plain_text
 
@@ -59,15 +58,6 @@ def _attribute(key: str, value: object) -> str:
 def _plain(value: object) -> str:
     """Returns a value as text, floats with two decimals."""
     return f"{value:.2f}".rstrip("0").rstrip(".") if isinstance(value, float) else plain_text(str(value))
-
-
-def flattened(facts: Mapping[str, object], prefix: str = "") -> Iterator[tuple[str, object]]:
-    """Yields (key, value) of all facts; keys of nested tables are dotted."""
-    for key, value in facts.items():
-        if isinstance(value, Mapping):
-            yield from flattened(value, f"{prefix}{key}.")
-        else:
-            yield f"{prefix}{key}", value
 
 
 def label(key: str) -> str:

@@ -13,10 +13,10 @@ from phyradgs_cl.report.charts import Chart, convergence_charts, histogram, tuni
 from phyradgs_cl.report.interactive.atlas import has_depth, space
 from phyradgs_cl.report.interactive.motion import frame_in_motion, object_in_motion
 from phyradgs_cl.report.interactive.viewer import stills, viewer
-from phyradgs_cl.report.markup import Markup, element, flattened, joined, label, number, shown, unit
+from phyradgs_cl.report.markup import Markup, element, joined, label, number, shown, unit
 from phyradgs_cl.report.run import Change, Run
 from phyradgs_cl.report.scan_charts import frames_chart, orbit_chart, shutter_chart, shutter_words, side_chart
-from phyradgs_cl.text import to_digits_of
+from phyradgs_cl.text import flattened, to_digits_of
 
 _MOST_ROWS = 400  # of a table
 _MOST_CHARTS, _MOST_COMBINATIONS = 6, 20  # of a calibration

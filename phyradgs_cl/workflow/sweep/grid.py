@@ -18,7 +18,7 @@ from phyradgs_cl.io.scan.header import read_header
 from phyradgs_cl.io.tables import refuse_unknown
 from phyradgs_cl.runtime import MEMORY_VARIABLE, Runtime
 from phyradgs_cl.simulation import scanner_for, scanner_options
-from phyradgs_cl.text import plain_text
+from phyradgs_cl.text import flattened, plain_text
 from phyradgs_cl.workflow.files import expecting
 from phyradgs_cl.workflow.scans import SimulationJob, run_simulation
 
@@ -62,7 +62,7 @@ class Setting:
         words = [self.method]
         if self.preset != methods.usual_preset(self.method):
             words.append(f"preset={self.preset}")
-        for name, value in flat({**self.before, **self.changes}):
+        for name, value in flattened({**self.before, **self.changes}):
             words.append(f"{name}={','.join(map(str, value)) if isinstance(value, list) else value}")
         return " ".join(words)
 
@@ -89,15 +89,6 @@ def read_grid(document: Table, path: Path) -> SweepGrid:
         with expecting(scan, "scan"), open_hdf5(scan) as source:
             read_header(source)
     return SweepGrid(scans, settings, seeds)
-
-
-def flat(table: Table, prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Yields (dotted name, value) of every value in nested tables."""
-    for name, value in table.items():
-        if isinstance(value, Mapping):
-            yield from flat(value, f"{prefix}{name}.")
-        else:
-            yield prefix + name, value
 
 
 def _nested(values: Table) -> dict[str, Any]:
@@ -161,11 +152,11 @@ def _limit_runs(subject: str, count: int) -> None:
 
 def _settings(document: Table, path: Path) -> tuple[Setting, ...]:
     """Returns the settings of [[grid]] and [[runs]] without repetitions."""
-    shared = dict(flat(_table(document.get("options", {}), f"{path}: [options]")))
+    shared = dict(flattened(_table(document.get("options", {}), f"{path}: [options]")))
     settings: dict[str, Setting] = {}
     for key in ("grid", "runs"):
         for where, table in _tables(document, key, path):
-            for values in _product(table, where) if key == "grid" else [dict(flat(table))]:
+            for values in _product(table, where) if key == "grid" else [dict(flattened(table))]:
                 setting = _setting({**shared, **values}, where)
                 settings.setdefault(repr(setting), setting)
     if not settings:
@@ -191,7 +182,7 @@ def _table(table: Any, where: str) -> Table:
 
 def _product(table: Table, where: str) -> Iterator[dict[str, Any]]:
     """Yields every combination of the lists; a value that is no list is a list of one."""
-    axes = {name: values if isinstance(values, list) else [values] for name, values in flat(table)}
+    axes = {name: values if isinstance(values, list) else [values] for name, values in flattened(table)}
     for name, values in axes.items():
         if not values:
             raise InputError(f"{where}: {name}", "an empty list", "the values to try")

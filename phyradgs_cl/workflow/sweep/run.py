@@ -109,7 +109,7 @@ def run_sweep(job: SweepJob, report: Report = lambda progress: None) -> tuple[li
     be written; BusyError while another sweep uses it. InputError: no scheduler, or a missing package."""
     results = _results_file(job.folder)
     with only_run(results):
-        lines = tables.read_lines(results, tables.is_sound)
+        lines = tables.read_lines(results)
         plan = plan_sweep(job.grid, job.folder, job.checkpoint_every_s)
         finished = {tables.identity(line) for line in lines if "error" not in line}
         missing = [run for run in plan if tables.identity(run.facts) not in finished]
@@ -191,13 +191,8 @@ def _reconstructed(run: SweepRun, report: ProgressReport, device: str | None) ->
 
 def _recorded(run: SweepRun) -> Line | None:
     """Returns the line stored next to the volume, if both exist and the line is of this run."""
-    if not run.output.is_file():
-        return None
-    try:
-        line = json.loads(run.record.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return None
-    return line if tables.is_sound(line) and tables.identity(line) == tables.identity(run.facts) else None
+    lines = tables.read_lines(run.record) if run.output.is_file() else []
+    return next((line for line in lines if tables.identity(line) == tables.identity(run.facts)), None)
 
 
 def failed_line(run: SweepRun, error: str) -> Line:
@@ -210,7 +205,6 @@ def failed_line(run: SweepRun, error: str) -> Line:
 def _results_file(folder: Path) -> Path:
     path = folder / RESULTS
     make_folder(folder / VOLUMES, folder)
-    tables.refuse_irregular(path)
     try:
         path.open("ab").close()
     except OSError as error:

@@ -5,19 +5,17 @@ import io
 import json
 import logging
 import os
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from phyradgs_cl import checks
 from phyradgs_cl.errors import InputError, OutputError
 from phyradgs_cl.io import written_beside
-from phyradgs_cl.io.files import read_regular, regular_file
+from phyradgs_cl.io.files import read_regular
 from phyradgs_cl.metrics import HELD_OUT, METRICS
-from phyradgs_cl.text import plain_text
-from phyradgs_cl.workflow.sweep.grid import flat
+from phyradgs_cl.text import flattened, plain_text
 
 _FACTS = ("run", "scan", "method", "preset", "seed")
 _RESULTS = (*METRICS, *HELD_OUT, "seconds", "gaussians", "device", "host", "version", "volume", "error")
@@ -32,22 +30,6 @@ def identity(line: Line) -> tuple[Any, ...]:
     results file has them, where text that is no UTF-8 is replaced."""
     values = (line.get(name) for name in ("run", "scan", "scan_bytes", "scan_mtime_ns"))
     return tuple(plain_text(value) if isinstance(value, str) else value for value in values)
-
-
-def is_sound(line: Any) -> bool:
-    """True for a line of a run that the tables can read: a person may have edited the file."""
-    if not isinstance(line, dict) or None in identity(line):
-        return False
-    texts, tables, numbers = [line.get("label"), line.get("error", "")], [line.get("changes"), line.get("input")], []
-    if "error" not in line:
-        metrics = line.get("metrics")
-        tables.append(metrics)
-        numbers = [line.get("seconds"), *(metrics.values() if isinstance(metrics, Mapping) else ())]
-    return (
-        all(isinstance(text, str) for text in (line["run"], line["scan"], *texts))
-        and all(isinstance(table, Mapping) for table in tables)
-        and all(number is None or checks.is_number(number) for number in numbers)
-    )
 
 
 def write_tables(folder: Path, lines: Sequence[Line], planned: Sequence[Line]) -> list[Path]:
@@ -92,7 +74,7 @@ def _failures(failed: Sequence[Line]) -> Iterator[str]:
 
 def comma_separated(lines: Sequence[Line]) -> str:
     """Returns a record per run, with a column for every option that any run states."""
-    options = [dict(flat({**line["input"], **line["changes"]})) for line in lines]
+    options = [dict(flattened({**line["input"], **line["changes"]})) for line in lines]
     names = list(dict.fromkeys(name for stated in options for name in stated))
     stream = io.StringIO()
     writer = csv.writer(stream, lineterminator="\n")
@@ -116,9 +98,9 @@ def _cell(text: str) -> str:
     return text.replace("|", "\\|").replace("\n", " ")
 
 
-def read_lines(path: Path, is_sound: Callable[[Line], bool] = lambda line: True) -> list[Line]:
-    """Reads the lines of a results file that are whole and pass ``is_sound``, and warns of others; no lines where there
-    is no file. InputError for a file that cannot be read, or with content but no result."""
+def read_lines(path: Path) -> list[Line]:
+    """Reads the lines of a results file that are whole, and warns of others; no lines where there is no file. InputError for
+    a file that cannot be read, or with content but no result."""
     text = ""
     if path.exists():
         text = read_regular(path, str(path), _MOST_BYTES, _EXPECTED).decode(errors="replace")
@@ -126,7 +108,7 @@ def read_lines(path: Path, is_sound: Callable[[Line], bool] = lambda line: True)
     damaged = []
     for number, row in enumerate(text.split("\n"), 1):
         line = _parsed(row)
-        if line is not None and is_sound(line):
+        if line is not None:
             lines.append(line)
         elif row.strip():
             damaged.append(number)
@@ -136,12 +118,6 @@ def read_lines(path: Path, is_sound: Callable[[Line], bool] = lambda line: True)
         where = ("line %s is" if len(damaged) == 1 else "lines %s are") % ", ".join(map(str, damaged))
         log.warning("%s: %s damaged and left out", path, where)
     return lines
-
-
-def refuse_irregular(path: Path) -> None:
-    """Raises InputError for an existing path that is no regular file: reading a device or a pipe may never end."""
-    if path.exists():
-        regular_file(path, str(path), _EXPECTED)
 
 
 def append_line(path: Path, line: Mapping[str, Any]) -> None:
@@ -167,7 +143,7 @@ def json_text(value: object) -> str:
 def _parsed(row: str) -> Line | None:
     try:
         line = json.loads(row)
-    except (ValueError, RecursionError):
+    except ValueError:
         return None
     return line if isinstance(line, dict) and "run" in line else None
 
