@@ -5,12 +5,10 @@ averaged over an exposure in place of intensities, where the forward model is ex
 over the true one, less 1; that of the total is of the whole volume.
 """
 
-import argparse
 from dataclasses import dataclass, field
 from functools import lru_cache
-from pathlib import Path
 
-from scans import RAPID, append, read_lines
+from scans import RAPID, append, read_lines, results_parser
 from tables.case import FLY, STILL
 from tables.phantom_case import PhantomCase
 from tables.sizes import bench_size
@@ -68,11 +66,9 @@ def run(rt: Runtime, case: PhantomCase, scan: Scan, trial: Trial) -> dict[str, f
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("results", type=Path, help="JSON lines; runs that it holds are not made again")
+    parser = results_parser(__doc__)
     parser.add_argument("--size", default="S", help="of benchmarks/tables")
     parser.add_argument("--trials", default="", help="beginnings of their names, with commas; all without it")
-    parser.add_argument("--device")
     arguments = parser.parse_args()
     rt = Runtime(arguments.device)
     case = PhantomCase(rt, bench_size(arguments.size), RAPID, "rows", 0, lambda: case.truth)

@@ -12,12 +12,11 @@ ignored: the beam is always on), lag (0.1 and 0.3; ignored: not undone), low-dos
 weighted by their transmission), pixel-area (a pixel is 4 by 4 rays; modelled: splats have a pixel's footprint).
 """
 
-import argparse
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from scans import append, read_lines
+from scans import append, read_lines, results_parser
 
 from phyradgs_cl.acquisition import ConeGeometry, Scan, make_protocol
 from phyradgs_cl.fields import Grid
@@ -129,12 +128,10 @@ def rows(rt: Runtime, name: str, seed: int, wanted: tuple[str, ...], done: set[t
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("results", type=Path)
+    parser = results_parser(__doc__)
     parser.add_argument("--names", default="shepp-logan", help="phantoms and volume files, with commas")
     parser.add_argument("--effects", default="", help="beginnings of the effects' names, with commas")
     parser.add_argument("--seeds", default="0")
-    parser.add_argument("--device")
     arguments = parser.parse_args()
     lines = read_lines(arguments.results)
     rt, wanted = Runtime(arguments.device), tuple(arguments.effects.split(","))

@@ -9,15 +9,12 @@ is 3. Least squares (``cgls``, 25 iterations) averages line integrals (ARTIC) or
 exposure. NMSE: the squared error over the squared truth. ``best``: the smallest, and its iteration. Rows that the results
 file has are not made again."""
 
-import argparse
-import json
 import time
-from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
-from parallel_fly import mean_light
+from parallel_fly import Trial, mean_light
+from scans import append, read_lines, results_parser
 
 from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, ConstantSpeed, Scan, Shutter
 from phyradgs_cl.api import reconstruct
@@ -29,17 +26,8 @@ SIDE, COLUMNS, VIEWS, TIMES, VOXEL_MM, PIXEL_MM = 700, 1250, 40, 120, 0.1, 0.15
 ARC_RAD, PHOTONS, PEAK = np.deg2rad(4.9), 1e5, 3.0
 
 
-@dataclass(frozen=True)
-class Trial:
-    """A method with its options, and what the row calls the model."""
-
-    method: str
-    model: str
-    options: dict[str, Any]
-
-
 def trials(iterations: int) -> list[Trial]:
-    """Returns the trials."""
+    """Returns the trials, each with what its row calls the model."""
     moving = {"motion": "per-row", "sub_intervals": 10}
     least = {"iterations": iterations}
     log, intensity = ({"detector_model": name} for name in ("log", "intensity"))
@@ -81,17 +69,14 @@ def make_scan(rt: Runtime, side: int, columns: int) -> tuple[Scan, np.ndarray]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("results", type=Path)
+    parser = results_parser(__doc__)
     parser.add_argument("--iterations", type=int, default=25, help="of least squares")
     parser.add_argument("--side", type=int, default=SIDE, help="voxels of the grid; the panel's pixels follow")
     parser.add_argument("--trials", type=int, help="the first of them alone")
-    parser.add_argument("--device")
     args = parser.parse_args()
     side, columns = args.side, round(COLUMNS * args.side / SIDE)
-    rows = [json.loads(line) for line in args.results.read_text().splitlines()] if args.results.exists() else []
-    done = {(row["method"], row["model"]) for row in rows if row["side"] == side}
-    wanted = [t for t in trials(args.iterations)[: args.trials] if (t.method, t.model) not in done]
+    done = {(row["method"], row["model"]) for row in read_lines(args.results) if row["side"] == side}
+    wanted = [t for t in trials(args.iterations)[: args.trials] if (t.method, t.label) not in done]
     if not wanted:
         return
     rt = Runtime(args.device)
@@ -107,13 +92,10 @@ def main() -> None:
         volume = reconstruct(scan, method=trial.method, device=rt, report=follow, **trial.options).volume
         curve[max(curve, default=0) + (not curve)] = nmse(volume[0], truth)
         best = min(curve, key=lambda iteration: curve[iteration])
-        row = {
-            "side": side, "method": trial.method, "model": trial.model, "nmse": round(nmse(volume[0], truth), 5),
+        append(args.results, {
+            "side": side, "method": trial.method, "model": trial.label, "nmse": round(nmse(volume[0], truth), 5),
             "best": round(curve[best], 5), "best_at": best, "processor_s": round(time.process_time() - before_s),
-        }  # fmt: skip
-        print(json.dumps(row), flush=True)
-        with args.results.open("a") as file:
-            file.write(json.dumps(row) + "\n")
+        })  # fmt: skip
 
 
 def nmse(image: np.ndarray, truth: np.ndarray) -> float:

@@ -8,7 +8,6 @@ demonstration. A line has the mean and the least PSNR, the mean SSIM and process
 middle of each of MACE4D's windows. FBP of each window alone and ``fista``, as if the object rested, are measured too. A
 pixel is taken as 1 mm. With TORCHDYNAMO_DISABLE=1 mbirtorch runs without the compiler of PyTorch."""
 
-import argparse
 import subprocess
 import tempfile
 import time
@@ -17,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 from moving import plan_of
-from scans import append
+from scans import append, results_parser
 
 from phyradgs_cl.acquisition import ParallelGeometry, Scan
 from phyradgs_cl.fields import Grid, deformed
@@ -70,12 +69,10 @@ def run(rt: Runtime, python: str, size: int, views: int, folder: Path) -> Iterat
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("results", type=Path)
+    parser = results_parser(__doc__)
     parser.add_argument("--peer-python", required=True)
     parser.add_argument("--size", type=int, default=32)
     parser.add_argument("--views", type=int, default=120)
-    parser.add_argument("--device")
     arguments = parser.parse_args()
     with tempfile.TemporaryDirectory() as name:
         for line in run(Runtime(arguments.device), arguments.peer_python, arguments.size, arguments.views, Path(name)):

@@ -13,7 +13,6 @@ makes as if the object rested; the case still has ``moving`` and --method on an 
 interrupted continues: a line for each volume, number of views, method, case and motion."""
 
 import argparse
-import json
 import tempfile
 import time
 from collections.abc import Iterator
@@ -181,9 +180,7 @@ def main() -> None:
                     run = (run_unknown if case == "unknown" else run_still)(rt, scans[moves], arguments.method)
                 else:
                     run = run_case(rt, scans[moves], case, arguments.method)
-                line = {**facts, **run, "device": rt.device.name}
-                append(arguments.results, line)
-                print(json.dumps(line), flush=True)
+                append(arguments.results, {**facts, **run, "device": rt.device.name})
 
 
 def key_of(line: dict[str, object]) -> tuple[object, ...]:

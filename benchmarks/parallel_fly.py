@@ -8,14 +8,12 @@ many turns as exposures of the stated blur need, at evenly spaced angles modulo 
 24 times of an exposure, of the object on pixels half as large, with Poisson noise. The modulation is the amplitude of a
 grating in the volume over that in the truth. Runs that the results file has are not made again."""
 
-import argparse
-import json
 import math
 import time
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
+from scans import append, read_lines, results_parser
 
 from phyradgs_cl.acquisition import CircularOrbit, ConstantSpeed, ParallelGeometry, Scan, Shutter
 from phyradgs_cl.acquisition.cells import per_line_cells
@@ -33,10 +31,10 @@ PLACES_PX = [(0.85 * RADIUS * math.cos(a), 0.85 * RADIUS * math.sin(a), a) for a
 
 @dataclass(frozen=True)
 class Trial:
-    """A method with its options; ``motion``: what the row is called."""
+    """A method with its options; ``label``: what its row calls the motion, or the model."""
 
     method: str
-    motion: str
+    label: str
     options: dict[str, object]
 
 
@@ -127,23 +125,20 @@ def mean_light(
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("results", type=Path)
+    parser = results_parser(__doc__)
     parser.add_argument("--views", type=int, nargs="+", default=[180, 720, 1800])
     parser.add_argument("--blur-px", type=float, nargs="+", default=[0.5, 1.5, 5.0])
     parser.add_argument("--dose", type=float, nargs="+", default=[1e4, 1e5])
     parser.add_argument("--seeds", type=int, nargs="+", default=[0])
     parser.add_argument("--methods", nargs="+", default=["fbp", "sirt", "fista", "phyradgs"])
-    parser.add_argument("--device")
     args = parser.parse_args()
-    known = args.results.read_text().splitlines() if args.results.exists() else []
-    done = {tuple(json.loads(line)[key] for key in KEYS) for line in known}
+    done = {tuple(row[key] for key in KEYS) for row in read_lines(args.results)}
     rt = Runtime(args.device)
     for views, blur_px, dose, seed in (
         (v, b, d, s) for v in args.views for b in args.blur_px for d in args.dose for s in args.seeds
     ):
         trials = [t for t in TRIALS if t.method in args.methods]
-        wanted = [t for t in trials if (views, blur_px, dose, seed, t.method, t.motion) not in done]
+        wanted = [t for t in trials if (views, blur_px, dose, seed, t.method, t.label) not in done]
         if not wanted:
             continue
         scan, truth = make_scan(rt, views, blur_px, dose, seed)
@@ -152,14 +147,11 @@ def main() -> None:
             volume = reconstruct(scan, method=trial.method, device=rt, **trial.options).volume
             image, seen = volume.mean(0, dtype=np.float64), np.repeat(truth[None], ROWS, 0)
             *rim, centre = (modulation(image, truth, place) for place in PLACES_PX)
-            values = (views, blur_px, dose, seed, trial.method, trial.motion)
-            row = dict(zip(KEYS, values, strict=True)) | {
+            values = (views, blur_px, dose, seed, trial.method, trial.label)
+            append(args.results, dict(zip(KEYS, values, strict=True)) | {
                 "psnr_db": round(float(psnr(volume, seen.astype(np.float32))), 2), "rim": round(float(np.mean(rim)), 3),
                 "centre": round(centre, 3), "processor_s": round(time.process_time() - before_s, 1),
-            }
-            print(json.dumps(row), flush=True)
-            with args.results.open("a") as file:
-                file.write(json.dumps(row) + "\n")
+            })  # fmt: skip
 
 
 KEYS = ("views", "blur_px", "dose", "seed", "method", "motion")

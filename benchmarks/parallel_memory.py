@@ -8,7 +8,6 @@ as ``--rows 4:36``. Buffers: the most that the runtime held at one time. Residen
 processor has the buffers in it. Each method runs in its own process."""
 
 import argparse
-import json
 import subprocess
 import sys
 import tempfile
@@ -17,6 +16,7 @@ from pathlib import Path
 
 import numpy as np
 from fbp_peers import sinogram
+from scans import append, results_parser
 
 from phyradgs_cl.acquisition import CircularOrbit, ConstantSpeed, ParallelGeometry, Scan, Shutter
 from phyradgs_cl.estimate import peak_host_bytes
@@ -56,22 +56,17 @@ def measured(method: str, memory: str, quick: bool, device: str | None) -> dict[
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("results", type=Path)
+    parser = results_parser(__doc__)
     parser.add_argument("--memory", default="2GiB")
     parser.add_argument("--methods", nargs="+", default=list(RUNS))
     parser.add_argument("--quick", action="store_true")
-    parser.add_argument("--device")
     parser.add_argument("--write", type=int, nargs=3, help=argparse.SUPPRESS)
     parser.add_argument("--here", action="store_true", help=argparse.SUPPRESS)
     args = parser.parse_args()
     if args.write:
         write(args.results, *args.write)
     elif args.here:
-        row = json.dumps(measured(args.methods[0], args.memory, args.quick, args.device))
-        print(row)
-        with args.results.open("a") as file:
-            file.write(row + "\n")
+        append(args.results, measured(args.methods[0], args.memory, args.quick, args.device))
     else:
         for method in args.methods:
             subprocess.run([sys.executable, *sys.argv, "--here", "--methods", method], check=True)

@@ -8,7 +8,6 @@ fly-scan together cover one turn, unless it has 25 or 50 views. ``numbers`` of a
 Runs that are in the file are not made again."""
 
 import argparse
-import json
 import time
 from pathlib import Path
 
@@ -64,7 +63,6 @@ def main() -> None:
             scores = compare(volume, scan.reference)
             row |= {"psnr_db": scores["psnr_db"], "ssim": scores["ssim"], "processor_s": time.process_time() - before_s}
             append(given.lines, row)
-            print(json.dumps(row), flush=True)
 
 
 if __name__ == "__main__":

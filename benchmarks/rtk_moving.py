@@ -9,7 +9,6 @@ and 22 dB. Also PSNR within 20 mm of the middle, because FDK's error elsewhere h
 same field: a smooth random displacement at both ends of the cycle, for both programs. Largest difference of the volumes over
 their peak, and processor seconds of the best of three runs, of FDK as a whole."""
 
-import argparse
 import subprocess
 import sys
 import tempfile
@@ -18,7 +17,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from scans import append
+from scans import append, results_parser
 from scipy.ndimage import zoom
 
 from phyradgs_cl.acquisition import Scan
@@ -113,10 +112,8 @@ def same_field(rt: Runtime, python: str, folder: Path) -> dict[str, object]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("results", type=Path)
+    parser = results_parser(__doc__)
     parser.add_argument("--peer-python", required=True)
-    parser.add_argument("--device")
     arguments = parser.parse_args()
     with tempfile.TemporaryDirectory() as name:
         for line in own_test(arguments.peer_python, Path(name)):

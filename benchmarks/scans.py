@@ -69,6 +69,14 @@ def append(path: Path, line: dict[str, object]) -> None:
         file.write(text + "\n")
 
 
+def results_parser(text: str | None) -> argparse.ArgumentParser:
+    """A parser with a file of lines and a device."""
+    parser = argparse.ArgumentParser(description=text, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("results", type=Path, help="JSON lines, appended to; runs that it has are not made again")
+    parser.add_argument("--device")
+    return parser
+
+
 def runs_parser(text: str | None, names: str = "--names", seeds: str = "0") -> argparse.ArgumentParser:
     """A parser with a folder of volumes, a file of lines, names of volumes, seeds, a device."""
     parser = argparse.ArgumentParser(description=text, formatter_class=argparse.RawDescriptionHelpFormatter)

@@ -6,9 +6,10 @@ VOLUMES: a folder of HDF5 volumes, whose 128³ ones are averaged over 2³ voxels
 """
 
 import argparse
-import json
 import time
 from pathlib import Path
+
+from scans import append, read_lines
 
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.fields.gaussians import ROWS
@@ -27,8 +28,7 @@ def main() -> None:
     parser.add_argument("--gaussians", default="20000,5000")
     parser.add_argument("--device")
     given = parser.parse_args()
-    text = given.results.read_text(encoding="utf-8") if given.results.exists() else ""
-    present = {(line["volume"], line["gaussians"]) for line in map(json.loads, text.splitlines())}
+    present = {(line["volume"], line["gaussians"]) for line in read_lines(given.results)}
     rt = Runtime(given.device)
     for count in map(int, given.gaussians.split(",")):
         for path in sorted(given.volumes.glob("*_128.h5")):
@@ -39,14 +39,11 @@ def main() -> None:
             started, used = time.perf_counter(), time.process_time()
             result = fit_volume(rt, values, Grid.cube(VOXELS, BOX_MM), VolumeFitOptions(count))
             seconds, processor_s = time.perf_counter() - started, time.process_time() - used
-            line = {
+            append(given.results, {
                 "volume": name, "gaussians": count, "iterations": VolumeFitOptions().iterations,
                 **compare(result.volume, values), "compression": values.size / (ROWS * count),
                 "seconds": round(seconds, 2), "processor_s": round(processor_s, 2), "device": rt.device.name,
-            }  # fmt: skip
-            with open(given.results, "a", encoding="utf-8") as file:
-                file.write(json.dumps(line) + "\n")
-            print(line, flush=True)
+            })  # fmt: skip
 
 
 if __name__ == "__main__":

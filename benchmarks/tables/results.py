@@ -2,33 +2,16 @@
 
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
-from phyradgs_cl.workflow.sweep.tables import Line, append_line, refuse_irregular
-from phyradgs_cl.workflow.sweep.tables import read_lines as sound_lines
+from phyradgs_cl.workflow.sweep.tables import Line, append_line, read_lines
 
-__all__ = ["KEY", "Line", "Present", "append_line", "key_of", "read_lines", "refuse_irregular"]
+__all__ = ["KEY", "Line", "Present", "append_line", "key_of", "read_lines"]
 
 # What makes a run the same run; its options are compared besides.
 KEY = (
     "study", "volume", "source", "run", "acquisition", "voxels", "pixels", "protocol", "axis", "seed", "iterations",
 )  # fmt: skip
-
-
-def read_lines(path: Path) -> list[Line]:
-    """All sound lines of a benchmark's results file, with a word about others; none where there is no file.
-
-    Raises:
-        InputError: a file that cannot be read, or that has content but no result.
-    """
-    return sound_lines(path, _is_sound)
-
-
-def _is_sound(line: Line) -> bool:
-    """Whether the parts of a line that are read have their types: a hand may have edited it."""
-    metrics = line.get("metrics", {})
-    return isinstance(metrics, dict) and not any(isinstance(line.get(name), list | dict) for name in KEY)
 
 
 def key_of(line: Mapping[str, Any]) -> tuple[Any, ...]:

@@ -27,7 +27,7 @@ from tables.identity import refuse_other_objects
 from tables.job import PHANTOM, BenchJob, BenchProgress, PlannedRun, Report, plan_runs
 from tables.phantom_case import PhantomCase
 from tables.pseudo_truth import PseudoTruth, refuse_interrupted
-from tables.results import Line, Present, append_line, read_lines, refuse_irregular
+from tables.results import Line, Present, append_line, read_lines
 from tables.summary import REFERENCE
 from tables.tables import write_tables
 
@@ -242,7 +242,6 @@ def _results_file(folder: Path) -> Path:
     try:
         folder.mkdir(parents=True, exist_ok=True)
         path = folder / RESULTS
-        refuse_irregular(path)
         path.open("ab").close()
     except OSError as error:
         raise OutputError(

@@ -11,7 +11,6 @@ from phyradgs_cl.report.images import BUDGET_PIXELS, bytes_of, diverging, planes
 from phyradgs_cl.report.markup import (
     Markup,
     element,
-    flattened,
     joined,
     json_block,
     label,
@@ -20,6 +19,7 @@ from phyradgs_cl.report.markup import (
     shown,
     unit,
 )
+from phyradgs_cl.text import flattened
 
 
 def test_text_is_escaped_and_elements_are_not() -> None:
