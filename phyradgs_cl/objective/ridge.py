@@ -17,7 +17,7 @@ from phyradgs_cl.runtime.layout import GUARD, Strides, move, on_device, padded_z
 
 EDGE = 5
 """Voxels along a side of a filter."""
-_SLICES = 4  # of channels and responses, computed at a time
+_SLICES = 2  # of channels and responses, computed at a time
 _RING = _SLICES + 2  # in memory: a correlation needs three
 
 
@@ -63,8 +63,8 @@ def learned_ridge() -> Ridge:
 class RidgeStep:
     """The step for volumes of a fixed ``shape`` (z, y, x); it does not change a volume thinner than a filter."""
 
-    VOLUMES = 6
-    """Volumes of floats that it holds in memory, with 40 slices or more of 64 voxels in a row or more."""
+    VOLUMES = 4
+    """Volumes of floats that it holds in memory, with 50 slices or more of 64 voxels in a row or more."""
 
     def __init__(self, rt: Runtime, shape: tuple[int, int, int], ridge: Ridge) -> None:
         self.rt, self.shape = rt, shape

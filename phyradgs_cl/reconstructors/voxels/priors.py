@@ -21,13 +21,14 @@ from phyradgs_cl.objective import (
     learned_ridge,
 )
 from phyradgs_cl.objective.dct_prox import TURNS
+from phyradgs_cl.objective.ridge import EDGE as RIDGE_EDGE
 from phyradgs_cl.reconstructors.checkpoint import State, count_of, state_arrays
 from phyradgs_cl.reconstructors.method import imported
 from phyradgs_cl.reconstructors.result import function_name
 from phyradgs_cl.runtime import Runtime, Space
 
 # shares of the prior's weight, by the prior (docs/results/settings.md)
-_TV_ALONE, _TV_BEFORE_DCT, _TV_BEFORE_RIDGE, _DCT = 1.6, 0.8, 0.4, 1.5
+_TV_ALONE, _TV_BEFORE_DCT, _TV_BEFORE_RIDGE, _DCT = 1.6, 0.8, 0.6, 1.5
 _TV_BEFORE_CURVES, _CURVES_NOISE, _CURVES = 0.5, 50.0, 3.0  # noise that the curves assume, and strength of their step
 _RIDGE_NOISE, _RIDGE_LENGTH, _RIDGE_EVERY = 15.0, 0.5, 4  # noise that the step assumes, its length, and maps for each step
 _NONLOCAL, _NONLOCAL_BEFORE_DCT = 300.0, 100.0  # of the filtering parameter h
@@ -66,8 +67,10 @@ class PriorInputs:
         curves = learned_curves().scaled(_CURVES / _CURVES_NOISE)
         return TvAndDct(self.tv(_TV_BEFORE_CURVES), DctProx(self.rt, self.grid.shape, curves), _CURVES_NOISE)
 
-    def dct_then_ridge(self) -> "ThenRidge":
-        """Less total variation sharpens scans at rest; on a fly-scan flat bodies lose by it."""
+    def dct_then_ridge(self) -> "Prior":
+        """Less total variation sharpens scans at rest; on a fly-scan flat bodies lose by it. Without a step it has no use."""
+        if min(self.grid.shape) < RIDGE_EDGE:
+            return self.tv_and_dct()
         before = self.tv_and_dct() if self.is_fly else self.tv_and_dct(_TV_BEFORE_RIDGE)
         return ThenRidge(before, RidgeStep(self.rt, self.grid.shape, learned_ridge()))
 
@@ -253,10 +256,10 @@ class OwnPrior(Prior):
 
 
 PRIORS: dict[str, Callable[[PriorInputs], Prior]] = {
+    "ridge": PriorInputs.dct_then_ridge,
     "dct": PriorInputs.tv_and_dct,
     "firm": PriorInputs.tv_and_firm,
     "curves": PriorInputs.tv_and_curves,
-    "ridge": PriorInputs.dct_then_ridge,
     "tv": lambda inputs: inputs.tv(_TV_ALONE),
     "nonlocal": lambda inputs: inputs.nonlocal_then(inputs.tv(_TV_ALONE), _NONLOCAL),
     "nonlocal+dct": lambda inputs: inputs.nonlocal_then(inputs.tv_and_dct(), _NONLOCAL_BEFORE_DCT),
