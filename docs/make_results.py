@@ -88,7 +88,8 @@ def with_prior(prior: str, like: Row) -> list[str]:
         lines = [x for x in lines_of("priors.jsonl") if wanted.items() <= x.items() and x["volume"] != "spheres"]
         by_volume = {name: [x for x in lines if x["volume"] == name] for name in {x["volume"] for x in lines}}
         if len(by_volume) != int(like["volumes"]):
-            raise SystemExit(f"priors.jsonl: {kind}, {views} views: found {len(by_volume)} volumes; expected {like['volumes']}")
+            found = f"found {len(by_volume)} volumes; expected {like['volumes']}"
+            raise SystemExit(f"priors.jsonl: {kind}, {views} views: {found}")
         means = [mean(mean(x[name] for x in of) for of in by_volume.values()) for name in ("psnr_db", "ssim")]
         cells.append(f"{means[0]:.2f} / {means[1]:.3f}")
     return cells

@@ -68,7 +68,7 @@ class PriorInputs:
         return TvAndDct(self.tv(_TV_BEFORE_CURVES), DctProx(self.rt, self.grid.shape, curves), _CURVES_NOISE)
 
     def dct_then_ridge(self) -> "Prior":
-        """Less total variation sharpens scans at rest; on a fly-scan flat bodies lose by it. Without a step it has no use."""
+        """Less total variation before a step sharpens scans at rest; on a fly-scan flat bodies lose by it."""
         if min(self.grid.shape) < RIDGE_EDGE:
             return self.tv_and_dct()
         before = self.tv_and_dct() if self.is_fly else self.tv_and_dct(_TV_BEFORE_RIDGE)
