@@ -1,6 +1,7 @@
 """Lists on the command line, and results as lines for people."""
 
 from phyradgs_cl.errors import InputError
+from phyradgs_cl.estimate import duration
 from tables.job import BenchProgress
 
 
@@ -34,11 +35,5 @@ def result_text(progress: BenchProgress) -> str:
         if "psnr_db_pseudo" in numbers:
             found += " to the truth"
         found += f", {line['seconds']:.1f} s"
-    left = f"; about {_duration(progress.left_s)} left" if progress.left_s else ""
+    left = f"; about {duration(progress.left_s)} left" if progress.left_s else ""
     return f"{progress.number}/{progress.runs} {progress.title}: {found}{left}"
-
-
-def _duration(seconds: float) -> str:
-    if seconds < 90:
-        return f"{seconds:.0f} s"
-    return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"

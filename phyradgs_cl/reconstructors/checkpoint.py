@@ -65,24 +65,3 @@ def history_arrays(record: Sequence[Mapping[str, float]], seconds: float) -> dic
 def history_of(state: State) -> tuple[list[dict[str, float]], float]:
     """Returns the convergence record and the seconds of a state."""
     return json.loads(str(state["record"])), float(state["seconds"])
-
-
-def state_arrays(state: State, names: Sequence[str]) -> list[np.ndarray]:
-    """Returns arrays of a state by name; raises InputError for a state that lacks one."""
-    missing = sorted(set(names) - set(state))
-    if missing:
-        raise InputError("checkpoint", f"no {', '.join(missing)}", "a whole checkpoint", _REMEDY)
-    return [state[name] for name in names]
-
-
-def check_like(state: State, like: Mapping[str, np.ndarray]) -> None:
-    """Raises InputError unless ``state`` has every array of ``like``, with its shape."""
-    for name, found in zip(like, state_arrays(state, list(like)), strict=True):
-        checks.shape(f"checkpoint, array {name}", found, np.shape(like[name]))
-
-
-def count_of(state: State, name: str, most: int) -> int:
-    """Returns a whole number of a state; raises InputError unless it is from 0 to ``most``."""
-    (found,) = state_arrays(state, [name])
-    checks.whole(f"checkpoint, array {name}", int(found), 0, most)
-    return int(found)

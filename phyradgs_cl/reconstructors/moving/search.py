@@ -14,7 +14,7 @@ from phyradgs_cl.acquisition import Motion, Scan
 from phyradgs_cl.acquisition.altered.coarse import SMOOTHING, binned, fewer_frames, smooth
 from phyradgs_cl.fields import Deformation, Grid, triple
 from phyradgs_cl.metrics import resampled
-from phyradgs_cl.reconstructors.checkpoint import State, check_like, count_of
+from phyradgs_cl.reconstructors.checkpoint import State
 from phyradgs_cl.reconstructors.moving import LEAST_GAIN
 from phyradgs_cl.reconstructors.moving.field import FieldProblem, MotionField, sum_squares
 from phyradgs_cl.reconstructors.moving.signal import MotionSignal, TemporalSplines
@@ -104,12 +104,11 @@ class FieldSearch:
         }  # fmt: skip
 
     def restore(self, state: State) -> None:
-        iteration = count_of(state, "iteration", self.iterations)
-        if iteration > self._coarse_rounds:
+        self.iteration = int(state["iteration"])
+        if self.iteration > self._coarse_rounds:
             self._refine()
-        check_like(state, self.state())
         self.field = replace(self.field, control_mm=state["control_mm"], temporal=state["temporal"])
-        self.volume, self.iteration = state["coarse_volume"], iteration
+        self.volume = state["coarse_volume"]
         self.relative, self.change = state["fit"].tolist()
 
     def present_volume(self) -> tuple[np.ndarray, Grid]:

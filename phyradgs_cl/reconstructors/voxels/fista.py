@@ -17,7 +17,7 @@ from phyradgs_cl import checks
 from phyradgs_cl.acquisition import Motion, PerRow, Scan
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields.volume import MOST_VOXELS
-from phyradgs_cl.reconstructors.checkpoint import State, state_arrays
+from phyradgs_cl.reconstructors.checkpoint import State
 from phyradgs_cl.reconstructors.method import Method
 from phyradgs_cl.reconstructors.result import Reconstruction, option_facts
 from phyradgs_cl.reconstructors.voxels import priors
@@ -147,9 +147,8 @@ class Fista(Accelerated):
 
     def restore(self, state: State) -> None:
         super().restore(state)
-        (subsets,) = state_arrays(state, ["subsets"])
-        self.subsets.split(int(subsets[0]))
-        self.subsets.least_residual = float(subsets[1])
+        count, self.subsets.least_residual = state["subsets"].tolist()
+        self.subsets.split(int(count))
 
 
 def fista(scan: Scan, options: FistaOptions, rt: Runtime, **arguments: Any) -> Reconstruction:

@@ -22,7 +22,7 @@ from phyradgs_cl.objective import (
 )
 from phyradgs_cl.objective.dct_prox import TURNS
 from phyradgs_cl.objective.ridge import EDGE as RIDGE_EDGE
-from phyradgs_cl.reconstructors.checkpoint import State, count_of, state_arrays
+from phyradgs_cl.reconstructors.checkpoint import State
 from phyradgs_cl.reconstructors.method import imported
 from phyradgs_cl.reconstructors.result import function_name
 from phyradgs_cl.runtime import Runtime, Space
@@ -115,7 +115,7 @@ class TvPrior(Prior):
         return {"dual": self.prox.dual}
 
     def restore(self, state: State) -> None:
-        (self.prox.dual,) = state_arrays(state, ["dual"])
+        self.prox.dual = state["dual"]
 
 
 class TvAndDct(Prior):
@@ -138,7 +138,7 @@ class TvAndDct(Prior):
 
     def restore(self, state: State) -> None:
         self.tv.restore(state)
-        self.turn = count_of(state, "turn", len(TURNS) - 1)
+        self.turn = int(state["turn"])
 
 
 class ThenRidge(Prior):
@@ -162,7 +162,7 @@ class ThenRidge(Prior):
 
     def restore(self, state: State) -> None:
         self.before.restore(state)
-        self.maps = count_of(state, "maps", _RIDGE_EVERY - 1)
+        self.maps = int(state["maps"])
 
 
 class Nonlocal(Prior):
@@ -199,9 +199,8 @@ class Nonlocal(Prior):
 
     def restore(self, state: State) -> None:
         self.then.restore(state)
-        guide, h = state_arrays(state, ["guide", "h"])
-        self._passes_done = count_of(state, "passes", self.passes)
-        self._guide, self._is_learned, self._h = guide if guide.any() else None, False, float(h)
+        self._passes_done, guide = int(state["passes"]), state["guide"]
+        self._guide, self._is_learned, self._h = guide if guide.any() else None, False, float(state["h"])
 
 
 class Piccs(Prior):
@@ -230,7 +229,7 @@ class Piccs(Prior):
 
     def restore(self, state: State) -> None:
         self.plain.restore(state)
-        (self.change.prox.dual,) = state_arrays(state, ["dual_of_change"])
+        self.change.prox.dual = state["dual_of_change"]
 
 
 Denoiser = Callable[[np.ndarray, float], np.ndarray]
