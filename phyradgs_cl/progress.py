@@ -7,6 +7,7 @@ from contextlib import suppress
 import typer
 
 from phyradgs_cl.reconstructors import Progress
+from phyradgs_cl.text import clock
 
 _OVER = "\r\x1b[K"  # clears the line
 _TERMINAL_EVERY_S, _ELSEWHERE_EVERY_S = 0.2, 10.0
@@ -95,12 +96,6 @@ class Ticker:
             return ""
         left_s = seconds * (1 - share) / (share - self.first_share)
         return f"  {since_first / seconds:.1f}/s  ETA {clock(left_s)}"
-
-
-def clock(seconds: float) -> str:
-    """Returns minutes:seconds, or hours:minutes:seconds."""
-    minutes, rest = divmod(int(seconds + 0.5), 60)
-    return f"{minutes // 60}:{minutes % 60:02d}:{rest:02d}" if minutes >= 60 else f"{minutes}:{rest:02d}"
 
 
 def _write(text: str, ends_line: bool = True) -> None:

@@ -1,4 +1,4 @@
-"""Text of files, users and other programs, made printable and compared with known names; numbers as text."""
+"""Text of files, users and other programs, made printable and compared with known names; numbers and times as text."""
 
 import difflib
 import math
@@ -49,3 +49,9 @@ def repr_of_changes(thing: Any) -> str:
 def to_digits_of(value: float, deviation: float) -> str:
     """Returns a value with as many decimals as two digits of its deviation have."""
     return f"{value:.{max(0, 1 - math.floor(math.log10(max(deviation, 1e-12))))}f}"
+
+
+def clock(seconds: float) -> str:
+    """Returns minutes:seconds, or hours:minutes:seconds."""
+    minutes, rest = divmod(int(seconds + 0.5), 60)
+    return f"{minutes // 60}:{minutes % 60:02d}:{rest:02d}" if minutes >= 60 else f"{minutes}:{rest:02d}"

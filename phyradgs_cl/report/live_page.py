@@ -17,6 +17,7 @@ from phyradgs_cl.report.interactive.viewer import stills
 from phyradgs_cl.report.markup import Markup, element, joined, json_block, label, number, raw_text
 from phyradgs_cl.report.page import head, web_script
 from phyradgs_cl.report.sections import facts_table, frame_pictures, note, section
+from phyradgs_cl.text import clock
 
 _MOST_POINTS = 400  # of the convergence
 _SAMPLES = 64  # along a side, for the grey values
@@ -159,13 +160,8 @@ def _tiles(status: Status, now: float) -> list[tuple[str, str]]:
         if (per_s := status.per_s) is not None:
             tiles.append(("per minute", number(60 * per_s)))
         if (left_s := status.left_s(now)) is not None and not status.ended:
-            tiles.append(("time left", _clock(left_s)))
-    return [*tiles, ("time so far", _clock(now - status.started))]
-
-
-def _clock(seconds: float) -> str:
-    minutes, rest = divmod(round(max(seconds, 0.0)), 60)
-    return f"{minutes // 60}:{minutes % 60:02d}:{rest:02d}"
+            tiles.append(("time left", clock(left_s)))
+    return [*tiles, ("time so far", clock(now - status.started))]
 
 
 def _settings(status: Status) -> Markup:

@@ -3,8 +3,9 @@
 import pytest
 
 from phyradgs_cl import progress
-from phyradgs_cl.progress import Ticker, clock
+from phyradgs_cl.progress import Ticker
 from phyradgs_cl.reconstructors import Progress
+from phyradgs_cl.text import clock
 
 
 @pytest.fixture
