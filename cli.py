@@ -8,7 +8,7 @@ import typer
 from typer.core import TyperGroup
 
 from phyradgs_cl import __version__, signals
-from phyradgs_cl.commands.console import GroupedCommand, complain, give_up_stdout, say, takes_part
+from phyradgs_cl.commands.console import GroupedCommand, complain, give_up_stdout, say, takes_part, usage_text
 from phyradgs_cl.errors import OutputError, PhyradgsError, naming_host_memory
 from phyradgs_cl.io.output import NO_SPACE
 
@@ -123,7 +123,7 @@ def _run(arguments: list[str], program: typer.Typer) -> int:
     except PhyradgsError as error:
         return complain(str(error), error.exit_code)
     except _CLICK_ERROR as error:
-        return complain(error.format_message())  # type: ignore[attr-defined]
+        return complain(usage_text(error, arguments))
     except OSError as error:  # one that no reader or writer has named
         text = f"{error.filename or 'operating system'}: {error.strerror or error}"
         return complain(text, OutputError.exit_code if error.errno in NO_SPACE else 2)

@@ -13,6 +13,7 @@ import typer
 from typer.core import TyperCommand
 
 from phyradgs_cl import signals
+from phyradgs_cl.checks import short_repr
 from phyradgs_cl.errors import InputError, OutputError, PhyradgsError
 from phyradgs_cl.parallel import launched
 from phyradgs_cl.text import plain_text
@@ -100,6 +101,24 @@ def scores(metrics: Mapping[str, float | None]) -> str:
 
     words = [*printed(metrics), *printed(metrics, HELD_OUT)]
     return "".join(f", {title} {value}" for title, value in words)
+
+
+def usage_text(error: Any, arguments: Sequence[str]) -> str:
+    """Returns Typer's message about the words of a command, with the value that it could not read."""
+    text = str(error.format_message()).replace("Value error, ", "")
+    value = _value_of(getattr(error, "param", None), arguments)
+    return text if value is None or repr(value) in text else f"{text.rstrip('.')}; found {short_repr(value)}"
+
+
+def _value_of(parameter: Any, arguments: Sequence[str]) -> str | None:
+    """Returns the word that follows an option; None for an argument, whose place only Typer knows."""
+    for flag in (name for name in getattr(parameter, "opts", ()) if name.startswith("-")):
+        for word, following in zip(arguments, [*arguments[1:], None], strict=True):
+            if word == flag:
+                return following
+            if word.startswith(f"{flag}="):
+                return word.removeprefix(f"{flag}=")
+    return None
 
 
 class GroupedCommand(TyperCommand):
