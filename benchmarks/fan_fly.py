@@ -27,7 +27,7 @@ ARC_RAD, PHOTONS, PEAK = np.deg2rad(4.9), 1e5, 3.0
 
 
 def trials(iterations: int) -> list[Trial]:
-    """Returns the trials, each with what its row calls the model."""
+    """Returns the trials, each with the name of its model."""
     moving = {"motion": "per-row", "sub_intervals": 10}
     least = {"iterations": iterations}
     log, intensity = ({"detector_model": name} for name in ("log", "intensity"))

@@ -73,7 +73,7 @@ def run_bench(
 
 
 def remake_tables(job: BenchJob, seeds: Sequence[int] | None = None) -> list[Path]:
-    """Writes tables and figures from the results file as it is; the files written.
+    """Writes tables and figures from the present results file. Returns the files written.
 
     The job's names, where it has any, and ``seeds`` restrict what is read.
     """
@@ -94,7 +94,7 @@ def _write_tables_and_figures(job: BenchJob, lines: Sequence[Line]) -> list[Path
 
 
 def _name_rows_left_out(job: BenchJob) -> None:
-    """Rows that this machine cannot run are said to be left out."""
+    """Names the rows that this machine cannot run."""
     lacking = {row.label: row.lacks(job.bench_size.voxels) for row in job.chosen_rows}
     left_out = [f"{label} {lacks}" for label, lacks in lacking.items() if lacks]
     if left_out:
