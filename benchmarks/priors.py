@@ -23,7 +23,7 @@ NUMBERS = {"curves": "procedural", "ridge": "procedural"}  # what the numbers we
 ARC_DEG = 360.0  # exposed by all views of a fly-scan together
 
 
-def scan_of(rt: Runtime, path: Path, facts: dict[str, object]) -> Scan:
+def scan_of(rt: Runtime, path: Path | str, facts: dict[str, object]) -> Scan:
     size, views, kind = int(facts["size"]), int(facts["views"]), facts["kind"]  # type: ignore[call-overload]
     usual = {"size": size, "detector": 2 * size, "noise": "tigre", "dose": facts["dose"], "seed": facts["seed"]}
     if kind == "still":

@@ -24,13 +24,15 @@ def main() -> None:
     parser.add_argument("volumes")
     parser.add_argument("lines", type=Path)
     parser.add_argument("--names", help="with commas; all")
+    parser.add_argument("--phantoms", nargs="+", default=[], help="of `simulate`, instead of volumes")
     parser.add_argument("--size", type=int, default=64)
     parser.add_argument("--views", type=int, default=25)
     parser.add_argument("--method", default="fista")
     parser.add_argument("--counts", nargs="+", type=int, default=[5, 9])
     given = parser.parse_args()
     rt, there = Runtime(), read_lines(given.lines)
-    for name, path in files_of(given.volumes, given.names, given.size).items():
+    phantoms = {name: name for name in given.phantoms}
+    for name, path in (phantoms or files_of(given.volumes, given.names, given.size)).items():
         case = {"volume": name, "size": given.size, "views": given.views, "method": given.method}
         facts = {**case, "kind": "fly", "dose": 1e4, "seed": 0}
         counts = [n for n in given.counts if not any({**case, "times": n}.items() <= line.items() for line in there)]

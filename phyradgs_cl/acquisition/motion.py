@@ -22,7 +22,7 @@ from phyradgs_cl.errors import InputError
 
 RAYS, SPLATS, LINE_POSES = "rays", "splats", "one pose per line"
 """The kinds of operator: ray projectors, splat projectors, and filtered backprojection."""
-_USUAL_TIMES, _MOST_TIMES = 5, 100  # of a line's exposure in the model ``PerRow``
+_USUAL_TIMES, _MOST_TIMES = 6, 100  # of a line's exposure in the model ``PerRow``
 _FINE_STEP_VOXELS, _COARSE_STEP_VOXELS = 0.3, 3.6
 _WEIGHT_TOLERANCE = 1e-3  # of the sum of a line's weights in a model of the user's own
 
@@ -142,7 +142,7 @@ class PerRow:
     def of(self, scan: Scan) -> "PerRow":
         """Returns the model with the number of times that this scan needs.
 
-        One time serves 0.3 voxels of the way of the grid's rim in an exposure, but 5 times serve up to 18 voxels. Beyond
+        One time serves 0.3 voxels of the way of the grid's rim in an exposure, but 6 times serve up to 22 voxels. Beyond
         that one time serves 3.6 voxels (measured in docs/results/settings.md)."""
         if self.sub_intervals:
             return self

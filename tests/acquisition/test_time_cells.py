@@ -155,7 +155,7 @@ def test_motion_models_of_fly_and_stop_and_shoot_scans() -> None:
 
 @pytest.mark.parametrize(
     ("size", "exposure_deg", "count"),
-    [(64, 14.4, 5), (128, 14.4, 5), (256, 14.4, 9), (64, 7.2, 5), (64, 4.8, 5), (64, 1.0, 2), (64, 0.4, 1), (512, 0.16, 3)],
+    [(64, 14.4, 6), (128, 14.4, 6), (256, 14.4, 9), (64, 7.2, 6), (64, 4.8, 6), (64, 1.0, 2), (64, 0.4, 1), (512, 0.16, 3)],
 )
 def test_the_rim_decides_on_the_times_of_an_exposure(size, exposure_deg, count) -> None:
     speed = ConstantSpeed(0.3, np.deg2rad(exposure_deg) / 0.8)
