@@ -124,6 +124,7 @@ class Fista(Accelerated):
 
     def step(self) -> float:
         weight = self.weight.at(self.volume)
+        self.prior.noise_share = self.weight.noise_share(weight)
         residual = self.system.space.sum_squares(self._update(subset, weight) for subset in self.subsets) ** 0.5
         # larger subsets have another step length: momentum of the former ones would mislead
         if self.subsets.join_if_diverging(residual):

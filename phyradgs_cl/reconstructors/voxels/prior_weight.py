@@ -76,6 +76,10 @@ class PriorWeight:
         by_edges = self.error.edges_mm * _density(self.space, volume) * self.common_mm
         return max(self.strength * math.hypot(by_noise, by_edges), self.least)
 
+    def noise_share(self, weight: float) -> float:
+        """Returns the share of noise in a weight: edges make up most of it where views are many, or photons."""
+        return min(self.strength * self.error.noise * self.noise_mm / weight, 1.0)
+
 
 def _density(space: Space[Any], volume: Any) -> float:
     """Mean of a volume's values weighted by their squares, in 1/mm: Σ x³ / Σ x², which air does not change."""
