@@ -498,7 +498,7 @@ def times_per_exposure() -> str:
     for one in lines_of("times_per_exposure.jsonl"):
         key = one["size"], one["views"], one["moved_voxels"], one["volume"], one["method"]
         by_scan.setdefault(key, {})[one["times"]] = one
-    counts = (1, 2, 3, 5, 9, 17)
+    counts = (1, 2, 3, 5, 6, 9, 17)
     rows = []
     for (size, views, moved, volume, method), runs in sorted(by_scan.items()):
         cells = [

@@ -94,7 +94,7 @@ def remove_rings(scan: Scan, options: RingOptions, make_model: MakeModel) -> tup
     if options.window > frames.shape[2]:
         expected = f"no more than the panel's {frames.shape[2]} columns"
         raise InputError("rings.window", str(options.window), expected, "state fewer pixels")
-    column, full_turn = axis_column(scan), is_full_turn(scan)
+    column, full_turn = axis_column(scan), surround_evenly(scan)
     means, mirrored = _means(frames, full_turn), mirror_columns(frames.shape[2], column)
     usable = np.full(frames.shape[1:], scan.frames >= _LEAST_FRAMES) & (scan.valid.mean(axis=0) > 0.5)
     single = find_single_gains(means, mirrored, usable, full_turn)
@@ -119,7 +119,7 @@ def remove_rings(scan: Scan, options: RingOptions, make_model: MakeModel) -> tup
     return replace(scan, projections=frames - pattern), facts
 
 
-def is_full_turn(scan: Scan) -> bool:
+def surround_evenly(scan: Scan) -> bool:
     """Returns whether the sources of all views lie evenly around a circle, that is equally far from their mean."""
     sources = middle_poses(scan)[:, :3]
     distance = np.linalg.norm(sources - sources.mean(axis=0), axis=1)
