@@ -159,7 +159,7 @@ class ThenRidge(Prior):
         if self.maps:
             return volume
         # edges are no noise: steps that took all of the weight for it lost 0.2 dB with 180 views
-        sigma = _RIDGE_NOISE * weight * max(self.noise_share, _LEAST_NOISE_SHARE) ** 0.5
+        sigma = _RIDGE_NOISE * weight * max(self.noise_share, _LEAST_NOISE_SHARE)
         step = partial(self.ridge, sigma=sigma, step=_RIDGE_LENGTH, nonnegative=nonnegative)
         return space.apply(step, volume, self.ridge.shape)
 
