@@ -37,7 +37,7 @@ from phyradgs_cl.reconstructors.voxels.prior_weight import (
     adjoint_response,
     frame_error,
 )
-from phyradgs_cl.reconstructors.voxels.priors import OwnPrior, Prior, PriorInputs, prior_of
+from phyradgs_cl.reconstructors.voxels.priors import OwnPrior, Prior, PriorInputs, ThenRidge, prior_of
 from phyradgs_cl.reconstructors.voxels.system import System
 from phyradgs_cl.runtime import DeviceSpace, Runtime
 
@@ -150,6 +150,25 @@ def test_voxels_miss_more_the_larger_they_are_and_less_behind_a_blur(scan) -> No
     blurred = frame_error(replace(scan, grid=Grid.cube(24, 2.0), reference=None), PerRow(5))
     assert blurred.noise == fine.noise
     assert blurred.edges_mm == pytest.approx(fine.edges_mm / np.sqrt(1 + smeared), rel=0.02)
+
+
+def test_the_ridge_step_follows_the_noise_in_the_weight_and_no_edges(rt, scan) -> None:
+    sigmas: list[float] = []
+
+    def ridge(volume: np.ndarray, *, sigma: float, **_: object) -> np.ndarray:
+        sigmas.append(sigma)
+        return volume
+
+    ridge.shape = scan.grid.shape
+    system = System.of_scan(rt, scan, PerRow())
+    errors = FrameError(0.01), FrameError(0.01, 0.02), FrameError(0.03)
+    weights = [PriorWeight(system, error, 0.42) for error in errors]
+    for weight in weights:
+        algorithm = Fista(system, FistaOptions(subsets=1), ThenRidge(Prior(), ridge), weight)
+        for _ in range(4):  # maps before a step
+            algorithm.step()
+    assert weights[1].noise_share(weights[1].at(algorithm.volume)) < 0.9
+    assert sigmas[1] == pytest.approx(sigmas[0], rel=1e-6) and sigmas[2] == pytest.approx(3 * sigmas[0], rel=1e-6)
 
 
 def test_a_denoiser_of_ones_own_is_the_prior(rt, scan) -> None:
