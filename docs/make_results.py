@@ -231,6 +231,7 @@ def sweep(name: str, held_out: bool) -> str:
 def beside_dct(other: str) -> str:
     """PSNR and SSIM with the priors dct and ``other``; runs with dct are also those of bench_s.jsonl.
 
+    Fly-scans with ridge have six times of an exposure, as those with dct in ridge.jsonl; the others have five.
     ±: standard deviation over seeds of the mean gain."""
     scans: dict[tuple[Any, ...], dict[tuple[str, int], dict[str, dict[str, float]]]] = {}
 
@@ -243,6 +244,8 @@ def beside_dct(other: str) -> str:
         if line["study"] == "synthetic" and kind == {"stop-and-shoot": "still", "fly-scan": "fly"}[line["acquisition"]]:
             add(line, kind, 1e4, line["voxels"], "dct", line["metrics"])
     for line in lines_of("priors.jsonl"):
+        add(line, line["kind"], line["dose"], line["size"], line["prior"], line)
+    for line in lines_of("ridge.jsonl") if other == "ridge" else []:
         add(line, line["kind"], line["dose"], line["size"], line["prior"], line)
     text = []
     for (kind, _, views, dose, size), runs in sorted(scans.items(), reverse=True):
