@@ -78,7 +78,8 @@ class PriorWeight:
 
     def noise_share(self, weight: float) -> float:
         """Returns the share of noise in a weight: edges make up most of it where views are many, or photons."""
-        return min(self.strength * self.error.noise * self.noise_mm / weight, 1.0)
+        by_noise = self.strength * self.error.noise * self.noise_mm
+        return min(by_noise / weight, 1.0) if weight > 0 else 1.0  # empty frames have no weight
 
 
 def _density(space: Space[Any], volume: Any) -> float:
