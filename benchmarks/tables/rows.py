@@ -101,12 +101,14 @@ _SPLATTING = (
     _CENTRES,
 )
 _FUSED = (
-    Row("FISTA with DCT", "fista"),
-    Row("FISTA with DCT per-row", "fista", "per-row", still="FISTA with DCT"),
+    Row("FISTA with DCT", "fista", changes={"prior": "dct"}),
+    Row("FISTA with DCT per-row", "fista", "per-row", still="FISTA with DCT", changes={"prior": "dct"}),
     Row(
         "FISTA with DCT on one grid per-row", "fista", "per-row", still="FISTA with DCT on one grid", variant="one grid",
-        changes={"subvoxels": 1, "iterations": 30},
+        changes={"prior": "dct", "subvoxels": 1, "iterations": 30},
     ),
+    Row("FISTA with ridge", "fista", variant="ridge"),
+    Row("FISTA with ridge per-row", "fista", "per-row", still="FISTA with ridge", variant="ridge"),
     Row("Fused", "fused"),
     Row("Fused exact in time", "fused", "exact", still="Fused"),
 )

@@ -98,7 +98,7 @@ _MOTION = (
     "(exact), or M×N that move only centres (centres)."
 )
 _PRIOR = (
-    "Prior, for fista: dct, firm, curves, ridge, tv, nonlocal, nonlocal+dct, piccs or none; MODULE:NAME: a denoiser of "
+    "Prior, for fista: ridge, dct, firm, curves, tv, nonlocal, nonlocal+dct, piccs or none; MODULE:NAME: a denoiser of "
     "your own."
 )
 _PRESET = "Constants: default, quick, paper, released (phyradgs); published (r2, naf, sax-nerf); a window (fdk)."
@@ -114,7 +114,7 @@ RUN_OPTIONS: dict[str, Any] = {
     "segments": _asked(int, "Segments of a frame (exact); 0: by --time-error.", "0"),
     "time_error": _asked(float, "Relative error of averaging over time (exact).", "0.005"),
     "iterations": _asked(int, "Iterations: of voxels all frames each, of splats one frame (then 3000).", "35"),
-    "prior": _asked(str, _PRIOR, "dct", metavar="NAME|MODULE:NAME"),
+    "prior": _asked(str, _PRIOR, "ridge", metavar="NAME|MODULE:NAME"),
     "gaussians": _asked(int, "Gaussians at the start, for splats.", "from the grid"),
     "size": Size,
     "voxel_mm": VoxelMm,

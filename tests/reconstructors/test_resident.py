@@ -42,7 +42,7 @@ def options_of(method: str, model: str, iterations: int = 4):
     if method == "cgls":
         changes["noise_stop"] = 0
     if method == "fista":  # one grid: between two the volume comes to the host, once
-        changes["subvoxels"] = 1
+        changes |= {"subvoxels": 1, "prior": "dct"}  # ridge holds more slices than so small a volume has
     return method_options(method, None, changes)
 
 

@@ -133,7 +133,7 @@ class FieldSearch:
 
     def _reconstructed(self, one: MotionField, volume: np.ndarray | None, passes: int) -> np.ndarray:
         """Returns the volume after so many passes of ``fista`` on the coarse scan."""
-        options = FistaOptions(motion=self.motion, iterations=passes, subvoxels=1)
+        options = FistaOptions(motion=self.motion, iterations=passes, prior="dct", subvoxels=1)
         deformation = one.deformation() if one.control_mm.any() else None
         inputs = MethodInputs(self.scan, options, self.rt, initial=volume, deformation=deformation)
         (stage,) = fista_stages(inputs)

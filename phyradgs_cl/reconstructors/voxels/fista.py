@@ -52,7 +52,7 @@ class FistaOptions(IterativeOptions):
 
     motion: Motion = PerRow()
     iterations: int = 35
-    prior: str | Denoiser = "dct"
+    prior: str | Denoiser = "ridge"
     prior_weight: float = checks.ranged(0.42, 0, 1e6)
     subvoxels: int = checks.ranged(0, 0, 8)
     prior_share: float = checks.ranged(0.5, 0, 1)

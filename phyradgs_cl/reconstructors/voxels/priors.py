@@ -261,10 +261,10 @@ class OwnPrior(Prior):
 
 
 PRIORS: dict[str, Callable[[PriorInputs], Prior]] = {
+    "ridge": PriorInputs.dct_then_ridge,
     "dct": PriorInputs.tv_and_dct,
     "firm": PriorInputs.tv_and_firm,
     "curves": PriorInputs.tv_and_curves,
-    "ridge": PriorInputs.dct_then_ridge,
     "tv": lambda inputs: inputs.tv(_TV_ALONE),
     "nonlocal": lambda inputs: inputs.nonlocal_then(inputs.tv(_TV_ALONE), _NONLOCAL),
     "nonlocal+dct": lambda inputs: inputs.nonlocal_then(inputs.tv_and_dct(), _NONLOCAL_BEFORE_DCT),
