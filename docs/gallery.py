@@ -31,8 +31,7 @@ HEAD = """# Gallery
 from its commands. **Trust it if** your scan resembles the phantom: [real scans](real.md) gain less.
 
 Each picture shows one slice of the truth and of the volumes, on one grey scale, with their PSNR. Seconds are processor
-seconds of all commands of a result, on two cores of a shared machine. [Check](check.md), [calibrate](calibrate.md) and
-[prepare](prepare.md) have such pictures too.
+seconds of all commands of a result, on two cores of a shared machine.
 """
 
 
@@ -107,6 +106,90 @@ RESULTS = {
         phyradgs reconstruct scan.h5 -o fista.h5
         """,
         {"sirt": "sirt.h5", "fista": "fista.h5"},
+    ),
+    "offset": Result(
+        "A panel that is not where the file says",
+        "The panel is three pixels off. `check` measures the offset and writes it into a copy.",
+        """
+        phyradgs simulate --phantom foot --size 32 --detector 64 --noise tigre --detector-offset 0,0.1875 -o scan.h5
+        python -c "import h5py; h5py.File('scan.h5', 'r+')['entry/phyradgs/detector_offset'][1] = 0"
+        phyradgs check scan.h5 --fix-offset -o fixed.h5
+        phyradgs reconstruct scan.h5 -o stated.h5
+        phyradgs reconstruct fixed.h5 -o mended.h5
+        """,
+        {"as stated": "stated.h5", "after check": "mended.h5"},
+        height=0.28,
+        detail=FOOT,
+    ),
+    "readout": Result(
+        "A readout time that is wrong",
+        "Columns are read; the file states 0.6 s in place of 0.86 s. `calibrate` finds the readout from the projections.",
+        """
+        phyradgs simulate --phantom foot --size 32 --detector 64 --readout columns --noise tigre -o scan.h5
+        python -c "import h5py; h5py.File('scan.h5', 'r+')['entry/instrument/detector/detector_readout_time'][()] = 0.6"
+        phyradgs calibrate scan.h5 --what readout,exposure -o calibrated.h5
+        phyradgs reconstruct scan.h5 -o stated.h5
+        phyradgs reconstruct calibrated.h5 -o found.h5
+        """,
+        {"as stated": "stated.h5", "calibrated": "found.h5"},
+        height=0.28,
+        detail=FOOT,
+    ),
+    "rings": Result(
+        "Rings and sparks",
+        "Pixels whose gain is off by 2 %, and sparks in 0.1 % of them, before and after the usual three steps.",
+        """
+        phyradgs simulate --phantom jaw --size 48 --detector 72 --views 180 --exposure-deg 1.6 --noise beer --dose 1e5 \\
+            --rings 0.02 --sparks 0.001 -o scan.h5
+        phyradgs reconstruct scan.h5 --method fdk --motion per-row -o before.h5
+        phyradgs reconstruct scan.h5 --method fdk --motion per-row --steps sparks,dead,rings -o after.h5
+        """,
+        {"as recorded": "before.h5", "sparks, dead, rings": "after.h5"},
+    ),
+    "scatter": Result(
+        "Scattered light",
+        "Scatter of 30 % of the primary light behind the object, fitted to the light around the object and removed.",
+        """
+        phyradgs simulate --phantom jaw --size 32 --detector 48 --views 60 --exposure-deg 4.8 --noise beer --dose 1e5 \\
+            --peak 3 --scatter 0.3 -o scan.h5
+        phyradgs reconstruct scan.h5 --method fista-tv --motion per-row -o before.h5
+        phyradgs reconstruct scan.h5 --method fista-tv --motion per-row --steps scatter -o after.h5
+        """,
+        {"as recorded": "before.h5", "scatter removed": "after.h5"},
+    ),
+    "hardening": Result(
+        "A beam that hardens",
+        "A tube of 120 kV, and the correction by its spectrum with bone taken into account.",
+        """
+        phyradgs simulate --phantom jaw --size 32 --detector 48 --views 60 --exposure-deg 4.8 --noise beer --dose 1e5 \\
+            --peak 3 --kvp 120 -o scan.h5
+        phyradgs reconstruct scan.h5 --method fdk --motion per-row -o before.h5
+        phyradgs reconstruct scan.h5 --method fdk --motion per-row --steps hardening --set hardening.kvp=120 -o after.h5
+        """,
+        {"as recorded": "before.h5", "hardening removed": "after.h5"},
+    ),
+    "truncation": Result(
+        "A panel that is too narrow",
+        "Half of the columns are cut off. FDK lets the rows end in air, or continues them as chords of a cylinder.",
+        """
+        phyradgs simulate --phantom shepp-logan --size 48 --detector 96 --views 60 --exposure-deg 4.8 \\
+            --truncation 0.5 -o scan.h5
+        phyradgs reconstruct scan.h5 --method fdk --motion per-row -o cut.h5
+        phyradgs reconstruct scan.h5 --method fdk --motion per-row --set extrapolate=cylinder -o cylinder.h5
+        """,
+        {"rows end": "cut.h5", "rows continued": "cylinder.h5"},
+    ),
+    "prior": Result(
+        "An earlier volume of the same object",
+        "Nine views alone, and nine views with the volume of an earlier scan of 120 views as prior image.",
+        """
+        phyradgs simulate --phantom jaw --size 32 --detector 64 --views 120 --exposure-deg 2.4 --noise tigre -o earlier.h5
+        phyradgs simulate --phantom jaw --size 32 --detector 64 --views 9 --noise tigre -o scan.h5
+        phyradgs reconstruct earlier.h5 -o earlier_volume.h5
+        phyradgs reconstruct scan.h5 -o alone.h5
+        phyradgs reconstruct scan.h5 --initial earlier_volume.h5 --prior piccs -o piccs.h5
+        """,
+        {"nine views": "alone.h5", "with the prior image": "piccs.h5"},
     ),
 }
 
