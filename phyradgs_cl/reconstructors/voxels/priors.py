@@ -28,7 +28,8 @@ from phyradgs_cl.reconstructors.result import function_name
 from phyradgs_cl.runtime import Runtime, Space
 
 # shares of the prior's weight, by the prior (docs/results/settings.md)
-_TV_ALONE, _TV_BEFORE_DCT, _TV_BEFORE_RIDGE, _DCT = 1.6, 0.8, 0.6, 1.5
+_TV_ALONE, _TV_BEFORE_DCT, _DCT = 1.6, 0.8, 1.5
+_TV_AT_REST, _DCT_AT_REST = 0.6, 1.35  # before ridge, of scans that stop for each projection
 _TV_BEFORE_CURVES, _CURVES_NOISE, _CURVES = 0.5, 50.0, 3.0  # noise that the curves assume, and strength of their step
 _RIDGE_NOISE, _RIDGE_LENGTH, _RIDGE_EVERY = 17.0, 0.5, 4  # noise that the step assumes, its length, and maps for each step
 _LEAST_NOISE_SHARE = 0.1  # for the ridge step of scans without noise
@@ -55,8 +56,8 @@ class PriorInputs:
     def tv(self, share: float = 1.0) -> "TvPrior":
         return TvPrior(TvProx(self.rt, self.grid.shape, axis_weights(self.grid)), self.tv_iterations, share)
 
-    def tv_and_dct(self, tv_share: float = _TV_BEFORE_DCT) -> "TvAndDct":
-        return TvAndDct(self.tv(tv_share), DctProx(self.rt, self.grid.shape), _DCT)
+    def tv_and_dct(self, tv_share: float = _TV_BEFORE_DCT, unit: float = _DCT) -> "TvAndDct":
+        return TvAndDct(self.tv(tv_share), DctProx(self.rt, self.grid.shape), unit)
 
     def tv_and_firm(self) -> "TvAndDct":
         """On the scan's own voxels, which blur edges, as ``tv_and_dct``: a firm threshold sharpens edges too far there."""
@@ -69,10 +70,10 @@ class PriorInputs:
         return TvAndDct(self.tv(_TV_BEFORE_CURVES), DctProx(self.rt, self.grid.shape, curves), _CURVES_NOISE)
 
     def dct_then_ridge(self) -> "Prior":
-        """Less total variation before a step sharpens scans at rest; on a fly-scan flat bodies lose by it."""
+        """A weaker prior before the step sharpens scans at rest; on a fly-scan flat bodies lose by it."""
         if min(self.grid.shape) < RIDGE_EDGE:
             return self.tv_and_dct()
-        before = self.tv_and_dct() if self.is_fly else self.tv_and_dct(_TV_BEFORE_RIDGE)
+        before = self.tv_and_dct() if self.is_fly else self.tv_and_dct(_TV_AT_REST, _DCT_AT_REST)
         return ThenRidge(before, RidgeStep(self.rt, self.grid.shape, learned_ridge()))
 
     def nonlocal_then(self, then: "Prior", h_share: float) -> "Nonlocal":
