@@ -12,7 +12,7 @@ from phyradgs_cl.acquisition.time_cells import TimeCells
 SHAPE = (13, 18)
 
 
-def noise(shape: tuple[int, ...], seed: int) -> np.ndarray:
+def noise(shape: tuple[int, ...], seed: int = 1) -> np.ndarray:
     return np.random.default_rng(seed).uniform(0, 1, shape).astype(np.float32)
 
 

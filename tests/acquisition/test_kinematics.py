@@ -5,7 +5,6 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from phyradgs_cl.acquisition import (
-    CircularOrbit,
     ConeGeometry,
     ConstantSpeed,
     EncoderTable,
@@ -59,12 +58,6 @@ def test_rounding_of_stored_times_is_forgiven_up_to_a_slack() -> None:
         for beyond_s in (-1.1 * slack_s, last_s + 1.1 * slack_s):
             with pytest.raises(InputError, match="encoder table"):
                 encoder.angle_rad(0, np.array([beyond_s]))
-
-
-def test_an_orbit_asks_geometry_and_kinematics() -> None:
-    orbit = CircularOrbit(GEOMETRY, ConstantSpeed(0.2, 0.1))
-    assert orbit.pose(0, TIMES_S).shape == (4, 12)
-    np.testing.assert_array_equal(orbit.pose(0, TIMES_S)[2], GEOMETRY.pose(0.2 + 0.1 * 1.3))
 
 
 @pytest.mark.parametrize("step_deg", [1.0, 5.0, 60.0, -20.0])

@@ -94,11 +94,7 @@ def test_per_line_cells_sample_each_lines_own_exposure(axis, direction) -> None:
             np.testing.assert_allclose(found_s, middles_s, atol=TIME_TOLERANCE_S)
 
 
-def test_poses_and_times_of_micro_views() -> None:
-    cells = micro_view_cells(ORBIT, Shutter(0.8, 0.3), 0, START_S, 7, 3, 2)
-    angles_rad = 0.1 + SPEED_RAD_PER_S * cells.time_s
-    np.testing.assert_allclose(cells.pose[:, 0], 50 * np.cos(angles_rad), atol=1e-12)
-    np.testing.assert_allclose(cells.pose[:, 1], 50 * np.sin(angles_rad), atol=1e-12)
+def test_micro_views_of_single_lines_have_nearly_their_own_times() -> None:
     shutter, lines = Shutter(0.8, 0.3), 200
     micro = micro_view_cells(ORBIT, shutter, 0, 0.0, lines, lines, 4)
     exact = per_line_cells(ORBIT, shutter, 0, 0.0, lines, 4)

@@ -102,8 +102,6 @@ def test_a_grid_is_given_or_described(rt, scan) -> None:
     assert given.grid == grid and given.volume.shape == grid.shape
     described = api.reconstruct(scan, "fdk", size=[4, 6, 8], voxel_mm=0.1, device=rt)
     assert described.grid == api.Grid(grid.shape, grid.voxel_size_mm)
-    with pytest.raises(InputError, match="^roi_mm: "):
-        api.reconstruct(scan, "fdk", roi_mm=(0, 1), device=rt)
 
 
 def test_the_command_and_python_make_the_same_scan(rt, tmp_path) -> None:

@@ -115,14 +115,6 @@ def astra_vectors() -> np.ndarray:
     return vectors
 
 
-def exchanged() -> np.ndarray:
-    """Vectors of who gave 700 mm as the distance of the axis, 400 mm as the panel's."""
-    vectors = astra_vectors()
-    out = np.stack([np.cos(ANGLES), np.sin(ANGLES), 0 * ANGLES], -1)
-    vectors[:, :3], vectors[:, 3:6] = 700 * out, 300 * out
-    return vectors
-
-
 def test_tigre_angles_that_look_like_degrees_are_said(caplog) -> None:
     for angles, is_said in ((ANGLES, False), (np.rad2deg(ANGLES), True)):
         caplog.clear()
@@ -130,39 +122,29 @@ def test_tigre_angles_that_look_like_degrees_are_said(caplog) -> None:
         assert is_said == ("4 frames over 234.9 rad: are they degrees?" in caplog.text)
 
 
-def test_points_fall_where_astra_puts_them_and_the_vectors_come_back(rt, tmp_path) -> None:
+@pytest.mark.parametrize("is_parallel", [False, True])
+def test_points_fall_where_astra_puts_them_and_the_vectors_come_back(rt, tmp_path, is_parallel) -> None:
+    """``cone_vec`` and ``parallel3d_vec``: rays of any length that rise, panels that lean and lie anywhere on them."""
     vectors = astra_vectors()
-    scan = Scan.from_astra(FRAMES, vectors)
-    expected = np.zeros((4, 4, 2))
-    for i, v in enumerate(vectors):
-        for k, point in enumerate(POINTS):  # panel + a·u + b·v on the line from the source through the point
-            a, b, _ = np.linalg.solve(np.stack([v[6:9], v[9:12], v[:3] - point], 1), v[:3] - v[3:6])
-            expected[i, k] = b + (PANEL[0] - 1) / 2, a + (PANEL[1] - 1) / 2
-    assert np.abs(drawn_pixels(scan, rt) - expected).max() < PIXEL
+    if is_parallel:
+        vectors[:, :3] = [[-2 * np.cos(a), -2 * np.sin(a), 0.01 * i] for i, a in enumerate(ANGLES)]
+    scan = Scan.from_astra(FRAMES, vectors, is_parallel=is_parallel)
+    assert scan.is_parallel == isinstance(scan.geometry, ParallelGeometry) == is_parallel
     assert isinstance(scan.trajectory, PoseTable)
-    np.testing.assert_allclose(scan.astra_vectors(), vectors, atol=1e-9)
-    save_scan(tmp_path / "s.h5", scan)
-    np.testing.assert_allclose(load_scan(tmp_path / "s.h5").astra_vectors(), vectors, atol=1e-6)
-
-
-def test_points_fall_where_astra_s_parallel_rays_put_them_and_the_vectors_come_back(rt, tmp_path) -> None:
-    """``parallel3d_vec``: rays of any length that rise, and panels that lean and lie anywhere along them."""
-    vectors = astra_vectors()
-    vectors[:, :3] = [[-2 * np.cos(a), -2 * np.sin(a), 0.01 * i] for i, a in enumerate(ANGLES)]
-    scan = Scan.from_astra(FRAMES, vectors, is_parallel=True)
-    assert scan.is_parallel and isinstance(scan.geometry, ParallelGeometry) and isinstance(scan.trajectory, PoseTable)
     expected = np.zeros((4, 4, 2))
     for i, v in enumerate(vectors):
         for k, point in enumerate(POINTS):  # point + t·ray = panel + a·u + b·v
-            a, b, _ = np.linalg.solve(np.stack([v[6:9], v[9:12], -v[:3]], 1), point - v[3:6])
+            ray = v[:3] if is_parallel else point - v[:3]
+            a, b, _ = np.linalg.solve(np.stack([v[6:9], v[9:12], -ray], 1), point - v[3:6])
             expected[i, k] = b + (PANEL[0] - 1) / 2, a + (PANEL[1] - 1) / 2
     assert np.abs(drawn_pixels(scan, rt) - expected).max() < PIXEL
-    vectors[:, :3] /= np.linalg.norm(vectors[:, :3], axis=1, keepdims=True)
+    if is_parallel:
+        vectors[:, :3] /= np.linalg.norm(vectors[:, :3], axis=1, keepdims=True)
     np.testing.assert_allclose(scan.astra_vectors(), vectors, atol=1e-9)
     save_scan(tmp_path / "s.h5", scan)
     stored = load_scan(tmp_path / "s.h5")
     np.testing.assert_allclose(stored.astra_vectors(), vectors, atol=1e-6)
-    assert stored.is_parallel
+    assert stored.is_parallel == is_parallel
 
 
 def test_tigre_s_parallel_mode_is_astra_s_parallel_geometry(rt, tmp_path) -> None:

@@ -8,6 +8,7 @@ import sys
 import time
 
 import numpy as np
+import pytest
 
 from phyradgs_cl.io import partial_path, read_volume
 from phyradgs_cl.progress import Ticker
@@ -27,7 +28,8 @@ def test_an_error_of_the_run_stands_on_its_page(cli, scan, tmp_path) -> None:
     page = tmp_path / "run.html"
     command = ["reconstruct", str(scan), "-o", str(tmp_path / "v.h5"), "--method", "fdk", "--resume", "--live", str(page)]
     assert cli.run(command) == 2
-    assert "Stopped by an error: --resume" in page.read_text(encoding="utf-8")
+    text = page.read_text(encoding="utf-8")
+    assert "Stopped by an error: --resume" in text and "stopped – v.h5" in text
 
 
 def test_a_run_that_is_refused_leaves_an_earlier_page_alone(refused, scan, tmp_path) -> None:
@@ -49,7 +51,7 @@ def test_an_interrupted_run_says_how_to_go_on(cli, scan, tmp_path, monkeypatch) 
     assert cli.run(command) == 130
     text = page.read_text(encoding="utf-8")
     assert "Interrupted at iteration 2 of 5: repeat the command with --resume to continue." in text
-    assert '"is_over":true' in text
+    assert '"is_over":true' in text and "after iteration" in text  # the last pictures stay
     monkeypatch.undo()
     assert cli.run([*command, "--resume"]) == 0 and 'id="provenance"' in page.read_text(encoding="utf-8")
 
@@ -71,8 +73,10 @@ def test_a_killed_run_leaves_a_whole_page_that_knows_its_age(scan, tmp_path) -> 
     assert 0 <= time.time() - written < 60 and '"late_s":30' in text and '"is_over":false' in text
 
 
-def test_the_page_does_not_replace_what_matters(refused, scan, tmp_path) -> None:
-    output, before = tmp_path / "volume.html", scan.read_bytes()
-    for page in (scan, output, partial_path(output), tmp_path / "page.txt"):
-        refused(["reconstruct", scan, "-o", output, "--live", page], "--live")
-    assert scan.read_bytes() == before
+@pytest.mark.parametrize(("option", "suffix", "other"), [("--live", "html", "page.txt"), ("--preview", "png", "now.jpg")])
+def test_pages_and_pictures_do_not_replace_what_matters(refused, scan, tmp_path, option, suffix, other) -> None:
+    output, before = tmp_path / f"volume.{suffix}", scan.read_bytes()
+    for path in (scan, output, partial_path(output), tmp_path / other):
+        refused(["reconstruct", scan, "-o", output, option, path], option)
+    refused(["reconstruct", scan, "-o", output, option, tmp_path / "none" / f"now.{suffix}"], "none", status=4)
+    assert scan.read_bytes() == before and not list(tmp_path.iterdir())

@@ -59,10 +59,3 @@ def test_pictures_are_no_more_often_than_asked_and_cost_one_warning(tmp_path, mo
     for iteration in range(3):
         preview(Progress(iteration, 9, 0.5, 0, 1.0, volume=volume))
     assert caplog.text.count("no preview") == 1
-
-
-def test_pictures_do_not_replace_what_matters(refused, scan, tmp_path) -> None:
-    output, before = tmp_path / "volume.png", scan.read_bytes()
-    for picture in (scan, output, tmp_path / "now.jpg"):
-        refused(["reconstruct", scan, "-o", output, "--preview", picture], "--preview")
-    assert scan.read_bytes() == before

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from kernel_kit import assert_near
+from ray_tables import noise
 from tolerances import ADJOINT, FLOAT32, GRIDDED_FIELD, RAYS
 
 from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, ConstantSpeed, Shutter
@@ -41,10 +42,6 @@ def tables(frames: int = 4) -> list[TimeCells]:
     orbit, shutter = CircularOrbit(GEOMETRY, ConstantSpeed(0.3, 1.0)), Shutter(0.8, 0.6)
     start_s = 1.2 * np.arange(frames)
     return [common_time_cells(orbit, shutter, f, start_s, SHAPE[0], 3) for f in range(frames)]
-
-
-def noise(shape: tuple[int, ...], seed: int = 1) -> np.ndarray:
-    return np.random.default_rng(seed).uniform(0.0, 1.0, shape).astype(np.float32)
 
 
 def states_of(one: Deformation) -> MotionStates:

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from kernel_kit import assert_near
+from ray_tables import noise
 from tolerances import ADJOINT, RAYS
 
 from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, ConstantSpeed, Shutter
@@ -25,10 +26,6 @@ def deformation(size_mm: float) -> Deformation:
     control_mm = np.random.default_rng(0).normal(scale=size_mm, size=(2, *counts, 3))
     weights = np.stack([np.cos(TIMES_S), np.sin(TIMES_S)], -1)
     return Deformation(control_mm, origin_mm, 0.6, TIMES_S, weights)
-
-
-def noise(shape: tuple[int, ...], seed: int = 1) -> np.ndarray:
-    return np.random.default_rng(seed).uniform(0.0, 1.0, shape).astype(np.float32)
 
 
 def in_voxels(fields_mm: np.ndarray) -> np.ndarray:

@@ -16,7 +16,7 @@ from phyradgs_cl.acquisition import (
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.phantoms import Ellipsoid, EllipsoidPhantom
-from phyradgs_cl.reconstructors.fdk import FbpOptions, FdkOptions, fbp, fdk
+from phyradgs_cl.reconstructors.fdk import FbpOptions, fbp
 
 SIDE, ROWS = 64, 5
 GRID = Grid((3, SIDE, SIDE), (1.0, 1.0, 1.0))
@@ -82,11 +82,6 @@ def test_lines_are_backprojected_at_their_own_angles(rt) -> None:
         centre = [float((lowest * axis[0]).sum() / lowest.sum()) for axis in (x, y)]
         off.append(np.hypot(centre[0] - 6, centre[1] + 4))
     assert off[0] < 0.03 and off[1] > 0.2
-
-
-def test_each_beam_has_its_method(rt) -> None:
-    with pytest.raises(InputError, match="parallel beam"):
-        fdk(scan_of(8, 180), FdkOptions(), rt)
 
 
 def test_laminography_is_refused_in_one_line(rt) -> None:

@@ -5,17 +5,15 @@ import time
 from io import BytesIO
 
 import numpy as np
-import pytest
 from skimage.io import imread
 
-from phyradgs_cl.errors import InputError, NumericalError, OutOfMemoryError, OutputError
+from phyradgs_cl.errors import InputError, OutOfMemoryError, OutputError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.reconstructors import Progress
 from phyradgs_cl.reconstructors.projected import FramePair
 from phyradgs_cl.report import LivePage
 from phyradgs_cl.report.live import SHARE
 from phyradgs_cl.report.live_page import Snapshot, Status, live_page
-from phyradgs_cl.workflow.files import check_picture
 
 GRID = Grid.cube(6, 3.0)
 SETTINGS = {"scan": "scan.h5", "method": "sart", "options": {"relaxation": 0.7}}
@@ -127,22 +125,6 @@ def test_a_thread_keeps_the_page_fresh_and_ends_with_the_run(tmp_path) -> None:
     assert not live._writer.is_alive() and [one.name for one in tmp_path.iterdir()] == ["p.html"]
 
 
-@pytest.mark.parametrize(
-    ("error", "words"),
-    [
-        (NumericalError("loss", "nan", "a finite number", "a smaller step"), "Stopped by an error: loss: found nan"),
-        (KeyboardInterrupt(), "Interrupted."),
-    ],
-)
-def test_an_error_leaves_its_reason(tmp_path, parse, error, words) -> None:
-    with pytest.raises(type(error)), LivePage(tmp_path / "p.html", "v.h5", SETTINGS) as live:
-        live(report(3))
-        raise error
-    page = parse((tmp_path / "p.html").read_text(encoding="utf-8"))
-    assert words in page.words and "3 of 20" in page.words and "stopped – v.h5" in page.words
-    assert "after iteration 3" in page.words  # the last pictures stay
-
-
 def test_frames_are_left_out_where_the_device_has_no_room_for_them(tmp_path, caplog) -> None:
     def full(count: int) -> list[FramePair]:
         raise OutOfMemoryError("device memory", "1 GiB", "2 GiB")
@@ -176,15 +158,5 @@ def test_a_report_that_fails_says_how_to_make_it(tmp_path, caplog) -> None:
     with LivePage(tmp_path / "p.html", "v.h5", SETTINGS) as live:
         live.become(lambda path: path.write_text("the report", encoding="utf-8"))
     assert (tmp_path / "p.html").read_text(encoding="utf-8") == "the report"
-
-
-def test_a_page_has_its_own_file(tmp_path) -> None:
-    for path, error in (
-        (tmp_path / "p.png", InputError), (tmp_path / "volume.html", InputError), (tmp_path / "none" / "p.html", OutputError)
-    ):  # fmt: skip
-        with pytest.raises(error):
-            check_picture("--live", path, tmp_path / "volume.html", suffixes=(".html", ".htm"))
-    check_picture("--live", tmp_path / "p.html", tmp_path / "volume.html", suffixes=(".html", ".htm"))
-    assert not list(tmp_path.iterdir())
 
 

@@ -80,11 +80,6 @@ def test_sections_links_and_the_documentation_have_one_order(page) -> None:
     assert [name for name in names if name in sections] == sections
 
 
-def test_a_page_has_the_suffix_of_one(files, tmp_path) -> None:
-    with pytest.raises(InputError, match=r"^-o: found the suffix \.pdf; expected an HTML page"):
-        write_report(files[1], tmp_path / "page.pdf", no_runtime)
-
-
 def test_a_slice_says_why_there_is_no_picture_in_3d(tmp_path, parse) -> None:
     thin = tmp_path / "thin.h5"
     write_volume(thin, np.ones((1, 8, 8), np.float32), Grid((1, 8, 8), (1.0, 1.0, 1.0)), {})
@@ -266,6 +261,7 @@ def test_files_of_another_kind_are_named_and_inputs_never_replaced(files, tmp_pa
         ((volume, tmp_path / "nowhere" / "p.html"), OutputError, "nowhere"),
         ((volume, volume), InputError, "reads or writes"),
         ((volume, scan), InputError, "reads or writes"),
+        ((volume, tmp_path / "page.pdf"), InputError, r"^-o: found the suffix \.pdf; expected an HTML page"),
     ):
         with pytest.raises(error, match=said):
             write_report(*arguments[:2], no_runtime, scan=arguments[2] if len(arguments) > 2 else None)
