@@ -3,6 +3,8 @@
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
+
 from phyradgs_cl.acquisition import CircularOrbit, Scan
 from phyradgs_cl.check import CheckResult
 
@@ -26,3 +28,21 @@ def negative(scan: Scan) -> Scan:
     sweeps = scan.trajectory.kinematics
     turned = replace(sweeps, angle_start_rad=-sweeps.angle_start_rad, angle_end_rad=-sweeps.angle_end_rad)
     return replace(scan, trajectory=CircularOrbit(scan.geometry, turned))
+
+
+def some_frames(scan: Scan, chosen: slice | np.ndarray) -> Scan:
+    """The scan with some of its frames."""
+    sweeps = scan.trajectory.kinematics
+    kept = {name: getattr(sweeps, name)[chosen] for name in ("start_s", "angle_start_rad", "angle_end_rad")}
+    return replace(
+        scan, projections=scan.projections[chosen], frame_start_s=scan.frame_start_s[chosen],
+        trajectory=CircularOrbit(scan.geometry, replace(sweeps, **kept)),
+    )  # fmt: skip
+
+
+def cropped(scan: Scan, part: Any, **geometry: Any) -> Scan:
+    """A smaller panel, the part of every frame that an index of all frames takes."""
+    frames = scan.projections[part]
+    panel = replace(scan.geometry, detector_shape=frames.shape[1:], **geometry)
+    orbit = CircularOrbit(panel, scan.trajectory.kinematics)
+    return replace(scan, projections=frames, geometry=panel, trajectory=orbit)

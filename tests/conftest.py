@@ -112,6 +112,7 @@ def refused(cli, capfd) -> Callable[..., str]:
         assert cli.run([str(word) for word in words]) == status, words
         line = capfd.readouterr().err
         assert line.startswith("phyradgs: ") and line.count("\n") == 1, (words, line)
+        assert "Value error" not in line, line
         assert all(part in line for part in parts), (words, line)
         return line
 

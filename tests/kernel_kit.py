@@ -61,7 +61,7 @@ def splat_gradients(
     )
 
 
-def random_weights(shape: tuple[int, int]) -> np.ndarray:
+def random_weights(shape: tuple[int, ...]) -> np.ndarray:
     """Of either sign, in float32's numbers."""
     return np.random.default_rng(5).normal(size=shape).astype(np.float32).astype(np.float64)
 

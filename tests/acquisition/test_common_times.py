@@ -28,7 +28,6 @@ def cells(shutter: Shutter, samples: int = 5, frame: int = 1, start_s: tuple[flo
 
 @pytest.mark.parametrize("name", SHUTTERS)
 def test_shares_are_those_of_windows(name) -> None:
-    """Each line's mean time is the middle of its window, and its weights sum to 1."""
     shutter, table = SHUTTERS[name], cells(SHUTTERS[name], 7)
     assert table.line_share is not None
     np.testing.assert_allclose(table.line_weights(), 1, atol=1e-12)

@@ -108,7 +108,6 @@ def test_numbers_that_hardly_a_scanner_has_are_warned_of(caplog) -> None:
     opaque = FRAMES.copy()
     opaque[..., :2] = 60.0
     for words, make in {
-        "^angles_deg: 12 frames within 5.76°: are they radians": lambda: static_scan(FRAMES, CONE, np.deg2rad(TURN_DEG)),
         "line integrals of up to 60: .* counts": lambda: static_scan(opaque, CONE, TURN_DEG, quantity="attenuation"),
         "^readout_ms: readout of 0.1 s, 1.5 times": lambda: fly_scan(
             FRAMES, CONE, TURN_DEG, fps=15, exposure_s=0.06, readout_ms=100

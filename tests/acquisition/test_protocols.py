@@ -43,7 +43,6 @@ def test_fly_protocols_of_the_paper(name, views, arc_deg) -> None:
 
 @pytest.mark.parametrize("exposure_s", [1.0, 0.05])
 def test_one_constant_speed_joins_all_frames(exposure_s) -> None:
-    """Frame starts and angles lie on one line: speed is arc over exposure."""
     protocol = Protocol(views=20, exposure_deg=9.0, exposure_s=exposure_s, start_deg=11.0)
     starts = protocol.frame_start_s()
     for frame in (3, 19):

@@ -100,7 +100,6 @@ def test_what_looks_like_radians_transmissions_or_percent_is_said(caplog) -> Non
 
 
 def test_numpy_numbers_are_numbers(rt, tmp_path) -> None:
-    """Counts and lengths from arrays are accepted in place of int and float."""
     whole, half = np.int64, np.float32(0.5)
     scan = simulate("jaw", size=whole(8), detector=whole(12), views=whole(6), exposure_deg=np.float32(30), device=rt)
     how = {"motion": "micro-views", "strips": whole(2), "sub_intervals": np.uint8(2), "seed": whole(3), "device": rt}

@@ -1,11 +1,10 @@
 """Half a turn of nearly parallel rays: too little of an offset's signal is its own, but the best axis is known."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
+from check_kit import some_frames, stated
 
-from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, Protocol, Scan
+from phyradgs_cl.acquisition import ConeGeometry, Protocol
 from phyradgs_cl.calibrate import AGREES, CANNOT_TELL, CORRECTED, calibrate
 from phyradgs_cl.calibrate.parameters import PARAMETERS
 from phyradgs_cl.calibrate.problem import CoarseProblem
@@ -25,17 +24,8 @@ def half_turn(rt):
     scene = phantom_scene(rt, "foot", geometry, Grid.cube(16, 2.0), 16, "rows", 0)
     plan = Protocol(views=60, exposure_deg=6.0, readout_ratio=0.0)
     options = SimulationOptions(plan, noise="tigre", dose=1e5, time_samples=2)
-    whole = simulate(scene.source, geometry, scene.grid, options)
-    sweeps, kept = whole.trajectory.kinematics, slice(0, 30)
-    half = {name: getattr(sweeps, name)[kept] for name in ("start_s", "angle_start_rad", "angle_end_rad")}
-
-    def make(pixels: float) -> Scan:
-        stated = replace(geometry, detector_offset_mm=(0.0, pixels * PITCH_MM))
-        orbit = CircularOrbit(stated, replace(sweeps, **half))
-        frames, starts_s = whole.projections[kept], whole.frame_start_s[kept]
-        return replace(whole, geometry=stated, projections=frames, frame_start_s=starts_s, trajectory=orbit)
-
-    return make
+    half = some_frames(simulate(scene.source, geometry, scene.grid, options), slice(30))
+    return lambda pixels: stated(half, detector_offset_mm=(0.0, pixels * PITCH_MM))
 
 
 def test_the_offset_of_half_a_turn_is_found_where_check_finds_it(rt, half_turn) -> None:

@@ -5,9 +5,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from check_kit import negative, stated, suspected, verdicts
+from check_kit import cropped, negative, some_frames, stated, suspected, verdicts
 
-from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, PoseTable
+from phyradgs_cl.acquisition import ConeGeometry, PoseTable
 from phyradgs_cl.acquisition.altered.coarse import FINE_COLUMNS, QUICK_COLUMNS, coarse
 from phyradgs_cl.acquisition.plausible import blur_facts, blur_line
 from phyradgs_cl.check import CANNOT_TELL, OK, SUSPICIOUS, check
@@ -77,13 +77,7 @@ def test_the_deviation_of_an_offset_covers_its_error_in_half_a_turn(rt, scan_of,
     """Most rays are then measured once, and coarse volumes pull the offset to one side."""
     geometry = ConeGeometry(5.0, 7.0, (64, 64), (0.0625, 0.0625))
     scan = scan_of(geometry, size=32, views=40, exposure_deg=9.0)
-    sweeps, kept = scan.trajectory.kinematics, slice(0, 24)
-    part = {name: getattr(sweeps, name)[kept] for name in ("start_s", "angle_start_rad", "angle_end_rad")}
-    half = replace(
-        scan, projections=scan.projections[kept], frame_start_s=scan.frame_start_s[kept],
-        trajectory=CircularOrbit(geometry, replace(sweeps, **part)),
-    )  # fmt: skip
-    found = check(stated(half, detector_offset_mm=(0.0, -pixels * 0.0625)), rt)
+    found = check(stated(some_frames(scan, slice(24)), detector_offset_mm=(0.0, -pixels * 0.0625)), rt)
     assert abs(found.offset_mm - pixels * 0.0625) < 2 * found.offset_spread_mm < 0.05
 
 
@@ -93,9 +87,7 @@ def test_a_drift_of_the_gain(rt, clean) -> None:
     drifted = (clean.projections - gain[:, None, None]).astype(np.float32)
     found = check(replace(clean, projections=drifted), rt)
     assert suspected(found) == ["gain drift"]
-    panel = replace(clean.geometry, detector_shape=(32, 14))
-    orbit = CircularOrbit(panel, clean.trajectory.kinematics)
-    narrow = replace(clean, projections=drifted[:, :, 9:23], geometry=panel, trajectory=orbit)
+    narrow = cropped(replace(clean, projections=drifted), np.s_[:, :, 9:23])
     cut = next(f for f in check(narrow, rt).findings if f.question == "gain drift")
     assert cut.verdict == CANNOT_TELL and "or the object does beyond the panel" in cut.text
     value = next(f.value for f in found.findings if f.question == "gain drift")

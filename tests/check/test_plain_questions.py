@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from check_kit import cropped, some_frames
 
 from phyradgs_cl.acquisition import CircularOrbit, EncoderTable, FrameSweeps, PoseTable, Saturation
 from phyradgs_cl.acquisition.altered.angles import exposure_arc_rad
@@ -11,16 +12,6 @@ from phyradgs_cl.check import OK, SUSPICIOUS, CountReader
 from phyradgs_cl.check.coverage import check_coverage
 from phyradgs_cl.check.detector import check_dead_pixels, check_saturation
 from phyradgs_cl.check.timing import check_angles, check_timing
-
-
-def some_frames(scan, chosen):
-    """The scan with some of its frames."""
-    sweeps = scan.trajectory.kinematics
-    kept = {name: getattr(sweeps, name)[chosen] for name in ("start_s", "angle_start_rad", "angle_end_rad")}
-    return replace(
-        scan, projections=scan.projections[chosen], frame_start_s=scan.frame_start_s[chosen],
-        trajectory=CircularOrbit(scan.geometry, replace(sweeps, **kept)),
-    )
 
 
 def test_a_clean_scan_is_left_in_peace(clean) -> None:
@@ -104,21 +95,13 @@ def test_half_a_turn_is_enough_for_rays_that_are_nearly_parallel(clean, away, ve
     assert check_angles(scan).verdict == verdict
 
 
-def cropped(scan, columns, offset_mm):
-    """A narrower panel, said to stand at ``offset_mm``."""
-    p = scan.projections[:, :, columns]
-    geometry = replace(scan.geometry, detector_shape=p.shape[1:], detector_offset_mm=(0.0, offset_mm))
-    orbit = CircularOrbit(geometry, scan.trajectory.kinematics)
-    return replace(scan, projections=p, geometry=geometry, trajectory=orbit)
-
-
 def test_a_panel_that_cuts_the_object(clean) -> None:
     """A displaced one may, on its short side."""
-    finding = check_coverage(cropped(clean, slice(9, 23), 0.0))
+    finding = check_coverage(cropped(clean, np.s_[:, :, 9:23]))
     assert finding.verdict == SUSPICIOUS and finding.value > finding.threshold
-    right_half = slice(14, 32)
-    assert check_coverage(cropped(clean, right_half, 0.875)).verdict == OK
-    assert check_coverage(cropped(clean, right_half, -0.875)).verdict == SUSPICIOUS
+    for offset_mm, verdict in ((0.875, OK), (-0.875, SUSPICIOUS)):
+        right_half = cropped(clean, np.s_[:, :, 14:32], detector_offset_mm=(0.0, offset_mm))
+        assert check_coverage(right_half).verdict == verdict
 
 
 def test_saturated_areas_but_not_noise_that_is_cut_off(clean) -> None:

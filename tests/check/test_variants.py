@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from check_kit import cropped, negative, stated
 
 from phyradgs_cl.acquisition import CircularOrbit, PoseTable, Shutter, pixel_centres
 from phyradgs_cl.acquisition.altered.coarse import FINE_COLUMNS, binned, coarse, fewer_frames
@@ -19,16 +20,12 @@ def poses(scan):
 
 
 def displaced(scan, u_mm):
-    geometry = replace(scan.geometry, detector_offset_mm=(0.3, u_mm))
-    return replace(scan, geometry=geometry, trajectory=CircularOrbit(geometry, scan.trajectory.kinematics))
+    return stated(scan, detector_offset_mm=(0.3, u_mm))
 
 
 def test_what_hypotheses_change(clean) -> None:
     scan = displaced(clean, 0.4)
-    sweeps = scan.trajectory.kinematics
-    negative = replace(sweeps, angle_start_rad=-sweeps.angle_start_rad, angle_end_rad=-sweeps.angle_end_rad)
-    expected = replace(scan, trajectory=CircularOrbit(scan.geometry, negative))
-    np.testing.assert_allclose(poses(reversed_rotation(scan)), poses(expected), **CLOSE)
+    np.testing.assert_allclose(poses(reversed_rotation(scan)), poses(negative(scan)), **CLOSE)
     moved = displaced(clean, 0.4 + 2.5 * clean.geometry.pixel_size_mm[1])
     np.testing.assert_allclose(poses(shifted(displaced(clean, 0.4), 2.5)), poses(moved), **CLOSE)
     assert reversed_readout(clean).shutter.direction == -1
@@ -36,11 +33,8 @@ def test_what_hypotheses_change(clean) -> None:
 
 def of_rows(scan, rows):
     """The middle rows of a scan."""
-    geometry = replace(scan.geometry, detector_shape=(rows, scan.geometry.detector_shape[1]))
     first = (scan.geometry.detector_shape[0] - rows) // 2
-    frames = scan.projections[:, first : first + rows]
-    orbit = CircularOrbit(geometry, scan.trajectory.kinematics)
-    return replace(scan, projections=frames, geometry=geometry, trajectory=orbit)
+    return cropped(scan, np.s_[:, first : first + rows])
 
 
 @pytest.mark.parametrize(("rows", "block", "high"), [(32, 2, 2), (32, 3, 3), (2, 3, 2), (1, 4, 1)])

@@ -33,7 +33,7 @@ RECONSTRUCT = {
     "--method": ("--method magic",),
     "--motion": ("--motion wobble", "--method fdk --motion micro-views"),
     "strips": ("--strips 0", f"--strips {DIGITS}", "--motion static --strips 4", "--method fdk --strips 4"),
-    "iterations": ("--iterations -5", "--iterations 1e3", "--method fdk --iterations 5"),
+    "iterations": ("--iterations -5", "--iterations 1e3", "--iterations abc", "--method fdk --iterations 5"),
     "--preset": ("--preset best", "--preset ''"),
     "--seed": ("--seed -1", "--seed 1.5", f"--seed {DIGITS}"),
     "none.toml": ("--config {tmp}/none.toml",),

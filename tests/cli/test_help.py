@@ -113,11 +113,3 @@ def test_the_tab_key_in_bash() -> None:
         environment = {**os.environ, **asked, "_PHYRADGS_COMPLETE": "complete_bash"}
         done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
         assert set(done.stdout.split()) == expected, (words, done.stderr)
-
-
-@pytest.mark.parametrize(("option", "value"), [("--iterations", "abc"), ("--motion", "warp"), ("--seed", "1.5")])
-def test_a_value_of_the_wrong_kind_is_named(cli, capsys, option, value) -> None:
-    """Typer's own message names it for choices alone, and begins with its class of errors."""
-    assert cli.run(["reconstruct", "scan.h5", "-o", "volume.h5", f"{option}={value}"]) == 2
-    said = capsys.readouterr().err
-    assert option in said and value in said and "Value error" not in said and said.count("\n") == 1

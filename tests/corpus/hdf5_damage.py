@@ -34,7 +34,7 @@ def put(file: h5py.File, address: str, value: object = None, **how: object) -> h
     return made
 
 
-def _changed(change: Callable[[np.ndarray], object]) -> Change:
+def changed(change: Callable[[np.ndarray], object]) -> Change:
     return lambda file, address: put(file, address, change(np.asarray(file[address][()])))
 
 
@@ -46,7 +46,7 @@ def _first(value: float) -> Change:
         array.reshape(-1)[:1] = value
         return array
 
-    return _changed(change)
+    return changed(change)
 
 
 def _instead(make: Change) -> Change:
@@ -134,10 +134,10 @@ FIELD: dict[str, Change] = {
     "a group": _instead(lambda f, a: f.create_group(a)),
     "a text": lambda f, a: put(f, a, "text"),
     "texts": lambda f, a: put(f, a, ["a", "b"]),
-    "an axis more": _changed(lambda v: np.stack([v, v])),
-    "nothing in it": _changed(lambda v: np.zeros((0, *v.shape[1:]), v.dtype)),
-    "complex": _changed(lambda v: v.astype(np.complex64)),
-    "a compound": _changed(lambda v: np.zeros(v.shape, "f4,f4")),
+    "an axis more": changed(lambda v: np.stack([v, v])),
+    "nothing in it": changed(lambda v: np.zeros((0, *v.shape[1:]), v.dtype)),
+    "complex": changed(lambda v: v.astype(np.complex64)),
+    "a compound": changed(lambda v: np.zeros(v.shape, "f4,f4")),
     "null": lambda f, a: put(f, a, h5py.Empty("f8")),
     "references": _references,
     "NaN": _first(np.nan),

@@ -10,7 +10,6 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from phyradgs_cl.api import save_scan, simulate
 from phyradgs_cl.commands.files import EXAMPLES, export_command
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.exporters import EXPORTS
@@ -57,14 +56,6 @@ def test_a_series_says_whose_it_is(run, volume_file, tmp_path) -> None:
         with pytest.raises(InputError, match=f"^--{name}: found"):
             raise run(volume_file, "--to", "dicom", "-o", tmp_path / "wrong", f"--{name}", value).exception
     assert not (tmp_path / "wrong").exists() and not volume_file.with_suffix(".nii").exists()
-
-
-def test_wrong_input_is_our_error(run, rt, tmp_path) -> None:
-    assert isinstance(run(tmp_path / "none.h5", "--to", "nii").exception, InputError)
-    assert run(tmp_path / "none.h5", "--to", "obj").exit_code == 2
-    save_scan(tmp_path / "scan.h5", simulate("foot", size=8, detector=8, views=3, noise="none", device=rt))
-    with pytest.raises(InputError, match="found a scan.*expected a volume"):
-        raise run(tmp_path / "scan.h5", "--to", "nii").exception
 
 
 DOCS = Path(__file__).resolve().parents[2] / "docs" / "export.md"

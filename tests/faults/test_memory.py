@@ -96,5 +96,7 @@ def test_a_loss_that_is_no_number_is_named(run, scan, tmp_path, capfd, monkeypat
     monkeypatch.setattr(ImageLoss, "value", lambda self: value(self) * np.float32("nan"))
     splats = ["--method", "phyradgs", "--iterations", "60", "--gaussians", "20"]
     assert run("reconstruct", scan, "-o", tmp_path / "v.h5", *splats) == 3
-    assert capfd.readouterr().err.splitlines()[-1].startswith("phyradgs: loss: found nan at iteration 3;")
+    line = capfd.readouterr().err.splitlines()[-1]
+    assert line.startswith("phyradgs: loss: found nan at iteration 3;")
+    assert line.endswith("check the scan for extreme values")
     assert kit.names(tmp_path) == []

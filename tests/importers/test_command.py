@@ -77,7 +77,6 @@ def test_formats_and_options_are_described() -> None:
 
 
 def test_the_documentation_s_example_runs(tmp_path, make_truth, monkeypatch) -> None:
-    """The worked TOML of docs/import.md describes the folder that the writer makes."""
     text = DOCS.read_text(encoding="utf-8")
     toml = next(block for block in re.findall(r"```toml\n(.*?)```", text, re.S) if "[frames]" in block)
     path = w.write_tiff(tmp_path / "scan", make_truth())

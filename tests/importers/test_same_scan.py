@@ -134,12 +134,6 @@ def test_naf_with_numpy_s_own_numbers(tmp_path, make_truth, assert_same) -> None
     assert import_scan(tmp_path / "chest.pickle").frames == make_truth().scan.frames - 2
 
 
-def test_a_flat_value_wins_over_flats(tmp_path, make_truth) -> None:
-    path = w.write_data_exchange(tmp_path / "scan.h5", make_truth())
-    usual, flat = (import_scan(path, ImportOptions(**CONE, flat_value=v)).projections for v in (None, w.AIR))
-    assert np.abs(usual - flat).max() > 0.05
-
-
 def test_data_exchange(tmp_path, make_truth, assert_same) -> None:
     truth = make_truth()
     path = w.write_data_exchange(tmp_path / "scan.h5", truth, dead=(2, 11))

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from phyradgs_cl.errors import InputError, OutputError
-from phyradgs_cl.io import check_writable, sha256_of, write_scan, written_beside
+from phyradgs_cl.io import check_writable, written_beside
 
 POSIX = os.name == "posix"
 
@@ -128,16 +128,3 @@ def test_a_killed_writer_leaves_the_old_file(tmp_path) -> None:
     elsewhere.write_text("half")
     check_writable(tmp_path / "out.h5")  # whatever the run writes: volume, checkpoint, picture
     assert names(tmp_path) == sorted([elsewhere.name, "out.txt"])
-
-
-def test_a_scan_that_fails_half_way_leaves_the_old_one(tmp_path, make_scan, monkeypatch) -> None:
-    write_scan(tmp_path / "scan.h5", make_scan())
-    before = sha256_of(tmp_path / "scan.h5")
-
-    def fails(*_: object) -> None:
-        raise RuntimeError("interrupted")
-
-    monkeypatch.setattr("phyradgs_cl.io.scan.writer.write_motion", fails)
-    with pytest.raises(RuntimeError, match="interrupted"):
-        write_scan(tmp_path / "scan.h5", make_scan(title="new"))
-    assert sha256_of(tmp_path / "scan.h5") == before and names(tmp_path) == ["scan.h5"]

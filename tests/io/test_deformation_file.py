@@ -6,6 +6,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
+from corpus.hdf5_damage import REMOVED, Change, attribute, on, value
 
 from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.detector import counts_to_attenuation
@@ -38,39 +39,23 @@ def test_values_come_back_in_mm_and_s(path: Path) -> None:
         np.testing.assert_allclose(getattr(after, name), getattr(before, name), rtol=1e-15)
 
 
-def _without(name: str) -> Callable[[h5py.Group], None]:
-    return lambda group: group.__delitem__(name)
+def _folded(file: h5py.File, address: str) -> None:
+    file[address][0, 1, 1, 1] = [0.0, 0.0, 60.0]
 
 
-def _with(name: str, value: object) -> Callable[[h5py.Group], None]:
-    def change(group: h5py.Group) -> None:
-        attributes = dict(group[name].attrs)
-        del group[name]
-        group[name] = value
-        group[name].attrs.update(attributes)
-
-    return change
-
-
-def _folded(group: h5py.Group) -> None:
-    group["control"][0, 1, 1, 1] = [0.0, 0.0, 60.0]
-
-
-@pytest.mark.parametrize(("damage", "subject", "found"), [
-    (_without("control"), "/control", "nothing there"),
-    (_without("weights"), "/weights", "nothing there"),
-    (_with("control", np.zeros((2, 3, 4, 5))), "/control", "shape"),
-    (_with("origin", np.zeros(2)), "/origin", "shape"),
-    (_with("spacing", np.array([4.0, 0.0, 6.0])), "deformation", "spacing_mm"),
-    (_with("times", np.array([0.0, 3.0, 1.0])), "deformation", "times_s"),
-    (_with("weights", np.zeros((2, 2))), "/weights", "shape"),
-    (_with("weights", np.full((3, 2), np.nan)), "/weights", "NaN"),
-    (lambda group: group["times"].attrs.modify("units", "mm"), "/times @units", "'mm'"),
-    (_folded, "deformation", "folds"),
+@pytest.mark.parametrize(("name", "damage", "subject", "found"), [
+    ("control", REMOVED, "/control", "nothing there"), ("weights", REMOVED, "/weights", "nothing there"),
+    ("control", value(np.zeros((2, 3, 4, 5))), "/control", "shape"),
+    ("origin", value(np.zeros(2)), "/origin", "shape"),
+    ("spacing", value(np.array([4.0, 0.0, 6.0])), "deformation", "spacing_mm"),
+    ("times", value(np.array([0.0, 3.0, 1.0])), "deformation", "times_s"),
+    ("weights", value(np.zeros((2, 2))), "/weights", "shape"),
+    ("weights", value(np.full((3, 2), np.nan)), "/weights", "NaN"),
+    ("times", attribute("units", "mm"), "/times @units", "'mm'"),
+    ("control", _folded, "deformation", "folds"),
 ])  # fmt: skip
-def test_damage_is_named_in_one_line(path: Path, damage: Callable[[h5py.Group], None], subject: str, found: str) -> None:
-    with h5py.File(path, "r+") as file:
-        damage(file[GROUP])
+def test_damage_is_named_in_one_line(path: Path, name: str, damage: Change, subject: str, found: str) -> None:
+    on(f"{GROUP}/{name}", damage)(path)
     with pytest.raises(InputError) as caught:
         read_deformation(path)
     assert caught.value.subject.endswith(subject)
@@ -98,23 +83,15 @@ def test_a_scan_holds_states_and_how_they_came_about(tmp_path: Path, make_scan: 
     assert scan.on_grid(Grid.cube(3, 90.0)).moving_truth is None
 
 
-@pytest.mark.parametrize(("damage", "subject"), [
-    (_without("states"), "/states"), (_without("state_times"), "/state_times"),
-    (_with("states", np.ones((3, 2, 3, 4))), "/states"), (_with("states", np.zeros((2, 2, 3, 4))), "/states"),
-    (_with("state_times", np.full(2, np.nan)), "/state_times"), (_without("deformation/control"), "/deformation/control"),
+@pytest.mark.parametrize(("name", "damage"), [
+    ("states", REMOVED), ("state_times", REMOVED), ("deformation/control", REMOVED),
+    ("states", value(np.ones((3, 2, 3, 4)))), ("states", value(np.zeros((2, 2, 3, 4)))),
+    ("state_times", value(np.full(2, np.nan))),
 ])  # fmt: skip
-def test_damaged_states_are_named(tmp_path, make_scan, damage, subject) -> None:
+def test_damaged_states_are_named(tmp_path, make_scan, name, damage) -> None:
     path = tmp_path / "scan.h5"
     write_scan(path, a_moving_scan(make_scan))
-    with h5py.File(path, "r+") as file:
-        damage(file["/entry/phyradgs/reference"])
+    on(f"/entry/phyradgs/reference/{name}", damage)(path)
     with pytest.raises(InputError) as caught:
         read_scan(path, counts_to_attenuation)
-    assert caught.value.subject.endswith(f"reference{subject}")
-
-
-def test_other_files_are_no_deformation(tmp_path: Path) -> None:
-    with h5py.File(tmp_path / "other.h5", "w") as file:
-        file["volume"] = np.ones((2, 2, 2))
-    with pytest.raises(InputError, match="expected a group /entry/deformation"):
-        read_deformation(tmp_path / "other.h5")
+    assert caught.value.subject.endswith(f"reference/{name}")

@@ -10,7 +10,8 @@ from typing import Any
 import h5py
 import numpy as np
 import pytest
-from corpus.hdf5_damage import on
+from corpus.hdf5_damage import REMOVED, attribute, changed, on, put
+from corpus.hdf5_damage import value as replaced
 from corpus.hdf5_files import HARMLESS_COUNTS, HARMLESS_FLY, damages_of
 
 from phyradgs_cl.acquisition import CircularOrbit, EncoderTable, PoseTable, Scan
@@ -29,27 +30,8 @@ GRID_SHAPE, REFERENCE = f"{EXTRA}/grid/shape", f"{EXTRA}/reference/volume"
 Damage = Callable[[h5py.File, str], object]
 
 
-def deleted(file: h5py.File, address: str) -> None:
-    del file[address]
-
-
 def renamed(name: str) -> Damage:
     return lambda file, address: file.move(address, f"{os.path.dirname(address)}/{name}")
-
-
-def replaced(value: object) -> Damage:
-    """Other content under the same attributes."""
-
-    def damage(file: h5py.File, address: str) -> None:
-        attributes = dict(file[address].attrs)
-        del file[address]
-        file.create_dataset(address, data=value).attrs.update(attributes)
-
-    return damage
-
-
-def changed(change: Callable[[np.ndarray], np.ndarray]) -> Damage:
-    return lambda file, address: replaced(change(file[address][()]))(file, address)
 
 
 def all_changed(change: Callable[[np.ndarray], np.ndarray]) -> Damage:
@@ -67,31 +49,10 @@ def poked(index: object, value: float) -> Damage:
     return lambda file, address: file[address].__setitem__(index, value)
 
 
-def attribute(name: str, value: object) -> Damage:
-    return lambda file, address: file[address].attrs.__setitem__(name, value)
-
-
-def linked(link: object) -> Damage:
-    def damage(file: h5py.File, address: str) -> None:
-        del file[address]
-        file[address] = link
-
-    return damage
-
-
-def created(*arguments: object, **how: object) -> Damage:
-    """Frames that are stored in another way."""
-
-    def damage(file: h5py.File, address: str) -> None:
-        del file[address]
-        file.create_dataset(address, *arguments, **how).attrs["quantity"] = "attenuation"
-
-    return damage
-
-
 def soft_link_to_external(file: h5py.File, away: str) -> None:
     file[away] = h5py.ExternalLink("other.h5", "/")
-    linked(h5py.SoftLink(f"{away}/data"))(file, DATA)
+    del file[DATA]
+    file[DATA] = h5py.SoftLink(f"{away}/data")
 
 
 def entry_misnamed(file: h5py.File, address: str) -> None:
@@ -112,7 +73,7 @@ CASES: dict[str, tuple[Any, ...]] = {
         f"{address} misnamed": (address, renamed(name), f"rename '{name}'")
         for address, name in RENAMED.items()
     },
-    "no entry": ("/entry", deleted, "NXentry"),
+    "no entry": ("/entry", REMOVED, "NXentry"),
     "entry misnamed": ("/entry", entry_misnamed, "rename 'entrys'"),
     "data 2D": (DATA, changed(lambda d: d[0]), "(3, 5)", "three axes"),
     "data float64": (DATA, changed(np.float64), "float64", "float32"),
@@ -247,7 +208,7 @@ def test_a_file_that_may_not_be_read(good, monkeypatch) -> None:
 
 def test_a_spoilt_chunk_is_named(tmp_path, good) -> None:
     with h5py.File(good, "r+") as file:
-        created(data=file[DATA][...], compression="gzip", fletcher32=True)(file, DATA)
+        put(file, DATA, file[DATA][...], compression="gzip", fletcher32=True)
     with h5py.File(good) as file:
         where = file[DATA].id.get_chunk_info(0)
     with open(good, "r+b") as raw:

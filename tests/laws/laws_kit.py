@@ -2,7 +2,6 @@
 
 import os
 
-import numpy as np
 from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
 
@@ -56,14 +55,3 @@ def grids(draw: st.DrawFn) -> Grid:
 
 
 seeds = st.integers(0, 2**32 - 1)
-
-
-def cloud(seed: int, count: int = 4, smallest: float = 0.08) -> np.ndarray:
-    """Rows (11, G) of Gaussians inside a volume of side 2, float64 numbers that float32 has too."""
-    rng = np.random.default_rng(seed)
-    quaternion = rng.normal(size=(4, count))
-    parts = [
-        rng.uniform(-0.7, 0.7, (3, count)), np.exp(rng.uniform(np.log(smallest), np.log(0.5), (3, count))),
-        quaternion / np.linalg.norm(quaternion, axis=0), rng.uniform(0.5, 2.0, (1, count)),
-    ]
-    return np.concatenate(parts).astype(np.float32).astype(np.float64)

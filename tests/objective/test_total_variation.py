@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from kernel_kit import random_weights
 from tolerances import FLOAT64, TV_GRADIENT, TV_VALUE, TWIN_GRADIENT
 
 from phyradgs_cl.objective.terms import TotalVariation, total_variation
@@ -10,13 +11,9 @@ from phyradgs_cl.runtime.layout import pad_rows, pitch_of, unpad_rows
 SHAPES = [(5, 6, 7), (4, 3, 33), (1, 8, 16), (8, 1, 5), (6, 7, 1), (1, 1, 1)]
 
 
-def volume_of(shape: tuple[int, int, int]) -> np.ndarray:
-    return np.random.default_rng(1).normal(size=shape).astype(np.float32).astype(float)
-
-
 @pytest.mark.parametrize("shape", SHAPES)
 def test_kernel_is_its_twin(any_rt, shape) -> None:
-    volume = volume_of(shape)
+    volume = random_weights(shape)
     tv = TotalVariation(any_rt, shape, pitch_of(shape[2]))
     flat = any_rt.download(tv.evaluate(any_rt.upload(pad_rows(volume))))
     value, gradient = total_variation(volume)
@@ -27,11 +24,11 @@ def test_kernel_is_its_twin(any_rt, shape) -> None:
 
 def test_twin_is_the_mean_difference_along_every_axis(finite_differences) -> None:
     for shape in [(5, 6, 7), (2, 3, 2)]:
-        volume = volume_of(shape)
+        volume = random_weights(shape)
         expected = sum(np.abs(np.diff(volume, axis=axis)).mean() for axis in range(3))
         assert total_variation(volume)[0] == pytest.approx(expected, rel=FLOAT64)
     for shape in [(3, 4, 5), (1, 4, 5)]:
-        volume = volume_of(shape)
+        volume = random_weights(shape)
         expected = finite_differences(lambda x: total_variation(x)[0], volume)
         np.testing.assert_allclose(total_variation(volume)[1], expected, rtol=0, atol=TWIN_GRADIENT)
 

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from kernel_kit import random_weights
 from tolerances import TV_MAP, TWIN_GRADIENT
 
 from phyradgs_cl.objective import TvDescent, TvProx
@@ -15,14 +16,10 @@ def isotropic_tv(volume: np.ndarray, axis_weights: tuple[float, float, float] = 
     return float(np.linalg.norm(differences(volume, axis_weights), axis=0).sum())
 
 
-def volume_of(shape: tuple[int, int, int], seed: int = 1) -> np.ndarray:
-    return np.random.default_rng(seed).normal(size=shape).astype(np.float32).astype(float)
-
-
 @pytest.mark.parametrize("shape", SHAPES)
 @pytest.mark.parametrize("nonnegative", [True, False])
 def test_proximal_kernel_is_its_twin(any_rt, shape, nonnegative) -> None:
-    volume = volume_of(shape)
+    volume = random_weights(shape)
     prox = TvProx(any_rt, shape, SKEWED)
     found = prox(volume.astype(np.float32), 0.3, 12, nonnegative=nonnegative)
     expected = tv_prox(volume, 0.3, 12, nonnegative=nonnegative, axis_weights=SKEWED)
@@ -31,7 +28,7 @@ def test_proximal_kernel_is_its_twin(any_rt, shape, nonnegative) -> None:
 
 @pytest.mark.parametrize("axis_weights", [SKEWED, (3.0, 2.0, 1.0)])
 def test_the_map_is_the_minimum_of_its_objective(axis_weights) -> None:
-    volume = volume_of((4, 5, 6))
+    volume = random_weights((4, 5, 6))
     weight = 0.4
 
     def objective(x: np.ndarray) -> float:
@@ -67,7 +64,7 @@ def test_the_first_step_by_hand(any_rt, axis_weights, step) -> None:
 
 
 def test_the_dual_goes_on_where_the_last_call_left_it(rt) -> None:
-    volume = volume_of((5, 6, 7)).astype(np.float32)
+    volume = random_weights((5, 6, 7)).astype(np.float32)
     goal = tv_prox(volume, 0.4, 4000, nonnegative=False)
     prox = TvProx(rt, volume.shape)
     errors = [np.abs(prox(volume, 0.4, 8, nonnegative=False) - goal).max() for _ in range(6)]
@@ -80,7 +77,7 @@ def test_the_dual_goes_on_where_the_last_call_left_it(rt) -> None:
 
 
 def test_no_weight_only_clips_and_a_flat_volume_stays(rt) -> None:
-    volume, flat = volume_of((3, 4, 5)).astype(np.float32), np.full((4, 5, 6), 2.5, np.float32)
+    volume, flat = random_weights((3, 4, 5)).astype(np.float32), np.full((4, 5, 6), 2.5, np.float32)
     prox = TvProx(rt, volume.shape)
     np.testing.assert_array_equal(prox(volume, 0.0, 5, nonnegative=True), np.maximum(volume, 0))
     np.testing.assert_array_equal(prox(volume, 0.0, 5, nonnegative=False), volume)
@@ -89,7 +86,7 @@ def test_no_weight_only_clips_and_a_flat_volume_stays(rt) -> None:
 
 @pytest.mark.parametrize("shape", SHAPES)
 def test_descent_kernel_is_its_twin(any_rt, shape) -> None:
-    volume = volume_of(shape)
+    volume = random_weights(shape)
     before, descent = volume.copy(), TvDescent(any_rt, shape)
     np.testing.assert_allclose(descent.gradient(volume), tv_gradient(volume), rtol=0, atol=TV_MAP)
     np.testing.assert_allclose(descent(volume, 0.05, 5), tv_descent(volume, 0.05, 5), rtol=0, atol=TV_MAP)
@@ -98,13 +95,13 @@ def test_descent_kernel_is_its_twin(any_rt, shape) -> None:
 
 @pytest.mark.parametrize("share", [0.0, 0.4, 1.0])
 def test_descent_with_a_prior_image_is_its_twin(any_rt, share) -> None:
-    volume, image = volume_of((4, 5, 19)), volume_of((4, 5, 19))[::-1].copy()
+    volume, image = random_weights((4, 5, 19)), random_weights((4, 5, 19))[::-1].copy()
     found = TvDescent(any_rt, volume.shape, image, share)(volume, 0.05, 5)
     np.testing.assert_allclose(found, tv_descent(volume, 0.05, 5, image, share), rtol=0, atol=TV_MAP)
 
 
 def test_descent_twin_is_differentiated_right(finite_differences) -> None:
-    volume = volume_of((3, 4, 5))
+    volume = random_weights((3, 4, 5))
 
     def value(x: np.ndarray) -> float:
         steps = [np.diff(x, axis=a, prepend=x.take([0], axis=a)) for a in range(3)]

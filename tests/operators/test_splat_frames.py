@@ -70,7 +70,6 @@ def test_constant_speed_against_a_brute_force_average(rt, make_cloud, orbit, axi
 
 
 def test_an_axially_symmetric_cloud_does_not_move(rt, make_geometry) -> None:
-    """Turning bodies on the axis: fly-scan and static show the same picture."""
     rows = np.zeros((11, 3))
     rows[2], rows[3:5], rows[5] = [-0.5, 0.0, 0.4], [0.1, 0.3, 0.2], [0.2, 0.1, 0.3]
     rows[6], rows[10] = 1.0, [1.0, 0.5, 2.0]

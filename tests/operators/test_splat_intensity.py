@@ -102,15 +102,6 @@ def test_thin_and_opaque_objects_and_none(any_rt, make_cloud, make_table) -> Non
     assert np.isfinite(opaque.project_adjoint(rows, cells, np.ones(SHAPE, np.float32))).all()
 
 
-@MOTIONS
-def test_no_line_has_two_cells_in_a_layer(make_table, motion) -> None:
-    table = make_table(motion)
-    weights = table.layer_weights
-    np.testing.assert_allclose(weights.sum(axis=0), 1, rtol=0, atol=1e-12)
-    by_line = [((table.line_start <= v) & (v < table.line_stop)).sum() for v in range(table.lines)]
-    assert len(weights) == max(by_line)
-
-
 def test_launches_do_not_grow_with_the_cells(banded_rt, make_cloud, make_table, monkeypatch) -> None:
     names, table = note_launches(monkeypatch), make_table("exact")
     projector(banded_rt, table).project(make_cloud(4, 65), DeviceCells.upload(banded_rt, table))

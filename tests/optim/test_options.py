@@ -20,5 +20,3 @@ def test_edges_of_control() -> None:
     scale = np.array([[1.0, 1.0, 2.0], [1.0, 1.0, 1.0], [1.0, 0.999, 1.0]])
     for aspect, allowed in {1.0: [True, False, False], 2.0: [True] * 3, 0.0: [True] * 3}.items():
         assert DensityControl(prune_aspect=aspect).allows(scale).tolist() == allowed
-    control = DensityControl(every=1, start_iteration=2, stop_fraction=0.5)
-    assert [i for i in range(1, 21) if control.is_due(i, 20)] == list(range(3, 10))

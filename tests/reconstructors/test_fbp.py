@@ -84,15 +84,6 @@ def test_lines_are_backprojected_at_their_own_angles(rt) -> None:
     assert off[0] < 0.03 and off[1] > 0.2
 
 
-def test_laminography_is_refused_in_one_line(rt) -> None:
-    scan = scan_of(8, 180)
-    poses = np.stack([scan.trajectory.pose(f, np.array(float(f))) for f in range(8)])
-    poses[:, :3] = poses[:, :3] * np.cos(0.5) + [0, 0, np.sin(0.5)]
-    tilted = Scan.from_poses(scan.projections, poses, GRID, is_parallel=True)
-    with pytest.raises(InputError, match="laminography"):
-        fbp(tilted, FbpOptions(), rt)
-
-
 @pytest.mark.parametrize(("views", "turn_deg"), [(90, 180), (180, 360)], ids=["half", "full"])
 def test_deblurring_along_the_angle_undoes_an_exposure(rt, views: int, turn_deg: float) -> None:
     """Frames averaged over 41 times of an arc of 6 degrees, 3 pixels at the rim: the volume of a gantry that stops."""

@@ -79,8 +79,6 @@ def test_lengths_times_1024_change_no_bit_and_times_1000_nothing_else(rt, run) -
 
 @pytest.mark.parametrize("gain", [2.0, 3.7])
 def test_more_counts_make_the_same_volume(rt, scan, gain) -> None:
-    """Counts × gain, flats included: line integrals and volume stay."""
-
     def from_counts(flat: float) -> np.ndarray:
         counts = np.concatenate([np.full((1, 24, 24), flat), flat * np.exp(-scan.projections)])
         p, unusable = counts_to_attenuation(counts, np.array([1] + [0] * 6), "counts")
@@ -102,7 +100,6 @@ def test_exact_motion_says_how_it_averaged(rt, scan, run) -> None:
 
 
 def test_it_gets_better(scan, run) -> None:
-    """200 iterations halve the loss of the first ones, and the volume comes nearer to the phantom."""
     truth = shepp_logan(1.0).voxelise(scan.grid, 3)
     short, long = run(STEADY, iterations=1), run(STEADY, iterations=200)
     assert long.record[-1]["loss"] < 0.5 * short.record[-1]["loss"]

@@ -9,9 +9,6 @@ from skimage import io
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.report.images import BUDGET_PIXELS, bytes_of, diverging, planes_of, png_bytes, windows_of
 from phyradgs_cl.report.markup import (
-    Markup,
-    element,
-    joined,
     json_block,
     label,
     number,
@@ -20,14 +17,6 @@ from phyradgs_cl.report.markup import (
     unit,
 )
 from phyradgs_cl.text import flattened
-
-
-def test_text_is_escaped_and_elements_are_not() -> None:
-    inner = element("b", "<&\"'")
-    assert inner == "<b>&lt;&amp;&quot;&#x27;</b>"
-    assert element("p", inner, title='"><script>') == f'<p title="&quot;&gt;&lt;script&gt;">{inner}</p>'
-    assert joined("<", Markup("<br>"), None, 3) == "&lt;<br>3"
-    assert element("input", checked=True, disabled=False, class_="a") == '<input checked class="a">'
 
 
 def test_data_cannot_end_their_block() -> None:

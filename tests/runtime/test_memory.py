@@ -39,9 +39,6 @@ def test_the_environment_limits_what_no_option_does(monkeypatch) -> None:
     monkeypatch.setenv(MEMORY_VARIABLE, "1MiB")
     assert Runtime().ledger.limit_bytes == 1 << 20
     assert Runtime(memory="2MiB").ledger.limit_bytes == 2 << 20
-    monkeypatch.setenv(MEMORY_VARIABLE, "much")
-    with pytest.raises(InputError, match=MEMORY_VARIABLE):
-        Runtime()
 
 
 def test_without_a_limit_it_is_what_the_device_reports(rt) -> None:
