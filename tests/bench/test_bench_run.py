@@ -57,14 +57,10 @@ def made(whole: Path, tmp_path: Path) -> BenchJob:
     return BenchJob("table1", tmp_path / "out", tmp_path, TINY, protocols=["rapid"], rows=ROWS)
 
 
-def lines_of(job: BenchJob) -> list[dict]:
-    return read_lines(job.output / RESULTS)
-
-
 def test_lines_and_tables_have_what_the_page_needs(made: BenchJob, rt: Runtime) -> None:
     job = replace(made, seeds=(0, 1))
     run_bench(job, lambda: rt)
-    lines = lines_of(job)
+    lines = read_lines(job.output / RESULTS)
     line = next(x for x in lines if (x["label"], x["volume"]) == ("PhyRadGS", "ball"))
     expected = {"source": "ball_24.h5", "acquisition": FLY, "method": "phyradgs", "views": 25, "iterations": 8}
     assert line | expected == line and line["options"]["motion"]["name"] == "micro-views"

@@ -23,16 +23,12 @@ from phyradgs_cl.workflow import load_scan
 OFFSET_MM, ROLL_DEG = 0.3, 0.8
 
 
-@pytest.fixture(scope="module")
-def wrong(right):
-    return perturb(right, GeometryCorrection(offset_u_mm=-OFFSET_MM, roll_rad=-np.deg2rad(ROLL_DEG)))
-
-
 def by_name(found):
     return {one.name: one for one in found.parameters}
 
 
-def test_offset_and_roll_are_found_in_a_file_of_which_all_else_stays(cli, right, wrong, tmp_path, capsys) -> None:
+def test_offset_and_roll_are_found_in_a_file_of_which_all_else_stays(cli, right, tmp_path, capsys) -> None:
+    wrong = perturb(right, GeometryCorrection(offset_u_mm=-OFFSET_MM, roll_rad=-np.deg2rad(ROLL_DEG)))
     path, out = tmp_path / "scan.h5", tmp_path / "out.h5"
     write_scan(path, wrong)
     words = ["calibrate", str(path), "--what", "offset,roll,readout,exposure", "-o", str(out), "--json"]

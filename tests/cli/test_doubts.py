@@ -13,13 +13,6 @@ from phyradgs_cl.errors import InputError
 from phyradgs_cl.runtime import device, pocl
 
 
-@pytest.fixture(scope="module")
-def volume(cli, scan, tmp_path_factory) -> Path:
-    path = tmp_path_factory.mktemp("fdk") / "volume.h5"
-    assert cli.run(["reconstruct", str(scan), "-o", str(path), "--method", "fdk"]) == 0
-    return path
-
-
 @pytest.fixture
 def warned(cli, scan, tmp_path, caplog):
     """What a reconstruction of a scan warns of."""
@@ -51,8 +44,9 @@ def test_doubtful_frames_are_said(cli, warned, scan, tiny, tmp_path) -> None:
     assert "frame 2 starts no later than frame 1" in warned("--method", "fdk", scan=swapped)
 
 
-def test_files_of_another_kind_are_called_by_their_kind(refused, scan, volume, tmp_path) -> None:
-    bare, output = tmp_path / "bare.h5", ["-o", tmp_path / "out.h5"]
+def test_files_of_another_kind_are_called_by_their_kind(cli, refused, scan, tmp_path) -> None:
+    volume, bare, output = tmp_path / "volume.h5", tmp_path / "bare.h5", ["-o", tmp_path / "out.h5"]
+    assert cli.run(["reconstruct", str(scan), "-o", str(volume), "--method", "fdk"]) == 0
     with h5py.File(bare, "w") as file:
         file["volume"] = np.ones((4, 4, 4), np.uint8)
     damaged = Path(f"{output[1]}.checkpoint.npz")

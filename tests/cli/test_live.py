@@ -74,12 +74,12 @@ def test_a_killed_run_leaves_a_whole_page_that_knows_its_age(scan, tmp_path) -> 
 
 
 @pytest.mark.parametrize(
-    ("option", "suffix", "other"), [("--live", "html", "page.txt"), ("--preview", "png", "now.jpg")]
+    ("flag", "suffix", "other"), [("--live", "html", "page.txt"), ("--preview", "png", "now.jpg")]
 )
-def test_pages_and_pictures_do_not_replace_what_matters(refused, scan, tmp_path, option, suffix, other) -> None:
+def test_pages_and_pictures_do_not_replace_what_matters(refused, scan, tmp_path, flag, suffix, other) -> None:
     output, before = tmp_path / f"volume.{suffix}", scan.read_bytes()
     for path in (scan, output, partial_path(output), tmp_path / other):
-        refused(["reconstruct", scan, "-o", output, option, path], option)
+        refused(["reconstruct", scan, "-o", output, flag, path], flag)
     elsewhere = tmp_path / "none" / f"now.{suffix}"
-    refused(["reconstruct", scan, "-o", output, option, elsewhere], "none", status=4)
+    refused(["reconstruct", scan, "-o", output, flag, elsewhere], "none", status=4)
     assert scan.read_bytes() == before and not list(tmp_path.iterdir())

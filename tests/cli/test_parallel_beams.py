@@ -52,12 +52,6 @@ def test_noise_scanner_and_protocol_are_those_of_cones(cli, tmp_path, options) -
     assert 1.5 < scan.projections.max() < 3 and scan.reference is not None
 
 
-def changed(path: Path, change: Callable[[h5py.Group], object]) -> Path:
-    with h5py.File(path, "r+") as file:
-        change(file["entry"])
-    return path
-
-
 def stated(file: h5py.Group, distance: float) -> None:
     file["instrument/source/distance"] = distance
 
@@ -85,7 +79,9 @@ FILES: dict[str, tuple[Callable[[h5py.Group], object], str]] = {
 @pytest.mark.parametrize("case", FILES)
 def test_files_that_contradict_themselves_are_refused(refused, parallel, tmp_path, case) -> None:
     change, words = FILES[case]
-    path = changed(Path(shutil.copy(parallel, tmp_path / "scan.h5")), change)
+    path = Path(shutil.copy(parallel, tmp_path / "scan.h5"))
+    with h5py.File(path, "r+") as file:
+        change(file["entry"])
     for command in (["info", path], ["reconstruct", path, "--method", "fbp", "-o", tmp_path / "volume.h5"]):
         refused(command, words)
     assert not (tmp_path / "volume.h5").exists()

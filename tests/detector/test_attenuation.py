@@ -1,6 +1,5 @@
 """Counts to line integrals, and the two detector models."""
 
-
 import numpy as np
 import pytest
 
@@ -9,8 +8,8 @@ from phyradgs_cl.detector import average, counts_to_attenuation
 KEY = np.array([2, 1, 0, 3, 0, 1, 2])
 
 
-def _scan() -> tuple[np.ndarray, np.ndarray]:
-    """Frames (7, 5, 6) in the order of KEY, and the line integrals of the two projections."""
+def test_flats_and_darks_are_averaged_and_the_inverse_inverts() -> None:
+    """Whatever the gain, of frames in the order of KEY."""
     rng = np.random.default_rng(0)
     p = rng.uniform(0, 5, (2, 5, 6))
     flat, dark = rng.uniform(3e4, 6e4, (5, 6)), rng.uniform(50, 200, (5, 6))
@@ -19,12 +18,6 @@ def _scan() -> tuple[np.ndarray, np.ndarray]:
     frames[KEY == 1] = np.stack([flat - 100, flat + 100])  # only their mean is the flat
     frames[KEY == 2] = np.stack([dark - 9, dark + 9])
     frames[KEY == 3] = np.nan
-    return frames, p
-
-
-def test_flats_and_darks_are_averaged_and_the_inverse_inverts() -> None:
-    """Whatever the gain."""
-    frames, p = _scan()
     for gain in (1.0, 7.5):
         result, unusable = counts_to_attenuation(gain * frames, KEY, "counts")
         assert result.dtype == np.float32 and result.shape == p.shape

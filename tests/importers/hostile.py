@@ -16,6 +16,7 @@ import laboratory_of_importers as lab
 import numpy as np
 import tifffile
 import toolkits_of_importers as kits
+from corpus.hdf5_damage import REMOVED, attribute, on, value
 
 Damage = Callable[[Path], None]
 SECRET = np.full((10, 14), 7.0, np.float32)
@@ -54,19 +55,6 @@ def in_text(name: str, old: str, new: str) -> Damage:
         (path / name).write_bytes(text.replace(old, new, 1).encode("latin-1"))
 
     return damage
-
-
-def in_hdf5(change: Callable[[h5py.File], object]) -> Damage:
-    def damage(path: Path) -> None:
-        with h5py.File(path, "r+") as file:
-            change(file)
-
-    return damage
-
-
-def replaced(file: h5py.File, address: str, value: object, **attributes: object) -> None:
-    del file[address]
-    file.create_dataset(address, data=value).attrs.update(attributes)
 
 
 def outside(path: Path) -> Path:
@@ -315,18 +303,18 @@ def linked(file: h5py.File, address: str) -> None:
 
 EXCHANGE: dict[str, tuple[Damage, tuple[str, ...]]] = {
     "truncated": (truncated(""), ("HDF5",)),
-    "no data": (in_hdf5(lambda f: f.pop("exchange/data")), ("/exchange/data",)),
-    "data elsewhere": (in_hdf5(lambda f: linked(f, "exchange/data")), ("/exchange/data", "passwd")),
-    "flat data": (in_hdf5(lambda f: replaced(f, "exchange/data", np.zeros(5))), ("/exchange/data",)),
-    "text data": (in_hdf5(lambda f: replaced(f, "exchange/data", [[["a"]]])), ("/exchange/data",)),
-    "no angles": (in_hdf5(lambda f: f.pop("exchange/theta")), ("/exchange/theta",)),
-    "too few angles": (in_hdf5(lambda f: replaced(f, "exchange/theta", np.zeros(3))), ("/exchange/theta",)),
-    "an angle that is NaN": (in_hdf5(lambda f: replaced(f, "exchange/theta", np.full(6, np.nan))), ("/exchange/theta",)),
-    "an unknown unit": (in_hdf5(lambda f: f["exchange/theta"].attrs.update(units="gon")), ("gon",)),
-    "flats of another size": (in_hdf5(lambda f: replaced(f, "exchange/data_white", np.ones((1, 2, 3)))), ("data_white",)),
-    "no flats": (in_hdf5(lambda f: f.pop("exchange/data_white")), ("what the pixels hold",)),
-    "dead flats": (in_hdf5(lambda f: replaced(f, "exchange/data_white", np.zeros((1, 10, 14)))), ("no usable value",)),
-    "no pixel size": (in_hdf5(lambda f: f.pop("measurement")), ("found nothing; expected a length; say",)),
+    "no data": (on("exchange/data", REMOVED), ("/exchange/data",)),
+    "data elsewhere": (on("exchange/data", linked), ("/exchange/data", "passwd")),
+    "flat data": (on("exchange/data", value(np.zeros(5))), ("/exchange/data",)),
+    "text data": (on("exchange/data", value([[["a"]]])), ("/exchange/data",)),
+    "no angles": (on("exchange/theta", REMOVED), ("/exchange/theta",)),
+    "too few angles": (on("exchange/theta", value(np.zeros(3))), ("/exchange/theta",)),
+    "an angle that is NaN": (on("exchange/theta", value(np.full(6, np.nan))), ("/exchange/theta",)),
+    "an unknown unit": (on("exchange/theta", attribute("units", "gon")), ("gon",)),
+    "flats of another size": (on("exchange/data_white", value(np.ones((1, 2, 3)))), ("data_white",)),
+    "no flats": (on("exchange/data_white", REMOVED), ("what the pixels hold",)),
+    "dead flats": (on("exchange/data_white", value(np.zeros((1, 10, 14)))), ("no usable value",)),
+    "no pixel size": (on("measurement", REMOVED), ("found nothing; expected a length; say",)),
 }  # fmt: skip
 
 DETECTOR = "entry0000/instrument/detector"
@@ -334,17 +322,17 @@ COUNT_TIME, MOVES = f"{DETECTOR}/count_time", "entry0000/sample/x_translation"
 DISTANCE = "entry0000/instrument/source/distance"
 NXTOMO: dict[str, tuple[Damage, tuple[str, ...]]] = {
     "truncated": (truncated(""), ("HDF5",)),
-    "no data": (in_hdf5(lambda f: f.pop(f"{DETECTOR}/data")), ("detector/data",)),
-    "data elsewhere": (in_hdf5(lambda f: linked(f, f"{DETECTOR}/data")), ("passwd",)),
-    "a distance of 0": (in_hdf5(lambda f: replaced(f, DISTANCE, 0.0, units="m")), ("source/distance", "found 0")),
-    "no detector distance": (in_hdf5(lambda f: f.pop(f"{DETECTOR}/distance")), ("detector/distance", "in mm")),
-    "no projections": (in_hdf5(lambda f: replaced(f, f"{DETECTOR}/image_key", np.ones(9, int))), ("image_key",)),
-    "a key short": (in_hdf5(lambda f: replaced(f, f"{DETECTOR}/image_key", np.zeros(3, int))), ("image_key",)),
-    "exposures that differ": (in_hdf5(lambda f: replaced(f, COUNT_TIME, np.arange(9.0), units="s")), ("count_time",)),
-    "a tilted detector": (in_hdf5(lambda f: replaced(f, f"{DETECTOR}/transformations/rx", 12.0, units="deg")), ("rx", "12")),
-    "a sample that moves": (in_hdf5(lambda f: f.create_dataset(MOVES, data=np.arange(9.0))), ("x_translation",)),
-    "a scan of this package": (in_hdf5(lambda f: f.create_group("entry0000/phyradgs")), ("as it is",)),
-    "no flats": (in_hdf5(lambda f: replaced(f, f"{DETECTOR}/image_key", [3, 3, 0, 0, 0, 0, 0, 0, 3])), ("what the pixels",)),
+    "no data": (on(f"{DETECTOR}/data", REMOVED), ("detector/data",)),
+    "data elsewhere": (on(f"{DETECTOR}/data", linked), ("passwd",)),
+    "a distance of 0": (on(DISTANCE, value(0.0)), ("source/distance", "found 0")),
+    "no detector distance": (on(f"{DETECTOR}/distance", REMOVED), ("detector/distance", "in mm")),
+    "no projections": (on(f"{DETECTOR}/image_key", value(np.ones(9, int))), ("image_key",)),
+    "a key short": (on(f"{DETECTOR}/image_key", value(np.zeros(3, int))), ("image_key",)),
+    "exposures that differ": (on(COUNT_TIME, value(np.arange(9.0))), ("count_time",)),
+    "a tilted detector": (on(f"{DETECTOR}/transformations/rx", value(12.0)), ("rx", "12")),
+    "a sample that moves": (on(MOVES, lambda f, a: f.create_dataset(a, data=np.arange(9.0))), ("x_translation",)),
+    "a scan of this package": (on("entry0000/phyradgs", lambda f, a: f.create_group(a)), ("as it is",)),
+    "no flats": (on(f"{DETECTOR}/image_key", value([3, 3, 0, 0, 0, 0, 0, 0, 3])), ("what the pixels",)),
 }  # fmt: skip
 
 TOML = "scan.toml"

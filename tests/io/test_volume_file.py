@@ -5,6 +5,7 @@ import hashlib
 import h5py
 import numpy as np
 import pytest
+from corpus.hdf5_damage import on, value
 
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Gaussians, Grid
@@ -77,36 +78,24 @@ def test_volumes_that_do_not_fit_are_refused(tmp_path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
-def _set(name: str, value: object, units: str | None = None):
-    def damage(file: h5py.File) -> None:
-        if name in file:
-            del file[name]
-        file[name] = value
-        if units:
-            file[name].attrs["units"] = units
-
-    return damage
-
-
 VOLUME, DISAGREEMENT = "entry/reconstruction/volume", "entry/reconstruction/disagreement"
 # beyond tests/corpus, which damages every object of a volume in every way
 DAMAGE = {
-    "other shape": (_set(VOLUME, np.zeros((3, 3, 4))), VOLUME),
-    "another disagreement": (_set(DISAGREEMENT, np.zeros((2, 3, 3))), DISAGREEMENT),
-    "NaN in it": (_set(DISAGREEMENT, np.full(GRID.shape, np.nan)), DISAGREEMENT),
-    "voxels": (_set("entry/grid/voxel_size", [1.0, 0.0, 1.0], "mm"), "entry/grid/voxel_size"),
-    "facts a list": (_set("entry/provenance/json", "[1]"), "entry/provenance/json"),
-    "a negative scale": (_set("entry/gaussians/scale", -np.ones((5, 3))), "entry/gaussians/scale"),
-}  # fmt: skip
+    "other shape": (VOLUME, np.zeros((3, 3, 4))),
+    "another disagreement": (DISAGREEMENT, np.zeros((2, 3, 3))),
+    "NaN in it": (DISAGREEMENT, np.full(GRID.shape, np.nan)),
+    "voxels": ("entry/grid/voxel_size", [1.0, 0.0, 1.0]),
+    "facts a list": ("entry/provenance/json", "[1]"),
+    "a negative scale": ("entry/gaussians/scale", -np.ones((5, 3))),
+}
 
 
 def test_damage_is_named(stored) -> None:
     path, _, _ = stored
     content = path.read_bytes()
-    for damage, address in DAMAGE.values():
+    for address, values in DAMAGE.values():
         path.write_bytes(content)
-        with h5py.File(path, "r+") as file:
-            damage(file)
+        on(address, value(values))(path)
         with pytest.raises(InputError) as caught:
             read_volume(path)
         assert caught.value.subject == f"{path}:/{address}"

@@ -8,11 +8,6 @@ from phyradgs_cl.fields import Grid
 from phyradgs_cl.phantoms import PHANTOMS, foot, jaw, make_phantom, shepp_logan, sphere_phantom
 
 
-def _blocks(volume: np.ndarray) -> np.ndarray:
-    n = len(volume) // 2
-    return volume.reshape(n, 2, n, 2, n, 2).mean(axis=(1, 3, 5))
-
-
 def test_shepp_logan_grey_levels_and_ventricles() -> None:
     for variant, skull, brain, ventricle in [("toft", 1.0, 0.2, 0.0), ("kak-slaney", 2.0, 1.02, 1.0)]:
         phantom = shepp_logan(80.0, variant)
@@ -77,7 +72,7 @@ def test_procedural_volumes_are_in_range_in_the_cylinder_and_not_empty(draw) -> 
 
 @pytest.mark.parametrize("draw", [foot, jaw])
 def test_a_coarse_phantom_is_the_block_mean_of_a_fine_one(draw) -> None:
-    coarse, fine = draw(32, 5), _blocks(draw(64, 5))
+    coarse, fine = draw(32, 5), draw(64, 5).reshape(32, 2, 32, 2, 32, 2).mean(axis=(1, 3, 5))
     error = np.sqrt(np.mean((coarse - fine) ** 2) / np.mean(fine**2))
     # Not exact: edges are averaged as if straight, and shells are thinner than a voxel of either.
     assert error < 0.12

@@ -23,10 +23,6 @@ def thickness_mm() -> np.ndarray:
     return 2 * np.sqrt(np.maximum(RADIUS_MM**2 - across[:, None] ** 2 - across**2, 0))
 
 
-def binned(image: np.ndarray) -> np.ndarray:
-    return image.reshape(PIXELS, FINE, PIXELS, FINE).mean(axis=(1, 3))
-
-
 def transported(intensity: np.ndarray) -> np.ndarray:
     """The intensity (v, u) at a distance, by finite differences: I − d (δ/μ) ∇²I with δ/μ = (λ/4π) (δ/β)."""
     fine_mm = PIXEL_MM / FINE
@@ -35,7 +31,8 @@ def transported(intensity: np.ndarray) -> np.ndarray:
 
 
 def line_integrals(intensity: np.ndarray) -> np.ndarray:
-    return -np.log(binned(intensity)).astype(np.float32)[None]
+    binned = intensity.reshape(PIXELS, FINE, PIXELS, FINE).mean(axis=(1, 3))
+    return -np.log(binned).astype(np.float32)[None]
 
 
 def retrieved_mm(frames: np.ndarray, distance_mm: float = DISTANCE_MM) -> np.ndarray:

@@ -38,21 +38,18 @@ def scan_of(
     return Scan(frames, geometry, orbit, shutter or Shutter(0.0), start_s, GRID, shutter is not None)
 
 
-def error_of(volume: np.ndarray) -> float:
-    """RMS over the disc's density, inside the largest circle and off the disc's edge."""
-    z, y, x = np.meshgrid(*GRID.axes_mm(), indexing="ij")
-    from_edge = np.abs(np.hypot(x - 6, y + 4) - 14)
-    where = (np.hypot(x, y) < SIDE / 2 - 2) & (from_edge > 2)
-    return float(np.sqrt(np.mean((volume - DISC.density(x, y, z))[where] ** 2)) / 0.02)
-
-
 @pytest.mark.parametrize(
     ("views", "turn_deg", "offset_mm", "columns"),
     [(90, 180, 0.0, SIDE), (180, 360, 0.0, SIDE), (110, 220, 0.0, SIDE), (180, 360, 0.25, SIDE), (180, 360, 14.0, 40)],
     ids=["half", "full", "more than half", "a quarter pixel off", "half-acquisition"],
 )
 def test_a_disc_comes_out_with_its_density(rt, views: int, turn_deg: float, offset_mm: float, columns: int) -> None:
-    assert error_of(fbp(scan_of(views, turn_deg, offset_mm, columns), FbpOptions(), rt).volume) < 0.03
+    """RMS over the disc's density, inside the largest circle and off the disc's edge."""
+    volume = fbp(scan_of(views, turn_deg, offset_mm, columns), FbpOptions(), rt).volume
+    z, y, x = np.meshgrid(*GRID.axes_mm(), indexing="ij")
+    from_edge = np.abs(np.hypot(x - 6, y + 4) - 14)
+    where = (np.hypot(x, y) < SIDE / 2 - 2) & (from_edge > 2)
+    assert np.sqrt(np.mean((volume - DISC.density(x, y, z))[where] ** 2)) < 0.03 * 0.02
 
 
 @pytest.mark.parametrize(

@@ -44,15 +44,11 @@ def loop_of(report: Callable[[Progress], None], every: int = 1, record_every: in
     return Loop(Halving(), Communicator(), report, time.perf_counter(), record_every, every)
 
 
-def iterations_of(loop: Loop) -> list[float]:
-    return [line["iteration"] for line in loop.record]
-
-
 def test_lines_and_reports_come_when_their_number_is_reached() -> None:
     seen: list[tuple[int, float]] = []
     loop = loop_of(lambda p: seen.append((p.iteration, float(p.volume()[0].max()))), every=5)
     loop.run(None)
-    assert iterations_of(loop) == [3, 6, 9]
+    assert [line["iteration"] for line in loop.record] == [3, 6, 9]
     assert seen == [(6, 2.0**-6)]
     assert (loop.stopped_by, loop.interrupted_at, loop.state_if_interrupted()) == ("small enough", None, None)
 
