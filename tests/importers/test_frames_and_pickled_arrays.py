@@ -11,7 +11,7 @@ from phyradgs_cl.acquisition import Saturation
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.importers import ImportOptions
 from phyradgs_cl.importers.formats.naf import PlainUnpickler, read_pickle
-from phyradgs_cl.importers.reading.frames import compact, line_integrals
+from phyradgs_cl.importers.reading.frames import compact, line_integrals, oriented
 from phyradgs_cl.io.scan.reader import united
 
 FRAMES = np.array([[[100.0, 50.0], [25.0, 10.0]]] * 3, np.float32)
@@ -71,6 +71,14 @@ def test_masks() -> None:
     assert compact(np.stack([one, other])).shape == (2, 1, 2)
     with pytest.raises(InputError, match="no usable value"):
         compact(np.stack([one | True, one | True]))
+
+
+def test_frames_are_turned_to_row_0_below_and_column_0_left() -> None:
+    frames = np.arange(4).reshape(1, 2, 2)
+    np.testing.assert_array_equal(oriented(frames, ImportOptions(), "bottom"), frames)
+    np.testing.assert_array_equal(oriented(frames, ImportOptions(), "top"), frames[:, ::-1])
+    np.testing.assert_array_equal(oriented(frames, ImportOptions(row_0="bottom"), "top"), frames)
+    np.testing.assert_array_equal(oriented(frames, ImportOptions(), "bottom", "right"), frames[..., ::-1])
 
 CONTENT = {
     "rows": np.arange(6.0).reshape(2, 3),

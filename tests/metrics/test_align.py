@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from phyradgs_cl.fields import Grid
-from phyradgs_cl.metrics import aligned, compare, reference_on, resampled
+from phyradgs_cl.metrics import aligned, compare, psnr, reference_on, resampled
 
 
 def _truth(shape: tuple[int, int, int]) -> np.ndarray:
@@ -30,6 +30,26 @@ def test_a_finer_truth_is_averaged_over_the_volumes_voxels(factors) -> None:
     np.testing.assert_allclose(reference_on(grid, truth, fine), means, rtol=1e-6)
 
 
+def test_a_part_of_a_finer_truth_is_averaged_too() -> None:
+    fine = Grid((8, 8, 8), (0.5,) * 3)
+    truth, part = _truth(fine.shape), Grid((2, 3, 4), (1.0,) * 3, (-1.0, 0.5, 0.0))
+    pair = aligned(np.zeros(part.shape, np.float32), part, truth, fine)
+    assert pair is not None and pair.share == 24 / 64 and "37.5 % of the reference" in pair.how
+    np.testing.assert_allclose(pair.reference, truth[:4, 2:8].reshape(2, 2, 3, 2, 4, 2).mean((1, 3, 5)), rtol=1e-6)
+
+
+def test_the_same_voxels_are_compared_one_by_one() -> None:
+    grid = Grid((6, 5, 4), (0.5, 0.4, 0.3), (1.0, 0.0, 2.0))
+    truth = _truth(grid.shape)
+    rounded = Grid(grid.shape, tuple(float(np.float32(d)) for d in grid.voxel_size_mm), grid.offset_mm)
+    pair = aligned(truth, rounded, truth, grid)
+    assert pair is not None and pair.how == "voxel by voxel" and pair.reference is truth
+    part = grid.part((1, 0, 2), (3, 5, 2))
+    pair = aligned(truth[1:4, :, 2:], part, truth, grid)
+    assert pair is not None and pair.how == "voxel by voxel, on 25 % of the reference"
+    assert psnr(pair.volume, pair.reference) == np.inf
+
+
 @pytest.mark.parametrize(
     "grid",
     [
@@ -47,6 +67,12 @@ def test_any_other_volume_is_resampled_onto_the_truth(grid) -> None:
     np.testing.assert_array_equal(pair.volume, resampled(volume, grid, pair.grid)[0])
     np.testing.assert_array_equal(pair.reference, truth[pair.grid.slices_in(truth_grid)])
     assert reference_on(grid, truth, truth_grid) is None
+
+
+def test_volumes_in_two_places_are_no_pair() -> None:
+    grid = Grid.cube(4, 4.0)
+    away = Grid(grid.shape, grid.voxel_size_mm, (0.0, 9.0, 0.0))
+    assert aligned(_truth(grid.shape), grid, _truth(grid.shape), away) is None
 
 
 FROM = Grid((9, 8, 7), (0.5, 0.4, 0.3), (1.0, -2.0, 3.0))

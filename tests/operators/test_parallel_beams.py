@@ -14,6 +14,7 @@ from phyradgs_cl.acquisition import (
     ConstantSpeed,
     ParallelGeometry,
     Shutter,
+    pixel_centres,
 )
 from phyradgs_cl.acquisition.cells import (
     common_time_cells,
@@ -29,6 +30,7 @@ from phyradgs_cl.operators.splats.layout import DeviceCells
 from phyradgs_cl.operators.splats.projector import SplatProjector
 from phyradgs_cl.operators.twins.rays import backprojection, lines_backprojection, ray_frame, ray_volume
 from phyradgs_cl.operators.twins.splat import moving_frame, splat_frame
+from phyradgs_cl.phantoms import Ellipsoid, EllipsoidPhantom, rotation_about_z
 
 SHAPE = (24, 13)
 GRID = Grid((12, 14, 11), (0.16, 0.13, 0.16), (0.1, -0.05, 0.2))
@@ -114,6 +116,19 @@ def test_the_cone_beam_comes_closer_with_its_distance(rt) -> None:
         (cells,) = cells_of(CircularOrbit(cone, ConstantSpeed(0.3, 0.9)), "static")[:1]
         off.append(np.linalg.norm(RayOperator(rt, GRID, SHAPE, [cells]).forward(volume) - expected))
     assert 1.7 < off[0] / off[1] < 2.3 and 1.7 < off[1] / off[2] < 2.3
+
+
+def test_an_ellipsoids_projection_halves_its_error_with_the_voxel(rt) -> None:
+    body = Ellipsoid((0.1, -0.05, 0.08), (0.7, 0.5, 0.6), 1.0, rotation_about_z(0.4))
+    phantom, errors = EllipsoidPhantom((body,), "one"), []
+    (cells,) = cells_of(CircularOrbit(GEOMETRY, ConstantSpeed(0.3, 0.9)), "static")[:1]
+    pixels, along = pixel_centres(cells.pose[0], SHAPE), 5 * cells.pose[0, :3]
+    exact = phantom.line_integrals(pixels - along, pixels + along)
+    for n in (24, 48):
+        grid = Grid((n, n, n), (2 / n,) * 3)
+        frame = RayOperator(rt, grid, SHAPE, [cells]).forward(phantom.voxelise(grid, 4))[0]
+        errors.append(np.linalg.norm(frame - exact) / np.linalg.norm(exact))
+    assert errors[1] < 0.04 and errors[1] < 0.65 * errors[0]
 
 
 @pytest.mark.parametrize(

@@ -4,7 +4,9 @@ import time
 from collections.abc import Callable
 
 import numpy as np
+import pytest
 
+from phyradgs_cl.errors import NumericalError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.parallel import Communicator
 from phyradgs_cl.reconstructors import Progress
@@ -44,11 +46,15 @@ def loop_of(report: Callable[[Progress], None], every: int = 1, record_every: in
     return Loop(Halving(), Communicator(), report, time.perf_counter(), record_every, every)
 
 
+def iterations_of(loop: Loop) -> list[float]:
+    return [line["iteration"] for line in loop.record]
+
+
 def test_lines_and_reports_come_when_their_number_is_reached() -> None:
     seen: list[tuple[int, float]] = []
     loop = loop_of(lambda p: seen.append((p.iteration, float(p.volume()[0].max()))), every=5)
     loop.run(None)
-    assert [line["iteration"] for line in loop.record] == [3, 6, 9]
+    assert iterations_of(loop) == [3, 6, 9]
     assert seen == [(6, 2.0**-6)]
     assert (loop.stopped_by, loop.interrupted_at, loop.state_if_interrupted()) == ("small enough", None, None)
 
@@ -65,3 +71,10 @@ def test_a_report_stops_the_run_which_goes_on_from_there() -> None:
     whole.run(None)
     assert [line["loss"] for line in resumed.record] == [line["loss"] for line in whole.record]
     assert resumed.seconds > resumed.record[-1]["seconds"] >= stopped.record[-1]["seconds"]
+
+
+def test_a_loss_that_is_no_number_is_named() -> None:
+    loop = loop_of(lambda progress: None)
+    loop.method.loss = np.nan
+    with pytest.raises(NumericalError, match="loss: found nan at iteration 3; .*lower the rate"):
+        loop.run(None)

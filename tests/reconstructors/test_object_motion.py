@@ -24,6 +24,7 @@ from phyradgs_cl.reconstructors.plan import check_object_motion
 from phyradgs_cl.reconstructors.projected import frame_pairs, spread_frames
 from phyradgs_cl.reconstructors.result import HELD_OUT, Progress
 from phyradgs_cl.report.run import computed_views, load_run
+from phyradgs_cl.runtime import Runtime
 
 GRID, SHAPE, FRAMES = Grid.cube(16, 2.0), (24, 24), 30
 MOVING = [name for name, method in METHODS.items() if method.takes_deformation]
@@ -113,6 +114,23 @@ def test_runs_resume_to_the_same_bits(rt, scan, method) -> None:
     other = replace(plan, object_motion=ObjectMotion(breathing(0.2)))
     with pytest.raises(InputError, match="object_motion"):
         reconstruct(scan, other, rt, resume=partial.state)
+
+
+def test_an_object_at_rest_has_the_bits_of_no_field(rt, scan) -> None:
+    plan = plan_of("fista", iterations=3)
+    at_rest = replace(plan, object_motion=ObjectMotion(breathing(0.0)))
+    plain = reconstruct(scan, replace(plan, object_motion=None), rt)
+    np.testing.assert_array_equal(reconstruct(scan, at_rest, rt).volume, plain.volume)
+
+
+def test_intensity_and_a_gpu_follow_too(scan) -> None:
+    """Volumes of a GPU's launch shape, with sums of integers, are those of a CPU's."""
+    averages = replace(scan, detector_model="intensity")
+    plan = plan_of("sirt", iterations=2)
+    volumes = [
+        reconstruct(averages, plan, rt).volume for rt in (Runtime(pixel_items=False), Runtime(lanes=1, pixel_items=True))
+    ]
+    np.testing.assert_allclose(*volumes, atol=1e-4 * volumes[0].max())
 
 
 def test_held_out_pixels_are_compared_with_the_object_as_it_was(rt, scan) -> None:
