@@ -40,6 +40,7 @@ def main() -> None:
     parser.add_argument("lines", type=Path)
     parser.add_argument("--priors", nargs="+", default=["dct", "curves"])
     parser.add_argument("--names", help="with commas; all")
+    parser.add_argument("--phantoms", nargs="*", default=[], help="in place of VOLUMES: spheres, shepp-logan, ...")
     parser.add_argument("--size", type=int, default=64)
     parser.add_argument("--kinds", nargs="+", default=["still", "fly"], choices=list(MOTIONS))
     parser.add_argument("--views", nargs="+", type=int, default=[25, 50])
@@ -47,15 +48,16 @@ def main() -> None:
     parser.add_argument("--seeds", nargs="+", type=int, default=[0])
     given = parser.parse_args()
     rt, there = Runtime(), {tuple(line[key] for key in KEYS) for line in read_lines(given.lines)}
+    objects = {name: name for name in given.phantoms} or files_of(given.volumes, given.names, given.size)
     cases = [
         {"volume": name, "kind": kind, "views": views, "dose": dose, "size": given.size, "seed": seed}
         for seed in given.seeds for dose in given.doses for views in given.views for kind in given.kinds
-        for name in files_of(given.volumes, given.names, given.size)
+        for name in objects
     ]  # fmt: skip
     for case in cases:
         rows = [{**case, "prior": prior, "numbers": NUMBERS.get(prior)} for prior in given.priors]
         rows = [row for row in rows if tuple(row[key] for key in KEYS) not in there]
-        scan = scan_of(rt, files_of(given.volumes, None, given.size)[str(case["volume"])], case) if rows else None
+        scan = scan_of(rt, objects[str(case["volume"])], case) if rows else None
         for row in rows:
             before_s = time.process_time()
             motion, prior = MOTIONS[str(case["kind"])], row["prior"]
