@@ -36,7 +36,7 @@ OTHER_CAUSE = "pixels, if pixel sizes are right"  # unit of an offset that wrong
 UNVERIFIED = "neither pixel sizes nor distances are verified by these frames"
 _ERRORS = 4.0  # standard errors between two hypotheses
 _SIGN_RATIO, _CLEAR_RATIO = 1.2, 3.0
-_TOLERATED_BLOCKS, _TOLERATED_PX = 0.2, 1 / 3
+_TOLERATED_PX = 1 / 3
 _DEVIATIONS = 4.0
 _BIAS_FULL_TURN, _BIAS_HALF_TURN = 0.003, 0.04  # coarse pixels: measured errors of the axis in coarse scans
 _WHOLE_PIXELS = 2  # blocks by which a shift from whole pixels is judged
@@ -143,10 +143,10 @@ def centre_of(shift: axis.AxisShift, block: int, scan: Scan) -> tuple[axis.AxisS
 
 
 def check_centre(shift: axis.AxisShift, block: int, pitch_mm: float, stated_px: float) -> Finding:
-    """Compares the panel's shift with a third of a pixel, a fifth of a coarse pixel and four standard deviations.
+    """Compares the panel's shift with a third of a pixel and four standard deviations.
 
     A stated offset that is wrong by the factor of a unit may be right in mm, with pixel sizes wrong by that factor."""
-    threshold = max(_TOLERATED_PX, _TOLERATED_BLOCKS * block, _DEVIATIONS * shift.deviation)
+    threshold = max(_TOLERATED_PX, _DEVIATIONS * shift.deviation)
     if not (shift.is_found and math.isfinite(shift.deviation)):
         return Finding(CENTRE, CANNOT_TELL, 0.0, _TOLERATED_PX, "pixels", "no shift fits best")
     shift_mm = shift.pixels * pitch_mm

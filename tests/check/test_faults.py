@@ -72,6 +72,11 @@ def test_a_beam_without_a_fan_leaves_sizes_and_offset_open() -> None:
     assert found(0.49).verdict == SUSPICIOUS and found(0.3).verdict == OK  # an axis on pixel N/2 in place of (N-1)/2
 
 
+def test_coarse_pixels_of_a_wide_panel_tolerate_no_more() -> None:
+    """512 columns are 26 a coarse pixel."""
+    assert check_centre(AxisShift(-1.9, 0.1, np.empty(0)), 26, 0.1, 0.0).verdict == SUSPICIOUS
+
+
 @pytest.mark.parametrize("pixels", [-0.5, 0.5])
 def test_the_deviation_of_an_offset_covers_its_error_in_half_a_turn(rt, scan_of, pixels) -> None:
     """Most rays are then measured once, and coarse volumes pull the offset to one side."""
