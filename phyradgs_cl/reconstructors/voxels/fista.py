@@ -3,8 +3,8 @@
 Each subset S of M makes one step: xₖ = prox(yₖ + M/L · A_Sᵀ (p_S − A_S yₖ)), yₖ₊₁ = xₖ + βₖ₊₁ (xₖ − xₖ₋₁).
 The step and its momentum are FISTA's (Beck and Teboulle, SIAM J. Imaging Sci. 2 (2009) 183, Eqs. 4.1 to 4.3). The gradient
 of a subset, times the number of subsets, stands for that of all frames (Kim, Ramani and Fessler, IEEE Trans. Med. Imaging
-34 (2015) 167). L bounds the norm of AᵀA. The last 3/7 of the passes run on smaller voxels, whose means make up two thirds
-of the result (``stages.py``)."""
+34 (2015) 167). L bounds the norm of AᵀA. The last 3/7 of the passes run on smaller voxels, whose means make up most of the
+result (``stages.py``)."""
 
 import math
 from dataclasses import dataclass, replace
@@ -172,7 +172,8 @@ def fista_stages(inputs: MethodInputs) -> list[Stage]:
     stages = [Stage("voxels", passes, partial(_run, options=replace(options, iterations=passes), image=inputs.initial))]
     if parts > 1:
         run = partial(_run, options=replace(options, iterations=fine_passes), image=inputs.initial, parts=parts)
-        stages.append(Stage("subvoxels", fine_passes, run, partial(merge_subvoxels, parts=parts)))
+        merge = partial(merge_subvoxels, parts=parts, share=priors.subvoxel_share(options.prior))
+        stages.append(Stage("subvoxels", fine_passes, run, merge))
     return stages
 
 
@@ -186,12 +187,14 @@ def _run(inputs: MethodInputs, options: FistaOptions, image: np.ndarray | None, 
         is_on_host = isinstance(system.space, HostSpace)
         held = _HELD + priors.volumes_of(options.prior)
         is_short = is_on_host and system.leave_room(rt, (held + _COPIES) * volume_bytes)
-        of_grid = rt, scan.grid, options.tv_iterations, options.iterations
-        of_scan = image, options.prior_share, parts, scan.is_fly
-        prior = priors.prior_of(options.prior, priors.PriorInputs(*of_grid, *of_scan))
+        error = frame_error(scan, options.motion)
+        prior_inputs = priors.PriorInputs(
+            rt, scan.grid, options.tv_iterations, options.iterations, image, options.prior_share, parts, scan.is_fly,
+            error.noise,
+        )
+        prior = priors.prior_of(options.prior, prior_inputs)
         with rt.ledger.reserved(_COPIES * volume_bytes if is_short else 0):
-            weight = PriorWeight(system, frame_error(scan, options.motion), options.prior_weight)
-            return Fista(system, options, prior, weight)
+            return Fista(system, options, prior, PriorWeight(system, error, options.prior_weight))
 
     stage_inputs = replace(inputs, scan=scan, options=options, initial=initial)
     volumes = _VOLUMES + priors.volumes_of(options.prior)

@@ -29,12 +29,15 @@ from phyradgs_cl.runtime import Runtime, Space
 
 # shares of the prior's weight, by the prior (docs/results/settings.md)
 _TV_ALONE, _TV_BEFORE_DCT, _DCT = 1.6, 0.8, 1.5
-_TV_AT_REST, _DCT_AT_REST = 0.6, 1.35  # before ridge, of scans that stop for each projection
+_TV_AT_REST, _DCT_AT_REST = 0.5, 1.35  # before ridge, of scans that stop for each projection
 _TV_BEFORE_CURVES, _CURVES_NOISE, _CURVES = 0.5, 50.0, 3.0  # noise that the curves assume, and strength of their step
 _RIDGE_NOISE, _RIDGE_LENGTH, _RIDGE_EVERY = 17.0, 0.5, 4  # noise that the step assumes, its length, and maps for each step
+_RIDGE_NOISE_AT_REST = 20.0
+_USUAL_NOISE, _LEAST_NOISE = 0.01, 0.001  # of line integrals: the shares at rest are of the former
 _LEAST_NOISE_SHARE = 0.1  # for the ridge step of scans without noise
 _NONLOCAL, _NONLOCAL_BEFORE_DCT = 300.0, 100.0  # of the filtering parameter h
 _NONLOCAL_STEP = 0.01  # length of a step down the nonlocal quadratic
+_SUBVOXELS, _SUBVOXELS_WITH_RIDGE = 2 / 3, 0.85  # share of the smaller voxels in the result
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,7 +45,7 @@ class PriorInputs:
     """The arguments of a prior: device, grid, and for piccs its image (nz, ny, nx) in 1/mm and the weight of the change.
 
     tv_iterations: dual iterations per map. passes: over all frames, of the run. parts: of a voxel's side, on this grid.
-    is_fly: of the scan, whose frames expose for an arc."""
+    is_fly: of the scan, whose frames expose for an arc. noise: of its line integrals, behind the object."""
 
     rt: Runtime
     grid: Grid
@@ -52,6 +55,7 @@ class PriorInputs:
     share: float = 0.5
     parts: int = 1
     is_fly: bool = False
+    noise: float = _USUAL_NOISE
 
     def tv(self, share: float = 1.0) -> "TvPrior":
         return TvPrior(TvProx(self.rt, self.grid.shape, axis_weights(self.grid)), self.tv_iterations, share)
@@ -70,11 +74,15 @@ class PriorInputs:
         return TvAndDct(self.tv(_TV_BEFORE_CURVES), DctProx(self.rt, self.grid.shape, curves), _CURVES_NOISE)
 
     def dct_then_ridge(self) -> "Prior":
-        """A weaker prior before the step sharpens scans at rest; on a fly-scan flat bodies lose by it."""
+        """At rest the step does more of the work, most of it where noise is low; flat bodies lose by that on fly-scans."""
         if min(self.grid.shape) < RIDGE_EDGE:
             return self.tv_and_dct()
-        before = self.tv_and_dct() if self.is_fly else self.tv_and_dct(_TV_AT_REST, _DCT_AT_REST)
-        return ThenRidge(before, RidgeStep(self.rt, self.grid.shape, learned_ridge()))
+        ridge = RidgeStep(self.rt, self.grid.shape, learned_ridge())
+        if self.is_fly:
+            return ThenRidge(self.tv_and_dct(), ridge, _RIDGE_NOISE)
+        relative = (max(self.noise, _LEAST_NOISE) / _USUAL_NOISE) ** (1 / 6)
+        before = self.tv_and_dct(_TV_AT_REST * relative, _DCT_AT_REST)
+        return ThenRidge(before, ridge, _RIDGE_NOISE_AT_REST / relative)
 
     def nonlocal_then(self, then: "Prior", h_share: float) -> "Nonlocal":
         return Nonlocal(then, NonlocalStep(self.rt, self.grid.shape), h_share, self.passes)
@@ -151,8 +159,10 @@ class ThenRidge(Prior):
 
     VOLUMES = RidgeStep.VOLUMES
 
-    def __init__(self, before: Prior, ridge: RidgeStep) -> None:
-        self.before, self.ridge, self.maps = before, ridge, 0  # maps: since the last step
+    def __init__(self, before: Prior, ridge: RidgeStep, noise: float) -> None:
+        """noise: that the step assumes, over the prior's weight."""
+        self.before, self.ridge, self.noise = before, ridge, noise
+        self.maps = 0  # since the last step
 
     def __call__(self, space: Space[Any], volume: Any, weight: float, *, nonnegative: bool) -> Any:
         volume = self.before(space, volume, weight, nonnegative=nonnegative)
@@ -160,7 +170,7 @@ class ThenRidge(Prior):
         if self.maps:
             return volume
         # edges are no noise: steps that took all of the weight for it lost 0.2 dB with 180 views
-        sigma = _RIDGE_NOISE * weight * max(self.noise_share, _LEAST_NOISE_SHARE)
+        sigma = self.noise * weight * max(self.noise_share, _LEAST_NOISE_SHARE)
         step = partial(self.ridge, sigma=sigma, step=_RIDGE_LENGTH, nonnegative=nonnegative)
         return space.apply(step, volume, self.ridge.shape)
 
@@ -290,6 +300,11 @@ def volumes_of(prior: str | Denoiser) -> int:
     """Returns how many more volumes a prior holds than ``dct``."""
     held = {"nonlocal": Nonlocal.VOLUMES, "nonlocal+dct": Nonlocal.VOLUMES, "ridge": ThenRidge.VOLUMES}
     return held.get(prior, 0) if isinstance(prior, str) else 0
+
+
+def subvoxel_share(prior: str | Denoiser) -> float:
+    """Returns the share of the smaller voxels in a result, whose noise the larger ones average."""
+    return _SUBVOXELS_WITH_RIDGE if prior == "ridge" else _SUBVOXELS
 
 
 def axis_weights(grid: Grid) -> tuple[float, float, float]:

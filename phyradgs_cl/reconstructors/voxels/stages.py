@@ -1,7 +1,7 @@
 """Runs of several stages: each stage starts from the volume of the stage before it.
 
 ``fista`` reconstructs voxels, then subvoxels; ``fused`` adds splats. Coarse voxels cannot represent edges. The last passes
-therefore run on voxels half as large; their block means make up two thirds of the result."""
+therefore run on voxels half as large; their block means make up most of the result."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
@@ -18,7 +18,6 @@ from phyradgs_cl.reconstructors.voxels.run import MethodInputs
 
 _STAGE, _VOLUME = "stage", "volume_before"  # entries of a state: the present stage, and the volume that it started from
 _HISTORY = {"record": "record_before", "seconds": "seconds_before"}
-_SUBVOXEL_SHARE = np.float32(2 / 3)  # of the result (docs/results/settings.md)
 
 
 @dataclass(frozen=True)
@@ -106,7 +105,7 @@ def repeated(volume: np.ndarray | None, parts: int) -> np.ndarray | None:
     return None if volume is None else volume.repeat(parts, 0).repeat(parts, 1).repeat(parts, 2)
 
 
-def merge_subvoxels(volume: np.ndarray, before: np.ndarray | None, parts: int) -> np.ndarray:
-    """Returns the weighted mean of ``before`` (nz, ny, nx) and the means of ``volume`` over blocks of ``parts``³ voxels."""
+def merge_subvoxels(volume: np.ndarray, before: np.ndarray | None, parts: int, share: float) -> np.ndarray:
+    """Returns the mean of ``before`` (nz, ny, nx) and, weighted by ``share``, of the means of ``volume`` over blocks."""
     assert before is not None
-    return before + _SUBVOXEL_SHARE * (block_means(volume, (parts,) * 3) - before)
+    return before + np.float32(share) * (block_means(volume, (parts,) * 3) - before)
