@@ -37,7 +37,7 @@ from phyradgs_cl.reconstructors.voxels.prior_weight import (
     adjoint_response,
     frame_error,
 )
-from phyradgs_cl.reconstructors.voxels.priors import OwnPrior, Prior, PriorInputs, ThenRidge, prior_of
+from phyradgs_cl.reconstructors.voxels.priors import OwnPrior, Prior, PriorInputs, ThenRidge, prior_of, subvoxel_share
 from phyradgs_cl.reconstructors.voxels.system import System
 from phyradgs_cl.runtime import DeviceSpace, Runtime
 
@@ -164,7 +164,7 @@ def test_the_ridge_step_follows_the_noise_in_the_weight_and_no_edges(rt, scan) -
     errors = FrameError(0.01), FrameError(0.01, 0.02), FrameError(0.03)
     weights = [PriorWeight(system, error, 0.42) for error in errors]
     for weight in weights:
-        algorithm = Fista(system, FistaOptions(subsets=1), ThenRidge(Prior(), ridge), weight)
+        algorithm = Fista(system, FistaOptions(subsets=1), ThenRidge(Prior(), ridge, 17.0), weight)
         for _ in range(4):  # maps before a step
             algorithm.step()
     assert weights[1].noise_share(weights[1].at(algorithm.volume)) < 0.9
@@ -276,6 +276,7 @@ def test_ridge_is_dct_in_a_volume_thinner_than_its_filters(rt) -> None:
     for _ in range(4):
         maps = [space.numpy(prior(space, space.array(volume), 0.01, nonnegative=True)) for prior in (dct, ridge)]
         np.testing.assert_array_equal(*maps)
+    assert subvoxel_share("ridge", (4, 12, 12)) == subvoxel_share("dct", (12, 12, 12)) < subvoxel_share("ridge", (5, 12, 12))
 
 
 def test_ridge_follows_the_maps_of_dct_on_a_fly_scan_and_less_total_variation_at_rest(rt, scan) -> None:
@@ -285,6 +286,9 @@ def test_ridge_follows_the_maps_of_dct_on_a_fly_scan_and_less_total_variation_at
     dct, fly, still = (space.numpy(prior(space, space.array(volume), 0.01, nonnegative=True)) for prior in priors)
     np.testing.assert_array_equal(dct, fly)
     assert still.std() > 1.001 * dct.std(), (still.std(), dct.std())
+    noises = [prior_of("ridge", replace(inputs, noise=noise)) for noise in (0.001, 0.01, 0.1)]
+    stds = [space.numpy(prior(space, space.array(volume), 0.01, nonnegative=True)).std() for prior in noises]
+    assert stds[0] > stds[1] > stds[2] > dct.std(), (stds, dct.std())
     scans = scan, replace(scan, is_fly=False)
     turned, at_rest = (run(rt, scan, "fista", motion="static", iterations=4, prior="ridge").volume for scan in scans)
     assert not np.array_equal(turned, at_rest)

@@ -172,7 +172,8 @@ def fista_stages(inputs: MethodInputs) -> list[Stage]:
     stages = [Stage("voxels", passes, partial(_run, options=replace(options, iterations=passes), image=inputs.initial))]
     if parts > 1:
         run = partial(_run, options=replace(options, iterations=fine_passes), image=inputs.initial, parts=parts)
-        merge = partial(merge_subvoxels, parts=parts, share=priors.subvoxel_share(options.prior))
+        share = priors.subvoxel_share(options.prior, inputs.scan.grid.finer(parts).shape)
+        merge = partial(merge_subvoxels, parts=parts, share=share)
         stages.append(Stage("subvoxels", fine_passes, run, merge))
     return stages
 

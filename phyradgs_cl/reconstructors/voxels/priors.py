@@ -302,9 +302,9 @@ def volumes_of(prior: str | Denoiser) -> int:
     return held.get(prior, 0) if isinstance(prior, str) else 0
 
 
-def subvoxel_share(prior: str | Denoiser) -> float:
-    """Returns the share of the smaller voxels in a result, whose noise the larger ones average."""
-    return _SUBVOXELS_WITH_RIDGE if prior == "ridge" else _SUBVOXELS
+def subvoxel_share(prior: str | Denoiser, shape: tuple[int, int, int]) -> float:
+    """Returns the share of smaller voxels (z, y, x) in a result. Larger ones average noise, which ridge leaves less of."""
+    return _SUBVOXELS_WITH_RIDGE if prior == "ridge" and min(shape) >= RIDGE_EDGE else _SUBVOXELS
 
 
 def axis_weights(grid: Grid) -> tuple[float, float, float]:
