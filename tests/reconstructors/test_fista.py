@@ -37,7 +37,14 @@ from phyradgs_cl.reconstructors.voxels.prior_weight import (
     adjoint_response,
     frame_error,
 )
-from phyradgs_cl.reconstructors.voxels.priors import OwnPrior, Prior, PriorInputs, ThenRidge, prior_of, subvoxel_share
+from phyradgs_cl.reconstructors.voxels.priors import (
+    OwnPrior,
+    Prior,
+    PriorInputs,
+    ThenRidge,
+    prior_of,
+    subvoxel_share,
+)
 from phyradgs_cl.reconstructors.voxels.system import System
 from phyradgs_cl.runtime import DeviceSpace, Runtime
 
