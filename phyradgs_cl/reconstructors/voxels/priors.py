@@ -33,7 +33,7 @@ _TV_AT_REST, _DCT_AT_REST = 0.5, 1.35  # before ridge, of scans that stop for ea
 _TV_BEFORE_CURVES, _CURVES_NOISE, _CURVES = 0.5, 50.0, 3.0  # noise that the curves assume, and strength of their step
 _RIDGE_NOISE, _RIDGE_LENGTH, _RIDGE_EVERY = 17.0, 0.5, 4  # noise that the step assumes, its length, and maps for each step
 _RIDGE_NOISE_AT_REST = 20.0
-_USUAL_NOISE, _LEAST_NOISE = 0.01, 0.001  # of line integrals: the shares at rest are of the former
+_USUAL_NOISE, _LEAST_NOISE = 0.01, 0.001  # of line integrals: where the numbers at rest hold, and the least that they follow
 _LEAST_NOISE_SHARE = 0.1  # for the ridge step of scans without noise
 _NONLOCAL, _NONLOCAL_BEFORE_DCT = 300.0, 100.0  # of the filtering parameter h
 _NONLOCAL_STEP = 0.01  # length of a step down the nonlocal quadratic
@@ -159,9 +159,9 @@ class ThenRidge(Prior):
 
     VOLUMES = RidgeStep.VOLUMES
 
-    def __init__(self, before: Prior, ridge: RidgeStep, noise: float) -> None:
-        """noise: that the step assumes, over the prior's weight."""
-        self.before, self.ridge, self.noise = before, ridge, noise
+    def __init__(self, before: Prior, ridge: RidgeStep, noise_factor: float) -> None:
+        """noise_factor: the noise that the step assumes, over the prior's weight."""
+        self.before, self.ridge, self.noise_factor = before, ridge, noise_factor
         self.maps = 0  # since the last step
 
     def __call__(self, space: Space[Any], volume: Any, weight: float, *, nonnegative: bool) -> Any:
@@ -170,7 +170,7 @@ class ThenRidge(Prior):
         if self.maps:
             return volume
         # edges are no noise: steps that took all of the weight for it lost 0.2 dB with 180 views
-        sigma = self.noise * weight * max(self.noise_share, _LEAST_NOISE_SHARE)
+        sigma = self.noise_factor * weight * max(self.noise_share, _LEAST_NOISE_SHARE)
         step = partial(self.ridge, sigma=sigma, step=_RIDGE_LENGTH, nonnegative=nonnegative)
         return space.apply(step, volume, self.ridge.shape)
 
