@@ -1,4 +1,4 @@
-# make demo    simulate a fly-scan, reconstruct it four ways, print a table (two to three minutes of processor time)
+# make demo    simulate a fly-scan, reconstruct it four ways, print a table (two to four minutes of processor time)
 # make test    style, types, every kernel, a bit of everything else: minutes; a skipped kernel test is a failure
 # make test-all   the same and then all other tests: a quarter of an hour
 # make docs     the documentation as a site, in site/

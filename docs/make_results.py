@@ -9,7 +9,7 @@ import json
 import re
 import sys
 from collections.abc import Callable, Iterable, Sequence
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from statistics import mean, stdev
 from typing import Any
@@ -38,6 +38,7 @@ METHODS = (
     (CENTRES, "PhyRadGS w/o ST", CENTRES, "PhyRadGS w/o ST"),
 )
 Row = dict[str, str]
+Scores = dict[str, Any]
 
 
 def markdown(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
@@ -84,14 +85,13 @@ def with_prior(prior: str, like: Row) -> list[str]:
     """PSNR and SSIM of ``fista`` with another prior, on a fly-scan and on one that stops, of the volumes of a row."""
     views, cells = {"rapid": 25, "standard": 50}[like["protocol"]], []
     for kind in ("fly", "still"):
-        wanted = {"prior": prior, "kind": kind, "views": views, "dose": 1e4, "size": int(like["voxels"])}
-        lines = [x for x in lines_of("ridge.jsonl") if wanted.items() <= x.items() and x["volume"] != "spheres"]
-        by_volume = {name: [x for x in lines if x["volume"] == name] for name in {x["volume"] for x in lines}}
+        by_volume: dict[str, list[Scores]] = {}
+        for (volume, _), by_prior in prior_runs()[kind, "volumes", views, 10000, int(like["voxels"])].items():
+            by_volume.setdefault(volume, []).append(by_prior[prior])
         if len(by_volume) != int(like["volumes"]):
-            found = f"found {len(by_volume)} volumes; expected {like['volumes']}"
-            raise SystemExit(f"ridge.jsonl: {kind}, {views} views: {found}")
-        means = [mean(mean(x[name] for x in of) for of in by_volume.values()) for name in ("psnr_db", "ssim")]
-        cells.append(f"{means[0]:.2f} / {means[1]:.3f}")
+            raise SystemExit(f"priors.jsonl: {kind}, {views} views: {len(by_volume)} volumes; expected {like['volumes']}")
+        psnr, ssim = (mean(mean(x[name] for x in of) for of in by_volume.values()) for name in ("psnr_db", "ssim"))
+        cells.append(f"{psnr:.2f} / {ssim:.3f}")
     return cells
 
 
@@ -249,32 +249,27 @@ def sweep(name: str, held_out: bool) -> str:
     return markdown(heads, text) + f"\nOf the other {others} kinds of scans the default is the best factor.\n"
 
 
-def beside_dct(other: str) -> str:
-    """PSNR and SSIM with the priors dct and ``other``; runs with dct are also those of bench_s.jsonl.
-
-    Fly-scans in ridge.jsonl have six times of an exposure, the others five.
-    ±: standard deviation over seeds of the mean gain."""
-    scans: dict[tuple[Any, ...], dict[tuple[str, int], dict[str, dict[str, float]]]] = {}
-
-    def add(line: dict[str, Any], kind: str, dose: float, size: int, prior: str, scores: dict[str, float]) -> None:
-        key = kind, line["volume"] if line["volume"] == "spheres" else "volumes", line["views"], int(dose), size
-        scans.setdefault(key, {}).setdefault((line["volume"], line["seed"]), {})[prior] = scores
-
-    for line in lines_of("bench_s.jsonl"):
-        kind = {"fista static": "still", "fista per-row": "fly"}.get(line["run"])
-        if line["study"] == "synthetic" and kind == {"stop-and-shoot": "still", "fly-scan": "fly"}[line["acquisition"]]:
-            add(line, kind, 1e4, line["voxels"], "dct", line["metrics"])
+@cache
+def prior_runs() -> dict[tuple[Any, ...], dict[tuple[str, int], dict[str, Scores]]]:
+    """The runs of ``priors.jsonl`` by scan: kind, object, views, photons, voxels; by volume and seed; and by prior."""
+    scans: dict[tuple[Any, ...], dict[tuple[str, int], dict[str, Scores]]] = {}
     for line in lines_of("priors.jsonl"):
-        add(line, line["kind"], line["dose"], line["size"], line["prior"], line)
-    for line in lines_of("ridge.jsonl") if other == "ridge" else []:
-        add(line, line["kind"], line["dose"], line["size"], line["prior"], line)
+        of = line["volume"] if line["volume"] == "spheres" else "volumes"
+        key = line["kind"], of, line["views"], int(line["dose"]), line["size"]
+        scans.setdefault(key, {}).setdefault((line["volume"], line["seed"]), {})[line["prior"]] = line
+    return scans
+
+
+def beside_dct(other: str) -> str:
+    """PSNR and SSIM with the priors dct and ``other``. ±: standard deviation over seeds of the mean gain."""
     text = []
-    for (kind, _, views, dose, size), runs in sorted(scans.items(), reverse=True):
+    for (kind, of, views, dose, size), runs in sorted(prior_runs().items(), reverse=True):
         pairs = {key: by for key, by in runs.items() if {"dct", other} <= set(by)}
         if not pairs:
             continue
-        names = ", ".join(sorted({name.partition("_")[0] for name, _ in pairs}))
-        cells = [f"{kind}, {names}", str(views), str(dose), f"{size}³"]
+        names = sorted({name.partition("_")[0] for name, _ in pairs})
+        objects = of if of == "spheres" else f"{len(names)} volumes" if len(names) > 3 else ", ".join(names)
+        cells = [f"{kind}, {objects}", str(views), str(dose), f"{size}³"]
         for prior in ("dct", other):
             psnr, ssim = (mean(by[prior][metric] for by in pairs.values()) for metric in ("psnr_db", "ssim"))
             cells.append(f"{psnr:.2f} / {ssim:.4f}")
@@ -517,20 +512,23 @@ def parallel_memory() -> str:
 
 
 def times_per_exposure() -> str:
-    """PSNR and time of ``per-row`` by the number of times in an exposure."""
-    by_scan: dict[tuple[Any, ...], dict[int, dict[str, Any]]] = {}
+    """PSNR and time of ``per-row`` by the number of times in an exposure, means over the volumes with the same numbers."""
+    by_volume: dict[tuple[Any, ...], dict[int, dict[str, Any]]] = {}
     for one in lines_of("times_per_exposure.jsonl"):
-        key = one["size"], one["views"], one["moved_voxels"], one["volume"], one["method"]
-        by_scan.setdefault(key, {})[one["times"]] = one
-    counts = (1, 2, 3, 5, 6, 9, 17)
-    rows = []
-    for (size, views, moved, volume, method), runs in sorted(by_scan.items()):
-        cells = [
-            f"{runs[n]['psnr_db']:.2f}" + (f" ({runs[n]['processor_s']:.0f} s)" if runs[n]["processor_s"] else "")
-            if n in runs else "" for n in counts
-        ]  # fmt: skip
-        rows.append([f"{size}³", str(views), f"{moved:.1f}", volume, f"`{method}`", *cells])
-    return markdown(["voxels", "views", "rim moves", "volume", "method", *(f"N = {n}" for n in counts)], rows)
+        key = one["size"], one["views"], one["moved_voxels"], one["method"], one["volume"]
+        by_volume.setdefault(key, {})[one["times"]] = one
+    scans: dict[tuple[Any, ...], list[dict[int, dict[str, Any]]]] = {}
+    for (*scan, volume), runs in by_volume.items():
+        scans.setdefault((*scan, volume == "spheres", tuple(sorted(runs))), []).append(runs)
+    counts, rows = (1, 2, 3, 5, 6, 9, 17), []
+    for (size, views, moved, method, _, made), of in sorted(scans.items()):
+        cells = {n: f"{mean(runs[n]['psnr_db'] for runs in of):.2f}" for n in made}
+        for n in made:
+            seconds = [runs[n]["processor_s"] for runs in of if runs[n]["processor_s"]]
+            cells[n] += f" ({mean(seconds):.0f} s)" if len(seconds) == len(of) else ""
+        names = ", ".join(sorted(next(iter(runs.values()))["volume"].partition("_")[0] for runs in of))
+        rows.append([f"{size}³, {views}", f"{moved:.1f}", names, f"`{method}`", *(cells.get(n, "") for n in counts)])
+    return markdown(["voxels, views", "rim moves", "volumes", "method", *(f"N = {n}" for n in counts)], rows)
 
 
 def moving_known() -> str:
@@ -608,7 +606,6 @@ TABLES: dict[str, Callable[[], str]] = {
     "prior_weight": lambda: sweep("prior_weight.jsonl", held_out=False),
     "passes": lambda: sweep("passes.jsonl", held_out=True),
     "curves": partial(beside_dct, "curves"),
-    "firm": partial(beside_dct, "firm"),
     "ridge": partial(beside_dct, "ridge"),
     "beside_rtk": beside_rtk,
     "ray_motions": ray_motions,

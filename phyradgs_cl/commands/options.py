@@ -98,7 +98,7 @@ _MOTION = (
     "(exact), or M×N that move only centres (centres)."
 )
 _PRIOR = (
-    "Prior, for fista: ridge, dct, firm, curves, tv, nonlocal, nonlocal+dct, piccs or none; MODULE:NAME: a denoiser of "
+    "Prior, for fista: ridge, dct, curves, tv, nonlocal, nonlocal+dct, piccs or none; MODULE:NAME: a denoiser of "
     "your own."
 )
 _PRESET = "Constants: default, quick, paper, released (phyradgs); published (r2, naf, sax-nerf); a window (fdk)."

@@ -3,8 +3,7 @@
 Shrinkage of an overcomplete transform: B_sᵀ T(B_s v), averaged over the shifts s of the blocks (Coifman and Donoho,
 "Translation-invariant de-noising", 1995; block DCT: Guleryuz, IEEE Trans. Image Process. 16 (2007) 3020). A block's mean is
 not shrunk. Near faces the average is over the blocks inside the volume. T is a soft threshold, or a curve for each class of
-frequencies (Hel-Or and Shaked, IEEE Trans. Image Process. 17 (2008) 443): a learned one, or a firm threshold for long waves
-(Gao and Bruce, Statistica Sinica 7 (1997) 855).
+frequencies (Hel-Or and Shaked, IEEE Trans. Image Process. 17 (2008) 443).
 
 A map takes a quarter of the shifts, the next map the next quarter: over iterations the average is the same (cycle spinning;
 Kamilov, Bostan and Unser, IEEE Signal Process. Lett. 21 (2014) 1326)."""
@@ -28,8 +27,7 @@ EDGE = 4
 TURNS = ((0, 1, 2, 3), (1, 3, 0, 2), (2, 0, 3, 1), (3, 2, 1, 0))
 # Frequencies (z, y, x) that differ in the order of their axes alone are of one class. Class 0 is the mean alone
 _SORTED = [tuple(sorted(frequency)) for frequency in itertools.product(range(EDGE), repeat=3)]
-_KINDS, _CLASS = np.unique(_SORTED, axis=0, return_inverse=True)  # (20, 3), (64,)
-CLASSES = _CLASS.reshape((EDGE,) * 3)
+CLASSES = np.unique(_SORTED, axis=0, return_inverse=True)[1].reshape((EDGE,) * 3)
 FREQUENCY_CLASSES = int(CLASSES.max())  # without the mean
 
 
@@ -68,21 +66,6 @@ def learned_curves() -> Curves:
 
 SOFT = Curves(np.ones(1, np.float32), np.ones((FREQUENCY_CLASSES, 1), np.float32))
 """The soft threshold, whose unit is the threshold."""
-
-_FALL = 200 / 3, 500 / 3  # thresholds: where the loss of a long wave begins to fall, and where it is 0
-_LONG, _SHORT = 0.9, 5 / 3  # thresholds of the longest and of the shortest waves
-
-
-def firm_curves() -> Curves:
-    """Returns curves that keep strong long waves: frequencies 0 and 1 alone. Waves with a 3, and 0 1 2, lose more.
-
-    The unit is the threshold of the other waves (docs/results/settings.md)."""
-    highest = _KINDS[1:, -1]
-    is_long, is_short = highest == 1, (highest == 3) | (_KINDS[1:] == (0, 1, 2)).all(1)
-    threshold = np.select([is_long, is_short], [_LONG, _SHORT], 1.0)
-    slope = np.where(is_long, threshold / (_FALL[1] - _FALL[0]), 0)
-    return Curves(np.array([1, *_FALL], np.float32), np.stack([threshold, slope, -slope], 1).astype(np.float32))
-
 
 class DctProx:
     """The map for volumes of a fixed ``shape`` (z, y, x); it does not change a volume thinner than a block."""

@@ -5,7 +5,7 @@ import pytest
 import scipy.fft
 from tolerances import FLOAT32, FLOAT64
 
-from phyradgs_cl.objective.dct_prox import CLASSES, Curves, DctProx, dct_prox, firm_curves
+from phyradgs_cl.objective.dct_prox import CLASSES, Curves, DctProx, dct_prox
 
 SHAPES = [(5, 6, 7), (4, 4, 33), (17, 4, 20), (9, 11, 16), (3, 8, 8), (1, 1, 1)]
 
@@ -48,18 +48,6 @@ def test_a_curve_acts_on_its_own_class_alone() -> None:
         turns = [dct_prox(block, 9, turn, nonnegative=False, curves=Curves(np.ones(1), own)) for turn in range(4)]
         np.testing.assert_allclose(np.mean(turns, 0), 0, atol=FLOAT64)
     assert np.bincount(CLASSES.ravel()).tolist() == [1] + [3] * 3 + [3, 6, 6, 3, 6, 3, 1, 3, 3, 3, 6, 3, 1, 3, 3, 1]
-
-
-@pytest.mark.parametrize(
-    ("frequency", "size", "lost"),
-    [((1, 0, 1), 0.5, 0.009), ((1, 0, 1), 2, 0), ((1, 0, 1), 7 / 6, 0.0045), ((0, 2, 0), 2, 0.01), ((2, 0, 1), 2, 0.05 / 3)],
-)
-def test_firm_curves_keep_strong_long_waves_alone(frequency, size, lost) -> None:
-    for sign in (1, -1):
-        values = np.zeros((4, 4, 4))
-        values[frequency] = sign * size
-        losses = firm_curves().losses(values, 0.01)
-        assert losses[frequency] == pytest.approx(sign * lost, abs=1e-6)
 
 
 def mean_of_turns(volume: np.ndarray, threshold: float) -> np.ndarray:

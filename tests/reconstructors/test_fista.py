@@ -242,7 +242,7 @@ def test_fused_is_the_mean_of_both(rt, scan) -> None:
 
 @pytest.mark.parametrize(
     ("at", "prior"),
-    [(2, "dct"), (5, "curves"), (5, "firm"), (3, "ridge"), (1, "nonlocal"), (3, "nonlocal+dct"), (6, "nonlocal")],
+    [(2, "dct"), (5, "curves"), (3, "ridge"), (1, "nonlocal"), (3, "nonlocal+dct"), (6, "nonlocal")],
 )
 def test_fista_goes_on_with_the_same_bits_from_either_grid(rt, scan, at, prior) -> None:
     options = method_options("fista", None, {"iterations": 7, "subvoxels": 2, "prior": prior})
@@ -300,14 +300,6 @@ def test_ridge_follows_the_maps_of_dct_on_a_fly_scan_and_less_total_variation_at
     turned, at_rest = (run(rt, scan, "fista", motion="static", iterations=4, prior="ridge").volume for scan in scans)
     assert not np.array_equal(turned, at_rest)
 
-
-def test_the_firm_prior_differs_from_dct_on_smaller_voxels_alone(rt, scan) -> None:
-    for parts in (1, 2):
-        firm, soft = (
-            run(rt, scan, "fista", motion="per-row", subvoxels=parts, prior=prior).volume for prior in ("firm", "dct")
-        )
-        assert np.array_equal(firm, soft) == (parts == 1)
-    assert quality(scan, firm) > quality(scan, soft)
 
 
 def test_a_prior_is_found_by_its_name(rt, scan, tmp_path, monkeypatch) -> None:

@@ -16,7 +16,6 @@ from phyradgs_cl.objective import (
     NonlocalStep,
     RidgeStep,
     TvProx,
-    firm_curves,
     learned_curves,
     learned_ridge,
 )
@@ -62,12 +61,6 @@ class PriorInputs:
 
     def tv_and_dct(self, tv_share: float = _TV_BEFORE_DCT, unit: float = _DCT) -> "TvAndDct":
         return TvAndDct(self.tv(tv_share), DctProx(self.rt, self.grid.shape), unit)
-
-    def tv_and_firm(self) -> "TvAndDct":
-        """On the scan's own voxels, which blur edges, as ``tv_and_dct``: a firm threshold sharpens edges too far there."""
-        if self.parts == 1:
-            return self.tv_and_dct()
-        return TvAndDct(self.tv(_TV_BEFORE_DCT), DctProx(self.rt, self.grid.shape, firm_curves()), _DCT)
 
     def tv_and_curves(self) -> "TvAndDct":
         curves = learned_curves().scaled(_CURVES / _CURVES_NOISE)
@@ -274,7 +267,6 @@ class OwnPrior(Prior):
 PRIORS: dict[str, Callable[[PriorInputs], Prior]] = {
     "ridge": PriorInputs.dct_then_ridge,
     "dct": PriorInputs.tv_and_dct,
-    "firm": PriorInputs.tv_and_firm,
     "curves": PriorInputs.tv_and_curves,
     "tv": lambda inputs: inputs.tv(_TV_ALONE),
     "nonlocal": lambda inputs: inputs.nonlocal_then(inputs.tv(_TV_ALONE), _NONLOCAL),
