@@ -11,7 +11,7 @@ from phyradgs_cl import checks
 from phyradgs_cl.acquisition import TimeCells, pixel_centres
 from phyradgs_cl.acquisition.geometry import Geometry
 from phyradgs_cl.detector import average
-from phyradgs_cl.fields import Deformation, Grid, deformed
+from phyradgs_cl.fields import Deformation, Grid, SplineVolume
 from phyradgs_cl.operators import RayOperator
 from phyradgs_cl.operators.rays.layout import RayLayout, some_cells
 from phyradgs_cl.operators.rays.memory import RayMemory
@@ -133,7 +133,7 @@ class DeformedSource(FrameSource):
         self, volume: np.ndarray, grid: Grid, deformation: Deformation, voxel_mm: float,
         make: Callable[[np.ndarray], FrameSource],
     ) -> None:  # fmt: skip
-        self._volume, self._grid, self._deformation = volume, grid, deformation
+        self._volume, self._deformation = SplineVolume(volume, grid), deformation
         reach_mm = np.maximum(deformation.reach_mm, np.finfo(float).tiny)
         self._step = 2 * NEAREST * voxel_mm / (deformation.rank * reach_mm)
         self._make = make
@@ -149,7 +149,7 @@ class DeformedSource(FrameSource):
         for number, state in enumerate(states):
             numbers = [k for k, of_cell in enumerate(by_table) if (of_cell == number).any()]
             parts = [part_of(tables[k], by_table[k] == number) for k in numbers]
-            source = self._make(deformed(self._volume, self._grid, self._deformation, state))
+            source = self._make(self._volume.deformed(self._deformation, state))
             frames = source.frames([part for part, _ in parts], model, factor)
             for k, frame, (_, share) in zip(numbers, frames, parts, strict=True):
                 sums[k].add(frame, share)

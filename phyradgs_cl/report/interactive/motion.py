@@ -2,7 +2,7 @@
 slices at any time of the scan and arrows of the displacement.
 
 Of the object the page has the voxels once, as the picture in 3D has them, and the deformation as control points. Its script
-makes the states: v(y + w(y, t)), trilinear, as ``fields.deformed`` does."""
+makes the states: v(y + w(y, t)), trilinear."""
 
 import numpy as np
 from numpy.typing import NDArray
