@@ -18,7 +18,6 @@ from phyradgs_cl.fields import Activation, Deformation, Grid
 from phyradgs_cl.fields.gaussians import DENSITY, MEAN, QUATERNION, SCALE
 from phyradgs_cl.objective import terms
 from phyradgs_cl.objective.dct_prox import FREQUENCY_CLASSES, Curves, DctProx, dct_prox
-from phyradgs_cl.objective.nonlocal_step import LARGEST, NonlocalStep, likeness_of, nonlocal_step
 from phyradgs_cl.objective.ridge import RidgeStep, learned_ridge, ridge_step
 from phyradgs_cl.objective.tv import TvDescent, TvProx, tv_descent, tv_prox
 from phyradgs_cl.operators.splats.binning import TileLists
@@ -307,11 +306,6 @@ def _variation(rt: Runtime) -> Iterator[Comparison]:
     curves = Curves(np.array([1.0, 4.0]), np.linspace(-0.5, 1, 2 * FREQUENCY_CLASSES).reshape(-1, 2))
     shrunk = DctProx(rt, GRID.shape, curves)(volume, 0.2, 2, nonnegative=False)
     yield shrunk, dct_prox(volume, 0.2, 2, nonnegative=False, curves=curves), VALUE
-    smooth = NonlocalStep(rt, GRID.shape)
-    smooth.learn(volume, 0.5)
-    likeness = smooth.likeness
-    yield likeness, likeness_of(volume, 0.5), 1 / LARGEST
-    yield smooth(volume, 0.4), nonlocal_step(volume, likeness, 0.4), VALUE
     descended = RidgeStep(rt, GRID.shape, learned_ridge())(volume, 0.1, 0.3, nonnegative=False)
     yield descended, ridge_step(volume, 0.1, 0.3, ridge=learned_ridge(), nonnegative=False), VALUE
 

@@ -207,9 +207,7 @@ def cases() -> dict[str, Callable[[Runtime], None]]:
             found[f"{name} {motion}"] = partial(method, name=name, motion=motion)
     for name, motion in (("fdk", "static"), ("fdk", "per-row"), ("sirt", "per-row"), ("phyradgs", "exact")):
         found[f"moving {name} {motion}"] = partial(moving, name=name, motion=motion)
-    few: dict[str, object] = {"iterations": 3, "subvoxels": 1}  # weights after the first
     found["fista ridge"] = partial(method, name="fista", motion="static", prior="ridge", iterations=6)  # after five maps
-    found["fista nonlocal"] = partial(method, name="fista", motion="static", prior="nonlocal", **few)
     return found
 
 

@@ -65,7 +65,7 @@ def quality(scan: Scan, volume: np.ndarray) -> float:
 def test_each_prior_is_better_than_none_and_subsets_are_quicker(rt, scan) -> None:
     found = {
         prior: quality(scan, run(rt, scan, "fista", motion="per-row", iterations=20, prior=prior).volume)
-        for prior in ("none", "tv", "dct", "curves", "ridge", "nonlocal", "nonlocal+dct")
+        for prior in ("none", "tv", "dct", "curves", "ridge")
     }
     without = found.pop("none")
     assert min(found.values()) > without + 0.5, (found, without)
@@ -78,7 +78,7 @@ def test_each_prior_is_better_than_none_and_subsets_are_quicker(rt, scan) -> Non
 def test_subsets_that_pull_apart_are_joined(rt, scan) -> None:
     """One frame a subset, with momentum, diverges; joined it ends near the whole scan's residual."""
     options = FistaOptions(subsets=1000)
-    prior = prior_of("tv", PriorInputs(rt, scan.grid, 5, 12))
+    prior = prior_of("tv", PriorInputs(rt, scan.grid, 5))
     system = System.of_scan(rt, scan, options.motion)
     algorithm = Fista(system, options, prior, PriorWeight(system, FrameError(0.01), 0.42))
     assert len(algorithm.subsets) == scan.frames
@@ -242,7 +242,7 @@ def test_fused_is_the_mean_of_both(rt, scan) -> None:
 
 @pytest.mark.parametrize(
     ("at", "prior"),
-    [(2, "dct"), (5, "curves"), (3, "ridge"), (1, "nonlocal"), (3, "nonlocal+dct"), (6, "nonlocal")],
+    [(2, "dct"), (5, "curves"), (3, "ridge"), (1, "tv")],
 )
 def test_fista_goes_on_with_the_same_bits_from_either_grid(rt, scan, at, prior) -> None:
     options = method_options("fista", None, {"iterations": 7, "subvoxels": 2, "prior": prior})
@@ -262,7 +262,7 @@ def test_fista_goes_on_with_the_same_bits_from_either_grid(rt, scan, at, prior) 
 
 def test_a_ridge_step_follows_every_fourth_map_and_resumes_between_them(rt, scan) -> None:
     volume, space = np.random.default_rng(0).uniform(size=scan.grid.shape).astype(np.float32), DeviceSpace(rt)
-    first, resumed, other = (prior_of("ridge", PriorInputs(rt, scan.grid, 5, 12)) for _ in range(3))
+    first, resumed, other = (prior_of("ridge", PriorInputs(rt, scan.grid, 5)) for _ in range(3))
 
     def maps(prior: Prior, count: int) -> list[np.ndarray]:
         arrays = [prior(space, space.array(volume), 0.01, nonnegative=True) for _ in range(count)]
@@ -278,7 +278,7 @@ def test_a_ridge_step_follows_every_fourth_map_and_resumes_between_them(rt, scan
 
 def test_ridge_is_dct_in_a_volume_thinner_than_its_filters(rt) -> None:
     volume, space = np.random.default_rng(0).uniform(size=(4, 12, 12)).astype(np.float32), DeviceSpace(rt)
-    inputs = PriorInputs(rt, Grid(volume.shape, (0.1, 0.1, 0.1)), 5, 12)
+    inputs = PriorInputs(rt, Grid(volume.shape, (0.1, 0.1, 0.1)), 5)
     dct, ridge = (prior_of(name, inputs) for name in ("dct", "ridge"))
     for _ in range(4):
         maps = [space.numpy(prior(space, space.array(volume), 0.01, nonnegative=True)) for prior in (dct, ridge)]
@@ -288,7 +288,7 @@ def test_ridge_is_dct_in_a_volume_thinner_than_its_filters(rt) -> None:
 
 def test_ridge_follows_the_maps_of_dct_on_a_fly_scan_and_less_total_variation_at_rest(rt, scan) -> None:
     volume, space = np.random.default_rng(0).uniform(size=scan.grid.shape).astype(np.float32), DeviceSpace(rt)
-    inputs = PriorInputs(rt, scan.grid, 5, 12)
+    inputs = PriorInputs(rt, scan.grid, 5)
     priors = prior_of("dct", inputs), prior_of("ridge", replace(inputs, is_fly=True)), prior_of("ridge", inputs)
     dct, fly, still = (space.numpy(prior(space, space.array(volume), 0.01, nonnegative=True)) for prior in priors)
     np.testing.assert_array_equal(dct, fly)

@@ -31,7 +31,7 @@ RUNS = [
     ("fista-tv", {"iterations": 2, "motion": "static"}),
     ("fista-tv", {"iterations": 1, "motion": "per-row"}),
     ("fista", {"iterations": 1, "motion": "per-row", "prior": "ridge"}),
-    ("fista", {"iterations": 4, "motion": "static", "prior": "nonlocal+dct"}),
+    ("fista", {"iterations": 4, "motion": "static", "prior": "dct"}),
     ("sirt", {"iterations": 2, "motion": "per-row", "moving": True}),
     ("phyradgs", {**SPLATS, "motion": "exact", "moving": True}),
     ("fdk", {"motion": "static", "moving": True}), ("fdk", {"motion": "per-row", "moving": True}),

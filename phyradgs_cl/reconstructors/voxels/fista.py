@@ -129,7 +129,6 @@ class Fista(Accelerated):
         # larger subsets have another step length: momentum of the former ones would mislead
         if self.subsets.join_if_diverging(residual):
             self.momentum, self.previous = 1.0, self.volume
-        self.prior.end_pass(self.system.space, self.volume)
         return residual
 
     def _update(self, subset: System, weight: float) -> Any:
@@ -190,8 +189,7 @@ def _run(inputs: MethodInputs, options: FistaOptions, image: np.ndarray | None, 
         is_short = is_on_host and system.leave_room(rt, (held + _COPIES) * volume_bytes)
         error = frame_error(scan, options.motion)
         prior_inputs = priors.PriorInputs(
-            rt, scan.grid, options.tv_iterations, options.iterations, image, options.prior_share, parts, scan.is_fly,
-            error.noise,
+            rt, scan.grid, options.tv_iterations, image, options.prior_share, scan.is_fly, error.noise
         )
         prior = priors.prior_of(options.prior, prior_inputs)
         with rt.ledger.reserved(_COPIES * volume_bytes if is_short else 0):

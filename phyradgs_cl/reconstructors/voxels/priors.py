@@ -11,14 +11,7 @@ import numpy as np
 from phyradgs_cl import checks
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
-from phyradgs_cl.objective import (
-    DctProx,
-    NonlocalStep,
-    RidgeStep,
-    TvProx,
-    learned_curves,
-    learned_ridge,
-)
+from phyradgs_cl.objective import DctProx, RidgeStep, TvProx, learned_curves, learned_ridge
 from phyradgs_cl.objective.dct_prox import TURNS
 from phyradgs_cl.objective.ridge import EDGE as RIDGE_EDGE
 from phyradgs_cl.reconstructors.checkpoint import State
@@ -34,8 +27,6 @@ _RIDGE_NOISE, _RIDGE_LENGTH, _RIDGE_EVERY = 17.0, 0.5, 4  # noise that the step 
 _RIDGE_NOISE_AT_REST = 20.0
 _USUAL_NOISE, _LEAST_NOISE = 0.01, 0.001  # of line integrals: where the numbers at rest hold, and the least that they follow
 _LEAST_NOISE_SHARE = 0.1  # for the ridge step of scans without noise
-_NONLOCAL, _NONLOCAL_BEFORE_DCT = 300.0, 100.0  # of the filtering parameter h
-_NONLOCAL_STEP = 0.01  # length of a step down the nonlocal quadratic
 _SUBVOXELS, _SUBVOXELS_WITH_RIDGE = 2 / 3, 0.85  # share of the smaller voxels in the result
 
 
@@ -43,16 +34,14 @@ _SUBVOXELS, _SUBVOXELS_WITH_RIDGE = 2 / 3, 0.85  # share of the smaller voxels i
 class PriorInputs:
     """The arguments of a prior: device, grid, and for piccs its image (nz, ny, nx) in 1/mm and the weight of the change.
 
-    tv_iterations: dual iterations per map. passes: over all frames, of the run. parts: of a voxel's side, on this grid.
-    is_fly: of the scan, whose frames expose for an arc. noise: of its line integrals, behind the object."""
+    tv_iterations: dual iterations per map. is_fly: of the scan, whose frames expose for an arc. noise: of its line
+    integrals, behind the object."""
 
     rt: Runtime
     grid: Grid
     tv_iterations: int
-    passes: int
     image: np.ndarray | None = None
     share: float = 0.5
-    parts: int = 1
     is_fly: bool = False
     noise: float = _USUAL_NOISE
 
@@ -77,9 +66,6 @@ class PriorInputs:
         before = self.tv_and_dct(_TV_AT_REST * relative, _DCT_AT_REST)
         return ThenRidge(before, ridge, _RIDGE_NOISE_AT_REST / relative)
 
-    def nonlocal_then(self, then: "Prior", h_share: float) -> "Nonlocal":
-        return Nonlocal(then, NonlocalStep(self.rt, self.grid.shape), h_share, self.passes)
-
 
 class Prior:
     """A map x → argmin ½‖x' − x‖² + weight R(x'), x' ≥ 0 if asked, or an approximation of it.
@@ -95,9 +81,6 @@ class Prior:
     def __call__(self, space: Space[Any], volume: Any, weight: float, *, nonnegative: bool) -> Any:
         """Maps a volume (nz, ny, nx) of ``space``; ``weight`` in 1/mm."""
         return space.add(volume, volume, 0.0, nonnegative=nonnegative)
-
-    def end_pass(self, space: Space[Any], volume: Any) -> None:
-        """Learns from the volume after a pass over all frames."""
 
     def state(self) -> dict[str, np.ndarray]:
         """Returns the arrays that the next map starts from."""
@@ -175,44 +158,6 @@ class ThenRidge(Prior):
         self.maps = int(state["maps"])
 
 
-class Nonlocal(Prior):
-    """A step down a nonlocal quadratic, then another prior.
-
-    The quadratic's weights come from the volume after a quarter and after half of the passes. Weights that kept following
-    the volume would sharpen structures that are not in the data."""
-
-    VOLUMES = NonlocalStep.VOLUMES
-
-    def __init__(self, then: Prior, smooth: NonlocalStep, h_share: float, passes: int) -> None:
-        self.then, self.smooth, self.h_share, self.passes = then, smooth, h_share, passes
-        self._passes_done, self._is_learned = 0, False
-        self._guide: np.ndarray | None = None
-        self._h = 0.0  # of the guide's weights; 0 before the first map with this guide
-
-    def __call__(self, space: Space[Any], volume: Any, weight: float, *, nonnegative: bool) -> Any:
-        if self._guide is not None and weight > 0:
-            if not self._is_learned:
-                self._h = self._h or self.h_share * weight
-                self.smooth.learn(self._guide, self._h)
-                self._is_learned = True
-            volume = space.apply(partial(self.smooth, step=_NONLOCAL_STEP), volume, self.smooth.shape)
-        return self.then(space, volume, weight, nonnegative=nonnegative)
-
-    def end_pass(self, space: Space[Any], volume: Any) -> None:
-        self._passes_done += 1
-        if self._passes_done in (checks.ceil_div(self.passes, 4), checks.ceil_div(self.passes, 2)):
-            self._guide, self._is_learned, self._h = space.numpy(volume), False, 0.0
-
-    def state(self) -> dict[str, np.ndarray]:
-        guide = np.zeros(self.smooth.shape, np.float32) if self._guide is None else self._guide
-        return {**self.then.state(), "guide": guide, "h": np.array(self._h), "passes": np.array(self._passes_done)}
-
-    def restore(self, state: State) -> None:
-        self.then.restore(state)
-        self._passes_done, guide = int(state["passes"]), state["guide"]
-        self._guide, self._is_learned, self._h = guide if guide.any() else None, False, float(state["h"])
-
-
 class Piccs(Prior):
     """(1 − share) TV(x) + share TV(x − image), as one map after the other.
 
@@ -269,8 +214,6 @@ PRIORS: dict[str, Callable[[PriorInputs], Prior]] = {
     "dct": PriorInputs.tv_and_dct,
     "curves": PriorInputs.tv_and_curves,
     "tv": lambda inputs: inputs.tv(_TV_ALONE),
-    "nonlocal": lambda inputs: inputs.nonlocal_then(inputs.tv(_TV_ALONE), _NONLOCAL),
-    "nonlocal+dct": lambda inputs: inputs.nonlocal_then(inputs.tv_and_dct(), _NONLOCAL_BEFORE_DCT),
     "piccs": Piccs,
     "none": lambda inputs: Prior(),
 }
@@ -290,8 +233,7 @@ def prior_of(prior: str | Denoiser, inputs: PriorInputs) -> Prior:
 
 def volumes_of(prior: str | Denoiser) -> int:
     """Returns how many more volumes a prior holds than ``dct``."""
-    held = {"nonlocal": Nonlocal.VOLUMES, "nonlocal+dct": Nonlocal.VOLUMES, "ridge": ThenRidge.VOLUMES}
-    return held.get(prior, 0) if isinstance(prior, str) else 0
+    return ThenRidge.VOLUMES if prior == "ridge" else 0
 
 
 def subvoxel_share(prior: str | Denoiser, shape: tuple[int, int, int]) -> float:
