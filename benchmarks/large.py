@@ -13,8 +13,7 @@ import time
 from collections.abc import Callable
 
 import numpy as np
-from measuring import Facts, finish, parser_of, where
-from scaling import cloud
+from measuring import Facts, finish, parser_of, random_cloud, where
 
 from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, ConstantSpeed, Shutter
 from phyradgs_cl.acquisition.cells import static_cells
@@ -35,7 +34,7 @@ def calls(
     z, y, x = (np.linspace(0, 1, voxels, dtype=np.float32).reshape(shape) for shape in _axes())
     volume = np.sin(40 * x) * np.cos(30 * y) + z  # every brick differs
     frames = np.random.default_rng(0).uniform(0, 1, (views, detector, detector)).astype(np.float32)
-    rows = cloud(gaussians)
+    rows = random_cloud(gaussians, (0.01, 0.03), np.random.default_rng(0))
     return {
         "ray-driven forward": lambda: RayOperator(rt, grid, (detector,) * 2, tables).forward(volume),
         "ray-driven adjoint": lambda: RayOperator(rt, grid, (detector,) * 2, tables).adjoint(frames),

@@ -1,4 +1,4 @@
-"""What the benchmarks share: where they ran, runs of splats, medians, exponents, children in processes, results as JSON."""
+"""What the benchmarks share: where they ran, runs of splats, medians, children in processes, results as JSON."""
 
 import argparse
 import json
@@ -81,12 +81,6 @@ def random_cloud(count: int, scale: tuple[float, float], rng: np.random.Generato
 
 def median(values: Sequence[float]) -> float:
     return float(statistics.median(values))
-
-
-def exponent(sizes: Sequence[float], costs: Sequence[float]) -> float:
-    """p of cost ~ size^p, by least squares on logarithms."""
-    slope, _ = np.polyfit(np.log(np.asarray(sizes, float)), np.log(np.asarray(costs, float)), 1)
-    return float(slope)
 
 
 def child(script: str, *words: str) -> Facts:

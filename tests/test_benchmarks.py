@@ -41,14 +41,6 @@ def test_the_demo(tmp_path) -> None:
     assert (tmp_path / "demo.png").read_bytes().startswith(b"\x89PNG")
 
 
-def test_scaling(tmp_path) -> None:
-    figure = tmp_path / "figure.png"
-    facts = facts_of(tmp_path, "scaling.py", "--figure", str(figure))
-    assert set(facts["exponents"]) == {"gaussians", "voxeliser", "pixels"}
-    assert all(cost["all_ms"] > 0 for cost in facts["pixels"].values())
-    assert figure.read_bytes().startswith(b"\x89PNG")
-
-
 def test_iteration(tmp_path) -> None:
     facts = facts_of(tmp_path, "iteration.py")
     stages = ("prepare", "binning", "forward", "loss", "backward", "tv", "adam", "gaps")
