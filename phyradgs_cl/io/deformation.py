@@ -10,10 +10,10 @@ from phyradgs_cl import checks
 from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Deformation, Grid, MovingTruth, triple
+from phyradgs_cl.io import scan as schema
 from phyradgs_cl.io.files import sha256_of
 from phyradgs_cl.io.hdf5 import datasets as h5
 from phyradgs_cl.io.hdf5.source import Hdf5Source, open_hdf5
-from phyradgs_cl.io.scan import schema
 
 DEFORMATION = "/entry/deformation"
 _MEANS = "at time t the object has, at point y, the attenuation of the reference volume at y + sum_r weights_r(t) U_r(y)"

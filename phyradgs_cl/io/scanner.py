@@ -13,7 +13,7 @@ from phyradgs_cl.acquisition.shutter import AXES
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid, triple
 from phyradgs_cl.fields.volume import MOST_VOXELS
-from phyradgs_cl.io.scan.schema import BEAMS
+from phyradgs_cl.io.scan import BEAMS
 from phyradgs_cl.io.tables import LARGEST_LENGTH, Fields, described, read_toml, refuse_unknown
 from phyradgs_cl.text import suggest_name
 

@@ -18,10 +18,10 @@ from phyradgs_cl.metrics.quality import (
     motion_error_mm,
     printed,
     psnr,
+    slices_png,
     ssim,
     ssim_map,
 )
-from phyradgs_cl.metrics.slices import slices_png
 
 __all__ = [
     "HELD_OUT", "METRICS", "VOXEL_BY_VOXEL", "Aligned", "aligned", "compare", "edge_points_mm", "in_words",

@@ -2,26 +2,35 @@
 
 SSIM (Z. Wang et al., IEEE Trans. Image Process. 13(4), 600-612, 2004) is taken in 2D with an 11×11 Gaussian window of sigma
 1.5 and zeros beyond the border. It is averaged over the slices of each axis whose truth is not empty, then over the axes, as
-in the published tables of radiative Gaussian splatting."""
+in the published tables of radiative Gaussian splatting. Also a figure of the three middle slices beside the truth."""
 
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy
 from numpy.typing import ArrayLike, NDArray
 
 from phyradgs_cl import checks
-from phyradgs_cl.errors import InputError
+from phyradgs_cl.drawing import draw_image, new_figure
+from phyradgs_cl.errors import InputError, OutputError
 from phyradgs_cl.fields import Deformation, Grid
+from phyradgs_cl.text import plain_text
+
+if TYPE_CHECKING:
+    from matplotlib.figure import FigureBase
 
 Array = NDArray[np.float64]
+Floats = NDArray[np.floating]
 WINDOW, SIGMA = 11, 1.5
 K1, K2 = 0.01, 0.03
 _VOXELS_PER_BATCH = 1 << 20  # about ten float64 arrays of this size live at once: 80 MB
 _EDGE = 0.25  # of the steepest slope: voxels at which a displacement can be seen
 _MOST_POINTS = 2000
+_INCH, _DPI = 3.2, 110  # of the figure of slices
 
 
 @dataclass(frozen=True)
@@ -80,9 +89,7 @@ def psnr(result: ArrayLike, reference: ArrayLike, data_range: float | None = Non
     return math.inf if squares == 0 else 10 * math.log10(peak**2 * a.size / squares)
 
 
-def checked_pair(
-    result: ArrayLike, reference: ArrayLike, data_range: float | None
-) -> tuple[NDArray[np.floating], NDArray[np.floating], float]:
+def checked_pair(result: ArrayLike, reference: ArrayLike, data_range: float | None) -> tuple[Floats, Floats, float]:
     """Returns both arrays with at least one axis, and the data range. Raises InputError where they do not fit."""
     a, b = np.atleast_1d(np.asarray(result)), np.atleast_1d(np.asarray(reference))
     checks.shape("result", a, b.shape)
@@ -117,7 +124,7 @@ def ssim_map(result: ArrayLike, reference: ArrayLike, data_range: float) -> Arra
     return ((2 * both + c1) * (2 * covariance + c2)) / ((squares + c1) * (variances + c2))
 
 
-def _along_axis(result: NDArray[np.floating], reference: NDArray[np.floating], peak: float, axis: int) -> float:
+def _along_axis(result: Floats, reference: Floats, peak: float, axis: int) -> float:
     """Returns the mean over the slices across ``axis`` that are not empty in the reference."""
     a, b = np.moveaxis(result, axis, 0), np.moveaxis(reference, axis, 0)
     full = np.flatnonzero(b.any(axis=(1, 2)))
@@ -167,3 +174,53 @@ def motion_error_mm(
     error_mm = displaced_mm(estimate, points_mm, times_s) - displaced_mm(truth, points_mm, times_s)
     distance_mm = np.linalg.norm(error_mm, axis=-1)
     return float(distance_mm.mean()), float(np.percentile(distance_mm, 95))
+
+
+def slices_png(path: str | Path, result: ArrayLike, reference: ArrayLike, title: str) -> None:
+    """Writes a PNG: a row for each middle slice, the columns result, truth and difference. z and y point up.
+
+    Grey values run over the truth's range, so that a wrong gain shows. The difference has its own scale, symmetric about 0.
+    result, reference: (z, y, x). ``title``: the heading's first line. Raises InputError for shapes that differ, NaN and
+    infinity, and OutputError for a file that cannot be written."""
+    volume, truth = np.asarray(result), np.asarray(reference)
+    figure = new_figure(3 * _INCH * 1.25, 3 * _INCH + 0.6)
+    figure.suptitle(plain_text(f"{title}\n{_scores(volume, truth)}"), parse_math=False)  # a dollar in a file's name is one
+    draw_slices(figure, volume, truth, None)
+    try:
+        figure.savefig(path, dpi=_DPI, format="png")
+    except OSError as error:
+        raise OutputError(str(path), str(error), "a file that can be written") from error
+
+
+def _scores(result: Floats, reference: Floats) -> str:
+    if not reference.max(initial=0) > 0:
+        return "empty truth"
+    return f"PSNR {psnr(result, reference):.2f} dB, SSIM {ssim(result, reference):.4f}"
+
+
+def draw_slices(figure: "FigureBase", volume: Floats, truth: Floats | None, grid: Grid | None) -> None:
+    """Draws the three middle slices of a volume (z, y, x) in 1/mm, and those of a truth and of the difference."""
+    if truth is not None:
+        checks.shape("reference", truth, volume.shape)
+        checks.finite("reference", truth)
+    shown = volume if truth is None else truth
+    low, high = min(0.0, float(shown.min())), float(shown.max())
+    high = high if high > low else low + 1.0
+    grey = {"cmap": "gray", "vmin": low, "vmax": high}
+    panels = figure.subplots(3, 1 if truth is None else 3, squeeze=False)
+    for axis, name in enumerate("zyx"):
+        index = volume.shape[axis] // 2
+        image = volume.take(index, axis=axis)
+        sides = None if grid is None else [side for a, side in enumerate(grid.size_mm) if a != axis]
+        size_mm = None if sides is None else (sides[0], sides[1])
+        where = f"{name} = {index}" if grid is None else f"{name} = {grid.axes_mm()[axis][index]:.3g} mm"
+        unit = "" if grid is None else ", 1/mm"
+        draw_image(panels[axis, 0], image, f"result{unit}, {where}", size_mm=size_mm, **grey)
+        if truth is not None:
+            other = truth.take(index, axis=axis)
+            difference = image.astype(np.float64) - other
+            limit = float(np.abs(difference).max()) or 1.0
+            rms = float(np.sqrt(np.mean(difference**2)))
+            draw_image(panels[axis, 1], other, f"truth, {where}", size_mm=size_mm, **grey)
+            signed = {"cmap": "RdBu_r", "vmin": -limit, "vmax": limit}
+            draw_image(panels[axis, 2], difference, f"difference, RMS {rms:.3g}", size_mm=size_mm, **signed)

@@ -11,7 +11,7 @@ from phyradgs_cl.drawing import draw_curve, draw_image, new_figure
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.metrics import reference_on
-from phyradgs_cl.metrics.slices import draw_slices
+from phyradgs_cl.metrics.quality import draw_slices
 from phyradgs_cl.reconstructors.projected import frame_pairs
 from phyradgs_cl.runtime import Runtime
 

@@ -17,10 +17,10 @@ from phyradgs_cl.importers import assemble
 from phyradgs_cl.importers.options import OF_BARE_FRAMES, ImportOptions
 from phyradgs_cl.importers.reading import frames as reading
 from phyradgs_cl.importers.reading.frames import line_integrals, oriented
+from phyradgs_cl.io import scan as schema
 from phyradgs_cl.io.hdf5 import datasets as h5
 from phyradgs_cl.io.hdf5.datasets import ANGLE, LENGTH, TIME
 from phyradgs_cl.io.hdf5.source import Hdf5Source, open_hdf5
-from phyradgs_cl.io.scan import schema
 from phyradgs_cl.io.scan.detector import read_duration
 from phyradgs_cl.io.scan.header import find_entry
 from phyradgs_cl.io.scan.reader import united

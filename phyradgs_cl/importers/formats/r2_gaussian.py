@@ -15,7 +15,7 @@ from phyradgs_cl.importers.assemble import Timing, assemble_scan, make_timing, t
 from phyradgs_cl.importers.options import TIMING, ImportOptions
 from phyradgs_cl.importers.reading.files import SafeFolder, read_json, read_npy
 from phyradgs_cl.importers.reading.frames import LineIntegrals, line_integrals, oriented
-from phyradgs_cl.io.scan.schema import BEAMS
+from phyradgs_cl.io.scan import BEAMS
 from phyradgs_cl.io.tables import Fields
 
 META = "meta_data.json"

@@ -1,1 +1,30 @@
-"""Scan files: schema, reading part by part, writing."""
+"""Scan files: reading part by part, writing. Addresses in a scan file, which is a NeXus NXtomo entry (docs/formats.md)."""
+
+DETECTOR = "instrument/detector"
+DATA, MASK = f"{DETECTOR}/data", f"{DETECTOR}/pixel_mask"
+SOURCE = "instrument/source"
+SAMPLE = "sample"
+EXTRA = "phyradgs"
+BEAM = f"{EXTRA}/beam"
+KINEMATICS = f"{EXTRA}/kinematics"
+POSES = f"{EXTRA}/poses"
+GRID = f"{EXTRA}/grid"
+REFERENCE = f"{EXTRA}/reference"
+TRUTH = f"{REFERENCE}/volume"
+STATES, STATE_TIMES = f"{REFERENCE}/states", f"{REFERENCE}/state_times"
+DEFORMATION = f"{REFERENCE}/deformation"
+GATING = f"{EXTRA}/gating"
+SIGNAL, PHASE = f"{GATING}/signal", f"{GATING}/phase"
+
+PROJECTION, FLAT, DARK, INVALID = 0, 1, 2, 3
+QUANTITIES = ("attenuation", "transmission", "counts")
+ROTATES = ("gantry", "sample")
+BEAMS = ("cone", "parallel")
+
+# Standard fields that change the geometry and that this package does not read.
+IGNORED = (
+    *(f"{DETECTOR}/{name}" for name in ("transformations", "x_rotation_axis_pixel_position")),
+    *(f"{DETECTOR}/{name}" for name in ("y_rotation_axis_pixel_position", "estimated_cor_from_motor")),
+    *(f"{DETECTOR}/{name}" for name in ("x_flipped", "y_flipped")),
+    *(f"{SAMPLE}/{name}" for name in ("transformations", "x_translation", "y_translation", "z_translation")),
+)

@@ -10,10 +10,10 @@ from phyradgs_cl.acquisition import ConeGeometry, ParallelGeometry, Shutter
 from phyradgs_cl.acquisition.geometry import Geometry
 from phyradgs_cl.acquisition.shutter import AXES
 from phyradgs_cl.errors import InputError
+from phyradgs_cl.io import scan as schema
 from phyradgs_cl.io.hdf5 import datasets as h5
 from phyradgs_cl.io.hdf5.datasets import LENGTH, TIME
 from phyradgs_cl.io.hdf5.source import Hdf5Source
-from phyradgs_cl.io.scan import schema
 
 _log = logging.getLogger(__name__)
 

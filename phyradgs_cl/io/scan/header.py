@@ -12,10 +12,11 @@ from phyradgs_cl.acquisition.geometry import Geometry, default_grid
 from phyradgs_cl.acquisition.scan import DETECTOR_MODELS, LARGEST_LAG
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
+from phyradgs_cl.io import scan as schema
 from phyradgs_cl.io.deformation import check_truth
 from phyradgs_cl.io.hdf5.datasets import read_attribute, read_grid, read_number, read_title, read_word
 from phyradgs_cl.io.hdf5.source import Hdf5Source
-from phyradgs_cl.io.scan import detector, schema
+from phyradgs_cl.io.scan import detector
 from phyradgs_cl.io.scan.motion import has_motion, read_gating, read_trajectory
 from phyradgs_cl.io.tables import read_facts
 

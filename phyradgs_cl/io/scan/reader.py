@@ -12,11 +12,11 @@ from phyradgs_cl.acquisition.plausible import blur_facts
 from phyradgs_cl.acquisition.scan import APPLIED, applied_facts
 from phyradgs_cl.acquisition.slabs import slab
 from phyradgs_cl.errors import InputError
+from phyradgs_cl.io import scan as schema
 from phyradgs_cl.io.deformation import read_moving_truth, read_reference
 from phyradgs_cl.io.files import sha256_of
 from phyradgs_cl.io.hdf5.datasets import read_values
 from phyradgs_cl.io.hdf5.source import Hdf5Source, open_hdf5
-from phyradgs_cl.io.scan import schema
 from phyradgs_cl.io.scan.header import ScanHeader, read_header
 
 LARGEST_LINE_INTEGRAL = 1e6
