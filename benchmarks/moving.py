@@ -1,8 +1,7 @@
-"""Objects that move during a scan, reconstructed at rest, with the true field, as if they rested, and with a field that
-``moving`` finds.
+"""Objects that move during a scan, reconstructed at rest, with the true field, and with a field that ``moving`` finds.
 
     python benchmarks/moving.py VOLUMES RESULTS.jsonl [--names a,b] [--views 75,150] [--method fista] [--size 64]
-        [--cases rest,known,ignored,unknown,still] [--motion breathing]
+        [--cases rest,known,unknown,still] [--motion breathing]
     python benchmarks/moving.py --insert VOLUMES RESULTS.jsonl [--size 64]: how far off the centre of a ball in a body is
 
 Volumes and scanner as benchmarks/scans.py has them: TIGRE's noise at 1e4 photons, a gantry that turns without stopping,
@@ -35,7 +34,7 @@ from phyradgs_cl.simulation.object_motion import ObjectMotion as PresetMotion
 from phyradgs_cl.workflow.volumes import compared_states
 
 TURN_S = 60.0
-CASES = ("rest", "known", "ignored", "unknown", "still")
+CASES = ("rest", "known", "unknown", "still")
 
 
 def moving_scan(
