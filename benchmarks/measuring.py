@@ -25,7 +25,7 @@ Facts = dict[str, object]
 
 
 def parser_of(text: str) -> argparse.ArgumentParser:
-    """A parser with what every benchmark takes: --quick, --device, --json."""
+    """Returns a parser with the options of every benchmark: --quick, --device, --json."""
     parser = argparse.ArgumentParser(description=text, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true", help="small and few: to see that it runs, no figures")
     parser.add_argument("--device", default=None, help="as for phyradgs")
@@ -84,6 +84,6 @@ def median(values: Sequence[float]) -> float:
 
 
 def child(script: str, *words: str) -> Facts:
-    """Runs a script in a process of its own; what it prints last is JSON. Its errors are shown as they are."""
+    """Runs a script in a new process and returns its last line of output, which is JSON. Its errors are not caught."""
     done = subprocess.run([sys.executable, script, *words], stdout=subprocess.PIPE, text=True, check=True)
     return json.loads(done.stdout.strip().splitlines()[-1])

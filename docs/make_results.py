@@ -323,7 +323,7 @@ def whole_runs() -> str:
 
 
 def estimates() -> str:
-    """Time and memory that ``estimate`` said, over those that the run then took."""
+    """Time and memory by ``estimate``, divided by those of the run."""
     text = []
     for run in json.loads((RESULTS / "estimates.json").read_text())["runs"]:
         ratio = run["ratio"]
@@ -333,7 +333,7 @@ def estimates() -> str:
 
 
 def prepared() -> str:
-    """What the steps of ``prepare`` give back, by effect and size: decibels lost, and the part of them that returns.
+    """Decibels that an effect costs, and the percentage of them that ``prepare`` regains, by effect and size.
 
     Both from the least to the most of all volumes."""
     cells: dict[tuple[str, int], dict[str, list[dict[str, Any]]]] = {}
