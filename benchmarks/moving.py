@@ -140,8 +140,8 @@ def run_still(rt: Runtime, scan: Scan, method: str) -> dict[str, object]:
 
 
 def means_over_states(result: Reconstruction, scan: Scan) -> dict[str, object]:
-    field = result.deformation
-    states = compared_states(Volume(result.volume, result.grid), field, scan.moving_truth, scan.grid)
+    volume = Volume(result.volume, result.grid, deformation=result.deformation, states=result.states)
+    states = compared_states(volume, scan.moving_truth, scan.grid)
     return {key: value for key, value in states.items() if key.startswith(("mean_", "p95_"))}
 
 

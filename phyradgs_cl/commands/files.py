@@ -15,7 +15,7 @@ from phyradgs_cl.exporters import (
     format_of,
     state_times_s,
 )
-from phyradgs_cl.io import holds_deformation, read_deformation
+from phyradgs_cl.io import holds_deformation, read_deformation, read_states
 from phyradgs_cl.signals import finish_despite_interrupt
 from phyradgs_cl.workflow.files import expecting, summary
 
@@ -65,7 +65,7 @@ def export_command(
     during: Annotated[
         Any,
         option(
-            _DURING, "the deformation's", parser=pair_of("--during", "START,STOP in s", "8,12"), metavar="START,STOP"
+            _DURING, "the motion's", parser=pair_of("--during", "START,STOP in s", "8,12"), metavar="START,STOP"
         ),
     ] = None,
     patient: Annotated[str | None, option("The patient's name and ID, as Family^Given.", metavar="NAME")] = None,
@@ -77,14 +77,15 @@ def export_command(
     form, labels = to or format_of(output), DicomLabels(patient, title, description, date)
     moves = object_motion is not None or states is not None or during is not None
     with finish_despite_interrupt(), expecting(volume, "volume"):
-        if object_motion is None and moves and not holds_deformation(volume):
-            expected = "--object-motion FILE with it, or a volume of --method moving"
-            raise InputError("--during" if states is None else "--states", "no motion", expected)
         if not moves:
             written: object = export_volume(volume, form, output, mu_water_per_mm, labels)
         else:
-            field = read_deformation(object_motion or volume)
-            times_s = state_times_s(field, 10 if states is None else states, during)
+            has_field = object_motion is not None or holds_deformation(volume)
+            field = read_deformation(object_motion or volume) if has_field else None
+            if (motion := field or read_states(volume)) is None:
+                expected = "--object-motion FILE with it, or a volume of --method moving or changing"
+                raise InputError("--during" if states is None else "--states", "no motion", expected)
+            times_s = state_times_s(motion, 10 if states is None else states, during)
             paths = export_states(volume, field, times_s, form, output, mu_water_per_mm, labels)
             written = paths[0] if len(paths) == 1 else f"{paths[0]} … {paths[-1]}"
     unit = "" if form in CLOUDS else ", HU" if mu_water_per_mm is not None else ", 1/mm"

@@ -10,7 +10,7 @@ from phyradgs_cl import checks
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.exporters import writers
 from phyradgs_cl.exporters.dicom import DicomLabels, write_dicom
-from phyradgs_cl.fields import Deformation, deformed
+from phyradgs_cl.fields import Deformation, States
 from phyradgs_cl.io import Volume, read_volume, refuse_overwriting
 
 __all__ = [
@@ -67,38 +67,38 @@ def _in_unit(values: np.ndarray, mu_water_per_mm: float | None) -> tuple[np.ndar
     return (plain, "1/mm") if mu_water_per_mm is None else (writers.hounsfield(plain, mu_water_per_mm), "HU")
 
 
-def state_times_s(deformation: Deformation, count: int, during_s: tuple[float, float] | None = None) -> list[float]:
-    """Returns the middles (count,) in s of equal parts of a time, by default that of the deformation. InputError: a count
-    that is not from 1 to 1000, a time that ends before it begins, or lies beside the deformation's."""
+def state_times_s(moves: Deformation | States, count: int, during_s: tuple[float, float] | None = None) -> list[float]:
+    """Returns the middles (count,) in s of equal parts of a time, by default that of the motion. InputError: a count that is
+    not from 1 to 1000, a time that ends before it begins, or lies beside the motion's."""
     checks.whole("--states", count, 1, 1000)
-    first_s, last_s = during_s or (deformation.times_s[0], deformation.times_s[-1])
+    first_s, last_s = during_s or (moves.times_s[0], moves.times_s[-1])
     if during_s is not None and not first_s < last_s:
         raise InputError("--during", f"{first_s:g},{last_s:g}", "a start before the stop")
-    begin_s, end_s = float(deformation.times_s[0]), float(deformation.times_s[-1])
+    begin_s, end_s = float(moves.times_s[0]), float(moves.times_s[-1])
     if begin_s < end_s and (last_s <= begin_s or first_s >= end_s):
-        raise InputError("--during", f"{first_s:g},{last_s:g} s", f"a part of the deformation's {begin_s:g} to {end_s:g} s")
+        raise InputError("--during", f"{first_s:g},{last_s:g} s", f"a part of the motion's {begin_s:g} to {end_s:g} s")
     return (first_s + (np.arange(count) + 0.5) / count * (last_s - first_s)).tolist()
 
 
 def export_states(
-    path: str | Path, deformation: Deformation, times_s: Sequence[float], to: str, output: str | Path | None = None,
-    mu_water_per_mm: float | None = None, labels: DicomLabels | None = None,
+    path: str | Path, deformation: Deformation | None, times_s: Sequence[float], to: str,
+    output: str | Path | None = None, mu_water_per_mm: float | None = None, labels: DicomLabels | None = None,
 ) -> list[Path]:  # fmt: skip
-    """Writes a volume file as it is at each of evenly spaced times, and returns the paths. NIfTI holds all states in one
-    file of four dimensions. The other formats get a file, or a folder, for each state: NAME_01.SUFFIX and so on. Arguments
-    and errors are those of ``export_volume``; InputError also for a format of Gaussians."""
+    """Writes a volume file as it is at each of evenly spaced times, and returns the paths. ``deformation``: how the object
+    moves; None where the file holds its states. NIfTI holds all states in one file of four dimensions. The other formats get
+    a file, or a folder, for each state: NAME_01.SUFFIX and so on. Other arguments and errors are those of
+    ``export_volume``; InputError also for a format of Gaussians."""
     if to in CLOUDS:
         raise InputError("--states", f"with --to {to}", "a format of voxels", "use nii, mha, nrrd, tiff, npy or dicom")
     target, volume = _checked_target(Path(path), to, output, mu_water_per_mm, labels), read_volume(path)
     grid = volume.required_grid
-    moves = any(deformation.on_grid_mm(grid, unit).any() for unit in np.eye(deformation.rank))
-    if deformation.control_mm.any() and not moves:
-        found = "a deformation that moves nothing in the volume's grid"
-        raise InputError("--object-motion", found, "one of this volume", "check origin and unit of its control points")
-    states = [
-        replace(volume, values=deformed(volume.values, grid, deformation, weights))
-        for weights in deformation.weights_at(times_s)
-    ]
+    if deformation is not None:
+        moves = any(deformation.on_grid_mm(grid, unit).any() for unit in np.eye(deformation.rank))
+        if deformation.control_mm.any() and not moves:
+            found = "a deformation that moves nothing in the volume's grid"
+            raise InputError("--object-motion", found, "one of this volume", "check origin and unit of its control points")
+        volume = replace(volume, deformation=deformation, states=None)
+    states = [replace(volume, values=volume.at(time_s)) for time_s in times_s]
     if to == "nii":
         values = [_in_unit(state.values, mu_water_per_mm) for state in states]
         stack = [replace(volume, values=value) for value, _ in values]

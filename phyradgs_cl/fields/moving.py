@@ -1,4 +1,4 @@
-"""An object that moves: its true volume at some times, a gating signal, its volume in any state."""
+"""An object that moves or changes: its volumes at some times, a gating signal, its volume in any state."""
 
 import os
 from collections.abc import Sequence
@@ -19,19 +19,36 @@ _BORDER = 8  # voxels of zeros around a volume: a spline's coefficients fall to 
 
 
 @dataclass(frozen=True, eq=False)
-class MovingTruth:
-    """True volumes of a simulated object. times_s: (K,) in s on the clock of the scan's frames. volumes: (K, nz, ny, nx)
-    float32 in 1/mm at these times, on the scan's grid. deformation: how the scan's reference became them; None where no
-    field describes it. Raises InputError for shapes that do not fit, and values that are not finite."""
+class States:
+    """Volumes of an object at some times. times_s: (K,) in s, rising, on the clock of the scan's frames. volumes:
+    (K, nz, ny, nx) float32 in 1/mm at these times, on the scan's grid. Raises InputError for shapes that do not fit, no
+    state at all, and values that are not finite."""
 
     times_s: np.ndarray
     volumes: np.ndarray
-    deformation: Deformation | None = None
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "times_s", checks.numbers("times of states", self.times_s, (None,)))
+        times_s = checks.numbers("times of states", self.times_s, (None,))
+        if len(times_s) == 0:
+            raise InputError("times of states", "no time", "at least one state")
+        object.__setattr__(self, "times_s", times_s)
         checks.shape("states", self.volumes, (len(self.times_s), None, None, None))
         checks.finite("states", self.volumes)
+
+    def at(self, time_s: float) -> np.ndarray:
+        """Returns the volume (nz, ny, nx) float32 at a time, straight between the two nearest states."""
+        place = float(np.interp(time_s, self.times_s, np.arange(len(self.times_s))))
+        first, share = int(place), np.float32(place - int(place))
+        after = self.volumes[min(first + 1, len(self.volumes) - 1)]
+        return np.asarray(self.volumes[first] + share * (after - self.volumes[first]), np.float32)
+
+
+@dataclass(frozen=True, eq=False)
+class MovingTruth(States):
+    """True volumes of a simulated object. deformation: how the scan's reference became them; None where no field describes
+    it."""
+
+    deformation: Deformation | None = None
 
 
 @dataclass(frozen=True, eq=False)

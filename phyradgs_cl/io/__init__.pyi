@@ -24,6 +24,7 @@ from .scanner import with_detector_count as with_detector_count
 from .volume import Volume as Volume
 from .volume import file_kind as file_kind
 from .volume import read_state as read_state
+from .volume import read_states as read_states
 from .volume import read_volume as read_volume
 from .volume import volume_summary as volume_summary
 from .volume import write_volume as write_volume

@@ -13,7 +13,7 @@ import numpy as np
 
 from phyradgs_cl import checks
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.fields import Deformation, Gaussians, Grid, triple
+from phyradgs_cl.fields import Deformation, Gaussians, Grid, States, deformed, triple
 from phyradgs_cl.io.deformation import DEFORMATION, read_deformation_group, write_deformation_group
 from phyradgs_cl.io.files import sha256_of
 from phyradgs_cl.io.hdf5 import datasets as h5
@@ -28,7 +28,7 @@ _DISAGREEMENT_MEANS = (
     "common to both are not in it, and it is no confidence interval"
 )
 _AXES = ("z", "y", "x")
-_GAUSSIANS, _STATE = "/entry/gaussians", "/entry/state"
+_GAUSSIANS, _STATE, _STATES = "/entry/gaussians", "/entry/state", "/entry/states"
 _CLOUD = {"mean": (3,), "scale": (3,), "quaternion": (4,), "density": ()}
 _AXIS_TOLERANCE = 1e-3  # of a voxel, for axes stored in float32
 log = logging.getLogger(__name__)
@@ -39,7 +39,7 @@ class Volume:
     """Values (nz, ny, nx) float32 in 1/mm and their grid; None for a bare array. A volume file also holds ``provenance``
     (types as in ``tables.PROVENANCE``), ``gaussians`` float32 in mm and 1/mm, ``metrics`` by name and ``disagreement``: half
     the RMS difference of two estimates (nz, ny, nx) float32 in 1/mm. deformation: how the object moves whose reference the
-    volume is."""
+    volume is. states: the object at some times, whose mean the volume is."""
 
     values: np.ndarray
     grid: Grid | None
@@ -48,6 +48,15 @@ class Volume:
     metrics: dict[str, object] | None = None
     disagreement: np.ndarray | None = None
     deformation: Deformation | None = None
+    states: States | None = None
+
+    def at(self, time_s: float) -> np.ndarray:
+        """Returns the values (nz, ny, nx) at a time in s; of an object that neither moves nor changes always the same."""
+        if self.states is not None:
+            return self.states.at(time_s)
+        if (field := self.deformation) is None:
+            return self.values
+        return deformed(self.values, self.required_grid, field, field.weights_at(time_s)[0])
 
     @property
     def required_grid(self) -> Grid:
@@ -61,17 +70,18 @@ def write_volume(
     path: str | Path, volume: np.ndarray, grid: Grid, provenance: Mapping[str, object],
     gaussians: Gaussians | None = None, metrics: Mapping[str, object] | None = None,
     state: Mapping[str, np.ndarray] | None = None, disagreement: np.ndarray | None = None,
-    deformation: Deformation | None = None,
+    deformation: Deformation | None = None, states: States | None = None,
 ) -> None:
     """Writes a volume (nz, ny, nx) in 1/mm, whole or not at all. ``provenance`` and ``metrics`` are stored as JSON, plain
     values also as attributes; ``gaussians`` as float32; ``state``: arrays and texts from which an interrupted run resumes;
-    ``disagreement`` (nz, ny, nx) in 1/mm; ``deformation``: how the object moves. InputError: an array that is not
-    finite or does not fit the grid. OutputError: the file cannot be written."""
+    ``disagreement`` (nz, ny, nx) in 1/mm; ``deformation``: how the object moves; ``states``: the object at some
+    times. InputError: an array that is not finite or does not fit the grid. OutputError: the file cannot be written."""
     for name, values in (("volume", volume), ("disagreement", disagreement)):
         if values is not None:
             checks.shape(name, values, grid.shape)
             checks.finite(name, values)
     arrays = [volume, disagreement, *(state or {}).values(), *([] if gaussians is None else vars(gaussians).values())]
+    arrays += [] if states is None else [states.volumes]
     with h5.new_hdf5(path, sum(values.nbytes for values in arrays if values is not None)) as file:
         entry = h5.new_group(file, "entry", "NXentry")
         entry.attrs["default"] = "reconstruction"
@@ -86,6 +96,8 @@ def write_volume(
                 group.create_dataset(name, data=np.asarray(getattr(gaussians, name), np.float32))
         if deformation is not None:
             write_deformation_group(entry, deformation)
+        if states is not None:
+            _write_states(entry, states, grid)
         if state is not None:
             group = h5.new_group(entry, "state", "NXcollection")
             for name, values in state.items():
@@ -110,7 +122,8 @@ def read_volume(path: str | Path) -> Volume:
         provenance, gaussians, metrics = _read_provenance(source), _read_gaussians(source), _read_metrics(source)
         deformation = None if source.find(DEFORMATION) is None else read_deformation_group(source, DEFORMATION)
         disagreement = _read_disagreement(source, grid.shape)
-        return Volume(values, grid, provenance, gaussians, metrics, disagreement, deformation)
+        states = _read_states(source, grid.shape)
+        return Volume(values, grid, provenance, gaussians, metrics, disagreement, deformation, states)
 
 
 def read_state(path: str | Path) -> dict[str, np.ndarray] | None:
@@ -156,8 +169,22 @@ def volume_summary(path: str | Path) -> dict[str, Any]:
             "provenance": _read_provenance(source), "metrics": _read_metrics(source),
             "gaussians": means.shape[0] if means is not None and means.ndim else 0,
             "disagreement": None if source.optional(_DISAGREEMENT) is None else _DISAGREEMENT,
+            **_states_summary(source),
             "sha256": sha256_of(path),
         }
+
+
+def read_states(path: str | Path) -> States | None:
+    """Reads the object at some times from a volume file. None where the file has no states."""
+    with open_hdf5(path) as source:
+        return _read_states(source, _dataset_and_grid(source)[1].shape)
+
+
+def _states_summary(source: Hdf5Source) -> dict[str, object]:
+    if source.optional_group(_STATES) is None:
+        return {}
+    times_s = h5.read_array(source, f"{_STATES}/time_s", (None,), h5.TIME)
+    return {"states": len(times_s), "states_from_s": float(times_s[0]), "states_to_s": float(times_s[-1])}
 
 
 def file_kind(path: str | Path) -> str:
@@ -210,8 +237,22 @@ def _write_data(entry: h5py.Group, volume: np.ndarray, grid: Grid, disagreement:
         group.attrs["auxiliary_signals"] = ["disagreement"]
         beside = group.create_dataset("disagreement", data=np.asarray(disagreement, np.float32))
         beside.attrs.update(units="1/mm", long_name="disagreement (1/mm)", description=_DISAGREEMENT_MEANS)
+    _write_axes(group, grid)
+
+
+def _write_axes(group: h5py.Group, grid: Grid) -> None:
     for name, centres_mm in zip(_AXES, grid.axes_mm(), strict=True):
         h5.write_number(group, name, centres_mm, "mm", long_name=f"{name} (mm)")
+
+
+def _write_states(entry: h5py.Group, states: States, grid: Grid) -> None:
+    group = h5.new_group(entry, "states", "NXdata")
+    group.attrs["signal"], group.attrs["axes"] = "volume", ["time_s", *_AXES]
+    group["title"] = "attenuation (1/mm) at some times"
+    dataset = group.create_dataset("volume", data=np.asarray(states.volumes, np.float32), chunks=(1, *grid.shape))
+    dataset.attrs.update(units="1/mm", long_name="attenuation (1/mm)", interpretation="image")
+    h5.write_number(group, "time_s", states.times_s, "s", long_name="time (s)")
+    _write_axes(group, grid)
 
 
 def _write_facts(entry: h5py.Group, name: str, facts: Mapping[str, object]) -> None:
@@ -262,6 +303,15 @@ def _read_disagreement(source: Hdf5Source, shape: tuple[int, ...]) -> np.ndarray
         return None
     checks.shape(source.name(_DISAGREEMENT), dataset, shape)
     return _read_attenuation(source, _DISAGREEMENT, dataset)
+
+
+def _read_states(source: Hdf5Source, shape: tuple[int, ...]) -> States | None:
+    dataset = source.optional(f"{_STATES}/volume")
+    if dataset is None:
+        return None
+    times_s = h5.read_array(source, f"{_STATES}/time_s", (None,), h5.TIME)
+    checks.shape(source.name(f"{_STATES}/volume"), dataset, (len(times_s), *shape))
+    return States(times_s, _read_attenuation(source, f"{_STATES}/volume", dataset))
 
 
 def _read_attenuation(source: Hdf5Source, address: str, dataset: h5py.Dataset) -> np.ndarray:

@@ -1,12 +1,14 @@
 """Two ways to lower the isotropic total variation of a volume: a proximal map, and steepest descent.
 
 ``TvProx`` solves argmin_x ½‖x − b‖² + weight · TV(x), with x ≥ 0 if asked, by fast gradient projection on the dual (Beck
-and Teboulle, IEEE Trans. Image Process. 18 (2009) 2419). Axis weights scale the differences where voxels are not cubes.
+and Teboulle, IEEE Trans. Image Process. 18 (2009) 2419). Axis weights scale the differences where voxels are not cubes. Of
+the states of an object that changes, the sum of |differences| between a state and the next one is added.
 
 ``TvDescent`` takes steps of a fixed length, as ASD-POCS does (Sidky and Pan, Phys. Med. Biol. 53 (2008) 4777). Backward
 differences and their floor are those of TIGRE. With a prior image i it descends (1 − share) TV(x) + share TV(x − i) (Chen,
 Tang and Leng, Med. Phys. 35 (2008) 660)."""
 
+import math
 from collections.abc import Callable
 from functools import partial
 from typing import cast
@@ -18,24 +20,23 @@ from phyradgs_cl.runtime.layout import on_device
 
 
 class TvProx:
-    """The map for volumes of a fixed ``shape`` (z, y, x). The next call starts from the dual of the last one."""
+    """The map for volumes of a fixed ``shape`` (z, y, x), or (K, z, y, x) of K states. The next call starts from the dual of
+    the last one. axis_weights: of the differences along the axes of ``shape``."""
 
     def __init__(
-        self, rt: Runtime, shape: tuple[int, int, int],
-        axis_weights: tuple[float, float, float] = (1.0, 1.0, 1.0),
+        self, rt: Runtime, shape: tuple[int, ...], axis_weights: tuple[float, ...] = (1.0, 1.0, 1.0)
     ) -> None:
         self.rt, self.shape = rt, shape
-        self.axis_weights = axis_weights  # z, y, x
-        nz, ny, nx = shape
-        self._shape4 = np.array([nx, ny, nz, 0], np.int32)
-        self._weights4 = np.array([*axis_weights[::-1], 0], np.float32)
+        self.axis_weights = axis_weights
+        self._shape4 = np.array([*shape[::-1], 1][:4], np.int32)
+        self._weights4 = np.array([*axis_weights[::-1], 0][:4], np.float32)
         self._primal_step, self._dual_step = rt.kernel("tv_prox", "tv_primal"), rt.kernel("tv_prox", "tv_dual")
-        self._dual = rt.zeros((3, *shape))
-        self._moved = rt.zeros((3, *shape))
+        self._dual = rt.zeros((len(shape), *shape))
+        self._moved = rt.zeros((len(shape), *shape))
 
     @property
     def dual(self) -> np.ndarray:
-        """The dual field (3, nz, ny, nx) along x, y, z, of length at most 1."""
+        """The dual field (3, nz, ny, nx) along x, y, z, of length at most 1; (4, K, nz, ny, nx) of states."""
         return self.rt.download(self._dual)
 
     @dual.setter
@@ -78,51 +79,52 @@ class TvProx:
         )  # fmt: skip
 
     def _launch(self, kernel: Kernel, *arguments: object) -> None:
-        nz, ny, nx = self.shape
-        self.rt.launch(kernel, (nx, ny, nz), *arguments, group=self.rt.group(on_cpu=16))
+        *slices, ny, nx = self.shape
+        self.rt.launch(kernel, (nx, ny, math.prod(slices)), *arguments, group=self.rt.group(on_cpu=16))
 
 
 def tv_prox(
     volume: np.ndarray, weight: float, iterations: int, *, nonnegative: bool,
-    axis_weights: tuple[float, float, float] = (1.0, 1.0, 1.0),
+    axis_weights: tuple[float, ...] = (1.0, 1.0, 1.0),
 ) -> np.ndarray:
     """Float64 twin of ``TvProx`` from a dual of zeros."""
     b = np.asarray(volume, np.float64)
-    dual = np.zeros((3, *b.shape))
+    dual = np.zeros((b.ndim, *b.shape))
     moved = dual.copy()
     t = 1.0
     for _ in range(iterations):
         x = _primal_of(b, moved, weight, nonnegative, axis_weights)
         q = moved + differences(x, axis_weights) / (_lipschitz(axis_weights) * weight)
-        new = q / np.maximum(1, np.linalg.norm(q, axis=0))
+        new = q / np.maximum(1, np.linalg.norm(q[-3:], axis=0))
+        new[:-3] = np.clip(q[:-3], -1, 1)  # of time
         t_next = (1 + np.sqrt(1 + 4 * t * t)) / 2
         moved = new + (t - 1) / t_next * (new - dual)
         dual, t = new, t_next
     return _primal_of(b, dual, weight, nonnegative, axis_weights)
 
 
-def differences(volume: np.ndarray, axis_weights: tuple[float, float, float]) -> np.ndarray:
-    """Weighted forward differences (3, z, y, x) along z, y, x; 0 behind the last voxel."""
-    result = np.zeros((3, *volume.shape))
+def differences(volume: np.ndarray, axis_weights: tuple[float, ...]) -> np.ndarray:
+    """Weighted forward differences (3, z, y, x) along z, y, x; 0 behind the last voxel. Of states (K, z, y, x) those in time
+    come first."""
+    result = np.zeros((volume.ndim, *volume.shape))
     for axis, weight in enumerate(axis_weights):
-        inner = tuple(slice(0, -1) if a == axis else slice(None) for a in range(3))
+        inner = tuple(slice(0, -1) if a == axis else slice(None) for a in range(volume.ndim))
         result[axis][inner] = weight * np.diff(volume, axis=axis)
     return result
 
 
 def _primal_of(
-    b: np.ndarray, dual: np.ndarray, weight: float, nonnegative: bool,
-    axis_weights: tuple[float, float, float],
+    b: np.ndarray, dual: np.ndarray, weight: float, nonnegative: bool, axis_weights: tuple[float, ...]
 ) -> np.ndarray:
     adjoint = np.zeros_like(b)
     for axis, axis_weight in enumerate(axis_weights):
-        pad = [(1, 0) if a == axis else (0, 0) for a in range(3)]
+        pad = [(1, 0) if a == axis else (0, 0) for a in range(b.ndim)]
         adjoint -= axis_weight * np.diff(np.pad(dual[axis], pad), axis=axis)
     x = b - weight * adjoint
     return np.maximum(x, 0) if nonnegative else x
 
 
-def _lipschitz(axis_weights: tuple[float, float, float]) -> float:
+def _lipschitz(axis_weights: tuple[float, ...]) -> float:
     return 4 * sum(w * w for w in axis_weights)
 
 

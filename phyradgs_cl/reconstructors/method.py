@@ -35,7 +35,7 @@ class Method:
 
     is_resumable: it has checkpoints. is_shared: several ranks can share its work. takes_initial: it can start from a volume.
     ends_anywhere: its short runs are the beginnings of its long ones. takes_deformation: its object may move.
-    finds_deformation: it finds how the object moves."""
+    finds_motion: it finds how the object moves or changes."""
 
     run: Callable[..., Reconstruction]
     presets: Mapping[str, Any]
@@ -44,7 +44,7 @@ class Method:
     takes_initial: bool = False
     ends_anywhere: bool = False
     takes_deformation: bool = False
-    finds_deformation: bool = False
+    finds_motion: bool = False
 
 
 @dataclass(frozen=True)
@@ -163,6 +163,7 @@ METHODS = _Methods({
     "sax-nerf": "neural:SAX_NERF",
     "fused": "fused",
     "moving": "moving.method",
+    "changing": "changing",
     "fdk": "fdk",
     "fbp": "fdk:FBP_METHOD",
 })

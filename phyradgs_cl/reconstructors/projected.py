@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from phyradgs_cl.acquisition import PerRow, Scan
 from phyradgs_cl.detector import noise_rms
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.fields import Deformation, Grid
+from phyradgs_cl.fields import Deformation, Grid, States
 from phyradgs_cl.operators import IntensityOperator, RayOperator
 from phyradgs_cl.operators.warp.operator import projector_of
 from phyradgs_cl.runtime import Runtime
@@ -57,15 +57,19 @@ def spread_frames(frames: int, count: int) -> list[int]:
 
 
 def frame_pairs(
-    rt: Runtime, scan: Scan, volume: np.ndarray, grid: Grid, frames: Sequence[int], deformation: Deformation | None = None
+    rt: Runtime, scan: Scan, volume: np.ndarray, grid: Grid, frames: Sequence[int],
+    moves: Deformation | States | None = None,
 ) -> list[FramePair]:
     """Returns some frames of a scan with those of a volume (nz, ny, nx) in 1/mm, under the scan's true motion and that of
-    the object.
+    the object. Its states take the place of the volume.
 
     For a detector that averages intensity the computed frames do so too."""
     motion = PerRow(sub_intervals=TIMES_PER_LINE)
     tables = [motion.cells(scan, frame) for frame in frames]
-    projector = projector_of(rt, grid, tables, deformation)
+    if isinstance(moves, States):
+        volume, projector = moves.volumes, projector_of(rt, grid, tables, None, moves.times_s)
+    else:
+        projector = projector_of(rt, grid, tables, moves)
     operator = projector(rt, grid, scan.geometry.detector_shape, tables)
     if scan.detector_model != "intensity":
         computed = operator.forward(volume)
@@ -91,7 +95,8 @@ def held_out(scan: Scan, percent: float, seed: int = _HOLDOUT_SEED, subject: str
 
 
 def holdout_errors(
-    rt: Runtime, scan: Scan, held: np.ndarray, volume: np.ndarray, grid: Grid, deformation: Deformation | None = None
+    rt: Runtime, scan: Scan, held: np.ndarray, volume: np.ndarray, grid: Grid,
+    moves: Deformation | States | None = None,
 ) -> dict[str, float]:
     """Returns the RMS residual of a volume (nz, ny, nx) in 1/mm at held-out pixels (F, v, u), the part of it that is their
     own noise, and their number.
@@ -100,7 +105,7 @@ def holdout_errors(
     squares = 0.0
     for first in range(0, scan.frames, _HOLDOUT_FRAMES):
         frames = range(first, min(first + _HOLDOUT_FRAMES, scan.frames))
-        for pair in frame_pairs(rt, scan, volume, grid, frames, deformation):
+        for pair in frame_pairs(rt, scan, volume, grid, frames, moves):
             squares += float(np.sum(np.square(pair.residual[held[pair.frame]], dtype=np.float64)))
     count = int(held.sum())
     noise = noise_rms(scan.projections, held, scan.valid)

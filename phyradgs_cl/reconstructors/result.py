@@ -10,7 +10,7 @@ import numpy as np
 from phyradgs_cl import checks
 from phyradgs_cl.acquisition.motion import motion_facts
 from phyradgs_cl.errors import InputError, naming_arguments
-from phyradgs_cl.fields import Deformation, Gaussians, Grid
+from phyradgs_cl.fields import Deformation, Gaussians, Grid, States
 from phyradgs_cl.reconstructors.checkpoint import State
 
 if TYPE_CHECKING:
@@ -39,8 +39,8 @@ class Reconstruction:
     gaussians: the cloud in mm, for methods that have one; record: the convergence record, one dict per report;
     facts: what is needed to make it again (method, options, scales, seconds); state: how to go on, where a run
     was interrupted; disagreement: how far two estimates are from each other near every voxel, (nz, ny, nx) float32 in 1/mm,
-    of ``fused``; deformation: how the object moves, of ``moving``, whose volume is its reference. Raises InputError for
-    arrays that are not the grid's."""
+    of ``fused``; deformation: how the object moves, of ``moving``, whose volume is its reference; states: the object at some
+    times, of ``changing``, whose volume is their mean. Raises InputError for arrays that are not the grid's."""
 
     volume: np.ndarray
     grid: Grid
@@ -50,11 +50,14 @@ class Reconstruction:
     state: State | None = None
     disagreement: np.ndarray | None = None
     deformation: Deformation | None = None
+    states: States | None = None
 
     def __post_init__(self) -> None:
         if not isinstance(self.grid, Grid):
             raise InputError("grid", checks.short_repr(self.grid), "a Grid")
         checks.shape("volume", self.volume, self.grid.shape)
+        if self.states is not None:
+            checks.shape("states", self.states.volumes, (None, *self.grid.shape))
         if self.disagreement is not None:
             checks.shape("disagreement", self.disagreement, self.grid.shape)
 
@@ -64,6 +67,11 @@ class Reconstruction:
         at = self.facts.get("interrupted_at")
         way = f", interrupted at iteration {at}" if at is not None else self.early_stop
         return f"Reconstruction({self.facts.get('method', 'a volume')}{of}, {voxels} voxels in {sides} mm{way})"
+
+    @property
+    def moves(self) -> Deformation | States | None:
+        """How the object moves, or changes, as the method has found it."""
+        return self.deformation if self.states is None else self.states
 
     @property
     def early_stop(self) -> str:
@@ -80,7 +88,8 @@ class Reconstruction:
         if (part := grid.slices_in(self.grid)) is None:
             return self
         disagreement = None if self.disagreement is None else self.disagreement[part].copy()
-        return replace(self, volume=self.volume[part].copy(), grid=grid, disagreement=disagreement)
+        states = self.states and replace(self.states, volumes=self.states.volumes[(slice(None), *part)].copy())
+        return replace(self, volume=self.volume[part].copy(), grid=grid, disagreement=disagreement, states=states)
 
     @naming_arguments()
     def plot(self, scan: "Scan | None" = None, *, frame: int = 0, device: "str | Runtime | None" = None) -> "Figure":
@@ -115,8 +124,8 @@ class Progress:
     loss: the dimensionless measure that ``quantity`` names. gaussians: their number, or 0. state: returns the state from
     which the run can resume. volume: returns the present volume (nz, ny, nx) in 1/mm and its grid. frames: returns so
     many measured frames, spread evenly, with those computed from the present volume. All three may be called during the
-    report only. deformation: how the object moves, where the method has found it. A report that raises
-    KeyboardInterrupt ends the run as Ctrl-C does."""
+    report only. deformation: how the object moves, where the method has found it. states: returns the object at some times,
+    of a method that has them. A report that raises KeyboardInterrupt ends the run as Ctrl-C does."""
 
     iteration: int
     iterations: int
@@ -128,6 +137,7 @@ class Progress:
     volume: "Callable[[], tuple[np.ndarray, Grid]] | None" = None
     frames: "Callable[[int], list[FramePair]] | None" = None
     deformation: Deformation | None = None
+    states: "Callable[[], States] | None" = None
 
     def mapped(
         self, state: "Callable[[State], State] | None" = None, volume: "VolumeMap | None" = None, **changes: Any

@@ -88,7 +88,7 @@ def reconstruct(
         progress = progress.mapped(state=lambda state: with_identity(state, identity()))
         if progress.volume is not None and rt.ranks.size == 1:  # ranks project together
             whole = cache(progress.volume)
-            pairs = partial(_spread_pairs, rt, ready, progress.deformation or deformation, whole)
+            pairs = partial(_spread_pairs, rt, ready, progress, deformation, whole)
             progress = replace(progress, volume=whole, frames=pairs)
         return progress if box is None else progress.mapped(volume=lambda volume, grid: _within(volume, grid, box))
 
@@ -100,8 +100,8 @@ def reconstruct(
     if result.state is not None:
         result = replace(result, state=with_identity(result.state, identity()))
     if hidden is not None and rt.ranks.rank == 0:
-        moving = result.deformation or deformation
-        result.facts[HELD_OUT] = holdout_errors(rt, ready, hidden, result.volume, result.grid, moving)
+        moves = result.moves or deformation
+        result.facts[HELD_OUT] = holdout_errors(rt, ready, hidden, result.volume, result.grid, moves)
     if PREPARED_KEY in ready.provenance:
         result.facts[PREPARED_KEY] = ready.provenance[PREPARED_KEY]
     if box is None:
@@ -111,9 +111,11 @@ def reconstruct(
 
 
 def _spread_pairs(
-    rt: Runtime, scan: Scan, deformation: Deformation | None, volume: Callable[[], tuple[np.ndarray, Grid]], count: int
-) -> list[FramePair]:
-    return frame_pairs(rt, scan, *volume(), spread_frames(scan.frames, count), deformation)
+    rt: Runtime, scan: Scan, progress: Progress, deformation: Deformation | None,
+    volume: Callable[[], tuple[np.ndarray, Grid]], count: int,
+) -> list[FramePair]:  # fmt: skip
+    moves = progress.states() if progress.states is not None else progress.deformation or deformation
+    return frame_pairs(rt, scan, *volume(), spread_frames(scan.frames, count), moves)
 
 
 def check_resumable(plan: RunPlan) -> None:

@@ -119,7 +119,7 @@ def _slabs_of(plan: methods.RunPlan, slabs: Slabs, scan: Path, ranks: Communicat
         return []
     with expecting(scan, "scan"):
         parts = slabs.of(read_scan_header(scan))
-    finds = methods.method_of(plan.method).finds_deformation
+    finds = methods.method_of(plan.method).finds_motion
     if parts and (finds or plan.object_motion is not None):
         expected, remedy = "all rows at a time: matter moves from slab to slab", "leave --rows and --slab out"
         raise InputError(f"--method {plan.method_name}" if finds else "--object-motion", "slabs of rows", expected, remedy)
@@ -170,7 +170,9 @@ def _reconstructed(
                 target = output if result.state is None else partial_path(output)
                 provenance = _provenance(result, scan_hash, plan, path, rt)
                 parts = result.volume, result.grid, provenance, result.gaussians, metrics or None
-                write_volume(target, *parts, disagreement=result.disagreement, deformation=result.deformation)
+                write_volume(
+                    target, *parts, disagreement=result.disagreement, deformation=result.deformation, states=result.states
+                )
                 _keep_checkpoint(output, result)
     except signals.InterruptedAfterwards:
         # After a complete run the signal takes effect; an interrupted run reports it.

@@ -2,6 +2,7 @@
 
 import logging
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +10,7 @@ import numpy as np
 from phyradgs_cl import __version__, checks
 from phyradgs_cl.errors import InputError, OutputError
 from phyradgs_cl.exporters import CLOUDS, export_stored, foreign_suffix, format_of
-from phyradgs_cl.fields import Deformation, Gaussians, Grid, MovingTruth, deformed, triple
+from phyradgs_cl.fields import Gaussians, Grid, MovingTruth, triple
 from phyradgs_cl.fields.gaussians import ROWS
 from phyradgs_cl.fields.grid_choice import voxel_sides_mm
 from phyradgs_cl.importers import load_attenuation
@@ -62,7 +63,8 @@ def run_evaluation(
         raise InputError("--object-motion", "no true states to compare with", expected, "leave it out")
     if reference_of_rtk:
         stored, moving = _with_our_axes(stored), None
-    field = field or result.deformation
+    if field is not None:
+        result = replace(result, deformation=field, states=None)
     volume, grid, provenance = result.values, result.grid, result.provenance
     reference, stored_grid = stored.values, stored.grid
     how, share = f"{VOXEL_BY_VOXEL}, as {plain_text(volume_path.name)} has no scale", 1.0
@@ -75,10 +77,10 @@ def run_evaluation(
     metrics = compare(volume, reference)
     states = {}
     if moving is not None and grid is not None and stored_grid is not None:
-        if field is None and "object_motion" in provenance:
+        if result.deformation is None and "object_motion" in provenance:
             text = "%s was reconstructed with --object-motion %s: add it here, else the volume is compared as if it rested"
             log.warning(text, volume_path, plain_text(str(provenance["object_motion"])))
-        states = compared_states(result, field, moving, stored_grid)
+        states = compared_states(result, moving, stored_grid)
     title = f"{provenance.get('method', 'volume')}: {volume_path.name}"
     with finish_despite_interrupt(), written_beside(picture) as temporary:
         try:
@@ -91,14 +93,13 @@ def run_evaluation(
     return {**metrics, **states, **known, **interruption(provenance), **compared, **files}
 
 
-def compared_states(result: Volume, field: Deformation | None, truth: MovingTruth, truth_grid: Grid) -> dict[str, object]:
-    """Returns PSNR and SSIM of a volume at each true state, and their means. ``field`` deforms the volume to the states'
-    times; without one the volume is taken as it is. Where both deformations are known the error of the motion follows."""
-    grid = result.required_grid
+def compared_states(result: Volume, truth: MovingTruth, truth_grid: Grid) -> dict[str, object]:
+    """Returns PSNR and SSIM of a volume at the time of each true state, and their means. Where both deformations are known
+    the error of the motion follows."""
+    grid, field = result.required_grid, result.deformation
     rows: list[dict[str, float]] = []
     for time_s, state in zip(truth.times_s, truth.volumes, strict=True):
-        values = result.values if field is None else deformed(result.values, grid, field, field.weights_at(time_s)[0])
-        pair = aligned(values, grid, state, truth_grid)
+        pair = aligned(result.at(float(time_s)), grid, state, truth_grid)
         if pair is None or not pair.reference.max() > 0:
             found = "nothing of the object in the part that is compared"
             raise InputError(f"state at {time_s:.4g} s", found, "volumes in one place")

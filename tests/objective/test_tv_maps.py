@@ -26,13 +26,31 @@ def test_proximal_kernel_is_its_twin(any_rt, shape, nonnegative) -> None:
     np.testing.assert_allclose(found, expected, rtol=0, atol=TV_MAP)
 
 
-@pytest.mark.parametrize("axis_weights", [SKEWED, (3.0, 2.0, 1.0)])
+@pytest.mark.parametrize("shape", [(3, 5, 6, 7), (2, 1, 8, 17), (5, 1, 1, 1), (1, 4, 3, 33)])
+@pytest.mark.parametrize("nonnegative", [True, False])
+def test_proximal_kernel_of_states_is_its_twin(any_rt, shape, nonnegative) -> None:
+    volume, weights = random_weights(shape), (2.0, *SKEWED)
+    found = TvProx(any_rt, shape, weights)(volume.astype(np.float32), 0.3, 12, nonnegative=nonnegative)
+    expected = tv_prox(volume, 0.3, 12, nonnegative=nonnegative, axis_weights=weights)
+    np.testing.assert_allclose(found, expected, rtol=0, atol=TV_MAP)
+
+
+def test_one_state_is_a_volume(any_rt) -> None:
+    volume = random_weights((5, 6, 7)).astype(np.float32)
+    alone = TvProx(any_rt, volume.shape, SKEWED)(volume, 0.3, 12, nonnegative=True)
+    state = TvProx(any_rt, (1, *volume.shape), (0.0, *SKEWED))(volume[None], 0.3, 12, nonnegative=True)
+    np.testing.assert_array_equal(state[0], alone)
+
+
+@pytest.mark.parametrize("axis_weights", [SKEWED, (3.0, 2.0, 1.0), (1.5, *SKEWED)])
 def test_the_map_is_the_minimum_of_its_objective(axis_weights) -> None:
-    volume = random_weights((4, 5, 6))
+    volume = random_weights((2, 4, 5, 6) if len(axis_weights) == 4 else (4, 5, 6))
     weight = 0.4
 
     def objective(x: np.ndarray) -> float:
-        return 0.5 * float(((x - volume) ** 2).sum()) + weight * isotropic_tv(x, axis_weights)
+        changes = differences(x, axis_weights)
+        variation = np.linalg.norm(changes[-3:], axis=0).sum() + np.abs(changes[:-3]).sum()
+        return 0.5 * float(((x - volume) ** 2).sum()) + weight * float(variation)
 
     best = tv_prox(volume, weight, 3000, nonnegative=True, axis_weights=axis_weights)
     assert best.min() >= 0

@@ -32,13 +32,13 @@ class IntensityOperator:
         projector: Callable[..., Any] = RayOperator,
     ) -> None:
         ones, weights = layered(tables)
-        self.volume_shape = grid.shape
         self.frames_shape = (len(tables), *detector_shape)
         self._operators: list[Any] = []
         # One memory for all layers, which run one after the other. The operator over all cells needs the largest.
         memory = RayOperator(rt, grid, detector_shape, tables).memory
         for part in ones:
             self._operators.append(projector(rt, grid, detector_shape, part, memory=memory))
+        self.volume_shape: tuple[int, ...] = self._operators[0].volume_shape
         self._by_row = tables[0].axis == "rows"
         self._device = DeviceSpace(rt)
         self._shares: list[Any] = []

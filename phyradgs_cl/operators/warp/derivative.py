@@ -8,6 +8,7 @@ from collections.abc import Callable
 import numpy as np
 
 from phyradgs_cl.operators.warp.operator import WarpedOperator
+from phyradgs_cl.operators.warp.volume import VolumeWarp
 from phyradgs_cl.runtime import DeviceArray
 
 _REACH = 2  # voxels: as far as a sample of cl/warp.cl counts
@@ -19,6 +20,7 @@ class FieldDerivative:
     Coefficients (R, cz, cy, cx, 3) are in mm as those of a ``Deformation``. Holds three volumes per state on the host."""
 
     def __init__(self, operator: WarpedOperator, volume: np.ndarray) -> None:
+        assert isinstance(operator.warp, VolumeWarp)
         self.operator, states = operator, operator.warp.states
         self.weights = states.weights
         self._bases = [matrix.astype(np.float32) for matrix in states.deformation.bases(operator.grid)]

@@ -1,7 +1,7 @@
 """The system matrix of a moving object: A x = Σ_k P_k W_k x over the states k, and its exact transpose.
 
-W_k warps the volume to a state. P_k projects it to the time cells that the state stands for (``states.py``). A cell may also
-be a blend of two states."""
+W_k warps the volume to a state; of an object that changes it takes the state from a stack. P_k projects it to the time cells
+that the state stands for (``states.py``). A cell may also be a blend of two states."""
 
 from collections.abc import Callable, Iterator, Sequence
 from copy import copy
@@ -17,6 +17,7 @@ from phyradgs_cl.fields import Deformation, Grid
 from phyradgs_cl.operators.rays.layout import some_cells
 from phyradgs_cl.operators.rays.memory import RayMemory
 from phyradgs_cl.operators.rays.operator import RayOperator
+from phyradgs_cl.operators.warp.stack import StateStack, TimeStates
 from phyradgs_cl.operators.warp.states import MotionStates
 from phyradgs_cl.operators.warp.volume import VolumeWarp
 from phyradgs_cl.runtime import DeviceArray, Runtime, SameArray
@@ -25,16 +26,18 @@ from phyradgs_cl.runtime import DeviceArray, Runtime, SameArray
 class WarpedOperator:
     """Ray-driven projector of an object that moves as the states of ``warp`` do; a ``LinearOperator``.
 
-    Arguments and arrays are those of ``RayOperator``. The volume must fit on the device as a whole. ``forward`` warps the
-    volume once for each state that the operator's frames use. Operators of one ``warp`` or ``memory`` share buffers: use
-    them one at a time. Raises OutOfMemoryError for a volume in bricks."""
+    Arguments and arrays are those of ``RayOperator``; with a ``StateStack`` volumes are stacks (K, nz, ny, nx). The volume
+    must fit on the device as a whole. ``forward`` warps the volume once for each state that the operator's frames use.
+    Operators of one ``warp`` or ``memory`` share buffers: use them one at a time. Raises OutOfMemoryError for a volume in
+    bricks."""
 
     def __init__(
-        self, rt: Runtime, grid: Grid, detector_shape: tuple[int, int], tables: Sequence[TimeCells], *, warp: VolumeWarp,
-        memory: RayMemory | None = None,
+        self, rt: Runtime, grid: Grid, detector_shape: tuple[int, int], tables: Sequence[TimeCells], *,
+        warp: VolumeWarp | StateStack, memory: RayMemory | None = None,
     ) -> None:  # fmt: skip
         self.rt, self.grid, self.warp = rt, grid, warp
-        self.volume_shape, self.detector_shape = grid.shape, detector_shape
+        self.volume_shape: tuple[int, ...] = warp.shape
+        self.detector_shape = detector_shape
         self.memory = memory or RayOperator(rt, grid, detector_shape, tables).memory
         self._parts = [
             _Part(rt, state, frames, RayOperator(rt, grid, detector_shape, shared, memory=self.memory))
@@ -131,12 +134,16 @@ class _Part:
 
 
 def projector_of(
-    rt: Runtime, grid: Grid, tables: Sequence[TimeCells], deformation: Deformation | None
+    rt: Runtime, grid: Grid, tables: Sequence[TimeCells], deformation: Deformation | None,
+    state_times_s: np.ndarray | None = None,
 ) -> Callable[..., RayOperator | WarpedOperator]:
-    """Returns what makes the projector of an object that moves as ``deformation`` does at the times of ``tables``.
+    """Returns what makes the projector of an object that moves as ``deformation`` does at the times of ``tables``, or that
+    changes between states at ``state_times_s`` (K,).
 
     The nearest state stands for a cell: a blend of two would blur, and project every cell twice. The result takes the
     arguments of ``RayOperator``, which it is for an object at rest."""
+    if state_times_s is not None:
+        return partial(WarpedOperator, warp=StateStack(rt, grid.shape, TimeStates(state_times_s)))
     if deformation is None:
         return RayOperator
     times_s = np.concatenate([table.time_s for table in tables])
@@ -145,7 +152,7 @@ def projector_of(
 
 
 def _tables_by_state(
-    tables: Sequence[TimeCells], warp: VolumeWarp
+    tables: Sequence[TimeCells], warp: VolumeWarp | StateStack
 ) -> list[tuple[np.ndarray, list[TimeCells]]]:
     """Returns for each state the frames that use it, and their tables of cells with its share of their weights."""
     ends = np.cumsum([table.count for table in tables])[:-1]

@@ -15,6 +15,7 @@ from phyradgs_cl.acquisition.time_cells import TimeCells
 from phyradgs_cl.fields import Deformation, control_points
 from phyradgs_cl.operators.warp.derivative import FieldDerivative
 from phyradgs_cl.operators.warp.operator import WarpedOperator
+from phyradgs_cl.operators.warp.stack import StateStack
 from phyradgs_cl.operators.warp.states import MotionStates
 from phyradgs_cl.operators.warp.volume import VolumeWarp
 from phyradgs_cl.reconstructors.moving.signal import Bending, TemporalSplines
@@ -96,7 +97,7 @@ class FieldProblem:
         return self._masked(self.scan.projections)
 
     def operator(
-        self, one: MotionField, tables: list[TimeCells] | None = None, warp: VolumeWarp | None = None
+        self, one: MotionField, tables: list[TimeCells] | None = None, warp: VolumeWarp | StateStack | None = None
     ) -> WarpedOperator:
         """Returns the projector of a field; of other ``tables`` of the same times with its ``warp``."""
         if warp is None:

@@ -116,7 +116,7 @@ def moving(scan: Scan, options: MovingOptions, rt: Runtime, **arguments: Any) ->
     return replace(result, state=state, deformation=one.deformation)
 
 
-METHOD = Method(moving, {"default": MovingOptions()}, finds_deformation=True)
+METHOD = Method(moving, {"default": MovingOptions()}, finds_motion=True)
 
 
 def _signal_of(scan: Scan, gating: str) -> MotionSignal:

@@ -16,7 +16,7 @@ import numpy as np
 from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.checks import ceil_div
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.fields import Deformation, Grid
+from phyradgs_cl.fields import Deformation, Grid, States
 from phyradgs_cl.prepare.step import with_masked
 from phyradgs_cl.reconstructors.checkpoint import State
 from phyradgs_cl.reconstructors.projected import held_out, holdout_errors
@@ -159,7 +159,7 @@ class _Trials:
             if result.facts.get("interrupted_at") is not None:
                 raise KeyboardInterrupt
             if self.rt.ranks.rank == 0:
-                self._measure(value, result.volume, result.grid, result.deformation)
+                self._measure(value, result.volume, result.grid, result.moves)
             self.errors, self.noise_rms = self.rt.ranks.bcast((self.errors, self.noise_rms))
 
     def _run(self, options: Any, measure: ProgressReport = ignore_progress) -> Reconstruction:
@@ -173,9 +173,9 @@ class _Trials:
         with self.report.through(hook):
             return self.run(self.visible, options, report=self.report, **self.extra)
 
-    def _measure(self, value: float, volume: np.ndarray, grid: Grid, deformation: Deformation | None) -> None:
-        """Adds the error of a volume whose object moves by a field that the run found, or that it was given."""
-        moves = deformation or self.extra.get("deformation")
+    def _measure(self, value: float, volume: np.ndarray, grid: Grid, found: Deformation | States | None) -> None:
+        """Adds the error of a volume whose object moves as the run found, or by a field that it was given."""
+        moves = found or self.extra.get("deformation")
         errors = holdout_errors(self.rt, self.scan, self.held, volume, grid, moves)
         self.errors[value], self.noise_rms = errors["holdout_rms"], errors["holdout_noise_rms"]
 

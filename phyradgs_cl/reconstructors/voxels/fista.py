@@ -117,10 +117,12 @@ class Accelerated(Algorithm):
 class Fista(Accelerated):
     """The residual of a pass is that of all subsets, each at the extrapolated point of its step."""
 
-    def __init__(self, system: System, options: FistaOptions, prior: Prior, weight: PriorWeight) -> None:
+    def __init__(
+        self, system: System, prior: Prior, weight: PriorWeight, *, subsets: int, nonnegative: bool
+    ) -> None:
         super().__init__(system, prior)
-        self.nonnegative, self.weight = options.nonnegative, weight
-        self.subsets = OrderedSubsets(system, options.subsets)
+        self.nonnegative, self.weight = nonnegative, weight
+        self.subsets = OrderedSubsets(system, subsets)
 
     def step(self) -> float:
         weight = self.weight.at(self.volume)
@@ -193,7 +195,8 @@ def _run(inputs: MethodInputs, options: FistaOptions, image: np.ndarray | None, 
         )
         prior = priors.prior_of(options.prior, prior_inputs)
         with rt.ledger.reserved(_COPIES * volume_bytes if is_short else 0):
-            return Fista(system, options, prior, PriorWeight(system, error, options.prior_weight))
+            weight = PriorWeight(system, error, options.prior_weight)
+            return Fista(system, prior, weight, subsets=options.subsets, nonnegative=options.nonnegative)
 
     stage_inputs = replace(inputs, scan=scan, options=options, initial=initial)
     volumes = _VOLUMES + priors.volumes_of(options.prior)

@@ -93,8 +93,8 @@ class Algorithm:
 
 @dataclass(frozen=True, eq=False)
 class MethodInputs:
-    """The arguments of one run: scan, options, device, seed, report, the state to resume from, the first volume in 1/mm, and
-    how the object moves."""
+    """The arguments of one run: scan, options, device, seed, report, the state to resume from, the first volume in 1/mm, how
+    the object moves, and the times in s of its states if it changes."""
 
     scan: Scan
     options: Any
@@ -104,6 +104,7 @@ class MethodInputs:
     resume: State | None = None
     initial: np.ndarray | None = None
     deformation: Deformation | None = None
+    state_times_s: np.ndarray | None = None
 
 
 def run_iterations(
@@ -116,7 +117,10 @@ def run_iterations(
     ‖x − x'‖/‖x‖, and the seconds since the start."""
     started = time.perf_counter()
     scan, options, rt = inputs.scan, inputs.options, inputs.rt
-    system = System.of_scan(rt, scan, options.motion, options.detector_model, deformation=inputs.deformation)
+    system = System.of_scan(
+        rt, scan, options.motion, options.detector_model, deformation=inputs.deformation,
+        state_times_s=inputs.state_times_s,
+    )  # fmt: skip
     if options.transmission_weights:
         system = system.transmission_weighted()
     system = system.resident(rt, volumes + 2, frames + _SYSTEM_FRAMES)
@@ -192,4 +196,6 @@ class _Iterations:
         self.algorithm.restore(state)
 
     def present_volume(self) -> tuple[np.ndarray, Grid]:
-        return self.algorithm.system.space.numpy(self.algorithm.volume), self.grid
+        """Returns the volume, or the mean of the states."""
+        values = self.algorithm.system.space.numpy(self.algorithm.volume)
+        return values if values.ndim == 3 else values.mean(0), self.grid

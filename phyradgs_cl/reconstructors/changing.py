@@ -1,0 +1,77 @@
+"""``changing``: an object that changes during the scan, as a stack of states: min ½‖p − A x‖² + R(x), x ≥ 0.
+
+A projects each state to the lines of its own time. R is the total variation of every state, and of every voxel in time. Most
+voxels keep their value from one state to the next, so that views of other times help a state where the object rests. The
+steps are those of ``fista``. Total variation in space and time: L. Ritschl et al., Iterative 4D cardiac micro-CT image
+reconstruction using an adaptive spatio-temporal sparsity prior, Phys. Med. Biol. 57 (2012) 1517."""
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from phyradgs_cl import checks
+from phyradgs_cl.acquisition import Motion, PerRow, Scan
+from phyradgs_cl.fields import States
+from phyradgs_cl.objective import TvProx
+from phyradgs_cl.reconstructors.method import Method
+from phyradgs_cl.reconstructors.result import Reconstruction, Report
+from phyradgs_cl.reconstructors.voxels.fista import Fista
+from phyradgs_cl.reconstructors.voxels.prior_weight import PriorWeight, frame_error
+from phyradgs_cl.reconstructors.voxels.priors import TvPrior, axis_weights
+from phyradgs_cl.reconstructors.voxels.run import IterativeOptions, MethodInputs, run_iterations
+from phyradgs_cl.reconstructors.voxels.system import System
+from phyradgs_cl.runtime import Runtime
+
+_STACKS, _FRAMES = 18, 3  # in memory at one time
+
+
+@dataclass(frozen=True)
+class ChangingOptions(IterativeOptions):
+    """states: of the object, at the middles of equal parts of the scan; at most one for each frame. prior_weight: of total
+    variation in space, relative to the error of the gradient as in ``fista``. time_weight: of a change in time, relative to
+    that of a step between two voxels. subsets and tv_iterations: as in ``fista``."""
+
+    motion: Motion = PerRow()
+    iterations: int = 40
+    states: int = checks.ranged(30, 1, 1000)
+    prior_weight: float = checks.ranged(0.42, 0, 1e6)
+    time_weight: float = checks.ranged(3.0, 0, 1e6)
+    subsets: int = checks.ranged(5, 1, 1_000_000)
+    tv_iterations: int = checks.ranged(8, 1, 10_000)
+
+
+def changing(scan: Scan, options: ChangingOptions, rt: Runtime, **arguments: Any) -> Reconstruction:
+    """Returns the states of the object, and as the volume their mean, in 1/mm. ``arguments``: the other ``MethodInputs``; no
+    seed is used."""
+    inputs = MethodInputs(scan, options, rt, **arguments)
+    times_s = state_times_s(scan, options.states)
+    shape = (len(times_s), *scan.grid.shape)
+    runs: list[Fista] = []
+
+    def states() -> States:
+        return States(times_s, runs[0].system.space.numpy(runs[0].volume))
+
+    def make(system: System) -> Fista:
+        prox = TvProx(rt, shape, (options.time_weight, *axis_weights(scan.grid)))
+        weight = PriorWeight(system, frame_error(scan, options.motion), options.prior_weight)
+        prior, nonnegative = TvPrior(prox, options.tv_iterations), options.nonnegative
+        runs.append(Fista(system, prior, weight, subsets=options.subsets, nonnegative=nonnegative))
+        return runs[0]
+
+    initial = None if inputs.initial is None else np.broadcast_to(inputs.initial, shape)
+    report = Report.of(inputs.report)
+    inputs = replace(inputs, initial=initial, state_times_s=times_s, report=report)
+    with report.through(lambda progress: replace(progress, states=states)):
+        result = run_iterations("changing", make, inputs, volumes=_STACKS, frames=_FRAMES)
+    return replace(result, states=states())
+
+
+def state_times_s(scan: Scan, count: int) -> np.ndarray:
+    """Returns the middles (K,) in s of equal parts of the scan's time, at most one for each frame."""
+    first_s, last_s = float(scan.frame_start_s.min()), float(scan.frame_start_s.max()) + scan.shutter.span_s
+    states = min(count, scan.frames)
+    return first_s + (np.arange(states) + 0.5) / states * (last_s - first_s)
+
+
+METHOD = Method(changing, {"default": ChangingOptions()}, takes_initial=True, finds_motion=True)
