@@ -29,7 +29,7 @@ __kernel void tv_primal(
 
 __kernel void tv_dual(
     __global const float *volume, const int4 shape, const float4 axis_weight,
-    const float step,                 /* one over the Lipschitz constant times the weight */
+    const float step, const float time_step, /* one over the Lipschitz constant times the weight */
     const float momentum,
     __global const float *from,       /* moved; at first the dual itself */
     __global float *dual, __global float *moved)
@@ -57,7 +57,7 @@ __kernel void tv_dual(
     dual[at + 2 * plane] = pz;
     if (shape.w > 1) {
         const float gt = state + 1 < shape.w ? axis_weight.w * (volume[at + volume_size] - here) : 0.0f;
-        const float pt = clamp(from[at + 3 * plane] + step * gt, -1.0f, 1.0f);
+        const float pt = clamp(from[at + 3 * plane] + time_step * gt, -1.0f, 1.0f);
         moved[at + 3 * plane] = pt + momentum * (pt - dual[at + 3 * plane]);
         dual[at + 3 * plane] = pt;
     }

@@ -58,13 +58,13 @@ class TvProx:
         if weight <= 0:
             self._primal(observed, self._dual, 0.0, nonnegative, result)
             return
-        step = np.float32(1 / (_lipschitz(self.axis_weights) * weight))
+        steps = np.float32(np.array(_steps(self.axis_weights)) / weight)
         t, start = 1.0, self._dual
         for _ in range(iterations):
             self._primal(observed, start, weight, nonnegative, result)
             t_next = (1 + np.sqrt(1 + 4 * t * t)) / 2
             self._launch(
-                self._dual_step, result, self._shape4, self._weights4, step, np.float32((t - 1) / t_next),
+                self._dual_step, result, self._shape4, self._weights4, *steps, np.float32((t - 1) / t_next),
                 start, self._dual, self._moved,
             )  # fmt: skip
             t, start = t_next, self._moved
@@ -94,7 +94,9 @@ def tv_prox(
     t = 1.0
     for _ in range(iterations):
         x = _primal_of(b, moved, weight, nonnegative, axis_weights)
-        q = moved + differences(x, axis_weights) / (_lipschitz(axis_weights) * weight)
+        step, time_step = _steps(axis_weights)
+        changes = differences(x, axis_weights) / weight
+        q = moved + np.concatenate([time_step * changes[:-3], step * changes[-3:]])
         new = q / np.maximum(1, np.linalg.norm(q[-3:], axis=0))
         new[:-3] = np.clip(q[:-3], -1, 1)  # of time
         t_next = (1 + np.sqrt(1 + 4 * t * t)) / 2
@@ -124,8 +126,12 @@ def _primal_of(
     return np.maximum(x, 0) if nonnegative else x
 
 
-def _lipschitz(axis_weights: tuple[float, ...]) -> float:
-    return 4 * sum(w * w for w in axis_weights)
+def _steps(axis_weights: tuple[float, ...]) -> tuple[float, float]:
+    """Returns the steps of the dual in space and in time: one over the Lipschitz constant of the differences. Of states each
+    of the two steps is half as long as it is alone: no step in space is as short as a large weight in time demands."""
+    *time, z, y, x = axis_weights
+    in_space = 1 / (4 * (z * z + y * y + x * x))
+    return (in_space / 2, 1 / (8 * time[0] ** 2)) if any(time) else (in_space, 0.0)
 
 
 _SMALLEST = 1e-8

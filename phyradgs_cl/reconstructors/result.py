@@ -88,7 +88,8 @@ class Reconstruction:
         if (part := grid.slices_in(self.grid)) is None:
             return self
         disagreement = None if self.disagreement is None else self.disagreement[part].copy()
-        states = self.states and replace(self.states, volumes=self.states.volumes[(slice(None), *part)].copy())
+        of_all = slice(None), *part
+        states = self.states and replace(self.states, volumes=self.states.volumes[of_all].copy())
         return replace(self, volume=self.volume[part].copy(), grid=grid, disagreement=disagreement, states=states)
 
     @naming_arguments()

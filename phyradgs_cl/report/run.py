@@ -171,7 +171,7 @@ def computed_views(run: Run, rt: Runtime, count: int) -> list[FramePair]:
         return []
     scan, volume = prepared(run.scan, run.preprocessing, rt), run.stored
     chosen = spread_frames(scan.frames, count)
-    return frame_pairs(rt, scan, volume.values, volume.required_grid, chosen, run.deformation)
+    return frame_pairs(rt, scan, volume.values, volume.required_grid, chosen, volume.states or run.deformation)
 
 
 def _named_deformation(path: Path, provenance: Mapping[str, object], notes: list[str]) -> Deformation | None:

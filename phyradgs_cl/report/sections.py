@@ -19,6 +19,7 @@ from phyradgs_cl.report.scan_charts import frames_chart, orbit_chart, shutter_ch
 from phyradgs_cl.text import flattened, to_digits_of
 
 _MOST_ROWS = 400  # of a table
+_STATES = 5
 _MOST_CHARTS, _MOST_COMBINATIONS = 6, 20  # of a calibration
 _ABSURD = 1e9  # no parameter of our files is larger
 _DISAGREEMENT = (
@@ -40,6 +41,19 @@ def slices_section(run: Run) -> Markup:
     if not has_depth(stored.values):
         words += "; there is no picture in 3D of a volume one voxel thick"
     return section("slices", "Slices", note(words + "."), viewer(planes, windows), _disagreement(run, planes))
+
+
+def states_section(run: Run) -> Markup | None:
+    """The middle slices of an object that changes, at some of its times."""
+    if (states := run.stored.states) is None:
+        return None
+    high = images.windows_of(run.stored.values, run.reference)["result"].high
+    planes = images.planes_of(run.stored.values, None, run.stored.required_grid, images.windows_of(run.stored.values, None))
+    parts = [note(f"The volume is the mean of {len(states.times_s)} states. Some of them, in middle slices:")]
+    for k in np.unique(np.linspace(0, len(states.times_s) - 1, _STATES).round().astype(int)).tolist():
+        pictures = images.stills_of(planes, states.volumes[k], (0.0, high))
+        parts += [element("h3", f"{number(float(states.times_s[k]))} s"), stills(pictures, f"state {k + 1}", high)]
+    return section("states", "States", *parts)
 
 
 def motion_section(run: Run) -> Markup | None:
