@@ -36,7 +36,7 @@ class ChangingOptions(IterativeOptions):
     iterations: int = 40
     states: int = checks.ranged(30, 1, 1000)
     prior_weight: float = checks.ranged(0.42, 0, 1e6)
-    time_weight: float = checks.ranged(3.0, 0, 1e6)
+    time_weight: float = checks.ranged(10.0, 0, 1e6)
     subsets: int = checks.ranged(5, 1, 1_000_000)
     tv_iterations: int = checks.ranged(8, 1, 10_000)
 

@@ -121,7 +121,7 @@ def _slabs_of(plan: methods.RunPlan, slabs: Slabs, scan: Path, ranks: Communicat
         parts = slabs.of(read_scan_header(scan))
     finds = methods.method_of(plan.method).finds_motion
     if parts and (finds or plan.object_motion is not None):
-        expected, remedy = "all rows at a time: matter moves from slab to slab", "leave --rows and --slab out"
+        expected, remedy = "all rows at a time: the object does not rest", "leave --rows and --slab out"
         raise InputError(f"--method {plan.method_name}" if finds else "--object-motion", "slabs of rows", expected, remedy)
     if parts and ranks is not None and ranks.size > 1:
         raise InputError("--rows", f"slabs on {ranks.size} ranks", "one rank", "run a slab of rows on each machine")

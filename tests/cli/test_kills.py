@@ -18,6 +18,7 @@ TINY = ["--phantom", "jaw", "--size", "12", "--detector", "16", "--views", "4", 
 RUNS = {
     "phyradgs": ["--method", "phyradgs", "--iterations", "400", "--gaussians", "60", "--set", "control.start_iteration=50"],
     "sirt": ["--method", "sirt", "--motion", "per-row", "--iterations", "300"],
+    "changing": ["--method", "changing", "--iterations", "60", "--set", "states=3"],
     "known field": ["--method", "fista", "--iterations", "30", "--set", "subvoxels=1"],
 }
 # STRESS=50 is what `make stress` sets

@@ -1,4 +1,4 @@
-"""A moving object from its simulation to its states: evaluate, export and info with a deformation."""
+"""An object that moves or changes from its simulation to its states: evaluate, export, info and report."""
 
 import json
 from dataclasses import replace
@@ -8,8 +8,10 @@ import numpy as np
 import pytest
 import SimpleITK as sitk
 
+from phyradgs_cl.api import load_volume, save_volume
 from phyradgs_cl.fields import deformed
 from phyradgs_cl.io import read_deformation, read_volume, write_deformation, write_volume
+from phyradgs_cl.metrics import compare
 from phyradgs_cl.workflow import load_scan
 
 MOTION = 'kind = "breathing"\namplitude = 0.3\nperiod_s = 2.0\nstates = 3\n'
@@ -64,6 +66,36 @@ def test_a_volume_with_its_own_deformation_needs_no_other(cli, capsys, folder, t
     line = f"reconstruct {folder}/scan.h5 -o {tmp_path}/cloud.h5 --method phyradgs --iterations 2 --object-motion {own}"
     assert cli.run(line.split()) == 0
     assert read_volume(tmp_path / "cloud.h5").provenance["object_motion"] == str(own)
+
+
+def test_an_object_that_changes_from_the_scan_to_its_states(cli, capsys, folder, tmp_path) -> None:
+    scan, own = folder / "scan.h5", tmp_path / "own.h5"
+    line = f"reconstruct {scan} -o {own} --method changing --set states=3 --iterations 5"
+    assert cli.run(line.split()) == 0
+    assert "\n3 states, from " in capsys.readouterr().out
+    stored = read_volume(own)
+    assert stored.states.volumes.shape == (3, *stored.values.shape)
+    np.testing.assert_array_equal(stored.states.volumes, load_volume(own).states.volumes)
+    facts = facts_of(cli, capsys, f"info {own} --json")
+    assert (facts["states"], facts["states_from_s"]) == (3, stored.states.times_s[0])
+    compared = facts_of(cli, capsys, f"evaluate {own} --reference {scan} --json")["states"]
+    truth = load_scan(scan).moving_truth
+    expected = [compare(stored.at(t), true)["psnr_db"] for t, true in zip(truth.times_s, truth.volumes, strict=True)]
+    np.testing.assert_allclose([state["psnr_db"] for state in compared], expected, rtol=1e-5)
+    assert cli.run(f"export {own} --states 2 -o {tmp_path}/state.npy".split()) == 0
+    first_s, last_s = stored.states.times_s[[0, -1]]
+    at_s = first_s + 0.75 * (last_s - first_s)
+    np.testing.assert_array_equal(np.load(tmp_path / "state_02.npy"), stored.at(at_s))
+    assert cli.run(f"export {own} --states 4 -o {tmp_path}/all.nii.gz".split()) == 0
+    assert sitk.ReadImage(str(tmp_path / "all.nii.gz")).GetSize()[3] == 4
+    assert cli.run(f"report {own} --views 1 -o {tmp_path}/page.html".split()) == 0
+    page = (tmp_path / "page.html").read_text()
+    assert 'id="states"' in page and page.count("slice of the state ") == 9
+    save_volume(tmp_path / "again.h5", load_volume(own))
+    np.testing.assert_array_equal(read_volume(tmp_path / "again.h5").states.volumes, stored.states.volumes)
+    capsys.readouterr()
+    line = f"reconstruct {scan} -o {tmp_path}/no.h5 --method changing --object-motion {folder}/field.h5"
+    assert cli.run(line.split()) == 2 and "--object-motion" in capsys.readouterr().err
 
 
 def test_evaluate_names_the_field_that_a_volume_was_reconstructed_with(cli, caplog, folder, tmp_path) -> None:

@@ -123,8 +123,8 @@ def test_without_a_price_of_change_states_do_not_help_each_other(rt, scan) -> No
 
 
 def test_an_enormous_price_of_change_gives_one_volume(rt, scan) -> None:
-    result = run(rt, scan, states=5, time_weight=100.0, tv_iterations=60)
-    assert np.ptp(result.states.volumes, axis=0).max() < 0.05 * result.volume.max()
+    spreads = [np.ptp(run(rt, scan, states=5, time_weight=w).states.volumes, axis=0).max() for w in (10.0, 1000.0)]
+    assert spreads[1] < 0.1 * spreads[0]
 
 
 def test_resumed_runs_have_the_same_bits(rt, scan) -> None:
@@ -140,10 +140,10 @@ def test_computed_frames_and_held_out_pixels_are_those_of_the_states(rt, scan) -
     hold = Preprocessing(holdout=2.0)
     plan = replace(plan_run("changing", {"states": 10, "iterations": 20}), preprocessing=hold)
     result = reconstruct(scan, plan, rt, report=lambda p: shown.append(p.frames(2)) if p.iteration == 20 else None)
-    assert max(pair.relative for pair in shown[0]) < 0.1
-    assert result.facts["held_out"]["holdout_rms"] < 0.03
+    assert max(pair.rms for pair in shown[0]) < 0.007  # 0.015 of the mean of the states
+    assert result.facts["held_out"]["holdout_rms"] < 0.007
     resting = reconstruct(scan, replace(plan_run("fista", {}), preprocessing=hold), rt)
-    assert resting.facts["held_out"]["holdout_rms"] > 0.03
+    assert resting.facts["held_out"]["holdout_rms"] > 0.01
 
 
 def test_more_states_than_frames(rt) -> None:

@@ -32,6 +32,7 @@ RUNS = [
     ("fista-tv", {"iterations": 1, "motion": "per-row"}),
     ("fista", {"iterations": 1, "motion": "per-row", "prior": "ridge"}),
     ("fista", {"iterations": 4, "motion": "static", "prior": "dct"}),
+    ("changing", {"iterations": 2, "states": 2}),
     ("sirt", {"iterations": 2, "motion": "per-row", "moving": True}),
     ("phyradgs", {**SPLATS, "motion": "exact", "moving": True}),
     ("fdk", {"motion": "static", "moving": True}), ("fdk", {"motion": "per-row", "moving": True}),
