@@ -302,6 +302,9 @@ def _variation(rt: Runtime) -> Iterator[Comparison]:
     yield TvDescent(rt, GRID.shape)(volume, 0.1, 2), tv_descent(volume, 0.1, 2), VALUE
     found = TvProx(rt, GRID.shape)(volume, 0.2, 4, nonnegative=True)
     yield found, tv_prox(volume, 0.2, 4, nonnegative=True), VALUE
+    states, weights = np.stack([volume, volume[::-1]]), (2.0, 1.0, 1.0, 1.0)
+    found = TvProx(rt, states.shape, weights)(states, 0.2, 4, nonnegative=True)
+    yield found, tv_prox(states, 0.2, 4, nonnegative=True, axis_weights=weights), VALUE
     yield DctProx(rt, GRID.shape)(volume, 0.2, 1, nonnegative=True), dct_prox(volume, 0.2, 1, nonnegative=True), VALUE
     curves = Curves(np.array([1.0, 4.0]), np.linspace(-0.5, 1, 2 * FREQUENCY_CLASSES).reshape(-1, 2))
     shrunk = DctProx(rt, GRID.shape, curves)(volume, 0.2, 2, nonnegative=False)

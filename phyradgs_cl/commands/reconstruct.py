@@ -113,7 +113,7 @@ def reconstruct_command(
         say(motion_line(result.facts[MOTION_FOUND]))
     if result.states is not None and result.state is None:
         times_s = result.states.times_s
-        say(f"{len(times_s)} states, from {times_s[0]:.4g} to {times_s[-1]:.4g} s; the volume is their mean")
+        say(f"states of the object: {len(times_s)}, {times_s[0]:.4g} to {times_s[-1]:.4g} s; the volume is their mean")
     if TUNED in result.facts:
         say(tuning_line(result.facts[TUNED]))
     if profile:

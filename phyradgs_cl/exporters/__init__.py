@@ -71,10 +71,10 @@ def state_times_s(moves: Deformation | States, count: int, during_s: tuple[float
     """Returns the middles (count,) in s of equal parts of a time, by default that of the motion. InputError: a count that is
     not from 1 to 1000, a time that ends before it begins, or lies beside the motion's."""
     checks.whole("--states", count, 1, 1000)
-    first_s, last_s = during_s or (moves.times_s[0], moves.times_s[-1])
+    begin_s, end_s = moves.span_s if isinstance(moves, States) else (float(moves.times_s[0]), float(moves.times_s[-1]))
+    first_s, last_s = during_s or (begin_s, end_s)
     if during_s is not None and not first_s < last_s:
         raise InputError("--during", f"{first_s:g},{last_s:g}", "a start before the stop")
-    begin_s, end_s = float(moves.times_s[0]), float(moves.times_s[-1])
     if begin_s < end_s and (last_s <= begin_s or first_s >= end_s):
         raise InputError("--during", f"{first_s:g},{last_s:g} s", f"a part of the motion's {begin_s:g} to {end_s:g} s")
     return (first_s + (np.arange(count) + 0.5) / count * (last_s - first_s)).tolist()
@@ -92,6 +92,9 @@ def export_states(
         raise InputError("--states", f"with --to {to}", "a format of voxels", "use nii, mha, nrrd, tiff, npy or dicom")
     target, volume = _checked_target(Path(path), to, output, mu_water_per_mm, labels), read_volume(path)
     grid = volume.required_grid
+    if deformation is not None and volume.states is not None:
+        expected = "a volume whose object does not change"
+        raise InputError("--object-motion", f"{path}, which holds its states", expected, "leave it out")
     if deformation is not None:
         moves = any(deformation.on_grid_mm(grid, unit).any() for unit in np.eye(deformation.rank))
         if deformation.control_mm.any() and not moves:

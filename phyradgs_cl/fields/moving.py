@@ -21,22 +21,29 @@ _BORDER = 8  # voxels of zeros around a volume: a spline's coefficients fall to 
 @dataclass(frozen=True, eq=False)
 class States:
     """Volumes of an object at some times. times_s: (K,) in s, rising, on the clock of the scan's frames. volumes:
-    (K, nz, ny, nx) float32 in 1/mm at these times, on the scan's grid. Raises InputError for shapes that do not fit, no
-    state at all, and values that are not finite."""
+    (K, nz, ny, nx) float32 in 1/mm at these times, on the scan's grid. Raises InputError for shapes that do not fit, times
+    that do not rise, no state at all, and values that are not finite."""
 
     times_s: np.ndarray
     volumes: np.ndarray
 
     def __post_init__(self) -> None:
         times_s = checks.numbers("times of states", self.times_s, (None,))
-        if len(times_s) == 0:
-            raise InputError("times of states", "no time", "at least one state")
+        if len(times_s) == 0 or (np.diff(times_s) <= 0).any():
+            raise InputError("times of states", checks.short_repr(times_s.tolist()), "at least one time, rising")
         object.__setattr__(self, "times_s", times_s)
         checks.shape("states", self.volumes, (len(self.times_s), None, None, None))
         checks.finite("states", self.volumes)
 
+    @property
+    def span_s(self) -> tuple[float, float]:
+        """The time that the states stand for, in s: half a step before the first one to half a step after the last one."""
+        half_s = (self.times_s[-1] - self.times_s[0]) / max(len(self.times_s) - 1, 1) / 2
+        return float(self.times_s[0] - half_s), float(self.times_s[-1] + half_s)
+
     def at(self, time_s: float) -> np.ndarray:
-        """Returns the volume (nz, ny, nx) float32 at a time, straight between the two nearest states."""
+        """Returns the volume (nz, ny, nx) float32 at a time: straight between two states, the first before, the last after
+        them."""
         place = float(np.interp(time_s, self.times_s, np.arange(len(self.times_s))))
         first, share = int(place), np.float32(place - int(place))
         after = self.volumes[min(first + 1, len(self.volumes) - 1)]

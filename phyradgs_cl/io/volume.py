@@ -169,7 +169,7 @@ def volume_summary(path: str | Path) -> dict[str, Any]:
             "provenance": _read_provenance(source), "metrics": _read_metrics(source),
             "gaussians": means.shape[0] if means is not None and means.ndim else 0,
             "disagreement": None if source.optional(_DISAGREEMENT) is None else _DISAGREEMENT,
-            **_states_summary(source),
+            **_states_summary(source, grid.shape),
             "sha256": sha256_of(path),
         }
 
@@ -180,10 +180,10 @@ def read_states(path: str | Path) -> States | None:
         return _read_states(source, _dataset_and_grid(source)[1].shape)
 
 
-def _states_summary(source: Hdf5Source) -> dict[str, object]:
+def _states_summary(source: Hdf5Source, shape: tuple[int, ...]) -> dict[str, object]:
     if source.optional_group(_STATES) is None:
         return {}
-    times_s = h5.read_array(source, f"{_STATES}/time_s", (None,), h5.TIME)
+    times_s, _ = _states_datasets(source, shape)
     return {"states": len(times_s), "states_from_s": float(times_s[0]), "states_to_s": float(times_s[-1])}
 
 
@@ -306,12 +306,20 @@ def _read_disagreement(source: Hdf5Source, shape: tuple[int, ...]) -> np.ndarray
 
 
 def _read_states(source: Hdf5Source, shape: tuple[int, ...]) -> States | None:
-    dataset = source.optional(f"{_STATES}/volume")
-    if dataset is None:
+    if source.optional_group(_STATES) is None:
         return None
-    times_s = h5.read_array(source, f"{_STATES}/time_s", (None,), h5.TIME)
-    checks.shape(source.name(f"{_STATES}/volume"), dataset, (len(times_s), *shape))
+    times_s, dataset = _states_datasets(source, shape)
     return States(times_s, _read_attenuation(source, f"{_STATES}/volume", dataset))
+
+
+def _states_datasets(source: Hdf5Source, shape: tuple[int, ...]) -> tuple[np.ndarray, h5py.Dataset]:
+    """Returns the times (K,) in s of states, and their dataset. InputError for times that do not rise, and other shapes."""
+    times_s = h5.read_array(source, f"{_STATES}/time_s", (None,), h5.TIME)
+    if len(times_s) == 0 or (np.diff(times_s) <= 0).any():
+        raise source.error(f"{_STATES}/time_s", checks.short_repr(times_s.tolist()), "at least one time, rising")
+    dataset = source.dataset(f"{_STATES}/volume")
+    checks.shape(source.name(f"{_STATES}/volume"), dataset, (len(times_s), *shape))
+    return times_s, dataset
 
 
 def _read_attenuation(source: Hdf5Source, address: str, dataset: h5py.Dataset) -> np.ndarray:

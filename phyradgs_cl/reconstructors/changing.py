@@ -12,6 +12,7 @@ import numpy as np
 
 from phyradgs_cl import checks
 from phyradgs_cl.acquisition import Motion, PerRow, Scan
+from phyradgs_cl.errors import OutOfMemoryError
 from phyradgs_cl.fields import States
 from phyradgs_cl.objective import TvProx
 from phyradgs_cl.reconstructors.method import Method
@@ -28,15 +29,15 @@ _STACKS, _FRAMES = 18, 3  # in memory at one time
 
 @dataclass(frozen=True)
 class ChangingOptions(IterativeOptions):
-    """states: of the object, at the middles of equal parts of the scan; at most one for each frame. prior_weight: of total
-    variation in space, relative to the error of the gradient as in ``fista``. time_weight: of a change in time, relative to
-    that of a step between two voxels. subsets and tv_iterations: as in ``fista``."""
+    """states: of the object, at the middles of equal parts of the scan; fewer where there are fewer frames. prior_weight: of
+    total variation in space, relative to the error of the gradient as in ``fista``. time_weight: of a voxel's change from one
+    state to the next, relative to that of an equal step between two voxels. subsets and tv_iterations: as in ``fista``."""
 
     motion: Motion = PerRow()
     iterations: int = 40
     states: int = checks.ranged(30, 1, 1000)
     prior_weight: float = checks.ranged(0.42, 0, 1e6)
-    time_weight: float = checks.ranged(10.0, 0, 1e6)
+    time_weight: float = checks.ranged(10.0, 0, 1000)
     subsets: int = checks.ranged(5, 1, 1_000_000)
     tv_iterations: int = checks.ranged(8, 1, 10_000)
 
@@ -63,7 +64,11 @@ def changing(scan: Scan, options: ChangingOptions, rt: Runtime, **arguments: Any
     report = Report.of(inputs.report)
     inputs = replace(inputs, initial=initial, state_times_s=times_s, report=report)
     with report.through(lambda progress: replace(progress, states=states)):
-        result = run_iterations("changing", make, inputs, volumes=_STACKS, frames=_FRAMES)
+        try:
+            result = run_iterations("changing", make, inputs, volumes=_STACKS, frames=_FRAMES)
+        except OutOfMemoryError as error:
+            error.remedy = f"take fewer of the {len(times_s)} states with --set states=N, or a smaller --size"
+            raise
     return replace(result, states=states())
 
 

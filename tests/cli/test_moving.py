@@ -4,12 +4,13 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
+import h5py
 import numpy as np
 import pytest
 import SimpleITK as sitk
 
 from phyradgs_cl.api import load_volume, save_volume
-from phyradgs_cl.fields import deformed
+from phyradgs_cl.fields import Grid, States, deformed
 from phyradgs_cl.io import read_deformation, read_volume, write_deformation, write_volume
 from phyradgs_cl.metrics import compare
 from phyradgs_cl.workflow import load_scan
@@ -72,7 +73,7 @@ def test_an_object_that_changes_from_the_scan_to_its_states(cli, capsys, folder,
     scan, own = folder / "scan.h5", tmp_path / "own.h5"
     line = f"reconstruct {scan} -o {own} --method changing --set states=3 --iterations 5"
     assert cli.run(line.split()) == 0
-    assert "\n3 states, from " in capsys.readouterr().out
+    assert "\nstates of the object: 3, " in capsys.readouterr().out
     stored = read_volume(own)
     assert stored.states.volumes.shape == (3, *stored.values.shape)
     np.testing.assert_array_equal(stored.states.volumes, load_volume(own).states.volumes)
@@ -83,9 +84,10 @@ def test_an_object_that_changes_from_the_scan_to_its_states(cli, capsys, folder,
     expected = [compare(stored.at(t), true)["psnr_db"] for t, true in zip(truth.times_s, truth.volumes, strict=True)]
     np.testing.assert_allclose([state["psnr_db"] for state in compared], expected, rtol=1e-5)
     assert cli.run(f"export {own} --states 2 -o {tmp_path}/state.npy".split()) == 0
-    first_s, last_s = stored.states.times_s[[0, -1]]
-    at_s = first_s + 0.75 * (last_s - first_s)
-    np.testing.assert_array_equal(np.load(tmp_path / "state_02.npy"), stored.at(at_s))
+    first_s, last_s = stored.states.span_s
+    np.testing.assert_allclose(np.load(tmp_path / "state_02.npy"), stored.at(first_s + 0.75 * (last_s - first_s)), atol=1e-7)
+    assert cli.run(f"export {own} --states 3 -o {tmp_path}/own.npy".split()) == 0  # the stored ones
+    np.testing.assert_allclose(np.load(tmp_path / "own_03.npy"), stored.states.volumes[2], atol=1e-6)
     assert cli.run(f"export {own} --states 4 -o {tmp_path}/all.nii.gz".split()) == 0
     assert sitk.ReadImage(str(tmp_path / "all.nii.gz")).GetSize()[3] == 4
     assert cli.run(f"report {own} --views 1 -o {tmp_path}/page.html".split()) == 0
@@ -94,8 +96,33 @@ def test_an_object_that_changes_from_the_scan_to_its_states(cli, capsys, folder,
     save_volume(tmp_path / "again.h5", load_volume(own))
     np.testing.assert_array_equal(read_volume(tmp_path / "again.h5").states.volumes, stored.states.volumes)
     capsys.readouterr()
-    line = f"reconstruct {scan} -o {tmp_path}/no.h5 --method changing --object-motion {folder}/field.h5"
-    assert cli.run(line.split()) == 2 and "--object-motion" in capsys.readouterr().err
+    motion = f"--object-motion {folder}/field.h5"
+    for line in (
+        f"reconstruct {scan} -o {tmp_path}/no.h5 --method changing {motion}", f"evaluate {own} --reference {scan} {motion}",
+        f"export {own} -o {tmp_path}/no.nii {motion}",
+    ):
+        assert cli.run(line.split()) == 2 and "--object-motion" in capsys.readouterr().err
+    line = f"reconstruct {scan} -o {tmp_path}/no.h5 --method changing --memory 40KiB"
+    assert cli.run(line.split()) == 6 and "--set states=N" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("name", "values"),
+    [("time_s", [3.0, 2.0]), ("time_s", None), ("volume", None), ("volume", np.zeros((3, 4, 4, 4)))],
+)
+def test_damaged_states_are_refused(cli, capsys, tmp_path, name, values) -> None:
+    path, volumes = tmp_path / "states.h5", np.ones((2, 4, 4, 4), np.float32)
+    write_volume(path, volumes[0], Grid.cube(4, 2.0), {}, states=States(np.array([1.0, 2.0]), volumes))
+    with h5py.File(path, "r+") as file:
+        units = file[f"entry/states/{name}"].attrs["units"]
+        del file[f"entry/states/{name}"]
+        if values is not None:
+            file[f"entry/states/{name}"] = values
+            file[f"entry/states/{name}"].attrs["units"] = units
+    for command in (f"info {path}", f"evaluate {path} --reference {path}", f"export {path} --states 2 -o {tmp_path}/s.npy"):
+        assert cli.run(command.split()) == 2
+        error = capsys.readouterr().err
+        assert f"states/{name}" in error and error.count("\n") == 1
 
 
 def test_evaluate_names_the_field_that_a_volume_was_reconstructed_with(cli, caplog, folder, tmp_path) -> None:
