@@ -1,4 +1,4 @@
-"""``moving`` and ``changing`` compared with MACE4D of mbirtorch, on the scan of mbirtorch's own 4D demonstration: a rack and pinion.
+"""``moving`` and ``changing`` beside MACE4D of mbirtorch, on the scan of mbirtorch's own 4D demonstration: rack and pinion.
 
     python -m venv PEER && PEER/bin/pip install mbirtorch
     python benchmarks/mace4d.py --peer-python PEER/bin/python RESULTS.jsonl [--size 32] [--views 120] [--device D]

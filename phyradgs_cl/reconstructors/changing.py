@@ -30,8 +30,8 @@ _STACKS, _FRAMES = 18, 3  # in memory at one time
 @dataclass(frozen=True)
 class ChangingOptions(IterativeOptions):
     """states: of the object, at the middles of equal parts of the scan; fewer where there are fewer frames. prior_weight: of
-    total variation in space, relative to the error of the gradient as in ``fista``. time_weight: of a voxel's change from one
-    state to the next, relative to that of an equal step between two voxels. subsets and tv_iterations: as in ``fista``."""
+    total variation in space, relative to the error of the gradient as in ``fista``. time_weight: of a voxel's change from
+    one state to the next, relative to an equal step between two voxels. subsets and tv_iterations: as in ``fista``."""
 
     motion: Motion = PerRow()
     iterations: int = 40
