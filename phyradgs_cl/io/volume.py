@@ -28,7 +28,7 @@ _DISAGREEMENT_MEANS = (
     "common to both are not in it, and it is no confidence interval"
 )
 _AXES = ("z", "y", "x")
-_GAUSSIANS, _STATE, _STATES = "/entry/gaussians", "/entry/state", "/entry/states"
+_GAUSSIANS, _STATE, _STATES = "/entry/gaussians", "/entry/state", "/entry/time_series"
 _CLOUD = {"mean": (3,), "scale": (3,), "quaternion": (4,), "density": ()}
 _AXIS_TOLERANCE = 1e-3  # of a voxel, for axes stored in float32
 log = logging.getLogger(__name__)
@@ -246,7 +246,7 @@ def _write_axes(group: h5py.Group, grid: Grid) -> None:
 
 
 def _write_states(entry: h5py.Group, states: States, grid: Grid) -> None:
-    group = h5.new_group(entry, "states", "NXdata")
+    group = h5.new_group(entry, "time_series", "NXdata")
     group.attrs["signal"], group.attrs["axes"] = "volume", ["time_s", *_AXES]
     group["title"] = "attenuation (1/mm) at some times"
     dataset = group.create_dataset("volume", data=np.asarray(states.volumes, np.float32), chunks=(1, *grid.shape))

@@ -114,15 +114,15 @@ def test_damaged_states_are_refused(cli, capsys, tmp_path, name, values) -> None
     path, volumes = tmp_path / "states.h5", np.ones((2, 4, 4, 4), np.float32)
     write_volume(path, volumes[0], Grid.cube(4, 2.0), {}, states=States(np.array([1.0, 2.0]), volumes))
     with h5py.File(path, "r+") as file:
-        units = file[f"entry/states/{name}"].attrs["units"]
-        del file[f"entry/states/{name}"]
+        units = file[f"entry/time_series/{name}"].attrs["units"]
+        del file[f"entry/time_series/{name}"]
         if values is not None:
-            file[f"entry/states/{name}"] = values
-            file[f"entry/states/{name}"].attrs["units"] = units
+            file[f"entry/time_series/{name}"] = values
+            file[f"entry/time_series/{name}"].attrs["units"] = units
     for command in (f"info {path}", f"evaluate {path} --reference {path}", f"export {path} --states 2 -o {tmp_path}/s.npy"):
         assert cli.run(command.split()) == 2
         error = capsys.readouterr().err
-        assert f"states/{name}" in error and error.count("\n") == 1
+        assert f"time_series/{name}" in error and error.count("\n") == 1
 
 
 def test_evaluate_names_the_field_that_a_volume_was_reconstructed_with(cli, caplog, folder, tmp_path) -> None:

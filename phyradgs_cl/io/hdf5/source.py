@@ -23,7 +23,7 @@ _KNOWN = frozenset((
     *("saturation_level", "saturation_share", "reference", "volume", "z", "y", "x"),
     *("kinematics", "poses", "time_s", "angle_deg", "pose", "grid", "shape", "voxel_size", "offset"),
     *("reconstruction", "metrics", "gaussians", "mean", "scale", "quaternion", "density"),
-    *("deformation", "control", "origin", "spacing", "times", "weights", "states", "state_times"),
+    *("deformation", "control", "origin", "spacing", "times", "weights", "states", "state_times", "time_series"),
     *("gating", "signal", "phase"),
 ))
 # Compression shrinks masks of zeros a thousandfold and frames hardly at all. Small files may expand by _FREE_BYTES.
