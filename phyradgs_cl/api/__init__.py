@@ -41,7 +41,7 @@ from phyradgs_cl.api.runs import (
 from phyradgs_cl.api.scans import fly_scan, static_scan
 from phyradgs_cl.calibrate import Calibration
 from phyradgs_cl.errors import InputError, PhyradgsError
-from phyradgs_cl.fields import Deformation, Gating, Gaussians, Grid, deformed
+from phyradgs_cl.fields import Deformation, Gating, Gaussians, Grid, States, deformed
 from phyradgs_cl.metrics import compare
 from phyradgs_cl.reconstructors import Progress, Reconstruction
 from phyradgs_cl.simulation import ObjectMotion
@@ -50,7 +50,7 @@ __all__ = [
     "Calibration", "Centres", "CircularOrbit", "ConeGeometry", "ConstantSpeed", "Deformation", "EncoderTable",
     "Exact", "FrameSweeps", "Gating", "Gaussians", "Grid", "InputError", "LineMiddles", "LinearOperator", "MicroViews",
     "Motion", "ObjectMotion", "Operator", "OwnTimes", "ParallelGeometry", "PerRow", "PhyradgsError", "PoseTable", "Progress",
-    "Reconstruction", "Scan", "Shutter", "SpeedRamp", "Static", "StaticStart", "TimeCells", "Trajectory",
+    "Reconstruction", "Scan", "Shutter", "SpeedRamp", "States", "Static", "StaticStart", "TimeCells", "Trajectory",
     "as_torch", "calibrate", "compare", "deformed", "fly_scan", "initial_gaussians", "load_deformation", "load_scan",
     "load_volume", "move_views", "pose_gradient", "prepare", "ray_operator", "reconstruct", "save_deformation",
     "save_scan", "save_volume", "simulate", "splat_operator", "static_scan", "voxel_operator", "voxelise",

@@ -43,8 +43,8 @@ class States:
 
     def at(self, time_s: float) -> np.ndarray:
         """Returns the volume (nz, ny, nx) float32 at a time: straight between two states, the first before, the last after
-        them."""
-        place = float(np.interp(time_s, self.times_s, np.arange(len(self.times_s))))
+        them. Raises InputError for anything but a finite number."""
+        place = float(np.interp(checks.numbers("time_s", time_s, ()), self.times_s, np.arange(len(self.times_s))))
         first, share = int(place), np.float32(place - int(place))
         after = self.volumes[min(first + 1, len(self.volumes) - 1)]
         return np.asarray(self.volumes[first] + share * (after - self.volumes[first]), np.float32)

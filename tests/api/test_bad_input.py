@@ -283,6 +283,13 @@ CASES: dict[str, list[tuple[str, Callable[[], object]]]] = {
         ("gating values", lambda: api.Gating(np.arange(3.0), np.full(3, np.nan))),
         ("gating", lambda: replace(GOOD, gating=np.zeros(4))),
     ],
+    "States": [
+        ("times of states", lambda: api.States([2.0, 1.0], np.zeros((2, 3, 3, 3)))),
+        ("states", lambda: api.States([1.0], np.zeros((2, 3, 3, 3)))),
+        ("states", lambda: api.States([1.0], np.full((1, 3, 3, 3), np.nan))),
+        ("time_s", lambda: api.States([1.0], np.zeros((1, 3, 3, 3))).at(np.nan)),
+        ("time_s", lambda: api.States([1.0], np.zeros((1, 3, 3, 3))).at("now")),
+    ],
     "Deformation": [
         *((f"deformation {name}", partial(still, **{name: value})) for name, value in (
             ("control_mm", np.zeros((1, 2, 2, 2))), ("control_mm", np.zeros((0, 2, 2, 2, 3))), ("times_s", []),
