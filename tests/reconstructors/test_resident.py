@@ -114,7 +114,7 @@ def test_frames_of_fdk_go_up_once_and_its_volume_comes_down_once(scan) -> None:
 def test_all_iterative_methods_are_looked_at() -> None:
     """But for methods that find a motion: their search works on the host, and their passes are those of fista."""
     iterative = {name for name in METHODS if hasattr(method_options(name), "tolerance")}
-    assert set(ITERATIVE) == {name for name in iterative if not METHODS[name].finds_deformation}
+    assert set(ITERATIVE) == {name for name in iterative if not METHODS[name].finds_motion}
 
 
 @pytest.mark.parametrize("method", ["phyradgs", "r2"])
