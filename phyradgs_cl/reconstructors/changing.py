@@ -6,7 +6,7 @@ steps are those of ``fista``. Total variation in space and time: L. Ritschl et a
 reconstruction using an adaptive spatio-temporal sparsity prior, Phys. Med. Biol. 57 (2012) 1517."""
 
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -32,6 +32,9 @@ class ChangingOptions(IterativeOptions):
     """states: of the object, at the middles of equal parts of the scan; fewer where there are fewer frames. prior_weight: of
     total variation in space, relative to the error of the gradient as in ``fista``. time_weight: of a voxel's change from
     one state to the next, relative to an equal step between two voxels. subsets and tv_iterations: as in ``fista``."""
+
+    TRIALS: ClassVar[tuple[int, int]] = (1, 8)
+    """Iterations of the short runs of ``estimate``: the first passes, which touch new memory, are slower."""
 
     motion: Motion = PerRow()
     iterations: int = 40
