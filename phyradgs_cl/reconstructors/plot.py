@@ -9,7 +9,7 @@ from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.detector import without_lag
 from phyradgs_cl.drawing import draw_curve, draw_image, new_figure
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.fields import Grid
+from phyradgs_cl.fields import Deformation, Grid, States
 from phyradgs_cl.metrics import reference_on
 from phyradgs_cl.metrics.quality import draw_slices
 from phyradgs_cl.reconstructors.projected import frame_pairs
@@ -24,11 +24,11 @@ _ROW_INCH, _SLICE_INCH, _SIDE_INCH = 3.2, 3.6, 4.4
 
 def plot_result(
     volume: np.ndarray, grid: Grid, record: list[dict[str, float]], scan: Scan | None, frame: int,
-    device: str | Runtime | None, note: str
+    device: str | Runtime | None, note: str, moves: Deformation | States | None = None
 ) -> "Figure":
     """Returns a figure of a volume's middle slices, the convergence record and, with a scan, a frame and its residual.
 
-    ``note``: of the residual's title."""
+    ``note``: of the residual's title. ``moves``: how the object moves or changes, for the residual."""
     if not (scan is None or isinstance(scan, Scan)):
         raise InputError("scan", checks.short_repr(scan), "the Scan of the result, or None")
     truth = None
@@ -50,7 +50,7 @@ def plot_result(
         residual.set_axis_off()
     else:
         rt = device if isinstance(device, Runtime) else Runtime(device)
-        (pair,) = frame_pairs(rt, without_lag(scan), volume, grid, [frame])
+        (pair,) = frame_pairs(rt, without_lag(scan), volume, grid, [frame], moves)
         (rows, columns), (dv_mm, du_mm) = scan.geometry.detector_shape, scan.geometry.pixel_size_mm
         size_mm, limit = (rows * dv_mm, columns * du_mm), float(abs(pair.residual).max()) or 1.0
         draw_image(measured, pair.measured, f"frame {frame}: line integrals", size_mm=size_mm, cmap="gray")

@@ -103,7 +103,7 @@ class Reconstruction:
         from phyradgs_cl.reconstructors.plot import plot_result
 
         note = ", without the margin" if MARGIN_MM in self.facts else ""
-        return plot_result(self.volume, self.grid, self.record, scan, frame, device, note)
+        return plot_result(self.volume, self.grid, self.record, scan, frame, device, note, self.moves)
 
 
 def interrupted(partial: Reconstruction | None) -> KeyboardInterrupt:

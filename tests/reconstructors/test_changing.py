@@ -1,5 +1,6 @@
 """An object that changes during its scan: projectors of a stack of states, and the method ``changing``."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -15,6 +16,7 @@ from phyradgs_cl.operators import IntensityOperator, RayOperator
 from phyradgs_cl.operators.warp.operator import projector_of
 from phyradgs_cl.reconstructors import Reconstruction, plan_run, reconstruct
 from phyradgs_cl.reconstructors.preprocess import Preprocessing
+from phyradgs_cl.reconstructors.projected import frame_pairs
 from phyradgs_cl.reconstructors.result import Report
 
 GRID = Grid.cube(20, 2.0)
@@ -141,6 +143,9 @@ def test_computed_frames_and_held_out_pixels_are_those_of_the_states(rt, scan) -
     plan = replace(plan_run("changing", {"states": 10, "iterations": 20}), preprocessing=hold)
     result = reconstruct(scan, plan, rt, report=lambda p: shown.append(p.frames(2)) if p.iteration == 20 else None)
     assert max(pair.rms for pair in shown[0]) < 0.007  # 0.015 of the mean of the states
+    titles = [re.search(r"RMS (.*) %", axes.get_title()) for axes in result.plot(scan, frame=2, device=rt).axes]
+    (percent,) = (float(title[1]) for title in titles if title)
+    assert percent < 0.7 * 100 * frame_pairs(rt, scan, result.volume, GRID, [2])[0].relative
     assert result.facts["held_out"]["holdout_rms"] < 0.007
     resting = reconstruct(scan, replace(plan_run("fista", {}), preprocessing=hold), rt)
     assert resting.facts["held_out"]["holdout_rms"] > 0.01
