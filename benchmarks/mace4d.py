@@ -1,12 +1,12 @@
-"""``moving`` and ``changing`` beside MACE4D of mbirtorch, on the scan of mbirtorch's own 4D demonstration: rack and pinion.
+"""Compares ``moving`` and ``changing`` with MACE4D of mbirtorch, on the scan of mbirtorch's 4D demonstration.
 
     python -m venv PEER && PEER/bin/pip install mbirtorch
     python benchmarks/mace4d.py --peer-python PEER/bin/python RESULTS.jsonl [--size 32] [--views 120] [--device D]
 
-They find the states of the object from line integrals without noise. Our methods have their default options, MACE4D those
-of the demonstration. A line has the mean and the least PSNR, the mean SSIM and processor seconds. The truth is the state in
-the middle of each of MACE4D's windows. FBP of each window alone and ``fista``, as if the object rested, are measured too. A
-pixel is taken as 1 mm. With TORCHDYNAMO_DISABLE=1 mbirtorch runs without the compiler of PyTorch."""
+The object is a rack and pinion, the frames are line integrals without noise. Our methods have their default options, MACE4D
+has those of the demonstration. A line has the mean and the least PSNR, the mean SSIM and processor seconds. The truth is the
+state in the middle of each of MACE4D's windows. FBP of each window alone is measured too, and ``fista``, as if the object
+rested. A pixel is taken as 1 mm. With TORCHDYNAMO_DISABLE=1 mbirtorch runs without the compiler of PyTorch."""
 
 import subprocess
 import tempfile

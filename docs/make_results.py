@@ -333,7 +333,7 @@ def estimates() -> str:
 
 
 def prepared() -> str:
-    """Decibels that an effect costs, and the percentage of them that ``prepare`` regains, by effect and size.
+    """Decibels that an effect costs, and the percentage that ``prepare`` regains, by effect and size.
 
     Both from the least to the most of all volumes."""
     cells: dict[tuple[str, int], dict[str, list[dict[str, Any]]]] = {}

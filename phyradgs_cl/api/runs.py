@@ -174,7 +174,7 @@ def prepare(scan: Scan, steps: str = DEFAULT_STEPS, *, device: Device = None, **
     steps: the steps of docs/prepare.md, names with commas. device: what ``--device`` takes, or a Runtime. options: tables
     of options of a step (``rings={"window": 11}``), and the other options of preprocessing. The scan's provenance lists the
     facts of each step under ``prepared``. Raises InputError for an unknown step or option, and for a scan that does not
-    show what a step looks for."""
+    show the effect of a step."""
     check_scan(scan)
     before = preprocessing_of({"steps": steps, **options})
     before.check_written()

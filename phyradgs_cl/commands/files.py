@@ -1,4 +1,4 @@
-"""info and export: what a file contains, and a volume for other programs."""
+"""info and export: the content of a file, and a volume for other programs."""
 
 import json
 from pathlib import Path

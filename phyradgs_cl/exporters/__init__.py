@@ -68,8 +68,8 @@ def _in_unit(values: np.ndarray, mu_water_per_mm: float | None) -> tuple[np.ndar
 
 
 def state_times_s(moves: Deformation | States, count: int, during_s: tuple[float, float] | None = None) -> list[float]:
-    """Returns the middles (count,) in s of equal parts of a time, by default that of the motion. InputError: a count that is
-    not from 1 to 1000, a time that ends before it begins, or lies beside the motion's."""
+    """Returns the middles (count,) in s of equal parts of a time, by default that of the motion. InputError: a count outside
+    1 to 1000, a time that ends before it begins, a time without any of the motion's."""
     checks.whole("--states", count, 1, 1000)
     begin_s, end_s = moves.span_s if isinstance(moves, States) else (float(moves.times_s[0]), float(moves.times_s[-1]))
     first_s, last_s = during_s or (begin_s, end_s)
@@ -84,7 +84,7 @@ def export_states(
     path: str | Path, deformation: Deformation | None, times_s: Sequence[float], to: str,
     output: str | Path | None = None, mu_water_per_mm: float | None = None, labels: DicomLabels | None = None,
 ) -> list[Path]:  # fmt: skip
-    """Writes a volume file as it is at each of evenly spaced times, and returns the paths. ``deformation``: how the object
+    """Writes the object of a volume file at each of evenly spaced times, and returns the paths. ``deformation``: how it
     moves; None where the file holds its states. NIfTI holds all states in one file of four dimensions. The other formats get
     a file, or a folder, for each state: NAME_01.SUFFIX and so on. Other arguments and errors are those of
     ``export_volume``; InputError also for a format of Gaussians."""
@@ -92,15 +92,12 @@ def export_states(
         raise InputError("--states", f"with --to {to}", "a format of voxels", "use nii, mha, nrrd, tiff, npy or dicom")
     target, volume = _checked_target(Path(path), to, output, mu_water_per_mm, labels), read_volume(path)
     grid = volume.required_grid
-    if deformation is not None and volume.states is not None:
-        expected = "a volume whose object does not change"
-        raise InputError("--object-motion", f"{path}, which holds its states", expected, "leave it out")
     if deformation is not None:
         moves = any(deformation.on_grid_mm(grid, unit).any() for unit in np.eye(deformation.rank))
         if deformation.control_mm.any() and not moves:
             found = "a deformation that moves nothing in the volume's grid"
             raise InputError("--object-motion", found, "one of this volume", "check origin and unit of its control points")
-        volume = replace(volume, deformation=deformation, states=None)
+        volume = volume.moved_by(deformation, str(path))
     states = [replace(volume, values=volume.at(time_s)) for time_s in times_s]
     if to == "nii":
         values = [_in_unit(state.values, mu_water_per_mm) for state in states]

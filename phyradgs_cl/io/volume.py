@@ -3,7 +3,7 @@
 import json
 import logging
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -57,6 +57,13 @@ class Volume:
         if (field := self.deformation) is None:
             return self.values
         return deformed(self.values, self.required_grid, field, field.weights_at(time_s)[0])
+
+    def moved_by(self, deformation: Deformation, subject: str) -> "Volume":
+        """Returns the volume with another deformation. InputError, which names it by ``subject``, where it holds states."""
+        if self.states is not None:
+            found, expected = f"{subject}, which holds its states", "a volume whose object does not change"
+            raise InputError("--object-motion", found, expected, "leave it out")
+        return replace(self, deformation=deformation)
 
     @property
     def required_grid(self) -> Grid:

@@ -2,7 +2,6 @@
 
 import logging
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -63,11 +62,8 @@ def run_evaluation(
         raise InputError("--object-motion", "no true states to compare with", expected, "leave it out")
     if reference_of_rtk:
         stored, moving = _with_our_axes(stored), None
-    if field is not None and result.states is not None:
-        found, expected = f"{volume_path}, which holds its states", "a volume whose object does not change"
-        raise InputError("--object-motion", found, expected, "leave it out")
     if field is not None:
-        result = replace(result, deformation=field)
+        result = result.moved_by(field, str(volume_path))
     volume, grid, provenance = result.values, result.grid, result.provenance
     reference, stored_grid = stored.values, stored.grid
     how, share = f"{VOXEL_BY_VOXEL}, as {plain_text(volume_path.name)} has no scale", 1.0
