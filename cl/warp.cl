@@ -1,7 +1,10 @@
 /* A volume seen through a displacement, (W v)(y) = v(y + w(y)), interpolated and zero outside the volume, and its exact
    transpose. The displacement of a state is w = sum of shares[r] * fields[r], in voxels. Twin: operators/twins/warp.py.
-   It interpolates by cubic convolution along each axis: R. G. Keys, IEEE Trans. Acoustics, Speech, Signal Processing 29,
-   1153-1160 (1981), a = -1/2.
+   It interpolates by cubic splines along each axis, which run through the voxels: their coefficients lie in the volume's
+   layout, from BORDER samples before it to BORDER behind it. M. Unser, A. Aldroubi and M. Eden, B-spline signal processing,
+   IEEE Trans. Signal Processing 41, 821-833 (1993).
+     spline_along_x     voxels to coefficients in place, along x; a work-item takes a row. Its own transpose.
+     spline_across_x    the same along y or z; a work-item takes LANES lines beside each other.
      warp_forward       a work-item takes LANES voxels along x.
      warp_adjoint_rows  CPUs: a work-item owns some slices of the result, to which it adds every voxel that reaches them.
      warp_adjoint_fixed GPUs: a work-item adds its voxel to integers, whose sums do not depend on their order.
@@ -12,6 +15,7 @@
 #include "common/lanes.h"
 
 #define REACH 2 /* voxels: as far as a sample counts */
+#define BORDER 4
 #define TAPS (2 * REACH)
 #define MOST_TAPS (TAPS + 2)
 
@@ -37,26 +41,66 @@ static inline int vi_least(const vi v)
 }
 #endif
 
-/* The weight of a sample at a distance of its voxels; 0 from REACH on. */
+#define POLE -0.26794919f /* sqrt(3) - 2 */
+
+/* Solves c[k - 1] + 4 c[k] + c[k + 1] = 6 v[k] for a line of zeros beyond its ends. */
+#define SPLINE_COEFFICIENTS(type, load, store)            \
+    type sum = 0.0f;                                      \
+    for (int k = 0; k < length; ++k) {                    \
+        sum = 6.0f * load(line + k * step) + POLE * sum;  \
+        store(sum, line + k * step);                      \
+    }                                                     \
+    sum *= -POLE / (1.0f - POLE * POLE);                  \
+    store(sum, line + (length - 1) * step);               \
+    for (int k = length - 2; k >= 0; --k) {               \
+        sum = POLE * (sum - load(line + k * step));       \
+        store(sum, line + k * step);                      \
+    }
+#define LOAD_ONE(at) (*(at))
+#define STORE_ONE(value, at) (*(at) = (value))
+
+__kernel void spline_along_x(
+    __global float *volume, const long start, /* the first row's first sample */
+    const long row,                           /* from row to row */
+    const int rows, const int length)
+{
+    if (get_global_id(0) >= rows)
+        return;
+    __global float *line = volume + start + get_global_id(0) * row;
+    const long step = 1;
+    SPLINE_COEFFICIENTS(float, LOAD_ONE, STORE_ONE)
+}
+
+__kernel void spline_across_x(
+    __global float *volume, const long start,
+    const long width, const long plane, /* lines beside each other; from one plane of them to the next */
+    const long step, const int length)  /* from sample to sample of a line */
+{
+    if (get_global_id(0) * LANES >= width)
+        return;
+    __global float *line = volume + start + get_global_id(0) * LANES + get_global_id(1) * plane;
+    SPLINE_COEFFICIENTS(vf, V_LOAD, V_STORE)
+}
+
+/* The cubic B-spline: the weight of a coefficient at a distance of its voxels; 0 from REACH on. */
 static inline vf tap(const vf distance)
 {
-    const vf x = fmin(fabs(distance), (vf)(2.0f));
-    const vf near = (1.5f * x - 2.5f) * x * x + 1.0f, far = ((2.5f - 0.5f * x) * x - 4.0f) * x + 2.0f;
-    return V_PICK(far, near, x < 1.0f);
+    const vf x = fmin(fabs(distance), (vf)(2.0f)), far = 2.0f - x;
+    return V_PICK(far * far * far * (1.0f / 6), (0.5f * x - 1.0f) * x * x + 2.0f / 3, x < 1.0f);
 }
 
 static inline float one_tap(const float distance)
 {
-    const float x = fmin(fabs(distance), 2.0f);
-    return x < 1.0f ? (1.5f * x - 2.5f) * x * x + 1.0f : ((2.5f - 0.5f * x) * x - 4.0f) * x + 2.0f;
+    const float x = fmin(fabs(distance), 2.0f), far = 2.0f - x;
+    return x < 1.0f ? (0.5f * x - 1.0f) * x * x + 2.0f / 3 : far * far * far * (1.0f / 6);
 }
 
-static inline int first_tap(const float at, const int length)
+static inline int first_tap(const float at)
 {
-    return clamp((int)floor(at) + 1 - REACH, -REACH, length - 1);
+    return (int)floor(at) + 1 - REACH;
 }
 
-/* Where LANES voxels look in the volume, and the samples around them: `count` of them along an axis from `first` on, which
+/* Where LANES voxels look in the volume, and the coefficients around them: `count` of them along an axis from `first` on, which
    along x moves with the lane, with the weights of the first MOST_TAPS. */
 typedef struct {
     vf at;
@@ -78,7 +122,7 @@ static inline Samples samples_of(const vf position, const vi lane, const int len
 {
     Samples s;
     s.at = clamp(position, (float)-REACH, (float)(length - 1 + REACH));
-    const vi first = clamp(V_INT(floor(s.at)) + 1 - REACH, -REACH, length - 1) - lane;
+    const vi first = V_INT(floor(s.at)) + 1 - REACH - lane;
     s.first = VI_LEAST(first);
     s.count = VI_MOST(first) - s.first + TAPS;
     for (int i = 0; i < MOST_TAPS; ++i)
@@ -96,7 +140,7 @@ static inline Samples samples_of(const vf position, const vi lane, const int len
     const Samples sz = samples_of((float)(z_) + displacement(fields, shares, voxels, 2, voxel), 0, shape.z);
 
 __kernel void warp_forward(
-    __global const float *volume, /* rows with a pitch, in a border of 2 REACH zeros; `strides`: start, row, slice */
+    __global const float *volume, /* coefficients: rows with a pitch, in their border; `strides`: start, row, slice */
     const long4 strides,
     __global const float *fields, /* (RANK, 3: x y z, nz, ny, nx) voxels, and zeros for a vector's end */
     __global const float *shares, /* (RANK,) of the state */
@@ -127,7 +171,7 @@ __kernel void warp_forward(
         V_STORE(sy.at, ys);
         V_STORE(sz.at, zs);
         for (int l = 0; l < LANES; ++l) {
-            const int ix = first_tap(xs[l], shape.x), iy = first_tap(ys[l], shape.y), iz = first_tap(zs[l], shape.z);
+            const int ix = first_tap(xs[l]), iy = first_tap(ys[l]), iz = first_tap(zs[l]);
             sums[l] = 0.0f;
             for (int k = iz; k < iz + TAPS; ++k)
                 for (int j = iy; j < iy + TAPS; ++j) {
@@ -150,6 +194,11 @@ __kernel void warp_forward(
     V_STORE(sum, result + voxel);
 }
 
+/* Whether voxels of slice z, with such displacements along z, count in the slices of a work-item. */
+#define REACHES(range)                                                                            \
+    (clamp(z + (range).y, (float)-REACH, (float)(shape.z - 1 + REACH)) > (float)(z_start - REACH) \
+     && clamp(z + (range).x, (float)-REACH, (float)(shape.z - 1 + REACH)) < (float)(z_stop - 1 + REACH))
+
 __kernel void warp_adjoint_rows(
     __global const float *values,  /* (nz, ny, nx), and zeros for a vector's end */
     __global const float *fields, __global const float *shares, const int4 shape,
@@ -157,19 +206,18 @@ __kernel void warp_adjoint_rows(
     __global const float2 *rows,   /* (nz, ny) in a row */
     const int owned,               /* slices of a work-item */
     const long4 strides,
-    __global float *result)        /* as the volume of warp_forward: sums begin with what is in it; its border is unused */
+    __global float *result)        /* coefficients as those of warp_forward: sums begin with what is in it */
 {
-    const int z_start = (int)get_global_id(0) * owned, z_stop = min(z_start + owned, shape.z);
-    if (z_start >= shape.z)
+    const int z_start = (int)get_global_id(0) * owned - BORDER, z_stop = min(z_start + owned, shape.z + BORDER);
+    if (z_start >= z_stop)
         return;
     const size_t voxels = (size_t)shape.x * shape.y * shape.z;
     __global float *origin = result + strides.x;
     for (int z = 0; z < shape.z; ++z) {
-        if (z + slices[z].y <= (float)(z_start - REACH) || z + slices[z].x >= (float)(z_stop - 1 + REACH))
+        if (!REACHES(slices[z]))
             continue;
         for (int y = 0; y < shape.y; ++y) {
-            const float2 reach = (float)z + rows[(size_t)z * shape.y + y];
-            if (reach.y <= (float)(z_start - REACH) || reach.x >= (float)(z_stop - 1 + REACH))
+            if (!REACHES(rows[(size_t)z * shape.y + y]))
                 continue;
             for (int first = 0; first < shape.x; first += LANES) {
                 WARP_SAMPLES(y, z)
@@ -193,7 +241,7 @@ __kernel void warp_adjoint_rows(
                 V_STORE(sz.at, zs);
                 V_STORE(value, each);
                 for (int l = 0; l < min(LANES, shape.x - first); ++l) {
-                    const int ix = first_tap(xs[l], shape.x), iy = first_tap(ys[l], shape.y), iz = first_tap(zs[l], shape.z);
+                    const int ix = first_tap(xs[l]), iy = first_tap(ys[l]), iz = first_tap(zs[l]);
                     for (int k = max(iz, z_start); k < min(iz + TAPS, z_stop); ++k)
                         for (int j = iy; j < iy + TAPS; ++j) {
                             __global float *row = origin + k * strides.z + j * strides.y;
@@ -212,7 +260,8 @@ __kernel void warp_adjoint_rows(
 __kernel void warp_adjoint_fixed(
     __global const float *values, __global const float *fields, __global const float *shares, const int4 shape,
     const float scale,     /* integers per unit: no sum overflows */
-    __global int *result)  /* (nz, ny, nx) zeros */
+    const long4 strides,
+    __global int *result)  /* zeros in the layout of coefficients */
 {
     const int first = get_global_id(0), y = get_global_id(1), z = get_global_id(2);
     if (first >= shape.x)
@@ -220,22 +269,21 @@ __kernel void warp_adjoint_fixed(
     const size_t voxels = (size_t)shape.x * shape.y * shape.z;
     WARP_SAMPLES(y, z)
     const float value = scale * values[voxel];
-    for (int k = max(sz.first, 0); k < min(sz.first + TAPS, shape.z); ++k)
-        for (int j = max(sy.first, 0); j < min(sy.first + TAPS, shape.y); ++j)
-            for (int i = max(sx.first, 0); i < min(sx.first + TAPS, shape.x); ++i) {
-                const float across = sz.weights[k - sz.first] * sy.weights[j - sy.first];
-                const float part = value * across * sx.weights[i - sx.first];
-                atomic_add(result + ((size_t)k * shape.y + j) * shape.x + i, convert_int_rte(part));
+    __global int *origin = result + strides.x + sz.first * strides.z + sy.first * strides.y + sx.first;
+    for (int k = 0; k < TAPS; ++k)
+        for (int j = 0; j < TAPS; ++j)
+            for (int i = 0; i < TAPS; ++i) {
+                const float part = value * (sz.weights[k] * sy.weights[j]) * sx.weights[i];
+                atomic_add(origin + k * strides.z + j * strides.y + i, convert_int_rte(part));
             }
 }
 
 __kernel void warp_adjoint_sum(
-    __global const int *sums, const float unit, const int4 shape, const long4 strides, __global float *result)
+    __global const int *sums, const float unit, const long count, __global float *result)
 {
-    const int x = get_global_id(0), y = get_global_id(1), z = get_global_id(2);
-    if (x < shape.x)
-        result[strides.x + z * strides.z + y * strides.y + x] +=
-            unit * convert_float(sums[((size_t)z * shape.y + y) * shape.x + x]);
+    const size_t k = get_global_id(0);
+    if (k < count)
+        result[k] += unit * convert_float(sums[k]);
 }
 #endif
 

@@ -108,7 +108,7 @@ class Deformation:
         control_mm = np.pad(self._state(weights), [(1, 1)] * 3 + [(0, 0)])
         place = self._in_spacings(np.asarray(points_mm, np.float64))[..., None]
         taps = np.floor(place).astype(np.int64) + np.arange(-1, 3)  # (n, 3, 4): all control points that reach the points
-        values, slopes = _cubic(place - taps), _cubic_slope(place - taps) / np.reshape(self.spacing_mm, (3, 1))
+        values, slopes = cubic(place - taps), cubic_slope(place - taps) / np.reshape(self.spacing_mm, (3, 1))
         last = np.reshape(control_mm.shape[2::-1], (3, 1)) - 1
         x, y, z = np.moveaxis(np.clip(taps + 1, 0, last), 1, 0)
         vectors = control_mm[z[:, :, None, None], y[:, None, :, None], x[:, None, None, :]]
@@ -175,7 +175,7 @@ class Deformation:
             origin_mm, step_mm = self.origin_mm[2 - axis], float(spacing_mm[2 - axis])
             count = self.control_mm.shape[1 + axis]
             offset = (centres_mm[:, None] - origin_mm) / step_mm - np.arange(count)
-            matrices.append(_cubic_slope(offset) / step_mm if axis == slope_along else _cubic(offset))
+            matrices.append(cubic_slope(offset) / step_mm if axis == slope_along else cubic(offset))
         return matrices[0], matrices[1], matrices[2]
 
     def _slopes(self, grid: Grid, control_mm: np.ndarray) -> np.ndarray:
@@ -204,13 +204,13 @@ def control_points(
     return (first_mm[2], first_mm[1], first_mm[0]), (counts[0], counts[1], counts[2])
 
 
-def _cubic(offset: np.ndarray) -> np.ndarray:
+def cubic(offset: np.ndarray) -> np.ndarray:
     """Returns the centred cubic B-spline β³ at offsets in spacings; 0 beyond ±2."""
     size = np.abs(offset)
     return np.asarray(np.maximum(2 - size, 0) ** 3 - 4 * np.maximum(1 - size, 0) ** 3) / 6
 
 
-def _cubic_slope(offset: np.ndarray) -> np.ndarray:
+def cubic_slope(offset: np.ndarray) -> np.ndarray:
     """Returns the derivative of β³ at offsets in spacings."""
     size = np.abs(offset)
     return np.asarray(-np.sign(offset) * (np.maximum(2 - size, 0) ** 2 - 4 * np.maximum(1 - size, 0) ** 2)) / 2

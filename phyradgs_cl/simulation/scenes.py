@@ -131,7 +131,7 @@ def _voxel_scene(
 
         if deformation is None or deformation.is_still:
             return of_state(values)
-        return DeformedSource(values, fine, deformation, min(grid.voxel_size_mm), of_state)
+        return DeformedSource(rt, values, fine, deformation, min(grid.voxel_size_mm), of_state)
 
     def bone() -> FrameSource:
         return source_of(np.where(volume >= bone_from(volume), volume, 0).astype(np.float32))

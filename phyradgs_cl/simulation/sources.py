@@ -15,6 +15,8 @@ from phyradgs_cl.fields import Deformation, Grid, SplineVolume
 from phyradgs_cl.operators import RayOperator
 from phyradgs_cl.operators.rays.layout import RayLayout, some_cells
 from phyradgs_cl.operators.rays.memory import RayMemory
+from phyradgs_cl.operators.warp.states import MotionStates, unit_fields_mm
+from phyradgs_cl.operators.warp.volume import VolumeWarp
 from phyradgs_cl.phantoms import EllipsoidPhantom, MovingPhantom
 from phyradgs_cl.runtime import DeviceArray, MemoryShortage, Runtime
 
@@ -130,10 +132,10 @@ class DeformedSource(FrameSource):
     frames."""
 
     def __init__(
-        self, volume: np.ndarray, grid: Grid, deformation: Deformation, voxel_mm: float,
+        self, rt: Runtime, volume: np.ndarray, grid: Grid, deformation: Deformation, voxel_mm: float,
         make: Callable[[np.ndarray], FrameSource],
     ) -> None:  # fmt: skip
-        self._volume, self._deformation = SplineVolume(volume, grid), deformation
+        self._rt, self._volume, self._grid, self._deformation = rt, volume, grid, deformation
         reach_mm = np.maximum(deformation.reach_mm, np.finfo(float).tiny)
         self._step = 2 * NEAREST * voxel_mm / (deformation.rank * reach_mm)
         self._make = make
@@ -144,16 +146,28 @@ class DeformedSource(FrameSource):
     def frames(self, tables: Sequence[TimeCells], model: str, factor: float) -> Iterator[np.ndarray]:
         weights = [self._rounded_weights(cells) for cells in tables]
         states, state_of_cell = np.unique(np.concatenate(weights), axis=0, return_inverse=True)
+        volume_of = self._volumes(states)
         by_table = np.split(state_of_cell.ravel(), np.cumsum([cells.count for cells in tables])[:-1])
         sums = [_Average(cells, model) for cells in tables]
-        for number, state in enumerate(states):
+        for number in range(len(states)):
             numbers = [k for k, of_cell in enumerate(by_table) if (of_cell == number).any()]
             parts = [part_of(tables[k], by_table[k] == number) for k in numbers]
-            source = self._make(self._volume.deformed(self._deformation, state))
+            source = self._make(volume_of(number))
             frames = source.frames([part for part, _ in parts], model, factor)
             for k, frame, (_, share) in zip(numbers, frames, parts, strict=True):
                 sums[k].add(frame, share)
         return (each.frame() for each in sums)
+
+    def _volumes(self, weights: np.ndarray) -> Callable[[int], np.ndarray]:
+        """Returns what makes the volume of each state of ``weights`` (K, R): on the device where its memory has room."""
+        volume, rank = self._volume, self._deformation.rank
+        if not self._rt.room().scaled(0.5).holds(3 * rank * volume.nbytes, *[2 * volume.nbytes] * 2):
+            spline = SplineVolume(volume, self._grid)
+            return lambda k: spline.deformed(self._deformation, weights[k])
+        fields_mm = unit_fields_mm(self._deformation, self._grid)
+        warp = VolumeWarp(self._rt, MotionStates(self._deformation, self._grid, fields_mm, weights, np.eye(rank)))
+        source, least = warp.source(self._rt.upload(volume)), min(float(volume.min()), 0.0)
+        return lambda k: volume if warp.is_still(k) else np.maximum(self._rt.download(warp.forward(k, source)), least)
 
     def _rounded_weights(self, cells: TimeCells) -> np.ndarray:
         """Returns the weights (C, R) of the states that the cells are projected from."""

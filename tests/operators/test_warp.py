@@ -119,13 +119,13 @@ def test_subsets_are_rows_and_devices_agree_with_the_host(rt) -> None:
 
 
 def test_an_object_at_rest_has_the_bits_of_today(rt) -> None:
-    """Also one that has moved by zero before it is projected."""
+    """Also one that has moved by zero before it is projected; splines of its backprojections round."""
     cells, x, y = tables(), noise(GRID.shape), noise((4, *SHAPE))
     plain, at_rest = RayOperator(rt, GRID, SHAPE, cells), deformation(0.0)
     assert isinstance(projector_of(rt, GRID, cells, at_rest)(rt, GRID, SHAPE, cells), RayOperator)
     operator = WarpedOperator(rt, GRID, SHAPE, cells, warp=VolumeWarp(rt, states_of(at_rest)))
     np.testing.assert_array_equal(operator.forward(x), plain.forward(x))
-    np.testing.assert_array_equal(operator.adjoint(y), plain.adjoint(y))
+    assert_near(operator.adjoint(y), plain.adjoint(y), FLOAT32)
 
 
 def test_a_rigid_field_is_a_moved_scanner(rt) -> None:
@@ -186,7 +186,7 @@ def test_states_cover_the_motion(rt) -> None:
 
 
 def test_cubic_warps_hardly_blur(rt) -> None:
-    """By half a voxel and back: trilinear samples lose 2.5 times as much of a blob of σ 1.2 voxels, splines a third."""
+    """By half a voxel and back: trilinear samples lose eight times as much of a blob of σ 1.2 voxels."""
     z, y, x = np.meshgrid(*(np.arange(n) - (n - 1) / 2 for n in GRID.shape), indexing="ij")
     blob = np.exp(-(x**2 + y**2 + z**2) / (2 * 1.2**2)).astype(np.float32)
     half = np.broadcast_to(np.array(GRID.voxel_size_mm[::-1]) / 2, (1, 9, 9, 9, 3))
@@ -195,9 +195,10 @@ def test_cubic_warps_hardly_blur(rt) -> None:
     there = rt.download(warp.forward(0, warp.source(rt.upload(blob))))
     cubic = rt.download(warp.forward(1, warp.source(rt.upload(there))))
     trilinear = scipy.ndimage.shift(scipy.ndimage.shift(blob, -0.5, order=1), 0.5, order=1)
-    splines = deformed(deformed(blob, GRID, one, one.weights[0]), GRID, one, one.weights[1])
-    errors = [np.abs(volume - blob).max() for volume in (trilinear, cubic, splines)]
-    assert errors[0] > 2.5 * errors[1] and errors[1] > 2.5 * errors[2], errors
+    errors = [np.abs(volume - blob).max() for volume in (trilinear, cubic)]
+    assert errors[0] > 8 * errors[1], errors
+    splines = deformed(blob, GRID, one, warp.states.weights[0])
+    assert_near(np.maximum(there, 0), splines, FLOAT32)
 
 
 def test_a_volume_in_bricks_is_refused(rt, monkeypatch) -> None:

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from kernel_kit import assert_near
+from memory_limits import room_for
 from tolerances import FLOAT32, MOVING_FRAME
 
 from phyradgs_cl.acquisition import ConeGeometry, ParallelGeometry, Protocol, Scan, pixel_centres
@@ -62,7 +63,7 @@ def frames_of(rt, options: SimulationOptions, deformation: Deformation, volume: 
     def make(state: np.ndarray) -> VolumeSource:
         return VolumeSource(rt, state, GRID, GEOMETRY, options.readout_axis)
 
-    source = DeformedSource(volume, GRID, deformation, 2.0 / 20, make)
+    source = DeformedSource(rt, volume, GRID, deformation, 2.0 / 20, make)
     return simulate(source, GEOMETRY, BOX, options)
 
 
@@ -101,6 +102,15 @@ def test_many_states_of_an_object_that_rests_are_one_frame(rt, model) -> None:
     moving = frames_of(rt, options, replace(field, control_mm=control_mm), volume)
     resting = simulate(VolumeSource(rt, volume, GRID, GEOMETRY, "rows"), GEOMETRY, BOX, options)
     assert_near(moving.projections, resting.projections, FLOAT32)
+
+
+def test_states_made_on_the_host_are_those_of_the_device(rt) -> None:
+    """Where the device has room for a projector, and none for the fields."""
+    field, options = translation(SPEED_MM_PER_S, FLY.window_s()[1]), SimulationOptions(FLY, time_samples=3)
+    on_device = frames_of(rt, options, field, blob(START_MM)).projections
+    with room_for(rt, 5 * 40**3 * 4):
+        on_host = frames_of(rt, options, field, blob(START_MM)).projections
+    assert_near(on_host, on_device, FLOAT32)
 
 
 SCANNER = replace(scanner_for("r2", 16), geometry=GEOMETRY, grid=BOX)

@@ -6,18 +6,19 @@ import numpy as np
 
 from phyradgs_cl.acquisition.time_cells import TimeCells
 from phyradgs_cl.fields import Deformation, Gaussians
+from phyradgs_cl.fields.deformation import cubic
 from phyradgs_cl.fields.gaussians import MEAN
 from phyradgs_cl.operators.rays.layout import some_cells
 from phyradgs_cl.operators.twins.splat import moving_frame, precision_matrices, splat_frame
 
-_REACH = 2  # voxels: as far as a sample counts
+_REACH = 2  # voxels: as far as a coefficient counts
+_BORDER = 4  # coefficients before and behind the volume
 Volume = np.ndarray
 
 
 def warp_forward(volume: Volume, displacement: np.ndarray) -> Volume:
-    """Returns v(y + w(y)) (nz, ny, nx) by cubic convolution, 0 outside, for w (nz, ny, nx, 3) in voxels, components x, y,
-    z."""
-    padded = np.pad(np.asarray(volume, np.float64), 2 * _REACH)
+    """Returns v(y + w(y)) (nz, ny, nx) by cubic splines, 0 outside, for w (nz, ny, nx, 3) in voxels, components x, y, z."""
+    padded = _coefficients(np.pad(np.asarray(volume, np.float64), _BORDER))
     result = np.zeros(volume.shape)
     for place, weight in _taps(displacement):
         result += weight * padded[place]
@@ -26,11 +27,20 @@ def warp_forward(volume: Volume, displacement: np.ndarray) -> Volume:
 
 def warp_adjoint(values: Volume, displacement: np.ndarray) -> Volume:
     """Returns the transpose of ``warp_forward`` at ``values`` (nz, ny, nx)."""
-    border = 2 * _REACH
-    padded = np.zeros([n + 2 * border for n in values.shape])
+    padded = np.zeros([n + 2 * _BORDER for n in values.shape])
     for place, weight in _taps(displacement):
         np.add.at(padded, place, weight * values)
-    return padded[border:-border, border:-border, border:-border]
+    inner = slice(_BORDER, -_BORDER)
+    return _coefficients(padded)[inner, inner, inner]
+
+
+def _coefficients(values: Volume) -> Volume:
+    """Returns the coefficients of the cubic spline through values (nz, ny, nx) between zeros, by its impulse response."""
+    for axis, side in enumerate(values.shape):
+        distance = np.abs(np.subtract.outer(np.arange(side), np.arange(side)))
+        response = np.sqrt(3) * (np.sqrt(3) - 2) ** distance
+        values = np.moveaxis(np.tensordot(response, values, (1, axis)), 0, axis)
+    return values
 
 
 def _taps(displacement: np.ndarray) -> Iterator[tuple[tuple[np.ndarray, ...], np.ndarray]]:
@@ -39,17 +49,11 @@ def _taps(displacement: np.ndarray) -> Iterator[tuple[tuple[np.ndarray, ...], np
     places = np.indices(shape) + np.moveaxis(np.asarray(displacement, np.float64), -1, 0)[::-1]
     sides = np.reshape(shape, (3, 1, 1, 1))
     places = np.clip(places, -_REACH, sides - 1 + _REACH)
-    first = np.clip(np.floor(places).astype(int) + 1 - _REACH, -_REACH, sides - 1)
+    first = np.floor(places).astype(int) + 1 - _REACH
     for tap in np.ndindex(*(2 * _REACH,) * 3):
         index = first + np.reshape(tap, (3, 1, 1, 1))
-        z, y, x = index + 2 * _REACH
-        yield (z, y, x), _weight(np.abs(places - index)).prod(axis=0)
-
-
-def _weight(distance: np.ndarray) -> np.ndarray:
-    near = 1.5 * distance**3 - 2.5 * distance**2 + 1
-    far = -0.5 * distance**3 + 2.5 * distance**2 - 4 * distance + 2
-    return np.asarray(np.where(distance < 1, near, np.where(distance < 2, far, 0)))
+        z, y, x = index + _BORDER
+        yield (z, y, x), cubic(places - index).prod(axis=0)
 
 
 def moved_rows(rows: np.ndarray, deformation: Deformation, weights: np.ndarray) -> np.ndarray:

@@ -6,12 +6,16 @@ U_r, and by the weights φ_r. With w_k of the state k and the slope ∇v of the 
 from collections.abc import Callable
 
 import numpy as np
+import scipy
 
+from phyradgs_cl.fields.deformation import cubic, cubic_slope
 from phyradgs_cl.operators.warp.operator import WarpedOperator
 from phyradgs_cl.operators.warp.volume import VolumeWarp
 from phyradgs_cl.runtime import DeviceArray
 
-_REACH = 2  # voxels: as far as a sample of cl/warp.cl counts
+_REACH = 2  # voxels: as far as a coefficient of cl/warp.cl counts
+_BORDER = 4  # coefficients before and behind the volume, as in cl/warp.cl
+_SETTLES = 8  # voxels of zeros more, within which coefficients fall to 3e-5
 
 
 class FieldDerivative:
@@ -69,19 +73,21 @@ class FieldDerivative:
 
 
 def warp_slopes(volume: np.ndarray, displacement: np.ndarray) -> np.ndarray:
-    """Returns ∇v(y + w(y)) (nz, ny, nx, 3) float32 per voxel, x y z, of the volume (nz, ny, nx) by cubic convolution, 0
-    outside, for w (nz, ny, nx, 3) in voxels."""
-    padded = np.pad(np.asarray(volume, np.float32), 2 * _REACH)
+    """Returns ∇v(y + w(y)) (nz, ny, nx, 3) float32 per voxel, x y z, of the volume (nz, ny, nx) by cubic splines, 0 outside,
+    for w (nz, ny, nx, 3) in voxels."""
+    wide = scipy.ndimage.spline_filter(np.pad(volume, _BORDER + _SETTLES), output=np.float32)
+    padded = np.ascontiguousarray(wide[(slice(_SETTLES, -_SETTLES),) * 3])
     strides = (padded.shape[1] * padded.shape[2], padded.shape[2], 1)
     corner, weights, slopes = np.int64(0), [], []
     for axis, (side, stride) in enumerate(zip(volume.shape, strides, strict=True)):
         index = np.arange(side, dtype=np.float32).reshape([-1 if a == axis else 1 for a in range(3)])
-        place = np.clip(index + displacement[..., 2 - axis].astype(np.float32), -_REACH, side - 1 + _REACH)
-        first = np.clip(np.floor(place) + 1 - _REACH, -_REACH, side - 1)
-        corner = corner + (first.astype(np.int64) + 2 * _REACH) * stride
+        wanted = index + displacement[..., 2 - axis].astype(np.float32)
+        place = np.clip(wanted, -_REACH, side - 1 + _REACH)
+        first = np.floor(place) + 1 - _REACH
+        corner = corner + (first.astype(np.int64) + _BORDER) * stride
         distances = [place - first - tap for tap in range(2 * _REACH)]
-        weights.append([_weight(distance) for distance in distances])
-        slopes.append([_slope(distance) for distance in distances])
+        weights.append([cubic(distance) for distance in distances])
+        slopes.append([cubic_slope(distance) * (place == wanted) for distance in distances])
     flat, (wz, wy, wx), (dz, dy, dx) = padded.ravel(), weights, slopes
     total = np.zeros((3, *volume.shape), np.float32)
     for k, j in np.ndindex(2 * _REACH, 2 * _REACH):
@@ -91,15 +97,3 @@ def warp_slopes(volume: np.ndarray, displacement: np.ndarray) -> np.ndarray:
         total[1] += wz[k] * dy[j] * value
         total[2] += dz[k] * wy[j] * value
     return np.moveaxis(total, 0, -1)
-
-
-def _weight(distance: np.ndarray) -> np.ndarray:
-    """Returns Keys' weight of samples at signed distances (…) in voxels; 0 from 2 voxels on."""
-    x = np.minimum(np.abs(distance), _REACH)
-    return np.asarray(np.where(x < 1, (1.5 * x - 2.5) * x * x + 1, ((2.5 - 0.5 * x) * x - 4) * x + 2))
-
-
-def _slope(distance: np.ndarray) -> np.ndarray:
-    """Returns the derivative of ``_weight``."""
-    x = np.minimum(np.abs(distance), _REACH)
-    return np.asarray(np.where(x < 1, (4.5 * x - 5) * x, (5 - 1.5 * x) * x - 4) * np.sign(distance))

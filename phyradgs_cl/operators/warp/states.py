@@ -38,8 +38,7 @@ class MotionStates:
 
         least_voxels: displacement of a unit of every weight that is assumed beside the fields' own, so that fields of zeros
         have several states too."""
-        units = np.eye(deformation.rank)
-        fields_mm = np.stack([deformation.on_grid_mm(grid, unit) for unit in units])
+        units, fields_mm = np.eye(deformation.rank), unit_fields_mm(deformation, grid)
         voxel_mm = min(grid.voxel_size_mm)
         moving = np.square(fields_mm).sum((0, -1))
         moves = moving >= _MOVES * moving.max(initial=0.0)
@@ -99,6 +98,11 @@ class MotionStates:
                 shares[better, second] = share[better]
                 shares[better, first] += 1 - share[better]
         return shares
+
+
+def unit_fields_mm(deformation: Deformation, grid: Grid) -> np.ndarray:
+    """Returns the displacements (R, nz, ny, nx, 3) of unit weight in mm."""
+    return np.stack([deformation.on_grid_mm(grid, unit) for unit in np.eye(deformation.rank)])
 
 
 def _length(difference: np.ndarray, metric: np.ndarray) -> np.ndarray:

@@ -7,7 +7,7 @@ from phyradgs_cl.operators.warp.states import MotionStates
 from phyradgs_cl.runtime import DeviceArray, DeviceSpace, Kernel, Runtime
 from phyradgs_cl.runtime.layout import GUARD, Strides, move, pitch_of
 
-_BORDER = 4  # voxels of zeros: twice REACH of cl/warp.cl
+_BORDER = 4  # coefficients before and behind the volume, as in cl/warp.cl: further ones are below 3e-3
 _MOST_OWNED = 8  # slices of the result that a CPU's work-item owns; it repeats the voxels that reach another's too
 _ITEMS_PER_UNIT = 4
 _HEADROOM = 64  # by which a sum of one voxel's shares may exceed 1, as where the field contracts by 4 along each axis
@@ -17,7 +17,8 @@ _ROUNDING = 1e-3  # voxels
 class VolumeWarp:
     """(W_k v)(y) = v(y + w_k(y)), 0 outside the volume, for the states of ``states``.
 
-    Cubic convolution hardly blurs, and has a slope everywhere, at voxel planes too, where an object at rest is sampled.
+    Cubic splines through the voxels hardly blur: W_k = B_k F E puts the volume between zeros (E), solves for its spline's
+    coefficients (F) and samples the spline (B_k). F is its own transpose.
     Holds 3 R volumes on the device for the R fields; a state's displacement is their weighted sum, made where it is used.
     Results have the same bits in every run: no sum depends on the order of work-items."""
 
@@ -33,7 +34,7 @@ class VolumeWarp:
         self._sums: DeviceArray | None = None
         self._space = DeviceSpace(rt)
         self.stack = FrameStack(rt, self.kernel("add_frames"))
-        self._reaches = [] if rt.pixel_items else [self._reach(fields[:, 2], k) for k in range(states.count)]
+        self._reaches: dict[int, tuple[DeviceArray, DeviceArray]] = {}
 
     volumes = 4  # that it holds besides the fields, at most
 
@@ -42,11 +43,25 @@ class VolumeWarp:
         return self.states.is_still(state)
 
     def source(self, volume: DeviceArray) -> DeviceArray:
-        """Returns a volume (nz, ny, nx) in the layout of ``forward``'s; the next call overwrites it."""
+        """Returns the spline's coefficients of a volume (nz, ny, nx); the next call overwrites them."""
         if self._source is None:
-            self._source = self.rt.zeros(self._floats)
+            self._source = self.rt.empty(self._floats)
+        self.rt.fill(self._source, 0)
         move(self.rt, (volume, Strides.plain(self.shape)), (self._source, self._strides), self.shape)
+        self._filter(self._source)
         return self._source
+
+    def _filter(self, values: DeviceArray) -> None:
+        """Applies F in place. Its planes are whole rows: their ends are zeros, and stay so."""
+        nz, ny, nx = (n + 2 * _BORDER for n in self.shape)
+        slice_, row = self._strides.slice, self._strides.row
+        start = np.int64(self._strides.start - _BORDER * (slice_ + row + 1))
+        along, across = self.kernel("spline_along_x"), self.kernel("spline_across_x")
+        group, lanes = self.rt.group(), self.rt.lanes
+        self.rt.launch(along, nz * ny, values, start, np.int64(row), nz * ny, nx, group=group)
+        for width, planes, step, length in ((row, nz, row, ny), (slice_, 1, slice_, nz)):
+            sides = np.int64(width), np.int64(slice_), np.int64(step), length
+            self.rt.launch(across, (width // lanes, planes), values, start, *sides, group=group)
 
     def forward(self, state: int, source: DeviceArray) -> DeviceArray:
         """Returns W_k v (nz, ny, nx); the next call overwrites it."""
@@ -65,7 +80,7 @@ class VolumeWarp:
         return DeviceArray(self._moved.buffer, self.shape, self._moved.dtype)
 
     def zeros(self) -> DeviceArray:
-        """Returns zeros in the layout of ``adjoint``'s sum; the next call overwrites it."""
+        """Returns zeros in the layout of the coefficients; the next call overwrites it."""
         if self._total is None:
             self._total = self.rt.empty(self._floats)
         self.rt.fill(self._total, 0)
@@ -76,15 +91,18 @@ class VolumeWarp:
         if self.rt.pixel_items:
             self._adjoint_fixed(state, moved, total)
             return
+        if state not in self._reaches:
+            self._reaches[state] = self._reach(state)
         slices, rows = self._reaches[state]
         owned = min(max(self.shape[0] // (_ITEMS_PER_UNIT * self.rt.device.compute_units), 1), _MOST_OWNED)
         self.rt.launch(
-            self.kernel("warp_adjoint_rows"), ceil_div(self.shape[0], owned), moved, self._fields,
+            self.kernel("warp_adjoint_rows"), ceil_div(self.shape[0] + 2 * _BORDER, owned), moved, self._fields,
             self._shares[state], self._size(), slices, rows, owned, self._strides.vector(), total,
         )  # fmt: skip
 
     def read(self, total: DeviceArray, result: DeviceArray) -> None:
-        """Copies a sum to a volume (nz, ny, nx)."""
+        """Writes the volume Eᵀ F ``total`` (nz, ny, nx); changes ``total``."""
+        self._filter(total)
         move(self.rt, (total, self._strides), (result, Strides.plain(self.shape)), self.shape)
 
     def _adjoint_fixed(self, state: int, moved: DeviceArray, total: DeviceArray) -> None:
@@ -94,23 +112,23 @@ class VolumeWarp:
             return
         nz, ny, nx = self.shape
         if self._sums is None:
-            self._sums = self.rt.empty(self.shape, np.int32)
+            self._sums = self.rt.empty(self._floats, np.int32)
         self.rt.fill(self._sums, 0)
         unit, group = largest * _HEADROOM / 2**31, self.rt.group(on_cpu=1)
         kernel = self.kernel("warp_adjoint_fixed")
         self.rt.launch(
             kernel, (nx, ny, nz), moved, self._fields, self._shares[state], self._size(),
-            np.float32(1 / unit), self._sums, group=group,
+            np.float32(1 / unit), self._strides.vector(), self._sums, group=group,
         )  # fmt: skip
-        sums = self._sums, np.float32(unit), self._size(), self._strides.vector(), total
-        self.rt.launch(self.kernel("warp_adjoint_sum"), (nx, ny, nz), *sums, group=group)
+        sums = self._sums, np.float32(unit), np.int64(self._floats), total
+        self.rt.launch(self.kernel("warp_adjoint_sum"), self._floats, *sums, group=group)
 
     def kernel(self, name: str) -> Kernel:
         """Returns a kernel of cl/warp.cl."""
         return self.rt.kernel("warp", name, RANK=len(self.states.fields_mm))
 
     def _layout(self) -> tuple[int, Strides]:
-        """Returns the floats and strides of volumes with a border of zeros, which samples beyond a face read."""
+        """Returns the floats and strides of the coefficients."""
         nz, ny, nx = self.shape
         slice_ = (ny + 2 * _BORDER) * pitch_of(nx)
         strides = Strides(GUARD + _BORDER * (slice_ + pitch_of(nx)), slice_, pitch_of(nx))
@@ -119,9 +137,10 @@ class VolumeWarp:
     def _size(self) -> np.ndarray:
         return np.array([*self.shape[::-1], 0], np.int32)
 
-    def _reach(self, fields_z: np.ndarray, state: int) -> tuple[DeviceArray, DeviceArray]:
+    def _reach(self, state: int) -> tuple[DeviceArray, DeviceArray]:
         """Returns the least and largest displacement along z of every slice (nz, 2) and row (nz, ny, 2), in voxels."""
-        along_z = np.tensordot(self.states.weights[state].astype(np.float32), fields_z.astype(np.float32), 1)
+        fields = (self.states.fields_mm[..., 2] / self.states.grid.voxel_size_mm[0]).astype(np.float32)
+        along_z = np.tensordot(self.states.weights[state].astype(np.float32), fields, 1)
         rows = np.stack([along_z.min(-1) - _ROUNDING, along_z.max(-1) + _ROUNDING], -1)
         slices = np.stack([rows[..., 0].min(1), rows[..., 1].max(1)], -1)
         return self.rt.upload(slices, np.float32), self.rt.upload(rows, np.float32)
