@@ -18,9 +18,11 @@ from phyradgs_cl.operators.rays.layout import some_cells
 from phyradgs_cl.operators.rays.memory import RayMemory
 from phyradgs_cl.operators.rays.operator import RayOperator
 from phyradgs_cl.operators.warp.stack import StateStack, TimeStates
-from phyradgs_cl.operators.warp.states import MotionStates
+from phyradgs_cl.operators.warp.states import MOST_STATES, MotionStates
 from phyradgs_cl.operators.warp.volume import VolumeWarp
 from phyradgs_cl.runtime import DeviceArray, Runtime, SameArray
+
+_FRAMES_PER_STATE = 12  # beyond MOST_STATES: the more frames are projected, the less of the time goes to a warp
 
 
 class WarpedOperator:
@@ -147,7 +149,8 @@ def projector_of(
     if deformation is None:
         return RayOperator
     times_s = np.concatenate([table.time_s for table in tables])
-    states = MotionStates.of_times(deformation, grid, times_s, blends=False)
+    most = MOST_STATES + len(tables) // _FRAMES_PER_STATE
+    states = MotionStates.of_times(deformation, grid, times_s, blends=False, most=most)
     return RayOperator if states.is_at_rest else partial(WarpedOperator, warp=VolumeWarp(rt, states))
 
 

@@ -32,9 +32,10 @@ class MotionStates:
 
     @classmethod
     def of_times(
-        cls, deformation: Deformation, grid: Grid, times_s: np.ndarray, least_voxels: float = 0.0, blends: bool = True
-    ) -> "MotionStates":
-        """Chooses states for times (T,) in s: each next one is the time furthest from the states so far.
+        cls, deformation: Deformation, grid: Grid, times_s: np.ndarray, least_voxels: float = 0.0, blends: bool = True,
+        most: int = MOST_STATES,
+    ) -> "MotionStates":  # fmt: skip
+        """Chooses at most ``most`` states for times (T,) in s: each next one is the time furthest from the states so far.
 
         least_voxels: displacement of a unit of every weight that is assumed beside the fields' own, so that fields of zeros
         have several states too."""
@@ -48,7 +49,7 @@ class MotionStates:
         seen = np.unique(deformation.weights_at(times_s), axis=0)
         chosen = [int(np.argmin(_length(seen - seen.mean(0), metric)))]
         spacing = _SPACING if blends else _SPACING_OF_NEAREST
-        while len(chosen) < MOST_STATES:
+        while len(chosen) < most:
             distance = np.min([_length(seen - seen[k], metric) for k in chosen], axis=0)
             furthest = int(np.argmax(distance))
             if distance[furthest] <= (spacing if len(chosen) > 1 else 0.0):
