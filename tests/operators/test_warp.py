@@ -185,6 +185,17 @@ def test_states_cover_the_motion(rt) -> None:
     assert np.sqrt(np.einsum("tr,rs,ts->t", off, states.metric, off)).max() < 1.0
 
 
+def test_scans_of_more_frames_have_more_states(rt) -> None:
+    fast = deformation(3.0)
+    counts = [MotionStates.of_times(fast, GRID, TIMES_S, blends=False, most=most).count for most in (2, 5)]
+    assert counts == [2, 5]
+    frames = np.linspace(0.0, TIMES_S[-1], 60)
+    orbit, shutter = CircularOrbit(GEOMETRY, ConstantSpeed(0.3, 1.0)), Shutter(0.05, 0.05)
+    cells = [static_cells(orbit, shutter, f, start_s, SHAPE[0]) for f, start_s in enumerate(frames)]
+    make = projector_of(rt, GRID, cells, fast)
+    assert make.keywords["warp"].states.count == MOST_STATES + 5
+
+
 def test_cubic_warps_hardly_blur(rt) -> None:
     """By half a voxel and back: trilinear samples lose eight times as much of a blob of σ 1.2 voxels."""
     z, y, x = np.meshgrid(*(np.arange(n) - (n - 1) / 2 for n in GRID.shape), indexing="ij")
