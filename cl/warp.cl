@@ -19,28 +19,6 @@
 #define TAPS (2 * REACH)
 #define MOST_TAPS (TAPS + 2)
 
-#if LANES == 1
-#define VI_LEAST(v) (v)
-#define VI_MOST(v) (v)
-#define V_AT(v, k) (v)
-#else
-#define VI_LEAST(v) vi_least(v)
-#define VI_MOST(v) (-vi_least(-(v)))
-static inline int vi_least(const vi v)
-{
-#if LANES == 4
-    const int4 a = v;
-#elif LANES == 8
-    const int4 a = min(v.lo, v.hi);
-#else
-    const int8 b = min(v.lo, v.hi);
-    const int4 a = min(b.lo, b.hi);
-#endif
-    const int2 c = min(a.lo, a.hi);
-    return min(c.x, c.y);
-}
-#endif
-
 #define POLE -0.26794919f /* sqrt(3) - 2 */
 
 /* Solves c[k - 1] + 4 c[k] + c[k + 1] = 6 v[k] for a line of zeros beyond its ends. */
@@ -83,12 +61,6 @@ __kernel void spline_across_x(
 }
 
 /* The cubic B-spline: the weight of a coefficient at a distance of its voxels; 0 from REACH on. */
-static inline vf tap(const vf distance)
-{
-    const vf x = fmin(fabs(distance), (vf)(2.0f)), far = 2.0f - x;
-    return V_PICK(far * far * far * (1.0f / 6), (0.5f * x - 1.0f) * x * x + 2.0f / 3, x < 1.0f);
-}
-
 static inline float one_tap(const float distance)
 {
     const float x = fmin(fabs(distance), 2.0f), far = 2.0f - x;
@@ -101,9 +73,10 @@ static inline int first_tap(const float at)
 }
 
 /* Where LANES voxels look in the volume, and the coefficients around them: `count` of them along an axis from `first` on, which
-   along x moves with the lane, with the weights of the first MOST_TAPS. */
+   along x moves with the lane, with their weights. is_far: whether a lane needs others. */
 typedef struct {
     vf at;
+    vi is_far;
     int first, count;
     vf weights[MOST_TAPS];
 } Samples;
@@ -117,20 +90,30 @@ static inline vf displacement(
     return sum;
 }
 
-/* Positions beyond the zeros around the volume are moved there. */
+/* Positions beyond the zeros around the volume are moved there. Displacements mostly rise or fall along the lanes. So the first
+   and the last lane have the range of all, which is tested. */
 static inline Samples samples_of(const vf position, const vi lane, const int length)
 {
     Samples s;
     s.at = clamp(position, (float)-REACH, (float)(length - 1 + REACH));
-    const vi first = V_INT(floor(s.at)) + 1 - REACH - lane;
-    s.first = VI_LEAST(first);
-    s.count = VI_MOST(first) - s.first + TAPS;
+    const vf before = floor(s.at);
+    const vi first = V_INT(before) + 1 - REACH - lane;
+    s.first = min(V_FIRST(first), V_LAST(first));
+    const int spread = max(V_FIRST(first), V_LAST(first)) - s.first;
+    s.count = TAPS + spread;
+    const vi late = first - s.first;
+    s.is_far = (late < 0) | (late > min(spread, MOST_TAPS - TAPS));
+    const vf t = s.at - before, u = 1.0f - t;
+    const vf w[MOST_TAPS + 2] = {
+        0.0f, 0.0f, u * u * u * (1.0f / 6), (0.5f * t - 1.0f) * t * t + 2.0f / 3, (0.5f * u - 1.0f) * u * u + 2.0f / 3,
+        t * t * t * (1.0f / 6), 0.0f, 0.0f,
+    };
     for (int i = 0; i < MOST_TAPS; ++i)
-        s.weights[i] = tap(s.at - V_FLOAT(lane + s.first + i));
+        s.weights[i] = V_PICK(V_PICK(w[i], w[i + 1], late < 2), w[i + 2], late < 1);
     return s;
 }
 
-#define IS_TOGETHER (max(sx.count, max(sy.count, sz.count)) <= MOST_TAPS)
+#define IS_TOGETHER (!V_ANY(sx.is_far | sy.is_far | sz.is_far))
 
 #define WARP_SAMPLES(y_, z_)                                                                                    \
     const vi lane = V_INT(V_IOTA);                                                                              \
@@ -159,8 +142,11 @@ __kernel void warp_forward(
             for (int j = 0; j < sy.count; ++j) {
                 __global const float *row = origin + (sz.first + k) * strides.z + (sy.first + j) * strides.y + sx.first;
                 vf along_x = sx.weights[0] * V_LOAD(row);
-                for (int i = 1; i < sx.count; ++i)
+                for (int i = 1; i < TAPS; ++i)
                     along_x += sx.weights[i] * V_LOAD(row + i);
+                if (sx.count > TAPS)
+                    for (int i = TAPS; i < MOST_TAPS; ++i)
+                        along_x += sx.weights[i] * V_LOAD(row + i);
                 sum += sz.weights[k] * sy.weights[j] * along_x;
             }
     }
