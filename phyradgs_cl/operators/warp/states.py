@@ -49,12 +49,13 @@ class MotionStates:
         seen = np.unique(deformation.weights_at(times_s), axis=0)
         chosen = [int(np.argmin(_length(seen - seen.mean(0), metric)))]
         spacing = _SPACING if blends else _SPACING_OF_NEAREST
+        distance = _length(seen - seen[chosen[0]], metric)
         while len(chosen) < most:
-            distance = np.min([_length(seen - seen[k], metric) for k in chosen], axis=0)
             furthest = int(np.argmax(distance))
             if distance[furthest] <= (spacing if len(chosen) > 1 else 0.0):
                 break
             chosen.append(furthest)
+            distance = np.minimum(distance, _length(seen - seen[furthest], metric))
         return cls(deformation, grid, fields_mm, seen[chosen], metric, blends)
 
     @property
