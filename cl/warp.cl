@@ -73,10 +73,11 @@ static inline int first_tap(const float at)
 }
 
 /* Where LANES voxels look in the volume, and the coefficients around them: `count` of them along an axis from `first` on, which
-   along x moves with the lane, with their weights. is_far: whether a lane needs others. */
+   along x moves with the lane, with their weights. is_far: whether a lane needs others. is_outside: whether it looks further
+   than REACH beyond the volume, where it finds 0. */
 typedef struct {
     vf at;
-    vi is_far;
+    vi is_far, is_outside;
     int first, count;
     vf weights[MOST_TAPS];
 } Samples;
@@ -90,12 +91,12 @@ static inline vf displacement(
     return sum;
 }
 
-/* Positions beyond the zeros around the volume are moved there. Displacements mostly rise or fall along the lanes. So the first
-   and the last lane have the range of all, which is tested. */
+/* Displacements mostly rise or fall along the lanes. So the first and the last lane have the range of all, which is tested. */
 static inline Samples samples_of(const vf position, const vi lane, const int length)
 {
     Samples s;
     s.at = clamp(position, (float)-REACH, (float)(length - 1 + REACH));
+    s.is_outside = position != s.at;
     const vf before = floor(s.at);
     const vi first = V_INT(before) + 1 - REACH - lane;
     s.first = min(V_FIRST(first), V_LAST(first));
@@ -114,6 +115,8 @@ static inline Samples samples_of(const vf position, const vi lane, const int len
 }
 
 #define IS_TOGETHER (!V_ANY(sx.is_far | sy.is_far | sz.is_far))
+
+#define ZERO_OUTSIDE(value) V_PICK((value), 0.0f, sx.is_outside | sy.is_outside | sz.is_outside)
 
 #define WARP_SAMPLES(y_, z_)                                                                                    \
     const vi lane = V_INT(V_IOTA);                                                                              \
@@ -169,6 +172,9 @@ __kernel void warp_forward(
         }
         sum = V_LOAD(sums);
     }
+#endif
+    sum = ZERO_OUTSIDE(sum);
+#if LANES > 1
     if (first + LANES > shape.x) { /* the row's end: the next row is another work-item's */
         float values[LANES];
         V_STORE(sum, values);
@@ -181,9 +187,7 @@ __kernel void warp_forward(
 }
 
 /* Whether voxels of slice z, with such displacements along z, count in the slices of a work-item. */
-#define REACHES(range)                                                                            \
-    (clamp(z + (range).y, (float)-REACH, (float)(shape.z - 1 + REACH)) > (float)(z_start - REACH) \
-     && clamp(z + (range).x, (float)-REACH, (float)(shape.z - 1 + REACH)) < (float)(z_stop - 1 + REACH))
+#define REACHES(range) (z + (range).y > (float)(z_start - REACH) && z + (range).x < (float)(z_stop - 1 + REACH))
 
 __kernel void warp_adjoint_rows(
     __global const float *values,  /* (nz, ny, nx), and zeros for a vector's end */
@@ -207,7 +211,7 @@ __kernel void warp_adjoint_rows(
                 continue;
             for (int first = 0; first < shape.x; first += LANES) {
                 WARP_SAMPLES(y, z)
-                const vf value = V_PICK(0.0f, V_LOAD(values + voxel), V_IOTA < (float)(shape.x - first));
+                const vf value = ZERO_OUTSIDE(V_PICK(0.0f, V_LOAD(values + voxel), V_IOTA < (float)(shape.x - first)));
                 if (IS_TOGETHER) {
                     for (int i = 0; i < sx.count; ++i) {
                         const vf along_x = value * sx.weights[i];
@@ -254,7 +258,7 @@ __kernel void warp_adjoint_fixed(
         return;
     const size_t voxels = (size_t)shape.x * shape.y * shape.z;
     WARP_SAMPLES(y, z)
-    const float value = scale * values[voxel];
+    const float value = ZERO_OUTSIDE(scale * values[voxel]);
     __global int *origin = result + strides.x + sz.first * strides.z + sy.first * strides.y + sx.first;
     for (int k = 0; k < TAPS; ++k)
         for (int j = 0; j < TAPS; ++j)

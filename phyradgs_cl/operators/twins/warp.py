@@ -17,7 +17,8 @@ Volume = np.ndarray
 
 
 def warp_forward(volume: Volume, displacement: np.ndarray) -> Volume:
-    """Returns v(y + w(y)) (nz, ny, nx) by cubic splines, 0 outside, for w (nz, ny, nx, 3) in voxels, components x, y, z."""
+    """Returns v(y + w(y)) (nz, ny, nx) by cubic splines, 0 further than ``_REACH`` outside, for w (nz, ny, nx, 3) in
+    voxels, components x, y, z."""
     padded = _coefficients(np.pad(np.asarray(volume, np.float64), _BORDER))
     result = np.zeros(volume.shape)
     for place, weight in _taps(displacement):
@@ -48,12 +49,13 @@ def _taps(displacement: np.ndarray) -> Iterator[tuple[tuple[np.ndarray, ...], np
     shape = displacement.shape[:3]
     places = np.indices(shape) + np.moveaxis(np.asarray(displacement, np.float64), -1, 0)[::-1]
     sides = np.reshape(shape, (3, 1, 1, 1))
+    is_inside = ((places >= -_REACH) & (places <= sides - 1 + _REACH)).all(axis=0)
     places = np.clip(places, -_REACH, sides - 1 + _REACH)
     first = np.floor(places).astype(int) + 1 - _REACH
     for tap in np.ndindex(*(2 * _REACH,) * 3):
         index = first + np.reshape(tap, (3, 1, 1, 1))
         z, y, x = index + _BORDER
-        yield (z, y, x), cubic(places - index).prod(axis=0)
+        yield (z, y, x), is_inside * cubic(places - index).prod(axis=0)
 
 
 def moved_rows(rows: np.ndarray, deformation: Deformation, weights: np.ndarray) -> np.ndarray:

@@ -78,7 +78,7 @@ def warp_slopes(volume: np.ndarray, displacement: np.ndarray) -> np.ndarray:
     wide = scipy.ndimage.spline_filter(np.pad(volume, _BORDER + _SETTLES), output=np.float32)
     padded = np.ascontiguousarray(wide[(slice(_SETTLES, -_SETTLES),) * 3])
     strides = (padded.shape[1] * padded.shape[2], padded.shape[2], 1)
-    corner, weights, slopes = np.int64(0), [], []
+    corner, weights, slopes, is_inside = np.int64(0), [], [], np.bool_(True)
     for axis, (side, stride) in enumerate(zip(volume.shape, strides, strict=True)):
         index = np.arange(side, dtype=np.float32).reshape([-1 if a == axis else 1 for a in range(3)])
         wanted = index + displacement[..., 2 - axis].astype(np.float32)
@@ -87,7 +87,8 @@ def warp_slopes(volume: np.ndarray, displacement: np.ndarray) -> np.ndarray:
         corner = corner + (first.astype(np.int64) + _BORDER) * stride
         distances = [place - first - tap for tap in range(2 * _REACH)]
         weights.append([cubic(distance) for distance in distances])
-        slopes.append([cubic_slope(distance) * (place == wanted) for distance in distances])
+        slopes.append([cubic_slope(distance) for distance in distances])
+        is_inside = is_inside & (place == wanted)
     flat, (wz, wy, wx), (dz, dy, dx) = padded.ravel(), weights, slopes
     total = np.zeros((3, *volume.shape), np.float32)
     for k, j in np.ndindex(2 * _REACH, 2 * _REACH):
@@ -96,4 +97,4 @@ def warp_slopes(volume: np.ndarray, displacement: np.ndarray) -> np.ndarray:
         total[0] += wz[k] * wy[j] * sum(slope * sample for slope, sample in zip(dx, row, strict=True))
         total[1] += wz[k] * dy[j] * value
         total[2] += dz[k] * wy[j] * value
-    return np.moveaxis(total, 0, -1)
+    return np.moveaxis(total * is_inside, 0, -1)
