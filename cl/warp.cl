@@ -42,7 +42,7 @@ __kernel void spline_along_x(
     const long row,                           /* from row to row */
     const int rows, const int length)
 {
-    if (get_global_id(0) >= rows)
+    if ((int)get_global_id(0) >= rows)
         return;
     __global float *line = volume + start + get_global_id(0) * row;
     const long step = 1;
@@ -54,7 +54,7 @@ __kernel void spline_across_x(
     const long width, const long plane, /* lines beside each other; from one plane of them to the next */
     const long step, const int length)  /* from sample to sample of a line */
 {
-    if (get_global_id(0) * LANES >= width)
+    if ((long)get_global_id(0) * LANES >= width)
         return;
     __global float *line = volume + start + get_global_id(0) * LANES + get_global_id(1) * plane;
     SPLINE_COEFFICIENTS(vf, V_LOAD, V_STORE)
@@ -271,7 +271,7 @@ __kernel void warp_adjoint_fixed(
 __kernel void warp_adjoint_sum(
     __global const int *sums, const float unit, const long count, __global float *result)
 {
-    const size_t k = get_global_id(0);
+    const long k = get_global_id(0);
     if (k < count)
         result[k] += unit * convert_float(sums[k]);
 }
