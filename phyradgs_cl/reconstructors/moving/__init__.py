@@ -3,7 +3,9 @@
 from collections.abc import Mapping
 from typing import Any
 
-LEAST_GAIN = 0.03  # of the squared residual: eight volumes at rest gain up to 0.02, a breath of a third of a voxel 0.05
+# Of the squared residual. Eight volumes at rest gain up to 0.02. A breath of a third of a voxel gains 0.03 in a noisy scan,
+# where its field does not help, and 0.06 in a clear one, where it helps by 1.2 dB.
+LEAST_GAIN = 0.03
 
 
 def motion_line(found: Mapping[str, Any]) -> str:

@@ -116,7 +116,8 @@ class FieldSearch:
 
     def finding(self) -> tuple[Deformation, float]:
         """Returns the field, and by which share the squared residual is smaller than that of an object at rest after as many
-        passes. The field is zeros unless the share exceeds 2 % and what as many free numbers would explain in noise."""
+        passes. The field is zeros unless the share exceeds ``LEAST_GAIN`` and what as many free numbers would explain in
+        noise."""
         if not self.field.control_mm.any():
             return self.field.deformation(), 0.0
         moving = self._reconstructed(self.field, self.volume, _PASSES)
