@@ -540,6 +540,8 @@ def moving_known() -> str:
     rows: list[list[str]] = []
     losses_db: dict[int, list[float]] = {}
     for (views, volume), of in sorted(by_scan.items()):
+        if "known" not in of:
+            continue
         scores = [f"{of[case]['psnr_db']:.2f}/{of[case]['ssim']:.3f}" for case in ("rest", "known")]
         loss_db = of["rest"]["psnr_db"] - of["known"]["psnr_db"]
         losses_db.setdefault(views, []).append(loss_db)
