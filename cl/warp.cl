@@ -4,7 +4,7 @@
    layout, from BORDER samples before it to BORDER behind it. M. Unser, A. Aldroubi and M. Eden, B-spline signal processing,
    IEEE Trans. Signal Processing 41, 821-833 (1993).
      spline_along_x     voxels to coefficients in place, along x; a work-item takes a row. Its own transpose.
-     spline_across_x    the same along y or z; a work-item takes LANES lines beside each other.
+     spline_across_x    the same along y or z; a work-item takes LANES neighbouring lines.
      warp_forward       a work-item takes LANES voxels along x.
      warp_adjoint_rows  CPUs: a work-item owns some slices of the result, to which it adds every voxel that reaches them.
      warp_adjoint_fixed GPUs: a work-item adds its voxel to integers, whose sums do not depend on their order.
@@ -51,7 +51,7 @@ __kernel void spline_along_x(
 
 __kernel void spline_across_x(
     __global float *volume, const long start,
-    const long width, const long plane, /* lines beside each other; from one plane of them to the next */
+    const long width, const long plane, /* neighbouring lines; from one plane of them to the next */
     const long step, const int length)  /* from sample to sample of a line */
 {
     if ((long)get_global_id(0) * LANES >= width)
@@ -196,7 +196,7 @@ __kernel void warp_adjoint_rows(
     __global const float2 *rows,   /* (nz, ny) in a row */
     const int owned,               /* slices of a work-item */
     const long4 strides,
-    __global float *result)        /* coefficients as those of warp_forward: sums begin with what is in it */
+    __global float *result)        /* coefficients as those of warp_forward; the kernel adds to them */
 {
     const int z_start = (int)get_global_id(0) * owned - BORDER, z_stop = min(z_start + owned, shape.z + BORDER);
     if (z_start >= z_stop)

@@ -54,12 +54,12 @@ class VolumeSource(FrameSource):
         return (self._rt.download(frames) if isinstance(frames, DeviceArray) else frames)[0]
 
     def _where_it_fits(self, volume: np.ndarray) -> np.ndarray | DeviceArray:
-        """On the device, beside the operator's padded copy; on the host where the device has no room for both."""
+        """Returns it on the device; on the host where the device has no room for it and the operator's padded copy."""
         if not self._rt.room().holds(volume.nbytes, 4 * self._memory.layout.volume_floats):
             return volume
         try:
             return self._rt.upload(volume)
-        except MemoryShortage:  # the operator says so, and projects in bricks
+        except MemoryShortage:  # the operator projects in bricks
             return volume
 
 

@@ -157,7 +157,7 @@ def projector_of(
 def _tables_by_state(
     tables: Sequence[TimeCells], warp: VolumeWarp | StateStack
 ) -> list[tuple[np.ndarray, list[TimeCells]]]:
-    """Returns for each state the frames that use it, and their tables of cells with its share of their weights."""
+    """Returns for each state the frames that use it, and tables of their cells, weighted by the state's part."""
     ends = np.cumsum([table.count for table in tables])[:-1]
     shares = np.split(warp.states.shares(np.concatenate([table.time_s for table in tables])), ends)
     by_state = []

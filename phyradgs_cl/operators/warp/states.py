@@ -37,8 +37,8 @@ class MotionStates:
     ) -> "MotionStates":  # fmt: skip
         """Chooses at most ``most`` states for times (T,) in s: each next one is the time furthest from the states so far.
 
-        least_voxels: displacement of a unit of every weight that is assumed beside the fields' own, so that fields of zeros
-        have several states too."""
+        least_voxels: displacement for a unit of every weight, added to the fields' own in the distances. With it fields of
+        zeros have several states too."""
         units, fields_mm = np.eye(deformation.rank), unit_fields_mm(deformation, grid)
         voxel_mm = min(grid.voxel_size_mm)
         moving = np.square(fields_mm).sum((0, -1))

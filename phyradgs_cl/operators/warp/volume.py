@@ -170,7 +170,7 @@ class FrameStack:
         return taken
 
     def add(self, places: DeviceArray, frames: DeviceArray) -> None:
-        """Adds the frames that were asked for last to those at ``places`` (n,) of ``frames``."""
+        """Adds the frames of the last ``of`` or ``take`` to those at ``places`` (n,) of ``frames``."""
         assert self._memory is not None
         count, pixels = self._shape[0], int(np.prod(self._shape[1:]))
         group = self.rt.group(on_cpu=min(pixels, 64))

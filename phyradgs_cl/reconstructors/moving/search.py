@@ -40,7 +40,7 @@ def coarse_scan(scan: Scan) -> Scan:
 
 
 def initial_field(scan: Scan, signal: MotionSignal, last_s: float, first_s: float) -> MotionField:
-    """Returns a field at rest whose weights follow the signal where it repeats, else go on steadily."""
+    """Returns a field at rest. Its weights follow the signal where it repeats, else a line and its square in time."""
     spacing_mm = max(scan.grid.size_mm) / _COARSE_SPACINGS
     if signal.period_s is not None:
         between_s = float(np.median(np.diff(signal.times_s)))
@@ -53,7 +53,7 @@ def initial_field(scan: Scan, signal: MotionSignal, last_s: float, first_s: floa
 
 
 class FieldSearch:
-    """The search as a ``Stepwise`` of so many rounds on a scan made coarse. bending: as in ``FieldProblem``."""
+    """The search as a ``Stepwise`` on a coarse copy of the scan. rounds: how many. bending: as in ``FieldProblem``."""
 
     quantity, remedy = "residual", "check the scan for extreme values"
 
@@ -133,7 +133,7 @@ class FieldSearch:
         return sum_squares(self.problem.residual(one, volume))
 
     def _reconstructed(self, one: MotionField, volume: np.ndarray | None, passes: int) -> np.ndarray:
-        """Returns the volume after so many passes of ``fista`` on the coarse scan."""
+        """Returns the volume after ``passes`` passes of ``fista`` on the coarse scan."""
         options = FistaOptions(motion=self.motion, iterations=passes, prior="dct", subvoxels=1)
         deformation = one.deformation() if one.control_mm.any() else None
         inputs = MethodInputs(self.scan, options, self.rt, initial=volume, deformation=deformation)
