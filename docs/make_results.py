@@ -10,6 +10,7 @@ import re
 import sys
 from collections.abc import Callable, Iterable, Sequence
 from functools import cache, partial
+from operator import itemgetter
 from pathlib import Path
 from statistics import mean, stdev
 from typing import Any
@@ -552,21 +553,24 @@ def moving_known() -> str:
     return markdown(heads, rows) + f"\nThe mean loss is {means}.\n"
 
 
-def moving_unknown(motion: str) -> str:
-    """Moving volumes as if they rested, and with the field that ``moving`` finds."""
-    rows = []
-    for one in lines_of("moving.jsonl"):
-        if one["case"] == "unknown" and one.get("motion", "breathing") == motion:
-            means = [one["static_mean_psnr_db"], one["mean_psnr_db"]]
-            voxels = [one[key] * one["size"] / BOX_MM for key in ("mean_motion_error_mm", "p95_motion_error_mm")]
-            rows.append(
-                [one["volume"], f"{one['size']}³", str(one["views"]), *(f"{mean:.2f}" for mean in means)]
-                + [f"{means[1] - means[0]:+.2f}", f"{voxels[0]:.2f} ({voxels[1]:.2f})"]
-                + [f"{one['period_s']:.2f}" if one["period_s"] else "none"]
-                + [f"{one['static_seconds']:.0f}", f"{one['seconds']:.0f}"]
-            )
-    heads = ["volume", "voxels", "views", "as if at rest, dB", "`moving`, dB", "gain, dB", "field wrong by, voxels"]
-    return markdown([*heads, "period, s", "`fista`, s", "`moving`, s"], rows)
+def moving_unknown(motion: str, size: int) -> str:
+    """Moving volumes of size³ voxels as if they rested, and with the field that ``moving`` finds; the mean gain."""
+    rows: list[list[str]] = []
+    gains_db: dict[int, list[float]] = {}
+    periods_s = []
+    found = (one for one in lines_of("moving.jsonl") if one["case"] == "unknown" and one["size"] == size)
+    for one in sorted((one for one in found if one.get("motion", "breathing") == motion), key=itemgetter("views", "volume")):
+        gain_db = one["mean_psnr_db"] - one["static_mean_psnr_db"]
+        gains_db.setdefault(one["views"], []).append(gain_db)
+        periods_s.append(one["period_s"])
+        scores = [f"{one[case + 'mean_psnr_db']:.2f}/{one[case + 'mean_ssim']:.3f}" for case in ("static_", "")]
+        voxels = [one[key] * size / BOX_MM for key in ("mean_motion_error_mm", "p95_motion_error_mm")]
+        row = [one["volume"], str(one["views"]), *scores, f"{gain_db:+.2f}", f"{voxels[0]:.2f} ({voxels[1]:.2f})"]
+        rows.append([*row, f"{one['seconds']:.0f}", f"{one['seconds'] / one['static_seconds']:.1f}"])
+    heads = ["volume", "views", "as if at rest", "`moving`", "gain, dB", "field wrong by, voxels", "`moving`, s"]
+    means = ", ".join(f"{mean(of):.2f} dB (least {min(of):.2f}) from {views} views" for views, of in gains_db.items())
+    periods = f"{min(periods_s):.2f} to {max(periods_s):.2f} s" if all(periods_s) else "none"
+    return markdown([*heads, "times at rest"], rows) + f"\nThe mean gain is {means}. Periods found: {periods}.\n"
 
 
 def moving_insert() -> str:
@@ -578,8 +582,8 @@ def moving_insert() -> str:
                 [f"{one[key]:.4f}", f"{10 * one[key] / one['moved_mm']:.2f}"] if key in one else ["–", "–"]
                 for key in ("off_mm", "states_off_mm")
             ]
-            rows.append([one["motion"], f"{one['size']}³", f"{one['moved_mm']:.3f}", *pairs[0], *pairs[1]])
-    heads = ["field", "voxels", "motion, mm", "reference off by, mm", "of 10 mm", "states off by, mm", "of 10 mm"]
+            rows.append([one["motion"], *pairs[0], *pairs[1]])
+    heads = ["field", "reference off by, mm", "of 10 mm", "states off by, mm", "of 10 mm"]
     return markdown(heads, rows)
 
 
@@ -626,8 +630,8 @@ TABLES: dict[str, Callable[[], str]] = {
     "moving_rtk": moving_rtk,
     "moving_known": moving_known,
     "moving_insert": moving_insert,
-    "moving_unknown": lambda: moving_unknown("breathing"),
-    "moving_drying": lambda: moving_unknown("drying"),
+    "moving_unknown": lambda: moving_unknown("breathing", 64),
+    "moving_drying": lambda: moving_unknown("drying", 32),
     "moving_mace4d": moving_mace4d,
 }
 

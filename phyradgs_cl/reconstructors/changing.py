@@ -31,7 +31,8 @@ _STACKS, _FRAMES = 18, 3  # in memory at one time
 class ChangingOptions(IterativeOptions):
     """states: of the object, at the middles of equal parts of the scan; fewer where there are fewer frames. prior_weight: of
     total variation in space, relative to the error of the gradient as in ``fista``. time_weight: of a voxel's change from
-    one state to the next, relative to an equal step between two voxels. subsets and tv_iterations: as in ``fista``."""
+    one state to the next, relative to an equal step between two voxels. subsets: as in ``fista``, but at most two for each
+    frame of a state. tv_iterations: as in ``fista``."""
 
     TRIALS: ClassVar[tuple[int, int]] = (1, 8)
     """Iterations of the short runs of ``estimate``: the first passes, which touch new memory, are slower."""
@@ -60,7 +61,9 @@ def changing(scan: Scan, options: ChangingOptions, rt: Runtime, **arguments: Any
         prox = TvProx(rt, shape, (options.time_weight, *axis_weights(scan.grid)))
         weight = PriorWeight(system, frame_error(scan, options.motion), options.prior_weight)
         prior, nonnegative = TvPrior(prox, options.tv_iterations), options.nonnegative
-        runs.append(Fista(system, prior, weight, subsets=options.subsets, nonnegative=nonnegative))
+        # a state has few frames: if a frame were many subsets' share of them, steps would be too long and diverge
+        subsets = min(options.subsets, 2 * scan.frames // len(times_s))
+        runs.append(Fista(system, prior, weight, subsets=subsets, nonnegative=nonnegative))
         return runs[0]
 
     initial = None if inputs.initial is None else np.broadcast_to(inputs.initial, shape)

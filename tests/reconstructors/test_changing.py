@@ -151,6 +151,11 @@ def test_computed_frames_and_held_out_pixels_are_those_of_the_states(rt, scan) -
     assert resting.facts["held_out"]["holdout_rms"] > 0.01
 
 
+def test_subsets_of_fewer_than_half_a_frame_for_each_state_are_joined(rt, scan) -> None:
+    eight, eighty = (run(rt, scan, states=20, iterations=2, subsets=n).states.volumes for n in (8, 80))
+    np.testing.assert_array_equal(eight, eighty)
+
+
 def test_more_states_than_frames(rt) -> None:
     few = replace(empty_scan(3), projections=noise((3, *SHAPE)).astype(np.float32) ** 2)
     assert len(run(rt, few, iterations=1).states.times_s) == 3
