@@ -19,11 +19,13 @@ from phyradgs_cl.acquisition.shutter import Shutter
 from phyradgs_cl.acquisition.time_cells import TimeCells
 from phyradgs_cl.acquisition.trajectory import Trajectory
 from phyradgs_cl.errors import InputError
+from phyradgs_cl.fields import Deformation
 
 RAYS, SPLATS, LINE_POSES = "rays", "splats", "one pose per line"
 """The kinds of operator: ray projectors, splat projectors, and filtered backprojection."""
 _USUAL_TIMES, _MOST_TIMES = 6, 100  # of a line's exposure in the model ``PerRow``
 _FINE_STEP_VOXELS, _COARSE_STEP_VOXELS = 0.3, 3.6
+_OBJECT_STEP_VOXELS = 0.7  # of the object's fastest part: its mean way is shorter, and states stand 0.6 voxels apart
 _WEIGHT_TOLERANCE = 1e-3  # of the sum of a line's weights in a model of the user's own
 
 
@@ -139,15 +141,17 @@ class PerRow:
     def __post_init__(self) -> None:
         checks.whole("sub_intervals", self.sub_intervals, 0, 10_000)
 
-    def of(self, scan: Scan) -> "PerRow":
-        """Returns the model with the number of times that this scan needs.
+    def of(self, scan: Scan, object_mm_per_s: float = 0.0) -> "PerRow":
+        """Returns the model with the number of times that this scan, of an object of this speed, needs.
 
-        One time serves 0.3 voxels of the way of the grid's rim in an exposure, but 6 times serve up to 22 voxels. Beyond
-        that one time serves 3.6 voxels (measured in docs/results/settings.md)."""
+        One time serves 0.3 voxels of the way of the grid's rim in an exposure, or 0.7 voxels of the object's way, but 6
+        times serve up to 22 voxels. Beyond that one time serves 3.6 voxels (measured in docs/results/settings.md)."""
         if self.sub_intervals:
             return self
-        moved_voxels = rim_travel_voxels(scan)
-        fine, coarse = (math.ceil(moved_voxels / step) for step in (_FINE_STEP_VOXELS, _COARSE_STEP_VOXELS))
+        rim_voxels = rim_travel_voxels(scan)
+        object_voxels = object_mm_per_s * scan.shutter.exposure_s / min(scan.grid.voxel_size_mm)
+        fine = max(math.ceil(rim_voxels / _FINE_STEP_VOXELS), math.ceil(object_voxels / _OBJECT_STEP_VOXELS))
+        coarse = math.ceil(max(rim_voxels, object_voxels) / _COARSE_STEP_VOXELS)
         return PerRow(min(max(1, min(fine, _USUAL_TIMES), coarse), _MOST_TIMES))
 
     def cells(self, scan: Scan, frame: int) -> TimeCells:
@@ -231,6 +235,12 @@ def motion_of(motion: str | Motion) -> Motion:
     if motion not in MOTIONS:
         raise InputError("motion", checks.short_repr(motion), f"one of {', '.join(MOTIONS)}")
     return next(model() for model in MODELS if model.name == motion)
+
+
+def with_times(motion: Motion, scan: Scan, deformation: Deformation | None = None) -> Motion:
+    """Returns ``motion``; a ``PerRow`` without a number of times gets that of ``PerRow.of`` for an object that moves so."""
+    speed_mm_per_s = 0.0 if deformation is None else deformation.fastest_mm_per_s
+    return motion.of(scan, speed_mm_per_s) if isinstance(motion, PerRow) else motion
 
 
 def motion_facts(motion: Motion) -> dict[str, object]:

@@ -58,6 +58,26 @@ class Deformation:
         object.__setattr__(self, "times_s", times_s)
         object.__setattr__(self, "weights", weights)
 
+    @classmethod
+    def of_displacements(
+        cls, displacements_mm: np.ndarray, grid: Grid, times_s: "ArrayLike", spacing_mm: float, rank: int = 2
+    ) -> "Deformation":
+        """Returns the deformation that is closest to dense displacements w (T, nz, ny, nx, 3) in mm, components x, y, z, at
+        the voxel centres of ``grid`` and at times (T,), as image registration gives them.
+
+        They become at most ``rank`` fields by singular values, whose weights have a largest size of 1, on control points
+        ``spacing_mm`` apart. Raises InputError for other shapes, values that are not finite, and times that do not rise."""
+        times_s = checks.numbers("times_s", times_s, (None,))
+        dense_mm = checks.numbers("displacements_mm", displacements_mm, (len(times_s), *grid.shape, 3))
+        checks.whole("rank", rank, 1, 1000)
+        rows = dense_mm.reshape(len(times_s), -1)
+        squares, vectors = np.linalg.eigh(rows @ rows.T)  # small, where singular values of the rows would be large
+        weights = vectors[:, ::-1][:, : min(rank, len(times_s))]
+        largest = np.abs(weights).max(0)
+        fields_mm = (weights * largest).T @ rows
+        control_mm, origin_mm = fitted_control_mm(fields_mm.reshape(-1, *dense_mm.shape[1:]), grid, spacing_mm)
+        return cls(control_mm, origin_mm, spacing_mm, times_s, weights / largest)
+
     def __repr__(self) -> str:
         rank, nz, ny, nx, _ = self.control_mm.shape
         return f"Deformation(rank {rank}, {nz} x {ny} x {nx} control points, {len(self.times_s)} times)"
@@ -202,6 +222,16 @@ def control_points(
     counts = [int(np.ceil((side_mm + 2 * margin_mm) / spacing_mm)) + 3 for side_mm in grid.size_mm]
     first_mm = [middle - (n - 1) / 2 * spacing_mm for middle, n in zip(grid.offset_mm, counts, strict=True)]
     return (first_mm[2], first_mm[1], first_mm[0]), (counts[0], counts[1], counts[2])
+
+
+def fitted_control_mm(fields_mm: np.ndarray, grid: Grid, spacing_mm: float) -> tuple[np.ndarray, tuple[float, float, float]]:
+    """Returns control vectors (R, cz, cy, cx, 3), and their origin in mm, whose splines follow fields (R, nz, ny, nx, 3) on
+    ``grid`` best: by least squares along one axis after the other, since the splines are a product."""
+    origin_mm, counts = control_points(grid, spacing_mm)
+    empty = Deformation(np.zeros((1, *counts, 3)), origin_mm, spacing_mm, np.zeros(1), np.zeros((1, 1)))
+    inverses = [np.linalg.pinv(matrix, rcond=1e-3) for matrix in empty.bases(grid)]
+    fitted = [np.einsum("kz,ly,mx,zyxi->klmi", *inverses, one.astype(np.float64), optimize=True) for one in fields_mm]
+    return np.stack(fitted), origin_mm
 
 
 def cubic(offset: np.ndarray) -> np.ndarray:

@@ -29,10 +29,10 @@ _STACKS, _FRAMES = 18, 3  # in memory at one time
 
 @dataclass(frozen=True)
 class ChangingOptions(IterativeOptions):
-    """states: of the object, at the middles of equal parts of the scan; fewer where there are fewer frames. prior_weight: of
-    total variation in space, relative to the error of the gradient as in ``fista``. time_weight: of a voxel's change from
-    one state to the next, relative to an equal step between two voxels. subsets: as in ``fista``, but at most two for each
-    frame of a state. tv_iterations: as in ``fista``."""
+    """states: of the object, each of as many frames; fewer where there are fewer frames. prior_weight: of total variation in
+    space, relative to the error of the gradient as in ``fista``. time_weight: of a voxel's change from one state to the
+    next, relative to an equal step between two voxels. subsets: as in ``fista``, but at most two for each frame of a state.
+    tv_iterations: as in ``fista``."""
 
     TRIALS: ClassVar[tuple[int, int]] = (1, 8)
     """Iterations of the short runs of ``estimate``: the first passes, which touch new memory, are slower."""
@@ -79,10 +79,10 @@ def changing(scan: Scan, options: ChangingOptions, rt: Runtime, **arguments: Any
 
 
 def state_times_s(scan: Scan, count: int) -> np.ndarray:
-    """Returns the middles (K,) in s of equal parts of the scan's time, at most one for each frame."""
-    first_s, last_s = float(scan.frame_start_s.min()), float(scan.frame_start_s.max()) + scan.shutter.span_s
-    states = min(count, scan.frames)
-    return first_s + (np.arange(states) + 0.5) / states * (last_s - first_s)
+    """Returns the mean times (K,) in s of equal shares of the frames, at most one for each frame, and so none in a pause."""
+    middles_s = np.unique(np.asarray(scan.frame_start_s, np.float64)) + scan.shutter.span_s / 2
+    shares = np.array_split(middles_s, min(count, len(middles_s)))
+    return np.array([share.mean() for share in shares])
 
 
 METHOD = Method(changing, {"default": ChangingOptions()}, takes_initial=True, finds_motion=True)

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from phyradgs_cl.acquisition import Scan
-from phyradgs_cl.acquisition.motion import PerRow, check_own_motion
+from phyradgs_cl.acquisition.motion import check_own_motion, with_times
 from phyradgs_cl.errors import InputError, OutOfMemoryError, naming_host_memory
 from phyradgs_cl.fields import Deformation, Grid, triple
 from phyradgs_cl.io.files import HOST_SHARE, free_bytes, host_bytes
@@ -70,14 +70,14 @@ def reconstruct(
     ready = prepared(scan, preprocessing, rt)
     ready.check_sight()
     check_own_motion(getattr(options, "motion", None), ready)
-    if isinstance(getattr(options, "motion", None), PerRow):
-        options = replace(options, motion=options.motion.of(ready))
     if plan.initial is not None:
         more["initial"] = _initial(plan, plan.initial, ready.grid)
     deformation = None if plan.object_motion is None else plan.object_motion.deformation
     if deformation is not None:
         check_object_motion(deformation, ready)
         more["deformation"] = deformation
+    if hasattr(options, "motion") and plan.method_name != "moving":  # which finds the object's speed itself
+        options = replace(options, motion=with_times(options.motion, ready, deformation))
     hidden = held_out(ready, preprocessing.holdout) if preprocessing.holdout else None
     visible = ready if hidden is None else with_masked(ready, hidden)
     run = partial(method_of(plan.method).run, rt=rt, seed=plan.seed)

@@ -160,6 +160,8 @@ def test_the_rim_decides_on_the_times_of_an_exposure(size, exposure_deg, count) 
     assert PerRow().of(fly) == PerRow(count) and PerRow(7).of(fly) == PerRow(7)
     assert PerRow().cells(fly, 1).count == PerRow(count).cells(fly, 1).count
     assert PerRow().of(replace(fly, is_fly=False)) == PerRow(1)
+    quick_mm_per_s = 2 * 2.0 / size / fly.shutter.exposure_s  # two voxels in an exposure: three times
+    assert PerRow().of(fly, quick_mm_per_s) == PerRow(max(count, 3)) and PerRow(7).of(fly, quick_mm_per_s) == PerRow(7)
     flat = replace(fly, grid=replace(fly.grid, voxel_size_mm=(0.1 / size, *fly.grid.voxel_size_mm[1:])))
     assert PerRow().of(flat) == PerRow(count)  # the rim moves within slices
 

@@ -41,6 +41,19 @@ def test_values_are_those_of_scipys_splines() -> None:
     assert (expected == 0).any() and (expected > 0.1).any()
 
 
+def test_dense_displacements_come_back_as_fields_of_low_rank() -> None:
+    field, times_s = a_deformation(), [1.0, 1.4, 2.0, 3.0, 3.9]
+    dense_mm = np.stack([field.on_grid_mm(GRID, weights) for weights in field.weights_at(times_s)])
+    found = Deformation.of_displacements(dense_mm, GRID, times_s, SPACING_MM)
+    assert found.rank == 2 and np.abs(found.weights).max(0) == pytest.approx([1, 1])
+    again_mm = np.stack([found.on_grid_mm(GRID, weights) for weights in found.weights_at(times_s)])
+    np.testing.assert_allclose(again_mm, dense_mm, atol=0.02 * np.abs(dense_mm).max())
+    still = Deformation.of_displacements(0 * dense_mm, GRID, times_s, SPACING_MM, rank=7)
+    assert still.rank == 5 and still.is_still
+    with pytest.raises(InputError, match="displacements_mm"):
+        Deformation.of_displacements(dense_mm[:4], GRID, times_s, SPACING_MM)
+
+
 def test_grid_and_points_agree() -> None:
     field = a_deformation()
     on_grid = field.on_grid_mm(GRID, [0.7, -0.4])

@@ -185,6 +185,14 @@ def test_states_cover_the_motion(rt) -> None:
     assert np.sqrt(np.einsum("tr,rs,ts->t", off, states.metric, off)).max() < 1.0
 
 
+def test_a_field_counts_by_how_far_it_moves_and_not_by_its_unit() -> None:
+    one = deformation(0.3)
+    control_mm = one.control_mm * np.array([10.0, 0.1]).reshape(2, 1, 1, 1, 1)
+    other = Deformation(control_mm, one.origin_mm, one.spacing_mm, TIMES_S, one.weights * [0.1, 10.0])
+    assert states_of(other).count == states_of(one).count
+    np.testing.assert_allclose(states_of(other).weights, states_of(one).weights * [0.1, 10.0], atol=1e-9)
+
+
 def test_scans_of_more_frames_have_more_states(rt) -> None:
     fast = deformation(3.0)
     counts = [MotionStates.of_times(fast, GRID, TIMES_S, blends=False, most=most).count for most in (2, 5)]

@@ -156,6 +156,13 @@ def test_subsets_of_fewer_than_half_a_frame_for_each_state_are_joined(rt, scan) 
     np.testing.assert_array_equal(eight, eighty)
 
 
+def test_no_state_is_in_a_pause(rt) -> None:
+    times_s = np.concatenate([np.arange(40.0), 1000 + np.arange(40.0)])
+    paused = replace(empty_scan(), frame_start_s=times_s)
+    found = run(rt, paused, states=8, iterations=1).states.times_s
+    np.testing.assert_allclose(found, [5, 15, 25, 35, 1005, 1015, 1025, 1035], atol=0.1)
+
+
 def test_more_states_than_frames(rt) -> None:
     few = replace(empty_scan(3), projections=noise((3, *SHAPE)).astype(np.float32) ** 2)
     assert len(run(rt, few, iterations=1).states.times_s) == 3

@@ -22,13 +22,15 @@ from phyradgs_cl.phantoms import shepp_logan
 from phyradgs_cl.reconstructors import ObjectMotion, Reconstruction, plan_run, reconstruct
 from phyradgs_cl.reconstructors.moving import motion_line
 from phyradgs_cl.reconstructors.moving.field import MotionField
-from phyradgs_cl.reconstructors.moving.search import coarse_scan, initial_field
+from phyradgs_cl.reconstructors.moving.search import FieldSearch, coarse_scan, initial_field
 from phyradgs_cl.reconstructors.moving.signal import (
     Bending,
+    MotionSignal,
     TemporalSplines,
     load_gating,
     middle_times_s,
     motion_signal,
+    period_of,
     signal_of,
 )
 from phyradgs_cl.reconstructors.result import MOTION_FOUND, Progress
@@ -199,6 +201,38 @@ def test_a_signal_of_a_file_is_followed_and_others_are_refused(scan, tmp_path) -
         loaded(tmp_path / "none.csv", scan)
     with pytest.raises(InputError, match="gating"):
         plan_run("moving", {"gating": "breaths"})
+
+
+def test_a_signal_that_does_not_repeat_is_followed_without_a_period(scan, tmp_path) -> None:
+    times_s = np.linspace(-1, 22, 400)
+    path = tmp_path / "drying.csv"
+    path.write_text("\n".join(f"{t},{np.exp(-t / 5)}" for t in times_s), encoding="utf-8-sig")
+    signal = loaded(path, scan)
+    assert signal.period_s is None and len(signal.values) == 400
+    field = initial_field(scan, signal, 16.0, 0.0)
+    assert field.temporal.shape[0] < 40
+    assert np.corrcoef(field.deformation().weights_at(times_s[20:300])[:, 0], np.exp(-times_s[20:300] / 5))[0, 1] > 0.99
+    found = {"moves": True, "follows": True, "period_s": None, "gain": 0.4, "rms_mm": 0.1}
+    assert "following a signal; " in motion_line(found) and "free in time" in motion_line({**found, "follows": False})
+
+
+def test_long_and_uneven_signals() -> None:
+    """A belt's 60,000 values, and pauses between them, in which the quadrature goes on."""
+    long_s = np.arange(60_000) / 100
+    assert period_of(long_s, np.cos(2 * np.pi * long_s / 4)) == pytest.approx(4, rel=0.01)
+    times_s = np.sort(np.random.default_rng(0).uniform(0, 40, 500))
+    later = MotionSignal(times_s, np.cos(2 * np.pi * times_s / 4)).pair()[:, 1]
+    assert np.corrcoef(later, np.sin(2 * np.pi * times_s / 4))[0, 1] > 0.97
+
+
+def test_the_search_sees_every_breath_of_a_long_scan(rt, scan) -> None:
+    many = replace(
+        scan, projections=np.zeros((700, *SHAPE), np.float32), frame_start_s=0.4 * np.arange(700), moving_truth=None
+    )
+    times_s = middle_times_s(many)
+    signals = [MotionSignal(times_s, np.cos(times_s), knot_s=knot_s) for knot_s in (0.4, 10.0)]
+    searches = [FieldSearch(rt, many, PerRow(), signal, 1, 0.01) for signal in signals]
+    assert [one.scan.frames for one in searches] == [699, 600]
 
 
 def test_phases_of_a_file_or_of_the_scan_are_followed(rt, scan, tmp_path) -> None:

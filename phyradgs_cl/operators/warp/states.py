@@ -41,12 +41,12 @@ class MotionStates:
         zeros have several states too."""
         units, fields_mm = np.eye(deformation.rank), unit_fields_mm(deformation, grid)
         voxel_mm = min(grid.voxel_size_mm)
-        moving = np.square(fields_mm).sum((0, -1))
+        seen = np.unique(deformation.weights_at(times_s), axis=0)
+        moving = np.einsum("r,rzyxi->zyx", np.square(seen).max(0), np.square(fields_mm))
         moves = moving >= _MOVES * moving.max(initial=0.0)
         parts = fields_mm[:, moves].reshape(len(units), -1).astype(np.float64) / voxel_mm
         metric = parts @ parts.T / max(np.count_nonzero(moves), 1)
         metric += least_voxels**2 * units
-        seen = np.unique(deformation.weights_at(times_s), axis=0)
         chosen = [int(np.argmin(_length(seen - seen.mean(0), metric)))]
         spacing = _SPACING if blends else _SPACING_OF_NEAREST
         distance = _length(seen - seen[chosen[0]], metric)

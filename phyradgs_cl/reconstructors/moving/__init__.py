@@ -16,5 +16,7 @@ def motion_line(found: Mapping[str, Any]) -> str:
             gain += ", which a field's coefficients can explain without motion: take more views"
         return f"object at rest: no motion shown ({gain})"
     period_s = found["period_s"]
-    follows = "free in time" if period_s is None else f"following a signal with a period of {period_s:.3g} s"
+    follows = "following a signal" if period_s or found.get("follows") else "free in time"
+    if period_s:
+        follows += f" with a period of {period_s:.3g} s"
     return f"object moves by {found['rms_mm']:.3g} mm RMS, {follows}; {gain}"

@@ -13,6 +13,7 @@ import numpy as np
 from phyradgs_cl.acquisition import Motion, Scan
 from phyradgs_cl.acquisition.time_cells import TimeCells
 from phyradgs_cl.fields import Deformation, control_points
+from phyradgs_cl.fields.deformation import fitted_control_mm
 from phyradgs_cl.operators.warp.derivative import FieldDerivative
 from phyradgs_cl.operators.warp.operator import WarpedOperator
 from phyradgs_cl.operators.warp.stack import StateStack
@@ -63,15 +64,9 @@ class MotionField:
 
     def refined(self, scan: Scan, spacing_mm: float) -> "MotionField":
         """Returns the field on control points that are closer to each other: those that follow its values best."""
-        origin_mm, counts = control_points(scan.grid, spacing_mm)
-        fine = Deformation(np.zeros((1, *counts, 3)), origin_mm, spacing_mm, np.zeros(1), np.zeros((1, 1)))
-        # least squares on the voxels, one axis after the other: the splines are a product
-        inverses = [np.linalg.pinv(matrix, rcond=1e-3) for matrix in fine.bases(scan.grid)]
         coarse = self.deformation()
-        control_mm = np.stack([
-            np.einsum("kz,ly,mx,zyxi->klmi", *inverses, coarse.on_grid_mm(scan.grid, unit).astype(np.float64), optimize=True)
-            for unit in np.eye(len(self.control_mm))
-        ])  # fmt: skip
+        units_mm = np.stack([coarse.on_grid_mm(scan.grid, unit) for unit in np.eye(coarse.rank)])
+        control_mm, origin_mm = fitted_control_mm(units_mm, scan.grid, spacing_mm)
         return replace(self, control_mm=control_mm, origin_mm=origin_mm, spacing_mm=spacing_mm)
 
 

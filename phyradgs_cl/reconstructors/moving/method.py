@@ -13,6 +13,7 @@ import numpy as np
 
 from phyradgs_cl import checks
 from phyradgs_cl.acquisition import Scan
+from phyradgs_cl.acquisition.motion import with_times
 from phyradgs_cl.checks import ceil_div
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Deformation, triple
@@ -112,6 +113,7 @@ def moving(scan: Scan, options: MovingOptions, rt: Runtime, **arguments: Any) ->
     with report.through(partial(_with_field_in_progress, one)):
         result = run_stages(stages, replace(inputs, report=report))
     state = None if result.state is None else {**result.state, **one.state()}
+    options = replace(options, motion=with_times(options.motion, scan, one.for_passes))
     result.facts.update(method="moving", options=option_facts(options), **{MOTION_FOUND: _motion_facts(one, signal, scan)})
     return replace(result, state=state, deformation=one.deformation)
 
@@ -126,7 +128,7 @@ def _signal_of(scan: Scan, gating: str) -> MotionSignal:
     if gating.endswith(".csv"):
         return signal_of(load_gating(gating, scan), scan, f"gating {gating}")
     signal = motion_signal(scan)
-    return replace(signal, period_s=None) if gating == "free" else signal
+    return replace(signal, period_s=None, knot_s=None) if gating == "free" else signal
 
 
 def _search(inputs: MethodInputs, signal: MotionSignal, one: _Field) -> Reconstruction:
@@ -146,8 +148,9 @@ def _with_field(
     run: Callable[[MethodInputs], Reconstruction], of_passes: MethodInputs, one: _Field, is_first: bool, inputs: MethodInputs
 ) -> Reconstruction:
     """Runs a stage of ``fista`` with the field. The first one starts as ``fista`` does, not from the coarse volume."""
+    options = replace(of_passes.options, motion=with_times(of_passes.options.motion, inputs.scan, one.for_passes))
     initial = of_passes.initial if is_first else inputs.initial
-    return run(replace(inputs, options=of_passes.options, initial=initial, deformation=one.for_passes))
+    return run(replace(inputs, options=options, initial=initial, deformation=one.for_passes))
 
 
 def _with_field_in_progress(one: _Field, progress: Progress) -> Progress:
@@ -157,10 +160,12 @@ def _with_field_in_progress(one: _Field, progress: Progress) -> Progress:
 def _motion_facts(one: _Field, signal: MotionSignal, scan: Scan) -> dict[str, object]:
     """Returns what was found, for the result: displacements relative to the mean place of matter in the scan."""
     moves = one.for_passes is not None
-    facts: dict[str, object] = {"moves": moves, "period_s": signal.period_s, "gain": one.gain}
+    follows = signal.knot_s is not None
+    facts: dict[str, object] = {"moves": moves, "follows": follows, "period_s": signal.period_s, "gain": one.gain}
     if (field := one.for_passes) is None:
         return facts
     units = np.stack([field.on_grid_mm(scan.grid, unit) for unit in np.eye(field.rank)]).reshape(field.rank, -1)
     gram = units.astype(np.float64) @ units.T.astype(np.float64) / (units.shape[1] / 3)
-    squares_mm2 = np.einsum("tr,rs,ts->t", field.weights, gram, field.weights)
+    weights = field.weights - field.weights.mean(0)
+    squares_mm2 = np.einsum("tr,rs,ts->t", weights, gram, weights)
     return {**facts, "rms_mm": float(np.sqrt(squares_mm2.mean()))}

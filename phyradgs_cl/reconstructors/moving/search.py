@@ -10,8 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from phyradgs_cl.acquisition import Motion, Scan
+from phyradgs_cl.acquisition import Motion, PerRow, Scan
 from phyradgs_cl.acquisition.altered.coarse import SMOOTHING, binned, fewer_frames, smooth
+from phyradgs_cl.acquisition.motion import with_times
 from phyradgs_cl.fields import Deformation, Grid, triple
 from phyradgs_cl.metrics import resampled
 from phyradgs_cl.reconstructors.checkpoint import State
@@ -22,29 +23,30 @@ from phyradgs_cl.reconstructors.voxels.fista import FistaOptions, fista_stages
 from phyradgs_cl.reconstructors.voxels.run import MethodInputs
 from phyradgs_cl.runtime import Runtime
 
-_MOST_COLUMNS, _MOST_VOXELS, _MOST_FRAMES = 64, 32, 600  # of the coarse scan
+_MOST_COLUMNS, _MOST_VOXELS, _MOST_FRAMES = 64, 32, 600  # of the coarse scan; more frames where a signal has more knots
+_TIMES_PER_PERIOD, _MOST_TIMES = 12, 6  # at which exposures see the object at least; but of one exposure
 _FIRST_PASSES, _PASSES = 8, 3  # of fista, at rest and in a round
 _COARSE_SPACINGS, _FINE_SPACINGS = 2, 4  # of control points along the box's longest side
 _FINE_BENDING = (_FINE_SPACINGS / _COARSE_SPACINGS) ** 4  # times as stiff in terms of coefficients is as stiff in mm
 _COARSE_SHARE = 0.6  # of the rounds
-_KNOTS_PER_PERIOD, _FREE_KNOTS = 6, 6
+_FREE_KNOTS = 6
 _AT_REST = "no motion found"
 
 
-def coarse_scan(scan: Scan) -> Scan:
-    """Returns the scan with blocks of pixels, few voxels in the same box, and at most 600 frames."""
+def coarse_scan(scan: Scan, most_frames: int = _MOST_FRAMES) -> Scan:
+    """Returns the scan with blocks of pixels, few voxels in the same box, and at most ``most_frames`` frames."""
     block = math.ceil(max(scan.geometry.detector_shape) / _MOST_COLUMNS)
-    small = binned(smooth(fewer_frames(scan, _MOST_FRAMES), SMOOTHING * block if block > 1 else 0.0), block)
+    small = binned(smooth(fewer_frames(scan, most_frames), SMOOTHING * block if block > 1 else 0.0), block)
     least_mm = max(max(scan.grid.size_mm) / _MOST_VOXELS, min(scan.grid.voxel_size_mm))
     return replace(small, grid=scan.grid.in_shape(triple(max(1, round(side / least_mm)) for side in scan.grid.size_mm)))
 
 
 def initial_field(scan: Scan, signal: MotionSignal, last_s: float, first_s: float) -> MotionField:
-    """Returns a field at rest. Its weights follow the signal where it repeats, else a line and its square in time."""
+    """Returns a field at rest. Its weights follow a signal that has knots, else a line and its square in time."""
     spacing_mm = max(scan.grid.size_mm) / _COARSE_SPACINGS
-    if signal.period_s is not None:
+    if signal.knot_s is not None:
         between_s = float(np.median(np.diff(signal.times_s)))
-        splines = TemporalSplines.of_step(first_s, last_s, max(signal.period_s / _KNOTS_PER_PERIOD, between_s))
+        splines = TemporalSplines.of_step(first_s, last_s, max(signal.knot_s, between_s))
         return MotionField.at_rest(scan, spacing_mm, splines, splines.fit(signal.times_s, signal.pair()))
     splines = TemporalSplines.of_step(first_s, last_s, (last_s - first_s) / _FREE_KNOTS)
     times_s = splines.node_times_s
@@ -60,9 +62,11 @@ class FieldSearch:
     def __init__(
         self, rt: Runtime, scan: Scan, motion: Motion, signal: MotionSignal, rounds: int, bending: float
     ) -> None:
-        self.rt, self.grid, self.motion = rt, scan.grid, motion
-        self.scan, self.iterations, self.iteration = coarse_scan(scan), rounds, 0
-        self.problem = FieldProblem(rt, self.scan, motion, bending)
+        knots = float(np.ptp(scan.frame_start_s)) / signal.knot_s if signal.knot_s else 0.0
+        self.rt, self.grid, self.iterations, self.iteration = rt, scan.grid, rounds, 0
+        self.scan = coarse_scan(scan, max(_MOST_FRAMES, math.ceil(knots)))
+        self.motion = _with_times(motion, scan, signal.period_s)
+        self.problem = FieldProblem(rt, self.scan, self.motion, bending)
         times_s = self.problem.times_s
         self.field = initial_field(self.scan, signal, float(times_s.max()), float(times_s.min()))
         self.volume = np.zeros(self.scan.grid.shape, np.float32)
@@ -139,6 +143,15 @@ class FieldSearch:
         inputs = MethodInputs(self.scan, options, self.rt, initial=volume, deformation=deformation)
         (stage,) = fista_stages(inputs)
         return stage.run(inputs).volume
+
+
+def _with_times(motion: Motion, scan: Scan, period_s: float | None) -> Motion:
+    """Returns the model with as many times as gantry and period need: the object's speed is not known yet."""
+    timed = with_times(motion, scan)
+    if motion != PerRow() or not isinstance(timed, PerRow) or period_s is None:
+        return timed
+    times = math.ceil(_TIMES_PER_PERIOD * scan.shutter.exposure_s / period_s)
+    return PerRow(max(timed.sub_intervals, min(times, _MOST_TIMES)))
 
 
 def _difference(one: MotionField, other: MotionField) -> float:

@@ -24,7 +24,9 @@ _BAND = 0.25  # on either side of the most frequent rate: breaths differ in leng
 _PERIODIC_SHARE = 0.5  # of the power in that band, beyond what white noise has there
 _FEWEST_FRAMES = 16
 _FEWEST = 4  # values
-_FRAMES_PER_PERIOD = 6  # where no rate dominates
+_KNOTS_PER_PERIOD = 6
+_SLOWER = 0.95  # of the power of a stated signal that does not repeat: knots follow what is slower than the rest
+_MOST_EVEN = 100_000  # times
 _FORMS = f"at least {_FEWEST} lines: time in s, value; or one value for each frame"
 
 
@@ -105,16 +107,21 @@ def _apply(matrix: np.ndarray, control: np.ndarray, axis: int) -> np.ndarray:
 class MotionSignal:
     """How the object's motion goes on in time. times_s (F,): the middles of the frames, rising. values (F,): mean 0, largest
     size 1, without a unit or a sign. period_s: mean length of a cycle, or None where no cycle repeats. later (F,): the
-    quadrature, a quarter of a cycle later; None derives it from ``values``."""
+    quadrature, a quarter of a cycle later; None derives it from ``values``. knot_s: between two knots of weights that follow
+    the signal; None: weights need not follow it."""
 
     times_s: np.ndarray
     values: np.ndarray
     period_s: float | None = None
     later: np.ndarray | None = None
+    knot_s: float | None = None
 
     def pair(self) -> np.ndarray:
         """Returns the signal and its quadrature (F, 2), a quarter of a cycle later; both together follow hysteresis."""
-        later = np.imag(hilbert(self.values)) if self.later is None else self.later
+        later = self.later
+        if later is None:
+            even_s, even = _evenly(self.times_s, self.values)
+            later = np.interp(self.times_s, even_s, np.imag(hilbert(even)))
         return np.stack([self.values, scaled(later)], -1)
 
 
@@ -126,7 +133,8 @@ def motion_signal(scan: Scan) -> MotionSignal:
     explained = _gantry(scan, times_s, order)
     rest = rows - explained @ np.linalg.lstsq(explained, rows, rcond=None)[0]
     values = scaled(np.linalg.svd(rest, full_matrices=False)[0][:, 0])
-    return MotionSignal(times_s, values, period_of(times_s, values))
+    period_s = period_of(times_s, values)
+    return MotionSignal(times_s, values, period_s, knot_s=None if period_s is None else period_s / _KNOTS_PER_PERIOD)
 
 
 def middle_times_s(scan: Scan) -> np.ndarray:
@@ -136,23 +144,35 @@ def middle_times_s(scan: Scan) -> np.ndarray:
 
 def period_of(times_s: np.ndarray, values: np.ndarray) -> float | None:
     """Returns the mean period of a signal (F,), or None where its power is not concentrated at one rate."""
-    count, step_s = len(values), float(np.median(np.diff(times_s))) if len(values) > 1 else 0.0
-    if count < _FEWEST_FRAMES or step_s <= 0:
+    power, length_s = _spectrum(times_s, values)
+    last = len(power) - 1
+    if len(values) < _FEWEST_FRAMES or last < _FEWEST_CYCLES or not power.sum() > 0:
         return None
-    even_s = times_s[0] + step_s * np.arange(int(round((times_s[-1] - times_s[0]) / step_s)) + 1)
-    even = np.interp(even_s, times_s, values)
-    power = np.abs(np.fft.rfft((even - even.mean()) * np.hanning(len(even)))) ** 2
-    rates = np.arange(len(power))  # cycles in the scan
-    if len(power) <= _FEWEST_CYCLES or not power.sum() > 0:
-        return None
-    in_band = np.abs(rates[:, None] / np.maximum(rates, 1) - 1) <= _BAND
-    width = in_band[1:].mean(0)
-    share = (power @ in_band / power.sum() - width) / (1 - width)
-    peak = _FEWEST_CYCLES + int(np.argmax(share[_FEWEST_CYCLES:]))
+    rates = np.arange(_FEWEST_CYCLES, last + 1)
+    first_in, behind = np.ceil((1 - _BAND) * rates).astype(int), np.minimum((1 + _BAND) * rates, last).astype(int) + 1
+    below = np.append(0.0, np.cumsum(power))
+    width = (behind - first_in) / last
+    share = ((below[behind] - below[first_in]) / power.sum() - width) / (1 - width)
+    peak = int(np.argmax(share))
     if share[peak] < _PERIODIC_SHARE:
         return None
-    mean_rate = float(power @ (in_band[:, peak] * rates) / (power @ in_band[:, peak]))
-    return len(even) * step_s / mean_rate
+    band = np.arange(first_in[peak], behind[peak])
+    return length_s * float(power[band].sum() / (power[band] @ band))
+
+
+def _spectrum(times_s: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, float]:
+    """Returns the power of a signal (n,) at 0, 1, 2 … cycles in the time that is returned with it."""
+    even_s, even = _evenly(times_s, values)
+    power = np.abs(np.fft.rfft((even - even.mean()) * np.hanning(len(even)))) ** 2
+    return power, float(even_s[-1] - even_s[0]) * len(even) / max(len(even) - 1, 1)
+
+
+def _evenly(times_s: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Returns times at the median step of ``times_s`` (n,), and the values at them, straight between two of ``values``."""
+    length_s = float(times_s[-1] - times_s[0])
+    step_s = max(float(np.median(np.diff(times_s))) if len(times_s) > 1 else 0.0, length_s / _MOST_EVEN)
+    even_s = times_s[0] + step_s * np.arange(round(length_s / step_s) + 1 if step_s > 0 else 1)
+    return even_s, np.interp(even_s, times_s, values)
 
 
 def _shroud(scan: Scan) -> np.ndarray:
@@ -192,7 +212,8 @@ def load_gating(path: str, scan: Scan) -> Gating:
     heading. Values whose heading is ``phase`` are phases in cycles. Raises InputError for other files."""
     subject = f"gating {path}"
     try:
-        lines = [line.strip() for line in Path(path).read_text(encoding="utf-8").splitlines() if line.strip()]
+        # utf-8-sig: spreadsheets begin a file with a mark
+        lines = [line.strip() for line in Path(path).read_text(encoding="utf-8-sig").splitlines() if line.strip()]
         names, lines = (lines[0].lower(), lines[1:]) if lines and not _is_number(lines[0].split(",")[0]) else ("", lines)
         rows = [[float(word) for word in line.split(",")] for line in lines]
     except OSError as error:
@@ -220,8 +241,9 @@ def load_gating(path: str, scan: Scan) -> Gating:
 
 
 def signal_of(gating: Gating, scan: Scan, subject: str) -> MotionSignal:
-    """Returns the signal of a gating. Its period is that of the phases or of the spectrum, or six frames' time where no rate
-    dominates. Raises InputError, about ``subject``, for times that miss the scan and values that do not change."""
+    """Returns the signal of a gating, with the period of the phases, or of the spectrum where one rate dominates.
+
+    Raises InputError, about ``subject``, for times that miss the scan and values that do not change."""
     times_s, values = gating.times_s, gating.values
     advance = float(gating.steps.sum()) if gating.is_phase else 0.0
     if advance == 0 and (gating.is_phase or np.ptp(values) == 0):
@@ -233,10 +255,13 @@ def signal_of(gating: Gating, scan: Scan, subject: str) -> MotionSignal:
         raise InputError(subject, found, f"times that cover the scan, {first_s:.4g} to {last_s:.4g} s")
     if gating.is_phase:
         angles_rad = 2 * np.pi * values
-        period_s = float(times_s[-1] - times_s[0]) / advance
-        return MotionSignal(times_s, scaled(np.cos(angles_rad)), period_s, np.sin(angles_rad))
-    step_s = float(np.median(np.diff(np.sort(scan.frame_start_s)))) if scan.frames > 1 else 1.0
-    return MotionSignal(times_s, scaled(values), period_of(times_s, values) or _FRAMES_PER_PERIOD * step_s)
+        cycle_s = float(times_s[-1] - times_s[0]) / advance
+        return MotionSignal(times_s, scaled(np.cos(angles_rad)), cycle_s, np.sin(angles_rad), cycle_s / _KNOTS_PER_PERIOD)
+    period_s = period_of(times_s, values)
+    power, length_s = _spectrum(times_s, values)
+    fastest = int(np.searchsorted(np.cumsum(power), _SLOWER * power.sum()))
+    fastest_s = period_s or length_s / max(fastest, 1)
+    return MotionSignal(times_s, scaled(values), period_s, knot_s=fastest_s / _KNOTS_PER_PERIOD)
 
 
 def _is_number(word: str) -> bool:

@@ -182,6 +182,7 @@ def fista_stages(inputs: MethodInputs) -> list[Stage]:
 def _run(inputs: MethodInputs, options: FistaOptions, image: np.ndarray | None, parts: int = 1) -> Reconstruction:
     """Runs one stage, with every voxel divided into ``parts`` along each side. ``image``: the prior image of piccs."""
     scan, rt = replace(inputs.scan, grid=inputs.scan.grid.finer(parts), reference=None, moving_truth=None), inputs.rt
+    options = replace(options, motion=inputs.options.motion)  # moving knows it only when its field is found
     image, initial = repeated(image, parts), repeated(inputs.initial, parts)
 
     def make(system: System) -> Fista:
