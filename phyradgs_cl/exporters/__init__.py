@@ -68,9 +68,11 @@ def _in_unit(values: np.ndarray, mu_water_per_mm: float | None) -> tuple[np.ndar
 
 
 def state_times_s(moves: Deformation | States, count: int, during_s: tuple[float, float] | None = None) -> list[float]:
-    """Returns the middles (count,) in s of equal parts of a time, by default that of the motion. InputError: a count outside
-    1 to 1000, a time that ends before it begins, a time without any of the motion's."""
+    """Returns the middles (count,) in s of equal parts of a time, by default that of the motion; the stored times of as many
+    states. InputError: a count outside 1 to 1000, a time that ends before it begins, a time without any of the motion's."""
     checks.whole("--states", count, 1, 1000)
+    if isinstance(moves, States) and during_s is None and count == len(moves.times_s):
+        return moves.times_s.tolist()
     begin_s, end_s = moves.span_s if isinstance(moves, States) else (float(moves.times_s[0]), float(moves.times_s[-1]))
     first_s, last_s = during_s or (begin_s, end_s)
     if during_s is not None and not first_s < last_s:

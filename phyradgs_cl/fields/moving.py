@@ -38,8 +38,8 @@ class States:
     @property
     def span_s(self) -> tuple[float, float]:
         """The time that the states stand for, in s: half a step before the first one to half a step after the last one."""
-        half_s = (self.times_s[-1] - self.times_s[0]) / max(len(self.times_s) - 1, 1) / 2
-        return float(self.times_s[0] - half_s), float(self.times_s[-1] + half_s)
+        steps_s = np.diff(self.times_s) if len(self.times_s) > 1 else np.zeros(1)
+        return float(self.times_s[0] - steps_s[0] / 2), float(self.times_s[-1] + steps_s[-1] / 2)
 
     def at(self, time_s: float) -> np.ndarray:
         """Returns the volume (nz, ny, nx) float32 at a time: straight between two states, the first before, the last after

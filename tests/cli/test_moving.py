@@ -11,9 +11,10 @@ import SimpleITK as sitk
 
 from phyradgs_cl.api import load_volume, save_volume
 from phyradgs_cl.fields import Grid, States, deformed
-from phyradgs_cl.io import read_deformation, read_volume, write_deformation, write_volume
+from phyradgs_cl.io import Volume, read_deformation, read_volume, write_deformation, write_volume
 from phyradgs_cl.metrics import compare
 from phyradgs_cl.workflow import load_scan
+from phyradgs_cl.workflow.volumes import compared_states
 
 MOTION = 'kind = "breathing"\namplitude = 0.3\nperiod_s = 2.0\nstates = 3\n'
 SCAN = "--phantom jaw --size 16 --detector 12 --views 4 --time-samples 1 --protocol static"
@@ -67,6 +68,15 @@ def test_a_volume_with_its_own_deformation_needs_no_other(cli, capsys, folder, t
     line = f"reconstruct {folder}/scan.h5 -o {tmp_path}/cloud.h5 --method phyradgs --iterations 2 --object-motion {own}"
     assert cli.run(line.split()) == 0
     assert read_volume(tmp_path / "cloud.h5").provenance["object_motion"] == str(own)
+
+
+def test_states_are_compared_where_the_error_of_the_motion_is_not_known(caplog, folder) -> None:
+    scan = load_scan(folder / "scan.h5")
+    field = scan.moving_truth.deformation
+    steep = replace(field, control_mm=10 * field.control_mm)  # with slopes above 1: no inverse is found
+    facts = compared_states(Volume(scan.reference, scan.grid, deformation=steep), scan.moving_truth, scan.grid)
+    assert len(facts["states"]) == 3 and "mean_motion_error_mm" not in facts
+    assert "no error of the motion: deformation: found no inverse" in caplog.text
 
 
 def test_an_object_that_changes_from_the_scan_to_its_states(cli, capsys, folder, tmp_path) -> None:
