@@ -546,9 +546,9 @@ def moving_known() -> str:
         scores = [f"{of[case]['psnr_db']:.2f}/{of[case]['ssim']:.3f}" for case in ("rest", "known")]
         loss_db = of["rest"]["psnr_db"] - of["known"]["psnr_db"]
         losses_db.setdefault(views, []).append(loss_db)
-        seconds = [f"{of['known']['seconds']:.0f}", f"{of['known']['seconds'] / of['rest']['seconds']:.1f}"]
-        rows.append([volume, str(views), *scores, f"{loss_db:.2f}", *seconds])
-    heads = ["volume", "views", "at rest", "known field", "loss, dB", "known field, s", "times at rest"]
+        times = of["known"]["seconds"] / of["rest"]["seconds"]
+        rows.append([volume, str(views), *scores, f"{loss_db:.2f}", f"{times:.1f}"])
+    heads = ["volume", "views", "at rest", "known field", "loss, dB", "time, times at rest"]
     means = ", ".join(f"{mean(of_views):.2f} dB from {views} views" for views, of_views in losses_db.items())
     return markdown(heads, rows) + f"\nThe mean loss is {means}.\n"
 
