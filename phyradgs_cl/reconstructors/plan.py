@@ -154,4 +154,4 @@ def _check_times(deformation: Deformation, scan: Scan) -> None:
     if covered_s < _LEAST_COVERED * (last_s - first_s):
         raise InputError(_SUBJECT, found, "times that cover the scan", "check their unit and where they begin")
     if covered_s < _MOSTLY_COVERED * (last_s - first_s):
-        log.warning("%s: found %s; before and after its times the object stays displaced as at their ends", _SUBJECT, found)
+        log.warning("%s: found %s; the object rests before and after them, displaced as at their ends", _SUBJECT, found)

@@ -148,9 +148,8 @@ def _with_field(
     run: Callable[[MethodInputs], Reconstruction], of_passes: MethodInputs, one: _Field, is_first: bool, inputs: MethodInputs
 ) -> Reconstruction:
     """Runs a stage of ``fista`` with the field. The first one starts as ``fista`` does, not from the coarse volume."""
-    options = replace(of_passes.options, motion=with_times(of_passes.options.motion, inputs.scan, one.for_passes))
     initial = of_passes.initial if is_first else inputs.initial
-    return run(replace(inputs, options=options, initial=initial, deformation=one.for_passes))
+    return run(replace(inputs, options=of_passes.options, initial=initial, deformation=one.for_passes))
 
 
 def _with_field_in_progress(one: _Field, progress: Progress) -> Progress:

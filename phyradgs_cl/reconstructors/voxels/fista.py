@@ -15,6 +15,7 @@ import numpy as np
 
 from phyradgs_cl import checks
 from phyradgs_cl.acquisition import Motion, PerRow, Scan
+from phyradgs_cl.acquisition.motion import with_times
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields.volume import MOST_VOXELS
 from phyradgs_cl.reconstructors.checkpoint import State
@@ -182,7 +183,7 @@ def fista_stages(inputs: MethodInputs) -> list[Stage]:
 def _run(inputs: MethodInputs, options: FistaOptions, image: np.ndarray | None, parts: int = 1) -> Reconstruction:
     """Runs one stage, with every voxel divided into ``parts`` along each side. ``image``: the prior image of piccs."""
     scan, rt = replace(inputs.scan, grid=inputs.scan.grid.finer(parts), reference=None, moving_truth=None), inputs.rt
-    options = replace(options, motion=inputs.options.motion)  # moving knows it only when its field is found
+    options = replace(options, motion=with_times(options.motion, inputs.scan, inputs.deformation))
     image, initial = repeated(image, parts), repeated(inputs.initial, parts)
 
     def make(system: System) -> Fista:
