@@ -34,21 +34,21 @@ from phyradgs_cl.reconstructors.voxels.run import MethodInputs
 from phyradgs_cl.reconstructors.voxels.stages import Stage, run_stages
 from phyradgs_cl.runtime import Runtime
 
-_ITERATIONS_PER_ROUND = 6  # 7 rounds of the search come before the 35 passes that are the default of fista
+_ITERATIONS_PER_ROUND = 4  # 7 rounds of the search come before the 19 passes that are the default of fista
 _STORED = ("field_control", "field_place", "field_times", "field_weights", "field_gain")
 
 
 @dataclass(frozen=True)
 class MovingOptions(FistaOptions):
-    """iterations: rounds of the search for the field, a sixth of them, and passes of ``fista`` after it. bending: stiffness
-    of the field, relative to how strongly frames respond to it. gating: what the motion follows at first: ``auto`` (the
+    """iterations: rounds of the search for the field, a quarter of them, and passes of ``fista`` after it. bending:
+    stiffness of the field, relative to how strongly frames respond to it. gating: what the motion follows at first: ``auto`` (the
     signal of the frames, where it repeats), ``free`` (any smooth curve in time), ``scan`` (the signal or phase that the scan
     states), or a file, NAME.csv (``load_gating``). The other options are those of ``fista``."""
 
     TRIALS: ClassVar[tuple[int, int]] = (1, 7)
     """Iterations of the short runs of ``estimate``: one round alone, two rounds with five passes."""
 
-    iterations: int = 42
+    iterations: int = 26
     bending: float = checks.ranged(0.01, 0, 1e6)
     gating: str = "auto"
 
@@ -106,9 +106,8 @@ def moving(scan: Scan, options: MovingOptions, rt: Runtime, **arguments: Any) ->
     signal = _signal_of(scan, options.gating)
     passes_inputs = replace(inputs, options=options.of_passes())
     stages = [Stage("field", options.rounds, partial(_search, signal=signal, one=one))] if options.rounds else []
-    for stage in fista_stages(passes_inputs):
-        is_first = stage.name == "voxels"
-        stages.append(replace(stage, run=partial(_with_field, stage.run, passes_inputs, one, is_first)))
+    for number, stage in enumerate(fista_stages(passes_inputs)):
+        stages.append(replace(stage, run=partial(_with_field, stage.run, passes_inputs, one, number == 0)))
     report = Report.of(inputs.report)
     with report.through(partial(_with_field_in_progress, one)):
         result = run_stages(stages, replace(inputs, report=report))

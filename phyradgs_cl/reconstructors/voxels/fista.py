@@ -3,10 +3,14 @@
 Each subset S of M makes one step: xₖ = prox(yₖ + M/L · A_Sᵀ (p_S − A_S yₖ)), yₖ₊₁ = xₖ + βₖ₊₁ (xₖ − xₖ₋₁).
 The step and its momentum are FISTA's (Beck and Teboulle, SIAM J. Imaging Sci. 2 (2009) 183, Eqs. 4.1 to 4.3). The gradient
 of a subset, times the number of subsets, stands for that of all frames (Kim, Ramani and Fessler, IEEE Trans. Med. Imaging
-34 (2015) 167). L bounds the norm of AᵀA. The last 3/7 of the passes run on smaller voxels, whose means make up most of the
-result (``stages.py``)."""
+34 (2015) 167). L bounds the norm of AᵀA.
+
+A run goes from coarse to fine. The first passes have many subsets and few times in an exposure. The last 2/3 of the passes
+have fewer and fewer subsets, whose steps differ less, and all times. They run on smaller voxels, whose means make up most
+of the result (``stages.py``)."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, ClassVar
@@ -33,7 +37,11 @@ from phyradgs_cl.runtime.algebra import HostSpace
 
 _VOLUMES, _FRAMES = 16, 3  # in memory at one time, with the prior `dct`
 _HELD, _COPIES = 9, 2  # volumes that ``dct`` holds on the device, and more while a prior maps a volume of the host
-_SUBVOXEL_PASSES = 3 / 7  # share of the passes on smaller voxels (docs/results/settings.md)
+# measured in docs/results/settings.md
+_FIRST_PASSES = 6 / 19  # share of the passes with coarse times, and on the scan's own voxels where there are smaller ones
+_FIRST_TIMES = 1 / 3  # share of the times in an exposure, but two at least
+_SUBSETS = ((0.3, 4 / 3), (0.7, 1.0), (1.0, 2 / 3))  # up to this share of the other passes, times the option ``subsets``
+_FAINTEST = 1e-6  # of the largest row sum of AᵀA: voxels with less have no part in its bound
 _MOST_DIVIDED = 90**3  # voxels of a grid: smaller voxels are worth their time at 64³, not at 128³
 
 
@@ -44,21 +52,25 @@ class FistaOptions(IterativeOptions):
     prior_share) TV(x) + prior_share TV(x − first volume). prior_weight: threshold relative to two errors of the gradient,
     added in squares: the noise of the frames, and edges inside large voxels.
 
-    subvoxels: parts of a voxel's side in the last 3/7 of the passes; 0: 2 up to 90³ voxels where memory allows, else 1.
-    subsets: of the frames, with one step each; subsets whose steps diverge are joined two by two.
+    subvoxels: parts of a voxel's side in the last 2/3 of the passes; 0: 2 up to 90³ voxels where memory allows, else 1.
+    subsets: of the frames, with one step each: a third more in the first half of the passes, a third fewer in the last
+    quarter; subsets whose steps diverge are joined two by two.
     tv_iterations: dual iterations per proximal map of TV. transmission_weights: as in ``fista-tv``."""
 
     FUNCTIONS: ClassVar[tuple[str, ...]] = ("prior",)
     """Options that may be a function."""
 
+    TRIALS: ClassVar[tuple[int, int]] = (3, 6)
+    """Iterations of the short runs of ``estimate``: a third of them is coarse, as in a whole run."""
+
     motion: Motion = PerRow()
-    iterations: int = 35
+    iterations: int = 19
     prior: str | Denoiser = "ridge"
-    prior_weight: float = checks.ranged(0.42, 0, 1e6)
+    prior_weight: float = checks.ranged(0.39, 0, 1e6)
     subvoxels: int = checks.ranged(0, 0, 8)
     prior_share: float = checks.ranged(0.5, 0, 1)
-    subsets: int = checks.ranged(5, 1, 1_000_000)
-    tv_iterations: int = checks.ranged(5, 1, 10_000)
+    subsets: int = checks.ranged(6, 1, 1_000_000)
+    tv_iterations: int = checks.ranged(3, 1, 10_000)
     transmission_weights: bool = False  # type: ignore[misc]
 
     def __post_init__(self) -> None:
@@ -76,16 +88,24 @@ class Accelerated(Algorithm):
     The restart is the gradient scheme of O'Donoghue and Candès, Found. Comput. Math. 15 (2015) 715."""
 
     ARRAYS: ClassVar[tuple[str, ...]] = ("volume", "previous")
-    NUMBERS = ("momentum",)
+    NUMBERS: ClassVar[tuple[str, ...]] = ("momentum",)
 
     def __init__(self, system: System, prior: Prior) -> None:
         super().__init__(system)
         self.prior = prior
         self.previous = self.volume
         self.momentum = 1.0  # tₖ
+        self._sums = system.adjoint(system.apply_weights(system.row_sums()))
         # AᵀA has no negative entry: its largest row sum bounds its norm
-        bound = system.space.largest(system.adjoint(system.apply_weights(system.row_sums())))
-        self.curvature = bound or 1.0  # L
+        self.curvature = system.space.largest(self._sums) or 1.0  # L
+
+    def tighten_curvature(self) -> None:
+        """Replaces L by a smaller bound, for longer steps, at the price of a pass: the largest (AᵀA x)/x of any x > 0 bounds
+        the norm (Collatz and Wielandt). x is the row sums of AᵀA, which makes the bound a fifth smaller."""
+        system, space = self.system, self.system.space
+        again = system.adjoint(system.apply_weights(system.forward(self._sums)))
+        ratio = space.largest(space.multiply(again, space.reciprocal(self._sums, _FAINTEST)))
+        self.curvature = min(self.curvature, ratio or self.curvature)
 
     def start_from(self, volume: Any) -> None:
         self.volume = self.previous = volume
@@ -116,22 +136,30 @@ class Accelerated(Algorithm):
 
 
 class Fista(Accelerated):
-    """The residual of a pass is that of all subsets, each at the extrapolated point of its step."""
+    """The residual of a pass is that of all subsets, each at the extrapolated point of its step. subsets: their number in
+    each pass; later passes have the last number."""
+
+    NUMBERS: ClassVar[tuple[str, ...]] = ("momentum", "passes", "most")
 
     def __init__(
-        self, system: System, prior: Prior, weight: PriorWeight, *, subsets: int, nonnegative: bool
+        self, system: System, prior: Prior, weight: PriorWeight, *, subsets: Sequence[int], nonnegative: bool
     ) -> None:
         super().__init__(system, prior)
-        self.nonnegative, self.weight = nonnegative, weight
-        self.subsets = OrderedSubsets(system, subsets)
+        self.nonnegative, self.weight, self.counts = nonnegative, weight, subsets
+        self.passes, self.most = 0, system.frames  # ``most``: subsets since some were joined
+        self.subsets = OrderedSubsets(system, subsets[0])
 
     def step(self) -> float:
+        count = min(self.counts[min(self.passes, len(self.counts) - 1)], self.most)
+        if count != len(self.subsets):
+            self.subsets = OrderedSubsets(self.system, count)
         weight = self.weight.at(self.volume)
         self.prior.noise_share = self.weight.noise_share(weight)
         residual = self.system.space.sum_squares(self._update(subset, weight) for subset in self.subsets) ** 0.5
+        self.passes += 1
         # larger subsets have another step length: momentum of the former ones would mislead
         if self.subsets.join_if_diverging(residual):
-            self.momentum, self.previous = 1.0, self.volume
+            self.momentum, self.previous, self.most = 1.0, self.volume, len(self.subsets)
         return residual
 
     def _update(self, subset: System, weight: float) -> Any:
@@ -150,8 +178,9 @@ class Fista(Accelerated):
 
     def restore(self, state: State) -> None:
         super().restore(state)
-        count, self.subsets.least_residual = state["subsets"].tolist()
-        self.subsets.split(int(count))
+        count, least_residual = state["subsets"].tolist()
+        self.subsets = OrderedSubsets(self.system, int(count))
+        self.subsets.least_residual = least_residual
 
 
 def fista(scan: Scan, options: FistaOptions, rt: Runtime, **arguments: Any) -> Reconstruction:
@@ -166,24 +195,48 @@ METHOD = Method(fista, {"default": FistaOptions()}, is_shared=True, takes_initia
 
 
 def fista_stages(inputs: MethodInputs) -> list[Stage]:
-    """Returns the passes on the scan's own voxels, and those on smaller ones if there are any."""
-    options = inputs.options
+    """Returns the coarse passes and the fine ones; no coarse passes where they would differ in nothing but subsets."""
+    options, scan = inputs.options, inputs.scan
     parts = options.subvoxels or (2 if _gains_from_subvoxels(inputs, 2) else 1)
-    fine_passes = int(_SUBVOXEL_PASSES * options.iterations) if parts > 1 else 0
-    passes = options.iterations - fine_passes
-    stages = [Stage("voxels", passes, partial(_run, options=replace(options, iterations=passes), image=inputs.initial))]
+    motion = with_times(options.motion, scan, inputs.deformation)
+    is_coarser = parts > 1 or (scan.is_fly and _few_times(motion) != motion)
+    first = round(_FIRST_PASSES * options.iterations) if is_coarser else 0
+    last = options.iterations - first
+
+    def stage(name: str, passes: int, subsets: Sequence[int], **where: Any) -> Stage:
+        own = replace(options, iterations=passes)
+        return Stage(name, passes, partial(fista_passes, options=own, subsets=subsets, image=inputs.initial, **where))
+
+    many = round(_SUBSETS[0][1] * options.subsets)
+    stages = [stage("coarse", first, [many], has_few_times=True)] if first else []
+    stages.append(stage("fine", last, subset_counts(options.subsets, last), parts=parts))
     if parts > 1:
-        run = partial(_run, options=replace(options, iterations=fine_passes), image=inputs.initial, parts=parts)
-        share = priors.subvoxel_share(options.prior, inputs.scan.grid.finer(parts).shape)
-        merge = partial(merge_subvoxels, parts=parts, share=share)
-        stages.append(Stage("subvoxels", fine_passes, run, merge))
+        share = priors.subvoxel_share(options.prior, scan.grid.finer(parts).shape)
+        stages[-1] = replace(stages[-1], merge=partial(merge_subvoxels, parts=parts, share=share))
     return stages
 
 
-def _run(inputs: MethodInputs, options: FistaOptions, image: np.ndarray | None, parts: int = 1) -> Reconstruction:
-    """Runs one stage, with every voxel divided into ``parts`` along each side. ``image``: the prior image of piccs."""
+def subset_counts(subsets: int, passes: int) -> list[int]:
+    """Returns the number of subsets of each fine pass."""
+    factors = [next(factor for end, factor in _SUBSETS if (k + 0.5) / passes < end) for k in range(passes)]
+    return [max(1, round(factor * subsets)) for factor in factors] or [subsets]
+
+
+def _few_times(motion: Motion) -> Motion:
+    """Returns the model with a third of its times: coarse passes only bring a first volume."""
+    times = motion.sub_intervals if isinstance(motion, PerRow) else 0
+    return PerRow(max(2, math.ceil(_FIRST_TIMES * times))) if times > 2 else motion
+
+
+def fista_passes(
+    inputs: MethodInputs, options: FistaOptions, subsets: Sequence[int], image: np.ndarray | None = None, parts: int = 1,
+    has_few_times: bool = False,
+) -> Reconstruction:  # fmt: skip
+    """Runs one stage, with every voxel divided into ``parts`` along each side. subsets: as of ``Fista``. image: the prior
+    image of piccs. has_few_times: a third of the times in an exposure are enough."""
     scan, rt = replace(inputs.scan, grid=inputs.scan.grid.finer(parts), reference=None, moving_truth=None), inputs.rt
-    options = replace(options, motion=with_times(options.motion, inputs.scan, inputs.deformation))
+    motion = with_times(options.motion, inputs.scan, inputs.deformation)
+    options = replace(options, motion=_few_times(motion) if has_few_times and scan.is_fly else motion)
     image, initial = repeated(image, parts), repeated(inputs.initial, parts)
 
     def make(system: System) -> Fista:
@@ -198,7 +251,9 @@ def _run(inputs: MethodInputs, options: FistaOptions, image: np.ndarray | None, 
         prior = priors.prior_of(options.prior, prior_inputs)
         with rt.ledger.reserved(_COPIES * volume_bytes if is_short else 0):
             weight = PriorWeight(system, error, options.prior_weight)
-            return Fista(system, prior, weight, subsets=options.subsets, nonnegative=options.nonnegative)
+            algorithm = Fista(system, prior, weight, subsets=subsets, nonnegative=options.nonnegative)
+            algorithm.tighten_curvature()
+            return algorithm
 
     stage_inputs = replace(inputs, scan=scan, options=options, initial=initial)
     volumes = _VOLUMES + priors.volumes_of(options.prior)
