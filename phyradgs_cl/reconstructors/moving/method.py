@@ -40,8 +40,8 @@ _STORED = ("field_control", "field_place", "field_times", "field_weights", "fiel
 
 @dataclass(frozen=True)
 class MovingOptions(FistaOptions):
-    """iterations: rounds of the search for the field, a quarter of them, and passes of ``fista`` after it. bending:
-    stiffness of the field, relative to how strongly frames respond to it. gating: what the motion follows at first: ``auto`` (the
+    """iterations: rounds of the search for the field, a quarter of them, and passes of ``fista`` after. bending: stiffness
+    of the field, relative to how strongly frames respond to it. gating: what the motion follows at first: ``auto`` (the
     signal of the frames, where it repeats), ``free`` (any smooth curve in time), ``scan`` (the signal or phase that the scan
     states), or a file, NAME.csv (``load_gating``). The other options are those of ``fista``."""
 

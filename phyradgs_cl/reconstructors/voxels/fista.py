@@ -201,6 +201,8 @@ def fista_stages(inputs: MethodInputs) -> list[Stage]:
     motion = with_times(options.motion, scan, inputs.deformation)
     is_coarser = parts > 1 or (scan.is_fly and _few_times(motion) != motion)
     first = round(_FIRST_PASSES * options.iterations) if is_coarser else 0
+    if parts > 1:  # smaller voxels need a volume to start from
+        first = max(first, min(1, options.iterations))
     last = options.iterations - first
 
     def stage(name: str, passes: int, subsets: Sequence[int], **where: Any) -> Stage:
