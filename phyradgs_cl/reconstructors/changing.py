@@ -63,7 +63,7 @@ def changing(scan: Scan, options: ChangingOptions, rt: Runtime, **arguments: Any
         prior, nonnegative = TvPrior(prox, options.tv_iterations), options.nonnegative
         # a state has few frames: if a frame were many subsets' share of them, steps would be too long and diverge
         subsets = min(options.subsets, 2 * scan.frames // len(times_s))
-        runs.append(Fista(system, prior, weight, subsets=[subsets], nonnegative=nonnegative))
+        runs.append(Fista(system, prior, weight, subsets=subsets, nonnegative=nonnegative))
         return runs[0]
 
     initial = None if inputs.initial is None else np.broadcast_to(inputs.initial, shape)

@@ -80,7 +80,7 @@ def test_subsets_that_pull_apart_are_joined(rt, scan) -> None:
     prior = prior_of("tv", PriorInputs(rt, scan.grid, 5))
     system = System.of_scan(rt, scan, PerRow())
     weight = PriorWeight(system, FrameError(0.01), 0.42)
-    algorithm = Fista(system, prior, weight, subsets=[1000], nonnegative=True)
+    algorithm = Fista(system, prior, weight, subsets=1000, nonnegative=True)
     assert len(algorithm.subsets) == scan.frames
     residuals = [algorithm.step() for _ in range(30)]
     assert 1 <= len(algorithm.subsets) <= scan.frames // 2
@@ -171,7 +171,7 @@ def test_the_ridge_step_follows_the_noise_in_the_weight_and_no_edges(rt, scan) -
     errors = FrameError(0.01), FrameError(0.01, 0.02), FrameError(0.03)
     weights = [PriorWeight(system, error, 0.42) for error in errors]
     for weight in weights:
-        algorithm = Fista(system, ThenRidge(Prior(), ridge, 17.0), weight, subsets=[1], nonnegative=True)
+        algorithm = Fista(system, ThenRidge(Prior(), ridge, 17.0), weight, subsets=1, nonnegative=True)
         for _ in range(4):  # maps before a step
             algorithm.step()
     assert weights[1].noise_share(weights[1].at(algorithm.volume)) < 0.9
@@ -188,7 +188,7 @@ def test_a_denoiser_of_ones_own_is_the_prior(rt, scan) -> None:
     system = System.of_scan(rt, scan, PerRow())
     weight = PriorWeight(system, FrameError(0.01), 0.42)
     algorithm, plain = (
-        Fista(system, prior, weight, subsets=[1], nonnegative=True) for prior in (OwnPrior(half), Prior())
+        Fista(system, prior, weight, subsets=1, nonnegative=True) for prior in (OwnPrior(half), Prior())
     )
     algorithm.step()
     plain.step()

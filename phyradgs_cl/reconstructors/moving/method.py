@@ -34,13 +34,13 @@ from phyradgs_cl.reconstructors.voxels.run import MethodInputs
 from phyradgs_cl.reconstructors.voxels.stages import Stage, run_stages
 from phyradgs_cl.runtime import Runtime
 
-_ITERATIONS_PER_ROUND = 4  # 7 rounds of the search come before the 19 passes that are the default of fista
+_ITERATIONS_PER_ROUND = 6  # 7 rounds of the search come before the 35 passes that are the default of fista
 _STORED = ("field_control", "field_place", "field_times", "field_weights", "field_gain")
 
 
 @dataclass(frozen=True)
 class MovingOptions(FistaOptions):
-    """iterations: rounds of the search for the field, a quarter of them, and passes of ``fista`` after. bending: stiffness
+    """iterations: rounds of the search for the field, a sixth of them, and passes of ``fista`` after it. bending: stiffness
     of the field, relative to how strongly frames respond to it. gating: what the motion follows at first: ``auto`` (the
     signal of the frames, where it repeats), ``free`` (any smooth curve in time), ``scan`` (the signal or phase that the scan
     states), or a file, NAME.csv (``load_gating``). The other options are those of ``fista``."""
@@ -48,7 +48,7 @@ class MovingOptions(FistaOptions):
     TRIALS: ClassVar[tuple[int, int]] = (1, 7)
     """Iterations of the short runs of ``estimate``: one round alone, two rounds with five passes."""
 
-    iterations: int = 26
+    iterations: int = 42
     bending: float = checks.ranged(0.01, 0, 1e6)
     gating: str = "auto"
 

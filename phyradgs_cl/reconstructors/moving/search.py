@@ -26,7 +26,7 @@ from phyradgs_cl.runtime import Runtime
 _MOST_COLUMNS, _MOST_VOXELS, _MOST_FRAMES = 64, 32, 600  # of the coarse scan; more frames where a signal has more knots
 _TIMES_PER_PERIOD, _MOST_TIMES = 12, 6  # at which exposures see the object at least; but of one exposure
 _FIRST_PASSES, _PASSES = 8, 3  # of fista, at rest and in a round
-_SUBSETS, _WEIGHT, _TV_ITERATIONS = 5, 0.42, 5  # of these passes
+_WEIGHT, _TV_ITERATIONS = 0.42, 5  # of these passes
 _COARSE_SPACINGS, _FINE_SPACINGS = 2, 4  # of control points along the box's longest side
 _FINE_BENDING = (_FINE_SPACINGS / _COARSE_SPACINGS) ** 4  # times as stiff in terms of coefficients is as stiff in mm
 _COARSE_SHARE = 0.6  # of the rounds
@@ -144,7 +144,7 @@ class FieldSearch:
         )
         deformation = one.deformation() if one.control_mm.any() else None
         inputs = MethodInputs(self.scan, options, self.rt, initial=volume, deformation=deformation)
-        return fista_passes(inputs, options, [_SUBSETS]).volume
+        return fista_passes(inputs, options).volume
 
 
 def _with_times(motion: Motion, scan: Scan, period_s: float | None) -> Motion:

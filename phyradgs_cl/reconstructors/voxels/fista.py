@@ -5,12 +5,10 @@ The step and its momentum are FISTA's (Beck and Teboulle, SIAM J. Imaging Sci. 2
 of a subset, times the number of subsets, stands for that of all frames (Kim, Ramani and Fessler, IEEE Trans. Med. Imaging
 34 (2015) 167). L bounds the norm of AᵀA.
 
-A run goes from coarse to fine. The first passes have many subsets and few times in an exposure. The last 2/3 of the passes
-have fewer and fewer subsets, whose steps differ less, and all times. They run on smaller voxels, whose means make up most
-of the result (``stages.py``)."""
+A run goes from coarse to fine. The first 3/5 of the passes have more subsets and few times in an exposure. The others run on
+smaller voxels, whose means make up most of the result (``stages.py``)."""
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, ClassVar
@@ -38,9 +36,9 @@ from phyradgs_cl.runtime.algebra import HostSpace
 _VOLUMES, _FRAMES = 16, 3  # in memory at one time, with the prior `dct`
 _HELD, _COPIES = 9, 2  # volumes that ``dct`` holds on the device, and more while a prior maps a volume of the host
 # measured in docs/results/settings.md
-_FIRST_PASSES = 6 / 19  # share of the passes with coarse times, and on the scan's own voxels where there are smaller ones
-_FIRST_TIMES = 1 / 3  # share of the times in an exposure, but two at least
-_SUBSETS = ((0.3, 4 / 3), (0.7, 1.0), (1.0, 2 / 3))  # up to this share of the other passes, times the option ``subsets``
+_COARSE_PASSES = 0.6  # share of the passes, on the scan's own voxels where there are smaller ones
+_COARSE_SUBSETS = 1.6  # times the option ``subsets``
+_COARSE_TIMES = 1 / 3  # share of the times in an exposure, but two at least
 _FAINTEST = 1e-6  # of the largest row sum of AᵀA: voxels with less have no part in its bound
 _MOST_DIVIDED = 90**3  # voxels of a grid: smaller voxels are worth their time at 64³, not at 128³
 
@@ -52,24 +50,23 @@ class FistaOptions(IterativeOptions):
     prior_share) TV(x) + prior_share TV(x − first volume). prior_weight: threshold relative to two errors of the gradient,
     added in squares: the noise of the frames, and edges inside large voxels.
 
-    subvoxels: parts of a voxel's side in the last 2/3 of the passes; 0: 2 up to 90³ voxels where memory allows, else 1.
-    subsets: of the frames, with one step each: a third more in the first half of the passes, a third fewer in the last
-    quarter; subsets whose steps diverge are joined two by two.
+    subvoxels: parts of a voxel's side in the last 2/5 of the passes; 0: 2 up to 90³ voxels where memory allows, else 1.
+    subsets: of the frames, with one step each, 1.6 times as many before; subsets whose steps diverge are joined two by two.
     tv_iterations: dual iterations per proximal map of TV. transmission_weights: as in ``fista-tv``."""
 
     FUNCTIONS: ClassVar[tuple[str, ...]] = ("prior",)
     """Options that may be a function."""
 
-    TRIALS: ClassVar[tuple[int, int]] = (3, 6)
-    """Iterations of the short runs of ``estimate``: a third of them is coarse, as in a whole run."""
+    TRIALS: ClassVar[tuple[int, int]] = (2, 7)
+    """Iterations of the short runs of ``estimate``: three of the five more are coarse, as in a whole run."""
 
     motion: Motion = PerRow()
-    iterations: int = 19
+    iterations: int = 35
     prior: str | Denoiser = "ridge"
     prior_weight: float = checks.ranged(0.39, 0, 1e6)
     subvoxels: int = checks.ranged(0, 0, 8)
     prior_share: float = checks.ranged(0.5, 0, 1)
-    subsets: int = checks.ranged(6, 1, 1_000_000)
+    subsets: int = checks.ranged(5, 1, 1_000_000)
     tv_iterations: int = checks.ranged(3, 1, 10_000)
     transmission_weights: bool = False  # type: ignore[misc]
 
@@ -136,30 +133,22 @@ class Accelerated(Algorithm):
 
 
 class Fista(Accelerated):
-    """The residual of a pass is that of all subsets, each at the extrapolated point of its step. subsets: their number in
-    each pass; later passes have the last number."""
-
-    NUMBERS: ClassVar[tuple[str, ...]] = ("momentum", "passes", "most")
+    """The residual of a pass is that of all subsets, each at the extrapolated point of its step."""
 
     def __init__(
-        self, system: System, prior: Prior, weight: PriorWeight, *, subsets: Sequence[int], nonnegative: bool
+        self, system: System, prior: Prior, weight: PriorWeight, *, subsets: int, nonnegative: bool
     ) -> None:
         super().__init__(system, prior)
-        self.nonnegative, self.weight, self.counts = nonnegative, weight, subsets
-        self.passes, self.most = 0, system.frames  # ``most``: subsets since some were joined
-        self.subsets = OrderedSubsets(system, subsets[0])
+        self.nonnegative, self.weight = nonnegative, weight
+        self.subsets = OrderedSubsets(system, subsets)
 
     def step(self) -> float:
-        count = min(self.counts[min(self.passes, len(self.counts) - 1)], self.most)
-        if count != len(self.subsets):
-            self.subsets = OrderedSubsets(self.system, count)
         weight = self.weight.at(self.volume)
         self.prior.noise_share = self.weight.noise_share(weight)
         residual = self.system.space.sum_squares(self._update(subset, weight) for subset in self.subsets) ** 0.5
-        self.passes += 1
         # larger subsets have another step length: momentum of the former ones would mislead
         if self.subsets.join_if_diverging(residual):
-            self.momentum, self.previous, self.most = 1.0, self.volume, len(self.subsets)
+            self.momentum, self.previous = 1.0, self.volume
         return residual
 
     def _update(self, subset: System, weight: float) -> Any:
@@ -178,9 +167,8 @@ class Fista(Accelerated):
 
     def restore(self, state: State) -> None:
         super().restore(state)
-        count, least_residual = state["subsets"].tolist()
-        self.subsets = OrderedSubsets(self.system, int(count))
-        self.subsets.least_residual = least_residual
+        count, self.subsets.least_residual = state["subsets"].tolist()
+        self.subsets.split(int(count))
 
 
 def fista(scan: Scan, options: FistaOptions, rt: Runtime, **arguments: Any) -> Reconstruction:
@@ -200,42 +188,34 @@ def fista_stages(inputs: MethodInputs) -> list[Stage]:
     parts = options.subvoxels or (2 if _gains_from_subvoxels(inputs, 2) else 1)
     motion = with_times(options.motion, scan, inputs.deformation)
     is_coarser = parts > 1 or (scan.is_fly and _few_times(motion) != motion)
-    first = round(_FIRST_PASSES * options.iterations) if is_coarser else 0
-    if parts > 1:  # smaller voxels need a volume to start from
-        first = max(first, min(1, options.iterations))
+    first = round(_COARSE_PASSES * options.iterations) if is_coarser else 0
     last = options.iterations - first
 
-    def stage(name: str, passes: int, subsets: Sequence[int], **where: Any) -> Stage:
+    def stage(name: str, passes: int, **how: Any) -> Stage:
         own = replace(options, iterations=passes)
-        return Stage(name, passes, partial(fista_passes, options=own, subsets=subsets, image=inputs.initial, **where))
+        return Stage(name, passes, partial(fista_passes, options=own, image=inputs.initial, **how))
 
-    many = round(_SUBSETS[0][1] * options.subsets)
-    stages = [stage("coarse", first, [many], has_few_times=True)] if first else []
-    stages.append(stage("fine", last, subset_counts(options.subsets, last), parts=parts))
+    many = round(_COARSE_SUBSETS * options.subsets)
+    stages = [stage("coarse", first, subsets=many, has_few_times=True)] if is_coarser else []
+    stages.append(stage("fine", last, parts=parts))
     if parts > 1:
         share = priors.subvoxel_share(options.prior, scan.grid.finer(parts).shape)
         stages[-1] = replace(stages[-1], merge=partial(merge_subvoxels, parts=parts, share=share))
     return stages
 
 
-def subset_counts(subsets: int, passes: int) -> list[int]:
-    """Returns the number of subsets of each fine pass."""
-    factors = [next(factor for end, factor in _SUBSETS if (k + 0.5) / passes < end) for k in range(passes)]
-    return [max(1, round(factor * subsets)) for factor in factors] or [subsets]
-
-
 def _few_times(motion: Motion) -> Motion:
     """Returns the model with a third of its times: coarse passes only bring a first volume."""
     times = motion.sub_intervals if isinstance(motion, PerRow) else 0
-    return PerRow(max(2, math.ceil(_FIRST_TIMES * times))) if times > 2 else motion
+    return PerRow(max(2, math.ceil(_COARSE_TIMES * times))) if times > 2 else motion
 
 
 def fista_passes(
-    inputs: MethodInputs, options: FistaOptions, subsets: Sequence[int], image: np.ndarray | None = None, parts: int = 1,
+    inputs: MethodInputs, options: FistaOptions, image: np.ndarray | None = None, parts: int = 1, subsets: int = 0,
     has_few_times: bool = False,
 ) -> Reconstruction:  # fmt: skip
-    """Runs one stage, with every voxel divided into ``parts`` along each side. subsets: as of ``Fista``. image: the prior
-    image of piccs. has_few_times: a third of the times in an exposure are enough."""
+    """Runs one stage, with every voxel divided into ``parts`` along each side. image: the prior image of piccs. subsets: in
+    place of those of the options. has_few_times: a third of the times in an exposure are enough."""
     scan, rt = replace(inputs.scan, grid=inputs.scan.grid.finer(parts), reference=None, moving_truth=None), inputs.rt
     motion = with_times(options.motion, inputs.scan, inputs.deformation)
     options = replace(options, motion=_few_times(motion) if has_few_times and scan.is_fly else motion)
@@ -253,7 +233,7 @@ def fista_passes(
         prior = priors.prior_of(options.prior, prior_inputs)
         with rt.ledger.reserved(_COPIES * volume_bytes if is_short else 0):
             weight = PriorWeight(system, error, options.prior_weight)
-            algorithm = Fista(system, prior, weight, subsets=subsets, nonnegative=options.nonnegative)
+            algorithm = Fista(system, prior, weight, subsets=subsets or options.subsets, nonnegative=options.nonnegative)
             algorithm.tighten_curvature()
             return algorithm
 
