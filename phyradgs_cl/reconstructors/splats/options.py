@@ -13,7 +13,7 @@ from phyradgs_cl.operators import DEFAULT_CUTOFF_SIGMA
 from phyradgs_cl.optim import PUBLISHED_RATES, DensityControl, Rates
 from phyradgs_cl.text import repr_of_changes
 
-_STATIC_SHARE, _COARSE_ERROR = 0.36, 0.1  # of the coarse iterations, and their time error (docs/results/motion_models.md)
+_STATIC_SHARE, _COARSE_ERROR = 0.4, 0.1  # of the coarse iterations, and their time error (docs/results/motion_models.md)
 
 
 @dataclass(frozen=True, repr=False)
@@ -54,7 +54,7 @@ class SplatOptions:
     scale_min: float = checks.ranged(0.001, 1e-9, 10)
     scale_min_voxels: float = checks.ranged(0.0, 0, 100)
     scale_max: float = checks.ranged(1.0, 1e-6, 100)
-    exact_from: float = checks.ranged(0.7, 0, 1)
+    exact_from: float = checks.ranged(0.73, 0, 1)
     batch: int = checks.ranged(0, 0, 1_000_000, "--batch (0: as many as ranks)")
     rates: Rates = Rates()
     control: DensityControl = DensityControl()
