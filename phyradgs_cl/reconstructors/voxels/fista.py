@@ -204,7 +204,7 @@ def fista_stages(inputs: MethodInputs) -> list[Stage]:
         own = replace(options, iterations=passes)
         return Stage(name, passes, partial(fista_passes, options=own, image=inputs.initial, **how))
 
-    many = round(_COARSE_SUBSETS * options.subsets)
+    many = round(_COARSE_SUBSETS * options.subsets) if parts > 1 else options.subsets
     stages = [stage("coarse", first, subsets=many, has_few_times=True)] if is_coarser else []
     stages.append(stage("fine", last, parts=parts))
     if parts > 1:
