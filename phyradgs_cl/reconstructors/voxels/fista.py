@@ -5,8 +5,8 @@ The step and its momentum are FISTA's (Beck and Teboulle, SIAM J. Imaging Sci. 2
 of a subset, times the number of subsets, stands for that of all frames (Kim, Ramani and Fessler, IEEE Trans. Med. Imaging
 34 (2015) 167). L bounds the norm of AᵀA.
 
-A run goes from coarse to fine. The first 3/5 of the passes have more subsets and few times in an exposure. The others run on
-smaller voxels, whose means make up most of the result (``stages.py``)."""
+The last 2/5 of the passes run on smaller voxels, whose means make up most of the result (``stages.py``). The passes before
+them only bring a first volume: they have more subsets, and few times in an exposure."""
 
 import math
 from dataclasses import dataclass, replace
@@ -35,8 +35,8 @@ from phyradgs_cl.runtime.algebra import HostSpace
 
 _VOLUMES, _FRAMES = 16, 3  # in memory at one time, with the prior `dct`
 _HELD, _COPIES = 9, 2  # volumes that ``dct`` holds on the device, and more while a prior maps a volume of the host
-# measured in docs/results/settings.md
-_COARSE_PASSES = 0.6  # share of the passes, on the scan's own voxels where there are smaller ones
+# of the passes before those on smaller voxels; measured in docs/results/settings.md
+_COARSE_PASSES = 0.6  # share of all passes
 _COARSE_SUBSETS = 1.6  # times the option ``subsets``
 _COARSE_TIMES = 1 / 3  # share of the times in an exposure, but two at least
 _FAINTEST = 1e-6  # of the largest row sum of AᵀA: voxels with less have no part in its bound
@@ -51,7 +51,8 @@ class FistaOptions(IterativeOptions):
     added in squares: the noise of the frames, and edges inside large voxels.
 
     subvoxels: parts of a voxel's side in the last 2/5 of the passes; 0: 2 up to 90³ voxels where memory allows, else 1.
-    subsets: of the frames, with one step each, 1.6 times as many before; subsets whose steps diverge are joined two by two.
+    subsets: of the frames, with one step each, 1.6 times as many before smaller voxels; subsets whose steps diverge are
+    joined two by two.
     tv_iterations: dual iterations per proximal map of TV. transmission_weights: as in ``fista-tv``."""
 
     FUNCTIONS: ClassVar[tuple[str, ...]] = ("prior",)
@@ -192,25 +193,22 @@ METHOD = Method(fista, {"default": FistaOptions()}, is_shared=True, takes_initia
 
 
 def fista_stages(inputs: MethodInputs) -> list[Stage]:
-    """Returns the coarse passes and the fine ones; no coarse passes where they would differ in nothing but subsets."""
-    options, scan = inputs.options, inputs.scan
+    """Returns the passes on the scan's own voxels, and those on smaller ones if there are any."""
+    options = inputs.options
     parts = options.subvoxels or (2 if _gains_from_subvoxels(inputs, 2) else 1)
-    motion = with_times(options.motion, scan, inputs.deformation)
-    is_coarser = parts > 1 or (scan.is_fly and _few_times(motion) != motion)
-    first = round(_COARSE_PASSES * options.iterations) if is_coarser else 0
+    first = round(_COARSE_PASSES * options.iterations) if parts > 1 else 0
     last = options.iterations - first
 
     def stage(name: str, passes: int, **how: Any) -> Stage:
         own = replace(options, iterations=passes)
         return Stage(name, passes, partial(fista_passes, options=own, image=inputs.initial, **how))
 
-    many = round(_COARSE_SUBSETS * options.subsets) if parts > 1 else options.subsets
-    stages = [stage("coarse", first, subsets=many, has_few_times=True)] if is_coarser else []
-    stages.append(stage("fine", last, parts=parts))
-    if parts > 1:
-        share = priors.subvoxel_share(options.prior, scan.grid.finer(parts).shape)
-        stages[-1] = replace(stages[-1], merge=partial(merge_subvoxels, parts=parts, share=share))
-    return stages
+    if parts == 1:
+        return [stage("voxels", last)]
+    many = round(_COARSE_SUBSETS * options.subsets)
+    share = priors.subvoxel_share(options.prior, inputs.scan.grid.finer(parts).shape)
+    fine = replace(stage("subvoxels", last, parts=parts), merge=partial(merge_subvoxels, parts=parts, share=share))
+    return [stage("voxels", first, subsets=many, has_few_times=True), fine]
 
 
 def _few_times(motion: Motion) -> Motion:
