@@ -165,3 +165,23 @@ def test_r2_is_affine_and_motion_matters(rt, scan, run) -> None:
     assert exact.facts["method"] == "phyradgs" and exact.facts["options"]["affine"] is False
     assert 1e-4 < difference(affine.volume, exact.volume) < 0.2
     assert difference(run(STEADY, motion=Static()).volume, run(STEADY, motion=MicroViews()).volume) > 0.01
+
+
+def test_exact_motion_is_coarse_at_first_and_goes_on_with_the_same_bits(rt, scan) -> None:
+    """One pose for each frame, one segment, then its own times; a run that is resumed in any phase knows where it was."""
+    options = replace(STEADY, motion=Exact(), gaussians=100, iterations=200)
+    whole = phyradgs(scan, options, rt, seed=1)
+    phases = [(one["from"], one["motion"]["name"], one["motion"].get("time_error")) for one in whole.facts["motion_phases"]]
+    assert phases == [(0, "static", None), (59, "exact", 0.1), (146, "exact", 0.005)]
+    for at in (50, 100, 150):
+
+        def stop(progress: Progress, at: int = at) -> None:
+            if progress.iteration >= at:
+                raise KeyboardInterrupt
+
+        part = phyradgs(scan, options, rt, seed=1, report=stop)
+        assert part.facts["interrupted_at"] == at
+        rest = phyradgs(scan, options, rt, seed=1, resume=part.state)
+        np.testing.assert_array_equal(rest.volume, whole.volume)
+    throughout = phyradgs(scan, replace(options, exact_from=0.0, iterations=2), rt, seed=1)
+    assert len(throughout.facts["motion_phases"]) == 1
