@@ -36,9 +36,10 @@ GROUPS = {
             *("output", "template", "form", "source_to_axis_mm", "source_to_detector_mm", "pixel_size_mm"),
             *("fps", "exposure_s", "readout_ms", "first"),
         ),
-        "Geometry": ("detector_offset_mm", "unit_mm", "rotates"),
+        "Geometry": ("detector_offset_mm", "unit_mm", "angles", "rotates"),
         "Timing": ("frame_time_s", "readout_s", "angle_at", "readout_axis", "readout_direction", "detector_model"),
         "Pixels": ("quantity", "flat_value", "row_0", "column_0", "part", "first_view"),
+        "HDF5": ("entry", "at", "linked_folder"),
         "Volume": ("size", "voxel_mm", "roi_mm"),
     }
 }
@@ -49,7 +50,7 @@ def _annotated(one: Field[Any]) -> tuple[Any, Any]:
     flag, words = option_name(one.name), (one.metadata["help"], one.metadata["usual"])
     if one.name in _PAIRS:
         return Annotated[Any, _PAIRS[one.name](flag, *words)], None
-    kind: Any = Literal[WORDS[one.name]] if one.name in WORDS else one.type
+    kind: Any = Literal[WORDS[one.name]] if one.name in WORDS else list[str] if one.name == "at" else one.type
     return Annotated[kind if one.default is not None else kind | None, option(*words, flag)], one.default
 
 

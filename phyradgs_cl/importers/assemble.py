@@ -14,9 +14,8 @@ from phyradgs_cl.acquisition.plausible import check_plausible
 from phyradgs_cl.acquisition.trajectory import resting_poses
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
-from phyradgs_cl.importers.options import ImportOptions, needed
-from phyradgs_cl.importers.reading.frames import LineIntegrals, distance_to_detector
-from phyradgs_cl.io.hdf5.source import Hdf5Source
+from phyradgs_cl.importers.options import ImportOptions
+from phyradgs_cl.importers.reading.frames import LineIntegrals
 
 _log = logging.getLogger(__name__)
 _OF_A_TURN = ("exposure_s", "readout_s", "angle_at", "readout_axis", "readout_direction")
@@ -113,7 +112,8 @@ def _first(*values: float | None) -> float | None:
 
 def _check_rest(subject: str, shutter: Shutter, options: ImportOptions, stored: StoredTiming) -> None:
     """Refuses options about a turn without a time from frame to frame; warns of a file's exposure."""
-    asked = [options.called(name) for name in options.given(_OF_A_TURN)]
+    turns = [name for name in options.given(_OF_A_TURN) if name != "exposure_s" or stored.exposure_s is None]
+    asked = [options.called(name) for name in turns]
     frame_time = f"{options.named('frame_time_s')} or {options.named('fps')}"
     for name in (*asked, *stored.written):
         expected = "both, or neither for frames taken at rest"
@@ -209,22 +209,6 @@ def assemble_scan(
     check_plausible(scan, lambda name: subjects.get(name) or options.called(name), is_timed)
     scan.warn_of_near_panel()
     return scan
-
-
-def stored_beam(
-    source: Hdf5Source, addresses: tuple[str, str], to_axis_mm: float | None, options: ImportOptions,
-    panel: tuple[int, int], pitch_mm: tuple[float, float], offset_mm: tuple[float, float] = (0.0, 0.0),
-) -> Geometry:
-    """Returns the geometry of an HDF5 file. ``addresses``: of the distances of source and detector; ``to_axis_mm``: the
-    source's, None without one. Where the options state no distance either, the beam is parallel, and a warning says so."""
-    of_source, of_detector = addresses
-    if to_axis_mm is None and not options.given(_DISTANCES):
-        _log.warning("%s: no source distance: a parallel beam", source.name(of_source))
-        return parallel(options, panel, pitch_mm, offset_mm)
-    stated_mm = options.source_to_axis_mm or to_axis_mm
-    to_axis_mm = needed(stated_mm, "source_to_axis_mm", source.name(of_source), options.named)
-    to_detector_mm = distance_to_detector(source, of_detector, to_axis_mm, options)
-    return cone(options, to_axis_mm, to_detector_mm, panel, pitch_mm, offset_mm)
 
 
 def names_in_file(options: ImportOptions, names: Mapping[str, str]) -> dict[str, str]:

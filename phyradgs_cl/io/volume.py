@@ -202,7 +202,7 @@ def file_kind(path: str | Path) -> str:
             return "volume"
         if isinstance(source.find(_BARE), h5py.Dataset):
             return "plain-volume"
-        if any(source.find(f"{group}/instrument") is not None for group in source.root_groups()):
+        if any(source.find(f"{group}/instrument") is not None for group in source.groups()):
             return "scan"
         if isinstance(source.find(DEFORMATION), h5py.Group):
             return "deformation"

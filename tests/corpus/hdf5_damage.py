@@ -59,19 +59,25 @@ def _instead(make: Change) -> Change:
     return change
 
 
+def _outside(file: h5py.File) -> Path:
+    """A file that is not in the folder of this one."""
+    folder = Path(file.filename).parent
+    return folder.parent / f"outside-{folder.name}.h5"
+
+
 def _external_link(file: h5py.File, address: str) -> None:
-    """To a good dataset of the same name in a good file beside this one."""
-    with h5py.File(Path(file.filename).with_name("outside.h5"), "w") as other:
+    """To a good dataset of the same name in a good file of another folder."""
+    with h5py.File(_outside(file), "w") as other:
         file.copy(address, other, name="there")
     del file[address]
-    file[address] = h5py.ExternalLink("outside.h5", "/there")
+    file[address] = h5py.ExternalLink(f"../{_outside(file).name}", "/there")
 
 
 def _virtual(file: h5py.File, address: str) -> None:
     shape, attributes = file[address].shape, dict(file[address].attrs)
     layout = h5py.VirtualLayout(shape, file[address].dtype)
-    layout[...] = h5py.VirtualSource("outside.h5", "there", shape)
-    with h5py.File(Path(file.filename).with_name("outside.h5"), "w") as other:
+    layout[...] = h5py.VirtualSource(_outside(file), "there", shape)
+    with h5py.File(_outside(file), "w") as other:
         other["there"] = file[address][()]
     del file[address]
     file.create_virtual_dataset(address, layout).attrs.update(attributes)

@@ -1,4 +1,4 @@
-"""Frames of any origin: read from HDF5, turned to row 0 the lowest, converted to line integrals, bad pixels masked."""
+"""Frames of any origin: turned to row 0 the lowest, converted to line integrals, bad pixels masked."""
 
 import logging
 from collections.abc import Mapping
@@ -11,9 +11,7 @@ from phyradgs_cl.acquisition.scan import applied_facts
 from phyradgs_cl.detector.attenuation import frames_to_attenuation
 from phyradgs_cl.detector.noise_level import find_saturation
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.importers.options import ImportOptions, needed
-from phyradgs_cl.io.hdf5.datasets import LENGTH, Quantity, read_length, read_values
-from phyradgs_cl.io.hdf5.source import Hdf5Source
+from phyradgs_cl.importers.options import ImportOptions
 from phyradgs_cl.io.scan.reader import LARGEST_LINE_INTEGRAL
 
 _log = logging.getLogger(__name__)
@@ -115,42 +113,6 @@ def oriented(array: np.ndarray, options: ImportOptions, row_0: str, column_0: st
     if (options.column_0 or column_0) == "right":
         array = array[..., ::-1]
     return array
-
-
-def read_frames(source: Hdf5Source, address: str, panel: tuple[int, int] | None = None) -> np.ndarray:
-    """Reads frames (F, v, u) in their own type. With ``panel`` all must have that shape, and one frame may be (v, u)."""
-    dataset, subject = source.dataset(address), source.name(address)
-    if dataset.dtype.kind not in "iuf":
-        raise InputError(subject, f"type {dataset.dtype}", "real numbers")
-    if panel is not None and dataset.shape == panel:
-        return read_values(source, address, dataset)[None]
-    if dataset.ndim != 3 or min(dataset.shape) < 1:
-        raise InputError(subject, f"shape {dataset.shape}", "three axes (frame, v, u), none of them empty")
-    if panel is not None and dataset.shape[1:] != panel:
-        expected = f"(any, {panel[0]}, {panel[1]}), as the projections"
-        raise InputError(subject, f"shape {dataset.shape}", expected)
-    return read_values(source, address, dataset)
-
-
-def optional_length(source: Hdf5Source, *addresses: str, quantity: Quantity = LENGTH) -> float | None:
-    """Reads a number above 0 at the first of the addresses that exists, in the package's unit."""
-    address = next((address for address in addresses if source.find(address) is not None), None)
-    return None if address is None else read_length(source, address, quantity)
-
-
-def stored_pitch(source: Hdf5Source, options: ImportOptions, *addresses: str) -> float:
-    """Reads the size of a pixel in mm at the first of the addresses that exists; InputError where none does."""
-    size = optional_length(source, *addresses)
-    if size is None:
-        raise source.error(addresses[0], "nothing", "a length", f"say {options.named('pixel_size_mm')}")
-    return size
-
-
-def distance_to_detector(source: Hdf5Source, address: str, to_axis_mm: float, options: ImportOptions) -> float:
-    """Returns the source-to-detector distance in mm: the option's, or that of the axis and the length at ``address``."""
-    behind_mm = None if options.source_to_detector_mm else optional_length(source, address)
-    to_detector_mm = options.source_to_detector_mm if behind_mm is None else to_axis_mm + behind_mm
-    return needed(to_detector_mm, "source_to_detector_mm", source.name(address), options.named)
 
 
 def gantry_sign(options: ImportOptions, convention: str) -> float:
