@@ -16,6 +16,7 @@ from phyradgs_cl.fields import GridChoice
 from phyradgs_cl.importers import FORMATS, ImportOptions, import_scan, recognise
 from phyradgs_cl.importers.formats.tiff_template import template_of
 from phyradgs_cl.importers.options import WORDS, option_name
+from phyradgs_cl.importers.reading.frames import TAKEN
 from phyradgs_cl.io import file_kind, only_run, refuse_overwriting, write_scan
 from phyradgs_cl.signals import finish_despite_interrupt
 from phyradgs_cl.workflow.files import check_output
@@ -36,9 +37,9 @@ GROUPS = {
             *("output", "template", "form", "source_to_axis_mm", "source_to_detector_mm", "pixel_size_mm"),
             *("fps", "exposure_s", "readout_ms", "first"),
         ),
-        "Geometry": ("detector_offset_mm", "unit_mm", "angles", "rotates"),
-        "Timing": ("frame_time_s", "readout_s", "angle_at", "readout_axis", "readout_direction", "detector_model"),
-        "Pixels": ("quantity", "flat_value", "row_0", "column_0", "part", "first_view"),
+        "Geometry": ("detector_offset_mm", "unit_mm", "rotates"),
+        "Timing": ("angles", "frame_time_s", "readout_s", "angle_at", "readout_axis", "readout_direction", "detector_model"),
+        "Pixels": ("frames", "quantity", "flats", "flat_value", "row_0", "column_0", "part", "first_view"),
         "HDF5": ("entry", "at", "linked_folder"),
         "Volume": ("size", "voxel_mm", "roi_mm"),
     }
@@ -93,7 +94,7 @@ def import_command(
     if unusable:
         remark(f"no pixel can be used in {len(unusable)} frames (from 0): {', '.join(map(str, unusable[:10]))}")
     facts = [f"{frames} frames of {rows}×{columns}", *_applied_in_words(scan), "fly-scan" if scan.is_fly else "at rest"]
-    say(f"{output}: {format_name}, {', '.join(facts)}, {masked} pixels masked\n{scan.summary()}")
+    say(f"{output}: {format_name}, {', '.join(facts)}, {masked} pixels masked\n{scan.provenance[TAKEN]}\n{scan.summary()}")
 
 
 def _applied_in_words(scan: Scan) -> list[str]:

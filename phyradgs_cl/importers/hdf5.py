@@ -15,6 +15,7 @@ from phyradgs_cl.errors import InputError
 from phyradgs_cl.importers.assemble import Turned, cone, parallel
 from phyradgs_cl.importers.options import ImportOptions
 from phyradgs_cl.importers.reading.files import SafeFolder
+from phyradgs_cl.importers.reading.flats import places
 from phyradgs_cl.importers.reading.frames import LineIntegrals, line_integrals, oriented
 from phyradgs_cl.io import scan as schema
 from phyradgs_cl.io.hdf5.datasets import (
@@ -81,14 +82,15 @@ class Places:
         there = [address for address in usual if self.source is not None and self.source.find(address) is not None]
         return self.stated.get(name, there)
 
-    def frames(self, name: str, usual: Sequence[str] = (), panel: tuple[int, int] | None = None) -> np.ndarray | None:
-        """Reads a stack (n, v, u) in its own type: of several places one after the other, None without any. ``usual``: the
-        addresses of the format, as far as they exist."""
-        stacks: list[np.ndarray] = []
+    def parts(
+        self, name: str, usual: Sequence[str] = (), panel: tuple[int, int] | None = None
+    ) -> dict[str, np.ndarray]:
+        """Reads frames (n, v, u) in their own type, by place. ``usual``: the addresses of the format, as far as they exist."""
+        stacks: dict[str, np.ndarray] = {}
         for text in self._at(name, usual):
             with self.opened(name, text) as (source, address):
-                stacks.append(self._stack(source, address, panel))
-        return np.concatenate(stacks) if len(stacks) > 1 else next(iter(stacks), None)
+                stacks[text] = self._stack(source, address, panel)
+        return stacks
 
     def _stack(self, source: Hdf5Source, address: str, panel: tuple[int, int] | None) -> np.ndarray:
         dataset, order = source.dataset(address), self._order()
@@ -117,19 +119,24 @@ class Places:
     ) -> "Stacks":
         """Reads all frames at the usual addresses of a format, or at the stated ones. A key of the frames sorts them;
         flats and darks at addresses count before its own."""
-        frames = self.frames("projections", [projections])
-        if frames is None:
-            assert self.source is not None
-            self.source.dataset(projections)  # says what is there in its place
+        parts = self.parts("projections", [projections])
+        if not parts:
+            if self.source is not None:
+                self.source.dataset(projections)  # says what is there in its place
             raise InputError(f"{self.subject} projections", "nothing", "FILE:/ADDRESS")
+        frames = joined(parts)
         panel = (frames.shape[1], frames.shape[2])
-        of_frame = self._key(key, len(frames))
-        usual = {"flats": flats, "darks": darks, "mask": mask}
-        apart = {name: self.frames(name, usual[name], panel) for name in usual}
-        of_key = {"flats": frames[of_frame == schema.FLAT], "darks": frames[of_frame == schema.DARK]}
-        used = of_frame == schema.PROJECTION
-        found = {name: of_key[name] if apart[name] is None else apart[name] for name in of_key}
-        return Stacks(frames if used.all() else frames[used], found["flats"], found["darks"], _mask(apart["mask"], used), used)
+        kinds = self._key(key, len(frames))
+        used = kinds == schema.PROJECTION
+        stacks, flats_at = {"flats": frames[kinds == schema.FLAT], "darks": frames[kinds == schema.DARK]}, None
+        if len(stacks["flats"]):
+            flats_at = places(kinds == schema.FLAT, used)
+        for name, addresses in (("flats", flats), ("darks", darks), ("mask", mask)):
+            if parts := self.parts(name, addresses, panel):
+                stacks[name] = joined(parts)
+                flats_at = _times_of(parts, int(used.sum())) if name == "flats" else flats_at
+        frames = frames if used.all() else frames[used]
+        return Stacks(frames, stacks["flats"], stacks["darks"], _mask(stacks.get("mask"), used), used, flats_at)
 
     def _key(self, usual: Sequence[str], frames: int) -> np.ndarray:
         """Reads the keys (F,) of frames, those of ``io.scan``; without any all frames are projections."""
@@ -160,13 +167,15 @@ class Places:
 @dataclass(frozen=True, eq=False)
 class Stacks:
     """Projections (P, v, u), flats and darks (n, v, u) or None, and a mask (v, u) or (P, v, u), non-zero for pixels that are
-    not to be used, or None. ``used`` (F,): which of the stored frames are projections."""
+    not to be used, or None. ``used`` (F,): which of the stored frames are projections. ``flats_at``: see
+    ``flats.light_of``."""
 
     projections: np.ndarray
-    flats: np.ndarray | None
-    darks: np.ndarray | None
+    flats: np.ndarray
+    darks: np.ndarray
     mask: np.ndarray | None
     used: np.ndarray
+    flats_at: np.ndarray | None
 
     @property
     def panel(self) -> tuple[int, int]:
@@ -174,18 +183,36 @@ class Stacks:
 
     def turned(self, turn: Turned) -> "Stacks":
         """Returns the stacks with flips that a file declares."""
-        arrays = (self.projections, self.flats, self.darks, self.mask)
-        return Stacks(*(None if one is None else turn.frames(one) for one in arrays), self.used)  # type: ignore[arg-type]
+        frames, flats, darks = (turn.frames(one) for one in (self.projections, self.flats, self.darks))
+        mask = None if self.mask is None else turn.frames(self.mask)
+        return replace(self, projections=frames, flats=flats, darks=darks, mask=mask)
 
     def line_integrals(
         self, subject: str, options: ImportOptions, row_0: str, convention: str | None = None
     ) -> LineIntegrals:
         """Converts the projections; see ``frames.line_integrals`` and ``oriented``."""
-        stacks = (self.projections, self.flats, self.darks, self.mask)
-        frames, flats, darks, mask = (None if one is None else oriented(one, options, row_0) for one in stacks)
-        assert frames is not None
-        integrals = line_integrals(subject, frames, options, flats=flats, darks=darks, convention=convention)
-        return integrals if mask is None else replace(integrals, mask=united(mask != 0, integrals.mask))
+        frames, flats, darks = (oriented(one, options, row_0) for one in (self.projections, self.flats, self.darks))
+        integrals = line_integrals(
+            subject, frames, options, flats=flats, darks=darks, convention=convention, flats_at=self.flats_at
+        )
+        if self.mask is None:
+            return integrals
+        return replace(integrals, mask=united(oriented(self.mask, options, row_0) != 0, integrals.mask))
+
+
+def joined(parts: Mapping[str, np.ndarray]) -> np.ndarray:
+    """Returns all frames of several places, one place after the other."""
+    stacks = list(parts.values())
+    return stacks[0] if len(stacks) == 1 else np.concatenate(stacks)
+
+
+def _times_of(parts: Mapping[str, np.ndarray], projections: int) -> np.ndarray | None:
+    """Returns the places of flats among the projections, of addresses that say before or after; None where one does not."""
+    at = {"pre": -0.5, "post": projections - 0.5}
+    words = [address.rpartition("_")[2] for address in parts]
+    if not all(word in at for word in words):
+        return None
+    return np.concatenate([np.full(len(stack), at[word]) for word, stack in zip(words, parts.values(), strict=True)])
 
 
 def _mask(stack: np.ndarray | None, used: np.ndarray) -> np.ndarray | None:

@@ -13,7 +13,8 @@ from phyradgs_cl.acquisition.readout import SIDES, Named, frame_time_of, readout
 from phyradgs_cl.acquisition.scan import DETECTOR_MODELS
 from phyradgs_cl.acquisition.shutter import AXES
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.importers.reading.files import SafeFolder, read_numbers
+from phyradgs_cl.importers.reading.files import SafeFolder
+from phyradgs_cl.importers.reading.text import read_angles_rad
 
 T = TypeVar("T")
 WORDS: dict[str, tuple[str, ...]] = {
@@ -26,6 +27,8 @@ WORDS: dict[str, tuple[str, ...]] = {
     "readout_axis": AXES,
     "first": SIDES,
     "detector_model": DETECTOR_MODELS,
+    "flats": ("median", "time"),
+    "frames": ("stated", "found"),
 }
 _POSITIVE = ("frame_time_s", "source_to_axis_mm", "source_to_detector_mm", "flat_value", "unit_mm")
 _TIMES = ("exposure_s", "readout_s")
@@ -39,6 +42,7 @@ _AT = (
 )
 _STEPS = re.compile(r"\s*([-+]?\d+(?:\.\d+)?)\s*(,|\.\.)\s*([-+]?\d+(?:\.\d+)?)\s*")
 _ANGLES = "Angles in degrees: a text file, FIRST,STEP or FIRST..LAST."
+_FRAMES = "Where a description states more frames than there are: refuse (stated), or take those found."
 _FIRST_VIEW = "First view of this scan in a JSON of several (phyradgs-real)."
 
 
@@ -70,6 +74,8 @@ class ImportOptions:
     column_0: str | None = _option("Place of the first stored column.", "left")
     quantity: str | None = _option("Quantity in the pixels.")
     angles: str | None = _option(_ANGLES)
+    frames: str | None = _option(_FRAMES, "stated")
+    flats: str | None = _option("Flats: their median, or interpolated in time.", "time if the file states it, else median")
     flat_value: float | None = _option("Counts without an object, in place of flat frames.")
     detector_model: str | None = _option("An exposure averages line integrals (log) or intensity.", "log")
     part: str = _option("Projections of a benchmark folder (r2, phyradgs, naf).", True, "train")
@@ -117,8 +123,9 @@ class ImportOptions:
     def taken(self, name: str, stored: Callable[[], T]) -> T:
         """Returns the option ``name`` where it is given, else what ``stored`` reads from the file, whose errors then say the
         option too."""
-        if (value := getattr(self, name)) is not None:
-            return value  # type: ignore[no-any-return]
+        value: T | None = getattr(self, name)
+        if value is not None:
+            return value
         try:
             return stored()
         except InputError as error:
@@ -132,7 +139,7 @@ class ImportOptions:
         if not (steps := _STEPS.fullmatch(self.angles)):
             path = Path(self.angles)
             file = SafeFolder(path.parent).file(path.name, self.named("angles"))
-            return np.deg2rad(read_numbers(file, count, "angles"))
+            return read_angles_rad(file, count)
         first, last = float(steps[1]), float(steps[3])
         if steps[2] == ",":
             return np.deg2rad(first + last * np.arange(count))
@@ -164,8 +171,9 @@ TIMING = (
 OF_BARE_FRAMES = (
     *TIMING,
     *("source_to_axis_mm", "source_to_detector_mm", "pixel_size_mm", "detector_offset_mm", "rotates"),
-    *("row_0", "column_0", "quantity", "flat_value", "detector_model", "angles"),
+    *("row_0", "column_0", "quantity", "flat_value", "detector_model", "angles", "flats"),
 )
+OF_FOLDERS = (*OF_BARE_FRAMES, "frames")
 OF_HDF5 = (*OF_BARE_FRAMES, "entry", "at", "linked_folder")
 _OPTIONS = {"readout_axis": "--readout", "detector_offset_mm": "--detector-offset"}
 

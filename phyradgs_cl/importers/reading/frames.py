@@ -1,7 +1,7 @@
 """Frames of any origin: turned to row 0 the lowest, converted to line integrals, bad pixels masked."""
 
 import logging
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -12,10 +12,13 @@ from phyradgs_cl.detector.attenuation import frames_to_attenuation
 from phyradgs_cl.detector.noise_level import find_saturation
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.importers.options import ImportOptions
+from phyradgs_cl.importers.reading.flats import light_of
 from phyradgs_cl.io.scan.reader import LARGEST_LINE_INTEGRAL
 
 _log = logging.getLogger(__name__)
 Mask = np.ndarray | None
+TAKEN = "taken"
+"""The key of the provenance for which frames and flats were taken, in words."""
 _SAME = 1e-3  # relative difference of a flat that is at the ceiling too
 
 
@@ -33,17 +36,18 @@ class LineIntegrals:
 def line_integrals(
     subject: str, frames: np.ndarray, options: ImportOptions, *, flats: np.ndarray | None = None,
     darks: np.ndarray | None = None, convention: str | None = None, is_corrected: bool = False,
+    flats_at: np.ndarray | None = None, names: Mapping[str, Sequence[str]] | None = None,
 ) -> LineIntegrals:
     """Converts ``frames`` (P, v, u) of any real type to line integrals. Masks clipped counts and values that no object has,
     with a warning. ``subject`` names the file; ``flats``, ``darks``: (n, v, u) or None. The quantity is that of the options,
     else ``convention``, of the format or file; without either, frames with flats are counts and others are refused.
-    ``is_corrected``: the scanner has subtracted the darks."""
+    ``is_corrected``: the scanner has subtracted the darks. ``flats_at``, ``names``: see ``flats.light_of``."""
     has_flats = (flats is not None and len(flats) > 0) or options.flat_value is not None
     quantity = options.quantity or convention or ("counts" if has_flats else None)
     if quantity is None:
         remedy = f"say {options.named('quantity')} attenuation, transmission or counts"
         raise InputError(f"{subject} quantity", "nothing that says it", "what the pixels hold", remedy)
-    saturation = flat = None
+    saturation = flat = light = None
     if quantity != "counts":
         _warn_of_unused(subject, quantity, flats, darks)
     else:
@@ -57,21 +61,24 @@ def line_integrals(
                 found = f"flats or darks of {stack.shape[1:]}"
                 raise InputError(subject, found, f"the projections' {frames.shape[1:]} pixels")
         with np.errstate(over="ignore", invalid="ignore"):
-            flat = flats.mean(axis=0, dtype=np.float64)
+            light = light_of(subject, flats, darks, len(frames), options, flats_at, names)
+            flat = light.flats.mean(axis=0)
             saturation = find_saturation(frames, flat)
         if not is_corrected and (darks is None or len(darks) == 0):
             _log.warning("%s: counts without darks: an offset of the panel stays in the line integrals", subject)
-    integrals, unusable = frames_to_attenuation(frames, quantity, flats, darks, LARGEST_LINE_INTEGRAL)
+    flats, darks, place = (light.flats, light.dark, light.place) if light else (None, None, None)
+    integrals, unusable = frames_to_attenuation(frames, quantity, flats, darks, LARGEST_LINE_INTEGRAL, place)
     if quantity == "attenuation" and unusable.any():
         text = "%s: %d line integrals are not finite or beyond %g: masked"
         _log.warning(text, subject, np.count_nonzero(unusable), LARGEST_LINE_INTEGRAL)
     if flat is not None and saturation is not None and saturation.share > 0:
         air = "the flats are clipped too" if options.flat_value is None else f"{options.named('flat_value')} is no brighter"
         _mask_clipped(subject, frames, flat, saturation, unusable, air)
-    are_applied = (quantity == "counts" and options.flat_value is None, quantity == "counts")
-    stacks = zip(are_applied, (flats, darks), strict=True)
-    counts = [len(stack) if applied and stack is not None else 0 for applied, stack in stacks]
-    return LineIntegrals(integrals, compact(unusable), saturation, applied_facts(*counts))
+    flats_used, darks_used = (0, 0) if light is None else light.used
+    applied = applied_facts(0 if options.flat_value is not None else flats_used, darks_used)
+    if light is not None and options.flat_value is None:
+        applied[TAKEN] = light.said
+    return LineIntegrals(integrals, compact(unusable), saturation, applied)
 
 
 def _warn_of_unused(subject: str, quantity: str, flats: np.ndarray | None, darks: np.ndarray | None) -> None:

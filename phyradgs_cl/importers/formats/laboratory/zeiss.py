@@ -11,11 +11,12 @@ from pathlib import Path
 import numpy as np
 
 from phyradgs_cl.acquisition import Scan
+from phyradgs_cl.acquisition.geometry import Geometry
 from phyradgs_cl.importers import assemble
 from phyradgs_cl.importers.options import OF_BARE_FRAMES, ImportOptions
 from phyradgs_cl.importers.reading.frames import gantry_sign, line_integrals, oriented
 from phyradgs_cl.importers.reading.ole import open_ole, read_images, read_stream
-from phyradgs_cl.importers.reading.settings import differing, say_missing
+from phyradgs_cl.importers.reading.settings import say_missing
 from phyradgs_cl.importers.stage import RotaryStage
 from phyradgs_cl.io.tables import LARGEST, Fields
 
@@ -53,7 +54,7 @@ def import_scan(path: Path, options: ImportOptions) -> Scan:
         if ole.exists(_REFERENCE):
             white = read_images(ole, path, [_REFERENCE], _type(scan, "ReferenceData/DataType", 10), (rows, columns))
     angles = f"{_INFO}/Angles"
-    angle_rad = gantry_sign(options, "sample") * differing(scan, angles, _numbers(scan, angles, count))
+    angle_rad = gantry_sign(options, "sample") * options.angle_rad(count, lambda: np.deg2rad(_numbers(scan, angles, count)))
     in_file = assemble.names_in_file(options, {
         "source_to_axis_mm": scan.name(f"{_INFO}/StoRADistance"), "angles": scan.name(angles),
         "source_to_detector_mm": scan.name(f"{_INFO}/DtoRADistance"), "exposure_s": scan.name(f"{_INFO}/ExpTimes"),
@@ -89,7 +90,8 @@ def _stage(scan: Fields, shape: tuple[int, int, int], options: ImportOptions) ->
         _log.warning(text, scan.name("ReconSettings/CenterShift"), shift)
     if is_cone:
         pitch_mm = pixel_mm * (to_axis_mm + behind_mm) / to_axis_mm
-        geometry = assemble.cone(options, to_axis_mm, to_axis_mm + behind_mm, shape[1:], (pitch_mm, pitch_mm), (0.0, 0.0))
+        lengths_mm = to_axis_mm, to_axis_mm + behind_mm, shape[1:], (pitch_mm, pitch_mm), (0.0, 0.0)
+        geometry: Geometry = assemble.cone(options, *lengths_mm)
     else:
         geometry = assemble.parallel(options, shape[1:], (pixel_mm, pixel_mm), (0.0, 0.0))
     names = ("Alignment/Y-Shifts", "Alignment/X-Shifts")
