@@ -62,7 +62,7 @@ class Places:
     @contextmanager
     def opened(self, name: str, text: str) -> Iterator[tuple[Hdf5Source, str]]:
         """Yields the open file and the address inside it of one place."""
-        file, _, address = text.rpartition(":/")
+        file, _, address = str(text).rpartition(":/")
         subject = f"{self.subject} {name}"
         if self.source is not None and not file and text.startswith("/"):
             yield self.source, text
@@ -114,17 +114,14 @@ class Places:
         return order
 
     def stacks(
-        self, projections: str = "", *, key: Sequence[str] = (), flats: Sequence[str] = (), darks: Sequence[str] = (),
+        self, projections: str = "/", *, key: Sequence[str] = (), flats: Sequence[str] = (), darks: Sequence[str] = (),
         mask: Sequence[str] = (),
     ) -> "Stacks":
         """Reads all frames at the usual addresses of a format, or at the stated ones. A key of the frames sorts them;
         flats and darks at addresses count before its own."""
-        parts = self.parts("projections", [projections])
-        if not parts:
-            if self.source is not None:
-                self.source.dataset(projections)  # says what is there in its place
-            raise InputError(f"{self.subject} projections", "nothing", "FILE:/ADDRESS")
-        frames = joined(parts)
+        if self.source is not None and "projections" not in self.stated:
+            self.source.dataset(projections)  # or says what is there in its place
+        frames = joined(self.parts("projections", [projections]))
         panel = (frames.shape[1], frames.shape[2])
         kinds = self._key(key, len(frames))
         used = kinds == schema.PROJECTION
@@ -317,6 +314,7 @@ def exposure_s(source: Hdf5Source, address: str, used: np.ndarray, options: Impo
         return read_duration(source, address, used, needed=False) or None
     except InputError as error:
         if options.frame_time_s is not None:
-            raise InputError(*error.args[:3], f"say {options.named('exposure_s')}") from error
+            remedy = f"say {options.named('exposure_s')}"
+            raise InputError(error.subject, error.found, error.expected, remedy) from error
         _log.warning("%s: not used, because the gantry stops for every frame", error)
         return None

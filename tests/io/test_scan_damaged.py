@@ -49,10 +49,10 @@ def poked(index: object, value: float) -> Damage:
     return lambda file, address: file[address].__setitem__(index, value)
 
 
-def soft_link_to_external(file: h5py.File, address: str) -> None:
-    file["/away"] = h5py.ExternalLink("other.h5", "/")
-    del file[address]
-    file[address] = h5py.SoftLink("/away/data")
+def soft_link_to_external(file: h5py.File, away: str) -> None:
+    file[away] = h5py.ExternalLink("other.h5", "/")
+    del file[DATA]
+    file[DATA] = h5py.SoftLink(f"{away}/data")
 
 
 def entry_misnamed(file: h5py.File, address: str) -> None:
@@ -80,7 +80,7 @@ CASES: dict[str, tuple[Any, ...]] = {
     "data int32": (DATA, changed(np.int32), "int32", "uint16"),
     "data uint16 attenuation": (DATA, changed(np.uint16), "uint16", "float32"),
     "data NaN": (DATA, poked((2, 1, 3), np.nan), "frame 2 at (1, 3)", "pixel_mask"),
-    "soft link to elsewhere": (DATA, soft_link_to_external, "other.h5"),
+    "soft link to elsewhere": ("/away", soft_link_to_external, "other.h5"),
     "no quantity": (f"{DATA} @quantity", lambda f, a: f[a].attrs.pop("quantity"), "attenuation"),
     "unknown quantity": (f"{DATA} @quantity", attribute("quantity", "HU"), "'HU'"),
     "quantity a number": (f"{DATA} @quantity", attribute("quantity", 3.0), "a string"),

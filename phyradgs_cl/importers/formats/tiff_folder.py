@@ -1,4 +1,4 @@
-"""A folder of TIFF frames and one TOML with their contents, geometry, angles and timing. The TOML has the tables of a
+"""A folder of TIFF or HDF5 frames and one TOML with their contents, geometry, angles and timing. The TOML has the tables of a
 scanner file, and [frames], [angles] and [timing]. Row 0 is the top, column 0 the left, seen from the source."""
 
 from dataclasses import replace
@@ -10,6 +10,7 @@ import numpy as np
 from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.acquisition.readout import frame_time_of, readout_of
 from phyradgs_cl.errors import InputError
+from phyradgs_cl.importers import hdf5
 from phyradgs_cl.importers.assemble import (
     StoredTiming,
     assemble_scan,
@@ -29,7 +30,9 @@ from phyradgs_cl.io.scanner import TABLES, Scanner, scanner_from
 from phyradgs_cl.io.tables import Fields, read_toml, refuse_unknown
 
 OWN_TABLES = {
-    "frames": ("projections", "flats", "darks", "mask", "order", "quantity", "flat_value", "row_0", "column_0"),
+    "frames": (
+        *(*hdf5.STACKS, "order", "image_key", "axes"), *("quantity", "flat_value", "row_0", "column_0")
+    ),
     "angles": ("first_deg", "last_deg", "step_deg", "values_deg", "file", "unit", "rotates", "at"),
     "timing": ("exposure_s", "readout_s", "frame_time_s", "start_s", "detector_model"),
 }
@@ -53,25 +56,35 @@ def recognises(path: Path) -> bool:
 
 def import_scan(path: Path, options: ImportOptions) -> Scan:
     """Imports a folder with one TOML and its frames, or the TOML with the frames in its folder."""
-    options.refuse_unused("tiff", OF_BARE_FRAMES)
+    options.refuse_unused("tiff", (*OF_BARE_FRAMES, "linked_folder"))
     folder = SafeFolder(path if path.is_dir() else path.parent)
     description = path if path.is_file() else folder.only("description of the scan", ".toml")
     tables = _tables(description)
     options = in_words_of_file(options)
     combined = _with_file(options, tables)
-    files = {name: _files(folder, tables["frames"], name) for name in ("flats", "darks", "mask")}
-    series = _projections(folder, tables, options, {path for paths in files.values() for path in paths})
-    frames, rows, columns = tiff.stack_shape(series.paths)
+    files, series = {}, None
+    stored = _in_hdf5(folder, tables["frames"], options)
+    if stored is None:
+        files = {name: _files(folder, tables["frames"], name) for name in ("flats", "darks", "mask")}
+        series = _projections(folder, tables, options, {path for paths in files.values() for path in paths})
+        frames, rows, columns = tiff.stack_shape(series.paths)
+    else:
+        frames, rows, columns = stored.projections.shape
+    used = np.ones(frames, bool) if stored is None else stored.used
     scanner = _scanner(description, tables[""], (rows, columns), options)
     geometry = with_options(options, scanner.geometry)
     timing = make_timing(str(description), frames, options, _stored_timing(tables, scanner, options))
     sign = gantry_sign(combined, "gantry")
-    angle_rad = sign * options.angle_rad(frames, lambda: _angles_rad(folder, tables["angles"], frames))
-    stacks = {name: tiff.read_tiffs(paths) for name, paths in {"projections": series.paths, **files}.items() if paths}
-    integrals = _line_integrals(stacks, files, series, combined, tables["frames"], str(description))
+    angle_rad = sign * options.angle_rad(frames, lambda: _angles_rad(folder, tables["angles"], used, options))
+    if series is None:
+        assert stored is not None
+        integrals = stored.line_integrals(str(description), combined, "top")
+    else:
+        stacks = {name: tiff.read_tiffs(paths) for name, paths in {"projections": series.paths, **files}.items() if paths}
+        integrals = _line_integrals(stacks, files, series, combined, tables["frames"], str(description))
     return assemble_scan(
         integrals, turning(geometry, angle_rad, timing), geometry, timing, combined,
-        title=tables[""].word("title", default=folder.root.resolve().name), source=str(path), said=series.said,
+        title=tables[""].word("title", default=folder.root.resolve().name), source=str(path), said=series.said if series else "",
         grid=scanner.grid if tables[""].has("volume") else None, lag=scanner.lag, names=_subjects(tables, options),
     )
 
@@ -90,6 +103,10 @@ def _subjects(tables: dict[str, Fields], options: ImportOptions) -> dict[str, st
 def _tables(path: Path) -> dict[str, Fields]:
     """Returns the file's own tables by name, and under "" those of a scanner file. InputError for unknown names."""
     content = read_toml(path)
+    for place in (content, content.get("frames")):  # short for [angles] file
+        if isinstance(place, dict) and isinstance(place.get("angles"), str):
+            text = place.pop("angles")
+            content["angles"] = {**content.get("angles", {}), "file": text}
     refuse_unknown(str(path), content, (*_SCANNER, *OWN_TABLES), "a name")
     tables = {name: Fields(f"{path} [{name}]", content.get(name, {}), keys) for name, keys in OWN_TABLES.items()}
     tables["readout"] = Fields(f"{path} [readout]", content.get("readout", {}), TABLES["readout"])
@@ -115,6 +132,15 @@ def _with_file(options: ImportOptions, tables: dict[str, Fields]) -> ImportOptio
     if frames.has("flat_value"):
         combined["flat_value"] = frames.length("flat_value")
     return replace(options, **{k: v for k, v in combined.items() if not getattr(options, k)})
+
+
+def _in_hdf5(folder: SafeFolder, frames: Fields, options: ImportOptions) -> hdf5.Stacks | None:
+    """Reads the frames where the projections have an address in HDF5, else returns None."""
+    stated = {name: frames.values[name] for name in (*hdf5.STACKS, "image_key", "axes") if frames.has(name)}
+    lists = {name: value if isinstance(value, list) else [value] for name, value in stated.items()}
+    if not all(map(hdf5.is_address, lists.get("projections", [None]))):
+        return None
+    return hdf5.Places(lists, frames.subject, options.linked_folder, folder=folder).stacks()
 
 
 def _projections(folder: SafeFolder, tables: dict[str, Fields], options: ImportOptions, others: set[Path]) -> Series:
@@ -211,8 +237,9 @@ def _stored_timing(tables: dict[str, Fields], scanner: Scanner, options: ImportO
     )
 
 
-def _angles_rad(folder: SafeFolder, angles: Fields, frames: int) -> np.ndarray:
-    """Reads angles (F,) as stored: a list, a file with one per line, or the first with the last or a step."""
+def _angles_rad(folder: SafeFolder, angles: Fields, used: np.ndarray, options: ImportOptions) -> np.ndarray:
+    """Reads the angles of the frames that ``used`` marks: a list, a file, a dataset, or the first with the last or a step."""
+    frames = int(used.sum())
     given = [key for key in _ANGLES if angles.has(key)]
     if len(given) != 1:
         raise InputError(angles.subject, " and ".join(given) or "no angles", f"one of {', '.join(_ANGLES)}")
@@ -220,6 +247,9 @@ def _angles_rad(folder: SafeFolder, angles: Fields, frames: int) -> np.ndarray:
         raise angles.error("unit", "no file beside it", "the unit of a file of angles", "leave it out")
     if angles.has("file"):
         unit = angles.word("unit", tuple(TO_RAD)) if angles.has("unit") else None
+        if hdf5.is_address(text := angles.get("file")):
+            places = hdf5.Places({"angles": [str(text)]}, angles.subject, options.linked_folder, folder=folder)
+            return places.angles_rad(used, options, unit=unit or "deg")
         return read_angles_rad(folder.file(angles.get("file"), angles.name("file")), frames, unit)
     if angles.has("values_deg"):
         return np.deg2rad(angles.numbers("values_deg", frames))

@@ -186,16 +186,14 @@ class Hdf5Source:
     def _leads_nowhere(self, group: h5py.Group, part: str, address: str, error: Exception) -> bool:
         """Whether a member that cannot be opened is a link inside the file to nothing. InputError for a link to another file,
         or in a circle."""
-        with suppress(*_DAMAGE):
-            link = group.get(part, getlink=True)
-            for _ in range(_MOST_LINKS):
-                if isinstance(link, h5py.ExternalLink):
-                    raise self._unlinked(address, group.file, link.filename, link.path) from error
-                if not isinstance(link, h5py.SoftLink):
-                    return link is None
-                group, link = group[posixpath.dirname(link.path) or "."], group.get(link.path, getlink=True)
+        link = group.get(part, getlink=True)
+        if isinstance(link, h5py.ExternalLink):
+            raise self._unlinked(address, group.file, link.filename, link.path) from error
+        if not isinstance(link, h5py.SoftLink):
+            return False
+        if isinstance(error, RuntimeError):
             raise self.error(address, "a loop of links", "a dataset", "store the data itself") from error
-        return isinstance(link, h5py.SoftLink)
+        return group.file != self.file or self.find(posixpath.join(group.name, link.path)) is None
 
     def _unlinked(self, address: str, file: h5py.File, name: str, inside: str) -> InputError:
         """Returns why what a link names in another file cannot be read."""
