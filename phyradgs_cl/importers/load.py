@@ -142,9 +142,9 @@ def _read_npy(path: Path) -> Volume:
 
 
 def _read_tiff(path: Path) -> Volume:
-    """Reads pages from the lowest slice up, row 0 at the smallest y, with the sizes that ImageJ writes."""
+    """Reads pages from the lowest slice up, row 0 at the smallest y, with the sizes that ImageJ or OME write."""
     values = tiff.read_tiffs([path])
-    size_mm, origin, note = tiff.imagej_calibration(path)
+    size_mm, origin, note = tiff.calibration(path)
     if size_mm is None:
         return _bare(path, values)
     first_mm = None if origin is None else -(origin * size_mm)[::-1]

@@ -30,6 +30,7 @@ _DISAGREEMENT_MEANS = (
 _AXES = ("z", "y", "x")
 _GAUSSIANS, _STATE, _STATES = "/entry/gaussians", "/entry/state", "/entry/time_series"
 _CLOUD = {"mean": (3,), "scale": (3,), "quaternion": (4,), "density": ()}
+_LOWEST_PER_MM, _HIGHEST_PER_MM = -10.0, 1000.0  # beyond noise below 0, and beyond gold
 _AXIS_TOLERANCE = 1e-3  # of a voxel, for axes stored in float32
 log = logging.getLogger(__name__)
 
@@ -163,6 +164,19 @@ def check_attenuation(subject: str, volume: Volume, *, warn: bool = True) -> Vol
     if warn and negative > 0.1 * positive:
         share = f"{100 * negative / positive:.0f} % as much below 0 as above"
         log.warning("%s: %s, %s; expected %s; %s", subject, found, share, expected, remedy)
+    return volume
+
+
+def attenuation_of(subject: str, volume: Volume, mu_water_per_mm: float | None) -> Volume:
+    """Returns a volume in 1/mm, from Hounsfield units where water's attenuation is stated. InputError about ``subject`` for
+    values that no attenuation in 1/mm has: those of CT numbers, and counts."""
+    lowest, highest = float(volume.values.min()), float(volume.values.max())
+    if mu_water_per_mm is not None:
+        checks.within("--mu-water-per-mm", mu_water_per_mm, 1e-6, 1e3)
+        return replace(volume, values=(mu_water_per_mm * (1 + volume.values.astype(np.float64) / 1000)).astype(np.float32))
+    if lowest < _LOWEST_PER_MM or highest > _HIGHEST_PER_MM:
+        found = f"values from {lowest:g} to {highest:g}, as of Hounsfield units"
+        raise InputError(subject, found, "attenuation in 1/mm", "say --mu-water-per-mm, near 0.02, to convert them")
     return volume
 
 

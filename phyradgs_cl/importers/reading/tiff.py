@@ -4,7 +4,7 @@ import logging
 import math
 import re
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,6 +17,7 @@ from phyradgs_cl.errors import InputError
 from phyradgs_cl.importers.options import ImportOptions
 from phyradgs_cl.importers.reading.files import SafeFolder, check_room
 from phyradgs_cl.importers.reading.series import series_of
+from phyradgs_cl.io.hdf5.datasets import LENGTH
 from phyradgs_cl.io.files import regular_file
 
 SUFFIXES = (".tif", ".tiff")
@@ -24,6 +25,9 @@ _MOST_PAGES = 100_000
 _PLAIN = 1  # compression
 _log = logging.getLogger(__name__)
 _RESULT_BYTES = 5  # per pixel: a line integral in float32, and its mask
+_NO_SPACE = {"C": "channels", "T": "times"}  # axes of a stack that are none of a volume
+_OME_SIZES = re.compile(r'PhysicalSize([XYZ](?:Unit)?)="([^"]*)"')
+_OF_SIZE = ("unit", "spacing")
 _ORIENTATION = 274  # 1: row 0 at the top, column 0 on the left
 
 
@@ -156,22 +160,36 @@ def _opened(path: Path) -> Iterator[Any]:
         raise InputError(str(path), found, "grey images", "save it uncompressed") from error
 
 
-def imagej_calibration(path: Path) -> tuple[np.ndarray | None, np.ndarray | None, str]:
-    """Returns the voxel sizes (x, y, z) in mm, the origin's place (x, y, z) in voxels and the text "Info" of a stack.
-    ImageJ wrote the stack, or tifffile, which keeps the same values of a BigTIFF as JSON. None stands for missing values.
-    Call ``read_tiffs`` first."""
+def calibration(path: Path) -> tuple[np.ndarray | None, np.ndarray | None, str]:
+    """Returns the voxel sizes (x, y, z) in mm, the origin's place (x, y, z) in voxels and the text "Info" of a stack. ImageJ
+    wrote the stack, or tifffile, which keeps the same values of a BigTIFF as JSON, or a program that writes OME-TIFF. None
+    stands for missing values, which a warning names where the file has a part of them. InputError for a stack with several
+    channels or times. Call ``read_tiffs`` first."""
     tifffile = checks.package("tifffile", "the package that reads TIFF", "phyradgs-cl[formats]")
-    try:
-        with _quiet("tifffile"), tifffile.TiffFile(path) as tiff:
-            facts: dict[str, Any] = tiff.imagej_metadata or (tiff.shaped_metadata or ({},))[0]
+    with _opened(path) as tiff:
+        series = tiff.series[0]
+        long = {axis: n for axis, n in zip(series.axes, series.shape, strict=False) if axis in _NO_SPACE and n > 1}
+        ome, per_mm = dict(_OME_SIZES.findall(tiff.ome_metadata or "")), []
+        with suppress(KeyError, TypeError, ValueError, ZeroDivisionError, tifffile.TiffFileError):
             per_mm = [np.divide(*tiff.pages[0].tags[f"{axis}Resolution"].value) for axis in "XY"]
-        sizes = np.array([1 / per_mm[0], 1 / per_mm[1], float(facts["spacing"])])
-        if facts.get("unit") != "mm" or not np.all(np.isfinite(sizes) & (sizes > 0)):
-            return None, None, ""
-        origin = np.array([float(facts.get(f"{axis}origin", np.nan)) for axis in "xyz"])
-        return sizes, origin if np.isfinite(origin).all() else None, str(facts.get("Info", ""))
-    except (KeyError, TypeError, ValueError, ZeroDivisionError, tifffile.TiffFileError):
+        facts: dict[str, Any] = tiff.imagej_metadata or next(iter(tiff.shaped_metadata or ()), {})
+    if long:
+        found = " and ".join(f"{count} {_NO_SPACE[axis]}" for axis, count in long.items())
+        raise InputError(str(path), f"a stack of axes {series.axes}, {found}", "one volume", "save one of them, as slices")
+    units = [ome.get(f"{axis}Unit", "um") if ome else str(facts.get("unit", "")) for axis in "XYZ"]
+    try:
+        sizes = [float(ome[axis]) for axis in "XYZ"] if ome else [*(1 / n for n in per_mm), float(facts["spacing"])]
+        factors = np.array([LENGTH.factor(unit) for unit in units], np.float64)
+        size_mm = np.array(sizes, np.float64) * factors
+    except (KeyError, TypeError, ValueError, ZeroDivisionError):
+        size_mm = np.full(3, np.nan)
+    if size_mm.shape != (3,) or not np.all(np.isfinite(size_mm) & (size_mm > 0)):
+        if ome or "unit" in facts:
+            found = ", ".join(f"{name} {value}" for name, value in (ome or {k: facts[k] for k in facts if k in _OF_SIZE}).items())
+            _log.warning("%s: no voxel sizes can be made of %s: the scale is left out", path, found)
         return None, None, ""
+    origin = np.array([float(facts.get(f"{axis}origin", np.nan)) for axis in "xyz"])
+    return size_mm, origin if np.isfinite(origin).all() else None, str(facts.get("Info", ""))
 
 
 @contextmanager
