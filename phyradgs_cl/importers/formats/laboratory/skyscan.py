@@ -111,10 +111,11 @@ def _timing(scan: settings.Settings, options: ImportOptions) -> assemble.StoredT
     averaged = re.fullmatch(r"ON *\(([1-9]\d{0,5})\)", averaging, re.I)
     if not averaged and not _OFF.fullmatch(averaging):
         raise scan.error("Frame Averaging", repr(averaging[:40]), "OFF, or ON and a count of frames, as ON (4)")
-    is_stopped = "STEP" in motion.upper() and options.frame_time_s is None
-    if options.exposure_s is not None or is_stopped or not scan.has("Exposure (ms)"):
+    if options.exposure_s is not None or not scan.has("Exposure (ms)"):
         return assemble.StoredTiming()
     exposure_s = scan.measured("Exposure (ms)", TIME, "ms")
+    if "STEP" in motion.upper() and options.frame_time_s is None:
+        return assemble.StoredTiming()
     return assemble.StoredTiming(exposure_s=exposure_s * int(averaged[1] if averaged else 1))
 
 
