@@ -21,7 +21,7 @@ from phyradgs_cl.importers.formats.naf import TIGRE_MODULE, PlainUnpickler, name
 from phyradgs_cl.importers.options import TIMING, ImportOptions
 from phyradgs_cl.importers.reading.frames import line_integrals, oriented
 from phyradgs_cl.importers.stage import along
-from phyradgs_cl.io.tables import described
+from phyradgs_cl.io.tables import Fields, described
 
 OPTIONS = (*TIMING, "row_0", "column_0", "quantity", "flat_value", "detector_model")
 _NAMES = ("DSO", "DSD", "nDetector", "dDetector", "nVoxel", "dVoxel", "offOrigin", "offDetector", "rotDetector", "COR")
@@ -53,10 +53,12 @@ def import_scan(path: Path, options: ImportOptions) -> Scan:
     """Imports the projections of a pickle."""
     options.refuse_unused("tigre", OPTIONS)
     content = read_pickle(path, TigreUnpickler)
-    if not isinstance(content, tuple) or len(content) != 3 or not isinstance(content[1], _Geometry):
+    if not isinstance(content, (tuple, list)) or len(content) != 3 or not isinstance(content[1], _Geometry):
         expected = "a tuple (projections, geometry, angles), as TIGRE's loaders return it"
         raise InputError(str(path), described(content), expected)
     frames, geo, angles = content[0], _checked(content[1], path), content[2]
+    if isinstance(angles, (list, tuple)):
+        angles = Fields(f"{path}:", {"angles": list(angles)}).numbers("angles")
     for name, value in (("projections", frames), ("angles", angles)):
         if not isinstance(value, np.ndarray) or value.dtype.kind not in "iuf":
             raise InputError(f"{path}: {name}", described(value), "an array of numbers")
