@@ -27,7 +27,7 @@ NAMES = {  # a name for each frame, in the order of the scan
     "angles alone": lambda i: f"rot_{-45 + 3.75 * i:g}deg.tif",
     "angles with commas": lambda i: f"p_{3.75 * i:.2f}".replace(".", ",") + "°.tif",
     "measured angles": lambda i: f"theta={7.5 * i + 0.1 * (i % 3):.2f}.tif",
-    "clock times over midnight": lambda i: f"im 2024-05-0{'67'[i > 11]}T{('23.59', '00.00')[i > 11]}.{(48 + i) % 60:02d}.tif",
+    "clock times over midnight": lambda i: f"a 2024-05-0{'67'[i > 11]}T{('23.59', '00.00')[i > 11]}.{(48 + i) % 60:02d}.tif",
     "milliseconds": lambda i: f"f_{1712345678000 + 250 * i + i % 3}.tif",
     "cameras that alternate": lambda i: f"cam{'LR'[i % 2]}_{i:05d}.tif",
     "turn and frame": lambda i: f"t{i // 8}_f{i % 8}.tif",
