@@ -2,7 +2,7 @@
 
 import re
 from collections.abc import Callable
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -144,6 +144,10 @@ class ImportOptions:
         if steps[2] == ",":
             return np.deg2rad(first + last * np.arange(count))
         return np.deg2rad(np.linspace(first, last, count))
+
+    def with_air(self, flat_value: float | None) -> "ImportOptions":
+        """Returns the options with a file's counts of air where they state none."""
+        return replace(self, flat_value=self.flat_value or flat_value)
 
     def called(self, name: str) -> str:
         """Returns the name of a field in messages: the word of a data sheet where the user gave that."""

@@ -20,7 +20,8 @@ _NUMBER = re.compile(r"([-+]?)(\d+)(?:[.,](\d+))?")
 _DATE = r"(?<!\d)((?:19|20)\d\d)[-_.]?(0[1-9]|1[0-2])[-_.]?(0[1-9]|[12]\d|3[01])"
 _TIME = re.compile(_DATE + r"[-_ T.]*([01]\d|2[0-3])[-_.:h]?([0-5]\d)[-_.:m]?([0-5]\d)(?!\d)")
 _DEGREES, _ANGLE = re.compile(r"[ _]?(deg|°|grad)", re.I), re.compile(r"(deg|angle|ang|theta|phi|rot)[ _=]*$", re.I)
-_STEADY, _USUAL = 0.25, 0.5  # of the usual step: how far a regular one differs; share of regular steps in a series
+_STEADY, _GAP = 0.25, 1.5  # of the usual step: how far a regular one differs; a gap between angles or times
+_USUAL, _STEADY_ANGLES = 0.5, 0.75  # share of regular steps in a series, and in angles or times whose gaps are holes
 _SMALL = 0.25  # of the largest group of names: smaller ones are no frames
 _BEFORE, _AFTER = (re.compile(rf"(?<![a-z])({words})(?![a-z])", re.I) for words in ("before|pre|start", "after|post|end"))
 _STAMP = 10**7  # numbers from here on count milliseconds, and no frames
@@ -50,27 +51,26 @@ class _Column:
 
     @property
     def steps(self) -> tuple[float, np.ndarray]:
-        """The usual step between the sorted numbers, and which steps (F − 1,) are it: the most frequent one, or within a
-        quarter of the median one. None are where the numbers have no usual step."""
+        """The usual step between the sorted numbers, and how many of it each step (F − 1,) is. The usual step is the most
+        frequent one, or the median."""
         steps = np.diff(np.sort(self.values))
         if not len(steps):
-            return 1.0, steps == 0
+            return 1.0, steps
         sizes, counts = np.unique(np.round(steps, 6), return_counts=True)
         usual = float(sizes[np.argmax(counts * (sizes > 0))])
-        is_usual = np.isclose(steps, usual, rtol=0, atol=1e-6)
-        if is_usual.mean() < _USUAL:
+        if 2 * counts.max() < len(steps):
             usual = float(np.median(steps))
-            is_usual = np.abs(steps - usual) <= _STEADY * usual
-        return usual, is_usual & (is_usual.mean() >= _USUAL)
+        return usual, steps / (usual or 1.0)
 
     @property
-    def is_regular(self) -> bool:
-        return len(self.values) == 1 or bool(self.steps[1].any())
+    def regular(self) -> float:
+        """The share of steps that are the usual one."""
+        return float(np.mean(np.abs(self.steps[1] - 1) <= _STEADY)) if len(self.values) > 1 else 1.0
 
     @property
     def rank(self) -> tuple[bool, bool, bool]:
         """Ranks columns: regular ones before others, indices before angles, whole numbers before times."""
-        return not self.is_regular, self.is_angle, self.values.dtype.kind == "f"
+        return self.regular < _USUAL, self.is_angle, self.values.dtype.kind == "f"
 
 
 def series_of(
@@ -103,13 +103,14 @@ def series_of(
     key = keys[0]
     if order is None:
         _warn_of_others(subject, key, distinct[1:])
-    numbers, (step, is_usual) = key.values[at], key.steps
+    numbers, (step, of_usual) = key.values[at], key.steps
     is_index = not key.is_angle and key.values.dtype.kind == "i" and numbers[-1] < _STAMP
-    for gap in np.flatnonzero(~is_usual)[: int(not holes and (is_index or key.is_regular))]:
-        kind = "one number" if numbers[gap] == numbers[gap + 1] else "a hole"
+    is_gap = np.abs(of_usual - 1) > _STEADY if is_index else (of_usual >= _GAP) & (key.regular >= _STEADY_ANGLES)
+    for gap in np.flatnonzero((of_usual == 0) | (is_gap & (not holes)))[:1]:
+        kind = "a hole" if of_usual[gap] else "one number"
         found = f"{paths[gap + 1].name} after {paths[gap].name}: {kind} in the numbering"
         raise InputError(subject, found, "every number once", remedy)
-    steps = f"in steps of {step:g}" if is_usual.all() else "in uneven steps, in which no hole shows"
+    steps = f"in steps of {step:g}" if key.regular == 1 else "in uneven steps, in which no hole shows"
     what = "angle" if key.is_angle else "number"
     by = f"by {what} {key.place} in their names, {numbers[0]:g} to {numbers[-1]:g} {steps}"
     return Series(paths, numbers, f"frames: {_ends(paths)}, {by}")
@@ -158,11 +159,12 @@ def _do_alternate(groups: list[list[Path]]) -> bool:
 
 def _columns(names: list[str]) -> list[_Column]:
     """Returns the numbers of names that have as many words, place by place."""
-    clocks = [_TIME.search(name) for name in names]
-    columns = _read(names)
-    if all(clocks) and not any(column.is_distinct and column.is_regular for column in columns):
-        seconds = [(datetime(*map(int, one.groups())) - datetime(2000, 1, 1)).total_seconds() for one in clocks if one]  # type: ignore[arg-type]
-        columns = [*_read([_TIME.sub("", name) for name in names]), _Column(len(columns) + 1, np.array(seconds), False)]
+    columns, clocks = _read(names), [_TIME.search(name) for name in names]
+    others = _read([_TIME.sub("", name) for name in names])
+    if all(clocks) and not any(column.is_distinct for column in others):
+        times = [datetime(*map(int, clock.groups())) for clock in clocks if clock]  # type: ignore[arg-type]
+        seconds = np.array([(time - times[0]).total_seconds() for time in times])
+        return [*others, _Column(len(columns) + 1, seconds, False)]
     return columns
 
 

@@ -1,14 +1,16 @@
 """Numbers in texts as people and their programs write them: decimal commas, units behind a number, tables of angles."""
 
+import logging
 import re
 from pathlib import Path
 
 import numpy as np
 
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.importers.reading.files import read_text
+from phyradgs_cl.importers.reading.files import SafeFolder, read_text
 from phyradgs_cl.io.tables import LARGEST
 
+_log = logging.getLogger(__name__)
 _BEGINNING = re.compile(r"([-+]?(?:\d[\d.,]*|[.,]\d+))([eE][-+]?\d+)?(?=$|[\s;°µμa-zA-Z%(])[\s;]*(.*)", re.S)
 _ENGLISH, _GERMAN = (re.compile(rf"[-+]?\d{{1,3}}({k}\d{{3}})+{d}") for k, d in ((",", r"(\.\d+|,\d{3})"), (r"\.", r",\d+")))
 _ONE_COMMA, _EITHER = re.compile(r"[-+]?\d*,\d+"), re.compile(r"[-+]?[1-9]\d{0,2},\d{3}")
@@ -47,7 +49,7 @@ def read_angles_rad(path: Path, count: int, unit: str | None = None, column: int
     ``column`` has the angles. InputError: another count, several columns without names, lines that are no numbers."""
     lines = [(i, line.partition("#")[0].strip()) for i, line in enumerate(read_text(path).splitlines(), 1)]
     lines = [(i, line) for i, line in lines if line]
-    is_header = [not re.search(r"\d", line) or _cells(line, True) is None for _, line in lines]
+    is_header = [not re.search(r"\d", line) or (_cells(line, True) or _cells(line, False)) is None for _, line in lines]
     head = is_header.index(False) if False in is_header else len(lines)
     if column is not None:  # a maker's file, whose lines above the table may hold numbers too
         head = max(head, len(lines) - count)
@@ -115,3 +117,25 @@ def _column(path: Path, names: list[str], table: list[list[float]], count: int, 
         raise InputError(str(path), f"{width} numbers a line", "one angle a line", remedy)
     is_counted = column > 0 and _is_index(columns[0].tolist())
     return np.asarray(columns[column][np.argsort(columns[0])] if is_counted else columns[column])
+
+
+def file_of_angles(folder: SafeFolder, name: str, *ends: str) -> Path | None:
+    """Returns the file ``name`` with the first of the ``ends`` that is there, else the only file with such an end."""
+    for end in ends:
+        files = folder.glob(f"*{end}")
+        own = [file for file in files if file.name.lower() == f"{name}{end}".lower()]
+        if own or len(files) == 1:
+            return (own or files)[0]
+    return None
+
+
+def measured_angles_rad(path: Path, steps_rad: np.ndarray) -> np.ndarray:
+    """Reads measured angles (F,) in rad. Such files count up or down, in either order: taken is what agrees best with equal
+    steps (F,). A line says how far both are apart."""
+    listed_rad = np.unwrap(read_angles_rad(path, len(steps_rad), column=1))
+    ways = [steps_rad[0] + way - way[0] for way in (listed_rad, listed_rad[::-1], -listed_rad, -listed_rad[::-1])]
+    off_deg = [float(np.rad2deg(np.abs(way - steps_rad).max())) for way in ways]
+    best = int(np.argmin(off_deg))
+    text = "%s: these measured angles are used; they differ from equal steps by %.3g° at most"
+    _log.warning(text, path, off_deg[best])
+    return ways[best]

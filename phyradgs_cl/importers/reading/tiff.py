@@ -128,7 +128,7 @@ def _header(path: Path) -> _Header:
         for page in tiff.pages:
             if pages >= _MOST_PAGES:
                 raise InputError(str(path), f"more than {_MOST_PAGES} pages", "fewer pages")
-            _check_page(path, page)
+            _check_page(path, page, images * math.prod(page.shape[-2:]) * (page.dtype or np.dtype(np.uint8)).itemsize)
             if pages == 0:
                 shape, dtype = page.shape[-2:], page.dtype
             if (page.shape[-2:], page.dtype) != (shape, dtype):
@@ -204,7 +204,7 @@ def _quiet(name: str) -> Iterator[None]:
         logger.disabled = before
 
 
-def _check_page(path: Path, page: Any) -> None:
+def _check_page(path: Path, page: Any, before_bytes: int) -> None:
     """Compares the size of a page with the file before anything is decoded. One page may be a stack (n, v, u)."""
     shape, dtype = page.shape, page.dtype
     grey = len(shape) == 2 or (len(shape) == 3 and page.axes.endswith("YX"))
@@ -215,7 +215,8 @@ def _check_page(path: Path, page: Any) -> None:
     if tag is not None and tag.value != 1:
         expected = "1 (row 0 at the top, column 0 on the left)"
         raise InputError(f"{path} tag Orientation", str(tag.value), expected, "turn the images")
-    needed, here = math.prod(shape) * page.bitspersample // 8, sum(page.databytecounts)
-    if page.compression == _PLAIN and needed > min(here, path.stat().st_size):
-        found = f"a page of shape {shape}, {needed} bytes, in {min(here, path.stat().st_size)} bytes of data"
+    needed = math.prod(shape) * page.bitspersample // 8
+    left = min(sum(page.databytecounts), path.stat().st_size - before_bytes * page.bitspersample // (8 * dtype.itemsize))
+    if page.compression == _PLAIN and needed > left:
+        found = f"a page of shape {shape}, {needed} bytes, in {max(left, 0)} bytes of data"
         raise InputError(str(path), found, "a size that the file can hold", "copy the file again")

@@ -11,13 +11,13 @@ from pathlib import Path
 import numpy as np
 
 from phyradgs_cl.acquisition import Scan
-from phyradgs_cl.importers.assemble import StoredTiming, assemble_scan, cone, make_timing, names_in_file
+from phyradgs_cl.importers.assemble import StoredTiming, cone, names_in_file
 from phyradgs_cl.importers.options import OF_BARE_FRAMES, ImportOptions
 from phyradgs_cl.importers.reading.files import SafeFolder
-from phyradgs_cl.importers.reading.frames import gantry_sign, line_integrals, oriented
+from phyradgs_cl.importers.reading.frames import gantry_sign
 from phyradgs_cl.importers.reading.settings import Settings, head_has, read_settings, say_missing
 from phyradgs_cl.importers.reading.tiff import read_numbered
-from phyradgs_cl.importers.stage import RotaryStage
+from phyradgs_cl.importers.stage import RotaryStage, StageScan
 from phyradgs_cl.io.hdf5.datasets import LENGTH, TIME
 
 _log = logging.getLogger(__name__)
@@ -62,13 +62,11 @@ def import_scan(path: Path, options: ImportOptions) -> Scan:
     if scan.has("Exposure time (ms)") and options.exposure_s is None:
         averages = scan.length("Number of averages") if scan.has("Number of averages") else 1.0
         exposure_s = averages * scan.measured("Exposure time (ms)", TIME, "ms")
-    timing = make_timing(str(description), len(frames), options, StoredTiming(exposure_s=exposure_s))
-    trajectory, geometry = stage.turned(gantry_sign(options, "gantry") * angle_rad, timing, str(description))
-    turned, flats, darks = (oriented(stack, options, "top") for stack in (frames, flats, darks))
-    integrals = line_integrals(str(description), turned, options, flats=flats, darks=darks, convention="counts")
-    parts = integrals, trajectory, geometry, timing, options
-    title = folder.root.resolve().name
-    return assemble_scan(*parts, title=title, source=str(path), names=names, said=said)
+    stored = StoredTiming(exposure_s=exposure_s)
+    angle_rad = gantry_sign(options, "gantry") * angle_rad
+    places = np.arange(len(frames))
+    turned = StageScan(frames, ("top", "left"), angle_rad, places, names, said, stored, flats, darks)
+    return turned.on(stage, options, description, folder.root.resolve().name)
 
 
 def _stage(scan: Settings, panel: tuple[int, int], options: ImportOptions, names: dict[str, str]) -> RotaryStage:

@@ -7,21 +7,20 @@ for ObjectRoll above 0, and towards the panel for ObjectTilt above 0. Lengths ar
 
 import logging
 import math
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 
 from phyradgs_cl.acquisition import Scan
-from phyradgs_cl.importers.assemble import assemble_scan, cone, make_timing, names_in_file
+from phyradgs_cl.importers.assemble import cone, names_in_file
 from phyradgs_cl.importers.options import OF_FOLDERS, ImportOptions
 from phyradgs_cl.importers.reading.files import SafeFolder, checked_name
-from phyradgs_cl.importers.reading.frames import gantry_sign, line_integrals, oriented
+from phyradgs_cl.importers.reading.frames import gantry_sign
 from phyradgs_cl.importers.reading.settings import Settings, read_settings, say_missing, white_level
-from phyradgs_cl.importers.reading.text import read_angles_rad
+from phyradgs_cl.importers.reading.text import file_of_angles, measured_angles_rad, read_angles_rad
 from phyradgs_cl.importers.reading.tiff import read_numbered
-from phyradgs_cl.importers.stage import RotaryStage
+from phyradgs_cl.importers.stage import RotaryStage, StageScan
 from phyradgs_cl.io.hdf5.datasets import LENGTH
 
 _log = logging.getLogger(__name__)
@@ -45,14 +44,14 @@ def import_scan(path: Path, options: ImportOptions) -> Scan:
     folder = SafeFolder(path if path.is_dir() else path.parent)
     description = path if path.is_file() else folder.only("description of the scan", ".xtekct")
     scan = read_settings(description, _NAMES)
-    if LENGTH.factor(unit := scan.word("Units", default="mm")) != 1.0:
+    if LENGTH.factor((unit := scan.word("Units", default="mm")).lower()) != 1.0:
         raise scan.error("Units", repr(unit[:40]), "mm", "convert the lengths to mm")
     sizes = ("Projections", "DetectorPixelsY", "DetectorPixelsX")
     count, *panel = (scan.count(name, _MOST_FRAMES) for name in sizes)
     prefix = scan.word("Name", default="") + scan.word("InputSeparator", default="_")
     place = _folder_of_frames(folder, scan)
     frames, at, said = read_numbered(place, prefix, (count, *panel), [*map(scan.name, sizes)], options, first=1)
-    measured = _measured_angles(folder, description)
+    measured = file_of_angles(folder, description.stem, ".ang", "_ctdata.txt")
     names = names_in_file(options, {
         "source_to_axis_mm": scan.name("SrcToObject"), "source_to_detector_mm": scan.name("SrcToDetector"),
         "pixel_size_mm": f"{scan.name('DetectorPixelSizeX')}, DetectorPixelSizeY",
@@ -60,43 +59,19 @@ def import_scan(path: Path, options: ImportOptions) -> Scan:
     })  # fmt: skip
     stage = _stage(scan, (panel[0], panel[1]), options, names)
     angle_rad = gantry_sign(options, "gantry") * options.angle_rad(len(at), lambda: _angles(scan, measured, count)[at])
-    timing = make_timing(str(description), at, options)
-    trajectory, geometry = stage.turned(angle_rad, timing, str(description))
     say_missing(scan, {"InitialAngle": "0", "ObjectTilt": "0", "Units": "mm"})
     remedy = f"correct it, or say {options.named('flat_value')}"
-    combined = replace(options, flat_value=options.flat_value or white_level(scan, "WhiteLevel", frames, remedy))
-    turned = oriented(frames, options, "top", "right")
-    integrals = line_integrals(str(description), turned, combined, convention="counts", is_corrected=True)
-    parts = integrals, trajectory, geometry, timing, options
-    return assemble_scan(*parts, title=description.stem, source=str(path), names=names, said=said)
-
-
-def _measured_angles(folder: SafeFolder, description: Path) -> Path | None:
-    """Returns the file of the angles that the scanner has measured: NAME.ang, else NAME_ctdata.txt, else the only such."""
-    for end in (".ang", "_ctdata.txt"):
-        files = folder.glob(f"*{end}")
-        own = [file for file in files if file.name.lower() == f"{description.stem}{end}".lower()]
-        if own or len(files) == 1:
-            return (own or files)[0]
-    return None
+    white = None if options.flat_value else white_level(scan, "WhiteLevel", frames, remedy)
+    turned = StageScan(frames, ("top", "right"), angle_rad, at, names, said)
+    return turned.on(stage, options, description, description.stem, white)
 
 
 def _angles(scan: Settings, measured: Path | None, count: int) -> np.ndarray:
-    """Returns the angles (count,) in rad: the measured ones, or equal steps. The files of measured angles count up or down,
-    and in either order: taken is what agrees best with the steps. A line says how far both are apart."""
-    step_deg = scan.number("AngularStep") if measured is None or scan.has("AngularStep") else 0.0
-    steps_rad = np.deg2rad(scan.number("InitialAngle", 0.0) + step_deg * np.arange(count))
-    if measured is None:
-        return steps_rad
-    listed_rad = np.unwrap(read_angles_rad(measured, count, column=1))
-    ways = [listed_rad, listed_rad[::-1], -listed_rad, -listed_rad[::-1]][: 4 if step_deg else 1]
-    ways = [steps_rad[0] + way - way[0] for way in ways]
-    off_deg = [float(np.rad2deg(np.abs(way - steps_rad).max())) for way in ways]
-    best = int(np.argmin(off_deg))
-    if step_deg:
-        text = "%s: these measured angles are used; they differ from equal steps by %.3g° at most"
-        _log.warning(text, measured, off_deg[best])
-    return ways[best]
+    """Returns the angles (count,) in rad: the measured ones, or equal steps."""
+    if measured is not None and not scan.has("AngularStep"):
+        return read_angles_rad(measured, count, column=1)
+    steps_rad = np.deg2rad(scan.number("InitialAngle", 0.0) + scan.number("AngularStep") * np.arange(count))
+    return steps_rad if measured is None else measured_angles_rad(measured, steps_rad)
 
 
 def _folder_of_frames(folder: SafeFolder, scan: Settings) -> SafeFolder:

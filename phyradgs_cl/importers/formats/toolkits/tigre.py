@@ -21,7 +21,7 @@ from phyradgs_cl.importers.formats.naf import TIGRE_MODULE, PlainUnpickler, name
 from phyradgs_cl.importers.options import TIMING, ImportOptions
 from phyradgs_cl.importers.reading.frames import line_integrals, oriented
 from phyradgs_cl.importers.stage import along
-from phyradgs_cl.io.tables import described
+from phyradgs_cl.io.tables import Fields, described
 
 OPTIONS = (*TIMING, "row_0", "column_0", "quantity", "flat_value", "detector_model")
 _NAMES = ("DSO", "DSD", "nDetector", "dDetector", "nVoxel", "dVoxel", "offOrigin", "offDetector", "rotDetector", "COR")
@@ -59,8 +59,8 @@ def import_scan(path: Path, options: ImportOptions) -> Scan:
         expected = "projections, geometry and angles, in this order as TIGRE's loaders return them, or by these names"
         raise InputError(str(path), described(content), expected)
     frames, geo, angles = content[0], _checked(content[1], path), content[2]
-    if isinstance(angles, list) and len(angles) < _MOST_VALUES and all(isinstance(one, (int, float)) for one in angles):
-        angles = np.array(angles, np.float64)
+    if isinstance(angles, (list, tuple)):
+        angles = Fields(f"{path}:", {"angles": list(angles)}).numbers("angles")
     for name, value in (("projections", frames), ("angles", angles)):
         if not isinstance(value, np.ndarray) or value.dtype.kind not in "iuf":
             raise InputError(f"{path}: {name}", described(value), "an array of numbers")
