@@ -1,4 +1,4 @@
-"""What the formats in HDF5 share: arrays at the addresses of the format, of the user's options or of a TOML, and the beam."""
+"""What formats in HDF5 share: arrays at the addresses of the format, of the user's options or of a TOML, and the beam."""
 
 import logging
 from collections.abc import Iterator, Mapping, Sequence
@@ -85,7 +85,7 @@ class Places:
     def parts(
         self, name: str, usual: Sequence[str] = (), panel: tuple[int, int] | None = None
     ) -> dict[str, np.ndarray]:
-        """Reads frames (n, v, u) in their own type, by place. ``usual``: the addresses of the format, as far as they exist."""
+        """Reads frames (n, v, u) in their own type, by place. ``usual``: addresses of the format, as far as they exist."""
         stacks: dict[str, np.ndarray] = {}
         for text in self._at(name, usual):
             with self.opened(name, text) as (source, address):
@@ -292,9 +292,10 @@ def _length_of(source: Hdf5Source, lengths: Lengths) -> Quantity:
     """Returns how to read the file's lengths: without units they are in metres where a pixel in mm would be smaller than
     light can see."""
     for address in (address for pair in (*lengths.at_sample, *lengths.on_panel) for address in pair):
-        if source.find(address) is not None and not read_attribute(source, address, "units"):
-            if abs(float(read_values(source, address, source.dataset(address)).ravel()[0])) < _LEAST_MM:
-                return replace(LENGTH, assumed="m")
+        if source.find(address) is None or read_attribute(source, address, "units"):
+            continue
+        if abs(float(read_values(source, address, source.dataset(address)).ravel()[0])) < _LEAST_MM:
+            return replace(LENGTH, assumed="m")
     return LENGTH
 
 

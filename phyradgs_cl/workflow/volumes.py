@@ -53,7 +53,8 @@ def run_evaluation(
     picture of slices. A volume without a scale is compared voxel by voxel. ``reference_voxel_mm``: sides of the voxels of a
     reference without a scale, one length or (z, y, x). ``object_motion``: the file of a deformation, which shows the volume
     at each true state of a scan; None takes the volume's own, if it has one. ``reference_of_rtk``: the
-    reference has RTK's axes. ``mu_water_per_mm``: of a reference in Hounsfield units. InputError: no such sides; files that do not fit each other."""
+    reference has RTK's axes. ``mu_water_per_mm``: of a reference in Hounsfield units. InputError: no such sides; files that
+    do not fit each other."""
     check_picture("--picture", picture, volume_path, reference_path, object_motion)
     field = None if object_motion is None else read_deformation(object_motion)
     result, (stored, moving) = load_result(volume_path), load_reference(reference_path)

@@ -1,5 +1,5 @@
-"""A folder of TIFF or HDF5 frames and one TOML with their contents, geometry, angles and timing. The TOML has the tables of a
-scanner file, and [frames], [angles] and [timing]. Row 0 is the top, column 0 the left, seen from the source."""
+"""A folder of TIFF or HDF5 frames and one TOML with their contents, geometry, angles and timing. The TOML has the tables of
+a scanner file, and [frames], [angles] and [timing]. Row 0 is the top, column 0 the left, seen from the source."""
 
 from dataclasses import replace
 from pathlib import Path, PurePosixPath
@@ -84,7 +84,8 @@ def import_scan(path: Path, options: ImportOptions) -> Scan:
         integrals = _line_integrals(stacks, files, series, combined, tables["frames"], str(description))
     return assemble_scan(
         integrals, turning(geometry, angle_rad, timing), geometry, timing, combined,
-        title=tables[""].word("title", default=folder.root.resolve().name), source=str(path), said=series.said if series else "",
+        title=tables[""].word("title", default=folder.root.resolve().name), source=str(path),
+        said=series.said if series else "",
         grid=scanner.grid if tables[""].has("volume") else None, lag=scanner.lag, names=_subjects(tables, options),
     )
 
@@ -238,7 +239,7 @@ def _stored_timing(tables: dict[str, Fields], scanner: Scanner, options: ImportO
 
 
 def _angles_rad(folder: SafeFolder, angles: Fields, used: np.ndarray, options: ImportOptions) -> np.ndarray:
-    """Reads the angles of the frames that ``used`` marks: a list, a file, a dataset, or the first with the last or a step."""
+    """Reads the angles of the frames that ``used`` marks: a list, a file, a dataset, or the first and the last or a step."""
     frames = int(used.sum())
     given = [key for key in _ANGLES if angles.has(key)]
     if len(given) != 1:

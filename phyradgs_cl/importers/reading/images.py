@@ -2,7 +2,9 @@
 
 import gzip
 import math
+import os
 import re
+import zlib
 from pathlib import Path
 from typing import Any
 
@@ -39,10 +41,9 @@ def read_image(path: Path, state: int | None = None) -> Any:
     sitk, reader = _reader_of(path)
     try:
         reader.ReadImageInformation()
-        is_plain = _check_text(path)
-        _check_header(sitk, subject, reader, path.stat().st_size if is_plain else None, state)
+        _check_header(sitk, subject, reader, _voxel_bytes(path, reader), state)
         return reader.Execute()
-    except RuntimeError as error:
+    except (RuntimeError, EOFError, gzip.BadGzipFile, zlib.error) as error:
         raise _damage(subject, error) from error
 
 
@@ -69,7 +70,7 @@ def _reader_of(path: Path) -> tuple[Any, Any]:
     return sitk, reader
 
 
-def _damage(subject: str, error: RuntimeError) -> InputError:
+def _damage(subject: str, error: Exception) -> InputError:
     reason = re.sub(r"^\w+\(0x\w+\): ", "", str(error).rpartition("ERROR: ")[2].strip()).replace(subject, "")[:100]
     return InputError(subject, f"a damaged file ({reason})", "an image of three axes")
 
@@ -105,8 +106,8 @@ def _suffix(path: Path) -> str:
 
 
 def _check_header(sitk: Any, subject: str, reader: Any, file_bytes: int | None, state: int | None) -> None:
-    """Refuses images without three axes, or larger than their file of ``file_bytes`` (None: packed, or in another). Axes of
-    one voxel beyond the third are dropped; ``state`` chooses along a longer fourth one."""
+    """Refuses images without three axes, or larger than the ``file_bytes`` of their voxels (None: unknown). Axes of one
+    voxel beyond the third are dropped; ``state`` chooses along a longer fourth one."""
     counts, axes = reader.GetSize(), reader.GetDimension()
     if axes < 3 or any(count != 1 for count in counts[3 if state is None else 4 :]) or min(counts) < 1:
         remedy = "'phyradgs info' reads volumes at several times" if axes == 4 else ""
@@ -123,24 +124,38 @@ def _check_header(sitk: Any, subject: str, reader: Any, file_bytes: int | None, 
     if reader.HasMetaDataKey("bitpix"):  # NIfTI, in which scaled integers come out as floats
         stored_bytes = int(reader.GetMetaData("bitpix")) // 8
     needed = math.prod(counts) * stored_bytes
-    if file_bytes is not None and needed > file_bytes:  # SimpleITK fills what a NIfTI lacks
+    if file_bytes is not None and needed > file_bytes:
         found = f"shape {counts}, {needed} bytes, in {file_bytes} bytes of data"
         raise InputError(subject, found, "as many bytes as its header announces", "copy the file again")
     check_room(subject, math.prod(counts[:3]) * voxel_bytes)
 
 
-def _check_text(path: Path) -> bool:
-    """Returns whether the file holds all voxels, not packed. InputError: Hounsfield units, data outside of the folder."""
-    is_packed = path.suffix.lower() == ".gz"
-    with gzip.open(path) if is_packed else open(path, "rb") as file:
+def _voxel_bytes(path: Path, reader: Any) -> int | None:
+    """Returns how many bytes of voxels a file holds, unpacked, where SimpleITK fills missing or damaged ones without an
+    error: in NIfTI, and in packed MetaImages. None where it refuses them. InputError: Hounsfield units, data outside of the
+    folder."""
+    is_nifti = _suffix(path).startswith(".nii")
+    with gzip.open(path) if path.suffix.lower() == ".gz" else open(path, "rb") as file:
         head = file.read(_HEAD_BYTES)
-    if b"values in HU" in head:
-        raise InputError(str(path), "Hounsfield units", "1/mm", "export it without --mu-water-per-mm")
-    found = None if _suffix(path).startswith(".nii") else _DATA_FILE.search(head)
-    name = found[1].decode("latin-1") if found else "LOCAL"
+        if b"values in HU" in head:
+            raise InputError(str(path), "Hounsfield units", "1/mm", "export it without --mu-water-per-mm")
+        if is_nifti:
+            return file.seek(0, os.SEEK_END) - int(float(reader.GetMetaData("vox_offset")))
+    found = _DATA_FILE.search(head)
+    name, start = (found[1].decode("latin-1"), found.end() + 1) if found else ("LOCAL", 0)
     if name not in ("LOCAL", "LIST"):
-        SafeFolder(path.parent).file(name.split(" ")[0] if "%" in name else name, f"{path} data file")
-    return not is_packed and name == "LOCAL" and not re.search(rb"CompressedData *= *True|encoding: *g", head, re.I)
+        path, start = SafeFolder(path.parent).file(name.split(" ")[0] if "%" in name else name, f"{path} data file"), 0
+    return _unpacked_bytes(path, start) if re.search(rb"CompressedData *= *True", head, re.I) else None
+
+
+def _unpacked_bytes(path: Path, start: int) -> int:
+    """Returns how many bytes the deflated data of a file hold from the byte ``start`` on."""
+    machine, count = zlib.decompressobj(), 0
+    with open(path, "rb") as file:
+        file.seek(start)
+        while not machine.eof and (part := file.read(_HEAD_BYTES)):
+            count += len(machine.decompress(part))
+    return count
 
 
 def _nrrd_header(path: Path) -> dict[str, str]:

@@ -17,8 +17,8 @@ from phyradgs_cl.errors import InputError
 from phyradgs_cl.importers.options import ImportOptions
 from phyradgs_cl.importers.reading.files import SafeFolder, check_room
 from phyradgs_cl.importers.reading.series import series_of
-from phyradgs_cl.io.hdf5.datasets import LENGTH
 from phyradgs_cl.io.files import regular_file
+from phyradgs_cl.io.hdf5.datasets import LENGTH
 
 SUFFIXES = (".tif", ".tiff")
 _MOST_PAGES = 100_000
@@ -185,7 +185,8 @@ def calibration(path: Path) -> tuple[np.ndarray | None, np.ndarray | None, str]:
         size_mm = np.full(3, np.nan)
     if size_mm.shape != (3,) or not np.all(np.isfinite(size_mm) & (size_mm > 0)):
         if ome or "unit" in facts:
-            found = ", ".join(f"{name} {value}" for name, value in (ome or {k: facts[k] for k in facts if k in _OF_SIZE}).items())
+            stated = ome or {name: facts[name] for name in facts if name in _OF_SIZE}
+            found = ", ".join(f"{name} {value}" for name, value in stated.items())
             _log.warning("%s: no voxel sizes can be made of %s: the scale is left out", path, found)
         return None, None, ""
     origin = np.array([float(facts.get(f"{axis}origin", np.nan)) for axis in "xyz"])

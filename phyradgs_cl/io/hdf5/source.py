@@ -1,5 +1,5 @@
-"""Opens HDF5 files of any origin, and finds what an address names: over links and virtual datasets too, as far as their files
-lie in the folder of the first file or in one that the user named."""
+"""Opens HDF5 files of any origin, and finds what an address names: over links and virtual datasets too, as far as their
+files lie in the folder of the first file or in one that the user named."""
 
 import difflib
 import errno
@@ -184,8 +184,8 @@ class Hdf5Source:
             raise self.error(address, "nothing there", f"{what} {name!r}", remedy)
 
     def _leads_nowhere(self, group: h5py.Group, part: str, address: str, error: Exception) -> bool:
-        """Whether a member that cannot be opened is a link inside the file to nothing. InputError for a link to another file,
-        or in a circle."""
+        """Whether a member that cannot be opened is a link inside the file to nothing. InputError for a link to another
+        file, or in a circle."""
         link = group.get(part, getlink=True)
         if isinstance(link, h5py.ExternalLink):
             raise self._unlinked(address, group.file, link.filename, link.path) from error
