@@ -262,19 +262,25 @@ RTK: dict[str, tuple[Damage, tuple[str, ...]]] = {
     "no spacing": (in_text(MHA, "ElementSpacing = 2.5", "ElementSpacing = 0"), ("projections.mha",)),
     "a skew stack": (in_text(MHA, "TransformMatrix = 1 0 0", "TransformMatrix = 0 0 1"), ("projections.mha",)),
     "no header": (filled(MHA, b"\0" * 100_000), ("header",)),
-    "deflated rubbish": (in_text(MHA, "CompressedData = False", "CompressedData = True"), ("compressed data",)),
+    "deflated rubbish": (in_text(MHA, "CompressedData = False", "CompressedData = True"), ("CompressedDataSize",)),
 }  # fmt: skip
 
 
-def deflate_bomb(path: Path) -> None:
-    """Zeros that unpack to far more than the header says: only what it says is unpacked."""
-    header = (path / MHA).read_bytes().split(b"LOCAL\n")[0].replace(
-        b"Data = False", b"Data = True"
-    ) + b"LOCAL\n"
-    (path / MHA).write_bytes(header + zlib.compress(b"\0" * 800))
+def deflated(data: bytes, change: int = 0) -> Damage:
+    """Packed voxels, of which one byte may be changed: SimpleITK leaves the voxels from there on undefined."""
+
+    def damage(path: Path) -> None:
+        packed = bytearray(zlib.compress(data))
+        packed[len(packed) // 2] ^= change
+        says = f"Data = True\nCompressedDataSize = {len(packed)}".encode()
+        header = (path / MHA).read_bytes().split(b"LOCAL\n")[0].replace(b"Data = False", says)
+        (path / MHA).write_bytes(header + b"LOCAL\n" + packed)
+
+    return damage
 
 
-RTK["deflated too short"] = (deflate_bomb, ("800 bytes of data",))
+RTK["deflated too short"] = (deflated(bytes(800)), ("800 bytes of data",))
+RTK["deflated and damaged"] = (deflated(np.arange(840.0, dtype=np.float32).tobytes(), 255), ("decompressing",))
 
 
 def linked(file: h5py.File, address: str) -> None:
@@ -288,7 +294,6 @@ EXCHANGE: dict[str, tuple[Damage, tuple[str, ...]]] = {
     "data elsewhere": (on("exchange/data", linked), ("/exchange/data", "passwd")),
     "flat data": (on("exchange/data", value(np.zeros(5))), ("/exchange/data",)),
     "text data": (on("exchange/data", value([[["a"]]])), ("/exchange/data",)),
-    "no angles": (on("exchange/theta", REMOVED), ("/exchange/theta",)),
     "too few angles": (on("exchange/theta", value(np.zeros(3))), ("/exchange/theta",)),
     "an angle that is NaN": (on("exchange/theta", value(np.full(6, np.nan))), ("/exchange/theta",)),
     "an unknown unit": (on("exchange/theta", attribute("units", "gon")), ("gon",)),
@@ -405,12 +410,6 @@ def declared_huge(path: Path) -> None:
         with tifffile.TiffFile(path / "proj_1.tif", mode="r+b") as tiff:
             for tag in ("ImageWidth", "ImageLength", "RowsPerStrip"):
                 tiff.pages[0].tags[tag].overwrite(60_000)
-
-
-def deflated_zeros(megabytes: int) -> bytes:
-    """A thousandth of as many bytes, made without ever holding them."""
-    machine, block = zlib.compressobj(6), bytes(1 << 20)
-    return b"".join(machine.compress(block) for _ in range(megabytes)) + machine.flush()
 
 
 def circular_pages(path: Path) -> None:
@@ -594,7 +593,7 @@ TIGRE: dict[str, tuple[Damage, tuple[str, ...]]] = {
     "another class of TIGRE's": (
         lambda p: p.write_bytes(p.read_bytes().replace(b"\x08Geometry", b"\x08Gpu_xxxx")), ("a call of tigre",)
     ),
-    "a dictionary": (tigre(lambda geo, path: {"geometry": geo}), ("tuple (projections, geometry, angles)",)),
+    "a dictionary": (tigre(lambda geo, path: {"geometry": geo}), ("projections", "an array of numbers")),
     "no array": (tigre(lambda geo, path: ([1.0], geo, np.zeros(6))), ("projections", "a list of 1")),
     "no angles": (tigre(lambda geo, path: (np.zeros((6, 10, 14)), geo, None)), ("angles",)),
     "another number of angles": (

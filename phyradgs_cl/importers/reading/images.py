@@ -131,9 +131,8 @@ def _check_header(sitk: Any, subject: str, reader: Any, file_bytes: int | None, 
 
 
 def _voxel_bytes(path: Path, reader: Any) -> int | None:
-    """Returns how many bytes of voxels a file holds, unpacked, where SimpleITK fills missing or damaged ones without an
-    error: in NIfTI, and in packed MetaImages. None where it refuses them. InputError: Hounsfield units, data outside of the
-    folder."""
+    """Returns how many bytes of voxels a file holds, unpacked: SimpleITK fills missing or damaged ones without an error, in
+    NIfTI and in packed MetaImages. None where it refuses them. InputError: Hounsfield units, data outside of the folder."""
     is_nifti = _suffix(path).startswith(".nii")
     with gzip.open(path) if path.suffix.lower() == ".gz" else open(path, "rb") as file:
         head = file.read(_HEAD_BYTES)
@@ -145,7 +144,13 @@ def _voxel_bytes(path: Path, reader: Any) -> int | None:
     name, start = (found[1].decode("latin-1"), found.end() + 1) if found else ("LOCAL", 0)
     if name not in ("LOCAL", "LIST"):
         path, start = SafeFolder(path.parent).file(name.split(" ")[0] if "%" in name else name, f"{path} data file"), 0
-    return _unpacked_bytes(path, start) if re.search(rb"CompressedData *= *True", head, re.I) else None
+    if _suffix(path) == ".nrrd" or name == "LIST" or "%" in name:
+        return None
+    if not re.search(rb"^CompressedData *= *True", head, re.I | re.M):
+        return path.stat().st_size - start
+    if not re.search(rb"^CompressedDataSize *= *\d", head, re.M):  # SimpleITK returns undefined voxels then
+        raise InputError(f"{path} CompressedDataSize", "nothing", "the bytes of packed voxels", "write it unpacked")
+    return _unpacked_bytes(path, start)
 
 
 def _unpacked_bytes(path: Path, start: int) -> int:
