@@ -23,6 +23,8 @@ _TABLES: dict[str, dict[str, tuple[object, str]]] = {
         "darks": ("dark_*.tif", "frames without a beam"),
         "mask": ("mask.tif", "non-zero: do not use the pixel"),
         "order": (1, "the number in the names that gives the order, 1 the first; without it the import finds it"),
+        "image_key": ("a.h5:/key", "of frames at an address in HDF5: 0 projection, 1 flat, 2 dark, 3 none of them"),
+        "axes": ("v,frame,u", "order of such an array, here of sinograms; frame,v,u without it"),
         "quantity": ("counts", "or attenuation (line integrals), transmission"),
         "flat_value": (50000.0, "counts without an object, in place of flats"),
         "row_0": ("top", "or bottom: where the images' first row is"),

@@ -142,9 +142,12 @@ def _voxel_bytes(path: Path, reader: Any) -> int | None:
             return file.seek(0, os.SEEK_END) - int(float(reader.GetMetaData("vox_offset")))
     found = _DATA_FILE.search(head)
     name, start = (found[1].decode("latin-1"), found.end() + 1) if found else ("LOCAL", 0)
-    if name not in ("LOCAL", "LIST"):
-        path, start = SafeFolder(path.parent).file(name.split(" ")[0] if "%" in name else name, f"{path} data file"), 0
-    if _suffix(path) == ".nrrd" or name == "LIST" or "%" in name:
+    if name.startswith("LIST") or "%" in name:  # SimpleITK returns undefined voxels where one file is missing
+        raise InputError(f"{path} data file", name[:60], "LOCAL or one file name", "write it as one file")
+    is_nrrd = _suffix(path) == ".nrrd"
+    if name != "LOCAL":
+        path, start = SafeFolder(path.parent).file(name, f"{path} data file"), 0
+    if is_nrrd:
         return None
     if not re.search(rb"^CompressedData *= *True", head, re.I | re.M):
         return path.stat().st_size - start

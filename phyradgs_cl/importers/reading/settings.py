@@ -20,7 +20,7 @@ _BRIGHTER, _FEW = 1.2, 0.01  # of the counts of air: no noise of air is so brigh
 class Settings(Fields):
     """Names and texts. A text becomes a number where a number is asked for, and stays text where a word is."""
 
-    def __init__(self, subject: str, values: Mapping[str, str], comma_is_decimal: bool = False) -> None:
+    def __init__(self, subject: str, values: Mapping[str, str | list[str]], comma_is_decimal: bool = False) -> None:
         super().__init__(subject, values)
         self.comma_is_decimal = comma_is_decimal
 
@@ -32,6 +32,10 @@ class Settings(Fields):
         factor = stated or quantity.factor(unit)
         assert factor is not None
         return self.length(key) * factor
+
+    def listed(self, key: str, count: int) -> np.ndarray:
+        """Returns the numbers (count,) of a text, which commas separate."""
+        return Settings(self.subject, {key: self.word(key).split(",")}).numbers(key, count)
 
     def _finite(self, key: str, value: object, largest: float = LARGEST) -> float:
         found = number_at_start(value, self.comma_is_decimal) if isinstance(value, str) else None

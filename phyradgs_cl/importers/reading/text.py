@@ -11,7 +11,7 @@ from phyradgs_cl.importers.reading.files import SafeFolder, read_text
 from phyradgs_cl.io.tables import LARGEST
 
 _log = logging.getLogger(__name__)
-_BEGINNING = re.compile(r"([-+]?(?:\d[\d.,]*|[.,]\d+))([eE][-+]?\d+)?(?=$|[\s;°µμa-zA-Z%(])[\s;]*(.*)", re.S)
+_BEGINNING = re.compile(r"([-+]?(?:\d[\d.,]*|[.,]\d+))([eE][-+]?\d+)?(?=$|[\s;°µμa-zA-Z%(])(?![eE][-+]?\d)[\s;]*(.*)", re.S)
 _ENGLISH, _GERMAN = (re.compile(rf"[-+]?\d{{1,3}}({k}\d{{3}})+{d}") for k, d in ((",", r"(\.\d+|,\d{3})"), (r"\.", r",\d+")))
 _ONE_COMMA, _EITHER = re.compile(r"[-+]?\d*,\d+"), re.compile(r"[-+]?[1-9]\d{0,2},\d{3}")
 _COLUMNS = re.compile(r",\s+|[;:\s]+")

@@ -22,7 +22,6 @@ from phyradgs_cl.importers.reading.series import series_of
 from phyradgs_cl.importers.reading.settings import Settings, head_has, read_settings, say_missing
 from phyradgs_cl.importers.reading.tiff import SUFFIXES, read_tiffs
 from phyradgs_cl.importers.stage import RotaryStage, along
-from phyradgs_cl.io.tables import Fields
 
 _VECTORS = ("sourcePositions", "moduleCenters", "colVectors", "rowVectors")
 _BEAMS, _MOST, _ENDS = ("cone", "parallel", "modular"), 1_000_000, (".txt", ".cfg")
@@ -54,12 +53,8 @@ def import_scan(path: Path, options: ImportOptions) -> Scan:
     arrays, images = folder.matching(".npy"), folder.matching(*SUFFIXES)
     if not arrays and not images:
         raise InputError(str(folder.root), "no .npy and no TIFF", "the line integrals")
-    said = ""
-    if arrays:
-        frames = read_npy(folder.only("stack", ".npy"), 3)
-    else:
-        series = series_of(images, str(folder.root), "complete the frames")
-        frames, said = read_tiffs(series.paths), series.said
+    series = None if arrays else series_of(images, str(folder.root), "complete the frames")
+    frames = read_tiffs(series.paths) if series else read_npy(folder.only("stack", ".npy"), 3)
     if frames.shape != shape:
         raise InputError(str((arrays or images)[0]), f"frames {frames.shape}", f"{shape} of {description.name}")
     timing = assemble.make_timing(str(description), shape[0], options)
@@ -67,6 +62,7 @@ def import_scan(path: Path, options: ImportOptions) -> Scan:
     trajectory, geometry = read(scan, shape, options, timing)
     integrals = line_integrals(str(folder.root), oriented(frames, options, "bottom"), options, convention="attenuation")
     parts = integrals, trajectory, geometry, timing, options
+    said = series.said if series else ""
     return assemble.assemble_scan(*parts, title=description.stem, source=str(path), grid=_grid(scan), said=said)
 
 
@@ -91,7 +87,7 @@ def _turning(
 
     def stored_rad() -> np.ndarray:
         if scan.has("phis"):
-            return np.deg2rad(_list(scan, "phis", shape[0]))
+            return np.deg2rad(scan.listed("phis", shape[0]))
         say_missing(scan, {"phis": "angularRange in equal steps from 0°"})
         return np.deg2rad(np.arange(shape[0]) * (scan.number("angularRange") / shape[0]))
 
@@ -105,21 +101,12 @@ def _modular(
 ) -> tuple[PoseTable, Geometry]:
     """Returns the table of poses of a modular beam."""
     options.refuse_unused("leap, which states every view", _OF_TABLES)
-    source, centre, right, up = (_list(scan, name, 3 * shape[0]).reshape(-1, 3) for name in _VECTORS)
+    source, centre, right, up = (scan.listed(name, 3 * shape[0]).reshape(-1, 3) for name in _VECTORS)
     step_u, step_v = right * scan.length("pixelWidth"), up * scan.length("pixelHeight")
     first = centre - (shape[2] - 1) / 2 * step_u - (shape[1] - 1) / 2 * step_v
     poses = np.concatenate([source, first, step_u, step_v], -1)
     geometry = plain_geometry(poses, (shape[1], shape[2]))
     return assemble.table_over_time(lambda position: along(poses, position), timing, scan.subject), geometry
-
-
-def _list(scan: Settings, name: str, count: int) -> np.ndarray:
-    """Returns the numbers (count,) of a line, which commas separate."""
-    try:
-        values = [float(word) for word in str(scan.get(name)).split(",")]
-    except ValueError as error:
-        raise scan.error(name, "a word that is no number", f"{count} numbers") from error
-    return Fields(scan.subject, {name: values}).numbers(name, count)
 
 
 def _grid(scan: Settings) -> Grid | None:
