@@ -1,5 +1,6 @@
 """Damage to one object of an HDF5 file: every way in which a field may be missing, wrong, boundless or elsewhere."""
 
+import tempfile
 from collections.abc import Callable
 from pathlib import Path
 
@@ -60,24 +61,24 @@ def _instead(make: Change) -> Change:
 
 
 def _outside(file: h5py.File) -> Path:
-    """A file that is not in the folder of this one."""
-    folder = Path(file.filename).parent
-    return folder.parent / f"outside-{folder.name}.h5"
+    """A new file that is not in the folder of this one: an error may keep the last one open."""
+    return Path(tempfile.mkdtemp(dir=Path(file.filename).parent.parent)) / "outside.h5"
 
 
 def _external_link(file: h5py.File, address: str) -> None:
     """To a good dataset of the same name in a good file of another folder."""
-    with h5py.File(_outside(file), "w") as other:
+    outside = _outside(file)
+    with h5py.File(outside, "w") as other:
         file.copy(address, other, name="there")
     del file[address]
-    file[address] = h5py.ExternalLink(f"../{_outside(file).name}", "/there")
+    file[address] = h5py.ExternalLink(f"../{outside.parent.name}/{outside.name}", "/there")
 
 
 def _virtual(file: h5py.File, address: str) -> None:
-    shape, attributes = file[address].shape, dict(file[address].attrs)
+    shape, attributes, outside = file[address].shape, dict(file[address].attrs), _outside(file)
     layout = h5py.VirtualLayout(shape, file[address].dtype)
-    layout[...] = h5py.VirtualSource(_outside(file), "there", shape)
-    with h5py.File(_outside(file), "w") as other:
+    layout[...] = h5py.VirtualSource(outside, "there", shape)
+    with h5py.File(outside, "w") as other:
         other["there"] = file[address][()]
     del file[address]
     file.create_virtual_dataset(address, layout).attrs.update(attributes)
