@@ -17,6 +17,7 @@ _REFERENCE = (
 )
 _VOXEL = "Sides of the voxels of a reference without a scale, mm; it is centred on the axis."
 _OF_RTK = "The reference is a volume of RTK, whose axis of rotation is y."
+_WATER = "Attenuation of water in 1/mm, near 0.02: REFERENCE is in Hounsfield units."
 _MOTION = "Deformation of the object: VOLUME is compared with the truth of every state."
 _PICTURE = "PNG of slices: result, truth, difference."
 
@@ -26,13 +27,16 @@ def evaluate_command(
     reference: Annotated[Path, file_option(_REFERENCE, "--reference")], as_json: AsJson = False,
     reference_voxel_mm: Annotated[Any, option(_VOXEL, "the file's", parser=numbers, metavar="D|Z,Y,X")] = None,
     rtk_reference: Annotated[bool, option(_OF_RTK, True, "--rtk-reference")] = False,
+    mu_water_per_mm: Annotated[float | None, option(_WATER, "1/mm", "--mu-water-per-mm")] = None,
     object_motion: Annotated[Path | None, file_option(_MOTION, "--object-motion")] = None,
     picture: Annotated[Path | None, file_option(_PICTURE, "--picture", default="v.evaluated.png for v.h5")] = None,
 ) -> None:
     """Measure a volume against the truth: 3D PSNR and SSIM, and a picture of slices."""
     stem = volume.stem if volume.suffix in ("", ".h5") else volume.name  # v.h5 and v.nii may lie in one folder
     usual = volume.with_name(f"{stem}.evaluated.png")  # v.png may be the preview of the run
-    facts = run_evaluation(volume, reference, picture or usual, reference_voxel_mm, object_motion, rtk_reference)
+    facts = run_evaluation(
+        volume, reference, picture or usual, reference_voxel_mm, object_motion, rtk_reference, mu_water_per_mm
+    )
     if as_json:
         say(json.dumps(_without_infinity(facts)))
         return

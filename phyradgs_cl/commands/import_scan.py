@@ -16,6 +16,7 @@ from phyradgs_cl.fields import GridChoice
 from phyradgs_cl.importers import FORMATS, ImportOptions, import_scan, recognise
 from phyradgs_cl.importers.formats.tiff_template import template_of
 from phyradgs_cl.importers.options import WORDS, option_name
+from phyradgs_cl.importers.reading.frames import TAKEN
 from phyradgs_cl.io import file_kind, only_run, refuse_overwriting, write_scan
 from phyradgs_cl.signals import finish_despite_interrupt
 from phyradgs_cl.workflow.files import check_output
@@ -37,8 +38,9 @@ GROUPS = {
             *("fps", "exposure_s", "readout_ms", "first"),
         ),
         "Geometry": ("detector_offset_mm", "unit_mm", "rotates"),
-        "Timing": ("frame_time_s", "readout_s", "angle_at", "readout_axis", "readout_direction", "detector_model"),
-        "Pixels": ("quantity", "flat_value", "row_0", "column_0", "part", "first_view"),
+        "Timing": ("angles", "frame_time_s", "readout_s", "angle_at", "readout_axis", "readout_direction", "detector_model"),
+        "Pixels": ("frames", "quantity", "flats", "flat_value", "row_0", "column_0", "part", "first_view"),
+        "HDF5": ("entry", "at", "linked_folder"),
         "Volume": ("size", "voxel_mm", "roi_mm"),
     }
 }
@@ -49,7 +51,7 @@ def _annotated(one: Field[Any]) -> tuple[Any, Any]:
     flag, words = option_name(one.name), (one.metadata["help"], one.metadata["usual"])
     if one.name in _PAIRS:
         return Annotated[Any, _PAIRS[one.name](flag, *words)], None
-    kind: Any = Literal[WORDS[one.name]] if one.name in WORDS else one.type
+    kind: Any = Literal[WORDS[one.name]] if one.name in WORDS else list[str] if one.name == "at" else one.type
     return Annotated[kind if one.default is not None else kind | None, option(*words, flag)], one.default
 
 
@@ -92,7 +94,7 @@ def import_command(
     if unusable:
         remark(f"no pixel can be used in {len(unusable)} frames (from 0): {', '.join(map(str, unusable[:10]))}")
     facts = [f"{frames} frames of {rows}×{columns}", *_applied_in_words(scan), "fly-scan" if scan.is_fly else "at rest"]
-    say(f"{output}: {format_name}, {', '.join(facts)}, {masked} pixels masked\n{scan.summary()}")
+    say(f"{output}: {format_name}, {', '.join(facts)}, {masked} pixels masked\n{scan.provenance[TAKEN]}\n{scan.summary()}")
 
 
 def _applied_in_words(scan: Scan) -> list[str]:

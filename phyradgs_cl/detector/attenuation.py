@@ -47,16 +47,18 @@ def counts_to_attenuation(
 
 def frames_to_attenuation(
     frames: NDArray[np.generic], quantity: str, flats: NDArray[np.generic] | None = None,
-    darks: NDArray[np.generic] | None = None, largest: float = _LARGEST
+    darks: NDArray[np.generic] | None = None, largest: float = _LARGEST, place: NDArray[np.floating] | None = None
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
     """Does the same for projections (P, v, u) with flats and darks (n, v, u) of their own. Attenuation above ``largest`` is
-    marked as unusable too."""
-    return _converted(frames, range(len(frames)), quantity, flats, darks, largest)
+    marked as unusable too. ``place`` (P,): each projection's place among the flats, which are interpolated, 0.5 halfway
+    from the first to the second; None takes their mean."""
+    return _converted(frames, range(len(frames)), quantity, flats, darks, largest, place)
 
 
 def _converted(
     frames: NDArray[np.generic], projections: Sequence[int] | NDArray[np.intp], quantity: str,
-    flats: NDArray[np.generic] | None, darks: NDArray[np.generic] | None, largest: float = _LARGEST
+    flats: NDArray[np.generic] | None, darks: NDArray[np.generic] | None, largest: float = _LARGEST,
+    place: NDArray[np.floating] | None = None
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
     panel = frames.shape[1:]
     result = np.empty((len(projections), *panel), dtype=np.float32)
@@ -71,6 +73,9 @@ def _converted(
             dark = mean_dark(darks, panel)
             gain = flats.mean(axis=0, dtype=np.float64) - dark
         for i, frame in enumerate(projections):
+            if place is not None and flats is not None and len(flats) > 1 and quantity == "counts":
+                first = min(int(place[i]), len(flats) - 2)
+                gain = flats[first] + (place[i] - first) * (flats[first + 1] - flats[first]) - dark
             for start in range(0, panel[0], rows):
                 part = slice(start, start + rows)
                 values = frames[frame, part].astype(np.float64)

@@ -4,6 +4,7 @@ times; these, line integrals, geometry and options make a scan."""
 import logging
 from collections.abc import Callable, Mapping
 from dataclasses import astuple, dataclass
+from functools import partial
 
 import numpy as np
 
@@ -14,13 +15,15 @@ from phyradgs_cl.acquisition.plausible import check_plausible
 from phyradgs_cl.acquisition.trajectory import resting_poses
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
-from phyradgs_cl.importers.options import ImportOptions, needed
-from phyradgs_cl.importers.reading.frames import LineIntegrals, distance_to_detector
-from phyradgs_cl.io.hdf5.source import Hdf5Source
+from phyradgs_cl.importers.options import ImportOptions
+from phyradgs_cl.importers.reading.frames import TAKEN, LineIntegrals
 
 _log = logging.getLogger(__name__)
 _OF_A_TURN = ("exposure_s", "readout_s", "angle_at", "readout_axis", "readout_direction")
+Length = float | Callable[[], float]
+Pitch = tuple[float, float] | Callable[[], tuple[float, float]]
 _DISTANCES = ("source_to_axis_mm", "source_to_detector_mm")
+_VIEW_DIGITS = 5  # of directions: views that agree to so many are one
 _SLACK = 1e-6  # of a span: how far a table extends beyond the times that are needed
 
 
@@ -59,12 +62,12 @@ class StoredTiming:
 
 
 def make_timing(
-    subject: str, frames: int, options: ImportOptions, stored: StoredTiming | None = None
+    subject: str, frames: int | np.ndarray, options: ImportOptions, stored: StoredTiming | None = None
 ) -> Timing:
-    """Returns the timing of ``frames`` frames; options replace stored values. Start times, or a time from frame to
-    frame, mean that the gantry turned continuously, which needs an exposure. Without them every frame was taken at
-    rest, and options about a turn are refused."""
-    stored = stored or StoredTiming()
+    """Returns the timing of ``frames`` frames, or of those with these numbers (F,); options replace stored values. Start
+    times, or a time from frame to frame, mean that the gantry turned continuously, which needs an exposure. Without them
+    every frame was taken at rest, and options about a turn are refused."""
+    stored, place = stored or StoredTiming(), np.arange(frames) if isinstance(frames, int) else frames
     exposure_s = _first(options.exposure_s, stored.exposure_s) or 0.0
     readout_s = _first(options.readout_s, stored.readout_s)
     axis = options.readout_axis or stored.axis
@@ -84,12 +87,12 @@ def make_timing(
     frame_time_s = _first(options.frame_time_s, stored.frame_time_s)
     if options.frame_time_s is None and stored.start_s is not None:
         start_s: np.ndarray = np.asarray(stored.start_s, np.float64)
-        checks.shape(f"{subject} start times", start_s, (frames,))
+        checks.shape(f"{subject} start times", start_s, place.shape)
     elif frame_time_s is not None:
-        start_s = np.arange(frames) * frame_time_s
+        start_s = place * frame_time_s
     else:
         _check_rest(subject, shutter, options, stored)
-        return Timing(shutter, np.arange(frames) * max(shutter.span_s, 1.0), False, angle_at)
+        return Timing(shutter, place * max(shutter.span_s, 1.0), False, angle_at)
     _check_flight(subject, shutter, start_s, options)
     return Timing(shutter, start_s, True, angle_at, assumed)
 
@@ -113,7 +116,8 @@ def _first(*values: float | None) -> float | None:
 
 def _check_rest(subject: str, shutter: Shutter, options: ImportOptions, stored: StoredTiming) -> None:
     """Refuses options about a turn without a time from frame to frame; warns of a file's exposure."""
-    asked = [options.called(name) for name in options.given(_OF_A_TURN)]
+    turns = [name for name in options.given(_OF_A_TURN) if name != "exposure_s" or stored.exposure_s is None]
+    asked = [options.called(name) for name in turns]
     frame_time = f"{options.named('frame_time_s')} or {options.named('fps')}"
     for name in (*asked, *stored.written):
         expected = "both, or neither for frames taken at rest"
@@ -191,40 +195,44 @@ def table_over_time(
 def assemble_scan(
     integrals: LineIntegrals, trajectory: CircularOrbit | PoseTable, geometry: Geometry, timing: Timing,
     options: ImportOptions, *, title: str, source: str, grid: Grid | None = None,
-    reference: np.ndarray | None = None, lag: float = 0.0, names: Mapping[str, str] | None = None,
+    reference: np.ndarray | None = None, lag: float = 0.0, names: Mapping[str, str] | None = None, said: str = "",
 ) -> Scan:
     """Returns the scan of line integrals with row 0 the lowest; without a grid it gets the cone's cube. ``names``: names in
-    messages about implausible values that a file states. InputError for such values."""
+    messages about implausible values that a file states; ``said``: which frames were taken. InputError for such values, and
+    for a scan most of whose views are one."""
     assumed = [*timing.assumed, *([] if options.detector_model else ["average"])] if timing.is_fly else []
     scan = Scan(
         projections=integrals.values, geometry=geometry, trajectory=trajectory, shutter=timing.shutter,
         frame_start_s=np.asarray(timing.start_s, np.float64), grid=grid or default_grid(geometry),
         is_fly=timing.is_fly, detector_model=options.detector_model or "log", pixel_mask=integrals.mask,
         reference=reference, title=title,
-        provenance={"imported_from": source, **integrals.applied, **({"assumed": assumed} if assumed else {})},
+        provenance={
+            "imported_from": source, **integrals.applied, **({"assumed": assumed} if assumed else {}),
+            TAKEN: "; ".join(str(part) for part in (said, integrals.applied.get(TAKEN)) if part),
+        },
         lag=lag, saturation=integrals.saturation,
     )
     subjects = {"grid": f"{source} grid", "angles": f"{source} angles", **(names or {})}
+    _check_turn(trajectory, scan.frame_start_s + timing.shutter.middle_s, subjects["angles"])
     is_timed = "exposure" not in assumed  # by convention an exposure of 1 s: the frame rate means nothing then
     check_plausible(scan, lambda name: subjects.get(name) or options.called(name), is_timed)
     scan.warn_of_near_panel()
     return scan
 
 
-def stored_beam(
-    source: Hdf5Source, addresses: tuple[str, str], to_axis_mm: float | None, options: ImportOptions,
-    panel: tuple[int, int], pitch_mm: tuple[float, float], offset_mm: tuple[float, float] = (0.0, 0.0),
-) -> Geometry:
-    """Returns the geometry of an HDF5 file. ``addresses``: of the distances of source and detector; ``to_axis_mm``: the
-    source's, None without one. Where the options state no distance either, the beam is parallel, and a warning says so."""
-    of_source, of_detector = addresses
-    if to_axis_mm is None and not options.given(_DISTANCES):
-        _log.warning("%s: no source distance: a parallel beam", source.name(of_source))
-        return parallel(options, panel, pitch_mm, offset_mm)
-    stated_mm = options.source_to_axis_mm or to_axis_mm
-    to_axis_mm = needed(stated_mm, "source_to_axis_mm", source.name(of_source), options.named)
-    to_detector_mm = distance_to_detector(source, of_detector, to_axis_mm, options)
-    return cone(options, to_axis_mm, to_detector_mm, panel, pitch_mm, offset_mm)
+def _check_turn(trajectory: CircularOrbit | PoseTable, middle_s: np.ndarray, subject: str) -> None:
+    """Raises InputError for most views at one angle, at times (F,): the angles are missing, or those of something else."""
+    if isinstance(trajectory, PoseTable):
+        views = trajectory.pose(0, middle_s)
+        views = views / np.abs(views).max(axis=0, initial=1e-9)
+    else:
+        angle_rad = np.array([float(trajectory.angle_rad(i, at_s)) for i, at_s in enumerate(middle_s)])
+        views = np.stack([np.cos(angle_rad), np.sin(angle_rad)], -1)
+    count = len(views)
+    most = int(np.unique(np.round(views, _VIEW_DIGITS) + 0.0, axis=0, return_counts=True)[1].max())
+    if count > 1 and 2 * most > count:
+        found = f"{most}{'' if most == count else f' of {count}'} views at one angle"
+        raise InputError(subject, found, "a turn between the views", "correct the angles")
 
 
 def names_in_file(options: ImportOptions, names: Mapping[str, str]) -> dict[str, str]:
@@ -240,28 +248,35 @@ def with_options(options: ImportOptions, geometry: Geometry) -> Geometry:
 
 
 def parallel(
-    options: ImportOptions, panel: tuple[int, int], pitch_mm: tuple[float, float], offset_mm: tuple[float, float]
+    options: ImportOptions, panel: tuple[int, int], pitch_mm: Pitch, offset_mm: tuple[float, float]
 ) -> ParallelGeometry:
     """Returns a parallel beam of a file's numbers, or the options' where they are given. InputError for distances."""
     for name in options.given(_DISTANCES):
         expected, remedy = "no distance: this file has a parallel beam", "leave it out"
         raise InputError(options.named(name), f"{getattr(options, name):g}", expected, remedy)
-    return ParallelGeometry(panel, options.pixel_size_mm or pitch_mm, options.detector_offset_mm or offset_mm)
+    return ParallelGeometry(panel, _pitch(options, pitch_mm), options.detector_offset_mm or offset_mm)
 
 
 def cone(
-    options: ImportOptions, to_axis_mm: float, to_detector_mm: float, panel: tuple[int, int],
-    pitch_mm: tuple[float, ...], offset_mm: tuple[float, float], names: Mapping[str, str] | None = None,
-) -> Geometry:
-    """Returns a geometry of a file's numbers, or the options' where they are given. ``names``: what the file calls them, see
-    ``names_in_file``. InputError unless the panel stands behind the axis."""
-    to_axis_mm = options.source_to_axis_mm or to_axis_mm
-    to_detector_mm = options.source_to_detector_mm or to_detector_mm
+    options: ImportOptions, to_axis_mm: Length, to_detector_mm: Length, panel: tuple[int, int], pitch_mm: Pitch,
+    offset_mm: tuple[float, float], names: Mapping[str, str] | None = None,
+) -> ConeGeometry:
+    """Returns a geometry of a file's numbers, or the options' where they are given: functions that read numbers are called
+    then only. ``names``: what the file calls them, see ``names_in_file``. InputError unless the panel stands behind the
+    axis."""
+    lengths = {"source_to_axis_mm": to_axis_mm, "source_to_detector_mm": to_detector_mm}
+    to_axis_mm, to_detector_mm = (
+        options.taken(name, length if callable(length) else partial(float, length)) for name, length in lengths.items()
+    )
     if to_detector_mm <= to_axis_mm:
         axis, detector = ((names or {}).get(name) or options.named(name) for name in _DISTANCES)
         remedy = "are the two exchanged?"
         if names and not names.keys().isdisjoint(_DISTANCES):
             remedy += f" Correct the file, or say {' and '.join(map(options.named, _DISTANCES))}"
         raise InputError(detector, f"{to_detector_mm:g}", f"more than {axis} ({to_axis_mm:g})", remedy)
-    dv, du = options.pixel_size_mm or pitch_mm
-    return ConeGeometry(to_axis_mm, to_detector_mm, panel, (dv, du), options.detector_offset_mm or offset_mm)
+    offset_mm = options.detector_offset_mm or offset_mm
+    return ConeGeometry(to_axis_mm, to_detector_mm, panel, _pitch(options, pitch_mm), offset_mm)
+
+
+def _pitch(options: ImportOptions, stored: Pitch) -> tuple[float, float]:
+    return options.taken("pixel_size_mm", stored if callable(stored) else lambda: stored)

@@ -15,6 +15,7 @@ from phyradgs_cl.importers.options import ImportOptions
 from phyradgs_cl.importers.reading import tiff
 from phyradgs_cl.importers.reading.files import SafeFolder, read_json, read_npy
 from phyradgs_cl.importers.reading.images import image_times_s, read_image_volume
+from phyradgs_cl.importers.unread import refuse_unread
 from phyradgs_cl.io.tables import Fields, read_toml, refuse_unknown
 from phyradgs_cl.io.volume import Volume, check_attenuation, finite_float32, read_volume, shares_of_maximum
 from phyradgs_cl.phantoms import Cylinder, Ellipsoid, EllipsoidPhantom
@@ -80,6 +81,8 @@ def recognise(path: Path) -> str:
         remedy = f"'phyradgs import {path if path.is_dir() else path.parent} --template' prints one to fill in"
         found = "TIFF images and no TOML that describes them"
         raise InputError(str(path), found, "geometry and angles in a TOML beside them", remedy)
+    if not names:
+        refuse_unread(path, "one of the formats of docs/import.md")
     found = f"several: {', '.join(names)}" if names else "no known format"
     raise InputError(str(path), found, "one of the formats of docs/import.md", "say which with --format")
 
@@ -104,8 +107,10 @@ def load_volume(path: str | Path) -> Volume:
     """Reads a volume (nz, ny, nx) float32 in 1/mm of any format. Its axes are turned to rise with the world's, which are LPS
     (docs/export.md). Bare values have no grid: a dataset /volume, NRRD and TIFF without voxel sizes, .npy without its .json.
     InputError: a damaged file, oblique axes, Hounsfield units, NaN or infinity."""
-    reader = _reader(path)
-    return reader[1](Path(path)) if reader else read_volume(path)
+    if (reader := _reader(path)) is None:
+        refuse_unread(Path(path), "a volume of a format of docs/formats.md")
+        return read_volume(path)
+    return reader[1](Path(path))
 
 
 def load_states(path: str | Path) -> Iterator[tuple[float, Volume]]:
@@ -142,9 +147,9 @@ def _read_npy(path: Path) -> Volume:
 
 
 def _read_tiff(path: Path) -> Volume:
-    """Reads pages from the lowest slice up, row 0 at the smallest y, with the sizes that ImageJ writes."""
+    """Reads pages from the lowest slice up, row 0 at the smallest y, with the sizes that ImageJ or OME write."""
     values = tiff.read_tiffs([path])
-    size_mm, origin, note = tiff.imagej_calibration(path)
+    size_mm, origin, note = tiff.calibration(path)
     if size_mm is None:
         return _bare(path, values)
     first_mm = None if origin is None else -(origin * size_mm)[::-1]

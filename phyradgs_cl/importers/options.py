@@ -1,14 +1,22 @@
 """Options of an import: values that a foreign scan's files do not state, or that replace theirs."""
 
-from dataclasses import dataclass, field, fields
-from typing import Any
+import re
+from collections.abc import Callable
+from dataclasses import dataclass, field, fields, replace
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
 
 from phyradgs_cl import checks
 from phyradgs_cl.acquisition.readout import SIDES, Named, frame_time_of, readout_of, readout_order
 from phyradgs_cl.acquisition.scan import DETECTOR_MODELS
 from phyradgs_cl.acquisition.shutter import AXES
 from phyradgs_cl.errors import InputError
+from phyradgs_cl.importers.reading.files import SafeFolder
+from phyradgs_cl.importers.reading.text import read_angles_rad
 
+T = TypeVar("T")
 WORDS: dict[str, tuple[str, ...]] = {
     "part": ("train", "test", "all"),
     "angle_at": ("start", "middle"),
@@ -19,6 +27,8 @@ WORDS: dict[str, tuple[str, ...]] = {
     "readout_axis": AXES,
     "first": SIDES,
     "detector_model": DETECTOR_MODELS,
+    "flats": ("median", "time"),
+    "frames": ("stated", "found"),
 }
 _POSITIVE = ("frame_time_s", "source_to_axis_mm", "source_to_detector_mm", "flat_value", "unit_mm")
 _TIMES = ("exposure_s", "readout_s")
@@ -26,6 +36,13 @@ _TIMES = ("exposure_s", "readout_s")
 
 _FILE, _FORMAT = "the file's", "the format's"
 DETECTOR_OFFSET = "Shift V,U of the panel's centre, mm: V > 0 up (rows), U > 0 right (columns), seen from the source."
+_AT = (
+    "An array in HDF5: NAME=FILE:/ADDRESS or NAME=/ADDRESS. NAME: projections, flats, darks, mask, image_key, angles; "
+    "axes=v,frame,u: their order."
+)
+_STEPS = re.compile(r"\s*([-+]?\d+(?:\.\d+)?)\s*(,|\.\.)\s*([-+]?\d+(?:\.\d+)?)\s*")
+_ANGLES = "Angles in degrees: a text file, FIRST,STEP or FIRST..LAST."
+_FRAMES = "Where a description states more frames than there are: refuse (stated), or take those found."
 _FIRST_VIEW = "First view of this scan in a JSON of several (phyradgs-real)."
 
 
@@ -56,6 +73,9 @@ class ImportOptions:
     row_0: str | None = _option("Place of the first stored row.", _FORMAT)
     column_0: str | None = _option("Place of the first stored column.", "left")
     quantity: str | None = _option("Quantity in the pixels.")
+    angles: str | None = _option(_ANGLES)
+    frames: str | None = _option(_FRAMES, "stated")
+    flats: str | None = _option("Flats: their median, or interpolated in time.", "time if the file states it, else median")
     flat_value: float | None = _option("Counts without an object, in place of flat frames.")
     detector_model: str | None = _option("An exposure averages line integrals (log) or intensity.", "log")
     part: str = _option("Projections of a benchmark folder (r2, phyradgs, naf).", True, "train")
@@ -63,6 +83,9 @@ class ImportOptions:
     first: str | None = _option("Line that is read first, seen from the source.", _FORMAT)
     fps: float | None = _option("Frames per second of a gantry that never stops.", f"{_FILE}, else at rest")
     readout_ms: float | None = _option("From the first line's opening to the last line's, ms.")
+    entry: str | None = _option("Address of the scan in an HDF5 file of several, as /entry1/tomo_entry.")
+    at: tuple[str, ...] | None = _option(_AT, _FORMAT)
+    linked_folder: Path | None = _option("Folder with the files that an HDF5 file links to.", "that of SRC")
     named: Named = field(default=str, repr=False, compare=False)
 
     def __post_init__(self) -> None:
@@ -97,6 +120,35 @@ class ImportOptions:
     def given(self, among: tuple[str, ...]) -> list[str]:
         return [name for name in among if getattr(self, name) != _DEFAULTS[name]]
 
+    def taken(self, name: str, stored: Callable[[], T]) -> T:
+        """Returns the option ``name`` where it is given, else what ``stored`` reads from the file, whose errors then say the
+        option too."""
+        value: T | None = getattr(self, name)
+        if value is not None:
+            return value
+        try:
+            return stored()
+        except InputError as error:
+            remedy = f"{error.remedy}, or say {self.named(name)}" if error.remedy else f"say {self.named(name)}"
+            raise InputError(error.subject, error.found, error.expected, remedy) from error
+
+    def angle_rad(self, count: int, stored: Callable[[], np.ndarray]) -> np.ndarray:
+        """Returns the angles (count,) of the option ``angles`` in rad, else those that ``stored`` reads, in rad."""
+        if self.angles is None:
+            return self.taken("angles", stored)
+        if not (steps := _STEPS.fullmatch(self.angles)):
+            path = Path(self.angles)
+            file = SafeFolder(path.parent).file(path.name, self.named("angles"))
+            return read_angles_rad(file, count)
+        first, last = float(steps[1]), float(steps[3])
+        if steps[2] == ",":
+            return np.deg2rad(first + last * np.arange(count))
+        return np.deg2rad(np.linspace(first, last, count))
+
+    def with_air(self, flat_value: float | None) -> "ImportOptions":
+        """Returns the options with a file's counts of air where they state none."""
+        return replace(self, flat_value=self.flat_value or flat_value)
+
     def called(self, name: str) -> str:
         """Returns the name of a field in messages: the word of a data sheet where the user gave that."""
         word = _WORD_OF.get(name, name)
@@ -123,8 +175,10 @@ TIMING = (
 OF_BARE_FRAMES = (
     *TIMING,
     *("source_to_axis_mm", "source_to_detector_mm", "pixel_size_mm", "detector_offset_mm", "rotates"),
-    *("row_0", "column_0", "quantity", "flat_value", "detector_model"),
+    *("row_0", "column_0", "quantity", "flat_value", "detector_model", "angles", "flats"),
 )
+OF_FOLDERS = (*OF_BARE_FRAMES, "frames")
+OF_HDF5 = (*OF_BARE_FRAMES, "entry", "at", "linked_folder")
 _OPTIONS = {"readout_axis": "--readout", "detector_offset_mm": "--detector-offset"}
 
 
@@ -132,9 +186,3 @@ def option_name(field: str) -> str:
     """Returns the option of the command line for a field of ImportOptions."""
     return _OPTIONS.get(field, "--" + field.replace("_", "-"))
 
-
-def needed(value: float | None, field: str, subject: str, named: Named) -> float:
-    """Returns a length that the file does not hold, from the options; InputError that asks for it where it is missing."""
-    if value is None:
-        raise InputError(subject, "nothing", "a length in mm", f"say {named(field)}")
-    return value

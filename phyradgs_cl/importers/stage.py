@@ -1,13 +1,23 @@
 """A sample on a rotary stage between a source and a panel at rest, and how far its axis is off the central ray."""
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from phyradgs_cl.acquisition import CircularOrbit, PoseTable
+from phyradgs_cl.acquisition import CircularOrbit, PoseTable, Scan
 from phyradgs_cl.acquisition.geometry import Geometry, ParallelGeometry, plain_geometry
-from phyradgs_cl.importers.assemble import Timing, table_over_time, turning
+from phyradgs_cl.importers.assemble import (
+    StoredTiming,
+    Timing,
+    assemble_scan,
+    make_timing,
+    table_over_time,
+    turning,
+)
+from phyradgs_cl.importers.options import ImportOptions
+from phyradgs_cl.importers.reading.frames import line_integrals, oriented
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,6 +61,39 @@ class RotaryStage:
         at_frames = poses(np.arange(len(unwrapped), dtype=np.float64))
         geometry = plain_geometry(at_frames, self.geometry.detector_shape, is_parallel)
         return table_over_time(poses, timing, subject, is_parallel), geometry
+
+
+@dataclass(frozen=True, eq=False)
+class StageScan:
+    """Counts (F, v, u) of a sample on a stage with the first row and column at ``sides``, and gantry angles (F,) in rad.
+
+    ``places`` (F,): numbers of the frames from 0 on; ``stored``: the file's timing; ``said``, ``names``: see
+    ``assemble_scan``. Flats and darks are (n, v, u), or None where the scanner has applied them."""
+
+    frames: np.ndarray
+    sides: tuple[str, str]
+    angle_rad: np.ndarray
+    places: np.ndarray
+    names: dict[str, str]
+    said: str
+    stored: StoredTiming | None = None
+    flats: np.ndarray | None = None
+    darks: np.ndarray | None = None
+
+    def on(
+        self, stage: RotaryStage, options: ImportOptions, path: Path, title: str, flat_value: float | None = None
+    ) -> Scan:
+        """Returns the scan of the description ``path``. ``flat_value``: the file's counts of air; options come first."""
+        timing = make_timing(str(path), self.places, options, self.stored)
+        trajectory, geometry = stage.turned(self.angle_rad, timing, str(path))
+        stacks = (None if one is None else oriented(one, options, *self.sides) for one in (self.flats, self.darks))
+        flats, darks = stacks
+        integrals = line_integrals(
+            str(path), oriented(self.frames, options, *self.sides), options.with_air(flat_value), flats=flats, darks=darks,
+            convention="counts", is_corrected=darks is None,
+        )
+        parts = integrals, trajectory, geometry, timing, options
+        return assemble_scan(*parts, title=title, source=str(path), names=self.names, said=self.said)
 
 
 def along(values: np.ndarray, position: np.ndarray) -> np.ndarray:

@@ -86,7 +86,7 @@ def read_deformation_group(source: Hdf5Source, address: str) -> Deformation:
 
 
 def _in_scans(source: Hdf5Source) -> list[str]:
-    return [f"{name}/phyradgs/reference/deformation" for name in source.root_groups()]
+    return [f"{name}/phyradgs/reference/deformation" for name in source.groups()]
 
 
 def write_truth(extra: h5py.Group, scan: Scan) -> None:

@@ -62,6 +62,18 @@ def read_regular(path: Path, subject: str, most_bytes: int, expected: str) -> by
         return file.read(size)
 
 
+def decoded(data: bytes) -> str:
+    """Returns the text of a file in UTF-8, in UTF-16 as Windows saves it, or in Windows' western code page 1252."""
+    if data[:2] in (b"\xff\xfe", b"\xfe\xff"):
+        return data.decode("utf-16", "replace")
+    if data[1:8:2] == bytes(4) or data[:8:2] == bytes(4):  # without a mark at its beginning
+        return data.decode("utf-16-le" if data[1:2] == b"\0" else "utf-16-be", "replace")
+    try:
+        return data.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        return data.decode("cp1252", "replace")
+
+
 def sha256_of(path: str | Path, given_up: threading.Event | None = None) -> str:
     """Returns the SHA-256 of a file as 64 hexadecimal digits; stops early when ``given_up`` is set."""
     digest = hashlib.sha256()

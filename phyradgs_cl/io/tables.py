@@ -11,7 +11,7 @@ import numpy as np
 
 from phyradgs_cl import checks
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.io.files import read_regular
+from phyradgs_cl.io.files import decoded, read_regular
 from phyradgs_cl.text import suggest_name
 
 if sys.version_info >= (3, 11):
@@ -38,7 +38,7 @@ def read_toml(path: Path, subject: str = "") -> dict[str, Any]:
     """Parses a TOML file. InputError about ``subject``, or the path, for a missing file or other text."""
     subject = subject or str(path)
     try:
-        return tomllib.loads(read_regular(path, subject, _MOST_TOML_BYTES, "a TOML file").decode("utf-8-sig"))
+        return tomllib.loads(decoded(read_regular(path, subject, _MOST_TOML_BYTES, "a TOML file")))
     except (ValueError, RecursionError) as error:  # also numbers of too many digits and tables that are too deep
         raise InputError(subject, f"text that is not TOML ({error})", "a TOML file") from error
 

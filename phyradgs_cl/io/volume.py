@@ -30,6 +30,7 @@ _DISAGREEMENT_MEANS = (
 _AXES = ("z", "y", "x")
 _GAUSSIANS, _STATE, _STATES = "/entry/gaussians", "/entry/state", "/entry/time_series"
 _CLOUD = {"mean": (3,), "scale": (3,), "quaternion": (4,), "density": ()}
+_LOWEST_PER_MM, _HIGHEST_PER_MM = -10.0, 1000.0  # beyond noise below 0, and beyond gold
 _AXIS_TOLERANCE = 1e-3  # of a voxel, for axes stored in float32
 log = logging.getLogger(__name__)
 
@@ -166,6 +167,19 @@ def check_attenuation(subject: str, volume: Volume, *, warn: bool = True) -> Vol
     return volume
 
 
+def attenuation_of(subject: str, volume: Volume, mu_water_per_mm: float | None) -> Volume:
+    """Returns a volume in 1/mm, from Hounsfield units where water's attenuation is stated. InputError about ``subject`` for
+    values that no attenuation in 1/mm has: those of CT numbers, and counts."""
+    lowest, highest = float(volume.values.min()), float(volume.values.max())
+    if mu_water_per_mm is not None:
+        checks.within("--mu-water-per-mm", mu_water_per_mm, 1e-6, 1e3)
+        return replace(volume, values=(mu_water_per_mm * (1 + volume.values.astype(np.float64) / 1000)).astype(np.float32))
+    if lowest < _LOWEST_PER_MM or highest > _HIGHEST_PER_MM:
+        found = f"values from {lowest:g} to {highest:g}, as of Hounsfield units"
+        raise InputError(subject, found, "attenuation in 1/mm", "say --mu-water-per-mm, near 0.02, to convert them")
+    return volume
+
+
 def volume_summary(path: str | Path) -> dict[str, Any]:
     """Returns facts about a volume file without reading the voxels."""
     with open_hdf5(path) as source:
@@ -202,7 +216,7 @@ def file_kind(path: str | Path) -> str:
             return "volume"
         if isinstance(source.find(_BARE), h5py.Dataset):
             return "plain-volume"
-        if any(source.find(f"{group}/instrument") is not None for group in source.root_groups()):
+        if any(source.find(f"{group}/instrument") is not None for group in source.groups()):
             return "scan"
         if isinstance(source.find(DEFORMATION), h5py.Group):
             return "deformation"

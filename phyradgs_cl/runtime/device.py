@@ -74,8 +74,8 @@ def choose_device(wish: str | None = None, turn: int = 0) -> tuple[DeviceInfo, s
         found = "no device"
         remedy = "install your vendor's OpenCL driver; on Linux x86-64, pip install 'phyradgs-cl[cpu]' "
         remedy += "brings PoCL for the CPU"
-        if pocl.unwritable_cache() is not None:
-            found += f", and PoCL's cache {pocl.unwritable_cache()} cannot be written"
+        if pocl.unusable_cache() is not None:
+            found += f", and PoCL's cache {pocl.unusable_cache()} cannot be written"
             remedy = f"set {pocl.CACHE_VARIABLE} to a folder that can be written"
         raise DeviceError("OpenCL", found, "at least one", remedy)
     if wish:

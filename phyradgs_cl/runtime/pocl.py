@@ -10,6 +10,7 @@ PoCL has no setting for the name, but its device record points to it. The pointe
 import contextlib
 import ctypes
 import logging
+import mmap
 import os
 import platform
 import re
@@ -47,16 +48,17 @@ _OLDEST_TARGET = "athlon64"
 THREADS_VARIABLE = "POCL_MAX_PTHREAD_COUNT"
 _MOST_THREADS = 1024
 _NO_CACHE_VARIABLE = "PYOPENCL_NO_CACHE"
-_unwritable: Path | None = None
+_unusable: tuple[Path, str] | None = None
 _kept_alive: list[ctypes.Array[ctypes.c_char]] = []
 
 
 def prepare_environment() -> None:
     """Gives PoCL a kernel cache for this processor, unless the user has chosen one. To be called before pyopencl loads. PoCL
     names its cache after the LLVM target, so two unknown processors would share binaries. Without a writable cache PoCL has
-    no device: then the cache lies in the temporary folder, and pyopencl's is switched off. Raises InputError for a number of
+    no device, and one that may not be executed (a mount with noexec) ends the process: then the cache lies in the temporary
+    folder. pyopencl's is switched off where it cannot be written. Raises InputError for a number of
     threads that PoCL would crash on or ignore."""
-    global _unwritable
+    global _unusable
     if platform.system() != "Linux":
         return
     _share_cores(launched())
@@ -66,12 +68,15 @@ def prepare_environment() -> None:
     wish = os.environ.get(CACHE_VARIABLE)
     own = _caches() / "phyradgs-cl" / f"pocl-{library_target() or platform.machine()}"
     folder = Path(wish) if wish else own
-    if not _can_write(folder):
-        _unwritable = folder
+    if (reason := _fault_of(folder)) is not None:
+        _unusable = folder, reason
         try:
             folder = _temporary_cache()
-        except OSError:  # not there either: PoCL will have no device
-            return
+        except OSError as error:
+            if reason == "executed":  # PoCL would end the process
+                found, remedy = f"{folder}, on a mount with noexec", f"set {CACHE_VARIABLE} to a folder on another mount"
+                raise InputError(CACHE_VARIABLE, found, "a folder whose files may be executed", remedy) from error
+            return  # not there either: PoCL will have no device
     os.environ[CACHE_VARIABLE] = str(folder)
 
 
@@ -89,18 +94,18 @@ def _check_threads(wish: str | None) -> None:
         raise InputError(THREADS_VARIABLE, checks.short_repr(wish), expected, f"unset {THREADS_VARIABLE}")
 
 
-def unwritable_cache() -> Path | None:
-    """Returns a cache that cannot be written, until ``warn_of_cache`` has named it."""
-    return _unwritable
+def unusable_cache() -> Path | None:
+    """Returns a cache that cannot be written or executed, until ``warn_of_cache`` has named it."""
+    return _unusable and _unusable[0]
 
 
 def warn_of_cache() -> None:
     """Warns once that kernels are kept in the temporary folder. To be called where PoCL is used."""
-    global _unwritable
-    if _unwritable is not None:
-        text = "PoCL's kernel cache %s cannot be written: kernels are kept in %s; set %s to a folder that can"
-        log.warning(text, _unwritable, os.environ.get(CACHE_VARIABLE), CACHE_VARIABLE)
-        _unwritable = None
+    global _unusable
+    if _unusable is not None:
+        text = "PoCL's kernel cache %s cannot be %s: kernels are kept in %s; set %s to a folder that can"
+        log.warning(text, *_unusable, os.environ.get(CACHE_VARIABLE), CACHE_VARIABLE)
+        _unusable = None
 
 
 def _caches() -> Path:
@@ -111,23 +116,39 @@ def _caches() -> Path:
 
 
 def _can_write(folder: Path) -> bool:
+    return _fault_of(folder) != "written"
+
+
+def _fault_of(folder: Path) -> str | None:
+    """Returns what cannot be done with files in a folder, "written" or "executed"; None for a folder that may hold kernels.
+    The kernel refuses to map an executable page of a file on a mount with noexec."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=folder):
-            return True
+        with tempfile.TemporaryFile(dir=folder) as file:
+            file.write(bytes(mmap.PAGESIZE))
+            file.flush()
+            try:
+                mmap.mmap(file.fileno(), mmap.PAGESIZE, mmap.MAP_PRIVATE, mmap.PROT_READ | mmap.PROT_EXEC).close()
+            except OSError:
+                return "executed"
+            return None
     except OSError:
-        return False
+        return "written"
 
 
 def _temporary_cache() -> Path:
-    """Returns a folder that only this user can write, because its binaries are executed."""
-    folder = Path(tempfile.gettempdir()) / f"phyradgs-cl-{os.getuid()}"
+    """Returns a folder that only this user can write, because its binaries are executed. OSError where none can be."""
+    places = [Path(place) for place in (tempfile.gettempdir(), "/var/tmp", "/dev/shm")]
+    place = next((place for place in places if _fault_of(place) is None), None)
+    if place is None:
+        raise OSError("no temporary folder for kernels")
+    folder = place / f"phyradgs-cl-{os.getuid()}"
     with contextlib.suppress(OSError):
         folder.mkdir(mode=0o700, exist_ok=True)
         status = folder.lstat()
         if stat.S_ISDIR(status.st_mode) and status.st_uid == os.getuid() and not status.st_mode & 0o077:
             return folder
-    return Path(tempfile.mkdtemp(prefix="phyradgs-cl-"))
+    return Path(tempfile.mkdtemp(prefix="phyradgs-cl-", dir=place))
 
 
 def library_target() -> str | None:

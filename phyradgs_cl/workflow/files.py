@@ -63,7 +63,7 @@ def _is_foreign_scan(path: Path) -> bool:
         if importers.recognise(path) != "nxtomo":
             return True
         with open_hdf5(path) as source:
-            data = [source.find(f"{entry}/instrument/detector/data") for entry in source.root_groups()]
+            data = [source.find(f"{entry}/instrument/detector/data") for entry in source.groups()]
             return any(frames is not None and "quantity" not in frames.attrs for frames in data)
     except (InputError, OSError):
         return False

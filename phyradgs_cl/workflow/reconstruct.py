@@ -37,6 +37,8 @@ from phyradgs_cl.workflow.files import check_output, expecting, load_scan
 from phyradgs_cl.workflow.slabs import Slabs, reconstruct_slabs, remove_slabs, surely_fits
 
 log = logging.getLogger(__name__)
+_SETTLED = 5  # iterations from which on a residual says something: it begins with 1
+_UNLIKELY = 0.5  # of the norm of the line integrals: scans with few photons leave 0.3
 _ALL_ROWS = Slabs()
 
 
@@ -174,6 +176,7 @@ def _reconstructed(
                     target, *parts, disagreement=result.disagreement, deformation=result.deformation, states=result.states
                 )
                 _keep_checkpoint(output, result)
+                _warn_of_residual(path, result)
     except signals.InterruptedAfterwards:
         # After a complete run the signal takes effect; an interrupted run reports it.
         if result is None or result.state is None:
@@ -221,6 +224,15 @@ def _warn_of_doubts(plan: methods.RunPlan, path: Path, scan: Scan) -> None:
     if (largest := float(scan.projections.max())) <= 0:
         found = f"no line integral is above 0 (the largest is {largest + 0.0:g})"  # + 0.0 makes a 0 of a -0
         log.warning("%s: %s: there is no object in it, or the sign is wrong", path, found)
+
+
+def _warn_of_residual(path: Path, result: methods.Reconstruction) -> None:
+    """Warns where the iterations came to rest at a volume that explains little of the scan."""
+    residual = float(result.record[-1].get("residual", 0.0)) if len(result.record) >= _SETTLED else 0.0
+    if residual > _UNLIKELY:
+        text = "%s: the volume does not explain %.0f %% of the line integrals: no scan with right angles, axis and flats "
+        text += "leaves so much; run 'phyradgs check' and see what it doubts"
+        log.warning(text, path, 100 * residual)
 
 
 def _averages(scan: Scan, options: Any) -> bool:

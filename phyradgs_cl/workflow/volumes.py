@@ -15,7 +15,7 @@ from phyradgs_cl.fields.grid_choice import voxel_sides_mm
 from phyradgs_cl.importers import load_attenuation
 from phyradgs_cl.io import Volume, check_writable, hashing, read_deformation, write_volume, written_beside
 from phyradgs_cl.io.output import refuse_overwriting
-from phyradgs_cl.io.volume import interruption
+from phyradgs_cl.io.volume import attenuation_of, interruption
 from phyradgs_cl.metrics import (
     METRICS,
     VOXEL_BY_VOXEL,
@@ -47,16 +47,18 @@ _LITTLE = 0.5 - 1e-6  # of either box: less in common is most often a wrong size
 @np.errstate(all="ignore")
 def run_evaluation(
     volume_path: Path, reference_path: Path, picture: Path, reference_voxel_mm: object = None,
-    object_motion: Path | None = None, reference_of_rtk: bool = False,
+    object_motion: Path | None = None, reference_of_rtk: bool = False, mu_water_per_mm: float | None = None,
 ) -> dict[str, object]:
     """Compares a volume with a scan's reference or another volume, by the rule of ``metrics.aligned``, and writes the
     picture of slices. A volume without a scale is compared voxel by voxel. ``reference_voxel_mm``: sides of the voxels of a
     reference without a scale, one length or (z, y, x). ``object_motion``: the file of a deformation, which shows the volume
     at each true state of a scan; None takes the volume's own, if it has one. ``reference_of_rtk``: the
-    reference has RTK's axes. InputError: no such sides; files that do not fit each other."""
+    reference has RTK's axes. ``mu_water_per_mm``: of a reference in Hounsfield units. InputError: no such sides; files that
+    do not fit each other."""
     check_picture("--picture", picture, volume_path, reference_path, object_motion)
     field = None if object_motion is None else read_deformation(object_motion)
     result, (stored, moving) = load_result(volume_path), load_reference(reference_path)
+    stored = attenuation_of(str(reference_path), stored, mu_water_per_mm)
     if field is not None and (moving is None or result.grid is None):
         expected = "a scan simulated with --motion-of-object, and a volume with a scale"
         raise InputError("--object-motion", "no true states to compare with", expected, "leave it out")

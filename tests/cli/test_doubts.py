@@ -62,7 +62,7 @@ def test_files_of_another_kind_are_called_by_their_kind(cli, refused, scan, tmp_
 
 
 def test_no_device_for_want_of_a_cache_is_said(refused, monkeypatch) -> None:
-    monkeypatch.setattr(pocl, "_unwritable", Path("/full/cache"))
+    monkeypatch.setattr(pocl, "_unusable", (Path("/full/cache"), "written"))
     monkeypatch.setattr(device, "list_devices", list)
     refused(["devices"], "/full/cache cannot be written", "set POCL_CACHE_DIR to a folder that can", status=5)
 

@@ -1,5 +1,6 @@
 """Damage to one object of an HDF5 file: every way in which a field may be missing, wrong, boundless or elsewhere."""
 
+import tempfile
 from collections.abc import Callable
 from pathlib import Path
 
@@ -59,19 +60,25 @@ def _instead(make: Change) -> Change:
     return change
 
 
+def _outside(file: h5py.File) -> Path:
+    """A new file that is not in the folder of this one: an error may keep the last one open."""
+    return Path(tempfile.mkdtemp(dir=Path(file.filename).parent.parent)) / "outside.h5"
+
+
 def _external_link(file: h5py.File, address: str) -> None:
-    """To a good dataset of the same name in a good file beside this one."""
-    with h5py.File(Path(file.filename).with_name("outside.h5"), "w") as other:
+    """To a good dataset of the same name in a good file of another folder."""
+    outside = _outside(file)
+    with h5py.File(outside, "w") as other:
         file.copy(address, other, name="there")
     del file[address]
-    file[address] = h5py.ExternalLink("outside.h5", "/there")
+    file[address] = h5py.ExternalLink(f"../{outside.parent.name}/{outside.name}", "/there")
 
 
 def _virtual(file: h5py.File, address: str) -> None:
-    shape, attributes = file[address].shape, dict(file[address].attrs)
+    shape, attributes, outside = file[address].shape, dict(file[address].attrs), _outside(file)
     layout = h5py.VirtualLayout(shape, file[address].dtype)
-    layout[...] = h5py.VirtualSource("outside.h5", "there", shape)
-    with h5py.File(Path(file.filename).with_name("outside.h5"), "w") as other:
+    layout[...] = h5py.VirtualSource(outside, "there", shape)
+    with h5py.File(outside, "w") as other:
         other["there"] = file[address][()]
     del file[address]
     file.create_virtual_dataset(address, layout).attrs.update(attributes)

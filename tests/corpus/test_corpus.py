@@ -8,7 +8,7 @@ import pytest
 from corpus.good import write_good
 from corpus.hdf5_files import Case, cases
 
-from phyradgs_cl.errors import InputError
+from phyradgs_cl.errors import InputError, OutOfMemoryError
 from phyradgs_cl.importers import load_attenuation
 from phyradgs_cl.io import read_volume
 from phyradgs_cl.io.files import in_use_bytes
@@ -28,7 +28,7 @@ def complaint(case: Case, good: Path, folder: Path) -> str:
     held, began_s = in_use_bytes("VmHWM:"), time.process_time()
     try:
         READERS[case.of](path)
-    except InputError as error:
+    except (InputError, OutOfMemoryError) as error:
         named = f"{path}:/{case.address}" if case.address else str(path)
         if not case.refused or "\n" in str(error) or not error.subject.startswith(named):
             return f"must be {'named' if case.refused else 'read'}: {error}"

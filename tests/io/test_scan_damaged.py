@@ -16,7 +16,7 @@ from corpus.hdf5_files import HARMLESS_COUNTS, HARMLESS_FLY, damages_of
 
 from phyradgs_cl.acquisition import CircularOrbit, EncoderTable, PoseTable, Scan
 from phyradgs_cl.detector import counts_to_attenuation
-from phyradgs_cl.errors import InputError
+from phyradgs_cl.errors import InputError, OutOfMemoryError
 from phyradgs_cl.io import read_scan, scan_summary, write_scan
 
 DETECTOR, SAMPLE, EXTRA = "/entry/instrument/detector", "/entry/sample", "/entry/phyradgs"
@@ -57,7 +57,7 @@ def soft_link_to_external(file: h5py.File, away: str) -> None:
 
 def entry_misnamed(file: h5py.File, address: str) -> None:
     file.move(address, "entrys")
-    del file["entrys"].attrs["NX_class"], file.attrs["default"]
+    del file["entrys"].attrs["NX_class"], file["entrys/definition"], file.attrs["default"]
 
 
 ENCODER_TIME, ENCODER_ANGLE = f"{EXTRA}/kinematics/time_s", f"{EXTRA}/kinematics/angle_deg"
@@ -169,7 +169,7 @@ def test_every_object_in_every_way_is_named(good, tmp_path, make_scan) -> None:
             damaged = tmp_path / "damaged.h5"
             shutil.copy(good, damaged)
             on(address, damages[name])(damaged)
-            with pytest.raises(InputError) as caught:
+            with pytest.raises((InputError, OutOfMemoryError)) as caught:
                 read_scan(damaged, counts_to_attenuation)
             assert caught.value.subject.startswith(f"{damaged}:/{address}"), (address, name, caught.value.subject)
 

@@ -19,8 +19,9 @@ from phyradgs_cl.importers.formats import phyradgs_synthetic as synthetic
 from phyradgs_cl.importers.formats.r2_gaussian import META, META_WITH_TIMES
 from phyradgs_cl.importers.options import ImportOptions
 from phyradgs_cl.importers.reading import tiff
-from phyradgs_cl.importers.reading.files import SafeFolder, check_numbering, read_json
+from phyradgs_cl.importers.reading.files import SafeFolder, read_json
 from phyradgs_cl.importers.reading.frames import line_integrals
+from phyradgs_cl.importers.reading.series import series_of
 from phyradgs_cl.io.tables import Fields
 
 _log = logging.getLogger(__name__)
@@ -107,11 +108,11 @@ def _frames_and_views(
 ) -> tuple[np.ndarray, list[Fields]]:
     """Reads frames (F, v, u) as stored, and returns their F views: all of the file, or those from ``first_view`` on."""
     folder = SafeFolder(description.parent)
-    if folder.exists(PROJECTIONS) and not (folder.root / PROJECTIONS).is_symlink():
+    if folder.exists(PROJECTIONS):
         folder = SafeFolder(folder.root / PROJECTIONS)
     paths = folder.matching(*tiff.SUFFIXES)
     if options.first_view is not None:
-        check_numbering(paths, "complete the frames")  # frame i has view first_view + i
+        paths = series_of(paths, str(folder.root), "complete the frames").paths  # frame i has view first_view + i
         views = views[options.first_view : options.first_view + len(paths)]
     if not paths or len(paths) != len(views):
         remedy = f"say {options.named('first_view')} if the JSON holds several scans"

@@ -1,5 +1,5 @@
-"""A folder of TIFF frames and one TOML with their contents, geometry, angles and timing. The TOML has the tables of a
-scanner file, and [frames], [angles] and [timing]. Row 0 is the top, column 0 the left, seen from the source."""
+"""A folder of TIFF or HDF5 frames and one TOML with their contents, geometry, angles and timing. The TOML has the tables of
+a scanner file, and [frames], [angles] and [timing]. Row 0 is the top, column 0 the left, seen from the source."""
 
 from dataclasses import replace
 from pathlib import Path, PurePosixPath
@@ -10,6 +10,7 @@ import numpy as np
 from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.acquisition.readout import frame_time_of, readout_of
 from phyradgs_cl.errors import InputError
+from phyradgs_cl.importers import hdf5
 from phyradgs_cl.importers.assemble import (
     StoredTiming,
     assemble_scan,
@@ -20,18 +21,21 @@ from phyradgs_cl.importers.assemble import (
 )
 from phyradgs_cl.importers.options import FIELDS, OF_BARE_FRAMES, WORDS, ImportOptions
 from phyradgs_cl.importers.reading import tiff
-from phyradgs_cl.importers.reading.files import SafeFolder, check_numbering, checked_name, read_numbers
+from phyradgs_cl.importers.reading.files import SafeFolder, checked_name
 from phyradgs_cl.importers.reading.frames import LineIntegrals, gantry_sign, line_integrals, oriented
+from phyradgs_cl.importers.reading.series import Series, flat_places, series_of
+from phyradgs_cl.importers.reading.text import TO_RAD, read_angles_rad
 from phyradgs_cl.io.scan.reader import united
 from phyradgs_cl.io.scanner import TABLES, Scanner, scanner_from
 from phyradgs_cl.io.tables import Fields, read_toml, refuse_unknown
 
 OWN_TABLES = {
-    "frames": ("projections", "flats", "darks", "mask", "quantity", "flat_value", "row_0", "column_0"),
+    "frames": (
+        *(*hdf5.STACKS, "order", "image_key", "axes"), *("quantity", "flat_value", "row_0", "column_0")
+    ),
     "angles": ("first_deg", "last_deg", "step_deg", "values_deg", "file", "unit", "rotates", "at"),
     "timing": ("exposure_s", "readout_s", "frame_time_s", "start_s", "detector_model"),
 }
-_TO_RAD = {"deg": np.pi / 180, "rad": 1.0}
 _PER_FRAME, _ANGLES = ("values_deg", "file"), ("step_deg", "last_deg", "values_deg", "file")
 _KEYS = {  # by option: where the file states the same
     **{name: f"[timing] {name}" for name in ("exposure_s", "readout_s", "frame_time_s")},
@@ -52,23 +56,36 @@ def recognises(path: Path) -> bool:
 
 def import_scan(path: Path, options: ImportOptions) -> Scan:
     """Imports a folder with one TOML and its frames, or the TOML with the frames in its folder."""
-    options.refuse_unused("tiff", OF_BARE_FRAMES)
+    options.refuse_unused("tiff", (*OF_BARE_FRAMES, "linked_folder"))
     folder = SafeFolder(path if path.is_dir() else path.parent)
     description = path if path.is_file() else folder.only("description of the scan", ".toml")
     tables = _tables(description)
     options = in_words_of_file(options)
     combined = _with_file(options, tables)
-    stacks = _stacks(folder, tables["frames"], tables["angles"])
-    frames, rows, columns = stacks["projections"].shape
-    scanner = _scanner(description, tables[""], (rows, columns))
+    files, series = {}, None
+    stored = _in_hdf5(folder, tables["frames"], options)
+    if stored is None:
+        files = {name: _files(folder, tables["frames"], name) for name in ("flats", "darks", "mask")}
+        series = _projections(folder, tables, options, {path for paths in files.values() for path in paths})
+        frames, rows, columns = tiff.stack_shape(series.paths)
+    else:
+        frames, rows, columns = stored.projections.shape
+    used = np.ones(frames, bool) if stored is None else stored.used
+    scanner = _scanner(description, tables[""], (rows, columns), options)
     geometry = with_options(options, scanner.geometry)
-    stored = _stored_timing(tables, scanner)
-    timing = make_timing(str(description), frames, options, stored)
-    angle_rad = gantry_sign(combined, "gantry") * _angles_rad(folder, tables["angles"], frames)
-    integrals = _line_integrals(stacks, combined, tables["frames"], str(description))
+    timing = make_timing(str(description), frames, options, _stored_timing(tables, scanner, options))
+    sign = gantry_sign(combined, "gantry")
+    angle_rad = sign * options.angle_rad(frames, lambda: _angles_rad(folder, tables["angles"], used, options))
+    if series is None:
+        assert stored is not None
+        integrals = stored.line_integrals(str(description), combined, "top")
+    else:
+        stacks = {name: tiff.read_tiffs(paths) for name, paths in {"projections": series.paths, **files}.items() if paths}
+        integrals = _line_integrals(stacks, files, series, combined, tables["frames"], str(description))
     return assemble_scan(
         integrals, turning(geometry, angle_rad, timing), geometry, timing, combined,
         title=tables[""].word("title", default=folder.root.resolve().name), source=str(path),
+        said=series.said if series else "",
         grid=scanner.grid if tables[""].has("volume") else None, lag=scanner.lag, names=_subjects(tables, options),
     )
 
@@ -87,6 +104,10 @@ def _subjects(tables: dict[str, Fields], options: ImportOptions) -> dict[str, st
 def _tables(path: Path) -> dict[str, Fields]:
     """Returns the file's own tables by name, and under "" those of a scanner file. InputError for unknown names."""
     content = read_toml(path)
+    for place in (content, content.get("frames")):  # short for [angles] file
+        if isinstance(place, dict) and isinstance(place.get("angles"), str):
+            text = place.pop("angles")
+            content["angles"] = {**content.get("angles", {}), "file": text}
     refuse_unknown(str(path), content, (*_SCANNER, *OWN_TABLES), "a name")
     tables = {name: Fields(f"{path} [{name}]", content.get(name, {}), keys) for name, keys in OWN_TABLES.items()}
     tables["readout"] = Fields(f"{path} [readout]", content.get("readout", {}), TABLES["readout"])
@@ -114,44 +135,75 @@ def _with_file(options: ImportOptions, tables: dict[str, Fields]) -> ImportOptio
     return replace(options, **{k: v for k, v in combined.items() if not getattr(options, k)})
 
 
-def _stacks(folder: SafeFolder, frames: Fields, angles: Fields) -> dict[str, np.ndarray]:
-    stacks = {}
-    for name in ("projections", "flats", "darks", "mask"):
-        if name != "projections" and not frames.has(name):
-            continue
-        paths = _files(folder, frames, name)
-        if name == "projections" and not any(angles.has(key) for key in _PER_FRAME):
-            check_numbering(paths, "complete the frames, or give every one its angle: [angles] values_deg or file")
-        stacks[name] = tiff.read_tiffs(paths)
-    return stacks
+def _in_hdf5(folder: SafeFolder, frames: Fields, options: ImportOptions) -> hdf5.Stacks | None:
+    """Reads the frames where the projections have an address in HDF5, else returns None."""
+    stated = {name: frames.values[name] for name in (*hdf5.STACKS, "image_key", "axes") if frames.has(name)}
+    lists = {name: value if isinstance(value, list) else [value] for name, value in stated.items()}
+    if not all(map(hdf5.is_address, lists.get("projections", [None]))):
+        return None
+    return hdf5.Places(lists, frames.subject, options.linked_folder, folder=folder).stacks()
+
+
+def _projections(folder: SafeFolder, tables: dict[str, Fields], options: ImportOptions, others: set[Path]) -> Series:
+    """Returns the files of the projections in order, without those that flats, darks and mask name."""
+    frames, angles = tables["frames"], tables["angles"]
+    paths = [path for path in _files(folder, frames, "projections", "*.tif*") if path not in others]
+    if not paths:
+        expected = "files that flats, darks and mask do not name"
+        raise frames.error("projections", "no file but those of flats, darks and mask", expected, "correct the patterns")
+    has_own = options.angles is None and any(angles.has(key) for key in _PER_FRAME)
+    remedy = "complete the frames, or give every one its angle: [angles] values_deg or file"
+    order = frames.count("order", 99) if frames.has("order") else None
+    return series_of(paths, str(folder.root), remedy, order=order, holes=has_own)
 
 
 def _line_integrals(
-    stacks: dict[str, np.ndarray], combined: ImportOptions, frames: Fields, subject: str
+    stacks: dict[str, np.ndarray], files: dict[str, list[Path]], series: Series, combined: ImportOptions, frames: Fields,
+    subject: str,
 ) -> LineIntegrals:
     turned = {name: oriented(stack, combined, "top") for name, stack in stacks.items()}
-    stack = turned["projections"]
-    integrals = line_integrals(subject, stack, combined, flats=turned.get("flats"), darks=turned.get("darks"))
+    stack, at = turned["projections"], None
+    if len(stacks.get("flats", ())) == len(files["flats"]) and len(stack) == len(series.paths):
+        at = flat_places(files["flats"], files["darks"], series)
+    names = {name: [path.name for path in paths] for name, paths in files.items() if len(paths) == len(stacks.get(name, ()))}
+    flats, darks = turned.get("flats"), turned.get("darks")
+    integrals = line_integrals(subject, stack, combined, flats=flats, darks=darks, flats_at=at, names=names)
     if "mask" not in turned:
         return integrals
     return replace(integrals, mask=united(integrals.mask, _mask(turned["mask"], stack.shape, frames.name("mask"))))
 
 
-def _files(folder: SafeFolder, frames: Fields, name: str) -> list[Path]:
-    pattern = checked_name(frames.word(name, default="*.tif*"), frames.name(name))
-    if "**" in pattern or "*" in str(PurePosixPath(pattern).parent):
-        raise frames.error(name, repr(pattern), "a pattern for files of one folder")
-    paths = folder.glob(pattern)
-    if not paths:
-        remedy = "correct the pattern, or leave it out"
-        raise frames.error(name, f"no file that matches {pattern!r}", "at least one TIFF", remedy)
-    return paths
+def _files(folder: SafeFolder, frames: Fields, name: str, default: str = "") -> list[Path]:
+    """Returns the files of a pattern, or of a list of them in its order; of ``default`` where there is none."""
+    value = frames.values.get(name) or default
+    paths: list[Path] = []
+    for one in value if isinstance(value, list) else [value] if value else []:
+        pattern = checked_name(one, frames.name(name))
+        if "**" in pattern or "*" in str(PurePosixPath(pattern).parent):
+            raise frames.error(name, repr(pattern), "a pattern for files of one folder")
+        found = folder.glob(pattern, *tiff.SUFFIXES)
+        if not found:
+            remedy = "correct the pattern, or leave it out"
+            raise frames.error(name, f"no file that matches {pattern!r}", "at least one TIFF", remedy)
+        paths += found
+    return list(dict.fromkeys(paths))
 
 
-def _scanner(path: Path, scanner: Fields, panel: tuple[int, int]) -> Scanner:
-    """Returns the described scanner, whose panel has as many pixels as the images."""
+def _scanner(path: Path, scanner: Fields, panel: tuple[int, int], options: ImportOptions) -> Scanner:
+    """Returns the described scanner, whose panel has as many pixels as the images. Options come before its lengths."""
     content = dict(scanner.values)
-    content["detector"] = {"rows": panel[0], "columns": panel[1], **scanner.table("detector").values}
+    pitch = zip(("pixel_size_v_mm", "pixel_size_u_mm"), options.pixel_size_mm or (None, None), strict=True)
+    lengths: dict[str, dict[str, float | None]] = {
+        "source": {"to_axis_mm": options.source_to_axis_mm, "to_detector_mm": options.source_to_detector_mm},
+        "detector": dict(pitch),
+    }
+    if not isinstance(content.get("source", {}), dict) or content.get("source", {}).get("beam") == "parallel":
+        del lengths["source"]  # a parallel beam refuses distances
+    stated = scanner.table("detector").values if scanner.has("detector") else {}
+    content["detector"] = {"rows": panel[0], "columns": panel[1], **stated}
+    for name, values in lengths.items():
+        given = {key: value for key, value in values.items() if value is not None}
+        content[name] = {**dict(content.get(name, {})), **given}
     described = scanner_from(path, content)
     if described.geometry.detector_shape != panel:
         found = f"{described.geometry.detector_shape} rows and columns"
@@ -159,7 +211,7 @@ def _scanner(path: Path, scanner: Fields, panel: tuple[int, int]) -> Scanner:
     return described
 
 
-def _stored_timing(tables: dict[str, Fields], scanner: Scanner) -> StoredTiming:
+def _stored_timing(tables: dict[str, Fields], scanner: Scanner, options: ImportOptions) -> StoredTiming:
     timing, angles, readout = tables["timing"], tables["angles"], tables["readout"]
     names = ("exposure_s", "readout_s")
     exposure_s, readout_s = (timing.number(name, lowest=0.0) if timing.has(name) else None for name in names)
@@ -186,17 +238,20 @@ def _stored_timing(tables: dict[str, Fields], scanner: Scanner) -> StoredTiming:
     )
 
 
-def _angles_rad(folder: SafeFolder, angles: Fields, frames: int) -> np.ndarray:
-    """Reads angles (F,) as stored: a list, a file with one per line, or the first with the last or a step."""
+def _angles_rad(folder: SafeFolder, angles: Fields, used: np.ndarray, options: ImportOptions) -> np.ndarray:
+    """Reads the angles of the frames that ``used`` marks: a list, a file, a dataset, or the first and the last or a step."""
+    frames = int(used.sum())
     given = [key for key in _ANGLES if angles.has(key)]
     if len(given) != 1:
         raise InputError(angles.subject, " and ".join(given) or "no angles", f"one of {', '.join(_ANGLES)}")
     if angles.has("unit") and not angles.has("file"):
         raise angles.error("unit", "no file beside it", "the unit of a file of angles", "leave it out")
     if angles.has("file"):
-        unit = angles.word("unit", tuple(_TO_RAD), default="deg")
-        path = folder.file(angles.get("file"), angles.name("file"))
-        return _TO_RAD[unit] * read_numbers(path, frames, "angles")
+        unit = angles.word("unit", tuple(TO_RAD)) if angles.has("unit") else None
+        if hdf5.is_address(text := angles.get("file")):
+            places = hdf5.Places({"angles": [str(text)]}, angles.subject, options.linked_folder, folder=folder)
+            return places.angles_rad(used, options, unit=unit or "deg")
+        return read_angles_rad(folder.file(angles.get("file"), angles.name("file")), frames, unit)
     if angles.has("values_deg"):
         return np.deg2rad(angles.numbers("values_deg", frames))
     first = angles.number("first_deg", 0.0)

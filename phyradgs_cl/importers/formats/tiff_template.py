@@ -9,7 +9,8 @@ import numpy as np
 
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.importers.reading import tiff
-from phyradgs_cl.importers.reading.files import SafeFolder, in_natural_order, read_numbers
+from phyradgs_cl.importers.reading.files import SafeFolder, in_natural_order
+from phyradgs_cl.importers.reading.text import read_angles_rad
 
 _KINDS = {"flats": r"flat|white", "darks": r"dark", "mask": r"mask"}  # what the names of such files contain
 _OPTIONAL = ("beam", "volume")  # tables that a file either leaves out or states in full
@@ -17,9 +18,13 @@ _FILL_IN, _LONGEST = 0.0, 44
 # table: key: (an example, which stands as a comment until the user wants it; what the key means)
 _TABLES: dict[str, dict[str, tuple[object, str]]] = {
     "frames": {
-        "projections": ("*.tif", "frames, in natural order of their names"),
-        "flats": ("flat_*.tif", "frames without an object"), "darks": ("dark_*.tif", "frames without a beam"),
+        "projections": ("*.tif", "frames, in the order of the numbers in their names"),
+        "flats": ("flat_*.tif", "frames without an object; with before and after in their names: interpolated"),
+        "darks": ("dark_*.tif", "frames without a beam"),
         "mask": ("mask.tif", "non-zero: do not use the pixel"),
+        "order": (1, "the number in the names that gives the order, 1 the first; without it the import finds it"),
+        "image_key": ("a.h5:/key", "of frames at an address in HDF5: 0 projection, 1 flat, 2 dark, 3 none of them"),
+        "axes": ("v,frame,u", "order of such an array, here of sinograms; frame,v,u without it"),
         "quantity": ("counts", "or attenuation (line integrals), transmission"),
         "flat_value": (50000.0, "counts without an object, in place of flats"),
         "row_0": ("top", "or bottom: where the images' first row is"),
@@ -42,7 +47,8 @@ _TABLES: dict[str, dict[str, tuple[object, str]]] = {
         "first_deg": (0.0, "degrees, angle of the first frame"),
         "step_deg": (1.0, "degrees from frame to frame; FILL IN this, last_deg, values_deg or file"),
         "last_deg": (359.0, "degrees, angle of the last frame"),
-        "values_deg": ([0.0, 1.0], "degrees, one for each frame"), "file": ("angles.txt", "one angle a line"),
+        "values_deg": ([0.0, 1.0], "degrees, one for each frame"),
+        "file": ("angles.txt", "one angle a line, or an index and an angle"),
         "unit": ("deg", "or rad: of the file"),
         "rotates": ("gantry", "or sample: what turns, counterclockwise seen from above"),
         "at": ("start", "or middle of the exposure of the frame's first line"),
@@ -124,6 +130,6 @@ def _angles(folder: Path, frames: int) -> dict[str, object]:
     """Returns the text file of the folder with a number for every frame, and the likely unit of its numbers."""
     for file in SafeFolder(folder).matching(".txt", ".csv"):
         with suppress(InputError):
-            values = read_numbers(file, frames, "angles")
+            values = read_angles_rad(file, frames, "rad")
             return {"file": file.name, "unit": "rad" if np.ptp(values) <= 2 * np.pi * (1 + 1e-3) else "deg"}
     return {}

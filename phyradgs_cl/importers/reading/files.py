@@ -1,17 +1,17 @@
 """Foreign files and folders: names that stay inside the folder, and texts and arrays bounded by the file's own size."""
 
-import math
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import islice, pairwise
+from fnmatch import fnmatchcase
+from itertools import islice
 from pathlib import Path, PurePosixPath, PureWindowsPath
 
 import numpy as np
 
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.io.files import HOST_SHARE, host_bytes, read_regular, regular_file
-from phyradgs_cl.io.tables import LARGEST, read_facts
+from phyradgs_cl.io.files import HOST_SHARE, decoded, host_bytes, read_regular, regular_file
+from phyradgs_cl.io.tables import read_facts
 
 MOST_TEXT_BYTES = 64 << 20
 _MOST_FILES = 200_000
@@ -32,27 +32,12 @@ def read_bytes(path: Path) -> bytes:
     return read_regular(path, str(path), MOST_TEXT_BYTES, "a description of a scan")
 
 
+def read_text(path: Path) -> str:
+    return decoded(read_bytes(path))
+
+
 def read_json(path: Path) -> dict[str, object]:
-    return read_facts(str(path), read_bytes(path).decode("utf-8-sig", "replace"), {})
-
-
-def read_numbers(path: Path, count: int, what: str) -> np.ndarray:
-    """Reads (count,) finite numbers of a text file, one per line. Empty lines and text after a # are ignored."""
-    values = []
-    for number, line in enumerate(read_bytes(path).decode("utf-8-sig", "replace").splitlines(), start=1):
-        text = line.partition("#")[0].strip()
-        if not text:
-            continue
-        try:
-            value = float(text)
-        except ValueError:
-            value = math.nan
-        if not abs(value) <= LARGEST:
-            raise InputError(f"{path} line {number}", repr(text[:40]), "a finite number")
-        values.append(value)
-    if len(values) != count:
-        raise InputError(str(path), f"{len(values)} {what}", f"{count}, one for each frame")
-    return np.array(values)
+    return read_facts(str(path), read_text(path), {})
 
 
 def read_npy(path: Path, ndim: int) -> np.ndarray:
@@ -74,7 +59,8 @@ def read_npy(path: Path, ndim: int) -> np.ndarray:
 
 @dataclass(frozen=True)
 class SafeFolder:
-    """A folder that the user named. Its methods reach only files inside it: no absolute path, "..", link or device."""
+    """A folder that the user named. Its methods reach only names inside it, no absolute path and no "..". A link in it is
+    followed, for the user has put it there."""
 
     root: Path
 
@@ -85,37 +71,27 @@ class SafeFolder:
 
     def file(self, name: object, subject: str) -> Path:
         """Returns the path of the regular file ``name`` below the folder; ``subject`` says where the name stands."""
-        text = checked_name(name, subject)
-        path = self.root
-        for part in PurePosixPath(text).parts:
-            path = path / part
-            if path.is_symlink():
-                raise InputError(subject, f"{text!r}, which leads over a symbolic link", "a plain file")
+        path = self.root / checked_name(name, subject)
         regular_file(path, subject)
         return path
 
     def exists(self, name: str) -> bool:
-        return (self.root / name).exists() or (self.root / name).is_symlink()
+        return (self.root / name).exists()
 
-    def glob(self, pattern: str) -> list[Path]:
-        """Returns the regular files that match a pattern below the folder, in natural order of their names."""
-        return in_natural_order([self.file(str(path.relative_to(self.root)), str(path)) for path in self._paths(pattern)])
+    def glob(self, pattern: str, *suffixes: str) -> list[Path]:
+        """Returns the files that match a pattern below the folder in any case, in natural order of their names. With
+        ``suffixes`` of images, names that end otherwise, and hidden ones, are left out."""
+        folder, name = (self.root / pattern).parent, PurePosixPath(pattern).name
+        if "*" in str(folder.relative_to(self.root)):
+            return in_natural_order([path for path in self.root.glob(pattern) if path.is_file()])
+        files = _files(folder) if folder.is_dir() else []
+        paths = [path for path in files if fnmatchcase(path.name.lower(), name.lower())]
+        is_plain = not set(name) & set("*?[")
+        return [path for path in paths if is_plain or not suffixes or _is_one_of(path, suffixes)]
 
     def matching(self, *suffixes: str) -> list[Path]:
-        """Returns the regular files with one of the suffixes in any case, in natural order of their names."""
-        paths = [path for path in self._paths("[!.]*") if path.suffix.lower() in suffixes]
-        return in_natural_order([self.file(path.name, str(path)) for path in paths])
-
-    def plain(self, *suffixes: str) -> list[Path]:
-        """Returns the same without links and folders, which ``matching`` refuses: of suffixes that any folder may have."""
-        paths = [path for path in self._paths("[!.]*") if path.suffix.lower() in suffixes]
-        return in_natural_order([path for path in paths if path.is_file() and not path.is_symlink()])
-
-    def _paths(self, pattern: str) -> list[Path]:
-        paths = list(islice(self.root.glob(pattern), _MOST_FILES + 1))
-        if len(paths) > _MOST_FILES:
-            raise InputError(str(self.root), f"more than {_MOST_FILES} files", "a folder with one scan")
-        return paths
+        """Returns the files with one of the suffixes in any case, without hidden ones, in natural order of their names."""
+        return [path for path in _files(self.root) if _is_one_of(path, suffixes)]
 
     def only(self, what: str, *suffixes: str) -> Path:
         """Returns the one regular file with one of the suffixes; ``what`` names it in messages."""
@@ -125,6 +101,18 @@ class SafeFolder:
             expected, remedy = f"one {what}", "leave only one, or name the file itself"
             raise InputError(str(self.root), f"{' or '.join(suffixes)} files: {names}", expected, remedy)
         return paths[0]
+
+
+def _files(folder: Path) -> list[Path]:
+    """Returns the regular files of a folder, and links that lead nowhere, in natural order of their names."""
+    paths = list(islice(folder.iterdir(), _MOST_FILES + 1))
+    if len(paths) > _MOST_FILES:
+        raise InputError(str(folder), f"more than {_MOST_FILES} files", "a folder with one scan")
+    return in_natural_order([path for path in paths if path.is_file() or (path.is_symlink() and not path.exists())])
+
+
+def _is_one_of(path: Path, suffixes: tuple[str, ...]) -> bool:
+    return path.suffix.lower() in suffixes and not path.name.startswith(".")
 
 
 def checked_name(name: object, subject: str) -> str:
@@ -141,22 +129,6 @@ def checked_name(name: object, subject: str) -> str:
 def in_natural_order(paths: Sequence[Path]) -> list[Path]:
     """Returns the paths sorted by name, numbers by value: 2.tif before 10.tif."""
     return sorted(paths, key=lambda path: _natural(path.name))
-
-
-def check_numbering(paths: Sequence[Path], remedy: str) -> None:
-    """Raises InputError for frames, in natural order, that share a number or leave one out: all later angles would be wrong.
-    The numbers are those at the one place where the names differ; names that differ elsewhere too are not checked."""
-    names = [_natural(path.stem) for path in paths]
-    places = [place for place in zip(*names, strict=False) if len(set(place)) > 1]
-    if len({len(name) for name in names}) > 1 or len(places) > 1 or any(word for _, _, word in sum(places, ())):
-        return
-    numbers = [number for _, number, _ in places[0]] if places else [0] * len(names)
-    steps = [after - before for before, after in pairwise(numbers)]
-    usual = min((step for step in steps if step > 0), default=1)
-    for (before, after), step in zip(pairwise(paths), steps, strict=True):
-        if step != usual:
-            found = f"{after.name} after {before.name}: {'one number' if step == 0 else 'a hole'} in the numbering"
-            raise InputError(str(after.parent), found, "every number once", remedy)
 
 
 def _natural(name: str) -> list[tuple[int, int, str]]:

@@ -1,7 +1,7 @@
-"""Frames of any origin: read from HDF5, turned to row 0 the lowest, converted to line integrals, bad pixels masked."""
+"""Frames of any origin: turned to row 0 the lowest, converted to line integrals, bad pixels masked."""
 
 import logging
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -11,13 +11,14 @@ from phyradgs_cl.acquisition.scan import applied_facts
 from phyradgs_cl.detector.attenuation import frames_to_attenuation
 from phyradgs_cl.detector.noise_level import find_saturation
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.importers.options import ImportOptions, needed
-from phyradgs_cl.io.hdf5.datasets import LENGTH, Quantity, read_length, read_values
-from phyradgs_cl.io.hdf5.source import Hdf5Source
+from phyradgs_cl.importers.options import ImportOptions
+from phyradgs_cl.importers.reading.flats import light_of
 from phyradgs_cl.io.scan.reader import LARGEST_LINE_INTEGRAL
 
 _log = logging.getLogger(__name__)
 Mask = np.ndarray | None
+TAKEN = "taken"
+"""The key of the provenance for which frames and flats were taken, in words."""
 _SAME = 1e-3  # relative difference of a flat that is at the ceiling too
 
 
@@ -35,17 +36,18 @@ class LineIntegrals:
 def line_integrals(
     subject: str, frames: np.ndarray, options: ImportOptions, *, flats: np.ndarray | None = None,
     darks: np.ndarray | None = None, convention: str | None = None, is_corrected: bool = False,
+    flats_at: np.ndarray | None = None, names: Mapping[str, Sequence[str]] | None = None,
 ) -> LineIntegrals:
     """Converts ``frames`` (P, v, u) of any real type to line integrals. Masks clipped counts and values that no object has,
     with a warning. ``subject`` names the file; ``flats``, ``darks``: (n, v, u) or None. The quantity is that of the options,
     else ``convention``, of the format or file; without either, frames with flats are counts and others are refused.
-    ``is_corrected``: the scanner has subtracted the darks."""
+    ``is_corrected``: the scanner has subtracted the darks. ``flats_at``, ``names``: see ``flats.light_of``."""
     has_flats = (flats is not None and len(flats) > 0) or options.flat_value is not None
     quantity = options.quantity or convention or ("counts" if has_flats else None)
     if quantity is None:
         remedy = f"say {options.named('quantity')} attenuation, transmission or counts"
         raise InputError(f"{subject} quantity", "nothing that says it", "what the pixels hold", remedy)
-    saturation = flat = None
+    saturation = flat = light = None
     if quantity != "counts":
         _warn_of_unused(subject, quantity, flats, darks)
     else:
@@ -59,21 +61,24 @@ def line_integrals(
                 found = f"flats or darks of {stack.shape[1:]}"
                 raise InputError(subject, found, f"the projections' {frames.shape[1:]} pixels")
         with np.errstate(over="ignore", invalid="ignore"):
-            flat = flats.mean(axis=0, dtype=np.float64)
+            light = light_of(subject, flats, darks, len(frames), options, flats_at, names)
+            flat = light.flats.mean(axis=0)
             saturation = find_saturation(frames, flat)
         if not is_corrected and (darks is None or len(darks) == 0):
             _log.warning("%s: counts without darks: an offset of the panel stays in the line integrals", subject)
-    integrals, unusable = frames_to_attenuation(frames, quantity, flats, darks, LARGEST_LINE_INTEGRAL)
+    flats, darks, place = (light.flats, light.dark, light.place) if light else (None, None, None)
+    integrals, unusable = frames_to_attenuation(frames, quantity, flats, darks, LARGEST_LINE_INTEGRAL, place)
     if quantity == "attenuation" and unusable.any():
         text = "%s: %d line integrals are not finite or beyond %g: masked"
         _log.warning(text, subject, np.count_nonzero(unusable), LARGEST_LINE_INTEGRAL)
     if flat is not None and saturation is not None and saturation.share > 0:
         air = "the flats are clipped too" if options.flat_value is None else f"{options.named('flat_value')} is no brighter"
         _mask_clipped(subject, frames, flat, saturation, unusable, air)
-    are_applied = (quantity == "counts" and options.flat_value is None, quantity == "counts")
-    stacks = zip(are_applied, (flats, darks), strict=True)
-    counts = [len(stack) if applied and stack is not None else 0 for applied, stack in stacks]
-    return LineIntegrals(integrals, compact(unusable), saturation, applied_facts(*counts))
+    flats_used, darks_used = (0, 0) if light is None else light.used
+    applied = applied_facts(0 if options.flat_value is not None else flats_used, darks_used)
+    if light is not None and options.flat_value is None:
+        applied[TAKEN] = light.said
+    return LineIntegrals(integrals, compact(unusable), saturation, applied)
 
 
 def _warn_of_unused(subject: str, quantity: str, flats: np.ndarray | None, darks: np.ndarray | None) -> None:
@@ -115,42 +120,6 @@ def oriented(array: np.ndarray, options: ImportOptions, row_0: str, column_0: st
     if (options.column_0 or column_0) == "right":
         array = array[..., ::-1]
     return array
-
-
-def read_frames(source: Hdf5Source, address: str, panel: tuple[int, int] | None = None) -> np.ndarray:
-    """Reads frames (F, v, u) in their own type. With ``panel`` all must have that shape, and one frame may be (v, u)."""
-    dataset, subject = source.dataset(address), source.name(address)
-    if dataset.dtype.kind not in "iuf":
-        raise InputError(subject, f"type {dataset.dtype}", "real numbers")
-    if panel is not None and dataset.shape == panel:
-        return read_values(source, address, dataset)[None]
-    if dataset.ndim != 3 or min(dataset.shape) < 1:
-        raise InputError(subject, f"shape {dataset.shape}", "three axes (frame, v, u), none of them empty")
-    if panel is not None and dataset.shape[1:] != panel:
-        expected = f"(any, {panel[0]}, {panel[1]}), as the projections"
-        raise InputError(subject, f"shape {dataset.shape}", expected)
-    return read_values(source, address, dataset)
-
-
-def optional_length(source: Hdf5Source, *addresses: str, quantity: Quantity = LENGTH) -> float | None:
-    """Reads a number above 0 at the first of the addresses that exists, in the package's unit."""
-    address = next((address for address in addresses if source.find(address) is not None), None)
-    return None if address is None else read_length(source, address, quantity)
-
-
-def stored_pitch(source: Hdf5Source, options: ImportOptions, *addresses: str) -> float:
-    """Reads the size of a pixel in mm at the first of the addresses that exists; InputError where none does."""
-    size = optional_length(source, *addresses)
-    if size is None:
-        raise source.error(addresses[0], "nothing", "a length", f"say {options.named('pixel_size_mm')}")
-    return size
-
-
-def distance_to_detector(source: Hdf5Source, address: str, to_axis_mm: float, options: ImportOptions) -> float:
-    """Returns the source-to-detector distance in mm: the option's, or that of the axis and the length at ``address``."""
-    behind_mm = None if options.source_to_detector_mm else optional_length(source, address)
-    to_detector_mm = options.source_to_detector_mm if behind_mm is None else to_axis_mm + behind_mm
-    return needed(to_detector_mm, "source_to_detector_mm", source.name(address), options.named)
 
 
 def gantry_sign(options: ImportOptions, convention: str) -> float:

@@ -1,7 +1,8 @@
-"""NIfTI, NRRD and MetaImage files, read by SimpleITK. Sizes in their headers are checked before the voxels are read."""
+"""NIfTI, NRRD and MetaImage files, read by SimpleITK, with what it does not see: Hounsfield units, units of NRRD."""
 
 import gzip
 import math
+import os
 import re
 import zlib
 from pathlib import Path
@@ -13,7 +14,7 @@ from phyradgs_cl import checks
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid, triple
 from phyradgs_cl.importers.reading.files import SafeFolder, check_room
-from phyradgs_cl.io.files import HOST_SHARE, host_bytes, regular_file
+from phyradgs_cl.io.files import regular_file
 from phyradgs_cl.io.hdf5.datasets import LENGTH
 from phyradgs_cl.io.volume import Volume, finite_float32, shares_of_maximum
 
@@ -26,8 +27,8 @@ _READERS = {
 _BYTES = {"Int8": 1, "UInt8": 1, "Int16": 2, "UInt16": 2, "Int32": 4, "UInt32": 4, "Float32": 4}
 _BYTES |= {"Int64": 8, "UInt64": 8, "Float64": 8}
 _SPACES = ("left-posterior-superior", "lps", "right-anterior-superior", "ras", "left-anterior-superior", "las", "")
-_HEAD_BYTES, _BLOCK_BYTES = 1 << 16, 1 << 20
-_NIFTI_START = 352  # the first byte of voxels
+_HEAD_BYTES = 1 << 16
+_DATA_FILE = re.compile(rb"^(?:ElementDataFile *=|data ?file:) *(\S.*?)\s*$", re.M)
 _OBLIQUE = 1e-3  # largest sine of an angle between an axis and the world's
 
 
@@ -38,12 +39,11 @@ def read_image(path: Path, state: int | None = None) -> Any:
     subject = str(path)
     regular_file(path, subject)
     sitk, reader = _reader_of(path)
-    available = _available_bytes(path)
     try:
         reader.ReadImageInformation()
-        _check_header(sitk, subject, reader, available, state)
+        _check_header(sitk, subject, reader, _voxel_bytes(path, reader), state)
         return reader.Execute()
-    except RuntimeError as error:
+    except (RuntimeError, EOFError, gzip.BadGzipFile, zlib.error) as error:
         raise _damage(subject, error) from error
 
 
@@ -70,7 +70,7 @@ def _reader_of(path: Path) -> tuple[Any, Any]:
     return sitk, reader
 
 
-def _damage(subject: str, error: RuntimeError) -> InputError:
+def _damage(subject: str, error: Exception) -> InputError:
     reason = re.sub(r"^\w+\(0x\w+\): ", "", str(error).rpartition("ERROR: ")[2].strip()).replace(subject, "")[:100]
     return InputError(subject, f"a damaged file ({reason})", "an image of three axes")
 
@@ -80,7 +80,7 @@ def read_image_volume(path: Path, state: int | None = None) -> Volume:
     grid; its integers are divided by the maximum of their type. ``state``, InputError: see ``read_image``; oblique axes."""
     subject, image = str(path), read_image(path, state)
     sitk = checks.package("SimpleITK", "the package that reads this file", "phyradgs-cl[formats]")
-    header = _text_header(path)[0] if _suffix(path) == ".nrrd" else {}
+    header = _nrrd_header(path) if _suffix(path) == ".nrrd" else {}
     if header and not {"space directions", "spacings"} & set(header):
         return Volume(finite_float32(subject, shares_of_maximum(sitk.GetArrayFromImage(image))), None)
     unit_mm = _nrrd_unit_mm(subject, header)
@@ -105,10 +105,10 @@ def _suffix(path: Path) -> str:
     return next(suffix for suffix in _READERS if path.name.lower().endswith(suffix))
 
 
-def _check_header(sitk: Any, subject: str, reader: Any, available: tuple[int, bool], state: int | None) -> None:
-    """Refuses images without three axes or larger than their file: ``available`` is its bytes, and whether the image must
-    fill them. Axes of one voxel beyond the third are dropped; ``state`` chooses along a longer fourth one."""
-    (available_bytes, is_exact), counts, axes = available, reader.GetSize(), reader.GetDimension()
+def _check_header(sitk: Any, subject: str, reader: Any, file_bytes: int | None, state: int | None) -> None:
+    """Refuses images without three axes, or larger than the ``file_bytes`` of their voxels (None: unknown). Axes of one
+    voxel beyond the third are dropped; ``state`` chooses along a longer fourth one."""
+    counts, axes = reader.GetSize(), reader.GetDimension()
     if axes < 3 or any(count != 1 for count in counts[3 if state is None else 4 :]) or min(counts) < 1:
         remedy = "'phyradgs info' reads volumes at several times" if axes == 4 else ""
         raise InputError(f"{subject}: shape", str(counts), "three axes, none of them empty", remedy)
@@ -121,96 +121,61 @@ def _check_header(sitk: Any, subject: str, reader: Any, available: tuple[int, bo
         found = sitk.GetPixelIDValueAsString(reader.GetPixelIDValue())
         raise InputError(f"{subject}: voxels", found, "plain real numbers")
     stored_bytes = voxel_bytes
-    if reader.HasMetaDataKey("vox_offset"):  # NIfTI, in which scaled integers come out as floats
-        stored_bytes, start = int(reader.GetMetaData("bitpix")) // 8, float(reader.GetMetaData("vox_offset"))
-        if not _NIFTI_START <= start <= available_bytes:
-            raise InputError(f"{subject} vox_offset", f"{start:g}", f"a byte from {_NIFTI_START} on within the file")
-        available_bytes -= int(start)
+    if reader.HasMetaDataKey("bitpix"):  # NIfTI, in which scaled integers come out as floats
+        stored_bytes = int(reader.GetMetaData("bitpix")) // 8
     needed = math.prod(counts) * stored_bytes
-    if needed > available_bytes or (is_exact and needed != available_bytes):
-        found = f"shape {counts}, {needed} bytes, in {available_bytes} bytes of data"
+    if file_bytes is not None and needed > file_bytes:
+        found = f"shape {counts}, {needed} bytes, in {file_bytes} bytes of data"
         raise InputError(subject, found, "as many bytes as its header announces", "copy the file again")
     check_room(subject, math.prod(counts[:3]) * voxel_bytes)
 
 
-def _available_bytes(path: Path) -> tuple[int, bool]:
-    """Returns how many bytes of voxels the file holds, unpacked, and whether the image must fill them; for NIfTI the header
-    counts too. InputError: no header, Hounsfield units, damaged compression, data outside of the folder."""
-    subject, is_packed = str(path), path.suffix.lower() == ".gz"
-    if _suffix(path).startswith(".nii"):
-        available_bytes = _inflated_bytes(path, 0) if is_packed else path.stat().st_size
-        if available_bytes < _NIFTI_START:
-            raise InputError(subject, f"{available_bytes} bytes", "a NIfTI-1 header and voxels")
-        with gzip.open(path) if is_packed else open(path, "rb") as file:
-            _refuse_hounsfield(subject, file.read(_NIFTI_START))
-        return available_bytes, False
-    header, start = _text_header(path)
-    if _suffix(path) == ".nrrd":
-        _check_nrrd(subject, header)
-        is_packed = header.get("encoding", "").lower() in ("gzip", "gz")
-        return (_inflated_bytes(path, start) if is_packed else path.stat().st_size - start), is_packed
-    name, is_packed = header["ElementDataFile"], header.get("CompressedData", "").lower() in ("true", "1")
+def _voxel_bytes(path: Path, reader: Any) -> int | None:
+    """Returns how many bytes of voxels a file holds, unpacked: SimpleITK fills missing or damaged ones without an error, in
+    NIfTI and in packed MetaImages. None where it refuses them. InputError: Hounsfield units, data outside of the folder."""
+    is_nifti = _suffix(path).startswith(".nii")
+    with gzip.open(path) if path.suffix.lower() == ".gz" else open(path, "rb") as file:
+        head = file.read(_HEAD_BYTES)
+        if b"values in HU" in head:
+            raise InputError(str(path), "Hounsfield units", "1/mm", "export it without --mu-water-per-mm")
+        if is_nifti:
+            return file.seek(0, os.SEEK_END) - int(float(reader.GetMetaData("vox_offset")))
+    found = _DATA_FILE.search(head)
+    name, start = (found[1].decode("latin-1"), found.end() + 1) if found else ("LOCAL", 0)
+    if name.startswith("LIST") or "%" in name:  # SimpleITK returns undefined voxels where one file is missing
+        raise InputError(f"{path} data file", name[:60], "LOCAL or one file name", "write it as one file")
+    is_nrrd = _suffix(path) == ".nrrd"
     if name != "LOCAL":
-        if name.split(" ")[0] == "LIST" or "%" in name:
-            raise InputError(f"{subject} ElementDataFile", name[:60], "LOCAL or one file name")
-        path, start = SafeFolder(path.parent).file(name, f"{subject} ElementDataFile"), 0
-    # MetaIO returns undefined voxels where compressed data are longer or shorter than the image
-    return (_inflated_bytes(path, start) if is_packed else path.stat().st_size - start), is_packed
+        path, start = SafeFolder(path.parent).file(name, f"{path} data file"), 0
+    if is_nrrd:
+        return None
+    if not re.search(rb"^CompressedData *= *True", head, re.I | re.M):
+        return path.stat().st_size - start
+    if not re.search(rb"^CompressedDataSize *= *\d", head, re.M):  # SimpleITK returns undefined voxels then
+        raise InputError(f"{path} CompressedDataSize", "nothing", "the bytes of packed voxels", "write it unpacked")
+    return _unpacked_bytes(path, start)
 
 
-def _inflated_bytes(path: Path, start: int) -> int:
-    """Counts the bytes that zlib or gzip data unpack to, block by block. The libraries do not report damage in them."""
-    machine, count, most_bytes = zlib.decompressobj(wbits=47), 0, HOST_SHARE * host_bytes()
-    try:
-        with open(path, "rb") as file:
-            file.seek(start)
-            data = file.read(_BLOCK_BYTES)
-            while data and count <= most_bytes:
-                count += len(machine.decompress(data, _BLOCK_BYTES))
-                rest = machine.unconsumed_tail
-                if machine.eof:  # gzip files may have several members
-                    machine, rest = zlib.decompressobj(wbits=47), machine.unused_data
-                data = rest or file.read(_BLOCK_BYTES)
-    except zlib.error as error:
-        raise InputError(str(path), f"compressed data that are damaged ({error})", "zlib or gzip data") from error
+def _unpacked_bytes(path: Path, start: int) -> int:
+    """Returns how many bytes the deflated data of a file hold from the byte ``start`` on."""
+    machine, count = zlib.decompressobj(), 0
+    with open(path, "rb") as file:
+        file.seek(start)
+        while not machine.eof and (part := file.read(_HEAD_BYTES)):
+            count += len(machine.decompress(part))
     return count
 
 
-def _refuse_hounsfield(subject: str, header: bytes) -> None:
-    if b"values in HU" in header:
-        raise InputError(subject, "Hounsfield units", "1/mm", "export it without --mu-water-per-mm")
-
-
-def _text_header(path: Path) -> tuple[dict[str, str], int]:
-    """Parses the header of a NRRD or MetaImage file; returns its fields and the position of the byte after it."""
-    is_nrrd = _suffix(path) == ".nrrd"
+def _nrrd_header(path: Path) -> dict[str, str]:
+    """Returns the fields of a NRRD file, of which SimpleITK shows only some."""
     with open(path, "rb") as file:
-        text = file.read(_HEAD_BYTES)
-    _refuse_hounsfield(str(path), text)
-    header: dict[str, str] = {}
-    position = 0
-    while (end := text.find(b"\n", position)) >= 0:
-        key, sign, value = text[position:end].decode("latin-1").strip().partition(":" if is_nrrd else "=")
-        position = end + 1
-        if is_nrrd and not key:
-            return header, position
-        header[key.strip().lower() if is_nrrd else key.strip()] = value.strip()
-        if not is_nrrd and (key.strip() == "ElementDataFile" or not sign):
-            break
-    if "ElementDataFile" not in header:
-        expected = "a NRRD file with its data in it" if is_nrrd else "a MetaImage with its ElementDataFile"
-        raise InputError(str(path), "no end of a header", expected)
-    return header, position
-
-
-def _check_nrrd(subject: str, header: dict[str, str]) -> None:
-    for key in ("data file", "datafile", "line skip", "byte skip"):
-        if header.get(key, "0") != "0":
-            raise InputError(f"{subject} {key}", header[key][:40], "the data behind the header, in one file")
+        lines = file.read(_HEAD_BYTES).split(b"\n\n")[0].decode("latin-1").splitlines()
+    fields = (line.partition(":") for line in lines)
+    header = {key.strip().lower(): value.strip() for key, sign, value in fields if sign}
     if header.get("space", "").lower() not in _SPACES:
         expected = ", ".join(name for name in _SPACES if "-" in name)
-        raise InputError(f"{subject} space", header["space"][:40], expected)
-    _nrrd_unit_mm(subject, header)
+        raise InputError(f"{path} space", header["space"][:40], expected)
+    return header
 
 
 def _nrrd_unit_mm(subject: str, header: dict[str, str]) -> float:

@@ -1,4 +1,4 @@
-"""OLE2 containers of numbers, as Zeiss writes them: streams of a size that the file can hold, read one by one."""
+"""OLE2 containers of numbers, as Zeiss writes them, by olefile."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -11,8 +11,33 @@ from phyradgs_cl import checks
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.importers.reading.files import check_room
 from phyradgs_cl.io.files import regular_file
+from phyradgs_cl.io.tables import LARGEST, Fields
 
 _RESULT_BYTES = 5  # per pixel: a line integral in float32, and its mask
+_STEADY = 1e-3  # relative: how far the lengths of single images may differ
+
+
+class Streams(Fields):
+    """Streams of numbers by their names. They may have room for more images than were taken."""
+
+    def first_of(self, name: str, lowest: float = -LARGEST, highest: float = LARGEST) -> float:
+        """Returns the first number of a stream, which is between two bounds."""
+        return Fields(self.subject, {name: float(self.leading(name, 1)[0])}).number(name, lowest=lowest, highest=highest)
+
+    def leading(self, name: str, count: int) -> np.ndarray:
+        """Returns the first ``count`` numbers (count,) of a stream."""
+        values = self.numbers(name)
+        if len(values) < count:
+            raise self.error(name, f"{len(values)} numbers", f"{count}, one for each image")
+        return values[:count]
+
+    def steady(self, name: str) -> float:
+        """Returns a length above 0 that is the same for all images, without its sign."""
+        lengths = np.abs(self.numbers(name))
+        lengths = lengths[lengths > 0]
+        if not len(lengths) or np.ptp(lengths) > _STEADY * lengths[0]:
+            raise self.error(name, f"{np.ptp(lengths):g} between images" if len(lengths) else "0", "one length above 0 mm")
+        return float(lengths[0])
 
 
 @contextmanager
@@ -30,18 +55,17 @@ def open_ole(path: Path) -> Iterator[Any]:
         raise InputError(str(path), found, "an OLE2 file") from error
 
 
-def read_stream(ole: Any, path: Path, name: str, dtype: str, most_values: int) -> np.ndarray:
-    """Returns a stream as numbers (n,). InputError for a stream that is larger than its file, or than ``most_values``."""
-    subject, size = f"{path}: {name}", ole.get_size(name)
-    most_bytes = min(path.stat().st_size, most_values * np.dtype(dtype).itemsize)
-    if size > most_bytes:
-        raise InputError(subject, f"{size} bytes", f"at most {most_bytes}")
-    data = ole.openstream(name).read(size)
+def read_stream(ole: Any, path: Path, name: str, dtype: str) -> np.ndarray:
+    """Returns a stream as numbers (n,). InputError for a missing one, and for one that is larger than its file."""
+    if not ole.exists(name) or ole.get_size(name) > path.stat().st_size:
+        found = f"{ole.get_size(name)} bytes" if ole.exists(name) else "nothing"
+        raise InputError(f"{path}: {name}", found, f"numbers in at most {path.stat().st_size} bytes")
+    data = ole.openstream(name).read()
     return np.frombuffer(data[: len(data) - len(data) % np.dtype(dtype).itemsize], dtype)
 
 
 def read_images(ole: Any, path: Path, names: list[str], dtype: str, panel: tuple[int, int]) -> np.ndarray:
-    """Returns images (F, v, u), one per stream, row 0 as stored. InputError for more of them than the file can hold."""
+    """Returns images (F, v, u), one per stream, row 0 as stored."""
     pixels, pixel_bytes = panel[0] * panel[1], np.dtype(dtype).itemsize
     if len(names) * pixels * pixel_bytes > path.stat().st_size:
         found = f"{len(names)} images of {panel[0]} × {panel[1]} pixels in {path.stat().st_size} bytes"
@@ -49,10 +73,8 @@ def read_images(ole: Any, path: Path, names: list[str], dtype: str, panel: tuple
     check_room(str(path), len(names) * pixels * (pixel_bytes + _RESULT_BYTES))
     stack = np.empty((len(names), *panel), dtype)
     for image, name in zip(stack, names, strict=True):
-        if not ole.exists(name):
-            raise InputError(f"{path}: {name}", "nothing", "an image")
-        values = read_stream(ole, path, name, dtype, pixels)
+        values = read_stream(ole, path, name, dtype)
         if len(values) != pixels:
-            raise InputError(f"{path}: {name}", f"{len(values)} pixels", f"{panel[0]} × {panel[1]}")
+            raise InputError(f"{path}: {name}", f"{len(values)} pixels", f"at most and at least {panel[0]} × {panel[1]}")
         image[:] = values.reshape(panel)
     return stack

@@ -1,38 +1,61 @@
 """Descriptions of scans as lines of names and values: the INI files and logs that scanners and toolkits write."""
 
 import logging
-import math
-import re
 from collections.abc import Collection, Mapping
 from pathlib import Path
 
 import numpy as np
 
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.importers.reading.files import read_bytes
-from phyradgs_cl.io.tables import Fields
+from phyradgs_cl.importers.reading.files import read_text
+from phyradgs_cl.importers.reading.text import commas_are_decimal, number_at_start
+from phyradgs_cl.io.files import decoded
+from phyradgs_cl.io.hdf5.datasets import Quantity
+from phyradgs_cl.io.tables import LARGEST, Fields
 
 _log = logging.getLogger(__name__)
-_NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?(?=$|[\s;])")
-
-_ONE_ANGLE = 1e-6
 _BRIGHTER, _FEW = 1.2, 0.01  # of the counts of air: no noise of air is so bright; fraction of pixels that may be broken
+
+
+class Settings(Fields):
+    """Names and texts. A text becomes a number where a number is asked for, and stays text where a word is."""
+
+    def __init__(self, subject: str, values: Mapping[str, str | list[str]], comma_is_decimal: bool = False) -> None:
+        super().__init__(subject, values)
+        self.comma_is_decimal = comma_is_decimal
+
+    def measured(self, key: str, quantity: Quantity, unit: str) -> float:
+        """Returns a number above zero in the package's unit of ``quantity``. It is in ``unit``, unless a unit behind it says
+        otherwise."""
+        found = number_at_start(str(self.get(key)), self.comma_is_decimal)
+        stated = quantity.factor(found[1]) if found and found[1] else None
+        factor = stated or quantity.factor(unit)
+        assert factor is not None
+        return self.length(key) * factor
+
+    def listed(self, key: str, count: int) -> np.ndarray:
+        """Returns the numbers (count,) of a text, which commas separate."""
+        return Settings(self.subject, {key: self.word(key).split(",")}).numbers(key, count)
+
+    def _finite(self, key: str, value: object, largest: float = LARGEST) -> float:
+        found = number_at_start(value, self.comma_is_decimal) if isinstance(value, str) else None
+        return super()._finite(key, found[0] if found else value, largest)
 
 
 def read_settings(
     path: Path, names: Collection[str], separator: str = "=", sections: Collection[str] = ()
-) -> Fields:
+) -> Settings:
     """Reads the lines NAME ``separator`` VALUE whose name is one of ``names``, in any case; other lines are not looked at.
 
-    A value that begins with a number is that number; other text stays text. ``sections``: the only [sections] that count,
-    in any case; () takes all. Of a name in two sections the first counts. InputError for a file without any of the names,
-    and for one section that gives a name two values."""
+    ``sections``: the only [sections] that count, in any case; () takes all. Of a name in two sections the first counts.
+    InputError for a file without any of the names, and for one section that gives a name two values."""
     spelt = {name.lower(): name for name in names}
     wanted = {section.lower() for section in sections}
-    values: dict[str, object] = {}
+    values: dict[str, str] = {}
     texts: dict[tuple[str, str], str] = {}
+    others: list[str] = []
     section, is_inside = "", not wanted
-    for raw in read_bytes(path).decode("utf-8-sig", "replace").splitlines():
+    for raw in read_text(path).splitlines():
         line = raw.strip()
         if line.startswith("[") and line.endswith("]"):
             section = line[1:-1].strip().lower()
@@ -40,8 +63,9 @@ def read_settings(
             continue
         key, sign, text = line.partition(separator)
         name = spelt.get(key.strip().lower())
+        others.append(text.strip())
         if is_inside and sign and name and text.strip():
-            values.setdefault(name, _value(text.strip()))
+            values.setdefault(name, text.strip())
             earlier = texts.setdefault((section, name), text.strip())
             if earlier != text.strip():
                 pair = f"{earlier[:40]!r} and {text.strip()[:40]!r}"
@@ -49,7 +73,7 @@ def read_settings(
     if not values:
         expected = f"lines such as {', '.join(list(names)[:4])}"
         raise InputError(str(path), f"nothing of a description: no line NAME {separator} VALUE", expected, "copy it again")
-    return Fields(f"{path}:", values)
+    return Settings(f"{path}:", values, commas_are_decimal(others))
 
 
 def head_has(path: Path, *marks: bytes, most_bytes: int = 1 << 14) -> bool:
@@ -57,8 +81,8 @@ def head_has(path: Path, *marks: bytes, most_bytes: int = 1 << 14) -> bool:
     if not path.is_file():
         return False
     with open(path, "rb") as file:
-        head = file.read(most_bytes).lower()
-    return all(mark.lower() in head for mark in marks)
+        head = decoded(file.read(most_bytes)).lower()
+    return all(mark.decode().lower() in head for mark in marks)
 
 
 def say_missing(fields: Fields, meanings: Mapping[str, str]) -> None:
@@ -66,14 +90,6 @@ def say_missing(fields: Fields, meanings: Mapping[str, str]) -> None:
     missing = [f"no {name} ({meaning})" for name, meaning in meanings.items() if not fields.has(name)]
     if missing:
         _log.warning("%s %s", fields.subject, ", ".join(missing))
-
-
-def differing(fields: Fields, key: str, angle_deg: np.ndarray) -> np.ndarray:
-    """Returns angles (F,) in rad. InputError about ``key``, which states them, where all of several are the same."""
-    angle_rad = np.deg2rad(angle_deg)
-    if len(angle_rad) > 1 and np.ptp(np.cos(angle_rad)) + np.ptp(np.sin(angle_rad)) < _ONE_ANGLE:
-        raise fields.error(key, f"{len(angle_rad)} views at one angle", "a turn between the views")
-    return angle_rad
 
 
 def white_level(fields: Fields, key: str, frames: np.ndarray, remedy: str) -> float:
@@ -85,8 +101,3 @@ def white_level(fields: Fields, key: str, frames: np.ndarray, remedy: str) -> fl
         raise fields.error(key, found, "the counts of air, which nothing outshines", remedy)
     return white
 
-
-def _value(text: str) -> float | str:
-    found = _NUMBER.match(text)
-    value = float(found.group()) if found else math.nan
-    return value if math.isfinite(value) else text

@@ -1,28 +1,33 @@
-"""Grey TIFF images, plain or deflated, one or many per file, of a size that the file can hold."""
+"""Grey TIFF images, one or many per file, by tifffile; by Pillow where tifffile needs imagecodecs and that is missing."""
 
 import logging
 import math
 import re
-import zlib
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from PIL import Image, ImageSequence
 
 from phyradgs_cl import checks
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.importers.reading.files import SafeFolder, check_numbering, check_room
+from phyradgs_cl.importers.options import ImportOptions
+from phyradgs_cl.importers.reading.files import SafeFolder, check_room
+from phyradgs_cl.importers.reading.series import series_of
 from phyradgs_cl.io.files import regular_file
+from phyradgs_cl.io.hdf5.datasets import LENGTH
 
 SUFFIXES = (".tif", ".tiff")
-_MOST_EXPANSION = 1200  # of a compressed image: deflate reaches 1032
 _MOST_PAGES = 100_000
-_PLAIN, _DEFLATED = 1, (8, 32946)
-_FREE_BYTES, _BLOCK_BYTES = 16 << 20, 16 << 20
+_PLAIN = 1  # compression
+_log = logging.getLogger(__name__)
 _RESULT_BYTES = 5  # per pixel: a line integral in float32, and its mask
+_NO_SPACE = {"C": "channels", "T": "times"}  # axes of a stack that are none of a volume
+_OME_SIZES = re.compile(r'PhysicalSize([XYZ](?:Unit)?)="([^"]*)"')
+_OF_SIZE = ("unit", "spacing")
 _ORIENTATION = 274  # 1: row 0 at the top, column 0 on the left
 
 
@@ -46,38 +51,66 @@ def read_tiffs(paths: list[Path]) -> np.ndarray:
     check_room(str(paths[0]), frames * math.prod(first.shape) * (first.dtype.itemsize + _RESULT_BYTES))
     stack = np.empty((frames, *first.shape), first.dtype)
     at = 0
-    for path in paths:
+    for path, header in zip(paths, headers, strict=True):
+        images = stack[at : at + header.images]
         with _opened(path) as tiff:
-            for page in tiff.pages:
-                images = math.prod(page.shape[:-2])
-                if page.compression in _DEFLATED:
-                    _check_inflation(path, page, _chunk(page))
-                page.asarray(maxworkers=1, out=stack[at : at + images].reshape(page.shape))
-                at += images
+            try:
+                for page, image in zip(tiff.pages, _pages(images, tiff), strict=True):
+                    page.asarray(maxworkers=1, out=image)
+            except (ValueError, NotImplementedError) as error:
+                if "imagecodecs" not in str(error):
+                    raise
+                with Image.open(path) as pillow:
+                    images[:] = [np.asarray(page) for page in ImageSequence.Iterator(pillow)]
+        at += header.images
     return stack
 
 
-def read_series(
-    folder: SafeFolder, prefix: str, shape: tuple[int | None, ...], subject: str | Sequence[str], pattern: str = r"\d+"
-) -> np.ndarray:
+def _pages(images: np.ndarray, tiff: Any) -> Iterator[np.ndarray]:
+    """Yields the part of a file's images that each of its pages fills, for a page may be a stack."""
+    at = 0
+    for page in tiff.pages:
+        count = math.prod(page.shape[:-2])
+        yield images[at : at + count].reshape(page.shape)
+        at += count
+
+
+def read_numbered(
+    folder: SafeFolder, prefix: str, shape: tuple[int | None, ...], subject: str | Sequence[str], options: ImportOptions,
+    first: int = 0, pattern: str = r"\d+",
+) -> tuple[np.ndarray, np.ndarray, str]:
     """Reads the TIFFs of a folder whose names are ``prefix`` and a number: frames (F, v, u) of ``shape``, in the numbers'
-    order; None is any size. ``pattern``: a number in the names; ``subject`` names what states the shape, or each of its
-    three sizes."""
+    order; None is any size. Returns them with their places (F,) from 0 on, and what was taken, in words.
+
+    ``pattern``: a number in the names; ``first``: the number of the first frame where that is missing; ``subject`` names
+    what states the shape, or each of its three sizes. Files beyond the stated number are left out by name. InputError for
+    fewer, unless the options ask for the frames that are found."""
     subjects = [subject] * 3 if isinstance(subject, str) else subject
     name = re.compile(re.escape(prefix) + pattern, re.I)
     paths = [path for path in folder.matching(*SUFFIXES) if name.fullmatch(path.stem)]
-    if not paths or shape[0] not in (None, len(paths)):
+    stated, is_free = shape[0], options.frames == "found"
+    remedy = f"copy the missing files, or say {options.named('frames')} found"
+    if not paths or (stated is not None and len(paths) < stated and not is_free):
         found = f"{len(paths)} files {prefix[:60]}*.tif in {folder.root}"
-        expected = f"{shape[0]}, one for every projection" if shape[0] else "at least one"
-        raise InputError(subjects[0], found, expected, "copy the missing files")
-    check_numbering(paths, "copy the missing files")
+        expected = f"{stated}, one for every projection" if stated else "at least one"
+        raise InputError(subjects[0], found, expected, remedy if paths else "copy the missing files")
+    numbers = np.array([int(path.stem[len(prefix) :]) for path in paths])
+    order = np.argsort(numbers, kind="stable")
+    paths, numbers = [paths[i] for i in order], numbers[order]
+    is_from_first = stated is not None and len(paths) < stated and numbers[0] > first and numbers[-1] < first + stated
+    numbers = numbers - (first if is_from_first else numbers[0])
+    if stated is not None and len(paths) > stated:
+        text = "%s: %d files, and %d are stated: left out: %s"
+        _log.warning(text, subjects[0], len(paths), stated, ", ".join(path.name for path in paths[stated:][:8]))
+        paths, numbers = paths[:stated], numbers[:stated]
+    series = series_of(paths, str(folder.root), remedy, holes=is_free, skip=len(prefix))
     sizes = stack_shape(paths)
-    sides = zip(subjects, sizes, shape, strict=True)
-    if wrong := [name for name, size, stated in sides if stated not in (None, size)]:
+    wrong = [name for name, size, n in zip(subjects[1:], sizes[1:], shape[1:], strict=True) if n not in (None, size)]
+    if wrong or sizes[0] != len(paths):
         found = f"{sizes[0]} images of {sizes[1]} × {sizes[2]} pixels"
-        expected = " × ".join(str(n or "any") for n in shape)
-        raise InputError(str(paths[0]), found, expected, f"see {', '.join(dict.fromkeys(wrong))}")
-    return read_tiffs(paths)
+        expected = " × ".join(str(n or "any") for n in (len(paths), *shape[1:]))
+        raise InputError(str(paths[0]), found, expected, f"see {', '.join(dict.fromkeys(wrong or subjects[:1]))}")
+    return read_tiffs(paths), numbers, series.said
 
 
 def stack_shape(paths: list[Path]) -> tuple[int, int, int]:
@@ -91,17 +124,16 @@ def stack_shape(paths: list[Path]) -> tuple[int, int, int]:
 def _header(path: Path) -> _Header:
     """Returns the images of one file, after a check of every page against the size of the file."""
     with _opened(path) as tiff:
-        images = pages = total_bytes = 0
+        images = pages = 0
         for page in tiff.pages:
             if pages >= _MOST_PAGES:
                 raise InputError(str(path), f"more than {_MOST_PAGES} pages", "fewer pages")
-            _check_page(path, page, total_bytes)
+            _check_page(path, page, images * math.prod(page.shape[-2:]) * (page.dtype or np.dtype(np.uint8)).itemsize)
             if pages == 0:
                 shape, dtype = page.shape[-2:], page.dtype
             if (page.shape[-2:], page.dtype) != (shape, dtype):
                 raise InputError(str(path), "pages of several sizes or types", "one for all frames")
             pages, images = pages + 1, images + math.prod(page.shape[:-2])
-            total_bytes = images * math.prod(shape) * dtype.itemsize
         stated_images = int((tiff.imagej_metadata or {}).get("images", 0)) if tiff.is_imagej else 0
     if not pages:
         raise InputError(str(path), "no page", "at least one image")
@@ -125,25 +157,40 @@ def _opened(path: Path) -> Iterator[Any]:
         raise InputError(str(path), error.strerror or str(error), "a readable TIFF") from error
     except Exception as error:  # damage raises any exception
         found = f"a TIFF that cannot be read ({type(error).__name__}: {str(error)[:80]})"
-        raise InputError(str(path), found, "grey images, uncompressed or deflated") from error
+        raise InputError(str(path), found, "grey images", "save it uncompressed") from error
 
 
-def imagej_calibration(path: Path) -> tuple[np.ndarray | None, np.ndarray | None, str]:
-    """Returns the voxel sizes (x, y, z) in mm, the origin's place (x, y, z) in voxels and the text "Info" of a stack.
-    ImageJ wrote the stack, or tifffile, which keeps the same values of a BigTIFF as JSON. None stands for missing values.
-    Call ``read_tiffs`` first."""
+def calibration(path: Path) -> tuple[np.ndarray | None, np.ndarray | None, str]:
+    """Returns the voxel sizes (x, y, z) in mm, the origin's place (x, y, z) in voxels and the text "Info" of a stack. ImageJ
+    wrote the stack, or tifffile, which keeps the same values of a BigTIFF as JSON, or a program that writes OME-TIFF. None
+    stands for missing values, which a warning names where the file has a part of them. InputError for a stack with several
+    channels or times. Call ``read_tiffs`` first."""
     tifffile = checks.package("tifffile", "the package that reads TIFF", "phyradgs-cl[formats]")
-    try:
-        with _quiet("tifffile"), tifffile.TiffFile(path) as tiff:
-            facts: dict[str, Any] = tiff.imagej_metadata or (tiff.shaped_metadata or ({},))[0]
+    with _opened(path) as tiff:
+        series = tiff.series[0]
+        long = {axis: n for axis, n in zip(series.axes, series.shape, strict=False) if axis in _NO_SPACE and n > 1}
+        ome, per_mm = dict(_OME_SIZES.findall(tiff.ome_metadata or "")), []
+        with suppress(KeyError, TypeError, ValueError, ZeroDivisionError, tifffile.TiffFileError):
             per_mm = [np.divide(*tiff.pages[0].tags[f"{axis}Resolution"].value) for axis in "XY"]
-        sizes = np.array([1 / per_mm[0], 1 / per_mm[1], float(facts["spacing"])])
-        if facts.get("unit") != "mm" or not np.all(np.isfinite(sizes) & (sizes > 0)):
-            return None, None, ""
-        origin = np.array([float(facts.get(f"{axis}origin", np.nan)) for axis in "xyz"])
-        return sizes, origin if np.isfinite(origin).all() else None, str(facts.get("Info", ""))
-    except (KeyError, TypeError, ValueError, ZeroDivisionError, tifffile.TiffFileError):
+        facts: dict[str, Any] = tiff.imagej_metadata or next(iter(tiff.shaped_metadata or ()), {})
+    if long:
+        found = " and ".join(f"{count} {_NO_SPACE[axis]}" for axis, count in long.items())
+        raise InputError(str(path), f"a stack of axes {series.axes}, {found}", "one volume", "save one of them, as slices")
+    units = [ome.get(f"{axis}Unit", "um") if ome else str(facts.get("unit", "")) for axis in "XYZ"]
+    try:
+        sizes = [float(ome[axis]) for axis in "XYZ"] if ome else [*(1 / n for n in per_mm), float(facts["spacing"])]
+        factors = np.array([LENGTH.factor(unit) for unit in units], np.float64)
+        size_mm = np.array(sizes, np.float64) * factors
+    except (KeyError, TypeError, ValueError, ZeroDivisionError):
+        size_mm = np.full(3, np.nan)
+    if size_mm.shape != (3,) or not np.all(np.isfinite(size_mm) & (size_mm > 0)):
+        if ome or "unit" in facts:
+            stated = ome or {name: facts[name] for name in facts if name in _OF_SIZE}
+            found = ", ".join(f"{name} {value}" for name, value in stated.items())
+            _log.warning("%s: no voxel sizes can be made of %s: the scale is left out", path, found)
         return None, None, ""
+    origin = np.array([float(facts.get(f"{axis}origin", np.nan)) for axis in "xyz"])
+    return size_mm, origin if np.isfinite(origin).all() else None, str(facts.get("Info", ""))
 
 
 @contextmanager
@@ -169,30 +216,8 @@ def _check_page(path: Path, page: Any, before_bytes: int) -> None:
     if tag is not None and tag.value != 1:
         expected = "1 (row 0 at the top, column 0 on the left)"
         raise InputError(f"{path} tag Orientation", str(tag.value), expected, "turn the images")
-    if page.compression not in (_PLAIN, *_DEFLATED):
-        found = f"a page with compression {int(page.compression)}"
-        raise InputError(str(path), found, "plain or deflated images", "save them uncompressed")
-    needed = math.prod(shape) * dtype.itemsize
-    size, here = path.stat().st_size, sum(page.databytecounts)
-    most = 1 if page.compression == _PLAIN else _MOST_EXPANSION
-    if needed > here * most or needed + before_bytes > size * most or _chunk(page) > 4 * needed + _FREE_BYTES:
-        found = f"a page of shape {shape}, {needed} bytes, in {min(here, size)} bytes of data"
+    needed = math.prod(shape) * page.bitspersample // 8
+    left = min(sum(page.databytecounts), path.stat().st_size - before_bytes * page.bitspersample // (8 * dtype.itemsize))
+    if page.compression == _PLAIN and needed > left:
+        found = f"a page of shape {shape}, {needed} bytes, in {max(left, 0)} bytes of data"
         raise InputError(str(path), found, "a size that the file can hold", "copy the file again")
-
-
-def _chunk(page: Any) -> int:
-    return math.prod(page.chunks) * page.dtype.itemsize
-
-
-def _check_inflation(path: Path, page: Any, most: int) -> None:
-    """Refuses a strip that unpacks to more than its pixels: the library would unpack all of it."""
-    with open(path, "rb") as file:
-        for offset, count in zip(page.dataoffsets, page.databytecounts, strict=True):
-            file.seek(offset)
-            packed, machine, left = file.read(count), zlib.decompressobj(), most
-            while packed and left >= 0:
-                left -= len(machine.decompress(packed, _BLOCK_BYTES))
-                packed = machine.unconsumed_tail
-            if left < 0:
-                found = f"a strip of more than {most} bytes"
-                raise InputError(str(path), found, "as many as its pixels take")

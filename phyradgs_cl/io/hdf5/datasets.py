@@ -34,8 +34,8 @@ class Quantity:
     factors: MappingProxyType[str, float]
 
     def factor(self, unit: str) -> float | None:
-        """Returns the multiplier for a value in ``unit``, or None for an unknown unit."""
-        return self.factors.get(unit.strip())
+        """Returns the multiplier for a value in ``unit``, in any case, or None for an unknown unit."""
+        return self.factors.get(_plain(unit))
 
     @property
     def accepted(self) -> str:
@@ -43,8 +43,12 @@ class Quantity:
         return ", ".join(name for name in self.factors if len(name) <= 4 and name.isascii())
 
 
+def _plain(unit: str) -> str:
+    return unit.strip().rstrip(".").casefold()
+
+
 def _quantity(name: str, assumed: str, largest: float, factors: dict[tuple[str, ...], float]) -> Quantity:
-    flat = {unit: factor for names, factor in factors.items() for unit in names}
+    flat = {_plain(unit): factor for names, factor in factors.items() for unit in names}
     return Quantity(name, assumed, largest, MappingProxyType(flat))
 
 
@@ -52,15 +56,16 @@ LENGTH = _quantity("length", "mm", 1e9, {
     ("mm", "millimeter", "millimetre", "millimeters", "millimetres"): 1.0,
     ("cm", "centimeter", "centimetre", "centimeters", "centimetres"): 10.0,
     ("m", "meter", "metre", "meters", "metres"): 1000.0,
-    ("um", "\u00b5m", "\u03bcm", "micrometer", "micrometre", "micrometers", "micrometres"): 1e-3,
+    ("um", "\u00b5m", "\\u00b5m", "micron", "microns", "micrometer", "micrometre", "micrometers", "micrometres"): 1e-3,
+    ("nm", "nanometer", "nanometre", "nanometers", "nanometres"): 1e-6,
 })  # fmt: skip
 TIME = _quantity("time", "s", 1e12, {
     ("s", "sec", "second", "seconds"): 1.0,
     ("ms", "millisecond", "milliseconds"): 1e-3,
-    ("us", "\u00b5s", "\u03bcs", "microsecond", "microseconds"): 1e-6,
+    ("us", "\u00b5s", "microsecond", "microseconds"): 1e-6,
 })  # fmt: skip
 ANGLE = _quantity("angle", "deg", 1e8, {
-    ("deg", "degree", "degrees", "\u00b0"): math.pi / 180, ("rad", "radian", "radians"): 1.0
+    ("deg", "degs", "degree", "degrees", "\u00b0"): math.pi / 180, ("rad", "rads", "radian", "radians"): 1.0
 })  # fmt: skip
 PHASE = _quantity("phase", "cycle", 1e9, {
     ("cycle", "cycles"): 1.0, ("deg", "degree", "degrees", "\u00b0"): 1 / 360, ("rad", "radian", "radians"): 0.5 / math.pi
@@ -81,7 +86,8 @@ def read_values(
             expected = "numbers" if "f" in kinds else "whole numbers"
             raise InputError(subject, f"type {dataset.dtype}", expected, "store them as plain HDF5 numbers")
         share = 1 if rows is None else (rows.stop - rows.start) / dataset.shape[-2]
-        if share * dataset.nbytes > HOST_SHARE * host_bytes():
+        chunk_bytes = math.prod(dataset.chunks or ()) * dataset.dtype.itemsize  # HDF5 unpacks whole ones
+        if max(share * dataset.nbytes, chunk_bytes) > HOST_SHARE * host_bytes():
             raise MemoryError
         return np.asarray(dataset[()] if rows is None else dataset[..., rows, :])
     except MemoryError as error:
@@ -103,6 +109,18 @@ def read_array(
     values = read_values(source, address, dataset).astype(np.float64)
     checks.finite(source.name(address), values)
     return in_unit(source, address, values, quantity) if quantity else values
+
+
+def read_per_frame(source: Hdf5Source, address: str, used: np.ndarray, quantity: Quantity) -> np.ndarray:
+    """Reads one finite number for each frame of which ``used`` (F,) is true, in the package's unit. The dataset has one for
+    every frame, where those of other frames may be anything, or only for the used ones."""
+    dataset, subject = source.dataset(address), source.name(address)
+    if dataset.shape != (count := int(used.sum()),):
+        checks.shape(subject, dataset, used.shape)
+    values = read_values(source, address, dataset).astype(np.float64)
+    values = values if len(values) == count else values[used]
+    checks.finite(subject, values)
+    return in_unit(source, address, values, quantity)
 
 
 def read_number(
@@ -185,9 +203,14 @@ def _text(value: object) -> str | None:
     """Returns the string in h5py's answer (str, bytes or an array of one), or None for anything else."""
     if isinstance(value, np.ndarray) and value.size == 1:
         value = value.reshape(-1)[0]
-    if isinstance(value, bytes):
-        return value.decode("utf-8", "replace")
-    return str(value) if isinstance(value, str) else None
+    if isinstance(value, str):
+        value = value.encode("utf-8", "surrogateescape")
+    if not isinstance(value, bytes):
+        return None
+    try:
+        return value.decode()
+    except UnicodeDecodeError:
+        return value.decode("latin-1")  # has a character for every byte
 
 
 def in_unit(source: Hdf5Source, address: str, values: np.ndarray, quantity: Quantity) -> np.ndarray:
@@ -201,8 +224,8 @@ def in_unit(source: Hdf5Source, address: str, values: np.ndarray, quantity: Quan
 
 
 def _unit_factor(source: Hdf5Source, address: str, quantity: Quantity) -> float:
-    unit = read_attribute(source, address, "units")
-    if unit is None:
+    unit = read_attribute(source, address, "units") or read_attribute(source, address, "unit")
+    if not unit or not unit.strip():
         unit = quantity.assumed
         # A name that ends in the unit (time_s, angle_deg) states it well enough.
         if not posixpath.basename(address).endswith(f"_{unit}"):

@@ -16,6 +16,7 @@ from phyradgs_cl.io.hdf5.datasets import LENGTH, TIME
 from phyradgs_cl.io.hdf5.source import Hdf5Source
 
 _log = logging.getLogger(__name__)
+_JITTER = 0.01  # of an exposure that a clock has measured
 
 
 def read_data_kind(source: Hdf5Source, entry: str) -> tuple[h5py.Dataset, str]:
@@ -112,7 +113,8 @@ def _read_pulse(source: Hdf5Source, entry: str, span_s: float) -> tuple[float, f
 
 
 def read_duration(source: Hdf5Source, address: str, used: np.ndarray, needed: bool) -> float:
-    """Reads one time in s for all projections, stored once or for every frame; 0 where it is not needed and missing."""
+    """Reads one time in s for all projections, stored once or for every frame: measured times differ by a percent, and their
+    median is taken. 0 where it is not needed and missing."""
     dataset = source.dataset(address) if needed else source.optional(address)
     if dataset is None:
         return 0.0
@@ -125,10 +127,11 @@ def read_duration(source: Hdf5Source, address: str, used: np.ndarray, needed: bo
     values = h5.in_unit(source, address, values, TIME)
     if values.min() < 0:
         raise InputError(subject, f"{values.min():.6g} s", "a time of at least 0 s", "correct the value")
-    if np.ptp(values) > 1e-6 * values.max():
+    usual_s = float(np.median(values))
+    if np.abs(values - usual_s).max() > _JITTER * usual_s:
         expected = "one time for all projections"
         raise InputError(subject, f"{values.min():.6g} to {values.max():.6g} s", expected)
-    return float(values[0])
+    return usual_s
 
 
 def read_starts(

@@ -21,6 +21,7 @@ from phyradgs_cl.io.scan.motion import has_motion, read_gating, read_trajectory
 from phyradgs_cl.io.tables import read_facts
 
 _log = logging.getLogger(__name__)
+_DEEPEST_ENTRY = 3  # groups from the root to the one with the definition, which may be a subentry
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,17 +80,36 @@ def read_header(source: Hdf5Source) -> ScanHeader:
     return ScanHeader(scan, entry, image_key, quantity, str(data.dtype), mask_shape, has_reference, states, has_grid)
 
 
-def find_entry(source: Hdf5Source) -> str:
-    """Returns the address of the NXtomo entry: the root's @default, /entry, or the only NXentry."""
-    default = read_attribute(source, "/", "default")
-    for name in (default, "entry"):
-        if name and isinstance(source.find(f"/{name.strip('/')}"), h5py.Group):
-            return f"/{name.strip('/')}"
-    entries = [name for name in source.root_groups() if read_attribute(source, name, "NX_class") == "NXentry"]
+def find_entry(source: Hdf5Source, asked: str | None = None) -> str:
+    """Returns the address of the NXtomo entry: the one ``asked`` for, else the only group with that definition, wherever it
+    stands; without one the root's @default, /entry, or the only NXentry. Of several it takes the root's @default, and says
+    so. InputError for none, or several."""
+    if asked is not None:
+        address = f"/{asked.strip('/')}"
+        source.group(address)
+        return address
+    default = f"/{(read_attribute(source, '/', 'default') or 'entry').strip('/')}"
+    entries: list[str] = []
+    for name in source.groups(_DEEPEST_ENTRY):
+        if not any(name.startswith(f"{entry}/") for entry in entries) and _is_nxtomo(source, name):
+            entries.append(name)
+    if len(entries) > 1 and default in entries:
+        _log.warning("%s: %d NXtomo entries; %s is taken: say --entry for another", source.path, len(entries), default)
+        return default
+    if not entries:
+        entries = [name for name in (default, "/entry") if isinstance(source.find(name), h5py.Group)][:1]
+    entries = entries or [name for name in source.groups() if read_attribute(source, name, "NX_class") == "NXentry"]
     if len(entries) == 1:
         return entries[0]
-    found = f"{len(entries)} NXentry groups" if entries else "no NXentry group"
-    raise source.error("/entry", found, "a group 'entry'", source.misspelling("/", "entry"))
+    if entries:
+        found, remedy = f"several entries: {', '.join(entries)[:200]}", f"say --entry {entries[0]} or another"
+        raise source.error("/entry", found, "one scan", remedy)
+    raise source.error("/entry", "no NXentry group", "a group 'entry'", source.misspelling("/", "entry"))
+
+
+def _is_nxtomo(source: Hdf5Source, address: str) -> bool:
+    thing = source.find(f"{address}/definition")
+    return isinstance(thing, h5py.Dataset) and thing.size == 1 and "nxtomo" in str(thing[()]).lower()
 
 
 def _read_or_derive_grid(source: Hdf5Source, entry: str, geometry: Geometry) -> tuple[Grid, bool]:

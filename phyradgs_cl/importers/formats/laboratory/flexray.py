@@ -5,19 +5,20 @@ moves its middle. The sample turns clockwise seen from above, row 0 is on top, c
 for the scanner of CWI are not applied, since they belong to that scanner and its dates."""
 
 import logging
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 
 from phyradgs_cl.acquisition import Scan
-from phyradgs_cl.importers.assemble import StoredTiming, assemble_scan, cone, make_timing, names_in_file
+from phyradgs_cl.importers.assemble import StoredTiming, cone, names_in_file
 from phyradgs_cl.importers.options import OF_BARE_FRAMES, ImportOptions
 from phyradgs_cl.importers.reading.files import SafeFolder
-from phyradgs_cl.importers.reading.frames import gantry_sign, line_integrals, oriented
-from phyradgs_cl.importers.reading.settings import differing, head_has, read_settings, say_missing
-from phyradgs_cl.importers.reading.tiff import read_series
-from phyradgs_cl.importers.stage import RotaryStage
-from phyradgs_cl.io.tables import Fields
+from phyradgs_cl.importers.reading.frames import gantry_sign
+from phyradgs_cl.importers.reading.settings import Settings, head_has, read_settings, say_missing
+from phyradgs_cl.importers.reading.tiff import read_numbered
+from phyradgs_cl.importers.stage import RotaryStage, StageScan
+from phyradgs_cl.io.hdf5.datasets import LENGTH, TIME
 
 _log = logging.getLogger(__name__)
 _FILE = "scan settings.txt"
@@ -41,10 +42,10 @@ def import_scan(path: Path, options: ImportOptions) -> Scan:
     folder = SafeFolder(path if path.is_dir() else path.parent)
     description = path if path.is_file() else folder.file(_FILE, str(path / _FILE))
     scan = read_settings(description, _NAMES, ":")
-    frames = read_series(folder, "scan_", (None, None, None), str(folder.root / "scan_*.tif"))
+    frames, _, said = read_numbered(folder, "scan_", (None, None, None), str(folder.root / "scan_*.tif"), options)
     panel = (frames.shape[1], frames.shape[2])
     flats, darks = (
-        oriented(read_series(folder, prefix, (None, *panel), str(folder.root / f"{prefix}*.tif")), options, "top")
+        read_numbered(folder, prefix, (None, *panel), str(folder.root / f"{prefix}*.tif"), options)[0]
         for prefix in ("io", "di")
     )
     names = names_in_file(options, {
@@ -53,27 +54,31 @@ def import_scan(path: Path, options: ImportOptions) -> Scan:
         "angles": scan.name("Last angle"), "exposure_s": scan.name("Exposure time (ms)"),
     })  # fmt: skip
     stage = _stage(scan, panel, options, names)
-    between = np.linspace(scan.number("Start angle", 0.0), scan.number("Last angle"), len(frames))
-    angle_rad = gantry_sign(options, "gantry") * differing(scan, "Last angle", between)
-    exposure_s = scan.length("Exposure time (ms)") / 1000 if scan.has("Exposure time (ms)") else None
-    if exposure_s is not None:
-        exposure_s *= scan.length("Number of averages") if scan.has("Number of averages") else 1
-    timing = make_timing(str(description), len(frames), options, StoredTiming(exposure_s=exposure_s))
-    trajectory, geometry = stage.turned(angle_rad, timing, str(description))
-    turned = oriented(frames, options, "top")
-    subject = str(description)
-    integrals = line_integrals(subject, turned, options, flats=flats, darks=darks, convention="counts")
-    title = folder.root.resolve().name
-    return assemble_scan(integrals, trajectory, geometry, timing, options, title=title, source=str(path), names=names)
+    first_deg = scan.number("Start angle", 0.0)
+    angle_rad = options.angle_rad(
+        len(frames), lambda: np.deg2rad(np.linspace(first_deg, scan.number("Last angle"), len(frames)))
+    )
+    exposure_s = None
+    if scan.has("Exposure time (ms)") and options.exposure_s is None:
+        averages = scan.length("Number of averages") if scan.has("Number of averages") else 1.0
+        exposure_s = averages * scan.measured("Exposure time (ms)", TIME, "ms")
+    stored = StoredTiming(exposure_s=exposure_s)
+    angle_rad = gantry_sign(options, "gantry") * angle_rad
+    places = np.arange(len(frames))
+    turned = StageScan(frames, ("top", "left"), angle_rad, places, names, said, stored, flats, darks)
+    return turned.on(stage, options, description, folder.root.resolve().name)
 
 
-def _stage(scan: Fields, panel: tuple[int, int], options: ImportOptions, names: dict[str, str]) -> RotaryStage:
+def _stage(scan: Settings, panel: tuple[int, int], options: ImportOptions, names: dict[str, str]) -> RotaryStage:
     """Returns the stage of the settings, in a frame whose origin is as high as the source."""
-    to_axis_mm, to_detector_mm = scan.length("SOD"), scan.length("SDD")
-    if scan.has("Binned pixel size"):
-        pitch_mm = scan.length("Binned pixel size")
-    else:
-        pitch_mm = scan.length("Voxel size") / 1000 * (to_detector_mm / to_axis_mm)
+    to_axis_mm = options.taken("source_to_axis_mm", partial(scan.length, "SOD"))
+    to_detector_mm = options.taken("source_to_detector_mm", partial(scan.length, "SDD"))
+
+    def pitch_mm() -> tuple[float, float]:
+        at_sample_mm = None if scan.has("Binned pixel size") else scan.measured("Voxel size", LENGTH, "um")
+        size_mm = at_sample_mm * to_detector_mm / to_axis_mm if at_sample_mm else scan.length("Binned pixel size")
+        return size_mm, size_mm
+
     place_mm = {name: scan.position(name) for name in _PLACES}
     right_mm, up_mm = _window_mm(scan)
     off_v = place_mm["ver_det"] + up_mm - place_mm["ver_tube"]
@@ -83,11 +88,11 @@ def _stage(scan: Fields, panel: tuple[int, int], options: ImportOptions, names: 
     if options.detector_offset_mm is None:
         text = "%s places are as stated, without a correction profile of flexdata: say %s, or calibrate"
         _log.warning(text, scan.subject, options.named("detector_offset_mm"))
-    geometry = cone(options, to_axis_mm, to_detector_mm, panel, (pitch_mm, pitch_mm), (off_v, off_u), names)
+    geometry = cone(options, to_axis_mm, to_detector_mm, panel, pitch_mm, (off_v, off_u), names)
     return RotaryStage(geometry, place_mm["tra_obj"] - place_mm["tra_tube"])
 
 
-def _window_mm(scan: Fields) -> tuple[float, float]:
+def _window_mm(scan: Settings) -> tuple[float, float]:
     """Returns how far (right, up) of the panel's own middle the middle of its window is."""
     if not scan.has("ROI (LTRB)"):
         return 0.0, 0.0

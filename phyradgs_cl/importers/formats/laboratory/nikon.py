@@ -7,21 +7,21 @@ for ObjectRoll above 0, and towards the panel for ObjectTilt above 0. Lengths ar
 
 import logging
 import math
-from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 
 from phyradgs_cl.acquisition import Scan
-from phyradgs_cl.acquisition.geometry import ConeGeometry
-from phyradgs_cl.importers.assemble import assemble_scan, cone, make_timing, names_in_file
-from phyradgs_cl.importers.options import OF_BARE_FRAMES, ImportOptions
+from phyradgs_cl.importers.assemble import cone, names_in_file
+from phyradgs_cl.importers.options import OF_FOLDERS, ImportOptions
 from phyradgs_cl.importers.reading.files import SafeFolder, checked_name
-from phyradgs_cl.importers.reading.frames import gantry_sign, line_integrals, oriented
-from phyradgs_cl.importers.reading.settings import differing, read_settings, say_missing, white_level
-from phyradgs_cl.importers.reading.tiff import read_series
-from phyradgs_cl.importers.stage import RotaryStage
-from phyradgs_cl.io.tables import Fields
+from phyradgs_cl.importers.reading.frames import gantry_sign
+from phyradgs_cl.importers.reading.settings import Settings, read_settings, say_missing, white_level
+from phyradgs_cl.importers.reading.text import file_of_angles, measured_angles_rad, read_angles_rad
+from phyradgs_cl.importers.reading.tiff import read_numbered
+from phyradgs_cl.importers.stage import RotaryStage, StageScan
+from phyradgs_cl.io.hdf5.datasets import LENGTH
 
 _log = logging.getLogger(__name__)
 _ENDS = ("CentreOfRotationTop", "CentreOfRotationBottom")
@@ -40,56 +40,61 @@ def recognises(path: Path) -> bool:
 
 def import_scan(path: Path, options: ImportOptions) -> Scan:
     """Imports a folder with one .xtekct and its TIFFs, or the .xtekct with the TIFFs in its folder."""
-    options.refuse_unused("nikon", OF_BARE_FRAMES)
+    options.refuse_unused("nikon", OF_FOLDERS)
     folder = SafeFolder(path if path.is_dir() else path.parent)
     description = path if path.is_file() else folder.only("description of the scan", ".xtekct")
     scan = read_settings(description, _NAMES)
-    if (unit := scan.word("Units", default="mm")).lower() != "mm":
+    if LENGTH.factor((unit := scan.word("Units", default="mm")).lower()) != 1.0:
         raise scan.error("Units", repr(unit[:40]), "mm", "convert the lengths to mm")
     sizes = ("Projections", "DetectorPixelsY", "DetectorPixelsX")
     count, *panel = (scan.count(name, _MOST_FRAMES) for name in sizes)
     prefix = scan.word("Name", default="") + scan.word("InputSeparator", default="_")
-    frames = read_series(_folder_of_frames(folder, scan), prefix, (count, *panel), [*map(scan.name, sizes)])
+    place = _folder_of_frames(folder, scan)
+    frames, at, said = read_numbered(place, prefix, (count, *panel), [*map(scan.name, sizes)], options, first=1)
+    measured = file_of_angles(folder, description.stem, ".ang", "_ctdata.txt")
     names = names_in_file(options, {
         "source_to_axis_mm": scan.name("SrcToObject"), "source_to_detector_mm": scan.name("SrcToDetector"),
-        "pixel_size_mm": f"{scan.name('DetectorPixelSizeX')}, DetectorPixelSizeY", "angles": scan.name("AngularStep"),
+        "pixel_size_mm": f"{scan.name('DetectorPixelSizeX')}, DetectorPixelSizeY",
+        "angles": str(measured or scan.name("AngularStep")),
     })  # fmt: skip
     stage = _stage(scan, (panel[0], panel[1]), options, names)
-    first_deg, step_deg = scan.number("InitialAngle", 0.0), scan.number("AngularStep")
-    angle_rad = gantry_sign(options, "gantry") * differing(scan, "AngularStep", first_deg + step_deg * np.arange(count))
-    timing = make_timing(str(description), count, options)
-    trajectory, geometry = stage.turned(angle_rad, timing, str(description))
+    angle_rad = gantry_sign(options, "gantry") * options.angle_rad(len(at), lambda: _angles(scan, measured, count)[at])
     say_missing(scan, {"InitialAngle": "0", "ObjectTilt": "0", "Units": "mm"})
     remedy = f"correct it, or say {options.named('flat_value')}"
-    combined = replace(options, flat_value=options.flat_value or white_level(scan, "WhiteLevel", frames, remedy))
-    turned = oriented(frames, options, "top", "right")
-    integrals = line_integrals(str(description), turned, combined, convention="counts", is_corrected=True)
-    title = description.stem
-    return assemble_scan(integrals, trajectory, geometry, timing, options, title=title, source=str(path), names=names)
+    white = None if options.flat_value else white_level(scan, "WhiteLevel", frames, remedy)
+    turned = StageScan(frames, ("top", "right"), angle_rad, at, names, said)
+    return turned.on(stage, options, description, description.stem, white)
 
 
-def _folder_of_frames(folder: SafeFolder, scan: Fields) -> SafeFolder:
+def _angles(scan: Settings, measured: Path | None, count: int) -> np.ndarray:
+    """Returns the angles (count,) in rad: the measured ones, or equal steps."""
+    if measured is not None and not scan.has("AngularStep"):
+        return read_angles_rad(measured, count, column=1)
+    steps_rad = np.deg2rad(scan.number("InitialAngle", 0.0) + scan.number("AngularStep") * np.arange(count))
+    return steps_rad if measured is None else measured_angles_rad(measured, steps_rad)
+
+
+def _folder_of_frames(folder: SafeFolder, scan: Settings) -> SafeFolder:
     """Returns the folder that InputFolderName names inside the description's own; that folder itself where it is none."""
     name = scan.word("InputFolderName", default="")
     if not name or not folder.exists(name.split("\\")[0].split("/")[0]):
         return folder  # often the place on the scanner's own disk
-    inner = folder.root / checked_name(name, scan.name("InputFolderName"))
-    if any(part.is_symlink() for part in (inner, *inner.parents) if folder.root in part.parents):
-        raise scan.error("InputFolderName", f"{name[:60]!r}, which leads over a symbolic link", "a plain folder")
-    return SafeFolder(inner)
+    return SafeFolder(folder.root / checked_name(name, scan.name("InputFolderName")))
 
 
-def _stage(scan: Fields, panel: tuple[int, int], options: ImportOptions, names: dict[str, str]) -> RotaryStage:
+def _stage(scan: Settings, panel: tuple[int, int], options: ImportOptions, names: dict[str, str]) -> RotaryStage:
     """Returns the stage of the description; options replace its lengths."""
-    pitch_mm = (scan.length("DetectorPixelSizeY"), scan.length("DetectorPixelSizeX"))
-    to_axis_mm, to_detector_mm = scan.length("SrcToObject"), scan.length("SrcToDetector")
+    to_axis_mm, to_detector_mm = partial(scan.length, "SrcToObject"), partial(scan.length, "SrcToDetector")
+
+    def pitch_mm() -> tuple[float, float]:
+        return scan.length("DetectorPixelSizeY"), scan.length("DetectorPixelSizeX")
+
     geometry = cone(options, to_axis_mm, to_detector_mm, panel, pitch_mm, (0.0, 0.0), names)
     for name in ("DetectorOffsetX", "DetectorOffsetY"):
         if scan.position(name) and options.detector_offset_mm is None:
             text = "%s is %g and not used, for its sign is not documented; say %s if the panel was moved"
             _log.warning(text, scan.name(name), scan.position(name), options.named("detector_offset_mm"))
     top_mm, bottom_mm = (scan.position(name) for name in _ENDS)
-    assert isinstance(geometry, ConeGeometry)
     if scan.has("ObjectOffsetX"):
         offset_mm = scan.position("ObjectOffsetX")
     else:
@@ -102,7 +107,7 @@ def _stage(scan: Fields, panel: tuple[int, int], options: ImportOptions, names: 
         name = "ObjectOffsetX" if scan.has("ObjectOffsetX") else _ENDS[0]
         found = f"{offset_mm:g} mm, {abs(offset_mm * geometry.magnification):.4g} mm from the middle of the panel"
         raise scan.error(name, found, f"an axis that the panel of {2 * half_mm:.4g} mm sees")
-    height_mm = panel[0] * pitch_mm[0]
+    height_mm = panel[0] * geometry.pixel_size_mm[0]
     roll_rad = math.radians(scan.number("ObjectRoll", lowest=-45, highest=45)) if scan.has("ObjectRoll") else (
         -math.atan2(top_mm - bottom_mm, height_mm)
     )  # fmt: skip

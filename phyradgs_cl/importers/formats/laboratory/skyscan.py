@@ -7,7 +7,7 @@ turns counterclockwise seen from above, which the log calls CC. The log states n
 
 import logging
 import re
-from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -15,12 +15,13 @@ import numpy as np
 from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.acquisition.geometry import Geometry
 from phyradgs_cl.importers import assemble
-from phyradgs_cl.importers.options import OF_BARE_FRAMES, ImportOptions
+from phyradgs_cl.importers.options import OF_FOLDERS, ImportOptions
 from phyradgs_cl.importers.reading import settings
 from phyradgs_cl.importers.reading.files import SafeFolder
-from phyradgs_cl.importers.reading.frames import gantry_sign, line_integrals, oriented
-from phyradgs_cl.importers.reading.tiff import read_series
-from phyradgs_cl.io.tables import Fields
+from phyradgs_cl.importers.reading.frames import gantry_sign
+from phyradgs_cl.importers.reading.tiff import read_numbered
+from phyradgs_cl.importers.stage import RotaryStage, StageScan
+from phyradgs_cl.io.hdf5.datasets import LENGTH, TIME
 
 _log = logging.getLogger(__name__)
 _RATIOS = ("Camera X/Y Ratio", "CameraXYRatio")
@@ -31,6 +32,10 @@ _NAMES = (
     *("Reference Intensity", "Image Rotation", "Flat Field Correction", "Type of Detector Motion", "Type of Motion"),
     "Random Movement",
 )
+_FIELDS = {
+    "source_to_axis_mm": "Object to Source (mm)", "source_to_detector_mm": "Camera to Source (mm)",
+    "exposure_s": "Exposure (ms)", "angles": "Rotation Step (deg)", "pixel_size_mm": "Image Pixel Size (um)",
+}  # fmt: skip
 _OFF = re.compile(r"OFF( *\(.*\))?", re.I)  # the log keeps the number that would hold if it were on
 _SENSES = {"CC": 1, "CCW": 1, "CW": -1, "C": -1}
 _ASSUMED = {
@@ -41,80 +46,75 @@ _ASSUMED = {
 
 def recognises(path: Path) -> bool:
     """True for a .log file of a SkyScan, and for a folder with one."""
-    paths = SafeFolder(path).plain(".log") if path.is_dir() else [path]
-    return any(file.suffix.lower() == ".log" and settings.head_has(file, b"[system]", b"scanner=") for file in paths)
+    paths = SafeFolder(path).matching(".log") if path.is_dir() else [path] if path.suffix.lower() == ".log" else []
+    return any(settings.head_has(file, b"[system]", b"scanner=") for file in paths)
 
 
 def import_scan(path: Path, options: ImportOptions) -> Scan:
     """Imports a folder with one .log and its TIFFs, or the .log with the TIFFs in its folder."""
-    options.refuse_unused("skyscan", OF_BARE_FRAMES)
+    options.refuse_unused("skyscan", OF_FOLDERS)
     folder = SafeFolder(path if path.is_dir() else path.parent)
     description = path if path.is_file() else folder.only("log of the scan", ".log")
     scan = settings.read_settings(description, _NAMES, sections=("System", "Acquisition"))
-    sizes = [f"Number of {what}" for what in ("Files", "Rows", "Columns")]
+    sizes = ("Number of Files", "Number of Rows", "Number of Columns")
     count, rows, columns = (scan.count(name, 1_000_000) for name in sizes)
     if scan.word("Scanning Trajectory", default="ROUND").upper() != "ROUND":
         raise scan.error("Scanning Trajectory", scan.word("Scanning Trajectory")[:40], "ROUND, a circle")
-    prefix, stated = str(scan.get("Filename Prefix")), [scan.name(name) for name in sizes]
-    frames = read_series(folder, prefix, (count, rows, columns), stated, r"\d{4,8}")
-    names = assemble.names_in_file(options, {
-        "source_to_axis_mm": scan.name("Object to Source (mm)"), "exposure_s": scan.name("Exposure (ms)"),
-        "source_to_detector_mm": scan.name("Camera to Source (mm)"), "angles": scan.name("Rotation Step (deg)"),
-        "pixel_size_mm": scan.name("Image Pixel Size (um)"),
-    })  # fmt: skip
+    parts = scan.word("Filename Prefix"), (count, rows, columns), [scan.name(name) for name in sizes], options
+    frames, at, said = read_numbered(folder, *parts, pattern=r"\d{4,8}")
+    names = assemble.names_in_file(options, {field: scan.name(name) for field, name in _FIELDS.items()})
     geometry = _geometry(scan, (rows, columns), options, names)
-    step_deg, first_deg = scan.number("Rotation Step (deg)"), scan.number("Scanning Start Angle", 0.0)
-    if (direction := scan.word("Rotation Direction", default="CC").upper()) not in _SENSES:
-        raise scan.error("Rotation Direction", repr(direction[:40]), "CC or CW")
-    turned_rad = settings.differing(scan, "Rotation Step (deg)", first_deg + step_deg * np.arange(count))
-    angle_rad = gantry_sign(options, "sample") * _SENSES[direction] * turned_rad
-    timing = assemble.make_timing(str(description), count, options, _timing(scan, options))
+    if (sense := _SENSES.get(scan.word("Rotation Direction", default="CC").upper())) is None:
+        raise scan.error("Rotation Direction", repr(scan.word("Rotation Direction")[:40]), "CC or CW")
+    first_deg, step_deg = scan.number("Scanning Start Angle", 0.0), partial(scan.number, "Rotation Step (deg)")
+    angle_rad = options.angle_rad(len(at), lambda: np.deg2rad(first_deg + step_deg() * at))
+    angle_rad *= gantry_sign(options, "sample") * sense
     settings.say_missing(scan, _ASSUMED)
-    if not _OFF.fullmatch(movement := str(scan.values.get("Random Movement", "OFF"))):
+    if not _OFF.fullmatch(movement := scan.word("Random Movement", default="OFF")):
         text = "%s is %s: the log states no shifts, so none are used; details blur where the scanner has not undone them"
         _log.warning(text, scan.name("Random Movement"), movement[:40])
     if roll_deg := scan.number("Image Rotation", 0.0):
         _log.warning("%s is %g° and not used: calibrate finds the panel's roll", scan.name("Image Rotation"), roll_deg)
-    combined = replace(options, flat_value=options.flat_value or _white(scan, frames, options))
-    frames = oriented(frames, options, "top", "right")
-    integrals = line_integrals(str(description), frames, combined, convention="counts", is_corrected=True)
-    parts = integrals, assemble.turning(geometry, angle_rad, timing), geometry, timing, options
-    return assemble.assemble_scan(*parts, title=description.stem, source=str(path), names=names)
+    turned = StageScan(frames, ("top", "right"), angle_rad, at, names, said, _timing(scan, options))
+    return turned.on(RotaryStage(geometry), options, description, description.stem, _white(scan, frames, options))
 
 
-def _geometry(scan: Fields, panel: tuple[int, int], options: ImportOptions, names: dict[str, str]) -> Geometry:
-    to_axis_mm, to_detector_mm = scan.length("Object to Source (mm)"), scan.length("Camera to Source (mm)")
-    width_mm = scan.length("Image Pixel Size (um)") / 1000 * (to_detector_mm / to_axis_mm)
-    pitch_mm = (width_mm / next((scan.length(name) for name in _RATIOS if scan.has(name)), 1.0), width_mm)
+def _geometry(scan: settings.Settings, panel: tuple[int, int], options: ImportOptions, names: dict[str, str]) -> Geometry:
+    to_axis_mm = options.taken("source_to_axis_mm", partial(scan.length, "Object to Source (mm)"))
+    to_detector_mm = options.taken("source_to_detector_mm", partial(scan.length, "Camera to Source (mm)"))
+
+    def stored_mm() -> tuple[float, float]:
+        width_mm = scan.measured("Image Pixel Size (um)", LENGTH, "um") * (to_detector_mm / to_axis_mm)
+        return width_mm / next((scan.length(name) for name in _RATIOS if scan.has(name)), 1.0), width_mm
+
+    pitch_mm = options.taken("pixel_size_mm", stored_mm)
     # a window of the camera may leave the central ray outside, by at most its own height
-    line = scan.number("Optical Axis (line)", panel[0] / 2, -panel[0], 2 * panel[0])
-    up_mm = (panel[0] / 2 - line) * pitch_mm[0]
+    up_mm = (panel[0] / 2 - scan.number("Optical Axis (line)", panel[0] / 2, -panel[0], 2 * panel[0])) * pitch_mm[0]
     if options.detector_offset_mm is None:
-        text = "%s no place of the axis across the panel: taken in the middle; check --fix-offset or calibrate find it"
-        _log.warning(text, scan.subject)
+        settings.say_missing(scan, {"place of the axis": "the middle of the panel; check --fix-offset or calibrate find it"})
     return assemble.cone(options, to_axis_mm, to_detector_mm, panel, pitch_mm, (up_mm, 0.0), names)
 
 
-def _timing(scan: Fields, options: ImportOptions) -> assemble.StoredTiming:
+def _timing(scan: settings.Settings, options: ImportOptions) -> assemble.StoredTiming:
     """Returns the exposure of all averaged frames; none for a scanner that stopped for each and options without a rate."""
     motion = next((scan.word(name) for name in ("Type of Detector Motion", "Type of Motion") if scan.has(name)), "")
-    averaging = str(scan.values.get("Frame Averaging", "OFF"))
+    averaging = scan.word("Frame Averaging", default="OFF")
     averaged = re.fullmatch(r"ON *\(([1-9]\d{0,5})\)", averaging, re.I)
     if not averaged and not _OFF.fullmatch(averaging):
         raise scan.error("Frame Averaging", repr(averaging[:40]), "OFF, or ON and a count of frames, as ON (4)")
-    exposure_s = scan.length("Exposure (ms)") / 1000 if scan.has("Exposure (ms)") else None
-    if exposure_s is None or ("STEP" in motion.upper() and options.frame_time_s is None):
+    stored_s = scan.measured("Exposure (ms)", TIME, "ms") if scan.has("Exposure (ms)") and not options.exposure_s else None
+    if stored_s is None or ("STEP" in motion.upper() and options.frame_time_s is None):
         return assemble.StoredTiming()
-    return assemble.StoredTiming(exposure_s=exposure_s * int(averaged[1] if averaged else 1))
+    return assemble.StoredTiming(exposure_s=stored_s * int(averaged[1] if averaged else 1))
 
 
-def _white(scan: Fields, frames: np.ndarray, options: ImportOptions) -> float:
-    """Returns the counts of air: Reference Intensity, else the largest number of Depth (bits)."""
+def _white(scan: settings.Settings, frames: np.ndarray, options: ImportOptions) -> float:
+    """Returns the counts of air: the option's, Reference Intensity, or the largest number of Depth (bits)."""
     remedy = f"say {options.named('flat_value')}"
-    if scan.word("Flat Field Correction", default="ON").upper() == "OFF":
+    if not options.flat_value and scan.word("Flat Field Correction", default="ON").upper() == "OFF":
         raise scan.error("Flat Field Correction", "OFF", "frames that the scanner has corrected", remedy)
-    if scan.has("Reference Intensity"):
-        return settings.white_level(scan, "Reference Intensity", frames, f"correct it, or {remedy}")
-    most = 2 ** int(scan.number("Depth (bits)", 16, 1, 32)) - 1
-    settings.say_missing(scan, {"Reference Intensity": f"air at {most} counts; else {remedy}"})
-    return float(most)
+    if options.flat_value or scan.has("Reference Intensity"):
+        return options.flat_value or settings.white_level(scan, "Reference Intensity", frames, f"correct it, or {remedy}")
+    most = 2.0 ** int(scan.number("Depth (bits)", 16, 1, 32)) - 1
+    settings.say_missing(scan, {"Reference Intensity": f"air at {most:.0f} counts; else {remedy}"})
+    return most

@@ -4,6 +4,7 @@ LEAP's cone equals ours a quarter turn back: at φ = 0° the source stands at �
 lowest. The ray through the origin falls on centerRow and centerCol; ``tau`` moves source and panel against the columns. A
 modular beam is a table of sources, panel centres and directions of rows and columns. Lengths in mm, angles in degrees."""
 
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -17,10 +18,10 @@ from phyradgs_cl.importers.formats.toolkits.leap_names import OLD_NAMES
 from phyradgs_cl.importers.options import OF_BARE_FRAMES, TIMING, ImportOptions
 from phyradgs_cl.importers.reading.files import SafeFolder, read_npy
 from phyradgs_cl.importers.reading.frames import gantry_sign, line_integrals, oriented
-from phyradgs_cl.importers.reading.settings import head_has, read_settings, say_missing
+from phyradgs_cl.importers.reading.series import series_of
+from phyradgs_cl.importers.reading.settings import Settings, head_has, read_settings, say_missing
 from phyradgs_cl.importers.reading.tiff import SUFFIXES, read_tiffs
 from phyradgs_cl.importers.stage import RotaryStage, along
-from phyradgs_cl.io.tables import Fields
 
 _VECTORS = ("sourcePositions", "moduleCenters", "colVectors", "rowVectors")
 _BEAMS, _MOST, _ENDS = ("cone", "parallel", "modular"), 1_000_000, (".txt", ".cfg")
@@ -33,7 +34,7 @@ def recognises(path: Path) -> bool:
 
 
 def _descriptions(path: Path) -> list[Path]:
-    files = SafeFolder(path).plain(*_ENDS) if path.is_dir() else [path]
+    files = SafeFolder(path).matching(*_ENDS) if path.is_dir() else [path]
     marks = ((b"numAngles", b"numCols"), (b"proj_nangles", b"proj_ncols"))
     return [file for file in files if file.suffix.lower() in _ENDS and any(head_has(file, *both) for both in marks)]
 
@@ -46,12 +47,14 @@ def import_scan(path: Path, options: ImportOptions) -> Scan:
         raise InputError(str(path), f"{len(descriptions)} files of LEAP's parameters", "one", "name the file itself")
     description = descriptions[0]
     stored = read_settings(description, [*OLD_NAMES, *OLD_NAMES.values()])
-    scan = Fields(stored.subject, {new: stored.values.get(new, stored.values.get(old)) for new, old in OLD_NAMES.items()})
+    texts = {new: stored.values.get(new) or stored.values.get(old) for new, old in OLD_NAMES.items()}
+    scan = Settings(stored.subject, {name: text for name, text in texts.items() if text})
     shape = triple(scan.count(name, _MOST) for name in ("numAngles", "numRows", "numCols"))
     arrays, images = folder.matching(".npy"), folder.matching(*SUFFIXES)
     if not arrays and not images:
         raise InputError(str(folder.root), "no .npy and no TIFF", "the line integrals")
-    frames = read_npy(folder.only("stack", ".npy"), 3) if arrays else read_tiffs(images)
+    series = None if arrays else series_of(images, str(folder.root), "complete the frames")
+    frames = read_tiffs(series.paths) if series else read_npy(folder.only("stack", ".npy"), 3)
     if frames.shape != shape:
         raise InputError(str((arrays or images)[0]), f"frames {frames.shape}", f"{shape} of {description.name}")
     timing = assemble.make_timing(str(description), shape[0], options)
@@ -59,11 +62,12 @@ def import_scan(path: Path, options: ImportOptions) -> Scan:
     trajectory, geometry = read(scan, shape, options, timing)
     integrals = line_integrals(str(folder.root), oriented(frames, options, "bottom"), options, convention="attenuation")
     parts = integrals, trajectory, geometry, timing, options
-    return assemble.assemble_scan(*parts, title=description.stem, source=str(path), grid=_grid(scan))
+    said = series.said if series else ""
+    return assemble.assemble_scan(*parts, title=description.stem, source=str(path), grid=_grid(scan), said=said)
 
 
 def _turning(
-    scan: Fields, shape: tuple[int, int, int], options: ImportOptions, timing: assemble.Timing
+    scan: Settings, shape: tuple[int, int, int], options: ImportOptions, timing: assemble.Timing
 ) -> tuple[CircularOrbit | PoseTable, Geometry]:
     """Returns the trajectory of a cone or parallel beam about the z axis."""
     for name in ("helicalPitch", "tiltAngle"):
@@ -71,30 +75,33 @@ def _turning(
             raise scan.error(name, f"{scan.number(name):g}", "0", "write it with convert_to_modularbeam()")
     if scan.word("detectorType", default="flat").lower() != "flat":
         raise scan.error("detectorType", scan.word("detectorType")[:40], "flat")
-    pitch_mm = (scan.length("pixelHeight"), scan.length("pixelWidth"))
+    pitch_mm = options.taken("pixel_size_mm", lambda: (scan.length("pixelHeight"), scan.length("pixelWidth")))
     centre = (scan.number("centerRow"), scan.number("centerCol"))
     sizes = zip(shape[1:], centre, pitch_mm, strict=True)
     off_v, off_u = (((size - 1) / 2 - ray) * pitch for size, ray, pitch in sizes)
     if scan.word("geometry") == "parallel":
         geometry: Geometry = assemble.parallel(options, shape[1:], pitch_mm, (off_v, off_u))
     else:
-        geometry = assemble.cone(options, scan.length("sod"), scan.length("sdd"), shape[1:], pitch_mm, (off_v, off_u))
-    if scan.has("phis"):
-        phi_deg = _list(scan, "phis", shape[0])
-    else:
+        sod, sdd = partial(scan.length, "sod"), partial(scan.length, "sdd")
+        geometry = assemble.cone(options, sod, sdd, shape[1:], pitch_mm, (off_v, off_u))
+
+    def stored_rad() -> np.ndarray:
+        if scan.has("phis"):
+            return np.deg2rad(scan.listed("phis", shape[0]))
         say_missing(scan, {"phis": "angularRange in equal steps from 0°"})
-        phi_deg = np.arange(shape[0]) * (scan.number("angularRange") / shape[0])
-    angle_rad = gantry_sign(options, "gantry") * np.deg2rad(phi_deg - 90)
+        return np.deg2rad(np.arange(shape[0]) * (scan.number("angularRange") / shape[0]))
+
+    angle_rad = gantry_sign(options, "gantry") * (options.angle_rad(shape[0], stored_rad) - np.pi / 2)
     tau_mm = 0.0 if isinstance(geometry, ParallelGeometry) else scan.position("tau")
     return RotaryStage(geometry, tau_mm).turned(angle_rad, timing, scan.subject)
 
 
 def _modular(
-    scan: Fields, shape: tuple[int, int, int], options: ImportOptions, timing: assemble.Timing
+    scan: Settings, shape: tuple[int, int, int], options: ImportOptions, timing: assemble.Timing
 ) -> tuple[PoseTable, Geometry]:
     """Returns the table of poses of a modular beam."""
     options.refuse_unused("leap, which states every view", _OF_TABLES)
-    source, centre, right, up = (_list(scan, name, 3 * shape[0]).reshape(-1, 3) for name in _VECTORS)
+    source, centre, right, up = (scan.listed(name, 3 * shape[0]).reshape(-1, 3) for name in _VECTORS)
     step_u, step_v = right * scan.length("pixelWidth"), up * scan.length("pixelHeight")
     first = centre - (shape[2] - 1) / 2 * step_u - (shape[1] - 1) / 2 * step_v
     poses = np.concatenate([source, first, step_u, step_v], -1)
@@ -102,16 +109,7 @@ def _modular(
     return assemble.table_over_time(lambda position: along(poses, position), timing, scan.subject), geometry
 
 
-def _list(scan: Fields, name: str, count: int) -> np.ndarray:
-    """Returns the numbers (count,) of a line, which commas separate."""
-    try:
-        values = [float(word) for word in str(scan.get(name)).split(",")]
-    except ValueError as error:
-        raise scan.error(name, "a word that is no number", f"{count} numbers") from error
-    return Fields(scan.subject, {name: values}).numbers(name, count)
-
-
-def _grid(scan: Fields) -> Grid | None:
+def _grid(scan: Settings) -> Grid | None:
     """Returns LEAP's volume where the file states one."""
     if not all(map(scan.has, ("numX", "numY", "numZ", "voxelWidth", "voxelHeight"))):
         return None

@@ -21,7 +21,7 @@ from phyradgs_cl.importers.formats.naf import TIGRE_MODULE, PlainUnpickler, name
 from phyradgs_cl.importers.options import TIMING, ImportOptions
 from phyradgs_cl.importers.reading.frames import line_integrals, oriented
 from phyradgs_cl.importers.stage import along
-from phyradgs_cl.io.tables import described
+from phyradgs_cl.io.tables import Fields, described
 
 OPTIONS = (*TIMING, "row_0", "column_0", "quantity", "flat_value", "detector_model")
 _NAMES = ("DSO", "DSD", "nDetector", "dDetector", "nVoxel", "dVoxel", "offOrigin", "offDetector", "rotDetector", "COR")
@@ -53,10 +53,14 @@ def import_scan(path: Path, options: ImportOptions) -> Scan:
     """Imports the projections of a pickle."""
     options.refuse_unused("tigre", OPTIONS)
     content = read_pickle(path, TigreUnpickler)
-    if not isinstance(content, tuple) or len(content) != 3 or not isinstance(content[1], _Geometry):
-        expected = "a tuple (projections, geometry, angles), as TIGRE's loaders return it"
+    if isinstance(content, dict):
+        content = tuple(_named(content, *names) for names in (("proj", "frames"), ("geo",), ("angle", "theta")))
+    if not isinstance(content, (tuple, list)) or len(content) != 3 or not isinstance(content[1], _Geometry):
+        expected = "projections, geometry and angles, in this order as TIGRE's loaders return them, or by these names"
         raise InputError(str(path), described(content), expected)
     frames, geo, angles = content[0], _checked(content[1], path), content[2]
+    if isinstance(angles, (list, tuple)):
+        angles = Fields(f"{path}:", {"angles": list(angles)}).numbers("angles")
     for name, value in (("projections", frames), ("angles", angles)):
         if not isinstance(value, np.ndarray) or value.dtype.kind not in "iuf":
             raise InputError(f"{path}: {name}", described(value), "an array of numbers")
@@ -72,6 +76,11 @@ def import_scan(path: Path, options: ImportOptions) -> Scan:
     integrals = line_integrals(str(path), turned, options, convention="attenuation")
     parts = integrals, trajectory, geometry, timing, options
     return assemble.assemble_scan(*parts, title=path.stem, source=str(path), grid=grid)
+
+
+def _named(content: dict[object, Any], *words: str) -> Any:
+    """Returns the one value of a dictionary whose name begins with one of the words, None where there is none."""
+    return next((value for name, value in content.items() if str(name).lower().startswith(words)), None)
 
 
 def _checked(geo: _Geometry, path: Path) -> SimpleNamespace:

@@ -1,0 +1,321 @@
+"""What formats in HDF5 share: arrays at the addresses of the format, of the user's options or of a TOML, and the beam."""
+
+import logging
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from types import MappingProxyType
+
+import numpy as np
+
+from phyradgs_cl import checks
+from phyradgs_cl.acquisition.geometry import Geometry
+from phyradgs_cl.errors import InputError
+from phyradgs_cl.importers.assemble import Turned, cone, parallel
+from phyradgs_cl.importers.options import ImportOptions
+from phyradgs_cl.importers.reading.files import SafeFolder
+from phyradgs_cl.importers.reading.flats import places
+from phyradgs_cl.importers.reading.frames import LineIntegrals, line_integrals, oriented
+from phyradgs_cl.io import scan as schema
+from phyradgs_cl.io.hdf5.datasets import (
+    ANGLE,
+    LENGTH,
+    Quantity,
+    read_attribute,
+    read_length,
+    read_number,
+    read_per_frame,
+    read_values,
+)
+from phyradgs_cl.io.hdf5.source import Hdf5Source, open_hdf5
+from phyradgs_cl.io.scan.detector import read_duration
+from phyradgs_cl.io.scan.reader import united
+
+_log = logging.getLogger(__name__)
+STACKS = ("projections", "flats", "darks", "mask")
+NAMES = (*STACKS, "image_key", "angles", "axes")
+_AXES = ("frame", "v", "u")
+_DISTANCES = ("source_to_axis_mm", "source_to_detector_mm")
+_LIKE = 0.1  # relative difference of two sizes that may be of one pixel
+_LEAST_MM = 1e-4  # of a pixel
+_TIMES = replace(LENGTH, name="magnification", assumed="", factors=MappingProxyType({"": 1.0, "x": 1.0}))
+
+
+def is_address(text: object) -> bool:
+    """True for FILE:/ADDRESS."""
+    return isinstance(text, str) and text.rpartition(":/")[0] != ""
+
+
+@dataclass(frozen=True, eq=False)
+class Places:
+    """Where the arrays of a scan are. ``stated``: for some of ``NAMES`` FILE:/ADDRESS, or /ADDRESS of ``source``; for "axes"
+    the order of frames' axes. ``subject`` says who states it. ``folder``: where the files lie; None for files that the user
+    named on the command line, which may lie anywhere."""
+
+    stated: Mapping[str, Sequence[str]]
+    subject: str
+    linked_folder: Path | None
+    source: Hdf5Source | None = None
+    folder: SafeFolder | None = None
+
+    @contextmanager
+    def opened(self, name: str, text: str) -> Iterator[tuple[Hdf5Source, str]]:
+        """Yields the open file and the address inside it of one place."""
+        file, _, address = str(text).rpartition(":/")
+        subject = f"{self.subject} {name}"
+        if self.source is not None and not file and text.startswith("/"):
+            yield self.source, text
+            return
+        if not file:
+            raise InputError(subject, repr(text)[:80], "an address in HDF5, as FILE:/ADDRESS", "'h5ls -r FILE' lists them")
+        if self.folder is not None:
+            path = self.folder.file(file, subject)
+        else:
+            beside = Path() if self.source is None else self.source.path.parent
+            path = Path(file) if Path(file).exists() else beside / file
+        with open_hdf5(path, self.linked_folder) as other:
+            yield other, f"/{address}"
+
+    def _at(self, name: str, usual: Sequence[str]) -> Sequence[str]:
+        """Returns where an array is: the stated places, else the usual ones at which something is."""
+        there = [address for address in usual if self.source is not None and self.source.find(address) is not None]
+        return self.stated.get(name, there)
+
+    def parts(
+        self, name: str, usual: Sequence[str] = (), panel: tuple[int, int] | None = None
+    ) -> dict[str, np.ndarray]:
+        """Reads frames (n, v, u) in their own type, by place. ``usual``: addresses of the format, as far as they exist."""
+        stacks: dict[str, np.ndarray] = {}
+        for text in self._at(name, usual):
+            with self.opened(name, text) as (source, address):
+                stacks[text] = self._stack(source, address, panel)
+        return stacks
+
+    def _stack(self, source: Hdf5Source, address: str, panel: tuple[int, int] | None) -> np.ndarray:
+        dataset, order = source.dataset(address), self._order()
+        long = [count for count in dataset.shape if count != 1]  # 1: axes that say nothing
+        shape = dataset.shape if dataset.ndim <= len(_AXES) or len(long) > len(_AXES) else tuple(long)
+        axes = [order.index(name) for name in _AXES]
+        if len(shape) == len(_AXES) - 1 and panel is not None:
+            shape = tuple(np.insert(shape, order.index("frame"), 1).tolist())
+        if len(shape) != len(_AXES) or min(shape) < 1:
+            raise source.error(address, f"shape {dataset.shape}", "three axes (frame, v, u), none of them empty")
+        sides = tuple(shape[axis] for axis in axes)
+        if panel is not None and sides[1:] != panel:
+            raise source.error(address, f"shape {dataset.shape}", f"(any, {panel[0]}, {panel[1]}), as the projections")
+        return read_values(source, address, dataset).reshape(shape).transpose(axes)
+
+    def _order(self) -> list[str]:
+        order = self.stated.get("axes", [",".join(_AXES)])[0].replace(",", " ").split()
+        if sorted(order) != sorted(_AXES):
+            remedy = "of a stack of sinograms say v,frame,u"
+            raise InputError(f"{self.subject} axes", " ".join(order), "frame, v and u in the order of the data", remedy)
+        return order
+
+    def stacks(
+        self, projections: str = "/", *, key: Sequence[str] = (), flats: Sequence[str] = (), darks: Sequence[str] = (),
+        mask: Sequence[str] = (),
+    ) -> "Stacks":
+        """Reads all frames at the usual addresses of a format, or at the stated ones. A key of the frames sorts them;
+        flats and darks at addresses count before its own."""
+        if self.source is not None and "projections" not in self.stated:
+            self.source.dataset(projections)  # or says what is there in its place
+        frames = joined(self.parts("projections", [projections]))
+        panel = (frames.shape[1], frames.shape[2])
+        kinds = self._key(key, len(frames))
+        used = kinds == schema.PROJECTION
+        stacks, flats_at = {"flats": frames[kinds == schema.FLAT], "darks": frames[kinds == schema.DARK]}, None
+        if len(stacks["flats"]):
+            flats_at = places(kinds == schema.FLAT, used)
+        for name, addresses in (("flats", flats), ("darks", darks), ("mask", mask)):
+            if parts := self.parts(name, addresses, panel):
+                stacks[name] = joined(parts)
+                flats_at = _times_of(parts, int(used.sum())) if name == "flats" else flats_at
+        frames = frames if used.all() else frames[used]
+        return Stacks(frames, stacks["flats"], stacks["darks"], _mask(stacks.get("mask"), used), used, flats_at)
+
+    def _key(self, usual: Sequence[str], frames: int) -> np.ndarray:
+        """Reads the keys (F,) of frames, those of ``io.scan``; without any all frames are projections."""
+        for text in self._at("image_key", usual)[:1]:
+            with self.opened("image_key", text) as (source, address):
+                values = read_values(source, address, source.dataset(address))
+                checks.shape(source.name(address), values, (frames,))
+                key = np.where(values == -1, schema.INVALID, values)  # -1: frames by which nxtomo aligns
+                if len(wrong := key[~np.isin(key, range(schema.INVALID + 1))]):
+                    raise source.error(address, f"{wrong[0]:g}", "0 projection, 1 flat, 2 dark or 3 invalid")
+                if not np.any(key == schema.PROJECTION):
+                    raise source.error(address, "no projection", "at least one 0")
+                return key.astype(np.int64)
+        return np.full(frames, schema.PROJECTION)
+
+    def angles_rad(self, used: np.ndarray, options: ImportOptions, usual: str = "", unit: str = "deg") -> np.ndarray:
+        """Reads the angles, as stored, of the frames that ``used`` (F,) marks. ``unit``: of a dataset that states none."""
+        quantity = replace(ANGLE, assumed=unit)
+        asked = [options.angles] if options.angles and is_address(options.angles) else self.stated.get("angles", ())
+        for text in asked:
+            with self.opened("angles", text) as (source, address):
+                return read_per_frame(source, address, used, quantity)
+        assert self.source is not None
+        source = self.source
+        return options.angle_rad(int(used.sum()), lambda: read_per_frame(source, usual, used, quantity))
+
+
+@dataclass(frozen=True, eq=False)
+class Stacks:
+    """Projections (P, v, u), flats and darks (n, v, u) or None, and a mask (v, u) or (P, v, u), non-zero for pixels that are
+    not to be used, or None. ``used`` (F,): which of the stored frames are projections. ``flats_at``: see
+    ``flats.light_of``."""
+
+    projections: np.ndarray
+    flats: np.ndarray
+    darks: np.ndarray
+    mask: np.ndarray | None
+    used: np.ndarray
+    flats_at: np.ndarray | None
+
+    @property
+    def panel(self) -> tuple[int, int]:
+        return self.projections.shape[1], self.projections.shape[2]
+
+    def turned(self, turn: Turned) -> "Stacks":
+        """Returns the stacks with flips that a file declares."""
+        frames, flats, darks = (turn.frames(one) for one in (self.projections, self.flats, self.darks))
+        mask = None if self.mask is None else turn.frames(self.mask)
+        return replace(self, projections=frames, flats=flats, darks=darks, mask=mask)
+
+    def line_integrals(
+        self, subject: str, options: ImportOptions, row_0: str, convention: str | None = None
+    ) -> LineIntegrals:
+        """Converts the projections; see ``frames.line_integrals`` and ``oriented``."""
+        frames, flats, darks = (oriented(one, options, row_0) for one in (self.projections, self.flats, self.darks))
+        integrals = line_integrals(
+            subject, frames, options, flats=flats, darks=darks, convention=convention, flats_at=self.flats_at
+        )
+        if self.mask is None:
+            return integrals
+        return replace(integrals, mask=united(oriented(self.mask, options, row_0) != 0, integrals.mask))
+
+
+def joined(parts: Mapping[str, np.ndarray]) -> np.ndarray:
+    """Returns all frames of several places, one place after the other."""
+    stacks = list(parts.values())
+    return stacks[0] if len(stacks) == 1 else np.concatenate(stacks)
+
+
+def _times_of(parts: Mapping[str, np.ndarray], projections: int) -> np.ndarray | None:
+    """Returns the places of flats among the projections, of addresses that say before or after; None where one does not."""
+    at = {"pre": -0.5, "post": projections - 0.5}
+    words = [address.rpartition("_")[2] for address in parts]
+    if not all(word in at for word in words):
+        return None
+    return np.concatenate([np.full(len(stack), at[word]) for word, stack in zip(words, parts.values(), strict=True)])
+
+
+def _mask(stack: np.ndarray | None, used: np.ndarray) -> np.ndarray | None:
+    """Returns one mask for all frames, or one for each used frame; None where no pixel is masked."""
+    if stack is None or not stack.any():
+        return None
+    if len(stack) not in (1, len(used)):
+        raise InputError("mask", f"{len(stack)} images", f"one, or {len(used)} as there are frames")
+    return stack[0] if len(stack) == 1 else stack[used]
+
+
+def places_of(options: ImportOptions, source: Hdf5Source) -> Places:
+    """Returns the places that options state. InputError for other names."""
+    stated: dict[str, list[str]] = {}
+    subject = options.named("at")
+    for text in options.at or ():
+        name, sign, value = text.partition("=")
+        if name not in NAMES or not sign or not value:
+            raise InputError(subject, repr(text)[:80], f"NAME=FILE:/ADDRESS, NAME one of {', '.join(NAMES)}")
+        stated.setdefault(name, []).append(value)
+    return Places(stated, subject, options.linked_folder, source)
+
+
+@dataclass(frozen=True)
+class Lengths:
+    """Addresses of the lengths of a scan: the distances from the axis to source and panel, and pairs (v, u) of a pixel's
+    sides, at the sample and on the panel, of which the first that exists counts. ``optics``: of their magnification."""
+
+    source: str
+    detector: str
+    at_sample: tuple[tuple[str, str], ...]
+    on_panel: tuple[tuple[str, str], ...]
+    optics: str = ""
+
+
+def beam(
+    source: Hdf5Source, lengths: Lengths, options: ImportOptions, panel: tuple[int, int], axis_columns: float = 0.0
+) -> Geometry:
+    """Returns the geometry of a file, or the options' numbers where they are given. Where neither states a distance of the
+    source the beam is parallel, with a warning. ``axis_columns``: from the rotation axis to the panel's middle."""
+    quantity = _length_of(source, lengths)
+
+    def sides_mm(pairs: Sequence[tuple[str, str]]) -> tuple[float, float] | None:
+        for pair in pairs:
+            if there := [address for address in pair if source.find(address) is not None]:
+                unit = replace(LENGTH, assumed="um") if there[0].endswith("resolution") else quantity
+                return read_length(source, there[0], unit), read_length(source, there[-1], unit)
+        return None
+
+    def pitch_mm() -> tuple[float, float]:
+        """Returns the pixel's sides on a panel behind the sample, without optics between them."""
+        at_sample, on_panel = sides_mm(lengths.at_sample), sides_mm(lengths.on_panel)
+        if at_sample is None and on_panel is not None and lengths.optics and source.find(lengths.optics) is not None:
+            times = read_length(source, lengths.optics, _TIMES)
+            at_sample = on_panel[0] / times, on_panel[1] / times
+        if at_sample is None or at_sample == on_panel:
+            if on_panel is None:
+                raise source.error(lengths.on_panel[0][0], "nothing", "a length")
+            return on_panel
+        widened = at_sample[0] * to_detector_mm / to_axis_mm, at_sample[1] * to_detector_mm / to_axis_mm
+        if on_panel is not None and not np.allclose(widened, on_panel, rtol=_LIKE, atol=0):
+            text = "%s: pixels of %.4g mm at the sample are taken, not those of %.4g mm on the panel"
+            _log.warning(text, source.path, at_sample[1], on_panel[1])
+        return widened
+
+    to_axis_mm = to_detector_mm = 1.0
+    if not options.given(_DISTANCES) and source.find(lengths.source) is None:
+        _log.warning("%s: no source distance: a parallel beam", source.name(lengths.source))
+        sides = options.taken("pixel_size_mm", pitch_mm)
+        return parallel(options, panel, sides, (0.0, axis_columns * sides[1]))
+    to_axis_mm = options.taken("source_to_axis_mm", lambda: _to_axis_mm(source, lengths.source, quantity))
+    to_detector_mm = options.taken(
+        "source_to_detector_mm", lambda: to_axis_mm + read_length(source, lengths.detector, quantity)
+    )
+    sides = options.taken("pixel_size_mm", pitch_mm)
+    return cone(options, to_axis_mm, to_detector_mm, panel, sides, (0.0, axis_columns * sides[1]))
+
+
+def _length_of(source: Hdf5Source, lengths: Lengths) -> Quantity:
+    """Returns how to read the file's lengths: without units they are in metres where a pixel in mm would be smaller than
+    light can see."""
+    for address in (address for pair in (*lengths.at_sample, *lengths.on_panel) for address in pair):
+        if source.find(address) is None or read_attribute(source, address, "units"):
+            continue
+        if abs(float(read_values(source, address, source.dataset(address)).ravel()[0])) < _LEAST_MM:
+            return replace(LENGTH, assumed="m")
+    return LENGTH
+
+
+def _to_axis_mm(source: Hdf5Source, address: str, quantity: Quantity) -> float:
+    distance_mm = abs(read_number(source, address, quantity))  # NeXus gives it a minus sign
+    if distance_mm == 0:
+        raise source.error(address, "0", "a length other than 0", "remove it: without one the beam is parallel")
+    return distance_mm
+
+
+def exposure_s(source: Hdf5Source, address: str, used: np.ndarray, options: ImportOptions) -> float | None:
+    """Reads the exposure of the used frames, or takes the options' in its place. Where it differs, a gantry that stops for
+    every frame gets none, with a warning. None where the file has none."""
+    if options.exposure_s is not None:
+        return options.exposure_s if source.find(address) is not None else None
+    try:
+        return read_duration(source, address, used, needed=False) or None
+    except InputError as error:
+        if options.frame_time_s is not None:
+            remedy = f"say {options.named('exposure_s')}"
+            raise InputError(error.subject, error.found, error.expected, remedy) from error
+        _log.warning("%s: not used, because the gantry stops for every frame", error)
+        return None

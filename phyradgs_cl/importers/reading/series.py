@@ -1,0 +1,236 @@
+"""Which files of a folder are a scan's frames, and their order: the numbers in their names, read as a person reads them.
+
+A number may be an index, an angle with sign and decimals, or a time. Files whose names have other words than the most are
+left out by name. A number that is missing, or there twice, is refused: all later angles would be wrong."""
+
+import logging
+import re
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path
+
+import numpy as np
+
+from phyradgs_cl.errors import InputError
+
+_log = logging.getLogger(__name__)
+_NUMBER = re.compile(r"([-+]?)(\d+)(?:[.,](\d+))?")
+_DATE = r"(?<!\d)((?:19|20)\d\d)[-_.]?(0[1-9]|1[0-2])[-_.]?(0[1-9]|[12]\d|3[01])"
+_TIME = re.compile(_DATE + r"[-_ T.]*([01]\d|2[0-3])[-_.:h]?([0-5]\d)[-_.:m]?([0-5]\d)(?!\d)")
+_DEGREES, _ANGLE = re.compile(r"[ _]?(deg|°|grad)", re.I), re.compile(r"(deg|angle|ang|theta|phi|rot)[ _=]*$", re.I)
+_STEADY, _GAP = 0.25, 1.5  # of the usual step: how far a regular one differs; a gap between angles or times
+_USUAL, _STEADY_ANGLES = 0.5, 0.75  # share of regular steps in a series, and in angles or times whose gaps are holes
+_SMALL = 0.25  # of the largest group of names: smaller ones are no frames
+_BEFORE, _AFTER = (re.compile(rf"(?<![a-z])({words})(?![a-z])", re.I) for words in ("before|pre|start", "after|post|end"))
+_STAMP = 10**7  # numbers from here on count milliseconds, and no frames
+_MOST_NAMES = 8  # in a message
+
+
+@dataclass(frozen=True, eq=False)
+class Series:
+    """Files in the order of the scan, the number of each, (F,) or None without numbers, and what was taken, in words."""
+
+    paths: list[Path]
+    numbers: np.ndarray | None
+    said: str
+
+
+@dataclass(frozen=True, eq=False)
+class _Column:
+    """The numbers (F,) at one place of the names. ``is_angle``: in degrees, by the words beside them."""
+
+    place: int
+    values: np.ndarray
+    is_angle: bool
+
+    @property
+    def is_distinct(self) -> bool:
+        return len(np.unique(self.values)) == len(self.values)
+
+    @property
+    def steps(self) -> tuple[float, np.ndarray]:
+        """The usual step between the sorted numbers, and how many of it each step (F − 1,) is. The usual step is the most
+        frequent one, or the median."""
+        steps = np.diff(np.sort(self.values))
+        if not len(steps):
+            return 1.0, steps
+        sizes, counts = np.unique(np.round(steps, 6), return_counts=True)
+        usual = float(sizes[np.argmax(counts * (sizes > 0))])
+        if 2 * counts.max() < len(steps):
+            usual = float(np.median(steps))
+        return usual, steps / (usual or 1.0)
+
+    @property
+    def regular(self) -> float:
+        """The share of steps that are the usual one."""
+        return float(np.mean(np.abs(self.steps[1] - 1) <= _STEADY)) if len(self.values) > 1 else 1.0
+
+    @property
+    def rank(self) -> tuple[bool, bool, bool]:
+        """Ranks columns: regular ones before others, indices before angles, whole numbers before times."""
+        return self.regular < _USUAL, self.is_angle, self.values.dtype.kind == "f"
+
+
+def series_of(
+    paths: Sequence[Path], subject: str, remedy: str, *, order: int | None = None, holes: bool = False, skip: int = 0
+) -> Series:
+    """Returns the frames among files, in their order. ``subject`` says where they are named; ``remedy``: what to do about a
+    hole. ``order``: the place of the number that counts, 1 the first; None finds it. ``holes``: numbers may be left out.
+    ``skip``: letters of a prefix that all files have. InputError: a hole, one number twice, several series."""
+    paths = list(paths) if skip else _of_one_series(list(paths), subject)
+    columns = _columns([path.stem[skip:] for path in paths])
+    if order is not None and order not in {column.place for column in columns}:
+        raise InputError(subject, f"{order}", f"the place of a number, from 1 on, in {paths[0].name}")
+    varying = [column for column in columns if len(paths) == 1 or np.ptp(column.values)]
+    if not varying:
+        words = "" if len(paths) == 1 else ", in the order of the alphabet: no number in their names gives one"
+        if len({path.stem for path in paths}) < len(paths):
+            raise InputError(subject, f"{paths[1].name} after {paths[0].name}: one name twice", "every name once", remedy)
+        return Series(paths, None, f"frames: {_ends(paths)}{words}")
+    distinct = sorted((column for column in varying if column.is_distinct), key=lambda column: column.rank)
+    if order is not None:
+        distinct = [column for column in columns if column.place == order][:1]
+    if not distinct and not _is_counted_twice(varying):
+        return _refuse_double(paths, varying, subject, remedy)
+    keys = distinct[:1] or varying
+    at = np.lexsort([column.values for column in reversed(keys)])
+    paths = [paths[i] for i in at]
+    if len(keys) > 1:
+        places = " and ".join(str(column.place) for column in keys)
+        return Series(paths, np.arange(len(paths)), f"frames: {_ends(paths)}, by the numbers {places} in their names")
+    key = keys[0]
+    if order is None:
+        _warn_of_others(subject, key, distinct[1:])
+    numbers, (step, of_usual) = key.values[at], key.steps
+    is_index = not key.is_angle and key.values.dtype.kind == "i" and numbers[-1] < _STAMP
+    is_gap = np.abs(of_usual - 1) > _STEADY if is_index else (of_usual >= _GAP) & (key.regular >= _STEADY_ANGLES)
+    for gap in np.flatnonzero((of_usual == 0) | (is_gap & (not holes)))[:1]:
+        kind = "a hole" if of_usual[gap] else "one number"
+        found = f"{paths[gap + 1].name} after {paths[gap].name}: {kind} in the numbering"
+        raise InputError(subject, found, "every number once", remedy)
+    steps = f"in steps of {step:g}" if key.regular == 1 else "in uneven steps, in which no hole shows"
+    what = "angle" if key.is_angle else "number"
+    by = f"by {what} {key.place} in their names, {numbers[0]:g} to {numbers[-1]:g} {steps}"
+    return Series(paths, numbers, f"frames: {_ends(paths)}, {by}")
+
+
+def _ends(paths: list[Path]) -> str:
+    return paths[0].name if len(paths) == 1 else f"{len(paths)} files, {paths[0].name} to {paths[-1].name}"
+
+
+def _words(name: str) -> tuple[str, ...]:
+    """Returns the words between the numbers of a name."""
+    return tuple(_NUMBER.sub("\0", _TIME.sub("\0", name)).lower().split("\0"))
+
+
+def _of_one_series(paths: list[Path], subject: str) -> list[Path]:
+    """Returns the files whose names have the words of the most names, or words that alternate with theirs."""
+    groups: dict[tuple[str, ...], list[Path]] = {}
+    for path in paths:
+        groups.setdefault(_words(path.stem), []).append(path)
+    largest = max(groups.values(), key=len)
+    if len(largest) == 1:
+        return paths
+    large = [group for group in groups.values() if len(group) >= max(2, _SMALL * len(largest))]
+    taken = [path for path in paths if any(_words(path.stem) == _words(group[0].stem) for group in large)]
+    if len(large) > 1 and not _do_alternate(large):
+        names = ", ".join(f"{group[0].name} and {len(group) - 1} more" for group in large[:_MOST_NAMES])
+        remedy = "name one of them as the projections, and others as flats or darks"
+        raise InputError(subject, f"several series of files: {names}", "one", remedy)
+    if strays := [path.name for path in paths if path not in taken]:
+        text = "%s: %d files are no frames by their names, and are left out: %s"
+        _log.warning(text, subject, len(strays), ", ".join(strays[:_MOST_NAMES]))
+    return taken
+
+
+def _do_alternate(groups: list[list[Path]]) -> bool:
+    """True for names of as many numbers, one of which counts through all groups, not group by group."""
+    if len({len(_words(group[0].stem)) for group in groups}) > 1:
+        return False
+    owner = [i for i, group in enumerate(groups) for _ in group]
+    for column in _columns([path.stem for group in groups for path in group]):
+        if column.is_distinct:
+            sorted_owner = np.array(owner)[np.argsort(column.values)]
+            return bool(np.count_nonzero(np.diff(sorted_owner)) >= min(map(len, groups)))
+    return False
+
+
+def _columns(names: list[str]) -> list[_Column]:
+    """Returns the numbers of names that have as many words, place by place."""
+    columns, clocks = _read(names), [_TIME.search(name) for name in names]
+    others = _read([_TIME.sub("", name) for name in names])
+    if all(clocks) and not any(column.is_distinct for column in others):
+        times = [datetime(*map(int, clock.groups())) for clock in clocks if clock]  # type: ignore[arg-type]
+        seconds = np.array([(time - times[0]).total_seconds() for time in times])
+        return [*others, _Column(len(columns) + 1, seconds, False)]
+    return columns
+
+
+def _read(names: list[str]) -> list[_Column]:
+    found = [list(_NUMBER.finditer(name)) for name in names]
+    if len({len(numbers) for numbers in found}) > 1:
+        return []
+    return [column for place, numbers in enumerate(zip(*found, strict=True), 1) for column in _column(place, numbers)]
+
+
+def _column(place: int, numbers: tuple[re.Match[str], ...]) -> Iterator[_Column]:
+    """Yields the numbers of one place; two columns for numbers with a point between them that are no decimals."""
+    befores, afters = ([one.string[: one.start()] for one in numbers], [one.string[one.end() :] for one in numbers])
+    is_angle = all(map(_DEGREES.match, afters)) or all(map(_ANGLE.search, befores))
+    signs, decimals = [one[1] for one in numbers], [one[3] or "" for one in numbers]
+    # a hyphen in all names stands between two words, but not before an angle behind a space
+    is_signed = not all(signs) or (is_angle and not any(before[-1:].isalnum() for before in befores))
+    sign = [-1 if is_signed and one == "-" else 1 for one in signs]
+    whole = [int(one[2]) for one in numbers]
+    if not any(decimals):
+        yield _Column(place, np.array(whole) * sign, is_angle)
+    elif is_angle or len({len(one) for one in decimals}) == 1:
+        texts = zip(sign, whole, decimals, strict=True)
+        yield _Column(place, np.array([s * float(f"{w}.{d or 0}") for s, w, d in texts]), is_angle)
+    else:
+        yield _Column(place, np.array(whole), False)
+        yield _Column(place, np.array([int(one or 0) for one in decimals]), False)
+
+
+def _is_counted_twice(columns: list[_Column]) -> bool:
+    """True for numbers that count within each other, as turn and frame: every frame in every turn."""
+    pairs = set(zip(*(column.values.tolist() for column in columns), strict=True))
+    full = np.prod([len(np.unique(column.values)) for column in columns])
+    return len(pairs) == len(columns[0].values) == full
+
+
+def _refuse_double(paths: list[Path], columns: list[_Column], subject: str, remedy: str) -> Series:
+    """Raises InputError for the first number that is there twice, at the place with the most numbers."""
+    key = max(columns, key=lambda column: len(np.unique(column.values)))
+    counts = Counter(key.values.tolist())
+    first, second, *_ = [path for path, value in zip(paths, key.values.tolist(), strict=True) if counts[value] > 1]
+    found = f"{second.name} after {first.name}: one number twice, or a hole in the numbering"
+    raise InputError(subject, found, "every number once", remedy)
+
+
+def _warn_of_others(subject: str, key: _Column, others: list[_Column]) -> None:
+    """Says that another number in the names gives another order."""
+    ranks = [np.argsort(np.argsort(column.values)) for column in (key, *others)]
+    for other, rank in zip(others, ranks[1:], strict=True):
+        if not (np.array_equal(rank, ranks[0]) or np.array_equal(rank, ranks[0][::-1])):
+            kind = "angle" if other.is_angle else "number"
+            text = "%s: number %d in the names gives the order, and %s %d another one: say [frames] order = %d for that"
+            _log.warning(text, subject, key.place, kind, other.place, other.place)
+            return
+
+
+def flat_places(flats: list[Path], darks: list[Path], series: Series) -> np.ndarray | None:
+    """Returns the places (n,) of flats among the projections, as of ``flats.places``, by words such as "before" in their
+    names, or by numbers that go on through flats, darks and projections; None where neither says it."""
+    ends = [[bool(words.search(path.stem)) for path in flats] for words in (_BEFORE, _AFTER)]
+    if flats and all(map(np.logical_xor, *ends)):
+        return np.where(ends[0], -0.5, len(series.paths) - 0.5)
+    own = [_columns([path.stem for path in paths]) for paths in (flats, darks) if paths]
+    if not flats or not all(own) or series.numbers is None:
+        return None
+    numbers = [*(columns[-1].values for columns in own), series.numbers]
+    if np.any(np.diff(np.sort(np.concatenate(numbers))) != 1):
+        return None
+    return np.asarray(np.searchsorted(np.sort(series.numbers), numbers[0]) - 0.5)

@@ -1,0 +1,141 @@
+"""Numbers in texts as people and their programs write them: decimal commas, units behind a number, tables of angles."""
+
+import logging
+import re
+from pathlib import Path
+
+import numpy as np
+
+from phyradgs_cl.errors import InputError
+from phyradgs_cl.importers.reading.files import SafeFolder, read_text
+from phyradgs_cl.io.tables import LARGEST
+
+_log = logging.getLogger(__name__)
+_BEGINNING = re.compile(r"([-+]?(?:\d[\d.,]*|[.,]\d+))([eE][-+]?\d+)?(?=$|[\s;°µμa-zA-Z%(])(?![eE][-+]?\d)[\s;]*(.*)", re.S)
+_ENGLISH, _GERMAN = (re.compile(rf"[-+]?\d{{1,3}}({k}\d{{3}})+{d}") for k, d in ((",", r"(\.\d+|,\d{3})"), (r"\.", r",\d+")))
+_ONE_COMMA, _EITHER = re.compile(r"[-+]?\d*,\d+"), re.compile(r"[-+]?[1-9]\d{0,2},\d{3}")
+_COLUMNS = re.compile(r",\s+|[;:\s]+")
+_ANGLE, _RAD = re.compile(r"angle|theta|phi|rot|deg", re.I), re.compile(r"\brad", re.I)
+TO_RAD = {"deg": np.pi / 180, "rad": 1.0}
+
+
+def number_at_start(text: str, comma_is_decimal: bool = False) -> tuple[float, str] | None:
+    """Returns the number that a text begins with, and the text behind it, such as a unit. None where there is none, and
+    where a comma may stand for a decimal point or for thousands: as in 1,000 unless ``comma_is_decimal``."""
+    if not (found := _BEGINNING.match(text.strip())):
+        return None
+    digits, power, rest = found[1], found[2] or "", found[3]
+    if _ENGLISH.fullmatch(digits):
+        digits = digits.replace(",", "")
+    elif _GERMAN.fullmatch(digits):
+        digits = digits.replace(".", "").replace(",", ".")
+    elif _ONE_COMMA.fullmatch(digits) and (comma_is_decimal or not _EITHER.fullmatch(digits)):
+        digits = digits.replace(",", ".")
+    try:
+        return float(digits + power), rest
+    except ValueError:
+        return None
+
+
+def commas_are_decimal(texts: list[str]) -> bool:
+    """True where some of the texts have a comma that can only be a decimal one, and none has a decimal point."""
+    commas = any(_ONE_COMMA.fullmatch(text) and not _EITHER.fullmatch(text) for text in texts)
+    return commas and not any(re.fullmatch(r"[-+]?\d*\.\d+", text) for text in texts)
+
+
+def read_angles_rad(path: Path, count: int, unit: str | None = None, column: int | None = None) -> np.ndarray:
+    """Reads (count,) angles in rad of a text file: one a line or all in one line, or in a column beside an index. A line of
+    names may say which column, and the unit, if ``unit`` ("deg", "rad") does not: else degrees. Text after a # is ignored.
+    ``column`` has the angles. InputError: another count, several columns without names, lines that are no numbers."""
+    lines = [(i, line.partition("#")[0].strip()) for i, line in enumerate(read_text(path).splitlines(), 1)]
+    lines = [(i, line) for i, line in lines if line]
+    is_header = [not re.search(r"\d", line) or (_cells(line, True) or _cells(line, False)) is None for _, line in lines]
+    head = is_header.index(False) if False in is_header else len(lines)
+    if column is not None:  # a maker's file, whose lines above the table may hold numbers too
+        head = max(head, len(lines) - count)
+    names, rows = [line for _, line in lines[:head]], lines[head:]
+    is_comma = _is_decimal_comma(path, [line for _, line in rows])
+    table = []
+    for i, line in rows:
+        if (cells := _cells(line, is_comma)) is None or not all(abs(value) <= LARGEST for value in cells):
+            raise InputError(f"{path} line {i}", repr(line[:40]), "a finite number, or an index and a number")
+        table.append(cells)
+    values = _column(path, names, table, count, column)
+    if len(values) != count:
+        raise InputError(str(path), f"{len(values)} angles", f"{count}, one for each frame")
+    return values * TO_RAD[unit or ("rad" if names and _RAD.search(names[-1]) else "deg")]
+
+
+def _cells(line: str, is_comma: bool) -> list[float] | None:
+    """Returns the numbers of a line of a table; None for anything else."""
+    parts = [part for part in (_COLUMNS if is_comma else re.compile(r"[,;:\s]+")).split(line) if part]
+    try:
+        return [float(part.replace(",", ".")) for part in parts]
+    except ValueError:
+        return None
+
+
+def _is_decimal_comma(path: Path, lines: list[str]) -> bool:
+    """True where commas in a table are decimal ones, False where they are between its columns."""
+    parts = [part for line in lines for part in _COLUMNS.split(line) if part]
+    if not all(part.count(",") < 2 and "." not in part for part in parts if "," in part):
+        return False
+    pairs = [part.split(",") for part in parts if "," in part]
+    if not pairs or any(left.strip("+-") == "" or not right.isdecimal() for left, right in pairs):
+        return True
+    if len(pairs) < len(lines) or not _is_index([float(left) for left, _ in pairs]):
+        return True
+    rights = [right for _, right in pairs]
+    if len({right.rstrip("0") for right in rights}) == 1 or any(right[0] == "0" and len(right) > 1 for right in rights):
+        return True
+    if len({len(right) for right in rights}) > 1:
+        return False
+    raise InputError(str(path), f"{lines[0][:30]!r}: a decimal comma, or two columns", "a point, or columns with a ;")
+
+
+def _is_index(values: list[float]) -> bool:
+    """True for the numbers from 0 or 1 on, in any order."""
+    first = min(values)
+    return len(values) > 1 and first in (0, 1) and sorted(values) == [first + i for i in range(len(values))]
+
+
+def _column(path: Path, names: list[str], table: list[list[float]], count: int, column: int | None) -> np.ndarray:
+    """Returns the angles of a table: its only column or row, the one with a name, or the one beside an index."""
+    widths = {len(row) for row in table}
+    if widths == {1} or (len(table) == 1 and column is None) or (len(table) < count == sum(map(len, table))):
+        return np.array([value for row in table for value in row])
+    if len(widths) != 1:
+        raise InputError(str(path), f"lines of {min(widths, default=0)} to {max(widths, default=0)} numbers", "one a line")
+    (width,), columns = widths, np.array(table).T
+    named = [i for i, name in enumerate(re.split(r"[\t;,]\s*|\s{2,}", names[-1])) if _ANGLE.search(name)] if names else []
+    if column is None and len(named) == 1 and named[0] < width:
+        column = named[0]
+    if column is None and width == 2 and _is_index(columns[0].tolist()):
+        column = 1
+    if column is None or column >= width:
+        remedy = "leave an index and the angles, or name the columns in a line above"
+        raise InputError(str(path), f"{width} numbers a line", "one angle a line", remedy)
+    is_counted = column > 0 and _is_index(columns[0].tolist())
+    return np.asarray(columns[column][np.argsort(columns[0])] if is_counted else columns[column])
+
+
+def file_of_angles(folder: SafeFolder, name: str, *ends: str) -> Path | None:
+    """Returns the file ``name`` with the first of the ``ends`` that is there, else the only file with such an end."""
+    for end in ends:
+        files = folder.glob(f"*{end}")
+        own = [file for file in files if file.name.lower() == f"{name}{end}".lower()]
+        if own or len(files) == 1:
+            return (own or files)[0]
+    return None
+
+
+def measured_angles_rad(path: Path, steps_rad: np.ndarray) -> np.ndarray:
+    """Reads measured angles (F,) in rad. Such files count up or down, in either order: taken is what agrees best with equal
+    steps (F,). A line says how far both are apart."""
+    listed_rad = np.unwrap(read_angles_rad(path, len(steps_rad), column=1))
+    ways = [steps_rad[0] + way - way[0] for way in (listed_rad, listed_rad[::-1], -listed_rad, -listed_rad[::-1])]
+    off_deg = [float(np.rad2deg(np.abs(way - steps_rad).max())) for way in ways]
+    best = int(np.argmin(off_deg))
+    text = "%s: these measured angles are used; they differ from equal steps by %.3g° at most"
+    _log.warning(text, path, off_deg[best])
+    return ways[best]

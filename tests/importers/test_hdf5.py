@@ -1,0 +1,270 @@
+"""HDF5 files as beamlines have them: links, virtual datasets, bare arrays at addresses, pixels at the sample, units."""
+
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+
+from phyradgs_cl.errors import InputError
+from phyradgs_cl.importers import ImportOptions, import_scan, load_volume
+from phyradgs_cl.importers.options import option_name
+
+KEY = np.repeat([2, 1, 0, 1], [1, 2, 6, 2])
+ANGLE_DEG = np.where(KEY == 0, np.cumsum(KEY == 0) * 20.0 - 20.0, np.nan)
+FRAMES = np.choose(KEY, [20000, 50000, 100])[:, None, None] * np.ones((1, 4, 5))
+FRAMES[KEY == 0, :, 1] = 10000.0
+
+
+def nxtomo(path: Path, entry: str = "entry", **arrays: object) -> Path:
+    """A small NXtomo; ``arrays`` replace datasets, by their last names, or leave them out (None)."""
+    values: dict[str, object] = {
+        "instrument/detector/data": FRAMES.astype(np.uint16), "instrument/detector/image_key": KEY,
+        "instrument/detector/x_pixel_size": 0.0065, "instrument/detector/y_pixel_size": 0.0065,
+        "sample/rotation_angle": ANGLE_DEG,
+    }  # fmt: skip
+    with h5py.File(path, "a") as file:
+        group = file.create_group(entry)
+        group["definition"] = "NXtomo"
+        for address, value in values.items():
+            value = arrays.get(address.rpartition("/")[2], value)
+            if value is not None:
+                group[address] = value
+    return path
+
+
+def same(path: Path, options: ImportOptions | None = None) -> None:
+    """The scan is the one of ``nxtomo``."""
+    scan = import_scan(path, options or ImportOptions())
+    assert scan.frames == 6 and scan.projections.shape == (6, 4, 5)
+    expected = np.log((50000 - 100) / (np.array([20000, 10000]) - 100))
+    np.testing.assert_allclose(scan.projections[:, 0, :2], np.tile(expected, (6, 1)), rtol=1e-5)
+    angle = [float(np.rad2deg(scan.trajectory.angle_rad(f, scan.frame_start_s[f : f + 1]))[0]) for f in range(6)]
+    np.testing.assert_allclose(np.unwrap(np.deg2rad(angle)), np.deg2rad(-20.0 * np.arange(6)), atol=1e-6)
+
+
+def moved(path: Path, other: Path, link: object) -> None:
+    """The frames lie in another file, and a link in their place."""
+    with h5py.File(path, "r+") as file, h5py.File(other, "a") as outside:
+        detector = file["entry/instrument/detector"]
+        outside["raw/frames"] = detector["data"][()]
+        del detector["data"]
+        if isinstance(link, h5py.VirtualLayout):
+            detector.create_virtual_dataset("data", link, fillvalue=0)
+        else:
+            detector["data"] = link
+
+
+def test_frames_in_linked_files_of_the_folder_are_read(tmp_path) -> None:
+    (tmp_path / "raw").mkdir()
+    moved(nxtomo(tmp_path / "a.nxs"), tmp_path / "raw/x.h5", h5py.ExternalLink("raw/x.h5", "/raw/frames"))
+    layout = h5py.VirtualLayout(FRAMES.shape, np.uint16)
+    for part in (slice(0, 5), slice(5, len(FRAMES))):
+        layout[part] = h5py.VirtualSource("y.h5", "raw/frames", FRAMES.shape)[part]
+    moved(nxtomo(tmp_path / "b.nxs"), tmp_path / "y.h5", layout)
+    with h5py.File(tmp_path / "c.nxs", "w") as file:  # a soft link over an external one
+        file["scan"] = h5py.ExternalLink("b.nxs", "/entry")
+        file["entry"] = h5py.SoftLink("/scan")
+    for name in "abc":
+        same(tmp_path / f"{name}.nxs")
+
+
+def test_a_link_out_of_the_folder_needs_the_option(tmp_path) -> None:
+    for folder in ("scan", "raw"):
+        (tmp_path / folder).mkdir()
+    link = h5py.ExternalLink("../raw/x.h5", "/raw/frames")
+    moved(path := nxtomo(tmp_path / "scan/a.nxs"), tmp_path / "raw/x.h5", link)
+    with pytest.raises(InputError, match=r"a link to the file .*raw/x.h5.*--linked-folder"):
+        import_scan(path)
+    same(path, ImportOptions(linked_folder=tmp_path / "raw"))
+
+
+@pytest.mark.parametrize(
+    ("parts", "words"),
+    [
+        ({"gone.h5": slice(0, 11)}, "gone.h5"),  # HDF5 answers with the fill value
+        ({"x.h5": slice(0, 6)}, "are kept nowhere"),
+    ],
+)
+def test_virtual_data_that_are_not_there_are_no_zeros(tmp_path, parts, words) -> None:
+    layout = h5py.VirtualLayout(FRAMES.shape, np.uint16)
+    for name, part in parts.items():
+        layout[part] = h5py.VirtualSource(name, "raw/frames", FRAMES.shape)[part]
+    moved(path := nxtomo(tmp_path / "a.nxs"), tmp_path / "x.h5", layout)
+    with pytest.raises(InputError, match=words):
+        import_scan(path)
+
+
+def test_the_entry_is_found_by_its_definition(tmp_path, caplog) -> None:
+    with h5py.File(path := tmp_path / "a.nxs", "w") as file:
+        file.create_group("entry").attrs["NX_class"] = "NXentry"  # of something else
+        file["gone"] = h5py.ExternalLink("nowhere.h5", "/")
+    same(nxtomo(path, "scan1/tomo", image_key=KEY.astype(np.float32)))
+    nxtomo(path, "scan2/tomo", rotation_angle=2 * ANGLE_DEG)
+    with pytest.raises(InputError, match=r"several entries: /scan1/tomo, /scan2/tomo.*--entry"):
+        import_scan(path)
+    same(path, ImportOptions(entry="scan1/tomo"))
+    with h5py.File(path, "r+") as file:
+        file.attrs["default"] = "scan1/tomo"
+    same(path)
+    assert "2 NXtomo entries; /scan1/tomo is taken" in caplog.text
+
+
+def bare(folder: Path) -> None:
+    with h5py.File(folder / "p.hdf", "w") as file:
+        file["entry/data/data"] = FRAMES[KEY == 0].transpose(1, 0, 2)[:, :, None]  # sinograms, with an axis of one
+        file["theta"] = np.deg2rad(ANGLE_DEG[KEY == 0])
+        file["theta"].attrs["units"] = "Radians"
+    for name, kind in (("flat.h5", 1), ("dark.h5", 2)):
+        with h5py.File(folder / name, "w") as file:
+            file["data"] = FRAMES[kind == KEY].transpose(1, 0, 2)
+
+
+AT = ("projections=/entry/data/data", "flats=flat.h5:/data", "darks=dark.h5:/data", "angles=/theta", "axes=v,frame,u")
+
+
+def test_bare_arrays_in_several_files_by_options(tmp_path) -> None:
+    bare(tmp_path)
+    same(tmp_path / "p.hdf", ImportOptions(at=AT, pixel_size_mm=(0.1, 0.1)))
+    for wrong, words in (
+        ((*AT, "flat=x"), "NAME=FILE:/ADDRESS"), ((*AT[:-1], "axes=z,y,x"), "frame, v and u"),
+        ((*AT[1:], "projections=/no"), "/no"),
+    ):  # fmt: skip
+        with pytest.raises(InputError, match=words):
+            import_scan(tmp_path / "p.hdf", ImportOptions(at=wrong, pixel_size_mm=(0.1, 0.1)))
+
+
+@pytest.mark.parametrize("angles", ['[angles]\nfile = "p.hdf:/theta"\nrotates = "sample"', ""])
+def test_bare_arrays_in_several_files_by_a_toml(tmp_path, angles) -> None:
+    bare(tmp_path)
+    short = "" if angles else 'angles = "p.hdf:/theta"'
+    (tmp_path / "scan.toml").write_text(
+        '[frames]\nprojections = "p.hdf:/entry/data/data"\nflats = ["flat.h5:/data"]\ndarks = "dark.h5:/data"\n'
+        f'axes = "v, frame, u"\n{short}\n{angles}\n[source]\nbeam = "parallel"\n'
+        "[detector]\npixel_size_v_mm = 0.1\npixel_size_u_mm = 0.1\n"
+    )
+    same(tmp_path, None if angles else ImportOptions(rotates="sample"))
+    text = (tmp_path / "scan.toml").read_text().replace("flat.h5", "../flat.h5")
+    (tmp_path / "scan.toml").write_text(text)
+    with pytest.raises(InputError, match=r"\[frames\] flats.*inside the folder"):
+        import_scan(tmp_path / "scan.toml")
+
+
+@pytest.mark.parametrize(
+    ("added", "side_mm"),
+    [
+        ({"sample/x_pixel_size": 0.65e-6, "sample/y_pixel_size": 0.65e-6}, 0.00065),  # without units: metres
+        ({"instrument/detector/x_magnified_pixel_size": 0.00065}, 0.00065),  # one side for both
+        ({}, 0.0065),
+    ],
+)
+def test_the_pixel_at_the_sample_counts(tmp_path, added, side_mm) -> None:
+    path = nxtomo(tmp_path / "a.nxs")
+    with h5py.File(path, "r+") as file:
+        for address, value in added.items():
+            file[f"entry/{address}"] = value
+    assert import_scan(path).geometry.pixel_size_mm == pytest.approx((side_mm, side_mm))
+
+
+def test_the_pixel_at_the_sample_grows_with_a_cone_beam(tmp_path) -> None:
+    path = nxtomo(tmp_path / "a.nxs")
+    with h5py.File(path, "r+") as file:
+        for address, value in {"instrument/source/distance": -100.0, "instrument/detector/distance": 100.0}.items():
+            file[f"entry/{address}"] = value
+        for axis in "xy":
+            file[f"entry/sample/{axis}_pixel_size"] = 0.002
+    assert import_scan(path).geometry.pixel_size_mm == pytest.approx((0.004, 0.004))
+
+
+INSTRUMENT = "measurement/instrument"
+
+
+@pytest.mark.parametrize(
+    ("added", "side_mm"),
+    [
+        ({"detector/actual_pixel_size_x": (1.3, "microns")}, 0.0013),
+        ({"detection_system/objective/resolution": (0.69, "")}, 0.00069),
+        ({"detector/pixel_size_x": (6.5e-6, ""), "detection_system/objective/magnification": (10.0, "")}, 0.00065),
+        ({"detector/pixel_size": (6.5, "um")}, 0.0065),
+    ],
+)
+def test_data_exchange_of_beamlines(tmp_path, added, side_mm, caplog) -> None:
+    """Flats before and after, and no angles."""
+    with h5py.File(path := tmp_path / "a.h5", "w") as file:
+        file["exchange/data"] = FRAMES[KEY == 0]
+        for name, counts in (("data_white_pre", 50000.0), ("data_white_post", 40000.0), ("data_dark", 100.0)):
+            file[f"exchange/{name}"] = np.full((2, 4, 5), counts)
+        for address, (value, unit) in added.items():
+            file[f"{INSTRUMENT}/{address}"] = value
+            if unit:
+                file[f"{INSTRUMENT}/{address}"].attrs["units"] = unit
+    scan = import_scan(path, ImportOptions(quantity="counts"))
+    assert scan.geometry.pixel_size_mm == pytest.approx((side_mm, side_mm))
+    assert "no angles: 0° to 180°" in caplog.text
+    expected = np.log((np.array([50000 - 10000 / 12, 40000 + 10000 / 12]) - 100) / 19900)  # within the first and last
+    np.testing.assert_allclose(scan.projections[[0, -1], 0, 0], expected, rtol=1e-3)
+    turned = import_scan(path, ImportOptions(quantity="counts", angles="0,30"))
+    last_deg = abs(float(np.rad2deg(turned.trajectory.angle_rad(5, np.array([5.0])))[0]))
+    assert last_deg % 360 in (pytest.approx(150), pytest.approx(210))
+
+
+def test_measured_exposures_and_values_at_darks(tmp_path, caplog) -> None:
+    path = nxtomo(tmp_path / "a.nxs")
+    times = np.where(KEY == 2, np.nan, 0.1)
+    times[KEY == 0] += 5e-4 * np.arange(6) / 5
+    with h5py.File(path, "r+") as file:
+        detector = file["entry/instrument/detector"]
+        detector["count_time"] = times
+        assert import_scan(path).shutter.exposure_s == pytest.approx(0.10025)
+        fly = ImportOptions(fps=1.0)
+        detector["count_time"][KEY == 0] = 0.1 * np.arange(1, 7)
+    with pytest.raises(InputError, match="--exposure-s"):
+        import_scan(path, replace(fly, named=option_name))
+    assert import_scan(path, replace(fly, exposure_s=0.2)).shutter.exposure_s == 0.2
+    same(path)
+    assert "not used, because the gantry stops" in caplog.text
+
+
+def test_a_file_that_another_program_writes_is_said(tmp_path) -> None:
+    path = nxtomo(tmp_path / "a.nxs")
+    code = f"import h5py; f = h5py.File({str(path)!r}, 'a'); print(1, flush=True); input()"
+    words = [sys.executable, "-c", code]
+    with subprocess.Popen(words, stdout=subprocess.PIPE, stdin=subprocess.PIPE, text=True) as other:
+        try:
+            other.stdout.readline()
+            with pytest.raises(InputError, match="another program.*HDF5_USE_FILE_LOCKING"):
+                import_scan(path)
+        finally:
+            other.kill()
+
+
+def test_a_missing_filter_is_named(tmp_path) -> None:
+    path = nxtomo(tmp_path / "a.nxs")
+    with h5py.File(path, "r+") as file:
+        detector = file["entry/instrument/detector"]
+        del detector["data"]
+        detector.create_dataset(
+            "data", FRAMES.shape, np.uint16, chunks=(1, 4, 5), compression=511, allow_unknown_filter=True
+        )
+    with pytest.raises(InputError, match="filter 511.*hdf5plugin"):
+        import_scan(path)
+
+
+def test_scales_and_axes_of_stacks(tmp_path, caplog) -> None:
+    tifffile = pytest.importorskip("tifffile")
+    values, path = np.ones((3, 4, 5), np.float32), tmp_path / "v.tif"
+    about = {"spacing": 2.0, "axes": "ZYX"}
+    for unit, voxel_mm in (("micron", 0.001), ("\\u00B5m", 0.001), ("cm", 10.0)):
+        tifffile.imwrite(path, values, imagej=True, resolution=(1.0, 1.0), metadata={**about, "unit": unit})
+        assert load_volume(path).required_grid.voxel_size_mm == pytest.approx((2 * voxel_mm, voxel_mm, voxel_mm))
+    tifffile.imwrite(path, values, imagej=True, resolution=(1.0, 1.0), metadata={**about, "unit": "pixel"})
+    assert load_volume(path).grid is None and "the scale is left out" in caplog.text
+    ome = {f"PhysicalSize{axis}": size for axis, size in zip("XYZ", (1.0, 1.0, 2.0), strict=True)}
+    tifffile.imwrite(tmp_path / "v.ome.tif", values, metadata={"axes": "ZYX", **ome})
+    assert load_volume(tmp_path / "v.ome.tif").required_grid.voxel_size_mm == pytest.approx((0.002, 0.001, 0.001))
+    tifffile.imwrite(path, np.stack([values] * 2), imagej=True, metadata={"axes": "TZYX"})
+    with pytest.raises(InputError, match="2 times"):
+        load_volume(path)
