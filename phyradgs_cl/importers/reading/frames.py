@@ -18,6 +18,7 @@ from phyradgs_cl.io.scan.reader import LARGEST_LINE_INTEGRAL
 
 _log = logging.getLogger(__name__)
 Mask = np.ndarray | None
+_AIR = 0.2  # of a line integral beside the object, with noise
 _SAME = 1e-3  # relative difference of a flat that is at the ceiling too
 
 
@@ -61,6 +62,7 @@ def line_integrals(
         with np.errstate(over="ignore", invalid="ignore"):
             flat = flats.mean(axis=0, dtype=np.float64)
             saturation = find_saturation(frames, flat)
+        _refuse_logarithms(subject, frames, flat, options)
         if not is_corrected and (darks is None or len(darks) == 0):
             _log.warning("%s: counts without darks: an offset of the panel stays in the line integrals", subject)
     integrals, unusable = frames_to_attenuation(frames, quantity, flats, darks, LARGEST_LINE_INTEGRAL)
@@ -74,6 +76,15 @@ def line_integrals(
     stacks = zip(are_applied, (flats, darks), strict=True)
     counts = [len(stack) if applied and stack is not None else 0 for applied, stack in stacks]
     return LineIntegrals(integrals, compact(unusable), saturation, applied_facts(*counts))
+
+
+def _refuse_logarithms(subject: str, frames: np.ndarray, flat: np.ndarray, options: ImportOptions) -> None:
+    """Raises InputError for line integrals with flats of ones: where counts are as bright as the flats, these are 0."""
+    border = np.concatenate([frames[..., 0].ravel(), frames[..., -1].ravel()])
+    if (flat == 1).all() and abs(float(np.median(border))) < _AIR:
+        remedy = f"say {options.named('quantity')} attenuation, and leave the flats out"
+        found = "flats of ones, and frames that are 0 at their borders"
+        raise InputError(f"{subject} flats", found, "counts, which are as bright as the flats there", remedy)
 
 
 def _warn_of_unused(subject: str, quantity: str, flats: np.ndarray | None, darks: np.ndarray | None) -> None:

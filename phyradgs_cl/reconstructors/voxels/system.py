@@ -16,6 +16,7 @@ from phyradgs_cl.detector import noise_level, transmission_weights
 from phyradgs_cl.fields import Deformation
 from phyradgs_cl.operators.rays.intensity import IntensityOperator
 from phyradgs_cl.operators.rays.operator import LinearOperator, RayOperator
+from phyradgs_cl.operators.rays.subrays import subrays_of
 from phyradgs_cl.operators.warp.operator import WarpedOperator, projector_of
 from phyradgs_cl.parallel import Communicator, exact_sum, span
 from phyradgs_cl.runtime import DeviceSpace, HostSpace, MemoryShortage, Runtime, Space
@@ -57,12 +58,13 @@ class System:
         shape = scan.geometry.detector_shape
         projector = projector_of(rt, scan.grid, tables, deformation, state_times_s)
         lines = {} if fewest_lines is None else {"fewest_lines": fewest_lines}
-        operator: LinearOperator = projector(rt, scan.grid, shape, tables, **lines)
+        subrays = subrays_of(scan.grid, tables)
+        operator: LinearOperator = projector(rt, scan.grid, shape, tables, subrays=subrays, **lines)
         measured = np.asarray(scan.projections, np.float32)
         model = scan.detector_model if detector_model == "scan" else detector_model
         intensity: IntensityOperator | SharedIntensity | None = None
         if model == "intensity" and any(table.averages for table in tables):  # both models agree on a single value
-            alone = IntensityOperator(rt, scan.grid, shape, tables, projector)
+            alone = IntensityOperator(rt, scan.grid, shape, tables, projector, subrays)
             intensity = SharedIntensity(rt.ranks, alone) if rt.ranks.size > 1 else alone
         if rt.ranks.size > 1:
             operator = SharedOperator(rt.ranks, operator)
