@@ -16,7 +16,7 @@ from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
 
 POSE_LENGTH = 12
-_MOST_VOXELS_AWAY = 1e6  # voxels from source to axis: rounding in float32 displaces rays by 6 % of a voxel there, by a half at 1e7
+_MOST_VOXELS_AWAY = 1e6  # of a source: float32 displaces its rays by 6 % of a voxel there, by a half at 1e7
 _STEEP = 1e-2  # squared sine of a ray's angle to the z axis: steeper ones pass it nowhere in particular
 
 
