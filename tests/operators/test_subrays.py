@@ -92,16 +92,24 @@ def test_an_object_that_moves(any_rt) -> None:
     assert moving.memory.layout.subrays == PAIR
 
 
-def test_rays_are_as_many_as_voxels_need() -> None:
+@pytest.mark.parametrize(
+    ("is_dense", "counts"),
+    [
+        (False, {0.5: 1, 1.0: 1, 1.4: 1, 1.5: 2, 2.0: 2, 2.5: 2, 2.6: 3, 4.0: 4, 40.0: 8}),
+        (True, {0.5: 1, 1.4: 1, 2.0: 1, 2.1: 2, 3.0: 3, 4.0: 4, 40.0: 8}),
+    ],
+)
+def test_rays_are_as_many_as_voxels_need(is_dense, counts) -> None:
     """Pixels of 0.3 by 0.2 mm; in the cone they are two thirds of that at the axis, and less nearer to the source."""
     shape = (13, 18)
     cone, parallel = (tables("static", shape, source_mm=1000.0, beam=beam) for beam in ("cone", "parallel"))
     pitch_v, pitch_u = 3.9 / 13 / 1.5, 4.1 / 18 / 1.5
     for cells, scale in ((parallel, 1.0), (cone, 1.5 * 1000 / 1002.5)):
-        for ratio, count in ((0.5, 1), (1.0, 1), (1.5, 1), (2.0, 1), (2.1, 2), (3.0, 3), (4.0, 4), (40.0, 8)):
+        for ratio, count in counts.items():
             sides_mm = scale * pitch_v / ratio, scale * pitch_u, scale * pitch_u
-            assert subrays_of(Grid((20, 2, 2), sides_mm), cells) == (count, 1)
+            assert subrays_of(Grid((20, 2, 2), sides_mm), cells, is_dense=is_dense) == (count, 1)
             sides_mm = scale * pitch_v, scale * pitch_u / ratio, scale * pitch_u / ratio
-            assert subrays_of(Grid((20, 2, 2), sides_mm), cells) == (1, count)
+            assert subrays_of(Grid((20, 2, 2), sides_mm), cells, is_dense=is_dense) == (1, count)
     near = tables("static", shape, source_mm=5.0)  # the grid reaches to 1 mm from the source
-    assert subrays_of(Grid((20, 20, 20), (pitch_v / 4, 0.4, 0.4)), near) == (1, 1)
+    expected = (1, 1) if is_dense else (4, 1)
+    assert subrays_of(Grid((20, 20, 20), (pitch_v / 4, 0.4, 0.4)), near, is_dense=is_dense) == expected

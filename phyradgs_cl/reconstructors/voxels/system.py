@@ -48,17 +48,18 @@ class System:
     @classmethod
     def of_scan(
         cls, rt: Runtime, scan: Scan, motion: Motion, detector_model: str = "log", *, fewest_lines: int | None = None,
-        deformation: Deformation | None = None, state_times_s: np.ndarray | None = None,
+        deformation: Deformation | None = None, state_times_s: np.ndarray | None = None, is_dense: bool = False,
     ) -> "System":  # fmt: skip
         """Returns the system of a scan under ``motion``, of an object that moves as ``deformation`` does, or that changes
         between states at ``state_times_s`` (K,). Volumes are then stacks (K, nz, ny, nx).
 
-        detector_model: log, intensity, or scan for the stated one. fewest_lines: as in ``RayOperator``, without a motion."""
+        detector_model: log, intensity, or scan for the stated one. fewest_lines: as in ``RayOperator``, without a motion.
+        is_dense: as in ``subrays_of``."""
         tables = [motion.cells(scan, f).still() for f in range(scan.frames)]
         shape = scan.geometry.detector_shape
         projector = projector_of(rt, scan.grid, tables, deformation, state_times_s)
         lines = {} if fewest_lines is None else {"fewest_lines": fewest_lines}
-        subrays = subrays_of(scan.grid, tables)
+        subrays = subrays_of(scan.grid, tables, is_dense=is_dense)
         operator: LinearOperator = projector(rt, scan.grid, shape, tables, subrays=subrays, **lines)
         measured = np.asarray(scan.projections, np.float32)
         model = scan.detector_model if detector_model == "scan" else detector_model
