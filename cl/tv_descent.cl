@@ -3,8 +3,6 @@
    voxel. A work-item takes one voxel. Twin: objective/tv.py. Behind a border in y and z the voxel itself is read: a branch
    would become masked accesses outside the buffer (tv_prox.cl). */
 
-#define SMALLEST 1e-8f    /* keeps flat regions from dividing by zero */
-
 /* at y or z 0 the difference is that of the voxel to itself */
 static inline float3 backward_difference(__global const float *volume, const size_t at, const int x, const size_t row,
                                          const size_t slice)
@@ -13,12 +11,13 @@ static inline float3 backward_difference(__global const float *volume, const siz
     return (float3)(x > 0 ? here - volume[at - 1] : 0.0f, here - volume[at - row], here - volume[at - slice]);
 }
 
-static inline float inverse_length(const float3 d)
+static inline float inverse_length(const float3 d, const float least)
 {
-    return 1.0f / (sqrt(d.x * d.x + d.y * d.y + d.z * d.z) + SMALLEST);
+    return 1.0f / (sqrt(d.x * d.x + d.y * d.y + d.z * d.z) + least);
 }
 
-__kernel void tv_gradient(__global const float *volume, const int4 shape, __global float *gradient)
+/* least: keeps flat regions from dividing by zero */
+__kernel void tv_gradient(__global const float *volume, const int4 shape, const float least, __global float *gradient)
 {
     const int x = (int)get_global_id(0), y = (int)get_global_id(1), z = (int)get_global_id(2);
     if (x >= shape.x)
@@ -28,15 +27,15 @@ __kernel void tv_gradient(__global const float *volume, const int4 shape, __glob
     const size_t back_y = y > 0 ? row : 0, back_z = z > 0 ? slice : 0;
     const size_t ahead_y = y + 1 < shape.y ? row : 0, ahead_z = z + 1 < shape.z ? slice : 0;
     const float3 own = backward_difference(volume, at, x, back_y, back_z);
-    float sum = (own.x + own.y + own.z) * inverse_length(own);
+    float sum = (own.x + own.y + own.z) * inverse_length(own, least);
     if (x + 1 < shape.x) {
         const float3 d = backward_difference(volume, at + 1, x + 1, back_y, back_z);
-        sum -= d.x * inverse_length(d);
+        sum -= d.x * inverse_length(d, least);
     }
     /* without a neighbour these differences are 0 */
     const float3 below = backward_difference(volume, at + ahead_y, x, ahead_y, back_z);
-    sum -= below.y * inverse_length(below);
+    sum -= below.y * inverse_length(below, least);
     const float3 above = backward_difference(volume, at + ahead_z, x, back_y, ahead_z);
-    sum -= above.z * inverse_length(above);
+    sum -= above.z * inverse_length(above, least);
     gradient[at] = sum;
 }

@@ -210,8 +210,14 @@ def _rays(rt: Runtime) -> Iterator[Comparison]:
         operator = operators.RayOperator(rt, GRID, shape, [cells])
         yield operator.forward(volume)[0], twins.ray_frame(volume, GRID, cells, shape), VALUE
         yield operator.adjoint(y), twins.ray_volume(y[0], GRID, cells), VALUE
+    on_device, pair = rt.upload(volume), (3, 2)
+    finer, blocks = still.finer(*pair), (1, SHAPE[0], pair[0], SHAPE[1], pair[1])
+    operator = operators.RayOperator(rt, GRID, SHAPE, [still], subrays=pair)
+    expected = twins.ray_frame(volume, GRID, finer, (pair[0] * SHAPE[0], pair[1] * SHAPE[1]))
+    yield rt.download(operator.forward(on_device)), expected.reshape(blocks).mean((2, 4)), VALUE
+    shares = np.kron(frames[0], np.ones(pair)) / np.prod(pair)
+    yield rt.download(operator.adjoint(rt.upload(frames))), twins.ray_volume(shares, GRID, finer), VALUE
     intensity = operators.IntensityOperator(rt, GRID, SHAPE, [table])
-    on_device = rt.upload(volume)
     mean, averaged = (twins.ray_frame(volume, GRID, table, SHAPE, model) for model in ("log", "intensity"))
     yield rt.download(intensity.forward(on_device))[0], mean, VALUE  # at 0: the mean
     yield rt.download(intensity.expected(on_device))[0], averaged, VALUE

@@ -16,6 +16,8 @@ from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
 
 POSE_LENGTH = 12
+_MOST_VOXELS_AWAY = 1e6  # of a source: float32 displaces its rays by 6 % of a voxel there, by a half at 1e7
+_STEEP = 1e-2  # squared sine of a ray's angle to the z axis: steeper ones pass it nowhere in particular
 
 
 @dataclass(frozen=True)
@@ -196,16 +198,47 @@ def field_of_view_mm(geometry: Geometry) -> tuple[float, float, float]:
     return half_height_mm * behind_mm / geometry.source_to_detector_mm, radius_mm, radius_mm
 
 
-def default_grid(geometry: Geometry) -> Grid:
-    """Returns the cube as wide as a full turn's field of view, in voxels of one pixel pitch at the axis. It is lower where
-    the panel has few rows. In a parallel beam it is as high as the panel."""
+def default_grid(geometry: Geometry, poses: np.ndarray | None = None) -> Grid:
+    """Returns the cube as wide as a full turn's field of view, in voxels of one pixel pitch at the axis: along z that of
+    rows, along y and x that of columns. It is lower where the panel has few rows. In a parallel beam it is as high as the
+    panel. poses (F, 12): of a gantry that travels along z, as in a helix; the grid is longer by its travel."""
     half_height_mm, radius_mm, _ = field_of_view_mm(geometry)
-    voxel_mm = min(geometry.pixel_size_mm) / geometry.magnification
-    wide = max(1, math.ceil(2 * radius_mm / voxel_mm))
-    high = max(1, round(2 * half_height_mm / voxel_mm))
+    high_mm, wide_mm = (pitch / geometry.magnification for pitch in geometry.pixel_size_mm)
+    wide = max(1, math.ceil(2 * radius_mm / wide_mm))
+    high = max(1, round(2 * half_height_mm / high_mm))
     if isinstance(geometry, ConeGeometry):
-        high = min(wide, high)
-    return Grid((high, wide, wide), (voxel_mm,) * 3)
+        high = min(max(1, round(wide * wide_mm / high_mm)), high)
+    low_mm, top_mm = (0.0, 0.0) if poses is None else _travel_mm(poses, geometry)
+    if top_mm - low_mm < high_mm:  # a wobble of the gantry is no travel
+        return Grid((high, wide, wide), (high_mm, wide_mm, wide_mm))
+    high += math.ceil((top_mm - low_mm) / high_mm)
+    return Grid((high, wide, wide), (high_mm, wide_mm, wide_mm), ((low_mm + top_mm) / 2, 0.0, 0.0))
+
+
+def _travel_mm(poses: np.ndarray, geometry: Geometry) -> tuple[float, float]:
+    """Returns the lowest and highest z at which the rays to the panel's middle pass the z axis; poses (F, 12). A panel off
+    the central ray counts as on it."""
+    (rows, columns), (off_v, off_u) = geometry.detector_shape, geometry.detector_offset_mm
+    start, first, step_u, step_v = (poses[:, i : i + 3] for i in (0, 3, 6, 9))
+    at_v, at_u = ((n - 1) / 2 - off / pitch for n, off, pitch in
+                  zip((rows, columns), (off_v, off_u), geometry.pixel_size_mm, strict=True))
+    middle = first + at_u * step_u + at_v * step_v
+    ray = start if isinstance(geometry, ParallelGeometry) else middle - start
+    across = np.maximum(np.sum(ray[:, :2] ** 2, axis=1), _STEEP * np.sum(ray**2, axis=1))
+    z_mm = middle[:, 2] - np.sum(middle[:, :2] * ray[:, :2], axis=1) / across * ray[:, 2]
+    return float(z_mm.min()), float(z_mm.max())
+
+
+def check_distances(geometry: Geometry, grid: Grid) -> None:
+    """Raises InputError for distances that float32 cannot tell apart from a parallel beam's, by the size of a voxel."""
+    if isinstance(geometry, ParallelGeometry):
+        return
+    source_mm, voxel_mm = geometry.source_to_axis_mm, min(grid.voxel_size_mm)
+    if source_mm > _MOST_VOXELS_AWAY * voxel_mm:
+        found = f"{source_mm:.4g} mm, {source_mm / voxel_mm:.3g} voxels of {voxel_mm:.4g} mm"
+        expected = f"at most {_MOST_VOXELS_AWAY:.0e} voxels: beyond, rounding displaces the rays"
+        remedy = "such rays are parallel: take ParallelGeometry, with pixels of their size over the magnification"
+        raise InputError("source_to_axis_mm", found, expected, remedy)
 
 
 def misses(grid: Grid, geometry: Geometry) -> bool:

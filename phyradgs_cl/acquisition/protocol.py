@@ -12,10 +12,13 @@ from phyradgs_cl.acquisition.shutter import Shutter
 from phyradgs_cl.acquisition.trajectory import CircularOrbit, EncoderTable, FrameSweeps
 from phyradgs_cl.errors import InputError
 
+_FEWEST_TURNS, _MOST_TURNS = 1e-3, 10_000
+
 
 @dataclass(frozen=True)
 class Protocol:
     """``views`` frames of ``turns`` turns at constant speed, each exposing an arc of ``exposure_deg`` (paper, section 3.1).
+    The gantry turns clockwise, seen from above, where ``turns`` is below 0.
     ``readout_ratio`` is T_ro/T_exp. ``pulse``: when the beam is on, (start, length) in exposures; None always."""
 
     views: int = 25
@@ -30,7 +33,9 @@ class Protocol:
     def __post_init__(self) -> None:
         checks.whole("--views", self.views, 1, 100_000)
         object.__setattr__(self, "views", int(self.views))
-        checks.within("--turns", self.turns, 1e-3, 10_000)
+        if not (checks.is_number(self.turns) and _FEWEST_TURNS <= abs(self.turns) <= _MOST_TURNS):
+            expected = f"a number from {_FEWEST_TURNS} to {_MOST_TURNS}, negative for a clockwise gantry"
+            raise InputError("--turns", checks.short_repr(self.turns), expected)
         checks.within("--start-deg", self.start_deg, -1e6, 1e6)
         checks.within("--exposure-deg", self.exposure_deg, 0, 3600)
         checks.within("--readout-ratio", self.readout_ratio, 0, 1000)
@@ -54,7 +59,7 @@ class Protocol:
         checks.positive(named("fps"), fps)
         if self.exposure_deg == 0:
             raise InputError(named("fps"), f"{fps:g} with an exposure arc of 0°", "a gantry that turns", "leave fps out")
-        exposure_s = self.exposure_deg / (self.step_deg * fps)
+        exposure_s = self.exposure_deg / (abs(self.step_deg) * fps)
         if readout_ms is None:
             return replace(self, exposure_s=exposure_s)
         if readout_ms > 1000 / fps:
@@ -71,7 +76,7 @@ class Protocol:
         """Returns opening times (F,) in s: from frame to frame the gantry needs step/arc exposures."""
         if self.exposure_deg == 0:
             return np.arange(self.views) * self.shutter().span_s
-        return np.arange(self.views) * self.step_deg / self.exposure_deg * self.exposure_s
+        return np.arange(self.views) * abs(self.step_deg) / self.exposure_deg * self.exposure_s
 
     def window_s(self) -> tuple[float, float]:
         """Returns when the first line opens, and when the last one closes, in s."""
@@ -87,12 +92,12 @@ class Protocol:
         """Returns the trajectory. Stop-and-shoot rests at the mid-window angles of the same fly-scan. Jitter is a smooth
         wander of the gantry, with standard deviation ``jitter_deg`` and one knot per frame, which the encoder records."""
         first = self.angle_start_rad()
-        arc_rad = np.deg2rad(self.exposure_deg)
+        arc_rad = self._arc_rad
         if not self.is_fly:
             middle = first + arc_rad * self.shutter().middle_s / self.exposure_s
             return CircularOrbit(geometry, FrameSweeps(self.frame_start_s(), self.exposure_s, middle, middle))
         if jitter_deg > 0:
-            if arc_rad == 0:
+            if self.exposure_deg == 0:
                 raise InputError("jitter", "an exposure arc of 0°", "a gantry that turns", "leave jitter out")
             if rng is None:
                 raise InputError("jitter", "no random generator", "a seeded generator")
@@ -100,9 +105,14 @@ class Protocol:
         sweeps = FrameSweeps(self.frame_start_s(), self.exposure_s, first, first + arc_rad)
         return CircularOrbit(geometry, sweeps)
 
+    @property
+    def _arc_rad(self) -> float:
+        """The arc of an exposure, below 0 clockwise."""
+        return float(np.copysign(np.deg2rad(self.exposure_deg), self.turns))
+
     def _wandering_encoder(self, jitter_rad: float, rng: np.random.Generator) -> EncoderTable:
         end_s = self.window_s()[1]
-        speed_rad_per_s = np.deg2rad(self.exposure_deg) / self.exposure_s
+        speed_rad_per_s = self._arc_rad / self.exposure_s
         knot_s = np.linspace(0.0, end_s, self.views + 1)
         time_s = np.linspace(0.0, end_s, 16 * self.views + 1)
         wander = np.interp(time_s, knot_s, rng.normal(0, jitter_rad, knot_s.size))

@@ -14,6 +14,7 @@ from phyradgs_cl.acquisition.geometry import (
     POSE_LENGTH,
     Geometry,
     ParallelGeometry,
+    check_distances,
     default_grid,
     field_of_view_mm,
     hidden,
@@ -28,6 +29,7 @@ from phyradgs_cl.acquisition.toolkits import astra_of_poses, is_parallel_tigre, 
 from phyradgs_cl.acquisition.trajectory import (
     CircularOrbit,
     Trajectory,
+    behind_axis,
     checked_poses,
     is_parallel,
     resting_trajectory,
@@ -62,7 +64,8 @@ class Scan:
     """One scan of a cone or a parallel beam, in line integrals.
 
     - projections (F, nv, nu) float32: −ln(I/I0), dimensionless. Row 0 is the lowest.
-    - geometry and grid in mm, shutter in s. trajectory: anything with ``pose(frame, time_s)``, a user-defined class too.
+    - geometry and grid in mm, shutter in s. A panel scaled to the axis is moved behind the object.
+    - trajectory: anything with ``pose(frame, time_s)``, a user-defined class too.
     - frame_start_s (F,): when the first-read line opens, in s.
     - is_fly: False for stop-and-shoot scans, whatever the exposure time.
     - detector_model: quantity that the detector averages over an exposure, "log" (line integrals) or "intensity".
@@ -104,6 +107,8 @@ class Scan:
             beam, other = ("parallel", "cone") if self.is_parallel else ("cone", "parallel")
             remedy = "make both of one kind; a trajectory of parallel beams has is_parallel = True"
             raise InputError("trajectory", f"a {beam} beam", f"a {other} beam, as the geometry", remedy)
+        for name, value in zip(("geometry", "trajectory"), behind_axis(self.geometry, self.trajectory), strict=True):
+            object.__setattr__(self, name, value)
         object.__setattr__(self, "projections", _line_integrals(self.projections, self.pixel_mask))
         frames = len(self.projections)
         expected = (frames, *self.geometry.detector_shape)
@@ -125,6 +130,7 @@ class Scan:
         if self.moving_truth is not None and self.moving_truth.volumes.shape[1:] != self.grid.shape:
             found = f"states of shape {self.moving_truth.volumes.shape[1:]}"
             raise InputError("moving_truth", found, f"the grid's {self.grid.shape}")
+        check_distances(self.geometry, self.grid)
         if self.pixel_mask is not None and np.shape(self.pixel_mask) not in (expected, expected[1:]):
             raise InputError("pixel_mask", f"shape {np.shape(self.pixel_mask)}", f"{expected[1:]} or {expected}")
         self._mask_dark_lines()
@@ -150,8 +156,8 @@ class Scan:
 
         frames (F, rows, columns): line integrals. poses (F, 12) in mm: source, centre of pixel (0, 0), step to the next
         column, step to the next row, x y z each; with ``is_parallel`` the direction of the rays, of any length, in place of
-        the source. grid: None takes the field of view of a full turn. others: the fields detector_model, pixel_mask,
-        reference, title, lag and provenance of ``Scan``.
+        the source. grid: None takes the field of view of a full turn, and the travel along z. others: the fields
+        detector_model, pixel_mask, reference, title, lag and provenance of ``Scan``.
 
         Raises InputError for shapes that do not fit, and for poses from which no ray meets the grid."""
         values = _uncounted(frames, others.get("pixel_mask"))
@@ -166,7 +172,8 @@ class Scan:
         shutter, start_s = Shutter(0.0), np.arange(len(values), dtype=np.float64)
         trajectory = resting_trajectory(geometry, table, start_s)
         check_others(others)
-        scan = cls(values, geometry, trajectory, shutter, start_s, grid or default_grid(geometry), False, **others)
+        grid = grid or default_grid(geometry, table)
+        scan = cls(values, geometry, trajectory, shutter, start_s, grid, False, **others)
         scan.check_sight()
         return scan
 
@@ -288,6 +295,31 @@ class Scan:
         if 0 <= behind_mm < half_mm:
             text = "the panel stands %.4g mm behind the middle of the grid, inside of it: rays end there"
             log.warning(text, behind_mm)
+
+    def warn_of_blind_places(self) -> None:
+        """Warns of a grid beside the field of view of an orbit, and of a panel that sees no part of the rotation axis."""
+        if not isinstance(self.trajectory, CircularOrbit):
+            return
+        fitting = default_grid(self.geometry)
+        box_mm, half_mm = np.round(fitting.box_mm, 3).tolist(), np.round(field_of_view_mm(self.geometry), 3).tolist()
+        if misses(self.grid, self.geometry):
+            found_mm = np.round(self.grid.box_mm, 3).tolist()
+            text = "the grid in %s mm (z, y, x) lies beside the field of view of ±%s mm: few views see its voxels, whose "
+            text += "values mean nothing; a grid that fits: %s mm"
+            log.warning(text, found_mm, half_mm, box_mm)
+        offset_mm, pitch_mm = abs(self.geometry.detector_offset_mm[1]), self.geometry.pixel_size_mm[1]
+        half_panel_mm = self.geometry.detector_shape[1] * pitch_mm / 2
+        if offset_mm > half_panel_mm:
+            text = "the panel of ±%.4g mm, %.4g mm off the central ray, does not see the rotation axis: the middle of the "
+            text += "volume is not measured; is the offset in mm? As pixels it were %.4g mm"
+            log.warning(text, half_panel_mm, offset_mm, offset_mm * pitch_mm)
+
+    def warn_of_negative_integrals(self) -> None:
+        """Warns of line integrals whose sum is below 0: most methods make a volume of zeros of them."""
+        total = float(np.sum(self.projections, where=self.valid, dtype=np.float64))
+        if total < 0:
+            text = "line integrals are negative on the whole, %.3g on the mean: is their sign wrong? −ln(I/I0) is above 0"
+            log.warning(text, total / np.count_nonzero(self.valid))
 
     def check_sight(self) -> None:
         """Raises InputError for a grid that no ray meets as any frame opens: its volume would be 0. Warns of a panel inside

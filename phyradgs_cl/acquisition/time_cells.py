@@ -94,13 +94,14 @@ class TimeCells:
         ends, conic = (None if p is None else p * factors for p in (self.end_poses, self.conic_pose))
         return replace(self, pose=self.pose * factors, end_poses=ends, conic_pose=conic)
 
-    def finer(self, factor: int) -> "TimeCells":
-        """Returns still cells for pixels cut into ``factor`` by ``factor``; the parts of a line share its times."""
-        pose = self.pose.copy()
-        pose[:, 6:] /= factor
-        pose[:, 3:6] -= (factor - 1) / 2 * (pose[:, 6:9] + pose[:, 9:12])
-        lines = {name: getattr(self, name) * factor for name in ("line_start", "line_stop", "lines")}
-        share = None if self.line_share is None else self.line_share.repeat(factor, 1)
+    def finer(self, rows: int, columns: int) -> "TimeCells":
+        """Returns still cells for pixels cut into ``rows`` by ``columns`` parts; the parts of a line share its times."""
+        pose, (of_line, _) = self.pose.copy(), self.readout.shape((rows, columns))
+        pose[:, 6:9] /= columns
+        pose[:, 9:12] /= rows
+        pose[:, 3:6] -= (columns - 1) / 2 * pose[:, 6:9] + (rows - 1) / 2 * pose[:, 9:12]
+        lines = {name: getattr(self, name) * of_line for name in ("line_start", "line_stop", "lines")}
+        share = None if self.line_share is None else self.line_share.repeat(of_line, 1)
         return replace(self, pose=pose, line_share=share, **lines)
 
     def still(self) -> "TimeCells":

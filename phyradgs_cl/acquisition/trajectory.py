@@ -1,6 +1,6 @@
 """Trajectories: the gantry angle θ(t), or whole poses, at any time of a frame."""
 
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from typing import Protocol
 
 import numpy as np
@@ -8,13 +8,22 @@ import scipy
 from numpy.typing import NDArray
 
 from phyradgs_cl import checks
-from phyradgs_cl.acquisition.geometry import GEOMETRIES, POSE_LENGTH, Geometry, ParallelGeometry
+from phyradgs_cl.acquisition.geometry import (
+    GEOMETRIES,
+    POSE_LENGTH,
+    ConeGeometry,
+    Geometry,
+    ParallelGeometry,
+    default_grid,
+)
 from phyradgs_cl.errors import InputError
+from phyradgs_cl.fields import Grid
 from phyradgs_cl.text import repr_of_changes
 
 _LEAST_SPAN_S = 1e-6  # for frames of no duration
 _MOST_SAMPLES = 1024  # per frame
 _LEAST_INCIDENCE = 1e-6  # sine of the angle between rays and panel
+_AT_AXIS, _AWAY = 1e-6, 2.0  # a panel so near to the axis, relative to the source's distance; distances it is moved by
 _SAME_PLACE = 1e-9  # of the longest distance: rounding of an orbit in float64
 
 
@@ -75,7 +84,8 @@ class SpeedRamp(ConstantSpeed):
 @dataclass(frozen=True, eq=False, repr=False)
 class EncoderTable:
     """Measured θ(t): linear between samples ``time_s`` (T,) in s and ``angle_rad_table`` (T,) in rad, not extrapolated.
-    Raises InputError for times that do not increase, and for times beyond the table."""
+    An encoder's jumps by a turn are taken out where samples lie close together otherwise. Raises InputError for times that
+    do not increase, and for times beyond the table."""
 
     time_s: np.ndarray
     angle_rad_table: "NDArray[np.float64]"
@@ -87,7 +97,7 @@ class EncoderTable:
         wanted = "two equal 1D arrays of at least 2 samples"
         time_s, table = _checked_table(self.subject, self.time_s, self.angle_rad_table, (), "angles", wanted)
         object.__setattr__(self, "time_s", time_s)
-        object.__setattr__(self, "angle_rad_table", table)
+        object.__setattr__(self, "angle_rad_table", table if _is_without_jumps(np.diff(table)) else np.unwrap(table))
 
     def angle_rad(self, frame: int, time_s: np.ndarray) -> np.ndarray:
         """Returns angles (...) in rad at times (...) s, the same in every frame. Raises InputError beyond the table."""
@@ -101,7 +111,8 @@ class FrameSweeps:
     """A constant speed for each frame, from its angle as the exposure starts to its angle as it ends.
 
     The speed continues through the readout; equal angles are a gantry at rest (stop-and-shoot). ``start_s`` (F,) in s: when
-    the first line opens. ``exposure_s``: of a line. ``angle_start_rad`` and ``angle_end_rad`` (F,) in rad.
+    the first line opens. ``exposure_s``: of a line. ``angle_start_rad`` and ``angle_end_rad`` (F,) in rad; an end that
+    jumped by a turn, as from 355° to 4°, is taken back to its start.
     Raises InputError for arrays of unequal length, infinite values and NaN."""
 
     start_s: np.ndarray
@@ -116,6 +127,9 @@ class FrameSweeps:
         frames = np.size(self.start_s)
         for name in ("start_s", "angle_start_rad", "angle_end_rad"):
             object.__setattr__(self, name, checks.numbers(name, getattr(self, name), (frames,)))
+        if not _is_without_jumps(arc_rad := self.angle_end_rad - self.angle_start_rad):
+            nearest_rad = arc_rad - 2 * np.pi * np.round(arc_rad / (2 * np.pi))
+            object.__setattr__(self, "angle_end_rad", self.angle_start_rad + nearest_rad)
 
     def angle_rad(self, frame: int, time_s: np.ndarray) -> np.ndarray:
         """Returns angles (...) in rad of frame number ``frame`` at times (...) s."""
@@ -124,6 +138,12 @@ class FrameSweeps:
         if self.exposure_s <= 0:
             return np.full(t.shape, first)
         return first + (last - first) * (t - float(self.start_s[frame])) / self.exposure_s
+
+
+def _is_without_jumps(steps_rad: np.ndarray) -> bool:
+    """Whether no step of angles is one of more than half a turn among steps that are mostly below a quarter."""
+    size_rad = np.abs(steps_rad)
+    return bool(size_rad.max(initial=0) <= np.pi or np.median(size_rad) >= np.pi / 2)
 
 
 @dataclass(frozen=True, eq=False)
@@ -227,6 +247,46 @@ def resting_trajectory(geometry: Geometry, poses: np.ndarray, middle_s: np.ndarr
     if np.allclose(geometry.pose(angle_rad), poses, rtol=0, atol=_SAME_PLACE * np.abs(poses).max()):
         return CircularOrbit(geometry, FrameSweeps(middle_s, 0.0, angle_rad, angle_rad))
     return resting_poses(poses, middle_s, 0.0, is_parallel=is_parallel)
+
+
+def behind_axis(geometry: Geometry, trajectory: Trajectory) -> tuple[Geometry, Trajectory]:
+    """Returns geometry and trajectory with a panel at the axis moved away from the source, to where its rays are the same.
+
+    No panel stands in its object: this one was scaled to the axis, and rays would end there. Trajectories of a user's own
+    class, and panels elsewhere, stay as they are."""
+    if not isinstance(geometry, ConeGeometry):
+        return geometry, trajectory
+    if geometry.source_to_detector_mm > (1 + _AT_AXIS) * geometry.source_to_axis_mm:
+        return geometry, trajectory
+    pitch_mm, offset_mm = ((_AWAY * v, _AWAY * u) for v, u in (geometry.pixel_size_mm, geometry.detector_offset_mm))
+    scaled = replace(
+        geometry, source_to_detector_mm=_AWAY * geometry.source_to_detector_mm, pixel_size_mm=pitch_mm,
+        detector_offset_mm=offset_mm,
+    )  # fmt: skip
+    if isinstance(trajectory, CircularOrbit):
+        return scaled, replace(trajectory, geometry=scaled)
+    if not isinstance(trajectory, PoseTable) or _is_off_axis(trajectory.table):
+        return geometry, trajectory
+    source, panel = trajectory.table[:, :3], trajectory.table[:, 3:].reshape(-1, 3, 3).copy()
+    panel[:, 0] -= source
+    panel = _AWAY * panel
+    panel[:, 0] += source
+    return scaled, replace(trajectory, table=np.concatenate([source, panel.reshape(-1, 9)], 1))
+
+
+def _is_off_axis(poses: np.ndarray) -> bool:
+    """Whether the plane of a panel, of poses (T, 12), passes beside the origin."""
+    normal = body_frames(poses)[..., 2]
+    from_axis_mm = np.abs(np.einsum("ti,ti->t", poses[:, 3:6], normal))
+    return bool((from_axis_mm > _AT_AXIS * np.linalg.norm(poses[:, :3], axis=1)).any())
+
+
+def grid_of_scan(geometry: Geometry, trajectory: Trajectory, frame_start_s: np.ndarray) -> Grid:
+    """Returns ``default_grid``, longer by the travel of a gantry whose poses are no circle's."""
+    if isinstance(trajectory, CircularOrbit):
+        return default_grid(geometry)
+    poses = [checked_poses(trajectory, f, np.array([t])) for f, t in enumerate(frame_start_s)]
+    return default_grid(geometry, np.concatenate(poses))
 
 
 _AS_TABLE = "give it as a PoseTable"

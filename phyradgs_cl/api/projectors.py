@@ -19,6 +19,7 @@ from phyradgs_cl.fields.gaussians import QUATERNION, ROWS, SCALE
 from phyradgs_cl.operators import DensityOperator, RayOperator, SplatOperator, VoxelOperator
 from phyradgs_cl.operators import voxelise as voxelise_rows
 from phyradgs_cl.operators.rays.intensity import IntensityOperator
+from phyradgs_cl.operators.rays.subrays import subrays_of
 from phyradgs_cl.operators.splats.projector import DEFAULT_CUTOFF_SIGMA, DEFAULT_TIME_ERROR
 from phyradgs_cl.reconstructors.splats.device import tables_of
 from phyradgs_cl.reconstructors.splats.method import first_cloud
@@ -41,7 +42,8 @@ def ray_operator(
     Raises InputError for anything but a Scan or a Grid, and for an unknown motion or one that moves within a cell."""
     model, voxels = _checked(scan, motion, models.RAYS), scan.grid if grid is None else _a_grid(grid)
     tables = [model.cells(scan, frame).still() for frame in range(scan.frames)]
-    return _rays(RayOperator(runtime_of(device), voxels, scan.geometry.detector_shape, tables))
+    like = runtime_of(device), voxels, scan.geometry.detector_shape, tables
+    return _rays(RayOperator(*like, subrays=subrays_of(voxels, tables)))
 
 
 def _rays(engine: RayOperator) -> LinearOperator:
@@ -53,7 +55,10 @@ def _rays(engine: RayOperator) -> LinearOperator:
         engine.adjoint,
         frames=lambda chosen: _rays(engine.subset(chosen)),
         intensity=lambda: _intensities(
-            engine.rt, IntensityOperator(engine.rt, engine.grid, engine.detector_shape, engine.tables)
+            engine.rt,
+            IntensityOperator(
+                engine.rt, engine.grid, engine.detector_shape, engine.tables, subrays=engine.memory.layout.subrays
+            ),
         ),
     )
 

@@ -84,7 +84,7 @@ def fly_scan(
         else np.arange(len(start_deg)) * shutter.span_s
     )
     first_rad = np.deg2rad(start_deg)
-    last_rad = first_rad + np.deg2rad(exposure_deg)
+    last_rad = first_rad + np.deg2rad(_arcs_deg(turned_deg, exposure_deg))
     orbit = CircularOrbit(geometry, FrameSweeps(start_s, exposure_s, first_rad, last_rad))
     least_step = steps.min(initial=np.inf)
     if np.rad2deg(1 - _SLACK) < least_step < np.inf:
@@ -93,6 +93,24 @@ def fly_scan(
     called |= {"readout_s": "readout_ms"} if readout_ms is not None else {}
     called |= {"exposure_s": "exposure_s"} if has_exposure_s else {}
     return _scan(pixels, orbit, shutter, start_s, grid, True, others, called, has_exposure_s or fps is not None)
+
+
+def _arcs_deg(angles_deg: np.ndarray, exposure_deg: float) -> np.ndarray:
+    """Returns the arc (F,) of each frame's exposure, in the sense in which the gantry turns then.
+
+    Angles (F,), unwrapped, that rise and fall are of a gantry that swings back. Its frames sweep towards the next one's
+    angle, except those from which it returns past their own. Steps too large to have a sense leave it as stated."""
+    steps_deg = np.diff(angles_deg)
+    arcs_deg = np.full(len(angles_deg), exposure_deg)
+    is_clear = (np.abs(steps_deg) < _CLEAR_STEP_DEG).all() and (steps_deg > 0).any() and (steps_deg < 0).any()
+    if not is_clear:
+        return arcs_deg
+    before, after = (np.append(x, y) for x, y in ((steps_deg[:1], steps_deg), (steps_deg, steps_deg[-1:])))
+    reaches_next = np.abs(after) >= abs(exposure_deg) * (1 - _SLACK)
+    sense = np.where((before * after > 0) | reaches_next, np.sign(after), np.sign(before))
+    back = np.count_nonzero(sense * np.sign(exposure_deg) < 0)
+    log.warning("angles_deg rise and fall: %d of %d frames sweep against the sign of exposure_deg", back, len(sense))
+    return np.asarray(np.where(sense == 0, np.sign(exposure_deg), sense) * abs(exposure_deg))
 
 
 def static_scan(

@@ -49,7 +49,7 @@ def simulate_command(
     scanner: Annotated[str, option("Scanner by name (r2, carm, parallel) or a TOML file.")] = "r2",
     protocol: Annotated[ProtocolName, option(_PROTOCOL)] = "rapid",  # type: ignore[valid-type]
     views: Annotated[int | None, option("Frames of the scan.", "protocol's")] = None,
-    turns: Annotated[float | None, option("Turns of the gantry, over which the frames are spread.", "1")] = None,
+    turns: Annotated[float | None, option("Turns over which the frames are spread; below 0 clockwise.", "1")] = None,
     exposure_deg: Annotated[float | None, option("Arc of one exposure, degrees.", "protocol's")] = None,
     readout_ratio: Annotated[float | None, option("Readout over exposure time.", "0.86")] = None,
     fps: Annotated[float | None, option("Frames per second; states the times of the arcs.", "scanner's")] = None,

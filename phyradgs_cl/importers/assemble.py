@@ -10,9 +10,9 @@ import numpy as np
 
 from phyradgs_cl import checks
 from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, FrameSweeps, PoseTable, Scan, Shutter
-from phyradgs_cl.acquisition.geometry import Geometry, ParallelGeometry, default_grid
+from phyradgs_cl.acquisition.geometry import Geometry, ParallelGeometry
 from phyradgs_cl.acquisition.plausible import check_plausible
-from phyradgs_cl.acquisition.trajectory import resting_poses
+from phyradgs_cl.acquisition.trajectory import grid_of_scan, resting_poses
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.importers.options import ImportOptions
@@ -203,7 +203,8 @@ def assemble_scan(
     assumed = [*timing.assumed, *([] if options.detector_model else ["average"])] if timing.is_fly else []
     scan = Scan(
         projections=integrals.values, geometry=geometry, trajectory=trajectory, shutter=timing.shutter,
-        frame_start_s=np.asarray(timing.start_s, np.float64), grid=grid or default_grid(geometry),
+        frame_start_s=np.asarray(timing.start_s, np.float64),
+        grid=grid or grid_of_scan(geometry, trajectory, timing.start_s),
         is_fly=timing.is_fly, detector_model=options.detector_model or "log", pixel_mask=integrals.mask,
         reference=reference, title=title,
         provenance={

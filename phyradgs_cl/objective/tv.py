@@ -5,8 +5,8 @@ and Teboulle, IEEE Trans. Image Process. 18 (2009) 2419). Axis weights scale the
 the states of an object that changes, the sum of |differences| between a state and the next one is added.
 
 ``TvDescent`` takes steps of a fixed length, as ASD-POCS does (Sidky and Pan, Phys. Med. Biol. 53 (2008) 4777). Backward
-differences and their floor are those of TIGRE. With a prior image i it descends (1 − share) TV(x) + share TV(x − i) (Chen,
-Tang and Leng, Med. Phys. 35 (2008) 660)."""
+differences are those of TIGRE; their floor is relative to the volume's values, so that units do not matter. With a prior
+image i it descends (1 − share) TV(x) + share TV(x − i) (Chen, Tang and Leng, Med. Phys. 35 (2008) 660)."""
 
 import math
 from collections.abc import Callable
@@ -136,7 +136,7 @@ def _steps(axis_weights: tuple[float, ...]) -> tuple[float, float]:
     return (in_space / 2, 1 / (8 * time[0] ** 2)) if any(time) else (in_space, 0.0)
 
 
-_SMALLEST = 1e-8
+_SMALLEST, _NOTHING = 1e-6, 1e-30  # floor of the differences, of the volume's RMS; for a volume of zeros
 
 
 class TvDescent:
@@ -154,30 +154,34 @@ class TvDescent:
 
     def gradient(self, volume: SameArray) -> SameArray:
         """Returns dTV/dvolume (z, y, x) float32; a device array gives a device array."""
-        return self._where_it_is(self._gradient, volume)
+        return self._where_it_is(lambda x: self._gradient(x, self._least(x)), volume)
 
     def __call__(self, volume: SameArray, step: float, count: int) -> SameArray:
         """Takes ``count`` steps of Euclidean length ``step`` (1/mm) downhill; a device array gives a device array."""
 
         def descended(x: DeviceArray) -> DeviceArray:
+            least = self._least(x)
             for _ in range(count):
-                x = self._space.descend(x, self._slope(x), step)
+                x = self._space.descend(x, self._slope(x, least), step)
             return x
 
         return self._where_it_is(descended, volume)
 
-    def _slope(self, volume: DeviceArray) -> DeviceArray:
-        slope, space = self._gradient(volume), self._space
+    def _slope(self, volume: DeviceArray, least: float) -> DeviceArray:
+        slope, space = self._gradient(volume, least), self._space
         if self._image is None:
             return slope
-        of_change = self._gradient(space.add(volume, self._image, -1.0))
+        of_change = self._gradient(space.add(volume, self._image, -1.0), least)
         return space.add(slope, space.add(of_change, slope, -1.0), self.share)
 
-    def _gradient(self, volume: DeviceArray) -> DeviceArray:
+    def _least(self, volume: DeviceArray) -> float:
+        return max(_SMALLEST * self._space.norm(volume) / math.sqrt(volume.size), _NOTHING)
+
+    def _gradient(self, volume: DeviceArray, least: float) -> DeviceArray:
         nz, ny, nx = self.shape
         gradient = self._space.empty(self.shape)
         items, group = (nx, ny, nz), self.rt.group(on_cpu=32)
-        self.rt.launch(self._kernel, items, volume, self._shape4, gradient, group=group)
+        self.rt.launch(self._kernel, items, volume, self._shape4, np.float32(least), gradient, group=group)
         return gradient
 
     def _where_it_is(self, function: Callable[[DeviceArray], DeviceArray], volume: SameArray) -> SameArray:
@@ -186,11 +190,12 @@ class TvDescent:
         return cast(SameArray, self.rt.download(function(self.rt.upload(volume, np.float32))))
 
 
-def tv_gradient(volume: np.ndarray) -> np.ndarray:
-    """Float64 twin: gradient (z, y, x) of Σ |backward difference|."""
+def tv_gradient(volume: np.ndarray, least: float | None = None) -> np.ndarray:
+    """Float64 twin: gradient (z, y, x) of Σ |backward difference|; ``least``: the floor, None for that of the volume."""
     volume = np.asarray(volume, np.float64)
+    least = _least_of(volume) if least is None else least
     difference = np.stack([np.diff(volume, axis=a, prepend=volume.take([0], axis=a)) for a in range(3)])
-    unit = difference / (np.linalg.norm(difference, axis=0) + _SMALLEST)
+    unit = difference / (np.linalg.norm(difference, axis=0) + least)
     gradient: np.ndarray = unit.sum(axis=0)
     for axis in range(3):
         ahead = np.diff(unit[axis], axis=axis, append=np.zeros_like(unit[axis].take([0], axis=axis)))
@@ -198,15 +203,20 @@ def tv_gradient(volume: np.ndarray) -> np.ndarray:
     return gradient
 
 
+def _least_of(volume: np.ndarray) -> float:
+    return max(_SMALLEST * float(np.linalg.norm(volume)) / math.sqrt(volume.size), _NOTHING)
+
+
 def tv_descent(
     volume: np.ndarray, step: float, count: int, image: np.ndarray | None = None, share: float = 0.0
 ) -> np.ndarray:
     """Float64 twin of ``TvDescent``."""
     result = np.array(volume, np.float64)
+    least = _least_of(result)
     for _ in range(count):
-        gradient = tv_gradient(result)
+        gradient = tv_gradient(result, least)
         if image is not None:
-            gradient = (1 - share) * gradient + share * tv_gradient(result - image)
+            gradient = (1 - share) * gradient + share * tv_gradient(result - image, least)
         length = np.linalg.norm(gradient)
         if length == 0:
             break

@@ -94,6 +94,7 @@ def reprojection(rt: Runtime | None, scan: Scan) -> Model:
     if rt is None:
         raise InputError("--steps", "a step that reconstructs, without a device", "a Runtime", "pass one")
     from phyradgs_cl.operators import RayOperator  # methods are slow to import
+    from phyradgs_cl.operators.rays.subrays import subrays_of
     from phyradgs_cl.reconstructors.fdk import FdkOptions, fdk
     from phyradgs_cl.reconstructors.voxels import fista_tv
 
@@ -101,7 +102,7 @@ def reprojection(rt: Runtime | None, scan: Scan) -> Model:
     fdk_options = FdkOptions(window="hann", motion=motion)
     tv_options = fista_tv.FistaTvOptions(motion=PerRow(sub_intervals=2), iterations=30, tv_weight=0.002)
     tables = [motion.cells(scan, frame).still() for frame in range(scan.frames)]
-    operator = RayOperator(rt, scan.grid, scan.geometry.detector_shape, tables)
+    operator = RayOperator(rt, scan.grid, scan.geometry.detector_shape, tables, subrays=subrays_of(scan.grid, tables))
 
     def of(frames: np.ndarray) -> Scan:
         return replace(scan, projections=np.asarray(frames, np.float32))

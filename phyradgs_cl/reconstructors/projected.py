@@ -14,6 +14,7 @@ from phyradgs_cl.detector import noise_rms
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Deformation, Grid, States
 from phyradgs_cl.operators import IntensityOperator, RayOperator
+from phyradgs_cl.operators.rays.subrays import subrays_of
 from phyradgs_cl.operators.warp.operator import projector_of
 from phyradgs_cl.runtime import Runtime
 
@@ -70,13 +71,14 @@ def frame_pairs(
         volume, projector = moves.volumes, projector_of(rt, grid, tables, None, moves.times_s)
     else:
         projector = projector_of(rt, grid, tables, moves)
-    operator = projector(rt, grid, scan.geometry.detector_shape, tables)
+    like, subrays = (rt, grid, scan.geometry.detector_shape, tables), subrays_of(grid, tables)
+    operator = projector(*like, subrays=subrays)
     if scan.detector_model != "intensity":
         computed = operator.forward(volume)
     elif isinstance(operator, RayOperator):
         computed = operator.forward(volume) - operator.intensity_correction(volume)
     else:
-        computed = IntensityOperator(rt, grid, scan.geometry.detector_shape, tables, projector).expected(volume)
+        computed = IntensityOperator(*like, projector, subrays).expected(volume)
     pairs = []
     for frame, image in zip(frames, computed, strict=True):
         valid = scan.valid[frame]

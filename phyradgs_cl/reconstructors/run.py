@@ -69,6 +69,8 @@ def reconstruct(
         more["resume"] = without_identity(resume, identity())
     ready = prepared(scan, preprocessing, rt)
     ready.check_sight()
+    ready.warn_of_blind_places()
+    ready.warn_of_negative_integrals()
     check_own_motion(getattr(options, "motion", None), ready)
     if plan.initial is not None:
         more["initial"] = _initial(plan, plan.initial, ready.grid)

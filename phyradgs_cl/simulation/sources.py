@@ -95,10 +95,10 @@ class PixelAreaSource(FrameSource):
         self._finer, self._samples = finer, samples
 
     def frame(self, cells: TimeCells, model: str, factor: float) -> np.ndarray:
-        return self._averaged(self._finer.frame(cells.finer(self._samples), model, factor), model)
+        return self._averaged(self._finer.frame(cells.finer(self._samples, self._samples), model, factor), model)
 
     def frames(self, tables: Sequence[TimeCells], model: str, factor: float) -> Iterator[np.ndarray]:
-        fine = self._finer.frames([cells.finer(self._samples) for cells in tables], model, factor)
+        fine = self._finer.frames([cells.finer(self._samples, self._samples) for cells in tables], model, factor)
         return (self._averaged(frame, model) for frame in fine)
 
     def _averaged(self, fine: np.ndarray, model: str) -> np.ndarray:

@@ -221,9 +221,8 @@ def _warn_of_doubts(plan: methods.RunPlan, path: Path, scan: Scan) -> None:
     if scan.is_fly and late.size:
         text = "%s: frame %d starts no later than frame %d: check frame_start_time, and that frames are in order"
         log.warning(text, path, late[0] + 1, late[0])
-    if (largest := float(scan.projections.max())) <= 0:
-        found = f"no line integral is above 0 (the largest is {largest + 0.0:g})"  # + 0.0 makes a 0 of a -0
-        log.warning("%s: %s: there is no object in it, or the sign is wrong", path, found)
+    if not scan.projections.any():
+        log.warning("%s: all line integrals are 0: there is no object in it", path)
 
 
 def _warn_of_residual(path: Path, result: methods.Reconstruction) -> None:

@@ -105,7 +105,7 @@ def test_cells_with_motion_are_for_splats() -> None:
 @pytest.mark.parametrize("factor", [2, 3])
 def test_finer_pixels_lie_inside_of_those_they_were_cut_from(factor) -> None:
     table = micro_views(2, 2)
-    finer = table.finer(factor)
+    finer = table.finer(factor, factor)
     assert finer.lines == factor * LINES
     np.testing.assert_array_equal(finer.line_stop, factor * table.line_stop)
     np.testing.assert_array_equal(finer.line_start, factor * table.line_start)

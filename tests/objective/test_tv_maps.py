@@ -126,12 +126,14 @@ def test_descent_twin_is_differentiated_right(finite_differences) -> None:
         return float(np.sqrt(sum(s * s for s in steps)).sum())
 
     expected = finite_differences(value, volume)
-    np.testing.assert_allclose(tv_gradient(volume), expected, rtol=0, atol=TWIN_GRADIENT)
+    np.testing.assert_allclose(tv_gradient(volume, 1e-8), expected, rtol=0, atol=TWIN_GRADIENT)
 
 
-@pytest.mark.parametrize("step, share", [(1e-8, 1 / 2), (3e-8, 3 / 4), (1.0, 1.0)])
-def test_steps_of_the_size_of_rounding_count_less(any_rt, step, share) -> None:
-    """The length of a difference is counted 1e-8 too long, as in TIGRE."""
-    volume = np.array([[[0.0, step]]])
-    for gradient in (tv_gradient(volume), TvDescent(any_rt, volume.shape).gradient(volume)):
-        np.testing.assert_allclose(gradient, [[[-share, share]]], rtol=1e-6)
+@pytest.mark.parametrize("unit", [1e-6, 1.0, 1e6])
+@pytest.mark.parametrize("step, share", [(1e-6, 1 / 2), (3e-6, 3 / 4), (0.01, 1.0)])
+def test_steps_of_the_size_of_rounding_count_less_in_every_unit(any_rt, unit, step, share) -> None:
+    """The length of a difference is counted 1e-6 of the volume's RMS too long."""
+    volume = np.zeros((1, 1, 40))
+    volume[..., :20], volume[..., 20:22] = 1.0, (0.0, step / np.sqrt(2))
+    for gradient in (tv_gradient(unit * volume), TvDescent(any_rt, volume.shape).gradient(unit * volume)):
+        assert gradient[0, 0, 22] == pytest.approx(-share, rel=2e-4)

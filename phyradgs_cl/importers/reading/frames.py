@@ -19,6 +19,7 @@ _log = logging.getLogger(__name__)
 Mask = np.ndarray | None
 TAKEN = "taken"
 """The key of the provenance for which frames and flats were taken, in words."""
+_AIR = 0.2  # of a line integral beside the object, with noise
 _SAME = 1e-3  # relative difference of a flat that is at the ceiling too
 
 
@@ -64,6 +65,7 @@ def line_integrals(
             light = light_of(subject, flats, darks, len(frames), options, flats_at, names)
             flat = light.flats.mean(axis=0)
             saturation = find_saturation(frames, flat)
+        _refuse_logarithms(subject, frames, flat, options)
         if not is_corrected and (darks is None or len(darks) == 0):
             _log.warning("%s: counts without darks: an offset of the panel stays in the line integrals", subject)
     flats, darks, place = (light.flats, light.dark, light.place) if light else (None, None, None)
@@ -79,6 +81,15 @@ def line_integrals(
     if light is not None and options.flat_value is None:
         applied[TAKEN] = light.said
     return LineIntegrals(integrals, compact(unusable), saturation, applied)
+
+
+def _refuse_logarithms(subject: str, frames: np.ndarray, flat: np.ndarray, options: ImportOptions) -> None:
+    """Raises InputError for line integrals with flats of ones: where counts are as bright as the flats, these are 0."""
+    border = np.concatenate([frames[..., 0].ravel(), frames[..., -1].ravel()])
+    if (flat == 1).all() and abs(float(np.median(border))) < _AIR:
+        remedy = f"say {options.named('quantity')} attenuation, and leave the flats out"
+        found = "flats of ones, and frames that are 0 at their borders"
+        raise InputError(f"{subject} flats", found, "counts, which are as bright as the flats there", remedy)
 
 
 def _warn_of_unused(subject: str, quantity: str, flats: np.ndarray | None, darks: np.ndarray | None) -> None:

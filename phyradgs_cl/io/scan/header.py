@@ -1,15 +1,17 @@
 """The header of a scan file: everything but its large arrays, checked before those are read."""
 
 import logging
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import h5py
 import numpy as np
 
 from phyradgs_cl import checks
 from phyradgs_cl.acquisition import Saturation, Scan
-from phyradgs_cl.acquisition.geometry import Geometry, default_grid
 from phyradgs_cl.acquisition.scan import DETECTOR_MODELS, LARGEST_LAG
+from phyradgs_cl.acquisition.trajectory import grid_of_scan
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.io import scan as schema
@@ -54,7 +56,7 @@ def read_header(source: Hdf5Source) -> ScanHeader:
     start_s = detector.read_starts(source, entry, used, shutter, moving)
     shutter.check_resolved(start_s, source.name(f"{entry}/{schema.DETECTOR}/count_time"))
     trajectory = read_trajectory(source, entry, geometry, used, start_s, shutter.exposure_s)
-    grid, has_grid = _read_or_derive_grid(source, entry, geometry)
+    grid, has_grid = _read_or_derive_grid(source, entry, partial(grid_of_scan, geometry, trajectory, start_s))
     extra = f"{entry}/{schema.EXTRA}"
     provenance = read_word(source, f"{extra}/provenance", default="{}")
     lag = read_number(source, f"{extra}/lag", default=0.0)
@@ -73,7 +75,8 @@ def read_header(source: Hdf5Source) -> ScanHeader:
     has_reference, states = check_truth(source, entry, grid)
     if not has_grid:
         where, size = source.name(f"{entry}/{schema.GRID}"), " × ".join(str(n) for n in grid.shape)
-        _log.warning("%s: no grid; %s voxels of %.4g mm taken", where, size, grid.voxel_size_mm[0])
+        sides_mm = " × ".join(f"{side:.4g}" for side in dict.fromkeys(grid.voxel_size_mm))
+        _log.warning("%s: no grid; %s voxels of %s mm taken", where, size, sides_mm)
     for address in (f"{entry}/{name}" for name in schema.IGNORED):
         if source.find(address) is not None:
             _log.warning("%s: not read by this package", source.name(address))
@@ -112,12 +115,12 @@ def _is_nxtomo(source: Hdf5Source, address: str) -> bool:
     return isinstance(thing, h5py.Dataset) and thing.size == 1 and "nxtomo" in str(thing[()]).lower()
 
 
-def _read_or_derive_grid(source: Hdf5Source, entry: str, geometry: Geometry) -> tuple[Grid, bool]:
+def _read_or_derive_grid(source: Hdf5Source, entry: str, derive: Callable[[], Grid]) -> tuple[Grid, bool]:
     address = f"{entry}/{schema.GRID}"
     if source.optional_group(address) is not None:
         return read_grid(source, address), True
     try:
-        grid = default_grid(geometry)
+        grid = derive()
     except InputError as error:
         remedy = "correct the geometry, or store the grid"
         raise source.error(address, "no grid, and none that follows", error.expected, remedy) from error

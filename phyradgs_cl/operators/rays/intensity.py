@@ -16,6 +16,7 @@ from phyradgs_cl.fields import Grid
 from phyradgs_cl.operators.rays.layout import layered
 from phyradgs_cl.operators.rays.memory import RayMemory
 from phyradgs_cl.operators.rays.operator import RayOperator
+from phyradgs_cl.operators.rays.subrays import SINGLE
 from phyradgs_cl.runtime import Array, DeviceArray, DeviceSpace, HostSpace, Runtime, SameArray, Space
 
 _HOST = HostSpace()
@@ -29,13 +30,13 @@ class IntensityOperator:
 
     def __init__(
         self, rt: Runtime, grid: Grid, detector_shape: tuple[int, int], tables: Sequence[TimeCells],
-        projector: Callable[..., Any] = RayOperator,
-    ) -> None:
+        projector: Callable[..., Any] = RayOperator, subrays: tuple[int, int] = SINGLE,
+    ) -> None:  # fmt: skip
         ones, weights = layered(tables)
         self.frames_shape = (len(tables), *detector_shape)
         self._operators: list[Any] = []
         # One memory for all layers, which run one after the other. The operator over all cells needs the largest.
-        memory = RayOperator(rt, grid, detector_shape, tables).memory
+        memory = RayOperator(rt, grid, detector_shape, tables, subrays=subrays).memory
         for part in ones:
             self._operators.append(projector(rt, grid, detector_shape, part, memory=memory))
         self.volume_shape: tuple[int, ...] = self._operators[0].volume_shape

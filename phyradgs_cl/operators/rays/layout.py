@@ -27,17 +27,21 @@ class RayLayout:
     """Layout of volumes (z, y, x) and of stacks of frames with ``lines`` × ``width`` pixels in device memory.
 
     ``brick`` selects the voxels of the grid that the volume holds. It has a border of zeros, so that the frames of all
-    bricks add up to the frames of the grid."""
+    bricks add up to the frames of the grid. ``subrays`` (along v, along u): lines and width count the rays of pixels."""
 
     grid: Grid
     lines: int
     width: int
     brick: Brick
+    subrays: tuple[int, int] = (1, 1)
 
     @classmethod
-    def of_scan(cls, grid: Grid, detector_shape: tuple[int, int], axis: str) -> "RayLayout":
+    def of_scan(
+        cls, grid: Grid, detector_shape: tuple[int, int], axis: str, subrays: tuple[int, int] = (1, 1)
+    ) -> "RayLayout":
         """The layout of the complete grid, with the readout's lines as rows of the frames."""
-        return cls(grid, *Readout(axis).shape(detector_shape), whole(grid.shape))
+        (rows, columns), (along_v, along_u) = detector_shape, subrays
+        return cls(grid, *Readout(axis).shape((rows * along_v, columns * along_u)), whole(grid.shape), subrays)
 
     def of(self, brick: Brick) -> "RayLayout":
         """The layout of the same frames with another brick of the grid."""
@@ -77,11 +81,12 @@ class RayLayout:
         row = pitch_of(self.lines)
         return Strides(GUARD, self.width * row, row)
 
-    def pixel_strides(self, axis: str) -> tuple[int, int, int, int]:
-        """Start of padded frames, and floats from column to column, row to row, frame to frame."""
-        row = pitch_of(self.width)
-        slice_ = self.lines * row
-        return (GUARD, 1, row, slice_) if axis == "rows" else (GUARD, row, 1, slice_)
+    def pixel_strides(self, axis: str, *, turned: bool = False) -> tuple[int, int, int, int]:
+        """Start of padded frames, and floats from column to column, row to row, frame to frame. ``turned``: of frames whose
+        lines are columns."""
+        strides = self.turned_strides if turned else self.frames_strides
+        steps = (1, strides.row) if (axis == "rows") != turned else (strides.row, 1)
+        return (strides.start, *steps, strides.slice)
 
     def column_floats(self, axis: str) -> int:
         """Floats of a padded frame with detector columns as rows."""

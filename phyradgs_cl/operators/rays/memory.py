@@ -9,6 +9,7 @@ from phyradgs_cl.fields import triple
 from phyradgs_cl.operators.bricks import Brick, cut, whole
 from phyradgs_cl.operators.rays.launches import owner_steps
 from phyradgs_cl.operators.rays.layout import RayLayout
+from phyradgs_cl.operators.rays.subrays import SINGLE, launch_means, launch_spread, means, spread
 from phyradgs_cl.operators.rays.upright import columns_floats, turn_volume
 from phyradgs_cl.runtime import Array, DeviceArray, Runtime
 from phyradgs_cl.runtime.layout import GUARD, Strides, move, pad_rows, unpad_rows
@@ -194,21 +195,28 @@ class RayMemory:
         ``axis`` is the readout's."""
         count, layout = part.stop - part.start, self.layout
         on_device = self._some_frames(layout.turned_floats(count)) if turned else self.frames(count)
-        if isinstance(frames, DeviceArray):
+        if layout.subrays != SINGLE and isinstance(frames, DeviceArray):
+            strides = layout.pixel_strides(axis, turned=turned)
+            launch_spread(self.rt, frames, part, layout.subrays, on_device, strides)
+        elif isinstance(frames, DeviceArray):
             source = frames, Strides.plain(frames.shape, (part.start, 0, 0))
             padded = on_device, layout.turned_strides if turned else layout.frames_strides
             move(self.rt, source, padded, (count, *frames.shape[1:]), turned=turned != (axis == "columns"))
         else:
-            lines = Readout(axis).frames(frames[part])
+            chosen = frames[part] if layout.subrays == SINGLE else spread(frames[part], layout.subrays)
+            lines = Readout(axis).frames(chosen)
             self.rt.write(on_device, pad_rows(lines.swapaxes(1, 2) if turned else lines))
         return on_device
 
     def read_frames(self, on_device: DeviceArray, result: Array, part: slice, axis: str) -> None:
         """Copies padded frames to their place in ``result`` (F, rows, columns): the inverse of ``write_frames``."""
-        shape = self.layout.frames_shape(part.stop - part.start)
-        if isinstance(result, DeviceArray):
+        shape, subrays = self.layout.frames_shape(part.stop - part.start), self.layout.subrays
+        if subrays != SINGLE and isinstance(result, DeviceArray):
+            launch_means(self.rt, on_device, self.layout.pixel_strides(axis), subrays, result, part)
+        elif isinstance(result, DeviceArray):
             plain = Strides.plain(result.shape, (part.start, 0, 0))
             padded = on_device, self.layout.frames_strides
             move(self.rt, padded, (result, plain), shape, turned=axis == "columns")
         else:
-            result[part] = Readout(axis).frames(unpad_rows(self.rt.download(on_device), shape))
+            frames = Readout(axis).frames(unpad_rows(self.rt.download(on_device), shape))
+            result[part] = frames if subrays == SINGLE else means(frames, subrays)

@@ -21,6 +21,7 @@ from phyradgs_cl.operators.rays.launches import AVERAGES, launch_adjoint, launch
 from phyradgs_cl.operators.rays.layout import RayCells, RayLayout, averaged, layered, runs_across
 from phyradgs_cl.operators.rays.memory import RayMemory
 from phyradgs_cl.operators.rays.slots import Slots, UprightPoses, merge_slots, split_slots
+from phyradgs_cl.operators.rays.subrays import SINGLE
 from phyradgs_cl.operators.rays.upright import launch_upright, launch_upright_adjoint, upright_of
 from phyradgs_cl.runtime import Array, DeviceArray, Runtime, SameArray, with_smaller_bricks
 from phyradgs_cl.runtime.layout import Strides
@@ -52,38 +53,44 @@ class RayOperator:
     """Joseph's projector and its matched adjoint over the cells of many frames; a ``LinearOperator``.
 
     NumPy arrays give NumPy arrays. Device arrays (plain, float32) give device arrays; only averages of intensity over a
-    volume in bricks are made on the host. ``out``, an array of the same kind, receives the result. detector_shape is (rows,
-    columns); ``tables`` has the time cells of each frame, all read out along one axis. An operator shares its tables and
-    buffers with its subsets, and with operators that were given the same ``memory``: use them one at a time. A volume that
-    does not fit is projected in bricks. fewest_lines: as in ``upright_of``; ``FEWEST_LINES`` is fastest for panels of few
-    lines, and rounds differently.
+    volume in bricks, or over sub-rays, are made on the host. ``out``, an array of the same kind, receives the result.
+    detector_shape is (rows, columns); ``tables`` has the time cells of each frame, all read out along one axis. An operator
+    shares its tables and buffers with its subsets, and with operators that were given the same ``memory``: use them one at
+    a time. A volume that does not fit is projected in bricks. fewest_lines: as in ``upright_of``; ``FEWEST_LINES`` is
+    fastest for panels of few lines, and rounds differently. subrays: of a pixel (along v, along u), by
+    ``subrays_of``; those of ``memory`` if given.
 
     Joseph, IEEE Trans. Med. Imaging 1 (1982) 192. Raises InputError for tables that do not fit the detector."""
 
     def __init__(
         self, rt: Runtime, grid: Grid, detector_shape: tuple[int, int], tables: Sequence[TimeCells], *,
-        memory: RayMemory | None = None, fewest_lines: int | None = None,
-    ) -> None:
+        memory: RayMemory | None = None, fewest_lines: int | None = None, subrays: tuple[int, int] = SINGLE,
+    ) -> None:  # fmt: skip
         _check_tables(tables, detector_shape)
+        subrays = subrays if memory is None else memory.layout.subrays
         self.rt, self.grid, self.detector_shape = rt, grid, detector_shape
         self.volume_shape = grid.shape
-        is_across = runs_across(rt, detector_shape, tables[0].axis)
+        rays_shape = detector_shape[0] * subrays[0], detector_shape[1] * subrays[1]
+        is_across = runs_across(rt, rays_shape, tables[0].axis)
         self._axis = "rows" if is_across else tables[0].axis  # whose lines are the kernels' lines
-        layout = RayLayout.of_scan(grid, detector_shape, self._axis)
+        layout = RayLayout.of_scan(grid, detector_shape, self._axis, subrays)
+        self._tables = list(tables)
+        if subrays != SINGLE:
+            tables = [table.finer(*subrays) for table in tables]
         # Upright kernels and their slots (``upright.py``, ``slots.py``) are for CPUs: on a GPU neighbouring pixels of the
         # general kernel read neighbouring addresses already.
         may_use_slots = not rt.pixel_items and (memory is None or memory.slot_floats > 0)
-        self._upright = upright_of(grid, tables, detector_shape, rt.lanes, fewest_lines) if may_use_slots else None
+        self._upright = upright_of(grid, tables, rays_shape, rt.lanes, fewest_lines) if may_use_slots else None
         self._poses: UprightPoses | None = None
         self.slot_floats = 0
         if self._upright is not None:
             self._poses = UprightPoses.upload(rt, grid, tables)
-            self.slot_floats = self._poses.floats_per_frame(detector_shape, self._upright.leans)
+            self.slot_floats = self._poses.floats_per_frame(rays_shape, self._upright.leans)
         self.memory = memory or RayMemory(rt, layout, len(tables), self.slot_floats)
         if self.slot_floats > self.memory.slot_floats:  # the shared memory was planned without room for slots
             self._upright = None
-        self._tables = list(tables)
-        self._cells = RayCells.upload(rt, grid, self._tables, detector_shape[0] if is_across else None)
+        self._rays_shape = rays_shape
+        self._cells = RayCells.upload(rt, grid, tables, rays_shape[0] if is_across else None)
         self._choose(np.arange(len(tables)))
 
     @property
@@ -114,7 +121,7 @@ class RayOperator:
 
     def _project(self, volume: Array, average: str, share: float, result: Array) -> None:
         bricks = self.memory.plan(share)
-        if average != "log" and len(bricks) > 1:
+        if average != "log" and (len(bricks) > 1 or self.memory.layout.subrays != SINGLE):
             self._project_layers(volume, average, result)
             return
         columns = self.memory.turned(volume) if self._is_upright and self.memory.has_columns else None
@@ -150,7 +157,7 @@ class RayOperator:
                 continue
             there = self.memory.slots()
             launch_upright(self.rt, layout, self._upright, self._poses, slots, columns, (there, slots.strides))
-            like = self.detector_shape, self._axis, AVERAGES.index(average)
+            like = self._rays_shape, self._axis, AVERAGES.index(average)
             merge_slots(self.rt, self._cells, slots, there, target, *like)
 
     def _slots_of(self, part: slice) -> Iterator[tuple[int, Slots]]:
@@ -161,15 +168,15 @@ class RayOperator:
             if key not in self._slots:
                 chosen = self._chosen[slice(*key)]
                 most_floats = self.memory.slot_frames * self.memory.slot_floats
-                like = self.detector_shape, self._upright.leans, most_floats
+                like = self._rays_shape, self._upright.leans, most_floats
                 self._slots[key] = self._poses.slots(self.rt, chosen, *like)
             yield first - part.start, self._slots[key]
 
     def _project_layers(self, volume: Array, average: str, result: Array) -> None:
-        """Averages −ln Σ w exp(−p) of a volume in bricks, on the host.
+        """Averages −ln Σ w exp(−p) of a volume in bricks, or over sub-rays, on the host.
 
-        These need the whole line integral of every cell, of which a brick holds a part. So a layer (at most one cell per
-        line) is projected at a time."""
+        These need the whole line integral of every cell, of which a brick, or a sub-ray, holds a part. So a layer (at most
+        one cell per line) is projected at a time."""
         ones, weights = layered(self.tables)
         like = (self.rt, self.grid, self.detector_shape)
         on_host = self.rt.download(volume) if isinstance(volume, DeviceArray) else volume
@@ -215,7 +222,7 @@ class RayOperator:
         there, pitch_mm = self.memory.slots(), layout.constants()[3]
         each = layout.column_floats(self._axis)
         for first, slots in self._slots_of(part):
-            like = self.detector_shape, pitch_mm, first * each
+            like = self._rays_shape, pitch_mm, first * each
             split_slots(self.rt, self._cells, self._poses, slots, frames, *like, there)
             launch_upright_adjoint(
                 self.rt, layout, self._upright, self._poses, slots, there, target, add=add or first > 0

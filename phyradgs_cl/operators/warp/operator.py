@@ -17,6 +17,7 @@ from phyradgs_cl.fields import Deformation, Grid
 from phyradgs_cl.operators.rays.layout import some_cells
 from phyradgs_cl.operators.rays.memory import RayMemory
 from phyradgs_cl.operators.rays.operator import RayOperator
+from phyradgs_cl.operators.rays.subrays import SINGLE
 from phyradgs_cl.operators.warp.stack import StateStack, TimeStates
 from phyradgs_cl.operators.warp.states import MOST_STATES, MotionStates
 from phyradgs_cl.operators.warp.volume import VolumeWarp
@@ -35,12 +36,12 @@ class WarpedOperator:
 
     def __init__(
         self, rt: Runtime, grid: Grid, detector_shape: tuple[int, int], tables: Sequence[TimeCells], *,
-        warp: VolumeWarp | StateStack, memory: RayMemory | None = None,
+        warp: VolumeWarp | StateStack, memory: RayMemory | None = None, subrays: tuple[int, int] = SINGLE,
     ) -> None:  # fmt: skip
         self.rt, self.grid, self.warp = rt, grid, warp
         self.volume_shape: tuple[int, ...] = warp.shape
         self.detector_shape = detector_shape
-        self.memory = memory or RayOperator(rt, grid, detector_shape, tables).memory
+        self.memory = memory or RayOperator(rt, grid, detector_shape, tables, subrays=subrays).memory
         self._parts = [
             _Part(rt, state, frames, RayOperator(rt, grid, detector_shape, shared, memory=self.memory))
             for state, (frames, shared) in enumerate(_tables_by_state(tables, warp))

@@ -24,6 +24,7 @@ from phyradgs_cl.acquisition.time_cells import TimeCells
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.operators import RayOperator
+from phyradgs_cl.operators.rays.subrays import subrays_of
 from phyradgs_cl.reconstructors.fdk.views import widened
 from phyradgs_cl.reconstructors.result import Progress, ProgressReport, Report
 from phyradgs_cl.reconstructors.voxels import fista_tv
@@ -111,7 +112,8 @@ def reprojected(
     by_line = wide[:, None] if wide.ndim == 2 else wide
     shape = rows, columns + 2 * count
     lines = shape[axis == "columns"]
-    operator = RayOperator(rt, grid, shape, [_cells(poses, lines, axis, is_parallel) for poses in by_line])
+    tables = [_cells(poses, lines, axis, is_parallel) for poses in by_line]
+    operator = RayOperator(rt, grid, shape, tables, subrays=subrays_of(grid, tables))
     continued = operator.forward(np.ascontiguousarray(volume, np.float32))
     continued[..., count : count + columns] = frames
     return continued, count

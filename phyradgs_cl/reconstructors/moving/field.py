@@ -14,6 +14,7 @@ from phyradgs_cl.acquisition import Motion, Scan
 from phyradgs_cl.acquisition.time_cells import TimeCells
 from phyradgs_cl.fields import Deformation, control_points
 from phyradgs_cl.fields.deformation import fitted_control_mm
+from phyradgs_cl.operators.rays.subrays import subrays_of
 from phyradgs_cl.operators.warp.derivative import FieldDerivative
 from phyradgs_cl.operators.warp.operator import WarpedOperator
 from phyradgs_cl.operators.warp.stack import StateStack
@@ -99,7 +100,9 @@ class FieldProblem:
             states = MotionStates.of_times(one.deformation(), self.scan.grid, self.times_s, _LEAST_VOXELS)
             warp = VolumeWarp(self.rt, states)
         shape = self.scan.geometry.detector_shape
-        return WarpedOperator(self.rt, self.scan.grid, shape, tables or self.tables, warp=warp)
+        tables = tables or self.tables
+        subrays = subrays_of(self.scan.grid, tables)
+        return WarpedOperator(self.rt, self.scan.grid, shape, tables, warp=warp, subrays=subrays)
 
     def residual(self, one: MotionField, volume: np.ndarray) -> np.ndarray:
         """Returns p − A v (F, rows, columns) at the valid pixels, 0 elsewhere."""

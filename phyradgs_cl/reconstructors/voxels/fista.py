@@ -8,6 +8,7 @@ of a subset, times the number of subsets, stands for that of all frames (Kim, Ra
 The last 2/5 of the passes run on smaller voxels, whose means make up most of the result (``stages.py``). The passes before
 them only bring a first volume: they have more subsets, and few times in an exposure."""
 
+import logging
 import math
 from dataclasses import dataclass, replace
 from functools import partial
@@ -33,6 +34,7 @@ from phyradgs_cl.reconstructors.voxels.system import System
 from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.runtime.algebra import HostSpace
 
+log = logging.getLogger(__name__)
 _VOLUMES, _FRAMES = 16, 3  # in memory at one time, with the prior `dct`
 _HELD, _COPIES = 9, 2  # volumes that ``dct`` holds on the device, and more while a prior maps a volume of the host
 # of the passes before those on smaller voxels; measured in docs/results/settings.md
@@ -256,4 +258,9 @@ def _gains_from_subvoxels(inputs: MethodInputs, parts: int) -> bool:
     voxels = coarse_voxels * parts**3
     sizes_bytes = *[4 * voxels] * (_VOLUMES + 2), 4 * voxels * priors.volumes_of(inputs.options.prior)
     has_room = voxels <= MOST_VOXELS and rt.room().holds(*sizes_bytes)
-    return not rt.ranks.any(not has_room)
+    if rt.ranks.any(not has_room):
+        text = "fista: the device has no room for voxels half as large in the last passes (%.3g MiB): the result is less "
+        text += "sharp than with them; allow more with --memory, or say subvoxels=1"
+        log.warning(text, sum(sizes_bytes) / 2**20)
+        return False
+    return True

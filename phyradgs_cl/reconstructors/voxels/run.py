@@ -119,7 +119,7 @@ def run_iterations(
     scan, options, rt = inputs.scan, inputs.options, inputs.rt
     system = System.of_scan(
         rt, scan, options.motion, options.detector_model, deformation=inputs.deformation,
-        state_times_s=inputs.state_times_s,
+        state_times_s=inputs.state_times_s, is_dense=inputs.initial is not None,
     )  # fmt: skip
     if options.transmission_weights:
         system = system.transmission_weighted()

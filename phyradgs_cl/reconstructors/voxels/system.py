@@ -16,6 +16,7 @@ from phyradgs_cl.detector import noise_level, transmission_weights
 from phyradgs_cl.fields import Deformation
 from phyradgs_cl.operators.rays.intensity import IntensityOperator
 from phyradgs_cl.operators.rays.operator import LinearOperator, RayOperator
+from phyradgs_cl.operators.rays.subrays import subrays_of
 from phyradgs_cl.operators.warp.operator import WarpedOperator, projector_of
 from phyradgs_cl.parallel import Communicator, exact_sum, span
 from phyradgs_cl.runtime import DeviceSpace, HostSpace, MemoryShortage, Runtime, Space
@@ -47,22 +48,24 @@ class System:
     @classmethod
     def of_scan(
         cls, rt: Runtime, scan: Scan, motion: Motion, detector_model: str = "log", *, fewest_lines: int | None = None,
-        deformation: Deformation | None = None, state_times_s: np.ndarray | None = None,
+        deformation: Deformation | None = None, state_times_s: np.ndarray | None = None, is_dense: bool = False,
     ) -> "System":  # fmt: skip
         """Returns the system of a scan under ``motion``, of an object that moves as ``deformation`` does, or that changes
         between states at ``state_times_s`` (K,). Volumes are then stacks (K, nz, ny, nx).
 
-        detector_model: log, intensity, or scan for the stated one. fewest_lines: as in ``RayOperator``, without a motion."""
+        detector_model: log, intensity, or scan for the stated one. fewest_lines: as in ``RayOperator``, without a motion.
+        is_dense: as in ``subrays_of``."""
         tables = [motion.cells(scan, f).still() for f in range(scan.frames)]
         shape = scan.geometry.detector_shape
         projector = projector_of(rt, scan.grid, tables, deformation, state_times_s)
         lines = {} if fewest_lines is None else {"fewest_lines": fewest_lines}
-        operator: LinearOperator = projector(rt, scan.grid, shape, tables, **lines)
+        subrays = subrays_of(scan.grid, tables, is_dense=is_dense)
+        operator: LinearOperator = projector(rt, scan.grid, shape, tables, subrays=subrays, **lines)
         measured = np.asarray(scan.projections, np.float32)
         model = scan.detector_model if detector_model == "scan" else detector_model
         intensity: IntensityOperator | SharedIntensity | None = None
         if model == "intensity" and any(table.averages for table in tables):  # both models agree on a single value
-            alone = IntensityOperator(rt, scan.grid, shape, tables, projector)
+            alone = IntensityOperator(rt, scan.grid, shape, tables, projector, subrays)
             intensity = SharedIntensity(rt.ranks, alone) if rt.ranks.size > 1 else alone
         if rt.ranks.size > 1:
             operator = SharedOperator(rt.ranks, operator)
