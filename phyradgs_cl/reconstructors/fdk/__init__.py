@@ -25,6 +25,7 @@ from phyradgs_cl.operators.warp.backproject import MovingBackprojector
 from phyradgs_cl.operators.warp.states import MotionStates
 from phyradgs_cl.prepare.step import unmasked_frames
 from phyradgs_cl.reconstructors.fdk import weights
+from phyradgs_cl.reconstructors.fdk.arc import filled_gap_rad, view_arc
 from phyradgs_cl.reconstructors.fdk.frames import (
     WAYS,
     deblurred,
@@ -38,7 +39,6 @@ from phyradgs_cl.reconstructors.fdk.views import (
     pose_of_pixels,
     ray_weight,
     view_angles,
-    view_arc,
     warn_if_incomplete,
     widened,
 )
@@ -178,9 +178,10 @@ def fdk_volume(
     # on a circle all views are the same but for a rotation: one set of weights serves all of them
     if np.ptp(canonical, axis=0).max() <= _SAME_POSE * np.abs(canonical).max():
         canonical = canonical[:1]
-    arc, fan = view_arc(angle_rad), weights.measured_fan(canonical, shape, is_parallel)
+    fan = weights.measured_fan(canonical, shape, is_parallel)
+    arc = view_arc(angle_rad, filled_gap_rad(fan))
     if extrapolate != "none" and fan.is_put_aside:
-        log.warning("FDK: the rows of a displaced detector are not extrapolated")
+        log.warning("%s: the rows of a displaced detector are not extrapolated", "FBP" if is_parallel else "FDK")
     elif extrapolate != "none":
         if extrapolate == "reprojected" and whole is not None:
             wide, count = reprojected(rt, frames, pose, axis, whole(), grid, is_parallel)
