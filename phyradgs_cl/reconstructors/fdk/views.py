@@ -61,6 +61,23 @@ def ray_weight(
     return weight
 
 
+def opposite_weight(
+    canonical: np.ndarray, shape: tuple[int, int], arc: Arc, is_parallel: bool
+) -> Callable[[int], np.ndarray | float]:
+    """Returns a function from a view's index to the weights (rows, columns) by which its rays share with opposite ones of
+    an arc; 1 in a full turn."""
+    rows, columns = np.arange(shape[0]), np.arange(shape[1])
+
+    def weight(view: int) -> np.ndarray | float:
+        if arc.is_full:
+            return 1.0
+        pose = canonical[view % len(canonical)]
+        angle_rad = _redundancy_angle(pose, weights.pixel_rays(pose, rows, columns, is_parallel), arc, is_parallel)
+        return _redundancy(view, angle_rad, arc, weights.Fan(0.0, 0.0))
+
+    return weight
+
+
 def _redundancy(view: int, angle_rad: np.ndarray, arc: Arc, fan: weights.Fan) -> np.ndarray | float:
     if len(arc.parts_rad) > 1:
         return weights.parted_weight(float(arc.progress_rad[view]), angle_rad, arc.parts_rad)
