@@ -26,6 +26,8 @@ QUICK = (
     "api/test_bad_input.py", "api/test_docstrings.py", "test_gate.py", "test_layers.py", "test_errors.py",
 )  # fmt: skip
 LATER = (
+    "reconstructors/test_fdk_travel.py::test_long", "reconstructors/test_fdk_travel.py::test_with_a_pose",
+    "reconstructors/test_fdk_travel.py::test_where",
     "operators/test_bricks.py", "operators/test_device_arrays.py", "acquisition/test_orbit_recipes.py",
     *(f"operators/test_splat_states.py::test_{one}" for one in ("frames_and_gradients", "parallel_rays", "pixels_average")),
     "importers/test_hostile.py::test_refused[nxtomo",

@@ -31,7 +31,8 @@ def levels(rt, kind: str, angles_deg: np.ndarray, columns: int = 48, offset_mm: 
     rows, is_parallel = np.arange(30), kind == "fbp"
     pose = geometry_of(kind, columns, offset_mm).pose(np.deg2rad(angles_deg[:, None] + lines_deg * (rows / 30 - 0.5)))
     by_pixel = pose[:, :, None]
-    targets = by_pixel[..., 3:6] + rows[:, None, None] * by_pixel[..., 9:12] + np.arange(columns)[:, None] * by_pixel[..., 6:9]
+    targets = by_pixel[..., 3:6] + np.arange(columns)[:, None] * by_pixel[..., 6:9]
+    targets = targets + rows[:, None, None] * by_pixel[..., 9:12]
     sources = targets - 20 * by_pixel[..., :3] if is_parallel else np.broadcast_to(by_pixel[..., :3], targets.shape)
     frames = PHANTOM.line_integrals(sources, targets + 20 * by_pixel[..., :3] * is_parallel)
     pose = pose if lines_deg else pose[:, 0]
@@ -93,8 +94,8 @@ def test_cells_fill_gaps_or_part_there() -> None:
     ends_deg = np.rad2deg(parted.parts_rad)
     np.testing.assert_allclose(ends_deg, [[0, 120], [130, 340]], rtol=FLOAT64)
     assert parted.coverage_rad == pytest.approx(np.deg2rad(330.0), rel=FLOAT64)
-    fan, progress = np.random.default_rng(3).uniform(-0.1, 0.1, 300), np.random.default_rng(4).choice(parted.progress_rad, 300)
-    for angle, here in zip(fan, progress, strict=True):
+    rng = np.random.default_rng(3)
+    for angle, here in zip(rng.uniform(-0.1, 0.1, 300), rng.choice(parted.progress_rad, 300), strict=True):
         there = (here + np.pi + 2 * angle) % (2 * np.pi)
         both = weights.parted_weight(here, np.array(angle), parted.parts_rad)
         if parted.covers(np.array(there)):

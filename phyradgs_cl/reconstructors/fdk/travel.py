@@ -74,7 +74,7 @@ def seen_volume(
             continue
         weight = (part[views] * row_weight).astype(np.float32)
         values = backproject(frames[views] * weight, views)
-        for i, view in enumerate(views):
+        for i, view in enumerate(views.tolist()):
             weight[i] *= pace[view] * counted(view)
         seen = backproject_seen(weight, views) * np.float32(2 / width_rad)
         volume += values / np.maximum(seen, _LEAST_SHARE) * np.float32(2 * np.pi / turn_rad)

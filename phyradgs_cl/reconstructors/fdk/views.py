@@ -158,26 +158,27 @@ def _check_rows(pose: np.ndarray) -> None:
 def _check_orbit(pose: np.ndarray) -> None:
     middle = pose if pose.ndim == 2 else pose[:, pose.shape[1] // 2]
     canonical = weights.turned_back(middle, azimuth_rad(middle)).reshape(-1, 4, 3)
-    source, corner = canonical[:, 0], canonical[:, 1]
     usual = np.median(canonical, axis=0)
     length_mm = float(np.linalg.norm(usual[1] - usual[0]))
-    off = max(float(np.linalg.norm(at - of, axis=-1).max()) for at, of in ((source, usual[0]), (corner, usual[1])))
+    off_mm = canonical[:, :2] - usual[:2]  # of source and panel
+    aside_mm = off_mm - np.eye(3)[2] * off_mm[:, :1, 2:]  # without the source's travel, of which a voxel misses views only
     above_deg = float(np.rad2deg(np.arctan2(abs(usual[0, 2]), np.hypot(*usual[0, :2]))))
-    parts = (
-        f"{100 * off / length_mm:.0f} % of their distance off a circle about z",
-        f"{above_deg:.0f}° above the middle of their circle",
-    )
 
-    def distances_beyond(most: float, most_deg: float) -> str:
+    def distances_beyond(most: float, most_deg: float, of_mm: np.ndarray) -> str:
         """Names the distances that are too large."""
+        off = float(np.linalg.norm(of_mm, axis=-1).max())
+        parts = (
+            f"{100 * off / length_mm:.0f} % of their distance off a circle about z",
+            f"{above_deg:.0f}° above the middle of their circle",
+        )
         wrong = (off > most * length_mm, above_deg > most_deg)
         return " and ".join(part for part, is_wrong in zip(parts, wrong, strict=True) if is_wrong)
 
-    if found := distances_beyond(_NO_CIRCLE, _NO_PLANE_DEG):
+    if found := distances_beyond(_NO_CIRCLE, _NO_PLANE_DEG, aside_mm):
         expected = f"at most {100 * _NO_CIRCLE:.0f} % off it and {_NO_PLANE_DEG:.0f}° above"
         remedy = "take an iterative or splatting method: they take any orbit"
         raise InputError("--method fdk", f"source and panel up to {found}", expected, remedy)
-    if found := distances_beyond(_CIRCLE, _PLANE_DEG):
+    if found := distances_beyond(_CIRCLE, _PLANE_DEG, off_mm):
         text = "FDK: source and panel up to %s: the volume is an approximation; %s"
         log.warning(text, found, "iterative and splatting methods take any orbit")
 
