@@ -12,7 +12,7 @@
 __kernel void rays_forward(
     __global const float *volume,     /* guard, then (z, y, pitch) with a border of BORDER in y and z */
     __global const float *cells,      /* (C, RAY_CELL), frame after frame */
-    __global const int *cell_lines,   /* (C, 2): first line of a cell and the one after its last */
+    __global const int *cell_lines,   /* (C, 2): first line of a cell and the one after its last; ACROSS: columns */
     __global const int *line_cells,   /* (F, lines, 2): first cell and cell after the last that may serve a line */
     __global const int *frame_list,   /* which frames */
     __global const float *weights, __global const int *weight_at, /* of each cell's lines, and where they begin */
@@ -34,14 +34,17 @@ __kernel void rays_forward(
     intensity_t sum = intensity_from(total);
     int any = 0;
     for (int c = line_cells[2 * line]; c < line_cells[2 * line + 1]; ++c) {
-        if (v < cell_lines[2 * c] || v >= cell_lines[2 * c + 1])
+        const int place = ACROSS ? u : v;
+        if (place + (ACROSS ? LANES : 1) <= cell_lines[2 * c] || place >= cell_lines[2 * c + 1])
             continue;
+        const own_t weight = weight_of(weights + weight_at[c] - cell_lines[2 * c], u, v);
+        const vi served = ACROSS ? real & (weight != 0.0f) : real;
         __global const float *cell = cells + (size_t)c * RAY_CELL;
         const rays_t r = rays_through(cell, pitch_mm, (float)u + V_IOTA, (float)v);
         vf p = (vf)(0.0f);
         for (int axis = 0; axis < 3; ++axis) {
             walk_t w;
-            if (!rays_enter(r, cell, axis, real, origin, shape, &w))
+            if (!rays_enter(r, cell, axis, served, origin, shape, &w))
                 continue;
             const index_t sa = axis == 0 ? 1 : (axis == 1 ? sy : sz), sb = axis == 0 ? sy : 1, sc = axis == 2 ? sy : sz;
             for (int i = w.lo; i <= w.hi; ++i) {
@@ -63,7 +66,6 @@ __kernel void rays_forward(
             }
         }
         p *= r.step_mm;
-        const float weight = weights[weight_at[c] + v - cell_lines[2 * c]];
         if (AVERAGE == AVERAGE_LOG) {
             total += weight * p;
             continue;

@@ -8,15 +8,15 @@
 #define TILE_Y (BRICK_Y + 2)
 #define TILE_Z (BRICK_Z + 2)
 
-/* rays u_lo..u_hi of one line and cell onto the tile; row: the line's values; weight: of the line in the cell */
-RAY_INLINE void line_onto(__global const float *cell, __global const float *row, const float weight, const float4 pitch_mm,
+/* rays u_lo..u_hi of one line and cell onto the tile; row: the line's values; own: the cell's weights */
+RAY_INLINE void line_onto(__global const float *cell, __global const float *row, __global const float *own, const float4 pitch_mm,
                           const int u_lo, const int u_hi, const int v, const int4 corner, const int4 size,
                           __local float *tile)
 {
     for (int u = u_lo; u <= u_hi; u += LANES) {
         const vi real = VI_IOTA + u <= u_hi;
         const rays_t r = rays_through(cell, pitch_mm, (float)u + V_IOTA, (float)v);
-        const vf value = V_LOAD(row + u) * (weight * r.step_mm);
+        const vf value = V_LOAD(row + u) * (weight_of(own, u, v) * r.step_mm);
         if (!V_ANY(value != 0.0f)) /* masked pixels, air */
             continue;
         for (int axis = 0; axis < 3; ++axis) {
@@ -80,7 +80,7 @@ __kernel void rays_adjoint(
         const int stop = frame_cells[frame_list[n] + 1];
         for (int c = frame_cells[frame_list[n]]; c < stop; c += LANES) {
             window_t w;
-            vi is_met = window_of(matrices, matrix_stride, cell_lines, width, c, stop, middle, half_size, &w);
+            vi is_met = window_of(matrices, matrix_stride, cell_lines, ACROSS ? lines : width, c, stop, middle, half_size, &w);
             if (!V_ANY(is_met))
                 continue;
             for (int lane = 0; lane < LANES; ++lane) {
@@ -89,7 +89,7 @@ __kernel void rays_adjoint(
                 __global const float *cell = cells + (size_t)(c + lane) * RAY_CELL;
                 __global const float *own = weights + weight_at[c + lane] - cell_lines[2 * (c + lane)];
                 for (int v = LANE(int, w.v_lo, lane); v <= LANE(int, w.v_hi, lane); ++v)
-                    line_onto(cell, frame + (size_t)v * image_pitch, own[v], pitch_mm, LANE(int, w.u_lo, lane),
+                    line_onto(cell, frame + (size_t)v * image_pitch, own, pitch_mm, LANE(int, w.u_lo, lane),
                               LANE(int, w.u_hi, lane), v, corner, size, tile);
             }
         }

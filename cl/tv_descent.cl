@@ -1,15 +1,16 @@
 /* Gradient of the isotropic total variation, the sum of |backward difference| over voxels, as ASD-POCS descends it
    (Sidky and Pan, Phys. Med. Biol. 53 (2008) 4777). Volume (nz, ny, nx) without padding; differences end at the first
-   voxel. A work-item takes one voxel. Twin: objective/tv_descent.py. */
+   voxel. A work-item takes one voxel. Twin: objective/tv.py. Behind a border in y and z the voxel itself is read: a branch
+   would become masked accesses outside the buffer (tv_prox.cl). */
 
 #define SMALLEST 1e-8f    /* keeps flat regions from dividing by zero */
 
-static inline float3 backward_difference(__global const float *volume, const size_t at, const int x, const int y, const int z,
-                                  const size_t row, const size_t slice)
+/* at y or z 0 the difference is that of the voxel to itself */
+static inline float3 backward_difference(__global const float *volume, const size_t at, const int x, const size_t row,
+                                         const size_t slice)
 {
     const float here = volume[at];
-    return (float3)(x > 0 ? here - volume[at - 1] : 0.0f, y > 0 ? here - volume[at - row] : 0.0f,
-                    z > 0 ? here - volume[at - slice] : 0.0f);
+    return (float3)(x > 0 ? here - volume[at - 1] : 0.0f, here - volume[at - row], here - volume[at - slice]);
 }
 
 static inline float inverse_length(const float3 d)
@@ -24,19 +25,18 @@ __kernel void tv_gradient(__global const float *volume, const int4 shape, __glob
         return;
     const size_t row = (size_t)shape.x, slice = row * shape.y;
     const size_t at = z * slice + y * row + x;
-    const float3 own = backward_difference(volume, at, x, y, z, row, slice);
+    const size_t back_y = y > 0 ? row : 0, back_z = z > 0 ? slice : 0;
+    const size_t ahead_y = y + 1 < shape.y ? row : 0, ahead_z = z + 1 < shape.z ? slice : 0;
+    const float3 own = backward_difference(volume, at, x, back_y, back_z);
     float sum = (own.x + own.y + own.z) * inverse_length(own);
     if (x + 1 < shape.x) {
-        const float3 d = backward_difference(volume, at + 1, x + 1, y, z, row, slice);
+        const float3 d = backward_difference(volume, at + 1, x + 1, back_y, back_z);
         sum -= d.x * inverse_length(d);
     }
-    if (y + 1 < shape.y) {
-        const float3 d = backward_difference(volume, at + row, x, y + 1, z, row, slice);
-        sum -= d.y * inverse_length(d);
-    }
-    if (z + 1 < shape.z) {
-        const float3 d = backward_difference(volume, at + slice, x, y, z + 1, row, slice);
-        sum -= d.z * inverse_length(d);
-    }
+    /* without a neighbour these differences are 0 */
+    const float3 below = backward_difference(volume, at + ahead_y, x, ahead_y, back_z);
+    sum -= below.y * inverse_length(below);
+    const float3 above = backward_difference(volume, at + ahead_z, x, back_y, ahead_z);
+    sum -= above.z * inverse_length(above);
     gradient[at] = sum;
 }

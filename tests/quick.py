@@ -7,7 +7,7 @@ QUICK = (
     # geometry to metrics, whole: values, closed forms, laws
     "acquisition/", "detector/", "fields/", "metrics/", "objective/", "optim/", "phantoms/", "simulation/",
     # every kernel against its twin
-    "runtime/", "operators/", "laws/",
+    "runtime/", "operators/", "laws/", "test_packed.py",
     # options of every method, the loop, the whole gradient, FDK, what a GPU would run
     "reconstructors/test_registry.py", "reconstructors/test_loop.py", "reconstructors/test_whole_objective.py",
     "reconstructors/test_fdk", "reconstructors/test_fbp.py", "reconstructors/test_gpu_shape.py",

@@ -23,6 +23,27 @@
 #define AHEAD_OF(start, i) ((float)(i) - (start))
 #endif
 
+/* ACROSS: of a panel of few rows that is read along columns. Its rows are the kernels' lines nevertheless, for vectors of
+   neighbouring columns. A cell then serves columns, and every column has its own weight. */
+#ifndef ACROSS
+#define ACROSS 0
+#endif
+#if ACROSS
+typedef vf own_t;
+#else
+typedef float own_t;
+#endif
+
+/* The weight of pixels u … u + LANES − 1 of line v, from the weights of a cell. */
+static inline own_t weight_of(__global const float *weights, const int u, const int v)
+{
+#if ACROSS
+    return V_LOAD(weights + u);
+#else
+    return weights[v];
+#endif
+}
+
 #define BORDER 1       /* zero voxels around a volume in y and z; in x the rows' padding does */
 #define CLIP_MARGIN 0.01f /* planes: more than the rounding of a clipped end; samples outside weigh nothing anyway */
 

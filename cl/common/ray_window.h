@@ -16,18 +16,21 @@ RAY_INLINE void window_along(const vf at, const vf mx, const vf my, const vf mz,
 }
 
 /* Pixels that a box of half-size `half_size` about a voxel index `at` may project to in LANES neighbouring cells: a
-   bound and not an estimate, within the detector's columns and each cell's lines. Returns which cells see it.
+   bound and not an estimate, within each cell's lines and the ``others`` of the detector. Returns which cells see it.
    matrix (12, stride) turns a voxel index into u z, v z and z; cell_lines (C, 2); cells from `stop` on do not count. */
-RAY_INLINE vi window_of(__global const float *matrix, const int stride, __global const int *cell_lines, const int width,
+RAY_INLINE vi window_of(__global const float *matrix, const int stride, __global const int *cell_lines, const int others,
                         const int cell, const int stop, const float4 at, const float4 half_size, window_t *w)
 {
 #define M(k) V_LOAD(matrix + (size_t)(k) * stride + cell)
+    vi first, last;
     for (int lane = 0; lane < LANES; ++lane) {
-        LANE(int, w->v_lo, lane) = cell_lines[2 * (cell + lane)];
-        LANE(int, w->v_hi, lane) = cell_lines[2 * (cell + lane) + 1] - 1;
+        LANE(int, first, lane) = cell_lines[2 * (cell + lane)];
+        LANE(int, last, lane) = cell_lines[2 * (cell + lane) + 1] - 1;
     }
-    w->u_lo = (vi)(0);
-    w->u_hi = (vi)(width - 1);
+    w->u_lo = ACROSS ? first : (vi)(0);
+    w->u_hi = ACROSS ? last : (vi)(others - 1);
+    w->v_lo = ACROSS ? (vi)(0) : first;
+    w->v_hi = ACROSS ? (vi)(others - 1) : last;
     const vf dx = M(8), dy = M(9), dz = M(10);
     const vf depth = dx * at.x + dy * at.y + dz * at.z + M(11);
     const vf reach = fabs(dx) * half_size.x + fabs(dy) * half_size.y + fabs(dz) * half_size.z;

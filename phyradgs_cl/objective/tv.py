@@ -30,7 +30,9 @@ class TvProx:
         self.axis_weights = axis_weights
         self._shape4 = np.array([*shape[::-1], 1][:4], np.int32)
         self._weights4 = np.array([*axis_weights[::-1], 0][:4], np.float32)
-        self._primal_step, self._dual_step = rt.kernel("tv_prox", "tv_primal"), rt.kernel("tv_prox", "tv_dual")
+        self._primal_step, self._dual_step = (
+            rt.kernel("tv_prox", name, STATES=len(shape) == 4) for name in ("tv_primal", "tv_dual")
+        )
         self._dual = rt.zeros((len(shape), *shape))
         self._moved = rt.zeros((len(shape), *shape))
 
@@ -80,7 +82,7 @@ class TvProx:
 
     def _launch(self, kernel: Kernel, *arguments: object) -> None:
         *slices, ny, nx = self.shape
-        self.rt.launch(kernel, (nx, ny, math.prod(slices)), *arguments, group=self.rt.group(on_cpu=16))
+        self.rt.launch(kernel, (nx, ny, math.prod(slices)), *arguments, group=self.rt.group(on_cpu=32))
 
 
 def tv_prox(
@@ -174,7 +176,7 @@ class TvDescent:
     def _gradient(self, volume: DeviceArray) -> DeviceArray:
         nz, ny, nx = self.shape
         gradient = self._space.empty(self.shape)
-        items, group = (nx, ny, nz), self.rt.group(on_cpu=16)
+        items, group = (nx, ny, nz), self.rt.group(on_cpu=32)
         self.rt.launch(self._kernel, items, volume, self._shape4, gradient, group=group)
         return gradient
 

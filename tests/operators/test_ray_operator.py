@@ -44,6 +44,19 @@ def test_frames_and_volumes_are_the_twins(any_rt, motion) -> None:
     check_twins(RayOperator(any_rt, GRID, SHAPE, tables(motion, SHAPE, "columns", -1, frames=2)))
 
 
+@pytest.mark.parametrize("motion", [*MOTIONS, "common"])
+@pytest.mark.parametrize(("shape", "beam"), [((1, 37), "cone"), ((3, 40), "parallel")])
+def test_columns_of_few_rows(any_rt, motion, shape, beam) -> None:
+    """Vectors run over columns that have weights of their own, and over the ends of their cells."""
+    operator = RayOperator(any_rt, GRID, shape, tables(motion, shape, "columns", -1, 2, beam=beam))
+    check_twins(operator)
+    assert mismatch(operator) <= ADJOINT
+    volume = noise(GRID.shape, 75)
+    expected = np.stack([ray_frame(volume, GRID, table, shape, "intensity") for table in operator.tables])
+    found = operator.project(volume, "intensity")
+    assert np.abs(found - expected).max() <= RAYS * expected.max()
+
+
 @pytest.mark.parametrize("lanes", [4, 8])
 def test_other_vector_widths(lanes) -> None:
     check_twins(RayOperator(Runtime(lanes=lanes), GRID, SHAPE, tables("micro-views", frames=2)))

@@ -79,4 +79,5 @@ def owner_steps(rt: Runtime) -> tuple[int, int]:
 
 def _defines(layout: RayLayout, cells: RayCells) -> dict[str, int]:
     is_long = layout.volume_floats >= _LONG_FROM
-    return {"IMAGE_GUARD": GUARD, "RAY_LONG": int(is_long), "RAY_PARALLEL": int(cells.is_parallel)}
+    how = {"RAY_PARALLEL": int(cells.is_parallel), "ACROSS": int(cells.is_across)}
+    return {"IMAGE_GUARD": GUARD, "RAY_LONG": int(is_long), **how}

@@ -121,14 +121,23 @@ class RayCells:
     weights: DeviceArray
     weight_at: DeviceArray
     is_parallel: bool
+    is_across: bool
 
     @classmethod
-    def upload(cls, rt: Runtime, grid: Grid, tables: Sequence[TimeCells]) -> "RayCells":
+    def upload(
+        cls, rt: Runtime, grid: Grid, tables: Sequence[TimeCells], rows_across: int | None = None
+    ) -> "RayCells":
+        """rows_across: the panel's rows, where these are the kernels' lines although columns are read (``runs_across``)."""
         starts = np.concatenate([[0], np.cumsum([table.count for table in tables])])
         pose = np.concatenate([table.readout.poses(table.pose) for table in tables])
         weights = [table.weights_of(cell) for table in tables for cell in range(table.count)]
         ranges = [np.stack([table.line_start, table.line_stop], -1) for table in tables]
         served = [table.line_cells() + start for table, start in zip(tables, starts[:-1], strict=True)]
+        if rows_across is not None:
+            pose = np.concatenate([table.pose for table in tables])
+            # vectors begin at every column and may reach beyond a cell's: there its weight is 0
+            weights = [np.pad(weight, _WIDEST) for weight in weights]
+            served = [np.tile(ends, (rows_across, 1)) for ends in zip(starts[:-1], starts[1:], strict=True)]
         matrices, stride = matrix_table(pose, grid, tables[0].is_parallel)
         cell_lines = np.zeros((stride, 2), np.int32)
         cell_lines[: starts[-1]] = np.concatenate(ranges)
@@ -140,9 +149,19 @@ class RayCells:
             matrix_stride=stride,
             frame_cells=rt.upload(starts, np.int32),
             weights=rt.upload(np.concatenate(weights), np.float32),
-            weight_at=rt.upload(np.concatenate([[0], np.cumsum([len(w) for w in weights])]), np.int32),
+            weight_at=rt.upload(_starts_of(weights) + (_WIDEST if rows_across is not None else 0), np.int32),
             is_parallel=tables[0].is_parallel,
+            is_across=rows_across is not None,
         )
+
+
+def _starts_of(parts: Sequence[np.ndarray]) -> np.ndarray:
+    return np.concatenate([[0], np.cumsum([len(part) for part in parts])])
+
+
+def runs_across(rt: Runtime, detector_shape: tuple[int, int], axis: str) -> bool:
+    """Whether a vector of a line would be mostly empty: columns of few rows. Rows are then the kernels' lines."""
+    return axis == "columns" and not rt.pixel_items and detector_shape[0] < rt.lanes
 
 
 def matrix_table(pose: np.ndarray, grid: Grid, is_parallel: bool = False) -> tuple[np.ndarray, int]:

@@ -18,7 +18,7 @@ from phyradgs_cl.acquisition.time_cells import TimeCells
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.operators.rays.launches import AVERAGES, launch_adjoint, launch_forward
-from phyradgs_cl.operators.rays.layout import RayCells, RayLayout, averaged, layered
+from phyradgs_cl.operators.rays.layout import RayCells, RayLayout, averaged, layered, runs_across
 from phyradgs_cl.operators.rays.memory import RayMemory
 from phyradgs_cl.operators.rays.slots import Slots, UprightPoses, merge_slots, split_slots
 from phyradgs_cl.operators.rays.upright import launch_upright, launch_upright_adjoint, upright_of
@@ -67,8 +67,9 @@ class RayOperator:
         _check_tables(tables, detector_shape)
         self.rt, self.grid, self.detector_shape = rt, grid, detector_shape
         self.volume_shape = grid.shape
-        self._readout = tables[0].readout
-        layout = RayLayout.of_scan(grid, detector_shape, self._readout.axis)
+        is_across = runs_across(rt, detector_shape, tables[0].axis)
+        self._axis = "rows" if is_across else tables[0].axis  # whose lines are the kernels' lines
+        layout = RayLayout.of_scan(grid, detector_shape, self._axis)
         # Upright kernels and their slots (``upright.py``, ``slots.py``) are for CPUs: on a GPU neighbouring pixels of the
         # general kernel read neighbouring addresses already.
         may_use_slots = not rt.pixel_items and (memory is None or memory.slot_floats > 0)
@@ -82,7 +83,7 @@ class RayOperator:
         if self.slot_floats > self.memory.slot_floats:  # the shared memory was planned without room for slots
             self._upright = None
         self._tables = list(tables)
-        self._cells = RayCells.upload(rt, grid, self._tables)
+        self._cells = RayCells.upload(rt, grid, self._tables, detector_shape[0] if is_across else None)
         self._choose(np.arange(len(tables)))
 
     @property
@@ -121,7 +122,7 @@ class RayOperator:
             frames = self.memory.frames(part.stop - part.start)
             if columns is not None:
                 self._project_upright(columns, part, average, frames)
-                self.memory.read_frames(frames, result, part, self._readout.axis)
+                self.memory.read_frames(frames, result, part, self._axis)
                 continue
             listed = self._listed(part)
             for k, brick in enumerate(bricks):
@@ -130,7 +131,7 @@ class RayOperator:
                 launch_forward(
                     self.rt, layout, self._cells, listed, on_device, frames, average=average, add=k > 0
                 )
-            self.memory.read_frames(frames, result, part, self._readout.axis)
+            self.memory.read_frames(frames, result, part, self._axis)
 
     @property
     def _is_upright(self) -> bool:
@@ -141,7 +142,7 @@ class RayOperator:
         """Projects a turned volume to some frames, in the padded layout."""
         assert self._upright is not None and self._poses is not None
         layout = self.memory.layout
-        start, *steps = layout.pixel_strides(self._readout.axis)
+        start, *steps = layout.pixel_strides(self._axis)
         for first, slots in self._slots_of(part):
             target = frames, np.array([start + first * steps[-1], *steps], np.int64)
             if slots.is_plain and average == "log":
@@ -149,7 +150,7 @@ class RayOperator:
                 continue
             there = self.memory.slots()
             launch_upright(self.rt, layout, self._upright, self._poses, slots, columns, (there, slots.strides))
-            like = self.detector_shape, self._readout.axis, AVERAGES.index(average)
+            like = self.detector_shape, self._axis, AVERAGES.index(average)
             merge_slots(self.rt, self._cells, slots, there, target, *like)
 
     def _slots_of(self, part: slice) -> Iterator[tuple[int, Slots]]:
@@ -195,7 +196,7 @@ class RayOperator:
             if self._is_upright and isinstance(result, DeviceArray):
                 target = result, Strides.plain(result.shape, brick.start)
             for part in parts:
-                add, axis = part.start > 0, self._readout.axis
+                add, axis = part.start > 0, self._axis
                 if k == 0 or len(parts) > 1:
                     turns = self._is_upright and axis == "rows"
                     there = self.memory.write_frames(frames, part, axis, turned=turns)
@@ -212,7 +213,7 @@ class RayOperator:
         """Adds the backprojection of some frames, stored column by column, to a volume with these strides."""
         assert self._upright is not None and self._poses is not None
         there, pitch_mm = self.memory.slots(), layout.constants()[3]
-        each = layout.column_floats(self._readout.axis)
+        each = layout.column_floats(self._axis)
         for first, slots in self._slots_of(part):
             like = self.detector_shape, pitch_mm, first * each
             split_slots(self.rt, self._cells, self._poses, slots, frames, *like, there)

@@ -86,7 +86,7 @@ class SplatProjector:
         self.rt, self.lines, self.width = rt, lines, width
         self.pitch = pitch_of(width)
         self.cutoff2 = np.float32(cutoff_sigma**2)
-        self.path_limits = np.array([*path_limits(time_error), 0], np.float32)
+        self.time_error = time_error
         self.by_pixel = rt.pixel_items
         self.tile_w, self.tile_h = rt.tile() if self.by_pixel else (self.pitch, _BAND_LINES)
         tiles = (ceil_div(width, self.tile_w), ceil_div(lines, self.tile_h), 1)
@@ -105,6 +105,11 @@ class SplatProjector:
             for moving, fixed in ((False, False), (False, True), (True, False))
             for parallel in (False, True)
         }
+
+    @property
+    def path_limits(self) -> np.ndarray:
+        """The kernels' limits of ``path_limits``, (4,)."""
+        return np.array([*path_limits(self.time_error), 0], np.float32)
 
     # --- device to device: the reconstruction's loop --------------------------------------------------
 

@@ -106,9 +106,8 @@ def moving(scan: Scan, options: MovingOptions, rt: Runtime, **arguments: Any) ->
     signal = _signal_of(scan, options.gating)
     passes_inputs = replace(inputs, options=options.of_passes())
     stages = [Stage("field", options.rounds, partial(_search, signal=signal, one=one))] if options.rounds else []
-    for stage in fista_stages(passes_inputs):
-        is_first = stage.name == "voxels"
-        stages.append(replace(stage, run=partial(_with_field, stage.run, passes_inputs, one, is_first)))
+    for number, stage in enumerate(fista_stages(passes_inputs)):
+        stages.append(replace(stage, run=partial(_with_field, stage.run, passes_inputs, one, number == 0)))
     report = Report.of(inputs.report)
     with report.through(partial(_with_field_in_progress, one)):
         result = run_stages(stages, replace(inputs, report=report))

@@ -19,13 +19,14 @@ from phyradgs_cl.reconstructors.checkpoint import State
 from phyradgs_cl.reconstructors.moving import LEAST_GAIN
 from phyradgs_cl.reconstructors.moving.field import FieldProblem, MotionField, sum_squares
 from phyradgs_cl.reconstructors.moving.signal import MotionSignal, TemporalSplines
-from phyradgs_cl.reconstructors.voxels.fista import FistaOptions, fista_stages
+from phyradgs_cl.reconstructors.voxels.fista import FistaOptions, fista_passes
 from phyradgs_cl.reconstructors.voxels.run import MethodInputs
 from phyradgs_cl.runtime import Runtime
 
 _MOST_COLUMNS, _MOST_VOXELS, _MOST_FRAMES = 64, 32, 600  # of the coarse scan; more frames where a signal has more knots
 _TIMES_PER_PERIOD, _MOST_TIMES = 12, 6  # at which exposures see the object at least; but of one exposure
 _FIRST_PASSES, _PASSES = 8, 3  # of fista, at rest and in a round
+_WEIGHT, _TV_ITERATIONS = 0.42, 5  # of these passes
 _COARSE_SPACINGS, _FINE_SPACINGS = 2, 4  # of control points along the box's longest side
 _FINE_BENDING = (_FINE_SPACINGS / _COARSE_SPACINGS) ** 4  # times as stiff in terms of coefficients is as stiff in mm
 _COARSE_SHARE = 0.6  # of the rounds
@@ -138,11 +139,12 @@ class FieldSearch:
 
     def _reconstructed(self, one: MotionField, volume: np.ndarray | None, passes: int) -> np.ndarray:
         """Returns the volume after ``passes`` passes of ``fista`` on the coarse scan."""
-        options = FistaOptions(motion=self.motion, iterations=passes, prior="dct", subvoxels=1)
+        options = FistaOptions(
+            motion=self.motion, iterations=passes, prior="dct", prior_weight=_WEIGHT, tv_iterations=_TV_ITERATIONS
+        )
         deformation = one.deformation() if one.control_mm.any() else None
         inputs = MethodInputs(self.scan, options, self.rt, initial=volume, deformation=deformation)
-        (stage,) = fista_stages(inputs)
-        return stage.run(inputs).volume
+        return fista_passes(inputs, options).volume
 
 
 def _with_times(motion: Motion, scan: Scan, period_s: float | None) -> Motion:

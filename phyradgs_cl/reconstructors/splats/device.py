@@ -73,15 +73,12 @@ class DeviceFrames:
     def __init__(
         self, rt: Runtime, scan: Scan, options: SplatOptions, scale: Scale, deformation: Deformation | None = None
     ) -> None:
+        self.rt, self.scan, self.scale, self.deformation = rt, scan, scale, deformation
         self.count = scan.frames
         readout = scan.shutter.readout
         self.lines, self.width = readout.shape(scan.geometry.detector_shape)
-        model = scan.detector_model if options.detector_model == "scan" else options.detector_model
-        tables, merges = tables_of(scan, options.motion, model, deformation)
-        states = [None if deformation is None else states_of(table, deformation) for table in tables]
-        scaled = (table.scaled(1 / scale.length_mm) for table in tables)
-        self._cells = [DeviceCells.upload(rt, table, own) for table, own in zip(scaled, states, strict=True)]
-        self.intensity_unit = scale.line_integral if merges else None
+        self._model = scan.detector_model if options.detector_model == "scan" else options.detector_model
+        self.intensity_unit = scale.line_integral if self.follow(options.motion) else None
         measured = (frame / np.float32(scale.line_integral) for frame in scan.projections)
         self._measured = [rt.upload(pad_rows(readout.frames(m))) for m in measured]
         self._mask, self._pixels = _upload_masks(rt, scan)
@@ -90,6 +87,15 @@ class DeviceFrames:
             valid = None if scan.pixel_mask is None else scan.pixel_mask == 0
             weights = transmission_weights(scan.projections, valid)
             self._transmission = [rt.upload(pad_rows(readout.frames(w))) for w in weights]
+
+    def follow(self, motion: Motion) -> bool:
+        """Takes the time cells of a motion model. Returns whether the detector averages intensities over them."""
+        tables, merges = tables_of(self.scan, motion, self._model, self.deformation)
+        of_object = self.deformation
+        states = [None if of_object is None else states_of(table, of_object) for table in tables]
+        scaled = (table.scaled(1 / self.scale.length_mm) for table in tables)
+        self._cells = [DeviceCells.upload(self.rt, table, own) for table, own in zip(scaled, states, strict=True)]
+        return merges
 
     def cells(self, frame: int) -> DeviceCells:
         return self._cells[frame]

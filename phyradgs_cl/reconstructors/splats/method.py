@@ -68,6 +68,7 @@ def reconstruct_splats(
     if isinstance(options.motion, Exact):
         # How the motion averaged over time: a frame's largest K, and the share of pairs by rule
         facts |= {"segments": run.frames.most_cells, "time_rules": _first_frame_work(run).rule_shares()}
+        facts["motion_phases"] = run.phases()
     if rt.profile:  # the Gaussian-pixel pairs that each kernel evaluates for the last cloud in the first frame
         facts["evaluated_pairs"] = dict.fromkeys(PAIR_KERNELS, _first_frame_work(run).evaluated)
     cloud = cloud.scaled(scale.length_mm, scale.density_per_mm)

@@ -13,6 +13,8 @@ from phyradgs_cl.operators import DEFAULT_CUTOFF_SIGMA
 from phyradgs_cl.optim import PUBLISHED_RATES, DensityControl, Rates
 from phyradgs_cl.text import repr_of_changes
 
+_STATIC_SHARE, _COARSE_ERROR = 0.4, 0.1  # of the coarse iterations, and their time error (docs/results/motion_models.md)
+
 
 @dataclass(frozen=True, repr=False)
 class SplatOptions:
@@ -21,7 +23,8 @@ class SplatOptions:
     gaussians: size of the first cloud; 0 chooses it from the grid. Weights are Eq. 4's λ. tv_edge: edge of the random
     sub-volume in voxels. scale_min_voxels: raises the smallest scale to this share of a voxel. detector_model: what quantity
     the detector averages over a line's times, line integrals (log) or intensity, or the model that the scan states (scan).
-    pixel_footprint: pixels average over their area.
+    pixel_footprint: pixels average over their area. exact_from: share of the iterations before which the motion ``exact`` is
+    coarse, first one pose for each frame, then one segment of few times; 0: it never is.
 
     iterations: frames, with a step of Adam every ``batch`` of them (0: as many as there are ranks) at rates × √batch. The
     same batch gives the same bits on any number of ranks (docs/cluster.md)."""
@@ -51,6 +54,7 @@ class SplatOptions:
     scale_min: float = checks.ranged(0.001, 1e-9, 10)
     scale_min_voxels: float = checks.ranged(0.0, 0, 100)
     scale_max: float = checks.ranged(1.0, 1e-6, 100)
+    exact_from: float = checks.ranged(0.73, 0, 1)
     batch: int = checks.ranged(0, 0, 1_000_000, "--batch (0: as many as ranks)")
     rates: Rates = Rates()
     control: DensityControl = DensityControl()
@@ -75,6 +79,13 @@ class SplatOptions:
             return self.gaussians
         voxels = grid.shape[0] * grid.shape[1] * grid.shape[2]
         return int(min(max(voxels / 16, 1000), 50_000))
+
+    def motion_at(self, share: float) -> Motion:
+        """Returns the motion model after this share of the run: early iterations cannot use what the last ones need."""
+        if not isinstance(self.motion, Exact) or share >= self.exact_from:
+            return self.motion
+        is_first = share < _STATIC_SHARE * self.exact_from
+        return Static() if is_first else Exact(1, max(_COARSE_ERROR, self.motion.time_error))
 
     def batch_for(self, frames: int, ranks: int) -> int:
         """Returns the frames per step: the option, or one for every rank."""

@@ -5,7 +5,8 @@ import time
 
 import numpy as np
 
-from phyradgs_cl.acquisition import Scan
+from phyradgs_cl.acquisition import Motion, Scan
+from phyradgs_cl.acquisition.motion import motion_facts
 from phyradgs_cl.checks import ceil_div
 from phyradgs_cl.fields import Deformation, Gaussians, Grid
 from phyradgs_cl.fields.gaussians import SCALE
@@ -43,6 +44,7 @@ class SplatRun:
     def step(self) -> None:
         """Does one batch of frames: gradient, move, and density control where it is due."""
         options, before = self.options, self.iteration
+        self.frame_step.follow(self.motion_at(before))
         batch = self.next_batch()
         self.cloud.activate(self.adam)
         self.sharing.differentiate(self.frame_step, self.cloud, batch)
@@ -52,6 +54,20 @@ class SplatRun:
         passed = range(before + 1, self.iteration + 1)
         if any(options.control.is_due(iteration, options.iterations) for iteration in passed):
             self.control_density()
+
+    def motion_at(self, iteration: int) -> Motion:
+        """Returns the motion model of an iteration. An object that moves needs its segments from the first one on."""
+        is_coarse = self.frames.scan.is_fly and self.frames.deformation is None
+        return self.options.motion_at(iteration / max(self.iterations, 1)) if is_coarse else self.options.motion
+
+    def phases(self) -> list[dict[str, object]]:
+        """Returns the motion models of the run, each with its first iteration."""
+        found: list[dict[str, object]] = []
+        for iteration in range(self.iterations):
+            facts = motion_facts(self.motion_at(iteration))
+            if not found or found[-1]["motion"] != facts:
+                found.append({"from": iteration, "motion": facts})
+        return found
 
     def next_batch(self) -> Batch:
         """Draws the frames of a step in random order, each once per pass."""

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from phyradgs_cl.acquisition import Scan
+from phyradgs_cl.acquisition import Motion, Scan
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Deformation, Grid
 from phyradgs_cl.objective import ImageLoss, TotalVariation
@@ -44,7 +44,7 @@ class FrameStep:
         self, rt: Runtime, scan: Scan, options: SplatOptions, scale: Scale, grid: Grid,
         deformation: Deformation | None = None,
     ) -> None:
-        self.rt, self.options, self.grid = rt, options, grid
+        self.rt, self.options, self.grid, self.motion = rt, options, grid, options.motion
         self.frames = DeviceFrames(rt, scan, options, scale, deformation)
         states = None if deformation is None else CloudStates(rt, deformation.scaled(1 / scale.length_mm))
         if states is not None:
@@ -61,6 +61,13 @@ class FrameStep:
         self.crop = Voxeliser(rt, (z, y, x), cutoff_sigma=options.cutoff_sigma)
         self.tv = TotalVariation(rt, self.crop.shape, self.crop.pitch)
         self.adam = DeviceAdam(rt, options.activation(grid))
+
+    def follow(self, motion: Motion) -> None:
+        """Takes a motion model for the next steps."""
+        if motion != self.motion:
+            self.motion = motion
+            self.frames.follow(motion)
+            self.projector.time_error = getattr(motion, "time_error", DEFAULT_TIME_ERROR)
 
     def draw_corner(self, rng: np.random.Generator) -> Corner | None:
         """Draws a sub-volume for the total variation, if it has a weight."""

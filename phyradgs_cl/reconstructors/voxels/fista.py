@@ -3,8 +3,10 @@
 Each subset S of M makes one step: xₖ = prox(yₖ + M/L · A_Sᵀ (p_S − A_S yₖ)), yₖ₊₁ = xₖ + βₖ₊₁ (xₖ − xₖ₋₁).
 The step and its momentum are FISTA's (Beck and Teboulle, SIAM J. Imaging Sci. 2 (2009) 183, Eqs. 4.1 to 4.3). The gradient
 of a subset, times the number of subsets, stands for that of all frames (Kim, Ramani and Fessler, IEEE Trans. Med. Imaging
-34 (2015) 167). L bounds the norm of AᵀA. The last 3/7 of the passes run on smaller voxels, whose means make up most of the
-result (``stages.py``)."""
+34 (2015) 167). L bounds the norm of AᵀA.
+
+A run goes from coarse to fine. The first 3/5 of the passes have more subsets and few times in an exposure. The others run on
+smaller voxels, whose means make up most of the result (``stages.py``)."""
 
 import math
 from dataclasses import dataclass, replace
@@ -33,7 +35,11 @@ from phyradgs_cl.runtime.algebra import HostSpace
 
 _VOLUMES, _FRAMES = 16, 3  # in memory at one time, with the prior `dct`
 _HELD, _COPIES = 9, 2  # volumes that ``dct`` holds on the device, and more while a prior maps a volume of the host
-_SUBVOXEL_PASSES = 3 / 7  # share of the passes on smaller voxels (docs/results/settings.md)
+# measured in docs/results/settings.md
+_COARSE_PASSES = 0.6  # share of the passes, on the scan's own voxels where there are smaller ones
+_COARSE_SUBSETS = 1.6  # times the option ``subsets``
+_COARSE_TIMES = 1 / 3  # share of the times in an exposure, but two at least
+_FAINTEST = 1e-6  # of the largest row sum of AᵀA: voxels with less have no part in its bound
 _MOST_DIVIDED = 90**3  # voxels of a grid: smaller voxels are worth their time at 64³, not at 128³
 
 
@@ -44,21 +50,24 @@ class FistaOptions(IterativeOptions):
     prior_share) TV(x) + prior_share TV(x − first volume). prior_weight: threshold relative to two errors of the gradient,
     added in squares: the noise of the frames, and edges inside large voxels.
 
-    subvoxels: parts of a voxel's side in the last 3/7 of the passes; 0: 2 up to 90³ voxels where memory allows, else 1.
-    subsets: of the frames, with one step each; subsets whose steps diverge are joined two by two.
+    subvoxels: parts of a voxel's side in the last 2/5 of the passes; 0: 2 up to 90³ voxels where memory allows, else 1.
+    subsets: of the frames, with one step each, 1.6 times as many before; subsets whose steps diverge are joined two by two.
     tv_iterations: dual iterations per proximal map of TV. transmission_weights: as in ``fista-tv``."""
 
     FUNCTIONS: ClassVar[tuple[str, ...]] = ("prior",)
     """Options that may be a function."""
 
+    TRIALS: ClassVar[tuple[int, int]] = (2, 7)
+    """Iterations of the short runs of ``estimate``: three of the five more are coarse, as in a whole run."""
+
     motion: Motion = PerRow()
     iterations: int = 35
     prior: str | Denoiser = "ridge"
-    prior_weight: float = checks.ranged(0.42, 0, 1e6)
+    prior_weight: float = checks.ranged(0.39, 0, 1e6)
     subvoxels: int = checks.ranged(0, 0, 8)
     prior_share: float = checks.ranged(0.5, 0, 1)
     subsets: int = checks.ranged(5, 1, 1_000_000)
-    tv_iterations: int = checks.ranged(5, 1, 10_000)
+    tv_iterations: int = checks.ranged(3, 1, 10_000)
     transmission_weights: bool = False  # type: ignore[misc]
 
     def __post_init__(self) -> None:
@@ -78,14 +87,12 @@ class Accelerated(Algorithm):
     ARRAYS: ClassVar[tuple[str, ...]] = ("volume", "previous")
     NUMBERS = ("momentum",)
 
-    def __init__(self, system: System, prior: Prior) -> None:
+    def __init__(self, system: System, prior: Prior, *, has_long_steps: bool = False) -> None:
         super().__init__(system)
         self.prior = prior
         self.previous = self.volume
         self.momentum = 1.0  # tₖ
-        # AᵀA has no negative entry: its largest row sum bounds its norm
-        bound = system.space.largest(system.adjoint(system.apply_weights(system.row_sums())))
-        self.curvature = bound or 1.0  # L
+        self.curvature = (_tight_curvature if has_long_steps else _curvature)(system) or 1.0  # L
 
     def start_from(self, volume: Any) -> None:
         self.volume = self.previous = volume
@@ -115,13 +122,32 @@ class Accelerated(Algorithm):
         self.prior.restore(state)
 
 
+def _row_sums(system: System) -> Any:
+    return system.adjoint(system.apply_weights(system.row_sums()))
+
+
+def _curvature(system: System) -> float:
+    """Bounds the norm of AᵀA, which has no negative entry, by its largest row sum."""
+    return system.space.largest(_row_sums(system))
+
+
+def _tight_curvature(system: System) -> float:
+    """Bounds the norm of AᵀA, at the price of another pass, by the largest (AᵀA x)/x of an x > 0 (Collatz and Wielandt). Row
+    sums as x make the bound a sixth smaller."""
+    sums, space = _row_sums(system), system.space
+    again = system.adjoint(system.apply_weights(system.forward(sums)))
+    bound = space.largest(space.multiply(again, space.reciprocal(sums, _FAINTEST)))
+    return min(space.largest(sums), bound)
+
+
 class Fista(Accelerated):
     """The residual of a pass is that of all subsets, each at the extrapolated point of its step."""
 
     def __init__(
-        self, system: System, prior: Prior, weight: PriorWeight, *, subsets: int, nonnegative: bool
-    ) -> None:
-        super().__init__(system, prior)
+        self, system: System, prior: Prior, weight: PriorWeight, *, subsets: int, nonnegative: bool,
+        has_long_steps: bool = False,
+    ) -> None:  # fmt: skip
+        super().__init__(system, prior, has_long_steps=has_long_steps)
         self.nonnegative, self.weight = nonnegative, weight
         self.subsets = OrderedSubsets(system, subsets)
 
@@ -166,24 +192,42 @@ METHOD = Method(fista, {"default": FistaOptions()}, is_shared=True, takes_initia
 
 
 def fista_stages(inputs: MethodInputs) -> list[Stage]:
-    """Returns the passes on the scan's own voxels, and those on smaller ones if there are any."""
-    options = inputs.options
+    """Returns the coarse passes and the fine ones; no coarse passes where they would differ in nothing but subsets."""
+    options, scan = inputs.options, inputs.scan
     parts = options.subvoxels or (2 if _gains_from_subvoxels(inputs, 2) else 1)
-    fine_passes = int(_SUBVOXEL_PASSES * options.iterations) if parts > 1 else 0
-    passes = options.iterations - fine_passes
-    stages = [Stage("voxels", passes, partial(_run, options=replace(options, iterations=passes), image=inputs.initial))]
+    motion = with_times(options.motion, scan, inputs.deformation)
+    is_coarser = parts > 1 or (scan.is_fly and _few_times(motion) != motion)
+    first = round(_COARSE_PASSES * options.iterations) if is_coarser else 0
+    last = options.iterations - first
+
+    def stage(name: str, passes: int, **how: Any) -> Stage:
+        own = replace(options, iterations=passes)
+        return Stage(name, passes, partial(fista_passes, options=own, image=inputs.initial, **how))
+
+    many = round(_COARSE_SUBSETS * options.subsets) if parts > 1 else options.subsets
+    stages = [stage("coarse", first, subsets=many, has_few_times=True)] if is_coarser else []
+    stages.append(stage("fine", last, parts=parts))
     if parts > 1:
-        run = partial(_run, options=replace(options, iterations=fine_passes), image=inputs.initial, parts=parts)
-        share = priors.subvoxel_share(options.prior, inputs.scan.grid.finer(parts).shape)
-        merge = partial(merge_subvoxels, parts=parts, share=share)
-        stages.append(Stage("subvoxels", fine_passes, run, merge))
+        share = priors.subvoxel_share(options.prior, scan.grid.finer(parts).shape)
+        stages[-1] = replace(stages[-1], merge=partial(merge_subvoxels, parts=parts, share=share))
     return stages
 
 
-def _run(inputs: MethodInputs, options: FistaOptions, image: np.ndarray | None, parts: int = 1) -> Reconstruction:
-    """Runs one stage, with every voxel divided into ``parts`` along each side. ``image``: the prior image of piccs."""
+def _few_times(motion: Motion) -> Motion:
+    """Returns the model with a third of its times: coarse passes only bring a first volume."""
+    times = motion.sub_intervals if isinstance(motion, PerRow) else 0
+    return PerRow(max(2, math.ceil(_COARSE_TIMES * times))) if times > 2 else motion
+
+
+def fista_passes(
+    inputs: MethodInputs, options: FistaOptions, image: np.ndarray | None = None, parts: int = 1, subsets: int = 0,
+    has_few_times: bool = False,
+) -> Reconstruction:  # fmt: skip
+    """Runs one stage, with every voxel divided into ``parts`` along each side. image: the prior image of piccs. subsets: in
+    place of those of the options. has_few_times: a third of the times in an exposure are enough."""
     scan, rt = replace(inputs.scan, grid=inputs.scan.grid.finer(parts), reference=None, moving_truth=None), inputs.rt
-    options = replace(options, motion=with_times(options.motion, inputs.scan, inputs.deformation))
+    motion = with_times(options.motion, inputs.scan, inputs.deformation)
+    options = replace(options, motion=_few_times(motion) if has_few_times and scan.is_fly else motion)
     image, initial = repeated(image, parts), repeated(inputs.initial, parts)
 
     def make(system: System) -> Fista:
@@ -198,7 +242,8 @@ def _run(inputs: MethodInputs, options: FistaOptions, image: np.ndarray | None, 
         prior = priors.prior_of(options.prior, prior_inputs)
         with rt.ledger.reserved(_COPIES * volume_bytes if is_short else 0):
             weight = PriorWeight(system, error, options.prior_weight)
-            return Fista(system, prior, weight, subsets=options.subsets, nonnegative=options.nonnegative)
+            count, clips = subsets or options.subsets, options.nonnegative
+            return Fista(system, prior, weight, subsets=count, nonnegative=clips, has_long_steps=True)
 
     stage_inputs = replace(inputs, scan=scan, options=options, initial=initial)
     volumes = _VOLUMES + priors.volumes_of(options.prior)
