@@ -132,10 +132,14 @@ class _Calibrator:
         as_stated = problem if is_as_stated else self._problem(self.stated, self.stages[-1], most_frames)
         before = self._residual(as_stated, self.stages[-1], GeometryCorrection())
         after = self._residual(problem, self.stages[-1], correction, views)
-        fits_worse = rms(after) > rms(before) and not self.search.held  # fits do not judge a held parameter
-        if views is None and fits_worse:  # a correction that explains the frames worse is none
-            corrections, correction, after = {}, GeometryCorrection(), before
-            self.search.determined, self.search.fixed = (), {}
+        held = {name: value for name, value in corrections.items() if name in self.search.held}
+        before_rest = before  # fits judge the rest, from where the held ones are
+        if held:
+            known = correction_of(held)
+            before_rest = after if held == corrections else self._residual(as_stated, self.stages[-1], known)
+        if views is None and rms(after) > rms(before_rest):  # a correction that explains the frames worse is none
+            corrections, correction, after = held, correction_of(held), before_rest
+            self.search.keep_held()
         table += self.search.table(self.scan, corrections) + views_table
         corrected = perturb(self.scan, correction, views) if corrections or views is not None else self.scan
         if correction.drift:

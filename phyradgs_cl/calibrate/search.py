@@ -110,6 +110,11 @@ class Search:
             self.at[name] = max(old + float(np.clip(difference, -most, most)), lowest)
         return bool(np.all(np.abs(change) < _SETTLED * self.reduced.deviations()))
 
+    def keep_held(self) -> None:
+        """Leaves only the held parameters estimated."""
+        self.determined = ()
+        self.fixed = {name: estimate for name, estimate in self.fixed.items() if name in self.held}
+
     def estimates(self) -> tuple[np.ndarray, np.ndarray]:
         """Returns the values of the determined parameters and their standard deviations.
 

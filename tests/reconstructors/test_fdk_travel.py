@@ -95,6 +95,16 @@ def test_a_feed_that_leaves_voxels_with_less_than_half_a_turn_is_named(rt, caplo
     assert "of the voxels are seen from less than half a turn, the least from" in caplog.records[0].message
 
 
+@pytest.mark.parametrize(("views", "said"), [(7, ["FDK: 7 views a turn are few"]), (25, [])])
+def test_few_views_a_turn_are_named(rt, views, said, caplog) -> None:
+    """Seven views a turn, also where no two turns have the same angles."""
+    for step_rad in (2 * np.pi / views, 2 * np.pi / (views + 0.3)):
+        angle = np.arange(3 * views) * step_rad
+        caplog.clear()
+        reconstructed(rt, poses_of(angle, 0.4 * (angle - angle.mean()) / (2 * np.pi)))
+        assert [line[: len(said[0])] if said else line for line in caplog.messages] == said
+
+
 def test_where_other_methods_begin(rt) -> None:
     pose = helix(3, 0.4)
     scan = Scan.from_poses(frames_of(pose, "rows", False), pose, GRID)
