@@ -114,7 +114,7 @@ def _views_a_turn(angle_rad: np.ndarray) -> float:
 def _warn_if_few_views(views_a_turn: float, name: str) -> None:
     """Logs that a turn has too few views for right densities: each voxel is seen for a turn or less."""
     if views_a_turn < _FEW_VIEWS - 0.5:
-        text = "%s: %.0f views a turn are few for a helix: densities may be wrong by 5 %% at 17 views and 20 %% at 7; take %d"
+        text = "%s: %.0f views a turn are few for a helix: densities may be 5 %% wrong at 17 views, 20 %% at 7; take %d"
         log.warning(text, name, views_a_turn, _FEW_VIEWS)
 
 
