@@ -8,6 +8,13 @@
 #include "common/lanes.h"
 #include "common/line_backprojection.h"
 
+/* FDK's weight of a sample; with DISTANCE_POWER 1 the angle that a voxel turns by per radian of the source */
+#if DISTANCE_POWER == 1
+#define BY_DISTANCE(weight, inv) (weight) * (inv)
+#else
+#define BY_DISTANCE(weight, inv) (weight) * (inv) * (inv)
+#endif
+
 __kernel void backproject(
     __global const float *projections, /* views of (guard, (rows, pitch)) */
     __global const float *matrices,    /* (views, 12): rows give u z, v z, z of a voxel index x y z */
@@ -42,7 +49,7 @@ __kernel void backproject(
         const vf below = GATHER(image + next_row, at), above = GATHER(image + next_row + next, at);
         const vf lower = low + wu * (high - low);
         const vf upper = below + wu * (above - below);
-        sum += V_PICK(0.0f, weights[f] * inv * inv * (lower + wv * (upper - lower)), inside);
+        sum += V_PICK(0.0f, BY_DISTANCE(weights[f], inv) * (lower + wv * (upper - lower)), inside);
     }
     /* the last vector may reach into the guard, where it must leave zeros */
     V_STORE(V_PICK(0.0f, sum, V_IOTA < (float)(shape.x - first)), target);
@@ -77,7 +84,7 @@ __kernel void backproject_upright(
             continue;
         const float step = m[6] * inv, start = (m[4] * x + (m[5] * y + m[6] * first + m[7])) * inv;
         const int column = min((int)u, max(width - 2, 0));
-        const float weight = weights[f] * inv * inv, high = weight * (u - column), low = weight - high;
+        const float weight = BY_DISTANCE(weights[f], inv), high = weight * (u - column), low = weight - high;
         __global const float *a = projections + f * image_step + IMAGE_GUARD + (size_t)column * image_pitch;
         __global const float *b = a + (width > 1 ? image_pitch : 0);
 #ifdef V_LOOKUP
@@ -228,7 +235,7 @@ __kernel void backproject_leaning(
                     value += max(1.0f - fabs(u - (float)i), 0.0f) * high;
                 }
             }
-            value *= weights[f] * inv * inv;
+            value *= BY_DISTANCE(weights[f], inv);
             V_STORE(V_LOAD(sum + k) + (is_inside ? value : V_PICK(0.0f, value, inside)), sum + k);
         }
     }

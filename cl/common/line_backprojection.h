@@ -53,5 +53,9 @@ static inline float line_added(
     const float there = line_sample(pixels + (step ? image_pitch : 0), next_u, width);
     const float middle = depth + t * (next_depth - depth);
     const float scale = filtered_across ? speed * speed : speed;
+#if DISTANCE_POWER == 1 /* see backproject.cl */
+    return sum + weight / (middle * scale) * (here + t * (there - here));
+#else
     return sum + weight / (middle * middle * scale) * (here + t * (there - here));
+#endif
 }

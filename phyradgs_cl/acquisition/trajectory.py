@@ -188,7 +188,8 @@ class PoseTable:
     table: np.ndarray
     subject: str = "pose table"
     is_parallel: bool = False
-    _frames: np.ndarray = field(init=False, repr=False)
+    _in_body: np.ndarray = field(init=False, repr=False)
+    _turns: scipy.spatial.transform.Slerp = field(init=False, repr=False)
 
     __repr__ = repr_of_changes
 
@@ -202,18 +203,20 @@ class PoseTable:
         if self.is_parallel:
             table = unit_directions(self.subject, table)
         object.__setattr__(self, "table", table)
-        object.__setattr__(self, "_frames", body_frames(table))
+        frames = body_frames(table)
+        # seen from the turning panel, the vectors of a pose hardly change: there straight lines between samples hold
+        in_body = np.einsum("tji,tkj->tki", frames, table.reshape(-1, 4, 3)).reshape(-1, POSE_LENGTH)
+        object.__setattr__(self, "_in_body", in_body)
+        turns = scipy.spatial.transform.Rotation.from_matrix(frames)
+        object.__setattr__(self, "_turns", scipy.spatial.transform.Slerp(time_s, turns))
 
     def pose(self, frame: int, time_s: np.ndarray) -> np.ndarray:
         """Returns poses (..., 12) in mm at times (...) s, the same in every frame. Raises InputError beyond the table."""
         t = np.asarray(time_s, np.float64)
         _check_covered(self.subject, frame, t, self.time_s)
-        # seen from the turning panel, the vectors of a pose hardly change: there straight lines between samples hold
-        in_body = np.einsum("tji,tkj->tki", self._frames, self.table.reshape(-1, 4, 3)).reshape(-1, POSE_LENGTH)
         flat = np.clip(t.ravel(), self.time_s[0], self.time_s[-1])  # Slerp allows no slack
-        body = np.stack([np.interp(flat, self.time_s, column) for column in in_body.T], -1).reshape(-1, 4, 3)
-        turns = scipy.spatial.transform.Rotation.from_matrix(self._frames)
-        turn = scipy.spatial.transform.Slerp(self.time_s, turns)(flat).as_matrix()
+        body = np.stack([np.interp(flat, self.time_s, column) for column in self._in_body.T], -1).reshape(-1, 4, 3)
+        turn = self._turns(flat).as_matrix()
         turned: np.ndarray = np.einsum("tij,tkj->tki", turn, body)
         return turned.reshape(*t.shape, POSE_LENGTH)
 

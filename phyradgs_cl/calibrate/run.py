@@ -38,6 +38,7 @@ from phyradgs_cl.calibrate.stages import PassCounter, Passes, Report, Stage, pas
 from phyradgs_cl.calibrate.views import ViewsEstimate, estimate_views, passes_of_views
 from phyradgs_cl.check import SUSPICIOUS
 from phyradgs_cl.check.coverage import CUT_OFF, check_coverage
+from phyradgs_cl.check.hypotheses import has_axis_near_edge
 from phyradgs_cl.check.orbit import OTHER_CAUSE, centre_of
 from phyradgs_cl.detector import without_lag
 from phyradgs_cl.errors import InputError
@@ -131,9 +132,14 @@ class _Calibrator:
         as_stated = problem if is_as_stated else self._problem(self.stated, self.stages[-1], most_frames)
         before = self._residual(as_stated, self.stages[-1], GeometryCorrection())
         after = self._residual(problem, self.stages[-1], correction, views)
-        if views is None and rms(after) > rms(before):  # a correction that explains the frames worse is none
-            corrections, correction, after = {}, GeometryCorrection(), before
-            self.search.determined, self.search.fixed = (), {}
+        held = {name: value for name, value in corrections.items() if name in self.search.held}
+        before_rest = before  # fits judge the rest, from where the held ones are
+        if held:
+            known = correction_of(held)
+            before_rest = after if held == corrections else self._residual(as_stated, self.stages[-1], known)
+        if views is None and rms(after) > rms(before_rest):  # a correction that explains the frames worse is none
+            corrections, correction, after = held, correction_of(held), before_rest
+            self.search.keep_held()
         table += self.search.table(self.scan, corrections) + views_table
         corrected = perturb(self.scan, correction, views) if corrections or views is not None else self.scan
         if correction.drift:
@@ -145,10 +151,13 @@ class _Calibrator:
         """Starts from the offset that ``check`` finds, because steps lead there from a few pixels away only.
 
         In half a turn of nearly parallel rays a volume explains most of what an offset changes, so the search cannot
-        determine it. ``check``'s answer then stands."""
+        determine it. ``check``'s answer then stands. It stands as well where the panel sees few rays twice, because a shift
+        that leaves fewer of them fits better whatever is true."""
+        if self.phantom is None and has_axis_near_edge(self.ready[0]):
+            self.search.held = (OFFSET_U,)
         quick, pitch_mm = coarse(self.ready[0], QUICK_COLUMNS), self.scan.geometry.pixel_size_mm[1]
         shift, finding = centre_of(axis_shift(self.rt, quick), columns_per_block(quick), self.ready[0])
-        if not shift.is_found:
+        if not shift.is_found or (self.search.held and finding.verdict == CANNOT_TELL):
             return
         self.search.at[OFFSET_U] = shift.pixels * pitch_mm
         if finding.verdict != CANNOT_TELL and finding.unit != OTHER_CAUSE:

@@ -48,10 +48,12 @@ class Fallback:
 class Search:
     """The state of a search. ``at``: the current values by name; ``former``: those at the end of the previous grid, for
     voxels. ``determined``: the parameters that the frames determine, None before the first step. ``fallback``: estimates of
-    parameters from elsewhere, for those that are not determined; ``fixed``: those in use. ``shares``: what remains of each
+    parameters from elsewhere, for those that are not determined; ``fixed``: those in use. ``held``: parameters that fits do
+    not determine, because wrong values fit better. ``shares``: what remains of each
     signal. ``alike``: combinations that no frame distinguishes, in words. ``reduced``: the last linear problem."""
 
     parameters: Sequence[Parameter]
+    held: tuple[str, ...] = ()
     fallback: Mapping[str, Fallback] = field(default_factory=dict)
     fixed: dict[str, Fallback] = field(default_factory=dict)
     at: dict[str, float] = field(default_factory=dict)
@@ -85,7 +87,8 @@ class Search:
         has_gauges = GAUGES[0].name in linear.names
         least = least_shares(linear) if has_gauges else dict.fromkeys(linear.names, LEAST_SHARE_OF_BEADS)
         linear = linear.only([one.name for one in self.parameters])
-        names = tuple(name for name, share in zip(linear.names, linear.shares, strict=True) if share >= least[name])
+        shares = [pair for pair in zip(linear.names, linear.shares, strict=True) if pair[0] not in self.held]
+        names = tuple(name for name, share in shares if share >= least[name])
         deviations = linear.only(names).deviations() if names else ()
         self.determined = tuple(n for n, d in zip(names, deviations, strict=True) if PARAMETERS[n].is_known(float(d)))
         self.shares = dict(zip(linear.names, linear.shares.tolist(), strict=True))
@@ -106,6 +109,11 @@ class Search:
             lowest = PARAMETERS[name].lowest(problem.scans[0])
             self.at[name] = max(old + float(np.clip(difference, -most, most)), lowest)
         return bool(np.all(np.abs(change) < _SETTLED * self.reduced.deviations()))
+
+    def keep_held(self) -> None:
+        """Leaves only the held parameters estimated."""
+        self.determined = ()
+        self.fixed = {name: estimate for name, estimate in self.fixed.items() if name in self.held}
 
     def estimates(self) -> tuple[np.ndarray, np.ndarray]:
         """Returns the values of the determined parameters and their standard deviations.

@@ -21,6 +21,7 @@ from phyradgs_cl.check.finding import (
 )
 from phyradgs_cl.check.hypotheses import (
     SIZE_FACTORS,
+    has_axis_near_edge,
     nearly_sized,
     shifts_for_sense_px,
     stated_redundancy,
@@ -29,6 +30,7 @@ from phyradgs_cl.check.timing import is_full_turn
 from phyradgs_cl.reconstructors.fits import axis
 from phyradgs_cl.reconstructors.fits.axis import opposite_shift
 from phyradgs_cl.reconstructors.fits.residuals import fit_squares, residual_ratio, t_statistic
+from phyradgs_cl.reconstructors.fits.twice import shift_by_rays_seen_twice
 from phyradgs_cl.runtime import Runtime
 
 SIGN, CENTRE, DISTANCES = "sign of rotation", "centre of rotation", "distances"
@@ -85,7 +87,7 @@ def find_orbit(rt: Runtime, quick: Scan, as_stated: Scan, sees_angles: bool) -> 
     shift = other if is_reversed else stated
     if is_rough or limits_px != axis.ANYWHERE:
         shift = axis.refined_shift(rt, reverse if is_reversed else quick, shift)
-    shift, centre = centre_of(shift, block, as_stated)
+    shift, centre = centre_of(shift, block, reversed_rotation(as_stated) if is_reversed else as_stated)
     if is_reversed:
         stated_px = as_stated.geometry.detector_offset_mm[1] / as_stated.geometry.pixel_size_mm[1]
         sign = with_cause(sign, shift.pixels, stated_px, centre.threshold)
@@ -128,9 +130,14 @@ def with_cause(finding: Finding, shift_px: float, stated_px: float, tolerance_px
 def centre_of(shift: axis.AxisShift, block: int, scan: Scan) -> tuple[axis.AxisShift, Finding]:
     """Returns a shift found with blocks of ``block`` pixels, and the finding about it.
 
-    The error of coarse pixels is added to its deviation, because the bootstrap over frames does not include it. It is far
-    larger where ``scan`` measures few rays twice: a shift that leaves fewer of them fits better anyway. Opposite views of
-    parallel rays give the shift as well, from whole pixels: the answer with the smaller deviation counts."""
+    The error of coarse pixels is added to its deviation, because the bootstrap over frames does not include it. It is
+    larger where ``scan`` measures fewer rays twice. Where these are less than half, a shift that leaves fewer of them fits
+    better anyway: then they alone decide, or nothing does. Opposite views of parallel rays give the shift as well, from
+    whole pixels: the answer with the smaller deviation counts."""
+    pitch_mm = scan.geometry.pixel_size_mm[1]
+    if has_axis_near_edge(scan):
+        shift = shift_by_rays_seen_twice(scan)
+        return shift, check_centre(shift, _WHOLE_PIXELS, pitch_mm, scan.geometry.detector_offset_mm[1] / pitch_mm)
     twice = min(2 * stated_redundancy(scan), 1.0)
     is_whole = is_full_turn(scan) and twice == 1
     bias = _BIAS_FULL_TURN if is_whole else _BIAS_HALF_TURN / max(twice, _LEAST_REDUNDANCY)
@@ -138,7 +145,6 @@ def centre_of(shift: axis.AxisShift, block: int, scan: Scan) -> tuple[axis.AxisS
     by_views = opposite_shift(scan)
     if by_views.is_found and not by_views.deviation >= shift.deviation:
         shift, block = by_views, min(block, _WHOLE_PIXELS)
-    pitch_mm = scan.geometry.pixel_size_mm[1]
     return shift, check_centre(shift, block, pitch_mm, scan.geometry.detector_offset_mm[1] / pitch_mm)
 
 

@@ -28,37 +28,40 @@ Arguments = tuple[DeviceArray, DeviceArray, DeviceArray, np.int32, np.int32, np.
 
 
 def backproject(
-    rt: Runtime, frames: SameArray, pose: np.ndarray, weight: np.ndarray, grid: Grid, *, is_parallel: bool = False
+    rt: Runtime, frames: SameArray, pose: np.ndarray, weight: np.ndarray, grid: Grid, *, is_parallel: bool = False,
+    power: int = 2,
 ) -> SameArray:
-    """Returns Σ_f weight_f / z² · frame_f(u, v) at every voxel centre; z is the voxel's depth relative to the detector's.
+    """Returns Σ_f weight_f / z^power · frame_f(u, v) at every voxel centre; z is the voxel's depth relative to the
+    detector's.
 
     frames (F, rows, columns), bilinear and zero outside; pose (F, 12) mm; weight (F,). z is 1 in a parallel beam. The
-    result (z, y, x) float32 is on the device if the frames are."""
+    result (z, y, x) float32 is on the device if the frames are. power: 2 of FDK, or 1."""
     matrices = voxel_matrices(pose, grid, is_parallel)
     block, leans = (0, False) if rt.pixel_items else _upright_block(matrices, grid)
     views = Views(frames, bool(block), matrices, weight)
     if block:
         name = "backproject_leaning" if leans else "backproject_upright"
-        volume = in_bricks(rt, views, grid, block, lambda *where: _upright(rt, name, block, *where))
+        volume = in_bricks(rt, views, grid, block, lambda *where: _upright(rt, name, power, block, *where))
     else:
-        volume = in_bricks(rt, views, grid, 1, lambda *where: _general(rt, *where))
+        volume = in_bricks(rt, views, grid, 1, lambda *where: _general(rt, power, *where))
     return cast(SameArray, volume)
 
 
 def backproject_lines(
     rt: Runtime, frames: SameArray, pose: np.ndarray, weight: np.ndarray, grid: Grid, axis: str = "rows", *,
-    is_parallel: bool = False,
+    is_parallel: bool = False, power: int = 2,
 ) -> SameArray:
     """Backprojects frames in which every line has its own pose: pose (F, lines, 12) mm, lines along ``axis``.
 
     A voxel reads the line r whose pose projects the voxel onto r, interpolated between neighbouring lines. Its value is
     divided by the rate at which the voxel crosses lines: once for the angular step, and once more for the filter's scale
-    if frames were filtered across lines (``axis`` columns). See docs/mathematics.md."""
+    if frames were filtered across lines (``axis`` columns). See docs/mathematics.md. power: as of ``backproject``; frames
+    are not filtered where it is 1."""
     pose = Readout(axis).poses(pose)
     matrices = voxel_matrices(pose.reshape(-1, 12), grid, is_parallel).reshape(len(pose), -1)
-    across = np.int32(axis == "columns")
+    across = np.int32(axis == "columns" and power == 2)
     views = Views(frames, axis == "columns", matrices, weight)
-    return cast(SameArray, in_bricks(rt, views, grid, 1, lambda *where: _lines(rt, across, *where)))
+    return cast(SameArray, in_bricks(rt, views, grid, 1, lambda *where: _lines(rt, power, across, *where)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,26 +147,31 @@ def _backprojected(
     return volume
 
 
-def _general(rt: Runtime, images: Arguments, brick: Brick, volume: DeviceArray) -> None:
+def _general(rt: Runtime, power: int, images: Arguments, brick: Brick, volume: DeviceArray) -> None:
     nz, ny, nx = brick.shape
-    kernel = rt.kernel("backproject", "backproject", IMAGE_GUARD=GUARD)
+    kernel = rt.kernel("backproject", "backproject", **_defines(power))
     rt.launch(kernel, (ceil_div(nx, rt.lanes), ny, nz), *images, *volume_shape(brick), volume, group=rt.group())
 
 
-def _lines(rt: Runtime, across: np.int32, images: Arguments, brick: Brick, volume: DeviceArray) -> None:
+def _lines(rt: Runtime, power: int, across: np.int32, images: Arguments, brick: Brick, volume: DeviceArray) -> None:
     nz, ny, nx = brick.shape
-    kernel = rt.kernel("backproject", "backproject_lines", IMAGE_GUARD=GUARD)
+    kernel = rt.kernel("backproject", "backproject_lines", **_defines(power))
     rt.launch(kernel, (nx, ny, nz), *images, *volume_shape(brick), across, volume, group=rt.group(on_cpu=16))
 
 
-def _upright(rt: Runtime, name: str, block: int, images: Arguments, brick: Brick, volume: DeviceArray) -> None:
+def _upright(rt: Runtime, name: str, power: int, block: int, images: Arguments, brick: Brick, volume: DeviceArray) -> None:
     """Launches an upright kernel. ``images`` are transposed: their width is the number of detector rows."""
     nz, ny, nx = brick.shape
-    defines = {"IMAGE_GUARD": GUARD, "BLOCK_VOXELS": _BLOCK_VOXELS, "COLUMN_ROWS": _COLUMN_ROWS}
-    kernel = rt.kernel("backproject", name, **defines)
+    sizes = {"BLOCK_VOXELS": _BLOCK_VOXELS, "COLUMN_ROWS": _COLUMN_ROWS}
+    kernel = rt.kernel("backproject", name, **_defines(power), **sizes)
     image, table, weights, views, columns, rows, *rest = images
     data = (image, table, weights, views, rows, columns, *rest)
     rt.launch(kernel, (nx, ny, ceil_div(nz, block)), *data, *volume_shape(brick), block, volume)
+
+
+def _defines(power: int) -> dict[str, int]:
+    """Returns the build options of a power of the distance; those of FDK's own stay as they are."""
+    return {"IMAGE_GUARD": GUARD} if power == 2 else {"IMAGE_GUARD": GUARD, "DISTANCE_POWER": power}
 
 
 def _upright_block(matrices: np.ndarray, grid: Grid) -> tuple[int, bool]:

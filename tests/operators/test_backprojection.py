@@ -49,6 +49,21 @@ def test_frames(any_rt, make_geometry: Geometries, shape) -> None:
         assert_same(backproject(any_rt, frames, pose, weight, GRID), expected)
 
 
+def test_by_the_first_power_of_the_distance(any_rt, make_geometry: Geometries) -> None:
+    """Of upright, leaning and other panels, and of lines, which count their speed once whichever way they run."""
+    frames, weight = random_frames((13, 18))
+    geometry = make_geometry(13, 18, offset=(0.1, 0.2))
+    for tilt in (0.0, 0.02, 0.3):
+        pose = geometry.pose(ANGLES)
+        pose[:, 9:12] += tilt * pose[:, 6:9]
+        expected = backprojection(frames, pose, weight, GRID, power=1)
+        assert_same(backproject(any_rt, frames, pose, weight, GRID, power=1), expected)
+    for axis, lines in (("rows", 13), ("columns", 18)):
+        pose = line_poses(geometry, lines, 0.15)
+        expected = lines_backprojection(frames, pose, weight, GRID, axis, power=1)
+        assert_same(backproject_lines(any_rt, frames, pose, weight, GRID, axis, power=1), expected, 2)
+
+
 @pytest.mark.parametrize("lanes", [1, 4, 8, 16])
 def test_panels_rolled_and_tilted_to_either_side(lanes) -> None:
     """Tilted by 6 degrees, a voxel's detector column hardly changes along z; rolled, it passes several columns."""

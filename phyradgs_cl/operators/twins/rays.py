@@ -111,9 +111,9 @@ def _rays(
 
 def backprojection(
     frames: np.ndarray, pose: np.ndarray, weight: np.ndarray, grid: Grid, is_parallel: bool = False,
-    push_mm: np.ndarray | None = None,
+    push_mm: np.ndarray | None = None, power: int = 2,
 ) -> np.ndarray:
-    """Σ_f weight_f / z² · frame_f(u, v); frames (F, rows, columns), pose (F, 12) mm, weight (F,) → (z, y, x).
+    """Σ_f weight_f / z^power · frame_f(u, v); frames (F, rows, columns), pose (F, 12) mm, weight (F,) → (z, y, x).
 
     push_mm: (F, z, y, x, 3) displacement, components x, y, z, of the matter of each voxel at the time of a frame."""
     volume = np.zeros(grid.shape)
@@ -121,16 +121,16 @@ def backprojection(
     for frame, one, share, moved in zip(frames.astype(np.float64), pose, weight, pushes, strict=True):
         u, v, depth = detector_position(one, grid, is_parallel, moved)
         inside = (depth > 0) & _on(u, frame.shape[1]) & _on(v, frame.shape[0])
-        volume[inside] += share / depth[inside] ** 2 * _bilinear(frame, v[inside], u[inside])
+        volume[inside] += share / depth[inside] ** power * _bilinear(frame, v[inside], u[inside])
     return volume
 
 
 def lines_backprojection(
     frames: np.ndarray, pose: np.ndarray, weight: np.ndarray, grid: Grid, axis: str = "rows",
-    is_parallel: bool = False, push_mm: np.ndarray | None = None,
+    is_parallel: bool = False, push_mm: np.ndarray | None = None, power: int = 2,
 ) -> np.ndarray:
     """The same with one pose per line, pose (F, lines, 12) mm: by definition, see ``backproject_lines``."""
-    power = 2 if axis == "columns" else 1
+    speed_power = 2 if axis == "columns" and power == 2 else 1
     if axis == "columns":
         frames, pose = frames.transpose(0, 2, 1), transpose_pose(pose)
     lines = frames.shape[1]
@@ -142,7 +142,7 @@ def lines_backprojection(
         ahead = v - np.arange(lines)[:, None, None, None]  # falls through zero where the voxel is seen
         for index in np.ndindex(*grid.shape):
             at = (slice(None), *index)
-            volume[index] += share * _seen(frame, u[at], ahead[at], depth[at], power)
+            volume[index] += share * _seen(frame, u[at], ahead[at], depth[at], power, speed_power)
     return volume
 
 
@@ -169,7 +169,9 @@ def detector_position(
         return u / depth, v / depth, depth
 
 
-def _seen(frame: np.ndarray, u: np.ndarray, ahead: np.ndarray, depth: np.ndarray, power: int) -> float:
+def _seen(
+    frame: np.ndarray, u: np.ndarray, ahead: np.ndarray, depth: np.ndarray, power: int, speed_power: int
+) -> float:
     """What one voxel receives from a frame; u, ahead and depth are (lines,), one pose each."""
     crossing = np.flatnonzero((ahead[:-1] >= 0) & (ahead[1:] <= 0))
     if crossing.size == 0 or depth.min() <= 0:
@@ -181,7 +183,7 @@ def _seen(frame: np.ndarray, u: np.ndarray, ahead: np.ndarray, depth: np.ndarray
         float(np.interp(u[r], np.arange(frame.shape[1]), frame[r], 0, 0)) for r in (line, line + 1)
     )
     middle = (1 - t) * depth[line] + t * depth[line + 1]
-    return float(((1 - t) * here + t * there) / (middle**2 * speed**power))
+    return float(((1 - t) * here + t * there) / (middle**power * speed**speed_power))
 
 
 def _on(position: np.ndarray, count: int) -> np.ndarray:

@@ -3,6 +3,7 @@
 The displacement of a view is blended of those of two states. S. Rit et al., Comparison of analytic and algebraic methods for
 motion-compensated cone-beam CT reconstruction of the thorax, IEEE Trans. Med. Imaging 28 (2009) 1513."""
 
+from copy import copy
 from functools import lru_cache
 
 import numpy as np
@@ -33,6 +34,12 @@ class MovingBackprojector:
     def __init__(self, rt: Runtime, states: MotionStates, shares: np.ndarray) -> None:
         self.rt, self.states, self.shares = rt, states, shares
         self._push = lru_cache(_HELD_STATES)(self._push_of)
+
+    def of_views(self, views: np.ndarray) -> "MovingBackprojector":
+        """Returns the backprojector of some of the views, by their numbers (n,)."""
+        some = copy(self)  # which shares the displacements on the device
+        some.shares = self.shares[views]
+        return some
 
     def __call__(
         self, frames: np.ndarray, pose: np.ndarray, weight: np.ndarray, grid: Grid, axis: str = "rows", *,

@@ -24,7 +24,8 @@ from phyradgs_cl.operators import backproject, backproject_lines
 from phyradgs_cl.operators.warp.backproject import MovingBackprojector
 from phyradgs_cl.operators.warp.states import MotionStates
 from phyradgs_cl.prepare.step import unmasked_frames
-from phyradgs_cl.reconstructors.fdk import weights
+from phyradgs_cl.reconstructors.fdk import travel, weights
+from phyradgs_cl.reconstructors.fdk.arc import filled_gap_rad, view_arc
 from phyradgs_cl.reconstructors.fdk.frames import (
     WAYS,
     deblurred,
@@ -35,10 +36,10 @@ from phyradgs_cl.reconstructors.fdk.frames import (
 from phyradgs_cl.reconstructors.fdk.views import (
     RayWeight,
     check_beam,
+    opposite_weight,
     pose_of_pixels,
     ray_weight,
     view_angles,
-    view_arc,
     warn_if_incomplete,
     widened,
 )
@@ -174,13 +175,14 @@ def fdk_volume(
     if np.any(np.hypot(by_pixel[..., 0], by_pixel[..., 1]) <= 0):
         raise InputError("poses", "a source on the rotation axis", "a source beside it")
     angle_rad = view_angles(by_pixel)
-    canonical = weights.turned_back(by_pixel, angle_rad)
+    canonical = travel.still_along_z(weights.turned_back(by_pixel, angle_rad), is_parallel)
     # on a circle all views are the same but for a rotation: one set of weights serves all of them
     if np.ptp(canonical, axis=0).max() <= _SAME_POSE * np.abs(canonical).max():
         canonical = canonical[:1]
-    arc, fan = view_arc(angle_rad), weights.measured_fan(canonical, shape, is_parallel)
+    fan = weights.measured_fan(canonical, shape, is_parallel)
+    arc = view_arc(angle_rad, filled_gap_rad(fan))
     if extrapolate != "none" and fan.is_put_aside:
-        log.warning("FDK: the rows of a displaced detector are not extrapolated")
+        log.warning("%s: the rows of a displaced detector are not extrapolated", "FBP" if is_parallel else "FDK")
     elif extrapolate != "none":
         if extrapolate == "reprojected" and whole is not None:
             wide, count = reprojected(rt, frames, pose, axis, whole(), grid, is_parallel)
@@ -194,13 +196,22 @@ def fdk_volume(
     missing = fan.missing_columns if arc.is_full else (0, 0)
     filtered = _filtered(frames, ray_weight(canonical, shape, arc, fan, is_parallel), missing, window)
     pose = widened(pose, axis, missing)
-    share = 0.5 * arc.gap_rad  # every ray is measured twice
-    if moving is not None:
-        volume = moving(filtered, pose, share, grid, axis, is_parallel=is_parallel)
-    elif pose.ndim == 2:
-        volume = backproject(rt, filtered, pose, share, grid, is_parallel=is_parallel)
+
+    def of_views(images: np.ndarray, views: np.ndarray, power: int = 2) -> np.ndarray:
+        share, one = 0.5 * arc.gap_rad[views], pose[views]  # every ray is measured twice
+        if moving is not None and power == 2:
+            return moving.of_views(views)(images, one, share, grid, axis, is_parallel=is_parallel)
+        if pose.ndim == 2:
+            return backproject(rt, images, one, share, grid, is_parallel=is_parallel, power=power)
+        return backproject_lines(rt, images, one, share, grid, axis, is_parallel=is_parallel, power=power)
+
+    if travel.travels(by_pixel, shape[0], is_parallel):
+        counted = opposite_weight(canonical, shape, arc, is_parallel)
+        volume = travel.seen_volume(
+            filtered, pose, axis, grid, fan.is_displaced, is_parallel, counted, of_views, partial(of_views, power=1)
+        )
     else:
-        volume = backproject_lines(rt, filtered, pose, share, grid, axis, is_parallel=is_parallel)
+        volume = of_views(filtered, np.arange(len(filtered)))
     if circle:
         _, y_mm, x_mm = grid.axes_mm()
         radius_mm = fan.half_rad + np.linalg.norm(canonical[0, 0, 0, 6:9]) / 2  # to the edge of the last pixel

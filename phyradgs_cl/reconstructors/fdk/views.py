@@ -1,8 +1,7 @@
-"""The views of an FDK reconstruction: their orbit, the arc that they cover, and their pixels' weights before filtering."""
+"""The views of an FDK reconstruction: their orbit, what they do not cover, and their pixels' weights before filtering."""
 
 import logging
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -10,67 +9,7 @@ from phyradgs_cl.acquisition.altered.angles import azimuth_rad, wrapped
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.reconstructors.fdk import weights
-
-# A short scan has one gap that stands out. It is compared with the second largest and not with the median, so
-# that uneven views (four times as dense over one half, say) stay a full turn; 2.5 lets one view of many be lost.
-SHORT_SCAN_GAP = 2.5
-_SAME_VIEW = 1e-3  # of the mean gap: views closer than this share one cell (a second turn over the first)
-
-
-@dataclass(frozen=True, eq=False)
-class Arc:
-    """The views' angular cells.
-
-    gap_rad (F,) is each view's share of the arc; progress_rad (F,) its angle from the start of the arc, which
-    begins half a step before the first view and ends half a step behind the last. A full turn has no start."""
-
-    gap_rad: np.ndarray
-    progress_rad: np.ndarray
-    coverage_rad: float
-    is_full: bool
-
-
-def view_arc(angle_rad: np.ndarray) -> Arc:
-    """Returns the arc that views at angles (F,) cover, in any order and over any number of turns."""
-    cell, centre = _distinct(angle_rad)
-    count = np.bincount(cell)
-    ahead = np.diff(centre, append=centre[0] + 2 * np.pi)
-    if not _is_short(ahead):
-        gap = (ahead + np.roll(ahead, 1)) / 2
-        return Arc((gap / count)[cell], (centre - centre[0])[cell], 2 * np.pi, True)
-    first = (int(np.argmax(ahead)) + 1) % ahead.size
-    ahead, centre = np.roll(ahead, -first), np.roll(centre, -first)  # the gap is now the last
-    # the last view has no next one: its share is that of the view before
-    ahead[-1] = ahead[-2]
-    behind = np.concatenate([ahead[:1], ahead[:-1]])
-    gap = (ahead + behind) / 2
-    progress = np.concatenate([[0.0], np.cumsum(ahead[:-1])]) + behind[0] / 2
-    place = (cell - first) % ahead.size
-    return Arc((gap / np.roll(count, -first))[place], progress[place], float(gap.sum()), False)
-
-
-def _is_short(ahead: np.ndarray) -> bool:
-    if ahead.size < 2:
-        return False
-    second, largest = np.sort(ahead)[-2:]
-    return bool(largest > SHORT_SCAN_GAP * second)
-
-
-def _distinct(angle_rad: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Returns each view's cell (F,), and the cells' ascending angles (K,) on the turn."""
-    turned = np.mod(np.asarray(angle_rad, np.float64), 2 * np.pi)
-    order = np.argsort(turned, kind="stable")
-    tolerance = _SAME_VIEW * 2 * np.pi / turned.size
-    is_new = np.diff(turned[order], prepend=-np.inf) > tolerance
-    index = np.cumsum(is_new) - 1
-    centre = turned[order][is_new]
-    if centre.size > 1 and centre[0] + 2 * np.pi - turned[order[-1]] <= tolerance:  # 0° and 360° are one
-        index[index == centre.size - 1] = 0
-        centre = centre[:-1]
-    cell = np.empty(turned.size, np.int64)
-    cell[order] = index
-    return cell, centre
-
+from phyradgs_cl.reconstructors.fdk.arc import Arc
 
 log = logging.getLogger(__name__)
 
@@ -78,6 +17,7 @@ _CIRCLE, _NO_CIRCLE = 0.05, 0.5  # of the way from source to panel: from here FD
 _PLANE_DEG, _NO_PLANE_DEG = 10.0, 45.0
 _LEAN_DEG, _NO_LEAN_DEG = 0.5, 10.0  # of a parallel beam
 _ROLL_DEG, _NO_ROLL_DEG = 3.0, 10.0  # of a cone's panel: densities are 0.1 % too low, 1.5 %, and all 0 at 90°
+_LEAST_OVERLAP = 2.0  # columns from the axis to the nearer edge of a displaced panel
 _TOLERATED_RAD = np.deg2rad(0.5)  # the fan of rays that are nearly parallel: half a turn is enough
 RayWeight = Callable[[int], np.ndarray]
 
@@ -121,7 +61,26 @@ def ray_weight(
     return weight
 
 
+def opposite_weight(
+    canonical: np.ndarray, shape: tuple[int, int], arc: Arc, is_parallel: bool
+) -> Callable[[int], np.ndarray | float]:
+    """Returns a function from a view's index to the weights (rows, columns) by which its rays share with opposite ones of
+    an arc; 1 in a full turn."""
+    rows, columns = np.arange(shape[0]), np.arange(shape[1])
+
+    def weight(view: int) -> np.ndarray | float:
+        if arc.is_full:
+            return 1.0
+        pose = canonical[view % len(canonical)]
+        angle_rad = _redundancy_angle(pose, weights.pixel_rays(pose, rows, columns, is_parallel), arc, is_parallel)
+        return _redundancy(view, angle_rad, arc, weights.Fan(0.0, 0.0))
+
+    return weight
+
+
 def _redundancy(view: int, angle_rad: np.ndarray, arc: Arc, fan: weights.Fan) -> np.ndarray | float:
+    if len(arc.parts_rad) > 1:
+        return weights.parted_weight(float(arc.progress_rad[view]), angle_rad, arc.parts_rad)
     if not arc.is_full:
         return weights.short_scan_weight(float(arc.progress_rad[view]), angle_rad, arc.coverage_rad)
     return weights.displaced_weight(angle_rad, fan) if fan.is_displaced else 1.0
@@ -199,26 +158,27 @@ def _check_rows(pose: np.ndarray) -> None:
 def _check_orbit(pose: np.ndarray) -> None:
     middle = pose if pose.ndim == 2 else pose[:, pose.shape[1] // 2]
     canonical = weights.turned_back(middle, azimuth_rad(middle)).reshape(-1, 4, 3)
-    source, corner = canonical[:, 0], canonical[:, 1]
     usual = np.median(canonical, axis=0)
     length_mm = float(np.linalg.norm(usual[1] - usual[0]))
-    off = max(float(np.linalg.norm(at - of, axis=-1).max()) for at, of in ((source, usual[0]), (corner, usual[1])))
+    off_mm = canonical[:, :2] - usual[:2]  # of source and panel
+    aside_mm = off_mm - np.eye(3)[2] * off_mm[:, :1, 2:]  # without the source's travel, of which a voxel misses views only
     above_deg = float(np.rad2deg(np.arctan2(abs(usual[0, 2]), np.hypot(*usual[0, :2]))))
-    parts = (
-        f"{100 * off / length_mm:.0f} % of their distance off a circle about z",
-        f"{above_deg:.0f}° above the middle of their circle",
-    )
 
-    def distances_beyond(most: float, most_deg: float) -> str:
+    def distances_beyond(most: float, most_deg: float, of_mm: np.ndarray) -> str:
         """Names the distances that are too large."""
+        off = float(np.linalg.norm(of_mm, axis=-1).max())
+        parts = (
+            f"{100 * off / length_mm:.0f} % of their distance off a circle about z",
+            f"{above_deg:.0f}° above the middle of their circle",
+        )
         wrong = (off > most * length_mm, above_deg > most_deg)
         return " and ".join(part for part, is_wrong in zip(parts, wrong, strict=True) if is_wrong)
 
-    if found := distances_beyond(_NO_CIRCLE, _NO_PLANE_DEG):
+    if found := distances_beyond(_NO_CIRCLE, _NO_PLANE_DEG, aside_mm):
         expected = f"at most {100 * _NO_CIRCLE:.0f} % off it and {_NO_PLANE_DEG:.0f}° above"
         remedy = "take an iterative or splatting method: they take any orbit"
         raise InputError("--method fdk", f"source and panel up to {found}", expected, remedy)
-    if found := distances_beyond(_CIRCLE, _PLANE_DEG):
+    if found := distances_beyond(_CIRCLE, _PLANE_DEG, off_mm):
         text = "FDK: source and panel up to %s: the volume is an approximation; %s"
         log.warning(text, found, "iterative and splatting methods take any orbit")
 
@@ -226,26 +186,50 @@ def _check_orbit(pose: np.ndarray) -> None:
 def warn_if_incomplete(
     arc: Arc, fan: weights.Fan, canonical: np.ndarray, grid: Grid, is_parallel: bool = False
 ) -> None:
+    """Logs what the views do not cover, in one line each."""
+    name = "FBP" if is_parallel else "FDK"
     if np.unique(arc.progress_rad).size == 1:
-        log.warning("FDK: all views are from one angle: the volume is a single backprojection")
+        log.warning("%s: all views are from one angle: the volume is a single backprojection", name)
         return
-    if arc.is_full and not fan.sees_axis:
-        log.warning(
-            "FDK: the detector does not see the rotation axis; the middle of the volume is not measured"
-        )
     if arc.is_full:
+        _warn_of_axis(name, fan)
+    else:
+        _warn_of_short_scan(name, arc, fan, canonical, grid, is_parallel)
+    if arc.filled_rad > 0:
+        text = "%s: %.1f° are missing where %s: the views beside them stand for them, and densities are approximate"
+        where = "a displaced detector needs a full turn" if fan.is_put_aside else "views are uneven"
+        log.warning(text, name, np.rad2deg(arc.filled_rad), where)
+
+
+def _warn_of_axis(name: str, fan: weights.Fan) -> None:
+    if not fan.sees_axis:
+        text = "%s: the detector does not see the rotation axis; the middle of the volume is not measured"
+        log.warning(text, name)
+    elif fan.is_displaced and fan.overlap_columns < _LEAST_OVERLAP:
+        text = "%s: the panel ends %.2f pixels beyond the axis: densities near the axis may be 20 %% wrong; %s"
+        log.warning(text, name, fan.overlap_columns, f"{_LEAST_OVERLAP:g} make them right")
+
+
+def _warn_of_short_scan(
+    name: str, arc: Arc, fan: weights.Fan, canonical: np.ndarray, grid: Grid, is_parallel: bool
+) -> None:
+    fan_rad = 0.0
+    if not is_parallel:
+        _, y_mm, x_mm = grid.axes_mm()
+        radius_mm = np.hypot(np.abs(x_mm).max(), np.abs(y_mm).max())
+        source_mm = float(np.hypot(canonical[..., 0], canonical[..., 1]).min())
+        fan_rad = min(fan.half_rad, float(np.arcsin(min(radius_mm / source_mm, 1.0))))
+    if len(arc.parts_rad) > 1:
+        if (unseen_rad := arc.unseen_rad(fan_rad)) > _TOLERATED_RAD:
+            text = "%s: the views cover %.1f° in %d parts, which leave %.1f° of half a turn unmeasured: densities are wrong"
+            log.warning(text, name, np.rad2deg(arc.coverage_rad), len(arc.parts_rad), np.rad2deg(unseen_rad))
         return
-    if fan.is_put_aside:
-        log.warning("FDK: a displaced detector needs a full turn; one side of the volume is not measured")
     if is_parallel:
         if arc.coverage_rad < np.pi - _TOLERATED_RAD:
             text = "FBP: the views cover %.1f°, complete data of a parallel beam need 180°"
             log.warning(text, np.rad2deg(arc.coverage_rad))
         return
-    _, y_mm, x_mm = grid.axes_mm()
-    radius_mm = np.hypot(np.abs(x_mm).max(), np.abs(y_mm).max())
-    source_mm = float(np.hypot(canonical[..., 0], canonical[..., 1]).min())
-    needed_rad = np.pi + 2 * min(fan.half_rad, float(np.arcsin(min(radius_mm / source_mm, 1.0))))
+    needed_rad = np.pi + 2 * fan_rad
     if arc.coverage_rad < needed_rad - _TOLERATED_RAD:
         log.warning(
             "FDK: the views cover %.1f°, complete data need %.1f° (half a turn and the fan)",

@@ -1,0 +1,126 @@
+"""FDK of helices and other orbits with travel, in which every voxel counts the views that see it.
+
+A voxel is seen by other views than its neighbour along z, some of its rays twice, others once. The rays' directions about
+z fall into overlapping classes. Of each class a voxel takes the mean of the views that see it, weighted down towards the
+panel's first and last rows, and counts it by the class' width. After K. Stierstorfer et al., Phys. Med. Biol. 49 (2004)
+2209, with classes of directions in place of rebinned rays."""
+
+import logging
+from collections.abc import Callable
+
+import numpy as np
+
+from phyradgs_cl.fields import Grid
+from phyradgs_cl.reconstructors.fdk import weights
+from phyradgs_cl.reconstructors.fdk.views import pose_of_pixels, view_angles
+
+log = logging.getLogger(__name__)
+
+_TRAVEL = 0.05  # of the panel's height, and a row: less than this concerns voxels that a circle sees in part too
+_CLASS_RAD = np.deg2rad(15)
+_VIEWS_A_CLASS = 2.0  # of a turn, at least
+_EVEN = 0.5  # of the panel's half height: rows beyond count less
+_LEAST_ROW = 0.02  # what the outermost row counts, so that voxels seen by no other are seen
+_LEAST_SHARE = 0.01  # of a class' width: less is as if it were not seen
+_NAMED = 0.01  # of the voxels
+_FEW_VIEWS = 24  # of a turn: from there densities of balls are within 2 %
+Backproject = Callable[[np.ndarray, np.ndarray], np.ndarray]
+"""Returns a volume (z, y, x) of frames (n, rows, columns) and the numbers (n,) of their views."""
+
+
+def travels(pose: np.ndarray, rows: int, is_parallel: bool) -> bool:
+    """Whether the origin moves along the panel's rows from view to view of poses (F, r, c, 12): voxels miss some views."""
+    middle = pose[:, pose.shape[1] // 2, pose.shape[2] // 2]
+    first, across = middle[:, 3:6], np.cross(middle[:, 6:9], middle[:, 9:12])
+    source = middle[:, :3]
+    if is_parallel:
+        hit = source * ((first * across).sum(-1) / (source * across).sum(-1))[:, None]
+    else:
+        hit = source - source * (((first - source) * across).sum(-1) / (-source * across).sum(-1))[:, None]
+    along = np.cross(across, middle[:, 6:9])
+    row = ((hit - first) * along).sum(-1) / (middle[:, 9:12] * along).sum(-1)
+    return bool(np.ptp(row) > max(1.0, _TRAVEL * rows))
+
+
+def still_along_z(canonical: np.ndarray, is_parallel: bool) -> np.ndarray:
+    """Returns poses (F, r, c, 12) without the height of their sources or first pixels, on which no ray's weight depends."""
+    level = canonical.copy()
+    level[..., 5] -= canonical[..., 5 if is_parallel else 2]
+    if not is_parallel:
+        level[..., 2] = 0
+    return level
+
+
+def seen_volume(
+    frames: np.ndarray, pose: np.ndarray, axis: str, grid: Grid, is_displaced: bool, is_parallel: bool,
+    counted: Callable[[int], np.ndarray | float], backproject: Backproject, backproject_seen: Backproject,
+) -> np.ndarray:  # fmt: skip
+    """Returns the volume (z, y, x) of filtered frames (F, rows, columns) in which every voxel counts the views that see it.
+
+    pose (F, 12) or (F, lines, 12) mm. ``counted``: the weight of a view's pixels by which opposite rays share. Both
+    backprojections weigh views by their angular cells; ``backproject_seen`` divides by the distance once."""
+    by_pixel, shape = pose_of_pixels(pose, axis), frames.shape[1:]
+    angle_rad, pace = _directions(by_pixel[:, [by_pixel.shape[1] // 2]], shape, is_parallel)
+    turn_rad = 2 * np.pi if is_displaced else np.pi  # opposite rays are one where both sides are measured alike
+    views_a_turn = np.unique(np.round(np.mod(view_angles(by_pixel), 2 * np.pi), 6)).size
+    width_rad = turn_rad / max(4, round(turn_rad / max(_CLASS_RAD, _VIEWS_A_CLASS * 2 * np.pi / views_a_turn)))
+    classes, place = round(turn_rad / width_rad), np.mod(angle_rad, turn_rad) / width_rad
+    name = "FBP" if is_parallel else "FDK"
+    _warn_if_few_views(min(views_a_turn, _views_a_turn(view_angles(by_pixel))), name)
+    row_weight = _row_weight(shape[0])[:, None]
+    volume, covered = np.zeros(grid.shape, np.float32), np.zeros(grid.shape, np.float32)
+    for number in range(classes):
+        apart = np.abs(place - number)
+        part = np.maximum(1 - np.minimum(apart, classes - apart), 0)
+        views = np.flatnonzero(part.any(axis=(1, 2)))
+        if not views.size:
+            continue
+        weight = (part[views] * row_weight).astype(np.float32)
+        values = backproject(frames[views] * weight, views)
+        for i, view in enumerate(views.tolist()):
+            weight[i] *= pace[view] * counted(view)
+        seen = backproject_seen(weight, views) * np.float32(2 / width_rad)
+        volume += values / np.maximum(seen, _LEAST_SHARE) * np.float32(2 * np.pi / turn_rad)
+        covered += np.minimum(seen / _LEAST_SHARE, 1)
+    _warn_if_unseen(covered / classes, name, "a" if is_displaced else "half a")
+    return volume * np.divide(classes, covered, out=np.zeros_like(covered), where=covered > 0)
+
+
+def _directions(pose: np.ndarray, shape: tuple[int, int], is_parallel: bool) -> tuple[np.ndarray, np.ndarray]:
+    """Returns the angles about z (F, 1, columns) of the rays of poses (F, 1, c, 12), and what they turn by per radian of the
+    source, of a voxel on the panel."""
+    rays = weights.pixel_rays(pose, np.array([shape[0] // 2]), np.arange(shape[1]))
+    if is_parallel:
+        angle_rad = np.broadcast_to(np.arctan2(pose[..., 1], pose[..., 0]), rays.shape[:-1])
+        return angle_rad, np.ones_like(angle_rad)
+    pace = np.abs(pose[..., 0] * rays[..., 0] + pose[..., 1] * rays[..., 1]) / (rays[..., :2] ** 2).sum(-1)
+    return np.arctan2(rays[..., 1], rays[..., 0]), pace
+
+
+def _row_weight(rows: int) -> np.ndarray:
+    """Returns the weights (rows,): 1 in the middle, cos² towards the panel's first and last row."""
+    away = np.abs(np.arange(rows) - (rows - 1) / 2) / max((rows - 1) / 2, 0.5)
+    falling = np.cos(np.pi / 2 * np.clip((away - _EVEN) / (1 - _EVEN), 0, 1)) ** 2
+    return np.maximum(falling, _LEAST_ROW)
+
+
+def _views_a_turn(angle_rad: np.ndarray) -> float:
+    """Returns the views (F,) of one turn where one follows the other; infinity where steps are too wide to tell turns."""
+    steps_rad = np.abs(np.angle(np.exp(1j * np.diff(angle_rad))))
+    step_rad = float(np.median(steps_rad)) if steps_rad.size else 0.0
+    return 2 * np.pi / step_rad if 0 < step_rad < np.pi / 2 else np.inf
+
+
+def _warn_if_few_views(views_a_turn: float, name: str) -> None:
+    """Logs that a turn has too few views for right densities: each voxel is seen for a turn or less."""
+    if views_a_turn < _FEW_VIEWS - 0.5:
+        text = "%s: %.0f views a turn are few for a helix: densities may be 5 %% wrong at 17 views, 20 %% at 7; take %d"
+        log.warning(text, name, views_a_turn, _FEW_VIEWS)
+
+
+def _warn_if_unseen(covered: np.ndarray, name: str, turn: str) -> None:
+    """Logs how many voxels the views see from too few directions; covered: the share (z, y, x) of those that they need."""
+    share = float((covered < 1 - 1e-3).mean())
+    if share > _NAMED:
+        text = "%s: %.0f %% of the voxels are seen from less than %s turn, the least from %.0f°: their densities are wrong"
+        log.warning(text, name, 100 * share, turn, (360 if turn == "a" else 180) * float(covered.min()))

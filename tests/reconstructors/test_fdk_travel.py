@@ -1,0 +1,118 @@
+"""FDK of helices and other orbits with travel: every voxel counts the views that see it."""
+
+import logging
+
+import numpy as np
+import pytest
+from tolerances import FDK_PARTIAL
+
+from phyradgs_cl.acquisition import ConeGeometry, ParallelGeometry, Scan
+from phyradgs_cl.fields import Grid
+from phyradgs_cl.phantoms import Ellipsoid, EllipsoidPhantom
+from phyradgs_cl.reconstructors.fdk import FdkOptions, fdk, fdk_volume, static_fdk
+
+GRID = Grid((8, 26, 26), (0.06,) * 3)
+BALLS = (((0.4, 0.0, 0.05), 0.25), ((-0.3, 0.35, -0.05), 0.2), ((-0.2, -0.4, 0.0), 0.22), ((0.0, 0.0, 0.0), 0.2))
+PHANTOM = EllipsoidPhantom(tuple(Ellipsoid(c, (r,) * 3, 1.0) for c, r in BALLS), "balls")
+SHAPE = (16, 60)
+
+
+def poses_of(angle_rad: np.ndarray, height_mm: np.ndarray, is_parallel: bool = False, offset_mm: float = 0.0) -> np.ndarray:
+    """Poses (..., 12) lifted by heights (...); the panel is 0.64 mm high at the axis."""
+    if is_parallel:
+        pose = ParallelGeometry(SHAPE, 0.04, (0.0, offset_mm)).pose(angle_rad)
+    else:
+        pose = ConeGeometry(10.0, 15.0, SHAPE, 0.06, (0.0, 1.5 * offset_mm)).pose(angle_rad)
+    pose[..., [5] if is_parallel else [2, 5]] += height_mm[..., None]
+    return pose
+
+
+def helix(turns: float, feed_mm: float, lines: int = 0, turned_rad: float = 0.1, **more) -> np.ndarray:
+    angle = np.arange(round(60 * turns)) * 2 * np.pi / 60
+    if lines:
+        angle = angle[:, None] + turned_rad * (np.arange(lines) / lines - 0.5)
+    return poses_of(angle, feed_mm * (angle / (2 * np.pi) - turns / 2), **more)
+
+
+def frames_of(pose: np.ndarray, axis: str, is_parallel: bool) -> np.ndarray:
+    by_pixel = pose[:, None, None] if pose.ndim == 2 else pose[:, :, None] if axis == "rows" else pose[:, None]
+    rows, columns = np.arange(SHAPE[0])[:, None, None], np.arange(SHAPE[1])[:, None]
+    targets = by_pixel[..., 3:6] + columns * by_pixel[..., 6:9] + rows * by_pixel[..., 9:12]
+    source = np.broadcast_to(by_pixel[..., :3], targets.shape)
+    ends = (targets - 20 * source, targets + 20 * source) if is_parallel else (source, targets)
+    return PHANTOM.line_integrals(*ends).astype(np.float32)
+
+
+def levels(volume: np.ndarray) -> np.ndarray:
+    z, y, x = np.meshgrid(*GRID.axes_mm(), indexing="ij")
+    distance = [np.sqrt((x - c[0]) ** 2 + (y - c[1]) ** 2 + (z - c[2]) ** 2) / r for c, r in BALLS]
+    return np.array([volume[d < 0.7].mean() for d in distance])
+
+
+def reconstructed(rt, pose: np.ndarray, axis: str = "rows", is_parallel: bool = False) -> np.ndarray:
+    frames = frames_of(pose, axis, is_parallel)
+    return levels(fdk_volume(rt, frames, pose, GRID, axis=axis, is_parallel=is_parallel))
+
+
+ANGLE = np.arange(180) * 2 * np.pi / 180
+ORBITS = {
+    "one turn": helix(1, 0.2), "less than a turn": helix(0.8, 0.1), "two turns": helix(2, 0.4),
+    "six turns, downwards": helix(6, -0.4), "not whole turns": helix(3.4, 0.4), "a high pitch": helix(4, 0.75),
+    "swings up and down": poses_of(ANGLE, 0.08 * np.sin(2 * ANGLE)),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("is_parallel", [False, True])
+def test_densities_of_a_circle(rt, is_parallel, caplog) -> None:
+    """Every view counted as if it saw every voxel: two turns had two thirds of the density, six a fifth."""
+    circle = reconstructed(rt, poses_of(ANGLE[::3], 0 * ANGLE[::3], is_parallel), is_parallel=is_parallel)
+    orbits = ORBITS if not is_parallel else {"parallel": helix(3, 0.4, is_parallel=True)}
+    for name, pose in orbits.items():
+        found = reconstructed(rt, pose, is_parallel=is_parallel)
+        np.testing.assert_allclose(found, circle, atol=FDK_PARTIAL, err_msg=name)
+    assert not caplog.records
+
+
+@pytest.mark.parametrize("axis", ["rows", "columns"])
+def test_with_a_pose_for_every_line(rt, axis) -> None:
+    circle = reconstructed(rt, poses_of(ANGLE[::3], 0 * ANGLE[::3]))
+    pose = helix(3, 0.4, SHAPE[axis == "columns"])
+    np.testing.assert_allclose(reconstructed(rt, pose, axis), circle, atol=FDK_PARTIAL)
+
+
+@pytest.mark.parametrize("is_parallel", [False, True])
+def test_displaced_panels_count_both_sides_apart(rt, is_parallel) -> None:
+    """Off centre by a sixth of the panel: each side is measured once by views half a turn apart."""
+    more = {"is_parallel": is_parallel, "offset_mm": 0.4}
+    circle = reconstructed(rt, poses_of(ANGLE[::3], 0 * ANGLE[::3], **more), is_parallel=is_parallel)
+    found = reconstructed(rt, helix(4, 0.25, **more), is_parallel=is_parallel)
+    np.testing.assert_allclose(found, circle, atol=FDK_PARTIAL)
+
+
+def test_a_feed_that_leaves_voxels_with_less_than_half_a_turn_is_named(rt, caplog) -> None:
+    with caplog.at_level(logging.WARNING):
+        reconstructed(rt, helix(5, 2.0))
+    assert "of the voxels are seen from less than half a turn, the least from" in caplog.records[0].message
+
+
+@pytest.mark.parametrize(("views", "said"), [(7, ["FDK: 7 views a turn are few"]), (25, [])])
+def test_few_views_a_turn_are_named(rt, views, said, caplog) -> None:
+    """Seven views a turn, also where no two turns have the same angles."""
+    for step_rad in (2 * np.pi / views, 2 * np.pi / (views + 0.3)):
+        angle = np.arange(3 * views) * step_rad
+        caplog.clear()
+        reconstructed(rt, poses_of(angle, 0.4 * (angle - angle.mean()) / (2 * np.pi)))
+        assert [line[: len(said[0])] if said else line for line in caplog.messages] == said
+
+
+def test_where_other_methods_begin(rt) -> None:
+    pose = helix(3, 0.4)
+    scan = Scan.from_poses(frames_of(pose, "rows", False), pose, GRID)
+    np.testing.assert_allclose(levels(static_fdk(rt, scan)), reconstructed(rt, pose), atol=FDK_PARTIAL / 10)
+
+
+def test_long_helices_are_not_refused(rt) -> None:
+    """A travel of the source–panel distance: refused as far off a circle, of which a voxel only misses views."""
+    pose = helix(20, 0.6)
+    scan = Scan.from_poses(frames_of(pose, "rows", False), pose, GRID)
+    assert abs(levels(fdk(scan, FdkOptions(), rt).volume).mean() - 1) < FDK_PARTIAL

@@ -1,0 +1,103 @@
+"""FDK and FBP of turns in which views are missing: densities stay, or one line says by which angles they cannot."""
+
+import logging
+
+import numpy as np
+import pytest
+from tolerances import FDK_PARTIAL, FLOAT64
+
+from phyradgs_cl.acquisition import ConeGeometry, ParallelGeometry
+from phyradgs_cl.fields import Grid
+from phyradgs_cl.phantoms import Ellipsoid, EllipsoidPhantom
+from phyradgs_cl.reconstructors.fdk import fdk_volume, weights
+from phyradgs_cl.reconstructors.fdk.arc import view_arc
+
+GRID = Grid((16, 32, 32), (0.0625,) * 3)
+BALLS = (((0.5, 0.1, 0.1), 0.28), ((-0.35, 0.4, -0.1), 0.25), ((-0.15, -0.5, 0.0), 0.25), ((0.0, 0.0, 0.0), 0.2))
+PHANTOM = EllipsoidPhantom(tuple(Ellipsoid(c, (r,) * 3, 1.0) for c, r in BALLS), "balls")
+EVERY_DEG = 2.0 * np.arange(180)
+
+
+def geometry_of(kind: str, columns: int, offset_mm: float) -> ConeGeometry | ParallelGeometry:
+    """A cone or parallel beam that sees ±(columns / 40 mm) about its middle at the axis."""
+    shape, offset = (30, columns), (0.0, offset_mm)
+    if kind == "fbp":
+        return ParallelGeometry(shape, 0.05, offset)
+    return ConeGeometry(6.0, 9.0, shape, 0.075, (0.0, 1.5 * offset_mm))
+
+
+def levels(rt, kind: str, angles_deg: np.ndarray, columns: int = 48, offset_mm: float = 0.0, lines_deg: float = 0.0):
+    """Mean reconstructed value inside each ball, whose attenuation is 1. ``lines_deg``: turned while a frame is read."""
+    rows, is_parallel = np.arange(30), kind == "fbp"
+    pose = geometry_of(kind, columns, offset_mm).pose(np.deg2rad(angles_deg[:, None] + lines_deg * (rows / 30 - 0.5)))
+    by_pixel = pose[:, :, None]
+    targets = by_pixel[..., 3:6] + np.arange(columns)[:, None] * by_pixel[..., 6:9]
+    targets = targets + rows[:, None, None] * by_pixel[..., 9:12]
+    sources = targets - 20 * by_pixel[..., :3] if is_parallel else np.broadcast_to(by_pixel[..., :3], targets.shape)
+    frames = PHANTOM.line_integrals(sources, targets + 20 * by_pixel[..., :3] * is_parallel)
+    pose = pose if lines_deg else pose[:, 0]
+    volume = fdk_volume(rt, frames.astype(np.float32), pose, GRID, is_parallel=is_parallel)
+    z, y, x = np.meshgrid(*GRID.axes_mm(), indexing="ij")
+    distance = [np.sqrt((x - c[0]) ** 2 + (y - c[1]) ** 2 + (z - c[2]) ** 2) / r for c, r in BALLS]
+    return np.array([volume[d < 0.7].mean() for d in distance])
+
+
+@pytest.mark.parametrize("kind", ["fdk", "fbp"])
+@pytest.mark.parametrize("lines_deg", [0.0, 1.5])
+def test_a_displaced_panel_keeps_its_weights_where_views_are_missing(rt, kind, lines_deg, caplog) -> None:
+    """They went, and the density at the axis was three times too high: two views in a row, or a turn that ends early."""
+    turns = {"whole": EVERY_DEG, "two lost": np.delete(EVERY_DEG, [40, 41]), "ends early": np.arange(0, 359, 1.0)}
+    whole = levels(rt, kind, EVERY_DEG, 30, 0.45, lines_deg)
+    for name, angles in turns.items():
+        np.testing.assert_allclose(levels(rt, kind, angles, 30, 0.45, lines_deg), whole, atol=FDK_PARTIAL / 2, err_msg=name)
+    assert [record.message.split(" are missing")[0] for record in caplog.records] == [f"{kind.upper()}: 4.0°"]
+
+
+@pytest.mark.parametrize("kind", ["fdk", "fbp"])
+@pytest.mark.parametrize("offset_mm", [0.0, 0.02])
+def test_a_panel_that_sees_both_sides_takes_missing_rays_from_opposite_views(rt, kind, offset_mm, caplog) -> None:
+    gaps = {"one": [(20, 50)], "two": [(20, 35), (80, 95)], "three": [(5, 20), (60, 75), (123, 137)]}
+    whole = levels(rt, kind, EVERY_DEG, 52, offset_mm)
+    for name, lost in gaps.items():
+        angles = np.delete(EVERY_DEG, np.concatenate([np.arange(*ends) for ends in lost]))
+        np.testing.assert_allclose(levels(rt, kind, angles, 52, offset_mm), whole, atol=FDK_PARTIAL, err_msg=name)
+    assert not caplog.records
+
+
+def test_gaps_that_nothing_covers_are_named(rt, caplog) -> None:
+    """In degrees, in one line each."""
+    opposite = np.delete(EVERY_DEG, np.r_[20:40, 110:130])
+    cases = (
+        ("fdk", opposite, 52, 0.0, "FDK: the views cover 280.0° in 2 parts, which leave"),
+        ("fbp", opposite, 52, 0.0, "FBP: the views cover 280.0° in 2 parts, which leave"),
+        ("fdk", EVERY_DEG[:150], 30, 0.45, "FDK: 60.0° are missing where a displaced detector needs a full turn"),
+        ("fbp", EVERY_DEG[:150], 30, 0.45, "FBP: 60.0° are missing where a displaced detector needs a full turn"),
+        ("fdk", EVERY_DEG, 30, 0.74, "FDK: the panel ends 0.20 pixels beyond the axis"),
+        ("fbp", EVERY_DEG, 30, -0.68, "FBP: the panel ends 1.40 pixels beyond the axis"),
+    )
+    for kind, angles, columns, offset_mm, message in cases:
+        caplog.clear()
+        with caplog.at_level(logging.WARNING):
+            levels(rt, kind, angles, columns, offset_mm)
+        assert [record.message[: len(message)] for record in caplog.records] == [message]
+
+
+def test_cells_fill_gaps_or_part_there() -> None:
+    """Cells of a displaced panel sum to a turn, the nearer to a gap the larger; parts end half a step beyond their views."""
+    angles = np.deg2rad(np.delete(EVERY_DEG, np.r_[20:30, 90:95]))
+    filled = view_arc(angles, 2 * np.pi)
+    assert filled.is_full
+    assert filled.gap_rad.sum() == pytest.approx(2 * np.pi, rel=FLOAT64)
+    assert np.all(np.diff(filled.gap_rad[20:25]) < 0)
+    np.testing.assert_allclose(filled.gap_rad[40:70], np.deg2rad(2.0), rtol=FLOAT64)
+    parted = view_arc(angles)
+    ends_deg = np.rad2deg(parted.parts_rad)
+    np.testing.assert_allclose(ends_deg, [[0, 120], [130, 340]], rtol=FLOAT64)
+    assert parted.coverage_rad == pytest.approx(np.deg2rad(330.0), rel=FLOAT64)
+    rng = np.random.default_rng(3)
+    for angle, here in zip(rng.uniform(-0.1, 0.1, 300), rng.choice(parted.progress_rad, 300), strict=True):
+        there = (here + np.pi + 2 * angle) % (2 * np.pi)
+        both = weights.parted_weight(here, np.array(angle), parted.parts_rad)
+        if parted.covers(np.array(there)):
+            both = both + weights.parted_weight(there, np.array(-angle), parted.parts_rad)
+        assert float(both) == pytest.approx(2.0, abs=1e-3)
