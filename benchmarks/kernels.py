@@ -76,7 +76,6 @@ def works(size: int) -> Iterator[tuple[str, Callable[[Runtime], object]]]:
     few = {"iterations": 1}
     splats = {"iterations": 12, "gaussians": size**3 // 16, "tv_edge": 32}
     yield "fista", runs(scan, "fista", subvoxels=1, **few)
-    yield "fista, curves", runs(scan, "fista", prior="curves", subvoxels=1, **few)
     yield "asd-pocs", runs(scan, "asd-pocs", **few)
     for name, of in {"still": foot(size, protocol="static"), "leaning": leaning, "columns": columns, "steep": steep}.items():
         yield f"cgls, {name}", runs(of, "cgls", motion="per-row", **few)
