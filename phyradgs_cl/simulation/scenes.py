@@ -124,7 +124,7 @@ def _voxel_scene(
         return on_panel(geometry, pixel_samples, lambda panel: on_one_panel(values, panel))
 
     def on_one_panel(values: np.ndarray, panel: Geometry) -> FrameSource:
-        memory = RayMemory(rt, RayLayout.of_scan(fine, panel.detector_shape, axis), 1)
+        memory = RayMemory(rt, RayLayout.of_scan(rt, fine, panel.detector_shape, axis), 1)
 
         def of_state(state: np.ndarray) -> FrameSource:
             return VolumeSource(rt, state, fine, panel, axis, memory)

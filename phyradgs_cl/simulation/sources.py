@@ -41,7 +41,7 @@ class VolumeSource(FrameSource):
         self, rt: Runtime, volume: np.ndarray, grid: Grid, geometry: Geometry, axis: str, memory: RayMemory | None = None
     ) -> None:
         self._rt, self._grid, self._detector_shape = rt, grid, geometry.detector_shape
-        self._memory = memory or RayMemory(rt, RayLayout.of_scan(grid, geometry.detector_shape, axis), 1)
+        self._memory = memory or RayMemory(rt, RayLayout.of_scan(rt, grid, geometry.detector_shape, axis), 1)
         self._volume = volume
         self._factor: float | None = None
 

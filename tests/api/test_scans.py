@@ -134,7 +134,8 @@ def test_counts_are_divided_and_bad_pixels_masked(tmp_path) -> None:
     assert sorted(zip(*np.nonzero(bad), strict=True)) == [(1, 2), (4, 5)]
     np.testing.assert_allclose(scan.projections[:, ~bad], wanted[:, ~bad], atol=1e-5)
     assert "stop-and-shoot" in repr(scan) and not scan.is_fly and scan.saturation is not None
-    assert scan.provenance == {"flats_applied": 3, "darks_applied": 2}
+    applied = {"flats_applied": 3, "darks_applied": 2}
+    assert scan.provenance == {**applied, "taken": "flats: the median of 3; darks: the median of 2"}
     save_scan(tmp_path / "s.h5", scan)
     again = load_scan(tmp_path / "s.h5")
     np.testing.assert_array_equal(again.pixel_mask != 0, bad)

@@ -55,6 +55,8 @@ def test_columns_of_few_rows(any_rt, motion, shape, beam) -> None:
     expected = np.stack([ray_frame(volume, GRID, table, shape, "intensity") for table in operator.tables])
     found = operator.project(volume, "intensity")
     assert np.abs(found - expected).max() <= RAYS * expected.max()
+    again = RayOperator(any_rt, GRID, shape, operator.tables, memory=operator.memory)
+    np.testing.assert_array_equal(again.project(volume, "intensity"), found)
 
 
 @pytest.mark.parametrize("lanes", [4, 8])

@@ -33,7 +33,7 @@ def cpu_rt(request: pytest.FixtureRequest) -> Runtime:
 
 def general(rt: Runtime, grid: Grid, shape: tuple[int, int], cells: list[TimeCells]) -> RayOperator:
     """The operator without room for the turned volume."""
-    layout = RayLayout.of_scan(grid, shape, cells[0].axis)
+    layout = RayLayout.of_scan(rt, grid, shape, cells[0].axis)
     return RayOperator(rt, grid, shape, cells, memory=RayMemory(rt, layout, len(cells)))
 
 
@@ -89,7 +89,7 @@ def test_a_subset_and_batches_of_frames(banded_rt) -> None:
     cells, x = tables("static", TALL_PANEL, frames=5), noise(GRID.shape, 105)
     expected = RayOperator(rt, GRID, TALL_PANEL, cells).forward(x)
     operator = RayOperator(rt, GRID, TALL_PANEL, cells)
-    layout = RayLayout.of_scan(GRID, TALL_PANEL, "rows")
+    layout = RayLayout.of_scan(rt, GRID, TALL_PANEL, "rows")
     volumes = layout.volume_floats + columns_floats(GRID) + 5 * operator.slot_floats + 32
     with room_for(rt, int(4 * (volumes + layout.frames_floats(2) + 16) / PLANNED)):
         assert [part.stop for part in operator.memory.batches(5)] == [2, 4, 5]
@@ -101,7 +101,7 @@ def test_without_room_for_the_turned_volume(banded_rt, monkeypatch) -> None:
     rt = banded_rt
     cells, x = tables("static", TALL_PANEL), noise(GRID.shape, 106)
     expected = RayOperator(rt, GRID, TALL_PANEL, cells).forward(x)
-    operator, layout = RayOperator(rt, GRID, TALL_PANEL, cells), RayLayout.of_scan(GRID, TALL_PANEL, "rows")
+    operator, layout = RayOperator(rt, GRID, TALL_PANEL, cells), RayLayout.of_scan(rt, GRID, TALL_PANEL, "rows")
     with room_for(rt, int(4 * (layout.volume_floats + layout.frames_floats(3) + 64) / PLANNED)):
         assert len(operator.memory.plan()) == 1
         launched = note_launches(monkeypatch)
@@ -219,7 +219,7 @@ def test_the_adjoints_bits_do_not_tell_of_bricks_batches_or_where_frames_are(ban
     cells, y = tables("static", TALL_PANEL, frames=5), noise((5, *TALL_PANEL), 110)
     grid = Grid((40, 37, 13), (0.05, 0.05, 0.1))
     expected = RayOperator(rt, grid, TALL_PANEL, cells).adjoint(y)
-    operator, layout = RayOperator(rt, grid, TALL_PANEL, cells), RayLayout.of_scan(grid, TALL_PANEL, "rows")
+    operator, layout = RayOperator(rt, grid, TALL_PANEL, cells), RayLayout.of_scan(rt, grid, TALL_PANEL, "rows")
     np.testing.assert_array_equal(rt.download(operator.adjoint(rt.upload(y))), expected)
     with room_for(rt, int(4 * (layout.volume_floats * 0.7 + layout.frames_floats(2)) / PLANNED)):
         small = RayOperator(rt, grid, TALL_PANEL, cells)

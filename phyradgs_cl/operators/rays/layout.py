@@ -27,21 +27,28 @@ class RayLayout:
     """Layout of volumes (z, y, x) and of stacks of frames with ``lines`` × ``width`` pixels in device memory.
 
     ``brick`` selects the voxels of the grid that the volume holds. It has a border of zeros, so that the frames of all
-    bricks add up to the frames of the grid. ``subrays`` (along v, along u): lines and width count the rays of pixels."""
+    bricks add up to the frames of the grid. ``subrays`` (along v, along u): lines and width count the rays of pixels. ``axis``:
+    what a line is on the detector; ``is_across``: it is a row although columns are read."""
 
     grid: Grid
     lines: int
     width: int
     brick: Brick
     subrays: tuple[int, int] = (1, 1)
+    axis: str = "rows"
+    is_across: bool = False
 
     @classmethod
     def of_scan(
-        cls, grid: Grid, detector_shape: tuple[int, int], axis: str, subrays: tuple[int, int] = (1, 1)
+        cls, rt: Runtime, grid: Grid, detector_shape: tuple[int, int], axis: str, subrays: tuple[int, int] = (1, 1)
     ) -> "RayLayout":
-        """The layout of the complete grid, with the readout's lines as rows of the frames."""
+        """The layout of the complete grid, with the readout's lines as rows of the frames. Of a panel that is read along
+        columns of few rows, vectors of columns would be mostly empty: there the panel's rows are."""
         (rows, columns), (along_v, along_u) = detector_shape, subrays
-        return cls(grid, *Readout(axis).shape((rows * along_v, columns * along_u)), whole(grid.shape), subrays)
+        shape = rows * along_v, columns * along_u
+        is_across = axis == "columns" and not rt.pixel_items and shape[0] < rt.lanes
+        own = "rows" if is_across else axis
+        return cls(grid, *Readout(own).shape(shape), whole(grid.shape), subrays, own, is_across)
 
     def of(self, brick: Brick) -> "RayLayout":
         """The layout of the same frames with another brick of the grid."""
@@ -132,7 +139,7 @@ class RayCells:
     def upload(
         cls, rt: Runtime, grid: Grid, tables: Sequence[TimeCells], rows_across: int | None = None
     ) -> "RayCells":
-        """rows_across: the panel's rows, where these are the kernels' lines although columns are read (``runs_across``)."""
+        """rows_across: the panel's rows, where these are the kernels' lines although columns are read."""
         starts = np.concatenate([[0], np.cumsum([table.count for table in tables])])
         pose = np.concatenate([table.readout.poses(table.pose) for table in tables])
         weights = [table.weights_of(cell) for table in tables for cell in range(table.count)]
@@ -162,11 +169,6 @@ class RayCells:
 
 def _starts_of(parts: Sequence[np.ndarray]) -> np.ndarray:
     return np.concatenate([[0], np.cumsum([len(part) for part in parts])])
-
-
-def runs_across(rt: Runtime, detector_shape: tuple[int, int], axis: str) -> bool:
-    """Whether a vector of a line would be mostly empty: columns of few rows. Rows are then the kernels' lines."""
-    return axis == "columns" and not rt.pixel_items and detector_shape[0] < rt.lanes
 
 
 def matrix_table(pose: np.ndarray, grid: Grid, is_parallel: bool = False) -> tuple[np.ndarray, int]:

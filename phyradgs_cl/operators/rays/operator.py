@@ -18,7 +18,7 @@ from phyradgs_cl.acquisition.time_cells import TimeCells
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.operators.rays.launches import AVERAGES, launch_adjoint, launch_forward
-from phyradgs_cl.operators.rays.layout import RayCells, RayLayout, averaged, layered, runs_across
+from phyradgs_cl.operators.rays.layout import RayCells, RayLayout, averaged, layered
 from phyradgs_cl.operators.rays.memory import RayMemory
 from phyradgs_cl.operators.rays.slots import Slots, UprightPoses, merge_slots, split_slots
 from phyradgs_cl.operators.rays.subrays import SINGLE
@@ -71,9 +71,8 @@ class RayOperator:
         self.rt, self.grid, self.detector_shape = rt, grid, detector_shape
         self.volume_shape = grid.shape
         rays_shape = detector_shape[0] * subrays[0], detector_shape[1] * subrays[1]
-        is_across = runs_across(rt, rays_shape, tables[0].axis)
-        self._axis = "rows" if is_across else tables[0].axis  # whose lines are the kernels' lines
-        layout = RayLayout.of_scan(grid, detector_shape, self._axis, subrays)
+        layout = memory.layout if memory else RayLayout.of_scan(rt, grid, detector_shape, tables[0].axis, subrays)
+        self._axis = layout.axis
         self._tables = list(tables)
         if subrays != SINGLE:
             tables = [table.finer(*subrays) for table in tables]
@@ -90,7 +89,7 @@ class RayOperator:
         if self.slot_floats > self.memory.slot_floats:  # the shared memory was planned without room for slots
             self._upright = None
         self._rays_shape = rays_shape
-        self._cells = RayCells.upload(rt, grid, tables, rays_shape[0] if is_across else None)
+        self._cells = RayCells.upload(rt, grid, tables, rays_shape[0] if layout.is_across else None)
         self._choose(np.arange(len(tables)))
 
     @property
