@@ -189,7 +189,7 @@ class PoseTable:
     subject: str = "pose table"
     is_parallel: bool = False
     _in_body: np.ndarray = field(init=False, repr=False)
-    _turns: scipy.spatial.transform.Slerp = field(init=False, repr=False)
+    _turns: "scipy.spatial.transform.Slerp" = field(init=False, repr=False)
 
     __repr__ = repr_of_changes
 

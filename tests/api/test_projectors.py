@@ -102,7 +102,7 @@ def test_gaussians_and_their_voxels_make_the_same_frames(rt, scan, columns_scan,
     motion, grid = OwnTimes(sub_intervals=4), Grid.cube(120, 2.4)
     volume = voxelise(cloud, grid, cutoff_sigma=0.0, device=rt)
     rays = ray_operator(scan, motion, grid=grid, device=rt)
-    splats = splat_operator(scan, motion, cutoff_sigma=0.0, device=rt)
+    splats = splat_operator(scan, motion, cutoff_sigma=0.0, pixel_footprint=True, device=rt)
     for by_rays, by_splats in ((rays(volume), splats(cloud)), (rays.intensity(volume), splats.intensity(cloud))):
         assert by_splats.shape == scan.projections.shape
         assert np.abs(by_splats - by_rays).max() <= VOXELS * by_rays.max()

@@ -133,13 +133,13 @@ def test_beams_that_miss_and_scans_without_an_object_are_said(cli, scan, reconst
     assert cli.run(["reconstruct", str(path), "-o", str(tmp_path / "volume.h5")]) == 2
     assert "that no ray meets in any frame" in capfd.readouterr().err
     shutil.copy(scan, path)
-    for value in (0.0, -1.0):
+    told = {0.0: "all line integrals are 0", -1.0: "line integrals are negative on the whole, -1 on the mean"}
+    for value, words in told.items():
         with h5py.File(path, "r+") as file:
             file["entry/instrument/detector/data"][...] = value
         caplog.clear()
         reconstructed(path, "--method", "fdk")
-        (told,) = [line for line in caplog.messages if "no line integral is above 0" in line]
-        assert f"the largest is {value:g}" in told
+        assert sum(words in line for line in caplog.messages) == 1
 
 
 def test_overflow_is_one_line_without_numpys_warnings(cli, scan, tmp_path, capfd, recwarn):

@@ -99,7 +99,7 @@ CASES: dict[str, tuple[Any, ...]] = {
     "start times short": (START, changed(lambda t: t[1:]), "(3,)", "(4)"),
     "mask of another shape": (MASK, replaced(np.zeros((5, 3), np.uint8)), "(5, 3)", "(3, 5)"),
     "mask of everything": (MASK, replaced(np.ones((3, 5), np.uint8)), "every pixel"),
-    "angle unit": (f"{ANGLE} @units", attribute("units", "gon"), "deg, rad"),
+    "angle unit": (f"{ANGLE} @units", attribute("units", "gon"), "deg", "rad"),
     "end angles short": (ANGLE_END, changed(lambda a: a[:2]), "(2,)"),
     "what rotates": (f"{ANGLE} @rotates", attribute("rotates", "room"), "'room'"),
     "readout axis": (AXIS, replaced("diagonal"), "'diagonal'", "'rows'"),

@@ -27,8 +27,8 @@ class RayLayout:
     """Layout of volumes (z, y, x) and of stacks of frames with ``lines`` × ``width`` pixels in device memory.
 
     ``brick`` selects the voxels of the grid that the volume holds. It has a border of zeros, so that the frames of all
-    bricks add up to the frames of the grid. ``subrays`` (along v, along u): lines and width count the rays of pixels. ``axis``:
-    what a line is on the detector; ``is_across``: it is a row although columns are read."""
+    bricks add up to the frames of the grid. ``subrays`` (along v, along u): lines and width count the rays of pixels.
+    ``axis``: what a line is on the detector; ``is_across``: it is a row although columns are read."""
 
     grid: Grid
     lines: int
