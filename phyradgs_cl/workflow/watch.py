@@ -13,6 +13,7 @@ from pathlib import Path
 from phyradgs_cl import checks, signals
 from phyradgs_cl.errors import DeviceError, InputError, OutOfMemoryError, OutputError, PhyradgsError
 from phyradgs_cl.io import checkpoint_path, former_checkpoint_path, only_run, partial_path, written_beside
+from phyradgs_cl.io.hdf5.source import BEING_WRITTEN
 from phyradgs_cl.io.output import beside, make_folder
 from phyradgs_cl.reconstructors import ProgressReport, Reconstruction, RunPlan, ignore_progress
 from phyradgs_cl.runtime import Runtime
@@ -217,7 +218,7 @@ class _Watch:
 
     def _fail(self, arrival: Arrival, error: BaseException) -> bool:
         """Writes the error file with the scan's size and time, so that the scan is tried again when they change."""
-        if not arrival.is_unchanged() or "unable to lock file" in str(error):  # HDF5 locks a file that it writes
+        if not arrival.is_unchanged() or BEING_WRITTEN in str(error):
             return False
         message = str(error) if isinstance(error, PhyradgsError) else f"{type(error).__name__}: {error}"
         text = f"{plain_text(message)}\n\nThe scan is tried again when it changes, or when this file is removed.\n"

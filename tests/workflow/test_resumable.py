@@ -59,9 +59,9 @@ def test_a_stopped_run_goes_on_to_the_same_bits(job, rt, tmp_path) -> None:
 
 def test_a_partial_volume_of_two_halves_has_their_disagreement(job, rt) -> None:
     """Once the second has begun; the whole one has it whatever came in between."""
-    job = replace(job, plan=plan_run("fused", {"voxel_iterations": 2, "iterations": 60}))
+    job = replace(job, plan=plan_run("fused", {"voxel_iterations": 4, "iterations": 60}))
     alone = job.run(rt, Report())
-    for stop_at, is_there in ((1, False), (52, True)):
+    for stop_at, is_there in ((1, False), (54, True)):
         assert not is_complete(job.run(rt, Report(stop_at)))
         assert (read_volume(partial_path(job.output)).disagreement is not None) == is_there, stop_at
         assert is_complete(job.run(rt, Report()))

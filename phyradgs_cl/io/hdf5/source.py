@@ -31,10 +31,11 @@ _KNOWN = frozenset((
 ))
 LINKED = "--linked-folder"
 _UNLOCK = "set HDF5_USE_FILE_LOCKING=FALSE"
+BEING_WRITTEN = "a file that another program has open for writing"
 _REASONS = {  # by words of HDF5's answer: what was found, what helps
     "truncated": ("a truncated HDF5 file", "copy or write it again"),
     "signature not found": ("a file that is not HDF5", "check the path or convert it"),
-    **{f"unable to lock file, errno = {number}": ("a file that another program has open for writing",
+    **{f"unable to lock file, errno = {number}": (BEING_WRITTEN,
        f"close it there, or {_UNLOCK} to read what is in it by now") for number in (errno.EAGAIN, errno.EACCES)},
     "unable to lock file": ("a file system that does not lock files", f"{_UNLOCK} and run the command again"),
     "already open for": ("a file that its writer has not closed", "close it there; after a crash, run 'h5clear -s' on it"),
