@@ -76,7 +76,8 @@ def test_rows_go_on_as_a_volume_has_them(rt, axis) -> None:
     np.testing.assert_array_equal(found[..., count : count + 20], frames)
     assert count >= 10 and np.abs(whole[..., :10]).max() > 0.1
     off = found[..., count - 10 : count + 30] - whole
-    assert np.sqrt(np.mean(off**2)) < 0.02 * np.sqrt(np.mean(whole**2))
+    # a pixel three voxels high is the mean of its rays, where the frames have one in its middle
+    assert np.sqrt(np.mean(off**2)) < 0.03 * np.sqrt(np.mean(whole**2))
     assert not found[..., [0, -1]].any()  # all of the grid is seen
 
 

@@ -141,7 +141,7 @@ def _voxel_bytes(path: Path, reader: Any) -> int | None:
         if is_nifti:
             return file.seek(0, os.SEEK_END) - int(float(reader.GetMetaData("vox_offset")))
     found = _DATA_FILE.search(head)
-    name, start = (found[1].decode("latin-1"), found.end() + 1) if found else ("LOCAL", 0)
+    name, start = (found[1].decode("latin-1"), head.find(b"\n", found.end(1)) + 1) if found else ("LOCAL", 0)
     if name.startswith("LIST") or "%" in name:  # SimpleITK returns undefined voxels where one file is missing
         raise InputError(f"{path} data file", name[:60], "LOCAL or one file name", "write it as one file")
     is_nrrd = _suffix(path) == ".nrrd"
