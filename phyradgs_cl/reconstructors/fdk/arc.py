@@ -70,8 +70,8 @@ def view_arc(angle_rad: np.ndarray, filled_rad: float = 0.0) -> Arc:
         gap = _filled_cells(ahead, wide)
         whole = np.array([[0.0, 2 * np.pi]])
         return Arc((gap / count)[cell], (centre - centre[0])[cell], 2 * np.pi, True, whole, _filled_rad(ahead))
-    first = (int(np.argmax(ahead)) + 1) % ahead.size
-    ahead, wide = np.roll(ahead, -first), np.roll(wide, -first)  # the widest gap is now the last
+    first = (int(np.argmax(np.where(wide, ahead, 0))) + 1) % ahead.size
+    ahead, wide = np.roll(ahead, -first), np.roll(wide, -first)  # the widest gap that stands out is now the last
     forward, back = _steps(ahead, wide)
     progress = np.concatenate([[0.0], np.cumsum(ahead[:-1])]) + back[0] / 2
     parts = np.stack([(progress - back / 2)[np.roll(wide, 1)], (progress + forward / 2)[wide]], -1)
