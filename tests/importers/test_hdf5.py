@@ -254,7 +254,8 @@ def test_a_missing_filter_is_named(tmp_path) -> None:
 
 
 def test_scales_and_axes_of_stacks(tmp_path, caplog) -> None:
-    tifffile = pytest.importorskip("tifffile")
+    import tifffile
+
     values, path = np.ones((3, 4, 5), np.float32), tmp_path / "v.tif"
     about = {"spacing": 2.0, "axes": "ZYX"}
     for unit, voxel_mm in (("micron", 0.001), ("\\u00B5m", 0.001), ("cm", 10.0)):
