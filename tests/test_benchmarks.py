@@ -41,6 +41,18 @@ def test_the_demo(tmp_path) -> None:
     assert (tmp_path / "demo.png").read_bytes().startswith(b"\x89PNG")
 
 
+def test_volumes_before_and_after(tmp_path) -> None:
+    """The same code has the same bits; a volume that was another before is named with its size."""
+    kept = tmp_path / "before.npz"
+    run("identity.py", str(kept), "fdk")
+    assert "2 of 2 volumes have the same bits" in run("identity.py", str(kept), "fdk")
+    before = dict(np.load(kept))
+    np.savez(kept, **{**before, "fdk, static": before["fdk, static"] * 1.25})
+    words = [sys.executable, str(FOLDER / "identity.py"), str(kept), "fdk"]
+    done = subprocess.run(words, env={**os.environ, "PYTHONPATH": str(FOLDER.parent)}, capture_output=True, text=True)
+    assert done.returncode == 1 and "fdk, static: 2.0e-01" in done.stdout
+
+
 def test_iteration(tmp_path) -> None:
     facts = facts_of(tmp_path, "iteration.py")
     stages = ("prepare", "binning", "forward", "loss", "backward", "tv", "adam", "gaps")
