@@ -131,7 +131,7 @@ def save_volume(
 def simulate(
     phantom: str | Path = "foot", *, scanner: str = "r2", protocol: str = "rapid", size: int = 64,
     detector: int | None = None, detector_offset_mm: tuple[float, float] | None = None,
-    truncation: float = 0.0, pixel_samples: int = 1, device: Device = None, **options: Any,
+    truncation: float = 0.0, pixel_samples: int = 0, device: Device = None, **options: Any,
 ) -> Scan:
     """Simulates a fly-scan of a phantom, or a stop-and-shoot scan with ``protocol="static"``; its truth is the reference.
 
@@ -139,9 +139,9 @@ def simulate(
     scanner: a name, or a TOML file. protocol: "rapid", "standard" or "static".
     size: number of voxels along the longest side of grid and reference. detector: number of columns; rows in proportion.
     detector_offset_mm: position of the panel's centre (v, u). truncation: the fraction of the columns that is cut off, half
-    of it at each side. pixel_samples: number of rays along each side of a pixel. device: what ``--device`` takes, or a
-    Runtime. options: those of ``phyradgs simulate`` with underscores (views, exposure_deg, readout_ratio, start_deg, pulse,
-    readout_axis, noise, dose, detector_model, peak, lag, jitter_deg, seed …).
+    of it at each side. pixel_samples: number of rays along each side of a pixel; 0: by the voxels. device: what
+    ``--device`` takes, or a Runtime. options: those of ``phyradgs simulate`` with underscores (views, exposure_deg,
+    readout_ratio, start_deg, pulse, readout_axis, noise, dose, detector_model, peak, lag, jitter_deg, seed …).
     motion_of_object: an ``ObjectMotion``, or the path of its TOML file; the scan then has ``moving_truth``, true states.
 
     Raises InputError for unknown names and for values out of range."""

@@ -16,6 +16,8 @@ _DEVIATIONS = 12.0
 _LEAST_CHANGE = 0.75  # of the usual mean line integral
 _FEWEST = 5
 _REPEATED = 0.15  # of the usual difference between neighbours
+_JUMP = 2.5  # steps of the order over steps of the angles sorted
+_UNLIKE = 2.0  # the difference from the view beside in angle over the usual one
 _OUTLIER = 4.0  # a frame's residual over the usual one
 _MOST_OUTLIERS = 0.2  # of the frames
 _EXCHANGED = 0.5  # squared residual after an exchange of two frames over the stated one
@@ -43,13 +45,27 @@ def odd_frames(p: np.ndarray, mask: np.ndarray | None) -> list[int]:
 
 def repeated_frames(scan: Scan) -> list[int]:
     """Returns frames that repeat their predecessor although the gantry has turned: they differ from it far less than
-    neighbours do."""
+    neighbours do. In an order that jumps, as the golden one, they are also unlike the view beside them in angle: views of a
+    round object from far apart may be alike as well."""
     p = scan.projections
     if len(p) < _FEWEST:
         return []
-    steps = np.array([float(np.square(b - a, dtype=np.float64).mean()) ** 0.5 for a, b in zip(p[:-1], p[1:], strict=True)])
-    has_turned = np.abs(wrapped(np.diff(start_azimuths_rad(scan)))) > 1e-6
-    return [int(f) + 1 for f in np.flatnonzero(has_turned & (steps < _REPEATED * np.min(_neighbours(steps), axis=0)))]
+    steps = np.array([_rms(b - a) for a, b in zip(p[:-1], p[1:], strict=True)])
+    azimuths_rad = start_azimuths_rad(scan)
+    turned_rad = np.abs(wrapped(np.diff(azimuths_rad)))
+    alike = np.flatnonzero((turned_rad > 1e-6) & (steps < _REPEATED * np.min(_neighbours(steps), axis=0)))
+    order = np.argsort(azimuths_rad % (2 * np.pi))
+    beside = np.empty(len(p), int)
+    beside[order] = np.roll(order, -1)
+    jumps = np.median(turned_rad) > _JUMP * np.median(np.abs(wrapped(azimuths_rad[beside] - azimuths_rad)))
+    if alike.size and jumps:
+        from_beside = np.array([_rms(p[g] - frame) for frame, g in zip(p, beside, strict=True)])
+        alike = alike[from_beside[alike + 1] > _UNLIKE * np.median(from_beside)]
+    return [int(f) + 1 for f in alike]
+
+
+def _rms(image: np.ndarray) -> float:
+    return float(np.square(image, dtype=np.float64).mean()) ** 0.5
 
 
 def _neighbours(values: np.ndarray) -> np.ndarray:

@@ -83,7 +83,7 @@ def simulate_command(
     detector: Annotated[int | None, option("Detector columns, rows in proportion; same size.", "scanner's")] = None,
     detector_offset: Annotated[Any, lengths("--detector-offset", DETECTOR_OFFSET, "scanner's")] = None,
     size: Annotated[int | None, option("Voxels along the longest side of the truth.", "scanner's or the file's")] = None,
-    pixel_samples: Annotated[int, option("Rays along each side of a pixel; 1: its centre.")] = 1,
+    pixel_samples: Annotated[int, option("Rays along each side of a pixel; 1: its centre; 0: by the voxels.")] = 0,
     time_samples: Annotated[int, option("Times of a line's exposure; 0: by the motion.")] = 0,
     seed: Annotated[int, option("Seed of phantom, noise and jitter.")] = 0,
     device: Device = None,

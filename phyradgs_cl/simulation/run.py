@@ -29,13 +29,13 @@ log = logging.getLogger(__name__)
 
 def simulated_scan(
     rt: Runtime, of: str | Volume | EllipsoidPhantom | MovingPhantom, scanner: Scanner, options: SimulationOptions, *,
-    size: int | None = None, pixel_samples: int = 1, name: str = "volume",
+    size: int | None = None, pixel_samples: int = 0, name: str = "volume",
     report: Callable[[int, int], None] = lambda done, total: None
 ) -> Scan:
     """Returns a scanner's scan of a phantom, given by name or as an object, or of a volume; the truth is its reference.
 
     name: of the volume. size: voxels along the longest side of grid and reference; None takes the scanner's or the volume's.
-    pixel_samples: rays along each side of a pixel. Warns of an inverse crime."""
+    pixel_samples: rays along each side of a pixel; 0: by the voxels of the truth. Warns of an inverse crime."""
     if size is not None:
         checks.within("--size", size, 1 if isinstance(of, Volume) else _SMALLEST_PHANTOM, _LARGEST_GRID)
     where, axis = (scanner.geometry, scanner.grid), options.readout_axis
@@ -58,7 +58,7 @@ def simulated_scan(
     )  # fmt: skip
     added = [name for name in ("rings", "sparks", "drift", "scatter", "kvp") if getattr(options, name)]
     stated = {key: getattr(options, key) for key in ("seed", "noise", "dose", "electronic_noise", *added)}
-    facts = {"program": f"phyradgs-cl {__version__}", "simulated": scene.title, "pixel_samples": pixel_samples}
+    facts = {"program": f"phyradgs-cl {__version__}", "simulated": scene.title, "pixel_samples": scene.source.pixel_samples}
     scan.provenance.update(facts | stated)
     if scene.state is None or (motion is None and scene.period_s is None):
         return scan

@@ -53,12 +53,12 @@ class Scene:
 
 def phantom_scene(
     rt: Runtime, of: str | EllipsoidPhantom | MovingPhantom, geometry: Geometry, box: Grid, size: int, axis: str,
-    seed: int, pixel_samples: int = 1, moves: Moves | None = None
+    seed: int, pixel_samples: int = 0, moves: Moves | None = None
 ) -> Scene:
     """Returns the scene of a phantom, or of one by its name, in the scanner's box, with ``size`` voxels per side.
 
     Closed forms are integrated exactly unless they deform. Other phantoms are projected at twice ``size``, and the truth is
-    their block mean. Pixels average ``pixel_samples``² rays over their area."""
+    their block mean. Pixels average ``pixel_samples``² rays over their area; 0: by the voxels of the truth."""
     half_size_mm = min(box.size_mm) / 2
     phantom = make_phantom(of, half_size_mm, 2 * size, seed) if isinstance(of, str) else of
     if isinstance(phantom, MovingPhantom):
@@ -69,7 +69,7 @@ def phantom_scene(
         grid, title = _resized(box, size), f"phantom {phantom.name}"
         deformation = None if moves is None else moves(grid)
         if deformation is None or deformation.is_still:
-            source = on_panel(geometry, pixel_samples, lambda panel: AnalyticSource(phantom, panel))
+            source = on_panel(geometry, grid, pixel_samples, lambda panel: AnalyticSource(phantom, panel))
             truth = phantom.voxelise(grid, 4)
             return Scene(source, grid, truth, title, deformation=deformation, state=lambda time_s: truth)
         return _voxel_scene(rt, phantom.voxelise(grid.finer(2), 4), grid.finer(2), grid, title, deformation, geometry, axis,
@@ -90,14 +90,14 @@ def _moving_scene(phantom: MovingPhantom, grid: Grid, geometry: Geometry, pixel_
     def state(time_s: float) -> np.ndarray:
         return phantom.at(time_s).voxelise(grid, 4)
 
-    source = on_panel(geometry, pixel_samples, lambda panel: AnalyticSource(phantom, panel))
+    source = on_panel(geometry, grid, pixel_samples, lambda panel: AnalyticSource(phantom, panel))
     truth, title, fastest = state(0.0), f"phantom {phantom.name}", phantom.fastest_mm_per_s
     return Scene(source, grid, truth, title, state=state, period_s=phantom.period_s, fastest_mm_per_s=fastest)
 
 
 def volume_scene(
     rt: Runtime, loaded: Volume, name: str, geometry: Geometry, box: Grid, size: int | None, axis: str,
-    pixel_samples: int = 1, moves: Moves | None = None
+    pixel_samples: int = 0, moves: Moves | None = None
 ) -> Scene:
     """Returns the scene of a volume, called ``name``, at its own resolution with ``pixel_samples``² rays per pixel.
 
@@ -121,7 +121,7 @@ def _voxel_scene(
     """Returns the scene of a volume (z, y, x) on ``fine``, with its block means on ``grid`` as the truth."""
 
     def source_of(values: np.ndarray) -> FrameSource:
-        return on_panel(geometry, pixel_samples, lambda panel: on_one_panel(values, panel))
+        return on_panel(geometry, grid, pixel_samples, lambda panel: on_one_panel(values, panel))
 
     def on_one_panel(values: np.ndarray, panel: Geometry) -> FrameSource:
         memory = RayMemory(rt, RayLayout.of_scan(rt, fine, panel.detector_shape, axis), 1)

@@ -1,6 +1,7 @@
 """Sources of frames: voxel volumes at rest or deforming, and phantoms in closed form, projected from the poses of a
 frame's time cells. Of an object that moves every line sees it at the times at which the line is open."""
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
@@ -20,11 +21,15 @@ from phyradgs_cl.operators.warp.volume import VolumeWarp
 from phyradgs_cl.phantoms import EllipsoidPhantom, MovingPhantom
 from phyradgs_cl.runtime import DeviceArray, MemoryShortage, Runtime
 
+WIDEST_RAY = 1.5  # voxels to a pixel; the usual scanner has 1.43 where voxels are as many as pixels
+_MOST_SAMPLES = 32
 NEAREST = 0.1  # of a voxel to be reconstructed: the largest distance of matter from its place
 
 
 class FrameSource(ABC):
     """An object that can be projected to the frame of a cell table, attenuation multiplied by ``factor``."""
+
+    pixel_samples = 1  # rays along each side of a pixel
 
     @abstractmethod
     def frame(self, cells: TimeCells, model: str, factor: float) -> np.ndarray: ...
@@ -93,6 +98,7 @@ class PixelAreaSource(FrameSource):
 
     def __init__(self, finer: FrameSource, samples: int) -> None:
         self._finer, self._samples = finer, samples
+        self.pixel_samples = samples
 
     def frame(self, cells: TimeCells, model: str, factor: float) -> np.ndarray:
         return self._averaged(self._finer.frame(cells.finer(self._samples, self._samples), model, factor), model)
@@ -115,9 +121,15 @@ def line_groups(cells: TimeCells) -> Iterator[tuple[int, int, np.ndarray]]:
         yield int(start), int(stop), np.flatnonzero((ranges == (start, stop)).all(axis=1))
 
 
-def on_panel(geometry: Geometry, pixel_samples: int, make: Callable[[Geometry], FrameSource]) -> FrameSource:
-    """Makes a source for the panel; with several samples per pixel for a finer panel, averaged over its pixels."""
-    checks.within("--pixel-samples", pixel_samples, 1, 32)
+def on_panel(geometry: Geometry, grid: Grid, pixel_samples: int, make: Callable[[Geometry], FrameSource]) -> FrameSource:
+    """Makes a source for the panel; with several samples per pixel for a finer panel, averaged over its pixels.
+
+    pixel_samples: 0 takes one where a pixel, at the axis, has at most ``WIDEST_RAY`` voxels of the grid, and otherwise one
+    for every voxel: rays through the middles of wide pixels alone would miss parts of the truth."""
+    checks.within("--pixel-samples", pixel_samples, 0, _MOST_SAMPLES)
+    if pixel_samples == 0:
+        voxels = max(geometry.pixel_size_mm) / geometry.magnification / min(grid.voxel_size_mm)
+        pixel_samples = 1 if voxels <= WIDEST_RAY else min(math.ceil(voxels - 1e-6), _MOST_SAMPLES)
     if pixel_samples == 1:
         return make(geometry)
     return PixelAreaSource(make(geometry.finer(pixel_samples)), pixel_samples)

@@ -18,6 +18,7 @@ from phyradgs_cl.acquisition import MicroViews, Scan
 from phyradgs_cl.acquisition.geometry import cuts
 from phyradgs_cl.errors import InputError, OutputError, PhyradgsError, naming_host_memory
 from phyradgs_cl.io import (
+    Volume,
     hashing,
     only_run,
     partial_path,
@@ -27,7 +28,7 @@ from phyradgs_cl.io import (
     write_volume,
 )
 from phyradgs_cl.io.output import checkpoint_path, former_checkpoint_path, refuse_overwriting
-from phyradgs_cl.metrics import VOXEL_BY_VOXEL, aligned, compare
+from phyradgs_cl.metrics import METRICS, VOXEL_BY_VOXEL, aligned, compare
 from phyradgs_cl.parallel import Communicator
 from phyradgs_cl.reconstructors.result import COMPARED, HELD_OUT
 from phyradgs_cl.reconstructors.run import check_resumable
@@ -35,6 +36,7 @@ from phyradgs_cl.runtime import Runtime, profile_text
 from phyradgs_cl.text import plain_text
 from phyradgs_cl.workflow.files import check_output, expecting, load_scan
 from phyradgs_cl.workflow.slabs import Slabs, reconstruct_slabs, remove_slabs, surely_fits
+from phyradgs_cl.workflow.volumes import compared_states
 
 log = logging.getLogger(__name__)
 _SETTLED = 5  # iterations from which on a residual says something: it begins with 1
@@ -186,7 +188,8 @@ def _reconstructed(
 
 def _metrics(scan: Scan, result: methods.Reconstruction) -> dict[str, float]:
     """Returns the metrics against the scan's reference, by the rule of ``metrics.aligned``, and those on held-out pixels.
-    The latter leave the result's facts. These get the way of comparison, if it is not voxel by voxel."""
+    The latter leave the result's facts. These get the way of comparison, if it is not voxel by voxel. A result that moves or
+    changes has the means over the true states: the place of its own reference is free."""
     held_out = result.facts.pop(HELD_OUT, {})
     if scan.reference is None:
         return held_out
@@ -194,6 +197,11 @@ def _metrics(scan: Scan, result: methods.Reconstruction) -> dict[str, float]:
     if pair is None or not pair.reference.max() > 0:
         log.warning("no PSNR: nothing of the scan's reference lies in the volume's box")
         return held_out
+    if scan.moving_truth is not None and result.moves is not None:
+        moving = Volume(result.volume, result.grid, deformation=result.deformation, states=result.states)
+        facts: dict[str, Any] = compared_states(moving, scan.moving_truth, scan.grid)
+        result.facts[COMPARED] = f"mean of {len(facts['states'])} states"
+        return {**{name: facts[f"mean_{name}"] for name in METRICS}, **held_out}
     if pair.how != VOXEL_BY_VOXEL:
         result.facts[COMPARED] = pair.how
     return {**compare(pair.volume, pair.reference), **held_out}

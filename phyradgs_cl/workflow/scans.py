@@ -35,7 +35,7 @@ class SimulationJob:
     volume: Path | None = None
     scanner: str = "r2"
     size: int | None = None
-    pixel_samples: int = 1
+    pixel_samples: int = 0
     motion_of_object: Path | None = None
 
 

@@ -6,12 +6,15 @@ import numpy as np
 import pytest
 from check_kit import cropped, some_frames
 
-from phyradgs_cl.acquisition import CircularOrbit, EncoderTable, FrameSweeps, PoseTable, Saturation
+from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, EncoderTable, FrameSweeps, PoseTable, Saturation, pixel_centres
 from phyradgs_cl.acquisition.altered.angles import exposure_arc_rad
+from phyradgs_cl.api import static_scan
 from phyradgs_cl.check import OK, SUSPICIOUS, CountReader
 from phyradgs_cl.check.coverage import check_coverage
 from phyradgs_cl.check.detector import check_dead_pixels, check_saturation
+from phyradgs_cl.check.odd_frames import repeated_frames
 from phyradgs_cl.check.timing import check_angles, check_timing
+from phyradgs_cl.phantoms import Ellipsoid, EllipsoidPhantom
 
 
 def test_a_clean_scan_is_left_in_peace(clean) -> None:
@@ -33,6 +36,20 @@ def test_frames_must_follow_each_other(clean) -> None:
     start_s = clean.frame_start_s.copy()
     start_s[3] = start_s[2]
     assert check_timing(replace(clean, frame_start_s=start_s)).verdict == SUSPICIOUS
+
+
+def test_views_of_a_round_object_in_golden_order_are_not_repeated_ones() -> None:
+    """Some are alike as no neighbours are, but a frame that was recorded twice differs by noise, or not at all."""
+    geometry, angles_deg = ConeGeometry(100.0, 150.0, (12, 20), 1.0), 137.50776405 * np.arange(60)
+    balls = (Ellipsoid((0.0, 0.0, 0.0), (5.0,) * 3, 0.02), Ellipsoid((1.5, 0.7, 0.4), (1.2,) * 3, 0.01))
+    pixels = pixel_centres(poses := geometry.pose(np.deg2rad(angles_deg)), geometry.detector_shape)
+    sources = np.broadcast_to(poses[:, None, None, :3], pixels.shape)
+    frames = EllipsoidPhantom(balls, "two balls").line_integrals(sources, pixels).astype(np.float32)
+    for noise in (0.0, 1e-4, 1e-3):
+        seen = frames + np.random.default_rng(5).normal(0, noise, frames.shape).astype(np.float32)
+        assert repeated_frames(static_scan(seen, geometry, angles_deg)) == []
+        seen[31] = frames[30] + np.random.default_rng(6).normal(0, noise, frames[30].shape)
+        assert noise == 1e-3 or repeated_frames(static_scan(seen, geometry, angles_deg)) == [31]  # lost in noise
 
 
 def test_speed_within_frames_fits_the_steps_between_them_but_for_wandering(clean) -> None:

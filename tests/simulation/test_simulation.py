@@ -194,6 +194,16 @@ def test_a_box_that_a_procedural_phantom_does_not_fill_is_said(rt, caplog) -> No
     assert cube.grid == Grid.cube(8, 2.0)
 
 
+def test_wide_pixels_average_by_themselves(rt) -> None:
+    """Rays through the middles of pixels alone would miss the voxels between them."""
+    panel = ParallelGeometry((6, 6), 2.0)
+    for voxels, samples in ((6, 1), (9, 1), (10, 2), (18, 3), (30, 5)):
+        scene = phantom_scene(rt, "shepp-logan", panel, Grid.cube(6, 2.0), voxels, "rows", 0)
+        assert scene.source.pixel_samples == samples
+    magnified = replace(GEOMETRY, pixel_size_mm=(2.0 * GEOMETRY.magnification,) * 2)
+    assert phantom_scene(rt, "shepp-logan", magnified, Grid.cube(6, 2.0), 18, "rows", 0).source.pixel_samples == 3
+
+
 @pytest.mark.parametrize("model", ["log", "intensity"])
 @pytest.mark.parametrize("axis", ["rows", "columns"])
 def test_pixels_with_an_area_average_over_it(rt, axis, model) -> None:
@@ -218,6 +228,6 @@ def test_pixels_with_an_area_average_over_it(rt, axis, model) -> None:
     frame = scan.projections[1]
     found = frame[line] if axis == "rows" else frame[:, line]
     np.testing.assert_allclose(found, expected, rtol=0, atol=ANALYTIC_FRAME * 6)
-    points = phantom_scene(rt, "shepp-logan", GEOMETRY, GRID, 16, axis, 0)
+    points = phantom_scene(rt, "shepp-logan", GEOMETRY, GRID, 16, axis, 0, pixel_samples=1)
     other = simulate(points.source, GEOMETRY, GRID, options).projections[1]
     assert np.abs(other - frame).max() > 0.1

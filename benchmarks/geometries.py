@@ -1,0 +1,296 @@
+"""The density of a ball in every kind of geometry, by every kind of method: right, doubted by a warning, or wrong in silence.
+
+    python benchmarks/geometries.py [--quick] [--case WORD] [--method NAME] [--json FILE] [--table FILE.md]
+
+A ball of 0.02 per mm in closed form, seen through the middles of pixels, off the axis where the field of view allows.
+A cell of the table is the mean of the voxels within 0.6 of its radius, over 0.02; `w` marks a warning, of the scan or the
+run. Ends with 1 where a cell without a warning is off by more than 2 %."""
+
+import argparse
+import json
+import logging
+import sys
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+
+from phyradgs_cl.acquisition import PoseTable, Scan
+from phyradgs_cl.api import ConeGeometry, Grid, InputError, ParallelGeometry, Shutter, fly_scan, reconstruct, static_scan
+from phyradgs_cl.phantoms import Ellipsoid, EllipsoidPhantom
+
+DENSITY_PER_MM = 0.02
+LIMIT = 0.02
+SWEEPS = 5  # times of a line's exposure
+METHODS: dict[str, dict[str, object]] = {
+    "fista": {"iterations": 14},
+    "fista-tv": {"iterations": 25},
+    "sirt": {"iterations": 60},
+    "os-sart": {"iterations": 8},
+    "cgls": {"iterations": 10},
+    "asd-pocs": {"iterations": 12},
+    "fdk": {},
+    "phyradgs": {"iterations": 300},
+}
+OF_FLY_SCANS = ("fista", "sirt", "fdk", "phyradgs")
+
+
+@dataclass(frozen=True)
+class Case:
+    """One geometry. Lengths in mm at unit 1; the grid is ``voxels`` of ``voxel_mm``, or None for the scan's own.
+
+    exposure_deg: the arc of a line's exposure in a fly-scan, whose readout takes as long; 0 for a scanner at rest.
+    feed_mm: along z per turn. turned: rotates a panel's steps (u, v) in space. unit: mm per unit of length."""
+
+    name: str
+    rows: int = 24
+    columns: int = 24
+    pitch_mm: tuple[float, float] = (1.5, 1.5)
+    offset: float = 0.0  # of the panel's width
+    angles_deg: np.ndarray = field(default_factory=lambda: np.arange(48) * 7.5)
+    voxel_mm: tuple[float, float, float] | None = (1.0, 1.0, 1.0)
+    voxels: tuple[int, int, int] = (20, 20, 20)
+    is_parallel: bool = False
+    exposure_deg: float = 0.0
+    feed_mm: float = 0.0
+    tilt_deg: float = 0.0
+    roll_deg: float = 0.0
+    unit: float = 1.0
+    radius_mm: float = 7.0
+    centre_mm: tuple[float, float, float] = (0.6, -0.8, 0.3)
+
+    @property
+    def has_poses(self) -> bool:
+        """Whether only a table of poses can describe it."""
+        return bool(self.feed_mm or self.tilt_deg or self.roll_deg)
+
+    def geometry(self) -> ConeGeometry | ParallelGeometry:
+        shape, sizes = (self.rows, self.columns), np.array(self.pitch_mm) * self.unit / (1.5 if self.is_parallel else 1)
+        pitch = (float(sizes[0]), float(sizes[1]))
+        offset = 0.0, self.offset * self.columns * pitch[1]
+        if self.is_parallel:
+            return ParallelGeometry(shape, pitch, offset)
+        return ConeGeometry(150.0 * self.unit, 225.0 * self.unit, shape, pitch, offset)
+
+    def poses(self, angles_deg: np.ndarray) -> np.ndarray:
+        """Returns poses (..., 12) at these angles (...), travel and tilt included."""
+        poses = self.geometry().pose(np.deg2rad(angles_deg))
+        if self.tilt_deg or self.roll_deg:
+            # the panel turns about its middle: roll in its plane, tilt about its rows
+            half_u, half_v = (self.columns - 1) / 2, (self.rows - 1) / 2
+            middle = poses[..., 3:6] + half_u * poses[..., 6:9] + half_v * poses[..., 9:12]
+            u, v = poses[..., 6:9].copy(), poses[..., 9:12].copy()
+            du, dv = (np.linalg.norm(one, axis=-1, keepdims=True) for one in (u, v))
+            c, s = np.cos(np.deg2rad(self.roll_deg)), np.sin(np.deg2rad(self.roll_deg))
+            u, v = c * u / du + s * v / dv, c * v / dv - s * u / du
+            normal = np.cross(u, v)
+            v = np.cos(np.deg2rad(self.tilt_deg)) * v + np.sin(np.deg2rad(self.tilt_deg)) * normal
+            poses[..., 6:9], poses[..., 9:12] = u * du, v * dv
+            poses[..., 3:6] = middle - half_u * poses[..., 6:9] - half_v * poses[..., 9:12]
+        turns = (np.asarray(angles_deg) - self.angles_deg.mean()) / 360.0
+        travel = self.feed_mm * self.unit * turns
+        poses[..., 5] += travel
+        if not self.is_parallel:
+            poses[..., 2] += travel
+        return poses
+
+    def phantom(self) -> EllipsoidPhantom:
+        centre, radius = np.array(self.centre_mm) * self.unit, self.radius_mm * self.unit
+        ball = Ellipsoid(tuple(centre.tolist()), (radius,) * 3, DENSITY_PER_MM / self.unit)
+        return EllipsoidPhantom((ball,), "ball")
+
+    def frames(self) -> np.ndarray:
+        """Returns line integrals (F, rows, columns) of the ball: of a fly-scan at the times of each row's exposure."""
+        opens = np.arange(self.rows) / self.rows if self.exposure_deg else np.zeros(self.rows)
+        within = (np.arange(SWEEPS) + 0.5) / SWEEPS if self.exposure_deg else np.zeros(1)
+        sense = np.sign(np.gradient(np.unwrap(self.angles_deg, period=360.0)))
+        frames = np.zeros((len(self.angles_deg), self.rows, self.columns))
+        columns, rows = np.arange(self.columns)[:, None], np.arange(self.rows)[:, None, None]
+        for when in within:
+            arc_deg = sense[:, None] * self.exposure_deg * (opens + when)
+            pose = self.poses(self.angles_deg[:, None] + arc_deg)[:, :, None]
+            targets = pose[..., 3:6] + columns * pose[..., 6:9] + rows * pose[..., 9:12]
+            sources = np.broadcast_to(pose[..., :3], targets.shape)
+            if self.is_parallel:
+                along = 100.0 * self.unit * pose[..., :3]
+                sources, targets = targets - along, targets + along
+            frames += self.phantom().line_integrals(sources, targets) / len(within)
+        return frames.astype(np.float32)
+
+    def grid(self) -> Grid | None:
+        if self.voxel_mm is None:
+            return None
+        z, y, x = (side * self.unit for side in self.voxel_mm)
+        return Grid(self.voxels, (z, y, x))
+
+    def scan(self) -> Scan:
+        frames, grid = self.frames(), self.grid()
+        if not self.has_poses:
+            if not self.exposure_deg:
+                return static_scan(frames, self.geometry(), self.angles_deg, grid=grid)
+            arc = self.exposure_deg * (1 if np.diff(np.unwrap(self.angles_deg, period=360.0))[0] > 0 else -1)
+            ratio = (self.rows - 1) / self.rows
+            return fly_scan(frames, self.geometry(), self.angles_deg, exposure_deg=arc, readout_ratio=ratio, grid=grid)
+        if not self.exposure_deg:
+            return Scan.from_poses(frames, self.poses(self.angles_deg), grid, is_parallel=self.is_parallel)
+        # a second of exposure, and as long a readout: the table goes on for two seconds after each frame's start
+        step_deg = self.exposure_deg
+        start_s = (self.angles_deg - self.angles_deg[0]) / step_deg
+        time_s = np.arange(0, start_s[-1] + 2.1, 0.05)
+        table = PoseTable(time_s, self.poses(self.angles_deg[0] + step_deg * time_s), is_parallel=self.is_parallel)
+        still = Scan.from_poses(frames, self.poses(self.angles_deg), grid, is_parallel=self.is_parallel)
+        shutter = Shutter(1.0, (self.rows - 1) / self.rows, "rows", 1)
+        return replace(still, trajectory=table, shutter=shutter, frame_start_s=start_s, is_fly=True)
+
+
+def cases() -> Iterator[Case]:
+    """Yields the geometries, kind by kind."""
+    turn = np.arange(48) * 7.5
+    for parallel in (False, True):
+        beam = "parallel" if parallel else "cone"
+        for ratio in (0.3, 0.5, 2.0, 4.0):
+            rows = max(round(24 / ratio), 6)
+            yield Case(f"{beam}, rows {ratio:g} × columns apart", rows, 24, (1.5 * ratio, 1.5), is_parallel=parallel)
+            yield Case(f"{beam}, rows {ratio:g} ×, own grid", rows, 24, (1.5 * ratio, 1.5), voxel_mm=None, is_parallel=parallel)
+        for ratio in (0.25, 0.5, 1.5, 2.0, 2.5, 3.0, 4.0):
+            count = round(20 * ratio)
+            if count < 8:  # voxels of 4 mm: a larger ball, in a larger panel
+                yield Case(f"{beam}, pixel {ratio:g} voxels", 48, 48, voxel_mm=(4.0,) * 3, voxels=(12,) * 3, radius_mm=15.0,
+                           is_parallel=parallel)  # fmt: skip
+                continue
+            yield Case(f"{beam}, pixel {ratio:g} voxels", voxel_mm=(20.0 / count,) * 3, voxels=(count,) * 3, is_parallel=parallel)
+        for offset in (0.1, 0.25, 0.4, 0.45, 0.49):
+            yield Case(f"{beam}, panel {offset:g} beside", 24, 28, offset=offset, is_parallel=parallel)
+        for name, angles in {
+            "a view lost": np.delete(turn, [20]),
+            "two views lost": np.delete(turn, [20, 21]),
+            "ends early": np.arange(47) * 7.5,
+            "short, 240°": np.arange(48) * 5.0,
+            "two gaps": np.delete(turn, [5, 6, 30, 31, 32]),
+            "12 views": np.arange(12) * 30.0,
+            "clockwise": -turn,
+            "jumps by a turn": np.where(turn > 180, turn - 360, turn),
+        }.items():
+            yield Case(f"{beam}, {name}", angles_deg=angles, is_parallel=parallel)
+            if name != "short, 240°" and name != "12 views":
+                yield Case(f"{beam}, {name}, panel 0.4 beside", 24, 28, offset=0.4, angles_deg=angles, is_parallel=parallel)
+        for unit in (1e-3, 1e3, 1e6):
+            yield Case(f"{beam}, unit {unit:g} mm", unit=unit, is_parallel=parallel)
+        yield Case(f"{beam}, one row", 1, 24, voxel_mm=(1.0,) * 3, voxels=(1, 20, 20), centre_mm=(0.6, -0.8, 0.0), is_parallel=parallel)
+        for feed, turns in ((6.0, 3), (10.0, 3)):
+            angles = np.arange(48 * turns) * 7.5
+            yield Case(f"{beam}, helix of {feed:g} mm a turn", angles_deg=angles, feed_mm=feed, is_parallel=parallel)
+        yield Case(f"{beam}, tilted by 3°, rolled by 2°", tilt_deg=3.0, roll_deg=2.0, is_parallel=parallel)
+        arcs = dict(exposure_deg=5.0, is_parallel=parallel)
+        yield Case(f"{beam}, fly-scan", **arcs)
+        yield Case(f"{beam}, fly-scan, clockwise", angles_deg=-turn, **arcs)
+        yield Case(f"{beam}, fly-scan, swings back", angles_deg=np.r_[turn, turn[::-1] + 5.0], **arcs)
+        yield Case(f"{beam}, fly-scan, jumps by a turn", angles_deg=np.where(turn > 180, turn - 360, turn), **arcs)
+        yield Case(f"{beam}, fly-scan, panel 0.4 beside", 24, 28, offset=0.4, **arcs)
+        yield Case(f"{beam}, fly-scan, two views lost, panel 0.4 beside", 24, 28, offset=0.4, angles_deg=np.delete(turn, [20, 21]), **arcs)
+        yield Case(f"{beam}, fly-scan, pixel 3 voxels", voxel_mm=(1 / 3,) * 3, voxels=(60,) * 3, **arcs)
+        yield Case(f"{beam}, fly-scan, rows 2 × columns apart", 12, 24, (3.0, 1.5), **arcs)
+        yield Case(f"{beam}, fly-scan, helix", angles_deg=np.arange(144) * 7.5, feed_mm=6.0, **arcs)
+        yield Case(f"{beam}, fly-scan, tilted by 3°, rolled by 2°", tilt_deg=3.0, roll_deg=2.0, **arcs)
+        yield Case(f"{beam}, fly-scan, unit 1e+06 mm", unit=1e6, **arcs)
+
+
+class Heard(logging.Handler):
+    """Keeps the warnings."""
+
+    def __init__(self) -> None:
+        super().__init__(logging.WARNING)
+        self.lines: list[str] = []
+
+    def emit(self, record: logging.LogRecord) -> None:
+        self.lines.append(record.getMessage())
+
+
+def listened(work: Callable[[], object]) -> tuple[object, list[str]]:
+    """Returns what the work returns, or the InputError that it raises, and its warnings."""
+    heard = Heard()
+    logger = logging.getLogger("phyradgs_cl")
+    logger.addHandler(heard)
+    try:
+        return work(), heard.lines
+    except InputError as error:
+        return error, heard.lines
+    finally:
+        logger.removeHandler(heard)
+
+
+def density(case: Case, volume: np.ndarray, grid: Grid) -> float:
+    """Returns the mean within 0.6 of the ball's radius over the ball's own density."""
+    z, y, x = np.meshgrid(*grid.axes_mm(), indexing="ij")
+    centre = np.array(case.centre_mm) * case.unit
+    distance = np.sqrt((x - centre[0]) ** 2 + (y - centre[1]) ** 2 + (z - centre[2]) ** 2)
+    return float(volume[distance < 0.6 * case.radius_mm * case.unit].mean() * case.unit / DENSITY_PER_MM)
+
+
+def measured(case: Case, method: str) -> dict[str, object]:
+    """Returns the density over the right one, or the refusal, and the warnings of scan and run."""
+    scan, of_scan = listened(case.scan)
+    if isinstance(scan, InputError):
+        return {"case": case.name, "method": method, "refused": str(scan), "warnings": of_scan}
+    assert isinstance(scan, Scan)
+    named = "fbp" if method == "fdk" and case.is_parallel and not case.has_poses else method
+    motion = {"motion": "per-row"} if case.exposure_deg and method not in ("phyradgs",) else {}
+    result, of_run = listened(lambda: reconstruct(scan, named, report=False, **motion, **METHODS[method]))
+    row: dict[str, object] = {"case": case.name, "method": method, "warnings": of_scan + of_run}
+    if isinstance(result, InputError):
+        return {**row, "refused": str(result)}
+    return {**row, "density": density(case, result.volume, result.grid)}  # type: ignore[attr-defined]
+
+
+def is_wrong(row: dict[str, object]) -> bool:
+    """Whether the density is off by more than the limit, without a word."""
+    return "density" in row and abs(float(row["density"]) - 1) > LIMIT and not row["warnings"]  # type: ignore[arg-type]
+
+
+def table(rows: list[dict[str, object]]) -> str:
+    """Returns the matrix in Markdown, a line for each geometry."""
+    methods = [name for name in METHODS if any(row["method"] == name for row in rows)]
+    lines = ["| geometry | " + " | ".join(methods) + " |", "| --- |" + " --- |" * len(methods)]
+    for case in dict.fromkeys(row["case"] for row in rows):
+        cells = []
+        for method in methods:
+            row = next((row for row in rows if row["case"] == case and row["method"] == method), None)
+            value = "" if row is None else "refused" if "refused" in row else f"{row['density']:.3f}"
+            cells.append(value + (" w" if row and row["warnings"] else ""))
+        lines.append(f"| {case} | " + " | ".join(cells) + " |")
+    return "\n".join(lines) + "\n"
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--quick", action="store_true", help="each geometry by one method, in turn")
+    parser.add_argument("--case", default="", help="only geometries whose names hold this")
+    parser.add_argument("--method", choices=METHODS, help="only this method")
+    parser.add_argument("--json", type=Path, help="lines of results; those that are there are not run again")
+    parser.add_argument("--table", type=Path, help="the matrix, in Markdown")
+    words = parser.parse_args()
+    lines = words.json.read_text(encoding="utf-8").splitlines() if words.json and words.json.exists() else []
+    rows = [json.loads(line) for line in lines]
+    done = {(row["case"], row["method"]) for row in rows}
+    for number, case in enumerate(case for case in cases() if words.case in case.name):
+        names = [name for name in METHODS if not case.exposure_deg or name in OF_FLY_SCANS]
+        if words.quick:
+            names = [names[number % len(names)]]
+        for method in names:
+            if (case.name, method) in done or words.method not in (None, method):
+                continue
+            rows.append(measured(case, method))
+            print("WRONG" if is_wrong(rows[-1]) else "ok", json.dumps(rows[-1]), flush=True)
+            if words.json:
+                with words.json.open("a", encoding="utf-8") as file:
+                    file.write(json.dumps(rows[-1]) + "\n")
+    if words.table:
+        words.table.write_text(table(rows), encoding="utf-8")
+    wrong = [row for row in rows if is_wrong(row)]
+    print(f"{len(rows)} cells, {len(wrong)} wrong without a word", file=sys.stderr)
+    return int(bool(wrong))
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
