@@ -7,7 +7,7 @@ its own. A kernel's time is the least of its runs, in ns a voxel of the volume. 
 machine copies a float, and by that of a multiply-add; the kinder of the two quotients is compared with kernels.json. Jobs
 are compared by their processor time over that of a fixed loop in the same process. Prints a line for each that takes 1.3
 times as long as there, and ends with 1. --quick: the small size, and half of the jobs. --write: puts this run in the table.
---all: prints every kernel with its share of the machine's rate of copying. It takes two minutes on two cores, or 45 s.
+--all: prints every kernel with its share of the machine's rate of copying. It takes four minutes on two cores, or 50 s.
 """
 
 import json
