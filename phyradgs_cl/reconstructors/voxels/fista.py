@@ -42,7 +42,7 @@ _COARSE_PASSES = 0.6  # share of all passes
 _COARSE_SUBSETS = 1.6  # times the option ``subsets``
 _COARSE_TIMES = 1 / 3  # share of the times in an exposure, but two at least
 _FAINTEST = 1e-6  # of the largest row sum of AᵀA: voxels with less have no part in its bound
-_MOST_DIVIDED = 90**3  # voxels of a grid: smaller voxels are worth their time at 64³, not at 128³
+_MOST_DIVIDED = 90**2  # voxels of a slice: smaller ones are worth their time at 64³, not at 128³; of every slab alike
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ class FistaOptions(IterativeOptions):
     prior_share) TV(x) + prior_share TV(x − first volume). prior_weight: threshold relative to two errors of the gradient,
     added in squares: the noise of the frames, and edges inside large voxels.
 
-    subvoxels: parts of a voxel's side in the last 2/5 of the passes; 0: 2 up to 90³ voxels where memory allows, else 1.
+    subvoxels: parts of a voxel's side in the last 2/5 of the passes; 0: 2 for slices of up to 90² voxels where memory allows, else 1.
     subsets: of the frames, with one step each, 1.6 times as many before smaller voxels; subsets whose steps diverge are
     joined two by two.
     tv_iterations: dual iterations per proximal map of TV. transmission_weights: as in ``fista-tv``."""
@@ -252,10 +252,10 @@ def fista_passes(
 
 def _gains_from_subvoxels(inputs: MethodInputs, parts: int) -> bool:
     """Whether the grid is small enough for smaller voxels, and every rank's device holds the method's volumes of them."""
-    coarse_voxels, rt = math.prod(inputs.scan.grid.shape), inputs.rt
-    if coarse_voxels > _MOST_DIVIDED:
+    shape, rt = inputs.scan.grid.shape, inputs.rt
+    if math.prod(shape[1:]) > _MOST_DIVIDED:
         return False
-    voxels = coarse_voxels * parts**3
+    voxels = math.prod(shape) * parts**3
     sizes_bytes = *[4 * voxels] * (_VOLUMES + 2), 4 * voxels * priors.volumes_of(inputs.options.prior)
     has_room = voxels <= MOST_VOXELS and rt.room().holds(*sizes_bytes)
     if rt.ranks.any(not has_room):
