@@ -4,7 +4,8 @@
      backproject          any pose; a work-item takes LANES voxels along x and walks the views
      backproject_upright  detector columns parallel to the volume's z; a work-item takes a column of voxels
      backproject_leaning  columns that lean a little, as every calibrated panel's do
-     backproject_lines    every line of a frame has its own pose (rolling shutter); a work-item takes one voxel */
+     backproject_lines    every line of a frame has its own pose (rolling shutter); a work-item takes
+                          LANES voxels along x */
 #include "common/lanes.h"
 #include "common/line_backprojection.h"
 
@@ -13,6 +14,21 @@
 #define BY_DISTANCE(weight, inv) (weight) * (inv)
 #else
 #define BY_DISTANCE(weight, inv) (weight) * (inv) * (inv)
+#endif
+
+/* Samples of a row, or a turned image's column, at several places, of which two vectors hold all, or by gathers. */
+#ifdef V_LOOKUP
+#define COLUMN_SAMPLES(column, least, place, wv, fits)                                                       \
+    ((fits) ? lerp_lookup(V_LOAD((column) + (least)), V_LOAD((column) + (least) + LANES), (place) - (least), wv) \
+            : lerp_of(GATHER((column), place), GATHER((column) + 1, place), wv))
+static inline vf lerp_of(const vf low, const vf high, const vf share) { return fma(share, high - low, low); }
+static inline vf lerp_lookup(const vf lower, const vf upper, const vi place, const vf share)
+{
+    return lerp_of(V_LOOKUP(lower, upper, place), V_LOOKUP(lower, upper, place + 1), share);
+}
+#else
+#define COLUMN_SAMPLES(column, least, place, wv, fits) lerp_of(GATHER((column), place), GATHER((column) + 1, place), wv)
+static inline vf lerp_of(const vf low, const vf high, const vf share) { return fma(share, high - low, low); }
 #endif
 
 __kernel void backproject(
@@ -126,21 +142,6 @@ __kernel void backproject_upright(
         target[z * slice] = sum[z];
 }
 
-/* Samples of a turned image's column at rows v, of which two vectors hold all, or by gathers. */
-#ifdef V_LOOKUP
-#define COLUMN_SAMPLES(column, least, place, wv, fits)                                                       \
-    ((fits) ? lerp_lookup(V_LOAD((column) + (least)), V_LOAD((column) + (least) + LANES), (place) - (least), wv) \
-            : lerp_of(GATHER((column), place), GATHER((column) + 1, place), wv))
-static inline vf lerp_of(const vf low, const vf high, const vf share) { return fma(share, high - low, low); }
-static inline vf lerp_lookup(const vf lower, const vf upper, const vi place, const vf share)
-{
-    return lerp_of(V_LOOKUP(lower, upper, place), V_LOOKUP(lower, upper, place + 1), share);
-}
-#else
-#define COLUMN_SAMPLES(column, least, place, wv, fits) lerp_of(GATHER((column), place), GATHER((column) + 1, place), wv)
-static inline vf lerp_of(const vf low, const vf high, const vf share) { return fma(share, high - low, low); }
-#endif
-
 #define EVEN_DEPTH 0.02f   /* change of the depth along a block of voxels, relative to the depth */
 #define VOXEL_MARGIN 0.01f /* voxels: more than the rounding of where a column of voxels enters or leaves a view */
 
@@ -244,6 +245,32 @@ __kernel void backproject_leaning(
 }
 #endif
 
+/* Samples of a line at places u, 0 outside. */
+static inline vf samples_of(__global const float *line, const vf u, const int width)
+{
+    const vf most = (vf)(width - 1);
+    const vi inside = (u >= 0.0f) & (u <= most);
+    const vf us = V_PICK(V_PICK(0.0f, most, u > most), u, inside);
+    const vi place = min(V_INT(us), max(width - 2, 0));
+    const int p0 = V_FIRST(place), p1 = V_LAST(place), fits = abs(p1 - p0) <= 2 * LANES - 2;
+    const int least = min(min(p0, p1), max(width + 1 - 2 * LANES, 0));
+    return V_PICK(0.0f, COLUMN_SAMPLES(line, least, place, us - V_FLOAT(place), fits), inside);
+}
+
+/* A vector of voxels lies along the lines, so that one line or two see all of it. */
+#ifdef ALONG_Z
+#define STRETCHED(begin) (begin).z *= LANES
+#define X_OF(first) ((vf)((first).x))
+#define Z_OF(first) ((vf)((first).z) + V_IOTA)
+#define TO_LAST(count) (float4)(0.0f, 0.0f, (float)((count) - 1), 0.0f)
+#else
+#define STRETCHED(begin) (begin).x *= LANES
+#define X_OF(first) ((vf)((first).x) + V_IOTA)
+#define Z_OF(first) ((vf)((first).z))
+#define TO_LAST(count) (float4)((float)((count) - 1), 0.0f, 0.0f, 0.0f)
+#endif
+#define PROJECTED(m, row) ((m)[4 * (row)] * x + (m)[4 * (row) + 2] * z + ((m)[4 * (row) + 1] * y + (m)[4 * (row) + 3]))
+
 __kernel void backproject_lines(
     __global const float *projections, /* views of (guard, (lines, pitch)) */
     __global const float *matrices,    /* (views, lines, 12) */
@@ -253,16 +280,56 @@ __kernel void backproject_lines(
     const int filtered_across, /* 1 where the ramp filter ran across lines: readout along columns */
     __global float *volume)
 {
-    if (get_global_id(0) >= shape.x)
+    int4 begin = (int4)(get_global_id(0), get_global_id(1), get_global_id(2), 0);
+    STRETCHED(begin);
+    if (begin.x >= shape.x)
         return;
-    const float x = (float)((int)get_global_id(0) + origin.x), y = (float)((int)get_global_id(1) + origin.y);
-    const float z = (float)((int)get_global_id(2) + origin.z);
-    __global float *target = volume + IMAGE_GUARD
-                             + (get_global_id(2) * shape.y + get_global_id(1)) * volume_pitch + get_global_id(0);
-    float sum = *target;
-    for (int f = 0; f < views; ++f)
-        sum = line_added(
-            sum, matrices + (size_t)f * lines * 12, projections + f * image_step + IMAGE_GUARD, lines, width, image_pitch, x, y,
-            z, weights[f], filtered_across);
-    *target = sum;
+#ifdef ALONG_Z
+    const int count = min(LANES, shape.z - begin.z);
+    const size_t apart = (size_t)shape.y * volume_pitch;
+#else
+    const int count = min(LANES, shape.x - begin.x);
+    const size_t apart = 1;
+#endif
+    __global float *target = volume + IMAGE_GUARD + ((size_t)begin.z * shape.y + begin.y) * volume_pitch + begin.x;
+    float sums[LANES] = {0};
+    for (int k = 0; k < count; ++k)
+        sums[k] = target[k * apart];
+    vf sum = V_LOAD(sums);
+    const int4 first = begin + origin;
+    const float4 a = convert_float4(first), b = a + TO_LAST(count); /* both ends of the vector */
+    const vf x = X_OF(first), z = Z_OF(first);
+    const float y = (float)first.y;
+    const int last = max(lines - 2, 0), step = lines > 1 ? 12 : 0, next_line = lines > 1 ? image_pitch : 0;
+    for (int f = 0; f < views; ++f) {
+        __global const float *table = matrices + (size_t)f * lines * 12;
+        __global const float *image = projections + f * image_step + IMAGE_GUARD;
+        float t, speed, depth0, next0, depth1, next1;
+        const int of_a = line_seeing(table, lines, last / 2, a.x, a.y, a.z, &t, &speed, &depth0, &next0);
+        const int of_b = line_seeing(table, lines, of_a, b.x, b.y, b.z, &t, &speed, &depth1, &next1);
+        const int is_in_front = depth0 > 0.0f && next0 > 0.0f && depth1 > 0.0f && next1 > 0.0f;
+        const int from = is_in_front ? min(of_a, of_b) : 0, to = is_in_front ? max(of_a, of_b) : last;
+        vi waits = V_IOTA < (float)count; /* lanes that no line has served */
+        for (int line = from; line <= to && V_ANY(waits); ++line) {
+            __global const float *m = table + (size_t)line * 12, *n = m + step, *pixels = image + (size_t)line * image_pitch;
+            const vf depth = PROJECTED(m, 2), next_depth = PROJECTED(n, 2);
+            const vf inv = 1.0f / depth, next_inv = 1.0f / next_depth;
+            const vf v = PROJECTED(m, 1) * inv, next_v = PROJECTED(n, 1) * next_inv;
+            const vf rate = fmax(1.0f - (next_v - v), LEAST_SPEED), on = (v - (float)line) / rate;
+            const vi served = waits & (on < (vf)(line == to ? MAXFLOAT : 1.0f));
+            waits &= ~served;
+            const vi is_open = served & (depth > 0.0f) & (next_depth > 0.0f) & (on >= (float)(-line))
+                               & (on <= (float)(lines - 1 - line));
+            if (!V_ANY(is_open))
+                continue;
+            const vf here = samples_of(pixels, PROJECTED(m, 0) * inv, width);
+            const vf there = samples_of(pixels + next_line, PROJECTED(n, 0) * next_inv, width);
+            const vf between = depth + on * (next_depth - depth);
+            const vf value = BY_LINE(weights[f], between, filtered_across ? rate * rate : rate) * (here + on * (there - here));
+            sum += V_PICK(0.0f, value, is_open);
+        }
+    }
+    V_STORE(sum, sums);
+    for (int k = 0; k < count; ++k)
+        target[k * apart] = sums[k];
 }

@@ -53,6 +53,15 @@ def test_volumes_before_and_after(tmp_path) -> None:
     assert done.returncode == 1 and "fdk, static: 2.0e-01" in done.stdout
 
 
+def test_densities_in_every_geometry(tmp_path) -> None:
+    """Each geometry by one method, in turn: none is off by more than 2 % without a warning."""
+    rows, table = tmp_path / "rows.jsonl", tmp_path / "table.md"
+    run("geometries.py", "--quick", "--json", str(rows), "--table", str(table))
+    found = [json.loads(line) for line in rows.read_text(encoding="utf-8").splitlines()]
+    assert len(found) > 90 and {row["method"] for row in found} >= {"fista", "sirt", "fdk", "phyradgs"}
+    assert "| cone: helices" in table.read_text(encoding="utf-8")
+
+
 def test_iteration(tmp_path) -> None:
     facts = facts_of(tmp_path, "iteration.py")
     stages = ("prepare", "binning", "forward", "loss", "backward", "tv", "adam", "gaps")

@@ -17,45 +17,55 @@ static inline float line_sample(__global const float *line, const float u, const
     return line[column] + (u - column) * (line[column + (width > 1)] - line[column]);
 }
 
-/* A voxel is seen by the line that is open where it stands: v(pose of line r) = r, solved by Newton's method on the
-   piecewise linear v between lines. */
-static inline float line_added(
-    const float sum, /* to which the voxel's value is added */
+/* Returns the line that is open where a voxel stands: v(pose of line r) = r, solved by Newton's method on the piecewise
+   linear v between lines, from `line` on. `t`: how far the voxel is on the way to the next line, of which both depths are the voxel's. */
+static inline int line_seeing(
     __global const float *table, /* (lines, 12) */
-    __global const float *image, const int lines, const int width, const int image_pitch,
-    const float x, const float y, const float z,
-    const float weight, const int filtered_across)
+    const int lines, int line, const float x, const float y, const float z,
+    float *t, float *speed, float *depth, float *next_depth)
 {
     const int last = max(lines - 2, 0), step = lines > 1 ? 12 : 0;
-    __global const float *m = table;
-    int line = last / 2;
-    float t = 0.0f, speed = 1.0f, depth = 1.0f, next_depth = 1.0f;
+    *t = 0.0f, *speed = *depth = *next_depth = 1.0f;
     for (int k = 0; k < LINE_STEPS; ++k) {
-        m = table + (size_t)line * 12;
-        const float v = line_position(m, x, y, z, &depth), next_v = line_position(m + step, x, y, z, &next_depth);
-        if (!(depth > 0.0f && next_depth > 0.0f))
+        __global const float *m = table + (size_t)line * 12;
+        const float v = line_position(m, x, y, z, depth), next_v = line_position(m + step, x, y, z, next_depth);
+        if (!(*depth > 0.0f && *next_depth > 0.0f))
             break;
-        speed = fmax(1.0f - (next_v - v), LEAST_SPEED);
-        t = (v - (float)line) / speed;
-        const int better = (int)clamp(floor((float)line + t), 0.0f, (float)last);
+        *speed = fmax(1.0f - (next_v - v), LEAST_SPEED);
+        *t = (v - (float)line) / *speed;
+        const int better = (int)clamp(floor((float)line + *t), 0.0f, (float)last);
         if (better == line)
             break;
         line = k + 1 < LINE_STEPS ? better : line;
     }
+    return line;
+}
+
+/* FDK's weight of a sample of a line, of which `middle` is the depth. */
+#if DISTANCE_POWER == 1 /* see backproject.cl */
+#define BY_LINE(weight, middle, scale) ((weight) / ((middle) * (scale)))
+#else
+#define BY_LINE(weight, middle, scale) ((weight) / ((middle) * (middle) * (scale)))
+#endif
+
+static inline float line_added(
+    const float sum, /* to which the voxel's value is added */
+    __global const float *table, __global const float *image, const int lines, const int width, const int image_pitch,
+    const float x, const float y, const float z,
+    const float weight, const int filtered_across)
+{
+    const int step = lines > 1 ? 12 : 0;
+    float t, speed, depth, next_depth;
+    const int line = line_seeing(table, lines, max(lines - 2, 0) / 2, x, y, z, &t, &speed, &depth, &next_depth);
     const float position = (float)line + t;
     if (!(depth > 0.0f && next_depth > 0.0f && position >= 0.0f && position <= (float)(lines - 1)))
         return sum;
-    __global const float *n = m + step;
+    __global const float *m = table + (size_t)line * 12, *n = m + step;
     __global const float *pixels = image + (size_t)line * image_pitch;
     const float u = (m[0] * x + m[1] * y + m[2] * z + m[3]) / depth;
     const float next_u = (n[0] * x + n[1] * y + n[2] * z + n[3]) / next_depth;
     const float here = line_sample(pixels, u, width);
     const float there = line_sample(pixels + (step ? image_pitch : 0), next_u, width);
     const float middle = depth + t * (next_depth - depth);
-    const float scale = filtered_across ? speed * speed : speed;
-#if DISTANCE_POWER == 1 /* see backproject.cl */
-    return sum + weight / (middle * scale) * (here + t * (there - here));
-#else
-    return sum + weight / (middle * middle * scale) * (here + t * (there - here));
-#endif
+    return sum + BY_LINE(weight, middle, filtered_across ? speed * speed : speed) * (here + t * (there - here));
 }

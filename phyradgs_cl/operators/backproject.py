@@ -59,9 +59,8 @@ def backproject_lines(
     are not filtered where it is 1."""
     pose = Readout(axis).poses(pose)
     matrices = voxel_matrices(pose.reshape(-1, 12), grid, is_parallel).reshape(len(pose), -1)
-    across = np.int32(axis == "columns" and power == 2)
     views = Views(frames, axis == "columns", matrices, weight)
-    return cast(SameArray, in_bricks(rt, views, grid, 1, lambda *where: _lines(rt, power, across, *where)))
+    return cast(SameArray, in_bricks(rt, views, grid, 1, lambda *where: _lines(rt, power, axis == "columns", *where)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -153,10 +152,14 @@ def _general(rt: Runtime, power: int, images: Arguments, brick: Brick, volume: D
     rt.launch(kernel, (ceil_div(nx, rt.lanes), ny, nz), *images, *volume_shape(brick), volume, group=rt.group())
 
 
-def _lines(rt: Runtime, power: int, across: np.int32, images: Arguments, brick: Brick, volume: DeviceArray) -> None:
+def _lines(rt: Runtime, power: int, is_turned: bool, images: Arguments, brick: Brick, volume: DeviceArray) -> None:
+    """Launches the kernel of lines with vectors along the lines, which are columns where ``is_turned``."""
     nz, ny, nx = brick.shape
-    kernel = rt.kernel("backproject", "backproject_lines", **_defines(power))
-    rt.launch(kernel, (nx, ny, nz), *images, *volume_shape(brick), across, volume, group=rt.group(on_cpu=16))
+    along_z = {"ALONG_Z": 1} if is_turned and rt.lanes > 1 else {}
+    kernel = rt.kernel("backproject", "backproject_lines", **_defines(power), **along_z)
+    items = (nx, ny, ceil_div(nz, rt.lanes)) if along_z else (ceil_div(nx, rt.lanes), ny, nz)
+    across = np.int32(is_turned and power == 2)
+    rt.launch(kernel, items, *images, *volume_shape(brick), across, volume, group=rt.group(on_cpu=4 if along_z else 1))
 
 
 def _upright(rt: Runtime, name: str, power: int, block: int, images: Arguments, brick: Brick, volume: DeviceArray) -> None:

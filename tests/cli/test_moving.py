@@ -57,7 +57,7 @@ def test_a_run_that_finds_the_motion_prints_the_mean_of_the_true_states(cli, cap
     """Its own reference state may lie anywhere between them."""
     for method in ("moving", "changing"):
         out = tmp_path / f"{method}.h5"
-        line = f"reconstruct {folder}/scan.h5 -o {out} --method {method} --iterations 2 --set states=2"
+        line = f"reconstruct {folder}/scan.h5 -o {out} --method {method} --iterations 2"
         assert cli.run(line.split()) == 0
         printed = capsys.readouterr().out
         facts = facts_of(cli, capsys, f"evaluate {out} --reference {folder}/scan.h5 --json")

@@ -18,7 +18,7 @@ _WIDEST = 1.25  # voxels from sub-ray to sub-ray
 # voxels from ray to ray of single rays: 1.43 on a usual scanner where voxels are as many as pixels. The shortest volume that
 # fits rays on a line loses 4 % of its density at 1.5, 16 % at 1.9, and a half at 2, where they may pass through every other
 # voxel alone. Voxels that begin with a density keep it.
-_FARTHEST, _FARTHEST_OF_DENSE = 1.5, 2.0
+_FARTHEST, _FARTHEST_OF_DENSE = 1.45, 2.0
 _ROUNDING = 1e-3
 _MOST = 8  # along an axis; so many at 10 voxels to a pixel
 
