@@ -198,10 +198,10 @@ def test_wide_pixels_average_by_themselves(rt) -> None:
     """Rays through the middles of pixels alone would miss the voxels between them."""
     panel = ParallelGeometry((6, 6), 2.0)
     for voxels, samples in ((6, 1), (9, 1), (10, 2), (18, 3), (30, 5)):
-        scene = phantom_scene(rt, "shepp-logan", panel, Grid.cube(6, 2.0), voxels, "rows", 0)
+        scene = phantom_scene(rt, "shepp-logan", panel, Grid.cube(6, 12.0), voxels, "rows", 0)
         assert scene.source.pixel_samples == samples
     magnified = replace(GEOMETRY, pixel_size_mm=(2.0 * GEOMETRY.magnification,) * 2)
-    assert phantom_scene(rt, "shepp-logan", magnified, Grid.cube(6, 2.0), 18, "rows", 0).source.pixel_samples == 3
+    assert phantom_scene(rt, "shepp-logan", magnified, Grid.cube(6, 12.0), 18, "rows", 0).source.pixel_samples == 3
 
 
 @pytest.mark.parametrize("model", ["log", "intensity"])
