@@ -17,7 +17,7 @@ from phyradgs_cl.errors import DeviceError, OutOfMemoryError
 from phyradgs_cl.fields import Activation, Deformation, Grid
 from phyradgs_cl.fields.gaussians import DENSITY, MEAN, QUATERNION, SCALE
 from phyradgs_cl.objective import terms
-from phyradgs_cl.objective.dct_prox import FREQUENCY_CLASSES, Curves, DctProx, dct_prox
+from phyradgs_cl.objective.dct_prox import DctProx, dct_prox
 from phyradgs_cl.objective.ridge import RidgeStep, learned_ridge, ridge_step
 from phyradgs_cl.objective.tv import TvDescent, TvProx, tv_descent, tv_prox
 from phyradgs_cl.operators.splats.binning import TileLists
@@ -312,9 +312,6 @@ def _variation(rt: Runtime) -> Iterator[Comparison]:
     found = TvProx(rt, states.shape, weights)(states, 0.2, 4, nonnegative=True)
     yield found, tv_prox(states, 0.2, 4, nonnegative=True, axis_weights=weights), VALUE
     yield DctProx(rt, GRID.shape)(volume, 0.2, 1, nonnegative=True), dct_prox(volume, 0.2, 1, nonnegative=True), VALUE
-    curves = Curves(np.array([1.0, 4.0]), np.linspace(-0.5, 1, 2 * FREQUENCY_CLASSES).reshape(-1, 2))
-    shrunk = DctProx(rt, GRID.shape, curves)(volume, 0.2, 2, nonnegative=False)
-    yield shrunk, dct_prox(volume, 0.2, 2, nonnegative=False, curves=curves), VALUE
     descended = RidgeStep(rt, GRID.shape, learned_ridge())(volume, 0.1, 0.3, nonnegative=False)
     yield descended, ridge_step(volume, 0.1, 0.3, ridge=learned_ridge(), nonnegative=False), VALUE
 

@@ -97,7 +97,7 @@ _MOTION = (
     "frame: one (static, static-start), M×N micro-views, one per line (per-row), or, for splats, integrals over time "
     "(exact), or M×N that move only centres (centres)."
 )
-_PRIOR = "Prior, for fista: ridge, dct, curves, tv, piccs or none; MODULE:NAME: a denoiser of your own."
+_PRIOR = "Prior, for fista: ridge, dct, tv, piccs or none; MODULE:NAME: a denoiser of your own."
 _PRESET = "Constants: default, quick, paper, released (phyradgs); published (r2, naf, sax-nerf); a window (fdk)."
 _CONFIG = "TOML file of options, with underscores for dashes (docs: formats.md); the command line wins."
 _SET = "An option of the method by name: --set tv_weight=0.002 (docs: methods.md)."

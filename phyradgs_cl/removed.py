@@ -1,0 +1,14 @@
+"""Words that have left the program, and what to write now."""
+
+from phyradgs_cl.errors import InputError
+
+REMOVED = {
+    "--prior curves": "say --prior ridge, the default, or dct",
+}
+"""By word: a value with its option, or an option as Python spells it."""
+
+
+def refuse_removed(word: str, subject: str = "") -> None:
+    """Raises InputError with the replacement if ``word`` has left; ``subject`` names it where the word alone does not."""
+    if word in REMOVED:
+        raise InputError(subject or word, "a word of an earlier version", "", REMOVED[word])
