@@ -3,6 +3,7 @@
 from phyradgs_cl.errors import InputError
 
 REMOVED = {
+    "--method fused": "take --method fista, or start Gaussians from its volume: --method phyradgs --initial VOLUME",
     "--prior curves": "say --prior ridge, the default, or dct",
 }
 """By word: a value with its option, or an option as Python spells it."""

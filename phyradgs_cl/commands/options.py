@@ -93,7 +93,7 @@ RUN_GROUPS = {
 }
 _METHOD = "fdk: analytic; phyradgs, r2: splats; naf, sax-nerf: neural fields; the others: voxels (docs: methods.md)."
 _MOTION = (
-    "Leave it out with fista, fused and phyradgs, which take the scan's motion; with others say per-row. Poses of a "
+    "Leave it out with fista and phyradgs, which take the scan's motion; with others say per-row. Poses of a "
     "frame: one (static, static-start), M×N micro-views, one per line (per-row), or, for splats, integrals over time "
     "(exact), or M×N that move only centres (centres)."
 )

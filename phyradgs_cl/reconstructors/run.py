@@ -43,7 +43,7 @@ from phyradgs_cl.runtime import Runtime
 # Volumes that voxel methods hold at one time at most (docs/large.md), with two of the intensity model; they hold stacks of
 # all frames too, and one buffer of three volumes.
 _HELD = {"sirt": 8, "sart": 28, "os-sart": 28, "cgls": 11, "asd-pocs": 32, "fista-tv": 16}
-_HELD |= {"fista": 20, "fused": 20, "moving": 28}
+_HELD |= {"fista": 20, "moving": 28}
 _STACKS, _ONE_BUFFER = 12, 3
 _OF_OTHERS = 4  # volumes: the result, and copies in which it is made, checked and written
 _DEVICE_SHARE = 0.9

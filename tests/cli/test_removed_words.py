@@ -5,6 +5,7 @@ import pytest
 from phyradgs_cl.removed import REMOVED
 
 WORDS = {
+    "--method fused": ["reconstruct", "scan.h5", "--method", "Fused", "-o", "volume.h5"],
     "--prior curves": ["reconstruct", "scan.h5", "--prior", "curves", "-o", "volume.h5"],
 }
 """Words of the command line, by the removed one."""

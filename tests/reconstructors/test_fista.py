@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from numpy.lib.stride_tricks import sliding_window_view
 from tolerances import RAYS
 
 from phyradgs_cl.acquisition import (
@@ -200,45 +199,12 @@ def test_a_denoiser_of_ones_own_is_the_prior(rt, scan) -> None:
 def test_a_first_volume_is_where_the_run_starts(rt, scan, method) -> None:
     """From the truth a few iterations are nearer to it than from nothing, on another grid too; FDK starts from none."""
     few = {"iterations": 40} if method in ("phyradgs", "r2") else {"iterations": 2}
-    if method == "fused":
-        few["voxel_iterations"] = 1
     options = method_options(method, None, few)
     begun = quality(scan, reconstruct(scan, RunPlan(method, options), rt).volume)
     from_truth = reconstruct(scan, RunPlan(method, options, initial=InitialVolume(scan.reference, scan.grid)), rt).volume
     assert quality(scan, from_truth) > begun + (0.1 if method in ("phyradgs", "r2") else 1)
     with pytest.raises(InputError, match="--initial"):
         reconstruct(scan, plan_run("fdk", initial=InitialVolume(scan.reference, scan.grid)), rt)
-
-
-@pytest.mark.parametrize("at", [2, 30])
-def test_fused_goes_on_with_the_same_bits_from_either_half(rt, scan, at) -> None:
-    options = method_options("fused", None, {"iterations": 100, "voxel_iterations": 4})
-
-    def stop(progress: Progress) -> None:
-        assert progress.iterations == 104
-        if progress.iteration >= at:
-            raise KeyboardInterrupt
-
-    whole = reconstruct(scan, RunPlan("fused", options), rt)
-    part = reconstruct(scan, RunPlan("fused", options), rt, report=stop)
-    assert part.facts["interrupted_at"] >= at
-    rest = reconstruct(scan, RunPlan("fused", options), rt, resume=part.state)
-    np.testing.assert_array_equal(rest.volume, whole.volume)
-    assert rest.gaussians is not None and whole.facts["disagreement_per_mm"] > 0
-    assert (part.disagreement is None) == (at < 4)  # before there are splats
-    np.testing.assert_array_equal(rest.disagreement, whole.disagreement)
-
-
-def test_fused_is_the_mean_of_both(rt, scan) -> None:
-    changes = {"iterations": 60, "voxel_iterations": 6}
-    whole = [run(rt, scan, "fused", splat_weight=w, **changes) for w in (0.0, 0.5, 1.0)]
-    voxels, mean, splats = (result.volume for result in whole)
-    np.testing.assert_allclose(mean, (voxels + splats) / 2, atol=1e-6)
-    near = sliding_window_view(np.pad(splats - voxels, 1, mode="edge"), (3, 3, 3))
-    for result in whole:
-        np.testing.assert_allclose(result.disagreement, np.sqrt(np.mean(near**2, (3, 4, 5))) / 2, atol=1e-6)
-    assert whole[0].facts["disagreement_per_mm"] == pytest.approx(np.sqrt(np.mean((splats - voxels) ** 2)) / 2, rel=1e-4)
-    assert run(rt, scan, "fista", iterations=1).disagreement is None
 
 
 @pytest.mark.parametrize(

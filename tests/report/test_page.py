@@ -237,21 +237,6 @@ def test_a_bare_result_is_a_picture_of_the_volume(any_volume, tmp_path, parse) -
     assert len(sizes) == 3 and "aspect-ratio: 0.8 / 1.2" in sizes
 
 
-def test_where_two_estimates_disagree_is_shown_at_the_places_of_the_volume(any_volume, tmp_path, parse) -> None:
-    """Only where the file has it; black is 0, and the bar says what white is."""
-    volume, grid = any_volume
-    write_volume(tmp_path / "v.h5", volume, grid, {}, disagreement=volume / 100)
-    page = parse(report_page(load_run(tmp_path / "v.h5")))
-    high = np.percentile(volume / 100, 99.9)
-    assert f"{number(high)} 1/mm and above" in page.words and "no confidence interval" in page.words
-    pictures = [image for image in page.all("img") if "slice of the disagreement" in image["alt"]]
-    expected = [np.clip(255 * volume.take(volume.shape[axis] // 2, axis) / 100 / high, 0, 255)[::-1] for axis in range(3)]
-    for picture, values in zip(pictures, expected, strict=True):
-        assert np.abs(decoded(picture["src"]) - values).max() <= 0.51
-    places = [text for text in page.texts["output"] if " of " in text]
-    assert len(places) == 3 and all(f"slice ({place})" in page.words for place in places)
-
-
 def test_files_of_another_kind_are_named_and_inputs_never_replaced(files, tmp_path) -> None:
     scan, volume = files
     page = tmp_path / "p.html"
