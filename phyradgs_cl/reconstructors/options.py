@@ -14,6 +14,7 @@ from phyradgs_cl.errors import InputError
 from phyradgs_cl.reconstructors.method import METHODS, method_name, method_of
 from phyradgs_cl.reconstructors.preprocess import Preprocessing
 from phyradgs_cl.reconstructors.tune import check_tuning
+from phyradgs_cl.removed import refuse_removed
 from phyradgs_cl.text import suggest_name
 
 _COUNTS = tuple(dict.fromkeys(f.name for model in MODELS for f in fields(model) if f.init))
@@ -112,6 +113,7 @@ def _changed(options: Any, changes: Mapping[str, Any], subject: str) -> Any:
     values: dict[str, Any] = {}
     for key, value in changes.items():
         if key not in known:
+            refuse_removed(key, f"{subject}: option {key}")
             names = [*known, *_motion_options(options)]
             remedy = suggest_name(key, names, _having(key) or "leave it out")
             raise InputError(f"{subject}: option {key}", "no such option", ", ".join(names), remedy)

@@ -4,9 +4,11 @@ import pytest
 
 from phyradgs_cl.removed import REMOVED
 
+RUN = ["reconstruct", "scan.h5", "-o", "volume.h5"]
 WORDS = {
-    "--method fused": ["reconstruct", "scan.h5", "--method", "Fused", "-o", "volume.h5"],
-    "--prior curves": ["reconstruct", "scan.h5", "--prior", "curves", "-o", "volume.h5"],
+    "--method fused": [*RUN, "--method", "Fused"],
+    "--prior curves": [*RUN, "--prior", "curves"],
+    "pixel_footprint": [*RUN, "--method", "r2", "--set", "pixel_footprint=true"],
 }
 """Words of the command line, by the removed one."""
 

@@ -107,7 +107,7 @@ def cloud(count: int) -> np.ndarray:
 
 OPTIONS = {
     "exact": {}, "affine, whole": {"affine": True, "cutoff_sigma": 0.0},
-    "intensity, pixels": {"intensity_unit": 2.0, "pixel_footprint": True},
+    "intensity": {"intensity_unit": 2.0},
 }
 MODELS: dict[str, Callable[..., TimeCells]] = {
     "still": static_cells, "micro-views": lambda *where: micro_view_cells(*where, 2, 2),

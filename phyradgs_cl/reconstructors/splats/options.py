@@ -23,8 +23,8 @@ class SplatOptions:
     gaussians: size of the first cloud; 0 chooses it from the grid. Weights are Eq. 4's λ. tv_edge: edge of the random
     sub-volume in voxels. scale_min_voxels: raises the smallest scale to this share of a voxel. detector_model: what quantity
     the detector averages over a line's times, line integrals (log) or intensity, or the model that the scan states (scan).
-    pixel_footprint: pixels average over their area. exact_from: share of the iterations before which the motion ``exact`` is
-    coarse, first one pose for each frame, then one segment of few times; 0: it never is.
+    exact_from: share of the iterations before which the motion ``exact`` is coarse, first one pose for each frame, then one
+    segment of few times; 0: it never is.
 
     iterations: frames, with a step of Adam every ``batch`` of them (0: as many as there are ranks) at rates × √batch. The
     same batch gives the same bits on any number of ranks (docs/cluster.md)."""
@@ -34,7 +34,6 @@ class SplatOptions:
     motion: Motion = Exact()
     affine: bool = False
     detector_model: str = "scan"
-    pixel_footprint: bool = False
     iterations: int = checks.ranged(3000, 0, 1_000_000_000, "--iterations")
     gaussians: int = checks.ranged(0, 0, 100_000_000, "--gaussians (0 chooses from the grid)")
     ssim_weight: float = checks.ranged(0.2, 0, 1e6)

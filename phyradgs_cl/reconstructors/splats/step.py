@@ -53,7 +53,7 @@ class FrameStep:
         self.projector = SplatProjector(
             rt, lines, width, affine=options.affine, cutoff_sigma=options.cutoff_sigma,
             time_error=getattr(options.motion, "time_error", DEFAULT_TIME_ERROR),
-            pixel_footprint=options.pixel_footprint, intensity_unit=self.frames.intensity_unit, states=states,
+            intensity_unit=self.frames.intensity_unit, states=states,
         )
         weights = options.ssim_weight, options.l1_weight, options.poisson_weight
         self.loss = ImageLoss(rt, lines, width, self.projector.pitch, *weights)
