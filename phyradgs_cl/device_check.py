@@ -4,7 +4,7 @@ Gradients are compared with central differences of the twins. Limits are several
 conforming device, and far below the error of a wrong kernel."""
 
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
@@ -318,16 +318,15 @@ def _variation(rt: Runtime) -> Iterator[Comparison]:
 
 def _optimiser(rt: Runtime) -> Iterator[Comparison]:
     activation, stride, count = Activation(0.01, 0.6), 16, 16
-    weights = terms.ParameterTerms(density_weight=0.3, shape_weight=0.7, shape_ratio=1.5, shape_floor=0.2)
     raw = activation.invert(_cloud(count)).astype(np.float32).astype(np.float64)
     raw[QUATERNION] *= 1.7
     adam, on_device = DeviceAdam(rt, activation), rt.upload(raw, np.float32)
     parameters, gradients, statistics = (rt.zeros((n, stride)) for n in (11, 13, 2))
     adam.activate(on_device, parameters, count, stride)
     yield rt.download(parameters), activation.apply(raw), VALUE
-    adam.chain(on_device, parameters, gradients, statistics, count, stride, **asdict(weights))
+    adam.chain(on_device, parameters, gradients, statistics, count, stride, density_weight=0.3)
     found = rt.download(gradients)[:11]
-    value = lambda rows: np.array(terms.parameter_loss(activation.apply(rows), weights)[0])  # noqa: E731
+    value = lambda rows: np.array(terms.mean_density(activation.apply(rows), 0.3)[0])  # noqa: E731
     yield found, _differences(value, raw), GRADIENT
     rates, moments = np.linspace(0.01, 0.03, 11), rt.zeros((2, 11, stride))
     adam.step(on_device, gradients, moments, stride, rates, 1)

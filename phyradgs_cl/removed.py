@@ -4,8 +4,12 @@ from phyradgs_cl.errors import InputError
 
 REMOVED = {
     "--method fused": "take --method fista, or start Gaussians from its volume: --method phyradgs --initial VOLUME",
+    "--preset released": "say --preset paper",
     "--prior curves": "say --prior ridge, the default, or dct",
     "pixel_footprint": "leave it out: pixels see splats at their centres, which gives 0.5 dB more",
+    "shape_floor": "use scale_min, the smallest scale",
+    "shape_ratio": "use control.prune_aspect, which removes thin Gaussians",
+    "shape_weight": "use control.prune_aspect, which removes thin Gaussians",
 }
 """By word: a value with its option, or an option as Python spells it."""
 

@@ -98,7 +98,7 @@ _MOTION = (
     "(exact), or M×N that move only centres (centres)."
 )
 _PRIOR = "Prior, for fista: ridge, dct, tv, piccs or none; MODULE:NAME: a denoiser of your own."
-_PRESET = "Constants: default, quick, paper, released (phyradgs); published (r2, naf, sax-nerf); a window (fdk)."
+_PRESET = "Constants: default, quick, paper (phyradgs); published (r2, naf, sax-nerf); a window (fdk)."
 _CONFIG = "TOML file of options, with underscores for dashes (docs: formats.md); the command line wins."
 _SET = "An option of the method by name: --set tv_weight=0.002 (docs: methods.md)."
 _TUNE = "Option that held-out pixels choose: tv_weight, prior_weight=0.4,0.8,1.6, iterations (docs: methods.md)."

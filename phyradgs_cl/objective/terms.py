@@ -1,4 +1,4 @@
-"""Terms of the objective (paper, Eq. 4): image loss, total variation of a small volume, terms of the parameters.
+"""Terms of the objective (paper, Eq. 4): image loss, total variation of a small volume, mean density.
 
 The image loss of one frame is L1 + λ (1 − SSIM). A term for photon noise, λ_P mean(½ t (x − y)²) with transmissions t
 (detector/noise_level.py), is off by default. Eq. 4 prints "+ SSIM"; the paper minimises 1 − SSIM, and so does this module.
@@ -9,13 +9,12 @@ Total variation is anisotropic, as in R2-Gaussian: the mean absolute difference 
 x, added up."""
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 import scipy
 
 from phyradgs_cl.checks import ceil_div
-from phyradgs_cl.fields import gaussians as g
+from phyradgs_cl.fields.gaussians import DENSITY
 from phyradgs_cl.runtime import DeviceArray, Runtime
 from phyradgs_cl.runtime.layout import GUARD
 
@@ -156,31 +155,10 @@ def _axis_weights(shape: tuple[int, ...]) -> list[float]:
     return [1.0 / (total // n * (n - 1)) if n > 1 else 0.0 for n in shape]
 
 
-@dataclass(frozen=True)
-class ParameterTerms:
-    """Weights of the mean density and of mean relu(longest/shortest − ratio)² + mean relu(floor − shortest)².
-
-    ``shape_floor`` is in half-sides of the volume."""
-
-    density_weight: float = 0.001
-    shape_weight: float = 0.0
-    shape_ratio: float = 10.0
-    shape_floor: float = 0.004
-
-
-def parameter_loss(rows: np.ndarray, terms: ParameterTerms) -> tuple[float, np.ndarray]:
-    """Float64 twin of the terms in ``chain_activations``: the value and its gradient by rows (11, G)."""
-    count = rows.shape[1]
+def mean_density(rows: np.ndarray, weight: float) -> tuple[float, np.ndarray]:
+    """Float64 twin of the term in ``chain_activations``: ``weight`` times the mean, and its gradient by rows (11, G)."""
     gradient = np.zeros_like(rows)
-    if count == 0:
+    if (count := rows.shape[1]) == 0:
         return 0.0, gradient
-    scale = rows[g.SCALE]
-    longest, shortest = scale.max(0), scale.min(0)
-    excess = np.maximum(longest / shortest - terms.shape_ratio, 0)
-    lack = np.maximum(terms.shape_floor - shortest, 0)
-    value = terms.density_weight * rows[g.DENSITY].mean() + terms.shape_weight * (excess**2 + lack**2).mean()
-    gradient[g.DENSITY] = terms.density_weight / count
-    each = 2 * terms.shape_weight / count
-    gradient[g.SCALE] += np.where(scale == longest, each * excess / shortest, 0)
-    gradient[g.SCALE] -= np.where(scale == shortest, each * (excess * longest / shortest**2 + lack), 0)
-    return float(value), gradient
+    gradient[DENSITY] = weight / count
+    return float(weight * rows[DENSITY].mean()), gradient

@@ -33,6 +33,7 @@ def method_options(
     name, presets = method_name(method), method_of(method).presets
     chosen = next(iter(presets)) if preset is None else preset
     if not isinstance(chosen, str) or chosen not in presets:
+        refuse_removed(f"--preset {chosen}")
         having = [other for other, one in METHODS.items() if isinstance(chosen, str) and chosen in one.presets]
         remedy = f"--method {' or '.join(having)} has it" if having else ""
         raise InputError("--preset", checks.short_repr(chosen), f"one of {', '.join(presets)} for --method {name}", remedy)

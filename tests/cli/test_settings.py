@@ -45,7 +45,7 @@ def test_a_named_option_wins_over_set_and_set_over_the_file(config: Path) -> Non
     assert plan_of(config, {}, ["iterations=2"]).options.iterations == 2
     found = plan_of(config, {"iterations": 3, "seed": 3}, ["iterations=2", "seed=2"])
     assert (found.options.iterations, found.seed) == (3, 3)
-    assert plan_of(config, {"preset": "default"}, ["preset=released"]).options.ssim_weight == 0.2
+    assert plan_of(config, {"preset": "default"}, ["preset=paper"]).options.gaussians == 0
 
 
 @pytest.mark.parametrize(

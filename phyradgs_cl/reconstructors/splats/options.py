@@ -1,6 +1,6 @@
-"""Options of the splatting methods, and their presets: ours, the paper's, the released code's."""
+"""Options of the splatting methods, and their presets: ours and the paper's."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import ClassVar
 
 from phyradgs_cl import checks
@@ -42,9 +42,6 @@ class SplatOptions:
     tv_weight: float = checks.ranged(0.01, 0, 1e6)
     tv_edge: int = checks.ranged(32, 1, 4096)
     density_weight: float = checks.ranged(0.001, 0, 1e6)
-    shape_weight: float = checks.ranged(0.0, 0, 1e6)
-    shape_ratio: float = checks.ranged(10.0, 1, 1e6)
-    shape_floor: float = checks.ranged(0.004, 0, 10)
     parameter_terms_from: int = checks.ranged(500, 0, 1_000_000_000)
     cutoff_sigma: float = checks.ranged(DEFAULT_CUTOFF_SIGMA, 0, 100)  # 0 cuts nothing off
     initial_threshold: float = checks.ranged(0.05, 0, 1e6)
@@ -103,14 +100,13 @@ _PAPER = SplatOptions(
     motion=MicroViews(8, 5), gaussians=50_000, iterations=20_000, rates=PUBLISHED_RATES,
     control=PUBLISHED_CONTROL,
 )
-_RELEASED = replace(_PAPER, ssim_weight=0.25, tv_weight=0.05, density_weight=0.01, shape_weight=0.02)
 # a sixth of the iterations, the schedule scaled with them, and two or three segments per frame
 _QUICK = SplatOptions(
     motion=Exact(time_error=0.02), iterations=500, parameter_terms_from=80,
     control=DensityControl(every=20, start_iteration=80),
 )
 
-PRESETS = {"default": SplatOptions(), "quick": _QUICK, "paper": _PAPER, "released": _RELEASED}
+PRESETS = {"default": SplatOptions(), "quick": _QUICK, "paper": _PAPER}
 # R2-Gaussian's constants; its 30,000 iterations are cut to ours unless asked for, rates decay over the run
 R2_PUBLISHED = SplatOptions(
     motion=Static(), affine=True, gaussians=50_000, ssim_weight=0.25, tv_weight=0.05, density_weight=0.0,

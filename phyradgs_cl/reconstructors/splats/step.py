@@ -28,8 +28,8 @@ Corner = tuple[int, int, int]
 
 @dataclass(frozen=True)
 class Batch:
-    """The frames of one step, a corner for each (None if the total variation has no weight), and whether the parameter
-    terms apply (``late``)."""
+    """The frames of one step, a corner for each (None if the total variation has no weight), and whether the density
+    term applies (``late``)."""
 
     frames: list[int]
     corners: list[Corner | None]
@@ -90,12 +90,8 @@ class FrameStep:
         if corner is not None:
             by_volume = self.tv.evaluate(self.crop.forward(gaussians, self.grid, corner))
             self.crop.backward(gaussians, self.grid, by_volume, by_cloud, add=True, weight=options.tv_weight)
-        self.adam.chain(
-            cloud.raw, gaussians.rows, by_cloud, statistics, cloud.count, gaussians.stride,
-            density_weight=options.density_weight if late else 0.0,
-            shape_weight=options.shape_weight if late else 0.0, shape_ratio=options.shape_ratio,
-            shape_floor=options.shape_floor,
-        )
+        own = cloud.raw, gaussians.rows, by_cloud, statistics, cloud.count, gaussians.stride
+        self.adam.chain(*own, density_weight=options.density_weight if late else 0.0)
 
 
 class Alone:
