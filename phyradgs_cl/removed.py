@@ -4,6 +4,7 @@ from phyradgs_cl.errors import InputError
 
 REMOVED = {
     "--method fused": "take --method fista, or start Gaussians from its volume: --method phyradgs --initial VOLUME",
+    "--method asd-pocs: option prior_share": "take --method fista --prior piccs",
     "--preset released": "say --preset paper",
     "--prior curves": "say --prior ridge, the default, or dct",
     "pixel_footprint": "leave it out: pixels see splats at their centres, which gives 0.5 dB more",
@@ -11,7 +12,7 @@ REMOVED = {
     "shape_ratio": "use control.prune_aspect, which removes thin Gaussians",
     "shape_weight": "use control.prune_aspect, which removes thin Gaussians",
 }
-"""By word: a value with its option, or an option as Python spells it."""
+"""By word: a value with its option, or an option as Python spells it, with the method that it left if others keep it."""
 
 
 def refuse_removed(word: str, subject: str = "") -> None:

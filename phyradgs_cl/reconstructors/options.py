@@ -114,10 +114,12 @@ def _changed(options: Any, changes: Mapping[str, Any], subject: str) -> Any:
     values: dict[str, Any] = {}
     for key, value in changes.items():
         if key not in known:
-            refuse_removed(key, f"{subject}: option {key}")
+            place = f"{subject}: option {key}"
+            refuse_removed(key, place)
+            refuse_removed(place)
             names = [*known, *_motion_options(options)]
             remedy = suggest_name(key, names, _having(key) or "leave it out")
-            raise InputError(f"{subject}: option {key}", "no such option", ", ".join(names), remedy)
+            raise InputError(place, "no such option", ", ".join(names), remedy)
         is_function = callable(value) and key in getattr(options, "FUNCTIONS", ())
         values[key] = value if is_function else _converted(known[key], value, f"{subject}: option {key}")
     try:

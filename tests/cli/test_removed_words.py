@@ -9,7 +9,8 @@ WORDS = [word for word in REMOVED if not word.startswith("phyradgs ")]
 
 @pytest.mark.parametrize("word", WORDS)
 def test_a_word_that_left_names_its_replacement(cli, capsys, word) -> None:
-    told = word.split() if word.startswith("--") else ["--set", f"{word}=1"]
+    value, _, option = word.rpartition(": option ")
+    told = word.split() if word.startswith("--") and not value else [*value.split(), "--set", f"{option}=1"]
     assert cli.run(["reconstruct", "scan.h5", "-o", "volume.h5", *told]) == 2
     error = capsys.readouterr().err
     assert error.count("\n") == 1 and "earlier version" in error and error.endswith(f"{REMOVED[word]}\n")
