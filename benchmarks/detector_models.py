@@ -33,7 +33,6 @@ ITERATIONS = {
     "phyradgs": 2000, "phyradgs micro-views": 2000,
 }  # fmt: skip
 ALL = tuple(ITERATIONS)
-WEIGHTED = {"poisson_weight": 10.0}  # of splats, added to L1
 GEOMETRY = ConeGeometry(5.0, 7.0, (PIXELS, PIXELS), (4.0 / PIXELS, 4.0 / PIXELS))
 
 Row = dict[str, object]
@@ -67,9 +66,7 @@ def effects() -> list[Effect]:
         Effect(f"lag {lag:g}", (*few, "sirt"), {"lag": lag}, {}, {"ignore_lag": True}) for lag in (0.1, 0.3)
     ]
     low = {"dose": 300.0, "electronic_noise": 1.0}
-    weights = {"transmission_weights": True}
-    found.append(Effect("low-dose weights", ("sart", "sirt", "fista-tv"), low, weights))
-    found.append(Effect("low-dose weights", ("phyradgs",), low, WEIGHTED))
+    found.append(Effect("low-dose weights", ("fista-tv",), low, {"transmission_weights": True}))
     return found
 
 

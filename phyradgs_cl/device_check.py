@@ -286,14 +286,14 @@ def _moving_backprojections(rt: Runtime) -> Iterator[Comparison]:
 
 
 def _image_terms(rt: Runtime) -> Iterator[Comparison]:
-    rendered, measured, transmission = (_noise(SHAPE, seed) for seed in (8, 9, 10))
+    rendered, measured = _noise(SHAPE, 8), _noise(SHAPE, 9)
     mask = (_noise(SHAPE, 11) > 0.2).astype(np.float32)
-    weights = 0.25, 1.0, 0.3
+    weights = 0.25, 1.0
     loss = terms.ImageLoss(rt, *SHAPE, pitch_of(SHAPE[1]), *weights)
-    x, y, m, t = (rt.upload(pad_rows(image)) for image in (rendered, measured, mask, transmission))
-    found = rt.download(loss.evaluate(x, y, m, float(mask.sum()), t))
+    x, y, m = (rt.upload(pad_rows(image)) for image in (rendered, measured, mask))
+    found = rt.download(loss.evaluate(x, y, m, float(mask.sum())))
     wide = rendered.astype(np.float64), measured.astype(np.float64), mask.astype(np.float64)
-    value, gradient = terms.image_loss(*wide, *weights, transmission)
+    value, gradient = terms.image_loss(*wide, *weights)
     yield unpad_rows(found, SHAPE), gradient, VALUE
     yield np.array(loss.value()), np.array(value), VALUE
 

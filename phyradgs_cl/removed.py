@@ -2,12 +2,16 @@
 
 from phyradgs_cl.errors import InputError
 
+_ALGEBRAIC = "sart", "os-sart", "sirt", "asd-pocs"
+_UNWEIGHTED = [f"--method {method}: option transmission_weights" for method in _ALGEBRAIC]
 REMOVED = {
     "--method fused": "take --method fista, or start Gaussians from its volume: --method phyradgs --initial VOLUME",
     "--method asd-pocs: option prior_share": "take --method fista --prior piccs",
+    **dict.fromkeys(_UNWEIGHTED, "take --method fista or fista-tv, which keep it"),
     "--preset released": "say --preset paper",
     "--prior curves": "say --prior ridge, the default, or dct",
     "pixel_footprint": "leave it out: pixels see splats at their centres, which gives 0.5 dB more",
+    "poisson_weight": "take transmission_weights of --method fista or fista-tv",
     "shape_floor": "use scale_min, the smallest scale",
     "shape_ratio": "use control.prune_aspect, which removes thin Gaussians",
     "shape_weight": "use control.prune_aspect, which removes thin Gaussians",

@@ -177,7 +177,7 @@ def method(rt: Runtime, name: str, motion: str, **more: object) -> None:
     if name in SPLATTING:
         control = {"every": 2, "start_iteration": 0, "threshold": 1e-9}
         changes |= {"gaussians": 6, "tv_edge": 4, "parameter_terms_from": 0}
-        changes |= {"iterations": 3, "poisson_weight": 0.1, "control": control}
+        changes |= {"iterations": 3, "control": control}
     elif name not in ("fdk", "fbp"):
         changes |= {"iterations": 1, **({"sub_intervals": 2} if motion == "per-row" else {})}
     reconstruct(scan, plan_run(name, {**changes, **more}), rt)

@@ -108,23 +108,6 @@ def test_sirt_is_its_definition() -> None:
     np.testing.assert_allclose(algorithm.volume.ravel(), x, rtol=0, atol=ITERATIVE_TWIN)
 
 
-def test_sart_and_sirt_weigh_rays_by_their_light() -> None:
-    """A first pass of all frames at once is a step of SIRT."""
-    system, matrix, _ = dense_system(noise=0.1)
-    system = system.transmission_weighted()
-    transmission = np.exp(-system.measured)
-    transmission /= transmission.mean()
-    np.testing.assert_allclose(system.transmission, transmission, rtol=FLOAT32)
-    rows, columns = weights_of(matrix)[0] * transmission.ravel(), 1 / (matrix.T @ transmission.ravel())
-    sart, sirt = Sart(system, replace(OS_SART, frames_per_subset=6), 0), Sirt(system, SirtOptions())
-    x = np.zeros(matrix.shape[1])
-    for steps in range(1, 5):
-        x = np.maximum(x + columns * (matrix.T @ (rows * (system.measured.ravel() - matrix @ x))), 0)
-        sirt.step()
-        for algorithm in (stepped(sart, 1)[0], sirt) if steps == 1 else (sirt,):
-            np.testing.assert_allclose(algorithm.volume.ravel(), x, rtol=0, atol=ITERATIVE_TWIN)
-
-
 def test_fista_minimises_squares_weighed_by_light(rt) -> None:
     system, matrix, _ = dense_system(noise=1.0)
     system = system.transmission_weighted()

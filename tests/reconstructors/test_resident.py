@@ -37,7 +37,7 @@ def scan() -> Scan:
 
 def options_of(method: str, model: str, iterations: int = 4):
     changes = {"motion": "per-row", "sub_intervals": 2, "iterations": iterations, "detector_model": model}
-    if method in ("sart", "fista", "fista-tv"):
+    if method in ("fista", "fista-tv"):
         changes["transmission_weights"] = True
     if method == "cgls":
         changes["noise_stop"] = 0

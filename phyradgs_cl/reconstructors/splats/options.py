@@ -38,7 +38,6 @@ class SplatOptions:
     gaussians: int = checks.ranged(0, 0, 100_000_000, "--gaussians (0 chooses from the grid)")
     ssim_weight: float = checks.ranged(0.2, 0, 1e6)
     l1_weight: float = checks.ranged(1.0, 0, 1e6)
-    poisson_weight: float = checks.ranged(0.0, 0, 1e6)
     tv_weight: float = checks.ranged(0.01, 0, 1e6)
     tv_edge: int = checks.ranged(32, 1, 4096)
     density_weight: float = checks.ranged(0.001, 0, 1e6)

@@ -55,8 +55,7 @@ class FrameStep:
             time_error=getattr(options.motion, "time_error", DEFAULT_TIME_ERROR),
             intensity_unit=self.frames.intensity_unit, states=states,
         )
-        weights = options.ssim_weight, options.l1_weight, options.poisson_weight
-        self.loss = ImageLoss(rt, lines, width, self.projector.pitch, *weights)
+        self.loss = ImageLoss(rt, lines, width, self.projector.pitch, options.ssim_weight, options.l1_weight)
         z, y, x = (min(options.tv_edge, n) for n in grid.shape)
         self.crop = Voxeliser(rt, (z, y, x), cutoff_sigma=options.cutoff_sigma)
         self.tv = TotalVariation(rt, self.crop.shape, self.crop.pitch)
@@ -85,7 +84,7 @@ class FrameStep:
         options, gaussians, by_cloud = self.options, cloud.gaussians, cloud.gradients
         cells, measured, mask, pixels = self.frames.get(frame)
         rendered = self.projector.forward(gaussians, cells)
-        by_image = self.loss.evaluate(rendered, measured, mask, pixels, self.frames.transmission(frame))
+        by_image = self.loss.evaluate(rendered, measured, mask, pixels)
         self.projector.backward(gaussians, cells, by_image, by_cloud)
         if corner is not None:
             by_volume = self.tv.evaluate(self.crop.forward(gaussians, self.grid, corner))

@@ -62,7 +62,6 @@ class SartOptions(IterativeOptions):
 
     frames_per_subset: frames that are corrected for together, 1 for SART. order: of the frames in a pass: ``spread``
     (neighbours in time far apart in angle), ``random`` (from the seed), ``ordered`` (as recorded).
-    transmission_weights: transmission-weighted (PWLS), W = t/(A 1) and V = 1/(Aᵀ t).
     noise_stop: the run ends when the residual falls to this many times the estimated noise of the measurement (discrepancy
     principle, Morozov 1966); further iterations fit the noise. 0 runs all iterations."""
 
@@ -70,7 +69,6 @@ class SartOptions(IterativeOptions):
     relaxation_reduction: float = checks.ranged(0.999, 1e-6, 1)
     frames_per_subset: int = checks.ranged(1, 1, 1_000_000)
     order: str = "spread"
-    transmission_weights: bool = False  # type: ignore[misc]
     noise_stop: float = checks.ranged(0.0, 0, 1e6)  # type: ignore[misc]
 
     def __post_init__(self) -> None:
@@ -147,11 +145,10 @@ METHOD, OS_METHOD = _method("sart", SartOptions()), _method("os-sart", OS_SART)
 
 @dataclass(frozen=True)
 class SirtOptions(IterativeOptions):
-    """relaxation: λ between 0 and 2. transmission_weights: transmission-weighted (PWLS), R = t/(A 1), C = 1/(Aᵀ t)."""
+    """relaxation: λ between 0 and 2."""
 
     iterations: int = 100
     relaxation: float = ranged(1.0, 1e-6, 2)
-    transmission_weights: bool = False  # type: ignore[misc]
 
 
 class Sirt(Algorithm):
