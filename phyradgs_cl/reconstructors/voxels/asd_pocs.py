@@ -34,12 +34,10 @@ class AsdPocsOptions(SartOptions):
 class AsdPocs(Algorithm):
     """The residual is that of the volume between the SART pass and the TV steps."""
 
-    def __init__(
-        self, system: System, options: AsdPocsOptions, seed: int, descend: TvDescent, epsilon: float
-    ) -> None:
+    def __init__(self, system: System, options: AsdPocsOptions, descend: TvDescent, epsilon: float) -> None:
         super().__init__(system)
         self.options, self.descend, self.epsilon = options, descend, epsilon
-        self.sart = Sart(system, options, seed)
+        self.sart = Sart(system, options)
         self.tv_step = 0.0
 
     def step(self) -> float:
@@ -75,7 +73,7 @@ class AsdPocs(Algorithm):
 def _started(system: System, options: AsdPocsOptions, inputs: MethodInputs) -> AsdPocs:
     start = system.space.array(static_fdk(inputs.rt, inputs.scan, inputs.deformation))
     epsilon = options.residual_share * system.space.norm(system.residual(start))
-    return AsdPocs(system, options, inputs.seed, TvDescent(inputs.rt, inputs.scan.grid.shape), epsilon)
+    return AsdPocs(system, options, TvDescent(inputs.rt, inputs.scan.grid.shape), epsilon)
 
 
 METHOD = voxel_method(
