@@ -16,11 +16,17 @@ REMOVED = {
     "shape_floor": "use scale_min, the smallest scale",
     "shape_ratio": "use control.prune_aspect, which removes thin Gaussians",
     "shape_weight": "use control.prune_aspect, which removes thin Gaussians",
+    "tune": "compare your own values of the option by --holdout 2",
 }
 """By word: a value with its option, or an option as Python spells it, with the method that it left if others keep it."""
 
 
+def removal(word: str, subject: str = "") -> InputError | None:
+    """Returns the error with the replacement if ``word`` has left; ``subject`` names it where the word alone does not."""
+    return InputError(subject or word, "a word of an earlier version", "", REMOVED[word]) if word in REMOVED else None
+
+
 def refuse_removed(word: str, subject: str = "") -> None:
-    """Raises InputError with the replacement if ``word`` has left; ``subject`` names it where the word alone does not."""
-    if word in REMOVED:
-        raise InputError(subject or word, "a word of an earlier version", "", REMOVED[word])
+    """Raises that error."""
+    if (error := removal(word, subject)) is not None:
+        raise error

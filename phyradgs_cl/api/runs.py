@@ -195,8 +195,7 @@ def reconstruct(
     grid: the voxels, in place of the scan's. Or ``size``, ``voxel_mm`` and ``roi_mm`` change parts of the scan's grid, and
     ``margin_mm`` adds a margin that is filled and discarded (docs/methods.md#the-grid).
     holdout: percentage of the pixels that the method does not see; the facts of the result have the error there
-    (docs/methods.md#quality-without-a-truth). tune: "NAME" or "NAME=VALUE,VALUE,VALUE" of an option that trials on this scan
-    choose; the facts have the trials (docs/methods.md#weights-from-the-data).
+    (docs/methods.md#quality-without-a-truth).
     seed: of all random numbers; the same seed on the same device gives the same bits.
 
     report: a function that gets every ``Progress``: every iteration of voxels, and every 50 iterations or ten seconds of

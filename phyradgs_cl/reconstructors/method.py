@@ -35,15 +35,13 @@ class Method:
     """A reconstruction method: its function, and its presets of options, of which the first is the default.
 
     is_resumable: it has checkpoints. is_shared: several ranks can share its work. takes_initial: it can start from a volume.
-    ends_anywhere: its short runs are the beginnings of its long ones. takes_deformation: its object may move.
-    finds_motion: it finds how the object moves or changes."""
+    takes_deformation: its object may move. finds_motion: it finds how the object moves or changes."""
 
     run: Callable[..., Reconstruction]
     presets: Mapping[str, Any]
     is_resumable: bool = True
     is_shared: bool = False
     takes_initial: bool = False
-    ends_anywhere: bool = False
     takes_deformation: bool = False
     finds_motion: bool = False
 

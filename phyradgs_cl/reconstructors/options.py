@@ -13,7 +13,6 @@ from phyradgs_cl.acquisition.motion import MODELS, RAYS, SPLATS, Centres, motion
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.reconstructors.method import METHODS, method_name, method_of
 from phyradgs_cl.reconstructors.preprocess import Preprocessing
-from phyradgs_cl.reconstructors.tune import check_tuning
 from phyradgs_cl.removed import refuse_removed
 from phyradgs_cl.text import suggest_name
 
@@ -22,14 +21,11 @@ _COUNTS = tuple(dict.fromkeys(f.name for model in MODELS for f in fields(model) 
 _ALL = motions_for(RAYS, SPLATS)  # for the user's own methods
 
 
-def method_options(
-    method: object, preset: str | None = None, changes: Mapping[str, Any] | None = None, tune: str = ""
-) -> Any:
+def method_options(method: object, preset: str | None = None, changes: Mapping[str, Any] | None = None) -> Any:
     """Returns the options of a method: a preset with ``changes`` by field name, nested ones as tables.
 
     ``motion``, ``strips``, ``sub_intervals``, ``segments`` and ``time_error`` change the motion model together; ``motion``
-    may be the user's own model. tune: the request to tune an option. Raises InputError for a name that the method lacks,
-    so that no option is ignored."""
+    may be the user's own model. Raises InputError for a name that the method lacks, so that no option is ignored."""
     name, presets = method_name(method), method_of(method).presets
     chosen = next(iter(presets)) if preset is None else preset
     if not isinstance(chosen, str) or chosen not in presets:
@@ -43,10 +39,7 @@ def method_options(
         motion = changes.pop("motion", None)
         counts = {key: value for key in _COUNTS if (value := changes.pop(key, None)) is not None}
         base = replace(base, motion=_motion(name, base, motion, counts))
-    options = _changed(base, changes, f"--method {name}")
-    if tune:
-        check_tuning(tune, name, options, changes, method_of(method).ends_anywhere)
-    return options
+    return _changed(base, changes, f"--method {name}")
 
 
 def preprocessing_of(changes: Mapping[str, Any]) -> Preprocessing:

@@ -30,7 +30,6 @@ from phyradgs_cl.reconstructors import Preprocessing, preprocessing_of
 from phyradgs_cl.reconstructors.fdk import static_fdk
 from phyradgs_cl.reconstructors.preprocess import prepared, stages
 from phyradgs_cl.reconstructors.projected import FramePair, frame_pairs, spread_frames
-from phyradgs_cl.reconstructors.tune import TUNED, is_tuning
 from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.text import plain_text
 
@@ -86,12 +85,6 @@ class Run:
         """The finite numbers of the convergence record."""
         lines: Any = self.stored.provenance.get("record") or []
         return [{k: float(v) for k, v in line.items() if checks.is_number(v)} for line in lines]
-
-    @property
-    def tuned(self) -> Mapping[str, Any] | None:
-        """The trials by which the scan chose an option, where the provenance has them."""
-        trials: Any = self.stored.provenance.get(TUNED)
-        return trials if is_tuning(trials) else None
 
 
 def load_run(path: Path, scan_path: Path | None = None) -> Run:

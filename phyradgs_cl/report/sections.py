@@ -9,7 +9,7 @@ from phyradgs_cl.acquisition.motion import motion_facts
 from phyradgs_cl.prepare import PREPARED_KEY
 from phyradgs_cl.reconstructors.projected import TIMES_PER_LINE, FramePair
 from phyradgs_cl.report import images
-from phyradgs_cl.report.charts import Chart, convergence_charts, histogram, tuning_chart, views_chart
+from phyradgs_cl.report.charts import Chart, convergence_charts, histogram, views_chart
 from phyradgs_cl.report.interactive.atlas import has_depth, space
 from phyradgs_cl.report.interactive.motion import frame_in_motion, object_in_motion
 from phyradgs_cl.report.interactive.viewer import stills, viewer
@@ -94,10 +94,6 @@ def metrics_section(run: Run, views: Sequence[FramePair]) -> Markup | None:
 def convergence_section(run: Run) -> Markup | None:
     charts = convergence_charts(run.record)
     return section("convergence", "Convergence", _charts(charts)) if charts else None
-
-
-def tuning_section(run: Run) -> Markup | None:
-    return section("tuning", "Tuning", _charts([tuning_chart(run.tuned)])) if run.tuned else None
 
 
 def scan_section(run: Run) -> Markup:
