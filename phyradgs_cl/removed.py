@@ -11,6 +11,7 @@ REMOVED = {
     "--preset released": "say --preset paper",
     "--prior curves": "say --prior ridge, the default, or dct",
     "pixel_footprint": "leave it out: pixels see splats at their centres, which gives 0.5 dB more",
+    "median_filter": "use --steps sparks,dead, which mend odd pixels alone",
     "order": "leave it out: neighbours in time are far apart in every pass",
     "poisson_weight": "take transmission_weights of --method fista or fista-tv",
     "shape_floor": "use scale_min, the smallest scale",

@@ -86,7 +86,7 @@ RUN_GROUPS = {
     "Volume": ("voxel_mm", "roi_mm", "margin_mm", "initial", "rows", "slab"),
     "Motion": ("object_motion", "strips", "sub_intervals", "segments", "time_error", "detector_model"),
     "Quality": (
-        *("prior", "preset", "assignments", "holdout", "steps", "median_filter", "ignore_lag", "gaussians", "seed"),
+        *("prior", "preset", "assignments", "holdout", "steps", "ignore_lag", "gaussians", "seed"),
     ),
     "Run": ("device", "memory", "config", "preview", "live", "resume", "checkpoint_every", "profile"),
     "Under mpiexec (docs: cluster.md)": ("batch",),
@@ -125,7 +125,6 @@ RUN_OPTIONS: dict[str, Any] = {
     "ignore_lag": IgnoreLag,
     "steps": Steps,
     "holdout": _asked(float, _HOLDOUT, "0", metavar="PERCENT"),
-    "median_filter": _asked(int, "Median filter of the frames, of 3 or 5 pixels a side.", "0"),
     "device": Device,
     "memory": Memory,
 }

@@ -30,6 +30,7 @@ from phyradgs_cl.reconstructors import Preprocessing, preprocessing_of
 from phyradgs_cl.reconstructors.fdk import static_fdk
 from phyradgs_cl.reconstructors.preprocess import prepared, stages
 from phyradgs_cl.reconstructors.projected import FramePair, frame_pairs, spread_frames
+from phyradgs_cl.removed import REMOVED
 from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.text import plain_text
 
@@ -73,10 +74,11 @@ class Run:
 
     @property
     def preprocessing(self) -> Preprocessing:
-        """The preprocessing of the frames; the usual one where the provenance lacks it."""
+        """The preprocessing of the frames, without what later versions lack; the usual one where the provenance lacks it."""
         table = self.stored.provenance.get("input")
+        known = {name: value for name, value in table.items() if name not in REMOVED} if isinstance(table, Mapping) else {}
         try:
-            return preprocessing_of(dict(table)) if isinstance(table, Mapping) else Preprocessing()
+            return preprocessing_of(known)
         except InputError:
             return Preprocessing()
 

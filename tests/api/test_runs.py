@@ -44,7 +44,7 @@ def test_the_suffix_says_what_is_written(rt, scan, tmp_path) -> None:
 
 def test_options_reach_the_method_and_the_frames(rt, scan) -> None:
     result = api.reconstruct(
-        scan, "sart", motion="per-row", sub_intervals=3, iterations=1, median_filter=3, device=rt
+        scan, "sart", motion="per-row", sub_intervals=3, iterations=1, holdout=3, device=rt
     )
     plain = api.reconstruct(scan, "sart", motion="per-row", sub_intervals=3, iterations=1, device=rt)
     assert result.facts["options"]["motion"]["sub_intervals"] == 3

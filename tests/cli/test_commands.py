@@ -106,7 +106,7 @@ def test_columns_intensity_jitter_pulse_and_lag_are_simulated(cli, reconstructed
         assert (own["pulse_start"][()], own["pulse_length"][()], own["lag"][()]) == (0.86, 0.14, 0.1)
         assert "kinematics" in own
     reconstructed(path, "--iterations", "5")
-    for words in ([], ["--ignore-lag"], ["--median-filter", "3"], ["--set", "median_filter=3"]):
+    for words in ([], ["--ignore-lag"], ["--holdout", "20"], ["--set", "holdout=20"]):
         with h5py.File(reconstructed(path, "--method", "fdk", *words)) as file:
             volumes.append(file["entry/reconstruction/volume"][()])
             facts = json.loads(file["entry/provenance/json"][()])

@@ -16,7 +16,7 @@ def test_a_word_that_left_names_its_replacement(cli, capsys, word) -> None:
     assert error.count("\n") == 1 and "earlier version" in error and error.endswith(f"{REMOVED[word]}\n")
 
 
-@pytest.mark.parametrize("flag", ["--tune"])
+@pytest.mark.parametrize("flag", ["--tune", "--median-filter"])
 def test_a_flag_that_left_names_its_replacement(cli, capsys, flag) -> None:
     assert cli.run(["reconstruct", "scan.h5", "-o", "volume.h5", flag, "3"]) == 2
     assert capsys.readouterr().err.endswith(f"{REMOVED[flag[2:].replace('-', '_')]}\n")

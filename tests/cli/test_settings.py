@@ -61,7 +61,7 @@ def test_a_named_option_wins_over_set_and_set_over_the_file(config: Path) -> Non
         ("preset = ['default']", "preset: "),
         ("size = '4,4,4'", "size: "),
         ("roi_mm = [-inf, inf, 0, 1, 0, 1]", "roi_mm: "),
-        ("median_filter = 4", "median_filter: "),
+        ("holdout = 60", "holdout: "),
         ("method = 'phyradgs'\nrates = 3", "rates: "),
         *((f"method = 'phyradgs'\n[rates]\nposition = {value}", "rates.position: ") for value in ("[nan, 1e-4]", "3")),
         ("method = 'phyradgs'\n[control]\nthreshold = -1", "control.threshold: "),

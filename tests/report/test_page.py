@@ -16,7 +16,7 @@ from phyradgs_cl.acquisition import CircularOrbit, FrameSweeps, Shutter
 from phyradgs_cl.errors import InputError, OutputError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.io import Volume, read_volume, write_scan, write_volume
-from phyradgs_cl.reconstructors import plan_run
+from phyradgs_cl.reconstructors import Preprocessing, plan_run
 from phyradgs_cl.report import Run, load_run, report_page, write_report
 from phyradgs_cl.report import page as page_module
 from phyradgs_cl.report.images import Window
@@ -181,7 +181,7 @@ def test_what_files_say_is_never_a_part_of_the_page(rt, files, small_scan, tmp_p
     write_scan(scan_path, replace(small_scan, title=HOSTILE))
     record = [{"iteration": 1, HOSTILE: 2.0, "loss": HOSTILE}, {"iteration": 2, HOSTILE: 3.0}, HOSTILE]
     options = {"motion": {"name": HOSTILE}, HOSTILE: [HOSTILE]}
-    facts = {"options": options, "input": {"median_filter": HOSTILE}, "record": record}
+    facts = {"options": options, "input": {"holdout": HOSTILE}, "record": record}
     facts |= {"method": HOSTILE, HOSTILE: HOSTILE, "scan": HOSTILE}
     write_volume(volume_path, stored.values, stored.grid, facts, None, {"psnr_db": HOSTILE, HOSTILE: 1})
     write_report(volume_path, tmp_path / "p.html", lambda: rt, scan=scan_path)
@@ -191,6 +191,11 @@ def test_what_files_say_is_never_a_part_of_the_page(rt, files, small_scan, tmp_p
     assert not any(key.startswith("on") for _, attributes in page.elements for key in attributes)
     assert not [image for image in page.all("img") if image["src"] == "x"]
     assert "alert(1)" in page.words  # it is shown, as text
+
+
+def test_what_version_0_2_did_to_the_frames_is_done_again(any_volume, tmp_path) -> None:
+    write_volume(tmp_path / "v.h5", *any_volume, {"input": {"ignore_lag": True, "median_filter": 0}})
+    assert load_run(tmp_path / "v.h5").preprocessing == Preprocessing(ignore_lag=True)
 
 
 def test_a_run_without_its_scan_still_shows_the_volume(files, tmp_path, parse, caplog) -> None:
