@@ -14,6 +14,7 @@ REMOVED = {
     "median_filter": "use --steps sparks,dead, which mend odd pixels alone",
     "order": "leave it out: neighbours in time are far apart in every pass",
     "poisson_weight": "take transmission_weights of --method fista or fista-tv",
+    "rings.method": "leave it out: the pattern comes from the mean over views",
     "shape_floor": "use scale_min, the smallest scale",
     "shape_ratio": "use control.prune_aspect, which removes thin Gaussians",
     "shape_weight": "use control.prune_aspect, which removes thin Gaussians",

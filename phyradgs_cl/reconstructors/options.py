@@ -108,7 +108,7 @@ def _changed(options: Any, changes: Mapping[str, Any], subject: str) -> Any:
     for key, value in changes.items():
         if key not in known:
             place = f"{subject}: option {key}"
-            refuse_removed(key, place)
+            refuse_removed(place.split(": option ", 1)[1].replace(": option ", "."), place)
             refuse_removed(place)
             names = [*known, *_motion_options(options)]
             remedy = suggest_name(key, names, _having(key) or "leave it out")

@@ -76,9 +76,8 @@ class Run:
     def preprocessing(self) -> Preprocessing:
         """The preprocessing of the frames, without what later versions lack; the usual one where the provenance lacks it."""
         table = self.stored.provenance.get("input")
-        known = {name: value for name, value in table.items() if name not in REMOVED} if isinstance(table, Mapping) else {}
         try:
-            return preprocessing_of(known)
+            return preprocessing_of(_kept(table)) if isinstance(table, Mapping) else Preprocessing()
         except InputError:
             return Preprocessing()
 
@@ -87,6 +86,14 @@ class Run:
         """The finite numbers of the convergence record."""
         lines: Any = self.stored.provenance.get("record") or []
         return [{k: float(v) for k, v in line.items() if checks.is_number(v)} for line in lines]
+
+
+def _kept(table: Mapping[str, Any], of: str = "") -> dict[str, Any]:
+    """Returns options by name without those that have left."""
+    return {
+        name: _kept(value, f"{name}.") if isinstance(value, Mapping) else value
+        for name, value in table.items() if f"{of}{name}" not in REMOVED
+    }  # fmt: skip
 
 
 def load_run(path: Path, scan_path: Path | None = None) -> Run:

@@ -16,6 +16,7 @@ from phyradgs_cl.acquisition import CircularOrbit, FrameSweeps, Shutter
 from phyradgs_cl.errors import InputError, OutputError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.io import Volume, read_volume, write_scan, write_volume
+from phyradgs_cl.prepare.rings import RingOptions
 from phyradgs_cl.reconstructors import Preprocessing, plan_run
 from phyradgs_cl.report import Run, load_run, report_page, write_report
 from phyradgs_cl.report import page as page_module
@@ -194,8 +195,9 @@ def test_what_files_say_is_never_a_part_of_the_page(rt, files, small_scan, tmp_p
 
 
 def test_what_version_0_2_did_to_the_frames_is_done_again(any_volume, tmp_path) -> None:
-    write_volume(tmp_path / "v.h5", *any_volume, {"input": {"ignore_lag": True, "median_filter": 0}})
-    assert load_run(tmp_path / "v.h5").preprocessing == Preprocessing(ignore_lag=True)
+    facts = {"ignore_lag": True, "median_filter": 0, "steps": "rings", "rings": {"method": "mean", "window": 5}}
+    write_volume(tmp_path / "v.h5", *any_volume, {"input": facts})
+    assert load_run(tmp_path / "v.h5").preprocessing == Preprocessing(ignore_lag=True, steps="rings", rings=RingOptions(5))
 
 
 def test_a_run_without_its_scan_still_shows_the_volume(files, tmp_path, parse, caplog) -> None:
