@@ -9,7 +9,7 @@ is exact in time, or has micro-views (8x5) by name. Results are one line per run
 
 Effects: intensity (peak line integral 4 and 6; ignored: line integrals are averaged), pulse (all lines share one flash;
 ignored: the beam is always on), lag (0.1 and 0.3; ignored: not undone), low-dose (300 photons; modelled: pixels are
-weighted by their transmission), pixel-area (a pixel is 4 by 4 rays; modelled: splats have a pixel's footprint).
+weighted by their transmission).
 """
 
 from collections.abc import Callable, Iterator
@@ -33,7 +33,6 @@ ITERATIONS = {
     "phyradgs": 2000, "phyradgs micro-views": 2000,
 }  # fmt: skip
 ALL = tuple(ITERATIONS)
-WEIGHTED = {"poisson_weight": 10.0}  # of splats, added to L1
 GEOMETRY = ConeGeometry(5.0, 7.0, (PIXELS, PIXELS), (4.0 / PIXELS, 4.0 / PIXELS))
 
 Row = dict[str, object]
@@ -49,7 +48,6 @@ class Effect:
     modelled: dict[str, object] = field(default_factory=dict)
     ignored: dict[str, object] = field(default_factory=dict)
     pulse: tuple[float, float] | None = None
-    pixel_samples: int = 1
     forget: Callable[[Scan], Scan] = lambda scan: scan  # what the scan file would say if nobody knew
 
 
@@ -68,19 +66,15 @@ def effects() -> list[Effect]:
         Effect(f"lag {lag:g}", (*few, "sirt"), {"lag": lag}, {}, {"ignore_lag": True}) for lag in (0.1, 0.3)
     ]
     low = {"dose": 300.0, "electronic_noise": 1.0}
-    weights = {"transmission_weights": True}
-    found.append(Effect("low-dose weights", ("sart", "sirt", "fista-tv"), low, weights))
-    found.append(Effect("low-dose weights", ("phyradgs",), low, WEIGHTED))
-    on = {"pixel_footprint": True}
-    found.append(Effect("pixel-area", ("phyradgs", "phyradgs micro-views"), {}, on, pixel_samples=4))
+    found.append(Effect("low-dose weights", ("fista-tv",), low, {"transmission_weights": True}))
     return found
 
 
-def scene_of(rt: Runtime, name: str, pixel_samples: int) -> Scene:
+def scene_of(rt: Runtime, name: str) -> Scene:
     box = Grid.cube(VOXELS, 2.0)
     if name.endswith(".h5"):
-        return volume_scene(rt, load_attenuation(name), f"volume {name}", GEOMETRY, box, VOXELS, "rows", pixel_samples)
-    return phantom_scene(rt, name, GEOMETRY, box, VOXELS, "rows", 0, pixel_samples)
+        return volume_scene(rt, load_attenuation(name), f"volume {name}", GEOMETRY, box, VOXELS, "rows")
+    return phantom_scene(rt, name, GEOMETRY, box, VOXELS, "rows", 0)
 
 
 def scan_of(scene: Scene, effect: Effect, seed: int) -> Scan:
@@ -112,7 +106,7 @@ def rows(rt: Runtime, name: str, seed: int, wanted: tuple[str, ...], done: set[t
         missing = [m for m in effect.methods if (Path(name).stem, effect.name, m, seed) not in done]
         if not missing or not effect.name.startswith(wanted):
             continue
-        scan = scan_of(scene_of(rt, name, effect.pixel_samples), effect, seed)
+        scan = scan_of(scene_of(rt, name), effect, seed)
         unaware = effect.forget(scan)
         for method in missing:
             modelled = psnr_db(rt, scan, method, effect.modelled, seed)

@@ -49,7 +49,7 @@ def moving_scan(
 
 
 def plan_of(method: str) -> RunPlan:
-    motion = "exact" if method in ("phyradgs", "fused") else "per-row"
+    motion = "exact" if method == "phyradgs" else "per-row"
     return RunPlan(method, method_options(method, None, {"motion": motion}))
 
 

@@ -1,6 +1,6 @@
 """Compares priors of ``fista`` in the protocol of the default: a line per volume, scan, seed and prior.
 
-    python benchmarks/priors.py VOLUMES docs/results/priors.jsonl --priors dct curves
+    python benchmarks/priors.py VOLUMES docs/results/priors.jsonl --priors dct ridge
     python docs/make_results.py      # the tables
 
 Scans are those of benchmarks/tables, with the photons of ``--doses`` and the numbers of ``--views``. All exposures of a
@@ -19,7 +19,7 @@ from phyradgs_cl.runtime import Runtime
 
 MOTIONS = {"still": Static(), "fly": PerRow()}
 KEYS = ("volume", "kind", "views", "dose", "size", "seed", "prior", "numbers")
-NUMBERS = {"curves": "procedural", "ridge": "procedural"}  # what the numbers were trained on
+NUMBERS = {"ridge": "procedural"}  # what the numbers were trained on
 ARC_DEG = 360.0  # exposed by all views of a fly-scan together
 
 
@@ -38,7 +38,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("volumes")
     parser.add_argument("lines", type=Path)
-    parser.add_argument("--priors", nargs="+", default=["dct", "curves"])
+    parser.add_argument("--priors", nargs="+", default=["dct", "ridge"])
     parser.add_argument("--names", help="with commas; all")
     parser.add_argument("--phantoms", nargs="*", default=[], help="in place of VOLUMES: spheres, shepp-logan, ...")
     parser.add_argument("--size", type=int, default=64)

@@ -7,18 +7,27 @@ The step takes G(v) = Wᵀ g(W v) from a volume v (Goujon, Neumayer and Unser, S
 convolutions of 3³, from 1 to 4 to 16 channels, whose product has zero mean. At noise of deviation σ
 g_i(t) = a_i clip(t, ± σ k_i) − b_i clip(t, ± σ l_i). Σ b_i |Ŵ_i|² ≤ 1 at all frequencies, so the regulariser plus ½‖x‖² is
 convex. Every cube counts by the logarithm of its squared error. The noise is smooth, as on the smaller voxels of ``fista``,
-which the pixels do not resolve. Without ``--volumes``, cubes come from procedural volumes, as for ``curves``
-(train_curves.py). Needs PyTorch, which the extra ``neural`` installs."""
+which the pixels do not resolve. Without ``--volumes``, cubes come from procedural volumes that this script draws, and from
+phantoms: solids with texture, foams, vessels, foot, jaw. Needs PyTorch, which the extra ``neural`` installs."""
 
 import argparse
 import json
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
+import scipy
 import torch
-from train_curves import CUBE, NOISES, cubes_of, file_volumes, procedural_volumes
 
+from phyradgs_cl.fields import Grid
+from phyradgs_cl.importers import load_attenuation
+from phyradgs_cl.metrics.align import block_means
+from phyradgs_cl.phantoms import make_phantom
+
+NOISES = (0.008, 0.016, 0.03, 0.05)  # σ, of a volume's range
+CUBE = 32  # voxels per side
+DRAWN = 128  # voxels per side of procedural volumes, before means of 2³
 MIDDLE, FILTERS = 4, 16  # channels
 TAPS = 3  # along an axis, of either convolution
 RIM = 2 * (TAPS - 1)  # voxels at a cube's faces that lack some filters
@@ -26,6 +35,84 @@ FREQUENCIES = 16, 48  # along an axis, where the gains of filters are computed: 
 NOISE_WIDTH = 0.8  # voxels, of the Gaussian that smooths the noise
 MARGIN = 0.97  # share of b in the file: rounding and more frequencies keep the bound
 BATCH, RATE = 8, 0.01  # cubes of a step, and Adam's first rate
+
+
+def band_of_noise(rng: np.random.Generator, width: float) -> np.ndarray:
+    """Returns periodic noise of deviation 1 (DRAWN, DRAWN, DRAWN), smoothed by a Gaussian of ``width`` voxels."""
+    along = np.exp(-2 * (np.pi * width * np.fft.fftfreq(DRAWN)) ** 2)
+    spectrum = scipy.fft.rfftn(rng.standard_normal((DRAWN,) * 3, np.float32))
+    spectrum *= (along[:, None, None] * along[:, None] * along[: DRAWN // 2 + 1]).astype(np.float32)
+    smooth = scipy.fft.irfftn(spectrum, (DRAWN,) * 3)
+    return smooth / smooth.std()
+
+
+def solids(rng: np.random.Generator) -> np.ndarray:
+    """Returns textured ellipsoids, boxes and shells in air."""
+    places = np.meshgrid(*[np.linspace(-1, 1, DRAWN, dtype=np.float32)] * 3, indexing="ij", sparse=True)
+    volume, grains = np.zeros((DRAWN,) * 3, np.float32), [band_of_noise(rng, width) for width in (0.8, 1.5, 3)]
+    for _ in range(14):
+        centre, half = rng.uniform(-0.6, 0.6, 3), rng.uniform(0.06, 0.45, 3)
+        turn = np.linalg.qr(rng.normal(size=(3, 3)))[0].astype(np.float32)
+        along = [sum(turn[i, j] * (p - centre[j]) for j, p in enumerate(places)) / half[i] for i in range(3)]
+        radius = np.maximum.reduce([abs(a) for a in along]) if rng.random() < 0.4 else np.sqrt(sum(a * a for a in along))
+        inside = radius < 1
+        if rng.random() < 0.3:
+            inside &= radius > rng.uniform(0.6, 0.9)
+        volume[inside] = rng.uniform(0.1, 1) + rng.choice([0, 0.03, 0.1]) * grains[rng.integers(3)][inside]
+    return volume
+
+
+def foam(rng: np.random.Generator) -> np.ndarray:
+    """Returns walls between pores, where a band of noise is near its mean, or grains that touch."""
+    band = band_of_noise(rng, rng.uniform(3, 9))
+    if rng.random() < 0.5:
+        return (abs(band) < rng.uniform(0.25, 0.6)).astype(np.float32)
+    grain = rng.uniform(0.05, 0.2) * band_of_noise(rng, 1.5)
+    return np.where(band > rng.uniform(-0.3, 0.5), 0.7 + grain, 0).astype(np.float32)
+
+
+def vessels(rng: np.random.Generator) -> np.ndarray:
+    """Returns bright tubes along random walks in soft material with texture."""
+    volume = np.float32(0.25) + np.float32(0.03) * band_of_noise(rng, 2.5)
+    for radius in (0.8, 1.2, 1.8, 2.5, 4, 7):
+        marks = np.ones((DRAWN,) * 3, bool)
+        for _ in range(5):
+            heading = np.cumsum(rng.normal(size=(4 * DRAWN, 3)) / 4, 0)
+            path = rng.uniform(0, DRAWN, 3) + np.cumsum(heading / np.linalg.norm(heading, axis=1, keepdims=True), 0) / 2
+            marks[tuple((path.astype(int) % DRAWN).T)] = False
+        volume[scipy.ndimage.distance_transform_edt(marks) < radius] = rng.uniform(0.4, 1)
+    return volume
+
+
+def procedural_volumes(seed: int) -> Iterator[np.ndarray]:
+    """Draws volumes at twice the resolution, so that edges pass through voxels."""
+    rng = np.random.default_rng(seed)
+    for draw in (solids, foam, vessels, solids, foam, solids, foam, vessels):
+        yield block_means(draw(rng), (2, 2, 2))
+    for name in ("foot", "jaw"):
+        for size in (64, 96):
+            yield make_phantom(name, 1.0, size).voxelise(Grid.cube(size, 2.0))
+
+
+def file_volumes(paths: list[Path]) -> Iterator[np.ndarray]:
+    """Loads volumes, at their own resolution and at half of it."""
+    for path in paths:
+        volume = np.asarray(load_attenuation(path).values, np.float32)
+        yield volume
+        yield block_means(volume, (2, 2, 2))
+
+
+def cubes_of(volume: np.ndarray, count: int, rng: np.random.Generator) -> Iterator[np.ndarray]:
+    """Draws cubes that are not flat, in units of the volume's range."""
+    volume = volume / volume.max()
+    for _ in range(20 * count):
+        first = [rng.integers(0, n - CUBE + 1) for n in volume.shape]
+        cube = volume[tuple(slice(f, f + CUBE) for f in first)]
+        if cube.std() > 0.03:
+            yield cube
+            count -= 1
+        if not count:
+            return
 
 
 class Ridge(torch.nn.Module):

@@ -1,5 +1,5 @@
 /* Activations and one step of Adam on the raw parameters of all Gaussians: the chain through softplus,
-   bounded sigmoid and normalisation, the density and shape terms of the objective, the moments, the step.
+   bounded sigmoid and normalisation, the density term of the objective, the moments, the step.
    Twins: fields/gaussians.py and optim/adam.py. */
 #include "common/gaussian.h"
 
@@ -30,13 +30,11 @@ __kernel void activate(
     V_STORE(softplus(V_LOAD(r + 10 * (size_t)stride)), g + 10 * (size_t)stride);
 }
 
-/* dL/dparameter -> dL/draw, in place; adds the regularisers whose gradient needs no image.
-   shape term: weight / count * (relu(longest / shortest - ratio)^2 + relu(floor - shortest)^2) */
+/* dL/dparameter -> dL/draw, in place; adds the regulariser whose gradient needs no image. */
 __kernel void chain_activations(
     __global const float *raw, __global const float *gaussians, const int count, const int stride,
     const float scale_min, const float scale_max,
     const float density_weight,      /* weight / count of the mean density */
-    const float shape_weight, const float shape_ratio, const float shape_floor,
     __global float *gradients,       /* (13, stride) */
     __global float *statistics)      /* (2, stride): sum of centre-gradient norms, iterations in view */
 {
@@ -46,19 +44,10 @@ __kernel void chain_activations(
     __global const float *r = raw + first;
     __global const float *g = gaussians + first;
     __global float *d = gradients + first;
-    vf s[3], ds[3];
     for (int k = 0; k < 3; ++k) {
-        s[k] = V_LOAD(g + (size_t)(ROW_SCALE + k) * stride);
-        ds[k] = V_LOAD(d + (size_t)(ROW_SCALE + k) * stride);
-    }
-    const vf longest = max(s[0], max(s[1], s[2])), shortest = min(s[0], min(s[1], s[2]));
-    const vf excess = max(longest / shortest - shape_ratio, 0.0f), lack = max(shape_floor - shortest, 0.0f);
-    const vf by_longest = 2.0f * shape_weight * excess / shortest;
-    const vf by_shortest = -2.0f * shape_weight * (excess * longest / (shortest * shortest) + lack);
-    for (int k = 0; k < 3; ++k) {
-        const vf total = ds[k] + V_PICK(0.0f, by_longest, s[k] == longest) + V_PICK(0.0f, by_shortest, s[k] == shortest);
-        const vf sigma = (s[k] - scale_min) / (scale_max - scale_min);
-        V_STORE(total * (scale_max - scale_min) * sigma * (1.0f - sigma), d + (size_t)(ROW_SCALE + k) * stride);
+        __global float *at = d + (size_t)(ROW_SCALE + k) * stride;
+        const vf sigma = (V_LOAD(g + (size_t)(ROW_SCALE + k) * stride) - scale_min) / (scale_max - scale_min);
+        V_STORE(V_LOAD(at) * (scale_max - scale_min) * sigma * (1.0f - sigma), at);
     }
     vf length2 = (vf)(0.0f);
     for (int k = 0; k < 4; ++k) {

@@ -1,8 +1,8 @@
 /* Shrinkage of all 4³ block DCTs of a volume, averaged (translation-invariant shrinkage, Coifman and Donoho 1995).
 
-   A coefficient c of the class k of frequencies loses e_k(c) = Σ_m weight_km clamp(c, ±unit knot_m); one knot of weight 1 is
-   the soft threshold. A block's mean loses nothing. The losses of all blocks are added in ``excess``: the result is
-   v − TURNS excess / blocks that cover a voxel, as a map takes one block of TURNS. Volumes are (z, y, pitch) with a guard.
+   A coefficient c loses clamp(c, ±threshold), a block's mean nothing. The losses of all blocks are added in ``excess``: the
+   result is v − TURNS excess / blocks that cover a voxel, as a map takes one block of TURNS. Volumes are (z, y, pitch) with a
+   guard.
    A work-item has one block in registers, and along x a vector of blocks one voxel apart; blocks of one launch do not meet in
    y and z, so that nothing adds at one time. Where work-items are the lanes they do not meet in x either.
    Twin: objective/dct_prox.py. */
@@ -35,18 +35,10 @@ static inline void inverse_4(vf *v, const int step)
     v[3 * step] = outer - slope;
 }
 
-/* Class of a frequency: sets of three of 0 to 3 by their sorted triples, 0 for the mean. The twin's ``CLASSES``. */
-__constant uchar CLASS_OF[BLOCK] = {
-    0, 1, 2, 3, 1, 4, 5, 6, 2, 5, 7, 8, 3, 6, 8, 9, 1, 4, 5, 6, 4, 10, 11, 12, 5, 11, 13, 14, 6, 12, 14, 15,
-    2, 5, 7, 8, 5, 11, 13, 14, 7, 13, 16, 17, 8, 14, 17, 18, 3, 6, 8, 9, 6, 12, 14, 15, 8, 14, 17, 18, 9, 15, 18, 19};
-
-/* What the block(s) at ``corner`` lose, in space. ``curves``: KNOTS knots, then as many weights of each class from 1 on. */
+/* What the block(s) at ``corner`` lose, in space. */
 static inline void shrunk(__global const float *volume, const size_t corner, const int pitch, const size_t slice,
-                          __global const float *curves, const float unit, vf *block)
+                          const float threshold, vf *block)
 {
-    float knot[KNOTS];
-    for (int m = 0; m < KNOTS; m++)
-        knot[m] = unit * curves[m];
     for (int k = 0; k < EDGE; k++)
         for (int j = 0; j < EDGE; j++)
             for (int i = 0; i < EDGE; i++)
@@ -58,14 +50,8 @@ static inline void shrunk(__global const float *volume, const size_t corner, con
     for (int n = 0; n < 16; n++)
         forward_4(block + n, 16);
     block[0] = (vf)(0.0f);
-    for (int n = 1; n < BLOCK; n++) {
-        __global const float *weight = curves + CLASS_OF[n] * KNOTS;
-        const vf size = fabs(block[n]);
-        vf loss = weight[0] * min(size, (vf)(knot[0]));
-        for (int m = 1; m < KNOTS; m++)
-            loss = mad((vf)(weight[m]), min(size, (vf)(knot[m])), loss);
-        block[n] = copysign((vf)(1.0f), block[n]) * loss;
-    }
+    for (int n = 1; n < BLOCK; n++)
+        block[n] = max(min(block[n], (vf)(threshold)), (vf)(-threshold));
     for (int n = 0; n < 16; n++)
         inverse_4(block + n, 16);
     for (int n = 0; n < 16; n++)
@@ -77,7 +63,7 @@ static inline void shrunk(__global const float *volume, const size_t corner, con
 __kernel void dct_excess(
     __global const float *volume, const int4 shape, const int pitch,
     const int4 shift,                /* of the first block, x y z; x counts where work-items are pixels */
-    __global const float *curves, const float unit, __global float *excess)
+    const float threshold, __global float *excess)
 {
     const int y = EDGE * (int)get_global_id(1) + shift.y, z = EDGE * (int)get_global_id(2) + shift.z;
     if (y + EDGE > shape.y || z + EDGE > shape.z)
@@ -94,7 +80,7 @@ __kernel void dct_excess(
     for (int x = 0; x <= last; x += LANES)
 #endif
     {
-        shrunk(volume, row + x, pitch, slice, curves, unit, block);
+        shrunk(volume, row + x, pitch, slice, threshold, block);
         const vf inside = V_PICK(0.0f, 1.0f, (vf)(x) + V_IOTA <= (float)last);
         for (int k = 0; k < EDGE; k++)
             for (int j = 0; j < EDGE; j++) {

@@ -1,7 +1,7 @@
-/* L1 + transmission-weighted squares + D-SSIM of one frame and its gradient, as separable passes over images with zero padding:
-   guard floats, then (lines, pitch), pitch at least width + guard and everything past width zero, so that
-   a window may reach past either end of a line. A work-item takes every get_global_size(0)-th vector of a line: all of them
-   on a CPU, one pixel on a GPU. Twin: objective/image_terms.py. */
+/* L1 + D-SSIM of one frame and its gradient, as separable passes over images with zero padding: guard floats, then
+   (lines, pitch), pitch at least width + guard and everything past width zero, so that a window may reach past either end.
+   A work-item takes every get_global_size(0)-th vector of a line: all of them on a CPU, one pixel on a GPU.
+   Twin: objective/terms.py. */
 #include "common/lanes.h"
 #include "common/group_sums.h"
 
@@ -45,15 +45,13 @@ __kernel void ssim_map(
     __global const float *moments, __global const float *rendered, __global const float *measured,
     __global const float *mask, __constant float *window,
     const int lines, const int width, const int pitch, const float c1, const float c2,
-    __global const float *transmission, /* read only if use_transmission */
-    const int use_transmission,
     __global float *partials,        /* 3 images */
-    __local float *tree,             /* (4, group's items) */
-    __global float *sums)            /* (groups, 4): ssim, |x - y|, masked pixels, transmission (x - y)^2 */
+    __local float *tree,             /* (3, group's items) */
+    __global float *sums)            /* (groups, 3): ssim, |x - y|, masked pixels */
 {
     const int v = (int)get_global_id(1), stop = v < lines ? width : 0;
     const size_t image = IMAGE_GUARD + (size_t)lines * pitch;
-    vf ssim_sum = (vf)(0.0f), l1_sum = ssim_sum, pixels = ssim_sum, squares = ssim_sum;
+    vf ssim_sum = (vf)(0.0f), l1_sum = ssim_sum, pixels = ssim_sum;
     for (int u = (int)get_global_id(0) * LANES; u < stop; u += (int)get_global_size(0) * LANES) {
         const size_t at = IMAGE_GUARD + (size_t)v * pitch + u;
         vf m[5] = {(vf)(0.0f), (vf)(0.0f), (vf)(0.0f), (vf)(0.0f), (vf)(0.0f)};
@@ -76,14 +74,11 @@ __kernel void ssim_map(
         V_STORE(V_PICK(0.0f, by_xy, inside), partials + 2 * image + at);
         const vf weight = V_LOAD(mask + at);
         ssim_sum += V_PICK(0.0f, ssim, inside);
-        const vf difference = V_LOAD(rendered + at) - V_LOAD(measured + at);
-        l1_sum += weight * fabs(difference);
-        if (use_transmission)
-            squares += weight * V_LOAD(transmission + at) * difference * difference;
+        l1_sum += weight * fabs(V_LOAD(rendered + at) - V_LOAD(measured + at));
         pixels += weight;
     }
-    const float own[4] = {v_sum(ssim_sum), v_sum(l1_sum), v_sum(pixels), v_sum(squares)};
-    group_sums(own, 4, tree, sums + 4 * (get_group_id(1) * get_num_groups(0) + get_group_id(0)));
+    const float own[3] = {v_sum(ssim_sum), v_sum(l1_sum), v_sum(pixels)};
+    group_sums(own, 3, tree, sums + 3 * (get_group_id(1) * get_num_groups(0) + get_group_id(0)));
 }
 
 /* rows pass of the three derivative images */
@@ -103,13 +98,11 @@ __kernel void ssim_spread(
     }
 }
 
-/* columns pass, and the gradient l1_weight sign(x - y) + poisson_weight transmission (x - y) - ssim_weight dSSIM/dx */
+/* columns pass, and the gradient l1_weight sign(x - y) - ssim_weight dSSIM/dx */
 __kernel void image_gradient(
     __global const float *spread, __global const float *rendered, __global const float *measured,
     __global const float *mask, __constant float *window,
     const int lines, const int width, const int pitch, const float l1_weight, const float ssim_weight,
-    __global const float *transmission, /* read only if poisson_weight is not 0 */
-    const float poisson_weight,
     __global float *gradient)        /* guard, then (lines, pitch) */
 {
     const int v = (int)get_global_id(1);
@@ -131,10 +124,7 @@ __kernel void image_gradient(
         const vf x = V_LOAD(rendered + at), y = V_LOAD(measured + at);
         const vf by_ssim = m[0] + 2.0f * weight * x * m[1] + weight * y * m[2];
         const vf difference = x - y;
-        const vf sign_of = V_PICK(V_PICK(0.0f, -1.0f, difference < 0.0f), 1.0f, difference > 0.0f);
-        vf by_data = l1_weight * sign_of;
-        if (poisson_weight != 0.0f)
-            by_data += poisson_weight * V_LOAD(transmission + at) * difference;
-        V_STORE(weight * (by_data - ssim_weight * by_ssim), gradient + at);
+        const vf by_l1 = V_PICK(V_PICK(0.0f, -l1_weight, difference < 0.0f), l1_weight, difference > 0.0f);
+        V_STORE(weight * (by_l1 - ssim_weight * by_ssim), gradient + at);
     }
 }

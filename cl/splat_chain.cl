@@ -50,23 +50,16 @@ static inline void add_vector(__global float *rows, const int row, const int str
     V_STORE(V_LOAD(at + 2 * (size_t)stride) + by.z, at + 2 * (size_t)stride);
 }
 
-/* adds dL by G, of which the vectors ray, eu and ev in the Gaussian's own frame are R' G (from_source, eu, ev); by_log_det:
-   dL by log det G, whose derivative by G has G's cofactors over its determinant */
-static inline void add_by_pull(__global float *by_state, __global const float *state, const int stride, const frame3 axes,
-                               const v3 from_source, __global const float *cell, const v3 by_ray, const v3 by_eu, const v3 by_ev,
-                               const vf by_log_det)
+/* Adds the derivative of the loss by the 3x3 map G. G turns from_source, eu and ev into the Gaussian's frame. */
+static inline void add_by_pull(__global float *by_state, const int stride, const frame3 axes, const v3 from_source,
+                               __global const float *cell, const v3 by_ray, const v3 by_eu, const v3 by_ev)
 {
     const v3 x = to_world(axes, by_ray), u = to_world(axes, by_eu), v = to_world(axes, by_ev);
     const v3 eu = v3_make((vf)(cell[CELL_EU]), (vf)(cell[CELL_EU + 1]), (vf)(cell[CELL_EU + 2]));
     const v3 ev = v3_make((vf)(cell[CELL_EV]), (vf)(cell[CELL_EV + 1]), (vf)(cell[CELL_EV + 2]));
-    const v3 a = state_vector(state, 3, stride), b = state_vector(state, 6, stride), c = state_vector(state, 9, stride);
-    const vf per = by_log_det / v3_dot(a, v3_cross(b, c));
-    add_vector(by_state, 3, stride, v3_add(v3_scale(v3_cross(b, c), per), v3_add(v3_scale(from_source, x.x),
-               v3_add(v3_scale(eu, u.x), v3_scale(ev, v.x)))));
-    add_vector(by_state, 6, stride, v3_add(v3_scale(v3_cross(c, a), per), v3_add(v3_scale(from_source, x.y),
-               v3_add(v3_scale(eu, u.y), v3_scale(ev, v.y)))));
-    add_vector(by_state, 9, stride, v3_add(v3_scale(v3_cross(a, b), per), v3_add(v3_scale(from_source, x.z),
-               v3_add(v3_scale(eu, u.z), v3_scale(ev, v.z)))));
+    add_vector(by_state, 3, stride, v3_add(v3_scale(from_source, x.x), v3_add(v3_scale(eu, u.x), v3_scale(ev, v.x))));
+    add_vector(by_state, 6, stride, v3_add(v3_scale(from_source, x.y), v3_add(v3_scale(eu, u.y), v3_scale(ev, v.y))));
+    add_vector(by_state, 9, stride, v3_add(v3_scale(from_source, x.z), v3_add(v3_scale(eu, u.z), v3_scale(ev, v.z))));
 }
 #else
 #define BY_PLACE by_mean
@@ -166,22 +159,6 @@ __kernel void splat_chain(
         const v3 au = v3_mul(scale, mu), av = v3_mul(scale, mv);
         const vf factor = (z / det) * (z / det) * inv_kappa;
         const vf s11 = factor * v3_dot(au, au), s12 = factor * v3_dot(au, av), s22 = factor * v3_dot(av, av);
-        vf drawn11 = s11, drawn12 = s12, drawn22 = s22, t_det = zero; /* S as drawn; derivative by log det S */
-#if FOOTPRINT
-        /* S is drawn as (S + E det S) / delta and the amplitude over sqrt(delta): see widen_by_pixel */
-        const vf pulled_det = DEFORMED ? det / fabs(v3_dot(axes.a, v3_cross(axes.b, axes.c))) : det;
-        const vf root_det = z * z * z * fabs((vf)(cell[CELL_VOLUME])) * rsqrt(kappa) / pulled_det;
-        const vf det_s = root_det * root_det;
-        const vf inv_delta = 1.0f / (1.0f + PIXEL_VARIANCE * ((s11 + s22) + PIXEL_VARIANCE * det_s));
-        drawn11 = (s11 + PIXEL_VARIANCE * det_s) * inv_delta;
-        drawn12 = s12 * inv_delta;
-        drawn22 = (s22 + PIXEL_VARIANCE * det_s) * inv_delta;
-        const vf by_delta = -inv_delta * (s_uu * drawn11 + s_uv * drawn12 + s_vv * drawn22 + 0.5f * w);
-        t_det = PIXEL_VARIANCE * det_s * ((s_uu + s_vv) * inv_delta + PIXEL_VARIANCE * by_delta);
-        s_uu = s_uu * inv_delta + PIXEL_VARIANCE * by_delta;
-        s_uv *= inv_delta;
-        s_vv = s_vv * inv_delta + PIXEL_VARIANCE * by_delta;
-#endif
         const vf t_s = s_uu * s11 + s_uv * s12 + s_vv * s22;
         const v3 by_au = v3_scale(v3_add(v3_scale(au, 2.0f * s_uu), v3_scale(av, s_uv)), factor);
         const v3 by_av = v3_scale(v3_add(v3_scale(av, 2.0f * s_vv), v3_scale(au, s_uv)), factor);
@@ -189,10 +166,10 @@ __kernel void splat_chain(
         v3 by_ray = v3_add(v3_cross(eu, by_mu), v3_cross(ev, by_mv));
         v3 by_eu = v3_cross(by_mu, ray), by_ev = v3_cross(by_mv, ray);
         v3 by_s = v3_add(v3_mul(mu, by_au), v3_mul(mv, by_av));
-        by_s = v3_add(by_s, v3_scale(inv_scale, -2.0f * (t_s + t_det)));
+        by_s = v3_add(by_s, v3_scale(inv_scale, -2.0f * t_s));
 
-        vf by_kappa = -inv_kappa * (t_s + t_det + 0.5f * w);
-        vf by_z = inv_z * (2.0f * t_s + 6.0f * t_det);
+        vf by_kappa = -inv_kappa * (t_s + 0.5f * w);
+        vf by_z = inv_z * (2.0f * t_s);
         v3 by_white = v3_make(zero, zero, zero);
 #if AFFINE
         const vf b1 = zero, b2 = zero;
@@ -218,7 +195,7 @@ __kernel void splat_chain(
 #if DEFORMED
         v3 by_place = v3_make(zero, zero, zero);
         __global float *by_state = by_states + (state - states);
-        add_by_pull(by_state, state, stride, g.axes, straight, cell, by_ray, by_eu, by_ev, 2.0f * t_det);
+        add_by_pull(by_state, stride, g.axes, straight, cell, by_ray, by_eu, by_ev);
 #if AFFINE && !PARALLEL
         by_place = v3_scale(straight, w / v3_dot(straight, straight)); /* a length, which the object's motion leaves alone */
 #endif
@@ -231,8 +208,8 @@ __kernel void splat_chain(
         const vf g_u0 = -(2.0f * (along_u * s_z + across_u * s_c) + b1 * s_b);
         const vf g_v0 = -(2.0f * (along_v * s_z + across_v * s_c) + b2 * s_b);
 #else
-        const vf g_u0 = -(2.0f * (drawn11 * s_u + drawn12 * s_v) + b1 * s_b);
-        const vf g_v0 = -(2.0f * (drawn12 * s_u + drawn22 * s_v) + b2 * s_b);
+        const vf g_u0 = -(2.0f * (s11 * s_u + s12 * s_v) + b1 * s_b);
+        const vf g_v0 = -(2.0f * (s12 * s_u + s22 * s_v) + b2 * s_b);
 #endif
         by_scale = v3_add(by_scale, by_s);
         by_log_density += w;

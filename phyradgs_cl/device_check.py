@@ -4,7 +4,7 @@ Gradients are compared with central differences of the twins. Limits are several
 conforming device, and far below the error of a wrong kernel."""
 
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
@@ -17,7 +17,7 @@ from phyradgs_cl.errors import DeviceError, OutOfMemoryError
 from phyradgs_cl.fields import Activation, Deformation, Grid
 from phyradgs_cl.fields.gaussians import DENSITY, MEAN, QUATERNION, SCALE
 from phyradgs_cl.objective import terms
-from phyradgs_cl.objective.dct_prox import FREQUENCY_CLASSES, Curves, DctProx, dct_prox
+from phyradgs_cl.objective.dct_prox import DctProx, dct_prox
 from phyradgs_cl.objective.ridge import RidgeStep, learned_ridge, ridge_step
 from phyradgs_cl.objective.tv import TvDescent, TvProx, tv_descent, tv_prox
 from phyradgs_cl.operators.splats.binning import TileLists
@@ -286,14 +286,14 @@ def _moving_backprojections(rt: Runtime) -> Iterator[Comparison]:
 
 
 def _image_terms(rt: Runtime) -> Iterator[Comparison]:
-    rendered, measured, transmission = (_noise(SHAPE, seed) for seed in (8, 9, 10))
+    rendered, measured = _noise(SHAPE, 8), _noise(SHAPE, 9)
     mask = (_noise(SHAPE, 11) > 0.2).astype(np.float32)
-    weights = 0.25, 1.0, 0.3
+    weights = 0.25, 1.0
     loss = terms.ImageLoss(rt, *SHAPE, pitch_of(SHAPE[1]), *weights)
-    x, y, m, t = (rt.upload(pad_rows(image)) for image in (rendered, measured, mask, transmission))
-    found = rt.download(loss.evaluate(x, y, m, float(mask.sum()), t))
+    x, y, m = (rt.upload(pad_rows(image)) for image in (rendered, measured, mask))
+    found = rt.download(loss.evaluate(x, y, m, float(mask.sum())))
     wide = rendered.astype(np.float64), measured.astype(np.float64), mask.astype(np.float64)
-    value, gradient = terms.image_loss(*wide, *weights, transmission)
+    value, gradient = terms.image_loss(*wide, *weights)
     yield unpad_rows(found, SHAPE), gradient, VALUE
     yield np.array(loss.value()), np.array(value), VALUE
 
@@ -312,25 +312,21 @@ def _variation(rt: Runtime) -> Iterator[Comparison]:
     found = TvProx(rt, states.shape, weights)(states, 0.2, 4, nonnegative=True)
     yield found, tv_prox(states, 0.2, 4, nonnegative=True, axis_weights=weights), VALUE
     yield DctProx(rt, GRID.shape)(volume, 0.2, 1, nonnegative=True), dct_prox(volume, 0.2, 1, nonnegative=True), VALUE
-    curves = Curves(np.array([1.0, 4.0]), np.linspace(-0.5, 1, 2 * FREQUENCY_CLASSES).reshape(-1, 2))
-    shrunk = DctProx(rt, GRID.shape, curves)(volume, 0.2, 2, nonnegative=False)
-    yield shrunk, dct_prox(volume, 0.2, 2, nonnegative=False, curves=curves), VALUE
     descended = RidgeStep(rt, GRID.shape, learned_ridge())(volume, 0.1, 0.3, nonnegative=False)
     yield descended, ridge_step(volume, 0.1, 0.3, ridge=learned_ridge(), nonnegative=False), VALUE
 
 
 def _optimiser(rt: Runtime) -> Iterator[Comparison]:
     activation, stride, count = Activation(0.01, 0.6), 16, 16
-    weights = terms.ParameterTerms(density_weight=0.3, shape_weight=0.7, shape_ratio=1.5, shape_floor=0.2)
     raw = activation.invert(_cloud(count)).astype(np.float32).astype(np.float64)
     raw[QUATERNION] *= 1.7
     adam, on_device = DeviceAdam(rt, activation), rt.upload(raw, np.float32)
     parameters, gradients, statistics = (rt.zeros((n, stride)) for n in (11, 13, 2))
     adam.activate(on_device, parameters, count, stride)
     yield rt.download(parameters), activation.apply(raw), VALUE
-    adam.chain(on_device, parameters, gradients, statistics, count, stride, **asdict(weights))
+    adam.chain(on_device, parameters, gradients, statistics, count, stride, density_weight=0.3)
     found = rt.download(gradients)[:11]
-    value = lambda rows: np.array(terms.parameter_loss(activation.apply(rows), weights)[0])  # noqa: E731
+    value = lambda rows: np.array(terms.mean_density(activation.apply(rows), 0.3)[0])  # noqa: E731
     yield found, _differences(value, raw), GRADIENT
     rates, moments = np.linspace(0.01, 0.03, 11), rt.zeros((2, 11, stride))
     adam.step(on_device, gradients, moments, stride, rates, 1)

@@ -79,8 +79,7 @@ class _Trials:
     """Short runs of one plan. ``result`` and ``device_bytes`` are of the last and longest."""
 
     def __init__(self, scan: Scan, plan: RunPlan, rt: Runtime) -> None:
-        self.scan, self.rt = scan, rt
-        self.plan = replace(plan, preprocessing=replace(plan.preprocessing, tune=""))  # tuning would repeat in each trial
+        self.scan, self.plan, self.rt = scan, plan, rt
 
     def run(self, iterations: int | None) -> float:
         """Returns the seconds of a number of iterations, or of the method as a whole."""

@@ -132,7 +132,7 @@ def read_config(path: Path | None, option: str = "--config") -> dict[str, Any]:
 
 
 def assignment(text: str) -> dict[str, Any]:
-    """NAME=VALUE as a line of TOML; a value that is not TOML is a word, so that order=random needs no quotes."""
+    """NAME=VALUE as a line of TOML; a value that is not TOML is a word, so that prior=dct needs no quotes."""
     name, sign, value = text.partition("=")
     if not (sign and name.strip()):
         raise InputError("--set", repr(text), "NAME=VALUE", "write for example tv_weight=0.002")

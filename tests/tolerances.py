@@ -36,12 +36,8 @@ MOVING_GRADIENT = 1e-4  # goal 1e-3; at rest 3e-7, at 50 pixels per segment 3e-6
 SEGMENTS_ORDER = 0.16
 EXACT_OVER_MICRO_VIEWS = 1 / 3  # goal of the design at equal time; at the default bound 0.1 to 0.2
 
-# --- intensity model and pixel footprint ----------------------------------------------------------------------
+# --- intensity model ------------------------------------------------------------------------------------------
 INTENSITY_FRAME = 1e-5  # SPLAT_MOVING and a few float32 exponentials
-# sum over pixels of a widened splat over that of its mean over pixel areas, less 1, by σ in pixels
-FOOTPRINT_MASS = {0.05: 0.06, 0.3: 6e-3, 0.5: 3e-4, 1.0: 1e-4, 3.0: 1e-4}  # points: all is lost, 0.034, 7e-4
-# relative L2 against the mean over pixel areas: a Gaussian of a pixel's variance is not the pixel
-FOOTPRINT_AREA = {0.3: 0.04, 0.5: 0.02, 1.0: 2e-3, 3.0: 1e-4}  # points: 0.40, 0.22, 0.058, 6e-3
 
 # --- gradients -----------------------------------------------------------------------------------------------
 GRADIENT = 1e-4  # goal 1e-3; float32 sums over a footprint leave 1e-6 to 2e-5

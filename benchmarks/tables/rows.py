@@ -109,8 +109,6 @@ _FUSED = (
     ),
     Row("FISTA with ridge", "fista", variant="ridge"),
     Row("FISTA with ridge per-row", "fista", "per-row", still="FISTA with ridge", variant="ridge"),
-    Row("Fused", "fused"),
-    Row("Fused exact in time", "fused", "exact", still="Fused"),
 )
 
 

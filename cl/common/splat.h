@@ -59,10 +59,6 @@
 #define LAYERS(count) 1
 #endif
 
-#if FOOTPRINT
-#define PIXEL_VARIANCE 0.08333333333f /* of a uniform pixel, in pixels */
-#endif
-
 /* constants of a cell, floats */
 #define CELL 24
 #define CELL_SOURCE 0     /* 3; PARALLEL: the direction of the rays, reversed */

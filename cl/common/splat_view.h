@@ -25,22 +25,6 @@ ALWAYS_INLINE splat_centre project_centre(__global const coefficient *matrix, co
 /* the splat of common/splat.h; is_drawn: the Gaussian lies in front of the source */
 typedef struct { vf l11, l12, l22, b1, b2, inv_kappa, amplitude; vi is_drawn; } splat_view;
 
-#if FOOTPRINT
-/* Averages the splat over a pixel's area: the pixel's variance E is added to the splat's covariance,
-   (S^-1 + E)^-1 = (S + E det S) / delta with delta = 1 + E tr S + E^2 det S. The mass does not change. */
-ALWAYS_INLINE void widen_by_pixel(splat_view *s)
-{
-    const vf det_s = (s->l11 * s->l22) * (s->l11 * s->l22);
-    const vf trace = s->l11 * s->l11 + s->l12 * s->l12 + s->l22 * s->l22;
-    const vf inv = 1.0f / (1.0f + PIXEL_VARIANCE * (trace + PIXEL_VARIANCE * det_s));
-    const vf wide11 = sqrt((s->l11 * s->l11 + PIXEL_VARIANCE * det_s) * inv);
-    s->l12 = s->l11 * s->l12 * inv / wide11;
-    s->l22 = sqrt(det_s * inv) / wide11;
-    s->l11 = wide11;
-    s->amplitude *= sqrt(inv);
-}
-#endif
-
 ALWAYS_INLINE splat_view view_splat(const gaussian g, __global const float *cell, const vf z)
 {
     splat_view s;
@@ -78,9 +62,6 @@ ALWAYS_INLINE splat_view view_splat(const gaussian g, __global const float *cell
     const vf ray_length = (vf)(1.0f);
 #endif
     s.amplitude = cell[CELL_WEIGHT] * 2.50662827463f * g.density * factor * ray_length;
-#if FOOTPRINT
-    widen_by_pixel(&s);
-#endif
     return s;
 }
 

@@ -85,14 +85,14 @@ def _in_new_memory(rt: Runtime, function: Callable[..., Any], values: Values, sh
 @naming_arguments()
 def splat_operator(
     scan: Scan, motion: str | Motion = "exact", *, affine: bool = False,
-    cutoff_sigma: float = DEFAULT_CUTOFF_SIGMA, pixel_footprint: bool = False, device: Device = None,
+    cutoff_sigma: float = DEFAULT_CUTOFF_SIGMA, device: Device = None,
 ) -> "SplatProjection":
     """Returns a scan's projector Φ (PhyRadGS, Eq. 3): ``Gaussians`` or rows (11, G) to frames (F, rows, columns).
 
     The rows are mean x y z and three scales in mm, quaternion w x y z of any length, density in 1/mm. motion: a model of
     docs/methods.md that splats support. affine: use R2-Gaussian's approximation. cutoff_sigma: the Mahalanobis radius at
-    which a Gaussian ends; 0 never cuts. pixel_footprint: average over the area of a pixel. device: what ``--device``
-    takes, or a Runtime. ``of_densities(gaussians)`` of the result is its linear part: densities (G,) to frames.
+    which a Gaussian ends; 0 never cuts. device: what ``--device`` takes, or a Runtime. ``of_densities(gaussians)`` of the
+    result is its linear part: densities (G,) to frames.
 
     Raises InputError for anything but a Scan, for an unknown motion, and for a cutoff out of range."""
     model = _checked(scan, motion, models.RAYS, models.SPLATS)
@@ -106,7 +106,7 @@ def splat_operator(
         return SplatOperator(
             rt, scan.geometry.detector_shape, [tables[f] for f in chosen], scan.grid.half_longest_mm,
             intensity=merges, affine=affine, cutoff_sigma=cutoff_sigma,
-            time_error=getattr(model, "time_error", DEFAULT_TIME_ERROR), pixel_footprint=pixel_footprint,
+            time_error=getattr(model, "time_error", DEFAULT_TIME_ERROR),
         )
 
     everything = range(scan.frames)

@@ -60,10 +60,9 @@ def save_scan(path: str | Path, scan: Scan) -> None:
 
 
 def load_volume(path: str | Path) -> Reconstruction:
-    """Reads a volume file: volume (nz, ny, nx) in 1/mm, grid, Gaussians, record, facts, disagreement (nz, ny, nx), state,
-    deformation, states.
+    """Reads a volume file: volume (nz, ny, nx) in 1/mm, grid, Gaussians, record, facts, state, deformation, states.
 
-    A disagreement is in 1/mm, where the method has one; only an interrupted run has a state.
+    Only an interrupted run has a state.
     path: the HDF5 file, or a file of ``phyradgs export`` (docs/export.md), which has a volume and a grid only. Raises
     InputError, which names the HDF5 path of the wrong value."""
     file = _checked_path(path)
@@ -75,7 +74,7 @@ def load_volume(path: str | Path) -> Reconstruction:
     stored = read_volume(file)
     facts = dict(stored.provenance)
     record: Any = facts.pop("record", [])
-    of_file = stored.gaussians, record, facts, read_state(file), stored.disagreement, stored.deformation, stored.states
+    of_file = stored.gaussians, record, facts, read_state(file), stored.deformation, stored.states
     return Reconstruction(stored.values, stored.required_grid, *of_file)
 
 
@@ -121,10 +120,8 @@ def save_volume(
         export_stored(stored, format_of(file, "path"), file, "result")
         return
     facts = {**result.facts, "program": f"phyradgs-cl {__version__}", "record": result.record}
-    write_volume(
-        file, result.volume, result.grid, facts, result.gaussians, metrics, result.state, result.disagreement,
-        result.deformation, result.states,
-    )
+    moves = result.deformation, result.states
+    write_volume(file, result.volume, result.grid, facts, result.gaussians, metrics, result.state, *moves)
 
 
 @naming_arguments()
@@ -198,8 +195,7 @@ def reconstruct(
     grid: the voxels, in place of the scan's. Or ``size``, ``voxel_mm`` and ``roi_mm`` change parts of the scan's grid, and
     ``margin_mm`` adds a margin that is filled and discarded (docs/methods.md#the-grid).
     holdout: percentage of the pixels that the method does not see; the facts of the result have the error there
-    (docs/methods.md#quality-without-a-truth). tune: "NAME" or "NAME=VALUE,VALUE,VALUE" of an option that trials on this scan
-    choose; the facts have the trials (docs/methods.md#weights-from-the-data).
+    (docs/methods.md#quality-without-a-truth).
     seed: of all random numbers; the same seed on the same device gives the same bits.
 
     report: a function that gets every ``Progress``: every iteration of voxels, and every 50 iterations or ten seconds of

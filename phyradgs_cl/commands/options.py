@@ -86,22 +86,21 @@ RUN_GROUPS = {
     "Volume": ("voxel_mm", "roi_mm", "margin_mm", "initial", "rows", "slab"),
     "Motion": ("object_motion", "strips", "sub_intervals", "segments", "time_error", "detector_model"),
     "Quality": (
-        *("prior", "preset", "assignments", "tune", "holdout", "steps", "median_filter", "ignore_lag", "gaussians", "seed"),
+        *("prior", "preset", "assignments", "holdout", "steps", "ignore_lag", "gaussians", "seed"),
     ),
     "Run": ("device", "memory", "config", "preview", "live", "resume", "checkpoint_every", "profile"),
     "Under mpiexec (docs: cluster.md)": ("batch",),
 }
 _METHOD = "fdk: analytic; phyradgs, r2: splats; naf, sax-nerf: neural fields; the others: voxels (docs: methods.md)."
 _MOTION = (
-    "Leave it out with fista, fused and phyradgs, which take the scan's motion; with others say per-row. Poses of a "
+    "Leave it out with fista and phyradgs, which take the scan's motion; with others say per-row. Poses of a "
     "frame: one (static, static-start), M×N micro-views, one per line (per-row), or, for splats, integrals over time "
     "(exact), or M×N that move only centres (centres)."
 )
-_PRIOR = "Prior, for fista: ridge, dct, curves, tv, piccs or none; MODULE:NAME: a denoiser of your own."
-_PRESET = "Constants: default, quick, paper, released (phyradgs); published (r2, naf, sax-nerf); a window (fdk)."
+_PRIOR = "Prior, for fista: ridge, dct, tv, piccs or none; MODULE:NAME: a denoiser of your own."
+_PRESET = "Constants: default, quick, paper (phyradgs); published (r2, naf, sax-nerf); a window (fdk)."
 _CONFIG = "TOML file of options, with underscores for dashes (docs: formats.md); the command line wins."
 _SET = "An option of the method by name: --set tv_weight=0.002 (docs: methods.md)."
-_TUNE = "Option that held-out pixels choose: tv_weight, prior_weight=0.4,0.8,1.6, iterations (docs: methods.md)."
 _HOLDOUT = "Pixels hidden from the method, to measure its error on them."
 RUN_OPTIONS: dict[str, Any] = {
     "method": _asked(str, _METHOD, DEFAULT_METHOD, metavar=f"{'|'.join(METHODS)}|MODULE:NAME"),
@@ -126,8 +125,6 @@ RUN_OPTIONS: dict[str, Any] = {
     "ignore_lag": IgnoreLag,
     "steps": Steps,
     "holdout": _asked(float, _HOLDOUT, "0", metavar="PERCENT"),
-    "tune": _asked(str, _TUNE, "none", metavar="NAME[=VALUES]"),
-    "median_filter": _asked(int, "Median filter of the frames, of 3 or 5 pixels a side.", "0"),
     "device": Device,
     "memory": Memory,
 }

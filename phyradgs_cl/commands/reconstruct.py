@@ -27,7 +27,6 @@ from phyradgs_cl.progress import Ticker
 from phyradgs_cl.reconstructors import ProgressReport, Reconstruction, Report, RunPlan
 from phyradgs_cl.reconstructors.moving import motion_line
 from phyradgs_cl.reconstructors.result import COMPARED, MOTION_FOUND, option_facts
-from phyradgs_cl.reconstructors.tune import TUNED, tuning_line
 from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.settings import Settings
 from phyradgs_cl.workflow import load_scan, profile_report, run_reconstruction
@@ -114,8 +113,6 @@ def reconstruct_command(
     if result.states is not None and result.state is None:
         times_s = result.states.times_s
         say(f"states of the object: {len(times_s)}, {times_s[0]:.4g} to {times_s[-1]:.4g} s; the volume is their mean")
-    if TUNED in result.facts:
-        say(tuning_line(result.facts[TUNED]))
     if profile:
         say(profile_report(runtimes[-1], result))
     if result.state is not None:
@@ -142,7 +139,7 @@ def _finish(page: "report.LivePage", result: Reconstruction, scan: Path, output:
             page.become(lambda path: report.write_report(output, path, lambda: rt, scan=scan))
 
 
-@with_run_options("seed", "tune")
+@with_run_options("seed")
 def estimate_command(scan: Scan, settings: Settings, object_motion: ObjectMotion = None) -> None:
     """Estimate the time and memory of a reconstruction, from a few iterations of it."""
     plan = settings.plan(object_motion=object_motion)

@@ -2,7 +2,7 @@
 
 Field of one Gaussian: ρ exp(−½ (x−μ)ᵀ Σ⁻¹ (x−μ)), Σ = R diag(s²) Rᵀ (paper, section 2)."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import scipy
@@ -69,17 +69,6 @@ class Gaussians:
     def scaled(self, length: float, density: float) -> "Gaussians":
         """Returns the cloud with lengths multiplied by ``length`` and densities by ``density``."""
         return Gaussians(self.mean * length, self.scale * length, self.quaternion, self.density * density)
-
-    def averaged(self, box: tuple[float, float, float]) -> "Gaussians":
-        """Returns the cloud blurred by a box with sides x y z, whose variance is added to every Gaussian; mass is kept.
-        Sampled at the centres of voxels of that size it is the mean over a voxel, to the Gaussians' second moments."""
-        if self.count == 0:
-            return self
-        turn = scipy.spatial.transform.Rotation.from_quat(self.quaternion[:, [1, 2, 3, 0]]).as_matrix()
-        covariance = np.einsum("gij,gj,gkj->gik", turn, self.scale.astype(np.float64) ** 2, turn)
-        wider = Gaussians.of_covariance(self.mean, covariance + np.diag(np.square(box)) / 12, self.density)
-        density = self.density * np.prod(self.scale, axis=1) / np.prod(wider.scale, axis=1)
-        return replace(wider, density=density)
 
 
 @dataclass(frozen=True)

@@ -22,11 +22,7 @@ from phyradgs_cl.io.tables import PROVENANCE, read_facts
 from phyradgs_cl.text import plain_text
 
 _DATA = "/entry/reconstruction"
-_VOLUME, _BARE, _DISAGREEMENT = f"{_DATA}/volume", "/volume", f"{_DATA}/disagreement"
-_DISAGREEMENT_MEANS = (
-    "half the RMS difference of two estimates over 3 x 3 x 3 voxels: where the result depends on the method; errors "
-    "common to both are not in it, and it is no confidence interval"
-)
+_VOLUME, _BARE = f"{_DATA}/volume", "/volume"
 _AXES = ("z", "y", "x")
 _GAUSSIANS, _STATE, _STATES = "/entry/gaussians", "/entry/state", "/entry/time_series"
 _CLOUD = {"mean": (3,), "scale": (3,), "quaternion": (4,), "density": ()}
@@ -38,16 +34,14 @@ log = logging.getLogger(__name__)
 @dataclass(frozen=True, eq=False)
 class Volume:
     """Values (nz, ny, nx) float32 in 1/mm and their grid; None for a bare array. A volume file also holds ``provenance``
-    (types as in ``tables.PROVENANCE``), ``gaussians`` float32 in mm and 1/mm, ``metrics`` by name and ``disagreement``: half
-    the RMS difference of two estimates (nz, ny, nx) float32 in 1/mm. deformation: how the object moves whose reference the
-    volume is. states: the object at some times, whose mean the volume is."""
+    (types as in ``tables.PROVENANCE``), ``gaussians`` float32 in mm and 1/mm, and ``metrics`` by name. deformation: how the
+    object moves whose reference the volume is. states: the object at some times, whose mean the volume is."""
 
     values: np.ndarray
     grid: Grid | None
     provenance: dict[str, object] = field(default_factory=dict)
     gaussians: Gaussians | None = None
     metrics: dict[str, object] | None = None
-    disagreement: np.ndarray | None = None
     deformation: Deformation | None = None
     states: States | None = None
 
@@ -77,23 +71,20 @@ class Volume:
 def write_volume(
     path: str | Path, volume: np.ndarray, grid: Grid, provenance: Mapping[str, object],
     gaussians: Gaussians | None = None, metrics: Mapping[str, object] | None = None,
-    state: Mapping[str, np.ndarray] | None = None, disagreement: np.ndarray | None = None,
-    deformation: Deformation | None = None, states: States | None = None,
+    state: Mapping[str, np.ndarray] | None = None, deformation: Deformation | None = None, states: States | None = None,
 ) -> None:
     """Writes a volume (nz, ny, nx) in 1/mm, whole or not at all. ``provenance`` and ``metrics`` are stored as JSON, plain
     values also as attributes; ``gaussians`` as float32; ``state``: arrays and texts from which an interrupted run resumes;
-    ``disagreement`` (nz, ny, nx) in 1/mm; ``deformation``: how the object moves; ``states``: the object at some
-    times. InputError: an array that is not finite or does not fit the grid. OutputError: the file cannot be written."""
-    for name, values in (("volume", volume), ("disagreement", disagreement)):
-        if values is not None:
-            checks.shape(name, values, grid.shape)
-            checks.finite(name, values)
-    arrays = [volume, disagreement, *(state or {}).values(), *([] if gaussians is None else vars(gaussians).values())]
+    ``deformation``: how the object moves; ``states``: the object at some times. InputError: an array that
+    is not finite or does not fit the grid. OutputError: the file cannot be written."""
+    checks.shape("volume", volume, grid.shape)
+    checks.finite("volume", volume)
+    arrays = [volume, *(state or {}).values(), *([] if gaussians is None else vars(gaussians).values())]
     arrays += [] if states is None else [states.volumes]
-    with h5.new_hdf5(path, sum(values.nbytes for values in arrays if values is not None)) as file:
+    with h5.new_hdf5(path, sum(values.nbytes for values in arrays)) as file:
         entry = h5.new_group(file, "entry", "NXentry")
         entry.attrs["default"] = "reconstruction"
-        _write_data(entry, np.asarray(volume, np.float32), grid, disagreement)
+        _write_data(entry, np.asarray(volume, np.float32), grid)
         h5.write_grid(entry, grid)
         _write_facts(entry, "provenance", provenance)
         if metrics is not None:
@@ -129,9 +120,8 @@ def read_volume(path: str | Path) -> Volume:
         values = _read_attenuation(source, _VOLUME, dataset)
         provenance, gaussians, metrics = _read_provenance(source), _read_gaussians(source), _read_metrics(source)
         deformation = None if source.find(DEFORMATION) is None else read_deformation_group(source, DEFORMATION)
-        disagreement = _read_disagreement(source, grid.shape)
         states = _read_states(source, grid.shape)
-        return Volume(values, grid, provenance, gaussians, metrics, disagreement, deformation, states)
+        return Volume(values, grid, provenance, gaussians, metrics, deformation, states)
 
 
 def read_state(path: str | Path) -> dict[str, np.ndarray] | None:
@@ -189,7 +179,6 @@ def volume_summary(path: str | Path) -> dict[str, Any]:
             "shape": grid.shape, "voxel_size_mm": grid.voxel_size_mm, "offset_mm": grid.offset_mm,
             "provenance": _read_provenance(source), "metrics": _read_metrics(source),
             "gaussians": means.shape[0] if means is not None and means.ndim else 0,
-            "disagreement": None if source.optional(_DISAGREEMENT) is None else _DISAGREEMENT,
             **_states_summary(source, grid.shape),
             "sha256": sha256_of(path),
         }
@@ -248,16 +237,12 @@ def _warn_once(path: Path, text: str) -> None:
     log.warning("%s: %s", path, text)
 
 
-def _write_data(entry: h5py.Group, volume: np.ndarray, grid: Grid, disagreement: np.ndarray | None) -> None:
+def _write_data(entry: h5py.Group, volume: np.ndarray, grid: Grid) -> None:
     group = h5.new_group(entry, "reconstruction", "NXdata")
     group.attrs["signal"], group.attrs["axes"] = "volume", list(_AXES)
     group["title"] = "attenuation (1/mm)"
     dataset = group.create_dataset("volume", data=volume)
     dataset.attrs.update(units="1/mm", long_name="attenuation (1/mm)", interpretation="image")
-    if disagreement is not None:
-        group.attrs["auxiliary_signals"] = ["disagreement"]
-        beside = group.create_dataset("disagreement", data=np.asarray(disagreement, np.float32))
-        beside.attrs.update(units="1/mm", long_name="disagreement (1/mm)", description=_DISAGREEMENT_MEANS)
     _write_axes(group, grid)
 
 
@@ -316,14 +301,6 @@ def _grid_of_axes(source: Hdf5Source, shape: tuple[int, ...]) -> Grid:
         centres_mm.append(float(axis_mm[0] + axis_mm[-1]) / 2)
     usual = next((step for step in steps_mm if step is not None), 1.0)  # an axis of one voxel has no spacing
     return Grid(triple(shape), triple(usual if s is None else s for s in steps_mm), triple(centres_mm))
-
-
-def _read_disagreement(source: Hdf5Source, shape: tuple[int, ...]) -> np.ndarray | None:
-    dataset = source.optional(_DISAGREEMENT)
-    if dataset is None:
-        return None
-    checks.shape(source.name(_DISAGREEMENT), dataset, shape)
-    return _read_attenuation(source, _DISAGREEMENT, dataset)
 
 
 def _read_states(source: Hdf5Source, shape: tuple[int, ...]) -> States | None:

@@ -1,8 +1,8 @@
-"""The objective (paper, Eq. 4): image terms, total variation, density and shape terms; TV maps of voxel methods."""
+"""The objective (paper, Eq. 4): image terms, total variation, mean density; TV maps of voxel methods."""
 
-from phyradgs_cl.objective.dct_prox import DctProx, learned_curves
+from phyradgs_cl.objective.dct_prox import DctProx
 from phyradgs_cl.objective.ridge import RidgeStep, learned_ridge
 from phyradgs_cl.objective.terms import ImageLoss, TotalVariation
 from phyradgs_cl.objective.tv import TvDescent, TvProx
 
-__all__ = ["DctProx", "ImageLoss", "RidgeStep", "TotalVariation", "TvDescent", "TvProx", "learned_curves", "learned_ridge"]
+__all__ = ["DctProx", "ImageLoss", "RidgeStep", "TotalVariation", "TvDescent", "TvProx", "learned_ridge"]

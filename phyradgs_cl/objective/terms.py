@@ -1,21 +1,19 @@
-"""Terms of the objective (paper, Eq. 4): image loss, total variation of a small volume, terms of the parameters.
+"""Terms of the objective (paper, Eq. 4): image loss, total variation of a small volume, mean density.
 
-The image loss of one frame is L1 + λ (1 − SSIM). A term for photon noise, λ_P mean(½ t (x − y)²) with transmissions t
-(detector/noise_level.py), is off by default. Eq. 4 prints "+ SSIM"; the paper minimises 1 − SSIM, and so does this module.
-SSIM is that of Wang et al. 2004 (IEEE Trans. Image Process. 13, 600): 11-tap Gaussian window of σ 1.5, zero padding,
+The image loss of one frame is L1 + λ (1 − SSIM). Eq. 4 prints "+ SSIM"; the paper minimises 1 − SSIM, as this
+module. SSIM is that of Wang et al. 2004 (IEEE Trans. Image Process. 13, 600): 11-tap Gaussian window of σ 1.5, zero padding,
 C1 = 0.01², C2 = 0.03².
 
 Total variation is anisotropic, as in R2-Gaussian: the mean absolute difference between neighbouring voxels along z, y and
 x, added up."""
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 import scipy
 
 from phyradgs_cl.checks import ceil_div
-from phyradgs_cl.fields import gaussians as g
+from phyradgs_cl.fields.gaussians import DENSITY
 from phyradgs_cl.runtime import DeviceArray, Runtime
 from phyradgs_cl.runtime.layout import GUARD
 
@@ -28,11 +26,10 @@ class ImageLoss:
     """Loss and gradient of a frame of ``lines`` lines by ``width`` pixels, in the padded image layout."""
 
     def __init__(
-        self, rt: Runtime, lines: int, width: int, pitch: int, ssim_weight: float, l1_weight: float = 1.0,
-        poisson_weight: float = 0.0,
+        self, rt: Runtime, lines: int, width: int, pitch: int, ssim_weight: float, l1_weight: float = 1.0
     ) -> None:
         self.rt, self.lines, self.width, self.pitch = rt, lines, width, pitch
-        self.ssim_weight, self.l1_weight, self.poisson_weight = ssim_weight, l1_weight, poisson_weight
+        self.ssim_weight, self.l1_weight = ssim_weight, l1_weight
         image = GUARD + lines * pitch
         kernels = ("ssim_moments", "ssim_map", "ssim_spread", "image_gradient")
         self._kernels = {name: rt.kernel("loss", name, IMAGE_GUARD=GUARD) for name in kernels}
@@ -40,19 +37,14 @@ class ImageLoss:
         self._partials = rt.zeros(3 * image + GUARD)
         self._spread = rt.zeros(3 * image + GUARD)
         self._window = rt.upload(WINDOW, np.float32)
-        self._sums = rt.zeros((rt.shape_of_lines(width, lines)[2], 4))
+        self._sums = rt.zeros((rt.shape_of_lines(width, lines)[2], 3))
         self.gradient = rt.zeros(image + GUARD)
 
     def evaluate(
-        self, rendered: DeviceArray, measured: DeviceArray, mask: DeviceArray, pixels: float,
-        transmission: DeviceArray | None = None,
+        self, rendered: DeviceArray, measured: DeviceArray, mask: DeviceArray, pixels: float
     ) -> DeviceArray:
-        """Returns dL/drendered, valid until the next call; ``mask`` is 1 where a pixel counts, ``pixels`` its sum.
-
-        ``transmission`` weighs pixels in the Poisson term, and is needed where that term has a weight."""
+        """Returns dL/drendered, valid until the next call; ``mask`` is 1 where a pixel counts, ``pixels`` its sum."""
         rt = self.rt
-        poisson = 0.0 if transmission is None else self.poisson_weight
-        weights = mask if transmission is None else transmission  # not read without a Poisson weight
         vectors = ceil_div(self.width, rt.lanes)
         size = (np.int32(self.lines), np.int32(self.width), np.int32(self.pitch))
         group = rt.group()
@@ -62,7 +54,7 @@ class ImageLoss:
         rt.launch(self._kernels["ssim_moments"], (vectors, self.lines), *images, *size, self._moments, group=group)
         rt.launch(
             self._kernels["ssim_map"], items, self._moments, *images, *size, np.float32(C1), np.float32(C2),
-            weights, poisson != 0, self._partials, rt.local(16 * math.prod(tile)), self._sums, group=tile,
+            self._partials, rt.local(12 * math.prod(tile)), self._sums, group=tile,
         )  # fmt: skip
         rt.launch(
             self._kernels["ssim_spread"], (vectors, self.lines), self._partials, self._window, *size,
@@ -71,21 +63,18 @@ class ImageLoss:
         rt.launch(
             self._kernels["image_gradient"], rt.shape_of_lines(self.pitch, self.lines)[0], self._spread,
             *images, *size, np.float32(self.l1_weight / max(pixels, 1.0)),
-            np.float32(self.ssim_weight / (self.lines * self.width)), weights,
-            np.float32(poisson / max(pixels, 1.0)), self.gradient, group=tile,
+            np.float32(self.ssim_weight / (self.lines * self.width)), self.gradient, group=tile,
         )  # fmt: skip
         return self.gradient
 
     def value(self) -> float:
         """Returns the loss at the last ``evaluate``; waits for the device."""
-        ssim, l1, pixels, squares = self.rt.download(self._sums).astype(np.float64).sum(axis=0)
-        data = (self.l1_weight * l1 + 0.5 * self.poisson_weight * squares) / max(pixels, 1.0)
-        return float(data + self.ssim_weight * (1 - ssim / (self.lines * self.width)))
+        ssim, l1, pixels = self.rt.download(self._sums).astype(np.float64).sum(axis=0)
+        return float(self.l1_weight * l1 / max(pixels, 1.0) + self.ssim_weight * (1 - ssim / (self.lines * self.width)))
 
 
 def image_loss(
-    rendered: np.ndarray, measured: np.ndarray, mask: np.ndarray, ssim_weight: float, l1_weight: float = 1.0,
-    poisson_weight: float = 0.0, transmission: np.ndarray | None = None,
+    rendered: np.ndarray, measured: np.ndarray, mask: np.ndarray, ssim_weight: float, l1_weight: float = 1.0
 ) -> tuple[float, np.ndarray]:
     """Float64 twin: returns the loss and dL/drendered, images (lines, width)."""
     x, y = rendered * mask, measured * mask
@@ -97,9 +86,7 @@ def image_loss(
     by_mean = 2 * my * n2 / (d1 * d2) - 2 * mx * ssim / d1 - 2 * mx * by_xx - my * by_xy
     by_ssim = _blur(by_mean) + 2 * x * _blur(by_xx) + y * _blur(by_xy)
     pixels = max(mask.sum(), 1.0)
-    weights = poisson_weight * (0.0 if transmission is None else transmission)
-    data = (l1_weight * np.abs(x - y) + 0.5 * weights * (x - y) ** 2).sum() / pixels
-    by_data = (l1_weight * np.sign(x - y) + weights * (x - y)) / pixels
+    data, by_data = l1_weight * np.abs(x - y).sum() / pixels, l1_weight * np.sign(x - y) / pixels
     return float(data + ssim_weight * (1 - ssim.mean())), mask * (by_data - ssim_weight * by_ssim / x.size)
 
 
@@ -156,31 +143,10 @@ def _axis_weights(shape: tuple[int, ...]) -> list[float]:
     return [1.0 / (total // n * (n - 1)) if n > 1 else 0.0 for n in shape]
 
 
-@dataclass(frozen=True)
-class ParameterTerms:
-    """Weights of the mean density and of mean relu(longest/shortest − ratio)² + mean relu(floor − shortest)².
-
-    ``shape_floor`` is in half-sides of the volume."""
-
-    density_weight: float = 0.001
-    shape_weight: float = 0.0
-    shape_ratio: float = 10.0
-    shape_floor: float = 0.004
-
-
-def parameter_loss(rows: np.ndarray, terms: ParameterTerms) -> tuple[float, np.ndarray]:
-    """Float64 twin of the terms in ``chain_activations``: the value and its gradient by rows (11, G)."""
-    count = rows.shape[1]
+def mean_density(rows: np.ndarray, weight: float) -> tuple[float, np.ndarray]:
+    """Float64 twin of the term in ``chain_activations``: ``weight`` times the mean, and its gradient by rows (11, G)."""
     gradient = np.zeros_like(rows)
-    if count == 0:
+    if (count := rows.shape[1]) == 0:
         return 0.0, gradient
-    scale = rows[g.SCALE]
-    longest, shortest = scale.max(0), scale.min(0)
-    excess = np.maximum(longest / shortest - terms.shape_ratio, 0)
-    lack = np.maximum(terms.shape_floor - shortest, 0)
-    value = terms.density_weight * rows[g.DENSITY].mean() + terms.shape_weight * (excess**2 + lack**2).mean()
-    gradient[g.DENSITY] = terms.density_weight / count
-    each = 2 * terms.shape_weight / count
-    gradient[g.SCALE] += np.where(scale == longest, each * excess / shortest, 0)
-    gradient[g.SCALE] -= np.where(scale == shortest, each * (excess * longest / shortest**2 + lack), 0)
-    return float(value), gradient
+    gradient[DENSITY] = weight / count
+    return float(weight * rows[DENSITY].mean()), gradient

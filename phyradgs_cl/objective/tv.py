@@ -5,8 +5,7 @@ and Teboulle, IEEE Trans. Image Process. 18 (2009) 2419). Axis weights scale the
 the states of an object that changes, the sum of |differences| between a state and the next one is added.
 
 ``TvDescent`` takes steps of a fixed length, as ASD-POCS does (Sidky and Pan, Phys. Med. Biol. 53 (2008) 4777). Backward
-differences are those of TIGRE; their floor is relative to the volume's values, so that units do not matter. With a prior
-image i it descends (1 − share) TV(x) + share TV(x − i) (Chen, Tang and Leng, Med. Phys. 35 (2008) 660)."""
+differences are those of TIGRE; their floor is relative to the volume's values, so that units do not matter."""
 
 import math
 from collections.abc import Callable
@@ -140,13 +139,10 @@ _SMALLEST, _NOTHING = 1e-6, 1e-30  # floor of the differences, of the volume's R
 
 
 class TvDescent:
-    """Steps of TV descent for volumes of a fixed ``shape`` (z, y, x). image: a prior image of that shape, with its share."""
+    """Steps of TV descent for volumes of a fixed ``shape`` (z, y, x)."""
 
-    def __init__(
-        self, rt: Runtime, shape: tuple[int, int, int], image: np.ndarray | None = None, share: float = 0.0
-    ) -> None:
-        self.rt, self.shape, self.share = rt, shape, share
-        self._image = None if image is None or share == 0 else rt.upload(image, np.float32)
+    def __init__(self, rt: Runtime, shape: tuple[int, int, int]) -> None:
+        self.rt, self.shape = rt, shape
         nz, ny, nx = shape
         self._shape4 = np.array([nx, ny, nz, 0], np.int32)
         self._kernel = rt.kernel("tv_descent", "tv_gradient")
@@ -162,17 +158,10 @@ class TvDescent:
         def descended(x: DeviceArray) -> DeviceArray:
             least = self._least(x)
             for _ in range(count):
-                x = self._space.descend(x, self._slope(x, least), step)
+                x = self._space.descend(x, self._gradient(x, least), step)
             return x
 
         return self._where_it_is(descended, volume)
-
-    def _slope(self, volume: DeviceArray, least: float) -> DeviceArray:
-        slope, space = self._gradient(volume, least), self._space
-        if self._image is None:
-            return slope
-        of_change = self._gradient(space.add(volume, self._image, -1.0), least)
-        return space.add(slope, space.add(of_change, slope, -1.0), self.share)
 
     def _least(self, volume: DeviceArray) -> float:
         return max(_SMALLEST * self._space.norm(volume) / math.sqrt(volume.size), _NOTHING)
@@ -207,16 +196,12 @@ def _least_of(volume: np.ndarray) -> float:
     return max(_SMALLEST * float(np.linalg.norm(volume)) / math.sqrt(volume.size), _NOTHING)
 
 
-def tv_descent(
-    volume: np.ndarray, step: float, count: int, image: np.ndarray | None = None, share: float = 0.0
-) -> np.ndarray:
+def tv_descent(volume: np.ndarray, step: float, count: int) -> np.ndarray:
     """Float64 twin of ``TvDescent``."""
     result = np.array(volume, np.float64)
     least = _least_of(result)
     for _ in range(count):
         gradient = tv_gradient(result, least)
-        if image is not None:
-            gradient = (1 - share) * gradient + share * tv_gradient(result - image, least)
         length = np.linalg.norm(gradient)
         if length == 0:
             break

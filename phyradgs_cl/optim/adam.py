@@ -80,16 +80,14 @@ class DeviceAdam:
 
     def chain(
         self, raw: DeviceArray, parameters: DeviceArray, gradients: DeviceArray, statistics: DeviceArray,
-        count: int, stride: int, *, density_weight: float, shape_weight: float, shape_ratio: float,
-        shape_floor: float,
+        count: int, stride: int, *, density_weight: float,
     ) -> None:
-        """dL/dparameters to dL/draw in place, with the parameter terms (means) added and the statistics gathered."""
+        """dL/dparameters to dL/draw in place, with the term of the mean density added and the statistics gathered."""
         share = 1.0 / max(count, 1)
         self.rt.launch(
             self._chain, stride // self.rt.lanes, raw, parameters, count, stride,
             np.float32(self.activation.scale_min), np.float32(self.activation.scale_max),
-            np.float32(density_weight * share), np.float32(shape_weight * share), np.float32(shape_ratio),
-            np.float32(shape_floor), gradients, statistics, group=self.rt.group(),
+            np.float32(density_weight * share), gradients, statistics, group=self.rt.group(),
         )  # fmt: skip
 
     def step(

@@ -3,9 +3,8 @@
 Over a full turn the mean of all views is the projection of the object averaged around the axis, and symmetric about it. A
 difference between a column and its mirror image is therefore an error of the panel. Its covariance between two independent
 sets of views tells whether there are rings and how strong they are; without rings the frames stay unchanged.
-``mean`` takes the pattern from the mean over views: it denoises the mean in overlapping blocks of cosines with the measured
-strength, and coefficients above the noise belong to the object. ``fitted`` also adds the mean residual of a reconstruction
-with a weak total-variation prior (after Paleo and Mirone, J. Synchrotron Radiat. 22 (2015) 1268)."""
+The pattern comes from the mean over views, which is denoised in overlapping blocks of cosines with the measured strength:
+coefficients above the noise belong to the object."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -22,7 +21,6 @@ from phyradgs_cl.prepare.bad_pixels import axis_column
 from phyradgs_cl.prepare.single_gains import find_single_gains
 from phyradgs_cl.prepare.step import Facts, MakeModel, unmasked_frames
 
-METHODS = ("mean", "fitted")
 _LEAST_FRAMES = 8
 _LEAST_PAIRS = 0.25  # of all columns: with fewer, columns are not compared with their mirror images
 _LEAST_SHARE = 0.25  # of the variance of the mean's noise: weaker patterns are not worth a correction
@@ -35,13 +33,11 @@ _EQUALLY_FAR = 1.15  # largest over smallest distance of the sources from their 
 
 @dataclass(frozen=True)
 class RingOptions:
-    """method: mean or fitted. window: side of the cosine blocks in pixels; only ``fitted`` removes wider patterns."""
+    """window: side of the cosine blocks in pixels; wider patterns stay."""
 
-    method: str = "mean"
     window: int = 10
 
     def __post_init__(self) -> None:
-        checks.one_of("rings.method", self.method, METHODS)
         checks.within("rings.window", self.window, 3, 999)
 
 
@@ -108,10 +104,6 @@ def remove_rings(scan: Scan, options: RingOptions, make_model: MakeModel) -> tup
     if scan.frames < _LEAST_FRAMES or not strength.is_certain:
         return scan, facts
     pattern = _pattern(frames, strength, options.window, column if full_turn else np.inf)
-    if options.method == "fitted":
-        model = make_model(scan)
-        clean = frames - pattern
-        pattern = pattern + (clean - model.frames(model.regularised(clean))).mean(axis=0)
     facts |= {"result": "removed", "rms_change": float(np.sqrt(np.mean(pattern.astype(np.float64) ** 2)))}
     remaining = find_single_gains(means - pattern, mirrored, usable, full_turn)
     if remaining.any:

@@ -23,6 +23,7 @@ from phyradgs_cl import checks
 from phyradgs_cl.acquisition import Motion, Scan, Static
 from phyradgs_cl.errors import InputError, NumericalError
 from phyradgs_cl.reconstructors.result import Reconstruction, function_name, option_facts
+from phyradgs_cl.removed import refuse_removed
 from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.text import suggest_name
 
@@ -34,15 +35,13 @@ class Method:
     """A reconstruction method: its function, and its presets of options, of which the first is the default.
 
     is_resumable: it has checkpoints. is_shared: several ranks can share its work. takes_initial: it can start from a volume.
-    ends_anywhere: its short runs are the beginnings of its long ones. takes_deformation: its object may move.
-    finds_motion: it finds how the object moves or changes."""
+    takes_deformation: its object may move. finds_motion: it finds how the object moves or changes."""
 
     run: Callable[..., Reconstruction]
     presets: Mapping[str, Any]
     is_resumable: bool = True
     is_shared: bool = False
     takes_initial: bool = False
-    ends_anywhere: bool = False
     takes_deformation: bool = False
     finds_motion: bool = False
 
@@ -161,7 +160,6 @@ METHODS = _Methods({
     "fista-tv": "voxels.fista_tv",
     "naf": "neural:NAF",
     "sax-nerf": "neural:SAX_NERF",
-    "fused": "fused",
     "moving": "moving.method",
     "changing": "changing",
     "fdk": "fdk",
@@ -178,6 +176,7 @@ def method_name(method: object) -> str:
     if callable(method):
         return function_name(method)
     if not isinstance(method, str) or ":" not in method:
+        refuse_removed(f"--method {method}".lower())
         expected = f"one of {', '.join(METHODS)}, or package.module:function of your own"
         raise InputError("--method", checks.short_repr(method), expected, suggest_name(method, METHODS, ""))
     return method

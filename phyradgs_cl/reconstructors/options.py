@@ -13,7 +13,7 @@ from phyradgs_cl.acquisition.motion import MODELS, RAYS, SPLATS, Centres, motion
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.reconstructors.method import METHODS, method_name, method_of
 from phyradgs_cl.reconstructors.preprocess import Preprocessing
-from phyradgs_cl.reconstructors.tune import check_tuning
+from phyradgs_cl.removed import refuse_removed
 from phyradgs_cl.text import suggest_name
 
 _COUNTS = tuple(dict.fromkeys(f.name for model in MODELS for f in fields(model) if f.init))
@@ -21,17 +21,15 @@ _COUNTS = tuple(dict.fromkeys(f.name for model in MODELS for f in fields(model) 
 _ALL = motions_for(RAYS, SPLATS)  # for the user's own methods
 
 
-def method_options(
-    method: object, preset: str | None = None, changes: Mapping[str, Any] | None = None, tune: str = ""
-) -> Any:
+def method_options(method: object, preset: str | None = None, changes: Mapping[str, Any] | None = None) -> Any:
     """Returns the options of a method: a preset with ``changes`` by field name, nested ones as tables.
 
     ``motion``, ``strips``, ``sub_intervals``, ``segments`` and ``time_error`` change the motion model together; ``motion``
-    may be the user's own model. tune: the request to tune an option. Raises InputError for a name that the method lacks,
-    so that no option is ignored."""
+    may be the user's own model. Raises InputError for a name that the method lacks, so that no option is ignored."""
     name, presets = method_name(method), method_of(method).presets
     chosen = next(iter(presets)) if preset is None else preset
     if not isinstance(chosen, str) or chosen not in presets:
+        refuse_removed(f"--preset {chosen}")
         having = [other for other, one in METHODS.items() if isinstance(chosen, str) and chosen in one.presets]
         remedy = f"--method {' or '.join(having)} has it" if having else ""
         raise InputError("--preset", checks.short_repr(chosen), f"one of {', '.join(presets)} for --method {name}", remedy)
@@ -41,10 +39,7 @@ def method_options(
         motion = changes.pop("motion", None)
         counts = {key: value for key in _COUNTS if (value := changes.pop(key, None)) is not None}
         base = replace(base, motion=_motion(name, base, motion, counts))
-    options = _changed(base, changes, f"--method {name}")
-    if tune:
-        check_tuning(tune, name, options, changes, method_of(method).ends_anywhere)
-    return options
+    return _changed(base, changes, f"--method {name}")
 
 
 def preprocessing_of(changes: Mapping[str, Any]) -> Preprocessing:
@@ -112,9 +107,12 @@ def _changed(options: Any, changes: Mapping[str, Any], subject: str) -> Any:
     values: dict[str, Any] = {}
     for key, value in changes.items():
         if key not in known:
+            place = f"{subject}: option {key}"
+            refuse_removed(place.split(": option ", 1)[1].replace(": option ", "."), place)
+            refuse_removed(place)
             names = [*known, *_motion_options(options)]
             remedy = suggest_name(key, names, _having(key) or "leave it out")
-            raise InputError(f"{subject}: option {key}", "no such option", ", ".join(names), remedy)
+            raise InputError(place, "no such option", ", ".join(names), remedy)
         is_function = callable(value) and key in getattr(options, "FUNCTIONS", ())
         values[key] = value if is_function else _converted(known[key], value, f"{subject}: option {key}")
     try:

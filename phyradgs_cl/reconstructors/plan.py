@@ -115,7 +115,7 @@ def plan_run(
     own = dict(values or {})
     names = [*preprocessing_names(method, preset), *of_preprocessing]
     preprocessing = preprocessing_of({name: own.pop(name) for name in names if name in own})
-    options = method_options(method, preset, own, preprocessing.tune)
+    options = method_options(method, preset, own)
     checks.whole("--seed", seed, 0, LARGEST_SEED)
     named = method if callable(method) else method_name(method)
     return RunPlan(named, options, preprocessing, int(seed), initial, object_motion)

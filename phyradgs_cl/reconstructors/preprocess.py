@@ -1,11 +1,10 @@
-"""Changes to a scan before any method sees it: another grid, lag removal, the steps of ``prepare``, a median filter."""
+"""Changes to a scan before any method sees it: another grid, lag removal, the steps of ``prepare``."""
 
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 
 import numpy as np
-import scipy
 
 from phyradgs_cl import checks
 from phyradgs_cl.acquisition import LineMiddles, PerRow, Scan
@@ -14,53 +13,36 @@ from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import GridChoice
 from phyradgs_cl.prepare import STEP_FIELDS, Model, PrepareOptions, prepare
 from phyradgs_cl.prepare.chain import one_by_one
-from phyradgs_cl.prepare.step import Facts, unmasked_frames
-from phyradgs_cl.reconstructors.tune import TuningRequest
+from phyradgs_cl.prepare.step import Facts
 from phyradgs_cl.runtime import Runtime
 
-MEDIAN_EDGES = (0, 3, 5)
 MOST_HELD_OUT = 50.0
-_HIDING = ("holdout", "tune")
 
 
 @dataclass(frozen=True)
 class Preprocessing(PrepareOptions, GridChoice):
     """size, voxel_mm, roi_mm, margin_mm: the grid, as in ``GridChoice``. ignore_lag: leave the panel's lag in the frames.
 
-    median_filter: edge of its window in pixels, 0 for none. holdout: percentage of the pixels that the method does not use,
-    for a measure of quality. tune: the option of the method that such pixels choose (``tune/``). steps and a table for each:
+    holdout: percentage of the pixels that the method does not use, for a measure of quality. steps and a table for each:
     as in ``PrepareOptions``."""
 
     ignore_lag: bool = False
-    median_filter: int = 0
     holdout: float = 0.0
-    tune: str = ""
 
     def __post_init__(self) -> None:
         GridChoice.__post_init__(self)
         PrepareOptions.__post_init__(self)
-        checks.one_of("median_filter", self.median_filter, MEDIAN_EDGES)
         checks.within("holdout", self.holdout, 0, MOST_HELD_OUT)
-        if self.tune:
-            TuningRequest.parse(self.tune)
-        if self._hiding and self.median_filter:
-            found = "a median filter, which mixes held-out pixels into their neighbours"
-            raise InputError(f"--{self._hiding[0]}", found, "frames as they are", "leave one of the two out")
-
-    @property
-    def _hiding(self) -> list[str]:
-        """The options in use that hide pixels from the method."""
-        return [name for name in _HIDING if getattr(self, name)]
 
     def facts(self) -> dict[str, object]:
         """Returns the options by name, without those that are not set."""
-        unset = set(_HIDING) - set(self._hiding) | set(STEP_FIELDS)
+        unset = {*STEP_FIELDS, *(() if self.holdout else ("holdout",))}
         plain = {name: value for name, value in asdict(self).items() if name not in unset and value is not None}
         return {**plain, **self.step_facts()}
 
     def check_written(self) -> None:
         """Raises InputError for options that mean nothing in a scan that is written to a file."""
-        for name in [*self._hiding, *(["margin_mm"] if self.margin_mm is not None else [])]:
+        for name in [name for name in ("holdout", "margin_mm") if getattr(self, name)]:
             found, remedy = f"{getattr(self, name)}, without a method", "give it to the reconstruction"
             raise InputError(f"--{name.replace('_', '-')}", found, "none where a scan is prepared", remedy)
 
@@ -69,10 +51,7 @@ def prepared(scan: Scan, options: Preprocessing, rt: Runtime | None = None) -> S
     """Returns the scan for a method, on a grid with its margin; the scan itself if there is nothing to do.
 
     ``rt``: the device of steps that reconstruct and project."""
-    scan = prepare(regrid_and_remove_lag(scan, options), options, partial(reprojection, rt))
-    if options.median_filter > 0:
-        scan = replace(scan, projections=median_frames(scan, options.median_filter))
-    return scan
+    return prepare(regrid_and_remove_lag(scan, options), options, partial(reprojection, rt))
 
 
 def stages(scan: Scan, options: Preprocessing, rt: Runtime) -> Iterator[tuple[str, Scan, Facts]]:
@@ -111,12 +90,3 @@ def reprojection(rt: Runtime | None, scan: Scan) -> Model:
         volume=lambda frames: fdk(of(frames), fdk_options, rt).volume, frames=operator.forward,
         regularised=lambda frames: fista_tv.METHOD.run(of(frames), tv_options, rt).volume,
     )
-
-
-def median_frames(scan: Scan, edge: int) -> np.ndarray:
-    """Returns line integrals (F, rows, columns) float32, each the median of ``edge`` × ``edge`` pixels of its frame.
-
-    Masked pixels are filled in from their row first, so that their values do not reach their neighbours."""
-    frames = unmasked_frames(scan)
-    smooth = [scipy.ndimage.median_filter(frame, size=edge, mode="nearest") for frame in frames]
-    return np.stack(smooth).astype(np.float32)

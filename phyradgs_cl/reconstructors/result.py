@@ -38,9 +38,8 @@ class Reconstruction:
 
     gaussians: the cloud in mm, for methods that have one; record: the convergence record, one dict per report;
     facts: what is needed to make it again (method, options, scales, seconds); state: how to go on, where a run
-    was interrupted; disagreement: how far two estimates are from each other near every voxel, (nz, ny, nx) float32 in 1/mm,
-    of ``fused``; deformation: how the object moves, of ``moving``, whose volume is its reference; states: the object at some
-    times, of ``changing``, whose volume is their mean. Raises InputError for arrays that are not the grid's."""
+    was interrupted; deformation: how the object moves, of ``moving``, whose volume is its reference; states: the object at
+    some times, of ``changing``, whose volume is their mean. Raises InputError for arrays that are not the grid's."""
 
     volume: np.ndarray
     grid: Grid
@@ -48,7 +47,6 @@ class Reconstruction:
     record: list[dict[str, float]] = field(default_factory=list)
     facts: dict[str, Any] = field(default_factory=dict)
     state: State | None = None
-    disagreement: np.ndarray | None = None
     deformation: Deformation | None = None
     states: States | None = None
 
@@ -58,8 +56,6 @@ class Reconstruction:
         checks.shape("volume", self.volume, self.grid.shape)
         if self.states is not None:
             checks.shape("states", self.states.volumes, (None, *self.grid.shape))
-        if self.disagreement is not None:
-            checks.shape("disagreement", self.disagreement, self.grid.shape)
 
     def __repr__(self) -> str:
         voxels, sides = (" × ".join(f"{n:g}" for n in three) for three in (self.grid.shape, self.grid.size_mm))
@@ -87,10 +83,9 @@ class Reconstruction:
         """Returns the part of the result on ``grid``, with all Gaussians, or the result itself outside its grid."""
         if (part := grid.slices_in(self.grid)) is None:
             return self
-        disagreement = None if self.disagreement is None else self.disagreement[part].copy()
         of_all = slice(None), *part
         states = self.states and replace(self.states, volumes=self.states.volumes[of_all].copy())
-        return replace(self, volume=self.volume[part].copy(), grid=grid, disagreement=disagreement, states=states)
+        return replace(self, volume=self.volume[part].copy(), grid=grid, states=states)
 
     @naming_arguments()
     def plot(self, scan: "Scan | None" = None, *, frame: int = 0, device: "str | Runtime | None" = None) -> "Figure":

@@ -1,4 +1,4 @@
-"""Runs a plan on a scan: preprocessing, first volume, margin, tuning, held-out pixels, and the method."""
+"""Runs a plan on a scan: preprocessing, first volume, margin, held-out pixels, and the method."""
 
 import math
 from collections.abc import Callable, Iterator
@@ -37,13 +37,12 @@ from phyradgs_cl.reconstructors.result import (
     Report,
     ignore_progress,
 )
-from phyradgs_cl.reconstructors.tune.trials import tuned
 from phyradgs_cl.runtime import Runtime
 
 # Volumes that voxel methods hold at one time at most (docs/large.md), with two of the intensity model; they hold stacks of
 # all frames too, and one buffer of three volumes.
 _HELD = {"sirt": 8, "sart": 28, "os-sart": 28, "cgls": 11, "asd-pocs": 32, "fista-tv": 16}
-_HELD |= {"fista": 20, "fused": 20, "moving": 28}
+_HELD |= {"fista": 20, "moving": 28}
 _STACKS, _ONE_BUFFER = 12, 3
 _OF_OTHERS = 4  # volumes: the result, and copies in which it is made, checked and written
 _DEVICE_SHARE = 0.9
@@ -82,7 +81,6 @@ def reconstruct(
         options = replace(options, motion=with_times(options.motion, ready, deformation))
     hidden = held_out(ready, preprocessing.holdout) if preprocessing.holdout else None
     visible = ready if hidden is None else with_masked(ready, hidden)
-    run = partial(method_of(plan.method).run, rt=rt, seed=plan.seed)
     box = None if preprocessing.margin_mm is None else preprocessing.of(scan.grid)
 
     def hook(progress: Progress) -> Progress:
@@ -95,10 +93,7 @@ def reconstruct(
         return progress if box is None else progress.mapped(volume=lambda volume, grid: _within(volume, grid, box))
 
     with report.through(hook), _naming_size_that_fits(rt, ready, plan), naming_host_memory():
-        if preprocessing.tune:
-            result = tuned(preprocessing.tune, run, visible, options, rt, report, **more)
-        else:
-            result = run(visible, options, report=report, **more)
+        result = method_of(plan.method).run(visible, options, rt=rt, seed=plan.seed, report=report, **more)
     if result.state is not None:
         result = replace(result, state=with_identity(result.state, identity()))
     if hidden is not None and rt.ranks.rank == 0:

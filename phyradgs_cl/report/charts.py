@@ -94,27 +94,6 @@ def draw_convergence(axes: "Axes", points: Sequence[tuple[float, float]], words:
         axes.set_ylim(bottom=0)
 
 
-def tuning_chart(tuned: Mapping[str, Any]) -> Chart:
-    """Returns a chart of the error on held-out pixels over the tried values of an option, and the chosen value."""
-    caption = f"{tuned['option']}: {number(tuned['chosen'])}, chosen by line integrals that the trials did not see."
-    return caption, chart(lambda axes: draw_tuning(axes, tuned), f"Error over {tuned['option']}", caption)
-
-
-def draw_tuning(axes: "Axes", tuned: Mapping[str, Any]) -> None:
-    """Draws the errors of the tried values, and the chosen value on the curve."""
-    name, chosen, values, errors = (tuned[key] for key in ("option", "chosen", "values", "holdout_rms"))
-    is_log = values[0] > 0
-    along, at = (np.log(values), np.log(chosen)) if is_log else (values, chosen)
-    error = float(np.interp(at, along, errors))
-    axes.plot(values, errors, "o-", color=ACCENT, ms=4)
-    axes.plot([chosen, chosen], [min(errors), error], "--", color=ACCENT)
-    axes.plot(chosen, error, "o", color=ACCENT, ms=9)
-    note(axes, number(chosen), (chosen, error), (0, 10), weight="bold")
-    if is_log:
-        axes.set_xscale("log")
-    style_axes(axes, name, "held-out RMS")
-
-
 def views_chart(key: str, values: object) -> Chart | None:
     """Returns a chart of a correction of every view; None for values that are no numbers, as a file may hold."""
     if not isinstance(values, list) or len(values) < 2 or not all(map(checks.is_number, values)):

@@ -60,7 +60,7 @@ def report_page(run: Run, views: Sequence[FramePair] = (), changes: Sequence[Cha
         "slices": sections.slices_section(run), "metrics": sections.metrics_section(run, views),
         "convergence": sections.convergence_section(run), "motion": sections.motion_section(run),
         "states": sections.states_section(run),
-        "volume": sections.volume_section(run), "tuning": sections.tuning_section(run), **of_scan,
+        "volume": sections.volume_section(run), **of_scan,
         "provenance": sections.provenance_section(run),
     }  # fmt: skip
     shown = {name: part for name, part in parts.items() if part is not None}

@@ -30,7 +30,7 @@ from phyradgs_cl.reconstructors import Preprocessing, preprocessing_of
 from phyradgs_cl.reconstructors.fdk import static_fdk
 from phyradgs_cl.reconstructors.preprocess import prepared, stages
 from phyradgs_cl.reconstructors.projected import FramePair, frame_pairs, spread_frames
-from phyradgs_cl.reconstructors.tune import TUNED, is_tuning
+from phyradgs_cl.removed import REMOVED
 from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.text import plain_text
 
@@ -74,10 +74,10 @@ class Run:
 
     @property
     def preprocessing(self) -> Preprocessing:
-        """The preprocessing of the frames; the usual one where the provenance lacks it."""
+        """The preprocessing of the frames, without what later versions lack; the usual one where the provenance lacks it."""
         table = self.stored.provenance.get("input")
         try:
-            return preprocessing_of(dict(table)) if isinstance(table, Mapping) else Preprocessing()
+            return preprocessing_of(_kept(table)) if isinstance(table, Mapping) else Preprocessing()
         except InputError:
             return Preprocessing()
 
@@ -87,11 +87,13 @@ class Run:
         lines: Any = self.stored.provenance.get("record") or []
         return [{k: float(v) for k, v in line.items() if checks.is_number(v)} for line in lines]
 
-    @property
-    def tuned(self) -> Mapping[str, Any] | None:
-        """The trials by which the scan chose an option, where the provenance has them."""
-        trials: Any = self.stored.provenance.get(TUNED)
-        return trials if is_tuning(trials) else None
+
+def _kept(table: Mapping[str, Any], of: str = "") -> dict[str, Any]:
+    """Returns options by name without those that have left."""
+    return {
+        name: _kept(value, f"{name}.") if isinstance(value, Mapping) else value
+        for name, value in table.items() if f"{of}{name}" not in REMOVED
+    }  # fmt: skip
 
 
 def load_run(path: Path, scan_path: Path | None = None) -> Run:

@@ -9,7 +9,7 @@ from phyradgs_cl.acquisition.motion import motion_facts
 from phyradgs_cl.prepare import PREPARED_KEY
 from phyradgs_cl.reconstructors.projected import TIMES_PER_LINE, FramePair
 from phyradgs_cl.report import images
-from phyradgs_cl.report.charts import Chart, convergence_charts, histogram, tuning_chart, views_chart
+from phyradgs_cl.report.charts import Chart, convergence_charts, histogram, views_chart
 from phyradgs_cl.report.interactive.atlas import has_depth, space
 from phyradgs_cl.report.interactive.motion import frame_in_motion, object_in_motion
 from phyradgs_cl.report.interactive.viewer import stills, viewer
@@ -22,11 +22,6 @@ _MOST_ROWS = 400  # of a table
 _STATES = 5
 _MOST_CHARTS, _MOST_COMBINATIONS = 6, 20  # of a calibration
 _ABSURD = 1e9  # no parameter of our files is larger
-_DISAGREEMENT = (
-    "Half the RMS of the difference of the two estimates over 3³ voxels, in the middle slices. It shows where the volume "
-    "depends on the method. It is no confidence interval: both estimates use the same frames, and it lacks the errors that "
-    "they share. In our measurements the volume's error is 1.5 to 3.5 times as large."
-)
 
 
 def slices_section(run: Run) -> Markup:
@@ -40,7 +35,7 @@ def slices_section(run: Run) -> Markup:
         words += "; the page has evenly chosen slices of them"
     if not has_depth(stored.values):
         words += "; there is no picture in 3D of a volume one voxel thick"
-    return section("slices", "Slices", note(words + "."), viewer(planes, windows), _disagreement(run, planes))
+    return section("slices", "Slices", note(words + "."), viewer(planes, windows))
 
 
 def states_section(run: Run) -> Markup | None:
@@ -79,16 +74,6 @@ def volume_section(run: Run) -> Markup | None:
     return None if picture is None else section("volume", "Volume in 3D", picture, hidden=True)
 
 
-def _disagreement(run: Run, planes: Sequence[images.Plane]) -> Markup | None:
-    values = run.stored.disagreement
-    if values is None:
-        return None
-    high = images.grey_range(values)[1]
-    heading = element("h3", "Disagreement of voxels and splats", id="disagreement")
-    pictures = images.stills_of(planes, values, (0.0, high))
-    return joined(heading, note(_DISAGREEMENT), stills(pictures, "disagreement", high))
-
-
 def metrics_section(run: Run, views: Sequence[FramePair]) -> Markup | None:
     """Numbers against the truth, and against the measurement where frames were computed."""
     facts: dict[str, object] = dict(run.metrics)
@@ -109,10 +94,6 @@ def metrics_section(run: Run, views: Sequence[FramePair]) -> Markup | None:
 def convergence_section(run: Run) -> Markup | None:
     charts = convergence_charts(run.record)
     return section("convergence", "Convergence", _charts(charts)) if charts else None
-
-
-def tuning_section(run: Run) -> Markup | None:
-    return section("tuning", "Tuning", _charts([tuning_chart(run.tuned)])) if run.tuned else None
 
 
 def scan_section(run: Run) -> Markup:

@@ -174,9 +174,7 @@ def _reconstructed(
                 target = output if result.state is None else partial_path(output)
                 provenance = _provenance(result, scan_hash, plan, path, rt)
                 parts = result.volume, result.grid, provenance, result.gaussians, metrics or None
-                write_volume(
-                    target, *parts, disagreement=result.disagreement, deformation=result.deformation, states=result.states
-                )
+                write_volume(target, *parts, deformation=result.deformation, states=result.states)
                 _keep_checkpoint(output, result)
                 _warn_of_residual(path, result)
     except signals.InterruptedAfterwards:

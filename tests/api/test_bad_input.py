@@ -177,7 +177,6 @@ ARGUMENTS: list[tuple[str, Callable[..., object], dict[str, list[Any]]]] = [
         lambda volume, noise: volume * np.nan, lambda volume, noise: "cleaned", lambda volume: volume],
     }),
     ("reconstruct", partial(reconstruct, GOOD), {"prior_share": [0.7], "prior": ["dtc"]}),
-    ("reconstruct", partial(reconstruct, GOOD, "asd-pocs"), {"prior_share": [0.5]}),
     ("simulate", partial(api.simulate, "foot"), {"scanner": ["none"]}),
     ("splat_operator", partial(splat_operator, GOOD), {"cutoff_sigma": [-1]}),
     ("voxel_operator", partial(voxel_operator, GOOD.grid), {"cutoff_sigma": [-1]}),

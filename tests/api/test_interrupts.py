@@ -102,7 +102,7 @@ def test_another_run_is_not_gone_on_with(rt, scan) -> None:
         (replace(scan, projections=scan.projections[::-1]), {}, "scan"),
         (replace(scan, pixel_mask=mask), {}, "scan"),
         (scan, {"seed": 1}, "seed"),
-        (scan, {"median_filter": 3}, "input.median_filter"),
+        (scan, {"holdout": 3}, "input.holdout"),
         (scan, {"initial": partial}, "initial"),
         (scan, {"grid": wider}, "grid"),
     ]:

@@ -44,7 +44,7 @@ RECONSTRUCT = {
     "--detector-model: found no such option of --method fdk": ("--method fdk --detector-model intensity",),
     "--resume": ("--resume",),
     "--iteration-count": ("--iteration-count 5",),
-    "--median-filter": ("--median-filter 4",),
+    "--holdout": ("--holdout 60",),
     "--set": ("--set tv_weight", "--set 'x y=3'"),
     "tv_weight": ("--set tv_weigth=3", "--set tv_weight=much"),
     "magic": ("--set method=magic",),

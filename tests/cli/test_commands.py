@@ -106,14 +106,14 @@ def test_columns_intensity_jitter_pulse_and_lag_are_simulated(cli, reconstructed
         assert (own["pulse_start"][()], own["pulse_length"][()], own["lag"][()]) == (0.86, 0.14, 0.1)
         assert "kinematics" in own
     reconstructed(path, "--iterations", "5")
-    for words in ([], ["--ignore-lag"], ["--median-filter", "3"], ["--set", "median_filter=3"]):
+    for words in ([], ["--ignore-lag"], ["--holdout", "20"], ["--set", "holdout=20"]):
         with h5py.File(reconstructed(path, "--method", "fdk", *words)) as file:
             volumes.append(file["entry/reconstruction/volume"][()])
             facts = json.loads(file["entry/provenance/json"][()])
         assert facts["input"]["ignore_lag"] == ("--ignore-lag" in words)
     assert np.abs(volumes[0] - volumes[1]).max() > 0 and np.abs(volumes[0] - volumes[2]).max() > 0
     np.testing.assert_array_equal(volumes[2], volumes[3])
-    micro_views, sart = ["--motion", "micro-views"], ["--method", "sart", "--set", "order=random"]
+    micro_views, sart = ["--motion", "micro-views"], ["--method", "sart"]
     for words in (micro_views, [*sart, *micro_views], [*sart, "--detector-model", "log"]):
         reconstructed(path, *words, "--iterations", "1")
     assert "averages intensity" not in caplog.text  # none of these merges poses without a model of intensity

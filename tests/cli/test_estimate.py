@@ -133,12 +133,12 @@ def test_the_words_of_reconstruct(cli, refused, scan, monkeypatch) -> None:
         raise KeyboardInterrupt
 
     monkeypatch.setattr("phyradgs_cl.commands.reconstruct.estimate", fake)
-    before = ["--detector-model", "intensity", "--median-filter", "3", "--ignore-lag"]
+    before = ["--detector-model", "intensity", "--holdout", "3", "--ignore-lag"]
     for words in (["--strips", "2", "--sub-intervals", "1"], ["--segments", "2", "--time-error", "0.01"]):
         cli.run(["estimate", str(scan), "--method", "phyradgs", *words, *before])
     for plan in plans:
         assert plan.options.detector_model == "intensity"
-        assert (plan.preprocessing.median_filter, plan.preprocessing.ignore_lag) == (3, True)
+        assert (plan.preprocessing.holdout, plan.preprocessing.ignore_lag) == (3, True)
     micro, exact = (plan.options.motion for plan in plans)
     assert (micro.name, micro.strips, micro.sub_intervals) == ("micro-views", 2, 1)
     assert (exact.name, exact.segments, exact.time_error) == ("exact", 2, 0.01)

@@ -44,11 +44,11 @@ def test_a_step_that_finds_nothing_says_none(cli, simulated, tmp_path, capsys) -
 
 def test_a_configuration_file_says_the_same(cli, simulated, tmp_path, capsys) -> None:
     config = tmp_path / "steps.toml"
-    config.write_text('steps = "rings"\n[rings]\nmethod = "mean"\nwindow = 5\n')
+    config.write_text('steps = "rings"\n[rings]\nwindow = 5\n')
     command = ["prepare", str(simulated(*SPOILT)), "-o", str(tmp_path / "clean.h5"), "--config", str(config), "--json"]
     assert cli.run(command) == 0
     (step,) = json.loads(capsys.readouterr().out.splitlines()[-1])["steps"]
-    assert step["options"] == {"method": "mean", "window": 5}
+    assert step["options"] == {"window": 5}
 
 
 def test_bad_input_is_one_line_and_loses_nothing(refused, simulated, tmp_path) -> None:

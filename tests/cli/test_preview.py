@@ -16,7 +16,7 @@ GRID = Grid.cube(4, 2.0)
 @pytest.mark.parametrize(
     "words",
     [
-        "--method phyradgs --iterations 60 --gaussians 60 --set pixel_footprint=true",
+        "--method phyradgs --iterations 60 --gaussians 60",
         "--method sirt --iterations 3",
     ],
 )

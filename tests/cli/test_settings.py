@@ -45,7 +45,7 @@ def test_a_named_option_wins_over_set_and_set_over_the_file(config: Path) -> Non
     assert plan_of(config, {}, ["iterations=2"]).options.iterations == 2
     found = plan_of(config, {"iterations": 3, "seed": 3}, ["iterations=2", "seed=2"])
     assert (found.options.iterations, found.seed) == (3, 3)
-    assert plan_of(config, {"preset": "default"}, ["preset=released"]).options.ssim_weight == 0.2
+    assert plan_of(config, {"preset": "default"}, ["preset=paper"]).options.gaussians == 0
 
 
 @pytest.mark.parametrize(
@@ -61,7 +61,7 @@ def test_a_named_option_wins_over_set_and_set_over_the_file(config: Path) -> Non
         ("preset = ['default']", "preset: "),
         ("size = '4,4,4'", "size: "),
         ("roi_mm = [-inf, inf, 0, 1, 0, 1]", "roi_mm: "),
-        ("median_filter = 4", "median_filter: "),
+        ("holdout = 60", "holdout: "),
         ("method = 'phyradgs'\nrates = 3", "rates: "),
         *((f"method = 'phyradgs'\n[rates]\nposition = {value}", "rates.position: ") for value in ("[nan, 1e-4]", "3")),
         ("method = 'phyradgs'\n[control]\nthreshold = -1", "control.threshold: "),

@@ -21,7 +21,7 @@ def stored(tmp_path):
     rows = np.arange(5 * 11.0).reshape(5, 11)
     gaussians = Gaussians(rows[:, :3], rows[:, 3:6], rows[:, 6:10], rows[:, 10])
     parts = PROVENANCE, gaussians, {"psnr_db": np.float64(31.5)}
-    write_volume(tmp_path / "volume.h5", volume, GRID, *parts, disagreement=volume / 7)
+    write_volume(tmp_path / "volume.h5", volume, GRID, *parts)
     return tmp_path / "volume.h5", volume, gaussians
 
 
@@ -34,13 +34,11 @@ def test_everything_comes_back(stored) -> None:
     for name, values in vars(gaussians).items():
         np.testing.assert_array_equal(getattr(again.gaussians, name), values)
     facts = volume_summary(path)
-    assert facts["shape"] == (2, 3, 4) and facts["gaussians"] == 5 and facts["disagreement"] == f"/{DISAGREEMENT}"
-    np.testing.assert_array_equal(again.disagreement, volume / 7)
+    assert facts["shape"] == (2, 3, 4) and facts["gaussians"] == 5
     assert facts["sha256"] == hashlib.sha256(path.read_bytes()).hexdigest() == sha256_of(path)
     write_volume(path, np.zeros(GRID.shape), GRID, {})
     again = read_volume(path)
     assert again.gaussians is None and again.metrics is None and again.provenance == {}
-    assert again.disagreement is None and volume_summary(path)["disagreement"] is None
 
 
 def test_viewers_find_signal_axes_and_plain_facts(stored) -> None:
@@ -50,9 +48,6 @@ def test_viewers_find_signal_axes_and_plain_facts(stored) -> None:
         assert group.attrs["NX_class"] == "NXdata" and group.attrs["signal"] == "volume"
         assert list(group.attrs["axes"]) == ["z", "y", "x"]
         assert group["volume"].attrs["units"] == "1/mm" and group["x"].attrs["units"] == "mm"
-        beside = file[DISAGREEMENT].attrs
-        assert list(group.attrs["auxiliary_signals"]) == ["disagreement"] and beside["units"] == "1/mm"
-        assert "no confidence interval" in beside["description"]
         np.testing.assert_allclose(group["x"], 0.3 + np.array([-1.5, -0.5, 0.5, 1.5]))
         np.testing.assert_allclose(group["z"], 0.1 + np.array([-0.75, 0.75]))
         assert [len(group[axis]) for axis in "zyx"] == list(volume.shape)
@@ -70,20 +65,17 @@ def test_the_axes_alone_give_the_grid(stored) -> None:
 
 
 def test_volumes_that_do_not_fit_are_refused(tmp_path) -> None:
-    good = np.zeros(GRID.shape)
     for wrong in (np.zeros((2, 3, 5)), np.full(GRID.shape, np.nan), np.zeros(3)):
-        for name, volume, beside in (("volume", wrong, None), ("disagreement", good, wrong)):
-            with pytest.raises(InputError, match=f"^{name}: "):
-                write_volume(tmp_path / "v.h5", volume, GRID, {}, disagreement=beside)
+        with pytest.raises(InputError, match="^volume: "):
+            write_volume(tmp_path / "v.h5", wrong, GRID, {})
     assert list(tmp_path.iterdir()) == []
 
 
-VOLUME, DISAGREEMENT = "entry/reconstruction/volume", "entry/reconstruction/disagreement"
+VOLUME = "entry/reconstruction/volume"
 # beyond tests/corpus, which damages every object of a volume in every way
 DAMAGE = {
     "other shape": (VOLUME, np.zeros((3, 3, 4))),
-    "another disagreement": (DISAGREEMENT, np.zeros((2, 3, 3))),
-    "NaN in it": (DISAGREEMENT, np.full(GRID.shape, np.nan)),
+    "NaN in it": (VOLUME, np.full(GRID.shape, np.nan)),
     "voxels": ("entry/grid/voxel_size", [1.0, 0.0, 1.0]),
     "facts a list": ("entry/provenance/json", "[1]"),
     "a negative scale": ("entry/gaussians/scale", -np.ones((5, 3))),

@@ -5,7 +5,7 @@ import pytest
 import scipy.fft
 from tolerances import FLOAT32, FLOAT64
 
-from phyradgs_cl.objective.dct_prox import CLASSES, Curves, DctProx, dct_prox
+from phyradgs_cl.objective.dct_prox import DctProx, dct_prox
 
 SHAPES = [(5, 6, 7), (4, 4, 33), (17, 4, 20), (9, 11, 16), (3, 8, 8), (1, 1, 1)]
 
@@ -23,31 +23,6 @@ def test_the_kernel_is_its_twin(any_rt, shape) -> None:
     np.testing.assert_array_equal(prox(volume, 0.4, turn, nonnegative=nonnegative), any_rt.download(found))
     prox(on_device, 0.4, turn, nonnegative=nonnegative, out=on_device)  # in place, the same bits
     np.testing.assert_array_equal(any_rt.download(on_device), any_rt.download(found))
-
-
-@pytest.mark.parametrize("shape", [(5, 6, 7), (9, 11, 20)])
-def test_the_kernel_applies_a_curve_to_each_class(any_rt, shape) -> None:
-    rng = np.random.default_rng(4)
-    volume = rng.normal(size=shape).astype(np.float32)
-    curves = Curves(np.float32([0.5, 1, 3]), rng.normal(size=(19, 3)).astype(np.float32) / 3)
-    for turn in range(4):
-        found = DctProx(any_rt, shape, curves)(volume, 0.4, turn, nonnegative=turn > 1)
-        expected = dct_prox(volume, 0.4, turn, nonnegative=turn > 1, curves=curves)
-        np.testing.assert_allclose(found, expected, rtol=0, atol=FLOAT32)
-
-
-def test_a_curve_acts_on_its_own_class_alone() -> None:
-    """One block that holds one frequency; its class loses all, or nothing."""
-    for frequency in ((0, 0, 1), (2, 0, 1), (3, 3, 3)):
-        values = np.zeros((4, 4, 4))
-        values[frequency] = 5.0
-        block = scipy.fft.idctn(values, norm="ortho")
-        own = np.zeros((19, 1))
-        own[CLASSES[frequency] - 1] = 1
-        np.testing.assert_allclose(dct_prox(block, 9, 0, nonnegative=False, curves=Curves(np.ones(1), 1 - own)), block)
-        turns = [dct_prox(block, 9, turn, nonnegative=False, curves=Curves(np.ones(1), own)) for turn in range(4)]
-        np.testing.assert_allclose(np.mean(turns, 0), 0, atol=FLOAT64)
-    assert np.bincount(CLASSES.ravel()).tolist() == [1] + [3] * 3 + [3, 6, 6, 3, 6, 3, 1, 3, 3, 3, 6, 3, 1, 3, 3, 1]
 
 
 def mean_of_turns(volume: np.ndarray, threshold: float) -> np.ndarray:

@@ -111,13 +111,6 @@ def test_descent_kernel_is_its_twin(any_rt, shape) -> None:
     np.testing.assert_array_equal(volume, before)  # the caller keeps his
 
 
-@pytest.mark.parametrize("share", [0.0, 0.4, 1.0])
-def test_descent_with_a_prior_image_is_its_twin(any_rt, share) -> None:
-    volume, image = random_weights((4, 5, 19)), random_weights((4, 5, 19))[::-1].copy()
-    found = TvDescent(any_rt, volume.shape, image, share)(volume, 0.05, 5)
-    np.testing.assert_allclose(found, tv_descent(volume, 0.05, 5, image, share), rtol=0, atol=TV_MAP)
-
-
 def test_descent_twin_is_differentiated_right(finite_differences) -> None:
     volume = random_weights((3, 4, 5))
 

@@ -57,7 +57,7 @@ NEURAL = ("naf", "sax-nerf")  # PyTorch, no kernel of ours
 FREEZES = ("a GPU's", "a GPU's without float64")  # builds, and cases, in which unwritten memory cannot be looked for
 NOT_INLINED = ("splat_prepare",)
 # "moving": the last frame of move_rows counts as unwritten, though memory full of NaN comes back without one.
-VECTORS_OR_FREEZES = ("moving", "asd-pocs", "fista", "fused", "phyradgs", "r2", "nothing", "operators")
+VECTORS_OR_FREEZES = ("moving", "asd-pocs", "fista", "phyradgs", "r2", "nothing", "operators")
 BUILDS = {
     "lanes 1": {"lanes": 1}, "a GPU's": {"lanes": 1, "pixel_items": True},
     "float pairs": {"lanes": 1, "fp64": False},
@@ -107,7 +107,7 @@ def cloud(count: int) -> np.ndarray:
 
 OPTIONS = {
     "exact": {}, "affine, whole": {"affine": True, "cutoff_sigma": 0.0},
-    "intensity, pixels": {"intensity_unit": 2.0, "pixel_footprint": True},
+    "intensity": {"intensity_unit": 2.0},
 }
 MODELS: dict[str, Callable[..., TimeCells]] = {
     "still": static_cells, "micro-views": lambda *where: micro_view_cells(*where, 2, 2),
@@ -176,11 +176,10 @@ def method(rt: Runtime, name: str, motion: str, **more: object) -> None:
     changes: dict[str, object] = {"motion": motion}
     if name in SPLATTING:
         control = {"every": 2, "start_iteration": 0, "threshold": 1e-9}
-        changes |= {"gaussians": 6, "tv_edge": 4, "parameter_terms_from": 0, "shape_weight": 0.1}
-        changes |= {"iterations": 3, "poisson_weight": 0.1, "control": control}
+        changes |= {"gaussians": 6, "tv_edge": 4, "parameter_terms_from": 0}
+        changes |= {"iterations": 3, "control": control}
     elif name not in ("fdk", "fbp"):
         changes |= {"iterations": 1, **({"sub_intervals": 2} if motion == "per-row" else {})}
-        changes |= {"voxel_iterations": 1} if name == "fused" else {}
     reconstruct(scan, plan_run(name, {**changes, **more}), rt)
 
 
@@ -203,7 +202,7 @@ def cases() -> dict[str, Callable[[Runtime], None]]:
         for options in OPTIONS:
             found[f"splats {model} {options}"] = partial(splats, model=model, options=options)
     for name in [name for name in METHODS if name not in NEURAL]:
-        for motion in ("static", "exact" if name in (*SPLATTING, "fused") else "per-row"):
+        for motion in ("static", "exact" if name in SPLATTING else "per-row"):
             found[f"{name} {motion}"] = partial(method, name=name, motion=motion)
     for name, motion in (("fdk", "static"), ("fdk", "per-row"), ("sirt", "per-row"), ("phyradgs", "exact")):
         found[f"moving {name} {motion}"] = partial(moving, name=name, motion=motion)

@@ -33,11 +33,10 @@ def test_frames_and_gradients_are_those_of_the_twin(rt, make_cloud, make_geometr
 
 
 def test_every_way_to_build_the_kernels(any_rt, make_cloud, make_geometry) -> None:
-    """With the cutoff and pixels' areas, on every shape of launch."""
+    """With the cutoff and without it, on every shape of launch."""
     table, rows = frame_cells("centres", make_geometry(*SHAPE)), make_cloud(4, 22, scale=(0.05, 0.3))
-    wide = {"pixel_footprint": True, "cutoff_sigma": 0.0}
-    expected = moving_frame(rows, table, SHAPE, pixel_variance=1 / 12)
-    assert_near(splat(any_rt, rows, table, SHAPE, **wide), expected, SPLAT_MOVING)
+    expected = moving_frame(rows, table, SHAPE)
+    assert_near(splat(any_rt, rows, table, SHAPE, cutoff_sigma=0.0), expected, SPLAT_MOVING)
     h = random_weights(SHAPE)
     whole, cut = (splat_gradients(any_rt, rows, table, h, cutoff_sigma=sigma) for sigma in (0.0, 6.0))
     assert_classes(cut, whole, 1e-4)

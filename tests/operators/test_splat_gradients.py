@@ -81,8 +81,7 @@ def test_quaternion_gradient_is_tangent(rt, make_cloud, make_table) -> None:
 ROUNDING = 1 + 3e-6 * np.array([[1.0], [0.0], [-1.0]])  # what three equal steps of Adam may leave
 
 
-ROUNDED = [("static", {}), ("micro-views", {"affine": True}), ("static", {"pixel_footprint": True})]
-ROUNDED += [("exact", options) for options in ({}, {"affine": True}, {"pixel_footprint": True})]
+ROUNDED = [("static", {}), ("micro-views", {"affine": True}), ("exact", {}), ("exact", {"affine": True})]
 
 
 @pytest.mark.parametrize(("motion", "options"), ROUNDED, ids=str)
@@ -119,7 +118,7 @@ def test_what_is_not_drawn_has_no_gradient(any_rt, make_cloud, make_geometry, on
     assert np.all(np.isfinite(found)) and np.any(found[:, 0])
 
 
-@pytest.mark.parametrize("options", [{}, {"affine": True}, {"cutoff_sigma": 0.0}, {"pixel_footprint": True}], ids=str)
+@pytest.mark.parametrize("options", [{}, {"affine": True}, {"cutoff_sigma": 0.0}], ids=str)
 @pytest.mark.parametrize("motion", ["static", "micro-views", "exact"])
 def test_a_group_sums_what_one_item_sums(make_cloud, make_geometry, motion, options) -> None:
     """Lines are walked within the cutoff there and from side to side of a box here: thin, tilted, cut by the border."""

@@ -46,10 +46,8 @@ def gradients(rt, rows, table, one, h, **options) -> np.ndarray:
 
 
 def check_frame_and_gradients(rt, finite_differences, rows, table, one, affine=False, **options) -> None:
-    footprint = {"pixel_variance": 1 / 12} if options.get("pixel_footprint") else {}
-
     def twin(r: np.ndarray) -> np.ndarray:
-        return deformed_frame(r, table, SHAPE, one, affine, **footprint)
+        return deformed_frame(r, table, SHAPE, one, affine)
 
     h = random_weights(SHAPE)
     assert_near(render(rt, rows, table, one, affine=affine, **options), twin(rows), SPLAT_MOVING)
@@ -93,12 +91,6 @@ def test_parallel_rays(rt, make_cloud, finite_differences, motion) -> None:
     where = orbit, Shutter(0.8, 0.6), 0, 0.2, SHAPE[0]
     table = static_cells(*where) if motion == "static" else exact_cells(*where, 1)
     check_frame_and_gradients(rt, finite_differences, make_cloud(1, 43), table, deformation())
-
-
-def test_pixels_average_over_their_area(rt, make_cloud, make_geometry, finite_differences) -> None:
-    table = frame_cells("exact", make_geometry(*SHAPE), 1)
-    rows = make_cloud(1, 44, scale=(0.05, 0.15))
-    check_frame_and_gradients(rt, finite_differences, rows, table, deformation(), pixel_footprint=True)
 
 
 @pytest.mark.parametrize("motion", ["micro-views", "exact"])

@@ -10,7 +10,6 @@ from tolerances import RANK_GRADIENT, RANK_VOLUME
 from phyradgs_cl.acquisition import Exact, Scan
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.reconstructors import Preprocessing, Progress, RunPlan, loop, method_options, reconstruct
-from phyradgs_cl.reconstructors.tune import TUNED
 from phyradgs_cl.runtime import Runtime
 
 DIVIDED = {
@@ -78,15 +77,6 @@ def test_classical_methods_come_to_the_same_volume(on_ranks, scan, method, model
         assert np.linalg.norm(volumes[0] - one) <= RANK_VOLUME * np.linalg.norm(one)
         for volume in volumes:
             np.testing.assert_array_equal(volume, first.setdefault(size, volumes[0]))
-
-
-@pytest.mark.parametrize("method, wish", [("sirt", "relaxation=0.5,1,1.5"), ("cgls", "iterations")])
-def test_ranks_let_the_scan_choose_as_one_does(on_ranks, scan, method, wish) -> None:
-    options, before = method_options(method, None, {"iterations": 6}), Preprocessing(tune=wish)
-    alone = reconstruct(scan, RunPlan(method, options, preprocessing=before), Runtime()).facts[TUNED]
-    for found in (result.facts[TUNED] for result in on_ranks(2, method, options, before=before)):
-        assert found["values"] == alone["values"]
-        assert found["chosen"] == pytest.approx(alone["chosen"], rel=1e-3)
 
 
 def test_a_stopped_run_goes_on_with_another_number_of_ranks(on_ranks, scan) -> None:

@@ -28,7 +28,6 @@ from phyradgs_cl.reconstructors.preprocess import prepared, reprojection
 CASES = (
     ({"sparks": 1e-3}, "sparks", {}, 0.6),
     ({"rings": 0.05}, "rings", {}, 0.4),
-    ({"rings": 0.05}, "rings", {"rings": {"method": "fitted"}}, 0.55),
     ({"scatter": 0.3}, "scatter", {"scatter": {"to_primary": 0.3}}, 0.75),
     ({"kvp": 120.0}, "hardening", {"hardening": {"kvp": 120.0}}, 0.6),
 )
@@ -165,7 +164,7 @@ def test_what_is_no_step_or_no_option_of_one(rt, planted) -> None:
     full = replace(planted(), projections=planted().projections + 1)
     cases = (
         (lambda: preprocessing_of({"steps": "rings", "rings": {"window": 1}}), "rings.window: found 1"),
-        (lambda: preprocessing_of({"steps": "rings", "rings": {"method": "x"}}), "rings.method"),
+        (lambda: preprocessing_of({"steps": "rings", "rings": {"window": 2}}), "rings.window"),
         (lambda: prepared(planted(), preprocessing_of({"steps": "rings", "rings": {"window": 99}}), rt), "rings.window"),
         (lambda: prepared(empty, preprocessing_of({"steps": "hardening", "hardening": {"kvp": 80}}), rt), "nothing"),
         (lambda: prepared(planted(), preprocessing_of({"steps": "hardening", "hardening": falling}), rt), "falls"),

@@ -20,7 +20,6 @@ GEOMETRY = ConeGeometry(5.0, 7.5, (13, 18), (0.3, 0.23), (0.1, 0.2))
 GRID = Grid((11, 12, 14), (0.18, 0.17, 0.14))
 SPLATS = {
     "iterations": 3, "gaussians": 60, "tv_edge": 5, "parameter_terms_from": 0,
-    "shape_weight": 0.1, "poisson_weight": 0.1,
     "control": {"every": 0},  # whether one is split hangs on rounding where it stands at the threshold
 }
 RUNS = [

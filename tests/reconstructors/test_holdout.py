@@ -62,8 +62,6 @@ def test_what_cannot_be_held_out_is_refused(rt, scan) -> None:
     for wrong in (-1.0, 51.0):
         with pytest.raises(InputError, match="holdout"):
             Preprocessing(holdout=wrong)
-    with pytest.raises(InputError, match="median filter"):
-        Preprocessing(holdout=2.0, median_filter=3)
     with pytest.raises(InputError, match="without a method"):
         prepare(scan, "sparks", device=rt, holdout=2.0)
     blind = replace(scan, pixel_mask=np.ones(scan.projections.shape[1:], bool))

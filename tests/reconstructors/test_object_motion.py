@@ -28,7 +28,7 @@ from phyradgs_cl.runtime import Runtime
 
 GRID, SHAPE, FRAMES = Grid.cube(16, 2.0), (24, 24), 30
 MOVING = [name for name, method in METHODS.items() if method.takes_deformation]
-SPLATS = ("phyradgs", "r2", "fused")
+SPLATS = ("phyradgs", "r2")
 ITERATIVE = [name for name in MOVING if name not in ("fdk", "fbp", "r2")]
 
 
@@ -99,7 +99,7 @@ def test_fdk_takes_voxels_where_their_matter_is(rt, scan, motion) -> None:
 
 @pytest.mark.parametrize("method", ITERATIVE)
 def test_runs_resume_to_the_same_bits(rt, scan, method) -> None:
-    more = {"fista": {"subvoxels": 1}, "fused": {"voxel_iterations": 1}, "phyradgs": {"gaussians": 200}}
+    more = {"fista": {"subvoxels": 1}, "phyradgs": {"gaussians": 200}}
     last = 50 if method in SPLATS else 2  # splats report every 50 iterations
     plan = plan_of(method, iterations=last + 1, **more.get(method, {}))
 

@@ -156,10 +156,10 @@ def test_the_command_line_takes_it_wherever_it_takes_a_method(cli, simulated, mo
         and facts["options"]["gain"] == 0.5
         and facts["options"]["motion"]["name"] == "per-row"
     )
-    both = ["--set", "steps=7", "--set", "median_filter=3"]  # its own goes before the frames' steps
+    both = ["--set", "steps=7", "--set", "holdout=3"]  # its own goes before the frames' steps
     assert cli.run(["reconstruct", str(scan), *run, *both, "-o", "v.h5"]) == 0
     facts = load_volume("v.h5").facts
-    assert facts["options"]["steps"] == 7 and facts["input"] == {"ignore_lag": False, "median_filter": 3}
+    assert facts["options"]["steps"] == 7 and facts["input"] == {"ignore_lag": False, "holdout": 3.0}
     assert cli.run(["reconstruct", str(scan), *run, "--steps", "sparks", "-o", "v.h5"]) == 0
     facts = load_volume("v.h5").facts
     assert facts["options"]["steps"] == 3 and facts["input"]["steps"] == "sparks"

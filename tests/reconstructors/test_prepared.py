@@ -48,28 +48,12 @@ def test_lag_is_undone_unless_it_is_to_be_ignored(rt, scan) -> None:
     assert undone < 1e-3 * np.abs(volumes[0]).max() < ignored
 
 
-def test_the_median_takes_out_sparks_but_not_what_masked_pixels_hold(scan, masked) -> None:
-    sparked = scan.projections.copy()
-    sparked[2, 7, 8] = 50.0
-    for edge in (3, 5):
-        frames = prepared(replace(scan, projections=sparked), Preprocessing(median_filter=edge)).projections
-        window = sparked[2, 7 - edge // 2 : 8 + edge // 2, 8 - edge // 2 : 9 + edge // 2]
-        assert frames[2, 7, 8] == np.median(window) < 5
-        assert frames.dtype == np.float32
-    mask = np.zeros(GEOMETRY.detector_shape, bool)
-    mask[4:7, 9] = True
-    one, two = (prepared(spoilt, Preprocessing(median_filter=3)) for spoilt in masked(scan, mask))
-    np.testing.assert_array_equal(one.projections, two.projections)
-
-
 def test_options_by_name() -> None:
-    assert preprocessing_of({"median_filter": 3.0, "ignore_lag": True}) == Preprocessing(ignore_lag=True, median_filter=3)
-    with pytest.raises(InputError, match="median_filter"):
-        preprocessing_of({"median_filter": 4})
+    assert preprocessing_of({"holdout": 3, "ignore_lag": True}) == Preprocessing(ignore_lag=True, holdout=3.0)
     with pytest.raises(InputError, match="ignore_lag"):
         preprocessing_of({"ignore_lag": "no"})
     assert preprocessing_of({"size": [4, 5, 6], "voxel_mm": 2}).facts() == {
-        "size": (4, 5, 6), "voxel_mm": (2.0, 2.0, 2.0), "ignore_lag": False, "median_filter": 0
+        "size": (4, 5, 6), "voxel_mm": (2.0, 2.0, 2.0), "ignore_lag": False
     }  # fmt: skip
-    with pytest.raises(InputError, match="median_filter"):
-        method_options("fdk", None, {"median_filter": 3})  # not the method's
+    with pytest.raises(InputError, match="holdout"):
+        method_options("fdk", None, {"holdout": 3})  # not the method's

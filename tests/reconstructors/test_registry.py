@@ -61,8 +61,7 @@ def test_every_preset_is_taken_as_it_is() -> None:
     for method, entry in METHODS.items():
         for name, options in entry.presets.items():
             assert method_options(method, name) == options, (method, name)
-    for preset in ("paper", "released"):
-        assert method_options("phyradgs", preset).motion == MicroViews(8, 5)
+    assert method_options("phyradgs", "paper").motion == MicroViews(8, 5)
 
 
 def test_every_number_has_a_checked_range_and_can_be_given_as_it_stands() -> None:

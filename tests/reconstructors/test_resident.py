@@ -37,7 +37,7 @@ def scan() -> Scan:
 
 def options_of(method: str, model: str, iterations: int = 4):
     changes = {"motion": "per-row", "sub_intervals": 2, "iterations": iterations, "detector_model": model}
-    if method in ("sart", "fista", "fista-tv"):
+    if method in ("fista", "fista-tv"):
         changes["transmission_weights"] = True
     if method == "cgls":
         changes["noise_stop"] = 0
@@ -129,7 +129,7 @@ def test_a_step_of_splats_waits_for_nothing(scan, method, monkeypatch) -> None:
         waits.append(self.rt.traffic.blocking - before)
 
     monkeypatch.setattr(SplatRun, "step", counted)
-    changes = {"gaussians": 200, "iterations": 8, "tv_edge": 8, "shape_weight": 0.1, "control": {"every": 0}}
+    changes = {"gaussians": 200, "iterations": 8, "tv_edge": 8, "control": {"every": 0}}
     changes |= {"exact_from": 0.0}  # another motion brings its cells
     reconstruct(scan, plan_run(method, changes), Runtime())
     assert len(waits) == 8 and waits[0] == 3 and max(waits[1:]) == 0, "lists of frames and of the sub-volume, its axes"

@@ -13,10 +13,9 @@ from tolerances import FINITE_DIFFERENCE_STEP, WHOLE_GRADIENT, WHOLE_VALUE
 
 from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, ConstantSpeed, MicroViews, Scan, Shutter
 from phyradgs_cl.acquisition.time_cells import TimeCells
-from phyradgs_cl.detector import transmission_weights
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.fields.gaussians import MEAN
-from phyradgs_cl.objective.terms import ParameterTerms, image_loss, parameter_loss, total_variation
+from phyradgs_cl.objective.terms import image_loss, mean_density, total_variation
 from phyradgs_cl.operators.twins.splat import splat_frame, voxel_field
 from phyradgs_cl.optim import DensityControl, Population
 from phyradgs_cl.reconstructors.splats.device import Scale
@@ -27,11 +26,9 @@ SHAPE, COUNT, SEED = (13, 15), 5, 17
 UNIT = Scale(length_mm=20.0, density_per_mm=0.05)
 GRID = Grid((7, 9, 10), (4.0, 4.2, 4.0), (1.0, 0.0, -1.0))  # half the longest side is 20 mm
 OPTIONS = SplatOptions(
-    motion=MicroViews(3, 2), iterations=1, ssim_weight=0.25, l1_weight=0.7, poisson_weight=1.5, tv_weight=0.3,
-    tv_edge=6, density_weight=0.02, shape_weight=0.01, shape_ratio=2.0, shape_floor=0.1,
-    parameter_terms_from=0, cutoff_sigma=0.0, scale_max=0.6, control=DensityControl(every=0),
+    motion=MicroViews(3, 2), iterations=1, ssim_weight=0.25, l1_weight=0.7, tv_weight=0.3,
+    tv_edge=6, density_weight=0.02, parameter_terms_from=0, cutoff_sigma=0.0, scale_max=0.6, control=DensityControl(every=0),
 )  # fmt: skip
-TERMS = ParameterTerms(OPTIONS.density_weight, OPTIONS.shape_weight, OPTIONS.shape_ratio, OPTIONS.shape_floor)
 
 
 def internal(table: TimeCells) -> TimeCells:
@@ -69,17 +66,15 @@ def test_gradient_of_everything(rt, make_cloud, finite_differences, axis) -> Non
     table = internal(OPTIONS.motion.cells(scan, frame))
     measured = scan.projections[frame].astype(float) / UNIT.line_integral
     mask = (scan.pixel_mask == 0).astype(float)
-    transmission = transmission_weights(scan.projections, scan.pixel_mask == 0)[frame].astype(float)
-    data = {"l1_weight": OPTIONS.l1_weight, "poisson_weight": OPTIONS.poisson_weight, "transmission": transmission}
 
     def image_term(at: np.ndarray) -> float:
         rendered = splat_frame(activation.apply(at), table, SHAPE)
-        return image_loss(rendered, measured, mask, OPTIONS.ssim_weight, **data)[0]
+        return image_loss(rendered, measured, mask, OPTIONS.ssim_weight, OPTIONS.l1_weight)[0]
 
     def objective(at: np.ndarray) -> float:
         rows = activation.apply(at)
         variation = total_variation(voxel_field(rows, *crop.axes_mm()))[0]
-        return image_term(at) + OPTIONS.tv_weight * variation + parameter_loss(rows, TERMS)[0]
+        return image_term(at) + OPTIONS.tv_weight * variation + mean_density(rows, OPTIONS.density_weight)[0]
 
     population = Population(raw, np.zeros((2, *raw.shape)))
     run = SplatRun(rt, scan, OPTIONS, UNIT, population, np.random.default_rng(SEED))

@@ -119,13 +119,3 @@ def test_a_record_becomes_a_chart_for_each_quantity_that_changes() -> None:
     axes = drawn(charts.draw_convergence, [(line["iteration"], line["loss"]) for line in record], "loss")
     assert axes.get_yscale() == "log" and len(axes.lines[0].get_xydata()) == 2000
     assert not charts.convergence_charts([]) and not charts.convergence_charts([{"loss": 1.0}])
-
-
-def test_what_was_tuned_is_drawn_with_the_choice_on_the_curve() -> None:
-    tuned = {"option": "tv_weight", "chosen": 0.002, "values": [0.001, 0.004, 0.016], "holdout_rms": [3.0, 2.0, 4.0]}
-    caption, drawing = charts.tuning_chart(tuned)
-    assert "tv_weight: 0.002" in caption and "nan" not in drawing
-    axes = drawn(charts.draw_tuning, tuned)
-    assert axes.get_xscale() == "log" and axes.lines[-1].get_xydata()[0] == pytest.approx([0.002, 2.5])
-    from_zero = drawn(charts.draw_tuning, {**tuned, "chosen": 0.004, "values": [0.0, 0.004, 0.016]})
-    assert from_zero.get_xscale() == "linear" and from_zero.lines[-1].get_xydata()[0] == pytest.approx([0.004, 2.0])

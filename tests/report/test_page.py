@@ -16,7 +16,8 @@ from phyradgs_cl.acquisition import CircularOrbit, FrameSweeps, Shutter
 from phyradgs_cl.errors import InputError, OutputError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.io import Volume, read_volume, write_scan, write_volume
-from phyradgs_cl.reconstructors import plan_run
+from phyradgs_cl.prepare.rings import RingOptions
+from phyradgs_cl.reconstructors import Preprocessing, plan_run
 from phyradgs_cl.report import Run, load_run, report_page, write_report
 from phyradgs_cl.report import page as page_module
 from phyradgs_cl.report.images import Window
@@ -181,7 +182,7 @@ def test_what_files_say_is_never_a_part_of_the_page(rt, files, small_scan, tmp_p
     write_scan(scan_path, replace(small_scan, title=HOSTILE))
     record = [{"iteration": 1, HOSTILE: 2.0, "loss": HOSTILE}, {"iteration": 2, HOSTILE: 3.0}, HOSTILE]
     options = {"motion": {"name": HOSTILE}, HOSTILE: [HOSTILE]}
-    facts = {"options": options, "input": {"median_filter": HOSTILE}, "record": record}
+    facts = {"options": options, "input": {"holdout": HOSTILE}, "record": record}
     facts |= {"method": HOSTILE, HOSTILE: HOSTILE, "scan": HOSTILE}
     write_volume(volume_path, stored.values, stored.grid, facts, None, {"psnr_db": HOSTILE, HOSTILE: 1})
     write_report(volume_path, tmp_path / "p.html", lambda: rt, scan=scan_path)
@@ -191,6 +192,12 @@ def test_what_files_say_is_never_a_part_of_the_page(rt, files, small_scan, tmp_p
     assert not any(key.startswith("on") for _, attributes in page.elements for key in attributes)
     assert not [image for image in page.all("img") if image["src"] == "x"]
     assert "alert(1)" in page.words  # it is shown, as text
+
+
+def test_what_version_0_2_did_to_the_frames_is_done_again(any_volume, tmp_path) -> None:
+    facts = {"ignore_lag": True, "median_filter": 0, "steps": "rings", "rings": {"method": "mean", "window": 5}}
+    write_volume(tmp_path / "v.h5", *any_volume, {"input": facts})
+    assert load_run(tmp_path / "v.h5").preprocessing == Preprocessing(ignore_lag=True, steps="rings", rings=RingOptions(5))
 
 
 def test_a_run_without_its_scan_still_shows_the_volume(files, tmp_path, parse, caplog) -> None:
@@ -235,21 +242,6 @@ def test_a_bare_result_is_a_picture_of_the_volume(any_volume, tmp_path, parse) -
     assert set(page.ids) & ALL == {"slices", "volume", "provenance"}
     sizes = {image["style"] for image in page.all("img")}
     assert len(sizes) == 3 and "aspect-ratio: 0.8 / 1.2" in sizes
-
-
-def test_where_two_estimates_disagree_is_shown_at_the_places_of_the_volume(any_volume, tmp_path, parse) -> None:
-    """Only where the file has it; black is 0, and the bar says what white is."""
-    volume, grid = any_volume
-    write_volume(tmp_path / "v.h5", volume, grid, {}, disagreement=volume / 100)
-    page = parse(report_page(load_run(tmp_path / "v.h5")))
-    high = np.percentile(volume / 100, 99.9)
-    assert f"{number(high)} 1/mm and above" in page.words and "no confidence interval" in page.words
-    pictures = [image for image in page.all("img") if "slice of the disagreement" in image["alt"]]
-    expected = [np.clip(255 * volume.take(volume.shape[axis] // 2, axis) / 100 / high, 0, 255)[::-1] for axis in range(3)]
-    for picture, values in zip(pictures, expected, strict=True):
-        assert np.abs(decoded(picture["src"]) - values).max() <= 0.51
-    places = [text for text in page.texts["output"] if " of " in text]
-    assert len(places) == 3 and all(f"slice ({place})" in page.words for place in places)
 
 
 def test_files_of_another_kind_are_named_and_inputs_never_replaced(files, tmp_path) -> None:

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.io import checkpoint_path, partial_path, read_volume
+from phyradgs_cl.io import checkpoint_path
 from phyradgs_cl.reconstructors import Progress, Reconstruction, RunPlan, plan_run
 from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.workflow.reconstruct import is_complete, resume_or_restart
@@ -55,17 +55,6 @@ def test_a_stopped_run_goes_on_to_the_same_bits(job, rt, tmp_path) -> None:
     alone = replace(job, output=tmp_path / "alone.h5").run(rt, Report())
     np.testing.assert_array_equal(result.volume, alone.volume)
     assert not checkpoint_path(job.output).exists()
-
-
-def test_a_partial_volume_of_two_halves_has_their_disagreement(job, rt) -> None:
-    """Once the second has begun; the whole one has it whatever came in between."""
-    job = replace(job, plan=plan_run("fused", {"voxel_iterations": 4, "iterations": 60}))
-    alone = job.run(rt, Report())
-    for stop_at, is_there in ((1, False), (54, True)):
-        assert not is_complete(job.run(rt, Report(stop_at)))
-        assert (read_volume(partial_path(job.output)).disagreement is not None) == is_there, stop_at
-        assert is_complete(job.run(rt, Report()))
-        np.testing.assert_array_equal(read_volume(job.output).disagreement, alone.disagreement)
 
 
 @pytest.mark.parametrize("what", ["damaged", "of another seed"])

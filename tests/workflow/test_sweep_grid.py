@@ -41,7 +41,7 @@ def test_lists_are_multiplied_and_runs_taken_as_they_are(read) -> None:
         + """
         seeds = [0, 3, 0]
         [options]
-        median_filter = 3
+        holdout = 3
         [[grid]]
         method = ["sirt", "cgls"]
         motion = ["static", "per-row"]
@@ -58,9 +58,9 @@ def test_lists_are_multiplied_and_runs_taken_as_they_are(read) -> None:
     assert [scan.name for scan in grid.scans] == ["a.h5", "b.h5"] and grid.seeds == (0, 3)
     assert len(grid.settings) == 8 + 2 + 1
     first, splats, fdk = grid.settings[0], grid.settings[8], grid.settings[10]
-    assert first.label == "sirt median_filter=3 motion=static iterations=5"
+    assert first.label == "sirt holdout=3 motion=static iterations=5"
     assert (first.plan().options.iterations, first.plan().options.motion.name) == (5, "static")
-    assert first.before == {"median_filter": 3}
+    assert first.before == {"holdout": 3}
     assert splats.plan().options.control.every == 50 and splats.plan().options.rates.position == (2e-4, 2e-5)
     assert (fdk.method, fdk.preset) == ("fdk", "hann")
 
@@ -92,7 +92,7 @@ def test_what_is_wrong_is_named_at_once(read) -> None:
         (GRID + '[[grid]]\nmethod = "fdk"\npreset = ["hann", "ham"]\n', "preset='ham'.*found 'ham'"),
         (GRID + "[[grid]]\niterations = [10, -1]\n", "iterations=-1"),
         (GRID + "[[grid]]\niterations = []\n", "iterations: found an empty list"),
-        (GRID + "[[grid]]\nmedian_filter = [0, 4]\n", "median_filter=4"),
+        (GRID + "[[grid]]\nholdout = [0, 60]\n", "holdout=60"),
         (GRID + "[[runs]]\nseed = 1\n", "seed: found 1; expected no option of a run; write seeds"),
         (GRID + '[[runs]]\ndevice = "gpu"\n', "device.*say it as --device"),
         (GRID + "[[runs]]\n[options]\niteratoins = 5\n", "iteratoins.*did you mean 'iterations'"),

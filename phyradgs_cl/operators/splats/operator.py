@@ -32,13 +32,13 @@ class SplatOperator:
     def __init__(
         self, rt: Runtime, detector_shape: tuple[int, int], tables: Sequence[TimeCells], length_mm: float, *,
         intensity: bool = False, affine: bool = False, cutoff_sigma: float = DEFAULT_CUTOFF_SIGMA,
-        time_error: float = DEFAULT_TIME_ERROR, pixel_footprint: bool = False,
+        time_error: float = DEFAULT_TIME_ERROR,
     ) -> None:
         readout = tables[0].readout
         self.rt, self.is_layered, self._affine = rt, intensity, affine
         self._projector = SplatProjector(
             rt, *readout.shape(detector_shape), affine=affine, cutoff_sigma=cutoff_sigma, time_error=time_error,
-            pixel_footprint=pixel_footprint, intensity_unit=1.0 if intensity else None,
+            intensity_unit=1.0 if intensity else None,
         )
         self.rows = PlainRows(rt, length_mm, line_integrals=True)
         self._images = PlainImages(rt, self._projector.lines, self._projector.width, turned=readout.axis != "rows")

@@ -74,14 +74,14 @@ class SplatProjector:
 
     ``affine`` selects R2-Gaussian's approximation instead of the exact ray integral. ``cutoff_sigma`` is the Mahalanobis
     radius beyond which a Gaussian is not drawn; 0 draws all of it. ``time_error`` (relative, RMS) bounds the error of
-    averages over time in cells with motion. ``pixel_footprint`` averages splats over the area of a pixel.
+    averages over time in cells with motion.
     ``intensity_unit`` is the line integral that is 1 in the image of a detector that averages intensities over a line's
     cells; with None line integrals are averaged. ``states`` moves the cloud to the states of cells uploaded with them."""
 
     def __init__(
         self, rt: Runtime, lines: int, width: int, *, affine: bool = False,
         cutoff_sigma: float = DEFAULT_CUTOFF_SIGMA, time_error: float = DEFAULT_TIME_ERROR,
-        pixel_footprint: bool = False, intensity_unit: float | None = None, states: CloudStates | None = None,
+        intensity_unit: float | None = None, states: CloudStates | None = None,
     ) -> None:
         self.rt, self.lines, self.width = rt, lines, width
         self.pitch = pitch_of(width)
@@ -97,7 +97,7 @@ class SplatProjector:
         self._is_visible = rt.empty(1, np.uint8)
         self._extents = rt.empty(1, np.int32)
         self.states, self._cloud = states, rt.empty(1)
-        options = {"FOOTPRINT": pixel_footprint, "LAYERED": self._layers is not None, "DEFORMED": states is not None}
+        options = {"LAYERED": self._layers is not None, "DEFORMED": states is not None}
         self._kernels = {
             (moving, fixed, parallel): _Kernels.declare(
                 rt, moving, fixed, AFFINE=affine or parallel, PARALLEL=parallel, **options

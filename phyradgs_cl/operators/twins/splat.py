@@ -149,13 +149,12 @@ class _Segment:
 
 def moving_frame(
     rows: np.ndarray, table: TimeCells, detector_shape: tuple[int, int], cutoff_sigma: float = 0.0,
-    affine: bool = False, pixel_variance: float = 0.0, cloud_at: Callable[[float], np.ndarray] | None = None,
+    affine: bool = False, cloud_at: Callable[[float], np.ndarray] | None = None,
 ) -> np.ndarray:
     """The merged frame (nv, nu) of parameter rows (11, G) over cells with motion, or over cells with a ``conic_pose``.
 
-    ``pixel_variance`` (pixels²) is added to the covariance of every splat on the detector, mass kept. A cell with a
-    ``conic_pose`` is a segment without a path: the splat of that pose, with its centre where the cell's pose has it.
-    ``cloud_at`` gives the rows at a time in s, of an object that moves."""
+    A cell with a ``conic_pose`` is a segment without a path: the splat of that pose, with its centre where the cell's pose
+    has it. ``cloud_at`` gives the rows at a time in s, of an object that moves."""
     moved = table.conic_pose is not None
     poses, end_poses, line_times = _centre_segments(table) if moved else (table.pose, table.end_poses, table.line_times)
     assert end_poses is not None and line_times is not None
@@ -170,8 +169,7 @@ def moving_frame(
         means = np.stack([cloud[:3] for cloud in clouds[1:]]).transpose(2, 0, 1)  # (G, 2, 3)
         for row, precision, end_means in zip(clouds[0].T, precision_matrices(clouds[0]), means, strict=True):
             frame += _segment_image(
-                row, precision, pose, ends, end_means, times, shape, cutoff_sigma, affine, pixel_variance, table.is_parallel,
-                moved,
+                row, precision, pose, ends, end_means, times, shape, cutoff_sigma, affine, table.is_parallel, moved
             )  # fmt: skip
     return frame.T if by_column else frame
 
@@ -194,32 +192,27 @@ def seen_at(pose: np.ndarray, point: np.ndarray, is_parallel: bool = False) -> n
 
 
 def _segment(
-    row: np.ndarray, precision: np.ndarray, pose: np.ndarray, ends: np.ndarray, end_means: np.ndarray, pixel_variance: float,
-    is_parallel: bool
+    row: np.ndarray, precision: np.ndarray, pose: np.ndarray, ends: np.ndarray, end_means: np.ndarray, is_parallel: bool
 ) -> _Segment:
     u, v, z = seen_at(pose, row[:3], is_parallel)
     first, last = (seen_at(end, mean, is_parallel)[:2] for end, mean in zip(ends, end_means, strict=True))
     d0, steps = pose[:3] if is_parallel else (row[:3] - pose[:3]) / z, np.stack([pose[6:9], pose[9:12]], -1)
     alpha = d0 @ precision @ d0
     b, c = steps.T @ precision @ d0 / alpha, steps.T @ precision @ steps / alpha
-    sharp = z * z * alpha * (c - np.outer(b, b))
-    conic = np.linalg.inv(np.linalg.inv(sharp) + pixel_variance * np.eye(2))
-    mass_kept = np.sqrt(np.linalg.det(conic) / np.linalg.det(sharp))
     return _Segment(
-        centre=(first + 4 * np.array([u, v]) + last) / 6, path=last - first, conic=conic, b=b,
-        c=np.outer(b, b) + conic / (z * z * alpha),
-        amplitude=float(mass_kept * row[10] * np.sqrt(2 * np.pi / alpha)),
+        centre=(first + 4 * np.array([u, v]) + last) / 6, path=last - first, conic=z * z * alpha * (c - np.outer(b, b)), b=b,
+        c=c, amplitude=float(row[10] * np.sqrt(2 * np.pi / alpha)),
     )
 
 
 def _segment_image(
     row: np.ndarray, precision: np.ndarray, pose: np.ndarray, ends: np.ndarray, end_means: np.ndarray,
-    times: np.ndarray, shape: tuple[int, int], cutoff_sigma: float, affine: bool, pixel_variance: float,
+    times: np.ndarray, shape: tuple[int, int], cutoff_sigma: float, affine: bool,
     is_parallel: bool, moved: bool,
 ) -> np.ndarray:
     if min(seen_at(p, m, is_parallel)[2] for p, m in zip((pose, *ends), (row[:3], *end_means), strict=True)) <= 0:
         return np.zeros(shape)
-    s = _segment(row, precision, pose, ends, end_means, pixel_variance, is_parallel)
+    s = _segment(row, precision, pose, ends, end_means, is_parallel)
     if moved:
         s = replace(s, centre=seen_at(ends[0], row[:3], is_parallel)[:2])
     v, u = np.mgrid[: shape[0], : shape[1]]

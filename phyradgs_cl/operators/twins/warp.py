@@ -71,8 +71,7 @@ def moved_rows(rows: np.ndarray, deformation: Deformation, weights: np.ndarray) 
 
 
 def deformed_frame(
-    rows: np.ndarray, table: TimeCells, detector_shape: tuple[int, int], deformation: Deformation, affine: bool = False,
-    pixel_variance: float = 0.0,
+    rows: np.ndarray, table: TimeCells, detector_shape: tuple[int, int], deformation: Deformation, affine: bool = False
 ) -> np.ndarray:
     """Returns the merged frame (nv, nu) of a reference's parameter rows (11, G), whose cells see it in their own states."""
 
@@ -80,7 +79,7 @@ def deformed_frame(
         return moved_rows(rows, deformation, deformation.weights_at(time_s)[0])
 
     if table.is_moving:
-        return moving_frame(rows, table, detector_shape, affine=affine, pixel_variance=pixel_variance, cloud_at=cloud_at)
+        return moving_frame(rows, table, detector_shape, affine=affine, cloud_at=cloud_at)
     frame = np.zeros(detector_shape)
     for cell in range(table.count):
         frame += splat_frame(cloud_at(table.time_s[cell]), some_cells(table, [cell]), detector_shape, affine=affine)

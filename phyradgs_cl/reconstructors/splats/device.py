@@ -6,7 +6,6 @@ from functools import partial
 import numpy as np
 
 from phyradgs_cl.acquisition import Exact, Motion, Scan, TimeCells
-from phyradgs_cl.detector import transmission_weights
 from phyradgs_cl.fields import Deformation
 from phyradgs_cl.operators import DeviceCells, DeviceGaussians
 from phyradgs_cl.operators.splats.layout import pad_columns, stride_of
@@ -82,11 +81,6 @@ class DeviceFrames:
         measured = (frame / np.float32(scale.line_integral) for frame in scan.projections)
         self._measured = [rt.upload(pad_rows(readout.frames(m))) for m in measured]
         self._mask, self._pixels = _upload_masks(rt, scan)
-        self._transmission: list[DeviceArray] = []
-        if options.poisson_weight > 0:
-            valid = None if scan.pixel_mask is None else scan.pixel_mask == 0
-            weights = transmission_weights(scan.projections, valid)
-            self._transmission = [rt.upload(pad_rows(readout.frames(w))) for w in weights]
 
     def follow(self, motion: Motion) -> bool:
         """Takes the time cells of a motion model. Returns whether the detector averages intensities over them."""
@@ -99,10 +93,6 @@ class DeviceFrames:
 
     def cells(self, frame: int) -> DeviceCells:
         return self._cells[frame]
-
-    def transmission(self, frame: int) -> DeviceArray | None:
-        """Returns the pixels' weights in the Poisson term; None if the term has no weight."""
-        return self._transmission[frame] if self._transmission else None
 
     @property
     def most_cells(self) -> int:

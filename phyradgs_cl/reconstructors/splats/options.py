@@ -1,6 +1,6 @@
-"""Options of the splatting methods, and their presets: ours, the paper's, the released code's."""
+"""Options of the splatting methods, and their presets: ours and the paper's."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import ClassVar
 
 from phyradgs_cl import checks
@@ -23,8 +23,8 @@ class SplatOptions:
     gaussians: size of the first cloud; 0 chooses it from the grid. Weights are Eq. 4's λ. tv_edge: edge of the random
     sub-volume in voxels. scale_min_voxels: raises the smallest scale to this share of a voxel. detector_model: what quantity
     the detector averages over a line's times, line integrals (log) or intensity, or the model that the scan states (scan).
-    pixel_footprint: pixels average over their area. exact_from: share of the iterations before which the motion ``exact`` is
-    coarse, first one pose for each frame, then one segment of few times; 0: it never is.
+    exact_from: share of the iterations before which the motion ``exact`` is coarse, first one pose for each frame, then one
+    segment of few times; 0: it never is.
 
     iterations: frames, with a step of Adam every ``batch`` of them (0: as many as there are ranks) at rates × √batch. The
     same batch gives the same bits on any number of ranks (docs/cluster.md)."""
@@ -34,18 +34,13 @@ class SplatOptions:
     motion: Motion = Exact()
     affine: bool = False
     detector_model: str = "scan"
-    pixel_footprint: bool = False
     iterations: int = checks.ranged(3000, 0, 1_000_000_000, "--iterations")
     gaussians: int = checks.ranged(0, 0, 100_000_000, "--gaussians (0 chooses from the grid)")
     ssim_weight: float = checks.ranged(0.2, 0, 1e6)
     l1_weight: float = checks.ranged(1.0, 0, 1e6)
-    poisson_weight: float = checks.ranged(0.0, 0, 1e6)
     tv_weight: float = checks.ranged(0.01, 0, 1e6)
     tv_edge: int = checks.ranged(32, 1, 4096)
     density_weight: float = checks.ranged(0.001, 0, 1e6)
-    shape_weight: float = checks.ranged(0.0, 0, 1e6)
-    shape_ratio: float = checks.ranged(10.0, 1, 1e6)
-    shape_floor: float = checks.ranged(0.004, 0, 10)
     parameter_terms_from: int = checks.ranged(500, 0, 1_000_000_000)
     cutoff_sigma: float = checks.ranged(DEFAULT_CUTOFF_SIGMA, 0, 100)  # 0 cuts nothing off
     initial_threshold: float = checks.ranged(0.05, 0, 1e6)
@@ -104,14 +99,13 @@ _PAPER = SplatOptions(
     motion=MicroViews(8, 5), gaussians=50_000, iterations=20_000, rates=PUBLISHED_RATES,
     control=PUBLISHED_CONTROL,
 )
-_RELEASED = replace(_PAPER, ssim_weight=0.25, tv_weight=0.05, density_weight=0.01, shape_weight=0.02)
 # a sixth of the iterations, the schedule scaled with them, and two or three segments per frame
 _QUICK = SplatOptions(
     motion=Exact(time_error=0.02), iterations=500, parameter_terms_from=80,
     control=DensityControl(every=20, start_iteration=80),
 )
 
-PRESETS = {"default": SplatOptions(), "quick": _QUICK, "paper": _PAPER, "released": _RELEASED}
+PRESETS = {"default": SplatOptions(), "quick": _QUICK, "paper": _PAPER}
 # R2-Gaussian's constants; its 30,000 iterations are cut to ours unless asked for, rates decay over the run
 R2_PUBLISHED = SplatOptions(
     motion=Static(), affine=True, gaussians=50_000, ssim_weight=0.25, tv_weight=0.05, density_weight=0.0,

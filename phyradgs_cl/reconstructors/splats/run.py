@@ -127,7 +127,5 @@ class SplatRun:
     def present_volume(self) -> tuple[np.ndarray, Grid]:
         """Returns ``present_cloud`` as a volume (nz, ny, nx) in 1/mm, on the scan's grid in mm."""
         cloud = self.present_cloud()
-        if self.options.pixel_footprint:  # voxels then average over their volume as pixels over their area
-            cloud = cloud.averaged(self.grid.voxel_size_mm[::-1])
         volume = voxelise(self.rt, cloud.rows(), self.grid, cutoff_sigma=self.options.cutoff_sigma)
         return volume * np.float32(self.scale.density_per_mm), self.grid.scaled(self.scale.length_mm)

@@ -28,8 +28,8 @@ Corner = tuple[int, int, int]
 
 @dataclass(frozen=True)
 class Batch:
-    """The frames of one step, a corner for each (None if the total variation has no weight), and whether the parameter
-    terms apply (``late``)."""
+    """The frames of one step, a corner for each (None if the total variation has no weight), and whether the density
+    term applies (``late``)."""
 
     frames: list[int]
     corners: list[Corner | None]
@@ -53,10 +53,9 @@ class FrameStep:
         self.projector = SplatProjector(
             rt, lines, width, affine=options.affine, cutoff_sigma=options.cutoff_sigma,
             time_error=getattr(options.motion, "time_error", DEFAULT_TIME_ERROR),
-            pixel_footprint=options.pixel_footprint, intensity_unit=self.frames.intensity_unit, states=states,
+            intensity_unit=self.frames.intensity_unit, states=states,
         )
-        weights = options.ssim_weight, options.l1_weight, options.poisson_weight
-        self.loss = ImageLoss(rt, lines, width, self.projector.pitch, *weights)
+        self.loss = ImageLoss(rt, lines, width, self.projector.pitch, options.ssim_weight, options.l1_weight)
         z, y, x = (min(options.tv_edge, n) for n in grid.shape)
         self.crop = Voxeliser(rt, (z, y, x), cutoff_sigma=options.cutoff_sigma)
         self.tv = TotalVariation(rt, self.crop.shape, self.crop.pitch)
@@ -85,17 +84,13 @@ class FrameStep:
         options, gaussians, by_cloud = self.options, cloud.gaussians, cloud.gradients
         cells, measured, mask, pixels = self.frames.get(frame)
         rendered = self.projector.forward(gaussians, cells)
-        by_image = self.loss.evaluate(rendered, measured, mask, pixels, self.frames.transmission(frame))
+        by_image = self.loss.evaluate(rendered, measured, mask, pixels)
         self.projector.backward(gaussians, cells, by_image, by_cloud)
         if corner is not None:
             by_volume = self.tv.evaluate(self.crop.forward(gaussians, self.grid, corner))
             self.crop.backward(gaussians, self.grid, by_volume, by_cloud, add=True, weight=options.tv_weight)
-        self.adam.chain(
-            cloud.raw, gaussians.rows, by_cloud, statistics, cloud.count, gaussians.stride,
-            density_weight=options.density_weight if late else 0.0,
-            shape_weight=options.shape_weight if late else 0.0, shape_ratio=options.shape_ratio,
-            shape_floor=options.shape_floor,
-        )
+        own = cloud.raw, gaussians.rows, by_cloud, statistics, cloud.count, gaussians.stride
+        self.adam.chain(*own, density_weight=options.density_weight if late else 0.0)
 
 
 class Alone:

@@ -5,7 +5,7 @@ their distances. Densities are then scaled until the field at their voxels is ri
 
 import time
 from dataclasses import asdict, dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 
@@ -30,7 +30,6 @@ _SCALE_SHARE = 0.6  # of the distance to the nearest others
 _SCALE_MIN_VOXELS, _SCALE_MAX = 0.25, 1.0  # the largest in half-sides
 _FIRST_DENSITY, _FAINTEST = 0.1, 1e-3  # of a voxel's value; of the 99.9th percentile
 _DENSITY_ROUNDS, _LARGEST_CORRECTION = 2, 5.0
-_NO_TERMS: dict[str, Any] = {"density_weight": 0.0, "shape_weight": 0.0, "shape_ratio": 10.0, "shape_floor": 0.004}
 
 
 @dataclass(frozen=True)
@@ -117,7 +116,7 @@ class _Fit:
         self.error = self._error()
         self.voxels.backward(gaussians, self.grid, self.error, cloud.gradients, add=False)
         own = cloud.raw, gaussians.rows, cloud.gradients, self.statistics, cloud.count, gaussians.stride
-        self.adam.chain(*own, **_NO_TERMS)
+        self.adam.chain(*own, density_weight=0.0)
         cloud.move(self.adam, self.rates * VolumeFitOptions.RATES.at((number - 1) / self.iterations), number)
 
     def relative_error(self) -> float:

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from phyradgs_cl.checks import ranged
-from phyradgs_cl.errors import InputError
 from phyradgs_cl.objective import TvDescent
 from phyradgs_cl.reconstructors.checkpoint import State
 from phyradgs_cl.reconstructors.fdk import static_fdk
@@ -21,8 +20,7 @@ class AsdPocsOptions(SartOptions):
     """tv_steps: TV steps per iteration. tv_share: α, length of a TV step over the change of the first SART pass.
 
     tv_reduction: factor of that length when TV moves the volume by more than ``tv_ratio`` (r_max) of the SART pass's change
-    and the residual is above ε. residual_share: ε over the residual of the FDK volume. prior_share: weight of the total
-    variation of the difference to the run's first volume, 0 to 1 (PICCS)."""
+    and the residual is above ε. residual_share: ε over the residual of the FDK volume."""
 
     iterations: int = 10
     relaxation_reduction: float = 0.9999
@@ -31,18 +29,15 @@ class AsdPocsOptions(SartOptions):
     tv_reduction: float = ranged(0.95, 1e-6, 1)
     tv_ratio: float = ranged(0.94, 0, 1e6)
     residual_share: float = ranged(0.15, 0, 1e6)
-    prior_share: float = ranged(0.0, 0, 1)
 
 
 class AsdPocs(Algorithm):
     """The residual is that of the volume between the SART pass and the TV steps."""
 
-    def __init__(
-        self, system: System, options: AsdPocsOptions, seed: int, descend: TvDescent, epsilon: float
-    ) -> None:
+    def __init__(self, system: System, options: AsdPocsOptions, descend: TvDescent, epsilon: float) -> None:
         super().__init__(system)
         self.options, self.descend, self.epsilon = options, descend, epsilon
-        self.sart = Sart(system, options, seed)
+        self.sart = Sart(system, options)
         self.tv_step = 0.0
 
     def step(self) -> float:
@@ -76,17 +71,12 @@ class AsdPocs(Algorithm):
 
 
 def _started(system: System, options: AsdPocsOptions, inputs: MethodInputs) -> AsdPocs:
-    if options.prior_share > 0 and inputs.initial is None:
-        found, remedy = f"{options.prior_share:g} without a prior image", "say --initial, or leave prior_share out"
-        raise InputError("prior_share", found, "a volume to start from", remedy)
     start = system.space.array(static_fdk(inputs.rt, inputs.scan, inputs.deformation))
     epsilon = options.residual_share * system.space.norm(system.residual(start))
-    descend = TvDescent(inputs.rt, inputs.scan.grid.shape, inputs.initial, options.prior_share)
-    return AsdPocs(system, options, inputs.seed, descend, epsilon)
+    return AsdPocs(system, options, TvDescent(inputs.rt, inputs.scan.grid.shape), epsilon)
 
 
 METHOD = voxel_method(
     "asd-pocs", AsdPocsOptions(), _started, frames=2,
-    # those of SART, four of the steps, and with a prior image two more: the image and the difference to it
-    volumes=lambda scan, options: held_volumes(scan, options) + (6 if options.prior_share > 0 else 4),
+    volumes=lambda scan, options: held_volumes(scan, options) + 4,  # of the steps
 )

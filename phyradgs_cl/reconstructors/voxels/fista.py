@@ -31,6 +31,7 @@ from phyradgs_cl.reconstructors.voxels.run import Algorithm, IterativeOptions, M
 from phyradgs_cl.reconstructors.voxels.sart import OrderedSubsets
 from phyradgs_cl.reconstructors.voxels.stages import Stage, merge_subvoxels, repeated, run_stages
 from phyradgs_cl.reconstructors.voxels.system import System
+from phyradgs_cl.removed import refuse_removed
 from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.runtime.algebra import HostSpace
 
@@ -76,6 +77,7 @@ class FistaOptions(IterativeOptions):
     def __post_init__(self) -> None:
         super().__post_init__()
         if not (callable(self.prior) or ":" in self.prior):
+            refuse_removed(f"--prior {self.prior}")
             checks.one_of("prior", self.prior, (*priors.PRIORS, "package.module:function"))
         if self.prior != "piccs" and self.prior_share != FistaOptions.prior_share:
             found = f"{self.prior_share:g} with the prior {self.prior}"

@@ -11,7 +11,7 @@ import numpy as np
 from phyradgs_cl import checks
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
-from phyradgs_cl.objective import DctProx, RidgeStep, TvProx, learned_curves, learned_ridge
+from phyradgs_cl.objective import DctProx, RidgeStep, TvProx, learned_ridge
 from phyradgs_cl.objective.dct_prox import TURNS
 from phyradgs_cl.objective.ridge import EDGE as RIDGE_EDGE
 from phyradgs_cl.reconstructors.checkpoint import State
@@ -22,7 +22,6 @@ from phyradgs_cl.runtime import Runtime, Space
 # shares of the prior's weight, by the prior (docs/results/settings.md)
 _TV_ALONE, _TV_BEFORE_DCT, _DCT = 1.6, 0.8, 1.5
 _TV_AT_REST, _DCT_AT_REST = 0.5, 1.35  # before ridge, of scans that stop for each projection
-_TV_BEFORE_CURVES, _CURVES_NOISE, _CURVES = 0.5, 50.0, 3.0  # noise that the curves assume, and strength of their step
 _RIDGE_NOISE, _RIDGE_LENGTH, _RIDGE_EVERY = 17.0, 0.5, 4  # noise that the step assumes, its length, and maps for each step
 _RIDGE_NOISE_AT_REST = 20.0
 _USUAL_NOISE, _LEAST_NOISE = 0.01, 0.001  # of line integrals: where the numbers at rest hold, and the least that they follow
@@ -48,12 +47,8 @@ class PriorInputs:
     def tv(self, share: float = 1.0) -> "TvPrior":
         return TvPrior(TvProx(self.rt, self.grid.shape, axis_weights(self.grid)), self.tv_iterations, share)
 
-    def tv_and_dct(self, tv_share: float = _TV_BEFORE_DCT, unit: float = _DCT) -> "TvAndDct":
-        return TvAndDct(self.tv(tv_share), DctProx(self.rt, self.grid.shape), unit)
-
-    def tv_and_curves(self) -> "TvAndDct":
-        curves = learned_curves().scaled(_CURVES / _CURVES_NOISE)
-        return TvAndDct(self.tv(_TV_BEFORE_CURVES), DctProx(self.rt, self.grid.shape, curves), _CURVES_NOISE)
+    def tv_and_dct(self, tv_share: float = _TV_BEFORE_DCT, dct_share: float = _DCT) -> "TvAndDct":
+        return TvAndDct(self.tv(tv_share), DctProx(self.rt, self.grid.shape), dct_share)
 
     def dct_then_ridge(self) -> "Prior":
         """At rest the step does more of the work, most of it where noise is low; flat bodies lose by that on fly-scans."""
@@ -110,14 +105,14 @@ class TvPrior(Prior):
 class TvAndDct(Prior):
     """Total variation, then a shrinkage of block cosine transforms, which follows best from a smooth volume.
 
-    unit: of the shrinkage, over the prior's weight."""
+    share: the threshold of the shrinkage over the prior's weight."""
 
-    def __init__(self, tv: TvPrior, shrink: DctProx, unit: float) -> None:
-        self.tv, self.shrink, self.unit, self.turn = tv, shrink, unit, 0
+    def __init__(self, tv: TvPrior, shrink: DctProx, share: float) -> None:
+        self.tv, self.shrink, self.share, self.turn = tv, shrink, share, 0
 
     def __call__(self, space: Space[Any], volume: Any, weight: float, *, nonnegative: bool) -> Any:
         smooth = self.tv(space, volume, weight, nonnegative=nonnegative)
-        shrink = partial(self.shrink, unit=self.unit * weight, turn=self.turn, nonnegative=nonnegative)
+        shrink = partial(self.shrink, threshold=self.share * weight, turn=self.turn, nonnegative=nonnegative)
         # the next map takes the next quarter of the shifts: four maps have all of them
         self.turn = (self.turn + 1) % len(TURNS)
         return space.apply(shrink, smooth, self.tv.prox.shape)
@@ -212,7 +207,6 @@ class OwnPrior(Prior):
 PRIORS: dict[str, Callable[[PriorInputs], Prior]] = {
     "ridge": PriorInputs.dct_then_ridge,
     "dct": PriorInputs.tv_and_dct,
-    "curves": PriorInputs.tv_and_curves,
     "tv": lambda inputs: inputs.tv(_TV_ALONE),
     "piccs": Piccs,
     "none": lambda inputs: Prior(),

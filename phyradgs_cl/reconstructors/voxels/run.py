@@ -153,9 +153,7 @@ def voxel_method(
             name, lambda system: make(system, options, inputs), inputs, volumes=held, frames=frames
         )
 
-    return Method(
-        run, {"default": default}, is_shared=True, takes_initial=True, ends_anywhere=True, takes_deformation=True
-    )
+    return Method(run, {"default": default}, is_shared=True, takes_initial=True, takes_deformation=True)
 
 
 class _Iterations:

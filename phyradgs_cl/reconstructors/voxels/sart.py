@@ -19,7 +19,6 @@ from phyradgs_cl.reconstructors.voxels.run import Algorithm, IterativeOptions, v
 from phyradgs_cl.reconstructors.voxels.system import System, column_weights, row_weights
 
 _GROWTH = 1.2  # of the residual over its minimum: subsets whose steps diverge that much are too small
-ORDERS = ("spread", "random", "ordered")
 _WEIGHT_CACHE_BYTES = 1 << 29
 
 
@@ -60,22 +59,14 @@ class OrderedSubsets:
 class SartOptions(IterativeOptions):
     """relaxation: λ, the applied share of each correction; relaxation_reduction: its factor per iteration.
 
-    frames_per_subset: frames that are corrected for together, 1 for SART. order: of the frames in a pass: ``spread``
-    (neighbours in time far apart in angle), ``random`` (from the seed), ``ordered`` (as recorded).
-    transmission_weights: transmission-weighted (PWLS), W = t/(A 1) and V = 1/(Aᵀ t).
+    frames_per_subset: frames that are corrected for together, 1 for SART; a pass takes neighbours in time far apart.
     noise_stop: the run ends when the residual falls to this many times the estimated noise of the measurement (discrepancy
     principle, Morozov 1966); further iterations fit the noise. 0 runs all iterations."""
 
     relaxation: float = checks.ranged(1.0, 1e-6, 2)
     relaxation_reduction: float = checks.ranged(0.999, 1e-6, 1)
     frames_per_subset: int = checks.ranged(1, 1, 1_000_000)
-    order: str = "spread"
-    transmission_weights: bool = False  # type: ignore[misc]
     noise_stop: float = checks.ranged(0.0, 0, 1e6)  # type: ignore[misc]
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        checks.one_of("order", self.order, ORDERS)
 
 
 OS_SART = SartOptions(frames_per_subset=10)
@@ -87,13 +78,12 @@ class Sart(Algorithm):
     The intensity model replaces Aᵢᵀ by Jᵢᵀ and Aᵢ x by Iᵢ(x). The residual is that of the pass: of every subset just before
     its correction."""
 
-    NUMBERS = ("relaxation", "passes")
+    NUMBERS = ("relaxation",)
 
-    def __init__(self, system: System, options: SartOptions, seed: int) -> None:
+    def __init__(self, system: System, options: SartOptions) -> None:
         super().__init__(system)
-        self.options, self.seed = options, seed
-        self.relaxation, self.passes = options.relaxation, 0
-        order = spread_order(system.frames) if options.order == "spread" else list(range(system.frames))
+        self.options, self.relaxation = options, options.relaxation
+        order = spread_order(system.frames)
         size = options.frames_per_subset
         self.subsets = [system.subset(order[i : i + size]) for i in range(0, len(order), size)]
         self._row_weights = [row_weights(subset) for subset in self.subsets]
@@ -103,17 +93,13 @@ class Sart(Algorithm):
     def step(self) -> float:
         squares = self.system.space.sum_squares(self._corrections())
         self.relaxation *= self.options.relaxation_reduction
-        self.passes += 1
         return float(np.sqrt(squares))
 
     def _corrections(self) -> Iterator[Any]:
         """Corrects for all subsets. Yields the residual of each just before its correction."""
         space, clip = self.system.space, self.options.nonnegative
-        order: Any = range(len(self.subsets))
-        if self.options.order == "random":
-            order = np.random.default_rng([self.seed, self.passes]).permutation(len(order)).tolist()
-        for index in order:
-            subset, columns = self.subsets[index], self._columns(index)
+        for index, subset in enumerate(self.subsets):
+            columns = self._columns(index)
             residual = subset.residual(self.volume)
             yield residual
             update = subset.back(space.multiply(residual, self._row_weights[index]))
@@ -136,10 +122,7 @@ def held_volumes(scan: Scan, options: SartOptions) -> int:
 
 
 def _method(name: str, default: SartOptions) -> Method:
-    def make(system: System, options: SartOptions, inputs: Any) -> Sart:
-        return Sart(system, options, inputs.seed)
-
-    return voxel_method(name, default, make, volumes=held_volumes, frames=2)
+    return voxel_method(name, default, lambda system, options, _: Sart(system, options), volumes=held_volumes, frames=2)
 
 
 METHOD, OS_METHOD = _method("sart", SartOptions()), _method("os-sart", OS_SART)
@@ -147,11 +130,10 @@ METHOD, OS_METHOD = _method("sart", SartOptions()), _method("os-sart", OS_SART)
 
 @dataclass(frozen=True)
 class SirtOptions(IterativeOptions):
-    """relaxation: λ between 0 and 2. transmission_weights: transmission-weighted (PWLS), R = t/(A 1), C = 1/(Aᵀ t)."""
+    """relaxation: λ between 0 and 2."""
 
     iterations: int = 100
     relaxation: float = ranged(1.0, 1e-6, 2)
-    transmission_weights: bool = False  # type: ignore[misc]
 
 
 class Sirt(Algorithm):

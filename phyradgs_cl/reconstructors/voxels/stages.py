@@ -1,7 +1,7 @@
 """Runs of several stages: each stage starts from the volume of the stage before it.
 
-``fista`` reconstructs voxels, then subvoxels; ``fused`` adds splats. Coarse voxels cannot represent edges. The last passes
-therefore run on voxels half as large; their block means make up most of the result."""
+``fista`` reconstructs voxels, then subvoxels: coarse voxels cannot represent edges. The last passes therefore run on voxels
+half as large; their block means make up most of the result."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
@@ -88,7 +88,7 @@ def run_stages(stages: Sequence[Stage], inputs: MethodInputs) -> Reconstruction:
     facts: dict[str, Any] = {**result.facts, "stages": stage_facts, "seconds": progress.seconds}
     facts["iterations"] = progress.iterations + iterations
     facts["interrupted_at"] = None if interrupted_at is None else progress.iterations + interrupted_at
-    return Reconstruction(volume, grid, result.gaussians, progress.record, facts, state)
+    return Reconstruction(volume, grid, record=progress.record, facts=facts, state=state)
 
 
 def _of_whole_run(stage: Stage, done: StageProgress, total: int, grid: Grid, progress: Progress) -> Progress:

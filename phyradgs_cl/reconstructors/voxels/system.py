@@ -196,12 +196,12 @@ class System:
 
 
 def row_weights(system: System) -> Any:
-    """Returns 1/(A 1) of every ray in 1/mm, times its transmission weight.
+    """Returns 1/(A 1) of every ray in 1/mm.
 
     A ray shorter than a tenth of the longest path counts as that long. A ray that only grazes an edge of the volume would
     otherwise put its noise on one or two voxels, and corners of the volume become bright. TIGRE measures the paths in a box
     that is a tenth larger, for the same reason."""
-    return system.apply_weights(system.space.reciprocal(system.row_sums(), _SHORTEST_PATH))
+    return system.space.reciprocal(system.row_sums(), _SHORTEST_PATH)
 
 
 def column_weights(system: System) -> Any:

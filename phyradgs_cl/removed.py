@@ -1,0 +1,34 @@
+"""Words that have left the program, and what to write now."""
+
+from phyradgs_cl.errors import InputError
+
+_ALGEBRAIC = "sart", "os-sart", "sirt", "asd-pocs"
+_UNWEIGHTED = [f"--method {method}: option transmission_weights" for method in _ALGEBRAIC]
+REMOVED = {
+    "--method fused": "take --method fista, or start Gaussians from its volume: --method phyradgs --initial VOLUME",
+    "--method asd-pocs: option prior_share": "take --method fista --prior piccs",
+    **dict.fromkeys(_UNWEIGHTED, "take --method fista or fista-tv, which keep it"),
+    "--preset released": "say --preset paper",
+    "--prior curves": "say --prior ridge, the default, or dct",
+    "pixel_footprint": "leave it out: pixels see splats at their centres, which gives 0.5 dB more",
+    "median_filter": "use --steps sparks,dead, which mend odd pixels alone",
+    "order": "leave it out: neighbours in time are far apart in every pass",
+    "poisson_weight": "take transmission_weights of --method fista or fista-tv",
+    "rings.method": "leave it out: the pattern comes from the mean over views",
+    "shape_floor": "use scale_min, the smallest scale",
+    "shape_ratio": "use control.prune_aspect, which removes thin Gaussians",
+    "shape_weight": "use control.prune_aspect, which removes thin Gaussians",
+    "tune": "compare your own values of the option by --holdout 2",
+}
+"""By word: a value with its option, or an option as Python spells it, with the method that it left if others keep it."""
+
+
+def removal(word: str, subject: str = "") -> InputError | None:
+    """Returns the error with the replacement if ``word`` has left; ``subject`` names it where the word alone does not."""
+    return InputError(subject or word, "a word of an earlier version", "", REMOVED[word]) if word in REMOVED else None
+
+
+def refuse_removed(word: str, subject: str = "") -> None:
+    """Raises that error."""
+    if (error := removal(word, subject)) is not None:
+        raise error

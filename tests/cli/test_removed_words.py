@@ -1,0 +1,22 @@
+"""Options and values that have left: one line says what to write instead."""
+
+import pytest
+
+from phyradgs_cl.removed import REMOVED
+
+WORDS = [word for word in REMOVED if not word.startswith("phyradgs ")]
+
+
+@pytest.mark.parametrize("word", WORDS)
+def test_a_word_that_left_names_its_replacement(cli, capsys, word) -> None:
+    value, _, option = word.rpartition(": option ")
+    told = word.split() if word.startswith("--") and not value else [*value.split(), "--set", f"{option}=1"]
+    assert cli.run(["reconstruct", "scan.h5", "-o", "volume.h5", *told]) == 2
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1 and "earlier version" in error and error.endswith(f"{REMOVED[word]}\n")
+
+
+@pytest.mark.parametrize("flag", ["--tune", "--median-filter"])
+def test_a_flag_that_left_names_its_replacement(cli, capsys, flag) -> None:
+    assert cli.run(["reconstruct", "scan.h5", "-o", "volume.h5", flag, "3"]) == 2
+    assert capsys.readouterr().err.endswith(f"{REMOVED[flag[2:].replace('-', '_')]}\n")
