@@ -110,7 +110,7 @@ class Runtime:
         try:
             buffer = cl.Buffer(self.context, self._memory_flags, nbytes)
         except cl.Error as error:
-            raise self.ledger.error(f"{nbytes / 2**20:.0f} MiB", error) from error
+            raise self.ledger.error(f"{nbytes / 2**20:.0f} MiB", error, self.queue) from error
         array = DeviceArray(buffer, shape, kind)
         self.ledger.count(nbytes)
         weakref.finalize(array, self.ledger.count, -nbytes)

@@ -141,17 +141,33 @@ class MemoryLedger:
                 remedy = f"allow more with --memory or {MEMORY_VARIABLE}, or {remedy}"
             raise MemoryShortage(subject, found, expected, remedy)
 
-    def error(self, work: str, error: "cl.Error") -> DeviceError:
+    def error(self, work: str, error: "cl.Error", queue: "cl.CommandQueue | None" = None) -> DeviceError:
         """Returns an error of the driver as a DeviceError, or as a MemoryShortage where memory ran out, which some drivers
-        report only at a launch or a wait. ``work`` names what failed: a kernel, or "a copy"."""
+        report only at a launch or a wait. ``work`` names what failed: a kernel, or "a copy". Where ``queue`` is dead no memory
+        was missed: drivers say "out of resources" of a kernel that crashed or ran too long, too."""
         code = getattr(error, "code", 0)  # none where pyopencl raises a text, as of a build
-        if isinstance(error, cl.MemoryError) or code in _MEMORY_CODES:
+        is_dead = queue is not None and not answers(queue)
+        if not is_dead and (isinstance(error, cl.MemoryError) or code in _MEMORY_CODES):
             remedy = f"set a limit with --memory or {MEMORY_VARIABLE}, or use a smaller problem"
             found = f"{work} refused ({error})"
             return MemoryShortage(f"memory of {self.device.name}", found, "enough free memory", remedy)
         found = f"{work} failed ({' '.join(str(error).split())[:300] or type(error).__name__})"
         remedy = "see the system's log, or try another --device"
+        if is_dead:
+            found += ": the driver ended a kernel, or lost the device"
+            remedy = "run 'phyradgs devices --check', see the system's log, or try another --device"
         return DeviceError(f"device {self.device.name}", found, "a device that works", remedy)
+
+
+def answers(queue: "cl.CommandQueue") -> bool:
+    """Whether a queue still works. After a driver has ended a kernel, every call fails until there is a new context."""
+    try:
+        word = cl.Buffer(queue.context, cl.mem_flags.READ_WRITE, 4)
+        cl.enqueue_fill_buffer(queue, word, np.zeros(1, np.float32), 0, 4)
+        queue.finish()
+    except cl.Error:
+        return False
+    return True
 
 
 def reported_bytes(device: DeviceInfo) -> int:

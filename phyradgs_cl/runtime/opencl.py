@@ -78,7 +78,7 @@ def naming_failures(work: str | None = None) -> Callable[[Callable[P, R]], Calla
                 return method(*args, **kwargs)
             except cl.Error as error:
                 what = work or f"a launch of {args[1].function_name}"  # type: ignore[attr-defined]
-                raise args[0].ledger.error(what, error) from error  # type: ignore[attr-defined]
+                raise args[0].ledger.error(what, error, args[0].queue) from error  # type: ignore[attr-defined]
 
         return named
 
