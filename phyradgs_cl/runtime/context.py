@@ -22,6 +22,7 @@ log = logging.getLogger(__name__)
 
 LANE_CHOICES = (1, 4, 8, 16)
 _TILE_ITEMS = 256  # of a work-group that shares local memory
+_FEWEST_ITEMS = 32  # that a kernel must be able to run in one group
 
 
 class Runtime:
@@ -61,7 +62,7 @@ class Runtime:
         at_once = cl.mem_flags.ALLOC_HOST_PTR if self.device.kind == "cpu" else 0
         self._memory_flags = cl.mem_flags.READ_WRITE | at_once
         self.profile = profile
-        self._tile: tuple[int, int] | None = None
+        self._multiple: int | None = None
         self._profile = Profile()
         self._programs: dict[tuple[str, tuple[str, ...]], cl.Program] = {}
         self._kernels: dict[tuple[str, str, tuple[str, ...]], Kernel] = {}
@@ -207,7 +208,7 @@ class Runtime:
         if min(shape) < 1:
             return
         given = (group,) if isinstance(group, (int, np.integer)) else group
-        local = (*given, *([1] * (len(shape) - len(given))))
+        local = self._fitting(kernel, (*given, *([1] * (len(shape) - len(given)))))
         rounded = tuple(ceil_div(int(n), size) * size for n, size in zip(shape, local, strict=True))
         arrays = [a for a in args if isinstance(a, DeviceArray)]
         built = self.compile(kernel)
@@ -215,25 +216,49 @@ class Runtime:
         event = cl.enqueue_nd_range_kernel(self.queue, built, rounded, local)
         self._record(kernel.function_name, event, sum(a.nbytes for a in arrays) if self.profile else 0)
 
-    def group(self, on_cpu: int = 1, on_gpu: int = 64) -> int:
-        """The work-group size for this class of device."""
+    def group(self, on_cpu: int = 1, on_gpu: int = 64, *kernels: Kernel) -> int:
+        """The work-group size for this class of device. ``kernels`` whose items work together must be able to run in it: on a
+        GPU it is halved until they are."""
+        while self.pixel_items and any(on_gpu > self.most_items(kernel) for kernel in kernels):
+            on_gpu //= 2
         return on_gpu if self.pixel_items else on_cpu
 
-    def tile(self) -> tuple[int, int]:
-        """Returns the sides of a work-group's tile on a GPU: as wide as items run together, and some lines high."""
-        if self._tile is None:
-            handle = self.device.handle
-            asked = self.compile(self.kernel("rates", "multiply_add")).get_work_group_info(
-                cl.kernel_work_group_info.PREFERRED_WORK_GROUP_SIZE_MULTIPLE, handle
-            )
-            width = min(max(int(asked), 16), 64)
-            self._tile = width, max(min(_TILE_ITEMS, handle.max_work_group_size) // width, 1)
-        return self._tile
+    def most_items(self, kernel: Kernel) -> int:
+        """Returns the largest group in which a kernel can run: its registers may allow fewer items than the device does."""
+        if kernel.most_items is None:
+            kernel.most_items = self._asked(kernel, "WORK_GROUP_SIZE")
+        return kernel.most_items
 
-    def shape_of_lines(self, width: int, *rows: int) -> tuple[tuple[int, ...], tuple[int, int], int]:
-        """Returns work-items, group and number of groups of kernels that step along lines of ``width`` pixels. A work-item
+    def _asked(self, kernel: Kernel, name: str) -> int:
+        what = getattr(cl.kernel_work_group_info, name)
+        return int(self.compile(kernel).get_work_group_info(what, self.device.handle))
+
+    def _fitting(self, kernel: Kernel, group: tuple[int, ...]) -> tuple[int, ...]:
+        """Returns a group with sides halved until the kernel can run in it: that of kernels whose items work alone."""
+        if math.prod(group) == 1:
+            return group
+        most, sides = self.most_items(kernel), list(group)
+        if most < min(_FEWEST_ITEMS, math.prod(group)):
+            subject, found = f"kernel {kernel.function_name} on {self.device.name}", f"groups of at most {most} work-items"
+            raise DeviceError(subject, found, f"{_FEWEST_ITEMS} or more", "try another --device")
+        while math.prod(sides) > most:
+            sides[sides.index(max(sides))] //= 2
+        return tuple(sides)
+
+    def tile(self, kernel: Kernel | None = None) -> tuple[int, int]:
+        """Returns the sides of a work-group's tile on a GPU: as wide as items run together, and as many lines high as the
+        kernel, or the device, allows."""
+        rates = self.kernel("rates", "multiply_add")
+        if self._multiple is None:
+            self._multiple = min(max(self._asked(rates, "PREFERRED_WORK_GROUP_SIZE_MULTIPLE"), 16), 64)
+        most = min(_TILE_ITEMS, self.device.handle.max_work_group_size, self.most_items(kernel or rates))
+        width = min(self._multiple, most)
+        return width, most // width
+
+    def shape_of_lines(self, kernel: Kernel, width: int, *rows: int) -> tuple[tuple[int, ...], tuple[int, int], int]:
+        """Returns work-items, group and number of groups of a kernel that steps along lines of ``width`` pixels. A work-item
         takes a line on a CPU, and a pixel on a GPU."""
-        items, group = ((width, *rows), self.tile()) if self.pixel_items else ((1, *rows), (1, 1))
+        items, group = ((width, *rows), self.tile(kernel)) if self.pixel_items else ((1, *rows), (1, 1))
         sides = (*group, *([1] * (len(rows) - 1)))
         return items, group, math.prod(ceil_div(n, side) for n, side in zip(items, sides, strict=True))
 

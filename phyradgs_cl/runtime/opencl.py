@@ -35,12 +35,14 @@ _INCLUDE = re.compile(r'^\s*#include\s+"([^"]+)"\s*$')
 
 @dataclass(eq=False)
 class Kernel:
-    """The kernel ``function_name`` of ``cl/<program>.cl``, built with ``options`` at its first launch."""
+    """The kernel ``function_name`` of ``cl/<program>.cl``, built with ``options`` at its first launch. ``most_items``: of
+    a group, once the driver was asked."""
 
     program: str
     function_name: str
     options: tuple[str, ...]
     built: "cl.Kernel | None" = None
+    most_items: int | None = None
 
 
 @cache

@@ -78,7 +78,7 @@ def test_memory_that_is_missed_late_leaves_the_checkpoint(run, scan, tmp_path, c
 
 
 @pytest.mark.parametrize("code", [-5, -36])
-def test_a_driver_that_ended_a_kernel_is_asked_no_more(run, scan, tmp_path, capfd, monkeypatch, caplog, launches, code) -> None:
+def test_a_driver_that_ended_a_kernel(run, scan, tmp_path, capfd, monkeypatch, caplog, launches, code) -> None:
     """Out of resources, says the launch, and the context is dead: smaller bricks would fail too."""
 
     def dead(*_: object, **__: object) -> object:

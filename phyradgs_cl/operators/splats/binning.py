@@ -49,7 +49,8 @@ class TileLists:
             self._counts = rt.empty(1, np.int32)  # frees the old memory before it allocates the new
             self._counts = rt.empty(self.total * chunks, np.int32)
         domain = extents, stride, count, chunk, chunks, self.tile, self.tiles
-        group, scan = (chunk, _SCANNED) if rt.pixel_items else (1, 1)
+        group = chunk if rt.pixel_items else 1
+        scan = rt.group(1, _SCANNED, self._within, self._starts)
         boxes, scratch = ([rt.local(24 * group)], [rt.local(8 * scan)]) if rt.pixel_items else ([], [])
         if rt.pixel_items:
             rt.fill(self._counts, 0)
@@ -92,7 +93,9 @@ def chunk_of(rt: Runtime, tiles: int, count: int) -> int:
     """Returns the splats per work-item on a CPU, or per group on a GPU, where each has its own item."""
     if not rt.pixel_items:
         return _CHUNK
-    chunk, largest = _GROUP, min(_LARGEST_GROUP, rt.device.handle.max_work_group_size)
+    kernels = (rt.kernel("binning", f"bin_{step}_group") for step in ("count", "fill"))
+    largest = rt.group(1, _LARGEST_GROUP, *kernels)
+    chunk = min(_GROUP, largest)
     while 2 * chunk <= largest and tiles * ceil_div(count, chunk) > _MANY_COUNTS:
         chunk *= 2
     return chunk
