@@ -39,7 +39,8 @@ __kernel void rays_adjoint(
 {
     __local int range[2]; /* cells outside of which none sees the block */
     const int item = (int)get_local_id(0), items = (int)get_local_size(0);
-    const int4 block = (int4)((int)get_group_id(0) * BLOCK, (int)get_group_id(1) * BLOCK, (int)get_group_id(2) * BLOCK_Z, 0);
+    const int4 block = (int4)((int)get_global_id(0) / items * BLOCK, (int)get_global_id(1) * BLOCK,
+                              (int)get_global_id(2) * BLOCK_Z, 0); /* not by group: a launch may be a part of them */
     const int4 own = block + (int4)(item % BLOCK, (item / BLOCK) % BLOCK, item / (BLOCK * BLOCK), 0);
     const int4 corner = origin + block, voxel = origin + own; /* in the grid; own, block: in this volume */
     const int inside = own.x < shape.x && own.y < shape.y && own.z < shape.z;

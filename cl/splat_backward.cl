@@ -128,7 +128,7 @@ __kernel void splat_backward_rows(ARGUMENTS)
 #else
 __kernel void splat_backward_group(ARGUMENTS)
 {
-    const int g = (int)get_group_id(0), item = GROUP_ITEM;
+    const int g = (int)get_global_id(0) / ACROSS, item = GROUP_ITEM; /* a launch may be a part of all groups */
     __local float tree[SUM_COUNT * GROUP], splat_record[RECORD], cell[CELL];
     __local const int *record_as_int = (__local const int *)splat_record;
     const float limit = cutoff2 > 0.0f ? cutoff2 : MAXFLOAT;

@@ -18,10 +18,10 @@ __kernel void voxel_forward(
     const float limit = cutoff2 > 0.0f ? cutoff2 : MAXFLOAT;
 #if BLOCK_PIXEL
     __local float records_here[STAGED * VOXEL_RECORD];
-    const int x = (int)get_global_id(0), y = (int)get_global_id(1), z_first = (int)get_group_id(2) * DEPTH;
+    const int x = (int)get_global_id(0), y = (int)get_global_id(1), z_first = (int)get_global_id(2) * DEPTH;
     const int item = (int)(get_local_id(1) * get_local_size(0) + get_local_id(0));
     const int items = (int)(get_local_size(0) * get_local_size(1));
-    const int t = ((int)get_group_id(2) * tiles.y + (int)get_group_id(1)) * tiles.x + (int)get_group_id(0);
+    const int t = ((int)get_global_id(2) * tiles.y + y / tile.y) * tiles.x + x / tile.x; /* a launch may be a part of all */
     const tile_list list = list_of(tile_offsets, t, capacity, count);
     float sum[DEPTH] = {0.0f};
     for (int done = 0; done < list.count; done += STAGED) {

@@ -5,7 +5,8 @@ import math
 import time
 import warnings
 import weakref
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -33,6 +34,8 @@ class Runtime:
     shape: a work-item per pixel in small groups (GPUs, needs ``lanes`` 1), or per band of lines (CPUs). ``memory`` (bytes,
     or text as 2GiB) limits the sum of its buffers. ``ranks``: the processes that work on the same scan, each with its own
     Runtime; where a machine has several devices, each rank takes the next."""
+
+    most_samples = 2**29  # of a GPU's launch: 0.1 s on a slow one; the driver of a screen ends long launches
 
     def __init__(
         self, device: str | None = None, *, lanes: int | None = None, fp64: bool | None = None,
@@ -200,10 +203,13 @@ class Runtime:
 
     @naming_failures()
     def launch(
-        self, kernel: Kernel, items: int | tuple[int, ...], *args: Any, group: int | tuple[int, ...] = 1
+        self, kernel: Kernel, items: int | tuple[int, ...], *args: Any, group: int | tuple[int, ...] = 1, samples: int = 0
     ) -> None:
         """Enqueues ``items`` work-items (kernels ignore those past the end) in groups of ``group``, other sides 1. Python's
-        whole numbers become int, its others float. A long is np.int64, a float that may be whole np.float32."""
+        whole numbers become int, its others float. A long is np.int64, a float that may be whole np.float32.
+
+        ``samples``: what all items read, in samples of a ray. On a GPU more than ``most_samples`` go in several launches, in
+        which the kernel's items have their own global ids, and groups new ones."""
         shape = (items,) if isinstance(items, (int, np.integer)) else items
         if min(shape) < 1:
             return
@@ -213,12 +219,17 @@ class Runtime:
         arrays = [a for a in args if isinstance(a, DeviceArray)]
         built = self.compile(kernel)
         built.set_args(*map(_argument, args))
-        event = cl.enqueue_nd_range_kernel(self.queue, built, rounded, local)
-        self._record(kernel.function_name, event, sum(a.nbytes for a in arrays) if self.profile else 0)
+        nbytes = sum(a.nbytes for a in arrays) if self.profile else 0
+        pieces = ceil_div(samples, self.most_samples) if self.pixel_items else 1
+        for first, part in _parts(rounded, local, pieces):
+            event = cl.enqueue_nd_range_kernel(self.queue, built, part, local, first)
+            self._record(kernel.function_name, event, nbytes if first is None or not any(first) else 0)
+            if first is not None:
+                self.queue.flush()  # or the driver may hand over several as one
 
     def group(self, on_cpu: int = 1, on_gpu: int = 64, *kernels: Kernel) -> int:
-        """The work-group size for this class of device. ``kernels`` whose items work together must be able to run in it: on a
-        GPU it is halved until they are."""
+        """The work-group size for this class of device. On a GPU it is halved until it suits ``kernels``, whose items work
+        together."""
         while self.pixel_items and any(on_gpu > self.most_items(kernel) for kernel in kernels):
             on_gpu //= 2
         return on_gpu if self.pixel_items else on_cpu
@@ -291,6 +302,22 @@ def default_lanes(device: DeviceInfo) -> int:
     if device.kind != "cpu":
         return 1
     return max((n for n in LANE_CHOICES if n <= device.vector_width), default=1)
+
+
+def _parts(
+    items: tuple[int, ...], group: tuple[int, ...], pieces: int
+) -> Iterator[tuple[tuple[int, ...] | None, tuple[int, ...]]]:
+    """Yields first item and work-items of ``pieces`` parts or more, as far as groups allow; None as the first of a whole."""
+    if pieces <= 1:
+        yield None, items
+        return
+    cuts: list[list[tuple[int, int]]] = []
+    for count, size in zip(reversed(items), reversed(group), strict=True):
+        step = max(count // size // pieces, 1) * size
+        cuts.insert(0, [(first, min(step, count - first)) for first in range(0, count, step)])
+        pieces = ceil_div(pieces, len(cuts[0]))
+    for part in product(*cuts):
+        yield tuple(first for first, _ in part), tuple(count for _, count in part)
 
 
 def _argument(value: Any) -> Any:

@@ -143,8 +143,8 @@ class MemoryLedger:
 
     def error(self, work: str, error: "cl.Error", queue: "cl.CommandQueue | None" = None) -> DeviceError:
         """Returns an error of the driver as a DeviceError, or as a MemoryShortage where memory ran out, which some drivers
-        report only at a launch or a wait. ``work`` names what failed: a kernel, or "a copy". Where ``queue`` is dead no memory
-        was missed: drivers say "out of resources" of a kernel that crashed or ran too long, too."""
+        report only at a launch or a wait. ``work`` names what failed: a kernel, or "a copy". A dead ``queue``
+        missed no memory: drivers say "out of resources" of a kernel that crashed or ran too long, too."""
         code = getattr(error, "code", 0)  # none where pyopencl raises a text, as of a build
         is_dead = queue is not None and not answers(queue)
         if not is_dead and (isinstance(error, cl.MemoryError) or code in _MEMORY_CODES):

@@ -128,15 +128,15 @@ class SplatProjector:
         if self.by_pixel and rt.tile(kernel) != (self.tile_w, self.tile_h):
             self._cut(*rt.tile(kernel))
         self.prepare(gaussians, cells)
-        self.lists.build(self._extents, gaussians.count, gaussians.stride)
+        self.lists.build(self._extents, gaussians.count, gaussians.stride, cells.count)
         drawn = self.image if self._layers is None else self._layers.images(cells)
         items = (self.width, self.lines) if self.by_pixel else self.lists.total
         rt.launch(
-            kernel, items, self._records, self._is_visible, cells.cells, cells.line_cells, cells.line_times, cells.time_pitch,
-            self.path_limits, self.lists.tile_offsets, self.lists.splat_ids, self.lists.splat_ids.size,
+            kernel, items, self._records, self._is_visible, cells.cells, cells.line_cells, cells.line_times,
+            cells.time_pitch, self.path_limits, self.lists.tile_offsets, self.lists.splat_ids, self.lists.splat_ids.size,
             gaussians.count, cells.count, self.lines, self.width, self.pitch, self.tile_w, self.tile_h,
             ceil_div(self.width, self.tile_w), self.cutoff2, cells.layers, drawn,
-            group=(self.tile_w, self.tile_h) if self.by_pixel else 1,
+            group=(self.tile_w, self.tile_h) if self.by_pixel else 1, samples=self.lists.samples * cells.count,
         )  # fmt: skip
         return drawn
 
@@ -159,7 +159,7 @@ class SplatProjector:
         rt.launch(
             kernels.backward, items, self._records, self._is_visible, cells.cells, cells.line_times,
             cells.time_pitch, self.path_limits, by_images, gaussians.count, cells.count, self.lines,
-            self.pitch, self.cutoff2, group=group,
+            self.pitch, self.cutoff2, group=group, samples=self.lists.samples * cells.count,
         )  # fmt: skip
         by_states = self._cloud if self.states is None else self.states.zeros(gaussians, cells)
         rt.launch(

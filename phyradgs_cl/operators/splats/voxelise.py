@@ -56,7 +56,7 @@ class Voxeliser:
             self._forward, (nx, ny, ceil_div(nz, _TILE_ROWS)) if self.by_pixel else self.lists.total,
             self._records, self.lists.tile_offsets, self.lists.splat_ids, self.lists.splat_ids.size,
             gaussians.count, self._shape4, self.pitch, self.tile, self.lists.tiles, self.cutoff2, self.volume,
-            group=tuple(self.tile[:2].tolist()) if self.by_pixel else 1,
+            group=tuple(self.tile[:2].tolist()) if self.by_pixel else 1, samples=self.lists.samples,
         )  # fmt: skip
         return self.volume
 
@@ -71,7 +71,7 @@ class Voxeliser:
         items, group = items_by_gaussian(rt, gaussians.count)
         rt.launch(
             self._backward, items, self._records, by_volume, self._shape4, self.pitch, gaussians.count,
-            self.cutoff2, self._sums, group=group,
+            self.cutoff2, self._sums, group=group, samples=self.lists.samples,
         )  # fmt: skip
         rt.launch(
             self._chain, gaussians.stride // rt.lanes, gaussians.rows, self._sums, _pitch4(grid),
