@@ -18,6 +18,7 @@ from phyradgs_cl.runtime.opencl import cl
 MEMORY_VARIABLE = "PHYRADGS_MEMORY"
 _SMALLER = 0.25
 _PLANNED = 0.9  # of the free memory
+_PLANNED_UNSEEN = 0.6  # of all memory, where a GPU's driver does not say what other programs and the screen hold
 _UNITS = {"": 1, "B": 1}
 for _power, _letter in enumerate("KMGT", start=1):
     _UNITS |= {_letter: 1024**_power, f"{_letter}IB": 1024**_power, f"{_letter}B": 1000**_power}
@@ -105,7 +106,10 @@ class MemoryLedger:
     def __init__(self, device: DeviceInfo, limit_bytes: int | None) -> None:
         self.device = device
         self.is_asked = limit_bytes is not None
-        self.limit_bytes = reported_bytes(device) if limit_bytes is None else limit_bytes
+        free_bytes = reported_bytes(device)
+        self.limit_bytes = (free_bytes or device.memory_bytes) if limit_bytes is None else limit_bytes
+        is_unseen = limit_bytes is None and free_bytes is None and device.kind != "cpu"
+        self.planned = _PLANNED_UNSEEN if is_unseen else _PLANNED
         self.held_bytes = 0
         self.peak_bytes = 0
         self.reserved_bytes = 0
@@ -124,9 +128,10 @@ class MemoryLedger:
             self.reserved_bytes -= nbytes
 
     def room(self, largest_bytes: int) -> Room:
-        """Returns nine tenths of the rest of the limit, in buffers of at most ``largest_bytes``."""
+        """Returns nine tenths of the rest of the limit, in buffers of at most ``largest_bytes``; six where a GPU's driver does
+        not say what is free and nobody has set a limit."""
         free_bytes = max(self.limit_bytes - self.held_bytes - self.reserved_bytes, 0)
-        return Room(int(_PLANNED * free_bytes), min(largest_bytes, self.limit_bytes))
+        return Room(int(self.planned * free_bytes), min(largest_bytes, self.limit_bytes))
 
     def check(self, nbytes: int, largest_bytes: int) -> None:
         """Raises MemoryShortage for a buffer that is too large, or that would pass the limit."""
@@ -170,12 +175,12 @@ def answers(queue: "cl.CommandQueue") -> bool:
     return True
 
 
-def reported_bytes(device: DeviceInfo) -> int:
-    """Returns the free memory where the device reports it (AMD's extension), else all memory."""
+def reported_bytes(device: DeviceInfo) -> int | None:
+    """Returns the free memory where the device reports it (AMD's extension)."""
     with suppress(cl.Error, AttributeError):
         if "cl_amd_device_attribute_query" in device.handle.extensions:
             return int(device.handle.global_free_memory_amd[0]) * 1024  # type: ignore[index]
-    return device.memory_bytes
+    return None
 
 
 def memory_limit(wish: str | int | None) -> int | None:
