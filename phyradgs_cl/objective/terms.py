@@ -70,7 +70,8 @@ class ImageLoss:
         )  # fmt: skip
         rt.launch(
             self._kernels["image_gradient"], whole, self._spread, *images, *size,
-            np.float32(self.l1_weight / max(pixels, 1.0)), np.float32(self.ssim_weight / (self.lines * self.width)), weights,
+            np.float32(self.l1_weight / max(pixels, 1.0)),
+            np.float32(self.ssim_weight / (self.lines * self.width)), weights,
             np.float32(poisson / max(pixels, 1.0)), self.gradient, group=beside,
         )  # fmt: skip
         return self.gradient

@@ -22,6 +22,7 @@ from phyradgs_cl.runtime.profile import KernelUse, Profile, Rates, measure_rates
 log = logging.getLogger(__name__)
 
 LANE_CHOICES = (1, 4, 8, 16)
+_FUSING, _PAIRS = "-cl-mad-enable", '#line 1 "common/precise.h"'
 _TILE_ITEMS = 256  # of a work-group that shares local memory
 _FEWEST_ITEMS = 32  # that a kernel must be able to run in one group
 
@@ -74,7 +75,7 @@ class Runtime:
         """Declares the kernel ``name`` of ``cl/<program>.cl``; the first launch builds it, once for all its declarations."""
         merged: dict[str, int | float | bool] = {"LANES": self.lanes, "FP64": int(self.fp64), **defines}
         flags = [f"-D{name}={_literal(value)}" for name, value in sorted(merged.items())]
-        key = (program, name, ("-cl-std=CL1.2", "-cl-mad-enable", *flags))
+        key = (program, name, ("-cl-std=CL1.2", _FUSING, *flags))
         return self._kernels.setdefault(key, Kernel(*key))
 
     def compile(self, kernel: Kernel) -> "cl.Kernel":
@@ -96,7 +97,8 @@ class Runtime:
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", cl.CompilerWarning)
-                built = cl.Program(self.context, kernel_source(program)).build(options=list(options))
+                source = kernel_source(program)
+                built = cl.Program(self.context, source).build(options=self._allowed(source, options))
         except cl.Error as error:
             message_lines = [line for line in str(error).splitlines() if "error:" in line]
             message = " ".join((message_lines or str(error).splitlines())[:3])[:600]
@@ -104,6 +106,11 @@ class Runtime:
             raise DeviceError(subject, message, "a program that builds", remedy) from error
         log.debug("built %s in %.2f s", program, time.perf_counter() - started)
         return built
+
+    def _allowed(self, source: str, options: tuple[str, ...]) -> list[str]:
+        """Returns build options without those that would break sums of pairs of floats: some drivers ignore the pragma."""
+        has_pairs = not self.fp64 and _PAIRS in source
+        return [option for option in options if not (has_pairs and option == _FUSING)]
 
     def empty(self, shape: int | Sequence[int], dtype: np.typing.DTypeLike = np.float32) -> DeviceArray:
         """Returns uninitialised memory. Raises MemoryShortage where the device, or the limit, has too little."""
