@@ -14,7 +14,7 @@ import numpy as np
 from phyradgs_cl.checks import ceil_div
 from phyradgs_cl.errors import DeviceError
 from phyradgs_cl.parallel import Communicator
-from phyradgs_cl.runtime.device import DeviceInfo, choose_device
+from phyradgs_cl.runtime.device import DeviceInfo, choose_device, warn_of_fault
 from phyradgs_cl.runtime.memory import DeviceArray, LaterItem, MemoryLedger, Room, Traffic, memory_limit
 from phyradgs_cl.runtime.opencl import Kernel, cl, kernel_source, naming_failures
 from phyradgs_cl.runtime.profile import KernelUse, Profile, Rates, measure_rates
@@ -47,6 +47,7 @@ class Runtime:
         self.ranks = Communicator() if ranks is None else ranks
         self.device: DeviceInfo
         self.device, self.reason = choose_device(device, self.ranks.local_rank)
+        warn_of_fault(self.device)
         self.ledger = MemoryLedger(self.device, limit_bytes)
         self.traffic = Traffic()
         properties = cl.command_queue_properties.PROFILING_ENABLE if profile else 0
@@ -92,6 +93,11 @@ class Runtime:
         """The names of the kernels that were launched so far."""
         return {kernel.function_name for kernel in self._kernels.values() if kernel.built is not None}
 
+    @property
+    def group_limits(self) -> dict[str, int]:
+        """The largest groups of the kernels that were asked, by name."""
+        return {one.function_name: one.most_items for one in self._kernels.values() if one.most_items is not None}
+
     def _build(self, program: str, options: tuple[str, ...]) -> "cl.Program":
         started = time.perf_counter()
         try:
@@ -107,9 +113,10 @@ class Runtime:
         log.debug("built %s in %.2f s", program, time.perf_counter() - started)
         return built
 
-    def _allowed(self, source: str, options: tuple[str, ...]) -> list[str]:
+    @staticmethod
+    def _allowed(source: str, options: tuple[str, ...]) -> list[str]:
         """Returns build options without those that would break sums of pairs of floats: some drivers ignore the pragma."""
-        has_pairs = not self.fp64 and _PAIRS in source
+        has_pairs = "-DFP64=0" in options and _PAIRS in source
         return [option for option in options if not (has_pairs and option == _FUSING)]
 
     def empty(self, shape: int | Sequence[int], dtype: np.typing.DTypeLike = np.float32) -> DeviceArray:

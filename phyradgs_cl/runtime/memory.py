@@ -128,8 +128,8 @@ class MemoryLedger:
             self.reserved_bytes -= nbytes
 
     def room(self, largest_bytes: int) -> Room:
-        """Returns nine tenths of the rest of the limit, in buffers of at most ``largest_bytes``; six where a GPU's driver does
-        not say what is free and nobody has set a limit."""
+        """Returns nine tenths of the rest of the limit, in buffers of at most ``largest_bytes``; six where a GPU's driver
+        does not say what is free and nobody has set a limit."""
         free_bytes = max(self.limit_bytes - self.held_bytes - self.reserved_bytes, 0)
         return Room(int(self.planned * free_bytes), min(largest_bytes, self.limit_bytes))
 

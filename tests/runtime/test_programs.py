@@ -133,7 +133,8 @@ def test_splats_and_voxels_where_the_smallest_numbers_are_0(monkeypatch, make_cl
 
     usual = computed(Runtime(lanes=1, pixel_items=True))
     allowed = Runtime._allowed
-    monkeypatch.setattr(Runtime, "_allowed", lambda *given: [*allowed(*given), "-cl-denorms-are-zero"])
+    flushing = staticmethod(lambda *given: [*allowed(*given), "-cl-denorms-are-zero"])
+    monkeypatch.setattr(Runtime, "_allowed", flushing)
     for found, expected in zip(computed(Runtime(lanes=1, pixel_items=True)), usual, strict=True):
         assert_near(found, expected, FLOAT32)
 
