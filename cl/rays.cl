@@ -19,11 +19,10 @@ __kernel void rays_forward(
     const int4 shape, const int4 origin, /* voxels of the volume, and the first of them in the grid, x y z */
     const int volume_pitch, const float4 pitch_mm,
     const int lines, const int width, const int image_pitch,
-    const int frame_first,            /* in the list */
     const int add,                    /* onto the image: the log average of one more brick */
     __global float *image)            /* guard, then (listed frames, lines, pitch) */
 {
-    const int u = (int)get_global_id(0) * LANES, v = (int)get_global_id(1), n = frame_first + (int)get_global_id(2);
+    const int u = (int)get_global_id(0) * LANES, v = (int)get_global_id(1), n = (int)get_global_id(2);
     if (u >= width)
         return;
     const index_t sy = volume_pitch, sz = sy * (shape.y + 2 * BORDER);

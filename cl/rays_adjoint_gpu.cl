@@ -1,9 +1,12 @@
 /* Adjoint of rays.cl for GPUs. A work-item is a voxel and gathers from the rays whose samples touch it. A work-group is a
-   block of 4 x 4 x 4 voxels, which searches for its cells together. */
+   block of 4 x 4 x 4 voxels, or fewer along z, which searches for its cells together. */
 #include "common/ray.h"
 #include "common/ray_window.h"
 
 #define BLOCK 4
+#ifndef BLOCK_Z
+#define BLOCK_Z BLOCK
+#endif
 #define FEW_CELLS 8    /* a frame of so few is not worth the search */
 
 /* weight that the ray's sample puts on the voxel, as rays_forward does */
@@ -36,13 +39,15 @@ __kernel void rays_adjoint(
 {
     __local int range[2]; /* cells outside of which none sees the block */
     const int item = (int)get_local_id(0), items = (int)get_local_size(0);
-    const int4 block = (int4)((int)get_group_id(0), (int)get_group_id(1), (int)get_group_id(2), 0) * BLOCK;
+    const int4 block = (int4)((int)get_global_id(0) / items * BLOCK, (int)get_global_id(1) * BLOCK,
+                              (int)get_global_id(2) * BLOCK_Z, 0); /* not by group: a launch may be a part of them */
     const int4 own = block + (int4)(item % BLOCK, (item / BLOCK) % BLOCK, item / (BLOCK * BLOCK), 0);
     const int4 corner = origin + block, voxel = origin + own; /* in the grid; own, block: in this volume */
     const int inside = own.x < shape.x && own.y < shape.y && own.z < shape.z;
     const index_t sy = volume_pitch, sz = sy * (shape.y + 2 * BORDER);
     __global float *to = volume + IMAGE_GUARD + (own.z + BORDER) * sz + (own.y + BORDER) * sy + own.x;
-    const float4 around = (float4)(0.5f * (BLOCK + 1)), middle = convert_float4(corner) + 0.5f * (BLOCK - 1);
+    const float4 sides = (float4)(BLOCK, BLOCK, BLOCK_Z, BLOCK);
+    const float4 around = 0.5f * (sides + 1.0f), middle = convert_float4(corner) + 0.5f * (sides - 1.0f);
     float sum = inside && add ? *to : 0.0f;
     for (int n = frame_first; n < frame_stop; ++n) {
         __global const float *frame = image + IMAGE_GUARD + (size_t)n * lines * image_pitch;

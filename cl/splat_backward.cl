@@ -128,16 +128,17 @@ __kernel void splat_backward_rows(ARGUMENTS)
 #else
 __kernel void splat_backward_group(ARGUMENTS)
 {
-    const int g = (int)get_group_id(0), item = GROUP_ITEM;
-    __local float tree[SUM_COUNT * GROUP], splat_record[RECORD], cell[CELL];
-    __local const int *record_as_int = (__local const int *)splat_record;
+    const int g = (int)get_global_id(0) / ACROSS, item = GROUP_ITEM; /* a launch may be a part of all groups */
+    __local float tree[SUM_COUNT * GROUP], cell[CELL];
+    __local int record_as_int[RECORD]; /* floats among them: a device may flush ints that are copied as floats */
+    __local const float *splat_record = (__local const float *)record_as_int;
     const float limit = cutoff2 > 0.0f ? cutoff2 : MAXFLOAT;
     for (int c = 0; c < cell_count; ++c) {
         const size_t at = (size_t)g * cell_count + c;
         if (!is_visible[at])
             continue;
         for (int f = item; f < RECORD; f += GROUP)
-            splat_record[f] = records[at * RECORD + f];
+            record_as_int[f] = ((__global const int *)records)[at * RECORD + f];
         for (int f = item; f < CELL; f += GROUP)
             cell[f] = cells[c * CELL + f];
         barrier(CLK_LOCAL_MEM_FENCE | CLK_GLOBAL_MEM_FENCE); /* all have read where sums will be */

@@ -71,14 +71,15 @@ ALWAYS_INLINE void add_line(const footprint_line line, const float limit, __glob
 /* Groups of tile_w by tile_h items. A line's cells lie between those of the tile's first and last line. */
 __kernel void splat_forward_pixels(ARGUMENTS)
 {
-    __local float records_here[STAGED * RECORD], cells_here[STAGED * CELL];
+    __local int records_here[STAGED * RECORD]; /* floats among them: a device may flush ints that are copied as floats */
+    __local float cells_here[STAGED * CELL];
     __local int place[STAGED], cell_of[STAGED]; /* in records, -1 where the splat is not visible in this tile; its cell */
     const int u = (int)get_global_id(0), v = (int)get_global_id(1);
     const int item = (int)(get_local_id(1) * get_local_size(0) + get_local_id(0));
     const int items = (int)(get_local_size(0) * get_local_size(1));
-    const int left = (int)get_group_id(0) * tile_w, top = (int)get_group_id(1) * tile_h;
+    const int left = u - (int)get_local_id(0), top = v - (int)get_local_id(1); /* a launch may be a part of all groups */
     const int right = min(left + tile_w, width) - 1, bottom = min(top + tile_h, lines) - 1;
-    const int tile = (int)get_group_id(1) * tiles_u + (int)get_group_id(0);
+    const int tile = top / tile_h * tiles_u + left / tile_w;
     const tile_list list = list_of(tile_offsets, tile, capacity, count);
     const int c_first = line_cells[2 * top], c_count = line_cells[2 * bottom + 1] - c_first;
     const int inside = u < width && v < lines;
@@ -107,7 +108,7 @@ __kernel void splat_forward_pixels(ARGUMENTS)
         barrier(CLK_LOCAL_MEM_FENCE);
         for (int f = item; f < here * RECORD; f += items)
             if (place[f / RECORD] >= 0)
-                records_here[f] = records[(size_t)place[f / RECORD] * RECORD + f % RECORD];
+                records_here[f] = ((__global const int *)records)[(size_t)place[f / RECORD] * RECORD + f % RECORD];
         for (int f = item; f < here * CELL; f += items)
             cells_here[f] = cells[cell_of[f / CELL] * CELL + f % CELL];
         barrier(CLK_LOCAL_MEM_FENCE);
@@ -115,8 +116,8 @@ __kernel void splat_forward_pixels(ARGUMENTS)
             const int c = cell_of[k];
             if (place[k] < 0 || c < own_first || c >= own_stop)
                 continue;
-            __local const float *splat_record = records_here + k * RECORD, *cell = cells_here + k * CELL;
-            __local const int *record_as_int = (__local const int *)splat_record;
+            __local const int *record_as_int = records_here + k * RECORD;
+            __local const float *splat_record = (__local const float *)record_as_int, *cell = cells_here + k * CELL;
             if (v < record_as_int[REC_V_LO] || v > record_as_int[REC_V_HI] || u < record_as_int[REC_U_LO] || u > record_as_int[REC_U_HI])
                 continue;
             const footprint_line line = footprint_alone(splat_record, cell, TIMES_OF(c, line_times, time_pitch), time_pitch, v,

@@ -17,11 +17,11 @@ __kernel void voxel_forward(
 {
     const float limit = cutoff2 > 0.0f ? cutoff2 : MAXFLOAT;
 #if BLOCK_PIXEL
-    __local float records_here[STAGED * VOXEL_RECORD];
-    const int x = (int)get_global_id(0), y = (int)get_global_id(1), z_first = (int)get_group_id(2) * DEPTH;
+    __local int records_here[STAGED * VOXEL_RECORD]; /* floats among them: a device may flush ints that are copied as floats */
+    const int x = (int)get_global_id(0), y = (int)get_global_id(1), z_first = (int)get_global_id(2) * DEPTH;
     const int item = (int)(get_local_id(1) * get_local_size(0) + get_local_id(0));
     const int items = (int)(get_local_size(0) * get_local_size(1));
-    const int t = ((int)get_group_id(2) * tiles.y + (int)get_group_id(1)) * tiles.x + (int)get_group_id(0);
+    const int t = ((int)get_global_id(2) * tiles.y + y / tile.y) * tiles.x + x / tile.x; /* a launch may be a part of all */
     const tile_list list = list_of(tile_offsets, t, capacity, count);
     float sum[DEPTH] = {0.0f};
     for (int done = 0; done < list.count; done += STAGED) {
@@ -29,12 +29,13 @@ __kernel void voxel_forward(
         barrier(CLK_LOCAL_MEM_FENCE); /* all have read what was there */
         for (int f = item; f < here * VOXEL_RECORD; f += items) {
             const int e = done + f / VOXEL_RECORD;
-            records_here[f] = records[(size_t)listed_splat(list, tile_splat_ids, e) * VOXEL_RECORD + f % VOXEL_RECORD];
+            const size_t splat = (size_t)listed_splat(list, tile_splat_ids, e) * VOXEL_RECORD;
+            records_here[f] = ((__global const int *)records)[splat + f % VOXEL_RECORD];
         }
         barrier(CLK_LOCAL_MEM_FENCE);
         for (int k = 0; k < here; ++k) {
-            __local const float *voxel_record = records_here + k * VOXEL_RECORD;
-            __local const int *record_as_int = (__local const int *)voxel_record;
+            __local const int *record_as_int = records_here + k * VOXEL_RECORD;
+            __local const float *voxel_record = (__local const float *)record_as_int;
             if (x < record_as_int[VOX_LO] || x > record_as_int[VOX_HI] || y < record_as_int[VOX_LO + 1] || y > record_as_int[VOX_HI + 1])
                 continue;
 #pragma unroll

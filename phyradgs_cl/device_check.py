@@ -4,7 +4,7 @@ Gradients are compared with central differences of the twins. Limits are several
 conforming device, and far below the error of a wrong kernel."""
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 
 import numpy as np
@@ -13,6 +13,7 @@ from phyradgs_cl import operators
 from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, ConstantSpeed, ParallelGeometry, Shutter
 from phyradgs_cl.acquisition.cells import common_time_cells, exact_cells, micro_view_cells, static_cells
 from phyradgs_cl.acquisition.time_cells import TimeCells
+from phyradgs_cl.device_probes import PAIRS, carried, pair_error
 from phyradgs_cl.errors import DeviceError, OutOfMemoryError
 from phyradgs_cl.fields import Activation, Deformation, Grid
 from phyradgs_cl.fields.gaussians import DENSITY, MEAN, QUATERNION, SCALE
@@ -47,11 +48,13 @@ Comparison = tuple[np.ndarray, np.ndarray, float]
 
 @dataclass(frozen=True)
 class Verdict:
-    """``agreeing``: kernels that agree with their twins; ``failures``: the others, in words."""
+    """``agreeing``: kernels that agree with their twins; ``failures``: the others, in words. ``group_limits``: the largest
+    groups of kernels that run in groups."""
 
     device: str
     agreeing: frozenset[str]
     failures: tuple[str, ...]
+    group_limits: dict[str, int] = field(default_factory=dict)
 
     def __str__(self) -> str:
         if not self.failures:
@@ -62,13 +65,15 @@ class Verdict:
 def check_device(device: str | None = None, **launch_shape: bool | int) -> Verdict:
     """Builds and runs every kernel of a device; ``launch_shape``: options of Runtime."""
     agreeing: set[str] = set()
-    failures = []
+    failures: list[str] = []
+    limits: dict[str, int] = {}
     for check in CHECKS:
         rt = Runtime(device, **launch_shape)  # type: ignore[arg-type]  # a new Runtime: the kernels that it has built are those that have run
         if problem := _problem(check, rt, agreeing):
             suspects = sorted(rt.built_kernels - agreeing) or sorted(rt.built_kernels)
             failures.append(f"{', '.join(suspects)} ({problem})" if suspects else problem)
-    return Verdict(rt.device.name, frozenset(agreeing), tuple(failures))
+        limits |= rt.group_limits
+    return Verdict(rt.device.name, frozenset(agreeing), tuple(failures), limits)
 
 
 def _problem(check: Callable[[Runtime], Iterator[Comparison]], rt: Runtime, agreeing: set[str]) -> str:
@@ -102,6 +107,13 @@ def _algebra(rt: Runtime) -> Iterator[Comparison]:
     rt.launch(rt.kernel("rates", "multiply_add"), 64, 3, np.float32(0.5), out, group=rt.group())
     chains = 0.5**3 * (np.arange(64)[:, None] % 7 + np.arange(8)) + 1 - 0.5**3
     yield rt.download(out), rt.lanes * chains.sum(1), VALUE
+
+
+def _numbers(rt: Runtime) -> Iterator[Comparison]:
+    """What kernels rely on: pairs of floats where there is no float64, whole numbers in local memory."""
+    error = pair_error(rt)
+    yield np.array(0.0 if rt.fp64 else error), np.zeros(()), PAIRS
+    yield np.array(float(carried(rt)[0])), np.ones(()), 0.0
 
 
 def _binning(rt: Runtime) -> Iterator[Comparison]:
@@ -336,7 +348,7 @@ def _optimiser(rt: Runtime) -> Iterator[Comparison]:
 
 
 CHECKS = (
-    _algebra, _binning, _splats, _splats_of_moving_objects, _layered_splats, _plain_splats, _voxels, _rays, _warps,
+    _numbers, _algebra, _binning, _splats, _splats_of_moving_objects, _layered_splats, _plain_splats, _voxels, _rays, _warps,
     _backprojections, _moving_backprojections, _image_terms, _variation, _optimiser,
 )  # fmt: skip
 """Ordered by dependence: a kernel that has agreed is not suspected later."""

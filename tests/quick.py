@@ -31,7 +31,7 @@ LATER = (
     "operators/test_bricks.py", "operators/test_device_arrays.py", "acquisition/test_orbit_recipes.py",
     *(f"operators/test_subrays.py::test_{one}" for one in ("arrays_of", "a_volume_in", "an_object")),
     *(f"operators/test_splat_states.py::test_{one}" for one in ("frames_and_gradients", "parallel_rays")),
-    "importers/test_hostile.py::test_refused[nxtomo",
+    "importers/test_hostile.py::test_refused[nxtomo", "runtime/test_launches.py::test_groups",
     "importers/test_hostile.py::test_good_files_pass_and_what_is_not_there_is_not_looked_for_elsewhere[nxtomo",
 )  # fmt: skip
 """The same kernels on parts of volumes, arrays of the device, files by packages of `test-all`: with the slow tests."""

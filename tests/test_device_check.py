@@ -1,14 +1,18 @@
 """Whether a device can be trusted: every kernel is asked, and one that is wrong is named."""
 
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 from kernel_kit import CPU_ONLY
 
-from phyradgs_cl import device_check
+from phyradgs_cl import device_check, device_probes
 from phyradgs_cl.device_check import check_device
-from phyradgs_cl.runtime import context
+from phyradgs_cl.device_probes import probe_lines
+from phyradgs_cl.errors import DeviceError
+from phyradgs_cl.runtime import Runtime, context, known_fault
+from phyradgs_cl.runtime.device import warn_of_fault
 from phyradgs_cl.runtime.opencl import kernel_source
 
 KERNELS = Path(__file__).resolve().parent.parent / "cl"
@@ -47,5 +51,63 @@ def test_a_wrong_kernel_is_named(monkeypatch, cli, capfd, check, program, right,
     monkeypatch.setattr(context, "kernel_source", planted)
     monkeypatch.setattr(device_check, "CHECKS", (getattr(device_check, check),))
     assert cli.run(["devices", "--check"]) == 5
-    line = capfd.readouterr().out
-    assert line.count("\n") == 1 and "cannot be trusted: " in line and named in line
+    line, *probes = capfd.readouterr().out.splitlines()
+    assert "cannot be trusted: " in line and named in line
+    assert [probe.partition(":")[0].split()[0] for probe in probes] == TOLD
+
+
+TOLD = ["driver", "pairs", "whole", "subnormal", "work-items", "times"]
+
+
+def told(**launch_shape) -> list[str]:
+    return list(probe_lines(None, {"wide": 256, "narrow": 64}, 1.5, **launch_shape))
+
+
+def test_what_a_device_does_with_numbers_is_told(monkeypatch) -> None:
+    """A build that may reorder sums stands for a driver that contracts pairs."""
+    monkeypatch.setattr(device_probes, "LASTING_S", (0.01,))
+    right = told(lanes=1, pixel_items=True, fp64=False)
+    assert "which stand for float64 here: kept" in right[1] and "kept, as floats kept" in right[2]
+    assert "of narrow at most 64" in right[4] and "compared in 1.5 s" in right[5]
+    assert re.search(r"longest launch that lived: [\d.e-]+ s or more", right[6])
+    allowed = Runtime._allowed
+    monkeypatch.setattr(Runtime, "_allowed", staticmethod(lambda *given: [*allowed(*given), "-cl-fast-relaxed-math"]))
+    assert "pairs of floats: contracted, relative error 5.9e-08" in told()[1]
+    monkeypatch.setattr(device_check, "CHECKS", (device_check._numbers,))
+    assert "probe_pairs (off by" in check_device(fp64=False).failures[0] and not check_device().failures
+
+
+def test_a_driver_that_ends_long_launches_is_found(monkeypatch) -> None:
+    made = []
+
+    def spin(rt: Runtime, steps: int) -> float:
+        made.append(rt)
+        if 1e-5 * steps > 2:
+            raise DeviceError("device", "ended", "one that works")
+        return 1e-5 * steps
+
+    monkeypatch.setattr(device_probes, "_spin", spin)
+    found = device_probes.longest_launch(lambda: Runtime(), (0.1, 1.0, 3.0))
+    assert found == "1 s; the driver ended one of 3 s" and len(set(made)) == 4
+
+
+def test_a_driver_that_is_known_to_be_wrong_is_named(monkeypatch, cli, rt, capfd, caplog) -> None:
+    monkeypatch.setattr(device_check, "CHECKS", (device_check._numbers,))
+    assert cli.run(["devices", "--check"]) == 0 and "known:" not in capfd.readouterr().out
+
+    class Old:
+        driver_version = "22.3.6"
+
+        def __getattr__(self, name: str) -> object:
+            return getattr(rt.device.handle, name)
+
+    old = replace(rt.device, platform="rusticl", handle=Old())
+    assert "install Mesa 25 or newer" in known_fault(old)
+    warn_of_fault(old)
+    warn_of_fault(old)
+    assert caplog.text.count("rusticl of Mesa 22.3.6 computes wrong sums") == 1
+    Old.driver_version = "25.0.7-2"
+    assert known_fault(old) is None
+    monkeypatch.setattr("phyradgs_cl.commands.devices.known_fault", lambda device: "wrong sums")
+    cli.run(["devices", "--check"])
+    assert "  known: wrong sums\n" in capfd.readouterr().out

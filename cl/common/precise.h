@@ -43,7 +43,7 @@ static inline vf wide_split(vwide a, vf *rest)
 typedef struct { vf high, low; } vwide;
 typedef float2 coefficient;
 
-/* error-free sums and products: nothing in these may become a multiply-add, which -cl-mad-enable would allow */
+/* error-free sums and products: nothing in these may become a multiply-add; the host leaves -cl-mad-enable out too */
 static inline vwide wide_sum(vwide a, vf b)
 {
 #pragma OPENCL FP_CONTRACT OFF

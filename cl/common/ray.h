@@ -16,7 +16,7 @@
 #define RAY_PARALLEL 0
 #endif
 #if RAY_PARALLEL
-#define START_OF(start, i) ((start) * (float)(i))
+#define START_OF(start, i) fma((start), (float)(i), 0.0f) /* rounded everywhere: no sum may take the product in */
 #define AHEAD_OF(start, i) 1.0f
 #else
 #define START_OF(start, i) (start)

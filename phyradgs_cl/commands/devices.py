@@ -1,12 +1,14 @@
 """devices: the OpenCL devices, the one that is used, and whether its kernels compute correctly."""
 
+import time
 from typing import Annotated
 
 from phyradgs_cl.commands.console import option, say
 from phyradgs_cl.commands.options import Device
 from phyradgs_cl.device_check import check_device
+from phyradgs_cl.device_probes import probe_lines
 from phyradgs_cl.errors import DeviceError
-from phyradgs_cl.runtime import choose_device, list_devices
+from phyradgs_cl.runtime import choose_device, known_fault, list_devices
 from phyradgs_cl.runtime.context import default_lanes
 from phyradgs_cl.settings import device_wish
 
@@ -18,8 +20,13 @@ def devices_command(check: Annotated[bool, option(_CHECK)] = False, device: Devi
     """List the OpenCL devices and the one that is used, with the reason; --check runs every kernel on it."""
     chosen, reason = choose_device(device_wish(device))
     if check:
+        started = time.perf_counter()
         verdict = check_device(device_wish(device))
         say(str(verdict))
+        if fault := known_fault(chosen):
+            say(f"  known: {fault}")
+        for line in probe_lines(device_wish(device), verdict.group_limits, time.perf_counter() - started):
+            say(f"  {line}")
         return DeviceError.exit_code if verdict.failures else 0
     for d in list_devices():
         mark = "*" if d.index == chosen.index else " "

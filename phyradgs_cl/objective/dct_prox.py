@@ -19,6 +19,7 @@ from phyradgs_cl.runtime import DeviceArray, Runtime, SameArray
 from phyradgs_cl.runtime.layout import GUARD, on_device, padded_zeros, pitch_of
 
 EDGE = 4
+_SAMPLES = 8  # as long as so many samples of a ray takes a voxel of a block
 # By turn, the shift along y for every shift along z: a turn has each of both once, four turns have all pairs
 TURNS = ((0, 1, 2, 3), (1, 3, 0, 2), (2, 0, 3, 1), (3, 2, 1, 0))
 
@@ -58,7 +59,7 @@ class DctProx:
         for (z, y), x in itertools.product(enumerate(turn), range(along_x)):
             shift = np.array([x, y, z, 0], np.int32)
             arguments = self._padded, *layout, shift, np.float32(threshold), self._excess
-            rt.launch(self._excess_of, blocks, *arguments, group=rt.group())
+            rt.launch(self._excess_of, blocks, *arguments, group=rt.group(), samples=_SAMPLES * nx * ny * nz)
         clip = np.int32(nonnegative)
         items = (ceil_div(nx, rt.lanes), ny, nz)
         rt.launch(self._end, items, volume, self._excess, *layout, clip, result, group=rt.group(on_cpu=min(items[0], 8)))

@@ -17,6 +17,7 @@ from phyradgs_cl.runtime.layout import GUARD, Strides, move, on_device, padded_z
 
 EDGE = 5
 """Voxels along a side of a filter."""
+_SAMPLES = 200  # as long as so many samples of a ray takes a voxel, at most
 _SLICES = 2  # of channels and responses, computed at a time
 _RING = _SLICES + 2  # in memory: a correlation needs three
 
@@ -107,7 +108,8 @@ class RidgeStep:
         if start < stop:
             items = nx if self.rt.pixel_items else 1, ny, stop - start
             arguments = *sources, *self._layout, np.int32(start), self._table, *ends
-            self.rt.launch(kernel, items, *arguments, group=self.rt.group())
+            samples = _SAMPLES * nx * ny * (stop - start)
+            self.rt.launch(kernel, items, *arguments, group=self.rt.group(), samples=samples)
 
 
 def ridge_gradient(volume: np.ndarray, sigma: float, ridge: Ridge) -> np.ndarray:

@@ -37,7 +37,7 @@ class ImageLoss:
         self._partials = rt.zeros(3 * image + GUARD)
         self._spread = rt.zeros(3 * image + GUARD)
         self._window = rt.upload(WINDOW, np.float32)
-        self._sums = rt.zeros((rt.shape_of_lines(width, lines)[2], 3))
+        self._sums = rt.zeros((rt.shape_of_lines(self._kernels["ssim_map"], width, lines)[2], 3))
         self.gradient = rt.zeros(image + GUARD)
 
     def evaluate(
@@ -48,8 +48,8 @@ class ImageLoss:
         vectors = ceil_div(self.width, rt.lanes)
         size = (np.int32(self.lines), np.int32(self.width), np.int32(self.pitch))
         group = rt.group()
-        items, tile, _ = rt.shape_of_lines(self.width, self.lines)
-
+        items, tile, _ = rt.shape_of_lines(self._kernels["ssim_map"], self.width, self.lines)
+        whole, beside, _ = rt.shape_of_lines(self._kernels["image_gradient"], self.pitch, self.lines)
         images = (rendered, measured, mask, self._window)
         rt.launch(self._kernels["ssim_moments"], (vectors, self.lines), *images, *size, self._moments, group=group)
         rt.launch(
@@ -61,9 +61,9 @@ class ImageLoss:
             self._spread, group=group,
         )  # fmt: skip
         rt.launch(
-            self._kernels["image_gradient"], rt.shape_of_lines(self.pitch, self.lines)[0], self._spread,
-            *images, *size, np.float32(self.l1_weight / max(pixels, 1.0)),
-            np.float32(self.ssim_weight / (self.lines * self.width)), self.gradient, group=tile,
+            self._kernels["image_gradient"], whole, self._spread, *images, *size,
+            np.float32(self.l1_weight / max(pixels, 1.0)),
+            np.float32(self.ssim_weight / (self.lines * self.width)), self.gradient, group=beside,
         )  # fmt: skip
         return self.gradient
 
@@ -105,13 +105,13 @@ class TotalVariation:
         self._shape4 = np.array([nx, ny, nz, 0], np.int32)
         self._weight4 = np.array([*_axis_weights(shape)[::-1], 0], np.float32)
         self._kernel = rt.kernel("total_variation", "total_variation", IMAGE_GUARD=GUARD)
-        self._sums = rt.zeros(rt.shape_of_lines(pitch, ny, nz)[2])
+        self._sums = rt.zeros(rt.shape_of_lines(self._kernel, pitch, ny, nz)[2])
         self.gradient = rt.zeros(2 * GUARD + nz * ny * pitch)
 
     def evaluate(self, volume: DeviceArray) -> DeviceArray:
         """Returns dTV/dvolume, valid until the next call."""
         nz, ny, _ = self.shape
-        items, tile, _ = self.rt.shape_of_lines(self.pitch, ny, nz)
+        items, tile, _ = self.rt.shape_of_lines(self._kernel, self.pitch, ny, nz)
         self.rt.launch(
             self._kernel, items, volume, self._shape4, self.pitch, self._weight4, self.gradient,
             self.rt.local(4 * math.prod(tile)), self._sums, group=tile,

@@ -23,6 +23,7 @@ _BLOCK_VOXELS = 128  # along z per work-item of the upright kernel
 _COLUMN_ROWS = 512  # detector rows that such a block may project to
 _UPRIGHT = 1e-7  # change of u or depth over the volume's height, relative to the depth
 _MOST_LEAN = 0.25  # columns per row along z: beyond it the general kernel is faster
+LINE_SAMPLES = 4  # as long as so many samples takes a voxel of a view whose lines have their own poses
 _WIDEST = 16  # voxels of a vector, which may run past the last one
 Arguments = tuple[DeviceArray, DeviceArray, DeviceArray, np.int32, np.int32, np.int32, np.int32, np.int64]
 
@@ -149,7 +150,8 @@ def _backprojected(
 def _general(rt: Runtime, power: int, images: Arguments, brick: Brick, volume: DeviceArray) -> None:
     nz, ny, nx = brick.shape
     kernel = rt.kernel("backproject", "backproject", **_defines(power))
-    rt.launch(kernel, (ceil_div(nx, rt.lanes), ny, nz), *images, *volume_shape(brick), volume, group=rt.group())
+    rt.launch(kernel, (ceil_div(nx, rt.lanes), ny, nz), *images, *volume_shape(brick), volume, group=rt.group(),
+              samples=nx * ny * nz * int(images[3]))  # fmt: skip
 
 
 def _lines(rt: Runtime, power: int, is_turned: bool, images: Arguments, brick: Brick, volume: DeviceArray) -> None:
@@ -159,7 +161,8 @@ def _lines(rt: Runtime, power: int, is_turned: bool, images: Arguments, brick: B
     kernel = rt.kernel("backproject", "backproject_lines", **_defines(power), **along_z)
     items = (nx, ny, ceil_div(nz, rt.lanes)) if along_z else (ceil_div(nx, rt.lanes), ny, nz)
     across = np.int32(is_turned and power == 2)
-    rt.launch(kernel, items, *images, *volume_shape(brick), across, volume, group=rt.group(on_cpu=4 if along_z else 1))
+    rt.launch(kernel, items, *images, *volume_shape(brick), across, volume, group=rt.group(on_cpu=4 if along_z else 1),
+              samples=LINE_SAMPLES * nx * ny * nz * int(images[3]))  # fmt: skip
 
 
 def _upright(rt: Runtime, name: str, power: int, block: int, images: Arguments, brick: Brick, volume: DeviceArray) -> None:

@@ -229,13 +229,14 @@ class DeviceSpace:
     def _sum(self, name: str, whole: DeviceArray, *arrays: DeviceArray, add: bool = False) -> None:
         """Sums over arrays on the device into ``whole``, or adds to it; the named kernel makes the first level."""
         groups = self._reduce(name, *arrays, scratch=8)
-        group = self.rt.group(1, _GPU_GROUP)
         kernel = self.rt.kernel("algebra", "dot_whole")
+        group = self.rt.group(1, _GPU_GROUP, kernel)
         self.rt.launch(kernel, group, self._parts, groups, add, self.rt.local(8 * group), whole, group=group)
 
     def _reduce(self, name: str, *arguments: Any, scratch: int) -> int:
         """Launches the first level of a sum over the first array; returns the number of results in ``_parts``."""
-        count, group = arguments[0].size, self.rt.group(1, _GPU_GROUP)
+        kernel = self.rt.kernel("algebra", name)
+        count, group = arguments[0].size, self.rt.group(1, _GPU_GROUP, kernel)
         if self.rt.pixel_items:  # neighbours side by side
             groups = min(_GPU_GROUPS, ceil_div(count, group))
             first_by, step, span = 1, groups * group, count
@@ -244,7 +245,6 @@ class DeviceSpace:
             span = ceil_div(span, self.rt.lanes) * self.rt.lanes
             groups, first_by, step = ceil_div(count, span), span, self.rt.lanes
         where = (np.int64(n) for n in (count, first_by, step, span))
-        kernel = self.rt.kernel("algebra", name)
         local = self.rt.local(scratch * group)
         self.rt.launch(kernel, groups * group, *arguments, *where, local, self._parts, group=group)
         return groups

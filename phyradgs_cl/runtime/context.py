@@ -5,7 +5,8 @@ import math
 import time
 import warnings
 import weakref
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -13,7 +14,7 @@ import numpy as np
 from phyradgs_cl.checks import ceil_div
 from phyradgs_cl.errors import DeviceError
 from phyradgs_cl.parallel import Communicator
-from phyradgs_cl.runtime.device import DeviceInfo, choose_device
+from phyradgs_cl.runtime.device import DeviceInfo, choose_device, warn_of_fault
 from phyradgs_cl.runtime.memory import DeviceArray, LaterItem, MemoryLedger, Room, Traffic, memory_limit
 from phyradgs_cl.runtime.opencl import Kernel, cl, kernel_source, naming_failures
 from phyradgs_cl.runtime.profile import KernelUse, Profile, Rates, measure_rates
@@ -21,7 +22,9 @@ from phyradgs_cl.runtime.profile import KernelUse, Profile, Rates, measure_rates
 log = logging.getLogger(__name__)
 
 LANE_CHOICES = (1, 4, 8, 16)
+_FUSING, _PAIRS = "-cl-mad-enable", '#line 1 "common/precise.h"'
 _TILE_ITEMS = 256  # of a work-group that shares local memory
+_FEWEST_ITEMS = 32  # that a kernel must be able to run in one group
 
 
 class Runtime:
@@ -33,6 +36,8 @@ class Runtime:
     or text as 2GiB) limits the sum of its buffers. ``ranks``: the processes that work on the same scan, each with its own
     Runtime; where a machine has several devices, each rank takes the next."""
 
+    most_samples = 2**29  # of a GPU's launch: 0.1 s on a slow one; the driver of a screen ends long launches
+
     def __init__(
         self, device: str | None = None, *, lanes: int | None = None, fp64: bool | None = None,
         pixel_items: bool | None = None, profile: bool = False, memory: str | int | None = None,
@@ -42,6 +47,7 @@ class Runtime:
         self.ranks = Communicator() if ranks is None else ranks
         self.device: DeviceInfo
         self.device, self.reason = choose_device(device, self.ranks.local_rank)
+        warn_of_fault(self.device)
         self.ledger = MemoryLedger(self.device, limit_bytes)
         self.traffic = Traffic()
         properties = cl.command_queue_properties.PROFILING_ENABLE if profile else 0
@@ -61,7 +67,7 @@ class Runtime:
         at_once = cl.mem_flags.ALLOC_HOST_PTR if self.device.kind == "cpu" else 0
         self._memory_flags = cl.mem_flags.READ_WRITE | at_once
         self.profile = profile
-        self._tile: tuple[int, int] | None = None
+        self._multiple: int | None = None
         self._profile = Profile()
         self._programs: dict[tuple[str, tuple[str, ...]], cl.Program] = {}
         self._kernels: dict[tuple[str, str, tuple[str, ...]], Kernel] = {}
@@ -70,7 +76,7 @@ class Runtime:
         """Declares the kernel ``name`` of ``cl/<program>.cl``; the first launch builds it, once for all its declarations."""
         merged: dict[str, int | float | bool] = {"LANES": self.lanes, "FP64": int(self.fp64), **defines}
         flags = [f"-D{name}={_literal(value)}" for name, value in sorted(merged.items())]
-        key = (program, name, ("-cl-std=CL1.2", "-cl-mad-enable", *flags))
+        key = (program, name, ("-cl-std=CL1.2", _FUSING, *flags))
         return self._kernels.setdefault(key, Kernel(*key))
 
     def compile(self, kernel: Kernel) -> "cl.Kernel":
@@ -87,12 +93,18 @@ class Runtime:
         """The names of the kernels that were launched so far."""
         return {kernel.function_name for kernel in self._kernels.values() if kernel.built is not None}
 
+    @property
+    def group_limits(self) -> dict[str, int]:
+        """The largest groups of the kernels that were asked, by name."""
+        return {one.function_name: one.most_items for one in self._kernels.values() if one.most_items is not None}
+
     def _build(self, program: str, options: tuple[str, ...]) -> "cl.Program":
         started = time.perf_counter()
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", cl.CompilerWarning)
-                built = cl.Program(self.context, kernel_source(program)).build(options=list(options))
+                source = kernel_source(program)
+                built = cl.Program(self.context, source).build(options=self._allowed(source, options))
         except cl.Error as error:
             message_lines = [line for line in str(error).splitlines() if "error:" in line]
             message = " ".join((message_lines or str(error).splitlines())[:3])[:600]
@@ -100,6 +112,12 @@ class Runtime:
             raise DeviceError(subject, message, "a program that builds", remedy) from error
         log.debug("built %s in %.2f s", program, time.perf_counter() - started)
         return built
+
+    @staticmethod
+    def _allowed(source: str, options: tuple[str, ...]) -> list[str]:
+        """Returns build options without those that would break sums of pairs of floats: some drivers ignore the pragma."""
+        has_pairs = "-DFP64=0" in options and _PAIRS in source
+        return [option for option in options if not (has_pairs and option == _FUSING)]
 
     def empty(self, shape: int | Sequence[int], dtype: np.typing.DTypeLike = np.float32) -> DeviceArray:
         """Returns uninitialised memory. Raises MemoryShortage where the device, or the limit, has too little."""
@@ -110,7 +128,7 @@ class Runtime:
         try:
             buffer = cl.Buffer(self.context, self._memory_flags, nbytes)
         except cl.Error as error:
-            raise self.ledger.error(f"{nbytes / 2**20:.0f} MiB", error) from error
+            raise self.ledger.error(f"{nbytes / 2**20:.0f} MiB", error, self.queue) from error
         array = DeviceArray(buffer, shape, kind)
         self.ledger.count(nbytes)
         weakref.finalize(array, self.ledger.count, -nbytes)
@@ -199,41 +217,73 @@ class Runtime:
 
     @naming_failures()
     def launch(
-        self, kernel: Kernel, items: int | tuple[int, ...], *args: Any, group: int | tuple[int, ...] = 1
+        self, kernel: Kernel, items: int | tuple[int, ...], *args: Any, group: int | tuple[int, ...] = 1, samples: int = 0
     ) -> None:
         """Enqueues ``items`` work-items (kernels ignore those past the end) in groups of ``group``, other sides 1. Python's
-        whole numbers become int, its others float. A long is np.int64, a float that may be whole np.float32."""
+        whole numbers become int, its others float. A long is np.int64, a float that may be whole np.float32.
+
+        ``samples``: what all items read, in samples of a ray. On a GPU more than ``most_samples`` go in several launches, in
+        which the kernel's items have their own global ids, and groups new ones."""
         shape = (items,) if isinstance(items, (int, np.integer)) else items
         if min(shape) < 1:
             return
         given = (group,) if isinstance(group, (int, np.integer)) else group
-        local = (*given, *([1] * (len(shape) - len(given))))
+        local = self._fitting(kernel, (*given, *([1] * (len(shape) - len(given)))))
         rounded = tuple(ceil_div(int(n), size) * size for n, size in zip(shape, local, strict=True))
         arrays = [a for a in args if isinstance(a, DeviceArray)]
         built = self.compile(kernel)
         built.set_args(*map(_argument, args))
-        event = cl.enqueue_nd_range_kernel(self.queue, built, rounded, local)
-        self._record(kernel.function_name, event, sum(a.nbytes for a in arrays) if self.profile else 0)
+        nbytes = sum(a.nbytes for a in arrays) if self.profile else 0
+        pieces = ceil_div(samples, self.most_samples) if self.pixel_items else 1
+        for first, part in _parts(rounded, local, pieces):
+            event = cl.enqueue_nd_range_kernel(self.queue, built, part, local, first)
+            self._record(kernel.function_name, event, nbytes if first is None or not any(first) else 0)
+            if first is not None:
+                self.queue.flush()  # or the driver may hand over several as one
 
-    def group(self, on_cpu: int = 1, on_gpu: int = 64) -> int:
-        """The work-group size for this class of device."""
+    def group(self, on_cpu: int = 1, on_gpu: int = 64, *kernels: Kernel) -> int:
+        """The work-group size for this class of device. On a GPU it is halved until it suits ``kernels``, whose items work
+        together."""
+        while self.pixel_items and any(on_gpu > self.most_items(kernel) for kernel in kernels):
+            on_gpu //= 2
         return on_gpu if self.pixel_items else on_cpu
 
-    def tile(self) -> tuple[int, int]:
-        """Returns the sides of a work-group's tile on a GPU: as wide as items run together, and some lines high."""
-        if self._tile is None:
-            handle = self.device.handle
-            asked = self.compile(self.kernel("rates", "multiply_add")).get_work_group_info(
-                cl.kernel_work_group_info.PREFERRED_WORK_GROUP_SIZE_MULTIPLE, handle
-            )
-            width = min(max(int(asked), 16), 64)
-            self._tile = width, max(min(_TILE_ITEMS, handle.max_work_group_size) // width, 1)
-        return self._tile
+    def most_items(self, kernel: Kernel) -> int:
+        """Returns the largest group in which a kernel can run: its registers may allow fewer items than the device does."""
+        if kernel.most_items is None:
+            kernel.most_items = self._asked(kernel, "WORK_GROUP_SIZE")
+        return kernel.most_items
 
-    def shape_of_lines(self, width: int, *rows: int) -> tuple[tuple[int, ...], tuple[int, int], int]:
-        """Returns work-items, group and number of groups of kernels that step along lines of ``width`` pixels. A work-item
+    def _asked(self, kernel: Kernel, name: str) -> int:
+        what = getattr(cl.kernel_work_group_info, name)
+        return int(self.compile(kernel).get_work_group_info(what, self.device.handle))
+
+    def _fitting(self, kernel: Kernel, group: tuple[int, ...]) -> tuple[int, ...]:
+        """Returns a group with sides halved until the kernel can run in it: that of kernels whose items work alone."""
+        if math.prod(group) == 1:
+            return group
+        most, sides = self.most_items(kernel), list(group)
+        if most < min(_FEWEST_ITEMS, math.prod(group)):
+            subject, found = f"kernel {kernel.function_name} on {self.device.name}", f"groups of at most {most} work-items"
+            raise DeviceError(subject, found, f"{_FEWEST_ITEMS} or more", "try another --device")
+        while math.prod(sides) > most:
+            sides[sides.index(max(sides))] //= 2
+        return tuple(sides)
+
+    def tile(self, kernel: Kernel | None = None) -> tuple[int, int]:
+        """Returns the sides of a work-group's tile on a GPU: as wide as items run together, and as many lines high as the
+        kernel, or the device, allows."""
+        rates = self.kernel("rates", "multiply_add")
+        if self._multiple is None:
+            self._multiple = min(max(self._asked(rates, "PREFERRED_WORK_GROUP_SIZE_MULTIPLE"), 16), 64)
+        most = min(_TILE_ITEMS, self.device.handle.max_work_group_size, self.most_items(kernel or rates))
+        width = min(self._multiple, most)
+        return width, most // width
+
+    def shape_of_lines(self, kernel: Kernel, width: int, *rows: int) -> tuple[tuple[int, ...], tuple[int, int], int]:
+        """Returns work-items, group and number of groups of a kernel that steps along lines of ``width`` pixels. A work-item
         takes a line on a CPU, and a pixel on a GPU."""
-        items, group = ((width, *rows), self.tile()) if self.pixel_items else ((1, *rows), (1, 1))
+        items, group = ((width, *rows), self.tile(kernel)) if self.pixel_items else ((1, *rows), (1, 1))
         sides = (*group, *([1] * (len(rows) - 1)))
         return items, group, math.prod(ceil_div(n, side) for n, side in zip(items, sides, strict=True))
 
@@ -266,6 +316,22 @@ def default_lanes(device: DeviceInfo) -> int:
     if device.kind != "cpu":
         return 1
     return max((n for n in LANE_CHOICES if n <= device.vector_width), default=1)
+
+
+def _parts(
+    items: tuple[int, ...], group: tuple[int, ...], pieces: int
+) -> Iterator[tuple[tuple[int, ...] | None, tuple[int, ...]]]:
+    """Yields first item and work-items of ``pieces`` parts or more, as far as groups allow; None as the first of a whole."""
+    if pieces <= 1:
+        yield None, items
+        return
+    cuts: list[list[tuple[int, int]]] = []
+    for count, size in zip(reversed(items), reversed(group), strict=True):
+        step = max(count // size // pieces, 1) * size
+        cuts.insert(0, [(first, min(step, count - first)) for first in range(0, count, step)])
+        pieces = ceil_div(pieces, len(cuts[0]))
+    for part in product(*cuts):
+        yield tuple(first for first, _ in part), tuple(count for _, count in part)
 
 
 def _argument(value: Any) -> Any:

@@ -1,9 +1,12 @@
 """The OpenCL devices of this machine, the choice between them, and the versions that results depend on."""
 
+import logging
 import os
 import platform
+import re
 from dataclasses import dataclass
 from datetime import datetime, timezone
+from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from typing import Any
 
@@ -16,6 +19,8 @@ from phyradgs_cl.runtime.opencl import cl
 
 DEVICE_VARIABLE = "PHYRADGS_DEVICE"
 _NEVER_BY_DEFAULT = ("oclgrind", "fpga", "emulat")
+_RIGHT_MESA = 25
+log = logging.getLogger(__name__)
 _targets: dict[int, str | None] = {}
 
 
@@ -133,6 +138,21 @@ def _describe(index: int, of: "cl.Platform", device: "cl.Device") -> DeviceInfo:
         by_default=usable and not any(word in text for word in _NEVER_BY_DEFAULT), handle=device,
         target=_targets.get(device.int_ptr),
     )
+
+
+def known_fault(device: DeviceInfo) -> str | None:
+    """Returns what is known to be wrong with a device's driver, in words; None where nothing is."""
+    version = re.search(r"\d+", device.handle.driver_version)
+    if device.platform.lower() == "rusticl" and version and int(version[0]) < _RIGHT_MESA:
+        return f"rusticl of Mesa {device.handle.driver_version} computes wrong sums: install Mesa {_RIGHT_MESA} or newer"
+    return None
+
+
+@cache
+def warn_of_fault(device: DeviceInfo) -> None:
+    """Warns once of a driver that is known to be wrong."""
+    if fault := known_fault(device):
+        log.warning("%s: %s", device.name, fault)
 
 
 def environment(device: DeviceInfo) -> dict[str, Any]:

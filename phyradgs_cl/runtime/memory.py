@@ -18,6 +18,7 @@ from phyradgs_cl.runtime.opencl import cl
 MEMORY_VARIABLE = "PHYRADGS_MEMORY"
 _SMALLER = 0.25
 _PLANNED = 0.9  # of the free memory
+_PLANNED_UNSEEN = 0.6  # of all memory, where a GPU's driver does not say what other programs and the screen hold
 _UNITS = {"": 1, "B": 1}
 for _power, _letter in enumerate("KMGT", start=1):
     _UNITS |= {_letter: 1024**_power, f"{_letter}IB": 1024**_power, f"{_letter}B": 1000**_power}
@@ -105,7 +106,10 @@ class MemoryLedger:
     def __init__(self, device: DeviceInfo, limit_bytes: int | None) -> None:
         self.device = device
         self.is_asked = limit_bytes is not None
-        self.limit_bytes = reported_bytes(device) if limit_bytes is None else limit_bytes
+        free_bytes = reported_bytes(device)
+        self.limit_bytes = (free_bytes or device.memory_bytes) if limit_bytes is None else limit_bytes
+        is_unseen = limit_bytes is None and free_bytes is None and device.kind != "cpu"
+        self.planned = _PLANNED_UNSEEN if is_unseen else _PLANNED
         self.held_bytes = 0
         self.peak_bytes = 0
         self.reserved_bytes = 0
@@ -124,9 +128,10 @@ class MemoryLedger:
             self.reserved_bytes -= nbytes
 
     def room(self, largest_bytes: int) -> Room:
-        """Returns nine tenths of the rest of the limit, in buffers of at most ``largest_bytes``."""
+        """Returns nine tenths of the rest of the limit, in buffers of at most ``largest_bytes``; six where a GPU's driver
+        does not say what is free and nobody has set a limit."""
         free_bytes = max(self.limit_bytes - self.held_bytes - self.reserved_bytes, 0)
-        return Room(int(_PLANNED * free_bytes), min(largest_bytes, self.limit_bytes))
+        return Room(int(self.planned * free_bytes), min(largest_bytes, self.limit_bytes))
 
     def check(self, nbytes: int, largest_bytes: int) -> None:
         """Raises MemoryShortage for a buffer that is too large, or that would pass the limit."""
@@ -141,25 +146,41 @@ class MemoryLedger:
                 remedy = f"allow more with --memory or {MEMORY_VARIABLE}, or {remedy}"
             raise MemoryShortage(subject, found, expected, remedy)
 
-    def error(self, work: str, error: "cl.Error") -> DeviceError:
+    def error(self, work: str, error: "cl.Error", queue: "cl.CommandQueue | None" = None) -> DeviceError:
         """Returns an error of the driver as a DeviceError, or as a MemoryShortage where memory ran out, which some drivers
-        report only at a launch or a wait. ``work`` names what failed: a kernel, or "a copy"."""
+        report only at a launch or a wait. ``work`` names what failed: a kernel, or "a copy". A dead ``queue``
+        missed no memory: drivers say "out of resources" of a kernel that crashed or ran too long, too."""
         code = getattr(error, "code", 0)  # none where pyopencl raises a text, as of a build
-        if isinstance(error, cl.MemoryError) or code in _MEMORY_CODES:
+        is_dead = queue is not None and not answers(queue)
+        if not is_dead and (isinstance(error, cl.MemoryError) or code in _MEMORY_CODES):
             remedy = f"set a limit with --memory or {MEMORY_VARIABLE}, or use a smaller problem"
             found = f"{work} refused ({error})"
             return MemoryShortage(f"memory of {self.device.name}", found, "enough free memory", remedy)
         found = f"{work} failed ({' '.join(str(error).split())[:300] or type(error).__name__})"
         remedy = "see the system's log, or try another --device"
+        if is_dead:
+            found += ": the driver ended a kernel, or lost the device"
+            remedy = "run 'phyradgs devices --check', see the system's log, or try another --device"
         return DeviceError(f"device {self.device.name}", found, "a device that works", remedy)
 
 
-def reported_bytes(device: DeviceInfo) -> int:
-    """Returns the free memory where the device reports it (AMD's extension), else all memory."""
+def answers(queue: "cl.CommandQueue") -> bool:
+    """Whether a queue still works. After a driver has ended a kernel, every call fails until there is a new context."""
+    try:
+        word = cl.Buffer(queue.context, cl.mem_flags.READ_WRITE, 4)
+        cl.enqueue_fill_buffer(queue, word, np.zeros(1, np.float32), 0, 4)
+        queue.finish()
+    except cl.Error:
+        return False
+    return True
+
+
+def reported_bytes(device: DeviceInfo) -> int | None:
+    """Returns the free memory where the device reports it (AMD's extension)."""
     with suppress(cl.Error, AttributeError):
         if "cl_amd_device_attribute_query" in device.handle.extensions:
             return int(device.handle.global_free_memory_amd[0]) * 1024  # type: ignore[index]
-    return device.memory_bytes
+    return None
 
 
 def memory_limit(wish: str | int | None) -> int | None:

@@ -35,12 +35,14 @@ _INCLUDE = re.compile(r'^\s*#include\s+"([^"]+)"\s*$')
 
 @dataclass(eq=False)
 class Kernel:
-    """The kernel ``function_name`` of ``cl/<program>.cl``, built with ``options`` at its first launch."""
+    """The kernel ``function_name`` of ``cl/<program>.cl``, built with ``options`` at its first launch. ``most_items``: of
+    a group, once the driver was asked."""
 
     program: str
     function_name: str
     options: tuple[str, ...]
     built: "cl.Kernel | None" = None
+    most_items: int | None = None
 
 
 @cache
@@ -78,7 +80,7 @@ def naming_failures(work: str | None = None) -> Callable[[Callable[P, R]], Calla
                 return method(*args, **kwargs)
             except cl.Error as error:
                 what = work or f"a launch of {args[1].function_name}"  # type: ignore[attr-defined]
-                raise args[0].ledger.error(what, error) from error  # type: ignore[attr-defined]
+                raise args[0].ledger.error(what, error, args[0].queue) from error  # type: ignore[attr-defined]
 
         return named
 

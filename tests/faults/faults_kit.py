@@ -12,6 +12,7 @@ from phyradgs_cl.io import checkpoint_path, read_volume
 TINY = ["--phantom", "jaw", "--size", "10", "--detector", "12", "--views", "4", "--time-samples", "2"]
 OLD = b"an older result"
 Run = Callable[..., int]
+fill = cl.enqueue_fill_buffer
 
 
 @pytest.fixture(scope="session")

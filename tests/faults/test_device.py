@@ -77,6 +77,24 @@ def test_memory_that_is_missed_late_leaves_the_checkpoint(run, scan, tmp_path, c
     kit.same_bits(output, whole)
 
 
+@pytest.mark.parametrize("code", [-5, -36])
+def test_a_driver_that_ended_a_kernel(run, scan, tmp_path, capfd, monkeypatch, caplog, launches, code) -> None:
+    """Out of resources, says the launch, and the context is dead: smaller bricks would fail too."""
+
+    def dead(*_: object, **__: object) -> object:
+        raise kit.cl_error(code)
+
+    for method in ("fdk", "sirt"):
+        launches.arm(1, code)
+        with monkeypatch.context() as patch:
+            patch.setattr(kit.cl, "enqueue_fill_buffer", lambda *given: dead() if launches.calls else kit.fill(*given))
+            assert run("reconstruct", scan, "-o", tmp_path / "v.h5", "--method", method) == 5
+        line = capfd.readouterr().err.splitlines()[-1]
+        assert all(words in line for words in ("phyradgs: device ", "ended a kernel", "devices --check"))
+        assert launches.calls == 1 and "smaller bricks" not in caplog.text
+    assert kit.names(tmp_path) == []
+
+
 def test_a_memory_that_is_too_small(run, scan, tmp_path, capfd, monkeypatch) -> None:
     """An allocator that refuses above a limit, as a device does that somebody else uses too."""
     real, limit_bytes, held = kit.cl.Buffer, 3_000, []

@@ -33,6 +33,7 @@ from phyradgs_cl.acquisition import (
 )
 from phyradgs_cl.acquisition.cells import common_time_cells, exact_cells, micro_view_cells, static_cells
 from phyradgs_cl.acquisition.time_cells import TimeCells
+from phyradgs_cl.device_probes import PAIRS, carried, pair_error
 from phyradgs_cl.fields import Deformation, Grid
 from phyradgs_cl.operators import (
     DensityOperator,
@@ -141,6 +142,7 @@ def nothing(rt: Runtime) -> None:
     SplatProjector(rt, *SHAPE).project(np.zeros((11, 0)), cells)
     voxelise(rt, cloud(3), GRID)
     rt.launch(rt.kernel("rates", "multiply_add"), 4, np.int32(3), np.float32(0.5), rt.zeros(4))
+    assert pair_error(rt) <= PAIRS and carried(rt)[0]
 
 
 def upright(rt: Runtime, beam: str) -> None:

@@ -1,12 +1,18 @@
 """Limits of device memory: how they are written, that they hold, and what is said where they do not suffice."""
 
 import gc
+from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from phyradgs_cl.acquisition import ConeGeometry
 from phyradgs_cl.errors import InputError, OutOfMemoryError
-from phyradgs_cl.runtime import MEMORY_VARIABLE, MemoryShortage, Runtime, bytes_of, with_smaller_bricks
+from phyradgs_cl.fields import Grid
+from phyradgs_cl.operators import backproject
+from phyradgs_cl.runtime import MEMORY_VARIABLE, MemoryShortage, Room, Runtime, bytes_of, with_smaller_bricks
+from phyradgs_cl.runtime.memory import MemoryLedger
 
 
 def test_sizes() -> None:
@@ -49,6 +55,27 @@ def test_without_a_limit_it_is_what_the_device_reports(rt) -> None:
     assert not room.holds(room.free_bytes, 1)
     assert rt.download(rt.empty((0, 7))).shape == (0, 7)
     assert rt.upload(np.zeros((3, 0), np.float32)).nbytes == 0
+
+
+def test_a_gpu_that_does_not_say_what_is_free(rt) -> None:
+    """The screen and other programs hold memory too. AMD's extension says how much is free."""
+    gpu = replace(rt.device, kind="gpu", memory_bytes=1000, largest_allocation_bytes=100)
+    assert MemoryLedger(gpu, None).room(100) == Room(600, 100)
+    assert MemoryLedger(gpu, 2000).room(100) == Room(1800, 100)  # asked for: an APU may report 256 MB
+    assert MemoryLedger(replace(gpu, kind="cpu"), None).room(100) == Room(900, 100)
+    amd = SimpleNamespace(extensions="cl_amd_device_attribute_query", global_free_memory_amd=[2, 1])
+    ledger = MemoryLedger(replace(gpu, memory_bytes=4096, handle=amd), None)
+    assert (ledger.limit_bytes, ledger.room(4096).free_bytes) == (2048, int(0.9 * 2048))
+
+
+def test_a_device_with_small_buffers_works_in_bricks(rt) -> None:
+    grid, frames = Grid((16, 16, 16), (0.1, 0.1, 0.1)), np.ones((2, 20, 20), np.float32)
+    pose = ConeGeometry(5.0, 7.5, (20, 20), (0.2, 0.2)).pose(np.array([0.3, 1.8]))
+    small = Runtime()
+    small.device = replace(small.device, largest_allocation_bytes=16_000)
+    expected = backproject(rt, frames, pose, np.ones(2), grid)
+    np.testing.assert_array_equal(backproject(small, frames, pose, np.ones(2), grid), expected)
+    assert 4 * grid.shape[0] ** 3 > 16_000 and small.peak_bytes < rt.peak_bytes
 
 
 def test_a_shortage_is_met_once(caplog) -> None:

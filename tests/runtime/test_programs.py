@@ -1,11 +1,18 @@
 """Programs and kernels: built once, sources with their headers, errors that name the file and line."""
 
+import re
+
 import numpy as np
 import pytest
+from kernel_kit import assert_near, frame_cells, splat
+from tolerances import FLOAT32
 
 from phyradgs_cl import resource
+from phyradgs_cl.acquisition import ConeGeometry
 from phyradgs_cl.errors import DeviceError
-from phyradgs_cl.runtime import Runtime
+from phyradgs_cl.fields import Grid
+from phyradgs_cl.operators import Voxeliser
+from phyradgs_cl.runtime import Runtime, context
 from phyradgs_cl.runtime import opencl as sources
 from phyradgs_cl.runtime.context import default_lanes
 from phyradgs_cl.runtime.opencl import kernel_source
@@ -75,6 +82,61 @@ def test_a_build_error_names_file_and_line(rt, broken_folder) -> None:
         with pytest.raises(DeviceError) as raised:
             rt.launch(rt.kernel(program, "nothing"), 1, rt.zeros(1))
         assert all(word in str(raised.value) for word in (f"{program}.cl", place, rt.device.name))
+
+
+def test_pairs_of_floats_are_built_without_multiply_adds(monkeypatch) -> None:
+    """Where a driver ignores the pragma, the option alone would break their sums. Others keep the option."""
+    built: dict[str, list[str]] = {}
+    real = context.cl.Program
+
+    class Noted:
+        def __init__(self, at: object, source: str) -> None:
+            self.source, self.program = source, real(at, source)
+
+        def build(self, options: list[str]) -> object:
+            built[self.source] = options
+            return self.program.build(options=options)
+
+    monkeypatch.setattr(context.cl, "Program", Noted)
+    for fp64 in (False, True):
+        rt = Runtime(fp64=fp64)
+        for program, name in (("algebra", "dot_parts"), ("voxel_prepare", "voxel_prepare"), ("adam", "adam_step")):
+            rt.compile(rt.kernel(program, name, IMAGE_GUARD=16))
+            has_pairs = program != "adam" and not fp64
+            assert ("-cl-mad-enable" not in built[kernel_source(program)]) == has_pairs, (program, fp64)
+
+
+def test_products_that_kernels_share_are_rounded(monkeypatch) -> None:
+    """Where rays of parallel beams start: fused into a sum in one kernel alone, forward and adjoint would differ."""
+    asked = "__kernel void at(const float s, const float g, __global float *out) { out[0] = START_OF(s, 3) + g; }"
+    monkeypatch.setattr(context, "kernel_source", lambda name: kernel_source(name) + asked)
+    rt, (s, g) = Runtime(), np.array([0.1, -0.3], np.float32)
+    out = rt.zeros(1)
+    rt.launch(rt.kernel("rays", "at", IMAGE_GUARD=16, RAY_LONG=0, RAY_PARALLEL=1, AVERAGE=0), 1, s, g, out)
+    fused = np.float32(3 * float(s) + float(g))
+    assert rt.download(out)[0] == np.float32(s * np.float32(3)) + g != fused
+
+
+@pytest.mark.parametrize("program", ["splat_forward", "splat_backward", "voxel_forward"])
+def test_whole_numbers_of_records_stay_whole_numbers(program) -> None:
+    """Small ones are subnormal as floats, and a device that flushes those would leave out whole splats."""
+    assert re.search(r"__local int record\w*\[", kernel_source(program))
+    assert not re.search(r"__local float[^;()]*\brecord\w*\[", kernel_source(program))
+
+
+def test_splats_and_voxels_where_the_smallest_numbers_are_0(monkeypatch, make_cloud) -> None:
+    rows, grid, shape = make_cloud(20, 3), Grid((9, 10, 11), (0.2, 0.2, 0.2)), (12, 20)
+    table = frame_cells("static", ConeGeometry(5.0, 7.5, shape, (0.3, 0.2)))
+
+    def computed(rt: Runtime) -> list[np.ndarray]:
+        return [splat(rt, rows, table, shape), Voxeliser(rt, grid.shape).voxelise(rows, grid)]
+
+    usual = computed(Runtime(lanes=1, pixel_items=True))
+    allowed = Runtime._allowed
+    flushing = staticmethod(lambda *given: [*allowed(*given), "-cl-denorms-are-zero"])
+    monkeypatch.setattr(Runtime, "_allowed", flushing)
+    for found, expected in zip(computed(Runtime(lanes=1, pixel_items=True)), usual, strict=True):
+        assert_near(found, expected, FLOAT32)
 
 
 def test_lanes_follow_the_device_and_can_be_told(rt) -> None:

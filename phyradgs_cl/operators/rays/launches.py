@@ -5,16 +5,15 @@ from collections.abc import Iterator
 
 from phyradgs_cl.checks import ceil_div
 from phyradgs_cl.operators.rays.layout import RayCells, RayLayout
-from phyradgs_cl.runtime import DeviceArray, Runtime
+from phyradgs_cl.runtime import DeviceArray, Kernel, Runtime
 from phyradgs_cl.runtime.layout import GUARD
 
 # On a CPU a work-item of the adjoint owns a brick of voxels (x, y, z), in local memory with a border of 1 around it.
 _BRICK = (32, 32, 8)
 _SMALL_BRICK = (24, 24, 8)  # 27 kB of the 32 that OpenCL guarantees
-_BLOCK = 4  # on a GPU a work-group owns a block with this many voxels per side; as in cl/rays_adjoint_gpu.cl
+_BLOCK = 4  # on a GPU a work-group owns a block with so many voxels per side, or fewer along z; as in cl/rays_adjoint_gpu.cl
 _SAMPLES_PER_VOXEL = 4  # about as many samples of a view touch a voxel
 _LONG_FROM = 2**31  # floats that 32-bit indices cannot address
-_MOST_SAMPLES = 2**29  # of a GPU's launch: 0.1 s on a slow one; the driver of a screen ends long launches
 AVERAGES = ("log", "intensity", "correction")  # correction: log minus intensity; in the order of cl/rays.cl
 
 
@@ -27,12 +26,12 @@ def launch_forward(
     ``add`` adds line integrals to those in ``frames``, as several bricks of a volume need it; for ``log`` alone."""
     blocks = ceil_div(layout.width, rt.lanes)
     kernel = rt.kernel("rays", "rays_forward", AVERAGE=AVERAGES.index(average), **_defines(layout, cells))
-    for first, stop in _parts(rt, frame_list.size, layout.lines * layout.width * max(layout.brick.shape)):
-        rt.launch(
-            kernel, (blocks, layout.lines, stop - first), volume, cells.cells, cells.cell_lines,
-            cells.line_cells, frame_list, cells.weights, cells.weight_at, *layout.constants(), first, add,
-            frames, group=rt.group(on_cpu=min(blocks, 8)),
-        )  # fmt: skip
+    items = blocks, layout.lines, frame_list.size
+    rt.launch(
+        kernel, items, volume, cells.cells, cells.cell_lines, cells.line_cells, frame_list, cells.weights,
+        cells.weight_at, *layout.constants(), add, frames, group=rt.group(on_cpu=min(blocks, 8)),
+        samples=math.prod(items) * max(layout.brick.shape) * cells.most_per_line,
+    )  # fmt: skip
 
 
 def launch_adjoint(
@@ -40,27 +39,36 @@ def launch_adjoint(
     volume: DeviceArray, *, add: bool = False,
 ) -> None:
     """Backprojects the listed frames into a padded volume; ``add`` keeps the sums that are in it."""
-    if rt.pixel_items:
-        owned, program, defines = (_BLOCK,) * 3, "rays_adjoint_gpu", _defines(layout, cells)
-    else:
-        owned, program = brick_of(rt), "rays_adjoint_cpu"
-        defines = _defines(layout, cells) | dict(zip(("BRICK_X", "BRICK_Y", "BRICK_Z"), owned, strict=True))
+    owned, kernel = _owners(rt, layout, cells)
     nz, ny, nx = layout.brick.shape
     columns, rows, slices = (ceil_div(n, side) for n, side in zip((nx, ny, nz), owned, strict=True))
-    group = rt.group(on_cpu=1, on_gpu=_BLOCK**3)
-    kernel = rt.kernel(program, "rays_adjoint", **defines)
-    for first, stop in _parts(rt, frame_list.size, _SAMPLES_PER_VOXEL * nz * ny * nx):
+    group = rt.group(1, math.prod(owned))
+    each = _SAMPLES_PER_VOXEL * nz * ny * nx * cells.most_per_line
+    for first, stop in _parts(rt, frame_list.size, each):
         adds = add or first > 0  # a launch continues the sums of the launch before: the same bits as one launch
         rt.launch(
             kernel, (columns * group, rows, slices), frames, cells.cells, cells.cell_lines, cells.matrices,
             cells.matrix_stride, cells.frame_cells, frame_list, cells.weights, cells.weight_at, first, stop,
-            *layout.constants(), adds, volume, group=group,
+            *layout.constants(), adds, volume, group=group, samples=(stop - first) * each,
         )  # fmt: skip
+
+
+def _owners(rt: Runtime, layout: RayLayout, cells: RayCells) -> tuple[tuple[int, int, int], Kernel]:
+    """Returns the voxels (x, y, z) that a CPU's work-item or a GPU's work-group owns, and the kernel of the adjoint."""
+    owned, defines = (_BLOCK,) * 3 if rt.pixel_items else brick_of(rt), _defines(layout, cells)
+    if not rt.pixel_items:
+        defines |= dict(zip(("BRICK_X", "BRICK_Y", "BRICK_Z"), owned, strict=True))
+        return owned, rt.kernel("rays_adjoint_cpu", "rays_adjoint", **defines)
+    kernel = rt.kernel("rays_adjoint_gpu", "rays_adjoint", **defines)
+    thin = rt.group(1, _BLOCK**3, kernel) // _BLOCK**2
+    if thin < _BLOCK:
+        owned, kernel = (_BLOCK, _BLOCK, thin), rt.kernel("rays_adjoint_gpu", "rays_adjoint", BLOCK_Z=thin, **defines)
+    return owned, kernel
 
 
 def _parts(rt: Runtime, frames: int, samples_per_frame: int) -> Iterator[tuple[int, int]]:
     """Yields the first frame of each launch and the one after its last. On a CPU one launch takes all frames."""
-    step = max(_MOST_SAMPLES // samples_per_frame, 1) if rt.pixel_items else frames
+    step = max(rt.most_samples // samples_per_frame, 1) if rt.pixel_items else frames
     for first in range(0, frames, step):
         yield first, min(first + step, frames)
 

@@ -134,6 +134,7 @@ class RayCells:
     weight_at: DeviceArray
     is_parallel: bool
     is_across: bool
+    most_per_line: int  # cells that may serve a line of a frame
 
     @classmethod
     def upload(
@@ -164,6 +165,7 @@ class RayCells:
             weight_at=rt.upload(_starts_of(weights) + (_WIDEST if rows_across is not None else 0), np.int32),
             is_parallel=tables[0].is_parallel,
             is_across=rows_across is not None,
+            most_per_line=max(1, *(int(np.ptp(ends, axis=1).max()) for ends in served)),
         )
 
 

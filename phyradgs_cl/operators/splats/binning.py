@@ -11,6 +11,7 @@ _MANY_COUNTS = 1 << 22
 _SCANNED = 64  # counts per step of a group
 _SLACK = 1.5  # allocated over needed indices
 _NEAR = 1.25  # allocate again below this reserve
+_MOST_CHECKS = 2**38  # of a splat in a pixel: without lists a launch makes all, in a second on a fast GPU
 _MOST_ENTRIES = 2**31 - 1  # the kernels index them by int
 
 
@@ -19,8 +20,8 @@ class TileLists:
 
     ``tile`` is a tile's size and ``tiles`` their number, along x, y, z. Lists keep the order of the splats, so that sums
     over them repeat bit for bit. The memory for indices follows the number needed by former builds. The host waits for this
-    number if the count of splats is new or ``waits`` is set. Otherwise it reads the number later; until then kernels do not
-    use lists that did not fit (cl/common/tile.h)."""
+    number if the count of splats is new, ``waits`` is set, or a GPU would take long without lists. Otherwise it reads the
+    number later; until then kernels do not use lists that did not fit (cl/common/tile.h)."""
 
     def __init__(self, rt: Runtime, tile: tuple[int, int, int], tiles: tuple[int, int, int]) -> None:
         self.rt = rt
@@ -38,8 +39,13 @@ class TileLists:
             rt.kernel("binning", f"bin_{step}{shape}") for step in ("count", "within", "starts", "fill")
         )
 
-    def build(self, extents: DeviceArray, count: int, stride: int) -> None:
-        """Fills ``tile_offsets`` (tiles + 1,) and ``splat_ids`` from extents (6, stride).
+    @property
+    def samples(self) -> int:
+        """Pixels or voxels of all entries that there is memory for: the most samples that the tiles' splats have."""
+        return self.splat_ids.size * int(np.prod(self.tile[:3], dtype=np.int64))
+
+    def build(self, extents: DeviceArray, count: int, stride: int, cells: int = 1) -> None:
+        """Fills ``tile_offsets`` (tiles + 1,) and ``splat_ids`` from extents (6, stride), for splats in so many cells.
 
         Raises MemoryShortage for 2^31 indices or more; smaller bricks of a volume may have fewer."""
         rt = self.rt
@@ -49,7 +55,8 @@ class TileLists:
             self._counts = rt.empty(1, np.int32)  # frees the old memory before it allocates the new
             self._counts = rt.empty(self.total * chunks, np.int32)
         domain = extents, stride, count, chunk, chunks, self.tile, self.tiles
-        group, scan = (chunk, _SCANNED) if rt.pixel_items else (1, 1)
+        group = chunk if rt.pixel_items else 1
+        scan = rt.group(1, _SCANNED, self._within, self._starts)
         boxes, scratch = ([rt.local(24 * group)], [rt.local(8 * scan)]) if rt.pixel_items else ([], [])
         if rt.pixel_items:
             rt.fill(self._counts, 0)
@@ -59,7 +66,8 @@ class TileLists:
             group=scan,
         )  # fmt: skip
         rt.launch(self._starts, scan, self.total, self.tile_offsets, *scratch, group=scan)
-        if self.waits or count != self._count_seen:
+        checks = self.total * int(np.prod(self.tile[:3], dtype=np.int64)) * count * cells
+        if self.waits or count != self._count_seen or (rt.pixel_items and checks > _MOST_CHECKS):
             self._make_room(int(rt.read_item(self.tile_offsets, self.total)), 1.0)
             self._count_seen, self._needed = count, None
         elif self._needed is not None and self._needed.is_here:
@@ -92,7 +100,9 @@ def chunk_of(rt: Runtime, tiles: int, count: int) -> int:
     """Returns the splats per work-item on a CPU, or per group on a GPU, where each has its own item."""
     if not rt.pixel_items:
         return _CHUNK
-    chunk, largest = _GROUP, min(_LARGEST_GROUP, rt.device.handle.max_work_group_size)
+    kernels = (rt.kernel("binning", f"bin_{step}_group") for step in ("count", "fill"))
+    largest = rt.group(1, _LARGEST_GROUP, *kernels)
+    chunk = min(_GROUP, largest)
     while 2 * chunk <= largest and tiles * ceil_div(count, chunk) > _MANY_COUNTS:
         chunk *= 2
     return chunk

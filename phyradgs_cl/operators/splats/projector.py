@@ -88,9 +88,7 @@ class SplatProjector:
         self.cutoff2 = np.float32(cutoff_sigma**2)
         self.time_error = time_error
         self.by_pixel = rt.pixel_items
-        self.tile_w, self.tile_h = rt.tile() if self.by_pixel else (self.pitch, _BAND_LINES)
-        tiles = (ceil_div(width, self.tile_w), ceil_div(lines, self.tile_h), 1)
-        self.lists = TileLists(rt, (self.tile_w, self.tile_h, 1), tiles)
+        self._cut(*(rt.tile() if self.by_pixel else (self.pitch, _BAND_LINES)))
         self.image = padded_zeros(rt, lines, width)
         self._layers = None if intensity_unit is None else Layers(rt, lines, width, intensity_unit)
         self._records = rt.empty(1)
@@ -106,6 +104,12 @@ class SplatProjector:
             for parallel in (False, True)
         }
 
+    def _cut(self, tile_w: int, tile_h: int) -> None:
+        """Cuts the frame into tiles, for which there will be lists."""
+        self.tile_w, self.tile_h = tile_w, tile_h
+        tiles = (ceil_div(self.width, tile_w), ceil_div(self.lines, tile_h), 1)
+        self.lists = TileLists(self.rt, (tile_w, tile_h, 1), tiles)
+
     @property
     def path_limits(self) -> np.ndarray:
         """The kernels' limits of ``path_limits``, (4,)."""
@@ -120,18 +124,19 @@ class SplatProjector:
 
     def draw(self, gaussians: DeviceGaussians, cells: DeviceCells) -> DeviceArray:
         """Renders the frame before its layers are merged, flat and padded: frames of several clouds can be added here."""
+        rt, kernel = self.rt, self._kernels[cells.moving, cells.fixed_conic, cells.is_parallel].forward
+        if self.by_pixel and rt.tile(kernel) != (self.tile_w, self.tile_h):
+            self._cut(*rt.tile(kernel))
         self.prepare(gaussians, cells)
-        self.lists.build(self._extents, gaussians.count, gaussians.stride)
-        rt = self.rt
+        self.lists.build(self._extents, gaussians.count, gaussians.stride, cells.count)
         drawn = self.image if self._layers is None else self._layers.images(cells)
         items = (self.width, self.lines) if self.by_pixel else self.lists.total
         rt.launch(
-            self._kernels[cells.moving, cells.fixed_conic, cells.is_parallel].forward, items, self._records,
-            self._is_visible, cells.cells, cells.line_cells, cells.line_times, cells.time_pitch,
-            self.path_limits, self.lists.tile_offsets, self.lists.splat_ids, self.lists.splat_ids.size,
+            kernel, items, self._records, self._is_visible, cells.cells, cells.line_cells, cells.line_times,
+            cells.time_pitch, self.path_limits, self.lists.tile_offsets, self.lists.splat_ids, self.lists.splat_ids.size,
             gaussians.count, cells.count, self.lines, self.width, self.pitch, self.tile_w, self.tile_h,
             ceil_div(self.width, self.tile_w), self.cutoff2, cells.layers, drawn,
-            group=(self.tile_w, self.tile_h) if self.by_pixel else 1,
+            group=(self.tile_w, self.tile_h) if self.by_pixel else 1, samples=self.lists.samples * cells.count,
         )  # fmt: skip
         return drawn
 
@@ -154,7 +159,7 @@ class SplatProjector:
         rt.launch(
             kernels.backward, items, self._records, self._is_visible, cells.cells, cells.line_times,
             cells.time_pitch, self.path_limits, by_images, gaussians.count, cells.count, self.lines,
-            self.pitch, self.cutoff2, group=group,
+            self.pitch, self.cutoff2, group=group, samples=self.lists.samples * cells.count,
         )  # fmt: skip
         by_states = self._cloud if self.states is None else self.states.zeros(gaussians, cells)
         rt.launch(

@@ -8,7 +8,7 @@ from phyradgs_cl.operators.bricks import Shape, cut
 from phyradgs_cl.operators.splats.binning import TileLists
 from phyradgs_cl.operators.splats.layout import DeviceGaussians, split_coefficients
 from phyradgs_cl.operators.splats.projector import DEFAULT_CUTOFF_SIGMA, GROUP_DEFINES, items_by_gaussian
-from phyradgs_cl.runtime import DeviceArray, Runtime, with_smaller_bricks
+from phyradgs_cl.runtime import DeviceArray, Kernel, Runtime, with_smaller_bricks
 from phyradgs_cl.runtime.layout import GUARD, pad_rows, padded_zeros, pitch_of, unpad_rows
 
 RECORD_FLOATS = 20
@@ -37,7 +37,7 @@ class Voxeliser:
         self._sums = rt.empty(1)
         self._extents = rt.empty(1, np.int32)
         self._prepare = rt.kernel("voxel_prepare", "voxel_prepare", IMAGE_GUARD=GUARD)
-        self._forward = rt.kernel("voxel_forward", "voxel_forward", BLOCK_PIXEL=self.by_pixel, IMAGE_GUARD=GUARD)
+        self._forward = _forward(rt)
         backward = {"IMAGE_GUARD": GUARD, **GROUP_DEFINES[self.by_pixel]}
         self._backward = rt.kernel("voxel_backward", "voxel_backward", **backward)
         self._chain = rt.kernel("voxel_backward", "voxel_chain", **backward)
@@ -56,7 +56,7 @@ class Voxeliser:
             self._forward, (nx, ny, ceil_div(nz, _TILE_ROWS)) if self.by_pixel else self.lists.total,
             self._records, self.lists.tile_offsets, self.lists.splat_ids, self.lists.splat_ids.size,
             gaussians.count, self._shape4, self.pitch, self.tile, self.lists.tiles, self.cutoff2, self.volume,
-            group=tuple(self.tile[:2].tolist()) if self.by_pixel else 1,
+            group=tuple(self.tile[:2].tolist()) if self.by_pixel else 1, samples=self.lists.samples,
         )  # fmt: skip
         return self.volume
 
@@ -71,7 +71,7 @@ class Voxeliser:
         items, group = items_by_gaussian(rt, gaussians.count)
         rt.launch(
             self._backward, items, self._records, by_volume, self._shape4, self.pitch, gaussians.count,
-            self.cutoff2, self._sums, group=group,
+            self.cutoff2, self._sums, group=group, samples=self.lists.samples,
         )  # fmt: skip
         rt.launch(
             self._chain, gaussians.stride // rt.lanes, gaussians.rows, self._sums, _pitch4(grid),
@@ -154,9 +154,14 @@ def _in_bricks(
 def _tiles(rt: Runtime, shape: Shape) -> tuple[Shape, Shape]:
     """Returns size and number of the tiles of a volume (z, y, x), both along x, y, z."""
     nz, ny, nx = shape
-    tile_x = 16 if rt.pixel_items else pitch_of(nx)
-    tile = (tile_x, _TILE_ROWS, _TILE_ROWS)
-    return tile, (ceil_div(nx, tile_x), ceil_div(ny, _TILE_ROWS), ceil_div(nz, _TILE_ROWS))
+    tile_x, tile_y = pitch_of(nx), _TILE_ROWS
+    if rt.pixel_items:  # a group has an item for each column of a tile
+        tile_x, tile_y = 16, rt.group(1, 16 * _TILE_ROWS, _forward(rt)) // 16
+    return (tile_x, tile_y, _TILE_ROWS), (ceil_div(nx, tile_x), ceil_div(ny, tile_y), ceil_div(nz, _TILE_ROWS))
+
+
+def _forward(rt: Runtime) -> Kernel:
+    return rt.kernel("voxel_forward", "voxel_forward", BLOCK_PIXEL=rt.pixel_items, IMAGE_GUARD=GUARD)
 
 
 def index_matrix(grid: Grid) -> np.ndarray:

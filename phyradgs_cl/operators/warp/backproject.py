@@ -12,7 +12,7 @@ from phyradgs_cl.acquisition.readout import Readout
 from phyradgs_cl.checks import ceil_div
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
-from phyradgs_cl.operators.backproject import Arguments, Views, in_bricks, volume_shape
+from phyradgs_cl.operators.backproject import LINE_SAMPLES, Arguments, Views, in_bricks, volume_shape
 from phyradgs_cl.operators.bricks import Brick
 from phyradgs_cl.operators.rays.layout import voxel_matrices
 from phyradgs_cl.operators.warp.states import MotionStates
@@ -73,7 +73,8 @@ class MovingBackprojector:
             across = (np.int32(turned),) if by_lines else ()
             items = (nx if by_lines else ceil_div(nx, rt.lanes), ny, nz)
             arguments = *images, *volume_shape(brick), *across, *fields, size, volume
-            rt.launch(kernel, items, *arguments, group=rt.group(on_cpu=group))
+            samples = LINE_SAMPLES * nx * ny * nz * int(images[3])
+            rt.launch(kernel, items, *arguments, group=rt.group(on_cpu=group), samples=samples)
 
         result: np.ndarray = in_bricks(rt, Views(frames, turned, matrices, weights), grid, 1, launch)  # type: ignore[assignment]
         return result
@@ -88,7 +89,8 @@ class MovingBackprojector:
         nz, ny, nx = grid.shape
         sizes = (np.array([*triple[::-1], 0], np.int32) for triple in (wide.shape, margin, grid.shape))
         kernel = rt.kernel("backproject_moving", "push_displacement", IMAGE_GUARD=GUARD)
-        rt.launch(kernel, (ceil_div(nx, rt.lanes), ny, nz), pull, *sizes, _MOST_STEPS, push, group=rt.group())
+        items = ceil_div(nx, rt.lanes), ny, nz
+        rt.launch(kernel, items, pull, *sizes, _MOST_STEPS, push, group=rt.group(), samples=_MOST_STEPS * nx * ny * nz)
         self._check_inverse(state, rt.download(push)[:-GUARD].reshape(3, -1).T * spacing_mm)
         return push
 

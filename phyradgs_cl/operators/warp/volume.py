@@ -11,6 +11,7 @@ _BORDER = 4  # coefficients before and behind the volume, as in cl/warp.cl: furt
 _MOST_OWNED = 8  # slices of the result that a CPU's work-item owns; it repeats the voxels that reach another's too
 _ITEMS_PER_UNIT = 4
 _HEADROOM = 64  # by which a sum of one voxel's shares may exceed 1, as where the field contracts by 4 along each axis
+_SAMPLES, _ADDED = 16, 64  # as long as so many samples of a ray take the 4³ coefficients of a voxel, read or added to
 _ROUNDING = 1e-3  # voxels
 
 
@@ -70,6 +71,7 @@ class VolumeWarp:
         self.rt.launch(
             self.kernel("warp_forward"), (blocks, ny, nz), source, self._strides.vector(), self._fields,
             self._shares[state], self._size(), result, group=self.rt.group(on_cpu=min(blocks, 8)),
+            samples=_SAMPLES * nz * ny * nx,
         )  # fmt: skip
         return result
 
@@ -118,7 +120,7 @@ class VolumeWarp:
         kernel = self.kernel("warp_adjoint_fixed")
         self.rt.launch(
             kernel, (nx, ny, nz), moved, self._fields, self._shares[state], self._size(),
-            np.float32(1 / unit), self._strides.vector(), self._sums, group=group,
+            np.float32(1 / unit), self._strides.vector(), self._sums, group=group, samples=_ADDED * nz * ny * nx,
         )  # fmt: skip
         sums = self._sums, np.float32(unit), np.int64(self._floats), total
         self.rt.launch(self.kernel("warp_adjoint_sum"), self._floats, *sums, group=group)

@@ -1,0 +1,96 @@
+"""Launches on devices that allow less than PoCL does: groups by the kernel's own limit, and no launch that takes long."""
+
+import math
+
+import numpy as np
+import pytest
+
+from phyradgs_cl import operators
+from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, ConstantSpeed, Shutter
+from phyradgs_cl.acquisition.cells import per_line_cells
+from phyradgs_cl.device_check import check_device
+from phyradgs_cl.errors import DeviceError
+from phyradgs_cl.fields import Grid
+from phyradgs_cl.operators.splats import binning
+from phyradgs_cl.runtime import Runtime
+from phyradgs_cl.runtime import context as runtime_context
+
+GPU = {"lanes": 1, "pixel_items": True}
+LONG = {  # kernels that may take long
+    "rays_forward", "rays_adjoint", "backproject", "backproject_lines", "backproject_moving", "backproject_lines_moving",
+    "push_displacement", "splat_forward_pixels", "splat_backward_group", "voxel_forward", "voxel_backward", "warp_forward",
+    "warp_adjoint_fixed", "dct_excess", "ridge_responses",
+}  # fmt: skip
+
+
+@pytest.fixture
+def parts(monkeypatch):
+    """(kernel, work-items, group, first item) of every launch from now on."""
+    seen, launch = [], runtime_context.cl.enqueue_nd_range_kernel
+
+    def noted(queue, kernel, items, group, first=None):
+        seen.append((kernel.function_name, items, group, first))
+        return launch(queue, kernel, items, group, first)
+
+    monkeypatch.setattr(runtime_context.cl, "enqueue_nd_range_kernel", noted)
+    return seen
+
+
+def test_groups_and_launches_keep_to_small_limits(monkeypatch, parts) -> None:
+    """A kernel with many registers may allow fewer items than its device. Here all do, and no launch may be long."""
+    monkeypatch.setattr(Runtime, "_asked", lambda *_: 32)
+    monkeypatch.setattr(Runtime, "most_samples", 50)
+    verdict = check_device(**GPU)
+    assert verdict.failures == () and len(verdict.agreeing) > 60
+    assert max(math.prod(group) for _, _, group, _ in parts) == 32
+    assert {name for name, _, _, first in parts if first is not None} >= LONG
+
+
+def test_a_kernel_that_allows_hardly_any_items_is_named(monkeypatch) -> None:
+    rt = Runtime(**GPU)
+    monkeypatch.setattr(Runtime, "_asked", lambda *_: 8)
+    with pytest.raises(DeviceError, match="kernel multiply_add on .*at most 8 work-items; expected 32 or more"):
+        rt.launch(rt.kernel("rates", "multiply_add"), 64, 3, 0.5, rt.zeros(64), group=64)
+
+
+def test_parts_hold_every_item_once() -> None:
+    for items, group in (((64,), (16,)), ((32, 7), (16, 1)), ((48, 10, 3), (16, 2, 1))):
+        for pieces in (1, 2, 3, 5, 1000):
+            found, cut = np.zeros(items, int), list(runtime_context._parts(items, group, pieces))
+            for first, count in cut:
+                first = first or (0,) * len(items)
+                found[tuple(slice(f, f + n) for f, n in zip(first, count, strict=True))] += 1
+                assert not any(f % g or n % g for f, n, g in zip(first, count, group, strict=True))
+            assert (found == 1).all()
+            assert len(cut) >= min(pieces, math.prod(items) // math.prod(group))
+
+
+@pytest.mark.parametrize("most_samples", [10**4, 10])
+def test_launches_below_a_frame_have_the_same_bits(monkeypatch, parts, most_samples) -> None:
+    """Cells count: each of the lines has three, of their own."""
+    rt, grid, shape = Runtime(**GPU), Grid((6, 7, 9), (0.2, 0.2, 0.2)), (10, 12)
+    orbit = CircularOrbit(ConeGeometry(5.0, 7.5, shape, (0.3, 0.3)), ConstantSpeed(0.3, 0.5))
+    tables = [per_line_cells(orbit, Shutter(0.8, 0.6), 0, start_s, shape[0], 3) for start_s in (0.2, 1.4)]
+    rng = np.random.default_rng(1)
+    x, y = (rng.uniform(size=size).astype(np.float32) for size in (grid.shape, (2, *shape)))
+    operator = operators.RayOperator(rt, grid, shape, tables)
+    whole = operator.forward(x), operator.adjoint(y)
+    del parts[:]
+    monkeypatch.setattr(Runtime, "most_samples", most_samples)
+    np.testing.assert_array_equal(operator.forward(x), whole[0])
+    np.testing.assert_array_equal(operator.adjoint(y), whole[1])
+    for name, items, group, _ in parts:
+        if name == "rays_forward":
+            assert shape[1] * math.prod(items[1:]) * 9 * 3 <= most_samples or items == group
+
+
+def test_a_gpu_waits_for_the_number_of_entries_where_a_launch_without_lists_would_be_long(monkeypatch) -> None:
+    rt = Runtime(**GPU)
+    lists, extents = binning.TileLists(rt, (16, 8, 1), (2, 2, 1)), rt.zeros((6, 16), np.int32)
+    lists.build(extents, 10, 16)
+    before = rt.traffic.blocking
+    lists.build(extents, 10, 16, cells=3)
+    assert rt.traffic.blocking == before
+    monkeypatch.setattr(binning, "_MOST_CHECKS", 4 * 128 * 10 * 3 - 1)
+    lists.build(extents, 10, 16, cells=3)
+    assert rt.traffic.blocking == before + 1
