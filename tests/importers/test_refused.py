@@ -379,6 +379,15 @@ def test_what_is_not_there_is_not_looked_for_elsewhere_and_no_pipe_is_opened(tmp
         import_scan(folder / "pipe", None, "rtk")
 
 
+def test_a_stack_without_the_directory_of_its_last_pages_is_refused(tmp_path) -> None:
+    """tifffile reads the first page, and logs that there are no others."""
+    tifffile.imwrite(path := tmp_path / "v.tif", np.ones((3, 40, 50), np.uint16), photometric="minisblack")
+    assert load_volume(path).values.shape == (3, 40, 50)
+    path.write_bytes(path.read_bytes()[: int(0.9 * path.stat().st_size)])
+    with pytest.raises(InputError, match="pages behind the end"):
+        load_volume(path)
+
+
 @pytest.mark.parametrize("name", ["v.nii", "v.nii.gz", "v.mha", "packed.mha"])
 def test_images_with_too_few_voxels_are_refused(tmp_path, name) -> None:
     """SimpleITK fills up what is missing in NIfTI, and what is damaged in packed MetaImages."""

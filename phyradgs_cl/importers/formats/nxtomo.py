@@ -65,7 +65,7 @@ def import_scan(path: Path, options: ImportOptions) -> Scan:
     if options.row_0 is None:
         text = "%s: row 0 is taken as the lowest, after flips that the file declares; say %s top if the volume is mirrored"
         _log.warning(text, path, options.named("row_0"))
-    integrals = stacks.turned(turn).line_integrals(f"{path}:{detector}/data", options, "bottom", quantity)
+    integrals = stacks.line_integrals(f"{path}:{detector}/data", options, "bottom", quantity, turn)
     parts = integrals, trajectory, geometry, timing, options
     return assemble.assemble_scan(*parts, title=title, source=str(path))
 
