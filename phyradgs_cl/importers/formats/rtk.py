@@ -56,7 +56,7 @@ def recognises(path: Path) -> bool:
     folder = SafeFolder(path if path.is_dir() else path.parent)
     if path.is_file() and path.suffix.lower() not in STACKS:
         is_xml = path.suffix.lower() == ".xml" and not path.name.lower().endswith(_ORA)
-        return is_xml and not folder.matching(*_RAW) and not folder.glob(XIM_BELOW)
+        return is_xml and not folder.matching(*_RAW) and not any(folder.root.glob(XIM_BELOW))
     descriptions = [file for file in folder.matching(".xml") if not file.name.lower().endswith(_ORA)]
     return bool(descriptions and folder.matching(*STACKS))
 

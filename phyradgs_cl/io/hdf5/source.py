@@ -16,18 +16,11 @@ import h5py
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.io.files import regular_file
 
-# Names in scan and volume files. A name outside this set that is close to one of them is taken for a misspelling.
-_KNOWN = frozenset((
-    *("name", "title", "provenance", "data", "image_key", "image_key_control", "pixel_mask", "quantity"),
-    *("x_pixel_size", "y_pixel_size", "distance", "count_time", "detector_readout_time", "frame_start_time"),
-    *("rotation_angle", "rotation_angle_end", "readout_axis", "readout_direction"),
-    *("detector_offset", "detector_model", "pulse_start", "pulse_length", "lag"),
-    *("saturation_level", "saturation_share", "reference", "volume", "z", "y", "x"),
-    *("kinematics", "poses", "time_s", "angle_deg", "pose", "grid", "shape", "voxel_size", "offset"),
-    *("reconstruction", "metrics", "gaussians", "mean", "scale", "quaternion", "density"),
-    *("deformation", "control", "origin", "spacing", "times", "weights", "states", "state_times", "time_series"),
-    *("gating", "signal", "phase"),
-))
+_ALIKE = (  # names of different things: none is a misspelling of another
+    *("x_pixel_size", "y_pixel_size", "rotation_angle", "rotation_angle_end", "image_key", "image_key_control"),
+    *("poses", "pose", "time_s", "times"),
+)
+_CLOSE = 0.8  # similarity of a misspelt name
 LINKED = "--linked-folder"
 _UNLOCK = "set HDF5_USE_FILE_LOCKING=FALSE"
 BEING_WRITTEN = "a file that another program has open for writing"
@@ -127,7 +120,7 @@ class Hdf5Source:
     def _optional(self, address: str, kind: type, other: str, what: str) -> h5py.Group | h5py.Dataset | None:
         thing = self.find(address)
         parent, name = posixpath.split(address)
-        if thing is None and (remedy := self.misspelling(parent, name, cutoff=0.8)):
+        if thing is None and (remedy := self.misspelling(parent, name)):
             raise self.error(address, "nothing there", f"{what} {name!r}", remedy)
         if not isinstance(thing, (kind, type(None))):
             raise self.error(address, other, what, f"store the values as {what}")
@@ -143,13 +136,12 @@ class Hdf5Source:
         remedy = self.misspelling(parent, name) or "add it to the file"
         raise self.error(address, "nothing there", f"a dataset {name!r}", remedy)
 
-    def misspelling(self, parent: str, name: str, cutoff: float = 0.6) -> str:
+    def misspelling(self, parent: str, name: str) -> str:
         """Returns a remedy for an unknown name in the group ``parent`` that is close to ``name``; "" if there is none."""
         group = self.find(parent)
-        names = group if isinstance(group, h5py.Group) else ()
-        unknown = {n.lower(): n for n in names if n != name and n not in _KNOWN}
-        close = difflib.get_close_matches(name.lower(), unknown, n=1, cutoff=cutoff)
-        return f"rename {unknown[close[0]]!r} to {name!r}" if close else ""
+        others = {n.lower(): n for n in group if n not in _ALIKE} if isinstance(group, h5py.Group) else {}
+        close = [others[n] for n in difflib.get_close_matches(name.lower(), others, n=1, cutoff=_CLOSE) if others[n] != name]
+        return f"rename {close[0]!r} to {name!r}" if close else ""
 
     def _refuse_broken(self, address: str, error: Exception) -> None:
         """Raises InputError where something is at an address that cannot be opened, but for a soft link to nothing."""
