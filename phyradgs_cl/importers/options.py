@@ -1,7 +1,7 @@
 """Options of an import: values that a foreign scan's files do not state, or that replace theirs."""
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, TypeVar
@@ -149,8 +149,11 @@ class ImportOptions:
         """Returns the options with a file's counts of air where they state none."""
         return replace(self, flat_value=self.flat_value or flat_value)
 
-    def called(self, name: str) -> str:
-        """Returns the name of a field in messages: the word of a data sheet where the user gave that."""
+    def called(self, name: str, in_file: Mapping[str, str] | None = None) -> str:
+        """Returns the name of a value in messages: the word of a data sheet where the user gave that, what it is called
+        ``in_file`` where the user gave none."""
+        if in_file and name in in_file and getattr(self, name, None) is None:
+            return in_file[name]
         word = _WORD_OF.get(name, name)
         return self.named(name if getattr(self, word) is None else word)
 

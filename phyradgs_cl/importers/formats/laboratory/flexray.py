@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from phyradgs_cl.acquisition import Scan
-from phyradgs_cl.importers.assemble import StoredTiming, cone, names_in_file
+from phyradgs_cl.importers.assemble import StoredTiming, cone
 from phyradgs_cl.importers.options import OF_BARE_FRAMES, ImportOptions
 from phyradgs_cl.importers.reading.files import SafeFolder
 from phyradgs_cl.importers.reading.frames import gantry_sign
@@ -48,11 +48,11 @@ def import_scan(path: Path, options: ImportOptions) -> Scan:
         read_numbered(folder, prefix, (None, *panel), str(folder.root / f"{prefix}*.tif"), options)[0]
         for prefix in ("io", "di")
     )
-    names = names_in_file(options, {
+    names = {
         "source_to_axis_mm": scan.name("SOD"), "source_to_detector_mm": scan.name("SDD"),
         "pixel_size_mm": scan.name("Binned pixel size" if scan.has("Binned pixel size") else "Voxel size"),
         "angles": scan.name("Last angle"), "exposure_s": scan.name("Exposure time (ms)"),
-    })  # fmt: skip
+    }  # fmt: skip
     stage = _stage(scan, panel, options, names)
     first_deg = scan.number("Start angle", 0.0)
     angle_rad = options.angle_rad(

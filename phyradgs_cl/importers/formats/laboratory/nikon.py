@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from phyradgs_cl.acquisition import Scan
-from phyradgs_cl.importers.assemble import cone, names_in_file
+from phyradgs_cl.importers.assemble import cone
 from phyradgs_cl.importers.options import OF_FOLDERS, ImportOptions
 from phyradgs_cl.importers.reading.files import SafeFolder, checked_name
 from phyradgs_cl.importers.reading.frames import gantry_sign
@@ -52,11 +52,11 @@ def import_scan(path: Path, options: ImportOptions) -> Scan:
     place = _folder_of_frames(folder, scan)
     frames, at, said = read_numbered(place, prefix, (count, *panel), [*map(scan.name, sizes)], options, first=1)
     measured = file_of_angles(folder, description.stem, ".ang", "_ctdata.txt")
-    names = names_in_file(options, {
+    names = {
         "source_to_axis_mm": scan.name("SrcToObject"), "source_to_detector_mm": scan.name("SrcToDetector"),
         "pixel_size_mm": f"{scan.name('DetectorPixelSizeX')}, DetectorPixelSizeY",
         "angles": str(measured or scan.name("AngularStep")),
-    })  # fmt: skip
+    }  # fmt: skip
     stage = _stage(scan, (panel[0], panel[1]), options, names)
     angle_rad = gantry_sign(options, "gantry") * options.angle_rad(len(at), lambda: _angles(scan, measured, count)[at])
     say_missing(scan, {"InitialAngle": "0", "ObjectTilt": "0", "Units": "mm"})

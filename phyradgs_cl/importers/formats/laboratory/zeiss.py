@@ -61,11 +61,11 @@ def import_scan(path: Path, options: ImportOptions) -> Scan:
     angle_rad = gantry_sign(options, "sample") * options.angle_rad(
         len(at), lambda: np.deg2rad(scan.leading(angles, int(at[-1]) + 1)[at])
     )
-    in_file = assemble.names_in_file(options, {
+    in_file = {
         "source_to_axis_mm": scan.name(f"{_INFO}/StoRADistance"), "angles": scan.name(angles),
         "source_to_detector_mm": scan.name(f"{_INFO}/DtoRADistance"), "exposure_s": scan.name(f"{_INFO}/ExpTimes"),
         "pixel_size_mm": scan.name(f"{_INFO}/PixelSize"),
-    })  # fmt: skip
+    }  # fmt: skip
     has_exposure = scan.has(f"{_INFO}/ExpTimes") and options.exposure_s is None
     exposure_s = scan.first_of(f"{_INFO}/ExpTimes", 0) if has_exposure else None
     stored = assemble.StoredTiming(exposure_s=exposure_s or None)
