@@ -2,7 +2,7 @@
 # make test    style, types, every kernel, a bit of everything else: minutes; a skipped kernel test is a failure
 # make test-all   the same and then all other tests: a quarter of an hour
 # make docs     the documentation as a site, in site/
-# make stress     runs killed fifty times each, injected faults, hostile files, laws on random scanners (hours)
+# make stress     runs killed fifty times each, injected faults, damaged files, laws on random scanners (hours)
 # make coverage   which lines the tests run, with PyTorch, Dask and MPI in one environment; fails below 95 %
 # make test-intel     the tests on Intel's OpenCL runtime for CPUs (x86-64 Linux; another 300 MB; SHAPE=--gpu-shape: as GPUs run)
 # make test-neural    the tests of naf and sax-nerf, and of deepinv, with PyTorch in an environment of its own

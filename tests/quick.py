@@ -18,11 +18,11 @@ QUICK = (
     "io/test_atomic.py", "io/test_checkpoint_file.py", "io/test_scan_round_trip.py", "io/test_volume_file.py",
     "io/test_deformation_file.py",
     *(f"prepare/test_each_step.py::test_{step}" for step in ("sparks", "dead", "air", "rings")),
-    # every command; a kill and a resume; a full disk; hostile files of each kind
+    # every command; a kill and a resume; a full disk; mistakes in files of each kind
     "cli/test_smoke.py", "cli/test_settings.py", "cli/test_startup.py",
     "cli/test_kills.py::test_killed_runs_end_with_the_bits_of_one_that_was_not[phyradgs]",
     "faults/test_disk.py::test_no_room_at_any",
-    "importers/test_hostile.py", "io/test_scan_damaged.py::test_damage",
+    "importers/test_refused.py", "io/test_scan_damaged.py::test_damage",
     "api/test_bad_input.py", "api/test_docstrings.py", "test_gate.py", "test_layers.py", "test_errors.py",
 )  # fmt: skip
 LATER = (
@@ -31,8 +31,7 @@ LATER = (
     "operators/test_bricks.py", "operators/test_device_arrays.py", "acquisition/test_orbit_recipes.py",
     *(f"operators/test_subrays.py::test_{one}" for one in ("arrays_of", "a_volume_in", "an_object")),
     *(f"operators/test_splat_states.py::test_{one}" for one in ("frames_and_gradients", "parallel_rays")),
-    "importers/test_hostile.py::test_refused[nxtomo", "runtime/test_launches.py::test_groups",
-    "importers/test_hostile.py::test_good_files_pass_and_what_is_not_there_is_not_looked_for_elsewhere[nxtomo",
+    "runtime/test_launches.py::test_groups", "importers/test_refused.py::test_a_mistake_is_named[nxtomo",
 )  # fmt: skip
 """The same kernels on parts of volumes, arrays of the device, files by packages of `test-all`: with the slow tests."""
 

@@ -5,6 +5,7 @@ import logging
 from collections.abc import Callable, Mapping
 from dataclasses import astuple, dataclass
 from functools import partial
+from typing import Any
 
 import numpy as np
 
@@ -68,33 +69,36 @@ def make_timing(
     times, or a time from frame to frame, mean that the gantry turned continuously, which needs an exposure. Without them
     every frame was taken at rest, and options about a turn are refused."""
     stored, place = stored or StoredTiming(), np.arange(frames) if isinstance(frames, int) else frames
-    exposure_s = _first(options.exposure_s, stored.exposure_s) or 0.0
-    readout_s = _first(options.readout_s, stored.readout_s)
-    axis = options.readout_axis or stored.axis
-    direction = options.readout_direction or stored.direction
+    exposure_s, readout_s, frame_time_s = (
+        getattr(stored, name) if getattr(options, name) is None else getattr(options, name)
+        for name in ("exposure_s", "readout_s", "frame_time_s")
+    )
+    axis, direction = options.readout_axis or stored.axis, options.readout_direction or stored.direction
     angle_at = options.angle_at or stored.angle_at
     unstated = {"readout": readout_s, "axis": axis, "first": direction, "angles": angle_at}
     assumed = tuple(name for name, value in unstated.items() if value is None)
-    start, length = stored.pulse or (0.0, 0.0)
-    pulse_s = (start * exposure_s, length * exposure_s) if stored.pulse and exposure_s > 0 else None
+    pulse_s = (stored.pulse[0] * exposure_s, stored.pulse[1] * exposure_s) if stored.pulse and exposure_s else None
     try:
-        shutter = Shutter(exposure_s, readout_s or 0.0, axis or "rows", direction or 1, pulse_s)
+        shutter = Shutter(exposure_s or 0.0, readout_s or 0.0, axis or "rows", direction or 1, pulse_s)
     except InputError as error:
         if pulse_s is None:
             raise
         raise InputError(f"{subject} [beam] pulse_start", error.found, error.expected, error.remedy) from error
-    angle_at = angle_at or "start"
-    frame_time_s = _first(options.frame_time_s, stored.frame_time_s)
     if options.frame_time_s is None and stored.start_s is not None:
-        start_s: np.ndarray = np.asarray(stored.start_s, np.float64)
+        start_s = np.asarray(stored.start_s, np.float64)
         checks.shape(f"{subject} start times", start_s, place.shape)
     elif frame_time_s is not None:
         start_s = place * frame_time_s
     else:
         _check_rest(subject, shutter, options, stored)
-        return Timing(shutter, place * max(shutter.span_s, 1.0), False, angle_at)
-    _check_flight(subject, shutter, start_s, options)
-    return Timing(shutter, start_s, True, angle_at, assumed)
+        return Timing(shutter, place * max(shutter.span_s, 1.0), False, angle_at or "start")
+    if shutter.exposure_s <= 0:
+        remedy = f"say {options.named('exposure_s')}, or leave the frame time out for frames taken at rest"
+        raise InputError(f"{subject} exposure", "none, with a gantry that does not stop", "a time above 0 s", remedy)
+    if len(start_s) < 2 or not np.all(np.diff(start_s) > 0):
+        found = f"{len(start_s)} frames" if len(start_s) < 2 else "start times that do not increase"
+        raise InputError(f"{subject} start times", found, "at least two frames, one after the other in time")
+    return Timing(shutter, start_s, True, angle_at or "start", assumed)
 
 
 def turning(geometry: Geometry, angle_rad: np.ndarray, timing: Timing) -> CircularOrbit:
@@ -110,32 +114,16 @@ def turning(geometry: Geometry, angle_rad: np.ndarray, timing: Timing) -> Circul
     return CircularOrbit(geometry, FrameSweeps(timing.start_s, exposure_s, first, first + speed * exposure_s))
 
 
-def _first(*values: float | None) -> float | None:
-    return next((value for value in values if value is not None), None)
-
-
 def _check_rest(subject: str, shutter: Shutter, options: ImportOptions, stored: StoredTiming) -> None:
     """Refuses options about a turn without a time from frame to frame; warns of a file's exposure."""
     turns = [name for name in options.given(_OF_A_TURN) if name != "exposure_s" or stored.exposure_s is None]
-    asked = [options.called(name) for name in turns]
     frame_time = f"{options.named('frame_time_s')} or {options.named('fps')}"
-    for name in (*asked, *stored.written):
+    for name in (*map(options.called, turns), *stored.written):
         expected = "both, or neither for frames taken at rest"
         raise InputError(name, "no time from frame to frame beside it", expected, f"say {frame_time}")
     if shutter.exposure_s > 0:
         text = "%s: an exposure of %g s and no time from frame to frame: taken at rest; say %s if the gantry did not stop"
         _log.warning(text, subject, shutter.exposure_s, frame_time)
-
-
-def _check_flight(subject: str, shutter: Shutter, start_s: np.ndarray, options: ImportOptions) -> None:
-    if shutter.exposure_s <= 0:
-        found = "none, with a gantry that does not stop"
-        remedy = f"say {options.named('exposure_s')}, or leave the frame time out for frames taken at rest"
-        raise InputError(f"{subject} exposure", found, "a time above 0 s", remedy)
-    checks.finite(f"{subject} start times", start_s)
-    if len(start_s) < 2 or np.any(np.diff(start_s) <= 0):
-        found = f"{len(start_s)} frames" if len(start_s) < 2 else "start times that do not increase"
-        raise InputError(f"{subject} start times", found, "at least two frames, one after the other in time")
 
 
 @dataclass(frozen=True)
@@ -153,12 +141,10 @@ class Turned:
     def poses(self, pose: np.ndarray, panel: tuple[int, int]) -> np.ndarray:
         """Returns the poses (..., 12) of the flipped images."""
         pose = np.array(pose, np.float64)
-        if self.rows:
-            pose[..., 3:6] += (panel[0] - 1) * pose[..., 9:12]
-            pose[..., 9:12] *= -1
-        if self.columns:
-            pose[..., 3:6] += (panel[1] - 1) * pose[..., 6:9]
-            pose[..., 6:9] *= -1
+        sides = (self.rows, panel[0], slice(9, 12)), (self.columns, panel[1], slice(6, 9))
+        for count, step in ((count, step) for is_flipped, count, step in sides if is_flipped):
+            pose[..., 3:6] += (count - 1) * pose[..., step]
+            pose[..., step] *= -1
         return pose
 
 
@@ -178,17 +164,12 @@ def table_over_time(
         at_s = np.asarray(timing.start_s) + timing.shutter.middle_s
         poses = pose_at(np.arange(len(at_s), dtype=np.float64))
         return resting_poses(poses, at_s, timing.shutter.span_s, f"{subject} poses", is_parallel)
-    at_s = timing.angle_time_s
-    span_s = timing.shutter.span_s
-    before, after = at_s[0] - timing.start_s[0] + _SLACK * span_s, timing.start_s[-1] + span_s - at_s[-1]
-    first = at_s[0] - max(before, 0.0)
-    last = at_s[-1] + max(after, 0.0) + _SLACK * span_s
-    time_s = np.concatenate([[first], at_s, [last]])
-    position = np.concatenate([
-        [-(at_s[0] - first) / (at_s[1] - at_s[0])],
-        np.arange(len(at_s)),
-        [len(at_s) - 1 + (last - at_s[-1]) / (at_s[-1] - at_s[-2])],
-    ])  # fmt: skip
+    at_s, span_s = timing.angle_time_s, timing.shutter.span_s
+    before_s = max(at_s[0] - timing.start_s[0] + _SLACK * span_s, 0.0)
+    after_s = max(timing.start_s[-1] + span_s - at_s[-1], 0.0) + _SLACK * span_s
+    time_s = np.concatenate([[at_s[0] - before_s], at_s, [at_s[-1] + after_s]])
+    first, last = -before_s / (at_s[1] - at_s[0]), len(at_s) - 1 + after_s / (at_s[-1] - at_s[-2])
+    position = np.concatenate([[first], np.arange(len(at_s)), [last]])
     return PoseTable(time_s, pose_at(position), f"{subject} poses", is_parallel)
 
 
@@ -214,9 +195,9 @@ def assemble_scan(
         lag=lag, saturation=integrals.saturation,
     )
     subjects = {"grid": f"{source} grid", "angles": f"{source} angles", **(names or {})}
-    _check_turn(trajectory, scan.frame_start_s + timing.shutter.middle_s, subjects["angles"])
+    _check_turn(trajectory, scan.frame_start_s + timing.shutter.middle_s, options.called("angles", subjects))
     is_timed = "exposure" not in assumed  # by convention an exposure of 1 s: the frame rate means nothing then
-    check_plausible(scan, lambda name: subjects.get(name) or options.called(name), is_timed)
+    check_plausible(scan, lambda name: options.called(name, subjects), is_timed)
     scan.warn_of_near_panel()
     return scan
 
@@ -236,16 +217,9 @@ def _check_turn(trajectory: CircularOrbit | PoseTable, middle_s: np.ndarray, sub
         raise InputError(subject, found, "a turn between the views", "correct the angles")
 
 
-def names_in_file(options: ImportOptions, names: Mapping[str, str]) -> dict[str, str]:
-    """Returns the file's names of those values that no option replaces, for messages."""
-    return {field: name for field, name in names.items() if getattr(options, field, None) is None}
-
-
 def with_options(options: ImportOptions, geometry: Geometry) -> Geometry:
     """Returns a geometry with the options' lengths where they are given. InputError for distances of a parallel beam."""
-    if isinstance(geometry, ParallelGeometry):
-        return parallel(options, *astuple(geometry))
-    return cone(options, *astuple(geometry))
+    return (parallel if isinstance(geometry, ParallelGeometry) else cone)(options, *astuple(geometry))
 
 
 def parallel(
@@ -255,7 +229,7 @@ def parallel(
     for name in options.given(_DISTANCES):
         expected, remedy = "no distance: this file has a parallel beam", "leave it out"
         raise InputError(options.named(name), f"{getattr(options, name):g}", expected, remedy)
-    return ParallelGeometry(panel, _pitch(options, pitch_mm), options.detector_offset_mm or offset_mm)
+    return ParallelGeometry(panel, _taken(options, "pixel_size_mm", pitch_mm), options.detector_offset_mm or offset_mm)
 
 
 def cone(
@@ -263,21 +237,18 @@ def cone(
     offset_mm: tuple[float, float], names: Mapping[str, str] | None = None,
 ) -> ConeGeometry:
     """Returns a geometry of a file's numbers, or the options' where they are given: functions that read numbers are called
-    then only. ``names``: what the file calls them, see ``names_in_file``. InputError unless the panel stands behind the
-    axis."""
-    lengths = {"source_to_axis_mm": to_axis_mm, "source_to_detector_mm": to_detector_mm}
-    to_axis_mm, to_detector_mm = (
-        options.taken(name, length if callable(length) else partial(float, length)) for name, length in lengths.items()
-    )
-    if to_detector_mm <= to_axis_mm:
-        axis, detector = ((names or {}).get(name) or options.named(name) for name in _DISTANCES)
+    then only. ``names``: what the file calls them, for messages. InputError unless the panel stands behind the axis."""
+    axis_mm, detector_mm = map(partial(_taken, options), _DISTANCES, (to_axis_mm, to_detector_mm))
+    if detector_mm <= axis_mm:
+        axis, detector = (options.called(name, names) for name in _DISTANCES)
         remedy = "are the two exchanged?"
         if names and not names.keys().isdisjoint(_DISTANCES):
             remedy += f" Correct the file, or say {' and '.join(map(options.named, _DISTANCES))}"
-        raise InputError(detector, f"{to_detector_mm:g}", f"more than {axis} ({to_axis_mm:g})", remedy)
-    offset_mm = options.detector_offset_mm or offset_mm
-    return ConeGeometry(to_axis_mm, to_detector_mm, panel, _pitch(options, pitch_mm), offset_mm)
+        raise InputError(detector, f"{detector_mm:g}", f"more than {axis} ({axis_mm:g})", remedy)
+    pitch = _taken(options, "pixel_size_mm", pitch_mm)
+    return ConeGeometry(axis_mm, detector_mm, panel, pitch, options.detector_offset_mm or offset_mm)
 
 
-def _pitch(options: ImportOptions, stored: Pitch) -> tuple[float, float]:
-    return options.taken("pixel_size_mm", stored if callable(stored) else lambda: stored)
+def _taken(options: ImportOptions, name: str, stored: Any) -> Any:
+    """Returns the option ``name`` where it is given, else a value, or that of a function that reads it."""
+    return options.taken(name, stored if callable(stored) else lambda: stored)

@@ -18,16 +18,8 @@ from phyradgs_cl.importers.reading.files import SafeFolder
 from phyradgs_cl.importers.reading.flats import places
 from phyradgs_cl.importers.reading.frames import LineIntegrals, line_integrals, oriented
 from phyradgs_cl.io import scan as schema
-from phyradgs_cl.io.hdf5.datasets import (
-    ANGLE,
-    LENGTH,
-    Quantity,
-    read_attribute,
-    read_length,
-    read_number,
-    read_per_frame,
-    read_values,
-)
+from phyradgs_cl.io.hdf5 import datasets as h5
+from phyradgs_cl.io.hdf5.datasets import ANGLE, LENGTH, Quantity
 from phyradgs_cl.io.hdf5.source import Hdf5Source, open_hdf5
 from phyradgs_cl.io.scan.detector import read_duration
 from phyradgs_cl.io.scan.reader import united
@@ -62,18 +54,16 @@ class Places:
     @contextmanager
     def opened(self, name: str, text: str) -> Iterator[tuple[Hdf5Source, str]]:
         """Yields the open file and the address inside it of one place."""
-        file, _, address = str(text).rpartition(":/")
+        file, _, address = text.rpartition(":/")
         subject = f"{self.subject} {name}"
         if self.source is not None and not file and text.startswith("/"):
             yield self.source, text
             return
         if not file:
             raise InputError(subject, repr(text)[:80], "an address in HDF5, as FILE:/ADDRESS", "'h5ls -r FILE' lists them")
-        if self.folder is not None:
-            path = self.folder.file(file, subject)
-        else:
-            beside = Path() if self.source is None else self.source.path.parent
-            path = Path(file) if Path(file).exists() else beside / file
+        path = Path(file) if self.folder is None else self.folder.file(file, subject)
+        if self.source is not None and not path.exists():
+            path = self.source.path.parent / file
         with open_hdf5(path, self.linked_folder) as other:
             yield other, f"/{address}"
 
@@ -82,36 +72,36 @@ class Places:
         there = [address for address in usual if self.source is not None and self.source.find(address) is not None]
         return self.stated.get(name, there)
 
-    def parts(
+    def stack(
         self, name: str, usual: Sequence[str] = (), panel: tuple[int, int] | None = None
-    ) -> dict[str, np.ndarray]:
-        """Reads frames (n, v, u) in their own type, by place. ``usual``: addresses of the format, as far as they exist."""
+    ) -> tuple[np.ndarray, dict[str, int]] | None:
+        """Reads frames (n, v, u) in their own type, and how many are at each place; None without a place. ``usual``:
+        addresses of the format, as far as they exist."""
         stacks: dict[str, np.ndarray] = {}
         for text in self._at(name, usual):
-            with self.opened(name, text) as (source, address):
-                stacks[text] = self._stack(source, address, panel)
-        return stacks
+            with self.opened(name, str(text)) as (source, address):
+                stacks[text] = self._read(source, address, panel)
+        if not stacks:
+            return None
+        parts = list(stacks.values())
+        return (parts[0] if len(parts) == 1 else np.concatenate(parts)), {text: len(one) for text, one in stacks.items()}
 
-    def _stack(self, source: Hdf5Source, address: str, panel: tuple[int, int] | None) -> np.ndarray:
-        dataset, order = source.dataset(address), self._order()
-        long = [count for count in dataset.shape if count != 1]  # 1: axes that say nothing
-        shape = dataset.shape if dataset.ndim <= len(_AXES) or len(long) > len(_AXES) else tuple(long)
-        axes = [order.index(name) for name in _AXES]
-        if len(shape) == len(_AXES) - 1 and panel is not None:
-            shape = tuple(np.insert(shape, order.index("frame"), 1).tolist())
-        if len(shape) != len(_AXES) or min(shape) < 1:
-            raise source.error(address, f"shape {dataset.shape}", "three axes (frame, v, u), none of them empty")
-        sides = tuple(shape[axis] for axis in axes)
-        if panel is not None and sides[1:] != panel:
-            raise source.error(address, f"shape {dataset.shape}", f"(any, {panel[0]}, {panel[1]}), as the projections")
-        return read_values(source, address, dataset).reshape(shape).transpose(axes)
-
-    def _order(self) -> list[str]:
+    def _read(self, source: Hdf5Source, address: str, panel: tuple[int, int] | None) -> np.ndarray:
         order = self.stated.get("axes", [",".join(_AXES)])[0].replace(",", " ").split()
         if sorted(order) != sorted(_AXES):
             remedy = "of a stack of sinograms say v,frame,u"
             raise InputError(f"{self.subject} axes", " ".join(order), "frame, v and u in the order of the data", remedy)
-        return order
+        dataset = source.dataset(address)
+        long = [count for count in dataset.shape if count != 1]  # 1: axes that say nothing
+        shape = dataset.shape if dataset.ndim <= len(_AXES) or len(long) > len(_AXES) else tuple(long)
+        if len(shape) == len(_AXES) - 1 and panel is not None:
+            shape = tuple(np.insert(shape, order.index("frame"), 1).tolist())
+        if len(shape) != len(_AXES) or min(shape) < 1:
+            raise source.error(address, f"shape {dataset.shape}", "three axes (frame, v, u), none of them empty")
+        values = h5.read_values(source, address, dataset).reshape(shape).transpose([order.index(name) for name in _AXES])
+        if panel is not None and values.shape[1:] != panel:
+            raise source.error(address, f"shape {dataset.shape}", f"(any, {panel[0]}, {panel[1]}), as the projections")
+        return values
 
     def stacks(
         self, projections: str = "/", *, key: Sequence[str] = (), flats: Sequence[str] = (), darks: Sequence[str] = (),
@@ -121,31 +111,34 @@ class Places:
         flats and darks at addresses count before its own."""
         if self.source is not None and "projections" not in self.stated:
             self.source.dataset(projections)  # or says what is there in its place
-        frames = joined(self.parts("projections", [projections]))
-        panel = (frames.shape[1], frames.shape[2])
+        if (stored := self.stack("projections", [projections])) is None:
+            raise InputError(self.subject, "no place of the projections", "one of them")
+        frames, panel = stored[0], (stored[0].shape[1], stored[0].shape[2])
         kinds = self._key(key, len(frames))
         used = kinds == schema.PROJECTION
-        stacks, flats_at = {"flats": frames[kinds == schema.FLAT], "darks": frames[kinds == schema.DARK]}, None
-        if len(stacks["flats"]):
-            flats_at = places(kinds == schema.FLAT, used)
+        stacks = {"flats": frames[kinds == schema.FLAT], "darks": frames[kinds == schema.DARK]}
+        flats_at = places(kinds == schema.FLAT, used) if np.any(kinds == schema.FLAT) else None
         for name, addresses in (("flats", flats), ("darks", darks), ("mask", mask)):
-            if parts := self.parts(name, addresses, panel):
-                stacks[name] = joined(parts)
-                flats_at = _times_of(parts, int(used.sum())) if name == "flats" else flats_at
-        frames = frames if used.all() else frames[used]
-        return Stacks(frames, stacks["flats"], stacks["darks"], _mask(stacks.get("mask"), used), used, flats_at)
+            if parts := self.stack(name, addresses, panel):
+                stacks[name] = parts[0]
+                flats_at = _times_of(parts[1], int(used.sum())) if name == "flats" else flats_at
+        bad = stacks.get("mask")
+        if bad is not None and len(bad) not in (1, len(used)):
+            raise InputError("mask", f"{len(bad)} images", f"one, or {len(used)} as there are frames")
+        if bad is not None:
+            bad = None if not bad.any() else bad[0] if len(bad) == 1 else bad[used]
+        return Stacks(frames if used.all() else frames[used], stacks["flats"], stacks["darks"], bad, used, flats_at)
 
     def _key(self, usual: Sequence[str], frames: int) -> np.ndarray:
         """Reads the keys (F,) of frames, those of ``io.scan``; without any all frames are projections."""
         for text in self._at("image_key", usual)[:1]:
             with self.opened("image_key", text) as (source, address):
-                values = read_values(source, address, source.dataset(address))
-                checks.shape(source.name(address), values, (frames,))
-                key = np.where(values == -1, schema.INVALID, values)  # -1: frames by which nxtomo aligns
-                if len(wrong := key[~np.isin(key, range(schema.INVALID + 1))]):
-                    raise source.error(address, f"{wrong[0]:g}", "0 projection, 1 flat, 2 dark or 3 invalid")
-                if not np.any(key == schema.PROJECTION):
-                    raise source.error(address, "no projection", "at least one 0")
+                key = h5.read_values(source, address, source.dataset(address))
+                checks.shape(source.name(address), key, (frames,))
+                key = np.where(key == -1, schema.INVALID, key)  # -1: frames by which nxtomo aligns
+                if not np.isin(key, range(schema.INVALID + 1)).all() or not np.any(key == schema.PROJECTION):
+                    expected = "0 projection, 1 flat, 2 dark or 3 invalid, and at least one 0"
+                    raise source.error(address, f"{np.unique(key)[:5]}", expected)
                 return key.astype(np.int64)
         return np.full(frames, schema.PROJECTION)
 
@@ -155,10 +148,13 @@ class Places:
         asked = [options.angles] if options.angles and is_address(options.angles) else self.stated.get("angles", ())
         for text in asked:
             with self.opened("angles", text) as (source, address):
-                return read_per_frame(source, address, used, quantity)
-        assert self.source is not None
-        source = self.source
-        return options.angle_rad(int(used.sum()), lambda: read_per_frame(source, usual, used, quantity))
+                return h5.read_per_frame(source, address, used, quantity)
+
+        def stored_rad() -> np.ndarray:
+            assert self.source is not None
+            return h5.read_per_frame(self.source, usual, used, quantity)
+
+        return options.angle_rad(int(used.sum()), stored_rad)
 
 
 @dataclass(frozen=True, eq=False)
@@ -178,47 +174,26 @@ class Stacks:
     def panel(self) -> tuple[int, int]:
         return self.projections.shape[1], self.projections.shape[2]
 
-    def turned(self, turn: Turned) -> "Stacks":
-        """Returns the stacks with flips that a file declares."""
-        frames, flats, darks = (turn.frames(one) for one in (self.projections, self.flats, self.darks))
-        mask = None if self.mask is None else turn.frames(self.mask)
-        return replace(self, projections=frames, flats=flats, darks=darks, mask=mask)
-
     def line_integrals(
-        self, subject: str, options: ImportOptions, row_0: str, convention: str | None = None
+        self, subject: str, options: ImportOptions, row_0: str, convention: str | None = None, turn: Turned | None = None
     ) -> LineIntegrals:
-        """Converts the projections; see ``frames.line_integrals`` and ``oriented``."""
-        frames, flats, darks = (oriented(one, options, row_0) for one in (self.projections, self.flats, self.darks))
+        """Converts the projections, with flips that a file declares; see ``frames.line_integrals`` and ``oriented``."""
+        frames, flats, darks, bad = (
+            None if one is None else oriented(turn.frames(one) if turn else one, options, row_0)
+            for one in (self.projections, self.flats, self.darks, self.mask)
+        )
+        assert frames is not None
         integrals = line_integrals(
             subject, frames, options, flats=flats, darks=darks, convention=convention, flats_at=self.flats_at
         )
-        if self.mask is None:
-            return integrals
-        return replace(integrals, mask=united(oriented(self.mask, options, row_0) != 0, integrals.mask))
+        return integrals if bad is None else replace(integrals, mask=united(bad != 0, integrals.mask))
 
 
-def joined(parts: Mapping[str, np.ndarray]) -> np.ndarray:
-    """Returns all frames of several places, one place after the other."""
-    stacks = list(parts.values())
-    return stacks[0] if len(stacks) == 1 else np.concatenate(stacks)
-
-
-def _times_of(parts: Mapping[str, np.ndarray], projections: int) -> np.ndarray | None:
+def _times_of(parts: Mapping[str, int], projections: int) -> np.ndarray | None:
     """Returns the places of flats among the projections, of addresses that say before or after; None where one does not."""
     at = {"pre": -0.5, "post": projections - 0.5}
     words = [address.rpartition("_")[2] for address in parts]
-    if not all(word in at for word in words):
-        return None
-    return np.concatenate([np.full(len(stack), at[word]) for word, stack in zip(words, parts.values(), strict=True)])
-
-
-def _mask(stack: np.ndarray | None, used: np.ndarray) -> np.ndarray | None:
-    """Returns one mask for all frames, or one for each used frame; None where no pixel is masked."""
-    if stack is None or not stack.any():
-        return None
-    if len(stack) not in (1, len(used)):
-        raise InputError("mask", f"{len(stack)} images", f"one, or {len(used)} as there are frames")
-    return stack[0] if len(stack) == 1 else stack[used]
+    return np.repeat([at[word] for word in words], list(parts.values())) if all(word in at for word in words) else None
 
 
 def places_of(options: ImportOptions, source: Hdf5Source) -> Places:
@@ -256,14 +231,14 @@ def beam(
         for pair in pairs:
             if there := [address for address in pair if source.find(address) is not None]:
                 unit = replace(LENGTH, assumed="um") if there[0].endswith("resolution") else quantity
-                return read_length(source, there[0], unit), read_length(source, there[-1], unit)
+                return h5.read_length(source, there[0], unit), h5.read_length(source, there[-1], unit)
         return None
 
     def pitch_mm() -> tuple[float, float]:
         """Returns the pixel's sides on a panel behind the sample, without optics between them."""
         at_sample, on_panel = sides_mm(lengths.at_sample), sides_mm(lengths.on_panel)
         if at_sample is None and on_panel is not None and lengths.optics and source.find(lengths.optics) is not None:
-            times = read_length(source, lengths.optics, _TIMES)
+            times = h5.read_length(source, lengths.optics, _TIMES)
             at_sample = on_panel[0] / times, on_panel[1] / times
         if at_sample is None or at_sample == on_panel:
             if on_panel is None:
@@ -282,7 +257,7 @@ def beam(
         return parallel(options, panel, sides, (0.0, axis_columns * sides[1]))
     to_axis_mm = options.taken("source_to_axis_mm", lambda: _to_axis_mm(source, lengths.source, quantity))
     to_detector_mm = options.taken(
-        "source_to_detector_mm", lambda: to_axis_mm + read_length(source, lengths.detector, quantity)
+        "source_to_detector_mm", lambda: to_axis_mm + h5.read_length(source, lengths.detector, quantity)
     )
     sides = options.taken("pixel_size_mm", pitch_mm)
     return cone(options, to_axis_mm, to_detector_mm, panel, sides, (0.0, axis_columns * sides[1]))
@@ -292,15 +267,15 @@ def _length_of(source: Hdf5Source, lengths: Lengths) -> Quantity:
     """Returns how to read the file's lengths: without units they are in metres where a pixel in mm would be smaller than
     light can see."""
     for address in (address for pair in (*lengths.at_sample, *lengths.on_panel) for address in pair):
-        if source.find(address) is None or read_attribute(source, address, "units"):
+        if source.find(address) is None or h5.read_attribute(source, address, "units"):
             continue
-        if abs(float(read_values(source, address, source.dataset(address)).ravel()[0])) < _LEAST_MM:
+        if abs(float(h5.read_values(source, address, source.dataset(address)).ravel()[0])) < _LEAST_MM:
             return replace(LENGTH, assumed="m")
     return LENGTH
 
 
 def _to_axis_mm(source: Hdf5Source, address: str, quantity: Quantity) -> float:
-    distance_mm = abs(read_number(source, address, quantity))  # NeXus gives it a minus sign
+    distance_mm = abs(h5.read_number(source, address, quantity))  # NeXus gives it a minus sign
     if distance_mm == 0:
         raise source.error(address, "0", "a length other than 0", "remove it: without one the beam is parallel")
     return distance_mm

@@ -42,10 +42,7 @@ FORMATS = {
 _MOST_BODIES = 1000
 _LARGEST_MM, _LARGEST_PER_MM = 1e5, 1e5
 _COMMON = "attenuation_per_mm"
-_KEYS = {
-    "bead": ("centre_mm", "radius_mm", _COMMON),
-    "wire": ("from_mm", "to_mm", "radius_mm", _COMMON),
-}
+_KEYS = {"bead": ("centre_mm", "radius_mm", _COMMON), "wire": ("from_mm", "to_mm", "radius_mm", _COMMON)}
 
 
 def import_scan(path: str | Path, options: ImportOptions | None = None, form: str | None = None) -> Scan:
@@ -53,9 +50,7 @@ def import_scan(path: str | Path, options: ImportOptions | None = None, form: st
     ``options``: values that the files do not state; ``form``: a key of ``FORMATS``, None recognises it. InputError: an
     unknown format, damaged or incomplete files, options without use for the format."""
     path = Path(path)
-    if not (path.is_dir() or path.is_file()):
-        found = "something that is neither a file nor a folder" if path.exists() else "nothing there"
-        raise InputError(str(path), found, "a scan to import", "check the path")
+    _check_there(path)
     form = form or recognise(path)
     checks.one_of("format", form, FORMATS)
     try:
@@ -68,39 +63,37 @@ def import_scan(path: str | Path, options: ImportOptions | None = None, form: st
     return scan
 
 
+def _check_there(path: Path) -> None:
+    """Raises InputError for what is neither a file nor a folder."""
+    if not (path.is_dir() or path.is_file()):
+        found = "something that is neither a file nor a folder" if path.exists() else "nothing there"
+        raise InputError(str(path), found, "a scan to import", "check the path")
+
+
 def recognise(path: Path) -> str:
     """Returns the name of the format of a file or folder, by its content. InputError if none fits, or more than one."""
-    if not path.exists():
-        raise InputError(str(path), "nothing there", "a scan to import", "check the path")
-    if not (path.is_dir() or path.is_file()):
-        raise InputError(str(path), "something that is not a regular file", "a file or a folder")
-    names = [name for name in FORMATS if _module(name).recognises(path)]
+    _check_there(path)
+    expected, names = "one of the formats of docs/import.md", [name for name in FORMATS if _module(name).recognises(path)]
     if len(names) == 1:
         return names[0]
-    if not names and _holds_tiffs(path):
+    tiffs = SafeFolder(path).matching(*tiff.SUFFIXES) if path.is_dir() else path.suffix.lower() in tiff.SUFFIXES
+    if not names and tiffs:
         remedy = f"'phyradgs import {path if path.is_dir() else path.parent} --template' prints one to fill in"
         found = "TIFF images and no TOML that describes them"
         raise InputError(str(path), found, "geometry and angles in a TOML beside them", remedy)
     if not names:
-        refuse_unread(path, "one of the formats of docs/import.md")
+        refuse_unread(path, expected)
     found = f"several: {', '.join(names)}" if names else "no known format"
-    raise InputError(str(path), found, "one of the formats of docs/import.md", "say which with --format")
+    raise InputError(str(path), found, expected, "say which with --format")
 
 
 def _module(form: str) -> ModuleType:
     return import_module(f"phyradgs_cl.importers.formats.{FORMATS[form]}")
 
 
-def _holds_tiffs(path: Path) -> bool:
-    if path.is_dir():
-        return bool(SafeFolder(path).matching(*tiff.SUFFIXES))
-    return path.suffix.lower() in tiff.SUFFIXES
-
-
 def foreign_volume(path: str | Path) -> str | None:
     """Returns the name of a volume format other than HDF5, by the suffix; None for any other file."""
-    reader = _reader(path)
-    return reader[0] if reader else None
+    return reader[0] if (reader := _reader(path)) else None
 
 
 def load_volume(path: str | Path) -> Volume:
@@ -116,8 +109,7 @@ def load_volume(path: str | Path) -> Volume:
 def load_states(path: str | Path) -> Iterator[tuple[float, Volume]]:
     """Yields (time in s, volume) for each of the volumes of a NIfTI, NRRD or MetaImage file with four axes, else nothing.
     InputError: as of ``load_volume``."""
-    reader = _reader(path)
-    if reader is not None and reader[1] is read_image_volume:
+    if (reader := _reader(path)) is not None and reader[1] is read_image_volume:
         for state, time_s in enumerate(image_times_s(Path(path))):
             yield time_s, read_image_volume(Path(path), state)
 
@@ -171,14 +163,10 @@ def _on_grid(path: Path, values: np.ndarray, size_mm: np.ndarray, first_mm: np.n
 
 
 _READERS: dict[str, tuple[str, Callable[[Path], Volume]]] = {
-    ".mha": ("MetaImage", read_image_volume),
-    ".mhd": ("MetaImage", read_image_volume),
-    ".nii": ("NIfTI", read_image_volume),
-    ".nii.gz": ("NIfTI", read_image_volume),
-    ".nrrd": ("NRRD", read_image_volume),
-    ".npy": ("NumPy", _read_npy),
-    ".tif": ("TIFF", _read_tiff),
-    ".tiff": ("TIFF", _read_tiff),
+    **dict.fromkeys((".mha", ".mhd"), ("MetaImage", read_image_volume)),
+    **dict.fromkeys((".nii", ".nii.gz"), ("NIfTI", read_image_volume)),
+    **dict.fromkeys(tiff.SUFFIXES, ("TIFF", _read_tiff)),
+    **{".nrrd": ("NRRD", read_image_volume), ".npy": ("NumPy", _read_npy)},
 }
 
 
@@ -187,28 +175,18 @@ def load_beads(path: Path) -> EllipsoidPhantom:
     missing or wrong keys; no bead; more than a thousand bodies."""
     content = read_toml(path)
     refuse_unknown(str(path), content, ("title", _COMMON, *_KEYS))
-    top = Fields(str(path), content)
-    beads = [
-        Ellipsoid(_place(one, "centre_mm"), (one.length("radius_mm"),) * 3, _attenuation(one, top))
-        for one in _bodies(top, "bead")
-    ]
-    wires = [
-        Cylinder((_place(one, "from_mm"), _place(one, "to_mm")), one.length("radius_mm"), _attenuation(one, top))
-        for one in (_bodies(top, "wire") if top.has("wire") else ())
-    ]
-    if len(beads) + len(wires) > _MOST_BODIES:
-        raise InputError(str(path), f"{len(beads) + len(wires)} beads and wires", f"at most {_MOST_BODIES}")
-    return EllipsoidPhantom((*beads, *wires), path.stem)
-
-
-def _bodies(top: Fields, kind: str) -> list[Fields]:
-    return [Fields(one.subject, one.values, _KEYS[kind]) for one in top.tables(kind)]
-
-
-def _place(body: Fields, key: str) -> tuple[float, float, float]:
-    x, y, z = body.numbers(key, 3, _LARGEST_MM).tolist()
-    return x, y, z
-
-
-def _attenuation(body: Fields, top: Fields) -> float:
-    return (body if body.has(_COMMON) else top).number(_COMMON, lowest=-_LARGEST_PER_MM, highest=_LARGEST_PER_MM)
+    top, bodies = Fields(str(path), content), list[Ellipsoid | Cylinder]()
+    for kind, keys in _KEYS.items():
+        for body in top.tables(kind) if kind == "bead" or top.has(kind) else ():
+            one = Fields(body.subject, body.values, keys)
+            places = [triple(one.numbers(key, 3, _LARGEST_MM).tolist()) for key in keys[:-2]]
+            radius_mm, given = one.length("radius_mm"), one if one.has(_COMMON) else top
+            per_mm = given.number(_COMMON, lowest=-_LARGEST_PER_MM, highest=_LARGEST_PER_MM)
+            is_bead = len(places) == 1
+            bodies.append(
+                Ellipsoid(places[0], (radius_mm,) * 3, per_mm) if is_bead
+                else Cylinder((places[0], places[1]), radius_mm, per_mm)
+            )  # fmt: skip
+    if len(bodies) > _MOST_BODIES:
+        raise InputError(str(path), f"{len(bodies)} beads and wires", f"at most {_MOST_BODIES}")
+    return EllipsoidPhantom(tuple(bodies), path.stem)

@@ -1,7 +1,7 @@
 """Options of an import: values that a foreign scan's files do not state, or that replace theirs."""
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, TypeVar
@@ -13,8 +13,8 @@ from phyradgs_cl.acquisition.readout import SIDES, Named, frame_time_of, readout
 from phyradgs_cl.acquisition.scan import DETECTOR_MODELS
 from phyradgs_cl.acquisition.shutter import AXES
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.importers.reading.files import SafeFolder
 from phyradgs_cl.importers.reading.text import read_angles_rad
+from phyradgs_cl.io.files import regular_file
 
 T = TypeVar("T")
 WORDS: dict[str, tuple[str, ...]] = {
@@ -30,10 +30,8 @@ WORDS: dict[str, tuple[str, ...]] = {
     "flats": ("median", "time"),
     "frames": ("stated", "found"),
 }
-_POSITIVE = ("frame_time_s", "source_to_axis_mm", "source_to_detector_mm", "flat_value", "unit_mm")
-_TIMES = ("exposure_s", "readout_s")
-
-
+_POSITIVE = ("frame_time_s", "source_to_axis_mm", "source_to_detector_mm", "flat_value", "unit_mm", "pixel_size_mm")
+_RANGES = {"exposure_s": (0, 1e6), "readout_s": (0, 1e6), "first_view": (0, 1e6), "detector_offset_mm": (-1e6, 1e6)}
 _FILE, _FORMAT = "the file's", "the format's"
 DETECTOR_OFFSET = "Shift V,U of the panel's centre, mm: V > 0 up (rows), U > 0 right (columns), seen from the source."
 _AT = (
@@ -89,27 +87,17 @@ class ImportOptions:
     named: Named = field(default=str, repr=False, compare=False)
 
     def __post_init__(self) -> None:
-        for name, allowed in {**WORDS, "readout_direction": (1, -1)}.items():
-            if getattr(self, name) is not None:
-                checks.one_of(self.named(name), getattr(self, name), allowed)
-        for name in _POSITIVE:
-            if getattr(self, name) is not None:
-                checks.positive(self.named(name), getattr(self, name))
-        for name in _TIMES:
-            if getattr(self, name) is not None:
-                checks.at_least(self.named(name), getattr(self, name), 0)
-        if self.first_view is not None:
-            checks.within(self.named("first_view"), self.first_view, 0, 1_000_000)
-        for length in self.pixel_size_mm or ():
-            checks.positive(self.named("pixel_size_mm"), length)
-        for length in self.detector_offset_mm or ():
-            checks.within(self.named("detector_offset_mm"), length, -1e6, 1e6)
-        self._take_words()
-
-    def _take_words(self) -> None:
-        """Converts the words of a data sheet to the fields that every format reads."""
+        words = {**WORDS, "readout_direction": (1, -1)}
+        for name, value in ((name, getattr(self, name)) for name in FIELDS if getattr(self, name) is not None):
+            if name in words:
+                checks.one_of(self.named(name), value, words[name])
+            for number in value if isinstance(value, tuple) else (value,):
+                if name in _POSITIVE:
+                    checks.positive(self.named(name), number)
+                elif name in _RANGES:
+                    checks.within(self.named(name), number, *_RANGES[name])
         axis, direction = readout_order(self.first, self.readout_axis, self.readout_direction, self.named)
-        stated = {
+        stated = {  # in the fields that every format reads
             "readout_axis": axis, "readout_direction": direction,
             "frame_time_s": frame_time_of(self.fps, self.frame_time_s, self.named),
             "readout_s": readout_of(self.readout_ms, self.readout_s, self.named),
@@ -137,20 +125,20 @@ class ImportOptions:
         if self.angles is None:
             return self.taken("angles", stored)
         if not (steps := _STEPS.fullmatch(self.angles)):
-            path = Path(self.angles)
-            file = SafeFolder(path.parent).file(path.name, self.named("angles"))
-            return read_angles_rad(file, count)
+            regular_file(path := Path(self.angles), self.named("angles"))
+            return read_angles_rad(path, count)
         first, last = float(steps[1]), float(steps[3])
-        if steps[2] == ",":
-            return np.deg2rad(first + last * np.arange(count))
-        return np.deg2rad(np.linspace(first, last, count))
+        return np.deg2rad(first + last * np.arange(count) if steps[2] == "," else np.linspace(first, last, count))
 
     def with_air(self, flat_value: float | None) -> "ImportOptions":
         """Returns the options with a file's counts of air where they state none."""
         return replace(self, flat_value=self.flat_value or flat_value)
 
-    def called(self, name: str) -> str:
-        """Returns the name of a field in messages: the word of a data sheet where the user gave that."""
+    def called(self, name: str, in_file: Mapping[str, str] | None = None) -> str:
+        """Returns the name of a value in messages: the word of a data sheet where the user gave that, what it is called
+        ``in_file`` where the user gave none."""
+        if in_file and name in in_file and getattr(self, name, None) is None:
+            return in_file[name]
         word = _WORD_OF.get(name, name)
         return self.named(name if getattr(self, word) is None else word)
 

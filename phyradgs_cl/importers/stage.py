@@ -8,14 +8,8 @@ from scipy.spatial.transform import Rotation
 
 from phyradgs_cl.acquisition import CircularOrbit, PoseTable, Scan
 from phyradgs_cl.acquisition.geometry import Geometry, ParallelGeometry, plain_geometry
-from phyradgs_cl.importers.assemble import (
-    StoredTiming,
-    Timing,
-    assemble_scan,
-    make_timing,
-    table_over_time,
-    turning,
-)
+from phyradgs_cl.importers import assemble
+from phyradgs_cl.importers.assemble import StoredTiming, Timing
 from phyradgs_cl.importers.options import ImportOptions
 from phyradgs_cl.importers.reading.frames import line_integrals, oriented
 
@@ -50,7 +44,7 @@ class RotaryStage:
         """Returns the trajectory of gantry angles (F,) and its plain geometry: a circular orbit where the axis crosses the
         central ray at a right angle, else a table of poses."""
         if self.axis_u_mm == self.roll_rad == self.tilt_rad == 0 and self.shift_mm is None:
-            return turning(self.geometry, angle_rad, timing), self.geometry
+            return assemble.turning(self.geometry, angle_rad, timing), self.geometry
         unwrapped = np.unwrap(angle_rad)
         shift_mm = np.zeros((len(unwrapped), 2)) if self.shift_mm is None else self.shift_mm
 
@@ -60,7 +54,7 @@ class RotaryStage:
         is_parallel = isinstance(self.geometry, ParallelGeometry)
         at_frames = poses(np.arange(len(unwrapped), dtype=np.float64))
         geometry = plain_geometry(at_frames, self.geometry.detector_shape, is_parallel)
-        return table_over_time(poses, timing, subject, is_parallel), geometry
+        return assemble.table_over_time(poses, timing, subject, is_parallel), geometry
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,16 +78,15 @@ class StageScan:
         self, stage: RotaryStage, options: ImportOptions, path: Path, title: str, flat_value: float | None = None
     ) -> Scan:
         """Returns the scan of the description ``path``. ``flat_value``: the file's counts of air; options come first."""
-        timing = make_timing(str(path), self.places, options, self.stored)
+        timing = assemble.make_timing(str(path), self.places, options, self.stored)
         trajectory, geometry = stage.turned(self.angle_rad, timing, str(path))
-        stacks = (None if one is None else oriented(one, options, *self.sides) for one in (self.flats, self.darks))
-        flats, darks = stacks
+        flats, darks = (None if one is None else oriented(one, options, *self.sides) for one in (self.flats, self.darks))
+        frames, options = oriented(self.frames, options, *self.sides), options.with_air(flat_value)
         integrals = line_integrals(
-            str(path), oriented(self.frames, options, *self.sides), options.with_air(flat_value), flats=flats, darks=darks,
-            convention="counts", is_corrected=darks is None,
+            str(path), frames, options, flats=flats, darks=darks, convention="counts", is_corrected=darks is None
         )
         parts = integrals, trajectory, geometry, timing, options
-        return assemble_scan(*parts, title=title, source=str(path), names=self.names, said=self.said)
+        return assemble.assemble_scan(*parts, title=title, source=str(path), names=self.names, said=self.said)
 
 
 def along(values: np.ndarray, position: np.ndarray) -> np.ndarray:

@@ -8,7 +8,6 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import BinaryIO
 
 from phyradgs_cl.errors import InputError
 
@@ -19,47 +18,36 @@ except ImportError:  # not POSIX
 
 HOST_SHARE = 0.8
 """The largest part of this machine's memory for one array."""
-_NO_WAITING = getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_NOCTTY", 0) | getattr(os, "O_BINARY", 0)
 _BLOCK_BYTES = 1 << 20
 
 
 def regular_file(path: Path, subject: str, expected: str = "a regular file") -> os.stat_result:
     """Returns the status of a readable regular file. InputError about ``subject`` for a missing file, a folder, a device or
     a pipe: reading the last two may never end."""
-    where = "" if str(path) in subject else f" {path}"
+    where, remedy = "" if str(path) in subject else f" {path}", "check the path"
     try:
         status = os.stat(path)
     except FileNotFoundError as error:
-        found = f"no file{where}" if where else "no such file"
-        raise InputError(subject, found, expected, "check the path") from error
+        raise InputError(subject, f"no file{where}" if where else "no such file", expected, remedy) from error
     except (OSError, ValueError) as error:  # ValueError: a NUL, or half a surrogate pair
         reason = getattr(error, "strerror", None) or "no name of a file"
-        raise InputError(subject, f"{reason}{where}", expected, "check the path") from error
+        raise InputError(subject, f"{reason}{where}", expected, remedy) from error
     if not stat.S_ISREG(status.st_mode):
         kind = "a folder" if stat.S_ISDIR(status.st_mode) else "something that is not a regular file"
-        raise InputError(subject, f"{kind}{where}", expected, "check the path")
+        raise InputError(subject, f"{kind}{where}", expected, remedy)
     if not os.access(path, os.R_OK):
         raise InputError(subject, f"no permission to read it{where}", expected, "ask whoever owns the file")
     return status
 
 
-@contextmanager
-def open_regular(path: Path, subject: str, expected: str = "a regular file") -> Iterator[tuple[BinaryIO, int]]:
-    """Yields an open file and its size. System errors of the body become InputError about ``subject``."""
-    regular_file(path, subject, expected)
-    try:
-        with open(os.open(path, os.O_RDONLY | _NO_WAITING), "rb") as file:
-            yield file, os.fstat(file.fileno()).st_size
-    except OSError as error:
-        raise InputError(subject, error.strerror or str(error), expected) from error
-
-
 def read_regular(path: Path, subject: str, most_bytes: int, expected: str) -> bytes:
     """Reads a whole file of at most ``most_bytes``."""
-    with open_regular(path, subject, expected) as (file, size):
-        if size > most_bytes:
-            raise InputError(subject, f"{size} bytes", f"at most {most_bytes} bytes for {expected}")
-        return file.read(size)
+    if (size := regular_file(path, subject, expected).st_size) > most_bytes:
+        raise InputError(subject, f"{size} bytes", f"at most {most_bytes} bytes for {expected}")
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise InputError(subject, error.strerror or str(error), expected) from error
 
 
 def decoded(data: bytes) -> str:
@@ -76,11 +64,14 @@ def decoded(data: bytes) -> str:
 
 def sha256_of(path: str | Path, given_up: threading.Event | None = None) -> str:
     """Returns the SHA-256 of a file as 64 hexadecimal digits; stops early when ``given_up`` is set."""
-    digest = hashlib.sha256()
-    with open_regular(Path(path), str(path), "a readable file") as (file, left):
-        while left > 0 and not (given_up and given_up.is_set()) and (block := file.read(_BLOCK_BYTES)):
-            digest.update(block[:left])
-            left -= len(block)
+    digest, subject = hashlib.sha256(), str(path)
+    regular_file(Path(path), subject, "a readable file")
+    try:
+        with open(path, "rb") as file:
+            while not (given_up and given_up.is_set()) and (block := file.read(_BLOCK_BYTES)):
+                digest.update(block)
+    except OSError as error:
+        raise InputError(subject, error.strerror or str(error), "a readable file") from error
     return digest.hexdigest()
 
 

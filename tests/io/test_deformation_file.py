@@ -6,7 +6,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-from corpus.hdf5_damage import REMOVED, Change, attribute, on, value
+from damage import Change, attribute, on, removed, value
 
 from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.detector import counts_to_attenuation
@@ -44,7 +44,7 @@ def _folded(file: h5py.File, address: str) -> None:
 
 
 @pytest.mark.parametrize(("name", "damage", "subject", "found"), [
-    ("control", REMOVED, "/control", "nothing there"), ("weights", REMOVED, "/weights", "nothing there"),
+    ("control", removed, "/control", "nothing there"), ("weights", removed, "/weights", "nothing there"),
     ("control", value(np.zeros((2, 3, 4, 5))), "/control", "shape"),
     ("origin", value(np.zeros(2)), "/origin", "shape"),
     ("spacing", value(np.array([4.0, 0.0, 6.0])), "deformation", "spacing_mm"),
@@ -84,7 +84,7 @@ def test_a_scan_holds_states_and_how_they_came_about(tmp_path: Path, make_scan: 
 
 
 @pytest.mark.parametrize(("name", "damage"), [
-    ("states", REMOVED), ("state_times", REMOVED), ("deformation/control", REMOVED),
+    ("states", removed), ("state_times", removed), ("deformation/control", removed),
     ("states", value(np.ones((3, 2, 3, 4)))), ("states", value(np.zeros((2, 2, 3, 4)))),
     ("state_times", value(np.full(2, np.nan))),
 ])  # fmt: skip

@@ -5,7 +5,7 @@ import hashlib
 import h5py
 import numpy as np
 import pytest
-from corpus.hdf5_damage import on, value
+from damage import on, value
 
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Gaussians, Grid
@@ -72,7 +72,6 @@ def test_volumes_that_do_not_fit_are_refused(tmp_path) -> None:
 
 
 VOLUME = "entry/reconstruction/volume"
-# beyond tests/corpus, which damages every object of a volume in every way
 DAMAGE = {
     "other shape": (VOLUME, np.zeros((3, 3, 4))),
     "NaN in it": (VOLUME, np.full(GRID.shape, np.nan)),

@@ -1,4 +1,4 @@
-"""Volumes from files: two layouts, axes and units. What damage leads to: tests/corpus, bare.h5."""
+"""Volumes from files: two layouts, axes and units."""
 
 from pathlib import Path
 

@@ -65,7 +65,7 @@ def import_scan(path: Path, options: ImportOptions) -> Scan:
     if options.row_0 is None:
         text = "%s: row 0 is taken as the lowest, after flips that the file declares; say %s top if the volume is mirrored"
         _log.warning(text, path, options.named("row_0"))
-    integrals = stacks.turned(turn).line_integrals(f"{path}:{detector}/data", options, "bottom", quantity)
+    integrals = stacks.line_integrals(f"{path}:{detector}/data", options, "bottom", quantity, turn)
     parts = integrals, trajectory, geometry, timing, options
     return assemble.assemble_scan(*parts, title=title, source=str(path))
 
@@ -101,15 +101,11 @@ def _turned(source: Hdf5Source, detector: str) -> assemble.Turned:
 
 def _axis_columns(source: Hdf5Source, detector: str, turn: assemble.Turned, options: ImportOptions) -> float:
     """Reads how far the panel's middle is to the right of the axis, in columns: nxtomo counts the axis's from there."""
-    for name in ("x_rotation_axis_pixel_position", "estimated_cor_from_motor"):
-        address = f"{detector}/{name}"
-        if source.find(address) is None:
-            continue
-        column = h5.read_number(source, address)
-        flipped = turn.columns != (options.column_0 == "right")
-        if column != 0:
+    names = (f"{detector}/{name}" for name in ("x_rotation_axis_pixel_position", "estimated_cor_from_motor"))
+    for address in [address for address in names if source.find(address) is not None][:1]:
+        if column := h5.read_number(source, address):
             _log.warning("%s: taken as %g columns from the panel's middle", source.name(address), column)
-        return column if flipped else -column
+        return column if turn.columns != (options.column_0 == "right") else -column
     return 0.0
 
 
@@ -140,11 +136,8 @@ def _refuse_moves(source: Hdf5Source, entry: str, used: np.ndarray) -> None:
     """Refuses a sample that moves between projections, which this import cannot express."""
     for name in _MOVES:
         address = f"{entry}/{schema.SAMPLE}/{name}"
-        if source.find(address) is None:
-            continue
-        if source.dataset(address).size == 1:
+        if source.find(address) is None or source.dataset(address).size == 1:
             continue
         values = h5.read_per_frame(source, address, used, LENGTH)
         if np.ptp(values) > 0:
-            found = f"{values.min():.6g} to {values.max():.6g} mm"
-            raise source.error(address, found, "a sample that stays where it is")
+            raise source.error(address, f"{values.min():.6g} to {values.max():.6g} mm", "a sample that stays where it is")

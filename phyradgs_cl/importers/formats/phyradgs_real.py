@@ -85,15 +85,20 @@ def import_scan(path: Path, options: ImportOptions) -> Scan:
     panel = (frames.shape[1], frames.shape[2])
     common = meta.table("rolling_shutter_geometry")
     source, detector = (Circle.read(common, views, body) for body in ("source", "detector"))
-    timing = _timing(str(description), detector, options)
-    poses = _all_poses(views, source, detector, timing, panel, _pitch(options, str(description)))
+    shutter, start_s = _timing(str(description), detector, options)
+    if (pitch := options.pixel_size_mm) is None:
+        expected, remedy = "a length in mm along v and along u", f"say {options.named('pixel_size_mm')}"
+        raise InputError(f"{description} pixel size", "nothing", expected, remedy)
+    share = np.linspace(0, shutter.span_s / shutter.exposure_s, _TIMES_A_FRAME)
+    poses = np.stack([  # (F, T, 12) of the stored images at T times of every frame's window
+        _view_poses(view, source.at(i, share)[1], detector.at(i, share), detector.centre, panel, pitch)
+        for i, view in enumerate(views)
+    ])  # fmt: skip
     turn = turn_of(poses[0, 0])
-    direction = options.readout_direction or (-1 if turn.rows else 1)
-    shutter = Shutter(timing.shutter.exposure_s, timing.shutter.readout_s, "rows", direction)
-    assumed = () if options.exposure_s is not None else ("exposure",)
-    timing = Timing(shutter, timing.start_s, True, assumed=assumed)
+    shutter = replace(shutter, direction=options.readout_direction or (-1 if turn.rows else 1))
+    timing = Timing(shutter, start_s, True, assumed=() if options.exposure_s is not None else ("exposure",))
     poses = turn.poses(poses, panel)
-    times = timing.start_s[:, None] + np.linspace(0, shutter.span_s, _TIMES_A_FRAME)
+    times = start_s[:, None] + np.linspace(0, shutter.span_s, _TIMES_A_FRAME)
     integrals = line_integrals(
         str(description), turn.frames(frames), _with_flat(str(description), options, frames), convention="counts"
     )
@@ -107,16 +112,15 @@ def _frames_and_views(
     description: Path, views: list[Fields], options: ImportOptions
 ) -> tuple[np.ndarray, list[Fields]]:
     """Reads frames (F, v, u) as stored, and returns their F views: all of the file, or those from ``first_view`` on."""
-    folder = SafeFolder(description.parent)
-    if folder.exists(PROJECTIONS):
-        folder = SafeFolder(folder.root / PROJECTIONS)
+    below = description.parent / PROJECTIONS
+    folder = SafeFolder(below if below.exists() else description.parent)
     paths = folder.matching(*tiff.SUFFIXES)
     if options.first_view is not None:
         paths = series_of(paths, str(folder.root), "complete the frames").paths  # frame i has view first_view + i
         views = views[options.first_view : options.first_view + len(paths)]
     if not paths or len(paths) != len(views):
-        remedy = f"say {options.named('first_view')} if the JSON holds several scans"
         found = f"{len(paths)} TIFF files for {len(views)} views"
+        remedy = f"say {options.named('first_view')} if the JSON holds several scans"
         raise InputError(str(folder.root), found, "one frame per view", remedy)
     frames = tiff.read_tiffs(paths)
     if len(frames) != len(views):
@@ -136,15 +140,8 @@ def _with_flat(subject: str, options: ImportOptions, frames: np.ndarray) -> Impo
     return replace(options, flat_value=brightest)
 
 
-def _pitch(options: ImportOptions, subject: str) -> tuple[float, float]:
-    if options.pixel_size_mm is None:
-        remedy = f"say {options.named('pixel_size_mm')}"
-        raise InputError(f"{subject} pixel size", "nothing", "a length in mm along v and along u", remedy)
-    return options.pixel_size_mm
-
-
-def _timing(subject: str, detector: Circle, options: ImportOptions) -> Timing:
-    """Returns shutter and opening times. Frames whose windows would overlap are moved apart, since each has its own
+def _timing(subject: str, detector: Circle, options: ImportOptions) -> tuple[Shutter, np.ndarray]:
+    """Returns shutter and opening times (F,). Frames whose windows would overlap are moved apart, since each has its own
     poses."""
     exposure_s = synthetic.exposure_of_blurred_s(options)
     first, closed, done = np.unwrap(detector.angle_rad, axis=1).T
@@ -152,19 +149,7 @@ def _timing(subject: str, detector: Circle, options: ImportOptions) -> Timing:
     shutter = Shutter(exposure_s, ratio * exposure_s)
     start_s = synthetic.start_times_s(np.unwrap(first), np.unwrap(first) + closed - first, exposure_s)
     least_s = shutter.span_s * (1 + _GAP)
-    return Timing(shutter, np.concatenate([[0.0], np.cumsum(np.maximum(np.diff(start_s), least_s))]), True)
-
-
-def _all_poses(
-    views: list[Fields], source: Circle, detector: Circle, timing: Timing, panel: tuple[int, int],
-    pitch: tuple[float, float],
-) -> np.ndarray:
-    """Returns poses (F, T, 12) of the stored images at T times of every frame's window."""
-    share = np.linspace(0, timing.shutter.span_s / timing.shutter.exposure_s, _TIMES_A_FRAME)
-    return np.stack([
-        _view_poses(view, source.at(i, share)[1], detector.at(i, share), detector.centre, panel, pitch)
-        for i, view in enumerate(views)
-    ])  # fmt: skip
+    return shutter, np.concatenate([[0.0], np.cumsum(np.maximum(np.diff(start_s), least_s))])
 
 
 def _view_poses(

@@ -37,12 +37,9 @@ def timing_of_marks(subject: Fields, marks_rad: np.ndarray, options: ImportOptio
     """Returns the timing from angles (F, 3): first line's start and end, last line's end. The first stored line is read
     first: column 0, or the top row in a readout along rows."""
     exposure_s = exposure_of_blurred_s(options)
-    ratio = readout_ratio(
-        subject.subject, marks_rad[:, 1] - marks_rad[:, 0], marks_rad[:, 2] - marks_rad[:, 1]
-    )
+    ratio = readout_ratio(subject.subject, marks_rad[:, 1] - marks_rad[:, 0], marks_rad[:, 2] - marks_rad[:, 1])
     axis = options.readout_axis or "columns"
-    convention = 1 if axis == "columns" else -1
-    direction = convention if options.readout_direction is None else options.readout_direction
+    direction = options.readout_direction or (1 if axis == "columns" else -1)
     unstated = {"exposure": options.exposure_s, "axis": options.readout_axis, "first": options.readout_direction}
     assumed = tuple(name for name, value in unstated.items() if value is None)
     start_s = start_times_s(marks_rad[:, 0], marks_rad[:, 1], exposure_s)

@@ -14,7 +14,7 @@ from phyradgs_cl.fields import Grid, triple
 from phyradgs_cl.importers.assemble import Timing, assemble_scan, make_timing, turning
 from phyradgs_cl.importers.options import TIMING, ImportOptions
 from phyradgs_cl.importers.reading.files import SafeFolder, read_json, read_npy
-from phyradgs_cl.importers.reading.frames import LineIntegrals, line_integrals, oriented
+from phyradgs_cl.importers.reading.frames import line_integrals, oriented
 from phyradgs_cl.io.scan import BEAMS
 from phyradgs_cl.io.tables import Fields
 
@@ -46,43 +46,27 @@ class R2Folder:
         """Reads one projection (v, u) as stored."""
         name = entry.word("file_path")
         first_copy = name.replace("_sim1", "")  # of a repeated simulation, whose first copy was kept
-        if (self.folder.root / first_copy).exists():
-            name = first_copy
-        image = read_npy(self.folder.file(name, entry.name("file_path")), 2)
-        checks.shape(str(self.folder.root / name), image, self.geometry.detector_shape)
+        path = self.folder.file(first_copy if self.folder.exists(first_copy) else name, entry.name("file_path"))
+        image = read_npy(path, 2)
+        checks.shape(str(path), image, self.geometry.detector_shape)
         return image
-
-    def projections(self, entries: list[Fields], options: ImportOptions) -> LineIntegrals:
-        """Reads the line integrals of the listed frames, row 0 the lowest."""
-        names = [entry.word("file_path") for entry in entries]
-        if len(set(names)) < len(names):  # a short list must not ask for more memory than its files hold
-            at = next(i for i, name in enumerate(names) if name in names[:i])
-            raise InputError(entries[at].name("file_path"), f"{names[at]!r} again", "every frame once")
-        first = self.frame(entries[0])
-        frames = np.empty((len(entries), *first.shape), first.dtype)
-        for index, entry in enumerate(entries):
-            frames[index] = self.frame(entry)
-        oriented_frames = oriented(frames, options, ROW_0)
-        return line_integrals(str(self.folder.root), oriented_frames, options, convention="attenuation")
-
-    def reference(self) -> tuple[Grid, np.ndarray | None]:
-        """Reads the grid, and the true volume in 1/mm where the folder has it."""
-        grid = read_grid(self.meta.table("scanner"), self.unit_mm)
-        if not self.meta.has("vol"):
-            return grid, None
-        path = self.folder.file(self.meta.word("vol"), self.meta.name("vol"))
-        return grid, turned_volume(str(path), read_npy(path, 3), grid, 1 / self.unit_mm)
 
     def scan(
         self, path: Path, entries: list[Fields], orbit: CircularOrbit, timing: Timing, options: ImportOptions
     ) -> Scan:
-        """Returns the scan of the listed frames along ``orbit``, with the truth."""
-        grid, reference = self.reference()
-        integrals, title = self.projections(entries, options), path.resolve().name
-        return assemble_scan(
-            integrals, orbit, self.geometry, timing, options, title=title, source=str(path), grid=grid,
-            reference=reference,
-        )
+        """Returns the scan of the listed frames along ``orbit``, with the truth in 1/mm where the folder has it."""
+        grid, reference = read_grid(self.meta.table("scanner"), self.unit_mm), None
+        if self.meta.has("vol"):
+            truth = self.folder.file(self.meta.word("vol"), self.meta.name("vol"))
+            reference = turned_volume(str(truth), read_npy(truth, 3), grid, 1 / self.unit_mm)
+        names = [entry.word("file_path") for entry in entries]
+        if twice := [i for i, name in enumerate(names) if name in names[:i]]:
+            raise InputError(entries[twice[0]].name("file_path"), f"{names[twice[0]]!r} again", "every frame once")
+        frames = oriented(np.stack([self.frame(entry) for entry in entries]), options, ROW_0)
+        integrals = line_integrals(str(self.folder.root), frames, options, convention="attenuation")
+        parts = integrals, orbit, self.geometry, timing, options
+        title = path.resolve().name
+        return assemble_scan(*parts, title=title, source=str(path), grid=grid, reference=reference)
 
 
 def entries_of(meta: Fields, prefix: str, part: str) -> list[Fields]:
@@ -111,21 +95,16 @@ def import_scan(path: Path, options: ImportOptions) -> Scan:
 def read_geometry(scanner: Fields, unit_mm: float) -> Geometry:
     """Reads the beam of a scanner's table, lengths in ``unit_mm``; "Detector" values run [v, u], ``offDetector`` [u, v].
     TIGRE does not use the distances of mode "parallel"."""
-    is_parallel = scanner.word("mode", BEAMS, default="cone") == "parallel"
-    distances_mm = () if is_parallel else _distances_mm(scanner, unit_mm)
     rows, columns = scanner.counts("nDetector", 2)
     pitch_v, pitch_u = (float(p * unit_mm) for p in _pitches(scanner, "Detector", (rows, columns)))
     offset_u, offset_v = (float(o * unit_mm) for o in _offset(scanner, "offDetector", 2))
     sides = (rows, columns), (pitch_v, pitch_u), (offset_v, offset_u)
-    return ConeGeometry(distances_mm[0], distances_mm[1], *sides) if distances_mm else ParallelGeometry(*sides)
-
-
-def _distances_mm(scanner: Fields, unit_mm: float) -> tuple[float, float]:
-    """Reads the distances from the source to the axis and to the detector."""
+    if scanner.word("mode", BEAMS, default="cone") == "parallel":
+        return ParallelGeometry(*sides)
     to_axis, to_detector = scanner.length("DSO"), scanner.length("DSD")
     if to_detector <= to_axis:
         raise scanner.error("DSD", f"{to_detector:g}", f"more than DSO ({to_axis:g})")
-    return to_axis * unit_mm, to_detector * unit_mm
+    return ConeGeometry(to_axis * unit_mm, to_detector * unit_mm, *sides)
 
 
 def read_grid(scanner: Fields, unit_mm: float) -> Grid:
@@ -158,7 +137,6 @@ def turned_volume(subject: str, volume: np.ndarray, grid: Grid, per_mm: float) -
     checks.shape(subject, volume, grid.shape[::-1])
     checks.finite(subject, volume)
     turned = np.transpose(volume, (2, 1, 0)).astype(np.float64) * per_mm
-    largest = float(np.abs(turned).max())
-    if largest > float(np.finfo(np.float32).max):
+    if (largest := float(np.abs(turned).max())) > float(np.finfo(np.float32).max):
         raise InputError(subject, f"a density of {largest:.3g} 1/mm", "one that float32 holds", "check the file")
     return np.ascontiguousarray(turned, np.float32)

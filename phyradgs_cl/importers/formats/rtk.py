@@ -1,11 +1,8 @@
 """Scans of RTK: a geometry file (RTKThreeDCircularGeometry, version 3) and a stack of projections as MetaImage. The geometry
 has nine numbers per projection. A SourceToDetectorDistance of 0 is a parallel beam, in which RTK ignores source distance and
-source offsets; its writer leaves out numbers that are 0 everywhere. XML entities and external files are refused: of DOCTYPEs
-only the empty one of RTK's own files passes."""
+source offsets; its writer leaves out numbers that are 0 everywhere. The parser opens no file that the XML names."""
 
 import logging
-import math
-import re
 from dataclasses import dataclass
 from pathlib import Path
 from xml.etree import ElementTree
@@ -22,6 +19,7 @@ from phyradgs_cl.importers.options import TIMING, ImportOptions
 from phyradgs_cl.importers.reading.files import SafeFolder, read_bytes
 from phyradgs_cl.importers.reading.frames import line_integrals
 from phyradgs_cl.importers.reading.images import STACKS, read_image
+from phyradgs_cl.importers.reading.settings import Settings
 from phyradgs_cl.importers.stage import along
 
 _log = logging.getLogger(__name__)
@@ -35,8 +33,6 @@ NAMES = (
 _TO_AXIS, _TO_DETECTOR, _ANGLE = NAMES[:3]
 _ANGLES = ("GantryAngle", "InPlaneAngle", "OutOfPlaneAngle")
 _RADIUS = "RadiusCylindricalDetector"
-_DECLARATIONS = re.compile(rb"<!DOCTYPE[^>]*(SYSTEM|PUBLIC|\[)")
-_LARGEST = 1e9
 _RAW, _ORA = (".his", ".hnd", ".hnc", ".xim"), ".ora.xml"  # what rtk_projections reads
 XIM_BELOW = "Acquisitions/*/*.xim"
 """Where Varian's TrueBeam puts projections, below its Scan.xml."""
@@ -60,7 +56,7 @@ def recognises(path: Path) -> bool:
     folder = SafeFolder(path if path.is_dir() else path.parent)
     if path.is_file() and path.suffix.lower() not in STACKS:
         is_xml = path.suffix.lower() == ".xml" and not path.name.lower().endswith(_ORA)
-        return is_xml and not folder.matching(*_RAW) and not folder.glob(XIM_BELOW)
+        return is_xml and not folder.matching(*_RAW) and not any(folder.root.glob(XIM_BELOW))
     descriptions = [file for file in folder.matching(".xml") if not file.name.lower().endswith(_ORA)]
     return bool(descriptions and folder.matching(*STACKS))
 
@@ -105,8 +101,7 @@ def stack_of(
     unless its third axis, the frames, is perpendicular to the others."""
     steps_mm = direction * spacing_mm  # columns: along u, v and the frames
     if np.abs([*steps_mm[:2, 2], *steps_mm[2, :2]]).max() > 1e-9 * np.abs(steps_mm).max():
-        found = str(steps_mm.tolist())[:80]
-        raise InputError(subject, found, "axes of a stack: columns, rows, frames")
+        raise InputError(subject, str(steps_mm.tolist())[:80], "axes of a stack: columns, rows, frames")
     return Stack(frames, np.array(origin_mm[:2]), steps_mm[:2, 0], steps_mm[:2, 1])
 
 
@@ -161,10 +156,10 @@ class RtkGeometry:
     ) -> np.ndarray:
         """Returns poses (T, 12) at frame positions (T,), linear between and beyond frames. ``origin_mm`` (2,): place (u, v)
         of pixel (0, 0) in the image's plane; ``step_u``, ``step_v`` (2,): from column to column and row to row."""
-        at = {
-            name: along(np.unwrap(v) if name in _ANGLES else v, position) for name, v in self.values.items()
-        }
-        turn = _rotations(at)
+        at = {name: along(np.unwrap(v) if name in _ANGLES else v, position) for name, v in self.values.items()}
+        # from the gantry's to RTK's fixed frame: the inverse of Rz(−in plane) Rx(−out of plane) Ry(−gantry)
+        angles_rad = np.stack([at[name] for name in ("GantryAngle", "OutOfPlaneAngle", "InPlaneAngle")], -1)
+        turn = Rotation.from_euler("YXZ", angles_rad).as_matrix()
         zero = np.zeros(position.shape)
         offsets = [at["SourceOffsetX"], at["SourceOffsetY"], at[_TO_AXIS]]
         to_detector = at[_TO_AXIS] - at[_TO_DETECTOR]
@@ -173,11 +168,8 @@ class RtkGeometry:
         shift = np.stack([at["ProjectionOffsetX"], at["ProjectionOffsetY"], to_detector], -1)
         first = shift + np.array([*origin_mm, 0.0])
         steps = [np.broadcast_to([*step, 0.0], first.shape) for step in (step_u, step_v)]
-        parts = [
-            np.einsum("tij,tj->ti", turn, part) @ _TO_WORLD.T
-            for part in (np.stack(offsets, -1), first, *steps)
-        ]
-        return np.concatenate(parts, -1)
+        parts = (np.stack(offsets, -1), first, *steps)
+        return np.concatenate([np.einsum("tij,tj->ti", turn, part) @ _TO_WORLD.T for part in parts], -1)
 
 
 def read_rtk_xml(path: Path) -> RtkGeometry:
@@ -191,63 +183,35 @@ def read_rtk_xml(path: Path) -> RtkGeometry:
     is_parallel = not any(stored[_TO_DETECTOR])
     for name in (_ANGLE,) if is_parallel else (_ANGLE, _TO_AXIS, _TO_DETECTOR):
         if None in stored[name]:
-            found = f"no {name} for projection {stored[name].index(None)}"
-            raise InputError(str(path), found, "one, in the projection or above all of them")
+            where = f"no {name} for projection {stored[name].index(None)}"
+            raise InputError(str(path), where, "one, in the projection or above all of them")
     columns = {name: np.array([0.0 if value is None else value for value in column]) for name, column in stored.items()}
     columns |= {name: np.deg2rad(columns[name]) for name in _ANGLES}
-    if is_parallel:
-        if None in stored[_TO_DETECTOR]:
-            _log.warning("%s: no %s, which RTK takes for 0: a parallel beam", path, _TO_DETECTOR)
-        return RtkGeometry(columns)
-    for name in (_TO_AXIS, _TO_DETECTOR):
+    if is_parallel and None in stored[_TO_DETECTOR]:
+        _log.warning("%s: no %s, which RTK takes for 0: a parallel beam", path, _TO_DETECTOR)
+    for name in () if is_parallel else (_TO_AXIS, _TO_DETECTOR):
         if columns[name].min() <= 0:
             expected = "a length above 0" + (", or 0 in all projections" if name == _TO_DETECTOR else "")
             raise InputError(f"{path} {name}", f"{columns[name].min():g}", expected)
-    if np.any(columns[_TO_DETECTOR] <= columns[_TO_AXIS]):
-        expected = "more than SourceToIsocenterDistance"
-        raise InputError(f"{path} {_TO_DETECTOR}", f"{columns[_TO_DETECTOR].min():g}", expected)
+    if not is_parallel and np.any(columns[_TO_DETECTOR] <= columns[_TO_AXIS]):
+        raise InputError(f"{path} {_TO_DETECTOR}", f"{columns[_TO_DETECTOR].min():g}", f"more than {_TO_AXIS}")
     return RtkGeometry(columns)
 
 
-def _rotations(at: dict[str, np.ndarray]) -> np.ndarray:
-    """Returns (T, 3, 3) from the gantry's to RTK's fixed frame: the inverse of Rz(−in plane) Rx(−out of plane)
-    Ry(−gantry)."""
-    angles_rad = np.stack([at[name] for name in ("GantryAngle", "OutOfPlaneAngle", "InPlaneAngle")], -1)
-    return Rotation.from_euler("YXZ", angles_rad).as_matrix()
-
-
 def _root(path: Path) -> ElementTree.Element:
-    data, subject = read_bytes(path), str(path)
-    if _DECLARATIONS.search(data):
-        expected, remedy = "plain elements", "nothing outside of the file is read"
-        raise InputError(subject, "a DOCTYPE with declarations or an external file", expected, remedy)
     try:
-        root = ElementTree.fromstring(data)
-    except ElementTree.ParseError as error:
-        raise InputError(subject, f"XML that is not well formed ({error})", f"a {ROOT}") from error
-    except (ValueError, LookupError) as error:  # an unknown encoding
-        raise InputError(subject, f"XML that cannot be read ({error})", f"a {ROOT}") from error
-    if root.tag != ROOT:
-        raise InputError(subject, f"a root element {root.tag[:60]!r}", ROOT)
-    if (version := root.get("version", "3")) != "3":
-        raise InputError(subject, f"version {version[:20]!r}", "version 3")
+        root = ElementTree.fromstring(read_bytes(path))
+    except (ElementTree.ParseError, ValueError, LookupError) as error:  # the latter for an unknown encoding
+        raise InputError(str(path), f"XML that is not well formed ({error})", f"a {ROOT}") from error
+    if root.tag != ROOT or root.get("version", "3") != "3":
+        found = f"a root element {root.tag[:60]!r}, version {root.get('version', '3')[:20]}"
+        raise InputError(str(path), found, f"{ROOT}, version 3")
     return root
 
 
 def _numbers(path: Path, parent: ElementTree.Element) -> dict[str, float]:
     """Returns the numbers directly inside an element by their names. InputError for a curved panel."""
-    values = {e.tag: _number(f"{path} {e.tag}", e.text) for e in parent if e.tag in (*NAMES, _RADIUS)}
-    if radius := values.pop(_RADIUS, 0.0):
-        raise InputError(f"{path} {_RADIUS}", f"{radius:g}", "a flat panel")
-    return values
-
-
-def _number(subject: str, text: str | None) -> float:
-    text = (text or "").strip()
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not abs(value) <= _LARGEST:
-        raise InputError(subject, repr(text[:40]), "a finite number")
-    return value
+    texts = Settings(f"{path}:", {e.tag: e.text or "" for e in parent})
+    if radius := texts.position(_RADIUS):
+        raise texts.error(_RADIUS, f"{radius:g}", "a flat panel")
+    return {name: texts.position(name) for name in NAMES if texts.has(name)}

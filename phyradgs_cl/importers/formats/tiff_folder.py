@@ -11,14 +11,7 @@ from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.acquisition.readout import frame_time_of, readout_of
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.importers import hdf5
-from phyradgs_cl.importers.assemble import (
-    StoredTiming,
-    assemble_scan,
-    make_timing,
-    names_in_file,
-    turning,
-    with_options,
-)
+from phyradgs_cl.importers.assemble import StoredTiming, assemble_scan, make_timing, turning, with_options
 from phyradgs_cl.importers.options import FIELDS, OF_BARE_FRAMES, WORDS, ImportOptions
 from phyradgs_cl.importers.reading import tiff
 from phyradgs_cl.importers.reading.files import SafeFolder, checked_name
@@ -62,43 +55,31 @@ def import_scan(path: Path, options: ImportOptions) -> Scan:
     tables = _tables(description)
     options = in_words_of_file(options)
     combined = _with_file(options, tables)
-    files, series = {}, None
     stored = _in_hdf5(folder, tables["frames"], options)
     if stored is None:
         files = {name: _files(folder, tables["frames"], name) for name in ("flats", "darks", "mask")}
         series = _projections(folder, tables, options, {path for paths in files.values() for path in paths})
         frames, rows, columns = tiff.stack_shape(series.paths)
+        used, said = np.ones(frames, bool), series.said
     else:
-        frames, rows, columns = stored.projections.shape
-    used = np.ones(frames, bool) if stored is None else stored.used
+        (frames, rows, columns), used, said = stored.projections.shape, stored.used, ""
     scanner = _scanner(description, tables[""], (rows, columns), options)
     geometry = with_options(options, scanner.geometry)
-    timing = make_timing(str(description), frames, options, _stored_timing(tables, scanner, options))
-    sign = gantry_sign(combined, "gantry")
-    angle_rad = sign * options.angle_rad(frames, lambda: _angles_rad(folder, tables["angles"], used, options))
-    if series is None:
-        assert stored is not None
-        integrals = stored.line_integrals(str(description), combined, "top")
+    timing = make_timing(str(description), frames, options, _stored_timing(tables, scanner))
+    angle_rad = options.angle_rad(frames, lambda: _angles_rad(folder, tables["angles"], used, options))
+    if stored is None:
+        integrals = _line_integrals(files, series, combined, tables["frames"], str(description))
     else:
-        stacks = {name: tiff.read_tiffs(paths) for name, paths in {"projections": series.paths, **files}.items() if paths}
-        integrals = _line_integrals(stacks, files, series, combined, tables["frames"], str(description))
+        integrals = stored.line_integrals(str(description), combined, "top")
+    readout_key = ("readout", "readout_ms") if tables["readout"].has("readout_ms") else ("timing", "readout_s")
+    keys = {"exposure_s": ("timing", "exposure_s"), "readout_s": readout_key}
+    names = {field: tables[table].name(key) for field, (table, key) in keys.items() if tables[table].has(key)}
     return assemble_scan(
-        integrals, turning(geometry, angle_rad, timing), geometry, timing, combined,
-        title=tables[""].word("title", default=folder.root.resolve().name), source=str(path),
-        said=series.said if series else "",
-        grid=scanner.grid if tables[""].has("volume") else None, lag=scanner.lag, names=_subjects(tables, options),
+        integrals, turning(geometry, gantry_sign(combined, "gantry") * angle_rad, timing), geometry, timing, combined,
+        title=tables[""].word("title", default=folder.root.resolve().name), source=str(path), said=said,
+        grid=scanner.grid if tables[""].has("volume") else None, lag=scanner.lag,
+        names={"grid": tables[""].name("[volume]"), "angles": tables["angles"].subject, **names},
     )
-
-
-def _subjects(tables: dict[str, Fields], options: ImportOptions) -> dict[str, str]:
-    """Returns the names in messages of the values that the file states and no option replaces."""
-    keys = {"exposure_s": ("timing", "exposure_s"), "readout_s": ("timing", "readout_s")}
-    if tables["readout"].has("readout_ms"):
-        keys["readout_s"] = ("readout", "readout_ms")
-    stated = {field: tables[table].name(key) for field, (table, key) in keys.items() if tables[table].has(key)}
-    return {
-        "grid": tables[""].name("[volume]"), "angles": tables["angles"].subject, **names_in_file(options, stated)
-    }
 
 
 def _tables(path: Path) -> dict[str, Fields]:
@@ -117,22 +98,20 @@ def _tables(path: Path) -> dict[str, Fields]:
 def in_words_of_file(options: ImportOptions) -> ImportOptions:
     """Returns the options with messages that name keys of the TOML for values not given as options."""
     given = options.given(FIELDS)
-
-    def named(field: str) -> str:
-        return options.named(field) if field in given else _KEYS.get(field) or options.named(field)
-
-    return replace(options, named=named)
+    return replace(
+        options, named=lambda field: (None if field in given else _KEYS.get(field)) or options.named(field)
+    )
 
 
 def _with_file(options: ImportOptions, tables: dict[str, Fields]) -> ImportOptions:
     """Returns the options, completed by values of the file with the same names."""
     frames = tables["frames"]
-    table_of = {"quantity": frames, "row_0": frames, "column_0": frames}
-    table_of |= {"rotates": tables["angles"], "detector_model": tables["timing"]}
-    combined: dict[str, Any] = {k: t.word(k, WORDS[k]) for k, t in table_of.items() if t.has(k)}
+    table_of = {**dict.fromkeys(("quantity", "row_0", "column_0"), frames), "rotates": tables["angles"]}
+    table_of["detector_model"] = tables["timing"]
+    combined: dict[str, Any] = {key: table.word(key, WORDS[key]) for key, table in table_of.items() if table.has(key)}
     if frames.has("flat_value"):
         combined["flat_value"] = frames.length("flat_value")
-    return replace(options, **{k: v for k, v in combined.items() if not getattr(options, k)})
+    return replace(options, **{key: value for key, value in combined.items() if not getattr(options, key)})
 
 
 def _in_hdf5(folder: SafeFolder, frames: Fields, options: ImportOptions) -> hdf5.Stacks | None:
@@ -158,19 +137,24 @@ def _projections(folder: SafeFolder, tables: dict[str, Fields], options: ImportO
 
 
 def _line_integrals(
-    stacks: dict[str, np.ndarray], files: dict[str, list[Path]], series: Series, combined: ImportOptions, frames: Fields,
-    subject: str,
+    files: dict[str, list[Path]], series: Series, combined: ImportOptions, frames: Fields, subject: str
 ) -> LineIntegrals:
-    turned = {name: oriented(stack, combined, "top") for name, stack in stacks.items()}
-    stack, at = turned["projections"], None
-    if len(stacks.get("flats", ())) == len(files["flats"]) and len(stack) == len(series.paths):
-        at = flat_places(files["flats"], files["darks"], series)
-    names = {name: [path.name for path in paths] for name, paths in files.items() if len(paths) == len(stacks.get(name, ()))}
-    flats, darks = turned.get("flats"), turned.get("darks")
+    turned = {
+        name: oriented(tiff.read_tiffs(paths), combined, "top")
+        for name, paths in {"projections": series.paths, **files}.items() if paths
+    }  # fmt: skip
+    stack, flats, darks, mask = (turned.get(name) for name in ("projections", "flats", "darks", "mask"))
+    assert stack is not None
+    names = {name: [path.name for path in paths] for name, paths in files.items() if len(paths) == len(turned.get(name, ()))}
+    is_one_a_file = "flats" in names and len(stack) == len(series.paths)
+    at = flat_places(files["flats"], files["darks"], series) if is_one_a_file else None
     integrals = line_integrals(subject, stack, combined, flats=flats, darks=darks, flats_at=at, names=names)
-    if "mask" not in turned:
+    if mask is None:
         return integrals
-    return replace(integrals, mask=united(integrals.mask, _mask(turned["mask"], stack.shape, frames.name("mask"))))
+    if mask.shape not in (stack.shape, (1, *stack.shape[1:])):
+        expected = f"one image of {stack.shape[1:]}, or one per frame"
+        raise frames.error("mask", f"shape {mask.shape}", expected)
+    return replace(integrals, mask=united(integrals.mask, (mask if mask.shape == stack.shape else mask[0]) != 0))
 
 
 def _files(folder: SafeFolder, frames: Fields, name: str, default: str = "") -> list[Path]:
@@ -191,19 +175,17 @@ def _files(folder: SafeFolder, frames: Fields, name: str, default: str = "") -> 
 
 def _scanner(path: Path, scanner: Fields, panel: tuple[int, int], options: ImportOptions) -> Scanner:
     """Returns the described scanner, whose panel has as many pixels as the images. Options come before its lengths."""
-    content = dict(scanner.values)
-    pitch = zip(("pixel_size_v_mm", "pixel_size_u_mm"), options.pixel_size_mm or (None, None), strict=True)
-    lengths: dict[str, dict[str, float | None]] = {
+    content = {name: dict(value) if isinstance(value, dict) else value for name, value in scanner.values.items()}
+    source, detector = content.setdefault("source", {}), content.setdefault("detector", {})
+    given: dict[str, dict[str, float | None]] = {
         "source": {"to_axis_mm": options.source_to_axis_mm, "to_detector_mm": options.source_to_detector_mm},
-        "detector": dict(pitch),
+        "detector": dict(zip(("pixel_size_v_mm", "pixel_size_u_mm"), options.pixel_size_mm or (), strict=False)),
     }
-    if not isinstance(content.get("source", {}), dict) or content.get("source", {}).get("beam") == "parallel":
-        del lengths["source"]  # a parallel beam refuses distances
-    stated = scanner.table("detector").values if scanner.has("detector") else {}
-    content["detector"] = {"rows": panel[0], "columns": panel[1], **stated}
-    for name, values in lengths.items():
-        given = {key: value for key, value in values.items() if value is not None}
-        content[name] = {**dict(content.get(name, {})), **given}
+    for table, values in ((source, given["source"]), (detector, given["detector"])):
+        if isinstance(table, dict) and table.get("beam") != "parallel":  # a parallel beam refuses distances
+            table.update({key: value for key, value in values.items() if value is not None})
+    if isinstance(detector, dict):
+        content["detector"] = {"rows": panel[0], "columns": panel[1], **detector}
     described = scanner_from(path, content)
     if described.geometry.detector_shape != panel:
         found = f"{described.geometry.detector_shape} rows and columns"
@@ -211,10 +193,11 @@ def _scanner(path: Path, scanner: Fields, panel: tuple[int, int], options: Impor
     return described
 
 
-def _stored_timing(tables: dict[str, Fields], scanner: Scanner, options: ImportOptions) -> StoredTiming:
+def _stored_timing(tables: dict[str, Fields], scanner: Scanner) -> StoredTiming:
     timing, angles, readout = tables["timing"], tables["angles"], tables["readout"]
-    names = ("exposure_s", "readout_s")
-    exposure_s, readout_s = (timing.number(name, lowest=0.0) if timing.has(name) else None for name in names)
+    exposure_s, readout_s = (
+        timing.number(name, lowest=0.0) if timing.has(name) else None for name in ("exposure_s", "readout_s")
+    )
 
     def named(field: str) -> str:
         return _KEYS[field] if field in OWN_TABLES["timing"] else readout.name(field)
@@ -224,17 +207,15 @@ def _stored_timing(tables: dict[str, Fields], scanner: Scanner, options: ImportO
         readout_s = scanner.readout_ratio * exposure_s
     frame_time_s = frame_time_of(scanner.fps, timing.length("frame_time_s") if timing.has("frame_time_s") else None, named)
     if scanner.fps is not None and timing.has("start_s"):
-        found = f"{scanner.fps:g} with [timing] start_s"
-        raise readout.error("fps", found, "one of the two", "leave fps out")
-    written = [timing.name(key) for key in names if timing.has(key)]
-    written += [readout.name("readout_ms")] if readout.has("readout_ms") else []
+        raise readout.error("fps", f"{scanner.fps:g} with [timing] start_s", "one of the two", "leave fps out")
+    stated = ((timing, "exposure_s"), (timing, "readout_s"), (readout, "readout_ms"), (angles, "at"))
     return StoredTiming(
         exposure_s=exposure_s, readout_s=readout_s, frame_time_s=frame_time_s,
         start_s=timing.numbers("start_s") if timing.has("start_s") else None,
         axis=scanner.readout_axis if readout.has("first") or readout.has("axis") else None,
         direction=scanner.readout_direction if readout.has("first") or readout.has("direction") else None,
         pulse=scanner.pulse, angle_at=angles.word("at", WORDS["angle_at"]) if angles.has("at") else None,
-        written=(*written, *([angles.name("at")] if angles.has("at") else [])),
+        written=tuple(table.name(key) for table, key in stated if table.has(key)),
     )
 
 
@@ -258,11 +239,3 @@ def _angles_rad(folder: SafeFolder, angles: Fields, used: np.ndarray, options: I
     if angles.has("step_deg"):
         return np.deg2rad(first + np.arange(frames) * angles.number("step_deg"))
     return np.deg2rad(np.linspace(first, angles.number("last_deg"), frames))
-
-
-def _mask(stack: np.ndarray, shape: tuple[int, ...], subject: str) -> np.ndarray:
-    if stack.shape == (1, *shape[1:]):
-        return stack[0] != 0
-    if stack.shape != shape:
-        raise InputError(subject, f"shape {stack.shape}", f"one image of {shape[1:]}, or one per frame")
-    return stack != 0

@@ -4,7 +4,6 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
-from itertools import islice
 from pathlib import Path, PurePosixPath, PureWindowsPath
 
 import numpy as np
@@ -13,23 +12,20 @@ from phyradgs_cl.errors import InputError
 from phyradgs_cl.io.files import HOST_SHARE, decoded, host_bytes, read_regular, regular_file
 from phyradgs_cl.io.tables import read_facts
 
-MOST_TEXT_BYTES = 64 << 20
-_MOST_FILES = 200_000
-_LONGEST_NAME = 4096
+_MOST_TEXT_BYTES = 64 << 20
 
 
 def check_room(subject: str, needed_bytes: int) -> None:
     """Raises InputError for more than ``HOST_SHARE`` of this machine's memory."""
-    most_bytes = HOST_SHARE * host_bytes()
-    if needed_bytes > most_bytes:
-        found, expected = (f"{n / 2**30:.3g} GiB" for n in (needed_bytes, most_bytes))
+    found, most = (f"{n / 2**30:.3g} GiB" for n in (needed_bytes, HOST_SHARE * host_bytes()))
+    if needed_bytes > HOST_SHARE * host_bytes():
         remedy = "import fewer frames at a time, or bin them"
-        raise InputError(subject, f"{found} to unpack", f"at most {expected} on this machine", remedy)
+        raise InputError(subject, f"{found} to unpack", f"at most {most} on this machine", remedy)
 
 
 def read_bytes(path: Path) -> bytes:
     """Reads a whole file of at most 64 MiB."""
-    return read_regular(path, str(path), MOST_TEXT_BYTES, "a description of a scan")
+    return read_regular(path, str(path), _MOST_TEXT_BYTES, "a description of a scan")
 
 
 def read_text(path: Path) -> str:
@@ -79,15 +75,12 @@ class SafeFolder:
         return (self.root / name).exists()
 
     def glob(self, pattern: str, *suffixes: str) -> list[Path]:
-        """Returns the files that match a pattern below the folder in any case, in natural order of their names. With
-        ``suffixes`` of images, names that end otherwise, and hidden ones, are left out."""
-        folder, name = (self.root / pattern).parent, PurePosixPath(pattern).name
-        if "*" in str(folder.relative_to(self.root)):
-            return in_natural_order([path for path in self.root.glob(pattern) if path.is_file()])
-        files = _files(folder) if folder.is_dir() else []
-        paths = [path for path in files if fnmatchcase(path.name.lower(), name.lower())]
-        is_plain = not set(name) & set("*?[")
-        return [path for path in paths if is_plain or not suffixes or _is_one_of(path, suffixes)]
+        """Returns the files that match a pattern of a folder in any case, in natural order of their names. With ``suffixes``
+        of images, names that end otherwise, and hidden ones, are left out, unless the pattern is a name."""
+        name = PurePosixPath(pattern).name.lower()
+        paths = [path for path in _files((self.root / pattern).parent) if fnmatchcase(path.name.lower(), name)]
+        is_plain = not suffixes or not set(name) & set("*?[")
+        return [path for path in paths if is_plain or _is_one_of(path, suffixes)]
 
     def matching(self, *suffixes: str) -> list[Path]:
         """Returns the files with one of the suffixes in any case, without hidden ones, in natural order of their names."""
@@ -105,9 +98,7 @@ class SafeFolder:
 
 def _files(folder: Path) -> list[Path]:
     """Returns the regular files of a folder, and links that lead nowhere, in natural order of their names."""
-    paths = list(islice(folder.iterdir(), _MOST_FILES + 1))
-    if len(paths) > _MOST_FILES:
-        raise InputError(str(folder), f"more than {_MOST_FILES} files", "a folder with one scan")
+    paths = folder.iterdir() if folder.is_dir() else ()
     return in_natural_order([path for path in paths if path.is_file() or (path.is_symlink() and not path.exists())])
 
 
@@ -117,20 +108,14 @@ def _is_one_of(path: Path, suffixes: tuple[str, ...]) -> bool:
 
 def checked_name(name: object, subject: str) -> str:
     """Returns a relative path without "..", with forward slashes; InputError for any other."""
-    if not isinstance(name, str) or not name.strip() or len(name) > _LONGEST_NAME or "\0" in name:
-        raise InputError(subject, repr(name)[:80], "the name of a file in the same folder")
-    text = name.replace("\\", "/")
-    if PureWindowsPath(name).drive or text.startswith("/") or ".." in PurePosixPath(text).parts:
-        expected = "a name inside the folder"
-        raise InputError(subject, repr(name)[:80], expected, "copy the file into the folder")
+    text = name.replace("\\", "/") if isinstance(name, str) else ""
+    leads_out = PureWindowsPath(text).drive or text.startswith("/") or ".." in PurePosixPath(text).parts
+    if not text.strip() or "\0" in text or leads_out:
+        raise InputError(subject, repr(name)[:80], "a name inside the folder", "copy the file into the folder")
     return text
 
 
 def in_natural_order(paths: Sequence[Path]) -> list[Path]:
     """Returns the paths sorted by name, numbers by value: 2.tif before 10.tif."""
-    return sorted(paths, key=lambda path: _natural(path.name))
-
-
-def _natural(name: str) -> list[tuple[int, int, str]]:
-    parts = re.split(r"(\d{1,18})", name)
-    return [(0, int(p), "") if p.isdecimal() and p.isascii() else (1, 0, p) for p in parts if p]
+    parts = {path: re.split(r"(\d+)", path.name) for path in paths}  # text and number by turns
+    return sorted(paths, key=lambda path: [int(part) if i % 2 else part for i, part in enumerate(parts[path])])

@@ -46,7 +46,7 @@ def light_of(
     the others are named and left out. ``at`` (n,): places of the flats as of ``places``, None where nothing states them;
     ``names``: of single "flats" and "darks" in messages. InputError for the option flats "time" with flats of one time."""
     at, assumed = _times(subject, len(flats), count, options, at)
-    light = max(float(np.median(_levels(_some(flats)))), 1e-30)
+    light = max(float(np.median(_levels(flats)[1])), 1e-30)
     times = [np.flatnonzero(at == time) for time in np.unique(at)]
     said_by = (subject, light, names or {})
     times = [group[_fitting("flats", flats, group, _TOGETHER, *said_by)] for group in times]
@@ -81,21 +81,15 @@ def _times(
     if flats < 2 or (at is not None and np.ptp(at) == 0):
         found = f"{flats} of one time in {subject}"
         raise InputError(options.named("flats"), found, "flats of several times", "take their median: leave it out")
-    if at is not None:
-        return at, ""
-    before = (flats + 1) // 2
-    places = np.repeat([-0.5, count - 0.5], [before, flats - before])
-    return places, f" (assumed: the first {before} before the scan, the others after it)"
+    before, said = (flats + 1) // 2, " (assumed: the first {} before the scan, the others after it)"
+    return (np.repeat([-0.5, count - 0.5], [before, flats - before]), said.format(before)) if at is None else (at, "")
 
 
-def _some(stack: np.ndarray) -> np.ndarray:
-    """Returns some pixels (n, k) of each frame, float64; those that are not finite become 0."""
+def _levels(stack: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Returns some pixels (n, k) of each frame, float64, those that are not finite as 0; and their medians (n,)."""
     pixels = stack.reshape(len(stack), -1)
-    return np.nan_to_num(pixels[:, :: -(-pixels.shape[1] // _PIXELS)].astype(np.float64), posinf=0.0, neginf=0.0)
-
-
-def _levels(some: np.ndarray) -> np.ndarray:
-    return np.asarray(np.median(some, axis=1))
+    some = np.nan_to_num(pixels[:, :: -(-pixels.shape[1] // _PIXELS)].astype(np.float64), posinf=0.0, neginf=0.0)
+    return some, np.median(some, axis=1)
 
 
 def _fitting(
@@ -104,8 +98,7 @@ def _fitting(
 ) -> np.ndarray:
     """Returns which frames (k,) of a group of a stack fit the others, in their level and in their pattern; all of them where
     no majority says which ones are right. ``light``: counts of the flats. Warns of each that does not fit."""
-    some = _some(stack[group])
-    level = _levels(some)
+    some, level = _levels(stack[group])
     usual = float(np.median(level))
     is_odd = np.abs(level - usual) > tolerance * light
     if tolerance != _APART:  # between several times the pattern of the beam may change

@@ -3,6 +3,7 @@
 import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 
 import numpy as np
 
@@ -43,24 +44,26 @@ def line_integrals(
     with a warning. ``subject`` names the file; ``flats``, ``darks``: (n, v, u) or None. The quantity is that of the options,
     else ``convention``, of the format or file; without either, frames with flats are counts and others are refused.
     ``is_corrected``: the scanner has subtracted the darks. ``flats_at``, ``names``: see ``flats.light_of``."""
-    has_flats = (flats is not None and len(flats) > 0) or options.flat_value is not None
-    quantity = options.quantity or convention or ("counts" if has_flats else None)
+    has_flats = flats is not None and len(flats) > 0
+    quantity = options.quantity or convention or ("counts" if has_flats or options.flat_value is not None else None)
     if quantity is None:
         remedy = f"say {options.named('quantity')} attenuation, transmission or counts"
         raise InputError(f"{subject} quantity", "nothing that says it", "what the pixels hold", remedy)
-    saturation = flat = light = None
+    saturation = light = None
     if quantity != "counts":
-        _warn_of_unused(subject, quantity, flats, darks)
-    else:
-        if options.flat_value is not None or flats is None or len(flats) == 0:
-            if options.flat_value is None:
-                remedy = f"add flat frames, or say {options.named('flat_value')}"
-                raise InputError(f"{subject} flats", "none", "flat frames to divide counts by", remedy)
-            flats = np.full((1, *frames.shape[1:]), options.flat_value, np.float32)
-        for stack in (flats, darks):
-            if stack is not None and len(stack) and stack.shape[1:] != frames.shape[1:]:
-                found = f"flats or darks of {stack.shape[1:]}"
-                raise InputError(subject, found, f"the projections' {frames.shape[1:]} pixels")
+        stacks = (("flats", flats), ("darks", darks))
+        if unused := [f"{len(stack)} {name}" for name, stack in stacks if stack is not None and len(stack)]:
+            _log.warning("%s: %s are left out, because the projections hold %s", subject, " and ".join(unused), quantity)
+        flats = darks = None
+    elif options.flat_value is not None:
+        flats, has_flats = np.full((1, *frames.shape[1:]), options.flat_value, np.float32), False
+    elif not has_flats:
+        remedy = f"add flat frames, or say {options.named('flat_value')}"
+        raise InputError(f"{subject} flats", "none", "flat frames to divide counts by", remedy)
+    for stack in (flats, darks):
+        if stack is not None and len(stack) and stack.shape[1:] != frames.shape[1:]:
+            raise InputError(subject, f"flats or darks of {stack.shape[1:]}", f"the projections' {frames.shape[1:]} pixels")
+    if flats is not None:
         with np.errstate(over="ignore", invalid="ignore"):
             light = light_of(subject, flats, darks, len(frames), options, flats_at, names)
             flat = light.flats.mean(axis=0)
@@ -73,12 +76,12 @@ def line_integrals(
     if quantity == "attenuation" and unusable.any():
         text = "%s: %d line integrals are not finite or beyond %g: masked"
         _log.warning(text, subject, np.count_nonzero(unusable), LARGEST_LINE_INTEGRAL)
-    if flat is not None and saturation is not None and saturation.share > 0:
+    if saturation is not None and saturation.share > 0:
         air = "the flats are clipped too" if options.flat_value is None else f"{options.named('flat_value')} is no brighter"
         _mask_clipped(subject, frames, flat, saturation, unusable, air)
-    flats_used, darks_used = (0, 0) if light is None else light.used
-    applied = applied_facts(0 if options.flat_value is not None else flats_used, darks_used)
-    if light is not None and options.flat_value is None:
+    flats_used, darks_used = light.used if light else (0, 0)
+    applied = applied_facts(flats_used if has_flats else 0, darks_used)
+    if light is not None and has_flats:
         applied[TAKEN] = light.said
     return LineIntegrals(integrals, compact(unusable), saturation, applied)
 
@@ -90,13 +93,6 @@ def _refuse_logarithms(subject: str, frames: np.ndarray, flat: np.ndarray, optio
         remedy = f"say {options.named('quantity')} attenuation, and leave the flats out"
         found = "flats of ones, and frames that are 0 at their borders"
         raise InputError(f"{subject} flats", found, "counts, which are as bright as the flats there", remedy)
-
-
-def _warn_of_unused(subject: str, quantity: str, flats: np.ndarray | None, darks: np.ndarray | None) -> None:
-    stacks = (("flats", flats), ("darks", darks))
-    names = [f"{len(stack)} {name}" for name, stack in stacks if stack is not None and len(stack)]
-    if names:
-        _log.warning("%s: %s are left out, because the projections hold %s", subject, " and ".join(names), quantity)
 
 
 def _mask_clipped(
@@ -115,12 +111,9 @@ def _mask_clipped(
 
 def compact(mask: np.ndarray) -> Mask:
     """Returns a mask (P, v, u) as (v, u) where all frames agree, and None where no pixel is masked."""
-    if not mask.any():
-        return None
     if mask.all():
-        expected = "frames brighter than the dark"
-        raise InputError("pixels", "no usable value", expected, "check flats and darks")
-    return mask[0] if all(np.array_equal(frame, mask[0]) for frame in mask) else mask
+        raise InputError("pixels", "no usable value", "frames brighter than the dark", "check flats and darks")
+    return None if not mask.any() else mask[0] if all(map(partial(np.array_equal, mask[0]), mask)) else mask
 
 
 def oriented(array: np.ndarray, options: ImportOptions, row_0: str, column_0: str = "left") -> np.ndarray:

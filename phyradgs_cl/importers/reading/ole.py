@@ -26,8 +26,7 @@ class Streams(Fields):
 
     def leading(self, name: str, count: int) -> np.ndarray:
         """Returns the first ``count`` numbers (count,) of a stream."""
-        values = self.numbers(name)
-        if len(values) < count:
+        if len(values := self.numbers(name)) < count:
             raise self.error(name, f"{len(values)} numbers", f"{count}, one for each image")
         return values[:count]
 
@@ -57,24 +56,20 @@ def open_ole(path: Path) -> Iterator[Any]:
 
 def read_stream(ole: Any, path: Path, name: str, dtype: str) -> np.ndarray:
     """Returns a stream as numbers (n,). InputError for a missing one, and for one that is larger than its file."""
-    if not ole.exists(name) or ole.get_size(name) > path.stat().st_size:
-        found = f"{ole.get_size(name)} bytes" if ole.exists(name) else "nothing"
-        raise InputError(f"{path}: {name}", found, f"numbers in at most {path.stat().st_size} bytes")
+    found, most = f"{ole.get_size(name)} bytes" if ole.exists(name) else "nothing", path.stat().st_size
+    if found == "nothing" or ole.get_size(name) > most:
+        raise InputError(f"{path}: {name}", found, f"numbers in at most {most} bytes")
     data = ole.openstream(name).read()
-    return np.frombuffer(data[: len(data) - len(data) % np.dtype(dtype).itemsize], dtype)
+    return np.frombuffer(data, dtype, len(data) // np.dtype(dtype).itemsize)
 
 
 def read_images(ole: Any, path: Path, names: list[str], dtype: str, panel: tuple[int, int]) -> np.ndarray:
     """Returns images (F, v, u), one per stream, row 0 as stored."""
-    pixels, pixel_bytes = panel[0] * panel[1], np.dtype(dtype).itemsize
-    if len(names) * pixels * pixel_bytes > path.stat().st_size:
-        found = f"{len(names)} images of {panel[0]} × {panel[1]} pixels in {path.stat().st_size} bytes"
-        raise InputError(str(path), found, "as many as the file can hold", "copy the file again")
-    check_room(str(path), len(names) * pixels * (pixel_bytes + _RESULT_BYTES))
+    check_room(str(path), len(names) * panel[0] * panel[1] * (np.dtype(dtype).itemsize + _RESULT_BYTES))
     stack = np.empty((len(names), *panel), dtype)
     for image, name in zip(stack, names, strict=True):
         values = read_stream(ole, path, name, dtype)
-        if len(values) != pixels:
-            raise InputError(f"{path}: {name}", f"{len(values)} pixels", f"at most and at least {panel[0]} × {panel[1]}")
+        if len(values) != panel[0] * panel[1]:
+            raise InputError(f"{path}: {name}", f"{len(values)} pixels", f"{panel[0]} × {panel[1]}")
         image[:] = values.reshape(panel)
     return stack

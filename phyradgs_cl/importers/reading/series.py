@@ -5,10 +5,10 @@ left out by name. A number that is missing, or there twice, is refused: all late
 
 import logging
 import re
-from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from datetime import datetime
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -50,6 +50,10 @@ class _Column:
         return len(np.unique(self.values)) == len(self.values)
 
     @property
+    def what(self) -> str:
+        return "angle" if self.is_angle else "number"
+
+    @cached_property
     def steps(self) -> tuple[float, np.ndarray]:
         """The usual step between the sorted numbers, and how many of it each step (F − 1,) is. The usual step is the most
         frequent one, or the median."""
@@ -57,9 +61,7 @@ class _Column:
         if not len(steps):
             return 1.0, steps
         sizes, counts = np.unique(np.round(steps, 6), return_counts=True)
-        usual = float(sizes[np.argmax(counts * (sizes > 0))])
-        if 2 * counts.max() < len(steps):
-            usual = float(np.median(steps))
+        usual = float(np.median(steps)) if 2 * counts.max() < len(steps) else float(sizes[np.argmax(counts * (sizes > 0))])
         return usual, steps / (usual or 1.0)
 
     @property
@@ -92,27 +94,33 @@ def series_of(
     distinct = sorted((column for column in varying if column.is_distinct), key=lambda column: column.rank)
     if order is not None:
         distinct = [column for column in columns if column.place == order][:1]
-    if not distinct and not _is_counted_twice(varying):
-        return _refuse_double(paths, varying, subject, remedy)
-    keys = distinct[:1] or varying
+    # turn and frame, say: numbers that count within each other, so that every pair is there once
+    pairs = set(zip(*(column.values.tolist() for column in varying), strict=True))
+    are_pairs = len(pairs) == len(paths) == np.prod([len(np.unique(column.values)) for column in varying])
+    key = distinct[0] if distinct else max(varying, key=lambda column: len(np.unique(column.values)))
+    keys = [key] if distinct or not are_pairs or len(varying) == 1 else varying
     at = np.lexsort([column.values for column in reversed(keys)])
     paths = [paths[i] for i in at]
     if len(keys) > 1:
         places = " and ".join(str(column.place) for column in keys)
         return Series(paths, np.arange(len(paths)), f"frames: {_ends(paths)}, by the numbers {places} in their names")
-    key = keys[0]
-    if order is None:
-        _warn_of_others(subject, key, distinct[1:])
     numbers, (step, of_usual) = key.values[at], key.steps
     is_index = not key.is_angle and key.values.dtype.kind == "i" and numbers[-1] < _STAMP
     is_gap = np.abs(of_usual - 1) > _STEADY if is_index else (of_usual >= _GAP) & (key.regular >= _STEADY_ANGLES)
-    for gap in np.flatnonzero((of_usual == 0) | (is_gap & (not holes)))[:1]:
-        kind = "a hole" if of_usual[gap] else "one number"
+    is_double = np.diff(numbers) == 0
+    for gap in np.flatnonzero(is_double if is_double.any() else is_gap & (not holes))[:1]:
+        kind = "one number twice, or a hole" if is_double.any() else "a hole"
         found = f"{paths[gap + 1].name} after {paths[gap].name}: {kind} in the numbering"
         raise InputError(subject, found, "every number once", remedy)
+    rank = np.argsort(np.argsort(key.values))
+    for other in distinct[1:]:
+        others = np.argsort(np.argsort(other.values))
+        if not (np.array_equal(others, rank) or np.array_equal(others, rank[::-1])):
+            text = "%s: number %d in the names gives the order, and %s %d another one: say [frames] order = %d for that"
+            _log.warning(text, subject, key.place, other.what, other.place, other.place)
+            break
     steps = f"in steps of {step:g}" if key.regular == 1 else "in uneven steps, in which no hole shows"
-    what = "angle" if key.is_angle else "number"
-    by = f"by {what} {key.place} in their names, {numbers[0]:g} to {numbers[-1]:g} {steps}"
+    by = f"by {key.what} {key.place} in their names, {numbers[0]:g} to {numbers[-1]:g} {steps}"
     return Series(paths, numbers, f"frames: {_ends(paths)}, {by}")
 
 
@@ -182,43 +190,15 @@ def _column(place: int, numbers: tuple[re.Match[str], ...]) -> Iterator[_Column]
     signs, decimals = [one[1] for one in numbers], [one[3] or "" for one in numbers]
     # a hyphen in all names stands between two words, but not before an angle behind a space
     is_signed = not all(signs) or (is_angle and not any(before[-1:].isalnum() for before in befores))
-    sign = [-1 if is_signed and one == "-" else 1 for one in signs]
-    whole = [int(one[2]) for one in numbers]
+    sign = np.array([-1 if is_signed and one == "-" else 1 for one in signs])
+    whole = np.array([int(one[2]) for one in numbers])
     if not any(decimals):
-        yield _Column(place, np.array(whole) * sign, is_angle)
+        yield _Column(place, whole * sign, is_angle)
     elif is_angle or len({len(one) for one in decimals}) == 1:
-        texts = zip(sign, whole, decimals, strict=True)
-        yield _Column(place, np.array([s * float(f"{w}.{d or 0}") for s, w, d in texts]), is_angle)
+        yield _Column(place, sign * [float(f"{one[2]}.{one[3] or 0}") for one in numbers], is_angle)
     else:
-        yield _Column(place, np.array(whole), False)
+        yield _Column(place, whole, False)
         yield _Column(place, np.array([int(one or 0) for one in decimals]), False)
-
-
-def _is_counted_twice(columns: list[_Column]) -> bool:
-    """True for numbers that count within each other, as turn and frame: every frame in every turn."""
-    pairs = set(zip(*(column.values.tolist() for column in columns), strict=True))
-    full = np.prod([len(np.unique(column.values)) for column in columns])
-    return len(pairs) == len(columns[0].values) == full
-
-
-def _refuse_double(paths: list[Path], columns: list[_Column], subject: str, remedy: str) -> Series:
-    """Raises InputError for the first number that is there twice, at the place with the most numbers."""
-    key = max(columns, key=lambda column: len(np.unique(column.values)))
-    counts = Counter(key.values.tolist())
-    first, second, *_ = [path for path, value in zip(paths, key.values.tolist(), strict=True) if counts[value] > 1]
-    found = f"{second.name} after {first.name}: one number twice, or a hole in the numbering"
-    raise InputError(subject, found, "every number once", remedy)
-
-
-def _warn_of_others(subject: str, key: _Column, others: list[_Column]) -> None:
-    """Says that another number in the names gives another order."""
-    ranks = [np.argsort(np.argsort(column.values)) for column in (key, *others)]
-    for other, rank in zip(others, ranks[1:], strict=True):
-        if not (np.array_equal(rank, ranks[0]) or np.array_equal(rank, ranks[0][::-1])):
-            kind = "angle" if other.is_angle else "number"
-            text = "%s: number %d in the names gives the order, and %s %d another one: say [frames] order = %d for that"
-            _log.warning(text, subject, key.place, kind, other.place, other.place)
-            return
 
 
 def flat_places(flats: list[Path], darks: list[Path], series: Series) -> np.ndarray | None:

@@ -49,31 +49,26 @@ def read_settings(
 
     ``sections``: the only [sections] that count, in any case; () takes all. Of a name in two sections the first counts.
     InputError for a file without any of the names, and for one section that gives a name two values."""
-    spelt = {name.lower(): name for name in names}
-    wanted = {section.lower() for section in sections}
-    values: dict[str, str] = {}
-    texts: dict[tuple[str, str], str] = {}
+    spelt, wanted = {name.lower(): name for name in names}, {section.lower() for section in sections}
+    values: dict[tuple[str, str], str] = {}  # by section and name
     others: list[str] = []
-    section, is_inside = "", not wanted
-    for raw in read_text(path).splitlines():
-        line = raw.strip()
+    section = ""
+    for line in map(str.strip, read_text(path).splitlines()):
         if line.startswith("[") and line.endswith("]"):
             section = line[1:-1].strip().lower()
-            is_inside = not wanted or section in wanted
             continue
-        key, sign, text = line.partition(separator)
-        name = spelt.get(key.strip().lower())
-        others.append(text.strip())
-        if is_inside and sign and name and text.strip():
-            values.setdefault(name, text.strip())
-            earlier = texts.setdefault((section, name), text.strip())
-            if earlier != text.strip():
-                pair = f"{earlier[:40]!r} and {text.strip()[:40]!r}"
-                raise InputError(f"{path}: {name}", pair, "one value", "are these two descriptions in one file?")
+        key, sign, text = (part.strip() for part in line.partition(separator))
+        name = spelt.get(key.lower())
+        others.append(text)
+        is_wanted = (not wanted or section in wanted) and sign and text
+        if is_wanted and name and (earlier := values.setdefault((section, name), text)) != text:
+            pair = f"{earlier[:40]!r} and {text[:40]!r}"
+            raise InputError(f"{path}: {name}", pair, "one value", "are these two descriptions in one file?")
     if not values:
         expected = f"lines such as {', '.join(list(names)[:4])}"
         raise InputError(str(path), f"nothing of a description: no line NAME {separator} VALUE", expected, "copy it again")
-    return Settings(f"{path}:", values, commas_are_decimal(others))
+    first = {name: text for (_, name), text in reversed(values.items())}
+    return Settings(f"{path}:", first, commas_are_decimal(others))
 
 
 def head_has(path: Path, *marks: bytes, most_bytes: int = 1 << 14) -> bool:
@@ -87,8 +82,7 @@ def head_has(path: Path, *marks: bytes, most_bytes: int = 1 << 14) -> bool:
 
 def say_missing(fields: Fields, meanings: Mapping[str, str]) -> None:
     """Says in one line which of the names the description lacks, and what that means."""
-    missing = [f"no {name} ({meaning})" for name, meaning in meanings.items() if not fields.has(name)]
-    if missing:
+    if missing := [f"no {name} ({meaning})" for name, meaning in meanings.items() if not fields.has(name)]:
         _log.warning("%s %s", fields.subject, ", ".join(missing))
 
 

@@ -47,8 +47,8 @@ def read_angles_rad(path: Path, count: int, unit: str | None = None, column: int
     """Reads (count,) angles in rad of a text file: one a line or all in one line, or in a column beside an index. A line of
     names may say which column, and the unit, if ``unit`` ("deg", "rad") does not: else degrees. Text after a # is ignored.
     ``column`` has the angles. InputError: another count, several columns without names, lines that are no numbers."""
-    lines = [(i, line.partition("#")[0].strip()) for i, line in enumerate(read_text(path).splitlines(), 1)]
-    lines = [(i, line) for i, line in lines if line]
+    numbered = enumerate(read_text(path).splitlines(), 1)
+    lines = [(i, text) for i, line in numbered if (text := line.partition("#")[0].strip())]
     is_header = [not re.search(r"\d", line) or (_cells(line, True) or _cells(line, False)) is None for _, line in lines]
     head = is_header.index(False) if False in is_header else len(lines)
     if column is not None:  # a maker's file, whose lines above the table may hold numbers too
@@ -77,16 +77,15 @@ def _cells(line: str, is_comma: bool) -> list[float] | None:
 
 def _is_decimal_comma(path: Path, lines: list[str]) -> bool:
     """True where commas in a table are decimal ones, False where they are between its columns."""
-    parts = [part for line in lines for part in _COLUMNS.split(line) if part]
-    if not all(part.count(",") < 2 and "." not in part for part in parts if "," in part):
+    parts = [part for line in lines for part in _COLUMNS.split(line) if "," in part]
+    if not all(part.count(",") == 1 and "." not in part for part in parts):
         return False
-    pairs = [part.split(",") for part in parts if "," in part]
+    pairs = [part.split(",") for part in parts]
     if not pairs or any(left.strip("+-") == "" or not right.isdecimal() for left, right in pairs):
         return True
-    if len(pairs) < len(lines) or not _is_index([float(left) for left, _ in pairs]):
-        return True
-    rights = [right for _, right in pairs]
-    if len({right.rstrip("0") for right in rights}) == 1 or any(right[0] == "0" and len(right) > 1 for right in rights):
+    rights = {right for _, right in pairs}
+    is_alike = len({right.rstrip("0") for right in rights}) == 1 or any(re.match("0.", right) for right in rights)
+    if is_alike or len(pairs) < len(lines) or not _is_index([float(left) for left, _ in pairs]):
         return True
     if len({len(right) for right in rights}) > 1:
         return False
@@ -107,16 +106,15 @@ def _column(path: Path, names: list[str], table: list[list[float]], count: int, 
     if len(widths) != 1:
         raise InputError(str(path), f"lines of {min(widths, default=0)} to {max(widths, default=0)} numbers", "one a line")
     (width,), columns = widths, np.array(table).T
-    named = [i for i, name in enumerate(re.split(r"[\t;,]\s*|\s{2,}", names[-1])) if _ANGLE.search(name)] if names else []
-    if column is None and len(named) == 1 and named[0] < width:
-        column = named[0]
-    if column is None and width == 2 and _is_index(columns[0].tolist()):
-        column = 1
-    if column is None or column >= width:
+    is_counted = _is_index(columns[0].tolist())
+    if column is None:
+        words = re.split(r"[\t;,]\s*|\s{2,}", names[-1]) if names else []
+        named = [i for i, word in enumerate(words) if _ANGLE.search(word)]
+        column = named[0] if len(named) == 1 else 1 if width == 2 and is_counted else width
+    if column >= width:
         remedy = "leave an index and the angles, or name the columns in a line above"
         raise InputError(str(path), f"{width} numbers a line", "one angle a line", remedy)
-    is_counted = column > 0 and _is_index(columns[0].tolist())
-    return np.asarray(columns[column][np.argsort(columns[0])] if is_counted else columns[column])
+    return np.asarray(columns[column][np.argsort(columns[0])] if column > 0 and is_counted else columns[column])
 
 
 def file_of_angles(folder: SafeFolder, name: str, *ends: str) -> Path | None:
@@ -134,8 +132,7 @@ def measured_angles_rad(path: Path, steps_rad: np.ndarray) -> np.ndarray:
     steps (F,). A line says how far both are apart."""
     listed_rad = np.unwrap(read_angles_rad(path, len(steps_rad), column=1))
     ways = [steps_rad[0] + way - way[0] for way in (listed_rad, listed_rad[::-1], -listed_rad, -listed_rad[::-1])]
-    off_deg = [float(np.rad2deg(np.abs(way - steps_rad).max())) for way in ways]
-    best = int(np.argmin(off_deg))
+    best = min(ways, key=lambda way: float(np.abs(way - steps_rad).max()))
     text = "%s: these measured angles are used; they differ from equal steps by %.3g° at most"
-    _log.warning(text, path, off_deg[best])
-    return ways[best]
+    _log.warning(text, path, np.rad2deg(np.abs(best - steps_rad).max()))
+    return best

@@ -16,7 +16,7 @@ from phyradgs_cl import checks
 from phyradgs_cl.errors import InputError, OutOfMemoryError
 from phyradgs_cl.fields import Grid, triple
 from phyradgs_cl.fields.volume import MOST_VOXELS
-from phyradgs_cl.io.files import HOST_SHARE, host_bytes
+from phyradgs_cl.io.files import HOST_SHARE, decoded, host_bytes
 from phyradgs_cl.io.hdf5.source import Hdf5Source
 from phyradgs_cl.io.output import written_beside
 
@@ -35,7 +35,7 @@ class Quantity:
 
     def factor(self, unit: str) -> float | None:
         """Returns the multiplier for a value in ``unit``, in any case, or None for an unknown unit."""
-        return self.factors.get(_plain(unit))
+        return self.factors.get(unit.strip().rstrip(".").casefold())
 
     @property
     def accepted(self) -> str:
@@ -43,12 +43,8 @@ class Quantity:
         return ", ".join(name for name in self.factors if len(name) <= 4 and name.isascii())
 
 
-def _plain(unit: str) -> str:
-    return unit.strip().rstrip(".").casefold()
-
-
 def _quantity(name: str, assumed: str, largest: float, factors: dict[tuple[str, ...], float]) -> Quantity:
-    flat = {_plain(unit): factor for names, factor in factors.items() for unit in names}
+    flat = {unit.casefold(): factor for names, factor in factors.items() for unit in names}
     return Quantity(name, assumed, largest, MappingProxyType(flat))
 
 
@@ -80,11 +76,10 @@ def read_values(
 ) -> np.ndarray:
     """Reads a dataset in its own type, or some rows (..., v, u) of it. InputError unless NumPy's kind of that type is in
     ``kinds``."""
-    subject = source.name(address)
+    if dataset.dtype.kind not in kinds:
+        expected = "numbers" if "f" in kinds else "whole numbers"
+        raise source.error(address, f"type {dataset.dtype}", expected, "store them as plain HDF5 numbers")
     try:
-        if dataset.dtype.kind not in kinds:
-            expected = "numbers" if "f" in kinds else "whole numbers"
-            raise InputError(subject, f"type {dataset.dtype}", expected, "store them as plain HDF5 numbers")
         share = 1 if rows is None else (rows.stop - rows.start) / dataset.shape[-2]
         chunk_bytes = math.prod(dataset.chunks or ()) * dataset.dtype.itemsize  # HDF5 unpacks whole ones
         if max(share * dataset.nbytes, chunk_bytes) > HOST_SHARE * host_bytes():
@@ -92,9 +87,9 @@ def read_values(
         return np.asarray(dataset[()] if rows is None else dataset[..., rows, :])
     except MemoryError as error:
         found = f"shape {dataset.shape}, {dataset.nbytes / 2**30:.3g} GiB"
-        raise OutOfMemoryError(subject, found, "data that this machine's memory can hold") from error
+        raise OutOfMemoryError(source.name(address), found, "data that this machine's memory can hold") from error
     except (OSError, RuntimeError, TypeError, ValueError) as error:
-        raise InputError(subject, f"data that HDF5 cannot read ({error})", "readable data") from error
+        raise source.error(address, f"data that HDF5 cannot read ({error})", "readable data") from error
 
 
 def read_array(
@@ -106,21 +101,23 @@ def read_array(
         return default
     dataset = source.dataset(address)
     checks.shape(source.name(address), dataset, shape)
-    values = read_values(source, address, dataset).astype(np.float64)
-    checks.finite(source.name(address), values)
-    return in_unit(source, address, values, quantity) if quantity else values
+    return _finite(source, address, read_values(source, address, dataset), quantity)
 
 
 def read_per_frame(source: Hdf5Source, address: str, used: np.ndarray, quantity: Quantity) -> np.ndarray:
     """Reads one finite number for each frame of which ``used`` (F,) is true, in the package's unit. The dataset has one for
     every frame, where those of other frames may be anything, or only for the used ones."""
-    dataset, subject = source.dataset(address), source.name(address)
-    if dataset.shape != (count := int(used.sum()),):
-        checks.shape(subject, dataset, used.shape)
-    values = read_values(source, address, dataset).astype(np.float64)
-    values = values if len(values) == count else values[used]
-    checks.finite(subject, values)
-    return in_unit(source, address, values, quantity)
+    dataset = source.dataset(address)
+    if is_of_all := dataset.shape != (int(used.sum()),):
+        checks.shape(source.name(address), dataset, used.shape)
+    values = read_values(source, address, dataset)
+    return _finite(source, address, values[used] if is_of_all else values, quantity)
+
+
+def _finite(source: Hdf5Source, address: str, values: np.ndarray, quantity: Quantity | None) -> np.ndarray:
+    checks.finite(source.name(address), values)
+    values = values.astype(np.float64)
+    return in_unit(source, address, values, quantity) if quantity else values
 
 
 def read_number(
@@ -139,10 +136,8 @@ def read_number(
 def read_length(source: Hdf5Source, address: str, quantity: Quantity) -> float:
     """Reads a required number above zero. Datasets of one element are accepted."""
     value = read_number(source, address, quantity)
-    if value <= 0:
-        raise source.error(address, str(value), f"a {quantity.name} above 0", "correct the value")
     if value < 1 / quantity.largest:
-        raise source.error(address, str(value), f"a {quantity.name} of a real scanner")
+        raise source.error(address, str(value), f"a {quantity.name} above 0, of a real scanner", "correct the value")
     return value
 
 
@@ -159,11 +154,9 @@ def read_word(
     """Reads a string, one of ``allowed`` where that is given; required without a ``default``."""
     if default is not None and source.optional(address) is None:
         return default
-    dataset = source.dataset(address)
-    if dataset.size != 1:  # a million entries may share one long text, which the file's size does not bound
-        raise source.error(address, f"shape {dataset.shape}", "a string")
+    dataset, word = source.dataset(address), None
     try:
-        word = _text(dataset[()])
+        word = _text(dataset[()]) if dataset.size == 1 else None
     except (MemoryError, OSError, RuntimeError, TypeError, ValueError) as error:
         raise source.error(address, f"data that HDF5 cannot read ({error})", "a string") from error
     if word is None:
@@ -180,23 +173,16 @@ def read_title(source: Hdf5Source, address: str, default: str) -> str:
 
 def read_attribute(source: Hdf5Source, address: str, name: str) -> str | None:
     """Reads a text attribute; None where the object or the attribute is missing."""
-    thing = source.find(address)
-    if thing is None:
+    if (thing := source.find(address)) is None:
         return None
     subject = f"{source.name(address)} @{name}"
     try:
-        if name not in thing.attrs:
-            return None
-        shape = thing.attrs.get_id(name).shape
-        if math.prod(shape) != 1:
-            raise InputError(subject, f"shape {shape}", "a string")
-        value = thing.attrs[name]
+        value = thing.attrs.get(name)
     except (OSError, RuntimeError, TypeError, ValueError, LookupError) as error:
         raise InputError(subject, f"an attribute that HDF5 cannot read ({error})", "a string") from error
-    text = _text(value)
-    if text is None:
+    if value is not None and (text := _text(value)) is None:
         raise InputError(subject, checks.short_repr(value), "a string")
-    return text
+    return None if value is None else text
 
 
 def _text(value: object) -> str | None:
@@ -205,50 +191,36 @@ def _text(value: object) -> str | None:
         value = value.reshape(-1)[0]
     if isinstance(value, str):
         value = value.encode("utf-8", "surrogateescape")
-    if not isinstance(value, bytes):
-        return None
-    try:
-        return value.decode()
-    except UnicodeDecodeError:
-        return value.decode("latin-1")  # has a character for every byte
+    return decoded(value) if isinstance(value, bytes) else None
 
 
 def in_unit(source: Hdf5Source, address: str, values: np.ndarray, quantity: Quantity) -> np.ndarray:
-    """Converts finite values (any shape) to the package's unit. InputError for values beyond ``quantity.largest``."""
-    values = values * _unit_factor(source, address, quantity)
-    size = np.abs(values).max(initial=0.0)
-    if size > quantity.largest:
-        expected = f"at most {quantity.largest:g} of the package's unit of {quantity.name}"
-        raise source.error(address, f"a value of size {size:.6g}", expected, "correct the value or its unit")
-    return values
-
-
-def _unit_factor(source: Hdf5Source, address: str, quantity: Quantity) -> float:
-    unit = read_attribute(source, address, "units") or read_attribute(source, address, "unit")
-    if not unit or not unit.strip():
+    """Converts finite values (any shape) to the package's unit, which a dataset's attribute "units" states. InputError for
+    values beyond ``quantity.largest``."""
+    unit = (read_attribute(source, address, "units") or read_attribute(source, address, "unit") or "").strip()
+    if not unit:
         unit = quantity.assumed
         # A name that ends in the unit (time_s, angle_deg) states it well enough.
         if not posixpath.basename(address).endswith(f"_{unit}"):
             _log.warning("%s: no units attribute; %s assumed", source.name(address), unit)
-    factor = quantity.factor(unit)
-    if factor is None:
+    if (factor := quantity.factor(unit)) is None:
         raise InputError(f"{source.name(address)} @units", repr(unit), f"one of {quantity.accepted}")
-    return factor
+    if (size := np.abs(values * factor).max(initial=0.0)) > quantity.largest:
+        expected = f"at most {quantity.largest:g} of the package's unit of {quantity.name}"
+        raise source.error(address, f"a value of size {size:.6g}", expected, "correct the value or its unit")
+    return values * factor
 
 
 def read_grid(source: Hdf5Source, address: str) -> Grid:
     """Reads the voxel grid in the group at ``address``: shape, voxel_size and offset, each (z, y, x)."""
-    shape = read_integers(source, f"{address}/shape", (3,))
+    shape = read_integers(source, f"{address}/shape", (3,)).tolist()
     voxel_size_mm = read_array(source, f"{address}/voxel_size", (3,), LENGTH)
     offset_mm = read_array(source, f"{address}/offset", (3,), LENGTH, default=np.zeros(3))
-    if shape.min() < 1:
-        raise source.error(f"{address}/shape", str(shape.tolist()), "three counts of at least 1")
-    if math.prod(shape.tolist()) > MOST_VOXELS:
-        expected = f"at most {MOST_VOXELS:.3g} voxels"
-        raise source.error(f"{address}/shape", str(shape.tolist()), expected, "correct the counts")
+    if min(shape) < 1 or math.prod(shape) > MOST_VOXELS:
+        raise source.error(f"{address}/shape", str(shape), f"three counts of at least 1, at most {MOST_VOXELS:.3g} voxels")
     if voxel_size_mm.min() < 1 / LENGTH.largest:
         raise source.error(f"{address}/voxel_size", str(voxel_size_mm.tolist()), "three lengths above 0")
-    return Grid(triple(shape.tolist()), triple(voxel_size_mm.tolist()), triple(offset_mm.tolist()))
+    return Grid(triple(shape), triple(voxel_size_mm.tolist()), triple(offset_mm.tolist()))
 
 
 @contextmanager

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from phyradgs_cl.acquisition import Scan
-from phyradgs_cl.importers.assemble import StoredTiming, cone, names_in_file
+from phyradgs_cl.importers.assemble import StoredTiming, cone
 from phyradgs_cl.importers.options import OF_BARE_FRAMES, ImportOptions
 from phyradgs_cl.importers.reading.files import SafeFolder
 from phyradgs_cl.importers.reading.frames import gantry_sign
@@ -45,14 +45,13 @@ def import_scan(path: Path, options: ImportOptions) -> Scan:
     frames, _, said = read_numbered(folder, "scan_", (None, None, None), str(folder.root / "scan_*.tif"), options)
     panel = (frames.shape[1], frames.shape[2])
     flats, darks = (
-        read_numbered(folder, prefix, (None, *panel), str(folder.root / f"{prefix}*.tif"), options)[0]
-        for prefix in ("io", "di")
+        read_numbered(folder, name, (None, *panel), str(folder.root / f"{name}*.tif"), options)[0] for name in ("io", "di")
     )
-    names = names_in_file(options, {
+    names = {
         "source_to_axis_mm": scan.name("SOD"), "source_to_detector_mm": scan.name("SDD"),
         "pixel_size_mm": scan.name("Binned pixel size" if scan.has("Binned pixel size") else "Voxel size"),
         "angles": scan.name("Last angle"), "exposure_s": scan.name("Exposure time (ms)"),
-    })  # fmt: skip
+    }  # fmt: skip
     stage = _stage(scan, panel, options, names)
     first_deg = scan.number("Start angle", 0.0)
     angle_rad = options.angle_rad(
@@ -60,11 +59,9 @@ def import_scan(path: Path, options: ImportOptions) -> Scan:
     )
     exposure_s = None
     if scan.has("Exposure time (ms)") and options.exposure_s is None:
-        averages = scan.length("Number of averages") if scan.has("Number of averages") else 1.0
-        exposure_s = averages * scan.measured("Exposure time (ms)", TIME, "ms")
-    stored = StoredTiming(exposure_s=exposure_s)
+        exposure_s = scan.number("Number of averages", 1.0, 1) * scan.measured("Exposure time (ms)", TIME, "ms")
+    stored, places = StoredTiming(exposure_s=exposure_s), np.arange(len(frames))
     angle_rad = gantry_sign(options, "gantry") * angle_rad
-    places = np.arange(len(frames))
     turned = StageScan(frames, ("top", "left"), angle_rad, places, names, said, stored, flats, darks)
     return turned.on(stage, options, description, folder.root.resolve().name)
 
@@ -96,9 +93,6 @@ def _window_mm(scan: Settings) -> tuple[float, float]:
     """Returns how far (right, up) of the panel's own middle the middle of its window is."""
     if not scan.has("ROI (LTRB)"):
         return 0.0, 0.0
-    words = scan.word("ROI (LTRB)").replace(" ", "").split(",")
-    if len(words) != 4 or not all(word.isascii() and word.isdecimal() and len(word) < 7 for word in words):
-        raise scan.error("ROI (LTRB)", repr(scan.word("ROI (LTRB)")[:40]), "four whole numbers: left, top, right, bottom")
-    left, top, right, bottom = map(int, words)
+    left, top, right, bottom = scan.listed("ROI (LTRB)", 4).tolist()
     middle = ((left + right) // 2 - _WHOLE_MIDDLE[0], (top + bottom) // 2 - _WHOLE_MIDDLE[1])
     return middle[0] * _WHOLE_PITCH_MM, middle[1] * _WHOLE_PITCH_MM

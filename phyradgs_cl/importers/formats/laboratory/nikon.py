@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from phyradgs_cl.acquisition import Scan
-from phyradgs_cl.importers.assemble import cone, names_in_file
+from phyradgs_cl.importers.assemble import cone
 from phyradgs_cl.importers.options import OF_FOLDERS, ImportOptions
 from phyradgs_cl.importers.reading.files import SafeFolder, checked_name
 from phyradgs_cl.importers.reading.frames import gantry_sign
@@ -52,11 +52,11 @@ def import_scan(path: Path, options: ImportOptions) -> Scan:
     place = _folder_of_frames(folder, scan)
     frames, at, said = read_numbered(place, prefix, (count, *panel), [*map(scan.name, sizes)], options, first=1)
     measured = file_of_angles(folder, description.stem, ".ang", "_ctdata.txt")
-    names = names_in_file(options, {
+    names = {
         "source_to_axis_mm": scan.name("SrcToObject"), "source_to_detector_mm": scan.name("SrcToDetector"),
         "pixel_size_mm": f"{scan.name('DetectorPixelSizeX')}, DetectorPixelSizeY",
         "angles": str(measured or scan.name("AngularStep")),
-    })  # fmt: skip
+    }  # fmt: skip
     stage = _stage(scan, (panel[0], panel[1]), options, names)
     angle_rad = gantry_sign(options, "gantry") * options.angle_rad(len(at), lambda: _angles(scan, measured, count)[at])
     say_missing(scan, {"InitialAngle": "0", "ObjectTilt": "0", "Units": "mm"})
@@ -84,32 +84,28 @@ def _folder_of_frames(folder: SafeFolder, scan: Settings) -> SafeFolder:
 
 def _stage(scan: Settings, panel: tuple[int, int], options: ImportOptions, names: dict[str, str]) -> RotaryStage:
     """Returns the stage of the description; options replace its lengths."""
-    to_axis_mm, to_detector_mm = partial(scan.length, "SrcToObject"), partial(scan.length, "SrcToDetector")
+    lengths = partial(scan.length, "SrcToObject"), partial(scan.length, "SrcToDetector")
 
     def pitch_mm() -> tuple[float, float]:
         return scan.length("DetectorPixelSizeY"), scan.length("DetectorPixelSizeX")
 
-    geometry = cone(options, to_axis_mm, to_detector_mm, panel, pitch_mm, (0.0, 0.0), names)
+    geometry = cone(options, *lengths, panel, pitch_mm, (0.0, 0.0), names)
     for name in ("DetectorOffsetX", "DetectorOffsetY"):
         if scan.position(name) and options.detector_offset_mm is None:
             text = "%s is %g and not used, for its sign is not documented; say %s if the panel was moved"
             _log.warning(text, scan.name(name), scan.position(name), options.named("detector_offset_mm"))
     top_mm, bottom_mm = (scan.position(name) for name in _ENDS)
+    offset_mm, name = (top_mm + bottom_mm) / 2 / geometry.magnification, _ENDS[0]
     if scan.has("ObjectOffsetX"):
-        offset_mm = scan.position("ObjectOffsetX")
-    else:
-        offset_mm = (top_mm + bottom_mm) / 2 / geometry.magnification
-        if not any(map(scan.has, _ENDS)):
-            remedy = f"the axis in the middle: {options.named('detector_offset_mm')}, or calibrate"
-            say_missing(scan, {"ObjectOffsetX": remedy})
-    half_mm = panel[1] / 2 * geometry.pixel_size_mm[1]
-    if abs(offset_mm * geometry.magnification + geometry.detector_offset_mm[1]) > half_mm:
-        name = "ObjectOffsetX" if scan.has("ObjectOffsetX") else _ENDS[0]
+        offset_mm, name = scan.position("ObjectOffsetX"), "ObjectOffsetX"
+    elif not any(map(scan.has, _ENDS)):
+        say_missing(scan, {"ObjectOffsetX": f"the axis in the middle: {options.named('detector_offset_mm')}, or calibrate"})
+    height_mm, width_mm = np.multiply(panel, geometry.pixel_size_mm)
+    if abs(offset_mm * geometry.magnification + geometry.detector_offset_mm[1]) > width_mm / 2:
         found = f"{offset_mm:g} mm, {abs(offset_mm * geometry.magnification):.4g} mm from the middle of the panel"
-        raise scan.error(name, found, f"an axis that the panel of {2 * half_mm:.4g} mm sees")
-    height_mm = panel[0] * geometry.pixel_size_mm[0]
-    roll_rad = math.radians(scan.number("ObjectRoll", lowest=-45, highest=45)) if scan.has("ObjectRoll") else (
-        -math.atan2(top_mm - bottom_mm, height_mm)
-    )  # fmt: skip
-    tilt_rad = math.radians(scan.number("ObjectTilt", 0.0, lowest=-45, highest=45))
-    return RotaryStage(geometry, -offset_mm, roll_rad, tilt_rad)
+        raise scan.error(name, found, f"an axis that the panel of {width_mm:.4g} mm sees")
+    usual_deg = -math.degrees(math.atan2(top_mm - bottom_mm, height_mm))
+    roll_deg, tilt_deg = (
+        scan.number(name, usual, lowest=-45, highest=45) for name, usual in (("ObjectRoll", usual_deg), ("ObjectTilt", 0.0))
+    )
+    return RotaryStage(geometry, -offset_mm, math.radians(roll_deg), math.radians(tilt_deg))

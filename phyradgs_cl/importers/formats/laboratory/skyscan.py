@@ -62,7 +62,7 @@ def import_scan(path: Path, options: ImportOptions) -> Scan:
         raise scan.error("Scanning Trajectory", scan.word("Scanning Trajectory")[:40], "ROUND, a circle")
     parts = scan.word("Filename Prefix"), (count, rows, columns), [scan.name(name) for name in sizes], options
     frames, at, said = read_numbered(folder, *parts, pattern=r"\d{4,8}")
-    names = assemble.names_in_file(options, {field: scan.name(name) for field, name in _FIELDS.items()})
+    names = {field: scan.name(name) for field, name in _FIELDS.items()}
     geometry = _geometry(scan, (rows, columns), options, names)
     if (sense := _SENSES.get(scan.word("Rotation Direction", default="CC").upper())) is None:
         raise scan.error("Rotation Direction", repr(scan.word("Rotation Direction")[:40]), "CC or CW")

@@ -47,8 +47,7 @@ def import_scan(path: Path, options: ImportOptions) -> Scan:
         present = {name: dtype for name, dtype in _STREAMS.items() if ole.exists(name)}
         values = {name: read_stream(ole, path, name, dtype).tolist() for name, dtype in present.items()}
         scan = Streams(f"{path}:", values)
-        counts = (scan.first_of(f"{_INFO}/{name}", 1, path.stat().st_size) for name in _COUNTS)
-        count, rows, columns = map(int, counts)
+        count, rows, columns = (int(scan.first_of(f"{_INFO}/{name}", 1, path.stat().st_size)) for name in _COUNTS)
         names, panel = [f"ImageData{i // _PER_FOLDER + 1}/Image{i + 1}" for i in range(_taken(scan, count))], (rows, columns)
         at = np.array([i for i, name in enumerate(names) if options.frames != "found" or ole.exists(name)], int)
         frames = read_images(ole, path, [names[i] for i in at], _type(scan, f"{_INFO}/DataType"), panel)
@@ -61,14 +60,14 @@ def import_scan(path: Path, options: ImportOptions) -> Scan:
     angle_rad = gantry_sign(options, "sample") * options.angle_rad(
         len(at), lambda: np.deg2rad(scan.leading(angles, int(at[-1]) + 1)[at])
     )
-    in_file = assemble.names_in_file(options, {
+    in_file = {
         "source_to_axis_mm": scan.name(f"{_INFO}/StoRADistance"), "angles": scan.name(angles),
         "source_to_detector_mm": scan.name(f"{_INFO}/DtoRADistance"), "exposure_s": scan.name(f"{_INFO}/ExpTimes"),
         "pixel_size_mm": scan.name(f"{_INFO}/PixelSize"),
-    })  # fmt: skip
-    has_exposure = scan.has(f"{_INFO}/ExpTimes") and options.exposure_s is None
-    exposure_s = scan.first_of(f"{_INFO}/ExpTimes", 0) if has_exposure else None
-    stored = assemble.StoredTiming(exposure_s=exposure_s or None)
+    }  # fmt: skip
+    stored = assemble.StoredTiming()
+    if scan.has(f"{_INFO}/ExpTimes") and options.exposure_s is None:
+        stored = assemble.StoredTiming(exposure_s=scan.first_of(f"{_INFO}/ExpTimes", 0) or None)
     turned = StageScan(frames, ("bottom", "left"), angle_rad, at, in_file, said, stored, flats)
     return turned.on(_stage(scan, at, panel, options), options, path, path.stem)
 

@@ -18,7 +18,7 @@ from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.importers.formats.rtk import XIM_BELOW, read_rtk_xml, scan_of, stack_of
 from phyradgs_cl.importers.options import TIMING, ImportOptions
-from phyradgs_cl.importers.reading.files import SafeFolder, check_room
+from phyradgs_cl.importers.reading.files import SafeFolder, check_room, in_natural_order
 
 _COPIES = 12  # bytes of memory for every byte of the files: RTK's images, packed by some makers, and line integrals
 
@@ -71,7 +71,7 @@ def _located(path: Path) -> tuple[_Maker, Path, list[Path]] | None:
         last = {suffix[suffix.rindex(".") :] for suffix in maker.suffixes}
         projections = [file for file in folder.matching(*last) if file.name.lower().endswith(maker.suffixes)]
         if matching and not projections and maker.below:
-            projections = folder.glob(maker.below)
+            projections = in_natural_order(list(folder.root.glob(maker.below)))
         if matching and projections:
             return maker, matching[0], projections
     return None

@@ -25,7 +25,6 @@ from phyradgs_cl.io.tables import Fields, described
 
 OPTIONS = (*TIMING, "row_0", "column_0", "quantity", "flat_value", "detector_model")
 _NAMES = ("DSO", "DSD", "nDetector", "dDetector", "nVoxel", "dVoxel", "offOrigin", "offDetector", "rotDetector", "COR")
-_MOST_VALUES = 10_000
 _SAME = 1e-9  # relative: poses of one circle
 _CLASSES = ("Geometry", "ConeGeometryDefault", "ParallelGeometryDefault")
 
@@ -58,7 +57,8 @@ def import_scan(path: Path, options: ImportOptions) -> Scan:
     if not isinstance(content, (tuple, list)) or len(content) != 3 or not isinstance(content[1], _Geometry):
         expected = "projections, geometry and angles, in this order as TIGRE's loaders return them, or by these names"
         raise InputError(str(path), described(content), expected)
-    frames, geo, angles = content[0], _checked(content[1], path), content[2]
+    frames, angles = content[0], content[2]
+    geo = SimpleNamespace(**{name: getattr(content[1], name, None) for name in (*_NAMES, "mode")})
     if isinstance(angles, (list, tuple)):
         angles = Fields(f"{path}:", {"angles": list(angles)}).numbers("angles")
     for name, value in (("projections", frames), ("angles", angles)):
@@ -81,17 +81,6 @@ def import_scan(path: Path, options: ImportOptions) -> Scan:
 def _named(content: dict[object, Any], *words: str) -> Any:
     """Returns the one value of a dictionary whose name begins with one of the words, None where there is none."""
     return next((value for name, value in content.items() if str(name).lower().startswith(words)), None)
-
-
-def _checked(geo: _Geometry, path: Path) -> SimpleNamespace:
-    """Returns the attributes that describe a scan, None where they are missing. InputError for any but plain numbers, for
-    containers in containers can take for ever to walk."""
-    values = {name: getattr(geo, name, None) for name in (*_NAMES, "mode")}
-    for name, value in values.items():
-        single = value if isinstance(value, (list, tuple)) and len(value) < _MOST_VALUES else [value]
-        if not all(one is None or isinstance(one, (bool, int, float, str, np.generic, np.ndarray)) for one in single):
-            raise InputError(f"{path}: geometry.{name}", described(value), "numbers")
-    return SimpleNamespace(**values)
 
 
 def _trajectory(

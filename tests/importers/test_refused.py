@@ -1,0 +1,405 @@
+"""Mistakes in files of other programs: each is one error that names the field. And what no file may do, whoever wrote it."""
+
+import json
+import os
+import pickle
+import struct
+import tracemalloc
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import h5py
+import laboratory_of_importers as lab
+import numpy as np
+import pytest
+import SimpleITK as sitk
+import tifffile
+import writers_of_importers as w
+from damage import attribute, on, removed, value
+
+from phyradgs_cl.errors import InputError
+from phyradgs_cl.importers import ImportOptions, import_scan, load_volume
+
+CONE = ImportOptions(source_to_axis_mm=500.0, source_to_detector_mm=800.0)
+REAL = ImportOptions(pixel_size_mm=(3.0, 2.5))
+OPTIONS = {"phyradgs-real": REAL, "data-exchange": CONE}
+Damage = Callable[[Path], object]
+
+
+def text(name: str, old: str, new: str) -> Damage:
+    """Another text in a file of the folder."""
+
+    def damage(path: Path) -> None:
+        content = (path / name).read_bytes().decode("latin-1")
+        assert old in content, old
+        (path / name).write_bytes(content.replace(old, new, 1).encode("latin-1"))
+
+    return damage
+
+
+def meta(change: Callable[[dict[str, Any]], object], name: str = "meta_data.json") -> Damage:
+    """Another value in a JSON of the folder."""
+
+    def damage(path: Path) -> None:
+        content = json.loads((path / name).read_text())
+        change(content)
+        (path / name).write_text(json.dumps(content))
+
+    return damage
+
+
+def named(name: str) -> Damage:
+    return meta(lambda m: m["proj_train"][0].update(file_path=name))
+
+
+def pickled(change: Callable[[dict[str, Any]], object]) -> Damage:
+    def damage(path: Path) -> None:
+        change(content := pickle.loads(path.read_bytes()))
+        path.write_bytes(pickle.dumps(content))
+
+    return damage
+
+
+def gone(name: str) -> Damage:
+    return lambda path: (path / name).unlink()
+
+
+def image(name: str, shape: tuple[int, ...], **how: Any) -> Damage:
+    return lambda path: tifffile.imwrite(path / name, np.zeros(shape, np.uint16), **{"photometric": "minisblack", **how})
+
+
+FPS, GEO = "meta_data_motion_blur_rolling_shutter_fps18.json", "geometric_motion_rs.json"
+XML, MHA, CURVED = "geometry.xml", "projections.mha", "<RadiusCylindricalDetector>9</RadiusCylindricalDetector>"
+ONE_MORE = "<Projection><GantryAngle>1</GantryAngle></Projection>"
+TOML, XTEK, LOG, SETTINGS, PARAMS = "scan.toml", "scan.xtekct", "scan_.log", "scan settings.txt", "params.txt"
+DETECTOR, ENTRY = "entry0000/instrument/detector", "entry0000"
+STEPS = ("values_deg", "step_deg = 25 #")
+MISTAKES: dict[str, dict[str, Damage]] = {  # by format: the field, or what a message names, and what is done to it
+    "r2": {
+        "DSO": meta(lambda m: m["scanner"].update(DSO="far")),
+        "DSD": meta(lambda m: m["scanner"].update(DSD=400)),
+        "mode": meta(lambda m: m["scanner"].update(mode="fan")),
+        "grid shape": meta(lambda m: m["scanner"].update(nVoxel=[10**6] * 3)),
+        "proj_train[1].angle": meta(lambda m: m["proj_train"][1].pop("angle")),
+        "again": meta(lambda m: m["proj_train"].append(m["proj_train"][0])),
+        "0000.npy": gone("proj_train/0000.npy"),
+    },
+    "phyradgs": {
+        "simulate_train[2].last_line_end": meta(lambda m: m["simulate_train"][2].pop("last_line_end"), FPS),
+        "exposure": meta(lambda m: m["simulate_train"][1].update(first_line_end=-9), FPS),
+        "readout": meta(lambda m: m["simulate_train"][1].update(last_line_end=9), FPS),
+    },
+    "phyradgs-real": {
+        "views[1].detector": meta(lambda m: m["views"][1]["detector"].pop(), GEO),
+        "orthonormal": meta(lambda m: m["views"][0]["detector"][0].__setitem__(1, 0.7), GEO),
+        "radius": meta(lambda m: m["rolling_shutter_geometry"]["source"].update(radius=0), GEO),
+        "5 TIFF files for 6 views": gone("projections/3.tif"),
+    },
+    "naf": {
+        "train.projections": pickled(lambda d: d["train"].pop("projections")),
+        "(4, 3, 3)": pickled(lambda d: d["train"].update(projections=np.zeros((4, 3, 3)))),
+        "train.angles": pickled(lambda d: d["train"].update(angles=np.zeros(2))),
+        "image": pickled(lambda d: d.update(image=np.zeros((2, 2, 2)))),
+    },
+    "rtk": {
+        "SourceToIsocenterDistance": text(XML, "Distance>500.0<", "Distance>0<"),
+        "SourceToDetectorDistance": text(XML, "Distance>800.0<", "Distance>80<"),
+        "GantryAngle": text(XML, "<GantryAngle>", "<GantryAngle>ten "),
+        "RadiusCylindricalDetector": text(XML, "<Projection>", f"{CURVED}<Projection>"),
+        "6 frames, 7": text(XML, "</RTKThree", f"{ONE_MORE}</RTKThree"),
+        "version": text(XML, 'version="3"', 'version="2"'),
+        "TransformMatrix": text(MHA, "Matrix = 1 0 0 0 1 0 0 0 1", "Matrix = 0 0 1 0 1 0 1 0 0"),
+        MHA: text(MHA, "NDims = 3", "NDims = 4"),
+    },
+    "data-exchange": {
+        "/exchange/theta": on("exchange/theta", value(np.zeros(3))),
+        "gon": on("exchange/theta", attribute("units", "gon")),
+        "data_white": on("exchange/data_white", value(np.ones((1, 2, 3)))),
+        "no usable value": on("exchange/data_white", value(np.zeros((1, 10, 14)))),
+        "what the pixels hold": on("exchange/data_white", removed),
+        "pixel_size": on("measurement", removed),
+    },
+    "nxtomo": {
+        "source/distance": on(f"{ENTRY}/instrument/source/distance", value(0.0)),
+        "detector/distance": on(f"{DETECTOR}/distance", removed),
+        "image_key_control": on(f"{DETECTOR}/image_key_control", value(np.ones(9, int))),
+        "transformations/rx": on(f"{DETECTOR}/transformations/rx", value(12.0)),
+        "x_translation": on(ENTRY, lambda f, a: f.__setitem__(f"{a}/sample/x_translation", np.arange(9.0))),
+        "phyradgs": on(ENTRY, lambda f, a: f.create_group(f"{a}/phyradgs")),
+    },
+    "tiff": {
+        "angels": text(TOML, "[angles]", "[angels]"),
+        "flat": text(TOML, "flats =", "flat ="),
+        "step_deg and values_deg": text(TOML, "[angles]", "[angles]\nstep_deg = 2"),
+        "values_deg": text(TOML, "values_deg = [", "values_deg = [1, 2] # ["),
+        "no file that matches": text(TOML, '"proj_*.tif"', '"x_*.tif"'),
+        "a hole": lambda path: (text(TOML, *STEPS)(path), gone("proj_3.tif")(path)),
+        "(10, 13)": image("proj_1.tif", (10, 13)),
+        "(10, 14, 3)": image("proj_1.tif", (10, 14, 3), photometric="rgb"),
+        "one number": lambda path: (text(TOML, *STEPS)(path), (path / "proj_3.tif").rename(path / "proj_02.tif")),
+        "Orientation": image("proj_1.tif", (10, 14), extratags=[(274, 3, 1, 6, True)]),
+        "100 images and 1 of them": image("proj_1.tif", (10, 14), description="ImageJ=1.54\nimages=100\n"),
+        "start times": text(TOML, "[frames]", "[timing]\nexposure_s = 1\nstart_s = [0, 0, 0, 0, 0, 0]\n[frames]"),
+    },
+    "nikon": {
+        "Projections": text(XTEK, "Projections=6", "Projections=7"),
+        "6 × 10 × 15": text(XTEK, "PixelsX=14", "PixelsX=15"),
+        "WhiteLevel": text(XTEK, "WhiteLevel", "Level"),
+        "SrcToObject": text(XTEK, "SrcToObject=500.0", "SrcToObject=far"),
+        "AngularStep": text(XTEK, "AngularStep", "Step"),
+        "source_to_detector_mm": text(XTEK, "SrcToDetector=800.0", "SrcToDetector=400"),
+    },
+    "skyscan": {
+        "Filename Prefix": text(LOG, "Filename Prefix=scan_", ""),
+        "Number of Files": text(LOG, "Files= 6", "Files= 9"),
+        "Scanning Trajectory": text(LOG, "ROUND", "SPIRAL"),
+        "Flat Field Correction": text(LOG, "Correction=ON", "Correction=OFF"),
+        "Image Pixel Size (um)": text(LOG, "Size (um)=1562.5", "Size (um)=0"),
+        "Optical Axis (line)": text(LOG, "(line)=", "(line)=1e9"),
+    },
+    "flexray": {
+        "SDD": text(SETTINGS, "SDD", "SD"),
+        "Binned pixel size": text(SETTINGS, "Binned pixel size : 3.0", "Binned pixel size : none"),
+        "ROI (LTRB)": text(SETTINGS, "0,0,1943,1535", "0,0,1943"),
+        "Last angle": text(SETTINGS, "Last angle", "Angle"),
+        "io": lambda path: [gone(f"io00000{i}.tif")(path) for i in (0, 1)], "io000000": image("io000000.tif", (9, 14)),
+    },
+    "leap": {
+        "geometry": text(PARAMS, "geometry = cone", "geometry = fan"),
+        "helicalPitch": text(PARAMS, "helicalPitch = 0.0", "helicalPitch = 2"),
+        "(7, 10, 14)": text(PARAMS, "numAngles = 6", "numAngles = 7"),
+        "phis": text(PARAMS, "phis = 100.0, ", "phis = "),
+        "sdd": text(PARAMS, "sdd = 800.0", ""),
+        "sourcePositions": text(PARAMS, "geometry = cone", "geometry = modular"),
+        "no .npy and no TIFF": gone("g.npy"),
+    },
+}  # fmt: skip
+CASES = [(form, said) for form, mistakes in MISTAKES.items() for said in mistakes]
+
+
+@contextmanager
+def at_most(peak_bytes: float) -> Iterator[None]:
+    tracemalloc.start()
+    try:
+        yield
+        assert tracemalloc.get_traced_memory()[1] < peak_bytes
+    finally:
+        tracemalloc.stop()
+
+
+def refused(path: Path, options: ImportOptions | None, form: str, said: str) -> None:
+    with pytest.raises(InputError) as caught:
+        import_scan(path, options, form)
+    assert said in str(caught.value) and len(str(caught.value).splitlines()) == 1, caught.value
+
+
+@pytest.mark.parametrize("form", MISTAKES)
+def test_a_mistake_is_named(tmp_path, make_truth, form) -> None:
+    for number, (said, damage) in enumerate(MISTAKES[form].items()):
+        (tmp_path / str(number)).mkdir()
+        path = w.write(form, tmp_path / str(number), make_truth)
+        damage(path)
+        refused(path, OPTIONS.get(form), form, said)
+
+
+def test_mistakes_in_streams_of_xradia(tmp_path, make_truth) -> None:
+    truth = make_truth(geometry=replace(make_truth().scan.geometry, detector_offset_mm=(0.0, 0.0)))
+    for name, wrong in {
+        "ImageInfo/NoOfImages": np.int32(1000), "ImageData1/Image4": np.zeros(99, np.uint16),
+        "ImageInfo/DataType": np.int32(7),
+        "ImageInfo/Angles": np.zeros(3, np.float32), "ImageInfo/StoRADistance": np.float32([500, 510] * 3),
+        "ImageInfo/PixelSize": np.float32(0), "Alignment/X-Shifts": np.ones(2, np.float32),
+        "ReferenceData/Image": np.ones(70, np.float32),
+    }.items():  # fmt: skip
+        path = lab.write_zeiss(tmp_path / f"{name.replace('/', ' ')}.txrm", truth, **{name: wrong})
+        refused(path, None, "zeiss", "ImageData1/Image7" if "NoOf" in name else name)
+
+
+# --- what no file may do ------------------------------------------------------------------------------------------------
+
+
+class Bomb:
+    """Runs a shell command when it is unpickled by anything that runs what a pickle says."""
+
+    def __init__(self, canary: Path) -> None:
+        self.canary = canary
+
+    def __reduce__(self) -> tuple[object, tuple[str]]:
+        return os.system, (f"touch {self.canary}",)
+
+
+def npy(shape: str, descr: str) -> bytes:
+    header = f"{{'descr': {descr}, 'fortran_order': False, 'shape': {shape}, }}\n".encode()
+    return b"\x93NUMPY\x01\x00" + struct.pack("<H", len(header)) + header + bytes(560)
+
+
+def test_nothing_in_a_pickle_is_executed(tmp_path, make_truth) -> None:
+    canary = tmp_path / "canary"
+    for form in ("naf", "tigre"):
+        path = w.write(form, tmp_path, make_truth)
+        path.write_bytes(pickle.dumps({"tigre.utilities.geometry": 1, "unused": Bomb(canary)}))
+        refused(path, None, form, "nothing was executed")
+    for opcodes in (b"(S'touch canary'\nios\nsystem\n.", b"cos\nsystem\n(S'touch canary'\ntR.", b"c__builtin__\neval\n."):
+        path.write_bytes(opcodes)
+        refused(path, None, "naf", "nothing was executed")
+    path = w.write("naf", tmp_path, make_truth)
+    pickled(lambda d: d["train"].update(projections=np.array([Bomb(canary), None], object)))(path)
+    refused(path, None, "naf", "'O8'")
+    path = w.write("r2", tmp_path, make_truth)
+    (path / "proj_train/0000.npy").write_bytes(npy("(10, 14)", "'|O'"))
+    refused(path, None, "r2", "damaged .npy")
+    assert not canary.exists()
+
+
+def test_no_file_leads_out_of_its_folder(tmp_path, make_truth) -> None:
+    np.save(tmp_path / "secret.npy", np.full((10, 14), 7.0, np.float32))
+    ways = ("../secret.npy", "proj_train/../../secret.npy", "..\\secret.npy", "C:secret.npy", str(tmp_path / "secret.npy"))
+    leads = [("r2", named(way)) for way in ways] + [("r2", meta(lambda m: m.update(vol="../secret.npy")))]
+    leads += [("rtk", text(MHA, "DataFile = LOCAL", f"DataFile = {way}")) for way in ("../secret.npy", "/etc/passwd")]
+    leads += [("tiff", text(TOML, '"proj_*.tif"', f'"{way}"')) for way in ("../proj_*.tif", "/tmp/*.tif")]
+    leads += [("tiff", text(TOML, "values_deg", "file = '../angles.txt' #"))]
+    leads += [("nikon", text(XTEK, "FolderName=", "FolderName=../in"))]
+    for number, (form, damage) in enumerate(leads):
+        (tmp_path / str(number)).mkdir()
+        damage(path := w.write(form, tmp_path / str(number), make_truth))
+        refused(path, None, form, "inside the folder")
+    for number, entity in enumerate(("[<!ENTITY x SYSTEM 'file:///etc/passwd'>]", f"SYSTEM '{tmp_path}/secret.npy'")):
+        (tmp_path / f"xml {number}").mkdir()
+        path = w.write("rtk", tmp_path / f"xml {number}", make_truth)
+        text(XML, "<!DOCTYPE RTKGEOMETRY>", f"<!DOCTYPE RTKGEOMETRY {entity}>")(path)
+        text(XML, "<GantryAngle>", "<GantryAngle>&x;")(path)
+        refused(path, None, "rtk", XML)
+    path = w.write("data-exchange", tmp_path, make_truth)
+    on("exchange", lambda f, a: (f[a].pop("data"), f[a].__setitem__("data", h5py.ExternalLink("/etc/passwd", "/"))))(path)
+    refused(path, CONE, "data-exchange", "passwd")
+
+
+def test_sizes_are_held_against_this_machine_before_anything_is_unpacked(tmp_path, make_truth, monkeypatch) -> None:
+    path = w.write("tiff", tmp_path, make_truth)
+    tifffile.imwrite(path / "proj_all.tif", np.zeros((6, 1000, 1000), np.float32), compression="zlib")
+    text(TOML, "proj_*", "proj_all")(path)
+    monkeypatch.setattr("phyradgs_cl.importers.reading.files.host_bytes", lambda: 50e6)
+    with at_most(2e6):
+        refused(path, None, "tiff", "proj_all.tif: found 0.0503 GiB to unpack; expected at most 0.0373 GiB")
+    packed = sitk.GetImageFromArray(np.zeros((200, 200, 200), np.float32))
+    sitk.WriteImage(packed, str(tmp_path / "v.nrrd"), useCompression=True)
+    with pytest.raises(InputError, match="to unpack"):
+        load_volume(tmp_path / "v.nrrd")
+    path = w.write("r2", tmp_path, make_truth)
+    (path / "proj_train/0000.npy").write_bytes(npy("(1000000, 1000000)", "'<f4'"))
+    refused(path, None, "r2", "damaged .npy")
+
+
+@pytest.mark.parametrize(("dtype", "compression"), [(np.float32, None), (np.float32, "zlib"), (np.uint16, None)])
+def test_a_good_stack_takes_twice_its_line_integrals(tmp_path, make_truth, dtype, compression) -> None:
+    """The frames as stored and their line integrals, one byte per pixel for the mask, and blocks."""
+    path = w.write_tiff(tmp_path / "tiff", make_truth(), angles="step_deg = 10")
+    frames = np.random.default_rng(0).integers(1000, 50000, (32, 250, 250)).astype(dtype)
+    for name, stack in (("proj", frames), ("flat", frames[:2]), ("dark", frames[:1] * 0)):
+        options = {"compression": compression, "photometric": "minisblack"}
+        tifffile.imwrite(path / f"{name}_all.tif", stack, **options)
+        text(TOML, f"{name}_*", f"{name}_all")(path)
+    with at_most(2.5 * 4 * frames.size + 8e6):
+        import_scan(path)
+
+
+def test_frames_by_name(tmp_path, make_truth) -> None:
+    """Each frame takes the view of its place from the first one on."""
+    path = w.write("phyradgs-real", tmp_path, make_truth)
+    (path / "projections" / "2.tif").unlink()
+    with pytest.raises(InputError, match=r"3.tif after 1.tif: a hole"):
+        import_scan(path, replace(REAL, first_view=0))
+    path = w.write_r2(tmp_path / "r2", make_truth())
+    meta = json.loads((path / "meta_data.json").read_text())
+    for entry in meta["proj_train"]:
+        entry["file_path"] = entry["file_path"].replace(".npy", "_sim1.npy")
+    (path / "meta_data.json").write_text(json.dumps(meta))
+    scan = import_scan(path)
+    np.testing.assert_array_equal(scan.projections, make_truth().scan.projections[:4])
+
+
+UNKNOWN = {
+    "nothing": lambda p: None, "an empty folder": lambda p: p.mkdir(),
+    "some text": lambda p: p.write_text("hello"),
+    "a folder of text": lambda p: (p.mkdir(), (p / "a.txt").write_text("hello")),
+    "two formats": lambda p: (p.mkdir(), [(p / f"a.{s}").write_text("") for s in ("xml", "mha", "toml")]),
+}
+
+
+def test_what_is_not_recognised_is_said(tmp_path) -> None:
+    for case, make in UNKNOWN.items():
+        (tmp_path / case).mkdir()
+        make(tmp_path / case / "what")
+        with pytest.raises(InputError, match="what: found"):
+            import_scan(tmp_path / case / "what")
+
+
+def test_notes_and_logs_that_are_links_or_folders_do_not_matter(tmp_path, make_truth) -> None:
+    """Files that any folder may have, and that some formats describe their scans with."""
+    path = w.write_tiff(tmp_path / "tiff", make_truth())
+    (path / "notes.txt").symlink_to(tmp_path / "nowhere")
+    (path / "run.log").mkdir()
+    assert import_scan(path).frames == 6
+
+
+def test_what_the_user_names_is_the_user_s_business(tmp_path, make_truth) -> None:
+    """A link, unlike one that a file names; a description under another name; an option without use."""
+    path = w.write_r2(tmp_path / "r2", make_truth())
+    (tmp_path / "link").symlink_to(path)
+    assert import_scan(tmp_path / "link").frames == 4
+    text = (path / "meta_data.json").read_text().replace('"DSO": 500.0', '"DSO": 400.0')
+    (path / "other.json").write_text(text)
+    assert import_scan(path / "other.json", form="r2").geometry.source_to_axis_mm == 400
+    (path / "other.json").unlink()
+    with pytest.raises(InputError, match="^rotates with format r2"):
+        import_scan(path, ImportOptions(rotates="sample"))
+
+
+def test_options_are_checked() -> None:
+    for name, wrong in [
+        ("exposure_s", -1.0), ("readout_s", float("nan")), ("frame_time_s", 0.0), ("angle_at", "end"),
+        ("part", "half"),
+        ("readout_axis", "diagonal"), ("readout_direction", 2), ("source_to_axis_mm", -5.0), ("unit_mm", 0.0),
+        ("pixel_size_mm", (1.0, 0.0)), ("detector_offset_mm", (float("inf"), 0.0)), ("rotates", "both"),
+        ("row_0", "left"), ("quantity", "hounsfield"), ("flat_value", 0.0),
+    ]:  # fmt: skip
+        with pytest.raises(InputError, match=f"^{name}: "):
+            ImportOptions(**{name: wrong})
+
+
+def test_what_is_not_there_is_not_looked_for_elsewhere_and_no_pipe_is_opened(tmp_path, make_truth) -> None:
+    folder = w.write("rtk", tmp_path, make_truth)
+    with pytest.raises(InputError, match="nothing there"):
+        import_scan(folder / "missing.xml", None, "rtk")
+    os.mkfifo(folder / "pipe")
+    with pytest.raises(InputError, match="neither a file nor a folder"):
+        import_scan(folder / "pipe", None, "rtk")
+
+
+def test_a_stack_without_the_directory_of_its_last_pages_is_refused(tmp_path) -> None:
+    """tifffile reads the first page, and logs that there are no others."""
+    tifffile.imwrite(path := tmp_path / "v.tif", np.ones((3, 40, 50), np.uint16), photometric="minisblack")
+    assert load_volume(path).values.shape == (3, 40, 50)
+    path.write_bytes(path.read_bytes()[: int(0.9 * path.stat().st_size)])
+    with pytest.raises(InputError, match="pages behind the end"):
+        load_volume(path)
+
+
+@pytest.mark.parametrize("name", ["v.nii", "v.nii.gz", "v.mha", "packed.mha"])
+def test_images_with_too_few_voxels_are_refused(tmp_path, name) -> None:
+    """SimpleITK fills up what is missing in NIfTI, and what is damaged in packed MetaImages."""
+    values = np.random.default_rng(0).normal(size=(8, 9, 10)).astype(np.float32)
+    sitk.WriteImage(sitk.GetImageFromArray(values), path := str(tmp_path / name), useCompression="packed" in name)
+    np.testing.assert_array_equal(load_volume(path).values, values)
+    content = Path(path).read_bytes()
+    for keep in (len(content) // 2, len(content) - 8):
+        Path(path).write_bytes(content[:keep])
+        with pytest.raises(InputError, match="bytes of voxels|a damaged file"):
+            load_volume(path)
+    if name != "v.nii" and name != "v.mha":
+        Path(path).write_bytes(content[:-200] + bytes(4) + content[-196:])
+        with pytest.raises(InputError, match="a damaged file"):
+            load_volume(path)
