@@ -30,7 +30,6 @@ COMMANDS = {
     "export": ("files", "Write a volume for 3D Slicer, ImageJ, napari and others."),
     "bench": ("sweep", "Compare methods on two built-in phantoms."),
     "sweep": ("sweep", "Reconstruct many scans with many settings."),
-    "watch": ("watch", "Reconstruct the scans of a folder as they arrive."),
     "info": ("files", "Print the contents of a scan or volume file."),
     "devices": ("devices", "List OpenCL devices, and the one that is used."),
 }

@@ -4,6 +4,7 @@ from phyradgs_cl.errors import InputError
 
 REMOVED = {
     "phyradgs splat": "start Gaussians from a volume with 'phyradgs reconstruct SCAN --method phyradgs --initial VOLUME'",
+    "phyradgs watch": "run examples/watch_folder.py of the source, which calls 'phyradgs reconstruct' for each scan",
 }
 
 

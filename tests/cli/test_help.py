@@ -54,7 +54,7 @@ def test_options_that_commands_share_are_declared_once(cli) -> None:
     """All but what is written, a file or a folder, and a sweep's devices say the same in every command."""
     commands = typer.main.get_command(cli.app).commands
     help_of: dict[str, str] = {}
-    for name in ("reconstruct", "estimate", "watch", "sweep"):
+    for name in ("reconstruct", "estimate", "sweep"):
         for parameter in commands[name].params:
             is_own = parameter.name == "output" or (name, parameter.name) == ("sweep", "device")
             if parameter.param_type_name == "option" and not is_own:
