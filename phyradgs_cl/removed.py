@@ -3,12 +3,13 @@
 from phyradgs_cl.errors import InputError
 
 REMOVED = {
+    "phyradgs bench": "run 'make demo', or python benchmarks/tables, in the source (docs: benchmarks.md)",
     "phyradgs splat": "start Gaussians from a volume with 'phyradgs reconstruct SCAN --method phyradgs --initial VOLUME'",
     "phyradgs watch": "run examples/watch_folder.py of the source, which calls 'phyradgs reconstruct' for each scan",
+    "--scheduler": "write --workers ADDRESS",
 }
 
 
-def refuse_removed(word: str) -> None:
-    """Raises InputError with the replacement if ``word`` has left: ``phyradgs NAME`` for a command."""
-    if word in REMOVED:
-        raise InputError(word, "a word of an earlier version", "", REMOVED[word])
+def removed(word: str) -> InputError | None:
+    """Returns the error that names the replacement of ``word``, a command as ``phyradgs NAME`` or an option; else None."""
+    return InputError(word, "a word of an earlier version", "", REMOVED[word]) if word in REMOVED else None

@@ -16,6 +16,7 @@ from phyradgs_cl import signals
 from phyradgs_cl.checks import short_repr
 from phyradgs_cl.errors import InputError, OutputError, PhyradgsError
 from phyradgs_cl.parallel import launched
+from phyradgs_cl.removed import removed
 from phyradgs_cl.text import plain_text
 
 AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
@@ -105,6 +106,8 @@ def scores(metrics: Mapping[str, float | None]) -> str:
 
 def usage_text(error: Any, arguments: Sequence[str]) -> str:
     """Returns Typer's message about the words of a command, with the value that it could not read."""
+    if left := removed(getattr(error, "option_name", "")):
+        return str(left)
     text = str(error.format_message()).replace("Value error, ", "")
     value = _value_of(getattr(error, "param", None), arguments)
     return text if value is None or repr(value) in text else f"{text.rstrip('.')}; found {short_repr(value)}"

@@ -42,7 +42,7 @@ def test_help_is_whole_everywhere(cli, told, monkeypatch) -> None:
         text = told(name, "--help")
         assert text == told(name, "-h") and "-h, --help" in text and f"Example: phyradgs {name}" in text
         for parameter in command.params:
-            if parameter.param_type_name == "argument" and name != "bench":  # which has a choice of words
+            if parameter.param_type_name == "argument":
                 assert parameter.metavar.isupper()
             assert getattr(parameter, "help", None), f"{name}: {parameter.name} says nothing"
     for name in ("reconstruct", "estimate"):
