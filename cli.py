@@ -11,6 +11,7 @@ from phyradgs_cl import __version__, signals
 from phyradgs_cl.commands.console import GroupedCommand, complain, give_up_stdout, say, takes_part, usage_text
 from phyradgs_cl.errors import OutputError, PhyradgsError, naming_host_memory
 from phyradgs_cl.io.output import NO_SPACE
+from phyradgs_cl.removed import removal
 
 _CLICK_ERROR: type[Exception] = next(c for c in typer.BadParameter.__mro__ if c.__name__ == "ClickException")
 HELP = {"help_option_names": ["-h", "--help"]}
@@ -26,11 +27,8 @@ COMMANDS = {
     "evaluate": ("evaluate", "Measure a volume against the truth."),
     "report": ("report", "Write one HTML page about a reconstruction."),
     "view": ("report", "Look at a volume in napari."),
-    "splat": ("splat", "Fit Gaussians to a volume."),
     "export": ("files", "Write a volume for 3D Slicer, ImageJ, napari and others."),
-    "bench": ("sweep", "Compare methods on two built-in phantoms."),
     "sweep": ("sweep", "Reconstruct many scans with many settings."),
-    "watch": ("watch", "Reconstruct the scans of a folder as they arrive."),
     "info": ("files", "Print the contents of a scan or volume file."),
     "devices": ("devices", "List OpenCL devices, and the one that is used."),
 }
@@ -69,6 +67,11 @@ class Commands(TyperGroup):
 
     def list_commands(self, ctx: Any) -> list[str]:
         return list(COMMANDS)
+
+    def get_command(self, ctx: Any, name: str) -> Any:
+        if error := removal(f"phyradgs {name}"):
+            raise error
+        return super().get_command(ctx, name)
 
     def format_commands(self, ctx: Any, formatter: Any) -> None:
         with formatter.section("Commands"):

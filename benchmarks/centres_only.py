@@ -3,8 +3,8 @@
     python benchmarks/centres_only.py docs/results/centres_only.jsonl [VOLUMES]
 
 Relative RMS of one frame, 128². By distance from the axis (half-sides of the box): mean of eight Gaussians of random turns,
-against 60 times of every row's own; long ones are 0.08 by 0.02 by 0.02, round ones 0.03. By object: 20,000 Gaussians fitted
-to each 128³ volume of the folder VOLUMES, averaged to 64³, against 20 segments of their exact motion.
+against 60 times of every row's own; long ones are 0.08 by 0.02 by 0.02, round ones 0.03. By object: the Gaussians of
+each volume file of the folder VOLUMES, as ``reconstruct --method phyradgs`` writes it, against 20 segments of their motion.
 """
 
 import json
@@ -23,13 +23,11 @@ from phyradgs_cl.acquisition.cells import (
     per_line_cells,
     static_cells,
 )
-from phyradgs_cl.fields import Grid
-from phyradgs_cl.importers import load_attenuation
+from phyradgs_cl.io import read_volume
 from phyradgs_cl.operators import DeviceCells, SplatProjector
-from phyradgs_cl.reconstructors.splats.volume_fit import VolumeFitOptions, fit_volume
 from phyradgs_cl.runtime import Runtime
 
-PIXELS, COUNT, TIMES, FITTED, FRAME = 128, 8, 60, 20_000, 3
+PIXELS, COUNT, TIMES, FRAME = 128, 8, 60, 3
 SCALES = {"round": (0.03, 0.03, 0.03), "long": (0.08, 0.02, 0.02)}
 Line = dict[str, object]
 
@@ -74,16 +72,14 @@ def by_distance(rt: Runtime) -> Iterator[Line]:
 
 
 def by_object(rt: Runtime, volumes: Path) -> Iterator[Line]:
-    for path in sorted(volumes.glob("*_128.h5")):
-        values = load_attenuation(path).values.reshape(64, 2, 64, 2, 64, 2).mean((1, 3, 5))
-        cloud = fit_volume(rt, values, Grid.cube(64, 2.0), VolumeFitOptions(FITTED)).gaussians
+    for path in sorted(volumes.glob("*.h5")):
+        cloud = read_volume(path).gaussians
         rows = cloud.rows()[:, np.argsort(cloud.mean[:, 2])]
         for protocol in ("rapid", "standard"):
             where = frame_of(protocol)
             fine = SplatProjector(rt, PIXELS, PIXELS, time_error=1e-4)
             expected = fine.project(rows, DeviceCells.upload(rt, exact_cells(*where, 20)))
-            name = path.stem.removesuffix("_128")
-            yield {"volume": name, "protocol": protocol, **errors(rt, where, rows, expected.astype(np.float64))}
+            yield {"volume": path.stem, "protocol": protocol, **errors(rt, where, rows, expected.astype(np.float64))}
 
 
 def main() -> None:

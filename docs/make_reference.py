@@ -59,7 +59,8 @@ def examples_page() -> str:
     text = [
         NOTE,
         "# Examples\n",
-        "Scripts that run as they stand (`python examples/NAME.py`), each in less than a minute on two cores.\n",
+        "Scripts that run as they stand (`python examples/NAME.py`), each in less than a minute on two cores; "
+        "`watch_folder.py` takes two folders and goes on.\n",
     ]
     for path in sorted((FOLDER.parent.parent / "examples").glob("*.py")):
         script = path.read_text(encoding="utf-8")

@@ -183,21 +183,6 @@ def centres_object() -> str:
     return markdown(["protocol", *ONE_FRAME.values()], text)
 
 
-def fitted_volumes() -> str:
-    """Gaussians fitted to volumes: error, compression and processor time, means for each number of Gaussians."""
-    by_count: dict[int, list[dict[str, Any]]] = {}
-    for line in lines_of("splat_volumes.jsonl"):
-        by_count.setdefault(line["gaussians"], []).append(line)
-    text = []
-    for count, lines in by_count.items():
-        psnr, ssim, compression, seconds = (
-            [line[key] for line in lines] for key in ("psnr_db", "ssim", "compression", "processor_s")
-        )
-        quality = [f"{mean(psnr):.1f} ({min(psnr):.1f} to {max(psnr):.1f})", f"{mean(ssim):.3f} ({min(ssim):.3f})"]
-        text.append([f"{count:,}", *quality, f"{mean(compression):.2f}", f"{mean(seconds):.0f}"])
-    return markdown(["Gaussians", "PSNR, dB", "SSIM (least)", "voxels / parameters", "processor, s"], text)
-
-
 def splat_starts() -> str:
     """PSNR and SSIM of phyradgs from two starts, volume by volume, and the mean processor time."""
     lines, text = lines_of("splat_starts.jsonl"), []
@@ -606,7 +591,6 @@ TABLES: dict[str, Callable[[], str]] = {
     "motion_models": motion_models,
     "centres_distance": centres_distance,
     "centres_object": centres_object,
-    "fitted_volumes": fitted_volumes,
     "splat_starts": splat_starts,
     "detector_models": detector_models,
     "prior_weight": lambda: sweep("prior_weight.jsonl", held_out=False),

@@ -32,6 +32,20 @@ def flattened(table: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str,
             yield prefix + name, value
 
 
+def nested(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Returns nested tables from dotted names, the inverse of ``flattened``; the last of two values for one name counts."""
+    tables: dict[str, Any] = {}
+    for name, value in values.items():
+        *groups, last = name.split(".")
+        table = tables
+        for group in groups:
+            if not isinstance(table.get(group), dict):
+                table[group] = {}
+            table = table[group]
+        table[last] = value
+    return tables
+
+
 def repr_of_changes(thing: Any) -> str:
     """Returns the repr of a dataclass with the fields that differ from their defaults; arrays as their shape."""
     texts = []

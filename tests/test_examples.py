@@ -3,9 +3,14 @@
 import ast
 import importlib.util
 import json
+import os
 import re
+import signal
 import subprocess
 import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -15,8 +20,11 @@ from phyradgs_cl import api
 ROOT = Path(__file__).resolve().parent.parent
 EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
 LACKING = [name for name in ("torch", "deepinv") if importlib.util.find_spec(name) is None]  # `make test-neural` has both
+SERVICE = ROOT / "examples" / "watch_folder.py"
 RUN = [
-    path for path in EXAMPLES if not any(f"import {name}\n" in path.read_text(encoding="utf-8") for name in LACKING)
+    path
+    for path in EXAMPLES
+    if path != SERVICE and not any(f"import {name}\n" in path.read_text(encoding="utf-8") for name in LACKING)
 ]
 MOST_LINES, LONGEST_S = 60, 300  # under a minute on two cores that have nothing else to do
 SAID = {
@@ -40,6 +48,47 @@ def test_an_example_runs_as_it_stands(tmp_path, path) -> None:
         assert found, done.stdout
         numbers = {name: float(value) for name, value in found.groupdict().items()}
         assert numbers.get("less", 0.0) < numbers["more"]
+
+
+def test_the_service_makes_each_scan_once_and_goes_on_when_it_is_killed(tmp_path, tiny_scan) -> None:
+    """A scan that is cut off fails, and is made when the rest of it has come."""
+    incoming, volumes, log = tmp_path / "in", tmp_path / "out", tmp_path / "said.txt"
+    incoming.mkdir()
+    whole = tiny_scan.read_bytes()
+    (incoming / "a.h5").write_bytes(whole[: len(whole) // 2])
+
+    @contextmanager
+    def service(iterations: int) -> Iterator[Callable[[Callable[[], bool]], None]]:
+        """A running service, which is killed in the end, and a function that waits for what it does."""
+        words = ["--method", "sirt", "--iterations", str(iterations), "--checkpoint-every", "0.01"]
+        command = [sys.executable, str(SERVICE), str(incoming), str(volumes), *words]
+        with open(log, "a") as said, subprocess.Popen(command, stdout=said, stderr=said, start_new_session=True) as process:
+
+            def wait_for(is_so: Callable[[], bool]) -> None:
+                deadline = time.monotonic() + LONGEST_S
+                while not is_so():
+                    assert process.poll() is None and time.monotonic() < deadline, log.read_text()
+                    time.sleep(0.02)
+
+            try:
+                yield wait_for
+            finally:
+                os.killpg(process.pid, signal.SIGKILL)
+
+    a, b = (volumes / name for name in ("a.h5", "b.h5"))
+    with service(3) as wait_for:
+        wait_for((volumes / "a.log").exists)
+        assert not a.exists() and "phyradgs: " in (volumes / "a.log").read_text()
+        (incoming / "a.h5").write_bytes(whole)
+        wait_for(lambda: a.exists() and "PSNR" in (volumes / "a.log").read_text())
+    made_ns = a.stat().st_mtime_ns
+    (incoming / "b.h5").write_bytes(whole)
+    with service(4000) as wait_for:
+        wait_for(Path(f"{b}.checkpoint.npz").exists)
+    assert not b.exists()
+    with service(4000) as wait_for:
+        wait_for(b.exists)
+    assert a.stat().st_mtime_ns == made_ns and not list(volumes.glob("*.bak"))  # no run has begun anew
 
 
 @pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.stem)

@@ -40,10 +40,6 @@ _STEPS = f"Corrections of the frames, of {', '.join(STEPS)} (docs: prepare.md)."
 STEPS_OF_PREPARE = option(_STEPS, DEFAULT_STEPS, metavar="NAME,...")
 Steps = Annotated[str | None, option(_STEPS, "none", metavar="NAME,...")]
 
-_SCHEDULER = "Dask scheduler for the runs: its address or its JSON file; local starts workers here."
-Scheduler = Annotated[str | None, option(_SCHEDULER, metavar="ADDRESS|local")]
-WorkerCount = Annotated[int | None, option("Local workers, each a process.", "one per device", metavar="N")]
-
 
 def numbers(text: str) -> float | list[float] | str:
     """Returns a number, or several with commas between; other text unchanged, for the error of the check that follows."""

@@ -26,7 +26,6 @@ _LONGEST = 50  # characters of the target's name, of up to four bytes each: name
 _LONGEST_BYTES = 255  # of a name, in all common file systems
 _SPARE_BYTES = 1 << 16  # for headers
 _WRITER = re.compile(r"\.([0-9a-f]{8})-(\d{1,9})-[0-9a-f]{8}\.part(\.[a-z.]+)?$")
-_TRY_EVERY_S = 0.2
 _FORMAT = 2
 _RESTART = "start without --resume"
 
@@ -62,15 +61,15 @@ def lock_path(output: str | Path) -> Path:
 
 
 @contextmanager
-def only_run(output: str | Path, wait_s: float = 0.0) -> Iterator[None]:
-    """Holds the lock of ``output``, which the system releases when a process ends. BusyError where another run still holds
-    it after ``wait_s``."""
+def only_run(output: str | Path) -> Iterator[None]:
+    """Holds the lock of ``output``, which the system releases when a process ends. BusyError where another run holds
+    it."""
     from filelock import FileLock, Timeout
 
     path = lock_path(output)
     lock = FileLock(path)
     try:
-        lock.acquire(timeout=wait_s, poll_interval=_TRY_EVERY_S)
+        lock.acquire(timeout=0)
     except Timeout:
         remedy = "wait for it, or choose another output"
         raise BusyError(str(output), "another run at work on it", "one run per output", remedy) from None

@@ -1,5 +1,5 @@
 """A run as one value: its method, options, preprocessing, seed and first volume, and how the object moves. The command line,
-configuration files, the API, sweeps and watched folders all make it with ``plan_run``."""
+configuration files, the API, sweeps all make it with ``plan_run``."""
 
 import hashlib
 import logging

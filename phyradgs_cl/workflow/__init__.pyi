@@ -9,4 +9,3 @@ from .scans import refuse_noise_options as refuse_noise_options
 from .scans import run_preparation as run_preparation
 from .scans import run_simulation as run_simulation
 from .volumes import run_evaluation as run_evaluation
-from .volumes import run_splat_fit as run_splat_fit

@@ -42,7 +42,7 @@ def test_help_is_whole_everywhere(cli, told, monkeypatch) -> None:
         text = told(name, "--help")
         assert text == told(name, "-h") and "-h, --help" in text and f"Example: phyradgs {name}" in text
         for parameter in command.params:
-            if parameter.param_type_name == "argument" and name != "bench":  # which has a choice of words
+            if parameter.param_type_name == "argument":
                 assert parameter.metavar.isupper()
             assert getattr(parameter, "help", None), f"{name}: {parameter.name} says nothing"
     for name in ("reconstruct", "estimate"):
@@ -54,7 +54,7 @@ def test_options_that_commands_share_are_declared_once(cli) -> None:
     """All but what is written, a file or a folder, and a sweep's devices say the same in every command."""
     commands = typer.main.get_command(cli.app).commands
     help_of: dict[str, str] = {}
-    for name in ("reconstruct", "estimate", "watch", "sweep"):
+    for name in ("reconstruct", "estimate", "sweep"):
         for parameter in commands[name].params:
             is_own = parameter.name == "output" or (name, parameter.name) == ("sweep", "device")
             if parameter.param_type_name == "option" and not is_own:

@@ -226,16 +226,6 @@ def test_a_signal_that_is_ignored_stays_ignored():
     signal.signal(signal.SIGINT, before)
 
 
-def test_a_benchmark_ends_with_its_own_line(tmp_path):
-    body = """
-        import phyradgs_cl.workflow.sweep.grid as r
-        r.run_simulation = lambda *_, **__: signal.raise_signal(signal.SIGTERM)
-    """
-    done = run_process(["bench", "quick", "-o", str(tmp_path)], body)
-    expected = f"phyradgs: interrupted: finished runs are in {tmp_path}/results.jsonl; repeat the command to continue\n"
-    assert (done.returncode, done.stderr) == (143, expected)
-
-
 def run_process(arguments, body):
     """The command line in a process that runs ``body`` first."""
     program = (

@@ -27,12 +27,9 @@ COMMANDS = (
     ("evaluate volume.h5 --reference scan.h5 --json", "volume.evaluated.png"),
     ("report volume.h5 --scan scan.h5 --views 2 -o page.html", "page.html"),
     ("view volume.h5", ""),
-    ("splat volume.h5 -o cloud.ply --gaussians 50 --iterations 2", "cloud.ply"),
     ("export volume.h5 --to nrrd -o volume.nrrd", "volume.nrrd"),
     (f"import foreign.h5 --format data-exchange {CONE} -o imported.h5", "imported.h5"),
-    ("sweep grid.toml -o swept", "swept/results.csv"),
-    ("watch incoming --once --settle-s 0 --method fdk -o out", "out/imported.h5"),
-    ("bench quick --iterations 1 -o bench", "bench/results.md"),
+    ("sweep grid.toml -o swept", "swept/results.md"),
 )
 
 
@@ -48,22 +45,15 @@ def write_foreign(path: Path) -> None:
 def test_every_command_does_its_work(cli, tmp_path, monkeypatch, capsys) -> None:
     windows = []
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("phyradgs_cl.workflow.sweep.grid.PHANTOMS", ("jaw",))
-    monkeypatch.setattr("phyradgs_cl.workflow.sweep.grid.VOXELS", 8)
-    monkeypatch.setattr("phyradgs_cl.workflow.sweep.grid.PIXELS", 12)
     monkeypatch.setattr("phyradgs_cl.commands.report.view_volume", windows.append)
     write_foreign(tmp_path / "foreign.h5")
     (tmp_path / "grid.toml").write_text(GRID)
     (tmp_path / "breathing.toml").write_text('kind = "breathing"')
-    (tmp_path / "incoming").mkdir()
     for line, output in COMMANDS:
-        if line.startswith("watch"):
-            (tmp_path / "incoming/imported.h5").write_bytes((tmp_path / "imported.h5").read_bytes())
         assert cli.run(line.split()) == 0, f"{line}: {capsys.readouterr().err}"
         assert (tmp_path / output).exists(), line
     assert len(windows) == 1 and load_scan(tmp_path / "imported.h5").frames == 4
-    for name in ("volume.h5", "out/imported.h5"):
-        assert read_volume(tmp_path / name).values.any(), name
+    assert read_volume(tmp_path / "volume.h5").values.any()
 
 
 def test_no_command_is_left_out(cli) -> None:

@@ -11,8 +11,8 @@ import psutil
 from cluster.processes import free_port, stop, wait_until
 
 from phyradgs_cl.io import read_volume
-from phyradgs_cl.settings import read_config
-from phyradgs_cl.workflow.sweep import RESULTS, SweepJob, read_grid, run_sweep
+from phyradgs_cl.workflow.sweep.grid import plan_sweep
+from phyradgs_cl.workflow.sweep.run import RESULTS, run_sweep
 from phyradgs_cl.workflow.sweep.tables import Line, read_lines
 
 RUNS = 40
@@ -50,8 +50,7 @@ def check_all(folder: Path, tmp: Path) -> None:
     lines = lines_of(folder)
     assert len(lines) == RUNS == len({line["run"] for line in lines})
     assert not [line for line in lines if "error" in line]
-    grid = read_grid(read_config(folder / "grid.toml"), folder / "grid.toml")
-    run_sweep(SweepJob(grid, tmp / "alone"))
+    run_sweep(plan_sweep(folder / "grid.toml", tmp / "alone"), tmp / "alone")
     for line in lines:
         volumes = (read_volume(root / line["volume"]).values for root in (folder / "out", tmp / "alone"))
         np.testing.assert_array_equal(*volumes)
@@ -95,13 +94,13 @@ def test_a_sweep_goes_on_at_a_new_scheduler(sweep_folder, start, tmp_path) -> No
         return start("-m", "dask", "scheduler", *options, log=tmp_path / "scheduler.txt")
 
     def workers() -> subprocess.Popen:
-        options = ["--nworkers", "2", "--nthreads", "1", "--resources", "device=1", "--no-dashboard"]
+        options = ["--nworkers", "2", "--nthreads", "1", "--no-dashboard"]
         environment = {**os.environ, "PHYRADGS_DEVICE": "cpu"}
         dask = ["-m", "dask", "worker", address, *options]
         return start(*dask, log=tmp_path / "workers.txt", env=environment, cwd=tmp_path)
 
     first, crew = scheduler(), workers()
-    sweep = start(*command(sweep_folder, "--scheduler", address), log=log)
+    sweep = start(*command(sweep_folder, "--workers", address), log=log)
 
     def said() -> str:
         return log.read_text()
@@ -112,9 +111,9 @@ def test_a_sweep_goes_on_at_a_new_scheduler(sweep_folder, start, tmp_path) -> No
     stop(first)
     stop(crew)
     wait_until(lambda: sweep.poll() is not None, 60, said)
-    assert sweep.returncode == 2 and "gone" in said() and "repeat the command" in said()
+    assert sweep.returncode == 2 and "no answer" in said() and "repeat the command" in said()
     scheduler(), workers()
-    again = start(*command(sweep_folder, "--scheduler", address), log=log)
+    again = start(*command(sweep_folder, "--workers", address), log=log)
     wait_until(lambda: again.poll() is not None, 900, said)
     assert again.returncode == 0, said()
     check_all(sweep_folder, tmp_path)

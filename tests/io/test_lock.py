@@ -25,8 +25,8 @@ def start(output: Path) -> subprocess.Popen[str]:
     return subprocess.Popen([sys.executable, "-c", HOLD, str(output)], stdout=PIPE, stderr=DEVNULL, text=True)
 
 
-def refused(path: Path, words: str = "another run", **wait: float) -> None:
-    with pytest.raises(OutputError, match=words), only_run(path, **wait):
+def refused(path: Path, words: str = "another run") -> None:
+    with pytest.raises(OutputError, match=words), only_run(path):
         pass
 
 
@@ -51,7 +51,7 @@ def test_a_second_run_is_refused_by_any_name_of_the_output(tmp_path, holder) -> 
 def test_a_run_beside_it_in_the_same_process_is_refused(tmp_path) -> None:
     output = tmp_path / "volume.h5"
     with only_run(output):
-        refused(output, wait_s=0.3)
+        refused(output)
     with only_run(output):
         pass
     with pytest.raises(ZeroDivisionError), only_run(tmp_path / "volume.h5"):

@@ -1,6 +1,5 @@
 """A method of somebody's own: a function, by itself or by its name, wherever a method is asked for."""
 
-import csv
 import json
 from dataclasses import dataclass
 from pathlib import Path
@@ -177,14 +176,6 @@ def test_the_command_line_takes_it_wherever_it_takes_a_method(cli, simulated, mo
     assert [line["method"] for line in lines] == [name, name] and len(
         {line["metrics"]["psnr_db"] for line in lines}
     ) == 2
-    assert any(
-        path.suffix == ".csv" and list(csv.reader(path.open())) for path in (module / "swept").iterdir()
-    )
-    incoming = module / "incoming"
-    incoming.mkdir()
-    (incoming / "s.h5").write_bytes(scan.read_bytes())
-    assert cli.run(["watch", str(incoming), "-o", "watched", *run, "--once", "--settle-s", "0"]) == 0
-    assert [path for path in (module / "watched").rglob("*.h5")]
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""Runs of a sweep or a watched folder: they go on from their own checkpoint, and from no other."""
+"""Runs of a sweep: they go on from their own checkpoint, and from no other."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
