@@ -45,6 +45,24 @@ def test_evaluate_has_one_answer_for_all_formats(cli, files, tmp_path, capsys) -
     assert json.loads(capsys.readouterr().out)["ssim"] == 1
 
 
+def test_evaluate_converts_a_reference_in_hounsfield_units_or_refuses_it(cli, files, tmp_path, capsys) -> None:
+    _, volume, values, grid = files
+    truth, water_per_mm = values - 0.01, 0.019
+    write_volume(tmp_path / "truth.h5", truth, grid, {})
+    write_volume(tmp_path / "hu.h5", 1000 * (truth / water_per_mm - 1), grid, {})
+    words = ["evaluate", str(volume), "--json", "--reference"]
+    assert cli.run([*words, str(tmp_path / "truth.h5")]) == 0
+    plain = json.loads(capsys.readouterr().out)
+    assert cli.run([*words, str(tmp_path / "hu.h5"), "--mu-water-per-mm", str(water_per_mm)]) == 0
+    converted = json.loads(capsys.readouterr().out)
+    assert converted["psnr_db"] == pytest.approx(plain["psnr_db"], abs=1e-3)
+    assert converted["ssim"] == pytest.approx(plain["ssim"], abs=1e-4)
+    assert cli.run([*words, str(tmp_path / "hu.h5")]) == 2
+    assert "hu.h5: found values from -1000 to" in (error := capsys.readouterr().err) and "--mu-water-per-mm" in error
+    assert cli.run([*words, str(tmp_path / "hu.h5"), "--mu-water-per-mm", "0"]) == 2
+    assert "--mu-water-per-mm: found 0" in capsys.readouterr().err
+
+
 def test_boxes_with_little_in_common_are_warned_of(cli, files, tmp_path, capsys, caplog) -> None:
     scan, volume, values, grid = files
     small, aside = (Grid(grid.shape, tuple(factor * side for side in grid.voxel_size_mm), offset) for factor, offset in (

@@ -113,6 +113,16 @@ def test_the_entry_is_found_by_its_definition(tmp_path, caplog) -> None:
     assert "2 NXtomo entries; /scan1/tomo is taken" in caplog.text
 
 
+def test_the_control_key_counts_before_the_key(tmp_path) -> None:
+    """nxtomo marks frames by which it aligns with −1 there, and leaves them projections in the other key."""
+    path = nxtomo(tmp_path / "a.nxs")
+    same(path)
+    with h5py.File(path, "r+") as file:
+        file["entry/instrument/detector/image_key_control"] = np.where((KEY == 0) & (np.cumsum(KEY == 0) > 4), -1, KEY)
+    scan = import_scan(path)
+    assert scan.frames == 4 and "4 of 2 times" in scan.provenance["taken"]
+
+
 def bare(folder: Path) -> None:
     with h5py.File(folder / "p.hdf", "w") as file:
         file["entry/data/data"] = FRAMES[KEY == 0].transpose(1, 0, 2)[:, :, None]  # sinograms, with an axis of one

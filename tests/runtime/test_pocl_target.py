@@ -94,3 +94,21 @@ def test_kernels_are_cached_per_processor_unless_told_otherwise(monkeypatch, tmp
     pocl.prepare_environment()
     folder = tmp_path / "phyradgs-cl" / "pocl-haswell"
     assert os.environ["POCL_CACHE_DIR"] == str(folder) and folder.is_dir()
+
+
+def test_a_cache_whose_files_may_not_be_executed_is_replaced(tmp_path, monkeypatch, caplog) -> None:
+    """As on a mount with noexec, where PoCL would end the process."""
+    mapped = pocl.mmap.mmap
+
+    def refusing(file: int, *how: int) -> object:
+        if os.readlink(f"/proc/self/fd/{file}").startswith(str(tmp_path)):
+            raise PermissionError(1, "Operation not permitted")
+        return mapped(file, *how)
+
+    monkeypatch.setattr(pocl.mmap, "mmap", refusing)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.setenv(pocl.CACHE_VARIABLE, "")
+    pocl.prepare_environment()
+    assert not os.environ[pocl.CACHE_VARIABLE].startswith(str(tmp_path))
+    pocl.warn_of_cache()
+    assert f"kernel cache {tmp_path}/phyradgs-cl/pocl-haswell cannot be executed: kernels are kept in" in caplog.text

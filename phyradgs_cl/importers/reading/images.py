@@ -24,7 +24,7 @@ from phyradgs_cl.io.volume import Volume, finite_float32, shares_of_maximum
 STACKS = (".mha", ".mhd")
 _SPACES = ("left-posterior-superior", "lps", "right-anterior-superior", "ras", "left-anterior-superior", "las", "")
 _HEAD_BYTES, _VOXEL_BYTES = 1 << 16, 8
-_DATA_FILE = re.compile(rb"^(?:ElementDataFile *=|data ?file:) *(\S.*?)\s*$\n?", re.M)
+_DATA_FILE = re.compile(rb"^(?:ElementDataFile *=|data ?file:) *(\S.*?)\s*$", re.M)
 _OBLIQUE = 1e-3  # largest sine of an angle between an axis and the world's
 
 
@@ -87,7 +87,8 @@ def _held_bytes(path: Path, reader: Any, voxel_bytes: int) -> int | None:
             stored = file.seek(0, os.SEEK_END) - int(float(reader.GetMetaData("vox_offset")))
             return stored * voxel_bytes * 8 // int(reader.GetMetaData("bitpix"))
     is_nrrd = path.suffix.lower() == ".nrrd"
-    name, start = (found[1].decode("latin-1"), found.end()) if (found := _DATA_FILE.search(head)) else ("LOCAL", 0)
+    found = _DATA_FILE.search(head)
+    name, start = (found[1].decode("latin-1"), head.find(b"\n", found.end(1)) + 1) if found else ("LOCAL", 0)
     if name.startswith("LIST") or "%" in name:  # SimpleITK returns undefined voxels where one file is missing
         raise InputError(f"{path} data file", name[:60], "LOCAL or one file name", "write it as one file")
     if name != "LOCAL":
