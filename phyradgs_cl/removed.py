@@ -8,6 +8,8 @@ REMOVED = {
     "--method fused": "take --method fista, or start Gaussians from its volume: --method phyradgs --initial VOLUME",
     "--method asd-pocs: option prior_share": "take --method fista --prior piccs",
     **dict.fromkeys(_UNWEIGHTED, "take --method fista or fista-tv, which keep it"),
+    "--motion own-times": "say --motion per-row, which is as exact; Python has OwnTimes()",
+    "--motion static-start": "say --motion static, which takes the middle; Python has StaticStart()",
     "--preset released": "say --preset paper",
     "--prior curves": "say --prior ridge, the default, or dct",
     "pixel_footprint": "leave it out: pixels see splats at their centres, which gives 0.5 dB more",
