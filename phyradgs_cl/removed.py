@@ -12,6 +12,8 @@ REMOVED = {
     "phyradgs splat": "start Gaussians from a volume with 'phyradgs reconstruct SCAN --method phyradgs --initial VOLUME'",
     "phyradgs watch": "run examples/watch_folder.py of the source, which calls 'phyradgs reconstruct' for each scan",
     "scheduler": "write --workers ADDRESS",
+    "--motion own-times": "say --motion per-row, which is as exact; Python has OwnTimes()",
+    "--motion static-start": "say --motion static, which takes the middle; Python has StaticStart()",
     "--preset released": "say --preset paper",
     "--prior curves": "say --prior ridge, the default, or dct",
     "pixel_footprint": "leave it out: pixels see splats at their centres, which gives 0.5 dB more",

@@ -16,6 +16,7 @@ from phyradgs_cl.importers import load_volume
 from phyradgs_cl.io import read_deformation, sha256_of
 from phyradgs_cl.io.tables import read_toml
 from phyradgs_cl.parallel import Communicator
+from phyradgs_cl.removed import refuse_removed
 from phyradgs_cl.runtime import Runtime, bytes_of
 
 if sys.version_info >= (3, 11):
@@ -47,6 +48,7 @@ class Settings:
         # an option of the command line means what --help says, whatever the method calls its own
         flags = [f.name for f in fields(methods.Preprocessing) if self.origins.get(f.name) == _flag(f.name)]
         method = method or methods.DEFAULT_METHOD
+        refuse_removed(f"--motion {values.get('motion')}", self.origins.get("motion", ""))
         with self.naming_origins(method):
             return methods.plan_run(method, values, preset=preset, of_preprocessing=flags, **run)
 

@@ -106,11 +106,12 @@ def scores(metrics: Mapping[str, float | None]) -> str:
 
 def usage_text(error: Any, arguments: Sequence[str]) -> str:
     """Returns Typer's message about the words of a command, with the value that it could not read."""
-    flag = str(getattr(error, "option_name", ""))  # that it does not know
-    if (left := removal(flag.lstrip("-").replace("-", "_"), flag)) is not None:
+    flag, param = str(getattr(error, "option_name", "")), getattr(error, "param", None)
+    value = _value_of(param, arguments)
+    words = [(flag.lstrip("-").replace("-", "_"), flag), *((f"{name} {value}", "") for name in getattr(param, "opts", ()))]
+    for left in filter(None, (removal(*word) for word in words)):
         return str(left)
     text = str(error.format_message()).replace("Value error, ", "")
-    value = _value_of(getattr(error, "param", None), arguments)
     return text if value is None or repr(value) in text else f"{text.rstrip('.')}; found {short_repr(value)}"
 
 

@@ -13,6 +13,7 @@ from phyradgs_cl.acquisition.shutter import AXES
 from phyradgs_cl.commands.console import file_argument, file_option, option, pair_of
 from phyradgs_cl.prepare import DEFAULT_STEPS, STEPS
 from phyradgs_cl.reconstructors import DEFAULT_METHOD, METHODS
+from phyradgs_cl.removed import REMOVED
 from phyradgs_cl.runtime import DEVICE_VARIABLE, MEMORY_VARIABLE
 from phyradgs_cl.settings import Settings, read_settings
 
@@ -90,9 +91,10 @@ RUN_GROUPS = {
 _METHOD = "fdk: analytic; phyradgs, r2: splats; naf, sax-nerf: neural fields; the others: voxels (docs: methods.md)."
 _MOTION = (
     "Leave it out with fista and phyradgs, which take the scan's motion; with others say per-row. Poses of a "
-    "frame: one (static, static-start), M×N micro-views, one per line (per-row), or, for splats, integrals over time "
-    "(exact), or M×N that move only centres (centres)."
+    "frame: one (static), M×N micro-views, one per line (per-row), or, for splats, integrals over time (exact), or M×N "
+    "that move only centres (centres)."
 )
+_MOTIONS = tuple(name for name in MOTIONS if f"--motion {name}" not in REMOVED)
 _PRIOR = "Prior, for fista: ridge, dct, tv, piccs or none; MODULE:NAME: a denoiser of your own."
 _PRESET = "Constants: default, quick, paper (phyradgs); published (r2, naf, sax-nerf); a window (fdk)."
 _CONFIG = "TOML file of options, with underscores for dashes (docs: formats.md); the command line wins."
@@ -100,7 +102,7 @@ _SET = "An option of the method by name: --set tv_weight=0.002 (docs: methods.md
 _HOLDOUT = "Pixels hidden from the method, to measure its error on them."
 RUN_OPTIONS: dict[str, Any] = {
     "method": _asked(str, _METHOD, DEFAULT_METHOD, metavar=f"{'|'.join(METHODS)}|MODULE:NAME"),
-    "motion": _asked(Literal[MOTIONS], _MOTION, "per-row"),
+    "motion": _asked(Literal[_MOTIONS], _MOTION, "per-row"),
     "strips": _asked(int, "Strips M of a frame; means micro-views.", "8"),
     "sub_intervals": _asked(int, "Sub-intervals N of an exposure; for phyradgs means micro-views.", "by arc and voxels"),
     "segments": _asked(int, "Segments of a frame (exact); 0: by --time-error.", "0"),

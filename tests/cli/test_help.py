@@ -105,7 +105,7 @@ def test_the_tab_key_in_bash() -> None:
         "phyradgs re": {"reconstruct", "report"},
         "phyradgs export v.h5 --to n": {"nii", "nrrd", "npy", "npz"},
         "phyradgs check --fi": {"--fix-offset"},
-        "phyradgs reconstruct s.h5 --motion ": {*MOTIONS},
+        "phyradgs reconstruct s.h5 --motion ": {*MOTIONS} - {"own-times", "static-start"},
         "phyradgs simulate --phantom ": {*PHANTOMS},
     }.items():
         asked = {"COMP_WORDS": words, "COMP_CWORD": str(words.count(" "))}

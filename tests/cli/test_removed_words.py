@@ -16,6 +16,14 @@ def test_a_word_that_left_names_its_replacement(cli, capsys, word) -> None:
     assert error.count("\n") == 1 and "earlier version" in error and error.endswith(f"{REMOVED[word]}\n")
 
 
+@pytest.mark.parametrize("name", ["own-times", "static-start"])
+def test_a_motion_that_left_is_named_in_a_file_too(cli, capsys, tmp_path, name) -> None:
+    (tmp_path / "run.toml").write_text(f"motion = '{name}'\n")
+    assert cli.run(["reconstruct", "scan.h5", "-o", "volume.h5", "--config", str(tmp_path / "run.toml")]) == 2
+    error = capsys.readouterr().err
+    assert "run.toml: motion" in error and error.endswith(f"{REMOVED[f'--motion {name}']}\n")
+
+
 @pytest.mark.parametrize("flag", ["--tune", "--median-filter"])
 def test_a_flag_that_left_names_its_replacement(cli, capsys, flag) -> None:
     assert cli.run(["reconstruct", "scan.h5", "-o", "volume.h5", flag, "3"]) == 2
