@@ -7,6 +7,9 @@ REMOVED = {
     "phyradgs splat": "start Gaussians from a volume with 'phyradgs reconstruct SCAN --method phyradgs --initial VOLUME'",
     "phyradgs watch": "run examples/watch_folder.py of the source, which calls 'phyradgs reconstruct' for each scan",
     "--scheduler": "write --workers ADDRESS",
+    "--what lag": "state the panel's lag in the TOML of 'phyradgs import' (docs: formats.md)",
+    "--what drift": "correct the frames by 'phyradgs prepare --steps air'",
+    "--what start": "leave it out: another start only turns the object about the axis",
 }
 
 
