@@ -25,6 +25,9 @@ REMOVED = {
     "shape_ratio": "use control.prune_aspect, which removes thin Gaussians",
     "shape_weight": "use control.prune_aspect, which removes thin Gaussians",
     "tune": "compare your own values of the option by --holdout 2",
+    "--what lag": "state the panel's lag in the TOML of 'phyradgs import' (docs: formats.md)",
+    "--what drift": "correct the frames by 'phyradgs prepare --steps air'",
+    "--what start": "leave it out: another start only turns the object about the axis",
 }
 """By word: a value with its option, or an option as Python spells it, with the method that it left if others keep it."""
 

@@ -30,14 +30,14 @@ def calibrate(
     """Estimates geometry and timing from the frames (docs/calibrate.md). Values that frames cannot show stay as stated.
 
     what: names with commas. None is ``offset,roll,tilt``, and ``readout,exposure`` too of a fly-scan. More names are
-    ``distance``, ``start``, ``direction``, ``lag``, ``drift``, ``motion`` and ``wobble`` (each view separately).
+    ``distance``, ``direction``, ``motion`` and ``wobble`` (each view separately).
     others: more scans of the same object in the same place, with the same panel; they share the errors of ``scan``.
     phantom: a TOML file of beads and wires (docs/formats.md) that describes the scanned object, at any place.
     splines: number of splines over time, at least 4, that describe a ``wobble``; 0 estimates every view separately.
     device: what ``--device`` takes, or a Runtime.
 
-    The result has ``scan``, corrected; ``parameters``, each stated and found with its deviation in its unit (mm, deg, s,
-    %) and a verdict (corrected, agrees, cannot tell); ``alike``, combinations that leave no trace; ``residual_rms`` of
+    The result has ``scan``, corrected; ``parameters``, each stated and found with its deviation in its unit (mm, deg, s)
+    and a verdict (corrected, agrees, cannot tell); ``alike``, combinations that leave no trace; ``residual_rms`` of
     line integrals before and after; ``before`` and ``after``, the residuals (F, rows, columns) of the coarsened frames;
     ``per_view()``, the corrections of every view by name and unit (F,); and ``plot()``, a figure of all that.
 

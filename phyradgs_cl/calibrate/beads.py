@@ -63,10 +63,6 @@ class BeadProblem(CoarseFrames):
         model = self.scans[0].detector_model
         return BeadOperator(self.phantom, tables, small.geometry.detector_shape, model, rays, self.clipped_noise)
 
-    def corrected(self, correction: GeometryCorrection) -> "BeadProblem":
-        """Returns itself: the background absorbs a drift, and lag is no parameter here."""
-        return self
-
     def residual(self, operator: BeadOperator, placement: np.ndarray) -> np.ndarray:
         """Returns measured less expected frames (F, rows, columns), without a smooth background."""
         return self._without_background(self.measured - operator.forward(placement))

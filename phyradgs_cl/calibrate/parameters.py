@@ -10,11 +10,11 @@ from phyradgs_cl.acquisition import ConeGeometry, Scan
 from phyradgs_cl.acquisition.altered.angles import exposure_arc_rad
 from phyradgs_cl.acquisition.altered.perturbed import GeometryCorrection
 from phyradgs_cl.errors import InputError
+from phyradgs_cl.removed import removal
 from phyradgs_cl.text import suggest_name
 
 _STEP_PX = 0.25  # by which a central difference moves the image at its edge
 _TIMING_STEP, _LARGEST_CUT = 0.1, 0.7  # of the stated time: a difference, and the most to subtract
-_PER_ONE = 50.0  # pixels per unit of lag and drift, which move nothing: differences of 0.5 %, steps of 4 % at most
 _MOST_TILT_RAD = math.radians(2.0)
 _SMALL_MISMATCH = 1.3  # of signals that change sign after half a turn, as errors of voxels do not
 _LEAST_KNOWN_RAD = math.radians(10.0)  # deviation of an angle that is unknown: sines are linear no further
@@ -128,12 +128,9 @@ PARAMETERS = {
             "exposure", "exposure_s", "s", f"{_TURN}, and smoother or sharper",
             lambda s: s.shutter.exposure_s, _timing_pixels, is_timing=True,
         ),
-        Parameter("start", "start_s", "s", _TURN, lambda s: 0.0, _timing_pixels, is_timing=True),
-        Parameter("lag", "lag", "%", "an object that is turned and blurred", lambda s: s.lag, lambda s: _PER_ONE, 100.0),
-        Parameter("drift", "drift", "%", "an object denser at one side", lambda s: 0.0, lambda s: _PER_ONE, 100.0),
     )
 }  # fmt: skip
-OFFSET_U, LAG, DRIFT = "offset-u", "lag", "drift"
+OFFSET_U = "offset-u"
 TURN = Parameter("all angles", "turn_rad", "deg", _TURN, lambda s: 0.0, _edge_pixels, _DEGREES)
 LIFT = Parameter("all heights", "lift_mm", "mm", "a lower object", lambda s: 0.0, lambda s: 1 / _pitch_mm(s), is_axial=True)
 GAUGES = (TURN, LIFT)
@@ -142,7 +139,7 @@ PARAMETER_GROUPS = {
     "offset": (OFFSET_U, "offset-v"),
     "tilt": ("tilt-v", "tilt-u"),
     "distance": ("source-distance", "detector-distance"),
-    "timing": ("readout", "exposure", "start"),
+    "timing": ("readout", "exposure"),
 }
 _CONE_ONLY = (*PARAMETER_GROUPS["tilt"], *PARAMETER_GROUPS["distance"])
 WOBBLE, MOTION, DIRECTION = "wobble", "motion", "direction"
@@ -175,6 +172,8 @@ def requested(what: str | None, scan: Scan, knows_shape: bool = False) -> Reques
         what += ",distance" if knows_shape and not scan.is_parallel else ""
     names: list[str] = []
     for word in (word.strip() for word in what.split(",")):
+        if left := removal(f"--what {word}"):
+            raise left
         if word not in NAMES:
             raise InputError("--what", repr(word), ", ".join(NAMES), suggest_name(word, NAMES, "name some of them"))
         names += PARAMETER_GROUPS.get(word, (word,))

@@ -8,11 +8,10 @@ import numpy as np
 
 from phyradgs_cl.acquisition import PerRow, Scan
 from phyradgs_cl.acquisition.altered import coarse
-from phyradgs_cl.acquisition.altered.perturbed import GeometryCorrection, Sway, Views, perturb, scan_course
+from phyradgs_cl.acquisition.altered.perturbed import GeometryCorrection, Sway, Views, perturb
 from phyradgs_cl.acquisition.motion import rim_travel_voxels
 from phyradgs_cl.calibrate.stages import Stage
 from phyradgs_cl.detector import noise_level
-from phyradgs_cl.detector.attenuation import TRANSMISSION_FLOOR
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.objective import TvProx
 from phyradgs_cl.operators.rays.operator import RayOperator
@@ -58,28 +57,19 @@ def without_pixels(scan: Scan) -> Scan:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class CoarseProblem(CoarseFrames):
-    """Frames of an unknown object, whose volume has ``grid``. ``course`` (F,): course of a drift. ``before`` (F, rows,
-    columns): transmission of the frame before each, where lag is a parameter."""
+    """Frames of an unknown object, whose volume has ``grid``."""
 
     rt: Runtime
     grid: Grid
-    course: np.ndarray
-    before: np.ndarray | None = None
 
     @classmethod
     def of(
-        cls, rt: Runtime, asks_lag: bool, scans: Sequence[Scan], stage: Stage,
-        most_frames: int = coarse.MOST_FRAMES,
+        cls, rt: Runtime, scans: Sequence[Scan], stage: Stage, most_frames: int = coarse.MOST_FRAMES
     ) -> "CoarseProblem":
         """Makes the scans as coarse as the stage says."""
         block = stage.block(scans[0])
-
-        def shrink(scan: Scan) -> Scan:
-            fewer = coarse.fewer_frames(scan, most_frames)
-            return coarse.binned(coarse.smooth(fewer, _smoothing_px(scan, block)), block)
-
         fewer = [coarse.fewer_frames(scan, most_frames) for scan in scans]
-        small = [shrink(scan) for scan in scans]
+        small = [coarse.binned(coarse.smooth(scan, _smoothing_px(scan, block)), block) for scan in fewer]
         measured, valid = measured_blocks(small)
         problem = cls(
             rt=rt,
@@ -88,20 +78,8 @@ class CoarseProblem(CoarseFrames):
             grid=coarse.coarse_grid(scans[0].grid, small[0].geometry),
             measured=measured,
             valid=valid,
-            course=np.concatenate([scan_course(scan) for scan in fewer]),
-            before=np.concatenate([_transmission_before(scan, shrink) for scan in scans]) if asks_lag else None,
         )
         return replace(problem, measured=problem.masked(measured))
-
-    def corrected(self, correction: GeometryCorrection) -> "CoarseProblem":
-        """Returns the problem with the correction's lag and drift removed from its frames."""
-        measured = self.measured
-        if self.before is not None:
-            lag = self.scans[0].lag + correction.lag
-            transmission = (np.exp(-measured) - lag * self.before) / (1 - lag)
-            measured = -np.log(np.maximum(transmission, TRANSMISSION_FLOOR))
-        measured = measured + correction.drift * self.course[:, None, None]
-        return replace(self, measured=self.masked(measured.astype(np.float32)), before=None)
 
     def operator(self, correction: GeometryCorrection, views: Views | Sway | None = None) -> RayOperator:
         """Returns A of all frames after a correction."""
@@ -168,12 +146,3 @@ def _smoothing_px(scan: Scan, block: int) -> float | tuple[float, float]:
         return 0.0
     is_rolling = scan.shutter.readout_s > 0 and scan.shutter.axis == "rows"
     return 0.0 if is_rolling else coarse.SMOOTHING * block, coarse.SMOOTHING * block
-
-
-def _transmission_before(scan: Scan, shrink: Callable[[Scan], Scan]) -> np.ndarray:
-    """Returns the transmission (F, rows, columns) of the frame before each; 0 before the first, when the beam was off."""
-    frames = np.asarray(scan.projections)
-    small = shrink(replace(scan, projections=np.concatenate([frames[:1], frames[:-1]])))
-    transmission: np.ndarray = np.exp(-np.asarray(small.projections, np.float32))
-    transmission[0] = 0
-    return transmission

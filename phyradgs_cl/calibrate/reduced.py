@@ -101,7 +101,7 @@ def reduced(
     """Linearises the frames about the parameters' values ``at`` (by name) and the object ``volume``. operator: the
     problem's at these values."""
     signals = [_signal(problem, one, at, volume) for one in parameters]
-    images = [*signals, problem.corrected(correction_of(at)).residual(operator, volume)]
+    images = [*signals, problem.residual(operator, volume)]
     *jacobian, residual = problem.beyond_object(operator, volume, images, iterations)
     whole = np.array([problem.compared(signal) for signal in signals], np.float64)
     sizes = np.maximum(np.linalg.norm(whole, axis=1), 1e-30)
@@ -123,7 +123,7 @@ def _signal(
     for sign in (1, -1):
         correction = correction_of({**at, one.name: at.get(one.name, 0.0) + sign * step})
         operator: Any = problem.operator(correction)
-        ends.append(operator.forward(volume) - problem.corrected(correction).measured)
+        ends.append(operator.forward(volume) - problem.measured)  # of numbers as small as residuals
     return problem.masked((ends[0] - ends[1]) / np.float32(2 * step))
 
 

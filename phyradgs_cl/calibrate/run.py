@@ -16,13 +16,11 @@ from phyradgs_cl import __version__, checks
 from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.acquisition.altered.angles import start_azimuths_rad
 from phyradgs_cl.acquisition.altered.coarse import MOST_FRAMES, QUICK_COLUMNS, coarse
-from phyradgs_cl.acquisition.altered.perturbed import GeometryCorrection, Sway, Views, perturb, without_drift
+from phyradgs_cl.acquisition.altered.perturbed import GeometryCorrection, Sway, Views, perturb
 from phyradgs_cl.acquisition.altered.variants import reversed_readout
 from phyradgs_cl.calibrate.beads import BeadProblem
 from phyradgs_cl.calibrate.parameters import (
     DIRECTION,
-    DRIFT,
-    LAG,
     OFFSET_U,
     WOBBLE,
     Request,
@@ -76,7 +74,7 @@ def calibrate(
     InputError for unknown parameters, a scan too small, others that do not fit the first, a phantom that the frames do not
     show."""
     request = requested(what, scan, phantom is not None)
-    ready = [one if LAG in request.names else without_lag(one) for one in (scan, *others)]
+    ready = [without_lag(one) for one in (scan, *others)]
     _check(ready, request, phantom, splines)
     _warn(ready, phantom)
     return _Calibrator(rt, scan, ready, request, phantom, splines, report, note).run()
@@ -142,8 +140,6 @@ class _Calibrator:
             self.search.keep_held()
         table += self.search.table(self.scan, corrections) + views_table
         corrected = perturb(self.scan, correction, views) if corrections or views is not None else self.scan
-        if correction.drift:
-            corrected = without_drift(corrected, correction.drift)
         calibration = Calibration(corrected, table, self.search.alike, (rms(before), rms(after)), before, after, views)
         return replace(calibration, scan=_with_provenance(corrected, self.scan, calibration))
 
@@ -203,7 +199,7 @@ class _Calibrator:
         """Returns the frames on the grid of a stage, whose passes are counted."""
         problem: Problem
         if self.phantom is None:
-            problem = CoarseProblem.of(self.rt, LAG in self.request.names, scans, stage, most_frames)
+            problem = CoarseProblem.of(self.rt, scans, stage, most_frames)
         else:
             problem = BeadProblem.of(self.phantom, self.placement, scans, stage, most_frames)
         return replace(problem, count_pass=self.passes.counter(pass_cost(scans, stage.columns, most_frames)))
@@ -212,7 +208,7 @@ class _Calibrator:
         """Returns a first placement (7,): of the places where its beads are seen, the one that explains the frames best."""
         bead_centres_mm(phantom)
         correction = correction_of(self.search.at)
-        voxels = CoarseProblem.of(self.rt, False, self.ready, STAGES[-1])
+        voxels = CoarseProblem.of(self.rt, self.ready, STAGES[-1])
         volume = voxels.reconstruct(voxels.operator(correction), None, STAGES[-1].first)
         candidates = []
         for place in placements(phantom, volume, voxels.grid):
@@ -249,8 +245,7 @@ class _Calibrator:
         self, problem: Problem, stage: Stage, correction: GeometryCorrection, views: Views | Sway | None = None
     ) -> np.ndarray:
         operator: Any = problem.operator(correction, views)
-        corrected = problem.corrected(correction)
-        return corrected.residual(operator, corrected.reconstruct(operator, None, stage.first))
+        return problem.residual(operator, problem.reconstruct(operator, None, stage.first))
 
     def _plan(self) -> dict[str, Passes]:
         """Returns the most passes through the frames of all phases, in order."""
@@ -303,12 +298,8 @@ def _check(scans: Sequence[Scan], request: Request, phantom: EllipsoidPhantom | 
         raise InputError("--splines", str(splines), f"with --what {WOBBLE}", f"leave it out, or ask for {WOBBLE}")
     for scan in scans:
         scan.check_sight()
-    unsuited = [name for name in (per_view, *request.names) if name and name in (per_view, LAG, DRIFT)]
-    if unsuited and phantom is not None:
-        expected = "parameters of geometry and timing, of all views"
-        raise InputError(f"--what {unsuited[0]}", "with a phantom", expected, "leave one of the two out")
-    if per_view and LAG in request.names:
-        raise InputError(f"--what {per_view}", "with lag", "one of the two at a time", "run it twice")
+    if per_view and phantom is not None:
+        raise InputError(f"--what {per_view}", "with a phantom", "parameters of all views", "leave one of the two out")
     if per_view and len(scans) > 1:
         expected = "one scan, because views differ from scan to scan"
         raise InputError(f"--what {per_view}", "a second scan", expected, "leave --with out")

@@ -70,9 +70,8 @@ class Search:
         self.former = {} if asks or isinstance(problem, BeadProblem) else dict(self.at)
         for number in range(stage.steps):
             parameters = self.parameters if asks else [PARAMETERS[name] for name in self.determined or ()]
-            correction = correction_of(self.at)
-            operator: Any = problem.operator(correction)
-            volume = problem.corrected(correction).reconstruct(operator, volume, stage.again if number else stage.first)
+            operator: Any = problem.operator(correction_of(self.at))
+            volume = problem.reconstruct(operator, volume, stage.again if number else stage.first)
             more = GAUGES if asks and isinstance(problem, CoarseProblem) else ()
             linear = reduced(problem, operator, [*parameters, *more], self.at, volume, stage.project)
             if asks:

@@ -43,7 +43,7 @@ def estimate_views(
 
     A deviation combines noise and discretisation error; the latter is half the change since the coarser grid."""
     for number, stage in enumerate(stages):
-        problem = CoarseProblem.of(rt, False, [scan], stage, scan.frames)
+        problem = CoarseProblem.of(rt, [scan], stage, scan.frames)
         problem = replace(problem, count_pass=passes.counter(pass_cost([scan], stage.columns, scan.frames)))
         former, volume = parameters.values, None
         is_kept = ~np.isin(np.arange(len(parameters.KINDS)), parameters.RESTARTED)

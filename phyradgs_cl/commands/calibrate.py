@@ -8,7 +8,7 @@ import numpy as np
 
 from phyradgs_cl.acquisition import Scan as Loaded
 from phyradgs_cl.calibrate import Calibration, ParameterEstimate, calibrate
-from phyradgs_cl.calibrate.parameters import DRIFT, NAMES, WOBBLE
+from phyradgs_cl.calibrate.parameters import NAMES, WOBBLE
 from phyradgs_cl.commands.console import AsJson, file_option, option, say
 from phyradgs_cl.commands.options import Device, Scan
 from phyradgs_cl.errors import InputError
@@ -84,10 +84,7 @@ def calibrate_command(
 
 
 def _check_storable(scan: Loaded, names: list[str]) -> None:
-    """Raises InputError for corrections that a scan file cannot hold: brighter frames, and two poses at one time."""
-    if DRIFT in names:
-        remedy = "leave -o out, and normalise frames by 'phyradgs prepare --steps air'"
-        raise InputError("--what drift", "with -o", "no -o, because a copy keeps its frames", remedy)
+    """Raises InputError for corrections that a scan file cannot hold: two poses at one time."""
     if WOBBLE not in names:
         return
     period_s = float(np.diff(np.sort(scan.frame_start_s)).min(initial=np.inf))

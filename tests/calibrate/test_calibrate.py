@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from phyradgs_cl.acquisition import CircularOrbit
-from phyradgs_cl.acquisition.altered.perturbed import GeometryCorrection, perturb, without_drift
+from phyradgs_cl.acquisition.altered.perturbed import GeometryCorrection, perturb
 from phyradgs_cl.api import simulate
 from phyradgs_cl.calibrate import AGREES, CANNOT_TELL, CORRECTED, calibrate
 from phyradgs_cl.calibrate.parameters import in_words
@@ -15,9 +15,9 @@ from phyradgs_cl.calibrate.problem import CoarseProblem
 from phyradgs_cl.calibrate.reduced import Reduced
 from phyradgs_cl.calibrate.search import Search
 from phyradgs_cl.calibrate.stages import Stage
-from phyradgs_cl.detector.effects import lagged
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.io import write_scan
+from phyradgs_cl.removed import REMOVED
 from phyradgs_cl.workflow import load_scan
 
 OFFSET_MM, ROLL_DEG = 0.3, 0.8
@@ -135,7 +135,7 @@ def test_blocks_mix_no_rows_that_are_read_at_other_times(rt, turned) -> None:
     frames[:, 10:12] = 1
     rolled = replace(scan, projections=frames)
     frozen = replace(rolled, shutter=replace(scan.shutter, readout_s=0.0))
-    profile = {name: CoarseProblem.of(rt, False, [one], Stage(16, 0, 0)).measured.mean((0, 2)) for name, one in
+    profile = {name: CoarseProblem.of(rt, [one], Stage(16, 0, 0)).measured.mean((0, 2)) for name, one in
                (("rolled", rolled), ("frozen", frozen))}  # fmt: skip
     np.testing.assert_allclose(profile["rolled"], np.arange(16) == 5, atol=1e-6)
     assert 0.2 < profile["frozen"][5] < 0.9 and profile["frozen"][4] > 0.05
@@ -148,8 +148,8 @@ def test_a_detector_that_adds_photons(rt, turned) -> None:
 
 
 def test_a_combination_in_words() -> None:
-    said = in_words({"readout": 0.2, "exposure": -0.9, "start": 0.8, "roll": 0.01})
-    assert said == "exposure against start: looks like an object turned about the axis, and smoother or sharper"
+    said = in_words({"offset-u": 0.2, "exposure": -0.9, "readout": 0.8, "roll": 0.01})
+    assert said == "exposure against readout: looks like an object turned about the axis, and smoother or sharper"
 
 
 def few(scan):
@@ -179,7 +179,7 @@ def test_views_of_frames_that_overlap_have_no_place_in_a_file(refused, right, tm
     path = tmp_path / "scan.h5"
     write_scan(path, replace(right, shutter=replace(right.shutter, readout_s=1.5)))
     refused(["calibrate", path, "--what", "wobble", "-o", tmp_path / "out.h5"], "do not overlap in time")
-    refused(["calibrate", path, "--what", "offset, drift", "-o", tmp_path / "out.h5"], "prepare --steps air")
+    refused(["calibrate", path, "--what", "offset, drift", "-o", tmp_path / "out.h5"], REMOVED["--what drift"])
     refused(["calibrate", path, "-o", path], "reads or writes")
     refused(["calibrate", path, "-o", tmp_path / "out.png"], "the suffix .png of another format")
     for picture in ("out.h5", "out.jpg", "out"):
@@ -200,21 +200,6 @@ def test_the_end_that_is_read_first_is_told_where_it_bends_the_object(cli, turne
         assert one["verdict"] == verdict, (asked, one)
         assert load_scan(out).shutter.direction == (1 if verdict == CORRECTED else -1)
         assert one["found"] is None if verdict == CANNOT_TELL else 0 < one["deviation"] <= 0.5
-
-
-def test_lag_and_drift_are_numbers_of_the_frames(rt, right) -> None:
-    """A panel with 5 % of lag of which 1 % is stated, and a beam that gets 4 % (log) brighter; neither."""
-    brighter = (right.projections - 0.04 * np.linspace(-0.5, 0.5, right.frames)[:, None, None]).astype(np.float32)
-    off = replace(right, projections=lagged(brighter, 0.05).astype(np.float32), lag=0.01)
-    found = calibrate(off, rt, "lag,drift,offset-u")
-    lines = by_name(found)
-    assert lines["lag"].stated == pytest.approx(1) and lines["offset-u"].verdict == AGREES
-    for one, truth in ((lines["lag"], 5), (lines["drift"], 4)):
-        assert one.verdict == CORRECTED and abs(one.found - truth) < 3 * one.deviation < 3, one
-    assert found.scan.lag == pytest.approx(lines["lag"].found / 100)
-    assert np.abs(found.scan.projections - without_drift(off, 0.04).projections).max() < 0.01
-    for one in calibrate(right, rt, "lag,drift").parameters:
-        assert one.verdict == AGREES and abs(one.found) < 3 * one.deviation, one
 
 
 def test_the_readout_of_a_global_shutter_is_refused(rt) -> None:

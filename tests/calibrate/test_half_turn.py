@@ -44,7 +44,7 @@ def test_the_offset_of_half_a_turn_is_found_where_check_finds_it(rt, half_turn) 
 def test_what_only_the_axis_tells_is_not_said_to_be_undetermined(rt, half_turn) -> None:
     """Without an answer from the axis the frames do not determine the offset."""
     scan, stage = half_turn(0.0), Stage(16, first=20, again=10, steps=1)
-    problem = CoarseProblem.of(rt, False, [scan], stage)
+    problem = CoarseProblem.of(rt, [scan], stage)
     alone = Search([PARAMETERS["offset-u"]])
     alone.descend(problem, stage)
     assert alone.determined == () and alone.shares["offset-u"] < 2 * LEAST_SHARE

@@ -21,9 +21,9 @@ from phyradgs_cl.workflow import load_scan
 
 NUMBERS = GeometryCorrection(offset_u_mm=0.3, offset_v_mm=-0.2, source_distance_mm=0.1, detector_distance_mm=-0.4)
 TURNS = GeometryCorrection(roll_rad=0.02, tilt_v_rad=-0.03, tilt_u_rad=0.01)
-TIMES = GeometryCorrection(readout_s=0.1, exposure_s=-0.2, start_s=0.05)
+TIMES = GeometryCorrection(readout_s=0.1, exposure_s=-0.2)
 
-TIMED = {"count_time", "detector_readout_time", "frame_start_time", "rotation_angle", "rotation_angle_end"}
+TIMED = {"count_time", "detector_readout_time", "rotation_angle_end"}
 
 
 def poses(scan):

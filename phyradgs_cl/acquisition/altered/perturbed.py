@@ -8,7 +8,7 @@ from scipy.interpolate import BSpline
 from scipy.spatial.transform import Rotation
 
 from phyradgs_cl.acquisition.geometry import ConeGeometry
-from phyradgs_cl.acquisition.scan import LARGEST_LAG, Scan
+from phyradgs_cl.acquisition.scan import Scan
 from phyradgs_cl.acquisition.trajectory import CircularOrbit, Trajectory, is_parallel
 
 
@@ -17,10 +17,8 @@ class GeometryCorrection:
     """Differences from a scan's stated geometry and timing; all 0 is the scan as stated.
 
     Offsets move the panel along its own columns and rows. Roll turns it in its plane, tilts about v and u through its
-    middle. Distances move source and panel away from the axis. Times lengthen readout and exposure, or start frames later.
-    lag adds to the fraction of each frame that the next one repeats. drift is the logarithm of the beam's gain from the
-    first frame to the last. turn_rad turns all views about the axis, lift_mm raises them along it: no frame can distinguish
-    these two from a turned or lowered object."""
+    middle. Distances move source and panel away from the axis. Times lengthen readout and exposure. turn_rad turns all
+    views about the axis, lift_mm raises them along it: a turned or lowered object explains the frames as well."""
 
     offset_u_mm: float = 0.0
     offset_v_mm: float = 0.0
@@ -31,9 +29,6 @@ class GeometryCorrection:
     detector_distance_mm: float = 0.0
     readout_s: float = 0.0
     exposure_s: float = 0.0
-    start_s: float = 0.0
-    lag: float = 0.0
-    drift: float = 0.0
     turn_rad: float = 0.0
     lift_mm: float = 0.0
 
@@ -146,7 +141,7 @@ def _seen_by(motion: np.ndarray, vectors: list[np.ndarray], places: int) -> list
 
 
 def perturb(scan: Scan, correction: GeometryCorrection, views: Views | Sway | None = None) -> Scan:
-    """Returns the scan after a correction, its frames unchanged (``without_drift`` changes those).
+    """Returns the scan after a correction, its frames unchanged.
 
     Offsets and distances of a circular orbit stay numbers of its geometry; other corrections make the trajectory a
     ``PerturbedTrajectory``."""
@@ -161,7 +156,7 @@ def perturb(scan: Scan, correction: GeometryCorrection, views: Views | Sway | No
             source_to_detector_mm=geometry.source_to_detector_mm + source_mm + correction.detector_distance_mm,
         )
     turned = (correction.roll_rad, correction.tilt_v_rad, correction.tilt_u_rad, correction.turn_rad)
-    of_poses = replace(correction, readout_s=0.0, exposure_s=0.0, start_s=0.0, lag=0.0, drift=0.0)
+    of_poses = replace(correction, readout_s=0.0, exposure_s=0.0)
     if isinstance(trajectory, CircularOrbit) and not any((*turned, correction.lift_mm)) and views is None:
         trajectory = CircularOrbit(geometry, trajectory.kinematics)
     elif of_poses != GeometryCorrection() or views is not None:
@@ -172,14 +167,7 @@ def perturb(scan: Scan, correction: GeometryCorrection, views: Views | Sway | No
         geometry=geometry,
         trajectory=trajectory,
         shutter=replace(shutter, readout_s=readout_s, exposure_s=exposure_s),
-        frame_start_s=np.asarray(scan.frame_start_s, np.float64) + correction.start_s,
-        lag=float(np.clip(scan.lag + correction.lag, 0, LARGEST_LAG)),
     )
-
-
-def without_drift(scan: Scan, drift: float) -> Scan:
-    """Returns the scan as a beam of constant brightness would have recorded it."""
-    return replace(scan, projections=(scan.projections + drift * scan_course(scan)[:, None, None]).astype(np.float32))
 
 
 def scan_course(scan: Scan) -> np.ndarray:

@@ -159,29 +159,22 @@ def copy_with_offset(source: str | Path, target: str | Path, shift_u_mm: float) 
 
 
 def copy_with_motion(source: str | Path, target: str | Path, scan: Scan) -> None:
-    """Copies a scan file with geometry, timing, lag, trajectory and provenance of ``scan``, which has its frames; equal
+    """Copies a scan file with geometry, timing of lines, trajectory and provenance of ``scan``, which has its frames; equal
     values are not touched. InputError for a file that is no scan, OutputError where the copy cannot be written."""
     with open_hdf5(source) as opened:
         header = read_header(opened)
-        start = f"{header.entry}/{schema.DETECTOR}/frame_start_time"
-        there = opened.optional(start) is not None
-        starts_s = h5.read_array(opened, start, header.image_key.shape, h5.TIME) if there else None
     stated, scan = header.scan, storable(scan)
-    later_s = np.asarray(scan.frame_start_s) - np.asarray(stated.frame_start_s)
     frame_of = np.clip(np.cumsum(header.image_key == schema.PROJECTION) - 1, 0, None)
     with _copied(source, target, header.entry) as entry:
         if scan.geometry != stated.geometry:
             _replace_geometry(entry, scan)
-        if scan.shutter != stated.shutter or later_s.any():
+        if scan.shutter != stated.shutter:
             detector = entry[schema.DETECTOR]
             _replace(detector, "count_time", scan.shutter.exposure_s, "s")
             _replace(detector, "detector_readout_time", scan.shutter.readout_s, "s")
             if scan.shutter.direction != stated.shutter.direction:
                 _remove(entry[schema.EXTRA], "readout_direction")
                 h5.write_number(entry[schema.EXTRA], "readout_direction", scan.shutter.direction)
-            if starts_s is not None:
-                starts_s[header.image_key == schema.PROJECTION] += later_s
-                _replace(detector, "frame_start_time", starts_s, "s")
             _remove(entry, f"{schema.SAMPLE}/rotation_angle", f"{schema.SAMPLE}/rotation_angle_end")
             _remove(entry, schema.KINEMATICS, schema.POSES)
             write_motion(entry, scan, frame_of)
@@ -193,9 +186,6 @@ def copy_with_motion(source: str | Path, target: str | Path, scan: Scan) -> None
                 _replace(detector, "detector_readout_time", 0.0, "s")
                 _replace(detector, "frame_start_time", np.asarray(scan.frame_start_s)[frame_of], "s")
             write_poses(entry, scan)
-        if scan.lag != stated.lag:
-            _remove(entry[schema.EXTRA], "lag")
-            h5.write_number(entry[schema.EXTRA], "lag", scan.lag)
         _remove(entry, f"{schema.EXTRA}/provenance")
         entry[schema.EXTRA]["provenance"] = json.dumps(scan.provenance, default=str)
 
