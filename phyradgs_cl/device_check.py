@@ -4,7 +4,7 @@ Gradients are compared with central differences of the twins. Limits are several
 conforming device, and far below the error of a wrong kernel."""
 
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 
 import numpy as np

@@ -90,9 +90,8 @@ RUN_GROUPS = {
 }
 _METHOD = "fdk: analytic; phyradgs, r2: splats; naf, sax-nerf: neural fields; the others: voxels (docs: methods.md)."
 _MOTION = (
-    "Leave it out with fista and phyradgs, which take the scan's motion; with others say per-row. Poses of a "
-    "frame: one (static), M×N micro-views, one per line (per-row), or, for splats, integrals over time (exact), or M×N "
-    "that move only centres (centres)."
+    "Every method takes the scan's motion; static ignores it. Poses of a frame: one (static), M×N micro-views, one per "
+    "line (per-row), or, for splats, integrals over time (exact), or M×N that move only centres (centres)."
 )
 _MOTIONS = tuple(name for name in MOTIONS if f"--motion {name}" not in REMOVED)
 _PRIOR = "Prior, for fista: ridge, dct, tv, piccs or none; MODULE:NAME: a denoiser of your own."

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from phyradgs_cl import checks
-from phyradgs_cl.acquisition import Motion, Static
+from phyradgs_cl.acquisition import Motion, PerRow
 from phyradgs_cl.acquisition.motion import RAYS, check_motion, motions_for
 from phyradgs_cl.acquisition.scan import DETECTOR_MODELS
 from phyradgs_cl.errors import InputError
@@ -39,7 +39,7 @@ class NeuralOptions:
 
     MOTIONS: ClassVar[tuple[Motion, ...]] = motions_for(RAYS)
 
-    motion: Motion = Static()
+    motion: Motion = PerRow()
     detector_model: str = "scan"
     iterations: int = checks.ranged(30, 0, 1_000_000)
     rays: int = checks.ranged(512, 1, 1_000_000)

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from phyradgs_cl import checks
-from phyradgs_cl.acquisition import Motion, Scan, Static
+from phyradgs_cl.acquisition import Motion, PerRow, Scan
 from phyradgs_cl.errors import InputError, NumericalError
 from phyradgs_cl.reconstructors.result import Reconstruction, function_name, option_facts
 from phyradgs_cl.removed import refuse_removed
@@ -50,7 +50,7 @@ class Method:
 class OwnOptions:
     """The only option of a function whose options have no annotation: the motion model."""
 
-    motion: Motion = Static()
+    motion: Motion = PerRow()
 
 
 def own_method(name: str, function: Any) -> Method:

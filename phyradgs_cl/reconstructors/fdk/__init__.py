@@ -17,7 +17,7 @@ import scipy
 from phyradgs_cl import checks
 from phyradgs_cl.acquisition import Motion, Scan, Static
 from phyradgs_cl.acquisition.altered.angles import azimuth_rad
-from phyradgs_cl.acquisition.motion import LINE_POSES, check_motion, motions_for
+from phyradgs_cl.acquisition.motion import LINE_POSES, LineMiddles, check_motion, motions_for
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Deformation, Grid
 from phyradgs_cl.operators import backproject, backproject_lines
@@ -72,7 +72,7 @@ class FdkOptions:
     MOTIONS: ClassVar[tuple[Motion, ...]] = motions_for(LINE_POSES)
 
     window: str = "ram-lak"
-    motion: Motion = Static()
+    motion: Motion = LineMiddles()
     extrapolate: str = "none"
 
     def __post_init__(self) -> None:

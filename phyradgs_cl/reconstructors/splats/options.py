@@ -108,6 +108,6 @@ _QUICK = SplatOptions(
 PRESETS = {"default": SplatOptions(), "quick": _QUICK, "paper": _PAPER}
 # R2-Gaussian's constants; its 30,000 iterations are cut to ours unless asked for, rates decay over the run
 R2_PUBLISHED = SplatOptions(
-    motion=Static(), affine=True, gaussians=50_000, ssim_weight=0.25, tv_weight=0.05, density_weight=0.0,
+    motion=Exact(), affine=True, gaussians=50_000, ssim_weight=0.25, tv_weight=0.05, density_weight=0.0,
     rates=PUBLISHED_RATES, control=PUBLISHED_CONTROL,
 )

@@ -53,9 +53,9 @@ class FistaOptions(IterativeOptions):
     prior_share) TV(x) + prior_share TV(x − first volume). prior_weight: threshold relative to two errors of the gradient,
     added in squares: the noise of the frames, and edges inside large voxels.
 
-    subvoxels: parts of a voxel's side in the last 2/5 of the passes; 0: 2 for slices of up to 90² voxels where memory allows, else 1.
-    subsets: of the frames, with one step each, 1.6 times as many before smaller voxels; subsets whose steps diverge are
-    joined two by two.
+    subvoxels: parts of a voxel's side in the last 2/5 of the passes; 0: 2 for slices of up to 90² voxels where memory
+    allows, else 1. subsets: of the frames, with one step each, 1.6 times as many before smaller voxels; subsets whose steps
+    diverge are joined two by two.
     tv_iterations: dual iterations per proximal map of TV. transmission_weights: as in ``fista-tv``."""
 
     FUNCTIONS: ClassVar[tuple[str, ...]] = ("prior",)

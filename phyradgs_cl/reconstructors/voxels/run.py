@@ -10,7 +10,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from phyradgs_cl import checks
-from phyradgs_cl.acquisition import Motion, Scan, Static
+from phyradgs_cl.acquisition import Motion, PerRow, Scan
 from phyradgs_cl.acquisition.motion import RAYS, check_motion, motions_for
 from phyradgs_cl.acquisition.scan import DETECTOR_MODELS
 from phyradgs_cl.fields import Deformation, Grid
@@ -42,7 +42,7 @@ class IterativeOptions:
 
     MOTIONS: ClassVar[tuple[Motion, ...]] = motions_for(RAYS)
 
-    motion: Motion = Static()
+    motion: Motion = PerRow()
     iterations: int = checks.ranged(20, 0, MOST_ITERATIONS)
     nonnegative: bool = True
     tolerance: float = checks.ranged(0.0, 0, 1)
