@@ -56,7 +56,7 @@ demo: $(VENV)/.installed-cpu
 
 # $(call tested,FOLDER,WORDS): pytest with these words in the environment of that folder; a skipped kernel test is a failure.
 define tested
-	$(1)/bin/python -m pytest $(2) --junit-xml=$(1)/junit.xml
+	$(1)/bin/python -m pytest -m "" $(2) --junit-xml=$(1)/junit.xml
 	@$(1)/bin/python .ci/no_skips.py $(1)/junit.xml
 endef
 
@@ -73,17 +73,17 @@ types: $(VENV)/.installed-test
 	else echo "types: left out before Python 3.11, whose NumPy states too few"; fi
 
 test-quick: $(VENV)/.installed-test
-	$(call tested,$(VENV),-m quick $(PARALLEL))
+	$(call tested,$(VENV),-m "not slow" $(PARALLEL))
 
 test-all: test $(VENV)/.installed-test-all
-	$(call tested,$(VENV),-m "not quick" $(PARALLEL))
+	$(call tested,$(VENV),-m slow $(PARALLEL))
 
 docs: $(VENV)/.installed-test-all
 	$(BIN)/python docs/make_reference.py
 	$(BIN)/mkdocs build --strict --site-dir site
 
 stress: $(VENV)/.installed-test-all
-	STRESS=50 $(BIN)/python -m pytest tests/cli/test_kills.py tests/faults tests/importers tests/laws tests/test_built_ins.py
+	STRESS=50 $(BIN)/python -m pytest -m "" tests/cli/test_kills.py tests/faults tests/importers tests/laws tests/test_built_ins.py
 
 # Environments beside the first, one per target: what each has beside pytest, and the extras of pyproject.toml.
 EXTRAS_browser   := cpu,test
@@ -113,7 +113,7 @@ $(ENVIRONMENTS:%=$(VENV)-%/.installed): $(VENV)-%/.installed: pyproject.toml
 # The tests of all rooms run, those in processes of their own and under mpiexec too.
 coverage: $(VENV)-coverage/.installed
 	$(VENV)-coverage/bin/python -m coverage erase
-	$(VENV)-coverage/bin/python -m coverage run -m pytest
+	$(VENV)-coverage/bin/python -m coverage run -m pytest -m ""
 	$(VENV)-coverage/bin/python -m coverage combine --quiet
 	$(VENV)-coverage/bin/python -m coverage report --fail-under=95
 

@@ -1,6 +1,7 @@
 """Runtimes and random clouds for all rooms; ``tolerances`` and the benchmarks' ``tables`` can be imported."""
 
 import os
+import re
 import signal
 import sys
 from collections.abc import Callable, Iterator, Sequence
@@ -19,7 +20,6 @@ if "PYTEST_XDIST_WORKER" in os.environ:  # a process per core: each has one thre
 
 import numpy as np  # noqa: E402
 from guarded import guard  # noqa: E402
-from quick import collects, is_quick  # noqa: E402
 
 from phyradgs_cl.__main__ import load_cli  # noqa: E402
 from phyradgs_cl.acquisition import ConeGeometry  # noqa: E402
@@ -36,6 +36,8 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 
 def pytest_configure(config: pytest.Config) -> None:
+    if any(".py" in word for word in config.args) and config.getoption("markexpr") == "not slow":
+        config.option.markexpr = ""  # who names a file or a test wants it
     if config.getoption("--guarded"):
         guard()
     if config.getoption("--gpu-shape"):
@@ -44,17 +46,11 @@ def pytest_configure(config: pytest.Config) -> None:
 
 
 def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
-    """Leaves out files without a test that ``-m`` chooses: every process of a run imports what it collects."""
-    file = collection_path.relative_to(HERE).as_posix()
-    left_out = collection_path.suffix == ".py" and not collects(file, config.getoption("markexpr"))
-    return True if left_out else None
-
-
-@pytest.hookimpl(tryfirst=True)  # before -m chooses
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    for item in items:
-        if is_quick(item.nodeid.partition("tests/")[2]):
-            item.add_marker("quick")
+    """Leaves out files whose tests are all slow: every process of a run imports what it collects."""
+    if config.getoption("markexpr") != "not slow" or collection_path.suffix != ".py":
+        return None
+    text = collection_path.read_text(encoding="utf-8")
+    return True if re.search(r"^pytestmark = \[?pytest\.mark\.slow", text, re.M) else None
 
 
 @pytest.hookimpl(wrapper=True)
@@ -85,7 +81,11 @@ def banded_rt() -> Runtime:
     return Runtime(lanes=8, pixel_items=False)
 
 
-@pytest.fixture(scope="session", params=["own lanes", "lanes 1", "work-items as lanes", "float pairs"])
+OTHER_BUILDS = [pytest.param(build, marks=pytest.mark.slow) for build in ("lanes 1", "float pairs")]
+"""Beside those that run on a CPU and on a GPU: half of the time of all kernels' tests, and rarely wrong alone."""
+
+
+@pytest.fixture(scope="session", params=["own lanes", "work-items as lanes", *OTHER_BUILDS])
 def any_rt(request: pytest.FixtureRequest) -> Runtime:
     """Every way in which kernels are built: the device's own vectors, scalars, a GPU's work-groups, no float64."""
     if request.param == "lanes 1":

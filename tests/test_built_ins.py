@@ -6,6 +6,8 @@ import re
 import pytest
 from machine_code import HERE, TARGETS, built
 
+pytestmark = pytest.mark.slow
+
 LONG_FUNCTIONS = {"log1p", "expm1"}  # of many instructions: a call costs little in comparison
 MOST = len(TARGETS) if int(os.environ.get("STRESS", "1")) > 1 else 1
 

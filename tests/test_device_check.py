@@ -15,6 +15,8 @@ from phyradgs_cl.runtime import Runtime, context, known_fault
 from phyradgs_cl.runtime.device import warn_of_fault
 from phyradgs_cl.runtime.opencl import kernel_source
 
+pytestmark = pytest.mark.slow
+
 KERNELS = Path(__file__).resolve().parent.parent / "cl"
 GPU_ONLY = {"splat_forward_pixels", "splat_backward_group"}
 GPU_ONLY |= {"bin_count_group", "bin_within_group", "bin_starts_group", "bin_fill_group"}

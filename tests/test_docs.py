@@ -20,6 +20,8 @@ from phyradgs_cl.__main__ import load_cli
 from phyradgs_cl.acquisition import ConeGeometry
 from phyradgs_cl.reconstructors import METHODS, method_options, plan_run, reconstruct
 
+pytestmark = pytest.mark.slow
+
 DOCS = Path(__file__).resolve().parent.parent / "docs"
 
 

@@ -17,6 +17,8 @@ import pytest
 
 from phyradgs_cl import api
 
+pytestmark = pytest.mark.slow
+
 ROOT = Path(__file__).resolve().parent.parent
 EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
 LACKING = [name for name in ("torch", "deepinv") if importlib.util.find_spec(name) is None]  # `make test-neural` has both

@@ -15,6 +15,8 @@ from phyradgs_cl.acquisition import Shutter
 from phyradgs_cl.api import Grid, ray_operator, static_scan
 from phyradgs_cl.importers import ImportOptions, import_scan
 
+pytestmark = pytest.mark.slow
+
 DOCS = Path(__file__).resolve().parents[1] / "docs"
 SHADOW, IN_FILE = (4, 6), (1, 6)  # as read off docs/images/conventions.png
 

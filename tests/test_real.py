@@ -14,6 +14,8 @@ from skimage.io import imsave
 
 from phyradgs_cl.api import load_scan
 
+pytestmark = pytest.mark.slow
+
 TEXT = (Path(__file__).resolve().parent.parent / "docs" / "real.md").read_text(encoding="utf-8")
 FLAT, DARK = 4000, 100
 

@@ -13,6 +13,8 @@ from phyradgs_cl.__main__ import load_cli
 from phyradgs_cl.api import load_scan
 from phyradgs_cl.io import read_volume
 
+pytestmark = pytest.mark.slow
+
 ROOT = Path(__file__).resolve().parent.parent
 TEXT = (ROOT / "docs" / "tutorial.md").read_text(encoding="utf-8")
 PIXELS = 32

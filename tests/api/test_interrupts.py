@@ -14,6 +14,8 @@ import pytest
 from phyradgs_cl import api
 from phyradgs_cl.api import Progress, reconstruct
 
+pytestmark = pytest.mark.slow
+
 SCRIPT = """
 import sys
 import phyradgs_cl.api as api

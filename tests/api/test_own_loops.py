@@ -13,6 +13,8 @@ import pytest
 from phyradgs_cl.api import Scan, compare, load_volume, ray_operator, reconstruct, save_scan, splat_operator
 from phyradgs_cl.runtime import Runtime
 
+pytestmark = pytest.mark.slow
+
 EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
 
 

@@ -9,6 +9,8 @@ from matplotlib.figure import Figure
 
 from phyradgs_cl.api import Reconstruction, Shutter, reconstruct
 
+pytestmark = pytest.mark.slow
+
 
 def titles(figure: Figure) -> list[str]:
     return [axes.get_title() for axes in figure.axes if axes.get_title()]

@@ -18,6 +18,8 @@ from phyradgs_cl.api import (
 )
 from phyradgs_cl.fields import GridChoice
 
+pytestmark = pytest.mark.slow
+
 FINE = Exact(time_error=1e-4)
 STEPS = (1e-3, 1e-2, 1e-2)  # rad, mm, mm
 

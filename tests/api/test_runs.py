@@ -11,6 +11,8 @@ from phyradgs_cl import api
 from phyradgs_cl.__main__ import load_cli
 from phyradgs_cl.errors import InputError
 
+pytestmark = pytest.mark.slow
+
 
 def test_every_exported_name_is_there() -> None:
     assert api.__all__ == sorted(api.__all__)

@@ -21,6 +21,8 @@ from phyradgs_cl.api import (
     static_scan,
 )
 
+pytestmark = pytest.mark.slow
+
 LIGHT, DARK = 40_000.0, 200.0
 
 

@@ -19,6 +19,8 @@ from phyradgs_cl.api import (
 )
 from phyradgs_cl.errors import InputError
 
+pytestmark = pytest.mark.slow
+
 RNG = np.random.default_rng(5)
 POINTS = RNG.uniform(-18, 18, (4, 3))  # x y z, mm
 PANEL, ANGLES = (23, 29), np.array([0.3, 1.7, 2.9, 4.4])

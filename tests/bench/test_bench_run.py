@@ -27,6 +27,8 @@ from tables.results import read_lines
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.runtime import Runtime
 
+pytestmark = pytest.mark.slow
+
 TINY = BenchSize("T", 12, 16, 8)
 ROWS = ["FDK", "PhyRadGS w/o ST", "PhyRadGS"]
 RUNS = 2 * 5  # of either volume three on the fly-scan, two on the stop-and-shoot scan

@@ -111,6 +111,7 @@ def test_frames_are_those_of_the_simulator(rt, known, axis, model, is_fly) -> No
         np.testing.assert_allclose(thinner, found * 2 / 3, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_a_placement_is_found_and_a_background_taken_out(rt, known) -> None:
     scan = scanned(rt, lying(known), views=5)
     slope = np.linspace(0, 0.3, 32, dtype=np.float32)
@@ -128,6 +129,7 @@ def test_a_placement_is_found_and_a_background_taken_out(rt, known) -> None:
         assert shown.max() < 0.1 * slope.max()
 
 
+@pytest.mark.slow
 def test_beads_are_told_from_spots_that_are_none_and_from_their_mirror_image(known) -> None:
     grid = Grid.cube(40, 2.0)
     spots = EllipsoidPhantom((Ellipsoid((0.7, -0.7, 0.0), (0.1,) * 3, 5.0),), "spots")
@@ -138,6 +140,7 @@ def test_beads_are_told_from_spots_that_are_none_and_from_their_mirror_image(kno
         placements(bare, np.ascontiguousarray(lying(bare).voxelise(grid)[:, :, ::-1]), grid)
 
 
+@pytest.mark.slow
 def test_a_scanner_is_found_by_what_it_shows_of_beads(cli, rt, file, known, tmp_path, capsys) -> None:
     """Rows read, from the other end than stated, one turn; another start of all frames is the phantom turned."""
     scan = scanned(rt, lying(known), noise="tigre", views=10)
@@ -159,6 +162,7 @@ def test_a_scanner_is_found_by_what_it_shows_of_beads(cli, rt, file, known, tmp_
     assert read.shutter.exposure_s == pytest.approx(1.0, abs=0.03) and read.shutter.readout_s == pytest.approx(0.5, abs=0.03)
 
 
+@pytest.mark.slow
 def test_what_is_no_known_shape_is_refused(rt, right, known) -> None:
     three = replace(known, ellipsoids=known.ellipsoids[:3])
     row = replace(known, ellipsoids=tuple(replace(known.ellipsoids[0], centre_mm=(0, 0, z / 9)) for z in range(5)))

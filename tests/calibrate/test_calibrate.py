@@ -20,6 +20,8 @@ from phyradgs_cl.io import write_scan
 from phyradgs_cl.removed import REMOVED
 from phyradgs_cl.workflow import load_scan
 
+pytestmark = pytest.mark.slow
+
 OFFSET_MM, ROLL_DEG = 0.3, 0.8
 
 

@@ -9,6 +9,8 @@ from phyradgs_cl.calibrate import CORRECTED, calibrate
 from phyradgs_cl.calibrate.search import Fallback, Search
 from phyradgs_cl.phantoms import Ellipsoid, EllipsoidPhantom
 
+pytestmark = pytest.mark.slow
+
 TRUE_PX, STATED_PX, PITCH_MM = 28.0, 26.0, 0.56
 BODY = EllipsoidPhantom(
     (

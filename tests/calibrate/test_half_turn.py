@@ -14,6 +14,8 @@ from phyradgs_cl.calibrate.stages import Stage
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.simulation import SimulationOptions, phantom_scene, simulate
 
+pytestmark = pytest.mark.slow
+
 PITCH_MM = 0.125
 
 

@@ -18,6 +18,8 @@ from phyradgs_cl.io import write_scan
 from phyradgs_cl.io.scan.writer import copy_with_motion
 from phyradgs_cl.workflow.files import load_scan
 
+pytestmark = pytest.mark.slow
+
 
 def seen_by(scan):
     """The frames of the bodies that a scan's poses see."""

@@ -6,6 +6,8 @@ from phyradgs_cl.api import simulate
 from phyradgs_cl.calibrate import calibrate
 from phyradgs_cl.calibrate.stages import PassCounter
 
+pytestmark = pytest.mark.slow
+
 
 def test_the_share_is_of_costs_and_what_is_not_needed_is_taken_out() -> None:
     told = []

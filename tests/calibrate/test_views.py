@@ -21,6 +21,8 @@ from phyradgs_cl.simulation import SimulationOptions, phantom_scene
 from phyradgs_cl.simulation import simulate as simulate_frames
 from phyradgs_cl.workflow import load_scan
 
+pytestmark = pytest.mark.slow
+
 SILENT = PassCounter(lambda *progress: None, {})
 
 

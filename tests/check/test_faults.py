@@ -20,6 +20,8 @@ from phyradgs_cl.io import read_scan, write_scan
 from phyradgs_cl.reconstructors.fits.axis import AxisShift
 from phyradgs_cl.workflow import load_scan
 
+pytestmark = pytest.mark.slow
+
 
 def test_the_wrong_sign_of_rotation_and_scans_at_rest(rt, clean) -> None:
     seen = []

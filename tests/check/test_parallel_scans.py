@@ -25,6 +25,8 @@ from phyradgs_cl.io import write_scan
 from phyradgs_cl.reconstructors.fits.axis import axis_shift, opposite_shift
 from phyradgs_cl.workflow.files import load_scan
 
+pytestmark = pytest.mark.slow
+
 HALF_TURNS = [(30, 180.0, False), (31, 180.0, True), (60, 360.0, False), (45, 360.0, False), (40, 220.0, False)]
 FOREIGN = ("distance", "fan", "cone", "source", "tilt")
 

@@ -15,6 +15,8 @@ from phyradgs_cl.check.orbit import find_orbit
 from phyradgs_cl.check.run import quick_scan
 from phyradgs_cl.reconstructors.fits.axis import AxisShift
 
+pytestmark = pytest.mark.slow
+
 
 def test_both_senses_are_looked_at_where_few_iterations_do_not_tell(rt, clean, monkeypatch) -> None:
     """A scan turned the other way may fit a little better at first, and not in the end."""

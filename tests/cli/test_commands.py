@@ -14,6 +14,8 @@ import pytest
 
 from phyradgs_cl.api import load_scan, save_scan
 
+pytestmark = pytest.mark.slow
+
 SIMULATE = ["simulate", "--phantom", "jaw", "--size", "16", "--detector", "24", "--views", "6", "--time-samples", "4"]
 
 

@@ -12,6 +12,8 @@ import pytest
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.runtime import device, pocl
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture
 def warned(cli, scan, tmp_path, caplog):

@@ -14,6 +14,8 @@ from phyradgs_cl.reconstructors.result import Reconstruction
 from phyradgs_cl.reconstructors.splats.options import SplatOptions
 from phyradgs_cl.workflow import load_scan
 
+pytestmark = pytest.mark.slow
+
 SIMULATE = ["simulate", "--phantom", "jaw", "--size", "12", "--detector", "16", "--views", "4"]
 
 

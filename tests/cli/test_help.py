@@ -13,6 +13,8 @@ from phyradgs_cl.prepare import DEFAULT_STEPS
 from phyradgs_cl.reconstructors import DEFAULT_METHOD, method_options
 from phyradgs_cl.reconstructors.voxels.priors import PRIORS
 
+pytestmark = pytest.mark.slow
+
 PROGRAM = "import sys; sys.argv[0] = 'phyradgs'; from phyradgs_cl.__main__ import main; sys.exit(main())"
 
 

@@ -9,6 +9,8 @@ import pytest
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.io import partial_path, write_volume
 
+pytestmark = pytest.mark.slow
+
 SAID = "interrupted at iteration 812 of 3000"
 READERS = {
     "evaluate": ["evaluate", "{volume}", "--reference", "{volume}", "--json"],

@@ -16,6 +16,8 @@ from phyradgs_cl.signals import finish_despite_interrupt, stop_on_interrupt
 from phyradgs_cl.simulation import options as simulation_options
 from phyradgs_cl.workflow import reconstruct, scans, volumes
 
+pytestmark = pytest.mark.slow
+
 NOTHING = "phyradgs: interrupted, nothing written\n"
 COMPLETE = "phyradgs: interrupted, the output is complete\n"
 

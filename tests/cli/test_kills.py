@@ -63,6 +63,7 @@ def kill_in_the_middle(run: list[str], output: Path, after_s: float) -> None:
     process.wait()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", RUNS)
 def test_killed_runs_end_with_the_bits_of_one_that_was_not(scan, moving_scan, tmp_path, name) -> None:
     whole, killed, options = tmp_path / "whole.h5", tmp_path / "killed.h5", RUNS[name]
@@ -89,6 +90,7 @@ def test_killed_runs_end_with_the_bits_of_one_that_was_not(scan, moving_scan, tm
     assert not checkpoint_path(killed).exists() and not lock_path(killed).exists()
 
 
+@pytest.mark.slow
 def test_two_runs_on_one_output_refuse_each_other(scan, tmp_path) -> None:
     output, quiet = tmp_path / "volume.h5", {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
     first = subprocess.Popen(command(scan, output, ["--iterations", "100000"]), **quiet)
@@ -104,6 +106,7 @@ def test_two_runs_on_one_output_refuse_each_other(scan, tmp_path) -> None:
     assert second.stderr.count("\n") == 1 and "volume.h5: found another run at work on it" in second.stderr
 
 
+@pytest.mark.slow
 def test_a_checkpoint_is_neither_needed_nor_lost(scan, tmp_path) -> None:
     """It is a warning that none can be written, and a run that forgets one sets it aside."""
     output, short = tmp_path / "volume.h5", ["--method", "sirt", "--iterations", "3"]

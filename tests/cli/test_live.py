@@ -13,6 +13,8 @@ import pytest
 from phyradgs_cl.io import partial_path, read_volume
 from phyradgs_cl.progress import Ticker
 
+pytestmark = pytest.mark.slow
+
 
 def test_a_run_with_a_page_is_the_same_run_and_ends_as_its_report(cli, scan, tmp_path) -> None:
     page, seen, plain = tmp_path / "run.html", tmp_path / "seen.h5", tmp_path / "plain.h5"

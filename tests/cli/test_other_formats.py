@@ -15,7 +15,7 @@ from phyradgs_cl.exporters import export_volume
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.io import read_scan, write_scan, write_volume
 
-pytestmark = pytest.mark.usefixtures("fast_pictures")
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("fast_pictures")]
 FORMATS = {"v.mha": "mha", "v.nii.gz": "nii", "v.nrrd": "nrrd", "v.npy": "npy", "v.tif": "tiff"}
 
 

@@ -11,6 +11,8 @@ import pytest
 
 from phyradgs_cl.api import load_scan
 
+pytestmark = pytest.mark.slow
+
 FLY = "--scanner parallel --phantom jaw --size 16 --detector 24 --views 20 --exposure-deg 12 --time-samples 4"
 
 

@@ -5,9 +5,12 @@ from pathlib import Path
 
 import h5py
 import numpy as np
+import pytest
 
 from phyradgs_cl.io import read_volume
 from phyradgs_cl.workflow import load_scan
+
+pytestmark = pytest.mark.slow
 
 SPOILT = (
     "--phantom", "jaw", "--size", "12", "--detector", "20", "--views", "8", "--time-samples", "2",

@@ -10,6 +10,8 @@ from phyradgs_cl.io import read_volume
 from phyradgs_cl.reconstructors.result import Progress
 from phyradgs_cl.report import Preview
 
+pytestmark = pytest.mark.slow
+
 GRID = Grid.cube(4, 2.0)
 
 

@@ -7,6 +7,8 @@ from phyradgs_cl.progress import Ticker
 from phyradgs_cl.reconstructors import Progress
 from phyradgs_cl.text import clock
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture
 def now(monkeypatch):

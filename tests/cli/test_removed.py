@@ -4,6 +4,8 @@ import pytest
 
 from phyradgs_cl.removed import REMOVED
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.mark.parametrize("word", [word for word in REMOVED if word.startswith("phyradgs ")])
 def test_a_command_that_left_names_its_replacement(cli, capsys, word) -> None:

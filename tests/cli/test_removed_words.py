@@ -4,6 +4,8 @@ import pytest
 
 from phyradgs_cl.removed import REMOVED
 
+pytestmark = pytest.mark.slow
+
 WORDS = [word for word in REMOVED if not word.startswith("phyradgs ")]
 
 

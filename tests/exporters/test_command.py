@@ -16,6 +16,8 @@ from phyradgs_cl.exporters import EXPORTS
 from phyradgs_cl.fields import Deformation
 from phyradgs_cl.io import write_deformation
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture
 def run():

@@ -15,6 +15,8 @@ from phyradgs_cl.errors import InputError
 from phyradgs_cl.exporters import export_volume
 from phyradgs_cl.importers import foreign_volume, load_attenuation, load_volume
 
+pytestmark = pytest.mark.slow
+
 NAMES = {"v.mha": "mha", "v.nii": "nii", "v.nii.gz": "nii", "v.nrrd": "nrrd", "v.npy": "npy", "v.tif": "tiff"}
 
 

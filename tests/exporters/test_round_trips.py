@@ -14,6 +14,8 @@ from phyradgs_cl.errors import InputError, OutputError
 from phyradgs_cl.exporters import EXPORTS, export_volume
 from phyradgs_cl.io import write_volume
 
+pytestmark = pytest.mark.slow
+
 MU_WATER = 0.02
 BRIGHT = (4, 1, 2)  # z, y, x
 

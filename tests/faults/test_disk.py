@@ -77,6 +77,7 @@ def test_no_room_at_any_call_leaves_the_old_file_or_the_new_one(tmp_path, monkey
         assert kit.names(tmp_path) == [kind]
 
 
+@pytest.mark.slow
 def test_results_keep_their_lines_when_there_is_no_room(tmp_path, monkeypatch) -> None:
     results = tmp_path / "results.jsonl"
     full = FullAt(monkeypatch)
@@ -109,6 +110,7 @@ printf '%s|%s|%s\\n' "$status" "$(ls -A "$folder" | tr '\\n' ' ')" "$content"
 """
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not can_mount(), reason="a mount needs the superuser")
 @pytest.mark.parametrize("size_kib", [8, 24, 1024])
 def test_a_disk_that_is_full(scan, tmp_path, size_kib) -> None:

@@ -13,6 +13,8 @@ from phyradgs_cl.objective import ImageLoss
 from phyradgs_cl.reconstructors.voxels import run as voxels
 from phyradgs_cl.reconstructors.voxels import sart
 
+pytestmark = pytest.mark.slow
+
 # In a process of its own that may map no more than so many MiB beyond what it has at the start.
 LIMITED = """
 import resource, sys

@@ -3,6 +3,8 @@
 import pytest
 from gpu_build.compilers import KernelCost, Refused, amdgcn_costs, ocloc_costs, ptxas_costs
 
+pytestmark = pytest.mark.slow
+
 PTXAS = """ptxas info    : Compiling entry function 'heavy' for 'sm_90'
 ptxas info    : Function properties for heavy
     16 bytes stack frame, 12 bytes spill stores, 20 bytes spill loads

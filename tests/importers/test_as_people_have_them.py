@@ -18,6 +18,8 @@ from phyradgs_cl.importers import ImportOptions, import_scan, load_volume
 from phyradgs_cl.importers.reading.series import flat_places, series_of
 from phyradgs_cl.importers.reading.text import number_at_start, read_angles_rad
 
+pytestmark = pytest.mark.slow
+
 CENTRED = ConeGeometry(512.0, 1024.0, (10, 14), (2.5, 2.5))
 COUNT = 24
 NAMES = {  # a name for each frame, in the order of the scan

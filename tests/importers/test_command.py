@@ -20,6 +20,8 @@ from phyradgs_cl.importers import FORMATS, import_scan
 from phyradgs_cl.importers.options import FIELDS, option_name
 from phyradgs_cl.io import read_scan
 
+pytestmark = pytest.mark.slow
+
 DOCS = Path(__file__).resolve().parents[2] / "docs" / "import.md"
 
 

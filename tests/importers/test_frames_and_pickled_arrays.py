@@ -14,6 +14,8 @@ from phyradgs_cl.importers.formats.naf import PlainUnpickler, read_pickle
 from phyradgs_cl.importers.reading.frames import compact, line_integrals, oriented
 from phyradgs_cl.io.scan.reader import united
 
+pytestmark = pytest.mark.slow
+
 FRAMES = np.array([[[100.0, 50.0], [25.0, 10.0]]] * 3, np.float32)
 
 

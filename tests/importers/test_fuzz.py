@@ -26,6 +26,8 @@ from phyradgs_cl.io import load_scanner, write_scan, write_volume
 from phyradgs_cl.settings import read_config
 from phyradgs_cl.workflow import load_scan
 
+pytestmark = pytest.mark.slow
+
 TIMES = int(os.environ.get("STRESS", "1"))
 OPTIONS = {
     "phyradgs-real": ImportOptions(pixel_size_mm=(3.0, 2.5)),

@@ -13,6 +13,8 @@ from phyradgs_cl.errors import InputError
 from phyradgs_cl.importers import ImportOptions, import_scan, load_volume
 from phyradgs_cl.importers.options import option_name
 
+pytestmark = pytest.mark.slow
+
 KEY = np.repeat([2, 1, 0, 1], [1, 2, 6, 2])
 ANGLE_DEG = np.where(KEY == 0, np.cumsum(KEY == 0) * 20.0 - 20.0, np.nan)
 FRAMES = np.choose(KEY, [20000, 50000, 100])[:, None, None] * np.ones((1, 4, 5))

@@ -18,6 +18,8 @@ from phyradgs_cl.importers.formats.tiff_folder import OWN_TABLES
 from phyradgs_cl.io import read_scan
 from phyradgs_cl.io.scanner import TABLES
 
+pytestmark = pytest.mark.slow
+
 SHEET = {"first": "left", "fps": 0.8, "readout_ms": 300.0}
 SHEET_TOML = '[timing]\nexposure_s = 0.4\n[readout]\nfirst = "left"\nfps = 0.8\nreadout_ms = 300.0'
 SHEET_WORDS = ("--exposure-s", "0.4", "--first", "left", "--fps", "0.8", "--readout-ms", "300")

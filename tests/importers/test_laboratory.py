@@ -17,6 +17,8 @@ from phyradgs_cl.errors import InputError
 from phyradgs_cl.importers import ImportOptions, formats, import_scan, recognise
 from phyradgs_cl.io import read_scan, write_scan
 
+pytestmark = pytest.mark.slow
+
 CENTRED = ConeGeometry(500.0, 800.0, (10, 14), (3.0, 2.5))
 WRITERS: dict[str, tuple[Callable[..., Path], ConeGeometry]] = {
     "nikon": (lab.write_nikon, CENTRED),

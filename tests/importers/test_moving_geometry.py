@@ -16,6 +16,8 @@ from phyradgs_cl.acquisition import CircularOrbit, PoseTable
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.importers import ImportOptions, import_scan, recognise
 
+pytestmark = pytest.mark.slow
+
 # Written by RTK 2.7: three projections, the third tilted about all axes with every offset in use.
 DATA = Path(__file__).with_name("data")
 RTK_FILE, RTK_PARALLEL = DATA / "rtk_tilted.xml", DATA / "rtk_parallel.xml"

@@ -196,7 +196,7 @@ def refused(path: Path, options: ImportOptions | None, form: str, said: str) -> 
     assert said in str(caught.value) and len(str(caught.value).splitlines()) == 1, caught.value
 
 
-@pytest.mark.parametrize("form", MISTAKES)
+@pytest.mark.parametrize("form", [pytest.param(one, marks=pytest.mark.slow) if one == "nxtomo" else one for one in MISTAKES])
 def test_a_mistake_is_named(tmp_path, make_truth, form) -> None:
     for number, (said, damage) in enumerate(MISTAKES[form].items()):
         (tmp_path / str(number)).mkdir()

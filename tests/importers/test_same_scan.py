@@ -12,6 +12,8 @@ from phyradgs_cl.acquisition import ConeGeometry, ParallelGeometry
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.importers import ImportOptions, import_scan, recognise
 
+pytestmark = pytest.mark.slow
+
 FLY = ImportOptions(0.4, 0.3, 1.25, readout_axis="columns", readout_direction=-1)
 MOVING = {"fly": True, "axis": "columns", "direction": -1}
 ALL = ImportOptions(part="all")

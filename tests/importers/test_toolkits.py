@@ -18,6 +18,8 @@ from phyradgs_cl.errors import InputError
 from phyradgs_cl.importers import ImportOptions, import_scan, recognise
 from phyradgs_cl.io import read_scan, write_scan
 
+pytestmark = pytest.mark.slow
+
 SQUARE = replace(GEOMETRY, detector_offset_mm=(3.0, -5.0))  # whole and half pixels, which text keeps to the bit
 WRITERS: dict[str, tuple[Callable[..., Path], str]] = {
     "leap": (kits.write_leap, "leap"), "tigre": (kits.write_tigre, "scan.pickle"),

@@ -166,6 +166,7 @@ def test_damage_is_named(good, make_scan) -> None:
         assert sorted(good.parent.iterdir()) == before, case
 
 
+@pytest.mark.slow
 def test_whole_files_that_are_wrong(tmp_path, good) -> None:
     content = good.read_bytes()
     (tmp_path / "text.h5").write_text("not HDF5 at all\n" * 100)
@@ -181,12 +182,14 @@ def test_whole_files_that_are_wrong(tmp_path, good) -> None:
         assert "\n" not in str(caught.value)
 
 
+@pytest.mark.slow
 def test_a_file_that_may_not_be_read(good, monkeypatch) -> None:
     """The superuser may read any: the system's answer is put in its place."""
     monkeypatch.setattr(os, "access", lambda path, mode: not (mode & os.R_OK and Path(path) == good))
     refuses(good, "", ("no permission to read it", "whoever owns"))
 
 
+@pytest.mark.slow
 def test_a_spoilt_chunk_is_named(tmp_path, good) -> None:
     with h5py.File(good, "r+") as file:
         put(file, DATA, file[DATA][...], compression="gzip", fletcher32=True)
@@ -208,6 +211,7 @@ def test_damage_is_found_before_the_pixels_are_read(good) -> None:
             read()
 
 
+@pytest.mark.slow
 def test_motion_without_meaning_is_still_said(good, caplog) -> None:
     with h5py.File(good, "r+") as file:
         file[f"{SAMPLE}/x_translation"] = np.zeros(4)
@@ -215,6 +219,7 @@ def test_motion_without_meaning_is_still_said(good, caplog) -> None:
     assert f"{SAMPLE}/x_translation: not read" in caplog.text
 
 
+@pytest.mark.slow
 def test_a_mask_of_all_projections_is_named_though_a_flat_is_free(tmp_path, make_scan) -> None:
     scan, path = make_scan(), tmp_path / "scan.h5"
     data = np.concatenate([np.full((1, 3, 5), 60000), np.full((4, 3, 5), 30000)]).astype(np.uint16)

@@ -9,6 +9,8 @@ from nxtomo.application import nxtomo
 from phyradgs_cl.detector import counts_to_attenuation
 from phyradgs_cl.io import read_scan, write_scan
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture
 def stored(tmp_path, make_scan):

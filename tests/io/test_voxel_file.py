@@ -10,6 +10,8 @@ from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields.volume import Grid
 from phyradgs_cl.importers import load_attenuation, load_volume
 
+pytestmark = pytest.mark.slow
+
 
 def _write(path: Path, data: object, name: str = "volume") -> Path:
     with h5py.File(path, "w") as file:

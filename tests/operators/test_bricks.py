@@ -24,6 +24,8 @@ from phyradgs_cl.operators.rays import launches as rays
 from phyradgs_cl.operators.splats import binning
 from phyradgs_cl.runtime import Room
 
+pytestmark = pytest.mark.slow
+
 SHAPE = (7, 37)
 TALL = Grid((21, 70, 37), (0.09, 0.03, 0.05), (0.05, 0.1, -0.1))
 Z_ONLY, Z_AND_Y = 320_000, 130_000  # bytes of room for TALL: cuts along z, and along both

@@ -12,6 +12,8 @@ from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.operators import IntensityOperator, RayOperator, backproject, backproject_lines
 
+pytestmark = pytest.mark.slow
+
 SHAPE = (7, 37)
 TALL = Grid((21, 70, 37), (0.09, 0.03, 0.05), (0.05, 0.1, -0.1))
 UPRIGHT = Grid((12, 17, 21), (0.1, 0.1, 0.1))

@@ -71,6 +71,7 @@ def test_a_cloud_in_every_state_is_its_twin(any_rt, make_cloud, make_geometry, c
         np.testing.assert_allclose(state[3:].T, pull.reshape(-1, 9), rtol=0, atol=FLOAT32)
 
 
+@pytest.mark.slow
 @MODELS
 @pytest.mark.parametrize(("motion", "counts"), [("micro-views", (2, 2)), ("exact", (2,))])
 def test_frames_and_gradients_are_those_of_the_twin(
@@ -85,6 +86,7 @@ def test_in_every_build(any_rt, make_cloud, make_geometry, finite_differences) -
     check_frame_and_gradients(any_rt, finite_differences, make_cloud(1, 42), table, deformation(rank=1))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("motion", ["static", "exact"])
 def test_parallel_rays(rt, make_cloud, finite_differences, motion) -> None:
     orbit = CircularOrbit(ParallelGeometry(SHAPE, (2.6 / 13, 2.7 / 18)), ConstantSpeed(0.3, 0.5))

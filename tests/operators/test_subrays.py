@@ -49,6 +49,7 @@ def test_a_pixel_is_the_mean_over_a_finer_panel(any_rt, motion, grid, beam, axis
     assert mismatch(operator) <= ADJOINT
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("axis", ["rows", "columns"])
 @pytest.mark.parametrize("motion", ["static", "common"])
 def test_arrays_of_the_device_and_some_of_the_frames(any_rt, motion, axis) -> None:
@@ -62,6 +63,7 @@ def test_arrays_of_the_device_and_some_of_the_frames(any_rt, motion, axis) -> No
         np.testing.assert_allclose(there, host, rtol=0, atol=RAYS * np.abs(host).max())
 
 
+@pytest.mark.slow
 def test_a_volume_in_bricks(any_rt) -> None:
     grid = Grid((21, 70, 37), (0.09, 0.03, 0.05), (0.05, 0.1, -0.1))
     whole = of(any_rt, "static", grid=grid, shape=(7, 37))
@@ -83,6 +85,7 @@ def test_intensity_averages_the_times_of_a_line_and_not_its_rays(any_rt) -> None
     assert mismatch(model) <= ADJOINT
 
 
+@pytest.mark.slow
 def test_an_object_that_moves(any_rt) -> None:
     control_mm = 0.1 * noise((1, 4, 4, 4, 3), 12)
     motion = Deformation(control_mm, (-1.0, -1.0, -1.0), 0.7, np.array([0.0, 6.0]), np.array([[0.0], [1.0]]))

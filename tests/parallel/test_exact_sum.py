@@ -1,8 +1,11 @@
 """Sums over ranks: exact, whatever the order, the number of ranks and the range of the numbers."""
 
 import numpy as np
+import pytest
 
 from phyradgs_cl.parallel import Communicator, exact_sum
+
+pytestmark = pytest.mark.slow
 
 
 def parts(count: int = 12, rows: int = 13, columns: int = 501) -> list[np.ndarray]:

@@ -12,6 +12,8 @@ from phyradgs_cl.errors import InputError
 from phyradgs_cl.reconstructors import Preprocessing, Progress, RunPlan, loop, method_options, reconstruct
 from phyradgs_cl.runtime import Runtime
 
+pytestmark = pytest.mark.slow
+
 DIVIDED = {
     "four frames per step": OPTIONS,
     "exact in time": replace(OPTIONS, motion=Exact()),

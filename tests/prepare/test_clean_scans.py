@@ -9,6 +9,8 @@ from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.api import compare, prepare, reconstruct
 from phyradgs_cl.prepare import DEFAULT_STEPS, PREPARED_KEY
 
+pytestmark = pytest.mark.slow
+
 CONE, PARALLEL = (5.0, 7.0), (500.0, 501.0)  # source to axis and to panel in mm
 OBJECTS = ("head", "tube about the axis", "grains")
 

@@ -51,6 +51,7 @@ def test_dead_pixels(rt, clean) -> None:
     assert rms(prepared.projections - clean.projections) < 0.1 * rms(frames - clean.projections)
 
 
+@pytest.mark.slow
 def test_scatter(rt, clean) -> None:
     """Of a clean scan the fit takes less than the noise of a pixel; of scatter most goes."""
     unchanged = prepare(clean, "scatter", device=rt).projections
@@ -76,6 +77,7 @@ def test_air(rt, clean) -> None:
     assert prepared.provenance[PREPARED_KEY][0]["light"] == pytest.approx([light.min(), light.max()], rel=0.003)
 
 
+@pytest.mark.slow
 def test_hardening(rt, clean) -> None:
     """No correction explains a straight scan better than none; a wedge's polynomial straightens water."""
     assert prepare(clean, "hardening", hardening={"kvp": 100.0}, device=rt).projections is clean.projections

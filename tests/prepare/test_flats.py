@@ -11,6 +11,8 @@ from phyradgs_cl.prepare import flat_correction
 from phyradgs_cl.reconstructors import Preprocessing
 from phyradgs_cl.reconstructors.preprocess import prepared
 
+pytestmark = pytest.mark.slow
+
 DARK = 100.0
 
 

@@ -10,6 +10,8 @@ from phyradgs_cl.errors import InputError
 from phyradgs_cl.prepare import PREPARED_KEY, retrieve_phase
 from phyradgs_cl.reconstructors import preprocessing_of
 
+pytestmark = pytest.mark.slow
+
 PIXELS, FINE = 64, 8
 PIXEL_MM, RADIUS_MM, MU_PER_MM = 1e-3, 0.02, 20.0
 ENERGY_KEV, DELTA_BETA, DISTANCE_MM = 25.0, 500.0, 3.0

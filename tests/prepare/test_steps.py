@@ -24,6 +24,8 @@ from phyradgs_cl.prepare.scatter import raised
 from phyradgs_cl.reconstructors import Preprocessing, preprocessing_of
 from phyradgs_cl.reconstructors.preprocess import prepared, reprojection
 
+pytestmark = pytest.mark.slow
+
 # effect, step, its options, least share of the loss that FDK gets back on this small scan
 CASES = (
     ({"sparks": 1e-3}, "sparks", {}, 0.6),

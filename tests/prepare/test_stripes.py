@@ -13,6 +13,8 @@ from phyradgs_cl.errors import InputError
 from phyradgs_cl.prepare import PREPARED_KEY, remove_stripes
 from phyradgs_cl.reconstructors import preprocessing_of
 
+pytestmark = pytest.mark.slow
+
 COLUMNS = (10, 20, 33)
 
 

@@ -19,6 +19,8 @@ from phyradgs_cl.reconstructors.preprocess import Preprocessing
 from phyradgs_cl.reconstructors.projected import frame_pairs
 from phyradgs_cl.reconstructors.result import Report
 
+pytestmark = pytest.mark.slow
+
 GRID = Grid.cube(20, 2.0)
 SHAPE = (20, 24)
 GEOMETRY = ConeGeometry(8.0, 12.0, SHAPE, (0.19, 0.19))

@@ -12,6 +12,8 @@ from phyradgs_cl.reconstructors.checkpoint import with_identity, without_identit
 from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.workflow import load_scan
 
+pytestmark = pytest.mark.slow
+
 
 def state() -> dict[str, np.ndarray]:
     record = [{"iteration": 1, "loss": 0.5}, {"iteration": 2, "loss": 0.25}]

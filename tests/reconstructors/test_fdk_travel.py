@@ -73,6 +73,7 @@ def test_densities_of_a_circle(rt, is_parallel, caplog) -> None:
     assert not caplog.records
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("axis", ["rows", "columns"])
 def test_with_a_pose_for_every_line(rt, axis) -> None:
     circle = reconstructed(rt, poses_of(ANGLE[::3], 0 * ANGLE[::3]))
@@ -105,12 +106,14 @@ def test_few_views_a_turn_are_named(rt, views, said, caplog) -> None:
         assert [line[: len(said[0])] if said else line for line in caplog.messages] == said
 
 
+@pytest.mark.slow
 def test_where_other_methods_begin(rt) -> None:
     pose = helix(3, 0.4)
     scan = Scan.from_poses(frames_of(pose, "rows", False), pose, GRID)
     np.testing.assert_allclose(levels(static_fdk(rt, scan)), reconstructed(rt, pose), atol=FDK_PARTIAL / 10)
 
 
+@pytest.mark.slow
 def test_long_helices_are_not_refused(rt) -> None:
     """A travel of the source–panel distance: refused as far off a circle, of which a voxel only misses views."""
     pose = helix(20, 0.6)

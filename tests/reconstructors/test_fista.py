@@ -47,6 +47,8 @@ from phyradgs_cl.reconstructors.voxels.priors import (
 from phyradgs_cl.reconstructors.voxels.system import System
 from phyradgs_cl.runtime import DeviceSpace, Runtime
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def scan(rt) -> Scan:

@@ -12,6 +12,8 @@ from phyradgs_cl.reconstructors import Preprocessing, RunPlan, method_options, r
 from phyradgs_cl.reconstructors.projected import held_out, holdout_errors
 from phyradgs_cl.reconstructors.result import HELD_OUT, Reconstruction
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def scan(rt) -> Scan:

@@ -7,6 +7,8 @@ from tolerances import FLOAT64
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.reconstructors.splats.start import initial_cloud
 
+pytestmark = pytest.mark.slow
+
 GRID = Grid((6, 7, 8), (0.1, 0.2, 0.3), (0.5, 0.0, -0.5))
 SETTINGS = {"threshold": 0.2, "density_share": 0.15, "scale_bounds": (0.001, 1.0), "scale_factor": 1.0}
 

@@ -14,6 +14,8 @@ from phyradgs_cl.reconstructors.voxels.system import System
 from phyradgs_cl.runtime.algebra import norm
 from phyradgs_cl.simulation import AnalyticSource, SimulationOptions, simulate
 
+pytestmark = pytest.mark.slow
+
 ITERATIONS = {
     "sart": 6, "os-sart": 8, "sirt": 25, "cgls": 8, "asd-pocs": 6, "fista": 12, "fista-tv": 25,
     "phyradgs exact": 500,

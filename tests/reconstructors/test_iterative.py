@@ -24,6 +24,8 @@ from phyradgs_cl.reconstructors.voxels.sart import OS_SART, Sart, SartOptions, S
 from phyradgs_cl.reconstructors.voxels.system import System
 from phyradgs_cl.runtime.algebra import norm
 
+pytestmark = pytest.mark.slow
+
 ITERATIVE = ("sart", "os-sart", "sirt", "cgls", "asd-pocs", "fista", "fista-tv")
 VOLUME, FRAMES = (3, 4, 4), (6, 4, 5)
 

@@ -9,6 +9,8 @@ from phyradgs_cl.errors import InputError, OutOfMemoryError
 from phyradgs_cl.fields import Grid, GridChoice
 from phyradgs_cl.reconstructors.result import HELD_OUT
 
+pytestmark = pytest.mark.slow
+
 PART = GridChoice(roi_mm=0.9, margin_mm=(0, 0.3, 0.3))
 
 

@@ -43,7 +43,7 @@ def levels(rt, kind: str, angles_deg: np.ndarray, columns: int = 48, offset_mm: 
 
 
 @pytest.mark.parametrize("kind", ["fdk", "fbp"])
-@pytest.mark.parametrize("lines_deg", [0.0, 1.5])
+@pytest.mark.parametrize("lines_deg", [0.0, pytest.param(1.5, marks=pytest.mark.slow)])
 def test_a_displaced_panel_keeps_its_weights_where_views_are_missing(rt, kind, lines_deg, caplog) -> None:
     """They went, and the density at the axis was three times too high: two views in a row, or a turn that ends early."""
     turns = {"whole": EVERY_DEG, "two lost": np.delete(EVERY_DEG, [40, 41]), "ends early": np.arange(0, 359, 1.0)}
@@ -53,6 +53,7 @@ def test_a_displaced_panel_keeps_its_weights_where_views_are_missing(rt, kind, l
     assert [record.message.split(" are missing")[0] for record in caplog.records] == [f"{kind.upper()}: 4.0°"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["fdk", "fbp"])
 @pytest.mark.parametrize("offset_mm", [0.0, 0.02])
 def test_a_panel_that_sees_both_sides_takes_missing_rays_from_opposite_views(rt, kind, offset_mm, caplog) -> None:
@@ -64,6 +65,7 @@ def test_a_panel_that_sees_both_sides_takes_missing_rays_from_opposite_views(rt,
     assert not caplog.records
 
 
+@pytest.mark.slow
 def test_gaps_that_nothing_covers_are_named(rt, caplog) -> None:
     """In degrees, in one line each."""
     opposite = np.delete(EVERY_DEG, np.r_[20:40, 110:130])
@@ -103,6 +105,7 @@ def test_cells_fill_gaps_or_part_there() -> None:
         assert float(both) == pytest.approx(2.0, abs=1e-3)
 
 
+@pytest.mark.slow
 def test_views_at_random_around_their_places_are_seen_from_somewhere() -> None:
     """The widest gap need not be one that stands out from its neighbours."""
     rng = np.random.default_rng(0)

@@ -35,6 +35,8 @@ from phyradgs_cl.reconstructors.moving.signal import (
 )
 from phyradgs_cl.reconstructors.result import MOTION_FOUND, Progress
 
+pytestmark = pytest.mark.slow
+
 FRAMES, PERIOD_S, STEP_S = 90, 3.1, 0.5
 
 

@@ -26,6 +26,8 @@ from phyradgs_cl.reconstructors.result import HELD_OUT, Progress
 from phyradgs_cl.report.run import computed_views, load_run
 from phyradgs_cl.runtime import Runtime
 
+pytestmark = pytest.mark.slow
+
 GRID, SHAPE, FRAMES = Grid.cube(16, 2.0), (24, 24), 30
 MOVING = [name for name, method in METHODS.items() if method.takes_deformation]
 SPLATS = ("phyradgs", "r2")

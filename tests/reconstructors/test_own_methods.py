@@ -19,6 +19,8 @@ from phyradgs_cl.api import (
 )
 from phyradgs_cl.errors import InputError, NumericalError
 
+pytestmark = pytest.mark.slow
+
 TINY = ["--phantom", "jaw", "--size", "8", "--detector", "12", "--views", "4", "--time-samples", "2"]
 MODULE = '''
 from dataclasses import dataclass

@@ -15,6 +15,8 @@ from phyradgs_cl.reconstructors import Preprocessing, RunPlan, method_options, p
 from phyradgs_cl.reconstructors.preprocess import prepared
 from phyradgs_cl.simulation import AnalyticSource, SimulationOptions, simulate
 
+pytestmark = pytest.mark.slow
+
 GEOMETRY = ConeGeometry(5.0, 7.0, (16, 16), (0.25, 0.25))
 
 

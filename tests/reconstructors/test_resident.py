@@ -17,6 +17,8 @@ from phyradgs_cl.runtime import DeviceSpace, Runtime, Traffic
 from phyradgs_cl.runtime.layout import GUARD, pitch_of
 from phyradgs_cl.simulation import AnalyticSource, SimulationOptions, simulate
 
+pytestmark = pytest.mark.slow
+
 ITERATIVE = ("sart", "os-sart", "sirt", "cgls", "asd-pocs", "fista", "fista-tv")
 MOST_BYTES = 1024  # over the bus in an iteration
 MOST_WAITS = dict.fromkeys(ITERATIVE, 8) | {"fista": 10}

@@ -8,6 +8,8 @@ from phyradgs_cl.api import static_scan
 from phyradgs_cl.phantoms import Ellipsoid, EllipsoidPhantom
 from phyradgs_cl.reconstructors.fits.twice import shift_by_rays_seen_twice
 
+pytestmark = pytest.mark.slow
+
 BODY = EllipsoidPhantom(
     (
         Ellipsoid((0.0, 0.0, 0.0), (16.0, 14.0, 6.0), 0.012), Ellipsoid((9.0, 3.0, 1.0), (1.6,) * 3, 0.02),

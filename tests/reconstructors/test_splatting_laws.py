@@ -22,6 +22,8 @@ from phyradgs_cl.reconstructors.splats import method as splatting
 from phyradgs_cl.reconstructors.splats.options import SplatOptions
 from phyradgs_cl.simulation import AnalyticSource, SimulationOptions, simulate
 
+pytestmark = pytest.mark.slow
+
 CONTROL = DensityControl(every=10, start_iteration=5, threshold=1e-6)
 OPTIONS = SplatOptions(
     motion=MicroViews(4, 2), iterations=30, gaussians=300, tv_edge=8, control=CONTROL

@@ -12,6 +12,8 @@ from phyradgs_cl.fields import Gaussians, Grid
 from phyradgs_cl.report.images import Window, bytes_of
 from phyradgs_cl.report.interactive.atlas import MOST_CENTRES, MOST_EDGE, MOST_TEXT, space
 
+pytestmark = pytest.mark.slow
+
 
 def data_of(parse, *arguments: object) -> dict:
     page = parse(space(*arguments))

@@ -17,6 +17,8 @@ from phyradgs_cl.acquisition.motion import MODELS
 from phyradgs_cl.drawing import SAMPLE
 from phyradgs_cl.report import charts, scan_charts
 
+pytestmark = pytest.mark.slow
+
 
 def drawn(draw: Callable[..., None], *arguments: object) -> Axes:
     axes = Figure().add_subplot()

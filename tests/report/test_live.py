@@ -5,6 +5,7 @@ import time
 from io import BytesIO
 
 import numpy as np
+import pytest
 from skimage.io import imread
 
 from phyradgs_cl.errors import InputError, OutOfMemoryError, OutputError
@@ -14,6 +15,8 @@ from phyradgs_cl.reconstructors.projected import FramePair
 from phyradgs_cl.report import LivePage
 from phyradgs_cl.report.live import SHARE
 from phyradgs_cl.report.live_page import Snapshot, Status, live_page
+
+pytestmark = pytest.mark.slow
 
 GRID = Grid.cube(6, 3.0)
 SETTINGS = {"scan": "scan.h5", "method": "sart", "options": {"relaxation": 0.7}}

@@ -18,6 +18,8 @@ from phyradgs_cl.report.markup import (
 )
 from phyradgs_cl.text import flattened
 
+pytestmark = pytest.mark.slow
+
 
 def test_data_cannot_end_their_block() -> None:
     text = json_block("data", {"a": "</script><!--&"})

@@ -17,6 +17,8 @@ from phyradgs_cl.report.images import Window
 from phyradgs_cl.report.interactive.motion import MOST_VALUES, fitting, object_in_motion
 from phyradgs_cl.report.sections import motion_section
 
+pytestmark = pytest.mark.slow
+
 SPAN_S = 0.5, 3.5
 
 

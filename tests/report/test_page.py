@@ -25,6 +25,8 @@ from phyradgs_cl.report.markup import number
 from phyradgs_cl.report.run import computed_views, spread_frames
 from phyradgs_cl.workflow import run_reconstruction
 
+pytestmark = pytest.mark.slow
+
 DOCS = Path(__file__).resolve().parents[2] / "docs" / "report.md"
 ALL = {"slices", "volume", "metrics", "convergence", "projections", "scan", "geometry", "shutter", "provenance"}
 HOSTILE = "</title></script><script>alert(1)</script><img src=x onerror='alert(2)'>\"'&amp;"

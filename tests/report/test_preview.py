@@ -18,6 +18,8 @@ from phyradgs_cl.io import write_volume
 from phyradgs_cl.report import write_preview
 from phyradgs_cl.report.preview import preview_image
 
+pytestmark = pytest.mark.slow
+
 GAP = 4
 
 

@@ -8,6 +8,8 @@ import pytest
 from phyradgs_cl.acquisition import Shutter, make_protocol
 from phyradgs_cl.report.interactive.motion import frame_in_motion
 
+pytestmark = pytest.mark.slow
+
 
 def data_of(parse, scan) -> dict:
     page = parse(frame_in_motion(scan))

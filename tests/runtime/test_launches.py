@@ -36,6 +36,7 @@ def parts(monkeypatch):
     return seen
 
 
+@pytest.mark.slow
 def test_groups_and_launches_keep_to_small_limits(monkeypatch, parts) -> None:
     """A kernel with many registers may allow fewer items than its device. Here all do, and no launch may be long."""
     monkeypatch.setattr(Runtime, "_asked", lambda *_: 32)

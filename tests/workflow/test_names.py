@@ -12,7 +12,8 @@ from phyradgs_cl.io import checkpoint_path, read_volume
 from phyradgs_cl.io.output import beside, shortened
 from phyradgs_cl.text import plain_text
 
-pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="file systems that take any bytes")
+linux = pytest.mark.skipif(sys.platform != "linux", reason="file systems that take any bytes")
+pytestmark = [pytest.mark.slow, linux]
 BAD = os.fsdecode(b"bad\xff")
 FAST = ["--method", "sirt", "--iterations", "2"]
 

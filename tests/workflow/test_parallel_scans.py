@@ -12,6 +12,8 @@ from phyradgs_cl.reconstructors import plan_run, reconstruct
 from phyradgs_cl.report import write_report
 from phyradgs_cl.workflow import run_reconstruction
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.mark.parametrize("make", [lambda: parallel_scan(10, shutter=Shutter(0.1, 0.5)), lambda: laminography_scan(10)])
 def test_a_report_has_no_source(rt, tmp_path, make) -> None:

@@ -11,7 +11,7 @@ from phyradgs_cl.io import read_volume, write_volume
 from phyradgs_cl.io.tables import PROVENANCE, read_facts
 from phyradgs_cl.workflow.files import load_scan
 
-pytestmark = pytest.mark.usefixtures("fast_pictures")
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("fast_pictures")]
 ABSURD = {
     "half a surrogate pair": "x\udcff\ud800",
     "a control": "x\x1b[2J\0",

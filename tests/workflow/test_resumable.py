@@ -12,6 +12,8 @@ from phyradgs_cl.reconstructors import Progress, Reconstruction, RunPlan, plan_r
 from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.workflow.reconstruct import is_complete, resume_or_restart
 
+pytestmark = pytest.mark.slow
+
 
 class Report:
     """Notes the iterations that were reported, and presses Ctrl-C at one of them."""

@@ -8,6 +8,8 @@ import pytest
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.workflow.sweep.grid import SweepRun, plan_sweep
 
+pytestmark = pytest.mark.slow
+
 GRID = 'scans = ["*.h5"]\n'
 
 

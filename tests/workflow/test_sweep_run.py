@@ -16,6 +16,8 @@ from phyradgs_cl.workflow.sweep.grid import plan_sweep
 from phyradgs_cl.workflow.sweep.run import RESULTS, run_sweep
 from phyradgs_cl.workflow.sweep.tables import markdown, read_lines
 
+pytestmark = pytest.mark.slow
+
 TEXT = """
 scans = ["*.h5"]
 seeds = [0, 1]
