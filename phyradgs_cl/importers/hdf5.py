@@ -15,8 +15,7 @@ from phyradgs_cl.errors import InputError
 from phyradgs_cl.importers.assemble import Turned, cone, parallel
 from phyradgs_cl.importers.options import ImportOptions
 from phyradgs_cl.importers.reading.files import SafeFolder
-from phyradgs_cl.importers.reading.flats import places
-from phyradgs_cl.importers.reading.frames import LineIntegrals, line_integrals, oriented
+from phyradgs_cl.importers.reading.frames import LineIntegrals, line_integrals, oriented, places
 from phyradgs_cl.io import scan as schema
 from phyradgs_cl.io.hdf5 import datasets as h5
 from phyradgs_cl.io.hdf5.datasets import ANGLE, LENGTH, Quantity
@@ -60,7 +59,8 @@ class Places:
             yield self.source, text
             return
         if not file:
-            raise InputError(subject, repr(text)[:80], "an address in HDF5, as FILE:/ADDRESS", "'h5ls -r FILE' lists them")
+            expected, remedy = "an address in HDF5, as FILE:/ADDRESS", "'h5ls -r FILE' lists them"
+            raise InputError(subject, repr(text)[:80], expected, remedy)
         path = Path(file) if self.folder is None else self.folder.file(file, subject)
         if self.source is not None and not path.exists():
             path = self.source.path.parent / file
@@ -121,7 +121,12 @@ class Places:
         for name, addresses in (("flats", flats), ("darks", darks), ("mask", mask)):
             if parts := self.stack(name, addresses, panel):
                 stacks[name] = parts[0]
-                flats_at = _times_of(parts[1], int(used.sum())) if name == "flats" else flats_at
+                at = {"pre": -0.5, "post": int(used.sum()) - 0.5}  # by what the addresses of flats end in
+                ends = [text.rpartition("_")[2] for text in parts[1]]
+                if name == "flats":
+                    flats_at = np.repeat([at.get(end, np.nan) for end in ends], list(parts[1].values()))
+        if flats_at is not None and np.isnan(flats_at).any():
+            flats_at = None
         bad = stacks.get("mask")
         if bad is not None and len(bad) not in (1, len(used)):
             raise InputError("mask", f"{len(bad)} images", f"one, or {len(used)} as there are frames")
@@ -189,13 +194,6 @@ class Stacks:
         return integrals if bad is None else replace(integrals, mask=united(bad != 0, integrals.mask))
 
 
-def _times_of(parts: Mapping[str, int], projections: int) -> np.ndarray | None:
-    """Returns the places of flats among the projections, of addresses that say before or after; None where one does not."""
-    at = {"pre": -0.5, "post": projections - 0.5}
-    words = [address.rpartition("_")[2] for address in parts]
-    return np.repeat([at[word] for word in words], list(parts.values())) if all(word in at for word in words) else None
-
-
 def places_of(options: ImportOptions, source: Hdf5Source) -> Places:
     """Returns the places that options state. InputError for other names."""
     stated: dict[str, list[str]] = {}
@@ -255,7 +253,10 @@ def beam(
         _log.warning("%s: no source distance: a parallel beam", source.name(lengths.source))
         sides = options.taken("pixel_size_mm", pitch_mm)
         return parallel(options, panel, sides, (0.0, axis_columns * sides[1]))
-    to_axis_mm = options.taken("source_to_axis_mm", lambda: _to_axis_mm(source, lengths.source, quantity))
+    # NeXus gives the distance of the source a minus sign
+    to_axis_mm = options.taken("source_to_axis_mm", lambda: abs(h5.read_number(source, lengths.source, quantity)))
+    if to_axis_mm == 0:
+        raise source.error(lengths.source, "0", "a length other than 0", "remove it: without one the beam is parallel")
     to_detector_mm = options.taken(
         "source_to_detector_mm", lambda: to_axis_mm + h5.read_length(source, lengths.detector, quantity)
     )
@@ -272,13 +273,6 @@ def _length_of(source: Hdf5Source, lengths: Lengths) -> Quantity:
         if abs(float(h5.read_values(source, address, source.dataset(address)).ravel()[0])) < _LEAST_MM:
             return replace(LENGTH, assumed="m")
     return LENGTH
-
-
-def _to_axis_mm(source: Hdf5Source, address: str, quantity: Quantity) -> float:
-    distance_mm = abs(h5.read_number(source, address, quantity))  # NeXus gives it a minus sign
-    if distance_mm == 0:
-        raise source.error(address, "0", "a length other than 0", "remove it: without one the beam is parallel")
-    return distance_mm
 
 
 def exposure_s(source: Hdf5Source, address: str, used: np.ndarray, options: ImportOptions) -> float | None:

@@ -1,5 +1,7 @@
-"""Scans and objects of other programs: a module per format of scans, volumes by their suffix, beads and wires in TOML."""
+"""Scans and objects of other programs: a module per format of scans, volumes by their suffix, beads and wires in TOML. Kinds
+of files that are not read are refused with the way to convert them."""
 
+from collections import Counter
 from collections.abc import Callable, Iterator
 from importlib import import_module
 from pathlib import Path
@@ -15,10 +17,42 @@ from phyradgs_cl.importers.options import ImportOptions
 from phyradgs_cl.importers.reading import tiff
 from phyradgs_cl.importers.reading.files import SafeFolder, read_json, read_npy
 from phyradgs_cl.importers.reading.images import image_times_s, read_image_volume
-from phyradgs_cl.importers.unread import refuse_unread
 from phyradgs_cl.io.tables import Fields, read_toml, refuse_unknown
 from phyradgs_cl.io.volume import Volume, check_attenuation, finite_float32, read_volume, shares_of_maximum
 from phyradgs_cl.phantoms import Cylinder, Ellipsoid, EllipsoidPhantom
+
+_TO_TIFF = "convert them to 16-bit TIFF, as in Fiji: File > Import > Image Sequence, then Save As > Image Sequence"
+_KINDS = {
+    ("png", "jpg", "jpeg", "bmp", "gif", "jp2"): ("images of another kind than TIFF", _TO_TIFF),
+    ("edf",): ("ESRF's EDF", "convert them to TIFF or HDF5 with fabio or silx: 'silx convert *.edf -o scan.h5'"),
+    ("raw", "bin", "img", "vol", "dat", "seq", "viv"): (
+        "raw numbers without a description", "convert them to TIFF, as in Fiji: File > Import > Raw, then Save As > Tiff"
+    ),
+    ("dcm", "dicom", "ima"): (
+        "DICOM", "convert a volume with SimpleITK to NIfTI, and its Hounsfield units to 1/mm; projections to TIFF"
+    ),
+    ("mat",): ("a file of MATLAB", "save its array as .npy or TIFF: scipy.io.loadmat and tifffile.imwrite"),
+    ("fit", "fits"): ("FITS", "convert them to TIFF: astropy.io.fits and tifffile.imwrite"),
+    ("xrm", "txm"): ("single images or a volume of Xradia", "import the scan's .txrm, or export TIFFs"),
+}  # fmt: skip
+_MOST_FILES = 1000
+
+
+def refuse_unread(path: Path, expected: str) -> None:
+    """Raises InputError for a file, or for a folder with mostly files, of a kind that is known and not read."""
+    entries = [path] if path.is_file() else sorted(path.iterdir())[:_MOST_FILES] if path.is_dir() else []
+    files = [file for file in entries if file.is_file()]
+    suffixes = Counter("dcm" if _is_dicom(file) else file.suffix.lower()[1:] for file in files)
+    for suffix, _ in suffixes.most_common():
+        for known, (what, remedy) in _KINDS.items():
+            if suffix in known:
+                raise InputError(str(path), f"{what} (.{suffix}), which is not read", expected, remedy)
+
+
+def _is_dicom(path: Path) -> bool:
+    with open(path, "rb") as file:
+        return file.read(132)[128:] == b"DICM"
+
 
 # The module of formats/ by the format's name, loaded when it is needed. It has two functions:
 # recognises(path) -> bool of a file or folder, and import_scan(path, options) -> Scan.
@@ -129,7 +163,7 @@ def _read_npy(path: Path) -> Volume:
     values, beside = read_npy(path, 3), path.with_suffix(".json")
     facts = read_json(beside) if beside.is_file() else {}
     if "voxel_size_mm" not in facts:
-        return _bare(path, values)
+        return _on_grid(path, values)
     if facts.get("axes") != ["z", "y", "x"] or facts.get("shape") != list(values.shape):
         found = f"axes {facts.get('axes')}, shape {facts.get('shape')}"
         raise InputError(str(beside), found[:80], f"axes z, y, x, shape {list(values.shape)}")
@@ -143,18 +177,18 @@ def _read_tiff(path: Path) -> Volume:
     values = tiff.read_tiffs([path])
     size_mm, origin, note = tiff.calibration(path)
     if size_mm is None:
-        return _bare(path, values)
+        return _on_grid(path, values)
     first_mm = None if origin is None else -(origin * size_mm)[::-1]
     return _on_grid(path, values, size_mm[::-1], first_mm, note)
 
 
-def _bare(path: Path, values: np.ndarray) -> Volume:
-    return Volume(finite_float32(str(path), shares_of_maximum(values)), None)
-
-
-def _on_grid(path: Path, values: np.ndarray, size_mm: np.ndarray, first_mm: np.ndarray | None, note: str) -> Volume:
+def _on_grid(
+    path: Path, values: np.ndarray, size_mm: np.ndarray | None = None, first_mm: np.ndarray | None = None, note: str = ""
+) -> Volume:
     """Returns a volume with voxels of ``size_mm``, the first of them centred at ``first_mm`` (z, y, x); None centres the
-    volume."""
+    volume. Without sizes it has no grid."""
+    if size_mm is None:
+        return Volume(finite_float32(str(path), shares_of_maximum(values)), None)
     if "HU" in note.split():
         raise InputError(str(path), "Hounsfield units", "1/mm", "export it without --mu-water-per-mm")
     centre_mm = np.zeros(3) if first_mm is None else first_mm + (np.array(values.shape) - 1) / 2 * size_mm

@@ -61,9 +61,9 @@ WRITERS: dict[str, tuple[Callable[[Path, Any], object], Callable[[Path], object]
     "angles.txt": (lambda path, _: path.write_text("angle (deg)\n0\n1,5\n3\n4,5\n"), lambda path: read_angles_rad(path, 4)),
 }  # fmt: skip
 HDF5 = (".h5", ".nxs")
-TEXTS, HEADED = (".json", ".toml", ".xml", ".xtekct", ".log", ".txt"), (".mha", ".nrrd")
+TEXTS, IMAGES = (".json", ".toml", ".xml", ".xtekct", ".log", ".txt"), (".mha", ".nrrd", ".nii", ".gz")
 WORDS = (b"word", b'"word"', b"", b"-1", b"0", b"nan", b"1e400", b"9" * 30, b"[]", b"null", b"0.5", b"1000000000")
-# HDF5 itself crashes on some changed bytes of headers: there, objects are changed
+# HDF5 and SimpleITK crash on some changed bytes of headers: there, objects are changed, or what comes behind the header
 CHANGES = {
     "removed": removed, "a text": value("text"), "texts": value(["a", "b"]), "a number": value(3.5), "1e300": value(1e300),
     "an axis more": changed(lambda v: np.stack([v, v])), "an axis less": changed(lambda v: v[0] if v.ndim else v),
@@ -120,16 +120,16 @@ def changed_objects(file: Path, read: Callable[[], object], draw: random.Random)
             is_needed = is_needed or (change == "removed" and not answered(read, address))
 
 
-def with_other_bytes(content: bytes, draw: random.Random) -> bytes:
+def with_other_bytes(content: bytes, draw: random.Random, first: int) -> bytes:
     new = bytearray(content)
     for _ in range(draw.randint(1, 6)):
-        at = draw.randrange(min(len(new), draw.choice((2048, len(new)))))
+        at = first + draw.randrange(min(len(new) - first, draw.choice((2048, len(new)))))
         new[at : at + draw.randint(0, 2)] = draw.choice((b"", draw.randbytes(2), b"\xff" * 8, b"nan", b"9" * 30))
     return bytes(new)
 
 
-def with_other_values(content: bytes, draw: random.Random) -> bytes:
-    """A number of a text, or of the text before an image, becomes something else."""
+def with_other_values(content: bytes, draw: random.Random, _: int) -> bytes:
+    """A number of a text becomes something else."""
     numbers = list(re.finditer(rb"-?\d+(\.\d+)?", content[: 1 << 14]))
     for one in sorted(draw.sample(numbers, min(len(numbers), draw.randint(1, 2))), key=lambda one: -one.start()):
         content = content[: one.start()] + draw.choice(WORDS) + content[one.end() :]
@@ -147,10 +147,10 @@ def damaged(file: Path, read: Callable[[], object], draw: random.Random) -> Iter
         file.write_bytes(content)
         yield from changed_objects(file, read, draw)
         return
-    ways = [with_other_bytes, *([with_other_values] if file.suffix in TEXTS + HEADED else [])]
+    ways = [with_other_bytes, *([with_other_values] if file.suffix in TEXTS else [])]
     for way in ways:
         for _ in range(24 * TIMES):
-            file.write_bytes(new := way(content, draw))
+            file.write_bytes(new := way(content, draw, len(content) // 2 if file.suffix in IMAGES else 0))
             yield repr(new[:2000]), False
     file.write_bytes(content)
 

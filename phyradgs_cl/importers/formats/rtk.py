@@ -15,12 +15,12 @@ from phyradgs_cl.acquisition import CircularOrbit, PoseTable, Scan
 from phyradgs_cl.acquisition.geometry import Geometry, plain_geometry, towards_source
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.importers import assemble
+from phyradgs_cl.importers.assemble import along
 from phyradgs_cl.importers.options import TIMING, ImportOptions
 from phyradgs_cl.importers.reading.files import SafeFolder, read_bytes
 from phyradgs_cl.importers.reading.frames import line_integrals
 from phyradgs_cl.importers.reading.images import STACKS, read_image
-from phyradgs_cl.importers.reading.settings import Settings
-from phyradgs_cl.importers.stage import along
+from phyradgs_cl.importers.reading.text import Settings
 
 _log = logging.getLogger(__name__)
 OPTIONS = (*TIMING, "quantity", "flat_value", "detector_model")
@@ -54,11 +54,13 @@ def recognises(path: Path) -> bool:
     """True for an .xml file that has no raw projections beside it, for a folder with one and a MetaImage, and for a
     MetaImage in such a folder."""
     folder = SafeFolder(path if path.is_dir() else path.parent)
-    if path.is_file() and path.suffix.lower() not in STACKS:
-        is_xml = path.suffix.lower() == ".xml" and not path.name.lower().endswith(_ORA)
-        return is_xml and not folder.matching(*_RAW) and not any(folder.root.glob(XIM_BELOW))
-    descriptions = [file for file in folder.matching(".xml") if not file.name.lower().endswith(_ORA)]
-    return bool(descriptions and folder.matching(*STACKS))
+    is_stack = path.suffix.lower() in STACKS
+    descriptions = folder.matching(".xml") if path.is_dir() or is_stack else [path] if path.suffix.lower() == ".xml" else []
+    if all(file.name.lower().endswith(_ORA) for file in descriptions):
+        return False
+    if path.is_dir() or is_stack:
+        return bool(folder.matching(*STACKS))
+    return not folder.matching(*_RAW) and not any(folder.root.glob(XIM_BELOW))
 
 
 def import_scan(path: Path, options: ImportOptions) -> Scan:
@@ -68,7 +70,10 @@ def import_scan(path: Path, options: ImportOptions) -> Scan:
     is_stack = path.suffix.lower() in STACKS and path.is_file()
     description = path if path.is_file() and not is_stack else folder.only("geometry", ".xml")
     stack_path = path if is_stack else folder.only("stack of projections", *STACKS)
-    rtk, stack = read_rtk_xml(description), _read_stack(stack_path)
+    rtk, image = read_rtk_xml(description), read_image(stack_path)
+    sitk = checks.package("SimpleITK", "the package that reads this file", "phyradgs-cl[formats]")
+    places_mm, direction = (image.GetOrigin(), image.GetSpacing()), np.reshape(image.GetDirection(), (3, 3))
+    stack = stack_of(sitk.GetArrayFromImage(image), *places_mm, direction, f"{stack_path} TransformMatrix")
     return scan_of(rtk, stack, options, (str(description), str(stack_path)), description.stem, str(path))
 
 
@@ -85,13 +90,6 @@ def scan_of(
     convention = "attenuation" if stack.frames.dtype.kind == "f" and options.flat_value is None else None
     integrals = line_integrals(stored, turn.frames(stack.frames), options, convention=convention)
     return assemble.assemble_scan(integrals, trajectory, geometry, timing, options, title=title, source=source)
-
-
-def _read_stack(path: Path) -> Stack:
-    image = read_image(path)
-    frames = checks.package("SimpleITK", "the package that reads this file", "phyradgs-cl[formats]").GetArrayFromImage(image)
-    direction = np.reshape(image.GetDirection(), (3, 3))
-    return stack_of(frames, image.GetOrigin(), image.GetSpacing(), direction, f"{path} TransformMatrix")
 
 
 def stack_of(

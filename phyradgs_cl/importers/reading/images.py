@@ -24,6 +24,7 @@ from phyradgs_cl.io.volume import Volume, finite_float32, shares_of_maximum
 STACKS = (".mha", ".mhd")
 _SPACES = ("left-posterior-superior", "lps", "right-anterior-superior", "ras", "left-anterior-superior", "las", "")
 _HEAD_BYTES, _VOXEL_BYTES = 1 << 16, 8
+_READERS = {".nii": "Nifti", ".gz": "Nifti", ".mha": "Meta", ".mhd": "Meta", ".nrrd": "Nrrd"}
 _DATA_FILE = re.compile(rb"^(?:ElementDataFile *=|data ?file:) *(\S.*?)\s*$", re.M)
 _OBLIQUE = 1e-3  # largest sine of an angle between an axis and the world's
 
@@ -37,6 +38,7 @@ def _opened(path: Path) -> Iterator[tuple[Any, Any]]:
     sitk.ProcessObject.SetGlobalWarningDisplay(False)
     reader = sitk.ImageFileReader()
     reader.SetFileName(subject)
+    reader.SetImageIO(f"{_READERS[path.suffix.lower()]}ImageIO")
     try:
         reader.ReadImageInformation()
         yield sitk, reader
@@ -72,7 +74,7 @@ def read_image(path: Path, state: int | None = None) -> Any:
         voxel_bytes = sitk.Image([1, 1, 1], reader.GetPixelIDValue()).GetSizeOfPixelComponent()
         held, needed = _held_bytes(path, reader, voxel_bytes), math.prod(counts) * voxel_bytes
         if held is not None and held < needed:
-            raise InputError(subject, f"{held} bytes of voxels", f"{needed}, as its header says", "copy the file again")
+            raise InputError(subject, f"{held} bytes of data", f"{needed}, as its header says", "copy the file again")
         return reader.Execute()
 
 

@@ -11,13 +11,12 @@ from pathlib import Path
 import numpy as np
 
 from phyradgs_cl.acquisition import Scan
-from phyradgs_cl.importers.assemble import StoredTiming, cone
+from phyradgs_cl.importers.assemble import RotaryStage, StageScan, StoredTiming, cone
 from phyradgs_cl.importers.options import OF_BARE_FRAMES, ImportOptions
 from phyradgs_cl.importers.reading.files import SafeFolder
 from phyradgs_cl.importers.reading.frames import gantry_sign
-from phyradgs_cl.importers.reading.settings import Settings, head_has, read_settings, say_missing
+from phyradgs_cl.importers.reading.text import Settings, head_has, read_settings, say_missing
 from phyradgs_cl.importers.reading.tiff import read_numbered
-from phyradgs_cl.importers.stage import RotaryStage, StageScan
 from phyradgs_cl.io.hdf5.datasets import LENGTH, TIME
 
 _log = logging.getLogger(__name__)

@@ -13,14 +13,20 @@ from pathlib import Path
 import numpy as np
 
 from phyradgs_cl.acquisition import Scan
-from phyradgs_cl.importers.assemble import cone
+from phyradgs_cl.importers.assemble import RotaryStage, StageScan, cone
 from phyradgs_cl.importers.options import OF_FOLDERS, ImportOptions
 from phyradgs_cl.importers.reading.files import SafeFolder, checked_name
 from phyradgs_cl.importers.reading.frames import gantry_sign
-from phyradgs_cl.importers.reading.settings import Settings, read_settings, say_missing, white_level
-from phyradgs_cl.importers.reading.text import file_of_angles, measured_angles_rad, read_angles_rad
+from phyradgs_cl.importers.reading.text import (
+    Settings,
+    file_of_angles,
+    measured_angles_rad,
+    read_angles_rad,
+    read_settings,
+    say_missing,
+    white_level,
+)
 from phyradgs_cl.importers.reading.tiff import read_numbered
-from phyradgs_cl.importers.stage import RotaryStage, StageScan
 from phyradgs_cl.io.hdf5.datasets import LENGTH
 
 _log = logging.getLogger(__name__)
@@ -49,7 +55,9 @@ def import_scan(path: Path, options: ImportOptions) -> Scan:
     sizes = ("Projections", "DetectorPixelsY", "DetectorPixelsX")
     count, *panel = (scan.count(name, _MOST_FRAMES) for name in sizes)
     prefix = scan.word("Name", default="") + scan.word("InputSeparator", default="_")
-    place = _folder_of_frames(folder, scan)
+    place, inside = folder, scan.word("InputFolderName", default="")  # often the place on the scanner's own disk
+    if inside and folder.exists(inside.split("\\")[0].split("/")[0]):
+        place = SafeFolder(folder.root / checked_name(inside, scan.name("InputFolderName")))
     frames, at, said = read_numbered(place, prefix, (count, *panel), [*map(scan.name, sizes)], options, first=1)
     measured = file_of_angles(folder, description.stem, ".ang", "_ctdata.txt")
     names = {
@@ -72,14 +80,6 @@ def _angles(scan: Settings, measured: Path | None, count: int) -> np.ndarray:
         return read_angles_rad(measured, count, column=1)
     steps_rad = np.deg2rad(scan.number("InitialAngle", 0.0) + scan.number("AngularStep") * np.arange(count))
     return steps_rad if measured is None else measured_angles_rad(measured, steps_rad)
-
-
-def _folder_of_frames(folder: SafeFolder, scan: Settings) -> SafeFolder:
-    """Returns the folder that InputFolderName names inside the description's own; that folder itself where it is none."""
-    name = scan.word("InputFolderName", default="")
-    if not name or not folder.exists(name.split("\\")[0].split("/")[0]):
-        return folder  # often the place on the scanner's own disk
-    return SafeFolder(folder.root / checked_name(name, scan.name("InputFolderName")))
 
 
 def _stage(scan: Settings, panel: tuple[int, int], options: ImportOptions, names: dict[str, str]) -> RotaryStage:

@@ -15,11 +15,11 @@ import numpy as np
 from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.acquisition.geometry import Geometry
 from phyradgs_cl.importers import assemble
+from phyradgs_cl.importers.assemble import RotaryStage, StageScan
 from phyradgs_cl.importers.options import OF_FOLDERS, ImportOptions
 from phyradgs_cl.importers.reading.frames import gantry_sign
 from phyradgs_cl.importers.reading.ole import Streams, open_ole, read_images, read_stream
-from phyradgs_cl.importers.reading.settings import say_missing
-from phyradgs_cl.importers.stage import RotaryStage, StageScan
+from phyradgs_cl.importers.reading.text import say_missing
 
 _log = logging.getLogger(__name__)
 _INFO, _ONE, _SEVERAL = "ImageInfo", "ReferenceData", "MultiReferenceData"

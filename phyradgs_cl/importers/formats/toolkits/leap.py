@@ -14,14 +14,14 @@ from phyradgs_cl.acquisition.geometry import Geometry, ParallelGeometry, plain_g
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid, triple
 from phyradgs_cl.importers import assemble
+from phyradgs_cl.importers.assemble import RotaryStage, along
 from phyradgs_cl.importers.formats.toolkits.leap_names import OLD_NAMES
 from phyradgs_cl.importers.options import OF_BARE_FRAMES, TIMING, ImportOptions
 from phyradgs_cl.importers.reading.files import SafeFolder, read_npy
 from phyradgs_cl.importers.reading.frames import gantry_sign, line_integrals, oriented
 from phyradgs_cl.importers.reading.series import series_of
-from phyradgs_cl.importers.reading.settings import Settings, head_has, read_settings, say_missing
+from phyradgs_cl.importers.reading.text import Settings, head_has, read_settings, say_missing
 from phyradgs_cl.importers.reading.tiff import SUFFIXES, read_tiffs
-from phyradgs_cl.importers.stage import RotaryStage, along
 
 _VECTORS = ("sourcePositions", "moduleCenters", "colVectors", "rowVectors")
 _BEAMS, _MOST, _ENDS = ("cone", "parallel", "modular"), 1_000_000, (".txt", ".cfg")

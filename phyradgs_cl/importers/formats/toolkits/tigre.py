@@ -17,10 +17,10 @@ from phyradgs_cl.acquisition.toolkits import is_parallel_tigre, poses_of_tigre
 from phyradgs_cl.acquisition.trajectory import CircularOrbit, PoseTable
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.importers import assemble
+from phyradgs_cl.importers.assemble import along
 from phyradgs_cl.importers.formats.naf import TIGRE_MODULE, PlainUnpickler, names_tigre, read_pickle
 from phyradgs_cl.importers.options import TIMING, ImportOptions
 from phyradgs_cl.importers.reading.frames import line_integrals, oriented
-from phyradgs_cl.importers.stage import along
 from phyradgs_cl.io.tables import Fields, described
 
 OPTIONS = (*TIMING, "row_0", "column_0", "quantity", "flat_value", "detector_model")
