@@ -64,12 +64,12 @@ def frame_time_of(fps: float | None, frame_time_s: float | None, named: Named = 
     return _agreed(1 / fps, named("fps"), f"{fps:g} (every {1 / fps:.4g} s)", frame_time_s, named("frame_time_s"))
 
 
-def readout_of(readout_ms: float | None, readout_s: float | None, named: Named = str) -> float | None:
-    """Returns the readout time in s, from ms or as given. InputError: the two differ."""
-    if readout_ms is None:
-        return readout_s
-    checks.at_least(named("readout_ms"), readout_ms, 0)
-    return _agreed(readout_ms / 1000, named("readout_ms"), f"{readout_ms:g}", readout_s, named("readout_s"))
+def seconds_of(word: str, in_ms: float | None, in_s: float | None, named: Named = str) -> float | None:
+    """Returns a time in s, ``word`` such as readout, from ms or as given. InputError: the two differ."""
+    if in_ms is None:
+        return in_s
+    checks.at_least(named(f"{word}_ms"), in_ms, 0)
+    return _agreed(in_ms / 1000, named(f"{word}_ms"), f"{in_ms:g}", in_s, named(f"{word}_s"))
 
 
 def exposure_of(

@@ -118,7 +118,7 @@ def _check_rest(subject: str, shutter: Shutter, options: ImportOptions, stored: 
     """Refuses options about a turn without a time from frame to frame; warns of a file's exposure."""
     turns = [name for name in options.given(_OF_A_TURN) if name != "exposure_s" or stored.exposure_s is None]
     asked = [options.called(name) for name in turns]
-    frame_time = f"{options.named('frame_time_s')} or {options.named('fps')}"
+    frame_time = " or ".join(dict.fromkeys(map(options.named, ("frame_time_s", "fps"))))
     for name in (*asked, *stored.written):
         expected = "both, or neither for frames taken at rest"
         raise InputError(name, "no time from frame to frame beside it", expected, f"say {frame_time}")
