@@ -125,7 +125,7 @@ RESULTS = {
         "A readout time that is wrong",
         "Columns are read; the file states 0.6 s in place of 0.86 s. `calibrate` finds the readout from the projections.",
         """
-        phyradgs simulate --phantom foot --size 32 --detector 64 --readout columns --noise tigre -o scan.h5
+        phyradgs simulate --phantom foot --size 32 --detector 64 --first left --noise tigre -o scan.h5
         python -c "import h5py; h5py.File('scan.h5', 'r+')['entry/instrument/detector/detector_readout_time'][()] = 0.6"
         phyradgs calibrate scan.h5 --what readout,exposure -o calibrated.h5
         phyradgs reconstruct scan.h5 -o stated.h5

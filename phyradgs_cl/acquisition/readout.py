@@ -64,59 +64,26 @@ def frame_time_of(fps: float | None, frame_time_s: float | None, named: Named = 
     return _agreed(1 / fps, named("fps"), f"{fps:g} (every {1 / fps:.4g} s)", frame_time_s, named("frame_time_s"))
 
 
-def readout_of(readout_ms: float | None, readout_s: float | None, named: Named = str) -> float | None:
-    """Returns the readout time in s, from ms or as given. InputError: the two differ."""
-    if readout_ms is None:
-        return readout_s
-    checks.at_least(named("readout_ms"), readout_ms, 0)
-    return _agreed(readout_ms / 1000, named("readout_ms"), f"{readout_ms:g}", readout_s, named("readout_s"))
+def seconds_of(word: str, in_ms: float | None, in_s: float | None, named: Named = str) -> float | None:
+    """Returns a time in s, ``word`` such as readout, from ms or as given. InputError: the two differ."""
+    if in_ms is None:
+        return in_s
+    checks.at_least(named(f"{word}_ms"), in_ms, 0)
+    return _agreed(in_ms / 1000, named(f"{word}_ms"), f"{in_ms:g}", in_s, named(f"{word}_s"))
 
 
-def exposure_of(
-    exposure_deg: float | None, exposure_s: float | None, fps: float | None, turned_deg: np.ndarray
-) -> tuple[float, float]:
-    """Returns arc in degrees and time in s of an exposure.
-
-    With ``fps`` either follows from the other by the median step of ``turned_deg`` (F,); without it the time is 1 s unless
-    given. Raises InputError where neither or both are given with ``fps``."""
-    if exposure_s is not None:
-        checks.positive("exposure_s", exposure_s)
-    if exposure_deg is not None:
-        checks.within("exposure_deg", exposure_deg, -3600, 3600)
-    if exposure_deg == 0:
-        raise InputError("exposure_deg", "0", "an arc other than 0", "use static_scan for a gantry that stops")
-    if fps is None:
-        if exposure_deg is None:
-            raise InputError("exposure_deg", "nothing", "the arc of an exposure", "give it, or fps and exposure_s")
-        return exposure_deg, exposure_s or 1.0
-    checks.positive("fps", fps)
-    if (exposure_deg is None) == (exposure_s is None):
-        found = f"{fps:g} with {'neither' if exposure_s is None else 'both'} exposure_s and exposure_deg"
-        raise InputError("fps", found, "one of the two", "give exposure_s and leave exposure_deg out")
-    deg_per_s = fps * float(np.median(np.diff(turned_deg))) if len(turned_deg) > 1 else 0.0
-    if deg_per_s == 0:
-        raise InputError("fps", f"{fps:g} with angles that do not change", "angles that turn", "leave fps out")
-    if exposure_s is not None:
-        return deg_per_s * exposure_s, exposure_s
-    assert exposure_deg is not None
-    return exposure_deg, abs(exposure_deg / deg_per_s)
-
-
-def readout_ratio_of(
-    readout_ms: float | None, readout_ratio: float | None, fps: float | None, exposure_s: float | None, named: Named = str
-) -> float | None:
-    """Returns ``readout_ratio``; None with a readout in ms. InputError: both, or ms without a rate or an exposure."""
+def check_readout(readout_ms: float | None, readout_ratio: float | None, fps: float | None, named: Named = str) -> None:
+    """Raises InputError for a ratio or a time out of range, for both, and for a time in ms without a rate."""
     if readout_ratio is not None:
         checks.within(named("readout_ratio"), readout_ratio, 0, 1000)
     if readout_ms is None:
-        return readout_ratio
+        return
     checks.at_least(named("readout_ms"), readout_ms, 0)
     if readout_ratio is not None:
         subject = named("readout_ratio")
         raise InputError(named("readout_ms"), f"{readout_ms:g} with {subject}", "one of the two", f"leave {subject} out")
-    if fps is None and exposure_s is None:
+    if fps is None:
         raise InputError(named("readout_ms"), f"{readout_ms:g} without a frame rate", "both", f"give {named('fps')} too")
-    return None
 
 
 def _agreed(time_s: float, subject: str, found: str, other_s: float | None, other: str) -> float:

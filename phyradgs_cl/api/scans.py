@@ -13,7 +13,6 @@ from phyradgs_cl import checks
 from phyradgs_cl.acquisition import CircularOrbit, FrameSweeps, Scan, Shutter
 from phyradgs_cl.acquisition.geometry import GEOMETRIES, Geometry, default_grid
 from phyradgs_cl.acquisition.plausible import check_plausible
-from phyradgs_cl.acquisition.readout import exposure_of, readout_order, readout_ratio_of
 from phyradgs_cl.acquisition.scan import check_not_counts, check_others
 from phyradgs_cl.acquisition.shutter import AXES
 from phyradgs_cl.detector.attenuation import QUANTITIES
@@ -21,11 +20,13 @@ from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.importers.options import ImportOptions
 from phyradgs_cl.importers.reading.frames import LineIntegrals, line_integrals
+from phyradgs_cl.removed import refuse_removed
 
 log = logging.getLogger(__name__)
 # the arguments of ``fly_scan`` that have another name in a Scan
 _ARGUMENTS = {
-    "angles": "angles_deg", "exposure_s": "exposure_deg", "readout_s": "readout_ratio", "readout_axis": "readout",
+    "angles": "angles_deg", "exposure_s": "exposure_deg", "frame_time_s": "exposure_s", "readout_s": "readout_ratio",
+    "readout_axis": "readout",
     "source_to_axis_mm": "geometry.source_to_axis_mm", "source_to_detector_mm": "geometry.source_to_detector_mm",
 }  # fmt: skip
 _SLACK = 1e-3  # relative: angles come rounded
@@ -34,11 +35,10 @@ _CLEAR_STEP_DEG = 90.0  # from frame to frame: below, angles say which way the g
 
 
 def fly_scan(
-    frames: "ArrayLike", geometry: "Geometry", angles_deg: "ArrayLike", *, exposure_deg: float | None = None,
-    readout_ratio: float | None = None, readout: str | None = None, readout_direction: int | None = None,
-    exposure_s: float | None = None, first: str | None = None, fps: float | None = None,
-    readout_ms: float | None = None, flats: "ArrayLike | None" = None, darks: "ArrayLike | None" = None,
-    mask: "ArrayLike | None" = None, quantity: str | None = None, grid: Grid | None = None, **others: Any,
+    frames: "ArrayLike", geometry: "Geometry", angles_deg: "ArrayLike", *, exposure_deg: float,
+    readout_ratio: float = 0.0, readout: str = "rows", readout_direction: int = 1, exposure_s: float | None = None,
+    flats: "ArrayLike | None" = None, darks: "ArrayLike | None" = None, mask: "ArrayLike | None" = None,
+    quantity: str | None = None, grid: Grid | None = None, **others: Any,
 ) -> Scan:
     """Returns a scan whose gantry never stops, from arrays.
 
@@ -46,13 +46,10 @@ def fly_scan(
     geometry: of a cone or a parallel beam, in mm.
     angles_deg: (F,) the gantry's angle in degrees when a frame's first line opens; 0 with the source on +x,
     counterclockwise seen from above (+z). A sample that turns has the opposite sign.
-    exposure_deg: the arc of one line's exposure, below 0 for a clockwise gantry; None takes it from fps and exposure_s.
-    readout_ratio: readout over exposure time, from the opening of the first line to that of the last; None is 0, a global
+    exposure_deg: the arc of one line's exposure, below 0 for a clockwise gantry: degrees per second times exposure_s.
+    readout_ratio: readout over exposure time, from the opening of the first line to that of the last; 0 is a global
     shutter. readout: the lines that are read one after the other, "rows" or "columns". readout_direction: 1 reads index 0
-    first, -1 last. exposure_s: of one line, in s; None is 1, or follows from fps and exposure_deg.
-    first, fps, readout_ms: the terms of data sheets. first: the line that is read first, "top", "bottom", "left" or "right"
-    seen from the source, in place of readout and readout_direction. fps: frames per second. readout_ms: in place of
-    readout_ratio.
+    (the lowest row, the left column) first, -1 last. exposure_s: of one line, in s; None is 1.
     flats, darks: (n, rows, columns) counts without an object, and without a beam (None is 0).
     mask: (rows, columns) or (F, rows, columns), non-zero for pixels that must not be used.
     quantity: of ``frames``, "attenuation", "transmission" or "counts", where ``flats`` do not tell.
@@ -61,23 +58,25 @@ def fly_scan(
 
     Raises InputError for shapes that do not fit, numbers out of range or implausible, contradictory arguments, and angles
     whose sense differs from the exposure's."""
+    for name in others:
+        refuse_removed(f"fly_scan.{name}", name)
     check_others(others, _keywords(fly_scan))
-    axis, direction = readout_order(first, readout, readout_direction, lambda name: _ARGUMENTS.get(name, name))
-    readout, readout_direction = axis or "rows", 1 if direction is None else direction
     checks.one_of("readout", readout, AXES)
+    checks.within("readout_ratio", readout_ratio, 0, 1000)
+    checks.within("exposure_deg", exposure_deg, -3600, 3600)
+    if exposure_deg == 0:
+        raise InputError("exposure_deg", "0", "an arc other than 0", "use static_scan for a gantry that stops")
+    is_timed, exposure_s = exposure_s is not None, 1.0 if exposure_s is None else exposure_s
+    checks.positive("exposure_s", exposure_s)
     pixels = _pixels(frames, geometry, flats, darks, mask, quantity)
     start_deg = checks.numbers("angles_deg", angles_deg, (len(pixels.values),))
     turned_deg = np.unwrap(start_deg, period=360.0)
-    readout_ratio = readout_ratio_of(readout_ms, readout_ratio, fps, exposure_s)
-    has_exposure_s = exposure_s is not None
-    exposure_deg, exposure_s = exposure_of(exposure_deg, exposure_s, fps, turned_deg)
-    readout_s = readout_ms / 1000 if readout_ms is not None else (readout_ratio or 0.0) * exposure_s
     steps = np.diff(turned_deg) / exposure_deg
     if np.all(steps < 0) and 0 < np.abs(np.diff(turned_deg)).max(initial=0) < _CLEAR_STEP_DEG:
         remedy = f"write exposure_deg={-exposure_deg:g}, or reverse the angles' sign"
         found = f"{exposure_deg:g} with angles that turn the other way"
         raise InputError("exposure_deg", found, "the sign of the angles' steps", remedy)
-    shutter = Shutter(exposure_s, readout_s, readout, readout_direction)
+    shutter = Shutter(exposure_s, readout_ratio * exposure_s, readout, readout_direction)
     start_s = (
         (turned_deg - turned_deg[:1]) / exposure_deg * exposure_s
         if np.all(steps > 0)
@@ -89,10 +88,8 @@ def fly_scan(
     least_step = steps.min(initial=np.inf)
     if np.rad2deg(1 - _SLACK) < least_step < np.inf:
         log.warning("exposure_deg: 1/%.3g of the step between frames: is it in radians? np.rad2deg(exposure)", least_step)
-    called = {**_ARGUMENTS, "frame_time_s": "exposure_s" if fps is None else "fps"}
-    called |= {"readout_s": "readout_ms"} if readout_ms is not None else {}
-    called |= {"exposure_s": "exposure_s"} if has_exposure_s else {}
-    return _scan(pixels, orbit, shutter, start_s, grid, True, others, called, has_exposure_s or fps is not None)
+    called = {**_ARGUMENTS, **({"exposure_s": "exposure_s"} if is_timed else {})}
+    return _scan(pixels, orbit, shutter, start_s, grid, True, others, called, is_timed)
 
 
 def _arcs_deg(angles_deg: np.ndarray, exposure_deg: float) -> np.ndarray:

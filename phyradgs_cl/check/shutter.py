@@ -86,7 +86,7 @@ def _read(scan: Scan, axis: str, direction: int, readout_s: float) -> Scan:
 def _readout_advice(scan: Scan, name: str) -> str:
     if name == _OTHER_WAY:
         mirror, option = ("v", MIRROR_V) if scan.shutter.axis == "rows" else ("u", MIRROR_U)
-        reverse = f"set readout_direction to {-scan.shutter.direction}, or import with --readout-direction"
+        reverse = f"set readout_direction to {-scan.shutter.direction}, or import with --first"
         return f"{reverse}; frames mirrored in {mirror} look the same: then import with the other {option}"
     if name == _AT_REST:
         return "did the gantry stop for every view? Then import without a frame time (stop-and-shoot)"

@@ -24,7 +24,7 @@ from phyradgs_cl.workflow.files import check_output
 EXAMPLES = {
     "import": (
         "Example: phyradgs import chest_50.pickle -o scan.h5\n\n"
-        "Example: phyradgs import scan.xml -o scan.h5 --fps 15 --exposure-s 0.06 --readout-ms 62 --first top\n\n"
+        "Example: phyradgs import scan.xml -o scan.h5 --fps 15 --exposure-ms 60 --readout-ms 62 --first top\n\n"
         "Example: phyradgs import tiffs --template > tiffs/scan.toml"
     )
 }
@@ -35,10 +35,10 @@ GROUPS = {
     "import": {
         "Basics": (
             *("output", "template", "form", "source_to_axis_mm", "source_to_detector_mm", "pixel_size_mm"),
-            *("fps", "exposure_s", "readout_ms", "first"),
+            *("fps", "exposure_ms", "readout_ms", "first"),
         ),
         "Geometry": ("detector_offset_mm", "unit_mm", "rotates"),
-        "Timing": ("angles", "frame_time_s", "readout_s", "angle_at", "readout_axis", "readout_direction", "detector_model"),
+        "Timing": ("angles", "angle_at", "detector_model"),
         "Pixels": ("frames", "quantity", "flats", "flat_value", "row_0", "column_0", "part", "first_view"),
         "HDF5": ("entry", "at", "linked_folder"),
         "Volume": ("size", "voxel_mm", "roi_mm"),
@@ -56,7 +56,7 @@ def _annotated(one: Field[Any]) -> tuple[Any, Any]:
 
 
 _PAIRS = {"pixel_size_mm": pitches, "detector_offset_mm": lengths}
-_OPTIONS = {one.name: _annotated(one) for one in fields(ImportOptions) if one.name != "named"}
+_OPTIONS = {one.name: _annotated(one) for one in fields(ImportOptions) if one.metadata}
 
 
 @with_options("options", _OPTIONS, lambda given: ImportOptions(**given, named=option_name))

@@ -9,7 +9,6 @@ from typing import Annotated, Any, Literal, get_args
 from phyradgs_cl.acquisition import MOTIONS
 from phyradgs_cl.acquisition.readout import SIDES
 from phyradgs_cl.acquisition.scan import DETECTOR_MODELS
-from phyradgs_cl.acquisition.shutter import AXES
 from phyradgs_cl.commands.console import file_argument, file_option, option, pair_of
 from phyradgs_cl.prepare import DEFAULT_STEPS, STEPS
 from phyradgs_cl.reconstructors import DEFAULT_METHOD, METHODS
@@ -18,7 +17,6 @@ from phyradgs_cl.runtime import DEVICE_VARIABLE, MEMORY_VARIABLE
 from phyradgs_cl.settings import Settings, read_settings
 
 LARGEST_MM = 1e6
-Axis = Literal[AXES]  # type: ignore[valid-type]
 First = Literal[SIDES]  # type: ignore[valid-type]
 DetectorModel = Literal[DETECTOR_MODELS]  # type: ignore[valid-type]
 

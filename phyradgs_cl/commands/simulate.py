@@ -7,7 +7,7 @@ import typer
 
 from phyradgs_cl.acquisition import PROTOCOLS
 from phyradgs_cl.commands.console import file_option, option, pair_of, say
-from phyradgs_cl.commands.options import Axis, DetectorModel, Device, First, Memory, Output, lengths
+from phyradgs_cl.commands.options import DetectorModel, Device, First, Memory, Output, lengths
 from phyradgs_cl.importers.options import DETECTOR_OFFSET
 from phyradgs_cl.phantoms import PHANTOMS
 from phyradgs_cl.progress import Ticker
@@ -22,7 +22,7 @@ GROUPS = {
         "Basics": ("output", "phantom", "volume", "scanner", "protocol", "size", "detector", "noise", "dose", "seed"),
         "Timing": (
             *("turns", "motion_of_object"),
-            *("views", "exposure_deg", "fps", "readout_ms", "readout_ratio", "first", "readout_axis", "readout_direction"),
+            *("views", "exposure_deg", "fps", "readout_ms", "first"),
             *("start_deg", "jitter_deg", "pulse"),
         ),
         "Panel and beam": (
@@ -51,13 +51,10 @@ def simulate_command(
     views: Annotated[int | None, option("Frames of the scan.", "protocol's")] = None,
     turns: Annotated[float | None, option("Turns over which the frames are spread; below 0 clockwise.", "1")] = None,
     exposure_deg: Annotated[float | None, option("Arc of one exposure, degrees.", "protocol's")] = None,
-    readout_ratio: Annotated[float | None, option("Readout over exposure time.", "0.86")] = None,
     fps: Annotated[float | None, option("Frames per second; states the times of the arcs.", "scanner's")] = None,
-    readout_ms: Annotated[float | None, option("Readout in ms, with --fps; no --readout-ratio.", "scanner's")] = None,
+    readout_ms: Annotated[float | None, option("Readout in ms, with --fps.", "scanner's, or 0.86 exposures")] = None,
     first: Annotated[First | None, option("Line that is read first, seen from the source.", "scanner's")] = None,
     start_deg: Annotated[float | None, option("Gantry angle at the start, degrees.", "0")] = None,
-    readout_axis: Annotated[Axis | None, option("Lines of the readout: rows or columns.", "scanner's", "--readout")] = None,
-    readout_direction: Annotated[int | None, option("1 reads index 0 first, -1 last.", "scanner's")] = None,
     pulse: Annotated[
         Any,
         option(

@@ -120,7 +120,7 @@ def turning(geometry: Geometry, angle_rad: np.ndarray, timing: Timing) -> Circul
 def _check_rest(subject: str, shutter: Shutter, options: ImportOptions, stored: StoredTiming) -> None:
     """Refuses options about a turn without a time from frame to frame; warns of a file's exposure."""
     turns = [name for name in options.given(_OF_A_TURN) if name != "exposure_s" or stored.exposure_s is None]
-    frame_time = f"{options.named('frame_time_s')} or {options.named('fps')}"
+    frame_time = " or ".join(dict.fromkeys(map(options.named, ("frame_time_s", "fps"))))
     for name in (*map(options.called, turns), *stored.written):
         expected = "both, or neither for frames taken at rest"
         raise InputError(name, "no time from frame to frame beside it", expected, f"say {frame_time}")

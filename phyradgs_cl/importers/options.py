@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from phyradgs_cl import checks
-from phyradgs_cl.acquisition.readout import SIDES, Named, frame_time_of, readout_of, readout_order
+from phyradgs_cl.acquisition.readout import SIDES, Named, frame_time_of, readout_order, seconds_of
 from phyradgs_cl.acquisition.scan import DETECTOR_MODELS
 from phyradgs_cl.acquisition.shutter import AXES
 from phyradgs_cl.errors import InputError
@@ -52,16 +52,16 @@ def _option(help: str, usual: str | bool = _FILE, default: Any = None) -> Any:
 @dataclass(frozen=True)
 class ImportOptions:
     """Options of an import. None leaves a value to the file or to the format's convention. Readout axis and direction are
-    those of the imported scan: row 0 the lowest, column 0 on the left, seen from the source. ``first``, ``fps`` and
-    ``readout_ms`` are the words of a data sheet; contradictions are refused. ``named``: returns the name of a field in
-    messages."""
+    those of the imported scan: row 0 the lowest, column 0 on the left, seen from the source. The command line has the words
+    of a data sheet, ``first``, ``fps``, ``exposure_ms`` and ``readout_ms``, from which the fields without help follow;
+    contradictions are refused. ``named``: returns the name of a field in messages."""
 
-    exposure_s: float | None = _option("Exposure of a line, s.")
-    readout_s: float | None = _option("--readout-ms in s.")
-    frame_time_s: float | None = _option("From frame to frame, s: in place of --fps.")
+    exposure_s: float | None = None
+    readout_s: float | None = None
+    frame_time_s: float | None = None
     angle_at: str | None = _option("A frame's angle: at its first line's start or middle.", "start")
-    readout_axis: str | None = _option("Lines of the readout: rows or columns.", _FORMAT)
-    readout_direction: int | None = _option("1 reads row 0 (lowest) or column 0 (left) first, -1 last.", _FORMAT)
+    readout_axis: str | None = None
+    readout_direction: int | None = None
     source_to_axis_mm: float | None = _option("Source to rotation axis, mm.")
     source_to_detector_mm: float | None = _option("Source to detector, mm.")
     pixel_size_mm: tuple[float, float] | None = _option("Pixel's side, or height and width, mm.")
@@ -80,6 +80,7 @@ class ImportOptions:
     first_view: int | None = _option(_FIRST_VIEW, "all")
     first: str | None = _option("Line that is read first, seen from the source.", _FORMAT)
     fps: float | None = _option("Frames per second of a gantry that never stops.", f"{_FILE}, else at rest")
+    exposure_ms: float | None = _option("Exposure of a line, ms.")
     readout_ms: float | None = _option("From the first line's opening to the last line's, ms.")
     entry: str | None = _option("Address of the scan in an HDF5 file of several, as /entry1/tomo_entry.")
     at: tuple[str, ...] | None = _option(_AT, _FORMAT)
@@ -100,7 +101,8 @@ class ImportOptions:
         stated = {  # in the fields that every format reads
             "readout_axis": axis, "readout_direction": direction,
             "frame_time_s": frame_time_of(self.fps, self.frame_time_s, self.named),
-            "readout_s": readout_of(self.readout_ms, self.readout_s, self.named),
+            "exposure_s": seconds_of("exposure", self.exposure_ms, self.exposure_s, self.named),
+            "readout_s": seconds_of("readout", self.readout_ms, self.readout_s, self.named),
         }
         for name, value in stated.items():
             object.__setattr__(self, name, value)
@@ -150,7 +152,10 @@ class ImportOptions:
             raise InputError(subject, found, expected, "leave the option out")
 
 
-_WORD_OF = {"readout_axis": "first", "readout_direction": "first", "frame_time_s": "fps", "readout_s": "readout_ms"}
+_WORD_OF = {
+    "readout_axis": "first", "readout_direction": "first", "frame_time_s": "fps", "exposure_s": "exposure_ms",
+    "readout_s": "readout_ms",
+}  # fmt: skip
 _DEFAULTS = {item.name: item.default for item in fields(ImportOptions) if item.name != "named"}
 FIELDS = tuple(_DEFAULTS)
 """The names of the options, without ``named``."""
@@ -158,7 +163,7 @@ FIELDS = tuple(_DEFAULTS)
 # options of formats whose files state little
 TIMING = (
     *("exposure_s", "readout_s", "frame_time_s", "angle_at", "readout_axis", "readout_direction"),
-    *("first", "fps", "readout_ms"),
+    *("first", "fps", "exposure_ms", "readout_ms"),
 )
 OF_BARE_FRAMES = (
     *TIMING,
@@ -167,10 +172,10 @@ OF_BARE_FRAMES = (
 )
 OF_FOLDERS = (*OF_BARE_FRAMES, "frames")
 OF_HDF5 = (*OF_BARE_FRAMES, "entry", "at", "linked_folder")
-_OPTIONS = {"readout_axis": "--readout", "detector_offset_mm": "--detector-offset"}
+_OPTIONS = {"detector_offset_mm": "--detector-offset"}
 
 
 def option_name(field: str) -> str:
     """Returns the option of the command line for a field of ImportOptions."""
-    return _OPTIONS.get(field, "--" + field.replace("_", "-"))
+    return _OPTIONS.get(field, "--" + _WORD_OF.get(field, field).replace("_", "-"))
 

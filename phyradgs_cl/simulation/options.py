@@ -6,7 +6,7 @@ from typing import Any
 
 from phyradgs_cl import checks, resource
 from phyradgs_cl.acquisition import Protocol, make_protocol
-from phyradgs_cl.acquisition.readout import readout_order, readout_ratio_of
+from phyradgs_cl.acquisition.readout import check_readout, readout_order
 from phyradgs_cl.acquisition.scan import LARGEST_LAG
 from phyradgs_cl.detector.attenuation import HIGHEST_KVP, LOWEST_KVP
 from phyradgs_cl.errors import InputError
@@ -102,7 +102,7 @@ def scanner_options(scanner: Scanner, protocol: str, **given: Any) -> Simulation
         is_scanner_s = name not in given and of_scanner.get(name) is not None
         return f"{scanner.name} [readout] {name}" if is_scanner_s else _flag(name)
 
-    readout_ratio_of(values.get("readout_ms"), values.get("readout_ratio"), values.get("fps"), None, named)
+    check_readout(values.get("readout_ms"), values.get("readout_ratio"), values.get("fps"), named)
     if unknown := sorted(set(values) - OPTION_NAMES):
         expected = f"one of {', '.join(sorted(OPTION_NAMES))}"
         raise InputError(f"simulate: option {unknown[0]}", "no such option", expected)

@@ -14,27 +14,26 @@ from phyradgs_cl.simulation import scanner_for, scanner_options
 
 CONE = ConeGeometry(500.0, 800.0, (6, 8), (0.4, 0.4))
 FRAMES, TURN_DEG = np.full((12, 6, 8), 0.5, np.float32), 30.0 * np.arange(12)
+SHEET = {"exposure_deg": 27.0, "exposure_s": 0.06}  # 15 frames per second
 
 
 def test_the_first_line_states_axis_and_direction() -> None:
     """Seen from the source: row 0 is the lowest, column 0 the left one; the first line opens without a delay."""
     for first, line in {"bottom": 0, "top": 5, "left": 0, "right": 7}.items():
-        shutter = fly_scan(FRAMES, CONE, TURN_DEG, exposure_deg=30.0, readout_ratio=0.9, first=first).shutter
+        axis, direction = FIRST_LINES[first]
+        order = {"readout": axis, "readout_direction": direction}
+        shutter = fly_scan(FRAMES, CONE, TURN_DEG, exposure_deg=30.0, readout_ratio=0.9, **order).shutter
         assert (shutter.axis, shutter.direction) == FIRST_LINES[first] and shutter.first == first
         assert shutter.delay_s(shutter.lines(CONE.detector_shape))[line] == 0
 
 
-def test_rate_and_readout_state_the_times_of_a_fly_scan() -> None:
-    sheet = {"fps": 15, "readout_ms": 62, "first": "top"}
-    by_arc = fly_scan(FRAMES, CONE, TURN_DEG, exposure_deg=27.0, **sheet)
-    by_time = fly_scan(FRAMES, CONE, TURN_DEG, exposure_s=0.06, **sheet)
-    for scan in (by_arc, by_time):
-        assert np.allclose(np.diff(scan.frame_start_s), 1 / 15) and scan.shutter.readout_s == 0.062
-        assert scan.shutter.exposure_s == pytest.approx(0.06)
-        ends = [scan.trajectory.angle_rad(3, scan.frame_start_s[3] + t) for t in (0.0, 0.06)]
-        assert np.rad2deg(np.diff(ends)) == pytest.approx(27.0)
+def test_arc_and_time_of_an_exposure_state_the_times_of_a_fly_scan() -> None:
+    scan = fly_scan(FRAMES, CONE, TURN_DEG, **SHEET, readout_ratio=62 / 60, readout_direction=-1)
+    assert np.allclose(np.diff(scan.frame_start_s), 1 / 15) and scan.shutter.readout_s == pytest.approx(0.062)
+    ends = [scan.trajectory.angle_rad(3, scan.frame_start_s[3] + t) for t in (0.0, 0.06)]
+    assert np.rad2deg(np.diff(ends)) == pytest.approx(27.0)
     words = "timing: rows read in 62 ms, top first; 15 fps; exposure 27° in 60 ms; averages line integrals"
-    assert by_time.summary().splitlines()[0] == words
+    assert scan.summary().splitlines()[0] == words
 
 
 def test_a_simulation_takes_a_data_sheet() -> None:
@@ -56,14 +55,10 @@ def test_words_that_contradict_each_other_are_refused_in_one_line() -> None:
         return lambda: scanner_options(scanner, "rapid", **how)
 
     assert_refused({
-        "^first: found 'left' with readout 'rows'; expected 'columns'": fly(first="left", readout="rows"),
-        "^first: found 'top' with readout_direction 1; expected -1": fly(first="top", readout_direction=1),
-        "^first: found 'topp'.*did you mean 'top'": fly(first="topp"),
-        "^readout_ms: found 62 with readout_ratio": fly(fps=15, readout_ms=62, readout_ratio=0.9),
-        "^readout_ms: found 62 without a frame rate.*give fps": fly(readout_ms=62),
-        "^fps: found 15 with both": fly(fps=15, exposure_s=0.06),
-        "^fps: found 15 with neither": fly(fps=15, exposure_deg=None),
-        "^exposure_deg: found nothing": fly(exposure_deg=None),
+        "^first: found a word of an earlier version; say readout and": fly(first="left"),
+        "^fps: found a word of an earlier version; say exposure_deg": fly(fps=15),
+        "^readout_ms: found a word of an earlier version; say readout_ratio": fly(readout_ms=62),
+        "^exposure_deg: found None": fly(exposure_deg=None),
         "^--first: found 'left' with --readout 'rows'": options(first="left", readout_axis="rows"),
         "^--readout-ms: found 62 with --readout-ratio": options(fps=15, readout_ms=62, readout_ratio=0.9),
         "^--readout-ms: found 62 without .*--fps": options(readout_ms=62),
@@ -87,11 +82,8 @@ def test_numbers_that_no_scanner_has_are_refused() -> None:
         "^grid: found 1×1×1 voxels of 585 mm; expected voxels of about 0.25": lambda: static_scan(
             FRAMES, CONE, TURN_DEG, grid=Grid((1, 1, 1), (585.0,) * 3)
         ),
-        "^readout_ms: found readout of 62 s, 930 times the 0.0667 s from frame to frame": lambda: fly_scan(
-            FRAMES, CONE, TURN_DEG, fps=15, exposure_s=0.06, readout_ms=62000
-        ),
-        "^exposure_s: found exposure of 6 s, 90 times the 0.0667 s from frame to frame": lambda: fly_scan(
-            FRAMES, CONE, TURN_DEG, fps=15, exposure_s=6.0
+        "^readout_ratio: found readout of 50 s, 750 times the 0.0667 s from frame to frame": lambda: fly_scan(
+            FRAMES, CONE, TURN_DEG, **SHEET, readout_ratio=50 / 0.06
         ),
         "^exposure_deg: found exposure of 1 s, 1.33 times the 0.75 s from frame to frame": lambda: fly_scan(
             FRAMES, CONE, TURN_DEG, exposure_deg=40.0
@@ -109,17 +101,16 @@ def test_numbers_that_hardly_a_scanner_has_are_warned_of(caplog) -> None:
     opaque[..., :2] = 60.0
     for words, make in {
         "line integrals of up to 60: .* counts": lambda: static_scan(opaque, CONE, TURN_DEG, quantity="attenuation"),
-        "^readout_ms: readout of 0.1 s, 1.5 times": lambda: fly_scan(
-            FRAMES, CONE, TURN_DEG, fps=15, exposure_s=0.06, readout_ms=100
+        "^readout_ratio: readout of 0.1 s, 1.5 times": lambda: fly_scan(
+            FRAMES, CONE, TURN_DEG, **SHEET, readout_ratio=100 / 60
         ),
-        "^readout_ms: readout of 0.062 ms for 120 lines: .*unit": lambda: fly_scan(
-            *_tall(), TURN_DEG, fps=15, exposure_s=0.06, readout_ms=0.062
+        "^readout_ratio: readout of 0.062 ms for 120 lines: .*unit": lambda: fly_scan(
+            *_tall(), TURN_DEG, **SHEET, readout_ratio=0.062 / 60
         ),
-        "^fps: 1.5 fps and 30° from frame to frame": lambda: fly_scan(
-            FRAMES, CONE, TURN_DEG, fps=1.5, exposure_s=0.06, readout_ms=62
+        "^exposure_s: 1.5 fps and 30° from frame to frame": lambda: fly_scan(
+            FRAMES, CONE, TURN_DEG, exposure_deg=2.7, exposure_s=0.06, readout_ratio=62 / 60
         ),
-        "^fps: 1.4 fps and": lambda: fly_scan(FRAMES, CONE, TURN_DEG, fps=1.4, exposure_deg=27.0),
-        "": lambda: fly_scan(FRAMES, CONE, TURN_DEG, fps=15, exposure_s=0.06, readout_ms=62),
+        "": lambda: fly_scan(FRAMES, CONE, TURN_DEG, **SHEET, readout_ratio=62 / 60),
     }.items():
         caplog.clear()
         make()

@@ -106,7 +106,7 @@ def test_a_grid_is_given_or_described(rt, scan) -> None:
 
 def test_the_command_and_python_make_the_same_scan(rt, tmp_path) -> None:
     options = ["--phantom", "jaw", "--size", "8", "--detector", "10", "--views", "2", "--noise", "beer", "--seed", "4"]
-    options += ["--readout", "columns", "--truncation", "0.4", "-o", str(tmp_path / "scan.h5")]
+    options += ["--first", "left", "--truncation", "0.4", "-o", str(tmp_path / "scan.h5")]
     assert load_cli().run(["simulate", *options]) == 0
     usual = {"size": 8, "detector": 10, "views": 2, "noise": "beer", "seed": 4, "readout_axis": "columns", "device": rt}
     ours = api.simulate("jaw", truncation=0.4, **usual)

@@ -64,7 +64,6 @@ SIMULATE = {
     "--dose": ("--dose 100", "--noise beer --dose=1o", "--noise beer --dose=nan", "--noise beer --dose=1e13"),
     "--electronic-noise": ("--electronic-noise 5",),
     "--jitter-deg": ("--protocol static --jitter-deg 0.1",),
-    "direction": ("--readout-direction 0",),
     "pulse": ("--pulse 0.5", "--pulse a,b", "--pulse 0,0"),
     "views": ("--views 1000000000", "--views many", "--views 1e23", f"--views {'9' * 5000}"),
     "--size": ("--size 100000", "--size 1", f"--size {DIGITS}"),

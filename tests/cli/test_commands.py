@@ -97,7 +97,7 @@ def test_a_method_that_ends_by_itself_says_when_and_why(scan, reconstructed, cap
 
 def test_columns_intensity_jitter_pulse_and_lag_are_simulated(cli, reconstructed, tmp_path, caplog):
     path, volumes = tmp_path / "scan.h5", []
-    options = ["--readout", "columns", "--readout-direction", "-1", "--detector-model", "intensity", "--jitter-deg", "0.2"]
+    options = ["--first", "right", "--detector-model", "intensity", "--jitter-deg", "0.2"]
     options += ["--noise", "beer", "--peak", "3", "--detector-offset", "0.1,-0.2", "--pulse", "0.86,0.14"]
     options += ["--lag", "0.1"]
     assert cli.run([*SIMULATE, *options, "-o", str(path)]) == 0

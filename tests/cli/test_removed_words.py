@@ -6,7 +6,7 @@ from phyradgs_cl.removed import REMOVED
 
 pytestmark = pytest.mark.slow
 
-WORDS = [word for word in REMOVED if not word.startswith("phyradgs ")]
+WORDS = [word for word in REMOVED if not word.startswith(("phyradgs ", "fly_scan."))]
 
 
 @pytest.mark.parametrize("word", WORDS)
@@ -26,7 +26,12 @@ def test_a_motion_that_left_is_named_in_a_file_too(cli, capsys, tmp_path, name) 
     assert "run.toml: motion" in error and error.endswith(f"{REMOVED[f'--motion {name}']}\n")
 
 
-@pytest.mark.parametrize("flag", ["--tune", "--median-filter"])
-def test_a_flag_that_left_names_its_replacement(cli, capsys, flag) -> None:
-    assert cli.run(["reconstruct", "scan.h5", "-o", "volume.h5", flag, "3"]) == 2
+FLAGS = [("reconstruct", flag) for flag in ("--tune", "--median-filter")]
+FLAGS += [("simulate", flag) for flag in ("--readout", "--readout-direction", "--readout-ratio")]
+FLAGS += [("import", flag) for flag in ("--readout", "--readout-direction", "--readout-s", "--frame-time-s", "--exposure-s")]
+
+
+@pytest.mark.parametrize(("command", "flag"), FLAGS)
+def test_a_flag_that_left_names_its_replacement(cli, capsys, command, flag) -> None:
+    assert cli.run([command, "scan.h5", "-o", "volume.h5", flag, "3"]) == 2
     assert capsys.readouterr().err.endswith(f"{REMOVED[flag[2:].replace('-', '_')]}\n")

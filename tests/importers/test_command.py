@@ -62,8 +62,8 @@ def test_the_grid_by_options(run, imported, tmp_path, make_truth) -> None:
 
 
 def test_timing_and_geometry_by_options(run, imported, tmp_path, make_truth) -> None:
-    timing = ["--exposure-s", "0.4", "--readout-s", "0.3", "--frame-time-s", "1.25", "--readout", "columns"]
-    done = run(w.write_rtk(tmp_path / "rtk", make_truth()), *timing, "--readout-direction", "-1")
+    timing = ["--exposure-ms", "400", "--readout-ms", "300", "--fps", "0.8", "--first", "right"]
+    done = run(w.write_rtk(tmp_path / "rtk", make_truth()), *timing)
     assert "fly-scan" in done.output and imported().shutter == Shutter(0.4, 0.3, "columns", -1)
     path = w.write_data_exchange(tmp_path / "dx.h5", make_truth())
     cone = ["--source-to-axis-mm", "500", "--source-to-detector-mm", "800", "--detector-offset", "4,-6"]

@@ -233,7 +233,7 @@ def test_measured_exposures_and_values_at_darks(tmp_path, caplog) -> None:
         assert import_scan(path).shutter.exposure_s == pytest.approx(0.10025)
         fly = ImportOptions(fps=1.0)
         detector["count_time"][KEY == 0] = 0.1 * np.arange(1, 7)
-    with pytest.raises(InputError, match="--exposure-s"):
+    with pytest.raises(InputError, match="--exposure-ms"):
         import_scan(path, replace(fly, named=option_name))
     assert import_scan(path, replace(fly, exposure_s=0.2)).shutter.exposure_s == 0.2
     same(path)

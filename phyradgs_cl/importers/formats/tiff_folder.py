@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from phyradgs_cl.acquisition import Scan
-from phyradgs_cl.acquisition.readout import frame_time_of, readout_of
+from phyradgs_cl.acquisition.readout import frame_time_of, seconds_of
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.importers import hdf5
 from phyradgs_cl.importers.assemble import StoredTiming, assemble_scan, make_timing, turning, with_options
@@ -202,7 +202,7 @@ def _stored_timing(tables: dict[str, Fields], scanner: Scanner) -> StoredTiming:
     def named(field: str) -> str:
         return _KEYS[field] if field in OWN_TABLES["timing"] else readout.name(field)
 
-    readout_s = readout_of(scanner.readout_ms, readout_s, named)
+    readout_s = seconds_of("readout", scanner.readout_ms, readout_s, named)
     if readout_s is None and exposure_s is not None and scanner.readout_ratio is not None:
         readout_s = scanner.readout_ratio * exposure_s
     frame_time_s = frame_time_of(scanner.fps, timing.length("frame_time_s") if timing.has("frame_time_s") else None, named)
