@@ -3,10 +3,12 @@
     python benchmarks/stripes.py docs/results/stripes.jsonl --views 180 720 1800
 
 A line per object, number of views, kind of stripes and steps. Lines that are there are not made again. The table is in
-docs/results/prepare.md.
+docs/results/prepare.md. ``pip install algotom`` adds its filters, by the widths of their medians.
 """
 
 import argparse
+from dataclasses import replace
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +32,8 @@ KINDS = ("none", "gains", "columns", "partial", "unresponsive", "fluctuating", "
 STEPS: dict[str, dict[str, Any]] = {
     "": {}, "dead,rings": {}, "stripes": {}, "dead,rings,stripes": {}, "every column": {"stripes": {"ratio": 0}}
 }  # fmt: skip
+ALGOTOM = {"algotom": (51, 21), "algotom, narrow": (21, 5)}
+"""Widths of the medians of ``remove_all_stripe``, in columns: its own, and the best of some on these scans."""
 
 
 def scan_of(name: str, views: int) -> Scan:
@@ -71,12 +75,21 @@ def spoilt(frames: np.ndarray, kind: str) -> np.ndarray:
     return bad
 
 
+def by_algotom(frames: np.ndarray, large: int, small: int) -> np.ndarray:
+    """Returns line integrals (F, v, u) after all of algotom's filters."""
+    from algotom.prep.removal import remove_all_stripe
+
+    rows = [remove_all_stripe(frames[:, row].astype(np.float64), 3.0, large, small) for row in range(frames.shape[1])]
+    return np.stack(rows, axis=1).astype(np.float32)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("results", type=Path, help="a file of one line of JSON per run")
     parser.add_argument("--views", type=int, nargs="+", default=[180, 720, 1800])
     parser.add_argument("--objects", nargs="+", default=list(OBJECTS), choices=list(OBJECTS))
     given, rt = parser.parse_args(), Runtime()
+    peers = ALGOTOM if find_spec("algotom") else {}
     done = {(line["object"], line["views"], line["stripes"], line["steps"]) for line in read_lines(given.results)}
     for views in given.views:
         for name in given.objects:
@@ -84,16 +97,19 @@ def main() -> None:
             assert (reference := clean.reference) is not None
             for kind in KINDS:
                 scan = Scan(**{**vars(clean), "projections": spoilt(clean.projections, kind)})
-                for steps, options in STEPS.items():
+                for steps in (*STEPS, *peers):
                     if (name, views, kind, steps) in done:
                         continue
+                    options = STEPS.get(steps, {})
                     names = "stripes" if options else steps
-                    ready = prepare(scan, names, device=rt, **options) if names else scan
+                    if steps in peers:
+                        ready = replace(scan, projections=by_algotom(scan.projections, *peers[steps]))
+                    else:
+                        ready = prepare(scan, names, device=rt, **options) if names else scan
                     volume = reconstruct(ready, "fbp", device=rt, report=False).volume
                     psnr_db = round(float(compare(volume, reference)["psnr_db"]), 3)
                     line = {"object": name, "views": views, "stripes": kind, "steps": steps, "psnr_db": psnr_db}
                     append(given.results, line)
-                    print(line, flush=True)
 
 
 if __name__ == "__main__":

@@ -384,9 +384,10 @@ def stripes() -> str:
     for line in lines:
         if line["views"] == views:
             cells.setdefault((line["stripes"], line["object"]), {})[line["steps"]] = line["psnr_db"]
-    steps = ["", "dead,rings", "stripes", "dead,rings,stripes", "every column"]
+    steps = ["", "dead,rings", "stripes", "dead,rings,stripes", "every column", "algotom", "algotom, narrow"]
     text = [[*key, *(f"{by_steps[name]:.2f}" for name in steps)] for key, by_steps in cells.items()]
-    return markdown(["stripes", "object", "no step", *(f"`{name}`" for name in steps[1:4]), "`stripes`, `ratio=0`"], text)
+    titles = ["no step", *(f"`{name}`" for name in steps[1:4]), "`stripes`, `ratio=0`", *steps[5:]]
+    return markdown(["stripes", "object", *titles], text)
 
 
 def calibrate_lines() -> list[dict[str, Any]]:

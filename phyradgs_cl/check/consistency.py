@@ -106,7 +106,7 @@ def check_consistency(rt: Runtime, scan: Scan, as_stated: Scan) -> Consistency:
         doubtful = "distances and pixel sizes, flats and the panel's tilt"
         if scan.is_parallel:
             doubtful = "flats and the panel's roll"
-        advice = f"compare order, angles, {doubtful} with the scanner's log"
+        advice = f"compare order and orientation of the frames, angles, {doubtful} with the scanner's log"
         return answer(SUSPICIOUS, f"frames do not fit together, cause not found: {text}", advice, False)
     return answer(SUSPICIOUS if notes else OK, text, about_frames, True)
 

@@ -1,4 +1,4 @@
-"""Other statements about a scan: sizes, distances, angles or orders of frames, frames mirrored or transposed."""
+"""Other statements about a scan: sizes and distances in other units, steps of the angles, lost frames, mirrored frames."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
@@ -11,7 +11,7 @@ from phyradgs_cl.acquisition.altered import variants
 from phyradgs_cl.acquisition.altered.angles import start_azimuths_rad, wrapped
 from phyradgs_cl.acquisition.altered.coarse import coarse_grid
 from phyradgs_cl.acquisition.geometry import default_grid
-from phyradgs_cl.check.finding import FEWEST_COLUMNS, MIRROR_U, MIRROR_V, PIXEL_SIZES
+from phyradgs_cl.check.finding import MIRROR_U, MIRROR_V, PIXEL_SIZES
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.reconstructors.fits import axis
 
@@ -22,12 +22,7 @@ _FANS = (0.02, 3.0)  # the panel's width over its distance from the source, in r
 _GRID_FACTOR = 3.0  # a stated grid that differs more from the panel's view does not belong to the hypothesis
 _SAME_PLACE = 1.0  # coarse pixels
 _ARC_PERCENTS = (-5, -4, -3, -2, -1, 1, 2, 3, 4, 5)
-_NEAR_SIZES = (0.5, 0.8, 0.9, 1.1, 1.25, 2.0)
 _GAPS = 15  # places at which a missing or repeated frame is tried
-_TRANSPOSED = (
-    "transpose the frames (numpy: .T of each) or turn them by 90° (numpy: rot90) and import them again: the two differ by "
-    "a mirror that no frame shows, so that one gives a mirror image; only a feature whose side is known decides which"
-)
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,7 +65,7 @@ def frame_number(scan: Scan, frame: int) -> int:
 
 def of_scan(scan: Scan, stated: Scan) -> Iterator[Hypothesis]:
     """Yields hypotheses about the whole coarse ``scan``, which was made of ``stated``: sizes in another unit, frames
-    mirrored or transposed."""
+    mirrored."""
     yield from _other_units(scan, stated)
     yield from _other_images(scan, stated)
 
@@ -133,19 +128,14 @@ def _other_images(scan: Scan, stated: Scan) -> Iterator[Hypothesis]:
     if offset_v_mm:
         text = "frames fit if they are mirrored in v (or with detector_offset along v and readout the other way)"
         yield Hypothesis(text, advice.format(MIRROR_V), partial(variants.mirrored, scan, "v"))
-    if scan.geometry.detector_shape[0] >= FEWEST_COLUMNS:
-        text = "frames fit if they are transposed, rows and columns exchanged (or turned by 90°"
-        yield Hypothesis(f"{text})", _TRANSPOSED, partial(variants.transposed, scan, False))
-        yield Hypothesis(f"{text}: more likely)", _TRANSPOSED, partial(variants.transposed, scan, True))
 
 
 def of_frames(scan: Scan, shifted_scan: Scan, tries_orders: bool) -> Iterator[Hypothesis]:
-    """Yields other angle steps, sizes near the stated ones (with the panel shifted) and, with ``tries_orders``, other orders
-    and missing or repeated frames."""
+    """Yields other angle steps, exchanged pixel sizes (with the panel shifted) and, with ``tries_orders``, missing or
+    repeated frames."""
     yield from _other_steps(scan)
-    yield from _near_sizes(shifted_scan)
+    yield from _exchanged_sizes(shifted_scan)
     if tries_orders:
-        yield from _name_orders(scan)
         yield from _missing_frames(scan)
 
 
@@ -182,41 +172,19 @@ def _other_steps(scan: Scan) -> Iterator[Hypothesis]:
         yield Hypothesis(text, advice, partial(variants.turned, scan, turns_rad, factor))
 
 
-def _near_sizes(scan: Scan) -> Iterator[Hypothesis]:
+def _exchanged_sizes(scan: Scan) -> Iterator[Hypothesis]:
     if scan.is_parallel:
         return  # an object of another size explains the frames as well
     v, u = scan.geometry.pixel_size_mm
     if abs(v / u - 1) > 0.02:
         text, advice = "pixel sizes fit if v and u are exchanged", f"exchange {PIXEL_SIZES}"
         yield Hypothesis(text, advice, partial(variants.stretched, scan, u / v, v / u))
-    for factor in _NEAR_SIZES:
-        text = f"pixels over the distance of the panel fit if they are {factor:g} times as large"
-        advice = f"correct {PIXEL_SIZES} (binning? unit?) or distances (unit? source to panel?)"
-        yield Hypothesis(text, advice, partial(nearly_sized, scan, factor))
 
 
 def nearly_sized(scan: Scan, factor: float) -> Scan:
     """Returns the scan with pixels ``factor`` times as large, the axis at its column, and the grid of ``stretched``."""
     grid = variants.stretched(scan, factor, factor).grid
     return replace(variants.resized(scan, factor, keeps_axis=True), grid=grid)
-
-
-def _name_orders(scan: Scan) -> Iterator[Hypothesis]:
-    """The order of file names without leading zeros, counted from 0 or 1."""
-    numbers = variants.altered_trajectory(scan).frame_numbers(scan)
-    count = int(numbers[-1]) + 1
-    starts_s = np.interp(np.arange(count), numbers, scan.frame_start_s)
-    for first in (0, 1):
-        by_name = np.array(sorted(range(first, count + first), key=str)) - first
-        if (by_name == np.arange(count)).all():
-            continue
-        text = "frames fit in another order: that of names without leading zeros (1, 10, 11, ... 2)"
-        advice = "sort the frames by number, not by name, and import them again"
-        yield Hypothesis(text, advice, partial(_in_order, scan, by_name[numbers], starts_s[by_name[numbers]]))
-
-
-def _in_order(scan: Scan, numbers: np.ndarray, starts_s: np.ndarray) -> Scan:
-    return replace(variants.with_trajectory(scan, frames=numbers), frame_start_s=starts_s)
 
 
 def _missing_frames(scan: Scan) -> Iterator[Hypothesis]:

@@ -13,7 +13,6 @@ from phyradgs_cl.acquisition.altered.variants import (
     reversed_rotation,
     shifted,
     stretched,
-    transposed,
     turned,
 )
 from phyradgs_cl.check import CANNOT_TELL, CENTRE, OK, SUSPICIOUS, check
@@ -113,7 +112,7 @@ def test_hypotheses_turn_directions_and_shift_none_of_them() -> None:
     scan = parallel_scan()
     angles = np.linspace(0.1, 0.2, scan.frames)
     variants = [
-        reversed_rotation(scan), shifted(scan, 2.5), mirrored(scan, "u"), transposed(scan, True), stretched(scan, 1.1, 0.9),
+        reversed_rotation(scan), shifted(scan, 2.5), mirrored(scan, "u"), stretched(scan, 1.1, 0.9),
         turned(scan, angles),
     ]
     for variant in variants:

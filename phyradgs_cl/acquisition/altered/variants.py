@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 
 from phyradgs_cl.acquisition.altered.angles import azimuth_rad, start_azimuths_rad, wrapped
-from phyradgs_cl.acquisition.geometry import transpose_pose
 from phyradgs_cl.acquisition.scan import Scan
 from phyradgs_cl.acquisition.trajectory import CircularOrbit, Trajectory, is_parallel
 
@@ -152,22 +151,6 @@ def mirrored(scan: Scan, axis: str) -> Scan:
     is_read_along = scan.shutter.axis == ("rows", "columns")[number]
     images = partial(_flipped, axis=number, count=altered_trajectory(scan).panel[number])
     return with_trajectory(reversed_readout(scan) if is_read_along else scan, images=images)
-
-
-def transposed(scan: Scan, is_quarter_turn: bool) -> Scan:
-    """Returns the scan with its frames' rows along u and columns along v; is_quarter_turn: mirrored in u as well, which
-    makes it a turn by 90°."""
-    rows, columns = altered_trajectory(scan).panel
-
-    def change(pose: np.ndarray) -> np.ndarray:
-        pose[..., _FIRST] += (columns - rows) / 2 * (pose[..., _COLUMN_STEP] - pose[..., _ROW_STEP])
-        pose = transpose_pose(pose)
-        return _flipped(pose, 0, rows) if is_quarter_turn else pose
-
-    axis = "columns" if scan.shutter.axis == "rows" else "rows"
-    runs_back = is_quarter_turn and axis == "rows"
-    shutter = replace(scan.shutter, axis=axis, direction=-scan.shutter.direction if runs_back else scan.shutter.direction)
-    return with_trajectory(replace(scan, shutter=shutter), images=change)
 
 
 def resized(scan: Scan, factor: float, keeps_axis: bool) -> Scan:
