@@ -10,6 +10,7 @@
 # make test-cluster   workers killed at random, schedulers restarted: the tests of Dask, in an environment of its own
 # make test-mpi       one reconstruction on 1 to 4 ranks, killed and resumed: the tests of MPI, in an environment of its own
 # make test-spectrum  the tests of tubes by SpekPy, in an environment of its own (another 160 MB)
+# make test-drivers   the kernel tests on PoCL 6.0 and on Mesa 25's rusticl, in a Debian 13 of their own (superuser; 1.5 GB)
 # make test-oclgrind  every kernel in Oclgrind's checker: bounds, races, unwritten memory (x86-64 Linux)
 # make gpu     what a GPU says: tests on it, trust, speed; results in results/gpu.json (ten minutes; DEVICE=..., QUICK=--quick)
 # make test-gpu-build every kernel compiled for NVIDIA, AMD and Intel: registers, spills (Debian, x86-64 Linux; another 500 MB)
@@ -25,7 +26,7 @@ TORCH  ?= torch==2.13.0
 BIN      := $(VENV)/bin
 PHYRADGS := $(BIN)/phyradgs
 
-.PHONY: demo test test-all docs stress coverage types test-quick test-browser test-cluster test-gpu-build gpu test-intel test-mpi test-neural test-oclgrind test-pocl-package test-spectrum clean
+.PHONY: demo test test-all docs stress coverage types test-quick test-browser test-cluster test-drivers test-gpu-build gpu test-intel test-mpi test-neural test-oclgrind test-pocl-package test-spectrum clean
 .DELETE_ON_ERROR:
 
 $(BIN)/python:
@@ -128,9 +129,19 @@ test-intel: export PHYRADGS_DEVICE = Intel(R) OpenCL
 test-intel: $(VENV)-intel/vendors/intel.icd
 	$(call tested,$(VENV)-intel,$(SHAPE))
 
+KERNEL_TESTS := tests/operators tests/laws tests/objective tests/optim tests/test_device_check.py
+
 # The machine's own PoCL (Debian: apt-get install pocl-opencl-icd) without the wheel's.
 test-pocl-package: $(VENV)-package/.installed
-	$(call tested,$(VENV)-package,tests/operators tests/laws tests/objective tests/optim tests/test_device_check.py)
+	$(call tested,$(VENV)-package,$(KERNEL_TESTS))
+
+# Drivers of another release of Debian, in a root that .ci/newer_drivers makes: in no other target.
+on_driver = PHYRADGS_DEVICE=$(1) PYTHONDONTWRITEBYTECODE=1 .ci/newer_drivers $(VENV)-drivers \
+	'python -m pytest $(KERNEL_TESTS) $(2) $(PARALLEL) -p no:cacheprovider --junit-xml=/root/junit.xml && python .ci/no_skips.py /root/junit.xml'
+
+test-drivers:
+	$(call on_driver,portable)
+	$(call on_driver,rusticl,--gpu-shape)
 
 # Compilers for GPUs and their libraries, unpacked beside the environment: nothing is installed, no driver is registered.
 DEBIAN_gpu := clang-15 libclang-cpp15 libclang1-15 libllvm15 libclang-common-15-dev libclc-15 libclc-15-dev \
@@ -174,4 +185,4 @@ test-oclgrind: $(VENV)-oclgrind/.installed
 	$(VENV)-oclgrind/bin/python tests/oclgrind/every_kernel.py
 
 clean:
-	rm -rf $(VENV) $(ENVIRONMENTS:%=$(VENV)-%) $(OUT) build dist site
+	rm -rf $(VENV) $(ENVIRONMENTS:%=$(VENV)-%) $(VENV)-drivers $(OUT) build dist site

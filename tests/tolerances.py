@@ -51,6 +51,8 @@ MICRO_VIEWS_ORDER = 8.0  # one micro-view (static) must be so much worse, or the
 VOXEL = 1e-5  # of the largest density: float32 rounding of the exponent (1e-6)
 # a brick counts voxels from its own corner: the float32 rest of a centre may round the other way
 VOXEL_NEEDLE = 2e-4  # aspect 1000: float32 centres and factors move a needle by a share of its width
+# one item adds up 15,750 voxels in float32, a group few each: by scale 9e-5 and 9e-6 from float64 (rusticl: 1.1e-4, 9e-6)
+SERIAL_SUM = 2e-4
 RAYS = 1e-5  # of the peak: some tens of float32 samples, positions to 1e-6 of a voxel
 # of the peak: a voxel has few samples, whose positions (1e-5 of a voxel, 200 away from the source) do not average out
 # of the peak, where an inverse field is found from the field's values at voxels (7e-4)
