@@ -67,7 +67,7 @@ def test_a_named_option_wins_over_set_and_set_over_the_file(config: Path) -> Non
         ("method = 'phyradgs'\n[control]\nthreshold = -1", "control.threshold: "),
         ("method = 'phyradgs'\n[control]\nevry = 3", "control.evry: found no such option of --method phyradgs"),
         ("method = 'fdk'\nwindow = 'round'", "window: "),
-        ("method = 'fdk'\nstrips = 3", "strips: found --motion static for --method fdk"),
+        ("method = 'fdk'\nstrips = 3", "strips: found --motion per-row for --method fdk"),
         (f"iterations = {'9' * 5000}", ""),
         ("a = " + "[" * 20_000, ""),
     ],

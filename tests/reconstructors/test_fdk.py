@@ -14,6 +14,7 @@ from phyradgs_cl.acquisition import (
     MicroViews,
     Scan,
     Shutter,
+    Static,
     StaticStart,
     pixel_centres,
 )
@@ -79,14 +80,14 @@ def test_scale_law(rt) -> None:
 
 
 def test_scan_and_volume_agree(rt) -> None:
-    """The method on a scan takes each frame's mid-window pose; static-start its first."""
+    """Static takes each frame's mid-window pose, static-start its first."""
     geometry, grid = cone(1.0), Grid.cube(8, 2.0)
     frames = np.random.default_rng(62).uniform(0, 1, (5, PIXELS, PIXELS)).astype(np.float32)
     start_s, first = np.arange(5.0), np.arange(5) * 2 * np.pi / 5
     sweeps = FrameSweeps(start_s, 0.5, first, first + 0.1)
     scan = Scan(frames, geometry, CircularOrbit(geometry, sweeps), Shutter(0.5, 0.25), start_s, grid)
     middle = geometry.pose(first + 0.1 * 1.5 / 2)
-    result = fdk(scan, FdkOptions(), rt)
+    result = fdk(scan, FdkOptions(motion=Static()), rt)
     np.testing.assert_allclose(result.volume, fdk_volume(rt, frames, middle, grid), rtol=0, atol=FLOAT32)
     begun = fdk(scan, FdkOptions(motion=StaticStart()), rt)
     expected = fdk_volume(rt, frames, geometry.pose(first), grid)
