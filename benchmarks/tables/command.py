@@ -2,13 +2,14 @@
 
 from enum import Enum
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
 from phyradgs_cl import signals
+from phyradgs_cl.acquisition.shutter import AXES
 from phyradgs_cl.commands.console import complain, file_parser, say
-from phyradgs_cl.commands.options import Axis, Device
+from phyradgs_cl.commands.options import Device
 from phyradgs_cl.progress import Ticker
 from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.settings import device_wish
@@ -95,7 +96,7 @@ def bench_command(
     iterations: Annotated[
         int | None, typer.Option(help="Iterations of the splatting methods.", show_default="the size's")
     ] = None,
-    readout: Annotated[Axis, typer.Option(help="What is read out at one time.")] = "rows",
+    readout: Annotated[Literal[AXES], typer.Option(help="What is read out at one time.")] = "rows",
     table_only: Annotated[
         bool,
         typer.Option(
