@@ -1,10 +1,10 @@
 """A scan's projector and its adjoint in one launch each: twins, ⟨Ax, y⟩ = ⟨x, Aᵀy⟩, subsets, repeatable bits."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
-from kernel_kit import note_launches
 from ray_tables import SHAPE, noise, tables
 from remembered import remembered
 from tolerances import ADJOINT, FLOAT32, RAYS, RAYS_BACK
@@ -14,7 +14,7 @@ from phyradgs_cl.fields import Grid
 from phyradgs_cl.operators import LinearOperator, RayOperator
 from phyradgs_cl.operators.rays import launches as rays
 from phyradgs_cl.operators.twins.rays import ray_frame, ray_volume
-from phyradgs_cl.runtime import Runtime
+from phyradgs_cl.runtime import Runtime, context
 
 ray_frame, ray_volume = remembered(ray_frame), remembered(ray_volume)
 GRID = Grid((9, 14, 11), (0.21, 0.13, 0.16), (0.1, -0.05, 0.2))
@@ -131,20 +131,27 @@ def test_lines_without_cells_are_zero_and_give_nothing(rt) -> None:
 
 
 def test_a_gpus_launches_of_bounded_length_have_the_bits_of_one(monkeypatch) -> None:
-    """Drivers of screens end long ones; a CPU's has no such limit."""
-    x, y = noise(GRID.shape, 90), noise((4, *SHAPE), 91)
-    launched = note_launches(monkeypatch)
-    for shape in ({"lanes": 1, "pixel_items": True}, {"pixel_items": False}):
-        operator = RayOperator(Runtime(**shape), GRID, SHAPE, tables("micro-views", frames=4))
-        launched.clear()
+    """Drivers of screens end long ones; a CPU's has no such limit. All cells of a line count."""
+    x, y, cells = noise(GRID.shape, 90), noise((4, *SHAPE), 91), tables("micro-views", frames=4)
+    per_line = max(int(np.ptp(table.line_cells(), axis=1).max()) for table in cells)
+    launched, launch = [], context.cl.enqueue_nd_range_kernel
+
+    def noted(queue: object, kernel: Any, *given: object) -> object:
+        launched.append(kernel.function_name)
+        return launch(queue, kernel, *given)
+
+    monkeypatch.setattr(context.cl, "enqueue_nd_range_kernel", noted)
+    for shape, frames_of_launch in (({"lanes": 1, "pixel_items": True}, 2), ({"pixel_items": False}, 4)):
+        operator = RayOperator(Runtime(**shape), GRID, SHAPE, cells)
         forward, adjoint = operator.project(x, "intensity"), operator.adjoint(y)
-        at_once = len(launched)
         with monkeypatch.context() as patch:
-            patch.setattr(Runtime, "most_samples", 3 * y[0].size * max(GRID.shape))
             launched.clear()
-            np.testing.assert_array_equal(operator.project(x, "intensity"), forward)
+            patch.setattr(Runtime, "most_samples", 2 * per_line * rays._SAMPLES_PER_VOXEL * x.size)
             np.testing.assert_array_equal(operator.adjoint(y), adjoint)
-        assert len(launched) > at_once if "lanes" in shape else len(launched) == at_once
+            patch.setattr(Runtime, "most_samples", 2 * per_line * y[0].size * max(GRID.shape))
+            np.testing.assert_array_equal(operator.project(x, "intensity"), forward)
+        found = [name for name in launched if name.startswith("rays_")]
+        assert found == ["rays_adjoint"] * (4 // frames_of_launch) + ["rays_forward"] * (4 // frames_of_launch)
 
 
 def test_one_launch_is_the_frames_one_by_one_and_bits_repeat(any_rt) -> None:
