@@ -70,4 +70,5 @@ def test_an_example_comes_near_the_method(rt: Runtime, scan: Scan, tmp_path: Pat
     found = compare(volume, scan.reference)["psnr_db"]
     assert f"PSNR {found:.2f} dB" in capsys.readouterr().out
     method = {"own_sirt": "sirt", "train_own": "phyradgs"}[example]
-    assert found > compare(reconstruct(scan, method, iterations=30, device=rt).volume, scan.reference)["psnr_db"] - 2
+    like = reconstruct(scan, method, iterations=30, device=rt).volume  # and sets negative voxels to 0
+    assert found > compare(like, scan.reference)["psnr_db"] - 3

@@ -83,14 +83,14 @@ def test_seconds_of_the_processor_are_printed(scan, reconstructed, capsys):
     """Those of the process up to then, whatever else the machine does."""
     before_s = time.process_time()
     reconstructed(scan, "--method", "fdk")
-    said = re.search(r"fdk, motion static, \S+ s \((\S+) s of processor time\), PSNR", capsys.readouterr().out)
+    said = re.search(r"fdk, motion per-row, \S+ s \((\S+) s of processor time\), PSNR", capsys.readouterr().out)
     assert before_s - 0.05 <= float(said[1]) <= time.process_time() + 0.05  # rounded to a tenth
 
 
 def test_a_method_that_ends_by_itself_says_when_and_why(scan, reconstructed, capsys):
     words = ["--method", "sirt", "--iterations", "9"]
     reconstructed(scan, *words, "--set", "tolerance=0.9")
-    assert "sirt, motion static, stopped after 2 of 9 iterations (tolerance), " in capsys.readouterr().out
+    assert "sirt, motion per-row, stopped after 2 of 9 iterations (tolerance), " in capsys.readouterr().out
     reconstructed(scan, *words)
     assert "stopped" not in capsys.readouterr().out
 

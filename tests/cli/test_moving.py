@@ -172,8 +172,6 @@ def test_states_go_into_one_nifti_of_four_dimensions_which_info_describes(cli, c
     assert "moves (NIfTI)" in facts["kind"] and facts["shape"] == list(volume.grid.shape)
     assert (facts["states"], facts["first_s"], facts["last_s"]) == (4, 1.5, pytest.approx(4.5))
     assert facts["maximum"] == pytest.approx(float(sitk.GetArrayFromImage(image).max()))
-    assert cli.run(f"splat {folder}/states.nii -o {folder}/cloud.h5".split()) == 2
-    assert "three axes, none of them empty; 'phyradgs info'" in capsys.readouterr().err
 
 
 def test_other_formats_get_a_file_for_each_state(cli, folder) -> None:

@@ -17,3 +17,8 @@ def test_a_command_that_left_names_its_replacement(cli, capsys, word) -> None:
 
 def test_an_option_that_left_names_its_replacement(cli, refused) -> None:
     refused(["sweep", "grid.toml", "-o", "out", "--scheduler", "tcp://a:1"], REMOVED["scheduler"])
+
+
+@pytest.mark.parametrize("word", ["lag", "drift", "start"])
+def test_a_parameter_that_left_names_its_replacement(cli, refused, scan, word) -> None:
+    refused(["calibrate", scan, "--what", word, "-o", "c.h5"], REMOVED[f"--what {word}"])

@@ -6,7 +6,7 @@ from phyradgs_cl.removed import REMOVED
 
 pytestmark = pytest.mark.slow
 
-WORDS = [word for word in REMOVED if not word.startswith(("phyradgs ", "fly_scan."))]
+WORDS = [word for word in REMOVED if not word.startswith(("phyradgs ", "fly_scan.", "--what "))]
 
 
 @pytest.mark.parametrize("word", WORDS)

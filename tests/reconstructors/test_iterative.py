@@ -9,7 +9,7 @@ from scipy.optimize import nnls
 from scipy.sparse.linalg import lsqr
 from tolerances import CONVERGED, FLOAT32, ITERATIVE_TWIN, KRYLOV
 
-from phyradgs_cl.acquisition import ConeGeometry, PerRow, Scan, Static
+from phyradgs_cl.acquisition import ConeGeometry, PerRow, Scan
 from phyradgs_cl.api import simulate
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.metrics import psnr
@@ -322,4 +322,4 @@ def test_methods_are_registered_and_bad_options_named() -> None:
             method_options(method, None, {option: value})
     assert set(ITERATIVE) <= set(METHODS)
     for name in ITERATIVE:
-        assert method_options(name).motion == (PerRow() if name == "fista" else Static())
+        assert method_options(name).motion == PerRow()

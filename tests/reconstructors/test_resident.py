@@ -105,7 +105,7 @@ def test_reports_alone_download(scan) -> None:
 
 def test_frames_of_fdk_go_up_once_and_its_volume_comes_down_once(scan) -> None:
     rt = Runtime()
-    reconstruct(scan, plan_run("fdk"), rt)
+    reconstruct(scan, plan_run("fdk", {"motion": "static"}), rt)
     (frames, lines, width), (nz, ny, nx) = scan.projections.shape, GRID.shape
     padded = max(lines * pitch_of(width), width * pitch_of(lines)) + 2 * GUARD  # columns may be made rows
     assert rt.traffic.bytes_up <= 4 * frames * (padded + 13)
