@@ -36,6 +36,7 @@ def test_a_method_is_as_right_as_it_was(scan: api.Scan, method: str, motion: str
     assert psnr_db == pytest.approx(expected_db, abs=tolerance_db)
 
 
+@pytest.mark.slow
 def test_commands_mend_a_scan_with_rings_and_a_displaced_panel(cli, tmp_path: Path, capsys, fast_pictures) -> None:
     """Prepare, calibrate, reconstruct, evaluate: 12 dB regained of 20, on a scan almost too small for it."""
     options = {"size": 16, "detector": 32, "views": 48, "exposure_deg": 5.0, "noise": "tigre", "dose": 1e5, "seed": 0}

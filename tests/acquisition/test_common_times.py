@@ -43,6 +43,7 @@ def test_shares_are_those_of_windows(name) -> None:
     assert np.abs(table.layer_weights.sum(0) - 1).max() < 1e-12
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", SHUTTERS)
 @pytest.mark.parametrize("model", ["log", "intensity"])
 def test_frames_are_those_of_many_times_of_each_line(rt: Runtime, name, model) -> None:

@@ -293,6 +293,7 @@ def test_sizes_are_held_against_this_machine_before_anything_is_unpacked(tmp_pat
     refused(path, None, "r2", "damaged .npy")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("dtype", "compression"), [(np.float32, None), (np.float32, "zlib"), (np.uint16, None)])
 def test_a_good_stack_takes_twice_its_line_integrals(tmp_path, make_truth, dtype, compression) -> None:
     """The frames as stored and their line integrals, one byte per pixel for the mask, and blocks."""

@@ -155,6 +155,7 @@ def refuses(path: Path, address: str, words: Sequence[str]) -> None:
     assert caught.value.found and caught.value.expected
 
 
+@pytest.mark.slow
 def test_damage_is_named(good, make_scan) -> None:
     for case, (address, damage, *words) in CASES.items():
         write_scan(good, scan_for(address, make_scan))

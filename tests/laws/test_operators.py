@@ -240,6 +240,7 @@ def test_frames_and_time_cells_add_up_and_space_may_move_and_grow(rt, make, name
     moves_and_scales(operator)
 
 
+@pytest.mark.slow
 @many
 @given(scanner=tables(), grid=grids(), seed=seeds)
 def test_rays_of_random_scanners(rt, scanner, grid, seed) -> None:
@@ -248,6 +249,7 @@ def test_rays_of_random_scanners(rt, scanner, grid, seed) -> None:
     is_linear(Rays(rt, cells, grid, shape), seed)
 
 
+@pytest.mark.slow
 @many
 @given(scanner=tables(), seed=seeds)
 def test_splats_of_random_scanners(rt, make_cloud, scanner, seed) -> None:

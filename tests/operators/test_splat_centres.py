@@ -19,6 +19,8 @@ from phyradgs_cl.acquisition import Shutter
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.operators.twins.splat import moving_frame
 
+pytestmark = pytest.mark.slow
+
 SHAPE = (13, 18)
 
 

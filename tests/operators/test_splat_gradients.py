@@ -84,6 +84,7 @@ ROUNDING = 1 + 3e-6 * np.array([[1.0], [0.0], [-1.0]])  # what three equal steps
 ROUNDED = [("static", {}), ("micro-views", {"affine": True}), ("exact", {}), ("exact", {"affine": True})]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("motion", "options"), ROUNDED, ids=str)
 def test_rounding_does_not_turn_a_round_gaussian(any_rt, make_cloud, make_geometry, motion, options) -> None:
     """Its torque is a difference that cancels; Adam would make whole steps of what rounding leaves of it."""

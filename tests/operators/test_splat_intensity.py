@@ -16,6 +16,8 @@ from phyradgs_cl.operators import DeviceCells, SplatProjector
 from phyradgs_cl.operators.twins.splat import moving_frame, splat_frame
 from phyradgs_cl.runtime import Runtime
 
+pytestmark = pytest.mark.slow
+
 SHAPE = (13, 18)
 UNIT = 2.5  # line integrals up to 6
 MOTIONS = pytest.mark.parametrize("motion", ["static", "micro-views", "exact", "per-row"])

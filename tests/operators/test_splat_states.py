@@ -81,6 +81,7 @@ def test_frames_and_gradients_are_those_of_the_twin(
     check_frame_and_gradients(rt, finite_differences, make_cloud(2, 41, scale=(0.05, 0.3)), table, deformation(), affine)
 
 
+@pytest.mark.slow
 def test_in_every_build(any_rt, make_cloud, make_geometry, finite_differences) -> None:
     table = frame_cells("exact", make_geometry(*SHAPE), 1, shutter=Shutter(0.8, 0.6, "columns", -1))
     check_frame_and_gradients(any_rt, finite_differences, make_cloud(1, 42), table, deformation(rank=1))

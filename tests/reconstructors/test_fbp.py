@@ -81,6 +81,7 @@ def test_lines_are_backprojected_at_their_own_angles(rt) -> None:
     assert off[0] < 0.03 and off[1] > 0.2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("views", "turn_deg"), [(90, 180), (180, 360)], ids=["half", "full"])
 def test_deblurring_along_the_angle_undoes_an_exposure(rt, views: int, turn_deg: float) -> None:
     """Frames averaged over 41 times of an arc of 6 degrees, 3 pixels at the rim: the volume of a gantry that stops."""

@@ -124,6 +124,7 @@ def test_whole_numbers_of_records_stay_whole_numbers(program) -> None:
     assert not re.search(r"__local float[^;()]*\brecord\w*\[", kernel_source(program))
 
 
+@pytest.mark.slow
 def test_splats_and_voxels_where_the_smallest_numbers_are_0(monkeypatch, make_cloud) -> None:
     rows, grid, shape = make_cloud(20, 3), Grid((9, 10, 11), (0.2, 0.2, 0.2)), (12, 20)
     table = frame_cells("static", ConeGeometry(5.0, 7.5, shape, (0.3, 0.2)))
