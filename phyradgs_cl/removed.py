@@ -17,7 +17,6 @@ REMOVED = {
     "--preset released": "say --preset paper",
     "--prior curves": "say --prior ridge, the default, or dct",
     "pixel_footprint": "leave it out: pixels see splats at their centres, which gives 0.5 dB more",
-    "exposure_s": "say --exposure-ms, as in a data sheet",
     "fly_scan.first": "say readout and readout_direction; row 0 is the lowest, column 0 the left one",
     "fly_scan.fps": "say exposure_deg, degrees per second times exposure_s, and exposure_s",
     "fly_scan.readout_ms": "say readout_ratio, the readout over the exposure",

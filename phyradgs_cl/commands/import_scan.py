@@ -38,7 +38,7 @@ GROUPS = {
             *("fps", "exposure_ms", "readout_ms", "first"),
         ),
         "Geometry": ("detector_offset_mm", "unit_mm", "rotates"),
-        "Timing": ("angles", "angle_at", "detector_model"),
+        "Timing": ("exposure_s", "angles", "angle_at", "detector_model"),
         "Pixels": ("frames", "quantity", "flats", "flat_value", "row_0", "column_0", "part", "first_view"),
         "HDF5": ("entry", "at", "linked_folder"),
         "Volume": ("size", "voxel_mm", "roi_mm"),
@@ -48,9 +48,10 @@ GROUPS = {
 
 def _annotated(one: Field[Any]) -> tuple[Any, Any]:
     """Returns the kind of an option of imports, for Typer, and its default."""
-    flag, words = option_name(one.name), (one.metadata["help"], one.metadata["usual"])
+    words = one.metadata["help"], one.metadata["usual"]
     if one.name in _PAIRS:
-        return Annotated[Any, _PAIRS[one.name](flag, *words)], None
+        return Annotated[Any, _PAIRS[one.name](option_name(one.name), *words)], None
+    flag = "--" + one.name.replace("_", "-")
     kind: Any = Literal[WORDS[one.name]] if one.name in WORDS else list[str] if one.name == "at" else one.type
     return Annotated[kind if one.default is not None else kind | None, option(*words, flag)], one.default
 

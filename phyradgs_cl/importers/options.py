@@ -56,7 +56,7 @@ class ImportOptions:
     of a data sheet, ``first``, ``fps``, ``exposure_ms`` and ``readout_ms``, from which the fields without help follow;
     contradictions are refused. ``named``: returns the name of a field in messages."""
 
-    exposure_s: float | None = None
+    exposure_s: float | None = _option("Exposure of a line, s, in place of --exposure-ms.")
     readout_s: float | None = None
     frame_time_s: float | None = None
     angle_at: str | None = _option("A frame's angle: at its first line's start or middle.", "start")

@@ -28,7 +28,7 @@ def test_a_motion_that_left_is_named_in_a_file_too(cli, capsys, tmp_path, name) 
 
 FLAGS = [("reconstruct", flag) for flag in ("--tune", "--median-filter")]
 FLAGS += [("simulate", flag) for flag in ("--readout", "--readout-direction", "--readout-ratio")]
-FLAGS += [("import", flag) for flag in ("--readout", "--readout-direction", "--readout-s", "--frame-time-s", "--exposure-s")]
+FLAGS += [("import", flag) for flag in ("--readout", "--readout-direction", "--readout-s", "--frame-time-s")]
 
 
 @pytest.mark.parametrize(("command", "flag"), FLAGS)
