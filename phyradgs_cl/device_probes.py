@@ -18,8 +18,7 @@ _TRIED_STEPS = 1 << 14
 
 def pair_error(rt: Runtime) -> float:
     """Returns the relative error of sums of pairs of floats."""
-    x, y, z = np.random.default_rng(1).uniform(0.5, 1, (3, 256)).astype(np.float32)
-    sums = rt.empty((256, 2))
+    (x, y, z), sums = np.random.default_rng(1).uniform(0.5, 1, (3, 256)).astype(np.float32), rt.empty((256, 2))
     kernel = rt.kernel("probes", "probe_pairs", LANES=1, FP64=0)
     rt.launch(kernel, 256, *map(rt.upload, (x, y, z)), 256, sums, group=rt.group(on_cpu=16))
     expected = x + y.astype(np.float64) * z
@@ -54,10 +53,8 @@ def longest_launch(make: Callable[[], Runtime], lasting_s: Sequence[float]) -> s
 
 def _spin(rt: Runtime, steps: int) -> float:
     """Returns the seconds of a launch with one group."""
-    out, kernel = rt.zeros(_ITEMS), rt.kernel("rates", "multiply_add")
-    rt.finish()
-    started = time.perf_counter()
-    rt.launch(kernel, _ITEMS, steps, np.float32(0.5), out, group=_ITEMS)
+    out, started = rt.zeros(_ITEMS), time.perf_counter()
+    rt.launch(rt.kernel("rates", "multiply_add"), _ITEMS, steps, np.float32(0.5), out, group=_ITEMS)
     rt.finish()
     return time.perf_counter() - started
 

@@ -20,6 +20,7 @@ from phyradgs_cl.runtime.opencl import Kernel, cl, kernel_source, naming_failure
 from phyradgs_cl.runtime.profile import KernelUse, Profile, Rates, measure_rates
 
 log = logging.getLogger(__name__)
+Sides = tuple[int, ...]
 
 LANE_CHOICES = (1, 4, 8, 16)
 _FUSING, _PAIRS = "-cl-mad-enable", '#line 1 "common/precise.h"'
@@ -255,8 +256,7 @@ class Runtime:
         return kernel.most_items
 
     def _asked(self, kernel: Kernel, name: str) -> int:
-        what = getattr(cl.kernel_work_group_info, name)
-        return int(self.compile(kernel).get_work_group_info(what, self.device.handle))
+        return int(self.compile(kernel).get_work_group_info(getattr(cl.kernel_work_group_info, name), self.device.handle))
 
     def _fitting(self, kernel: Kernel, group: tuple[int, ...]) -> tuple[int, ...]:
         """Returns a group with sides halved until the kernel can run in it: that of kernels whose items work alone."""
@@ -318,9 +318,7 @@ def default_lanes(device: DeviceInfo) -> int:
     return max((n for n in LANE_CHOICES if n <= device.vector_width), default=1)
 
 
-def _parts(
-    items: tuple[int, ...], group: tuple[int, ...], pieces: int
-) -> Iterator[tuple[tuple[int, ...] | None, tuple[int, ...]]]:
+def _parts(items: Sides, group: Sides, pieces: int) -> Iterator[tuple[Sides | None, Sides]]:
     """Yields first item and work-items of ``pieces`` parts or more, as far as groups allow; None as the first of a whole."""
     if pieces <= 1:
         yield None, items

@@ -60,10 +60,9 @@ def _owners(rt: Runtime, layout: RayLayout, cells: RayCells) -> tuple[tuple[int,
         defines |= dict(zip(("BRICK_X", "BRICK_Y", "BRICK_Z"), owned, strict=True))
         return owned, rt.kernel("rays_adjoint_cpu", "rays_adjoint", **defines)
     kernel = rt.kernel("rays_adjoint_gpu", "rays_adjoint", **defines)
-    thin = rt.group(1, _BLOCK**3, kernel) // _BLOCK**2
-    if thin < _BLOCK:
-        owned, kernel = (_BLOCK, _BLOCK, thin), rt.kernel("rays_adjoint_gpu", "rays_adjoint", BLOCK_Z=thin, **defines)
-    return owned, kernel
+    if (thin := rt.group(1, _BLOCK**3, kernel) // _BLOCK**2) == _BLOCK:
+        return owned, kernel
+    return (_BLOCK, _BLOCK, thin), rt.kernel("rays_adjoint_gpu", "rays_adjoint", BLOCK_Z=thin, **defines)
 
 
 def _parts(rt: Runtime, frames: int, samples_per_frame: int) -> Iterator[tuple[int, int]]:

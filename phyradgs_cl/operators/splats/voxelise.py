@@ -154,9 +154,9 @@ def _in_bricks(
 def _tiles(rt: Runtime, shape: Shape) -> tuple[Shape, Shape]:
     """Returns size and number of the tiles of a volume (z, y, x), both along x, y, z."""
     nz, ny, nx = shape
-    tile_x, tile_y = pitch_of(nx), _TILE_ROWS
-    if rt.pixel_items:  # a group has an item for each column of a tile
-        tile_x, tile_y = 16, rt.group(1, 16 * _TILE_ROWS, _forward(rt)) // 16
+    # a GPU's group has an item for each column of a tile
+    tile_x = 16 if rt.pixel_items else pitch_of(nx)
+    tile_y = rt.group(16 * _TILE_ROWS, 16 * _TILE_ROWS, _forward(rt)) // 16
     return (tile_x, tile_y, _TILE_ROWS), (ceil_div(nx, tile_x), ceil_div(ny, tile_y), ceil_div(nz, _TILE_ROWS))
 
 
