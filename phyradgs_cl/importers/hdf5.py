@@ -18,7 +18,7 @@ from phyradgs_cl.importers.reading.files import SafeFolder
 from phyradgs_cl.importers.reading.frames import LineIntegrals, line_integrals, oriented, places
 from phyradgs_cl.io import scan as schema
 from phyradgs_cl.io.hdf5 import datasets as h5
-from phyradgs_cl.io.hdf5.datasets import ANGLE, LENGTH, Quantity
+from phyradgs_cl.io.hdf5.datasets import ANGLE, LENGTH
 from phyradgs_cl.io.hdf5.source import Hdf5Source, open_hdf5
 from phyradgs_cl.io.scan.detector import read_duration
 from phyradgs_cl.io.scan.reader import united
@@ -223,7 +223,12 @@ def beam(
 ) -> Geometry:
     """Returns the geometry of a file, or the options' numbers where they are given. Where neither states a distance of the
     source the beam is parallel, with a warning. ``axis_columns``: from the rotation axis to the panel's middle."""
-    quantity = _length_of(source, lengths)
+    quantity = LENGTH
+    for address in (address for pair in (*lengths.at_sample, *lengths.on_panel) for address in pair):
+        if source.find(address) is not None and not h5.read_attribute(source, address, "units"):
+            pixel = h5.read_values(source, address, source.dataset(address)).ravel()
+            if pixel.size and abs(float(pixel[0])) < _LEAST_MM:  # without units: in mm smaller than light can see
+                quantity = replace(LENGTH, assumed="m")
 
     def sides_mm(pairs: Sequence[tuple[str, str]]) -> tuple[float, float] | None:
         for pair in pairs:
@@ -264,17 +269,6 @@ def beam(
     return cone(options, to_axis_mm, to_detector_mm, panel, sides, (0.0, axis_columns * sides[1]))
 
 
-def _length_of(source: Hdf5Source, lengths: Lengths) -> Quantity:
-    """Returns how to read the file's lengths: without units they are in metres where a pixel in mm would be smaller than
-    light can see."""
-    for address in (address for pair in (*lengths.at_sample, *lengths.on_panel) for address in pair):
-        if source.find(address) is None or h5.read_attribute(source, address, "units"):
-            continue
-        if abs(float(h5.read_values(source, address, source.dataset(address)).ravel()[0])) < _LEAST_MM:
-            return replace(LENGTH, assumed="m")
-    return LENGTH
-
-
 def exposure_s(source: Hdf5Source, address: str, used: np.ndarray, options: ImportOptions) -> float | None:
     """Reads the exposure of the used frames, or takes the options' in its place. Where it differs, a gantry that stops for
     every frame gets none, with a warning. None where the file has none."""
@@ -284,7 +278,6 @@ def exposure_s(source: Hdf5Source, address: str, used: np.ndarray, options: Impo
         return read_duration(source, address, used, needed=False) or None
     except InputError as error:
         if options.frame_time_s is not None:
-            remedy = f"say {options.named('exposure_s')}"
-            raise InputError(error.subject, error.found, error.expected, remedy) from error
+            raise InputError(error.subject, error.found, error.expected, f"say {options.named('exposure_s')}") from error
         _log.warning("%s: not used, because the gantry stops for every frame", error)
         return None
