@@ -40,7 +40,7 @@ JOBS: dict[str, tuple[int, str, dict[str, object]]] = {
     "phyradgs, exact": (64, "phyradgs", {"iterations": 60}),
     "default, M": (128, "fista", {"iterations": 2}),
     "fista-tv, M": (128, "fista-tv", {"iterations": 5, "motion": "per-row"}),
-    "fdk, M": (128, "fdk", {}),
+    "fdk, M": (128, "fdk", {"motion": "static"}),
 }
 """Voxels along a side, method, options; --quick runs the first half."""
 Table = dict[str, list[float]]
@@ -76,18 +76,18 @@ def works(size: int) -> Iterator[tuple[str, Callable[[Runtime], object]]]:
     few = {"iterations": 1}
     splats = {"iterations": 12, "gaussians": size**3 // 16, "tv_edge": 32}
     yield "fista", runs(scan, "fista", subvoxels=1, **few)
-    yield "asd-pocs", runs(scan, "asd-pocs", **few)
+    yield "asd-pocs", runs(scan, "asd-pocs", motion="static", **few)
     for name, of in {"still": foot(size, protocol="static"), "leaning": leaning, "columns": columns, "steep": steep}.items():
         yield f"cgls, {name}", runs(of, "cgls", motion="per-row", **few)
     yield "sirt, own times", runs(scan, "sirt", motion="own-times", sub_intervals=2, **few)
     yield "sirt, averages of intensity", runs(averaging, "sirt", motion="per-row", **few)
-    yield "sirt, moving object", runs(scan, "sirt", object_motion=moving(scan), **few)
+    yield "sirt, moving object", runs(scan, "sirt", motion="static", object_motion=moving(scan), **few)
     yield "changing", runs(scan, "changing", **few)
-    yield "fdk", runs(scan, "fdk")
-    yield "fdk, leaning", runs(leaning, "fdk")
-    yield "fdk, steep", runs(steep, "fdk")
+    yield "fdk", runs(scan, "fdk", motion="static")
+    yield "fdk, leaning", runs(leaning, "fdk", motion="static")
+    yield "fdk, steep", runs(steep, "fdk", motion="static")
     yield "fdk, per-row", runs(scan, "fdk", motion="per-row")
-    yield "fdk, moving object", runs(scan, "fdk", object_motion=moving(scan))
+    yield "fdk, moving object", runs(scan, "fdk", motion="static", object_motion=moving(scan))
     yield "fdk, moving object, per-row", runs(scan, "fdk", motion="per-row", object_motion=moving(scan))
     for motion in ("static", "exact", "micro-views"):
         yield f"phyradgs, {motion}", runs(scan, "phyradgs", motion=motion, **splats)
