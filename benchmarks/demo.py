@@ -22,7 +22,7 @@ from phyradgs_cl.workflow import load_reference
 OPTIONS = Path(__file__).resolve().parents[1] / "data" / "demo.toml"
 SCAN = ("--phantom", "foot", "--protocol", "rapid", "--noise", "tigre", "--dose", "1e4", "--electronic-noise", "10")
 RUNS = {
-    "fdk": ("fdk", "ignored", ("--method", "fdk")),
+    "fdk": ("fdk", "ignored", ("--method", "fdk", "--motion", "static")),
     "static": ("fista", "ignored", ("--motion", "static")),
     "moving": ("fista", "known", ()),
     "splats": ("phyradgs", "known", ("--method", "phyradgs", "--config", str(OPTIONS))),
