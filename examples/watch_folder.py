@@ -1,7 +1,7 @@
 """A volume of every scan in a folder, as it arrives: python watch_folder.py INCOMING VOLUMES --method fista-tv
 
 VOLUMES/NAME.log holds the words or the error of the run of NAME.h5, and the version of the scan. A scan that has changed,
-or whose log was removed, is made again. Options are those of phyradgs reconstruct. Kill it at will.
+or whose log was removed, is made again. Options are those of phyradgs reconstruct. Kill it at any moment.
 """
 
 import subprocess
@@ -11,7 +11,7 @@ from pathlib import Path
 
 from watchfiles import watch
 
-FATAL = (4, 5, 130, 143)  # a full disk, no device, Ctrl-C, SIGTERM: no fault of the scan
+NOT_THE_SCANS = (4, 5, 130, 143)  # a full disk or another run there, no device, Ctrl-C, SIGTERM: it is tried again
 
 
 def version(scan: Path) -> str:
@@ -25,10 +25,8 @@ def make(scan: Path, volume: Path, words: list[str]) -> None:
     resume = ["--resume"] if Path(f"{volume}.checkpoint.npz").exists() else []
     command = [sys.executable, "-m", "phyradgs_cl", "reconstruct", str(scan), "-o", str(volume), *words, *resume]
     done = subprocess.run(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, check=False)
-    print(f"{scan}: status {done.returncode}", flush=True)
-    if done.returncode in FATAL:
-        sys.exit(done.stdout)
-    if version(scan) == began:  # else more of it has come: it is made again at the next look
+    print(f"{scan}: status {done.returncode}\n{done.stdout}", flush=True)
+    if done.returncode not in NOT_THE_SCANS and version(scan) == began:  # else more of it has come: made again
         log.write_text(began + done.stdout, encoding="utf-8")
 
 

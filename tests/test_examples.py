@@ -85,10 +85,10 @@ def test_the_service_makes_each_scan_once_and_goes_on_when_it_is_killed(tmp_path
         wait_for(lambda: a.exists() and "PSNR" in (volumes / "a.log").read_text())
     made_ns = a.stat().st_mtime_ns
     (incoming / "b.h5").write_bytes(whole)
-    with service(4000) as wait_for:
+    with service(500) as wait_for:
         wait_for(Path(f"{b}.checkpoint.npz").exists)
     assert not b.exists()
-    with service(4000) as wait_for:
+    with service(500) as wait_for:
         wait_for(b.exists)
     assert a.stat().st_mtime_ns == made_ns and not list(volumes.glob("*.bak"))  # no run has begun anew
 
