@@ -21,14 +21,14 @@
 #define COLUMN_SAMPLES(column, least, place, wv, fits)                                                       \
     ((fits) ? lerp_lookup(V_LOAD((column) + (least)), V_LOAD((column) + (least) + LANES), (place) - (least), wv) \
             : lerp_of(GATHER((column), place), GATHER((column) + 1, place), wv))
-static inline vf lerp_of(const vf low, const vf high, const vf share) { return fma(share, high - low, low); }
-static inline vf lerp_lookup(const vf lower, const vf upper, const vi place, const vf share)
+ALWAYS_INLINE vf lerp_of(const vf low, const vf high, const vf share) { return fma(share, high - low, low); }
+ALWAYS_INLINE vf lerp_lookup(const vf lower, const vf upper, const vi place, const vf share)
 {
     return lerp_of(V_LOOKUP(lower, upper, place), V_LOOKUP(lower, upper, place + 1), share);
 }
 #else
 #define COLUMN_SAMPLES(column, least, place, wv, fits) lerp_of(GATHER((column), place), GATHER((column) + 1, place), wv)
-static inline vf lerp_of(const vf low, const vf high, const vf share) { return fma(share, high - low, low); }
+ALWAYS_INLINE vf lerp_of(const vf low, const vf high, const vf share) { return fma(share, high - low, low); }
 #endif
 
 __kernel void backproject(
@@ -146,7 +146,7 @@ __kernel void backproject_upright(
 #define VOXEL_MARGIN 0.01f /* voxels: more than the rounding of where a column of voxels enters or leaves a view */
 
 /* Narrows the z between low and high to those where start + per_z z >= 0. */
-static inline float2 narrowed(const float2 within, const float start, const float per_z)
+ALWAYS_INLINE float2 narrowed(const float2 within, const float start, const float per_z)
 {
     const float root = -start / per_z;
     if (per_z == 0.0f)
@@ -246,7 +246,7 @@ __kernel void backproject_leaning(
 #endif
 
 /* Samples of a line at places u, 0 outside. */
-static inline vf samples_of(__global const float *line, const vf u, const int width)
+ALWAYS_INLINE vf samples_of(__global const float *line, const vf u, const int width)
 {
     const vf most = (vf)(width - 1);
     const vi inside = (u >= 0.0f) & (u <= most);
