@@ -13,6 +13,7 @@ from phyradgs_cl.acquisition import (
     SpeedRamp,
     StaticStart,
 )
+from phyradgs_cl.acquisition.altered.summed import sum_frames
 from phyradgs_cl.acquisition.motion import Exact, LineMiddles, MicroViews, Motion, OwnTimes, PerRow, Static
 from phyradgs_cl.acquisition.scan import Scan
 from phyradgs_cl.acquisition.shutter import Shutter
@@ -53,5 +54,5 @@ __all__ = [
     "Reconstruction", "Scan", "Shutter", "SpeedRamp", "States", "Static", "StaticStart", "TimeCells", "Trajectory",
     "as_torch", "calibrate", "compare", "deformed", "fly_scan", "initial_gaussians", "load_deformation", "load_scan",
     "load_volume", "move_views", "pose_gradient", "prepare", "ray_operator", "reconstruct", "save_deformation",
-    "save_scan", "save_volume", "simulate", "splat_operator", "static_scan", "voxel_operator", "voxelise",
+    "save_scan", "save_volume", "simulate", "splat_operator", "static_scan", "sum_frames", "voxel_operator", "voxelise",
 ]  # fmt: skip

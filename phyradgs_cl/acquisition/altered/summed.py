@@ -1,0 +1,107 @@
+"""Fly-scans made of dense scans: integrating while the gantry turns sums what a panel records at rest."""
+
+import logging
+from dataclasses import replace
+
+import numpy as np
+
+from phyradgs_cl import checks
+from phyradgs_cl.acquisition.readout import Readout
+from phyradgs_cl.acquisition.scan import Scan
+from phyradgs_cl.acquisition.shutter import AXES, Shutter
+from phyradgs_cl.acquisition.trajectory import (
+    CircularOrbit,
+    EncoderTable,
+    PoseTable,
+    Trajectory,
+    checked_poses,
+)
+from phyradgs_cl.errors import InputError
+
+log = logging.getLogger(__name__)
+_UNEVEN = 0.01  # of the mean interval between frames
+
+
+def sum_frames(
+    scan: Scan, count: int, readout_ratio: float = 0.0, readout: str = "rows", readout_direction: int = 1
+) -> Scan:
+    """Returns a fly-scan without gaps, each frame of which sums the intensities of ``count`` projections that follow.
+
+    Each projection of ``scan`` stands for the interval until the next one, in which the gantry turns evenly. readout_ratio,
+    readout, readout_direction: of the new panel, as in ``fly_scan``. A line whose exposure begins within a projection takes
+    a share of it. Frames that would need projections beyond the last are left out. Photons, detector and object are those
+    of the dense scan: a true test of a motion model, if the object moves by less than a pixel from projection to projection.
+
+    Raises InputError for a count that no frame can have, a rolling shutter or lag in ``scan``, and uneven intervals."""
+    checks.whole("count", count, 1, scan.frames)
+    checks.within("readout_ratio", readout_ratio, 0, 1000)
+    checks.one_of("readout", readout, AXES)
+    step_s, first_s = _interval_s(scan)
+    shutter = Shutter(count * step_s, readout_ratio * count * step_s, readout, readout_direction)
+    trajectory, skipped = _continued(scan, first_s, step_s)
+    frames = int((scan.frames - 2 * skipped) / count - readout_ratio + 1e-9)
+    if frames < 1:
+        found = f"{count} with a readout of {readout_ratio:g} exposures"
+        raise InputError("count", found, f"exposure and readout within the scan's {scan.frames} projections")
+    starts = skipped + count * np.arange(frames)
+    share = _shares(shutter.delay_s(shutter.lines(scan.geometry.detector_shape)) / step_s, count)
+    summed = [_sum(scan, int(start), share, shutter.readout) for start in starts]
+    mask = scan.pixel_mask
+    if mask is not None and mask.ndim == 3:
+        mask = np.stack([is_masked for _, is_masked in summed])
+    return replace(
+        scan, projections=np.stack([values for values, _ in summed]), pixel_mask=mask, shutter=shutter,
+        trajectory=trajectory, frame_start_s=first_s + starts * step_s, is_fly=True, detector_model="intensity",
+        provenance={**scan.provenance, "summed_projections": count},
+    )  # fmt: skip
+
+
+def _interval_s(scan: Scan) -> tuple[float, float]:
+    """Returns the interval of the projections in s, and when that of the first one begins."""
+    remedy = "give a scan whose frames are short, or of a gantry at rest"
+    if scan.is_fly and scan.shutter.readout_s > 0:
+        raise InputError("scan", f"a readout of {scan.shutter.readout_s:g} s", "a global shutter", remedy)
+    if scan.lag:
+        raise InputError("scan", f"a lag of {scan.lag:g}", "0", remedy)
+    steps_s = np.diff(scan.frame_start_s)
+    if len(steps_s) == 0 or np.ptp(steps_s) > _UNEVEN * steps_s.mean():
+        raise InputError("frame_start_s", "uneven intervals", "projections at even intervals", "sort or split the scan")
+    step_s = float(steps_s.mean())
+    return step_s, float(scan.frame_start_s[0] + scan.shutter.middle_s - step_s / 2)
+
+
+def _continued(scan: Scan, first_s: float, step_s: float) -> tuple[Trajectory, int]:
+    """Returns the poses between the projections, and how many projections at either end lie beyond known poses."""
+    middle_s = first_s + (np.arange(scan.frames) + 0.5) * step_s
+    own_s = scan.frame_start_s + scan.shutter.middle_s
+    if isinstance(scan.trajectory, CircularOrbit):
+        angle_rad = np.array([scan.trajectory.angle_rad(f, np.array(t)) for f, t in enumerate(own_s)])
+        angle_rad = np.unwrap(angle_rad)
+        rim_px = np.abs(np.diff(angle_rad)).mean() * scan.geometry.detector_shape[1] / 2
+        if rim_px > 1:
+            text = "the rim moves by %.3g pixels from projection to projection: a sum has as many images of it, not a smear"
+            log.warning(text, rim_px)
+        ends_rad = angle_rad[[0, -1]] + np.diff(angle_rad)[[0, -1]] * (-0.5, 0.5)
+        time_s = np.concatenate([middle_s[:1] - step_s / 2, middle_s, middle_s[-1:] + step_s / 2])
+        table = EncoderTable(time_s, np.concatenate([ends_rad[:1], angle_rad, ends_rad[1:]]))
+        return CircularOrbit(scan.trajectory.geometry, table), 0
+    poses = np.concatenate([checked_poses(scan.trajectory, f, np.array([t])) for f, t in enumerate(own_s)])
+    return PoseTable(middle_s, poses, is_parallel=scan.is_parallel), 1
+
+
+def _shares(delay: np.ndarray, count: int) -> np.ndarray:
+    """Returns the share (projections, lines) of each projection in each line's exposure. ``delay`` (lines,): when a line
+    opens, in projections after the frame's start."""
+    number = np.arange(int(np.ceil(delay.max() - 1e-9)) + count)[:, None]
+    overlap = np.minimum(number + 1, delay + count) - np.maximum(number, delay)
+    return np.where(overlap > 1e-9, overlap, 0.0)
+
+
+def _sum(scan: Scan, start: int, share: np.ndarray, readout: Readout) -> tuple[np.ndarray, np.ndarray]:
+    """Returns the line integrals (rows, columns) of one frame, and which pixels a projection has masked."""
+    total, is_masked = np.zeros(scan.projections.shape[1:]), np.zeros(scan.projections.shape[1:], bool)
+    for number, lines in enumerate(share, start):
+        of_lines = np.broadcast_to(readout.spread(lines), total.shape)
+        total += of_lines * np.exp(-scan.projections[number].astype(np.float64))
+        is_masked |= ~scan.valid[number] & (of_lines > 0)
+    return (-np.log(total / share.sum(0).mean())).astype(np.float32), is_masked
