@@ -140,6 +140,21 @@ class FrameSweeps:
         return first + (last - first) * (t - float(self.start_s[frame])) / self.exposure_s
 
 
+def continued(trajectory: Trajectory, by_s: float) -> Trajectory:
+    """Returns an orbit whose encoder table goes on for ``by_s`` at either end, at the speed there; others as they are."""
+    if not (isinstance(trajectory, CircularOrbit) and isinstance(trajectory.kinematics, EncoderTable)):
+        return trajectory
+    table = trajectory.kinematics
+    time_s, angle_rad = table.time_s, table.angle_rad_table
+    speeds = (np.diff(angle_rad) / np.diff(time_s))[[0, -1]]
+    beyond_s, beyond_rad = by_s * np.array([-1, 1]), by_s * np.array([-1, 1]) * speeds
+    time_s, angle_rad = (
+        np.concatenate([inner[:1] + outer[:1], inner, inner[-1:] + outer[1:]])
+        for inner, outer in ((time_s, beyond_s), (angle_rad, beyond_rad))
+    )
+    return replace(trajectory, kinematics=EncoderTable(time_s, angle_rad, table.subject))
+
+
 def _is_without_jumps(steps_rad: np.ndarray) -> bool:
     """Whether no step of angles is one of more than half a turn among steps that are mostly below a quarter."""
     size_rad = np.abs(steps_rad)

@@ -18,6 +18,7 @@ from phyradgs_cl.acquisition.altered.angles import start_azimuths_rad
 from phyradgs_cl.acquisition.altered.coarse import MOST_FRAMES, QUICK_COLUMNS, coarse
 from phyradgs_cl.acquisition.altered.perturbed import GeometryCorrection, Sway, Views, perturb
 from phyradgs_cl.acquisition.altered.variants import reversed_readout
+from phyradgs_cl.acquisition.trajectory import continued
 from phyradgs_cl.calibrate.beads import BeadProblem
 from phyradgs_cl.calibrate.parameters import (
     DIRECTION,
@@ -57,6 +58,7 @@ _FEWEST_FRAMES, _FEWEST_COLUMNS = 8, 12
 _FEWEST_SPLINES = 4  # of a cubic spline
 _LEAST_EXPLAINED = 0.3  # of the frames' variance, by a phantom in its best place before any correction
 _ORDER_ERRORS, _ORDER_RATIO = 4.0, 1.04  # of the other readout direction's residual, as in ``check``
+_BEYOND = 1e6  # frames that an encoder table goes on for: first steps of the search may be very wrong
 _EXPECTED_SHARE = 0.25  # of the most passes of a stage: few parameters are determined, and steps become small early
 
 
@@ -74,7 +76,10 @@ def calibrate(
     InputError for unknown parameters, a scan too small, others that do not fit the first, a phantom that the frames do not
     show."""
     request = requested(what, scan, phantom is not None)
-    ready = [without_lag(one) for one in (scan, *others)]
+    ready = [
+        without_lag(replace(one, trajectory=continued(one.trajectory, _BEYOND * one.shutter.span_s)))
+        for one in (scan, *others)
+    ]
     _check(ready, request, phantom, splines)
     _warn(ready, phantom)
     return _Calibrator(rt, scan, ready, request, phantom, splines, report, note).run()
@@ -139,7 +144,9 @@ class _Calibrator:
             corrections, correction, after = held, correction_of(held), before_rest
             self.search.keep_held()
         table += self.search.table(self.scan, corrections) + views_table
-        corrected = perturb(self.scan, correction, views) if corrections or views is not None else self.scan
+        later_s = max(0.0, correction.exposure_s) + max(0.0, correction.readout_s)
+        stated = replace(self.scan, trajectory=continued(self.scan.trajectory, later_s)) if later_s else self.scan
+        corrected = perturb(stated, correction, views) if corrections or views is not None else self.scan
         calibration = Calibration(corrected, table, self.search.alike, (rms(before), rms(after)), before, after, views)
         return replace(calibration, scan=_with_provenance(corrected, self.scan, calibration))
 
@@ -324,7 +331,7 @@ def _warn(scans: Sequence[Scan], phantom: EllipsoidPhantom | None) -> None:
     if phantom is None and check_coverage(first).unit == CUT_OFF:
         log.warning(
             "calibrate: the object reaches beyond the panel, which can look like a shifted panel: "
-            "state a grid that holds the whole object (--roi-mm), and compare slices before and after"
+            "compare slices before and after"
         )
     for other in others:
         is_as_long = len(other.frame_start_s) == len(first.frame_start_s) and other.shutter == first.shutter

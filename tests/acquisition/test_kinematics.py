@@ -5,6 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from phyradgs_cl.acquisition import (
+    CircularOrbit,
     ConeGeometry,
     ConstantSpeed,
     EncoderTable,
@@ -12,6 +13,7 @@ from phyradgs_cl.acquisition import (
     PoseTable,
     SpeedRamp,
 )
+from phyradgs_cl.acquisition.trajectory import continued
 from phyradgs_cl.errors import InputError
 
 GEOMETRY = ConeGeometry(1000.0, 1500.0, (4, 6), (0.7, 0.5), (3.0, -8.0))
@@ -95,3 +97,12 @@ def test_a_table_returns_its_own_samples() -> None:
     np.testing.assert_allclose(poses.pose(0, np.arange(9.0)), table, atol=RIGID_TOLERANCE_MM)
     assert poses.pose(0, np.arange(6.0).reshape(2, 3)).shape == (2, 3, 12)
     assert poses.pose(0, np.array(2.5)).shape == (12,)
+
+
+def test_an_encoder_table_goes_on_at_the_speed_of_its_ends() -> None:
+    table = EncoderTable(np.array([0.0, 1.0, 3.0]), np.array([0.0, 0.1, 0.5]))
+    longer = continued(CircularOrbit(GEOMETRY, table), 2.0)
+    times_s = np.array([-2.0, 0.0, 0.5, 3.0, 5.0])
+    np.testing.assert_allclose(longer.angle_rad(0, times_s), [-0.2, 0.0, 0.05, 0.5, 0.9])
+    steady = CircularOrbit(GEOMETRY, ConstantSpeed(0.0, 1.0))
+    assert continued(steady, 2.0) is steady

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from phyradgs_cl.acquisition import CircularOrbit
+from phyradgs_cl.acquisition import CircularOrbit, EncoderTable
 from phyradgs_cl.acquisition.altered.perturbed import GeometryCorrection, perturb
 from phyradgs_cl.api import simulate
 from phyradgs_cl.calibrate import AGREES, CANNOT_TELL, CORRECTED, calibrate
@@ -53,6 +53,16 @@ def test_offset_and_roll_are_found_in_a_file_of_which_all_else_stays(cli, right,
     assert (tmp_path / "out.png").read_bytes().startswith(b"\x89PNG")
     time_s = right.frame_start_s[4:5]
     np.testing.assert_allclose(read.trajectory.pose(4, time_s), right.trajectory.pose(4, time_s), atol=0.02)
+
+
+def test_frames_may_be_longer_than_the_encoder_table_of_the_stated_ones(rt, right) -> None:
+    time_s = np.array([right.frame_start_s[0], right.frame_start_s[-1] + right.shutter.span_s])
+    angle_rad = np.concatenate([right.trajectory.angle_rad(f, time_s[[end]]) for f, end in ((0, 0), (right.frames - 1, 1))])
+    tight = CircularOrbit(right.geometry, EncoderTable(time_s, np.unwrap(angle_rad)))
+    stated = replace(right, shutter=replace(right.shutter, exposure_s=0.5 * right.shutter.exposure_s))
+    found = calibrate(replace(stated, trajectory=tight), rt, "timing")
+    assert all(one.verdict in (AGREES, CANNOT_TELL, CORRECTED) for one in found.parameters)
+    found.scan.check_timing()
 
 
 def test_a_right_scan_stays_as_it_is(rt, right) -> None:
