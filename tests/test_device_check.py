@@ -55,7 +55,8 @@ def test_a_wrong_kernel_is_named(monkeypatch, cli, capfd, check, program, right,
     assert cli.run(["devices", "--check"]) == 5
     line, *probes = capfd.readouterr().out.splitlines()
     assert "cannot be trusted: " in line and named in line
-    assert [probe.partition(":")[0].split()[0] for probe in probes] == TOLD
+    # only GPUs are asked for the longest launch
+    assert [word for probe in probes if (word := probe.partition(":")[0].split()[0]) != "longest"] == TOLD
 
 
 TOLD = ["driver", "pairs", "whole", "subnormal", "work-items", "times"]
@@ -74,6 +75,8 @@ def test_what_a_device_does_with_numbers_is_told(monkeypatch) -> None:
     assert re.search(r"longest launch that lived: [\d.e-]+ s or more", right[6])
     allowed = Runtime._allowed
     monkeypatch.setattr(Runtime, "_allowed", staticmethod(lambda *given: [*allowed(*given), "-cl-fast-relaxed-math"]))
+    if "rusticl" in right[0]:  # which ignores the option
+        return
     assert "pairs of floats: contracted, relative error 5.9e-08" in told()[1]
     monkeypatch.setattr(device_check, "CHECKS", (device_check._numbers,))
     assert "probe_pairs (off by" in check_device(fp64=False).failures[0] and not check_device().failures

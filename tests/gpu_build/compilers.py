@@ -48,7 +48,8 @@ def ptxas_costs(text: str) -> list[KernelCost]:
     found = []
     for block in text.split("Compiling entry function ")[1:]:
         name, registers = _match(r"'(\w+)'", block), int(_match(r"Used (\d+) registers", block))
-        spilled = sum(int(count) for count in re.findall(r"(\d+) bytes spill stores", block))
+        # the frame holds spilled registers, and arrays whose index is not known when the kernel is built
+        spilled = int(_match(r"(\d+) bytes stack frame", block))
         local = sum(int(count) for count in re.findall(r"(\d+) bytes smem", block))
         warps = min(SM_WARPS, SM_REGISTERS // (-(-registers // REGISTER_STEP) * REGISTER_STEP * 32))
         found.append(KernelCost("NVIDIA sm_90", name, registers, spilled, local, warps))

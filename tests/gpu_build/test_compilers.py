@@ -26,7 +26,7 @@ Build succeeded.
 
 def test_costs() -> None:
     assert ptxas_costs(PTXAS) == [
-        KernelCost("NVIDIA sm_90", "heavy", 70, 12, 1536, 28), KernelCost("NVIDIA sm_90", "light", 12, 0, 0, 64)
+        KernelCost("NVIDIA sm_90", "heavy", 70, 16, 1536, 28), KernelCost("NVIDIA sm_90", "light", 12, 0, 0, 64)
     ]  # fmt: skip
     assert amdgcn_costs(AMD) == [KernelCost("AMD gfx1030", "heavy", 256, 40, 512, 4)]
     assert [cost.spilled_bytes for cost in ocloc_costs(INTEL, ["heavy", "light"])] == [733, 0]
