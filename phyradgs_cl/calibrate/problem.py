@@ -14,6 +14,7 @@ from phyradgs_cl.calibrate.stages import Stage
 from phyradgs_cl.detector import noise_level
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.objective import TvProx
+from phyradgs_cl.operators.rays.intensity import IntensityOperator
 from phyradgs_cl.operators.rays.operator import RayOperator
 from phyradgs_cl.operators.rays.upright import FEWEST_LINES
 from phyradgs_cl.reconstructors.voxels.cgls import Cgls
@@ -96,7 +97,13 @@ class CoarseProblem(CoarseFrames):
         difference is added as ``volume`` has it."""
         if self.scans[0].detector_model != "intensity":
             return self.measured
-        return self.measured + self.masked(operator.intensity_correction(volume))
+        return self.measured + self.masked(operator.forward(volume) - self._expected(operator, volume))
+
+    def _expected(self, operator: RayOperator, volume: np.ndarray) -> np.ndarray:
+        """Returns the frames of a volume, averaged as the detector does."""
+        if self.scans[0].detector_model != "intensity":
+            return operator.forward(volume)
+        return IntensityOperator(self.rt, self.grid, operator.detector_shape, operator.tables).expected(volume)
 
     def reconstruct(self, operator: RayOperator, start: np.ndarray | None, iterations: int) -> np.ndarray:
         """Returns a nonnegative volume with little total variation, iterated from ``start``."""
@@ -117,7 +124,7 @@ class CoarseProblem(CoarseFrames):
 
     def residual(self, operator: RayOperator, volume: np.ndarray) -> np.ndarray:
         """Returns measured less expected frames (F, rows, columns)."""
-        return self.line_integrals(operator, volume) - self.masked(operator.forward(volume))
+        return self.measured - self.masked(self._expected(operator, volume))
 
     def noise(self, residual: np.ndarray) -> float:
         """Returns the standard deviation of a pixel's noise; not from ``residual``, because a volume fits some noise."""
