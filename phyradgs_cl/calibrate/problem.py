@@ -110,9 +110,7 @@ class CoarseProblem(CoarseFrames):
         volume = np.zeros(self.grid.shape, np.float32) if start is None else start
         system = System(operator, self.line_integrals(operator, volume), self.valid)
         method = FistaTv(system, _TV, TvProx(self.rt, self.grid.shape, axis_weights(self.grid)))
-        projected = system.expected(volume)
-        current = {"volume": volume, "previous": volume, "projected": projected, "projected_previous": projected}
-        method.restore({**method.state(), **current})
+        method.start_from(volume)
         for _ in range(iterations):
             method.step()
             self.count_pass()

@@ -84,12 +84,12 @@ def frame_pairs(
     return pairs
 
 
-def held_out(scan: Scan, percent: float, seed: int = _HOLDOUT_SEED, subject: str = "--holdout") -> np.ndarray:
+def held_out(scan: Scan, percent: float) -> np.ndarray:
     """Draws a percentage of the valid pixels (F, v, u) bool, the same in every run. Raises InputError for none."""
-    drawn = np.random.default_rng(seed).random(scan.projections.shape, np.float32) < percent / 100
+    drawn = np.random.default_rng(_HOLDOUT_SEED).random(scan.projections.shape, np.float32) < percent / 100
     held: np.ndarray = drawn & scan.valid
     if not held.any():
-        raise InputError(subject, f"{percent:g} % of {int(scan.valid.sum())} pixels", "at least one pixel", "take more")
+        raise InputError("--holdout", f"{percent:g} % of {int(scan.valid.sum())} pixels", "at least one pixel", "take more")
     return held
 
 
