@@ -23,7 +23,7 @@ from phyradgs_cl.operators.rays.memory import RayMemory
 from phyradgs_cl.operators.rays.slots import Slots, UprightPoses, merge_slots, split_slots
 from phyradgs_cl.operators.rays.subrays import SINGLE
 from phyradgs_cl.operators.rays.upright import launch_upright, launch_upright_adjoint, upright_of
-from phyradgs_cl.runtime import Array, DeviceArray, Runtime, SameArray, with_smaller_bricks
+from phyradgs_cl.runtime import Array, DeviceArray, Runtime, SameArray, attempts
 from phyradgs_cl.runtime.layout import Strides
 
 
@@ -36,11 +36,11 @@ class LinearOperator(Protocol):
     @property
     def frames_shape(self) -> tuple[int, int, int]: ...
 
-    def forward(self, volume: np.ndarray) -> np.ndarray:
-        """A x: volume (nz, ny, nx) 1/mm to frames (F, rows, columns) float32."""
+    def forward(self, volume: Any, out: Any = None) -> Any:
+        """A x: volume (nz, ny, nx) 1/mm to frames (F, rows, columns) float32. ``out`` receives the result if given."""
         ...
 
-    def adjoint(self, frames: np.ndarray) -> np.ndarray:
+    def adjoint(self, frames: Any, out: Any = None) -> Any:
         """Aᵀ y: frames (F, rows, columns) to a volume (nz, ny, nx) float32."""
         ...
 
@@ -101,7 +101,9 @@ class RayOperator:
         """Returns A x for a volume (nz, ny, nx) in 1/mm: frames (F, rows, columns) float32."""
         _check_shape("volume", volume, self.volume_shape)
         result: SameArray = _room_for(self.rt, self.frames_shape, volume, out)
-        with_smaller_bricks("ray-driven projector", lambda share: self._forward(volume, share, result))
+        for attempt in attempts("ray-driven projector"):
+            with attempt as share:
+                self._forward(volume, share, result)
         return result
 
     def _forward(self, volume: Array, share: float, result: Array) -> None:
@@ -155,7 +157,9 @@ class RayOperator:
         """Returns Aᵀ y for frames (F, rows, columns): a volume (nz, ny, nx) float32."""
         _check_shape("frames", frames, self.frames_shape)
         result: SameArray = _room_for(self.rt, self.volume_shape, frames, out)
-        with_smaller_bricks("ray-driven backprojector", lambda share: self._adjoint(frames, share, result))
+        for attempt in attempts("ray-driven backprojector"):
+            with attempt as share:
+                self._adjoint(frames, share, result)
         return result
 
     def _adjoint(self, frames: Array, share: float, result: Array) -> None:
