@@ -80,9 +80,8 @@ class Commands(TyperGroup):
     def invoke(self, ctx: Any) -> object:
         try:
             return super().invoke(ctx)
-        except KeyboardInterrupt as error:
-            is_complete = isinstance(error, signals.InterruptedAfterwards)
-            raise Interrupted(signals.COMPLETE if is_complete else signals.farewell()) from None
+        except KeyboardInterrupt:
+            raise Interrupted from None
 
 
 app = typer.Typer(
@@ -115,25 +114,19 @@ def run(arguments: list[str], program: typer.Typer = app) -> int:
     if not takes_part(arguments):
         return 0
     with signals.answer_signals():
-        return _run(arguments, program)
-
-
-def _run(arguments: list[str], program: typer.Typer) -> int:
-    try:
-        with naming_host_memory():
-            status = program(arguments, standalone_mode=False)
-        return status if isinstance(status, int) else 0
-    except PhyradgsError as error:
-        return complain(str(error), error.exit_code)
-    except _CLICK_ERROR as error:
-        return complain(usage_text(error, arguments))
-    except OSError as error:  # one that no reader or writer has named
-        text = f"{error.filename or 'operating system'}: {error.strerror or error}"
-        return complain(text, OutputError.exit_code if error.errno in NO_SPACE else 2)
-    except SystemExit:  # Typer's answer to a reader of its help that has left, as in `| head`
-        give_up_stdout()
-        return 0
-    except Interrupted as interrupted:
-        return complain(str(interrupted), signals.exit_status())
-    except (KeyboardInterrupt, typer.Abort):
-        return complain(signals.farewell(), signals.exit_status())
+        try:
+            with naming_host_memory():
+                status = program(arguments, standalone_mode=False)
+            return status if isinstance(status, int) else 0
+        except PhyradgsError as error:
+            return complain(str(error), error.exit_code)
+        except _CLICK_ERROR as error:
+            return complain(usage_text(error, arguments))
+        except OSError as error:  # one that no reader or writer has named
+            text = f"{error.filename or 'operating system'}: {error.strerror or error}"
+            return complain(text, OutputError.exit_code if error.errno in NO_SPACE else 2)
+        except SystemExit:  # Typer's answer to a reader of its help that has left, as in `| head`
+            give_up_stdout()
+            return 0
+        except (Interrupted, KeyboardInterrupt, typer.Abort):
+            return complain(signals.farewell(), signals.exit_status())

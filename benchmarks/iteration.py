@@ -12,8 +12,8 @@ import time
 from measuring import Facts, finish, foot_scan, median, parser_of, splat_run, where
 
 from phyradgs_cl.acquisition import Exact, MicroViews, Static
+from phyradgs_cl.reconstructors.splats.method import SplatRun
 from phyradgs_cl.reconstructors.splats.options import SplatOptions
-from phyradgs_cl.reconstructors.splats.run import SplatRun
 from phyradgs_cl.runtime import Runtime
 
 MOTIONS = {"static": Static(), "8x5": MicroViews(8, 5), "exact": Exact()}

@@ -16,8 +16,8 @@ from phyradgs_cl import __version__
 from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.api import simulate
 from phyradgs_cl.reconstructors.fdk import static_fdk
+from phyradgs_cl.reconstructors.splats.method import SplatRun
 from phyradgs_cl.reconstructors.splats.options import SplatOptions
-from phyradgs_cl.reconstructors.splats.run import SplatRun
 from phyradgs_cl.reconstructors.splats.start import first_population, internal_scale
 from phyradgs_cl.runtime import Runtime
 

@@ -25,7 +25,7 @@ from scans import append, files_of, make_scan, read_lines, runs_parser
 from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.metrics import compare
 from phyradgs_cl.reconstructors import RunPlan, method_options, reconstruct
-from phyradgs_cl.reconstructors.splats.run import SplatRun
+from phyradgs_cl.reconstructors.splats.method import SplatRun
 from phyradgs_cl.runtime import Runtime
 
 MOTIONS = "static,4x3,8x5,16x7,exact 0.02,exact 0.01,exact 0.005,exact 0.002"

@@ -35,8 +35,8 @@ from phyradgs_cl.optim import DensityControl
 from phyradgs_cl.parallel import launched_ranks
 from phyradgs_cl.phantoms import shepp_logan
 from phyradgs_cl.reconstructors.splats import step as splat_step
+from phyradgs_cl.reconstructors.splats.method import SplatRun
 from phyradgs_cl.reconstructors.splats.options import SplatOptions
-from phyradgs_cl.reconstructors.splats.run import SplatRun
 from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.simulation import AnalyticSource, SimulationOptions, simulate
 

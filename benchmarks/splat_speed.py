@@ -1,9 +1,6 @@
-"""Speed of the splat projector, as rates and ratios from one run.
+"""Speed of the splat projector: the median time of its kernels, forward and backward.
 
     python benchmarks/splat_speed.py [--detector 256] [--gaussians 50000] [--repeats 7] [--device D] [--json FILE]
-
-"Evaluated" pairs are the Gaussian-pixel pairs of all vectors that were computed; "box" pairs lie in the bounding boxes
-of the cutoff ellipses, "useful" ones inside the ellipses (pi/4 of the box).
 """
 
 import resource
@@ -21,7 +18,7 @@ MOTIONS = {"static": Static(), "micro-views 8x5": MicroViews(8, 5)}
 
 
 def projector_rates(rt: Runtime, scan: Scan, count: int, repeats: int) -> dict[str, dict[str, float]]:
-    """Kernel seconds and rates of forward and backward, by motion model."""
+    """Kernel milliseconds of forward and backward, by motion model."""
     rng = np.random.default_rng(0)
     detector = scan.lines
     pixel = 4.0 / detector / 1.4
@@ -33,7 +30,6 @@ def projector_rates(rt: Runtime, scan: Scan, count: int, repeats: int) -> dict[s
     seconds: dict[str, dict[str, list[float]]] = {
         name: {"forward": [], "backward": [], "all": []} for name in tables
     }
-    result: dict[str, dict[str, float]] = {}
     for repeat in range(repeats + 1):
         for name, cells in tables.items():
             rt.kernel_seconds()
@@ -41,20 +37,14 @@ def projector_rates(rt: Runtime, scan: Scan, count: int, repeats: int) -> dict[s
             projector.backward(gaussians, cells, by_image, gradients)
             kernels = rt.kernel_seconds()
             if repeat == 0:
-                work = projector.work(gaussians, cells)
-                result[name] = {"box_pairs": work.pairs, "evaluated_pairs": work.evaluated, "footprints": work.footprints}
                 continue
             seconds[name]["forward"].append(kernels["splat_forward_rows"])
             seconds[name]["backward"].append(kernels["splat_backward_rows"])
             seconds[name]["all"].append(sum(kernels.values()))
-    for name, times in seconds.items():
-        facts = result[name]
-        for step in ("forward", "backward", "all"):
-            facts[f"{step}_ms"] = 1e3 * statistics.median(times[step])
-        for step in ("forward", "backward"):
-            facts[f"{step}_evaluated_g_per_s"] = facts["evaluated_pairs"] / facts[f"{step}_ms"] / 1e6
-            facts[f"{step}_useful_g_per_s"] = np.pi / 4 * facts["box_pairs"] / facts[f"{step}_ms"] / 1e6
-    return result
+    return {
+        name: {f"{step}_ms": 1e3 * statistics.median(of_step) for step, of_step in times.items()}
+        for name, times in seconds.items()
+    }
 
 
 def main() -> None:

@@ -4,9 +4,9 @@
 
 One frame of the rapid protocol (14.4° of exposure, readout 0.86 of it). Errors are relative (RMS over RMS) to a reference
 that takes every row at --samples times of its own exposure: the mean over single random Gaussians with scales of 0.5 to
-4 % of the half-width, and that of a Shepp-Logan cloud. Costs are of another cloud, of scales of 0.8 to 3 %: pairs of
-Gaussian and pixel that are walked and evaluated (whole vectors), and the smallest time of several runs in turn, of all
-kernels forward and backward: on CPUs processor time, which other programs disturb little, on GPUs the kernels'.
+4 % of the half-width, and that of a Shepp-Logan cloud. Costs are of another cloud, of scales of 0.8 to 3 %: the smallest
+time of several runs in turn, of all kernels forward and backward: on CPUs processor time, which other programs disturb
+little, on GPUs the kernels'.
 """
 
 import time
@@ -131,12 +131,8 @@ class Bench:
         return kernels if self.rt.pixel_items else time.process_time() - started
 
     def facts(self) -> dict[str, object]:
-        work = self.projector.work(self.gaussians, self.cells)
         return {
             "poses": self.cells.count,
-            "pairs": work.pairs,
-            "evaluated": work.evaluated,
-            "rules": work.rule_shares(),
             "forward_ms": 1e3 * self.best["forward"],
             "backward_ms": 1e3 * self.best["backward"],
         }

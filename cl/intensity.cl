@@ -1,8 +1,9 @@
 /* The intensity model over the cells of a frame: a detector adds photons, not line integrals.
 
    The k-th cell of every line is drawn into the k-th layer as w_k p_k. The merged frame is -ln(sum w_k exp(-p_k)) and
-   its derivative by w_k p_k is the share exp(-p_k) / sum w_j exp(-p_j). Twin: detector/average.py. */
-#include "common/intensity.h"
+   its derivative by w_k p_k is the share exp(-p_k) / sum w_j exp(-p_j). Sums are of differences from the least p, so that
+   nearly equal times cost no digits, and nothing overflows. Twin: detector/attenuation.py. */
+#include "common/lanes.h"
 
 /* p_k of a pixel from w_k p_k */
 #define SEEN(k) (V_LOAD(layers + (size_t)(k) * layer_size + at) * unit / weights[(size_t)(k) * lines + v])
@@ -20,20 +21,20 @@ __kernel void intensity_merge(
         return;
     const size_t at = IMAGE_GUARD + (size_t)v * pitch + u, layer_size = IMAGE_GUARD + (size_t)lines * pitch;
     const vi inside = V_INT((vf)(u) + V_IOTA) < width;
-    vf least = (vf)(MAXFLOAT); /* of the brightest cell: nothing overflows */
+    vf least = (vf)(MAXFLOAT); /* of the brightest cell */
     for (int k = 0; k < layer_count; ++k)
         if (weights[(size_t)k * lines + v] > 0.0f)
             least = min(least, SEEN(k));
-    intensity_t sum = intensity_from(least);
+    vf light = (vf)(0.0f); /* sum of w (exp(least - p) - 1) */
     int any = 0;
     for (int k = 0; k < layer_count; ++k) {
         const float weight = weights[(size_t)k * lines + v];
         if (!(weight > 0.0f))
             continue;
-        intensity_add(&sum, weight, SEEN(k));
+        light += weight * expm1(least - SEEN(k));
         any = 1;
     }
-    const vf brighter = intensity_brighter(sum);
+    const vf brighter = log1p(max(light, -0.9999999f));
     for (int k = 0; k < layer_count; ++k) {
         vf share = (vf)(0.0f);
         if (weights[(size_t)k * lines + v] > 0.0f)

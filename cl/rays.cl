@@ -1,13 +1,8 @@
 /* Ray-driven projector by Joseph's method over all time cells of many frames, in as few launches as the device allows. One
    bilinear sample per plane of the ray's main axis (Joseph, IEEE Trans. Med. Imaging 1 (1982) 192). Frames and volumes are
-   padded rows; a volume has a border of zeros in y and z. AVERAGE: how the cells of a line are averaged. Adjoints:
-   rays_adjoint_cpu.cl, rays_adjoint_gpu.cl. Twin: operators/twins/rays.py. */
-#include "common/intensity.h"
+   padded rows; a volume has a border of zeros in y and z. Adjoints: rays_adjoint_cpu.cl, rays_adjoint_gpu.cl.
+   Twin: operators/twins/rays.py. */
 #include "common/ray.h"
-
-#define AVERAGE_LOG 0       /* sum of w p */
-#define AVERAGE_INTENSITY 1 /* -log of the sum of w exp(-p) */
-#define AVERAGE_CORRECTION 2       /* the first less the second, from differences between cells: no cancellation */
 
 __kernel void rays_forward(
     __global const float *volume,     /* guard, then (z, y, pitch) with a border of BORDER in y and z */
@@ -19,7 +14,7 @@ __kernel void rays_forward(
     const int4 shape, const int4 origin, /* voxels of the volume, and the first of them in the grid, x y z */
     const int volume_pitch, const float4 pitch_mm,
     const int lines, const int width, const int image_pitch,
-    const int add,                    /* onto the image: the log average of one more brick */
+    const int add,                    /* onto the image, for one more brick */
     __global float *image)            /* guard, then (listed frames, lines, pitch) */
 {
     const int u = (int)get_global_id(0) * LANES, v = (int)get_global_id(1), n = (int)get_global_id(2);
@@ -30,8 +25,6 @@ __kernel void rays_forward(
     const size_t line = (size_t)frame_list[n] * lines + v;
     const vi real = VI_IOTA + u < width;
     vf total = (vf)(0.0f);
-    intensity_t sum = intensity_from(total);
-    int any = 0;
     for (int c = line_cells[2 * line]; c < line_cells[2 * line + 1]; ++c) {
         const int place = ACROSS ? u : v;
         if (place + (ACROSS ? LANES : 1) <= cell_lines[2 * c] || place >= cell_lines[2 * c + 1])
@@ -65,17 +58,8 @@ __kernel void rays_forward(
             }
         }
         p *= r.step_mm;
-        if (AVERAGE == AVERAGE_LOG) {
-            total += weight * p;
-            continue;
-        }
-        if (!any)
-            sum = intensity_from(p);
-        any = 1;
-        intensity_add(&sum, (vf)(weight), p);
+        total += weight * p;
     }
-    if (AVERAGE != AVERAGE_LOG && any)
-        total = AVERAGE == AVERAGE_CORRECTION ? sum.mean + intensity_brighter(sum) : sum.from - intensity_brighter(sum);
     __global float *pixels = image + IMAGE_GUARD + ((size_t)n * lines + v) * image_pitch + u;
     if (add)
         total += V_LOAD(pixels);

@@ -1,12 +1,7 @@
 /* Between frames and slots: what the upright kernels project from one pose, for the part of the panel that it serves.
    A frame is an average over slots with a weight for each line; the transpose gives a slot its share of the frames.
-   A line is a detector row where `by_row`, else a column. AVERAGE: of a pixel's slots, as in rays.cl. */
-#include "common/intensity.h"
+   A line is a detector row where `by_row`, else a column. */
 #include "common/ray_column.h"
-
-#define AVERAGE_LOG 0       /* sum of w p */
-#define AVERAGE_INTENSITY 1 /* -log of the sum of w exp(-p) */
-#define AVERAGE_CORRECTION 2       /* the first less the second, from differences between poses: no cancellation */
 
 #define SHARE 4        /* ints of a share: slot (or frame), first line, line after the last, where its weights begin */
 
@@ -41,8 +36,6 @@ __kernel void merge_slots(
     __global float *pixels = image + to.x + u * to.y + n * to.w;
     for (int v = 0; v < height; v += LANES) {
         vf total = (vf)(0.0f);
-        vf lit = total;
-        intensity_t sum = intensity_from(total);
         for (int e = frame_shares[n]; e < frame_shares[n + 1]; ++e) {
             __global const int *share = shares + SHARE * e, *slot = slots + SLOT * (size_t)share[0];
             if (by_row && v + LANES <= share[1]) /* shares begin in the order of their lines */
@@ -56,23 +49,14 @@ __kernel void merge_slots(
             /* near the ends of the slot: only the lanes inside */
             const vf p = own >= 0 && own <= most
                 ? V_LOAD(column + own) : GATHER(column, min(max(own + VI_IOTA, 0), slot_pitch - 1));
-            if (AVERAGE == AVERAGE_LOG) {
-                total += V_PICK(0.0f, weight * p, weight > 0.0f);
-                continue;
-            }
-            const vi is_lit = weight > 0.0f;
-            sum.from = V_PICK(sum.from, p, (lit <= 0.0f) & is_lit); /* of a line's first slot */
-            lit += weight;
-            intensity_add(&sum, weight, V_PICK(sum.from, p, is_lit));
+            total += V_PICK(0.0f, weight * p, weight > 0.0f);
         }
-        if (AVERAGE != AVERAGE_LOG)
-            total = AVERAGE == AVERAGE_CORRECTION ? sum.mean + intensity_brighter(sum) : sum.from - intensity_brighter(sum);
         for (int k = 0; k < min(LANES, height - v); ++k)
             pixels[(v + k) * to.z] = LANE(float, total, k);
     }
 }
 
-/* The transpose of merge_slots with the log average, times the length of each ray from plane to plane. Where
+/* The transpose of merge_slots, times the length of each ray from plane to plane. Where
    columns lean the rays' slopes along z follow, slots_floats behind the values. */
 __kernel void split_slots(
     __global const float *turned,     /* guard, then (F, width, turned_pitch): frames with detector columns as rows */

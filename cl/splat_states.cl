@@ -1,5 +1,5 @@
 /* Moves a cloud of Gaussians to the states of an object that moves, and takes gradients back. Twin:
-   operators/twins/warp.py. Pull convention, as everywhere: the object at y is the reference at y + w(y), so a
+   operators/twins/rays.py. Pull convention, as everywhere: the object at y is the reference at y + w(y), so a
    Gaussian whose mean is m in the reference lies at the y with y + w(y) = m. w is a sum of tensor cubic B-splines, 0 beyond
    their control points; of a state it is the sum of shares[r] times the field r.
      splat_states       a work-item moves a Gaussian to every state, by Newton steps from its place in the state before.

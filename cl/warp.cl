@@ -1,5 +1,5 @@
 /* A volume seen through a displacement, (W v)(y) = v(y + w(y)), interpolated and zero outside the volume, and its exact
-   transpose. The displacement of a state is w = sum of shares[r] * fields[r], in voxels. Twin: operators/twins/warp.py.
+   transpose. The displacement of a state is w = sum of shares[r] * fields[r], in voxels. Twin: operators/twins/rays.py.
    It interpolates by cubic splines along each axis, which run through the voxels: their coefficients lie in the volume's
    layout, from BORDER samples before it to BORDER behind it. M. Unser, A. Aldroubi and M. Eden, B-spline signal processing,
    IEEE Trans. Signal Processing 41, 821-833 (1993).

@@ -24,8 +24,8 @@ from phyradgs_cl.objective.tv import TvDescent, TvProx, tv_descent, tv_prox
 from phyradgs_cl.operators.splats.binning import TileLists
 from phyradgs_cl.operators.splats.states import CloudStates, states_of
 from phyradgs_cl.operators.twins import rays as twins
+from phyradgs_cl.operators.twins.rays import deformed_frame, warp_adjoint, warp_forward
 from phyradgs_cl.operators.twins.splat import moving_frame, splat_frame, splat_image, voxel_field
-from phyradgs_cl.operators.twins.warp import deformed_frame, warp_adjoint, warp_forward
 from phyradgs_cl.operators.warp.backproject import MovingBackprojector
 from phyradgs_cl.operators.warp.operator import WarpedOperator
 from phyradgs_cl.operators.warp.states import MotionStates

@@ -87,7 +87,7 @@ class _Trials:
         plan = self.plan if iterations is None else replace(self.plan, options=shortened(options, iterations))
         self.rt.reset_peak()
         started = time.perf_counter()
-        self.result = reconstruct(self.scan, plan, self.rt)
+        self.result = reconstruct(self.scan, plan, self.rt).complete()
         self.device_bytes = self.rt.peak_bytes
         return time.perf_counter() - started
 

@@ -128,9 +128,9 @@ def _origin_of(subject: str, origins: Mapping[str, str]) -> str | None:
     return origin if origin is None or origin.startswith("--") else ".".join([origin, *rest])
 
 
-def read_config(path: Path | None, option: str = "--config") -> dict[str, Any]:
+def read_config(path: Path | None) -> dict[str, Any]:
     """The content of a TOML file, nothing for None. Raises InputError for a file that is missing or not TOML."""
-    return {} if path is None else read_toml(path, f"{option} {path}")
+    return {} if path is None else read_toml(path, f"--config {path}")
 
 
 def assignment(text: str) -> dict[str, Any]:

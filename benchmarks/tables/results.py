@@ -4,7 +4,7 @@ from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from phyradgs_cl.workflow.sweep.tables import Line, append_line, read_lines
+from phyradgs_cl.workflow.sweep import Line, append_line, read_lines
 
 __all__ = ["KEY", "Line", "Present", "append_line", "key_of", "read_lines"]
 

@@ -4,6 +4,7 @@ import logging
 from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
+from weakref import WeakValueDictionary
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -48,6 +49,7 @@ APPLIED = ("flats_applied", "darks_applied")
 """Keys of the provenance for the numbers of flats and darks that were applied to the counts."""
 _OTHERS = ("detector_model", "pixel_mask", "reference", "title", "lag", "provenance")
 _TITLE = "cone-beam scan"
+_CHECKED = WeakValueDictionary[int, np.ndarray]()  # frames of scans, which are looked through once
 LARGEST_LAG = 0.9  # far beyond any panel; towards 1 a frame holds hardly any new information
 
 
@@ -315,8 +317,11 @@ class Scan:
             log.warning(text, half_panel_mm, offset_mm, offset_mm * pitch_mm)
 
     def warn_of_negative_integrals(self) -> None:
-        """Warns of line integrals whose sum is below 0: most methods make a volume of zeros of them."""
+        """Warns of line integrals whose sum is below 0: most methods make a volume of zeros of them. Raises InputError where
+        frames have become NaN or infinite since the scan was made of them."""
         total = float(np.sum(self.projections, where=self.valid, dtype=np.float64))
+        if not np.isfinite(total):
+            checks.finite("projections", np.where(self.valid, self.projections, 0))
         if total < 0:
             text = "line integrals are negative on the whole, %.3g on the mean: is their sign wrong? −ln(I/I0) is above 0"
             log.warning(text, total / np.count_nonzero(self.valid))
@@ -375,7 +380,10 @@ def _uncounted(frames: ArrayLike, mask: np.ndarray | None) -> np.ndarray:
 
 
 def _line_integrals(frames: ArrayLike, mask: np.ndarray | None) -> np.ndarray:
-    """Returns frames as float32, with 0 for masked pixels that are not finite. Raises InputError for others."""
+    """Returns frames as float32, with 0 for masked pixels that are not finite. Raises InputError for others. Frames that a
+    scan has had already are returned at once."""
+    if isinstance(frames, np.ndarray) and _CHECKED.get(id(frames)) is frames:
+        return frames
     values = checks.real_array("projections", frames)
     with np.errstate(over="ignore"):
         values = values.astype(np.float32, copy=False)
@@ -383,4 +391,5 @@ def _line_integrals(frames: ArrayLike, mask: np.ndarray | None) -> np.ndarray:
         if mask is not None and np.shape(mask) in (values.shape, values.shape[1:]):
             values = np.where((np.asarray(mask) != 0) & ~np.isfinite(values), np.float32(0), values)
         checks.finite("projections", values)
+    _CHECKED[id(values)] = values
     return values

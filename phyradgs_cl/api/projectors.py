@@ -10,8 +10,17 @@ import numpy as np
 from phyradgs_cl import checks
 from phyradgs_cl.acquisition import Motion, OwnTimes, PerRow, Scan
 from phyradgs_cl.acquisition import motion as models
-from phyradgs_cl.api.arrays import Device, Values, computed, moved_to, runtime_of
-from phyradgs_cl.api.operators import LinearOperator, Map, Operator, Shape
+from phyradgs_cl.api.operators import (
+    Device,
+    LinearOperator,
+    Map,
+    Operator,
+    Shape,
+    Values,
+    computed,
+    moved_to,
+    runtime_of,
+)
 from phyradgs_cl.api.runs import check_scan
 from phyradgs_cl.errors import InputError, naming_arguments
 from phyradgs_cl.fields import Gaussians, Grid

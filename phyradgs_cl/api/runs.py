@@ -11,7 +11,7 @@ import numpy as np
 
 from phyradgs_cl import __version__, checks
 from phyradgs_cl.acquisition import Scan
-from phyradgs_cl.api.arrays import Device, runtime_of
+from phyradgs_cl.api.operators import Device, runtime_of
 from phyradgs_cl.errors import InputError, naming_arguments
 from phyradgs_cl.exporters import export_stored, foreign_suffix, format_of
 from phyradgs_cl.fields import Deformation, Grid

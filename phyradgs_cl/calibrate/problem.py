@@ -14,6 +14,7 @@ from phyradgs_cl.calibrate.stages import Stage
 from phyradgs_cl.detector import noise_level
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.objective import TvProx
+from phyradgs_cl.operators.rays.intensity import IntensityOperator
 from phyradgs_cl.operators.rays.operator import RayOperator
 from phyradgs_cl.operators.rays.upright import FEWEST_LINES
 from phyradgs_cl.reconstructors.voxels.cgls import Cgls
@@ -96,16 +97,20 @@ class CoarseProblem(CoarseFrames):
         difference is added as ``volume`` has it."""
         if self.scans[0].detector_model != "intensity":
             return self.measured
-        return self.measured + self.masked(operator.intensity_correction(volume))
+        return self.measured + self.masked(operator.forward(volume) - self._expected(operator, volume))
+
+    def _expected(self, operator: RayOperator, volume: np.ndarray) -> np.ndarray:
+        """Returns the frames of a volume, averaged as the detector does."""
+        if self.scans[0].detector_model != "intensity":
+            return operator.forward(volume)
+        return IntensityOperator(self.rt, self.grid, operator.detector_shape, operator.tables).expected(volume)
 
     def reconstruct(self, operator: RayOperator, start: np.ndarray | None, iterations: int) -> np.ndarray:
         """Returns a nonnegative volume with little total variation, iterated from ``start``."""
         volume = np.zeros(self.grid.shape, np.float32) if start is None else start
         system = System(operator, self.line_integrals(operator, volume), self.valid)
         method = FistaTv(system, _TV, TvProx(self.rt, self.grid.shape, axis_weights(self.grid)))
-        projected = system.expected(volume)
-        current = {"volume": volume, "previous": volume, "projected": projected, "projected_previous": projected}
-        method.restore({**method.state(), **current})
+        method.start_from(volume)
         for _ in range(iterations):
             method.step()
             self.count_pass()
@@ -117,7 +122,7 @@ class CoarseProblem(CoarseFrames):
 
     def residual(self, operator: RayOperator, volume: np.ndarray) -> np.ndarray:
         """Returns measured less expected frames (F, rows, columns)."""
-        return self.line_integrals(operator, volume) - self.masked(operator.forward(volume))
+        return self.measured - self.masked(self._expected(operator, volume))
 
     def noise(self, residual: np.ndarray) -> float:
         """Returns the standard deviation of a pixel's noise; not from ``residual``, because a volume fits some noise."""

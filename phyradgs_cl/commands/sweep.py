@@ -10,8 +10,7 @@ from phyradgs_cl.commands.console import complain, file_argument, option, say, s
 from phyradgs_cl.commands.options import CHECKPOINT_EVERY_S, CheckpointEvery
 from phyradgs_cl.progress import Ticker
 from phyradgs_cl.settings import device_wish
-from phyradgs_cl.workflow.sweep.grid import plan_sweep
-from phyradgs_cl.workflow.sweep.run import RESULTS, TABLE, run_sweep
+from phyradgs_cl.workflow.sweep import RESULTS, TABLE, plan_sweep, run_sweep
 
 _REPEAT = "The command makes only the runs that its results file lacks: interrupt and repeat it at will."
 EXAMPLES = {"sweep": f"Example: phyradgs sweep grid.toml -o results --workers 2\n\n{_REPEAT} Docs: cluster.md."}

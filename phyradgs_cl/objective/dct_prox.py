@@ -8,15 +8,13 @@ A map takes a quarter of the shifts, the next map the next quarter: over iterati
 Kamilov, Bostan and Unser, IEEE Signal Process. Lett. 21 (2014) 1326)."""
 
 import itertools
-from collections.abc import Sequence
-from functools import partial
 
 import numpy as np
 import scipy
 
 from phyradgs_cl.checks import ceil_div
 from phyradgs_cl.runtime import DeviceArray, Runtime, SameArray
-from phyradgs_cl.runtime.layout import GUARD, on_device, padded_zeros, pitch_of
+from phyradgs_cl.runtime.layout import GUARD, beside, brought_to, padded_zeros, pitch_of
 
 EDGE = 4
 _SAMPLES = 8  # as long as so many samples of a ray takes a voxel of a block
@@ -44,25 +42,22 @@ class DctProx:
         """Maps a volume (z, y, x), float32; ``threshold`` of the coefficients of the orthonormal transform.
 
         ``turn``, 0 to 3, chooses a quarter of the shifts. A device array gives a device array (``out``, if given)."""
-        return on_device(self.rt, partial(self._map, threshold, TURNS[turn], nonnegative), volume, out)
-
-    def _map(
-        self, threshold: float, turn: Sequence[int], nonnegative: bool, volume: DeviceArray, result: DeviceArray
-    ) -> None:
         rt, (nz, ny, nx) = self.rt, self.shape
+        observed, result = beside(rt, volume, out)
         voxels, by_voxel = (nx, ny, nz), rt.group(on_cpu=16)
         layout = self._shape4, self._pitch
-        rt.launch(self._start, voxels, volume, *layout, self._padded, self._excess, group=by_voxel)
+        rt.launch(self._start, voxels, observed, *layout, self._padded, self._excess, group=by_voxel)
         # Blocks of one launch do not overlap. On a GPU they are work-items, also along x; on a CPU a vector runs along x
         along_x = EDGE if rt.pixel_items else 1
         blocks = ceil_div(nx, EDGE) if rt.pixel_items else 1, ceil_div(ny, EDGE), ceil_div(nz, EDGE)
-        for (z, y), x in itertools.product(enumerate(turn), range(along_x)):
+        for (z, y), x in itertools.product(enumerate(TURNS[turn]), range(along_x)):
             shift = np.array([x, y, z, 0], np.int32)
             arguments = self._padded, *layout, shift, np.float32(threshold), self._excess
             rt.launch(self._excess_of, blocks, *arguments, group=rt.group(), samples=_SAMPLES * nx * ny * nz)
         clip = np.int32(nonnegative)
         items = (ceil_div(nx, rt.lanes), ny, nz)
-        rt.launch(self._end, items, volume, self._excess, *layout, clip, result, group=rt.group(on_cpu=min(items[0], 8)))
+        rt.launch(self._end, items, observed, self._excess, *layout, clip, result, group=rt.group(on_cpu=min(items[0], 8)))
+        return brought_to(rt, volume, result)
 
 
 def dct_prox(volume: np.ndarray, threshold: float, turn: int, *, nonnegative: bool) -> np.ndarray:

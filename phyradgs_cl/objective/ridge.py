@@ -7,13 +7,13 @@ near 0 and may fall beyond, but R is ρ-weakly convex with ρ ≤ 1. ½‖x − 
 
 import json
 from dataclasses import dataclass
-from functools import cache, partial
+from functools import cache
 
 import numpy as np
 
 from phyradgs_cl import resource
 from phyradgs_cl.runtime import DeviceArray, Kernel, Runtime, SameArray
-from phyradgs_cl.runtime.layout import GUARD, Strides, move, on_device, padded_zeros, pitch_of
+from phyradgs_cl.runtime.layout import GUARD, Strides, beside, brought_to, move, padded_zeros, pitch_of
 
 EDGE = 5
 """Voxels along a side of a filter."""
@@ -85,12 +85,10 @@ class RidgeStep:
         self, volume: SameArray, sigma: float, step: float, *, nonnegative: bool, out: DeviceArray | None = None
     ) -> SameArray:
         """Returns v − ``step`` ∇R(v), float32; ``sigma`` in the unit of v (z, y, x). ``out``: as of ``DctProx``."""
-        return on_device(self.rt, partial(self._descend, sigma, step, nonnegative), volume, out)
-
-    def _descend(self, sigma: float, step: float, nonnegative: bool, volume: DeviceArray, result: DeviceArray) -> None:
         nz, ny, nx = self.shape
+        observed, result = beside(self.rt, volume, out)
         padded = self._padded, Strides(GUARD, ny * pitch_of(nx), pitch_of(nx))
-        move(self.rt, (volume, Strides.plain(self.shape)), padded, self.shape)
+        move(self.rt, (observed, Strides.plain(self.shape)), padded, self.shape)
         is_thin = min(self.shape) < EDGE  # the channels of the gradient stay 0
         end = np.float32(step), np.int32(nonnegative), result
         # Responses follow two slices behind the channels, of which they need three
@@ -100,6 +98,7 @@ class RidgeStep:
                 self._launch(self._bent, first - 2, 4, self._channels, ends=(np.float32(sigma), self._responses))
                 self._launch(self._back, first - 2, 2, self._responses, ends=(self._channels_back,))
             self._launch(self._step, first - 2, 0, self._padded, self._channels_back, ends=end)
+        return brought_to(self.rt, volume, result)
 
     def _launch(self, kernel: Kernel, first: int, less: int, *sources: DeviceArray, ends: tuple[object, ...]) -> None:
         """Runs a kernel on slices from ``first`` on. Its result is ``less`` smaller than the volume."""

@@ -9,13 +9,12 @@ differences are those of TIGRE; their floor is relative to the volume's values, 
 
 import math
 from collections.abc import Callable
-from functools import partial
 from typing import cast
 
 import numpy as np
 
-from phyradgs_cl.runtime import DeviceArray, DeviceSpace, Kernel, Runtime, SameArray
-from phyradgs_cl.runtime.layout import on_device
+from phyradgs_cl.runtime import DeviceArray, DeviceSpace, Runtime, SameArray
+from phyradgs_cl.runtime.layout import beside, brought_to
 
 
 class TvProx:
@@ -27,6 +26,8 @@ class TvProx:
     ) -> None:
         self.rt, self.shape = rt, shape
         self.axis_weights = axis_weights
+        *slices, ny, nx = shape
+        self._items = nx, ny, math.prod(slices)
         self._shape4 = np.array([*shape[::-1], 1][:4], np.int32)
         self._weights4 = np.array([*axis_weights[::-1], 0][:4], np.float32)
         self._primal_step, self._dual_step = (
@@ -50,38 +51,28 @@ class TvProx:
         """Maps a volume (z, y, x), float32, by ``iterations`` from the last dual.
 
         A device array gives a device array (``out``, if given)."""
-
-        return on_device(self.rt, partial(self._map, weight, iterations, nonnegative), volume, out)
-
-    def _map(
-        self, weight: float, iterations: int, nonnegative: bool, observed: DeviceArray, result: DeviceArray
-    ) -> None:
-        if weight <= 0:
-            self._primal(observed, self._dual, 0.0, nonnegative, result)
-            return
-        steps = np.float32(np.array(_steps(self.axis_weights)) / weight)
+        observed, result = beside(self.rt, volume, out)
+        weight = max(weight, 0.0)
+        steps = np.float32(np.array(_steps(self.axis_weights)) / (weight or 1.0))
         t, start = 1.0, self._dual
-        for _ in range(iterations):
+        for _ in range(iterations if weight else 0):
             self._primal(observed, start, weight, nonnegative, result)
             t_next = (1 + np.sqrt(1 + 4 * t * t)) / 2
-            self._launch(
-                self._dual_step, result, self._shape4, self._weights4, *steps, np.float32((t - 1) / t_next),
-                start, self._dual, self._moved,
+            self.rt.launch(
+                self._dual_step, self._items, result, self._shape4, self._weights4, *steps, np.float32((t - 1) / t_next),
+                start, self._dual, self._moved, group=self.rt.group(on_cpu=32),
             )  # fmt: skip
             t, start = t_next, self._moved
         self._primal(observed, self._dual, weight, nonnegative, result)
+        return brought_to(self.rt, volume, result)
 
     def _primal(
         self, observed: DeviceArray, dual: DeviceArray, weight: float, nonnegative: bool, result: DeviceArray
     ) -> None:
-        self._launch(
-            self._primal_step, observed, dual, self._shape4, self._weights4, np.float32(weight),
-            np.int32(nonnegative), result,
+        self.rt.launch(
+            self._primal_step, self._items, observed, dual, self._shape4, self._weights4, np.float32(weight),
+            np.int32(nonnegative), result, group=self.rt.group(on_cpu=32),
         )  # fmt: skip
-
-    def _launch(self, kernel: Kernel, *arguments: object) -> None:
-        *slices, ny, nx = self.shape
-        self.rt.launch(kernel, (nx, ny, math.prod(slices)), *arguments, group=self.rt.group(on_cpu=32))
 
 
 def tv_prox(

@@ -13,7 +13,7 @@ from phyradgs_cl.checks import ceil_div
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.operators.bricks import Brick, Shape, cut
 from phyradgs_cl.operators.rays.layout import voxel_matrices
-from phyradgs_cl.runtime import Array, DeviceArray, Room, Runtime, SameArray, with_smaller_bricks
+from phyradgs_cl.runtime import Array, DeviceArray, Room, Runtime, SameArray, attempts
 from phyradgs_cl.runtime.layout import GUARD, Strides, move, padded_zeros, pitch_of, unpad_rows
 
 _VIEWS_PER_LAUNCH = 64  # a work-item reads a few lines of every view: they should stay in a core's cache
@@ -118,7 +118,7 @@ def in_bricks(rt: Runtime, views: Views, grid: Grid, step: int, launch: _Launch)
     is_resident = isinstance(views.frames, DeviceArray)
     volume: Array = rt.empty(grid.shape) if is_resident else np.empty(grid.shape, np.float32)
 
-    def attempt(share: float) -> None:
+    def fill(share: float) -> None:
         room = rt.room()
         parts = list(views.parts(room.scaled(share)))
         views_bytes = views.bytes(parts[0].stop)
@@ -130,7 +130,9 @@ def in_bricks(rt: Runtime, views: Views, grid: Grid, step: int, launch: _Launch)
             else:
                 volume[brick.box] = unpad_rows(rt.download(padded), brick.shape)
 
-    with_smaller_bricks("FDK's backprojection", attempt)
+    for attempt in attempts("FDK's backprojection"):
+        with attempt as share:
+            fill(share)
     return volume
 
 

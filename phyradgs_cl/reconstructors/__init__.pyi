@@ -5,13 +5,12 @@ from .method import Method as Method
 from .method import method_name as method_name
 from .method import method_of as method_of
 from .method import usual_preset as usual_preset
-from .options import method_options as method_options
-from .options import preprocessing_names as preprocessing_names
-from .options import preprocessing_of as preprocessing_of
 from .plan import InitialVolume as InitialVolume
 from .plan import ObjectMotion as ObjectMotion
 from .plan import RunPlan as RunPlan
+from .plan import method_options as method_options
 from .plan import plan_run as plan_run
+from .plan import preprocessing_of as preprocessing_of
 from .preprocess import Preprocessing as Preprocessing
 from .result import Progress as Progress
 from .result import ProgressReport as ProgressReport

@@ -18,10 +18,8 @@ from phyradgs_cl.objective import TvProx
 from phyradgs_cl.reconstructors.method import Method
 from phyradgs_cl.reconstructors.result import Reconstruction, Report
 from phyradgs_cl.reconstructors.voxels.fista import Fista
-from phyradgs_cl.reconstructors.voxels.prior_weight import PriorWeight, frame_error
-from phyradgs_cl.reconstructors.voxels.priors import TvPrior, axis_weights
-from phyradgs_cl.reconstructors.voxels.run import IterativeOptions, MethodInputs, run_iterations
-from phyradgs_cl.reconstructors.voxels.system import System
+from phyradgs_cl.reconstructors.voxels.priors import PriorWeight, TvPrior, axis_weights, frame_error
+from phyradgs_cl.reconstructors.voxels.run import Iterations, IterativeOptions, MethodRun
 from phyradgs_cl.runtime import Runtime
 
 _STACKS, _FRAMES = 18, 3  # in memory at one time
@@ -47,34 +45,30 @@ class ChangingOptions(IterativeOptions):
 
 
 def changing(scan: Scan, options: ChangingOptions, rt: Runtime, **arguments: Any) -> Reconstruction:
-    """Returns the states of the object, and as the volume their mean, in 1/mm. ``arguments``: the other ``MethodInputs``; no
-    seed is used."""
-    inputs = MethodInputs(scan, options, rt, **arguments)
+    """Returns the states of the object, and as the volume their mean, in 1/mm. ``arguments``: the others of ``MethodRun``;
+    no seed is used."""
     times_s = state_times_s(scan, options.states)
     shape = (len(times_s), *scan.grid.shape)
-    runs: list[Fista] = []
-
-    def states() -> States:
-        return States(times_s, runs[0].system.space.numpy(runs[0].volume))
-
-    def make(system: System) -> Fista:
+    run = MethodRun(scan, options, rt, state_times_s=times_s, **arguments)
+    initial, report = None if run.initial is None else np.broadcast_to(run.initial, shape), Report.of(run.report)
+    run = replace(run, initial=initial, report=report)
+    try:
+        system = run.system(volumes=_STACKS, frames=_FRAMES)
         prox = TvProx(rt, shape, (options.time_weight, *axis_weights(scan.grid)))
         weight = PriorWeight(system, frame_error(scan, options.motion), options.prior_weight)
         prior, nonnegative = TvPrior(prox, options.tv_iterations), options.nonnegative
         # a state has few frames: if a frame were many subsets' share of them, steps would be too long and diverge
         subsets = min(options.subsets, 2 * scan.frames // len(times_s))
-        runs.append(Fista(system, prior, weight, subsets=subsets, nonnegative=nonnegative))
-        return runs[0]
+        method = Fista(system, prior, weight, subsets=subsets, nonnegative=nonnegative)
 
-    initial = None if inputs.initial is None else np.broadcast_to(inputs.initial, shape)
-    report = Report.of(inputs.report)
-    inputs = replace(inputs, initial=initial, state_times_s=times_s, report=report)
-    with report.through(lambda progress: replace(progress, states=states)):
-        try:
-            result = run_iterations("changing", make, inputs, volumes=_STACKS, frames=_FRAMES)
-        except OutOfMemoryError as error:
-            error.remedy = f"take fewer of the {len(times_s)} states with --set states=N, or a smaller --size"
-            raise
+        def states() -> States:
+            return States(times_s, system.space.numpy(method.volume))
+
+        with report.through(lambda progress: replace(progress, states=states)):
+            result = run.result("changing", Iterations(method, run))
+    except OutOfMemoryError as error:
+        error.remedy = f"take fewer of the {len(times_s)} states with --set states=N, or a smaller --size"
+        raise
     return replace(result, states=states())
 
 

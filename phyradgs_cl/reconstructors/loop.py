@@ -19,12 +19,17 @@ SILENT_S = 10.0
 
 
 class Stepwise(Protocol):
-    """An iterative method, between its start and its result. ``quantity``: the name of the measure of convergence, loss or
-    residual, which must stay finite; ``remedy``: advice where it does not; ``iterations``: to do."""
+    """An iterative method, between its start and its result. ``iterations``: to do."""
 
-    quantity: str
-    remedy: str
     iterations: int
+
+    @property
+    def quantity(self) -> str:
+        """The name of the measure of convergence, loss or residual, which must stay finite."""
+
+    @property
+    def remedy(self) -> str:
+        """Advice where it does not."""
 
     @property
     def iteration(self) -> int:

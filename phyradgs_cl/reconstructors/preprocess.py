@@ -88,5 +88,5 @@ def reprojection(rt: Runtime | None, scan: Scan) -> Model:
 
     return Model(
         volume=lambda frames: fdk(of(frames), fdk_options, rt).volume, frames=operator.forward,
-        regularised=lambda frames: fista_tv.METHOD.run(of(frames), tv_options, rt).volume,
+        regularised=lambda frames: fista_tv.METHOD.run(of(frames), tv_options, rt).complete().volume,
     )

@@ -13,7 +13,7 @@ from phyradgs_cl.acquisition import PerRow, Scan
 from phyradgs_cl.detector import noise_rms
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Deformation, Grid, States
-from phyradgs_cl.operators import IntensityOperator, RayOperator
+from phyradgs_cl.operators import IntensityOperator
 from phyradgs_cl.operators.rays.subrays import subrays_of
 from phyradgs_cl.operators.warp.operator import projector_of
 from phyradgs_cl.runtime import Runtime
@@ -72,13 +72,10 @@ def frame_pairs(
     else:
         projector = projector_of(rt, grid, tables, moves)
     like, subrays = (rt, grid, scan.geometry.detector_shape, tables), subrays_of(grid, tables)
-    operator = projector(*like, subrays=subrays)
-    if scan.detector_model != "intensity":
-        computed = operator.forward(volume)
-    elif isinstance(operator, RayOperator):
-        computed = operator.forward(volume) - operator.intensity_correction(volume)
-    else:
+    if scan.detector_model == "intensity":
         computed = IntensityOperator(*like, projector, subrays).expected(volume)
+    else:
+        computed = projector(*like, subrays=subrays).forward(volume)
     pairs = []
     for frame, image in zip(frames, computed, strict=True):
         valid = scan.valid[frame]
@@ -87,12 +84,12 @@ def frame_pairs(
     return pairs
 
 
-def held_out(scan: Scan, percent: float, seed: int = _HOLDOUT_SEED, subject: str = "--holdout") -> np.ndarray:
+def held_out(scan: Scan, percent: float) -> np.ndarray:
     """Draws a percentage of the valid pixels (F, v, u) bool, the same in every run. Raises InputError for none."""
-    drawn = np.random.default_rng(seed).random(scan.projections.shape, np.float32) < percent / 100
+    drawn = np.random.default_rng(_HOLDOUT_SEED).random(scan.projections.shape, np.float32) < percent / 100
     held: np.ndarray = drawn & scan.valid
     if not held.any():
-        raise InputError(subject, f"{percent:g} % of {int(scan.valid.sum())} pixels", "at least one pixel", "take more")
+        raise InputError("--holdout", f"{percent:g} % of {int(scan.valid.sum())} pixels", "at least one pixel", "take more")
     return held
 
 

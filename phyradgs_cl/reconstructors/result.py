@@ -79,6 +79,12 @@ class Reconstruction:
             return ""
         return f", stopped after {done} of {asked} iterations ({reason})"
 
+    def complete(self) -> "Reconstruction":
+        """Returns the result; KeyboardInterrupt for that of an interrupted run, which others would take for the whole."""
+        if self.facts.get("interrupted_at") is not None:
+            raise KeyboardInterrupt
+        return self
+
     def within(self, grid: Grid) -> "Reconstruction":
         """Returns the part of the result on ``grid``, with all Gaussians, or the result itself outside its grid."""
         if (part := grid.slices_in(self.grid)) is None:

@@ -12,7 +12,7 @@ import numpy as np
 from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.acquisition.motion import check_own_motion, with_times
 from phyradgs_cl.errors import InputError, OutOfMemoryError, naming_host_memory
-from phyradgs_cl.fields import Deformation, Grid, triple
+from phyradgs_cl.fields import Grid, triple
 from phyradgs_cl.io.files import HOST_SHARE, free_bytes, host_bytes
 from phyradgs_cl.metrics import resampled, shared_slices
 from phyradgs_cl.prepare import PREPARED_KEY
@@ -56,63 +56,75 @@ def reconstruct(
     """Runs a plan on a scan. resume: the state of an interrupted run of the same plan.
 
     The plan's first volume is resampled onto the scan's grid."""
-    preprocessing, options, report = plan.preprocessing, plan.options, Report.of(report)
-    if rt.ranks.size > 1:
-        _check_ranks(plan.method_name, rt)
-    if preprocessing.margin_mm is not None:
-        _check_margin(plan)
-    identity = cache(partial(plan.identity, scan))  # made where it is needed: it reads all frames
-    more: dict[str, Any] = {}
-    if resume is not None:
-        check_resumable(plan)
-        more["resume"] = without_identity(resume, identity())
-    ready = prepared(scan, preprocessing, rt)
-    ready.check_sight()
-    ready.warn_of_blind_places()
-    ready.warn_of_negative_integrals()
-    check_own_motion(getattr(options, "motion", None), ready)
-    if plan.initial is not None:
-        more["initial"] = _initial(plan, plan.initial, ready.grid)
-    deformation = None if plan.object_motion is None else plan.object_motion.deformation
-    if deformation is not None:
-        check_object_motion(deformation, ready)
-        more["deformation"] = deformation
-    if hasattr(options, "motion") and plan.method_name != "moving":  # which finds the object's speed itself
-        options = replace(options, motion=with_times(options.motion, ready, deformation))
-    hidden = held_out(ready, preprocessing.holdout) if preprocessing.holdout else None
-    visible = ready if hidden is None else with_masked(ready, hidden)
-    box = None if preprocessing.margin_mm is None else preprocessing.of(scan.grid)
+    run, report = _Prepared(scan, plan, rt, resume), Report.of(report)
+    with report.through(run.shown), _naming_size_that_fits(rt, run.scan, plan), naming_host_memory():
+        result = method_of(plan.method).run(
+            run.visible, run.options, rt=rt, seed=plan.seed, report=report, **run.arguments
+        )
+    return run.finished(result)
 
-    def hook(progress: Progress) -> Progress:
+
+class _Prepared:
+    """A run that is ready for its method: ``scan`` after preprocessing, with its margin; ``visible``, without held-out
+    pixels; ``options`` and further ``arguments``."""
+
+    def __init__(self, scan: Scan, plan: RunPlan, rt: Runtime, resume: State | None) -> None:
+        preprocessing, self.plan, self.rt = plan.preprocessing, plan, rt
+        if rt.ranks.size > 1:
+            _check_ranks(plan.method_name, rt)
+        if preprocessing.margin_mm is not None:
+            _check_margin(plan)
+        self.identity = cache(partial(plan.identity, scan))  # made where it is needed: it reads all frames
+        self.arguments: dict[str, Any] = {}
+        if resume is not None:
+            check_resumable(plan)
+            self.arguments["resume"] = without_identity(resume, self.identity())
+        self.scan = self.visible = prepared(scan, preprocessing, rt)
+        self.scan.check_sight()
+        self.scan.warn_of_blind_places()
+        self.scan.warn_of_negative_integrals()
+        check_own_motion(getattr(plan.options, "motion", None), self.scan)
+        if plan.initial is not None:
+            self.arguments["initial"] = _initial(plan, plan.initial, self.scan.grid)
+        self.deformation = None if plan.object_motion is None else plan.object_motion.deformation
+        if self.deformation is not None:
+            check_object_motion(self.deformation, self.scan)
+            self.arguments["deformation"] = self.deformation
+        self.options = plan.options
+        if hasattr(self.options, "motion") and plan.method_name != "moving":  # which finds the object's speed itself
+            motion = with_times(self.options.motion, self.scan, self.deformation)
+            self.options = replace(self.options, motion=motion)
+        self.hidden = held_out(self.scan, preprocessing.holdout) if preprocessing.holdout else None
+        if self.hidden is not None:
+            self.visible = with_masked(self.scan, self.hidden)
+        self.box = None if preprocessing.margin_mm is None else preprocessing.of(scan.grid)
+
+    def shown(self, progress: Progress) -> Progress:
         """Adds the run's identity to its states, and frames; takes the margin from its volumes."""
-        progress = progress.mapped(state=lambda state: with_identity(state, identity()))
-        if progress.volume is not None and rt.ranks.size == 1:  # ranks project together
+        progress = progress.mapped(state=lambda state: with_identity(state, self.identity()))
+        if progress.volume is not None and self.rt.ranks.size == 1:  # ranks project together
             whole = cache(progress.volume)
-            pairs = partial(_spread_pairs, rt, ready, progress, deformation, whole)
-            progress = replace(progress, volume=whole, frames=pairs)
+            progress = replace(progress, volume=whole, frames=partial(self._pairs, progress, whole))
+        box = self.box
         return progress if box is None else progress.mapped(volume=lambda volume, grid: _within(volume, grid, box))
 
-    with report.through(hook), _naming_size_that_fits(rt, ready, plan), naming_host_memory():
-        result = method_of(plan.method).run(visible, options, rt=rt, seed=plan.seed, report=report, **more)
-    if result.state is not None:
-        result = replace(result, state=with_identity(result.state, identity()))
-    if hidden is not None and rt.ranks.rank == 0:
-        moves = result.moves or deformation
-        result.facts[HELD_OUT] = holdout_errors(rt, ready, hidden, result.volume, result.grid, moves)
-    if PREPARED_KEY in ready.provenance:
-        result.facts[PREPARED_KEY] = ready.provenance[PREPARED_KEY]
-    if box is None:
-        return result
-    result.facts[MARGIN_MM] = preprocessing.margin_mm
-    return result.within(box)
+    def _pairs(self, progress: Progress, volume: Callable[[], tuple[np.ndarray, Grid]], count: int) -> list[FramePair]:
+        moves = progress.states() if progress.states is not None else progress.deformation or self.deformation
+        return frame_pairs(self.rt, self.scan, *volume(), spread_frames(self.scan.frames, count), moves)
 
-
-def _spread_pairs(
-    rt: Runtime, scan: Scan, progress: Progress, deformation: Deformation | None,
-    volume: Callable[[], tuple[np.ndarray, Grid]], count: int,
-) -> list[FramePair]:  # fmt: skip
-    moves = progress.states() if progress.states is not None else progress.deformation or deformation
-    return frame_pairs(rt, scan, *volume(), spread_frames(scan.frames, count), moves)
+    def finished(self, result: Reconstruction) -> Reconstruction:
+        """Returns the method's result with the run's identity and facts, without the margin."""
+        if result.state is not None:
+            result = replace(result, state=with_identity(result.state, self.identity()))
+        if self.hidden is not None and self.rt.ranks.rank == 0:
+            pairs = self.rt, self.scan, self.hidden, result.volume, result.grid
+            result.facts[HELD_OUT] = holdout_errors(*pairs, result.moves or self.deformation)
+        if PREPARED_KEY in self.scan.provenance:
+            result.facts[PREPARED_KEY] = self.scan.provenance[PREPARED_KEY]
+        if self.box is None:
+            return result
+        result.facts[MARGIN_MM] = self.plan.preprocessing.margin_mm
+        return result.within(self.box)
 
 
 def check_resumable(plan: RunPlan) -> None:

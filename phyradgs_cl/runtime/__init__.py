@@ -13,10 +13,10 @@ from phyradgs_cl.runtime.memory import (
     SameArray,
     Traffic,
     adopted,
+    attempts,
     bytes_of,
     is_cl_array,
     lent,
-    with_smaller_bricks,
 )
 from phyradgs_cl.runtime.opencl import Kernel
 from phyradgs_cl.runtime.profile import KernelUse, Rates, profile_text
@@ -24,6 +24,6 @@ from phyradgs_cl.runtime.profile import KernelUse, Rates, profile_text
 __all__ = [
     "DEVICE_VARIABLE", "MEMORY_VARIABLE", "Array", "DeviceArray", "DeviceInfo", "DeviceSpace",
     "HostSpace", "Kernel", "KernelUse", "LaterItem", "MemoryShortage", "Rates", "Room", "Runtime",
-    "SameArray", "Space", "Traffic", "adopted", "bytes_of", "choose_device", "is_cl_array", "known_fault",
-    "lent", "list_devices", "profile_text", "with_smaller_bricks",
+    "SameArray", "Space", "Traffic", "adopted", "attempts", "bytes_of", "choose_device", "is_cl_array", "known_fault",
+    "lent", "list_devices", "profile_text",
 ]  # fmt: skip

@@ -4,7 +4,7 @@ deterministic: the same arrays on the same device give the same bits."""
 
 import weakref
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any, Generic, Protocol, TypeVar
 
 import numpy as np
@@ -31,8 +31,8 @@ class Space(Protocol, Generic[A]):
 
     def full(self, shape: Shape, value: float) -> A: ...
 
-    def apply(self, function: Callable[..., Any], x: A, shape: Shape) -> A:
-        """Returns ``function(x)`` of ``shape``; on a device the function receives ``out``, the memory of its result."""
+    def place(self, shape: Shape) -> A | None:
+        """Returns memory for a function's result, its argument ``out``; None on the host, where functions make their own."""
 
     def take(self, x: A, chosen: Sequence[int]) -> A:
         """Returns the ``chosen`` entries along the first axis, in this order."""
@@ -80,8 +80,8 @@ class HostSpace:
     def full(self, shape: Shape, value: float) -> np.ndarray:
         return np.full(shape, value, np.float32)
 
-    def apply(self, function: Callable[..., Any], x: np.ndarray, shape: Shape) -> np.ndarray:
-        return function(x)
+    def place(self, shape: Shape) -> None:
+        return None
 
     def take(self, x: np.ndarray, chosen: Sequence[int]) -> np.ndarray:
         return x[list(chosen)]
@@ -155,8 +155,8 @@ class DeviceSpace:
         self.rt.fill(array, value)
         return array
 
-    def apply(self, function: Callable[..., Any], x: DeviceArray, shape: Shape) -> DeviceArray:
-        return function(x, out=self.empty(shape))
+    def place(self, shape: Shape) -> DeviceArray:
+        return self.empty(shape)
 
     def take(self, x: DeviceArray, chosen: Sequence[int]) -> DeviceArray:
         result = self.empty((len(chosen), *x.shape[1:]))

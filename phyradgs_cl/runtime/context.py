@@ -216,7 +216,6 @@ class Runtime:
     def local(nbytes: int) -> "cl.LocalMemory":
         return cl.LocalMemory(nbytes)
 
-    @naming_failures()
     def launch(
         self, kernel: Kernel, items: int | tuple[int, ...], *args: Any, group: int | tuple[int, ...] = 1, samples: int = 0
     ) -> None:
@@ -232,15 +231,18 @@ class Runtime:
         local = self._fitting(kernel, (*given, *([1] * (len(shape) - len(given)))))
         rounded = tuple(ceil_div(int(n), size) * size for n, size in zip(shape, local, strict=True))
         arrays = [a for a in args if isinstance(a, DeviceArray)]
-        built = self.compile(kernel)
-        built.set_args(*map(_argument, args))
         nbytes = sum(a.nbytes for a in arrays) if self.profile else 0
         pieces = ceil_div(samples, self.most_samples) if self.pixel_items else 1
-        for first, part in _parts(rounded, local, pieces):
-            event = cl.enqueue_nd_range_kernel(self.queue, built, part, local, first)
-            self._record(kernel.function_name, event, nbytes if first is None or not any(first) else 0)
-            if first is not None:
-                self.queue.flush()  # or the driver may hand over several as one
+        try:  # no decorator: a step has thousands of launches
+            built = self.compile(kernel)
+            built.set_args(*map(_argument, args))
+            for first, part in _parts(rounded, local, pieces):
+                event = cl.enqueue_nd_range_kernel(self.queue, built, part, local, first)
+                self._record(kernel.function_name, event, nbytes if first is None or not any(first) else 0)
+                if first is not None:
+                    self.queue.flush()  # or the driver may hand over several as one
+        except cl.Error as error:
+            raise self.ledger.error(f"a launch of {kernel.function_name}", error, self.queue) from error
 
     def group(self, on_cpu: int = 1, on_gpu: int = 64, *kernels: Kernel) -> int:
         """The work-group size for this class of device. On a GPU it is halved until it suits ``kernels``, whose items work

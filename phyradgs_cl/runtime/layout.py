@@ -2,7 +2,7 @@
 ends in at least GUARD zeros. A vector of pixels may therefore start or end outside a row without a test. In kernels GUARD is
 ``IMAGE_GUARD``."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import cast
 
@@ -10,7 +10,7 @@ import numpy as np
 
 from phyradgs_cl.checks import ceil_div
 from phyradgs_cl.runtime.context import Runtime
-from phyradgs_cl.runtime.memory import DeviceArray, SameArray
+from phyradgs_cl.runtime.memory import Array, DeviceArray, SameArray
 
 GUARD = 16
 
@@ -53,17 +53,15 @@ def move(
     rt.launch(kernel, (blocks, ny, nz), *ends, group=rt.group(on_cpu=min(blocks, 8)))
 
 
-def on_device(
-    rt: Runtime, function: Callable[[DeviceArray, DeviceArray], None], volume: SameArray, out: DeviceArray | None
-) -> SameArray:
-    """Runs ``function(volume, result)`` on the device; the result has the shape of ``volume`` and lies where it lies.
-    ``out``: the memory of a result on the device."""
-    result = rt.empty(volume.shape) if out is None else out
-    if isinstance(volume, DeviceArray):
-        function(volume, result)
-        return cast(SameArray, result)
-    function(rt.upload(volume, np.float32), result)
-    return cast(SameArray, rt.download(result))
+def beside(rt: Runtime, volume: Array, out: DeviceArray | None) -> tuple[DeviceArray, DeviceArray]:
+    """Returns a volume on the device, and memory for a result of its shape: ``out`` if given."""
+    there = volume if isinstance(volume, DeviceArray) else rt.upload(volume, np.float32)
+    return there, rt.empty(volume.shape) if out is None else out
+
+
+def brought_to(rt: Runtime, like: SameArray, result: DeviceArray) -> SameArray:
+    """Returns a result where ``like`` lies, on the device or on the host."""
+    return cast(SameArray, result if isinstance(like, DeviceArray) else rt.download(result))
 
 
 def pitch_of(width: int) -> int:

@@ -4,7 +4,7 @@ import logging
 import os
 import re
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from typing import Any, TypeVar
@@ -25,7 +25,6 @@ for _power, _letter in enumerate("KMGT", start=1):
 log = logging.getLogger(__name__)
 # mem object allocation failure, out of resources, out of host memory, invalid buffer size
 _MEMORY_CODES = (-4, -5, -6, -61)
-R = TypeVar("R")
 
 
 class MemoryShortage(OutOfMemoryError):
@@ -207,14 +206,29 @@ def mebibytes(nbytes: int) -> str:
     return f"{size:.0f} MiB" if size >= 10 else f"{size:.2g} MiB"
 
 
-def with_smaller_bricks(what: str, attempt: Callable[[float], R]) -> R:
-    """Returns ``attempt(1.0)``, or after a shortage, with a warning, ``attempt`` with a quarter of the memory."""
-    try:
-        return attempt(1.0)
-    except MemoryShortage as error:
-        message = str(error)  # a log that kept the error itself would keep the buffers of the attempt
-    log.warning("%s: %s; trying again with smaller bricks", what, message)
-    return attempt(_SMALLER)
+class Attempt:
+    """One attempt at work in bricks, which may fail for want of memory. As a context it gives the share of the memory."""
+
+    has_failed = False
+
+    def __init__(self, what: str, share: float) -> None:
+        self.what, self.share = what, share
+
+    def __enter__(self) -> float:
+        return self.share
+
+    def __exit__(self, kind: object, error: object, at: object) -> bool:
+        self.has_failed = isinstance(error, MemoryShortage) and self.share == 1
+        if self.has_failed:
+            log.warning("%s: %s; trying again with smaller bricks", self.what, str(error))  # the error keeps its buffers
+        return self.has_failed
+
+
+def attempts(what: str) -> Iterator[Attempt]:
+    """Yields an attempt with all memory, and after a shortage, with a warning, one with a quarter of it."""
+    yield (first := Attempt(what, 1.0))
+    if first.has_failed:
+        yield Attempt(what, _SMALLER)
 
 
 def is_cl_array(value: object) -> bool:

@@ -68,10 +68,9 @@ def _expand(relative: str, pasted: set[str]) -> list[str]:
     return lines
 
 
-def naming_failures(work: str | None = None) -> Callable[[Callable[P, R]], Callable[P, R]]:
-    """Decorates a method of a runtime, so that OpenCL's errors become DeviceError or MemoryShortage. Drivers queue work: a
-    launch may be refused at once, or fail later in any call that waits. ``work`` names the method's work; None takes the
-    name of the kernel, the first argument of a launch."""
+def naming_failures(work: str) -> Callable[[Callable[P, R]], Callable[P, R]]:
+    """Decorates a method of a runtime, so that OpenCL's errors become DeviceError or MemoryShortage about its ``work``.
+    Drivers queue work: a launch may be refused at once, or fail later in any call that waits."""
 
     def decorate(method: Callable[P, R]) -> Callable[P, R]:
         @wraps(method)
@@ -79,8 +78,7 @@ def naming_failures(work: str | None = None) -> Callable[[Callable[P, R]], Calla
             try:
                 return method(*args, **kwargs)
             except cl.Error as error:
-                what = work or f"a launch of {args[1].function_name}"  # type: ignore[attr-defined]
-                raise args[0].ledger.error(what, error, args[0].queue) from error  # type: ignore[attr-defined]
+                raise args[0].ledger.error(work, error, args[0].queue) from error  # type: ignore[attr-defined]
 
         return named
 

@@ -1,6 +1,5 @@
-"""A run's device time by kernel: launches, seconds and bytes, compared with the device's best rates. Seconds are of OpenCL
-events. Bytes count each buffer of a launch once. The best rates are measured by copies of the driver and by a kernel of
-multiply-adds."""
+"""A run's device time by kernel: launches, seconds and bytes. Seconds are of OpenCL events. Bytes count each buffer of a
+launch once. The device's best rates are measured by copies of the driver and by a kernel of multiply-adds."""
 
 from collections import defaultdict
 from dataclasses import dataclass
@@ -61,28 +60,18 @@ class Rates:
     flops_per_s: float
 
 
-def profile_text(uses: dict[str, KernelUse], wall_s: float, rates: Rates, pairs: dict[str, int]) -> str:
-    """Formats a table of ``uses`` (Profile.uses) and the part of ``wall_s`` that kernels take. ``pairs``: Gaussian–pixel
-    pairs per launch of a kernel, where known."""
+def profile_text(uses: dict[str, KernelUse], wall_s: float) -> str:
+    """Formats a table of ``uses`` (Profile.uses) and the part of ``wall_s`` that kernels take."""
     busy_s = sum(use.seconds for use in uses.values())
-    rows = [("kernel", "launches", "seconds", "share", "ms each", "GB/s", "of copy", "Gpairs/s", "ns/pair")]
+    rows = [("kernel", "launches", "seconds", "share", "ms each", "GB/s")]
     for name, use in uses.items():
-        speed = use.bytes / use.seconds if use.seconds > 0 else 0.0
-        evaluated = pairs.get(name, 0) * use.launches
         share, each_ms = use.seconds / max(busy_s, 1e-12), 1e3 * use.seconds / use.launches
-        times = str(use.launches), f"{use.seconds:.3f}", f"{share:.1%}", f"{each_ms:.3f}"
-        speeds = f"{speed / 1e9:.1f}", f"{speed / rates.copy_bytes_per_s:.0%}"
-        of_pairs = ("", "")
-        if evaluated:
-            of_pairs = f"{evaluated / use.seconds / 1e9:.2f}", f"{1e9 * use.seconds / evaluated:.3f}"
-        rows.append((name, *times, *speeds, *of_pairs))
+        speed = use.bytes / use.seconds / 1e9 if use.seconds > 0 else 0.0
+        numbers = f"{use.seconds:.3f}", f"{share:.1%}", f"{each_ms:.3f}", f"{speed:.1f}"
+        rows.append((name, str(use.launches), *numbers))
     first, *others = (max(map(len, column)) for column in zip(*rows, strict=True))
-    lines = ["  ".join([row[0].ljust(first), *map(str.rjust, row[1:], others)]).rstrip() for row in rows]
-    lines.append(
-        f"kernels {busy_s:.2f} s of {wall_s:.2f} s ({busy_s / max(wall_s, 1e-12):.0%}); best measured here: "
-        f"copy {rates.copy_bytes_per_s / 1e9:.1f} GB/s, multiply-add {rates.flops_per_s / 1e9:.0f} Gflop/s"
-    )
-    return "\n".join(lines)
+    lines = ["  ".join([row[0].ljust(first), *map(str.rjust, row[1:], others)]) for row in rows]
+    return "\n".join([*lines, f"kernels {busy_s:.2f} s of {wall_s:.2f} s ({busy_s / max(wall_s, 1e-12):.0%})"])
 
 
 def measure_rates(

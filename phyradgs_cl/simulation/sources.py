@@ -13,7 +13,7 @@ from phyradgs_cl.acquisition import TimeCells, pixel_centres
 from phyradgs_cl.acquisition.geometry import Geometry
 from phyradgs_cl.detector import average
 from phyradgs_cl.fields import Deformation, Grid, SplineVolume
-from phyradgs_cl.operators import RayOperator
+from phyradgs_cl.operators import IntensityOperator, RayOperator
 from phyradgs_cl.operators.rays.layout import RayLayout, some_cells
 from phyradgs_cl.operators.rays.memory import RayMemory
 from phyradgs_cl.operators.warp.states import MotionStates, unit_fields_mm
@@ -54,8 +54,11 @@ class VolumeSource(FrameSource):
         if factor != self._factor:
             self._scaled = self._where_it_fits((self._volume * np.float32(factor)).astype(np.float32))
             self._factor = factor
-        operator = RayOperator(self._rt, self._grid, self._detector_shape, [cells], memory=self._memory)
-        frames = operator.project(self._scaled, model)
+        of_cells = self._rt, self._grid, self._detector_shape, [cells]
+        if model == "intensity":
+            frames = IntensityOperator(*of_cells).expected(self._scaled)
+        else:
+            frames = RayOperator(*of_cells, memory=self._memory).forward(self._scaled)
         return (self._rt.download(frames) if isinstance(frames, DeviceArray) else frames)[0]
 
     def _where_it_fits(self, volume: np.ndarray) -> np.ndarray | DeviceArray:

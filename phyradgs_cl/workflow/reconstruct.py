@@ -16,7 +16,7 @@ from phyradgs_cl import __version__, checks, signals
 from phyradgs_cl import reconstructors as methods
 from phyradgs_cl.acquisition import MicroViews, Scan
 from phyradgs_cl.acquisition.geometry import cuts
-from phyradgs_cl.errors import InputError, OutputError, PhyradgsError, naming_host_memory
+from phyradgs_cl.errors import InputError, OutputError, PhyradgsError
 from phyradgs_cl.io import (
     Volume,
     hashing,
@@ -78,8 +78,7 @@ class _Checkpoints:
     def mentioned_in_errors(self) -> Iterator[None]:
         """Adds the way to resume to the errors of the body, if there is a checkpoint."""
         try:
-            with naming_host_memory():
-                yield
+            yield
         except PhyradgsError as error:
             if self.iteration is not None:
                 way_on = f"--resume continues from iteration {self.iteration}"
@@ -136,7 +135,7 @@ def _in_slabs(
     plan: methods.RunPlan, path: Path, output: Path, slabs: list[tuple[int, int]], rt: Runtime,
     report: methods.ProgressReport, resume: bool,
 ) -> tuple[methods.Reconstruction, dict[str, float]]:
-    with hashing(path) as scan_hash_of, naming_host_memory():
+    with hashing(path) as scan_hash_of:
         result = reconstruct_slabs(plan, path, output, slabs, rt, report, resume=resume)
         scan_hash = scan_hash_of()
     with signals.finish_despite_interrupt():
@@ -250,8 +249,7 @@ def _averages(scan: Scan, options: Any) -> bool:
 
 def profile_report(rt: Runtime, result: methods.Reconstruction) -> str:
     """Returns a table of a run's device time by kernel; ``rt`` is the run's, opened with ``profile``."""
-    pairs = {str(name): int(n) for name, n in result.facts.get("evaluated_pairs", {}).items()}
-    return profile_text(rt.kernel_uses(), float(result.facts["seconds"]), rt.best_rates(), pairs)
+    return profile_text(rt.kernel_uses(), float(result.facts["seconds"]))
 
 
 def _provenance(

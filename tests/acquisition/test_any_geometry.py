@@ -124,6 +124,14 @@ def test_warnings_of_places_that_no_view_sees(caplog) -> None:
     assert "is their sign wrong" in caplog.text
 
 
+def test_frames_that_change_after_they_were_checked_are_checked_by_a_run() -> None:
+    scan = scan_of(CONE)
+    scan.projections[1, 2, 3] = np.nan
+    scan = replace(scan, title="the same frames")
+    with pytest.raises(InputError, match=r"projections.*\(1, 2, 3\)"):
+        scan.warn_of_negative_integrals()
+
+
 def test_logarithms_with_flats_of_ones_are_refused() -> None:
     frames = np.zeros((len(ANGLES), *SHAPE))
     frames[..., 5:15] = 0.8

@@ -196,7 +196,7 @@ def test_ctrl_c_that_ends_the_compiler_of_a_kernel_is_no_failure_of_the_device(s
             def iterate(run):
                 {first}
                 raise DeviceError("kernel rays.cl", "linker command failed", "a program that builds")
-            i._Iterations.step = iterate
+            i.Iterations.step = iterate
         """
         done = run_process(command, body)
         assert done.returncode == status and said in done.stderr

@@ -11,9 +11,7 @@ import psutil
 from cluster.processes import free_port, stop, wait_until
 
 from phyradgs_cl.io import read_volume
-from phyradgs_cl.workflow.sweep.grid import plan_sweep
-from phyradgs_cl.workflow.sweep.run import RESULTS, run_sweep
-from phyradgs_cl.workflow.sweep.tables import Line, read_lines
+from phyradgs_cl.workflow.sweep import RESULTS, Line, plan_sweep, read_lines, run_sweep
 
 RUNS = 40
 

@@ -8,10 +8,8 @@ import pytest
 from cluster.processes import free_port
 
 from phyradgs_cl.runtime import DEVICE_VARIABLE, list_devices
-from phyradgs_cl.workflow.sweep import run as sweep_run
-from phyradgs_cl.workflow.sweep.grid import plan_sweep
-from phyradgs_cl.workflow.sweep.run import run_sweep
-from phyradgs_cl.workflow.sweep.tables import Line, read_lines
+from phyradgs_cl.workflow import sweep as sweep_run
+from phyradgs_cl.workflow.sweep import Line, plan_sweep, read_lines, run_sweep
 
 
 def where(run: object, device: str | None = None) -> Line:

@@ -17,7 +17,7 @@ from phyradgs_cl.errors import OutputError
 from phyradgs_cl.exporters import export_stored
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.io import Volume, read_checkpoint, write_checkpoint, write_scan, write_volume
-from phyradgs_cl.workflow.sweep.tables import append_line, read_lines
+from phyradgs_cl.workflow.sweep import append_line, read_lines
 
 ARRAYS = {"volume": np.arange(5000, dtype=np.float32), "iteration": np.array(3)}
 GRID = Grid.cube(4, 2.0)

@@ -77,14 +77,14 @@ def test_memory_that_runs_out_leaves_the_checkpoint(run, scan, tmp_path, capfd, 
 
 def test_a_residual_that_is_no_number_is_named(run, scan, tmp_path, capfd, monkeypatch) -> None:
     """By the loop that all methods share."""
-    step = voxels._Iterations.step
+    step = voxels.Iterations.step
 
-    def poisoned(self: voxels._Iterations) -> None:
+    def poisoned(self: voxels.Iterations) -> None:
         if self.iteration == 2:
             self.measured_norm = float("nan")
         step(self)
 
-    monkeypatch.setattr(voxels._Iterations, "step", poisoned)
+    monkeypatch.setattr(voxels.Iterations, "step", poisoned)
     words = ["--method", "sirt", "--iterations", "5", "--checkpoint-every", "1e-6"]
     assert run("reconstruct", scan, "-o", tmp_path / "v.h5", *words) == 3
     line = capfd.readouterr().err.splitlines()[-1]

@@ -5,7 +5,7 @@ import pytest
 from tolerances import FLOAT32
 
 from phyradgs_cl.operators.splats.layout import pad_columns
-from phyradgs_cl.operators.splats.plain import PlainImages, PlainRows
+from phyradgs_cl.operators.splats.operator import PlainImages, PlainRows
 from phyradgs_cl.runtime.layout import pad_rows, unpad_rows
 
 LENGTH_MM = 12.5

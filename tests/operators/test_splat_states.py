@@ -15,7 +15,7 @@ from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Deformation, Grid
 from phyradgs_cl.operators import DeviceCells, DeviceGaussians, SplatProjector
 from phyradgs_cl.operators.splats.states import STATE_ROWS, CloudStates, segments_for_object, states_of
-from phyradgs_cl.operators.twins.warp import deformed_frame
+from phyradgs_cl.operators.twins.rays import deformed_frame
 from phyradgs_cl.runtime import Runtime
 
 SHAPE = (13, 18)

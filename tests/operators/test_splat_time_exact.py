@@ -25,7 +25,7 @@ from phyradgs_cl.acquisition.cells import (
     static_cells,
 )
 from phyradgs_cl.acquisition.time_cells import TimeCells
-from phyradgs_cl.operators import DEFAULT_CUTOFF_SIGMA, DeviceCells, DeviceGaussians, SplatProjector
+from phyradgs_cl.operators import DEFAULT_CUTOFF_SIGMA, DeviceCells, SplatProjector
 from phyradgs_cl.operators.twins.splat import moving_frame
 
 moving_frame = remembered(moving_frame)
@@ -200,16 +200,3 @@ def test_behind_the_source_at_any_time_nothing_is_seen(any_rt, make_cloud, make_
     np.testing.assert_array_equal(render(any_rt, rows, table, SHAPE), alone)
     found = gradients(any_rt, rows, table, weights(SHAPE))
     assert np.all(np.isfinite(found)) and not np.any(found[:, 1])
-
-
-def test_counted_work_is_that_of_the_spans(rt) -> None:
-    """A Gaussian alone: the counted pixels hold every pixel that is drawn, and few others."""
-    row = fast_cloud(54, 1)
-    table = table_of(fast_geometry(), Shutter(0.8, 0.6), 0.5, 1)
-    projector, cells = SplatProjector(rt, *WIDE), DeviceCells.upload(rt, table)
-    gaussians = DeviceGaussians.upload(rt, row)
-    drawn = np.count_nonzero(projector.project(row, cells))
-    work = projector.work(gaussians, cells)
-    assert drawn <= work.pairs <= 1.1 * drawn + 2 * WIDE[0]
-    assert work.evaluated >= work.pairs and work.footprints == 1
-    assert sum(work.rule_shares().values()) == pytest.approx(1.0)

@@ -17,8 +17,7 @@ from phyradgs_cl.fields import Deformation, Grid, control_points, deformed
 from phyradgs_cl.operators import IntensityOperator, RayOperator
 from phyradgs_cl.operators.bricks import whole
 from phyradgs_cl.operators.rays.memory import RayMemory
-from phyradgs_cl.operators.twins.rays import backprojection
-from phyradgs_cl.operators.twins.warp import warp_adjoint, warp_forward
+from phyradgs_cl.operators.twins.rays import backprojection, warp_adjoint, warp_forward
 from phyradgs_cl.operators.warp.backproject import MovingBackprojector
 from phyradgs_cl.operators.warp.operator import WarpedOperator, projector_of
 from phyradgs_cl.operators.warp.states import MOST_STATES, MotionStates

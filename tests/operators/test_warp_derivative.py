@@ -9,9 +9,8 @@ from tolerances import ADJOINT, RAYS
 from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, ConstantSpeed, Shutter
 from phyradgs_cl.acquisition.cells import common_time_cells
 from phyradgs_cl.fields import Deformation, Grid, control_points
-from phyradgs_cl.operators.twins.warp import warp_forward
-from phyradgs_cl.operators.warp.derivative import FieldDerivative, warp_slopes
-from phyradgs_cl.operators.warp.operator import WarpedOperator
+from phyradgs_cl.operators.twins.rays import warp_forward
+from phyradgs_cl.operators.warp.operator import FieldDerivative, WarpedOperator, warp_slopes
 from phyradgs_cl.operators.warp.states import MotionStates
 from phyradgs_cl.operators.warp.volume import VolumeWarp
 

@@ -7,8 +7,8 @@ from phyradgs_cl.fields import Grid
 from phyradgs_cl.optim import DensityControl
 from phyradgs_cl.phantoms import shepp_logan
 from phyradgs_cl.reconstructors.fdk import static_fdk
+from phyradgs_cl.reconstructors.splats.method import SplatRun
 from phyradgs_cl.reconstructors.splats.options import SplatOptions
-from phyradgs_cl.reconstructors.splats.run import SplatRun
 from phyradgs_cl.reconstructors.splats.start import first_population, internal_scale
 from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.simulation import AnalyticSource, SimulationOptions, simulate

@@ -16,7 +16,7 @@ from phyradgs_cl.acquisition import (
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.phantoms import Ellipsoid, EllipsoidPhantom
-from phyradgs_cl.reconstructors.fdk import FbpOptions, fbp
+from phyradgs_cl.reconstructors.fdk import FbpOptions, fdk
 
 SIDE, ROWS = 64, 5
 GRID = Grid((3, SIDE, SIDE), (1.0, 1.0, 1.0))
@@ -45,7 +45,7 @@ def scan_of(
 )
 def test_a_disc_comes_out_with_its_density(rt, views: int, turn_deg: float, offset_mm: float, columns: int) -> None:
     """RMS over the disc's density, inside the largest circle and off the disc's edge."""
-    volume = fbp(scan_of(views, turn_deg, offset_mm, columns), FbpOptions(), rt).volume
+    volume = fdk(scan_of(views, turn_deg, offset_mm, columns), FbpOptions(), rt).volume
     z, y, x = np.meshgrid(*GRID.axes_mm(), indexing="ij")
     from_edge = np.abs(np.hypot(x - 6, y + 4) - 14)
     where = (np.hypot(x, y) < SIDE / 2 - 2) & (from_edge > 2)
@@ -62,12 +62,12 @@ def test_the_volume_ends_at_the_circle_of_the_field_of_view(
 ) -> None:
     """Half-acquisition keeps the wider circle, which a full turn measures; rows that are continued keep the corners."""
     scan, (_, y, x) = scan_of(views, turn_deg, offset_mm, columns), np.meshgrid(*GRID.axes_mm(), indexing="ij")
-    cut, whole = (fbp(scan, FbpOptions(circle=circle), rt).volume for circle in (True, False))
+    cut, whole = (fdk(scan, FbpOptions(circle=circle), rt).volume for circle in (True, False))
     inside = np.hypot(x, y) <= radius_mm
     np.testing.assert_array_equal(cut, np.where(inside, whole, 0))
     assert np.abs(whole[~inside]).max() > 1e-4
     if offset_mm == 0:
-        assert np.abs(fbp(scan, FbpOptions(extrapolate="cosine"), rt).volume[~inside]).max() > 1e-4
+        assert np.abs(fdk(scan, FbpOptions(extrapolate="cosine"), rt).volume[~inside]).max() > 1e-4
 
 
 def test_lines_are_backprojected_at_their_own_angles(rt) -> None:
@@ -75,7 +75,7 @@ def test_lines_are_backprojected_at_their_own_angles(rt) -> None:
     scan, (_, y, x) = scan_of(36, 360, shutter=Shutter(0.02, 0.95)), np.meshgrid(*GRID.axes_mm(), indexing="ij")
     off = []
     for motion in (LineMiddles(), Static()):
-        lowest = np.where(np.hypot(x - 6, y + 4) < 20, fbp(scan, FbpOptions(motion=motion), rt).volume, 0)[0]
+        lowest = np.where(np.hypot(x - 6, y + 4) < 20, fdk(scan, FbpOptions(motion=motion), rt).volume, 0)[0]
         centre = [float((lowest * axis[0]).sum() / lowest.sum()) for axis in (x, y)]
         off.append(np.hypot(centre[0] - 6, centre[1] + 4))
     assert off[0] < 0.03 and off[1] > 0.2
@@ -96,10 +96,10 @@ def test_deblurring_along_the_angle_undoes_an_exposure(rt, views: int, turn_deg:
     exposure_s = np.deg2rad(6) / speed
     start_s = np.arange(float(views)) - exposure_s / 2
     moving = Scan(blurred, still.geometry, still.trajectory, Shutter(exposure_s), start_s, GRID)
-    plain, sharp = (fbp(moving, FbpOptions(deblur=noise), rt).volume for noise in (0.0, 1e-4))
-    target = fbp(still, FbpOptions(), rt).volume
+    plain, sharp = (fdk(moving, FbpOptions(deblur=noise), rt).volume for noise in (0.0, 1e-4))
+    target = fdk(still, FbpOptions(), rt).volume
     assert np.linalg.norm(sharp - target) < 0.5 * np.linalg.norm(plain - target)
-    np.testing.assert_array_equal(fbp(still, FbpOptions(deblur=0.01), rt).volume, target)
+    np.testing.assert_array_equal(fdk(still, FbpOptions(deblur=0.01), rt).volume, target)
     with pytest.raises(InputError, match="evenly spaced"):
         uneven = Scan(blurred[::-1], still.geometry, still.trajectory, Shutter(exposure_s), start_s**2 / views, GRID)
-        fbp(uneven, FbpOptions(deblur=0.01), rt)
+        fdk(uneven, FbpOptions(deblur=0.01), rt)

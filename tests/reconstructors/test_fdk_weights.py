@@ -11,7 +11,7 @@ from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.phantoms import Ellipsoid, EllipsoidPhantom
 from phyradgs_cl.reconstructors.fdk import fdk_volume, weights
-from phyradgs_cl.reconstructors.fdk.arc import view_arc
+from phyradgs_cl.reconstructors.fdk.views import view_arc
 
 GRID = Grid.cube(32, 2.0)
 BALLS = (((0.45, 0.1, 0.1), 0.3), ((-0.3, 0.45, -0.15), 0.28), ((-0.15, -0.5, 0.0), 0.25))

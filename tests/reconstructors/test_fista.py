@@ -30,17 +30,15 @@ from phyradgs_cl.reconstructors import (
     reconstruct,
 )
 from phyradgs_cl.reconstructors.voxels.fista import Fista, FistaOptions, fista
-from phyradgs_cl.reconstructors.voxels.prior_weight import (
-    FrameError,
-    PriorWeight,
-    adjoint_response,
-    frame_error,
-)
 from phyradgs_cl.reconstructors.voxels.priors import (
+    FrameError,
     OwnPrior,
     Prior,
     PriorInputs,
+    PriorWeight,
     ThenRidge,
+    adjoint_response,
+    frame_error,
     prior_of,
     subvoxel_share,
 )

@@ -37,10 +37,10 @@ class MatrixOperator:
         self.matrix, self.volume_shape = matrix, volume_shape
         self.frames_shape = (matrix.shape[0] // (frame[0] * frame[1]), *frame)
 
-    def forward(self, volume: np.ndarray) -> np.ndarray:
+    def forward(self, volume: np.ndarray, out: None = None) -> np.ndarray:
         return (self.matrix @ volume.ravel()).reshape(self.frames_shape)
 
-    def adjoint(self, frames: np.ndarray) -> np.ndarray:
+    def adjoint(self, frames: np.ndarray, out: None = None) -> np.ndarray:
         return (self.matrix.T @ frames.ravel()).reshape(self.volume_shape)
 
     def subset(self, frames: Sequence[int]) -> "MatrixOperator":

@@ -22,7 +22,7 @@ from phyradgs_cl.phantoms import shepp_logan
 from phyradgs_cl.reconstructors import ObjectMotion, Reconstruction, plan_run, reconstruct
 from phyradgs_cl.reconstructors.moving import motion_line
 from phyradgs_cl.reconstructors.moving.field import MotionField
-from phyradgs_cl.reconstructors.moving.search import FieldSearch, coarse_scan, initial_field
+from phyradgs_cl.reconstructors.moving.method import FieldSearch, coarse_scan, initial_field
 from phyradgs_cl.reconstructors.moving.signal import (
     Bending,
     MotionSignal,

@@ -12,7 +12,7 @@ from phyradgs_cl.acquisition import Exact, MicroViews, Scan, Static, TimeCells
 from phyradgs_cl.api import simulate
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.reconstructors import METHODS, method_options, plan_run, reconstruct
-from phyradgs_cl.reconstructors.options import _models
+from phyradgs_cl.reconstructors.plan import _models
 from phyradgs_cl.reconstructors.voxels.sart import SirtOptions
 
 ABSURD = {

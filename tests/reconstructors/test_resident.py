@@ -11,7 +11,7 @@ from phyradgs_cl.fields import Grid
 from phyradgs_cl.phantoms import shepp_logan
 from phyradgs_cl.reconstructors import METHODS, RunPlan, method_options, plan_run, reconstruct
 from phyradgs_cl.reconstructors.result import Progress
-from phyradgs_cl.reconstructors.splats.run import SplatRun
+from phyradgs_cl.reconstructors.splats.method import SplatRun
 from phyradgs_cl.reconstructors.voxels.system import System
 from phyradgs_cl.runtime import DeviceSpace, Runtime, Traffic
 from phyradgs_cl.runtime.layout import GUARD, pitch_of

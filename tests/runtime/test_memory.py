@@ -11,7 +11,7 @@ from phyradgs_cl.acquisition import ConeGeometry
 from phyradgs_cl.errors import InputError, OutOfMemoryError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.operators import backproject
-from phyradgs_cl.runtime import MEMORY_VARIABLE, MemoryShortage, Room, Runtime, bytes_of, with_smaller_bricks
+from phyradgs_cl.runtime import MEMORY_VARIABLE, MemoryShortage, Room, Runtime, attempts, bytes_of
 from phyradgs_cl.runtime.memory import MemoryLedger
 
 
@@ -80,22 +80,17 @@ def test_a_device_with_small_buffers_works_in_bricks(rt) -> None:
 
 def test_a_shortage_is_met_once(caplog) -> None:
     asked: list[float] = []
-
-    def attempt(share: float) -> str:
-        asked.append(share)
-        if share == 1:
-            raise MemoryShortage("memory", "much", "less")
-        return "done"
-
-    assert with_smaller_bricks("work", attempt) == "done"
+    for attempt in attempts("work"):
+        with attempt as share:
+            asked.append(share)
+            if share == 1:
+                raise MemoryShortage("memory", "much", "less")
     assert asked == [1.0, 0.25] and "work: memory: found much" in caplog.text
     assert not any(isinstance(argument, Exception) for record in caplog.records for argument in record.args)
-
-    def never(share: float) -> None:
-        raise MemoryShortage("memory", f"{share}", "less")
-
     with pytest.raises(OutOfMemoryError, match=r"found 0\.25"):
-        with_smaller_bricks("work", never)
+        for attempt in attempts("work"):
+            with attempt as share:
+                raise MemoryShortage("memory", f"{share}", "less")
 
 
 def test_traffic_is_what_crosses_the_bus() -> None:

@@ -5,7 +5,7 @@ import gc
 import numpy as np
 import pytest
 
-from phyradgs_cl.runtime import KernelUse, Rates, Runtime, profile_text
+from phyradgs_cl.runtime import KernelUse, Runtime, profile_text
 
 
 @pytest.fixture(scope="module")
@@ -59,8 +59,7 @@ def test_memory_held_at_one_time() -> None:
 
 def test_the_table_says_shares_and_rates() -> None:
     uses = {"draw": KernelUse(4, 2.0, 8_000_000_000), "add": KernelUse(1, 0.5, 1_000_000_000)}
-    text = profile_text(uses, 5.0, Rates(8e9, 3e11), {"draw": 1_000_000_000})
-    draw, add, last = text.splitlines()[1:]
-    assert draw.split() == ["draw", "4", "2.000", "80.0%", "500.000", "4.0", "50%", "2.00", "0.500"]
-    assert add.split() == ["add", "1", "0.500", "20.0%", "500.000", "2.0", "25%"]
-    assert "kernels 2.50 s of 5.00 s (50%)" in last and "300 Gflop/s" in last
+    draw, add, last = profile_text(uses, 5.0).splitlines()[1:]
+    assert draw.split() == ["draw", "4", "2.000", "80.0%", "500.000", "4.0"]
+    assert add.split() == ["add", "1", "0.500", "20.0%", "500.000", "2.0"]
+    assert last == "kernels 2.50 s of 5.00 s (50%)"

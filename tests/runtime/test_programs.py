@@ -112,7 +112,7 @@ def test_products_that_kernels_share_are_rounded(monkeypatch) -> None:
     monkeypatch.setattr(context, "kernel_source", lambda name: kernel_source(name) + asked)
     rt, (s, g) = Runtime(), np.array([0.1, -0.3], np.float32)
     out = rt.zeros(1)
-    rt.launch(rt.kernel("rays", "at", IMAGE_GUARD=16, RAY_LONG=0, RAY_PARALLEL=1, AVERAGE=0), 1, s, g, out)
+    rt.launch(rt.kernel("rays", "at", IMAGE_GUARD=16, RAY_LONG=0, RAY_PARALLEL=1), 1, s, g, out)
     fused = np.float32(3 * float(s) + float(g))
     assert rt.download(out)[0] == np.float32(s * np.float32(3)) + g != fused
 

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.workflow.sweep.grid import SweepRun, plan_sweep
+from phyradgs_cl.workflow.sweep import SweepRun, plan_sweep
 
 pytestmark = pytest.mark.slow
 

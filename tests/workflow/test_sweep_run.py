@@ -11,10 +11,8 @@ import pytest
 from phyradgs_cl.errors import DeviceError, InputError, OutputError
 from phyradgs_cl.io import only_run, read_volume
 from phyradgs_cl.io.output import BusyError
-from phyradgs_cl.workflow.sweep import run as sweep_run
-from phyradgs_cl.workflow.sweep.grid import plan_sweep
-from phyradgs_cl.workflow.sweep.run import RESULTS, run_sweep
-from phyradgs_cl.workflow.sweep.tables import markdown, read_lines
+from phyradgs_cl.workflow import sweep as sweep_run
+from phyradgs_cl.workflow.sweep import RESULTS, markdown, plan_sweep, read_lines, run_sweep
 
 pytestmark = pytest.mark.slow
 

@@ -61,7 +61,7 @@ class IntensityOperator:
         self._shares = []  # frees their memory
         frames: Array
         if isinstance(volume, DeviceArray):
-            p = [self._device.apply(operator.forward, volume, self.frames_shape) for operator in self._operators]
+            p = [operator.forward(volume, self._device.place(self.frames_shape)) for operator in self._operators]
             frames, self._shares = self._device_average(p)
         else:
             averaged, shares = intensity_average(
@@ -77,7 +77,7 @@ class IntensityOperator:
         space = self._space(volume)
         total: Any = None
         for share, operator in zip(self._shares_for(volume), self._operators, strict=True):
-            part = space.apply(operator.forward, volume, self.frames_shape)
+            part = operator.forward(volume, space.place(self.frames_shape))
             total = space.multiply(part, share) if total is None else space.add_product(total, part, share)
         same: SameArray = self._given(total, out)
         return same
@@ -87,7 +87,7 @@ class IntensityOperator:
         space = self._space(frames)
         total: Any = None
         for share, operator in zip(self._shares_for(frames), self._operators, strict=True):
-            part = space.apply(operator.adjoint, space.multiply(frames, share), self.volume_shape)
+            part = operator.adjoint(space.multiply(frames, share), space.place(self.volume_shape))
             total = part if total is None else space.add(total, part)
         same: SameArray = self._given(total, out)
         return same

@@ -14,18 +14,16 @@ _SMALL_BRICK = (24, 24, 8)  # 27 kB of the 32 that OpenCL guarantees
 _BLOCK = 4  # on a GPU a work-group owns a block with so many voxels per side, or fewer along z; as in cl/rays_adjoint_gpu.cl
 _SAMPLES_PER_VOXEL = 4  # about as many samples of a view touch a voxel
 _LONG_FROM = 2**31  # floats that 32-bit indices cannot address
-AVERAGES = ("log", "intensity", "correction")  # correction: log minus intensity; in the order of cl/rays.cl
 
 
 def launch_forward(
     rt: Runtime, layout: RayLayout, cells: RayCells, frame_list: DeviceArray, volume: DeviceArray,
-    frames: DeviceArray, *, average: str = "log", add: bool = False,
+    frames: DeviceArray, *, add: bool = False,
 ) -> None:
-    """Projects a padded volume to the listed frames. ``average``, one of AVERAGES, is taken over the cells of a line.
-
-    ``add`` adds line integrals to those in ``frames``, as several bricks of a volume need it; for ``log`` alone."""
+    """Projects a padded volume to the listed frames. ``add`` adds line integrals to those in ``frames``, as several bricks
+    of a volume need it."""
     blocks = ceil_div(layout.width, rt.lanes)
-    kernel = rt.kernel("rays", "rays_forward", AVERAGE=AVERAGES.index(average), **_defines(layout, cells))
+    kernel = rt.kernel("rays", "rays_forward", **_defines(layout, cells))
     items = blocks, layout.lines, frame_list.size
     rt.launch(
         kernel, items, volume, cells.cells, cells.cell_lines, cells.line_cells, frame_list, cells.weights,

@@ -10,7 +10,6 @@ import numpy as np
 
 from phyradgs_cl.acquisition.readout import Readout
 from phyradgs_cl.acquisition.time_cells import TimeCells
-from phyradgs_cl.detector import intensity_average
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.operators.bricks import Brick, whole
 from phyradgs_cl.operators.splats.layout import projection_matrices
@@ -240,19 +239,6 @@ def layered(tables: Sequence[TimeCells]) -> tuple[list[list[TimeCells]], list[np
         weights.append(tables[0].readout.spread(weight))
         ones.append([replace(part, weight=np.ones(part.count), line_share=None) for part in parts])
     return ones, weights
-
-
-def averaged(integrals: Sequence[np.ndarray], weights: Sequence[np.ndarray], average: str) -> np.ndarray:
-    """Averages line integrals p of each layer, (F, rows, columns), with the weights of ``layered``; float32.
-
-    ``intensity`` is −ln Σ w exp(−p); ``correction`` is Σ w p minus that. Lines without cells are 0; the weights of other
-    lines sum to 1. cl/rays.cl does the same where one launch has all cells of a line."""
-    sums = np.sum(weights, axis=0, dtype=np.float64)  # 1 except for float32 rounding, which would show in a small correction
-    exact = [np.divide(w, sums, out=np.zeros_like(sums), where=sums > 0) for w in weights]
-    frames, _ = intensity_average(integrals, exact)
-    if average == "correction":
-        frames = np.add.reduce([w * (p - frames) for p, w in zip(integrals, exact, strict=True)])
-    return frames.astype(np.float32)
 
 
 def some_cells(table: TimeCells, cells: Sequence[int] | np.ndarray) -> TimeCells:

@@ -17,13 +17,13 @@ import numpy as np
 from phyradgs_cl.acquisition.time_cells import TimeCells
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
-from phyradgs_cl.operators.rays.launches import AVERAGES, launch_adjoint, launch_forward
-from phyradgs_cl.operators.rays.layout import RayCells, RayLayout, averaged, layered
+from phyradgs_cl.operators.rays.launches import launch_adjoint, launch_forward
+from phyradgs_cl.operators.rays.layout import RayCells, RayLayout
 from phyradgs_cl.operators.rays.memory import RayMemory
 from phyradgs_cl.operators.rays.slots import Slots, UprightPoses, merge_slots, split_slots
 from phyradgs_cl.operators.rays.subrays import SINGLE
 from phyradgs_cl.operators.rays.upright import launch_upright, launch_upright_adjoint, upright_of
-from phyradgs_cl.runtime import Array, DeviceArray, Runtime, SameArray, with_smaller_bricks
+from phyradgs_cl.runtime import Array, DeviceArray, Runtime, SameArray, attempts
 from phyradgs_cl.runtime.layout import Strides
 
 
@@ -36,11 +36,11 @@ class LinearOperator(Protocol):
     @property
     def frames_shape(self) -> tuple[int, int, int]: ...
 
-    def forward(self, volume: np.ndarray) -> np.ndarray:
-        """A x: volume (nz, ny, nx) 1/mm to frames (F, rows, columns) float32."""
+    def forward(self, volume: Any, out: Any = None) -> Any:
+        """A x: volume (nz, ny, nx) 1/mm to frames (F, rows, columns) float32. ``out`` receives the result if given."""
         ...
 
-    def adjoint(self, frames: np.ndarray) -> np.ndarray:
+    def adjoint(self, frames: Any, out: Any = None) -> Any:
         """Aᵀ y: frames (F, rows, columns) to a volume (nz, ny, nx) float32."""
         ...
 
@@ -52,8 +52,8 @@ class LinearOperator(Protocol):
 class RayOperator:
     """Joseph's projector and its matched adjoint over the cells of many frames; a ``LinearOperator``.
 
-    NumPy arrays give NumPy arrays. Device arrays (plain, float32) give device arrays; only averages of intensity over a
-    volume in bricks, or over sub-rays, are made on the host. ``out``, an array of the same kind, receives the result.
+    NumPy arrays give NumPy arrays. Device arrays (plain, float32) give device arrays. ``out``, an array of the same kind,
+    receives the result.
     detector_shape is (rows, columns); ``tables`` has the time cells of each frame, all read out along one axis. An operator
     shares its tables and buffers with its subsets, and with operators that were given the same ``memory``: use them one at
     a time. A volume that does not fit is projected in bricks. fewest_lines: as in ``upright_of``; ``FEWEST_LINES`` is
@@ -99,44 +99,27 @@ class RayOperator:
 
     def forward(self, volume: SameArray, out: SameArray | None = None) -> SameArray:
         """Returns A x for a volume (nz, ny, nx) in 1/mm: frames (F, rows, columns) float32."""
-        return self.project(volume, "log", out)
-
-    def intensity_correction(self, volume: SameArray, out: SameArray | None = None) -> SameArray:
-        """A x − I(x) with I(x) = −ln Σ w exp(−p) over a line's cells, where A x is Σ w p; shapes as in ``forward``.
-
-        At least 0 except for rounding. It is computed from differences between cells, so that small corrections keep their
-        digits. Intensity frames of about x plus this correction are the frames of a detector that averages line integrals.
-        """
-        return self.project(volume, "correction", out)
-
-    def project(self, volume: SameArray, average: str, out: SameArray | None = None) -> SameArray:
-        """Projects with ``average``, one of AVERAGES, over the cells of each line; shapes as in ``forward``."""
         _check_shape("volume", volume, self.volume_shape)
         result: SameArray = _room_for(self.rt, self.frames_shape, volume, out)
-        with_smaller_bricks(
-            "ray-driven projector", lambda share: self._project(volume, average, share, result)
-        )
+        for attempt in attempts("ray-driven projector"):
+            with attempt as share:
+                self._forward(volume, share, result)
         return result
 
-    def _project(self, volume: Array, average: str, share: float, result: Array) -> None:
+    def _forward(self, volume: Array, share: float, result: Array) -> None:
         bricks = self.memory.plan(share)
-        if average != "log" and (len(bricks) > 1 or self.memory.layout.subrays != SINGLE):
-            self._project_layers(volume, average, result)
-            return
         columns = self.memory.turned(volume) if self._is_upright and self.memory.has_columns else None
         for part in self.memory.batches(len(self._chosen)):
             frames = self.memory.frames(part.stop - part.start)
             if columns is not None:
-                self._project_upright(columns, part, average, frames)
+                self._forward_upright(columns, part, frames)
                 self.memory.read_frames(frames, result, part, self._axis)
                 continue
             listed = self._listed(part)
             for k, brick in enumerate(bricks):
                 if k + part.start == 0 or len(bricks) > 1:
                     layout, on_device = self.memory.write_volume(volume, brick)
-                launch_forward(
-                    self.rt, layout, self._cells, listed, on_device, frames, average=average, add=k > 0
-                )
+                launch_forward(self.rt, layout, self._cells, listed, on_device, frames, add=k > 0)
             self.memory.read_frames(frames, result, part, self._axis)
 
     @property
@@ -144,20 +127,19 @@ class RayOperator:
         """Whether the upright kernels apply, and the planned memory has room for slots."""
         return self._upright is not None and self.memory.slot_frames > 0
 
-    def _project_upright(self, columns: DeviceArray, part: slice, average: str, frames: DeviceArray) -> None:
+    def _forward_upright(self, columns: DeviceArray, part: slice, frames: DeviceArray) -> None:
         """Projects a turned volume to some frames, in the padded layout."""
         assert self._upright is not None and self._poses is not None
         layout = self.memory.layout
         start, *steps = layout.pixel_strides(self._axis)
         for first, slots in self._slots_of(part):
             target = frames, np.array([start + first * steps[-1], *steps], np.int64)
-            if slots.is_plain and average == "log":
+            if slots.is_plain:
                 launch_upright(self.rt, layout, self._upright, self._poses, slots, columns, target)
                 continue
             there = self.memory.slots()
             launch_upright(self.rt, layout, self._upright, self._poses, slots, columns, (there, slots.strides))
-            like = self._rays_shape, self._axis, AVERAGES.index(average)
-            merge_slots(self.rt, self._cells, slots, there, target, *like)
+            merge_slots(self.rt, self._cells, slots, there, target, self._rays_shape, self._axis)
 
     def _slots_of(self, part: slice) -> Iterator[tuple[int, Slots]]:
         """Yields the first frame, within the part, and the slots of as many frames as fit into memory at a time."""
@@ -171,26 +153,13 @@ class RayOperator:
                 self._slots[key] = self._poses.slots(self.rt, chosen, *like)
             yield first - part.start, self._slots[key]
 
-    def _project_layers(self, volume: Array, average: str, result: Array) -> None:
-        """Averages −ln Σ w exp(−p) of a volume in bricks, or over sub-rays, on the host.
-
-        These need the whole line integral of every cell, of which a brick, or a sub-ray, holds a part. So a layer (at most
-        one cell per line) is projected at a time."""
-        ones, weights = layered(self.tables)
-        like = (self.rt, self.grid, self.detector_shape)
-        on_host = self.rt.download(volume) if isinstance(volume, DeviceArray) else volume
-        parts = [RayOperator(*like, tables, memory=self.memory).forward(on_host) for tables in ones]
-        frames = averaged(parts, weights, average)
-        if isinstance(result, DeviceArray):
-            self.rt.write(result, frames)
-        else:
-            result[...] = frames
-
     def adjoint(self, frames: SameArray, out: SameArray | None = None) -> SameArray:
         """Returns Aᵀ y for frames (F, rows, columns): a volume (nz, ny, nx) float32."""
         _check_shape("frames", frames, self.frames_shape)
         result: SameArray = _room_for(self.rt, self.volume_shape, frames, out)
-        with_smaller_bricks("ray-driven backprojector", lambda share: self._adjoint(frames, share, result))
+        for attempt in attempts("ray-driven backprojector"):
+            with attempt as share:
+                self._adjoint(frames, share, result)
         return result
 
     def _adjoint(self, frames: Array, share: float, result: Array) -> None:

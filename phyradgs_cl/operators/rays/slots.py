@@ -162,12 +162,12 @@ class Slots:
 
 def merge_slots(
     rt: Runtime, cells: RayCells, slots: Slots, integrals: DeviceArray,
-    target: tuple[DeviceArray, np.ndarray], detector_shape: tuple[int, int], axis: str, average: int,
+    target: tuple[DeviceArray, np.ndarray], detector_shape: tuple[int, int], axis: str,
 ) -> None:
     """Averages slots to frames. ``target`` is an array and its strides (start, column, row, frame)."""
     rows, columns = detector_shape
     rt.launch(
-        rt.kernel("rays_slots", "merge_slots", AVERAGE=average, **{**slots.defines, "LEAN": 0}),
+        rt.kernel("rays_slots", "merge_slots", **{**slots.defines, "LEAN": 0}),
         (columns, slots.frames), integrals, slots.columns, slots.pitch, slots.slots, slots.frame_shares,
         slots.shares, cells.weights, axis == "rows", columns, rows, target[1], target[0],
         group=min(columns, 8),
@@ -183,7 +183,7 @@ def split_slots(
     turned: frames (F, columns, rows), which begin at ``start`` floats."""
     rows, columns = detector_shape
     rt.launch(
-        rt.kernel("rays_slots", "split_slots", AVERAGE=0, **slots.defines), (slots.columns, slots.count),
+        rt.kernel("rays_slots", "split_slots", **slots.defines), (slots.columns, slots.count),
         turned, np.int64(start), pitch_of(rows), poses.cells, slots.slots, slots.slot_shares,
         slots.shares_by_slot, cells.weights, poses.axis == "rows", columns, pitch_mm, slots.columns,
         slots.pitch, np.int64(slots.floats), values, group=1,

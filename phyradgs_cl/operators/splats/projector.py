@@ -14,14 +14,12 @@ from phyradgs_cl.checks import ceil_div
 from phyradgs_cl.operators.splats.binning import TileLists
 from phyradgs_cl.operators.splats.layout import DeviceCells, DeviceGaussians, Layers
 from phyradgs_cl.operators.splats.states import CloudStates
-from phyradgs_cl.operators.splats.work import UNSEEN, Work, moving_work, still_work
 from phyradgs_cl.runtime import DeviceArray, Kernel, Runtime
 from phyradgs_cl.runtime.layout import GUARD, pad_rows, padded_zeros, pitch_of, unpad_rows
 
 RECORD_FLOATS = {False: 16, True: 20}  # per splat and cell, by whether the cell has motion
 DEFAULT_TIME_ERROR = 0.005  # relative, RMS, of averages over time
 DEFAULT_CUTOFF_SIGMA = 3.7  # where a Gaussian has fallen to 0.1 % of its peak
-PAIR_KERNELS = ("splat_forward_rows", "splat_forward_pixels", "splat_backward_rows", "splat_backward_group")
 _BAND_LINES = 8
 GROUP_DEFINES = {False: {"GROUP": 1, "ACROSS": 1}, True: {"GROUP": 32, "ACROSS": 8}}
 """Work-items of a Gaussian's adjoint, and how many of them lie along a line; by whether items are pixels."""
@@ -170,19 +168,6 @@ class SplatProjector:
         )  # fmt: skip
         if self.states is not None:
             self.states.back(gaussians, cells, gradients)
-
-    def work(self, gaussians: DeviceGaussians, cells: DeviceCells) -> Work:
-        """Counts the work of a ``forward`` of these Gaussians and cells."""
-        self.prepare(gaussians, cells)
-        shape = (gaussians.stride, cells.count, RECORD_FLOATS[cells.moving])
-        size = int(np.prod(shape))
-        records = self.rt.download(DeviceArray(self._records.buffer, (size,), np.dtype(np.float32)))
-        seen = self.rt.download(DeviceArray(self._is_visible.buffer, shape[:2], np.dtype(np.uint8)))
-        records = np.where(seen[..., None], records.reshape(shape), UNSEEN[: shape[2]])[: gaussians.count]
-        if not cells.moving:
-            return still_work(records, self.rt.lanes)
-        times = self.rt.download(cells.line_times)
-        return moving_work(records, times, self.path_limits, self.rt.lanes, bool(self.cutoff2 > 0))
 
     def prepare(self, gaussians: DeviceGaussians, cells: DeviceCells) -> None:
         """Projects every Gaussian from every pose: the first step of ``draw``, whose records ``backward`` needs."""

@@ -8,7 +8,7 @@ from phyradgs_cl.operators.bricks import Shape, cut
 from phyradgs_cl.operators.splats.binning import TileLists
 from phyradgs_cl.operators.splats.layout import DeviceGaussians, split_coefficients
 from phyradgs_cl.operators.splats.projector import DEFAULT_CUTOFF_SIGMA, GROUP_DEFINES, items_by_gaussian
-from phyradgs_cl.runtime import DeviceArray, Kernel, Runtime, with_smaller_bricks
+from phyradgs_cl.runtime import DeviceArray, Kernel, Runtime, attempts
 from phyradgs_cl.runtime.layout import GUARD, pad_rows, padded_zeros, pitch_of, unpad_rows
 
 RECORD_FLOATS = 20
@@ -117,11 +117,10 @@ def voxelise(
     """Returns the complete grid (z, y, x) float32, computed brick by brick with the same bits.
 
     The device holds ``brick_bytes`` of voxels at a time, or less if memory is short."""
-
-    def attempt(share: float) -> np.ndarray:
-        return _in_bricks(rt, DeviceGaussians.upload(rt, rows), grid, cutoff_sigma, brick_bytes, share)
-
-    return with_smaller_bricks("voxeliser", attempt)
+    for attempt in attempts("voxeliser"):
+        with attempt as share:
+            volume = _in_bricks(rt, DeviceGaussians.upload(rt, rows), grid, cutoff_sigma, brick_bytes, share)
+    return volume
 
 
 def _in_bricks(

@@ -25,7 +25,6 @@ from phyradgs_cl.operators.warp.backproject import MovingBackprojector
 from phyradgs_cl.operators.warp.states import MotionStates
 from phyradgs_cl.prepare.step import unmasked_frames
 from phyradgs_cl.reconstructors.fdk import travel, weights
-from phyradgs_cl.reconstructors.fdk.arc import filled_gap_rad, view_arc
 from phyradgs_cl.reconstructors.fdk.frames import (
     WAYS,
     deblurred,
@@ -34,12 +33,15 @@ from phyradgs_cl.reconstructors.fdk.frames import (
     whole_object,
 )
 from phyradgs_cl.reconstructors.fdk.views import (
+    Arc,
     RayWeight,
     check_beam,
+    filled_gap_rad,
     opposite_weight,
     pose_of_pixels,
     ray_weight,
     view_angles,
+    view_arc,
     warn_if_incomplete,
     widened,
 )
@@ -99,29 +101,14 @@ def fdk(
     scan: Scan, options: FdkOptions, rt: Runtime, *, seed: int = 0, report: ProgressReport = ignore_progress,
     deformation: Deformation | None = None,
 ) -> Reconstruction:
-    """Returns the FDK volume of a scan in 1/mm; of an object that moves, that of the reference.
+    """Returns the FDK volume of a scan in 1/mm, or with ``FbpOptions`` the filtered backprojection of a parallel beam: half
+    turns, full turns, and full turns with the axis near the panel's edge. Of an object that moves it is the reference.
 
     ``seed`` is part of the common signature and not used.
 
-    Logs a warning for an orbit that is not a circle about z, and raises InputError for one that is far from it."""
-    return _filtered_backprojection("fdk", scan, options, rt, report, deformation)
-
-
-def fbp(
-    scan: Scan, options: FbpOptions, rt: Runtime, *, seed: int = 0, report: ProgressReport = ignore_progress,
-    deformation: Deformation | None = None,
-) -> Reconstruction:
-    """Returns the filtered backprojection of a parallel beam in 1/mm: half turns, full turns, and full turns with the axis
-    near the panel's edge. ``seed`` is part of the common signature and not used.
-
-    Logs a warning for incomplete turns, and raises InputError for rays that are not at right angles to the axis."""
-    return _filtered_backprojection("fbp", scan, options, rt, report, deformation)
-
-
-def _filtered_backprojection(
-    method: str, scan: Scan, options: FdkOptions, rt: Runtime, report: ProgressReport, deformation: Deformation | None
-) -> Reconstruction:
-    started = time.perf_counter()
+    Logs a warning for incomplete turns, and for an orbit that is not a circle about z. Raises InputError for one that is far
+    from it, and for parallel rays that are not at right angles to the axis."""
+    started, method = time.perf_counter(), "fbp" if isinstance(options, FbpOptions) else "fdk"
     if deformation is not None and options.extrapolate == "reprojected":
         expected, remedy = "another way of rows beyond the panel", "leave extrapolate out"
         raise InputError("--object-motion", "extrapolate=reprojected, of an object at rest", expected, remedy)
@@ -156,7 +143,7 @@ def _moving(
 
 _KIND = {"is_resumable": False, "takes_deformation": True}
 METHOD = Method(fdk, {window: FdkOptions(window) for window in WINDOWS}, **_KIND)
-FBP_METHOD = Method(fbp, {window: FbpOptions(window) for window in WINDOWS}, **_KIND)
+FBP_METHOD = Method(fdk, {window: FbpOptions(window) for window in WINDOWS}, **_KIND)
 
 
 def fdk_volume(
@@ -170,27 +157,18 @@ def fdk_volume(
     scans are recognised and weighted. Logs a warning where data are missing. ``whole`` reconstructs the object (z, y, x) in
     1/mm on ``grid``, for ``reprojected``. ``circle``, for parallel beams: as in ``FbpOptions``. ``moving`` backprojects an
     object that moves. Raises InputError for a source on the rotation axis."""
-    shape = (frames.shape[1], frames.shape[2])
-    by_pixel = pose_of_pixels(pose, axis)
-    if np.any(np.hypot(by_pixel[..., 0], by_pixel[..., 1]) <= 0):
-        raise InputError("poses", "a source on the rotation axis", "a source beside it")
-    angle_rad = view_angles(by_pixel)
-    canonical = travel.still_along_z(weights.turned_back(by_pixel, angle_rad), is_parallel)
-    # on a circle all views are the same but for a rotation: one set of weights serves all of them
-    if np.ptp(canonical, axis=0).max() <= _SAME_POSE * np.abs(canonical).max():
-        canonical = canonical[:1]
-    fan = weights.measured_fan(canonical, shape, is_parallel)
-    arc = view_arc(angle_rad, filled_gap_rad(fan))
+    by_pixel, canonical, fan, arc = _seen(pose, frames, axis, is_parallel)
     if extrapolate != "none" and fan.is_put_aside:
         log.warning("%s: the rows of a displaced detector are not extrapolated", "FBP" if is_parallel else "FDK")
     elif extrapolate != "none":
         if extrapolate == "reprojected" and whole is not None:
-            wide, count = reprojected(rt, frames, pose, axis, whole(), grid, is_parallel)
+            frames, count = reprojected(rt, frames, pose, axis, whole(), grid, is_parallel)
         else:
-            wide, count = extrapolated(frames, extrapolate)
+            frames, count = extrapolated(frames, extrapolate)
         # from here on the frames are those of a wider panel
-        wider = widened(pose, axis, (count, count))
-        return fdk_volume(rt, wide, wider, grid, window=window, axis=axis, is_parallel=is_parallel, moving=moving)
+        pose, circle = widened(pose, axis, (count, count)), False
+        by_pixel, canonical, fan, arc = _seen(pose, frames, axis, is_parallel)
+    shape = (frames.shape[1], frames.shape[2])
     warn_if_incomplete(arc, fan, canonical, grid, is_parallel)
     # only a full turn has the opposite rays that complete a displaced detector
     missing = fan.missing_columns if arc.is_full else (0, 0)
@@ -217,6 +195,22 @@ def fdk_volume(
         radius_mm = fan.half_rad + np.linalg.norm(canonical[0, 0, 0, 6:9]) / 2  # to the edge of the last pixel
         volume[:, np.hypot(y_mm[:, None], x_mm) > radius_mm] = 0
     return volume
+
+
+def _seen(
+    pose: np.ndarray, frames: np.ndarray, axis: str, is_parallel: bool
+) -> tuple[np.ndarray, np.ndarray, weights.Fan, Arc]:
+    """Returns the poses of pixels, those turned back to one angle, their fan, and the arc of all views."""
+    by_pixel = pose_of_pixels(pose, axis)
+    if np.any(np.hypot(by_pixel[..., 0], by_pixel[..., 1]) <= 0):
+        raise InputError("poses", "a source on the rotation axis", "a source beside it")
+    angle_rad = view_angles(by_pixel)
+    canonical = travel.still_along_z(weights.turned_back(by_pixel, angle_rad), is_parallel)
+    # on a circle all views are the same but for a rotation: one set of weights serves all of them
+    if np.ptp(canonical, axis=0).max() <= _SAME_POSE * np.abs(canonical).max():
+        canonical = canonical[:1]
+    fan = weights.measured_fan(canonical, (frames.shape[1], frames.shape[2]), is_parallel)
+    return by_pixel, canonical, fan, view_arc(angle_rad, filled_gap_rad(fan))
 
 
 def _filtered(frames: np.ndarray, weight: RayWeight, missing: tuple[int, int], window: str) -> np.ndarray:

@@ -93,10 +93,7 @@ def whole_object(scan: Scan, motion: Motion, rt: Runtime, report: ProgressReport
     at_times: Motion = PerRow(sub_intervals=2) if isinstance(motion, LineMiddles) else motion
     options, report = FistaTvOptions(motion=at_times, iterations=_ITERATIONS), Report.of(report)
     with report.through(hook):
-        result = fista_tv.METHOD.run(scan, options, rt, report=report)
-    if result.facts["interrupted_at"] is not None:
-        raise KeyboardInterrupt
-    return result.volume
+        return fista_tv.METHOD.run(scan, options, rt, report=report).complete().volume
 
 
 def reprojected(

@@ -100,11 +100,11 @@ class AugmentedOperator:
         """Returns the equations for the measured frames (F, rows, columns). They cannot be divided into subsets."""
         return System(self, measured, valid)  # type: ignore[arg-type]
 
-    def forward(self, vector: np.ndarray) -> np.ndarray:
+    def forward(self, vector: np.ndarray, out: None = None) -> np.ndarray:
         volume, values = self.parts(vector)
         return self.extra.add_to(self.operator.forward(volume), values)
 
-    def adjoint(self, frames: np.ndarray) -> np.ndarray:
+    def adjoint(self, frames: np.ndarray, out: None = None) -> np.ndarray:
         volume = self.operator.adjoint(frames).ravel()
         return np.concatenate([volume, self.extra.adjoint(frames)]).astype(np.float32)
 

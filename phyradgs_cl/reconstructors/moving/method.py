@@ -1,10 +1,14 @@
 """``moving``: the volume of an object that moves in an unknown way, and its displacement field.
 
-The search finds the field on a coarse copy of the scan (``search.py``). ``fista`` then reconstructs the reference volume
-with that field, as it does with ``--object-motion``. An object that shows no motion gets the volume of ``fista`` at rest."""
+The search finds the field on a coarse copy of the scan. Each of its rounds makes a few passes of ``fista`` with the
+present field, then a Gauss-Newton step on the field, and one on its weights (``field.py``). Motion and image together: J.
+Wang and X. Gu, Simultaneous motion estimation and image reconstruction (SMEIR) for 4D cone-beam CT, Med. Phys. 40, 101912
+(2013).
 
-import time
-from collections.abc import Callable
+``fista`` then reconstructs the reference volume with that field, as it does with ``--object-motion``. An object that shows
+no motion gets the volume of ``fista`` at rest."""
+
+import math
 from dataclasses import dataclass, fields, replace
 from functools import partial
 from typing import Any, ClassVar
@@ -12,30 +16,178 @@ from typing import Any, ClassVar
 import numpy as np
 
 from phyradgs_cl import checks
-from phyradgs_cl.acquisition import Scan
+from phyradgs_cl.acquisition import Motion, PerRow, Scan
+from phyradgs_cl.acquisition.altered.coarse import SMOOTHING, binned, fewer_frames, smooth
 from phyradgs_cl.acquisition.motion import with_times
 from phyradgs_cl.checks import ceil_div
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.fields import Deformation, triple
+from phyradgs_cl.fields import Deformation, Grid, triple
+from phyradgs_cl.metrics import resampled
 from phyradgs_cl.reconstructors.checkpoint import State
-from phyradgs_cl.reconstructors.loop import Loop
 from phyradgs_cl.reconstructors.method import Method
-from phyradgs_cl.reconstructors.moving.search import FieldSearch
+from phyradgs_cl.reconstructors.moving import LEAST_GAIN
+from phyradgs_cl.reconstructors.moving.field import FieldProblem, MotionField, sum_squares
 from phyradgs_cl.reconstructors.moving.signal import (
     MotionSignal,
+    TemporalSplines,
     gating_of_scan,
     load_gating,
     motion_signal,
     signal_of,
 )
 from phyradgs_cl.reconstructors.result import MOTION_FOUND, Progress, Reconstruction, Report, option_facts
-from phyradgs_cl.reconstructors.voxels.fista import FistaOptions, fista_stages
-from phyradgs_cl.reconstructors.voxels.run import MethodInputs
-from phyradgs_cl.reconstructors.voxels.stages import Stage, run_stages
+from phyradgs_cl.reconstructors.voxels.fista import FistaOptions, fista_passes, fista_stages
+from phyradgs_cl.reconstructors.voxels.run import MethodRun
+from phyradgs_cl.reconstructors.voxels.stages import Stage, Stages
 from phyradgs_cl.runtime import Runtime
 
+_MOST_COLUMNS, _MOST_VOXELS, _MOST_FRAMES = 64, 32, 600  # of the coarse scan; more frames where a signal has more knots
+_TIMES_PER_PERIOD, _MOST_TIMES = 12, 6  # at which exposures see the object at least; but of one exposure
+_FIRST_PASSES, _PASSES = 8, 3  # of fista, at rest and in a round
+_WEIGHT, _TV_ITERATIONS = 0.42, 5  # of these passes
+_COARSE_SPACINGS, _FINE_SPACINGS = 2, 4  # of control points along the box's longest side
+_FINE_BENDING = (_FINE_SPACINGS / _COARSE_SPACINGS) ** 4  # times as stiff in terms of coefficients is as stiff in mm
+_COARSE_SHARE = 0.6  # of the rounds
+_FREE_KNOTS = 6
+_AT_REST = "no motion found"
 _ITERATIONS_PER_ROUND = 6  # 7 rounds of the search come before the 35 passes that are the default of fista
 _STORED = ("field_control", "field_place", "field_times", "field_weights", "field_gain")
+
+
+def coarse_scan(scan: Scan, most_frames: int = _MOST_FRAMES) -> Scan:
+    """Returns the scan with blocks of pixels, few voxels in the same box, and at most ``most_frames`` frames."""
+    block = math.ceil(max(scan.geometry.detector_shape) / _MOST_COLUMNS)
+    small = binned(smooth(fewer_frames(scan, most_frames), SMOOTHING * block if block > 1 else 0.0), block)
+    least_mm = max(max(scan.grid.size_mm) / _MOST_VOXELS, min(scan.grid.voxel_size_mm))
+    return replace(small, grid=scan.grid.in_shape(triple(max(1, round(side / least_mm)) for side in scan.grid.size_mm)))
+
+
+def initial_field(scan: Scan, signal: MotionSignal, last_s: float, first_s: float) -> MotionField:
+    """Returns a field at rest. Its weights follow a signal that has knots, else a line and its square in time."""
+    spacing_mm = max(scan.grid.size_mm) / _COARSE_SPACINGS
+    if signal.knot_s is not None:
+        between_s = float(np.median(np.diff(signal.times_s)))
+        splines = TemporalSplines.of_step(first_s, last_s, max(signal.knot_s, between_s))
+        return MotionField.at_rest(scan, spacing_mm, splines, splines.fit(signal.times_s, signal.pair()))
+    splines = TemporalSplines.of_step(first_s, last_s, (last_s - first_s) / _FREE_KNOTS)
+    times_s = splines.node_times_s
+    line = np.linspace(-1, 1, len(times_s))
+    return MotionField.at_rest(scan, spacing_mm, splines, splines.fit(times_s, np.stack([line, line**2], -1)))
+
+
+class FieldSearch:
+    """The search as a ``Stepwise`` on a coarse copy of the scan. rounds: how many. bending: as in ``FieldProblem``."""
+
+    quantity, remedy = "residual", "check the scan for extreme values"
+
+    def __init__(
+        self, rt: Runtime, scan: Scan, motion: Motion, signal: MotionSignal, rounds: int, bending: float
+    ) -> None:
+        knots = float(np.ptp(scan.frame_start_s)) / signal.knot_s if signal.knot_s else 0.0
+        self.rt, self.grid, self.iterations, self.iteration = rt, scan.grid, rounds, 0
+        self.scan = coarse_scan(scan, max(_MOST_FRAMES, math.ceil(knots)))
+        self.motion = _with_times(motion, scan, signal.period_s)
+        self.problem = FieldProblem(rt, self.scan, self.motion, bending)
+        times_s = self.problem.times_s
+        self.field = initial_field(self.scan, signal, float(times_s.max()), float(times_s.min()))
+        self.volume = np.zeros(self.scan.grid.shape, np.float32)
+        self.relative, self.change = 0.0, 0.0
+        self._coarse_rounds = math.ceil(_COARSE_SHARE * rounds)
+
+    @property
+    def finished(self) -> str | None:
+        """The first rounds of an object at rest find no step that lowers the residual."""
+        return _AT_REST if self.iteration >= 2 and not self.field.control_mm.any() else None
+
+    def step(self) -> None:
+        if self.iteration == 0:
+            self.volume = self._reconstructed(self.field, None, _FIRST_PASSES)
+        elif self.field.control_mm.any():
+            self.volume = self._reconstructed(self.field, self.volume, _PASSES)
+        if self.iteration == self._coarse_rounds:
+            self._refine()
+        before = self.field
+        self.field = self.problem.space_step(self.field, self.volume)
+        if self.iteration > 0 and self.field.control_mm.any():
+            self.field = self.problem.time_step(self.field, self.volume)
+        self.change = _difference(self.field, before)
+        self.relative = self._misfit(self.field, self.volume) / max(sum_squares(self.problem.measured), 1e-30)
+        self.iteration += 1
+
+    def _refine(self) -> None:
+        self.field = self.field.refined(self.scan, max(self.scan.grid.size_mm) / _FINE_SPACINGS)
+        self.problem.bending *= _FINE_BENDING
+
+    def measures(self) -> dict[str, float]:
+        return {"residual": self.relative**0.5, "change": self.change}
+
+    def facts(self, is_complete: bool) -> dict[str, object]:
+        return {}
+
+    def state(self) -> dict[str, np.ndarray]:
+        one = self.field
+        return {
+            "control_mm": one.control_mm, "temporal": one.temporal, "coarse_volume": self.volume,
+            "fit": np.array([self.relative, self.change]), "iteration": np.array(self.iteration),
+        }  # fmt: skip
+
+    def restore(self, state: State) -> None:
+        self.iteration = int(state["iteration"])
+        if self.iteration > self._coarse_rounds:
+            self._refine()
+        self.field = replace(self.field, control_mm=state["control_mm"], temporal=state["temporal"])
+        self.volume = state["coarse_volume"]
+        self.relative, self.change = state["fit"].tolist()
+
+    def present_volume(self) -> tuple[np.ndarray, Grid]:
+        return resampled(self.volume, self.scan.grid, self.grid)[0], self.grid
+
+    def finding(self) -> tuple[Deformation, float]:
+        """Returns the field, and by which share the squared residual is smaller than that of an object at rest after as many
+        passes. The field is zeros unless the share exceeds ``LEAST_GAIN`` and what as many free numbers would explain in
+        noise."""
+        if not self.field.control_mm.any():
+            return self.field.deformation(), 0.0
+        moving = self._reconstructed(self.field, self.volume, _PASSES)
+        resting_field = replace(self.field, control_mm=np.zeros_like(self.field.control_mm))
+        resting = self._reconstructed(resting_field, None, _FIRST_PASSES + _PASSES * self.iteration)
+        ratio: float = self._misfit(self.field, moving) / self._misfit(resting_field, resting)
+        gain = 1 - ratio
+        numbers = self.field.control_mm.size + self.field.temporal.size
+        least = max(LEAST_GAIN, 2 * numbers / max(int(np.count_nonzero(self.scan.valid)), 1))
+        return (self.field if gain > least else resting_field).deformation(), gain
+
+    def _misfit(self, one: MotionField, volume: np.ndarray) -> float:
+        return sum_squares(self.problem.residual(one, volume))
+
+    def _reconstructed(self, one: MotionField, volume: np.ndarray | None, passes: int) -> np.ndarray:
+        """Returns the volume after ``passes`` passes of ``fista`` on the coarse scan."""
+        options = FistaOptions(
+            motion=self.motion, iterations=passes, prior="dct", prior_weight=_WEIGHT, tv_iterations=_TV_ITERATIONS
+        )
+        deformation = one.deformation() if one.control_mm.any() else None
+        run = fista_passes(lambda: MethodRun(self.scan, options, self.rt, deformation=deformation), passes, volume)
+        for _ in range(passes):
+            run.step()
+        return run.present_volume()[0]
+
+
+def _with_times(motion: Motion, scan: Scan, period_s: float | None) -> Motion:
+    """Returns the model with as many times as gantry and period need: the object's speed is not known yet."""
+    timed = with_times(motion, scan)
+    if motion != PerRow() or not isinstance(timed, PerRow) or period_s is None:
+        return timed
+    times = math.ceil(_TIMES_PER_PERIOD * scan.shutter.exposure_s / period_s)
+    return PerRow(max(timed.sub_intervals, min(times, _MOST_TIMES)))
+
+
+def _difference(one: MotionField, other: MotionField) -> float:
+    """Returns the change of the control vectors and weights between two rounds, relative to their size."""
+    pairs = [(one.control_mm, other.control_mm), (one.temporal, other.temporal)]
+    parts: list[Any] = [
+        sum_squares(new - old) / sum_squares(new) for new, old in pairs if new.shape == old.shape and new.any()
+    ]
+    return float(sum(parts)) ** 0.5
 
 
 @dataclass(frozen=True)
@@ -82,6 +234,10 @@ class _Field:
         """None where nothing moves."""
         return None if self.deformation is None or self.deformation.is_still else self.deformation
 
+    def take(self, search: Any) -> None:
+        """Takes what a complete ``FieldSearch`` has found."""
+        self.deformation, self.gain = search.finding()
+
     def state(self) -> dict[str, np.ndarray]:
         if (one := self.deformation) is None:
             return {}
@@ -99,22 +255,27 @@ class _Field:
 
 
 def moving(scan: Scan, options: MovingOptions, rt: Runtime, **arguments: Any) -> Reconstruction:
-    """Returns the reference volume in 1/mm with the object's ``deformation``. ``arguments``: the other ``MethodInputs``."""
-    inputs, one = MethodInputs(scan, options, rt, **arguments), _Field()
-    if inputs.resume is not None:
-        inputs = replace(inputs, resume=one.restore(inputs.resume))
+    """Returns the reference volume in 1/mm with the object's ``deformation``. ``arguments``: the others of ``MethodRun``."""
+    run, one = MethodRun(scan, options, rt, **arguments), _Field()
+    if run.resume is not None:
+        run = replace(run, resume=one.restore(run.resume))
     signal = _signal_of(scan, options.gating)
-    passes_inputs = replace(inputs, options=options.of_passes())
-    stages = [Stage("field", options.rounds, partial(_search, signal=signal, one=one))] if options.rounds else []
-    for stage in fista_stages(passes_inputs):
-        is_first = stage.name == "voxels"
-        stages.append(replace(stage, run=partial(_with_field, stage.run, passes_inputs, one, is_first)))
-    report = Report.of(inputs.report)
+    search = partial(FieldSearch, rt, scan, options.motion, signal, options.rounds, options.bending)
+    stages = [Stage("field", options.rounds, lambda _: search(), end=one.take)] if options.rounds else []
+
+    def of_passes() -> MethodRun:
+        motion = with_times(options.motion, scan, one.for_passes)
+        return replace(run, options=replace(options.of_passes(), motion=motion), deformation=one.for_passes)
+
+    coarse, *fine = fista_stages(of_passes(), of_passes)
+    # the first passes start as ``fista`` does, not from the volume of the search
+    stages += [replace(coarse, make=lambda _: coarse.make(None)), *fine]
+    report = Report.of(run.report)
     with report.through(partial(_with_field_in_progress, one)):
-        result = run_stages(stages, replace(inputs, report=report))
+        result = replace(run, report=report).result("moving", Stages(stages, run))
     state = None if result.state is None else {**result.state, **one.state()}
-    options = replace(options, motion=with_times(options.motion, scan, one.for_passes))
-    result.facts.update(method="moving", options=option_facts(options), **{MOTION_FOUND: _motion_facts(one, signal, scan)})
+    facts = option_facts(replace(options, motion=of_passes().options.motion))
+    result.facts.update(options=facts, **{MOTION_FOUND: _motion_facts(one, signal, scan)})
     return replace(result, state=state, deformation=one.deformation)
 
 
@@ -129,27 +290,6 @@ def _signal_of(scan: Scan, gating: str) -> MotionSignal:
         return signal_of(load_gating(gating, scan), scan, f"gating {gating}")
     signal = motion_signal(scan)
     return replace(signal, period_s=None, knot_s=None) if gating == "free" else signal
-
-
-def _search(inputs: MethodInputs, signal: MotionSignal, one: _Field) -> Reconstruction:
-    """Runs the search, and keeps the field in ``one`` when it is complete."""
-    started, scan, options = time.perf_counter(), inputs.scan, inputs.options
-    search = FieldSearch(inputs.rt, scan, options.motion, signal, options.rounds, options.bending)
-    loop = Loop(search, inputs.rt.ranks, inputs.report, started)
-    loop.run(inputs.resume)
-    if loop.interrupted_at is None:
-        one.deformation, one.gain = search.finding()
-    facts = {"iterations": options.rounds, "interrupted_at": loop.interrupted_at, "seconds": loop.seconds}
-    volume, grid = search.present_volume()
-    return Reconstruction(volume, grid, record=loop.record, facts=facts, state=loop.state_if_interrupted())
-
-
-def _with_field(
-    run: Callable[[MethodInputs], Reconstruction], of_passes: MethodInputs, one: _Field, is_first: bool, inputs: MethodInputs
-) -> Reconstruction:
-    """Runs a stage of ``fista`` with the field. The first one starts as ``fista`` does, not from the coarse volume."""
-    initial = of_passes.initial if is_first else inputs.initial
-    return run(replace(inputs, options=of_passes.options, initial=initial, deformation=one.for_passes))
 
 
 def _with_field_in_progress(one: _Field, progress: Progress) -> Progress:

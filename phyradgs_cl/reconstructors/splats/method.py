@@ -7,6 +7,7 @@ make it the paper's "R2 w/ ST".
 Inside, lengths are divided by half the volume's longest side and densities by a reference (FDK's 99.9th percentile), so that
 rates, thresholds and SSIM's constants hold for every scan."""
 
+import json
 import time
 from dataclasses import replace
 from functools import partial
@@ -14,23 +15,136 @@ from typing import Any
 
 import numpy as np
 
-from phyradgs_cl.acquisition import Exact, Scan
-from phyradgs_cl.fields import Deformation
-from phyradgs_cl.operators.splats.projector import PAIR_KERNELS
-from phyradgs_cl.operators.splats.work import Work
-from phyradgs_cl.optim import Population
+from phyradgs_cl.acquisition import Exact, Motion, Scan
+from phyradgs_cl.acquisition.motion import motion_facts
+from phyradgs_cl.checks import ceil_div
+from phyradgs_cl.fields import Deformation, Gaussians, Grid
+from phyradgs_cl.fields.gaussians import SCALE
+from phyradgs_cl.operators import voxelise
+from phyradgs_cl.optim import Population, control_density
 from phyradgs_cl.reconstructors.checkpoint import State
 from phyradgs_cl.reconstructors.fdk import static_fdk
 from phyradgs_cl.reconstructors.loop import Loop
 from phyradgs_cl.reconstructors.method import Method
 from phyradgs_cl.reconstructors.result import ProgressReport, Reconstruction, ignore_progress, option_facts
-from phyradgs_cl.reconstructors.splats.device import Scale
+from phyradgs_cl.reconstructors.splats.device import DeviceCloud, Scale
 from phyradgs_cl.reconstructors.splats.options import PRESETS, R2_PUBLISHED, SplatOptions
-from phyradgs_cl.reconstructors.splats.run import SplatRun
-from phyradgs_cl.reconstructors.splats.start import first_population, internal_scale
+from phyradgs_cl.reconstructors.splats.start import box_of, first_population, internal_scale
+from phyradgs_cl.reconstructors.splats.step import Batch, FrameStep, sharing_of
 from phyradgs_cl.runtime import Runtime
 
 REPORT_EVERY, LEAST_RECORDED = 50, 20
+
+
+class SplatRun:
+    """The state of one optimisation, the same on every rank, as the ``Stepwise`` that a ``Loop`` runs."""
+
+    quantity, remedy, finished = "loss", "check the scan for extreme values", None
+
+    def __init__(
+        self, rt: Runtime, scan: Scan, options: SplatOptions, scale: Scale, population: Population,
+        rng: np.random.Generator, deformation: Deformation | None = None,
+    ) -> None:
+        self.rt, self.options, self.scale, self.rng = rt, options, scale, rng
+        self.grid = scan.grid.scaled(1 / scale.length_mm)
+        self.activation = options.activation(self.grid)
+        self.batch = options.batch_for(scan.frames, rt.ranks.size)
+        self.sharing = sharing_of(rt.ranks, self.batch)
+        self.frame_step = FrameStep(rt, scan, options, scale, self.grid, deformation)
+        self.frames, self.adam = self.frame_step.frames, self.frame_step.adam
+        self.iteration, self.iterations = 0, options.iterations
+        self.control_seconds, self.control_rounds = 0.0, 0
+        self._queue: list[int] = []
+        self.cloud = DeviceCloud(rt, population)
+
+    def step(self) -> None:
+        """Does one batch of frames: gradient, move, and density control where it is due."""
+        options, before = self.options, self.iteration
+        self.frame_step.follow(self.motion_at(before))
+        batch = self.next_batch()
+        self.cloud.activate(self.adam)
+        self.sharing.differentiate(self.frame_step, self.cloud, batch)
+        rates = options.rates.at(before / max(options.iterations, 1)) * np.sqrt(len(batch.frames))
+        self.iteration += len(batch.frames)
+        self.cloud.move(self.adam, rates, ceil_div(self.iteration, self.batch))
+        passed = range(before + 1, self.iteration + 1)
+        if any(options.control.is_due(iteration, options.iterations) for iteration in passed):
+            self.control_density()
+
+    def motion_at(self, iteration: int) -> Motion:
+        """Returns the motion model of an iteration. An object that moves needs its segments from the first one on."""
+        is_coarse = self.frames.scan.is_fly and self.frames.deformation is None
+        return self.options.motion_at(iteration / max(self.iterations, 1)) if is_coarse else self.options.motion
+
+    def phases(self) -> list[dict[str, object]]:
+        """Returns the motion models of the run, each with its first iteration."""
+        found: list[dict[str, object]] = []
+        for iteration in range(self.iterations):
+            facts = motion_facts(self.motion_at(iteration))
+            if not found or found[-1]["motion"] != facts:
+                found.append({"from": iteration, "motion": facts})
+        return found
+
+    def next_batch(self) -> Batch:
+        """Draws the frames of a step in random order, each once per pass."""
+        frames = []
+        for _ in range(min(self.batch, max(self.iterations - self.iteration, 1))):
+            if not self._queue:
+                self._queue = self.rng.permutation(self.frames.count).tolist()
+            frames.append(self._queue.pop())
+        corners = [self.frame_step.draw_corner(self.rng) for _ in frames]
+        return Batch(frames, corners, late=self.iteration >= self.options.parameter_terms_from)
+
+    def measures(self) -> dict[str, float]:
+        """Returns the mean loss of the last batch, and the number of Gaussians."""
+        return {"loss": self.sharing.loss(self.frame_step), "gaussians": self.cloud.count}
+
+    def control_density(self) -> None:
+        sums = self.cloud.read_statistics().astype(np.float64)
+        begun = time.perf_counter()  # the download has waited for the device
+        statistic = sums[0] / np.maximum(sums[1], 1)
+        population, box = self.cloud.population(), box_of(self.grid)
+        self._load(control_density(population, statistic, self.activation, self.options.control, box, self.rng))
+        self.control_seconds += time.perf_counter() - begun
+        self.control_rounds += 1
+
+    def _load(self, population: Population) -> None:
+        del self.cloud  # free the old arrays before the new ones are allocated
+        self.cloud = DeviceCloud(self.rt, population)
+
+    def state(self) -> dict[str, np.ndarray]:
+        """Returns the arrays that the next step depends on."""
+        population = self.cloud.population()
+        return {
+            "raw": population.raw, "moments": population.moments, "statistics": self.cloud.read_statistics(),
+            "iteration": np.array(self.iteration), "batch": np.array(self.batch),
+            "queue": np.array(self._queue, np.int64),
+            "rng": np.array(json.dumps(self.rng.bit_generator.state)),
+        }  # fmt: skip
+
+    def restore(self, state: State) -> None:
+        """Continues from ``state``, on any number of ranks up to the batch."""
+        self.iteration, self.batch = int(state["iteration"]), int(state["batch"])
+        self.sharing = sharing_of(self.rt.ranks, self.batch)
+        self.rng.bit_generator.state = json.loads(str(state["rng"]))
+        self._load(Population(state["raw"], state["moments"]))
+        self.cloud.write_statistics(state["statistics"])
+        self._queue = state["queue"].tolist()
+
+    def parameters(self) -> np.ndarray:
+        """Returns parameter rows (11, G) float64 in internal units."""
+        return self.activation.apply(self.cloud.population().raw.astype(np.float64))
+
+    def present_cloud(self) -> Gaussians:
+        """Returns the cloud in internal units, without Gaussians that density control would remove for their shape."""
+        rows = self.parameters()
+        return Gaussians.from_rows(rows[:, self.options.control.allows(rows[SCALE])])
+
+    def present_volume(self) -> tuple[np.ndarray, Grid]:
+        """Returns ``present_cloud`` as a volume (nz, ny, nx) in 1/mm, on the scan's grid in mm."""
+        cloud = self.present_cloud()
+        volume = voxelise(self.rt, cloud.rows(), self.grid, cutoff_sigma=self.options.cutoff_sigma)
+        return volume * np.float32(self.scale.density_per_mm), self.grid.scaled(self.scale.length_mm)
 
 
 def reconstruct_splats(
@@ -66,11 +180,8 @@ def reconstruct_splats(
         "ranks": rt.ranks.size,
     }  # fmt: skip
     if isinstance(options.motion, Exact):
-        # How the motion averaged over time: a frame's largest K, and the share of pairs by rule
-        facts |= {"segments": run.frames.most_cells, "time_rules": _first_frame_work(run).rule_shares()}
-        facts["motion_phases"] = run.phases()
-    if rt.profile:  # the Gaussian-pixel pairs that each kernel evaluates for the last cloud in the first frame
-        facts["evaluated_pairs"] = dict.fromkeys(PAIR_KERNELS, _first_frame_work(run).evaluated)
+        # a frame's largest K
+        facts |= {"segments": run.frames.most_cells, "motion_phases": run.phases()}
     cloud = cloud.scaled(scale.length_mm, scale.density_per_mm)
     return Reconstruction(volume, scan.grid, cloud, loop.record, facts, loop.state_if_interrupted())
 
@@ -85,12 +196,6 @@ def first_cloud(
     rng = np.random.default_rng(seed)
     grid = scan.grid.scaled(1 / scale.length_mm)
     return scale, first_population(first / scale.density_per_mm, grid, options, rng), rng
-
-
-def _first_frame_work(run: SplatRun) -> Work:
-    gaussians, cells, projector = run.cloud.gaussians, run.frames.cells(0), run.frame_step.projector
-    run.cloud.activate(run.adam)
-    return projector.work(gaussians, cells)
 
 
 def _r2(scan: Scan, options: SplatOptions, rt: Runtime, **arguments: Any) -> Reconstruction:

@@ -10,7 +10,7 @@ from phyradgs_cl.checks import ranged
 from phyradgs_cl.objective import TvDescent
 from phyradgs_cl.reconstructors.checkpoint import State
 from phyradgs_cl.reconstructors.fdk import static_fdk
-from phyradgs_cl.reconstructors.voxels.run import Algorithm, MethodInputs, voxel_method
+from phyradgs_cl.reconstructors.voxels.run import Algorithm, MethodRun, voxel_method
 from phyradgs_cl.reconstructors.voxels.sart import Sart, SartOptions, held_volumes
 from phyradgs_cl.reconstructors.voxels.system import System
 
@@ -70,10 +70,10 @@ class AsdPocs(Algorithm):
         self.tv_step = float(state["tv_step"])
 
 
-def _started(system: System, options: AsdPocsOptions, inputs: MethodInputs) -> AsdPocs:
-    start = system.space.array(static_fdk(inputs.rt, inputs.scan, inputs.deformation))
+def _started(system: System, options: AsdPocsOptions, run: MethodRun) -> AsdPocs:
+    start = system.space.array(static_fdk(run.rt, run.scan, run.deformation))
     epsilon = options.residual_share * system.space.norm(system.residual(start))
-    return AsdPocs(system, options, TvDescent(inputs.rt, inputs.scan.grid.shape), epsilon)
+    return AsdPocs(system, options, TvDescent(run.rt, run.scan.grid.shape), epsilon)
 
 
 METHOD = voxel_method(

@@ -10,6 +10,7 @@ them only bring a first volume: they have more subsets, and few times in an expo
 
 import logging
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, ClassVar
@@ -18,18 +19,16 @@ import numpy as np
 
 from phyradgs_cl import checks
 from phyradgs_cl.acquisition import Motion, PerRow, Scan
-from phyradgs_cl.acquisition.motion import with_times
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields.volume import MOST_VOXELS
 from phyradgs_cl.reconstructors.checkpoint import State
 from phyradgs_cl.reconstructors.method import Method
-from phyradgs_cl.reconstructors.result import Reconstruction, option_facts
+from phyradgs_cl.reconstructors.result import Reconstruction
 from phyradgs_cl.reconstructors.voxels import priors
-from phyradgs_cl.reconstructors.voxels.prior_weight import PriorWeight, frame_error
-from phyradgs_cl.reconstructors.voxels.priors import Denoiser, Prior
-from phyradgs_cl.reconstructors.voxels.run import Algorithm, IterativeOptions, MethodInputs, run_iterations
+from phyradgs_cl.reconstructors.voxels.priors import Denoiser, Prior, PriorWeight, frame_error
+from phyradgs_cl.reconstructors.voxels.run import Algorithm, Iterations, IterativeOptions, MethodRun
 from phyradgs_cl.reconstructors.voxels.sart import OrderedSubsets
-from phyradgs_cl.reconstructors.voxels.stages import Stage, merge_subvoxels, repeated, run_stages
+from phyradgs_cl.reconstructors.voxels.stages import Stage, Stages, merge_subvoxels, repeated
 from phyradgs_cl.reconstructors.voxels.system import System
 from phyradgs_cl.removed import refuse_removed
 from phyradgs_cl.runtime import Runtime
@@ -186,31 +185,29 @@ class Fista(Accelerated):
 
 
 def fista(scan: Scan, options: FistaOptions, rt: Runtime, **arguments: Any) -> Reconstruction:
-    """Returns the regularised volume of a scan in 1/mm. ``arguments``: the other ``MethodInputs``; no seed is used."""
-    inputs = MethodInputs(scan, options, rt, **arguments)
-    result = run_stages(fista_stages(inputs), inputs)
-    result.facts["options"] = option_facts(options)
-    return result
+    """Returns the regularised volume of a scan in 1/mm. ``arguments``: the others of ``MethodRun``; no seed is used."""
+    run = MethodRun(scan, options, rt, **arguments)
+    return run.result("fista", Stages(fista_stages(run, lambda: run), run))
 
 
 METHOD = Method(fista, {"default": FistaOptions()}, is_shared=True, takes_initial=True, takes_deformation=True)
 
 
-def fista_stages(inputs: MethodInputs) -> list[Stage]:
-    """Returns the passes on the scan's own voxels, and those on smaller ones if there are any."""
-    options = inputs.options
-    parts = options.subvoxels or (2 if _gains_from_subvoxels(inputs, 2) else 1)
+def fista_stages(run: MethodRun, now: Callable[[], MethodRun]) -> list[Stage]:
+    """Returns the passes on the scan's own voxels, and those on smaller ones if there are any. A stage that starts asks
+    ``now`` for its run, because the motion of the object may be known only then."""
+    options = run.options
+    parts = options.subvoxels or (2 if _gains_from_subvoxels(run, 2) else 1)
     first = round(_COARSE_PASSES * options.iterations) if parts > 1 else 0
     last = options.iterations - first
 
     def stage(name: str, passes: int, **how: Any) -> Stage:
-        own = replace(options, iterations=passes)
-        return Stage(name, passes, partial(fista_passes, options=own, image=inputs.initial, **how))
+        return Stage(name, passes, partial(fista_passes, now, passes, **how))
 
     if parts == 1:
         return [stage("voxels", last)]
     many = round(_COARSE_SUBSETS * options.subsets)
-    share = priors.subvoxel_share(options.prior, inputs.scan.grid.finer(parts).shape)
+    share = priors.subvoxel_share(options.prior, run.scan.grid.finer(parts).shape)
     fine = replace(stage("subvoxels", last, parts=parts), merge=partial(merge_subvoxels, parts=parts, share=share))
     return [stage("voxels", first, subsets=many, has_few_times=True), fine]
 
@@ -222,43 +219,41 @@ def _few_times(motion: Motion) -> Motion:
 
 
 def fista_passes(
-    inputs: MethodInputs, options: FistaOptions, image: np.ndarray | None = None, parts: int = 1, subsets: int = 0,
+    now: Callable[[], MethodRun], passes: int, volume: np.ndarray | None, parts: int = 1, subsets: int = 0,
     has_few_times: bool = False,
-) -> Reconstruction:  # fmt: skip
-    """Runs one stage, with every voxel divided into ``parts`` along each side. image: the prior image of piccs. subsets: in
+) -> Iterations:  # fmt: skip
+    """Returns one stage from a volume (nz, ny, nx), with every voxel divided into ``parts`` along each side. subsets: in
     place of those of the options. has_few_times: a third of the times in an exposure are enough."""
-    scan, rt = replace(inputs.scan, grid=inputs.scan.grid.finer(parts), reference=None, moving_truth=None), inputs.rt
-    motion = with_times(options.motion, inputs.scan, inputs.deformation)
-    options = replace(options, motion=_few_times(motion) if has_few_times and scan.is_fly else motion)
-    image, initial = repeated(image, parts), repeated(inputs.initial, parts)
-
-    def make(system: System) -> Fista:
-        volume_bytes = 4 * math.prod(scan.grid.shape)
-        is_on_host = isinstance(system.space, HostSpace)
-        held = _HELD + priors.volumes_of(options.prior)
-        is_short = is_on_host and system.leave_room(rt, (held + _COPIES) * volume_bytes)
-        error = frame_error(scan, options.motion)
-        prior_inputs = priors.PriorInputs(
-            rt, scan.grid, options.tv_iterations, image, options.prior_share, scan.is_fly, error.noise
-        )
-        prior = priors.prior_of(options.prior, prior_inputs)
-        with rt.ledger.reserved(_COPIES * volume_bytes if is_short else 0):
-            weight = PriorWeight(system, error, options.prior_weight)
-            count, clips = subsets or options.subsets, options.nonnegative
-            return Fista(system, prior, weight, subsets=count, nonnegative=clips, has_long_steps=True)
-
-    stage_inputs = replace(inputs, scan=scan, options=options, initial=initial)
-    volumes = _VOLUMES + priors.volumes_of(options.prior)
-    return run_iterations("fista", make, stage_inputs, volumes=volumes, frames=_FRAMES)
+    whole = now()
+    scan = replace(whole.scan, grid=whole.scan.grid.finer(parts), reference=None, moving_truth=None)
+    options, rt = replace(whole.options, iterations=passes), whole.rt
+    if has_few_times and scan.is_fly:
+        options = replace(options, motion=_few_times(options.motion))
+    run = replace(whole, scan=scan, options=options, initial=repeated(volume, parts), resume=None)
+    system = run.system(volumes=_VOLUMES + priors.volumes_of(options.prior), frames=_FRAMES)
+    volume_bytes = 4 * math.prod(scan.grid.shape)
+    is_on_host = isinstance(system.space, HostSpace)
+    held = _HELD + priors.volumes_of(options.prior)
+    is_short = is_on_host and system.leave_room(rt, (held + _COPIES) * volume_bytes)
+    error, image = frame_error(scan, options.motion), repeated(whole.initial, parts)
+    prior_inputs = priors.PriorInputs(
+        rt, scan.grid, options.tv_iterations, image, options.prior_share, scan.is_fly, error.noise
+    )
+    prior = priors.prior_of(options.prior, prior_inputs)
+    with rt.ledger.reserved(_COPIES * volume_bytes if is_short else 0):
+        weight = PriorWeight(system, error, options.prior_weight)
+        count, clips = subsets or options.subsets, options.nonnegative
+        method = Fista(system, prior, weight, subsets=count, nonnegative=clips, has_long_steps=True)
+    return Iterations(method, run)
 
 
-def _gains_from_subvoxels(inputs: MethodInputs, parts: int) -> bool:
+def _gains_from_subvoxels(run: MethodRun, parts: int) -> bool:
     """Whether the grid is small enough for smaller voxels, and every rank's device holds the method's volumes of them."""
-    shape, rt = inputs.scan.grid.shape, inputs.rt
+    shape, rt = run.scan.grid.shape, run.rt
     if math.prod(shape[1:]) > _MOST_DIVIDED:
         return False
     voxels = math.prod(shape) * parts**3
-    sizes_bytes = *[4 * voxels] * (_VOLUMES + 2), 4 * voxels * priors.volumes_of(inputs.options.prior)
+    sizes_bytes = *[4 * voxels] * (_VOLUMES + 2), 4 * voxels * priors.volumes_of(run.options.prior)
     has_room = voxels <= MOST_VOXELS and rt.room().holds(*sizes_bytes)
     if rt.ranks.any(not has_room):
         text = "fista: the device has no room for voxels half as large in the last passes (%.3g MiB): the result is less "

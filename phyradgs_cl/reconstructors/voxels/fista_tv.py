@@ -9,7 +9,7 @@ from phyradgs_cl.checks import ranged
 from phyradgs_cl.objective import TvProx
 from phyradgs_cl.reconstructors.voxels.fista import Accelerated
 from phyradgs_cl.reconstructors.voxels.priors import TvPrior, axis_weights
-from phyradgs_cl.reconstructors.voxels.run import IterativeOptions, MethodInputs, voxel_method
+from phyradgs_cl.reconstructors.voxels.run import IterativeOptions, MethodRun, voxel_method
 from phyradgs_cl.reconstructors.voxels.system import System
 
 
@@ -57,9 +57,9 @@ class FistaTv(Accelerated):
         return space.norm(system.difference(system.measured, self.projected))
 
 
-def _started(system: System, options: FistaTvOptions, inputs: MethodInputs) -> FistaTv:
-    grid = inputs.scan.grid
-    return FistaTv(system, options, TvProx(inputs.rt, grid.shape, axis_weights(grid)))
+def _started(system: System, options: FistaTvOptions, run: MethodRun) -> FistaTv:
+    grid = run.scan.grid
+    return FistaTv(system, options, TvProx(run.rt, grid.shape, axis_weights(grid)))
 
 
 METHOD = voxel_method("fista-tv", FistaTvOptions(), _started, volumes=12, frames=3)

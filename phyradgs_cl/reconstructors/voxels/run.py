@@ -1,11 +1,11 @@
 """Runs an iterative voxel method on a scan: its options, its inputs, its convergence, the facts of its result.
 
-A method is a subclass of ``Algorithm``. ``voxel_method`` makes it an entry of the registry; ``run_iterations`` runs it."""
+A method is a subclass of ``Algorithm``. ``voxel_method`` makes it an entry of the registry, and ``MethodRun`` runs it."""
 
 import time
-from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Any, ClassVar
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any, ClassVar, Protocol
 
 import numpy as np
 
@@ -15,7 +15,7 @@ from phyradgs_cl.acquisition.motion import RAYS, check_motion, motions_for
 from phyradgs_cl.acquisition.scan import DETECTOR_MODELS
 from phyradgs_cl.fields import Deformation, Grid
 from phyradgs_cl.reconstructors.checkpoint import State
-from phyradgs_cl.reconstructors.loop import Loop
+from phyradgs_cl.reconstructors.loop import Loop, Stepwise
 from phyradgs_cl.reconstructors.method import Method
 from phyradgs_cl.reconstructors.result import ProgressReport, Reconstruction, ignore_progress, option_facts
 from phyradgs_cl.reconstructors.voxels.system import System
@@ -91,10 +91,17 @@ class Algorithm:
         self.system.linearise_at(self.volume)
 
 
+class WithFacts(Stepwise, Protocol):
+    """A method with facts of its own for the result."""
+
+    def facts(self, is_complete: bool) -> Mapping[str, object]:
+        """Returns them after the last step, of a run that came to its end or of an interrupted one."""
+
+
 @dataclass(frozen=True, eq=False)
-class MethodInputs:
-    """The arguments of one run: scan, options, device, seed, report, the state to resume from, the first volume in 1/mm, how
-    the object moves, and the times in s of its states if it changes."""
+class MethodRun:
+    """One run: scan, options, device, seed, report, the state to resume from, the first volume in 1/mm, how the object
+    moves, and the times in s of its states if it changes. Seconds count from ``started``."""
 
     scan: Scan
     options: Any
@@ -105,70 +112,64 @@ class MethodInputs:
     initial: np.ndarray | None = None
     deformation: Deformation | None = None
     state_times_s: np.ndarray | None = None
+    started: float = field(default_factory=time.perf_counter)
 
+    def system(self, *, volumes: int, frames: int) -> System:
+        """Returns the scan's system, for an algorithm that holds ``volumes`` volumes and ``frames`` stacks of all frames at
+        one time, its tables included. They stay on the device where it has room for them."""
+        system = System.of_scan(
+            self.rt, self.scan, self.options.motion, self.options.detector_model, deformation=self.deformation,
+            state_times_s=self.state_times_s, is_dense=self.initial is not None,
+        )  # fmt: skip
+        if self.options.transmission_weights:
+            system = system.transmission_weighted()
+        return system.resident(self.rt, volumes + 2, frames + _SYSTEM_FRAMES)
 
-def run_iterations(
-    method: str, make: Callable[[System], Algorithm], inputs: MethodInputs, *, volumes: int, frames: int
-) -> Reconstruction:
-    """Builds the scan's system, runs the method on it, and returns volume, record and facts.
+    def result(self, name: str, method: WithFacts) -> Reconstruction:
+        """Runs a method in a loop; returns volume, record and facts.
 
-    The method holds ``volumes`` volumes and ``frames`` stacks of all frames at one time, its tables included. They stay on
-    the device where it has room for them. The record has a line per iteration: the residual ‖p − A x‖/‖p‖, the change
-    ‖x − x'‖/‖x‖, and the seconds since the start."""
-    started = time.perf_counter()
-    scan, options, rt = inputs.scan, inputs.options, inputs.rt
-    system = System.of_scan(
-        rt, scan, options.motion, options.detector_model, deformation=inputs.deformation,
-        state_times_s=inputs.state_times_s, is_dense=inputs.initial is not None,
-    )  # fmt: skip
-    if options.transmission_weights:
-        system = system.transmission_weighted()
-    system = system.resident(rt, volumes + 2, frames + _SYSTEM_FRAMES)
-    algorithm = make(system)
-    if inputs.initial is not None and inputs.resume is None:
-        algorithm.start_from(system.space.array(np.ascontiguousarray(inputs.initial, np.float32)))
-    run = _Iterations(algorithm, options, scan.grid)
-    loop = Loop(run, rt.ranks, inputs.report, started)
-    loop.run(inputs.resume)
-    facts: dict[str, object] = {
-        "method": method, "options": option_facts(options),
-        "detector_model": "log" if system.intensity is None else "intensity", "iterations": run.iteration,
-        "stopped_by": loop.stopped_by, "seconds": loop.seconds, "interrupted_at": loop.interrupted_at,
-        "ranks": rt.ranks.size,
-    }  # fmt: skip
-    (volume, _), state = run.present_volume(), loop.state_if_interrupted()
-    return Reconstruction(volume, scan.grid, record=loop.record, facts=facts, state=state)
+        The record has a line per iteration: the residual ‖p − A x‖/‖p‖, the change ‖x − x'‖/‖x‖, and the seconds since the
+        start."""
+        loop = Loop(method, self.rt.ranks, self.report, self.started)
+        loop.run(self.resume)
+        facts: dict[str, object] = {
+            "method": name, "options": option_facts(self.options), **method.facts(loop.interrupted_at is None),
+            "iterations": method.iteration, "stopped_by": loop.stopped_by, "seconds": loop.seconds,
+            "interrupted_at": loop.interrupted_at, "ranks": self.rt.ranks.size,
+        }  # fmt: skip
+        volume, grid = method.present_volume()
+        return Reconstruction(volume, grid, record=loop.record, facts=facts, state=loop.state_if_interrupted())
 
 
 def voxel_method(
-    name: str, default: IterativeOptions, make: Callable[[System, Any, MethodInputs], Algorithm], *,
+    name: str, default: IterativeOptions, make: Callable[[System, Any, MethodRun], Algorithm], *,
     volumes: int | Callable[[Scan, Any], int], frames: int,
 ) -> Method:
-    """Returns an algorithm as a method. ``volumes`` and ``frames`` as in ``run_iterations``; a function gives volumes."""
+    """Returns an algorithm as a method. ``volumes`` and ``frames`` as in ``MethodRun.system``; a function gives volumes."""
 
-    def run(scan: Scan, options: Any, rt: Runtime, **arguments: Any) -> Reconstruction:
-        inputs = MethodInputs(scan, options, rt, **arguments)
-        held = volumes(scan, options) if callable(volumes) else volumes
-        return run_iterations(
-            name, lambda system: make(system, options, inputs), inputs, volumes=held, frames=frames
-        )
+    def reconstruct(scan: Scan, options: Any, rt: Runtime, **arguments: Any) -> Reconstruction:
+        run = MethodRun(scan, options, rt, **arguments)
+        system = run.system(volumes=volumes(scan, options) if callable(volumes) else volumes, frames=frames)
+        return run.result(name, Iterations(make(system, options, run), run))
 
-    return Method(run, {"default": default}, is_shared=True, takes_initial=True, takes_deformation=True)
+    return Method(reconstruct, {"default": default}, is_shared=True, takes_initial=True, takes_deformation=True)
 
 
-class _Iterations:
+class Iterations:
     """An algorithm and its convergence, as the ``Stepwise`` that a ``Loop`` runs."""
 
     quantity, remedy = "residual", "check the scan for extreme values, or lower the relaxation"
 
-    def __init__(self, algorithm: Algorithm, options: IterativeOptions, grid: Grid) -> None:
-        self.algorithm, self.options, self.grid = algorithm, options, grid
-        self.iteration, self.iterations = 0, options.iterations
+    def __init__(self, algorithm: Algorithm, run: MethodRun) -> None:
+        self.algorithm, self.options, self.grid = algorithm, run.options, run.scan.grid
+        self.iteration, self.iterations = 0, run.options.iterations
         self.residual, self.change = 0.0, 0.0
         system = algorithm.system
+        if run.initial is not None and run.resume is None:
+            algorithm.start_from(system.space.array(np.ascontiguousarray(run.initial, np.float32)))
         self.measured_norm = system.space.norm(system.measured) or 1.0
-        noise = system.noise_norm() if options.noise_stop else 0.0
-        self.noise_residual = options.noise_stop * noise / self.measured_norm
+        noise = system.noise_norm() if run.options.noise_stop else 0.0
+        self.noise_residual = run.options.noise_stop * noise / self.measured_norm
 
     @property
     def finished(self) -> str | None:
@@ -185,6 +186,9 @@ class _Iterations:
 
     def measures(self) -> dict[str, float]:
         return {"residual": self.residual, "change": self.change}
+
+    def facts(self, is_complete: bool) -> dict[str, object]:
+        return {"detector_model": "log" if self.algorithm.system.intensity is None else "intensity"}
 
     def state(self) -> dict[str, np.ndarray]:
         return {**self.algorithm.state(), "iteration": np.array(self.iteration)}

@@ -3,101 +3,113 @@
 ``fista`` reconstructs voxels, then subvoxels: coarse voxels cannot represent edges. The last passes therefore run on voxels
 half as large; their block means make up most of the result."""
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
-from functools import partial
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.metrics.align import block_means
-from phyradgs_cl.reconstructors.checkpoint import State, history_arrays, history_of
-from phyradgs_cl.reconstructors.result import Progress, Reconstruction, Report
-from phyradgs_cl.reconstructors.voxels.run import MethodInputs
+from phyradgs_cl.reconstructors.checkpoint import State
+from phyradgs_cl.reconstructors.voxels.run import MethodRun, WithFacts
 
 _STAGE, _VOLUME = "stage", "volume_before"  # entries of a state: the present stage, and the volume that it started from
-_HISTORY = {"record": "record_before", "seconds": "seconds_before"}
 
 
 @dataclass(frozen=True)
 class Stage:
-    """One stage: its number of iterations and a function that runs them.
+    """One stage: its number of iterations, and a function that makes its method, to start from a volume (nz, ny, nx).
 
-    ``merge`` combines the stage's volume and that of the stages before it to the result of the whole run (nz, ny, nx)."""
+    ``merge`` combines the stage's volume and that of the stages before it to the result of the whole run (nz, ny, nx).
+    ``end`` is called with the finished method."""
 
     name: str
     iterations: int
-    run: Callable[[MethodInputs], Reconstruction]
+    make: Callable[[np.ndarray | None], WithFacts]
     merge: Callable[[np.ndarray, np.ndarray | None], np.ndarray] = lambda volume, before: volume
+    end: Callable[[Any], object] = lambda method: None
 
 
-@dataclass
-class StageProgress:
-    """The result of the finished stages: volume, iterations, seconds and record; ``index``: the present stage."""
+class Stages:
+    """One stage after the other as one ``Stepwise``, which a ``Loop`` runs, reports, stops and resumes.
 
-    volume: np.ndarray | None
-    index: int = 0
-    iterations: int = 0
-    seconds: float = 0.0
-    record: list[dict[str, float]] = field(default_factory=list)
-
-    def state(self, stage_state: State) -> State:
-        """Returns the state of the present stage as one of the whole run."""
-        history = history_arrays(self.record, self.seconds)
-        volume = {} if self.index == 0 or self.volume is None else {_VOLUME: self.volume}
-        history = {_HISTORY[name]: array for name, array in history.items()}
-        return {**stage_state, **volume, **history, _STAGE: np.array(self.index)}
-
-    def restore(self, state: State, stages: Sequence[Stage]) -> State:
-        """Continues from ``state``. Returns the present stage's own."""
-        self.index = int(state[_STAGE])
-        if self.index:
-            self.volume = state[_VOLUME]
-        self.record, self.seconds = history_of({name: state[stored] for name, stored in _HISTORY.items()})
-        self.iterations = sum(stage.iterations for stage in stages[: self.index])
-        return {name: array for name, array in state.items() if name not in (_STAGE, _VOLUME, *_HISTORY.values())}
-
-    def finish(self, stage: Stage, result: Reconstruction) -> None:
-        """Adds a stage's record and seconds."""
-        shifted = [{**line, "iteration": self.iterations + line["iteration"]} for line in result.record]
-        self.record = self.record + shifted
-        self.seconds += result.facts["seconds"]
+    The first stage starts from the run's first volume, if any."""
 
 
-def run_stages(stages: Sequence[Stage], inputs: MethodInputs) -> Reconstruction:
-    """Runs one stage after the other as one run, which is reported, stopped and resumed as such.
+    def __init__(self, stages: Sequence[Stage], run: MethodRun) -> None:
+        self.stages, self.grid = stages, run.scan.grid
+        self.before = run.initial
+        self.iterations = sum(stage.iterations for stage in stages)
+        self._facts: dict[str, Any] = {"stages": {}}
+        index = 0
+        if run.resume is not None:
+            index, self.before = int(run.resume[_STAGE]), run.resume.get(_VOLUME, run.initial)
+        self.stage, self._index, self._started = stages[index], index, run.started
+        self.method: WithFacts = self.stage.make(self.before)
 
-    Iterations, seconds and the record are those of all stages; the other facts are the last stage's. The fact ``stages``
-    lists the iterations and seconds of each."""
-    progress, stage_facts, grid = StageProgress(inputs.initial), {}, inputs.scan.grid
-    resume = None if inputs.resume is None else progress.restore(inputs.resume, stages)
-    report, total = Report.of(inputs.report), sum(stage.iterations for stage in stages)
-    for stage in stages[progress.index :]:
-        with report.through(partial(_of_whole_run, stage, progress, total, grid)):
-            result = stage.run(replace(inputs, initial=progress.volume, report=report, resume=resume))
-        volume, state = stage.merge(result.volume, progress.volume), result.state
-        state = None if state is None else progress.state(state)
-        iterations, interrupted_at = result.facts.get("iterations", stage.iterations), result.facts["interrupted_at"]
-        stage_facts[stage.name] = {"iterations": iterations, "seconds": result.facts["seconds"]}
-        progress.finish(stage, result)
-        if interrupted_at is not None or stage is stages[-1]:
-            break
-        resume, progress.volume = None, volume
-        progress.index, progress.iterations = progress.index + 1, progress.iterations + stage.iterations
-    facts: dict[str, Any] = {**result.facts, "stages": stage_facts, "seconds": progress.seconds}
-    facts["iterations"] = progress.iterations + iterations
-    facts["interrupted_at"] = None if interrupted_at is None else progress.iterations + interrupted_at
-    return Reconstruction(volume, grid, record=progress.record, facts=facts, state=state)
+    @property
+    def quantity(self) -> str:
+        return self.method.quantity
 
+    @property
+    def remedy(self) -> str:
+        return self.method.remedy
 
-def _of_whole_run(stage: Stage, done: StageProgress, total: int, grid: Grid, progress: Progress) -> Progress:
-    """Returns the progress of one stage as that of the whole run."""
-    return progress.mapped(
-        state=done.state, volume=lambda volume, _: (stage.merge(volume, done.volume), grid),
-        iteration=done.iterations + progress.iteration, iterations=total,
-        seconds=done.seconds + progress.seconds,
-    )
+    @property
+    def iteration(self) -> int:
+        return sum(stage.iterations for stage in self.stages[: self._index]) + self.method.iteration
+
+    @property
+    def is_last(self) -> bool:
+        """Whether no stage follows the present one."""
+        return self._index == len(self.stages) - 1
+
+    @property
+    def finished(self) -> str | None:
+        return self.method.finished if self.is_last else None
+
+    def step(self) -> None:
+        while not self.is_last and (self.method.iteration >= self.stage.iterations or self.method.finished):
+            self.advance()
+        self.method.step()
+
+    def advance(self) -> None:
+        """Ends the present stage, and frees its memory before the next one takes its own."""
+        self.before, _ = self.present_volume()
+        self.stage.end(self.method)
+        self._note()
+        self._index, self._started = self._index + 1, time.perf_counter()
+        self.stage = self.stages[self._index]
+        del self.method
+        self.method = self.stage.make(self.before)
+
+    def _note(self) -> None:
+        seconds = time.perf_counter() - self._started
+        self._facts["stages"][self.stage.name] = {"iterations": self.method.iteration, "seconds": seconds}
+        self._facts.update(self.method.facts(True))
+
+    def facts(self, is_complete: bool) -> Mapping[str, object]:
+        """Returns the facts of the last stage, with the iterations of each stage, and its seconds in this process. A
+        complete run ends its stages without iterations first."""
+        while is_complete and not self.is_last:
+            self.advance()
+        self._note()
+        return self._facts
+
+    def measures(self) -> Mapping[str, float]:
+        return self.method.measures()
+
+    def state(self) -> dict[str, np.ndarray]:
+        volume = {} if self._index == 0 or self.before is None else {_VOLUME: self.before}
+        return {**self.method.state(), **volume, _STAGE: np.array(self._index)}
+
+    def restore(self, state: State) -> None:
+        self.method.restore(state)
+
+    def present_volume(self) -> tuple[np.ndarray, Grid]:
+        return self.stage.merge(self.method.present_volume()[0], self.before), self.grid
 
 
 def repeated(volume: np.ndarray | None, parts: int) -> np.ndarray | None:

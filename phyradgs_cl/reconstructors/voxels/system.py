@@ -125,28 +125,34 @@ class System:
 
     def forward(self, volume: Any) -> Any:
         """Returns A x at the valid pixels."""
-        return self._projected(self.operator.forward, volume)
+        return self.masked(self.operator.forward(volume, self.space.place(self.operator.frames_shape)))
 
     def adjoint(self, frames: Any) -> Any:
         """Returns Aᵀ y of frames that are 0 at pixels that are not valid."""
-        return self.space.apply(self.operator.adjoint, frames, self.volume_shape)
+        return self.operator.adjoint(frames, self.space.place(self.volume_shape))
 
     def expected(self, volume: Any) -> Any:
         """Returns the measurement expected of x at the valid pixels: A x, or I(x) in the intensity model."""
-        return self._projected(self.operator.forward if self.intensity is None else self.intensity.expected, volume)
+        return self.masked(self._model(volume, self.space.place(self.operator.frames_shape)))
+
+    @property
+    def _model(self) -> Callable[..., Any]:
+        return self.operator.forward if self.intensity is None else self.intensity.expected
 
     def derivative(self, change: Any) -> Any:
         """Returns A d, or J d: the change in ``expected`` for a change d of the last volume compared."""
-        return self._projected((self.operator if self.intensity is None else self.intensity).forward, change)
+        operator = self.operator if self.intensity is None else self.intensity
+        return self.masked(operator.forward(change, self.space.place(self.operator.frames_shape)))
 
     def back(self, frames: Any) -> Any:
         """The transpose of ``derivative``: Aᵀ y, or Jᵀ y, of frames that are 0 at pixels that are not valid."""
         operator = self.operator if self.intensity is None else self.intensity
-        return self.space.apply(operator.adjoint, frames, self.volume_shape)
+        return operator.adjoint(frames, self.space.place(self.volume_shape))
 
     def residual(self, volume: Any) -> Any:
         """Returns p − A x, or p − I(x), dimensionless."""
-        return self.difference(self.measured, self.expected(volume))
+        expected = self._model(volume, self.space.place(self.operator.frames_shape))
+        return self.space.add(self.measured, self.masked(expected), -1.0)
 
     def difference(self, x: Any, y: Any) -> Any:
         """Returns x − y."""
@@ -191,9 +197,6 @@ class System:
             transmission=None if self.transmission is None else self.space.take(self.transmission, numbers),
         )
 
-    def _projected(self, function: Callable[..., Any], volume: Any) -> Any:
-        return self.masked(self.space.apply(function, volume, self.operator.frames_shape))
-
 
 def row_weights(system: System) -> Any:
     """Returns 1/(A 1) of every ray in 1/mm.
@@ -222,11 +225,11 @@ class SharedOperator:
         self._own = slice(run.start, run.stop)
         self._part = whole.subset(list(run)) if len(run) else None
 
-    def forward(self, volume: np.ndarray) -> np.ndarray:
-        """A x: volume (nz, ny, nx) 1/mm to frames (F, rows, columns) float32."""
+    def forward(self, volume: np.ndarray, out: None = None) -> np.ndarray:
+        """A x: volume (nz, ny, nx) 1/mm to frames (F, rows, columns) float32, in new memory of the host."""
         return self._gathered(None if self._part is None else self._part.forward(volume))
 
-    def adjoint(self, frames: np.ndarray) -> np.ndarray:
+    def adjoint(self, frames: np.ndarray, out: None = None) -> np.ndarray:
         """Aᵀ y: frames (F, rows, columns) to a volume (nz, ny, nx) float32."""
         shape = (self.volume_shape[0], self.volume_shape[1] * self.volume_shape[2])
         parts = [] if self._part is None else [self._part.adjoint(frames[self._own]).reshape(shape)]
@@ -247,6 +250,6 @@ class SharedIntensity(SharedOperator):
     whole: IntensityOperator
     _part: IntensityOperator | None
 
-    def expected(self, volume: np.ndarray) -> np.ndarray:
+    def expected(self, volume: np.ndarray, out: None = None) -> np.ndarray:
         """Returns I(x) (F, rows, columns) float32 of a volume (nz, ny, nx) in 1/mm. J is that at x from then on."""
         return self._gathered(None if self._part is None else self._part.expected(volume))

@@ -1,0 +1,283 @@
+"""Scans × settings × seeds: the file of a sweep, checked before any run; the runs, made one after the other or by Dask's
+workers; their lines in one results file, and the table of means over scans and seeds."""
+
+import functools
+import glob
+import hashlib
+import itertools
+import json
+import logging
+import math
+import os
+import platform
+import signal
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import CancelledError
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from phyradgs_cl import __version__, checks
+from phyradgs_cl.errors import InputError, NumericalError, OutOfMemoryError, OutputError, PhyradgsError
+from phyradgs_cl.io import only_run, written_beside
+from phyradgs_cl.io.hdf5.source import open_hdf5
+from phyradgs_cl.io.output import BusyError, make_folder, shortened
+from phyradgs_cl.io.scan.header import read_header
+from phyradgs_cl.io.tables import read_toml, refuse_unknown
+from phyradgs_cl.metrics import HELD_OUT, METRICS
+from phyradgs_cl.reconstructors import (
+    DEFAULT_METHOD,
+    ProgressReport,
+    RunPlan,
+    ignore_progress,
+    method_name,
+    plan_run,
+)
+from phyradgs_cl.runtime import DEVICE_VARIABLE, Runtime, choose_device
+from phyradgs_cl.runtime.device import environment
+from phyradgs_cl.signals import finish_despite_interrupt, keep_finished_work
+from phyradgs_cl.text import flattened, nested, plain_text
+from phyradgs_cl.workflow.files import expecting
+from phyradgs_cl.workflow.reconstruct import is_complete, resume_or_restart
+
+log = logging.getLogger(__name__)
+RESULTS, TABLE = "results.jsonl", "results.md"
+_RETRIES, _CONNECT_S, _BUSY_S = 3, 10.0, 20.0
+# other machines must not send work to this one
+_LOCAL = {"host": "127.0.0.1", "dashboard_address": "127.0.0.1:0", "silence_logs": logging.CRITICAL}
+Line = dict[str, Any]
+
+runtime_of_process = functools.cache(Runtime)  # built kernels stay from run to run
+
+
+@dataclass(frozen=True)
+class SweepRun:
+    """One reconstruction, as a worker gets it. facts: how its line in the results file begins; ``run`` is its name."""
+
+    scan: Path
+    plan: RunPlan
+    output: Path
+    facts: dict[str, Any]
+    checkpoint_every_s: float
+
+
+def plan_sweep(path: Path, folder: Path, checkpoint_every_s: float = 600.0) -> list[SweepRun]:
+    """Returns every run of the file GRID.toml, scan by scan. Volumes go to ``folder``/volumes. Patterns start at the folder
+    of ``path``. A name stands for a scan (path, size, time), a setting and a seed. Raises InputError for everything that
+    would stop a run: unknown keys, values out of range, patterns that match nothing, files that are no scans."""
+    document = read_toml(path, f"GRID {path}")
+    refuse_unknown(f"{path}:", document, ("scans", "seeds", "options", "grid", "runs"))
+    patterns = _list(document.get("scans"), str, f"{path}: scans", 'a list of files or patterns, as ["scans/*.h5"]')
+    seeds = dict.fromkeys(_list(document.get("seeds", [0]), int, f"{path}: seeds", "a list of whole numbers"))
+    settings, runs = list(_settings(document, path)), []
+    for scan in dict.fromkeys(scan for pattern in patterns for scan in _files(pattern, path)):
+        with expecting(scan, "scan"), open_hdf5(scan) as source:
+            read_header(source)
+        version = [str(scan), scan.stat().st_size, scan.stat().st_mtime_ns]
+        for values, seed in itertools.product(settings, seeds):
+            plan = _plan(values, seed, str(path))
+            label = " ".join([plan.method_name, *(f"{n}={value}" for n, value in values.items() if n != "method")])
+            digest = hashlib.sha256(json.dumps([version, values], sort_keys=True, default=str).encode()).hexdigest()[:10]
+            name = f"{shortened(plain_text(scan.stem), 80)}_{plan.method_name}_{digest}_s{seed}"
+            facts = {"run": name, "scan": str(scan), "method": plan.method_name, "options": values, "label": label}
+            facts |= {"seed": seed, "volume": f"volumes/{name}.h5"}
+            runs.append(SweepRun(scan, plan, folder.resolve() / str(facts["volume"]), facts, checkpoint_every_s))
+    return list({run.facts["run"]: run for run in runs}.values())
+
+
+def _list(values: Any, kind: type, subject: str, expected: str) -> list[Any]:
+    if not (isinstance(values, list) and values and all(type(value) is kind for value in values)):
+        raise InputError(subject, checks.short_repr(values), expected)
+    return values
+
+
+def _files(pattern: str, path: Path) -> list[Path]:
+    folder = path.resolve().parent
+    files = sorted(name for name in glob.glob(str(folder / pattern), recursive=True) if os.path.isfile(name))
+    if not files:
+        remedy = f"patterns start at the folder of the file, {folder}"
+        raise InputError(f"{path}: scans", f"no file for {pattern!r}", "at least one scan file", remedy)
+    return [Path(os.path.abspath(name)) for name in files]
+
+
+def _settings(document: Mapping[str, Any], path: Path) -> Iterator[dict[str, Any]]:
+    """Yields the options of every setting by dotted name: combinations of the lists of [[grid]], and [[runs]]."""
+    keys = [key for key in ("grid", "runs") if key in document]
+    if not keys:
+        remedy = "write for example [[grid]] with method = ['fdk', 'sirt']"
+        raise InputError(str(path), "neither [[grid]] nor [[runs]]", "at least one of them", remedy)
+    (shared,) = _list([document.get("options", {})], dict, f"{path}: options", "a table")
+    for key in keys:
+        for table in _list(document[key], dict, f"{path}: {key}", f"tables that begin with [[{key}]]"):
+            stated = dict(flattened(table))
+            lists = [value if isinstance(value, list) and key == "grid" else [value] for value in stated.values()]
+            if [] in lists:
+                raise InputError(f"{path}: [[grid]]", "an empty list", "the values to try")
+            for values in itertools.product(*lists):
+                yield {**dict(flattened(shared)), **dict(zip(stated, values, strict=True))}
+
+
+def _plan(values: Mapping[str, Any], seed: int, where: str) -> RunPlan:
+    """Returns the plan of a run; its errors state the values."""
+    options = nested(values)
+    method, preset = options.pop("method", DEFAULT_METHOD), options.pop("preset", None)
+    try:
+        return plan_run(method_name(method), options, preset=preset, seed=seed)
+    except PhyradgsError as error:
+        stated = ", ".join(f"{name}={checks.short_repr(value)}" for name, value in values.items())
+        raise type(error)(f"{where} ({stated}): {error.subject}", error.found, error.expected, error.remedy) from error
+
+
+def run_sweep(
+    runs: Sequence[SweepRun], folder: Path, workers: str | None = None, device: str | None = None, *,
+    tell: Callable[[int, Line], object] = lambda done, line: None, report: ProgressReport = ignore_progress,
+) -> int:  # fmt: skip
+    """Makes the runs that the results file lacks, then the table, results.md. Returns the number of runs that failed now,
+    which the next call makes again. workers: a number of Dask's workers on this machine, or the address of a Dask scheduler;
+    None makes the runs here. ``tell`` gets the number of finished runs and the last line. Raises OutputError where the
+    folder cannot be written, BusyError while another sweep uses it, InputError for no scheduler or a missing package."""
+    make_folder(folder / "volumes", folder)
+    with only_run(folder / RESULTS):
+        newest = {line["run"]: line for line in read_lines(folder / RESULTS)}
+        missing = [run for run in runs if "error" in newest.get(run.facts["run"], {"error": "not made"})]
+        done, failed = len(runs) - len(missing), 0
+        lines = _made_here(missing, device, report)
+        if workers is not None and missing:
+            lines = _made_by_workers(missing, workers, device, folder / "workers.html")
+        for line in lines:
+            with finish_despite_interrupt():
+                append_line(folder / RESULTS, line)
+            newest[line["run"]] = line
+            done, failed = done + 1, failed + ("error" in line)
+            tell(done, line)
+        with finish_despite_interrupt(), written_beside(folder / TABLE) as temporary:
+            temporary.write_text(markdown([newest[run.facts["run"]] for run in runs], len(runs)), encoding="utf-8")
+        return failed
+
+
+def _made_here(runs: Sequence[SweepRun], device: str | None, report: ProgressReport) -> Iterator[Line]:
+    for run in runs:
+        runtime_of_process(device)  # a missing device is not the error of a run
+        with keep_finished_work():  # a finished run is kept, then the sweep stops
+            try:
+                line = make_run(run, report, device)
+            except Exception as error:
+                line = _failed(run, error)
+            yield line
+
+
+def _made_by_workers(runs: Sequence[SweepRun], workers: str, device: str | None, page: Path) -> Iterator[Line]:
+    """Yields lines as the runs finish, and writes Dask's page about them."""
+    os.environ.setdefault("DASK_DISTRIBUTED__SCHEDULER__WORKER_SATURATION", "1.0")  # a death counts against one run only
+    dask = checks.package("distributed", "the package that --workers needs", "phyradgs-cl[cluster]")
+    logging.getLogger("distributed.client").setLevel(logging.CRITICAL)  # an error of ours says it
+    count, where = int(workers) if workers.isdigit() else None, {"address": workers, "timeout": _CONNECT_S}
+    if count is not None:
+        checks.within("--workers", count, 1, 1024)
+        choose_device(device)
+        where = {"n_workers": count, "threads_per_worker": 1, "memory_limit": None, **_LOCAL}
+    try:
+        with dask.Client(**where) as client, dask.performance_report(str(page)):
+            if count is not None:
+                client.register_worker_callbacks(functools.partial(_begin, device))
+                client.cluster.adapt(minimum=count, maximum=count)  # else a worker that dies early is not replaced
+                device = None  # each has its own
+            run_of = {client.submit(make_run, run, device=device, retries=_RETRIES, pure=False): run for run in runs}
+            for future in dask.as_completed(list(run_of)):
+                run = run_of.pop(future)
+                failure = None if future.cancelled() else future.exception()
+                yield future.result() if failure is None else _failed(run, failure)
+    except (TimeoutError, dask.TimeoutError, CancelledError, OSError, RuntimeError, ValueError) as error:
+        expected, remedy = "a number of processes, or the address of a running Dask scheduler", "repeat the command to go on"
+        raise InputError(f"--workers {workers}", f"no answer ({error})", expected, remedy) from error
+
+
+def _begin(device: str | None, dask_worker: Any) -> None:
+    """Gives a worker its device, by its number. Ctrl-C in a terminal reaches every process; the sweep answers it."""
+    os.environ[DEVICE_VARIABLE] = str(choose_device(device, int(dask_worker.name))[0].index)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
+def make_run(run: SweepRun, report: ProgressReport = ignore_progress, device: str | None = None) -> Line:
+    """Returns the line of a run, with the error where scan or options are at fault. Raises what another try may change."""
+    try:
+        rt = runtime_of_process(device)
+        result, metrics = resume_or_restart(run.plan, run.scan, run.output, lambda: rt, report, run.checkpoint_every_s)
+    except (InputError, NumericalError, OutOfMemoryError) as error:
+        return _failed(run, error)
+    except Exception as error:
+        runtime_of_process.cache_clear()  # the next run opens its device again
+        time.sleep(_BUSY_S if isinstance(error, BusyError) else 0)  # a lost worker may still be making it
+        raise
+    if not is_complete(result):
+        raise KeyboardInterrupt
+    facts = {name: result.facts.get(name) for name in ("seconds", "gaussians")}
+    facts["metrics"] = {name: value if math.isfinite(value) else None for name, value in metrics.items()}
+    return {**run.facts, **facts, **environment(rt.device), "host": platform.node()}
+
+
+def _failed(run: SweepRun, error: Exception) -> Line:
+    """Returns the line of a run that failed, or whose workers died. Raises OutputError where there is no room for any."""
+    if isinstance(error, OutputError) and not isinstance(error, BusyError):
+        raise error
+    text = str(error) if isinstance(error, PhyradgsError) else f"{type(error).__name__}: {error}"
+    return {**run.facts, "error": text[:2000], "version": __version__, "host": platform.node()}
+
+
+def markdown(lines: Sequence[Line], planned: int) -> str:
+    """Returns means and standard deviations over the scans and seeds of every setting, and the failed runs below."""
+    done, failed = [line for line in lines if "error" not in line], [line for line in lines if "error" in line]
+    measured = {name for line in done for name in line["metrics"]}
+    metrics = {**METRICS, **{name: metric for name, metric in HELD_OUT.items() if name in measured}}
+    headings = ["setting", "runs", *(metric.heading for metric in metrics.values()), "seconds"]
+    title = f"{len(done)} of {planned} runs, {len(failed)} failed; mean ± standard deviation over scans and seeds."
+    rows = [title, "", _row(headings), _row(["---"] + ["---:"] * (len(headings) - 1))]
+    for label in dict.fromkeys(line["label"] for line in done):
+        same = [line for line in done if line["label"] == label]
+        means = [_mean([line["metrics"].get(name) for line in same], metric.form) for name, metric in metrics.items()]
+        rows.append(_row([label, str(len(same)), *means, _mean([line["seconds"] for line in same], ".1f")]))
+    if failed:
+        rows += ["", _row(["failed run", "setting", "error"]), _row(["---"] * 3)]
+    return "\n".join([*rows, *(_row([line["run"], line["label"], line["error"]]) for line in failed), ""])
+
+
+def _row(cells: Sequence[str]) -> str:
+    return "| " + " | ".join(cell.replace("|", "\\|").replace("\n", " ") for cell in cells) + " |"
+
+
+def _mean(values: Sequence[Any], form: str) -> str:
+    numbers = [float(value) for value in values if value is not None]
+    spread = f" ± {np.std(numbers, ddof=1):{form}}" if len(numbers) > 1 else ""
+    return f"{np.mean(numbers):{form}}{spread}" if numbers else "–"
+
+
+def read_lines(path: Path) -> list[Line]:
+    """Reads the lines of a results file that are whole, and warns of others; no lines where there is no file."""
+    lines, damaged = [], []
+    text = path.read_text(encoding="utf-8", errors="replace") if path.exists() else ""
+    for number, row in enumerate(text.split("\n"), 1):
+        try:
+            line = json.loads(row)
+            lines.append({"run": line["run"], **line})
+        except (ValueError, KeyError, TypeError):
+            damaged += [str(number)] if row.strip() else []
+    if damaged:
+        log.warning("%s: damaged and left out: line %s", path, ", ".join(damaged))
+    return lines
+
+
+def append_line(path: Path, line: Mapping[str, Any]) -> None:
+    """Appends one line in a single write, and waits until it is on the disk."""
+    text = plain_text(json.dumps(line, ensure_ascii=False, allow_nan=False, default=str)) + "\n"
+    try:
+        with open(path, "ab+") as file:
+            if file.tell() and file.seek(-1, os.SEEK_END) >= 0 and file.read(1) != b"\n":
+                text = "\n" + text  # after a line that was cut off
+            file.write(text.encode())
+            file.flush()
+            os.fsync(file.fileno())
+    except OSError as error:
+        raise OutputError(str(path), error.strerror or str(error), "a file that can be appended to") from error

@@ -1,1 +1,0 @@
-"""Scans × settings × seeds to one resumable results file, volumes and a table."""
