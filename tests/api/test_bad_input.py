@@ -424,6 +424,12 @@ CASES: dict[str, list[tuple[str, Callable[[], object]]]] = {
         ("x", lambda: api.pose_gradient(GOOD, FRAMES, FRAMES)),
         ("motion", lambda: api.pose_gradient(GOOD, Gaussians.from_rows(FLAT + 1), FRAMES, "quick")),
     ],
+    "sum_frames": [
+        ("scan", lambda: api.sum_frames(FRAMES, 2)), ("count", lambda: api.sum_frames(GOOD, 0)),
+        ("count", lambda: api.sum_frames(GOOD, "2")), ("readout", lambda: api.sum_frames(GOOD, 2, readout="left")),
+        ("readout", lambda: api.sum_frames(GOOD, 2, 0.5, readout_direction=0)),
+        ("lag", lambda: api.sum_frames(replace(GOOD, lag=0.1), 2)),
+    ],
     "as_torch": [("", lambda: api.as_torch(3))],
 }
 """Of a name: the subject of the error, and a call."""

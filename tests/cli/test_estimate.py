@@ -44,7 +44,9 @@ class Clock:
             rounds = sum(options.control.is_due(i, iterations) for i in range(1, iterations + 1))
         self.now += self.start + iterations * self.each + rounds * self.control
         facts = {"density_control_rounds": rounds, "density_control_seconds": rounds * self.control}
-        return SimpleNamespace(facts=facts)
+        result = SimpleNamespace(facts=facts)
+        result.complete = lambda: result
+        return result
 
 
 @pytest.fixture
@@ -158,6 +160,5 @@ def test_profile_says_where_the_time_went(cli, scan, tmp_path, capsys) -> None:
     assert cli.run([*command, "--profile"]) == 0
     text = capsys.readouterr().out
     assert all(re.search(rf"^splat_{way}_(rows|pixels|group) +5 ", text, re.M) for way in ("forward", "backward"))
-    assert "Gpairs/s" in text and "Gflop/s" in text
     assert cli.run(command) == 0
-    assert "Gpairs/s" not in capsys.readouterr().out
+    assert "splat_forward" not in capsys.readouterr().out

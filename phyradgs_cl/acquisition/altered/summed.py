@@ -27,12 +27,14 @@ def sum_frames(
 ) -> Scan:
     """Returns a fly-scan without gaps, each frame of which sums the intensities of ``count`` projections that follow.
 
-    Each projection of ``scan`` stands for the interval until the next one, in which the gantry turns evenly. readout_ratio,
-    readout, readout_direction: of the new panel, as in ``fly_scan``. A line whose exposure begins within a projection takes
+    scan: F projections (F, rows, columns); each stands for an interval in s, in which the gantry turns evenly. count: of
+    projections in an exposure. readout_ratio, readout, readout_direction: of the new panel, as in ``fly_scan``. A line whose exposure begins within a projection takes
     a share of it. Frames that would need projections beyond the last are left out. Photons, detector and object are those
     of the dense scan: a true test of a motion model, if the object moves by less than a pixel from projection to projection.
 
     Raises InputError for a count that no frame can have, a rolling shutter or lag in ``scan``, and uneven intervals."""
+    if not isinstance(scan, Scan):
+        raise InputError("scan", checks.short_repr(scan), "a Scan")
     checks.whole("count", count, 1, scan.frames)
     checks.within("readout_ratio", readout_ratio, 0, 1000)
     checks.one_of("readout", readout, AXES)
@@ -62,7 +64,7 @@ def _interval_s(scan: Scan) -> tuple[float, float]:
     if scan.is_fly and scan.shutter.readout_s > 0:
         raise InputError("scan", f"a readout of {scan.shutter.readout_s:g} s", "a global shutter", remedy)
     if scan.lag:
-        raise InputError("scan", f"a lag of {scan.lag:g}", "0", remedy)
+        raise InputError("lag", f"{scan.lag:g}", "0", remedy)
     steps_s = np.diff(scan.frame_start_s)
     if len(steps_s) == 0 or np.ptp(steps_s) > _UNEVEN * steps_s.mean():
         raise InputError("frame_start_s", "uneven intervals", "projections at even intervals", "sort or split the scan")
