@@ -28,9 +28,10 @@ def sum_frames(
     """Returns a fly-scan without gaps, each frame of which sums the intensities of ``count`` projections that follow.
 
     scan: F projections (F, rows, columns); each stands for an interval in s, in which the gantry turns evenly. count: of
-    projections in an exposure. readout_ratio, readout, readout_direction: of the new panel, as in ``fly_scan``. A line whose exposure begins within a projection takes
-    a share of it. Frames that would need projections beyond the last are left out. Photons, detector and object are those
-    of the dense scan: a true test of a motion model, if the object moves by less than a pixel from projection to projection.
+    projections in an exposure. readout_ratio, readout, readout_direction: of the new panel, as in ``fly_scan``. A line
+    whose exposure begins within a projection takes a share of it. Frames that would need projections beyond the last are
+    left out. Photons, detector and object are those of the dense scan. It is a true test of a motion model, if the object
+    moves by less than a pixel from projection to projection.
 
     Raises InputError for a count that no frame can have, a rolling shutter or lag in ``scan``, and uneven intervals."""
     if not isinstance(scan, Scan):
