@@ -26,7 +26,7 @@ from phyradgs_cl.errors import InputError
 from phyradgs_cl.importers.assemble import Timing, along, assemble_scan, make_timing, table_over_time, turning
 from phyradgs_cl.importers.formats import r2_gaussian
 from phyradgs_cl.importers.options import TIMING, ImportOptions
-from phyradgs_cl.importers.reading.files import check_room
+from phyradgs_cl.importers.reading.files import check_room, naming_damage
 from phyradgs_cl.importers.reading.frames import line_integrals, oriented
 from phyradgs_cl.io.files import read_regular, regular_file
 from phyradgs_cl.io.tables import Fields, described
@@ -103,14 +103,12 @@ def read_pickle(path: Path, unpickler: "type[PlainUnpickler] | None" = None) -> 
     size = regular_file(path, subject).st_size
     check_room(subject, _COPIES * size)
     data = read_regular(path, subject, size, "a pickle")
-    try:
-        kind = unpickler or PlainUnpickler
-        return kind(io.BytesIO(data), encoding="latin1").load()  # Python 2 wrote the bytes of arrays as text
-    except InputError as error:
-        raise InputError(subject, error.found, error.expected, error.remedy) from error
-    except Exception as error:  # opcodes in any order raise any exception
-        found = f"a damaged pickle ({type(error).__name__}: {str(error)[:80]})"
-        raise InputError(subject, found, "a pickle of plain containers and NumPy arrays") from error
+    kind = unpickler or PlainUnpickler
+    with naming_damage(path, "a damaged pickle", "a pickle of plain containers and NumPy arrays"):
+        try:
+            return kind(io.BytesIO(data), encoding="latin1").load()  # Python 2 wrote the bytes of arrays as text
+        except InputError as error:
+            raise InputError(subject, error.found, error.expected, error.remedy) from error
 
 
 class PlainUnpickler(pickle.Unpickler):

@@ -20,9 +20,9 @@ from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.acquisition.geometry import Geometry
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.importers import assemble
-from phyradgs_cl.importers.assemble import RotaryStage, StageScan
+from phyradgs_cl.importers.assemble import RotaryStage, scan_on_stage
 from phyradgs_cl.importers.options import OF_FOLDERS, ImportOptions
-from phyradgs_cl.importers.reading.files import check_room
+from phyradgs_cl.importers.reading.files import check_room, naming_damage
 from phyradgs_cl.importers.reading.frames import gantry_sign
 from phyradgs_cl.importers.reading.text import say_missing
 from phyradgs_cl.io.files import regular_file
@@ -99,8 +99,8 @@ def import_scan(path: Path, options: ImportOptions) -> Scan:
     stored = assemble.StoredTiming()
     if scan.has(f"{_INFO}/ExpTimes") and options.exposure_s is None:
         stored = assemble.StoredTiming(exposure_s=scan.first_of(f"{_INFO}/ExpTimes", 0) or None)
-    turned = StageScan(frames, ("bottom", "left"), angle_rad, at, in_file, said, stored, flats)
-    return turned.on(_stage(scan, at, panel, options), options, path, path.stem)
+    turned, stage = (frames, ("bottom", "left"), angle_rad, at, in_file, said), _stage(scan, at, panel, options)
+    return scan_on_stage(stage, options, path, path.stem, *turned, stored=stored, flats=flats)
 
 
 def _taken(scan: Streams, count: int) -> int:
@@ -151,14 +151,8 @@ def open_ole(path: Path) -> Iterator[Any]:
     """Yields an open container of olefile. Any error of the library in the body becomes InputError."""
     regular_file(path, str(path))
     olefile = checks.package("olefile", "the package that reads .txrm", "phyradgs-cl[formats]")
-    try:
-        with olefile.OleFileIO(str(path)) as ole:
-            yield ole
-    except (InputError, MemoryError):
-        raise
-    except Exception as error:  # damage raises any exception
-        found = f"a container that cannot be read ({type(error).__name__}: {str(error)[:80]})"
-        raise InputError(str(path), found, "an OLE2 file") from error
+    with naming_damage(path, "a container that cannot be read", "an OLE2 file"), olefile.OleFileIO(str(path)) as ole:
+        yield ole
 
 
 def read_stream(ole: Any, path: Path, name: str, dtype: str) -> np.ndarray:
