@@ -78,11 +78,13 @@ def check_consistency(rt: Runtime, scan: Scan, as_stated: Scan) -> Consistency:
         return Consistency(finding, np.arange(scan.frames), False, False)
     frames, notes = without_odd_frames(scan)
     turned, best, rough_square = _best_sense(rt, some_frames(scan, frames))
-    remaining, stated, outlier_notes = without_outliers(rt, best, fit(rt, best))
+    random_total = _random_order(rt, best)
+    remaining, stated, outlier_notes = without_outliers(rt, best, fit(rt, best), random_total / best.frames)
     frames, notes = frames[remaining], notes + outlier_notes
     if outlier_notes:
         turned, best = some_frames(turned, remaining), some_frames(best, remaining)
-    coarse = _CoarseFit(turned, best, stated, _random_order(rt, best), rough_square)
+        random_total = _random_order(rt, best)
+    coarse = _CoarseFit(turned, best, stated, random_total, rough_square)
     ratio = coarse.ratio
 
     def answer(verdict: str, text: str, advice: str, is_sound: bool, sees_angles: bool = True) -> Consistency:

@@ -19,6 +19,8 @@ _REPEATED = 0.15  # of the usual difference between neighbours
 _JUMP = 2.5  # steps of the order over steps of the angles sorted
 _UNLIKE = 2.0  # the difference from the view beside in angle over the usual one
 _OUTLIER = 4.0  # a frame's residual over the usual one
+_ALIKE = 1.7  # residuals of the two ends: right frames left 1.4 at most, one odd frame 2.3 at least
+_AT_BOTH_ENDS = 0.25  # over the residual in a random order: right frames left 0.2 at most, odd ones mostly 0.3 and more
 _MOST_OUTLIERS = 0.2  # of the frames
 _EXCHANGED = 0.5  # squared residual after an exchange of two frames over the stated one
 
@@ -74,17 +76,21 @@ def _neighbours(values: np.ndarray) -> np.ndarray:
     return np.stack([wide[:-4], wide[1:-3], wide[3:-1], wide[4:]])
 
 
-def without_outliers(rt: Runtime, scan: Scan, stated: Fit) -> tuple[np.ndarray, Fit, list[str]]:
+def without_outliers(
+    rt: Runtime, scan: Scan, stated: Fit, random_square: float
+) -> tuple[np.ndarray, Fit, list[str]]:
     """Removes frames whose residual is far above the others', the worst first, with a new fit after each.
 
-    Returns the other frames (indices), their fit, and notes. Where a fifth of the frames would go, the cause is common to
-    all, and none is removed. Two outliers may be frames whose order is exchanged."""
+    random_square: the mean squared residual of frames in a random order. Returns the other frames (indices), their fit, and
+    notes. Where a fifth of the frames would go, the cause is common to all, and none is removed. Two outliers may be frames
+    whose order is exchanged."""
     remaining, current = np.arange(scan.frames), stated
     outliers: list[int] = []
     while len(outliers) < _MOST_OUTLIERS * scan.frames:
         size = np.sqrt(current.squares)
+        size[_ends_alike(size, random_square**0.5)] = 0
         worst = int(np.argmax(size))
-        if size[worst] < _OUTLIER * np.median(size):
+        if size[worst] < _OUTLIER * np.sqrt(np.median(current.squares)):
             break
         outliers.append(int(remaining[worst]))
         remaining = np.delete(remaining, worst)
@@ -100,3 +106,13 @@ def without_outliers(rt: Runtime, scan: Scan, stated: Fit) -> tuple[np.ndarray, 
         if fit_squares(rt, replace(scan, projections=scan.projections[order])).sum() < _EXCHANGED * stated.total:
             note = f"frames {numbers[0]} and {numbers[1]} (from 0) fit if their order is exchanged"
     return remaining, current, [note]
+
+
+def _ends_alike(residual: np.ndarray, random: float) -> np.ndarray:
+    """Returns which first and last frames (F,) fit about equally badly, as right ones of an open arc do.
+
+    They have neighbours on one side alone, so a fit of few iterations leaves them more, and a slow drift shows in them. If
+    they were taken out, those beside them would be the next."""
+    is_apart = residual >= _OUTLIER * np.median(residual)
+    at_an_end = np.logical_and.accumulate(is_apart) | np.logical_and.accumulate(is_apart[::-1])[::-1]
+    return at_an_end & (residual < _ALIKE * residual[::-1]) & (residual < _AT_BOTH_ENDS * random)

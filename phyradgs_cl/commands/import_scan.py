@@ -14,7 +14,7 @@ from phyradgs_cl.commands.options import RoiMm, Size, VoxelMm, lengths, pitches,
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import GridChoice
 from phyradgs_cl.importers import FORMATS, ImportOptions, import_scan, recognise
-from phyradgs_cl.importers.formats.tiff_template import template_of
+from phyradgs_cl.importers.formats.tiff_folder import TEMPLATE
 from phyradgs_cl.importers.options import WORDS, option_name
 from phyradgs_cl.importers.reading.frames import TAKEN
 from phyradgs_cl.io import file_kind, only_run, refuse_overwriting, write_scan
@@ -73,7 +73,7 @@ def import_command(
 ) -> None:
     """Import a scan: TIFF, Nikon, SkyScan, Zeiss, FleX-ray, NXtomo, Data Exchange, RTK, LEAP, TIGRE, NAF, R2-Gaussian."""
     if template:
-        say(template_of(source))
+        say(TEMPLATE)
         return
     if output is None:
         raise InputError("--output", "nothing", "a scan file to write", "say -o scan.h5")

@@ -300,36 +300,26 @@ class RotaryStage:
         return table_over_time(poses, timing, subject, is_parallel), geometry
 
 
-@dataclass(frozen=True, eq=False)
-class StageScan:
-    """Counts (F, v, u) of a sample on a stage with the first row and column at ``sides``, and gantry angles (F,) in rad.
+def scan_on_stage(
+    stage: RotaryStage, options: ImportOptions, path: Path, title: str, frames: np.ndarray, sides: tuple[str, str],
+    angle_rad: np.ndarray, places: np.ndarray, names: dict[str, str], said: str, *, stored: StoredTiming | None = None,
+    flats: np.ndarray | None = None, darks: np.ndarray | None = None, flat_value: float | None = None,
+) -> Scan:
+    """Returns the scan of the description ``path``: counts (F, v, u) of a sample on a stage with the first row and column at
+    ``sides``, gantry angles (F,) in rad, and numbers (F,) of the frames from 0 on, ``places``.
 
-    ``places`` (F,): numbers of the frames from 0 on; ``stored``: the file's timing; ``said``, ``names``: see
-    ``assemble_scan``. Flats and darks are (n, v, u), or None where the scanner has applied them."""
-
-    frames: np.ndarray
-    sides: tuple[str, str]
-    angle_rad: np.ndarray
-    places: np.ndarray
-    names: dict[str, str]
-    said: str
-    stored: StoredTiming | None = None
-    flats: np.ndarray | None = None
-    darks: np.ndarray | None = None
-
-    def on(
-        self, stage: RotaryStage, options: ImportOptions, path: Path, title: str, flat_value: float | None = None
-    ) -> Scan:
-        """Returns the scan of the description ``path``. ``flat_value``: the file's counts of air; options come first."""
-        timing = make_timing(str(path), self.places, options, self.stored)
-        trajectory, geometry = stage.turned(self.angle_rad, timing, str(path))
-        flats, darks = (None if one is None else oriented(one, options, *self.sides) for one in (self.flats, self.darks))
-        frames, options = oriented(self.frames, options, *self.sides), options.with_air(flat_value)
-        integrals = line_integrals(
-            str(path), frames, options, flats=flats, darks=darks, convention="counts", is_corrected=darks is None
-        )
-        parts = integrals, trajectory, geometry, timing, options
-        return assemble_scan(*parts, title=title, source=str(path), names=self.names, said=self.said)
+    ``stored``: the file's timing; ``names``, ``said``: see ``assemble_scan``. Flats and darks are (n, v, u), or None where
+    the scanner has applied them; ``flat_value``: the file's counts of air; options come first."""
+    timing = make_timing(str(path), places, options, stored)
+    trajectory, geometry = stage.turned(angle_rad, timing, str(path))
+    images = (None if one is None else oriented(one, options, *sides) for one in (frames, flats, darks))
+    frames, flats, darks = images  # type: ignore[assignment]
+    integrals = line_integrals(
+        str(path), frames, options.with_air(flat_value), flats=flats, darks=darks, convention="counts",
+        is_corrected=darks is None,
+    )  # fmt: skip
+    parts = integrals, trajectory, geometry, timing, options
+    return assemble_scan(*parts, title=title, source=str(path), names=names, said=said)
 
 
 def along(values: np.ndarray, position: np.ndarray) -> np.ndarray:

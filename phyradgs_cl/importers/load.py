@@ -5,7 +5,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from importlib import import_module
 from pathlib import Path
-from types import ModuleType
+from typing import Any
 
 import numpy as np
 
@@ -55,23 +55,23 @@ def _is_dicom(path: Path) -> bool:
 
 
 # The module of formats/ by the format's name, loaded when it is needed. It has two functions:
-# recognises(path) -> bool of a file or folder, and import_scan(path, options) -> Scan.
+# recognises(path) -> bool of a file or folder, and import_scan(path, options) -> Scan; with an end behind a colon.
 FORMATS = {
     "r2": "r2_gaussian",
-    "phyradgs": "phyradgs_synthetic",
+    "phyradgs": "r2_gaussian:with_times",
     "phyradgs-real": "phyradgs_real",
-    "naf": "naf",
+    "naf": "pickles",
     "rtk": "rtk",
-    "data-exchange": "data_exchange",
-    "nxtomo": "nxtomo",
+    "data-exchange": "beamlines:exchange",
+    "nxtomo": "beamlines",
     "tiff": "tiff_folder",
-    "nikon": "laboratory.nikon",
-    "skyscan": "laboratory.skyscan",
-    "zeiss": "laboratory.zeiss",
-    "flexray": "laboratory.flexray",
-    "rtk-projections": "toolkits.rtk_projections",
-    "leap": "toolkits.leap",
-    "tigre": "toolkits.tigre",
+    "nikon": "nikon",
+    "skyscan": "skyscan",
+    "zeiss": "zeiss",
+    "flexray": "flexray",
+    "rtk-projections": "rtk_projections",
+    "leap": "leap",
+    "tigre": "pickles:tigre",
 }
 _MOST_BODIES = 1000
 _LARGEST_MM, _LARGEST_PER_MM = 1e5, 1e5
@@ -88,7 +88,7 @@ def import_scan(path: str | Path, options: ImportOptions | None = None, form: st
     form = form or recognise(path)
     checks.one_of("format", form, FORMATS)
     try:
-        scan: Scan = _module(form).import_scan(path, options or ImportOptions())
+        scan: Scan = _function("import_scan", form)(path, options or ImportOptions())
     except InputError as error:
         if not error.subject.startswith("grid "):
             raise
@@ -107,7 +107,8 @@ def _check_there(path: Path) -> None:
 def recognise(path: Path) -> str:
     """Returns the name of the format of a file or folder, by its content. InputError if none fits, or more than one."""
     _check_there(path)
-    expected, names = "one of the formats of docs/import.md", [name for name in FORMATS if _module(name).recognises(path)]
+    expected = "one of the formats of docs/import.md"
+    names = [name for name in FORMATS if _function("recognises", name)(path)]
     if len(names) == 1:
         return names[0]
     tiffs = SafeFolder(path).matching(*tiff.SUFFIXES) if path.is_dir() else path.suffix.lower() in tiff.SUFFIXES
@@ -121,8 +122,10 @@ def recognise(path: Path) -> str:
     raise InputError(str(path), found, expected, "say which with --format")
 
 
-def _module(form: str) -> ModuleType:
-    return import_module(f"phyradgs_cl.importers.formats.{FORMATS[form]}")
+def _function(name: str, form: str) -> Callable[..., Any]:
+    module, _, end = FORMATS[form].partition(":")
+    function: Callable[..., Any] = getattr(import_module(f"{__package__}.formats.{module}"), f"{name}_{end}".rstrip("_"))
+    return function
 
 
 def foreign_volume(path: str | Path) -> str | None:

@@ -15,8 +15,7 @@ from phyradgs_cl.acquisition import PoseTable, Scan, Shutter
 from phyradgs_cl.acquisition.geometry import plain_geometry
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.importers.assemble import Timing, assemble_scan, turn_of
-from phyradgs_cl.importers.formats import phyradgs_synthetic as synthetic
-from phyradgs_cl.importers.formats.r2_gaussian import META, META_WITH_TIMES
+from phyradgs_cl.importers.formats import r2_gaussian as synthetic
 from phyradgs_cl.importers.options import ImportOptions
 from phyradgs_cl.importers.reading import tiff
 from phyradgs_cl.importers.reading.files import SafeFolder, read_json
@@ -65,7 +64,7 @@ class Circle:
 
 def recognises(path: Path) -> bool:
     """True for a .json that is not the description of another format, and for a folder with one and TIFF frames."""
-    others = (META, META_WITH_TIMES)
+    others = (synthetic.META, synthetic.META_WITH_TIMES)
     if not path.is_dir():
         return path.suffix.lower() == ".json" and path.name not in others
     folder = SafeFolder(path)

@@ -1,7 +1,8 @@
 """Foreign files and folders: names that stay inside the folder, and texts and arrays bounded by the file's own size."""
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from pathlib import Path, PurePosixPath, PureWindowsPath
@@ -23,6 +24,18 @@ def check_room(subject: str, needed_bytes: int) -> None:
         raise InputError(subject, f"{found} to unpack", f"at most {most} on this machine", remedy)
 
 
+@contextmanager
+def naming_damage(path: Path, found: str, expected: str, remedy: str = "") -> Iterator[None]:
+    """Turns any error of a library in the body into InputError: damage raises any exception."""
+    try:
+        yield
+    except (InputError, MemoryError):
+        raise
+    except Exception as error:
+        text = f"{found} ({type(error).__name__}: {' '.join(str(error).split())[-120:]})"
+        raise InputError(str(path), text, expected, remedy) from error
+
+
 def read_bytes(path: Path) -> bytes:
     """Reads a whole file of at most 64 MiB."""
     return read_regular(path, str(path), _MOST_TEXT_BYTES, "a description of a scan")
@@ -41,11 +54,9 @@ def read_npy(path: Path, ndim: int) -> np.ndarray:
     announces more than the file holds."""
     subject = str(path)
     regular_file(path, subject)
-    try:
+    with naming_damage(path, "a damaged .npy file", "a NumPy array"):
         values = np.load(path, mmap_mode="r", allow_pickle=False)  # maps no bytes that the file does not have
         dtype, shape = values.dtype, values.shape
-    except Exception as error:  # NumPy passes on any exception of Python's parser and tokeniser
-        raise InputError(subject, f"a damaged .npy file ({error})", "a NumPy array") from error
     if dtype.kind not in "iuf" or dtype.itemsize > 8:
         raise InputError(subject, f"type {dtype}", "plain real numbers")
     if len(shape) != ndim or 0 in shape:

@@ -14,7 +14,7 @@ from PIL import Image, ImageSequence
 from phyradgs_cl import checks
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.importers.options import ImportOptions
-from phyradgs_cl.importers.reading.files import SafeFolder, check_room
+from phyradgs_cl.importers.reading.files import SafeFolder, check_room, naming_damage
 from phyradgs_cl.importers.reading.series import series_of
 from phyradgs_cl.io.files import regular_file
 from phyradgs_cl.io.hdf5.datasets import LENGTH
@@ -135,16 +135,12 @@ def _opened(path: Path) -> Iterator[Any]:
         return False
 
     logger.addFilter(collect)
+    parts = "a TIFF that cannot be read", "grey images", "copy the file again, or save it uncompressed"
     try:
-        with tifffile.TiffFile(path) as tiff:
+        with naming_damage(path, *parts), tifffile.TiffFile(path) as tiff:
             yield tiff
         if any("invalid page offset" in text for text in said):
             raise InputError(str(path), "pages behind the end of the file", "a whole TIFF", "copy the file again")
-    except (InputError, MemoryError):
-        raise
-    except Exception as error:  # damage raises any exception
-        found = f"a TIFF that cannot be read ({type(error).__name__}: {str(error)[:80]})"
-        raise InputError(str(path), found, "grey images", "copy the file again, or save it uncompressed") from error
     finally:
         logger.filters = before
 

@@ -15,7 +15,7 @@ import numpy as np
 from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.acquisition.geometry import Geometry
 from phyradgs_cl.importers import assemble
-from phyradgs_cl.importers.assemble import RotaryStage, StageScan
+from phyradgs_cl.importers.assemble import RotaryStage, scan_on_stage
 from phyradgs_cl.importers.options import OF_FOLDERS, ImportOptions
 from phyradgs_cl.importers.reading import text as settings
 from phyradgs_cl.importers.reading.files import SafeFolder
@@ -75,8 +75,10 @@ def import_scan(path: Path, options: ImportOptions) -> Scan:
         _log.warning(text, scan.name("Random Movement"), movement[:40])
     if roll_deg := scan.number("Image Rotation", 0.0):
         _log.warning("%s is %g° and not used: calibrate finds the panel's roll", scan.name("Image Rotation"), roll_deg)
-    turned = StageScan(frames, ("top", "right"), angle_rad, at, names, said, _timing(scan, options))
-    return turned.on(RotaryStage(geometry), options, description, description.stem, _white(scan, frames, options))
+    return scan_on_stage(
+        RotaryStage(geometry), options, description, description.stem, frames, ("top", "right"), angle_rad, at, names, said,
+        stored=_timing(scan, options), flat_value=_white(scan, frames, options),
+    )  # fmt: skip
 
 
 def _geometry(scan: settings.Settings, panel: tuple[int, int], options: ImportOptions, names: dict[str, str]) -> Geometry:

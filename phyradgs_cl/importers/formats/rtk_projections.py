@@ -5,8 +5,6 @@ unless the options state them; ORA's files hold the transmission. RTK checks les
 of people whom you trust."""
 
 import tempfile
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -18,7 +16,7 @@ from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.importers.formats.rtk import XIM_BELOW, read_rtk_xml, scan_of, stack_of
 from phyradgs_cl.importers.options import TIMING, ImportOptions
-from phyradgs_cl.importers.reading.files import SafeFolder, check_room, in_natural_order
+from phyradgs_cl.importers.reading.files import SafeFolder, check_room, in_natural_order, naming_damage
 
 _COPIES = 12  # bytes of memory for every byte of the files: RTK's images, packed by some makers, and line integrals
 
@@ -89,7 +87,8 @@ def import_scan(path: Path, options: ImportOptions) -> Scan:
     check_room(str(path), _COPIES * sum(file.stat().st_size for file in projections))
     itk = checks.package("itk", "the package whose RTK reads these files", "phyradgs-cl[rtk]")
     names = [str(file) for file in projections]
-    with _as_input_error(path), tempfile.TemporaryDirectory() as folder:
+    expected = "projections with their geometry"
+    with naming_damage(path, "files that RTK does not read", expected), tempfile.TemporaryDirectory() as folder:
         from itk import RTK
 
         written = Path(folder) / "geometry.xml"
@@ -106,15 +105,3 @@ def import_scan(path: Path, options: ImportOptions) -> Scan:
         stack = stack_of(np.array(itk.array_from_image(image)), *places_mm, direction, str(path))
     options = replace(options, flat_value=None)  # RTK has divided by it
     return scan_of(geometry, stack, options, (str(description), str(path)), description.stem, str(path))
-
-
-@contextmanager
-def _as_input_error(path: Path) -> Iterator[None]:
-    """Turns any error of RTK in the body into InputError."""
-    try:
-        yield
-    except (InputError, MemoryError):
-        raise
-    except Exception as error:  # ITK raises RuntimeError, and TypeError for what it cannot convert
-        text = " ".join(str(error).split())[-160:]
-        raise InputError(str(path), f"files that RTK does not read ({text})", "projections with their geometry") from error

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from phyradgs_cl.acquisition import Scan
-from phyradgs_cl.importers.assemble import RotaryStage, StageScan, StoredTiming, cone
+from phyradgs_cl.importers.assemble import RotaryStage, StoredTiming, cone, scan_on_stage
 from phyradgs_cl.importers.options import OF_BARE_FRAMES, ImportOptions
 from phyradgs_cl.importers.reading.files import SafeFolder
 from phyradgs_cl.importers.reading.frames import gantry_sign
@@ -61,8 +61,8 @@ def import_scan(path: Path, options: ImportOptions) -> Scan:
         exposure_s = scan.number("Number of averages", 1.0, 1) * scan.measured("Exposure time (ms)", TIME, "ms")
     stored, places = StoredTiming(exposure_s=exposure_s), np.arange(len(frames))
     angle_rad = gantry_sign(options, "gantry") * angle_rad
-    turned = StageScan(frames, ("top", "left"), angle_rad, places, names, said, stored, flats, darks)
-    return turned.on(stage, options, description, folder.root.resolve().name)
+    turned, title = (frames, ("top", "left"), angle_rad, places, names, said), folder.root.resolve().name
+    return scan_on_stage(stage, options, description, title, *turned, stored=stored, flats=flats, darks=darks)
 
 
 def _stage(scan: Settings, panel: tuple[int, int], options: ImportOptions, names: dict[str, str]) -> RotaryStage:

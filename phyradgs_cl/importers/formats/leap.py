@@ -15,7 +15,6 @@ from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid, triple
 from phyradgs_cl.importers import assemble
 from phyradgs_cl.importers.assemble import RotaryStage, along
-from phyradgs_cl.importers.formats.toolkits.leap_names import OLD_NAMES
 from phyradgs_cl.importers.options import OF_BARE_FRAMES, TIMING, ImportOptions
 from phyradgs_cl.importers.reading.files import SafeFolder, read_npy
 from phyradgs_cl.importers.reading.frames import gantry_sign, line_integrals, oriented
@@ -24,6 +23,11 @@ from phyradgs_cl.importers.reading.text import Settings, head_has, read_settings
 from phyradgs_cl.importers.reading.tiff import SUFFIXES, read_tiffs
 
 _VECTORS = ("sourcePositions", "moduleCenters", "colVectors", "rowVectors")
+_NAMES = (
+    *("numX", "numY", "numZ", "voxelWidth", "voxelHeight", "offsetX", "offsetY", "offsetZ", "geometry", "detectorType"),
+    *("numAngles", "numRows", "numCols", "pixelHeight", "pixelWidth", "centerRow", "centerCol", "angularRange", "phis"),
+    *("sod", "sdd", "tau", "helicalPitch", "tiltAngle", *_VECTORS),
+)
 _BEAMS, _MOST, _ENDS = ("cone", "parallel", "modular"), 1_000_000, (".txt", ".cfg")
 _OF_TABLES = (*TIMING, "row_0", "column_0", "quantity", "flat_value", "detector_model")
 
@@ -35,8 +39,7 @@ def recognises(path: Path) -> bool:
 
 def _descriptions(path: Path) -> list[Path]:
     files = SafeFolder(path).matching(*_ENDS) if path.is_dir() else [path]
-    marks = ((b"numAngles", b"numCols"), (b"proj_nangles", b"proj_ncols"))
-    return [file for file in files if file.suffix.lower() in _ENDS and any(head_has(file, *both) for both in marks)]
+    return [file for file in files if file.suffix.lower() in _ENDS and head_has(file, b"numAngles", b"numCols")]
 
 
 def import_scan(path: Path, options: ImportOptions) -> Scan:
@@ -46,9 +49,7 @@ def import_scan(path: Path, options: ImportOptions) -> Scan:
     if len(descriptions) != 1:
         raise InputError(str(path), f"{len(descriptions)} files of LEAP's parameters", "one", "name the file itself")
     description = descriptions[0]
-    stored = read_settings(description, [*OLD_NAMES, *OLD_NAMES.values()])
-    texts = {new: stored.values.get(new) or stored.values.get(old) for new, old in OLD_NAMES.items()}
-    scan = Settings(stored.subject, {name: text for name, text in texts.items() if text})
+    scan = read_settings(description, _NAMES)
     shape = triple(scan.count(name, _MOST) for name in ("numAngles", "numRows", "numCols"))
     arrays, images = folder.matching(".npy"), folder.matching(*SUFFIXES)
     if not arrays and not images:

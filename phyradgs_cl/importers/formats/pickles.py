@@ -1,8 +1,10 @@
-"""Pickles of NAF and SAX-NeRF: a dictionary of geometry (mm), projections (dimensionless) and true volume (1/m).
+"""Pickles of NAF and SAX-NeRF: a dictionary of geometry (mm), projections (dimensionless) and true volume (1/m). Pickles of
+TIGRE: the tuple (projections, geometry, angles) that its loaders return, with a ``tigre.geometry``. TIGRE's frames (F, v, u)
+are line integrals with row 0 the lowest, as ``tigre.Ax`` gives them; angles are the gantry's in radians.
 
-They hold plain containers, numbers and NumPy arrays. Every other name in a pickle is refused, so nothing is executed.
-NumPy's own constructors are no substitute for the functions below: with types of Python objects, or with fields, they read
-memory at addresses that the file states."""
+Pickles hold plain containers, numbers and NumPy arrays. Every other name in a pickle is refused, so nothing is executed; a
+geometry of TIGRE becomes a plain bag of its attributes. NumPy's own constructors are no substitute for the functions below:
+with types of Python objects, or with fields, they read memory at addresses that the file states."""
 
 import io
 import math
@@ -10,17 +12,21 @@ import os
 import pickle
 import re
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 
 from phyradgs_cl import checks
 from phyradgs_cl.acquisition import Scan
+from phyradgs_cl.acquisition.geometry import ConeGeometry, Geometry, ParallelGeometry, plain_geometry
+from phyradgs_cl.acquisition.toolkits import is_parallel_tigre, poses_of_tigre
+from phyradgs_cl.acquisition.trajectory import CircularOrbit, PoseTable
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.importers.assemble import assemble_scan, make_timing, turning
-from phyradgs_cl.importers.formats import r2_gaussian as tigre
+from phyradgs_cl.importers.assemble import Timing, along, assemble_scan, make_timing, table_over_time, turning
+from phyradgs_cl.importers.formats import r2_gaussian
 from phyradgs_cl.importers.options import TIMING, ImportOptions
-from phyradgs_cl.importers.reading.files import check_room
+from phyradgs_cl.importers.reading.files import check_room, naming_damage
 from phyradgs_cl.importers.reading.frames import line_integrals, oriented
 from phyradgs_cl.io.files import read_regular, regular_file
 from phyradgs_cl.io.tables import Fields, described
@@ -29,6 +35,10 @@ OPTIONS = (*TIMING, "detector_model", "part")
 _PER_MM = 1e-3  # of a density per metre
 _PARTS = {"train": ("train",), "test": ("val",), "all": ("train", "val")}
 TIGRE_MODULE, _END_BYTES = "tigre.utilities.geometry", 1 << 18
+OPTIONS_OF_TIGRE = (*TIMING, "row_0", "column_0", "quantity", "flat_value", "detector_model")
+_NAMES = ("DSO", "DSD", "nDetector", "dDetector", "nVoxel", "dVoxel", "offOrigin", "offDetector", "rotDetector", "COR")
+_SAME = 1e-9  # relative: poses of one circle
+_CLASSES = ("Geometry", "ConeGeometryDefault", "ParallelGeometryDefault")
 _COPIES = 3  # arrays and line integrals, for every byte of the file
 
 
@@ -49,14 +59,14 @@ def import_scan(path: Path, options: ImportOptions) -> Scan:
     """Imports the train (or val, or both) projections of a pickle."""
     options.refuse_unused("naf", OPTIONS)
     data = Fields(f"{path}:", read_pickle(path))
-    geometry, grid = tigre.read_geometry(data, 1.0), tigre.read_grid(data, 1.0)
+    geometry, grid = r2_gaussian.read_geometry(data, 1.0), r2_gaussian.read_grid(data, 1.0)
     frames, angle_rad = _frames(data, _PARTS[options.part], geometry.detector_shape)
     timing = make_timing(str(path), len(angle_rad), options)
     reference = None
     if data.has("image"):
         volume = _array(data, "image", 3)
-        reference = tigre.turned_volume(data.name("image"), volume, grid, _PER_MM)
-    frames = oriented(frames, options, tigre.ROW_0)
+        reference = r2_gaussian.turned_volume(data.name("image"), volume, grid, _PER_MM)
+    frames = oriented(frames, options, r2_gaussian.ROW_0)
     integrals = line_integrals(str(path), frames, options, convention="attenuation")
     trajectory = turning(geometry, angle_rad, timing)
     return assemble_scan(
@@ -93,14 +103,12 @@ def read_pickle(path: Path, unpickler: "type[PlainUnpickler] | None" = None) -> 
     size = regular_file(path, subject).st_size
     check_room(subject, _COPIES * size)
     data = read_regular(path, subject, size, "a pickle")
-    try:
-        kind = unpickler or PlainUnpickler
-        return kind(io.BytesIO(data), encoding="latin1").load()  # Python 2 wrote the bytes of arrays as text
-    except InputError as error:
-        raise InputError(subject, error.found, error.expected, error.remedy) from error
-    except Exception as error:  # opcodes in any order raise any exception
-        found = f"a damaged pickle ({type(error).__name__}: {str(error)[:80]})"
-        raise InputError(subject, found, "a pickle of plain containers and NumPy arrays") from error
+    kind = unpickler or PlainUnpickler
+    with naming_damage(path, "a damaged pickle", "a pickle of plain containers and NumPy arrays"):
+        try:
+            return kind(io.BytesIO(data), encoding="latin1").load()  # Python 2 wrote the bytes of arrays as text
+        except InputError as error:
+            raise InputError(subject, error.found, error.expected, error.remedy) from error
 
 
 class PlainUnpickler(pickle.Unpickler):
@@ -156,3 +164,75 @@ def _plain_array(raw: object, dtype: object, shape: object, order: object = "C")
     array = _Array((0,))
     array.__setstate__((1, shape, dtype, order == "F", raw))
     return array
+
+
+class _Geometry(SimpleNamespace):
+    """The attributes of a ``tigre.geometry``."""
+
+
+class TigreUnpickler(PlainUnpickler):
+    """The unpickler of plain arrays, which also takes TIGRE's geometries."""
+
+    def find_class(self, module: str, name: str) -> Any:
+        """Returns the bag of attributes for a class of TIGRE's geometries; for other names what plain pickles may have."""
+        if module.startswith(TIGRE_MODULE) and name in _CLASSES:
+            return _Geometry
+        return super().find_class(module, name)
+
+
+def recognises_tigre(path: Path) -> bool:
+    """True for a pickle that names TIGRE's geometry in its first or last bytes."""
+    return path.is_file() and path.suffix.lower() in (".pickle", ".pkl") and names_tigre(path)
+
+
+def import_scan_tigre(path: Path, options: ImportOptions) -> Scan:
+    """Imports the projections of a pickle."""
+    options.refuse_unused("tigre", OPTIONS_OF_TIGRE)
+    content = read_pickle(path, TigreUnpickler)
+    if isinstance(content, dict):
+        content = tuple(_named(content, *names) for names in (("proj", "frames"), ("geo",), ("angle", "theta")))
+    if not isinstance(content, (tuple, list)) or len(content) != 3 or not isinstance(content[1], _Geometry):
+        expected = "projections, geometry and angles, in this order as TIGRE's loaders return them, or by these names"
+        raise InputError(str(path), described(content), expected)
+    frames, angles = content[0], content[2]
+    geo = SimpleNamespace(**{name: getattr(content[1], name, None) for name in (*_NAMES, "mode")})
+    if isinstance(angles, (list, tuple)):
+        angles = Fields(f"{path}:", {"angles": list(angles)}).numbers("angles")
+    for name, value in (("projections", frames), ("angles", angles)):
+        if not isinstance(value, np.ndarray) or value.dtype.kind not in "iuf":
+            raise InputError(f"{path}: {name}", described(value), "an array of numbers")
+    try:
+        poses, panel, grid = poses_of_tigre(geo, np.asarray(angles))
+    except InputError as error:
+        raise InputError(f"{path}: {error.subject}", error.found, error.expected, error.remedy) from error
+    checks.shape(f"{path}: projections", frames, (len(poses), *panel))
+    timing = make_timing(str(path), len(poses), options)
+    angle_rad = np.asarray(angles, np.float64).reshape(len(poses), -1)[:, 0]
+    trajectory, geometry = _trajectory(geo, poses, angle_rad, timing, str(path))
+    turned = oriented(np.asarray(frames), options, "bottom")
+    integrals = line_integrals(str(path), turned, options, convention="attenuation")
+    parts = integrals, trajectory, geometry, timing, options
+    return assemble_scan(*parts, title=path.stem, source=str(path), grid=grid)
+
+
+def _named(content: dict[object, Any], *words: str) -> Any:
+    """Returns the one value of a dictionary whose name begins with one of the words, None where there is none."""
+    return next((value for name, value in content.items() if str(name).lower().startswith(words)), None)
+
+
+def _trajectory(
+    geo: Any, poses: np.ndarray, angle_rad: np.ndarray, timing: Timing, subject: str
+) -> tuple[CircularOrbit | PoseTable, Geometry]:
+    """Returns a circular orbit where one value of each length describes the poses (F, 12), else a table of them."""
+    rows, columns = np.ravel(geo.nDetector).tolist()
+    pitch_v, pitch_u = np.ravel(geo.dDetector).tolist()
+    off_v, off_u = np.resize(0.0 if geo.offDetector is None else geo.offDetector, 2).tolist()
+    is_parallel, sides = is_parallel_tigre(geo), ((rows, columns), (pitch_v, pitch_u), (off_v, off_u))
+    if is_parallel:
+        geometry: Geometry = ParallelGeometry(*sides)
+    else:
+        geometry = ConeGeometry(float(np.ravel(geo.DSO)[0]), float(np.ravel(geo.DSD)[0]), *sides)
+    if np.allclose(geometry.pose(angle_rad), poses, rtol=0, atol=_SAME * np.abs(poses).max()):
+        return turning(geometry, angle_rad, timing), geometry
+    table = table_over_time(lambda position: along(poses, position), timing, subject, is_parallel)
+    return table, plain_geometry(poses, geometry.detector_shape, is_parallel)

@@ -1,7 +1,12 @@
-"""NXtomo files of other programs (HDF5). Values that this package's scan files must have may come from options. The format
-does not state which row is on top. Row 0 is taken as the lowest, with a warning, after the flips that the file declares in
-either way of the nxtomo package. The column of the rotation axis becomes a detector offset. Without a
-source distance the beam is parallel."""
+"""HDF5 files of beamlines: NXtomo of other programs, and Data Exchange. Values that this package's scan files must have may
+come from options.
+
+NXtomo does not state which row is on top. Row 0 is taken as the lowest, with a warning, after the flips that the file
+declares in either way of the nxtomo package. The column of the rotation axis becomes a detector offset. Without a source
+distance the beam is parallel.
+
+Data Exchange has /exchange with data, data_white, data_dark and theta, of parallel beams; distances from the options make a
+cone. Angles are the sample's, in degrees unless units differ; row 0 is the top of the image."""
 
 import logging
 from pathlib import Path
@@ -24,6 +29,20 @@ from phyradgs_cl.io.scan.header import find_entry
 
 _log = logging.getLogger(__name__)
 _NOWHERE = "/no entry"  # of bare arrays: all else comes from the options
+_EXCHANGE = "/exchange"
+_INSTRUMENT = "/measurement/instrument"
+_DETECTOR, _OPTICS = f"{_INSTRUMENT}/detector", f"{_INSTRUMENT}/detection_system/objective"
+_LENGTHS = hdf5.Lengths(
+    source=f"{_INSTRUMENT}/source/distance", detector=f"{_DETECTOR}/distance", optics=f"{_OPTICS}/magnification",
+    at_sample=(
+        (f"{_DETECTOR}/actual_pixel_size_y", f"{_DETECTOR}/actual_pixel_size_x"),
+        *((f"{place}/resolution",) * 2 for place in (_OPTICS, f"{_INSTRUMENT}/objective")),
+    ),
+    on_panel=(
+        (f"{_DETECTOR}/pixel_size_y", f"{_DETECTOR}/pixel_size_x"),
+        (f"{_DETECTOR}/y_pixel_size", f"{_DETECTOR}/x_pixel_size"), (f"{_DETECTOR}/pixel_size",) * 2,
+    ),
+)  # fmt: skip
 _MOVES = ("x_translation", "y_translation", "z_translation")
 
 
@@ -32,7 +51,7 @@ def recognises(path: Path) -> bool:
     if not path.is_file() or not h5py.is_hdf5(path):
         return False
     with open_hdf5(path) as source:
-        if isinstance(source.find("/exchange"), h5py.Group):
+        if isinstance(source.find(_EXCHANGE), h5py.Group):
             return False
         for member in ("/entry/reconstruction", "/volume"):
             if source.find(member) is not None and source.find("/entry/instrument") is None:
@@ -141,3 +160,35 @@ def _refuse_moves(source: Hdf5Source, entry: str, used: np.ndarray) -> None:
         values = h5.read_per_frame(source, address, used, LENGTH)
         if np.ptp(values) > 0:
             raise source.error(address, f"{values.min():.6g} to {values.max():.6g} mm", "a sample that stays where it is")
+
+
+def recognises_exchange(path: Path) -> bool:
+    """True for an HDF5 file with a group /exchange."""
+    if not path.is_file() or not h5py.is_hdf5(path):
+        return False
+    with open_hdf5(path) as source:
+        return isinstance(source.find(_EXCHANGE), h5py.Group)
+
+
+def import_scan_exchange(path: Path, options: ImportOptions) -> Scan:
+    """Imports the projections of /exchange, with its flats and darks before and after."""
+    options.refuse_unused("data-exchange", OF_HDF5)
+    with open_hdf5(path, options.linked_folder) as source:
+        places, theta = hdf5.places_of(options, source), f"{_EXCHANGE}/theta"
+        stacks = places.stacks(f"{_EXCHANGE}/data", **{
+            name: [f"{_EXCHANGE}/data_{kind}{when}" for when in ("", "_pre", "_post")]
+            for name, kind in (("flats", "white"), ("darks", "dark"))
+        })  # fmt: skip
+        if options.angles is None and "angles" not in places.stated and source.find(theta) is None:
+            text = "%s: no angles: 0° to 180°, as tomopy.angles has them; say %s FIRST..LAST if the arc is another"
+            _log.warning(text, source.name(theta), options.named("angles"))
+            theta_rad = np.linspace(0, np.pi, int(stacks.used.sum()))
+        else:
+            theta_rad = places.angles_rad(stacks.used, options, theta)
+        geometry = hdf5.beam(source, _LENGTHS, options, stacks.panel)
+        exposure_s = hdf5.exposure_s(source, f"{_DETECTOR}/exposure_time", stacks.used, options)
+        title = h5.read_title(source, f"{_EXCHANGE}/title", path.stem)
+    timing = assemble.make_timing(str(path), len(theta_rad), options, assemble.StoredTiming(exposure_s=exposure_s))
+    integrals = stacks.line_integrals(f"{path}:{_EXCHANGE}/data", options, "top")
+    trajectory = assemble.turning(geometry, gantry_sign(options, "sample") * theta_rad, timing)
+    return assemble.assemble_scan(integrals, trajectory, geometry, timing, options, title=title, source=str(path))

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from phyradgs_cl.acquisition import Scan
-from phyradgs_cl.importers.assemble import RotaryStage, StageScan, cone
+from phyradgs_cl.importers.assemble import RotaryStage, cone, scan_on_stage
 from phyradgs_cl.importers.options import OF_FOLDERS, ImportOptions
 from phyradgs_cl.importers.reading.files import SafeFolder, checked_name
 from phyradgs_cl.importers.reading.frames import gantry_sign
@@ -70,8 +70,8 @@ def import_scan(path: Path, options: ImportOptions) -> Scan:
     say_missing(scan, {"InitialAngle": "0", "ObjectTilt": "0", "Units": "mm"})
     remedy = f"correct it, or say {options.named('flat_value')}"
     white = None if options.flat_value else white_level(scan, "WhiteLevel", frames, remedy)
-    turned = StageScan(frames, ("top", "right"), angle_rad, at, names, said)
-    return turned.on(stage, options, description, description.stem, white)
+    turned = frames, ("top", "right"), angle_rad, at, names, said
+    return scan_on_stage(stage, options, description, description.stem, *turned, flat_value=white)
 
 
 def _angles(scan: Settings, measured: Path | None, count: int) -> np.ndarray:

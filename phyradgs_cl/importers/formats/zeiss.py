@@ -7,19 +7,26 @@ CenterShift is not used: calibrate finds the axis."""
 
 import logging
 import re
+from collections.abc import Iterator
+from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from phyradgs_cl import checks
 from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.acquisition.geometry import Geometry
+from phyradgs_cl.errors import InputError
 from phyradgs_cl.importers import assemble
-from phyradgs_cl.importers.assemble import RotaryStage, StageScan
+from phyradgs_cl.importers.assemble import RotaryStage, scan_on_stage
 from phyradgs_cl.importers.options import OF_FOLDERS, ImportOptions
+from phyradgs_cl.importers.reading.files import check_room, naming_damage
 from phyradgs_cl.importers.reading.frames import gantry_sign
-from phyradgs_cl.importers.reading.ole import Streams, open_ole, read_images, read_stream
 from phyradgs_cl.importers.reading.text import say_missing
+from phyradgs_cl.io.files import regular_file
+from phyradgs_cl.io.tables import LARGEST, Fields
 
 _log = logging.getLogger(__name__)
 _INFO, _ONE, _SEVERAL = "ImageInfo", "ReferenceData", "MultiReferenceData"
@@ -33,6 +40,30 @@ _STREAMS = {
 }  # fmt: skip
 _TYPES = {5: "<u2", 10: "<f4"}
 _PER_FOLDER = 100
+_RESULT_BYTES = 5  # per pixel: a line integral in float32, and its mask
+_STEADY = 1e-3  # relative: how far the lengths of single images may differ
+
+
+class Streams(Fields):
+    """Streams of numbers by their names. They may have room for more images than were taken."""
+
+    def first_of(self, name: str, lowest: float = -LARGEST, highest: float = LARGEST) -> float:
+        """Returns the first number of a stream, which is between two bounds."""
+        return Fields(self.subject, {name: float(self.leading(name, 1)[0])}).number(name, lowest=lowest, highest=highest)
+
+    def leading(self, name: str, count: int) -> np.ndarray:
+        """Returns the first ``count`` numbers (count,) of a stream."""
+        if len(values := self.numbers(name)) < count:
+            raise self.error(name, f"{len(values)} numbers", f"{count}, one for each image")
+        return values[:count]
+
+    def steady(self, name: str) -> float:
+        """Returns a length above 0 that is the same for all images, without its sign."""
+        lengths = np.abs(self.numbers(name))
+        lengths = lengths[lengths > 0]
+        if not len(lengths) or np.ptp(lengths) > _STEADY * lengths[0]:
+            raise self.error(name, f"{np.ptp(lengths):g} between images" if len(lengths) else "0", "one length above 0 mm")
+        return float(lengths[0])
 
 
 def recognises(path: Path) -> bool:
@@ -68,8 +99,8 @@ def import_scan(path: Path, options: ImportOptions) -> Scan:
     stored = assemble.StoredTiming()
     if scan.has(f"{_INFO}/ExpTimes") and options.exposure_s is None:
         stored = assemble.StoredTiming(exposure_s=scan.first_of(f"{_INFO}/ExpTimes", 0) or None)
-    turned = StageScan(frames, ("bottom", "left"), angle_rad, at, in_file, said, stored, flats)
-    return turned.on(_stage(scan, at, panel, options), options, path, path.stem)
+    turned, stage = (frames, ("bottom", "left"), angle_rad, at, in_file, said), _stage(scan, at, panel, options)
+    return scan_on_stage(stage, options, path, path.stem, *turned, stored=stored, flats=flats)
 
 
 def _taken(scan: Streams, count: int) -> int:
@@ -113,3 +144,33 @@ def _stage(scan: Streams, at: np.ndarray, panel: tuple[int, int], options: Impor
     last = int(at[-1]) + 1
     shifts = np.stack([scan.leading(name, last) if scan.has(name) else np.zeros(last) for name in names], -1)[at]
     return RotaryStage(geometry, shift_mm=shifts * geometry.pixel_size_mm if shifts.any() else None)
+
+
+@contextmanager
+def open_ole(path: Path) -> Iterator[Any]:
+    """Yields an open container of olefile. Any error of the library in the body becomes InputError."""
+    regular_file(path, str(path))
+    olefile = checks.package("olefile", "the package that reads .txrm", "phyradgs-cl[formats]")
+    with naming_damage(path, "a container that cannot be read", "an OLE2 file"), olefile.OleFileIO(str(path)) as ole:
+        yield ole
+
+
+def read_stream(ole: Any, path: Path, name: str, dtype: str) -> np.ndarray:
+    """Returns a stream as numbers (n,). InputError for a missing one, and for one that is larger than its file."""
+    found, most = f"{ole.get_size(name)} bytes" if ole.exists(name) else "nothing", path.stat().st_size
+    if found == "nothing" or ole.get_size(name) > most:
+        raise InputError(f"{path}: {name}", found, f"numbers in at most {most} bytes")
+    data = ole.openstream(name).read()
+    return np.frombuffer(data, dtype, len(data) // np.dtype(dtype).itemsize)
+
+
+def read_images(ole: Any, path: Path, names: list[str], dtype: str, panel: tuple[int, int]) -> np.ndarray:
+    """Returns images (F, v, u), one per stream, row 0 as stored."""
+    check_room(str(path), len(names) * panel[0] * panel[1] * (np.dtype(dtype).itemsize + _RESULT_BYTES))
+    stack = np.empty((len(names), *panel), dtype)
+    for image, name in zip(stack, names, strict=True):
+        values = read_stream(ole, path, name, dtype)
+        if len(values) != panel[0] * panel[1]:
+            raise InputError(f"{path}: {name}", f"{len(values)} pixels", f"{panel[0]} × {panel[1]}")
+        image[:] = values.reshape(panel)
+    return stack

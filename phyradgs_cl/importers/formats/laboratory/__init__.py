@@ -1,1 +1,0 @@
-"""Formats of laboratory scanners, whose sample turns between a source and a panel at rest."""

@@ -1,0 +1,91 @@
+"""Frames that do not belong to a scan are found at its ends as in its middle, and its ends are not blamed for a drift."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from check_kit import some_frames
+from parallel_kit import BODIES, line_integrals, parallel_scan
+from scipy.ndimage import shift
+
+from phyradgs_cl.acquisition import (
+    CircularOrbit,
+    ConeGeometry,
+    ConstantSpeed,
+    ParallelGeometry,
+    Scan,
+    Shutter,
+)
+from phyradgs_cl.check.consistency import check_consistency
+from phyradgs_cl.check.finding import OK, SUSPICIOUS
+from phyradgs_cl.check.run import quick_scan
+from phyradgs_cl.fields import Grid
+
+pytestmark = pytest.mark.slow
+
+PLANTED = {
+    "moved": lambda p, at: shift(p[at], (0, 2), order=1, mode="nearest"),
+    "mirrored": lambda p, at: p[at][:, ::-1],
+}
+
+
+@pytest.fixture(scope="module")
+def arcs(scan_of) -> dict[str, Scan]:
+    cone = scan_of(ConeGeometry(5.0, 7.0, (32, 32), (0.125, 0.125)), views=60, exposure_deg=6.0, readout_ratio=0.5)
+    return {
+        "half a turn": parallel_scan(30), "its end too": parallel_scan(31, with_end=True),
+        "cone, 216°": some_frames(cone, slice(36)), "cone, full": cone,
+    }  # fmt: skip
+
+
+def answer(rt, scan: Scan) -> tuple[str, str]:
+    finding = check_consistency(rt, quick_scan(scan), scan).finding
+    return finding.verdict, finding.text.split(";")[0]
+
+
+@pytest.mark.parametrize("place", ["first", "middle", "last"])
+@pytest.mark.parametrize("arc", ["half a turn", "its end too", "cone, 216°", "cone, full"])
+def test_one_odd_frame_is_named_wherever_it_is(rt, arcs, arc, place) -> None:
+    scan = arcs[arc]
+    at = {"first": 0, "middle": scan.frames // 2, "last": scan.frames - 1}[place]
+    for change in PLANTED.values():
+        frames = scan.projections.copy()
+        frames[at] = change(frames, at)
+        said = answer(rt, replace(scan, projections=frames))
+        assert said == (SUSPICIOUS, f"frame {at} (from 0) does not fit the others")
+
+
+def test_the_first_and_the_last_frame_may_both_be_odd(rt, arcs) -> None:
+    scan = arcs["its end too"]
+    frames = scan.projections.copy()
+    frames[[0, -1]] *= 0.7
+    assert answer(rt, replace(scan, projections=frames)) == (SUSPICIOUS, "frames 0, 30 (from 0) do not fit the others")
+
+
+def strip_scan(views: int, turn_deg: float, columns: int, rows: int = 2) -> Scan:
+    """A right scan of a wide, low panel, as of a synchrotron: a fit of coarse voxels leaves the ends of its arc five times
+    the usual residual."""
+    pitch_mm = 3.2 / columns
+    geometry = ParallelGeometry((rows, columns), pitch_mm)
+    orbit = CircularOrbit(geometry, ConstantSpeed(0.3, np.deg2rad(turn_deg) / (views - 1)))
+    frames = [line_integrals(BODIES, orbit.pose(f, np.array(float(f))), (rows, columns)) for f in range(views)]
+    noise = np.random.default_rng(0).normal(0, 0.001, (views, rows, columns))
+    grid = Grid((rows, columns, columns), (pitch_mm,) * 3)
+    return Scan(np.array(frames) + noise, geometry, orbit, Shutter(0.0), np.arange(float(views)), grid, False)
+
+
+@pytest.mark.parametrize(("views", "turn_deg", "columns"), [(61, 180.0, 192), (61, 170.0, 192), (91, 180.0, 320)])
+@pytest.mark.parametrize("gain", [0.0, 0.02])
+def test_the_ends_of_a_right_arc_are_not_odd(rt, views, turn_deg, columns, gain) -> None:
+    """Nor are they where the contrast drifts by 2 %."""
+    scan = strip_scan(views, turn_deg, columns)
+    contrast = 1 + np.linspace(-gain / 2, gain / 2, views)[:, None, None]
+    assert answer(rt, replace(scan, projections=scan.projections * contrast))[0] == OK
+
+
+@pytest.mark.parametrize("at", [0, 1, 30, 58, 59])
+def test_an_odd_frame_of_such_an_arc_is_named_alone(rt, at) -> None:
+    scan = strip_scan(60, 180.0, 192)
+    frames = scan.projections.copy()
+    frames[at] = np.roll(frames[at], 6, axis=1)
+    assert answer(rt, replace(scan, projections=frames)) == (SUSPICIOUS, f"frame {at} (from 0) does not fit the others")

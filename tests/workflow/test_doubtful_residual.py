@@ -1,0 +1,59 @@
+"""reconstruct ends with a line where the volume leaves much more of a scan than its noise: such a scan cannot be right."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, Scan, make_protocol
+from phyradgs_cl.fields import Grid
+from phyradgs_cl.io import write_scan
+from phyradgs_cl.simulation import SimulationOptions, phantom_scene, simulate
+
+pytestmark = pytest.mark.slow
+
+LINE = "the volume does not explain"
+
+
+@pytest.fixture(scope="module")
+def fly(rt) -> Scan:
+    """A fly-scan of 25 views."""
+    geometry = ConeGeometry(5.0, 7.0, (48, 48), (4 / 48, 4 / 48))
+    scene = phantom_scene(rt, "jaw", geometry, Grid.cube(32, 2.0), 32, "rows", 0)
+    options = SimulationOptions(make_protocol("rapid"), "rows", noise="tigre", dose=1e4, time_samples=8)
+    return replace(simulate(scene.source, geometry, scene.grid, options), reference=None)
+
+
+def of_photons(scan: Scan, photons: float) -> Scan:
+    counts = np.random.default_rng(1).poisson(photons * np.exp(-scan.projections.astype(float)))
+    return replace(scan, projections=np.log(photons / np.maximum(counts, 0.5)).astype(np.float32))
+
+
+def stated(scan: Scan, frames: np.ndarray | None = None, turns: float = 1.0, **geometry: object) -> Scan:
+    """The same frames, or others, with another geometry, and angles ``turns`` times as large."""
+    panel, sweeps = replace(scan.geometry, **geometry), scan.trajectory.kinematics
+    angles = {name: turns * getattr(sweeps, name) for name in ("angle_start_rad", "angle_end_rad")}
+    frames = scan.projections if frames is None else np.ascontiguousarray(frames, np.float32)
+    return replace(scan, projections=frames, geometry=panel, trajectory=CircularOrbit(panel, replace(sweeps, **angles)))
+
+
+RIGHT = {
+    "25 views, fly": lambda scan: scan,
+    "1000 photons": lambda scan: of_photons(scan, 1000),
+    "30 photons": lambda scan: of_photons(scan, 30),
+    "truncated": lambda scan: stated(scan, scan.projections[:, :, 12:36], detector_shape=(48, 24)),
+}
+WRONG = {
+    "axis off by 10 pixels": lambda scan: stated(scan, detector_offset_mm=(0.0, 10 * 4 / 48)),
+    "no flats": lambda scan: stated(scan, scan.projections - np.log(2e4)),
+    "flats of a tenth of the time": lambda scan: stated(scan, scan.projections - np.log(10)),
+    "angles reversed": lambda scan: stated(scan, turns=-1.0),
+    "angles in radians": lambda scan: stated(scan, turns=np.pi / 180),
+}
+
+
+@pytest.mark.parametrize("name", [*RIGHT, *WRONG])
+def test_a_residual_beyond_the_noise_is_said(cli, fly, tmp_path, caplog, name) -> None:
+    write_scan(tmp_path / "scan.h5", {**RIGHT, **WRONG}[name](fly))
+    assert cli.run(["reconstruct", str(tmp_path / "scan.h5"), "-o", str(tmp_path / "volume.h5")]) == 0
+    assert (LINE in caplog.text) == (name in WRONG)
