@@ -1,10 +1,9 @@
-"""Speed of the splat projector, as rates and ratios from one run.
+"""Measures the speed of the splat projector, as rates and as ratios of one run.
 
     python benchmarks/splat_speed.py [--detector 256] [--gaussians 50000] [--repeats 7] [--device D] [--json FILE]
 
-"Evaluated" pairs are the Gaussian-pixel pairs of all vectors that were computed; "box" pairs lie in the bounding boxes
-of the cutoff ellipses, "useful" ones inside the ellipses (pi/4 of the box).
-"""
+"Evaluated" pairs are the Gaussian-pixel pairs of all vectors that were computed. "box" pairs lie in the bounding boxes of
+the cutoff ellipses, "useful" pairs inside the ellipses (pi/4 of the box)."""
 
 import resource
 import statistics
@@ -21,7 +20,7 @@ MOTIONS = {"static": Static(), "micro-views 8x5": MicroViews(8, 5)}
 
 
 def projector_rates(rt: Runtime, scan: Scan, count: int, repeats: int) -> dict[str, dict[str, float]]:
-    """Kernel seconds and rates of forward and backward, by motion model."""
+    """Returns kernel seconds and rates of forward and backward, by motion model."""
     rng = np.random.default_rng(0)
     detector = scan.lines
     pixel = 4.0 / detector / 1.4

@@ -1,13 +1,14 @@
-"""Error and cost of the ways to project a moving gantry: static, M×N micro-views, and splats exact in time.
+"""Measures error and cost of three ways to project a moving gantry: static, M×N micro-views, and splats exact in time.
 
     python benchmarks/time_exact.py [--detector 512] [--gaussians 20000] [--repeats 7] [--device D] [--json FILE]
 
-One frame of the rapid protocol (14.4° of exposure, readout 0.86 of it). Errors are relative (RMS over RMS) to a reference
-that takes every row at --samples times of its own exposure: the mean over single random Gaussians with scales of 0.5 to
-4 % of the half-width, and that of a Shepp-Logan cloud. Costs are of another cloud, of scales of 0.8 to 3 %: pairs of
-Gaussian and pixel that are walked and evaluated (whole vectors), and the smallest time of several runs in turn, of all
-kernels forward and backward: on CPUs processor time, which other programs disturb little, on GPUs the kernels'.
-"""
+The scan is one frame of the rapid protocol (14.4° of exposure, readout 0.86 of it). Errors are relative (RMS over RMS) to a
+reference that takes every row at --samples times of its own exposure. They are the mean over single random Gaussians, with
+scales of 0.5 to 4 % of the half-width, and that of a Shepp-Logan cloud.
+
+Costs are of another cloud, with scales of 0.8 to 3 %: pairs of Gaussian and pixel that are visited and evaluated (whole
+vectors), and the smallest time of several runs in turn, of all kernels forward and backward. On CPUs this is processor time,
+which other programs change little; on GPUs it is the kernels' time."""
 
 import time
 from collections.abc import Callable
@@ -35,9 +36,9 @@ from phyradgs_cl.simulation import phantom_scene
 MICRO_VIEWS = ((8, 5), (16, 5), (16, 15))
 BOUNDS = (0.02, 0.01, 0.007, 0.005, 0.002, 0.001)
 SEGMENTS = (2, 3, 4, 6, 8)
-SCALES = (0.008, 0.03)  # of the cloud that is timed
-FINE_BOUND = 0.001  # of the rules, where K is given
-_FOOTPRINTS = 12_000_000  # of Gaussians in cells at one time, for the reference
+SCALES = (0.008, 0.03)  # scales of the timed cloud
+FINE_BOUND = 0.001  # bound of the rules, where K is given
+_FOOTPRINTS = 12_000_000  # Gaussians in cells at one time, for the reference
 
 
 @dataclass(frozen=True)
@@ -61,7 +62,7 @@ def models_of(where: tuple) -> list[Model]:
 
 
 def shepp_logan_cloud(rt: Runtime, geometry: ConeGeometry, count: int, edge: int = 64) -> np.ndarray:
-    """Gaussians (11, G) drawn from a voxelised Shepp-Logan head as the first cloud of a reconstruction is."""
+    """Returns Gaussians (11, G) drawn from a voxelised Shepp-Logan head, as the first cloud of a reconstruction is."""
     grid = Grid.cube(edge, 2.0)
     scene = phantom_scene(rt, "shepp-logan", geometry, grid, edge, "rows", 0)
     usual = {"threshold": 0.05, "density_share": 0.15, "scale_bounds": (0.001, 1.0), "scale_factor": 1.0}
@@ -71,7 +72,7 @@ def shepp_logan_cloud(rt: Runtime, geometry: ConeGeometry, count: int, edge: int
 
 
 def reference_frame(rt: Runtime, rows: np.ndarray, table: TimeCells, width: int) -> np.ndarray:
-    """The frame (lines, width) of a table with many cells, a batch of Gaussians at a time."""
+    """Returns the frame (lines, width) of a table with many cells, a batch of Gaussians at a time."""
     projector, cells = SplatProjector(rt, table.lines, width), DeviceCells.upload(rt, table)
     step = max(_FOOTPRINTS // table.count // 16, 1) * 16
     frame = np.zeros((table.lines, width))
@@ -87,7 +88,7 @@ def relative(found: np.ndarray, expected: np.ndarray) -> float:
 def errors(
     rt: Runtime, models: list[Model], reference: TimeCells, clouds: list[np.ndarray]
 ) -> dict[str, float]:
-    """Mean over the clouds of each model's relative error."""
+    """Returns the mean over the clouds of each model's relative error."""
     width = reference.lines
     expected = [reference_frame(rt, rows, reference, width) for rows in clouds]
     found = {}
@@ -123,7 +124,7 @@ class Bench:
                 self.best[name] = min(self.best[name], seconds)
 
     def _seconds(self, call: Callable[[], None]) -> float:
-        """Processor time on CPUs, kernel time on GPUs."""
+        """Returns processor time on CPUs, kernel time on GPUs."""
         self.rt.kernel_seconds()
         started = time.process_time()
         call()

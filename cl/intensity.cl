@@ -1,17 +1,16 @@
 /* The intensity model over the cells of a frame: a detector adds photons, not line integrals.
-
-   The k-th cell of every line is drawn into the k-th layer as w_k p_k. The merged frame is -ln(sum w_k exp(-p_k)) and
-   its derivative by w_k p_k is the share exp(-p_k) / sum w_j exp(-p_j). Twin: detector/average.py. */
+   The k-th cell of every line is drawn into the k-th layer, as w_k p_k. The merged frame is -ln(sum w_k exp(-p_k)). Its
+   derivative by w_k p_k is the share exp(-p_k) / sum w_j exp(-p_j). Twin: detector/average.py. */
 #include "common/intensity.h"
 
-/* p_k of a pixel from w_k p_k */
+/* p_k of a pixel, from w_k p_k */
 #define SEEN(k) (V_LOAD(layers + (size_t)(k) * layer_size + at) * unit / weights[(size_t)(k) * lines + v])
 
 __kernel void intensity_merge(
     __global const float *layers,   /* layer_count images: guard, then (lines, pitch) */
-    __global const float *weights,  /* (layer_count, lines): weight in a line's window, 0 where a layer has no cell of the line */
+    __global const float *weights,  /* (layer_count, lines): weight in a line's window, 0 for no cell */
     const int layer_count, const int lines, const int width, const int pitch,
-    const float unit,               /* line integral that is 1 in the images */
+    const float unit,               /* the line integral that is 1 in the images */
     __global float *shares,         /* layer_count images: derivative of the merged frame by the layers */
     __global float *merged)         /* guard, then (lines, pitch), padding is not written */
 {
@@ -20,7 +19,7 @@ __kernel void intensity_merge(
         return;
     const size_t at = IMAGE_GUARD + (size_t)v * pitch + u, layer_size = IMAGE_GUARD + (size_t)lines * pitch;
     const vi inside = V_INT((vf)(u) + V_IOTA) < width;
-    vf least = (vf)(MAXFLOAT); /* of the brightest cell: nothing overflows */
+    vf least = (vf)(MAXFLOAT); /* p of the brightest cell: nothing overflows */
     for (int k = 0; k < layer_count; ++k)
         if (weights[(size_t)k * lines + v] > 0.0f)
             least = min(least, SEEN(k));
@@ -43,7 +42,7 @@ __kernel void intensity_merge(
     V_STORE(V_PICK(0.0f, any ? (least - brighter) / unit : (vf)(0.0f), inside), merged + at);
 }
 
-/* dL/dlayers from dL/dmerged */
+/* dL/dlayers, from dL/dmerged */
 __kernel void intensity_split(
     __global const float *by_merged, /* guard, then (lines, pitch) */
     __global const float *shares,

@@ -1,6 +1,7 @@
-/* Between frames and slots: what the upright kernels project from one pose, for the part of the panel that it serves.
-   A frame is an average over slots with a weight for each line; the transpose gives a slot its share of the frames.
-   A line is a detector row where `by_row`, else a column. AVERAGE: of a pixel's slots, as in rays.cl. */
+/* Converts between frames and slots. A slot is what the upright kernels project from one pose, for the part of the panel
+   that the pose serves. A frame is an average over slots with a weight for each line; the transpose gives a slot its share
+   of the frames. A line is a detector row where `by_row`, otherwise a column. AVERAGE: that of a pixel's slots, as in
+   rays.cl. */
 #include "common/intensity.h"
 #include "common/ray_column.h"
 
@@ -8,9 +9,9 @@
 #define AVERAGE_INTENSITY 1 /* -log of the sum of w exp(-p) */
 #define AVERAGE_CORRECTION 2       /* the first less the second, from differences between poses: no cancellation */
 
-#define SHARE 4        /* ints of a share: slot (or frame), first line, line after the last, where its weights begin */
+#define SHARE 4        /* ints of a share: slot (or frame), first line, line after the last, start of its weights */
 
-/* Weights of LANES pixels from row v on, in column u; 0 where the share serves none. */
+/* Weights of LANES pixels from row v on in column u; 0 where the share does not serve them. */
 RAY_INLINE vf weights_at(__global const float *weights, __global const int *share, const int by_row, const int u, const int v)
 {
     const int first = share[1], stop = share[2];
@@ -28,7 +29,7 @@ __kernel void merge_slots(
     __global const float *integrals,  /* guard, then (S, columns of a slot, slot_pitch) */
     const int slot_columns, const int slot_pitch,
     __global const int *slots,        /* (S, SLOT) */
-    __global const int *frame_shares, /* (F + 1,): where a frame's shares begin */
+    __global const int *frame_shares, /* (F + 1,): starts of each frame's shares */
     __global const int *shares,       /* (E, SHARE) */
     __global const float *weights,
     const int by_row, const int width, const int height,
@@ -53,7 +54,7 @@ __kernel void merge_slots(
             __global const float *column = integrals + IMAGE_GUARD
                 + ((size_t)share[0] * slot_columns + u - slot[SLOT_U]) * slot_pitch;
             const int own = v - slot[SLOT_V], most = slot_pitch - LANES;
-            /* near the ends of the slot: only the lanes inside */
+            /* Near the ends of the slot only some lanes are inside. */
             const vf p = own >= 0 && own <= most
                 ? V_LOAD(column + own) : GATHER(column, min(max(own + VI_IOTA, 0), slot_pitch - 1));
             if (AVERAGE == AVERAGE_LOG) {
@@ -72,13 +73,13 @@ __kernel void merge_slots(
     }
 }
 
-/* The transpose of merge_slots with the log average, times the length of each ray from plane to plane. Where
-   columns lean the rays' slopes along z follow, slots_floats behind the values. */
+/* The transpose of merge_slots with the log average, times the length of each ray from plane to plane. Where columns lean,
+   the rays' slopes along z come after the values, slots_floats later. */
 __kernel void split_slots(
     __global const float *turned,     /* guard, then (F, width, turned_pitch): frames with detector columns as rows */
-    const long start, const int turned_pitch, /* start: floats before the first of the frames */
+    const long start, const int turned_pitch, /* start: floats before the first frame */
     __global const float *cells, __global const int *slots,
-    __global const int *slot_shares,  /* (S + 1,): where a slot's shares begin */
+    __global const int *slot_shares,  /* (S + 1,): starts of each slot's shares */
     __global const int *shares,       /* (E, SHARE), by slot */
     __global const float *weights,
     const int by_row, const int width, const float4 pitch_mm,

@@ -1,4 +1,4 @@
-"""Frames of a phantom of known shape on a coarse grid: its placement, density and a background replace the volume."""
+"""Compares frames with a phantom of known shape: its placement, its density and a background replace the volume."""
 
 import math
 from collections.abc import Sequence
@@ -18,19 +18,20 @@ from phyradgs_cl.calibrate.shadows import DENSITY, BeadOperator
 from phyradgs_cl.calibrate.stages import Stage
 from phyradgs_cl.phantoms import EllipsoidPhantom
 
-_FEWEST_TIMES, _MOST_TIMES = 6, 24  # per exposure; the phantom's edge moves by a pixel between two
-_FEWEST_RAYS, _MOST_RAYS = 2, 6  # along each side of a pixel or a block; also per bead's radius
-_BLUR_PX = 0.8  # less would show single rays, half a pixel apart, in differences of sharp edges
-_LEAST_ZEROS, _ZEROS_PX = 0.2, 5  # of all pixels, where noise about air was clipped at 0; side of the blocks to average
-_BACKGROUND = 4  # cosines along each side of a frame: holder, scatter, drift of the tube
+_FEWEST_TIMES, _MOST_TIMES = 6, 24  # times per exposure; the phantom's edge moves by a pixel between two of them
+_FEWEST_RAYS, _MOST_RAYS = 2, 6  # rays along each side of a pixel or a block, and per bead's radius
+_BLUR_PX = 0.8  # with less blur, differences of sharp edges would show single rays, which are half a pixel apart
+_LEAST_ZEROS, _ZEROS_PX = 0.2, 5  # fraction of zeros from which air was clipped; side of the averaged blocks
+_BACKGROUND = 4  # cosines along each side of a frame: they describe holder, scatter and drift of the tube
 _STEP_PX = 0.25
-_MOST_PX = 1.5  # by which a step of the placement moves a frame
-_SETTLED_PX, _LINEAR_PX = 0.01, 0.3  # the last step; the largest step after which the signals are still valid
+_MOST_PX = 1.5  # largest movement of a frame by a step of the placement
+_SETTLED_PX, _LINEAR_PX = 0.01, 0.3  # size of the last step; the largest step after which the signals are still valid
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class BeadProblem(CoarseFrames):
-    """Like ``CoarseProblem`` for a known phantom. Its objects are placements (7,), ``start`` being a first guess."""
+    """The problem of ``CoarseProblem`` for a known phantom. Its objects are placements (7,), of which ``start`` is a first
+    guess."""
 
     phantom: EllipsoidPhantom
     start: np.ndarray
@@ -68,11 +69,11 @@ class BeadProblem(CoarseFrames):
         return self._without_background(self.measured - operator.forward(placement))
 
     def noise(self, residual: np.ndarray) -> float:
-        """Returns the standard deviation of a pixel's noise and model errors."""
+        """Returns the standard deviation of a pixel, from noise and model errors."""
         return float(np.std(residual if self.valid is None else residual[self.valid]))
 
     def explained(self, operator: BeadOperator, placement: np.ndarray) -> float:
-        """Returns the fraction of the compared frames' squares that the phantom explains; 0 for a negative density."""
+        """Returns the fraction of the compared values' squares that the phantom explains. A negative density explains 0."""
         residual = self.compared(self.residual(operator, placement))
         whole = self.compared(self.masked(self.measured))
         return float(1 - residual @ residual / max(float(whole @ whole), 1e-30)) if placement[DENSITY] > 0 else 0.0
@@ -109,7 +110,8 @@ class BeadProblem(CoarseFrames):
         return blurred.ravel()
 
     def _units(self) -> np.ndarray:
-        """Returns the amount of each number (7,) that moves a frame by a pixel at its edge, or adds the known density."""
+        """Returns the amount of each number (7,) that moves a frame by a pixel at its edge, or changes the density by the
+        known one."""
         scan = self.scans[0]
         pixel_mm = self.block * min(scan.geometry.pixel_size_mm) / scan.geometry.magnification
         return np.array([pixel_mm / (max(scan.grid.size_mm) / 2)] * 3 + [pixel_mm] * 3 + [1.0])
@@ -124,7 +126,7 @@ class BeadProblem(CoarseFrames):
         return np.array(signals)
 
     def _without_background(self, frames: np.ndarray) -> np.ndarray:
-        """Returns frames less their fit by a few cosines along each side."""
+        """Returns frames less the background, which is their fit by a few cosines along each side."""
         rows, columns = (_cosines(count) for count in frames.shape[1:])
         if self.valid is None:
             inner = np.einsum("vi,fvu,uj->fij", rows, frames, columns)
@@ -138,8 +140,9 @@ class BeadProblem(CoarseFrames):
 
 
 def _clipped_noise(scans: Sequence[Scan]) -> float:
-    """Returns the standard deviation of noise about air that was clipped at 0, from means of small blocks; 0 where few
-    pixels are 0."""
+    """Returns the standard deviation of the noise about air where it was clipped at 0, from means of small blocks.
+
+    Returns 0 where few pixels are 0."""
     values = np.concatenate([np.asarray(scan.projections, np.float32) for scan in scans])
     valid = np.concatenate([scan.valid for scan in scans])
     if np.mean(values[valid] == 0) < _LEAST_ZEROS or values[valid].min() < 0:
@@ -150,7 +153,7 @@ def _clipped_noise(scans: Sequence[Scan]) -> float:
 
 def _with_spread_of(scan: Scan, times: int) -> Scan:
     """Returns the scan with longer exposures about the same middle, so that ``times`` moments have the standard deviation of
-    the whole exposure. Few moments would otherwise look like a shorter exposure. Pulses stay unchanged."""
+    the whole exposure. Otherwise few moments would look like a shorter exposure. Pulses stay unchanged."""
     if scan.shutter.pulse_s is not None:
         return scan
     exposure_s = scan.shutter.exposure_s / math.sqrt(1 - times**-2)
@@ -160,14 +163,14 @@ def _with_spread_of(scan: Scan, times: int) -> Scan:
 
 
 def _moved(placement: np.ndarray, step: np.ndarray) -> np.ndarray:
-    """Returns a placement (7,) after another turn about the world's axes, a shift, and a change of density."""
+    """Returns the placement (7,) after a further turn about the world's axes, a shift, and a change of density."""
     turn = Rotation.from_rotvec(step[:3])
     turned = (turn * Rotation.from_rotvec(placement[:3])).as_rotvec()
     return np.concatenate([turned, turn.apply(placement[3:DENSITY]) + step[3:DENSITY], placement[DENSITY:] + step[DENSITY:]])
 
 
 def _cosines(count: int) -> np.ndarray:
-    """Returns the slowest cosines (count, n) along a side, orthonormal."""
+    """Returns the slowest cosines (count, n) along a side, which are orthonormal."""
     order = np.arange(min(_BACKGROUND, count))
     waves = np.cos(np.pi * order * (np.arange(count)[:, None] + 0.5) / count)
     return waves / np.linalg.norm(waves, axis=0)

@@ -1,7 +1,7 @@
-"""Parameters of single views (a wobble), or of an object that moves slowly (a motion), by splines of time.
+"""Parameters of single views (a wobble), or of an object that moves slowly (a motion), as splines of time.
 
-A view's parameters change its own frame only, so their signals are images of that frame. CGLS solves the normal equations of
-a Gauss–Newton step for the volume and all parameters together, so that parameters explain only what the volume cannot."""
+A view's parameters change its own frame only, so their signals are images of that frame. CGLS solves the normal equations
+of a Gauss–Newton step for the volume and all parameters together. Parameters then explain only what the volume cannot."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
@@ -19,16 +19,16 @@ from phyradgs_cl.operators.rays.operator import RayOperator
 from phyradgs_cl.reconstructors.fits.residuals import AugmentedOperator, ViewParameters
 from phyradgs_cl.reconstructors.voxels.cgls import Cgls
 
-SPLINES = 7  # of a motion: about one per seventh of the scan
+SPLINES = 7  # of a motion: one spline reaches over about a seventh of the scan
 TURN, SHIFT_V, SHIFT_U = 0, 1, 2
 _STEP_PX = 0.25
-_LEAST_NORM = 0.1  # of the largest of a kind: parameters with weaker signals are not scaled up further
+_LEAST_NORM = 0.1  # fraction of the largest norm of a kind: parameters with weaker signals are not scaled up further
 _DEG = float(np.rad2deg(1.0))
 
 
 @dataclass(frozen=True)
 class Kind:
-    """A kind of parameter: its name in the table, its unit there, and that unit per unit of the parameter."""
+    """A kind of parameter: its name and unit in the table, and how much of that unit is one unit of the parameter."""
 
     name: str
     unit: str
@@ -37,10 +37,12 @@ class Kind:
 
 @dataclass(frozen=True, eq=False)
 class PerViewParameters(ABC):
-    """``values`` (n, K), of which view f has ``basis`` (F, n) @ values (K,). ``units`` (K,): the amount of each kind that
-    moves a frame by a pixel at its edge. ``circle`` (n, 2): values that vary as cosine and sine of the angle, as far as the
-    basis can. MISMATCH: measured errors (docs/calibrate.md) over those of noise, because voxels do not represent the object
-    exactly. RESTARTED: kinds that start from 0 on each grid."""
+    """Values of the parameters. View f has ``basis`` (F, n) @ values (K,), of ``values`` (n, K).
+
+    - units (K,): the amount of each kind that moves a frame by a pixel at its edge.
+    - circle (n, 2): values that vary as cosine and sine of the angle, as far as the basis can.
+    - MISMATCH: measured errors (docs/calibrate.md) over those of noise, because voxels do not represent the object exactly.
+    - RESTARTED: kinds that start from 0 on each grid."""
 
     values: np.ndarray
     basis: np.ndarray
@@ -60,7 +62,7 @@ class PerViewParameters(ABC):
         """Returns values (n, K) without the part that another object explains exactly."""
 
     def kinds_of_stage(self, number: int, count: int) -> Sequence[int]:
-        """Returns the kinds to estimate in a stage; by default all."""
+        """Returns the kinds to estimate in a stage. By default these are all kinds."""
         return range(len(self.KINDS))
 
     def operator(
@@ -70,7 +72,7 @@ class PerViewParameters(ABC):
 
 
 class WobbleParameters(PerViewParameters):
-    """A turn and two shifts per view, separately for each or by splines of time."""
+    """A turn and two shifts per view, either separate for each view or as splines of time."""
 
     KINDS = (Kind("turn per view", "deg", _DEG), Kind("shift-v per view", "mm", 1.0), Kind("shift-u per view", "mm", 1.0))
     MISMATCH = 4.0
@@ -91,8 +93,8 @@ class WobbleParameters(PerViewParameters):
         return Views(per_view[:, TURN], per_view[:, SHIFT_V:])
 
     def without_gauges(self, values: np.ndarray) -> np.ndarray:
-        """A turned or shifted object explains the mean of turns and of shifts along v, and shifts along u that vary as
-        cosine and sine of the angle."""
+        """Returns values without what a turned or shifted object explains: the mean of turns and of shifts along v, and
+        shifts along u that vary as cosine and sine of the angle."""
         rest = values.copy()
         rest[:, :SHIFT_U] -= (self.basis @ rest[:, :SHIFT_U]).mean(0)
         pattern, shifts = self.basis @ self.circle, self.basis @ rest[:, SHIFT_U]
@@ -100,14 +102,14 @@ class WobbleParameters(PerViewParameters):
         return rest
 
     def kinds_of_stage(self, number: int, count: int) -> Sequence[int]:
-        """Turns need fine detail: they are estimated on the last two grids only, each time from 0, so that the difference
-        between the two shows their error."""
+        """Returns the kinds of a stage. Turns need fine detail, so they are estimated on the last two grids only, each time
+        from 0. The difference between the two grids then shows their error."""
         return (TURN, SHIFT_V, SHIFT_U) if number >= count - 2 else (SHIFT_V, SHIFT_U)
 
 
 @dataclass(frozen=True, eq=False)
 class MotionParameters(PerViewParameters):
-    """Three turns and three shifts of the object, by splines of time."""
+    """Three turns and three shifts of the object, as splines of time."""
 
     still: Sway
 
@@ -120,7 +122,7 @@ class MotionParameters(PerViewParameters):
 
     @classmethod
     def of(cls, scan: Scan, count: int = SPLINES) -> "MotionParameters":
-        """Returns no motion, by ``count`` splines."""
+        """Returns a motion of zeros, as ``count`` splines."""
         still = Sway.none(scan, count)
         basis = still.basis(np.asarray(scan.frame_start_s) + scan.shutter.middle_s)
         shift_mm = scan.geometry.pixel_size_mm[1] / scan.geometry.magnification
@@ -131,8 +133,8 @@ class MotionParameters(PerViewParameters):
         return replace(self.still, coefficients=values)
 
     def without_gauges(self, values: np.ndarray) -> np.ndarray:
-        """An object elsewhere explains the mean of each kind; a larger or smaller one shifts along x and y that follow the
-        source."""
+        """Returns values without what another object explains. An object elsewhere explains the mean of each kind; a larger
+        or smaller one explains shifts along x and y that follow the source."""
         rest = values - (self.basis @ values).mean(0)
         towards_source = self.circle - (self.basis @ self.circle).mean(0)
         shifts, pattern = self.basis @ rest[:, 3:5], self.basis @ towards_source
@@ -141,13 +143,13 @@ class MotionParameters(PerViewParameters):
 
 
 def _turn_unit_rad(scan: Scan) -> float:
-    """Returns the turn that moves the object's edge by a pixel."""
+    """Returns the turn in rad that moves the object's edge by a pixel."""
     edge_mm = max(scan.grid.size_mm[1:]) / 2 * scan.geometry.magnification
     return scan.geometry.pixel_size_mm[1] / edge_mm
 
 
 def units_of_views(scan: Scan) -> np.ndarray:
-    """Returns the turn (rad) and the shifts along v and u (mm) of a view that move its frame by a pixel at its edge."""
+    """Returns the turn (rad) and the shifts along v and u (mm) that move a view's frame by a pixel at its edge."""
     return np.array([_turn_unit_rad(scan), *scan.geometry.pixel_size_mm])
 
 
@@ -165,8 +167,8 @@ def view_step(
     problem: CoarseProblem, correction: GeometryCorrection, parameters: PerViewParameters, volume: np.ndarray,
     kinds: Sequence[int], iterations: int,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the Gauss–Newton step (n, K) from the parameters' values for the object ``volume``, 0 for other kinds than
-    ``kinds``. Also returns the signals (F, kinds, rows, columns) of one pixel's worth of each kind."""
+    """Returns the Gauss–Newton step (n, K) from the parameters' values for the object ``volume``; it is 0 for kinds outside
+    of ``kinds``. Also returns the signals (F, kinds, rows, columns) of a movement by one pixel, for each kind."""
     operator = parameters.operator(problem, correction)
     residual = problem.residual(operator, volume)
     signals = np.stack([_signal(problem, correction, parameters, volume, kind) for kind in kinds], 1)
@@ -192,8 +194,10 @@ def view_deviations(
     problem: CoarseProblem, correction: GeometryCorrection, parameters: PerViewParameters,
     signals: np.ndarray, iterations: int,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the standard deviations (K,) of a view's parameters, and the shares (K,) of their signals (F, K, rows,
-    columns) that no object explains. Errors of the values that make up a view are taken as independent."""
+    """Returns the standard deviations (K,) of a view's parameters, and the shares (K,) of their signals that no object
+    explains.
+
+    signals: (F, K, rows, columns). The errors of the values that make up a view are taken as independent."""
     operator = parameters.operator(problem, correction)
     norms = _norms(parameters.basis, signals)
     noise = noise_level(problem.measured, problem.valid)
@@ -210,7 +214,7 @@ def _norms(basis: np.ndarray, signals: np.ndarray) -> np.ndarray:
 
 
 def _strength(operator: RayOperator) -> float:
-    """Returns about the largest singular value of A: parameters in its units converge as fast as the object's main
+    """Returns a rough largest singular value of A. Parameters in its units converge as fast as the object's main
     features."""
     lengths = operator.forward(np.ones(operator.volume_shape, np.float32))
     return float(np.linalg.norm(operator.adjoint(lengths)) / np.linalg.norm(lengths))
@@ -220,7 +224,7 @@ def _signal(
     problem: CoarseProblem, correction: GeometryCorrection, parameters: PerViewParameters, volume: np.ndarray,
     kind: int,
 ) -> np.ndarray:
-    """Returns the change of the frames (F, rows, columns) per pixel's worth of a kind in each view."""
+    """Returns the change of the frames (F, rows, columns) by a kind, where it moves each view by one pixel."""
     step_px = _STEP_PX * problem.block
     step = np.zeros(len(parameters.units))
     step[kind] = step_px * parameters.units[kind]

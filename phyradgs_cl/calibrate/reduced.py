@@ -1,8 +1,8 @@
-"""The Gauss–Newton step of the parameters, after removing the signals that a change of the volume explains.
+"""The Gauss–Newton step of the parameters, without the signals that a change of the volume explains.
 
-Variable projection (Golub and Pereyra, SIAM J. Numer. Anal. 10 (1973) 413) in Kaufman's form: with A the operator at the
+Variable projection (Golub and Pereyra, SIAM J. Numer. Anal. 10 (1973) 413) in Kaufman's form. With A the operator at the
 parameters θ, x the volume and P the projector onto A's range, the Jacobian is J = (I − P) ∂A/∂θ x. Each parameter's signal
-∂A/∂θ x is a central difference. CGLS removes from it the part that some volume explains. The remaining signals and the
+∂A/∂θ x is a central difference, from which CGLS removes the part that some volume explains. The remaining signals and the
 remaining residual give the step, its standard deviations, and the parameters that the frames determine at all."""
 
 from collections.abc import Mapping, Sequence
@@ -16,19 +16,20 @@ from phyradgs_cl.calibrate.beads import BeadProblem
 from phyradgs_cl.calibrate.parameters import GAUGES, PARAMETERS, Parameter, correction_of
 from phyradgs_cl.calibrate.problem import CoarseProblem
 
-LEAST_SHARE = 0.2  # of a signal, beyond what the object and the other parameters explain
-LEAST_SHARE_OF_BEADS = 0.02  # of a known object, which has no voxels that explain signals by accident
+LEAST_SHARE = 0.2  # of a signal, the least share beyond what the object and the other parameters explain
+LEAST_SHARE_OF_BEADS = 0.02  # the same for a known object, which has no voxels that explain signals by accident
 _TINY = 1e-9
-_GAUGE_FACTOR, _MOST_GAUGE = 2.0, 0.2  # over a gauge's share, which is itself large where the geometry is wrong
+_GAUGE_FACTOR, _MOST_GAUGE = 2.0, 0.2  # factor of a gauge's share; most of it to count, as it is large in a wrong geometry
 
 
 @dataclass(frozen=True, eq=False)
 class Reduced:
-    """The linear problem of the parameters ``names`` (K of them) on one grid, N = F · pixels, ordered by frame.
+    """The linear problem of the K parameters ``names`` on one grid. N = F · pixels, ordered by frame.
 
-    jacobian (K, N): the parts of the signals that no volume explains, per unit of each parameter's field. residual (N,):
-    that of the residual. sizes (K,): norms of the whole signals. whole_gram (K, K): their inner products over their norms.
-    noise: standard deviation of a pixel. mismatch (K,): factor of the deviations for errors other than noise."""
+    - jacobian (K, N): the parts of the signals that no volume explains, per unit of each parameter's field.
+    - residual (N,): the part of the residual that no volume explains.
+    - sizes (K,): norms of the whole signals. whole_gram (K, K): their inner products over their norms.
+    - noise: standard deviation of a pixel. mismatch (K,): factors of the deviations, for errors other than noise."""
 
     names: tuple[str, ...]
     mismatch: np.ndarray
@@ -40,7 +41,7 @@ class Reduced:
     noise: float
 
     def only(self, names: Sequence[str]) -> "Reduced":
-        """Returns the problem of some parameters, the others fixed."""
+        """Returns the problem of some parameters. The others are fixed."""
         at = [self.names.index(name) for name in names]
         whole_gram = self.whole_gram[np.ix_(at, at)]
         mismatch, jacobian, sizes = self.mismatch[at], self.jacobian[at], self.sizes[at]
@@ -49,18 +50,18 @@ class Reduced:
         )
 
     def relative_to_stated(self, at: Mapping[str, float]) -> "Reduced":
-        """Returns the same problem, linearised at the values ``at``, with its step counted from the stated values."""
+        """Returns the problem, linearised at the values ``at``, with its step counted from the stated values."""
         back = np.array([at.get(name, 0.0) for name in self.names]) @ self.jacobian
         return replace(self, residual=self.residual + back)
 
     @property
     def unit(self) -> np.ndarray:
-        """The remaining signals (K, N) over the norms of the whole ones."""
+        """The remaining signals (K, N) over the norms of the whole signals."""
         return self.jacobian / self.sizes[:, None]
 
     @property
     def gram(self) -> np.ndarray:
-        """Inner products (K, K) of ``unit``: 1 on the diagonal where a volume explains nothing of a signal."""
+        """Inner products (K, K) of ``unit``. The diagonal is 1 where a volume explains nothing of a signal."""
         unit = self.unit
         return unit @ unit.T
 
@@ -68,8 +69,8 @@ class Reduced:
     def shares(self) -> np.ndarray:
         """How much of each parameter's signal (K,) no object explains, 0 to 1.
 
-        The smaller of two ratios: the remaining norm over the whole one; the parameter's certainty among all others, over
-        that with a known object."""
+        This is the smaller of two ratios. One is the remaining norm over the whole norm. The other is the parameter's
+        certainty among all others, over its certainty with a known object."""
         tiny = _TINY * np.eye(len(self.names))
         variance, variance_with_object = (np.diag(np.linalg.inv(gram + tiny)) for gram in (self.gram, self.whole_gram))
         certainty = variance_with_object / variance
@@ -80,9 +81,10 @@ class Reduced:
         return np.linalg.solve(self.gram, self.unit @ self.residual) / self.sizes
 
     def deviations(self) -> np.ndarray:
-        """Returns the standard deviations (K,) of the step, by a sandwich estimator with frames as the sample, so that noise
-        may be correlated within a frame. They are at least those of white noise; noise that the fit has removed from the
-        residual is added back."""
+        """Returns the standard deviations (K,) of the step, by a sandwich estimator.
+
+        Its sample are the frames, so that noise may be correlated within a frame. Deviations are at least those of white
+        noise. The noise that the fit has removed from the residual is added back."""
         unit = self.unit
         residual = self.residual - self.step() @ self.jacobian
         by_frame = (unit * residual).reshape(len(self.names), self.frames, -1).sum(-1)
@@ -98,8 +100,9 @@ def reduced(
     problem: CoarseProblem | BeadProblem, operator: Any, parameters: Sequence[Parameter], at: Mapping[str, float],
     volume: np.ndarray, iterations: int,
 ) -> Reduced:
-    """Linearises the frames about the parameters' values ``at`` (by name) and the object ``volume``. operator: the
-    problem's at these values."""
+    """Linearises the frames about the parameters' values ``at`` (by name) and the object ``volume``.
+
+    operator: that of the problem at these values."""
     signals = [_signal(problem, one, at, volume) for one in parameters]
     images = [*signals, problem.residual(operator, volume)]
     *jacobian, residual = problem.beyond_object(operator, volume, images, iterations)
@@ -123,16 +126,16 @@ def _signal(
     for sign in (1, -1):
         correction = correction_of({**at, one.name: at.get(one.name, 0.0) + sign * step})
         operator: Any = problem.operator(correction)
-        ends.append(operator.forward(volume) - problem.measured)  # of numbers as small as residuals
+        ends.append(operator.forward(volume) - problem.measured)  # residuals are small: less rounding
     return problem.masked((ends[0] - ends[1]) / np.float32(2 * step))
 
 
 def least_shares(problem: Reduced) -> dict[str, float]:
-    """Returns the least share that has to remain of each parameter's signal, by name, of a problem with ``GAUGES``.
+    """Returns by name the least share of each parameter's signal that has to remain, in a problem with ``GAUGES``.
 
-    It exceeds the share that remains of a turn of all views, or of a lift for parameters that move the image along the
-    axis. No frame distinguishes a turn from a turned object; voxels do not follow it exactly, and leave as much of any
-    other signal."""
+    It exceeds the share that remains of a turn of all views; for parameters that move the image along the axis, that of a
+    lift. No frame distinguishes a turn from a turned object. Voxels do not follow such an object exactly, and leave as much
+    of any other signal."""
     remaining = {gauge.is_axial: float(problem.only([gauge.name]).shares[0]) for gauge in GAUGES}
     names = [name for name in problem.names if name in PARAMETERS]
     gauge_shares = {name: min(remaining[PARAMETERS[name].is_axial], _MOST_GAUGE) for name in names}
@@ -140,8 +143,9 @@ def least_shares(problem: Reduced) -> dict[str, float]:
 
 
 def indistinguishable(problem: Reduced, least: Mapping[str, float]) -> list[dict[str, float]]:
-    """Returns combinations of parameters, as weights by name, of which an object explains all but ``least``: the least
-    share of the parameter with the largest weight."""
+    """Returns combinations of parameters, as weights by name, of which an object explains nearly all.
+
+    Nearly all is all but ``least``: the least share of the parameter with the largest weight."""
     values, vectors = scipy.linalg.eigh(problem.gram, problem.whole_gram + _TINY * np.eye(len(problem.names)))
     limits = np.array([least[problem.names[k]] for k in np.abs(vectors).argmax(0)])
     return [dict(zip(problem.names, map(float, weights), strict=True)) for weights in vectors[:, values < limits**2].T]

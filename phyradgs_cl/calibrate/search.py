@@ -1,7 +1,7 @@
 """The search for the parameters that all views share: Gauss–Newton steps from coarse to fine grids.
 
-On each grid a volume is reconstructed, the signals that a volume explains are removed (``reduced``), and the
-parameters step, until the steps are small. On the first grid each step decides which parameters the frames determine."""
+On each grid a volume is reconstructed, and the signals that a volume explains are removed (``reduced``). The parameters then
+step until the steps are small. On the first grid each step decides which parameters the frames determine."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -24,16 +24,16 @@ from phyradgs_cl.calibrate.result import AGREES, CANNOT_TELL, CORRECTED, Paramet
 from phyradgs_cl.calibrate.stages import Stage
 from phyradgs_cl.calibrate.views import DISCRETISATION
 
-DEVIATIONS = 3.0  # by which a parameter has to differ from its stated value
-_MOST_PX = 2.0  # of a grid, per step: signals are linear no further
-_SETTLED = 0.1  # of a standard deviation
+DEVIATIONS = 3.0  # deviations by which a parameter has to differ from its stated value
+_MOST_PX = 2.0  # largest step, in pixels of the grid: signals are not linear beyond
+_SETTLED = 0.1  # largest last step, in standard deviations
 
 Problem = CoarseProblem | BeadProblem
 
 
 @dataclass(frozen=True)
 class Fallback:
-    """A parameter's value less the stated one, and its standard deviation, in the field's unit."""
+    """A parameter's value less the stated value, and its standard deviation, in the field's unit."""
 
     value: float
     deviation: float
@@ -46,11 +46,14 @@ class Fallback:
 
 @dataclass(eq=False)
 class Search:
-    """The state of a search. ``at``: the current values by name; ``former``: those at the end of the previous grid, for
-    voxels. ``determined``: the parameters that the frames determine, None before the first step. ``fallback``: estimates of
-    parameters from elsewhere, for those that are not determined; ``fixed``: those in use. ``held``: parameters that fits do
-    not determine, because wrong values fit better. ``shares``: what remains of each
-    signal. ``alike``: combinations that no frame distinguishes, in words. ``reduced``: the last linear problem."""
+    """The state of a search.
+
+    - at: the current values by name. former: those at the end of the previous grid, which shows the error of the voxels.
+    - determined: the parameters that the frames determine, None before the first step.
+    - fallback: estimates from elsewhere, for parameters that are not determined. fixed: those of them in use.
+    - held: parameters that fits do not determine, because wrong values fit better.
+    - shares: the part of each signal that remains. alike: combinations, in words, that no frame distinguishes.
+    - reduced: the last linear problem."""
 
     parameters: Sequence[Parameter]
     held: tuple[str, ...] = ()
@@ -82,7 +85,7 @@ class Search:
                 return
 
     def _decide_determined(self, linear: Reduced) -> None:
-        """Decides which parameters the frames determine: those with a large enough share, and a useful deviation."""
+        """Decides which parameters the frames determine: those with a large enough share and a useful deviation."""
         has_gauges = GAUGES[0].name in linear.names
         least = least_shares(linear) if has_gauges else dict.fromkeys(linear.names, LEAST_SHARE_OF_BEADS)
         linear = linear.only([one.name for one in self.parameters])
@@ -98,7 +101,7 @@ class Search:
             self.at[name] = estimate.correction
 
     def _step(self, problem: Problem) -> bool:
-        """Moves the determined parameters, each as far as its signal is linear; True where the step was small."""
+        """Moves the determined parameters, each as far as its signal is linear. Returns True where the step was small."""
         assert self.reduced is not None and self.determined is not None
         current = np.array([self.at.get(name, 0.0) for name in self.determined])
         change = self.reduced.step() - current
@@ -117,8 +120,8 @@ class Search:
     def estimates(self) -> tuple[np.ndarray, np.ndarray]:
         """Returns the values of the determined parameters and their standard deviations.
 
-        A deviation combines noise and discretisation error; the latter is half the change since the coarser grid. Both grow
-        where a parameter resembles undetermined ones, which stay as stated, right or wrong."""
+        A deviation combines noise and discretisation error, which is half the change since the coarser grid. Both grow where
+        a parameter resembles undetermined ones, which stay as stated, right or wrong."""
         if self.reduced is None or not self.determined:
             return np.zeros(0), np.zeros(0)
         values, noise = self.reduced.step(), self.reduced.deviations()
@@ -127,8 +130,10 @@ class Search:
         return values, resemblance * np.hypot(noise, DISCRETISATION * change)
 
     def corrections(self) -> dict[str, float]:
-        """Returns the values of the parameters that differ from the stated ones by three deviations. The others go back to
-        their stated values, which changes the rest: this repeats until all of the rest differ."""
+        """Returns the values of the parameters that differ from the stated ones by three deviations.
+
+        The others go back to their stated values. That changes the remaining ones, so this repeats until all of those
+        differ."""
         values, deviations = self.estimates()
         deviation = dict(zip(self.determined or (), deviations, strict=True))
         names = self.determined or ()
@@ -142,7 +147,7 @@ class Search:
         return significant | dict(zip(names, map(float, values), strict=True))
 
     def table(self, scan: Scan, corrections: Mapping[str, float]) -> list[ParameterEstimate]:
-        """Returns an estimate per parameter; with ``corrections``, their values."""
+        """Returns an estimate per parameter. Those in ``corrections`` have these values."""
         values, deviations = self.estimates()
         estimates = {name: (estimate.value, estimate.deviation) for name, estimate in self.fixed.items()}
         estimates |= dict(zip(self.determined or (), zip(values.tolist(), deviations.tolist(), strict=True), strict=True))

@@ -1,4 +1,4 @@
-"""Expected frames of a phantom of known shape, in closed form, with each line at its own times."""
+"""Computes the expected frames of a phantom of known shape in closed form, each line at its own times."""
 
 import itertools
 import math
@@ -14,14 +14,16 @@ from phyradgs_cl.acquisition.time_cells import TimeCells
 from phyradgs_cl.detector.attenuation import TRANSMISSION_FLOOR
 from phyradgs_cl.phantoms import EllipsoidPhantom
 
-DENSITY = 6  # index in a placement: turn (rotation vector, rad), shift (mm), density
-_MARGIN = 1.2  # of a shadow's half-width, for the panel's obliqueness
+DENSITY = 6  # index in a placement, which is turn (rotation vector, rad), shift (mm), density
+_MARGIN = 1.2  # margin of a shadow's half-width, for an oblique panel
 
 
 @dataclass(frozen=True, eq=False)
 class BeadOperator:
-    """Frames (F, rows, columns) of a phantom seen along the lines of ``tables``, by a detector of ``model``. ``samples``:
-    rays along each side of a pixel. ``clipped_noise``: standard deviation of noise that was clipped at 0; 0: none was."""
+    """Frames (F, rows, columns) of a phantom seen along the lines of ``tables``, by a detector of ``model``.
+
+    ``samples``: rays along each side of a pixel. ``clipped_noise``: standard deviation of noise that was clipped at 0; 0
+    where none was."""
 
     phantom: EllipsoidPhantom
     tables: Sequence[TimeCells]
@@ -37,7 +39,7 @@ class BeadOperator:
         turn = Rotation.from_rotvec(placement[:3]).as_matrix()
         places, steps = pose[:, :2] - placement[3:DENSITY], pose[:, 2:]
         if self.tables[0].is_parallel:
-            places[:, 0] = pose[:, 0]  # a direction
+            places[:, 0] = pose[:, 0]  # a turn does not move the direction of parallel rays
         is_rows = self.tables[0].axis == "rows"
         panel_lines = _PanelLines(
             source=places[:, 0] @ turn, first=places[:, 1] @ turn, line_step=steps[:, int(is_rows)] @ turn,
@@ -57,7 +59,7 @@ class BeadOperator:
 
 
 def _mean_of_clipped(p: np.ndarray, sigma: float) -> np.ndarray:
-    """Returns the mean of max(p + noise, 0) for normal noise: clipping raises air more than faint shadows."""
+    """Returns the mean of max(p + noise, 0) for normal noise. Clipping raises air more than faint shadows."""
     ratio = p / sigma
     return p * scipy.special.ndtr(ratio) + sigma * np.exp(-(ratio**2) / 2) / math.sqrt(2 * math.pi)
 
@@ -77,9 +79,12 @@ def _poses_by_line(tables: Sequence[TimeCells]) -> tuple[np.ndarray, np.ndarray]
 
 @dataclass(frozen=True, eq=False)
 class _PanelLines:
-    """N lines of a panel in the phantom's frame of reference, each at one time. source, first (N, 3): the source and the
-    middle of the panel's first pixel, mm; line_step, pixel_step (N, 3): to the next line and to the next of its ``pixels``;
-    line (N,): the line's number. is_parallel: ``source`` is the rays' direction."""
+    """N lines of a panel, each at one time, in the phantom's frame of reference.
+
+    - source, first (N, 3): the source and the middle of the panel's first pixel, mm.
+    - line_step, pixel_step (N, 3): the steps to the next line and to the next of its ``pixels``. line (N,): the line's
+      number.
+    - is_parallel: ``source`` is the rays' direction."""
 
     source: np.ndarray
     first: np.ndarray
@@ -102,7 +107,7 @@ class _PanelLines:
                 first = first if self.is_parallel else first - source
                 ray = first[:, None] + (pixel[..., None] + along) * self.pixel_step[lines][:, None]
                 starts, rays = np.repeat(source, width, axis=0), ray.reshape(-1, 3)
-                if self.is_parallel:  # from one side of the body to the other
+                if self.is_parallel:  # integrate from one side of the body to the other
                     reach = 2 * (np.abs(rays).max(initial=0.0) + np.abs(body.ends_mm).max() + body.reach_mm)
                     starts, rays = rays - reach * starts, 2 * reach * starts
                 fraction = body.chord_fraction(starts, rays)
@@ -112,9 +117,10 @@ class _PanelLines:
 
     @cached_property
     def _panel_axes(self) -> tuple[tuple[np.ndarray, ...], ...]:
-        """Vectors (N, 3) whose inner products with a place are its distance from the source in panel distances, its line and
-        its pixel; each with that of the source and of the first pixel (N,), and its length (N,). In a parallel beam that
-        distance is 1, and lines and pixels are those that a ray through the place meets."""
+        """Vectors (N, 3) whose inner products with a place are its distance from the source (in panel distances), its line
+        and its pixel. Each comes with the products of the source and of the first pixel (N,), and with its length (N,).
+
+        In a parallel beam the distance is 1, and lines and pixels are those that a ray through the place meets."""
         normal = np.cross(self.line_step, self.pixel_step)
         to_panel = self.source if self.is_parallel else self.first - self.source
         vectors = [normal / np.sum(normal * to_panel, -1, keepdims=True)]

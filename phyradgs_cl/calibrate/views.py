@@ -1,4 +1,4 @@
-"""Estimates the parameters of all views, or of a motion, from coarse to fine grids."""
+"""Estimates the parameters of single views, or of a motion, from coarse to fine grids."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -13,15 +13,16 @@ from phyradgs_cl.calibrate.result import AGREES, CORRECTED, ParameterEstimate
 from phyradgs_cl.calibrate.stages import PassCounter, Passes, Stage, pass_cost
 from phyradgs_cl.runtime import Runtime
 
-DISCRETISATION = 0.5  # of the change since a grid half as fine: the error that remains, if it is of first order
+DISCRETISATION = 0.5  # fraction of the change since a grid half as fine: the error that remains, if it is of first order
 _STEPS = 3
 _ITERATIONS = 20
-_DEVIATIONS = 3.0  # of one value; their root mean square has to exceed these
+_DEVIATIONS = 3.0  # deviations of one value, which the root mean square of all has to exceed
 
 
 @dataclass(frozen=True, eq=False)
 class ViewsEstimate:
-    """``views``: corrections of the kinds that are significant, None without any; a line of the table per kind."""
+    """``views``: corrections of the kinds that are significant, None without any. ``table``: a line of the table per
+    kind."""
 
     views: Views | Sway | None
     table: list[ParameterEstimate]
@@ -41,7 +42,7 @@ def estimate_views(
 ) -> ViewsEstimate:
     """Estimates ``parameters`` of a scan after ``correction``, in a few Gauss–Newton steps per stage.
 
-    A deviation combines noise and discretisation error; the latter is half the change since the coarser grid."""
+    A deviation combines noise and discretisation error, which is half the change since the coarser grid."""
     for number, stage in enumerate(stages):
         problem = CoarseProblem.of(rt, [scan], stage, scan.frames)
         problem = replace(problem, count_pass=passes.counter(pass_cost([scan], stage.columns, scan.frames)))

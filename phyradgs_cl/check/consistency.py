@@ -2,8 +2,8 @@
 
 A coarse reconstruction of consistent frames leaves a far smaller residual than one of the same frames in a random order.
 Where it does not, or where another hypothesis leaves at most half the squared residual, something stated is wrong. The
-steps: remove odd frames; choose the sense of rotation and the panel's shift (``orbit.py`` reports them); remove outliers;
-compare with random orders; try hypotheses."""
+steps are: remove odd frames; choose the sense of rotation and the panel's shift, which ``orbit.py`` reports; remove
+outliers; compare with random orders; try hypotheses."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
@@ -25,23 +25,25 @@ from phyradgs_cl.reconstructors.fits.residuals import Fit, fit, fit_squares, t_s
 from phyradgs_cl.runtime import Runtime
 
 CONSISTENCY = "consistency"
-_LARGEST = 0.35  # residual over that in a random order: correct scans of every kind leave 0.02 to 0.23
-_DOUBTFUL = 0.1  # of that ratio: from here other orders and missing frames are tried
+_LARGEST = 0.35  # of the residual over that in a random order: correct scans of every kind have 0.02 to 0.23
+_DOUBTFUL = 0.1  # from this ratio on, other orders and missing frames are tried
 _RANDOM_ORDERS = 2
 _FEWEST_FRAMES, _FEWEST_PIXELS = 5, 32
-_CLEAR = 0.5  # squared residual of another hypothesis over the stated one's
-_NEARLY = 1.5  # squared residual of a rough fit over the best one's: up to here a hypothesis is refined
+_CLEAR = 0.5  # squared residual of another hypothesis over that of the stated one
+_NEARLY = 1.5  # squared residual of a rough fit over that of the best fit: up to here a hypothesis is refined
 _ERRORS = 4.0
-_SYMMETRIC = 2.0  # residual in a random order over the stated one's
+_SYMMETRIC = 2.0  # residual in a random order over that in the stated one
 _SAME = 0.03  # residual in a random order over the frames' spread: below this and _SYMMETRIC, angles leave no trace
-_MOST_REFINED = 2  # hypotheses about the whole scan
-_SHIFT_PENALTY = 1.5  # of the squared residual, per coarse pixel of shift: stated offsets are mostly right
+_MOST_REFINED = 2  # of hypotheses about the whole scan
+_SHIFT_PENALTY = 1.5  # fraction of the squared residual per coarse pixel of shift: stated offsets are mostly right
 
 
 @dataclass(frozen=True, eq=False)
 class Consistency:
-    """The finding, the ``frames`` (indices) that fit together, whether further questions make sense (``is_sound``), and
-    whether the object looks different from different angles (``sees_angles``)."""
+    """The finding and what it means for further questions.
+
+    ``frames``: indices of those that fit together. ``is_sound``: further questions make sense. ``sees_angles``: the object
+    looks different from different angles."""
 
     finding: Finding
     frames: np.ndarray
@@ -52,8 +54,9 @@ class Consistency:
 @dataclass(frozen=True, eq=False)
 class _CoarseFit:
     """The coarse scan with its best sense of rotation (``turned``), and with its best panel shift as well (``best``).
-    fitted: the fit of ``best``. random_total: its squared residual in a random order. rough_mean_square: that of the best
-    rough fit, per value."""
+
+    fitted: the fit of ``best``. random_total: its squared residual in a random order. rough_mean_square: the squared
+    residual of the best rough fit, per value."""
 
     turned: Scan
     best: Scan
@@ -69,7 +72,7 @@ class _CoarseFit:
 def check_consistency(rt: Runtime, scan: Scan, as_stated: Scan) -> Consistency:
     """Finds frames and hypotheses that explain why the frames of a coarse ``scan`` do not fit together.
 
-    The value is the root of the ratio of two squared residuals: in the stated order over a random order.
+    The finding's value is the root of a ratio of squared residuals: that in the stated order over that in a random order.
     ``as_stated``: the scan before it was made coarse."""
     pixels = float(scan.valid.sum()) / scan.frames
     if scan.frames < _FEWEST_FRAMES or pixels < _FEWEST_PIXELS or scan.projections.shape[2] < FEWEST_COLUMNS:
@@ -115,7 +118,7 @@ def _best_sense(rt: Runtime, scan: Scan) -> tuple[Scan, Scan, float]:
     """Chooses the sense of rotation and the panel's shift, where they fit far better than as stated. Both senses fit
     opposite views equally well.
 
-    Returns the scan with the sense, the same with the shift, and the mean squared residual of the best rough fit."""
+    Returns the scan with that sense, the same with that shift, and the mean squared residual of the best rough fit."""
     senses, limits_px = [scan], [axis.ANYWHERE]
     if not has_opposite_views(scan):
         senses, limits_px = [scan, reversed_rotation(scan)], [axis.ANYWHERE, hypotheses.shifts_for_sense_px(scan)]
@@ -124,7 +127,7 @@ def _best_sense(rt: Runtime, scan: Scan) -> tuple[Scan, Scan, float]:
     turned = best = scan
     least = _CLEAR * fit_squares(rt, scan).sum()
     for sense, rough, limits in zip(senses, roughs, limits_px, strict=True):
-        if rough.squares.mean() > _NEARLY * least_rough:  # in a narrow fan rough fits do not decide
+        if rough.squares.mean() > _NEARLY * least_rough:  # rough fits do not decide in a narrow fan
             continue
         shift = axis.refined_shift(rt, sense, rough, limits)
         if not shift.is_found:
@@ -136,7 +139,7 @@ def _best_sense(rt: Runtime, scan: Scan) -> tuple[Scan, Scan, float]:
 
 
 def _random_order(rt: Runtime, scan: Scan) -> float:
-    """Returns the sum of squared residuals of the scan's frames in a random order, as the mean of two draws."""
+    """Returns the sum of squared residuals of the scan's frames in a random order: the mean of two draws."""
     rng = np.random.default_rng(0)
     orders = [rng.permutation(scan.frames) for _ in range(_RANDOM_ORDERS)]
     return float(np.mean([fit_squares(rt, replace(scan, projections=scan.projections[order])).sum() for order in orders]))
@@ -145,7 +148,7 @@ def _random_order(rt: Runtime, scan: Scan) -> float:
 def _explanation(rt: Runtime, scan: Scan, as_stated: Scan, coarse: _CoarseFit) -> Hypothesis | None:
     """Returns the best hypothesis that fits far better than the stated scan does.
 
-    A panel that sees few rays twice fits any geometry: then it is the first other size under which frames are consistent."""
+    A panel that sees few rays twice fits any geometry. Then it is the first other size under which frames are consistent."""
     is_one_sided = hypotheses.stated_redundancy(as_stated) < hypotheses.LEAST_REDUNDANCY
     about_scan = _refined_hypotheses(rt, scan, as_stated, np.inf if is_one_sided else coarse.rough_mean_square)
     if is_one_sided:
@@ -159,10 +162,10 @@ def _explanation(rt: Runtime, scan: Scan, as_stated: Scan, coarse: _CoarseFit) -
 
 
 def _refined_hypotheses(rt: Runtime, scan: Scan, as_stated: Scan, most: float) -> list[Hypothesis]:
-    """Returns the best two hypotheses about the whole scan, the panel shifted to fit best.
+    """Returns the best two hypotheses about the whole scan, with the panel shifted to fit best.
 
-    A rough fit must nearly reach ``most`` (mean squared residual): an offset between two coarse pixels hides other
-    differences there. Large shifts count against a hypothesis; of hypotheses with the same factor of sizes the one with the
+    A rough fit must nearly reach ``most`` (mean squared residual), because an offset between two coarse pixels hides other
+    differences. Large shifts count against a hypothesis. Of hypotheses with the same factor of sizes the one with the
     smaller shift counts."""
     tried: list[tuple[Hypothesis, Scan, axis.AxisShift]] = []
     for hypothesis in hypotheses.of_scan(scan, as_stated):
@@ -190,7 +193,7 @@ def _is_consistent(rt: Runtime, scan: Scan) -> bool:
 
 
 def _best_below(rt: Runtime, candidates: Iterable[Hypothesis], stated: Fit, most: float) -> Hypothesis | None:
-    """Returns the hypothesis with the least squared residual, if that is below ``most`` and four standard errors better."""
+    """Returns the hypothesis with the least squared residual, if it is below ``most`` and four standard errors better."""
     best, least = None, most
     for hypothesis in candidates:
         squares = fit_squares(rt, hypothesis.scan())

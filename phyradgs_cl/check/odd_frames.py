@@ -13,18 +13,19 @@ from phyradgs_cl.reconstructors.fits.residuals import Fit, fit, fit_squares
 from phyradgs_cl.runtime import Runtime
 
 _DEVIATIONS = 12.0
-_LEAST_CHANGE = 0.75  # of the usual mean line integral
+_LEAST_CHANGE = 0.75  # a change of the mean line integral, over the usual mean
 _FEWEST = 5
-_REPEATED = 0.15  # of the usual difference between neighbours
-_JUMP = 2.5  # steps of the order over steps of the angles sorted
-_UNLIKE = 2.0  # the difference from the view beside in angle over the usual one
+_REPEATED = 0.15  # difference from the frame before, over the usual difference between neighbours
+_JUMP = 2.5  # steps of the order over steps of the sorted angles
+_UNLIKE = 2.0  # difference from the neighbouring view in angle over the usual difference
 _OUTLIER = 4.0  # a frame's residual over the usual one
-_MOST_OUTLIERS = 0.2  # of the frames
+_MOST_OUTLIERS = 0.2  # fraction of the frames
 _EXCHANGED = 0.5  # squared residual after an exchange of two frames over the stated one
 
 
 def without_odd_frames(scan: Scan) -> tuple[np.ndarray, list[str]]:
-    """Finds odd and repeated frames before any reconstruction. Returns the other frames (indices), and a note for each."""
+    """Finds odd and repeated frames before any reconstruction. Returns the indices of the other frames, and a note for
+    each."""
     odd, repeated = odd_frames(scan.projections, scan.pixel_mask), repeated_frames(scan)
     notes = [f"frame {frame_number(scan, f)} is unlike all others (black, bright, or no image)" for f in odd]
     notes += [f"frame {frame_number(scan, f)} is frame {frame_number(scan, f - 1)} recorded twice" for f in repeated]
@@ -32,7 +33,7 @@ def without_odd_frames(scan: Scan) -> tuple[np.ndarray, list[str]]:
 
 
 def odd_frames(p: np.ndarray, mask: np.ndarray | None) -> list[int]:
-    """Returns frames of p (F, v, u) whose mean line integral is far from that of their neighbours."""
+    """Returns the frames of p (F, v, u) whose mean line integral is far from that of their neighbours."""
     if len(p) < _FEWEST:
         return []
     valid = 1.0 if mask is None else (np.asarray(mask) == 0).astype(np.float32)
@@ -44,9 +45,11 @@ def odd_frames(p: np.ndarray, mask: np.ndarray | None) -> list[int]:
 
 
 def repeated_frames(scan: Scan) -> list[int]:
-    """Returns frames that repeat their predecessor although the gantry has turned: they differ from it far less than
-    neighbours do. In an order that jumps, as the golden one, they are also unlike the view beside them in angle: views of a
-    round object from far apart may be alike as well."""
+    """Returns frames that repeat the one before although the gantry has turned: they differ from it far less than neighbours
+    do.
+
+    In an order that jumps, as the golden one, they are also unlike the view beside them in angle. Views of a round object
+    from far apart may be alike as well."""
     p = scan.projections
     if len(p) < _FEWEST:
         return []
@@ -77,8 +80,8 @@ def _neighbours(values: np.ndarray) -> np.ndarray:
 def without_outliers(rt: Runtime, scan: Scan, stated: Fit) -> tuple[np.ndarray, Fit, list[str]]:
     """Removes frames whose residual is far above the others', the worst first, with a new fit after each.
 
-    Returns the other frames (indices), their fit, and notes. Where a fifth of the frames would go, the cause is common to
-    all, and none is removed. Two outliers may be frames whose order is exchanged."""
+    Returns the indices of the other frames, their fit, and notes. Where a fifth of the frames would go, the cause is common
+    to all, and none is removed. Two outliers may be frames whose order is exchanged."""
     remaining, current = np.arange(scan.frames), stated
     outliers: list[int] = []
     while len(outliers) < _MOST_OUTLIERS * scan.frames:

@@ -1,4 +1,4 @@
-"""The page of a run under way, replaced whole every few seconds; after the run it is the report."""
+"""Writes the page of a run under way, whole and every few seconds. After the run it becomes the report."""
 
 import logging
 import threading
@@ -15,27 +15,27 @@ from phyradgs_cl.reconstructors.projected import FramePair
 from phyradgs_cl.report.live_page import Snapshot, Status, live_page
 
 EVERY_S = 5.0
-SHARE = 0.01  # of the run's time, at most, that pictures may cost it
+SHARE = 0.01  # pictures may cost the run this fraction of its time
 FRAMES = 2
-FRAMES_FROM_S = 60.0  # of runs that are expected to be shorter no frames are computed: the report has them soon
+FRAMES_FROM_S = 60.0  # no frames are computed in runs expected to be shorter: their report comes soon
 log = logging.getLogger(__name__)
 
 
 class LivePage:
-    """A listener to a running method that keeps a page about it; a context around the run.
+    """Writes a page about a running method, to which it listens. It is a context around the run.
 
-    A thread writes the page every ``every_s`` seconds, so that an older page is that of a run that was killed. Pictures are
-    taken between two iterations, as long as their time is below ``SHARE`` of the run's. An error, or Ctrl-C, leaves its
-    reason on the page. A file that was there before is replaced from the first iteration on: a run that is refused leaves it
-    alone. A page that cannot be written is a warning, once, and no error."""
+    A thread writes the page every ``every_s`` seconds, so an older page belongs to a run that was killed. Pictures are taken
+    between two iterations, as long as their time is below ``SHARE`` of the run's. An error, or Ctrl-C, leaves its reason on
+    the page. A file that was there before is replaced from the first iteration on, so a refused run leaves it alone. A page
+    that cannot be written is one warning, and no error."""
 
     def __init__(self, path: Path, title: str, settings: Mapping[str, object], every_s: float = EVERY_S) -> None:
         self.path, self.every_s = path, every_s
         self.status = Status(title, settings, every_s, time.time())
         self.spent_s = 0.0
-        """Seconds that the run has waited for pictures."""
+        """The time in s that the run has waited for pictures."""
         self._pictured_s = -every_s
-        self._waits = False  # for the first iteration
+        self._waits = False  # true until the first iteration
         self._started_s = time.monotonic()
         self._is_over = threading.Event()
         self._writer = threading.Thread(target=self._keep_writing, name="live page", daemon=True)
@@ -60,7 +60,7 @@ class LivePage:
         self.end(f"Stopped by an error: {error}" if isinstance(error, Exception) else "Interrupted.")
 
     def stage(self, text: str) -> None:
-        """Says what the run does before its first iteration."""
+        """Says on the page what the run does before its first iteration."""
         self.status = replace(self.status, stage=text)
 
     def __call__(self, progress: Progress) -> None:
@@ -75,7 +75,7 @@ class LivePage:
         self.spent_s += self._pictured_s - used_s
 
     def end(self, reason: str, is_complete: bool = False) -> None:
-        """Writes the page a last time, which says why there is no more news; later calls do nothing."""
+        """Writes the page a last time, with the reason why no more news will come. Later calls do nothing."""
         if not self._is_over.is_set():
             self._stop()
             self.status = replace(self.status, ended=reason, is_complete=is_complete)

@@ -19,17 +19,17 @@ from phyradgs_cl.report.page import head, web_script
 from phyradgs_cl.report.sections import facts_table, frame_pictures, note, section
 from phyradgs_cl.text import clock
 
-_MOST_POINTS = 400  # of the convergence
-_SAMPLES = 64  # along a side, for the grey values
-_LATE_S, _LATE_TIMES = 30.0, 6  # without news: the run may have been killed
-_LOG_RATIO = 20.0  # largest over smallest value, above which the axis is logarithmic
+_MOST_POINTS = 400  # points of the convergence
+_SAMPLES = 64  # samples along a side for the grey values
+_LATE_S, _LATE_TIMES = 30.0, 6  # without news for this time, or this multiple of the usual one, the run may have been killed
+_LOG_RATIO = 20.0  # largest over smallest value: above this ratio the axis is logarithmic
 _CHART = 560, 240
-_MARGIN = 64, 12, 12, 34  # of the chart: left, top, right, bottom
+_MARGIN = 64, 12, 12, 34  # margins of the chart: left, top, right, bottom
 
 
 @dataclass(frozen=True, eq=False)
 class Snapshot:
-    """The middle slices (axial, coronal, sagittal) of the volume after an iteration in 1/mm, and some frames."""
+    """The middle slices (axial, coronal, sagittal) of the volume after an iteration, in 1/mm, and some frames."""
 
     iteration: int
     slices: tuple[NDArray[np.floating], ...]
@@ -57,9 +57,11 @@ class Snapshot:
 
 @dataclass(frozen=True, eq=False)
 class Status:
-    """What a page says of a run. settings: facts by name. Times are seconds since 1970. stage: what the run does before its
-    first iteration; ended: the reason for which there will be no news, no warning if ``is_complete``. points: (iteration,
-    measure of convergence)."""
+    """What a page says about a run. Times are seconds since 1970.
+
+    - settings: facts by name. stage: what the run does before its first iteration.
+    - ended: the reason why no more news will come. It is no warning if ``is_complete``.
+    - points: (iteration, measure of convergence)."""
 
     title: str
     settings: Mapping[str, object]
@@ -71,12 +73,12 @@ class Status:
     progress: Progress | None = None
     points: tuple[tuple[int, float], ...] = ()
     first: tuple[int, float] = (0, 0.0)
-    """Iteration and time of the first report of the present count."""
+    """Iteration and time of the first report in the present count."""
     reported: float = 0.0
     snapshot: Snapshot | None = None
 
     def after(self, progress: Progress, now: float) -> "Status":
-        """Returns the status after a report. A count that starts again, as of a trial, starts another curve."""
+        """Returns the status after a report. A count that starts again, as in a trial, starts another curve."""
         last, points, first = self.progress, self.points, self.first
         is_same = last is not None and (last.quantity, last.iterations) == (progress.quantity, progress.iterations)
         if last is None or not is_same or progress.iteration < last.iteration:
@@ -89,13 +91,13 @@ class Status:
 
     @property
     def per_s(self) -> float | None:
-        """Iterations per second, once there are two reports."""
+        """Iterations per second, from the second report on."""
         if self.progress is None or self.reported <= self.first[1] or self.progress.iteration <= self.first[0]:
             return None
         return (self.progress.iteration - self.first[0]) / (self.reported - self.first[1])
 
     def left_s(self, now: float) -> float | None:
-        """The time to the last iteration."""
+        """The time in s until the last iteration."""
         if self.progress is None or self.per_s is None:
             return None
         return max(0.0, (self.progress.iterations - self.progress.iteration) / self.per_s - (now - self.reported))
@@ -124,7 +126,7 @@ def live_page(status: Status, now: float) -> str:
 
 
 def _tab(status: Status) -> str:
-    """Returns the title in the browser's tab, which begins with how far the run is."""
+    """Returns the title in the browser's tab, which begins with the run's progress."""
     p = status.progress
     share = "starting" if p is None else f"{100 * p.iteration // max(p.iterations, 1)} %"
     if status.ended:
@@ -175,7 +177,7 @@ def _settings(status: Status) -> Markup:
 
 
 def _curve(status: Status) -> Markup:
-    """Returns the convergence as SVG. matplotlib draws the report's; here its import would cost more than the run allows."""
+    """Returns the convergence as SVG, drawn without matplotlib: its import would cost more than the run allows."""
     x, y = np.array(status.points, float).T
     words = status.progress.quantity if status.progress is not None else ""
     is_log = 0 < _LOG_RATIO * y.min() < y.max()

@@ -1,6 +1,7 @@
-"""pyopencl, loaded when it is first used, and kernels with their sources. Sources are files of ``cl/`` with their headers
-pasted in, because an include path fails on a folder with a space. ``#line`` marks keep file and line in the compiler's
-messages."""
+"""Loads pyopencl when it is first used, and holds kernels with their sources.
+
+Sources are files of ``cl/`` with their headers pasted in, because an include path fails on a folder with a space. ``#line``
+marks keep file and line in the compiler's messages."""
 
 import re
 from collections.abc import Callable
@@ -35,8 +36,9 @@ _INCLUDE = re.compile(r'^\s*#include\s+"([^"]+)"\s*$')
 
 @dataclass(eq=False)
 class Kernel:
-    """The kernel ``function_name`` of ``cl/<program>.cl``, built with ``options`` at its first launch. ``most_items``: of
-    a group, once the driver was asked."""
+    """The kernel ``function_name`` of ``cl/<program>.cl``, built with ``options`` at its first launch.
+
+    ``most_items``: the largest group, once the driver was asked for it."""
 
     program: str
     function_name: str
@@ -64,14 +66,15 @@ def _expand(relative: str, pasted: set[str]) -> list[str]:
             lines += _expand(match.group(1), pasted)
             lines.append(f'#line {number + 1} "{relative}"')
         else:
-            lines.append("")  # keeps the line numbers
+            lines.append("")  # an empty line keeps the line numbers
     return lines
 
 
 def naming_failures(work: str | None = None) -> Callable[[Callable[P, R]], Callable[P, R]]:
-    """Decorates a method of a runtime, so that OpenCL's errors become DeviceError or MemoryShortage. Drivers queue work: a
-    launch may be refused at once, or fail later in any call that waits. ``work`` names the method's work; None takes the
-    name of the kernel, the first argument of a launch."""
+    """Decorates a method of a runtime, so that OpenCL's errors become DeviceError or MemoryShortage.
+
+    Drivers queue work: a launch may be refused at once, or fail later in any call that waits. ``work`` names the method's
+    work; None takes the name of the kernel, which is the first argument of a launch."""
 
     def decorate(method: Callable[P, R]) -> Callable[P, R]:
         @wraps(method)

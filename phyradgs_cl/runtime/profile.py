@@ -1,6 +1,7 @@
-"""A run's device time by kernel: launches, seconds and bytes, compared with the device's best rates. Seconds are of OpenCL
-events. Bytes count each buffer of a launch once. The best rates are measured by copies of the driver and by a kernel of
-multiply-adds."""
+"""Measures a run's device time by kernel: launches, seconds and bytes, compared with the device's best rates.
+
+Seconds come from OpenCL events. Bytes count each buffer of a launch once. Copies of the driver and a kernel of multiply-adds
+measure the best rates."""
 
 from collections import defaultdict
 from dataclasses import dataclass
@@ -9,7 +10,7 @@ import numpy as np
 
 from phyradgs_cl.runtime.opencl import cl
 
-_FOLD_AT = 20_000  # events that are kept at most; folding waits for the queue
+_FOLD_AT = 20_000  # most events that are kept; folding them waits for the queue
 _COPY_BYTES = 1 << 26
 _STEPS = 20_000
 _REPEATS = 5
@@ -25,7 +26,7 @@ class KernelUse:
 
 
 class Profile:
-    """Collects the events of a queue with profiling."""
+    """Collects the events of a queue that measures times."""
 
     def __init__(self) -> None:
         self._events: list[tuple[str, cl.Event, int]] = []
@@ -55,15 +56,16 @@ class Profile:
 
 @dataclass(frozen=True)
 class Rates:
-    """The device's measured rates: bytes moved (read and written) and floating-point operations per second."""
+    """The device's measured rates: bytes moved (read and written), and floating-point operations, per second."""
 
     copy_bytes_per_s: float
     flops_per_s: float
 
 
 def profile_text(uses: dict[str, KernelUse], wall_s: float, rates: Rates, pairs: dict[str, int]) -> str:
-    """Formats a table of ``uses`` (Profile.uses) and the part of ``wall_s`` that kernels take. ``pairs``: Gaussian–pixel
-    pairs per launch of a kernel, where known."""
+    """Formats a table of ``uses`` (from ``Profile.uses``) and the part of ``wall_s`` that kernels take.
+
+    ``pairs``: Gaussian–pixel pairs per launch of a kernel, where known."""
     busy_s = sum(use.seconds for use in uses.values())
     rows = [("kernel", "launches", "seconds", "share", "ms each", "GB/s", "of copy", "Gpairs/s", "ns/pair")]
     for name, use in uses.items():
@@ -88,7 +90,7 @@ def profile_text(uses: dict[str, KernelUse], wall_s: float, rates: Rates, pairs:
 def measure_rates(
     queue: "cl.CommandQueue", multiply_add: "cl.Kernel", lanes: int, units: int, group: int
 ) -> Rates:
-    """Measures both rates, the best of a few runs; ``queue`` needs profiling."""
+    """Measures both rates, each as the best of a few runs. ``queue`` needs profiling."""
     context = queue.context
     source, target = (cl.Buffer(context, cl.mem_flags.READ_WRITE, _COPY_BYTES) for _ in range(2))
     cl.enqueue_fill_buffer(queue, source, np.zeros(1, np.float32), 0, _COPY_BYTES)
