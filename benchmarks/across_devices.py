@@ -62,7 +62,7 @@ def cells_of(motion: str, frame: int = 0) -> TimeCells:
 
 
 def cloud(count: int, aspect: float, seed: int) -> np.ndarray:
-    """Returns rows (11, G) of Gaussians. Their smallest axes are half a pixel to four; the longest is up to ``aspect`` times
+    """Returns rows (11, G) of Gaussians. The smallest axes are half a pixel to four, the longest up to ``aspect`` times
     that."""
     rng = np.random.default_rng(seed)
     pixel = GEOMETRY.pixel_size_mm[0] / GEOMETRY.magnification

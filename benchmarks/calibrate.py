@@ -76,8 +76,7 @@ class Planned(Protocol):
 
 @dataclass(frozen=True)
 class Case:
-    """The scan as stated, the right scan, other scans, the parameters to ask for, and the planted value of each
-    parameter."""
+    """The scan as stated, the right scan, other scans, the parameters to ask for, and what is planted by parameter."""
 
     stated: Scan
     right: Scan
@@ -166,8 +165,7 @@ def motion(make: Maker, seed: int) -> Case:
 
 
 def beads(make: Maker, seed: int) -> Case:
-    """Plants twelve beads and two wires. Readout and exposure are off by 10 to 20 %, the rest by up to the errors of
-    ``draw``."""
+    """Plants twelve beads and two wires. Readout and exposure are off by 10 to 20 %, the rest as in ``draw``."""
     rng = np.random.default_rng(seed)
     known, lying = drawn_beads(rng)
     size = {

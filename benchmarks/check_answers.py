@@ -50,8 +50,7 @@ def run_one(rt: Runtime, path: Path) -> dict[str, object]:
 
 def outcome(line: dict[str, Any]) -> str:
     """Returns the outcome of a line. A good scan has silent or false alarm. Another scan has found, cannot tell, or missed,
-    and whether another cause is blamed. ``leaves no trace``: no frame can show the fault, and there was neither alarm nor
-    doubt."""
+    and whether another cause is blamed. ``leaves no trace``: no frame can show the fault, and there was no answer to it."""
     said = {f["question"]: f["verdict"] for f in line["findings"]}
     suspicious = {question for question, verdict in said.items() if verdict == SUSPICIOUS}
     beside = suspicious - set(line["right"])

@@ -8,8 +8,7 @@ exposure of 4.9 degrees, one after the other, with 10⁵ photons. The panel aver
 and two pixels. The largest line integral along an axis of the phantom is 3.
 
 Least squares (``cgls``, 25 iterations) averages line integrals (ARTIC) or intensity (RACE), at 10 times of an exposure. NMSE
-is the squared error over the squared truth. ``best``: the smallest, and its iteration. Rows that the results file has are
-not made again."""
+is the squared error over the squared truth. ``best``: the smallest, and its iteration. Present rows are not made again."""
 
 import time
 from typing import Any

@@ -1,5 +1,4 @@
-"""Measures the density of a ball in every kind of geometry by every kind of method, and finds results that are wrong
-silently.
+"""Measures the density of a ball in every kind of geometry by every kind of method, and finds silent errors.
 
     python benchmarks/geometries.py [--quick] [--case WORD] [--method NAME] [--json FILE] [--table FILE.md]
 
@@ -126,8 +125,7 @@ class Case:
         return EllipsoidPhantom((ball,), "ball")
 
     def frames(self) -> np.ndarray:
-        """Returns line integrals (F, rows, columns) of the ball. In a fly-scan they are at the times of each row's
-        exposure."""
+        """Returns line integrals (F, rows, columns) of the ball. In a fly-scan every row has its own times."""
         opens = np.arange(self.rows) / self.rows if self.exposure_deg else np.zeros(self.rows)
         within = (np.arange(SWEEPS) + 0.5) / SWEEPS if self.exposure_deg else np.zeros(1)
         sense = np.sign(np.gradient(np.unwrap(self.angles_deg, period=360.0)))

@@ -5,8 +5,7 @@
 It runs short reconstructions of 64³ voxels from 128² pixels, and of 128³ from 256², with every motion model that has kernels
 of its own. A kernel's time is the least of its runs, in ns per voxel of the volume. It is divided by the time in which this
 machine copies a float, and by that of a multiply-add. The smaller of the two quotients is compared with kernels.json. What
-seems slower is measured again, up to three times. Jobs are compared by their processor time over that of a fixed loop in the
-same process.
+seems slower is measured again, up to three times. Jobs are compared by their processor time over that of a fixed loop.
 
 Prints a line for each that takes 1.3 times as long as in the table, and then ends with 1. --quick: the small size, and half
 of the jobs. --write: puts this run in the table. --all: prints every kernel with its share of the machine's rate of copying.

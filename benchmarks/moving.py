@@ -6,8 +6,8 @@
 
     Volumes and scanner are those of benchmarks/scans.py: TIGRE's noise at 1e4 photons, a gantry that turns without stopping,
     exposures without gaps. A turn takes a minute. The breath has a period of 4 s, jittered by 10 %, and an amplitude of 15 %
-    of half the box; --motion takes another preset with its own defaults. PSNR and SSIM are against the reference volume;
-    seconds are processor time.
+    of half the box; --motion takes another preset with its own defaults. PSNR and SSIM compare with the reference volume.
+    Seconds are processor time.
 
     The case unknown has means over ten true states, of the method ``moving`` and of the volume that --method makes as if the
     object rested. The case still has ``moving`` and --method on an object at rest. A run that was interrupted continues.
@@ -118,8 +118,7 @@ def centre_mm(volume: np.ndarray, grid: Grid, ball: Ellipsoid) -> np.ndarray:
 
 
 def run_unknown(rt: Runtime, scan: Scan, method: str) -> dict[str, object]:
-    """Returns means over the true states of ``moving`` and of ``method`` as if the object rested, and the field's error in
-    mm."""
+    """Returns means over the true states of ``moving`` and of ``method`` as if the object rested, and the field's error."""
     lines: dict[str, object] = {}
     for name, label in ((method, "static_"), ("moving", "")):
         rt.reset_peak()

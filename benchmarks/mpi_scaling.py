@@ -1,5 +1,4 @@
-"""Measures the parts of a step of one reconstruction over ranks: kernels, host, sums over ranks, waiting. Predicts other
-ranks.
+"""Measures the parts of a step of one reconstruction over ranks: kernels, host, sums over ranks, waiting. Predicts others.
 
     python benchmarks/mpi_scaling.py [--quick] [--ranks 1,2,3,4] [--json docs/results/mpi_scaling.json]
 

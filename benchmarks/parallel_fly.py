@@ -1,5 +1,4 @@
-"""Measures fly-scans of parallel beams: PSNR, and the modulation at half Nyquist at rim and centre, motion ignored and
-known.
+"""Measures fly-scans of parallel beams: PSNR, and the modulation at half Nyquist at rim and centre, with and without motion.
 
     python benchmarks/parallel_fly.py docs/results/parallel_fly.jsonl [--views 180 720] [--blur-px 0.5 5] [--dose 1e4]
 

@@ -1,5 +1,4 @@
-"""Measures the cost of each effect of a real scan and what its step of ``prepare`` regains: PSNR without, with, and
-corrected.
+"""Measures the PSNR that each effect of a real scan costs, and what its step of ``prepare`` regains.
 
     python benchmarks/prepare.py docs/results/prepare.jsonl --size 32
     python benchmarks/prepare.py docs/results/prepare.jsonl --table
@@ -124,8 +123,8 @@ def lines(rt: Runtime, phantom: str, usual: dict[str, Any], left: dict[str, list
 
 
 def table(found: list[dict[str, Any]]) -> str:
-    """Returns a Markdown table: a row per volume and effect, a column per method, and the largest cost of the step in a
-    clean scan."""
+    """Returns a Markdown table: a row per volume and effect, a column per method, and the step's largest cost in a clean
+    scan."""
     methods = [method for method in METHODS if any(line["method"] == method for line in found)]
     by_place = {(line["phantom"], line["effect"], line["method"]): line for line in found}
     head = ["effect", "volume", *(f"{method}: clean, with it, corrected" for method in methods), "clean, step"]

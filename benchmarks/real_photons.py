@@ -1,5 +1,4 @@
-"""Measures fly-scans of real photons: sums of neighbouring projections of dense real scans, with the dense scan as
-reference.
+"""Measures fly-scans of real photons: sums of projections of dense real scans, which are the reference.
 
     python benchmarks/real_photons.py RESULTS.jsonl DENSE.h5 ... [--counts 20] [--readouts 0,0.86] [--methods fista]
         [--side 640] [--rim 80,155] [--axis columns] [--times 0] [--passes 25]

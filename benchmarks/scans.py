@@ -1,5 +1,4 @@
-"""Functions that benchmarks of whole reconstructions share: scans of a folder's volumes, and files with one JSON line per
-run."""
+"""Functions that benchmarks of whole reconstructions share: scans of a folder's volumes, and files of JSON lines."""
 
 import argparse
 import json
@@ -22,8 +21,7 @@ RAPID = PROTOCOLS["rapid"]
 def make_scan(
     rt: Runtime, path: Path, size: int, seed: int, protocol: Protocol = RAPID, away: float = 1.0, aside: float = 0.0
 ) -> Scan:
-    """Returns the scan of a volume file as benchmarks/tables makes it: R2-Gaussian's scanner, TIGRE's noise at 1e4 photons,
-    σ 10.
+    """Returns the scan of a volume file as benchmarks/tables makes it: R2-Gaussian's scanner, TIGRE's noise (1e4, σ 10).
 
     size: the reference's voxels per side, half the detector's pixels. away: factor of the distances of source and detector,
     which keeps the magnification. aside: moves the panel along u by this fraction of its width."""
@@ -36,8 +34,7 @@ def make_scan(
 
 
 def files_of(folder: str | Path, names: str | None, size: int) -> dict[str, Path]:
-    """Returns volumes as for benchmarks/tables: those of ``names`` (with commas) or all, with twice ``size`` voxels per
-    side."""
+    """Returns volumes as for benchmarks/tables: those of ``names`` (with commas) or all, of twice ``size`` voxels."""
     try:
         return find_volumes(Path(folder), names.split(",") if names else None, size)
     except InputError as error:

@@ -52,8 +52,7 @@ def scan_of(name: str, views: int) -> Scan:
 
 def spoilt(frames: np.ndarray, kind: str) -> np.ndarray:
     """Returns line integrals (F, v, u) with stripes of a kind: gains of 2 % in all pixels; eight columns 5 % off, in all
-    views or in two fifths of them; three columns that repeat one value, or have a noise of 0.3; two bands of 7 columns 5 %
-    off."""
+    views or in two fifths of them; three columns that repeat one value, or have a noise of 0.3; two bands of 7 columns."""
     rng, bad = np.random.default_rng(3), frames.copy()
     views, rows, _ = frames.shape
     columns = np.array([35, 60, 84, 110, 150, 166, 200, 213])  # none is the mirror image of another

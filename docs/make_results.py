@@ -82,8 +82,7 @@ def quality(name: str, protocol: str, with_seconds: bool = False) -> str:
 
 
 def with_prior(prior: str, like: Row) -> list[str]:
-    """Returns PSNR and SSIM of ``fista`` with another prior, on a fly-scan and on one that stops, of the volumes of a
-    row."""
+    """Returns PSNR and SSIM of ``fista`` with another prior, on a fly-scan and on one that stops."""
     views, cells = {"rapid": 25, "standard": 50}[like["protocol"]], []
     for kind in ("fly", "still"):
         by_volume: dict[str, list[Scores]] = {}
@@ -237,8 +236,7 @@ def sweep(name: str, held_out: bool) -> str:
 
 @cache
 def prior_runs() -> dict[tuple[Any, ...], dict[tuple[str, int], dict[str, Scores]]]:
-    """Returns the runs of ``priors.jsonl`` by scan (kind, object, views, photons, voxels), by volume and seed, and by
-    prior."""
+    """Returns the runs of ``priors.jsonl`` by scan (kind, object, views, photons, voxels), volume and seed, and prior."""
     scans: dict[tuple[Any, ...], dict[tuple[str, int], dict[str, Scores]]] = {}
     for line in lines_of("priors.jsonl"):
         of = line["volume"] if line["volume"] == "spheres" else "volumes"
@@ -541,8 +539,7 @@ def moving_known() -> str:
 
 
 def moving_unknown(motion: str, size: int) -> str:
-    """Returns moving volumes of size³ voxels as if they rested, and with the field that ``moving`` finds; and the mean
-    gain."""
+    """Returns moving volumes of size³ voxels as if they rested, and with the field of ``moving``, and the mean gain."""
     rows: list[list[str]] = []
     gains_db: dict[int, list[float]] = {}
     periods_s = []

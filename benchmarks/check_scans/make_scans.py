@@ -29,7 +29,7 @@ from recording import SHEPP_LOGAN, counted, shepp_logan, transmissions
 
 
 def make(kind: Kind, group: str, out: Path, volumes: Path, command: list[str], seed: int) -> dict[str, object]:
-    """Makes one scan and its truth; returns the manifest's line. ``seed``: that of noise; if not 0, other volumes are taken
+    """Makes one scan and its truth; returns the manifest's line. ``seed``: of noise; if not 0, other volumes are taken
     too."""
     setup, panel = kind.setup, kind.counting
     scanned = another(kind.scanned, seed)

@@ -82,8 +82,7 @@ class BenchJob:
 
     @property
     def stem(self) -> str:
-        """Returns the beginning of the names of tables and figures: one for each set of results that is summed up
-        together."""
+        """Returns the beginning of the names of tables and figures: one for each set of results."""
         size = self.bench_size
         own = self.iterations in (None, replace(self, iterations=None).bench_size.iterations)
         parts = self.kind, size.name, "" if own else f"i{size.iterations}", "" if self.axis == "rows" else self.axis

@@ -64,7 +64,6 @@ class PseudoTruth:
 
 
 def refuse_interrupted(result: Reconstruction) -> None:
-    """Raises an error for a result that ended early: on Ctrl-C methods return what they have, which is no benchmark's
-    result."""
+    """Raises an error for a result that ended early: on Ctrl-C methods return an unfinished result."""
     if result.facts.get("interrupted_at") is not None:
         raise KeyboardInterrupt

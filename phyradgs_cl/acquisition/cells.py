@@ -41,8 +41,7 @@ def micro_view_cells(
 ) -> TimeCells:
     """Returns M strips × N sub-intervals at t = t_f + (j+½)/M·T_ro + (k+½)/N·T_exp (paper, Eq. 2).
 
-    With a pulsed beam the N sub-intervals divide the lit part of the strip's window. With more strips than lines, strips
-    without a line have no cells."""
+    With a pulsed beam the N sub-intervals divide the lit part of the strip's window. Strips without a line have no cells."""
     share = (np.arange(sub_intervals) + 0.5) / sub_intervals
     ranges = np.array(shutter.strip_ranges(lines, strips))
     strip = np.flatnonzero(ranges[:, 1] > ranges[:, 0])
@@ -192,7 +191,7 @@ def _line_times(windows_s: np.ndarray, edges_s: np.ndarray) -> np.ndarray:
 
 
 def _segments_of_lines(opens: np.ndarray, closes: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the first and last segment (lines,) of every line. Segments of which it covers at most ``_OVERHANG`` are left
+    """Returns the first and last segment (lines,) of every line. Those that it covers by at most ``_OVERHANG`` are left
     out."""
     first = np.clip(np.floor(opens), 0, count - 1)
     last = np.clip(np.ceil(closes) - 1, first, count - 1)
@@ -219,8 +218,7 @@ def segments_for(
 
 
 def _turns_rad(pose: np.ndarray) -> np.ndarray:
-    """Returns the angles (T − 1,) between successive poses (T, 12): the larger of the source's turn about the origin and
-    the detector's."""
+    """Returns the angles (T − 1,) between successive poses (T, 12): the larger of the turns of source and detector."""
     u_hat, _, normal = np.moveaxis(body_frames(pose), -1, 0)
     source = pose[:, :3] / np.maximum(np.linalg.norm(pose[:, :3], axis=1, keepdims=True), 1e-300)
     chords = [np.linalg.norm(np.diff(x, axis=0), axis=1) for x in (u_hat, normal, source)]

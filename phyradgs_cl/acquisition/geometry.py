@@ -72,8 +72,8 @@ class ParallelGeometry:
 
     Distances do not matter: the panel's plane contains the axis. ``detector_shape`` counts (rows, columns).
     ``pixel_size_mm`` is (dv, du); one number stands for square pixels. ``detector_offset_mm`` (v, u) shifts the panel's
-    centre from the ray through the axis, as in ``ConeGeometry``. A positive u shifts it to higher columns, to the right for
-    who looks along the rays.
+    centre from the ray through the axis, as in ``ConeGeometry``. A positive u shifts it to higher columns, to the right
+    along the rays.
 
     Raises InputError for lengths and counts that are not above 0."""
 
@@ -85,8 +85,8 @@ class ParallelGeometry:
         _check_panel(self)
 
     def pose(self, angle_rad: np.ndarray | float) -> np.ndarray:
-        """Returns poses (..., 12) float64 at gantry angles (...). Rays run along (−cos θ, −sin θ, 0): they come from where a
-        cone beam has its source."""
+        """Returns poses (..., 12) float64 at gantry angles (...). Rays run along (−cos θ, −sin θ, 0), away from a cone
+        beam's source."""
         radial, panel = _panel_at(self, angle_rad)
         return np.concatenate([-radial, panel], -1)
 
@@ -208,8 +208,8 @@ def default_grid(geometry: Geometry, poses: np.ndarray | None = None) -> Grid:
     """Returns the cube as wide as a full turn's field of view, lower where the panel has few rows.
 
     A voxel is as large as a pixel at the axis: along z the pitch of rows, along y and x that of columns. In a parallel beam
-    the grid is as high as the panel. poses (F, 12): those of a gantry that travels along z, as in a helix. The grid is then
-    longer by the travel."""
+    the grid is as high as the panel. poses (F, 12): of a gantry that travels along z, as in a helix; the grid is longer by
+    the travel."""
     half_height_mm, radius_mm, _ = field_of_view_mm(geometry)
     high_mm, wide_mm = (pitch / geometry.magnification for pitch in geometry.pixel_size_mm)
     wide = max(1, math.ceil(2 * radius_mm / wide_mm))
@@ -238,8 +238,7 @@ def _travel_mm(poses: np.ndarray, geometry: Geometry) -> tuple[float, float]:
 
 
 def check_distances(geometry: Geometry, grid: Grid) -> None:
-    """Raises InputError where the source is so far away that float32 cannot tell its rays from parallel ones within a
-    voxel."""
+    """Raises InputError for a source so far away that float32 cannot tell its rays from parallel ones."""
     if isinstance(geometry, ParallelGeometry):
         return
     source_mm, voxel_mm = geometry.source_to_axis_mm, min(grid.voxel_size_mm)

@@ -52,8 +52,7 @@ def rim_travel_voxels(scan: Scan) -> float:
 
 
 def _travel_mm(scan: Scan, frame: int, points_mm: np.ndarray) -> float:
-    """Returns the largest travel in mm of the points (P, 3), in the panel's coordinates, during the first line's
-    exposure."""
+    """Returns the largest travel in mm of points (P, 3), in the panel's coordinates, during the first line's exposure."""
     start_s = float(scan.frame_start_s[frame])
     pose = scan.trajectory.pose(frame, np.array([start_s, start_s + scan.shutter.exposure_s]))
     panel, column, row = pose[:, 3:6], pose[:, 6:9], pose[:, 9:12]
@@ -253,8 +252,7 @@ def motion_facts(motion: Motion) -> dict[str, object]:
 
 
 def motion_from_facts(facts: Mapping[str, object]) -> Motion | None:
-    """Inverts ``motion_facts``. Returns None for a user-defined model. Raises InputError or TypeError for values out of
-    range."""
+    """Inverts ``motion_facts``. Returns None for a user-defined model. Values out of range raise InputError or TypeError."""
     for model in MODELS:
         keys = [f.name for f in fields(model) if f.init]
         if model.name == facts.get("name") and all(key in facts for key in keys):

@@ -63,8 +63,7 @@ def blur_line(scan: "Scan") -> str:
 
 
 def _cone_deg(geometry: Geometry) -> tuple[float, float]:
-    """Returns the full angles (cone along v, fan along u) in degrees that the panel spans at the source; 0 in a parallel
-    beam."""
+    """Returns the full angles (cone along v, fan along u) in degrees of the panel at the source; 0 in a parallel beam."""
     if isinstance(geometry, ParallelGeometry):
         return 0.0, 0.0
     sides = zip(geometry.detector_shape, geometry.pixel_size_mm, geometry.detector_offset_mm, strict=True)

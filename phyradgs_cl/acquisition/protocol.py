@@ -93,8 +93,7 @@ class Protocol:
     ) -> CircularOrbit:
         """Returns the trajectory. A stop-and-shoot gantry rests at the mid-window angles of the same fly-scan.
 
-        Jitter is a smooth wander of the gantry with standard deviation ``jitter_deg``, one knot per frame. The encoder
-        records it."""
+        Jitter is a smooth wander of deviation ``jitter_deg``, with one knot per frame, which the encoder records."""
         first = self.angle_start_rad()
         arc_rad = self._arc_rad
         if not self.is_fly:

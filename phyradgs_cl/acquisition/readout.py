@@ -18,8 +18,8 @@ Named = Callable[[str], str]
 
 @dataclass(frozen=True)
 class Readout:
-    """Puts frames and poses in the order of operators, whose rows are the readout's lines. ``axis``: the detector's "rows"
-    or "columns" that make a line."""
+    """Puts frames and poses in the order of operators, whose rows are the readout's lines. ``axis``: a line is "rows" or
+    "columns"."""
 
     axis: str
 
@@ -65,8 +65,7 @@ def frame_time_of(fps: float | None, frame_time_s: float | None, named: Named = 
 
 
 def seconds_of(word: str, in_ms: float | None, in_s: float | None, named: Named = str) -> float | None:
-    """Returns a time in s, from ms or as given. ``word``: its name, such as readout. Raises InputError where they
-    differ."""
+    """Returns a time in s, from ms or as given. ``word``: its name, such as readout. InputError: they differ."""
     if in_ms is None:
         return in_s
     checks.at_least(named(f"{word}_ms"), in_ms, 0)

@@ -103,8 +103,8 @@ def from_tigre(cls: "type[Scan]", /, geo: Any, angles: "ArrayLike", frames: "Arr
 def astra_vectors(scan: "Scan") -> np.ndarray:
     """Returns ASTRA's ``cone_vec`` or ``parallel3d_vec`` (F, 12) in mm, each frame at the middle of its lit window.
 
-    ``from_astra`` inverts it. ASTRA stacks frames as (rows, F, columns): ``scan.projections.swapaxes(0, 1)``. Its volumes
-    are (z, y, x) too."""
+    ``from_astra`` inverts it. ASTRA stacks frames as (rows, F, columns), ``scan.projections.swapaxes(0, 1)``; volumes are
+    (z, y, x)."""
     times_s = scan.frame_start_s + scan.shutter.middle_s
     poses = np.stack([scan.trajectory.pose(f, np.array(t)) for f, t in enumerate(times_s)])
     return astra_of_poses(poses, scan.geometry.detector_shape)
@@ -229,8 +229,7 @@ def _counts(geo: Any, name: str, length: int) -> np.ndarray:
 
 
 def _each(geo: Any, name: str, frames: int, length: int, absent: float) -> np.ndarray:
-    """Returns an attribute (F, length) for every frame, given once or for each. ``absent``: the value where it is
-    missing."""
+    """Returns an attribute (F, length) for every frame, given once or for each. ``absent``: if missing."""
     value = _of(geo, name) if name in ("DSO", "DSD") else getattr(geo, name, None)
     table = checks.numbers(f"geo.{name}", absent if value is None else value)
     per_frame = (frames,) if length == 1 else (frames, length)

@@ -134,16 +134,14 @@ class TimeCells:
         return self.pose[cell[nearest[first]]]
 
     def line_cells(self) -> np.ndarray:
-        """Returns for each line a range of cells (lines, 2), [first, stop). It holds all cells of the line, and maybe
-        others."""
+        """Returns for each line a range of cells (lines, 2), [first, stop). It holds all cells of the line."""
         line = np.arange(self.lines)
         first = np.searchsorted(np.maximum.accumulate(self.line_stop), line, side="right")
         return np.stack([first, np.searchsorted(self.line_start, line, side="right")], -1)
 
     @cached_property
     def layer_numbers(self) -> np.ndarray:
-        """The layer (C,) of every cell. No line has two cells in one layer. There are as many layers as a line has cells at
-        most."""
+        """The layer (C,) of every cell. No line has two cells in one layer. There are as few as possible."""
         numbers = np.zeros(self.count, np.int64)
         free_from: list[int] = []
         for cell, (start, stop) in enumerate(zip(self.line_start, self.line_stop, strict=True)):
@@ -156,8 +154,7 @@ class TimeCells:
 
     @cached_property
     def layer_weights(self) -> np.ndarray:
-        """Weights (layers, lines) of each line's cell in each layer of ``layer_numbers``; 0 where the line has none
-        there."""
+        """Weights (layers, lines) of each line's cell in each layer of ``layer_numbers``; 0 without a cell."""
         weights = np.zeros((int(self.layer_numbers.max(initial=-1)) + 1, self.lines))
         for cell, lines in enumerate(self.ranges):
             weights[self.layer_numbers[cell], lines] = self.weights_of(cell)

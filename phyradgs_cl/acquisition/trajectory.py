@@ -239,8 +239,8 @@ def unit_directions(subject: str, poses: np.ndarray) -> np.ndarray:
 def resting_poses(
     poses: np.ndarray, middle_s: np.ndarray, span_s: float, subject: str = "poses", is_parallel: bool = False
 ) -> PoseTable:
-    """Returns a table for a gantry that stops for every frame: each pose (F, 12) holds for ``span_s`` about the middle
-    (F,) of its frame, in s."""
+    """Returns a table for a gantry that stops for every frame: each pose (F, 12) holds ``span_s`` about its ``middle_s``
+    (F,)."""
     half_s = max(span_s / 2, 0.25) * (1 - 1e-10)  # two frames in a row must not share a time
     time_s = np.stack([middle_s - half_s, middle_s + half_s], -1).ravel()
     return PoseTable(time_s, np.repeat(poses, 2, axis=0), subject, is_parallel)
@@ -302,8 +302,7 @@ _AS_TABLE = "give it as a PoseTable"
 def sampled(trajectory: Trajectory, frame_start_s: np.ndarray, span_s: float, error_mm: float) -> PoseTable:
     """Samples a user-defined trajectory over ``span_s`` from each frame's start (F,), to a table within ``error_mm`` of it.
 
-    Raises InputError where even a fine table is not close enough, as for frames that overlap in time with different
-    poses."""
+    Raises InputError where a fine table is not close enough, as for frames that overlap in time with other poses."""
     samples = 2
     while True:
         offsets_s = np.linspace(0.0, max(span_s, _LEAST_SPAN_S), samples)

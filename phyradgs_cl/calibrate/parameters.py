@@ -73,8 +73,7 @@ def _edge_pixels(scan: Scan, factor: float = 1.0) -> float:
 
 
 def _tilt_pixels(axis: int) -> Callable[[Scan], float]:
-    """Returns the pixels of a tilt. It magnifies one side: points move outwards by the square of their distance from its
-    axis."""
+    """Returns the pixels of a tilt. It magnifies one side: points move by the square of their distance from its axis."""
     return lambda scan: _half_mm(scan, axis) ** 2 / _cone(scan).source_to_detector_mm / _pitch_mm(scan)
 
 
@@ -150,8 +149,7 @@ NAMES = list(dict.fromkeys([*PARAMETER_GROUPS, *PARAMETERS, WOBBLE, MOTION, DIRE
 
 @dataclass(frozen=True)
 class Request:
-    """The parameters to estimate. ``per_view``: wobble, motion or nothing (""). ``asks_direction``: whether to test the
-    readout's direction."""
+    """The parameters to estimate. ``per_view``: wobble, motion or nothing (""). ``asks_direction``: test the readout's."""
 
     parameters: list[Parameter]
     per_view: str

@@ -1,7 +1,8 @@
-"""Parameters of single views (a wobble), or of an object that moves slowly (a motion), as splines of time.
+"""Estimates parameters of single views (a wobble), or of an object that moves slowly (a motion), as splines of time.
 
 A view's parameters change its own frame only, so their signals are images of that frame. CGLS solves the normal equations
-of a Gauss–Newton step for the volume and all parameters together. Parameters then explain only what the volume cannot."""
+of a Gauss–Newton step for the volume and all parameters together. Parameters then explain only what the volume cannot.
+``estimate_views`` takes such steps from coarse to fine grids."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
@@ -14,16 +15,23 @@ from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.acquisition.altered.angles import start_azimuths_rad
 from phyradgs_cl.acquisition.altered.perturbed import GeometryCorrection, Sway, Views, scan_course, splines
 from phyradgs_cl.calibrate.problem import CoarseProblem
+from phyradgs_cl.calibrate.result import AGREES, CORRECTED, ParameterEstimate
+from phyradgs_cl.calibrate.stages import PassCounter, Passes, Stage, pass_cost
 from phyradgs_cl.detector import noise_level
 from phyradgs_cl.operators.rays.operator import RayOperator
 from phyradgs_cl.reconstructors.fits.residuals import AugmentedOperator, ViewParameters
 from phyradgs_cl.reconstructors.voxels.cgls import Cgls
+from phyradgs_cl.runtime import Runtime
 
 SPLINES = 7  # of a motion: one spline reaches over about a seventh of the scan
 TURN, SHIFT_V, SHIFT_U = 0, 1, 2
 _STEP_PX = 0.25
 _LEAST_NORM = 0.1  # fraction of the largest norm of a kind: parameters with weaker signals are not scaled up further
 _DEG = float(np.rad2deg(1.0))
+DISCRETISATION = 0.5  # fraction of the change since a grid half as fine: the error that remains, if it is of first order
+_STEPS = 3
+_ITERATIONS = 20
+_DEVIATIONS = 3.0  # deviations of one value, which the root mean square of all has to exceed
 
 
 @dataclass(frozen=True)
@@ -194,8 +202,7 @@ def view_deviations(
     problem: CoarseProblem, correction: GeometryCorrection, parameters: PerViewParameters,
     signals: np.ndarray, iterations: int,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the standard deviations (K,) of a view's parameters, and the shares (K,) of their signals that no object
-    explains.
+    """Returns standard deviations (K,) of a view's parameters, and the shares (K,) of signals that no object explains.
 
     signals: (F, K, rows, columns). The errors of the values that make up a view are taken as independent."""
     operator = parameters.operator(problem, correction)
@@ -214,8 +221,7 @@ def _norms(basis: np.ndarray, signals: np.ndarray) -> np.ndarray:
 
 
 def _strength(operator: RayOperator) -> float:
-    """Returns a rough largest singular value of A. Parameters in its units converge as fast as the object's main
-    features."""
+    """Returns a rough largest singular value of A. Parameters in its units converge as fast as the object does."""
     lengths = operator.forward(np.ones(operator.volume_shape, np.float32))
     return float(np.linalg.norm(operator.adjoint(lengths)) / np.linalg.norm(lengths))
 
@@ -240,3 +246,59 @@ def _share(
     probe = signals * (basis @ signs).astype(np.float32)[:, None, None]
     (rest,) = problem.beyond_object(operator, np.zeros(operator.volume_shape, np.float32), [probe], iterations)
     return float(np.linalg.norm(rest) / max(float(np.linalg.norm(probe)), 1e-30))
+
+
+@dataclass(frozen=True, eq=False)
+class ViewsEstimate:
+    """``views``: corrections of significant kinds, None without any. ``table``: a line of the table per kind."""
+
+    views: Views | Sway | None
+    table: list[ParameterEstimate]
+
+
+def passes_of_views(scan: Scan, stages: Sequence[Stage], kinds: int) -> Passes:
+    """Returns the passes through the frames that ``estimate_views`` makes."""
+    costs = [pass_cost([scan], stage.columns, scan.frames) for stage in stages]
+    counts = [stage.first + (_STEPS - 1) * stage.again + _STEPS * _ITERATIONS for stage in stages]
+    counts[-1] += kinds * _ITERATIONS
+    return sum(counts), sum(cost * count for cost, count in zip(costs, counts, strict=True))
+
+
+def estimate_views(
+    rt: Runtime, scan: Scan, parameters: PerViewParameters, stages: Sequence[Stage],
+    correction: GeometryCorrection, passes: PassCounter,
+) -> ViewsEstimate:
+    """Estimates ``parameters`` of a scan after ``correction``, in a few Gauss–Newton steps per stage.
+
+    A deviation combines noise and discretisation error, which is half the change since the coarser grid."""
+    for number, stage in enumerate(stages):
+        problem = CoarseProblem.of(rt, [scan], stage, scan.frames)
+        problem = replace(problem, count_pass=passes.counter(pass_cost([scan], stage.columns, scan.frames)))
+        former, volume = parameters.values, None
+        is_kept = ~np.isin(np.arange(len(parameters.KINDS)), parameters.RESTARTED)
+        parameters = replace(parameters, values=former * is_kept)
+        kinds = parameters.kinds_of_stage(number, len(stages))
+        for _ in range(_STEPS):
+            operator = parameters.operator(problem, correction)
+            volume = problem.reconstruct(operator, volume, stage.first if volume is None else stage.again)
+            step, signals = view_step(problem, correction, parameters, volume, kinds, _ITERATIONS)
+            parameters = replace(parameters, values=parameters.without_gauges(parameters.values + step))
+    noise, shares = view_deviations(problem, correction, parameters, signals, _ITERATIONS)
+    change = _rms_over_views(parameters, parameters.values - former)
+    kinds_before = parameters.kinds_of_stage(len(stages) - 2, len(stages)) if len(stages) > 1 else []
+    was_estimated = np.isin(np.arange(len(parameters.KINDS)), kinds_before)
+    deviations = np.hypot(noise, DISCRETISATION * change * was_estimated)
+    sizes = _rms_over_views(parameters, parameters.values)
+    is_significant = sizes > _DEVIATIONS * deviations
+    table = []
+    for k, kind in enumerate(parameters.KINDS):
+        size, deviation = float(sizes[k] * kind.scale), float(deviations[k] * kind.scale)
+        verdict = CORRECTED if is_significant[k] else AGREES
+        table.append(ParameterEstimate(kind.name, kind.unit, 0.0, size, deviation, float(shares[k]), verdict))
+    views = parameters.views_of(parameters.values * is_significant) if is_significant.any() else None
+    return ViewsEstimate(views, table)
+
+
+def _rms_over_views(parameters: PerViewParameters, values: np.ndarray) -> np.ndarray:
+    """Returns the root mean square (K,) over the views of values (n, K)."""
+    return np.sqrt(np.mean(np.square(parameters.basis @ values), 0))

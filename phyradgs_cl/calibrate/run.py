@@ -27,13 +27,19 @@ from phyradgs_cl.calibrate.parameters import (
     correction_of,
     requested,
 )
-from phyradgs_cl.calibrate.per_view import MotionParameters, PerViewParameters, WobbleParameters
+from phyradgs_cl.calibrate.per_view import (
+    MotionParameters,
+    PerViewParameters,
+    ViewsEstimate,
+    WobbleParameters,
+    estimate_views,
+    passes_of_views,
+)
 from phyradgs_cl.calibrate.placing import WRONG_PHANTOM, bead_centres_mm, placements
 from phyradgs_cl.calibrate.problem import CoarseProblem
 from phyradgs_cl.calibrate.result import AGREES, CANNOT_TELL, CORRECTED, Calibration, ParameterEstimate, rms
 from phyradgs_cl.calibrate.search import Fallback, Problem, Search
 from phyradgs_cl.calibrate.stages import PassCounter, Passes, Report, Stage, pass_cost
-from phyradgs_cl.calibrate.views import ViewsEstimate, estimate_views, passes_of_views
 from phyradgs_cl.check import SUSPICIOUS
 from phyradgs_cl.check.coverage import CUT_OFF, check_coverage
 from phyradgs_cl.check.hypotheses import has_axis_near_edge
@@ -73,8 +79,7 @@ def calibrate(
     - splines: a wobble's number of splines of time; 0 takes every view by itself.
     - note: takes a line with the estimates so far after each grid.
 
-    Raises InputError for unknown parameters, a scan too small, others that do not fit the first, and a phantom that the
-    frames do not show."""
+    Raises InputError for unknown parameters, a scan too small, others that do not fit the first, and a phantom not seen."""
     request = requested(what, scan, phantom is not None)
     ready = [without_lag(one) for one in (scan, *others)]
     _check(ready, request, phantom, splines)
@@ -163,8 +168,8 @@ class _Calibrator:
             self.search.fallback = {OFFSET_U: Fallback(shift.pixels * pitch_mm, shift.deviation * pitch_mm, is_significant)}
 
     def _search_common(self) -> None:
-        """Searches the parameters common to all views, in a scan whose views are corrected first. Errors of single views
-        would look like a roll."""
+        """Searches the parameters common to all views, in a scan whose views are corrected first. Their errors would look
+        like a roll."""
         steady = self.ready
         if self.per_view is not None:
             self.passes.begin("views before", "views, before the rest")
@@ -179,8 +184,8 @@ class _Calibrator:
             self.passes.plan |= self._plan_of_stages(len(self.search.determined), number + 1)
 
     def _with_steady_views(self, scan: Scan) -> Scan:
-        """Returns the scan with its views corrected. If the panel's offset is a parameter, a shift along u common to all
-        views counts as offset."""
+        """Returns the scan with its views corrected. A common shift along u counts as the panel's offset, if that is a
+        parameter."""
         views = self._estimate_views(correction_of(self.search.at)).views
         if isinstance(views, Views) and OFFSET_U in self.search.at:
             common_mm = float(views.shift_mm[:, 1].mean())

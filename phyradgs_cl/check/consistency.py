@@ -1,4 +1,4 @@
-"""Do the frames fit together under the stated order, angles and geometry?
+"""Do the frames fit together under the stated order, angles and geometry, and which of them are odd?
 
 A coarse reconstruction of consistent frames leaves a far smaller residual than one of the same frames in a random order.
 Where it does not, or where another hypothesis leaves at most half the squared residual, something stated is wrong. The
@@ -13,13 +13,13 @@ from itertools import chain
 import numpy as np
 
 from phyradgs_cl.acquisition import Scan
-from phyradgs_cl.acquisition.altered.angles import has_opposite_views
+from phyradgs_cl.acquisition.altered.angles import has_opposite_views, start_azimuths_rad, wrapped
 from phyradgs_cl.acquisition.altered.coarse import some_frames
 from phyradgs_cl.acquisition.altered.variants import reversed_rotation, shifted
 from phyradgs_cl.check import hypotheses
 from phyradgs_cl.check.finding import CANNOT_TELL, FEWEST_COLUMNS, OK, SUSPICIOUS, Finding
-from phyradgs_cl.check.hypotheses import Hypothesis
-from phyradgs_cl.check.odd_frames import without_odd_frames, without_outliers
+from phyradgs_cl.check.hypotheses import Hypothesis, frame_number
+from phyradgs_cl.detector import robust_deviation
 from phyradgs_cl.reconstructors.fits import axis
 from phyradgs_cl.reconstructors.fits.residuals import Fit, fit, fit_squares, t_statistic
 from phyradgs_cl.runtime import Runtime
@@ -36,6 +36,15 @@ _SYMMETRIC = 2.0  # residual in a random order over that in the stated one
 _SAME = 0.03  # residual in a random order over the frames' spread: below this and _SYMMETRIC, angles leave no trace
 _MOST_REFINED = 2  # of hypotheses about the whole scan
 _SHIFT_PENALTY = 1.5  # fraction of the squared residual per coarse pixel of shift: stated offsets are mostly right
+_DEVIATIONS = 12.0
+_LEAST_CHANGE = 0.75  # a change of the mean line integral, over the usual mean
+_FEWEST = 5
+_REPEATED = 0.15  # difference from the frame before, over the usual difference between neighbours
+_JUMP = 2.5  # steps of the order over steps of the sorted angles
+_UNLIKE = 2.0  # difference from the neighbouring view in angle over the usual difference
+_OUTLIER = 4.0  # a frame's residual over the usual one
+_MOST_OUTLIERS = 0.2  # fraction of the frames
+_EXCHANGED = 0.5  # squared residual after an exchange of two frames over the stated one
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,8 +124,8 @@ def check_consistency(rt: Runtime, scan: Scan, as_stated: Scan) -> Consistency:
 
 
 def _best_sense(rt: Runtime, scan: Scan) -> tuple[Scan, Scan, float]:
-    """Chooses the sense of rotation and the panel's shift, where they fit far better than as stated. Both senses fit
-    opposite views equally well.
+    """Chooses the sense of rotation and the panel's shift, where they fit far better than as stated. Opposite views do not
+    decide.
 
     Returns the scan with that sense, the same with that shift, and the mean squared residual of the best rough fit."""
     senses, limits_px = [scan], [axis.ANYWHERE]
@@ -165,8 +174,8 @@ def _refined_hypotheses(rt: Runtime, scan: Scan, as_stated: Scan, most: float) -
     """Returns the best two hypotheses about the whole scan, with the panel shifted to fit best.
 
     A rough fit must nearly reach ``most`` (mean squared residual), because an offset between two coarse pixels hides other
-    differences. Large shifts count against a hypothesis. Of hypotheses with the same factor of sizes the one with the
-    smaller shift counts."""
+    differences. Large shifts count against a hypothesis. Of hypotheses with one factor of sizes, the smaller shift
+    counts."""
     tried: list[tuple[Hypothesis, Scan, axis.AxisShift]] = []
     for hypothesis in hypotheses.of_scan(scan, as_stated):
         other = hypothesis.scan()
@@ -200,3 +209,83 @@ def _best_below(rt: Runtime, candidates: Iterable[Hypothesis], stated: Fit, most
         if squares.sum() < least and t_statistic(stated.squares, squares) <= -_ERRORS:
             best, least = hypothesis, float(squares.sum())
     return best
+
+
+def without_odd_frames(scan: Scan) -> tuple[np.ndarray, list[str]]:
+    """Finds odd and repeated frames before any reconstruction. Returns the other frames (indices), and notes."""
+    odd, repeated = odd_frames(scan.projections, scan.pixel_mask), repeated_frames(scan)
+    notes = [f"frame {frame_number(scan, f)} is unlike all others (black, bright, or no image)" for f in odd]
+    notes += [f"frame {frame_number(scan, f)} is frame {frame_number(scan, f - 1)} recorded twice" for f in repeated]
+    return np.setdiff1d(np.arange(scan.frames), [*odd, *repeated]), notes
+
+
+def odd_frames(p: np.ndarray, mask: np.ndarray | None) -> list[int]:
+    """Returns the frames of p (F, v, u) whose mean line integral is far from that of their neighbours."""
+    if len(p) < _FEWEST:
+        return []
+    valid = 1.0 if mask is None else (np.asarray(mask) == 0).astype(np.float32)
+    weight = np.broadcast_to(valid, p.shape)
+    level = (p * weight).sum((1, 2), dtype=np.float64) / np.maximum(weight.sum((1, 2)), 1)
+    difference = level - np.median(_neighbours(level), axis=0)
+    least = max(_DEVIATIONS * robust_deviation(difference), _LEAST_CHANGE * abs(float(np.median(level))))
+    return [int(f) for f in np.flatnonzero(np.abs(difference) > least)]
+
+
+def repeated_frames(scan: Scan) -> list[int]:
+    """Returns frames that repeat the one before although the gantry has turned: they differ less than neighbours do.
+
+    In an order that jumps, as the golden one, they are also unlike the view beside them in angle. Views of a round object
+    from far apart may be alike as well."""
+    p = scan.projections
+    if len(p) < _FEWEST:
+        return []
+    steps = np.array([_rms(b - a) for a, b in zip(p[:-1], p[1:], strict=True)])
+    azimuths_rad = start_azimuths_rad(scan)
+    turned_rad = np.abs(wrapped(np.diff(azimuths_rad)))
+    alike = np.flatnonzero((turned_rad > 1e-6) & (steps < _REPEATED * np.min(_neighbours(steps), axis=0)))
+    order = np.argsort(azimuths_rad % (2 * np.pi))
+    beside = np.empty(len(p), int)
+    beside[order] = np.roll(order, -1)
+    jumps = np.median(turned_rad) > _JUMP * np.median(np.abs(wrapped(azimuths_rad[beside] - azimuths_rad)))
+    if alike.size and jumps:
+        from_beside = np.array([_rms(p[g] - frame) for frame, g in zip(p, beside, strict=True)])
+        alike = alike[from_beside[alike + 1] > _UNLIKE * np.median(from_beside)]
+    return [int(f) + 1 for f in alike]
+
+
+def _rms(image: np.ndarray) -> float:
+    return float(np.square(image, dtype=np.float64).mean()) ** 0.5
+
+
+def _neighbours(values: np.ndarray) -> np.ndarray:
+    """Returns (4, F): the two values before and the two after each of ``values`` (F,), mirrored at the ends."""
+    wide = np.r_[values[2:0:-1], values, values[-2:-4:-1]]
+    return np.stack([wide[:-4], wide[1:-3], wide[3:-1], wide[4:]])
+
+
+def without_outliers(rt: Runtime, scan: Scan, stated: Fit) -> tuple[np.ndarray, Fit, list[str]]:
+    """Removes frames whose residual is far above the others', the worst first, with a new fit after each.
+
+    Returns the indices of the other frames, their fit, and notes. Where a fifth of the frames would go, the cause is common
+    to all, and none is removed. Two outliers may be frames whose order is exchanged."""
+    remaining, current = np.arange(scan.frames), stated
+    outliers: list[int] = []
+    while len(outliers) < _MOST_OUTLIERS * scan.frames:
+        size = np.sqrt(current.squares)
+        worst = int(np.argmax(size))
+        if size[worst] < _OUTLIER * np.median(size):
+            break
+        outliers.append(int(remaining[worst]))
+        remaining = np.delete(remaining, worst)
+        current = fit(rt, some_frames(scan, remaining))
+    if not outliers or len(outliers) >= _MOST_OUTLIERS * scan.frames:
+        return np.arange(scan.frames), stated, []
+    numbers = sorted(frame_number(scan, f) for f in outliers)
+    frames, do = ("frames", "do") if len(outliers) > 1 else ("frame", "does")
+    note = f"{frames} {', '.join(map(str, numbers))} (from 0) {do} not fit the others"
+    if len(outliers) == 2:
+        order = np.arange(scan.frames)
+        order[outliers] = order[outliers[::-1]]
+        if fit_squares(rt, replace(scan, projections=scan.projections[order])).sum() < _EXCHANGED * stated.total:
+            note = f"frames {numbers[0]} and {numbers[1]} (from 0) fit if their order is exchanged"
+    return remaining, current, [note]

@@ -89,8 +89,7 @@ def _check_sides(scan: Scan, p: np.ndarray, valid: np.ndarray, largest: float, t
 
 
 def _width_mm(scan: Scan, p: np.ndarray, valid: np.ndarray, threshold: float) -> float:
-    """Returns the object's usual width at the axis: that of the columns in which a tenth of the rows is above
-    ``threshold``."""
+    """Returns the object's usual width at the axis: columns in which a tenth of the rows is above ``threshold``."""
     geometry = scan.geometry
     columns = float(np.median((((p > threshold) & valid).mean(1) > _COVERED).sum(1)))
     if isinstance(geometry, ParallelGeometry):

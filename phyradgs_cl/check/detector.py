@@ -93,7 +93,7 @@ def _clipped(saturation: Saturation, remedy: str) -> Finding:
 
 
 def _jumps(p: np.ndarray, masked: np.ndarray) -> float:
-    """Returns the fraction of pixels (F, v, u) that differ from a neighbour by most of the range. Single dead pixels do not
+    """Returns the fraction of pixels (F, v, u) that differ from a neighbour by most of the range. Dead pixels do not
     count."""
     if p.shape[2] < 2:
         return 0.0
@@ -136,8 +136,7 @@ def check_dead_pixels(scan: Scan) -> tuple[Finding, np.ndarray]:
 def check_gain(rt: Runtime, scan: Scan) -> Finding:
     """Fits a ramp, and a step at each frame, to the levels of the frames of a coarse ``scan``.
 
-    A change of more than 1.5 % and five standard deviations is suspicious. Levels that turn with the gantry are fitted
-    too."""
+    A change of more than 1.5 % and five standard deviations is suspicious. Levels may turn with the gantry."""
     if scan.frames < _FEWEST_FRAMES:
         return Finding(GAIN, CANNOT_TELL, 0.0, _LARGEST_DRIFT, "share", f"fewer than {_FEWEST_FRAMES} frames")
     level = fit(rt, scan).level

@@ -38,8 +38,7 @@ class Hypothesis:
 
 
 def stated_redundancy(scan: Scan) -> float:
-    """Returns the fraction of columns whose rays a full turn measures twice. It is negative where the stated axis misses the
-    panel."""
+    """Returns the fraction of columns whose rays a full turn measures twice. Negative: the axis misses the panel."""
     geometry = scan.geometry
     return 1 - 2 * abs(geometry.detector_offset_mm[1]) / (geometry.pixel_size_mm[1] * geometry.detector_shape[1])
 
@@ -66,15 +65,14 @@ def frame_number(scan: Scan, frame: int) -> int:
 
 
 def of_scan(scan: Scan, stated: Scan) -> Iterator[Hypothesis]:
-    """Yields hypotheses about the whole coarse ``scan``: sizes in another unit, mirrored frames. ``stated``: the scan that
-    was made coarse."""
+    """Yields hypotheses about the whole coarse ``scan``: sizes in another unit, mirrored frames. ``stated``: before it was
+    coarse."""
     yield from _other_units(scan, stated)
     yield from _other_images(scan, stated)
 
 
 def _other_units(scan: Scan, stated: Scan) -> Iterator[Hypothesis]:
-    """Yields sizes and distances in other units. They enter the fan only as a ratio; the panel's offset in mm may tell them
-    apart."""
+    """Yields sizes and distances in other units. Only their ratio enters the fan; the panel's offset may decide."""
     geometry = stated.geometry
     if isinstance(geometry, ParallelGeometry):
         return  # in a parallel beam sizes scale with the object
@@ -115,8 +113,7 @@ def _with_sizes(scan: Scan, stated: Scan, factor: float, keeps_axis: bool) -> Sc
 
 
 def _matching_grid(stated: Scan, panel_grid: Grid) -> Grid:
-    """Returns the stated grid. Where it has another size or was derived from the wrong panel, returns that of the panel's
-    view."""
+    """Returns the stated grid. If that has another size or came from the wrong panel, returns the panel's."""
     ratio = max(stated.grid.size_mm) / max(panel_grid.size_mm)
     is_derived = stated.grid == default_grid(stated.geometry)
     return panel_grid if is_derived or not 1 / _GRID_FACTOR < ratio < _GRID_FACTOR else stated.grid
@@ -134,8 +131,7 @@ def _other_images(scan: Scan, stated: Scan) -> Iterator[Hypothesis]:
 
 
 def of_frames(scan: Scan, shifted_scan: Scan, tries_orders: bool) -> Iterator[Hypothesis]:
-    """Yields other angle steps, exchanged pixel sizes (with the panel shifted) and, with ``tries_orders``, missing or
-    repeated frames."""
+    """Yields other angle steps, exchanged pixel sizes and, with ``tries_orders``, missing or repeated frames."""
     yield from _other_steps(scan)
     yield from _exchanged_sizes(shifted_scan)
     if tries_orders:
@@ -143,8 +139,7 @@ def of_frames(scan: Scan, shifted_scan: Scan, tries_orders: bool) -> Iterator[Hy
 
 
 def _azimuths(scan: Scan) -> np.ndarray:
-    """Returns each frame's angle (F,) from the first one's. Where the trajectory has angles, they are as stated, with
-    turns."""
+    """Returns each frame's angle (F,) from the first one's. A trajectory's own angles keep their turns."""
     trajectory = variants.altered_trajectory(scan)
     angle_rad = getattr(trajectory.base, "angle_rad", None)
     if angle_rad is None:

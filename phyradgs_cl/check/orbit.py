@@ -58,16 +58,14 @@ class Orbit:
     is_reversed: bool = False
 
     def corrected(self, scan: Scan) -> Scan:
-        """Returns a coarse scan with its sense of rotation corrected, and its panel shifted where the shift is
-        significant."""
+        """Returns a coarse scan with its sense of rotation corrected, and its panel shifted if that is significant."""
         scan = reversed_rotation(scan) if self.is_reversed else scan
         is_shifted = self.shift.is_found and abs(self.shift.pixels) > self.centre.threshold
         return shifted(scan, self.shift.pixels) if is_shifted else scan
 
 
 def find_orbit(rt: Runtime, quick: Scan, as_stated: Scan, sees_angles: bool) -> Orbit:
-    """Answers from a coarse scan which way the gantry turns and where the axis is. A panel with few columns decides
-    neither."""
+    """Answers from a coarse scan which way the gantry turns and where the axis is. Few columns decide neither."""
     if quick.geometry.detector_shape[1] < FEWEST_COLUMNS:
         return Orbit(too_narrow(SIGN, "standard errors"), too_narrow(CENTRE, "pixels"))
     if not sees_angles:

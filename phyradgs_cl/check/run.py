@@ -1,5 +1,4 @@
-"""Asks all questions in an order in which each rests on those before. Each error found is corrected for the next
-question."""
+"""Asks all questions in an order in which each rests on those before. Errors found are corrected for the next."""
 
 import math
 from collections.abc import Callable

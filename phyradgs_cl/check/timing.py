@@ -87,8 +87,7 @@ def _table(scan: Scan) -> list[Finding]:
 
 
 def _speed(scan: Scan, starts_s: np.ndarray) -> Finding:
-    """Compares the angle to the next frame with the speed within the frame. Medians count, because gantries vary their
-    speed."""
+    """Compares the angle to the next frame with the speed within the frame. Medians count: gantries vary their speed."""
     span_s = scan.shutter.exposure_s or scan.shutter.span_s
     by_speed, stepped = np.empty(scan.frames - 1), np.empty(scan.frames - 1)
     for frame in range(scan.frames - 1):

@@ -119,8 +119,8 @@ def average(p: ArrayLike, weight: ArrayLike, model: str) -> NDArray[np.float64]:
 def intensity_average(p: Iterable[np.ndarray], weights: Iterable[np.ndarray]) -> tuple[np.ndarray, list[np.ndarray]]:
     """Returns −ln Σ w exp(−p) over S moments, and each moment's share w exp(−p) / Σ w exp(−p), without overflow.
 
-    p: S arrays, whose precision the result has. weights: S numbers or arrays that broadcast, with sum 1. Where all are 0,
-    both results are 0."""
+    p: S arrays, whose precision the result has. weights: S numbers or arrays that broadcast, with sum 1. All 0 gives 0 for
+    both."""
     pairs = list(zip(p, weights, strict=True))
     least = np.minimum.reduce([np.where(w > 0, q, np.inf) for q, w in pairs])  # p of the brightest moment
     least = np.where(np.isfinite(least), least, 0)

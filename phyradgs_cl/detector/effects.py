@@ -76,8 +76,7 @@ def beer_lambert_noise(
 ) -> NDArray[np.float32]:
     """Returns −ln(counts/dose) with counts clamped at ``COUNT_FLOOR``. Negatives stay: otherwise air would attenuate.
 
-    Arguments and result are those of ``tigre_noise``. Lag λ mixes the photons of successive frames; electronic noise is
-    added after it."""
+    Arguments and result as in ``tigre_noise``. Lag λ mixes photons of successive frames, before electronic noise."""
     expected = beer_lambert_counts(line_integrals, dose)
     share = np.asarray(light, dtype=np.float64)
     counts = add_lag(sample_counts(expected * share, 0.0, rng), lag)

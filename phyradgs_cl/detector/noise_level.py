@@ -36,8 +36,7 @@ def noise_level(line_integrals: NDArray[np.float32], valid: NDArray[np.bool_] | 
 
     It is estimated from the median of |second differences| along rows, where values are above 0. Structure is smooth
     compared with white noise, and a median ignores edges (Donoho and Johnstone, Biometrika 81 (1994) 425). Structure as fine
-    as a pixel raises the estimate; noise correlated along rows lowers it. line_integrals (F, v, u); valid likewise, None for
-    all."""
+    as a pixel raises the estimate; noise correlated along rows lowers it. line_integrals (F, v, u); valid: None for all."""
     if line_integrals.shape[-1] < 3:
         return 0.0
     left, middle, right = _along_rows(line_integrals)

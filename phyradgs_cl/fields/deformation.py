@@ -62,8 +62,7 @@ class Deformation:
     def of_displacements(
         cls, displacements_mm: np.ndarray, grid: Grid, times_s: "ArrayLike", spacing_mm: float, rank: int = 2
     ) -> "Deformation":
-        """Returns the deformation closest to dense displacements w (T, nz, ny, nx, 3) in mm, components x, y, z, at times
-        (T,).
+        """Returns the deformation closest to dense displacements w (T, nz, ny, nx, 3) in mm, x y z, at times (T,).
 
         They are at the voxel centres of ``grid``, as image registration gives them.
 
@@ -147,8 +146,7 @@ class Deformation:
     def inverse_on_grid_mm(self, grid: Grid, weights: "ArrayLike") -> np.ndarray:
         """Returns u (nz, ny, nx, 3) float32 in mm with u(x) = −w(x + u(x)): matter at x of the reference is at x + u(x).
 
-        It is a fixed point, reached from u = 0. Raises InputError where it does not converge, for example where the field
-        folds."""
+        It is a fixed point, reached from u = 0. Raises InputError where it does not converge, as where the field folds."""
         z, y, x = np.meshgrid(*grid.axes_mm(), indexing="ij")
         centres_mm = np.stack([x.ravel(), y.ravel(), z.ravel()], -1)
         return self.inverse_mm(centres_mm, weights).reshape(*grid.shape, 3).astype(np.float32)

@@ -118,8 +118,7 @@ class GridChoice:
 
 
 def voxel_sides_mm(option: str, value: Any) -> tuple[float, float, float]:
-    """Returns the sides of a voxel (z, y, x) in mm from one length or three. Raises InputError about ``option``
-    otherwise."""
+    """Returns the sides of a voxel (z, y, x) in mm from one length or three. InputError names ``option``."""
     sides_mm = _numbers(option, value, (1, 3), "0.5 or 1,0.5,0.5")
     for side_mm in sides_mm:
         checks.within(option, side_mm, 1 / _LARGEST_MM, _LARGEST_MM)

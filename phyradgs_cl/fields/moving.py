@@ -39,8 +39,7 @@ class States:
 
     @property
     def span_s(self) -> tuple[float, float]:
-        """The time in s that the states describe, from half a step before the first one to half a step after the last
-        one."""
+        """The time in s that the states describe, from half a step before the first to half a step after the last."""
         steps_s = np.diff(self.times_s) if len(self.times_s) > 1 else np.zeros(1)
         return float(self.times_s[0] - steps_s[0] / 2), float(self.times_s[-1] + steps_s[-1] / 2)
 
@@ -55,8 +54,7 @@ class States:
 
 @dataclass(frozen=True, eq=False)
 class MovingTruth(States):
-    """True volumes of a simulated object. deformation: what made them of the scan's reference; None if no field describes
-    it."""
+    """True volumes of a simulated object. deformation: of the scan's reference; None if no field describes it."""
 
     deformation: Deformation | None = None
 
@@ -119,8 +117,8 @@ class SplineVolume:
         self._coefficients: np.ndarray | None = None
 
     def deformed(self, deformation: Deformation, weights: np.ndarray) -> np.ndarray:
-        """Returns v(y + w(y)) (nz, ny, nx) float32 at every voxel centre y, for the weights (R,) of a state. A state at rest
-        is the volume itself."""
+        """Returns v(y + w(y)) (nz, ny, nx) float32 at every voxel centre y, for a state's weights (R,). At rest it is the
+        volume."""
         if not np.any(deformation.reach_mm * np.abs(weights)):
             return self.volume
         if self._coefficients is None:

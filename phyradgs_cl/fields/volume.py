@@ -48,8 +48,7 @@ class Grid:
 
     @classmethod
     def cube(cls, count: int, side_mm: float) -> "Grid":
-        """Returns a centred cube of ``count``³ voxels with a side of ``side_mm``. Raises InputError for numbers not above
-        0."""
+        """Returns a centred cube of ``count``³ voxels with a side of ``side_mm``. InputError: numbers not above 0."""
         checks.whole("count", count, 1, MOST_VOXELS)
         checks.positive("side_mm", side_mm)
         return cls((count,) * 3, (side_mm / count,) * 3)

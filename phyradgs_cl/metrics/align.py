@@ -27,8 +27,7 @@ class Aligned:
 
 
 def aligned(volume: Values, grid: Grid, reference: Values, reference_grid: Grid) -> Aligned | None:
-    """Brings both volumes (nz, ny, nx) to one grid. Returns None where the volume's box holds no voxel centre of the
-    reference.
+    """Brings both volumes (nz, ny, nx) to one grid. None: the boxes share no voxel centre.
 
     Where the volume's voxels are whole blocks of the reference's, the reference is averaged over the blocks. Any other
     volume is resampled trilinearly onto the reference's voxels that lie in its box."""
@@ -58,8 +57,7 @@ def overlap(one: Grid, other: Grid) -> tuple[float, float]:
 
 
 def reference_on(grid: Grid, reference: Values, reference_grid: Grid) -> Values | None:
-    """Returns the reference (nz, ny, nx) on ``grid`` by the rule of ``aligned``; None where the rule resamples the
-    volume."""
+    """Returns the reference (nz, ny, nx) on ``grid`` by the rule of ``aligned``; None if that resamples the volume."""
     if grid.is_close(reference_grid):
         return reference
     blocks = _blocks(grid, reference_grid)
@@ -83,8 +81,7 @@ def in_words(grid: Grid) -> str:
 
 
 def _blocks(grid: Grid, finer: Grid) -> tuple[tuple[int, int, int], tuple[slice, slice, slice]] | None:
-    """Returns how many voxels (z, y, x) of ``finer`` fill one of ``grid``, and which voxels fill all; None for partial
-    voxels."""
+    """Returns how many voxels (z, y, x) of ``finer`` fill one of ``grid``, and which fill all; None for partial voxels."""
     factors = triple(max(1, round(d / f)) for d, f in zip(grid.voxel_size_mm, finer.voxel_size_mm, strict=True))
     counts = triple(n * factor for n, factor in zip(grid.shape, factors, strict=True))
     if any(n > most for n, most in zip(counts, finer.shape, strict=True)):

@@ -80,11 +80,10 @@ def compare(volume: np.ndarray, reference: np.ndarray) -> dict[str, float]:
 
 
 def psnr(result: ArrayLike, reference: ArrayLike, data_range: float | None = None) -> float:
-    """Returns 10 · log10(data_range² / mean squared error) in dB over all voxels, without clipping. Equal arrays give
-    infinity.
+    """Returns 10 · log10(data_range² / mean squared error) in dB over all voxels, without clipping. Equal arrays: infinity.
 
-    ``data_range``: by default the reference's maximum. Raises InputError for shapes that differ, NaN or infinity, and a
-    range that is not positive."""
+    ``data_range``: by default the reference's maximum. Raises InputError for shapes that differ, NaN, infinity, and a range
+    not above 0."""
     a, b, peak = checked_pair(result, reference, data_range)
     # One slice at a time: float64 copies of whole volumes would triple the memory.
     squares = sum(float(np.sum((p.astype(np.float64) - q) ** 2)) for p, q in zip(a, b, strict=True))
@@ -169,8 +168,7 @@ def displaced_mm(deformation: Deformation, points_mm: np.ndarray, times_s: np.nd
 def motion_error_mm(
     estimate: Deformation, truth: Deformation, points_mm: np.ndarray, times_s: np.ndarray
 ) -> tuple[float, float]:
-    """Returns mean and 95th percentile of the distance in mm between two motions, of matter at ``points_mm`` at the first
-    time.
+    """Returns mean and 95th percentile of the distance in mm between two motions of matter, first at ``points_mm``.
 
     The distance is taken at the other times. Raises InputError for less than two times."""
     if len(times_s) < 2:

@@ -19,8 +19,7 @@ _FIRST_FEATURES = 1e-4  # the first features are uniform in ± this (Müller et 
 
 
 class LineAttention(nn.Module):
-    """Multi-head attention within segments of ``segment`` neighbours, for values (P, width). P is a multiple of
-    ``segment``."""
+    """Multi-head attention within segments of ``segment`` neighbours, for values (P, width). ``segment`` divides P."""
 
     def __init__(self, width: int, segment: int, heads: int, head_width: int) -> None:
         super().__init__()
@@ -115,8 +114,7 @@ def network_of(inputs: int, options: NeuralOptions) -> AttenuationNetwork:
 class HashEncoding(nn.Module):
     """Features (P, levels · features) of positions (P, 3) in [0, 1]³, interpolated linearly between a level's corners.
 
-    A level has an entry for each corner if its corners fit into 2^table_log2 entries. Otherwise they share entries by a
-    hash."""
+    A level has an entry for each corner if its corners fit into 2^table_log2 entries. Otherwise they share by a hash."""
 
     def __init__(
         self, levels: int, features: int, base_resolution: int, growth: float, table_log2: int
@@ -146,8 +144,7 @@ class HashEncoding(nn.Module):
 
 
 def corners(positions: torch.Tensor, cells: int, size: int) -> tuple[torch.Tensor, torch.Tensor]:
-    """Returns entries (8, P) int64 and weights (8, P) of the corners around positions (P, 3), on a level of ``cells``³
-    cells."""
+    """Returns entries (8, P) int64 and weights (8, P) of the corners around positions (P, 3), of a level."""
     scaled = positions.t() * cells
     low = scaled.floor().clamp_(0, cells - 1)
     high_share = scaled - low  # (3, P)
@@ -169,8 +166,7 @@ def _corner_shape(axis: int) -> tuple[int, int, int, int]:
 
 
 def weighted_rows(table: torch.Tensor, index: torch.Tensor, weight: torch.Tensor) -> torch.Tensor:
-    """Returns Σ weight · table[index] over the last axis of index (B, 8). Some devices lack ``embedding_bag``, which does
-    this."""
+    """Returns Σ weight · table[index] over the last axis of index (B, 8). Some devices lack ``embedding_bag``."""
     rows = table.index_select(0, index.reshape(-1)).reshape(*index.shape, table.shape[1])
     return torch.einsum("bkf,bk->bf", rows, weight)
 

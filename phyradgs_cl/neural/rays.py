@@ -152,8 +152,7 @@ def line_integrals(
     field: Field, source: torch.Tensor, direction: torch.Tensor, half_sides: torch.Tensor, samples: int,
     shifts: torch.Tensor,
 ) -> torch.Tensor:
-    """Returns the integrals (R,) of a field along rays (R, 3), with a sample in each of ``samples`` equal intervals in the
-    box.
+    """Returns the integrals (R,) of a field along rays (R, 3), a sample in each of ``samples`` intervals in the box.
 
     ``shifts``: from ``sample_shifts``. With uniformly drawn shifts the expectation is the integral itself, for any field."""
     first, length = box_span(source, direction, half_sides)

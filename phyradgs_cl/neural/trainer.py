@@ -137,8 +137,7 @@ class Trainer:
         return rays.scattered_pixels(usable, options.rays, self.rng)
 
     def _loss_and_gradient(self, frame: int, pixels: np.ndarray) -> float:
-        """Returns the mean squared error in internal units. Its gradient is added up in the parameters, a chunk at a
-        time."""
+        """Returns the mean squared error in internal units. Its gradient is added up in the parameters."""
         exposure = self.rays[frame]
         times = rays.chosen_times(len(pixels), exposure.times, self.times, self.rng)
         shifts = rays.sample_shifts(times.size, self.samples, self.options.jitter, self.rng)

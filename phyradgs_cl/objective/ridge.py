@@ -102,8 +102,7 @@ class RidgeStep:
             self._launch(self._step, first - 2, 0, self._padded, self._channels_back, ends=end)
 
     def _launch(self, kernel: Kernel, first: int, less: int, *sources: DeviceArray, ends: tuple[object, ...]) -> None:
-        """Runs a kernel on slices from ``first`` on. Its result has ``less`` fewer voxels along each axis than the
-        volume."""
+        """Runs a kernel on slices from ``first`` on. Its result has ``less`` fewer voxels along each axis."""
         nz, ny, nx = (count - less for count in self.shape)
         start, stop = max(first, 0), min(first + _SLICES, nz)
         if start < stop:

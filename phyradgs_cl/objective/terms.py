@@ -43,8 +43,7 @@ class ImageLoss:
     def evaluate(
         self, rendered: DeviceArray, measured: DeviceArray, mask: DeviceArray, pixels: float
     ) -> DeviceArray:
-        """Returns dL/drendered, valid until the next call. ``mask``: 1 where a pixel counts. ``pixels``: the sum of the
-        mask."""
+        """Returns dL/drendered, valid until the next call. ``mask``: 1 where a pixel counts. ``pixels``: its sum."""
         rt = self.rt
         vectors = ceil_div(self.width, rt.lanes)
         size = (np.int32(self.lines), np.int32(self.width), np.int32(self.pitch))

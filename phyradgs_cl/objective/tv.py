@@ -38,8 +38,7 @@ class TvProx:
 
     @property
     def dual(self) -> np.ndarray:
-        """The dual field (3, nz, ny, nx) along x, y, z, with vectors of length at most 1. For states it is (4, K, nz, ny,
-        nx)."""
+        """The dual field (3, nz, ny, nx) along x, y, z, with vectors of length at most 1. Of states (4, K, nz, ny, nx)."""
         return self.rt.download(self._dual)
 
     @dual.setter
@@ -132,8 +131,8 @@ def _primal_of(
 def _steps(axis_weights: tuple[float, ...]) -> tuple[float, float]:
     """Returns the steps of the dual in space and in time: one over the Lipschitz constant of the differences.
 
-    For states, each of the two is half as long as it would be alone. The step in space is then not as short as a large
-    weight in time demands."""
+    For states, each of the two is half as long as it would be alone. A large weight in time then leaves the step in space
+    long."""
     *time, z, y, x = axis_weights
     in_space = 1 / (4 * (z * z + y * y + x * x))
     return (in_space / 2, 1 / (8 * time[0] ** 2)) if any(time) else (in_space, 0.0)
@@ -184,8 +183,8 @@ class TvDescent:
 
 
 def tv_gradient(volume: np.ndarray, least: float | None = None) -> np.ndarray:
-    """Float64 twin of ``gradient``: that of Σ |backward difference|, (z, y, x). ``least``: the floor; None: the volume's
-    own."""
+    """Float64 twin of ``gradient``: that of Σ |backward difference|, (z, y, x). ``least``: the floor, None for the
+    volume's."""
     volume = np.asarray(volume, np.float64)
     least = _least_of(volume) if least is None else least
     difference = np.stack([np.diff(volume, axis=a, prepend=volume.take([0], axis=a)) for a in range(3)])

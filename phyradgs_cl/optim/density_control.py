@@ -14,8 +14,8 @@ from phyradgs_cl.fields import gaussians as g
 
 @dataclass(frozen=True)
 class DensityControl:
-    """When to clone, split and prune, and which Gaussians. Lengths are in half-sides of the volume, times in fractions of
-    the run.
+    """When and which Gaussians to clone, split and prune. Lengths are in half-sides of the volume, times in fractions of a
+    run.
 
     ``every``: iterations between two rounds; 0 keeps the first population. Gaussians whose longest scale is more than
     ``prune_aspect`` times their shortest are removed (0: never). Such thin sheets and needles lie between the rays, where no
@@ -92,8 +92,7 @@ def control_density(
 def prune(
     population: Population, activation: Activation, control: DensityControl, box: np.ndarray
 ) -> Population:
-    """Removes Gaussians that are faint, outside the box or too thin. Sorts the others by height, so that neighbours share
-    lines."""
+    """Removes Gaussians that are faint, outside the box or too thin. Sorts the others by height: neighbours share lines."""
     rows = activation.apply(population.raw)
     inside = np.all((rows[g.MEAN] >= box[0][:, None]) & (rows[g.MEAN] <= box[1][:, None]), axis=0)
     kept = np.flatnonzero(inside & (rows[g.DENSITY] >= control.prune_density) & control.allows(rows[g.SCALE]))

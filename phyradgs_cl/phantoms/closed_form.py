@@ -1,5 +1,4 @@
-"""Phantoms in closed form: Shepp and Logan's head, circles of beads, and the moving sphere of RTK's motion-compensation
-tests."""
+"""Phantoms in closed form: Shepp and Logan's head, circles of beads, and the moving sphere of RTK's tests."""
 
 from dataclasses import dataclass, replace
 from typing import ClassVar
@@ -39,8 +38,7 @@ def shepp_logan(
     """Returns the head in a cube of side 2 · ``half_size_mm`` about the origin.
 
     ``variant``: "toft" (high contrast) or "kak-slaney". ``unit_attenuation_per_mm``: attenuation of grey level 1. By default
-    it is 1 / ``half_size_mm``, so that line integrals do not depend on the size. Raises InputError for a wrong size or
-    variant."""
+    it is 1 / ``half_size_mm``, so that line integrals do not depend on the size. InputError: a wrong size or variant."""
     positive("half_size_mm", half_size_mm)
     one_of("Shepp-Logan variant", variant, _GREY_LEVELS)
     unit = 1.0 / half_size_mm if unit_attenuation_per_mm is None else unit_attenuation_per_mm
@@ -66,9 +64,8 @@ _HOLDER_AXES = (0.85, 0.85, 0.7)  # the holder contains every bead and fits into
 def sphere_phantom(half_size_mm: float) -> EllipsoidPhantom:
     """Returns two horizontal circles of dense beads, the second turned by half a step, in a light holder.
 
-    Round edges show blur and distortion, as in the phantoms that calibrate cone-beam scanners. The cube of side
-    2 · ``half_size_mm`` is about the origin. A bead attenuates 1 / ``half_size_mm`` (holder included), the holder 0.15 times
-    that."""
+    Round edges show blur and distortion, as in the phantoms that calibrate cone-beam scanners. The cube of side 2 ·
+    ``half_size_mm`` is about the origin. A bead attenuates 1 / ``half_size_mm``, the holder 0.15 times that."""
     positive("half_size_mm", half_size_mm)
     unit = 1.0 / half_size_mm
     ax, ay, az = (a * half_size_mm for a in _HOLDER_AXES)

@@ -206,8 +206,7 @@ class EllipsoidPhantom:
         return total
 
     def voxelise(self, grid: Grid, supersampling: int = 2) -> NDArray[np.float32]:
-        """Returns mean attenuation (nz, ny, nx) float32 in 1/mm, over ``supersampling`` points along each axis of a
-        voxel."""
+        """Returns mean attenuation (nz, ny, nx) float32 in 1/mm, over ``supersampling`` points along a voxel's axes."""
         if supersampling < 1:
             raise InputError("supersampling", str(supersampling), "an integer of at least 1")
         volume = np.zeros(grid.shape)

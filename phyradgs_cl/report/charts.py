@@ -44,8 +44,7 @@ def chart(draw: "Callable[[Axes], None]", title: str, description: str, size: tu
 
 
 def _label_powers(axes: "Axes") -> None:
-    """Labels logarithmic axes with plain numbers. Where there are few powers of ten, 2 and 5 times these are labelled
-    too."""
+    """Labels logarithmic axes with plain numbers. With few powers of ten, 2 and 5 times these too."""
     from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
     for axis, scale, (low, high) in (

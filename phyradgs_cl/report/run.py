@@ -76,8 +76,7 @@ class Run:
 
     @property
     def preprocessing(self) -> Preprocessing:
-        """The preprocessing of the frames, without steps that later versions lack. The usual one where the provenance has
-        none."""
+        """The preprocessing of the frames, without steps that later versions lack. By default the usual one."""
         table = self.stored.provenance.get("input")
         try:
             return preprocessing_of(_kept(table)) if isinstance(table, Mapping) else Preprocessing()
@@ -181,8 +180,8 @@ def computed_views(run: Run, rt: Runtime, count: int) -> list[FramePair]:
 
 
 def _named_deformation(path: Path, provenance: Mapping[str, object], notes: list[str]) -> Deformation | None:
-    """Returns how the object moved, from the file that the provenance names, if it has the stored hash. A missing file is a
-    remark."""
+    """Returns how the object moved, from the file that the provenance names, if it has the stored hash. A missing one is
+    noted."""
     name = provenance.get("object_motion")
     if not isinstance(name, str) or not name:
         return None

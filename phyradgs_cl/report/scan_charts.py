@@ -131,8 +131,7 @@ def with_sources(scan: Scan, poses: Points) -> Points:
 
 
 def panel_corners(pose: Points, detector_shape: tuple[int, int]) -> Points:
-    """Returns the panel's corners (4, ..., 3) in mm at poses (..., 12): (low, left), (high, left), (low, right), (high,
-    right)."""
+    """Returns the panel's corners (4, ..., 3) in mm at poses (..., 12): left low, left high, right low, right high."""
     rows, columns = detector_shape
     u, v = np.array([-0.5, columns - 0.5]), np.array([-0.5, rows - 0.5])
     return np.array([pose[..., 3:6] + a * pose[..., 6:9] + b * pose[..., 9:12] for a in u for b in v])
@@ -219,8 +218,7 @@ def _draw_samples(axes: "Axes", scan: Scan, motion: Motion) -> None:
 
 
 def sample_times(scan: Scan, motion: Motion) -> Points:
-    """Returns (time after the frame's start, line) of the poses, (N, 2). Where each line has its own, some lines are
-    taken."""
+    """Returns (time after the frame's start, line) of the poses, (N, 2). If every line has its own, some lines are taken."""
     rows = min(motion.strips, scan.lines) if isinstance(motion, MicroViews) else scan.lines
     if rows * getattr(motion, "sub_intervals", 1) > _MOST_CELLS:
         return np.empty((0, 2))

@@ -138,8 +138,7 @@ def projections_section(scan: Scan, views: Sequence[FramePair]) -> Markup | None
 
 
 def frame_pictures(views: Sequence[FramePair], style: str | None = None) -> tuple[str, list[Markup]]:
-    """Returns the legend of frames, and their pictures, one row each. ``style``: that of a picture with pixels not
-    square."""
+    """Returns the legend of frames, and their pictures, one row each. ``style``: for pixels not square."""
     low = min(0.0, *(float(v.measured.min()) for v in views))
     high = max(float(v.measured.max()) for v in views)
     limit = max(float(np.percentile(np.abs(v.residual), 99.5)) for v in views) or 1.0
@@ -158,8 +157,7 @@ def frame_pictures(views: Sequence[FramePair], style: str | None = None) -> tupl
 
 
 def preparation_section(run: Run, changes: Sequence[Change]) -> Markup | None:
-    """Shows the effect of each preprocessing step: pictures, a histogram and numbers. An earlier ``prepare`` has only
-    numbers."""
+    """Shows the effect of each preprocessing step: pictures, a histogram and numbers. Numbers only for ``prepare``."""
     prepared = [] if run.scan is None else run.scan.provenance.get(PREPARED_KEY)
     earlier = [element("div", element("h3", str(line.get("step"))), facts_table(line)) for line in _tables(prepared)]
     if not changes and not earlier:
@@ -185,8 +183,7 @@ def _change(change: Change) -> Markup:
 
 
 def calibration_section(scan: Scan) -> Markup | None:
-    """Shows the results of ``calibrate``, the first run first: tables of parameters, and charts of corrections of the
-    views."""
+    """Shows the results of ``calibrate``, the first run first: tables of parameters, charts of views."""
     calibrations = _tables(scan.provenance.get("calibrated_before")) + _tables([scan.provenance.get("calibration")])
     parts = [part for one in calibrations for part in _calibration(one, scan)]
     if not parts:
@@ -197,8 +194,7 @@ def calibration_section(scan: Scan) -> Markup | None:
 
 
 def _calibration(calibration: Mapping[str, object], scan: Scan) -> list[Markup]:
-    """Returns a row per parameter, the combinations that frames do not distinguish, and a chart per correction of the
-    views."""
+    """Returns a row per parameter, combinations that frames do not distinguish, and a chart per correction of views."""
     parameters = _tables(calibration.get("parameters"))
     if not parameters:
         return []

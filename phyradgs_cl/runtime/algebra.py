@@ -214,8 +214,7 @@ class DeviceSpace:
         return float(self.rt.download(self._parts).view(np.float32)[:groups].max())
 
     def _each(self, name: str, x: DeviceArray, *others: Any, period: int = 0) -> DeviceArray:
-        """Launches an element-wise kernel of x and others. ``period``: the length of the runs for which a shorter array
-        repeats."""
+        """Launches an element-wise kernel of x and others. ``period``: the length after which a short array repeats."""
         result, count = self.empty(x.shape), period or x.size
         items = ceil_div(count, self.rt.lanes), x.size // max(count, 1)
         kernel = self.rt.kernel("algebra", name)
@@ -229,8 +228,7 @@ class DeviceSpace:
         return float(values[0] if self.rt.fp64 else values.view(np.float32).astype(np.float64).sum())
 
     def _sum(self, name: str, whole: DeviceArray, *arrays: DeviceArray, add: bool = False) -> None:
-        """Sums over arrays on the device into ``whole``, or adds to it. The named kernel makes the first level of the
-        sum."""
+        """Sums over arrays on the device into ``whole``, or adds to it. The named kernel makes the first level."""
         groups = self._reduce(name, *arrays, scratch=8)
         kernel = self.rt.kernel("algebra", "dot_whole")
         group = self.rt.group(1, _GPU_GROUP, kernel)

@@ -119,8 +119,7 @@ class Runtime:
 
     @staticmethod
     def _allowed(source: str, options: tuple[str, ...]) -> list[str]:
-        """Returns build options without those that would break sums of pairs of floats. Some drivers ignore the pragma
-        instead."""
+        """Returns build options without those that would break sums of pairs of floats. Some drivers ignore the pragma."""
         has_pairs = "-DFP64=0" in options and _PAIRS in source
         return [option for option in options if not (has_pairs and option == _FUSING)]
 
@@ -224,8 +223,7 @@ class Runtime:
     def launch(
         self, kernel: Kernel, items: int | tuple[int, ...], *args: Any, group: int | tuple[int, ...] = 1, samples: int = 0
     ) -> None:
-        """Enqueues ``items`` work-items in groups of ``group``, whose missing sides are 1. Kernels ignore items past the
-        end.
+        """Enqueues ``items`` work-items in groups of ``group``, whose missing sides are 1. Items past the end do nothing.
 
         Python's whole numbers become int, its other numbers float. For a long give np.int64; for a float that may be whole,
         give np.float32. ``samples``: what all items read, in samples of a ray. On a GPU more than ``most_samples`` go in
@@ -324,8 +322,7 @@ def default_lanes(device: DeviceInfo) -> int:
 
 
 def _parts(items: Sides, group: Sides, pieces: int) -> Iterator[tuple[Sides | None, Sides]]:
-    """Yields first item and work-items of ``pieces`` parts or more, as far as groups allow. A whole has None as its
-    first."""
+    """Yields first item and work-items of ``pieces`` parts or more, as far as groups allow. A whole has None as first."""
     if pieces <= 1:
         yield None, items
         return

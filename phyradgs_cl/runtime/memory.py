@@ -166,8 +166,7 @@ class MemoryLedger:
 
 
 def answers(queue: "cl.CommandQueue") -> bool:
-    """Returns whether a queue still works. After a driver has ended a kernel, every call fails until there is a new
-    context."""
+    """Returns whether a queue still works. After a driver has ended a kernel, every call fails in this context."""
     try:
         word = cl.Buffer(queue.context, cl.mem_flags.READ_WRITE, 4)
         cl.enqueue_fill_buffer(queue, word, np.zeros(1, np.float32), 0, 4)
@@ -220,8 +219,7 @@ def with_smaller_bricks(what: str, attempt: Callable[[float], R]) -> R:
 
 
 def is_cl_array(value: object) -> bool:
-    """Returns whether a value is a pyopencl.array.Array. A caller who has one has imported pyopencl, so sys.modules knows
-    it."""
+    """Returns whether a value is a pyopencl.array.Array. Whoever has one has imported pyopencl."""
     module = sys.modules.get("pyopencl.array")
     return module is not None and isinstance(value, module.Array)
 

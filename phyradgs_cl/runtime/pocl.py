@@ -140,8 +140,7 @@ def _fault_of(folder: Path) -> str | None:
 
 
 def _temporary_cache() -> Path:
-    """Returns a folder that only this user can write, because its binaries are executed. Raises OSError where none can
-    be."""
+    """Returns a folder that only this user can write, because its binaries are executed. Raises OSError without one."""
     places = [Path(place) for place in (tempfile.gettempdir(), "/var/tmp", "/dev/shm")]
     place = next((place for place in places if _fault_of(place) is None), None)
     if place is None:

@@ -34,8 +34,8 @@ class ObjectMotion:
     """A known motion of the object, by a preset.
 
     kind: "breathing" lowers the object, most at its top and not at its base, and moves it along y a little later. "drying"
-    lowers its top and shrinks it sideways, and never returns. "sliding" moves a cylinder about the z axis up and down in its
-    surroundings, which rest.
+    lowers its top and shrinks it sideways, and never returns. "sliding" moves a cylinder about the z axis up and down in
+    surroundings at rest.
 
     - amplitude_mm: the largest displacement. None takes ``amplitude`` times half of the box's shortest side.
     - period_s: the time of a breath or of the slide. jitter: standard deviation of a breath's period over ``period_s``.

@@ -81,8 +81,7 @@ def simulate(
 ) -> Scan:
     """Returns a scan of the object that ``source`` projects, with noise.
 
-    reference (nz, ny, nx): the truth, which ``peak`` scales too. bone: the source of its bone, for a beam of many
-    energies."""
+    reference (nz, ny, nx): the truth, which ``peak`` scales too. bone: its bone's source, for a beam of many energies."""
     if options.kvp and bone is None:
         expected = "an object of voxels, whose dense ones are bone: foot, jaw or a volume"
         raise InputError("--kvp", "a phantom in closed form", expected, "leave it out")
@@ -168,8 +167,7 @@ def _recorded(frames: np.ndarray, options: SimulationOptions, light: np.ndarray,
 
 
 def _with_noise(frames: np.ndarray, options: SimulationOptions, light: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Adds lag and noise to frames (F, v, u). TIGRE's counts are no real intensities, so their lag comes before the
-    noise."""
+    """Adds lag and noise to frames (F, v, u). TIGRE's counts are no real intensities: lag comes before noise."""
     if options.noise == "beer":
         return effects.beer_lambert_noise(frames, options.dose, options.electronic_noise, rng, light, options.lag)
     if options.lag > 0:

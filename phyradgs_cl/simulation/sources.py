@@ -60,8 +60,7 @@ class VolumeSource(FrameSource):
         return (self._rt.download(frames) if isinstance(frames, DeviceArray) else frames)[0]
 
     def _where_it_fits(self, volume: np.ndarray) -> np.ndarray | DeviceArray:
-        """Returns the volume on the device, or on the host where the device has no room for it and the operator's padded
-        copy."""
+        """Returns the volume on the device, or on the host without room for it and the operator's padded copy."""
         if not self._rt.room().holds(volume.nbytes, 4 * self._memory.layout.volume_floats):
             return volume
         try:
@@ -142,8 +141,7 @@ class DeformedSource(FrameSource):
 
     A frame at a single time sees the object exactly then. In other frames the weights φ_r of each time cell are rounded, so
     that all cells with the same rounded weights project one deformed volume. The rounding displaces no point by more than
-    ``NEAREST`` of ``voxel_mm``. ``frames`` deforms once for each state of all its frames. make: returns the source of a
-    volume's frames."""
+    ``NEAREST`` of ``voxel_mm``. ``frames`` deforms once for each state of all its frames. make: a volume's source."""
 
     def __init__(
         self, rt: Runtime, volume: np.ndarray, grid: Grid, deformation: Deformation, voxel_mm: float,
@@ -173,8 +171,7 @@ class DeformedSource(FrameSource):
         return (each.frame() for each in sums)
 
     def _volumes(self, weights: np.ndarray) -> Callable[[int], np.ndarray]:
-        """Returns a function that makes the volume of each state of ``weights`` (K, R). It is on the device if that has
-        room."""
+        """Returns a function that makes the volume of each state of ``weights`` (K, R). On the device if it has room."""
         volume, rank = self._volume, self._deformation.rank
         if not self._rt.room().scaled(0.5).holds(3 * rank * volume.nbytes, *[2 * volume.nbytes] * 2):
             spline = SplineVolume(volume, self._grid)

@@ -16,7 +16,7 @@ def regional_bias(
 
     result, reference: (z, y, x) in one unit. labels: (z, y, x) integers; 0 is no region. erosion_voxels: by how much regions
     shrink before, so that blurred edges do not count as bias. Regions that vanish in erosion, and those whose true mean is
-    0, are left out. Raises InputError for shapes that differ, labels that are not integers, NaN or infinity, and a negative
+    0, are left out. Raises InputError for shapes that differ, labels that are no integers, NaN or infinity, and negative
     erosion."""
     a, b, _ = checked_pair(result, reference, 1.0)
     regions = np.asarray(labels)

@@ -11,8 +11,7 @@ from phyradgs_cl.metrics.quality import checked_pair, psnr, ssim_map
 
 
 def compare_projections(result: ArrayLike, reference: ArrayLike) -> dict[str, float]:
-    """Returns 2D PSNR and SSIM of projections against noise-free held-out ones, (F, v, u) line integrals from the same
-    poses.
+    """Returns 2D PSNR and SSIM of projections against noise-free held-out ones, both (F, v, u) line integrals.
 
     psnr_2d_db is over all pixels of all frames. ssim_2d is the mean over pixels and frames (11×11 Gaussian window of σ 1.5,
     zeros beyond the border). data_range_2d is the largest reference value. Raises InputError for arrays that are not 3D,

@@ -36,8 +36,7 @@ def coarse(scan: Scan, columns: int) -> Scan:
 
 
 def smooth(scan: Scan, pixels: float | tuple[float, float]) -> Scan:
-    """Returns the scan with frames smoothed by a Gaussian, from valid pixels only. Blocks of smoothed frames have no
-    aliasing.
+    """Returns the scan with frames smoothed by a Gaussian, from valid pixels only. Their blocks have no aliasing.
 
     pixels: the standard deviation, or a pair of them (across rows, across columns)."""
     v_px, u_px = pixels if isinstance(pixels, tuple) else (pixels, pixels)
@@ -98,8 +97,7 @@ def binned(scan: Scan, block: int) -> Scan:
 
 
 def coarse_grid(grid: Grid, geometry: Geometry) -> Grid:
-    """Returns a grid of the same box with a margin of one voxel. Voxels are about a pixel at the axis, never finer than
-    before."""
+    """Returns a grid of the same box with a margin of one voxel. Voxels are about a pixel at the axis, but no finer."""
     height_mm, width_mm = (pitch / geometry.magnification for pitch in geometry.pixel_size_mm)
     least_mm = max(max(grid.size_mm) / _MOST_VOXELS, min(grid.voxel_size_mm))
     wanted_mm = (max(height_mm, least_mm), *(max(width_mm, least_mm),) * 2)
@@ -114,8 +112,7 @@ def around_object(scan: Scan, spare_columns: float = 0.0) -> Scan:
 
     spare_columns: by how many columns more the grid is wider, because the axis may be off by as many.
 
-    With few frames, voxels of air let a wrong hypothesis fit better than the right one. A grid derived from the panel has
-    many voxels of air."""
+    With few frames, voxels of air let a wrong hypothesis fit better than the right one. A panel's grid has many of them."""
     geometry, grid = scan.geometry, scan.grid
     columns = np.where(scan.valid, scan.projections, 0).max((0, 1))
     shown = np.flatnonzero(columns > _OBJECT_SHARE * columns.max())

@@ -35,7 +35,7 @@ class GeometryCorrection:
 
 @dataclass(frozen=True, eq=False)
 class Views:
-    """Corrections of each view in the file: turns (F,) about the axis in rad; shifts (F, 2) of the panel along v and u in
+    """Corrections of each view in the file: turns (F,) about the axis in rad; the panel's shifts (F, 2) along v and u in
     mm."""
 
     turn_rad: np.ndarray
@@ -145,7 +145,7 @@ def _seen_by(motion: np.ndarray, vectors: list[np.ndarray], places: int) -> list
 def perturb(scan: Scan, correction: GeometryCorrection, views: Views | Sway | None = None) -> Scan:
     """Returns the scan after a correction. Its frames are unchanged.
 
-    Offsets and distances of a circular orbit remain numbers of its geometry. Other corrections make the trajectory a
+    Offsets and distances of a circular orbit remain numbers of its geometry. Others make the trajectory a
     ``PerturbedTrajectory``."""
     shutter, geometry, trajectory = scan.shutter, scan.geometry, scan.trajectory
     source_mm = correction.source_distance_mm

@@ -25,8 +25,7 @@ _HELP = (
 def space(volume: NDArray[np.floating], grid: Grid, window: Window, gaussians: Gaussians | None) -> Markup | None:
     """Returns a 3D picture of a volume (nz, ny, nx), its controls and the data of the script.
 
-    Returns None for fewer than two voxels along a side. ``window``: that of the result's slices. ``gaussians``: lengths in
-    mm."""
+    Returns None for fewer than two voxels along a side. ``window``: that of the result's slices. ``gaussians``: in mm."""
     if not has_depth(volume):
         return None
     cloud = None if gaussians is None or not gaussians.count else gaussians

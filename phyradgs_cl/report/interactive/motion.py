@@ -81,8 +81,7 @@ def object_in_motion(
 ) -> Markup:
     """Returns three slices of the object at the first time of ``span_s``, their controls and the data of the script.
 
-    The script shows any time of the span. ``volume`` (nz, ny, nx) is the reference, with at least two voxels along every
-    side."""
+    The script shows any time of the span. ``volume`` (nz, ny, nx): the reference, at least two voxels thick."""
     means = block_means(volume, MOST_EDGE)
     small = grid.in_shape(triple(means.shape))
     first = deformed(means, small, deformation, deformation.weights_at(span_s[0])[0])
