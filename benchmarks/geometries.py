@@ -71,7 +71,7 @@ class Case:
     rows: int = 24
     columns: int = 24
     pitch_mm: tuple[float, float] = (1.5, 1.5)
-    offset: float = 0.0  # over the panel's width
+    offset: float = 0.0  # offset over the panel's width
     angles_deg: np.ndarray = field(default_factory=lambda: np.arange(48) * 7.5)
     voxel_mm: tuple[float, float, float] | None = (1.0, 1.0, 1.0)
     voxels: tuple[int, int, int] = (20, 20, 20)

@@ -420,8 +420,8 @@ __kernel void rays_upright_adjoint(
                 const int b_first = along_x ? origin.y + y_first : origin.x + x_first;
                 const int b_stop = b_first + (along_x ? ny : nx);
                 const int a_first = along_x ? origin.x + x_first : origin.y + y_first;
-                const int step = (along_x ? ADJOINT_X : 1) * (ADJOINT_Z + LANES); /* from a column along b, and along a, */
-                const int step_a = (along_x ? 1 : ADJOINT_X) * (ADJOINT_Z + LANES); /* to the next */
+                const int step = (along_x ? ADJOINT_X : 1) * (ADJOINT_Z + LANES); /* from one column to the next along b */
+                const int step_a = (along_x ? 1 : ADJOINT_X) * (ADJOINT_Z + LANES); /* and along a */
                 const int2 planes = planes_between(cell, u, along_x, a_first, along_x ? nx : ny);
                 planes_t met;
                 meet_planes(r, cell[RAY_SOURCE + !along_x], planes, origin.z + z_first, nz, b_first, b_stop, &met);

@@ -23,7 +23,7 @@ from phyradgs_cl.reconstructors.fits.residuals import AugmentedOperator, ViewPar
 from phyradgs_cl.reconstructors.voxels.cgls import Cgls
 from phyradgs_cl.runtime import Runtime
 
-SPLINES = 7  # of a motion: one spline reaches over about a seventh of the scan
+SPLINES = 7  # splines of a motion, each about a seventh of the scan wide
 TURN, SHIFT_V, SHIFT_U = 0, 1, 2
 _STEP_PX = 0.25
 _LEAST_NORM = 0.1  # fraction of the largest norm of a kind: parameters with weaker signals are not scaled up further

@@ -18,7 +18,7 @@ _PEAKS_PER_BEAD = 2.0
 _TOLERANCE_VOXELS = 1.5
 _TRIANGLES = 40  # triangles of known beads to try
 _APART = 0.05  # least angle in rad between different placements
-_MOST = 6  # the most placements that fit equally well, of a nearly symmetric phantom
+_MOST = 6  # placements to try where a nearly symmetric phantom fits equally well in several
 
 
 def bead_centres_mm(phantom: EllipsoidPhantom) -> np.ndarray:

@@ -3,7 +3,7 @@
 It starts from the axis that fits best and, for a known phantom, from the place where its beads are seen. On request it
 tests the readout's direction, and corrects single views or a motion first. The search (``search``) then estimates the
 parameters common to all views, from coarse to fine grids. After that, views or the motion are estimated again. Significant
-corrections enter the scan and its provenance. Those without corrected views do so only if they lower the residual."""
+corrections enter the scan and its provenance. Without corrected views, they do so only if they lower the residual."""
 
 import logging
 from collections.abc import Callable, Sequence

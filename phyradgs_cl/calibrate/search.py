@@ -23,7 +23,7 @@ from phyradgs_cl.calibrate.problem import CoarseProblem
 from phyradgs_cl.calibrate.result import AGREES, CANNOT_TELL, CORRECTED, ParameterEstimate
 from phyradgs_cl.calibrate.stages import Stage
 
-LEAST_SHARE = 0.2  # of a signal, the least share beyond what the object and the other parameters explain
+LEAST_SHARE = 0.2  # least fraction of a signal that the object and the other parameters leave unexplained
 LEAST_SHARE_OF_BEADS = 0.02  # the same for a known object, which has no voxels that explain signals by accident
 _TINY = 1e-9
 _GAUGE_FACTOR, _MOST_GAUGE = 2.0, 0.2  # factor of a gauge's share; most of it to count, as it is large in a wrong geometry

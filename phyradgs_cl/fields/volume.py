@@ -12,7 +12,7 @@ from phyradgs_cl.errors import InputError
 
 MOST_VOXELS = 2**38
 """The most voxels of a grid: a terabyte of float32. Larger requests come from damaged files."""
-_SAME_PLACE = 1e-3  # in voxels, for grids stored in float32
+_SAME_PLACE = 1e-3  # voxels by which grids stored in float32 may differ
 T = TypeVar("T")
 
 

@@ -110,7 +110,7 @@ def coarse_grid(grid: Grid, geometry: Geometry) -> Grid:
 def around_object(scan: Scan, spare_columns: float = 0.0) -> Scan:
     """Returns a coarse scan with its grid about the axis cut to the object that the frames show.
 
-    spare_columns: by how many columns more the grid is wider, because the axis may be off by as many.
+    spare_columns: columns by which the grid is wider, because the axis may be off by as many.
 
     With few frames, voxels of air let a wrong hypothesis fit better than the right one. A panel's grid has many of them."""
     geometry, grid = scan.geometry, scan.grid

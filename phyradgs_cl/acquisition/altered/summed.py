@@ -29,7 +29,8 @@ def sum_frames(
 
     A projection of ``scan`` stands for the interval until the next one, in which the gantry turns evenly. A line whose
     exposure begins within a projection takes a share of it. Frames that need projections beyond the last are left out.
-    readout_ratio, readout and readout_direction describe the new panel, as in ``fly_scan``.
+    readout_ratio, readout and readout_direction describe the new panel, as in ``fly_scan``. The result's frames
+    (F, rows, columns) are line integrals again.
 
     Photons, detector and object are those of the dense scan. This tests a motion model truly if the object moves by less
     than a pixel from projection to projection.
