@@ -1,12 +1,11 @@
-"""How far two devices are apart: one fixed set of operators and short runs, kept from one device, compared on another.
+"""Measures how far two devices differ: operators and short runs are kept from one device and compared on another.
 
     python benchmarks/across_devices.py store FILE.npz [--device D]
     python benchmarks/across_devices.py compare FILE.npz [--device D] [--json FILE]
 
-NumPy draws the inputs from fixed seeds, so that both devices see the same bits. The largest differences are printed: of
-images and volumes relative to the largest number, of gradients the norm of the difference over the norm. Of place, scale,
-rotation and density the worst counts.
-"""
+NumPy draws the inputs from fixed seeds, so both devices see the same bits. The largest differences are printed. For images
+and volumes they are relative to the largest number, for gradients they are the norm of the difference over the norm. Of
+place, scale, rotation and density the worst counts."""
 
 import argparse
 import json
@@ -63,7 +62,8 @@ def cells_of(motion: str, frame: int = 0) -> TimeCells:
 
 
 def cloud(count: int, aspect: float, seed: int) -> np.ndarray:
-    """Rows (11, G): smallest axes of half a pixel to four, the longest up to ``aspect`` times that."""
+    """Returns rows (11, G) of Gaussians. The smallest axes are half a pixel to four, the longest up to ``aspect`` times
+    that."""
     rng = np.random.default_rng(seed)
     pixel = GEOMETRY.pixel_size_mm[0] / GEOMETRY.magnification
     quaternion = rng.normal(size=(4, count))
@@ -135,7 +135,7 @@ def terms(rt: Runtime) -> Iterator[tuple[str, np.ndarray]]:
 
 
 def adam(rt: Runtime) -> Iterator[tuple[str, np.ndarray]]:
-    """Six steps from numbers near 1: how far they went."""
+    """Yields how far six steps went from numbers near 1."""
     rng, start = np.random.default_rng(8), np.ones((11, 64), np.float32)
     raw, moments, optimiser = rt.upload(start), rt.zeros((2, 11, 64)), DeviceAdam(rt, Activation(0.01, 0.5))
     for step in range(1, 7):
@@ -145,7 +145,7 @@ def adam(rt: Runtime) -> Iterator[tuple[str, np.ndarray]]:
 
 
 def a_scan(rt: Runtime) -> Scan:
-    """Closed-form frames, made without a device."""
+    """Returns a scan of closed-form frames, made without a device."""
     return simulate(
         "shepp-logan", size=24, detector=32, views=12, exposure_deg=10.0, time_samples=2, device=rt
     )
@@ -168,7 +168,7 @@ def results(rt: Runtime) -> Results:
 
 
 def difference(name: str, one: np.ndarray, other: np.ndarray) -> float:
-    """Relative to the largest number, or for gradients of Gaussians (11, G) row by row to their norm."""
+    """Returns the difference over the largest number. For gradients of Gaussians (11, G), each row is over its own norm."""
     gap = one.astype(np.float64) - other
     if name.endswith("gradient") and one.ndim == 2 and len(one) == 11:
         norms = [

@@ -1,9 +1,8 @@
-"""Why the beads of the sphere phantom come out too dense from fly-scans: one thing changed at a time.
+"""Measures why the beads of the sphere phantom come out too dense from fly-scans, by changing one thing at a time.
 
-The scans are those of `python benchmarks/tables phantom`; for comparison free of noise and jitter, and with line integrals
-averaged over an exposure in place of intensities, where the forward model is exact. Bias is the mean inside the beads
-over the true one, less 1; that of the total is of the whole volume.
-"""
+The scans are those of `python benchmarks/tables phantom`. Others have no noise and no jitter, and average line integrals
+over an exposure in place of intensities, where the forward model is exact. Bias is the mean inside the beads over the true
+mean, less 1. The bias of the total is that of the whole volume."""
 
 from dataclasses import dataclass, field
 from functools import lru_cache
@@ -46,7 +45,7 @@ TRIALS = (
 
 
 def ideal(case: PhantomCase, detector_model: str) -> Scan:
-    """The fly-scan of a case with nothing wrong but what is averaged over an exposure."""
+    """Returns the fly-scan of a case in which only the quantity averaged over an exposure may be wrong."""
     options = SimulationOptions(protocol=RAPID, readout_axis="rows", detector_model=detector_model)
     source = AnalyticSource(case.phantom, case.geometry)
     return simulate(source, case.geometry, case.grid, options, reference=case.truth)

@@ -1,28 +1,24 @@
-"""What `phyradgs calibrate` finds of planted errors, and what that does for the volume: one line of JSON per run, resumable.
+"""Plants errors, and measures what `phyradgs calibrate` finds of them and what that does for the volume.
 
     python benchmarks/calibrate.py FOLDER RESULTS.jsonl [--cases panel,...] [--only NAME,...] [--size 32] [--views 25]
 
-docs/make_results.py makes the tables of docs/results/calibrate.md from the lines. FOLDER holds volumes as benchmarks/tables
-takes them; --only spheres is the sphere phantom, in closed form. The scanner is R2-Gaussian's with TIGRE's noise and a panel
-twice as wide as the volume. Volumes are those of fista-tv, every line at its own times.
+It writes one line of JSON per run, and continues where it stopped. docs/make_results.py makes the tables of
+docs/results/calibrate.md from the lines. FOLDER holds volumes as for benchmarks/tables; --only spheres is the sphere
+phantom, in closed form. The scanner is R2-Gaussian's with TIGRE's noise and a panel twice as wide as the volume. Volumes are
+those of fista-tv, with every line at its own times.
 
 Cases:
 
-    panel      offset of 2.5 pixels, roll of 0.5°, tilt about v of 1°, all at once.
-    right      nothing wrong; every parameter is estimated.
-    columns    readout 20 % longer than stated, columns read.
-    rows       the same, rows read: such a scan does not determine it.
-    turned     readout and exposure 20 % longer than stated, rows read, and a second scan turned the other way.
-    wobble     0.3° and 1 pixel (RMS) per view.
-    slow       the same by six splines of time, and estimated so.
-    kaist      0.03 rad and 1 voxel (RMS) per view, the noise of Choi et al. (2026), for --views 75.
-    motion     the object turns by up to 2° and moves by up to 2 voxels during the scan, about and along all axes.
-    beads      a phantom of known shape at any place, rows read. The seed draws readout, exposure, offset, roll, tilt and
-               both distances. No volume is scored.
-    draw       columns read. The seed draws the offset to 2.5 pixels, roll to 0.5°, tilt about v to 1°, readout to 20 %.
-               Counts how often the stated intervals hold the truth; no volume is scored.
-    draw_rows  the same, rows read, which do not determine readout and exposure.
-"""
+        panel      offset of 2.5 pixels, roll of 0.5°, tilt about v of 1°, all at once. right      no error; every parameter
+        is estimated. columns    readout 20 % longer than stated, by columns. rows       readout 20 % longer than stated, by
+        rows; such a scan does not determine it. turned     readout and exposure 20 % longer than stated, by rows, and a
+        second scan turned the other way. wobble     0.3° and 1 pixel (RMS) per view. slow       0.3° and 1 pixel (RMS), as
+        six splines of time, and estimated as splines. kaist      0.03 rad and 1 voxel (RMS) per view, with the noise of Choi
+        et al. (2026), for --views 75. motion     the object turns by up to 2° and moves by up to 2 voxels during the scan,
+        about and along all axes. beads      a phantom of known shape at any place, read by rows. The seed draws readout,
+        exposure, offset, roll, tilt and both distances. No volume is scored. draw       read by columns. The seed draws the
+        offset to 2.5 pixels, roll to 0.5°, tilt about v to 1°, readout to 20 %. Counts how often the stated intervals hold
+        the truth; no volume is scored. draw_rows  as draw but read by rows, which do not determine readout and exposure. """
 
 import time
 from collections.abc import Callable
@@ -61,7 +57,7 @@ Maker = Callable[..., Scan]
 
 @dataclass(frozen=True)
 class Planned(Protocol):
-    """A protocol whose gantry turns the other way, wobbles, or is not built as it says."""
+    """A protocol whose gantry turns the other way, wobbles, or is built with other numbers than stated."""
 
     is_backwards: bool = False
     views_off: Views | Sway | None = None
@@ -80,7 +76,7 @@ class Planned(Protocol):
 
 @dataclass(frozen=True)
 class Case:
-    """The scan as stated, the right one, others, what to ask for, and what is planted by parameter."""
+    """The scan as stated, the right scan, other scans, the parameters to ask for, and what is planted by parameter."""
 
     stated: Scan
     right: Scan
@@ -126,7 +122,7 @@ def turned(make: Maker, seed: int) -> Case:
 
 
 def wobble(make: Maker, seed: int) -> Case:
-    """Without the part that a turned or shifted object would explain: its volume could not be compared with the truth."""
+    """Plants a wobble without the part that a turned or shifted object explains: its volume could not be compared."""
     scan = make(seed)
     return _shaken(make, scan, seed, np.array([np.deg2rad(0.3), *scan.geometry.pixel_size_mm]))
 
@@ -142,7 +138,7 @@ def slow(make: Maker, seed: int) -> Case:
 
 
 def kaist(make: Maker, seed: int) -> Case:
-    """Turns about the axis only, of the three that theirs have; shifts as the panel sees them."""
+    """Plants turns about the axis only, where theirs have three axes, and shifts along the panel."""
     scan = make(seed)
     voxel_mm = scan.grid.voxel_size_mm[0] * scan.geometry.magnification
     return _shaken(make, scan, seed, np.array([0.03, voxel_mm, voxel_mm]))
@@ -157,7 +153,7 @@ def _shaken(make: Maker, scan: Scan, seed: int, sizes: np.ndarray) -> Case:
 
 
 def motion(make: Maker, seed: int) -> Case:
-    """Splines with coefficients that are half of one drift and half of chance, about the mean place."""
+    """Plants splines about the mean place, whose coefficients are half drift and half random."""
     scan, rng = make(seed), np.random.default_rng(seed)
     parameters = MotionParameters.of(scan)
     course = np.linspace(-1, 1, SPLINES)[:, None] * rng.choice([-1, 1], 6) + rng.uniform(-1, 1, (SPLINES, 6))
@@ -169,7 +165,7 @@ def motion(make: Maker, seed: int) -> Case:
 
 
 def beads(make: Maker, seed: int) -> Case:
-    """Twelve beads and two wires; readout and exposure off by 10 to 20 %, the rest by up to the errors of ``draw``."""
+    """Plants twelve beads and two wires. Readout and exposure are off by 10 to 20 %, the rest as in ``draw``."""
     rng = np.random.default_rng(seed)
     known, lying = drawn_beads(rng)
     size = {
@@ -185,7 +181,7 @@ def beads(make: Maker, seed: int) -> Case:
 
 
 def drawn_beads(rng: np.random.Generator) -> tuple[EllipsoidPhantom, EllipsoidPhantom]:
-    """A phantom as its file has it, and the same one turned and shifted, in mm: it is at home in R2-Gaussian's scanner."""
+    """Returns a phantom as its file has it, in R2-Gaussian's scanner, and the same phantom turned and shifted, in mm."""
     centres: list[np.ndarray] = []
     while len(centres) < 12:
         place = rng.uniform(-0.7, 0.7, 3)
@@ -233,7 +229,7 @@ CASES = {
 
 
 def maker(rt: Runtime, path: Path | None, size: int, views: int) -> Maker:
-    """Of a volume file, or of the sphere phantom."""
+    """Returns a maker of scans of a volume file, or of the sphere phantom."""
     detector = 2 * size
     geometry = ConeGeometry(5.0, 7.0, (detector, detector), (4.0 / detector,) * 2)
 
@@ -247,7 +243,7 @@ def maker(rt: Runtime, path: Path | None, size: int, views: int) -> Maker:
         else:
             scene = phantom_scene(rt, phantom, *where, seed, pixel_samples=2)
         protocol = Planned(views=views, exposure_deg=360.0 / views, **plan)  # type: ignore[arg-type]
-        if phantom is not None:  # a few times of an exposure are spread less than all of it: an error of 0.2 %
+        if phantom is not None:  # a few times of an exposure are less spread than all of it: an error of 0.2 %
             options = SimulationOptions(protocol, axis, noise="tigre", seed=seed, time_samples=16)
             return simulate(scene.source, geometry, scene.grid, options)
         return SyntheticCase(rt, scene, geometry, protocol, axis, seed).scan(FLY)
@@ -277,14 +273,14 @@ def run_one(rt: Runtime, case: Case) -> dict[str, object]:
 
 def line(found, planted: dict[str, float]) -> dict[str, object]:  # type: ignore[no-untyped-def]
     truth = planted[found.name] * PARAMETERS[found.name].scale if found.name in planted else 0.0
-    if found.found is None or found.name not in PARAMETERS:  # of views the table has sizes
+    if found.found is None or found.name not in PARAMETERS:  # of single views the table has sizes
         return {**found.facts(), "truth": truth + found.stated, "error": None, "z": None}
     error = found.found - found.stated - truth
     return {**found.facts(), "truth": truth + found.stated, "error": error, "z": error / found.deviation}
 
 
 def wobble_left(found: Calibration, case: Case) -> dict[str, object]:
-    """The remaining and the planted turns (deg) and shifts (pixels) of views, RMS."""
+    """Returns the remaining and the planted turns (deg) and shifts (pixels) of views, RMS."""
     if case.views is None:
         return {}
     pitch_mm = case.right.geometry.pixel_size_mm[1]
@@ -297,7 +293,7 @@ def wobble_left(found: Calibration, case: Case) -> dict[str, object]:
 
 
 def score(rt: Runtime, scan: Scan) -> float:
-    """PSNR in dB of fista-tv's volume."""
+    """Returns the PSNR in dB of fista-tv's volume."""
     options = method_options("fista-tv", None, {"motion": PerRow(3), "iterations": ITERATIONS})
     volume = reconstruct(scan, RunPlan("fista-tv", options), rt).volume
     assert scan.reference is not None
@@ -305,7 +301,7 @@ def score(rt: Runtime, scan: Scan) -> float:
 
 
 def volumes_of(folder: Path, names: str | None, size: int) -> dict[str, Path | None]:
-    """Files of volumes; none for the sphere phantom."""
+    """Returns the files of volumes; None for the sphere phantom."""
     given = names.split(",") if names else []
     of_files = ",".join(name for name in given if name != SPHERES)
     files: dict[str, Path | None] = dict(files_of(folder, of_files or None, size)) if of_files or not given else {}

@@ -1,11 +1,11 @@
-"""What the covariance is worth: errors of frames in which only the centres of Gaussians move.
+"""Measures the worth of the covariance: the errors of frames in which only the centres of Gaussians move.
 
     python benchmarks/centres_only.py docs/results/centres_only.jsonl [VOLUMES]
 
-Relative RMS of one frame, 128². By distance from the axis (half-sides of the box): mean of eight Gaussians of random turns,
-against 60 times of every row's own; long ones are 0.08 by 0.02 by 0.02, round ones 0.03. By object: the Gaussians of
-each volume file of the folder VOLUMES, as ``reconstruct --method phyradgs`` writes it, against 20 segments of their motion.
-"""
+Errors are relative RMS of one frame of 128² pixels. By distance from the axis (half-sides of the box): the mean of eight
+Gaussians in random orientations, against 60 times of every row's own. Long ones are 0.08 by 0.02 by 0.02, round ones 0.03.
+By object: the Gaussians of each volume file in the folder VOLUMES, as ``reconstruct --method phyradgs`` writes it, against
+20 segments of their motion. """
 
 import json
 import sys

@@ -3,9 +3,9 @@
     python benchmarks/check_answers.py FOLDER RESULTS.jsonl [--only PART,...]
     python benchmarks/check_answers.py FOLDER RESULTS.jsonl --table
 
-FOLDER is what benchmarks/check_scans/make_scans.py writes: scans, and ``manifest.jsonl``, one line per scan, which says what
-is planted, which questions may rightly be suspicious (``right``), and, where nothing can tell it, why (``undecidable``).
-"""
+FOLDER is what benchmarks/check_scans/make_scans.py writes: scans, and ``manifest.jsonl`` with one line per scan. A line has
+the planted fault, the questions that may rightly be suspicious (``right``), and, where no frame shows the fault, the reason
+(``undecidable``)."""
 
 import argparse
 import time
@@ -49,10 +49,8 @@ def run_one(rt: Runtime, path: Path) -> dict[str, object]:
 
 
 def outcome(line: dict[str, Any]) -> str:
-    """silent or false alarm on a good scan; on another found, cannot tell, or missed, and whether another cause is blamed.
-
-    ``leaves no trace`` is a fault that no frame can show and about which nothing was said: neither an alarm nor a doubt.
-    """
+    """Returns the outcome of a line. A good scan has silent or false alarm. Another scan has found, cannot tell, or missed,
+    and whether another cause is blamed. ``leaves no trace``: no frame can show the fault, and there was no answer to it."""
     said = {f["question"]: f["verdict"] for f in line["findings"]}
     suspicious = {question for question, verdict in said.items() if verdict == SUSPICIOUS}
     beside = suspicious - set(line["right"])
@@ -67,7 +65,7 @@ def outcome(line: dict[str, Any]) -> str:
 
 
 def words(line: dict[str, Any]) -> str:
-    """What was said: the suspicious findings, else why those that should know cannot tell."""
+    """Returns the suspicious findings in words. Without any, returns why the questions that should find it cannot tell."""
     if "error" in line:
         return f"refused: {line['error']}"
     chosen = [f for f in line["findings"] if f["verdict"] == SUSPICIOUS]
@@ -78,7 +76,7 @@ def words(line: dict[str, Any]) -> str:
 
 
 def table(path: Path) -> str:
-    """Markdown: one row per scan and the sums."""
+    """Returns a Markdown table with one row per scan, and the sums."""
     lines = lines_of(path)
     text = ["| planted | object | answer | in words |", "| --- | --- | --- | --- |"]
     sums: dict[tuple[str, str], int] = {}

@@ -1,15 +1,18 @@
-"""Plants faults in scans of a folder of volumes and asks `phyradgs check` about them: one line of JSON per scan, resumable.
+"""Plants faults in scans of a folder's volumes, and counts which of them `phyradgs check` finds.
 
     python benchmarks/check_faults.py VOLUMES RESULTS.jsonl [--names a,b] [--size 64] [--seeds 7] [--faults none,rotation]
     python benchmarks/check_faults.py VOLUMES RESULTS.jsonl --table
 
-Scans are those of benchmarks/scans.py: 25 views of the rapid protocol, TIGRE's noise at 1e4 photons and σ 10. Some
-faults need scans of their own: `short exposure` one that exposes half of the time between frames, so that twice the
-exposure fits the timing and only the frames can tell; `narrow cone` one with the source 100 times as far, where a wrong
-sign of rotation leaves no trace and `cannot tell` is the right answer; `... aside` one with a panel 8 % of its width
-beside the axis, correctly stated; `half turn` one of 180° and the fan. Scans with wrong sizes, distances or images have the
-grid that an import would give them.
-"""
+It writes one line of JSON per scan, and continues where it stopped. Scans are those of benchmarks/scans.py: 25 views of the
+rapid protocol, with TIGRE's noise at 1e4 photons and σ 10. Some faults need scans of their own:
+
+- `short exposure`: the exposure is half of the time between frames. Twice the exposure then fits the timing, and only the
+  frames show the fault.
+- `narrow cone`: the source is 100 times as far. A wrong sign of rotation leaves no trace, and `cannot tell` is right.
+- `... aside`: the panel is 8 % of its width beside the axis, and correctly stated.
+- `half turn`: the views cover 180° and the fan.
+
+Scans with wrong sizes, distances or images have the grid that an import would give them."""
 
 import argparse
 import platform
@@ -39,33 +42,33 @@ def as_it_is(scan: Scan, rng: np.random.Generator) -> Scan:
 
 
 def rotation(scan: Scan, rng: np.random.Generator) -> Scan:
-    """Angles with the other sign."""
+    """Plants angles with the other sign."""
     sweeps = scan.trajectory.kinematics
     turned = replace(sweeps, angle_start_rad=-sweeps.angle_start_rad, angle_end_rad=-sweeps.angle_end_rad)
     return replace(scan, trajectory=CircularOrbit(scan.geometry, turned))
 
 
 def readout(scan: Scan, rng: np.random.Generator) -> Scan:
-    """The readout direction is stated the wrong way round."""
+    """Plants the opposite readout direction."""
     return replace(scan, shutter=replace(scan.shutter, direction=-scan.shutter.direction))
 
 
 def offset(scan: Scan, rng: np.random.Generator) -> Scan:
-    """The panel is stated three pixels off, to either side."""
+    """Plants a panel offset that is wrong by three pixels, to either side."""
     shift_mm = OFFSET_PX * scan.geometry.pixel_size_mm[1] * rng.choice([-1, 1])
     geometry = replace(scan.geometry, detector_offset_mm=(0.0, shift_mm))
     return replace(scan, geometry=geometry, trajectory=CircularOrbit(geometry, scan.trajectory.kinematics))
 
 
 def drift(scan: Scan, rng: np.random.Generator) -> Scan:
-    """A gain that rises or falls evenly by 5 % over the scan, after the flats."""
+    """Plants a gain that rises or falls evenly by 5 % over the scan, after the flats."""
     gain = 1 + DRIFT * rng.choice([-1, 1]) * np.arange(scan.frames) / (scan.frames - 1)
     shift = np.log(gain).astype(np.float32)[:, None, None]
     return replace(scan, projections=scan.projections - shift)
 
 
 def dead(scan: Scan, rng: np.random.Generator) -> Scan:
-    """1 % of the panel's pixels: half without a count (the floor of half a count), half stuck at some value."""
+    """Plants faults in 1 % of the panel's pixels: half have no count (the floor of half a count), half repeat some value."""
     p = scan.projections.copy()
     count = round(DEAD_SHARE * p[0].size)
     rows, columns = np.unravel_index(rng.choice(p[0].size, count, replace=False), p.shape[1:])
@@ -76,7 +79,7 @@ def dead(scan: Scan, rng: np.random.Generator) -> Scan:
 
 
 def exposure(scan: Scan, rng: np.random.Generator) -> Scan:
-    """Exposure stated twice as long, at the speed that the gantry has."""
+    """Plants a stated exposure twice as long as the true one. The gantry's speed is right."""
     sweeps: FrameSweeps = scan.trajectory.kinematics
     arc = sweeps.angle_end_rad - sweeps.angle_start_rad
     longer = replace(sweeps, exposure_s=2 * sweeps.exposure_s, angle_end_rad=sweeps.angle_start_rad + 2 * arc)
@@ -85,30 +88,30 @@ def exposure(scan: Scan, rng: np.random.Generator) -> Scan:
 
 
 def stated(scan: Scan, **changes: object) -> Scan:
-    """The same frames with another geometry stated, and the grid that an import makes of it."""
+    """Returns the same frames with another geometry stated, and with the grid that an import makes of it."""
     geometry = replace(scan.geometry, **changes)
     orbit = CircularOrbit(geometry, scan.trajectory.kinematics)
     return replace(scan, geometry=geometry, trajectory=orbit, grid=default_grid(geometry), reference=None)
 
 
 def pixels(factor: float) -> Plant:
-    """Pixel sizes stated ``factor`` times their true size; the stated offset in mm is right."""
+    """Plants pixel sizes of ``factor`` times their true size. The stated offset in mm is right."""
     return lambda scan, rng: stated(scan, pixel_size_mm=tuple(factor * p for p in scan.geometry.pixel_size_mm))
 
 
 def distances(factor: float) -> Plant:
-    """Both distances stated ``factor`` times as large as they are."""
+    """Plants distances of ``factor`` times their true values."""
     names = ("source_to_axis_mm", "source_to_detector_mm")
     return lambda scan, rng: stated(scan, **{name: factor * getattr(scan.geometry, name) for name in names})
 
 
 def images(change: Callable[[np.ndarray], np.ndarray]) -> Plant:
-    """Every frame changed alike."""
+    """Plants one change of all frames, such as a mirror image."""
     return lambda scan, rng: stated(replace(scan, projections=np.ascontiguousarray(change(scan.projections))))
 
 
 def of_half_turn(scan: Scan) -> Scan:
-    """The frames of 180° and the fan."""
+    """Returns the scan with only the frames of 180° and the fan."""
     geometry = scan.geometry
     fan_rad = 2 * np.arctan2(geometry.detector_shape[1] * geometry.pixel_size_mm[1] / 2, geometry.source_to_detector_mm)
     sweeps: FrameSweeps = scan.trajectory.kinematics
@@ -126,13 +129,13 @@ def half_turn_offset(scan: Scan, rng: np.random.Generator) -> Scan:
 
 CENTRE, SIGN, READOUT, SAME = "centre of rotation", "sign of rotation", "sign of readout", "consistency"
 
-EITHER = (SUSPICIOUS, CANNOT_TELL)  # a narrow cone does not show it
+EITHER = (SUSPICIOUS, CANNOT_TELL)  # a narrow cone does not show the fault
 
 
 @dataclass(frozen=True)
 class Fault:
-    """What is planted in which scan. One of ``questions`` should have one of the ``right`` verdicts, and the first
-    suspicious answer should say ``says``. aside: a true offset of the panel, in shares of its width."""
+    """A fault and the scan in which it is planted. One of ``questions`` should have one of the ``right`` verdicts, and the
+    first suspicious answer should say ``says``. aside: the true offset of the panel over its width."""
 
     plant: Plant = as_it_is
     questions: tuple[str, ...] = ()
@@ -211,7 +214,7 @@ def key_of(line: dict[str, object]) -> tuple[object, ...]:
 
 
 def is_right(planted: Fault, findings: list[dict[str, object]]) -> bool:
-    """Whether a question that should find it does, and the first suspicious answer says what it is."""
+    """Returns whether a question that should find the fault does, and the first suspicious answer names the right cause."""
     if not planted.questions:
         return True
     answered = any(f["question"] in planted.questions and f["verdict"] in planted.right for f in findings)
@@ -220,7 +223,7 @@ def is_right(planted: Fault, findings: list[dict[str, object]]) -> bool:
 
 
 def table(path: Path) -> str:
-    """Markdown: a row for each planted fault, then every scan that was answered wrong."""
+    """Returns a Markdown table with a row for each planted fault, then every scan with a wrong answer."""
     lines = lines_of(path)
     text = ["| planted | scans | answered rightly | other questions suspicious |", "| --- | --- | --- | --- |"]
     wrong: list[str] = []

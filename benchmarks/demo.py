@@ -1,9 +1,8 @@
-"""What `make demo` runs: a fly-scan, reconstructed with its motion ignored and known, a table and a picture.
+"""Runs `make demo`: a fly-scan reconstructed with its motion ignored and with it known, a table and a picture.
 
     python benchmarks/demo.py FOLDER [--quick]
 
-Seconds are processor seconds (user and system) of the whole command, so that other programs do not change them.
-"""
+Seconds are processor seconds (user and system) of the whole command, so that other programs do not change them."""
 
 import argparse
 import resource
@@ -27,9 +26,9 @@ RUNS = {
     "moving": ("fista", "known", ()),
     "splats": ("phyradgs", "known", ("--method", "phyradgs", "--config", str(OPTIONS))),
 }
-"""By file name: method and motion, as the table prints them, and the options of `phyradgs reconstruct`."""
-_HEIGHT = 0.28  # of the slice, as a share of the volume's
-_CROP = slice(0.28, 0.98), slice(0.33, 0.69)  # of that slice along y and x: the foot
+"""The runs by file name: method and motion, as the table prints them, and the options of `phyradgs reconstruct`."""
+_HEIGHT = 0.28  # height of the drawn slice over the volume's height
+_CROP = slice(0.28, 0.98), slice(0.33, 0.69)  # part of that slice along y and x that holds the foot
 
 
 def main() -> None:
@@ -81,7 +80,7 @@ def draw(truth: np.ndarray, volumes: Mapping[str, np.ndarray], path: Path) -> No
     axes = figure.subplots(2, 1 + len(volumes))
     slices = {"truth": truth, **volumes}
     for column, (name, volume) in enumerate(slices.items()):
-        # Transposed, so that the long side of the foot lies along the picture.
+        # The image is transposed, so that the long side of the foot lies along the picture.
         above, below = axes[:, column]
         above.imshow(volume[part].T, cmap="gray", vmin=0, vmax=most, origin="lower")
         above.set_title(name if volume is truth else f"{name}: {psnr(volume, truth):.1f} dB")

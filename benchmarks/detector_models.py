@@ -1,16 +1,15 @@
-"""Measures the gain from modelling the detector: every effect modelled and ignored, several methods, mean over seeds.
+"""Measures the gain from modelling the detector: every effect modelled and ignored, several methods, means over seeds.
 
     python benchmarks/detector_models.py RESULTS.jsonl [--names shepp-logan,VOLUME.h5] [--effects lag,pulse] [--seeds 0]
     python benchmarks/detector_models.py RESULTS.jsonl --table
 
-Rapid fly-scans: 25 frames of 14.4 degrees, rows read out, 48 cubed voxels, 72 squared pixels. Counts are of 1e5 photons
-with electronic noise of 10, unless an effect says otherwise. Iterative methods take every line at its own 5 times. phyradgs
-is exact in time, or has micro-views (8x5) by name. Results are one line per run, and the command resumes.
+Scans are rapid fly-scans: 25 frames of 14.4 degrees, read by rows, 48³ voxels, 72² pixels. Counts are of 1e5 photons with
+electronic noise of 10, unless an effect has others. Iterative methods take every line at its own 5 times. phyradgs is exact
+in time, or has micro-views (8x5) where named so. There is one line per run, and the command continues where it stopped.
 
 Effects: intensity (peak line integral 4 and 6; ignored: line integrals are averaged), pulse (all lines share one flash;
 ignored: the beam is always on), lag (0.1 and 0.3; ignored: not undone), low-dose (300 photons; modelled: pixels are
-weighted by their transmission).
-"""
+weighted by their transmission)."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
@@ -40,7 +39,7 @@ Row = dict[str, object]
 
 @dataclass(frozen=True)
 class Effect:
-    """One effect: the scan that has it, and the options of the runs that model it and ignore it."""
+    """One effect: the scan that has it, and the options of the runs that model it and that ignore it."""
 
     name: str
     methods: tuple[str, ...]
@@ -48,7 +47,7 @@ class Effect:
     modelled: dict[str, object] = field(default_factory=dict)
     ignored: dict[str, object] = field(default_factory=dict)
     pulse: tuple[float, float] | None = None
-    forget: Callable[[Scan], Scan] = lambda scan: scan  # what the scan file would say if nobody knew
+    forget: Callable[[Scan], Scan] = lambda scan: scan  # the scan file's statement without knowledge of the effect
 
 
 def always_on(scan: Scan) -> Scan:

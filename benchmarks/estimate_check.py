@@ -1,11 +1,10 @@
-"""Compares time and peak memory that `phyradgs estimate` predicts with those of the run, by method.
+"""Compares the time and peak memory that `phyradgs estimate` predicts with those of the run, by method.
 
     python benchmarks/estimate_check.py [--quick] [--size 64] [--methods phyradgs,r2,sirt] [--device D] [--json FILE]
 
 Estimate and run are separate processes, one after the other. Ratios are prediction over measurement. Time is the wall time
 of the whole process, with its start, reading, writing and comparing. Memory is the largest resident memory and the largest
-sum of device buffers. On a CPU the resident memory includes the buffers. --estimates no measures the runs alone.
-"""
+sum of device buffers. On a CPU the resident memory includes the buffers. --estimates no measures only the runs."""
 
 import json
 import sys
@@ -37,7 +36,7 @@ RUNS: dict[str, tuple[str, Facts]] = {
 
 
 def said(scan: Path, name: str, device: str | None, iterations: int | None) -> Facts:
-    """Returns an estimate, made in this process."""
+    """Returns an estimate made in this process."""
     method, changes = changed(name, iterations)
     loaded, rt = load_scan(scan), Runtime(device)
     before_s = time.process_time()

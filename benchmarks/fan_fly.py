@@ -1,13 +1,14 @@
-"""Fly-scan of a fan beam with the numbers of the published test of RACE: NMSE of least squares and of ``fista``.
+"""Measures the NMSE of least squares and of ``fista`` on a fan beam's fly-scan, as in the published test of RACE.
 
     python benchmarks/fan_fly.py docs/results/fan_fly.jsonl [--side 700]
 
-Shepp-Logan with Toft's contrasts on 700² voxels of 0.1 mm, simulated on 1400²; source to axis 500 mm, axis to panel 250 mm,
-1250 pixels of 0.15 mm; 40 views, each an exposure of 4.9 degrees, one after the other over 196 degrees; 10⁵ photons. The
-panel averages intensity over 120 times of an exposure and two pixels. The largest line integral along an axis of the phantom
-is 3. Least squares (``cgls``, 25 iterations) averages line integrals (ARTIC) or intensity (RACE), at 10 times of an
-exposure. NMSE: the squared error over the squared truth. ``best``: the smallest, and its iteration. Rows that the results
-file has are not made again."""
+The object is Shepp-Logan with Toft's contrasts on 700² voxels of 0.1 mm, simulated on 1400² voxels. The source is 500 mm
+from the axis and the panel 250 mm beyond it, with 1250 pixels of 0.15 mm. There are 40 views over 196 degrees, each an
+exposure of 4.9 degrees, one after the other, with 10⁵ photons. The panel averages intensity over 120 times of an exposure
+and two pixels. The largest line integral along an axis of the phantom is 3.
+
+Least squares (``cgls``, 25 iterations) averages line integrals (ARTIC) or intensity (RACE), at 10 times of an exposure. NMSE
+is the squared error over the squared truth. ``best``: the smallest, and its iteration. Present rows are not made again."""
 
 import time
 from typing import Any

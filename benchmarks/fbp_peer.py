@@ -1,10 +1,9 @@
-"""Filtered backprojection by scikit-image, ASTRA's CPU or silx's OpenCL, in a separate Python, for fbp_peers.py.
+"""Runs filtered backprojection by scikit-image, ASTRA's CPU or silx's OpenCL for fbp_peers.py, in a Python of its own.
 
     PEER/bin/python fbp_peer.py IN.npz OUT.npz skimage|astra|silx
 
-IN: sino (rows, views, columns) and angle_rad (views,). OUT: volume (rows, y, x), wall_s and processor_s of a run after a
-short one.
-"""
+IN: sino (rows, views, columns) and angle_rad (views,). OUT: volume (rows, y, x), and wall_s and processor_s of a run after a
+short one."""
 
 import sys
 import time
@@ -57,7 +56,7 @@ def main() -> None:
     given = np.load(sys.argv[1])
     make = {"skimage": skimage, "astra": astra, "silx": silx}[sys.argv[3]]
     sino, angle_rad = given["sino"], given["angle_rad"]
-    make(sino[:, :8], angle_rad[:8])()  # imports and kernels
+    make(sino[:, :8], angle_rad[:8])()  # this imports packages and builds kernels
     run = make(sino, angle_rad)
     wall_s, processor_s = time.perf_counter(), time.process_time()
     volume = run()

@@ -4,9 +4,9 @@
     python benchmarks/fbp_peers.py --peer-python PEER/bin/python [--json docs/results/fbp_peers.json] [--quick]
 
 The phantom is Shepp-Logan by Kak and Slaney's table, in closed form, over half a turn. Differences are relative RMS inside
-the panel's circle, of 129 columns and 180 views. PSNR has the range 1, against the phantom at the pixels' centres. Speed is
-of 2048 columns, 1800 views and 16 rows. Peers reconstruct slice by slice: they get one row, and times count sixteenfold.
-"""
+the panel's circle, for 129 columns and 180 views. PSNR has the range 1, against the phantom at the pixels' centres. Speed is
+that of 2048 columns, 1800 views and 16 rows. Peers reconstruct slice by slice, so they get one row, and their times count
+sixteenfold."""
 
 import subprocess
 import tempfile
@@ -41,7 +41,7 @@ def ours(rt: Runtime, lines: np.ndarray, angle_rad: np.ndarray, rows: int) -> tu
     views, columns = lines.shape
     pose, frames = ParallelGeometry((rows, columns), 1.0).pose(angle_rad), np.repeat(lines[:, None], rows, 1)
     grid = Grid((rows, columns, columns), (1.0, 1.0, 1.0))
-    fdk_volume(rt, frames[:: views // 8], pose[:: views // 8], grid, is_parallel=True)  # builds the kernels
+    fdk_volume(rt, frames[:: views // 8], pose[:: views // 8], grid, is_parallel=True)  # this builds the kernels
     wall_s, processor_s = time.perf_counter(), time.process_time()
     volume = fdk_volume(rt, frames, pose, grid, is_parallel=True)
     wall_s, processor_s = time.perf_counter() - wall_s, time.process_time() - processor_s

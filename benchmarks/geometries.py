@@ -1,11 +1,11 @@
-"""The density of a ball in every kind of geometry, by every kind of method: right, doubted by a warning, or silently wrong.
+"""Measures the density of a ball in every kind of geometry by every kind of method, and finds silent errors.
 
     python benchmarks/geometries.py [--quick] [--case WORD] [--method NAME] [--json FILE] [--table FILE.md]
 
-A ball of 0.02 per mm in closed form, seen through the middles of pixels, off the axis where the field of view allows.
-The density is the mean of the voxels within 0.6 of its radius, over 0.02. The table has the least and the largest of each
-kind of geometry; `w` counts runs with a warning, of the scan or the run. Ends with 1 where a run without a warning is off by
-more than 2 %."""
+The ball has 0.02 per mm in closed form. Rays pass through the middles of pixels. The ball is off the axis where the field of
+view allows. The measured density is the mean of the voxels within 0.6 of its radius, over 0.02. The table has the least and
+the largest density of each kind of geometry; `w` counts runs with a warning about the scan or the run. The command ends with
+1 if a run without a warning is off by more than 2 %."""
 
 import argparse
 import json
@@ -33,7 +33,7 @@ from phyradgs_cl.phantoms import Ellipsoid, EllipsoidPhantom
 
 DENSITY_PER_MM = 0.02
 LIMIT = 0.02
-SWEEPS = 5  # times of a line's exposure
+SWEEPS = 5  # times in a line's exposure
 METHODS: dict[str, dict[str, object]] = {
     "fista": {"iterations": 14},
     "fista-tv": {"iterations": 25},
@@ -57,21 +57,21 @@ KINDS = {
     "one row": "one row",
     "": "arcs: 1 to 5 views lost, 240°, 12 views; clockwise; jumps by a turn",
 }
-"""Kinds of geometries for the table, by a word of a case's name; the first that fits."""
+"""Kinds of geometries for the table, by a word in a case's name. The first that fits counts."""
 
 
 @dataclass(frozen=True)
 class Case:
-    """One geometry. Lengths in mm at unit 1; the grid is ``voxels`` of ``voxel_mm``, or None for the scan's own.
+    """One geometry. Lengths are in mm at unit 1. The grid is ``voxels`` of ``voxel_mm``, or None for the scan's own grid.
 
-    exposure_deg: the arc of a line's exposure in a fly-scan, whose readout takes as long; 0 for a scanner at rest.
-    feed_mm: along z per turn. turned: rotates a panel's steps (u, v) in space. unit: mm per unit of length."""
+    exposure_deg: the arc of a line's exposure in a fly-scan, whose readout takes as long; 0 for a scanner at rest. feed_mm:
+    the way along z per turn. turned: rotates a panel's steps (u, v) in space. unit: mm per unit of length."""
 
     name: str
     rows: int = 24
     columns: int = 24
     pitch_mm: tuple[float, float] = (1.5, 1.5)
-    offset: float = 0.0  # of the panel's width
+    offset: float = 0.0  # offset over the panel's width
     angles_deg: np.ndarray = field(default_factory=lambda: np.arange(48) * 7.5)
     voxel_mm: tuple[float, float, float] | None = (1.0, 1.0, 1.0)
     voxels: tuple[int, int, int] = (20, 20, 20)
@@ -98,10 +98,10 @@ class Case:
         return ConeGeometry(150.0 * self.unit, 225.0 * self.unit, shape, pitch, offset)
 
     def poses(self, angles_deg: np.ndarray) -> np.ndarray:
-        """Returns poses (..., 12) at these angles (...), travel and tilt included."""
+        """Returns poses (..., 12) at these angles (...), with travel and tilt."""
         poses = self.geometry().pose(np.deg2rad(angles_deg))
         if self.tilt_deg or self.roll_deg:
-            # the panel turns about its middle: roll in its plane, tilt about its rows
+            # The panel turns about its middle: roll in its plane, tilt about its rows.
             half_u, half_v = (self.columns - 1) / 2, (self.rows - 1) / 2
             middle = poses[..., 3:6] + half_u * poses[..., 6:9] + half_v * poses[..., 9:12]
             u, v = poses[..., 6:9].copy(), poses[..., 9:12].copy()
@@ -125,7 +125,7 @@ class Case:
         return EllipsoidPhantom((ball,), "ball")
 
     def frames(self) -> np.ndarray:
-        """Returns line integrals (F, rows, columns) of the ball: of a fly-scan at the times of each row's exposure."""
+        """Returns line integrals (F, rows, columns) of the ball. In a fly-scan every row has its own times."""
         opens = np.arange(self.rows) / self.rows if self.exposure_deg else np.zeros(self.rows)
         within = (np.arange(SWEEPS) + 0.5) / SWEEPS if self.exposure_deg else np.zeros(1)
         sense = np.sign(np.gradient(np.unwrap(self.angles_deg, period=360.0)))
@@ -158,7 +158,7 @@ class Case:
             return fly_scan(frames, self.geometry(), self.angles_deg, exposure_deg=arc, readout_ratio=ratio, grid=grid)
         if not self.exposure_deg:
             return Scan.from_poses(frames, self.poses(self.angles_deg), grid, is_parallel=self.is_parallel)
-        # a second of exposure, and as long a readout: the table goes on for two seconds after each frame's start
+        # Exposure and readout take a second each, so the table goes on for two seconds after each frame's start.
         step_deg = self.exposure_deg
         start_s = (self.angles_deg - self.angles_deg[0]) / step_deg
         time_s = np.arange(0, start_s[-1] + 2.1, 0.05)
@@ -177,7 +177,7 @@ def cases() -> Iterator[Case]:
             rows = max(round(24 / ratio), 6)
             yield of_beam(f"{beam}, rows {ratio:g} × columns apart", rows, 24, (1.5 * ratio, 1.5))
             yield of_beam(f"{beam}, rows {ratio:g} ×, own grid", rows, 24, (1.5 * ratio, 1.5), voxel_mm=None)
-        for ratio, panel, radius_mm in ((0.25, 96, 30.0), (0.5, 48, 15.0)):  # a ball of 7.5 voxels: edges ring near them
+        for ratio, panel, radius_mm in ((0.25, 96, 30.0), (0.5, 48, 15.0)):  # edges ring in a ball of 7.5 voxels
             yield of_beam(f"{beam}, pixel {ratio:g} voxels", panel, panel, voxel_mm=(1 / ratio,) * 3, radius_mm=radius_mm)
         for ratio in (1.5, 2.0, 2.5, 3.0, 4.0):
             count = round(20 * ratio)
@@ -251,7 +251,7 @@ def density(case: Case, volume: np.ndarray, grid: Grid) -> float:
 
 
 def measured(case: Case, method: str) -> dict[str, object]:
-    """Returns the density over the right one, or the refusal, and the warnings of scan and run."""
+    """Returns the density over the right density, or the refusal, and the warnings of scan and run."""
     scan, of_scan = listened(case.scan)
     if isinstance(scan, InputError):
         return {"case": case.name, "method": method, "refused": str(scan), "warnings": of_scan}
@@ -266,7 +266,7 @@ def measured(case: Case, method: str) -> dict[str, object]:
 
 
 def is_wrong(row: dict[str, object]) -> bool:
-    """Whether the density is off by more than the limit, without a word."""
+    """Returns whether the density is off by more than the limit without a warning."""
     return "density" in row and abs(float(row["density"]) - 1) > LIMIT and not row["warnings"]  # type: ignore[arg-type]
 
 

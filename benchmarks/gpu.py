@@ -1,10 +1,9 @@
-"""Tests and times the program on a GPU in at most ten minutes: `make gpu`. Tests, trust, the same bits twice, and speed.
+"""Tests and times the program on a GPU in at most ten minutes (`make gpu`): tests, trust, the same bits twice, and speed.
 
     python benchmarks/gpu.py [--device gpu] [--quick] [--json FILE] [--table FILE]
 
-One results file and one table, both with the device's name. A part that fails is noted and does not end the others. A CPU is
-driven in a GPU's launch shape, so that what will run there can be tried anywhere (with --quick: smaller).
-"""
+There is one results file and one table, both with the device's name. A part that fails is noted and does not end the others.
+A CPU runs in a GPU's launch shape, so that everything can be tried anywhere (with --quick: smaller)."""
 
 import os
 import subprocess
@@ -28,13 +27,13 @@ from phyradgs_cl.simulation import SimulationOptions, phantom_scene, simulate
 
 ROOT = Path(__file__).resolve().parents[1]
 TESTS = ("tests/operators", "tests/objective", "tests/optim", "tests/runtime", "tests/reconstructors/test_gpu_shape.py")
-TESTS_S, RUN_S = 200, 60  # the most for the tests, and for each long run
-# what is wanted of a GPU: Gaussians in time
+TESTS_S, RUN_S = 200, 60  # longest time of the tests, and of each long run
+# The goals for a GPU in time.
 GOALS = {"iteration_ms": "≤ 4", "run_s": "≤ 20", "fista_tv_s": "≤ 10", "fdk_gups": "≥ 100"}
 
 
 def tests(device: str, quick: bool) -> Facts:
-    """The kernel tests on the device: the last line that pytest prints."""
+    """Runs the kernel tests on the device. Returns the last line that pytest prints."""
     chosen = TESTS[2:3] if quick else TESTS
     command = [sys.executable, "-m", "pytest", "-q", "--no-header", "-p", "no:cacheprovider", *chosen]
     environment = {**os.environ, DEVICE_VARIABLE: device}
@@ -50,7 +49,7 @@ def trust(device: str, shape: dict[str, object]) -> Facts:
 
 
 def same_bits(rt: Runtime, quick: bool) -> Facts:
-    """Whether two runs of every kind of method give the same bits."""
+    """Returns whether two runs of every kind of method give the same bits."""
     scan, count = foot_scan(rt, 12 if quick else 64), 200 if quick else 5000
     different = []
     runs: dict[str, dict[str, object]] = {
@@ -66,7 +65,7 @@ def same_bits(rt: Runtime, quick: bool) -> Facts:
 
 
 def splats(rt: Runtime, quick: bool) -> Facts:
-    """Exact motion, 512² and 50,000 Gaussians: milliseconds of an iteration with the kernels' shares, seconds of 3,000."""
+    """Measures exact motion with 512² pixels and 50,000 Gaussians: ms of an iteration, kernels' shares, s of 3,000."""
     pixels, count = (32, 300) if quick else (512, 50_000)
     run = splat_run(rt, foot_scan(rt, pixels // 2), SplatOptions(motion=Exact(), gaussians=count))
     for _ in range(5):
@@ -100,7 +99,7 @@ def jaw(rt: Runtime, voxels: int, pixels: int) -> Scan:
 
 
 def fista_tv(rt: Runtime, quick: bool) -> Facts:
-    """FISTA-TV with a pose per row, 256³ from 25 × 512²: seconds of 100 iterations, from as many as there is time for."""
+    """Measures FISTA-TV with a pose per row, 256³ from 25 × 512²: seconds of 100 iterations, from as many as time allows."""
     scan = jaw(rt, *((24, 32) if quick else (256, 512)))
     marks: list[float] = []
 
@@ -111,7 +110,7 @@ def fista_tv(rt: Runtime, quick: bool) -> Facts:
         reconstruct(scan, RunPlan("fista-tv", options), rt, report=lambda progress: marks.append(time.perf_counter()))
         return time.perf_counter() - started
 
-    run(2)  # builds kernels
+    run(2)  # this builds kernels
     each_s = marks[1] - marks[0]
     iterations = int(np.clip((1 if quick else RUN_S) / max(each_s, 1e-9), 2, 100))
     whole_s = run(iterations)
@@ -120,7 +119,7 @@ def fista_tv(rt: Runtime, quick: bool) -> Facts:
 
 
 def fdk(rt: Runtime, quick: bool) -> Facts:
-    """FDK's backprojection from device to device: 512³ from 360 × 512², in 10⁹ voxel updates per second."""
+    """Measures FDK's backprojection from device to device: 512³ from 360 × 512², in 10⁹ voxel updates per second."""
     voxels, views, pixels = (48, 16, 64) if quick else (512, 360, 512)
     geometry = ConeGeometry(5.0, 7.0, (pixels, pixels), (4 / pixels, 4 / pixels))
     pose, weight = geometry.pose(np.linspace(0, 2 * np.pi, views, endpoint=False)), np.ones(views)
@@ -173,7 +172,7 @@ def main() -> int:
         started = time.perf_counter()
         try:
             facts |= part()
-        except Exception as error:  # whatever a driver does: the other parts still say something
+        except Exception as error:  # a driver may raise anything; the other parts should still run
             errors[name] = f"{type(error).__name__}: {error}"
         print(f"{name}: {time.perf_counter() - started:.0f} s {errors.get(name, '')}", file=sys.stderr, flush=True)
     facts["errors"] = errors

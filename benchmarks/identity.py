@@ -1,10 +1,10 @@
-"""Whether a change of the code leaves every volume the same: small reconstructions by every method, prior and motion.
+"""Shows whether a change of the code leaves every volume the same: small reconstructions by every method, prior and motion.
 
     python benchmarks/identity.py FILE.npz [WORD]
 
-Writes the volumes where FILE is not there yet. Otherwise it compares with FILE, prints a line for each volume that
-differs, with the size of the difference relative to the volume's norm, and ends with 1. WORD: only the runs whose names
-hold it. Bits depend on processor and driver: compare on one machine."""
+It writes the volumes where FILE does not exist. Otherwise it compares them with FILE, prints a line for each volume that
+differs, with the size of the difference over the volume's norm, and ends with 1. WORD: takes only the runs whose names hold
+it. Bits depend on processor and driver, so compare on one machine."""
 
 import sys
 from pathlib import Path
@@ -31,7 +31,7 @@ FEW = {
 """Iterations of each method."""
 MOTIONS = {"phyradgs": ("static", "micro-views", "centres", "exact"), "r2": ("static",), "fdk": ("static", "per-row")}
 OF_RAYS = "static", "per-row", "micro-views"
-"""Motion models by method; those of rays are the same for all others."""
+"""Motion models by method. Those of rays are the same for all other methods."""
 
 
 def scans() -> dict[str, Scan]:
@@ -61,7 +61,7 @@ def runs() -> dict[str, tuple[str, dict[str, object]]]:
 
 
 def volumes(word: str) -> dict[str, np.ndarray]:
-    """Reconstructs what holds the word: volumes (nz, ny, nx) in 1/mm by the name of a run."""
+    """Reconstructs the runs whose names hold the word. Returns volumes (nz, ny, nx) in 1/mm by the name of a run."""
     of_scan, found = scans(), {}
     for name, (scan, arguments) in runs().items():
         if word not in name:
@@ -72,7 +72,7 @@ def volumes(word: str) -> dict[str, np.ndarray]:
 
 
 def difference(one: np.ndarray, other: np.ndarray) -> float:
-    """Returns the norm of the difference over that of ``one``: 0 for the same bits."""
+    """Returns the norm of the difference over that of ``one``. It is 0 for the same bits."""
     if np.array_equal(one, other):
         return 0.0
     return float(np.linalg.norm(other - one) / max(float(np.linalg.norm(one)), 1e-30))

@@ -1,11 +1,10 @@
-"""Where the time of one iteration goes: binning, forward, loss, backward, TV, Adam, density control, gaps of the host.
+"""Measures the parts of one iteration: binning, forward, loss, backward, TV, Adam, density control, gaps of the host.
 
     python benchmarks/iteration.py [--quick] [--size 128] [--gaussians 50000] [--rounds 5] [--device D] [--json FILE]
 
-Kernel times are OpenCL events, the rest is the host's clock. Motions take turns, round by round; medians over rounds of
-the mean iteration. "gaps" is what an iteration takes beyond its kernels: launches, copies, Python. Density control is one
-round of it, on the host, and counts with a hundredth per iteration (control.every).
-"""
+Kernel times are OpenCL events, the rest is the host's clock. Motions take turns in each round. Results are medians over
+rounds of the mean iteration. "gaps" is what an iteration takes beyond its kernels: launches, copies, Python. Density control
+is one round on the host, and counts with a hundredth per iteration (control.every)."""
 
 import time
 
@@ -29,7 +28,7 @@ STAGES = {
 
 
 def one_round(rt: Runtime, run: SplatRun, iterations: int) -> dict[str, float]:
-    """Milliseconds per iteration, by stage."""
+    """Returns milliseconds per iteration, by stage."""
     rt.kernel_seconds()
     started = time.perf_counter()
     for _ in range(iterations):
@@ -46,7 +45,7 @@ def one_round(rt: Runtime, run: SplatRun, iterations: int) -> dict[str, float]:
 
 
 def control_ms(run: SplatRun) -> float:
-    """One round of density control, which leaves the run with another cloud."""
+    """Returns the milliseconds of one round of density control, which leaves the run with another cloud."""
     started = time.perf_counter()
     run.control_density()
     run.rt.finish()

@@ -1,15 +1,15 @@
-"""The ledger: what every kernel and six whole jobs take, beside the table of this kind of processor.
+"""Measures every kernel and six whole jobs, and compares them with the table of this kind of processor (the ledger).
 
     python benchmarks/kernels.py [--quick] [--write] [--all] [--json FILE] [--device D]
 
-Runs short reconstructions of 64³ voxels from 128² pixels, and of 128³ from 256², with every motion model that has kernels of
-its own. A kernel's time is the least of its runs, in ns a voxel of the volume. It is divided by the time in which this
-machine copies a float, and by that of a multiply-add; the kinder of the two quotients is compared with kernels.json. What
-seems slower is measured again, up to three times. Jobs
-are compared by their processor time over that of a fixed loop in the same process. Prints a line for each that takes 1.3
-times as long as there, and ends with 1. --quick: the small size, and half of the jobs. --write: puts this run in the table.
---all: prints every kernel with its share of the machine's rate of copying. It takes four minutes on two cores, or 50 s.
-"""
+It runs short reconstructions of 64³ voxels from 128² pixels, and of 128³ from 256², with every motion model that has kernels
+of its own. A kernel's time is the least of its runs, in ns per voxel of the volume. It is divided by the time in which this
+machine copies a float, and by that of a multiply-add. The smaller of the two quotients is compared with kernels.json. What
+seems slower is measured again, up to three times. Jobs are compared by their processor time over that of a fixed loop.
+
+Prints a line for each that takes 1.3 times as long as in the table, and then ends with 1. --quick: the small size, and half
+of the jobs. --write: puts this run in the table. --all: prints every kernel with its share of the machine's rate of copying.
+It takes four minutes on two cores, or 50 s with --quick."""
 
 import json
 import resource
@@ -34,7 +34,7 @@ TABLE = Path(__file__).with_suffix(".json")
 SLOWER = 1.3
 _REPEATS = 2
 _TRIES = 3  # of a work that seems slower
-_LEAST_S = 2e-4  # of a kernel in one run: less is not measured well
+_LEAST_S = 2e-4  # time of a kernel in one run, below which the measurement is not good
 SIZES = (64, 128)
 JOBS: dict[str, tuple[int, str, dict[str, object]]] = {
     "default, S": (64, "fista", {"iterations": 7}),
@@ -44,19 +44,19 @@ JOBS: dict[str, tuple[int, str, dict[str, object]]] = {
     "fista-tv, M": (128, "fista-tv", {"iterations": 5, "motion": "per-row"}),
     "fdk, M": (128, "fdk", {"motion": "static"}),
 }
-"""Voxels along a side, method, options; --quick runs the first half."""
+"""Voxels along a side, method, options. --quick runs the first half."""
 Table = dict[str, list[float]]
-"""By the name of a kernel's work: its ns a voxel over those of copying a float, and over those of a multiply-add."""
+"""By the name of a kernel's work: its ns per voxel over those of copying a float, and over those of a multiply-add."""
 
 
 @cache
 def foot(size: int, views: int = 6, protocol: str = "rapid", readout: str = "rows") -> Scan:
-    """A fly-scan of twice as many pixels as voxels along a side."""
+    """Returns a fly-scan with twice as many pixels as voxels along a side."""
     return simulate("foot", size=size, detector=2 * size, views=views, protocol=protocol, readout_axis=readout)
 
 
 def moving(scan: Scan) -> Deformation:
-    """A field that is a voxel large and turns once in the scan."""
+    """Returns a field of a voxel's size, with one oscillation in the scan."""
     control_mm = np.random.default_rng(0).uniform(-1, 1, (2, 4, 4, 4, 3)) * max(scan.grid.voxel_size_mm)
     spacing_mm = max(scan.grid.size_mm) / 3
     first_mm = tuple(-spacing_mm * 1.5 for _ in range(3))
@@ -99,7 +99,7 @@ def works(size: int) -> Iterator[tuple[str, Callable[[Runtime], object]]]:
 
 
 def operators(scan: Scan, rt: Runtime) -> None:
-    """The operators of one's own loops, on plain arrays."""
+    """Runs the operators that users call in loops of their own, on plain arrays."""
     rng, half_mm = np.random.default_rng(0), scan.grid.half_longest_mm
     count = scan.grid.shape[0] ** 3 // 16
     mean, scales = rng.uniform(-0.6, 0.6, (count, 3)) * half_mm, rng.uniform(0.01, 0.04, (count, 3)) * half_mm
@@ -120,14 +120,14 @@ def uses_of(rt: Runtime, run: Callable[[Runtime], object]) -> tuple[dict[str, Ke
 
 
 def measure(rt: Runtime, sizes: tuple[int, ...], table: Table) -> tuple[Table, dict[str, tuple[float, float]]]:
-    """Returns the two quotients of every kernel by "KERNEL: work, size³", and its ns a voxel with its share of copying.
+    """Returns the two quotients of every kernel by "KERNEL: work, size³", and its ns per voxel with its share of copying.
 
-    A work that has a kernel slower than in ``table`` runs again: other programs slow single runs down by half."""
+    A work with a kernel slower than in ``table`` runs again, because other programs slow single runs down by half."""
     least: Table = {}
     kernels: dict[str, tuple[float, float]] = {}
     for size in sizes:
         for name, run in works(size):
-            run(rt)  # compiles
+            run(rt)  # this compiles
             rt.kernel_uses()
             for _ in range(_TRIES):
                 uses, rates = uses_of(rt, run)
@@ -135,7 +135,7 @@ def measure(rt: Runtime, sizes: tuple[int, ...], table: Table) -> tuple[Table, d
                 for kernel, use in uses.items():
                     if use.seconds > _LEAST_S:
                         ns, key = 1e9 * use.seconds / size**3, f"{kernel}: {name}, {size}³"
-                        float_ns, flop_ns = 8e9 / rates.copy_bytes_per_s, 2e9 / rates.flops_per_s  # read and written
+                        float_ns, flop_ns = 8e9 / rates.copy_bytes_per_s, 2e9 / rates.flops_per_s  # a copy reads and writes
                         now[key] = [round(ns / float_ns, 3), round(ns / flop_ns, 2)]
                         kernels[key] = ns, use.bytes / use.seconds / rates.copy_bytes_per_s
                 least |= {key: [min(pair) for pair in zip(now[key], least.get(key, now[key]), strict=True)] for key in now}
@@ -146,7 +146,7 @@ def measure(rt: Runtime, sizes: tuple[int, ...], table: Table) -> tuple[Table, d
 
 
 def loop(rt: Runtime) -> None:
-    """The fixed work to which jobs are compared: copies and multiply-adds."""
+    """Runs the fixed work to which jobs are compared: copies and multiply-adds."""
     for _ in range(4):
         rt.best_rates()
 
@@ -174,7 +174,7 @@ def measure_jobs(rt: Runtime, names: list[str]) -> dict[str, float]:
 
 
 def kind_of(rt: Runtime) -> str:
-    """Names the kind of processor whose table is right: its maker and the instructions that kernels are built for."""
+    """Names the kind of processor whose table is right: its maker, and the instructions for which kernels are built."""
     return f"{cpu_facts().get('vendor_id', 'unknown')} {rt.device.target or rt.device.name}"
 
 

@@ -1,13 +1,12 @@
-"""Large problems: bricks against the whole, in results, time and memory, past 2^31 voxels where the device can hold them.
+"""Compares large problems in bricks with the whole, in results, time and memory, past 2^31 voxels if the device holds them.
 
     python benchmarks/large.py [--quick] [--voxels 256] [--detector 512] [--views 4] [--gaussians 50000] [--memory 64MiB]
                                [--device D] [--json FILE]
 
-Runs the ray-driven operators, FDK's backprojection and the voxeliser twice. The first run has all of the device's memory,
-the second ``--memory`` for its bricks. Differences are the largest, relative to the largest value: 0 is bit for bit. On a
-device with buffers of more than 8 GiB, ``--voxels 1300`` has more than 2^31 of them as a whole: 64-bit indices are compared
-with 32-bit ones.
-"""
+It runs the ray-driven operators, FDK's backprojection and the voxeliser twice: first with all of the device's memory, then
+with ``--memory`` for its bricks. Differences are the largest, over the largest value; 0 means equal bits. On a device with
+buffers of more than 8 GiB, ``--voxels 1300`` has more than 2^31 voxels as a whole. 64-bit indices are then compared with
+32-bit ones."""
 
 import time
 from collections.abc import Callable
@@ -78,7 +77,7 @@ def main() -> None:
     runs: dict[str, Facts] = {}
     work = calls(rt, arguments.voxels, arguments.detector, arguments.views, arguments.gaussians)
     for name, call in work.items():
-        call()  # builds kernels
+        call()  # this builds kernels
         whole, of_whole = measured(rt, call)
         rt.ledger.limit_bytes = limit
         bricks, of_bricks = measured(rt, call)

@@ -3,10 +3,10 @@
     python -m venv PEER && PEER/bin/pip install mbirtorch
     python benchmarks/mace4d.py --peer-python PEER/bin/python RESULTS.jsonl [--size 32] [--views 120] [--device D]
 
-The object is a rack and pinion, the frames are line integrals without noise. Our methods have their default options, MACE4D
+The object is a rack and pinion; the frames are line integrals without noise. Our methods have their default options, MACE4D
 has those of the demonstration. A line has the mean and the least PSNR, the mean SSIM and processor seconds. The truth is the
 state in the middle of each of MACE4D's windows. FBP of each window alone is measured too, and ``fista``, as if the object
-rested. A pixel is taken as 1 mm. With TORCHDYNAMO_DISABLE=1 mbirtorch runs without the compiler of PyTorch."""
+rested. A pixel counts as 1 mm. With TORCHDYNAMO_DISABLE=1 mbirtorch runs without PyTorch's compiler."""
 
 import subprocess
 import tempfile
@@ -34,7 +34,7 @@ def run_peer(python: str, size: int, views: int, path: Path) -> dict[str, np.nda
 
 
 def in_our_axes(volumes: np.ndarray) -> np.ndarray:
-    """Returns volumes (n, row, column, slice) as (n, z, y, x): at angle 0 rays run along the rows."""
+    """Returns volumes (n, row, column, slice) as (n, z, y, x). At angle 0, rays follow the rows."""
     return np.ascontiguousarray(volumes.transpose(0, 3, 2, 1), np.float32)
 
 

@@ -1,11 +1,11 @@
-"""mbirtorch's 4D demonstration for benchmarks/mace4d.py. Needs mbirtorch and NumPy, nothing else.
+"""Runs mbirtorch's 4D demonstration for benchmarks/mace4d.py. Needs only mbirtorch and NumPy.
 
     python mace4d_peer.py SIZE VIEWS RESULT.npz
 
-The scan of its demonstration: a rack and pinion over two turns of a parallel beam, SIZE² pixels, 24 steps in time. The
-result has `frames` (views, rows, columns), `angles` in rad, `middles` (the view in the middle of each window of MACE4D), and
-volumes (windows, row, column, slice): `truth`, those of MACE4D, `mace4d`, and FBP of each window alone, `fbp`, with the
-processor seconds of both, with any compilation."""
+The scan is that of the demonstration: a rack and pinion over two turns of a parallel beam, SIZE² pixels, 24 steps in time.
+The result has `frames` (views, rows, columns), `angles` in rad, `middles` (the view in the middle of each window of MACE4D)
+and volumes (windows, row, column, slice): `truth`, `mace4d` by MACE4D, and `fbp` by FBP of each window alone. It has the
+processor seconds of both, compilation included."""
 
 import sys
 import time

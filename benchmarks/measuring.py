@@ -1,4 +1,4 @@
-"""What the benchmarks share: where they ran, runs of splats, medians, children in processes, results as JSON."""
+"""Functions that the benchmarks share: where they ran, runs of splats, medians, children in processes, results as JSON."""
 
 import argparse
 import json
@@ -34,7 +34,7 @@ def parser_of(text: str) -> argparse.ArgumentParser:
 
 
 def where(rt: Runtime) -> Facts:
-    """Machine, device and how busy the machine was when this began."""
+    """Returns machine, device, and how busy the machine was at the start."""
     load = os.getloadavg()[0] if hasattr(os, "getloadavg") else -1.0
     return {
         "device": rt.device.name,
@@ -50,7 +50,7 @@ def where(rt: Runtime) -> Facts:
 
 
 def finish(facts: Facts, path: Path | None) -> None:
-    """Prints results, and keeps them where asked."""
+    """Prints results, and writes them to a file if asked."""
     text = json.dumps(facts, indent=1)
     print(text)
     if path is not None:
@@ -58,12 +58,12 @@ def finish(facts: Facts, path: Path | None) -> None:
 
 
 def foot_scan(rt: Runtime, size: int) -> Scan:
-    """The foot phantom by a rapid protocol, ``size`` voxels per side from twice as many pixels."""
+    """Returns a scan of the foot phantom by a rapid protocol, with ``size`` voxels per side from twice as many pixels."""
     return simulate("foot", size=size, detector=2 * size, noise="tigre", device=rt)
 
 
 def splat_run(rt: Runtime, scan: Scan, options: SplatOptions) -> SplatRun:
-    """A reconstruction before its first step, from FDK's cloud."""
+    """Returns a reconstruction before its first step, with FDK's cloud."""
     fdk, rng = static_fdk(rt, scan), np.random.default_rng(0)
     scale = internal_scale(fdk, scan.grid)
     grid = scan.grid.scaled(1 / scale.length_mm)
@@ -71,7 +71,7 @@ def splat_run(rt: Runtime, scan: Scan, options: SplatOptions) -> SplatRun:
 
 
 def random_cloud(count: int, scale: tuple[float, float], rng: np.random.Generator) -> np.ndarray:
-    """Random Gaussians (11, G) in a cube of half the volume, sorted by height as a reconstruction keeps them."""
+    """Returns random Gaussians (11, G) in a cube of half the volume, sorted by height as a reconstruction keeps them."""
     quaternion = rng.normal(size=(4, count))
     place, size = rng.uniform(-0.55, 0.55, (3, count)), rng.uniform(*scale, (3, count))
     turn, density = quaternion / np.linalg.norm(quaternion, axis=0), rng.uniform(0.1, 1.0, (1, count))
@@ -84,6 +84,6 @@ def median(values: Sequence[float]) -> float:
 
 
 def child(script: str, *words: str) -> Facts:
-    """Runs a script in a new process and returns its last line of output, which is JSON. Its errors are not caught."""
+    """Runs a script in a new process. Returns its last line of output, which is JSON. Its errors are not caught."""
     done = subprocess.run([sys.executable, script, *words], stdout=subprocess.PIPE, text=True, check=True)
     return json.loads(done.stdout.strip().splitlines()[-1])

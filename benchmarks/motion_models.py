@@ -1,14 +1,13 @@
-"""Accuracy and cost of the splats' motion models: quality of whole reconstructions, time per iteration, and a figure.
+"""Measures accuracy and cost of the splats' motion models: quality of reconstructions, time per iteration, and a figure.
 
     python benchmarks/motion_models.py run VOLUMES RESULTS.jsonl [--size 64] [--names a,b] [--motions 8x5,static]
     python benchmarks/motion_models.py cost COST.json [--size 64]
     python benchmarks/motion_models.py figure RESULTS.jsonl COST.json TIME_EXACT.json FIGURE.png
 
 Motions are static, MxN (micro-views) and "exact BOUND". ``run`` scans the volumes as benchmarks/scans.py does (rapid, rows,
-TIGRE's noise at 1e4 photons and sigma 10), and resumes. ``cost`` times whole iterations without density control on one scan
-of the foot phantom. It takes the median over rounds in which all motions take turns. benchmarks/time_exact.py writes
-TIME_EXACT.json, the errors of one frame.
-"""
+TIGRE's noise at 1e4 photons and sigma 10), and continues where it stopped. ``cost`` times whole iterations without density
+control on one scan of the foot phantom, as the median over rounds in which all motions take turns. benchmarks/time_exact.py
+writes TIME_EXACT.json, the errors of one frame."""
 
 import argparse
 import json
@@ -35,7 +34,7 @@ Line = dict[str, object]
 
 
 def motion_of(name: str) -> dict[str, object]:
-    """Options of a motion by its name here."""
+    """Returns the options of a motion by its name here."""
     if name.startswith("exact"):
         return {"motion": "exact", "time_error": float(name.split()[1])}
     if name == "static":
@@ -86,7 +85,7 @@ def key_of(line: Line) -> tuple[object, ...]:
 
 
 def means(lines: list[Line], size: int) -> dict[str, dict[str, tuple[float, float]]]:
-    """(PSNR dB, SSIM) by motion and volume, the mean over seeds."""
+    """Returns (PSNR dB, SSIM) by motion and volume, as means over seeds."""
     groups: dict[str, dict[str, list[tuple[float, float]]]] = {}
     for line in lines:
         if line["size"] == size:
@@ -102,7 +101,7 @@ def means(lines: list[Line], size: int) -> dict[str, dict[str, tuple[float, floa
 
 
 def cost(arguments: Namespace) -> dict[str, object]:
-    """Median milliseconds per iteration by motion, and the ratio to ``REFERENCE``."""
+    """Returns median milliseconds per iteration by motion, and the ratio to ``REFERENCE``."""
     rt = Runtime(arguments.device)
     scan = foot_scan(rt, arguments.size)
     runs = {name: fresh_run(rt, scan, name) for name in arguments.motions.split(",")}
@@ -120,7 +119,7 @@ def cost(arguments: Namespace) -> dict[str, object]:
 
 
 def fresh_run(rt: Runtime, scan: Scan, name: str) -> SplatRun:
-    """A reconstruction after its first 200 iterations, from where its cost hardly changes."""
+    """Returns a reconstruction after 200 iterations. From there on its cost hardly changes."""
     options = method_options("phyradgs", None, motion_of(name))
     started = splat_run(rt, scan, options)
     for _ in range(200):
@@ -132,7 +131,7 @@ def fresh_run(rt: Runtime, scan: Scan, name: str) -> SplatRun:
 
 
 def figure(lines: list[Line], costs: dict, errors: dict, path: Path) -> None:
-    """Error of a frame and PSNR of a reconstruction over the time of an iteration, by motion."""
+    """Draws the error of a frame and the PSNR of a reconstruction over the time of an iteration, by motion."""
     from matplotlib.figure import Figure
 
     size = int(costs["size"])
@@ -165,7 +164,7 @@ def figure(lines: list[Line], costs: dict, errors: dict, path: Path) -> None:
 
 
 def frame_errors(errors: dict) -> dict[str, float]:
-    """Percent, mean of single Gaussians, by the motion's name here."""
+    """Returns errors in percent, as means of single Gaussians, by the motion's name here."""
     named = {
         name.removeprefix("micro-views ").replace("exact, bound", "exact"): 100 * row["error_gaussians"]
         for name, row in errors["models"].items()

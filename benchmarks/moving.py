@@ -1,15 +1,17 @@
-"""Objects that move during a scan, reconstructed at rest, with the true field, and with a field that ``moving`` finds.
+"""Reconstructs objects that move during a scan: as if at rest, with the true field, and with a field that ``moving`` finds.
 
     python benchmarks/moving.py VOLUMES RESULTS.jsonl [--names a,b] [--views 75,150] [--method fista] [--size 64]
         [--cases rest,known,unknown,still] [--motion breathing]
-    python benchmarks/moving.py --insert VOLUMES RESULTS.jsonl [--size 64]: how far off the centre of a ball in a body is
+        python benchmarks/moving.py --insert VOLUMES RESULTS.jsonl [--size 64]: the error of the centre of a ball in a body
 
-Volumes and scanner as benchmarks/scans.py has them: TIGRE's noise at 1e4 photons, a gantry that turns without stopping,
-exposures without gaps. A turn takes a minute. The breath has a period of 4 s, jittered by 10 %, and an amplitude of 15 % of
-half the box; --motion takes another preset with its own defaults. PSNR and SSIM against the reference volume; seconds of
-processor time. The case unknown has means over ten true states, of the method ``moving`` and of the volume that --method
-makes as if the object rested; the case still has ``moving`` and --method on an object at rest. A run that was
-interrupted continues: a line for each volume, number of views, method, case and motion."""
+    Volumes and scanner are those of benchmarks/scans.py: TIGRE's noise at 1e4 photons, a gantry that turns without stopping,
+    exposures without gaps. A turn takes a minute. The breath has a period of 4 s, jittered by 10 %, and an amplitude of 15 %
+    of half the box; --motion takes another preset with its own defaults. PSNR and SSIM compare with the reference volume.
+    Seconds are processor time.
+
+    The case unknown has means over ten true states, of the method ``moving`` and of the volume that --method makes as if the
+    object rested. The case still has ``moving`` and --method on an object at rest. A run that was interrupted continues.
+    There is a line for each volume, number of views, method, case and motion."""
 
 import argparse
 import tempfile
@@ -40,7 +42,7 @@ CASES = ("rest", "known", "unknown", "still")
 def moving_scan(
     rt: Runtime, path: Path, size: int, views: int, amplitude: float, kind: str = "breathing"
 ) -> Scan:
-    """The scan of a volume file; with an amplitude of 0 the same scan of the object at rest."""
+    """Returns the scan of a volume file. With an amplitude of 0 the object is at rest."""
     motion = PresetMotion(kind, amplitude=amplitude)
     return api.simulate(
         str(path), size=size, detector=2 * size, views=views, exposure_deg=360 / views, fps=views / TURN_S, noise="tigre",
@@ -54,7 +56,7 @@ def plan_of(method: str) -> RunPlan:
 
 
 def run_case(rt: Runtime, scan: Scan, case: str, method: str) -> dict[str, float]:
-    """PSNR, SSIM, seconds and MiB in buffers of one reconstruction."""
+    """Returns PSNR, SSIM, seconds and MiB in buffers of one reconstruction."""
     plan = plan_of(method)
     if case == "known":
         plan = replace(plan, object_motion=ObjectMotion(scan.moving_truth.deformation))
@@ -67,8 +69,9 @@ def run_case(rt: Runtime, scan: Scan, case: str, method: str) -> dict[str, float
 
 def run_insert(rt: Runtime, size: int, folder: Path) -> Iterator[dict[str, object]]:
     """Yields by how many mm the centre of a ball in a breathing body is off in the reference and, as a mean, in true states.
-    Each with the true field, without, and with the field that ``moving`` finds. The reference of ``moving`` is not compared,
-    because its field may hold a constant displacement. ``moved_mm``: how far the ball goes."""
+
+    Reconstructions have the true field, no field, and the field that ``moving`` finds. The reference of ``moving`` is not
+    compared, because its field may hold a constant displacement. ``moved_mm``: the ball's largest displacement."""
     body, ball = Ellipsoid((0.0, 0.0, 0.0), (0.7, 0.6, 0.85), 0.4), Ellipsoid((0.1, 0.0, 0.35), (0.2, 0.2, 0.2), 0.4)
     fine = Grid.cube(2 * size, 2.0)
     write_volume(folder / "insert.h5", EllipsoidPhantom((body, ball), "insert").voxelise(fine, 4), fine, {})
@@ -101,12 +104,12 @@ def mean_distance_mm(result: Reconstruction, field: Deformation | None, scan: Sc
 
 
 def ball_at(ball: Ellipsoid, field: Deformation, weights: np.ndarray) -> Ellipsoid:
-    """The ball where its centre is in the state with these weights."""
+    """Returns the ball at the place of its centre in the state with these weights."""
     return replace(ball, centre_mm=tuple(ball.centre_mm + field.inverse_mm(np.array([ball.centre_mm]), weights)[0]))
 
 
 def centre_mm(volume: np.ndarray, grid: Grid, ball: Ellipsoid) -> np.ndarray:
-    """Returns the centre of the voxels near the ball that are denser than the mean of body and ball: within two radii."""
+    """Returns the centre of the voxels within two radii of the ball that are denser than the mean of body and ball."""
     z, y, x = np.meshgrid(*grid.axes_mm(), indexing="ij")
     places_mm = np.stack([x, y, z], -1)
     near = np.linalg.norm(places_mm - ball.centre_mm, axis=-1) < 2 * ball.reach_mm
@@ -115,7 +118,7 @@ def centre_mm(volume: np.ndarray, grid: Grid, ball: Ellipsoid) -> np.ndarray:
 
 
 def run_unknown(rt: Runtime, scan: Scan, method: str) -> dict[str, object]:
-    """Means over the true states of ``moving`` and of ``method`` as if the object rested, the error of the field in mm."""
+    """Returns means over the true states of ``moving`` and of ``method`` as if the object rested, and the field's error."""
     lines: dict[str, object] = {}
     for name, label in ((method, "static_"), ("moving", "")):
         rt.reset_peak()
@@ -128,7 +131,7 @@ def run_unknown(rt: Runtime, scan: Scan, method: str) -> dict[str, object]:
 
 
 def run_still(rt: Runtime, scan: Scan, method: str) -> dict[str, object]:
-    """What ``moving`` makes of an object at rest, by how many dB it differs from ``method``, and its field in voxels."""
+    """Returns what ``moving`` makes of an object at rest: its difference from ``method`` in dB, and its field in voxels."""
     volumes = {name: reconstruct(scan, plan_of(name), rt) for name in (method, "moving")}
     psnr_db = {name: compare(result.volume, scan.reference)["psnr_db"] for name, result in volumes.items()}
     found = volumes["moving"].facts[MOTION_FOUND]

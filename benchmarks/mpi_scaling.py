@@ -1,20 +1,19 @@
-"""How a step of one reconstruction over ranks is made up: kernels, host, sums over ranks, waiting; and what that predicts.
+"""Measures the parts of a step of one reconstruction over ranks: kernels, host, sums over ranks, waiting. Predicts others.
 
     python benchmarks/mpi_scaling.py [--quick] [--ranks 1,2,3,4] [--json docs/results/mpi_scaling.json]
 
-Needs the extra [mpi]. Every number of ranks is a run of mpiexec on this machine. Where the device is its processor, a rank
-has one thread of PoCL, and times are processor seconds. The splats are exact in time, on 25 frames. Strong runs have four
-frames per step whatever the ranks, weak ones one frame per rank. Of every part the least of the steps counts, on the rank
-for which it is largest. Waiting and whole steps are by the clock, waiting is a median. They mean nothing with more ranks
-than free processors.
+It needs the extra [mpi]. Every number of ranks is a run of mpiexec on this machine. Where the device is the processor, a
+rank has one thread of PoCL, and times are processor seconds. The splats are exact in time, on 25 frames. Strong runs have
+four frames per step for any number of ranks; weak runs have one frame per rank. For every part the least of the steps
+counts, on the rank where it is largest. Waiting and whole steps are by the clock; waiting is a median. Both mean nothing
+with more ranks than free processors.
 
 The model of a step of B frames on R ranks:
 
     ceil(B / R) (kernels and host of a frame) + (kernels and host of a step) + sum of the gradients.
 
-The parts come from the strong runs by least squares. The sum is 13 rows x 8 bytes x Gaussians through Allreduce:
-2 log2(R) latencies and 2 (R - 1) / R times the bytes over the network's rate. The rate of this machine is measured.
-"""
+The parts come from the strong runs by least squares. The sum is 13 rows x 8 bytes x Gaussians through Allreduce. It takes
+2 log2(R) latencies, and 2 (R - 1) / R times the bytes over the network's rate. The rate of this machine is measured."""
 
 import json
 import os
@@ -59,7 +58,7 @@ def started(rt: Runtime, gaussians: int, pixels: int, batch: int) -> SplatRun:
     """Returns a run of about this number of Gaussians, which stays constant."""
     geometry = ConeGeometry(5.0, 7.0, (pixels, pixels), (4.0 / pixels,) * 2)
     voxels = 16
-    while voxels**3 < 8 * gaussians:  # enough that attenuate
+    while voxels**3 < 8 * gaussians:  # a half of the voxels does not attenuate
         voxels += 16
     grid = Grid.cube(voxels, 2.0)
     options = SimulationOptions(make_protocol("rapid"), time_samples=2)
@@ -71,9 +70,10 @@ def started(rt: Runtime, gaussians: int, pixels: int, batch: int) -> SplatRun:
 
 
 class Clock:
-    """Seconds of this rank by part. On a processor they are seconds of its own threads, which other programs do not change:
-    kernels take those of all threads but this one. On other devices kernels are timed by events and the rest by the clock.
-    """
+    """Seconds of this rank by part. On a processor they are seconds of its own threads, which other programs do not change.
+
+    Kernels take the seconds of all threads but this one. On other devices, events time the kernels and the clock times the
+    rest."""
 
     def __init__(self, rt: Runtime) -> None:
         self.rt, self.is_cpu = rt, rt.device.kind == "cpu"
@@ -81,7 +81,7 @@ class Clock:
         self.own = time.thread_time if self.is_cpu else time.perf_counter
 
     def part(self, work: Callable[..., Any], name: str) -> Callable[..., Any]:
-        """``work``, whose seconds are added to the attribute ``name``."""
+        """Returns ``work`` with its seconds added to the attribute ``name``."""
 
         def timed(*arguments: object) -> Any:
             begun = self.own()
@@ -93,13 +93,13 @@ class Clock:
         return timed
 
     def wait(self) -> None:
-        """Until all ranks are here."""
+        """Waits until all ranks are here."""
         begun, sending = time.perf_counter(), self.sending
         self.part(self.rt.ranks.any, "waiting")(False)
         self.idle, self.sending = self.idle + time.perf_counter() - begun, sending
 
     def step(self, run: SplatRun) -> list[float]:
-        """One step; its parts in the order of PARTS, in seconds."""
+        """Takes one step. Returns its parts in seconds, in the order of PARTS."""
         self.summing = self.sending = self.waiting = self.idle = 0.0
         self.rt.kernel_seconds()
         begun, own, whole = time.perf_counter(), self.own(), time.process_time()
@@ -112,7 +112,7 @@ class Clock:
 
 
 def measure(run: SplatRun, steps: int) -> tuple[np.ndarray, int]:
-    """(steps, parts) milliseconds of this rank, and bytes that it hands over in a step."""
+    """Returns (steps, parts) milliseconds of this rank, and the bytes that it hands over in a step."""
     ranks, clock = run.rt.ranks, Clock(run.rt)
     summing = clock.part(splat_step.exact_sum, "summing")
 
@@ -171,20 +171,20 @@ def slowest(facts: Facts, name: str) -> float:
 
 
 def exchange_share(facts: Facts) -> float:
-    """Sums over ranks, with all that prepares them, as a share of a step without waiting."""
+    """Returns the sums over ranks, with all that prepares them, as a share of a step without waiting."""
     parts = {name: slowest(facts, name) for name in PARTS}
     return parts["sum_ms"] / (parts["kernels_ms"] + parts["host_ms"] + parts["sum_ms"])
 
 
 def predict(strong: list[Facts], batch: int) -> Facts:
-    """Milliseconds of a step of ``batch`` frames by network and ranks, from the parts of the strong runs."""
+    """Returns milliseconds of a step of ``batch`` frames by network and ranks, from the parts of the strong runs."""
     work = [slowest(facts, "kernels_ms") + slowest(facts, "host_ms") for facts in strong]
     frames = [-(-int(facts["batch"]) // int(facts["ranks"])) for facts in strong]  # type: ignore[call-overload]
     a_frame, a_step = np.polyfit(frames, work, 1) if len(set(frames)) > 1 else (work[0], 0.0)
     two = next(facts for facts in strong if facts["ranks"] == 2)
     nbytes, allreduce_s = int(two["bytes_a_step"]), 1e-3 * slowest(two, "allreduce_ms")  # type: ignore[call-overload]
     prepare_ms = slowest(two, "sum_ms") - slowest(two, "allreduce_ms")
-    own_rate = nbytes / allreduce_s  # of two ranks, which send 2 (R − 1) / R = 1 times the bytes
+    own_rate = nbytes / allreduce_s  # two ranks send 2 (R − 1) / R = 1 times the bytes
     found: Facts = {
         "frame_ms": round(float(a_frame), 2),
         "step_ms": round(float(max(a_step, 0.0)), 2),

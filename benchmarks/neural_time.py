@@ -1,13 +1,12 @@
-"""PSNR against processor seconds for naf, sax-nerf and phyradgs, static and with motion known: lines of JSON, then a figure.
+"""Measures PSNR over processor seconds for naf, sax-nerf and phyradgs, static and with known motion: JSON, then a figure.
 
     python benchmarks/neural_time.py run VOLUMES RESULTS.jsonl [--names cthead,walnut] [--size 64] [--methods a,b] ...
     python benchmarks/neural_time.py draw RESULTS.jsonl FIGURE.png
 
-Scans are those of scans.py. A run's volume is scored on the way, each time that a third more time has passed; scoring
-(and the volume that it needs) is not counted. Seconds are those of processors in this process, all threads of it added up:
-with --threads 1, the default, what a core that does nothing else would take, also on a busy machine. They begin with the
-call: FDK and kernel builds are in them. A run is in the file once it is done; what the file has is not run again.
-"""
+Scans are those of scans.py. A run's volume is scored each time that a third more time has passed. Scoring, and making the
+volume for it, is not counted. Seconds are processor seconds of all threads in this process. With --threads 1, the default,
+they are what an idle core would take, also on a busy machine. They begin with the call, and include FDK and kernel builds. A
+run is in the file once it is done; runs in the file are not made again."""
 
 import argparse
 import os
@@ -40,7 +39,7 @@ _SPACING = 1.3
 
 
 class Scores:
-    """A report that scores the present volume now and then, and keeps a clock that stands still meanwhile."""
+    """A report that scores the present volume now and then. Its clock stops meanwhile."""
 
     def __init__(self, reference: np.ndarray) -> None:
         self.reference = reference
@@ -56,7 +55,7 @@ class Scores:
         self._scoring_s += time.process_time() - begun
 
     def finish(self, iteration: int, volume: np.ndarray) -> None:
-        """The result of the run."""
+        """Adds the result of the run."""
         self._add(iteration, time.process_time() - self._started - self._scoring_s, volume)
 
     def _add(self, iteration: int, seconds: float, volume: np.ndarray) -> None:
@@ -66,7 +65,7 @@ class Scores:
 
 
 def run_one(rt: Runtime, scan: Scan, label: str, factor: float, seed: int) -> dict[str, object]:
-    """The scores of one run; ``factor``: iterations as a multiple of the default's."""
+    """Returns the scores of one run. ``factor``: iterations over the default number."""
     method, changes = METHODS[label]
     iterations = max(round(factor * method_options(method).iterations), 1)
     options = method_options(method, None, {**changes, "iterations": iterations})
@@ -87,7 +86,7 @@ def run_one(rt: Runtime, scan: Scan, label: str, factor: float, seed: int) -> di
 
 
 def run_all(arguments: argparse.Namespace) -> None:
-    for variable in ("POCL_MAX_PTHREAD_COUNT", "OMP_NUM_THREADS"):  # OpenCL's on a CPU, and PyTorch's
+    for variable in ("POCL_MAX_PTHREAD_COUNT", "OMP_NUM_THREADS"):  # one is OpenCL's on a CPU, the other PyTorch's
         os.environ[variable] = str(arguments.threads)
     rt = Runtime(arguments.device)
     done = {tuple(line[name] for name in KEY) for line in read_lines(arguments.results)}
@@ -103,7 +102,7 @@ def run_all(arguments: argparse.Namespace) -> None:
 
 
 def draw(lines: Sequence[dict], path: Path) -> None:
-    """A panel per volume; one line per method, from its longest run, and a dot at the end of every run."""
+    """Draws a panel per volume, with one line per method from its longest run, and a dot at the end of every run."""
     import matplotlib
 
     matplotlib.use("Agg")

@@ -1,12 +1,12 @@
-"""Fly-scans of parallel beams: PSNR, and the modulation at half Nyquist at rim and centre, motion ignored and known.
+"""Measures fly-scans of parallel beams: PSNR, and the modulation at half Nyquist at rim and centre, with and without motion.
 
     python benchmarks/parallel_fly.py docs/results/parallel_fly.jsonl [--views 180 720] [--blur-px 0.5 5] [--dose 1e4]
 
 A disc of unit attenuation over its diameter holds discs of other contrasts and four gratings of 4 pixels' period across the
-motion. Three gratings lie at 0.85 of the radius, one in the middle. The panel has 128 columns of 4 rows. Views go over as
-many turns as exposures of the stated blur need, at evenly spaced angles modulo a turn. Frames are averages of intensity over
-24 times of an exposure, of the object on pixels half as large, with Poisson noise. The modulation is the amplitude of a
-grating in the volume over that in the truth. Runs that the results file has are not made again."""
+motion. Three gratings are at 0.85 of the radius, one is in the middle. The panel has 128 columns and 4 rows. Views extend
+over as many turns as exposures of the stated blur need, at evenly spaced angles modulo a turn. Frames are averages of
+intensity over 24 times of an exposure, of the object on pixels half as large, with Poisson noise. The modulation is the
+amplitude of a grating in the volume over that in the truth. Runs that the results file has are not made again."""
 
 import math
 import time
@@ -24,14 +24,14 @@ from phyradgs_cl.operators import RayOperator
 from phyradgs_cl.runtime import Runtime
 
 SIDE, ROWS, FINER, TIMES = 128, 4, 2, 24
-RADIUS, PERIOD, PATCH = 0.46 * SIDE, 4.0, 10.0  # pixels
+RADIUS, PERIOD, PATCH = 0.46 * SIDE, 4.0, 10.0  # in pixels
 ATTENUATION = 2.0 / (2 * RADIUS)
 PLACES_PX = [(0.85 * RADIUS * math.cos(a), 0.85 * RADIUS * math.sin(a), a) for a in (0.3, 2.4, 4.5)] + [(0.0, 0.0, 0.0)]
 
 
 @dataclass(frozen=True)
 class Trial:
-    """A method with its options; ``label``: what its row calls the motion, or the model."""
+    """A method with its options. ``label``: the name of the motion or the model in its row."""
 
     method: str
     label: str
@@ -66,7 +66,7 @@ def phantom(side: int) -> np.ndarray:
 
 
 def grating(x: np.ndarray, y: np.ndarray, place: tuple[float, float, float]) -> tuple[np.ndarray, np.ndarray]:
-    """Returns where a grating is, and its wave, which runs along the motion of its place."""
+    """Returns where a grating is, and its wave, which follows the motion of its place."""
     dx, dy = x - place[0], y - place[1]
     along = -math.sin(place[2]) * dx + math.cos(place[2]) * dy
     across = math.cos(place[2]) * dx + math.sin(place[2]) * dy
@@ -83,7 +83,7 @@ def modulation(image: np.ndarray, truth: np.ndarray, place: tuple[float, float, 
 
 
 def turns_for(views: int, blur_px: float) -> int:
-    """Returns the number of turns, without a factor in common with the views, that leave room for exposures of this blur."""
+    """Returns the number of turns, coprime to the number of views, that leaves room for exposures of this blur."""
     turns = max(1, math.ceil(views * blur_px / RADIUS / (2 * math.pi)))
     while math.gcd(turns, views) > 1:
         turns += 1
@@ -111,8 +111,8 @@ def mean_light(
     rt: Runtime, orbit: CircularOrbit, shutter: Shutter, start_s: np.ndarray, grid: Grid, field: np.ndarray, times: int,
     finer: int,
 ) -> np.ndarray:
-    """Returns the light (views, columns) behind a slice (y, x), as a share of that without it: the mean of ``times`` times
-    of an exposure and of ``finer`` pixels, of a panel of one row."""
+    """Returns the light (views, columns) behind a slice (y, x), over that without it, for a panel of one row. It is the mean
+    of ``times`` times of an exposure and of ``finer`` pixels."""
     columns, light = orbit.geometry.detector_shape[1], []
     one_line = {"line_start": np.zeros(1, np.int32), "line_stop": np.ones(1, np.int32), "weight": np.ones(1)}
     for view, at_s in enumerate(start_s):

@@ -1,11 +1,11 @@
-"""Memory of parallel scans within a limit: ``fbp`` of 16 rows of 2048 columns, ``fista`` of a slab of 32 rows of 1024.
+"""Measures memory of parallel scans within a limit: ``fbp`` of 16 rows of 2048 columns, ``fista`` of 32 rows of 1024.
 
     python benchmarks/parallel_memory.py docs/results/parallel_memory.jsonl [--memory 2GiB] [--methods fbp fista] [--quick]
 
-Shepp-Logan over half a turn, every row the same: 1800 views for ``fbp``, and 60 for one pass of ``fista``, enough for
-the memory of its volumes. From a scan file, by the code of ``phyradgs reconstruct``. The slab comes from a panel of 40 rows,
-as ``--rows 4:36``. Buffers: the most that the runtime held at one time. Resident: the most of the whole process, which on a
-processor has the buffers in it. Each method runs in its own process."""
+The object is Shepp-Logan over half a turn, with every row the same. ``fbp`` has 1800 views; one pass of ``fista`` has 60,
+enough for the memory of its volumes. Scans come from a file, by the code of ``phyradgs reconstruct``. The slab of ``fista``
+comes from a panel of 40 rows, as by ``--rows 4:36``. Buffers: the most that the runtime held at one time. Resident: the most
+of the whole process, which includes the buffers on a processor. Each method runs in its own process."""
 
 import argparse
 import subprocess
@@ -27,7 +27,7 @@ from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.workflow import run_reconstruction
 from phyradgs_cl.workflow.slabs import Slabs
 
-# columns, rows of the panel, views, rows that are reconstructed, options
+# Columns, rows of the panel, views, rows that are reconstructed, options.
 RUNS = {"fbp": (2048, 16, 1800, (0, 16), {}), "fista": (1024, 40, 60, (4, 36), {"iterations": 1})}
 
 

@@ -1,12 +1,11 @@
-"""What each effect of a real scan costs, and what its step of ``prepare`` gives back: PSNR without it, with it, corrected.
+"""Measures the PSNR that each effect of a real scan costs, and what its step of ``prepare`` regains.
 
     python benchmarks/prepare.py docs/results/prepare.jsonl --size 32
     python benchmarks/prepare.py docs/results/prepare.jsonl --table
 
-A line per effect, volume and method: ``clean``, ``clean_prepared`` (the step on a scan without the effect), ``spoilt`` and
-``prepared``, dB. Lines that are there are not made again. docs/results/prepare.md has the tables, and the figure that
---figure docs/images/prepare.png draws.
-"""
+There is a line per effect, volume and method: ``clean``, ``clean_prepared`` (the step on a scan without the effect),
+``spoilt`` and ``prepared``, in dB. Lines in the file are not made again. docs/results/prepare.md has the tables, and the
+figure that --figure docs/images/prepare.png draws."""
 
 import argparse
 from collections.abc import Iterator
@@ -24,7 +23,7 @@ from phyradgs_cl.fields import Grid
 from phyradgs_cl.prepare import water_polynomial
 from phyradgs_cl.runtime import Runtime
 
-PEAK = 3.0  # of the line integrals: a head's
+PEAK = 3.0  # largest line integral, as in a head
 METHODS: dict[str, dict[str, Any]] = {
     "fdk": {"motion": "per-row"},
     "fista-tv": {"motion": "per-row", "iterations": 30},
@@ -32,15 +31,16 @@ METHODS: dict[str, dict[str, Any]] = {
     "fista": {"motion": "per-row"},
 }
 USUAL = ["fdk", "fista-tv", "phyradgs"]
-BOXES = (20, 22, 26, 28, 32)  # with the margin, of a grid of 32; a margin of half the part is 24
+BOXES = (20, 22, 26, 28, 32)  # with the margin, in a grid of 32; a margin of half the part is 24
 GAUSSIANS = 1000  # at least, in a box of any size
-LOST_DB = 0.1  # less is not worth a share of it
+LOST_DB = 0.1  # of a smaller loss no share is given
 
 
 @dataclass(frozen=True)
 class Effect:
-    """What is planted, the steps that undo it, and their options. told: the steps believe in the effect. part: of the
-    grid's sides about the middle, reconstructed and compared. margin: of these, filled at each side and discarded."""
+    """What is planted, the steps that undo it, and their options. told: whether the steps know of the effect. part: the
+    share of the grid's sides about the middle that is reconstructed and compared. margin: the share of these filled at each
+    side and discarded."""
 
     planted: dict[str, float]
     steps: str
@@ -57,7 +57,7 @@ class Effect:
         return prepare(scan, self.steps, device=rt, **self.options) if self.steps else scan
 
     def beyond(self, method: str, grid: Grid) -> dict[str, Any]:
-        """Options of a method that fills the margin of ``grid``; Gaussians as densely as in the box alone."""
+        """Returns options of a method that fills the margin of ``grid``, with Gaussians as dense as in the box alone."""
         if not self.margin:
             return {}
         gaussians = round(GAUSSIANS * (1 + 2 * self.margin) ** 3)
@@ -101,7 +101,7 @@ def psnr_db(volume: np.ndarray, scan: Scan) -> float:
 
 
 def lines(rt: Runtime, phantom: str, usual: dict[str, Any], left: dict[str, list[str]]) -> Iterator[dict[str, Any]]:
-    """The lines of a phantom that are ``left``: an effect's methods."""
+    """Yields the lines of a phantom that are ``left``: an effect's methods."""
     if not left:
         return
     clean = simulate(phantom, **usual)
@@ -123,7 +123,8 @@ def lines(rt: Runtime, phantom: str, usual: dict[str, Any], left: dict[str, list
 
 
 def table(found: list[dict[str, Any]]) -> str:
-    """Markdown: a row per volume and effect, a column per method, and what the step costs a clean scan at worst."""
+    """Returns a Markdown table: a row per volume and effect, a column per method, and the step's largest cost in a clean
+    scan."""
     methods = [method for method in METHODS if any(line["method"] == method for line in found)]
     by_place = {(line["phantom"], line["effect"], line["method"]): line for line in found}
     head = ["effect", "volume", *(f"{method}: clean, with it, corrected" for method in methods), "clean, step"]
@@ -140,7 +141,7 @@ def table(found: list[dict[str, Any]]) -> str:
 
 
 def _cell(line: dict[str, Any] | None) -> str:
-    """PSNR, dB, clean, with the effect and corrected; and the share of the loss that is regained."""
+    """Returns the PSNR in dB, clean, with the effect and corrected, and the regained share of the loss."""
     if line is None:
         return ""
     stages = ", ".join(f"{line[key]:.2f}" for key in ("clean", "spoilt", "prepared"))
@@ -188,7 +189,7 @@ def main() -> None:
 
 
 def draw(path: Path, rt: Runtime, usual: dict[str, Any]) -> None:
-    """The middle slice of the jaw by FDK: with each effect, and corrected."""
+    """Draws the middle slice of the jaw by FDK: with each effect, and corrected."""
     from matplotlib.figure import Figure
 
     unseen = ("sparks 0.01 %", "rings 1 %", "drift 2 %", "120 kVp, water")

@@ -1,10 +1,10 @@
-"""What the usual steps of ``prepare`` cost clean scans, and what ``rings`` gives back where there are some.
+"""Measures what the usual steps of ``prepare`` cost clean scans, and what ``rings`` regains in scans that have rings.
 
     python benchmarks/prepare_clean.py docs/results/prepare_clean.jsonl --phantoms VOLUMES/cthead_128.h5 ...
 
-A line per volume, views, method and cell: a step on the clean scan, or rings of some percent. ``lost_db`` is 0 without a run
-where the step leaves the frames bit for bit. Lines that are there are not made again. docs/results/prepare.md has the table.
-"""
+There is a line per volume, views, method and cell: a step on the clean scan, or rings of some percent. Where the step leaves
+the frames bit for bit, ``lost_db`` is 0 without a run. Lines in the file are not made again. docs/results/prepare.md has the
+table."""
 
 import argparse
 from collections.abc import Iterator

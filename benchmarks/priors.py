@@ -4,8 +4,8 @@
     python docs/make_results.py      # the tables
 
 Scans are those of benchmarks/tables, with the photons of ``--doses`` and the numbers of ``--views``. All exposures of a
-fly-scan together cover one turn, unless it has 25 or 50 views. ``numbers`` of a line names what the prior was trained on.
-Runs that are in the file are not made again."""
+fly-scan together cover one turn, unless it has 25 or 50 views. ``numbers`` of a line is the data on which the prior was
+trained. Runs in the file are not made again."""
 
 import argparse
 import time
@@ -19,8 +19,8 @@ from phyradgs_cl.runtime import Runtime
 
 MOTIONS = {"still": Static(), "fly": PerRow()}
 KEYS = ("volume", "kind", "views", "dose", "size", "seed", "prior", "numbers")
-NUMBERS = {"ridge": "procedural"}  # what the numbers were trained on
-ARC_DEG = 360.0  # exposed by all views of a fly-scan together
+NUMBERS = {"ridge": "procedural"}  # the data on which the numbers were trained
+ARC_DEG = 360.0  # arc that all views of a fly-scan expose together
 
 
 def scan_of(rt: Runtime, path: Path | str, facts: dict[str, object]) -> Scan:

@@ -1,16 +1,16 @@
-"""Speed of the ray-driven projector and its adjoint: beside RTK's Joseph projectors, and by motion model.
+"""Measures the speed of the ray-driven projector and its adjoint, beside RTK's Joseph projectors and by motion model.
 
     python -m venv PEER && PEER/bin/pip install itk-rtk numpy
     python benchmarks/ray_speed.py --peer-python PEER/bin/python [--json docs/results/ray_speed.json] [--device D]
 
-The scanner: source 600 mm from the axis and 1200 mm from the detector, a full turn of 90 views of 128 x 128 pixels of
-4 mm, 128^3 voxels of 2 mm. Ours and RTK's operators run in turns; both from host arrays to host arrays. Figures are
-the smallest of all runs, for a random volume with a border of zeros (where RTK ends a volume half a voxel earlier) and
-random frames; results are compared away from that border. RTK's adjoint runs on one thread. Processor time, over all
-threads, tells more than wall time where the machine is not quiet. Motion models are compared with each other on a
-rolling shutter that exposes for half a view and reads for the other half; ``gapless`` exposes for a whole view. Panels that
-lean are rolled by 0.3 degrees and tilted by 0.5.
-"""
+The scanner has its source 600 mm from the axis and 1200 mm from the detector, with a full turn of 90 views of 128 x 128
+pixels of 4 mm, and 128^3 voxels of 2 mm. Ours and RTK's operators take turns, both from host arrays to host arrays. Times
+are the smallest of all runs. The volume is random with a border of zeros, because RTK ends a volume half a voxel earlier;
+frames are random. Results are compared away from that border. RTK's adjoint runs on one thread. Where the machine is busy,
+processor time over all threads says more than wall time.
+
+Motion models are compared with each other on a rolling shutter that exposes for half a view and reads for the other half;
+``gapless`` exposes for a whole view. Panels that lean are rolled by 0.3 degrees and tilted by 0.5."""
 
 import json
 import subprocess
@@ -31,7 +31,7 @@ from phyradgs_cl.operators import RayOperator
 from phyradgs_cl.runtime import Runtime
 
 VIEWS, PIXELS, VOXELS = 90, 128, 128
-BORDER = 2  # voxels
+BORDER = 2  # in voxels
 SID_MM, SDD_MM, PIXEL_MM, VOXEL_MM = 600.0, 1200.0, 4.0, 2.0
 EXPOSURE_S, READOUT_S, VIEW_S = 0.5, 0.5, 1.0
 ROLL_DEG, TILT_DEG = 0.3, 0.5
@@ -57,7 +57,7 @@ class Leaning:
 
 
 def tables(motion: str) -> list[TimeCells]:
-    """The cells of a full turn; ``still`` is a gantry at rest, as RTK knows it."""
+    """Returns the cells of a full turn. ``still`` is a gantry at rest, which is all that RTK knows."""
     geometry = ConeGeometry(SID_MM, SDD_MM, (PIXELS, PIXELS), (PIXEL_MM, PIXEL_MM))
     orbit: Trajectory = CircularOrbit(geometry, ConstantSpeed(0.0, 2 * np.pi / VIEWS / VIEW_S))
     if motion.endswith("leaning"):
@@ -119,7 +119,7 @@ class Peer:
         return self._answer()
 
     def result(self, name: str) -> np.ndarray:
-        """Frames, or a volume (z, y, x), of the last run."""
+        """Returns frames, or a volume (z, y, x), of the last run."""
         values = np.load(self.folder / f"{name}.npy")
         return values if name == "forward" else values.transpose(1, 2, 0)
 
@@ -150,7 +150,7 @@ def least(runs: list[Seconds]) -> Seconds:
 def beside_rtk(
     rt: Runtime, grid: Grid, volume: np.ndarray, python: str, repeats: int
 ) -> dict[str, dict[str, object]]:
-    """Seconds of both, their ratios and the relative RMS difference of their results, by operator."""
+    """Returns the seconds of both, their ratios, and the relative RMS difference of their results, by operator."""
     operator = RayOperator(rt, grid, (PIXELS, PIXELS), tables("still"))
     frames = np.random.default_rng(1).uniform(0, 1, operator.frames_shape).astype(np.float32)
     mine = {"forward": lambda: operator.forward(volume), "adjoint": lambda: operator.adjoint(frames)}
@@ -174,7 +174,7 @@ def beside_rtk(
 
 
 def by_motion(rt: Runtime, grid: Grid, volume: np.ndarray, repeats: int) -> dict[str, dict[str, Seconds]]:
-    """Seconds of forward and adjoint with every motion model, run in turns."""
+    """Returns the seconds of forward and adjoint with every motion model, run in turns."""
     operators = {motion: RayOperator(rt, grid, (PIXELS, PIXELS), tables(motion)) for motion in MOTIONS}
     frames = operators["static"].forward(volume)
     runs: dict[str, dict[str, list[Seconds]]] = {m: {"forward": [], "adjoint": []} for m in MOTIONS}

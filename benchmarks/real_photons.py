@@ -1,12 +1,12 @@
-"""Fly-scans of real photons: sums of neighbouring projections of dense real scans, with the dense scan as reference.
+"""Measures fly-scans of real photons: sums of projections of dense real scans, which are the reference.
 
     python benchmarks/real_photons.py RESULTS.jsonl DENSE.h5 ... [--counts 20] [--readouts 0,0.86] [--methods fista]
         [--side 640] [--rim 80,155] [--axis columns] [--times 0] [--passes 25]
 
-A scan is summed by ``sum_frames``: --counts projections a frame, read out at once or along --axis. The reference is the
-default method on every second projection, at rest. A line has the PSNR of a run against it in the ring --rim (voxels from
-the axis) and inside of it; the peak is the 99.9th percentile of the reference. It has the error on 2 % held-out pixels,
-and the rise of edges along the rotation in the ring. --side: voxels of the grid. A run that was interrupted continues."""
+A scan is made by ``sum_frames``, with --counts projections a frame, read out at once or along --axis. The reference is the
+default method on every second projection, at rest. A line has the PSNR of a run against the reference, in the ring --rim
+(voxels from the axis) and inside of it; the peak is the 99.9th percentile of the reference. It has the error on 2 % held-out
+pixels, and the rise of edges along the rotation in the ring. --side: voxels of the grid. An interrupted run continues."""
 
 import argparse
 import math
@@ -25,9 +25,9 @@ from phyradgs_cl.fields import Grid
 from phyradgs_cl.reconstructors.result import HELD_OUT
 from phyradgs_cl.runtime import Runtime
 
-_ANGLES = 4096  # of a circle
+_ANGLES = 4096  # samples of a circle
 _SIGMAS_PX = np.arange(0, 8, 0.05)
-_RISE = 2.563  # 10 to 90 % of a Gaussian's edge, in its standard deviations
+_RISE = 2.563  # rise of a Gaussian's edge from 10 to 90 %, in its standard deviations
 SPLATS = ("phyradgs", "r2")
 _PEAK = 99.9  # percentile of the reference: a dead pixel makes brighter dots
 
@@ -39,7 +39,7 @@ def wide(scan: Scan, side: int) -> Scan:
 
 
 def at_rest(scan: Scan, passes: int, rt: Runtime, path: Path) -> np.ndarray:
-    """The volume of every second projection, kept in a file beside the results."""
+    """Returns the volume of every second projection, which is kept in a file beside the results."""
     if not path.is_file():
         half = some_frames(scan, np.arange(0, scan.frames, 2))
         np.save(path, reconstruct(half, motion="static", iterations=passes, device=rt, report=False).volume)
@@ -53,8 +53,8 @@ def rings(shape: tuple[int, ...], rim: tuple[float, float]) -> dict[str, np.ndar
 
 
 def edge_rise_px(volume: np.ndarray, reference: np.ndarray, rim: tuple[float, float]) -> float:
-    """The 10 to 90 % rise along the rotation, in voxels, of what is an edge in the reference: that of the Gaussian whose
-    blur of the reference along the circles of the ring resembles the volume most."""
+    """Returns the 10 to 90 % rise along the rotation, in voxels, of the reference's edges in the volume. It is that of the
+    Gaussian whose blur of the reference along the circles of the ring resembles the volume most."""
     radius = np.arange(rim[0], rim[1])[:, None]
     angle = np.arange(_ANGLES) * 2 * np.pi / _ANGLES
     middle = (np.array(reference.shape[1:]) - 1) / 2

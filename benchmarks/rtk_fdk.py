@@ -1,4 +1,4 @@
-"""Compares FDK with RTK's on the same projections: difference, RTK's own quality limits, and speed as a ratio of one run.
+"""Compares FDK with RTK's on the same projections: difference, RTK's own quality limits, and the ratio of speeds.
 
     python -m venv PEER && PEER/bin/pip install itk-rtk numpy
     python benchmarks/rtk_fdk.py --peer-python PEER/bin/python [--json docs/results/rtk_fdk.json] [--device D]
@@ -7,8 +7,7 @@ The set-up is that of RTK's own tests, whose limits the table names: Shepp-Logan
 with its contrasts in 1/mm. The source is 600 mm from the axis and 1200 mm from the detector, with 128 x 128 pixels of 4 mm
 and 128^3 voxels of 2 mm. PSNR has the range 2, against the phantom at the voxels' centres. It counts the voxels that every
 view sees (displaced: that some view of every opposite pair sees). A second PSNR counts as RTK's tests do: over the whole
-cube, with no error outside that field of view.
-"""
+cube, with no error outside that field of view."""
 
 import subprocess
 import tempfile
@@ -35,7 +34,7 @@ PHANTOM = shepp_logan(116.0, "kak-slaney", 1.0)
 
 @dataclass(frozen=True)
 class Case:
-    """One comparison; offsets in mm along u and v, ``limit_db`` RTK's own."""
+    """One comparison. Offsets are in mm along u and v; ``limit_db`` is RTK's own."""
 
     name: str
     views: int
@@ -49,7 +48,7 @@ class Case:
         return np.deg2rad(self.arc_deg) * np.arange(self.views) / self.views
 
     def pose(self) -> np.ndarray:
-        """Poses (F, 12): the source moves along the detector's own axes, the detector stays."""
+        """Returns poses (F, 12). An offset moves the source along the detector's own axes; the detector stays."""
         shape, pitch = (PIXELS, PIXELS), (PIXEL_MM, PIXEL_MM)
         pose = ConeGeometry(DSO_MM, DSD_MM, shape, pitch, (0.0, self.detector_offset_mm)).pose(
             self.angles_rad
@@ -59,7 +58,7 @@ class Case:
         return pose
 
     def task(self, frames: np.ndarray, repeats: int) -> dict[str, Any]:
-        """What benchmarks/rtk_peer.py reads; RTK's (X, Y, Z) are (y, z, x) here, angles and stack the same."""
+        """Returns what benchmarks/rtk_peer.py reads. RTK's (X, Y, Z) are (y, z, x) here; angles and stack are the same."""
         return {
             "projections": frames,
             "gantry_deg": np.rad2deg(self.angles_rad),
@@ -85,14 +84,14 @@ CASES = (
 
 
 def projections(pose: np.ndarray) -> np.ndarray:
-    """Closed-form line integrals (F, rows, columns)."""
+    """Returns closed-form line integrals (F, rows, columns)."""
     targets = (pixel_centres(one, (PIXELS, PIXELS)) for one in pose)
     frames = [PHANTOM.line_integrals(one[:3], target) for one, target in zip(pose, targets, strict=True)]
     return np.stack(frames).astype(np.float32)
 
 
 def field_of_view(case: Case, pose: np.ndarray) -> np.ndarray:
-    """Voxels (z, y, x) whose rays are measured: by every view, or for a displaced detector by one of a pair."""
+    """Returns the voxels (z, y, x) whose rays are measured: by every view; for a displaced detector by one of a pair."""
     z, y, x = np.meshgrid(*GRID.axes_mm(), indexing="ij", sparse=True)
     seen = np.ones(GRID.shape, bool)
     for m in projection_matrices(pose[:: max(1, len(pose) // 36)]):
@@ -106,7 +105,7 @@ def field_of_view(case: Case, pose: np.ndarray) -> np.ndarray:
 
 
 def run_peer(python: str, task: dict[str, Any]) -> tuple[np.ndarray, list[list[float]], str]:
-    """RTK's volume in this project's axes (z, y, x), its seconds and processor seconds, its version."""
+    """Returns RTK's volume in this project's axes (z, y, x), its seconds and processor seconds, and its version."""
     with tempfile.TemporaryDirectory() as folder:
         given, result = Path(folder) / "task.npz", Path(folder) / "result.npz"
         np.savez(given, **task)
@@ -118,7 +117,7 @@ def run_peer(python: str, task: dict[str, Any]) -> tuple[np.ndarray, list[list[f
 
 
 def decibels(volume: np.ndarray, truth: np.ndarray, seen: np.ndarray, voxels: int | None = None) -> float:
-    """PSNR of range 2 over the voxels seen; their squared error spread over ``voxels`` where given."""
+    """Returns the PSNR of range 2 over the voxels seen. ``voxels``: spreads their squared error over so many instead."""
     squares = float(np.sum((volume[seen] - truth[seen]) ** 2))
     return float(10 * np.log10(4.0 * (voxels or np.count_nonzero(seen)) / squares))
 
@@ -147,14 +146,13 @@ def compare(rt: Runtime, python: str, case: Case) -> dict[str, Any]:
 
 
 def speed(rt: Runtime, python: str, rounds: int) -> dict[str, Any]:
-    """Best seconds of alternating runs, both from arrays in memory to an array in memory; processor time too.
+    """Returns the best seconds of alternating runs, both from arrays in memory to an array in memory, and processor time.
 
-    Processor time (all cores together) says more where other programs run at the same time.
-    """
+    Processor time (of all cores) says more where other programs run at the same time."""
     case = CASES[0]
     pose = case.pose()
     frames = projections(pose)
-    fdk_volume(rt, frames, pose, GRID)  # builds the kernels
+    fdk_volume(rt, frames, pose, GRID)  # this builds the kernels
     ours: list[list[float]] = []
     theirs: list[list[float]] = []
     for _ in range(rounds):

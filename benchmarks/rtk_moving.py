@@ -1,13 +1,14 @@
-"""RTK's own test of motion-compensated FDK, from its files, and its warped backprojection beside ours on the same field.
+"""Compares moving FDK with RTK's: on RTK's own test, from its files, and by warped backprojection with the same field.
 
     python -m venv PEER && PEER/bin/pip install itk-rtk numpy
     python benchmarks/rtk_moving.py --peer-python PEER/bin/python RESULTS.jsonl [--device D]
 
-own test: the scan is imported from RTK's geometry file and stack; a field file says how the inner sphere moves, and the
-command line reconstructs. Mean absolute error and PSNR (range 2) against the spheres in the middle. RTK's limits are 0.05
-and 22 dB. Also PSNR within 20 mm of the middle, because FDK's error elsewhere hides the motion.
-same field: a smooth random displacement at both ends of the cycle, for both programs. Largest difference of the volumes over
-their peak, and processor seconds of the best of three runs, of FDK as a whole."""
+own test: the scan is imported from RTK's geometry file and stack. A field file says how the inner sphere moves, and the
+command line reconstructs. Results are mean absolute error and PSNR (range 2) against the spheres in the middle. RTK's limits
+are 0.05 and 22 dB. PSNR within 20 mm of the middle is given too, because FDK's error elsewhere hides the motion.
+
+same field: both programs take a smooth random displacement at both ends of the cycle. Results are the largest difference of
+the volumes over their peak, and processor seconds of the best of three runs of the whole FDK."""
 
 import subprocess
 import sys
@@ -32,7 +33,7 @@ from phyradgs_cl.runtime import Runtime
 
 FRAMES, VOXEL_MM = 128, 2.0  # as in rtk_moving_peer.py
 GRID = Grid((32, 64, 64), (VOXEL_MM,) * 3)  # z, y, x are RTK's Y, X, Z
-NEAR_MM = 20.0  # of the middle, where the inner sphere moves
+NEAR_MM = 20.0  # from the middle, where the inner sphere moves
 PHASE = np.abs((4 + np.arange(FRAMES)) % 8 - 4) / 4  # 0 where the sphere is at -8 mm, 1 at 8 mm
 
 
@@ -61,13 +62,13 @@ def imported(folder: Path) -> Scan:
 
 
 def own_test(python: str, folder: Path) -> list[dict[str, object]]:
-    """RTK's own field is 8 mm within 31.5 mm, 0 outside; ours falls smoothly to 0 there."""
+    """Runs RTK's own test. RTK's field is 8 mm within 31.5 mm and 0 outside; ours falls smoothly to 0 there."""
     field = np.zeros((2, 64, 64, 64, 3), np.float32)
     field[..., 0] = np.array([-8.0, 8.0])[:, None, None, None]
     theirs, _ = run_peer(python, folder, field, 1.0, 1)
     scan = imported(folder)
     control_mm = np.zeros((1, 7, 7, 7, 3))
-    control_mm[..., 1] = -1.0  # matter that is shifted by s along y has the attenuation of the reference at y - s
+    control_mm[..., 1] = -1.0  # matter shifted by s along y has the attenuation of the reference at y - s
     times_s = scan.frame_start_s + scan.shutter.middle_s
     one = Deformation(control_mm, (-24.0,) * 3, 8.0, times_s, (16 * PHASE - 8)[:, None])
     write_scan(folder / "scan.h5", scan)
@@ -86,7 +87,7 @@ def own_test(python: str, folder: Path) -> list[dict[str, object]]:
 
 
 def same_field(rt: Runtime, python: str, folder: Path) -> dict[str, object]:
-    """Both take the displacement of a view as a blend of those at both ends of the cycle."""
+    """Compares both on one field. Both blend a view's displacement from those at the two ends of the cycle."""
     coarse = np.random.default_rng(0).normal(scale=4.0, size=(2, 5, 5, 5, 3))
     push_mm = np.stack([zoom(end, [n / 5 for n in GRID.shape] + [1], order=3) for end in coarse])  # z, y, x; x, y, z
     theirs, their_seconds = run_peer(python, folder, push_mm.transpose(0, 3, 1, 2, 4)[..., [1, 2, 0]], VOXEL_MM, 3)
@@ -97,12 +98,12 @@ def same_field(rt: Runtime, python: str, folder: Path) -> dict[str, object]:
     moving._push = ends.__getitem__  # type: ignore[method-assign, assignment]
     pose = np.concatenate([scan.trajectory.pose(f, scan.frame_start_s[f : f + 1]) for f in range(scan.frames)])
     seconds = []
-    for _ in range(4):  # the first builds kernels
+    for _ in range(4):  # the first run builds kernels
         started = time.process_time()
         ours = fdk_volume(rt, scan.projections, pose, GRID, moving=moving)
         seconds.append(time.process_time() - started)
     reach = np.ceil(np.abs(push_mm).max((0, 1, 2, 3))[::-1] / VOXEL_MM).astype(int)
-    inner = tuple(slice(n, -n) for n in reach)  # RTK leaves views out of which a voxel's matter is outside of the volume
+    inner = tuple(slice(n, -n) for n in reach)  # RTK leaves out views in which a voxel's matter is outside of the volume
     off = np.abs(ours - theirs)[inner]
     return {
         "case": "same field", "largest_difference": float(off.max() / np.abs(theirs).max()),

@@ -1,11 +1,11 @@
-"""RTK's motion-compensated FDK for benchmarks/rtk_moving.py. Needs itk-rtk and NumPy, nothing else.
+"""Runs RTK's motion-compensated FDK for benchmarks/rtk_moving.py. Needs only itk-rtk and NumPy.
 
     python rtk_moving_peer.py FOLDER TASK.npz RESULT.npz
 
-Writes the scan of RTK's own test as RTK's files into FOLDER (geometry.xml, projections.mha, signal.txt): a sphere of 60 mm,
-and in it a sphere of 8 mm that goes from -8 to 8 mm along X and back in eight frames. The task has `field`
-(2, Z, Y, X, 3) in mm, components X, Y, Z, of both ends of the cycle, `spacing_mm` of its voxels, and `repeats`. The result
-has the volume (Z, Y, X), and the seconds and processor seconds of every run."""
+It writes the scan of RTK's own test as RTK's files into FOLDER (geometry.xml, projections.mha, signal.txt): a sphere of 60
+mm that holds a sphere of 8 mm, which goes from -8 to 8 mm along X and back in eight frames. The task has `field` (2, Z, Y,
+X, 3) in mm, components X, Y, Z, of both ends of the cycle, `spacing_mm` of its voxels, and `repeats`. The result has the
+volume (Z, Y, X), and the seconds and processor seconds of every run."""
 
 import sys
 import time

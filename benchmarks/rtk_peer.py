@@ -1,11 +1,10 @@
-"""Runs RTK's FDK for benchmarks/rtk_fdk.py: one task in, one result out. Needs itk-rtk and NumPy, nothing else.
+"""Runs RTK's FDK for benchmarks/rtk_fdk.py: one task in, one result out. Needs only itk-rtk and NumPy.
 
     python rtk_peer.py TASK.npz RESULT.npz
 
-The task has RTK's geometry: lengths in mm, gantry angles in degrees, offsets (x, y); projections (F, rows, columns);
-a cube of `voxels` and `spacing_mm`. The result has the volume in RTK's own axes, (seconds, processor seconds) of every
-run, the version.
-"""
+The task has RTK's geometry (lengths in mm, gantry angles in degrees, offsets (x, y)), projections (F, rows, columns), and a
+cube of `voxels` and `spacing_mm`. The result has the volume in RTK's own axes, (seconds, processor seconds) of every run,
+and the version."""
 
 import importlib.metadata
 import sys
@@ -41,7 +40,7 @@ def geometry_of(task: Any) -> Any:
 def image_of(
     values: np.ndarray, spacing: tuple[float, float, float], centred: tuple[bool, bool, bool]
 ) -> Any:
-    """An ITK image of an array (z, y, x), centred about the origin along the axes (x, y, z) that say so."""
+    """Returns an ITK image of an array (z, y, x), centred about the origin along the axes (x, y, z) that ask for it."""
     image = itk.image_from_array(np.ascontiguousarray(values, np.float32))
     image.SetSpacing(spacing)
     count = values.shape[::-1]
@@ -50,7 +49,7 @@ def image_of(
 
 
 def reconstruct(task: Any) -> tuple[np.ndarray, tuple[float, float]]:
-    """The volume (RTK's Z, Y, X), the seconds and processor seconds for it, reading and wrapping not counted."""
+    """Returns the volume (RTK's Z, Y, X), and seconds and processor seconds for it. Reading and wrapping are not counted."""
     geometry = geometry_of(task)
     pixel = float(task["pixel_mm"])
     stack: Any = image_of(task["projections"], (pixel, pixel, 1.0), (True, True, False))

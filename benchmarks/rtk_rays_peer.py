@@ -1,11 +1,10 @@
-"""Runs RTK's Joseph projectors for benchmarks/ray_speed.py, one on each request. Needs itk-rtk and NumPy, nothing else.
+"""Runs RTK's Joseph projectors for benchmarks/ray_speed.py, one on each request. Needs only itk-rtk and NumPy.
 
     python rtk_rays_peer.py FOLDER
 
-FOLDER/task.npz has lengths in mm, gantry angles in degrees, a volume (Z, Y, X) and frames (F, rows, columns) in RTK's
-axes. Every line of standard input, ``forward`` or ``adjoint``, runs that operator once, keeps its result as
-FOLDER/NAME.npy and answers with a line of JSON: wall and processor seconds of the operator itself.
-"""
+FOLDER/task.npz has lengths in mm, gantry angles in degrees, a volume (Z, Y, X) and frames (F, rows, columns) in RTK's axes.
+Every line of standard input, ``forward`` or ``adjoint``, runs that operator once. It keeps the result as FOLDER/NAME.npy and
+answers with a line of JSON: wall and processor seconds of the operator itself."""
 
 import importlib.metadata
 import json
@@ -26,7 +25,7 @@ FILTERS = {
 
 
 def image_of(values: np.ndarray, spacing_mm: float, is_stack: bool) -> Any:
-    """An ITK image of an array (z, y, x) about the origin; frames of a stack are one apart."""
+    """Returns an ITK image of an array (z, y, x) about the origin. Frames of a stack are one apart."""
     image = itk.image_from_array(np.ascontiguousarray(values, np.float32))
     image.SetSpacing([spacing_mm, spacing_mm, 1.0 if is_stack else spacing_mm])
     origin = [-(n - 1) / 2 * spacing_mm for n in values.shape[::-1]]
@@ -42,7 +41,7 @@ def geometry_of(task: dict[str, np.ndarray]) -> Any:
 
 
 def run(name: str, task: dict[str, np.ndarray], geometry: Any) -> tuple[np.ndarray, dict[str, float]]:
-    """One operator from new images on, as RTK adds to its first input."""
+    """Runs one operator on new images, because RTK adds to its first input."""
     volume, frames = task["volume"], task["frames"]
     if name == "forward":
         inputs = (np.zeros_like(frames), task["pixel_mm"], True), (volume, task["voxel_mm"], False)

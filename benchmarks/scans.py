@@ -1,4 +1,4 @@
-"""What the benchmarks of whole reconstructions share: scans of a folder's volumes, and files of one line of JSON per run."""
+"""Functions that benchmarks of whole reconstructions share: scans of a folder's volumes, and files of JSON lines."""
 
 import argparse
 import json
@@ -21,11 +21,10 @@ RAPID = PROTOCOLS["rapid"]
 def make_scan(
     rt: Runtime, path: Path, size: int, seed: int, protocol: Protocol = RAPID, away: float = 1.0, aside: float = 0.0
 ) -> Scan:
-    """The scan of a volume file as benchmarks/tables makes it: R2-Gaussian's scanner, TIGRE's noise at 1e4 photons and σ 10.
+    """Returns the scan of a volume file as benchmarks/tables makes it: R2-Gaussian's scanner, TIGRE's noise (1e4, σ 10).
 
-    ``size`` counts the reference's voxels per side, half the detector's pixels; ``away`` multiplies the distances of source
-    and detector, which leaves the magnification; ``aside`` moves the panel along u by that share of its width.
-    """
+    size: the reference's voxels per side, half the detector's pixels. away: factor of the distances of source and detector,
+    which keeps the magnification. aside: moves the panel along u by this fraction of its width."""
     detector = 2 * size
     geometry = ConeGeometry(
         5.0 * away, 7.0 * away, (detector, detector), (4.0 / detector,) * 2, (0.0, 4.0 * aside)
@@ -35,7 +34,7 @@ def make_scan(
 
 
 def files_of(folder: str | Path, names: str | None, size: int) -> dict[str, Path]:
-    """Volumes as benchmarks/tables has them: those of ``names`` (with commas), else all; twice ``size`` voxels per side."""
+    """Returns volumes as for benchmarks/tables: those of ``names`` (with commas) or all, of twice ``size`` voxels."""
     try:
         return find_volumes(Path(folder), names.split(",") if names else None, size)
     except InputError as error:
@@ -43,7 +42,7 @@ def files_of(folder: str | Path, names: str | None, size: int) -> dict[str, Path
 
 
 def chosen(option: str, names: str, known: Iterable[str]) -> list[str]:
-    """The ``names`` of an option, with commas between; the script ends where one of them is not ``known``."""
+    """Returns the ``names`` of an option, which commas separate. The script ends where one of them is not ``known``."""
     asked = names.split(",")
     if unknown := set(asked) - set(known):
         raise SystemExit(f"{option}: found {', '.join(sorted(unknown))}; expected some of {', '.join(known)}")
@@ -51,7 +50,7 @@ def chosen(option: str, names: str, known: Iterable[str]) -> list[str]:
 
 
 def lines_of(path: Path) -> list[dict[str, object]]:
-    """``read_lines`` of a file that has to be there: the script ends where it is not."""
+    """Returns ``read_lines`` of a file. The script ends where the file does not exist."""
     if not path.is_file():
         raise SystemExit(f"{path}: found no such file; expected JSON lines; check the path")
     return read_lines(path)
@@ -70,7 +69,7 @@ def append(path: Path, line: dict[str, object]) -> None:
 
 
 def results_parser(text: str | None) -> argparse.ArgumentParser:
-    """A parser with a file of lines and a device."""
+    """Returns a parser with a file of lines and a device."""
     parser = argparse.ArgumentParser(description=text, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("results", type=Path, help="JSON lines, appended to; runs that it has are not made again")
     parser.add_argument("--device")
@@ -78,7 +77,7 @@ def results_parser(text: str | None) -> argparse.ArgumentParser:
 
 
 def runs_parser(text: str | None, names: str = "--names", seeds: str = "0") -> argparse.ArgumentParser:
-    """A parser with a folder of volumes, a file of lines, names of volumes, seeds, a device."""
+    """Returns a parser with a folder of volumes, a file of lines, names of volumes, seeds, and a device."""
     parser = argparse.ArgumentParser(description=text, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("volumes", type=Path, help="folder of volumes")
     parser.add_argument("results", type=Path, help="JSON lines, appended to; runs that it has are not made again")

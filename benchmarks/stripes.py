@@ -1,10 +1,9 @@
-"""What stripes cost a parallel-beam scan of many views, and what steps of ``prepare`` give back: PSNR of FBP's volume.
+"""Measures what stripes cost a parallel scan of many views, and what steps of ``prepare`` regain: PSNR of FBP's volume.
 
     python benchmarks/stripes.py docs/results/stripes.jsonl --views 180 720 1800
 
-A line per object, number of views, kind of stripes and steps. Lines that are there are not made again. The table is in
-docs/results/prepare.md. ``pip install algotom`` adds its filters, by the widths of their medians.
-"""
+There is a line per object, number of views, kind of stripes and steps. Lines in the file are not made again. The table is in
+docs/results/prepare.md. ``pip install algotom`` adds its filters, with medians of two widths."""
 
 import argparse
 from dataclasses import replace
@@ -33,11 +32,11 @@ STEPS: dict[str, dict[str, Any]] = {
     "": {}, "dead,rings": {}, "stripes": {}, "dead,rings,stripes": {}, "every column": {"stripes": {"ratio": 0}}
 }  # fmt: skip
 ALGOTOM = {"algotom": (51, 21), "algotom, narrow": (21, 5)}
-"""Widths of the medians of ``remove_all_stripe``, in columns: its own, and the best of some on these scans."""
+"""Widths of the medians of ``remove_all_stripe`` in columns: its own defaults, and the best of some on these scans."""
 
 
 def scan_of(name: str, views: int) -> Scan:
-    """A full turn at rest, with photon noise."""
+    """Returns a full turn at rest, with photon noise."""
     body = EllipsoidPhantom(tuple(Ellipsoid((x, y, z), (a, b, c), mu) for mu, x, y, z, a, b, c in OBJECTS[name]), name)
     geometry = ParallelGeometry((ROWS, COLUMNS), WIDTH_MM / COLUMNS)
     angle_rad, start_s = 2 * np.pi * np.arange(views) / views, np.arange(views, dtype=np.float64)
@@ -52,8 +51,8 @@ def scan_of(name: str, views: int) -> Scan:
 
 
 def spoilt(frames: np.ndarray, kind: str) -> np.ndarray:
-    """Line integrals (F, v, u) with stripes: gains of 2 % in all pixels; eight columns 5 % off, in all views or in two
-    fifths of them; three columns stuck at one value, or with a noise of 0.3; two bands of 7 columns 5 % off."""
+    """Returns line integrals (F, v, u) with stripes of a kind: gains of 2 % in all pixels; eight columns 5 % off, in all
+    views or in two fifths of them; three columns that repeat one value, or have a noise of 0.3; two bands of 7 columns."""
     rng, bad = np.random.default_rng(3), frames.copy()
     views, rows, _ = frames.shape
     columns = np.array([35, 60, 84, 110, 150, 166, 200, 213])  # none is the mirror image of another

@@ -1,14 +1,13 @@
-"""How near a default of ``fista`` comes to the best of a sweep: the weight that it takes from the data, or its passes.
+"""Measures how near a default of ``fista`` comes to the best of a sweep: its prior's weight, or its number of passes.
 
     python benchmarks/sweep.py VOLUMES docs/results/prior_weight.jsonl
     python benchmarks/sweep.py VOLUMES docs/results/passes.jsonl --option iterations --holdout 2
     python docs/make_results.py      # the tables of both in docs/results/settings.md
 
-Writes a line per volume, scan and factor: the PSNR in dB with ``factor`` times the default of the option. ``--holdout`` adds
-the error on that percentage of the pixels, which the run does not see. Runs of the file are not made again. Scans are those
-of benchmarks/tables with other ``--dose`` and ``--views``. Weights are swept with 30 passes on the scan's own voxels
-(``subvoxels`` 1), passes with the other defaults.
-"""
+There is a line per volume, scan and factor: the PSNR in dB with ``factor`` times the default of the option. ``--holdout``
+adds the error on that percentage of the pixels, which the run does not see. Runs in the file are not made again. Scans are
+those of benchmarks/tables with other ``--dose`` and ``--views``. Weights are swept with 30 passes on the scan's own voxels
+(``subvoxels`` 1), passes with the other defaults."""
 
 import argparse
 from itertools import product
@@ -24,12 +23,12 @@ from phyradgs_cl.runtime import Runtime
 MOTIONS = {"still": Static(), "fly": PerRow()}
 PROTOCOLS = {25: "rapid", 50: "standard"}
 USUAL = {"prior_weight": {"subvoxels": 1, "iterations": 30}, "iterations": {}}
-"""What else is set where an option is swept."""
+"""Further options of a run in which an option is swept."""
 SCAN = ("kind", "views", "dose", "size", "pixels")
 
 
 def scan_of(rt: Runtime, path: Path, size: int, pixels: int, kind: str, views: int, dose: float, seed: int) -> Scan:
-    """A scan of a volume's file: still, or of the protocol with so many views."""
+    """Returns a scan of a volume's file: still, or of the protocol with so many views."""
     protocol = "static" if kind == "still" else PROTOCOLS[views]
     usual = {"size": size, "detector": pixels, "noise": "tigre", "dose": dose, "seed": seed, "device": rt}
     return simulate(path, protocol=protocol, views=views if kind == "still" else None, **usual)  # type: ignore[arg-type]

@@ -1,4 +1,4 @@
-"""Error and cost of the ways to project a moving gantry: static, M×N micro-views, and splats exact in time.
+"""Measures error and cost of three ways to project a moving gantry: static, M×N micro-views, and splats exact in time.
 
     python benchmarks/time_exact.py [--detector 512] [--gaussians 20000] [--repeats 7] [--device D] [--json FILE]
 
@@ -35,9 +35,9 @@ from phyradgs_cl.simulation import phantom_scene
 MICRO_VIEWS = ((8, 5), (16, 5), (16, 15))
 BOUNDS = (0.02, 0.01, 0.007, 0.005, 0.002, 0.001)
 SEGMENTS = (2, 3, 4, 6, 8)
-SCALES = (0.008, 0.03)  # of the cloud that is timed
-FINE_BOUND = 0.001  # of the rules, where K is given
-_FOOTPRINTS = 12_000_000  # of Gaussians in cells at one time, for the reference
+SCALES = (0.008, 0.03)  # scales of the timed cloud
+FINE_BOUND = 0.001  # bound of the rules, where K is given
+_FOOTPRINTS = 12_000_000  # Gaussians in cells at one time, for the reference
 
 
 @dataclass(frozen=True)
@@ -61,7 +61,7 @@ def models_of(where: tuple) -> list[Model]:
 
 
 def shepp_logan_cloud(rt: Runtime, geometry: ConeGeometry, count: int, edge: int = 64) -> np.ndarray:
-    """Gaussians (11, G) drawn from a voxelised Shepp-Logan head as the first cloud of a reconstruction is."""
+    """Returns Gaussians (11, G) drawn from a voxelised Shepp-Logan head, as the first cloud of a reconstruction is."""
     grid = Grid.cube(edge, 2.0)
     scene = phantom_scene(rt, "shepp-logan", geometry, grid, edge, "rows", 0)
     usual = {"threshold": 0.05, "density_share": 0.15, "scale_bounds": (0.001, 1.0), "scale_factor": 1.0}
@@ -71,7 +71,7 @@ def shepp_logan_cloud(rt: Runtime, geometry: ConeGeometry, count: int, edge: int
 
 
 def reference_frame(rt: Runtime, rows: np.ndarray, table: TimeCells, width: int) -> np.ndarray:
-    """The frame (lines, width) of a table with many cells, a batch of Gaussians at a time."""
+    """Returns the frame (lines, width) of a table with many cells, a batch of Gaussians at a time."""
     projector, cells = SplatProjector(rt, table.lines, width), DeviceCells.upload(rt, table)
     step = max(_FOOTPRINTS // table.count // 16, 1) * 16
     frame = np.zeros((table.lines, width))
@@ -87,7 +87,7 @@ def relative(found: np.ndarray, expected: np.ndarray) -> float:
 def errors(
     rt: Runtime, models: list[Model], reference: TimeCells, clouds: list[np.ndarray]
 ) -> dict[str, float]:
-    """Mean over the clouds of each model's relative error."""
+    """Returns the mean over the clouds of each model's relative error."""
     width = reference.lines
     expected = [reference_frame(rt, rows, reference, width) for rows in clouds]
     found = {}
@@ -123,7 +123,7 @@ class Bench:
                 self.best[name] = min(self.best[name], seconds)
 
     def _seconds(self, call: Callable[[], None]) -> float:
-        """Processor time on CPUs, kernel time on GPUs."""
+        """Returns processor time on CPUs, kernel time on GPUs."""
         self.rt.kernel_seconds()
         started = time.process_time()
         call()

@@ -3,8 +3,8 @@
     python benchmarks/times_per_exposure.py VOLUMES docs/results/times_per_exposure.jsonl --counts 5 9 --names cthead
     python docs/make_results.py      # the table
 
-Scans are those of ``priors.py``. A line per volume, scan, method and count; ``moved_voxels``: how far the rim moves in an
-exposure. Runs that are in the file are not made again."""
+Scans are those of ``priors.py``. There is a line per volume, scan, method and count. ``moved_voxels``: the travel of the rim
+in an exposure. Runs in the file are not made again."""
 
 import argparse
 import time

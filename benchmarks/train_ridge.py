@@ -1,14 +1,16 @@
-"""The numbers of the prior ``ridge``: one step down a weakly convex ridge regulariser, with the least error on smooth noise.
+"""Trains the numbers of the prior ``ridge``: one step of a weakly convex ridge regulariser, with the least error.
 
     python benchmarks/train_ridge.py data/ridge.json
     python benchmarks/train_ridge.py other.json --volumes A.h5 B.h5
 
 The step takes G(v) = Wᵀ g(W v) from a volume v (Goujon, Neumayer and Unser, SIAM J. Imaging Sci. 17 (2024) 91). W is two
-convolutions of 3³, from 1 to 4 to 16 channels, whose product has zero mean. At noise of deviation σ
+convolutions of 3³ voxels, from 1 to 4 to 16 channels, whose product has zero mean. At noise of deviation σ
 g_i(t) = a_i clip(t, ± σ k_i) − b_i clip(t, ± σ l_i). Σ b_i |Ŵ_i|² ≤ 1 at all frequencies, so the regulariser plus ½‖x‖² is
 convex. Every cube counts by the logarithm of its squared error. The noise is smooth, as on the smaller voxels of ``fista``,
-which the pixels do not resolve. Without ``--volumes``, cubes come from procedural volumes that this script draws, and from
-phantoms: solids with texture, foams, vessels, foot, jaw. Needs PyTorch, which the extra ``neural`` installs."""
+which the pixels do not resolve.
+
+Without ``--volumes``, cubes come from procedural volumes that this script draws, and from phantoms: solids with texture,
+foams, vessels, foot, jaw. Needs PyTorch, which the extra ``neural`` installs."""
 
 import argparse
 import json
@@ -25,15 +27,15 @@ from phyradgs_cl.importers import load_attenuation
 from phyradgs_cl.metrics.align import block_means
 from phyradgs_cl.phantoms import make_phantom
 
-NOISES = (0.008, 0.016, 0.03, 0.05)  # σ, of a volume's range
+NOISES = (0.008, 0.016, 0.03, 0.05)  # σ over a volume's range
 CUBE = 32  # voxels per side
 DRAWN = 128  # voxels per side of procedural volumes, before means of 2³
-MIDDLE, FILTERS = 4, 16  # channels
-TAPS = 3  # along an axis, of either convolution
+MIDDLE, FILTERS = 4, 16  # channels of the two convolutions
+TAPS = 3  # along an axis, in either convolution
 RIM = 2 * (TAPS - 1)  # voxels at a cube's faces that lack some filters
-FREQUENCIES = 16, 48  # along an axis, where the gains of filters are computed: in training, for the file
-NOISE_WIDTH = 0.8  # voxels, of the Gaussian that smooths the noise
-MARGIN = 0.97  # share of b in the file: rounding and more frequencies keep the bound
+FREQUENCIES = 16, 48  # along an axis, where the gains of filters are computed: in training, and for the file
+NOISE_WIDTH = 0.8  # standard deviation, in voxels, of the Gaussian that smooths the noise
+MARGIN = 0.97  # fraction of b in the file, so that rounding and more frequencies keep the bound
 BATCH, RATE = 8, 0.01  # cubes of a step, and Adam's first rate
 
 
@@ -188,7 +190,7 @@ def train(ridge: Ridge, cubes: torch.Tensor, steps: int, draw: torch.Generator) 
 
 
 def errors(ridge: Ridge, cubes: torch.Tensor, sigma: torch.Tensor, draw: torch.Generator) -> torch.Tensor:
-    """Returns the mean square errors of cubes with noise, in σ²."""
+    """Returns the mean square errors of cubes with noise, over σ²."""
     noisy = cubes + sigma * smooth_noise(cubes.shape, draw)
     return ((ridge(noisy, sigma) - inside(cubes)) / sigma).square().mean((1, 2, 3, 4))
 
@@ -231,7 +233,7 @@ def main() -> None:
 
 
 def write(path: Path, ridge: Ridge, origin: str) -> None:
-    """Writes the numbers in thousandths, with the bounds of the curvature of the regulariser from above and below."""
+    """Writes the numbers in thousandths, with bounds of the regulariser's curvature from above and below."""
     with torch.no_grad():
         numbers = ridge.numbers()
         numbers["slope_down"] = MARGIN * numbers["slope_down"]

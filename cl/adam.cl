@@ -1,5 +1,5 @@
-/* Activations and one step of Adam on the raw parameters of all Gaussians: the chain through softplus,
-   bounded sigmoid and normalisation, the density term of the objective, the moments, the step.
+/* Activations and one step of Adam on the raw parameters of all Gaussians: the chain through softplus, bounded sigmoid and
+   normalisation, the density term of the objective, the moments, and the step.
    Twins: fields/gaussians.py and optim/adam.py. */
 #include "common/gaussian.h"
 
@@ -30,11 +30,11 @@ __kernel void activate(
     V_STORE(softplus(V_LOAD(r + 10 * (size_t)stride)), g + 10 * (size_t)stride);
 }
 
-/* dL/dparameter -> dL/draw, in place; adds the regulariser whose gradient needs no image. */
+/* Turns dL/dparameter into dL/draw in place, and adds the regulariser whose gradient needs no image. */
 __kernel void chain_activations(
     __global const float *raw, __global const float *gaussians, const int count, const int stride,
     const float scale_min, const float scale_max,
-    const float density_weight,      /* weight / count of the mean density */
+    const float density_weight,      /* weight of the mean density, over the count */
     __global float *gradients,       /* (13, stride) */
     __global float *statistics)      /* (2, stride): sum of centre-gradient norms, iterations in view */
 {
@@ -71,7 +71,7 @@ __kernel void chain_activations(
 
 __kernel void adam_step(
     __global float *raw, __global const float *gradients, __global float *moments, /* (2, 11, stride) */
-    const int stride, const float16 rates,      /* (11,) of them count, bias corrections folded in */
+    const int stride, const float16 rates,      /* 11 of them count, with bias corrections */
     const float beta1, const float beta2, const float epsilon)
 {
     const int first = (int)get_global_id(0) * LANES, row = (int)get_global_id(1);

@@ -1,7 +1,7 @@
 /* Voxel-driven backprojection with FDK's distance weight: bilinear in the filtered projections, zero outside them.
-   All kernels add to the volume, view after view, so that the bits do not tell how many launches there were. The volume may
+   All kernels add to the volume, view after view, so that the bits do not depend on the number of launches. The volume may
    be a brick of the grid, with its first voxel at `origin`. Twins: operators/twins/backproject.py.
-     backproject          any pose; a work-item takes LANES voxels along x and walks the views
+     backproject          any pose; a work-item takes LANES voxels along x and loops over the views
      backproject_upright  detector columns parallel to the volume's z; a work-item takes a column of voxels
      backproject_leaning  columns that lean a little, as every calibrated panel's do
      backproject_lines    every line of a frame has its own pose (rolling shutter); a work-item takes
@@ -9,14 +9,14 @@
 #include "common/lanes.h"
 #include "common/line_backprojection.h"
 
-/* FDK's weight of a sample; with DISTANCE_POWER 1 the angle that a voxel turns by per radian of the source */
+/* FDK's weight of a sample. With DISTANCE_POWER 1 it is the angle by which a voxel turns per radian of the source. */
 #if DISTANCE_POWER == 1
 #define BY_DISTANCE(weight, inv) (weight) * (inv)
 #else
 #define BY_DISTANCE(weight, inv) (weight) * (inv) * (inv)
 #endif
 
-/* Samples of a row, or a turned image's column, at several places, of which two vectors hold all, or by gathers. */
+/* Samples at several places of a row, or of a transposed image's column: by lookup in two vectors, or by gathers. */
 #ifdef V_LOOKUP
 #define COLUMN_SAMPLES(column, least, place, wv, fits)                                                       \
     ((fits) ? lerp_lookup(V_LOAD((column) + (least)), V_LOAD((column) + (least) + LANES), (place) - (least), wv) \
@@ -56,7 +56,7 @@ __kernel void backproject(
         const vf u = (m[0] * x + (m[1] * y + m[2] * z + m[3])) * inv;
         const vf v = (m[4] * x + (m[5] * y + m[6] * z + m[7])) * inv;
         const vi inside = (u >= 0.0f) & (u <= (float)(width - 1)) & (v >= 0.0f) & (v <= (float)(rows - 1)) & (depth > 0.0f);
-        /* picked before they become integers: outside they may be too large for one */
+        /* Places outside may be too large for an integer, so the choice comes before the cast. */
         const vf us = V_PICK(0.0f, u, inside), vs = V_PICK(0.0f, v, inside);
         const vi column = min(V_INT(us), max(width - 2, 0)), row = min(V_INT(vs), max(rows - 2, 0));
         const vf wu = us - V_FLOAT(column), wv = vs - V_FLOAT(row);
@@ -67,14 +67,14 @@ __kernel void backproject(
         const vf upper = below + wu * (above - below);
         sum += V_PICK(0.0f, BY_DISTANCE(weights[f], inv) * (lower + wv * (upper - lower)), inside);
     }
-    /* the last vector may reach into the guard, where it must leave zeros */
+    /* The last vector may reach into the guard, where it must leave zeros. */
     V_STORE(V_PICK(0.0f, sum, V_IOTA < (float)(shape.x - first)), target);
 }
 
 #ifdef COLUMN_ROWS
-/* Along z the detector column and the depth stay and v is linear: two columns are blended once for LANES voxels, or, where
-   those meet more rows than two vectors hold, for all. Images are transposed: (columns, pitch) with v along a row. The host
-   sees to it that a block of voxels along z meets at most COLUMN_ROWS rows. */
+/* Along z the detector column and the depth are constant and v is linear. Two columns are blended once for LANES voxels, or
+   for all voxels where these meet more rows than two vectors hold. Images are transposed: (columns, pitch) with v along a
+   row. The host limits blocks of voxels along z to at most COLUMN_ROWS rows. */
 __kernel void backproject_upright(
     __global const float *projections, __global const float *matrices, __global const float *weights,
     const int views, const int rows, const int width, const int image_pitch, const long image_step,
@@ -128,13 +128,13 @@ __kernel void backproject_upright(
             continue;
         const float v_start = start + step * z_start, v_last = start + step * (z_stop - 1);
         const int base = clamp((int)fmin(v_start, v_last), 0, max(rows - 2, 0));
-        const int stop = min((int)fmax(v_start, v_last), rows - 1) + 2; /* row `rows` is the guard's zeros */
+        const int stop = min((int)fmax(v_start, v_last), rows - 1) + 2; /* row `rows` is in the guard, with zeros */
         for (int v = base; v < stop; v += LANES)
             V_STORE(low * V_LOAD(a + v) + high * V_LOAD(b + v), blended + (v - base));
         const float shift = start - base;
         for (int z = z_start; z < z_stop; ++z) {
             const float v = shift + step * z;
-            const int row = (int)v; /* rounding may leave v a hair below 0, where the cast still gives 0 */
+            const int row = (int)v; /* rounding may leave v just below 0, where the cast still gives 0 */
             sum[z] += blended[row] + (v - row) * (blended[row + 1] - blended[row]);
         }
     }
@@ -142,10 +142,10 @@ __kernel void backproject_upright(
         target[z * slice] = sum[z];
 }
 
-#define EVEN_DEPTH 0.02f   /* change of the depth along a block of voxels, relative to the depth */
+#define EVEN_DEPTH 0.02f   /* largest change of the depth along a block of voxels, over the depth */
 #define VOXEL_MARGIN 0.01f /* voxels: more than the rounding of where a column of voxels enters or leaves a view */
 
-/* Narrows the z between low and high to those where start + per_z z >= 0. */
+/* Narrows the range of z between low and high to where start + per_z z >= 0. */
 ALWAYS_INLINE float2 narrowed(const float2 within, const float start, const float per_z)
 {
     const float root = -start / per_z;
@@ -154,8 +154,8 @@ ALWAYS_INLINE float2 narrowed(const float2 within, const float start, const floa
     return per_z > 0.0f ? (float2)(fmax(within.x, root), within.y) : (float2)(within.x, fmin(within.y, root));
 }
 
-/* As backproject_upright, where the detector column, the depth and the rows change a little along z: LANES voxels lie between
-   two detector columns, or pass from one to the next. */
+/* As backproject_upright, but the detector column, the depth and the rows change a little along z. LANES voxels lie between
+   two detector columns, or pass from one column to the next. */
 __kernel void backproject_leaning(
     __global const float *projections, __global const float *matrices, __global const float *weights,
     const int views, const int rows, const int width, const int image_pitch, const long image_step,
@@ -186,7 +186,7 @@ __kernel void backproject_leaning(
         const int start = (int)clamp(seen.x - VOXEL_MARGIN, 0.0f, (float)count) / LANES * LANES;
         const int stop = (int)clamp(seen.y + VOXEL_MARGIN + 1.0f, 0.0f, (float)count);
         __global const float *image = projections + f * image_step + IMAGE_GUARD;
-        /* where the depth hardly changes its inverse is nearly linear, and a Newton step leaves 1e-8 of it */
+        /* Where the depth hardly changes its inverse is nearly linear, and a Newton step leaves 1e-8 of it. */
         const float inv_0 = 1.0f / depth_0, per_z = (1.0f / fma((float)count, m[10], depth_0) - inv_0) / (float)count;
         const int is_even = fabs((float)count * m[10]) <= EVEN_DEPTH * depth_0;
         const int rises = m[2] * depth_0 > u_0 * m[10]; /* u along z */
@@ -212,7 +212,7 @@ __kernel void backproject_leaning(
             const vi row = min(V_INT(vs), last_row);
             const vf wv = vs - V_FLOAT(row);
             int column = own, to = own;
-            if (LANES == 1 || end >= until) { /* without a memory of the last column a compiler makes its own vectors */
+            if (LANES == 1 || end >= until) { /* without this test of LANES a compiler makes vectors of its own */
                 const float u0 = clamp(V_FIRST(u), 0.0f, u_most), u1 = clamp(V_LAST(u), 0.0f, u_most);
                 own = min((int)u1, last_column);
                 column = min(own, (int)u0);
@@ -245,7 +245,7 @@ __kernel void backproject_leaning(
 }
 #endif
 
-/* Samples of a line at places u, 0 outside. */
+/* Samples of a line at places u; 0 outside the line. */
 ALWAYS_INLINE vf samples_of(__global const float *line, const vf u, const int width)
 {
     const vf most = (vf)(width - 1);
@@ -257,7 +257,7 @@ ALWAYS_INLINE vf samples_of(__global const float *line, const vf u, const int wi
     return V_PICK(0.0f, COLUMN_SAMPLES(line, least, place, us - V_FLOAT(place), fits), inside);
 }
 
-/* A vector of voxels lies along the lines, so that one line or two see all of it. */
+/* A vector of voxels lies along the lines, so that one or two lines see all of it. */
 #ifdef ALONG_Z
 #define STRETCHED(begin) (begin).z *= LANES
 #define X_OF(first) ((vf)((first).x))
@@ -277,7 +277,7 @@ __kernel void backproject_lines(
     __global const float *weights,     /* (views,) */
     const int views, const int lines, const int width, const int image_pitch, const long image_step,
     const int4 shape, const int4 origin, const int volume_pitch,
-    const int filtered_across, /* 1 where the ramp filter ran across lines: readout along columns */
+    const int filtered_across, /* 1 where the ramp filter acted across lines: readout along columns */
     __global float *volume)
 {
     int4 begin = (int4)(get_global_id(0), get_global_id(1), get_global_id(2), 0);
@@ -309,7 +309,7 @@ __kernel void backproject_lines(
         const int of_b = line_seeing(table, lines, of_a, b.x, b.y, b.z, &t, &speed, &depth1, &next1);
         const int is_in_front = depth0 > 0.0f && next0 > 0.0f && depth1 > 0.0f && next1 > 0.0f;
         const int from = is_in_front ? min(of_a, of_b) : 0, to = is_in_front ? max(of_a, of_b) : last;
-        vi waits = V_IOTA < (float)count; /* lanes that no line has served */
+        vi waits = V_IOTA < (float)count; /* lanes that have not found their line */
         for (int line = from; line <= to && V_ANY(waits); ++line) {
             __global const float *m = table + (size_t)line * 12, *n = m + step, *pixels = image + (size_t)line * image_pitch;
             const vf depth = PROJECTED(m, 2), next_depth = PROJECTED(n, 2);

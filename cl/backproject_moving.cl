@@ -1,13 +1,13 @@
-/* FDK's backprojection of an object that moves, and where its matter is. A voxel x of the reference is, at a view's time, at
-   x + u(x). u is blended of the displacements of two states by the view's share of the second. In other respects as
-   backproject.cl. Twins: operators/twins/rays.py.
+/* FDK's backprojection of an object that moves, and the places of its matter. A voxel x of the reference is at x + u(x) at a
+   view's time. u is blended from the displacements of two states, by the view's share of the second state. Otherwise the
+   kernels are those of backproject.cl. Twins: operators/twins/rays.py.
      push_displacement       u of one state, from u(x) = -w(x + u(x)); a work-item takes LANES voxels along x
-     backproject_moving      any pose; a work-item takes LANES voxels along x and walks the views
+     backproject_moving      any pose; a work-item takes LANES voxels along x and loops over the views
      backproject_lines_moving  every line of a frame has its own pose; a work-item takes one voxel */
 #include "common/lanes.h"
 #include "common/line_backprojection.h"
 
-#define PUSH_CLOSE 1e-4f /* voxels: where the fixed point ends */
+#define PUSH_CLOSE 1e-4f /* voxels: a step this short ends the fixed point */
 
 static inline vf lerp(const vf low, const vf high, const vf share) { return low + share * (high - low); }
 
@@ -17,7 +17,7 @@ static inline vf lerp(const vf low, const vf high, const vf share) { return low 
 #define V_BETWEEN(v, last) clamp((v), (vf)(0.0f), (vf)((float)(last)))
 #endif
 
-/* trilinear in (nz, ny, nx), whose faces continue outside */
+/* Trilinear interpolation in (nz, ny, nx). Outside, the faces' values continue. */
 static inline vf sample_at(__global const float *field, const int4 shape, const vf x, const vf y, const vf z)
 {
     const vf px = V_BETWEEN(x, shape.x - 1), py = V_BETWEEN(y, shape.y - 1), pz = V_BETWEEN(z, shape.z - 1);
@@ -36,9 +36,9 @@ static inline vf sample_at(__global const float *field, const int4 shape, const 
 
 __kernel void push_displacement(
     __global const float *pull, /* (3: x y z, wide) voxels: w on a wider grid, with zeros for a vector's end */
-    const int4 wide, const int4 margin, /* its voxels; the place of the grid's first voxel in it */
+    const int4 wide, const int4 margin, /* the voxels of pull; the place of the grid's first voxel in it */
     const int4 shape, const int most_steps,
-    __global float *push)       /* (3, shape), and room for a vector's end */
+    __global float *push)       /* (3, shape), with room for a vector's end */
 {
     const int first = (int)get_global_id(0) * LANES, y = get_global_id(1), z = get_global_id(2);
     if (first >= shape.x)
@@ -70,17 +70,17 @@ __kernel void push_displacement(
     }
 }
 
-/* The displacement of two states at LANES voxels along an axis, and of a view between them. */
+/* Displacements of two states at LANES voxels along an axis, and of a view between the states. */
 #define TWO_STATES(name, axis)                                                   \
     const vf name##_0 = V_LOAD(first_push + axis * voxels + voxel);              \
     const vf name##_1 = V_LOAD(second_push + axis * voxels + voxel) - name##_0;
 
 __kernel void backproject_moving(
     __global const float *projections, __global const float *matrices,
-    __global const float2 *weights, /* (views,) weight, and share of the second state */
+    __global const float2 *weights, /* (views,): weight, and share of the second state */
     const int views, const int rows, const int width, const int image_pitch, const long image_step,
     const int4 shape, const int4 origin, const int volume_pitch,
-    __global const float *first_push, __global const float *second_push, /* (3: x y z, grid) voxels, and room for a vector */
+    __global const float *first_push, __global const float *second_push, /* (3: x y z, grid) voxels, with room for a vector */
     const int4 grid,
     __global float *volume)
 {

@@ -1,12 +1,12 @@
-/* Which splats touch which tile: a stable counting sort without atomics. Chunks of splats are counted per
-   tile, the counts are summed up, then every chunk writes the indices of its splats; the order in a list is the order of
-   the splats, so sums over a list always run the same way.
+/* Lists which splats touch which tile, by a stable counting sort without atomics. Chunks of splats are counted per tile, the
+   counts are summed up, then every chunk writes the indices of its splats. A list has the order of the splats, so sums over
+   a list always add in the same order.
    On CPUs a work-item takes a chunk (bin_count, bin_fill) or a tile (bin_within); bin_starts is one work-item.
-   On GPUs, with _group, a group takes a chunk, with a work-item per splat, or a tile; bin_starts_group is one group. */
+   On GPUs (_group) a group takes a chunk, with a work-item per splat, or a tile; bin_starts_group is one group. */
 #include "common/group_sums.h"
 
 __kernel void bin_count(
-    __global const int *extents, /* (6, stride): lo and hi along x, y, z; empty when hi < lo */
+    __global const int *extents, /* (6, stride): lo and hi along x, y, z; empty where hi < lo */
     const int stride, const int count, const int chunk, const int chunks,
     const int4 tile,             /* tile size along x, y, z */
     const int4 tiles,            /* number of tiles along x, y, z */
@@ -32,7 +32,7 @@ __kernel void bin_count(
     }
 }
 
-/* per tile: counts become positions within the tile, totals go to tile_offsets[tile + 1] */
+/* For each tile, counts become positions within the tile, and the total goes to tile_offsets[tile + 1]. */
 __kernel void bin_within(const int total, const int chunks, __global int *counts, __global int *tile_offsets)
 {
     const int t = (int)get_global_id(0);
@@ -47,7 +47,7 @@ __kernel void bin_within(const int total, const int chunks, __global int *counts
     tile_offsets[t + 1] = sum;
 }
 
-/* stays at the largest int where there are more indices than it can count: the host raises an error */
+/* The number stays at the largest int where there are more indices: the host then raises an error. */
 __kernel void bin_starts(const int total, __global int *tile_offsets)
 {
     if (get_global_id(0) > 0)
@@ -88,7 +88,7 @@ __kernel void bin_fill(
     }
 }
 
-/* lowest and highest tile of the item's splat along x, y, z into `boxes` (6, items), none without a splat */
+/* Writes the lowest and highest tile of the item's splat along x, y, z into `boxes` (6, items); empty without a splat. */
 ALWAYS_INLINE void share_box(
     __global const int *extents, const int stride, const int count, const int g, const int4 tile, __local int *boxes)
 {
@@ -100,7 +100,7 @@ ALWAYS_INLINE void share_box(
     barrier(CLK_LOCAL_MEM_FENCE);
 }
 
-/* how many of the items first..stop-1 have a tile in their boxes */
+/* Returns how many of the items first..stop-1 have a tile in their boxes. */
 ALWAYS_INLINE int having(__local const int *boxes, const int first, const int stop, const int x, const int y, const int z)
 {
     const int items = GROUP_ITEMS;
@@ -120,17 +120,17 @@ __kernel void bin_count_group(
     __global const int *extents,
     const int stride, const int count, const int chunk, const int chunks,
     const int4 tile, const int4 tiles,
-    __global int *counts,            /* (tiles, chunks), zero */
+    __global int *counts,            /* (tiles, chunks), zero before */
     __local int *boxes)              /* (6, chunk) */
 {
     const int item = GROUP_ITEM, k = (int)get_group_id(0);
     share_box(extents, stride, count, k * chunk + item, tile, boxes);
     FOR_TILES_OF(item, boxes, tiles, x, y, z, t)
-        if (having(boxes, 0, item, x, y, z) == 0) /* the first of the chunk that has the tile */
+        if (having(boxes, 0, item, x, y, z) == 0) /* this item is the first of the chunk that has the tile */
             counts[(size_t)t * chunks + k] = having(boxes, item, chunk, x, y, z);
 }
 
-/* returns the sum over the items before this one; `group_sum` is that over all items */
+/* Returns the sum over the items before this one. `group_sum` becomes the sum over all items. */
 ALWAYS_INLINE long group_scan(const long own, __local long *scratch, long *group_sum)
 {
     const int item = GROUP_ITEM, items = GROUP_ITEMS;

@@ -1,5 +1,5 @@
-/* The intensity model over plain frames (F, rows, columns), a layer of time cells at a time: p of layer k has the weight
-   w_k of a line. Frames are -log(sum w exp(-p)), the shares w exp(-p) / sum w exp(-p), without overflow. Weights are
+/* The intensity model over plain frames (F, rows, columns), one layer of time cells at a time. p of layer k has the weight
+   w_k of a line. Frames are -log(sum w exp(-p)), and shares are w exp(-p) / sum w exp(-p), without overflow. Weights are
    (F, lines); a line is a row, or a column where `by_row` is 0. A work-item takes one pixel. Twin: detector/average.py. */
 
 #define PIXEL                                                                                              \
@@ -9,7 +9,7 @@
     const size_t at = ((size_t)f * rows + v) * columns + u;                                                \
     const float weight = weights[by_row ? (size_t)f * rows + v : (size_t)f * columns + u];
 
-/* the least p of the layers so far that have weight; the first begins with infinity */
+/* Keeps the least p of the layers so far that have weight. The first layer begins with infinity. */
 __kernel void layer_least(
     __global const float *p, __global const float *weights, const int rows, const int columns, const int by_row,
     const int first, __global float *least)
@@ -19,7 +19,7 @@ __kernel void layer_least(
     least[at] = weight > 0.0f ? fmin(before, p[at]) : before;
 }
 
-/* p to w exp(least - p), and the sum of that over the layers so far */
+/* Turns p into w exp(least - p), and adds it to the sum over the layers so far. */
 __kernel void layer_seen(
     __global float *p, __global const float *weights, const int rows, const int columns, const int by_row,
     const int first, __global const float *least, __global float *total)
@@ -30,7 +30,7 @@ __kernel void layer_seen(
     total[at] = first ? seen : total[at] + seen;
 }
 
-/* least to the average, and the sum to its inverse; both 0 where no layer has weight */
+/* Turns least into the average, and the sum into its inverse. Both are 0 where no layer has weight. */
 __kernel void layer_average(const long count, __global float *least, __global float *total)
 {
     const size_t at = get_global_id(0);
@@ -41,7 +41,7 @@ __kernel void layer_average(const long count, __global float *least, __global fl
     total[at] = any ? 1.0f / total[at] : 0.0f;
 }
 
-/* the weights themselves, over all pixels of their lines */
+/* Writes the weights themselves over all pixels of their lines. */
 __kernel void layer_weights(
     __global const float *weights, const int rows, const int columns, const int by_row, __global float *spread)
 {

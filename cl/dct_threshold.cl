@@ -1,10 +1,9 @@
 /* Shrinkage of all 4³ block DCTs of a volume, averaged (translation-invariant shrinkage, Coifman and Donoho 1995).
-
-   A coefficient c loses clamp(c, ±threshold), a block's mean nothing. The losses of all blocks are added in ``excess``: the
-   result is v − TURNS excess / blocks that cover a voxel, as a map takes one block of TURNS. Volumes are (z, y, pitch) with a
-   guard.
-   A work-item has one block in registers, and along x a vector of blocks one voxel apart; blocks of one launch do not meet in
-   y and z, so that nothing adds at one time. Where work-items are the lanes they do not meet in x either.
+   A coefficient c loses clamp(c, ±threshold); a block's mean loses nothing. The losses of all blocks are added in
+   ``excess``. The result is v − TURNS excess / blocks that cover a voxel, because a call takes one block of TURNS. Volumes
+   are (z, y, pitch) with a guard.
+   A work-item has one block in registers and, along x, a vector of blocks one voxel apart. Blocks of one launch do not meet
+   in y and z, so no two add at the same time. Where work-items are the lanes they do not meet in x either.
    Twin: objective/dct_prox.py. */
 #include "common/lanes.h"
 
@@ -24,7 +23,7 @@ static inline void forward_4(vf *v, const int step)
     v[3 * step] = COS_3 * slope - COS_1 * middle;
 }
 
-/* Its transpose. */
+/* The transpose of ``forward_4``. */
 static inline void inverse_4(vf *v, const int step)
 {
     const vf outer = 0.5f * (v[0] + v[2 * step]), inner = 0.5f * (v[0] - v[2 * step]);
@@ -35,7 +34,7 @@ static inline void inverse_4(vf *v, const int step)
     v[3 * step] = outer - slope;
 }
 
-/* What the block(s) at ``corner`` lose, in space. */
+/* Returns in space what the block or blocks at ``corner`` lose. */
 static inline void shrunk(__global const float *volume, const size_t corner, const int pitch, const size_t slice,
                           const float threshold, vf *block)
 {
@@ -62,7 +61,7 @@ static inline void shrunk(__global const float *volume, const size_t corner, con
 
 __kernel void dct_excess(
     __global const float *volume, const int4 shape, const int pitch,
-    const int4 shift,                /* of the first block, x y z; x counts where work-items are pixels */
+    const int4 shift,                /* shift of the first block, x y z; x counts where work-items are pixels */
     const float threshold, __global float *excess)
 {
     const int y = EDGE * (int)get_global_id(1) + shift.y, z = EDGE * (int)get_global_id(2) + shift.z;
@@ -91,7 +90,7 @@ __kernel void dct_excess(
     }
 }
 
-/* Plain (nz, ny, nx) to the padded layout. */
+/* Copies plain (nz, ny, nx) to the padded layout. */
 __kernel void dct_start(
     __global const float *volume, const int4 shape, const int pitch, __global float *padded, __global float *excess)
 {
@@ -103,7 +102,7 @@ __kernel void dct_start(
     excess[IMAGE_GUARD + row * pitch + x] = 0.0f;
 }
 
-/* A work-item takes LANES voxels of a row. */
+/* Writes the result. A work-item takes LANES voxels of a row. */
 __kernel void dct_end(
     __global const float *volume, __global const float *excess, const int4 shape, const int pitch, const int nonnegative,
     __global float *result)
@@ -112,7 +111,7 @@ __kernel void dct_end(
     if (x >= shape.x)
         return;
     const size_t row = (size_t)z * shape.y + y, first = row * shape.x + x;
-    /* blocks along each axis that cover a voxel */
+    /* the number of blocks along each axis that cover a voxel */
     const vf at = (float)x + V_IOTA;
     const vf along = min(at, (float)(shape.x - EDGE)) - max(at - (float)(EDGE - 1), 0.0f) + 1.0f;
     const int across = (min(y, shape.y - EDGE) - max(0, y - EDGE + 1) + 1) * (min(z, shape.z - EDGE) - max(0, z - EDGE + 1) + 1);

@@ -5,14 +5,14 @@
    nearly equal times cost no digits, and nothing overflows. Twin: detector/attenuation.py. */
 #include "common/lanes.h"
 
-/* p_k of a pixel from w_k p_k */
+/* p_k of a pixel, from w_k p_k */
 #define SEEN(k) (V_LOAD(layers + (size_t)(k) * layer_size + at) * unit / weights[(size_t)(k) * lines + v])
 
 __kernel void intensity_merge(
     __global const float *layers,   /* layer_count images: guard, then (lines, pitch) */
-    __global const float *weights,  /* (layer_count, lines): weight in a line's window, 0 where a layer has no cell of the line */
+    __global const float *weights,  /* (layer_count, lines): weight in a line's window, 0 for no cell */
     const int layer_count, const int lines, const int width, const int pitch,
-    const float unit,               /* line integral that is 1 in the images */
+    const float unit,               /* the line integral that is 1 in the images */
     __global float *shares,         /* layer_count images: derivative of the merged frame by the layers */
     __global float *merged)         /* guard, then (lines, pitch), padding is not written */
 {
@@ -44,7 +44,7 @@ __kernel void intensity_merge(
     V_STORE(V_PICK(0.0f, any ? (least - brighter) / unit : (vf)(0.0f), inside), merged + at);
 }
 
-/* dL/dlayers from dL/dmerged */
+/* dL/dlayers, from dL/dmerged */
 __kernel void intensity_split(
     __global const float *by_merged, /* guard, then (lines, pitch) */
     __global const float *shares,

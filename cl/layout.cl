@@ -1,4 +1,4 @@
-/* Plain arrays (nz, ny, nx) into the padded layouts of operators and out of them. An element (z, y, x) lies at
+/* Copies plain arrays (nz, ny, nx) into the padded layouts of operators and back. An element (z, y, x) is at
    strides.s0 + y strides.s1 + z strides.s2 + x floats. Twins: NumPy's slices and swapaxes (tests/runtime/test_layout.py). */
 #include "common/lanes.h"
 
@@ -7,7 +7,7 @@ static inline size_t row_of(const long4 strides, const int y, const int z)
     return (size_t)(strides.s0 + y * strides.s1 + z * strides.s2);
 }
 
-/* a work-item copies LANES elements of a row, and writes nothing behind the row */
+/* A work-item copies LANES elements of a row, and writes nothing after the row. */
 __kernel void move_rows(
     __global const float *source, const long4 from, __global float *target, const long4 to, const int rows, const int width)
 {
@@ -24,7 +24,7 @@ __kernel void move_rows(
         target[k] = source[k];
 }
 
-/* rows become columns; a work-item takes TILE of each */
+/* Rows become columns. A work-item takes TILE of each. */
 __kernel void move_turned(
     __global const float *source, const long4 from, __global float *target, const long4 to, const int rows, const int width)
 {

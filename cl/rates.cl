@@ -1,12 +1,12 @@
-/* What the device can do at best, measured: multiply-adds on registers. Copies are the driver's own. */
+/* Measures the device's best rate of multiply-adds on registers. Copies are the driver's own. */
 #include "common/lanes.h"
 
-/* 8 independent chains of multiply-adds per work-item, so that latency does not count: 16 LANES `steps` operations */
+/* 8 independent chains of multiply-adds per work-item, so that latency does not count: 16 LANES `steps` operations. */
 __kernel void multiply_add(const int steps, const float factor, __global float *out)
 {
     const vf a = (vf)(factor), b = (vf)(1.0f - factor);
     vf c0 = (vf)((float)(get_global_id(0) % 7)), c1 = c0 + 1.0f, c2 = c0 + 2.0f, c3 = c0 + 3.0f;
-    vf c4 = c0 + 4.0f, c5 = c0 + 5.0f, c6 = c0 + 6.0f, c7 = c0 + 7.0f; /* by name: an array would live in memory */
+    vf c4 = c0 + 4.0f, c5 = c0 + 5.0f, c6 = c0 + 6.0f, c7 = c0 + 7.0f; /* named variables: an array would be in memory */
     for (int step = 0; step < steps; ++step) {
         c0 = mad(c0, a, b);
         c1 = mad(c1, a, b);

@@ -7,11 +7,11 @@
 __kernel void rays_forward(
     __global const float *volume,     /* guard, then (z, y, pitch) with a border of BORDER in y and z */
     __global const float *cells,      /* (C, RAY_CELL), frame after frame */
-    __global const int *cell_lines,   /* (C, 2): first line of a cell and the one after its last; ACROSS: columns */
-    __global const int *line_cells,   /* (F, lines, 2): first cell and cell after the last that may serve a line */
-    __global const int *frame_list,   /* which frames */
+    __global const int *cell_lines,   /* (C, 2): first line of a cell and the line after its last; ACROSS: columns */
+    __global const int *line_cells,   /* (F, lines, 2): first cell, and the cell after the last, that may serve a line */
+    __global const int *frame_list,   /* the listed frames */
     __global const float *weights, __global const int *weight_at, /* of each cell's lines, and where they begin */
-    const int4 shape, const int4 origin, /* voxels of the volume, and the first of them in the grid, x y z */
+    const int4 shape, const int4 origin, /* voxels of the volume, and its first voxel in the grid, x y z */
     const int volume_pitch, const float4 pitch_mm,
     const int lines, const int width, const int image_pitch,
     const int add,                    /* onto the image, for one more brick */

@@ -5,7 +5,7 @@
 
 #define SHARE 4        /* ints of a share: slot (or frame), first line, line after the last, where its weights begin */
 
-/* Weights of LANES pixels from row v on, in column u; 0 where the share serves none. */
+/* Weights of LANES pixels from row v on in column u; 0 where the share does not serve them. */
 RAY_INLINE vf weights_at(__global const float *weights, __global const int *share, const int by_row, const int u, const int v)
 {
     const int first = share[1], stop = share[2];
@@ -23,7 +23,7 @@ __kernel void merge_slots(
     __global const float *integrals,  /* guard, then (S, columns of a slot, slot_pitch) */
     const int slot_columns, const int slot_pitch,
     __global const int *slots,        /* (S, SLOT) */
-    __global const int *frame_shares, /* (F + 1,): where a frame's shares begin */
+    __global const int *frame_shares, /* (F + 1,): starts of each frame's shares */
     __global const int *shares,       /* (E, SHARE) */
     __global const float *weights,
     const int by_row, const int width, const int height,
@@ -46,7 +46,7 @@ __kernel void merge_slots(
             __global const float *column = integrals + IMAGE_GUARD
                 + ((size_t)share[0] * slot_columns + u - slot[SLOT_U]) * slot_pitch;
             const int own = v - slot[SLOT_V], most = slot_pitch - LANES;
-            /* near the ends of the slot: only the lanes inside */
+            /* Near the ends of the slot only some lanes are inside. */
             const vf p = own >= 0 && own <= most
                 ? V_LOAD(column + own) : GATHER(column, min(max(own + VI_IOTA, 0), slot_pitch - 1));
             total += V_PICK(0.0f, weight * p, weight > 0.0f);
@@ -60,9 +60,9 @@ __kernel void merge_slots(
    columns lean the rays' slopes along z follow, slots_floats behind the values. */
 __kernel void split_slots(
     __global const float *turned,     /* guard, then (F, width, turned_pitch): frames with detector columns as rows */
-    const long start, const int turned_pitch, /* start: floats before the first of the frames */
+    const long start, const int turned_pitch, /* start: floats before the first frame */
     __global const float *cells, __global const int *slots,
-    __global const int *slot_shares,  /* (S + 1,): where a slot's shares begin */
+    __global const int *slot_shares,  /* (S + 1,): starts of each slot's shares */
     __global const int *shares,       /* (E, SHARE), by slot */
     __global const float *weights,
     const int by_row, const int width, const float4 pitch_mm,

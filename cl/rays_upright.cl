@@ -1,15 +1,15 @@
-/* The projector of rays.cl where detector columns are nearly parallel to the volume's z: the rays of a column then share
-   most of their work. Volumes are turned, with z along a row, so that the samples of neighbouring lines lie side by side.
+/* The projector of rays.cl where detector columns are nearly parallel to the volume's z. The rays of a column then share
+   most of their work. Volumes are turned, with z along a row, so that the samples of neighbouring lines are side by side.
    Samples and weights are those of rays.cl. A work-item takes a detector column of one pose.
-   LEAN 0: columns are parallel to z. Their rays cut a plane x = const (or y) at one y (or x): two columns of voxels are
-   blended once for all of them. LEAN 1: where they cut it changes a little from line to line.
+   LEAN 0: columns are parallel to z. Their rays cut a plane x = const (or y) at one y (or x), and two columns of voxels are
+   blended once for all of them. LEAN 1: this place changes a little from line to line.
    Twin: operators/twins/rays.py. */
 #include "common/ray_column.h"
 
 #define TURN 16 /* voxels along x and z that are turned at a time */
 
-/* (z, y, x), voxel (z, y, x) at from.x + y from.y + z from.z + x, to guard, then (y, x, pitch) with a border of BORDER in y
-   and x; zeros must be there */
+/* Copies (z, y, x), with voxel (z, y, x) at from.x + y from.y + z from.z + x, to guard, then (y, x, pitch) with a border of
+   BORDER in y and x. The border must hold zeros before. */
 __kernel void turn_upright(
     __global const float *volume, const long4 from, const int4 shape, const int column_pitch,
     __global float *columns)
@@ -33,11 +33,11 @@ __kernel void turn_upright(
             to[(size_t)x * column_pitch + z] = tile[z][x];
 }
 
-/* The planes of a detector column's rays along their main axis a, and where they cut them: b = s_b + g_b (i - s_a). */
+/* The planes of a detector column's rays along their main axis a, and the places where they cut: b = s_b + g_b (i - s_a). */
 typedef struct {
     float sa, sb, sc;
     int na, nb, a_first, b_first, b_last, c_first, c_last;
-    size_t stride_a, stride_b; /* of a step along a and b among the turned columns */
+    size_t stride_a, stride_b; /* of a step along a and along b among the turned columns */
 } planes_t;
 
 RAY_INLINE planes_t planes_of(__global const float *cell, const int along_x, const int4 shape, const int4 origin,
@@ -60,7 +60,7 @@ RAY_INLINE planes_t planes_of(__global const float *cell, const int along_x, con
     return r;
 }
 
-/* The same, as plane i sees it: the source of a parallel beam differs from plane to plane. */
+/* The same for plane i. The source that stands for a parallel beam differs from plane to plane. */
 RAY_INLINE planes_t planes_from(planes_t r, const int i)
 {
 #if RAY_PARALLEL
@@ -74,30 +74,30 @@ RAY_INLINE planes_t planes_from(planes_t r, const int i)
 /* The voxel at or below a position on the clamped axis of a box from `first` to `last`. */
 RAY_INLINE int voxel_below(const float at, const int last) { return min((int)(at + 1.0f) - 1, last); }
 
-/* Whether LANES lines, from g[0] to g[LANES - 1] apart along c, meet voxels that two vectors hold. */
+/* Whether the voxels of LANES lines, from g[0] to g[LANES - 1] along c, are within two vectors. */
 #ifdef V_LOOKUP
 #define FIT_TWO_VECTORS(g, ahead) (fabs(((g)[LANES - 1] - (g)[0]) * (ahead)) < (float)(2 * LANES - 3))
 #endif
 
-/* Samples of LANES lines at z and z + 1, share wc, in a column of voxels of which two vectors are at hand. */
+/* Samples of LANES lines at z and z + 1, with share wc, in a column of voxels of which two vectors are loaded. */
 #define BETWEEN(low, high, place, wc) \
     fma((wc), V_LOOKUP(low, high, (place) + 1) - V_LOOKUP(low, high, place), V_LOOKUP(low, high, place))
 
 #if LEAN
-/* Adds to p what `count` lines meet on plane i; plane: its voxel b = c = 0 (counted in the grid). */
+/* Adds to p what `count` lines meet on plane i. plane: its voxel b = c = 0 (counted in the grid). */
 RAY_INLINE void sample_plane(__global const float *plane, const planes_t r, const int i, const float *gb, const float *gc,
                              const int count, float *p, float *blended)
 {
     const float ahead = (float)i - r.sa, lowest = (float)(r.b_first - 1), highest = (float)(r.b_last + 1);
-    const int last = (count + LANES - 1) / LANES * LANES - 1; /* of the last vector, beyond the last line */
+    const int last = (count + LANES - 1) / LANES * LANES - 1; /* line of the last vector, beyond the last line */
     const float b0 = fma(gb[0], ahead, r.sb), b1 = fma(gb[last], ahead, r.sb);
     if (fmax(b0, b1) <= lowest || fmin(b0, b1) >= highest)
         return;
 #ifdef V_LOOKUP
     const int is_dense = FIT_TWO_VECTORS(gc, ahead) && FIT_TWO_VECTORS(gc + last + 1 - LANES, ahead);
     const int top = max(r.c_last + 2 - 2 * LANES, r.c_first - 1);
-    /* b rises or falls from line to line: a vector lies between two columns of voxels if its last line and that before its
-       first do */
+    /* b rises or falls from line to line. A vector lies between two columns of voxels if its last line does, and the line
+       before its first one. */
     int j = voxel_below(clamp(b0, lowest, highest), r.b_last), is_between = is_dense && b0 >= lowest && b0 < highest;
 #endif
     for (int k = 0; k < count; k += LANES) {
@@ -154,7 +154,7 @@ RAY_INLINE void sample_plane(__global const float *plane, const planes_t r, cons
     }
 }
 #else
-/* Adds to p what `count` lines meet on plane i; plane: its voxel b = c = 0 (counted in the grid); gb: of all lines. */
+/* Adds to p what `count` lines meet on plane i. plane: its voxel b = c = 0 (counted in the grid). gb: those of all lines. */
 RAY_INLINE void sample_plane(__global const float *plane, const planes_t r, const int i, const float *gb, const float *gc,
                              const int count, float *p, float *blended)
 {
@@ -179,7 +179,7 @@ RAY_INLINE void sample_plane(__global const float *plane, const planes_t r, cons
         return;
     }
 #endif
-    /* voxels that the lines' samples need: from the one below the lowest to the one above the highest */
+    /* The voxels that the lines' samples need, from the one below the lowest to the one above the highest. */
     const float z0 = fma(gc[0], ahead, r.sc), z1 = fma(gc[count - 1], ahead, r.sc);
     const int base = voxel_below(clamp(fmin(z0, z1), (float)(r.c_first - 1), (float)(r.c_last + 1)), r.c_last);
     const int stop = voxel_below(clamp(fmax(z0, z1), (float)(r.c_first - 1), (float)(r.c_last + 1)), r.c_last) + 2;
@@ -189,7 +189,7 @@ RAY_INLINE void sample_plane(__global const float *plane, const planes_t r, cons
     }
     for (int k = 0; k < count; k += LANES) {
         vf wc;
-        /* lanes beyond the last line may point outside of the blended voxels */
+        /* Lanes beyond the last line may point outside of the blended voxels. */
         const vi z = sample_at(V_LOAD(gc + k), r.sc, ahead, r.c_first, r.c_last, &wc) - base;
         const vi own = min(max(z, 0), stop - base - 2);
         const vf a = GATHER(blended, own), b = GATHER(blended + 1, own);
@@ -199,12 +199,12 @@ RAY_INLINE void sample_plane(__global const float *plane, const planes_t r, cons
 #endif
 
 __kernel void rays_upright(
-    __global const float *columns,    /* the turned volume, whole */
+    __global const float *columns,    /* the whole turned volume */
     __global const float *cells,      /* (C, RAY_CELL) */
-    __global const int *slots,        /* (S, SLOT): which poses, and for which part of the panel */
+    __global const int *slots,        /* (S, SLOT): poses, and the parts of the panel that they serve */
     const int4 shape, const int4 origin, const int column_pitch, const float4 pitch_mm,
     const int block,                  /* lines per work-item, <= UPRIGHT_LINES */
-    const long4 to,                   /* where line integrals go: start + u s0 + v s1 + slot s2, of a slot's own u and v */
+    const long4 to,                   /* place of line integrals: start + u s0 + v s1 + slot s2, of a slot's own u and v */
     __global float *image)
 {
     __global const int *slot = slots + SLOT * (size_t)get_global_id(2);
@@ -213,7 +213,7 @@ __kernel void rays_upright(
     if (u >= slot[SLOT_U_STOP] || count <= 0)
         return;
     __global const float *cell = cells + (size_t)slot[SLOT_CELL] * RAY_CELL;
-    /* of lines, with room for a vector that begins at any; of voxels, with room for a vector and the next voxel */
+    /* Room for lines and a vector that begins at any line; for voxels, a vector and the next voxel. */
     float total[UPRIGHT_LINES + LANES], p[UPRIGHT_LINES + LANES], gc[UPRIGHT_LINES + LANES], gb[UPRIGHT_LINES + LANES];
     float blended[UPRIGHT_VOXELS + 2 * LANES];
     const int first_along_x = is_along_x(cell, u, start), last_along_x = is_along_x(cell, u, start + count - 1);

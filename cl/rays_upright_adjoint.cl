@@ -1,13 +1,13 @@
-/* The adjoint of rays_upright.cl. A ray of a detector column weighs the voxels of a column by its distance, and lines follow
-   each other along the voxels: a vector of voxels gathers from a few neighbouring lines. One writer per voxel, in a fixed
-   order. LEAN as in ray_column.h. Twin: operators/twins/rays.py. */
+/* The adjoint of rays_upright.cl. A ray of a detector column weighs the voxels of a column by its distance. Lines follow
+   each other along the voxels, so a vector of voxels gathers from a few neighbouring lines. Each voxel has one writer, in a
+   fixed order. LEAN as in ray_column.h. Twin: operators/twins/rays.py. */
 #include "common/ray_column.h"
 
-#define LINE_MARGIN 0.01f /* lines: more than the rounding of where they lie; beyond a voxel's neighbours they weigh nothing */
-#define PLANES ((ADJOINT_X > ADJOINT_Y ? ADJOINT_X : ADJOINT_Y) + LANES) /* of a box, in whole vectors */
-#define LEAST_SLOPE 1e-6f /* voxels per line: smaller near the source, where all lines have one height */
+#define LINE_MARGIN 0.01f /* lines: more than the rounding of their places; beyond a voxel's neighbours they have weight 0 */
+#define PLANES ((ADJOINT_X > ADJOINT_Y ? ADJOINT_X : ADJOINT_Y) + LANES) /* planes of a box, in whole vectors */
+#define LEAST_SLOPE 1e-6f /* voxels per line: it is smaller near the source, where all lines have one height */
 
-/* floor and ceil of what an int holds: PoCL's take ten times as long */
+/* Floor and ceil of what an int can hold: PoCL's functions take ten times as long. */
 RAY_INLINE int whole_below(const float at)
 {
     const int whole = (int)at;
@@ -19,7 +19,7 @@ RAY_INLINE int whole_above(const float at)
     return whole + ((float)whole < at);
 }
 
-/* Detector columns (first, last) whose rays may touch a box of voxels. */
+/* The detector columns (first, last) whose rays may touch a box of voxels. */
 static inline int2 columns_of_box(__global const float *matrix, const int stride, const float4 first, const float4 last,
                                   const int u_first, const int u_stop)
 {
@@ -58,14 +58,14 @@ RAY_INLINE int2 lines_along(__global const float *cell, const int u, const int f
     return begins ? (int2)(first, high) : (int2)(high, stop);
 }
 
-/* A detector column and where its rays pass: at plane i, ahead of the source, line v at the height
+/* A detector column and the course of its rays. At plane i, ahead of the source, line v is at the height
    c = sc + ahead (dz + v ez) / (da + v ea) and at b = sb + across ahead + along (c - sc). The rays lie in a plane. */
 typedef struct {
     __global const float *values, *slopes; /* of line v; slopes where columns lean: (dz + v ez) / (da + v ea) */
     int is_cut;                     /* whether lines of the slot beyond the last have the other main axis */
-    int v_first, v_stop, last_start; /* last_start: where two vectors may begin at most */
+    int v_first, v_stop, last_start; /* last_start: the last place where two vectors may begin */
     float sb, sc, da, ea, dz, ez;
-    float inv;                      /* 1 / da; of a column that leans one over its turn in the rays' plane */
+    float inv;                      /* 1 / da; in a column that leans, one over its turn in the rays' plane */
     float bend, per_along;          /* 4 |ea / da|, 1 / |along| */
     float across, along;
     float first, last;              /* slope (dz + v ez) / (da + v ea) of the first and the last line */
@@ -106,10 +106,10 @@ RAY_INLINE column_t column_of(__global const float *cell, const int u, const int
     return r;
 }
 
-/* Where LANES voxels of a column find their lines: `most` from `first` on. */
+/* The lines of LANES voxels of a column: `most` lines from `first` on. */
 typedef struct {
     vi first;
-    int base;  /* where two vectors of lines begin that hold them all, if they do */
+    int base;  /* begin of two vectors of lines that hold them all, if they do */
     int some;  /* whether there are any */
     int dense; /* whether two vectors hold them */
 } near_lines_t;
@@ -126,7 +126,8 @@ RAY_INLINE near_lines_t near_lines(const column_t r, const vi first, const int m
 }
 
 #ifdef V_LOOKUP
-/* Where two vectors of lines begin for the lower and for the upper half of the voxels; negative where they do not hold them. */
+/* Begin of two vectors of lines for the lower and for the upper half of the voxels; negative where these do not hold them.
+   */
 RAY_INLINE int2 bases_of_halves(const column_t r, const near_lines_t lines, const int most)
 {
     const int begin = V_FIRST(lines.first), before = V_END_OF_HALF(lines.first);
@@ -138,11 +139,11 @@ RAY_INLINE int2 bases_of_halves(const column_t r, const near_lines_t lines, cons
 #endif
 
 #if LEAN
-/* line first + m of each lane; values are 0 beyond the last */
+/* Line first + m of each lane. Values are 0 beyond the last line. */
 #define GATHER_SLOPE(m) GATHER(r.slopes, min(lines.first + (m), r.v_stop - 1))
 #define GATHER_VALUE(m) V_PICK(0.0f, GATHER(r.values, min(lines.first + (m), r.v_stop - 1)), lines.first + (m) < r.v_stop)
 
-/* the vectors of lines that LANES voxels look theirs up in: lines beyond the last have the other main axis, or are 0 */
+/* The vectors in which LANES voxels look up their lines. Lines beyond the last have the other main axis, or are 0. */
 #define LINE_VECTORS                                                                                       \
     vf v0 = V_LOAD(r.values + lines.base), v1 = V_LOAD(r.values + lines.base + LANES);                     \
     const vf c0 = V_LOAD(r.slopes + lines.base), c1 = V_LOAD(r.slopes + lines.base + LANES);               \
@@ -152,7 +153,7 @@ RAY_INLINE int2 bases_of_halves(const column_t r, const near_lines_t lines, cons
         v1 = V_PICK(0.0f, v1, VI_IOTA + (lines.base + LANES) < r.v_stop);                                  \
     }
 
-/* Runs `body` with value and off, a line's value and its height above the voxel's, for all lines that may touch LANES voxels. */
+/* Runs `body` for all lines that may touch LANES voxels, with a line's value and its height above the voxel (off). */
 #define OF_LINES(value_of, slope_of, next, body)                                                           \
     for (int m = 0; m < most; ++m, next) {                                                                 \
         const vf value = value_of, off = fma(slope_of, (vf)(ahead), under);                                \
@@ -169,8 +170,8 @@ RAY_INLINE int2 bases_of_halves(const column_t r, const near_lines_t lines, cons
 #define EACH_LINE(body) OF_LINES(GATHER_VALUE(m), GATHER_SLOPE(m), (void)0, body)
 #endif
 
-/* LANES voxels of two columns between which all their lines pass. under: heights up to the source; b: where the rays' plane
-   passes at these heights, from the first of the columns on. */
+/* Adds to LANES voxels of two columns, between which all their lines pass. under: heights up to the source. b: the place of
+   the rays' plane at these heights, from the first column on. */
 RAY_INLINE void add_between(const column_t r, const near_lines_t lines, const int most, const float ahead, const vf under,
                             const vf b, float *low, float *high)
 {
@@ -181,7 +182,7 @@ RAY_INLINE void add_between(const column_t r, const near_lines_t lines, const in
     V_STORE(V_LOAD(high) + far, high);
 }
 
-/* LANES voxels of three columns, where lines pass the second. b: from the second column on. */
+/* Adds to LANES voxels of three columns, where lines pass the second. b: from the second column on. */
 RAY_INLINE void add_around(const column_t r, const near_lines_t lines, const int most, const float ahead, const vf under,
                            const vf b, float *low, float *middle, float *high)
 {
@@ -193,7 +194,7 @@ RAY_INLINE void add_around(const column_t r, const near_lines_t lines, const int
     V_STORE(V_LOAD(high) + after, high);
 }
 
-/* LANES voxels of one column, where lines pass from one column to the next. b: from this column on. */
+/* Adds to LANES voxels of one column, where lines pass from one column to the next. b: from this column on. */
 RAY_INLINE void add_across(const column_t r, const near_lines_t lines, const int most, const float ahead, const vf under,
                            const vf b, float *own)
 {
@@ -208,15 +209,15 @@ RAY_INLINE void add_across(const column_t r, const near_lines_t lines, const int
 typedef struct {
     int from[PLANES], stop[PLANES]; /* voxels along z that its lines may touch; none where it misses the box */
     int first[PLANES];              /* column of voxels at or below the lower of its first and last line */
-    int most[PLANES];               /* lines that may touch a voxel */
-    float ahead[PLANES];            /* of the source */
-    float at[PLANES];               /* where the rays' plane passes at the source's height */
+    int most[PLANES];               /* most lines that may touch a voxel */
+    float ahead[PLANES];            /* ahead of the source */
+    float at[PLANES];               /* place of the rays' plane at the source's height */
 #if LEAN
     int is_between[PLANES];                      /* whether all lines pass between the first column and the next */
-    /* the first of these lines, not whole, is first_line + (per_voxel + bend z) z for voxel z of the box */
+    /* The first of these lines, not whole, is first_line + (per_voxel + bend z) z for voxel z of the box. */
     float first_line[PLANES], per_voxel[PLANES], bend[PLANES];
 #else
-    float reach[PLANES];            /* lines from a voxel to the farthest of them */
+    float reach[PLANES];            /* lines from a voxel to the farthest line that touches it */
     float slope[PLANES], at_zero[PLANES], per_slope[PLANES]; /* voxels to a line, the height of line 0, lines to a voxel */
 #endif
 } planes_t;
@@ -227,8 +228,8 @@ RAY_INLINE vi whole_below_all(const vf at)
     return whole - VI_PICK(0, 1, V_FLOAT(whole) > at);
 }
 
-/* LANES planes at a time, which share divisions. sa: the source's place among planes. The box has columns from b_first to
-   b_stop and nz voxels from z_first on. */
+/* Meets LANES planes at a time, which share divisions. sa: the source's place among planes. The box has columns from b_first
+   to b_stop and nz voxels from z_first on. */
 RAY_INLINE void meet_planes(const column_t r, const float sa, const int2 between, const int z_first, const int nz,
                             const int b_first, const int b_stop, planes_t *planes)
 {
@@ -249,9 +250,9 @@ RAY_INLINE void meet_planes(const column_t r, const float sa, const int2 between
         const vi stop = VI_PICK(min(above, nz), from, misses);
         const vi column = whole_below_all(max(min(at0, at1), (float)(b_first - 2)));
 #if LEAN
-        /* lines within a voxel of a height; a little more where lines beyond the ends are denser */
+        /* Lines within a voxel of a height; a little more where lines beyond the ends are denser. */
         const vf per = r.dense / max(fabs(ahead), LEAST_SLOPE);
-        /* lines at both ends; between them a parabola, and how much they turn bounds its error */
+        /* Lines at both ends. Between them they follow a parabola, and their turn bounds its error. */
         const vf over0 = V_FLOAT(from + z_first) - sc, over1 = V_FLOAT(stop + z_first) - sc;
         const vf turn0 = ahead * r.ez - over0 * r.ea, turn1 = ahead * r.ez - over1 * r.ea;
         const vf per_turns = 1.0f / (turn0 * turn1);
@@ -261,7 +262,7 @@ RAY_INLINE void meet_planes(const column_t r, const float sa, const int2 between
         const vf reach = per * (1.0f + r.bend * per) + 0.15f * fabs(line1 - line0) * turn * turn + LINE_MARGIN;
         const vf bottom = V_FLOAT(from), top = V_FLOAT(stop);
         const vf per_height = 1.0f / max(top - bottom, 1.0f), per_voxel = (line1 - line0) * per_height;
-        const vf bend = -turn * per_voxel * per_height; /* at share t of the way turn (line1 - line0) t (1 - t) is added */
+        const vf bend = -turn * per_voxel * per_height; /* turn (line1 - line0) t (1 - t) is added at share t of the way */
         V_STORE(line0 - (per_voxel - bend * top) * bottom - reach + 1.0f, planes->first_line + p);
         V_STORE(per_voxel - bend * (bottom + top), planes->per_voxel + p);
         V_STORE(bend, planes->bend + p);
@@ -284,8 +285,8 @@ RAY_INLINE void meet_planes(const column_t r, const float sa, const int2 between
     }
 }
 
-/* Adds a detector column at plane p to columns of voxels that begin at voxel z_first. Column j of them is
-   sums + (j - b_first) step for b_first <= j < b_stop and `beyond` elsewhere. */
+/* Adds a detector column at plane p to columns of voxels that begin at voxel z_first. Column j is at
+   sums + (j - b_first) step for b_first <= j < b_stop, and at `beyond` elsewhere. */
 RAY_INLINE void lines_onto(const column_t r, const planes_t *planes, const int p, const int z_first, const int b_first,
                            const int b_stop, float *sums, const int step, float *beyond)
 {
@@ -294,8 +295,8 @@ RAY_INLINE void lines_onto(const column_t r, const planes_t *planes, const int p
 #define COLUMN(j) ((j) < b_first || (j) >= b_stop ? beyond : sums + ((j) - b_first) * step)
 #if LEAN
     const float ahead = planes->ahead[p], first_line = planes->first_line[p], per_voxel = planes->per_voxel[p];
-    const float bend = planes->bend[p], start = r.sc - (float)z_first; /* of the source, among the box's voxels */
-    int j0 = j, j1 = j, next_look = planes->is_between[p] ? stop : from; /* until then lines pass between j0 and the next */
+    const float bend = planes->bend[p], start = r.sc - (float)z_first; /* place of the source among the box's voxels */
+    int j0 = j, j1 = j, next_look = planes->is_between[p] ? stop : from; /* lines pass between two columns up to it */
     float *low = COLUMN(j), *high = COLUMN(j + 1), b_from = b_zero - (float)j;
     vf at = V_IOTA + (float)from;
     for (int z = from; z < stop; z += LANES, at += (float)LANES) {
@@ -375,12 +376,12 @@ RAY_INLINE void lines_onto(const column_t r, const planes_t *planes, const int p
 
 /* A work-item owns ADJOINT_X by ADJOINT_Y columns of voxels. */
 __kernel void rays_upright_adjoint(
-    __global const float *values,     /* as split_slots leaves them */
+    __global const float *values,     /* as split_slots writes them */
     const int slot_columns, const int slot_pitch, const long slots_floats,
     __global const float *cells, __global const int *slots, const int slot_count,
     __global const float *matrices, const int matrix_stride, /* (12, matrix_stride): rows give u z, v z, z of a voxel index */
     const int4 shape, const int4 origin,
-    const long4 to,                   /* voxel (z, y, x) at to.x + y to.y + z to.z + x */
+    const long4 to,                   /* voxel (z, y, x) is at to.x + y to.y + z to.z + x */
     const int add,
     __global float *volume)
 {
@@ -419,8 +420,8 @@ __kernel void rays_upright_adjoint(
                 const int b_first = along_x ? origin.y + y_first : origin.x + x_first;
                 const int b_stop = b_first + (along_x ? ny : nx);
                 const int a_first = along_x ? origin.x + x_first : origin.y + y_first;
-                const int step = (along_x ? ADJOINT_X : 1) * (ADJOINT_Z + LANES); /* from a column along b, and along a, */
-                const int step_a = (along_x ? 1 : ADJOINT_X) * (ADJOINT_Z + LANES); /* to the next */
+                const int step = (along_x ? ADJOINT_X : 1) * (ADJOINT_Z + LANES); /* from one column to the next along b */
+                const int step_a = (along_x ? 1 : ADJOINT_X) * (ADJOINT_Z + LANES); /* and along a */
                 const int2 planes = planes_between(cell, u, along_x, a_first, along_x ? nx : ny);
                 planes_t met;
                 meet_planes(r, cell[RAY_SOURCE + !along_x], planes, origin.z + z_first, nz, b_first, b_stop, &met);

@@ -1,12 +1,13 @@
 /* The gradient of a weakly convex ridge regulariser, Wᵀ g(W v), and a step down it (Goujon, Neumayer and Unser 2024).
 
-   W is a chain of correlations of 3³: CHANNELS filters of the volume, then FILTERS of those channels. Only windows inside the
-   volume count: channels have n − 2 elements along an axis, responses n − 4, each at the first voxel of its window. A response
-   t becomes slope_up clamp(t, ±σ knot_up) − slope_down clamp(t, ±σ knot_down). ``table`` holds the filters (3, 3, 3, CHANNELS),
-   the second ones (CHANNELS, 3, 3, 3, FILTERS) and (3, 3, 3, FILTERS, CHANNELS), then slopes and knots of up and down.
+   W is a chain of correlations of 3³: CHANNELS filters of the volume, then FILTERS of those channels. Only windows inside
+   the volume count: channels have n − 2 elements along an axis, responses n − 4, each at the first voxel of its window. A
+   response t becomes slope_up clamp(t, ±σ knot_up) − slope_down clamp(t, ±σ knot_down). ``table`` holds the first filters
+   (3, 3, 3, CHANNELS), the second filters as (CHANNELS, 3, 3, 3, FILTERS) and as (3, 3, 3, FILTERS, CHANNELS), then slopes
+   and knots of up and down.
 
-   Between kernels are RING slices of all channels: (RING, channels, ny, pitch), slice z in place z % RING, zeros past a row.
-   A work-item takes a row, in vectors, or a voxel. Twin: objective/ridge.py. */
+   Between kernels, RING slices of all channels are kept: (RING, channels, ny, pitch), slice z at z % RING, with zeros after
+   a row. A work-item takes a row, in vectors, or a voxel. Twin: objective/ridge.py. */
 #include "common/lanes.h"
 
 #define CHANNELS 4
@@ -22,7 +23,7 @@
 #define FOR_X(x, width) for (int x = 0; x < width; x += LANES)
 #endif
 
-/* Voxel 0 of a row of a channel of a ring. */
+/* The place of voxel 0 in a row of a channel of a ring. */
 static inline size_t row_of(const int4 shape, const int pitch, const int channels, const int c, const int y, const int z)
 {
     return IMAGE_GUARD + (((size_t)(z % RING) * channels + c) * shape.y + y) * pitch;
@@ -33,7 +34,7 @@ static inline vf inside(const vf value, const int x, const int width)
     return V_PICK(0.0f, value, (vf)(x) + V_IOTA < (float)width);
 }
 
-/* Channels of the padded volume; z counts from ``first``, as in all kernels here. */
+/* Writes the channels of the padded volume. z counts from ``first``, as in all kernels here. */
 __kernel void ridge_channels(
     __global const float *volume, const int4 shape, const int pitch, const int first, __constant const float *table,
     __global float *channels)
@@ -59,7 +60,7 @@ __kernel void ridge_channels(
     }
 }
 
-/* Responses of the filters, bent. */
+/* Writes the responses of the filters, clamped. */
 __kernel void ridge_responses(
     __global const float *channels, const int4 shape, const int pitch, const int first, __constant const float *table,
     const float sigma, __global float *responses)
@@ -93,7 +94,7 @@ __kernel void ridge_responses(
     }
 }
 
-/* The transpose of the second filters. Sums of their own for each k do not wait for one another. */
+/* The transpose of the second filters. Each k has its own sums, which do not wait for one another. */
 __kernel void ridge_channels_back(
     __global const float *responses, const int4 shape, const int pitch, const int first, __constant const float *table,
     __global float *channels)
@@ -129,7 +130,7 @@ __kernel void ridge_channels_back(
     }
 }
 
-/* The transpose of the first filters is the gradient; v − step times it, plain. */
+/* The transpose of the first filters is the gradient. Writes v − step times it, without padding. */
 __kernel void ridge_step(
     __global const float *volume, __global const float *channels, const int4 shape, const int pitch, const int first,
     __constant const float *table, const float step, const int nonnegative, __global float *result)

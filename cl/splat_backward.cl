@@ -1,7 +1,7 @@
-/* Adjoint of the splat, first pass: sums over the footprint of a Gaussian in every time cell, the input of the chain rule.
+/* Adjoint of the splat, first pass: sums over the footprint of a Gaussian in every time cell, which the chain rule reads.
    Every Gaussian has one writer, without atomics: results repeat bit for bit.
-   splat_backward_rows: one work-item per Gaussian, vectors along its lines (CPUs).
-   splat_backward_group: a group per Gaussian, ACROSS items along a line and as many lines as fit (GPUs). */
+   splat_backward_rows: one work-item per Gaussian, with vectors along its lines (CPUs).
+   splat_backward_group: a group per Gaussian, with ACROSS items along a line and as many lines as fit (GPUs). */
 #if GROUP > 1
 #define SPLAT_SPACE __local
 #endif
@@ -19,7 +19,7 @@ ALWAYS_INLINE splat_sums no_sums(void)
     return sum;
 }
 
-/* adds what the pixels u.. of a line contribute; h: gradient by the pixels */
+/* Adds the contribution of the pixels u.. of a line. h: gradient by the pixels. */
 #if MOVING
 ALWAYS_INLINE void gather(splat_sums *sum, const footprint_line line, const int u, const float limit, const vf h)
 {
@@ -97,7 +97,7 @@ ALWAYS_INLINE void visit(gatherer *own, const footprint_line line)
 #endif
 
 #define ARGUMENTS                                                                                                    \
-    __global float *records,          /* (stride, C, RECORD); the sums come in their place */                        \
+    __global float *records,          /* (stride, C, RECORD); the sums replace them */                               \
     __global const uchar *is_visible, /* (stride, C) */                                                              \
     __global const float *cells,      /* (C, CELL) */                                                                \
     __global const float *line_times, /* MOVING: (C, TIME_ROWS, time_pitch) */                                       \
@@ -128,9 +128,9 @@ __kernel void splat_backward_rows(ARGUMENTS)
 #else
 __kernel void splat_backward_group(ARGUMENTS)
 {
-    const int g = (int)get_global_id(0) / ACROSS, item = GROUP_ITEM; /* a launch may be a part of all groups */
+    const int g = (int)get_global_id(0) / ACROSS, item = GROUP_ITEM; /* a launch may have a part of the groups */
     __local float tree[SUM_COUNT * GROUP], cell[CELL];
-    __local int record_as_int[RECORD]; /* floats among them: a device may flush ints that are copied as floats */
+    __local int record_as_int[RECORD]; /* ints, because a device may flush ints copied as floats */
     __local const float *splat_record = (__local const float *)record_as_int;
     const float limit = cutoff2 > 0.0f ? cutoff2 : MAXFLOAT;
     for (int c = 0; c < cell_count; ++c) {
@@ -141,7 +141,7 @@ __kernel void splat_backward_group(ARGUMENTS)
             record_as_int[f] = ((__global const int *)records)[at * RECORD + f];
         for (int f = item; f < CELL; f += GROUP)
             cell[f] = cells[c * CELL + f];
-        barrier(CLK_LOCAL_MEM_FENCE | CLK_GLOBAL_MEM_FENCE); /* all have read where sums will be */
+        barrier(CLK_LOCAL_MEM_FENCE | CLK_GLOBAL_MEM_FENCE); /* wait until all have read where sums will be */
         __global const float *times = TIMES_OF(c, line_times, time_pitch);
         __global const float *image = images + LAYER_AT(cell, lines, pitch) + IMAGE_GUARD;
         splat_sums mine = no_sums();
@@ -151,7 +151,7 @@ __kernel void splat_backward_group(ARGUMENTS)
                 gather(&mine, line, u, limit, image[(size_t)v * pitch + u]);
         }
         group_sums(mine.of, SUM_COUNT, tree, records + at * RECORD + SUMS);
-        barrier(CLK_LOCAL_MEM_FENCE); /* all have read what the next cell writes */
+        barrier(CLK_LOCAL_MEM_FENCE); /* wait until all have read what the next cell overwrites */
     }
 }
 #endif

@@ -1,5 +1,5 @@
-/* Adjoint of the splat, second pass: from the pixel sums of every time cell to the gradients of mean, scale,
-   rotation and density. A work-item takes LANES Gaussians and walks the cells in a fixed order. */
+/* Adjoint of the splat, second pass: from the pixel sums of every time cell to the gradients of mean, scale, rotation and
+   density. A work-item takes LANES Gaussians and loops over the cells in a fixed order. */
 #include "common/precise.h"
 #include "common/gradient.h"
 #include "common/splat_state.h"
@@ -13,7 +13,7 @@
 #define POSES (1 + FIXED_CONIC)
 #endif
 
-/* from the gradient by (u0, v0) and by the depth z to that by the mean: u0 = (row 0 . x) / z, v0 = (row 1 . x) / z */
+/* Maps the gradient by (u0, v0) and depth z to that by the mean, with u0 = (row 0 . x) / z and v0 = (row 1 . x) / z. */
 static inline void add_by_centre(v3 *by_mean, __global const coefficient *m, const vf u0, const vf v0, const vf inv_z,
                           const vf by_u0, const vf by_v0, const vf by_z)
 {
@@ -30,8 +30,8 @@ static inline vf torque_about(const vf forth, const vf back, const vf s2, const 
     return 0.5f * (forth * (s2 * inv3) + back * (s3 * inv2)) * out_of_round(s2, s3, inv2, inv3);
 }
 
-/* The torque is forth - back, the gradients by all vectors crossed with them. Line integrals depend only on
-   vectors over scales, where a turn does not change them: forth s2 / s3 = back s3 / s2. The result is no small difference. */
+/* The torque is forth - back, the gradients by all vectors crossed with them. Line integrals depend only on vectors over
+   scales, and a turn does not change them there: forth s2 / s3 = back s3 / s2. So the result is no small difference. */
 static inline v3 torque_of(const v3 forth, const v3 back, const v3 s, const v3 inv)
 {
     return v3_make(torque_about(forth.x, back.x, s.y, s.z, inv.y, inv.z),
@@ -40,7 +40,7 @@ static inline v3 torque_of(const v3 forth, const v3 back, const v3 s, const v3 i
 }
 
 #if DEFORMED
-#define BY_PLACE by_place /* what a cell or the end of a segment adds to is a state's own */
+#define BY_PLACE by_place /* the cell, or end of a segment, adds to a state's own sums */
 
 static inline void add_vector(__global float *rows, const int row, const int stride, const v3 by)
 {
@@ -76,7 +76,7 @@ __kernel void splat_chain(
     __global float *gradients,            /* (13, stride); DEFORMED: without the rows of the mean */
     __global const float *states,         /* DEFORMED: (S, STATE_ROWS, stride) */
     __global const int *cell_states,      /* (C, POSES) */
-    __global float *by_states)            /* DEFORMED: as states, zeros to which dL by them is added */
+    __global float *by_states)            /* DEFORMED: like states, zeros to which the derivatives of L are added */
 {
     const int first = (int)get_global_id(0) * LANES;
     if (first >= stride)
@@ -112,7 +112,7 @@ __kernel void splat_chain(
             continue;
         const vf w = V_LOAD(fields + SUM_W * LANES), by_ik = V_LOAD(fields + SUM_IK * LANES);
 #if MOVING
-        /* by S: with (along, across) = V D, D D' = V^-1 (..)(..)' V^-T */
+        /* Derivatives by S: with (along, across) = V D, D D' = V^-1 (..)(..)' V^-T. */
         const vf zz = V_LOAD(fields + SUM_ZZ * LANES), zc = V_LOAD(fields + SUM_ZC * LANES), cc = V_LOAD(fields + SUM_CC * LANES);
         const vf along_u = V_LOAD(fields + SUM_COUNT * LANES), along_v = V_LOAD(fields + (SUM_COUNT + 1) * LANES);
         const vf across_u = V_LOAD(fields + (SUM_COUNT + 2) * LANES), across_v = V_LOAD(fields + (SUM_COUNT + 3) * LANES);
@@ -136,7 +136,7 @@ __kernel void splat_chain(
         const frame3 axes = seen.axes;
         __global const float *cell = cells + c * CELL;
         __global const coefficient *m = matrices + c * POSES * 12;
-        /* lanes that are not drawn have sums of 0, and may be at the source: any other place keeps them from 0/0 */
+        /* Lanes that are not drawn have sums of 0, and may be at the source. Any other place keeps them from 0/0. */
         const vi is_in_view = V_LOAD(visible) > 0.0f;
         const vf z = V_PICK((vf)(1.0f), wide_value(wide_dot(m + 8, mean.x, mean.y, mean.z)), is_in_view);
         const vf inv_z = 1.0f / z;
@@ -154,7 +154,7 @@ __kernel void splat_chain(
         const vf kappa = v3_dot(white, white);
         const vf inv_kappa = 1.0f / kappa;
 
-        /* S = z^2 / (kappa det^2) a_i.a_j with a_i = scale * (ray x e_i) */
+        /* S = z^2 / (kappa det^2) a_i.a_j with a_i = scale * (ray x e_i). */
         const v3 mu = v3_cross(ray, eu), mv = v3_cross(ray, ev);
         const v3 au = v3_mul(scale, mu), av = v3_mul(scale, mv);
         const vf factor = (z / det) * (z / det) * inv_kappa;
@@ -174,7 +174,7 @@ __kernel void splat_chain(
 #if AFFINE
         const vf b1 = zero, b2 = zero;
 #else
-        /* b_i = z white.(e_i / scale) / kappa */
+        /* b_i = z white.(e_i / scale) / kappa. */
         const v3 wu = v3_mul(eu, inv_scale), wv = v3_mul(ev, inv_scale);
         const vf ratio = z * inv_kappa;
         const vf b1 = ratio * v3_dot(white, wu), b2 = ratio * v3_dot(white, wv);
@@ -197,7 +197,7 @@ __kernel void splat_chain(
         __global float *by_state = by_states + (state - states);
         add_by_pull(by_state, stride, g.axes, straight, cell, by_ray, by_eu, by_ev);
 #if AFFINE && !PARALLEL
-        by_place = v3_scale(straight, w / v3_dot(straight, straight)); /* a length, which the object's motion leaves alone */
+        by_place = v3_scale(straight, w / v3_dot(straight, straight)); /* the object's motion does not change this length */
 #endif
 #elif AFFINE
         by_ray = v3_add(by_ray, v3_scale(ray, w / v3_dot(ray, ray))); /* a length, which no turn changes */
@@ -220,7 +220,7 @@ __kernel void splat_chain(
         BY_PLACE = v3_add(BY_PLACE, to_world(axes, by_ray));
 #endif
 #if MOVING
-        /* the centre is the mean of the path's parabola, (end 0 + 4 middle + end 1) / 6; the path end 1 - end 0 */
+        /* The centre is the mean of the path's parabola, (end 0 + 4 middle + end 1) / 6. The path is end 1 - end 0. */
         add_by_centre(&BY_PLACE, m, u0, v0, inv_z, 0.66666666667f * g_u0, 0.66666666667f * g_v0, by_z);
         const vf g_path_u = -2.0f * (along_u * s_tz + across_u * s_tc);
         const vf g_path_v = -2.0f * (along_v * s_tz + across_v * s_tc);
@@ -243,7 +243,7 @@ __kernel void splat_chain(
 #endif
         }
 #elif FIXED_CONIC
-        /* the second pose places the centre, the first one has the depth of the conic and of the density */
+        /* The second pose places the centre. The first pose has the depth of the conic and of the density. */
         __global const coefficient *n = m + 12;
         const vf inv = 1.0f / V_PICK((vf)(1.0f), wide_value(wide_dot(n + 8, mean.x, mean.y, mean.z)), is_in_view);
         add_by_centre(&by_mean, n, wide_value(wide_dot(n, mean.x, mean.y, mean.z)) * inv,

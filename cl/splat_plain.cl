@@ -1,8 +1,8 @@
-/* Between the arrays that users hold and what the splats' kernels work on: parameter rows (11, count) in mm with quaternions
-   of any length, and internal rows (11, stride) with unit ones. Twins: NumPy's, in tests/operators/test_splat_plain.py. */
+/* Converts the arrays that users hold, parameter rows (11, count) in mm with quaternions of any length, into internal rows
+   (11, stride) with unit quaternions, and back. Twins: NumPy's, in tests/operators/test_splat_plain.py. */
 
 #define ROWS 11
-#define LENGTHS 6  /* mean and scale */
+#define LENGTHS 6  /* rows that are lengths: mean and scale */
 #define QUATERNION 6
 #define DENSITY 10
 
@@ -11,14 +11,14 @@ static inline float unit_of(const int row, const float per_mm, const float per_d
     return row < LENGTHS ? per_mm : row == DENSITY ? per_density : 1.0f;
 }
 
-/* padding becomes a unit Gaussian, which harms nothing */
+/* Padding becomes a unit Gaussian, which changes nothing. */
 __kernel void rows_enter(
     __global const float *plain,  /* (11, count) */
     const int count, const int stride,
     const float per_mm,           /* internal units of length */
-    const float per_density,      /* and of density, in 1/mm */
+    const float per_density,      /* internal units of density, which is in 1/mm */
     __global float *rows,         /* (11, stride) */
-    __global float *norms)        /* (stride): of the quaternions */
+    __global float *norms)        /* (stride): lengths of the quaternions */
 {
     const int g = (int)get_global_id(0);
     if (g >= stride)
@@ -38,7 +38,7 @@ __kernel void rows_enter(
     norms[g] = norm;
 }
 
-/* the gradients by internal rows onto those by plain ones, or in their place */
+/* Adds gradients by internal rows to those by plain rows, or replaces these. */
 __kernel void rows_leave(
     __global const float *gradients, /* (13, stride) */
     __global const float *norms,
@@ -56,7 +56,7 @@ __kernel void rows_leave(
     }
 }
 
-/* a row of a matrix, times a factor, to one of another */
+/* Copies a row of a matrix, times a factor, to a row of another. */
 __kernel void row_copy(__global const float *from, const long from_start, const int count, const float factor,
                        const long to_start, __global float *to)
 {

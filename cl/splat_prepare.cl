@@ -1,18 +1,19 @@
 /* Projects every Gaussian from every time cell of a frame, in one launch. A work-item takes LANES Gaussians and loops over
    the cells. For each cell it writes one record per Gaussian (common/splat.h): the splat and the box of its pixels. At the
    end it writes the box around each Gaussian's splats in all cells, from which binning.cl makes the lists of the tiles.
-   splat_prepare: a cell is one pose, which with FIXED_CONIC places the centre only. splat_prepare_moving: a cell is a segment of the frame, in which the centre moves from
-   one end to the other (common/splat_moving.h). Twin: operators/twins/splat.py. */
+   splat_prepare: a cell is one pose. With FIXED_CONIC this pose places the centre only.
+   splat_prepare_moving: a cell is a segment of the frame, in which the centre moves from one end to the other
+   (common/splat_moving.h). Twin: operators/twins/splat.py. */
 #include "common/splat_view.h"
 #include "common/splat_state.h"
 #include "common/splat_moving.h"
 
-#define COMMON_FIELDS 9 /* floats of a record before its six ints; those of a moving splat follow them */
+#define COMMON_FIELDS 9 /* floats of a record before its six ints; those of a moving splat come after the ints */
 #if MOVING
 #define FIELDS 12
 #else
 #define FIELDS COMMON_FIELDS
-#define POSES (1 + FIXED_CONIC) /* of a cell: the one that the constants of `cells` are of, and that of the centre */
+#define POSES (1 + FIXED_CONIC) /* of a cell: the pose to which the constants of `cells` belong, and that of the centre */
 #endif
 
 /* The fields that both kinds of record share. fields (FIELDS, LANES); bounds (6, LANES): centre, u lo hi, v lo hi. */
@@ -31,8 +32,8 @@ ALWAYS_INLINE void collect(const splat_centre centre, const splat_view s, const 
     VI_STORE(box.u_hi, bounds + 3 * LANES);
 }
 
-/* Writes the records of those of LANES Gaussians that are visible, and their flags. record_step: records from one Gaussian
-   to the next. */
+/* Writes the records and flags of those of LANES Gaussians that are visible. record_step: records from one Gaussian to the
+   next. */
 ALWAYS_INLINE void write_records(__private const float *fields, __private int *bounds, const pixel_box box,
                                  const size_t first_record, const size_t record_step, __global float *records,
                                  __global uchar *is_visible)
@@ -76,7 +77,7 @@ __kernel void splat_prepare(
     const int cell_count,
     const int width,                      /* pixels of a line */
     const float cutoff2,                  /* squared Mahalanobis radius; 0 = no cutoff */
-    __global float *records,              /* (stride, C, RECORD), not changed where nothing is visible */
+    __global float *records,              /* (stride, C, RECORD), unchanged where nothing is visible */
     __global uchar *is_visible,           /* (stride, C): 1 where a record was written */
     __global int *extents,                /* (6, stride): u lo hi, v lo hi, 0 0 over all cells */
     __global const float *states,         /* DEFORMED: (S, STATE_ROWS, stride) */
@@ -129,8 +130,8 @@ __kernel void splat_prepare(
 /* The path of the centre in a segment, from one end to the other, and whether both ends lie in front of the source. */
 typedef struct { vf u, v; vi is_in_front; } centre_path;
 
-/* Finds the path, and shifts the centre at mid-time so that the straight path is right in the mean: over t from -1/2 to 1/2
-   a path bent by s t^2 has the mean s/12, a sixth of the sum of its ends. */
+/* Finds the path, and shifts the centre at mid-time so that the mean of the straight path is right. Over t from -1/2 to 1/2,
+   a path bent by s t^2 has the mean s/12, which is a sixth of the sum of its ends. */
 ALWAYS_INLINE centre_path path_of(__global const coefficient *end_matrices, const v3 means[2], splat_centre *middle)
 {
     centre_path path;
@@ -150,7 +151,7 @@ ALWAYS_INLINE centre_path path_of(__global const coefficient *end_matrices, cons
     return path;
 }
 
-/* narrows [lo, hi] to the pixels within `reach` of the path between two times */
+/* Narrows [lo, hi] to the pixels within `reach` of the path between two times. */
 ALWAYS_INLINE void narrow_to_path(const vf whole, const vf rest, const vf path, const vf reach, const vf early,
                                   const vf late, vi *lo, vi *hi)
 {
@@ -158,8 +159,8 @@ ALWAYS_INLINE void narrow_to_path(const vf whole, const vf rest, const vf path, 
     narrow(whole, rest + min(from, to) - reach, rest + max(from, to) + reach, lo, hi);
 }
 
-/* Earliest and latest time at which any of the lines lo..hi integrates. Windows open and close in the order of the lines:
-   the two outermost lines bound the others. */
+/* The earliest and latest time at which any of the lines lo..hi integrates. Windows open and close in the order of the
+   lines, so the two outermost lines bound the others. */
 ALWAYS_INLINE void times_of_lines(__global const float *times, const int pitch, const vi lo, const vi hi, vf *early, vf *late)
 {
     float from[LANES], to[LANES];
@@ -179,8 +180,8 @@ ALWAYS_INLINE void times_of_lines(__global const float *times, const int pitch, 
     *late = V_LOAD(to);
 }
 
-/* Squared cutoff about the path, in widths of the splat. S and Q: common/splat.h, here of the segment's middle. slack bounds
-   how much Q changes along the path: 0.75 is the longest time from the middle, 1.1 and 1.2 are margins. */
+/* The squared cutoff about the path, in widths of the splat. S and Q: common/splat.h, of the segment's middle. slack bounds
+   the change of Q along the path: 0.75 is the longest time from the middle, 1.1 and 1.2 are margins. */
 ALWAYS_INLINE vf reach2_of(const splat_view s, const cutoff_ellipse e, const centre_path path, const vf speed, const float cutoff2)
 {
     const vf tilt = fabs(s.b1) * (fabs(e.u) + e.half_u + 0.75f * fabs(path.u))
@@ -217,10 +218,10 @@ __kernel void splat_prepare_moving(
         const centre_path path = path_of(matrix + 12, end_means, &centre);
         const splat_view s = view_splat(g, cells + c * CELL, centre.depth);
         vi is_drawn = exists & s.is_drawn & path.is_in_front;
-        /* the path in widths of the splat: its length and direction */
+        /* The path in widths of the splat: its length and direction. */
         const vf wide_u = s.l11 * path.u + s.l12 * path.v, wide_v = s.l22 * path.v;
         const vf speed = sqrt(wide_u * wide_u + wide_v * wide_v);
-        const vi moves = speed > 1e-6f; /* else any direction will do */
+        const vi moves = speed > 1e-6f; /* otherwise any direction will do */
         const vf inv_speed = 1.0f / V_PICK(1.0f, speed, moves);
         const vf cosine = V_PICK(1.0f, wide_u * inv_speed, moves), sine = V_PICK(0.0f, wide_v * inv_speed, moves);
         vf reach2 = (vf)(MAXFLOAT);

@@ -3,14 +3,14 @@
    Gaussian whose mean is m in the reference lies at the y with y + w(y) = m. w is a sum of tensor cubic B-splines, 0 beyond
    their control points; of a state it is the sum of shares[r] times the field r.
      splat_states       a work-item moves a Gaussian to every state, by Newton steps from its place in the state before.
-     splat_states_back  a work-item adds up a Gaussian's gradients by its place and its G of every state.
-   All states of a Gaussian: STATE_ROWS of common/splat_state.h. */
+     splat_states_back  a work-item adds up a Gaussian's gradients by its place and its G in every state.
+   A Gaussian has STATE_ROWS of common/splat_state.h in each state. */
 #define STATE_ROWS 12
 #define MOST_STEPS 50
-#define CLOSE 2e-5f     /* spacings: a shorter step ends the search; the next one would be its square */
-#define LEAST_DET 0.05f /* of G, below which a step is one of the fixed point y = m - w(y) */
+#define CLOSE 2e-5f     /* spacings: a shorter step ends the search; the next step would be its square */
+#define LEAST_DET 0.05f /* of G; below it a step is one of the fixed point y = m - w(y) */
 
-/* the four B-splines along an axis that reach a point, with both derivatives; control point `first` has the first of them */
+/* The four B-splines along an axis that reach a point, with both derivatives. The first belongs to control point `first`. */
 typedef struct { float value[4], slope[4], bend[4]; int first, start, stop; } splines;
 
 static inline splines splines_at(const float place, const float per_spacing, const int count)
@@ -51,7 +51,7 @@ static inline float4 control_at(__global const float4 *controls, const size_t po
     return sum;
 }
 
-/* w at a point and its derivatives along x, y, z */
+/* w at a point, and its derivatives along x, y, z. */
 typedef struct { float4 shift, along_x, along_y, along_z; } flow;
 
 static flow flow_at(__global const float4 *controls, const int4 counts, const float4 origin, const float4 per_spacing,
@@ -80,7 +80,7 @@ static flow flow_at(__global const float4 *controls, const int4 counts, const fl
     return f;
 }
 
-/* the gradient by the point of the sum of by_pull[i][j] dw_i/dy_j; by_pull: rows i of three floats */
+/* The gradient by the point of the sum of by_pull[i][j] dw_i/dy_j. by_pull: rows i of three floats. */
 static float4 by_curvature(__global const float4 *controls, const int4 counts, const float4 origin, const float4 per_spacing,
                            __global const float *shares, const float4 point, const float4 by_pull[3])
 {
@@ -131,7 +131,7 @@ __kernel void splat_states(
                 move = (float4)(dot(off, cross(b, c)), dot(a, cross(off, c)), dot(a, cross(b, off)), 0.0f) / det;
             const float4 spacings = fabs(move * per_spacing);
             const float furthest = max(spacings.x, max(spacings.y, spacings.z));
-            place -= move / max(furthest, 1.0f); /* a spacing at most */
+            place -= move / max(furthest, 1.0f); /* at most one spacing */
             if (furthest <= CLOSE)
                 break;
         }
@@ -159,7 +159,7 @@ static inline float4 vector_of(__global const float *rows, const int row, const 
 
 __kernel void splat_states_back(
     __global const float *states, const int stride, FIELD,
-    __global const float *by_states, /* (S, STATE_ROWS, stride): dL by the places and by G */
+    __global const float *by_states, /* (S, STATE_ROWS, stride): derivatives of L by the places and by G */
     __global float *gradients)       /* (13, stride), in which the rows of the mean are replaced */
 {
     const int g = (int)get_global_id(0);
@@ -175,9 +175,9 @@ __kernel void splat_states_back(
         }
         const float4 place = vector_of(states + at, 0, stride);
         float4 by_place = vector_of(by_states + at, 0, stride);
-        if (any((by_pull[0] != 0.0f) | (by_pull[1] != 0.0f) | (by_pull[2] != 0.0f))) /* not at the ends of a segment */
+        if (any((by_pull[0] != 0.0f) | (by_pull[1] != 0.0f) | (by_pull[2] != 0.0f))) /* the ends of a segment have none */
             by_place += by_curvature(controls, counts, origin, per_spacing, shares + s * RANK, place, by_pull);
-        /* dy/dm = 1/G, whose transpose has the rows of G's cofactors */
+        /* dy/dm = 1/G; its transpose has the rows of G's cofactors. */
         const float4 x = cross(pull[1], pull[2]), y = cross(pull[2], pull[0]), z = cross(pull[0], pull[1]);
         by_mean += (float4)(dot(x, by_place), dot(y, by_place), dot(z, by_place), 0.0f) / dot(pull[0], x);
     }

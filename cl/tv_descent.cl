@@ -1,9 +1,9 @@
-/* Gradient of the isotropic total variation, the sum of |backward difference| over voxels, as ASD-POCS descends it
-   (Sidky and Pan, Phys. Med. Biol. 53 (2008) 4777). Volume (nz, ny, nx) without padding; differences end at the first
-   voxel. A work-item takes one voxel. Twin: objective/tv.py. Behind a border in y and z the voxel itself is read: a branch
-   would become masked accesses outside the buffer (tv_prox.cl). */
+/* Gradient of the isotropic total variation, the sum of |backward difference| over voxels, for ASD-POCS (Sidky and Pan,
+   Phys. Med. Biol. 53 (2008) 4777). Volumes (nz, ny, nx) have no padding; differences end at the first voxel. A work-item
+   takes one voxel. Twin: objective/tv.py. At the border in y and z the voxel itself is read: a branch would become masked
+   accesses outside the buffer (tv_prox.cl). */
 
-/* at y or z 0 the difference is that of the voxel to itself */
+/* At y or z 0 the difference is that of the voxel to itself. */
 static inline float3 backward_difference(__global const float *volume, const size_t at, const int x, const size_t row,
                                          const size_t slice)
 {
@@ -16,7 +16,7 @@ static inline float inverse_length(const float3 d, const float least)
     return 1.0f / (sqrt(d.x * d.x + d.y * d.y + d.z * d.z) + least);
 }
 
-/* least: keeps flat regions from dividing by zero */
+/* least: keeps flat regions from a division by zero. */
 __kernel void tv_gradient(__global const float *volume, const int4 shape, const float least, __global float *gradient)
 {
     const int x = (int)get_global_id(0), y = (int)get_global_id(1), z = (int)get_global_id(2);
@@ -32,7 +32,7 @@ __kernel void tv_gradient(__global const float *volume, const int4 shape, const 
         const float3 d = backward_difference(volume, at + 1, x + 1, back_y, back_z);
         sum -= d.x * inverse_length(d, least);
     }
-    /* without a neighbour these differences are 0 */
+    /* Without a neighbour these differences are 0. */
     const float3 below = backward_difference(volume, at + ahead_y, x, ahead_y, back_z);
     sum -= below.y * inverse_length(below, least);
     const float3 above = backward_difference(volume, at + ahead_z, x, back_y, ahead_z);

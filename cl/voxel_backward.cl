@@ -1,6 +1,6 @@
-/* Adjoint of the voxeliser: each Gaussian gathers the moments of dL/dvolume under it, then chains them to
-   its parameters. One work-item per Gaussian, vectors along its rows (CPUs), or a group of GROUP, of which ACROSS along
-   a row (GPUs). */
+/* Adjoint of the voxeliser: each Gaussian gathers the moments of dL/dvolume under it, then chains them to its parameters.
+   A work-item takes a Gaussian, with vectors along its rows (CPUs), or a group of GROUP items does, with ACROSS along a row
+   (GPUs). */
 #include "common/gradient.h"
 #include "common/group_sums.h"
 #include "common/voxel.h"
@@ -16,7 +16,7 @@
 #define PLACE_IN_ROW 0
 #endif
 
-/* the voxels of a row that are walked: of the box, and where a row costs its lanes anything, those within the cutoff */
+/* The voxels of a row to visit: those of the box. Where a row costs its lanes anything, those within the cutoff. */
 ALWAYS_INLINE int2 voxel_span(const voxel_row r, const int lo, const int hi, const float limit)
 {
 #if GROUP > 1
@@ -70,7 +70,7 @@ __kernel void voxel_backward(
     const vf all[SUM_COUNT] = {w_, x_, y_, z_, xx, xy, xz, yy, yz, zz};
 #if GROUP > 1
     __local float tree[SUM_COUNT * GROUP];
-    if (record_as_int[VOX_HI + 2] >= record_as_int[VOX_LO + 2]) /* most Gaussians are nowhere near a small volume */
+    if (record_as_int[VOX_HI + 2] >= record_as_int[VOX_LO + 2]) /* most Gaussians are far from a small volume */
         group_sums(all, SUM_COUNT, tree, out);
     else
         for (int f = GROUP_ITEM; f < SUM_COUNT; f += GROUP)
@@ -99,7 +99,7 @@ __kernel void voxel_chain(
     const v3 n = to_local(axes, v3_make(weight * pitch.x * V_LOAD(fields + LANES),
                                         weight * pitch.y * V_LOAD(fields + 2 * LANES),
                                         weight * pitch.z * V_LOAD(fields + 3 * LANES)));
-    /* second moments in the world, then in the Gaussian's own frame */
+    /* Second moments in the world, then in the Gaussian's own frame. */
     const vf xx = weight * pitch.x * pitch.x * V_LOAD(fields + 4 * LANES);
     const vf xy = weight * pitch.x * pitch.y * V_LOAD(fields + 5 * LANES);
     const vf xz = weight * pitch.x * pitch.z * V_LOAD(fields + 6 * LANES);

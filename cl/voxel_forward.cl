@@ -1,5 +1,5 @@
-/* Voxeliser: every tile of voxels sums its list of Gaussians. With BLOCK_PIXEL 0 a work-item owns rows along x.
-   With BLOCK_PIXEL 1 it owns voxels along z; a work-group owns a tile, tile.x by tile.y items, and reads its records once. */
+/* Voxeliser: every tile of voxels sums its list of Gaussians. With BLOCK_PIXEL 0 a work-item owns rows along x. With
+   BLOCK_PIXEL 1 it owns voxels along z; a work-group owns a tile, tile.x by tile.y items, and reads its records once. */
 #if BLOCK_PIXEL
 #define VOXEL_SPACE __local
 #endif
@@ -17,16 +17,16 @@ __kernel void voxel_forward(
 {
     const float limit = cutoff2 > 0.0f ? cutoff2 : MAXFLOAT;
 #if BLOCK_PIXEL
-    __local int records_here[STAGED * VOXEL_RECORD]; /* floats among them: a device may flush ints that are copied as floats */
+    __local int records_here[STAGED * VOXEL_RECORD]; /* ints, because a device may flush ints copied as floats */
     const int x = (int)get_global_id(0), y = (int)get_global_id(1), z_first = (int)get_global_id(2) * DEPTH;
     const int item = (int)(get_local_id(1) * get_local_size(0) + get_local_id(0));
     const int items = (int)(get_local_size(0) * get_local_size(1));
-    const int t = ((int)get_global_id(2) * tiles.y + y / tile.y) * tiles.x + x / tile.x; /* a launch may be a part of all */
+    const int t = ((int)get_global_id(2) * tiles.y + y / tile.y) * tiles.x + x / tile.x; /* the launch may be a part */
     const tile_list list = list_of(tile_offsets, t, capacity, count);
     float sum[DEPTH] = {0.0f};
     for (int done = 0; done < list.count; done += STAGED) {
         const int here = min(STAGED, list.count - done);
-        barrier(CLK_LOCAL_MEM_FENCE); /* all have read what was there */
+        barrier(CLK_LOCAL_MEM_FENCE); /* wait until all have read what was there */
         for (int f = item; f < here * VOXEL_RECORD; f += items) {
             const int e = done + f / VOXEL_RECORD;
             const size_t splat = (size_t)listed_splat(list, tile_splat_ids, e) * VOXEL_RECORD;

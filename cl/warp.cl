@@ -11,10 +11,10 @@
      warp_adjoint_sum   adds such integers to the result.
      add_frames         adds the frames of a state to some of a stack.
    Near voxels move together. So LANES voxels meet a few more samples than one voxel does, and each sample is a vector of the
-   volume with its weights. Voxels that part more than MOST_TAPS along an axis allows are taken one by one. */
+   volume with its weights. Voxels further apart than MOST_TAPS along an axis allows are taken one by one. */
 #include "common/lanes.h"
 
-#define REACH 2 /* voxels: as far as a sample counts */
+#define REACH 2 /* voxels: the distance within which a sample counts */
 #define BORDER 4
 #define TAPS (2 * REACH)
 #define MOST_TAPS (TAPS + 2)
@@ -39,7 +39,7 @@
 
 __kernel void spline_along_x(
     __global float *volume, const long start, /* the first row's first sample */
-    const long row,                           /* from row to row */
+    const long row,                           /* from one row to the next */
     const int rows, const int length)
 {
     if ((int)get_global_id(0) >= rows)
@@ -52,7 +52,7 @@ __kernel void spline_along_x(
 __kernel void spline_across_x(
     __global float *volume, const long start,
     const long width, const long plane, /* neighbouring lines; from one plane of them to the next */
-    const long step, const int length)  /* from sample to sample of a line */
+    const long step, const int length)  /* from one sample of a line to the next */
 {
     if ((long)get_global_id(0) * LANES >= width)
         return;
@@ -60,7 +60,7 @@ __kernel void spline_across_x(
     SPLINE_COEFFICIENTS(vf, V_LOAD, V_STORE)
 }
 
-/* The cubic B-spline: the weight of a coefficient at a distance of its voxels; 0 from REACH on. */
+/* The cubic B-spline: the weight of a coefficient at a distance in voxels; 0 from REACH on. */
 static inline float one_tap(const float distance)
 {
     const float x = fmin(fabs(distance), 2.0f), far = 2.0f - x;
@@ -72,9 +72,9 @@ static inline int first_tap(const float at)
     return (int)floor(at) + 1 - REACH;
 }
 
-/* Where LANES voxels look in the volume, and the coefficients around them: `count` of them along an axis from `first` on, which
-   along x moves with the lane, with their weights. is_far: whether a lane needs others. is_outside: whether it looks further
-   than REACH beyond the volume, where it finds 0. */
+/* Where LANES voxels look in the volume, and the coefficients around them with their weights: `count` along an axis from
+   `first` on. Along x, `first` moves with the lane. is_far: whether a lane needs others. is_outside: whether it looks
+   further than REACH beyond the volume, where it finds 0. */
 typedef struct {
     vf at;
     vi is_far, is_outside;
@@ -91,7 +91,8 @@ static inline vf displacement(
     return sum;
 }
 
-/* Displacements mostly rise or fall along the lanes. So the first and the last lane have the range of all, which is tested. */
+/* Displacements mostly rise or fall along the lanes, so the first and the last lane have the range of all. This is tested.
+   */
 static inline Samples samples_of(const vf position, const vi lane, const int length)
 {
     Samples s;
@@ -175,7 +176,7 @@ __kernel void warp_forward(
 #endif
     sum = ZERO_OUTSIDE(sum);
 #if LANES > 1
-    if (first + LANES > shape.x) { /* the row's end: the next row is another work-item's */
+    if (first + LANES > shape.x) { /* the next row is another work-item's */
         float values[LANES];
         V_STORE(sum, values);
         for (int l = 0; first + l < shape.x; ++l)
@@ -192,11 +193,11 @@ __kernel void warp_forward(
 __kernel void warp_adjoint_rows(
     __global const float *values,  /* (nz, ny, nx), and zeros for a vector's end */
     __global const float *fields, __global const float *shares, const int4 shape,
-    __global const float2 *slices, /* (nz,) least and largest displacement along z in a slice */
-    __global const float2 *rows,   /* (nz, ny) in a row */
+    __global const float2 *slices, /* (nz,): least and largest displacement along z in a slice */
+    __global const float2 *rows,   /* (nz, ny): the same in a row */
     const int owned,               /* slices of a work-item */
     const long4 strides,
-    __global float *result)        /* coefficients as those of warp_forward; the kernel adds to them */
+    __global float *result)        /* coefficients like those of warp_forward; the kernel adds to them */
 {
     const int z_start = (int)get_global_id(0) * owned - BORDER, z_stop = min(z_start + owned, shape.z + BORDER);
     if (z_start >= z_stop)
@@ -249,7 +250,7 @@ __kernel void warp_adjoint_rows(
 #if LANES == 1
 __kernel void warp_adjoint_fixed(
     __global const float *values, __global const float *fields, __global const float *shares, const int4 shape,
-    const float scale,     /* integers per unit: no sum overflows */
+    const float scale,     /* integers per unit, such that no sum overflows */
     const long4 strides,
     __global int *result)  /* zeros in the layout of coefficients */
 {
@@ -279,7 +280,7 @@ __kernel void warp_adjoint_sum(
 
 __kernel void add_frames(
     __global const float *frames, /* (n, pixels) */
-    __global const int *places,   /* (n,) of them in the stack */
+    __global const int *places,   /* (n,): places of the frames in the stack */
     const int pixels, __global float *stack)
 {
     const int pixel = get_global_id(0), frame = get_global_id(1);

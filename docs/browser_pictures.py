@@ -1,10 +1,10 @@
-"""Takes the pictures of the report and of the live page in a real browser, for docs/gallery.md and docs/report.md:
+"""Takes pictures of the report and of the live page in a real browser, for docs/gallery.md and docs/report.md.
 
     python docs/browser_pictures.py [FOLDER]
 
-Needs playwright (pip install playwright) and Chromium or Chrome. FOLDER takes the scan, the volume and the pages (default:
-a temporary one); a scan and a volume that are there are used again. docs/gallery.py puts ``SECTION`` at the end of its page.
-"""
+Needs playwright (pip install playwright) and Chromium or Chrome. FOLDER takes the scan, the volume and the pages (default: a
+temporary folder). A scan and a volume that exist there are used again. docs/gallery.py puts ``SECTION`` at the end of its
+page."""
 
 import io
 import os
@@ -24,8 +24,8 @@ IMAGES = Path(__file__).resolve().parent / "images" / "gallery"
 PROGRAMS = ("chromium", "chromium-browser", "google-chrome")
 SOFTWARE = ["--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]  # WebGL2 without a GPU
 DESKTOP, PHONE = {"width": 1000, "height": 700}, {"width": 390, "height": 760}
-COLOURS = 160  # of a picture
-SHOWN_FROM = 300  # iterations of the live page
+COLOURS = 160  # colours of a picture
+SHOWN_FROM = 300  # iteration of the live page from which on pictures are taken
 GAP = 12  # pixels between pictures
 SIMULATE = "simulate --phantom foot --size 64 --detector 96 --noise tigre -o scan.h5"
 RECONSTRUCT = "reconstruct scan.h5 --method phyradgs --iterations 600 -o volume.h5"
@@ -113,7 +113,7 @@ def take_live(browser: Any, folder: Path) -> None:
                 sys.exit("the run has ended before its page had pictures")
         desktop, phone = opened(browser, page_file, DESKTOP), opened(browser, page_file, PHONE, "dark")
         for page in (desktop, phone):
-            page.locator("#pause").click()  # a page that loads itself again cannot be taken
+            page.locator("#pause").click()  # a page that reloads itself cannot be photographed
         under_way = phone.screenshot()
         save("live_desktop", desktop.screenshot(clip={"x": 0, "y": 0, "width": 1000, "height": 1500}, full_page=True))
     finally:
@@ -124,7 +124,7 @@ def take_live(browser: Any, folder: Path) -> None:
 
 
 def shown_iteration(page_file: Path) -> int:
-    """Returns the finished iterations on a live page that has projections, else 0."""
+    """Returns the finished iterations on a live page that has projections, otherwise 0."""
     text = page_file.read_text(encoding="utf-8")
     value = re.search(r'<progress value="(\d+)"', text)
     return int(value[1]) if value and 'id="projections"' in text else 0
@@ -133,7 +133,7 @@ def shown_iteration(page_file: Path) -> int:
 def take_report(browser: Any, page_file: Path, *, has_webgl: bool) -> None:
     desktop = opened(browser, page_file, DESKTOP)
     if has_webgl:
-        for name, width, height in (("../report_desktop", 1280, 1330), ("../report_phone", 390, 1250)):  # of docs/report.md
+        for name, width, height in (("../report_desktop", 1280, 1330), ("../report_phone", 390, 1250)):  # for docs/report.md
             page = opened(browser, page_file, {"width": width, "height": 800})
             save(name, page.screenshot(clip={"x": 0, "y": 0, "width": width, "height": height}, full_page=True))
     else:
@@ -171,7 +171,7 @@ def opened(browser: Any, page_file: Path, size: dict[str, int], scheme: str = "l
 
 
 def at_rest(page: Any, control: str) -> None:
-    """Uses a control of the 3D view and waits until the picture is drawn in full."""
+    """Uses a control of the 3D view, and waits until the picture is drawn in full."""
     page.wait_for_selector("#space[data-drawn]")
     page.locator("#space").evaluate("canvas => (canvas.dataset.patience = 60000)")
     page.locator(f"#{control}").check()

@@ -1,4 +1,4 @@
-"""The figure of the conventions: gantry, panel and image file, drawn from poses as the package computes them."""
+"""Draws the figure of the conventions: gantry, panel and image file, from poses that the package computes."""
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -25,7 +25,7 @@ def shadow() -> tuple[float, float]:
 
 
 def pixels() -> tuple[tuple[int, int], tuple[int, int]]:
-    """Returns row and column of the shadow in the frame, and in an image file whose row 0 is on top."""
+    """Returns row and column of the shadow in the frame, and in an image file whose row 0 is at the top."""
     row, column = (round(place) for place in shadow())
     return (row, column), (GEOMETRY.detector_shape[0] - 1 - row, column)
 
@@ -121,7 +121,7 @@ def _draw_file(axes: Axes) -> None:
 
 
 def _draw_pixels(axes: Axes, marked: tuple[int, int], words: dict[tuple[int, int], str]) -> None:
-    """Draws all pixels, row 0 below; ``marked`` is the shadow, ``words`` are written into the pixels (row, column)."""
+    """Draws all pixels, row 0 below. ``marked`` is the shadow; ``words`` are written into the pixels (row, column)."""
     rows, columns = GEOMETRY.detector_shape
     for row, column in np.ndindex(rows, columns):
         face = SAMPLE if (row, column) == marked else EXPOSED if (row, column) in words else "white"

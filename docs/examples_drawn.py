@@ -1,7 +1,6 @@
-"""Figures of results: methods on one scan, and what check and calibrate put right. Phantoms are the package's own.
+"""Draws figures of results: methods on one scan, and what check and calibrate correct. Phantoms are the package's own.
 
-Computed on the default OpenCL device, in about ten minutes of processor time.
-"""
+They are computed on the default OpenCL device, in about ten minutes of processor time."""
 
 from dataclasses import replace
 
@@ -17,16 +16,15 @@ from phyradgs_cl.drawing import SAMPLE
 from phyradgs_cl.metrics import psnr
 from phyradgs_cl.runtime import Runtime
 
-_HEIGHT = 0.28  # of the slice, relative to the volume
-_CROP = slice(0.28, 0.98), slice(0.33, 0.69)  # of that slice along y and x: the foot
+_HEIGHT = 0.28  # height of the drawn slice over the volume's height
+_CROP = slice(0.28, 0.98), slice(0.33, 0.69)  # part of that slice along y and x that holds the foot
 _SMALL = 10
 
 
 def methods_figure() -> Figure:
-    """Five methods with their defaults on the scan of `make demo`, the motion known, and the truth.
+    """Draws five methods with their defaults on the scan of `make demo`, with known motion, and the truth.
 
-    phyradgs has 33.2 dB after its 3,000 iterations, and 34.5 dB if `--iterations 2000` is stated.
-    """
+    phyradgs has 33.2 dB after its 3,000 iterations, and 34.5 dB if `--iterations 2000` is stated."""
     scan = simulate("foot", size=64, detector=128, noise="tigre", dose=1e4, electronic_noise=10.0, seed=0)
     figure = Figure(figsize=(10.5, 4.1), layout="constrained")
     axes = figure.subplots(2, 3).ravel()
@@ -39,7 +37,7 @@ def methods_figure() -> Figure:
 
 
 def check_figure(size: int = 48) -> Figure:
-    """A scan whose panel is three pixels off its stated place, before and after `check --fix-offset`."""
+    """Draws a scan whose panel is three pixels off its stated place, before and after `check --fix-offset`."""
     offset_mm = 3 * 4 / (2 * size)
     right = simulate("foot", size=size, detector=2 * size, noise="tigre", dose=1e4, detector_offset_mm=(0.0, offset_mm))
     stated = _with_offset(right, 0.0)
@@ -56,9 +54,9 @@ def check_figure(size: int = 48) -> Figure:
 
 
 def calibrate_figure(size: int = 48) -> Figure:
-    """A scan whose panel is shifted, rolled and tilted, and nothing of it stated, before and after `calibrate`."""
+    """Draws a scan whose panel is shifted, rolled and tilted without a statement of it, before and after `calibrate`."""
     right = simulate("foot", size=size, detector=2 * size, noise="tigre", dose=1e4)
-    planted = {"offset-u": 2.5 * 4 / (2 * size), "roll": 2.0, "tilt-v": 1.0}  # mm, degrees
+    planted = {"offset-u": 2.5 * 4 / (2 * size), "roll": 2.0, "tilt-v": 1.0}  # in mm, degrees
     shift_mm, roll_rad, tilt_rad = planted["offset-u"], np.deg2rad(planted["roll"]), np.deg2rad(planted["tilt-v"])
     stated = perturb(right, GeometryCorrection(offset_u_mm=-shift_mm, roll_rad=-roll_rad, tilt_v_rad=-tilt_rad))
     found = calibrate(stated, "offset,roll,tilt")
@@ -85,7 +83,7 @@ def calibrate_figure(size: int = 48) -> Figure:
 
 
 def _with_offset(scan: Scan, offset_u_mm: float) -> Scan:
-    """The scan with its panel stated there."""
+    """Returns the scan with its panel stated at this offset."""
     assert isinstance(scan.trajectory, CircularOrbit)
     geometry = replace(scan.geometry, detector_offset_mm=(0.0, offset_u_mm))
     return replace(scan, geometry=geometry, trajectory=replace(scan.trajectory, geometry=geometry))

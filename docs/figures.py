@@ -128,7 +128,7 @@ def _bracket(axes: Axes, start: float, stop: float, height: float, text: str) ->
 
 
 def splat_figure() -> None:
-    """One row of pixels through a wide Gaussian half-way to the edge of the volume."""
+    """Draws one row of pixels through a wide Gaussian half-way to the edge of the volume."""
     columns, scale = 257, 0.25
     geometry = ConeGeometry(5.0, 7.0, (3, columns), (4 / columns, 4 / columns))
     pose = geometry.pose(0.0)
@@ -159,7 +159,7 @@ def splat_figure() -> None:
 
 
 def _quadrature(row: np.ndarray, pose: np.ndarray, columns: int) -> np.ndarray:
-    """Line integrals along the middle row by 4000 midpoints per ray (the rotation is the identity)."""
+    """Returns line integrals along the middle row by 4000 midpoints per ray (the rotation is the identity)."""
     pixel = pose[3:6] + np.arange(columns)[:, None] * pose[6:9] + pose[9:12]
     ray = pixel - pose[:3]
     share = (np.arange(4000) + 0.5) / 4000
@@ -172,7 +172,7 @@ def _quadrature(row: np.ndarray, pose: np.ndarray, columns: int) -> np.ndarray:
 
 
 def sampling_figure() -> None:
-    """Shepp-Logan, rapid protocol, one frame: relative RMS error against 1536 times per line."""
+    """Draws the relative RMS error of one frame against 1536 times per line: Shepp-Logan, rapid protocol."""
     count = 96
     geometry = ConeGeometry(5.0, 7.0, (count, count), (4 / count, 4 / count))
     protocol = make_protocol("rapid", start_deg=30.0)
@@ -226,7 +226,7 @@ def api_figures() -> None:
 
 
 def motion_figure() -> None:
-    """One slice of `make demo`; a line sweeps over it, and behind the line the motion is known."""
+    """Draws one slice of `make demo`. A line sweeps over it, and behind the line the motion is known."""
     folder = Path(os.environ.get("DEMO", IMAGES.parents[1] / "demo"))
     truth = load_reference(folder / "scan.h5")[0].values
     ignored, known = (read_volume(folder / name).values for name in ("static.h5", "moving.h5"))
@@ -237,7 +237,7 @@ def motion_figure() -> None:
 
 
 def _sweep() -> np.ndarray:
-    """Positions of the line from frame to frame, as shares of the width: a rest, there, a rest, and back."""
+    """Returns the line's positions from frame to frame, as shares of the width: a rest, forth, a rest, and back."""
     there = np.linspace(0, 1, 14)
     return np.concatenate([np.zeros(8), there, np.ones(12), there[::-1]])
 
@@ -247,7 +247,7 @@ def _swept_frame(
 ) -> Image.Image:
     """Draws one frame: motion known left of the line, ignored right of it, on the grey scale of the truth."""
     rows, columns = truth.shape
-    width, title = 7.2, 0.35  # inches
+    width, title = 7.2, 0.35  # in inches
     height = width * rows / columns
     figure = Figure(figsize=(width, height + title), dpi=100)
     axes = figure.add_axes((0.0, 0.0, 1.0, height / (height + title)))

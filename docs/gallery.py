@@ -2,9 +2,9 @@
 
     python docs/gallery.py [FOLDER] [NAME ...]
 
-Without names all results are made; with names only theirs, and the page keeps the text of the others. FOLDER takes scans
-and volumes (default: a temporary one). Seconds are processor seconds (user and system) of all commands of a result.
-"""
+Without names all results are made. With names only those are made, and the page keeps the text of the others. FOLDER takes
+scans and volumes (default: a temporary folder). Seconds are processor seconds (user and system) of all commands of a
+result."""
 
 import re
 import resource
@@ -37,7 +37,7 @@ seconds of all commands of a result, on two cores of a shared machine.
 
 @dataclass(frozen=True)
 class Result:
-    """A result: its title and sentence, the commands, and volumes by the label that the picture gives them."""
+    """A result: its title and sentence, the commands, and volumes by their labels in the picture."""
 
     title: str
     text: str
@@ -45,9 +45,9 @@ class Result:
     volumes: dict[str, str]
     scan: str = "scan.h5"
     height: float = 0.5
-    """Of the slice, relative to the volume."""
+    """Height of the drawn slice over the volume's height."""
     detail: tuple[float, float, float, float] = field(default=(0.0, 1.0, 0.0, 1.0))
-    """Of the slice, along y and x, as shares."""
+    """Part of the slice that is drawn, along y and x, as shares."""
 
 
 FOOT = (0.25, 1.0, 0.3, 0.72)
@@ -214,7 +214,7 @@ def command_lines(commands: str) -> list[str]:
 
 
 def run(commands: str, folder: Path) -> float:
-    """Runs commands in a folder and returns the processor seconds of all. Status 10 of `check` is no failure."""
+    """Runs commands in a folder. Returns the processor seconds of all. Status 10 of `check` is no failure."""
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
     for line in command_lines(commands):
         program, *words = shlex.split(line)

@@ -22,7 +22,7 @@ def on_config(config: Any) -> Any:
 
 
 def on_page_content(html: str, **_: Any) -> str:
-    """A | in the code of a table's cell is written \\|, which GitHub reads as | and this Markdown as it stands."""
+    """Replaces \\| in the code of a table's cell. GitHub reads it as |; this Markdown keeps the backslash."""
     return html.replace(r"\|", "|")
 
 
@@ -49,5 +49,5 @@ class _Inline(InlineProcessor):
 
 
 def _plain(formula: str) -> str:
-    """One line, rewritten where latex2mathml draws it wrongly."""
+    """Returns a formula in one line, rewritten where latex2mathml draws it wrongly."""
     return " ".join(formula.split()).replace(r"\big", "").replace(r"\Big", "")

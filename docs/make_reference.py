@@ -19,7 +19,7 @@ NOTE = "<!-- made from the code by docs/make_reference.py; do not edit -->\n"
 
 
 def cli_page() -> str:
-    """Every command's help, as the terminal shows it at 100 columns."""
+    """Returns every command's help, as the terminal shows it at 100 columns."""
     group = typer.main.get_command(load_cli().app)
     text = [
         NOTE,
@@ -43,7 +43,7 @@ def _help(context: click.Context) -> str:
 
 
 def api_page() -> str:
-    """Every public name with its signature and docstring."""
+    """Returns every public name with its signature and docstring."""
     text = [
         NOTE,
         "# Python reference\n",
@@ -55,7 +55,7 @@ def api_page() -> str:
 
 
 def examples_page() -> str:
-    """The scripts in examples/ as they are."""
+    """Returns the scripts in examples/ as they are."""
     text = [
         NOTE,
         "# Examples\n",
@@ -71,9 +71,9 @@ def examples_page() -> str:
 def _entry(name: str, thing: object, heading: str) -> Iterator[str]:
     yield f"{heading}{name}\n"
     signature = str(inspect.signature(thing)).replace("'", "")  # type: ignore[arg-type]
-    signature = re.sub(r"\b(phyradgs_cl|collections|pathlib|typing)\.[a-z_.]*", "", signature)  # as the code writes them
+    signature = re.sub(r"\b(phyradgs_cl|collections|pathlib|typing)\.[a-z_.]*", "", signature)  # short names, as in the code
     signature = signature.replace("numpy.", "np.")
-    signature = re.sub(r"<function (\w+) at 0x\w+>", r"\1", signature)  # where it lies changes from run to run
+    signature = re.sub(r"<function (\w+) at 0x\w+>", r"\1", signature)  # the address changes from run to run
     yield f"```python\n{name}{signature}\n```\n"
     yield f"```text\n{inspect.getdoc(thing) or ''}\n```\n"
     if inspect.isclass(thing):

@@ -1,8 +1,7 @@
 """Fills the tables of docs/results/*.md from the recorded runs in that folder: python docs/make_results.py [--check]
 
-A table stands between ``<!-- table: NAME -->`` and ``<!-- end of table -->``; NAME is a key of ``TABLES``. With
-``--check`` nothing is written, and the exit status is 1 where a page differs from its data.
-"""
+A table is between ``<!-- table: NAME -->`` and ``<!-- end of table -->``; NAME is a key of ``TABLES``. With ``--check``
+nothing is written, and the exit status is 1 where a page differs from its data."""
 
 import csv
 import json
@@ -21,7 +20,7 @@ BLOCK = re.compile(r"(<!-- table: (\S+) -->\n).*?(<!-- end of table -->)", re.S)
 CENTRES = "PhyRadGS centres only (as GS-on-the-Move)"
 DEFAULT = "**`fista`, the default**"
 METHODS = (
-    # label of the page, row with the motion ignored, row with the motion known, row of the still scan
+    # Label of the page; rows with the motion ignored, with the motion known, and of the still scan.
     ("FDK", "FDK", "FDK per-row", "FDK"),
     ("SART", "SART", "SART per-row", "SART"),
     ("OS-SART", "OS-SART", "OS-SART per-row", "OS-SART"),
@@ -43,24 +42,24 @@ Scores = dict[str, Any]
 
 
 def markdown(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """A table of Markdown."""
+    """Returns a table in Markdown."""
     lines = [heads, ["---"] * len(heads), *rows]
     return "".join("| " + " | ".join(line) + " |\n" for line in lines)
 
 
 def lines_of(name: str) -> list[dict[str, Any]]:
-    """The lines of a JSONL file in docs/results."""
+    """Returns the lines of a JSONL file in docs/results."""
     return [json.loads(line) for line in (RESULTS / name).read_text(encoding="utf-8").splitlines()]
 
 
 def rows_of(name: str) -> dict[tuple[str, str, str], Row]:
-    """The rows of a benchmark's CSV by protocol, row and acquisition."""
+    """Returns the rows of a benchmark's CSV by protocol, row and acquisition."""
     with open(RESULTS / name, encoding="utf-8") as file:
         return {(row["protocol"], row["row"], row["acquisition"]): row for row in csv.DictReader(file)}
 
 
 def quality(name: str, protocol: str, with_seconds: bool = False) -> str:
-    """PSNR and SSIM of every method: motion ignored, motion known, and of a scan that stops for each projection."""
+    """Returns PSNR and SSIM of every method: motion ignored, motion known, and for a scan that stops at each projection."""
     rows = rows_of(name)
     text = []
     for label, ignored, known, still in METHODS:
@@ -83,7 +82,7 @@ def quality(name: str, protocol: str, with_seconds: bool = False) -> str:
 
 
 def with_prior(prior: str, like: Row) -> list[str]:
-    """PSNR and SSIM of ``fista`` with another prior, on a fly-scan and on one that stops, of the volumes of a row."""
+    """Returns PSNR and SSIM of ``fista`` with another prior, on a fly-scan and on one that stops."""
     views, cells = {"rapid": 25, "standard": 50}[like["protocol"]], []
     for kind in ("fly", "still"):
         by_volume: dict[str, list[Scores]] = {}
@@ -97,12 +96,12 @@ def with_prior(prior: str, like: Row) -> list[str]:
 
 
 def number(row: Row, name: str = "psnr_db") -> float:
-    """A number of a CSV's row."""
+    """Returns a number of a CSV's row."""
     return float(row[name])
 
 
 def both(row: Row | None) -> str:
-    """PSNR and SSIM as the pages print them."""
+    """Returns PSNR and SSIM as the pages print them."""
     if row is None:
         return "–"
     few = "†" if row["volumes"] == "2" and row["size"] == "M" else ""
@@ -110,12 +109,12 @@ def both(row: Row | None) -> str:
 
 
 def seconds_of(row: Row | None) -> str:
-    """Processor seconds of a row."""
+    """Returns processor seconds of a row."""
     return f"{float(row['processor_s']):.0f}" if row is not None and row["processor_s"] else "–"
 
 
 def strips() -> str:
-    """Table 2 of the paper: PhyRadGS over strips and sub-intervals."""
+    """Returns Table 2 of the paper: PhyRadGS over strips and sub-intervals."""
     rows = [row for key, row in rows_of("table2_S.csv").items() if key[0] == "rapid" and key[2] == "fly-scan"]
     names = {"PhyRadGS w/o ST": "static"}
     cells = [
@@ -126,11 +125,11 @@ def strips() -> str:
 
 
 def phantom() -> str:
-    """The paper's sphere phantom: PSNR, shape and density of its beads."""
+    """Returns the paper's sphere phantom: PSNR, shape and density of its beads."""
     rows = rows_of("phantom_M.csv")
     text = []
     for label, ignored, known, _ in METHODS:
-        if label in ("SART", "OS-SART", "SIRT", "CGLS"):  # in the CSV file
+        if label in ("SART", "OS-SART", "SIRT", "CGLS"):  # these are in the CSV file
             continue
         for kind, name in (("ignored", ignored), ("known", known)):
             row = rows.get(("rapid", name, "fly-scan"))
@@ -145,7 +144,7 @@ def phantom() -> str:
 
 
 def motion_models() -> str:
-    """Whole reconstructions by the motion models of the splats, means over the volumes."""
+    """Returns whole reconstructions by the motion models of the splats, as means over the volumes."""
     lines = [line for line in lines_of("motion_models_pruned.jsonl") if line["size"] == 64 and line["iterations"] == 3000]
     found: dict[str, dict[str, Any]] = {}
     for line in lines:
@@ -165,7 +164,7 @@ ONE_FRAME = {"static": "static", "centres": "centres", "8x5": "8 × 5", "exact":
 
 
 def centres_distance() -> str:
-    """Errors of a frame of single Gaussians by motion model and distance from the axis."""
+    """Returns errors of a frame of single Gaussians, by motion model and distance from the axis."""
     lines = [line for line in lines_of("centres_only.jsonl") if "gaussians" in line]
     text = [
         [line["gaussians"], str(line["distance"]), *(f"{100 * line[name]:.2g} %" for name in ONE_FRAME)] for line in lines
@@ -174,7 +173,7 @@ def centres_distance() -> str:
 
 
 def centres_object() -> str:
-    """Errors of a frame of whole objects by motion model: from the least to the most."""
+    """Returns errors of a frame of whole objects, by motion model, from the least to the largest."""
     lines = [line for line in lines_of("centres_only.jsonl") if "volume" in line]
     text = []
     for protocol in ("rapid", "standard"):
@@ -184,7 +183,7 @@ def centres_object() -> str:
 
 
 def splat_starts() -> str:
-    """PSNR and SSIM of phyradgs from two starts, volume by volume, and the mean processor time."""
+    """Returns PSNR and SSIM of phyradgs from two starts, volume by volume, and the mean processor time."""
     lines, text = lines_of("splat_starts.jsonl"), []
     for start in dict.fromkeys(line["start"] for line in lines):
         runs = [line for line in lines if line["start"] == start]
@@ -195,7 +194,7 @@ def splat_starts() -> str:
 
 
 def detector_models() -> str:
-    """What modelling an effect of the detector gives each method: modelled PSNR, and the gain over ignoring it."""
+    """Returns the gain of each method from modelling a detector's effect: modelled PSNR, and its excess over ignoring it."""
     lines = lines_of("detector_models.jsonl")
     methods = list(dict.fromkeys(line["method"] for line in lines))
     effects = list(dict.fromkeys(line["effect"] for line in lines))
@@ -209,7 +208,7 @@ def detector_models() -> str:
 
 
 def sweep(name: str, held_out: bool) -> str:
-    """PSNR with the default of an option, and with the best one factor for all volumes; means over volumes."""
+    """Returns PSNR with the default of an option, and with the best one factor for all volumes, as means over volumes."""
     scans: dict[tuple[Any, ...], dict[str, dict[float, dict[str, Any]]]] = {}
     for line in lines_of(name):
         key = (line["kind"], line["views"], int(line["dose"]), line["size"], line["pixels"])
@@ -217,7 +216,7 @@ def sweep(name: str, held_out: bool) -> str:
     text = []
     for (kind, views, dose, size, pixels), volumes in sorted(scans.items()):
         factors = sorted(set.union(*(set(by) for by in volumes.values())))
-        volumes = {name: by for name, by in volumes.items() if len(by) == len(factors)}  # a sweep may be half made
+        volumes = {name: by for name, by in volumes.items() if len(by) == len(factors)}  # a sweep may be unfinished
         of_factor = {factor: mean(by[factor]["psnr_db"] for by in volumes.values()) for factor in factors}
         best = max(of_factor, key=of_factor.__getitem__)
         cells = [kind, str(views), str(dose), f"{size}³, {pixels}²", f"{of_factor[1.0]:.2f}"]
@@ -237,7 +236,7 @@ def sweep(name: str, held_out: bool) -> str:
 
 @cache
 def prior_runs() -> dict[tuple[Any, ...], dict[tuple[str, int], dict[str, Scores]]]:
-    """The runs of ``priors.jsonl`` by scan: kind, object, views, photons, voxels; by volume and seed; and by prior."""
+    """Returns the runs of ``priors.jsonl`` by scan (kind, object, views, photons, voxels), volume and seed, and prior."""
     scans: dict[tuple[Any, ...], dict[tuple[str, int], dict[str, Scores]]] = {}
     for line in lines_of("priors.jsonl"):
         of = line["volume"] if line["volume"] == "spheres" else "volumes"
@@ -247,7 +246,7 @@ def prior_runs() -> dict[tuple[Any, ...], dict[tuple[str, int], dict[str, Scores
 
 
 def beside_dct(other: str) -> str:
-    """PSNR and SSIM with the priors dct and ``other``. ±: standard deviation over seeds of the mean gain."""
+    """Returns PSNR and SSIM with the priors dct and ``other``. ±: standard deviation over seeds of the mean gain."""
     text = []
     for (kind, of, views, dose, size), runs in sorted(prior_runs().items(), reverse=True):
         pairs = {key: by for key, by in runs.items() if {"dct", other} <= set(by)}
@@ -267,7 +266,7 @@ def beside_dct(other: str) -> str:
 
 
 def beside_rtk() -> str:
-    """FDK, projector and adjoint compared with RTK's, on two processors."""
+    """Returns FDK, projector and adjoint compared with RTK's, on two processors."""
     text = []
     for processor, suffix in (("AMD EPYC", ""), ("Intel Xeon", "_intel")):
         fdk = json.loads((RESULTS / f"rtk_fdk{suffix}.json").read_text())["speed"]
@@ -284,7 +283,7 @@ def beside_rtk() -> str:
 
 
 def ray_motions() -> str:
-    """The cost of every motion model in passes of a scanner at rest, on two processors."""
+    """Returns the cost of every motion model in passes of a scanner at rest, on two processors."""
     files = ("ray_speed.json", "ray_speed_intel.json")
     by_file = {name: json.loads((RESULTS / name).read_text())["by_motion"] for name in files}
     text = []
@@ -299,7 +298,7 @@ def ray_motions() -> str:
 
 
 def whole_runs() -> str:
-    """Processor time and PSNR of methods, and an iteration of splats."""
+    """Returns processor time and PSNR of methods, and an iteration of splats."""
     text = []
     for x in lines_of("before_after_intel.jsonl"):
         (kind,) = {key for key in x["before"] if key != "psnr_db"}
@@ -309,7 +308,7 @@ def whole_runs() -> str:
 
 
 def estimates() -> str:
-    """Time and memory by ``estimate``, divided by those of the run."""
+    """Returns time and memory by ``estimate`` over those of the run."""
     text = []
     for run in json.loads((RESULTS / "estimates.json").read_text())["runs"]:
         ratio = run["ratio"]
@@ -319,9 +318,9 @@ def estimates() -> str:
 
 
 def prepared() -> str:
-    """Decibels that an effect costs, and the percentage that ``prepare`` regains, by effect and size.
+    """Returns the decibels that an effect costs, and the percentage that ``prepare`` regains, by effect and size.
 
-    Both from the least to the most of all volumes."""
+    Both are ranges from the least to the largest of all volumes."""
     cells: dict[tuple[str, int], dict[str, list[dict[str, Any]]]] = {}
     for line in _prepared_lines():
         by_method = cells.setdefault((line["effect"], line["size"]), {})
@@ -338,7 +337,7 @@ PREPARED_METHODS = ("fdk", "fista-tv", "phyradgs")
 
 
 def _prepared_lines() -> list[dict[str, Any]]:
-    """The lines of all runs of ``prepare``, each with the size of its volume."""
+    """Returns the lines of all runs of ``prepare``, each with the size of its volume."""
     found = []
     for name in ("prepare", "prepare_volumes", "prepare_fresh", "prepare_64"):
         head, *lines = lines_of(f"{name}.jsonl")
@@ -347,7 +346,7 @@ def _prepared_lines() -> list[dict[str, Any]]:
 
 
 def _losses(lines: Sequence[dict[str, Any]]) -> str:
-    """The loss in dB and the part of it that returns; the part of a loss below 0.1 dB says nothing."""
+    """Returns the loss in dB and the part of it that returns. The part of a loss below 0.1 dB means nothing."""
     if not lines:
         return ""
     losses_db = [line["clean"] - line["spoilt"] for line in lines]
@@ -361,7 +360,7 @@ def _range(values: Sequence[float], form: str) -> str:
 
 
 def clean_scans() -> str:
-    """What the usual steps change in clean scans, and the part of rings that returns."""
+    """Returns what the usual steps change in clean scans, and the part of rings that returns."""
     text = []
     lines = lines_of("prepare_clean.jsonl")
     for method, views in sorted({(line["method"], line["views"]) for line in lines}):
@@ -377,7 +376,7 @@ def clean_scans() -> str:
 
 
 def stripes() -> str:
-    """PSNR with stripes, and after steps of ``prepare``; of the clean scan in the rows "none". At most views recorded."""
+    """Returns PSNR with stripes, and after steps of ``prepare``, at the most views. Rows "none" are the clean scan."""
     cells: dict[tuple[str, str], dict[str, float]] = {}
     lines = lines_of("stripes.jsonl")
     views = max(line["views"] for line in lines)
@@ -391,14 +390,14 @@ def stripes() -> str:
 
 
 def calibrate_lines() -> list[dict[str, Any]]:
-    """The recorded calibrations of every case on its finest grid."""
+    """Returns the recorded calibrations of every case on its finest grid."""
     lines = lines_of("calibrate.jsonl")
     finest = {line["case"]: max(other["size"] for other in lines if other["case"] == line["case"]) for line in lines}
     return [line for line in lines if line["size"] == finest[line["case"]]]
 
 
 def calibrated_parameters() -> str:
-    """The worst error of every parameter with two runs or more, the stated σ, and how often 2 σ held the truth."""
+    """Returns the worst error of every parameter with two runs or more, the stated σ, and how often 2 σ held the truth."""
     cells: dict[tuple[Any, ...], list[dict[str, Any]]] = {}
     for line in calibrate_lines():
         for one in line["parameters"]:
@@ -417,7 +416,7 @@ def calibrated_parameters() -> str:
 
 
 def calibrated_psnr() -> str:
-    """PSNR with the stated, the calibrated and the right geometry."""
+    """Returns PSNR with the stated, the calibrated and the right geometry."""
     cells: dict[tuple[Any, ...], list[dict[str, Any]]] = {}
     for line in calibrate_lines():
         if "stated" in line.get("psnr_db", {}) and not line["case"].startswith("draw"):
@@ -431,7 +430,7 @@ def calibrated_psnr() -> str:
 
 
 def fbp_peers() -> str:
-    """Filtered backprojection compared with its peers: differences, PSNR, seconds."""
+    """Returns filtered backprojection compared with its peers: differences, PSNR, seconds."""
     found = json.loads((RESULTS / "fbp_peers.json").read_text(encoding="utf-8"))
     rows = []
     for name in ("ours", "skimage", "astra", "silx"):
@@ -447,7 +446,7 @@ def fbp_peers() -> str:
 
 
 def parallel_fly() -> str:
-    """PSNR and modulation at rim and centre of fly-scans with parallel beams: a line per scan, a column per method."""
+    """Returns PSNR and modulation at rim and centre of parallel fly-scans: a row per scan, a column per method."""
     cells: dict[tuple[Any, ...], dict[tuple[str, str], str]] = {}
     for one in lines_of("parallel_fly.jsonl"):
         scan = cells.setdefault((one["views"], one["blur_px"], one["dose"]), {})
@@ -465,7 +464,7 @@ def parallel_fly() -> str:
 
 
 def fan_fly() -> str:
-    """NMSE of a fan beam's fly-scan."""
+    """Returns NMSE of a fan beam's fly-scan."""
     rows = [
         [f"{one['side']}²", f"`{one['method']}`", one["model"]]
         + [f"{one['nmse']:.4f}", f"{one['best']:.4f} ({one['best_at']})"]
@@ -475,7 +474,7 @@ def fan_fly() -> str:
 
 
 def moving_rtk() -> str:
-    """RTK's own test of motion-compensated FDK, from its files."""
+    """Returns RTK's own test of motion-compensated FDK, from its files."""
     rows = [
         [one["program"], f"{one['mean_error']:.4f}", f"{one['psnr_db']:.2f}", f"{one['near_psnr_db']:.2f}"]
         for one in lines_of("moving.jsonl") if one["case"] == "own test"
@@ -489,7 +488,7 @@ def moving_rtk() -> str:
 
 
 def parallel_memory() -> str:
-    """The memory of parallel scans within a limit."""
+    """Returns the memory of parallel scans within a limit."""
     rows = [
         [f"`{one['method']}`", f"{one['columns']} × {one['rows']} × {one['views']}", one["limit"]]
         + [f"{one[key] / 2**30:.2f} GiB" for key in ("buffer_bytes", "host_bytes")] + [str(one["processor_s"])]
@@ -499,7 +498,7 @@ def parallel_memory() -> str:
 
 
 def times_per_exposure() -> str:
-    """PSNR and time of ``per-row`` by the number of times in an exposure, means over the volumes with the same numbers."""
+    """Returns PSNR and time of ``per-row`` by the times in an exposure, as means over the volumes with the same numbers."""
     by_volume: dict[tuple[Any, ...], dict[int, dict[str, Any]]] = {}
     for one in lines_of("times_per_exposure.jsonl"):
         key = one["size"], one["views"], one["moved_voxels"], one["method"], one["volume"]
@@ -519,7 +518,7 @@ def times_per_exposure() -> str:
 
 
 def moving_known() -> str:
-    """Breathing volumes of 64³ by ``fista``, at rest and with the known field."""
+    """Returns breathing volumes of 64³ by ``fista``, at rest and with the known field."""
     by_scan: dict[tuple[int, str], dict[str, dict[str, Any]]] = {}
     for one in lines_of("moving.jsonl"):
         if one["case"] in ("rest", "known"):
@@ -540,7 +539,7 @@ def moving_known() -> str:
 
 
 def moving_unknown(motion: str, size: int) -> str:
-    """Moving volumes of size³ voxels as if they rested, and with the field that ``moving`` finds; the mean gain."""
+    """Returns moving volumes of size³ voxels as if they rested, and with the field of ``moving``, and the mean gain."""
     rows: list[list[str]] = []
     gains_db: dict[int, list[float]] = {}
     periods_s = []
@@ -560,7 +559,7 @@ def moving_unknown(motion: str, size: int) -> str:
 
 
 def moving_insert() -> str:
-    """The centre of a ball in a breathing body, with the true field, with the motion ignored, and with a field found."""
+    """Returns the centre of a ball in a breathing body: with the true field, the motion ignored, and a field found."""
     rows = []
     for one in lines_of("moving.jsonl"):
         if one["case"] == "insert":
@@ -574,7 +573,7 @@ def moving_insert() -> str:
 
 
 def moving_mace4d() -> str:
-    """The rack and pinion of mbirtorch's demonstration, by its MACE4D and by ``moving``."""
+    """Returns the rack and pinion of mbirtorch's demonstration, by its MACE4D and by ``moving``."""
     rows = [
         [one["program"], f"{one['mean_psnr_db']:.2f}", f"{one['least_psnr_db']:.2f}", f"{one['mean_ssim']:.3f}"]
         + [f"{one['seconds']:.1f}"]
@@ -622,7 +621,7 @@ TABLES: dict[str, Callable[[], str]] = {
 
 
 def filled(text: str) -> str:
-    """A page with its tables made from the data."""
+    """Returns a page with its tables made from the data."""
     return BLOCK.sub(lambda block: block[1] + TABLES[block[2]]() + block[3], text)
 
 

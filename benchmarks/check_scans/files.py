@@ -1,4 +1,4 @@
-"""Writes scans by the documented formats: NXtomo by h5py, or TIFF folders and RTK stacks for `phyradgs import`."""
+"""Writes scans in the documented formats: NXtomo by h5py, or TIFF folders and RTK stacks for `phyradgs import`."""
 
 import shutil
 import subprocess
@@ -24,10 +24,10 @@ def write_nxtomo(
     angle_factor: float = 1.0,
     with_grid: bool = True,
 ) -> None:
-    """A scan file (docs/formats.md) that states ``setup``.
+    """Writes a scan file (docs/formats.md) that states ``setup``.
 
-    An array instead of counts is written as line integrals. Angles are written times ``angle_factor`` in ``angle_unit``.
-    """
+    An array in place of counts is written as line integrals. Angles are multiplied by ``angle_factor`` and written in
+    ``angle_unit``."""
     frames, keys, mask = _stored(recorded)
     starts = np.arange(len(frames)) * setup.frame_time_s
     is_projection = keys == PROJECTION
@@ -104,7 +104,7 @@ def _group(parent: h5py.Group, name: str, kind: str, **members: object) -> h5py.
 
 
 def _fill(group: h5py.Group, **members: object) -> None:
-    """Datasets; a pair of a value and a unit carries its unit."""
+    """Writes datasets. A pair of a value and a unit makes a dataset with that unit."""
     for name, value in members.items():
         if isinstance(value, tuple) and isinstance(value[-1], str):
             group[name] = np.asarray(value[0], np.float64)
@@ -114,7 +114,7 @@ def _fill(group: h5py.Group, **members: object) -> None:
 
 
 def write_tiffs(folder: Path, title: str, setup: Setup, recorded: Recorded, flat_value: float | None) -> None:
-    """One TIFF per frame, row 0 on top, and the TOML beside them; ``flat_value`` stands for flats and darks."""
+    """Writes one TIFF per frame, row 0 at the top, and a TOML file. ``flat_value`` replaces flats and darks."""
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
     kinds = {"proj": recorded.frames}
@@ -142,7 +142,7 @@ def write_tiffs(folder: Path, title: str, setup: Setup, recorded: Recorded, flat
 
 
 def write_rtk(folder: Path, setup: Setup, integrals: np.ndarray) -> None:
-    """An RTK stack of line integrals and its geometry, written by ITK and RTK themselves."""
+    """Writes an RTK stack of line integrals and its geometry, by ITK and RTK themselves."""
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
     image = itk.image_from_array(np.ascontiguousarray(integrals, np.float32))
@@ -151,7 +151,7 @@ def write_rtk(folder: Path, setup: Setup, integrals: np.ndarray) -> None:
     itk.imwrite(image, str(folder / "projections.mha"))
     writer = rtk.ThreeDCircularProjectionGeometryXMLFileWriter.New()
     writer.SetFilename(str(folder / "geometry.xml"))
-    circle = geometry(setup, setup.angle_deg(setup.starts_s))  # the writer keeps no reference of its own
+    circle = geometry(setup, setup.angle_deg(setup.starts_s))  # the writer holds no reference to it
     writer.SetObject(circle)
     writer.WriteFile()
 

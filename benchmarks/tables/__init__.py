@@ -1,4 +1,4 @@
-"""Benchmarks: volumes × methods × protocols to a results file, tables and figures; resumable at any run."""
+"""Benchmarks of volumes × methods × protocols: a results file, tables and figures. They continue after any run."""
 
 from tables.job import BenchJob, BenchProgress, plan_runs
 from tables.rows import KINDS, Row, choose_rows, rows_of

@@ -15,7 +15,7 @@ app.command("tables", epilog=EXAMPLE)(bench_command)
 
 
 def run(arguments: list[str]) -> int:
-    """Errors are a line and a status, as of ``phyradgs``."""
+    """Runs the command. Errors are a line and a status, as for ``phyradgs``."""
     return load_cli().run(arguments, app)
 
 

@@ -1,4 +1,4 @@
-"""Cases: one object scanned by one protocol with one seed, on a moving and on a gantry at rest, and how to score it."""
+"""Cases: one object scanned by one protocol with one seed, by a moving gantry and by one at rest, and their scores."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -20,7 +20,7 @@ Measure = Callable[[], dict[str, float]]
 
 
 class Case(Interface):
-    """What a run needs: a scan, the truth, and the numbers of a result (z, y, x)."""
+    """The parts that a run needs: a scan, the truth, and the numbers of a result (z, y, x)."""
 
     truth: np.ndarray
 
@@ -31,21 +31,21 @@ class Case(Interface):
     def slices(self, volume: np.ndarray) -> Images: ...
 
     def references(self) -> dict[str, Measure]:
-        """What results are compared with, where its own numbers are worth a line."""
+        """Returns what results are compared with, where its own numbers are worth a line."""
         ...
 
     def warn_of_inverse_crime(self) -> None:
-        """Says so where what is projected is no finer than what is reconstructed."""
+        """Warns where the projected object is no finer than the reconstructed grid."""
         ...
 
 
 def stop_and_shoot(protocol: Protocol) -> Protocol:
-    """The stop-and-shoot protocol at the mid-window angles of a fly-scan."""
+    """Returns the stop-and-shoot protocol at the mid-window angles of a fly-scan."""
     return replace(protocol, is_fly=False)
 
 
 def held_out(protocol: Protocol) -> Protocol:
-    """Stop-and-shoot poses half-way between the mid-window angles of a scan."""
+    """Returns stop-and-shoot poses half-way between the mid-window angles of a scan."""
     return replace(protocol, is_fly=False, start_deg=protocol.start_deg + protocol.step_deg / 2)
 
 
@@ -70,7 +70,7 @@ class HeldOutViews:
         self._reference = self._project(source)
 
     def measure(self, volume: np.ndarray) -> dict[str, float]:
-        """2D PSNR and SSIM of a result (z, y, x) in 1/mm."""
+        """Returns the 2D PSNR and SSIM of a result (z, y, x) in 1/mm."""
         source = VolumeSource(self._rt, volume, self._grid, self._geometry, self._axis)
         return compare_projections(self._project(source), self._reference)
 
@@ -79,7 +79,7 @@ class HeldOutViews:
 
 
 class SyntheticCase:
-    """A volume on the published scanner with TIGRE's noise; scans are made when they are first asked for."""
+    """A volume on the published scanner with TIGRE's noise. Scans are made when they are first asked for."""
 
     def __init__(
         self, rt: Runtime, scene: Scene, geometry: ConeGeometry, protocol: Protocol, axis: str, seed: int
@@ -91,7 +91,7 @@ class SyntheticCase:
         self.truth = scene.reference
 
     def scan(self, acquisition: str) -> Scan:
-        """The scan of one acquisition, noise included."""
+        """Returns the scan of one acquisition, with noise."""
         if acquisition not in self._scans:
             moving = acquisition == FLY
             options = SimulationOptions(
@@ -105,21 +105,21 @@ class SyntheticCase:
         return self._scans[acquisition]
 
     def measure(self, volume: np.ndarray) -> dict[str, float]:
-        """3D PSNR and SSIM against the truth, 2D against held-out views."""
+        """Returns 3D PSNR and SSIM against the truth, and 2D ones against held-out views."""
         if self._views is None:
             where = (self._geometry, self._scene.grid, self._protocol, self._axis)
             self._views = HeldOutViews(self._rt, self._scene.source, *where)
         return {**compare(volume, self.truth), **self._views.measure(volume)}
 
     def slices(self, volume: np.ndarray) -> Images:
-        """The middle axial and coronal slice."""
+        """Returns the middle axial and coronal slice."""
         nz, ny, _ = volume.shape
         return [volume[nz // 2], volume[:, ny // 2]]
 
     def references(self) -> dict[str, Measure]:
-        """None: the truth is exact."""
+        """Returns nothing: the truth is exact."""
         return {}
 
     def warn_of_inverse_crime(self) -> None:
-        """Where the volume's file has no more voxels than the benchmark's grid."""
+        """Warns where the volume's file has no more voxels than the benchmark's grid."""
         self._scene.warn_of_inverse_crime()

@@ -106,7 +106,7 @@ def bench_command(
     ] = False,
     device: Device = None,
 ) -> None:
-    """Compare methods on volumes: a resumable results file, tables in Markdown and CSV, figures of slices."""
+    """Compares methods on volumes: a results file that grows, tables in Markdown and CSV, figures of slices."""
     chosen_seeds = None if seeds is None else listed_seeds("--seeds", seeds)
     job = BenchJob(
         kind.value,  # type: ignore[attr-defined]
@@ -135,7 +135,7 @@ def bench_command(
 
 
 class BenchTicker:
-    """Progress of a benchmark: a counter for each run, and its result once it is done."""
+    """Shows the progress of a benchmark: a counter for each run, and its result once it is done."""
 
     def __init__(self) -> None:
         self.title = ""
@@ -146,7 +146,7 @@ class BenchTicker:
             self.title = p.title
             self.ticker = Ticker(f"{p.number}/{p.runs} {p.title}: iteration")
         if p.line is not None:
-            with self.ticker:  # ends the line that it rewrites
+            with self.ticker:  # this ends the line that the ticker rewrites
                 pass
             say(result_text(p))
         elif p.iterations:

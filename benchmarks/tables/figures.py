@@ -1,4 +1,4 @@
-"""Slices of every run, kept small beside the results, and figures that put the rows of a table side by side."""
+"""Slices of every run, kept beside the results, and figures that put the rows of a table side by side."""
 
 import hashlib
 import json
@@ -22,7 +22,7 @@ _TRUTH = {"run": "truth", "acquisition": None, "protocol": None, "seed": None, "
 
 
 def write_slices(folder: Path, facts: Mapping[str, Any], images: Images) -> None:
-    """Keeps the slices of a run, or of the truth where ``facts`` say so."""
+    """Keeps the slices of a run, or of the truth where ``facts`` are the truth's."""
     path = slices_path(folder, facts)
     _make(path.parent)
     with written_beside(path) as temporary, open(temporary, "wb") as file:
@@ -30,28 +30,28 @@ def write_slices(folder: Path, facts: Mapping[str, Any], images: Images) -> None
 
 
 def read_slices(folder: Path, facts: Mapping[str, Any]) -> Images | None:
-    """The slices of a run; None where there are none, or they are damaged."""
+    """Returns the slices of a run, or None where there are none or they are damaged."""
     try:
         with np.load(slices_path(folder, facts), allow_pickle=False) as stored:
             images = [stored[f"arr_{number}"] for number in range(len(stored))]
             return images if all(isinstance(image, np.ndarray) for image in images) else None
-    except Exception:  # zipfile, zlib and NumPy's parser hand on whatever they stumble over
+    except Exception:  # zipfile, zlib and NumPy's parser raise whatever they meet
         return None
 
 
 def slices_path(folder: Path, facts: Mapping[str, Any]) -> Path:
-    """Where the slices of a run are: a file whose name follows from the run's identity."""
+    """Returns the path of a run's slices. The file's name follows from the run's identity."""
     digest = hashlib.sha256(json.dumps(key_of(facts)).encode()).hexdigest()[:16]
     return folder / "slices" / f"{facts['volume']}_{digest}.npz"
 
 
 def truth_of(facts: Mapping[str, Any]) -> Line:
-    """The facts under which the truth's slices of a run's volume are kept."""
+    """Returns the facts under which the truth's slices of a run's volume are kept."""
     return {**facts, **_TRUTH}
 
 
 def write_figures(job: BenchJob, lines: Sequence[Line]) -> list[Path]:
-    """One PNG for each volume and protocol that the lines hold; the files written."""
+    """Writes one PNG for each volume and protocol of the lines. Returns the files written."""
     job = job.with_all(lines)
     chosen = [line for line in lines_of(job, lines) if line["acquisition"] == FLY]
     cases = dict.fromkeys((line["protocol"], line["volume"]) for line in chosen)
@@ -68,7 +68,7 @@ def write_figures(job: BenchJob, lines: Sequence[Line]) -> list[Path]:
 
 
 def _figure(job: BenchJob, protocol: str, lines: Sequence[Line]) -> Path | None:
-    """The figure of one volume, of its first seed; None where no slices are kept."""
+    """Writes the figure of one volume, of its first seed. Returns None where no slices are kept."""
     seed = min(line["seed"] for line in lines)
     by_run = {line["run"]: line for line in lines if line["seed"] == seed}
     truth = read_slices(job.output, truth_of(lines[0]))

@@ -1,4 +1,4 @@
-"""One name, one object: results of a volume are not mixed with those of another that has its name."""
+"""Keeps results of different objects apart that have the same name."""
 
 import hashlib
 from collections.abc import Mapping, Sequence
@@ -11,7 +11,7 @@ _CHUNK_BYTES = 1 << 20
 
 
 def content_hash(source: Path | None) -> str | None:
-    """The BLAKE2b hash of a file's bytes, 16 hexadecimal digits; None for what is no regular file or cannot be read."""
+    """Returns the BLAKE2b hash of a file's bytes, 16 hexadecimal digits. None for anything but a readable regular file."""
     if source is None or not source.is_file():
         return None
     digest = hashlib.blake2b(digest_size=8)
@@ -19,7 +19,7 @@ def content_hash(source: Path | None) -> str | None:
         with open(source, "rb") as file:
             while chunk := file.read(_CHUNK_BYTES):
                 digest.update(chunk)
-    except OSError:  # said by the check of the volumes, which tells why
+    except OSError:  # the check of the volumes says why
         return None
     return digest.hexdigest()
 
@@ -29,8 +29,7 @@ def refuse_other_objects(
 ) -> None:
     """Raises InputError where lines of a planned volume, at its size, are of another file or of other contents.
 
-    Lines of early versions have no hash: of them the file's name is compared.
-    """
+    Lines of early versions have no hash: for these the file's name is compared."""
     now = {_name(facts): facts for facts in planned}
     for line in lines:
         facts = now.get(_name(line))

@@ -1,4 +1,4 @@
-"""What a benchmark is told to do, and the runs that follow from it, checked before any work."""
+"""The task of a benchmark, and the runs that follow from it, checked before any work."""
 
 import json
 from collections.abc import Callable, Sequence
@@ -31,18 +31,14 @@ _FLY_PROTOCOLS = tuple(name for name, protocol in PROTOCOLS.items() if protocol.
 class BenchJob:
     """Which table, of which volumes, at which size.
 
-    Args:
-        kind: table1, table2 or phantom.
-        output: folder of the results file, tables, figures and slices; made where it is missing.
-        volumes: folder of HDF5 volumes; the built-in phantoms foot and jaw without it. Not for phantom.
-        size: XS, S, M, L, XL or a size of one's own; by default the kind's.
-        names: volumes by name; all by default.
-        protocols: rapid (25 views), standard (50); by default both for table1, rapid for the others.
-        rows: labels of rows; all of the table by default.
-        seeds: of noise, jitter, cloud and frame order.
-        iterations: of the splatting methods, instead of the size's.
-        axis: what is read out at one time, rows or columns.
-    """
+    - kind: table1, table2 or phantom.
+    - output: folder of the results file, tables, figures and slices. It is made where it is missing.
+    - volumes: folder of HDF5 volumes, not for phantom. None takes the built-in phantoms foot and jaw.
+    - size: XS, S, M, L, XL or a size of one's own; by default the kind's.
+    - names: volumes by name. protocols: rapid (25 views), standard (50). rows: labels of rows. Defaults: all volumes and
+      rows, both protocols for table1, rapid for the others.
+    - seeds: of noise, jitter, cloud and frame order. iterations: those of the splatting methods, in place of the size's.
+    - axis: what is read out at one time, rows or columns."""
 
     kind: str
     output: Path
@@ -71,7 +67,7 @@ class BenchJob:
 
     @property
     def bench_size(self) -> BenchSize:
-        """The size with the job's own number of iterations."""
+        """Returns the size with the job's own number of iterations."""
         wish = _DEFAULT_SIZES[self.kind] if self.size is None else self.size
         size = bench_size(wish) if isinstance(wish, str) else wish
         return size if self.iterations is None else replace(size, iterations=self.iterations)
@@ -86,17 +82,16 @@ class BenchJob:
 
     @property
     def stem(self) -> str:
-        """How the names of tables and figures begin: one for each set of results that is summed up together."""
+        """Returns the beginning of the names of tables and figures: one for each set of results."""
         size = self.bench_size
         own = self.iterations in (None, replace(self, iterations=None).bench_size.iterations)
         parts = self.kind, size.name, "" if own else f"i{size.iterations}", "" if self.axis == "rows" else self.axis
         return "_".join(part for part in parts if part)
 
     def with_all(self, lines: Sequence[Line]) -> "BenchJob":
-        """The job whose table has everything of its kind and size that the lines hold, whatever is to be run now.
+        """Returns the job whose table has everything of its kind and size that the lines hold, whatever is to be run now.
 
-        Rows of the kind are always there, others where they have results or are asked for.
-        """
+        Rows of the kind are always there; others are there if they have results or are asked for."""
         runs = {line.get("run") for line in lines if line.get("acquisition") == FLY}
         always = {row.run for row in (*rows_of(self.kind), *self.chosen_rows)}
         labels = {row.label for row in (*rows_of(self.kind), *self.chosen_rows)}
@@ -106,20 +101,20 @@ class BenchJob:
 
     @property
     def study(self) -> str:
-        """Volumes with TIGRE's noise, or the sphere phantom with raw counts."""
+        """Returns the study: volumes with TIGRE's noise, or the sphere phantom with raw counts."""
         return PHANTOM if self.kind == "phantom" else SYNTHETIC
 
     def paper_column(self, protocol: str) -> str:
-        """Where the paper's tables have their numbers for a protocol of this study."""
+        """Returns the column of the paper's tables for a protocol of this study."""
         return PHANTOM if self.study == PHANTOM else protocol
 
     @property
     def gaussians(self) -> int:
-        """The first cloud of every splatting row: the default number for the grid."""
+        """Returns the first cloud's number of Gaussians in every splatting row: the default for the grid."""
         return SplatOptions().gaussians_for(Grid.cube(self.bench_size.voxels, 2.0))
 
     def sources(self) -> dict[str, Path | None]:
-        """Volume names with their files; None for a phantom of this package."""
+        """Returns volume names with their files; None for a phantom of this package."""
         if self.kind == "phantom":
             return {SPHERES: None}
         if self.volumes is not None:
@@ -131,7 +126,7 @@ class BenchJob:
 
 @dataclass(frozen=True, eq=False)
 class PlannedRun:
-    """One reconstruction: of which case, by which row, and the facts that identify it in the results file."""
+    """One reconstruction: its case, its row, and the facts that identify it in the results file."""
 
     volume: str
     source: Path | None
@@ -144,7 +139,7 @@ class PlannedRun:
 
     @property
     def case(self) -> tuple[str, str, int]:
-        """Runs with the same case share their scans."""
+        """Returns the key of the case. Runs with the same case share their scans."""
         return self.volume, self.protocol, self.seed
 
     @property
@@ -153,11 +148,9 @@ class PlannedRun:
 
 
 def plan_runs(job: BenchJob) -> list[PlannedRun]:
-    """Every run of a job, a case after the other, stop-and-shoot runs once for all rows that share them.
+    """Returns every run of a job, one case after the other. Rows share their stop-and-shoot runs.
 
-    Raises:
-        InputError: rows, volumes or options that do not exist, or no row that can be run.
-    """
+    Raises InputError for rows, volumes or options that do not exist, and where no row can be run."""
     shared = _with_options(job)
     if not shared:
         voxels = job.bench_size.voxels
@@ -178,7 +171,7 @@ def plan_runs(job: BenchJob) -> list[PlannedRun]:
 
 
 def _with_options(job: BenchJob) -> list[tuple[str, Row, Any]]:
-    """(acquisition, row, options) of every case: options are checked here, before any work."""
+    """Returns (acquisition, row, options) of every case. Options are checked here, before any work."""
     rows = [row for row in job.chosen_rows if not row.lacks(job.bench_size.voxels)]
     wanted = [(FLY, row) for row in rows] + [(STILL, row.static()) for row in rows]
     unique = {(acquisition, row.run): row for acquisition, row in reversed(wanted)}
@@ -214,7 +207,7 @@ def _facts(
 
 
 def plain(value: Any) -> Any:
-    """A value as it comes back from JSON: tuples are lists."""
+    """Returns a value as JSON gives it back: tuples become lists."""
     return json.loads(json.dumps(value, default=str))
 
 
@@ -223,7 +216,7 @@ Report = Callable[["BenchProgress"], None]
 
 @dataclass(frozen=True)
 class BenchProgress:
-    """Where a benchmark is: run ``number`` of ``runs``, and how far in it; ``line`` is the result once it is done."""
+    """Progress of a benchmark: run ``number`` of ``runs``, and the progress of that run. ``line``: its result once done."""
 
     number: int
     runs: int

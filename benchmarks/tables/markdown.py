@@ -13,7 +13,7 @@ Cell = Callable[[Summary], str]
 
 
 def markdown(job: BenchJob, lines: Sequence[Line]) -> str:
-    """A block for each protocol: the means of every row, and the volumes one by one."""
+    """Returns a block for each protocol: the means of every row, and the volumes one by one."""
     size = job.bench_size
     text = [
         f"# {_TITLES[job.kind]}: {size.voxels}³ voxels, {size.pixels}² pixels", "", *_notes(job, lines), ""

@@ -1,8 +1,7 @@
 """The paper's real-phantom study, simulated: a double-layer sphere phantom on a C-arm, scored against a pseudo-truth.
 
-64 stop-and-shoot projections reconstructed with R2-Gaussian are the reference that a real study has; the true
-phantom is known here as well, and the beads give roundness, edge sharpness and bias.
-"""
+64 stop-and-shoot projections reconstructed with R2-Gaussian are the reference that a real study has. Here the true phantom
+is known as well, and the beads give roundness, edge sharpness and bias."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -25,7 +24,7 @@ from tables.sizes import BenchSize
 PSEUDO = "pseudo-truth"
 PSEUDO_VIEWS = 64
 PANEL = Panel()
-JITTER_DEG = 0.1  # wander of the gantry about constant speed; the encoder sees it
+JITTER_DEG = 0.1  # wander of the gantry about constant speed, which the encoder records
 DETECTOR_OFFSET_MM = (1.3, -2.1)
 # Beads of 0.04/mm, as aluminium has near 80 keV, in a holder of 0.006/mm.
 _ATTENUATION_FACTOR = 4.0
@@ -33,7 +32,7 @@ HOLDER, BEADS = 1, 2
 
 
 class PhantomCase:
-    """The sphere phantom on the C-arm of ``data/carm.toml``; ``pseudo_truth`` is asked for when results are scored."""
+    """The sphere phantom on the C-arm of ``data/carm.toml``. ``pseudo_truth`` is asked for when results are scored."""
 
     def __init__(
         self,
@@ -54,13 +53,13 @@ class PhantomCase:
         self.truth = self.phantom.voxelise(self.grid, 4)
 
     def scan(self, acquisition: str) -> Scan:
-        """The fly-scan, the stop-and-shoot one from its mid-window angles, or the one of the pseudo-truth."""
+        """Returns the fly-scan, the stop-and-shoot scan at its mid-window angles, or the scan of the pseudo-truth."""
         if acquisition not in self._scans:
             self._scans[acquisition] = self._measured(acquisition)
         return self._scans[acquisition]
 
     def measure(self, volume: np.ndarray) -> dict[str, float]:
-        """Numbers against the pseudo-truth (…_pseudo) and the truth, on held-out views, and of the beads' shape."""
+        """Returns numbers against the pseudo-truth (…_pseudo) and the truth, on held-out views, and of the beads' shape."""
         if self._views is None:
             where = (self.geometry, self.grid, self._protocol, self._axis)
             self._views = HeldOutViews(self._rt, self._source, *where)
@@ -68,7 +67,7 @@ class PhantomCase:
         return {**compare(volume, self.truth), **against, **self._views.measure(volume), **self.shape(volume)}
 
     def shape(self, volume: np.ndarray) -> dict[str, float]:
-        """Roundness, edge rise and bias of a volume (z, y, x)."""
+        """Returns roundness, edge rise and bias of a volume (z, y, x)."""
         beads = beads_of(self.phantom)
         bias = regional_bias(volume, self.truth, self._labels())
         return {
@@ -79,24 +78,24 @@ class PhantomCase:
         }
 
     def slices(self, volume: np.ndarray) -> Images:
-        """The axial slice through the upper layer of beads and the middle coronal one."""
+        """Returns the axial slice through the upper layer of beads, and the middle coronal slice."""
         layer_mm = max(bead.centre_mm[2] for bead in beads_of(self.phantom))
         z_mm = self.grid.axes_mm()[0]
         return [volume[int(np.abs(z_mm - layer_mm).argmin())], volume[:, volume.shape[1] // 2]]
 
     def references(self) -> dict[str, Measure]:
-        """The truth's own shape, which voxels limit, and the pseudo-truth's distance from it."""
+        """Returns the truth's own shape, which voxels limit, and the pseudo-truth's distance from it."""
         return {"truth": lambda: self.shape(self.truth), PSEUDO: self._measure_pseudo}
 
     def warn_of_inverse_crime(self) -> None:
-        """Never: the phantom's line integrals are closed forms."""
+        """Does nothing: the phantom's line integrals are closed forms."""
 
     def _measure_pseudo(self) -> dict[str, float]:
         numbers = self.measure(self._pseudo_truth())
         return {name: value for name, value in numbers.items() if not name.endswith("_pseudo")}
 
     def _labels(self) -> np.ndarray:
-        """(z, y, x): 1 in voxels of holder alone, 2 in those of beads alone, 0 in mixed ones and air."""
+        """Returns labels (z, y, x): 1 in voxels of holder alone, 2 in those of beads alone, 0 in mixed voxels and air."""
         holder = self.phantom.ellipsoids[0].attenuation_per_mm
         bead = holder + self.phantom.ellipsoids[1].attenuation_per_mm
         labels = np.zeros(self.truth.shape, np.int8)
@@ -117,14 +116,14 @@ class PhantomCase:
         )
         title = f"sphere phantom, {acquisition}"
         scan = simulate(self._source, self.geometry, self.grid, options, reference=self.truth, title=title)
-        rng = np.random.default_rng([self._seed, 1])  # a stream of its own: jitter has drawn from the first
+        rng = np.random.default_rng([self._seed, 1])  # jitter has drawn from the first stream
         frames, unusable = measured_attenuation(scan.projections, PANEL, rng)
         mask = unusable.astype(np.uint8) if unusable.any() else None
         return replace(scan, projections=frames, pixel_mask=mask)
 
 
 def c_arm(size: BenchSize) -> tuple[ConeGeometry, Grid]:
-    """The C-arm of ``data/carm.toml`` with the size's pixels and a shifted panel, and the grid on its box."""
+    """Returns the C-arm of ``data/carm.toml`` with the size's pixels and a shifted panel, and the grid on its box."""
     scanner = load_scanner("carm", resource("data"))
     panel = with_detector_count(scanner.geometry, size.pixels, size.pixels)
     geometry = replace(panel, detector_offset_mm=DETECTOR_OFFSET_MM)
@@ -132,7 +131,7 @@ def c_arm(size: BenchSize) -> tuple[ConeGeometry, Grid]:
 
 
 def phantom_in(grid: Grid) -> EllipsoidPhantom:
-    """The sphere phantom in the box of a grid, as dense as metal in plastic."""
+    """Returns the sphere phantom in the box of a grid, as dense as metal in plastic."""
     phantom = sphere_phantom(grid.half_longest_mm)
     bodies = (
         replace(e, attenuation_per_mm=_ATTENUATION_FACTOR * e.attenuation_per_mm) for e in phantom.ellipsoids
@@ -141,5 +140,5 @@ def phantom_in(grid: Grid) -> EllipsoidPhantom:
 
 
 def beads_of(phantom: EllipsoidPhantom) -> list[Bead]:
-    """The beads of the sphere phantom: every body but the first, which holds them."""
+    """Returns the beads of the sphere phantom: every body but the first, which holds them."""
     return [Bead(e.centre_mm, e.semi_axes_mm[0]) for e in phantom.ellipsoids[1:]]

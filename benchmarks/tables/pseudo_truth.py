@@ -1,4 +1,4 @@
-"""The reference of the phantom study: made once for a size and seed, kept beside the results."""
+"""The reference of the phantom study. It is made once for a size and seed, and kept beside the results."""
 
 import json
 from dataclasses import asdict
@@ -33,7 +33,7 @@ class PseudoTruth:
         self._volume: np.ndarray | None = None
 
     def volume_of(self) -> np.ndarray:
-        """(z, y, x) float32 in 1/mm."""
+        """Returns the volume (z, y, x) float32 in 1/mm."""
         if self._volume is None:
             self._volume = self._stored()
         if self._volume is None:
@@ -41,7 +41,7 @@ class PseudoTruth:
         return self._volume
 
     def _stored(self) -> np.ndarray | None:
-        """The volume of an earlier run with the same options; None where there is none."""
+        """Returns the volume of an earlier run with the same options, or None."""
         if not self.path.exists():
             return None
         try:
@@ -64,6 +64,6 @@ class PseudoTruth:
 
 
 def refuse_interrupted(result: Reconstruction) -> None:
-    """Methods end early, with what they have, on Ctrl-C: that is no result of a benchmark."""
+    """Raises an error for a result that ended early: on Ctrl-C methods return an unfinished result."""
     if result.facts.get("interrupted_at") is not None:
         raise KeyboardInterrupt

@@ -1,13 +1,12 @@
-"""The paper's own numbers, printed beside ours as a reference; its data, volumes and hardware are others.
+"""The paper's own numbers, printed beside ours as a reference. Their data, volumes and hardware differ.
 
-PhyRadGS, Tables 1 and 2: PSNR in dB, SSIM and minutes on an RTX 4090.
-"""
+They are from PhyRadGS, Tables 1 and 2: PSNR in dB, SSIM and minutes on an RTX 4090."""
 
 from typing import NamedTuple
 
 
 class Published(NamedTuple):
-    """One cell of the paper's tables; None where it has no number."""
+    """One cell of the paper's tables. A number that the paper lacks is None."""
 
     psnr_db: float
     ssim: float
@@ -64,5 +63,5 @@ TABLE2: dict[str, dict[str, Published]] = {
 
 
 def published(label: str, column: str) -> Published | None:
-    """The paper's cell of a row in the column "rapid", "standard" or "phantom"; None where it has none."""
+    """Returns the paper's cell of a row in the column "rapid", "standard" or "phantom"; None where it has none."""
     return {**TABLE1, **TABLE2}.get(label, {}).get(column)

@@ -1,4 +1,4 @@
-"""What a flat panel delivers: 16-bit counts, with flat and dark frames beside them."""
+"""Raw data of a flat panel: 16-bit counts, with flat and dark frames beside them."""
 
 from dataclasses import dataclass
 
@@ -15,9 +15,8 @@ _FULL_SCALE = 65_535
 class Panel:
     """Photon counts of an open pixel, electronic noise (standard deviation) and dark offset, all in counts.
 
-    Pixels differ in gain by ``gain_spread`` (relative standard deviation), and the beam falls off towards the
-    corners by ``falloff``: what flat fields are for.
-    """
+    Flat fields correct two things: gains of pixels differ by ``gain_spread`` (relative standard deviation), and the beam
+    falls off towards the corners by ``falloff``."""
 
     dose: float = 5e4
     electronic_noise: float = 10.0
@@ -29,16 +28,9 @@ class Panel:
 def measured_attenuation(
     line_integrals: np.ndarray, panel: Panel, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Line integrals as they come out of raw counts, flats and darks.
+    """Returns line integrals (F, v, u) float32 from raw counts, flats and darks, and a mask of values that must not be used.
 
-    Args:
-        line_integrals: (F, v, u), free of noise.
-        panel: what the detector does to them.
-        rng: the only source of randomness.
-
-    Returns:
-        (F, v, u) float32, and a bool mask of the same shape, True where a value must not be used.
-    """
+    line_integrals: (F, v, u), free of noise. panel: the detector's effects. rng: the only source of randomness."""
     frames, rows, columns = line_integrals.shape
     gain = _open_beam(panel, rows, columns, rng)
     flats = np.broadcast_to(gain, (CALIBRATION_FRAMES, rows, columns))
@@ -49,7 +41,7 @@ def measured_attenuation(
 
 
 def _open_beam(panel: Panel, rows: int, columns: int, rng: np.random.Generator) -> np.ndarray:
-    """Expected counts (v, u) above dark without an object."""
+    """Returns expected counts (v, u) above dark without an object."""
     v, u = np.linspace(-1, 1, rows)[:, None], np.linspace(-1, 1, columns)
     beam = 1 - panel.falloff * (u * u + v * v) / 2
     spread = np.clip(rng.normal(1.0, panel.gain_spread, (rows, columns)), 0.5, 1.5)

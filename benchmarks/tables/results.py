@@ -1,4 +1,4 @@
-"""The results file: which runs it holds."""
+"""The results file, and which runs it holds."""
 
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
@@ -8,14 +8,14 @@ from phyradgs_cl.workflow.sweep import Line, append_line, read_lines
 
 __all__ = ["KEY", "Line", "Present", "append_line", "key_of", "read_lines"]
 
-# What makes a run the same run; its options are compared besides.
+# The facts that identify a run. Its options are compared as well.
 KEY = (
     "study", "volume", "source", "run", "acquisition", "voxels", "pixels", "protocol", "axis", "seed", "iterations",
 )  # fmt: skip
 
 
 def key_of(line: Mapping[str, Any]) -> tuple[Any, ...]:
-    """The identity of a run."""
+    """Returns the identity of a run."""
     return tuple(line.get(name) for name in KEY)
 
 
@@ -28,16 +28,14 @@ class Present:
             self.add(line)
 
     def add(self, line: Line) -> None:
-        """One line more; those of failed runs do not count."""
+        """Adds a line. Failed runs do not count."""
         if "error" not in line:
             self._by_key[key_of(line)].append(line)
 
     def has(self, facts: Mapping[str, Any]) -> bool:
-        """Whether the run that ``facts`` describe was made, with the same options.
+        """Returns whether the run that ``facts`` describe was made, with the same options.
 
-        Options that one of the two does not know, because the program has gained or lost them since, are not
-        compared.
-        """
+        Options that only one of the two has, because the program has changed, are not compared."""
         same = self._by_key.get(key_of(facts), ())
         return any(_agree(line.get("options"), facts.get("options")) for line in same)
 

@@ -1,4 +1,4 @@
-"""Rows of the tables: a label, and the method with the motion model behind it."""
+"""Rows of the tables: a label, and the method with its motion model."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -19,10 +19,8 @@ _WITH_COUNTS = ("micro-views", "centres")
 class Row:
     """One row: a method with a motion model.
 
-    strips and sub_intervals matter to ``_WITH_COUNTS``; ``still`` is the label of the same method with a static
-    model, which is what a stop-and-shoot scan is reconstructed with; ``changes`` are further options, told apart
-    by ``variant``.
-    """
+    strips and sub_intervals matter to ``_WITH_COUNTS``. ``still``: the label of the same method with a static model, which
+    reconstructs stop-and-shoot scans. ``changes``: further options, which ``variant`` names."""
 
     label: str
     method: str
@@ -35,16 +33,16 @@ class Row:
 
     @property
     def run(self) -> str:
-        """What is computed, whatever it is called: rows of two tables with one run share its result."""
+        """Returns the key of the computation. Rows of two tables with the same run share its result."""
         counts = f"{self.strips}x{self.sub_intervals}" if self.motion in _WITH_COUNTS else ""
         return " ".join(part for part in (self.method, self.motion, counts, self.variant) if part)
 
     def static(self) -> "Row":
-        """The row of the same method with a static model, for a gantry at rest."""
+        """Returns the row of the same method with a static model, for a gantry at rest."""
         return Row(self.still or self.label, self.method, variant=self.variant, changes=self.changes)
 
     def options(self, gaussians: int, iterations: int) -> Any:
-        """The method's options; splatting methods all get the same first cloud and iterations."""
+        """Returns the method's options. Splatting methods all get the same first cloud and iterations."""
         if self.method not in METHODS:
             expected = f"one of {', '.join(METHODS)}"
             raise InputError(f"row {self.label!r}", f"the method {self.method!r}", expected, "choose others with --rows")
@@ -61,11 +59,11 @@ class Row:
 
     @property
     def is_splatting(self) -> bool:
-        """Whether the method places Gaussians, and so shares their number and the iterations."""
+        """Returns whether the method places Gaussians, and so shares their number and the iterations."""
         return self._has(SplatOptions)
 
     def lacks(self, voxels: int) -> str:
-        """What this machine lacks to run the row at so many voxels per side, as PyTorch or a GPU for it; else nothing."""
+        """Returns what this machine lacks for the row at so many voxels per side, such as PyTorch or a GPU; otherwise ""."""
         if not self._has(NeuralOptions):
             return ""
         if not has_torch():
@@ -121,9 +119,9 @@ def _table1() -> tuple[Row, ...]:
 
 
 def _extras() -> tuple[Row, ...]:
-    """Rows that are run only when they are asked for by name."""
+    """Returns rows that are run only when they are asked for by name."""
     known = {row.method for row in (*_table1(), *_FUSED)}
-    others = [name for name in METHODS if name not in known]  # methods that somebody has added to the registry
+    others = [name for name in METHODS if name not in known]  # methods that users have added to the registry
     per_row = [Row(f"{name} per-row", name, "per-row", still=name) for name in others]
     return (*_FUSED, *(Row(name, name) for name in others), *per_row)
 
@@ -134,19 +132,19 @@ def _table2() -> tuple[Row, ...]:
 
 
 def rows_of(kind: str) -> tuple[Row, ...]:
-    """The rows of a table, in order."""
+    """Returns the rows of a table, in order."""
     if kind not in KINDS:
         raise InputError("benchmark", repr(kind), f"one of {', '.join(KINDS)}")
     return _table2() if kind == "table2" else _table1()
 
 
 def candidate_rows(kind: str) -> tuple[Row, ...]:
-    """Every row that a kind may have; extras stand at the end."""
+    """Returns every row that a kind may have. Extras are at the end."""
     return (*rows_of(kind), *(() if kind == "table2" else _extras()))
 
 
 def choose_rows(kind: str, labels: Sequence[str] | None) -> tuple[Row, ...]:
-    """The rows of a kind, or those with the given labels in the table's order; InputError for one that is unknown."""
+    """Returns the rows of a kind, or those with the given labels in the table's order. InputError: an unknown label."""
     rows = rows_of(kind)
     if not labels:
         return rows

@@ -1,4 +1,4 @@
-"""Runs a benchmark: whatever the results file lacks, one line per run, and then the tables."""
+"""Runs a benchmark: the runs that the results file lacks, one line each, and then the tables."""
 
 import logging
 import math
@@ -32,29 +32,23 @@ from tables.summary import REFERENCE
 from tables.tables import write_tables
 
 RESULTS = "results.jsonl"
-# R2-Gaussian's scanner: distances and sides in scene units
+# R2-Gaussian's scanner: distances and sides in scene units.
 _TO_AXIS, _TO_DETECTOR, _PANEL_SIDE, _BOX_SIDE = 5.0, 7.0, 4.0, 2.0
 log = logging.getLogger(__name__)
 
 
-@np.errstate(all="ignore")  # what overflows is found in the result, and reported in one line
+@np.errstate(all="ignore")  # overflow is found in the result, and reported in one line
 def run_bench(
     job: BenchJob, make_runtime: Callable[[], Runtime], report: Report = lambda progress: None
 ) -> list[Path]:
-    """Makes the runs that the results file lacks, then tables and figures; the files written.
+    """Makes the runs that the results file lacks, then tables and figures. Returns the files written.
 
-    A run is in the file once it is done, so that an interruption (KeyboardInterrupt) loses the present one only and
-    the same job goes on from there.
+    A run is in the file once it is done. An interruption (KeyboardInterrupt) loses only the present run, and the same job
+    continues from there. job: all of it is checked before the first run. make_runtime: called once, if there is anything to
+    do. report: called at the iterations of a run, and with its line when it is done.
 
-    Args:
-        job: what to run; everything in it is checked before the first run.
-        make_runtime: called once, if there is anything to do.
-        report: called at the iterations of a run, and with its line when it is done.
-
-    Raises:
-        InputError: rows, volumes, names or options that do not exist.
-        OutputError: the folder cannot be written.
-    """
+    Raises InputError for rows, volumes, names or options that do not exist, and OutputError for a folder that cannot be
+    written."""
 
     plan = plan_runs(job)
     _name_rows_left_out(job)
@@ -75,8 +69,7 @@ def run_bench(
 def remake_tables(job: BenchJob, seeds: Sequence[int] | None = None) -> list[Path]:
     """Writes tables and figures from the present results file. Returns the files written.
 
-    The job's names, where it has any, and ``seeds`` restrict what is read.
-    """
+    The job's names, if it has any, and ``seeds`` restrict what is read."""
     lines = read_lines(job.output / RESULTS)
     if job.names:
         held = list(dict.fromkeys(str(line.get("volume")) for line in lines))
@@ -102,7 +95,7 @@ def _name_rows_left_out(job: BenchJob) -> None:
 
 
 class Batch:
-    """The ``missing`` runs of ``total``, a case after the other. ``lines`` are those of the results file, and grow."""
+    """The ``missing`` runs of ``total``, one case after the other. ``lines`` are those of the results file, and grow."""
 
     def __init__(
         self, job: BenchJob, results: Path, lines: list[Line], missing: Sequence[PlannedRun], total: int,
@@ -114,20 +107,20 @@ class Batch:
         self.warned: set[str] = set()
 
     def keep(self, line: Line) -> None:
-        """One line more, in the file and here."""
+        """Adds a line to the file and to ``lines``."""
         with finish_despite_interrupt():
             append_line(self.results, line)
         self.present.add(line)
         self.lines.append(line)
 
     def finish(self, run: PlannedRun, line: Line) -> None:
-        """Says what a run gave, and how long the others will take."""
+        """Reports the result of a run, and how long the others will take."""
         number = self.total - len(self.left) + 1
         self.left.remove(run)
         self.report(BenchProgress(number, self.total, run.title, line=line, left_s=self._left_s()))
 
     def _left_s(self) -> float | None:
-        """Seconds that the missing runs will take, by what the same runs took on other objects; None if unknown."""
+        """Returns the seconds that the missing runs will take, from the same runs on other objects; None if unknown."""
         total = 0.0
         for run in self.left:
             like = [line["seconds"] for line in self.lines if "seconds" in line and _is_like(line, run)]
@@ -137,7 +130,7 @@ class Batch:
         return total
 
     def run_case(self, runs: Sequence[PlannedRun]) -> None:
-        """All missing runs of one case."""
+        """Makes all missing runs of one case."""
         title = f"reference of seed {runs[0].seed}"
         first = BenchProgress(self.total - len(self.left) + 1, self.total, title)
         case = make_case(self.job, self.rt, runs[0], _forwarded(self.report, first))
@@ -151,7 +144,7 @@ class Batch:
             number = self.total - len(self.left) + 1
             started = BenchProgress(number, self.total, run.title)
             self.report(started)
-            with keep_finished_work():  # a run that is done is measured and kept, then the benchmark stops
+            with keep_finished_work():  # a finished run is measured and kept, then the benchmark stops
                 line = one_run(self.job, run, case, self.rt, _forwarded(self.report, started))
                 self.keep(line)
             self.finish(run, line)
@@ -160,7 +153,7 @@ class Batch:
 def reference_lines(
     job: BenchJob, run: PlannedRun, case: Case, rt: Runtime, present: Present
 ) -> Iterator[Line]:
-    """Lines about what results are compared with, where the case has any that are not present."""
+    """Returns lines about what results are compared with, where the case has any that are missing."""
     same = {"acquisition": REFERENCE, "method": None, "options": {}, "iterations": job.bench_size.iterations}
     for name, measure in case.references().items():
         facts = {**run.facts, **same, "run": name, "label": name}
@@ -170,12 +163,12 @@ def reference_lines(
 
 
 def one_run(job: BenchJob, run: PlannedRun, case: Case, rt: Runtime, progress: ProgressReport) -> Line:
-    """Makes a run and keeps its slices; the line has its error where numbers overflowed."""
+    """Makes a run and keeps its slices. Where numbers overflowed, the line has the error."""
     scan = case.scan(run.acquisition)
     started, used = time.perf_counter(), time.process_time()
     try:
         result = reconstruct(scan, RunPlan(str(run.row.method), run.options, seed=run.seed), rt, report=progress)
-    except NumericalError as error:  # one method that overflows must not cost a night's other runs
+    except NumericalError as error:  # an overflow in one method must not cost a night's other runs
         log.warning("%s: %s", run.title, error)
         return {**run.facts, "error": str(error), **environment(rt.device)}
     seconds, processor_s = time.perf_counter() - started, time.process_time() - used
@@ -185,14 +178,14 @@ def one_run(job: BenchJob, run: PlannedRun, case: Case, rt: Runtime, progress: P
         **run.facts,
         "metrics": {name: _number(value) for name, value in case.measure(result.volume).items()},
         "seconds": round(seconds, 3),
-        "processor_s": round(processor_s, 3),  # of all threads: comparable beside other work, unlike seconds
+        "processor_s": round(processor_s, 3),  # of all threads: unlike seconds, it is comparable beside other work
         "gaussians": result.facts.get("gaussians"),
         **environment(rt.device),
     }
 
 
 def make_case(job: BenchJob, rt: Runtime, run: PlannedRun, report: ProgressReport) -> Case:
-    """The object of a run on its scanner; ``report`` follows the reconstruction of a pseudo-truth."""
+    """Returns the object of a run on its scanner. ``report`` follows the reconstruction of a pseudo-truth."""
     size, protocol = job.bench_size, PROTOCOLS[run.protocol]
     if job.study == PHANTOM:
         pseudo = PseudoTruth(job, rt, run.seed, report)
@@ -210,12 +203,12 @@ def _scene(job: BenchJob, rt: Runtime, run: PlannedRun, geometry: ConeGeometry) 
 
 
 def _number(value: float) -> float | None:
-    """JSON has neither NaN nor infinity."""
+    """Returns a number for JSON, which has neither NaN nor infinity."""
     return float(value) if math.isfinite(value) else None
 
 
 def _forwarded(report: Report, started: BenchProgress) -> ProgressReport:
-    """A method's report as the benchmark's."""
+    """Returns a method's report as the benchmark's."""
 
     def forward(p: Progress) -> None:
         report(BenchProgress(started.number, started.runs, started.title, p.iteration, p.iterations))
@@ -229,13 +222,13 @@ def _is_like(line: Line, run: PlannedRun) -> bool:
 
 
 def _check_volumes(runs: Sequence[PlannedRun]) -> None:
-    """Files that are no volumes are named now, not after hours of other runs."""
+    """Refuses files that are no volumes now, not after hours of other runs."""
     for path in dict.fromkeys(run.source for run in runs):
         if path is not None and file_kind(path) == "scan":
             expected = "a dataset /volume (z, y, x), or one of our volumes"
             raise InputError(str(path), "a scan", expected, "take it out of the folder, or choose --names")
         if path is not None:
-            load_attenuation(path, warn=False)  # it will, when the volume's turn comes
+            load_attenuation(path, warn=False)  # the warning comes when the volume is used
 
 
 def _results_file(folder: Path) -> Path:

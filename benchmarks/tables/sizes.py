@@ -8,7 +8,7 @@ from phyradgs_cl.errors import InputError
 
 @dataclass(frozen=True)
 class BenchSize:
-    """A cube of ``voxels``³ seen by ``pixels``² pixels, splatted for ``iterations`` iterations."""
+    """A cube of ``voxels``³ seen by ``pixels``² pixels. Splatting methods take ``iterations`` iterations."""
 
     name: str
     voxels: int
@@ -34,7 +34,7 @@ SIZES = {
 
 
 def bench_size(name: str) -> BenchSize:
-    """A size by its name; InputError lists the known ones."""
+    """Returns a size by its name. InputError lists the known ones."""
     if name not in SIZES:
         known = ", ".join(f"{s.name} ({s.voxels}³ from {s.pixels}²)" for s in SIZES.values())
         raise InputError("--size", repr(name), f"one of {known}")

@@ -1,4 +1,4 @@
-"""Means over volumes and spreads over seeds of the lines that belong to a table."""
+"""Means over volumes, and spreads over seeds, of the lines that belong to a table."""
 
 from collections import defaultdict
 from collections.abc import Sequence
@@ -14,7 +14,7 @@ REFERENCE = "reference"  # the acquisition of lines about the truth and the pseu
 
 @dataclass(frozen=True)
 class Summary:
-    """One row under one acquisition: means over volumes; spreads are standard deviations over seeds."""
+    """One row under one acquisition: means over volumes. Spreads are standard deviations over seeds."""
 
     mean: dict[str, float]
     spread: dict[str, float]
@@ -23,10 +23,9 @@ class Summary:
 
 
 def lines_of(job: BenchJob, lines: Sequence[Line]) -> list[Line]:
-    """The newest line of every successful run at the job's size, iterations and readout axis.
+    """Returns the newest line of every successful run at the job's size, iterations and readout axis.
 
-    Names, protocols and rows restrict them where the job gives any; volumes and seeds of earlier jobs are included.
-    """
+    The job's names, protocols and rows restrict them. Volumes and seeds of earlier jobs are included."""
     size = job.bench_size
     runs = {row.run for row in job.chosen_rows} | {row.static().run for row in job.chosen_rows}
     chosen: dict[tuple[object, ...], Line] = {}
@@ -48,17 +47,16 @@ def lines_of(job: BenchJob, lines: Sequence[Line]) -> list[Line]:
 
 
 def lines_of_run(lines: Sequence[Line], protocol: str, run: str, acquisition: str) -> list[Line]:
-    """Those lines that are of one run under a protocol and an acquisition, of whatever volumes and seeds."""
+    """Returns the lines of one run under a protocol and an acquisition, of all volumes and seeds."""
     wanted = (protocol, run, acquisition)
     return [line for line in lines if (line["protocol"], line["run"], line["acquisition"]) == wanted]
 
 
 def summarise(lines: Sequence[Line]) -> Summary | None:
-    """Means over volumes of means over seeds; None without lines.
+    """Returns means over volumes of means over seeds; None without lines.
 
-    Few volumes may have been run with several seeds. A spread is that of the mean over those volumes that have them all:
-    that of other volumes, which have one, would tell of volumes and not of seeds.
-    """
+    Only a few volumes may have been run with several seeds. A spread is that of the mean over the volumes that have all
+    seeds. Volumes with one seed would add the spread of volumes to that of seeds."""
     if not lines:
         return None
     found = [(line["volume"], line["seed"], _numbers(line)) for line in lines]
@@ -79,6 +77,6 @@ def summarise(lines: Sequence[Line]) -> Summary | None:
 
 
 def _numbers(line: Line) -> dict[str, float]:
-    """A line's measures, with the times it has: lines about the truth have none, those of early versions one."""
+    """Returns a line's measures, with the times that it has: the truth's lines have none, those of early versions one."""
     numbers = {name: value for name, value in line["metrics"].items() if value is not None}
     return numbers | {name: line[name] for name in ("seconds", "processor_s") if name in line}

@@ -25,13 +25,10 @@ _FACTS = ("study", "size", "voxels", "pixels", "iterations", "axis", "protocol",
 
 
 def write_tables(job: BenchJob, lines: Sequence[Line]) -> list[Path]:
-    """Writes KIND_SIZE.md and KIND_SIZE.csv into the job's folder; the two paths.
+    """Writes KIND_SIZE.md and KIND_SIZE.csv into the job's folder. Returns both paths.
 
-    They have all that the lines hold for the kind and size: a run of some rows, volumes or protocols adds to a table.
-
-    Raises:
-        InputError: no line of the results file belongs to the table.
-    """
+    They have all that the lines hold for the kind and size: a run of some rows, volumes or protocols adds to a table. Raises
+    InputError where no line of the results file belongs to the table."""
     job = job.with_all(lines)
     chosen = lines_of(job, lines)
     size = job.bench_size
@@ -50,7 +47,7 @@ def write_tables(job: BenchJob, lines: Sequence[Line]) -> list[Path]:
 
 
 def comma_separated(job: BenchJob, lines: Sequence[Line]) -> str:
-    """One record for each protocol, row and acquisition, with means, spreads over seeds and the paper's numbers."""
+    """Returns a record for each protocol, row and acquisition, with means, spreads over seeds and the paper's numbers."""
     out = io.StringIO()
     columns = [f"{name}{end}" for name in METRICS for end in ("", "_spread")]
     counts = ("volumes", "seeds")
@@ -88,6 +85,6 @@ def _record(job: BenchJob, protocol: str, row: Row, acquisition: str, summary: S
 
 
 def _all_rows(job: BenchJob) -> list[Row]:
-    """The rows of a table and the static ones behind their stop-and-shoot runs, each run once."""
+    """Returns the rows of a table, and the static rows of their stop-and-shoot runs. Each run comes once."""
     rows = job.chosen_rows
     return list({row.run: row for row in [*(row.static() for row in rows), *rows]}.values())

@@ -1,4 +1,4 @@
-"""Which volumes a folder holds, and which of several resolutions is projected."""
+"""Finds the volumes of a folder, and chooses the projected one of several resolutions."""
 
 import re
 from collections.abc import Sequence
@@ -11,13 +11,10 @@ _COUNTED = re.compile(r"(?P<name>.+)_(?P<count>\d+)")
 
 
 def find_volumes(folder: Path, names: Sequence[str] | None, voxels: int) -> dict[str, Path]:
-    """Name to file of the volumes in ``folder``, in alphabetical order, or those of ``names``.
+    """Returns name to file of the volumes in ``folder``, in alphabetical order, or of those in ``names``.
 
-    Files are NAME_COUNT.h5 or NAME.h5. Of one name, the file with twice ``voxels`` per side is taken, else the largest.
-
-    Raises:
-        InputError: no such folder, no volume in it, a name that is not there.
-    """
+    Files are NAME_COUNT.h5 or NAME.h5. Of files with one name, the one with twice ``voxels`` per side is taken, otherwise
+    the largest. Raises InputError for a missing folder, a folder without volumes, and a name that is not there."""
     if not folder.is_dir():
         raise InputError("--volumes", str(folder), "a folder of HDF5 volumes", "check the path")
     found: dict[str, dict[int, Path]] = {}

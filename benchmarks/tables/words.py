@@ -6,7 +6,7 @@ from tables.job import BenchProgress
 
 
 def listed(option: str, text: str | None) -> list[str] | None:
-    """The parts of "a,b", without blanks around them; None for None, InputError for an empty part."""
+    """Returns the parts of "a,b" without blanks around them; None for None. InputError: an empty part."""
     if text is None:
         return None
     parts = [part.strip() for part in text.split(",")]
@@ -16,7 +16,7 @@ def listed(option: str, text: str | None) -> list[str] | None:
 
 
 def listed_seeds(option: str, text: str) -> list[int]:
-    """The whole numbers of "0,1,2"."""
+    """Returns the whole numbers of "0,1,2"."""
     parts = [part.strip() for part in text.split(",")]
     if not all(part.isascii() and part.isdigit() for part in parts):
         raise InputError(option, repr(text), "whole numbers of at least 0", "write for example 0,1,2")
@@ -24,7 +24,7 @@ def listed_seeds(option: str, text: str) -> list[int]:
 
 
 def result_text(progress: BenchProgress) -> str:
-    """What a finished run gave, and how long the others will take."""
+    """Returns the result of a finished run, and how long the others will take."""
     line = progress.line or {}
     numbers = line.get("metrics")
     if numbers is None:

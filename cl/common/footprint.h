@@ -1,11 +1,11 @@
-/* The pixels that a splat covers in one cell, line by line: the same for the projector and its adjoint. */
+/* The pixels that a splat covers in one cell, line by line. The projector and its adjoint share them. */
 #include "common/splat_moving.h"
 
-/* a splat on one line, and its pixels u_lo..u_hi there */
+/* A splat on one line, and its pixels u_lo..u_hi on it. */
 typedef struct {
 #if MOVING
     moving_line s;
-    float amp, speed, middle, half_time; /* amp: of the line's window, the part in this segment */
+    float amp, speed, middle, half_time; /* amp: the part of the line's window in this segment */
 #else
     splat_line s;
 #endif
@@ -41,7 +41,7 @@ ALWAYS_INLINE footprint_line footprint_at(SPLAT_SPACE const float *splat_record,
     return line;
 }
 
-/* the same for a single line; `times`: the cell's (TIME_ROWS, time_pitch), if splats move */
+/* The same for a single line. `times`: the cell's (TIME_ROWS, time_pitch), if splats move. */
 ALWAYS_INLINE footprint_line footprint_alone(SPLAT_SPACE const float *splat_record, SPLAT_SPACE const float *cell,
                                              __global const float *times, const int time_pitch, const int v,
                                              const float4 path_limits)
@@ -55,7 +55,7 @@ ALWAYS_INLINE footprint_line footprint_alone(SPLAT_SPACE const float *splat_reco
 #endif
 }
 
-/* offset of the pixels u.. of a line from the splat's centre */
+/* The offset of the pixels u.. of a line from the splat's centre. */
 ALWAYS_INLINE vf footprint_du(const footprint_line line, const int u)
 {
     return ((float)(u - line.u_whole) + V_IOTA) - line.u_rest;
@@ -63,7 +63,7 @@ ALWAYS_INLINE vf footprint_du(const footprint_line line, const int u)
 
 #if GROUP > 1
 /* The same, with only the pixels within the cutoff. With t = l11 du + t0 and B = beta t + gamma, num <= cutoff2 Q is a
-   quadratic in t. It does not depend on the distance of the line from the centre, so that needles keep their digits. */
+   quadratic in t. It does not depend on the distance of the line from the centre, so needles lose no digits. */
 ALWAYS_INLINE footprint_line footprint_within(SPLAT_SPACE const float *splat_record, SPLAT_SPACE const float *cell,
                                               __global const float *times, const int time_pitch, const int v,
                                               const float4 path_limits, const float cutoff2)

@@ -1,5 +1,5 @@
-/* Calls visit(visitor, line) for every line v_lo..v_hi on which a splat covers pixels, in order. The including file
-   defines `visit` and the type VISITOR first. */
+/* Calls visit(visitor, line) in order for every line v_lo..v_hi on which a splat covers pixels. The including file defines
+   `visit` and the type VISITOR before. */
 ALWAYS_INLINE void walk_footprint(__global const float *splat_record, __global const float *cell, __global const float *times,
                                   const int time_pitch, const float4 path_limits, const float cutoff2,
                                   const int v_lo, const int v_hi, VISITOR *visitor)

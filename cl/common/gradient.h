@@ -1,13 +1,13 @@
-/* Rows of a gradient matrix (13, stride): the parameters' rows, then the two numbers that density control
-   watches. Rotations are differentiated by a small turn in the Gaussian's own frame (a torque) and stored
-   as the tangent 2 q (0, torque) of the unit quaternion. */
+/* Rows of a gradient matrix (13, stride): the parameters' rows, then the two numbers that density control reads. Rotations
+   are differentiated by a small turn in the Gaussian's own frame (a torque). They are stored as the tangent 2 q (0, torque)
+   of the unit quaternion. */
 #include "common/gaussian.h"
 
 #define ROW_STATISTIC 11
-#define ROUND 4e-6f /* of the sum of two scales: a difference that rounding makes */
+#define ROUND 4e-6f /* times the sum of two scales: rounding makes differences as large as this */
 
-/* s3 / s2 - s2 / s3, the factor of the torque about the third axis. Two scales that differ only by rounding count as equal:
-   the torque would be rounding too, and Adam would make it a step of full length. */
+/* The factor s3 / s2 - s2 / s3 of the torque about the third axis. Two scales that differ only by rounding count as equal:
+   otherwise the torque would be rounding too, and Adam would make it a step of full length. */
 static inline vf out_of_round(const vf s2, const vf s3, const vf inv2, const vf inv3)
 {
     const vf more = s3 - s2, both = s3 + s2;
@@ -31,7 +31,7 @@ static inline void gradient_store(__global float *out, const int stride, const i
     }
 }
 
-/* sums (.., 16) of LANES Gaussians that lie `step` floats apart, turned into one vector per field */
+/* Collects sums (.., 16) of LANES Gaussians, `step` floats apart, into one vector per field. */
 static inline void gather_sums(__global const float *sums, const size_t step, const int fields, __private float *buffer)
 {
     for (int lane = 0; lane < LANES; ++lane)

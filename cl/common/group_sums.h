@@ -1,5 +1,6 @@
-/* Sums over the items of a work-group, in a tree: the same bits whichever item runs first. `own`: what the calling item has of
-   each of `fields` sums; `tree`: (fields, items) of local memory; `sums` gets one number per field. All items call it. */
+/* Sums over the items of a work-group, in a tree: the bits do not depend on which item comes first. All items call it.
+   `own`: the calling item's part of each of `fields` sums. `tree`: (fields, items) of local memory. `sums` gets one number
+   per field. */
 #include "common/lanes.h"
 
 #define GROUP_ITEM ((int)(get_local_id(1) * get_local_size(0) + get_local_id(0)))

@@ -1,5 +1,5 @@
-/* Vectors of LANES floats. Width 1 is a plain scalar, where comparisons give 1 instead of -1 and
-   select/any have no scalar form, so everything that differs is hidden here. */
+/* Vectors of LANES floats. Width 1 is a plain scalar, where comparisons give 1 instead of -1 and select/any have no scalar
+   form. Everything that differs is hidden here. */
 #ifndef LANES
 #error "build with -DLANES=1, 4, 8 or 16"
 #endif
@@ -33,7 +33,7 @@ static inline float v_sum(vf v) { return v; }
 typedef LANE_TYPE(float, LANES) vf;
 typedef LANE_TYPE(int, LANES) vi;
 #ifdef __clang__
-/* PoCL's vloadn and vstoren take a vector in up to four parts, which a load of the whole soon after has to wait for. */
+/* PoCL's vloadn and vstoren move a vector in up to four parts. A load of the whole vector soon after must wait for all. */
 typedef LANE_TYPE(float, LANES) __attribute__((aligned(4))) vf_anywhere;
 #define WIDE_ALIGNED __attribute__((aligned(64))) /* a vector at a multiple of LANES lies in one line of the cache */
 #define V_OVERLOAD ALWAYS_INLINE __attribute__((overloadable))
@@ -85,7 +85,7 @@ static inline float v_sum(vf v)
 #endif
 #endif
 
-/* Element by element into a register: through an array in memory the wide load waits for all narrow stores. */
+/* Fills a register element by element: through an array in memory the wide load would wait for all narrow stores. */
 #if LANES == 1
 #define GATHER(p, i) ((p)[i])
 #elif LANES == 4
@@ -100,8 +100,8 @@ static inline float v_sum(vf v)
 #endif
 #endif
 
-/* V_LOOKUP(low, high, i): in each lane element i of the 2 LANES that two vectors hold, where the processor has an instruction
-   for it, which takes a fraction of a gather's time. */
+/* V_LOOKUP(low, high, i) takes in each lane element i of the 2 LANES elements of two vectors. It is defined where the
+   processor has an instruction for it, which takes a fraction of a gather's time. */
 #ifdef __has_builtin
 #if LANES == 16 && defined(__AVX512F__) && __has_builtin(__builtin_ia32_vpermi2varps512)
 typedef float v_table __attribute__((vector_size(64)));

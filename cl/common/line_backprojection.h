@@ -1,4 +1,4 @@
-/* What a voxel receives from a view whose lines have their own poses: backproject.cl and backproject_moving.cl. */
+/* What a voxel receives from a view whose lines have their own poses, for backproject.cl and backproject_moving.cl. */
 
 #define LINE_STEPS 6
 #define LEAST_SPEED 0.1f
@@ -17,8 +17,8 @@ static inline float line_sample(__global const float *line, const float u, const
     return line[column] + (u - column) * (line[column + (width > 1)] - line[column]);
 }
 
-/* Returns the line that is open where a voxel stands: v(pose of line r) = r, solved by Newton's method on the piecewise
-   linear v between lines, from `line` on. `t`: how far the voxel is on the way to the next line, of which both depths are the voxel's. */
+/* Returns the line that is open where a voxel is: v(pose of line r) = r. Newton's method solves it on the piecewise linear v
+   between lines, from `line` on. `t`: the part of the way to the next line; both lines' depths are those of the voxel. */
 static inline int line_seeing(
     __global const float *table, /* (lines, 12) */
     const int lines, int line, const float x, const float y, const float z,
@@ -41,7 +41,7 @@ static inline int line_seeing(
     return line;
 }
 
-/* FDK's weight of a sample of a line, of which `middle` is the depth. */
+/* FDK's weight of a sample of a line; `middle` is the depth of the line's middle. */
 #if DISTANCE_POWER == 1 /* see backproject.cl */
 #define BY_LINE(weight, middle, scale) ((weight) / ((middle) * (scale)))
 #else
@@ -49,7 +49,7 @@ static inline int line_seeing(
 #endif
 
 static inline float line_added(
-    const float sum, /* to which the voxel's value is added */
+    const float sum, /* the value so far */
     __global const float *table, __global const float *image, const int lines, const int width, const int image_pitch,
     const float x, const float y, const float z,
     const float weight, const int filtered_across)

@@ -1,6 +1,6 @@
-/* A dot product a·x + t with a result split into an integer and a small rest. Positions on a detector
-   of 1000 pixels need more than float32's 24 bits: float64 where the device has it, otherwise pairs of
-   floats with error-free sums and products. Coefficients come from the host as double or as (high, low). */
+/* A dot product a·x + t, with a result split into an integer and a small rest. Positions on a detector of 1000 pixels need
+   more than float32's 24 bits. They use float64 where the device has it, otherwise pairs of floats with error-free sums and
+   products. Coefficients come from the host as double or as (high, low). */
 #include "common/lanes.h"
 
 #if FP64
@@ -22,7 +22,7 @@ static inline vwide wide_dot(__global const coefficient *row, vf x, vf y, vf z)
 }
 static inline vf wide_value(vwide a) { return WIDE_FLOAT(a); }
 
-/* a/b as whole + rest, |rest| <= 1/2 (whole kept within the range that a detector index can have) */
+/* a/b as whole + rest, |rest| <= 1/2. The whole is kept within the range of a detector's indices. */
 static inline vf wide_ratio(vwide a, vwide b, vf *rest)
 {
     vwide ratio = a / b;
@@ -43,7 +43,7 @@ static inline vf wide_split(vwide a, vf *rest)
 typedef struct { vf high, low; } vwide;
 typedef float2 coefficient;
 
-/* error-free sums and products: nothing in these may become a multiply-add; the host leaves -cl-mad-enable out too */
+/* Error-free sums and products. Nothing in them may become a multiply-add; the host leaves -cl-mad-enable out too. */
 static inline vwide wide_sum(vwide a, vf b)
 {
 #pragma OPENCL FP_CONTRACT OFF

@@ -1,9 +1,9 @@
 /* Joseph's samples along LANES rays of one detector line, for the projector and both shapes of its adjoint.
-   Everything is in voxel indices (x, y, z). All of them take axis, planes and weights from here, and fma fixes
-   the rounding: a ray has the same samples in all kernels.
-   RAY_PARALLEL: the rays of a cell have one direction. RAY_SOURCE is this direction over its main component, and RAY_D00,
-   RAY_EU, RAY_EV give where rays cut the plane 0 of the main axis, with 1, 0, 0 along it. On a plane i these are the rays
-   of a cone beam whose source lies at the direction times i, a plane before (START_OF, AHEAD_OF). */
+   Everything is in voxel indices (x, y, z). All kernels take axis, planes and weights from here, and fma fixes the rounding,
+   so a ray has the same samples in all of them.
+   RAY_PARALLEL: the rays of a cell have one direction. RAY_SOURCE is this direction over its main component. RAY_D00, RAY_EU
+   and RAY_EV give where rays cut the plane 0 of the main axis, with 1, 0, 0 along it. On a plane i these are the rays of a
+   cone beam whose source is one plane before, at the direction times i (START_OF, AHEAD_OF). */
 #include "common/lanes.h"
 
 #define RAY_CELL 16    /* floats per cell */
@@ -16,15 +16,15 @@
 #define RAY_PARALLEL 0
 #endif
 #if RAY_PARALLEL
-#define START_OF(start, i) fma((start), (float)(i), 0.0f) /* rounded everywhere: no sum may take the product in */
+#define START_OF(start, i) fma((start), (float)(i), 0.0f) /* rounded here, so that no sum can fuse the product */
 #define AHEAD_OF(start, i) 1.0f
 #else
 #define START_OF(start, i) (start)
 #define AHEAD_OF(start, i) ((float)(i) - (start))
 #endif
 
-/* ACROSS: of a panel of few rows that is read along columns. Its rows are the kernels' lines nevertheless, for vectors of
-   neighbouring columns. A cell then serves columns, and every column has its own weight. */
+/* ACROSS: a panel of few rows that is read along columns. Its rows are still the kernels' lines, for vectors of neighbouring
+   columns. A cell then serves columns, and every column has its own weight. */
 #ifndef ACROSS
 #define ACROSS 0
 #endif
@@ -34,7 +34,7 @@ typedef vf own_t;
 typedef float own_t;
 #endif
 
-/* The weight of pixels u … u + LANES − 1 of line v, from the weights of a cell. */
+/* The weights of pixels u … u + LANES − 1 of line v, from the weights of a cell. */
 static inline own_t weight_of(__global const float *weights, const int u, const int v)
 {
 #if ACROSS
@@ -44,8 +44,8 @@ static inline own_t weight_of(__global const float *weights, const int u, const 
 #endif
 }
 
-#define BORDER 1       /* zero voxels around a volume in y and z; in x the rows' padding does */
-#define CLIP_MARGIN 0.01f /* planes: more than the rounding of a clipped end; samples outside weigh nothing anyway */
+#define BORDER 1       /* zero voxels around a volume in y and z; in x the rows' padding does this */
+#define CLIP_MARGIN 0.01f /* planes: more than the rounding of a clipped end; samples outside have weight 0 */
 
 #if RAY_LONG           /* a volume of 2^31 floats or more */
 typedef long index_t;
@@ -124,17 +124,17 @@ RAY_INLINE rays_t rays_through(__global const float *cell, const float4 pitch_mm
     return r;
 }
 
-/* Rays along one main axis a through a box of voxels: position on plane i is s_b + g_b (i - s_a), likewise c; with s_b i for
-   s_b and 1 for i - s_a in a parallel beam. */
+/* Rays along one main axis a through a box of voxels. The position on plane i is s_b + g_b (i - s_a), likewise for c. In a
+   parallel beam s_b i replaces s_b, and 1 replaces i - s_a. */
 typedef struct {
     float sa, sb, sc;
     vf gb, gc;
     int a_first, b_first, b_last, c_first, c_last; /* voxels of the box */
     vi first, last;                                /* planes of each ray */
-    int lo, hi;                                    /* planes of any of them */
+    int lo, hi;                                    /* planes of any ray */
 } walk_t;
 
-/* narrows [lo, hi] to the planes where the other coordinate, sb + g (i - sa), lies in (below, above) */
+/* Narrows [lo, hi] to the planes where the other coordinate, sb + g (i - sa), lies in (below, above). */
 RAY_INLINE void clip_planes(const vf g, const float sa, const float sb, const float below, const float above,
                         vf *lo, vf *hi)
 {
@@ -152,7 +152,8 @@ RAY_INLINE void clip_planes(const vf g, const float sa, const float sb, const fl
     *hi = V_PICK(*hi, min(*hi, max(p, q) + CLIP_MARGIN), oblique);
 }
 
-/* those of the rays `which` whose main axis is this one; box = (first voxel, number of voxels); 0: none meets it */
+/* Finds the planes of those of the rays `which` whose main axis is this one. box = (first voxel, number of voxels). Returns
+   0 if no ray meets it. */
 RAY_INLINE int rays_enter(const rays_t r, __global const float *cell, const int axis, const vi which,
                       const int4 corner, const int4 size, walk_t *w)
 {
@@ -172,7 +173,7 @@ RAY_INLINE int rays_enter(const rays_t r, __global const float *cell, const int 
     const vf inv = 1.0f / V_PICK(1.0f, da, own);
     w->gb = V_PICK(0.0f, db * inv, own);
     w->gc = V_PICK(0.0f, dc * inv, own);
-    /* planes between source and detector, then those where both other coordinates touch the box */
+    /* Planes between source and detector, then those on which both other coordinates touch the box. */
     vf lo = (vf)(a0), hi = (vf)(a0 + na - 1);
 #if !RAY_PARALLEL
     lo = max(lo, min((vf)(w->sa), w->sa + da));
@@ -191,8 +192,8 @@ RAY_INLINE int rays_enter(const rays_t r, __global const float *cell, const int 
     return w->lo <= w->hi;
 }
 
-/* Voxel at or below a position, and the weight of the next one; beyond the box it is the border of zeros.
-   PoCL's floor is slow: positions start at -1, so cutting off the fraction of position + 1 does the same. */
+/* The voxel at or below a position, and the weight of the next voxel. Beyond the box it is in the border of zeros. PoCL's
+   floor is slow. Positions start at -1, so cutting off the fraction of position + 1 does the same. */
 RAY_INLINE vi sample_at(const vf g, const float s, const float ahead, const int first, const int last, vf *share)
 {
     const vf at = min(max(fma(g, (vf)(ahead), (vf)(s)), (float)first - 1.0f), (float)last + 1.0f);

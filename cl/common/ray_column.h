@@ -1,8 +1,8 @@
-/* The rays of one detector column, LANES lines at a time, and where poses and parts of the panel are listed.
+/* The rays of one detector column, LANES lines at a time, and the list of poses and parts of the panel.
    LEAN 0: the column is parallel to the volume's z, and all its rays have one direction along x and y. */
 #include "common/ray.h"
 
-#define SLOT 8         /* ints of a slot: a pose and the lines and columns [first, stop) of the panel that it serves */
+#define SLOT 8         /* ints of a slot: a pose, and the lines and columns [first, stop) of the panel that it serves */
 #define SLOT_CELL 0
 #define SLOT_U 1
 #define SLOT_U_STOP 2
@@ -11,7 +11,7 @@
 
 typedef struct { vf x, y, z; } column_rays_t; /* from the source to pixels, in voxels */
 
-/* one component of the ray to a pixel, as rays_through has it */
+/* One component of the ray to a pixel, as in rays_through. */
 RAY_INLINE float ray_component(__global const float *cell, const int axis, const int u, const int v)
 {
     const float line = LEAN || axis == 2 ? fma((float)v, cell[RAY_EV + axis], cell[RAY_D00 + axis]) : cell[RAY_D00 + axis];
@@ -33,7 +33,7 @@ RAY_INLINE column_rays_t column_rays(__global const float *cell, const int u, co
     return d;
 }
 
-/* a main axis is x or y here: rays that are steeper along z take the general kernel */
+/* The main axis is x or y here. Rays that are steeper along z take the general kernel. */
 RAY_INLINE vi column_along_x(__global const float *cell, const column_rays_t d)
 {
 #if RAY_PARALLEL
@@ -52,7 +52,7 @@ RAY_INLINE int is_along_x(__global const float *cell, const int u, const int v)
 #endif
 }
 
-/* length of each ray from one plane to the next */
+/* The length of each ray from one plane to the next. */
 RAY_INLINE vf column_steps_mm(__global const float *cell, column_rays_t d, const float4 pitch_mm)
 {
 #if RAY_PARALLEL
@@ -65,7 +65,7 @@ RAY_INLINE vf column_steps_mm(__global const float *cell, column_rays_t d, const
 }
 
 /* First and last of `count` planes i along the main axis that lie between source and detector. Columns lean only where the
-   whole volume does, as operators/rays/upright.py sees to. */
+   whole volume does; operators/rays/upright.py ensures this. */
 RAY_INLINE int2 planes_between(__global const float *cell, const int u, const int along_x, const int first, const int count)
 {
 #if LEAN || RAY_PARALLEL
@@ -78,7 +78,7 @@ RAY_INLINE int2 planes_between(__global const float *cell, const int u, const in
 #endif
 }
 
-/* Those of the planes on which b = sb + g (i - sa) may lie between two bounds, for all slopes from g0 to g1. */
+/* The planes on which b = sb + g (i - sa) may lie between two bounds, for all slopes from g0 to g1. */
 RAY_INLINE int2 planes_within(const int2 planes, const float sa, const float sb, const float g0, const float g1,
                               const float below, const float above)
 {

@@ -2,15 +2,13 @@
 
    D = (u - u0, v - v0) is the offset of a pixel from the centre. num = D'SD, with S from the Gram form, stored as its
    triangular factor L. B = 1 + b.D, and Q = B^2 + num/kappa. The line integral of the Gaussian along the pixel's ray is
-
        p = amp * sqrt(|d|^2 / Q) * exp(-num / (2 Q))
-
    with d the vector from source to pixel. This is exact, perspective included: docs/mathematics.md.
-   The affine (R2-Gaussian) splat is Q = 1 and |d| of the central ray. */
+   The affine (R2-Gaussian) splat has Q = 1 and |d| of the central ray. */
 #include "common/falling_exp2.h"
 
 #ifndef PARALLEL
-#define PARALLEL 0 /* rays of a cell have one direction; AFFINE, which is exact then, must be 1 */
+#define PARALLEL 0 /* the rays of a cell have one direction; AFFINE, which is exact then, must be 1 */
 #endif
 
 #ifndef DEFORMED
@@ -18,7 +16,7 @@
 #endif
 
 #ifndef SPLAT_SPACE
-#define SPLAT_SPACE __global /* where records and constants of cells are read from */
+#define SPLAT_SPACE __global /* memory of the records and of the cells' constants */
 #endif
 
 #if MOVING
@@ -34,10 +32,10 @@
 #define REC_B1 5
 #define REC_B2 6
 #define REC_INV_KAPPA 7
-#define REC_AMP 8         /* density, ray factor and cell weight */
+#define REC_AMP 8         /* density times ray factor times cell weight */
 #define REC_U_WHOLE 9     /* int */
 #define REC_V_WHOLE 10    /* int */
-#define REC_U_LO 11       /* int: the pixels to visit, empty when HI < LO */
+#define REC_U_LO 11       /* int: the pixels to visit; empty where HI < LO */
 #define REC_U_HI 12
 #define REC_V_LO 13
 #define REC_V_HI 14
@@ -50,7 +48,7 @@
 #define REC_REACH2 17     /* cutoff for |(along, across)|^2, enlarged by the largest Q */
 #endif
 
-/* floats from the first image to that of a cell; all of a frame's cells share one unless each line's own are wanted */
+/* Floats from the first image to a cell's image. All cells of a frame share one, unless each line's own are wanted. */
 #if LAYERED
 #define LAYER_AT(cell, lines, pitch) ((size_t)(cell)[CELL_LAYER] * (IMAGE_GUARD + (size_t)(lines) * (pitch)))
 #define LAYERS(count) (count)
@@ -59,9 +57,9 @@
 #define LAYERS(count) 1
 #endif
 
-/* constants of a cell, floats */
+/* The constants of a cell, in floats. */
 #define CELL 24
-#define CELL_SOURCE 0     /* 3; PARALLEL: the direction of the rays, reversed */
+#define CELL_SOURCE 0     /* 3; PARALLEL: the reversed direction of the rays */
 #define CELL_EU 3         /* 3: step to the next pixel across the lines */
 #define CELL_EV 6         /* 3: step to the next line */
 #define CELL_VOLUME 9     /* (eu x ev) . (first pixel - source) */
@@ -72,9 +70,9 @@
 #define CELL_DUU 14
 #define CELL_DUV 15
 #define CELL_DVV 16
-#define CELL_LAYER 17     /* LAYERED: image that the cell is drawn into; no line has two cells in one */
+#define CELL_LAYER 17     /* LAYERED: the image into which the cell is drawn; no line has two cells in one image */
 
-/* constants of a splat along one line */
+/* The constants of a splat along one line. */
 typedef struct {
     float l11, t0, k, b1, b0, inv_kappa, amp, d0, d1, d2;
 } splat_line;
@@ -95,7 +93,7 @@ static inline splat_line splat_on_line(SPLAT_SPACE const float *splat_record, SP
     return s;
 }
 
-/* exponent (num/Q) and value at pixels u (absolute) with offset du from the centre */
+/* Exponent (num/Q) and value at pixels u (absolute), whose offset from the centre is du. */
 static inline vf splat_value(splat_line s, vf u, vf du, vf *num_out, vf *big_b, vf *inv_q)
 {
     vf t = s.l11 * du + s.t0;

@@ -1,35 +1,34 @@
 /* A splat that moves through one segment of a frame (docs/mathematics.md, "Exact in time").
-
-   In units of the segment's length, time t runs from -1/2 to 1/2 about its middle. The centre is at t p, conic and
-   amplitude are those of the middle. With V'V = S, turned so that V p = (speed, 0), a pixel lies at
+   In units of the segment's length, time t goes from -1/2 to 1/2 about its middle. The centre is at t p; conic and amplitude
+   are those of the middle. With V'V = S, turned so that V p = (speed, 0), a pixel lies at
 
        along = V1.D,  across = V2.D,   q(t) = ((along - speed t)^2 + across^2) / Q
 
    and a line integrates exp(-q/2) over its own part [middle - half, middle + half] of the segment. */
 #include "common/splat.h"
 
-/* rows of a cell's table of lines, `time_pitch` floats each */
+/* Rows of a cell's table of lines, of `time_pitch` floats each. */
 #define TIME_MIDDLE 0
 #define TIME_HALF 1
-#define TIME_WEIGHT 2 /* part of the line's window in this segment */
+#define TIME_WEIGHT 2 /* the part of the line's window in this segment */
 #define TIME_ROWS 3
 #define TIMES_OF(c, line_times, time_pitch) ((line_times) + (size_t)(c) * TIME_ROWS * (time_pitch))
 
 #if MOVING
 #define LANE(type, v, lane) (((type *)&(v))[lane])
-#define CLOSED 0 /* rules: closed form, or the number of Gauss-Legendre times */
+#define CLOSED 0 /* the rule: closed form, or the number of Gauss-Legendre times */
 #define GAUSS_2 0.57735026919f
 #define GAUSS_3 0.77459666924f
 #define ROOT_HALF 0.70710678119f
 #define ROOT_HALF_PI 1.25331413732f
 
-/* constants of a moving splat along one line; z = along - speed * middle */
+/* The constants of a moving splat along one line. z = along - speed * middle. */
 typedef struct {
     float z1, z0, c1, c0, shift, b1, b0, inv_kappa, amplitude, half_path, d0, d1, d2;
     int rule;
 } moving_line;
 
-/* which rule meets the bound: by the path within the line's window over the splat's width (limits: of 1, 2, 3 times) */
+/* Which rule meets the error bound, from the path in the line's window over the splat's width. limits: for 1, 2, 3 times. */
 ALWAYS_INLINE int moving_rule(const float path, const float4 limits)
 {
     return path <= limits.x ? 1 : (path <= limits.y ? 2 : (path <= limits.z ? 3 : CLOSED));
@@ -60,8 +59,8 @@ ALWAYS_INLINE moving_line moving_on_line(SPLAT_SPACE const float *splat_record, 
     return s;
 }
 
-/* a pixel relative to the splat: z and across, Q, 1/Q and the factor of squares in the exponent, across^2,
-   |d|^2 (1 in the affine model), and whether it is drawn */
+/* A pixel relative to the splat: z and across, Q, 1/Q and the factor of squares in the exponent, across^2, |d|^2 (1 in the
+   affine model), and whether it is drawn. */
 typedef struct { vf z, across, b, q, rq, fall, c2, d2; vi drawn; } moving_pixel;
 
 #if AFFINE
@@ -93,7 +92,7 @@ ALWAYS_INLINE moving_pixel moving_at(const moving_line s, const vf u, const vf d
     return p;
 }
 
-/* 1 - erf|x| = 1/D, D = (1 + ...)^16 (Abramowitz and Stegun 7.1.28, 3e-7); beyond 5 that is 0 */
+/* 1 - erf|x| = 1/D, D = (1 + ...)^16 (Abramowitz and Stegun 7.1.28, to 3e-7). Beyond 5 it is 0. */
 ALWAYS_INLINE vf erf_complement(const vf x)
 {
     const vf t = min(fabs(x), 5.0f);
@@ -105,7 +104,7 @@ ALWAYS_INLINE vf erf_complement(const vf x)
     return d * d;
 }
 
-/* erf(x1) - erf(x0) with one division */
+/* erf(x1) - erf(x0) with one division. */
 ALWAYS_INLINE vf erf_between(const vf x0, const vf x1)
 {
     const vf d0 = erf_complement(x0), d1 = erf_complement(x1);
@@ -118,7 +117,7 @@ ALWAYS_INLINE vf moving_exp(const vf z, const moving_pixel p)
     return falling_exp2((z * z + p.c2) * p.fall);
 }
 
-/* the line's integral over its window at a pixel; `rule` is a constant where this is inlined */
+/* The line's integral over its window at a pixel. `rule` is a constant where this is inlined. */
 ALWAYS_INLINE vf moving_value(const int rule, const moving_line s, const moving_pixel p)
 {
     if (rule == CLOSED) {
@@ -136,7 +135,7 @@ ALWAYS_INLINE vf moving_value(const int rule, const moving_line s, const moving_
     return factor * (0.27777777778f * ends + 0.44444444444f * moving_exp(p.z, p));
 }
 
-/* means over the window of E = exp(-q/2) with z = along - speed t: E, E z, E z^2, E t, E t z */
+/* Means over the window of E = exp(-q/2) with z = along - speed t: E, E z, E z^2, E t, E t z. */
 typedef struct { vf e, ez, ezz, et, etz; } moving_means;
 
 ALWAYS_INLINE void moving_add(moving_means *m, const moving_line s, const moving_pixel p, const float weight,
@@ -151,8 +150,8 @@ ALWAYS_INLINE void moving_add(moving_means *m, const moving_line s, const moving
     m->etz += ez * time;
 }
 
-/* Closed form: with the values e at both ends, int E z = Q (e1 - e0)/speed and
-   int E z^2 = Q (int E + (z1 e1 - z0 e0)/speed); nothing here subtracts large numbers. */
+/* The closed form. With the values e at both ends, int E z = Q (e1 - e0)/speed and
+   int E z^2 = Q (int E + (z1 e1 - z0 e0)/speed). Nothing here subtracts large numbers. */
 ALWAYS_INLINE moving_means moving_closed(const moving_line s, const moving_pixel p, const float speed)
 {
     moving_means m;
@@ -190,8 +189,8 @@ ALWAYS_INLINE moving_means moving_all_means(const moving_line s, const moving_pi
     return m;
 }
 
-/* Pixels of LANES lines from `v` on that the splat reaches within each line's window: the discs at its two ends (in
-   whitened coordinates) and the flat sides between them. Lines that see nothing of the segment come out empty. */
+/* Pixels of LANES lines from `v` on that the splat reaches within each line's window: the discs at its two ends (in whitened
+   coordinates) and the flat sides between them. Lines that see nothing of the segment get no pixels. */
 ALWAYS_INLINE void moving_span(SPLAT_SPACE const float *splat_record, const vf dv, const vf middle, const vf half_time,
                                const vf weight, const int cuts, vi *u_lo, vi *u_hi)
 {

@@ -1,5 +1,6 @@
 /* The splats of a tile, in their order: tile_splat_ids[tile_offsets[tile]] to tile_splat_ids[tile_offsets[tile + 1] - 1], as
-   binning.cl writes them. Where the lists outgrew `capacity`, a tile's list is all splats: slow, with the same result. */
+   binning.cl writes them. Where the lists outgrew `capacity`, every tile lists all splats: this is slow, with the same
+   result. */
 #include "common/lanes.h"
 
 typedef struct { int is_written, first, count; } tile_list;

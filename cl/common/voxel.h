@@ -1,9 +1,9 @@
-/* The record of a Gaussian on a grid. With voxel offset D from the centre,
-   value = density exp(-|U D|^2 / 2), U upper triangular. */
+/* The record of a Gaussian on a grid. With a voxel's offset D from the centre, its value is density exp(-|U D|^2 / 2), with
+   U upper triangular. */
 #include "common/falling_exp2.h"
 
 #ifndef VOXEL_SPACE
-#define VOXEL_SPACE __global /* where records are read from */
+#define VOXEL_SPACE __global /* memory of the records */
 #endif
 
 #define VOXEL_RECORD 20
@@ -16,10 +16,10 @@
 #define VOX_U33 8
 #define VOX_DENSITY 9
 #define VOX_WHOLE 10    /* 3 ints */
-#define VOX_LO 13       /* 3 ints: x y z; empty when HI.z < LO.z */
+#define VOX_LO 13       /* 3 ints: x y z; empty where HI.z < LO.z */
 #define VOX_HI 16
 
-/* a Gaussian on one row of voxels */
+/* A Gaussian on one row of voxels. */
 typedef struct { float u11, a0, k, density, dy, dz, x_rest; int x_whole; } voxel_row;
 
 ALWAYS_INLINE voxel_row voxel_row_at(VOXEL_SPACE const float *voxel_record, const int y, const int z)
@@ -31,7 +31,7 @@ ALWAYS_INLINE voxel_row voxel_row_at(VOXEL_SPACE const float *voxel_record, cons
     r.u11 = voxel_record[VOX_U11];
     r.a0 = voxel_record[VOX_U12] * r.dy + voxel_record[VOX_U13] * r.dz;
     const float b = voxel_record[VOX_U22] * r.dy + voxel_record[VOX_U23] * r.dz, c = voxel_record[VOX_U33] * r.dz;
-    r.k = b * b + c * c; /* least |U D|^2 on the row */
+    r.k = b * b + c * c; /* the least |U D|^2 on the row */
     r.density = voxel_record[VOX_DENSITY];
     r.x_rest = voxel_record[VOX_REST];
     r.x_whole = record_as_int[VOX_WHOLE];
@@ -40,7 +40,7 @@ ALWAYS_INLINE voxel_row voxel_row_at(VOXEL_SPACE const float *voxel_record, cons
 
 ALWAYS_INLINE vf voxel_dx(const voxel_row r, const int x) { return ((float)(x - r.x_whole) + V_IOTA) - r.x_rest; }
 
-/* the values at dx, times `by`, 0 beyond the cutoff */
+/* The values at dx, times `by`; 0 beyond the cutoff. */
 ALWAYS_INLINE vf voxel_value(const voxel_row r, const vf dx, const vf by, const float limit)
 {
     const vf a = r.u11 * dx + r.a0;

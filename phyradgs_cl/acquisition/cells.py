@@ -9,29 +9,29 @@ from phyradgs_cl.acquisition.shutter import Shutter
 from phyradgs_cl.acquisition.time_cells import TimeCells
 from phyradgs_cl.acquisition.trajectory import Trajectory, body_frames, is_parallel
 
-_SAME_TIME = 1e-6  # of a cell: how exactly a frame has to begin on the grid of the first one
-_NOTHING = 1e-9  # of a window: smaller shares are rounding
-_INSTANT = 1e-9  # of the frame's span: shorter windows are moments
-_OVERHANG = 0.1  # of a segment: how far a line may stay in a segment beyond its end
+_SAME_TIME = 1e-6  # a frame shares the first one's grid of times if it begins on it to this fraction of a cell
+_NOTHING = 1e-9  # a smaller fraction of a line's window is rounding
+_INSTANT = 1e-9  # a window shorter than this fraction of the frame's span counts as a moment
+_OVERHANG = 0.1  # a line stays in a segment up to this fraction of a segment beyond its end
 _TURN_SAMPLES = 32
-_TURN_FACTOR = 0.32  # relative error per squared radian
-_HARMLESS_PEAK = 4.0  # line integral
+_TURN_FACTOR = 0.32  # relative error per squared radian of turn
+_HARMLESS_PEAK = 4.0  # largest line integral whose averaging over a segment does no harm
 _MOST_SEGMENTS = 1000
 
 
 Served = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
-"""Used cells, their first lines and their last ones, and the order of the first lines."""
+"""The used cells, their first lines, their last lines, and the order that sorts the first lines."""
 
 
 def static_cells(trajectory: Trajectory, shutter: Shutter, frame: int, start_s: float, lines: int) -> TimeCells:
-    """Returns one cell at the middle of the frame's lit span, the best single pose of a frame."""
+    """Returns one cell at the middle of the frame's lit span. That is the best single pose of a frame."""
     return _single_cell(trajectory, shutter, frame, start_s + shutter.middle_s, lines)
 
 
 def static_start_cells(
     trajectory: Trajectory, shutter: Shutter, frame: int, start_s: float, lines: int
 ) -> TimeCells:
-    """Returns one cell at the frame's first light, which rotates the volume by half the span."""
+    """Returns one cell at the frame's first light. The volume is then rotated by half the span."""
     return _single_cell(trajectory, shutter, frame, start_s + shutter.lit_span_s[0], lines)
 
 
@@ -41,8 +41,7 @@ def micro_view_cells(
 ) -> TimeCells:
     """Returns M strips × N sub-intervals at t = t_f + (j+½)/M·T_ro + (k+½)/N·T_exp (paper, Eq. 2).
 
-    With a pulsed beam the N sub-intervals divide the lit part of the strip's window. Strips without a line, where M is above
-    the number of lines, have no cells."""
+    With a pulsed beam the N sub-intervals divide the lit part of the strip's window. Strips without a line have no cells."""
     share = (np.arange(sub_intervals) + 0.5) / sub_intervals
     ranges = np.array(shutter.strip_ranges(lines, strips))
     strip = np.flatnonzero(ranges[:, 1] > ranges[:, 0])
@@ -66,8 +65,9 @@ def centre_cells(
 def per_line_cells(
     trajectory: Trajectory, shutter: Shutter, frame: int, start_s: float, lines: int, samples: int
 ) -> TimeCells:
-    """Returns ``samples`` cells for every line, at times of its exposure by the midpoint rule. The error falls with
-    samples⁻² for fields that are smooth along the motion of one step."""
+    """Returns ``samples`` cells for every line, at times of its exposure by the midpoint rule.
+
+    The error falls with samples⁻² for fields that are smooth over the motion between two times."""
     opens_s, closes_s = shutter.line_windows_s(lines).T
     share = (np.arange(samples) + 0.5) / samples
     times = (start_s + opens_s[:, None] + share * (closes_s - opens_s)[:, None]).ravel()
@@ -79,15 +79,15 @@ def per_line_cells(
 def common_time_cells(
     trajectory: Trajectory, shutter: Shutter, frame: int, frame_start_s: np.ndarray, lines: int, samples: int
 ) -> TimeCells:
-    """Returns cells of an exposure / ``samples`` from first light to last, on one grid of times for all lines of a frame.
+    """Returns cells of one exposure / ``samples`` each, on one grid of times for all lines, from first light to last.
 
-    A line takes from each cell the fraction of its own window that lies in the cell: P(v) = Σ_k w_k(v) P(θ(t_k), v), with
-    t_k the cell's middle and w_k(v) = |window(v) ∩ cell k| / |window(v)|. One pose then serves many lines, which operators
-    project together: the paper's strip concatenation with fractional strips.
+    A line takes from each cell the fraction of its own window that lies in the cell: P(v) = Σ_k w_k(v) P(θ(t_k), v). Here
+    t_k is the cell's middle and w_k(v) = |window(v) ∩ cell k| / |window(v)|. Operators project the many lines of a pose
+    together. This is the paper's strip concatenation with fractional strips.
 
-    frame_start_s (F,): of all frames. Frames that begin on the grid of the first one, as in a scan without gaps between
-    exposures, share poses where they overlap in time. An exposure of 0 s, and cells shorter than the readout of a line,
-    leave nothing to share: each line gets its own times."""
+    frame_start_s (F,): the starts of all frames. Frames that begin on the first one's grid share poses where they overlap
+    in time, as in a scan without gaps. Nothing can be shared in an exposure of 0 s, or if a cell is shorter than the readout
+    of a line. Then each line gets its own times."""
     start_s = float(frame_start_s[frame])
     windows_s = shutter.line_windows_s(lines)
     length_s = float(np.ptp(windows_s, axis=1).max())
@@ -102,11 +102,11 @@ def common_time_cells(
     return replace(table, line_share=share[used][order])
 
 
-@lru_cache(maxsize=8)  # all frames of a scan have the same
+@lru_cache(maxsize=8)  # all frames of a scan have the same windows
 def _common_shares(windows: bytes, samples: int) -> tuple[np.ndarray, np.ndarray, Served]:
-    """Returns edges (K + 1,) of cells, the share (K, lines) of each line's window in each cell, and ``_served_lines`` of it.
+    """Returns cell edges (K + 1,), each line's share (K, lines) of its window in each cell, and the ``_served_lines``.
 
-    windows: bytes of the windows (lines, 2) in s after a frame's start. Do not write to the arrays."""
+    windows: bytes of the windows (lines, 2), in s after a frame's start. Do not write to the arrays: they are cached."""
     windows_s = np.frombuffer(windows, np.float64).reshape(-1, 2)
     first_s, last_s = float(windows_s.min()), float(windows_s.max())
     step_s = float(np.ptp(windows_s, axis=1).max()) / samples
@@ -116,7 +116,7 @@ def _common_shares(windows: bytes, samples: int) -> tuple[np.ndarray, np.ndarray
 
 
 def _served_lines(served: np.ndarray) -> Served:
-    """Returns for lines served by K cells, bool (K, lines): the used cells, their first and last lines, and the order."""
+    """Returns which cells serve a line, with their first and last lines and the order. served: bool (K, lines)."""
     used = np.flatnonzero(served.any(axis=1))
     line_start = served[used].argmax(axis=1)
     line_stop = served.shape[1] - served[used, ::-1].argmax(axis=1)
@@ -124,25 +124,25 @@ def _served_lines(served: np.ndarray) -> Served:
 
 
 def _middles_s(frame_start_s: np.ndarray, frame: int, edges_s: np.ndarray) -> np.ndarray:
-    """Returns the middles of cells. Frames on the first one's grid get bitwise equal times for common cells."""
+    """Returns the middles of the cells in s. Frames on the first one's grid get bitwise equal times for common cells."""
     step_s = edges_s[1] - edges_s[0]
     start_s, origin_s = float(frame_start_s[frame]), float(frame_start_s[0])
     cells = (start_s - origin_s) / step_s
     number = np.arange(len(edges_s) - 1) + 0.5
     if abs(cells - round(cells)) < _SAME_TIME:
-        # counted from the first frame, the times of common cells have the same bits: operators project them once
+        # Times counted from the first frame have the same bits in common cells, so operators project these once.
         start_s, number = origin_s, round(cells) + number
     middles_s: np.ndarray = start_s + edges_s[0] + number * step_s
     return middles_s
 
 
 def _shares(windows_s: np.ndarray, edges_s: np.ndarray) -> np.ndarray:
-    """Returns the share (K, lines) of each line's window (lines, 2) in cells between edges (K + 1,); columns sum to 1."""
+    """Returns the share (K, lines) of each line's window (lines, 2) in cells between edges (K + 1,). Columns sum to 1."""
     opens, closes = windows_s.T
     length_s = closes - opens
     overlap = np.minimum(closes, edges_s[1:, None]) - np.maximum(opens, edges_s[:-1, None])
     share = np.maximum(overlap, 0) / np.where(length_s > 0, length_s, 1)
-    # a window of no length overlaps with nothing: the cell in which it lies has all of it
+    # A window of no length overlaps with nothing: it belongs to the cell in which it lies.
     moment = np.clip(np.searchsorted(edges_s, opens, side="right") - 1, 0, len(edges_s) - 2)
     share[:, length_s <= 0] = 0
     share[moment[length_s <= 0], np.flatnonzero(length_s <= 0)] = 1
@@ -153,14 +153,15 @@ def _shares(windows_s: np.ndarray, edges_s: np.ndarray) -> np.ndarray:
 def exact_cells(
     trajectory: Trajectory, shutter: Shutter, frame: int, start_s: float, lines: int, segments: int
 ) -> TimeCells:
-    """Returns ``segments`` equal segments of the frame's lit span, in which splats move (docs/mathematics.md). Every line
-    integrates over its own window. A gantry at rest, or a span of 0 s, gives the cell of ``static_cells``."""
+    """Returns ``segments`` equal segments of the frame's lit span, in which splats move (docs/mathematics.md).
+
+    Every line integrates over its own window. A gantry at rest, or a span of 0 s, gives the cell of ``static_cells``."""
     first_s, last_s = shutter.lit_span_s
     if last_s <= first_s:
         return static_cells(trajectory, shutter, frame, start_s, lines)
     edges_s = np.linspace(first_s, last_s, segments + 1)
     times = _line_times(shutter.line_windows_s(lines), edges_s)
-    # a cell that no line sees would be projected for nothing
+    # Projecting a cell that no line sees would be wasted work.
     used, line_start, line_stop, order = _served_lines(times[:, 2] > 0)
     middle_s = start_s + (edges_s[:-1] + edges_s[1:])[used] / 2
     ends_s = start_s + np.stack([edges_s[:-1], edges_s[1:]], -1)[used][order]
@@ -172,11 +173,12 @@ def exact_cells(
 
 
 def _line_times(windows_s: np.ndarray, edges_s: np.ndarray) -> np.ndarray:
-    """Returns ``TimeCells.line_times`` (K, 3, lines) for windows (lines, 2) and edges of segments (K + 1,), in s. A line
-    that reaches only a little way into a segment stays in the neighbouring one, which saves footprints."""
+    """Returns ``TimeCells.line_times`` (K, 3, lines) for windows (lines, 2) and edges of segments (K + 1,), both in s.
+
+    A line that reaches only a little way into a segment stays in the neighbouring one, which saves footprints."""
     length_s = edges_s[1] - edges_s[0]
     count = len(edges_s) - 1
-    opens, closes = ((windows_s - edges_s[0]) / length_s).T  # in segments from the first light
+    opens, closes = ((windows_s - edges_s[0]) / length_s).T  # in segments after the first light
     first, last = _segments_of_lines(opens, closes, count)
     index = np.arange(count)[:, None]
     start = np.where(index == first, opens, index)
@@ -189,7 +191,8 @@ def _line_times(windows_s: np.ndarray, edges_s: np.ndarray) -> np.ndarray:
 
 
 def _segments_of_lines(opens: np.ndarray, closes: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the first and last segment (lines,) of every line, without those of which it covers at most ``_OVERHANG``."""
+    """Returns the first and last segment (lines,) of every line. Those that it covers by at most ``_OVERHANG`` are left
+    out."""
     first = np.clip(np.floor(opens), 0, count - 1)
     last = np.clip(np.ceil(closes) - 1, first, count - 1)
     first = np.where((first < last) & (first + 1 - opens <= _OVERHANG), first + 1, first)
@@ -204,8 +207,8 @@ def segments_for(
     """Returns how many segments keep the error of straight paths and constant conics below ``time_error`` (relative RMS).
 
     Both errors grow with the square of the view's turn in a segment. The factor was measured (benchmarks/time_exact.py) for
-    Gaussians of 0.5 to 4 % of the half-width. intensity_peak: largest line integral where the detector averages intensities,
-    else 0. Half of their variance in a segment remains, which up to a peak of 4 is smaller than the other errors."""
+    Gaussians of 0.5 to 4 % of the half-width. intensity_peak: the largest line integral where the detector averages
+    intensities, else 0. Half of their variance in a segment remains; up to a peak of 4 the other errors are larger."""
     first_s, last_s = shutter.lit_span_s
     pose = trajectory.pose(frame, start_s + np.linspace(first_s, last_s, _TURN_SAMPLES + 1))
     fastest_rad = float(np.max(_turns_rad(pose))) * _TURN_SAMPLES
@@ -215,8 +218,7 @@ def segments_for(
 
 
 def _turns_rad(pose: np.ndarray) -> np.ndarray:
-    """Returns the angles (T − 1,) between successive poses (T, 12), of the source about the origin or of the detector. The
-    larger of the two counts."""
+    """Returns the angles (T − 1,) between successive poses (T, 12): the larger of the turns of source and detector."""
     u_hat, _, normal = np.moveaxis(body_frames(pose), -1, 0)
     source = pose[:, :3] / np.maximum(np.linalg.norm(pose[:, :3], axis=1, keepdims=True), 1e-300)
     chords = [np.linalg.norm(np.diff(x, axis=0), axis=1) for x in (u_hat, normal, source)]
@@ -232,7 +234,7 @@ def cell_table(
     trajectory: Trajectory, shutter: Shutter, frame: int, time_s: np.ndarray, line_start: np.ndarray,
     line_stop: np.ndarray, weight: np.ndarray, lines: int
 ) -> TimeCells:
-    """Returns cells at times (C,) s, sorted by their first lines."""
+    """Returns the cells at times (C,) in s, sorted by their first lines."""
     order = np.argsort(line_start, kind="stable")
     return TimeCells(
         pose=trajectory.pose(frame, time_s[order]), time_s=time_s[order],

@@ -1,8 +1,8 @@
 """Geometry of cone and parallel beams: positions of source and detector at a gantry angle, and the field of view.
 
 A *pose* is 12 numbers in world coordinates (mm): source, centre of pixel (0, 0), the step from column to column (û·du)
-and from row to row (v̂·dv). A parallel beam has the rays' direction, towards the panel, in place of the source. Operators
-take poses, never angles."""
+and the step from row to row (v̂·dv). A parallel beam has the rays' direction, towards the panel, in place of the source.
+Operators take poses, never angles."""
 
 import math
 from dataclasses import dataclass, replace
@@ -16,8 +16,8 @@ from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
 
 POSE_LENGTH = 12
-_MOST_VOXELS_AWAY = 1e6  # of a source: float32 displaces its rays by 6 % of a voxel there, by a half at 1e7
-_STEEP = 1e-2  # squared sine of a ray's angle to the z axis: steeper ones pass it nowhere in particular
+_MOST_VOXELS_AWAY = 1e6  # largest distance of a source: float32 moves its rays by 6 % of a voxel, at 1e7 by half of one
+_STEEP = 1e-2  # squared sine of a ray's angle to the z axis: where a steeper ray passes the axis is not certain
 
 
 @dataclass(frozen=True)
@@ -26,7 +26,9 @@ class ConeGeometry:
 
     ``source_to_axis_mm`` and ``source_to_detector_mm`` are measured along the central ray. ``detector_shape`` counts (rows,
     columns). ``pixel_size_mm`` is (dv, du); one number stands for square pixels. ``detector_offset_mm`` (v, u) shifts the
-    panel's centre from the central ray: v > 0 up, to higher rows; u > 0 to higher columns, right seen from the source.
+    panel's centre from the central ray. A positive v shifts it up, to higher rows. A positive u shifts it to higher
+    columns, to the right seen from the source.
+
     Raises InputError for lengths and counts that are not above 0, and for a panel nearer to the source than the axis."""
 
     source_to_axis_mm: float
@@ -44,7 +46,7 @@ class ConeGeometry:
         _check_panel(self)
 
     def pose(self, angle_rad: np.ndarray | float) -> np.ndarray:
-        """Returns poses (..., 12) float64 at gantry angles (...): the source is at (DSO cos θ, DSO sin θ, 0)."""
+        """Returns poses (..., 12) float64 at gantry angles (...). The source is at (DSO cos θ, DSO sin θ, 0)."""
         radial, panel = _panel_at(self, angle_rad)
         panel[..., :3] -= (self.source_to_detector_mm - self.source_to_axis_mm) * radial
         return np.concatenate([self.source_to_axis_mm * radial, panel], -1)
@@ -60,7 +62,7 @@ class ConeGeometry:
 
     @property
     def magnification(self) -> float:
-        """The size of an object's image on the detector over its size, at the axis."""
+        """The magnification at the axis: the size of an object's image on the detector over the object's size."""
         return self.source_to_detector_mm / self.source_to_axis_mm
 
 
@@ -68,10 +70,12 @@ class ConeGeometry:
 class ParallelGeometry:
     """A circular parallel-beam orbit about +z with a flat panel across the rays, in mm.
 
-    Distances do not matter: the panel's plane is put through the axis. ``detector_shape`` counts (rows, columns).
+    Distances do not matter: the panel's plane contains the axis. ``detector_shape`` counts (rows, columns).
     ``pixel_size_mm`` is (dv, du); one number stands for square pixels. ``detector_offset_mm`` (v, u) shifts the panel's
-    centre from the ray through the axis, as in ``ConeGeometry``: u > 0 to higher columns, right seen against the rays'
-    origin. Raises InputError for lengths and counts that are not above 0."""
+    centre from the ray through the axis, as in ``ConeGeometry``. A positive u shifts it to higher columns, to the right
+    along the rays.
+
+    Raises InputError for lengths and counts that are not above 0."""
 
     detector_shape: tuple[int, int]
     pixel_size_mm: tuple[float, float]
@@ -81,8 +85,8 @@ class ParallelGeometry:
         _check_panel(self)
 
     def pose(self, angle_rad: np.ndarray | float) -> np.ndarray:
-        """Returns poses (..., 12) float64 at gantry angles (...): rays run along (−cos θ, −sin θ, 0), from where a cone
-        beam has its source."""
+        """Returns poses (..., 12) float64 at gantry angles (...). Rays run along (−cos θ, −sin θ, 0), away from a cone
+        beam's source."""
         radial, panel = _panel_at(self, angle_rad)
         return np.concatenate([-radial, panel], -1)
 
@@ -105,7 +109,7 @@ GEOMETRIES = (ConeGeometry, ParallelGeometry)
 
 
 def _check_panel(geometry: Geometry) -> None:
-    """Checks a geometry's panel, and makes its fields tuples: geometries are compared. Raises InputError."""
+    """Checks a geometry's panel and makes its fields tuples, so that geometries can be compared. Raises InputError."""
     counts = checks.numbers("detector_shape", geometry.detector_shape, (2,))
     if (counts < 1).any() or (counts != np.floor(counts)).any():
         raise InputError("detector_shape", str(geometry.detector_shape), "two counts (rows, columns) of at least 1")
@@ -118,8 +122,8 @@ def _check_panel(geometry: Geometry) -> None:
 
 
 def _panel_at(geometry: Geometry, angle_rad: np.ndarray | float) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the unit vector from the axis to the source (..., 3), and pixel (0, 0) and the steps (..., 9) of a panel
-    whose plane contains the axis."""
+    """Returns the unit vector from the axis to the source (..., 3), and pixel (0, 0) and the two steps (..., 9). The
+    panel's plane contains the axis."""
     angle = np.asarray(angle_rad, dtype=np.float64)
     cos, sin, zero = np.cos(angle), np.sin(angle), np.zeros_like(angle)
     u_hat = np.stack([-sin, cos, zero], -1)
@@ -155,8 +159,10 @@ def pixel_centres(pose: np.ndarray, detector_shape: tuple[int, int]) -> np.ndarr
 
 
 def plain_geometry(pose: np.ndarray, panel: tuple[int, int], is_parallel: bool = False) -> Geometry:
-    """Returns the circular geometry nearest to poses (F, 12), by mean distances and offsets. The detector's distance is that
-    of its plane, its offset that of its middle from the foot of the source, or of the axis in a parallel beam, on it."""
+    """Returns the circular geometry nearest to poses (F, 12), by mean distances and offsets.
+
+    The detector's distance is that of its plane. Its offset is measured from the foot of the source on that plane, in a
+    parallel beam from the foot of the axis, to the panel's middle."""
     source, first, step_u, step_v = (pose[:, i : i + 3] for i in (0, 3, 6, 9))
     pitch_u, pitch_v = (np.linalg.norm(step, axis=1, keepdims=True) for step in (step_u, step_v))
     u_hat, v_hat = step_u / pitch_u, step_v / pitch_v
@@ -168,13 +174,13 @@ def plain_geometry(pose: np.ndarray, panel: tuple[int, int], is_parallel: bool =
     means = [float(np.mean(x)) for x in (to_axis, np.abs(away), pitch_v, pitch_u, offset_v, offset_u)]
     if is_parallel:
         return ParallelGeometry(panel, (means[2], means[3]), (means[4], means[5]))
-    to_detector = max(means[:2])  # a panel that does not turn with the source may have its plane nearer than the axis
+    to_detector = max(means[:2])  # the plane of a panel that does not turn with the source may be nearer than the axis
     return ConeGeometry(means[0], to_detector, panel, (means[2], means[3]), (means[4], means[5]))
 
 
 def towards_source(pose: np.ndarray, is_parallel: bool) -> np.ndarray:
-    """Returns vectors (..., 3) from the axis towards where rays come from, for poses (..., 12): of length 1 in a parallel
-    beam, else to the source."""
+    """Returns vectors (..., 3) from the axis towards the origin of the rays, for poses (..., 12). They lead to the source;
+    in a parallel beam they have length 1."""
     return -pose[..., :3] if is_parallel else pose[..., :3]
 
 
@@ -184,10 +190,10 @@ def transpose_pose(pose: np.ndarray) -> np.ndarray:
 
 
 def field_of_view_mm(geometry: Geometry) -> tuple[float, float, float]:
-    """Returns half the sides (z, y, x) of the box about the origin that the beams of a full turn fill.
+    """Returns half the sides (z, y, x) of the box about the origin that the beam fills in every view of a full turn.
 
-    The radius is DSO·sin(atan(half width/DSD)), with the far edge of a shifted panel; the height is the cone's, behind the
-    axis at that radius. A parallel beam fills half the panel's width and height, to its far edges."""
+    The radius is DSO·sin(atan(half width/DSD)), with the far edge of a shifted panel. The height is the cone's at that
+    radius behind the axis. A parallel beam fills half the panel's width and height, up to its far edges."""
     sides = zip(geometry.detector_shape, geometry.pixel_size_mm, geometry.detector_offset_mm, strict=True)
     half_height_mm, half_width_mm = (count * pitch / 2 + abs(offset) for count, pitch, offset in sides)
     if isinstance(geometry, ParallelGeometry):
@@ -199,9 +205,11 @@ def field_of_view_mm(geometry: Geometry) -> tuple[float, float, float]:
 
 
 def default_grid(geometry: Geometry, poses: np.ndarray | None = None) -> Grid:
-    """Returns the cube as wide as a full turn's field of view, in voxels of one pixel pitch at the axis: along z that of
-    rows, along y and x that of columns. It is lower where the panel has few rows. In a parallel beam it is as high as the
-    panel. poses (F, 12): of a gantry that travels along z, as in a helix; the grid is longer by its travel."""
+    """Returns the cube as wide as a full turn's field of view, lower where the panel has few rows.
+
+    A voxel is as large as a pixel at the axis: along z the pitch of rows, along y and x that of columns. In a parallel beam
+    the grid is as high as the panel. poses (F, 12): of a gantry that travels along z, as in a helix; the grid is longer by
+    the travel."""
     half_height_mm, radius_mm, _ = field_of_view_mm(geometry)
     high_mm, wide_mm = (pitch / geometry.magnification for pitch in geometry.pixel_size_mm)
     wide = max(1, math.ceil(2 * radius_mm / wide_mm))
@@ -216,7 +224,7 @@ def default_grid(geometry: Geometry, poses: np.ndarray | None = None) -> Grid:
 
 
 def _travel_mm(poses: np.ndarray, geometry: Geometry) -> tuple[float, float]:
-    """Returns the lowest and highest z at which the rays to the panel's middle pass the z axis; poses (F, 12). A panel off
+    """Returns the lowest and highest z at which rays of poses (F, 12) to the panel's middle pass the z axis. A panel off
     the central ray counts as on it."""
     (rows, columns), (off_v, off_u) = geometry.detector_shape, geometry.detector_offset_mm
     start, first, step_u, step_v = (poses[:, i : i + 3] for i in (0, 3, 6, 9))
@@ -230,7 +238,7 @@ def _travel_mm(poses: np.ndarray, geometry: Geometry) -> tuple[float, float]:
 
 
 def check_distances(geometry: Geometry, grid: Grid) -> None:
-    """Raises InputError for distances that float32 cannot tell apart from a parallel beam's, by the size of a voxel."""
+    """Raises InputError for a source so far away that float32 cannot tell its rays from parallel ones."""
     if isinstance(geometry, ParallelGeometry):
         return
     source_mm, voxel_mm = geometry.source_to_axis_mm, min(grid.voxel_size_mm)
@@ -249,7 +257,7 @@ def misses(grid: Grid, geometry: Geometry) -> bool:
 
 
 def hidden(grid: Grid, pose: np.ndarray, detector_shape: tuple[int, int], is_parallel: bool = False) -> str:
-    """Returns where a grid lies that no ray of a pose (12,) meets, "behind the panel" or "beside the rays"; else ""."""
+    """Returns "behind the panel" or "beside the rays" for a grid that no ray of a pose (12,) meets; otherwise ""."""
     if is_parallel:
         at = grid_on_panel(grid, pose)[:2]
         last = np.array(detector_shape[::-1])[:, None] - 0.5
@@ -265,7 +273,7 @@ def hidden(grid: Grid, pose: np.ndarray, detector_shape: tuple[int, int], is_par
     inward = sides * np.sign(sides @ rays.sum(axis=0))[:, None]
     if (corners @ away > rays[0] @ away).all():
         return "behind the panel"
-    planes = np.concatenate([inward, away[None]])  # of the pyramid of rays, and the source's own
+    planes = np.concatenate([inward, away[None]])  # the sides of the pyramid of rays, and the source's own plane
     return "beside the rays" if (corners @ planes.T < 0).all(axis=0).any() else ""
 
 
@@ -277,8 +285,8 @@ def grid_on_panel(grid: Grid, pose: np.ndarray) -> np.ndarray:
 
 
 def panel_behind_mm(grid: Grid, pose: np.ndarray) -> float:
-    """Returns how far behind the middle of ``grid`` the panel of a pose (12,) stands. A panel less than half the grid's
-    width behind stands inside it, and rays end there."""
+    """Returns the distance in mm of the panel of a pose (12,) behind the middle of ``grid``. Below half the grid's width the
+    panel stands inside the grid, and rays end there."""
     source, first, step_u, step_v = pose.reshape(4, 3)
     away = np.cross(step_u, step_v)
     away = away * np.sign(away @ (first - source)) / np.linalg.norm(away)

@@ -1,4 +1,4 @@
-"""Motion models: each turns a frame of a scan into time cells.
+"""Motion models. Each turns a frame of a scan into time cells.
 
 A model is a frozen class with ``cells(scan, frame)``. A user-defined class works in every method (docs/methods.md).
 On a stop-and-shoot scan every model of this module gives one pose per frame."""
@@ -23,26 +23,25 @@ from phyradgs_cl.fields import Deformation
 
 RAYS, SPLATS, LINE_POSES = "rays", "splats", "one pose per line"
 """The kinds of operator: ray projectors, splat projectors, and filtered backprojection."""
-_USUAL_TIMES, _MOST_TIMES = 6, 100  # of a line's exposure in the model ``PerRow``
+_USUAL_TIMES, _MOST_TIMES = 6, 100  # usual and largest number of times in a line's exposure of ``PerRow``
 _FINE_STEP_VOXELS, _COARSE_STEP_VOXELS = 0.3, 3.6
-_OBJECT_STEP_VOXELS = 0.7  # of the object's fastest part: its mean way is shorter, and states stand 0.6 voxels apart
-_WEIGHT_TOLERANCE = 1e-3  # of the sum of a line's weights in a model of the user's own
+_OBJECT_STEP_VOXELS = 0.7  # travel per time of the object's fastest part: its mean travel is shorter
+_WEIGHT_TOLERANCE = 1e-3  # how far the weights of a line in a user's own model may sum to another number than 1
 
 
 class Motion(Protocol):
-    """The interface of a motion model. ``name``, where there is one, and dataclass fields go into a result's provenance."""
-
+    """The interface of a motion model. Its ``name``, if it has one, and dataclass fields go into a result's provenance."""
     def cells(self, scan: Scan, frame: int) -> TimeCells:
         """Returns the time cells of one frame. The weights of every line sum to 1."""
         ...
 
 
 def rim_travel_voxels(scan: Scan) -> float:
-    """Returns how far the grid's rim moves, seen from the panel, during a line's exposure, in voxels of a slice (y, x): the
-    most in the first, middle and last frame; 0 for a gantry at rest.
+    """Returns the travel of the grid's rim, seen from the panel, during a line's exposure, in voxels of a slice (y, x).
 
     The rim is the middles of the box's four sides around the axis. Their places relative to the panel move by r Δθ on a
-    circular orbit, and by the panel's shift where that does not turn."""
+    circular orbit. Where the panel does not turn they move by its shift. The largest travel in the first, middle and last
+    frame counts; a gantry at rest has 0."""
     if not scan.is_fly:
         return 0.0
     half_x_mm, half_y_mm = scan.grid.size_mm[2] / 2, scan.grid.size_mm[1] / 2
@@ -53,7 +52,7 @@ def rim_travel_voxels(scan: Scan) -> float:
 
 
 def _travel_mm(scan: Scan, frame: int, points_mm: np.ndarray) -> float:
-    """Returns how far the points (P, 3) move at most in the panel's coordinates during the first line's exposure."""
+    """Returns the largest travel in mm of points (P, 3), in the panel's coordinates, during the first line's exposure."""
     start_s = float(scan.frame_start_s[frame])
     pose = scan.trajectory.pose(frame, np.array([start_s, start_s + scan.shutter.exposure_s]))
     panel, column, row = pose[:, 3:6], pose[:, 6:9], pose[:, 9:12]
@@ -69,7 +68,7 @@ def _place(scan: Scan, frame: int) -> tuple[Trajectory, Shutter, int, float, int
 
 @dataclass(frozen=True)
 class Static:
-    """One pose per frame, at the middle of its lit span: ignores the motion of the gantry."""
+    """One pose per frame, at the middle of its lit span. This model ignores the motion of the gantry."""
 
     operators: ClassVar = (RAYS, SPLATS, LINE_POSES)
     name: str = field(default="static", init=False, repr=False)
@@ -81,7 +80,7 @@ class Static:
 
 @dataclass(frozen=True)
 class StaticStart:
-    """One pose per frame, at first light: the volume is rotated by half the span against ``static``."""
+    """One pose per frame, at first light. The volume is rotated by half the span against that of ``static``."""
 
     operators: ClassVar = (RAYS, SPLATS, LINE_POSES)
     name: str = field(default="static-start", init=False, repr=False)
@@ -115,7 +114,7 @@ class MicroViews:
 class Centres(MicroViews):
     """``MicroViews`` in which only the centres of splats move, as in GS-on-the-Move (the paper's reference 21).
 
-    ``strips`` of lines × ``sub_intervals`` poses per frame move them; conics, extents and densities on the panel are
+    ``strips`` of lines × ``sub_intervals`` poses per frame move the centres. Conics, extents and densities on the panel are
     those of the middle of the frame's lit span. Raises InputError for counts below 1."""
 
     operators: ClassVar = (SPLATS,)  # type: ignore[assignment]
@@ -130,9 +129,10 @@ class Centres(MicroViews):
 
 @dataclass(frozen=True)
 class PerRow:
-    """Every line averages over its own window; all lines of a frame share their times, ``sub_intervals`` to an exposure (0:
-    as many as the scan's voxels need). The weight of a line in a cell is the fraction of its window that lies there. Raises
-    InputError for a count below 0."""
+    """Every line averages over its own window. All lines of a frame share their times.
+
+    ``sub_intervals`` counts the times in an exposure; 0 takes as many as the scan's voxels need. The weight of a line in a
+    cell is the fraction of its window that lies there. Raises InputError for a count below 0."""
 
     operators: ClassVar = (RAYS,)
     name: str = field(default="per-row", init=False, repr=False)
@@ -142,10 +142,10 @@ class PerRow:
         checks.whole("sub_intervals", self.sub_intervals, 0, 10_000)
 
     def of(self, scan: Scan, object_mm_per_s: float = 0.0) -> "PerRow":
-        """Returns the model with the number of times that this scan, of an object of this speed, needs.
+        """Returns the model with as many times as this scan needs, of an object with this speed.
 
-        One time serves 0.3 voxels of the way of the grid's rim in an exposure, or 0.7 voxels of the object's way, but 6
-        times serve up to 22 voxels. Beyond that one time serves 3.6 voxels (measured in docs/results/settings.md)."""
+        One time serves 0.3 voxels of the rim's travel in an exposure, or 0.7 voxels of the object's, but 6 times serve up to
+        22 voxels. Beyond that one time serves 3.6 voxels (measured in docs/results/settings.md)."""
         if self.sub_intervals:
             return self
         rim_voxels = rim_travel_voxels(scan)
@@ -155,7 +155,7 @@ class PerRow:
         return PerRow(min(max(1, min(fine, _USUAL_TIMES), coarse), _MOST_TIMES))
 
     def cells(self, scan: Scan, frame: int) -> TimeCells:
-        """Returns the ``TimeCells`` of one frame: cells of exposure / sub-intervals, from first light to last."""
+        """Returns the ``TimeCells`` of one frame: cells of exposure / sub-intervals each, from first light to last."""
         if not scan.is_fly:
             return Static().cells(scan, frame)
         where = scan.trajectory, scan.shutter, frame, scan.frame_start_s, scan.lines
@@ -164,7 +164,7 @@ class PerRow:
 
 @dataclass(frozen=True)
 class OwnTimes:
-    """Every line has ``sub_intervals`` poses in its exposure, as in the simulator. ``per-row`` is faster and equally exact.
+    """Every line has ``sub_intervals`` poses in its own exposure, as in the simulator. ``per-row`` is faster and as exact.
     Raises InputError for a count below 1."""
 
     operators: ClassVar = (RAYS,)
@@ -175,7 +175,7 @@ class OwnTimes:
         checks.whole("sub_intervals", self.sub_intervals, 1, 10_000)
 
     def cells(self, scan: Scan, frame: int) -> TimeCells:
-        """Returns the ``TimeCells`` of one frame: sub-intervals cells for every line."""
+        """Returns the ``TimeCells`` of one frame: ``sub_intervals`` cells for every line."""
         if not scan.is_fly:
             return Static().cells(scan, frame)
         return cells.per_line_cells(*_place(scan, frame), self.sub_intervals)
@@ -183,7 +183,7 @@ class OwnTimes:
 
 @dataclass(frozen=True)
 class LineMiddles:
-    """Every line has one pose, at the middle of its exposure: the ``per-row`` of filtered backprojection."""
+    """Every line has one pose, at the middle of its exposure. This is the ``per-row`` of filtered backprojection."""
 
     operators: ClassVar = (LINE_POSES,)
     name: str = field(default="per-row", init=False, repr=False)
@@ -195,10 +195,10 @@ class LineMiddles:
 
 @dataclass(frozen=True)
 class Exact:
-    """``segments`` per frame in which splats move; every line integrates over its own window.
+    """``segments`` per frame, in which splats move. Every line integrates over its own window.
 
-    With 0 segments their number keeps the error of a frame below ``time_error``, relative to the frame's RMS. ``time_error``
-    also bounds the error of quadrature over time. Raises InputError for numbers out of range."""
+    With 0 segments, as many are taken as keep a frame's error below ``time_error``, relative to the frame's RMS.
+    ``time_error`` also bounds the error of quadrature over time. Raises InputError for numbers out of range."""
 
     operators: ClassVar = (SPLATS,)
     name: str = field(default="exact", init=False, repr=False)
@@ -210,7 +210,7 @@ class Exact:
         checks.within("time_error", self.time_error, 1e-6, 1)
 
     def cells(self, scan: Scan, frame: int, intensity_peak: float = 0.0) -> TimeCells:
-        """Returns the ``TimeCells`` of one frame: its segments. intensity_peak: as in ``segments_for``."""
+        """Returns the ``TimeCells`` of one frame, one per segment. intensity_peak: as in ``segments_for``."""
         if not scan.is_fly:
             return Static().cells(scan, frame)
         where = _place(scan, frame)
@@ -224,12 +224,12 @@ MOTIONS = tuple(dict.fromkeys(model.name for model in MODELS))
 
 
 def motions_for(*operators: str) -> tuple[Motion, ...]:
-    """Returns the models that one of these kinds of operator can take, each with its default numbers."""
+    """Returns the models, with their default numbers, that suit one of these kinds of operator."""
     return tuple(model() for model in MODELS if set(operators) & set(model.operators))
 
 
 def motion_of(motion: str | Motion) -> Motion:
-    """Returns the model of a name, with its default numbers; a model is returned unchanged. InputError: unknown name."""
+    """Returns the model of a name, with its default numbers, or the given model unchanged. InputError: unknown name."""
     if not isinstance(motion, str):
         return motion
     if motion not in MOTIONS:
@@ -238,7 +238,7 @@ def motion_of(motion: str | Motion) -> Motion:
 
 
 def with_times(motion: Motion, scan: Scan, deformation: Deformation | None = None) -> Motion:
-    """Returns ``motion``; a ``PerRow`` without a number of times gets that of ``PerRow.of`` for an object that moves so."""
+    """Returns ``motion``. A ``PerRow`` without a number of times gets the number that scan and deformation need."""
     speed_mm_per_s = 0.0 if deformation is None else deformation.fastest_mm_per_s
     return motion.of(scan, speed_mm_per_s) if isinstance(motion, PerRow) else motion
 
@@ -252,7 +252,7 @@ def motion_facts(motion: Motion) -> dict[str, object]:
 
 
 def motion_from_facts(facts: Mapping[str, object]) -> Motion | None:
-    """Inverts ``motion_facts``. Returns None for a model of the user's own. InputError or TypeError: values out of range."""
+    """Inverts ``motion_facts``. Returns None for a user-defined model. Values out of range raise InputError or TypeError."""
     for model in MODELS:
         keys = [f.name for f in fields(model) if f.init]
         if model.name == facts.get("name") and all(key in facts for key in keys):
@@ -271,7 +271,7 @@ def check_motion(motion: Motion, taken: tuple[Motion, ...]) -> None:
 
 
 def check_own_motion(motion: Motion | None, scan: Scan) -> None:
-    """Raises InputError where the cells that a user-defined model gives for the first frame do not fit the scan."""
+    """Raises InputError where a user-defined model's cells of the first frame do not fit the scan."""
     if motion is None or isinstance(motion, MODELS):
         return
     subject, table = f"motion {type(motion).__name__}", motion.cells(scan, 0)

@@ -1,4 +1,4 @@
-"""Summarises a scan in two or three lines, its blur among them; refuses or warns of numbers that no scanner has."""
+"""Summarises a scan in two or three lines with its blur, and refuses or warns of numbers that no scanner has."""
 
 import logging
 import math
@@ -15,35 +15,35 @@ if TYPE_CHECKING:
     from phyradgs_cl.acquisition.scan import Scan
 
 log = logging.getLogger(__name__)
-OPAQUE, FEW = 50.0, 0.01  # largest line integral that a panel can measure; fraction of pixels that may be broken
-_WIDEST_DEG = 120.0  # of a panel seen from the source; dental scanners reach 30, nano-CT 60
-_LARGEST_PITCH_MM, _LEAST_DISTANCE_MM = 5.0, 10.0  # of a panel's pixel; from the source to a panel under a wide angle
-_WRONG_UNIT = 100.0  # readout over frame time: seconds given as milliseconds make it some hundreds
-_SHORT_READOUT_S, _MANY_LINES = 0.5e-3, 100  # real panels take some ms for hundreds of lines
-_SLOW_FPS, _LARGE_STEP_DEG = 2.0, 10.0  # a gantry that moves so far between frames takes them faster
-_TIMES = 17  # of an exposure: between two of them no gantry turns by half a turn
-_SLACK = 1e-3  # relative: times and angles come rounded
-_MANY_FRAMES = 10  # fewer may lie within a few degrees on purpose
-_ASIDE = 0.1  # of the panel's width: a panel further off centre was put there for a wider field of view
+OPAQUE, FEW = 50.0, 0.01  # a panel measures no larger line integrals; this fraction of the pixels may be broken
+_WIDEST_DEG = 120.0  # the largest fan of a panel; dental scanners have 30°, nano-CT 60°
+_LARGEST_PITCH_MM, _LEAST_DISTANCE_MM = 5.0, 10.0  # the largest pixel; the nearest panel with a wide fan
+_WRONG_UNIT = 100.0  # the readout over the frame time: seconds given as milliseconds make it some hundreds
+_SHORT_READOUT_S, _MANY_LINES = 0.5e-3, 100  # real panels take some ms to read hundreds of lines
+_SLOW_FPS, _LARGE_STEP_DEG = 2.0, 10.0  # a gantry that moves this far between frames takes them faster
+_TIMES = 17  # samples of an exposure: between two of them no gantry makes half a turn
+_SLACK = 1e-3  # relative tolerance: times and angles come rounded
+_MANY_FRAMES = 10  # fewer frames may lie within a few degrees on purpose
+_ASIDE = 0.1  # fraction of the panel's width: a panel further off centre was displaced for a wider field of view
 
 
 def summary(scan: "Scan") -> str:
-    """Returns a line of the timing, a line of the sizes, and a line of a fly-scan's blur. Marks values that the provenance
-    lists as assumed."""
+    """Returns one line about the timing, one about the sizes, and one about the blur of a fly-scan. Values that the
+    provenance lists as assumed are marked."""
     return "\n".join(filter(None, (_timing(scan), _sizes(scan), blur_line(scan))))
 
 
 def blur_facts(scan: "Scan") -> dict[str, float]:
-    """Returns ``blur_at_rim_px`` and ``blur_at_half_radius_px`` of a fly-scan, in columns; nothing of a scan at rest.
+    """Returns ``blur_at_rim_px`` and ``blur_at_half_radius_px`` of a fly-scan, in columns. A scan at rest has no facts.
 
-    In an exposure of arc Δθ a point at radius r moves by r·Δθ, and blurs most where it moves at right angles to its ray. Its
-    image moves by M·r·Δθ, with the magnification M, and M·r is the image's largest distance from the axis. So the blur is
-    the arc times a radius on the panel, whatever M is. This is the first order in r/R, with R from source to axis: a point
+    In an exposure with arc Δθ a point at radius r moves by r·Δθ, and blurs most where it moves at right angles to its ray.
+    With the magnification M its image moves by M·r·Δθ, and M·r is the image's largest distance from the axis. So the blur is
+    the arc times a radius on the panel, whatever M is. This is the first order in r/R, with R from source to axis. A point
     nearer to the source is magnified up to R/(R − r) times as much, one nearer to the panel down to R/(R + r) times.
 
-    The arc is the median over frames, of the time that a line is open and the beam is on. The rim is the largest radius that
-    every view sees, up to the panel's nearer side. A panel more than a tenth of its width off centre was put there for a
-    wider field of view, which opposite views complete: its rim is the farther side."""
+    The arc is the median over the frames; only the time that a line is open with the beam on counts. The rim is the largest
+    radius that every view sees, up to the panel's nearer side. A panel more than a tenth of its width off centre was
+    displaced for a wider field of view, which opposite views complete: its rim is the farther side."""
     if not scan.is_fly:
         return {}
     windows_s = scan.shutter.line_windows_s(scan.lines)
@@ -63,7 +63,7 @@ def blur_line(scan: "Scan") -> str:
 
 
 def _cone_deg(geometry: Geometry) -> tuple[float, float]:
-    """Returns the full angles (cone along v, fan along u) in degrees that the panel spans at the source; 0 for none."""
+    """Returns the full angles (cone along v, fan along u) in degrees of the panel at the source; 0 in a parallel beam."""
     if isinstance(geometry, ParallelGeometry):
         return 0.0, 0.0
     sides = zip(geometry.detector_shape, geometry.pixel_size_mm, geometry.detector_offset_mm, strict=True)
@@ -138,7 +138,7 @@ def check_plausible(scan: "Scan", named: Named = str, is_timed: bool = True) -> 
     Warns of times most likely in a wrong unit, of angles that look like radians and of line integrals that may be counts.
     ``named`` translates ``source_to_axis_mm``, ``source_to_detector_mm``, ``pixel_size_mm``, ``grid``, ``readout_s``,
     ``exposure_s``, ``frame_time_s``, ``angles`` and ``quantity`` to the caller's names. ``is_timed``: False where nobody
-    stated a time, so that a frame rate means nothing."""
+    stated a time, which makes the frame rate meaningless."""
     _check_panel(scan.geometry, named)
     _check_voxels(scan.grid, scan.geometry, named("grid"))
     angle_deg = np.rad2deg(np.unwrap(_source_angle_rad(scan, 0.0, scan.shutter.exposure_s)[:, 0]))
@@ -155,7 +155,7 @@ def check_plausible(scan: "Scan", named: Named = str, is_timed: bool = True) -> 
 
 def _check_opaque(scan: "Scan", subject: str) -> None:
     """Raises InputError where most pixels are darker than a panel can measure: these are counts, whose air is bright. Warns
-    where some pixels are."""
+    where some pixels are that dark."""
     pairs = zip(scan.projections, scan.valid, strict=True)
     counts = [(np.count_nonzero(frame[valid] > OPAQUE), np.count_nonzero(valid)) for frame, valid in pairs]
     opaque, valid_pixels = np.sum(counts, axis=0).tolist()
@@ -170,7 +170,7 @@ def _check_opaque(scan: "Scan", subject: str) -> None:
 
 
 def _warn_of_radians(angle_deg: np.ndarray, subject: str) -> bool:
-    """Returns whether the angles (F,) of many frames lie within 2π degrees, and warns of it."""
+    """Warns, and returns True, where the angles (F,) of many frames lie within 2π degrees: they may be radians."""
     span_deg = float(np.ptp(angle_deg))
     looks_so = len(angle_deg) >= _MANY_FRAMES and 0 < span_deg <= 2 * np.pi * (1 + _SLACK)
     if looks_so:
@@ -180,8 +180,8 @@ def _warn_of_radians(angle_deg: np.ndarray, subject: str) -> bool:
 
 
 def _check_panel(geometry: Geometry, named: Named) -> None:
-    """Raises InputError for a panel seen under a wide angle. Names the distances where they are too short for any panel
-    and the pixels are not too large, else the pixels."""
+    """Raises InputError for a panel with too wide a fan. It names the distances where they are too short for any panel and
+    the pixels are not too large, otherwise the pixels."""
     widest_deg = max(_cone_deg(geometry))
     if isinstance(geometry, ParallelGeometry) or widest_deg <= _WIDEST_DEG:
         return
@@ -225,7 +225,7 @@ def _longer_than_a_frame(subject: str, stated: str, time_s: float, frame_s: floa
 
 
 def _warn_of_slow_frames(frame_s: float, angle_deg: np.ndarray, subject: str) -> None:
-    """Warns of a low frame rate where the gantry turns far from frame to frame, between the angles (F,)."""
+    """Warns of a low frame rate where the gantry turns far between two frames. angle_deg (F,)."""
     step_deg = float(np.median(np.abs(np.diff(angle_deg))))
     if _SLOW_FPS * frame_s > 1 and step_deg > _LARGE_STEP_DEG:
         log.warning("%s: %.3g fps and %.3g° from frame to frame; is the rate right?", subject, 1 / frame_s, step_deg)

@@ -15,11 +15,13 @@ if TYPE_CHECKING:
 
     from phyradgs_cl.acquisition.scan import Scan
 
-_MOST_CORNERS = 129  # of a side of a window
+_MOST_CORNERS = 129  # the points along each side of a window's outline
 
 
-def plot_frame(scan: "Scan", frame: int) -> "Figure":
-    """Returns a figure of one frame (rows, columns) of line integrals, in mm on the panel, and its exposure windows in s."""
+def plot_frame(scan: "Scan", frame: int = 0) -> "Figure":
+    """Returns a figure of one frame (rows, columns), and of the times in s at which its lines are open.
+
+    The frame's line integrals are drawn in mm on the panel. Raises InputError for a frame number out of range."""
     checks.whole("frame", frame, 0, scan.frames - 1)
     figure = new_figure(10, 4.2)
     picture, windows = figure.subplots(1, 2, width_ratios=(1, 1.1))
@@ -46,7 +48,7 @@ def plot_frame(scan: "Scan", frame: int) -> "Figure":
 
 
 def draw_windows(axes: "Axes", shutter: Shutter, lines: int, start_s: float = 0.0) -> None:
-    """Draws when each of ``lines`` lines opens and closes, and the part of it in which a pulsed beam is on."""
+    """Draws when each of ``lines`` lines opens and closes, and in which part of that time a pulsed beam is on."""
     line = np.unique(np.linspace(0, lines - 1, _MOST_CORNERS).round().astype(int))
     lit_s = shutter.line_windows_s(lines)[line] + start_s
     if shutter.pulse_s is not None:
@@ -58,7 +60,7 @@ def draw_windows(axes: "Axes", shutter: Shutter, lines: int, start_s: float = 0.
 
 
 def _outline(first_s: np.ndarray, last_s: np.ndarray, line: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the corners (times, lines) of a window between two times per line."""
+    """Returns the corners (times, lines) of a window between a first and a last time per line."""
     return np.concatenate([first_s, last_s[::-1]]), np.concatenate([line, line[::-1]])
 
 

@@ -17,9 +17,10 @@ _FEWEST_TURNS, _MOST_TURNS = 1e-3, 10_000
 
 @dataclass(frozen=True)
 class Protocol:
-    """``views`` frames of ``turns`` turns at constant speed, each exposing an arc of ``exposure_deg`` (paper, section 3.1).
-    The gantry turns clockwise, seen from above, where ``turns`` is below 0.
-    ``readout_ratio`` is T_ro/T_exp. ``pulse``: when the beam is on, (start, length) in exposures; None always."""
+    """``views`` frames in ``turns`` turns at constant speed, each exposing an arc of ``exposure_deg`` (paper, section 3.1).
+
+    The gantry turns clockwise, seen from above, where ``turns`` is below 0. ``readout_ratio`` is T_ro/T_exp. ``pulse``:
+    (start, length) of the time that the beam is on, in exposures; None: always."""
 
     views: int = 25
     exposure_deg: float = 14.4
@@ -54,8 +55,9 @@ class Protocol:
         return 360.0 * self.turns / self.views
 
     def at_rate(self, fps: float, readout_ms: float | None = None, named: Named = str) -> "Protocol":
-        """Returns the protocol with exposure time and readout ratio from frames per second and a readout in ms. Raises
-        InputError for an arc of 0, and for a readout longer than a frame."""
+        """Returns the protocol with exposure time and readout ratio from frames per second and a readout in ms.
+
+        Raises InputError for an arc of 0, and for a readout longer than a frame."""
         checks.positive(named("fps"), fps)
         if self.exposure_deg == 0:
             raise InputError(named("fps"), f"{fps:g} with an exposure arc of 0°", "a gantry that turns", "leave fps out")
@@ -73,13 +75,13 @@ class Protocol:
         return Shutter(self.exposure_s, self.readout_ratio * self.exposure_s, axis, direction, pulse_s)
 
     def frame_start_s(self) -> np.ndarray:
-        """Returns opening times (F,) in s: from frame to frame the gantry needs step/arc exposures."""
+        """Returns opening times (F,) in s. From frame to frame the gantry needs step/arc exposures."""
         if self.exposure_deg == 0:
             return np.arange(self.views) * self.shutter().span_s
         return np.arange(self.views) * abs(self.step_deg) / self.exposure_deg * self.exposure_s
 
     def window_s(self) -> tuple[float, float]:
-        """Returns when the first line opens, and when the last one closes, in s."""
+        """Returns the times in s at which the first line opens and the last one closes."""
         start_s = self.frame_start_s()
         return float(start_s[0]), float(start_s[-1]) + self.shutter().span_s
 
@@ -89,8 +91,9 @@ class Protocol:
     def orbit(
         self, geometry: Geometry, jitter_deg: float = 0.0, rng: np.random.Generator | None = None
     ) -> CircularOrbit:
-        """Returns the trajectory. Stop-and-shoot rests at the mid-window angles of the same fly-scan. Jitter is a smooth
-        wander of the gantry, with standard deviation ``jitter_deg`` and one knot per frame, which the encoder records."""
+        """Returns the trajectory. A stop-and-shoot gantry rests at the mid-window angles of the same fly-scan.
+
+        Jitter is a smooth wander of deviation ``jitter_deg``, with one knot per frame, which the encoder records."""
         first = self.angle_start_rad()
         arc_rad = self._arc_rad
         if not self.is_fly:
@@ -107,7 +110,7 @@ class Protocol:
 
     @property
     def _arc_rad(self) -> float:
-        """The arc of an exposure, below 0 clockwise."""
+        """The arc of an exposure; negative clockwise."""
         return float(np.copysign(np.deg2rad(self.exposure_deg), self.turns))
 
     def _wandering_encoder(self, jitter_rad: float, rng: np.random.Generator) -> EncoderTable:
@@ -127,7 +130,7 @@ PROTOCOLS = {
 
 
 def make_protocol(name: str, **changes: Any) -> Protocol:
-    """Returns a named protocol with the options that are not None replaced."""
+    """Returns the named protocol with those options changed that are not None."""
     if name not in PROTOCOLS:
         raise InputError("protocol", repr(name), f"one of {', '.join(PROTOCOLS)}")
     return replace(PROTOCOLS[name], **{k: v for k, v in changes.items() if v is not None})

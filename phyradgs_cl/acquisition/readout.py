@@ -1,4 +1,4 @@
-"""Readout of a panel: the order of lines for operators, and the terms of data sheets for order, rate and time."""
+"""Readout of a panel: the order of its lines, and the terms of data sheets for order, frame rate and time."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -9,22 +9,22 @@ from phyradgs_cl import checks
 from phyradgs_cl.acquisition.geometry import transpose_pose
 from phyradgs_cl.errors import InputError
 
-# readout axis and direction, by the side of the panel that is read first, seen from the source
+# Readout axis and direction, by the side of the panel that is read first, seen from the source.
 FIRST_LINES = {"bottom": ("rows", 1), "top": ("rows", -1), "left": ("columns", 1), "right": ("columns", -1)}
 SIDES = tuple(FIRST_LINES)
 Named = Callable[[str], str]
-"""Translates the name of a field for messages: to an argument, an option of the command line or a key of a TOML file."""
+"""Translates a field's name for messages: to an argument, an option of the command line or a key of a TOML file."""
 
 
 @dataclass(frozen=True)
 class Readout:
-    """Puts frames and poses in the order that operators use, with the readout's lines as rows. ``axis``: what a line is on
-    the detector, "rows" or "columns"."""
+    """Puts frames and poses in the order of operators, whose rows are the readout's lines. ``axis``: a line is "rows" or
+    "columns"."""
 
     axis: str
 
     def shape(self, detector_shape: tuple[int, int]) -> tuple[int, int]:
-        """Returns (lines, width) of a (rows, columns) detector."""
+        """Returns (lines, width) of a detector with (rows, columns)."""
         rows, columns = detector_shape
         return (rows, columns) if self.axis == "rows" else (columns, rows)
 
@@ -44,8 +44,8 @@ class Readout:
 def readout_order(
     first: str | None, axis: str | None, direction: int | None, named: Named = str
 ) -> tuple[str | None, int | None]:
-    """Returns readout axis and direction; ``first``, a key of ``FIRST_LINES``, states both. Raises InputError where they
-    contradict."""
+    """Returns readout axis and direction. ``first``, a key of ``FIRST_LINES``, states both. Raises InputError where the
+    arguments contradict each other."""
     if first is None:
         return axis, direction
     checks.one_of(named("first"), first, FIRST_LINES)
@@ -57,7 +57,7 @@ def readout_order(
 
 
 def frame_time_of(fps: float | None, frame_time_s: float | None, named: Named = str) -> float | None:
-    """Returns seconds from frame to frame, from frames per second or as given. InputError: the two differ."""
+    """Returns the seconds between frames, from frames per second or as given. Raises InputError where the two differ."""
     if fps is None:
         return frame_time_s
     checks.positive(named("fps"), fps)
@@ -65,7 +65,7 @@ def frame_time_of(fps: float | None, frame_time_s: float | None, named: Named = 
 
 
 def seconds_of(word: str, in_ms: float | None, in_s: float | None, named: Named = str) -> float | None:
-    """Returns a time in s, ``word`` such as readout, from ms or as given. InputError: the two differ."""
+    """Returns a time in s, from ms or as given. ``word``: its name, such as readout. InputError: they differ."""
     if in_ms is None:
         return in_s
     checks.at_least(named(f"{word}_ms"), in_ms, 0)
@@ -73,7 +73,7 @@ def seconds_of(word: str, in_ms: float | None, in_s: float | None, named: Named 
 
 
 def check_readout(readout_ms: float | None, readout_ratio: float | None, fps: float | None, named: Named = str) -> None:
-    """Raises InputError for a ratio or a time out of range, for both, and for a time in ms without a rate."""
+    """Raises InputError for a ratio or a time out of range, for both together, and for a time in ms without a rate."""
     if readout_ratio is not None:
         checks.within(named("readout_ratio"), readout_ratio, 0, 1000)
     if readout_ms is None:

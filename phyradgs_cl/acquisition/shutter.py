@@ -9,8 +9,8 @@ from phyradgs_cl.acquisition.readout import FIRST_LINES, Readout
 from phyradgs_cl.errors import InputError
 
 AXES = ("rows", "columns")
-_STEPS = 1000  # of float64 in an exposure: times within it are then exact to a thousandth
-_DARK = 1e-9  # of the longest lit window: shorter ones are rounding in a line that the pulse misses
+_STEPS = 1000  # least number of float64 steps in an exposure: times within it are then exact to a thousandth
+_DARK = 1e-9  # fraction of the longest lit window: a shorter window is rounding in a line that the pulse misses
 
 
 @dataclass(frozen=True)
@@ -18,9 +18,9 @@ class Shutter:
     """Exposure and readout of one frame, in s (paper, section 2.1).
 
     Line r of H opens ``r/(H−1)·readout_s`` after the frame's start and stays open for ``exposure_s``. A readout of 0 is a
-    global shutter. ``axis``: what one line is, "rows" or "columns". ``direction``: +1 reads index 0 first, −1 last.
-    ``pulse_s`` (start after the frame's start, length): when the beam is on, None always. A line sees the part of its window
-    in the pulse. Raises InputError for times below 0, other words, and a pulse that meets no frame."""
+    global shutter. ``axis``: "rows" or "columns", what one line is. ``direction``: +1 reads index 0 first, −1 the last index
+    first. ``pulse_s`` (start after the frame's start, length): the time that the beam is on; None: always. A line sees the
+    part of its window in the pulse. Raises InputError for times below 0, other words, and a pulse that meets no frame."""
 
     exposure_s: float
     readout_s: float = 0.0
@@ -49,7 +49,7 @@ class Shutter:
             raise InputError("pulse_s", found, expected, "correct the pulse, or leave it out")
 
     def check_resolved(self, frame_start_s: np.ndarray, subject: str = "exposure_s") -> None:
-        """Raises InputError for an exposure below the precision of opening times (F,): its angles would be noise."""
+        """Raises InputError for an exposure below the precision of opening times (F,), because its angles would be noise."""
         latest_s = float(np.max(np.abs(frame_start_s), initial=0.0)) + self.span_s
         shortest_s = _STEPS * float(np.spacing(latest_s))
         if 0 < self.exposure_s < shortest_s:
@@ -58,34 +58,35 @@ class Shutter:
 
     @property
     def readout(self) -> Readout:
-        """The readout axis, which puts frames and poses in the order lines, width."""
+        """The readout axis, which puts frames and poses in the order (lines, width)."""
         return Readout(self.axis)
 
     @property
     def first(self) -> str:
-        """The side that is read first, "top", "bottom", "left" or "right", seen from the source."""
+        """The side that is read first, seen from the source: "top", "bottom", "left" or "right"."""
         return next(side for side, order in FIRST_LINES.items() if order == (self.axis, self.direction))
 
     @property
     def span_s(self) -> float:
-        """Time from the first line's opening to the last line's closing."""
+        """The time from the first line's opening to the last line's closing."""
         return self.exposure_s + self.readout_s
 
     @property
     def lit_span_s(self) -> tuple[float, float]:
-        """First and last light in seconds after the frame's start; without a pulse the whole span."""
+        """First and last light in seconds after the frame's start. Without a pulse this is the whole span."""
         first_s, last_s = self.in_pulse(np.array([0.0, self.span_s]))
         return float(first_s), float(last_s)
 
     @property
     def middle_s(self) -> float:
-        """The middle of the lit span, the best time for a single pose."""
+        """The middle of the lit span: the best time for a single pose."""
         first_s, last_s = self.lit_span_s
         return first_s + (last_s - first_s) / 2
 
     def in_pulse(self, time_s: np.ndarray) -> np.ndarray:
-        """Returns times (...) after the frame's start, moved to the nearest moment with beam. The ends of a window become
-        those of its part in the pulse, or equal times where the pulse misses it."""
+        """Returns times (...) after the frame's start, moved to the nearest moment with beam.
+
+        The ends of a window become those of its part in the pulse. Where the pulse misses the window, they become equal."""
         if self.pulse_s is None:
             return time_s
         start_s, length_s = self.pulse_s
@@ -101,13 +102,14 @@ class Shutter:
         return order / max(lines - 1, 1) * self.readout_s
 
     def line_windows_s(self, lines: int) -> np.ndarray:
-        """Returns first and last light (lines, 2) of every line index, in seconds after the frame's start. Without a pulse
-        they are opening and closing; a line that the pulse misses has equal times."""
+        """Returns first and last light (lines, 2) of every line index, in seconds after the frame's start.
+
+        Without a pulse these are opening and closing. A line that the pulse misses has two equal times."""
         delay = self.delay_s(lines)
         return self.in_pulse(np.stack([delay, delay + self.exposure_s], -1))
 
     def lit_share(self, lines: int) -> np.ndarray:
-        """Returns each line's lit time (lines,) relative to the longest one; 1 everywhere without a pulse."""
+        """Returns each line's lit time (lines,) relative to the longest one. Without a pulse it is 1 everywhere."""
         if self.pulse_s is None:
             return np.ones(lines)
         seen_s = np.diff(self.line_windows_s(lines))[:, 0]
@@ -118,7 +120,7 @@ class Shutter:
         return np.where(seen_s > _DARK * longest_s, seen_s / longest_s, 0.0)
 
     def strip_ranges(self, lines: int, strips: int) -> list[tuple[int, int]]:
-        """Returns [start, stop) of strips in reading order, where line r is in strip floor(r·M/H); some may be empty."""
+        """Returns [start, stop) of strips in reading order. Line r is in strip floor(r·M/H); a strip may be empty."""
         edges = [checks.ceil_div(strip * lines, strips) for strip in range(strips + 1)]
         ranges = list(zip(edges[:-1], edges[1:], strict=True))
         if self.direction < 0:

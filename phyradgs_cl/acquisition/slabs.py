@@ -1,4 +1,4 @@
-"""Slabs of a parallel scan: detector rows, and the slices of the volume that they see alone."""
+"""Slabs of a parallel scan: detector rows, and the slices of the volume that no other rows see."""
 
 from dataclasses import replace
 
@@ -11,11 +11,11 @@ from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid, triple
 
 HALO_ROWS = 4
-"""Rows on each side of a slab that are read too: slices between two rows need both, and priors look at neighbours."""
+"""Rows read on each side of a slab as well: slices between two rows need both, and priors look at neighbours."""
 
 
 def check_has_slabs(scan: Scan, subject: str, found: str) -> None:
-    """Raises InputError about the option ``subject`` and its value ``found`` for scans whose slices need other rows."""
+    """Raises InputError for scans whose slices need other rows. ``subject`` is the option to name, ``found`` its value."""
     if not has_slabs(scan):
         expected = "all rows: only in a parallel beam about z does a slice need few of them"
         raise InputError(subject, found, expected, "take --roi-mm, with --margin-mm")
@@ -37,7 +37,7 @@ def check_rows(scan: Scan, first: int, stop: int) -> None:
 def slab(scan: Scan, first: int, stop: int) -> Scan:
     """Returns the scan of detector rows [first, stop) alone, on the same grid. Its lines keep their times.
 
-    Raises InputError as ``check_rows``."""
+    Raises InputError as ``check_rows`` does."""
     check_rows(scan, first, stop)
     geometry, shutter, rows = scan.geometry, scan.shutter, scan.geometry.detector_shape[0]
     pitch_v_mm, (offset_v_mm, offset_u_mm) = geometry.pixel_size_mm[0], geometry.detector_offset_mm
@@ -58,7 +58,7 @@ def slab(scan: Scan, first: int, stop: int) -> Scan:
 
 
 def slices_of(scan: Scan, first: int, stop: int) -> slice:
-    """Returns the slices of the scan's grid whose centres lie on detector rows [first, stop); together all rows have all."""
+    """Returns the slices of the scan's grid whose centres lie on detector rows [first, stop). All rows have all slices."""
     rows, pitch_mm = scan.geometry.detector_shape[0], scan.geometry.pixel_size_mm[0]
     row = (scan.grid.axes_mm()[0] - scan.geometry.detector_offset_mm[0]) / pitch_mm + (rows - 1) / 2
     number = np.clip(np.floor(row + 0.5), 0, rows - 1)
@@ -67,7 +67,7 @@ def slices_of(scan: Scan, first: int, stop: int) -> slice:
 
 
 def part_of(grid: Grid, slices: slice) -> Grid:
-    """Returns the grid of some slices; of all slices ``grid`` itself."""
+    """Returns the grid of some slices. For all slices this is ``grid`` itself."""
     if slices == slice(0, grid.shape[0]):
         return grid
     return grid.part(triple((slices.start, 0, 0)), triple((slices.stop - slices.start, *grid.shape[1:])))

@@ -1,7 +1,7 @@
-"""Time cells: one table of (pose, lines, weight) for each frame, which drives every operator.
+"""Time cells: one table of (pose, lines, weight) per frame, which drives every operator.
 
-A frame is a sum over cells: its pixel lines [line_start, line_stop) receive ``weight`` times the projection from the cell's
-pose. The weights of a line sum to 1. ``cells.py`` builds these tables."""
+A frame is a sum over cells. The pixel lines [line_start, line_stop) receive ``weight`` times the projection from the
+cell's pose. The weights of a line sum to 1. ``cells.py`` builds these tables."""
 
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -16,21 +16,22 @@ from phyradgs_cl.errors import InputError
 
 @dataclass(frozen=True, eq=False)
 class TimeCells:
-    """The time cells of one frame, sorted by line_start, so that the cells of a line are neighbours.
+    """The time cells of one frame, sorted by line_start.
 
-    pose (C, 12) in mm refers to the detector's own rows and columns, whatever the readout axis. time_s (C,) in s.
-    line_start, line_stop (C,) count lines along the readout ``axis``, which has ``lines`` lines. weight (C,). ``line_share``
-    (C, lines) multiplies the weight of a still cell by the fraction of each line's window that lies in the cell; None: 1 for
-    every line of the cell.
+    - pose (C, 12) in mm: counts the detector's own rows and columns, whatever the readout axis. time_s (C,) in s.
+    - line_start, line_stop (C,): count lines along the readout ``axis``, which has ``lines`` lines. weight (C,).
+    - line_share (C, lines): the fraction of each line's window that lies in a still cell, a factor of the weight. None: 1.
 
-    Moving cells are segments of the frame, of ``weight`` 1. ``end_poses`` (C, 2, 12) are the poses at their ends, at
-    ``end_times_s`` (C, 2), which objects that move need.
-    ``line_times`` (C, 3, lines) describes the part of each line's window in the segment: its middle and half its length, in
-    units of the segment's length from its mid-time, and its fraction of the whole window. Methods raise InputError for
-    user-defined cells that do not fit the scan. is_parallel: poses begin with the direction of parallel rays.
+    - end_poses (C, 2, 12), end_times_s (C, 2): poses and times at the ends of moving cells, which are segments of the frame
+      with ``weight`` 1. Objects that move need the times.
+    - line_times (C, 3, lines): the part of each line's window in a segment. The numbers are the part's middle and half its
+      length, in units of the segment's length from its mid-time, and its fraction of the whole window.
+    - is_parallel: poses begin with the direction of parallel rays.
 
-    ``conic_pose`` (12,), only for splats: the poses of the cells then place the centres of Gaussians; their shapes and
-    densities on the panel are those of this pose."""
+    - conic_pose (12,): only for splats. The cells' poses then place the centres of Gaussians, whose shapes and densities on
+      the panel are those of this pose.
+
+    Methods raise InputError for user-defined cells that do not fit the scan."""
 
     pose: np.ndarray
     time_s: np.ndarray
@@ -52,7 +53,7 @@ class TimeCells:
         return len(self.weight)
 
     def line_weights(self) -> np.ndarray:
-        """Returns the sum of the weights (lines,) of each line; 1 for a complete table."""
+        """Returns the sum of the weights (lines,) of each line. It is 1 for a complete table."""
         total = np.zeros(self.lines)
         for cell, lines in enumerate(self.ranges):
             total[lines] += self.weights_of(cell)
@@ -60,7 +61,7 @@ class TimeCells:
 
     @property
     def ranges(self) -> list[slice]:
-        """The lines of every cell."""
+        """The range of lines of every cell."""
         return [slice(int(a), int(b)) for a, b in zip(self.line_start, self.line_stop, strict=True)]
 
     def weights_of(self, cell: int) -> np.ndarray:
@@ -73,12 +74,12 @@ class TimeCells:
 
     @property
     def readout(self) -> Readout:
-        """The readout axis, which puts frames and poses in the order lines, width."""
+        """The readout axis, which puts frames and poses in the order (lines, width)."""
         return Readout(self.axis)
 
     @property
     def is_moving(self) -> bool:
-        """Whether poses change within a cell. Only splats support that."""
+        """Whether poses change within a cell. Only splats can be projected so."""
         return self.end_poses is not None
 
     @property
@@ -90,12 +91,12 @@ class TimeCells:
         """Returns the cells with all lengths multiplied by ``factor``."""
         factors = np.full(POSE_LENGTH, factor)
         if self.is_parallel:
-            factors[:3] = 1  # a direction
+            factors[:3] = 1  # the direction of rays has no length in mm
         ends, conic = (None if p is None else p * factors for p in (self.end_poses, self.conic_pose))
         return replace(self, pose=self.pose * factors, end_poses=ends, conic_pose=conic)
 
     def finer(self, rows: int, columns: int) -> "TimeCells":
-        """Returns still cells for pixels cut into ``rows`` by ``columns`` parts; the parts of a line share its times."""
+        """Returns still cells for pixels cut into ``rows`` by ``columns`` parts. The parts of a line share its times."""
         pose, (of_line, _) = self.pose.copy(), self.readout.shape((rows, columns))
         pose[:, 6:9] /= columns
         pose[:, 9:12] /= rows
@@ -105,7 +106,7 @@ class TimeCells:
         return replace(self, pose=pose, line_share=share, **lines)
 
     def still(self) -> "TimeCells":
-        """Returns these cells, for operators on rays. Raises InputError for cells that only splats support."""
+        """Returns these cells for operators on rays. Raises InputError for moving cells, which only splats support."""
         if self.is_moving:
             raise InputError("--motion", "cells with motion", "still cells: only splats move", "take --motion per-row")
         if self.conic_pose is not None:
@@ -113,8 +114,9 @@ class TimeCells:
         return self
 
     def line_poses(self) -> np.ndarray:
-        """Returns poses (lines, 12) of the cell nearest to each line's mid-exposure, (1, 12) for a single cell. Raises
-        InputError for a line without a cell."""
+        """Returns each line's pose (lines, 12): that of the cell nearest to its mid-exposure. A single cell gives (1, 12).
+
+        Raises InputError for a line without a cell."""
         if self.count == 1:
             return self.pose
         lengths = self.line_stop - self.line_start
@@ -132,14 +134,14 @@ class TimeCells:
         return self.pose[cell[nearest[first]]]
 
     def line_cells(self) -> np.ndarray:
-        """Returns for each line a range (lines, 2), [first, stop), that holds all its cells, and maybe others."""
+        """Returns for each line a range of cells (lines, 2), [first, stop). It holds all cells of the line."""
         line = np.arange(self.lines)
         first = np.searchsorted(np.maximum.accumulate(self.line_stop), line, side="right")
         return np.stack([first, np.searchsorted(self.line_start, line, side="right")], -1)
 
     @cached_property
     def layer_numbers(self) -> np.ndarray:
-        """The layer (C,) of every cell: no line has two cells in one layer. Their number is the most cells of a line."""
+        """The layer (C,) of every cell. No line has two cells in one layer. There are as few as possible."""
         numbers = np.zeros(self.count, np.int64)
         free_from: list[int] = []
         for cell, (start, stop) in enumerate(zip(self.line_start, self.line_stop, strict=True)):
@@ -152,7 +154,7 @@ class TimeCells:
 
     @cached_property
     def layer_weights(self) -> np.ndarray:
-        """Weights (layers, lines) of each line's cell in each layer of ``layer_numbers``, 0 without a cell."""
+        """Weights (layers, lines) of each line's cell in each layer of ``layer_numbers``; 0 without a cell."""
         weights = np.zeros((int(self.layer_numbers.max(initial=-1)) + 1, self.lines))
         for cell, lines in enumerate(self.ranges):
             weights[self.layer_numbers[cell], lines] = self.weights_of(cell)

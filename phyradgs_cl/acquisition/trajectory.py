@@ -20,26 +20,27 @@ from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.text import repr_of_changes
 
-_LEAST_SPAN_S = 1e-6  # for frames of no duration
-_MOST_SAMPLES = 1024  # per frame
-_LEAST_INCIDENCE = 1e-6  # sine of the angle between rays and panel
-_AT_AXIS, _AWAY = 1e-6, 2.0  # a panel so near to the axis, relative to the source's distance; distances it is moved by
-_SAME_PLACE = 1e-9  # of the longest distance: rounding of an orbit in float64
+_LEAST_SPAN_S = 1e-6  # between samples of frames without duration
+_MOST_SAMPLES = 1024  # samples per frame
+_LEAST_INCIDENCE = 1e-6  # least sine of the angle between rays and panel
+_AT_AXIS, _AWAY = 1e-6, 2.0  # in source distances: a panel so near counts as at the axis, and is moved so far
+_SAME_PLACE = 1e-9  # fraction of the longest distance: float64 rounds orbits by less
 
 
 class Trajectory(Protocol):
-    """The interface of a trajectory: poses (..., 12) in mm of a frame at times (...) in seconds. A user-defined class with
-    this method works in every reconstruction method; ``save_scan`` samples it into a table. A parallel beam's trajectory
-    has an attribute ``is_parallel`` that is True."""
+    """The interface of a trajectory: poses (..., 12) in mm of a frame at times (...) in seconds.
+
+    A user-defined class with this method works in every reconstruction method; ``save_scan`` samples it into a table. The
+    trajectory of a parallel beam has an attribute ``is_parallel`` that is True."""
 
     def pose(self, frame: int, time_s: np.ndarray) -> np.ndarray:
         """Returns poses (..., 12) in mm of frame number ``frame`` at times (...) s. A pose is source, centre of pixel (0,
-        0), step to the next column, step to the next row, x y z each; a parallel beam's begins with the rays' direction."""
+        0), step to the next column, step to the next row, x y z each. A parallel beam's begins with the rays' direction."""
         ...
 
 
 def is_parallel(trajectory: Trajectory) -> bool:
-    """True for poses that begin with the direction of parallel rays; a trajectory says so by ``is_parallel``."""
+    """True for poses that begin with the direction of parallel rays: the trajectory has ``is_parallel``."""
     return bool(getattr(trajectory, "is_parallel", False))
 
 
@@ -53,7 +54,7 @@ class Kinematics(Protocol):
 
 @dataclass(frozen=True)
 class ConstantSpeed:
-    """θ(t) = θ0 + ω t: ``angle_start_rad`` at time 0 and ``speed_rad_per_s``. Raises InputError for inf or NaN."""
+    """θ(t) = θ0 + ω t: ``angle_start_rad`` at time 0, and ``speed_rad_per_s``. Raises InputError for inf or NaN."""
 
     angle_start_rad: float
     speed_rad_per_s: float
@@ -83,9 +84,10 @@ class SpeedRamp(ConstantSpeed):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class EncoderTable:
-    """Measured θ(t): linear between samples ``time_s`` (T,) in s and ``angle_rad_table`` (T,) in rad, not extrapolated.
-    An encoder's jumps by a turn are taken out where samples lie close together otherwise. Raises InputError for times that
-    do not increase, and for times beyond the table."""
+    """Measured θ(t): samples ``time_s`` (T,) in s and ``angle_rad_table`` (T,) in rad, linear between them.
+
+    An encoder's jumps by a turn are taken out where the other steps between samples are small. Raises InputError for times
+    that do not increase, and for times beyond the table."""
 
     time_s: np.ndarray
     angle_rad_table: "NDArray[np.float64]"
@@ -108,11 +110,12 @@ class EncoderTable:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class FrameSweeps:
-    """A constant speed for each frame, from its angle as the exposure starts to its angle as it ends.
+    """A constant speed in each frame, from its angle as the exposure starts to its angle as it ends.
 
-    The speed continues through the readout; equal angles are a gantry at rest (stop-and-shoot). ``start_s`` (F,) in s: when
-    the first line opens. ``exposure_s``: of a line. ``angle_start_rad`` and ``angle_end_rad`` (F,) in rad; an end that
-    jumped by a turn, as from 355° to 4°, is taken back to its start.
+    The speed continues through the readout. Equal angles are a gantry at rest (stop-and-shoot). ``start_s`` (F,): the
+    opening of each frame's first line, in s. ``exposure_s``: the exposure of a line. ``angle_start_rad``, ``angle_end_rad``
+    (F,) in rad: an end that jumped by a turn, as from 355° to 4°, is taken back to its start.
+
     Raises InputError for arrays of unequal length, infinite values and NaN."""
 
     start_s: np.ndarray
@@ -156,15 +159,16 @@ def continued(trajectory: Trajectory, by_s: float) -> Trajectory:
 
 
 def _is_without_jumps(steps_rad: np.ndarray) -> bool:
-    """Whether no step of angles is one of more than half a turn among steps that are mostly below a quarter."""
+    """Whether no step of more than half a turn stands among steps that are mostly below a quarter."""
     size_rad = np.abs(steps_rad)
     return bool(size_rad.max(initial=0) <= np.pi or np.median(size_rad) >= np.pi / 2)
 
 
 @dataclass(frozen=True, eq=False)
 class CircularOrbit:
-    """A circular ``geometry`` in mm, with ``kinematics`` that give its angle: anything with angle_rad(frame, time_s). Raises
-    InputError for other objects."""
+    """A circular ``geometry`` in mm, at the angles of its ``kinematics``: anything with angle_rad(frame, time_s).
+
+    Raises InputError for other objects."""
 
     geometry: "Geometry"
     kinematics: Kinematics
@@ -195,7 +199,7 @@ class PoseTable:
 
     A pose is source, centre of pixel (0, 0), step to the next column, step to the next row, x y z each. With
     ``is_parallel`` it begins with the direction of the rays, of any length, in place of the source.
-    Rotations are interpolated by slerp, and the other numbers linearly in the body's own frame: a linear interpolation in
+    Rotations are interpolated by slerp, and the other numbers linearly in the body's own frame. A linear interpolation in
     world coordinates would shrink an orbit (by 1 mm at 1 m over 5°).
     Raises InputError for times that do not increase, steps that span no panel, and times beyond the table."""
 
@@ -219,7 +223,7 @@ class PoseTable:
             table = unit_directions(self.subject, table)
         object.__setattr__(self, "table", table)
         frames = body_frames(table)
-        # seen from the turning panel, the vectors of a pose hardly change: there straight lines between samples hold
+        # Seen from the turning panel, the vectors of a pose hardly change, so linear interpolation is exact enough there.
         in_body = np.einsum("tji,tkj->tki", frames, table.reshape(-1, 4, 3)).reshape(-1, POSE_LENGTH)
         object.__setattr__(self, "_in_body", in_body)
         turns = scipy.spatial.transform.Rotation.from_matrix(frames)
@@ -229,7 +233,7 @@ class PoseTable:
         """Returns poses (..., 12) in mm at times (...) s, the same in every frame. Raises InputError beyond the table."""
         t = np.asarray(time_s, np.float64)
         _check_covered(self.subject, frame, t, self.time_s)
-        flat = np.clip(t.ravel(), self.time_s[0], self.time_s[-1])  # Slerp allows no slack
+        flat = np.clip(t.ravel(), self.time_s[0], self.time_s[-1])  # Slerp refuses times beyond the table
         body = np.stack([np.interp(flat, self.time_s, column) for column in self._in_body.T], -1).reshape(-1, 4, 3)
         turn = self._turns(flat).as_matrix()
         turned: np.ndarray = np.einsum("tij,tkj->tki", turn, body)
@@ -250,15 +254,15 @@ def unit_directions(subject: str, poses: np.ndarray) -> np.ndarray:
 def resting_poses(
     poses: np.ndarray, middle_s: np.ndarray, span_s: float, subject: str = "poses", is_parallel: bool = False
 ) -> PoseTable:
-    """Returns a table for a gantry that stops for every frame. It holds each pose (F, 12) for ``span_s`` about its frame's
-    middle (F,) in s."""
+    """Returns a table for a gantry that stops for every frame: each pose (F, 12) holds ``span_s`` about its ``middle_s``
+    (F,)."""
     half_s = max(span_s / 2, 0.25) * (1 - 1e-10)  # two frames in a row must not share a time
     time_s = np.stack([middle_s - half_s, middle_s + half_s], -1).ravel()
     return PoseTable(time_s, np.repeat(poses, 2, axis=0), subject, is_parallel)
 
 
 def resting_trajectory(geometry: Geometry, poses: np.ndarray, middle_s: np.ndarray) -> CircularOrbit | PoseTable:
-    """Returns a circular orbit where the poses (F, 12) of a gantry at rest are those of ``geometry``, else a table."""
+    """Returns a circular orbit where the poses (F, 12) of a gantry at rest are those of ``geometry``; otherwise a table."""
     is_parallel = isinstance(geometry, ParallelGeometry)
     side = -1 if is_parallel else 1  # rays run away from where a source would be
     angle_rad = np.arctan2(side * poses[:, 1], side * poses[:, 0])
@@ -268,10 +272,10 @@ def resting_trajectory(geometry: Geometry, poses: np.ndarray, middle_s: np.ndarr
 
 
 def behind_axis(geometry: Geometry, trajectory: Trajectory) -> tuple[Geometry, Trajectory]:
-    """Returns geometry and trajectory with a panel at the axis moved away from the source, to where its rays are the same.
+    """Moves a panel at the axis away from the source, where its rays are the same. Returns geometry and trajectory.
 
-    No panel stands in its object: this one was scaled to the axis, and rays would end there. Trajectories of a user's own
-    class, and panels elsewhere, stay as they are."""
+    No panel stands in its object. Such a panel was scaled to the axis, and rays would end there. User-defined trajectories
+    and panels elsewhere stay as they are."""
     if not isinstance(geometry, ConeGeometry):
         return geometry, trajectory
     if geometry.source_to_detector_mm > (1 + _AT_AXIS) * geometry.source_to_axis_mm:
@@ -293,14 +297,14 @@ def behind_axis(geometry: Geometry, trajectory: Trajectory) -> tuple[Geometry, T
 
 
 def _is_off_axis(poses: np.ndarray) -> bool:
-    """Whether the plane of a panel, of poses (T, 12), passes beside the origin."""
+    """Whether the plane of a panel, with poses (T, 12), passes beside the origin."""
     normal = body_frames(poses)[..., 2]
     from_axis_mm = np.abs(np.einsum("ti,ti->t", poses[:, 3:6], normal))
     return bool((from_axis_mm > _AT_AXIS * np.linalg.norm(poses[:, :3], axis=1)).any())
 
 
 def grid_of_scan(geometry: Geometry, trajectory: Trajectory, frame_start_s: np.ndarray) -> Grid:
-    """Returns ``default_grid``, longer by the travel of a gantry whose poses are no circle's."""
+    """Returns ``default_grid``, longer by the travel of a gantry that moves on no circle."""
     if isinstance(trajectory, CircularOrbit):
         return default_grid(geometry)
     poses = [checked_poses(trajectory, f, np.array([t])) for f, t in enumerate(frame_start_s)]
@@ -311,8 +315,9 @@ _AS_TABLE = "give it as a PoseTable"
 
 
 def sampled(trajectory: Trajectory, frame_start_s: np.ndarray, span_s: float, error_mm: float) -> PoseTable:
-    """Samples a user-defined trajectory to a table within ``error_mm`` of it, over ``span_s`` from each frame's start (F,).
-    Raises InputError where a fine table is not close enough, as for frames that overlap in time with different poses."""
+    """Samples a user-defined trajectory over ``span_s`` from each frame's start (F,), to a table within ``error_mm`` of it.
+
+    Raises InputError where a fine table is not close enough, as for frames that overlap in time with other poses."""
     samples = 2
     while True:
         offsets_s = np.linspace(0.0, max(span_s, _LEAST_SPAN_S), samples)
@@ -320,7 +325,7 @@ def sampled(trajectory: Trajectory, frame_start_s: np.ndarray, span_s: float, er
         poses = np.concatenate([checked_poses(trajectory, f, t) for f, t in enumerate(times)])
         time_s, at = np.unique(times.ravel(), return_index=True)  # frames may overlap in time
         table = PoseTable(time_s, poses[at], "trajectory", is_parallel(trajectory))
-        between = (time_s[:-1] + time_s[1:]) / 2  # of all samples, those of overlapping frames included
+        between = (time_s[:-1] + time_s[1:]) / 2  # samples of all frames count, also of overlapping ones
         inside = [between[(t[0] < between) & (between < t[-1])] for t in times]
         errors = (np.abs(table.pose(f, t) - trajectory.pose(f, t)).max(initial=0.0) for f, t in enumerate(inside))
         worst_mm = max(errors)
@@ -331,12 +336,12 @@ def sampled(trajectory: Trajectory, frame_start_s: np.ndarray, span_s: float, er
             overlap = np.any(np.sort(times[:, 0])[1:] < np.sort(times[:, -1])[:-1])
             remedy = "take frames that do not overlap in time: a file has one pose at a time" if overlap else _AS_TABLE
             raise InputError("trajectory", found, f"at most {error_mm:.3g} mm", remedy)
-        # the former samples are among the new ones
+        # The former samples are among the new ones.
         samples = 2 * samples - 1
 
 
 def checked_poses(trajectory: Trajectory, frame: int, time_s: np.ndarray) -> np.ndarray:
-    """Returns poses (T, 12) of a trajectory at times (T,) s. InputError: a user-defined one gives other shapes or NaN."""
+    """Returns poses (T, 12) of a trajectory at times (T,) s. InputError: a user-defined one returns other shapes or NaN."""
     subject = f"trajectory {type(trajectory).__name__}"
     return checks.numbers(subject, trajectory.pose(frame, time_s), (*time_s.shape, POSE_LENGTH))
 
@@ -354,7 +359,7 @@ def _checked_table(
 
 
 def body_frames(table: np.ndarray) -> np.ndarray:
-    """Returns right-handed orthonormal frames (T, 3, 3), with columns û, v̂ and normal, of poses (T, 12)."""
+    """Returns the right-handed orthonormal frames (T, 3, 3) of poses (T, 12). Their columns are û, v̂ and the normal."""
     u_hat = table[:, 6:9] / np.linalg.norm(table[:, 6:9], axis=1, keepdims=True)
     normal = np.cross(u_hat, table[:, 9:12])
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
@@ -362,7 +367,7 @@ def body_frames(table: np.ndarray) -> np.ndarray:
 
 
 def _check_covered(subject: str, frame: int, t: np.ndarray, table_s: np.ndarray) -> None:
-    """Raises InputError for times beyond a table; a nanosecond of slack absorbs rounding of stored times."""
+    """Raises InputError for times beyond a table. A nanosecond of tolerance absorbs the rounding of stored times."""
     slack = 1e-9 * max(1.0, abs(table_s[-1]))
     if t.size and (t.min() < table_s[0] - slack or t.max() > table_s[-1] + slack):
         found = f"frame {frame} needs {t.min():.6g} to {t.max():.6g} s"

@@ -13,7 +13,7 @@ from phyradgs_cl import checks
 from phyradgs_cl.acquisition import CircularOrbit, FrameSweeps, Scan, Shutter
 from phyradgs_cl.acquisition.geometry import GEOMETRIES, Geometry, default_grid
 from phyradgs_cl.acquisition.plausible import check_plausible
-from phyradgs_cl.acquisition.scan import check_not_counts, check_others
+from phyradgs_cl.acquisition.scans_from import check_not_counts, check_others
 from phyradgs_cl.acquisition.shutter import AXES
 from phyradgs_cl.detector.attenuation import QUANTITIES
 from phyradgs_cl.errors import InputError

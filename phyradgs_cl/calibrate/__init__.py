@@ -1,4 +1,4 @@
-"""The true geometry and timing of a scan from its own frames, with deviations, and what the frames cannot determine."""
+"""Estimates a scan's true geometry and timing from its own frames, with deviations. It says what they cannot determine."""
 
 from phyradgs_cl.calibrate.result import AGREES, CANNOT_TELL, CORRECTED, Calibration, ParameterEstimate
 from phyradgs_cl.calibrate.run import calibrate

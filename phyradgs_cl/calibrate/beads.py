@@ -1,10 +1,15 @@
-"""Frames of a phantom of known shape on a coarse grid: its placement, density and a background replace the volume."""
+"""Compares frames with a phantom of known shape: its placement, its density and a background replace the volume.
 
+``BeadOperator`` computes the expected frames in closed form, with each line at its own times."""
+
+import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
+import scipy
 from scipy.ndimage import gaussian_filter, uniform_filter
 from scipy.spatial.transform import Rotation
 
@@ -14,23 +19,160 @@ from phyradgs_cl.acquisition.altered.coarse import MOST_FRAMES, binned, fewer_fr
 from phyradgs_cl.acquisition.altered.perturbed import GeometryCorrection, Sway, Views, perturb
 from phyradgs_cl.acquisition.time_cells import TimeCells
 from phyradgs_cl.calibrate.problem import CoarseFrames, measured_blocks, without_pixels
-from phyradgs_cl.calibrate.shadows import DENSITY, BeadOperator
 from phyradgs_cl.calibrate.stages import Stage
+from phyradgs_cl.detector.attenuation import TRANSMISSION_FLOOR
 from phyradgs_cl.phantoms import EllipsoidPhantom
 
-_FEWEST_TIMES, _MOST_TIMES = 6, 24  # per exposure; the phantom's edge moves by a pixel between two
-_FEWEST_RAYS, _MOST_RAYS = 2, 6  # along each side of a pixel or a block; also per bead's radius
-_BLUR_PX = 0.8  # less would show single rays, half a pixel apart, in differences of sharp edges
-_LEAST_ZEROS, _ZEROS_PX = 0.2, 5  # of all pixels, where noise about air was clipped at 0; side of the blocks to average
-_BACKGROUND = 4  # cosines along each side of a frame: holder, scatter, drift of the tube
+DENSITY = 6  # index in a placement, which is turn (rotation vector, rad), shift (mm), density
+_MARGIN = 1.2  # margin of a shadow's half-width, for an oblique panel
+_FEWEST_TIMES, _MOST_TIMES = 6, 24  # times per exposure; the phantom's edge moves by a pixel between two of them
+_FEWEST_RAYS, _MOST_RAYS = 2, 6  # rays along each side of a pixel or a block, and per bead's radius
+_BLUR_PX = 0.8  # with less blur, differences of sharp edges would show single rays, which are half a pixel apart
+_LEAST_ZEROS, _ZEROS_PX = 0.2, 5  # fraction of zeros from which air was clipped; side of the averaged blocks
+_BACKGROUND = 4  # cosines along each side of a frame: they describe holder, scatter and drift of the tube
 _STEP_PX = 0.25
-_MOST_PX = 1.5  # by which a step of the placement moves a frame
-_SETTLED_PX, _LINEAR_PX = 0.01, 0.3  # the last step; the largest step after which the signals are still valid
+_MOST_PX = 1.5  # largest movement of a frame by a step of the placement
+_SETTLED_PX, _LINEAR_PX = 0.01, 0.3  # size of the last step; the largest step after which the signals are still valid
+
+
+@dataclass(frozen=True, eq=False)
+class BeadOperator:
+    """Frames (F, rows, columns) of a phantom seen along the lines of ``tables``, by a detector of ``model``.
+
+    ``samples``: rays along each side of a pixel. ``clipped_noise``: standard deviation of noise clipped at 0, or 0."""
+
+    phantom: EllipsoidPhantom
+    tables: Sequence[TimeCells]
+    shape: tuple[int, int]
+    model: str
+    samples: int
+    clipped_noise: float
+
+    def forward(self, placement: np.ndarray) -> np.ndarray:
+        """Returns the line integrals of the phantom at a placement (7,)."""
+        pose, weight = _poses_by_line(self.tables)
+        frames, lines, samples = weight.shape
+        turn = Rotation.from_rotvec(placement[:3]).as_matrix()
+        places, steps = pose[:, :2] - placement[3:DENSITY], pose[:, 2:]
+        if self.tables[0].is_parallel:
+            places[:, 0] = pose[:, 0]  # a turn does not move the direction of parallel rays
+        is_rows = self.tables[0].axis == "rows"
+        panel_lines = _PanelLines(
+            source=places[:, 0] @ turn, first=places[:, 1] @ turn, line_step=steps[:, int(is_rows)] @ turn,
+            pixel_step=steps[:, 1 - int(is_rows)] @ turn,
+            line=np.tile(np.repeat(np.arange(lines), samples), frames),
+            pixels=self.shape[1] if is_rows else self.shape[0],
+            is_parallel=self.tables[0].is_parallel,
+        )
+        total = np.zeros((frames, lines, panel_lines.pixels))
+        for p in panel_lines.integrals(self.phantom, self.samples):
+            p = placement[DENSITY] * p.reshape(frames, lines, samples, -1)
+            total += np.einsum("fls,flsp->flp", weight, p if self.model == "log" else np.exp(-p)) / self.samples**2
+        expected = total if self.model == "log" else -np.log(np.maximum(total, TRANSMISSION_FLOOR))
+        if self.clipped_noise > 0:
+            expected = _mean_of_clipped(expected, self.clipped_noise)
+        return np.ascontiguousarray(expected if is_rows else expected.swapaxes(1, 2), np.float32)
+
+
+def _mean_of_clipped(p: np.ndarray, sigma: float) -> np.ndarray:
+    """Returns the mean of max(p + noise, 0) for normal noise. Clipping raises air more than faint shadows."""
+    ratio = p / sigma
+    return p * scipy.special.ndtr(ratio) + sigma * np.exp(-(ratio**2) / 2) / math.sqrt(2 * math.pi)
+
+
+def _poses_by_line(tables: Sequence[TimeCells]) -> tuple[np.ndarray, np.ndarray]:
+    """Returns poses (F · lines · S, 4, 3) and weights (F, lines, S) of every line of every frame, at S times each."""
+    poses, weights = [], []
+    for table in tables:
+        counts = table.line_stop - table.line_start
+        cell = np.repeat(np.arange(table.count), counts)
+        line = table.line_start[cell] + np.arange(cell.size) - np.repeat(np.cumsum(counts) - counts, counts)
+        cell = cell[np.argsort(line, kind="stable")]
+        poses.append(table.pose[cell].reshape(-1, 4, 3))
+        weights.append(table.weight[cell].reshape(table.lines, -1))
+    return np.concatenate(poses), np.stack(weights)
+
+
+@dataclass(frozen=True, eq=False)
+class _PanelLines:
+    """N lines of a panel, each at one time, in the phantom's frame of reference.
+
+    - source, first (N, 3): the source and the middle of the panel's first pixel, mm.
+    - line_step, pixel_step (N, 3): the steps to the next line and to the next of its ``pixels``. line (N,): the line's
+      number.
+    - is_parallel: ``source`` is the rays' direction."""
+
+    source: np.ndarray
+    first: np.ndarray
+    line_step: np.ndarray
+    pixel_step: np.ndarray
+    line: np.ndarray
+    pixels: int
+    is_parallel: bool
+
+    def integrals(self, phantom: EllipsoidPhantom, samples: int) -> Iterator[np.ndarray]:
+        """Yields line integrals (N, pixels), float32, for each of samples² points of a pixel's area."""
+        shadows = [(body, *self._shadow(np.array(body.ends_mm), body.reach_mm)) for body in phantom.ellipsoids]
+        offsets = (np.arange(samples) + 0.5) / samples - 0.5
+        for across, along in itertools.product(offsets, offsets):
+            total = np.zeros((len(self.line), self.pixels), np.float32)
+            for body, lines, start, width in shadows:
+                pixel = start[:, None] + np.arange(width)
+                source = self.source[lines]
+                first = self.first[lines] + (self.line[lines, None] + across) * self.line_step[lines]
+                first = first if self.is_parallel else first - source
+                ray = first[:, None] + (pixel[..., None] + along) * self.pixel_step[lines][:, None]
+                starts, rays = np.repeat(source, width, axis=0), ray.reshape(-1, 3)
+                if self.is_parallel:  # integrate from one side of the body to the other
+                    reach = 2 * (np.abs(rays).max(initial=0.0) + np.abs(body.ends_mm).max() + body.reach_mm)
+                    starts, rays = rays - reach * starts, 2 * reach * starts
+                fraction = body.chord_fraction(starts, rays)
+                value = body.attenuation_per_mm * fraction * np.sqrt(np.einsum("ij,ij->i", rays, rays))
+                total[lines[:, None], pixel] += value.reshape(pixel.shape)
+            yield total
+
+    @cached_property
+    def _panel_axes(self) -> tuple[tuple[np.ndarray, ...], ...]:
+        """Vectors (N, 3) whose inner products with a place are its distance from the source (in panel distances), its line
+        and its pixel. Each comes with the products of the source and of the first pixel (N,), and with its length (N,).
+
+        In a parallel beam the distance is 1, and lines and pixels are those that a ray through the place meets."""
+        normal = np.cross(self.line_step, self.pixel_step)
+        to_panel = self.source if self.is_parallel else self.first - self.source
+        vectors = [normal / np.sum(normal * to_panel, -1, keepdims=True)]
+        vectors += [step / np.sum(step**2, -1, keepdims=True) for step in (self.line_step, self.pixel_step)]
+        if self.is_parallel:
+            vectors = [vector - np.sum(vector * self.source, -1, keepdims=True) * vectors[0] for vector in vectors]
+        products = [[np.sum(vector * place, -1) for place in (self.source, self.first)] for vector in vectors]
+        if self.is_parallel:
+            products[0][0] = -np.ones(len(self.line))
+        return tuple((v, *both, np.linalg.norm(v, axis=-1)) for v, both in zip(vectors, products, strict=True))
+
+    def _shadow(self, ends_mm: np.ndarray, reach_mm: float) -> tuple[np.ndarray, np.ndarray, int]:
+        """Returns the lines (n,) that may see a body, the first pixel (n,) in each, and the number of pixels."""
+        (depth, depth_of_source, *_), *axes = self._panel_axes
+        lowest, highest = [], []
+        for end_mm in ends_mm:
+            magnification = 1 / (depth @ end_mm - depth_of_source)
+            for vector, of_source, of_first, per_mm in axes:
+                centre = of_source - of_first + magnification * (vector @ end_mm - of_source)
+                reach = _MARGIN * reach_mm * np.abs(magnification) * per_mm + 1
+                lowest.append(centre - reach)
+                highest.append(centre + reach)
+        line_from, pixel_from = (np.minimum(lowest[k], lowest[k + 2]) for k in (0, 1))
+        line_to, pixel_to = (np.maximum(highest[k], highest[k + 2]) for k in (0, 1))
+        lines = np.flatnonzero(
+            (self.line >= line_from) & (self.line <= line_to) & (pixel_to >= 0) & (pixel_from <= self.pixels - 1)
+        )
+        first = np.clip(np.floor(pixel_from[lines]), 0, self.pixels - 1).astype(int)
+        last = np.clip(np.ceil(pixel_to[lines]), 0, self.pixels - 1).astype(int)
+        width = int((last - first).max(initial=0)) + 1
+        return lines, np.minimum(first, self.pixels - width), width
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class BeadProblem(CoarseFrames):
-    """Like ``CoarseProblem`` for a known phantom. Its objects are placements (7,), ``start`` being a first guess."""
+    """The problem of ``CoarseProblem`` for a known phantom. Its objects are placements (7,); ``start`` is a guess."""
 
     phantom: EllipsoidPhantom
     start: np.ndarray
@@ -68,11 +210,11 @@ class BeadProblem(CoarseFrames):
         return self._without_background(self.measured - operator.forward(placement))
 
     def noise(self, residual: np.ndarray) -> float:
-        """Returns the standard deviation of a pixel's noise and model errors."""
+        """Returns the standard deviation of a pixel, from noise and model errors."""
         return float(np.std(residual if self.valid is None else residual[self.valid]))
 
     def explained(self, operator: BeadOperator, placement: np.ndarray) -> float:
-        """Returns the fraction of the compared frames' squares that the phantom explains; 0 for a negative density."""
+        """Returns the fraction of the compared values' squares that the phantom explains. A negative density explains 0."""
         residual = self.compared(self.residual(operator, placement))
         whole = self.compared(self.masked(self.measured))
         return float(1 - residual @ residual / max(float(whole @ whole), 1e-30)) if placement[DENSITY] > 0 else 0.0
@@ -109,7 +251,7 @@ class BeadProblem(CoarseFrames):
         return blurred.ravel()
 
     def _units(self) -> np.ndarray:
-        """Returns the amount of each number (7,) that moves a frame by a pixel at its edge, or adds the known density."""
+        """Returns the amount of each number (7,) that moves a frame by a pixel at its edge, or doubles the density."""
         scan = self.scans[0]
         pixel_mm = self.block * min(scan.geometry.pixel_size_mm) / scan.geometry.magnification
         return np.array([pixel_mm / (max(scan.grid.size_mm) / 2)] * 3 + [pixel_mm] * 3 + [1.0])
@@ -124,7 +266,7 @@ class BeadProblem(CoarseFrames):
         return np.array(signals)
 
     def _without_background(self, frames: np.ndarray) -> np.ndarray:
-        """Returns frames less their fit by a few cosines along each side."""
+        """Returns frames less the background, which is their fit by a few cosines along each side."""
         rows, columns = (_cosines(count) for count in frames.shape[1:])
         if self.valid is None:
             inner = np.einsum("vi,fvu,uj->fij", rows, frames, columns)
@@ -138,8 +280,9 @@ class BeadProblem(CoarseFrames):
 
 
 def _clipped_noise(scans: Sequence[Scan]) -> float:
-    """Returns the standard deviation of noise about air that was clipped at 0, from means of small blocks; 0 where few
-    pixels are 0."""
+    """Returns the standard deviation of the noise about air where it was clipped at 0, from means of small blocks.
+
+    Returns 0 where few pixels are 0."""
     values = np.concatenate([np.asarray(scan.projections, np.float32) for scan in scans])
     valid = np.concatenate([scan.valid for scan in scans])
     if np.mean(values[valid] == 0) < _LEAST_ZEROS or values[valid].min() < 0:
@@ -150,7 +293,7 @@ def _clipped_noise(scans: Sequence[Scan]) -> float:
 
 def _with_spread_of(scan: Scan, times: int) -> Scan:
     """Returns the scan with longer exposures about the same middle, so that ``times`` moments have the standard deviation of
-    the whole exposure. Few moments would otherwise look like a shorter exposure. Pulses stay unchanged."""
+    the whole exposure. Otherwise few moments would look like a shorter exposure. Pulses stay unchanged."""
     if scan.shutter.pulse_s is not None:
         return scan
     exposure_s = scan.shutter.exposure_s / math.sqrt(1 - times**-2)
@@ -160,14 +303,14 @@ def _with_spread_of(scan: Scan, times: int) -> Scan:
 
 
 def _moved(placement: np.ndarray, step: np.ndarray) -> np.ndarray:
-    """Returns a placement (7,) after another turn about the world's axes, a shift, and a change of density."""
+    """Returns the placement (7,) after a further turn about the world's axes, a shift, and a change of density."""
     turn = Rotation.from_rotvec(step[:3])
     turned = (turn * Rotation.from_rotvec(placement[:3])).as_rotvec()
     return np.concatenate([turned, turn.apply(placement[3:DENSITY]) + step[3:DENSITY], placement[DENSITY:] + step[DENSITY:]])
 
 
 def _cosines(count: int) -> np.ndarray:
-    """Returns the slowest cosines (count, n) along a side, orthonormal."""
+    """Returns the slowest cosines (count, n) along a side, which are orthonormal."""
     order = np.arange(min(_BACKGROUND, count))
     waves = np.cos(np.pi * order * (np.arange(count)[:, None] + 0.5) / count)
     return waves / np.linalg.norm(waves, axis=0)

@@ -13,10 +13,10 @@ from phyradgs_cl.errors import InputError
 from phyradgs_cl.removed import removal
 from phyradgs_cl.text import suggest_name
 
-_STEP_PX = 0.25  # by which a central difference moves the image at its edge
-_TIMING_STEP, _LARGEST_CUT = 0.1, 0.7  # of the stated time: a difference, and the most to subtract
-_MOST_TILT_RAD = math.radians(2.0)
-_SMALL_MISMATCH = 1.3  # of signals that change sign after half a turn, as errors of voxels do not
+_STEP_PX = 0.25  # movement of the image at its edge by half a central difference
+_TIMING_STEP, _LARGEST_CUT = 0.1, 0.7  # shares of the stated time: half a central difference, and the most to subtract
+_MOST_TILT_RAD = math.radians(2.0)# for signals that change sign after half a turn, which errors of the voxels do not
+_SMALL_MISMATCH = 1.3  # an angle with this deviation is unknown: sines are not linear beyond
 _LEAST_KNOWN_RAD = math.radians(10.0)  # deviation of an angle that is unknown: sines are linear no further
 _DEGREES = math.degrees(1.0)
 
@@ -25,10 +25,11 @@ _DEGREES = math.degrees(1.0)
 class Parameter:
     """A field of ``GeometryCorrection``.
 
-    scale: of the displayed unit per unit of the field. object_instead: the object that explains the frames as well, where
-    they do not determine the parameter. pixels: how far a unit of the field moves the image at its edge. mismatch: measured
-    errors (docs/calibrate.md) over those of noise, because voxels do not represent the object exactly. is_axial: the
-    parameter moves the image along the axis, like ``LIFT``; the others move it across the axis, like ``TURN``."""
+    - scale: displayed units per unit of the field.
+    - object_instead: the object that explains the frames as well, where they do not determine the parameter.
+    - pixels: how far a unit of the field moves the image at its edge.
+    - mismatch: measured errors (docs/calibrate.md) over those of noise, because voxels do not represent the object exactly.
+    - is_axial: the parameter moves the image along the axis, like ``LIFT``. The others move it across, like ``TURN``."""
 
     name: str
     field: str
@@ -49,11 +50,11 @@ class Parameter:
         return min(step, _TIMING_STEP * self.stated(scan) or step) if self.is_timing else step
 
     def is_known(self, deviation: float) -> bool:
-        """True where a value with this standard deviation, in the field's unit, says anything."""
+        """True where a value with this standard deviation, in the field's unit, is useful."""
         return self.unit != "deg" or deviation < _LEAST_KNOWN_RAD
 
     def lowest(self, scan: Scan) -> float:
-        """Returns the lowest value of the field to try: times stay above 0."""
+        """Returns the lowest value of the field to try, at which times are still above 0."""
         stated = self.stated(scan) if self.is_timing else 0.0
         return -_LARGEST_CUT * stated if stated > 0 else -math.inf
 
@@ -67,23 +68,23 @@ def _pitch_mm(scan: Scan) -> float:
 
 
 def _edge_pixels(scan: Scan, factor: float = 1.0) -> float:
-    """Pixels from the panel's middle to its further edge, by which a radian of roll moves that; times a factor."""
+    """Returns how many pixels a radian of roll moves the panel's further edge, times a factor."""
     return factor * max(_half_mm(scan, 0), _half_mm(scan, 1)) / _pitch_mm(scan)
 
 
 def _tilt_pixels(axis: int) -> Callable[[Scan], float]:
-    """A tilt magnifies one side: points move outwards by the square of their distance from the tilt's axis."""
+    """Returns the pixels of a tilt. It magnifies one side: points move by the square of their distance from its axis."""
     return lambda scan: _half_mm(scan, axis) ** 2 / _cone(scan).source_to_detector_mm / _pitch_mm(scan)
 
 
 def _cone(scan: Scan) -> ConeGeometry:
-    """Returns the geometry of a cone beam; ``requested`` refuses tilts and distances of other beams."""
+    """Returns the geometry of a cone beam. ``requested`` refuses tilts and distances of other beams."""
     assert isinstance(scan.geometry, ConeGeometry)
     return scan.geometry
 
 
 def _timing_pixels(scan: Scan) -> float:
-    """Pixels by which the object's edge turns in a second."""
+    """Returns the pixels by which the object's edge turns in a second."""
     speed_rad_per_s = exposure_arc_rad(scan) / scan.shutter.exposure_s
     edge_mm = max(scan.grid.size_mm[1:]) / 2 * scan.geometry.magnification
     return max(speed_rad_per_s * edge_mm / _pitch_mm(scan), 1e-12)
@@ -134,7 +135,7 @@ OFFSET_U = "offset-u"
 TURN = Parameter("all angles", "turn_rad", "deg", _TURN, lambda s: 0.0, _edge_pixels, _DEGREES)
 LIFT = Parameter("all heights", "lift_mm", "mm", "a lower object", lambda s: 0.0, lambda s: 1 / _pitch_mm(s), is_axial=True)
 GAUGES = (TURN, LIFT)
-"""Parameters that no frame determines: their remaining signals are errors of the voxels."""
+"""Parameters that no frame determines. What remains of their signals is errors of the voxels."""
 PARAMETER_GROUPS = {
     "offset": (OFFSET_U, "offset-v"),
     "tilt": ("tilt-v", "tilt-u"),
@@ -148,7 +149,7 @@ NAMES = list(dict.fromkeys([*PARAMETER_GROUPS, *PARAMETERS, WOBBLE, MOTION, DIRE
 
 @dataclass(frozen=True)
 class Request:
-    """Parameters to estimate; ``per_view``: wobble, motion or nothing (""); whether the readout's direction is tested."""
+    """The parameters to estimate. ``per_view``: wobble, motion or nothing (""). ``asks_direction``: test the readout's."""
 
     parameters: list[Parameter]
     per_view: str
@@ -160,11 +161,12 @@ class Request:
 
 
 def requested(what: str | None, scan: Scan, knows_shape: bool = False) -> Request:
-    """Reads names separated by commas. None: offset, roll and tilt; of a fly-scan readout and exposure as well, of an object
-    of known shape distances as well. A parallel beam has neither tilt nor distances.
+    """Reads names separated by commas. A parallel beam has neither tilt nor distances.
 
-    InputError: an unknown name, distances and tilts of a parallel beam, wobble together with motion, timing of a gantry that
-    stands still."""
+    None takes offset, roll and tilt, in a fly-scan also readout and exposure, for an object of known shape also distances.
+
+    Raises InputError for an unknown name, distances and tilts of a parallel beam, wobble together with motion, and the
+    timing of a gantry that stands still."""
     if what is None:
         is_rolling = _turns(scan) and scan.shutter.readout_s > 0
         what = "offset,roll" if scan.is_parallel else "offset,roll,tilt"
@@ -207,7 +209,7 @@ def correction_of(values: Mapping[str, float]) -> GeometryCorrection:
 
 
 def in_words(weights: Mapping[str, float]) -> str:
-    """Describes a combination of parameters (weights by name), the largest first, without small ones."""
+    """Describes a combination of parameters (weights by name). The largest comes first; small ones are left out."""
     order = sorted(weights, key=lambda name: -abs(weights[name]))
     largest = abs(weights[order[0]])
     main, *others = [name for name in order if abs(weights[name]) > 0.3 * largest]

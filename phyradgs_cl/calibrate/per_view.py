@@ -1,7 +1,8 @@
-"""Parameters of single views (a wobble), or of an object that moves slowly (a motion), by splines of time.
+"""Estimates parameters of single views (a wobble), or of an object that moves slowly (a motion), as splines of time.
 
-A view's parameters change its own frame only, so their signals are images of that frame. CGLS solves the normal equations of
-a Gauss–Newton step for the volume and all parameters together, so that parameters explain only what the volume cannot."""
+A view's parameters change its own frame only, so their signals are images of that frame. CGLS solves the normal equations
+of a Gauss–Newton step for the volume and all parameters together. Parameters then explain only what the volume cannot.
+``estimate_views`` takes such steps from coarse to fine grids."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
@@ -14,21 +15,28 @@ from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.acquisition.altered.angles import start_azimuths_rad
 from phyradgs_cl.acquisition.altered.perturbed import GeometryCorrection, Sway, Views, scan_course, splines
 from phyradgs_cl.calibrate.problem import CoarseProblem
+from phyradgs_cl.calibrate.result import AGREES, CORRECTED, ParameterEstimate
+from phyradgs_cl.calibrate.stages import PassCounter, Passes, Stage, pass_cost
 from phyradgs_cl.detector import noise_level
 from phyradgs_cl.operators.rays.operator import RayOperator
 from phyradgs_cl.reconstructors.fits.residuals import AugmentedOperator, ViewParameters
 from phyradgs_cl.reconstructors.voxels.cgls import Cgls
+from phyradgs_cl.runtime import Runtime
 
-SPLINES = 7  # of a motion: about one per seventh of the scan
+SPLINES = 7  # splines of a motion, each about a seventh of the scan wide
 TURN, SHIFT_V, SHIFT_U = 0, 1, 2
 _STEP_PX = 0.25
-_LEAST_NORM = 0.1  # of the largest of a kind: parameters with weaker signals are not scaled up further
+_LEAST_NORM = 0.1  # fraction of the largest norm of a kind: parameters with weaker signals are not scaled up further
 _DEG = float(np.rad2deg(1.0))
+DISCRETISATION = 0.5  # fraction of the change since a grid half as fine: the error that remains, if it is of first order
+_STEPS = 3
+_ITERATIONS = 20
+_DEVIATIONS = 3.0  # deviations of one value, which the root mean square of all has to exceed
 
 
 @dataclass(frozen=True)
 class Kind:
-    """A kind of parameter: its name in the table, its unit there, and that unit per unit of the parameter."""
+    """A kind of parameter: its name and unit in the table, and how much of that unit is one unit of the parameter."""
 
     name: str
     unit: str
@@ -37,10 +45,12 @@ class Kind:
 
 @dataclass(frozen=True, eq=False)
 class PerViewParameters(ABC):
-    """``values`` (n, K), of which view f has ``basis`` (F, n) @ values (K,). ``units`` (K,): the amount of each kind that
-    moves a frame by a pixel at its edge. ``circle`` (n, 2): values that vary as cosine and sine of the angle, as far as the
-    basis can. MISMATCH: measured errors (docs/calibrate.md) over those of noise, because voxels do not represent the object
-    exactly. RESTARTED: kinds that start from 0 on each grid."""
+    """Values of the parameters. View f has ``basis`` (F, n) @ values (K,), of ``values`` (n, K).
+
+    - units (K,): the amount of each kind that moves a frame by a pixel at its edge.
+    - circle (n, 2): values that vary as cosine and sine of the angle, as far as the basis can.
+    - MISMATCH: measured errors (docs/calibrate.md) over those of noise, because voxels do not represent the object exactly.
+    - RESTARTED: kinds that start from 0 on each grid."""
 
     values: np.ndarray
     basis: np.ndarray
@@ -60,7 +70,7 @@ class PerViewParameters(ABC):
         """Returns values (n, K) without the part that another object explains exactly."""
 
     def kinds_of_stage(self, number: int, count: int) -> Sequence[int]:
-        """Returns the kinds to estimate in a stage; by default all."""
+        """Returns the kinds to estimate in a stage. By default these are all kinds."""
         return range(len(self.KINDS))
 
     def operator(
@@ -70,7 +80,7 @@ class PerViewParameters(ABC):
 
 
 class WobbleParameters(PerViewParameters):
-    """A turn and two shifts per view, separately for each or by splines of time."""
+    """A turn and two shifts per view, either separate for each view or as splines of time."""
 
     KINDS = (Kind("turn per view", "deg", _DEG), Kind("shift-v per view", "mm", 1.0), Kind("shift-u per view", "mm", 1.0))
     MISMATCH = 4.0
@@ -91,8 +101,8 @@ class WobbleParameters(PerViewParameters):
         return Views(per_view[:, TURN], per_view[:, SHIFT_V:])
 
     def without_gauges(self, values: np.ndarray) -> np.ndarray:
-        """A turned or shifted object explains the mean of turns and of shifts along v, and shifts along u that vary as
-        cosine and sine of the angle."""
+        """Returns values without what a turned or shifted object explains: the mean of turns and of shifts along v, and
+        shifts along u that vary as cosine and sine of the angle."""
         rest = values.copy()
         rest[:, :SHIFT_U] -= (self.basis @ rest[:, :SHIFT_U]).mean(0)
         pattern, shifts = self.basis @ self.circle, self.basis @ rest[:, SHIFT_U]
@@ -100,14 +110,14 @@ class WobbleParameters(PerViewParameters):
         return rest
 
     def kinds_of_stage(self, number: int, count: int) -> Sequence[int]:
-        """Turns need fine detail: they are estimated on the last two grids only, each time from 0, so that the difference
-        between the two shows their error."""
+        """Returns the kinds of a stage. Turns need fine detail, so they are estimated on the last two grids only, each time
+        from 0. The difference between the two grids then shows their error."""
         return (TURN, SHIFT_V, SHIFT_U) if number >= count - 2 else (SHIFT_V, SHIFT_U)
 
 
 @dataclass(frozen=True, eq=False)
 class MotionParameters(PerViewParameters):
-    """Three turns and three shifts of the object, by splines of time."""
+    """Three turns and three shifts of the object, as splines of time."""
 
     still: Sway
 
@@ -120,7 +130,7 @@ class MotionParameters(PerViewParameters):
 
     @classmethod
     def of(cls, scan: Scan, count: int = SPLINES) -> "MotionParameters":
-        """Returns no motion, by ``count`` splines."""
+        """Returns a motion of zeros, as ``count`` splines."""
         still = Sway.none(scan, count)
         basis = still.basis(np.asarray(scan.frame_start_s) + scan.shutter.middle_s)
         shift_mm = scan.geometry.pixel_size_mm[1] / scan.geometry.magnification
@@ -131,8 +141,8 @@ class MotionParameters(PerViewParameters):
         return replace(self.still, coefficients=values)
 
     def without_gauges(self, values: np.ndarray) -> np.ndarray:
-        """An object elsewhere explains the mean of each kind; a larger or smaller one shifts along x and y that follow the
-        source."""
+        """Returns values without what another object explains. An object elsewhere explains the mean of each kind; a larger
+        or smaller one explains shifts along x and y that follow the source."""
         rest = values - (self.basis @ values).mean(0)
         towards_source = self.circle - (self.basis @ self.circle).mean(0)
         shifts, pattern = self.basis @ rest[:, 3:5], self.basis @ towards_source
@@ -141,13 +151,13 @@ class MotionParameters(PerViewParameters):
 
 
 def _turn_unit_rad(scan: Scan) -> float:
-    """Returns the turn that moves the object's edge by a pixel."""
+    """Returns the turn in rad that moves the object's edge by a pixel."""
     edge_mm = max(scan.grid.size_mm[1:]) / 2 * scan.geometry.magnification
     return scan.geometry.pixel_size_mm[1] / edge_mm
 
 
 def units_of_views(scan: Scan) -> np.ndarray:
-    """Returns the turn (rad) and the shifts along v and u (mm) of a view that move its frame by a pixel at its edge."""
+    """Returns the turn (rad) and the shifts along v and u (mm) that move a view's frame by a pixel at its edge."""
     return np.array([_turn_unit_rad(scan), *scan.geometry.pixel_size_mm])
 
 
@@ -165,8 +175,8 @@ def view_step(
     problem: CoarseProblem, correction: GeometryCorrection, parameters: PerViewParameters, volume: np.ndarray,
     kinds: Sequence[int], iterations: int,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the Gauss–Newton step (n, K) from the parameters' values for the object ``volume``, 0 for other kinds than
-    ``kinds``. Also returns the signals (F, kinds, rows, columns) of one pixel's worth of each kind."""
+    """Returns the Gauss–Newton step (n, K) from the parameters' values for the object ``volume``; it is 0 for kinds outside
+    of ``kinds``. Also returns the signals (F, kinds, rows, columns) of a movement by one pixel, for each kind."""
     operator = parameters.operator(problem, correction)
     residual = problem.residual(operator, volume)
     signals = np.stack([_signal(problem, correction, parameters, volume, kind) for kind in kinds], 1)
@@ -192,8 +202,9 @@ def view_deviations(
     problem: CoarseProblem, correction: GeometryCorrection, parameters: PerViewParameters,
     signals: np.ndarray, iterations: int,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the standard deviations (K,) of a view's parameters, and the shares (K,) of their signals (F, K, rows,
-    columns) that no object explains. Errors of the values that make up a view are taken as independent."""
+    """Returns standard deviations (K,) of a view's parameters, and the shares (K,) of signals that no object explains.
+
+    signals: (F, K, rows, columns). The errors of the values that make up a view are taken as independent."""
     operator = parameters.operator(problem, correction)
     norms = _norms(parameters.basis, signals)
     noise = noise_level(problem.measured, problem.valid)
@@ -210,8 +221,7 @@ def _norms(basis: np.ndarray, signals: np.ndarray) -> np.ndarray:
 
 
 def _strength(operator: RayOperator) -> float:
-    """Returns about the largest singular value of A: parameters in its units converge as fast as the object's main
-    features."""
+    """Returns a rough largest singular value of A. Parameters in its units converge as fast as the object does."""
     lengths = operator.forward(np.ones(operator.volume_shape, np.float32))
     return float(np.linalg.norm(operator.adjoint(lengths)) / np.linalg.norm(lengths))
 
@@ -220,7 +230,7 @@ def _signal(
     problem: CoarseProblem, correction: GeometryCorrection, parameters: PerViewParameters, volume: np.ndarray,
     kind: int,
 ) -> np.ndarray:
-    """Returns the change of the frames (F, rows, columns) per pixel's worth of a kind in each view."""
+    """Returns the change of the frames (F, rows, columns) by a kind, where it moves each view by one pixel."""
     step_px = _STEP_PX * problem.block
     step = np.zeros(len(parameters.units))
     step[kind] = step_px * parameters.units[kind]
@@ -236,3 +246,59 @@ def _share(
     probe = signals * (basis @ signs).astype(np.float32)[:, None, None]
     (rest,) = problem.beyond_object(operator, np.zeros(operator.volume_shape, np.float32), [probe], iterations)
     return float(np.linalg.norm(rest) / max(float(np.linalg.norm(probe)), 1e-30))
+
+
+@dataclass(frozen=True, eq=False)
+class ViewsEstimate:
+    """``views``: corrections of significant kinds, None without any. ``table``: a line of the table per kind."""
+
+    views: Views | Sway | None
+    table: list[ParameterEstimate]
+
+
+def passes_of_views(scan: Scan, stages: Sequence[Stage], kinds: int) -> Passes:
+    """Returns the passes through the frames that ``estimate_views`` makes."""
+    costs = [pass_cost([scan], stage.columns, scan.frames) for stage in stages]
+    counts = [stage.first + (_STEPS - 1) * stage.again + _STEPS * _ITERATIONS for stage in stages]
+    counts[-1] += kinds * _ITERATIONS
+    return sum(counts), sum(cost * count for cost, count in zip(costs, counts, strict=True))
+
+
+def estimate_views(
+    rt: Runtime, scan: Scan, parameters: PerViewParameters, stages: Sequence[Stage],
+    correction: GeometryCorrection, passes: PassCounter,
+) -> ViewsEstimate:
+    """Estimates ``parameters`` of a scan after ``correction``, in a few Gauss–Newton steps per stage.
+
+    A deviation combines noise and discretisation error, which is half the change since the coarser grid."""
+    for number, stage in enumerate(stages):
+        problem = CoarseProblem.of(rt, [scan], stage, scan.frames)
+        problem = replace(problem, count_pass=passes.counter(pass_cost([scan], stage.columns, scan.frames)))
+        former, volume = parameters.values, None
+        is_kept = ~np.isin(np.arange(len(parameters.KINDS)), parameters.RESTARTED)
+        parameters = replace(parameters, values=former * is_kept)
+        kinds = parameters.kinds_of_stage(number, len(stages))
+        for _ in range(_STEPS):
+            operator = parameters.operator(problem, correction)
+            volume = problem.reconstruct(operator, volume, stage.first if volume is None else stage.again)
+            step, signals = view_step(problem, correction, parameters, volume, kinds, _ITERATIONS)
+            parameters = replace(parameters, values=parameters.without_gauges(parameters.values + step))
+    noise, shares = view_deviations(problem, correction, parameters, signals, _ITERATIONS)
+    change = _rms_over_views(parameters, parameters.values - former)
+    kinds_before = parameters.kinds_of_stage(len(stages) - 2, len(stages)) if len(stages) > 1 else []
+    was_estimated = np.isin(np.arange(len(parameters.KINDS)), kinds_before)
+    deviations = np.hypot(noise, DISCRETISATION * change * was_estimated)
+    sizes = _rms_over_views(parameters, parameters.values)
+    is_significant = sizes > _DEVIATIONS * deviations
+    table = []
+    for k, kind in enumerate(parameters.KINDS):
+        size, deviation = float(sizes[k] * kind.scale), float(deviations[k] * kind.scale)
+        verdict = CORRECTED if is_significant[k] else AGREES
+        table.append(ParameterEstimate(kind.name, kind.unit, 0.0, size, deviation, float(shares[k]), verdict))
+    views = parameters.views_of(parameters.values * is_significant) if is_significant.any() else None
+    return ViewsEstimate(views, table)
+
+
+def _rms_over_views(parameters: PerViewParameters, values: np.ndarray) -> np.ndarray:
+    """Returns the root mean square (K,) over the views of values (n, K)."""
+    return np.sqrt(np.mean(np.square(parameters.basis @ values), 0))

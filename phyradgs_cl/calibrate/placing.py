@@ -1,4 +1,4 @@
-"""A first placement of a known phantom: bright spots of a volume, and the rigid motion that takes known beads there."""
+"""Finds a first placement of a known phantom: the rigid motion that takes its beads to bright spots of a volume."""
 
 from collections.abc import Iterator
 
@@ -12,17 +12,17 @@ from phyradgs_cl.phantoms import Ellipsoid, EllipsoidPhantom
 
 FEWEST_BEADS = 4
 WRONG_PHANTOM = "is it the right phantom, all of it in view, in mm? Does the gantry turn as stated ('phyradgs check')?"
-_LEAST_SHARE = 0.75  # of the beads have to be in bright spots
-_SMOOTH = 0.5  # of a bead's radius: a bead of many voxels then has one maximum
+_LEAST_SHARE = 0.75  # least fraction of the beads that have to be in bright spots
+_SMOOTH = 0.5  # smoothing over a bead's radius: a bead of many voxels then has one maximum
 _PEAKS_PER_BEAD = 2.0
 _TOLERANCE_VOXELS = 1.5
-_TRIANGLES = 40  # of known beads to try
-_APART = 0.05  # rad between different placements
-_MOST = 6  # placements that fit equally well, of a nearly symmetric phantom
+_TRIANGLES = 40  # triangles of known beads to try
+_APART = 0.05  # least angle in rad between different placements
+_MOST = 6  # placements to try where a nearly symmetric phantom fits equally well in several
 
 
 def bead_centres_mm(phantom: EllipsoidPhantom) -> np.ndarray:
-    """Returns the centres (n, 3) of a phantom's beads; InputError for fewer than four, and for beads on a line."""
+    """Returns the centres (n, 3) of a phantom's beads. Raises InputError for fewer than four, and for beads on a line."""
     centres_mm = np.array([body.centre_mm for body in phantom.ellipsoids if isinstance(body, Ellipsoid)]).reshape(-1, 3)
     spread_mm = np.linalg.svd(centres_mm - centres_mm.mean(0), compute_uv=False) if len(centres_mm) else np.zeros(3)
     if len(centres_mm) < FEWEST_BEADS or spread_mm[1] < 0.01 * spread_mm[0]:
@@ -33,17 +33,18 @@ def bead_centres_mm(phantom: EllipsoidPhantom) -> np.ndarray:
 
 
 def placements(phantom: EllipsoidPhantom, volume: np.ndarray, grid: Grid) -> list[np.ndarray]:
-    """Returns placements (6,): turns (rotation vectors, rad) and shifts (mm), which take most of the known beads to bright
-    spots of a volume (z, y, x), the best first. InputError where none does."""
+    """Returns placements (6,), the best first, which take most of the known beads to bright spots of a volume (z, y, x).
+
+    A placement is a turn (rotation vector, rad) and a shift (mm). Raises InputError where none does."""
     beads_mm = bead_centres_mm(phantom)
     radius_mm = np.median([body.reach_mm for body in phantom.ellipsoids if isinstance(body, Ellipsoid)])
     smooth = gaussian_filter(volume, _SMOOTH * radius_mm / np.array(grid.voxel_size_mm))
     spots_mm = _peaks_mm(smooth, grid, int(_PEAKS_PER_BEAD * len(beads_mm)) + FEWEST_BEADS)
     within_mm = _TOLERANCE_VOXELS * max(grid.voxel_size_mm)
-    matches: list[tuple[int, float, np.ndarray]] = []  # beads found (negative), mean distance, placement
+    matches: list[tuple[int, float, np.ndarray]] = []  # number of beads found (negative), mean distance, placement
     for three, corners in _matching_triangles(beads_mm, spots_mm, within_mm):
         place = _rigid(beads_mm[list(three)], spots_mm[corners])
-        for _ in range(2):  # from three beads, then from all near ones
+        for _ in range(2):  # first from three beads, then from all beads that are near
             apart_mm = np.linalg.norm(_moved(place, beads_mm)[:, None] - spots_mm, axis=-1)
             near = apart_mm.min(1) < within_mm
             if near.sum() < 3:
@@ -66,7 +67,7 @@ def placements(phantom: EllipsoidPhantom, volume: np.ndarray, grid: Grid) -> lis
 
 
 def _peaks_mm(volume: np.ndarray, grid: Grid, most: int) -> np.ndarray:
-    """Returns bright spots (m, 3) of a volume (z, y, x), as x, y, z in mm: the centroids about the largest local maxima."""
+    """Returns the bright spots (m, 3), x y z in mm, of a volume (z, y, x): the centroids about its largest local maxima."""
     inner = np.zeros(volume.shape, bool)
     inner[1:-1, 1:-1, 1:-1] = True
     peaks = np.argwhere((volume == maximum_filter(volume, 3)) & inner & (volume > 0))
@@ -84,7 +85,7 @@ def _peaks_mm(volume: np.ndarray, grid: Grid, most: int) -> np.ndarray:
 def _matching_triangles(
     beads_mm: np.ndarray, spots_mm: np.ndarray, within_mm: float
 ) -> Iterator[tuple[tuple[int, int, int], list[int]]]:
-    """Yields triangles of known points (n, 3) with triangles of seen ones (m, 3) whose sides are as long."""
+    """Yields triangles of known points (n, 3) with triangles of seen points (m, 3) that have the same sides."""
     rng = np.random.default_rng(0)
     apart = np.linalg.norm(spots_mm[:, None] - spots_mm, axis=-1)
     for _ in range(_TRIANGLES):

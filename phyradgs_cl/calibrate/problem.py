@@ -23,16 +23,17 @@ from phyradgs_cl.reconstructors.voxels.priors import axis_weights
 from phyradgs_cl.reconstructors.voxels.system import System
 from phyradgs_cl.runtime import Runtime
 
-_MOST_TIMES = 8  # per exposure
-_VOXELS_PER_TIME = 2.0  # by which the volume's edge moves between two
+_MOST_TIMES = 8  # times per exposure
+_VOXELS_PER_TIME = 2.0  # how far the volume's edge moves between two times
 _TV = FistaTvOptions(tv_weight=0.0005, tv_iterations=8)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class CoarseFrames:
-    """``scans`` as stated, with at most 60 frames each and no pixels; measured (F, rows, columns): the frames of all of them
-    in blocks of ``block`` pixels, with their ``valid`` pixels (None: all). ``count_pass`` is called once per iteration, each
-    of which passes through the frames forward and back."""
+    """``scans`` as stated, without pixels and with at most 60 frames each, and what was measured.
+
+    measured (F, rows, columns): all frames in blocks of ``block`` pixels; valid: their valid pixels, None for all.
+    ``count_pass`` is called once per iteration, in which the frames are passed forward and back."""
 
     scans: Sequence[Scan]
     block: int
@@ -46,13 +47,13 @@ class CoarseFrames:
 
 
 def measured_blocks(small: Sequence[Scan]) -> tuple[np.ndarray, np.ndarray | None]:
-    """Returns the frames (F, rows, columns) of all binned scans, and their valid pixels (None: all)."""
+    """Returns the frames (F, rows, columns) of all binned scans, and their valid pixels (None for all)."""
     valid = np.concatenate([scan.valid for scan in small])
     return np.concatenate([np.asarray(scan.projections, np.float32) for scan in small]), None if valid.all() else valid
 
 
 def without_pixels(scan: Scan) -> Scan:
-    """Returns the scan with zeros that take no memory for its frames."""
+    """Returns the scan with frames of zeros that take no memory."""
     return replace(scan, projections=np.broadcast_to(np.float32(0), scan.projections.shape))
 
 
@@ -83,7 +84,7 @@ class CoarseProblem(CoarseFrames):
         return replace(problem, measured=problem.masked(measured))
 
     def operator(self, correction: GeometryCorrection, views: Views | Sway | None = None) -> RayOperator:
-        """Returns A of all frames after a correction."""
+        """Returns the operator A of all frames after a correction."""
         tables = []
         for scan in self.scans:
             small = coarse.binned(perturb(scan, correction, views), self.block)
@@ -93,8 +94,8 @@ class CoarseProblem(CoarseFrames):
         return RayOperator(self.rt, self.grid, small.geometry.detector_shape, tables, fewest_lines=FEWEST_LINES)
 
     def line_integrals(self, operator: RayOperator, volume: np.ndarray) -> np.ndarray:
-        """Returns the measurement as mean line integrals. A detector that averages intensity lowers them at edges; the
-        difference is added as ``volume`` has it."""
+        """Returns the measurement as mean line integrals. A detector that averages intensity lowers line integrals at edges;
+        the difference is added as it is for ``volume``."""
         if self.scans[0].detector_model != "intensity":
             return self.measured
         return self.measured + self.masked(operator.forward(volume) - self._expected(operator, volume))
@@ -125,7 +126,7 @@ class CoarseProblem(CoarseFrames):
         return self.measured - self.masked(self._expected(operator, volume))
 
     def noise(self, residual: np.ndarray) -> float:
-        """Returns the standard deviation of a pixel's noise; not from ``residual``, because a volume fits some noise."""
+        """Returns the standard deviation of a pixel's noise. A volume fits some noise, so ``residual`` is not used."""
         return noise_level(self.measured, self.valid)
 
     def beyond_object(
@@ -145,8 +146,9 @@ class CoarseProblem(CoarseFrames):
 
 
 def _smoothing_px(scan: Scan, block: int) -> float | tuple[float, float]:
-    """Returns the smoothing of blocks, across rows and columns. Rows read one after the other see the object turned:
-    smoothing across them would look like a shorter readout. Columns read so are sheared, which smoothing keeps."""
+    """Returns the smoothing of blocks across rows and columns, in pixels. Rows read one after the other see the object
+    turned: smoothing across them would look like a shorter readout. Columns read so are sheared, which smoothing does not
+    change."""
     if block == 1:
         return 0.0
     is_rolling = scan.shutter.readout_s > 0 and scan.shutter.axis == "rows"

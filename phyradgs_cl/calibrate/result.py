@@ -14,14 +14,16 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 CORRECTED, AGREES, CANNOT_TELL = "corrected", "agrees", "cannot tell"
-_FRAMES = 4  # of the figure
+_FRAMES = 4  # frames in the figure
 _ROW_INCH, _CURVES_INCH, _WIDTH_INCH = 1.8, 2.4, 7.0
 
 
 @dataclass(frozen=True)
 class ParameterEstimate:
-    """One parameter in ``unit``: stated, and found with its standard deviation (both None where the frames do not determine
-    it). ``share``: what remains of its signal after object and other parameters have adapted, 0 to 1."""
+    """One parameter in ``unit``: its stated value, and the value found with its standard deviation.
+
+    These two are None where the frames do not determine the parameter. ``share``: the part of its signal that remains after
+    object and other parameters have adapted, 0 to 1."""
 
     name: str
     unit: str
@@ -38,12 +40,16 @@ class ParameterEstimate:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Calibration:
-    """The corrected ``scan``, everything else unchanged. parameters: an estimate each. alike: combinations of parameters
-    that the frames do not distinguish from another object, in words. residual_rms: of the frames before and after, in line
-    integrals, on the finest grid. before, after: those residuals (F, rows, columns). views: corrections per view, or the
-    object's motion, where they were significant; the table has the root mean square of each kind, with the deviation of one.
+    """The corrected ``scan``, in which everything else is unchanged, and how it was found.
 
-    Lengths are in mm, angles in degrees, times in s. ``calibrate`` returns it, or raises InputError."""
+    - parameters: an estimate each. alike: combinations of parameters, in words, that the frames do not distinguish from
+      another object.
+    - residual_rms: of the frames before and after, in line integrals, on the finest grid. before, after: these residuals
+      (F, rows, columns).
+    - views: corrections per view, or the object's motion, where they were significant. The table has the root mean square of
+      each kind, with the deviation of one.
+
+    Lengths are in mm, angles in degrees, times in s. ``calibrate`` returns a Calibration, or raises InputError."""
 
     scan: Scan
     parameters: list[ParameterEstimate]
@@ -74,10 +80,10 @@ class Calibration:
         }
 
     def per_view(self) -> dict[str, np.ndarray]:
-        """Returns the corrections of every view, (F,) by name and unit; empty without any.
+        """Returns the corrections of every view, (F,) by name and unit. Without corrections it is empty.
 
-        A wobble: additions to the stated poses. Source and panel turn counterclockwise as seen from above, the panel moves
-        along its own v and u. A motion: the object's position in the middle of each view, turned about x, y and z and then
+        A wobble is added to the stated poses: source and panel turn counterclockwise as seen from above, and the panel moves
+        along its own v and u. A motion is the object's position in the middle of each view: turned about x, y and z, then
         moved along them."""
         if self.views is None:
             return {}
@@ -88,11 +94,13 @@ class Calibration:
             six = self.views.at(np.asarray(self.scan.frame_start_s) + self.scan.shutter.middle_s).T
             curves = {f"turn_{axis}_deg": np.rad2deg(values) for axis, values in zip("xyz", six[:3], strict=True)}
             curves |= {f"shift_{axis}_mm": values for axis, values in zip("xyz", six[3:], strict=True)}
-        return {name: values for name, values in curves.items() if values.any()}  # 0: a kind without a correction
+        return {name: values for name, values in curves.items() if values.any()}  # a kind without a correction has zeros
 
     def plot(self) -> "Figure":
-        """Returns a figure: residuals of four frames, before on the left and after on the right, on one scale; below, the
-        corrections per view, where there are any. Red: more than the volume explains; blue: less."""
+        """Returns a figure of the residuals of four frames, before on the left and after on the right, on one scale.
+
+        Below are the corrections per view, where there are any. Red: the frame has more than the volume explains; blue:
+        less."""
         frames = np.unique(np.linspace(0, len(self.before) - 1, _FRAMES).round().astype(int))
         curves = self.per_view()
         heights = [_ROW_INCH] * len(frames)

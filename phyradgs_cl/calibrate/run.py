@@ -1,9 +1,9 @@
 """Calibrates a scan from its own frames.
 
-It starts from the axis that fits best and, for a known phantom, from the place where its beads are seen. On request it tests
-the readout's direction, and corrects single views or a motion first. The search (``search``) then estimates the parameters
-common to all views, from coarse to fine grids. Views or the motion are estimated again after that. Significant corrections
-enter the scan and its provenance; without views, only if they lower the residual."""
+It starts from the axis that fits best and, for a known phantom, from the place where its beads are seen. On request it
+tests the readout's direction, and corrects single views or a motion first. The search (``search``) then estimates the
+parameters common to all views, from coarse to fine grids. After that, views or the motion are estimated again. Significant
+corrections enter the scan and its provenance. Without corrected views, they do so only if they lower the residual."""
 
 import logging
 from collections.abc import Callable, Sequence
@@ -28,13 +28,19 @@ from phyradgs_cl.calibrate.parameters import (
     correction_of,
     requested,
 )
-from phyradgs_cl.calibrate.per_view import MotionParameters, PerViewParameters, WobbleParameters
+from phyradgs_cl.calibrate.per_view import (
+    MotionParameters,
+    PerViewParameters,
+    ViewsEstimate,
+    WobbleParameters,
+    estimate_views,
+    passes_of_views,
+)
 from phyradgs_cl.calibrate.placing import WRONG_PHANTOM, bead_centres_mm, placements
 from phyradgs_cl.calibrate.problem import CoarseProblem
 from phyradgs_cl.calibrate.result import AGREES, CANNOT_TELL, CORRECTED, Calibration, ParameterEstimate, rms
 from phyradgs_cl.calibrate.search import Fallback, Problem, Search
 from phyradgs_cl.calibrate.stages import PassCounter, Passes, Report, Stage, pass_cost
-from phyradgs_cl.calibrate.views import ViewsEstimate, estimate_views, passes_of_views
 from phyradgs_cl.check import SUSPICIOUS
 from phyradgs_cl.check.coverage import CUT_OFF, check_coverage
 from phyradgs_cl.check.hypotheses import has_axis_near_edge
@@ -55,7 +61,7 @@ STAGES = (
 )
 BEAD_STAGES = (Stage(48, first=8, again=4, steps=6, project=0), Stage(128, first=6, again=4, steps=6, project=0))
 _FEWEST_FRAMES, _FEWEST_COLUMNS = 8, 12
-_FEWEST_SPLINES = 4  # of a cubic spline
+_FEWEST_SPLINES = 4  # splines of a wobble: a cubic spline needs four
 _LEAST_EXPLAINED = 0.3  # of the frames' variance, by a phantom in its best place before any correction
 _ORDER_ERRORS, _ORDER_RATIO = 4.0, 1.04  # of the other readout direction's residual, as in ``check``
 _BEYOND = 1e6  # frames that an encoder table goes on for: first steps of the search may be very wrong
@@ -69,12 +75,13 @@ def calibrate(
 ) -> Calibration:
     """Estimates a scan's true geometry and timing, as far as its frames determine them.
 
-    what: parameters with commas, None the usual ones. others: more scans of the same object in the same place, with the same
-    errors. phantom: the object, in any place, if its shape is known. splines: of time, for a wobble; 0: every view by
-    itself. note: takes a line with the estimates so far after each grid.
+    - what: parameters separated by commas. None takes the usual ones.
+    - others: more scans of the same object in the same place, with the same errors.
+    - phantom: the object, in any place, if its shape is known.
+    - splines: a wobble's number of splines of time; 0 takes every view by itself.
+    - note: takes a line with the estimates so far after each grid.
 
-    InputError for unknown parameters, a scan too small, others that do not fit the first, a phantom that the frames do not
-    show."""
+    Raises InputError for unknown parameters, a scan too small, others that do not fit the first, and a phantom not seen."""
     request = requested(what, scan, phantom is not None)
     ready = [
         without_lag(replace(one, trajectory=continued(one.trajectory, _BEYOND * one.shutter.span_s)))
@@ -102,7 +109,7 @@ class _Calibrator:
         self.placement = np.zeros(0)
         self.stated = self.ready  # ``ready`` may get the other readout direction
         stages = {one.block(self.scan): one for one in reversed(STAGES if self.phantom is None else BEAD_STAGES)}
-        self.stages = list(stages.values())[::-1]  # of a small panel several have the same blocks
+        self.stages = list(stages.values())[::-1]  # on a small panel several stages have the same blocks
         self.per_view: PerViewParameters | None = None
         if self.request.per_view == WOBBLE:
             self.per_view = WobbleParameters.of(self.ready[0], self.splines)
@@ -136,11 +143,11 @@ class _Calibrator:
         before = self._residual(as_stated, self.stages[-1], GeometryCorrection())
         after = self._residual(problem, self.stages[-1], correction, views)
         held = {name: value for name, value in corrections.items() if name in self.search.held}
-        before_rest = before  # fits judge the rest, from where the held ones are
+        before_rest = before  # the residual of the rest is compared at the values of the held parameters
         if held:
             known = correction_of(held)
             before_rest = after if held == corrections else self._residual(as_stated, self.stages[-1], known)
-        if views is None and rms(after) > rms(before_rest):  # a correction that explains the frames worse is none
+        if views is None and rms(after) > rms(before_rest):  # a correction that explains the frames worse is not applied
             corrections, correction, after = held, correction_of(held), before_rest
             self.search.keep_held()
         table += self.search.table(self.scan, corrections) + views_table
@@ -151,11 +158,11 @@ class _Calibrator:
         return replace(calibration, scan=_with_provenance(corrected, self.scan, calibration))
 
     def _start_from_axis(self) -> None:
-        """Starts from the offset that ``check`` finds, because steps lead there from a few pixels away only.
+        """Starts from the offset that ``check`` finds, because steps reach it from a distance of a few pixels only.
 
-        In half a turn of nearly parallel rays a volume explains most of what an offset changes, so the search cannot
-        determine it. ``check``'s answer then stands. It stands as well where the panel sees few rays twice, because a shift
-        that leaves fewer of them fits better whatever is true."""
+        In half a turn of nearly parallel rays, a volume explains most of what an offset changes. The search cannot determine
+        the offset there, so ``check``'s answer stands. It stands as well where the panel sees few rays twice: a shift that
+        leaves fewer of them fits better whatever is true."""
         if self.phantom is None and has_axis_near_edge(self.ready[0]):
             self.search.held = (OFFSET_U,)
         quick, pitch_mm = coarse(self.ready[0], QUICK_COLUMNS), self.scan.geometry.pixel_size_mm[1]
@@ -168,8 +175,8 @@ class _Calibrator:
             self.search.fallback = {OFFSET_U: Fallback(shift.pixels * pitch_mm, shift.deviation * pitch_mm, is_significant)}
 
     def _search_common(self) -> None:
-        """Searches the parameters common to all views, in a scan whose views are corrected first: errors of single
-        views would look like a roll."""
+        """Searches the parameters common to all views, in a scan whose views are corrected first. Their errors would look
+        like a roll."""
         steady = self.ready
         if self.per_view is not None:
             self.passes.begin("views before", "views, before the rest")
@@ -184,8 +191,8 @@ class _Calibrator:
             self.passes.plan |= self._plan_of_stages(len(self.search.determined), number + 1)
 
     def _with_steady_views(self, scan: Scan) -> Scan:
-        """Returns the scan with its views corrected. A shift along u common to all views is the panel's offset, where that
-        is a parameter."""
+        """Returns the scan with its views corrected. A common shift along u counts as the panel's offset, if that is a
+        parameter."""
         views = self._estimate_views(correction_of(self.search.at)).views
         if isinstance(views, Views) and OFFSET_U in self.search.at:
             common_mm = float(views.shift_mm[:, 1].mean())
@@ -194,7 +201,7 @@ class _Calibrator:
         return scan if views is None else perturb(scan, GeometryCorrection(), views)
 
     def _estimate_views(self, correction: GeometryCorrection) -> ViewsEstimate:
-        """Returns the views' estimate after a correction, once for each correction."""
+        """Returns the views' estimate after a correction. It is made once for each correction."""
         assert self.per_view is not None
         if correction not in self.views_estimates:
             self.views_estimates[correction] = estimate_views(
@@ -203,7 +210,7 @@ class _Calibrator:
         return self.views_estimates[correction]
 
     def _problem(self, scans: Sequence[Scan], stage: Stage, most_frames: int = MOST_FRAMES) -> Problem:
-        """Returns the frames on the grid of a stage, whose passes are counted."""
+        """Returns the frames on the grid of a stage. The passes through them are counted."""
         problem: Problem
         if self.phantom is None:
             problem = CoarseProblem.of(self.rt, scans, stage, most_frames)
@@ -212,7 +219,7 @@ class _Calibrator:
         return replace(problem, count_pass=self.passes.counter(pass_cost(scans, stage.columns, most_frames)))
 
     def _place(self, phantom: EllipsoidPhantom) -> np.ndarray:
-        """Returns a first placement (7,): of the places where its beads are seen, the one that explains the frames best."""
+        """Returns a first placement (7,) of the phantom: the one of those seen that explains the frames best."""
         bead_centres_mm(phantom)
         correction = correction_of(self.search.at)
         voxels = CoarseProblem.of(self.rt, self.ready, STAGES[-1])
@@ -230,8 +237,9 @@ class _Calibrator:
         return placement
 
     def _test_direction(self) -> list[ParameterEstimate]:
-        """Compares the residuals with lines read from either end, and corrects the scans' direction. It takes four standard
-        errors and 4 %; the deviation is that of a direction between 1 and −1."""
+        """Compares the residuals with lines read from either end, and corrects the scans' direction.
+
+        A correction takes four standard errors and 4 %. The deviation is that of a direction between 1 and −1."""
         self.passes.begin("order", "which line is read first")
         stage = self.stages[min(1, len(self.stages) - 1)]
         reverse = [reversed_readout(scan) for scan in self.ready]
@@ -255,7 +263,7 @@ class _Calibrator:
         return problem.residual(operator, problem.reconstruct(operator, None, stage.first))
 
     def _plan(self) -> dict[str, Passes]:
-        """Returns the most passes through the frames of all phases, in order."""
+        """Returns the most passes through the frames that each phase may need, in order."""
         second, last = self.stages[min(1, len(self.stages) - 1)], self.stages[-1]
         parameters, views, most_frames = len(self.request.parameters), (0, 0.0), MOST_FRAMES
         if self.per_view is not None:
@@ -299,7 +307,7 @@ def _with_provenance(corrected: Scan, scan: Scan, calibration: Calibration) -> S
 
 
 def _check(scans: Sequence[Scan], request: Request, phantom: EllipsoidPhantom | None, splines: int) -> None:
-    """Raises InputError for options that exclude each other, a scan too small, and others that do not fit the first."""
+    """Raises InputError for options that exclude each other, a scan too small, and others that do not fit the first scan."""
     first, per_view = scans[0], request.per_view
     if splines and per_view != WOBBLE:
         raise InputError("--splines", str(splines), f"with --what {WOBBLE}", f"leave it out, or ask for {WOBBLE}")

@@ -7,17 +7,18 @@ from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.checks import ceil_div
 
 Report = Callable[[int, int, str, float], None]
-"""Takes passes done, passes in all, the phase, and the share of the time that has passed."""
-_LEAST_SHARE = 0.1  # of the most passes to come, which are expected where a phase takes longer than expected
+"""Takes the passes done, the passes in all, the phase, and the share of the time that has passed."""
+_LEAST_SHARE = 0.1  # passes still expected, over the most, where a phase takes longer than expected
 Passes = tuple[int, float]
-"""The most passes to come, and the cost that they are expected to have together."""
+"""The most passes to come, and the cost that all passes are expected to have together."""
 
 
 @dataclass(frozen=True)
 class Stage:
-    """One of the grids, from coarse to fine: at most ``columns`` blocks along the panel's longer side, and iterations of a
-    ``first`` volume and of one made ``again``. ``steps`` Gauss–Newton steps at most, with ``project`` iterations each to
-    remove the part of a signal that a volume explains."""
+    """One of the grids, from coarse to fine: at most ``columns`` blocks along the panel's longer side.
+
+    ``first``, ``again``: iterations of a first volume and of a later one. ``steps``: the most Gauss–Newton steps.
+    ``project``: iterations in each step that remove the part of a signal that a volume explains."""
 
     columns: int
     first: int
@@ -30,12 +31,12 @@ class Stage:
         return ceil_div(max(scan.geometry.detector_shape), self.columns)
 
     def passes(self, parameters: int, asks: bool) -> int:
-        """Returns the most passes through the frames; ``asks``: it is tested which parameters the frames determine."""
+        """Returns the most passes through the frames. ``asks``: the stage tests which parameters the frames determine."""
         return self.first - self.again + self.steps * (self.again + self.project * (parameters + (3 if asks else 1)))
 
 
 def pass_cost(scans: Sequence[Scan], columns: int, most_frames: int) -> float:
-    """Returns the cost of one pass with at most ``columns``: in proportion to rays times voxels along a ray."""
+    """Returns the cost of one pass with at most ``columns``. It is proportional to rays times voxels along a ray."""
     shape = scans[0].geometry.detector_shape
     rows, across = (ceil_div(n, ceil_div(max(shape), columns)) for n in shape)
     return float(sum(min(scan.frames, most_frames) for scan in scans) * rows * across * max(rows, across))
@@ -49,10 +50,10 @@ class PassCounter:
         self.plan = dict(plan)
         self._report = report
         self._done, self._spent, self._text = 0, 0.0, ""
-        self._current: Passes = (0, 0.0)  # those that remain in this phase
+        self._current: Passes = (0, 0.0)  # passes that remain in this phase
 
     def begin(self, phase: str, text: str) -> None:
-        """Begins a phase; the plan's earlier phases are over."""
+        """Begins a phase. The plan's earlier phases are over."""
         while phase in self.plan and next(iter(self.plan)) != phase:
             self.plan.pop(next(iter(self.plan)))
         self._text, self._current = text, self.plan.pop(phase, (0, 0.0))

@@ -1,4 +1,4 @@
-"""What is wrong or suspicious in a scan, before a reconstruction: questions by subject, asked in order by ``run``."""
+"""Finds what is wrong or suspicious in a scan before a reconstruction. ``run`` asks the questions in order, by subject."""
 
 from phyradgs_cl.check.detector import CountReader
 from phyradgs_cl.check.finding import CANNOT_TELL, OK, SUSPICIOUS, Finding

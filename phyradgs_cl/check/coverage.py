@@ -9,27 +9,27 @@ from phyradgs_cl.acquisition.geometry import field_of_view_mm
 from phyradgs_cl.check.finding import FEWEST_COLUMNS, OK, SUSPICIOUS, Finding, too_narrow
 from phyradgs_cl.detector import noise_level
 
-_LARGEST_SHARE = 0.1  # of the largest line integral
-_DISPLACED = 0.1  # of the panel's width: a panel this far off centre was displaced on purpose
+_LARGEST_SHARE = 0.1  # line integral over the largest one
+_DISPLACED = 0.1  # offset over the panel's width: a panel this far off centre was displaced on purpose
 _NOISES = 4.0
-_OPAQUE = 30.0  # line integral: nothing passes
-_INVERTED = 0.9  # of the largest value: panel sides this high are no air
-_BRIGHT = 0.05  # of the pixels may be brighter than the flats
-_FRAMES = 0.1  # of the frames may touch a border
-_COVERED = 0.1  # of a column's rows
-_ANOTHER_SIZE = 5.0  # times as wide: a grid may hold a part of an object, or be a little wider, but no more
-NO_OBJECT, OPAQUE, TOO_BRIGHT = "no object", "opaque", "too bright"  # units of findings that make line integrals meaningless
-CUT_OFF = "line integral at the border"  # unit: the object reaches beyond the panel
+_OPAQUE = 30.0  # line integral: no light passes
+_INVERTED = 0.9  # values at the panel's sides over the largest one: this high they are no air
+_BRIGHT = 0.05  # fraction of the pixels that may be brighter than the flats
+_FRAMES = 0.1  # fraction of the frames that may touch a border
+_COVERED = 0.1  # fraction of a column's rows
+_ANOTHER_SIZE = 5.0  # ratio of widths: a grid may hold a part of the object or be a little wider, but no more
+NO_OBJECT, OPAQUE, TOO_BRIGHT = "no object", "opaque", "too bright"  # units of findings without line integrals
+CUT_OFF = "line integral at the border"  # unit of a finding: the object reaches beyond the panel
 _QUESTION = "coverage"
 
 
 def check_coverage(scan: Scan) -> Finding:
     """Compares the line integrals at the panel's sides with a tenth of the largest one.
 
-    The object touches a side where the mean over a few rows of the two outermost columns is above threshold and noise in a
+    The object touches a side where the mean over a few rows of the two outermost columns is above threshold and noise, in a
     tenth of the frames. A displaced panel may cut the object on its short side. Rows at the top and bottom are not checked.
-    Other findings: no object above the noise, inverted values, line integrals beyond 30, pixels brighter than the flats, a
-    grid of another size than the object."""
+    Other findings: no object above the noise, inverted values, line integrals beyond 30, pixels brighter than the flats, and
+    a grid with another size than the object."""
     p = np.asarray(scan.projections)
     if p.shape[2] < FEWEST_COLUMNS:
         return too_narrow(_QUESTION, "line integral")
@@ -40,7 +40,7 @@ def check_coverage(scan: Scan) -> Finding:
 
 
 def _check_values(p: np.ndarray, valid: np.ndarray, largest: float, threshold: float) -> Finding | None:
-    """Returns why the values are no line integrals of an object; None where they may be."""
+    """Returns a finding where the values cannot be line integrals of an object; otherwise None."""
     noise = _NOISES * noise_level(p, valid)
     if largest <= noise:
         text = f"no object: line integrals reach {largest:.3g}, noise {noise:.3g}"
@@ -89,7 +89,7 @@ def _check_sides(scan: Scan, p: np.ndarray, valid: np.ndarray, largest: float, t
 
 
 def _width_mm(scan: Scan, p: np.ndarray, valid: np.ndarray, threshold: float) -> float:
-    """Returns the object's usual width at the axis: the columns in which a tenth of the rows is above ``threshold``."""
+    """Returns the object's usual width at the axis: columns in which a tenth of the rows is above ``threshold``."""
     geometry = scan.geometry
     columns = float(np.median((((p > threshold) & valid).mean(1) > _COVERED).sum(1)))
     if isinstance(geometry, ParallelGeometry):
@@ -111,7 +111,7 @@ def _border(p: np.ndarray, valid: np.ndarray, columns: slice) -> float:
 
 
 def _short_side(scan: Scan) -> str:
-    """Returns the side on which a displaced panel is short of the axis; "" for a centred one."""
+    """Returns the side on which a displaced panel is shorter from the axis; "" for a centred panel."""
     geometry = scan.geometry
     offset_mm = geometry.detector_offset_mm[1]
     width_mm = geometry.detector_shape[1] * geometry.pixel_size_mm[1]

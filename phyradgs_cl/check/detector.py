@@ -1,4 +1,4 @@
-"""Is the detector sound: saturated areas, dead pixels, and drift of the gain over the scan."""
+"""Is the detector sound: are there saturated areas or dead pixels, and does the gain drift over the scan?"""
 
 import math
 from dataclasses import dataclass
@@ -16,22 +16,24 @@ from phyradgs_cl.reconstructors.fits.residuals import fit
 from phyradgs_cl.runtime import Runtime
 
 GAIN = "gain drift"
-OVERFLOW = "overflow"  # unit of a finding that makes line integrals meaningless
+OVERFLOW = "overflow"  # unit of a finding without line integrals
 _SATURATION, _DEAD = "saturation", "dead pixels"
-_MOST_SATURATED = 1e-3  # of all pixels
+_MOST_SATURATED = 1e-3  # fraction of all pixels
 _REPEATS = 3  # frames in which a clipped pixel has its least value
 _ZERO = 1e-6  # line integral
-_JUMP = 0.75  # of the brightest transmission, between neighbouring pixels
-_MOST_JUMPS = 5e-4  # of all pixels
-_MOST_DEAD = 2e-4  # of all pixels
+_JUMP = 0.75  # difference between neighbouring pixels over the brightest transmission
+_MOST_JUMPS = 5e-4  # fraction of all pixels
+_MOST_DEAD = 2e-4  # fraction of all pixels
 _LARGEST_DRIFT, _DRIFT_DEVIATIONS = 0.015, 5.0
-_FEWEST_FRAMES = 8  # for a drift
+_FEWEST_FRAMES = 8  # least number of frames to see a drift
 
 
 @dataclass
 class CountReader:
-    """``counts_to_attenuation`` for ``read_scan`` that remembers the counts' range. ``ceiling``: the largest count of any
-    frame, None for files without counts. ``at_ceiling``: the fraction of the projections' pixels with that count."""
+    """``counts_to_attenuation`` for ``read_scan`` that remembers the counts' range.
+
+    ``ceiling``: the largest count of any frame, None for files without counts. ``at_ceiling``: the fraction of the
+    projections' pixels with that count."""
 
     ceiling: float | None = None
     at_ceiling: float = 0.0
@@ -47,10 +49,10 @@ class CountReader:
 
 
 def check_saturation(scan: Scan, counts: CountReader | None = None) -> Finding:
-    """Finds areas of pixels at one extreme value; more than 0.1 % of the pixels is suspicious.
+    """Finds areas of pixels at one extreme value. More than 0.1 % of the pixels is suspicious.
 
-    Only pixels whose neighbours have the same value count: noise clipped at 0 gives single pixels, saturation whole areas.
-    Areas of exactly 0 may be air, so they answer ``cannot tell``."""
+    Only pixels whose neighbours have the same value count. Noise clipped at 0 gives single pixels, saturation whole areas.
+    Areas of exactly 0 may be air, so they get the answer ``cannot tell``."""
     if counts is not None and counts.ceiling is not None and counts.at_ceiling > _MOST_SATURATED:
         return _clipped(Saturation(counts.ceiling, counts.at_ceiling), "lower the exposure, or mask these pixels")
     if scan.saturation is not None and scan.saturation.share > _MOST_SATURATED:
@@ -63,7 +65,7 @@ def check_saturation(scan: Scan, counts: CountReader | None = None) -> Finding:
         advice = "did counts overflow (65,536 becomes 0)? Read the frames as unsigned, or lower the exposure"
         return Finding(_SATURATION, SUSPICIOUS, jumps, _MOST_JUMPS, OVERFLOW, text, advice)
     lowest, highest = float(p[~masked].min()), float(p[~masked].max())
-    is_inverted = float(np.median(p[:, :, [0, -1]])) == highest  # coverage reports that air has the largest values
+    is_inverted = float(np.median(p[:, :, [0, -1]])) == highest  # ``check_coverage`` reports bright air
     at_least = clustered_share((p == lowest) & ~masked & (abs(lowest) > _ZERO))
     at_largest = 0.0
     if not is_inverted:
@@ -91,27 +93,29 @@ def _clipped(saturation: Saturation, remedy: str) -> Finding:
 
 
 def _jumps(p: np.ndarray, masked: np.ndarray) -> float:
-    """Returns the fraction of pixels (F, v, u) next to one that differs by most of the range; single dead pixels do not
+    """Returns the fraction of pixels (F, v, u) that differ from a neighbour by most of the range. Dead pixels do not
     count."""
     if p.shape[2] < 2:
         return 0.0
     transmission = np.where(masked, 1.0, np.exp(-np.clip(p, -20, 20))).astype(np.float32)
     brightest = float(np.percentile(transmission[:: max(1, len(p) // 20)], 99))
     jumps = np.abs(np.diff(median_filter(transmission, size=(1, 1, 5)), axis=2)) > _JUMP * brightest
-    return float(np.median(jumps.mean((1, 2))))  # a median: a few odd frames are for another question
+    return float(np.median(jumps.mean((1, 2))))  # the median ignores a few odd frames, which another question finds
 
 
 def _at_own_least(p: np.ndarray, masked: np.ndarray) -> float:
-    """Returns the fraction of pixels (F, v, u) that repeat their own least value: counts clipped before the flats. Pixels
-    that never change are dead, and line integrals of 0 are air in scans without noise."""
+    """Returns the fraction of pixels (F, v, u) that repeat their own least value, as counts clipped before the flats do.
+
+    Pixels that never change are dead, and line integrals of 0 are air in scans without noise. Neither counts."""
     least = p.min(0)
     at = (p == least) & ~masked & (np.abs(least) > _ZERO) & (p.max(0) > least)
     return clustered_share(at & (at.sum(0) >= _REPEATS))
 
 
 def check_dead_pixels(scan: Scan) -> tuple[Finding, np.ndarray]:
-    """Finds dead pixels that the mask does not have; more than 0.02 % is suspicious. Returns the finding and a map of them
-    (v, u), bool. A dead pixel always has the same value, or differs from its neighbours in every frame."""
+    """Finds dead pixels that the mask does not have. Returns the finding and a map of them (v, u), bool.
+
+    A dead pixel always has the same value, or differs from its neighbours in every frame. More than 0.02 % is suspicious."""
     masked = ~scan.valid.any(0)
     if scan.frames < LEAST_FRAMES:
         text = f"fewer than {LEAST_FRAMES} frames"
@@ -130,8 +134,9 @@ def check_dead_pixels(scan: Scan) -> tuple[Finding, np.ndarray]:
 
 
 def check_gain(rt: Runtime, scan: Scan) -> Finding:
-    """Fits a ramp, and a step at each frame, to the levels of the frames of a coarse ``scan``; more than 1.5 % and five
-    standard deviations is suspicious. Levels that turn with the gantry are fitted as well."""
+    """Fits a ramp, and a step at each frame, to the levels of the frames of a coarse ``scan``.
+
+    A change of more than 1.5 % and five standard deviations is suspicious. Levels may turn with the gantry."""
     if scan.frames < _FEWEST_FRAMES:
         return Finding(GAIN, CANNOT_TELL, 0.0, _LARGEST_DRIFT, "share", f"fewer than {_FEWEST_FRAMES} frames")
     level = fit(rt, scan).level
@@ -151,8 +156,9 @@ def check_gain(rt: Runtime, scan: Scan) -> Finding:
 
 
 def _fit_change(turning: np.ndarray, shape: np.ndarray, level: np.ndarray) -> tuple[float, float, float]:
-    """Fits ``level`` (F,) by ``turning`` (F, n) and ``shape`` (F,). Returns the shape's coefficient, its standard deviation
-    and the squared residual."""
+    """Fits ``level`` (F,) by ``turning`` (F, n) and ``shape`` (F,).
+
+    Returns the shape's coefficient, its standard deviation, and the squared residual."""
     design = np.column_stack([turning, shape])
     coefficients, *_ = np.linalg.lstsq(design, level, rcond=None)
     residual = level - design @ coefficients

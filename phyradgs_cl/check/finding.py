@@ -4,16 +4,16 @@ from dataclasses import asdict, dataclass
 
 OK, SUSPICIOUS, CANNOT_TELL = "ok", "suspicious", "cannot tell"
 PIXEL_SIZES = "x_pixel_size and y_pixel_size (--pixel-size-mm of import)"
-MIRROR_U, MIRROR_V = "--column-0 (left or right)", "--row-0 (top or bottom)"  # of import
-FEWEST_COLUMNS = 8  # four gave false alarms, five did not
+MIRROR_U, MIRROR_V = "--column-0 (left or right)", "--row-0 (top or bottom)"  # options of import that mirror frames
+FEWEST_COLUMNS = 8  # four columns gave false alarms, five did not
 
 
 @dataclass(frozen=True)
 class Finding:
     """The answer to one question: ``ok``, ``suspicious`` or ``cannot tell``.
 
-    value: the measured number, in ``unit``, with its standard deviation ``uncertainty`` where it is an estimate. threshold:
-    the value from which it is suspicious. text: what was found. advice: what to do about it."""
+    value: the measured number, in ``unit``. uncertainty: its standard deviation, where it is an estimate. threshold: the
+    value from which it is suspicious. text: what was found. advice: what to do about it."""
 
     question: str
     verdict: str

@@ -1,4 +1,4 @@
-"""Other statements about a scan: sizes and distances in other units, steps of the angles, lost frames, mirrored frames."""
+"""Other statements about a scan: other units of sizes, other steps of the angles, lost frames, mirrored frames."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
@@ -16,19 +16,20 @@ from phyradgs_cl.fields import Grid
 from phyradgs_cl.reconstructors.fits import axis
 
 SIZE_FACTORS = (10.0, 0.1, 1e3, 1e-3)
-LEAST_REDUNDANCY = 0.5  # of the columns: with fewer rays measured twice, frames fit any size
+LEAST_REDUNDANCY = 0.5  # fraction of the columns: with fewer rays measured twice, frames fit any size
 _UNITS = {10.0: " (in cm, read as mm?)", 1e3: " (in m, read as mm?)", 1e-3: " (in µm, read as mm?)"}
 _FANS = (0.02, 3.0)  # the panel's width over its distance from the source, in real scanners
 _GRID_FACTOR = 3.0  # a stated grid that differs more from the panel's view does not belong to the hypothesis
-_SAME_PLACE = 1.0  # coarse pixels
+_SAME_PLACE = 1.0  # in coarse pixels
 _ARC_PERCENTS = (-5, -4, -3, -2, -1, 1, 2, 3, 4, 5)
 _GAPS = 15  # places at which a missing or repeated frame is tried
 
 
 @dataclass(frozen=True, eq=False)
 class Hypothesis:
-    """Another statement about the scan: a description, what to do about it, and the scan under it. Hypotheses with the same
-    ``factor`` of sizes differ only by the panel's shift."""
+    """Another statement about the scan: a description, advice, and the scan under it.
+
+    Hypotheses with the same ``factor`` of sizes differ only by the panel's shift."""
 
     text: str
     advice: str
@@ -37,20 +38,20 @@ class Hypothesis:
 
 
 def stated_redundancy(scan: Scan) -> float:
-    """Returns the fraction of columns whose rays a full turn measures twice; negative where the stated axis misses the
-    panel."""
+    """Returns the fraction of columns whose rays a full turn measures twice. Negative: the axis misses the panel."""
     geometry = scan.geometry
     return 1 - 2 * abs(geometry.detector_offset_mm[1]) / (geometry.pixel_size_mm[1] * geometry.detector_shape[1])
 
 
 def has_axis_near_edge(scan: Scan) -> bool:
-    """Whether the panel stands so far beside the axis, which it still sees, that it sees few rays twice."""
+    """Whether the panel sees the axis but is so far off it that it sees few rays twice."""
     return 0 <= stated_redundancy(scan) < LEAST_REDUNDANCY
 
 
 def shifts_for_sense_px(scan: Scan) -> tuple[float, float]:
-    """Returns the limits of the panel's shift with which senses of rotation are compared, in pixels of the recorded scan. A
-    panel beside the axis does not go further off: rays that are measured once fit under any angles."""
+    """Returns the limits of the panel's shift, in pixels of the recorded scan, when senses of rotation are compared.
+
+    A panel beside the axis goes no further off, because rays that are measured once fit under any angles."""
     offset_mm, pitch_mm = scan.geometry.detector_offset_mm[1], scan.geometry.pixel_size_mm[1]
     if not has_axis_near_edge(scan):
         return axis.ANYWHERE
@@ -59,22 +60,22 @@ def shifts_for_sense_px(scan: Scan) -> tuple[float, float]:
 
 
 def frame_number(scan: Scan, frame: int) -> int:
-    """Returns a frame's number in the file, from 0."""
+    """Returns a frame's number in the file, counted from 0."""
     return int(variants.altered_trajectory(scan).frame_numbers(scan)[frame])
 
 
 def of_scan(scan: Scan, stated: Scan) -> Iterator[Hypothesis]:
-    """Yields hypotheses about the whole coarse ``scan``, which was made of ``stated``: sizes in another unit, frames
-    mirrored."""
+    """Yields hypotheses about the whole coarse ``scan``: sizes in another unit, mirrored frames. ``stated``: before it was
+    coarse."""
     yield from _other_units(scan, stated)
     yield from _other_images(scan, stated)
 
 
 def _other_units(scan: Scan, stated: Scan) -> Iterator[Hypothesis]:
-    """Sizes and distances enter the fan alone, as a ratio. Only the panel's offset, which is in mm, may distinguish them."""
+    """Yields sizes and distances in other units. Only their ratio enters the fan; the panel's offset may decide."""
     geometry = stated.geometry
     if isinstance(geometry, ParallelGeometry):
-        return  # sizes scale with the object
+        return  # in a parallel beam sizes scale with the object
     fan = geometry.detector_shape[1] * geometry.pixel_size_mm[1] / geometry.source_to_detector_mm
     offset_px = np.abs(np.array(geometry.detector_offset_mm) / geometry.pixel_size_mm)
     for factor in SIZE_FACTORS:
@@ -100,7 +101,7 @@ def _times(name: str, factor: float) -> str:
 
 
 def _with_sizes(scan: Scan, stated: Scan, factor: float, keeps_axis: bool) -> Scan:
-    """Returns the coarse scan with pixels ``factor`` times as large, and the grid that belongs to them."""
+    """Returns the coarse scan with pixels ``factor`` times as large, and with the grid that belongs to them."""
     v_mm, u_mm = stated.geometry.pixel_size_mm
     off_v_mm, off_u_mm = (offset * (factor if keeps_axis else 1) for offset in stated.geometry.detector_offset_mm)
     pixel_size_mm = (factor * v_mm, factor * u_mm)
@@ -112,8 +113,7 @@ def _with_sizes(scan: Scan, stated: Scan, factor: float, keeps_axis: bool) -> Sc
 
 
 def _matching_grid(stated: Scan, panel_grid: Grid) -> Grid:
-    """Returns the stated grid, or the one of the panel's view where the stated one has another size or was derived from the
-    wrong panel."""
+    """Returns the stated grid. If that has another size or came from the wrong panel, returns the panel's."""
     ratio = max(stated.grid.size_mm) / max(panel_grid.size_mm)
     is_derived = stated.grid == default_grid(stated.geometry)
     return panel_grid if is_derived or not 1 / _GRID_FACTOR < ratio < _GRID_FACTOR else stated.grid
@@ -131,8 +131,7 @@ def _other_images(scan: Scan, stated: Scan) -> Iterator[Hypothesis]:
 
 
 def of_frames(scan: Scan, shifted_scan: Scan, tries_orders: bool) -> Iterator[Hypothesis]:
-    """Yields other angle steps, exchanged pixel sizes (with the panel shifted) and, with ``tries_orders``, missing or
-    repeated frames."""
+    """Yields other angle steps, exchanged pixel sizes and, with ``tries_orders``, missing or repeated frames."""
     yield from _other_steps(scan)
     yield from _exchanged_sizes(shifted_scan)
     if tries_orders:
@@ -140,7 +139,7 @@ def of_frames(scan: Scan, shifted_scan: Scan, tries_orders: bool) -> Iterator[Hy
 
 
 def _azimuths(scan: Scan) -> np.ndarray:
-    """Returns each frame's angle from the first one's (F,): as stated, turns included, where the trajectory has angles."""
+    """Returns each frame's angle (F,) from the first one's. A trajectory's own angles keep their turns."""
     trajectory = variants.altered_trajectory(scan)
     angle_rad = getattr(trajectory.base, "angle_rad", None)
     if angle_rad is None:
@@ -188,7 +187,7 @@ def nearly_sized(scan: Scan, factor: float) -> Scan:
 
 
 def _missing_frames(scan: Scan) -> Iterator[Hypothesis]:
-    """A missing or a repeated frame at fifteen places, later frames being one step further or less far."""
+    """Yields a missing or a repeated frame at fifteen places. Later frames are then one step further or less far."""
     sense = -1.0 if variants.altered_trajectory(scan).is_reversed else 1.0
     step = float(np.median(wrapped(np.diff(_azimuths(scan))))) * sense
     for at in np.unique(np.linspace(1, scan.frames - 1, _GAPS).round().astype(int)):

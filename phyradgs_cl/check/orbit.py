@@ -40,7 +40,7 @@ _ERRORS = 4.0  # standard errors between two hypotheses
 _SIGN_RATIO, _CLEAR_RATIO = 1.2, 3.0
 _TOLERATED_PX = 1 / 3
 _DEVIATIONS = 4.0
-_BIAS_FULL_TURN, _BIAS_HALF_TURN = 0.003, 0.04  # coarse pixels: measured errors of the axis in coarse scans
+_BIAS_FULL_TURN, _BIAS_HALF_TURN = 0.003, 0.04  # in coarse pixels: measured errors of the axis in coarse scans
 _WHOLE_PIXELS = 2  # blocks by which a shift from whole pixels is judged
 _LEAST_REDUNDANCY = 0.1  # of a panel that sees the axis at its edge
 _NO_SIGN = "parallel rays show an object that turns one way and its mirror image that turns the other way alike"
@@ -50,7 +50,7 @@ _OTHER_SIZES, _SIZE_RATIO = (0.8, 1.25), 1.05
 
 @dataclass(frozen=True, eq=False)
 class Orbit:
-    """Whether the gantry turns the other way, the panel's shift along u, and the findings about the two."""
+    """Whether the gantry turns the other way, the panel's shift along u, and the findings about both."""
 
     sign: Finding
     centre: Finding
@@ -58,14 +58,14 @@ class Orbit:
     is_reversed: bool = False
 
     def corrected(self, scan: Scan) -> Scan:
-        """Returns a coarse scan with its sense of rotation corrected, and its panel shifted where that is significant."""
+        """Returns a coarse scan with its sense of rotation corrected, and its panel shifted if that is significant."""
         scan = reversed_rotation(scan) if self.is_reversed else scan
         is_shifted = self.shift.is_found and abs(self.shift.pixels) > self.centre.threshold
         return shifted(scan, self.shift.pixels) if is_shifted else scan
 
 
 def find_orbit(rt: Runtime, quick: Scan, as_stated: Scan, sees_angles: bool) -> Orbit:
-    """Answers the questions of the sense of rotation and of the axis, from a coarse scan; few columns decide neither."""
+    """Answers from a coarse scan which way the gantry turns and where the axis is. Few columns decide neither."""
     if quick.geometry.detector_shape[1] < FEWEST_COLUMNS:
         return Orbit(too_narrow(SIGN, "standard errors"), too_narrow(CENTRE, "pixels"))
     if not sees_angles:
@@ -78,7 +78,7 @@ def find_orbit(rt: Runtime, quick: Scan, as_stated: Scan, sees_angles: bool) -> 
     reverse, limits_px = reversed_rotation(quick), shifts_for_sense_px(quick)
     stated, other = (axis.rough_shift(rt, sense, limits_px) for sense in (quick, reverse))
     ratio = residual_ratio(stated.squares, other.squares)
-    is_rough = max(ratio, 1 / max(ratio, 1e-30)) >= _CLEAR_RATIO  # the other sense needs no closer look
+    is_rough = max(ratio, 1 / max(ratio, 1e-30)) >= _CLEAR_RATIO  # such a clear answer needs no closer look
     if not is_rough:
         stated = axis.refined_shift(rt, quick, stated, limits_px)
         other = axis.refined_shift(rt, reverse, other, limits_px)
@@ -98,8 +98,8 @@ def find_orbit(rt: Runtime, quick: Scan, as_stated: Scan, sees_angles: bool) -> 
 def check_rotation(stated: axis.AxisShift, other: axis.AxisShift) -> Finding:
     """Compares the residuals with the angles as stated and reversed, each with its own best shift of the panel.
 
-    It takes four standard errors and 20 % of the squared residual, because a mirror image in a narrow fan fits as well.
-    Frames mirrored in u fit reversed angles and the opposite offset: ``with_cause`` decides between the two."""
+    A reversal takes four standard errors and 20 % of the squared residual, because a mirror image in a narrow fan fits as
+    well. Frames mirrored in u fit reversed angles and the opposite offset; ``with_cause`` decides between the two."""
     errors, ratio = t_statistic(stated.squares, other.squares), residual_ratio(stated.squares, other.squares)
     text = f"turned the other way, the squared residual is {ratio:.3g} times as large ({errors:+.1f} standard errors)"
     values = (errors, -_ERRORS, "standard errors", text)
@@ -111,7 +111,7 @@ def check_rotation(stated: axis.AxisShift, other: axis.AxisShift) -> Finding:
 
 
 def with_cause(finding: Finding, shift_px: float, stated_px: float, tolerance_px: float) -> Finding:
-    """Adds the cause to a suspicious sign of rotation: reversed angles, or frames mirrored in u.
+    """Adds the cause to a suspicious sense of rotation: reversed angles, or frames mirrored in u.
 
     Frames are mirrored where the best panel offset under reversed angles (stated_px + shift_px) is nearer to the opposite of
     the stated one than to it. A stated offset below the tolerance does not decide."""
@@ -128,12 +128,12 @@ def with_cause(finding: Finding, shift_px: float, stated_px: float, tolerance_px
 
 
 def centre_of(shift: axis.AxisShift, block: int, scan: Scan) -> tuple[axis.AxisShift, Finding]:
-    """Returns a shift found with blocks of ``block`` pixels, and the finding about it.
+    """Returns the panel's shift and the finding about it. ``shift``: found with blocks of ``block`` pixels.
 
-    The error of coarse pixels is added to its deviation, because the bootstrap over frames does not include it. It is
-    larger where ``scan`` measures fewer rays twice. Where these are less than half, a shift that leaves fewer of them fits
-    better anyway: then they alone decide, or nothing does. Opposite views of parallel rays give the shift as well, from
-    whole pixels: the answer with the smaller deviation counts."""
+    The error of coarse pixels is added to its deviation, because the bootstrap over frames does not include it. That error
+    is larger where ``scan`` measures fewer rays twice. Where less than half are measured twice, a shift that leaves fewer of
+    them fits better anyway. Opposite views of parallel rays give the shift as well, from whole pixels. The answer with the
+    smaller deviation counts; where few rays are measured twice, opposite views alone decide, or nothing does."""
     pitch_mm = scan.geometry.pixel_size_mm[1]
     if has_axis_near_edge(scan):
         shift = shift_by_rays_seen_twice(scan)
@@ -178,8 +178,8 @@ def check_centre(shift: axis.AxisShift, block: int, pitch_mm: float, stated_px: 
 def check_distances(rt: Runtime, scan: Scan) -> Finding:
     """Fits a coarse scan with its fan 0.8 and 1.25 times as wide, each with its own best shift of the panel.
 
-    Only the fan distinguishes these: the answer is ``ok`` where both fit worse, else ``cannot tell``. Sizes that fit far
-    better make the frames inconsistent, which is another question's finding."""
+    Only the fan distinguishes these. The answer is ``ok`` where both fit worse, otherwise ``cannot tell``. Sizes that fit
+    far better make the frames inconsistent, which another question finds."""
     stated = fit_squares(rt, scan)
     others = {factor: fit_squares(rt, axis.with_best_shift(rt, nearly_sized(scan, factor))) for factor in _OTHER_SIZES}
     ratios = {factor: residual_ratio(stated, other) for factor, other in others.items()}

@@ -1,4 +1,4 @@
-"""All questions in an order in which each rests on the ones before: each error found is corrected for the next question."""
+"""Asks all questions in an order in which each rests on those before. Errors found are corrected for the next."""
 
 import math
 from collections.abc import Callable
@@ -22,16 +22,18 @@ from phyradgs_cl.detector import without_lag
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.runtime import Runtime
 
-_SPARE_COLUMNS = 2.0  # coarse ones, by which a stated offset may be wrong and the object still fits into the grid
+_SPARE_COLUMNS = 2.0  # coarse columns by which a stated offset may be wrong and the object still fits into the grid
 Report = Callable[[int, int, str], None]
-"""Takes how many questions are answered, how many there are, and the next one."""
+"""Takes the number of answered questions, the number of all, and the next question."""
 
 
 @dataclass(frozen=True, eq=False)
 class CheckResult:
-    """The findings in order. ``offset_mm``: the shift of the panel along u that explains the frames best, with its standard
-    deviation ``offset_spread_mm``; NaN where none does, or where something else has to be corrected first (then
-    ``is_consistent`` is false)."""
+    """The findings in order.
+
+    ``offset_mm``: the shift of the panel along u that explains the frames best, with its standard deviation
+    ``offset_spread_mm``. Both are NaN where no shift does, or where something else has to be corrected first. In that case
+    ``is_consistent`` is false."""
 
     findings: list[Finding]
     offset_mm: float = math.nan
@@ -44,7 +46,7 @@ class CheckResult:
 
 
 class _Answers:
-    """Collects the findings and reports each."""
+    """Collects the findings and reports each of them."""
 
     def __init__(self, questions: list[str], report: Report) -> None:
         self.findings: list[Finding] = []
@@ -115,7 +117,7 @@ def check(
     if not scan.is_parallel:
         ask(orbit.DISTANCES, orbit.check_distances, quick)
     gain = detector.check_gain(rt, quick)
-    if gain.verdict == SUSPICIOUS and covered.unit == coverage.CUT_OFF:  # such an object changes the levels too
+    if gain.verdict == SUSPICIOUS and covered.unit == coverage.CUT_OFF:  # an object cut off changes the levels too
         gain = replace(gain, verdict=CANNOT_TELL, text=f"{gain.text}, or the object does beyond the panel")
     answers.add(gain)
     if shutter.READOUT in questions:
@@ -130,14 +132,16 @@ def check(
 
 
 def quick_scan(scan: Scan) -> Scan:
-    """Returns the coarse scan of the questions about angles and the axis. Of a panel far beside the axis its grid is cut to
-    the object: the grid of the panel's view has so many voxels that few frames fit under other angles, too."""
+    """Returns the coarse scan for the questions about angles and the axis.
+
+    For a panel far beside the axis, the grid is cut to the object. The grid of the panel's view has so many voxels that few
+    frames would fit under wrong angles, too."""
     quick = coarse(scan, QUICK_COLUMNS)
     return around_object(quick, _SPARE_COLUMNS) if has_axis_near_edge(scan) else quick
 
 
 def _finite(scan: Scan) -> Scan:
-    """Returns the scan with zeros for masked values that are not finite."""
+    """Returns the scan with zeros in place of masked values that are not finite."""
     p = np.asarray(scan.projections)
     if not scan.valid.any():
         raise InputError("pixel_mask", "every pixel masked", "at least one usable pixel", "correct the mask")

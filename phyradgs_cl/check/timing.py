@@ -23,12 +23,12 @@ from phyradgs_cl.acquisition.altered.angles import (
 from phyradgs_cl.check.finding import OK, SUSPICIOUS, Finding
 
 _TIMING, _ANGLES = "timing", "angles"
-_ROUNDING = 1e-3  # relative: files round times and angles
-_SPEED_TOLERANCE = 0.02  # relative: gantries vary their speed by less
-_LONGEST_TABLE = 100.0  # times the scan's duration: a longer table belongs to no single scan
+_ROUNDING = 1e-3  # relative tolerance: files round times and angles
+_SPEED_TOLERANCE = 0.02  # relative tolerance: gantries vary their speed by less
+_LONGEST_TABLE = 100.0  # over the scan's duration: a longer table belongs to no single scan
 _FEW_RAD = math.radians(5)  # a scan that covers less of its table may have another unit of time
-_MILLISECONDS = (900.0, 3000.0)  # times the scan's duration: a table in ms and frames in s, the table a little longer
-_WIDE = 3.0  # times the median step between angles
+_MILLISECONDS = (900.0, 3000.0)  # ratio of durations of table and scan: ms against s
+_WIDE = 3.0  # over the median step between angles
 _SAME_RAD = 1e-6
 _TOLERATED_DEG = 1.0  # nearly parallel rays need half a turn only
 
@@ -36,9 +36,9 @@ _TOLERATED_DEG = 1.0  # nearly parallel rays need half a turn only
 def check_timing(scan: Scan) -> Finding:
     """Compares exposure, readout and table times with the frame times, and the angles with the speed.
 
-    A line cannot open while it is open, a frame cannot be read while the last one is, and a gantry has one angle at a time.
-    The value is the worst of: exposure and readout over the shortest frame period (at most 1); 1 + the relative difference
-    between the angle steps and the speed within the frames; a table's duration over the scan's."""
+    A line cannot open while it is open, a frame cannot be read while the one before is, and a gantry has one angle at a
+    time. The value is the worst of three numbers: exposure and readout over the shortest frame period (at most 1); 1 + the
+    relative difference between the angle steps and the speed within the frames; a table's duration over the scan's."""
     starts_s = np.asarray(scan.frame_start_s, np.float64)
     if scan.frames < 2:
         return Finding(_TIMING, OK, 0.0, 1.0, "share", "one frame: nothing to compare")
@@ -69,8 +69,8 @@ def _share(name: str, consequence: str, share: float) -> Finding:
 
 
 def _table(scan: Scan) -> list[Finding]:
-    """Finds a table of angles or poses that lasts far longer than the scan, which sees next to nothing of it: its unit of
-    time differs from the frames'."""
+    """Finds a table of angles or poses that lasts far longer than the scan. Its unit of time differs from that of the
+    frames, because the scan would see next to nothing of the table."""
     table = scan.trajectory.kinematics if isinstance(scan.trajectory, CircularOrbit) else scan.trajectory
     if not isinstance(table, EncoderTable | PoseTable):
         return []
@@ -87,7 +87,7 @@ def _table(scan: Scan) -> list[Finding]:
 
 
 def _speed(scan: Scan, starts_s: np.ndarray) -> Finding:
-    """Compares the angle to the next frame with the speed within the frame. Medians, since gantries vary their speed."""
+    """Compares the angle to the next frame with the speed within the frame. Medians count: gantries vary their speed."""
     span_s = scan.shutter.exposure_s or scan.shutter.span_s
     by_speed, stepped = np.empty(scan.frames - 1), np.empty(scan.frames - 1)
     for frame in range(scan.frames - 1):
@@ -113,8 +113,8 @@ def check_angles(scan: Scan) -> Finding:
     """Compares the largest gap between neighbouring views with three times the median one.
 
     Views that cover half a turn and the fan, or more, may leave one gap. Less coverage is suspicious with any steps.
-    Parallel rays across the axis see the same after half a turn: their angles count modulo 180°. Rays that rise need a full
-    turn."""
+    Parallel rays across the axis see the same after half a turn, so their angles count modulo 180°. Rays that rise need a
+    full turn."""
     turn_deg, needed_deg, of_needed = _needed_turn(scan)
     steps_deg = _steps_deg(scan, turn_deg)
     if steps_deg.size < 3:
@@ -125,7 +125,7 @@ def check_angles(scan: Scan) -> Finding:
     usual_deg = float(np.median(_steps_deg(scan)))
     widest = np.sort(steps_deg)[::-1]
     is_short = widest[0] > _WIDE * usual_deg
-    covered_deg = turn_deg - float(widest[0]) + (usual_deg if is_short else 0.0)  # half a step beyond the ends
+    covered_deg = turn_deg - float(widest[0]) + (usual_deg if is_short else 0.0)  # half a step beyond each end counts
     if is_short and covered_deg < needed_deg - _TOLERATED_DEG:
         text = f"views cover {covered_deg:.4g}°; {of_needed}"
         advice = "expect streaks along the missing directions; check rotation_angle, its unit and its sign"
@@ -145,7 +145,7 @@ def is_full_turn(scan: Scan) -> bool:
 
 
 def _needed_turn(scan: Scan) -> tuple[float, float, str]:
-    """Returns the degrees after which views repeat, the degrees that a volume needs, and those in words."""
+    """Returns the degrees after which views repeat, the degrees that a volume needs, and the latter in words."""
     geometry = scan.geometry
     if isinstance(geometry, ParallelGeometry):
         if has_opposite_views(scan):
@@ -158,13 +158,13 @@ def _needed_turn(scan: Scan) -> tuple[float, float, str]:
 def _steps_deg(scan: Scan, turn_deg: float = 360.0) -> np.ndarray:
     """Returns the degrees from each different view angle to the next, around a turn of ``turn_deg``."""
     angles_deg = np.rad2deg(azimuth_rad(middle_poses(scan))) % turn_deg
-    angles_deg = np.sort(angles_deg % turn_deg)  # a second time: -1e-16 % 360 is 360
+    angles_deg = np.sort(angles_deg % turn_deg)  # the second % is needed because -1e-16 % 360 is 360
     steps_deg = np.diff(angles_deg, append=angles_deg[0] + turn_deg)
     return steps_deg[steps_deg > math.degrees(_SAME_RAD)]
 
 
 def _half_fan_deg(scan: Scan, geometry: ConeGeometry) -> float:
-    """Returns half the fan of the reconstruction's box, at most half that of the panel."""
+    """Returns half the fan of the reconstruction's box, at most half the panel's fan."""
     half_width_mm = geometry.detector_shape[1] * geometry.pixel_size_mm[1] / 2
     panel_rad = math.atan2(half_width_mm, geometry.source_to_detector_mm)
     radius_mm = max(scan.grid.size_mm[1:]) / 2

@@ -1,4 +1,4 @@
-"""The detector: counts and line integrals, averages over an exposure, noise and other effects, estimates of them."""
+"""The detector: counts and line integrals, averages over an exposure, noise and other effects, and their estimates."""
 
 from phyradgs_cl.detector.attenuation import (
     Spectrum,

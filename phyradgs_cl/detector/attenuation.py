@@ -1,8 +1,8 @@
-"""Counts to line integrals, the average of line integrals over an exposure, and line integrals in the spectrum of a tube.
+"""Converts counts to line integrals, averages line integrals over an exposure, and models the spectrum of a tube.
 
 The spectrum follows Kramers' law (Phil. Mag. 46 (1923) 836), or SpekPy's tungsten anode (Poludniowski et al., Med. Phys. 48
 (2021) 3630), behind aluminium. Attenuation is interpolated in the logarithms of NIST's tables (Hubbell and Seltzer, NISTIR
-5632). Both materials attenuate as stated in the thinnest layer; thicker layers attenuate less per length."""
+5632). The thinnest layer of each material attenuates as stated; thicker layers attenuate less per length."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -13,20 +13,20 @@ from numpy.typing import ArrayLike, NDArray
 from phyradgs_cl import checks
 from phyradgs_cl.errors import InputError
 
-PROJECTION, FLAT, DARK, INVALID = 0, 1, 2, 3  # NXtomo's image_key
+PROJECTION, FLAT, DARK, INVALID = 0, 1, 2, 3  # the codes of NXtomo's image_key
 QUANTITIES = ("attenuation", "transmission", "counts")
-# Smallest transmission before the logarithm (a line integral of 13.8): below what 16-bit panels resolve, and finite.
+# Smallest transmission before the logarithm: a line integral of 13.8. It is finite, and below what 16-bit panels resolve.
 TRANSMISSION_FLOOR = 1e-6
 _LARGEST = float(np.finfo(np.float32).max)
-_BLOCK_PIXELS = 1 << 18  # converted at a time: float64 copies of a whole scan, or of one huge frame, are large
+_BLOCK_PIXELS = 1 << 18  # pixels converted at a time: float64 copies of a whole scan, or of one huge frame, are large
 Array = NDArray[np.floating]
 _ENERGY_KEV = np.array([15.0, 20.0, 30.0, 40.0, 50.0, 60.0, 80.0, 100.0, 150.0])
-# Mass attenuation in cm²/g: water, cortical bone (ICRU-44) and aluminium
+# Mass attenuation in cm²/g of water, cortical bone (ICRU-44) and aluminium.
 _WATER = np.array([1.673, 0.8096, 0.3756, 0.2683, 0.2269, 0.2059, 0.1837, 0.1707, 0.1505])
 _BONE = np.array([9.032, 4.001, 1.331, 0.6655, 0.4242, 0.3148, 0.2229, 0.1855, 0.1480])
 _ALUMINIUM = np.array([7.955, 3.441, 1.128, 0.5685, 0.3681, 0.2778, 0.2018, 0.1704, 0.1378])
 _ALUMINIUM_G_PER_CM3 = 2.699
-_STEP_KEV = 2.0  # of SpekPy's energies: finer steps change a half-value layer by less than a thousandth
+_STEP_KEV = 2.0  # step of SpekPy's energies: finer steps change a half-value layer by less than a thousandth
 LOWEST_KVP, HIGHEST_KVP = 30.0, 150.0
 FILTER_MM = 5.0
 
@@ -36,11 +36,12 @@ def counts_to_attenuation(
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
     """Converts the projections of a scan, data (F, v, u), to line integrals (P, v, u) float32, always finite.
 
-    Of ``quantity`` "counts", transmission is (I − dark) / (flat − dark) with the mean flat and the mean dark (0 without
-    darks); "transmission" is taken as it is, "attenuation" is returned unchanged. image_key (F,): 0 projection, 1 flat,
-    2 dark, 3 invalid. The second result (P, v, u) is True where a value must not be used: it is not finite, the flat is not
-    brighter than the dark, or the transmission is at most ``TRANSMISSION_FLOOR``. Raises InputError for counts without a
-    flat."""
+    With ``quantity`` "counts", the transmission is (I − dark) / (flat − dark) with the mean flat and the mean dark (0
+    without darks). With "transmission" the data are the transmission; with "attenuation" they are returned unchanged.
+    image_key (F,): 0 projection, 1 flat, 2 dark, 3 invalid.
+
+    The second result (P, v, u) is True where a value must not be used: it is not finite, the flat is not brighter than the
+    dark, or the transmission is at most ``TRANSMISSION_FLOOR``. Raises InputError for counts without a flat."""
     frames, key = np.asarray(data), np.asarray(image_key)
     return _converted(frames, np.flatnonzero(key == PROJECTION), quantity, frames[key == FLAT], frames[key == DARK])
 
@@ -49,9 +50,10 @@ def frames_to_attenuation(
     frames: NDArray[np.generic], quantity: str, flats: NDArray[np.generic] | None = None,
     darks: NDArray[np.generic] | None = None, largest: float = _LARGEST, place: NDArray[np.floating] | None = None
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-    """Does the same for projections (P, v, u) with flats and darks (n, v, u) of their own. Attenuation above ``largest`` is
-    marked as unusable too. ``place`` (P,): each projection's place among the flats, which are interpolated, 0.5 halfway
-    from the first to the second; None takes their mean."""
+    """Converts projections (P, v, u) that come with flats and darks (n, v, u) of their own, as ``counts_to_attenuation``.
+
+    Attenuation above ``largest`` is marked as unusable too. ``place`` (P,): each projection's place between the flats, which
+    are interpolated; 0.5 is halfway from the first to the second. None takes the flats' mean."""
     return _converted(frames, range(len(frames)), quantity, flats, darks, largest, place)
 
 
@@ -88,15 +90,16 @@ def _converted(
 
 
 def mean_dark(darks: NDArray[np.generic] | None, panel: tuple[int, ...]) -> NDArray[np.float64]:
-    """Returns the mean (v, u) of dark frames (n, v, u), 0 without any. A frame with NaN affects its pixel only."""
+    """Returns the mean (v, u) of dark frames (n, v, u), or 0 without any. NaN in a frame affects its own pixel only."""
     if darks is None or len(darks) == 0:
         return np.zeros(panel)
     return np.asarray(darks.mean(axis=0, dtype=np.float64))
 
 
 def minus_log(signal: NDArray[np.float64], gain: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """Returns −ln(signal / gain) for arrays of one shape, and where the result must not be used. A pixel without gain
-    becomes 0, because it holds no information; a dark one becomes −ln ``TRANSMISSION_FLOOR``."""
+    """Returns −ln(signal / gain) for arrays of one shape, and where the result must not be used.
+
+    A pixel without gain holds no information and becomes 0. A dark pixel becomes −ln ``TRANSMISSION_FLOOR``."""
     live = np.isfinite(signal) & np.isfinite(gain) & (gain > 0)
     transmission = np.divide(signal, gain, out=np.zeros_like(signal), where=live)
     p = -np.log(np.maximum(transmission, TRANSMISSION_FLOOR))
@@ -105,19 +108,21 @@ def minus_log(signal: NDArray[np.float64], gain: NDArray[np.float64]) -> tuple[N
 
 
 def average(p: ArrayLike, weight: ArrayLike, model: str) -> NDArray[np.float64]:
-    """Averages line integrals p (S, ...) of S moments of an exposure to (...) float64.
+    """Averages line integrals p (S, ...) over S moments of an exposure. Returns (...) float64.
 
-    Model "log" takes their weighted mean (PhyRadGS, Eq. 1). Model "intensity" adds photons as a detector does,
-    −ln Σ w exp(−p), without overflow at any p. weight (S,): fractions of the exposure, not negative, sum 1."""
+    Model "log" takes their weighted mean (PhyRadGS, Eq. 1). Model "intensity" adds photons as a detector does:
+    −ln Σ w exp(−p), without overflow at any p. weight (S,): fractions of the exposure, not negative, with sum 1."""
     values, weights = np.asarray(p, dtype=np.float64), np.asarray(weight, dtype=np.float64)
     return np.tensordot(weights, values, axes=1) if model == "log" else intensity_average(values, weights)[0]
 
 
 def intensity_average(p: Iterable[np.ndarray], weights: Iterable[np.ndarray]) -> tuple[np.ndarray, list[np.ndarray]]:
-    """Returns −ln Σ w exp(−p) over S moments, and each moment's share w exp(−p) / Σ w exp(−p), without overflow. p: S arrays
-    of the result's precision. weights: S numbers or arrays that broadcast, sum 1; all 0 gives 0 for both."""
+    """Returns −ln Σ w exp(−p) over S moments, and each moment's share w exp(−p) / Σ w exp(−p), without overflow.
+
+    p: S arrays, whose precision the result has. weights: S numbers or arrays that broadcast, with sum 1. All 0 gives 0 for
+    both."""
     pairs = list(zip(p, weights, strict=True))
-    least = np.minimum.reduce([np.where(w > 0, q, np.inf) for q, w in pairs])  # of the brightest moment
+    least = np.minimum.reduce([np.where(w > 0, q, np.inf) for q, w in pairs])  # p of the brightest moment
     least = np.where(np.isfinite(least), least, 0)
     intensities = [w * np.exp(np.where(w > 0, least - q, 0)) for q, w in pairs]
     total = np.sum(intensities, axis=0)
@@ -127,8 +132,9 @@ def intensity_average(p: Iterable[np.ndarray], weights: Iterable[np.ndarray]) ->
 
 @dataclass(frozen=True, eq=False)
 class Spectrum:
-    """energy_kev (E,). weight (E,): fraction of the signal recorded at each energy, sum 1. soft, bone (E,): attenuation
-    there relative to its mean."""
+    """A spectrum. energy_kev (E,). weight (E,): fraction of the signal recorded at each energy, with sum 1.
+
+    soft, bone (E,): the material's attenuation at each energy over its mean attenuation."""
 
     energy_kev: Array
     weight: Array
@@ -136,17 +142,17 @@ class Spectrum:
     bone: Array
 
     def hardened(self, soft: Array, bone: Array | float = 0.0) -> Array:
-        """Returns measured line integrals for those of the two materials (any shape) in the thin limit."""
+        """Returns measured line integrals (any shape) for line integrals of the two materials in the thin limit."""
         soft, energies = np.asarray(soft, np.float64), zip(self.weight, self.soft, self.bone, strict=True)
-        # Energy by energy, as ``intensity_average`` would hold all of them in memory.
+        # One energy at a time: ``intensity_average`` would hold all of them in memory.
         return -np.log(sum(w * np.exp(-(s * soft + b * np.asarray(bone))) for w, s, b in energies))
 
 
 def tube_spectrum(kvp: float, filter_mm: float = FILTER_MM, anode_deg: float = 0.0) -> Spectrum:
     """Returns the spectrum of a tube at ``kvp`` kV behind ``filter_mm`` of aluminium, for a panel that integrates energy.
 
-    It is SpekPy's for a tungsten anode of ``anode_deg``, and follows Kramers' law at 0. Raises InputError for an anode
-    without the package spekpy."""
+    The spectrum is SpekPy's for a tungsten anode of ``anode_deg``; at 0 it follows Kramers' law. Raises InputError for an
+    anode without the package spekpy."""
     energy_kev, photons = _tungsten(kvp, anode_deg) if anode_deg else _kramers(kvp)
     light = photons * energy_kev * np.exp(-_at(energy_kev, _ALUMINIUM) * _ALUMINIUM_G_PER_CM3 * filter_mm / 10)
     weight = light / light.sum()
@@ -155,13 +161,13 @@ def tube_spectrum(kvp: float, filter_mm: float = FILTER_MM, anode_deg: float = 0
 
 
 def _kramers(kvp: float) -> tuple[Array, Array]:
-    """Returns energies (E,) in keV and the photons of each, without a filter."""
+    """Returns energies (E,) in keV and the number of photons of each, without a filter."""
     energy_kev = np.linspace(_ENERGY_KEV[0], kvp, 40, endpoint=False)
     return energy_kev, (kvp - energy_kev) / energy_kev
 
 
 def _tungsten(kvp: float, anode_deg: float) -> tuple[Array, Array]:
-    """Returns the same with SpekPy, characteristic lines included."""
+    """Returns energies and photons by SpekPy, with characteristic lines."""
     spekpy = checks.package("spekpy", "the package that hardening.anode_deg asks", "phyradgs-cl[spectrum]")
     energy_kev, photons = spekpy.Spek(kvp=kvp, th=anode_deg, dk=_STEP_KEV).get_spectrum(diff=False)
     tabulated = energy_kev >= _ENERGY_KEV[0]

@@ -1,11 +1,11 @@
-"""Effects of tube and panel on frames: photon and electronic noise, lag, gains, sparks, drift, scatter.
+"""Effects of tube and panel on frames: photon and electronic noise, lag, gains, sparks, drift and scatter.
 
-The simulator adds them, each random one from a seeded generator; ``without_lag`` undoes lag. Expected counts and one sample
+The simulator adds them; random ones come from a seeded generator. ``without_lag`` removes lag. Expected counts and a sample
 of them are separate functions: counts = Poisson(expected) + N(0, electronic_noise). There are two rules for ``expected``:
 
 - tigre: line integrals are divided by the scan's largest one, which squeezes the transmission into [1/e, 1]. This is the
   noise of the published synthetic scans (TIGRE's CTnoise; Biguri et al., Biomed. Phys. Eng. Express 2 055010, 2016).
-- Beer-Lambert: expected = dose · exp(−p), the physics.
+- Beer-Lambert: expected = dose · exp(−p), which is the physics.
 
 Lag is one exponential from frame to frame: y_f = (1 − λ) x_f + λ y_(f−1), with y = 0 before the first frame. For its
 effect on reconstructions see Tilley et al., arXiv:1805.11631."""
@@ -20,18 +20,18 @@ from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.detector.attenuation import TRANSMISSION_FLOOR
 
 Array = NDArray[np.floating]
-# Above this mean Poisson is drawn as a rounded normal: NumPy's sampler fails near 9.2e18, and the lost skewness is < 4e-5.
+# Above this mean, Poisson is drawn as a rounded normal, whose skewness is off by < 4e-5. NumPy's sampler fails near 9.2e18.
 NORMAL_FROM = 1e9
 COUNT_FLOOR = 0.5  # smallest count before the logarithm: below what a detector can tell
-_LARGEST_EXPONENT = 700.0  # of float64: very negative line integrals, as of ringing, would overflow
-_SPARK_HEIGHT = (0.3, 2.0)  # of the light without object
-_SCATTER_REACH = 6.0  # panel's longer side over the length of the scatter kernel
-_SCATTER_POWERS = (0.8, 1.5)  # of the primary light and of the line integral
-_SHADOW = 0.1  # of the largest line integral: pixels above it lie behind the object
+_LARGEST_EXPONENT = 700.0  # largest exponent in float64: very negative line integrals, as of ringing, would overflow
+_SPARK_HEIGHT = (0.3, 2.0)  # range of a spark's light, over the light without object
+_SCATTER_REACH = 6.0  # the panel's longer side over the length of the scatter kernel
+_SCATTER_POWERS = (0.8, 1.5)  # powers of the primary light and of the line integral
+_SHADOW = 0.1  # fraction of the largest line integral: pixels above it lie behind the object
 
 
 def tigre_counts(line_integrals: ArrayLike, dose: float) -> tuple[Array, float]:
-    """Returns expected counts dose · exp(−p/m) for p (F, v, u), and the scale m: the largest p, 1 for an empty scan."""
+    """Returns expected counts dose · exp(−p/m) for p (F, v, u), and the scale m: the largest p, or 1 for an empty scan."""
     p = np.asarray(line_integrals, dtype=np.float64)
     largest = float(p.max(initial=0.0))
     scale = largest if largest > 0 else 1.0
@@ -44,7 +44,7 @@ def beer_lambert_counts(line_integrals: ArrayLike, dose: float) -> Array:
 
 
 def sample_counts(expected: Array, electronic_noise: float, rng: np.random.Generator) -> Array:
-    """Draws Poisson(expected (...)) + N(0, electronic_noise) once: float64 counts, not clamped."""
+    """Draws counts Poisson(expected (...)) + N(0, electronic_noise) once, float64. They are not clamped."""
     many = expected > NORMAL_FROM
     counts = rng.poisson(np.where(many, 0.0, expected)).astype(np.float64)
     if many.any():
@@ -59,11 +59,11 @@ def tigre_noise(
     line_integrals: ArrayLike, dose: float, electronic_noise: float, rng: np.random.Generator,
     light: ArrayLike = 1.0
 ) -> NDArray[np.float32]:
-    """Returns noisy line integrals −ln(counts/dose) · m, (F, v, u) float32, after TIGRE's scaling; negatives become 0.
+    """Returns noisy line integrals −ln(counts/dose) · m, (F, v, u) float32, after TIGRE's scaling. Negatives become 0.
 
-    line_integrals (F, v, u): all projections of the scan, m is their maximum. ``dose``: counts of an unattenuated pixel.
+    line_integrals (F, v, u): all projections of the scan, whose maximum is m. ``dose``: counts of an unattenuated pixel.
     ``electronic_noise``: standard deviation in counts. The published scans have 1e4 and 10. ``light``: fraction of the dose
-    for each pixel, above 0, broadcast to (F, v, u), because a pulse may miss part of a line's window."""
+    for each pixel, above 0, broadcast to (F, v, u). It is below 1 where a pulse misses part of a line's window."""
     expected, scale = tigre_counts(line_integrals, dose)
     share = np.asarray(light, dtype=np.float64)
     p = _log_ratio(sample_counts(expected * share, electronic_noise, rng), dose * share) * scale
@@ -74,10 +74,9 @@ def beer_lambert_noise(
     line_integrals: ArrayLike, dose: float, electronic_noise: float, rng: np.random.Generator,
     light: ArrayLike = 1.0, lag: float = 0.0
 ) -> NDArray[np.float32]:
-    """Returns −ln(counts/dose) with counts clamped at ``COUNT_FLOOR``; negatives stay, else air would attenuate.
+    """Returns −ln(counts/dose) with counts clamped at ``COUNT_FLOOR``. Negatives stay: otherwise air would attenuate.
 
-    Arguments and result as in ``tigre_noise``. Lag λ mixes the photons of successive frames; electronic noise is
-    added after it."""
+    Arguments and result as in ``tigre_noise``. Lag λ mixes photons of successive frames, before electronic noise."""
     expected = beer_lambert_counts(line_integrals, dose)
     share = np.asarray(light, dtype=np.float64)
     counts = add_lag(sample_counts(expected * share, 0.0, rng), lag)
@@ -91,7 +90,7 @@ def _log_ratio(counts: Array, dose: float | Array) -> Array:
 
 
 def add_lag(signal: ArrayLike, lag: float) -> NDArray[np.float64]:
-    """Returns signals (F, ...) as a panel with lag λ records them, in the order of the frames, float64."""
+    """Returns signals (F, ...), in the order of the frames, as a panel with lag λ records them, float64."""
     return np.asarray(scipy.signal.lfilter([1 - lag], [1, -lag], np.asarray(signal, np.float64), axis=0))
 
 
@@ -101,16 +100,16 @@ def lagged(line_integrals: ArrayLike, lag: float) -> NDArray[np.float64]:
 
 
 def without_lag(scan: Scan) -> Scan:
-    """Returns the scan as a panel without lag would have recorded it; the scan itself if its lag is 0.
+    """Returns the scan as a panel without lag would have recorded it. A scan whose lag is 0 is returned itself.
 
-    Masks values at or below ``TRANSMISSION_FLOOR``, and values that need a masked pixel of this or the previous frame.
-    Photon noise returns to its level without lag; noise that was added after the panel grows by √(1 + λ²)/(1 − λ)."""
+    Values at or below ``TRANSMISSION_FLOOR`` are masked, and values that need a masked pixel of this or the previous frame.
+    Photon noise returns to its level without lag. Noise that was added after the panel grows by √(1 + λ²)/(1 − λ)."""
     if scan.lag == 0:
         return scan
     projections = np.empty(scan.projections.shape, np.float32)
     bad = np.zeros(projections.shape, bool)
     previous = np.zeros(projections.shape[1:])
-    for f, frame in enumerate(scan.projections):  # frame by frame: float64 copies of a whole scan are large
+    for f, frame in enumerate(scan.projections):  # a float64 copy of the whole scan would be large
         recorded = np.exp(-frame.astype(np.float64))
         signal = (recorded - scan.lag * previous) / (1 - scan.lag)
         bad[f] = ~(signal > TRANSMISSION_FLOOR)
@@ -125,13 +124,13 @@ def without_lag(scan: Scan) -> Scan:
 
 
 def pixel_gains(shape: tuple[int, int], spread: float, rng: np.random.Generator) -> Array:
-    """Draws gains (v, u) about 1 with standard deviation ``spread``; a quarter of the variance is common to a column."""
+    """Draws gains (v, u) about 1 with standard deviation ``spread``. A quarter of the variance is common to a column."""
     own, column = rng.standard_normal(shape), rng.standard_normal((1, shape[1]))
     return np.maximum(1 + spread * (np.sqrt(0.75) * own + 0.5 * column), 0.05)
 
 
 def add_sparks(line_integrals: Array, share: float, rng: np.random.Generator) -> tuple[Array, NDArray[np.bool_]]:
-    """Adds light to a ``share`` of the pixels of line integrals (F, v, u); returns these and which pixels were hit."""
+    """Adds light to a ``share`` of the pixels of line integrals (F, v, u). Returns the result and which pixels were hit."""
     hit = rng.random(line_integrals.shape) < share
     height = rng.uniform(*_SPARK_HEIGHT, int(hit.sum()))
     sparked = np.array(line_integrals)
@@ -140,7 +139,7 @@ def add_sparks(line_integrals: Array, share: float, rng: np.random.Generator) ->
 
 
 def drifting_light(frames: int, largest: float, rng: np.random.Generator) -> Array:
-    """Draws the tube's light in each frame (F,) relative to the flats: a random walk, at most ``largest`` away from 1."""
+    """Draws the tube's light in each frame (F,), relative to the flats: a random walk at most ``largest`` away from 1."""
     walk = np.cumsum(rng.standard_normal(frames))
     walk -= walk.mean()
     return 1 + largest * walk / max(float(np.abs(walk).max()), 1e-12)
@@ -149,9 +148,9 @@ def drifting_light(frames: int, largest: float, rng: np.random.Generator) -> Arr
 def add_scatter(line_integrals: Array, to_primary: float) -> Array:
     """Returns line integrals (F, v, u) with scatter, float64.
 
-    A ray scatters P^0.8 p^1.5, as Sun and Star-Lack (Phys. Med. Biol. 55 (2010) 6695) found for water; a kernel exp(−r/ℓ)
-    with ℓ a sixth of the panel spreads it. Behind the object scatter is ``to_primary`` times the primary light on average.
-    """
+    A ray scatters P^0.8 p^1.5 with the primary light P, as Sun and Star-Lack (Phys. Med. Biol. 55 (2010) 6695) found for
+    water. A kernel exp(−r/ℓ) spreads it, with ℓ a sixth of the panel. Behind the object, scatter is ``to_primary`` times the
+    primary light on average."""
     p = np.asarray(line_integrals, np.float64)
     primary = np.exp(-p)
     lost = primary**_SCATTER_POWERS[0] * np.maximum(p, 0) ** _SCATTER_POWERS[1]
@@ -163,7 +162,7 @@ def add_scatter(line_integrals: Array, to_primary: float) -> Array:
 
 
 def _spread(light: Array, length: float) -> Array:
-    """Convolves a frame (v, u) with exp(−r/length), length in pixels; no light comes from beyond the panel."""
+    """Convolves a frame (v, u) with exp(−r/length), length in pixels. No light comes from beyond the panel."""
     v, u = (np.arange(1 - n, n) for n in light.shape)
     kernel = np.exp(-np.hypot(v[:, None], u[None, :]) / length)
     return np.maximum(scipy.signal.fftconvolve(light, kernel / kernel.sum(), mode="same"), 0)

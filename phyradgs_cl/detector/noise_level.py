@@ -14,15 +14,15 @@ NORMAL_MAD = 1.4826  # standard deviation of a normal variable over its median a
 _MEDIAN_OF_NORMAL, _FILTER_NORM = 0.6745, 1.5**0.5
 _LARGEST_SAMPLE = 1_000_000
 _TENTHS = 10
-_BEHIND = 5.0  # times the noise: larger line integrals have met the object
-_FRAMES = 16  # from which noise is estimated
+_BEHIND = 5.0  # in noise levels: larger line integrals have met the object
+_FRAMES = 16  # frames from which noise is estimated
 
 LEAST_SHARE = 1e-3
-"""Share of the pixels at one extreme from which saturation is suspected."""
-_TOUCHING = 0.5  # fraction of those with all four neighbours at the same extreme
+"""Saturation is suspected from this fraction of the pixels at one extreme."""
+_TOUCHING = 0.5  # fraction of the extreme pixels whose four neighbours are at the same extreme
 _SAME = 1e-3  # relative difference between a flat and the projections' ceiling that counts as none
-_MOST_FRAMES, _LONGEST_EDGE = 8, 1024  # of the frames that are searched for noise
-_ROUNDING, _RELATIVE = 0.5, 2e-5  # noise in counts, and relative to the ceiling, that counts as none
+_MOST_FRAMES, _LONGEST_EDGE = 8, 1024  # number of frames, and their longest side, that are searched for noise
+_ROUNDING, _RELATIVE = 0.5, 2e-5  # noise that counts as none: in counts, and relative to the ceiling
 _WHITE = 0.5  # least ratio of two estimates that agree for white noise and differ by far for smooth structure
 
 
@@ -32,11 +32,11 @@ def robust_deviation(values: np.ndarray) -> float:
 
 
 def noise_level(line_integrals: NDArray[np.float32], valid: NDArray[np.bool_] | None = None) -> float:
-    """Returns the standard deviation of a pixel's noise behind the object, dimensionless; 0 without usable pixels.
+    """Returns the standard deviation of a pixel's noise behind the object, dimensionless. Without usable pixels it is 0.
 
-    It is the median of |second differences| along rows where values are above 0: structure is smooth compared with white
-    noise, and a median ignores edges (Donoho and Johnstone, Biometrika 81 (1994) 425). Structure as fine as a pixel raises
-    it, noise correlated along rows lowers it. line_integrals (F, v, u); valid likewise, None: all."""
+    It is estimated from the median of |second differences| along rows, where values are above 0. Structure is smooth
+    compared with white noise, and a median ignores edges (Donoho and Johnstone, Biometrika 81 (1994) 425). Structure as fine
+    as a pixel raises the estimate; noise correlated along rows lowers it. line_integrals (F, v, u); valid: None for all."""
     if line_integrals.shape[-1] < 3:
         return 0.0
     left, middle, right = _along_rows(line_integrals)
@@ -52,12 +52,12 @@ def noise_level(line_integrals: NDArray[np.float32], valid: NDArray[np.bool_] | 
 
 
 def noise_rms(line_integrals: NDArray[np.float32], chosen: NDArray[np.bool_], valid: NDArray[np.bool_]) -> float:
-    """Returns the root mean square of the noise of the pixels ``chosen`` (F, v, u), dimensionless; ``valid`` likewise.
+    """Returns the root mean square of the noise of the pixels ``chosen`` (F, v, u), dimensionless. ``valid`` likewise.
 
-    Noise grows with attenuation, so it is estimated by tenths of the line integrals and averaged as the chosen pixels lie.
-    Each estimate is the median of |second differences along rows of those along columns|, which vanish at straight edges
-    along either (Immerkær, Comput. Vis. Image Underst. 64 (1996) 300). Detail as fine as a pixel raises it: by up to 70 %
-    on panels of 64² with noise of 0.5 %. Panels of fewer than three rows use rows alone."""
+    Noise grows with attenuation, so it is estimated for each tenth of the line integrals and averaged as the chosen pixels
+    lie. Each estimate is the median of |second differences along rows of those along columns|. These vanish at straight
+    edges along either (Immerkær, Comput. Vis. Image Underst. 64 (1996) 300). Detail as fine as a pixel raises the estimate,
+    by up to 70 % on panels of 64² with noise of 0.5 %. For panels of fewer than three rows, rows alone are used."""
     usable, differences = valid, line_integrals
     means = line_integrals
     cuts = (_along_rows, _along_columns) if line_integrals.shape[-2] >= 3 else (_along_rows,)
@@ -77,8 +77,9 @@ def noise_rms(line_integrals: NDArray[np.float32], chosen: NDArray[np.bool_], va
 
 
 def noise_behind(line_integrals: NDArray[np.float32], valid: NDArray[np.bool_]) -> float:
-    """Returns ``noise_rms`` behind the object, from some of the frames. line_integrals and valid (F, v, u). Air has less
-    noise, and in some files half of it is clipped at 0."""
+    """Returns ``noise_rms`` behind the object, from some of the frames. line_integrals and valid (F, v, u).
+
+    Air is left out because it has less noise, and in some files half of that is clipped at 0."""
     some = slice(None, None, max(1, len(line_integrals) // _FRAMES))
     frames, usable = line_integrals[some], valid[some]
     behind = usable & (frames > _BEHIND * noise_level(frames, usable))
@@ -99,7 +100,7 @@ def transmission_weights(
     """Returns weights exp(−p) of line integrals p (F, v, u), with mean 1 over the ``valid`` pixels (None: all).
 
     They are the least-squares weights of photon noise (Sauer and Bouman, IEEE Trans. Signal Process. 41 (1993) 534).
-    Negative line integrals count as air, because a pixel is not more precise for being bright by chance."""
+    Negative line integrals count as air, because a pixel that is bright by chance is not more precise."""
     weights = np.exp(-np.maximum(line_integrals, 0)).astype(np.float32)
     if valid is None:
         mean = float(weights.mean(dtype=np.float64))
@@ -112,7 +113,7 @@ def transmission_weights(
 def find_saturation(frames: NDArray[np.generic], flat: NDArray[np.floating]) -> Saturation:
     """Returns the largest count of projections (P, v, u), and the fraction of their pixels clipped there.
 
-    Only whole areas count as clipped. An area at the count of the mean ``flat`` (v, u) may be air without noise: it counts
+    Only whole areas count as clipped. An area at the count of the mean ``flat`` (v, u) may be air without noise. It counts
     only where the rest of the frames shows noise."""
     level = float(np.fmax.reduce([np.fmax.reduce(frame, axis=None) for frame in frames]))
     share = clustered_share(frame == level for frame in frames)
@@ -122,8 +123,9 @@ def find_saturation(frames: NDArray[np.generic], flat: NDArray[np.floating]) -> 
 
 
 def clustered_share(extreme: Iterable[NDArray[np.bool_]]) -> float:
-    """Returns the fraction of pixels at an extreme, given frame by frame (v, u), if most have four such neighbours; else 0.
-    Saturation puts whole areas at an extreme, clipped noise single pixels."""
+    """Returns the fraction of pixels at an extreme, given frame by frame (v, u), if most of them have four such neighbours.
+
+    Otherwise it returns 0. Saturation puts whole areas at an extreme; clipped noise puts single pixels there."""
     pixels = count = inner = touching = 0
     for at in extreme:
         pixels, count = pixels + at.size, count + int(np.count_nonzero(at))
@@ -156,6 +158,6 @@ def _shows_noise(frames: NDArray[np.generic], level: float) -> bool:
     rows, both = np.concatenate(along_rows), np.concatenate(along_both)
     unclipped = np.isfinite(both)
     if not unclipped.any():
-        return True  # nothing but clipped pixels and their rims
+        return True  # there are only clipped pixels and their rims
     in_rows, in_both = (float(np.median(np.abs(d[unclipped]))) / norm for d, norm in ((rows, 6**0.5), (both, 6.0)))
     return in_both > max(_ROUNDING, _RELATIVE * level, _WHITE * in_rows)

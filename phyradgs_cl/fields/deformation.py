@@ -1,8 +1,8 @@
-"""A deforming object as a value: displacement fields of low rank in time, on tensor cubic B-splines in space.
+"""A deforming object: displacement fields of low rank in time, on tensor cubic B-splines in space.
 
     w(y, t) = Σ_r φ_r(t) U_r(y),   U_r(y) = Σ_c control_c,r β³((y − origin) / spacing − c)
 
-Pull convention: at time t the object has, at point y, the attenuation that the reference volume has at y + w(y, t).
+Pull convention: at time t the object has at point y the attenuation that the reference volume has at y + w(y, t).
 D. Rueckert et al., Nonrigid registration using free-form deformations, IEEE Trans. Med. Imaging 18, 712-721 (1999)."""
 
 from dataclasses import dataclass, replace
@@ -15,10 +15,10 @@ from phyradgs_cl import checks
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields.volume import Grid
 
-_LEVELS = 16  # steps of a weight's range among which the folding check tells states apart
-_MOST_STEPS = 200  # of the fixed point: enough for a contraction of 0.93
-_FLAT = 1e-4  # slopes without which a point's determinant is 1
-_CLOSE = 1e-6  # of the smallest control spacing: where the fixed point ends
+_LEVELS = 16  # steps of a weight's range at which the folding check distinguishes states
+_MOST_STEPS = 200  # iterations of the fixed point: enough for a contraction of 0.93
+_FLAT = 1e-4  # at points with smaller slopes the determinant is 1
+_CLOSE = 1e-6  # fraction of the smallest control spacing at which the fixed point ends
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,10 +26,10 @@ class Deformation:
     """How an object moves and deforms during a scan.
 
     control_mm: (R, nz, ny, nx, 3) coefficients of the fields U_r, components x, y, z. Coefficients outside of the array are
-    0, so the field falls smoothly to 0 within two spacings beyond the outermost control points.
-    origin_mm: the control point (0, 0, 0), x, y, z. spacing_mm: of the control points, one length or three (x, y, z).
-    times_s: (T,) rising, on the clock of ``Scan.frame_start_s``. weights: (T, R) φ_r at these times, linear between two of
-    them, constant before the first and after the last. A field of unit weight has its displacements in mm.
+    0, so the field falls smoothly to 0 within two spacings beyond the outermost control points. origin_mm: the control point
+    (0, 0, 0), x, y, z. spacing_mm: the distance of control points, one length or three (x, y, z). times_s: (T,) rising, on
+    the clock of ``Scan.frame_start_s``. weights: (T, R) φ_r at these times. They are linear between two times, and constant
+    before the first and after the last. A field of unit weight has its displacements in mm.
 
     Raises InputError for other shapes, values that are not finite, lengths that are not above 0, and times that do not
     rise."""
@@ -62,16 +62,17 @@ class Deformation:
     def of_displacements(
         cls, displacements_mm: np.ndarray, grid: Grid, times_s: "ArrayLike", spacing_mm: float, rank: int = 2
     ) -> "Deformation":
-        """Returns the deformation that is closest to dense displacements w (T, nz, ny, nx, 3) in mm, components x, y, z, at
-        the voxel centres of ``grid`` and at times (T,), as image registration gives them.
+        """Returns the deformation closest to dense displacements w (T, nz, ny, nx, 3) in mm, x y z, at times (T,).
 
-        They become at most ``rank`` fields by singular values, whose weights have a largest size of 1, on control points
-        ``spacing_mm`` apart. Raises InputError for other shapes, values that are not finite, and times that do not rise."""
+        They are at the voxel centres of ``grid``, as image registration gives them.
+
+        Singular values make them at most ``rank`` fields, on control points ``spacing_mm`` apart, whose weights have a
+        largest size of 1. Raises InputError for other shapes, values that are not finite, and times that do not rise."""
         times_s = checks.numbers("times_s", times_s, (None,))
         dense_mm = checks.numbers("displacements_mm", displacements_mm, (len(times_s), *grid.shape, 3))
         checks.whole("rank", rank, 1, 1000)
         rows = dense_mm.reshape(len(times_s), -1)
-        squares, vectors = np.linalg.eigh(rows @ rows.T)  # small, where singular values of the rows would be large
+        squares, vectors = np.linalg.eigh(rows @ rows.T)  # a small matrix, unlike that of singular values of the rows
         weights = vectors[:, ::-1][:, : min(rank, len(times_s))]
         largest = np.abs(weights).max(0)
         fields_mm = (weights * largest).T @ rows
@@ -89,12 +90,12 @@ class Deformation:
 
     @property
     def is_still(self) -> bool:
-        """Whether no state displaces anything."""
+        """Whether all displacements are 0."""
         return not np.any(self.reach_mm * np.abs(self.weights).max(axis=0))
 
     @property
     def reach_mm(self) -> np.ndarray:
-        """Bounds (R,) of the displacements of fields of unit weight: the longest control vector of each."""
+        """Bounds (R,) of the displacements of fields of unit weight: the longest control vector of each field."""
         return np.asarray(np.linalg.norm(self.control_mm, axis=-1).max(axis=(1, 2, 3)))
 
     @property
@@ -145,13 +146,13 @@ class Deformation:
     def inverse_on_grid_mm(self, grid: Grid, weights: "ArrayLike") -> np.ndarray:
         """Returns u (nz, ny, nx, 3) float32 in mm with u(x) = −w(x + u(x)): matter at x of the reference is at x + u(x).
 
-        Fixed point from u = 0. Raises InputError where it does not converge, for example because the field folds."""
+        It is a fixed point, reached from u = 0. Raises InputError where it does not converge, as where the field folds."""
         z, y, x = np.meshgrid(*grid.axes_mm(), indexing="ij")
         centres_mm = np.stack([x.ravel(), y.ravel(), z.ravel()], -1)
         return self.inverse_mm(centres_mm, weights).reshape(*grid.shape, 3).astype(np.float32)
 
     def inverse_mm(self, points_mm: np.ndarray, weights: "ArrayLike") -> np.ndarray:
-        """Returns the same u (n, 3) float64 in mm at points (n, 3), x y z."""
+        """Returns the u of ``inverse_on_grid_mm``, (n, 3) float64 in mm, at points (n, 3), x y z."""
         moved_mm = np.zeros_like(points_mm)
         for _ in range(_MOST_STEPS):
             next_mm = -self.displacement_mm(points_mm + moved_mm, weights)
@@ -162,9 +163,11 @@ class Deformation:
         raise InputError("deformation", found, "a field whose gradient stays below 1", "use a smoother or smaller field")
 
     def smallest_determinant(self, grid: Grid | None = None) -> float:
-        """Returns the smallest det(I + ∂w/∂y) over the voxel centres of ``grid`` and the states of ``times_s``; matter folds
-        where it is not above 0. Without a grid: points at half the spacing of the control points. Weights are rounded to a
-        16th of each field's largest, and slopes below 1e-4 are taken as 0."""
+        """Returns the smallest det(I + ∂w/∂y) over the voxel centres of ``grid`` and the states of ``times_s``. Matter folds
+        where it is not above 0.
+
+        Without a grid, the points are half a spacing of the control points apart. Weights are rounded to a 16th of each
+        field's largest, and slopes below 1e-4 count as 0."""
         grid = grid or self._half_spacing_grid()
         slopes = np.stack([self._slopes(grid, control_mm) for control_mm in self.control_mm])  # (R, 3, 3, n)
         largest = np.abs(self.weights).max(axis=0)
@@ -187,8 +190,9 @@ class Deformation:
         return (points_mm - self.origin_mm) / self.spacing_mm
 
     def bases(self, grid: Grid, slope_along: int | None = None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Returns β³ (voxels, control points) along z, y and x at the voxel centres of ``grid``; its slope in 1/mm along
-        ``slope_along`` (0: z)."""
+        """Returns β³ (voxels, control points) along z, y and x at the voxel centres of ``grid``.
+
+        Along ``slope_along`` (0: z) it returns the slope of β³ in 1/mm instead."""
         matrices = []
         spacing_mm = np.broadcast_to(self.spacing_mm, 3)
         for axis, centres_mm in enumerate(grid.axes_mm()):
@@ -209,7 +213,7 @@ class Deformation:
     def _half_spacing_grid(self) -> Grid:
         spacing_mm = np.broadcast_to(self.spacing_mm, 3)[::-1]
         counts = np.array(self.control_mm.shape[1:4])
-        shape = 2 * (counts + 3) + 1  # two more spacings on either side, where the field falls to 0
+        shape = 2 * (counts + 3) + 1  # the field falls to 0 within two more spacings on either side
         centre_mm = np.array(self.origin_mm)[::-1] + spacing_mm * (counts - 1) / 2
         return Grid(tuple(shape.tolist()), tuple((spacing_mm / 2).tolist()), tuple(centre_mm.tolist()))
 
@@ -218,6 +222,7 @@ def control_points(
     grid: Grid, spacing_mm: float, margin_mm: float = 0.0
 ) -> tuple[tuple[float, float, float], tuple[int, int, int]]:
     """Returns origin x, y, z in mm and counts (nz, ny, nx) of control points that cover a grid and ``margin_mm`` around it.
+
     The outermost stand at least one spacing further out, so that four of them along each axis reach every point."""
     counts = [int(np.ceil((side_mm + 2 * margin_mm) / spacing_mm)) + 3 for side_mm in grid.size_mm]
     first_mm = [middle - (n - 1) / 2 * spacing_mm for middle, n in zip(grid.offset_mm, counts, strict=True)]
@@ -225,8 +230,8 @@ def control_points(
 
 
 def fitted_control_mm(fields_mm: np.ndarray, grid: Grid, spacing_mm: float) -> tuple[np.ndarray, tuple[float, float, float]]:
-    """Returns control vectors (R, cz, cy, cx, 3), and their origin in mm, whose splines follow fields (R, nz, ny, nx, 3) on
-    ``grid`` best: by least squares along one axis after the other, since the splines are a product."""
+    """Returns control vectors (R, cz, cy, cx, 3) whose splines follow fields (R, nz, ny, nx, 3) on ``grid`` best, and their
+    origin in mm. Splines are a product over the axes, so least squares along one axis after the other give them."""
     origin_mm, counts = control_points(grid, spacing_mm)
     empty = Deformation(np.zeros((1, *counts, 3)), origin_mm, spacing_mm, np.zeros(1), np.zeros((1, 1)))
     inverses = [np.linalg.pinv(matrix, rcond=1e-3) for matrix in empty.bases(grid)]
@@ -235,7 +240,7 @@ def fitted_control_mm(fields_mm: np.ndarray, grid: Grid, spacing_mm: float) -> t
 
 
 def cubic(offset: np.ndarray) -> np.ndarray:
-    """Returns the centred cubic B-spline β³ at offsets in spacings; 0 beyond ±2."""
+    """Returns the centred cubic B-spline β³ at offsets in spacings. It is 0 beyond ±2."""
     size = np.abs(offset)
     return np.asarray(np.maximum(2 - size, 0) ** 3 - 4 * np.maximum(1 - size, 0) ** 3) / 6
 

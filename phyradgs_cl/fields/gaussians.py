@@ -1,6 +1,6 @@
 """Radiative Gaussians: parameters with units, and the unconstrained ("raw") numbers that are optimised.
 
-Field of one Gaussian: ρ exp(−½ (x−μ)ᵀ Σ⁻¹ (x−μ)), Σ = R diag(s²) Rᵀ (paper, section 2)."""
+The field of one Gaussian is ρ exp(−½ (x−μ)ᵀ Σ⁻¹ (x−μ)) with Σ = R diag(s²) Rᵀ (paper, section 2)."""
 
 from dataclasses import dataclass
 
@@ -19,8 +19,8 @@ _DENSITY_FLOOR = 1e-12
 class Gaussians:
     """A cloud of G Gaussians.
 
-    mean (G, 3) and scale (G, 3) in one unit of length (mm outside the reconstruction), x y z; unit quaternion (G, 4) w x y
-    z; density (G,) attenuation per that length. Raises InputError for other shapes, infinite values or NaN, and for scales
+    mean (G, 3) and scale (G, 3), x y z, in one unit of length (mm outside the reconstruction). Unit quaternion (G, 4), w x y
+    z. density (G,): attenuation per that length. Raises InputError for other shapes, infinite values or NaN, and for scales
     that are not above 0."""
 
     mean: np.ndarray
@@ -62,7 +62,7 @@ class Gaussians:
     def of_covariance(cls, mean: np.ndarray, covariance: np.ndarray, density: np.ndarray) -> "Gaussians":
         """Makes a cloud from means (G, 3), covariances (G, 3, 3) and densities (G,)."""
         variance, axes = np.linalg.eigh(covariance)
-        axes[:, :, 0] *= np.sign(np.linalg.det(axes))[:, None]  # a turn, not a mirror
+        axes[:, :, 0] *= np.sign(np.linalg.det(axes))[:, None]  # makes a rotation of a reflection
         x, y, z, w = scipy.spatial.transform.Rotation.from_matrix(axes).as_quat().T
         return cls(mean, np.sqrt(variance), np.stack([w, x, y, z], -1), density)
 
@@ -79,7 +79,7 @@ class Activation:
     scale_max: float
 
     def apply(self, raw: np.ndarray) -> np.ndarray:
-        """Returns parameter rows (11, G) for raw ones (11, G); the float64 twin of ``activate`` in cl/adam.cl."""
+        """Returns parameter rows (11, G) for raw rows (11, G). This is the float64 twin of ``activate`` in cl/adam.cl."""
         rows = np.array(raw, dtype=np.float64)
         rows[SCALE] = self.scale_min + (self.scale_max - self.scale_min) * scipy.special.expit(raw[SCALE])
         rows[QUATERNION] = raw[QUATERNION] / np.linalg.norm(raw[QUATERNION], axis=0)
@@ -87,7 +87,7 @@ class Activation:
         return rows
 
     def invert(self, rows: np.ndarray) -> np.ndarray:
-        """Returns raw rows (11, G) for parameter rows; scales stay a little inside their bounds."""
+        """Returns raw rows for parameter rows (11, G). Scales stay a little inside their bounds."""
         raw = np.array(rows, dtype=np.float64)
         span = self.scale_max - self.scale_min
         raw[SCALE] = scipy.special.logit(np.clip((rows[SCALE] - self.scale_min) / span, 1e-4, 1 - 1e-4))

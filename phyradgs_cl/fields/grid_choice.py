@@ -1,4 +1,4 @@
-"""The grid of a volume, where the user wants another than the scan's."""
+"""The grid that a user wants for a volume in place of the scan's grid."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,18 +11,19 @@ from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields.volume import MOST_VOXELS, Grid, triple
 
 _LARGEST_MM = 1e9
-_ROUNDING = 1e-6  # of a voxel: a box that ends at a voxel's face ends there, whatever its decimals
+_ROUNDING = 1e-6  # in voxels: a box that ends so near to a voxel's face ends at that face
 _TYPED = 0.01  # the same for a typed box and the scan's voxels, whose sides are rarely round numbers
 
 
 @dataclass(frozen=True)
 class GridChoice:
-    """How a volume's grid differs from the scan's. None keeps the scan's value, or takes the one that the others imply.
+    """How a volume's grid differs from the scan's. None keeps the scan's value, or takes the value that the others imply.
 
-    size: voxels (z, y, x), or one count along the longest side, with the others in proportion. voxel_mm: sides of a voxel
-    (z, y, x), or one length. roi_mm: the box (z0, z1, y0, y1, x0, x1) in the world frame, or its sides (z, y, x) or one side
-    of a cube, about the middle of the scan's grid. margin_mm: width (z, y, x), or on all sides, that methods reconstruct
-    beyond this box and discard.
+    - size: voxels (z, y, x), or one count along the longest side, with the others in proportion.
+    - voxel_mm: sides of a voxel (z, y, x), or one length.
+    - roi_mm: the box (z0, z1, y0, y1, x0, x1) in the world frame. Three sides (z, y, x), or the side of a cube, are a box
+      about the middle of the scan's grid.
+    - margin_mm: width (z, y, x), or on all sides, that methods reconstruct beyond this box and discard.
 
     Raises InputError for other values, a box that ends before it begins, and all of size, voxel_mm and roi_mm."""
 
@@ -58,9 +59,9 @@ class GridChoice:
             raise InputError("--size", "all three", expected, "leave one out")
 
     def of(self, grid: Grid) -> Grid:
-        """Returns the chosen grid in place of ``grid``; ``grid`` itself where nothing is chosen.
+        """Returns the chosen grid in place of ``grid``. Where nothing is chosen this is ``grid`` itself.
 
-        A box alone takes the voxels of ``grid`` that it meets by more than a hundredth, continued beyond ``grid``: the
+        A box alone takes the voxels of ``grid`` that it meets by more than a hundredth, continued beyond ``grid``. The
         volume is then a part of the one on ``grid``. A size alone keeps the box. A voxel alone keeps it too, with its sides
         rounded up to whole voxels. Raises InputError for too many voxels."""
         box_mm = self._box_mm(grid)
@@ -88,7 +89,7 @@ class GridChoice:
         return grid.part(triple(int(-n) for n in around), self._whole(grid.shape + 2 * around, "--margin-mm"))
 
     def _box_mm(self, grid: Grid) -> np.ndarray:
-        """Returns the ends (3, 2) of the chosen box, else those of ``grid``."""
+        """Returns the ends (3, 2) of the chosen box, or those of ``grid``."""
         if self.roi_mm is None:
             return grid.box_mm
         if len(self.roi_mm) == 6:
@@ -117,7 +118,7 @@ class GridChoice:
 
 
 def voxel_sides_mm(option: str, value: Any) -> tuple[float, float, float]:
-    """Returns sides of a voxel (z, y, x) in mm from one length or three. Raises InputError about ``option`` for others."""
+    """Returns the sides of a voxel (z, y, x) in mm from one length or three. InputError names ``option``."""
     sides_mm = _numbers(option, value, (1, 3), "0.5 or 1,0.5,0.5")
     for side_mm in sides_mm:
         checks.within(option, side_mm, 1 / _LARGEST_MM, _LARGEST_MM)
@@ -125,7 +126,7 @@ def voxel_sides_mm(option: str, value: Any) -> tuple[float, float, float]:
 
 
 def _numbers(option: str, value: Any, counts: tuple[int, ...], example: str) -> tuple[float, ...]:
-    """Returns a number, or a sequence of numbers, as finite floats; ``counts``: how many there may be."""
+    """Returns a number, or a sequence of numbers, as finite floats. ``counts``: how many there may be."""
     value = value.ravel().tolist() if isinstance(value, np.ndarray) else value  # Grid.box_mm is (3, 2)
     parts = value if isinstance(value, Sequence) and not isinstance(value, str) else [value]
     parts = [part.item() if isinstance(part, np.generic) else part for part in parts]

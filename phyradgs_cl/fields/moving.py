@@ -1,4 +1,4 @@
-"""An object that moves or changes: its volumes at some times, a gating signal, its volume in any state."""
+"""An object that moves or changes: its volumes at some times, a gating signal, and its volume in any state."""
 
 import os
 from collections.abc import Sequence
@@ -14,15 +14,17 @@ from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields.deformation import Deformation
 from phyradgs_cl.fields.volume import Grid, triple
 
-_SLAB_VOXELS = 1 << 18  # displaced by one thread at a time: their coordinates take six times the memory of the volume
+_SLAB_VOXELS = 1 << 18  # voxels that one thread displaces at a time: their coordinates need six times a volume's memory
 _BORDER = 8  # voxels of zeros around a volume: a spline's coefficients fall to 3e-5 within them
 
 
 @dataclass(frozen=True, eq=False)
 class States:
-    """Volumes of an object at some times. times_s: (K,) in s, rising, on the clock of the scan's frames. volumes:
-    (K, nz, ny, nx) float32 in 1/mm at these times, on the scan's grid. Raises InputError for shapes that do not fit, times
-    that do not rise, no state at all, and values that are not finite."""
+    """Volumes of an object at some times.
+
+    times_s: (K,) in s, rising, on the clock of the scan's frames. volumes: (K, nz, ny, nx) float32 in 1/mm at these times,
+    on the scan's grid. Raises InputError for shapes that do not fit, times that do not rise, values that are not finite, and
+    for no state at all."""
 
     times_s: np.ndarray
     volumes: np.ndarray
@@ -37,13 +39,13 @@ class States:
 
     @property
     def span_s(self) -> tuple[float, float]:
-        """The time that the states stand for, in s: half a step before the first one to half a step after the last one."""
+        """The time in s that the states describe, from half a step before the first to half a step after the last."""
         steps_s = np.diff(self.times_s) if len(self.times_s) > 1 else np.zeros(1)
         return float(self.times_s[0] - steps_s[0] / 2), float(self.times_s[-1] + steps_s[-1] / 2)
 
     def at(self, time_s: float) -> np.ndarray:
-        """Returns the volume (nz, ny, nx) float32 at a time: straight between two states, the first before, the last after
-        them. Raises InputError for anything but a finite number."""
+        """Returns the volume (nz, ny, nx) float32 at a time. It is interpolated linearly between two states; before the
+        first and after the last one it is constant. Raises InputError for anything but a finite number."""
         place = float(np.interp(checks.numbers("time_s", time_s, ()), self.times_s, np.arange(len(self.times_s))))
         first, share = int(place), np.float32(place - int(place))
         after = self.volumes[min(first + 1, len(self.volumes) - 1)]
@@ -52,16 +54,17 @@ class States:
 
 @dataclass(frozen=True, eq=False)
 class MovingTruth(States):
-    """True volumes of a simulated object. deformation: how the scan's reference became them; None where no field describes
-    it."""
+    """True volumes of a simulated object. deformation: of the scan's reference; None if no field describes it."""
 
     deformation: Deformation | None = None
 
 
 @dataclass(frozen=True, eq=False)
 class Gating:
-    """How far the object's motion is at some times. times_s: (n,) rising, on the clock of ``Scan.frame_start_s``.
-    values: (n,) of any unit and sign; with ``is_phase`` phases in cycles, which rise, and whose whole cycles do not count.
+    """A signal that tells how far the object's motion is at some times.
+
+    times_s: (n,) rising, on the clock of ``Scan.frame_start_s``. values: (n,) of any unit and sign. With ``is_phase`` they
+    are phases in cycles, which rise, and whose whole cycles do not count.
 
     Raises InputError for shapes that differ, values that are not finite, and times that do not rise."""
 
@@ -78,12 +81,12 @@ class Gating:
 
     @property
     def steps(self) -> np.ndarray:
-        """By how much each value (n − 1,) is exceeded by the next: from 0 to below 1 of phases."""
+        """The difference (n − 1,) from each value to the next. Of phases it is from 0 to below 1."""
         steps = np.diff(self.values)
         return steps % 1.0 if self.is_phase else steps
 
     def at(self, times_s: np.ndarray) -> np.ndarray:
-        """Returns the values (m,) at times (m,), straight between two stated ones; phases may be 1 or more."""
+        """Returns the values (m,) at times (m,), linear between two stated values. Phases may be 1 or more."""
         before = np.clip(np.searchsorted(self.times_s, times_s, "right") - 1, 0, len(self.times_s) - 1)
         lengths_s, steps = np.append(np.diff(self.times_s), 1.0), np.append(self.steps, 0.0)
         share = np.clip((np.asarray(times_s) - self.times_s[before]) / lengths_s[before], 0, 1)
@@ -94,7 +97,7 @@ def deformed(volume: np.ndarray, grid: Grid, deformation: Deformation, weights: 
     """Returns the object (nz, ny, nx) float32 in 1/mm at one state's weights (R,), as ``deformation.weights_at`` gives them.
 
     It is v(y + w(y)) at every voxel centre y, by cubic splines through the voxels of the reference ``volume`` (nz, ny, nx)
-    in 1/mm on ``grid``, 0 outside of it. A state at rest is the volume itself. Raises InputError for shapes that do not
+    in 1/mm on ``grid``. Outside of it v is 0. A state at rest is the volume itself. Raises InputError for shapes that do not
     fit."""
     if not isinstance(deformation, Deformation):
         raise InputError("deformation", checks.short_repr(deformation), "a Deformation")
@@ -104,9 +107,9 @@ def deformed(volume: np.ndarray, grid: Grid, deformation: Deformation, weights: 
 
 
 class SplineVolume:
-    """A volume (nz, ny, nx) float32 in 1/mm with values between its voxels too: cubic splines through them, 0 outside.
+    """A volume (nz, ny, nx) float32 in 1/mm with values between its voxels too, by cubic splines. Outside it is 0.
 
-    Splines undershoot beside edges: no value is below the least voxel, or 0."""
+    Splines undershoot near edges, so values are limited to the least voxel, or 0, from below."""
 
     def __init__(self, volume: np.ndarray, grid: Grid) -> None:
         self.volume, self.grid = volume, grid
@@ -114,8 +117,8 @@ class SplineVolume:
         self._coefficients: np.ndarray | None = None
 
     def deformed(self, deformation: Deformation, weights: np.ndarray) -> np.ndarray:
-        """Returns v(y + w(y)) (nz, ny, nx) float32 of every voxel centre y, for the weights (R,) of a state. A state at rest
-        is the volume itself."""
+        """Returns v(y + w(y)) (nz, ny, nx) float32 at every voxel centre y, for a state's weights (R,). At rest it is the
+        volume."""
         if not np.any(deformation.reach_mm * np.abs(weights)):
             return self.volume
         if self._coefficients is None:
@@ -129,7 +132,7 @@ class SplineVolume:
         return np.concatenate(slabs)
 
     def _slab(self, deformation: Deformation, weights: np.ndarray, first: int, part: Grid) -> np.ndarray:
-        """Returns the deformed slices of ``part`` of the grid, from slice ``first`` on."""
+        """Returns the deformed slices of ``part`` of the grid. ``first``: its first slice."""
         shift = deformation.on_grid_mm(part, weights) / np.array(self.grid.voxel_size_mm[::-1], np.float32)
         nz, ny, nx = part.shape
         voxels = np.ogrid[first : first + nz, :ny, :nx]

@@ -11,8 +11,8 @@ from phyradgs_cl import checks
 from phyradgs_cl.errors import InputError
 
 MOST_VOXELS = 2**38
-"""A terabyte of float32: larger requests come from damaged files."""
-_SAME_PLACE = 1e-3  # of a voxel, for grids stored in float32
+"""The most voxels of a grid: a terabyte of float32. Larger requests come from damaged files."""
+_SAME_PLACE = 1e-3  # voxels by which grids stored in float32 may differ
 T = TypeVar("T")
 
 
@@ -24,10 +24,10 @@ def triple(values: Iterable[T]) -> tuple[T, T, T]:
 
 @dataclass(frozen=True)
 class Grid:
-    """A box of voxels centred at ``offset_mm``; all triples run (z, y, x) like the arrays.
+    """A box of voxels centred at ``offset_mm``. All triples are (z, y, x), like the arrays.
 
-    shape: counts. voxel_size_mm: sides of a voxel in mm. Raises InputError for counts below 1, for lengths that are not
-    finite, and for sides that are not above 0."""
+    shape: counts. voxel_size_mm: sides of a voxel in mm. Raises InputError for counts below 1, lengths that are not finite,
+    and sides that are not above 0."""
 
     shape: tuple[int, int, int]
     voxel_size_mm: tuple[float, float, float]
@@ -66,7 +66,7 @@ class Grid:
 
     @property
     def half_longest_mm(self) -> float:
-        """Half the longest side: the unit of length inside the reconstruction."""
+        """Half the longest side, which is the unit of length inside the reconstruction."""
         return max(self.size_mm) / 2
 
     @property
@@ -81,7 +81,7 @@ class Grid:
         return triple(first + np.arange(n) * d for first, n, d in sides)
 
     def is_close(self, other: "Grid") -> bool:
-        """Returns whether two grids are equal but for the rounding of files."""
+        """Returns whether two grids are equal up to the rounding of files."""
         near_mm = 1e-5 * max(self.size_mm)
         same_voxels = np.allclose(self.voxel_size_mm, other.voxel_size_mm, rtol=1e-5)
         return self.shape == other.shape and same_voxels and np.allclose(self.offset_mm, other.offset_mm, atol=near_mm)
@@ -92,7 +92,7 @@ class Grid:
         return Grid(shape, self.voxel_size_mm, triple(first + (s + (n - 1) / 2) * d for first, s, n, d in sides))
 
     def slices_in(self, whole: "Grid") -> tuple[slice, slice, slice] | None:
-        """Returns the place (z, y, x) of this grid in ``whole``; None where it is no part of it."""
+        """Returns the place (z, y, x) of this grid in ``whole``, or None where it is no part of it."""
         if not np.allclose(self.voxel_size_mm, whole.voxel_size_mm, rtol=1e-5):
             return None
         exact = np.subtract(self.first_centre_mm, whole.first_centre_mm) / whole.voxel_size_mm

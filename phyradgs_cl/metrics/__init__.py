@@ -1,4 +1,4 @@
-"""How close a reconstruction is to the truth."""
+"""Compares a reconstruction with the truth."""
 
 from phyradgs_cl.metrics.align import (
     VOXEL_BY_VOXEL,

@@ -1,4 +1,4 @@
-"""A volume and its truth on one grid: the rule by which every PSNR compares them."""
+"""Brings a volume and its truth to one grid, by the rule that every PSNR follows."""
 
 import math
 from dataclasses import dataclass
@@ -11,13 +11,13 @@ from phyradgs_cl.fields import Grid, triple
 
 Values = NDArray[np.floating]
 VOXEL_BY_VOXEL = "voxel by voxel"
-_ROUNDING = 1e-6  # of a voxel
+_ROUNDING = 1e-6  # in voxels
 
 
 @dataclass(frozen=True, eq=False)
 class Aligned:
-    """A volume and a reference (nz, ny, nx), both on ``grid``. ``how``: how they were brought there, in words. ``share``: of
-    the reference's box that is compared."""
+    """A volume and a reference (nz, ny, nx), both on ``grid``. ``how``: how they were brought there, in words. ``share``:
+    the compared fraction of the reference's box."""
 
     volume: Values
     reference: Values
@@ -27,7 +27,7 @@ class Aligned:
 
 
 def aligned(volume: Values, grid: Grid, reference: Values, reference_grid: Grid) -> Aligned | None:
-    """Brings both volumes (nz, ny, nx) to one grid; None where no voxel centre of the reference lies in the volume's box.
+    """Brings both volumes (nz, ny, nx) to one grid. None: the boxes share no voxel centre.
 
     Where the volume's voxels are whole blocks of the reference's, the reference is averaged over the blocks. Any other
     volume is resampled trilinearly onto the reference's voxels that lie in its box."""
@@ -50,14 +50,14 @@ def aligned(volume: Values, grid: Grid, reference: Values, reference_grid: Grid)
 
 
 def overlap(one: Grid, other: Grid) -> tuple[float, float]:
-    """Returns the volume that two boxes share, as a fraction of each."""
+    """Returns the volume that two boxes share, as a fraction of each box."""
     low, high = np.maximum(one.box_mm[:, 0], other.box_mm[:, 0]), np.minimum(one.box_mm[:, 1], other.box_mm[:, 1])
     shared_mm3 = float(np.prod(np.maximum(high - low, 0)))
     return shared_mm3 / math.prod(one.size_mm), shared_mm3 / math.prod(other.size_mm)
 
 
 def reference_on(grid: Grid, reference: Values, reference_grid: Grid) -> Values | None:
-    """Returns the reference (nz, ny, nx) on ``grid`` by the rule of ``aligned``; None where that resamples the volume."""
+    """Returns the reference (nz, ny, nx) on ``grid`` by the rule of ``aligned``; None if that resamples the volume."""
     if grid.is_close(reference_grid):
         return reference
     blocks = _blocks(grid, reference_grid)
@@ -65,7 +65,7 @@ def reference_on(grid: Grid, reference: Values, reference_grid: Grid) -> Values 
 
 
 def block_means(values: Values, factors: tuple[int, int, int]) -> Values:
-    """Returns means over blocks of ``factors`` (z, y, x) voxels of a volume that whole blocks fill."""
+    """Returns means over blocks of ``factors`` (z, y, x) voxels of a volume that consists of whole blocks."""
     if factors == (1, 1, 1):
         return values
     split = [part for n, factor in zip(values.shape, factors, strict=True) for part in (n // factor, factor)]
@@ -73,9 +73,9 @@ def block_means(values: Values, factors: tuple[int, int, int]) -> Values:
 
 
 def in_words(grid: Grid) -> str:
-    """Describes a grid in a few words, in the order x y z, as all texts for users do."""
+    """Describes a grid in a few words. The order is x y z, as in all texts for users."""
     sizes, offsets = (v[::-1] for v in (grid.voxel_size_mm, grid.offset_mm))
-    digits = 3 - math.floor(math.log10(min(sizes)))  # a thousandth of a voxel is no offset
+    digits = 3 - math.floor(math.log10(min(sizes)))  # an offset below a thousandth of a voxel is not shown
     words = f"{_times(grid.shape)} voxels (x y z) of {'×'.join(f'{s:.4g}' for s in sizes)} mm"
     return f"{words} about ({', '.join(f'{round(o, digits) + 0.0:g}' for o in offsets)}) mm"
 
@@ -92,7 +92,7 @@ def _blocks(grid: Grid, finer: Grid) -> tuple[tuple[int, int, int], tuple[slice,
 
 
 def shared_slices(onto: Grid, grid: Grid) -> tuple[slice, slice, slice] | None:
-    """Returns the block (z, y, x) of voxels of ``onto`` whose centres lie in the box of ``grid``; None without any."""
+    """Returns the block (z, y, x) of voxels of ``onto`` whose centres lie in the box of ``grid``; None if there are none."""
     block = []
     for centres_mm, (low_mm, high_mm), side_mm in zip(onto.axes_mm(), grid.box_mm, onto.voxel_size_mm, strict=True):
         rounding_mm = _ROUNDING * side_mm
@@ -104,9 +104,9 @@ def shared_slices(onto: Grid, grid: Grid) -> tuple[slice, slice, slice] | None:
 
 
 def resampled(volume: NDArray[np.floating], grid: Grid, onto: Grid) -> tuple[NDArray[np.float32], float]:
-    """Samples a volume (nz, ny, nx) trilinearly at the voxel centres of another grid, 0 outside its box.
+    """Samples a volume (nz, ny, nx) trilinearly at the voxel centres of another grid. Outside its box it is 0.
 
-    Between the outermost centres and the faces the value is that of the centres. The second result is the fraction of the
+    Between the outermost centres and the faces, the value is that of the centres. The second result is the fraction of the
     voxels of ``onto`` that lie in the box."""
     step = np.divide(onto.voxel_size_mm, grid.voxel_size_mm)
     first = np.subtract(onto.first_centre_mm, grid.first_centre_mm) / grid.voxel_size_mm

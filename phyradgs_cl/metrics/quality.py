@@ -1,8 +1,8 @@
-"""How close a volume is to the truth: peak signal-to-noise ratio and structural similarity. How well a motion is known.
+"""Compares a volume with the truth, by peak signal-to-noise ratio and structural similarity, and a motion with the true one.
 
 SSIM (Z. Wang et al., IEEE Trans. Image Process. 13(4), 600-612, 2004) is taken in 2D with an 11×11 Gaussian window of sigma
 1.5 and zeros beyond the border. It is averaged over the slices of each axis whose truth is not empty, then over the axes, as
-in the published tables of radiative Gaussian splatting. Also a figure of the three middle slices beside the truth."""
+in the published tables of radiative Gaussian splatting. A figure shows the three middle slices beside the truth."""
 
 import math
 from collections.abc import Iterator, Mapping
@@ -27,10 +27,10 @@ Array = NDArray[np.float64]
 Floats = NDArray[np.floating]
 WINDOW, SIGMA = 11, 1.5
 K1, K2 = 0.01, 0.03
-_VOXELS_PER_BATCH = 1 << 20  # about ten float64 arrays of this size live at once: 80 MB
-_EDGE = 0.25  # of the steepest slope: voxels at which a displacement can be seen
+_VOXELS_PER_BATCH = 1 << 20  # about ten float64 arrays of this size exist at once: 80 MB
+_EDGE = 0.25  # fraction of the steepest slope: at such voxels a displacement can be seen
 _MOST_POINTS = 2000
-_INCH, _DPI = 3.2, 110  # of the figure of slices
+_INCH, _DPI = 3.2, 110  # inches and dots per inch of the figure of slices
 
 
 @dataclass(frozen=True)
@@ -47,18 +47,18 @@ class Metric:
 
     @property
     def heading(self) -> str:
-        """The title and the unit, for a column of a table."""
+        """The title and the unit, as the head of a table's column."""
         return f"{self.title} ({self.unit})" if self.unit else self.title
 
 
 METRICS = {"psnr_db": Metric("PSNR", "dB", ".2f"), "ssim": Metric("SSIM", "", ".4f")}
 """The results of ``compare`` that are printed."""
 HELD_OUT = {"holdout_rms": Metric("held-out RMS", "", ".4g"), "holdout_noise_rms": Metric("noise RMS", "", ".4g")}
-"""The errors on pixels that the method did not see, in line integrals, where a run has held out some."""
+"""The errors in line integrals on pixels that the method did not see, for runs that have held out some."""
 
 
 def printed(metrics: Mapping[str, object], names: Mapping[str, Metric] = METRICS) -> Iterator[tuple[str, str]]:
-    """Yields (title, value with unit) of the metrics that are there and are numbers."""
+    """Yields (title, value with unit) of the metrics that are present and are numbers."""
     for name, metric in names.items():
         value = metrics.get(name)
         if isinstance(value, int | float):
@@ -66,7 +66,8 @@ def printed(metrics: Mapping[str, object], names: Mapping[str, Metric] = METRICS
 
 
 def compare(volume: np.ndarray, reference: np.ndarray) -> dict[str, float]:
-    """Returns psnr_db in dB, ssim (3D) and data_range, the maximum of ``reference``; volume and reference are (z, y, x).
+    """Returns psnr_db in dB, ssim (3D) and data_range, the maximum of ``reference``. volume, reference: (z, y, x).
+
     Raises InputError for an empty reference, shapes that differ, NaN and infinity."""
     for name, values in {"volume": volume, "reference": reference}.items():
         if not isinstance(values, np.ndarray):
@@ -79,12 +80,12 @@ def compare(volume: np.ndarray, reference: np.ndarray) -> dict[str, float]:
 
 
 def psnr(result: ArrayLike, reference: ArrayLike, data_range: float | None = None) -> float:
-    """Returns 10 · log10(data_range² / mean squared error) in dB over all voxels, without clipping; infinity for equals.
+    """Returns 10 · log10(data_range² / mean squared error) in dB over all voxels, without clipping. Equal arrays: infinity.
 
-    ``data_range``: by default the reference's maximum. Raises InputError for shapes that differ, NaN or infinity, and a
-    range that is not positive."""
+    ``data_range``: by default the reference's maximum. Raises InputError for shapes that differ, NaN, infinity, and a range
+    not above 0."""
     a, b, peak = checked_pair(result, reference, data_range)
-    # A slice at a time: float64 copies of whole volumes would triple the memory.
+    # One slice at a time: float64 copies of whole volumes would triple the memory.
     squares = sum(float(np.sum((p.astype(np.float64) - q) ** 2)) for p, q in zip(a, b, strict=True))
     return math.inf if squares == 0 else 10 * math.log10(peak**2 * a.size / squares)
 
@@ -103,7 +104,7 @@ def checked_pair(result: ArrayLike, reference: ArrayLike, data_range: float | No
 
 
 def ssim(result: ArrayLike, reference: ArrayLike, data_range: float | None = None) -> float:
-    """Returns the mean structural similarity, at most 1, of two volumes (z, y, x); slices with an empty truth do not count.
+    """Returns the mean structural similarity, at most 1, of two volumes (z, y, x). Slices with an empty truth do not count.
 
     ``data_range``: L in C1 = (0.01 L)², C2 = (0.03 L)², by default the reference's maximum. Raises InputError for arrays
     that are not 3D, shapes that differ, NaN or infinity, and a range that is not positive."""
@@ -125,7 +126,7 @@ def ssim_map(result: ArrayLike, reference: ArrayLike, data_range: float) -> Arra
 
 
 def _along_axis(result: Floats, reference: Floats, peak: float, axis: int) -> float:
-    """Returns the mean over the slices across ``axis`` that are not empty in the reference."""
+    """Returns the mean over those slices across ``axis`` that are not empty in the reference."""
     a, b = np.moveaxis(result, axis, 0), np.moveaxis(reference, axis, 0)
     full = np.flatnonzero(b.any(axis=(1, 2)))
     if full.size == 0:
@@ -137,7 +138,7 @@ def _along_axis(result: Floats, reference: Floats, peak: float, axis: int) -> fl
 
 
 def _blur(images: Array) -> Array:
-    """Applies the Gaussian window over the last two axes, with zeros outside; the whole window sums to 1."""
+    """Applies the Gaussian window over the last two axes, with zeros outside. The whole window sums to 1."""
     offsets = np.arange(WINDOW) - WINDOW // 2
     weights = np.exp(-0.5 * (offsets / SIGMA) ** 2)
     weights /= weights.sum()
@@ -146,7 +147,7 @@ def _blur(images: Array) -> Array:
 
 
 def edge_points_mm(volume: np.ndarray, grid: Grid) -> np.ndarray:
-    """Returns centres (n, 3), x y z, of voxels of a volume (nz, ny, nx) at which it changes steeply, at most 2,000."""
+    """Returns the centres (n, 3), x y z, of at most 2,000 voxels at which a volume (nz, ny, nx) changes steeply."""
     axes = [axis for axis, count in enumerate(volume.shape) if count > 1]
     slopes = [np.gradient(volume, grid.voxel_size_mm[axis], axis=axis) for axis in axes]
     steepness = np.sqrt(np.sum(np.square(slopes), axis=0)) if axes else np.zeros(volume.shape)
@@ -156,9 +157,9 @@ def edge_points_mm(volume: np.ndarray, grid: Grid) -> np.ndarray:
 
 
 def displaced_mm(deformation: Deformation, points_mm: np.ndarray, times_s: np.ndarray) -> np.ndarray:
-    """Returns how far the matter at points (n, 3) at the first of K times has gone at the others, (K − 1, n, 3) in mm.
+    """Returns the displacement (K − 1, n, 3) in mm, from the first of K times to the others, of matter at points (n, 3).
 
-    This does not depend on the state that the reference volume shows: two descriptions of one motion give the same."""
+    It does not depend on the state that the reference volume shows: two descriptions of one motion give the same result."""
     weights = deformation.weights_at(times_s)
     reference_mm = points_mm + deformation.displacement_mm(points_mm, weights[0])
     return np.stack([reference_mm + deformation.inverse_mm(reference_mm, other) - points_mm for other in weights[1:]])
@@ -167,8 +168,9 @@ def displaced_mm(deformation: Deformation, points_mm: np.ndarray, times_s: np.nd
 def motion_error_mm(
     estimate: Deformation, truth: Deformation, points_mm: np.ndarray, times_s: np.ndarray
 ) -> tuple[float, float]:
-    """Returns mean and 95th percentile of the distance, in mm, between where matter at ``points_mm`` at the first time is at
-    the other times, by both. Raises InputError for less than two times."""
+    """Returns mean and 95th percentile of the distance in mm between two motions of matter, first at ``points_mm``.
+
+    The distance is taken at the other times. Raises InputError for less than two times."""
     if len(times_s) < 2:
         raise InputError("states", str(len(times_s)), "at least two, between which the object moves")
     error_mm = displaced_mm(estimate, points_mm, times_s) - displaced_mm(truth, points_mm, times_s)
@@ -177,14 +179,14 @@ def motion_error_mm(
 
 
 def slices_png(path: str | Path, result: ArrayLike, reference: ArrayLike, title: str) -> None:
-    """Writes a PNG: a row for each middle slice, the columns result, truth and difference. z and y point up.
+    """Writes a PNG with a row for each middle slice, and columns for result, truth and difference. z and y point up.
 
-    Grey values run over the truth's range, so that a wrong gain shows. The difference has its own scale, symmetric about 0.
-    result, reference: (z, y, x). ``title``: the heading's first line. Raises InputError for shapes that differ, NaN and
+    Grey values extend over the truth's range, so that a wrong gain shows. The difference has its own scale, symmetric about
+    0. result, reference: (z, y, x). ``title``: the heading's first line. Raises InputError for shapes that differ, NaN and
     infinity, and OutputError for a file that cannot be written."""
     volume, truth = np.asarray(result), np.asarray(reference)
     figure = new_figure(3 * _INCH * 1.25, 3 * _INCH + 0.6)
-    figure.suptitle(plain_text(f"{title}\n{_scores(volume, truth)}"), parse_math=False)  # a dollar in a file's name is one
+    figure.suptitle(plain_text(f"{title}\n{_scores(volume, truth)}"), parse_math=False)  # a dollar is no formula
     draw_slices(figure, volume, truth, None)
     try:
         figure.savefig(path, dpi=_DPI, format="png")

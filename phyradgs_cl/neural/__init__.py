@@ -1,6 +1,6 @@
-"""Attenuation as a neural field: hash encoding, networks, rays over an exposure, training. The only room built on PyTorch.
+"""Attenuation as a neural field: hash encoding, networks, rays over an exposure, training. Only this room uses PyTorch.
 
-PyTorch is an optional package: this module and ``options`` load without it, the others need it."""
+PyTorch is an optional package. This module and ``options`` load without it; the other modules need it."""
 
 import importlib.util
 
@@ -17,6 +17,6 @@ def has_torch() -> bool:
 
 
 def require_torch(subject: str) -> None:
-    """Raise InputError that says what to install, unless PyTorch is there."""
+    """Raises InputError that says what to install, unless PyTorch is there."""
     if not has_torch():
         raise InputError(subject, "no PyTorch", "the package torch", INSTALL)

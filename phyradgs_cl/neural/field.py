@@ -1,5 +1,5 @@
-"""The field that is fitted: positions in the volume's cube to attenuation, its first parameters, its values on a grid; and
-PyTorch's devices and tensors: the device of a run, repeatable arithmetic, NumPy's arrays by DLPack."""
+"""The field that is fitted: it maps positions in the volume's cube to attenuation. Also its first parameters, its values on
+a grid, and PyTorch's devices and tensors."""
 
 import os
 from collections.abc import Iterator
@@ -15,11 +15,11 @@ from phyradgs_cl.fields import Grid, triple
 from phyradgs_cl.neural.networks import AttenuationNetwork, HashEncoding, network_of
 from phyradgs_cl.neural.options import LineOptions, NeuralOptions
 
-_ORDERS = ((0, 1, 2), (1, 2, 0), (2, 0, 1))  # of a volume's axes z, y, x
+_ORDERS = ((0, 1, 2), (1, 2, 0), (2, 0, 1))  # orders of a volume's axes z, y, x
 
 
 def torch_device(name: str) -> torch.device:
-    """``cpu``, ``cuda`` (ROCm too), ``mps``, or for ``auto`` the first available of cuda, mps, cpu.
+    """Returns the device ``cpu``, ``cuda`` (ROCm too) or ``mps``. ``auto`` takes the first available of cuda, mps, cpu.
 
     Raises DeviceError for a device that this PyTorch does not have."""
     is_available = {"cuda": torch.cuda.is_available(), "mps": torch.backends.mps.is_available(), "cpu": True}
@@ -36,7 +36,7 @@ def torch_device(name: str) -> torch.device:
 def repeatable(device: torch.device) -> Iterator[None]:
     """Makes PyTorch use algorithms that give the same bits in every run.
 
-    On CPUs the sums of this room have a fixed order anyway, and the switch would only slow them down."""
+    On CPUs the sums of this room have a fixed order anyway. The switch would only slow them down."""
     if device.type != "cuda":
         yield
         return
@@ -50,19 +50,19 @@ def repeatable(device: torch.device) -> Iterator[None]:
 
 
 def to_tensor(array: np.ndarray, device: torch.device) -> torch.Tensor:
-    """A tensor of the array's own type and shape on ``device``; never the array's memory."""
+    """Returns a tensor of the array's own type and shape on ``device``. It never shares the array's memory."""
     return torch.from_dlpack(np.array(array, order="C")).to(device)
 
 
 def to_array(tensor: torch.Tensor) -> np.ndarray:
-    """An array of the tensor's values, of the same type and shape."""
+    """Returns an array of the tensor's values, with the same type and shape."""
     return np.from_dlpack(tensor.detach().to("cpu").contiguous()).copy()
 
 
 class NeuralField(nn.Module):
     """Attenuation (P,) of positions (P, 3) x y z, in [−1, 1] along the longest side of the volume.
 
-    ``segment``: neighbours among the positions that belong together; 1 where every position stands for itself."""
+    ``segment``: the number of neighbouring positions that belong together; 1 where every position stands for itself."""
 
     def __init__(self, encoding: HashEncoding, network: AttenuationNetwork, segment: int = 1) -> None:
         super().__init__()
@@ -75,10 +75,10 @@ class NeuralField(nn.Module):
 def voxel_values(
     field: NeuralField, grid: Grid, device: torch.device, points_at_once: int, points: int = 1
 ) -> np.ndarray:
-    """The field in all voxels (nz, ny, nx) float32; ``grid`` in units of half the longest side, centred.
+    """Returns the field in all voxels (nz, ny, nx) float32. ``grid``: centred, in units of half the longest side.
 
-    A voxel is the mean over ``points``³ points, the centres of its equal parts. With segments a point's value depends on its
-    neighbours along the segment; it is then the mean over segments along x, y and z."""
+    A voxel is the mean over ``points``³ points, the centres of its equal parts. With segments, a point's value depends on
+    its neighbours along the segment. It is then the mean over segments along x, y and z."""
     orders = _ORDERS if field.segment > 1 else _ORDERS[:1]
     values = np.zeros(grid.shape, np.float32)
     for order in orders:
@@ -93,15 +93,15 @@ def _in_rows(
     field: NeuralField, grid: Grid, order: tuple[int, int, int], device: torch.device, points_at_once: int,
     points: int,
 ) -> np.ndarray:
-    """The voxels of a grid whose axes are z, y, x in another ``order``, with segments along its last.
+    """Returns the voxels of a grid whose axes are z, y, x in another ``order``, with segments along the last axis.
 
-    A row's last segment is filled up beyond its end."""
+    A row's last segment is filled up beyond the row's end."""
     fine = grid.finer(points)
     slow, middle, fast = fine.axes_mm()
     filled = ceil_div(fast.size, field.segment) * field.segment
     fast = np.concatenate([fast, fast[-1] + fine.voxel_size_mm[2] * np.arange(1, filled - fast.size + 1)])
     slows, middles, fasts = grid.shape
-    rows: np.ndarray = np.empty((slows, middles, points, points, 2))  # rows of points, row of voxels by row of voxels
+    rows: np.ndarray = np.empty((slows, middles, points, points, 2))  # rows of points, for one row of voxels after the other
     rows[..., 0], rows[..., 1] = slow.reshape(slows, 1, points, 1), middle.reshape(1, middles, 1, points)
     rows = rows.reshape(slows * middles, points**2, 2)
     values = np.empty((slows * middles, fasts), np.float32)
@@ -119,7 +119,7 @@ def _in_rows(
 
 
 def first_field(options: NeuralOptions, longest_voxels: int, seed: int) -> NeuralField:
-    """Returns SAX-NeRF's field for ``LineOptions``, else NAF's, for the voxels along a volume's longest side.
+    """Returns SAX-NeRF's field for ``LineOptions``, otherwise NAF's, for the number of voxels along a volume's longest side.
 
     The same seed gives the same parameters on every device."""
     with torch.random.fork_rng(devices=[]):

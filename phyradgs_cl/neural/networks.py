@@ -1,5 +1,5 @@
-"""The layers of a neural field: the hash encoding of positions, and the networks from its features to attenuation, NAF's and
-SAX-NeRF's with attention along line segments.
+"""The layers of a neural field: the hash encoding of positions, and the networks that map its features to attenuation. They
+are NAF's, and SAX-NeRF's with attention along line segments.
 
 Encoding: Müller, Evans, Schied, Keller, ACM Trans. Graph. 41 (2022) 102. NAF: Zha, Zhang, Li, "NAF: Neural Attenuation
 Fields for Sparse-View CBCT Reconstruction", MICCAI 2022. SAX-NeRF: Cai, Wang, Yuille, Zhou, Wang, "Structure-Aware
@@ -13,13 +13,13 @@ from torch import nn
 
 from phyradgs_cl.neural.options import LineOptions, NeuralOptions
 
-_WIDER = 4  # of the feed-forward layers
-_FACTORS = (1, 2_654_435_761, 805_459_861)  # of x, y, z in the hash (Müller et al., Eq. 4)
-_FIRST_FEATURES = 1e-4  # uniform in ± this (Müller et al., NAF)
+_WIDER = 4  # width of the feed-forward layers over that of the others
+_FACTORS = (1, 2_654_435_761, 805_459_861)  # factors of x, y, z in the hash (Müller et al., Eq. 4)
+_FIRST_FEATURES = 1e-4  # the first features are uniform in ± this (Müller et al., NAF)
 
 
 class LineAttention(nn.Module):
-    """Multi-head attention within segments of ``segment`` neighbours of (P, width); P is a multiple of it."""
+    """Multi-head attention within segments of ``segment`` neighbours, for values (P, width). ``segment`` divides P."""
 
     def __init__(self, width: int, segment: int, heads: int, head_width: int) -> None:
         super().__init__()
@@ -39,12 +39,12 @@ class LineAttention(nn.Module):
         return self.to_output(mixed.reshape(values.shape[0], -1))
 
     def _by_head(self, values: torch.Tensor) -> torch.Tensor:
-        """(P, inner) as (P / segment, segment, heads, head_width)."""
+        """Returns values (P, inner) as (P / segment, segment, heads, head_width)."""
         return values.reshape(-1, self.segment, self.heads, values.shape[1] // self.heads)
 
 
 class LineAttentionBlocks(nn.Module):
-    """Attention and feed-forward layers in turn, each after a layer norm and beside an identity; (P, width) to the same."""
+    """Attention and feed-forward layers in turn, each after a layer norm and beside an identity. Shapes stay (P, width)."""
 
     def __init__(self, width: int, segment: int, heads: int, head_width: int, blocks: int) -> None:
         super().__init__()
@@ -71,8 +71,8 @@ class LineAttentionBlocks(nn.Module):
 class AttenuationNetwork(nn.Module):
     """Attenuation (P,) from features (P, inputs), in the units of ``options.density_bound``.
 
-    ``middle`` are the modules between the first and the last layer, ``skip`` the place among all layers where the
-    features come in again; leaky ReLU follows every layer but the last."""
+    ``middle``: the modules between the first and the last layer. ``skip``: the place among all layers where the features
+    enter again. Leaky ReLU follows every layer but the last."""
 
     def __init__(self, inputs: int, middle: list[nn.Module], skip: int, options: NeuralOptions) -> None:
         super().__init__()
@@ -98,8 +98,9 @@ class AttenuationNetwork(nn.Module):
 
 
 def network_of(inputs: int, options: NeuralOptions) -> AttenuationNetwork:
-    """Returns NAF's linear layers; for ``LineOptions`` line-segment attention takes the place of every one in the middle but
-    the one after the skip. There, in the middle of three and more layers, the encoding comes in again."""
+    """Returns NAF's linear layers. For ``LineOptions``, line-segment attention takes the place of the layers in the middle.
+
+    In the middle of three or more layers the encoding enters again. The layer after this skip stays linear."""
     skip, width = options.layers // 2 if options.layers > 2 else 0, options.width
     middle: list[nn.Module] = []
     for number in range(1, options.layers - 1):
@@ -113,7 +114,7 @@ def network_of(inputs: int, options: NeuralOptions) -> AttenuationNetwork:
 class HashEncoding(nn.Module):
     """Features (P, levels · features) of positions (P, 3) in [0, 1]³, interpolated linearly between a level's corners.
 
-    A level whose corners fit into 2^table_log2 entries has one for each, another shares entries by a hash."""
+    A level has an entry for each corner if its corners fit into 2^table_log2 entries. Otherwise they share by a hash."""
 
     def __init__(
         self, levels: int, features: int, base_resolution: int, growth: float, table_log2: int
@@ -128,7 +129,7 @@ class HashEncoding(nn.Module):
 
     @property
     def width(self) -> int:
-        """Features of a position."""
+        """The number of features of a position."""
         return len(self.sizes) * self.features
 
     def forward(self, positions: torch.Tensor) -> torch.Tensor:
@@ -143,7 +144,7 @@ class HashEncoding(nn.Module):
 
 
 def corners(positions: torch.Tensor, cells: int, size: int) -> tuple[torch.Tensor, torch.Tensor]:
-    """Entries (8, P) int64 and weights (8, P) of the corners around positions (P, 3), on a level of ``cells``³ cells."""
+    """Returns entries (8, P) int64 and weights (8, P) of the corners around positions (P, 3), of a level."""
     scaled = positions.t() * cells
     low = scaled.floor().clamp_(0, cells - 1)
     high_share = scaled - low  # (3, P)
@@ -165,13 +166,13 @@ def _corner_shape(axis: int) -> tuple[int, int, int, int]:
 
 
 def weighted_rows(table: torch.Tensor, index: torch.Tensor, weight: torch.Tensor) -> torch.Tensor:
-    """Σ weight · table[index] over the last axis of index (B, 8): ``embedding_bag``, which some devices lack."""
+    """Returns Σ weight · table[index] over the last axis of index (B, 8). Some devices lack ``embedding_bag``."""
     rows = table.index_select(0, index.reshape(-1)).reshape(*index.shape, table.shape[1])
     return torch.einsum("bkf,bk->bf", rows, weight)
 
 
 class _Interpolate(torch.autograd.Function):
-    """Σ weight · table[index] over the 8 corners (B, 8) of each bag; the gradient sums into the table in one fixed order."""
+    """Σ weight · table[index] over the 8 corners (B, 8) of each bag. The gradient sums into the table in one fixed order."""
 
     @staticmethod
     def forward(ctx: Any, table: torch.Tensor, index: torch.Tensor, weight: torch.Tensor) -> torch.Tensor:

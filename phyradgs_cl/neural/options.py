@@ -1,4 +1,4 @@
-"""Options of the neural methods, with their ranges. Loads without PyTorch."""
+"""Options of the neural methods with their ranges. This module loads without PyTorch."""
 
 import math
 from dataclasses import dataclass
@@ -14,8 +14,8 @@ JITTERS = ("ray", "sample", "none")
 LAST_ACTIVATIONS = ("sigmoid", "leaky-relu")
 TORCH_DEVICES = ("auto", "cpu", "cuda", "mps")
 CELLS_PER_VOXEL = 1.0  # of the finest level
-SAMPLES_PER_VOXEL = 1.5  # NAF: 192 samples for 128 voxels
-SAMPLES_PER_TIME = 1.2  # of each of several: what counts is the mean over their rays
+SAMPLES_PER_VOXEL = 1.5  # NAF takes 192 samples for 128 voxels
+SAMPLES_PER_TIME = 1.2  # for a pixel with several times, where only the mean over their rays counts
 
 _FINEST = 2**24  # cells along a side: beyond it float32 coordinates have no fractions
 
@@ -24,18 +24,21 @@ _FINEST = 2**24  # cells along a side: beyond it float32 coordinates have no fra
 class NeuralOptions:
     """A field on a hash encoding and a small network, fitted to rays.
 
-    iterations: passes over all frames, with one step per frame. rays: pixels per step. samples: along a ray inside the
-    volume; 0: 1.5 per voxel of the longest side, 1.2 for a ray of several times. jitter: random shift of the samples: one
-    per ``ray``, one per ``sample`` inside its own interval, or ``none``. times: how many times of a line a step uses, drawn
-    for each pixel; 0: all of them. positive_only: use only pixels with a line integral above 0. voxel_points: points along
-    each side of a voxel, whose value is the field's mean over them.
+    - iterations: passes over all frames, with one step per frame. rays: pixels per step.
+    - samples: number along a ray inside the volume. 0 takes 1.5 per voxel of the longest side, 1.2 for a pixel of several
+      times.
+    - jitter: random shift of the samples, one per ``ray``, one per ``sample`` inside its own interval, or ``none``.
+    - times: how many times of a line a step uses, drawn for each pixel; 0 takes all.
+    - positive_only: use only pixels with a line integral above 0.
+    - voxel_points: points along each side of a voxel, whose value is the field's mean over them.
 
-    The encoding: levels (0: until the finest has one cell per voxel), features, base_resolution (cells along a side),
-    level_growth, table_log2 (most entries of a level).
-    The network: layers, width, last_activation. A sigmoid has a density_bound, its largest value in units of FDK's 99.9th
-    percentile, and a first_share of it at which the field starts everywhere. The rate of Adam is multiplied by rate_factor
-    every rate_step passes; step 0 spreads one factor over the run. detector_model: which quantity the detector averages over
-    a line's times, or the model that the scan states (scan). torch_device: the device of PyTorch."""
+    - The encoding: levels (0: until the finest has one cell per voxel), features, base_resolution (cells along a side),
+      level_growth, table_log2 (most entries of a level).
+    - The network: layers, width, last_activation. A sigmoid has a density_bound, its largest value in units of FDK's 99.9th
+      percentile. The field starts everywhere at first_share of it.
+    - The rate of Adam is multiplied by rate_factor every rate_step passes; step 0 spreads one factor over the run.
+    - detector_model: the quantity that the detector averages over a line's times, or the model that the scan states (scan).
+    - torch_device: the device of PyTorch."""
 
     MOTIONS: ClassVar[tuple[Motion, ...]] = motions_for(RAYS)
 
@@ -77,7 +80,7 @@ class NeuralOptions:
         check_motion(self.motion, self.MOTIONS)
 
     def levels_for(self, longest_voxels: int) -> int:
-        """Returns the levels of the encoding for a volume with ``longest_voxels`` along its longest side."""
+        """Returns the number of levels of the encoding, for the voxels along a volume's longest side."""
         if self.levels or self.level_growth == 1:
             return max(self.levels, 1)
         steps = math.log(CELLS_PER_VOXEL * longest_voxels / self.base_resolution, self.level_growth)
@@ -92,8 +95,8 @@ class NeuralOptions:
     def times_for(self, count: int, model: str) -> int:
         """Returns how many of the ``count`` times of a line a step uses.
 
-        Raises InputError for a number that would bias the loss. One time gives no estimate of the variance that the square
-        adds, and the logarithm of a mean intensity is not the mean over subsets."""
+        Raises InputError for a number that would bias the loss. The square adds a variance, which one time cannot estimate.
+        The logarithm of a mean intensity is not the mean over subsets."""
         if self.times == 0:
             return count
         if self.times < count and model == "intensity":
@@ -107,10 +110,10 @@ class NeuralOptions:
 
 @dataclass(frozen=True)
 class LineOptions(NeuralOptions):
-    """Options of a field with a transformer over line segments, and windows of pixels beside the scattered ones.
+    """Options of a field with a transformer over line segments, and windows of pixels in addition to the scattered ones.
 
-    segment: samples of a line segment. heads, head_width, blocks: of its attention. windows: per step, each of ``window``
-    by ``window`` pixels."""
+    segment: samples of a line segment. heads, head_width, blocks: those of its attention. windows: their number per step;
+    each has ``window`` by ``window`` pixels."""
 
     segment: int = checks.ranged(2, 1, 256)
     heads: int = checks.ranged(8, 1, 256)
@@ -120,5 +123,5 @@ class LineOptions(NeuralOptions):
     windows: int = checks.ranged(16, 0, 100_000)
 
     def samples_for(self, longest_voxels: int, times: int = 1) -> int:
-        """Returns the samples of every field, rounded up to whole segments."""
+        """Returns the samples of the base class, rounded up to whole segments."""
         return checks.ceil_div(super().samples_for(longest_voxels, times), self.segment) * self.segment

@@ -1,6 +1,6 @@
-"""The rays of a step: which pixels and times it takes, their rays over the exposure, and a field's integrals along them.
+"""The rays of a step: its pixels and times, their rays over the exposure, and a field's integrals along them.
 
-Scattered pixels and windows: the masked local–global sampling of SAX-NeRF (Cai et al., CVPR 2024)."""
+Scattered pixels and windows are SAX-NeRF's masked local–global sampling (Cai et al., CVPR 2024)."""
 
 import math
 from collections.abc import Callable
@@ -13,7 +13,7 @@ from phyradgs_cl.acquisition.time_cells import TimeCells
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
 
-_BEYOND_VOLUME = 2.0  # half-sides: further than a corner of the volume
+_BEYOND_VOLUME = 2.0  # in half-sides: further away than any corner of the volume
 Field = Callable[[torch.Tensor], torch.Tensor]
 
 
@@ -21,9 +21,9 @@ Field = Callable[[torch.Tensor], torch.Tensor]
 class ExposureRays:
     """The rays of one frame's pixels.
 
-    pose (C, 12) in units of half the volume's longest side about the volume's centre; cell (K, lines), the cell of each
-    of a line's K times, which all weigh the same; axis: whether lines are rows or columns; is_parallel: poses begin with
-    the rays' direction."""
+    - pose (C, 12): in units of half the volume's longest side about the volume's centre.
+    - cell (K, lines): the cell of each of a line's K times, which have equal weights.
+    - axis: whether lines are rows or columns. is_parallel: poses begin with the rays' direction."""
 
     pose: np.ndarray
     cell: np.ndarray
@@ -32,7 +32,7 @@ class ExposureRays:
 
     @classmethod
     def of_cells(cls, table: TimeCells, grid: Grid) -> "ExposureRays":
-        """The rays of still cells in mm, for a volume on ``grid`` in mm.
+        """Returns the rays of still cells in mm, for a volume on ``grid`` in mm.
 
         Raises InputError for a table whose lines have different numbers of cells or different weights."""
         centre, unit = np.array(grid.offset_mm[::-1]), grid.half_longest_mm
@@ -53,11 +53,12 @@ class ExposureRays:
 
     @property
     def times(self) -> int:
-        """K, how many times per line has."""
+        """The number K of times of each line."""
         return len(self.cell)
 
     def __call__(self, pixels: np.ndarray, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Sources and directions (R, s, 3), unit length, of pixels (R, 2) row, column at some of their times (R, s).
+        """Returns sources and unit directions (R, s, 3) of pixels (R, 2), row and column, at some of their times (R, s).
+
         Parallel rays begin in front of the volume."""
         rows, columns = pixels.T
         line = rows if self.axis == "rows" else columns
@@ -72,7 +73,7 @@ class ExposureRays:
         return pose[..., :3], direction
 
     def shadow(self, half_sides: np.ndarray, detector_shape: tuple[int, int]) -> tuple[slice, slice]:
-        """Rows and columns within which every pixel lies whose rays meet a box of ``half_sides`` (x, y, z) about 0."""
+        """Returns rows and columns that hold every pixel whose rays meet a box of ``half_sides`` (x, y, z) about 0."""
         corners = np.array(np.meshgrid(*[(-h, h) for h in half_sides], indexing="ij")).reshape(3, -1).T
         source, first, steps = self.pose[:, None, :3], self.pose[:, None, 3:6], self.pose[:, None, 6:12]
         to_corner = corners - source  # (C, 8, 3)
@@ -84,7 +85,7 @@ class ExposureRays:
             place = np.full(to_corner.shape, np.nan)
         scale, column, row = np.moveaxis(place, -1, 0)
         is_behind = not self.is_parallel and np.any(scale <= 0)
-        if is_behind or not np.all(np.isfinite(scale)):  # a corner that the panel cannot see
+        if is_behind or not np.all(np.isfinite(scale)):  # the panel cannot see a corner
             return slice(0, detector_shape[0]), slice(0, detector_shape[1])
         return _within(row, detector_shape[0]), _within(column, detector_shape[1])
 
@@ -95,7 +96,7 @@ def _within(place: np.ndarray, count: int) -> slice:
 
 
 def scattered_pixels(usable: np.ndarray, count: int, rng: np.random.Generator) -> np.ndarray:
-    """``count`` pixels (R, 2) row, column of those that are usable (rows, columns) bool, each at most once."""
+    """Returns ``count`` of the usable pixels (rows, columns) bool, as (R, 2) row, column. No pixel comes twice."""
     where = np.flatnonzero(usable)
     chosen = rng.choice(where, min(count, where.size), replace=False, shuffle=False)
     return np.stack(np.unravel_index(chosen, usable.shape), -1)
@@ -106,7 +107,7 @@ def windows_and_scattered_pixels(
 ) -> np.ndarray:
     """Draws the pixels (R, 2) of ``windows`` windows of ``edge``² usable pixels, and ``count`` scattered ones outside them.
 
-    Windows tile the frame. There are fewer where fewer of them are usable throughout."""
+    Windows are tiles of the frame. There are fewer windows if fewer tiles are usable throughout."""
     down, across = (n // edge for n in usable.shape)
     tiles = usable[: down * edge, : across * edge].reshape(down, edge, across, edge).all(axis=(1, 3))
     whole = np.flatnonzero(tiles)
@@ -120,7 +121,7 @@ def windows_and_scattered_pixels(
 
 
 def chosen_times(pixels: int, times: int, count: int, rng: np.random.Generator) -> np.ndarray:
-    """``count`` of the ``times`` of every pixel (R, count), each at most once and all equally likely."""
+    """Returns ``count`` of the ``times`` of every pixel (R, count). None comes twice, and all are equally likely."""
     if count >= times:
         return np.broadcast_to(np.arange(times), (pixels, times))
     return np.argsort(rng.random((pixels, times)), axis=1)[:, :count]
@@ -129,9 +130,9 @@ def chosen_times(pixels: int, times: int, count: int, rng: np.random.Generator) 
 def box_span(
     source: torch.Tensor, direction: torch.Tensor, half_sides: torch.Tensor
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """(first distance, length) (R,) of rays (R, 3) in a box of ``half_sides`` (3,) about 0; length 0 where they miss it.
+    """Returns (first distance, length) (R,) of rays (R, 3) in a box of ``half_sides`` (3,) about 0. Length 0: no meeting.
 
-    Directions have unit length; a ray begins at its source."""
+    Directions have unit length. A ray begins at its source."""
     tiny = torch.finfo(direction.dtype).tiny
     slope = torch.where(direction.abs() < tiny, torch.full_like(direction, tiny), direction)
     one, other = (-half_sides - source) / slope, (half_sides - source) / slope
@@ -141,7 +142,7 @@ def box_span(
 
 
 def sample_shifts(rays: int, samples: int, jitter: str, rng: np.random.Generator) -> np.ndarray:
-    """Where in its interval each sample lies, 0 to 1; (R, 1) for one shift per ray or none, (R, samples) for one each."""
+    """Returns the place of each sample in its interval, 0 to 1. (R, 1) for one shift per ray or none, else (R, samples)."""
     if jitter == "none":
         return np.full((rays, 1), 0.5, np.float32)
     return rng.random((rays, samples if jitter == "sample" else 1), np.float32)
@@ -151,9 +152,9 @@ def line_integrals(
     field: Field, source: torch.Tensor, direction: torch.Tensor, half_sides: torch.Tensor, samples: int,
     shifts: torch.Tensor,
 ) -> torch.Tensor:
-    """Integrals (R,) of a field along rays (R, 3), a sample in each of ``samples`` equal intervals inside the box.
+    """Returns the integrals (R,) of a field along rays (R, 3), a sample in each of ``samples`` intervals in the box.
 
-    ``shifts`` as from ``sample_shifts``. With shifts drawn uniformly the mean is the integral itself, for any field."""
+    ``shifts``: from ``sample_shifts``. With uniformly drawn shifts the expectation is the integral itself, for any field."""
     first, length = box_span(source, direction, half_sides)
     step = length / samples
     number = torch.arange(samples, dtype=source.dtype, device=source.device)
@@ -163,15 +164,15 @@ def line_integrals(
 
 
 def intensity_average(integrals: torch.Tensor, unit: float) -> torch.Tensor:
-    """−ln(mean over K of exp(−unit · p)) / unit (R,) of the integrals p (R, K) at a pixel's times."""
+    """Returns −ln(mean over K of exp(−unit · p)) / unit (R,) of the integrals p (R, K) at a pixel's times."""
     return (math.log(integrals.shape[1]) - torch.logsumexp(-unit * integrals, 1)) / unit
 
 
 def log_squares(integrals: torch.Tensor, measured: torch.Tensor, times: int) -> torch.Tensor:
-    """Squared errors (R,) of the mean over all ``times`` of a pixel, estimated from s of them, integrals (R, s).
+    """Returns squared errors (R,) of the mean over all K ``times`` of a pixel, estimated from s of them, integrals (R, s).
 
-    The square of a mean over a random subset is too large by the subset's variance, which (1/s − 1/K) times the spread
-    among the s samples estimates; less that, expectation and gradient are those of all K times."""
+    The square of a mean over a random subset is too large by the subset's variance. The spread of the s samples, times
+    (1/s − 1/K), estimates this variance. Without it, expectation and gradient are those of all K times."""
     count = integrals.shape[1]
     squares = (integrals.mean(1) - measured) ** 2
     return squares if count == times else squares - (1 / count - 1 / times) * integrals.var(1, unbiased=True)

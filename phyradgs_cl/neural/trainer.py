@@ -1,4 +1,4 @@
-"""Fits a field to a scan's rays, step by step; its state lies between two steps."""
+"""Fits a field to a scan's rays, step by step. The state between two steps can be stored."""
 
 import json
 
@@ -12,11 +12,11 @@ from phyradgs_cl.neural.field import NeuralField, repeatable, to_array, to_tenso
 from phyradgs_cl.neural.options import LineOptions, NeuralOptions
 
 _BETAS, _EPSILON = (0.9, 0.999), 1e-8
-_POINTS_ON_CPU, _POINTS_ELSEWHERE = 2**14, 2**20  # at once: a cache's, a GPU's
+_POINTS_ON_CPU, _POINTS_ELSEWHERE = 2**14, 2**20  # points evaluated at once: as many as a CPU's cache or a GPU holds
 
 
 class Trainer:
-    """A field, its optimiser and the random draws: the state that changes from step to step.
+    """A field, its optimiser and the random draws, which change from step to step.
 
     Lengths are in units of half the volume's longest side, attenuation in units of ``density_per_mm``."""
 
@@ -27,16 +27,16 @@ class Trainer:
         self.scan, self.options, self.device = scan, options, device
         self.field = field.to(device)
         self.density_per_mm = density_per_mm
-        self.unit = density_per_mm * scan.grid.half_longest_mm  # of line integrals
+        self.unit = density_per_mm * scan.grid.half_longest_mm  # unit of line integrals
         self.rng = np.random.default_rng(seed)
         motion = options.motion
-        if isinstance(motion, PerRow):  # the field evaluates single rays: common times would save nothing
+        if isinstance(motion, PerRow):  # the field evaluates single rays, so common times would save nothing
             motion = OwnTimes(motion.of(scan).sub_intervals)
         tables = [motion.cells(scan, frame).still() for frame in range(scan.frames)]
         self.rays = [rays.ExposureRays.of_cells(table, scan.grid) for table in tables]
         times = self.rays[0].times
         stated = scan.detector_model if options.detector_model == "scan" else options.detector_model
-        self.model = stated if times > 1 else "log"  # of one value both are the mean
+        self.model = stated if times > 1 else "log"  # for a single value both models are the mean
         self.times = options.times_for(times, self.model)
         self.samples = options.samples_for(max(scan.grid.shape), times)
         self.points_at_once = _POINTS_ON_CPU if device.type == "cpu" else _POINTS_ELSEWHERE
@@ -49,12 +49,12 @@ class Trainer:
 
     @property
     def passes(self) -> int:
-        """Whole passes over the frames so far."""
+        """The number of whole passes over the frames so far."""
         return self.steps // self.scan.frames
 
     @property
     def parameters(self) -> int:
-        """Number of fitted parameters."""
+        """The number of fitted parameters."""
         return sum(p.numel() for p in self.field.parameters())
 
     def step(self) -> None:
@@ -78,7 +78,7 @@ class Trainer:
             self.queue = self._shuffled()
 
     def volume(self, grid: Grid) -> np.ndarray:
-        """The field in the voxels (nz, ny, nx) of the scan's grid in mm, 1/mm."""
+        """Returns the field in the voxels (nz, ny, nx) of the scan's grid in mm, in 1/mm."""
         unit_grid = Grid(grid.shape, grid.scaled(1 / grid.half_longest_mm).voxel_size_mm)
         points = self.options.voxel_points
         values = voxel_values(self.field, unit_grid, self.device, self.points_at_once, points)
@@ -98,7 +98,7 @@ class Trainer:
         }
 
     def restore(self, parameters: np.ndarray, moments: np.ndarray, updates: int) -> None:
-        """Sets the field's values (n,) and Adam's moments (2, n) after ``updates`` of them."""
+        """Sets the field's values (n,) and Adam's moments (2, n) after this number of ``updates``."""
         first = 0
         with torch.no_grad():
             for p in self.field.parameters():
@@ -121,7 +121,7 @@ class Trainer:
         return options.rate * options.rate_factor ** (self.steps / (options.iterations * self.scan.frames))
 
     def _pixels(self, frame: int) -> np.ndarray:
-        """Pixels (R, 2) of a frame that may be used and whose rays can meet the volume."""
+        """Returns the pixels (R, 2) of a frame that may be used and whose rays can meet the volume."""
         scan, options = self.scan, self.options
         usable = np.zeros(scan.geometry.detector_shape, bool)
         usable[self._shadows[frame]] = True
@@ -137,13 +137,13 @@ class Trainer:
         return rays.scattered_pixels(usable, options.rays, self.rng)
 
     def _loss_and_gradient(self, frame: int, pixels: np.ndarray) -> float:
-        """The mean squared error in internal units; its gradient is added up in the parameters, a chunk at a time."""
+        """Returns the mean squared error in internal units. Its gradient is added up in the parameters."""
         exposure = self.rays[frame]
         times = rays.chosen_times(len(pixels), exposure.times, self.times, self.rng)
         shifts = rays.sample_shifts(times.size, self.samples, self.options.jitter, self.rng)
         shifts = shifts.reshape(*times.shape, -1)
         measured = self.scan.projections[frame][tuple(pixels.T)].astype(np.float32) / np.float32(self.unit)
-        # the gradient of a sum is the sum of gradients: a part at a time needs a part of the memory
+        # Gradients of chunks add up to the whole gradient; a chunk needs less memory.
         at_once = max(self.points_at_once // (self.samples * self.times), 1)
         total = 0.0
         for start in range(0, len(pixels), at_once):
@@ -158,7 +158,7 @@ class Trainer:
     def _squares(
         self, source: np.ndarray, direction: np.ndarray, shifts: np.ndarray, measured: np.ndarray, times: int
     ) -> torch.Tensor:
-        """Squared errors (R,) of pixels with rays (R, s, 3) of their ``times`` times."""
+        """Returns the squared errors (R,) of pixels with rays (R, s, 3) at some of their ``times``."""
         from_, along, shift = (
             to_tensor(a.reshape(-1, a.shape[-1]).astype(np.float32), self.device)
             for a in (source, direction, shifts)

@@ -1,11 +1,11 @@
 """Shrinkage of all 4³ block cosine transforms: a prior for textures and edges, which total variation flattens.
 
-Shrinkage of an overcomplete transform: B_sᵀ T(B_s v), averaged over the shifts s of the blocks (Coifman and Donoho,
-"Translation-invariant de-noising", 1995; block DCT: Guleryuz, IEEE Trans. Image Process. 16 (2007) 3020). T is a soft
-threshold, except of a block's mean, which is not shrunk. Near faces the average is over the blocks inside the volume.
+The map is B_sᵀ T(B_s v), averaged over the shifts s of the blocks: shrinkage of an overcomplete transform (Coifman and
+Donoho, "Translation-invariant de-noising", 1995; block DCT: Guleryuz, IEEE Trans. Image Process. 16 (2007) 3020). T is a
+soft threshold that leaves a block's mean as it is. Near faces the average is over the blocks inside the volume.
 
-A map takes a quarter of the shifts, the next map the next quarter: over iterations the average is the same (cycle spinning;
-Kamilov, Bostan and Unser, IEEE Signal Process. Lett. 21 (2014) 1326)."""
+A call takes a quarter of the shifts, the next call the next quarter. Over iterations the average is the same (cycle
+spinning; Kamilov, Bostan and Unser, IEEE Signal Process. Lett. 21 (2014) 1326)."""
 
 import itertools
 
@@ -17,13 +17,13 @@ from phyradgs_cl.runtime import DeviceArray, Runtime, SameArray
 from phyradgs_cl.runtime.layout import GUARD, beside, brought_to, padded_zeros, pitch_of
 
 EDGE = 4
-_SAMPLES = 8  # as long as so many samples of a ray takes a voxel of a block
-# By turn, the shift along y for every shift along z: a turn has each of both once, four turns have all pairs
+_SAMPLES = 8  # time for a voxel of a block, in samples of a ray
+# The shift along y for every shift along z, by turn. A turn has each shift of both once; four turns have all pairs.
 TURNS = ((0, 1, 2, 3), (1, 3, 0, 2), (2, 0, 3, 1), (3, 2, 1, 0))
 
 
 class DctProx:
-    """The map for volumes of a fixed ``shape`` (z, y, x); it does not change a volume thinner than a block."""
+    """The map for volumes of a fixed ``shape`` (z, y, x). It does not change a volume thinner than a block."""
 
     def __init__(self, rt: Runtime, shape: tuple[int, int, int]) -> None:
         self.rt, self.shape = rt, shape
@@ -39,7 +39,7 @@ class DctProx:
     def __call__(
         self, volume: SameArray, threshold: float, turn: int, *, nonnegative: bool, out: DeviceArray | None = None
     ) -> SameArray:
-        """Maps a volume (z, y, x), float32; ``threshold`` of the coefficients of the orthonormal transform.
+        """Maps a volume (z, y, x), float32. ``threshold``: that of the coefficients of the orthonormal transform.
 
         ``turn``, 0 to 3, chooses a quarter of the shifts. A device array gives a device array (``out``, if given)."""
         rt, (nz, ny, nx) = self.rt, self.shape

@@ -1,9 +1,9 @@
-"""A step down a learned weakly convex ridge regulariser R(x) = Σ_i Σ_p ψ_i((W_i x)_p): a prior for texture and anatomy.
+"""A gradient step of a learned, weakly convex ridge regulariser R(x) = Σ_i Σ_p ψ_i((W_i x)_p): a prior for texture, anatomy.
 
 Goujon, Neumayer and Unser, "Learning weakly convex regularizers for convergent image-reconstruction algorithms", SIAM J.
-Imaging Sci. 17 (2024) 91, in 3D. The 16 filters W_i of 5³ are a chain: 4 correlations with 3³, then 16 with their results.
-Only windows inside the volume count. ψ_i' is a difference of two clamps whose knots are in units of the noise σ. It rises
-near 0 and may fall beyond, but R is ρ-weakly convex with ρ ≤ 1. ½‖x − v‖² + step R(x) is therefore convex for step ≤ 1."""
+Imaging Sci. 17 (2024) 91, in 3D. The 16 filters W_i of 5³ voxels are a chain: 4 correlations with 3³ voxels, then 16 with
+their results. Only windows inside the volume count. ψ_i' is a difference of two clamps, with knots in units of the noise σ.
+It rises near 0 and may fall beyond, but R is ρ-weakly convex with ρ ≤ 1. So ½‖x − v‖² + step R(x) is convex for step ≤ 1."""
 
 import json
 from dataclasses import dataclass
@@ -16,17 +16,17 @@ from phyradgs_cl.runtime import DeviceArray, Kernel, Runtime, SameArray
 from phyradgs_cl.runtime.layout import GUARD, Strides, beside, brought_to, move, padded_zeros, pitch_of
 
 EDGE = 5
-"""Voxels along a side of a filter."""
-_SAMPLES = 200  # as long as so many samples of a ray takes a voxel, at most
-_SLICES = 2  # of channels and responses, computed at a time
-_RING = _SLICES + 2  # in memory: a correlation needs three
+"""The number of voxels along a side of a filter."""
+_SAMPLES = 200  # time for a voxel, in samples of a ray, at most
+_SLICES = 2  # slices of channels and responses that are computed at a time
+_RING = _SLICES + 2  # slices in memory: a correlation needs three
 
 
 @dataclass(frozen=True, eq=False)
 class Ridge:
-    """The numbers of a regulariser, float32. first (4, 3, 3, 3) and second (16, 4, 3, 3, 3): filters, axes z, y, x.
+    """The numbers of a regulariser, float32. first (4, 3, 3, 3), second (16, 4, 3, 3, 3): filters, with axes z, y, x.
 
-    ψ_i'(t) = slope_up[i] clip(t, ±σ knot_up[i]) − slope_down[i] clip(t, ±σ knot_down[i]), each (16,) and not below 0."""
+    ψ_i'(t) = slope_up[i] clip(t, ±σ knot_up[i]) − slope_down[i] clip(t, ±σ knot_down[i]). Each is (16,) and not below 0."""
 
     first: np.ndarray
     second: np.ndarray
@@ -36,7 +36,7 @@ class Ridge:
     knot_down: np.ndarray
 
     def table(self) -> np.ndarray:
-        """Returns the kernels' table, float32."""
+        """Returns the table of numbers that the kernels read, float32."""
         filters = np.moveaxis(self.first, 0, -1), np.moveaxis(self.second, 0, -1), np.moveaxis(self.second, (0, 1), (-2, -1))
         curves = self.slope_up, self.knot_up, self.slope_down, self.knot_down
         return np.concatenate([part.ravel() for part in (*filters, *curves)]).astype(np.float32)
@@ -51,21 +51,21 @@ class Ridge:
 
 @cache
 def learned_ridge() -> Ridge:
-    """Returns the regulariser of ``data/ridge.json``, in thousandths (benchmarks/train_ridge.py)."""
+    """Returns the regulariser of ``data/ridge.json``, whose unit is a thousandth (benchmarks/train_ridge.py)."""
     stored = json.loads((resource("data") / "ridge.json").read_text(encoding="utf-8"))
     first, second, *curves = (np.array(stored[name]) / 1000 for name in Ridge.__dataclass_fields__)
     first, second = first.reshape(-1, 3, 3, 3), second.reshape(len(curves[0]), -1, 3, 3, 3)
-    # Rounding leaves the filters of the chain small sums
+    # Filters of the chain must sum to 0; rounding leaves small sums.
     sums = first.sum((1, 2, 3))
     second -= np.multiply.outer(second.sum((2, 3, 4)) @ sums, sums / (27 * sums @ sums))[..., None, None, None]
     return Ridge(*(values.astype(np.float32) for values in (first, second, *curves)))
 
 
 class RidgeStep:
-    """The step for volumes of a fixed ``shape`` (z, y, x); it does not change a volume thinner than a filter."""
+    """The step for volumes of a fixed ``shape`` (z, y, x). It does not change a volume thinner than a filter."""
 
     VOLUMES = 4
-    """Volumes of floats that it holds in memory, with 50 slices or more of 64 voxels in a row or more."""
+    """How many volumes of floats it holds in memory, for 50 slices or more of 64 voxels in a row or more."""
 
     def __init__(self, rt: Runtime, shape: tuple[int, int, int], ridge: Ridge) -> None:
         self.rt, self.shape = rt, shape
@@ -91,7 +91,7 @@ class RidgeStep:
         move(self.rt, (observed, Strides.plain(self.shape)), padded, self.shape)
         is_thin = min(self.shape) < EDGE  # the channels of the gradient stay 0
         end = np.float32(step), np.int32(nonnegative), result
-        # Responses follow two slices behind the channels, of which they need three
+        # Responses follow two slices behind the channels, because they need three slices of channels.
         for first in range(0, nz + 2, _SLICES):
             if not is_thin:
                 self._launch(self._channels_of, first, 2, self._padded, ends=(self._channels,))
@@ -101,7 +101,7 @@ class RidgeStep:
         return brought_to(self.rt, volume, result)
 
     def _launch(self, kernel: Kernel, first: int, less: int, *sources: DeviceArray, ends: tuple[object, ...]) -> None:
-        """Runs a kernel on slices from ``first`` on. Its result is ``less`` smaller than the volume."""
+        """Runs a kernel on slices from ``first`` on. Its result has ``less`` fewer voxels along each axis."""
         nz, ny, nx = (count - less for count in self.shape)
         start, stop = max(first, 0), min(first + _SLICES, nz)
         if start < stop:
@@ -127,12 +127,12 @@ def ridge_step(volume: np.ndarray, sigma: float, step: float, *, ridge: Ridge, n
 
 
 def correlated(channels: np.ndarray, filters: np.ndarray) -> np.ndarray:
-    """Correlates channels (c, z, y, x) with filters (i, c, 3, 3, 3): (i, z − 2, y − 2, x − 2), where windows are inside."""
+    """Correlates channels (c, z, y, x) with filters (i, c, 3, 3, 3), where windows are inside: (i, z − 2, y − 2, x − 2)."""
     windows = np.lib.stride_tricks.sliding_window_view(channels, (3, 3, 3), axis=(1, 2, 3))
     return np.asarray(np.einsum("czyxkji,fckji->fzyx", windows, filters.astype(np.float64), optimize=True))
 
 
 def correlated_back(responses: np.ndarray, filters: np.ndarray) -> np.ndarray:
-    """The transpose of ``correlated``: (i, z, y, x) to (c, z + 2, y + 2, x + 2)."""
+    """The transpose of ``correlated``, from (i, z, y, x) to (c, z + 2, y + 2, x + 2)."""
     padded = np.pad(responses, ((0, 0), (2, 2), (2, 2), (2, 2)))
     return correlated(padded, filters.swapaxes(0, 1)[..., ::-1, ::-1, ::-1])

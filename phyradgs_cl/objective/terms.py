@@ -1,10 +1,10 @@
 """Terms of the objective (paper, Eq. 4): image loss, total variation of a small volume, mean density.
 
-The image loss of one frame is L1 + λ (1 − SSIM). Eq. 4 prints "+ SSIM"; the paper minimises 1 − SSIM, as this
-module. SSIM is that of Wang et al. 2004 (IEEE Trans. Image Process. 13, 600): 11-tap Gaussian window of σ 1.5, zero padding,
-C1 = 0.01², C2 = 0.03².
+The image loss of one frame is L1 + λ (1 − SSIM). Eq. 4 prints "+ SSIM"; the paper minimises 1 − SSIM, as this module does.
+SSIM is that of Wang et al. 2004 (IEEE Trans. Image Process. 13, 600), with an 11-tap Gaussian window of σ 1.5, zero
+padding, C1 = 0.01² and C2 = 0.03².
 
-Total variation is anisotropic, as in R2-Gaussian: the mean absolute difference between neighbouring voxels along z, y and
+Total variation is anisotropic, as in R2-Gaussian: the mean absolute differences between neighbouring voxels along z, y and
 x, added up."""
 
 import math
@@ -43,7 +43,7 @@ class ImageLoss:
     def evaluate(
         self, rendered: DeviceArray, measured: DeviceArray, mask: DeviceArray, pixels: float
     ) -> DeviceArray:
-        """Returns dL/drendered, valid until the next call; ``mask`` is 1 where a pixel counts, ``pixels`` its sum."""
+        """Returns dL/drendered, valid until the next call. ``mask``: 1 where a pixel counts. ``pixels``: its sum."""
         rt = self.rt
         vectors = ceil_div(self.width, rt.lanes)
         size = (np.int32(self.lines), np.int32(self.width), np.int32(self.pitch))
@@ -68,7 +68,7 @@ class ImageLoss:
         return self.gradient
 
     def value(self) -> float:
-        """Returns the loss at the last ``evaluate``; waits for the device."""
+        """Returns the loss of the last ``evaluate``. This waits for the device."""
         ssim, l1, pixels = self.rt.download(self._sums).astype(np.float64).sum(axis=0)
         return float(self.l1_weight * l1 / max(pixels, 1.0) + self.ssim_weight * (1 - ssim / (self.lines * self.width)))
 
@@ -76,7 +76,7 @@ class ImageLoss:
 def image_loss(
     rendered: np.ndarray, measured: np.ndarray, mask: np.ndarray, ssim_weight: float, l1_weight: float = 1.0
 ) -> tuple[float, np.ndarray]:
-    """Float64 twin: returns the loss and dL/drendered, images (lines, width)."""
+    """Float64 twin of ``ImageLoss``: returns the loss and dL/drendered of images (lines, width)."""
     x, y = rendered * mask, measured * mask
     mx, my = _blur(x), _blur(y)
     xx, yy, xy = _blur(x * x) - mx * mx, _blur(y * y) - my * my, _blur(x * y) - mx * my
@@ -119,12 +119,12 @@ class TotalVariation:
         return self.gradient
 
     def value(self) -> float:
-        """Returns TV at the last ``evaluate``; waits for the device."""
+        """Returns the total variation of the last ``evaluate``. This waits for the device."""
         return float(self.rt.download(self._sums).astype(np.float64).sum())
 
 
 def total_variation(volume: np.ndarray) -> tuple[float, np.ndarray]:
-    """Float64 twin: returns TV of a volume (z, y, x) and its gradient."""
+    """Float64 twin of ``TotalVariation``: returns its value for a volume (z, y, x), and the gradient."""
     volume = np.asarray(volume, np.float64)
     gradient = np.zeros_like(volume)
     value = 0.0
@@ -138,7 +138,7 @@ def total_variation(volume: np.ndarray) -> tuple[float, np.ndarray]:
 
 
 def _axis_weights(shape: tuple[int, ...]) -> list[float]:
-    """Returns one over the number of differences along each axis (z, y, x); 0 along an axis of one voxel."""
+    """Returns one over the number of differences along each axis (z, y, x). An axis of one voxel has 0."""
     total = int(np.prod(shape))
     return [1.0 / (total // n * (n - 1)) if n > 1 else 0.0 for n in shape]
 

@@ -1,11 +1,11 @@
-"""Two ways to lower the isotropic total variation of a volume: a proximal map, and steepest descent.
+"""Two ways to lower the isotropic total variation (TV) of a volume: a proximal map, and steepest descent.
 
 ``TvProx`` solves argmin_x ½‖x − b‖² + weight · TV(x), with x ≥ 0 if asked, by fast gradient projection on the dual (Beck
-and Teboulle, IEEE Trans. Image Process. 18 (2009) 2419). Axis weights scale the differences where voxels are not cubes. Of
+and Teboulle, IEEE Trans. Image Process. 18 (2009) 2419). Axis weights scale the differences where voxels are not cubes. For
 the states of an object that changes, the sum of |differences| between a state and the next one is added.
 
 ``TvDescent`` takes steps of a fixed length, as ASD-POCS does (Sidky and Pan, Phys. Med. Biol. 53 (2008) 4777). Backward
-differences are those of TIGRE; their floor is relative to the volume's values, so that units do not matter."""
+differences are those of TIGRE. Their floor is relative to the volume's values, so that units do not matter."""
 
 import math
 from collections.abc import Callable
@@ -18,8 +18,9 @@ from phyradgs_cl.runtime.layout import beside, brought_to
 
 
 class TvProx:
-    """The map for volumes of a fixed ``shape`` (z, y, x), or (K, z, y, x) of K states. The next call starts from the dual of
-    the last one. axis_weights: of the differences along the axes of ``shape``."""
+    """The map for volumes of a fixed ``shape`` (z, y, x), or (K, z, y, x) of K states.
+
+    A call starts from the dual of the call before. axis_weights: factors of the differences along the axes of ``shape``."""
 
     def __init__(
         self, rt: Runtime, shape: tuple[int, ...], axis_weights: tuple[float, ...] = (1.0, 1.0, 1.0)
@@ -38,7 +39,7 @@ class TvProx:
 
     @property
     def dual(self) -> np.ndarray:
-        """The dual field (3, nz, ny, nx) along x, y, z, of length at most 1; (4, K, nz, ny, nx) of states."""
+        """The dual field (3, nz, ny, nx) along x, y, z, with vectors of length at most 1. Of states (4, K, nz, ny, nx)."""
         return self.rt.download(self._dual)
 
     @dual.setter
@@ -90,7 +91,7 @@ def tv_prox(
         changes = differences(x, axis_weights) / weight
         q = moved + np.concatenate([time_step * changes[:-3], step * changes[-3:]])
         new = q / np.maximum(1, np.linalg.norm(q[-3:], axis=0))
-        new[:-3] = np.clip(q[:-3], -1, 1)  # of time
+        new[:-3] = np.clip(q[:-3], -1, 1)  # differences in time
         t_next = (1 + np.sqrt(1 + 4 * t * t)) / 2
         moved = new + (t - 1) / t_next * (new - dual)
         dual, t = new, t_next
@@ -98,8 +99,8 @@ def tv_prox(
 
 
 def differences(volume: np.ndarray, axis_weights: tuple[float, ...]) -> np.ndarray:
-    """Weighted forward differences (3, z, y, x) along z, y, x; 0 behind the last voxel. Of states (K, z, y, x) those in time
-    come first."""
+    """Returns weighted forward differences (3, z, y, x) along z, y, x; 0 behind the last voxel. For states (K, z, y, x) the
+    differences in time come first."""
     result = np.zeros((volume.ndim, *volume.shape))
     for axis, weight in enumerate(axis_weights):
         inner = tuple(slice(0, -1) if a == axis else slice(None) for a in range(volume.ndim))
@@ -119,14 +120,16 @@ def _primal_of(
 
 
 def _steps(axis_weights: tuple[float, ...]) -> tuple[float, float]:
-    """Returns the steps of the dual in space and in time: one over the Lipschitz constant of the differences. Of states each
-    of the two steps is half as long as it is alone: no step in space is as short as a large weight in time demands."""
+    """Returns the steps of the dual in space and in time: one over the Lipschitz constant of the differences.
+
+    For states, each of the two is half as long as it would be alone. A large weight in time then leaves the step in space
+    long."""
     *time, z, y, x = axis_weights
     in_space = 1 / (4 * (z * z + y * y + x * x))
     return (in_space / 2, 1 / (8 * time[0] ** 2)) if any(time) else (in_space, 0.0)
 
 
-_SMALLEST, _NOTHING = 1e-6, 1e-30  # floor of the differences, of the volume's RMS; for a volume of zeros
+_SMALLEST, _NOTHING = 1e-6, 1e-30  # floor of the differences over the volume's RMS; floor for a volume of zeros
 
 
 class TvDescent:
@@ -140,11 +143,11 @@ class TvDescent:
         self._space = DeviceSpace(rt)
 
     def gradient(self, volume: SameArray) -> SameArray:
-        """Returns dTV/dvolume (z, y, x) float32; a device array gives a device array."""
+        """Returns dTV/dvolume (z, y, x) float32. A device array gives a device array."""
         return self._where_it_is(lambda x: self._gradient(x, self._least(x)), volume)
 
     def __call__(self, volume: SameArray, step: float, count: int) -> SameArray:
-        """Takes ``count`` steps of Euclidean length ``step`` (1/mm) downhill; a device array gives a device array."""
+        """Takes ``count`` steps of Euclidean length ``step`` (1/mm) downhill. A device array gives a device array."""
 
         def descended(x: DeviceArray) -> DeviceArray:
             least = self._least(x)
@@ -171,7 +174,8 @@ class TvDescent:
 
 
 def tv_gradient(volume: np.ndarray, least: float | None = None) -> np.ndarray:
-    """Float64 twin: gradient (z, y, x) of Σ |backward difference|; ``least``: the floor, None for that of the volume."""
+    """Float64 twin of ``gradient``: that of Σ |backward difference|, (z, y, x). ``least``: the floor, None for the
+    volume's."""
     volume = np.asarray(volume, np.float64)
     least = _least_of(volume) if least is None else least
     difference = np.stack([np.diff(volume, axis=a, prepend=volume.take([0], axis=a)) for a in range(3)])

@@ -8,15 +8,15 @@ from phyradgs_cl import checks
 from phyradgs_cl.fields import Activation
 from phyradgs_cl.runtime import DeviceArray, Runtime
 
-_RANGE = (1e-12, 10)  # a rate of 0 has no decay; 1e-12 moves nothing in float32
+_RANGE = (1e-12, 10)  # a rate of 0 cannot decay; 1e-12 moves nothing in float32
 
 
 @dataclass(frozen=True)
 class Rates:
-    """(first, last) rate of each kind of parameter, in internal units (half-sides of the volume).
+    """The (first, last) rate of each kind of parameter, in internal units (half-sides of the volume).
 
-    The default rates are two to ten times the published ones, which are made for 20,000 iterations and more: at
-    3,000 they leave 1 to 2 dB on the table (docs/results/settings.md)."""
+    The default rates are two to ten times the published ones, which are made for 20,000 iterations and more. In 3,000
+    iterations, the published rates end 1 to 2 dB lower (docs/results/settings.md)."""
 
     position: tuple[float, float] = checks.ranged((2e-3, 2e-4), *_RANGE)
     scale: tuple[float, float] = checks.ranged((2e-2, 2e-3), *_RANGE)
@@ -27,7 +27,7 @@ class Rates:
         checks.fields_within("rates.", self)
 
     def at(self, progress: float) -> np.ndarray:
-        """Rates (11,) per parameter row at ``progress`` (0 to 1) through the run."""
+        """Returns the rates (11,) per parameter row, at ``progress`` (0 to 1) of the run."""
         position, scale, rotation, density = (
             first * (last / first) ** progress
             for first, last in (self.position, self.scale, self.rotation, self.density)
@@ -45,16 +45,16 @@ EPSILON = 1e-15
 
 
 def folded_rates(rates: np.ndarray, step: int) -> np.ndarray:
-    """Learning rates (11,) with both bias corrections of step ``step`` (from 1) folded in.
+    """Returns the learning rates (11,) with both bias corrections of step ``step`` (from 1) folded in.
 
-    m̂/√v̂ = m/√v · √(1−β2^t)/(1−β1^t); ε is scaled along, which at 1e-15 is without effect."""
+    m̂/√v̂ = m/√v · √(1−β2^t)/(1−β1^t). ε is scaled along, which has no effect at 1e-15."""
     return np.asarray(rates * np.sqrt(1 - BETA2**step) / (1 - BETA1**step))
 
 
 def adam_step(
     raw: np.ndarray, gradients: np.ndarray, moments: np.ndarray, rates: np.ndarray, step: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Float64 twin of one step: raw (11, G), moments (2, 11, G) → the new ones."""
+    """Float64 twin of one step: returns the new raw (11, G) and moments (2, 11, G)."""
     first = BETA1 * moments[0] + (1 - BETA1) * gradients
     second = BETA2 * moments[1] + (1 - BETA2) * gradients**2
     stepped = raw - folded_rates(rates, step)[:, None] * first / (np.sqrt(second) + EPSILON)
@@ -71,7 +71,7 @@ class DeviceAdam:
         self._step = rt.kernel("adam", "adam_step")
 
     def activate(self, raw: DeviceArray, parameters: DeviceArray, count: int, stride: int) -> None:
-        """Parameter rows from raw rows."""
+        """Writes parameter rows from raw rows."""
         self.rt.launch(
             self._activate, stride // self.rt.lanes, raw, count, stride,
             np.float32(self.activation.scale_min), np.float32(self.activation.scale_max), parameters,
@@ -82,7 +82,7 @@ class DeviceAdam:
         self, raw: DeviceArray, parameters: DeviceArray, gradients: DeviceArray, statistics: DeviceArray,
         count: int, stride: int, *, density_weight: float,
     ) -> None:
-        """dL/dparameters to dL/draw in place, with the term of the mean density added and the statistics gathered."""
+        """Turns dL/dparameters into dL/draw in place, adds the term of the mean density and gathers the statistics."""
         share = 1.0 / max(count, 1)
         self.rt.launch(
             self._chain, stride // self.rt.lanes, raw, parameters, count, stride,
@@ -94,7 +94,7 @@ class DeviceAdam:
         self, raw: DeviceArray, gradients: DeviceArray, moments: DeviceArray, stride: int, rates: np.ndarray,
         step: int,
     ) -> None:
-        """One step of Adam; ``rates`` (11,), ``step`` counts from 1."""
+        """Takes one step of Adam. ``rates`` (11,). ``step`` counts from 1."""
         rates16 = np.zeros(16, np.float32)
         rates16[:11] = folded_rates(rates, step)
         self.rt.launch(

@@ -1,7 +1,7 @@
-"""Adaptive density control: clone and split Gaussians with a large image gradient, prune faint and thin ones.
+"""Adaptive density control: clones and splits Gaussians with a large image gradient, and prunes faint and thin ones.
 
-After Kerbl et al. 2023 in R2-Gaussian's radiative form: the statistic is the mean norm of the gradient by the
-projected centre in normalised detector units; both halves of a clone or split keep half the density."""
+It follows Kerbl et al. 2023 in R2-Gaussian's radiative form. The statistic is the mean norm of the gradient by the projected
+centre, in normalised detector units. Both halves of a clone or split have half the density."""
 
 from dataclasses import dataclass
 
@@ -14,7 +14,8 @@ from phyradgs_cl.fields import gaussians as g
 
 @dataclass(frozen=True)
 class DensityControl:
-    """When to clone, split and prune, and which Gaussians; lengths in half-sides of the volume, fractions of the run.
+    """When and which Gaussians to clone, split and prune. Lengths are in half-sides of the volume, times in fractions of a
+    run.
 
     ``every``: iterations between two rounds; 0 keeps the first population. Gaussians whose longest scale is more than
     ``prune_aspect`` times their shortest are removed (0: never). Such thin sheets and needles lie between the rays, where no
@@ -40,7 +41,7 @@ class DensityControl:
         return np.asarray(scale.max(0) <= self.prune_aspect * scale.min(0))
 
     def is_due(self, iteration: int, iterations: int) -> bool:
-        """Whether to act after ``iteration`` (counted from 1)."""
+        """Returns whether to act after ``iteration`` (counted from 1)."""
         inside = self.start_iteration < iteration < self.stop_fraction * iterations
         return self.every > 0 and inside and iteration % self.every == 0
 
@@ -66,7 +67,7 @@ def control_density(
 ) -> Population:
     """Does one round of density control.
 
-    statistic (G,) mean gradient norm; box (2, 3): lowest and highest corner x y z; centres outside are removed."""
+    statistic (G,): mean gradient norm. box (2, 3): lowest and highest corner x y z; Gaussians with centres outside go."""
     rows = activation.apply(population.raw)
     room = max(control.max_gaussians - statistic.size, 0)
     has_large_gradient = _strongest(statistic, control.threshold, room)
@@ -79,10 +80,10 @@ def control_density(
     changed = population.raw.copy()
     changed[:, cloned] = activation.invert(rows[:, cloned])
     new_raw = activation.invert(np.concatenate([copies, first, second], axis=1))
-    # two children replace a Gaussian that is split; one that is cloned stays beside its copy
+    # Two children replace a Gaussian that is split. A cloned Gaussian stays, with its copy.
     remaining = np.setdiff1d(np.arange(population.count), split)
     raw = np.concatenate([changed[:, remaining], new_raw], axis=1)
-    # new Gaussians have no history of gradients
+    # New Gaussians have no history of gradients.
     fresh = np.zeros((2, g.ROWS, new_raw.shape[1]), population.moments.dtype)
     grown = Population(raw, np.concatenate([population.moments[:, :, remaining], fresh], axis=2))
     return prune(grown, activation, control, box)
@@ -99,7 +100,7 @@ def prune(
 
 
 def _strongest(statistic: np.ndarray, threshold: float, room: int) -> np.ndarray:
-    """Returns which statistics are at or above the threshold; the largest ``room`` of them if there are more."""
+    """Returns which statistics are at or above the threshold; of more than ``room``, the largest."""
     chosen = statistic >= threshold
     if int(chosen.sum()) > room:
         order = np.argsort(-statistic, kind="stable")[:room]
@@ -109,7 +110,7 @@ def _strongest(statistic: np.ndarray, threshold: float, room: int) -> np.ndarray
 
 
 def _children(rows: np.ndarray, control: DensityControl, rng: np.random.Generator) -> np.ndarray:
-    """Draws one child from each Gaussian (11, S), smaller and half as dense."""
+    """Draws one child (11, S) from each Gaussian (11, S), smaller and half as dense."""
     child: np.ndarray = rows.copy()
     child[g.MEAN] += rotate(rows[g.QUATERNION], rng.normal(size=(3, rows.shape[1])) * rows[g.SCALE])
     child[g.SCALE] /= control.split_factor
@@ -118,7 +119,7 @@ def _children(rows: np.ndarray, control: DensityControl, rng: np.random.Generato
 
 
 def rotate(quaternion: np.ndarray, vector: np.ndarray) -> np.ndarray:
-    """Vectors (3, S) turned by unit quaternions (4, S), w x y z."""
+    """Returns vectors (3, S) turned by unit quaternions (4, S), w x y z."""
     w, axis = quaternion[0], quaternion[1:]
     cross = 2 * np.cross(axis, vector, axis=0)
     return np.asarray(vector + w * cross + np.cross(axis, cross, axis=0))

@@ -1,8 +1,8 @@
-"""Phantoms: objects of known attenuation, for simulations and as the truth of comparisons; ``make_phantom`` makes one.
+"""Phantoms are objects of known attenuation, for simulations and as the truth of comparisons; ``make_phantom`` makes one.
 
 All have ``name``, ``kind`` and ``voxelise(grid)``. An "analytic" phantom also has ``line_integrals(source, target)`` in
-closed form, a "moving" one has them at any time, a "voxel" one has ``volume`` and ``grid``. Attenuation scales with
-1 / half-size, so that line integrals do not depend on the size."""
+closed form, and a "moving" phantom has them at any time. A "voxel" phantom has ``volume`` and ``grid``. Attenuation scales
+with 1 / half-size, so that line integrals do not depend on the size."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -54,7 +54,7 @@ class VoxelPhantom:
 
 
 Phantom = EllipsoidPhantom | MovingPhantom | VoxelPhantom
-# (half_size_mm, resolution, seed) -> phantom; closed forms ignore the last two.
+# (half_size_mm, resolution, seed) -> phantom. Closed forms ignore the last two.
 Factory = Callable[[float, int, int], Phantom]
 
 

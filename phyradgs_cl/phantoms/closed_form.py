@@ -1,5 +1,4 @@
-"""Phantoms in closed form: Shepp and Logan's head, circles of beads, and the moving sphere of RTK's motion-compensation
-tests."""
+"""Phantoms in closed form: Shepp and Logan's head, circles of beads, and the moving sphere of RTK's tests."""
 
 from dataclasses import dataclass, replace
 from typing import ClassVar
@@ -12,7 +11,7 @@ from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.phantoms.ellipsoids import Array, Body, Ellipsoid, EllipsoidPhantom, Triple, rotation_about_z
 
-# Shepp-Logan: centre x, y, z | semi-axes a, b, c | rotation about z in degrees; lengths in half-sizes
+# Shepp-Logan: centre x, y, z | semi-axes a, b, c | rotation about z in degrees. Lengths are in half-sizes.
 _BODIES = (
     (0.0, 0.0, 0.0, 0.69, 0.92, 0.9, 0.0),
     (0.0, 0.0, 0.0, 0.6624, 0.874, 0.88, 0.0),
@@ -30,7 +29,7 @@ _GREY_LEVELS = {
     "kak-slaney": (2.0, -0.98, -0.02, -0.02, 0.02, 0.02, 0.01, 0.01, 0.02, -0.02),
 }
 _OUTER, _INNER, _SWING = 60 / 64, 8 / 64, 8 / 64  # RTK's mm over half of its box of 128 mm
-_STEPS = 8  # frames of RTK's cycle, which the sphere crosses forth and back
+_STEPS = 8  # frames of RTK's cycle, in which the sphere goes forth and back
 
 
 def shepp_logan(
@@ -38,8 +37,8 @@ def shepp_logan(
 ) -> EllipsoidPhantom:
     """Returns the head in a cube of side 2 · ``half_size_mm`` about the origin.
 
-    ``variant``: "toft" (high contrast) or "kak-slaney". ``unit_attenuation_per_mm``: attenuation of grey level 1, by default
-    1 / ``half_size_mm``, so that line integrals do not depend on the size. Raises InputError for a wrong size or variant."""
+    ``variant``: "toft" (high contrast) or "kak-slaney". ``unit_attenuation_per_mm``: attenuation of grey level 1. By default
+    it is 1 / ``half_size_mm``, so that line integrals do not depend on the size. InputError: a wrong size or variant."""
     positive("half_size_mm", half_size_mm)
     one_of("Shepp-Logan variant", variant, _GREY_LEVELS)
     unit = 1.0 / half_size_mm if unit_attenuation_per_mm is None else unit_attenuation_per_mm
@@ -52,22 +51,21 @@ def shepp_logan(
     return EllipsoidPhantom(tuple(bodies), "shepp-logan")
 
 
-# Spheres: lengths in half-sizes, densities in 1 / half-size.
+# Spheres: lengths are in half-sizes, densities in 1 / half-size.
 _BEADS_PER_LAYER = 8
 _LAYER_HEIGHT = 0.27
 _CIRCLE_RADIUS = 0.52
-_BEAD_RADII = (0.12, 0.06, 0.09, 0.045)  # repeated around a layer
+_BEAD_RADII = (0.12, 0.06, 0.09, 0.045)  # the radii repeat around a layer
 _BEAD_DENSITY = 0.85
 _HOLDER_DENSITY = 0.15
-_HOLDER_AXES = (0.85, 0.85, 0.7)  # contains every bead and fits into the scanner's cylinder
+_HOLDER_AXES = (0.85, 0.85, 0.7)  # the holder contains every bead and fits into the scanner's cylinder
 
 
 def sphere_phantom(half_size_mm: float) -> EllipsoidPhantom:
     """Returns two horizontal circles of dense beads, the second turned by half a step, in a light holder.
 
-    Round edges show blur and distortion, as in the phantoms that cone-beam scanners are calibrated with. In a cube of side
-    2 · ``half_size_mm`` about the origin beads attenuate 1 / ``half_size_mm`` (holder included), the holder 0.15 times that.
-    """
+    Round edges show blur and distortion, as in the phantoms that calibrate cone-beam scanners. The cube of side 2 ·
+    ``half_size_mm`` is about the origin. A bead attenuates 1 / ``half_size_mm``, the holder 0.15 times that."""
     positive("half_size_mm", half_size_mm)
     unit = 1.0 / half_size_mm
     ax, ay, az = (a * half_size_mm for a in _HOLDER_AXES)
@@ -76,7 +74,7 @@ def sphere_phantom(half_size_mm: float) -> EllipsoidPhantom:
         for i in range(_BEADS_PER_LAYER):
             angle = 2 * np.pi * (i + layer / 2) / _BEADS_PER_LAYER
             x, y = _CIRCLE_RADIUS * np.cos(angle), _CIRCLE_RADIUS * np.sin(angle)
-            # The second layer starts elsewhere in the list, so that large beads do not sit above large ones.
+            # The second layer starts elsewhere in the list, so that large beads do not stand above large ones.
             radius = _BEAD_RADII[(i + 2 * layer) % len(_BEAD_RADII)] * half_size_mm
             centre = (float(x) * half_size_mm, float(y) * half_size_mm, height * half_size_mm)
             bodies.append(Ellipsoid(centre, (radius,) * 3, _BEAD_DENSITY * unit))
@@ -87,8 +85,8 @@ def sphere_phantom(half_size_mm: float) -> EllipsoidPhantom:
 class MovingBody:
     """A body that goes from end to end of a line and back at constant speed.
 
-    body: in the middle of its way. swing_mm: (x, y, z) from there to the end that it reaches after half a period; it starts
-    at the other end. period_s: of the way there and back. Raises InputError for a period that is not positive."""
+    body: in the middle of its line. swing_mm: (x, y, z) from there to the end that it reaches after half a period; it starts
+    at the other end. period_s: the time forth and back. Raises InputError for a period that is not positive."""
 
     body: Body
     swing_mm: Triple
@@ -105,7 +103,7 @@ class MovingBody:
         return np.outer(way, self.swing_mm)
 
     def at(self, time_s: float) -> Body:
-        """Returns the body where it is at a time."""
+        """Returns the body at its place at a time."""
         shift_mm = self.shift_mm(time_s)[0]
         if isinstance(self.body, Ellipsoid):
             x, y, z = (np.asarray(self.body.centre_mm) + shift_mm).tolist()
@@ -116,8 +114,9 @@ class MovingBody:
 
 @dataclass(frozen=True)
 class MovingPhantom:
-    """A sum of bodies at rest and of bodies that move, with exact line integrals at any time. Raises InputError for bodies
-    with different periods, and for none that moves."""
+    """A sum of bodies at rest and of bodies that move, with exact line integrals at any time.
+
+    Raises InputError for bodies with different periods, and if no body moves."""
 
     resting: tuple[Body, ...]
     moving: tuple[MovingBody, ...]
@@ -136,7 +135,7 @@ class MovingPhantom:
 
     @property
     def reach_mm(self) -> float:
-        """Radius of a ball about the origin that holds every body at any time."""
+        """The radius of a ball about the origin that holds every body at any time."""
         ends = [body.at(part * body.period_s) for body in self.moving for part in (0.0, 0.5)]
         return EllipsoidPhantom((*self.resting, *ends), self.name).reach_mm
 
@@ -146,12 +145,13 @@ class MovingPhantom:
         return max(4 * float(np.linalg.norm(body.swing_mm)) / body.period_s for body in self.moving)
 
     def at(self, time_s: float) -> EllipsoidPhantom:
-        """Returns the phantom as it is at a time."""
+        """Returns the phantom at rest as it is at a time."""
         return EllipsoidPhantom((*self.resting, *(body.at(time_s) for body in self.moving)), self.name)
 
     def line_integrals(self, source: ArrayLike, target: ArrayLike, time_s: ArrayLike) -> Array:
-        """Integrates attenuation from ``source`` to ``target``, world points (n, ..., 3) in mm that broadcast, the n-th
-        along the first axis at the n-th time (n,). Returns (n, ...) float64."""
+        """Integrates attenuation from ``source`` to ``target``, world points (n, ..., 3) in mm that broadcast.
+
+        time_s (n,): the time of each entry along the first axis. Returns (n, ...) float64."""
         start, end = np.asarray(source, np.float64), np.asarray(target, np.float64)
         total = EllipsoidPhantom(self.resting, self.name).line_integrals(start, end)
         for body in self.moving:
@@ -168,9 +168,9 @@ class MovingPhantom:
 def moving_sphere(half_size_mm: float, period_s: float = float(_STEPS)) -> MovingPhantom:
     """Returns a ball in which a small hole goes to and fro along y, in a cube of side 2 · ``half_size_mm`` about the origin.
 
-    With 64 mm it has the lengths of RTK's tests: a ball of 60 mm, in it one of 8 mm that moves by ±8 mm in 8 frames, where
-    frames follow each other by 1 s (S. Rit et al., J. Phys. Conf. Ser. 489, 012079, 2014). The ball attenuates
-    1 / ``half_size_mm``, in the hole half of that, as RTK's densities of 2 and −1."""
+    With 64 mm it has the lengths of RTK's tests: a ball of 60 mm that holds one of 8 mm, which moves by ±8 mm in 8 frames of
+    1 s (S. Rit et al., J. Phys. Conf. Ser. 489, 012079, 2014). The ball attenuates 1 / ``half_size_mm`` and the hole half of
+    that, like RTK's densities of 2 and −1."""
     positive("half_size_mm", half_size_mm)
     outer, inner, swing = (share * half_size_mm for share in (_OUTER, _INNER, _SWING))
     ball = Ellipsoid((0.0, 0.0, 0.0), (outer,) * 3, 1 / half_size_mm)

@@ -18,8 +18,8 @@ Triple = tuple[float, float, float]
 Matrix = tuple[Triple, Triple, Triple]
 
 IDENTITY: Matrix = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
-_PARALLEL = 1e-30  # instead of 0: a ray along a cylinder meets its side nowhere
-RAYS_PER_CHUNK = 1 << 15  # a chunk's intermediates stay in a core's cache: 2-3 MB
+_PARALLEL = 1e-30  # replaces 0: a ray along a cylinder meets its side nowhere
+RAYS_PER_CHUNK = 1 << 15  # the intermediates of a chunk stay in a core's cache: 2-3 MB
 
 
 def rotation_about_z(angle_rad: float) -> Matrix:
@@ -55,7 +55,7 @@ class Ellipsoid:
 
     @property
     def to_unit_ball(self) -> Array:
-        """Matrix (3, 3) that maps a world vector (x, y, z) in mm to the frame where the surface has radius 1."""
+        """The matrix (3, 3) that maps a world vector (x, y, z) in mm to the frame where the surface has radius 1."""
         return np.asarray(self.rotation).T / np.asarray(self.semi_axes_mm)[:, None]
 
     @property
@@ -65,7 +65,7 @@ class Ellipsoid:
 
     @property
     def ends_mm(self) -> tuple[Triple, Triple]:
-        """The ends of a line segment; the whole body lies within ``reach_mm`` of it."""
+        """The ends of a line segment. The whole body lies within ``reach_mm`` of it."""
         return self.centre_mm, self.centre_mm
 
     @property
@@ -78,9 +78,9 @@ class Ellipsoid:
         o = (start - np.asarray(self.centre_mm)) @ to_ball
         d = step @ to_ball
         dd = np.einsum("ij,ij->i", d, d)
-        dd[dd == 0] = 1.0  # the fraction of a segment without length is multiplied by zero later
+        dd[dd == 0] = 1.0  # a segment without length has fraction 0 later
         nearest = -np.einsum("ij,ij->i", o, d) / dd
-        # The distance from the foot point, not the discriminant, whose terms cancel for far sources.
+        # The distance of the foot point is precise; the discriminant's terms would cancel for far sources.
         foot = o + nearest[:, None] * d
         half = np.sqrt(np.maximum(1.0 - np.einsum("ij,ij->i", foot, foot), 0.0) / dd)
         return np.clip(nearest + half, 0.0, 1.0) - np.clip(nearest - half, 0.0, 1.0)
@@ -88,7 +88,7 @@ class Ellipsoid:
     def contains(self, x: Array, y: Array, z: Array) -> NDArray[np.bool_]:
         """Returns whether points lie inside, given by coordinates in mm that broadcast."""
         cx, cy, cz = self.centre_mm
-        # One term per axis before they broadcast: coordinates of a grid stay one-dimensional.
+        # The sum has one term per axis before it broadcasts, so coordinates of a grid stay one-dimensional.
         rows = [m[0] * (x - cx) + m[1] * (y - cy) + m[2] * (z - cz) for m in self.to_unit_ball]
         return rows[0] ** 2 + rows[1] ** 2 + rows[2] ** 2 <= 1.0
 
@@ -116,7 +116,7 @@ class Cylinder:
 
     @property
     def axis(self) -> Array:
-        """Unit vector (3,) from the first end to the second."""
+        """The unit vector (3,) from the first end to the second."""
         return np.asarray(np.subtract(self.ends_mm[1], self.ends_mm[0]) / self.length_mm)
 
     @property
@@ -172,20 +172,20 @@ class EllipsoidPhantom:
 
     @property
     def reach_mm(self) -> float:
-        """Radius of a ball about the origin that holds every body."""
+        """The radius of a ball about the origin that holds every body."""
         return max(float(np.linalg.norm(body.ends_mm, axis=1).max()) + body.reach_mm for body in self.ellipsoids)
 
     def line_integrals(self, source: ArrayLike, target: ArrayLike) -> Array:
         """Integrates attenuation from ``source`` to ``target``, world points (..., 3) in mm, x y z, that broadcast.
 
-        Returns (...) float64, dimensionless; 0 for a segment that misses or has no length. Raises InputError for a last axis
-        that is not 3, and for shapes that do not broadcast."""
+        Returns (...) float64, dimensionless. A segment that misses or has no length gives 0. Raises InputError for a last
+        axis that is not 3, and for shapes that do not broadcast."""
         start, end = _broadcast_points(source, target)
         result = np.zeros(start.shape[:-1])
         flat = result.reshape(-1)
         for first in range(0, flat.size, RAYS_PER_CHUNK):
             chunk = slice(first, min(first + RAYS_PER_CHUNK, flat.size))
-            # Indexing the broadcast views copies a chunk's points only, never all of them.
+            # Indexing the broadcast views copies only a chunk's points.
             where = np.unravel_index(np.arange(chunk.start, chunk.stop), result.shape) if result.ndim else ()
             p = start[where].reshape(-1, 3)
             flat[chunk] = self._segments(p, end[where].reshape(-1, 3) - p)
@@ -206,7 +206,7 @@ class EllipsoidPhantom:
         return total
 
     def voxelise(self, grid: Grid, supersampling: int = 2) -> NDArray[np.float32]:
-        """Returns mean attenuation (nz, ny, nx) float32 in 1/mm, of ``supersampling`` points along each axis of a voxel."""
+        """Returns mean attenuation (nz, ny, nx) float32 in 1/mm, over ``supersampling`` points along a voxel's axes."""
         if supersampling < 1:
             raise InputError("supersampling", str(supersampling), "an integer of at least 1")
         volume = np.zeros(grid.shape)
@@ -228,7 +228,7 @@ def _broadcast_points(source: ArrayLike, target: ArrayLike) -> tuple[Array, Arra
 
 
 def _add_ellipsoid(volume: Array, ellipsoid: Body, grid: Grid, samples: int) -> None:
-    """Adds a body to ``volume`` (nz, ny, nx) in place, within its box and a slice at a time."""
+    """Adds a body to ``volume`` (nz, ny, nx) in place, within its box, one slice at a time."""
     offsets = (np.arange(samples) + 0.5) / samples - 0.5
     centre, half = ellipsoid.centre_mm[::-1], ellipsoid.half_box_mm[::-1]
     ranges, fine = [], []

@@ -1,7 +1,7 @@
 """Implicit bodies for procedural phantoms: signed distances, smooth unions, band-limited texture.
 
 They are functions of position in the cube [-1, 1]^3, averaged over voxels, so that every resolution samples the same object.
-Distances are positive outside. Points run (x, y, z), arrays (z, y, x), float32."""
+Distances are positive outside. Points are (x, y, z); arrays are (z, y, x), float32."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -14,7 +14,7 @@ Box = tuple[slice, slice, slice]
 Point = tuple[float, float, float]
 
 FAR = np.float32(4.0)  # a distance larger than any inside the cube
-_REACH = 5.0  # blend widths after which a body no longer counts in a union: exp(-5) = 0.7 %
+_REACH = 5.0  # in blend widths: a body further away no longer counts in a union (exp(-5) = 0.7 %)
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,7 @@ class Capsule:
 
 @dataclass(frozen=True)
 class Lattice:
-    """Voxel centres of `count` voxels along each axis of the cube [-1, 1]^3."""
+    """The centres of `count` voxels along each axis of the cube [-1, 1]^3."""
 
     count: int
 
@@ -62,12 +62,12 @@ class Lattice:
         return (z, y, x)
 
     def coverage(self, distance: Field) -> Field:
-        """Returns the part of each voxel that lies inside, linear in the distance across one voxel."""
+        """Returns the part of each voxel that lies inside. It is linear in the distance across one voxel."""
         return np.clip(0.5 - distance / np.float32(self.step), 0.0, 1.0)
 
 
 def capsule_distance(capsule: Capsule, x: Field, y: Field, z: Field) -> Field:
-    """Returns the distance to a tapered capsule (exact for equal radii), for coordinates that broadcast."""
+    """Returns the distance to a tapered capsule, for coordinates that broadcast. It is exact for equal radii."""
     a, b = np.asarray(capsule.p0), np.asarray(capsule.p1)
     axis = (b - a).astype(np.float32)
     length2 = np.float32(max(float(axis @ axis), 1e-12))
@@ -83,7 +83,7 @@ def ellipsoid_distance(centre: Point, semi_axes: Point, x: Field, y: Field, z: F
 
 
 def ratio_distance(offsets: Sequence[Field], semi_axes: Sequence[ArrayLike]) -> Field:
-    """Returns the first-order distance to the surface Σ (offset / semi-axis)² = 1; semi-axes may be arrays."""
+    """Returns the first-order distance to the surface Σ (offset / semi-axis)² = 1. Semi-axes may be arrays."""
     scaled = sum((o / np.asarray(s, np.float32)) ** 2 for o, s in zip(offsets, semi_axes, strict=True))
     slopes = sum((o / np.asarray(s, np.float32) ** 2) ** 2 for o, s in zip(offsets, semi_axes, strict=True))
     radius = np.sqrt(scaled)
@@ -103,7 +103,7 @@ def add_to_union(union: Field, box: Box, distance: Field, blend: float) -> None:
 
 
 def union_distance(union: Field, blend: float) -> Field:
-    """Returns the distance of a sum of ``add_to_union``; FAR where no body came near."""
+    """Returns the distance of a sum of ``add_to_union``; FAR where no body is near."""
     with np.errstate(divide="ignore"):
         return np.minimum(-np.float32(blend) * np.log(union), FAR)
 
@@ -133,19 +133,20 @@ def _intersect(part: Box, box: Box) -> Box:
 def texture(
     lattice: Lattice, wavelengths: tuple[float, float], waves: int, rng: np.random.Generator
 ) -> Field:
-    """Draws isotropic noise (n, n, n) float32 of unit variance: ``waves`` random cosines between two wavelengths. They are
-    averaged over each voxel, and the draws from ``rng`` do not depend on the resolution."""
+    """Draws isotropic noise (n, n, n) float32 of unit variance: ``waves`` random cosines between two wavelengths.
+
+    They are averaged over each voxel. The draws from ``rng`` do not depend on the resolution."""
     direction = rng.standard_normal((waves, 3))
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
     k = 2 * np.pi * direction / rng.uniform(*wavelengths, waves)[:, None]  # rad per unit length
     phase = rng.uniform(0, 2 * np.pi, waves)
-    mean = np.prod(np.sinc(k * lattice.step / (2 * np.pi)), axis=1)  # of a cosine over a voxel
+    mean = np.prod(np.sinc(k * lattice.step / (2 * np.pi)), axis=1)  # mean of a cosine over a voxel
     amplitude = np.sqrt(2.0 / waves) * mean
     axis = lattice.axis().astype(np.float64)
     ex, ey, ez = (np.exp(1j * np.outer(axis, k[:, i])).astype(np.complex64) for i in range(3))
     ez = ez * (amplitude * np.exp(1j * phase)).astype(np.complex64)
     n = lattice.count
-    # cos(a + b + c) is the real part of a product: one matrix product per slice instead of n^3 cosines.
+    # cos(a + b + c) is the real part of a product, so one matrix product per slice replaces n^3 cosines.
     noise = np.empty((n, n, n), dtype=np.float32)
     for i in range(n):
         noise[i] = ((ey * ez[i]) @ ex.T).real

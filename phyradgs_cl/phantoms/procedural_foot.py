@@ -1,7 +1,7 @@
 """A foot-like voxel phantom: tarsals, metatarsals and phalanges in soft tissue, drawn from scratch.
 
-Tapered capsules with a cortical shell and a trabecular inside. Toes point to +z, the big one to -x, the sole to -y.
-Lengths are in units of half the cube's side."""
+Bones are tapered capsules with a cortical shell and a trabecular inside. Toes point to +z, the big toe to -x, the sole to
+-y. Lengths are in units of half the cube's side."""
 
 from itertools import pairwise
 
@@ -19,7 +19,7 @@ _SHELL = 0.022  # cortical thickness
 _SKIN_DEPTH, _FAT_DEPTH = 0.018, 0.06
 _JOINT_BLEND, _SKIN_BLEND = 0.012, 0.022
 
-# Tarsals and the stumps of the leg: each bone a chain of (x, y, z, radius).
+# Tarsals and the stumps of the leg. Each bone is a chain of (x, y, z, radius).
 _TARSALS: tuple[tuple[tuple[float, float, float, float], ...], ...] = (
     ((0.06, -0.21, -0.71, 0.140), (0.07, -0.11, -0.54, 0.150), (0.13, -0.08, -0.27, 0.105)),  # calcaneus
     ((-0.04, 0.16, -0.47, 0.140), (-0.12, 0.12, -0.22, 0.105)),  # talus
@@ -39,7 +39,7 @@ _RAYS: tuple[tuple[Point, Point, float, tuple[float, ...]], ...] = (
     ((0.14, 0.00, 0.14), (0.20, -0.12, 0.46), 1.15, (0.46, 0.59, 0.66, 0.72)),
     ((0.26, -0.05, 0.10), (0.38, -0.14, 0.38), 1.20, (0.38, 0.50, 0.565, 0.62)),
 )
-# What the skin is stretched over besides the bones: sole, arch, ball, leg.
+# Parts besides the bones over which the skin is stretched: sole, arch, ball, leg.
 _FLESH = (
     Capsule((0.07, -0.21, -0.66), (0.21, -0.17, 0.25), 0.18, 0.13),
     Capsule((-0.03, -0.05, -0.40), (-0.14, -0.11, 0.38), 0.23, 0.16),
@@ -49,8 +49,9 @@ _FLESH = (
 
 
 def foot(grid_shape: int, seed: int) -> Field:
-    """Returns the phantom (n, n, n) float32 (z, y, x) in [0, 1], air exactly 0, inside the cube's inscribed cylinder. A
-    ``seed`` gives the same foot at every resolution. Raises InputError for fewer than 4 voxels."""
+    """Returns the phantom (n, n, n) float32 (z, y, x) in [0, 1], air exactly 0, inside the cube's inscribed cylinder.
+
+    A ``seed`` gives the same foot at every resolution. Raises InputError for fewer than 4 voxels."""
     at_least("grid_shape", grid_shape, 4)
     rng = np.random.default_rng(seed)
     bones = [_chain([(p[:3], p[3]) for p in chain], rng) for chain in _TARSALS]
@@ -59,7 +60,7 @@ def foot(grid_shape: int, seed: int) -> Field:
     lattice = Lattice(int(grid_shape))
     ripple = np.float32(0.004) * implicit.texture(lattice, (0.15, 0.4), 48, rng)
     grain = implicit.texture(lattice, (0.035, 0.09), 160, rng)
-    # Toes carry less flesh than the rest, so that there is air between them.
+    # Toes have less flesh than the rest, so that there is air between them.
     cover = [c.grown(0.06) for bone in bones for c in bone] + [c.grown(0.042) for toe in toes for c in toe]
     volume = _soft_tissue(lattice, cover, ripple, rng)
     for bone in bones + toes:
@@ -75,7 +76,7 @@ def _chain(points: list[tuple[Point, float]], rng: np.random.Generator) -> Bone:
 
 
 def _long_bone(start: Point, end: Point, radius: float, rng: np.random.Generator) -> Bone:
-    """A bone between two joints: wide at both ends, with a waist, and a gap for the cartilage."""
+    """Returns a bone between two joints: wide at both ends, with a waist, and a gap for the cartilage."""
     a, b = np.asarray(start), np.asarray(end)
     length = float(np.linalg.norm(b - a))
     unit = (b - a) / length
@@ -89,7 +90,7 @@ def _long_bone(start: Point, end: Point, radius: float, rng: np.random.Generator
 
 
 def _toe(head: Point, thickness: float, joints: tuple[float, ...], rng: np.random.Generator) -> list[Bone]:
-    """The phalanges from a metatarsal's head onwards, the toe bending slightly to the sole."""
+    """Returns the phalanges from a metatarsal's head onwards. The toe bends slightly to the sole."""
     bones = []
     for i, (z0, z1) in enumerate(pairwise(joints)):
         spread = 0.15 * head[0]
@@ -100,7 +101,7 @@ def _toe(head: Point, thickness: float, joints: tuple[float, ...], rng: np.rando
 
 
 def _soft_tissue(lattice: Lattice, cover: list[Capsule], ripple: Field, rng: np.random.Generator) -> Field:
-    """Muscle, a layer of fat and the skin, stretched over `cover` and the flesh; air 0."""
+    """Returns muscle, a layer of fat and the skin, stretched over `cover` and the flesh. Air is 0."""
     distance = implicit.capsule_union(lattice, [*cover, *_FLESH], _SKIN_BLEND, lattice.everything) + ripple
     muscle = np.float32(_MUSCLE) + np.float32(0.02) * implicit.texture(lattice, (0.12, 0.4), 48, rng)
     whole = lattice.coverage(distance)
@@ -110,7 +111,7 @@ def _soft_tissue(lattice: Lattice, cover: list[Capsule], ripple: Field, rng: np.
 
 
 def _add_bone(volume: Field, lattice: Lattice, bone: Bone, ripple: Field, grain: Field) -> None:
-    """Replace what is in `volume` by a bone: cortical shell, trabeculae, fatty marrow in the middle."""
+    """Replaces what is in `volume` by a bone: cortical shell, trabeculae, and fatty marrow in the middle."""
     box = implicit.capsule_box(lattice, bone, 0.05)
     distance = implicit.capsule_union(lattice, bone, _JOINT_BLEND, box) + ripple[box]
     outer = lattice.coverage(distance)

@@ -1,6 +1,6 @@
 """A jaw-like voxel phantom: a mandible with its rami and a row of teeth in soft tissue, drawn from scratch.
 
-The body is an elliptic section swept along a horizontal arc; rami and roots are tapered capsules, crowns small
+The body is an elliptic section swept along a horizontal arc. Rami and roots are tapered capsules; crowns are small
 ellipsoids with an enamel cap. The chin points to -y, the teeth to +z. Lengths are in units of half the cube's side."""
 
 from dataclasses import dataclass
@@ -39,7 +39,7 @@ _FIRST_GAP = 0.006
 
 @dataclass(frozen=True)
 class Tooth:
-    """A tooth at (x, y) on the arc, with the arc's unit direction there; sizes as in `_TEETH`."""
+    """A tooth at (x, y) on the arc, with the arc's unit direction there. Sizes are those of `_TEETH`."""
 
     centre: tuple[float, float]
     along: tuple[float, float]
@@ -50,8 +50,9 @@ class Tooth:
 
 
 def jaw(grid_shape: int, seed: int) -> Field:
-    """Returns the phantom (n, n, n) float32 (z, y, x) in [0, 1], air exactly 0, inside the cube's inscribed cylinder. A
-    ``seed`` gives the same jaw at every resolution. Raises InputError for fewer than 4 voxels."""
+    """Returns the phantom (n, n, n) float32 (z, y, x) in [0, 1], air exactly 0, inside the cube's inscribed cylinder.
+
+    A ``seed`` gives the same jaw at every resolution. Raises InputError for fewer than 4 voxels."""
     at_least("grid_shape", grid_shape, 4)
     rng = np.random.default_rng(seed)
     teeth = _teeth(rng)
@@ -70,7 +71,7 @@ def _arc(phi: float) -> tuple[float, float]:
 
 
 def _teeth(rng: np.random.Generator) -> list[Tooth]:
-    """Fourteen teeth set side by side along the arc, sizes a little different for every seed."""
+    """Returns fourteen teeth side by side along the arc. Their sizes differ a little for every seed."""
     phi = np.linspace(0.0, _PHI_END, 2000)
     x, y = _ARC_A * np.sin(phi), _ARC_Y0 - _ARC_B * np.cos(phi)
     length = np.concatenate([[0.0], np.cumsum(np.hypot(np.diff(x), np.diff(y)))])
@@ -90,7 +91,7 @@ def _teeth(rng: np.random.Generator) -> list[Tooth]:
 
 
 def _arc_distance(lattice: Lattice) -> Field:
-    """(1, n, n): horizontal distance of every column of voxels from the arc."""
+    """Returns the horizontal distance (1, n, n) of every column of voxels from the arc."""
     axis = lattice.axis()
     x, y = axis[None, :], axis[:, None]
     nearest = np.full((lattice.count, lattice.count), np.inf, dtype=np.float32)
@@ -103,7 +104,7 @@ def _arc_distance(lattice: Lattice) -> Field:
 
 
 def _rami() -> list[Capsule]:
-    """Both rami: the angle, a flat blade of three capsules, coronoid process and condyle."""
+    """Returns both rami: the angle, a flat blade of three capsules, coronoid process and condyle."""
     capsules = []
     for side in (-1.0, 1.0):
         x, y = _arc(_PHI_END)
@@ -138,7 +139,7 @@ def _bone_distance(lattice: Lattice) -> Field:
 
 
 def _soft_tissue(lattice: Lattice, bone: Field, teeth: list[Tooth], rng: np.random.Generator) -> Field:
-    """Gums, cheeks and the floor of the mouth with a layer of fat; the airway and the outside are 0."""
+    """Returns gums, cheeks and the floor of the mouth with a layer of fat. The airway and the outside are 0."""
     x, y, z = lattice.points(lattice.everything)
     union = np.zeros_like(bone)
     implicit.add_to_union(union, lattice.everything, bone - np.float32(0.075), _FLESH_BLEND)
@@ -159,7 +160,7 @@ def _soft_tissue(lattice: Lattice, bone: Field, teeth: list[Tooth], rng: np.rand
 
 
 def _fill_bone(volume: Field, lattice: Lattice, distance: Field, rng: np.random.Generator) -> None:
-    """Replace what is in `volume` by cortical bone around trabeculae around the nerve's canal."""
+    """Replaces what is in `volume` by cortical bone around trabeculae around the nerve's canal."""
     _, _, z = lattice.points(lattice.everything)
     outer = lattice.coverage(distance)
     inner = lattice.coverage(distance + np.float32(_SHELL))
@@ -194,7 +195,7 @@ def _add_tooth(volume: Field, lattice: Lattice, tooth: Tooth) -> None:
 
 
 def _roots(tooth: Tooth, top: float, tip: float) -> list[Capsule]:
-    """The tooth's root, or its two roots side by side along the arc, from the crown's middle down."""
+    """Returns the tooth's root, or its two roots side by side along the arc, from the crown's middle down."""
     spread = 0.22 * tooth.width if tooth.roots == 2 else 0.0
     top = min(top, 0.26 * tooth.width) if tooth.roots == 2 else min(top, 0.42 * tooth.width)
     upper, lower = _GUM_Z + 0.02, _GUM_Z - 1.35 * tooth.height
@@ -203,5 +204,5 @@ def _roots(tooth: Tooth, top: float, tip: float) -> list[Capsule]:
 
 
 def _on(tooth: Tooth, shift: float, z: float) -> Point:
-    """The point at height `z`, moved from the tooth's centre along the arc."""
+    """Returns the point at height `z`, moved from the tooth's centre along the arc."""
     return (tooth.centre[0] + shift * tooth.along[0], tooth.centre[1] + shift * tooth.along[1], z)

@@ -1,4 +1,4 @@
-"""A reconstruction as a page, a picture or a window for people."""
+"""Shows a reconstruction to people: as a page, a picture or a window."""
 
 import lazy_loader
 

@@ -1,4 +1,4 @@
-"""Charts of a page, drawn by matplotlib, as SVG inside the page; and those that are curves."""
+"""Charts of a page, drawn by matplotlib as SVG inside the page, and the charts that are curves."""
 
 import hashlib
 import io
@@ -18,20 +18,20 @@ from phyradgs_cl.report.markup import Markup, element, label, number, unit
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-MOST_CHARTS = 3  # of convergence
-SIZE = 440, 320  # of the picture's own units, in which letters are 13 high
+MOST_CHARTS = 3  # charts of convergence
+SIZE = 440, 320  # in the picture's own units, in which letters are 13 high
 _STYLE: Any = {"svg.fonttype": "none", "text.parse_math": False, "font.size": 13}
 Chart = tuple[str, Markup]
 """A caption and a drawing."""
 
 
 def chart(draw: "Callable[[Axes], None]", title: str, description: str, size: tuple[float, float] = SIZE) -> Markup:
-    """Returns an SVG element in the colours of the page; ``title`` and ``description`` are for screen readers."""
+    """Returns an SVG element in the colours of the page. ``title`` and ``description`` are for screen readers."""
     from matplotlib import rc_context
     from matplotlib.figure import Figure
 
     with rc_context(_STYLE), warnings.catch_warnings(), io.StringIO() as stream:
-        warnings.simplefilter("ignore")  # letters that matplotlib's font lacks: the browser has them
+        warnings.simplefilter("ignore")  # the browser has the letters that matplotlib's font lacks
         figure = Figure(figsize=(size[0] / 72, size[1] / 72), layout="constrained")
         axes = figure.add_subplot()
         draw(axes)
@@ -44,7 +44,7 @@ def chart(draw: "Callable[[Axes], None]", title: str, description: str, size: tu
 
 
 def _label_powers(axes: "Axes") -> None:
-    """Labels logarithmic axes with plain numbers; 2 and 5 times powers of ten are added where there are few powers."""
+    """Labels logarithmic axes with plain numbers. With few powers of ten, 2 and 5 times these too."""
     from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
     for axis, scale, (low, high) in (
@@ -57,12 +57,12 @@ def _label_powers(axes: "Axes") -> None:
 
 
 def _inline(svg: str) -> str:
-    """Returns the content of matplotlib's SVG for a place inside HTML: no outer element, metadata, styles or clipping."""
+    """Returns the content of matplotlib's SVG for use inside HTML: no outer element, metadata, styles or clipping."""
     content = svg[svg.index(">") + 1 : svg.rindex("</svg>")]
     content = re.sub(r"<(metadata|style|clipPath)\b.*?</\1>|<!--.*?-->", "", content, flags=re.S)
     content = re.sub(r' clip-path="[^"]*"| font-family: [^;"]*;|font-family: [^;"]*; ', "", content)
     used = set(re.findall(r'xlink:href="#(\w+)"', content))
-    prefix = "c" + hashlib.sha256(content.encode()).hexdigest()[:8]  # names are those of the whole page
+    prefix = "c" + hashlib.sha256(content.encode()).hexdigest()[:8]  # names of SVG elements are shared by the whole page
     content = re.sub(r' id="([^"]*)"', lambda m: f' id="{prefix}{m[1]}"' if m[1] in used else "", content)
     content = content.replace('xlink:href="#', f'href="#{prefix}').replace("#000000", COLOURS["ink"])
     for name, colour in COLOURS.items():
@@ -95,7 +95,7 @@ def draw_convergence(axes: "Axes", points: Sequence[tuple[float, float]], words:
 
 
 def views_chart(key: str, values: object) -> Chart | None:
-    """Returns a chart of a correction of every view; None for values that are no numbers, as a file may hold."""
+    """Returns a chart of a correction of every view. Returns None for values that are no numbers, which a file may hold."""
     if not isinstance(values, list) or len(values) < 2 or not all(map(checks.is_number, values)):
         return None
     words = label(key).capitalize()
@@ -122,6 +122,6 @@ def histogram(edges: NDArray[np.float64], counts: NDArray[np.int64]) -> Markup:
 
 
 def note(axes: "Axes", words: str, point: Any, shift: tuple[float, float], **style: Any) -> None:
-    """Writes words next to a point; ``shift`` is in units of the picture, upwards positive."""
+    """Writes words next to a point. ``shift`` is in units of the picture, positive upwards."""
     style = {"ha": "center", "color": INK, **style}
     axes.annotate(words, point, xytext=shift, textcoords="offset points", **style)

@@ -11,18 +11,18 @@ from numpy.typing import NDArray
 from phyradgs_cl.fields import Grid
 
 LONGEST_EDGE = 192  # pixels of a slice in the page
-BUDGET_PIXELS = 16_000_000  # of all slices together: some 20 MB of page at worst, of pure noise
-# Plane, axis of the array that is cut, and the world axes to the right and up in the picture.
+BUDGET_PIXELS = 16_000_000  # of all slices together: at worst, for pure noise, a page of some 20 MB
+# Plane, axis of the array that is cut, world axes to the right, and world axis up in the picture.
 PLANES = (("axial", 0, "z", "x", "y"), ("coronal", 1, "y", "x", "z"), ("sagittal", 2, "x", "y", "z"))
-_ROOM = 0.25  # of the window, on either side of it
+_ROOM = 0.25  # widening of the window on either side, as a share of it
 _BLUE, _WHITE, _RED = (33, 86, 158), (247, 247, 245), (178, 34, 40)
-_PERCENTILE = 99.9  # a few hot voxels would make the rest dark
+_PERCENTILE = 99.9  # a few very bright voxels would make all others dark
 Volume = NDArray[np.floating]
 
 
 def png_bytes(image: NDArray[np.uint8], colours: NDArray[np.uint8] | None = None) -> bytes:
-    """Returns a PNG of an image (rows, columns) uint8, row 0 at the top; colours (256, 3) uint8, None is grey."""
-    from PIL import Image  # takes a tenth of a second, which most commands save
+    """Returns a PNG of an image (rows, columns) uint8, row 0 at the top. colours: (256, 3) uint8, None for grey."""
+    from PIL import Image  # this import takes a tenth of a second, which most commands do not need
 
     picture = Image.fromarray(image)
     if colours is not None:
@@ -41,14 +41,14 @@ def base64_of(content: bytes) -> str:
 
 
 def bytes_of(image: NDArray[np.floating], low: float, high: float) -> NDArray[np.uint8]:
-    """Returns values of any shape as 0 to 255 for ``low`` to ``high``, clipped; NaN and infinity become 0."""
+    """Returns values of any shape as 0 to 255 for ``low`` to ``high``, clipped. NaN and infinity become 0."""
     span = high - low if high > low else 1.0
     share = np.nan_to_num((image.astype(np.float64) - low) / span)
     return np.rint(255 * np.clip(share, 0, 1)).astype(np.uint8)
 
 
 def top_row_first(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Returns an image (rows, columns) whose row 0 is the lowest as a picture, whose row 0 is the top."""
+    """Returns an image (rows, columns) whose row 0 is the lowest as a picture whose row 0 is the top."""
     return np.ascontiguousarray(image[::-1])
 
 
@@ -66,13 +66,13 @@ def diverging() -> NDArray[np.uint8]:
     """Returns colours (256, 3) for differences: blue, white in the middle, red."""
     at = np.linspace(-1, 1, 256)[:, None]
     ends = np.where(at < 0, np.array(_BLUE), np.array(_RED))
-    # the power makes small differences visible on a white page
+    # The power makes small differences visible on a white page.
     mixed = np.array(_WHITE) + np.abs(at) ** 0.8 * (ends - np.array(_WHITE))
     return np.rint(mixed).astype(np.uint8)
 
 
 def grey_range(volume: NDArray[np.floating]) -> tuple[float, float]:
-    """Returns the values of black and white: 0 and a high percentile, or the extremes where nothing is above 0."""
+    """Returns the values of black and white: 0 and a high percentile. Where nothing is above 0 they are the extremes."""
     high = float(np.percentile(volume, _PERCENTILE))
     if high > 0:
         return 0.0, high
@@ -82,8 +82,9 @@ def grey_range(volume: NDArray[np.floating]) -> tuple[float, float]:
 
 @dataclass(frozen=True)
 class Window:
-    """The first values of black and white, ``low`` and ``high``, and the values ``least`` to ``most`` of 256 grey levels.
-    All are in 1/mm. beyond: whether there are smaller values than ``least``, and larger ones than ``most``."""
+    """Black and white at first (``low``, ``high``), and the range ``least`` to ``most`` of 256 grey levels, all in 1/mm.
+
+    beyond: whether there are smaller values than ``least``, and larger values than ``most``."""
 
     low: float
     high: float
@@ -102,9 +103,10 @@ class Window:
 
 @dataclass(frozen=True)
 class Plane:
-    """The slices of one orientation: ``indices`` among ``count`` slices. layers: PNGs in base64, by layer. first_mm,
-    step_mm: the centre of slice 0 and the distance to the next. size_mm: (width, height). still: a PNG of the middle slice,
-    for browsers without scripts."""
+    """The slices of one orientation: ``indices`` among ``count`` slices.
+
+    layers: PNGs in base64, by layer. first_mm, step_mm: the centre of slice 0 and the distance to the next. size_mm: (width,
+    height). still: a PNG of the middle slice, for browsers without scripts."""
 
     name: str
     axis: str
@@ -128,7 +130,7 @@ class Plane:
 
 
 def windows_of(volume: Volume, reference: Volume | None) -> dict[str, Window]:
-    """Returns a window per layer; result and truth share the range of the truth, so that a wrong gain shows."""
+    """Returns a window per layer. Result and truth share the range of the truth, so that a wrong gain shows."""
     if reference is None or not float(reference.max()) > 0:
         return {"result": Window.of(*grey_range(volume), volume)}
     grey = Window.of(min(0.0, float(reference.min())), float(reference.max()), volume, reference)
@@ -158,8 +160,9 @@ def planes_of(volume: Volume, reference: Volume | None, grid: Grid, windows: Map
 
 
 def middle_planes(slices: Sequence[Volume], grid: Grid, window: tuple[float, float]) -> list[Plane]:
-    """Returns planes with nothing but the stills of three middle slices (axial, coronal, sagittal) of a volume on ``grid``;
-    ``window`` is the values of black and white."""
+    """Returns planes that have only the stills of three middle slices (axial, coronal, sagittal) of a volume on ``grid``.
+
+    window: the values of black and white."""
     planes = []
     for (name, axis, letter, right, up), image in zip(PLANES, slices, strict=True):
         still = grey_png(block_means(image, LONGEST_EDGE), *window)
@@ -169,19 +172,19 @@ def middle_planes(slices: Sequence[Volume], grid: Grid, window: tuple[float, flo
 
 
 def _extent(grid: Grid, axis: int) -> tuple[float, float, tuple[float, float]]:
-    """Returns the first slice's centre and the distance to the next, and (width, height) of a slice, all in mm."""
+    """Returns the first slice's centre, the distance to the next slice, and (width, height) of a slice, all in mm."""
     height_mm, width_mm = (side for a, side in enumerate(grid.size_mm) if a != axis)
     return grid.first_centre_mm[axis], grid.voxel_size_mm[axis], (width_mm, height_mm)
 
 
 def stills_of(planes: Sequence[Plane], volume: Volume, window: tuple[float, float]) -> list[Plane]:
-    """Returns ``planes`` with the stills of another volume (nz, ny, nx); ``window`` is the values of black and white."""
+    """Returns ``planes`` with the stills of another volume (nz, ny, nx). ``window``: the values of black and white."""
     pictures = (_picture(volume, axis, plane.indices[plane.middle], *window) for axis, plane in enumerate(planes))
     return [replace(plane, layers={}, still=still) for plane, still in zip(planes, pictures, strict=True)]
 
 
 def _slice_counts(shape: tuple[int, ...], layers: int) -> list[int]:
-    """Returns the number of slices along every axis: all, or what the budget allows."""
+    """Returns the number of slices along every axis: all of them, or as many as the budget allows."""
     edges = [min(n, LONGEST_EDGE) for n in shape]
     pixels = [int(np.prod(edges)) // edges[axis] for axis in range(3)]
     most = max(1, BUDGET_PIXELS // (layers * sum(pixels)))

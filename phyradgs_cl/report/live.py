@@ -1,41 +1,237 @@
-"""The page of a run under way, replaced whole every few seconds; after the run it is the report."""
+"""Writes the page of a run under way, whole and every few seconds. After the run it becomes the report.
+
+``Status`` and ``Snapshot`` hold the words and pictures of the page, ``LivePage`` writes it."""
 
 import logging
+import math
 import threading
 import time
-from collections.abc import Callable, Mapping
-from dataclasses import replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from types import TracebackType
 
+import numpy as np
+from numpy.typing import NDArray
+
 from phyradgs_cl.errors import PhyradgsError
+from phyradgs_cl.fields import Grid
 from phyradgs_cl.io import written_beside
 from phyradgs_cl.reconstructors import Progress
 from phyradgs_cl.reconstructors.projected import FramePair
-from phyradgs_cl.report.live_page import Snapshot, Status, live_page
+from phyradgs_cl.report.images import grey_range, middle_planes
+from phyradgs_cl.report.interactive.viewer import stills
+from phyradgs_cl.report.markup import Markup, element, joined, json_block, label, number, raw_text
+from phyradgs_cl.report.page import head, web_script
+from phyradgs_cl.report.sections import facts_table, frame_pictures, note, section
+from phyradgs_cl.text import clock
 
+_MOST_POINTS = 400  # points of the convergence
+_SAMPLES = 64  # samples along a side for the grey values
+_LATE_S, _LATE_TIMES = 30.0, 6  # without news for this time, or this multiple of the usual one, the run may have been killed
+_LOG_RATIO = 20.0  # largest over smallest value: above this ratio the axis is logarithmic
+_CHART = 560, 240
+_MARGIN = 64, 12, 12, 34  # margins of the chart: left, top, right, bottom
 EVERY_S = 5.0
-SHARE = 0.01  # of the run's time, at most, that pictures may cost it
+SHARE = 0.01  # pictures may cost the run this fraction of its time
 FRAMES = 2
-FRAMES_FROM_S = 60.0  # of runs that are expected to be shorter no frames are computed: the report has them soon
+FRAMES_FROM_S = 60.0  # no frames are computed in runs expected to be shorter: their report comes soon
+
+
+@dataclass(frozen=True, eq=False)
+class Snapshot:
+    """The middle slices (axial, coronal, sagittal) of the volume after an iteration, in 1/mm, and some frames."""
+
+    iteration: int
+    slices: tuple[NDArray[np.floating], ...]
+    grid: Grid
+    high: float
+    frames: Sequence[FramePair] = ()
+
+    @classmethod
+    def of(cls, iteration: int, volume: NDArray[np.floating], grid: Grid, frames: Sequence[FramePair]) -> "Snapshot":
+        slices = tuple(np.take(volume, n // 2, axis=axis) for axis, n in enumerate(volume.shape))
+        sample = volume[tuple(slice(None, None, math.ceil(n / _SAMPLES)) for n in volume.shape)]
+        return cls(iteration, slices, grid, max(grey_range(sample)[1], 0.0) or 1.0, frames)
+
+    @cached_property
+    def parts(self) -> list[Markup]:
+        """The sections with pictures."""
+        words = note(f"The middle slices after iteration {self.iteration}.")
+        pictures = stills(middle_planes(self.slices, self.grid, (0.0, self.high)), "volume", self.high)
+        parts = [section("slices", "Slices", words, pictures)]
+        if self.frames:
+            legend, rows = frame_pictures(self.frames)
+            parts.append(section("projections", "Projections", note(legend), *rows))
+        return parts
+
+
+@dataclass(frozen=True, eq=False)
+class Status:
+    """What a page says about a run. Times are seconds since 1970.
+
+    - settings: facts by name. stage: what the run does before its first iteration.
+    - ended: the reason why no more news will come. It is no warning if ``is_complete``.
+    - points: (iteration, measure of convergence)."""
+
+    title: str
+    settings: Mapping[str, object]
+    every_s: float
+    started: float
+    stage: str = ""
+    ended: str = ""
+    is_complete: bool = False
+    progress: Progress | None = None
+    points: tuple[tuple[int, float], ...] = ()
+    first: tuple[int, float] = (0, 0.0)
+    """Iteration and time of the first report in the present count."""
+    reported: float = 0.0
+    snapshot: Snapshot | None = None
+
+    def after(self, progress: Progress, now: float) -> "Status":
+        """Returns the status after a report. A count that starts again, as in a trial, starts another curve."""
+        last, points, first = self.progress, self.points, self.first
+        is_same = last is not None and (last.quantity, last.iterations) == (progress.quantity, progress.iterations)
+        if last is None or not is_same or progress.iteration < last.iteration:
+            points, first = (), (progress.iteration, now)
+        points = (*points, (progress.iteration, progress.loss))
+        if len(points) > _MOST_POINTS:
+            points = (*points[::2], points[-1])
+        alone = replace(progress, state=None, volume=None, frames=None)
+        return replace(self, progress=alone, points=points, first=first, reported=now, stage="")
+
+    @property
+    def per_s(self) -> float | None:
+        """Iterations per second, from the second report on."""
+        if self.progress is None or self.reported <= self.first[1] or self.progress.iteration <= self.first[0]:
+            return None
+        return (self.progress.iteration - self.first[0]) / (self.reported - self.first[1])
+
+    def left_s(self, now: float) -> float | None:
+        """The time in s until the last iteration."""
+        if self.progress is None or self.per_s is None:
+            return None
+        return max(0.0, (self.progress.iterations - self.progress.iteration) / self.per_s - (now - self.reported))
+
+
+def live_page(status: Status, now: float) -> str:
+    """Returns the page as text, written at ``now`` in seconds since 1970."""
+    pictures = [] if status.snapshot is None else status.snapshot.parts
+    curve = [section("convergence", "Convergence", _curve(status))] if len(status.points) > 1 else []
+    parts = [*pictures[:1], *curve, *pictures[1:], section("settings", "Settings", _settings(status))]
+    names = ["slices", "convergence", "projections", "settings"]
+    links = [element("a", n.capitalize(), href=f"#{n}") for n in names if any(f' id="{n}"' in part for part in parts)]
+    skip = element("a", "To the content", href="#settings", class_="skip")
+    data = {
+        "written": now, "every_s": status.every_s, "late_s": max(_LATE_S, _LATE_TIMES * status.every_s),
+        "is_over": bool(status.ended),
+    }  # fmt: skip
+    body = joined(
+        skip, element("header", *_top(status, now), element("nav", *links, aria_label="Sections")),
+        element("main", *parts), json_block("live-data", data),
+    )
+    script = web_script("common", "live")
+    page = element("body", body, raw_text("script", script))
+    seconds = None if status.ended else math.ceil(status.every_s)
+    return "<!doctype html>\n" + element("html", head(_tab(status), script, seconds), page, lang="en") + "\n"
+
+
+def _tab(status: Status) -> str:
+    """Returns the title in the browser's tab, which begins with the run's progress."""
+    p = status.progress
+    share = "starting" if p is None else f"{100 * p.iteration // max(p.iterations, 1)} %"
+    if status.ended:
+        share = "complete" if status.is_complete else "stopped"
+    return f"{share} – {status.title}"
+
+
+def _top(status: Status, now: float) -> list[Markup]:
+    at = time.strftime("%H:%M:%S", time.localtime(now))
+    words = f"Written at {at}. " + ("" if status.ended else f"A run that is alive writes every {status.every_s:g} s.")
+    state = status.ended or (f"{status.stage[:1].upper()}{status.stage[1:]}." if status.stage else "")
+    kind = "warning" if status.ended and not status.is_complete else None
+    news = element("p", state, id="news", role="status", class_=kind, hidden=not state)
+    controls = []
+    if not status.ended:
+        button = element("button", "Pause reloading", type="button", id="pause", aria_pressed="false")
+        controls = [element("p", button, class_="tools")]
+    tiles = [element("li", element("b", value), element("span", name)) for name, value in _tiles(status, now)]
+    about = f"{status.settings.get('method', '')}, from {status.settings.get('scan', 'a scan')}"
+    title = status.title if status.ended else f"{status.title}, under way"
+    parts = [element("h1", title), element("p", about), news, element("p", words, id="written"), *controls]
+    if (p := status.progress) is not None:
+        parts.append(element("progress", value=p.iteration, max=max(p.iterations, 1), aria_label="Finished iterations"))
+    return [*parts, element("ul", *tiles, class_="tiles")]
+
+
+def _tiles(status: Status, now: float) -> list[tuple[str, str]]:
+    tiles = []
+    if (p := status.progress) is not None:
+        tiles += [("iteration", f"{p.iteration} of {p.iterations}"), (p.quantity, number(p.loss))]
+        if p.gaussians:
+            tiles.append(("Gaussians", f"{p.gaussians:,}".replace(",", "\N{NARROW NO-BREAK SPACE}")))
+        if (per_s := status.per_s) is not None:
+            tiles.append(("per minute", number(60 * per_s)))
+        if (left_s := status.left_s(now)) is not None and not status.ended:
+            tiles.append(("time left", clock(left_s)))
+    return [*tiles, ("time so far", clock(now - status.started))]
+
+
+def _settings(status: Status) -> Markup:
+    """Returns a table of the plain facts, and one for each table of facts."""
+    tables = {name: facts for name, facts in status.settings.items() if isinstance(facts, Mapping)}
+    plain = {name: value for name, value in status.settings.items() if name not in tables}
+    parts = [facts_table(plain)]
+    for name, facts in tables.items():
+        parts += [element("h3", label(name).capitalize()), element("div", facts_table(facts), class_="columns")]
+    return joined(*parts)
+
+
+def _curve(status: Status) -> Markup:
+    """Returns the convergence as SVG, drawn without matplotlib: its import would cost more than the run allows."""
+    x, y = np.array(status.points, float).T
+    words = status.progress.quantity if status.progress is not None else ""
+    is_log = 0 < _LOG_RATIO * y.min() < y.max()
+    height = np.log(y) if is_log else y
+    left, top, right, bottom = _MARGIN
+    across = left + (x - x[0]) / ((x[-1] - x[0]) or 1) * (_CHART[0] - left - right)
+    down = _CHART[1] - bottom - (height - height.min()) / (np.ptp(height) or 1) * (_CHART[1] - top - bottom)
+    path = " ".join(f"{a:.1f},{b:.1f}" for a, b in zip(across, down, strict=True))
+    ends = [(top + 4, y.max()), (_CHART[1] - bottom + 4, y.min())]
+    base = _CHART[1] - bottom
+    texts = [element("text", number(value), x=left - 8, y=at, text_anchor="end") for at, value in ends]
+    texts.append(element("text", number(x[0]), x=left, y=base + 20))
+    texts.append(element("text", f"iteration {number(x[-1])}", x=_CHART[0] - right, y=base + 20, text_anchor="end"))
+    frame = element("path", d=f"M{left},{top}V{base}H{_CHART[0] - right}", class_="frame")
+    curve = element("polyline", points=path, class_="curve")
+    caption = f"{words.capitalize()}: from {number(y[0])} to {number(y[-1])} at iteration {number(x[-1])}"
+    caption += ", on a logarithmic axis." if is_log else "."
+    drawing = element(
+        "svg", frame, curve, *texts, viewBox=f"0 0 {_CHART[0]} {_CHART[1]}", role="img", aria_label=caption,
+        class_="drawing plain",
+    )
+    return element("div", element("figure", drawing, element("figcaption", caption)), class_="charts")
+
+
 log = logging.getLogger(__name__)
 
 
 class LivePage:
-    """A listener to a running method that keeps a page about it; a context around the run.
+    """Writes a page about a running method, to which it listens. It is a context around the run.
 
-    A thread writes the page every ``every_s`` seconds, so that an older page is that of a run that was killed. Pictures are
-    taken between two iterations, as long as their time is below ``SHARE`` of the run's. An error, or Ctrl-C, leaves its
-    reason on the page. A file that was there before is replaced from the first iteration on: a run that is refused leaves it
-    alone. A page that cannot be written is a warning, once, and no error."""
+    A thread writes the page every ``every_s`` seconds, so an older page belongs to a run that was killed. Pictures are taken
+    between two iterations, as long as their time is below ``SHARE`` of the run's. An error, or Ctrl-C, leaves its reason on
+    the page. A file that was there before is replaced from the first iteration on, so a refused run leaves it alone. A page
+    that cannot be written is one warning, and no error."""
 
     def __init__(self, path: Path, title: str, settings: Mapping[str, object], every_s: float = EVERY_S) -> None:
         self.path, self.every_s = path, every_s
         self.status = Status(title, settings, every_s, time.time())
         self.spent_s = 0.0
-        """Seconds that the run has waited for pictures."""
+        """The time in s that the run has waited for pictures."""
         self._pictured_s = -every_s
-        self._waits = False  # for the first iteration
+        self._waits = False  # true until the first iteration
         self._started_s = time.monotonic()
         self._is_over = threading.Event()
         self._writer = threading.Thread(target=self._keep_writing, name="live page", daemon=True)
@@ -60,7 +256,7 @@ class LivePage:
         self.end(f"Stopped by an error: {error}" if isinstance(error, Exception) else "Interrupted.")
 
     def stage(self, text: str) -> None:
-        """Says what the run does before its first iteration."""
+        """Says on the page what the run does before its first iteration."""
         self.status = replace(self.status, stage=text)
 
     def __call__(self, progress: Progress) -> None:
@@ -75,7 +271,7 @@ class LivePage:
         self.spent_s += self._pictured_s - used_s
 
     def end(self, reason: str, is_complete: bool = False) -> None:
-        """Writes the page a last time, which says why there is no more news; later calls do nothing."""
+        """Writes the page a last time, with the reason why no more news will come. Later calls do nothing."""
         if not self._is_over.is_set():
             self._stop()
             self.status = replace(self.status, ended=reason, is_complete=is_complete)

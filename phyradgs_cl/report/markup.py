@@ -1,4 +1,4 @@
-"""The words of a page: HTML built from elements, so that nothing from a file gets in unescaped, and facts as text."""
+"""The words of a page: HTML built from elements, so that no text of a file gets in unescaped, and facts as text."""
 
 import html
 import json
@@ -15,21 +15,23 @@ _RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
 class Markup(str):
-    """Text that is HTML. Any other text is escaped when it becomes part of an element."""
+    """Text that is HTML. Other text is escaped when it becomes part of an element."""
 
 
 VOID = frozenset({"br", "img", "input", "link", "meta"})
 
 
 def element(name: str, /, *children: object, **attributes: object) -> Markup:
-    """Returns ``<name attributes>children</name>``; children that are no Markup are escaped. Attributes that are None or
-    False are left out, and True has no value. Underscores in names become dashes; one at the end is removed (``class_``)."""
+    """Returns ``<name attributes>children</name>``; children that are no Markup are escaped.
+
+    Attributes that are None or False are left out, and True has no value. Underscores in names become dashes; one at the end
+    is removed (``class_``)."""
     opening = f"<{name}{''.join(_attribute(key, value) for key, value in attributes.items())}>"
     return Markup(opening) if name in VOID else Markup(f"{opening}{joined(*children)}</{name}>")
 
 
 def joined(*children: object) -> Markup:
-    """Joins children, escaped where they are no Markup; None adds nothing."""
+    """Joins children, which are escaped where they are no Markup. None adds nothing."""
     shown = (c if isinstance(c, Markup) else html.escape(_plain(c)) for c in children if c is not None)
     return Markup("".join(shown))
 
@@ -42,7 +44,7 @@ def raw_text(name: str, content: str, /, **attributes: object) -> Markup:
 
 
 def json_block(identifier: str, value: object) -> Markup:
-    """Returns data for the page's script, as JSON in which no element can begin or end."""
+    """Returns data for the page's script as JSON. No element can begin or end in it."""
     text = json.dumps(value, separators=(",", ":"), allow_nan=False)
     safe = text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
     return element("script", Markup(safe), id=identifier, type="application/json")
@@ -75,7 +77,7 @@ def unit(key: str) -> str:
 
 
 def shown(value: object, unit_name: str = "") -> str:
-    """Returns a value with its unit, cut if it is very long."""
+    """Returns a value with its unit. A very long value is cut."""
     text = _text(value, _RESOLUTION.get(unit_name, 0.0))
     if len(text) > _LONGEST:
         text = text[:_LONGEST] + "…"
@@ -84,7 +86,7 @@ def shown(value: object, unit_name: str = "") -> str:
 
 
 def number(value: float, resolution: float = 0.0) -> str:
-    """Returns a number with at most four digits; values up to a millionth of ``resolution`` are 0."""
+    """Returns a number with at most four digits. Values up to a millionth of ``resolution`` become 0."""
     if abs(value) <= 1e-6 * resolution:
         value = 0.0
     if not math.isfinite(value):

@@ -1,4 +1,4 @@
-"""A reconstruction as one HTML page that loads nothing."""
+"""Writes a reconstruction as one HTML page that loads nothing."""
 
 import hashlib
 from collections.abc import Callable, Sequence
@@ -20,9 +20,9 @@ from phyradgs_cl.report.run import Change, Run, computed_views, load_run, step_c
 from phyradgs_cl.runtime import Runtime
 
 DEFAULT_VIEWS = 3
-# space.js and motion.js hear of the window from slices.js, and therefore come before it
+# Order matters: slices.js sends the window when it loads, so its listeners (space.js, motion.js) load first.
 _SCRIPT = ("common", "shaders", "render", "space", "motion", "slices", "rows")
-_SCRIPTED = ("volume",)  # sections that the script reveals
+_SCRIPTED = ("volume",)  # the script reveals these sections
 
 
 @np.errstate(all="ignore")  # a file may hold any values
@@ -30,11 +30,13 @@ def write_report(
     volume: Path, output: Path, make_runtime: Callable[[], Runtime], *, scan: Path | None = None,
     views: int = DEFAULT_VIEWS,
 ) -> Run:
-    """Writes the page ``output`` of a volume file, completely or not at all, and returns the run. scan: None is the file
-    that the volume's provenance names, if it is unchanged. views: the number of frames that are computed from the volume, on
-    the device of ``make_runtime``; without frames no device is needed. Raises InputError for files that cannot be read or
-    are of another kind, and for an output that is one of them or no page; OutputError where the page cannot be written;
-    DeviceError where no device can project."""
+    """Writes the page ``output`` of a volume file, completely or not at all, and returns the run.
+
+    scan: None takes the file that the volume's provenance names, if it is unchanged. views: the number of frames that are
+    computed from the volume, on the device of ``make_runtime``. Without frames no device is needed.
+
+    Raises InputError for files that cannot be read or are of another kind, and for an output that is one of them or no page.
+    Raises OutputError where the page cannot be written, and DeviceError where no device can project."""
     check_writable(output)
     run = load_run(volume, scan)
     refuse_overwriting("-o", output, volume, run.scan_path)
@@ -49,7 +51,7 @@ def write_report(
 
 
 def report_page(run: Run, views: Sequence[FramePair] = (), changes: Sequence[Change] = ()) -> str:
-    """Returns the page as text; ``views`` come from ``computed_views``, ``changes`` from ``step_changes``."""
+    """Returns the page as text. ``views`` come from ``computed_views``, ``changes`` from ``step_changes``."""
     of_scan = {} if run.scan is None else {
         "preparation": sections.preparation_section(run, changes),
         "projections": sections.projections_section(run.scan, views),
@@ -78,7 +80,7 @@ def report_page(run: Run, views: Sequence[FramePair] = (), changes: Sequence[Cha
 
 
 def _arranged(shown: dict[str, Markup]) -> list[Markup]:
-    """Returns the sections; metrics and convergence are side by side where there is room."""
+    """Returns the sections. Metrics and convergence are side by side where there is room."""
     narrow = [part for name, part in shown.items() if name in ("metrics", "convergence")]
     wide = [part for name, part in shown.items() if name not in ("metrics", "convergence")]
     pair = element("div", *narrow, class_="pair") if narrow else Markup()
@@ -86,8 +88,9 @@ def _arranged(shown: dict[str, Markup]) -> list[Markup]:
 
 
 def head(title: str, script: str, reload_s: int | None = None) -> Markup:
-    """Returns the styles, and a policy that permits no network and no script except ``script``. reload_s: after how many
-    seconds a browser without scripts loads the page again."""
+    """Returns the styles, and a policy that permits no network and no script except ``script``.
+
+    reload_s: the seconds after which a browser without scripts loads the page again."""
     digest = base64_of(hashlib.sha256(script.encode()).digest())
     policy = f"default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'sha256-{digest}'"
     policy += "; base-uri 'none'; form-action 'none'"

@@ -1,4 +1,4 @@
-"""A volume outside of a report: a picture of its middle slices, also during a run, and a window of napari."""
+"""Shows a volume outside of a report: as a picture of its middle slices, also during a run, or in a window of napari."""
 
 import logging
 import math
@@ -32,9 +32,10 @@ log = logging.getLogger(__name__)
 
 
 def write_preview(volume: NDArray[np.floating], grid: Grid, path: str | Path) -> None:
-    """Writes a grey PNG of the middle slices of a volume (nz, ny, nx), in true proportions, completely or not at all. From
-    left to right: axial (y up), coronal and sagittal (z up). Raises InputError for a volume that does not fit its grid, NaN
-    and infinity; OutputError where the file cannot be written."""
+    """Writes a grey PNG of the middle slices of a volume (nz, ny, nx), in true proportions, completely or not at all.
+
+    From left to right they are axial (y up), coronal and sagittal (z up). Raises InputError for a volume that does not fit
+    its grid, NaN and infinity, and OutputError where the file cannot be written."""
     checks.shape("volume", volume, grid.shape)
     checks.finite("volume", volume)
     picture = png_bytes(preview_image(volume, grid))
@@ -43,8 +44,9 @@ def write_preview(volume: NDArray[np.floating], grid: Grid, path: str | Path) ->
 
 
 class Preview:
-    """A listener to a running method that writes a picture of the present volume to ``io.partial_path`` of ``path``. It
-    writes at most every ``every_s`` seconds. A picture that cannot be written is a warning, once."""
+    """Writes a picture of the present volume to ``io.partial_path`` of ``path``, as a listener to a running method.
+
+    It writes at most every ``every_s`` seconds. A picture that cannot be written is a warning, once."""
 
     def __init__(self, path: Path, every_s: float = 5.0) -> None:
         self.path, self.partial, self.every_s = path, partial_path(path), every_s
@@ -58,7 +60,7 @@ class Preview:
         self._last_s = time.monotonic()
 
     def finish(self, volume: NDArray[np.floating], grid: Grid) -> None:
-        """Writes the picture of the result, and removes that of the run."""
+        """Writes the picture of the result, and removes the picture of the run."""
         self._write(volume, grid, self.path)
         with suppress(OSError):
             self.partial.unlink()
@@ -73,7 +75,7 @@ class Preview:
 
 
 def preview_image(volume: NDArray[np.floating], grid: Grid) -> NDArray[np.uint8]:
-    """Returns the picture (rows, columns) uint8, row 0 at the top; the slices are aligned at the bottom."""
+    """Returns the picture (rows, columns) uint8, row 0 at the top. The slices are aligned at the bottom."""
     low, high = grey_range(volume)
     per_mm = np.clip(max(grid.shape), _SMALLEST, _LARGEST) / max(grid.size_mm)
     slices = []
@@ -81,7 +83,7 @@ def preview_image(volume: NDArray[np.floating], grid: Grid) -> NDArray[np.uint8]
         image = bytes_of(np.take(volume, volume.shape[axis] // 2, axis=axis), low, high)
         size_mm = [side for a, side in enumerate(grid.size_mm) if a != axis]
         shape = [max(1, round(side * per_mm)) for side in size_mm]
-        ends = zip(shape, image.shape, strict=True)  # by the nearest pixel, so that voxels stay visible
+        ends = zip(shape, image.shape, strict=True)  # the nearest pixel keeps voxels visible
         rows, columns = (((np.arange(n) + 0.5) * m / n).astype(int) for n, m in ends)
         slices.append(top_row_first(image[rows[:, None], columns]))
     height, width = max(s.shape[0] for s in slices), sum(s.shape[1] + _GAP for s in slices) - _GAP
@@ -94,7 +96,7 @@ def preview_image(volume: NDArray[np.floating], grid: Grid) -> NDArray[np.uint8]
 
 
 def _shown_axes(grid: Grid) -> list[int]:
-    """Returns the axes to look along; for a grid of one layer only the axis across the layer."""
+    """Returns the axes to look along. For a grid of one layer this is only the axis across the layer."""
     across = [min(n for a, n in enumerate(grid.shape) if a != axis) for axis in range(3)]
     return [axis for axis in range(3) if across[axis] > 1] or [0, 1, 2]
 
@@ -104,8 +106,9 @@ Layer = tuple[np.ndarray, dict[str, Any], str]
 
 
 def view_volume(path: Path) -> None:
-    """Opens a window with a volume file and returns when it is closed. Raises InputError where napari is missing, and for
-    anything but a volume file of phyradgs-cl."""
+    """Opens a window with a volume file, and returns when it is closed.
+
+    Raises InputError where napari is missing, and for anything but a volume file of phyradgs-cl."""
     napari = checks.package("napari", "the package for this, 0.5.4 or later", "napari[all]")
     if (kind := file_kind(path)) != "volume":
         raise InputError(str(path), f"a {kind}", "a volume of phyradgs-cl")
@@ -114,19 +117,19 @@ def view_volume(path: Path) -> None:
 
 
 def add_volume(viewer: Any, stored: Volume, name: str) -> None:
-    """Adds a volume to a viewer, in mm at its position, with axes z, y, x, y up, grey from 0."""
+    """Adds a volume to a viewer, in mm at its position, with axes z, y, x. y points up; grey begins at 0."""
     viewer.add_image(stored.values, **_look_of_volume(stored, name))
     viewer.dims.axis_labels = _AXES
-    if hasattr(viewer.camera, "orientation2d"):  # since napari 0.6; before, y points down
+    if hasattr(viewer.camera, "orientation2d"):  # napari has this since 0.6; before, y points down
         viewer.camera.orientation2d = ("up", "right")
-    # napari 0.9 has moved its overlays
+    # napari 0.9 has moved its overlays.
     overlays = viewer.canvas.overlays if hasattr(viewer, "canvas") else viewer
     overlays.scale_bar.visible = True
 
 
 def napari_reader(path: str | list[str]) -> Callable[[str | list[str]], list[Layer]] | None:
-    """Returns the function that reads a file for napari, which calls this for every .h5 file; None for what is neither a
-    volume nor a scan of phyradgs-cl."""
+    """Returns the function that reads a file for napari, which asks this for every .h5 file. Returns None for files that are
+    neither a volume nor a scan of phyradgs-cl."""
     paths = [path] if isinstance(path, str) else path
     with suppress(PhyradgsError):
         if all(file_kind(one) in ("volume", "scan") for one in paths):
@@ -137,7 +140,7 @@ def napari_reader(path: str | list[str]) -> Callable[[str | list[str]], list[Lay
 def napari_layer(path: Path) -> Layer:
     """Returns (values, arguments of add_image, "image") of a volume (z, y, x) in mm, or of a scan (projection, v, u).
 
-    Rows and columns of a scan are in mm from the central ray; row 0 is the lowest."""
+    Rows and columns of a scan are in mm from the central ray. Row 0 is the lowest."""
     if file_kind(path) == "volume":
         stored = read_volume(path)
         return stored.values, _look_of_volume(stored, path.stem), "image"

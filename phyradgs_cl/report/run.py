@@ -1,4 +1,4 @@
-"""The subject of a report: a stored volume, its scan, and how the two compare; frames before and after each step."""
+"""The subject of a report: a stored volume, its scan, and how both compare. Also frames before and after each step."""
 
 import logging
 from collections.abc import Mapping
@@ -41,10 +41,12 @@ Image = NDArray[np.float32]
 
 @dataclass(frozen=True, eq=False)
 class Run:
-    """A reconstruction from its volume file and, where it is found, its scan. scan, scan_path, scan_facts: the scan, on the
-    volume's grid. reference (nz, ny, nx) 1/mm: the truth on that grid. metrics: by name. notes: remarks for the reader of
-    the page. compared: how volume and truth were compared. deformation: how the object moved, where the run knew or found
-    it."""
+    """A reconstruction from its volume file and, where it is found, its scan.
+
+    - scan, scan_path, scan_facts: the scan, on the volume's grid.
+    - reference (nz, ny, nx) 1/mm: the truth on that grid. compared: how volume and truth were compared. metrics: by name.
+    - notes: remarks for the reader of the page.
+    - deformation: how the object moved, where the run knew or found it."""
 
     path: Path
     stored: Volume
@@ -59,7 +61,7 @@ class Run:
 
     @property
     def motion(self) -> Motion | None:
-        """The motion model of the run, with the segments that it chose; None where the provenance lacks it."""
+        """The motion model of the run, with the segments that it chose. None where the provenance lacks it."""
         options = self.stored.provenance.get("options")
         table = options.get("motion") if isinstance(options, Mapping) else None
         if not isinstance(table, Mapping):
@@ -69,12 +71,12 @@ class Run:
             table = {**table, "segments": segments}
         try:
             return motion_from_facts(table)
-        except (InputError, TypeError):  # of another version, or of another program
+        except (InputError, TypeError):  # the provenance may be of another version or program
             return None
 
     @property
     def preprocessing(self) -> Preprocessing:
-        """The preprocessing of the frames, without what later versions lack; the usual one where the provenance lacks it."""
+        """The preprocessing of the frames, without steps that later versions lack. By default the usual one."""
         table = self.stored.provenance.get("input")
         try:
             return preprocessing_of(_kept(table)) if isinstance(table, Mapping) else Preprocessing()
@@ -89,7 +91,7 @@ class Run:
 
 
 def _kept(table: Mapping[str, Any], of: str = "") -> dict[str, Any]:
-    """Returns options by name without those that have left."""
+    """Returns options by name, without options that this version no longer has."""
     return {
         name: _kept(value, f"{name}.") if isinstance(value, Mapping) else value
         for name, value in table.items() if f"{of}{name}" not in REMOVED
@@ -97,8 +99,9 @@ def _kept(table: Mapping[str, Any], of: str = "") -> dict[str, Any]:
 
 
 def load_run(path: Path, scan_path: Path | None = None) -> Run:
-    """Reads a volume file and its scan: ``scan_path``, or the unchanged file that the provenance names. Raises InputError
-    for anything but a volume file of phyradgs-cl, and for a ``scan_path`` that cannot be read."""
+    """Reads a volume file and its scan: ``scan_path``, or the unchanged file that the provenance names.
+
+    Raises InputError for anything but a volume file of phyradgs-cl, and for a ``scan_path`` that cannot be read."""
     kind = file_kind(path)
     if kind != "volume":
         raise InputError(str(path), f"a {kind}", "a volume of phyradgs-cl", "make one with 'phyradgs reconstruct'")
@@ -115,7 +118,7 @@ def load_run(path: Path, scan_path: Path | None = None) -> Run:
 
 
 def _with_scan(run: Run, path: Path, is_given: bool, notes: list[str]) -> Run:
-    """Adds the scan of a file, and the comparison with its reference; appends remarks to ``notes``."""
+    """Adds the scan of a file and the comparison with its reference. Appends remarks to ``notes``."""
     kind = file_kind(path) if is_given else "scan"
     if kind != "scan":
         raise InputError(f"--scan {path}", f"a {kind}", "a scan")
@@ -177,8 +180,8 @@ def computed_views(run: Run, rt: Runtime, count: int) -> list[FramePair]:
 
 
 def _named_deformation(path: Path, provenance: Mapping[str, object], notes: list[str]) -> Deformation | None:
-    """Returns how the object moved, from the file that the provenance names, if it has the stored hash. A file that is
-    missing is a remark."""
+    """Returns how the object moved, from the file that the provenance names, if it has the stored hash. A missing one is
+    noted."""
     name = provenance.get("object_motion")
     if not isinstance(name, str) or not name:
         return None
@@ -192,9 +195,12 @@ def _named_deformation(path: Path, provenance: Mapping[str, object], notes: list
 
 @dataclass(frozen=True, eq=False)
 class Change:
-    """The effect of a preprocessing step. numbers: the facts that the step reports. pairs: images before and after, by name:
-    the frame (rows, columns) and the sinogram (frames, columns) that changed most, and the middle slice (y, x) by FDK.
-    counts (2, n): histograms of all line integrals, before and after, between ``edges`` (n + 1,)."""
+    """The effect of a preprocessing step.
+
+    - numbers: the facts that the step reports.
+    - pairs: images before and after, by name. These are the frame (rows, columns) and the sinogram (frames, columns) that
+      changed most, and the middle slice (y, x) by FDK.
+    - counts (2, n): histograms of all line integrals, before and after, between ``edges`` (n + 1,)."""
 
     step: str
     numbers: Facts

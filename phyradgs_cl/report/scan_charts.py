@@ -21,14 +21,14 @@ _MOST_FRAMES = 180  # marks on the orbit
 _ARC_SAMPLES = 24
 _FIRST_FRAMES = 4
 _MOST_DOTS, _MOST_CELLS, _LINES_WITH_DOTS = 600, 100_000, 12
-_BESIDE = 0.75  # of the volume's diagonal, from its middle: where rays begin and panels stand that have no distance
-_ROOM = 0.06  # next to the data, relative to them
+_BESIDE = 0.75  # distance from the volume's middle, over its diagonal, of sources and panels of a parallel beam
+_ROOM = 0.06  # margin around the data, relative to them
 Points = NDArray[np.float64]
 
 
 def orbit_chart(scan: Scan) -> Markup:
-    """Returns the scanner from above: all source positions, the first frame's arc, rays, panel and volume. The arc of a
-    parallel beam is where its middle ray comes from."""
+    """Returns the scanner from above: all source positions, the first frame's arc, rays, panel and volume. In a parallel
+    beam the arc is where the middle ray comes from."""
     places = "directions of parallel rays" if scan.is_parallel else "source positions"
     middles, words = source_positions(scan), f"{scan.frames} {places}; the first frame's rays, panel and volume"
     arc = _first_arc(scan)
@@ -81,7 +81,7 @@ def side_chart(scan: Scan) -> Markup:
 
 
 def _draw_rays(axes: "Axes", panel: Points, source: Points, is_parallel: bool) -> None:
-    """Draws the rays to a panel's two ends (2, 2): from the source, or as long as the middle one of a parallel beam."""
+    """Draws the rays to a panel's two ends (2, 2): from the source, or as long as a parallel beam's middle ray."""
     starts = panel + source - panel.mean(0) if is_parallel else (source, source)
     for start, end in zip(starts, panel, strict=True):
         axes.plot(*np.array([start, end]).T, color=ACCENT, alpha=0.55, lw=1)
@@ -94,7 +94,7 @@ def _draw_source(axes: "Axes", source: Points, shift: tuple[float, float], is_pa
 
 
 def _plan(draw: "Callable[[Axes], None]", points: Sequence[Points], title: str, words: str) -> Markup:
-    """Returns a drawing in mm to scale, with a scale bar and room for labels around ``points``, each (N, 2)."""
+    """Returns a drawing in mm to scale, with a scale bar, and with room for labels around ``points``, each (N, 2)."""
     every = np.concatenate(points)
     low, high = every.min(axis=0), every.max(axis=0)
     room = 0.1 * float(np.max(high - low)) or 1.0
@@ -131,8 +131,7 @@ def with_sources(scan: Scan, poses: Points) -> Points:
 
 
 def panel_corners(pose: Points, detector_shape: tuple[int, int]) -> Points:
-    """Returns the panel's corners (4, ..., 3) in mm at poses (..., 12): (low, left), (high, left), (low, right), (high,
-    right)."""
+    """Returns the panel's corners (4, ..., 3) in mm at poses (..., 12): left low, left high, right low, right high."""
     rows, columns = detector_shape
     u, v = np.array([-0.5, columns - 0.5]), np.array([-0.5, rows - 0.5])
     return np.array([pose[..., 3:6] + a * pose[..., 6:9] + b * pose[..., 9:12] for a in u for b in v])
@@ -146,7 +145,7 @@ def _first_arc(scan: Scan) -> Points:
 
 
 def box_corners(scan: Scan) -> Points:
-    """Returns the corners (8, 3) x y z mm of the grid: the lower four in a circle, then the upper four."""
+    """Returns the corners (8, 3), x y z in mm, of the grid: the lower four around the box, then the upper four."""
     half, centre = np.array(scan.grid.size_mm[::-1]) / 2, np.array(scan.grid.offset_mm[::-1])
     around = [(-1, -1), (1, -1), (1, 1), (-1, 1)]
     return np.array([centre + half * (x, y, z) for z in (-1, 1) for x, y in around])
@@ -203,7 +202,7 @@ def shutter_words(scan: Scan) -> str:
 
 
 def _draw_samples(axes: "Axes", scan: Scan, motion: Motion) -> None:
-    """Draws when the run took its poses: dots on lines, or vertical lines for poses that all lines share."""
+    """Draws the times of the run's poses: dots on lines, or vertical lines for poses that all lines share."""
     if isinstance(motion, MicroViews | OwnTimes | LineMiddles) and scan.is_fly:
         axes.plot(*sample_times(scan, motion).T, ".", color=SAMPLE, ms=5)
         return
@@ -219,7 +218,7 @@ def _draw_samples(axes: "Axes", scan: Scan, motion: Motion) -> None:
 
 
 def sample_times(scan: Scan, motion: Motion) -> Points:
-    """Returns (time after the frame's start, line) of the poses, (N, 2); of some lines where each line has its own."""
+    """Returns (time after the frame's start, line) of the poses, (N, 2). If every line has its own, some lines are taken."""
     rows = min(motion.strips, scan.lines) if isinstance(motion, MicroViews) else scan.lines
     if rows * getattr(motion, "sub_intervals", 1) > _MOST_CELLS:
         return np.empty((0, 2))

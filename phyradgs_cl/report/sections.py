@@ -1,4 +1,4 @@
-"""The sections of a page, each from a run to HTML. A section with nothing to show is None."""
+"""The sections of a page. Each function makes HTML of a run, or returns None where there is nothing to show."""
 
 from collections.abc import Iterable, Mapping, Sequence
 
@@ -18,14 +18,14 @@ from phyradgs_cl.report.run import Change, Run
 from phyradgs_cl.report.scan_charts import frames_chart, orbit_chart, shutter_chart, shutter_words, side_chart
 from phyradgs_cl.text import flattened, to_digits_of
 
-_MOST_ROWS = 400  # of a table
+_MOST_ROWS = 400  # rows of a table
 _STATES = 5
-_MOST_CHARTS, _MOST_COMBINATIONS = 6, 20  # of a calibration
+_MOST_CHARTS, _MOST_COMBINATIONS = 6, 20  # charts and combinations of a calibration
 _ABSURD = 1e9  # no parameter of our files is larger
 
 
 def slices_section(run: Run) -> Markup:
-    """The volume, together with the truth where the scan has one."""
+    """Shows the volume, together with the truth where the scan has one."""
     stored, grid = run.stored, run.stored.required_grid
     windows = images.windows_of(stored.values, run.reference)
     planes = images.planes_of(stored.values, run.reference, grid, windows)
@@ -39,7 +39,7 @@ def slices_section(run: Run) -> Markup:
 
 
 def states_section(run: Run) -> Markup | None:
-    """The middle slices of an object that changes, at some of its times."""
+    """Shows the middle slices of an object that changes, at some of its times."""
     if (states := run.stored.states) is None:
         return None
     high = images.windows_of(run.stored.values, run.reference)["result"].high
@@ -52,7 +52,7 @@ def states_section(run: Run) -> Markup | None:
 
 
 def motion_section(run: Run) -> Markup | None:
-    """The object at any time of the scan, where it is known how it moved."""
+    """Shows the object at any time of the scan, where its motion is known."""
     if run.deformation is None or not has_depth(run.stored.values):
         return None
     stored, grid, field = run.stored, run.stored.required_grid, run.deformation
@@ -67,7 +67,7 @@ def motion_section(run: Run) -> Markup | None:
 
 
 def volume_section(run: Run) -> Markup | None:
-    """The volume in 3D, which the script reveals where the browser can draw it."""
+    """Shows the volume in 3D. The script reveals this section where the browser can draw it."""
     stored = run.stored
     window = images.windows_of(stored.values, run.reference)["result"]
     picture = space(stored.values, stored.required_grid, window, stored.gaussians)
@@ -75,7 +75,7 @@ def volume_section(run: Run) -> Markup | None:
 
 
 def metrics_section(run: Run, views: Sequence[FramePair]) -> Markup | None:
-    """Numbers against the truth, and against the measurement where frames were computed."""
+    """Shows numbers against the truth and, where frames were computed, against the measurement."""
     facts: dict[str, object] = dict(run.metrics)
     if run.reference is not None:
         error = run.stored.values.astype(np.float64) - run.reference
@@ -110,7 +110,7 @@ def geometry_section(scan: Scan) -> Markup:
 
 
 def shutter_section(run: Run, scan: Scan) -> Markup | None:
-    """The times of a frame, and of successive frames if the gantry moves; None for stops without a stated exposure."""
+    """Shows the times of a frame, and of successive frames if the gantry moves. None for stops without a stated exposure."""
     if not scan.is_fly and scan.shutter.exposure_s == 0:
         return None
     words = shutter_words(scan)
@@ -125,7 +125,7 @@ def shutter_section(run: Run, scan: Scan) -> Markup | None:
 
 
 def projections_section(scan: Scan, views: Sequence[FramePair]) -> Markup | None:
-    """Measured, computed and residual frames, with one range of grey values and one of residuals."""
+    """Shows measured, computed and residual frames, with one range of grey values and one range of residuals."""
     if not views:
         return None
     (rows, columns), (dv_mm, du_mm) = scan.geometry.detector_shape, scan.geometry.pixel_size_mm
@@ -138,7 +138,7 @@ def projections_section(scan: Scan, views: Sequence[FramePair]) -> Markup | None
 
 
 def frame_pictures(views: Sequence[FramePair], style: str | None = None) -> tuple[str, list[Markup]]:
-    """Returns the legend of frames and their pictures, a row each. ``style``: of a picture, where pixels are not square."""
+    """Returns the legend of frames, and their pictures, one row each. ``style``: CSS, if pixels are not square."""
     low = min(0.0, *(float(v.measured.min()) for v in views))
     high = max(float(v.measured.max()) for v in views)
     limit = max(float(np.percentile(np.abs(v.residual), 99.5)) for v in views) or 1.0
@@ -157,7 +157,7 @@ def frame_pictures(views: Sequence[FramePair], style: str | None = None) -> tupl
 
 
 def preparation_section(run: Run, changes: Sequence[Change]) -> Markup | None:
-    """The effect of each preprocessing step: pictures, a histogram and numbers; numbers only of an earlier ``prepare``."""
+    """Shows the effect of each preprocessing step: pictures, a histogram and numbers. Numbers only for ``prepare``."""
     prepared = [] if run.scan is None else run.scan.provenance.get(PREPARED_KEY)
     earlier = [element("div", element("h3", str(line.get("step"))), facts_table(line)) for line in _tables(prepared)]
     if not changes and not earlier:
@@ -183,7 +183,7 @@ def _change(change: Change) -> Markup:
 
 
 def calibration_section(scan: Scan) -> Markup | None:
-    """The results of ``calibrate``, the first run first: tables of parameters, and charts of corrections of the views."""
+    """Shows the results of ``calibrate``, the first run first: tables of parameters, charts of views."""
     calibrations = _tables(scan.provenance.get("calibrated_before")) + _tables([scan.provenance.get("calibration")])
     parts = [part for one in calibrations for part in _calibration(one, scan)]
     if not parts:
@@ -194,7 +194,7 @@ def calibration_section(scan: Scan) -> Markup | None:
 
 
 def _calibration(calibration: Mapping[str, object], scan: Scan) -> list[Markup]:
-    """A row per parameter, the combinations that frames cannot tell apart, and a chart per correction of the views."""
+    """Returns a row per parameter, combinations that frames do not distinguish, and a chart per correction of views."""
     parameters = _tables(calibration.get("parameters"))
     if not parameters:
         return []
@@ -216,7 +216,7 @@ def _calibration(calibration: Mapping[str, object], scan: Scan) -> list[Markup]:
 
 
 def _cells(line: Mapping[str, object]) -> list[str]:
-    """The cells of a parameter: name, stated value, estimate with its deviation, verdict."""
+    """Returns the cells of a parameter: name, stated value, estimate with its deviation, verdict."""
     estimate, deviation, unit_name = line.get("found"), line.get("deviation"), line.get("unit")
     of = unit_name if isinstance(unit_name, str) else ""
     value = "–" if estimate is None else f"{shown(estimate)} ± {_or_dash(deviation, of)}"
@@ -226,7 +226,7 @@ def _cells(line: Mapping[str, object]) -> list[str]:
 
 
 def provenance_section(run: Run) -> Markup:
-    """Everything that the volume file stores about its making, except the convergence record."""
+    """Shows everything that the volume file stores about its making, except the convergence record."""
     facts = {k: v for k, v in run.stored.provenance.items() if k not in ("record", "options")}
     options = run.stored.provenance.get("options")
     parts: list[object] = [facts_table(facts)]
@@ -260,7 +260,7 @@ def _motion_words(motion: Motion) -> str:
 
 
 def _tables(value: object) -> list[Mapping[str, object]]:
-    """The tables of a list from a file; nothing of anything else."""
+    """Returns the tables of a list from a file. Anything else has none."""
     return [line for line in value if isinstance(line, Mapping)] if isinstance(value, list) else []
 
 
@@ -269,7 +269,7 @@ def _or_dash(value: object, unit_name: str = "") -> str:
 
 
 def _row(heading: str, of: str, pictures: Sequence[tuple[str, bytes]], style: str | None = None) -> Markup:
-    """Pictures next to each other under a heading, each with its caption."""
+    """Returns pictures next to each other under a heading, each with its caption."""
     figures = []
     for words, png in pictures:
         image = element("img", src=images.data_uri(png), alt=f"{of}, {words}", style=style)
@@ -288,7 +288,7 @@ def note(words: str) -> Markup:
 
 
 def section(identifier: str, heading: str, *content: object, hidden: bool = False) -> Markup:
-    """Returns a section with its heading; content that is empty or None is left out."""
+    """Returns a section with its heading. Content that is empty or None is left out."""
     title = element("h2", heading, id=f"{identifier}-heading")
     body = joined(*(part for part in content if part))
     return element("section", title, body, id=identifier, aria_labelledby=f"{identifier}-heading", hidden=hidden)

@@ -1,6 +1,7 @@
-"""Algebra of arrays with one interface: on the device by kernels (cl/algebra.cl), on the host by NumPy. A method is written
-once, over a ``Space``. Every function returns a new array or a number; only numbers come back from a device. Sums are
-deterministic: the same arrays on the same device give the same bits."""
+"""Algebra of arrays with one interface: on the device by kernels (cl/algebra.cl), on the host by NumPy.
+
+A method is written once, over a ``Space``. Every function returns a new array or a number; only numbers come back from a
+device. Sums are deterministic: the same arrays on the same device give the same bits."""
 
 import weakref
 from collections import defaultdict
@@ -17,7 +18,7 @@ A = TypeVar("A")
 Shape = tuple[int, ...]
 _CPU_SPAN = 1 << 14  # elements that one work-item sums
 _GPU_GROUP, _GPU_GROUPS = 256, 512
-_ITEMS = 64  # of a work-group on a CPU, element by element
+_ITEMS = 64  # items of a work-group on a CPU, in element-wise kernels
 
 
 class Space(Protocol, Generic[A]):
@@ -27,7 +28,7 @@ class Space(Protocol, Generic[A]):
         """Returns host values as an array of this space, which may share their memory."""
 
     def numpy(self, x: A) -> np.ndarray:
-        """Returns the values on the host; they may share memory."""
+        """Returns the values on the host. Both may share memory."""
 
     def full(self, shape: Shape, value: float) -> A: ...
 
@@ -38,38 +39,38 @@ class Space(Protocol, Generic[A]):
         """Returns the ``chosen`` entries along the first axis, in this order."""
 
     def add(self, x: A, y: A, scale: float = 1.0, *, nonnegative: bool = False) -> A:
-        """x + ``scale`` y; ``nonnegative`` clips it at 0."""
+        """Returns x + ``scale`` y; ``nonnegative`` clips it at 0."""
 
     def extrapolate(self, x: A, y: A, scale: float) -> A:
-        """x + ``scale`` (x − y)."""
+        """Returns x + ``scale`` (x − y)."""
 
     def add_product(self, x: A, y: A, z: A, scale: float = 1.0, *, nonnegative: bool = False) -> A:
-        """x + ``scale`` y z element by element; ``nonnegative`` clips it at 0."""
+        """Returns x + ``scale`` y z element by element; ``nonnegative`` clips it at 0."""
 
     def multiply(self, x: A, y: A) -> A:
-        """x y element by element; y may have only the last axes of x."""
+        """Returns x y element by element. y may have only the last axes of x."""
 
     def reciprocal(self, x: A, share: float) -> A:
-        """1/x, with x raised to ``share`` of its largest; 0 where x is not above 0."""
+        """Returns 1/x, with x raised to ``share`` of its largest value; 0 where x is not above 0."""
 
     def inner(self, x: A, y: A) -> float:
-        """Σ x y, with the accuracy of float64."""
+        """Returns Σ x y, with the accuracy of float64."""
 
     def turn(self, x: A, y: A, z: A) -> float:
-        """Σ (x − y) (y − z): above 0 where the steps z to y and y to x have one direction."""
+        """Returns Σ (x − y) (y − z). It is above 0 where the steps from z to y and from y to x have one direction."""
 
     def norm(self, x: A) -> float:
-        """√Σ x²."""
+        """Returns √Σ x²."""
 
     def sum_squares(self, arrays: Iterable[A]) -> float:
-        """Σ ‖x‖² over arrays, which may be generated; a device sends one number back."""
+        """Returns Σ ‖x‖² over arrays, which may be generated. A device sends one number back."""
 
     def largest(self, x: A, *, absolute: bool = False) -> float:
-        """The largest x, or |x|."""
+        """Returns the largest x, or the largest |x|."""
 
 
 class HostSpace:
-    """NumPy's arrays, of any float type: a ``Space``, and the twin of ``DeviceSpace``."""
+    """NumPy's arrays of any float type. This is a ``Space``, and the twin of ``DeviceSpace``."""
 
     def array(self, values: np.ndarray) -> np.ndarray:
         return values
@@ -105,7 +106,7 @@ class HostSpace:
         return x * y
 
     def reciprocal(self, x: np.ndarray, share: float) -> np.ndarray:
-        # an array without a number above 0 has no scale; every result is 0
+        # An array without a number above 0 has no scale, and every result is 0.
         least = share * max(self.largest(x), 0.0) or 1.0
         return np.where(x > 0, 1 / np.maximum(x, least), 0).astype(np.float32)
 
@@ -126,16 +127,16 @@ class HostSpace:
 
 
 class DeviceSpace:
-    """Float32 arrays of one device: a ``Space`` that reuses the memory of released arrays."""
+    """Float32 arrays of one device. This ``Space`` reuses the memory of released arrays."""
 
     def __init__(self, rt: Runtime) -> None:
         self.rt = rt
         self._unused: dict[int, list[DeviceArray]] = defaultdict(list)
-        # partial sums of the groups; their sum; the sum over several arrays, between whose parts other sums may be made
+        # The partial sums of groups; their sum; the sum over several arrays, between which other sums may be made.
         self._parts, self._whole, self._total = (rt.empty(count, np.float64) for count in (_GPU_GROUPS, 1, 1))
 
     def empty(self, shape: Shape) -> DeviceArray:
-        """Returns uninitialised memory. The queue is in order, so earlier work may still read it."""
+        """Returns uninitialised memory. Earlier work may still read it, because the queue is in order."""
         unused = self._unused[int(np.prod(shape, dtype=np.int64))]
         memory = unused.pop() if unused else self.rt.empty(shape)
         array = DeviceArray(memory.buffer, tuple(shape), memory.dtype)
@@ -185,9 +186,9 @@ class DeviceSpace:
         return self._each("reciprocal", x, np.float32(share * max(self.largest(x), 0.0) or 1.0))
 
     def descend(self, x: DeviceArray, y: DeviceArray, step: float) -> DeviceArray:
-        """x − ``step`` y/‖y‖, and x where y is 0; no number comes back."""
+        """Returns x − ``step`` y/‖y‖, or x where y is 0. No number comes back from the device."""
         self._sum("dot_parts", self._whole, y, y)
-        # the step as a high and a low float: not every device has float64
+        # The step is split into a high and a low float, because not every device has float64.
         high = np.float32(step)
         return self._each("descend", x, y, np.array([high, step - float(high)], np.float32), self._whole)
 
@@ -213,7 +214,7 @@ class DeviceSpace:
         return float(self.rt.download(self._parts).view(np.float32)[:groups].max())
 
     def _each(self, name: str, x: DeviceArray, *others: Any, period: int = 0) -> DeviceArray:
-        """Launches an element-wise kernel of x and others, for runs of ``period`` elements."""
+        """Launches an element-wise kernel of x and others. ``period``: the length after which a short array repeats."""
         result, count = self.empty(x.shape), period or x.size
         items = ceil_div(count, self.rt.lanes), x.size // max(count, 1)
         kernel = self.rt.kernel("algebra", name)
@@ -227,17 +228,17 @@ class DeviceSpace:
         return float(values[0] if self.rt.fp64 else values.view(np.float32).astype(np.float64).sum())
 
     def _sum(self, name: str, whole: DeviceArray, *arrays: DeviceArray, add: bool = False) -> None:
-        """Sums over arrays on the device into ``whole``, or adds to it; the named kernel makes the first level."""
+        """Sums over arrays on the device into ``whole``, or adds to it. The named kernel makes the first level."""
         groups = self._reduce(name, *arrays, scratch=8)
         kernel = self.rt.kernel("algebra", "dot_whole")
         group = self.rt.group(1, _GPU_GROUP, kernel)
         self.rt.launch(kernel, group, self._parts, groups, add, self.rt.local(8 * group), whole, group=group)
 
     def _reduce(self, name: str, *arguments: Any, scratch: int) -> int:
-        """Launches the first level of a sum over the first array; returns the number of results in ``_parts``."""
+        """Launches the first level of a sum over the first array. Returns the number of results in ``_parts``."""
         kernel = self.rt.kernel("algebra", name)
         count, group = arguments[0].size, self.rt.group(1, _GPU_GROUP, kernel)
-        if self.rt.pixel_items:  # neighbours side by side
+        if self.rt.pixel_items:  # on a GPU, neighbouring items read neighbouring elements
             groups = min(_GPU_GROUPS, ceil_div(count, group))
             first_by, step, span = 1, groups * group, count
         else:
@@ -251,13 +252,14 @@ class DeviceSpace:
 
 
 def norm(values: np.ndarray) -> float:
-    """Euclidean norm of a host's array of any shape, summed in float64."""
+    """Returns the Euclidean norm of a host's array of any shape, summed in float64."""
     return inner(values, values) ** 0.5
 
 
 def inner(a: np.ndarray, b: np.ndarray) -> float:
-    """Inner product of two arrays of one shape on the host, summed in float64. BLAS is avoided: its threads wait for cores
-    that the device uses, which took most of a small run."""
+    """Returns the inner product of two arrays of one shape on the host, summed in float64.
+
+    BLAS is avoided: its threads wait for cores that the device uses, which took most of a small run."""
     return float(np.einsum("i,i->", a.ravel(), b.ravel(), dtype=np.float64))
 
 

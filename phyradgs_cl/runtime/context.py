@@ -1,4 +1,4 @@
-"""A runtime: one device, one in-order queue, the programs built for it, and its buffers."""
+"""A runtime: one device, one in-order queue, the programs built for the device, and its buffers."""
 
 import logging
 import math
@@ -24,20 +24,23 @@ Sides = tuple[int, ...]
 
 LANE_CHOICES = (1, 4, 8, 16)
 _FUSING, _PAIRS = "-cl-mad-enable", '#line 1 "common/precise.h"'
-_TILE_ITEMS = 256  # of a work-group that shares local memory
-_FEWEST_ITEMS = 32  # that a kernel must be able to run in one group
+_TILE_ITEMS = 256  # items in a work-group that shares local memory
+_FEWEST_ITEMS = 32  # items that a kernel must be able to run in one group
 
 
 class Runtime:
-    """Owns everything OpenCL. Declare (``kernel``), allocate (``empty``, ``upload``), call (``launch``, which builds).
+    """Owns everything OpenCL. First declare (``kernel``), then allocate (``empty``, ``upload``), then call (``launch``).
 
-    ``lanes`` is the width of the vectors in kernels: wide on CPUs, 1 on GPUs, where work-items are the lanes. It follows
-    from the device unless given. ``fp64`` false selects the fallback of float32 pairs. ``pixel_items`` selects the launch
-    shape: a work-item per pixel in small groups (GPUs, needs ``lanes`` 1), or per band of lines (CPUs). ``memory`` (bytes,
-    or text as 2GiB) limits the sum of its buffers. ``ranks``: the processes that work on the same scan, each with its own
-    Runtime; where a machine has several devices, each rank takes the next."""
+    - lanes: the width of vectors in kernels. It is wide on CPUs; on GPUs, where work-items are the lanes, it is 1. None
+      takes the device's width.
+    - fp64: False selects the fallback by pairs of float32.
+    - pixel_items: the launch shape. True is a work-item per pixel in small groups (GPUs, needs ``lanes`` 1), False a
+      work-item per band of lines (CPUs).
+    - memory: the limit of the sum of its buffers in bytes, or as text like 2GiB.
+    - ranks: the processes that work on the same scan, each with its own Runtime. Where a machine has several devices, each
+      rank takes the next device."""
 
-    most_samples = 2**29  # of a GPU's launch: 0.1 s on a slow one; the driver of a screen ends long launches
+    most_samples = 2**29  # per GPU launch: a display driver kills launches of seconds; this takes 0.1 s on a slow GPU
 
     def __init__(
         self, device: str | None = None, *, lanes: int | None = None, fp64: bool | None = None,
@@ -74,14 +77,14 @@ class Runtime:
         self._kernels: dict[tuple[str, str, tuple[str, ...]], Kernel] = {}
 
     def kernel(self, program: str, name: str, **defines: int | float | bool) -> Kernel:
-        """Declares the kernel ``name`` of ``cl/<program>.cl``; the first launch builds it, once for all its declarations."""
+        """Declares the kernel ``name`` of ``cl/<program>.cl``. The first launch builds it, once for all its declarations."""
         merged: dict[str, int | float | bool] = {"LANES": self.lanes, "FP64": int(self.fp64), **defines}
         flags = [f"-D{name}={_literal(value)}" for name, value in sorted(merged.items())]
         key = (program, name, ("-cl-std=CL1.2", _FUSING, *flags))
         return self._kernels.setdefault(key, Kernel(*key))
 
     def compile(self, kernel: Kernel) -> "cl.Kernel":
-        """Returns the built kernel; a program is built once for all its kernels."""
+        """Returns the built kernel. A program is built once for all its kernels."""
         if kernel.built is None:
             key = (kernel.program, kernel.options)
             if key not in self._programs:
@@ -91,12 +94,12 @@ class Runtime:
 
     @property
     def built_kernels(self) -> set[str]:
-        """The names of the kernels that were launched so far."""
+        """The names of the kernels that have been launched."""
         return {kernel.function_name for kernel in self._kernels.values() if kernel.built is not None}
 
     @property
     def group_limits(self) -> dict[str, int]:
-        """The largest groups of the kernels that were asked, by name."""
+        """The largest groups, by name, of the kernels whose limit was asked for."""
         return {one.function_name: one.most_items for one in self._kernels.values() if one.most_items is not None}
 
     def _build(self, program: str, options: tuple[str, ...]) -> "cl.Program":
@@ -116,7 +119,7 @@ class Runtime:
 
     @staticmethod
     def _allowed(source: str, options: tuple[str, ...]) -> list[str]:
-        """Returns build options without those that would break sums of pairs of floats: some drivers ignore the pragma."""
+        """Returns build options without those that would break sums of pairs of floats. Some drivers ignore the pragma."""
         has_pairs = "-DFP64=0" in options and _PAIRS in source
         return [option for option in options if not (has_pairs and option == _FUSING)]
 
@@ -166,7 +169,7 @@ class Runtime:
 
     @naming_failures("a copy to it")
     def write(self, array: DeviceArray, values: np.ndarray) -> None:
-        """Copies host values (same size) into an existing array; the host array may be reused afterwards."""
+        """Copies host values (same size) into an existing array. The host array may be reused afterwards."""
         values = np.ascontiguousarray(values, dtype=array.dtype)
         if values.size:
             cl.enqueue_copy(self.queue, array.buffer, values, is_blocking=True)
@@ -182,7 +185,7 @@ class Runtime:
 
     @naming_failures("a copy from it")
     def read_item(self, array: DeviceArray, index: int) -> np.generic:
-        """Returns one element of a flat array; waits for the queue."""
+        """Returns one element of a flat array. This waits for the queue."""
         value = np.empty(1, array.dtype)
         offset = index * array.dtype.itemsize
         cl.enqueue_copy(self.queue, value, array.buffer, src_offset=offset, is_blocking=True)
@@ -219,11 +222,11 @@ class Runtime:
     def launch(
         self, kernel: Kernel, items: int | tuple[int, ...], *args: Any, group: int | tuple[int, ...] = 1, samples: int = 0
     ) -> None:
-        """Enqueues ``items`` work-items (kernels ignore those past the end) in groups of ``group``, other sides 1. Python's
-        whole numbers become int, its others float. A long is np.int64, a float that may be whole np.float32.
+        """Enqueues ``items`` work-items in groups of ``group``, whose missing sides are 1. Items past the end do nothing.
 
-        ``samples``: what all items read, in samples of a ray. On a GPU more than ``most_samples`` go in several launches, in
-        which the kernel's items have their own global ids, and groups new ones."""
+        Python's whole numbers become int, its other numbers float. For a long give np.int64; for a float that may be whole,
+        give np.float32. ``samples``: what all items read, in samples of a ray. On a GPU more than ``most_samples`` go in
+        several launches. The kernel's items then keep their global ids, and groups get new ones."""
         shape = (items,) if isinstance(items, (int, np.integer)) else items
         if min(shape) < 1:
             return
@@ -245,14 +248,14 @@ class Runtime:
             raise self.ledger.error(f"a launch of {kernel.function_name}", error, self.queue) from error
 
     def group(self, on_cpu: int = 1, on_gpu: int = 64, *kernels: Kernel) -> int:
-        """The work-group size for this class of device. On a GPU it is halved until it suits ``kernels``, whose items work
-        together."""
+        """Returns the work-group size for this class of device. On a GPU it is halved until it suits ``kernels``, whose
+        items work together."""
         while self.pixel_items and any(on_gpu > self.most_items(kernel) for kernel in kernels):
             on_gpu //= 2
         return on_gpu if self.pixel_items else on_cpu
 
     def most_items(self, kernel: Kernel) -> int:
-        """Returns the largest group in which a kernel can run: its registers may allow fewer items than the device does."""
+        """Returns the largest group in which a kernel can run. Its registers may allow fewer items than the device does."""
         if kernel.most_items is None:
             kernel.most_items = self._asked(kernel, "WORK_GROUP_SIZE")
         return kernel.most_items
@@ -261,7 +264,7 @@ class Runtime:
         return int(self.compile(kernel).get_work_group_info(getattr(cl.kernel_work_group_info, name), self.device.handle))
 
     def _fitting(self, kernel: Kernel, group: tuple[int, ...]) -> tuple[int, ...]:
-        """Returns a group with sides halved until the kernel can run in it: that of kernels whose items work alone."""
+        """Returns the group with sides halved until the kernel can run in it. It is for kernels whose items work alone."""
         if math.prod(group) == 1:
             return group
         most, sides = self.most_items(kernel), list(group)
@@ -273,8 +276,8 @@ class Runtime:
         return tuple(sides)
 
     def tile(self, kernel: Kernel | None = None) -> tuple[int, int]:
-        """Returns the sides of a work-group's tile on a GPU: as wide as items run together, and as many lines high as the
-        kernel, or the device, allows."""
+        """Returns the sides of a work-group's tile on a GPU. It is as wide as items run together, and as many lines high as
+        the kernel, or the device, allows."""
         rates = self.kernel("rates", "multiply_add")
         if self._multiple is None:
             self._multiple = min(max(self._asked(rates, "PREFERRED_WORK_GROUP_SIZE_MULTIPLE"), 16), 64)
@@ -299,29 +302,29 @@ class Runtime:
             self._profile.add(name, event, nbytes)
 
     def kernel_uses(self) -> dict[str, KernelUse]:
-        """Launches, seconds and bytes by kernel since the last call, the longest first; needs ``profile=True``."""
+        """Returns launches, seconds and bytes by kernel since the last call, the longest first. Needs ``profile=True``."""
         self.queue.finish()
         return self._profile.uses()
 
     def kernel_seconds(self) -> dict[str, float]:
-        """Device time by kernel since the last call, seconds; needs ``profile=True``."""
+        """Returns the device time in s by kernel since the last call. Needs ``profile=True``."""
         return {name: use.seconds for name, use in self.kernel_uses().items()}
 
     def best_rates(self) -> Rates:
-        """Measures the device's best rates of copying and computing (per second); needs ``profile=True``."""
+        """Measures the device's best rates of copying and computing (per second). Needs ``profile=True``."""
         kernel = self.compile(self.kernel("rates", "multiply_add"))
         return measure_rates(self.queue, kernel, self.lanes, self.device.compute_units, self.group())
 
 
 def default_lanes(device: DeviceInfo) -> int:
-    """Returns the vector width: a CPU's native one; 1 where work-items are the lanes."""
+    """Returns the vector width: a CPU's native width, or 1 where work-items are the lanes."""
     if device.kind != "cpu":
         return 1
     return max((n for n in LANE_CHOICES if n <= device.vector_width), default=1)
 
 
 def _parts(items: Sides, group: Sides, pieces: int) -> Iterator[tuple[Sides | None, Sides]]:
-    """Yields first item and work-items of ``pieces`` parts or more, as far as groups allow; None as the first of a whole."""
+    """Yields first item and work-items of ``pieces`` parts or more, as far as groups allow. A whole has None as first."""
     if pieces <= 1:
         yield None, items
         return

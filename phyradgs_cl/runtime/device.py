@@ -1,4 +1,4 @@
-"""The OpenCL devices of this machine, the choice between them, and the versions that results depend on."""
+"""The OpenCL devices of this machine, the choice among them, and the versions on which results depend."""
 
 import logging
 import os
@@ -26,7 +26,7 @@ _targets: dict[int, str | None] = {}
 
 @dataclass(frozen=True)
 class DeviceInfo:
-    """One OpenCL device with the properties that the choice between devices uses."""
+    """One OpenCL device, with the properties that matter for the choice among devices."""
 
     index: int
     name: str
@@ -40,11 +40,11 @@ class DeviceInfo:
     has_fp64: bool
     by_default: bool
     handle: "cl.Device"
-    target: str | None = None  # the processor that PoCL builds kernels for
+    target: str | None = None  # the processor for which PoCL builds kernels
 
     @property
     def rank(self) -> tuple[int, int, int, int, int]:
-        """Larger is better: eligible, GPU before CPU, own memory, wider vectors, more units."""
+        """The rank of a device, larger being better: eligible, GPU before CPU, own memory, wider vectors, more units."""
         kind = {"gpu": 2, "cpu": 1}.get(self.kind, 0)
         unified = bool(self.handle.host_unified_memory)
         return (int(self.by_default), kind, int(not unified), self.vector_width, self.compute_units)
@@ -67,10 +67,11 @@ def list_devices() -> list[DeviceInfo]:
 
 
 def choose_device(wish: str | None = None, turn: int = 0) -> tuple[DeviceInfo, str]:
-    """Returns the device to use and the reason in words. ``wish`` (or the environment variable PHYRADGS_DEVICE) is an index,
-    ``cpu``, ``gpu`` or a part of a device's or platform's name, or several of these with commas. ``turn`` counts processes
-    that share a machine: each takes the next of the list, or, without a list or an index, the next device of the same name.
-    Raises DeviceError where nothing fits."""
+    """Returns the device to use, and the reason in words.
+
+    ``wish`` (or the environment variable PHYRADGS_DEVICE) is an index, ``cpu``, ``gpu`` or a part of a device's or
+    platform's name, or several of these with commas. ``turn`` counts processes that share a machine. Each process takes the
+    next of the list; without a list or an index it takes the next device of the same name. DeviceError: nothing fits."""
     source = "--device"
     if not wish:
         wish, source = os.environ.get(DEVICE_VARIABLE), DEVICE_VARIABLE
@@ -98,7 +99,7 @@ def choose_device(wish: str | None = None, turn: int = 0) -> tuple[DeviceInfo, s
 
 
 def _next_of_name(first: DeviceInfo, devices: list[DeviceInfo], turn: int) -> DeviceInfo:
-    """Returns ``first``, or the ``turn``-th after it among the devices of its platform and name."""
+    """Returns ``first``, or the ``turn``-th device after it among those of its platform and name."""
     same = [d for d in devices if (d.platform, d.name) == (first.platform, first.name)]
     return same[(same.index(first) + turn) % len(same)]
 
@@ -118,7 +119,7 @@ def _wished(wish: str, source: str, devices: list[DeviceInfo]) -> tuple[DeviceIn
 
 def _describe(index: int, of: "cl.Platform", device: "cl.Device") -> DeviceInfo:
     is_pocl = "portable computing language" in of.name.lower()
-    # device types are bit fields: PoCL answers ALL | CPU
+    # Device types are bit fields: PoCL answers ALL | CPU.
     kind = "gpu" if device.type & cl.device_type.GPU else "accelerator"
     kind = "cpu" if device.type & cl.device_type.CPU else kind
     if is_pocl:
@@ -141,7 +142,7 @@ def _describe(index: int, of: "cl.Platform", device: "cl.Device") -> DeviceInfo:
 
 
 def known_fault(device: DeviceInfo) -> str | None:
-    """Returns what is known to be wrong with a device's driver, in words; None where nothing is."""
+    """Returns what is known to be wrong with a device's driver, in words; otherwise None."""
     version = re.search(r"\d+", device.handle.driver_version)
     if device.platform.lower() == "rusticl" and version and int(version[0]) < _RIGHT_MESA:
         return f"rusticl of Mesa {device.handle.driver_version} computes wrong sums: install Mesa {_RIGHT_MESA} or newer"

@@ -1,6 +1,7 @@
-"""The layout of images and volumes in device memory: rows with a pitch. GUARD floats, then (rows, pitch), where every row
-ends in at least GUARD zeros. A vector of pixels may therefore start or end outside a row without a test. In kernels GUARD is
-``IMAGE_GUARD``."""
+"""The layout of images and volumes in device memory: GUARD floats, then rows with a pitch (rows, pitch).
+
+Every row ends in at least GUARD zeros. A vector of pixels may therefore start or end outside a row without a test. In
+kernels GUARD is ``IMAGE_GUARD``."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -14,7 +15,7 @@ from phyradgs_cl.runtime.memory import Array, DeviceArray, SameArray
 
 GUARD = 16
 
-_TILE = 16  # rows and columns that a CPU's work-item turns at a time
+_TILE = 16  # rows and columns that a CPU's work-item transposes at a time
 
 
 @dataclass(frozen=True)
@@ -39,7 +40,7 @@ def move(
     rt: Runtime, source: tuple[DeviceArray, Strides], target: tuple[DeviceArray, Strides],
     shape: Sequence[int], *, turned: bool = False,
 ) -> None:
-    """Copies (nz, ny, nx) floats from one layout to another on the device; ``turned``: to (nz, nx, ny)."""
+    """Copies (nz, ny, nx) floats from one layout to another on the device; ``turned`` copies them to (nz, nx, ny)."""
     nz, ny, nx = (int(n) for n in shape)
     (from_array, from_strides), (to_array, to_strides) = source, target
     ends = from_array, from_strides.vector(), to_array, to_strides.vector(), np.int32(ny), np.int32(nx)

@@ -17,18 +17,18 @@ from phyradgs_cl.runtime.opencl import cl
 
 MEMORY_VARIABLE = "PHYRADGS_MEMORY"
 _SMALLER = 0.25
-_PLANNED = 0.9  # of the free memory
-_PLANNED_UNSEEN = 0.6  # of all memory, where a GPU's driver does not say what other programs and the screen hold
+_PLANNED = 0.9  # fraction of the free memory
+_PLANNED_UNSEEN = 0.6  # fraction of all memory, if a GPU's driver does not say what other programs and the screen use
 _UNITS = {"": 1, "B": 1}
 for _power, _letter in enumerate("KMGT", start=1):
     _UNITS |= {_letter: 1024**_power, f"{_letter}IB": 1024**_power, f"{_letter}B": 1000**_power}
 log = logging.getLogger(__name__)
-# mem object allocation failure, out of resources, out of host memory, invalid buffer size
+# Mem object allocation failure, out of resources, out of host memory, invalid buffer size.
 _MEMORY_CODES = (-4, -5, -6, -61)
 
 
 class MemoryShortage(OutOfMemoryError):
-    """A buffer is too large for the device or the limit; smaller bricks may fit."""
+    """Raised for a buffer that is too large for the device or the limit. Smaller bricks may fit."""
 
 
 @dataclass(eq=False)
@@ -61,18 +61,18 @@ class LaterItem:
 
     @property
     def value(self) -> np.generic:
-        """The number, once ``is_here``."""
+        """Returns the number, once ``is_here``."""
         return self._values[0]
 
 
 Array = np.ndarray | DeviceArray
-"""Plain C-contiguous values. Operators return host arrays for host arrays and device arrays for device arrays."""
+"""Plain C-contiguous values. Operators return host arrays for host arrays, and device arrays for device arrays."""
 SameArray = TypeVar("SameArray", bound=Array)
 
 
 @dataclass
 class Traffic:
-    """Bytes sent to the device and back, and how often the host waited for the device."""
+    """Counts the bytes sent to the device and back, and how often the host waited for the device."""
 
     bytes_up: int = 0
     bytes_down: int = 0
@@ -92,7 +92,7 @@ class Room:
     largest_bytes: int
 
     def holds(self, *sizes_bytes: int) -> bool:
-        """True where buffers of these sizes fit at the same time."""
+        """Returns whether buffers of these sizes fit at the same time."""
         return sum(sizes_bytes) <= self.free_bytes and max(sizes_bytes, default=0) <= self.largest_bytes
 
     def scaled(self, share: float) -> "Room":
@@ -119,7 +119,7 @@ class MemoryLedger:
 
     @contextmanager
     def reserved(self, nbytes: int) -> Iterator[None]:
-        """Plans made in the body leave this many bytes for later."""
+        """Reserves bytes for later: plans made in the body leave them free."""
         self.reserved_bytes += nbytes
         try:
             yield
@@ -127,13 +127,13 @@ class MemoryLedger:
             self.reserved_bytes -= nbytes
 
     def room(self, largest_bytes: int) -> Room:
-        """Returns nine tenths of the rest of the limit, in buffers of at most ``largest_bytes``; six where a GPU's driver
-        does not say what is free and nobody has set a limit."""
+        """Returns nine tenths of the rest of the limit, in buffers of at most ``largest_bytes``. It is six tenths where a
+        GPU's driver does not say what is free and nobody has set a limit."""
         free_bytes = max(self.limit_bytes - self.held_bytes - self.reserved_bytes, 0)
         return Room(int(self.planned * free_bytes), min(largest_bytes, self.limit_bytes))
 
     def check(self, nbytes: int, largest_bytes: int) -> None:
-        """Raises MemoryShortage for a buffer that is too large, or that would pass the limit."""
+        """Raises MemoryShortage for a buffer that is too large or would exceed the limit."""
         subject, found = f"memory of {self.device.name}", f"{mebibytes(nbytes)} in one buffer"
         remedy = "use a smaller problem"
         if nbytes > largest_bytes:
@@ -146,10 +146,11 @@ class MemoryLedger:
             raise MemoryShortage(subject, found, expected, remedy)
 
     def error(self, work: str, error: "cl.Error", queue: "cl.CommandQueue | None" = None) -> DeviceError:
-        """Returns an error of the driver as a DeviceError, or as a MemoryShortage where memory ran out, which some drivers
-        report only at a launch or a wait. ``work`` names what failed: a kernel, or "a copy". A dead ``queue``
-        missed no memory: drivers say "out of resources" of a kernel that crashed or ran too long, too."""
-        code = getattr(error, "code", 0)  # none where pyopencl raises a text, as of a build
+        """Returns an error of the driver as a DeviceError, or as a MemoryShortage where memory ran out.
+
+        Some drivers report a shortage only at a launch or a wait. ``work`` names what failed: a kernel, or "a copy". With a
+        dead ``queue`` it was no shortage: drivers say "out of resources" also of a kernel that crashed or ran too long."""
+        code = getattr(error, "code", 0)  # pyopencl may raise an error without a code, as for a build
         is_dead = queue is not None and not answers(queue)
         if not is_dead and (isinstance(error, cl.MemoryError) or code in _MEMORY_CODES):
             remedy = f"set a limit with --memory or {MEMORY_VARIABLE}, or use a smaller problem"
@@ -164,7 +165,7 @@ class MemoryLedger:
 
 
 def answers(queue: "cl.CommandQueue") -> bool:
-    """Whether a queue still works. After a driver has ended a kernel, every call fails until there is a new context."""
+    """Returns whether a queue still works. After a driver has ended a kernel, every call fails in this context."""
     try:
         word = cl.Buffer(queue.context, cl.mem_flags.READ_WRITE, 4)
         cl.enqueue_fill_buffer(queue, word, np.zeros(1, np.float32), 0, 4)
@@ -191,7 +192,7 @@ def memory_limit(wish: str | int | None) -> int | None:
 
 
 def bytes_of(wish: str | int, subject: str) -> int:
-    """Parses 2GiB, 1.5 GB, 512M or a plain number of bytes; K, M, G and T alone are powers of 1024, as with iB."""
+    """Parses 2GiB, 1.5 GB, 512M or a plain number of bytes. K, M, G and T alone are powers of 1024, as with iB."""
     text = "" if isinstance(wish, bool) else str(wish)
     match = re.fullmatch(r"\s*(\d+(?:\.\d+)?)\s*([A-Za-z]*)\s*", text)
     factor = _UNITS.get(match.group(2).upper()) if match else None
@@ -232,14 +233,15 @@ def attempts(what: str) -> Iterator[Attempt]:
 
 
 def is_cl_array(value: object) -> bool:
-    """True for a pyopencl.array.Array. Looks into sys.modules: a caller who has one has imported pyopencl."""
+    """Returns whether a value is a pyopencl.array.Array. Whoever has one has imported pyopencl."""
     module = sys.modules.get("pyopencl.array")
     return module is not None and isinstance(value, module.Array)
 
 
 def adopted(name: str, array: Any, queue: "cl.CommandQueue") -> DeviceArray:
-    """Returns a float32 Array of pyopencl (C order) as a DeviceArray on the same memory; a view of another is copied. Raises
-    InputError, with ``name`` as its subject, for another context, queue or type."""
+    """Returns a float32 Array of pyopencl (C order) as a DeviceArray on the same memory. A view of another array is copied.
+
+    Raises InputError, with ``name`` as its subject, for another context, queue or type."""
     remedy = "make it with the operator's to_device, or on its queue"
     if array.context != queue.context:
         raise InputError(name, "an Array of another OpenCL context", "the operator's context", remedy)
@@ -253,7 +255,7 @@ def adopted(name: str, array: Any, queue: "cl.CommandQueue") -> DeviceArray:
 
 
 def lent(array: DeviceArray, queue: "cl.CommandQueue") -> Any:
-    """Returns a DeviceArray as an Array of pyopencl on the same memory, which the ledger counts while the Array lives."""
+    """Returns a DeviceArray as an Array of pyopencl on the same memory. The ledger counts it while the Array exists."""
     import pyopencl.array
 
     shared = pyopencl.array.Array(queue, array.shape, array.dtype, data=array.buffer)

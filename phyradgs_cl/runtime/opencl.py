@@ -1,6 +1,7 @@
-"""pyopencl, loaded when it is first used, and kernels with their sources. Sources are files of ``cl/`` with their headers
-pasted in, because an include path fails on a folder with a space. ``#line`` marks keep file and line in the compiler's
-messages."""
+"""Loads pyopencl when it is first used, and holds kernels with their sources.
+
+Sources are files of ``cl/`` with their headers pasted in, because an include path fails on a folder with a space. ``#line``
+marks keep file and line in the compiler's messages."""
 
 import re
 from collections.abc import Callable
@@ -35,8 +36,9 @@ _INCLUDE = re.compile(r'^\s*#include\s+"([^"]+)"\s*$')
 
 @dataclass(eq=False)
 class Kernel:
-    """The kernel ``function_name`` of ``cl/<program>.cl``, built with ``options`` at its first launch. ``most_items``: of
-    a group, once the driver was asked."""
+    """The kernel ``function_name`` of ``cl/<program>.cl``, built with ``options`` at its first launch.
+
+    ``most_items``: the largest group, once the driver was asked for it."""
 
     program: str
     function_name: str
@@ -64,7 +66,7 @@ def _expand(relative: str, pasted: set[str]) -> list[str]:
             lines += _expand(match.group(1), pasted)
             lines.append(f'#line {number + 1} "{relative}"')
         else:
-            lines.append("")  # keeps the line numbers
+            lines.append("")  # an empty line keeps the line numbers
     return lines
 
 

@@ -1,11 +1,12 @@
-"""Builds PoCL's kernels for the processor that PoCL's own library was compiled for.
+"""Builds PoCL's kernels for the processor for which PoCL's own library was compiled.
 
-PoCL links every kernel with a library of built-in functions (fma, min, vload16, ...), of which its wheel has one per
-family of x86 processors. LLVM inlines a function only where the caller has every instruction set of the callee. PoCL 3.0
-builds kernels for the name that LLVM 14 gives the host, which differs from the library's: an Ice Lake lacks CLWB in
-LLVM's list, so that every built-in stays a call, 3 times as slow. An unknown processor is "generic", which builds nothing
-(pocl/pocl issue 1049), and a Zen 4 is taken for a Zen 3 without AVX-512, on which LLVM aborts ("Cannot select: i64 = fma").
-PoCL has no setting for the name, but its device record points to it. The pointer is turned to the library's name here."""
+PoCL links every kernel with a library of built-in functions (fma, min, vload16, ...), of which its wheel has one per family
+of x86 processors. LLVM inlines a function only where the caller has every instruction set of the callee. PoCL 3.0 builds
+kernels for the name that LLVM 14 gives the host, which differs from the library's. An Ice Lake lacks CLWB in LLVM's list,
+so every built-in stays a call, 3 times as slow. An unknown processor is "generic", which builds nothing (pocl/pocl issue
+1049). A Zen 4 is taken for a Zen 3 without AVX-512, on which LLVM aborts ("Cannot select: i64 = fma").
+
+PoCL has no setting for the name, but its device record points to it. Here the pointer is changed to the library's name."""
 
 import contextlib
 import ctypes
@@ -43,7 +44,7 @@ _LIBRARIES = (
     ({"sse4_1", "cx16"}, "penryn"),
     ({"ssse3", "cx16"}, "core2"),
 )
-"""Flags of /proc/cpuinfo by which PoCL chooses a library, and the processor that this library was compiled for."""
+"""Flags of /proc/cpuinfo by which PoCL chooses a library, and the processor for which this library was compiled."""
 _OLDEST_TARGET = "athlon64"
 THREADS_VARIABLE = "POCL_MAX_PTHREAD_COUNT"
 _MOST_THREADS = 1024
@@ -53,11 +54,12 @@ _kept_alive: list[ctypes.Array[ctypes.c_char]] = []
 
 
 def prepare_environment() -> None:
-    """Gives PoCL a kernel cache for this processor, unless the user has chosen one. To be called before pyopencl loads. PoCL
-    names its cache after the LLVM target, so two unknown processors would share binaries. Without a writable cache PoCL has
-    no device, and one that may not be executed (a mount with noexec) ends the process: then the cache lies in the temporary
-    folder. pyopencl's is switched off where it cannot be written. Raises InputError for a number of
-    threads that PoCL would crash on or ignore."""
+    """Gives PoCL a kernel cache for this processor, unless the user has chosen one. Call it before pyopencl loads.
+
+    PoCL names its cache after the LLVM target, so two unknown processors would share binaries. Without a writable cache PoCL
+    has no device. A cache that may not be executed (a mount with noexec) ends the process. In both cases the cache is in the
+    temporary folder. pyopencl's cache is switched off where it cannot be written. Raises InputError for a number of threads
+    that PoCL would crash on or ignore."""
     global _unusable
     if platform.system() != "Linux":
         return
@@ -76,7 +78,7 @@ def prepare_environment() -> None:
             if reason == "executed":  # PoCL would end the process
                 found, remedy = f"{folder}, on a mount with noexec", f"set {CACHE_VARIABLE} to a folder on another mount"
                 raise InputError(CACHE_VARIABLE, found, "a folder whose files may be executed", remedy) from error
-            return  # not there either: PoCL will have no device
+            return  # the temporary folder does not work either: PoCL will have no device
     os.environ[CACHE_VARIABLE] = str(folder)
 
 
@@ -100,7 +102,7 @@ def unusable_cache() -> Path | None:
 
 
 def warn_of_cache() -> None:
-    """Warns once that kernels are kept in the temporary folder. To be called where PoCL is used."""
+    """Warns once that kernels are kept in the temporary folder. Call it where PoCL is used."""
     global _unusable
     if _unusable is not None:
         text = "PoCL's kernel cache %s cannot be %s: kernels are kept in %s; set %s to a folder that can"
@@ -111,7 +113,7 @@ def warn_of_cache() -> None:
 def _caches() -> Path:
     try:
         return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-    except RuntimeError:  # a user without a home
+    except RuntimeError:  # the user has no home
         return Path("/nonexistent")
 
 
@@ -121,7 +123,8 @@ def _can_write(folder: Path) -> bool:
 
 def _fault_of(folder: Path) -> str | None:
     """Returns what cannot be done with files in a folder, "written" or "executed"; None for a folder that may hold kernels.
-    The kernel refuses to map an executable page of a file on a mount with noexec."""
+
+    On a mount with noexec, the operating system refuses to map an executable page of a file."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder) as file:
@@ -137,7 +140,7 @@ def _fault_of(folder: Path) -> str | None:
 
 
 def _temporary_cache() -> Path:
-    """Returns a folder that only this user can write, because its binaries are executed. OSError where none can be."""
+    """Returns a folder that only this user can write, because its binaries are executed. Raises OSError without one."""
     places = [Path(place) for place in (tempfile.gettempdir(), "/var/tmp", "/dev/shm")]
     place = next((place for place in places if _fault_of(place) is None), None)
     if place is None:
@@ -152,7 +155,7 @@ def _temporary_cache() -> Path:
 
 
 def library_target() -> str | None:
-    """Returns LLVM's name of the processor that PoCL's library for this machine was compiled for; None off x86-64."""
+    """Returns LLVM's name of the processor for which PoCL's library on this machine was compiled. None off x86-64."""
     if platform.machine() not in ("x86_64", "AMD64"):
         return None
     flags = _cpu_flags()
@@ -160,9 +163,10 @@ def library_target() -> str | None:
 
 
 def use_library_target(device_address: int) -> str | None:
-    """Names the library's processor in the record of a PoCL 3.0 CPU device, and returns that name. The record holds the
-    target triple and, next to it, the processor's name. Nothing is changed, and None returned, where the two are not found.
-    From 3.1 on PoCL names the library's processor itself."""
+    """Names the library's processor in the record of a PoCL 3.0 CPU device, and returns that name.
+
+    The record holds the target triple and, next to it, the processor's name. Where the two are not found, nothing is changed
+    and None is returned. From 3.1 on PoCL names the library's processor itself."""
     target = library_target()
     if target is None or platform.system() != "Linux":
         return None
@@ -182,7 +186,7 @@ def use_library_target(device_address: int) -> str | None:
 
 
 def _text(memory: bytes) -> bytes | None:
-    """Returns the C string at the start of some memory; None where it does not end there."""
+    """Returns the C string at the start of some memory. Returns None where it does not end there."""
     text, end, _ = memory.partition(b"\0")
     return text if end else None
 
@@ -209,7 +213,7 @@ def _cpu_flags() -> set[str]:
 
 
 def cpu_facts(described: Path = Path("/proc/cpuinfo")) -> dict[str, str]:
-    """Reads Linux's description of its first processor ("model name", "flags", …); empty where there is no such file."""
+    """Reads Linux's description of its first processor ("model name", "flags", …). Without such a file it is empty."""
     facts: dict[str, str] = {}
     with contextlib.suppress(OSError):
         for line in described.read_text().split("\n\n", 1)[0].splitlines():
@@ -219,7 +223,7 @@ def cpu_facts(described: Path = Path("/proc/cpuinfo")) -> dict[str, str]:
 
 
 def cpu_name(facts: dict[str, str] | None = None) -> str:
-    """Returns the processor's name with family and model where they are known: generations may share a name."""
+    """Returns the processor's name, with family and model where they are known: generations may share a name."""
     facts = cpu_facts() if facts is None else facts
     name = facts.get("model name") or platform.processor() or platform.machine()
     if "cpu family" in facts and "model" in facts:

@@ -8,7 +8,7 @@ import numpy as np
 
 from phyradgs_cl.runtime.opencl import cl
 
-_FOLD_AT = 20_000  # events that are kept at most; folding waits for the queue
+_FOLD_AT = 20_000  # most events that are kept; folding them waits for the queue
 _COPY_BYTES = 1 << 26
 _STEPS = 20_000
 _REPEATS = 5
@@ -24,7 +24,7 @@ class KernelUse:
 
 
 class Profile:
-    """Collects the events of a queue with profiling."""
+    """Collects the events of a queue that measures times."""
 
     def __init__(self) -> None:
         self._events: list[tuple[str, cl.Event, int]] = []
@@ -54,7 +54,7 @@ class Profile:
 
 @dataclass(frozen=True)
 class Rates:
-    """The device's measured rates: bytes moved (read and written) and floating-point operations per second."""
+    """The device's measured rates: bytes moved (read and written), and floating-point operations, per second."""
 
     copy_bytes_per_s: float
     flops_per_s: float
@@ -77,7 +77,7 @@ def profile_text(uses: dict[str, KernelUse], wall_s: float) -> str:
 def measure_rates(
     queue: "cl.CommandQueue", multiply_add: "cl.Kernel", lanes: int, units: int, group: int
 ) -> Rates:
-    """Measures both rates, the best of a few runs; ``queue`` needs profiling."""
+    """Measures both rates, each as the best of a few runs. ``queue`` needs profiling."""
     context = queue.context
     source, target = (cl.Buffer(context, cl.mem_flags.READ_WRITE, _COPY_BYTES) for _ in range(2))
     cl.enqueue_fill_buffer(queue, source, np.zeros(1, np.float32), 0, _COPY_BYTES)

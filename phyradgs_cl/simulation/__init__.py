@@ -1,4 +1,4 @@
-"""Simulation: scans of phantoms and volumes, with noise and the effects of tube and panel."""
+"""Simulates scans of phantoms and volumes, with noise and the effects of tube and panel."""
 
 from phyradgs_cl.simulation.object_motion import ObjectMotion, load_object_motion
 from phyradgs_cl.simulation.options import OPTION_NAMES, SimulationOptions, scanner_for, scanner_options

@@ -1,4 +1,4 @@
-"""How a simulated object moves: presets of a TOML file become deformations.
+"""Makes deformations of the presets of a TOML file that say how a simulated object moves.
 
 Breathing follows A. E. Lujan et al., Med. Phys. 26, 715-720 (1999): a(φ) = 1 − cos⁴(π φ) at the phase φ of a breath."""
 
@@ -12,13 +12,13 @@ from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Deformation, Grid, control_points
 from phyradgs_cl.io.tables import Fields, read_toml
 
-_NODES = 40  # of the weights in a cycle: straight between them the curves are true to 0.3 %
+_NODES = 40  # weights in a cycle: linear interpolation between them follows the curves to 0.3 %
 _SETTLING_NODES = 200
-_SPACINGS = 8.0  # of the control points along the longest side of the box
+_SPACINGS = 8.0  # of the control points, along the longest side of the box
 _SLIDING_SPACINGS = 16.0
-_ASIDE = 1 / 3  # of the amplitude: how far breathing moves along y, with its delay
-_PERIODS = (0.5, 1.5)  # of the mean period: the shortest and the longest breath
-_FADE = 3.0  # amplitudes, from a spacing beyond the box on, in which the field falls to 0: its slope is then a third
+_ASIDE = 1 / 3  # amplitude of breathing along y, with its delay, over that along z
+_PERIODS = (0.5, 1.5)  # shortest and longest breath over the mean period
+_FADE = 3.0  # amplitudes over which the field falls to 0 beyond the box: its slope is then a third
 _MOST_CYCLES = 100_000
 _COMMON = ("kind", "amplitude_mm", "amplitude", "states")
 _KEYS = {
@@ -33,14 +33,16 @@ Array = np.ndarray
 class ObjectMotion:
     """A known motion of the object, by a preset.
 
-    kind: "breathing" lowers the object, most at its top and not at its base, and moves it along y a little later.
-    "drying" lowers its top and shrinks it sideways, and never returns. "sliding" moves a cylinder about the z axis up and
-    down in its surroundings, which rest.
+    kind: "breathing" lowers the object, most at its top and not at its base, and moves it along y a little later. "drying"
+    lowers its top and shrinks it sideways, and never returns. "sliding" moves a cylinder about the z axis up and down in
+    surroundings at rest.
 
-    amplitude_mm: the largest displacement; None takes ``amplitude`` times half of the box's shortest side. period_s: of a
-    breath or of the slide. jitter: standard deviation of a breath's period, as part of ``period_s``. hysteresis: delay of
-    the motion along y, in periods. settling_s: time after which 63 % of the way down is done; None is a third of the scan.
-    radius: of the sliding cylinder, in halves of the shortest side. seed: of the jitter. states: number of true volumes.
+    - amplitude_mm: the largest displacement. None takes ``amplitude`` times half of the box's shortest side.
+    - period_s: the time of a breath or of the slide. jitter: standard deviation of a breath's period over ``period_s``.
+    - hysteresis: the delay of the motion along y, in periods.
+    - settling_s: the time after which 63 % of the way down is done. None takes a third of the scan.
+    - radius: that of the sliding cylinder, over half of the shortest side. seed: that of the jitter.
+    - states: the number of true volumes.
 
     Raises InputError for an unknown kind and for numbers out of range."""
 
@@ -66,8 +68,9 @@ class ObjectMotion:
             checks.positive("motion of the object: settling_s", self.settling_s)
 
     def deformation(self, box: Grid, first_s: float, last_s: float) -> Deformation:
-        """Returns the field for an object in ``box``, from a scan's first light to its last. Raises InputError for an
-        amplitude larger than half of the box's shortest side."""
+        """Returns the field for an object in ``box``, from a scan's first light to its last.
+
+        Raises InputError for an amplitude larger than half of the box's shortest side."""
         half_mm = min(box.size_mm) / 2
         amplitude_mm = self.amplitude * half_mm if self.amplitude_mm is None else self.amplitude_mm
         if amplitude_mm > half_mm:
@@ -88,8 +91,8 @@ class ObjectMotion:
         return Deformation(control_mm, origin_mm, spacing_mm, times_s, weights)
 
     def state_times_s(self, first_s: float, last_s: float) -> Array:
-        """Returns the times (K,) of the true volumes. They are the middles of equal parts of the cycle about the middle of
-        the scan, or of the whole scan where nothing repeats."""
+        """Returns the times (K,) of the true volumes: the middles of equal parts of the cycle about the middle of the scan.
+        Where nothing repeats, they are those of equal parts of the whole scan."""
         parts = (np.arange(self.states) + 0.5) / self.states
         if self.kind == "drying":
             return np.asarray(first_s + parts * (last_s - first_s))
@@ -104,7 +107,7 @@ class ObjectMotion:
         return [_vectors(z=(np.hypot(x, y) < self.radius).astype(float))]
 
     def _cycles_s(self, first_s: float, last_s: float) -> Array:
-        """Returns the beginnings of all cycles that touch the scan, the first one at its first light or before."""
+        """Returns the beginnings of all cycles that touch the scan. The first one begins at its first light or before."""
         count = int(np.ceil((last_s - first_s) / self.period_s)) + 1
         if count > _MOST_CYCLES:
             expected = f"at most {_MOST_CYCLES} cycles in the scan's {last_s - first_s:.4g} s"
@@ -150,7 +153,7 @@ def load_object_motion(path: str | Path) -> ObjectMotion:
 
 
 def _breath(phase: Array) -> Array:
-    """Returns how far a breath is at a phase: 0 at whole numbers, 1 half-way between."""
+    """Returns how far a breath has gone at a phase: 0 at whole numbers, 1 half-way between."""
     return np.asarray(1 - np.cos(np.pi * phase) ** 4)
 
 
@@ -161,7 +164,7 @@ def _breathing_mm(places: list[Array], height: Array) -> list[Array]:
 
 
 def _drying_mm(places: list[Array], height: Array) -> list[Array]:
-    """Returns the control vectors of unit amplitude: downwards with the height, and towards the z axis."""
+    """Returns the control vectors of unit amplitude: downwards, growing with the height, and towards the z axis."""
     _, y, x = places
     return [_vectors(z=height), _vectors(x=x / 2, y=y / 2)]
 

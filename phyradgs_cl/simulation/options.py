@@ -14,7 +14,7 @@ from phyradgs_cl.io import Scanner, load_scanner, with_detector_count
 from phyradgs_cl.simulation.object_motion import ObjectMotion, load_object_motion
 
 _NOISES = ("none", "tigre", "beer")
-# Far beyond any scanner, and far below an overflow of float32 or a sampler.
+# Far beyond any scanner, and far below an overflow of float32 or of a sampler.
 _LARGEST_PEAK, _LARGEST_NOISE = 1e4, 1e9
 _SMALLEST_DOSE, _LARGEST_DOSE = 1e-3, 1e12
 _LARGEST_DETECTOR = 32_000
@@ -26,11 +26,12 @@ _DATA_SHEET = ("first", "fps", "readout_ms")
 class SimulationOptions:
     """Options of a simulation. ``peak`` > 0 scales attenuation so that the largest line integral is ``peak``.
 
-    time_samples: midpoint samples in the exposure of a line; with 0 the volume's edge moves at most half a voxel of ``grid``
-    between two (docs/mathematics.md), and so does a moving object. dose: photons of a pixel without object, on a line that
-    sees the whole pulse.
-    lag (λ), rings, sparks, drift, scatter: of detector/effects.py, 0 without. kvp: of detector/attenuation.py, 0 for a beam
-    of one energy. motion_of_object: how the object moves during the scan; None: it rests."""
+    - time_samples: midpoint samples in the exposure of a line. With 0, the volume's edge and a moving object move at most
+      half a voxel of ``grid`` between two samples (docs/mathematics.md).
+    - dose: photons of a pixel without object, on a line that sees the whole pulse.
+    - lag (λ), rings, sparks, drift, scatter: as in detector/effects.py; 0 is without.
+    - kvp: as in detector/attenuation.py; 0 is a beam of one energy.
+    - motion_of_object: how the object moves during the scan. None: it rests."""
 
     protocol: Protocol = Protocol()
     readout_axis: str = "rows"
@@ -70,8 +71,10 @@ def scanner_for(
     name: str, detector: int | None = None, detector_offset_mm: tuple[float, float] | None = None,
     truncation: float = 0.0
 ) -> Scanner:
-    """Returns a scanner by name or TOML file. detector: another number of columns, with rows in proportion.
-    detector_offset_mm: of the panel, (v, u). truncation: fraction of the columns to cut off, half at each side."""
+    """Returns a scanner by name or TOML file.
+
+    detector: another number of columns, with rows in proportion. detector_offset_mm: the panel's offset (v, u). truncation:
+    the fraction of the columns to cut off, half at each side."""
     scanner = load_scanner(name, resource("data"))
     geometry = scanner.geometry
     if detector is not None:
@@ -87,13 +90,14 @@ def scanner_for(
 
 
 def scanner_options(scanner: Scanner, protocol: str, **given: Any) -> SimulationOptions:
-    """Returns options of a simulation with a named protocol; missing ones and None take the scanner's value or the default.
+    """Returns options of a simulation with a named protocol. Missing ones and None take the scanner's value or the default.
+
     Raises InputError for unknown options, values out of range, and values that contradict each other."""
     given = {key: value for key, value in given.items() if value is not None}
     order = readout_order(given.get("first"), given.get("readout_axis"), given.get("readout_direction"), _flag)
     keys = ("readout_axis", "readout_direction", "lag", "readout_ratio", "pulse", "fps", "readout_ms")
     of_scanner = {key: getattr(scanner, key) for key in keys}
-    if "readout_ratio" in given or "readout_ms" in given:  # either wins over both of the scanner
+    if "readout_ratio" in given or "readout_ms" in given:  # either of these replaces both of the scanner
         del of_scanner["readout_ratio"], of_scanner["readout_ms"]
     values = {**of_scanner, **given}
     values.update({key: value for key, value in zip(keys, order, strict=False) if value is not None})

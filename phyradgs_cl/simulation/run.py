@@ -1,4 +1,4 @@
-"""Simulates a scan from a source of frames and an acquisition; each line averages over its own time window."""
+"""Simulates a scan from a source of frames and an acquisition. Each line averages over its own time window."""
 
 import logging
 from collections.abc import Callable
@@ -23,7 +23,7 @@ from phyradgs_cl.simulation.sources import FrameSource
 
 _LARGEST_GRID = 4096
 _SMALLEST_PHANTOM = 2  # procedural phantoms need 4 voxels and are drawn on twice as many
-_STATES = 8  # of a phantom whose bodies move
+_STATES = 8  # states of a phantom whose bodies move
 log = logging.getLogger(__name__)
 
 
@@ -32,10 +32,10 @@ def simulated_scan(
     size: int | None = None, pixel_samples: int = 0, name: str = "volume",
     report: Callable[[int, int], None] = lambda done, total: None
 ) -> Scan:
-    """Returns a scanner's scan of a phantom, given by name or as an object, or of a volume; the truth is its reference.
+    """Returns a scanner's scan of a phantom (given by name or as an object) or of a volume. The truth is its reference.
 
-    name: of the volume. size: voxels along the longest side of grid and reference; None takes the scanner's or the volume's.
-    pixel_samples: rays along each side of a pixel; 0: by the voxels of the truth. Warns of an inverse crime."""
+    name: that of the volume. size: voxels along the longest side of grid and reference; None takes the scanner's or the
+    volume's. pixel_samples: rays along each side of a pixel; 0 takes the truth's voxels. Warns of an inverse crime."""
     if size is not None:
         checks.within("--size", size, 1 if isinstance(of, Volume) else _SMALLEST_PHANTOM, _LARGEST_GRID)
     where, axis = (scanner.geometry, scanner.grid), options.readout_axis
@@ -66,7 +66,7 @@ def simulated_scan(
         scan.provenance["motion_of_object"] = asdict(motion)
         times_s = motion.state_times_s(*window_s)
     else:
-        # eighths of the cycle about the middle of the scan
+        # Times are eighths of the cycle about the middle of the scan.
         period_s = scene.period_s or 1.0
         times_s = (np.floor(sum(window_s) / 2 / period_s) + np.arange(_STATES) / _STATES) * period_s
     volumes = np.stack([scene.state(time_s) for time_s in times_s])
@@ -79,8 +79,9 @@ def simulate(
     reference: np.ndarray | None = None, title: str = "simulated scan",
     report: Callable[[int, int], None] = lambda done, total: None, bone: FrameSource | None = None
 ) -> Scan:
-    """Returns a scan of the object that ``source`` projects, noise included. reference (nz, ny, nx): the truth, which
-    ``peak`` scales too. bone: the source of its bone, for a beam of many energies."""
+    """Returns a scan of the object that ``source`` projects, with noise.
+
+    reference (nz, ny, nx): the truth, which ``peak`` scales too. bone: its bone's source, for a beam of many energies."""
     if options.kvp and bone is None:
         expected = "an object of voxels, whose dense ones are bone: foot, jaw or a volume"
         raise InputError("--kvp", "a phantom in closed form", expected, "leave it out")
@@ -136,7 +137,7 @@ def simulate(
 
 
 def _gating(scan: Scan, scene: Scene) -> Gating:
-    """Returns the weight of the first field in the middle of every frame, or the phase of what moves without a field."""
+    """Returns the weight of the first field in the middle of every frame. Without a field it is the phase of the motion."""
     middle_s = np.asarray(scan.frame_start_s) + scan.shutter.span_s / 2
     if scene.deformation is not None:
         return Gating(middle_s, scene.deformation.weights_at(middle_s)[:, 0])
@@ -144,8 +145,8 @@ def _gating(scan: Scan, scene: Scene) -> Gating:
 
 
 def default_time_samples(protocol: Protocol, grid: Grid, fastest_mm_per_s: float = 0.0) -> int:
-    """Returns samples per line so that the volume's edge, or the fastest part of an object that moves, goes at most half a
-    voxel from one to the next; at least 8."""
+    """Returns the number of samples per line, at least 8. From one to the next, the volume's edge, or the fastest part of an
+    object that moves, goes at most half a voxel."""
     path_mm = np.deg2rad(protocol.exposure_deg) * max(grid.size_mm[1:]) / 2
     path_mm = max(path_mm, fastest_mm_per_s * protocol.exposure_s)
     return int(np.clip(np.ceil(2 * path_mm / min(grid.voxel_size_mm)), 8, 128))
@@ -166,7 +167,7 @@ def _recorded(frames: np.ndarray, options: SimulationOptions, light: np.ndarray,
 
 
 def _with_noise(frames: np.ndarray, options: SimulationOptions, light: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Adds lag and noise to frames (F, v, u). TIGRE's counts are no real intensities, so there the lag comes first."""
+    """Adds lag and noise to frames (F, v, u). TIGRE's counts are no real intensities: lag comes before noise."""
     if options.noise == "beer":
         return effects.beer_lambert_noise(frames, options.dose, options.electronic_noise, rng, light, options.lag)
     if options.lag > 0:

@@ -16,19 +16,21 @@ from phyradgs_cl.phantoms import EllipsoidPhantom, MovingPhantom, make_phantom
 from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.simulation.sources import AnalyticSource, DeformedSource, FrameSource, VolumeSource, on_panel
 
-_DENSE = 0.5  # of the largest attenuation: denser voxels may be bone in a beam of many energies
-_RARE = 0.2  # of the most common attenuation's voxels: a more common one is a material that no threshold may divide
+_DENSE = 0.5  # fraction of the largest attenuation: denser voxels may be bone in a beam of many energies
+_RARE = 0.2  # fraction of the commonest voxels: a threshold must not divide a material with more
 log = logging.getLogger(__name__)
 Moves = Callable[[Grid], Deformation]
-"""How an object in a box moves."""
+"""Returns how an object in a box moves."""
 
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """An object to scan: a source of frames, the grid to reconstruct, and the truth (nz, ny, nx) on it. source_shape: voxels
-    (z, y, x) of a source that is a user's volume. bone: makes the source of its dense part. deformation: how the object
-    moves. state: returns the truth at a time in s, of an object that moves. period_s: of one that moves without a
-    deformation. fastest_mm_per_s: a bound of the speed of its parts."""
+    """An object to scan: a source of frames, the grid to reconstruct, and the truth (nz, ny, nx) on it.
+
+    - source_shape: voxels (z, y, x) of a source that is a user's volume. bone: makes the source of its dense part.
+    - deformation: how the object moves. state: returns the truth of a moving object at a time in s.
+    - period_s: the period of an object that moves without a deformation.
+    - fastest_mm_per_s: a bound of the speed of its parts."""
 
     source: FrameSource
     grid: Grid
@@ -58,7 +60,7 @@ def phantom_scene(
     """Returns the scene of a phantom, or of one by its name, in the scanner's box, with ``size`` voxels per side.
 
     Closed forms are integrated exactly unless they deform. Other phantoms are projected at twice ``size``, and the truth is
-    their block mean. Pixels average ``pixel_samples``² rays over their area; 0: by the voxels of the truth."""
+    their block mean. Pixels average ``pixel_samples``² rays over their area; 0 takes the truth's voxels."""
     half_size_mm = min(box.size_mm) / 2
     phantom = make_phantom(of, half_size_mm, 2 * size, seed) if isinstance(of, str) else of
     if isinstance(phantom, MovingPhantom):
@@ -99,7 +101,7 @@ def volume_scene(
     rt: Runtime, loaded: Volume, name: str, geometry: Geometry, box: Grid, size: int | None, axis: str,
     pixel_samples: int = 0, moves: Moves | None = None
 ) -> Scene:
-    """Returns the scene of a volume, called ``name``, at its own resolution with ``pixel_samples``² rays per pixel.
+    """Returns the scene of a volume, called ``name``, at its own resolution, with ``pixel_samples``² rays per pixel.
 
     A volume with a grid keeps it and its unit 1/mm. A bare array is fitted into the scanner's box; its values are
     attenuation per half of the longest side."""
@@ -149,8 +151,8 @@ def _voxel_scene(
 
 
 def bone_from(volume: np.ndarray) -> float:
-    """Returns the attenuation from which voxels (z, y, x) are bone. It is half the largest, or the end of the material that
-    this value would divide."""
+    """Returns the attenuation from which voxels (z, y, x) are bone. It is half the largest value, or the end of the material
+    that this value would divide."""
     largest = float(volume.max())
     counts, edges = np.histogram(volume, 64, (0.1 * largest, max(largest, 1e-20)))
     is_rare = (edges[1:] > _DENSE * largest) & (counts < _RARE * counts.max())
@@ -161,7 +163,7 @@ def block_mean(volume: np.ndarray, shape: tuple[int, int, int]) -> np.ndarray:
     """Returns means float32 of a volume (z, y, x) over the voxels of a coarser or equal grid of the same box."""
     if volume.shape == tuple(shape):
         return volume.astype(np.float32)
-    from skimage.transform import resize_local_mean  # imported here because it is slow to import
+    from skimage.transform import resize_local_mean  # this import is slow
 
     mean = resize_local_mean(volume.astype(np.float32), shape, grid_mode=True, preserve_range=True)
     return mean.astype(np.float32)

@@ -1,5 +1,6 @@
-"""Sources of frames: voxel volumes at rest or deforming, and phantoms in closed form, projected from the poses of a
-frame's time cells. Of an object that moves every line sees it at the times at which the line is open."""
+"""Sources of frames: voxel volumes at rest or deforming, and phantoms in closed form, projected from a frame's time cells.
+
+Every line sees a moving object at the times at which the line is open."""
 
 import math
 from abc import ABC, abstractmethod
@@ -23,11 +24,11 @@ from phyradgs_cl.runtime import DeviceArray, MemoryShortage, Runtime
 
 WIDEST_RAY = 1.5  # voxels to a pixel; the usual scanner has 1.43 where voxels are as many as pixels
 _MOST_SAMPLES = 32
-NEAREST = 0.1  # of a voxel to be reconstructed: the largest distance of matter from its place
+NEAREST = 0.1  # largest distance of matter from its place, in voxels to be reconstructed
 
 
 class FrameSource(ABC):
-    """An object that can be projected to the frame of a cell table, attenuation multiplied by ``factor``."""
+    """An object that can be projected to the frame of a cell table. Attenuation is multiplied by ``factor``."""
 
     pixel_samples = 1  # rays along each side of a pixel
 
@@ -62,12 +63,12 @@ class VolumeSource(FrameSource):
         return (self._rt.download(frames) if isinstance(frames, DeviceArray) else frames)[0]
 
     def _where_it_fits(self, volume: np.ndarray) -> np.ndarray | DeviceArray:
-        """Returns it on the device; on the host where the device has no room for it and the operator's padded copy."""
+        """Returns the volume on the device, or on the host without room for it and the operator's padded copy."""
         if not self._rt.room().holds(volume.nbytes, 4 * self._memory.layout.volume_floats):
             return volume
         try:
             return self._rt.upload(volume)
-        except MemoryShortage:  # the operator projects in bricks
+        except MemoryShortage:  # the operator then projects in bricks
             return volume
 
 
@@ -84,7 +85,7 @@ class AnalyticSource(FrameSource):
             pixels = pixel_centres(cells.pose[members], self._geometry.detector_shape)
             target = pixels[:, start:stop] if by_row else pixels[:, :, start:stop]
             origin = cells.pose[members][:, None, None, :3]
-            if cells.is_parallel:  # from before the phantom to behind it, along the rays' direction
+            if cells.is_parallel:  # rays begin before the phantom and end behind it
                 along = (self._phantom.reach_mm + np.linalg.norm(target, axis=-1, keepdims=True)) * origin
                 origin, target = target - along, target + along
             if isinstance(self._phantom, MovingPhantom):
@@ -125,10 +126,10 @@ def line_groups(cells: TimeCells) -> Iterator[tuple[int, int, np.ndarray]]:
 
 
 def on_panel(geometry: Geometry, grid: Grid, pixel_samples: int, make: Callable[[Geometry], FrameSource]) -> FrameSource:
-    """Makes a source for the panel; with several samples per pixel for a finer panel, averaged over its pixels.
+    """Makes a source for the panel. With several samples per pixel, a finer panel is averaged over the panel's pixels.
 
-    pixel_samples: 0 takes one where a pixel, at the axis, has at most ``WIDEST_RAY`` voxels of the grid, and otherwise one
-    for every voxel: rays through the middles of wide pixels alone would miss parts of the truth."""
+    pixel_samples: 0 takes one sample where a pixel, at the axis, has at most ``WIDEST_RAY`` voxels of the grid. Otherwise it
+    takes one for every voxel: rays through the middles of wide pixels alone would miss parts of the truth."""
     checks.within("--pixel-samples", pixel_samples, 0, _MOST_SAMPLES)
     if pixel_samples == 0:
         voxels = max(geometry.pixel_size_mm) / geometry.magnification / min(grid.voxel_size_mm)
@@ -143,8 +144,7 @@ class DeformedSource(FrameSource):
 
     A frame at a single time sees the object exactly then. In other frames the weights φ_r of each time cell are rounded, so
     that all cells with the same rounded weights project one deformed volume. The rounding displaces no point by more than
-    ``NEAREST`` of ``voxel_mm``. ``frames`` deforms once for each state of all its frames. make: the source of a volume's
-    frames."""
+    ``NEAREST`` of ``voxel_mm``. ``frames`` deforms once for each state of all its frames. make: a volume's source."""
 
     def __init__(
         self, rt: Runtime, volume: np.ndarray, grid: Grid, deformation: Deformation, voxel_mm: float,
@@ -174,7 +174,7 @@ class DeformedSource(FrameSource):
         return (each.frame() for each in sums)
 
     def _volumes(self, weights: np.ndarray) -> Callable[[int], np.ndarray]:
-        """Returns what makes the volume of each state of ``weights`` (K, R): on the device where its memory has room."""
+        """Returns a function that makes the volume of each state of ``weights`` (K, R). On the device if it has room."""
         volume, rank = self._volume, self._deformation.rank
         if not self._rt.room().scaled(0.5).holds(3 * rank * volume.nbytes, *[2 * volume.nbytes] * 2):
             spline = SplineVolume(volume, self._grid)
@@ -185,13 +185,13 @@ class DeformedSource(FrameSource):
         return lambda k: volume if warp.is_still(k) else np.maximum(self._rt.download(warp.forward(k, source)), least)
 
     def _rounded_weights(self, cells: TimeCells) -> np.ndarray:
-        """Returns the weights (C, R) of the states that the cells are projected from."""
+        """Returns the weights (C, R) of the states from which the cells are projected."""
         weights = self._deformation.weights_at(cells.time_s)
         return np.round(weights / self._step) * self._step if np.ptp(weights, axis=0).any() else weights
 
 
 class _Average:
-    """A frame as the average of frames of some of its time cells."""
+    """A frame as the average of frames, each of some of its time cells."""
 
     def __init__(self, cells: TimeCells, model: str) -> None:
         self._readout, self._is_log = cells.readout, model == "log"
@@ -203,20 +203,21 @@ class _Average:
         if self._is_log:
             self._sum = weight * frame + (0.0 if self._sum is None else self._sum)
             return
-        with np.errstate(divide="ignore"):  # no share of a line: ln 0
+        with np.errstate(divide="ignore"):  # a line without a share gives ln 0
             log_part = np.log(weight) - frame
         self._sum = log_part if self._sum is None else np.logaddexp(self._sum, log_part)
 
     def frame(self) -> np.ndarray:
-        """Returns the average (rows, columns); 0 on lines without light."""
+        """Returns the average (rows, columns). It is 0 on lines without light."""
         assert self._sum is not None
         mean = self._sum if self._is_log else np.where(np.isfinite(self._sum), -self._sum, 0)
         return mean.astype(np.float32)
 
 
 def part_of(cells: TimeCells, members: np.ndarray) -> tuple[TimeCells, np.ndarray]:
-    """Returns the table of some still cells, bool (C,), and the part (lines,) of each line's weight that they have. The
-    weights of a line in the new table sum to 1, or are 0."""
+    """Returns the table of some still cells, bool (C,), and the part (lines,) of each line's weight that they have.
+
+    The weights of a line in the new table sum to 1, or are 0."""
     part = some_cells(cells, np.flatnonzero(members))
     share = part.line_weights()
     factors = np.divide(1.0, share, out=np.zeros_like(share), where=share > 0)

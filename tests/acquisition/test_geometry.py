@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import asdict, replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -153,3 +154,14 @@ def test_an_exposure_is_longer_than_the_times_steps(scan) -> None:
     for exposure_s in (5e-324, 1e-13):
         with pytest.raises(InputError, match=r"^exposure_s: found .* s; expected 0, or at least the 2\.2e-13 s"):
             Shutter(exposure_s, 0.2).check_resolved(scan.frame_start_s)
+
+
+def test_frames_are_searched_for_nan_where_they_enter(scan) -> None:
+    """A replaced field leaves the frames unsearched; other frames are searched, also those of a scan of one's own."""
+    bad = scan.projections.copy()
+    bad[0, 0, 0] = np.nan
+    for enter in (partial(replace, scan), partial(Scan, geometry=scan.geometry, trajectory=scan.trajectory)):
+        with pytest.raises(InputError, match="projections: found 1 NaN"):
+            enter(projections=bad, shutter=scan.shutter, frame_start_s=scan.frame_start_s, grid=scan.grid)
+    scan.projections[0, 0, 0] = np.nan
+    assert replace(scan, title="another").projections is scan.projections

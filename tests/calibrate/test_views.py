@@ -10,9 +10,8 @@ from phyradgs_cl.acquisition import ConeGeometry, Protocol
 from phyradgs_cl.acquisition.altered.perturbed import GeometryCorrection, Sway, Views, perturb
 from phyradgs_cl.api import simulate
 from phyradgs_cl.calibrate import AGREES, CORRECTED, Calibration, calibrate
-from phyradgs_cl.calibrate.per_view import SPLINES, MotionParameters, WobbleParameters
+from phyradgs_cl.calibrate.per_view import SPLINES, MotionParameters, WobbleParameters, estimate_views
 from phyradgs_cl.calibrate.stages import PassCounter, Stage
-from phyradgs_cl.calibrate.views import estimate_views
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.io import write_scan

@@ -11,7 +11,7 @@ from report.browser import POOR_CONTRAST, launched, watched
 
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.reconstructors import Progress
-from phyradgs_cl.report.live_page import Snapshot, Status, live_page
+from phyradgs_cl.report.live import Snapshot, Status, live_page
 
 EVERY_S = 0.5
 RAMP = np.linspace(0, 1, 512, dtype=np.float32).reshape(8, 8, 8)

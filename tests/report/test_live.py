@@ -13,8 +13,7 @@ from phyradgs_cl.fields import Grid
 from phyradgs_cl.reconstructors import Progress
 from phyradgs_cl.reconstructors.projected import FramePair
 from phyradgs_cl.report import LivePage
-from phyradgs_cl.report.live import SHARE
-from phyradgs_cl.report.live_page import Snapshot, Status, live_page
+from phyradgs_cl.report.live import SHARE, Snapshot, Status, live_page
 
 pytestmark = pytest.mark.slow
 

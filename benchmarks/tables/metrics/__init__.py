@@ -1,4 +1,4 @@
-"""What the tables measure beside 3D PSNR and SSIM: projections, shapes of beads, bias of regions, and figures."""
+"""Measures of the tables beside 3D PSNR and SSIM: projections, shapes of beads, bias of regions. Also figures."""
 
 from tables.metrics.beads import Bead
 from tables.metrics.bias import regional_bias

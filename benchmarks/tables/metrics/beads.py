@@ -1,4 +1,4 @@
-"""Beads of known place and size in a volume: what the shape metrics are measured on."""
+"""Beads of known place and size in a volume, on which the shape metrics are measured."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,23 +11,17 @@ from phyradgs_cl.fields import Grid
 
 Array = NDArray[np.float64]
 
-# Beads are looked at out to this multiple of their radius: enough surroundings to know the level outside.
+# Voxels up to this multiple of a bead's radius count: enough surroundings for the level outside.
 REACH = 1.75
-# Below this radius a bead is a handful of voxels: its shape is the voxels' own.
+# A bead with a smaller radius is only a few voxels, whose shape is that of the voxels.
 SMALLEST_RADIUS_VOXELS = 2.5
 
 
 @dataclass(frozen=True)
 class Bead:
-    """A homogeneous bead in homogeneous surroundings (out to ``REACH`` radii).
+    """A homogeneous bead at ``centre_mm`` (x, y, z) in homogeneous surroundings (out to ``REACH`` radii).
 
-    Args:
-        centre_mm: (x, y, z).
-        radius_mm: radius.
-
-    Raises:
-        InputError: a centre that is not finite or not three numbers, a radius that is not positive.
-    """
+    Raises InputError for a centre that is not three finite numbers, and for a radius that is not positive."""
 
     centre_mm: tuple[float, float, float]
     radius_mm: float
@@ -39,13 +33,13 @@ class Bead:
 
 
 def resolved(beads: Sequence[Bead], grid: Grid) -> list[Bead]:
-    """The beads that are large enough on ``grid`` to have a shape, and lie in it with their surroundings."""
+    """Returns the beads that are large enough on ``grid`` to have a shape, and lie in it with their surroundings."""
     least_mm = SMALLEST_RADIUS_VOXELS * max(grid.voxel_size_mm)
     return [bead for bead in beads if bead.radius_mm >= least_mm and _is_inside(bead, grid)]
 
 
 def surroundings(volume: NDArray[np.floating], grid: Grid, bead: Bead) -> tuple[Array, Array]:
-    """Distances (n,) in mm from the bead's centre and values (n,) of all voxels within ``REACH`` radii."""
+    """Returns distances (n,) in mm from the bead's centre, and values (n,), of all voxels within ``REACH`` radii."""
     reach_mm = REACH * bead.radius_mm
     picks, offsets = [], []
     for axis_mm, centre_mm in zip(grid.axes_mm(), bead.centre_mm[::-1], strict=True):
@@ -60,7 +54,7 @@ def surroundings(volume: NDArray[np.floating], grid: Grid, bead: Bead) -> tuple[
 
 
 def levels(distance_mm: Array, values: Array, radius_mm: float) -> tuple[float, float]:
-    """Values inside and outside, as medians away from the edge; NaN where there is no voxel to ask."""
+    """Returns the values inside and outside, as medians away from the edge. NaN: there is no such voxel."""
     inside = values[distance_mm < 0.6 * radius_mm]
     outside = values[distance_mm > 1.4 * radius_mm]
     if inside.size == 0 or outside.size == 0:

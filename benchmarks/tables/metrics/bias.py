@@ -1,4 +1,4 @@
-"""Bias: whether known regions have the right mean, which PSNR mixes with everything else."""
+"""Bias: whether known regions have the right mean, which PSNR does not separate from other errors."""
 
 import numpy as np
 import scipy
@@ -12,20 +12,12 @@ from phyradgs_cl.metrics.quality import checked_pair
 def regional_bias(
     result: ArrayLike, reference: ArrayLike, labels: ArrayLike, erosion_voxels: int = 1
 ) -> dict[int, float]:
-    """Mean of the result over the mean of the truth, minus 1, in every labelled region.
+    """Returns by label the mean of the result over the mean of the truth, minus 1.
 
-    Args:
-        result: (z, y, x).
-        reference: (z, y, x), the truth in the same unit.
-        labels: (z, y, x) integers; 0 is no region.
-        erosion_voxels: how far regions shrink first, so that blurred edges are not taken for bias.
-
-    Returns:
-        label to relative bias. Left out: regions that vanish in erosion, and those whose true mean is 0.
-
-    Raises:
-        InputError: shapes that differ, labels that are not integers, NaN or infinity, a negative erosion.
-    """
+    result, reference: (z, y, x) in one unit. labels: (z, y, x) integers; 0 is no region. erosion_voxels: by how much regions
+    shrink before, so that blurred edges do not count as bias. Regions that vanish in erosion, and those whose true mean is
+    0, are left out. Raises InputError for shapes that differ, labels that are no integers, NaN or infinity, and negative
+    erosion."""
     a, b, _ = checked_pair(result, reference, 1.0)
     regions = np.asarray(labels)
     shape("labels", regions, b.shape)
@@ -42,7 +34,7 @@ def regional_bias(
 
 
 def _eroded(mask: NDArray[np.bool_], voxels: int) -> NDArray[np.bool_]:
-    """Erosion by the full 3×3×3 neighbourhood; what lies beyond the volume belongs to no region."""
+    """Returns the mask eroded by the full 3×3×3 neighbourhood. Voxels beyond the volume belong to no region."""
     if voxels == 0:
         return mask
     return scipy.ndimage.binary_erosion(mask, np.ones((3,) * mask.ndim, bool), iterations=int(voxels))

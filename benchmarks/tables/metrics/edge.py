@@ -1,10 +1,9 @@
 """Edge sharpness: the distance over which a bead's edge rises from 10 % to 90 %.
 
-A bead blurred by an isotropic Gaussian has a radial profile in closed form, so σ, radius and the two levels follow
-from a fit to all voxels around the bead: below a voxel, insensitive to noise, and right for small beads too, whose
-profile has no plateau. A straight edge blurred by σ rises from 10 % to 90 % within 2.563 σ. Voxels that average over
-their own width d add d²/12 to σ²: a perfect volume has a rise of about 0.74 voxel.
-"""
+A bead blurred by an isotropic Gaussian has a radial profile in closed form. So σ, radius and the two levels follow from a
+fit to all voxels around the bead. The fit resolves less than a voxel, is insensitive to noise, and is right for small beads
+too, whose profile has no plateau. A straight edge blurred by σ rises from 10 % to 90 % within 2.563 σ. Voxels that average
+over their own width d add d²/12 to σ²: a perfect volume has a rise of about 0.74 voxel."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -17,7 +16,7 @@ from phyradgs_cl.checks import finite, shape
 from phyradgs_cl.fields import Grid
 from tables.metrics.beads import Array, Bead, levels, resolved, surroundings
 
-RISE_PER_SIGMA = 2.5631031310892007  # between the 10th and the 90th percentile of a normal distribution
+RISE_PER_SIGMA = 2.5631031310892007  # from the 10th to the 90th percentile of a normal distribution
 
 
 @dataclass(frozen=True)
@@ -31,19 +30,10 @@ class Edge:
 
 
 def edge_sharpness(volume: NDArray[np.floating], grid: Grid, beads: Sequence[Bead]) -> dict[str, float]:
-    """Mean 10–90 % rise over the beads that the grid resolves.
+    """Returns edge_rise_mm, the mean 10–90 % rise over the beads that the grid resolves, and edge_balls, their number.
 
-    Args:
-        volume: (z, y, x).
-        grid: where its voxels are.
-        beads: known centres and radii.
-
-    Returns:
-        edge_rise_mm, NaN where no bead could be measured; edge_balls, how many were.
-
-    Raises:
-        InputError: a volume of another shape than the grid, NaN or infinity.
-    """
+    volume: (z, y, x) on ``grid``. beads: known centres and radii. The rise is NaN where no bead could be measured. Raises
+    InputError for a volume of another shape than the grid, NaN or infinity."""
     shape("volume", volume, grid.shape)
     finite("volume", volume)
     rises = [bead_edge(volume, grid, bead).rise_mm for bead in resolved(beads, grid)]
@@ -52,7 +42,7 @@ def edge_sharpness(volume: NDArray[np.floating], grid: Grid, beads: Sequence[Bea
 
 
 def bead_edge(volume: NDArray[np.floating], grid: Grid, bead: Bead) -> Edge:
-    """The edge of one bead; NaN where nothing brighter or darker than its surroundings is found."""
+    """Returns the edge of one bead. It is NaN where nothing brighter or darker than its surroundings is found."""
     distance, values = surroundings(volume, grid, bead)
     inside, outside = levels(distance, values, bead.radius_mm)
     if not (np.isfinite(inside) and np.isfinite(outside)) or inside == outside:
@@ -73,8 +63,8 @@ def bead_edge(volume: NDArray[np.floating], grid: Grid, bead: Bead) -> Edge:
 
 
 def blurred_ball(distance_mm: Array, radius_mm: float, sigma_mm: float) -> Array:
-    """A unit ball convolved with a normalised 3D Gaussian, at distances (n,) from its centre."""
-    r = np.maximum(distance_mm, 1e-4 * radius_mm)  # the limit at 0, without its 0/0
+    """Returns a unit ball convolved with a normalised 3D Gaussian, at distances (n,) from its centre."""
+    r = np.maximum(distance_mm, 1e-4 * radius_mm)  # takes the limit at 0, without its 0/0
     to_edge, from_edge = (radius_mm - r) / sigma_mm, (radius_mm + r) / sigma_mm
     within = 0.5 * (scipy.special.erf(from_edge / np.sqrt(2)) + scipy.special.erf(to_edge / np.sqrt(2)))
     shells = np.exp(-0.5 * to_edge**2) - np.exp(-0.5 * from_edge**2)

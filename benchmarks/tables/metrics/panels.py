@@ -1,4 +1,4 @@
-"""A figure of many reconstructions side by side: a column each, the same slices and grey values in all."""
+"""A figure of many reconstructions side by side: one column each, with the same slices and grey values in all."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -13,21 +13,12 @@ _INCH, _DPI = 1.9, 110
 
 
 def panels_png(path: str | Path, columns: Sequence[tuple[str, Images]], title: str) -> None:
-    """Write a PNG with one column for each (heading, images); the first column is the truth.
+    """Writes a PNG with one column for each (heading, images). The first column is the truth.
 
-    Grey values run over the first column's range, 0 included, so that a wrong gain shows. Row 0 of an image is
-    drawn at the bottom.
-
-    Args:
-        path: file to write.
-        columns: heading and images, each (rows, columns); the same number of images in every column.
-        title: heading of the figure.
-
-    Raises:
-        InputError: no column, or columns of different lengths.
-        OutputError: the file cannot be written.
-    """
-    from matplotlib.figure import Figure  # slow to import, and only figures need it
+    Grey values extend over the first column's range, with 0, so that a wrong gain shows. Images are (rows, columns), with
+    row 0 at the bottom, and every column has the same number of them. ``title``: heading of the figure. Raises InputError
+    for no column or columns of different lengths, and OutputError for a file that cannot be written."""
+    from matplotlib.figure import Figure  # only figures need it, and its import is slow
 
     counts = {len(images) for _, images in columns}
     if len(counts) != 1 or counts == {0}:

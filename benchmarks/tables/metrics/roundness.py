@@ -1,9 +1,8 @@
-"""Roundness: how circular the sections of beads are, the claim that pictures of a sphere phantom make by eye.
+"""Roundness: how circular the sections of beads are, which pictures of a sphere phantom show to the eye.
 
-In the central axial, coronal and sagittal section of every bead the contour at half level is followed ray by ray.
-As in metrology, radii are taken about the centre of the least-squares circle, so that a bead that is round but
-displaced counts as round; the displacement is reported beside it.
-"""
+The contour at half level is followed ray by ray in the central axial, coronal and sagittal section of every bead. As in
+metrology, radii are taken about the centre of the least-squares circle. A bead that is round but displaced then counts as
+round; the displacement is reported beside it."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -18,8 +17,8 @@ from tables.metrics.beads import REACH, Array, Bead, levels, resolved, surroundi
 
 RAYS = 72
 _STEPS_PER_VOXEL = 8
-_LEAST_SHARE = 0.75  # of the rays that must meet the contour, or the section has none
-# (first, second) axis of each section in (x, y, z)
+_LEAST_SHARE = 0.75  # fraction of the rays that must meet the contour; otherwise the section has none
+# (first, second) axis of each section in (x, y, z).
 SECTIONS = {"axial": (0, 1), "coronal": (0, 2), "sagittal": (1, 2)}
 
 
@@ -34,20 +33,11 @@ class Section:
 
 
 def roundness(volume: NDArray[np.floating], grid: Grid, beads: Sequence[Bead]) -> dict[str, float]:
-    """Means over all sections of the beads that the grid resolves; 0 is round.
+    """Returns means over all sections of the beads that the grid resolves. 0 is round.
 
-    Args:
-        volume: (z, y, x).
-        grid: where its voxels are.
-        beads: known centres and radii.
-
-    Returns:
-        roundness, (r_max − r_min)/r_mean; roundness_rms, RMS deviation/r_mean; centre_shift_mm, distance of the
-        contour's centre from the true one; round_sections, how many were found. NaN where there were none.
-
-    Raises:
-        InputError: a volume of another shape than the grid, NaN or infinity.
-    """
+    roundness is (r_max − r_min)/r_mean; roundness_rms is RMS deviation/r_mean; centre_shift_mm is the distance of the
+    contour's centre from the true one; round_sections is the number of sections found. They are NaN where there are none.
+    volume: (z, y, x) on ``grid``. Raises InputError for a volume of another shape than the grid, NaN or infinity."""
     shape("volume", volume, grid.shape)
     finite("volume", volume)
     found = [
@@ -64,7 +54,7 @@ def roundness(volume: NDArray[np.floating], grid: Grid, beads: Sequence[Bead]) -
 
 
 def bead_sections(volume: NDArray[np.floating], grid: Grid, bead: Bead) -> dict[str, Section]:
-    """The three central sections of one bead by name; NaN where less than three quarters of a contour exist."""
+    """Returns the three central sections of one bead by name. NaN: less than three quarters of a contour exist."""
     inside, outside = levels(*surroundings(volume, grid, bead), bead.radius_mm)
     return {
         name: _section(half_level_radii(volume, grid, bead, axes, (inside, outside)))
@@ -79,10 +69,9 @@ def half_level_radii(
     axes: tuple[int, int],
     inside_outside: tuple[float, float],
 ) -> Array:
-    """Distances (RAYS,) in mm from the bead's centre to the half level, in the plane of two axes of (x, y, z).
+    """Returns distances (RAYS,) in mm from the bead's centre to the half level, in the plane of two axes of (x, y, z).
 
-    Of several crossings that noise may make, the one nearest to the true radius; NaN on a ray without any.
-    """
+    Noise may make several crossings; the one nearest to the true radius counts. A ray without a crossing has NaN."""
     inside, outside = inside_outside
     if not (np.isfinite(inside) and np.isfinite(outside)) or inside == outside:
         return np.full(RAYS, np.nan)
@@ -101,7 +90,7 @@ def half_level_radii(
 def _along_rays(
     volume: NDArray[np.floating], grid: Grid, bead: Bead, axes: tuple[int, int], r_mm: Array
 ) -> Array:
-    """Values (RAYS, len(r_mm)) from the centre outwards, interpolated by cubic splines."""
+    """Returns values (RAYS, len(r_mm)) from the centre outwards, interpolated by cubic splines."""
     angle = 2 * np.pi * np.arange(RAYS) / RAYS
     points = np.broadcast_to(
         np.asarray(bead.centre_mm, np.float64)[:, None, None], (3, RAYS, r_mm.size)
@@ -110,7 +99,7 @@ def _along_rays(
     points[axes[1]] += np.sin(angle)[:, None] * r_mm
     first, pitch = np.array(grid.first_centre_mm), np.array(grid.voxel_size_mm)
     index = (points[::-1] - first[:, None, None]) / pitch[:, None, None]
-    # A box around the bead: spline coefficients of the whole volume would be computed for every bead.
+    # A box around the bead is enough: otherwise every bead would need spline coefficients of the whole volume.
     low = [max(0, int(i.min()) - 8) for i in index]
     high = [min(n, int(i.max()) + 9) for i, n in zip(index, grid.shape, strict=True)]
     box = volume[tuple(slice(a, b) for a, b in zip(low, high, strict=True))].astype(np.float64)
@@ -123,7 +112,7 @@ def _section(radii_mm: Array) -> Section:
         return Section(np.nan, np.nan, np.nan, np.nan)
     angle = 2 * np.pi * np.arange(RAYS)[known] / RAYS
     x, y = radii_mm[known] * np.cos(angle), radii_mm[known] * np.sin(angle)
-    # Circle through the points by linear least squares: x² + y² = 2ax + 2by + c.
+    # The circle through the points follows by linear least squares: x² + y² = 2ax + 2by + c.
     a, b, _ = np.linalg.lstsq(np.stack([2 * x, 2 * y, np.ones_like(x)], -1), x * x + y * y, rcond=None)[0]
     r = np.hypot(x - a, y - b)
     mean = float(r.mean())

@@ -1,1 +1,1 @@
-"""Scans derived from a stated one: coarser, with another geometry or timing, under another hypothesis."""
+"""Scans derived from a stated scan: coarser, with corrected or altered geometry and timing, or with summed frames."""

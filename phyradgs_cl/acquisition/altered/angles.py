@@ -1,14 +1,14 @@
-"""Angles of the source, or of parallel rays, about the axis of rotation (+z), from poses or from a scan."""
+"""Angles of the source, or of parallel rays, about the axis of rotation (+z). They come from poses or from a scan."""
 
 import numpy as np
 
 from phyradgs_cl.acquisition.scan import Scan
 
-_ACROSS = 1e-3  # largest part along the axis of a ray that counts as across it
+_ACROSS = 1e-3  # largest cosine between a ray and the axis at which the ray counts as across the axis
 
 
 def azimuth_rad(pose: np.ndarray) -> np.ndarray:
-    """Returns the angles (...) about +z of the source, or of the rays' direction, of poses (..., 12), in (-π, π]."""
+    """Returns the angles (...) of poses (..., 12) about +z, in (-π, π]: those of the source, or of the rays' direction."""
     angle_rad: np.ndarray = np.arctan2(pose[..., 1], pose[..., 0])
     return angle_rad
 
@@ -26,13 +26,12 @@ def middle_poses(scan: Scan) -> np.ndarray:
 
 
 def has_opposite_views(scan: Scan) -> bool:
-    """True where views half a turn apart are mirror images, those of parallel rays across the axis."""
+    """True where views half a turn apart are mirror images: parallel rays that run across the axis."""
     return scan.is_parallel and bool((np.abs(middle_poses(scan)[:, 2]) < _ACROSS).all())
 
 
 def exposure_arc_rad(scan: Scan) -> float:
-    """Returns the angle by which the gantry turns during one line's exposure, in the middle frame; 0 for a gantry at
-    rest."""
+    """Returns the angle by which the gantry turns during one line's exposure in the middle frame. A gantry at rest has 0."""
     if not scan.is_fly:
         return 0.0
     frame = scan.frames // 2

@@ -1,4 +1,4 @@
-"""A scan made small enough to be reconstructed many times: fewer frames, blocks of pixels, coarse voxels."""
+"""Makes a scan small enough to be reconstructed many times: fewer frames, blocks of pixels, coarse voxels."""
 
 import math
 from dataclasses import replace
@@ -13,18 +13,18 @@ from phyradgs_cl.acquisition.shutter import Shutter
 from phyradgs_cl.fields import Grid
 
 MOST_FRAMES = 60
-QUICK_COLUMNS, FINE_COLUMNS = 20, 32  # along the detector's longer side
-SMOOTHING = 0.8  # blocks: standard deviation
-_LEAST_VALID = 0.5  # of a block's pixels
-_MOST_VOXELS = 64  # per side
-_MARGIN = 1  # voxels around the box: an object that fills it would fit better with a smaller size
-_OBJECT_SHARE = 0.02  # of the largest line integral: columns above it show the object
-_LEAST_COLUMNS = 12  # of blocks, where the panel has that many
-_NARROW = 3  # times the columns, on a panel lower than two blocks: a row of few blocks holds little
+QUICK_COLUMNS, FINE_COLUMNS = 20, 32  # blocks along the detector's longer side
+SMOOTHING = 0.8  # standard deviation of the smoothing, in blocks
+_LEAST_VALID = 0.5  # a block with a smaller fraction of valid pixels is masked
+_MOST_VOXELS = 64  # per side of the grid
+_MARGIN = 1  # voxels around the box: a too small size would fit an object that fills the box better
+_OBJECT_SHARE = 0.02  # a column shows the object above this fraction of the largest line integral
+_LEAST_COLUMNS = 12  # least number of blocks across a panel that has as many columns
+_NARROW = 3  # blocks are this much smaller on a panel lower than two of them: a row of few blocks holds little
 
 
 def coarse(scan: Scan, columns: int) -> Scan:
-    """Returns the scan with at most 60 frames, its pixels averaged in blocks, and a grid to match; without a reference.
+    """Returns the scan with at most 60 frames, pixels averaged in blocks, a grid to match, and no reference.
 
     The detector's longer side has at most ``columns`` blocks."""
     shape = scan.geometry.detector_shape
@@ -36,8 +36,9 @@ def coarse(scan: Scan, columns: int) -> Scan:
 
 
 def smooth(scan: Scan, pixels: float | tuple[float, float]) -> Scan:
-    """Returns the scan with frames smoothed by a Gaussian of ``pixels`` (or a pair: across rows, across columns), from valid
-    pixels only. Blocks of smoothed frames have no aliasing."""
+    """Returns the scan with frames smoothed by a Gaussian, from valid pixels only. Their blocks have no aliasing.
+
+    pixels: the standard deviation, or a pair of them (across rows, across columns)."""
     v_px, u_px = pixels if isinstance(pixels, tuple) else (pixels, pixels)
     if max(v_px, u_px) <= 0.5:
         return scan
@@ -58,7 +59,7 @@ def fewer_frames(scan: Scan, most: int) -> Scan:
 
 
 def some_frames(scan: Scan, frames: np.ndarray) -> Scan:
-    """Returns the scan with the given frames (indices) only. Its trajectory still counts them as in the file."""
+    """Returns the scan with the given frames (indices) only. The trajectory keeps the frame numbers of the file."""
     trajectory = altered_trajectory(scan)
     mask = scan.pixel_mask
     return replace(
@@ -71,10 +72,10 @@ def some_frames(scan: Scan, frames: np.ndarray) -> Scan:
 
 
 def binned(scan: Scan, block: int) -> Scan:
-    """Returns the scan with blocks of ``block`` × ``block`` pixels as one pixel each, no larger than the panel.
+    """Returns the scan with ``block`` × ``block`` pixels averaged to one. A block is no larger than the panel.
 
-    A block is the mean of its valid pixels, masked where less than half are valid. Rows and columns that fill no block are
-    dropped at the far end. A block of lines opens at the mean of its lines' times."""
+    Only the valid pixels of a block are averaged; a block with less than half of them valid is masked. Rows and columns at
+    the far end that fill no block are dropped. A block of lines opens at the mean of its lines' times."""
     if block == 1:
         return replace(scan, reference=None, moving_truth=None)
     height, width = blocks = tuple(min(block, count) for count in scan.geometry.detector_shape)
@@ -96,7 +97,7 @@ def binned(scan: Scan, block: int) -> Scan:
 
 
 def coarse_grid(grid: Grid, geometry: Geometry) -> Grid:
-    """Returns the same box with a margin of one voxel, in voxels of about a pixel at the axis, never finer than ``grid``."""
+    """Returns a grid of the same box with a margin of one voxel. Voxels are about a pixel at the axis, but no finer."""
     height_mm, width_mm = (pitch / geometry.magnification for pitch in geometry.pixel_size_mm)
     least_mm = max(max(grid.size_mm) / _MOST_VOXELS, min(grid.voxel_size_mm))
     wanted_mm = (max(height_mm, least_mm), *(max(width_mm, least_mm),) * 2)
@@ -107,11 +108,11 @@ def coarse_grid(grid: Grid, geometry: Geometry) -> Grid:
 
 
 def around_object(scan: Scan, spare_columns: float = 0.0) -> Scan:
-    """Returns a coarse scan with its grid about the axis cut to the object that the frames show, and to so many columns more
-    as the axis may be off.
+    """Returns a coarse scan with its grid about the axis cut to the object that the frames show.
 
-    With few frames, voxels of air let a wrong hypothesis fit better than the right one. A grid derived from the panel has
-    many."""
+    spare_columns: columns by which the grid is wider, because the axis may be off by as many.
+
+    With few frames, voxels of air let a wrong hypothesis fit better than the right one. A panel's grid has many of them."""
     geometry, grid = scan.geometry, scan.grid
     columns = np.where(scan.valid, scan.projections, 0).max((0, 1))
     shown = np.flatnonzero(columns > _OBJECT_SHARE * columns.max())
@@ -131,7 +132,7 @@ def around_object(scan: Scan, spare_columns: float = 0.0) -> Scan:
 
 
 def _binned_panel(geometry: Geometry, height: int, width: int) -> Geometry:
-    """Returns the panel of the whole blocks; pixels dropped at the far end move its middle."""
+    """Returns the panel made of whole blocks. Pixels dropped at the far end move its middle."""
     (rows, columns), (pitch_v_mm, pitch_u_mm) = geometry.detector_shape, geometry.pixel_size_mm
     offset_v_mm, offset_u_mm = geometry.detector_offset_mm
     return replace(
@@ -146,7 +147,7 @@ def _binned_panel(geometry: Geometry, height: int, width: int) -> Geometry:
 
 
 def _binned_shutter(scan: Scan, block: int) -> tuple[Shutter, float]:
-    """Returns the shutter of blocks of lines, and how much later than the frame the first of them opens."""
+    """Returns the shutter of blocks of lines, and the delay in s of the first block after the frame's start."""
     shutter, lines = scan.shutter, scan.lines
     line_s = shutter.readout_s / max(lines - 1, 1)
     blocks = lines // block

@@ -14,11 +14,11 @@ from phyradgs_cl.acquisition.trajectory import CircularOrbit, Trajectory, is_par
 
 @dataclass(frozen=True)
 class GeometryCorrection:
-    """Differences from a scan's stated geometry and timing; all 0 is the scan as stated.
+    """Differences from a scan's stated geometry and timing. All zeros leave the scan as stated.
 
-    Offsets move the panel along its own columns and rows. Roll turns it in its plane, tilts about v and u through its
-    middle. Distances move source and panel away from the axis. Times lengthen readout and exposure. turn_rad turns all
-    views about the axis, lift_mm raises them along it: a turned or lowered object explains the frames as well."""
+    Offsets move the panel along its own columns and rows. Roll turns it in its plane; tilts turn it about v and u through
+    its middle. Distances move source and panel away from the axis. Times lengthen readout and exposure. turn_rad turns all
+    views about the axis, and lift_mm raises them along it. A turned or lowered object would explain these two as well."""
 
     offset_u_mm: float = 0.0
     offset_v_mm: float = 0.0
@@ -35,7 +35,8 @@ class GeometryCorrection:
 
 @dataclass(frozen=True, eq=False)
 class Views:
-    """Corrections per view of the file: turns about the axis (F,) in rad, shifts of the panel along v and u (F, 2) in mm."""
+    """Corrections of each view in the file: turns (F,) about the axis in rad; the panel's shifts (F, 2) along v and u in
+    mm."""
 
     turn_rad: np.ndarray
     shift_mm: np.ndarray
@@ -44,7 +45,7 @@ class Views:
 @dataclass(frozen=True, eq=False)
 class Sway:
     """A rigid motion of the object: turns about x, y and z in rad, then shifts along them in mm. Both are cubic splines of
-    time from ``start_s`` to ``end_s`` with coefficients (n, 6), constant before and after."""
+    time with coefficients (n, 6), between ``start_s`` and ``end_s``. They are constant before and after."""
 
     coefficients: np.ndarray
     start_s: float
@@ -52,12 +53,12 @@ class Sway:
 
     @classmethod
     def none(cls, scan: Scan, count: int) -> "Sway":
-        """Returns no motion, by ``count`` splines over the scan."""
+        """Returns a motion of zeros, in ``count`` splines over the scan."""
         starts_s = np.asarray(scan.frame_start_s, np.float64)
         return cls(np.zeros((count, 6)), float(starts_s.min()), float(starts_s.max() + scan.shutter.span_s))
 
     def basis(self, time_s: np.ndarray) -> np.ndarray:
-        """Returns the splines (..., n) at times (...)."""
+        """Returns the values (..., n) of the splines at times (...)."""
         return splines((np.asarray(time_s, np.float64) - self.start_s) / (self.end_s - self.start_s), len(self.coefficients))
 
     def at(self, time_s: np.ndarray) -> np.ndarray:
@@ -67,7 +68,7 @@ class Sway:
 
 
 def splines(fraction: np.ndarray, count: int) -> np.ndarray:
-    """Returns cubic splines (..., count), which sum to 1, at fractions (...) of a time, 0 to 1."""
+    """Returns ``count`` cubic splines (..., count), which sum to 1, at fractions (...) of the whole time, 0 to 1."""
     knots = np.concatenate([np.zeros(3), np.linspace(0, 1, count - 2), np.ones(3)])
     basis: np.ndarray = BSpline.design_matrix(np.clip(np.ravel(fraction), 0, 1), knots, 3).toarray()
     return basis.reshape(*np.shape(fraction), count)
@@ -75,7 +76,7 @@ def splines(fraction: np.ndarray, count: int) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class PerturbedTrajectory:
-    """Poses of ``base`` for a panel of ``shape`` (rows, columns) after a correction of all views. ``views`` then corrects
+    """Poses of ``base`` after a correction of all views, for a panel of ``shape`` (rows, columns). ``views`` then corrects
     single views, or lets the object move."""
 
     base: Trajectory
@@ -90,7 +91,7 @@ class PerturbedTrajectory:
 
     @cached_property
     def _turn(self) -> np.ndarray:
-        """The turned u, v and normal as columns (3, 3), in components along u, v and normal."""
+        """The turned u, v and normal as columns (3, 3), in components along the old u, v and normal."""
         correction = self.correction
         turn: np.ndarray = Rotation.from_rotvec(
             [correction.tilt_u_rad, correction.tilt_v_rad, correction.roll_rad]
@@ -111,13 +112,13 @@ class PerturbedTrajectory:
         return np.concatenate(vectors, -1)
 
     def _with_moved_panel(self, pose: np.ndarray, shift_v_mm: float, shift_u_mm: float) -> list[np.ndarray]:
-        """Returns source (or direction), first pixel, column step and row step (..., 3) after the correction and shifts of
-        one view."""
+        """Returns source (or direction), first pixel, column step and row step, each (..., 3). They include the correction
+        of all views and the panel's shifts in one view."""
         correction = self.correction
         source, first, column, row = np.moveaxis(pose.reshape(*pose.shape[:-1], 4, 3), -2, 0)
         pitch_u_mm, pitch_v_mm = (np.linalg.norm(step, axis=-1, keepdims=True) for step in (column, row))
         u_hat, v_hat = column / pitch_u_mm, row / pitch_v_mm
-        normal = np.cross(u_hat, v_hat)  # towards the source
+        normal = np.cross(u_hat, v_hat)  # it points towards the source
         half_v, half_u = ((n - 1) / 2 for n in self.shape)
         middle = first + half_u * column + half_v * row - correction.detector_distance_mm * normal
         middle = middle + (correction.offset_u_mm + shift_u_mm) * u_hat + (correction.offset_v_mm + shift_v_mm) * v_hat
@@ -131,9 +132,10 @@ class PerturbedTrajectory:
 
 
 def _seen_by(motion: np.ndarray, vectors: list[np.ndarray], places: int) -> list[np.ndarray]:
-    """Returns four vectors (..., 3) as an object sees them that has turned and shifted by ``motion`` (..., 6). The last two
-    are steps; before them one or two are ``places``, which shift."""
-    # an object that turns and shifts sees the scanner shifted back, then turned back
+    """Returns four vectors (..., 3) in the frame of an object that has turned and shifted by ``motion`` (..., 6).
+
+    The last two vectors are steps. Of the two before, the last ``places`` (1 or 2) are points, which a shift moves."""
+    # An object that turns and shifts sees the scanner shifted back, then turned back.
     back = Rotation.from_rotvec(motion[..., :3].reshape(-1, 3)).as_matrix().reshape(*motion.shape[:-1], 3, 3)
     shifted = np.stack(vectors, -2)
     shifted[..., 2 - places : 2, :] -= motion[..., None, 3:]
@@ -141,9 +143,9 @@ def _seen_by(motion: np.ndarray, vectors: list[np.ndarray], places: int) -> list
 
 
 def perturb(scan: Scan, correction: GeometryCorrection, views: Views | Sway | None = None) -> Scan:
-    """Returns the scan after a correction, its frames unchanged.
+    """Returns the scan after a correction. Its frames are unchanged.
 
-    Offsets and distances of a circular orbit stay numbers of its geometry; other corrections make the trajectory a
+    Offsets and distances of a circular orbit remain numbers of its geometry. Others make the trajectory a
     ``PerturbedTrajectory``."""
     shutter, geometry, trajectory = scan.shutter, scan.geometry, scan.trajectory
     source_mm = correction.source_distance_mm
@@ -171,6 +173,6 @@ def perturb(scan: Scan, correction: GeometryCorrection, views: Views | Sway | No
 
 
 def scan_course(scan: Scan) -> np.ndarray:
-    """Returns where in the scan each frame (F,) begins, -1/2 to 1/2."""
+    """Returns where each frame (F,) begins in the scan, from -1/2 for the first to 1/2 for the last."""
     starts_s = np.asarray(scan.frame_start_s, np.float64)
     return np.asarray((starts_s - starts_s.min()) / max(np.ptp(starts_s), 1e-30) - 0.5)

@@ -1,4 +1,4 @@
-"""Fly-scans made of dense scans: integrating while the gantry turns sums what a panel records at rest."""
+"""Makes fly-scans of dense scans: a panel that integrates while the gantry turns sums what it would record at rest."""
 
 import logging
 from dataclasses import replace
@@ -19,13 +19,13 @@ from phyradgs_cl.acquisition.trajectory import (
 from phyradgs_cl.errors import InputError
 
 log = logging.getLogger(__name__)
-_UNEVEN = 0.01  # of the mean interval between frames
+_UNEVEN = 0.01  # intervals between frames may differ by this fraction of their mean
 
 
 def sum_frames(
     scan: Scan, count: int, readout_ratio: float = 0.0, readout: str = "rows", readout_direction: int = 1
 ) -> Scan:
-    """Returns a fly-scan without gaps, each frame of which sums the intensities of ``count`` projections that follow.
+    """Returns a fly-scan without gaps, in which each frame sums the intensities of ``count`` successive projections.
 
     scan: F projections (F, rows, columns); each stands for an interval in s, in which the gantry turns evenly. count: of
     projections in an exposure. readout_ratio, readout, readout_direction: of the new panel, as in ``fly_scan``. A line
@@ -60,7 +60,7 @@ def sum_frames(
 
 
 def _interval_s(scan: Scan) -> tuple[float, float]:
-    """Returns the interval of the projections in s, and when that of the first one begins."""
+    """Returns the interval between projections in s, and the time at which that of the first one begins."""
     remedy = "give a scan whose frames are short, or of a gantry at rest"
     if scan.is_fly and scan.shutter.readout_s > 0:
         raise InputError("scan", f"a readout of {scan.shutter.readout_s:g} s", "a global shutter", remedy)
@@ -74,7 +74,7 @@ def _interval_s(scan: Scan) -> tuple[float, float]:
 
 
 def _continued(scan: Scan, first_s: float, step_s: float) -> tuple[Trajectory, int]:
-    """Returns the poses between the projections, and how many projections at either end lie beyond known poses."""
+    """Returns a trajectory between the projections, and how many projections at either end lie beyond known poses."""
     middle_s = first_s + (np.arange(scan.frames) + 0.5) * step_s
     own_s = scan.frame_start_s + scan.shutter.middle_s
     if isinstance(scan.trajectory, CircularOrbit):
@@ -93,15 +93,15 @@ def _continued(scan: Scan, first_s: float, step_s: float) -> tuple[Trajectory, i
 
 
 def _shares(delay: np.ndarray, count: int) -> np.ndarray:
-    """Returns the share (projections, lines) of each projection in each line's exposure. ``delay`` (lines,): when a line
-    opens, in projections after the frame's start."""
+    """Returns the share (projections, lines) of each projection in each line's exposure. ``delay`` (lines,): the opening of
+    a line after the frame's start, in projections."""
     number = np.arange(int(np.ceil(delay.max() - 1e-9)) + count)[:, None]
     overlap = np.minimum(number + 1, delay + count) - np.maximum(number, delay)
     return np.where(overlap > 1e-9, overlap, 0.0)
 
 
 def _sum(scan: Scan, start: int, share: np.ndarray, readout: Readout) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the line integrals (rows, columns) of one frame, and which pixels a projection has masked."""
+    """Returns the line integrals (rows, columns) of one frame, and the pixels that any of its projections masks."""
     total, is_masked = np.zeros(scan.projections.shape[1:]), np.zeros(scan.projections.shape[1:], bool)
     for number, lines in enumerate(share, start):
         of_lines = np.broadcast_to(readout.spread(lines), total.shape)

@@ -1,7 +1,7 @@
-"""The same frames under another hypothesis: rotation or readout reversed, longer exposure, panel shifted or mirrored.
+"""The same frames under another hypothesis, such as reversed rotation or readout, or a panel shifted or mirrored.
 
-Poses (..., 12) are four vectors: the source (or the direction of parallel rays), the middle of the first pixel, the steps
-to the next column and the next row."""
+A pose (..., 12) is four vectors: the source (or the direction of parallel rays), the middle of the first pixel, the step
+to the next column, and the step to the next row."""
 
 import math
 from collections.abc import Callable
@@ -17,17 +17,19 @@ from phyradgs_cl.acquisition.trajectory import CircularOrbit, Trajectory, is_par
 
 _MIRROR_Y = np.array([1.0, -1.0, 1.0] * 4)
 _FIRST, _COLUMN_STEP, _ROW_STEP = slice(3, 6), slice(6, 9), slice(9, 12)
-_STEPS = _ROW_STEP, _COLUMN_STEP  # by axis: v, u
+_STEPS = _ROW_STEP, _COLUMN_STEP  # index: axis 0 (v), axis 1 (u)
 
 
 @dataclass(frozen=True, eq=False)
 class AlteredTrajectory:
-    """Poses of ``base`` for a ``panel`` of (rows, columns), altered in the order of the fields.
+    """Poses of ``base`` for a ``panel`` (rows, columns), altered in the order of the fields.
 
-    is_reversed: the gantry turns the other way (a mirror image, whose columns run backwards); offset_u_mm of the panel stays
-    on its side. shift_px: the panel moves along u, in its own columns. images: maps poses (..., 12) to those of frames that
-    lie otherwise on the panel; None: as stated. blocks: rows and columns per block of pixels. frames (F,): the frames of
-    ``base`` in use; None: all."""
+    - is_reversed: the gantry turns the other way. This is a mirror image, whose columns run backwards; the panel's
+      offset_u_mm stays on its side.
+    - shift_px: the panel moves along u, in its own columns.
+    - images: maps poses (..., 12) to those of frames that lie otherwise on the panel. None leaves the frames as stated.
+    - blocks: rows and columns in a block of pixels.
+    - frames (F,): the frames of ``base`` in use. None takes all."""
 
     base: Trajectory
     panel: tuple[int, int]
@@ -71,7 +73,7 @@ class AlteredTrajectory:
 
 @dataclass(frozen=True, eq=False)
 class MappedTrajectory:
-    """Poses of ``base`` after ``change``, which maps a frame and its poses (..., 12) to poses."""
+    """Poses of ``base`` mapped by ``change``. It takes a frame number and the frame's poses (..., 12), and returns poses."""
 
     base: Trajectory
     change: Callable[[int, np.ndarray], np.ndarray]
@@ -86,7 +88,7 @@ class MappedTrajectory:
 
 
 def altered_trajectory(scan: Scan) -> AlteredTrajectory:
-    """Returns the scan's trajectory in a form that can be altered."""
+    """Returns the scan's trajectory as an ``AlteredTrajectory``, whose fields can be changed."""
     trajectory = scan.trajectory
     if isinstance(trajectory, AlteredTrajectory):
         return trajectory
@@ -110,12 +112,13 @@ def reversed_readout(scan: Scan) -> Scan:
 
 
 def shifted(scan: Scan, pixels: float) -> Scan:
-    """Returns the scan with its panel moved along u by ``pixels`` of the recorded scan, whatever the binning."""
+    """Returns the scan with its panel moved along u by ``pixels`` of the recorded scan, however the scan is binned."""
     return with_trajectory(scan, shift_px=pixels)
 
 
 def turned(scan: Scan, angle_rad: np.ndarray, speed: float = 1.0) -> Scan:
-    """Returns the scan with frames turned about z by ``angle_rad`` (F,), and the gantry ``speed`` times as fast in them."""
+    """Returns the scan with frames turned about z by ``angle_rad`` (F,). In a frame the gantry is ``speed`` times as
+    fast."""
     first_rad = start_azimuths_rad(scan)
 
     def change(frame: int, pose: np.ndarray) -> np.ndarray:
@@ -127,7 +130,7 @@ def turned(scan: Scan, angle_rad: np.ndarray, speed: float = 1.0) -> Scan:
 
 def stretched(scan: Scan, v: float, u: float) -> Scan:
     """Returns the scan with pixels ``v`` times as high and ``u`` times as wide about the panel's middle. The grid grows with
-    them if it then matches the panel's view better."""
+    the pixels if it then matches the panel's view better."""
     rows, columns = scan.geometry.detector_shape
 
     def change(_: int, pose: np.ndarray) -> np.ndarray:
@@ -137,7 +140,7 @@ def stretched(scan: Scan, v: float, u: float) -> Scan:
         pose[..., _ROW_STEP] *= v
         return pose
 
-    half_mm = columns * scan.geometry.pixel_size_mm[1] / 2 + abs(scan.geometry.detector_offset_mm[1])  # its wider side turns
+    half_mm = columns * scan.geometry.pixel_size_mm[1] / 2 + abs(scan.geometry.detector_offset_mm[1])  # its wider side
     share = max(scan.grid.size_mm[1:]) * scan.geometry.magnification / (2 * u * half_mm)
     grows = abs(math.log(share * u)) < abs(math.log(share))
     z, y, x = scan.grid.voxel_size_mm
@@ -154,8 +157,9 @@ def mirrored(scan: Scan, axis: str) -> Scan:
 
 
 def resized(scan: Scan, factor: float, keeps_axis: bool) -> Scan:
-    """Returns a cone beam's scan with pixels ``factor`` times as large. keeps_axis: the central ray stays at its pixel, as
-    with shorter distances; else the panel's offset stays in mm."""
+    """Returns a cone beam's scan with pixels ``factor`` times as large.
+
+    keeps_axis: the central ray stays at its pixel, as with shorter distances. Otherwise the panel's offset stays in mm."""
     trajectory = altered_trajectory(scan)
     rows, columns = trajectory.panel
 
@@ -175,7 +179,7 @@ def resized(scan: Scan, factor: float, keeps_axis: bool) -> Scan:
 
 
 def _flipped(pose: np.ndarray, axis: int, count: int) -> np.ndarray:
-    """Returns poses (..., 12) of frames whose ``count`` rows (axis 0) or columns (1) run backwards."""
+    """Returns poses (..., 12) of frames whose ``count`` rows (axis 0) or columns (axis 1) run backwards."""
     step = _STEPS[axis]
     pose[..., _FIRST] += (count - 1) * pose[..., step]
     pose[..., step] *= -1

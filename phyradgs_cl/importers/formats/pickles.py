@@ -20,7 +20,7 @@ import numpy as np
 from phyradgs_cl import checks
 from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.acquisition.geometry import ConeGeometry, Geometry, ParallelGeometry, plain_geometry
-from phyradgs_cl.acquisition.toolkits import is_parallel_tigre, poses_of_tigre
+from phyradgs_cl.acquisition.scans_from import is_parallel_tigre, poses_of_tigre
 from phyradgs_cl.acquisition.trajectory import CircularOrbit, PoseTable
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.importers.assemble import Timing, along, assemble_scan, make_timing, table_over_time, turning

@@ -1,4 +1,4 @@
-"""The volume in 3D as a part of the page: voxels of 8 bit in one picture, the Gaussians' centres, and the controls."""
+"""The volume in 3D as a part of the page: 8-bit voxels in one picture, the Gaussians' centres, and the controls."""
 
 import math
 
@@ -14,8 +14,8 @@ MOST_EDGE = 128  # voxels along a side
 MOST_TEXT = 2_000_000  # characters of base64, for voxels and centres together
 MOST_CENTRES = 20_000
 MOST_ZOOM = 8
-_TURN_DEG, _TILT_DEG = 325, 20  # the three marked edges are then in front and on the left
-_PATIENCE_MS = 1500  # for a picture at rest
+_TURN_DEG, _TILT_DEG = 325, 20  # with these angles the three marked edges are in front and on the left
+_PATIENCE_MS = 1500  # time that a picture at rest may take
 _HELP = (
     "Drag to turn; on a touch screen one finger turns and two fingers tilt and zoom. Keys in the picture: arrows turn and "
     "tilt, + and − zoom, Home resets. Ctrl and the wheel zoom. Black and white are those of the slices."
@@ -23,8 +23,9 @@ _HELP = (
 
 
 def space(volume: NDArray[np.floating], grid: Grid, window: Window, gaussians: Gaussians | None) -> Markup | None:
-    """Returns a picture in 3D of a volume (nz, ny, nx), its controls and the data of the script; None for fewer than two
-    voxels along a side. ``window`` is that of the slices of the result; lengths of ``gaussians`` are in mm."""
+    """Returns a 3D picture of a volume (nz, ny, nx), its controls and the data of the script.
+
+    Returns None for fewer than two voxels along a side. ``window``: that of the result's slices. ``gaussians``: in mm."""
     if not has_depth(volume):
         return None
     cloud = None if gaussians is None or not gaussians.count else gaussians
@@ -50,7 +51,7 @@ def space(volume: NDArray[np.floating], grid: Grid, window: Window, gaussians: G
 
 
 def has_depth(volume: NDArray[np.floating]) -> bool:
-    """Whether every side has at least two voxels, so that there is something to show in 3D."""
+    """Returns whether every side has at least two voxels, so that there is something to show in 3D."""
     return min(volume.shape) >= 2
 
 
@@ -99,8 +100,9 @@ def _centres(cloud: Gaussians, grid: Grid) -> dict[str, str]:
 
 
 def _atlas_within(steps: NDArray[np.uint8], most_text: int) -> tuple[str, int]:
-    """Returns the slices of steps (nz, ny, nx) side by side, as PNG in base64, and how many are in a row. Noise that does
-    not shrink loses its lowest bits until the text is short enough."""
+    """Returns the slices of steps (nz, ny, nx) side by side as PNG in base64, and how many are in a row.
+
+    Noise does not shrink; it loses its lowest bits until the text is short enough."""
     nz, ny, nx = steps.shape
     columns = max(1, min(nz, round(math.sqrt(nz * ny / nx))))
     rows = math.ceil(nz / columns)
@@ -116,13 +118,13 @@ def _atlas_within(steps: NDArray[np.uint8], most_text: int) -> tuple[str, int]:
 
 
 def _between(steps: NDArray[np.uint8]) -> int:
-    """Returns the step that best divides steps into two classes: the largest variance between them (Otsu, IEEE Transactions
-    on Systems, Man, and Cybernetics 9 (1979) 62)."""
+    """Returns the step that best divides steps into two classes: that with the largest variance between them (Otsu, IEEE
+    Transactions on Systems, Man, and Cybernetics 9 (1979) 62)."""
     counts = np.bincount(steps.ravel(), minlength=256).astype(np.float64)
     below, sums = np.cumsum(counts), np.cumsum(counts * np.arange(256))
     above = below[-1] - below
     with np.errstate(all="ignore"):
         variance = below * above * (sums / below - (sums[-1] - sums) / above) ** 2
     variance = np.nan_to_num(variance)
-    best = np.flatnonzero(variance >= variance.max() * (1 - 1e-9))  # a run of steps, where none lies between the classes
+    best = np.flatnonzero(variance >= variance.max() * (1 - 1e-9))  # several where no value lies between classes
     return int(np.clip(round(best.mean()) + 1, 1, 255))

@@ -1,8 +1,8 @@
-"""Motion as a part of the page: the lines of a fly-scan's frame at their own poses, and an object that moves, with its
-slices at any time of the scan and arrows of the displacement.
+"""Motion as a part of the page. One picture shows the lines of a fly-scan's frame at their own poses. The other shows an
+object that moves, with its slices at any time of the scan and arrows of the displacement.
 
-Of the object the page has the voxels once, as the picture in 3D has them, and the deformation as control points. Its script
-makes the states: v(y + w(y, t)), trilinear."""
+The page has the object's voxels once, as in the 3D picture, and its deformation as control points. The script makes the
+states: v(y + w(y, t)), trilinear."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,20 +17,20 @@ from phyradgs_cl.report.interactive.viewer import decimals_of, picture, place, s
 from phyradgs_cl.report.markup import Markup, element, joined, json_block, number
 from phyradgs_cl.report.scan_charts import box_corners, with_sources
 
-_TIMES = 49  # at which the scanner's pose is given; the script interpolates
+_TIMES = 49  # times at which the scanner's pose is given; the script interpolates between them
 _MOST_LINES = 64
-_FRAME_STEPS = 500  # of the slider
-_LOOK_DEG = 125  # from the source to the eye, about the axis: behind the panel, and to one side
+_FRAME_STEPS = 500  # steps of the slider
+_LOOK_DEG = 125  # angle about the axis from the source to the eye, which is behind the panel and to one side
 _TILT_DEG = 28
 _FRAME_HELP = (
     "Lines that wait are thin and grey, exposed ones gold, with the rays of the first and the last. A line that has been "
     "read is blue, and stays where the panel was in the middle of its exposure. Drag, or press arrow keys here, to turn."
 )
-MOST_VALUES = 150_000  # of control points; 2 bytes each
+MOST_VALUES = 150_000  # values of control points, with 2 bytes each
 _MOST_TIMES = 2000
-_STEPS = 200  # of the slider of the time
-_MOST_LENGTH = 10  # by which arrows are made longer
-_LARGEST = 32767  # of 16 bits
+_STEPS = 200  # steps of the time's slider
+_MOST_LENGTH = 10  # largest factor by which arrows are made longer
+_LARGEST = 32767  # largest number of 16 bits
 _HELP = (
     "An arrow ends where matter is, and begins where the same matter is in the reference volume; black parts have none. "
     "Play, or arrow keys on the slider of the time, go through the scan. A click in a picture moves the other two slices."
@@ -38,7 +38,7 @@ _HELP = (
 
 
 def frame_in_motion(scan: Scan) -> Markup:
-    """Returns a picture of the first frame of a fly-scan, a slider of its time and the data of the script."""
+    """Returns a picture of the first frame of a fly-scan, a slider of its time, and the data of the script."""
     first_s, last_s = scan.shutter.lit_span_s
     times_s = np.linspace(first_s, last_s, _TIMES)
     poses = with_sources(scan, scan.trajectory.pose(0, scan.frame_start_s[0] + times_s))
@@ -70,7 +70,7 @@ def frame_in_motion(scan: Scan) -> Markup:
 
 
 def _angles_deg(scan: Scan, times_s: np.ndarray) -> list[list[float]] | None:
-    """Returns the gantry's angle at times (T,) within the first frame as (T, 1), or None where it is on no circle."""
+    """Returns the gantry's angle at times (T,) within the first frame, as (T, 1). Returns None for a gantry on no circle."""
     if not isinstance(scan.trajectory, CircularOrbit):
         return None
     return np.rad2deg(scan.trajectory.angle_rad(0, scan.frame_start_s[0] + times_s))[:, None].tolist()
@@ -79,8 +79,9 @@ def _angles_deg(scan: Scan, times_s: np.ndarray) -> list[list[float]] | None:
 def object_in_motion(
     volume: NDArray[np.floating], grid: Grid, window: Window, deformation: Deformation, span_s: tuple[float, float]
 ) -> Markup:
-    """Returns three slices of the object at the first time of ``span_s``, their controls and the data of the script, which
-    shows any time of the span. ``volume`` (nz, ny, nx) is the reference, with at least two voxels along every side."""
+    """Returns three slices of the object at the first time of ``span_s``, their controls and the data of the script.
+
+    The script shows any time of the span. ``volume`` (nz, ny, nx): the reference, at least two voxels thick."""
     means = block_means(volume, MOST_EDGE)
     small = grid.in_shape(triple(means.shape))
     first = deformed(means, small, deformation, deformation.weights_at(span_s[0])[0])
@@ -102,8 +103,8 @@ def object_in_motion(
 
 
 def fitting(deformation: Deformation, grid: Grid) -> Deformation:
-    """Returns the deformation with at most ``MOST_VALUES`` numbers: where it has more, control points at larger distances,
-    at which it stays as it is."""
+    """Returns the deformation with at most ``MOST_VALUES`` numbers. One that has more gets control points at larger
+    distances, where it keeps its values."""
     spacing_mm = float(np.max(deformation.spacing_mm))
     reduced = deformation
     while reduced.control_mm.size > MOST_VALUES and spacing_mm < 2 * max(grid.size_mm):

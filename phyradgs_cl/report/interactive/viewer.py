@@ -1,4 +1,4 @@
-"""The part of a page that shows the slices of a volume, by keyboard, mouse or finger; and pictures without controls."""
+"""Shows the slices of a volume on a page, by keyboard, mouse or finger. Also pictures without controls."""
 
 import math
 from collections.abc import Mapping
@@ -11,7 +11,7 @@ from phyradgs_cl.report.markup import Markup, element, joined, json_block, numbe
 
 _LAYER_NAMES = {"result": "Result", "truth": "Truth", "difference": "Difference"}
 _MOST_ZOOM = 8
-_BAR = 0.3  # of a picture's width, at most
+_BAR = 0.3  # fraction of a picture's width, at most
 _HELP = (
     "Arrow keys, Page Up and Down, Home and End move a slider. The wheel moves the slice under the pointer, with Ctrl the "
     "zoom. A click in a picture, or dragging, moves the other two slices to that point."
@@ -42,7 +42,7 @@ def viewer(planes: list[Plane], windows: Mapping[str, Window]) -> Markup:
 
 
 def slider(name: str, words: str, low: float, high: float, value: float, shown: str, step: float = 1) -> Markup:
-    """Returns a slider with its name and its value in words, which the script keeps."""
+    """Returns a slider with its name and its value in words, which the script updates."""
     control = element(
         "input", type="range", id=name, min=low, max=high, step=step, value=value, aria_describedby=f"{name}-value"
     )
@@ -64,7 +64,7 @@ def _figure(plane: Plane) -> Markup:
 
 
 def stills(planes: list[Plane], of: str, high: float) -> Markup:
-    """Returns pictures without controls, black 0 and white ``high`` in 1/mm or more, and a bar of these values."""
+    """Returns pictures without controls, and a bar of their values. Black is 0, white is ``high`` in 1/mm or more."""
     figures = []
     for plane in planes:
         words = f"{plane.name.capitalize()} slice ({place(plane, plane.middle)})"
@@ -75,8 +75,8 @@ def stills(planes: list[Plane], of: str, high: float) -> Markup:
 
 
 def picture(plane: Plane, of: str, *, canvases: int = 0, has_lines: bool = False) -> Markup:
-    """Returns a slice with the directions at its edges and a scale bar. ``canvases`` for the script lie above it, and lines
-    that cross if ``has_lines``."""
+    """Returns a slice with the directions at its edges and a scale bar. Above it lie ``canvases`` for the script, and
+    crossing lines if ``has_lines``."""
     width_mm, height_mm = plane.size_mm
     image = element(
         "img", src=data_uri(plane.still),
@@ -116,5 +116,5 @@ def _plane_data(plane: Plane) -> dict[str, object]:
 
 
 def decimals_of(step: float) -> int:
-    """Returns the decimals that tell values apart whose distance is ``step``."""
+    """Returns the number of decimals that distinguishes values ``step`` apart."""
     return int(min(20, max(0, math.ceil(-math.log10(step))))) if step > 0 else 0
