@@ -65,7 +65,9 @@ def quality(name: str, protocol: str, with_seconds: bool = False) -> str:
     for label, ignored, known, still in METHODS:
         if label == DEFAULT:
             fly, at_rest = with_prior("ridge", rows[protocol, "FISTA with DCT per-row", "fly-scan"])
-            text.append([label, "–", fly, "–", at_rest, *(["–"] if with_seconds else [])])
+            static = rows.get((protocol, still, "fly-scan"))
+            gain = f"{float(fly.split()[0]) - number(static):+.2f}" if static else "–"
+            text.append([label, both(static), fly, gain, at_rest, *(["–"] if with_seconds else [])])
             continue
         cells = [rows.get((protocol, ignored, "fly-scan")), rows.get((protocol, known, "fly-scan"))]
         if cells[1] is None:
