@@ -23,7 +23,7 @@ _PICTURE = "PNG of slices: result, truth, difference."
 
 
 def evaluate_command(
-    volume: Annotated[Path, file_argument("VOLUME", "Volume file: ours, or mha, nii, nrrd, npy, tiff.")],
+    volume: Annotated[Path, file_argument("VOLUME", "Volume file: ours, or mha, nii, nrrd, npy, tiff, zarr.")],
     reference: Annotated[Path, file_option(_REFERENCE, "--reference")], as_json: AsJson = False,
     reference_voxel_mm: Annotated[Any, option(_VOXEL, "the file's", parser=numbers, metavar="D|Z,Y,X")] = None,
     rtk_reference: Annotated[bool, option(_OF_RTK, True, "--rtk-reference")] = False,

@@ -40,8 +40,8 @@ _STATES = "Number of states, at the middles of equal parts of the time; nii has 
 _DURING = "Time that the states cover, s."
 _PEAK, _BOX = "the volume's own peak", "Z0,Z1,Y0,Y1,X0,X1"
 _LONGEST = 2000
-_OUTPUT = "File to write, or for dicom a new folder; nii.gz is compressed."
-_TO = "nii, mha, nrrd, tiff, npy, dicom (a folder): the voxels; ply, npz: the Gaussians."
+_OUTPUT = "File to write, or for dicom and zarr a new folder; nii.gz is compressed."
+_TO = "nii, mha, nrrd, tiff, npy, zarr and dicom (folders): the voxels; ply, npz: the Gaussians."
 _WATER = "Attenuation of water in 1/mm; the values are then Hounsfield units, with air at 0."
 _HU = "Hounsfield units by the volume's own scale, else fitted to air and water. An output .h5 keeps 1/mm and the scale."
 _AIR = "Box of air for --hu."
@@ -50,7 +50,7 @@ _INSERT = "HU of the second point of --hu, where it is not water."
 
 
 def info_command(
-    file: Annotated[Path, file_argument("FILE", "Scan or volume file, or a volume as mha, nii, nrrd, npy, tiff.")],
+    file: Annotated[Path, file_argument("FILE", "Scan or volume file, or a volume as mha, nii, nrrd, npy, tiff, zarr.")],
     as_json: AsJson = False,
 ) -> None:
     """Print the contents of a scan or volume file."""

@@ -10,6 +10,7 @@ from phyradgs_cl import checks
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.exporters import writers
 from phyradgs_cl.exporters.dicom import DicomLabels, write_dicom
+from phyradgs_cl.exporters.ome_zarr import write_zarr
 from phyradgs_cl.fields import HOUNSFIELD, Deformation, Hounsfield, States
 from phyradgs_cl.fields.hounsfield import Box
 from phyradgs_cl.io import Volume, read_state, read_volume, refuse_overwriting, write_volume
@@ -27,23 +28,27 @@ VOXELS: dict[str, Callable[[Path, Volume, str], None]] = {
     "npy": writers.write_npy,
 }
 CLOUDS = {"ply": writers.write_ply, "npz": writers.write_npz}
-EXPORTS = (*VOXELS, "dicom", *CLOUDS)
+EXPORTS = (*VOXELS, "dicom", *CLOUDS, "zarr")
 OWN = "h5"
 """The format of a volume file that gets a scale of Hounsfield units; its values stay in 1/mm."""
 ScaleOf = Callable[[Volume], Hounsfield | None]
-_SUFFIXES = {"nii": (".nii", ".nii.gz"), "tiff": (".tif", ".tiff"), "dicom": ()}
+_SUFFIXES = {"nii": (".nii", ".nii.gz"), "tiff": (".tif", ".tiff"), "dicom": (), "zarr": (".ome.zarr", ".zarr")}
 
 
 def export_volume(
     path: str | Path, to: str, output: str | Path | None = None, mu_water_per_mm: float | None = None,
     labels: DicomLabels | None = None, scale_of: ScaleOf | None = None,
 ) -> Path:  # fmt: skip
-    """Writes a volume file in another format, whole or not at all, and returns the path of the output. ``to``: one of
-    ``EXPORTS``; ply and npz take the Gaussians, all others the voxels. Or ``OWN``, a volume file with its scale of
-    Hounsfield units. ``output``: a file, or a folder for dicom; None takes the folder of ``path``. ``mu_water_per_mm``:
-    attenuation of water; the values are then Hounsfield units. ``scale_of``: another way to their scale, as ``hu_scale``.
-    ``labels``: patient, study and series, for dicom alone. InputError: an unknown format, a damaged volume or one without
-    Gaussians, a suffix of another format, labels with another format. OutputError: the output cannot be written."""
+    """Writes a volume file in another format, whole or not at all, and returns the path of the output.
+
+    to: one of ``EXPORTS``; ply and npz take the Gaussians, all others the voxels. Or ``OWN``, a volume file with its scale.
+    output: a file, or a folder for dicom and zarr; None takes the folder of ``path``.
+    mu_water_per_mm: attenuation of water; the values are then Hounsfield units.
+    scale_of: another way to the scale of Hounsfield units, as ``hu_scale``.
+    labels: patient, study and series, for dicom alone.
+
+    InputError: an unknown format, a damaged volume or one without Gaussians, a suffix of another format, labels with another
+    format. OutputError: the output cannot be written."""
     target, scale_of = _checked(Path(path), to, output, mu_water_per_mm, labels, scale_of)
     export_stored(read_volume(path), to, target, str(path), scale_of, labels)
     return target
@@ -113,7 +118,7 @@ def export_states(
     a file, or a folder, for each state: NAME_01.SUFFIX and so on. Other arguments and errors are those of
     ``export_volume``; InputError also for a format of Gaussians."""
     if to in (*CLOUDS, OWN):
-        raise InputError("--states", f"with --to {to}", "a format of voxels", "use nii, mha, nrrd, tiff, npy or dicom")
+        raise InputError("--states", f"with --to {to}", "a format of voxels", "use nii, mha, nrrd, tiff, npy, zarr or dicom")
     target, scale_of = _checked(Path(path), to, output, mu_water_per_mm, labels, scale_of)
     volume = read_volume(path)
     grid, scale = volume.required_grid, None if scale_of is None else scale_of(volume)
@@ -151,6 +156,9 @@ def export_stored(
     scale = None if scale_of is None else scale_of(volume)
     if to == OWN:
         _write_own(target, volume, subject, scale)
+        return
+    if to == "zarr":
+        write_zarr(target, volume, scale)
         return
     values, note = _in_unit(volume.values, scale)
     volume = replace(volume, values=values)

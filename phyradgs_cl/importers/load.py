@@ -18,6 +18,7 @@ from phyradgs_cl.importers.options import ImportOptions
 from phyradgs_cl.importers.reading import tiff
 from phyradgs_cl.importers.reading.files import SafeFolder, read_json, read_npy
 from phyradgs_cl.importers.reading.images import image_times_s, read_image_volume
+from phyradgs_cl.importers.reading.ome_zarr import read_zarr
 from phyradgs_cl.io.tables import Fields, read_toml, refuse_unknown
 from phyradgs_cl.io.volume import (
     VALUES,
@@ -192,6 +193,10 @@ def _read_tiff(path: Path) -> Volume:
     return _on_grid(path, values, size_mm[::-1], first_mm, note)
 
 
+def _read_zarr(path: Path) -> Volume:
+    return _on_grid(path, *read_zarr(path))
+
+
 def _on_grid(
     path: Path, values: np.ndarray, size_mm: np.ndarray | None = None, first_mm: np.ndarray | None = None, note: str = ""
 ) -> Volume:
@@ -208,7 +213,7 @@ _READERS: dict[str, tuple[str, Callable[[Path], Volume]]] = {
     **dict.fromkeys((".mha", ".mhd"), ("MetaImage", read_image_volume)),
     **dict.fromkeys((".nii", ".nii.gz"), ("NIfTI", read_image_volume)),
     **dict.fromkeys(tiff.SUFFIXES, ("TIFF", _read_tiff)),
-    **{".nrrd": ("NRRD", read_image_volume), ".npy": ("NumPy", _read_npy)},
+    **{".nrrd": ("NRRD", read_image_volume), ".npy": ("NumPy", _read_npy), ".zarr": ("OME-Zarr", _read_zarr)},
 }
 
 

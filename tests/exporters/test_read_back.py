@@ -4,6 +4,7 @@ import gzip
 import json
 import random
 import re
+import shutil
 
 import nibabel
 import numpy as np
@@ -20,11 +21,16 @@ from phyradgs_cl.io import read_volume
 pytestmark = pytest.mark.slow
 
 NAMES = {"v.mha": "mha", "v.nii": "nii", "v.nii.gz": "nii", "v.nrrd": "nrrd", "v.npy": "npy", "v.tif": "tiff"}
+NAMES["v.ome.zarr"] = "zarr"
 
 
 @pytest.fixture
 def exported(volume_file, tmp_path):
-    return lambda name, **wish: export_volume(volume_file, NAMES[name], tmp_path / name, **wish)
+    def export(name, **wish):
+        shutil.rmtree(tmp_path / name, ignore_errors=True)  # a folder is never replaced
+        return export_volume(volume_file, NAMES[name], tmp_path / name, **wish)
+
+    return export
 
 
 def assert_same(path, stored, atol: float = 0) -> None:
@@ -162,15 +168,18 @@ def test_a_grid_beside_an_array_must_be_its_own(exported) -> None:
 @pytest.mark.parametrize("name", NAMES)
 def test_random_damage_is_a_volume_or_one_line(exported, name) -> None:
     path, rng = exported(name), random.Random(len(name))
-    good, refused = path.read_bytes(), 0
-    for _ in range(60):
-        data = bytearray(good)
+    files = sorted(one for one in path.rglob("*") if one.is_file()) or [path]  # an OME-Zarr is a folder
+    good, refused = {one: one.read_bytes() for one in files}, 0
+    for turn in range(60):
+        file = files[turn % len(files)]
+        data = bytearray(good[file])
         for _ in range(rng.choice((1, 2, 8))):
             data[rng.randrange(min(len(data), 600))] = rng.randrange(256)
-        path.write_bytes(data[: rng.choice((len(data), rng.randrange(len(data))))])
+        file.write_bytes(data[: rng.choice((len(data), rng.randrange(len(data))))])
         try:
             load_volume(path)
         except InputError as error:
             refused += 1
             assert "\n" not in str(error)
+        file.write_bytes(good[file])
     assert refused > 20
