@@ -9,7 +9,8 @@ from contextlib import contextmanager
 from phyradgs_cl.text import plain_text
 
 _OPTION = re.compile(r"(?<!\w)'[^']*'|--set |(?<![\w-])--([a-z][a-z-]*)")  # quoted commands and values stay
-_OTHER_NAMES = {"with": "others", "readout": "readout_axis"}  # options whose argument has another name
+_OTHER_NAMES = {"with": "others", "readout": "readout_axis", "air-mm": "air", "water-mm": "water", "hu": "hounsfield"}
+"""Options whose argument has another name."""
 
 
 class PhyradgsError(Exception):

@@ -15,6 +15,7 @@ from phyradgs_cl.errors import InputError, PhyradgsError
 from phyradgs_cl.importers import load_volume
 from phyradgs_cl.io import read_deformation, sha256_of
 from phyradgs_cl.io.tables import read_toml
+from phyradgs_cl.io.volume import attenuation_of, words_of_hu
 from phyradgs_cl.parallel import Communicator
 from phyradgs_cl.removed import refuse_removed
 from phyradgs_cl.runtime import Runtime, bytes_of
@@ -36,13 +37,17 @@ class Settings:
     device: str | None = None
     memory: int | None = None
 
-    def plan(self, initial: Path | None = None, object_motion: Path | None = None) -> methods.RunPlan:
+    def plan(
+        self, initial: Path | None = None, object_motion: Path | None = None, mu_water_per_mm: float | None = None
+    ) -> methods.RunPlan:
         """Returns the checked plan of a run that starts from the volume file ``initial``, if any, of an object that moves as
-        the file ``object_motion`` says, if any."""
+        the file ``object_motion`` says, if any. ``mu_water_per_mm``: of a first volume in Hounsfield units."""
+        if mu_water_per_mm is not None and initial is None:
+            raise InputError("--mu-water-per-mm", "given without --initial", "a first volume in Hounsfield units")
         values = dict(self.values)
         method, preset = (self._word(values, name) for name in ("method", "preset"))
         run = {
-            "seed": values.pop("seed", 0), "initial": None if initial is None else _initial_volume(initial),
+            "seed": values.pop("seed", 0), "initial": None if initial is None else _initial_volume(initial, mu_water_per_mm),
             "object_motion": None if object_motion is None else _object_motion(object_motion),
         }  # fmt: skip
         # an option of the command line means what --help says, whatever the method calls its own
@@ -103,11 +108,13 @@ def read_settings(
     return Settings(values, origins, config, device, memory)
 
 
-def _initial_volume(path: Path) -> methods.InitialVolume:
-    volume = load_volume(path)
+def _initial_volume(path: Path, mu_water_per_mm: float | None) -> methods.InitialVolume:
+    volume = attenuation_of(str(path), load_volume(path, mu_water_per_mm))
     if volume.grid is None:
         raise InputError("--initial", f"{path}, values without voxel sizes", "a volume with its grid in mm")
     facts = {"initial": str(path), "initial_sha256": sha256_of(path)}
+    if converted := words_of_hu({path: volume}, mu_water_per_mm):
+        facts["initial_converted"] = converted.removeprefix(", ")
     return methods.InitialVolume(volume.values, volume.grid, facts)
 
 

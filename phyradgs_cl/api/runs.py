@@ -13,7 +13,7 @@ from phyradgs_cl import __version__, checks
 from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.api.operators import Device, runtime_of
 from phyradgs_cl.errors import InputError, naming_arguments
-from phyradgs_cl.exporters import export_stored, foreign_suffix, format_of
+from phyradgs_cl.exporters import CLOUDS, export_stored, foreign_suffix, format_of
 from phyradgs_cl.fields import Deformation, Grid
 from phyradgs_cl.importers import foreign_volume, load_attenuation, load_beads
 from phyradgs_cl.importers import load_volume as load_voxels
@@ -26,6 +26,7 @@ from phyradgs_cl.io import (
     write_scan,
     write_volume,
 )
+from phyradgs_cl.io.volume import attenuation_of, words_of_hu
 from phyradgs_cl.phantoms import PHANTOMS
 from phyradgs_cl.prepare import DEFAULT_STEPS
 from phyradgs_cl.prepare.light import read_corrected
@@ -59,18 +60,23 @@ def save_scan(path: str | Path, scan: Scan) -> None:
     write_scan(_checked_path(path), scan)
 
 
-def load_volume(path: str | Path) -> Reconstruction:
+@naming_arguments()
+def load_volume(path: str | Path, mu_water_per_mm: float | None = None) -> Reconstruction:
     """Reads a volume file: volume (nz, ny, nx) in 1/mm, grid, Gaussians, record, facts, state, deformation, states.
 
     Only an interrupted run has a state.
-    path: the HDF5 file, or a file of ``phyradgs export`` (docs/export.md), which has a volume and a grid only. Raises
-    InputError, which names the HDF5 path of the wrong value."""
+    path: the HDF5 file, or a file of ``phyradgs export`` (docs/export.md), which has a volume and a grid only.
+    mu_water_per_mm: attenuation of water, of such a file in Hounsfield units that does not state its scale. Raises
+    InputError, which names the HDF5 path of the wrong value, also for Hounsfield units without a scale."""
     file = _checked_path(path)
     if foreign_volume(file) is not None:
-        volume = load_voxels(file)
+        volume = attenuation_of(str(file), load_voxels(file, mu_water_per_mm))
         if volume.grid is None:
             raise InputError(str(file), "values without voxel sizes", "a volume with its grid in mm")
-        return Reconstruction(volume.values, volume.grid)
+        words_of_hu({file: volume}, mu_water_per_mm)
+        return Reconstruction(volume.values, volume.grid, facts=volume.provenance)
+    if mu_water_per_mm is not None:
+        raise InputError("--mu-water-per-mm", f"given for {file}, which is in 1/mm", "a file in Hounsfield units")
     stored = read_volume(file)
     facts = dict(stored.provenance)
     record: Any = facts.pop("record", [])
@@ -99,25 +105,31 @@ def save_deformation(path: str | Path, deformation: Deformation) -> None:
 
 @naming_arguments()
 def save_volume(
-    path: str | Path, result: Reconstruction, metrics: Mapping[str, object] | None = None
+    path: str | Path, result: Reconstruction, metrics: Mapping[str, object] | None = None, hu: bool = False
 ) -> None:
     """Writes a complete volume file, or nothing: volume (nz, ny, nx) in 1/mm, lengths in mm.
 
     path: the HDF5 file; an existing one is replaced. A suffix of ``phyradgs export`` (.nii, .mha, .nrrd, .tif, .npy; .ply
     and .npz of the Gaussians) writes that format, which holds the volume or the Gaussians only. result: what
     ``reconstruct`` returns; the file of an interrupted run can be resumed. metrics: the result of ``compare``, stored too.
-    Raises InputError for anything but a result, and for a suffix that cannot be written; OutputError where nothing can be
-    written."""
+    hu: another format holds Hounsfield units, by the scale of ``Reconstruction.hounsfield``; a volume file keeps 1/mm and
+    the scale.
+    Raises InputError for anything but a result, a suffix that cannot be written, and ``hu`` without a scale; OutputError
+    where nothing can be written."""
     if not isinstance(result, Reconstruction):
         remedy = "for an array, Reconstruction(volume, grid)"
         raise InputError("result", checks.short_repr(result), "a Reconstruction", remedy)
     file = _checked_path(path)
+    if hu and result.scale is None:
+        raise InputError("hu", "a result without a scale", "one", "result.hounsfield(air, water) fits one")
     if foreign_suffix(file) is not None:
         checks.finite("volume", result.volume)
         if metrics is not None:
             raise InputError("metrics", f"some for {file.name}", "a file that has a place for them, as volume.h5")
-        stored = Volume(result.volume, result.grid, {}, result.gaussians)
-        export_stored(stored, format_of(file, "path"), file, "result")
+        stored, form = Volume(result.volume, result.grid, {}, result.gaussians), format_of(file, "path")
+        if hu and form in CLOUDS:
+            raise InputError("hu", f"given for {file.name}", "voxels", "Gaussians stay in 1/mm")
+        export_stored(stored, form, file, "result", (lambda _: result.scale) if hu else None)
         return
     facts = {**result.facts, "program": f"phyradgs-cl {__version__}", "record": result.record}
     moves = result.deformation, result.states

@@ -17,17 +17,17 @@ _REFERENCE = (
 )
 _VOXEL = "Sides of the voxels of a reference without a scale, mm; it is centred on the axis."
 _OF_RTK = "The reference is a volume of RTK, whose axis of rotation is y."
-_WATER = "Attenuation of water in 1/mm, near 0.02: REFERENCE is in Hounsfield units."
+_WATER = "Attenuation of water in 1/mm, near 0.02, for a file in Hounsfield units that does not state its scale."
 _MOTION = "Deformation of the object: VOLUME is compared with the truth of every state."
 _PICTURE = "PNG of slices: result, truth, difference."
 
 
 def evaluate_command(
-    volume: Annotated[Path, file_argument("VOLUME", "Volume file: ours, or mha, nii, nrrd, npy, tiff.")],
+    volume: Annotated[Path, file_argument("VOLUME", "Volume file: ours, or mha, nii, nrrd, npy, tiff, zarr.")],
     reference: Annotated[Path, file_option(_REFERENCE, "--reference")], as_json: AsJson = False,
     reference_voxel_mm: Annotated[Any, option(_VOXEL, "the file's", parser=numbers, metavar="D|Z,Y,X")] = None,
     rtk_reference: Annotated[bool, option(_OF_RTK, True, "--rtk-reference")] = False,
-    mu_water_per_mm: Annotated[float | None, option(_WATER, "1/mm", "--mu-water-per-mm")] = None,
+    mu_water_per_mm: Annotated[float | None, option(_WATER, "the file's", "--mu-water-per-mm")] = None,
     object_motion: Annotated[Path | None, file_option(_MOTION, "--object-motion")] = None,
     picture: Annotated[Path | None, file_option(_PICTURE, "--picture", default="v.evaluated.png for v.h5")] = None,
 ) -> None:

@@ -5,27 +5,32 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from phyradgs_cl.commands.console import AsJson, file_argument, file_option, option, pair_of, say
+from phyradgs_cl.commands.options import numbers
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.exporters import (
     CLOUDS,
     EXPORTS,
+    OWN,
     DicomLabels,
     export_states,
     export_volume,
     format_of,
+    hu_scale,
     state_times_s,
 )
-from phyradgs_cl.io import holds_deformation, read_deformation, read_states
+from phyradgs_cl.fields import Hounsfield
+from phyradgs_cl.io import Volume, holds_deformation, read_deformation, read_states
 from phyradgs_cl.signals import finish_despite_interrupt
 from phyradgs_cl.workflow.files import expecting, summary
 
 EXAMPLES = {
     "info": "Example: phyradgs info scan.h5",
-    "export": "Example: phyradgs export volume.h5 -o volume.nii --mu-water-per-mm 0.0195",
+    "export": "Example: phyradgs export volume.h5 -o volume.nii --hu",
 }
 GROUPS = {
     "export": {
-        "Basics": ("output", "to", "mu_water_per_mm"),
+        "Basics": ("output", "to"),
+        "Hounsfield units": ("hu", "air_mm", "water_mm", "insert_hu", "mu_water_per_mm"),
         "Objects that move": ("object_motion", "states", "during"),
         "DICOM": ("patient", "title", "description", "date")
     }
@@ -33,14 +38,19 @@ GROUPS = {
 _MOTION = "Deformation of the object: the volume is written at several states."
 _STATES = "Number of states, at the middles of equal parts of the time; nii has them in one file."
 _DURING = "Time that the states cover, s."
+_PEAK, _BOX = "the volume's own peak", "Z0,Z1,Y0,Y1,X0,X1"
 _LONGEST = 2000
-_OUTPUT = "File to write, or for dicom a new folder; nii.gz is compressed."
-_TO = "nii, mha, nrrd, tiff, npy, dicom (a folder): the voxels; ply, npz: the Gaussians."
-_WATER = "Attenuation of water in 1/mm; the values are then Hounsfield units."
+_OUTPUT = "File to write, or for dicom and zarr a new folder; nii.gz is compressed."
+_TO = "nii, mha, nrrd, tiff, npy, zarr and dicom (folders): the voxels; ply, npz: the Gaussians."
+_WATER = "Attenuation of water in 1/mm; the values are then Hounsfield units, with air at 0."
+_HU = "Hounsfield units by the volume's own scale, else fitted to air and water. An output .h5 keeps 1/mm and the scale."
+_AIR = "Box of air for --hu."
+_WATER_BOX = "Box of water, or of the insert, for --hu."
+_INSERT = "HU of the second point of --hu, where it is not water."
 
 
 def info_command(
-    file: Annotated[Path, file_argument("FILE", "Scan or volume file, or a volume as mha, nii, nrrd, npy, tiff.")],
+    file: Annotated[Path, file_argument("FILE", "Scan or volume file, or a volume as mha, nii, nrrd, npy, tiff, zarr.")],
     as_json: AsJson = False,
 ) -> None:
     """Print the contents of a scan or volume file."""
@@ -59,6 +69,10 @@ def export_command(
         Path | None, file_option(_OUTPUT, "--output", "-o", default="VOLUME with the format's suffix")
     ] = None,
     to: Annotated[Literal[EXPORTS] | None, option(_TO, "by the output's suffix", "--to")] = None,  # type: ignore[valid-type]
+    hu: Annotated[bool, option(_HU, True, "--hu")] = False,
+    air_mm: Annotated[Any, option(_AIR, _PEAK, parser=numbers, metavar=_BOX)] = None,
+    water_mm: Annotated[Any, option(_WATER_BOX, _PEAK, parser=numbers, metavar=_BOX)] = None,
+    insert_hu: Annotated[float, option(_INSERT)] = 0.0,
     mu_water_per_mm: Annotated[float | None, option(_WATER, "none: values in 1/mm")] = None,
     object_motion: Annotated[Path | None, file_option(_MOTION, "--object-motion")] = None,
     states: Annotated[int | None, option(_STATES, "10")] = None,
@@ -76,9 +90,19 @@ def export_command(
     """Export a volume, upright and to scale, for 3D Slicer, ITK-SNAP, ImageJ, napari and others."""
     form, labels = to or format_of(output), DicomLabels(patient, title, description, date)
     moves = object_motion is not None or states is not None or during is not None
+    scales: list[Hounsfield | None] = []
+    for name, value in (("--air-mm", air_mm), ("--water-mm", water_mm), ("--insert-hu", insert_hu or None)):
+        if value is not None and not hu:
+            raise InputError(name, "given without --hu", "both, or neither", "add --hu")
+
+    def scale_of(stored: Volume) -> Hounsfield | None:
+        scales.append(hu_scale(stored, air_mm, water_mm, insert_hu))
+        return scales[-1]
+
+    scaling = scale_of if hu else None
     with finish_despite_interrupt(), expecting(volume, "volume"):
         if not moves:
-            written: object = export_volume(volume, form, output, mu_water_per_mm, labels)
+            written: object = export_volume(volume, form, output, mu_water_per_mm, labels, scaling)
         else:
             has_field = object_motion is not None or holds_deformation(volume)
             field = read_deformation(object_motion or volume) if has_field else None
@@ -86,11 +110,14 @@ def export_command(
                 expected = "--object-motion FILE with it, or a volume of --method moving or changing"
                 raise InputError("--during" if states is None else "--states", "no motion", expected)
             times_s = state_times_s(motion, 10 if states is None else states, during)
-            paths = export_states(volume, field, times_s, form, output, mu_water_per_mm, labels)
+            paths = export_states(volume, field, times_s, form, output, mu_water_per_mm, labels, scaling)
             written = paths[0] if len(paths) == 1 else f"{paths[0]} … {paths[-1]}"
-    unit = "" if form in CLOUDS else ", HU" if mu_water_per_mm is not None else ", 1/mm"
+    is_hu = form != OWN and (hu or mu_water_per_mm is not None)
+    unit = "" if form in CLOUDS else ", HU" if is_hu else ", 1/mm"
     moving = "" if not moves else f", {len(times_s)} states from {times_s[0]:.4g} to {times_s[-1]:.4g} s"
     say(f"{written}: {form}{unit}{moving}")
+    if scales and scales[0] is not None:
+        say(f"Hounsfield units: {scales[0].line}")
 
 
 def _short(value: Any, is_inside: bool = False) -> str:

@@ -78,7 +78,7 @@ _MARGIN = "Width around the box, mm, that is reconstructed and discarded: for ob
 # heading of the help: names of parameters; a command shows those that it has
 RUN_GROUPS = {
     "Basics": ("output", "method", "motion", "size", "iterations"),
-    "Volume": ("voxel_mm", "roi_mm", "margin_mm", "initial", "rows", "slab"),
+    "Volume": ("voxel_mm", "roi_mm", "margin_mm", "initial", "mu_water_per_mm", "rows", "slab"),
     "Motion": ("object_motion", "strips", "sub_intervals", "segments", "time_error", "detector_model"),
     "Quality": (
         *("prior", "preset", "assignments", "holdout", "steps", "ignore_lag", "gaussians", "seed"),

@@ -43,6 +43,7 @@ EXAMPLES = {
 GROUPS = {"reconstruct": RUN_GROUPS, "estimate": RUN_GROUPS}
 _ROWS = "Detector rows of a parallel scan to read and reconstruct; row 0 is the lowest."
 _SLAB = "Rows of a parallel scan at a time: slabs, kept on disk as they are done."
+_WATER = "Attenuation of water in 1/mm, for --initial in Hounsfield units that does not state its scale."
 _LIVE = "HTML page of the run, written again every five seconds; after the run it is the report."
 _PREVIEW = "PNG of the three middle slices; during the run NAME.partial.png, every five seconds."
 
@@ -51,6 +52,7 @@ _PREVIEW = "PNG of the three middle slices; during the run NAME.partial.png, eve
 def reconstruct_command(
     scan: Scan, output: Output, settings: Settings,
     initial: Annotated[Path | None, file_option("Volume to start from.", "--initial")] = None,
+    mu_water_per_mm: Annotated[float | None, option(_WATER, "the file's")] = None,
     object_motion: ObjectMotion = None,
     resume: Annotated[bool, option("Continue an interrupted run from its checkpoint.", True, "--resume")] = False,
     checkpoint_every: CheckpointEvery = CHECKPOINT_EVERY_S,
@@ -61,7 +63,7 @@ def reconstruct_command(
     slab: Annotated[int, option(_SLAB, "as memory allows", metavar="ROWS", min=0)] = 0,
 ) -> None:
     """Reconstruct a scan into a volume; print PSNR and SSIM if the scan carries the truth. Defaults are those of fista."""
-    plan, ranks = settings.plan(initial, object_motion), launched_ranks()
+    plan, ranks = settings.plan(initial, object_motion, mu_water_per_mm), launched_ranks()
     ticker, runtimes = Ticker("iteration"), list[Runtime]()
 
     def stage(text: str) -> None:
@@ -108,6 +110,8 @@ def reconstruct_command(
     how = f"{method}{result.early_stop}, {result.facts['seconds']:.1f} s ({used_s:.1f} s of processor time)"
     compared = f" ({result.facts[COMPARED]})" if COMPARED in result.facts else ""
     say(f"{written}: {how}{scores(metrics)}{compared}")
+    if plan.initial is not None and "initial_converted" in plan.initial.facts:
+        say(f"first volume: {plan.initial.facts['initial_converted']}")
     if MOTION_FOUND in result.facts and result.state is None:
         say(motion_line(result.facts[MOTION_FOUND]))
     if result.states is not None and result.state is None:

@@ -10,12 +10,14 @@ from phyradgs_cl import checks
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.exporters import writers
 from phyradgs_cl.exporters.dicom import DicomLabels, write_dicom
-from phyradgs_cl.fields import Deformation, States
-from phyradgs_cl.io import Volume, read_volume, refuse_overwriting
+from phyradgs_cl.exporters.ome_zarr import write_zarr
+from phyradgs_cl.fields import HOUNSFIELD, Deformation, Hounsfield, States
+from phyradgs_cl.fields.hounsfield import Box
+from phyradgs_cl.io import Volume, read_state, read_volume, refuse_overwriting, write_volume
 
 __all__ = [
-    "CLOUDS", "EXPORTS", "DicomLabels", "default_output", "export_states", "export_stored", "export_volume",
-    "foreign_suffix", "format_of", "state_times_s",
+    "CLOUDS", "EXPORTS", "OWN", "DicomLabels", "default_output", "export_states", "export_stored", "export_volume",
+    "foreign_suffix", "format_of", "hu_scale", "state_times_s",
 ]  # fmt: skip
 
 VOXELS: dict[str, Callable[[Path, Volume, str], None]] = {
@@ -26,45 +28,69 @@ VOXELS: dict[str, Callable[[Path, Volume, str], None]] = {
     "npy": writers.write_npy,
 }
 CLOUDS = {"ply": writers.write_ply, "npz": writers.write_npz}
-EXPORTS = (*VOXELS, "dicom", *CLOUDS)
-_SUFFIXES = {"nii": (".nii", ".nii.gz"), "tiff": (".tif", ".tiff"), "dicom": ()}
+EXPORTS = (*VOXELS, "dicom", *CLOUDS, "zarr")
+OWN = "h5"
+"""The format of a volume file that gets a scale of Hounsfield units; its values stay in 1/mm."""
+ScaleOf = Callable[[Volume], Hounsfield | None]
+_SUFFIXES = {"nii": (".nii", ".nii.gz"), "tiff": (".tif", ".tiff"), "dicom": (), "zarr": (".ome.zarr", ".zarr")}
 
 
 def export_volume(
     path: str | Path, to: str, output: str | Path | None = None, mu_water_per_mm: float | None = None,
-    labels: DicomLabels | None = None,
+    labels: DicomLabels | None = None, scale_of: ScaleOf | None = None,
 ) -> Path:  # fmt: skip
-    """Writes a volume file in another format, whole or not at all, and returns the path of the output. ``to``: one of
-    ``EXPORTS``; ply and npz take the Gaussians, all others the voxels. ``output``: a file, or a folder for dicom; None takes
-    the folder of ``path``. ``mu_water_per_mm``: attenuation of water; the values are then Hounsfield units. ``labels``:
-    patient, study and series, for dicom alone. InputError: an unknown format, a damaged volume or one without Gaussians, a
-    suffix of another format, labels with another format. OutputError: the output cannot be written."""
-    target = _checked_target(Path(path), to, output, mu_water_per_mm, labels)
-    export_stored(read_volume(path), to, target, str(path), mu_water_per_mm, labels)
+    """Writes a volume file in another format, whole or not at all, and returns the path of the output.
+
+    to: one of ``EXPORTS``; ply and npz take the Gaussians, all others the voxels. Or ``OWN``, a volume file with its scale.
+    output: a file, or a folder for dicom and zarr; None takes the folder of ``path``.
+    mu_water_per_mm: attenuation of water; the values are then Hounsfield units.
+    scale_of: another way to the scale of Hounsfield units, as ``hu_scale``.
+    labels: patient, study and series, for dicom alone.
+
+    InputError: an unknown format, a damaged volume or one without Gaussians, a suffix of another format, labels with another
+    format. OutputError: the output cannot be written."""
+    target, scale_of = _checked(Path(path), to, output, mu_water_per_mm, labels, scale_of)
+    export_stored(read_volume(path), to, target, str(path), scale_of, labels)
     return target
 
 
-def _checked_target(
-    path: Path, to: str, output: str | Path | None, mu_water_per_mm: float | None, labels: DicomLabels | None
-) -> Path:
-    """Returns the path to write; InputError for options that do not fit the format."""
-    checks.one_of("--to", to, EXPORTS)
+def hu_scale(volume: Volume, air: Box | None = None, water: Box | None = None, insert_hu: float = 0.0) -> Hounsfield | None:
+    """Returns the scale that a volume holds, where neither a box nor an insert is given, else fits one."""
+    if (stored := volume.scale) is not None and air is None and water is None and insert_hu == 0:
+        return replace(stored, fitted=f"{stored.line}, as stored")
+    return volume.hounsfield(air, water, insert_hu).scale
+
+
+def _checked(
+    path: Path, to: str, output: str | Path | None, mu_water_per_mm: float | None, labels: DicomLabels | None,
+    scale_of: ScaleOf | None,
+) -> tuple[Path, ScaleOf | None]:  # fmt: skip
+    """Returns the path to write and the way to the scale; InputError for options that do not fit the format."""
+    checks.one_of("--to", to, (*EXPORTS, OWN))
+    if mu_water_per_mm is not None and scale_of is not None:
+        raise InputError("--mu-water-per-mm", "given with --hu", "one of the two", "leave one out")
+    if mu_water_per_mm is not None:
+        stated = Hounsfield(mu_water_per_mm)
+        scale_of = lambda _: stated  # noqa: E731
+    if to == OWN and scale_of is None:
+        raise InputError("--hu", f"not given for {output}", "another format, or a scale to store", "add --hu")
     target = default_output(path, to) if output is None else Path(output)
     suffixes = _suffixes(to)  # programs go by the suffix
     if suffixes and not target.name.lower().endswith(suffixes):
         raise InputError(f"output of --to {to}", str(target), f"a name that ends in {' or '.join(suffixes)}")
     refuse_overwriting("output", target, path)
-    if to in CLOUDS and mu_water_per_mm is not None:
-        raise InputError("--mu-water-per-mm", f"with --to {to}", "voxels", "Gaussians stay in 1/mm")
+    if to in CLOUDS and scale_of is not None:
+        option = "--hu" if mu_water_per_mm is None else "--mu-water-per-mm"
+        raise InputError(option, f"with --to {to}", "voxels", "Gaussians stay in 1/mm")
     if to != "dicom" and labels is not None and labels.given:
         raise InputError(f"--{next(iter(labels.given))}", f"with --to {to}", "--to dicom", "leave it out")
-    return target
+    return target, scale_of
 
 
-def _in_unit(values: np.ndarray, mu_water_per_mm: float | None) -> tuple[np.ndarray, str]:
-    """Returns values (z, y, x) in 1/mm, or in Hounsfield units where water's attenuation is given, and the unit."""
+def _in_unit(values: np.ndarray, scale: Hounsfield | None) -> tuple[np.ndarray, str]:
+    """Returns values (z, y, x) in 1/mm, or in Hounsfield units where there is a scale, and a note of that."""
     plain = np.ascontiguousarray(values, np.float32)
-    return (plain, "1/mm") if mu_water_per_mm is None else (writers.hounsfield(plain, mu_water_per_mm), "HU")
+    return (plain, "values in 1/mm") if scale is None else (scale.of(plain), scale.note)
 
 
 def state_times_s(moves: Deformation | States, count: int, during_s: tuple[float, float] | None = None) -> list[float]:
@@ -85,15 +111,17 @@ def state_times_s(moves: Deformation | States, count: int, during_s: tuple[float
 def export_states(
     path: str | Path, deformation: Deformation | None, times_s: Sequence[float], to: str,
     output: str | Path | None = None, mu_water_per_mm: float | None = None, labels: DicomLabels | None = None,
+    scale_of: ScaleOf | None = None,
 ) -> list[Path]:  # fmt: skip
     """Writes the object of a volume file at each of evenly spaced times, and returns the paths. ``deformation``: how it
     moves; None where the file holds its states. NIfTI holds all states in one file of four dimensions. The other formats get
     a file, or a folder, for each state: NAME_01.SUFFIX and so on. Other arguments and errors are those of
     ``export_volume``; InputError also for a format of Gaussians."""
-    if to in CLOUDS:
-        raise InputError("--states", f"with --to {to}", "a format of voxels", "use nii, mha, nrrd, tiff, npy or dicom")
-    target, volume = _checked_target(Path(path), to, output, mu_water_per_mm, labels), read_volume(path)
-    grid = volume.required_grid
+    if to in (*CLOUDS, OWN):
+        raise InputError("--states", f"with --to {to}", "a format of voxels", "use nii, mha, nrrd, tiff, npy, zarr or dicom")
+    target, scale_of = _checked(Path(path), to, output, mu_water_per_mm, labels, scale_of)
+    volume = read_volume(path)
+    grid, scale = volume.required_grid, None if scale_of is None else scale_of(volume)
     if deformation is not None:
         moves = any(deformation.on_grid_mm(grid, unit).any() for unit in np.eye(deformation.rank))
         if deformation.control_mm.any() and not moves:
@@ -102,7 +130,7 @@ def export_states(
         volume = volume.moved_by(deformation, str(path))
     states = [replace(volume, values=volume.at(time_s)) for time_s in times_s]
     if to == "nii":
-        values = [_in_unit(state.values, mu_water_per_mm) for state in states]
+        values = [_in_unit(state.values, scale) for state in states]
         stack = [replace(volume, values=value) for value, _ in values]
         writers.write_image(target, stack[0], values[0][1], times_s, stack)
         return [target]
@@ -111,12 +139,12 @@ def export_states(
     numbers = range(1, len(states) + 1)
     targets = [target.with_name(f"{stem}_{number:0{digits}d}{target.name[len(stem) :]}") for number in numbers]
     for state, one in zip(states, targets, strict=True):
-        export_stored(state, to, one, str(path), mu_water_per_mm, labels)
+        export_stored(state, to, one, str(path), None if scale is None else lambda _: scale, labels)
     return targets
 
 
 def export_stored(
-    volume: Volume, to: str, target: Path, subject: str, mu_water_per_mm: float | None = None,
+    volume: Volume, to: str, target: Path, subject: str, scale_of: ScaleOf | None = None,
     labels: DicomLabels | None = None,
 ) -> None:  # fmt: skip
     """Writes a volume as ``export_volume`` does; ``subject`` names it in messages."""
@@ -125,12 +153,26 @@ def export_stored(
         return
     if volume.grid is None:
         raise InputError(subject, "values without voxel sizes", "a volume with its grid", "see 'phyradgs info'")
-    values, unit = _in_unit(volume.values, mu_water_per_mm)
+    scale = None if scale_of is None else scale_of(volume)
+    if to == OWN:
+        _write_own(target, volume, subject, scale)
+        return
+    if to == "zarr":
+        write_zarr(target, volume, scale)
+        return
+    values, note = _in_unit(volume.values, scale)
     volume = replace(volume, values=values)
     if to == "dicom":
-        write_dicom(target, volume, unit, labels or DicomLabels())
+        write_dicom(target, volume, note, labels or DicomLabels())
     else:
-        VOXELS[to](target, volume, unit)
+        VOXELS[to](target, volume, note)
+
+
+def _write_own(target: Path, volume: Volume, path: str, scale: Hounsfield | None) -> None:
+    """Writes all that the volume file ``path`` holds to another one, with the scale."""
+    facts = volume.provenance if scale is None else {**volume.provenance, HOUNSFIELD: scale.facts()}
+    parts = volume.gaussians, volume.metrics, read_state(path), volume.deformation, volume.states
+    write_volume(target, volume.values, volume.required_grid, facts, *parts)
 
 
 def foreign_suffix(output: str | Path) -> str | None:
@@ -146,7 +188,7 @@ def default_output(path: Path, to: str) -> Path:
 
 def format_of(output: str | Path | None, subject: str = "--to") -> str:
     """Returns the one of ``EXPORTS`` that the suffix of an output means; InputError, with the suffixes, for any other."""
-    for to in EXPORTS:
+    for to in (*EXPORTS, OWN):
         if output is not None and _suffixes(to) and Path(output).name.lower().endswith(_suffixes(to)):
             return to
     suffixes = ", ".join(suffix for to in EXPORTS for suffix in _suffixes(to))

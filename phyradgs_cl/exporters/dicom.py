@@ -15,6 +15,7 @@ import numpy as np
 from phyradgs_cl import checks
 from phyradgs_cl.errors import InputError, OutputError
 from phyradgs_cl.fields import Grid
+from phyradgs_cl.fields.hounsfield import of_note
 from phyradgs_cl.io.output import temporary_name
 from phyradgs_cl.io.volume import Volume
 
@@ -66,9 +67,11 @@ class DicomLabels:
             image.StudyDate = image.SeriesDate = self._day.strftime("%Y%m%d")
 
 
-def write_dicom(path: Path, volume: Volume, unit: str, labels: DicomLabels) -> None:
-    """Writes a new folder with 0001.dcm from the lowest slice up; ``unit`` of the values: "1/mm" or "HU"."""
+def write_dicom(path: Path, volume: Volume, note: str, labels: DicomLabels) -> None:
+    """Writes a new folder with 0001.dcm from the lowest slice up; ``note``: "values in 1/mm", or "values in HU" with their
+    scale."""
     pydicom = checks.package("pydicom", "the package that this export needs", "phyradgs-cl[formats]")
+    unit = "HU" if of_note(note)[0] else "1/mm"
     slope, grid = _rescale_slope(volume.values, unit), volume.required_grid
     content = volume.values.tobytes() + repr((grid.voxel_size_mm[::-1], grid.first_centre_mm[::-1])).encode()
     content += repr(labels.given).encode() if labels.given else b""  # other labels make another study
@@ -77,6 +80,7 @@ def write_dicom(path: Path, volume: Volume, unit: str, labels: DicomLabels) -> N
     with folder_written_beside(path) as folder:
         for index, plane in enumerate(volume.values):
             image = _common(pydicom, volume.values.shape, unit, slope, uid)
+            image.ImageComments = note
             labels.write(image)
             instance = generate(entropy_srcs=[seed, unit, str(index)])
             image.SOPInstanceUID = image.file_meta.MediaStorageSOPInstanceUID = instance
@@ -108,7 +112,7 @@ def _common(pydicom: Any, shape: tuple[int, ...], unit: str, slope: str, uid: di
     for name in ("ReferringPhysicianName", "PositionReferenceIndicator", "KVP", "AcquisitionNumber"):
         setattr(image, name, None)
     image.Modality, image.Manufacturer, image.SeriesNumber = "CT", "phyradgs-cl", 1
-    image.SeriesDescription = image.ImageComments = f"values in {unit}"
+    image.SeriesDescription = f"values in {unit}"
     image.ImageType, image.PatientPosition = ["DERIVED", "PRIMARY", "AXIAL"], "HFS"
     _, image.Rows, image.Columns = shape
     image.SamplesPerPixel, image.PhotometricInterpretation = 1, "MONOCHROME2"

@@ -21,19 +21,9 @@ _PLY_NAMES = (
 )
 
 
-def hounsfield(values: np.ndarray, mu_water_per_mm: float) -> np.ndarray:
-    """Returns 1000 (μ/μ_water − 1) as float32: 0 for water, −1000 for nothing."""
-    checks.within("--mu-water-per-mm", mu_water_per_mm, 1e-6, 1e3)
-    with np.errstate(over="ignore"):
-        hu = (1000.0 * (values.astype(np.float64) / mu_water_per_mm - 1.0)).astype(np.float32)
-    if not np.isfinite(hu).all():
-        raise InputError("--mu-water-per-mm", f"{mu_water_per_mm:g}", "water's attenuation in 1/mm, near 0.02")
-    return hu
-
-
-def write_image(path: Path, volume: Volume, unit: str, times_s: Sequence[float] = (), states: Sequence[Volume] = ()) -> None:
-    """Writes NIfTI, NRRD or MetaImage, by the suffix; ``unit`` of the values: "1/mm" or "HU". ``states``: volumes that make
-    one of four dimensions in place of ``volume``, at evenly spaced ``times_s``."""
+def write_image(path: Path, volume: Volume, note: str, times_s: Sequence[float] = (), states: Sequence[Volume] = ()) -> None:
+    """Writes NIfTI, NRRD or MetaImage, by the suffix; ``note``: "values in 1/mm" or "values in HU" with their scale.
+    ``states``: volumes that make one of four dimensions in place of ``volume``, at evenly spaced ``times_s``."""
     sitk = checks.package("SimpleITK", "the package that this export needs", "phyradgs-cl[formats]")
     suffix = next(suffix for suffix in reversed(_WRITERS) if path.name.lower().endswith(suffix))
     if suffix.startswith(".nii") and max(volume.values.shape) > _MOST_NIFTI_VOXELS:
@@ -45,7 +35,7 @@ def write_image(path: Path, volume: Volume, unit: str, times_s: Sequence[float] 
     if states:
         step_s = float(times_s[1] - times_s[0]) if len(times_s) > 1 else 1.0
         image = sitk.JoinSeries(images, float(times_s[0]), step_s)
-    image.SetMetaData("ITK_FileNotes", f"values in {unit}")
+    image.SetMetaData("ITK_FileNotes", note)
     with written_beside(path, len(images) * volume.values.nbytes, suffix) as temporary:
         writer = sitk.ImageFileWriter()
         writer.SetImageIO(_WRITERS[suffix])
@@ -54,7 +44,7 @@ def write_image(path: Path, volume: Volume, unit: str, times_s: Sequence[float] 
         writer.Execute(image)
 
 
-def write_tiff(path: Path, volume: Volume, unit: str) -> None:
+def write_tiff(path: Path, volume: Volume, note: str) -> None:
     """Writes a page per slice from the lowest up, row 0 at the smallest y, with sizes in mm and the origin in pixels. Files
     beyond 4 GB are BigTIFF, which ImageJ opens through Bio-Formats."""
     tifffile = checks.package("tifffile", "the package that this export needs", "phyradgs-cl[formats]")
@@ -64,7 +54,7 @@ def write_tiff(path: Path, volume: Volume, unit: str) -> None:
         "axes": "ZYX", "spacing": dz, "unit": "mm", "min": float(volume.values.min()),
         "max": float(volume.values.max()),
         **{f"{axis}origin": -place / step for axis, place, step in zip("xyz", first_mm, (dx, dy, dz), strict=True)},
-        "Info": f"values in {unit}",
+        "Info": note,
     }  # fmt: skip
     is_small = volume.values.nbytes < _MOST_IMAGEJ_BYTES
     with written_beside(path) as temporary:
@@ -74,12 +64,12 @@ def write_tiff(path: Path, volume: Volume, unit: str) -> None:
         )
 
 
-def write_npy(path: Path, volume: Volume, unit: str) -> None:
+def write_npy(path: Path, volume: Volume, note: str) -> None:
     """Writes the values (z, y, x) float32 to ``path``, and their grid to a .json file of the same name."""
     facts = {
         "axes": ["z", "y", "x"], "shape": list(volume.values.shape),
         "voxel_size_mm": list(volume.required_grid.voxel_size_mm),
-        "first_centre_mm": list(volume.required_grid.first_centre_mm), "values": unit,
+        "first_centre_mm": list(volume.required_grid.first_centre_mm), "values": note.removeprefix("values in "),
     }
     with written_beside(path.with_suffix(".json")) as temporary:
         temporary.write_text(json.dumps(facts, indent=1) + "\n", encoding="utf-8")

@@ -3,10 +3,11 @@
 from phyradgs_cl.fields.deformation import Deformation, control_points
 from phyradgs_cl.fields.gaussians import Activation, Gaussians
 from phyradgs_cl.fields.grid_choice import GridChoice
+from phyradgs_cl.fields.hounsfield import HOUNSFIELD, Hounsfield
 from phyradgs_cl.fields.moving import Gating, MovingTruth, SplineVolume, States, deformed
 from phyradgs_cl.fields.volume import Grid, triple
 
 __all__ = [
-    "Activation", "Deformation", "Gating", "Gaussians", "Grid", "GridChoice", "MovingTruth", "SplineVolume", "States",
-    "control_points", "deformed", "triple"
+    "HOUNSFIELD", "Activation", "Deformation", "Gating", "Gaussians", "Grid", "GridChoice", "Hounsfield", "MovingTruth",
+    "SplineVolume", "States", "control_points", "deformed", "triple"
 ]  # fmt: skip

@@ -3,12 +3,15 @@
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
 from phyradgs_cl import checks
 from phyradgs_cl.errors import InputError
+
+if TYPE_CHECKING:
+    from xarray import DataArray
 
 MOST_VOXELS = 2**38
 """The most voxels of a grid: a terabyte of float32. Larger requests come from damaged files."""
@@ -79,6 +82,16 @@ class Grid:
         """Returns the coordinates of voxel centres, z (nz,), y (ny,), x (nx,), float64."""
         sides = zip(self.first_centre_mm, self.shape, self.voxel_size_mm, strict=True)
         return triple(first + np.arange(n) * d for first, n, d in sides)
+
+    def data_array(self, values: np.ndarray, unit: str, times_s: np.ndarray | None = None) -> "DataArray":
+        """Returns values (nz, ny, nx), or (K, nz, ny, nx) at ``times_s`` (K,), as xarray's DataArray with coordinates in mm
+        and s. ``unit``: of the values. InputError where xarray is not installed."""
+        xarray = checks.package("xarray", "the package of labelled arrays", "xarray")
+        axes = {name: (name, axis, {"units": "mm"}) for name, axis in zip("zyx", self.axes_mm(), strict=True)}
+        if times_s is not None:
+            axes = {"time": ("time", times_s, {"units": "s"}), **axes}
+        facts = {"units": unit, "long_name": "CT number" if unit == "HU" else "attenuation"}
+        return xarray.DataArray(values, axes, list(axes), facts["long_name"], facts)
 
     def is_close(self, other: "Grid") -> bool:
         """Returns whether two grids are equal up to the rounding of files."""

@@ -13,12 +13,22 @@ from phyradgs_cl import checks
 from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid, triple
+from phyradgs_cl.fields.hounsfield import of_note
 from phyradgs_cl.importers.options import ImportOptions
 from phyradgs_cl.importers.reading import tiff
 from phyradgs_cl.importers.reading.files import SafeFolder, read_json, read_npy
 from phyradgs_cl.importers.reading.images import image_times_s, read_image_volume
+from phyradgs_cl.importers.reading.ome_zarr import read_zarr
 from phyradgs_cl.io.tables import Fields, read_toml, refuse_unknown
-from phyradgs_cl.io.volume import Volume, check_attenuation, finite_float32, read_volume, shares_of_maximum
+from phyradgs_cl.io.volume import (
+    VALUES,
+    Volume,
+    check_attenuation,
+    finite_float32,
+    in_per_mm,
+    read_volume,
+    shares_of_maximum,
+)
 from phyradgs_cl.phantoms import Cylinder, Ellipsoid, EllipsoidPhantom
 
 _TO_TIFF = "convert them to 16-bit TIFF, as in Fiji: File > Import > Image Sequence, then Save As > Image Sequence"
@@ -29,7 +39,7 @@ _KINDS = {
         "raw numbers without a description", "convert them to TIFF, as in Fiji: File > Import > Raw, then Save As > Tiff"
     ),
     ("dcm", "dicom", "ima"): (
-        "DICOM", "convert a volume with SimpleITK to NIfTI, and its Hounsfield units to 1/mm; projections to TIFF"
+        "DICOM", "convert a volume with SimpleITK to NIfTI (its Hounsfield units: --mu-water-per-mm); projections to TIFF"
     ),
     ("mat",): ("a file of MATLAB", "save its array as .npy or TIFF: scipy.io.loadmat and tifffile.imwrite"),
     ("fit", "fits"): ("FITS", "convert them to TIFF: astropy.io.fits and tifffile.imwrite"),
@@ -133,14 +143,15 @@ def foreign_volume(path: str | Path) -> str | None:
     return reader[0] if (reader := _reader(path)) else None
 
 
-def load_volume(path: str | Path) -> Volume:
+def load_volume(path: str | Path, mu_water_per_mm: float | None = None) -> Volume:
     """Reads a volume (nz, ny, nx) float32 in 1/mm of any format. Its axes are turned to rise with the world's, which are LPS
     (docs/export.md). Bare values have no grid: a dataset /volume, NRRD and TIFF without voxel sizes, .npy without its .json.
-    InputError: a damaged file, oblique axes, Hounsfield units, NaN or infinity."""
+    Hounsfield units are converted, see ``in_per_mm``. InputError: a damaged file, oblique axes, Hounsfield units without a
+    scale, NaN or infinity."""
     if (reader := _reader(path)) is None:
         refuse_unread(Path(path), "a volume of a format of docs/formats.md")
-        return read_volume(path)
-    return reader[1](Path(path))
+        return in_per_mm(str(path), read_volume(path), mu_water_per_mm)
+    return in_per_mm(str(path), reader[1](Path(path)), mu_water_per_mm)
 
 
 def load_states(path: str | Path) -> Iterator[tuple[float, Volume]]:
@@ -148,7 +159,7 @@ def load_states(path: str | Path) -> Iterator[tuple[float, Volume]]:
     InputError: as of ``load_volume``."""
     if (reader := _reader(path)) is not None and reader[1] is read_image_volume:
         for state, time_s in enumerate(image_times_s(Path(path))):
-            yield time_s, read_image_volume(Path(path), state)
+            yield time_s, in_per_mm(str(path), read_image_volume(Path(path), state))
 
 
 def load_attenuation(path: str | Path, *, warn: bool = True) -> Volume:
@@ -172,7 +183,7 @@ def _read_npy(path: Path) -> Volume:
         raise InputError(str(beside), found[:80], f"axes z, y, x, shape {list(values.shape)}")
     table = Fields(str(beside), facts)
     size_mm, first_mm = table.lengths("voxel_size_mm", 3), table.numbers("first_centre_mm", 3)
-    return _on_grid(path, values, size_mm, first_mm, str(facts.get("values", "")))
+    return _on_grid(path, values, size_mm, first_mm, f"values in {facts.get('values')}")
 
 
 def _read_tiff(path: Path) -> Volume:
@@ -185,6 +196,10 @@ def _read_tiff(path: Path) -> Volume:
     return _on_grid(path, values, size_mm[::-1], first_mm, note)
 
 
+def _read_zarr(path: Path) -> Volume:
+    return _on_grid(path, *read_zarr(path))
+
+
 def _on_grid(
     path: Path, values: np.ndarray, size_mm: np.ndarray | None = None, first_mm: np.ndarray | None = None, note: str = ""
 ) -> Volume:
@@ -192,18 +207,16 @@ def _on_grid(
     volume. Without sizes it has no grid."""
     if size_mm is None:
         return Volume(finite_float32(str(path), shares_of_maximum(values)), None)
-    if "HU" in note.split():
-        raise InputError(str(path), "Hounsfield units", "1/mm", "export it without --mu-water-per-mm")
     centre_mm = np.zeros(3) if first_mm is None else first_mm + (np.array(values.shape) - 1) / 2 * size_mm
     grid = Grid(triple(values.shape), triple(size_mm.tolist()), triple(centre_mm.tolist()))
-    return Volume(finite_float32(str(path), values), grid)
+    return Volume(finite_float32(str(path), values), grid, {VALUES: note} if of_note(note)[0] else {})
 
 
 _READERS: dict[str, tuple[str, Callable[[Path], Volume]]] = {
     **dict.fromkeys((".mha", ".mhd"), ("MetaImage", read_image_volume)),
     **dict.fromkeys((".nii", ".nii.gz"), ("NIfTI", read_image_volume)),
     **dict.fromkeys(tiff.SUFFIXES, ("TIFF", _read_tiff)),
-    **{".nrrd": ("NRRD", read_image_volume), ".npy": ("NumPy", _read_npy)},
+    **{".nrrd": ("NRRD", read_image_volume), ".npy": ("NumPy", _read_npy), ".zarr": ("OME-Zarr", _read_zarr)},
 }
 
 

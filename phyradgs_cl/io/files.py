@@ -63,8 +63,13 @@ def decoded(data: bytes) -> str:
 
 
 def sha256_of(path: str | Path, given_up: threading.Event | None = None) -> str:
-    """Returns the SHA-256 of a file as 64 hexadecimal digits; stops early when ``given_up`` is set."""
+    """Returns the SHA-256 of a file, or of the names and files in a folder, as 64 hexadecimal digits; stops early when
+    ``given_up`` is set."""
     digest, subject = hashlib.sha256(), str(path)
+    if (folder := Path(path)).is_dir():
+        for part in sorted(part for part in folder.rglob("*") if part.is_file()):
+            digest.update(f"{part.relative_to(folder)} {sha256_of(part, given_up)}\n".encode())
+        return digest.hexdigest()
     regular_file(Path(path), subject, "a readable file")
     try:
         with open(path, "rb") as file:

@@ -6,14 +6,15 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import h5py
 import numpy as np
 
 from phyradgs_cl import checks
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.fields import Deformation, Gaussians, Grid, States, deformed, triple
+from phyradgs_cl.fields import HOUNSFIELD, Deformation, Gaussians, Grid, Hounsfield, States, deformed, triple
+from phyradgs_cl.fields.hounsfield import Box, fitted, of_facts, of_note
 from phyradgs_cl.io.deformation import DEFORMATION, read_deformation_group, write_deformation_group
 from phyradgs_cl.io.files import sha256_of
 from phyradgs_cl.io.hdf5 import datasets as h5
@@ -21,12 +22,20 @@ from phyradgs_cl.io.hdf5.source import Hdf5Source, open_hdf5
 from phyradgs_cl.io.tables import PROVENANCE, read_facts
 from phyradgs_cl.text import plain_text
 
+if TYPE_CHECKING:
+    from xarray import DataArray
+
 _DATA = "/entry/reconstruction"
 _VOLUME, _BARE = f"{_DATA}/volume", "/volume"
 _AXES = ("z", "y", "x")
 _GAUSSIANS, _STATE, _STATES = "/entry/gaussians", "/entry/state", "/entry/time_series"
 _CLOUD = {"mean": (3,), "scale": (3,), "quaternion": (4,), "density": ()}
 _LOWEST_PER_MM, _HIGHEST_PER_MM = -10.0, 1000.0  # beyond noise below 0, and beyond gold
+_USUAL_PER_MM = 10.0  # values beyond, of a volume that the user takes for one in HU, are HU
+VALUES = "values"
+"""The key, in a volume's provenance, of what a file of another format notes of its values."""
+FROM_HU = "1/mm, from HU"
+"""What it says of a volume that ``in_per_mm`` has converted."""
 _AXIS_TOLERANCE = 1e-3  # of a voxel, for axes stored in float32
 log = logging.getLogger(__name__)
 
@@ -59,6 +68,20 @@ class Volume:
             found, expected = f"{subject}, which holds its states", "a volume whose object does not change"
             raise InputError("--object-motion", found, expected, "leave it out")
         return replace(self, deformation=deformation)
+
+    @property
+    def scale(self) -> Hounsfield | None:
+        """The scale of Hounsfield units that the file holds, or None."""
+        return of_facts(self.provenance)
+
+    def hounsfield(self, air: Box | None = None, water: Box | None = None, insert_hu: float = 0.0) -> "Volume":
+        """Returns the volume, still in 1/mm, with a scale of Hounsfield units. See ``hounsfield.fitted``."""
+        scale = fitted(self.values, self.required_grid, air, water, insert_hu)
+        return replace(self, provenance={**self.provenance, HOUNSFIELD: scale.facts()})
+
+    def to_xarray(self) -> "DataArray":
+        """Returns the values in 1/mm as xarray's DataArray with coordinates in mm. See ``Grid.data_array``."""
+        return self.required_grid.data_array(self.values, "1/mm")
 
     @property
     def required_grid(self) -> Grid:
@@ -157,13 +180,37 @@ def check_attenuation(subject: str, volume: Volume, *, warn: bool = True) -> Vol
     return volume
 
 
-def attenuation_of(subject: str, volume: Volume, mu_water_per_mm: float | None) -> Volume:
-    """Returns a volume in 1/mm, from Hounsfield units where water's attenuation is stated. InputError about ``subject`` for
-    values that no attenuation in 1/mm has: those of CT numbers, and counts."""
+def in_per_mm(subject: str, volume: Volume, mu_water_per_mm: float | None = None) -> Volume:
+    """Returns a volume in 1/mm. Values that a file notes as Hounsfield units are converted by the scale in the note, or by
+    water's attenuation; values beyond 10 by water's alone. The result then holds the scale. InputError about ``subject``
+    for noted Hounsfield units without either."""
+    stated = None if mu_water_per_mm is None else Hounsfield(mu_water_per_mm)
+    is_hu, scale = of_note(str(volume.provenance.get(VALUES, "")))
+    if scale is None and (is_hu or float(np.abs(volume.values).max()) > _USUAL_PER_MM):
+        scale = stated
+    if scale is not None:
+        facts = {**volume.provenance, HOUNSFIELD: scale.facts(), VALUES: FROM_HU}
+        return replace(volume, values=scale.per_mm(volume.values), provenance=facts)
+    if is_hu:
+        raise InputError(subject, "Hounsfield units", "1/mm", "say --mu-water-per-mm, near 0.02, to convert them")
+    return volume
+
+
+def words_of_hu(volumes: Mapping[Path, Volume], mu_water_per_mm: float | None = None) -> str:
+    """Returns the names and scales of volumes that ``in_per_mm`` has converted, for the end of a line. InputError for
+    water's attenuation that none of them needed."""
+    scales = {path: one.scale for path, one in volumes.items() if one.provenance.get(VALUES) == FROM_HU}
+    if mu_water_per_mm is not None and Hounsfield(mu_water_per_mm) not in scales.values():
+        found = f"{mu_water_per_mm:g} for {' and '.join(map(str, volumes))}"
+        expected = "a volume in Hounsfield units that does not state its scale"
+        raise InputError("--mu-water-per-mm", found, expected, "leave it out")
+    return "".join(f", {plain_text(path.name)} from HU ({scale.line})" for path, scale in scales.items() if scale)
+
+
+def attenuation_of(subject: str, volume: Volume) -> Volume:
+    """Returns the volume. InputError about ``subject`` for values that no attenuation in 1/mm has: those of CT numbers, and
+    counts."""
     lowest, highest = float(volume.values.min()), float(volume.values.max())
-    if mu_water_per_mm is not None:
-        checks.within("--mu-water-per-mm", mu_water_per_mm, 1e-6, 1e3)
-        return replace(volume, values=(mu_water_per_mm * (1 + volume.values.astype(np.float64) / 1000)).astype(np.float32))
     if lowest < _LOWEST_PER_MM or highest > _HIGHEST_PER_MM:
         found = f"values from {lowest:g} to {highest:g}, as of Hounsfield units"
         raise InputError(subject, found, "attenuation in 1/mm", "say --mu-water-per-mm, near 0.02, to convert them")

@@ -10,11 +10,13 @@ import numpy as np
 from phyradgs_cl import checks
 from phyradgs_cl.acquisition.motion import motion_facts
 from phyradgs_cl.errors import InputError, naming_arguments
-from phyradgs_cl.fields import Deformation, Gaussians, Grid, States
+from phyradgs_cl.fields import HOUNSFIELD, Deformation, Gaussians, Grid, Hounsfield, States
+from phyradgs_cl.fields.hounsfield import Box, fitted, of_facts
 from phyradgs_cl.reconstructors.checkpoint import State
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+    from xarray import DataArray
 
     from phyradgs_cl.acquisition import Scan
     from phyradgs_cl.reconstructors.projected import FramePair
@@ -92,6 +94,43 @@ class Reconstruction:
         of_all = slice(None), *part
         states = self.states and replace(self.states, volumes=self.states.volumes[of_all].copy())
         return replace(self, volume=self.volume[part].copy(), grid=grid, states=states)
+
+    @property
+    def scale(self) -> Hounsfield | None:
+        """The scale of Hounsfield units, where ``hounsfield`` has fitted or a file has kept one."""
+        return of_facts(self.facts)
+
+    @naming_arguments()
+    def hounsfield(
+        self, air: Box | None = None, water: Box | None = None, insert_hu: float = 0.0
+    ) -> "Reconstruction":
+        """Returns the result, still in 1/mm, with a scale of Hounsfield units fitted to two points.
+
+        air, water: boxes (z0, z1, y0, y1, x0, x1) in mm, whose mean counts; None takes the volume's own peak, the lowest
+        and the largest above it. insert_hu: the HU of the second point, where it is not water. ``result.scale.line`` says
+        what was fitted, ``result.scale.of(result.volume)`` is the volume (nz, ny, nx) in HU. ``save_volume`` keeps it.
+
+        Raises InputError for less than 100 voxels, air that is not below water, and peaks that are not theirs."""
+        scale = fitted(self.volume, self.grid, air, water, insert_hu)
+        return replace(self, facts={**self.facts, HOUNSFIELD: scale.facts()})
+
+    @naming_arguments()
+    def to_xarray(self, *, hu: bool = False, states: bool = False) -> "DataArray":
+        """Returns the volume as xarray's DataArray (z, y, x) with coordinates in mm; nothing is copied.
+
+        hu: in Hounsfield units of ``scale``, a copy, in place of 1/mm. states: the states (time, z, y, x) of a result that
+        has them, with times in s.
+
+        Raises InputError for a scale or states that the result does not have, and where xarray is not installed."""
+        scale, of_times = self.scale, self.states
+        if hu and scale is None:
+            raise InputError("hu", "a result without a scale", "one", "result.hounsfield(air, water) fits one")
+        if states and of_times is None:
+            raise InputError("states", "a result without states", "one of method changing", "leave it out")
+        values = self.volume if not states or of_times is None else of_times.volumes
+        if hu and scale is not None:
+            values = scale.of(values)
+        return self.grid.data_array(values, "HU" if hu else "1/mm", of_times.times_s if states and of_times else None)
 
     @naming_arguments()
     def plot(self, scan: "Scan | None" = None, *, frame: int = 0, device: "str | Runtime | None" = None) -> "Figure":

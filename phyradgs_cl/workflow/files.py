@@ -21,6 +21,7 @@ from phyradgs_cl.io import (
 )
 from phyradgs_cl.io.hdf5.source import open_hdf5
 from phyradgs_cl.io.output import refuse_overwriting
+from phyradgs_cl.io.volume import FROM_HU, VALUES
 from phyradgs_cl.prepare.light import read_corrected
 
 _KINDS = {
@@ -87,20 +88,22 @@ def check_picture(option: str, picture: Path, *others: Path | None, suffixes: Se
     check_writable(picture)
 
 
-def load_result(path: Path) -> Volume:
+def load_result(path: Path, mu_water_per_mm: float | None = None) -> Volume:
+    """Reads a volume in 1/mm. ``mu_water_per_mm``: of one in Hounsfield units."""
     with expecting(path, "volume", "plain-volume"):
-        return importers.load_volume(path)
+        return importers.load_volume(path, mu_water_per_mm)
 
 
-def load_reference(path: Path) -> tuple[Volume, MovingTruth | None]:
-    """Returns the true volume of a scan, or a volume, and the true states of a simulated object that moves."""
+def load_reference(path: Path, mu_water_per_mm: float | None = None) -> tuple[Volume, MovingTruth | None]:
+    """Returns the true volume of a scan, or a volume, and the true states of a simulated object that moves.
+    ``mu_water_per_mm``: of a volume in Hounsfield units."""
     if importers.foreign_volume(path) is None and file_kind(path) == "scan":
         scan = load_scan(path)
         if scan.reference is None:
             expected = "a scan with a known truth"
             raise InputError(f"{path}:/entry/phyradgs/reference/volume", "no reference", expected)
         return Volume(scan.reference, scan.grid), scan.moving_truth
-    return load_result(path), None
+    return load_result(path, mu_water_per_mm), None
 
 
 def summary(path: Path) -> dict[str, object]:
@@ -137,7 +140,8 @@ def _facts_of_states(states: list[tuple[float, dict[str, Any]]]) -> dict[str, ob
 def _voxel_facts(volume: Volume) -> dict[str, object]:
     values, grid = volume.values, volume.grid
     where = {} if grid is None else {"voxel_size_mm": grid.voxel_size_mm, "offset_mm": grid.offset_mm}
-    return {"shape": values.shape, **where, "minimum": float(values.min()), "maximum": float(values.max())}
+    unit = {VALUES: FROM_HU} if volume.provenance.get(VALUES) == FROM_HU else {}
+    return {"shape": values.shape, **where, **unit, "minimum": float(values.min()), "maximum": float(values.max())}
 
 
 def _options_in_words(options: object) -> dict[str, object]:

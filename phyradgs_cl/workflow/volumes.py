@@ -10,7 +10,7 @@ from phyradgs_cl.errors import InputError, OutputError
 from phyradgs_cl.fields import Grid, MovingTruth, triple
 from phyradgs_cl.fields.grid_choice import voxel_sides_mm
 from phyradgs_cl.io import Volume, read_deformation, written_beside
-from phyradgs_cl.io.volume import attenuation_of, interruption
+from phyradgs_cl.io.volume import attenuation_of, interruption, words_of_hu
 from phyradgs_cl.metrics import (
     METRICS,
     VOXEL_BY_VOXEL,
@@ -40,12 +40,14 @@ def run_evaluation(
     picture of slices. A volume without a scale is compared voxel by voxel. ``reference_voxel_mm``: sides of the voxels of a
     reference without a scale, one length or (z, y, x). ``object_motion``: the file of a deformation, which shows the volume
     at each true state of a scan; None takes the volume's own, if it has one. ``reference_of_rtk``: the
-    reference has RTK's axes. ``mu_water_per_mm``: of a reference in Hounsfield units. InputError: no such sides; files that
-    do not fit each other."""
+    reference has RTK's axes. ``mu_water_per_mm``: of files in Hounsfield units that do not state their scale. InputError: no
+    such sides; files that do not fit each other; attenuation of water for files that are in 1/mm."""
     check_picture("--picture", picture, volume_path, reference_path, object_motion)
     field = None if object_motion is None else read_deformation(object_motion)
-    result, (stored, moving) = load_result(volume_path), load_reference(reference_path)
-    stored = attenuation_of(str(reference_path), stored, mu_water_per_mm)
+    result = attenuation_of(str(volume_path), load_result(volume_path, mu_water_per_mm))
+    stored, moving = load_reference(reference_path, mu_water_per_mm)
+    stored = attenuation_of(str(reference_path), stored)
+    converted = words_of_hu({volume_path: result, reference_path: stored}, mu_water_per_mm)
     if field is not None and (moving is None or result.grid is None):
         expected = "a scan simulated with --motion-of-object, and a volume with a scale"
         raise InputError("--object-motion", "no true states to compare with", expected, "leave it out")
@@ -77,7 +79,7 @@ def run_evaluation(
             raise error.__cause__ or error from None
     known: dict[str, object] = {key: provenance[key] for key in ("method", "seconds", "gaussians") if key in provenance}
     files = {"volume": str(volume_path), "reference": str(reference_path), "picture": str(picture)}
-    compared: dict[str, object] = {"compared": how, "share_of_reference_covered": share}
+    compared: dict[str, object] = {"compared": how + converted, "share_of_reference_covered": share}
     return {**metrics, **states, **known, **interruption(provenance), **compared, **files}
 
 

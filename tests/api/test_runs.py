@@ -1,6 +1,7 @@
 """Scans and reconstructions from Python."""
 
 import json
+import sys
 import threading
 from functools import partial
 
@@ -42,6 +43,49 @@ def test_the_suffix_says_what_is_written(rt, scan, tmp_path) -> None:
     for suffix, start in {".ply": b"ply", ".npz": b"PK", ".NII": b"\x5c\x01"}.items():
         api.save_volume(tmp_path / f"v{suffix}", result)
         assert (tmp_path / f"v{suffix}").read_bytes().startswith(start), suffix
+
+
+def test_hounsfield_units_are_kept_by_files(rt, scan, tmp_path) -> None:
+    result = api.reconstruct(scan, "fdk", device=rt)
+    (z0, z1), (y0, y1), (x0, x1) = result.grid.box_mm
+    edge, middle = (z0, z1, y0, y1, x0, x0 + (x1 - x0) / 9), (z0 / 2, z1 / 2, y0 / 2, y1 / 2, x0 / 2, x1 / 2)
+    scaled = result.hounsfield(edge, middle)
+    for name in ("v.h5", "v.nii", "v.npy"):
+        api.save_volume(tmp_path / name, scaled, hu=True)
+        again = api.load_volume(tmp_path / name)
+        np.testing.assert_allclose(again.volume, result.volume, atol=2e-7)
+        assert again.scale.water_per_mm == pytest.approx(scaled.scale.water_per_mm)
+    for name in ("v.mha", "v.ply", "v.h5"):
+        with pytest.raises(InputError, match="hu: found a result without a scale"):
+            api.save_volume(tmp_path / name, result, hu=True)
+    with pytest.raises(InputError, match="hu: found given for v.ply"):
+        api.save_volume(tmp_path / "v.ply", scaled, hu=True)
+    with pytest.raises(InputError, match="^air: found shape"):
+        result.hounsfield((1.0, 2.0))
+    with pytest.raises(InputError, match="mu_water_per_mm: found given for .*v.h5, which is in 1/mm"):
+        api.load_volume(tmp_path / "v.h5", mu_water_per_mm=0.02)
+
+
+def test_xarray_has_the_places_of_voxels_in_mm(monkeypatch) -> None:
+    grid = api.Grid((4, 5, 6), (2.0, 1.5, 1.0), (10.0, 0.0, -3.0))
+    values = np.random.default_rng(0).uniform(0, 0.02, grid.shape).astype(np.float32)
+    states = api.States(np.array([1.0, 4.0]), np.stack([values, 2 * values]))
+    result = api.Reconstruction(values, grid, states=states, facts={"hounsfield": {"water_per_mm": 0.02, "air_per_mm": 0.0}})
+    array = result.to_xarray()
+    assert array.dims == ("z", "y", "x") and array.data is values and array.attrs["units"] == "1/mm"
+    assert array["z"].attrs["units"] == "mm"
+    place = array.sel(z=11.1, y=-1.4, x=-5.4, method="nearest")
+    assert (float(place.z), float(place.y), float(place.x), float(place)) == (11.0, -1.5, -5.5, values[2, 1, 0])
+    in_hu = result.to_xarray(hu=True, states=True)
+    assert in_hu.dims == ("time", "z", "y", "x") and in_hu.attrs["units"] == "HU" and in_hu["time"].values.tolist() == [1, 4]
+    np.testing.assert_allclose(in_hu.sel(time=1.0), 1000 * (values / 0.02 - 1), atol=1e-3)
+    with pytest.raises(InputError, match="hu: found a result without a scale"):
+        api.Reconstruction(values, grid).to_xarray(hu=True)
+    with pytest.raises(InputError, match="states: found a result without states"):
+        api.Reconstruction(values, grid).to_xarray(states=True)
+    monkeypatch.setitem(sys.modules, "xarray", None)
+    with pytest.raises(InputError, match="xarray: found not installed; .*pip install 'xarray'"):
+        result.to_xarray()
 
 
 def test_options_reach_the_method_and_the_frames(rt, scan) -> None:

@@ -13,6 +13,7 @@ import SimpleITK as sitk
 from phyradgs_cl.api import compare, load_scan, simulate
 from phyradgs_cl.exporters import export_volume
 from phyradgs_cl.fields import Grid
+from phyradgs_cl.importers import load_volume
 from phyradgs_cl.io import read_scan, write_scan, write_volume
 
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("fast_pictures")]
@@ -61,6 +62,54 @@ def test_evaluate_converts_a_reference_in_hounsfield_units_or_refuses_it(cli, fi
     assert "hu.h5: found values from -1000 to" in (error := capsys.readouterr().err) and "--mu-water-per-mm" in error
     assert cli.run([*words, str(tmp_path / "hu.h5"), "--mu-water-per-mm", "0"]) == 2
     assert "--mu-water-per-mm: found 0" in capsys.readouterr().err
+    assert cli.run([*words, str(tmp_path / "truth.h5"), "--mu-water-per-mm", "0.019"]) == 2
+    assert "expected a volume in Hounsfield units that does not state its scale" in capsys.readouterr().err
+
+
+def test_a_result_in_hounsfield_units_is_converted_once(cli, refused, files, tmp_path, capfd) -> None:
+    """By the scale that an export notes, and of other programs by water's attenuation; the line says so."""
+    scan, volume, values, _ = files
+    noted, bare = tmp_path / "noted.nii", tmp_path / "bare.nii"
+    assert cli.run(["export", str(volume), "-o", str(noted), "--mu-water-per-mm", "0.002"]) == 0
+    image = sitk.ReadImage(str(noted))
+    without_note = sitk.GetImageFromArray(sitk.GetArrayFromImage(image))
+    without_note.SetSpacing(image.GetSpacing())
+    without_note.SetOrigin(image.GetOrigin())
+    sitk.WriteImage(without_note, str(bare))
+    answers = []
+    for path, water in ((volume, ()), (noted, ()), (bare, ("--mu-water-per-mm", "0.002"))):
+        capfd.readouterr()
+        assert cli.run(["evaluate", str(path), "--reference", str(scan), *water, "--json"]) == 0
+        answers.append(json.loads(capfd.readouterr().out))
+    assert answers[0]["compared"] == "voxel by voxel"
+    assert answers[1]["compared"] == "voxel by voxel, noted.nii from HU (water 0.002, air 0 1/mm)"
+    assert all(answer["psnr_db"] == pytest.approx(answers[0]["psnr_db"], abs=1e-3) for answer in answers)
+    refused(["evaluate", bare, "--reference", scan], "as of Hounsfield units", "--mu-water-per-mm")
+    start = ["reconstruct", scan, "--method", "sirt", "--iterations", "1", "-o", tmp_path / "r.h5"]
+    assert cli.run([str(word) for word in (*start, "--initial", noted)]) == 0
+    assert "first volume: noted.nii from HU (water 0.002" in capfd.readouterr().out
+    refused([*start, "--initial", bare], "bare.nii: found values from", "--mu-water-per-mm")
+    refused([*start, "--mu-water-per-mm", "0.02"], "--mu-water-per-mm: found given without --initial")
+    refused([*start, "--initial", volume, "--mu-water-per-mm", "0.02"], "expected a volume in Hounsfield units")
+    assert load_volume(noted).values == pytest.approx(values, abs=1e-6)
+
+
+def test_export_fits_hounsfield_units_and_says_so(cli, refused, files, tmp_path, capfd) -> None:
+    _, volume, values, grid = files
+    box = np.full(grid.shape, 0.001)
+    box[3:9, 3:9, 3:9] = 0.02
+    write_volume(tmp_path / "box.h5", box, grid, {})
+    words = ["export", str(tmp_path / "box.h5"), "--hu", "-o"]
+    assert cli.run([*words, str(tmp_path / "box.nii")]) == 0
+    told = capfd.readouterr().out
+    assert "air 0.001 ± " in told and "(1512 voxels of the lowest peak), water 0.02 ± " in told and "(216 voxels" in told
+    hu = sitk.GetArrayFromImage(sitk.ReadImage(str(tmp_path / "box.nii")))
+    np.testing.assert_allclose([hu.min(), hu.max()], [-1000, 0], atol=0.01)
+    refused([*words, tmp_path / "x.ply"], "--hu: found with --to ply")
+    refused([*words, tmp_path / "x.nii", "--mu-water-per-mm", "0.02"], "one of the two")
+    refused(["export", volume, "-o", tmp_path / "x.nii", "--insert-hu", "40"], "--insert-hu: found given without --hu")
+    refused([*words, tmp_path / "x.nii", "--air-mm", "1,2"], "--air-mm: found shape (2,)")
+    assert not (tmp_path / "x.nii").exists()
 
 
 def test_boxes_with_little_in_common_are_warned_of(cli, files, tmp_path, capsys, caplog) -> None:
@@ -193,8 +242,6 @@ def test_an_export_is_scanned_like_the_volume_itself(cli, files, tmp_path, capsy
 
 
 def test_what_is_of_another_kind_is_refused(refused, files, tmp_path) -> None:
-    hounsfield = export_volume(files[1], "nii", tmp_path / "hu.nii", 0.02)
-    refused(["evaluate", hounsfield, "--reference", files[0]], "Hounsfield")
     nxtomo = shutil.copy(files[0], tmp_path / "other.nxs")
     with h5py.File(nxtomo, "r+") as file:
         del file["entry/instrument/detector/data"].attrs["quantity"]

@@ -4,6 +4,7 @@ import gzip
 import json
 import random
 import re
+import shutil
 
 import nibabel
 import numpy as np
@@ -12,17 +13,24 @@ import SimpleITK as sitk
 import tifffile
 
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.exporters import export_volume
+from phyradgs_cl.exporters import export_volume, hu_scale
+from phyradgs_cl.fields import Hounsfield
 from phyradgs_cl.importers import foreign_volume, load_attenuation, load_volume
+from phyradgs_cl.io import read_volume
 
 pytestmark = pytest.mark.slow
 
 NAMES = {"v.mha": "mha", "v.nii": "nii", "v.nii.gz": "nii", "v.nrrd": "nrrd", "v.npy": "npy", "v.tif": "tiff"}
+NAMES["v.ome.zarr"] = "zarr"
 
 
 @pytest.fixture
 def exported(volume_file, tmp_path):
-    return lambda name, **wish: export_volume(volume_file, NAMES[name], tmp_path / name, **wish)
+    def export(name, **wish):
+        shutil.rmtree(tmp_path / name, ignore_errors=True)  # a folder is never replaced
+        return export_volume(volume_file, NAMES[name], tmp_path / name, **wish)
+
+    return export
 
 
 def assert_same(path, stored, atol: float = 0) -> None:
@@ -33,11 +41,33 @@ def assert_same(path, stored, atol: float = 0) -> None:
 
 @pytest.mark.parametrize("name", NAMES)
 def test_an_export_comes_back_bit_for_bit_and_in_its_place(exported, stored, name) -> None:
-    """Hounsfield units are not taken for attenuation."""
+    """Hounsfield units too, by the scale that the file notes; of a file without one they are refused, or converted once."""
     assert_same(exported(name), stored)
     assert foreign_volume(f"{name.upper()}") and load_attenuation(exported(name)).grid is not None
+    scale = Hounsfield(0.02, 0.001)
+    path = exported(name, scale_of=lambda _: scale)
+    assert_same(path, stored, atol=1e-8)
+    assert load_volume(path).scale == scale and load_volume(path, 0.03).scale == scale
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Hounsfield, "note", "values in HU")
+        path = exported(name, mu_water_per_mm=0.02)
     with pytest.raises(InputError, match="Hounsfield.*--mu-water-per-mm"):
-        load_volume(exported(name, mu_water_per_mm=0.02))
+        load_volume(path)
+    np.testing.assert_allclose(load_volume(path, 0.02).values, stored.values, atol=1e-8)
+
+
+def test_a_volume_file_keeps_its_scale_and_all_else(volume_file, stored, tmp_path) -> None:
+    """Its values stay in 1/mm; later exports take the scale from it."""
+    scale = Hounsfield(0.02, 0.001, "by hand")
+    path = export_volume(volume_file, "h5", tmp_path / "own.h5", scale_of=lambda _: scale)
+    again = read_volume(path)
+    assert_same(path, stored)
+    assert again.scale == scale and again.gaussians.count == stored.gaussians.count
+    assert again.provenance["method"] == "phyradgs"
+    kept = load_volume(export_volume(path, "nii", tmp_path / "own.nii", scale_of=hu_scale))
+    assert (kept.scale.water_per_mm, kept.scale.air_per_mm) == (0.02, 0.001)
+    with pytest.raises(InputError, match="--hu: found not given"):
+        export_volume(volume_file, "h5", tmp_path / "none.h5")
 
 
 def test_a_bigtiff_has_the_same_grid(exported, stored, monkeypatch) -> None:
@@ -138,15 +168,18 @@ def test_a_grid_beside_an_array_must_be_its_own(exported) -> None:
 @pytest.mark.parametrize("name", NAMES)
 def test_random_damage_is_a_volume_or_one_line(exported, name) -> None:
     path, rng = exported(name), random.Random(len(name))
-    good, refused = path.read_bytes(), 0
-    for _ in range(60):
-        data = bytearray(good)
+    files = sorted(one for one in path.rglob("*") if one.is_file()) or [path]  # an OME-Zarr is a folder
+    good, refused = {one: one.read_bytes() for one in files}, 0
+    for turn in range(60):
+        file = files[turn % len(files)]
+        data = bytearray(good[file])
         for _ in range(rng.choice((1, 2, 8))):
             data[rng.randrange(min(len(data), 600))] = rng.randrange(256)
-        path.write_bytes(data[: rng.choice((len(data), rng.randrange(len(data))))])
+        file.write_bytes(data[: rng.choice((len(data), rng.randrange(len(data))))])
         try:
             load_volume(path)
         except InputError as error:
             refused += 1
             assert "\n" not in str(error)
+        file.write_bytes(good[file])
     assert refused > 20

@@ -1,5 +1,5 @@
 """NIfTI, NRRD and MetaImage files, read by SimpleITK, with what it does not see: voxels that are missing or in another
-folder, Hounsfield units, and NRRD's units."""
+folder, a note of Hounsfield units, and NRRD's units."""
 
 import gzip
 import math
@@ -19,11 +19,12 @@ from phyradgs_cl.fields import Grid, triple
 from phyradgs_cl.importers.reading.files import SafeFolder, check_room
 from phyradgs_cl.io.files import regular_file
 from phyradgs_cl.io.hdf5.datasets import LENGTH
-from phyradgs_cl.io.volume import Volume, finite_float32, shares_of_maximum
+from phyradgs_cl.io.volume import VALUES, Volume, finite_float32, shares_of_maximum
 
 STACKS = (".mha", ".mhd")
 _SPACES = ("left-posterior-superior", "lps", "right-anterior-superior", "ras", "left-anterior-superior", "las", "")
 _HEAD_BYTES, _VOXEL_BYTES = 1 << 16, 8
+_IN_HU, _NOTE_BYTES = b"values in HU", 79
 _READERS = {".nii": "Nifti", ".gz": "Nifti", ".mha": "Meta", ".mhd": "Meta", ".nrrd": "Nrrd"}
 _DATA_FILE = re.compile(rb"^(?:ElementDataFile *=|data ?file:) *(\S.*?)\s*$", re.M)
 _OBLIQUE = 1e-3  # largest sine of an angle between an axis and the world's
@@ -57,7 +58,7 @@ def image_times_s(path: Path) -> list[float]:
 
 def read_image(path: Path, state: int | None = None) -> Any:
     """Reads a SimpleITK image of three axes with one real number per voxel; ``state``: the place along a fourth axis.
-    InputError: a damaged file, other axes or voxels, voxels that are missing or in another folder, Hounsfield units."""
+    InputError: a damaged file, other axes or voxels, voxels that are missing or in another folder."""
     subject = str(path)
     with _opened(path) as (sitk, reader):
         counts, axes = reader.GetSize(), reader.GetDimension()
@@ -80,11 +81,9 @@ def read_image(path: Path, state: int | None = None) -> Any:
 
 def _held_bytes(path: Path, reader: Any, voxel_bytes: int) -> int | None:
     """Returns how many bytes of voxels a file holds, unpacked: SimpleITK fills those that are missing in NIfTI, and damaged
-    in packed MetaImages, without an error. None where it refuses them. InputError: Hounsfield units, data elsewhere."""
-    with gzip.open(path) if path.suffix.lower() == ".gz" else open(path, "rb") as file:
+    in packed MetaImages, without an error. None where it refuses them. InputError: data elsewhere."""
+    with _unpacked(path) as file:
         head = file.read(_HEAD_BYTES)
-        if b"values in HU" in head:
-            raise InputError(str(path), "Hounsfield units", "1/mm", "export it without --mu-water-per-mm")
         if reader.HasMetaDataKey("bitpix"):  # NIfTI, in which scaled integers come out as floats
             stored = file.seek(0, os.SEEK_END) - int(float(reader.GetMetaData("vox_offset")))
             return stored * voxel_bytes * 8 // int(reader.GetMetaData("bitpix"))
@@ -100,6 +99,17 @@ def _held_bytes(path: Path, reader: Any, voxel_bytes: int) -> int | None:
     if not re.search(rb"^CompressedDataSize *= *\d", head, re.M):  # SimpleITK returns undefined voxels then
         raise InputError(f"{path} CompressedDataSize", "nothing", "the bytes of packed voxels", "write it unpacked")
     return len(zlib.decompress(path.read_bytes()[start:]))
+
+
+def _unpacked(path: Path) -> Any:
+    return gzip.open(path) if path.suffix.lower() == ".gz" else open(path, "rb")
+
+
+def _noted(path: Path) -> dict[str, object]:
+    """Returns what the file of an image in Hounsfield units notes of its values, for a volume's provenance."""
+    with _unpacked(path) as file:
+        head = file.read(_HEAD_BYTES)
+    return {VALUES: head[place : place + _NOTE_BYTES].decode("latin-1")} if (place := head.find(_IN_HU)) >= 0 else {}
 
 
 def read_image_volume(path: Path, state: int | None = None) -> Volume:
@@ -127,7 +137,8 @@ def read_image_volume(path: Path, state: int | None = None) -> Volume:
     if not np.all(np.abs(centre_mm) <= LENGTH.largest):
         raise InputError(f"{subject}: origin", str(list(image.GetOrigin()))[:80], "three lengths in mm")
     values = finite_float32(subject, sitk.GetArrayFromImage(image))
-    return Volume(values, Grid(triple(values.shape), triple(size_mm[::-1].tolist()), triple(centre_mm[::-1].tolist())))
+    grid = Grid(triple(values.shape), triple(size_mm[::-1].tolist()), triple(centre_mm[::-1].tolist()))
+    return Volume(values, grid, _noted(path))
 
 
 def _nrrd_header(path: Path) -> dict[str, str]:

@@ -1,0 +1,189 @@
+"""Hounsfield units of a volume: two points, air and water, fitted to boxes or to the peaks of its histogram."""
+
+import logging
+import re
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+
+import numpy as np
+import scipy
+
+from phyradgs_cl import checks
+from phyradgs_cl.errors import InputError
+from phyradgs_cl.fields.volume import Grid
+
+log = logging.getLogger(__name__)
+HOUNSFIELD = "hounsfield"
+"""The key of a volume's scale in its provenance."""
+Box = tuple[float, ...]
+"""Z0, Z1, Y0, Y1, X0, X1 in mm."""
+Window = tuple[float, float, int]
+"""Where a peak of the histogram has half its height, from and to in 1/mm, and the voxels between."""
+_FEWEST = 100  # voxels of a point: their mean has a tenth of a voxel's noise
+_WATER_PER_MM = (0.009, 0.6)  # water's attenuation at 500 keV and at 10 keV
+_AIR_BELOW = 0.25  # of water: the lowest peak of a volume without air is fat, say
+_BINS, _SMOOTH_BINS = 512, 2.0
+_PROMINENT, _CERTAIN = 0.1, 3.0  # of a peak's own height, and of its root: eight times the noise of smooth counts
+_ZOOM = 2.5  # times water
+_SHORTENED = 5  # times, to a quarter each: metal may be a thousand times denser than water
+_NOTE = re.compile(r"values in HU(?:, water ([-+.\de]+), air ([-+.\de]+) 1/mm)?")
+
+
+@dataclass(frozen=True)
+class Hounsfield:
+    """Attenuation of water, 0 HU, and of air, −1000 HU, in 1/mm. ``fitted``: a line that says to what. InputError for water
+    outside 1e-6 to 1e3, and for air that is not below it."""
+
+    water_per_mm: float
+    air_per_mm: float = 0.0
+    fitted: str = ""
+
+    def __post_init__(self) -> None:
+        checks.within("--mu-water-per-mm", self.water_per_mm, 1e-6, 1e3)
+        checks.within("air of the Hounsfield units (1/mm)", self.air_per_mm, -1e3, 1e3)
+        if not self.air_per_mm < self.water_per_mm:
+            found = f"air of {self.air_per_mm:.4g}, not below water of {self.water_per_mm:.4g} 1/mm"
+            raise InputError("Hounsfield units", found, "air below water", "exchange or move the boxes")
+
+    def of(self, per_mm: np.ndarray) -> np.ndarray:
+        """Returns attenuation (z, y, x) in 1/mm as float32 in HU. InputError where float32 does not hold them."""
+        factor = 1000.0 / (self.water_per_mm - self.air_per_mm)
+        hu = np.empty(per_mm.shape, np.float32)
+        with np.errstate(over="ignore"):
+            for z, plane in enumerate(per_mm):  # by planes: no second volume in float64
+                hu[z] = factor * (plane.astype(np.float64) - self.water_per_mm)
+        if not np.isfinite(hu).all():
+            found = f"{self.water_per_mm:g}"
+            raise InputError("--mu-water-per-mm", found, "water's attenuation in 1/mm, near 0.02")
+        return hu
+
+    def per_mm(self, hu: np.ndarray) -> np.ndarray:
+        """Returns values (z, y, x) in HU as float32 in 1/mm."""
+        step = (self.water_per_mm - self.air_per_mm) / 1000
+        values = np.empty(hu.shape, np.float32)
+        for z, plane in enumerate(hu):
+            values[z] = self.water_per_mm + step * plane.astype(np.float64)
+        return values
+
+    @property
+    def note(self) -> str:
+        """What an exported file says of its values; ``of_note`` reads it."""
+        return f"values in HU, water {self.water_per_mm:.9g}, air {self.air_per_mm:.9g} 1/mm"
+
+    @property
+    def line(self) -> str:
+        return self.fitted or f"water {self.water_per_mm:.4g}, air {self.air_per_mm:.4g} 1/mm"
+
+    def facts(self) -> dict[str, object]:
+        return asdict(self)
+
+
+def of_facts(facts: Mapping[str, object]) -> Hounsfield | None:
+    """Returns the scale in a volume's provenance, or None. InputError for a damaged one."""
+    stored = facts.get(HOUNSFIELD)
+    if stored is None:
+        return None
+    if not isinstance(stored, Mapping) or not {"water_per_mm", "air_per_mm"} <= set(stored):
+        expected = "a table of water_per_mm and air_per_mm"
+        raise InputError(f"provenance {HOUNSFIELD}", checks.short_repr(stored), expected)
+    return Hounsfield(stored["water_per_mm"], stored["air_per_mm"], str(stored.get("fitted", "")))
+
+
+def of_note(text: str) -> tuple[bool, Hounsfield | None]:
+    """Returns whether a file's note says that its values are HU, and the scale, where it states one."""
+    found = _NOTE.search(text)
+    if found is None or found[1] is None:
+        return found is not None, None
+    try:
+        return True, Hounsfield(float(found[1]), float(found[2]))
+    except ValueError:
+        return True, None
+
+
+def fitted(
+    values: np.ndarray, grid: Grid, air: Box | None = None, water: Box | None = None, insert_hu: float = 0.0
+) -> Hounsfield:
+    """Fits the scale of a volume (z, y, x) in 1/mm to the means of two boxes. A box that is None becomes the volume's own
+    peak: the lowest is air, the largest above it water. ``insert_hu``: the HU of the second point, where it is not water.
+
+    InputError: less than 100 voxels; air that is not below water; no two peaks, peaks that cannot be air and water."""
+    checks.within("--insert-hu", insert_hu, -900, 30_000)
+    if values.min() < -10:  # no attenuation in 1/mm
+        raise InputError("--hu", f"values from {values.min():g}, as of Hounsfield units", "attenuation in 1/mm")
+    of_air = None if air is None else _inside("--air-mm", values, grid, air)
+    of_water = None if water is None else _inside("--water-mm", values, grid, water)
+    if of_air is None or of_water is None:
+        lowest, largest = (values[(values >= start) & (values <= end)] for start, end, _ in _peaks(values))
+        of_air, of_water = lowest if of_air is None else of_air, largest if of_water is None else of_water
+    low, of_low = _mean("air", of_air, air is None)
+    high, of_high = _mean("water" if insert_hu == 0 else f"insert of {insert_hu:g} HU", of_water, water is None)
+    if not low < high:
+        found = f"{of_low}, {of_high}"
+        raise InputError("Hounsfield units", found, "air below water", "exchange or move the boxes")
+    per_mm = (high + insert_hu / 1000 * low) / (1 + insert_hu / 1000)
+    if air is None and low > _AIR_BELOW * per_mm:
+        found = f"a lowest peak at {low:.3g}, water at {per_mm:.3g} 1/mm"
+        raise InputError("--hu", found, "air near 0", "state a box of air by --air-mm")
+    if not _WATER_PER_MM[0] <= per_mm <= _WATER_PER_MM[1]:
+        text = "Hounsfield units: water has %.3g 1/mm, and at 10 to 500 keV 0.6 to 0.009: check that lengths are in mm"
+        log.warning(text, per_mm)
+    so = "" if insert_hu == 0 else f", so water {per_mm:.4g} 1/mm"
+    return Hounsfield(per_mm, low, f"{of_low}, {of_high}{so}")
+
+
+def _mean(name: str, voxels: np.ndarray, is_peak: bool) -> tuple[float, str]:
+    if voxels.size < _FEWEST:
+        remedy = f"state a box by {'--air-mm' if name == 'air' else '--water-mm'}" if is_peak else "take a larger box"
+        raise InputError(f"Hounsfield units, {name}", f"{voxels.size} voxels", f"at least {_FEWEST}", remedy)
+    mean, deviation = float(voxels.mean(dtype=np.float64)), float(voxels.std(dtype=np.float64))
+    where = "its box" if not is_peak else "the lowest peak" if name == "air" else "the largest peak above air"
+    return mean, f"{name} {mean:.4g} ± {deviation:.2g} 1/mm ({voxels.size} voxels of {where})"
+
+
+def _inside(option: str, values: np.ndarray, grid: Grid, box: Box) -> np.ndarray:
+    """Returns the voxels whose centres lie in a box. InputError for other than six numbers, rising in pairs."""
+    ends_mm = checks.numbers(option, np.asarray(box), (6,)).reshape(3, 2)
+    if (ends_mm[:, 0] >= ends_mm[:, 1]).any():
+        raise InputError(option, checks.short_repr(box), "Z0 below Z1, Y0 below Y1, X0 below X1")
+    z, y, x = (slice(*np.searchsorted(axis, ends)) for axis, ends in zip(grid.axes_mm(), ends_mm, strict=True))
+    return values[z, y, x]
+
+
+def _peaks(values: np.ndarray) -> tuple[Window, Window]:
+    """Returns the windows of air and of water. Metal is so dense that both may lie in a few bins, so the histogram is
+    shortened until it shows two peaks, and once more to end beyond water."""
+    lowest, highest = (float(v) for v in np.percentile(values, (0.1, 99.9)))
+    for _ in range(_SHORTENED):
+        if len(windows := _windows(values, lowest, highest)) > 1:
+            break
+        highest = lowest + (highest - lowest) / 4
+    if len(windows) > 1:
+        windows = _windows(values, lowest, min(highest, _ZOOM * _largest(windows)[1])) or windows
+    if len(windows) < 2:
+        found = f"{len(windows)} peak{'s' if len(windows) != 1 else ''} in the volume"
+        raise InputError("--hu", found, "two, air and water", "state boxes by --air-mm and --water-mm")
+    return windows[0], _largest(windows)
+
+
+def _largest(windows: list[Window]) -> Window:
+    """Returns the window with most voxels above the lowest."""
+    return max(windows[1:], key=lambda window: window[2])
+
+
+def _windows(values: np.ndarray, lowest: float, highest: float) -> list[Window]:
+    """Returns the windows of the peaks that hold enough voxels, from low to high."""
+    if not lowest < highest:
+        return []
+    counts, edges = np.histogram(values, _BINS, (lowest, highest))
+    smooth = scipy.ndimage.gaussian_filter1d(np.pad(counts.astype(np.float64), 8), _SMOOTH_BINS)
+    places, facts = scipy.signal.find_peaks(smooth, prominence=0)
+    least = np.maximum(_PROMINENT * smooth[places], _CERTAIN * np.sqrt(smooth[places]))
+    places = places[facts["prominences"] >= least]
+    _, _, left, right = scipy.signal.peak_widths(smooth, places, 0.5)
+    found = []
+    for first, last in zip(left - 8, right - 7, strict=True):
+        low, high = np.interp((first, last), np.arange(_BINS + 1), edges)
+        count = int(np.sum(counts[max(int(first), 0) : int(last) + 1]))
+        if count >= _FEWEST:
+            found.append((float(low), float(high), count))
+    return found
