@@ -34,27 +34,37 @@ static inline void inverse_4(vf *v, const int step)
     v[3 * step] = outer - slope;
 }
 
-/* Returns in space what the block or blocks at ``corner`` lose. */
+/* Returns in space what the block or blocks at ``corner`` lose. Unrolled loops keep the block in registers. */
 static inline void shrunk(__global const float *volume, const size_t corner, const int pitch, const size_t slice,
                           const float threshold, vf *block)
 {
+    #pragma unroll
     for (int k = 0; k < EDGE; k++)
+        #pragma unroll
         for (int j = 0; j < EDGE; j++)
+            #pragma unroll
             for (int i = 0; i < EDGE; i++)
                 block[(k * EDGE + j) * EDGE + i] = V_LOAD(volume + corner + k * slice + j * pitch + i);
+    #pragma unroll
     for (int n = 0; n < BLOCK; n += 4)
         forward_4(block + n, 1);
+    #pragma unroll
     for (int n = 0; n < 16; n++)
         forward_4(block + (n / 4) * 16 + n % 4, 4);
+    #pragma unroll
     for (int n = 0; n < 16; n++)
         forward_4(block + n, 16);
     block[0] = (vf)(0.0f);
+    #pragma unroll
     for (int n = 1; n < BLOCK; n++)
         block[n] = max(min(block[n], (vf)(threshold)), (vf)(-threshold));
+    #pragma unroll
     for (int n = 0; n < 16; n++)
         inverse_4(block + n, 16);
+    #pragma unroll
     for (int n = 0; n < 16; n++)
         inverse_4(block + (n / 4) * 16 + n % 4, 4);
+    #pragma unroll
     for (int n = 0; n < BLOCK; n += 4)
         inverse_4(block + n, 1);
 }
@@ -81,9 +91,12 @@ __kernel void dct_excess(
     {
         shrunk(volume, row + x, pitch, slice, threshold, block);
         const vf inside = V_PICK(0.0f, 1.0f, (vf)(x) + V_IOTA <= (float)last);
+        #pragma unroll
         for (int k = 0; k < EDGE; k++)
+            #pragma unroll
             for (int j = 0; j < EDGE; j++) {
                 __global float *line = excess + row + x + k * slice + j * pitch;
+                #pragma unroll
                 for (int i = 0; i < EDGE; i++)
                     V_STORE(V_LOAD(line + i) + inside * block[(k * EDGE + j) * EDGE + i], line + i);
             }
