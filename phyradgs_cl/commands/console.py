@@ -24,6 +24,15 @@ SHARED_BY_RANKS = ("reconstruct",)
 """Commands whose work ranks share; rank 0 alone runs the others."""
 
 
+def numbers(text: str) -> float | list[float] | str:
+    """Returns a number, or several with commas between; other text unchanged, for the error of the check that follows."""
+    try:
+        values = [float(part) for part in text.split(",")]
+    except ValueError:
+        return text
+    return values if len(values) > 1 else values[0]
+
+
 def option(help: str, default: bool | str = True, *flags: str, **more: Any) -> Any:
     """An option with its help; ``default`` replaces the value in the help where it is text."""
     return typer.Option(*flags, help=help, show_default=default, **more)

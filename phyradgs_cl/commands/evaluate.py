@@ -5,8 +5,7 @@ import math
 from pathlib import Path
 from typing import Annotated, Any
 
-from phyradgs_cl.commands.console import AsJson, file_argument, file_option, option, say
-from phyradgs_cl.commands.options import numbers
+from phyradgs_cl.commands.console import AsJson, file_argument, file_option, numbers, option, say
 from phyradgs_cl.metrics import METRICS, printed
 from phyradgs_cl.workflow import run_evaluation
 

@@ -4,8 +4,7 @@ import json
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from phyradgs_cl.commands.console import AsJson, file_argument, file_option, option, pair_of, say
-from phyradgs_cl.commands.options import numbers
+from phyradgs_cl.commands.console import AsJson, file_argument, file_option, numbers, option, pair_of, say
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.exporters import (
     CLOUDS,

@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal, get_args
 from phyradgs_cl.acquisition import MOTIONS
 from phyradgs_cl.acquisition.readout import SIDES
 from phyradgs_cl.acquisition.scan import DETECTOR_MODELS
-from phyradgs_cl.commands.console import file_argument, file_option, option, pair_of
+from phyradgs_cl.commands.console import file_argument, file_option, numbers, option, pair_of
 from phyradgs_cl.prepare import DEFAULT_STEPS, STEPS
 from phyradgs_cl.reconstructors import DEFAULT_METHOD, METHODS
 from phyradgs_cl.removed import REMOVED
@@ -38,15 +38,6 @@ CHECKPOINT_EVERY_S = 600.0
 _STEPS = f"Corrections of the frames, of {', '.join(STEPS)} (docs: prepare.md)."
 STEPS_OF_PREPARE = option(_STEPS, DEFAULT_STEPS, metavar="NAME,...")
 Steps = Annotated[str | None, option(_STEPS, "none", metavar="NAME,...")]
-
-
-def numbers(text: str) -> float | list[float] | str:
-    """Returns a number, or several with commas between; other text unchanged, for the error of the check that follows."""
-    try:
-        values = [float(part) for part in text.split(",")]
-    except ValueError:
-        return text
-    return values if len(values) > 1 else values[0]
 
 
 def lengths(flag: str, help: str, default: str) -> Any:
