@@ -4,12 +4,12 @@
     python benchmarks/check_faults.py VOLUMES RESULTS.jsonl --table
 
 It writes one line of JSON per scan, and continues where it stopped. Scans are those of benchmarks/scans.py: 25 views of the
-rapid protocol, with TIGRE's noise at 1e4 photons and σ 10. Some faults need scans of their own:
+rapid protocol, with TIGRE's noise at 1e4 photons and σ 10. Four faults need other scans:
 
 - `short exposure`: the exposure is half of the time between frames. Twice the exposure then fits the timing, and only the
   frames show the fault.
 - `narrow cone`: the source is 100 times as far. A wrong sign of rotation leaves no trace, and `cannot tell` is right.
-- `... aside`: the panel is 8 % of its width beside the axis, and correctly stated.
+- `... aside`: the panel's middle is off the axis by 8 % of its width, and the scan states it correctly.
 - `half turn`: the views cover 180° and the fan.
 
 Scans with wrong sizes, distances or images have the grid that an import would give them."""

@@ -151,8 +151,9 @@ class System:
 
     def residual(self, volume: Any) -> Any:
         """Returns p − A x, or p − I(x), dimensionless."""
-        expected = self._model(volume, self.space.place(self.operator.frames_shape))
-        return self.space.add(self.measured, self.masked(expected), -1.0)
+        # the frames before their mask have no name: a name would keep their memory
+        expected = self.masked(self._model(volume, self.space.place(self.operator.frames_shape)))
+        return self.space.add(self.measured, expected, -1.0)
 
     def difference(self, x: Any, y: Any) -> Any:
         """Returns x − y."""
