@@ -7,7 +7,7 @@
      spline_across_x    the same along y or z; a work-item takes LANES neighbouring lines.
      warp_forward       a work-item takes LANES voxels along x.
      warp_adjoint_rows  CPUs: a work-item owns some slices of the result, to which it adds every voxel that reaches them.
-     warp_adjoint_fixed GPUs: a work-item adds its voxel to integers, whose sums do not depend on their order.
+     warp_adjoint_fixed GPUs: a group adds its voxels to integers, whose sums do not depend on their order.
      warp_adjoint_sum   adds such integers to the result.
      add_frames         adds the frames of a state to some of a stack.
    Near voxels move together. So LANES voxels meet a few more samples than one voxel does, and each sample is a vector of the
@@ -18,6 +18,7 @@
 #define BORDER 4
 #define TAPS (2 * REACH)
 #define MOST_TAPS (TAPS + 2)
+#define SLAB 2048 /* samples that a group holds: those of 8 x 8 x 4 voxels that spread by a third, 15 x 15 x 9 */
 
 #define POLE -0.26794919f /* sqrt(3) - 2 */
 
@@ -248,25 +249,62 @@ __kernel void warp_adjoint_rows(
 }
 
 #if LANES == 1
+/* Neighbouring voxels add to the same samples. So a group sums in a slab of local memory, and its items add the slab to the
+   result: a few global atomics for a voxel in place of 64. A group whose voxels move too far apart adds at once. */
 __kernel void warp_adjoint_fixed(
     __global const float *values, __global const float *fields, __global const float *shares, const int4 shape,
     const float scale,     /* integers per unit, such that no sum overflows */
     const long4 strides,
     __global int *result)  /* zeros in the layout of coefficients */
 {
-    const int first = get_global_id(0), y = get_global_id(1), z = get_global_id(2);
-    if (first >= shape.x)
-        return;
+    __local int slab[SLAB], low[3], high[3]; /* the group's first samples, least and largest along x, y and z */
+    const int3 at = (int3)((int)get_global_id(0), (int)get_global_id(1), (int)get_global_id(2));
+    const int item = (int)((get_local_id(2) * get_local_size(1) + get_local_id(1)) * get_local_size(0) + get_local_id(0));
+    const int items = (int)(get_local_size(0) * get_local_size(1) * get_local_size(2));
+    const int3 held = min(at, shape.xyz - 1);
+    const int first = held.x;
     const size_t voxels = (size_t)shape.x * shape.y * shape.z;
-    WARP_SAMPLES(y, z)
-    const float value = ZERO_OUTSIDE(scale * values[voxel]);
-    __global int *origin = result + strides.x + sz.first * strides.z + sy.first * strides.y + sx.first;
-    for (int k = 0; k < TAPS; ++k)
-        for (int j = 0; j < TAPS; ++j)
-            for (int i = 0; i < TAPS; ++i) {
-                const float part = value * (sz.weights[k] * sy.weights[j]) * sx.weights[i];
-                atomic_add(origin + k * strides.z + j * strides.y + i, convert_int_rte(part));
+    WARP_SAMPLES(held.y, held.z)
+    const float value = ZERO_OUTSIDE(all(at == held) ? scale * values[voxel] : 0.0f);
+
+    for (int k = item; k < SLAB; k += items)
+        slab[k] = 0;
+    if (item < 3) {
+        low[item] = shape.x + shape.y + shape.z;
+        high[item] = -low[item];
+    }
+    barrier(CLK_LOCAL_MEM_FENCE);
+    if (value != 0.0f) {
+        atomic_min(low, sx.first), atomic_max(high, sx.first);
+        atomic_min(low + 1, sy.first), atomic_max(high + 1, sy.first);
+        atomic_min(low + 2, sz.first), atomic_max(high + 2, sz.first);
+    }
+    barrier(CLK_LOCAL_MEM_FENCE);
+    const int3 corner = (int3)(low[0], low[1], low[2]);
+    const int3 sides = max((int3)(high[0], high[1], high[2]) - corner + TAPS, 0);
+    const bool is_near = max(max(sides.x, sides.y), sides.z) <= SLAB && (long)sides.x * sides.y * sides.z <= SLAB;
+
+    if (value != 0.0f)
+        for (int k = 0; k < TAPS; ++k)
+            for (int j = 0; j < TAPS; ++j) {
+                const float along = value * (sz.weights[k] * sy.weights[j]);
+                const int3 to = (int3)(sx.first, sy.first + j, sz.first + k);
+                __local int *near = slab + ((to.z - corner.z) * sides.y + to.y - corner.y) * sides.x + to.x - corner.x;
+                __global int *far = result + strides.x + to.z * strides.z + to.y * strides.y + to.x;
+                for (int i = 0; i < TAPS; ++i) {
+                    const int part = convert_int_rte(along * sx.weights[i]);
+                    if (is_near)
+                        atomic_add(near + i, part);
+                    else
+                        atomic_add(far + i, part);
+                }
             }
+    barrier(CLK_LOCAL_MEM_FENCE);
+    for (int k = item; is_near && k < sides.x * sides.y * sides.z; k += items)
+        if (slab[k] != 0) {
+            const int3 to = corner + (int3)(k % sides.x, k / sides.x % sides.y, k / sides.x / sides.y);
+            atomic_add(result + strides.x + to.z * strides.z + to.y * strides.y + to.x, slab[k]);
+        }
 }
 
 __kernel void warp_adjoint_sum(

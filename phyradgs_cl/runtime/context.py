@@ -230,8 +230,8 @@ class Runtime:
         shape = (items,) if isinstance(items, (int, np.integer)) else items
         if min(shape) < 1:
             return
-        given = (group,) if isinstance(group, (int, np.integer)) else group
-        local = self._fitting(kernel, (*given, *([1] * (len(shape) - len(given)))))
+        given = (*group, *([1] * (len(shape) - len(group)))) if isinstance(group, tuple) else self._sides(group, shape)
+        local = self._fitting(kernel, given)
         rounded = tuple(ceil_div(int(n), size) * size for n, size in zip(shape, local, strict=True))
         arrays = [a for a in args if isinstance(a, DeviceArray)]
         nbytes = sum(a.nbytes for a in arrays) if self.profile else 0
@@ -246,6 +246,17 @@ class Runtime:
                     self.queue.flush()  # or the driver may hand over several as one
         except cl.Error as error:
             raise self.ledger.error(f"a launch of {kernel.function_name}", error, self.queue) from error
+
+    def _sides(self, items: int, shape: Sides) -> Sides:
+        """Returns the sides of a work-group of ``items``: along the first axis, but on a GPU no longer than that axis asks
+        for, where another axis divides by what is left. Items past the end of the first axis would idle."""
+        sides = [int(items), *([1] * (len(shape) - 1))]
+        while self.pixel_items and sides[0] % 2 == 0 and sides[0] // 2 >= shape[0]:
+            axis = next((k for k in range(1, len(shape)) if shape[k] % (2 * sides[k]) == 0), None)
+            if axis is None:
+                break
+            sides[0], sides[axis] = sides[0] // 2, 2 * sides[axis]
+        return tuple(sides)
 
     def group(self, on_cpu: int = 1, on_gpu: int = 64, *kernels: Kernel) -> int:
         """Returns the work-group size for this class of device. On a GPU it is halved until it suits ``kernels``, whose

@@ -54,6 +54,18 @@ def test_a_kernel_that_allows_hardly_any_items_is_named(monkeypatch) -> None:
         rt.launch(rt.kernel("rates", "multiply_add"), 64, 3, 0.5, rt.zeros(64), group=64)
 
 
+@pytest.mark.parametrize(
+    ("shape", "sides"),
+    [((64, 5), (64, 1)), ((16, 16, 16), (16, 4, 1)), ((16, 6, 4), (16, 2, 2)), ((17, 4), (32, 2)), ((5, 3), (64, 1)), ((3,), (64,))],
+)
+def test_a_gpu_group_fills_other_axes_where_the_first_is_short(parts, shape, sides) -> None:
+    rt = Runtime(**GPU)
+    rt.launch(rt.kernel("rates", "multiply_add"), shape, 3, 0.5, rt.zeros(64), group=64)
+    rt.launch(rt.kernel("rates", "multiply_add"), shape, 3, 0.5, rt.zeros(64), group=(64,))
+    assert [group for *_, group, _ in parts] == [sides, (64, *([1] * (len(shape) - 1)))]
+    assert all(count % size == 0 for _, items, group, _ in parts for count, size in zip(items, group, strict=True))
+
+
 def test_parts_hold_every_item_once() -> None:
     for items, group in (((64,), (16,)), ((32, 7), (16, 1)), ((48, 10, 3), (16, 2, 1))):
         for pieces in (1, 2, 3, 5, 1000):

@@ -11,6 +11,7 @@ _BORDER = 4  # coefficients before and behind the volume, as in cl/warp.cl: furt
 _MOST_OWNED = 8  # slices of the result that a CPU's work-item owns; it repeats the voxels that reach another's too
 _ITEMS_PER_UNIT = 4
 _HEADROOM = 64  # by which a sum of one voxel's shares may exceed 1, as where the field contracts by 4 along each axis
+_TOGETHER = 8, 8, 4  # voxels of a GPU's group, which add to a slab of local memory
 _SAMPLES, _ADDED = 16, 64  # as long as so many samples of a ray take the 4³ coefficients of a voxel, read or added to
 _ROUNDING = 1e-3  # voxels
 
@@ -116,14 +117,14 @@ class VolumeWarp:
         if self._sums is None:
             self._sums = self.rt.empty(self._floats, np.int32)
         self.rt.fill(self._sums, 0)
-        unit, group = largest * _HEADROOM / 2**31, self.rt.group(on_cpu=1)
+        unit = largest * _HEADROOM / 2**31
         kernel = self.kernel("warp_adjoint_fixed")
         self.rt.launch(
             kernel, (nx, ny, nz), moved, self._fields, self._shares[state], self._size(),
-            np.float32(1 / unit), self._strides.vector(), self._sums, group=group, samples=_ADDED * nz * ny * nx,
+            np.float32(1 / unit), self._strides.vector(), self._sums, group=_TOGETHER, samples=_ADDED * nz * ny * nx,
         )  # fmt: skip
         sums = self._sums, np.float32(unit), np.int64(self._floats), total
-        self.rt.launch(self.kernel("warp_adjoint_sum"), self._floats, *sums, group=group)
+        self.rt.launch(self.kernel("warp_adjoint_sum"), self._floats, *sums, group=self.rt.group())
 
     def kernel(self, name: str) -> Kernel:
         """Returns a kernel of cl/warp.cl."""
