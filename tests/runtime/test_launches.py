@@ -56,7 +56,10 @@ def test_a_kernel_that_allows_hardly_any_items_is_named(monkeypatch) -> None:
 
 @pytest.mark.parametrize(
     ("shape", "sides"),
-    [((64, 5), (64, 1)), ((16, 16, 16), (16, 4, 1)), ((16, 6, 4), (16, 2, 2)), ((17, 4), (32, 2)), ((5, 3), (64, 1)), ((3,), (64,))],
+    [
+        ((64, 5), (64, 1)), ((16, 16, 16), (16, 4, 1)), ((16, 6, 4), (16, 2, 2)), ((17, 4), (32, 2)), ((5, 3), (64, 1)),
+        ((3,), (64,)),
+    ],
 )
 def test_a_gpu_group_fills_other_axes_where_the_first_is_short(parts, shape, sides) -> None:
     rt = Runtime(**GPU)
