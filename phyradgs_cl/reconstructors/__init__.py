@@ -1,6 +1,6 @@
-"""Methods: one file each, one signature for all, ``(scan, options, rt, seed, report) → Reconstruction``.
+"""Methods: a file or a folder each. ``run.py`` runs a plan (``reconstruct``), ``method.py`` lists the methods (``METHODS``).
 
-They are imported when they are used: a command that only holds its signals does not wait for them."""
+Modules are imported when they are used: a command that only holds its signals does not wait for them."""
 
 import lazy_loader
 

@@ -7,7 +7,7 @@ import numpy as np
 from phyradgs_cl.acquisition.readout import Readout
 from phyradgs_cl.fields import triple
 from phyradgs_cl.operators.bricks import Brick, cut, whole
-from phyradgs_cl.operators.rays.launches import owner_steps
+from phyradgs_cl.operators.rays.general import owner_steps
 from phyradgs_cl.operators.rays.layout import RayLayout
 from phyradgs_cl.operators.rays.subrays import SINGLE, launch_means, launch_spread, means, spread
 from phyradgs_cl.operators.rays.upright import columns_floats, turn_volume

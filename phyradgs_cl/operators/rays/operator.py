@@ -4,9 +4,9 @@ Each frame has a table of time cells: poses, the detector lines that each pose s
 average of the line integrals from the poses that serve its line. ``forward`` projects batches of frames (``RayMemory``),
 one brick of the volume after the other if the volume does not fit on the device; ``adjoint`` is its exact transpose.
 
-Two sets of kernels compute the same samples. The general ones follow each ray (``launches.py``). The upright ones serve
-CPUs and scans whose detector columns run nearly along z: they project each pose once, into a slot, and average slots to
-frames (``upright.py``, ``slots.py``)."""
+Two sets of kernels compute the same samples. The general ones follow each ray (``general.py``): on every GPU, and on CPUs
+where columns lean. The upright ones need a CPU and detector columns that run nearly along z: they project each pose once,
+into a slot, and average slots to frames (``upright.py``, ``slots.py``)."""
 
 from collections.abc import Iterator, Sequence
 from copy import copy
@@ -17,7 +17,7 @@ import numpy as np
 from phyradgs_cl.acquisition.time_cells import TimeCells
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
-from phyradgs_cl.operators.rays.launches import launch_adjoint, launch_forward
+from phyradgs_cl.operators.rays.general import launch_adjoint, launch_forward
 from phyradgs_cl.operators.rays.layout import RayCells, RayLayout
 from phyradgs_cl.operators.rays.memory import RayMemory
 from phyradgs_cl.operators.rays.slots import Slots, UprightPoses, merge_slots, split_slots

@@ -1,7 +1,8 @@
 """The ray-driven projector for detector columns nearly parallel to the volume's z, and poses that serve many lines.
 
 The rays of such a column share most of their work. Each pose is projected once, into a slot for its part of the panel;
-frames are weighted averages of slots (``slots.py``). Samples are the same as those of ``launches.py``."""
+frames are weighted averages of slots (``slots.py``). Samples are the same as those of ``general.py``. Kernels:
+``cl/rays_upright.cl``, ``rays_upright_adjoint.cl``."""
 
 import math
 from collections.abc import Sequence

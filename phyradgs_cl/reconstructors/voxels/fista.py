@@ -6,7 +6,9 @@ of a subset, times the number of subsets, stands for that of all frames (Kim, Ra
 34 (2015) 167). L bounds the norm of AᵀA.
 
 The last 2/5 of the passes run on smaller voxels, whose means make up most of the result (``stages.py``). The passes before
-them only bring a first volume: they have more subsets, and few times in an exposure."""
+them only bring a first volume: they have more subsets, and few times in an exposure.
+
+A run: ``MethodRun``, ``Stages``, ``Loop``, ``Iterations.step``, ``Fista.step``, ``System``, ``RayOperator``, a launch."""
 
 import logging
 import math
@@ -27,8 +29,8 @@ from phyradgs_cl.reconstructors.result import Reconstruction
 from phyradgs_cl.reconstructors.voxels import priors
 from phyradgs_cl.reconstructors.voxels.priors import Denoiser, Prior, PriorWeight, frame_error
 from phyradgs_cl.reconstructors.voxels.run import Algorithm, Iterations, IterativeOptions, MethodRun
-from phyradgs_cl.reconstructors.voxels.sart import OrderedSubsets
 from phyradgs_cl.reconstructors.voxels.stages import Stage, Stages, merge_subvoxels, repeated
+from phyradgs_cl.reconstructors.voxels.subsets import OrderedSubsets
 from phyradgs_cl.reconstructors.voxels.system import System
 from phyradgs_cl.removed import refuse_removed
 from phyradgs_cl.runtime import Runtime
@@ -113,7 +115,7 @@ class Accelerated(Algorithm):
 
     def accept(self, point: Any, volume: Any) -> None:
         """Takes the result of the step from ``point`` as the present volume."""
-        # the step leads back against the last movement: momentum carried the point past a minimum
+        # gradient restart: the step points against the last movement, so momentum carried the point past a minimum
         is_uphill = self.system.space.turn(point, volume, self.volume) > 0
         self.momentum = 1.0 if is_uphill else self.next_momentum
         self.previous, self.volume = self.volume, volume

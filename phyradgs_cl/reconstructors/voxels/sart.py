@@ -1,8 +1,7 @@
-"""SIRT, SART and OS-SART: the volume is corrected after all frames, after every frame, or after every few. Ordered subsets,
-also those of ``fista``.
+"""SIRT, SART and OS-SART: the volume is corrected after all frames, after every frame, or after every few.
 
-SIRT: Gilbert, J. Theor. Biol. 36 (1972) 105. SART: Andersen and Kak, Ultrasonic Imaging 6 (1984) 81. Ordered subsets: H. M.
-Hudson and R. S. Larkin, IEEE Trans. Med. Imaging 13 (1994) 601, Wang and Jiang, J. X-Ray Sci. Technol. 12 (2004) 169."""
+SIRT: Gilbert, J. Theor. Biol. 36 (1972) 105. SART: Andersen and Kak, Ultrasonic Imaging 6 (1984) 81. OS-SART: Wang and
+Jiang, J. X-Ray Sci. Technol. 12 (2004) 169."""
 
 import math
 from collections.abc import Iterator
@@ -13,46 +12,13 @@ import numpy as np
 
 from phyradgs_cl import checks
 from phyradgs_cl.acquisition import Scan
-from phyradgs_cl.checks import ceil_div, ranged
+from phyradgs_cl.checks import ranged
 from phyradgs_cl.reconstructors.method import Method
 from phyradgs_cl.reconstructors.voxels.run import Algorithm, IterativeOptions, voxel_method
+from phyradgs_cl.reconstructors.voxels.subsets import spread_order
 from phyradgs_cl.reconstructors.voxels.system import System, column_weights, row_weights
 
-_GROWTH = 1.2  # of the residual over its minimum: subsets whose steps diverge that much are too small
 _WEIGHT_CACHE_BYTES = 1 << 29
-
-
-def spread_order(count: int) -> list[int]:
-    """Returns 0 … count−1 in steps near the golden section of count, so that each is far from the few before it."""
-    step = next(s for s in range(max(round(0.618 * count), 1), 2 * count + 1) if np.gcd(s, count) == 1)
-    return [(i * step) % count for i in range(count)]
-
-
-class OrderedSubsets:
-    """A system in ``count`` subsets: every count-th frame, in an order that spreads them over the turn."""
-
-    def __init__(self, system: System, count: int) -> None:
-        self.system, self.least_residual = system, float("inf")
-        self.split(min(count, system.frames))
-
-    def __iter__(self) -> Iterator[System]:
-        return iter(self._systems)
-
-    def __len__(self) -> int:
-        return len(self._systems)
-
-    def split(self, count: int) -> None:
-        """Divides the frames into ``count`` subsets."""
-        frames = self.system.frames
-        self._systems = [self.system.subset(range(first, frames, count)) for first in spread_order(count)]
-
-    def join_if_diverging(self, residual: float) -> bool:
-        """Joins subsets two by two if a pass with this residual shows that their steps diverge. Returns whether it did."""
-        diverges = residual > _GROWTH * self.least_residual and len(self) > 1
-        if diverges:
-            self.split(ceil_div(len(self), 2))
-        self.least_residual = residual if diverges else min(self.least_residual, residual)
-        return diverges
 
 
 @dataclass(frozen=True)

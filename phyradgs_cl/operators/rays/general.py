@@ -1,4 +1,6 @@
-"""Launches of the ray-driven projector (Joseph) and its matched adjoint, over the time cells of many frames at a time."""
+"""Launches of the general ray-driven projector (Joseph) and its matched adjoint, over the cells of many frames at a time.
+
+Kernels: ``cl/rays.cl``, ``rays_adjoint_gpu.cl``, ``rays_adjoint_cpu.cl``."""
 
 import math
 from collections.abc import Iterator

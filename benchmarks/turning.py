@@ -1,0 +1,43 @@
+"""Measures what a person chooses at the scanner, at equal dose: frames, arc of an exposure, and readout.
+
+    python benchmarks/turning.py VOLUMES RESULTS.jsonl --names bonsai,engine
+    python docs/make_results.py      # the table in docs/scanner.md
+
+All scans of a volume are one turn with the same photons in all. There is a line per scan and motion: the PSNR in dB of the
+default method, with the motion known and ignored. ``arcs``: frames with the arc of an exposure in degrees; where frames
+times arc is less than 360, the beam is pulsed. Runs in the file are not made again."""
+
+from scans import append, files_of, read_lines, runs_parser
+
+from phyradgs_cl.api import compare, reconstruct, simulate
+from phyradgs_cl.runtime import Runtime
+
+PHOTONS = 25 * 1e4  # per pixel, over all frames
+GLOBAL = [(25, 14.4), (50, 7.2), (100, 3.6), (200, 1.8), (25, 7.2), (25, 3.6), (25, 1.8), (50, 3.6), (50, 1.8), (100, 1.8)]
+ROLLING = [(frames, arc, ratio) for ratio in (0.86, 4.0) for frames, arc in ((25, 14.4), (50, 7.2), (100, 3.6))]
+SCANS = [(*pair, 0.0) for pair in GLOBAL] + ROLLING
+
+
+def main() -> None:
+    given = runs_parser(__doc__).parse_args()
+    rt = Runtime(given.device)
+    there = read_lines(given.results)
+    for name, path in files_of(given.volumes, given.names, 64).items():
+        for seed in given.seeds:
+            for frames, arc_deg, ratio in SCANS:
+                key = {"volume": name, "seed": seed, "frames": frames, "arc_deg": arc_deg, "readout_ratio": ratio}
+                made = [line["motion"] for line in there if key.items() <= line.items()]
+                left = [motion for motion in ("per-row", "static") if motion not in made]
+                if not left:
+                    continue
+                scan = simulate(
+                    path, views=frames, exposure_deg=arc_deg, readout_ratio=ratio, size=64, noise="tigre",
+                    dose=PHOTONS / frames, seed=seed, device=rt,
+                )  # fmt: skip
+                for motion in left:
+                    volume = reconstruct(scan, motion=motion, device=rt, report=False).volume
+                    append(given.results, {**key, "motion": motion, "psnr_db": compare(volume, scan.reference)["psnr_db"]})
+
+
+if __name__ == "__main__":
+    main()
