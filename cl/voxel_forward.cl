@@ -72,7 +72,7 @@ __kernel void voxel_forward(
         for (int z = z_lo; z <= z_hi; ++z)
             for (int y = y_lo; y <= y_hi; ++y) {
                 const voxel_row r = voxel_row_at(voxel_record, y, z);
-                if (r.k > limit) /* a corner of the box */
+                if (r.k > limit) /* the row meets only a corner of the box, beyond the cutoff */
                     continue;
                 __global float *row = volume + IMAGE_GUARD + ((size_t)z * shape.y + y) * pitch;
                 for (int x = x_lo; x <= x_hi; x += LANES)
