@@ -20,9 +20,9 @@ _MOVES = 0.1  # a voxel moves if its squared displacement is at least so much of
 class MotionStates:
     """States of ``deformation``, and which of them stand for a time.
 
-    fields_mm: (R, nz, ny, nx, 3) displacements of unit weight on ``grid``, components x, y, z. weights: (K, R), the fields' in
-    each state. metric: (R, R); the distance of two weights is √(dᵀ metric d), an RMS displacement in voxels. blends: whether two
-    states are blended for a time between them; else the nearest one stands for it."""
+    fields_mm: (R, nz, ny, nx, 3) displacements of unit weight on ``grid``, components x, y, z. weights: (K, R), the
+    fields' in each state. metric: (R, R); the distance of two weights is √(dᵀ metric d), an RMS displacement in voxels.
+    blends: whether two states are blended for a time between them; else the nearest one stands for it."""
 
     deformation: Deformation
     grid: Grid

@@ -33,7 +33,7 @@ from phyradgs_cl.reconstructors.splats.start import box_of, first_population, in
 from phyradgs_cl.reconstructors.splats.step import Batch, FrameStep, sharing_of
 from phyradgs_cl.runtime import Runtime
 
-REPORT_EVERY, LEAST_RECORDED = 50, 20
+REPORT_EVERY, LEAST_RECORDED = 50, 20  # iterations between reports, and lines of a short run's record
 
 
 class SplatRun:

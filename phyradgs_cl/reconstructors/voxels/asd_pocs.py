@@ -78,5 +78,5 @@ def _started(system: System, options: AsdPocsOptions, run: MethodRun) -> AsdPocs
 
 METHOD = voxel_method(
     "asd-pocs", AsdPocsOptions(), _started, frames=2,
-    volumes=lambda scan, options: held_volumes(scan, options) + 4,  # of the steps
+    volumes=lambda scan, options: held_volumes(scan, options) + 4,  # 4: for the balance of the steps
 )
