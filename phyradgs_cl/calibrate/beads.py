@@ -30,7 +30,7 @@ _FEWEST_RAYS, _MOST_RAYS = 2, 6  # rays along each side of a pixel or a block, a
 _BLUR_PX = 0.8  # with less blur, differences of sharp edges would show single rays, which are half a pixel apart
 _LEAST_ZEROS, _ZEROS_PX = 0.2, 5  # fraction of zeros from which air was clipped; side of the averaged blocks
 _BACKGROUND = 4  # cosines along each side of a frame: they describe holder, scatter and drift of the tube
-_STEP_PX = 0.25
+_STEP_PX = 0.25  # movement of a frame by half a central difference of a signal
 _MOST_PX = 1.5  # largest movement of a frame by a step of the placement
 _SETTLED_PX, _LINEAR_PX = 0.01, 0.3  # size of the last step; the largest step after which the signals are still valid
 
