@@ -133,6 +133,6 @@ def correlated(channels: np.ndarray, filters: np.ndarray) -> np.ndarray:
 
 
 def correlated_back(responses: np.ndarray, filters: np.ndarray) -> np.ndarray:
-    """The transpose of ``correlated``, from (i, z, y, x) to (c, z + 2, y + 2, x + 2)."""
+    """Applies the transpose of ``correlated``, from (i, z, y, x) to (c, z + 2, y + 2, x + 2)."""
     padded = np.pad(responses, ((0, 0), (2, 2), (2, 2), (2, 2)))
     return correlated(padded, filters.swapaxes(0, 1)[..., ::-1, ::-1, ::-1])
