@@ -188,7 +188,7 @@ __kernel void dot_whole(
         whole[0] = add ? sum_add(whole[0], own) : own;
 }
 
-/* Writes each work-group's largest x, or |x| if `absolute`. A second launch over these parts gives the result. */
+/* Writes each work-group's largest x, or |x| if `absolute`. The host takes the largest of these parts. */
 __kernel void largest_parts(
     __global const float *x, const int absolute, const long count, const long first_by, const long step, const long span,
     __local float *scratch, __global float *parts)

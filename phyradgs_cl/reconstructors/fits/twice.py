@@ -15,11 +15,11 @@ from phyradgs_cl.prepare.step import fill_masked
 from phyradgs_cl.reconstructors.fdk.weights import fan_angle, pixel_rays
 from phyradgs_cl.reconstructors.fits.axis import AxisShift
 
-_SMOOTHING_PX = 1.0  # σ of the smoothing along rows: interpolation lowers noise between pixels, which would draw the shift there
+_SMOOTHING_PX = 1.0  # σ of a smoothing of rows: interpolation lowers noise between pixels, which would draw the shift there
 _COARSE_COLUMNS = 128  # columns of the coarse frames, at most
 # trial shifts to either side, and their step; then about the best of them, in coarse pixels
 _MOST_PX, _STEP_PX, _NEAR_PX = 16.0, 0.5, 2.0
-_FEWEST_VIEWS, _MOST_VIEWS, _WIDEST_STEP_RAD = 24, 360, math.radians(10.0)  # views of a scan; views compared; step between views
+_FEWEST_VIEWS, _MOST_VIEWS, _WIDEST_STEP_RAD = 24, 360, math.radians(10.0)  # views of a scan, views compared, step of views
 _MOST_ROWS, _MOST_PAIRS = 32, 48  # rows, and pairs of opposite rays in a row, that are compared
 _LEAST_PX = 1.0  # least distance from the axis to the middle of the panel's outer column
 _BLOCKS = 12  # blocks of views of the jackknife
