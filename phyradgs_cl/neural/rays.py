@@ -32,7 +32,7 @@ class ExposureRays:
 
     @classmethod
     def of_cells(cls, table: TimeCells, grid: Grid) -> "ExposureRays":
-        """Returns the rays of still cells in mm, for a volume on ``grid`` in mm.
+        """Returns the rays of cells of fixed pose in mm, for a volume on ``grid`` in mm.
 
         Raises InputError for a table whose lines have different numbers of cells or different weights."""
         centre, unit = np.array(grid.offset_mm[::-1]), grid.half_longest_mm
