@@ -40,7 +40,7 @@ __kernel void rays_adjoint(
     __local int range[2]; /* no cell outside of this range sees the block */
     const int item = (int)get_local_id(0), items = (int)get_local_size(0);
     const int4 block = (int4)((int)get_global_id(0) / items * BLOCK, (int)get_global_id(1) * BLOCK,
-                              (int)get_global_id(2) * BLOCK_Z, 0); /* by global id: a launch may have a part of the groups */
+                              (int)get_global_id(2) * BLOCK_Z, 0); /* by global id: launches may hold some groups only */
     const int4 own = block + (int4)(item % BLOCK, (item / BLOCK) % BLOCK, item / (BLOCK * BLOCK), 0);
     const int4 corner = origin + block, voxel = origin + own; /* indices in the grid; own, block: in this volume */
     const int inside = own.x < shape.x && own.y < shape.y && own.z < shape.z;

@@ -128,7 +128,7 @@ __kernel void splat_backward_rows(ARGUMENTS)
 #else
 __kernel void splat_backward_group(ARGUMENTS)
 {
-    const int g = (int)get_global_id(0) / ACROSS, item = GROUP_ITEM; /* a launch may have a part of the groups */
+    const int g = (int)get_global_id(0) / ACROSS, item = GROUP_ITEM; /* launches may hold some work-groups only */
     __local float tree[SUM_COUNT * GROUP], cell[CELL];
     __local int record_as_int[RECORD]; /* ints, because a device may flush ints copied as floats */
     __local const float *splat_record = (__local const float *)record_as_int;

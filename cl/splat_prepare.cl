@@ -221,7 +221,7 @@ __kernel void splat_prepare_moving(
         /* The path in widths of the splat: its length and direction. */
         const vf wide_u = s.l11 * path.u + s.l12 * path.v, wide_v = s.l22 * path.v;
         const vf speed = sqrt(wide_u * wide_u + wide_v * wide_v);
-        const vi moves = speed > 1e-6f; /* otherwise any direction will do */
+        const vi moves = speed > 1e-6f; /* without motion any direction will do */
         const vf inv_speed = 1.0f / V_PICK(1.0f, speed, moves);
         const vf cosine = V_PICK(1.0f, wide_u * inv_speed, moves), sine = V_PICK(0.0f, wide_v * inv_speed, moves);
         vf reach2 = (vf)(MAXFLOAT);

@@ -11,9 +11,9 @@
 #define SUM_ZZ 2         /* sums of dL/d(num) times z^2, z across and across^2 */
 #define SUM_ZC 3
 #define SUM_CC 4
-#define SUM_Z 5          /* for the centre, through num */
+#define SUM_Z 5          /* sums of dL/d(num) times z and across, for dL/d(centre) */
 #define SUM_C 6
-#define SUM_TZ 10        /* for the path, through num */
+#define SUM_TZ 10        /* the same with the place on the path as a factor, for dL/d(path) */
 #define SUM_TC 11
 #else
 #define SUMS 0
@@ -21,6 +21,6 @@
 #define SUM_UU 2         /* dL/dS11, half of dL/dS12, dL/dS22 */
 #define SUM_UV 3
 #define SUM_VV 4
-#define SUM_U 5          /* for the centre, through num */
+#define SUM_U 5          /* sums of dL/d(num) times u and v from the centre, for dL/d(centre) */
 #define SUM_V 6
 #endif

@@ -51,7 +51,7 @@ class Parameter:
         return min(step, _TIMING_STEP * self.stated(scan) or step) if self.is_timing else step
 
     def is_known(self, deviation: float) -> bool:
-        """True where a value with this standard deviation, in the field's unit, is useful."""
+        """Returns whether a value with this standard deviation, in the field's unit, is useful."""
         return self.unit != "deg" or deviation < _LEAST_KNOWN_RAD
 
     def lowest(self, scan: Scan) -> float:

@@ -11,7 +11,7 @@ from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields.volume import MOST_VOXELS, Grid, triple
 
 _LARGEST_MM = 1e9  # largest length that an option takes; its inverse is the smallest
-_ROUNDING = 1e-6  # in voxels: a box that ends so near to a voxel's face ends at that face
+_ROUNDING = 1e-6  # distance in voxels between a box's end and a voxel's face below which they are one
 _TYPED = 0.01  # the same for a typed box and the scan's voxels, whose sides are rarely round numbers
 
 

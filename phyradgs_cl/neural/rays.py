@@ -13,7 +13,7 @@ from phyradgs_cl.acquisition.time_cells import TimeCells
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
 
-_BEYOND_VOLUME = 2.0  # in half-sides: further away than any corner of the volume
+_BEYOND_VOLUME = 2.0  # a distance in half-sides that is beyond every corner of the volume
 Field = Callable[[torch.Tensor], torch.Tensor]
 
 

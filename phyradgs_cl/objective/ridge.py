@@ -84,7 +84,7 @@ class RidgeStep:
     def __call__(
         self, volume: SameArray, sigma: float, step: float, *, nonnegative: bool, out: DeviceArray | None = None
     ) -> SameArray:
-        """Returns v − ``step`` ∇R(v), float32; ``sigma`` in the unit of v (z, y, x). ``out``: as of ``DctProx``."""
+        """Returns v − ``step`` ∇R(v), float32; ``sigma`` in the unit of v (z, y, x). ``out``: as in ``DctProx``."""
         nz, ny, nx = self.shape
         observed, result = beside(self.rt, volume, out)
         padded = self._padded, Strides(GUARD, ny * pitch_of(nx), pitch_of(nx))

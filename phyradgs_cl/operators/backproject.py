@@ -16,7 +16,7 @@ from phyradgs_cl.operators.rays.layout import voxel_matrices
 from phyradgs_cl.runtime import Array, DeviceArray, Room, Runtime, SameArray, attempts
 from phyradgs_cl.runtime.layout import GUARD, Strides, move, padded_zeros, pitch_of, unpad_rows
 
-_VIEWS_PER_LAUNCH = 64  # a work-item reads a few lines of every view: they should stay in a core's cache
+_VIEWS_PER_LAUNCH = 64  # views of a launch, at most: a work-item reads a few lines of each, which should stay in the cache
 _BYTES_A_LAUNCH = 1 << 28  # upper limit for the frames that are uploaded together
 _VIEWS_SHARE = 0.25  # share of the free device memory for the frames that are uploaded together
 _BLOCK_VOXELS = 128  # voxels along z per work-item of the upright kernel, at most
@@ -24,7 +24,7 @@ _COLUMN_ROWS = 512  # detector rows that such a block may project to
 # columns are upright where u·depth and depth change by less than so much of the depth over the volume's height
 _UPRIGHT = 1e-7
 _MOST_LEAN = 0.25  # largest lean: columns crossed per row crossed along z; beyond it the general kernel is faster
-LINE_SAMPLES = 4  # a voxel of a view with a pose for every line takes as long as so many samples of a view with one pose
+LINE_SAMPLES = 4  # work of a voxel in a view with a pose for every line, in samples of a view with one pose
 _WIDEST = 16  # voxels of the widest vector, which may reach beyond the end of a column
 Arguments = tuple[DeviceArray, DeviceArray, DeviceArray, np.int32, np.int32, np.int32, np.int32, np.int64]
 

@@ -1,6 +1,6 @@
 """Methods: one file each, one signature for all, ``(scan, options, rt, seed, report) → Reconstruction``.
 
-They are imported when they are used: a command that only holds its signals does not wait for them."""
+They are imported when they are used, so that commands without a reconstruction do not wait for them."""
 
 import lazy_loader
 

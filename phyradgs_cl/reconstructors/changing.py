@@ -73,7 +73,7 @@ def changing(scan: Scan, options: ChangingOptions, rt: Runtime, **arguments: Any
 
 
 def state_times_s(scan: Scan, count: int) -> np.ndarray:
-    """Returns the mean times (K,) in s of equal shares of the frames, at most one for each frame, and so none in a pause."""
+    """Returns the times (K,) in s of states: means over equal shares of the frames, each with a frame or more."""
     middles_s = np.unique(np.asarray(scan.frame_start_s, np.float64)) + scan.shutter.span_s / 2
     shares = np.array_split(middles_s, min(count, len(middles_s)))
     return np.array([share.mean() for share in shares])

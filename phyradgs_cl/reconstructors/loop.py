@@ -135,7 +135,7 @@ class Loop:
         return False
 
     def _reaches(self, every: int, before: int) -> bool:
-        """True if the step from iteration ``before`` has reached a multiple of ``every``, or the end."""
+        """Returns whether the step from iteration ``before`` has reached a multiple of ``every``, or the end."""
         now = self.method.iteration
         return now // every > before // every or now == self.method.iterations
 

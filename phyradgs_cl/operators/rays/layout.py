@@ -136,7 +136,7 @@ class RayCells:
     weight_at: DeviceArray
     is_parallel: bool
     is_across: bool
-    most_per_line: int  # cells that may serve a line of a frame
+    most_per_line: int  # most cells that serve one line of a frame
 
     @classmethod
     def upload(

@@ -95,7 +95,7 @@ class RayMemory:
         return cut(layout.grid.shape, steps, needs, room, share), frames
 
     def batches(self, count: int) -> Iterator[slice]:
-        """Yields runs of frames that fit on the device together."""
+        """Yields slices of consecutive frames that fit on the device together."""
         self.plan()
         for start in range(0, count, self._batch):
             yield slice(start, min(start + self._batch, count))

@@ -14,7 +14,7 @@ from phyradgs_cl.runtime.layout import GUARD, pad_rows, padded_zeros, pitch_of, 
 RECORD_FLOATS = 20  # floats of a Gaussian that ``voxel_prepare`` writes
 SUM_FLOATS = 16  # floats of a Gaussian's sums over voxels
 _TILE_ROWS = 8  # lines along z of a tile
-_DEFAULT_BRICK_BYTES = 1 << 28  # of voxels at a time on the device
+_DEFAULT_BRICK_BYTES = 1 << 28  # bytes of voxels that the device holds at a time
 
 
 class Voxeliser:

@@ -248,7 +248,7 @@ def _taps(displacement: np.ndarray) -> Iterator[tuple[tuple[np.ndarray, ...], np
 
 
 def moved_rows(rows: np.ndarray, deformation: Deformation, weights: np.ndarray) -> np.ndarray:
-    """Returns parameter rows (11, G) of a reference in one state, of ``weights`` (R,); the peaks of densities stay."""
+    """Returns parameter rows (11, G) of a reference in one state, of ``weights`` (R,); densities keep their peaks."""
     mean = rows[MEAN].T + deformation.inverse_mm(rows[MEAN].T, weights)
     for _ in range(2):  # Newton steps: differences of frames need more digits
         off = mean + deformation.displacement_mm(mean, weights) - rows[MEAN].T

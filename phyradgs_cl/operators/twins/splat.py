@@ -84,7 +84,7 @@ def _affine(
     row: np.ndarray, precision: np.ndarray, pose: np.ndarray, detector_shape: tuple[int, int],
     cutoff_sigma: float,
 ) -> np.ndarray:
-    """R2-Gaussian's splat: covariance through the Jacobian at the centre, ray factor of the central ray."""
+    """Returns R2-Gaussian's splat: covariance through the Jacobian at the centre, amplitude of the central ray."""
     source, eu, ev = pose[:3], pose[6:9], pose[9:12]
     centre = row[:3] - source
     inverse = np.linalg.inv(np.stack([eu, ev, pose[3:6] - source], -1))
@@ -134,7 +134,7 @@ def voxel_field(
     return volume
 
 
-_PANELS, _NODES = 6, 12  # of the quadrature in time: panels, and Gauss–Legendre nodes of each
+_PANELS, _NODES = 6, 12  # panels of the quadrature in time, and Gauss–Legendre nodes of each
 
 
 @dataclass(frozen=True)

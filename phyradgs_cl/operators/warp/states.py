@@ -70,7 +70,7 @@ class MotionStates:
         return self.count == 1 and self.is_still(0)
 
     def is_still(self, state: int) -> bool:
-        """Whether nothing is displaced in a state."""
+        """Returns whether nothing is displaced in a state."""
         return not np.any(self._has_effect & (self.weights[state] != 0))
 
     @cached_property

@@ -116,7 +116,7 @@ def fdk(
         raise InputError("--object-motion", "extrapolate=reprojected, of an object at rest", expected, remedy)
     frames, numbers = _measured_frames(scan)
     poses = [options.motion.cells(scan, f).still().line_poses() for f in numbers]
-    # a frame at rest among frames with a pose for every line repeats its own
+    # beside frames with a pose for every line, a frame with one pose repeats it
     lines = max(map(len, poses))
     pose = np.concatenate(poses) if lines == 1 else np.stack([np.broadcast_to(p, (lines, 12)) for p in poses])
     check_beam(method, pose, scan.is_parallel)

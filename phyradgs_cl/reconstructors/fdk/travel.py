@@ -58,8 +58,8 @@ def seen_volume(
 ) -> np.ndarray:  # fmt: skip
     """Returns the volume (z, y, x) of filtered frames (F, rows, columns) in which every voxel counts the views that see it.
 
-    pose (F, 12) or (F, lines, 12) mm. ``counted``: the weight of a view's pixels by which opposite rays share. Both
-    backprojections weigh views by their angular cells; ``backproject_seen`` divides by the distance once."""
+    pose (F, 12) or (F, lines, 12) mm. ``counted`` returns the weights (rows, columns) by which a view's rays share with
+    opposite ones. Both backprojections weigh views by angular cells; ``backproject_seen`` divides by the distance once."""
     by_pixel, shape = pose_of_pixels(pose, axis), frames.shape[1:]
     angle_rad, pace = _directions(by_pixel[:, [by_pixel.shape[1] // 2]], shape, is_parallel)
     turn_rad = 2 * np.pi if is_displaced else np.pi  # opposite rays are one where both sides are measured alike

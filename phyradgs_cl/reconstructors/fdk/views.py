@@ -299,12 +299,12 @@ def _check_orbit(pose: np.ndarray) -> None:
     canonical = weights.turned_back(middle, azimuth_rad(middle)).reshape(-1, 4, 3)
     usual = np.median(canonical, axis=0)
     length_mm = float(np.linalg.norm(usual[1] - usual[0]))
-    off_mm = canonical[:, :2] - usual[:2]  # of source and panel
-    aside_mm = off_mm - np.eye(3)[2] * off_mm[:, :1, 2:]  # without the source's travel, of which a voxel misses views only
+    off_mm = canonical[:, :2] - usual[:2]  # offsets of source and panel from their usual places
+    aside_mm = off_mm - np.eye(3)[2] * off_mm[:, :1, 2:]  # less the source's travel along z, by which voxels only miss views
     above_deg = float(np.rad2deg(np.arctan2(abs(usual[0, 2]), np.hypot(*usual[0, :2]))))
 
     def distances_beyond(most: float, most_deg: float, of_mm: np.ndarray) -> str:
-        """Names the distances that are too large."""
+        """Returns in words which distances are too large."""
         off = float(np.linalg.norm(of_mm, axis=-1).max())
         parts = (
             f"{100 * off / length_mm:.0f} % of their distance off a circle about z",

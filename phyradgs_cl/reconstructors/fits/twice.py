@@ -23,7 +23,7 @@ _FEWEST_VIEWS, _MOST_VIEWS, _WIDEST_STEP_RAD = 24, 360, math.radians(10.0)  # vi
 _MOST_ROWS, _MOST_PAIRS = 32, 48  # rows, and pairs of opposite rays in a row, that are compared
 _LEAST_PX = 1.0  # least distance from the axis to the middle of the panel's outer column
 _BLOCKS = 12  # blocks of views of the jackknife
-_BIAS_PX = 0.05  # measured errors of half-fans without noise, with features of two pixels
+_BIAS_PX = 0.05  # error of the shift beside noise, measured with half-fans and features of two pixels
 _NONE = AxisShift(math.nan, math.nan, np.empty(0))
 
 

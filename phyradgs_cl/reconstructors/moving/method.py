@@ -101,7 +101,7 @@ class FieldSearch:
 
     @property
     def finished(self) -> str | None:
-        """The first rounds of an object at rest find no step that lowers the residual."""
+        """An object is at rest where the first two rounds found no step of the field that lowers the residual."""
         return _AT_REST if self.iteration >= 2 and not self.field.control_mm.any() else None
 
     def step(self) -> None:
@@ -197,7 +197,7 @@ def _difference(one: MotionField, other: MotionField) -> float:
 
 @dataclass(frozen=True)
 class MovingOptions(FistaOptions):
-    """iterations: rounds of the search for the field, a sixth of them, and passes of ``fista`` after it. bending: stiffness
+    """iterations: a sixth are rounds of the search for the field, the rest passes of ``fista`` after it. bending: stiffness
     of the field, relative to how strongly frames respond to it. gating: what the motion follows at first: ``auto`` (the
     signal of the frames, where it repeats), ``free`` (any smooth curve in time), ``scan`` (the signal or phase that the scan
     states), or a file, NAME.csv (``load_gating``). The other options are those of ``fista``."""
@@ -236,7 +236,7 @@ class _Field:
 
     @property
     def for_passes(self) -> Deformation | None:
-        """None where nothing moves."""
+        """The deformation, or None where nothing moves."""
         return None if self.deformation is None or self.deformation.is_still else self.deformation
 
     def take(self, search: Any) -> None:
@@ -302,7 +302,7 @@ def _with_field_in_progress(one: _Field, progress: Progress) -> Progress:
 
 
 def _motion_facts(one: _Field, signal: MotionSignal, scan: Scan) -> dict[str, object]:
-    """Returns what was found, for the result: displacements relative to the mean place of matter in the scan."""
+    """Returns what was found, for the result's facts: displacements relative to the mean place of matter in the scan."""
     moves = one.for_passes is not None
     follows = signal.knot_s is not None
     facts: dict[str, object] = {"moves": moves, "follows": follows, "period_s": signal.period_s, "gain": one.gain}

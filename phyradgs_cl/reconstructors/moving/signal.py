@@ -176,7 +176,7 @@ def _evenly(times_s: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.nda
 
 
 def _shroud(scan: Scan) -> np.ndarray:
-    """Returns the mean of the valid pixels (F, rows) of every detector row."""
+    """Returns the means (F, rows) over the valid pixels of every detector row."""
     valid = np.broadcast_to(scan.valid, scan.projections.shape)
     return np.asarray((scan.projections * valid).sum(2, dtype=np.float64) / np.maximum(valid.sum(2), 1))
 
@@ -188,7 +188,7 @@ def _gantry(scan: Scan, times_s: np.ndarray, order: np.ndarray) -> np.ndarray:
     angle_rad = np.arctan2(towards[:, 1], towards[:, 0])
     harmonics = [wave(k * angle_rad) for k in range(1, _HARMONICS + 1) for wave in (np.cos, np.sin)]
     drift = (times_s - times_s[0]) / max(times_s[-1] - times_s[0], 1e-300)
-    most = max(1, len(times_s) // 4)  # of few frames they would explain everything
+    most = max(1, len(times_s) // 4)  # so many terms at most: more would explain all of few frames
     return np.stack([np.ones(len(times_s)), drift, *harmonics][:most], -1)
 
 

@@ -120,7 +120,7 @@ def tables_of(
             needed = segments_for_object(deformation, start_s + lit_s, voxel_mm)
             if needed > tables[frame].count:
                 tables[frame] = replace(motion, segments=needed).cells(scan, frame)
-    # both models agree on a single value
+    # with a single value the log and the intensity model agree
     return tables, model == "intensity" and any(table.averages for table in tables)
 
 

@@ -180,7 +180,7 @@ def reconstruct_splats(
         "ranks": rt.ranks.size,
     }  # fmt: skip
     if isinstance(options.motion, Exact):
-        # a frame's largest K
+        # segments: the largest number K of a frame
         facts |= {"segments": run.frames.most_cells, "motion_phases": run.phases()}
     cloud = cloud.scaled(scale.length_mm, scale.density_per_mm)
     return Reconstruction(volume, scan.grid, cloud, loop.record, facts, loop.state_if_interrupted())

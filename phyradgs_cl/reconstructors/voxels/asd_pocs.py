@@ -32,7 +32,7 @@ class AsdPocsOptions(SartOptions):
 
 
 class AsdPocs(Algorithm):
-    """The residual is that of the volume between the SART pass and the TV steps."""
+    """ASD-POCS, whose residual is that of the volume between the SART pass and the TV steps."""
 
     def __init__(self, system: System, options: AsdPocsOptions, descend: TvDescent, epsilon: float) -> None:
         super().__init__(system)

@@ -146,7 +146,7 @@ def _tight_curvature(system: System) -> float:
 
 
 class Fista(Accelerated):
-    """The residual of a pass is that of all subsets, each at the extrapolated point of its step."""
+    """FISTA with subsets. The residual of a pass is that of all subsets, each at the extrapolated point of its step."""
 
     def __init__(
         self, system: System, prior: Prior, weight: PriorWeight, *, subsets: int, nonnegative: bool,

@@ -114,7 +114,7 @@ def _density(space: Space[Any], volume: Any) -> float:
 class PriorInputs:
     """The arguments of a prior: device, grid, and for piccs its image (nz, ny, nx) in 1/mm and the weight of the change.
 
-    tv_iterations: dual iterations per map. is_fly: of the scan, whose frames expose for an arc. noise: of its line
+    tv_iterations: dual iterations per map. is_fly: the scan's frames expose over an arc. noise: that of its line
     integrals, behind the object."""
 
     rt: Runtime
@@ -213,7 +213,7 @@ class ThenRidge(Prior):
     VOLUMES = RidgeStep.VOLUMES
 
     def __init__(self, before: Prior, ridge: RidgeStep, noise_factor: float) -> None:
-        """noise_factor: the noise that the step assumes, over the prior's weight."""
+        """noise_factor: ratio of the noise that the step assumes to the prior's weight."""
         self.before, self.ridge, self.noise_factor = before, ridge, noise_factor
         self.maps = 0  # maps since the last step
 

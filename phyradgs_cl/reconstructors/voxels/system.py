@@ -64,7 +64,7 @@ class System:
         measured = np.asarray(scan.projections, np.float32)
         model = scan.detector_model if detector_model == "scan" else detector_model
         intensity: IntensityOperator | SharedIntensity | None = None
-        if model == "intensity" and any(table.averages for table in tables):  # both models agree on a single value
+        if model == "intensity" and any(table.averages for table in tables):  # of one value both models are the same
             alone = IntensityOperator(rt, scan.grid, shape, tables, projector, subrays)
             intensity = SharedIntensity(rt.ranks, alone) if rt.ranks.size > 1 else alone
         if rt.ranks.size > 1:
