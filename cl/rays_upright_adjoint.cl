@@ -110,7 +110,7 @@ RAY_INLINE column_t column_of(__global const float *cell, const int u, const int
 typedef struct {
     vi first;
     int base;  /* begin of two vectors of lines that hold them all, if they do */
-    int some;  /* whether there are any */
+    int some;  /* whether any line touches */
     int dense; /* whether two vectors hold them */
 } near_lines_t;
 
@@ -170,8 +170,8 @@ RAY_INLINE int2 bases_of_halves(const column_t r, const near_lines_t lines, cons
 #define EACH_LINE(body) OF_LINES(GATHER_VALUE(m), GATHER_SLOPE(m), (void)0, body)
 #endif
 
-/* Adds to LANES voxels of two columns, between which all their lines pass. under: heights up to the source. b: the place of
-   the rays' plane at these heights, from the first column on. */
+/* Adds to LANES voxels of two columns, between which all their lines pass. under: the source's height less
+   the voxels'. b: the place of the rays' plane at the voxels' heights, from the first column on. */
 RAY_INLINE void add_between(const column_t r, const near_lines_t lines, const int most, const float ahead, const vf under,
                             const vf b, float *low, float *high)
 {
@@ -182,7 +182,7 @@ RAY_INLINE void add_between(const column_t r, const near_lines_t lines, const in
     V_STORE(V_LOAD(high) + far, high);
 }
 
-/* Adds to LANES voxels of three columns, where lines pass the second. b: from the second column on. */
+/* Adds to LANES voxels of three columns, where lines pass the second on both sides. b: from the second column on. */
 RAY_INLINE void add_around(const column_t r, const near_lines_t lines, const int most, const float ahead, const vf under,
                            const vf b, float *low, float *middle, float *high)
 {

@@ -38,7 +38,7 @@ ALWAYS_INLINE void gather(splat_sums *sum, const footprint_line line, const int 
 #else
     const vf along = p.z + line.s.shift;
     const vf by_q = by_num * (m.e - (m.ezz + p.c2 * m.e) * p.rq);
-    const vf still = by_q * line.s.inv_kappa; /* Q has num at mid-time */
+    const vf still = by_q * line.s.inv_kappa; /* Q depends on num at mid-time, not on means over the window */
     const vf sb = 2.0f * by_q * p.b;
     sum->of[SUM_IK] += by_q * (along * along + p.c2);
     sum->of[SUM_B] += sb;

@@ -200,7 +200,7 @@ __kernel void splat_chain(
         by_place = v3_scale(straight, w / v3_dot(straight, straight)); /* the object's motion does not change this length */
 #endif
 #elif AFFINE
-        by_ray = v3_add(by_ray, v3_scale(ray, w / v3_dot(ray, ray))); /* of a length, which no rotation changes */
+        by_ray = v3_add(by_ray, v3_scale(ray, w / v3_dot(ray, ray))); /* by the ray's length, which no rotation changes */
 #endif
         by_s = v3_add(by_s, v3_scale(v3_mul(by_white_s, white), -1.0f));
 

@@ -42,7 +42,7 @@ static inline int line_seeing(
     return line;
 }
 
-/* A sample's weight: that of BY_DISTANCE over `scale`, a power of the speed. `middle`: depth between both lines. */
+/* A sample's weight: that of BY_DISTANCE (backproject.cl) at the depth `middle` between both lines, divided by `scale`. */
 #if DISTANCE_POWER == 1 /* see backproject.cl */
 #define BY_LINE(weight, middle, scale) ((weight) / ((middle) * (scale)))
 #else

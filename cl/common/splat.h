@@ -93,7 +93,7 @@ static inline splat_line splat_on_line(SPLAT_SPACE const float *splat_record, SP
     return s;
 }
 
-/* Exponent (num/Q) and value at pixels u (absolute), whose offset from the centre is du. */
+/* The value at pixels u, whose offset from the centre is du; also num, B and 1/Q. */
 static inline vf splat_value(splat_line s, vf u, vf du, vf *num_out, vf *big_b, vf *inv_q)
 {
     vf t = s.l11 * du + s.t0;

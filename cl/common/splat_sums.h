@@ -13,7 +13,7 @@
 #define SUM_CC 4
 #define SUM_Z 5          /* sums of dL/d(num) times z and across, for dL/d(centre) */
 #define SUM_C 6
-#define SUM_TZ 10        /* the same with the place on the path as a factor, for dL/d(path) */
+#define SUM_TZ 10        /* the same times the time t as well, for dL/d(path) */
 #define SUM_TC 11
 #else
 #define SUMS 0

@@ -182,7 +182,7 @@ def _shroud(scan: Scan) -> np.ndarray:
 
 
 def _gantry(scan: Scan, times_s: np.ndarray, order: np.ndarray) -> np.ndarray:
-    """Returns what an object at rest, or a slow drift, puts into a row (F, n): harmonics of the angle, and a line."""
+    """Returns the terms (F, n) that rest and slow drift put into a row: a constant, a line, harmonics of the angle."""
     poses = np.stack([scan.trajectory.pose(int(f), np.array([t]))[0] for f, t in zip(order, times_s, strict=True)])
     towards = poses[:, :3] - (0.0 if scan.is_parallel else np.array(scan.grid.offset_mm[::-1]))
     angle_rad = np.arctan2(towards[:, 1], towards[:, 0])
