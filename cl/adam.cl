@@ -30,13 +30,13 @@ __kernel void activate(
     V_STORE(softplus(V_LOAD(r + 10 * (size_t)stride)), g + 10 * (size_t)stride);
 }
 
-/* Turns dL/dparameter into dL/draw in place, and adds the regulariser whose gradient needs no image. */
+/* Replaces dL/d(parameters) by dL/d(raw parameters), and adds the density term's gradient, which needs no image. */
 __kernel void chain_activations(
     __global const float *raw, __global const float *gaussians, const int count, const int stride,
     const float scale_min, const float scale_max,
-    const float density_weight,      /* weight of the mean density, over the count */
+    const float density_weight,      /* the term's weight over the number of Gaussians */
     __global float *gradients,       /* (13, stride) */
-    __global float *statistics)      /* (2, stride): sum of centre-gradient norms, iterations in view */
+    __global float *statistics)      /* (2, stride): sum of |dL/d(centre on the detector)|, iterations in view */
 {
     const int first = (int)get_global_id(0) * LANES;
     if (first >= stride)
@@ -71,7 +71,7 @@ __kernel void chain_activations(
 
 __kernel void adam_step(
     __global float *raw, __global const float *gradients, __global float *moments, /* (2, 11, stride) */
-    const int stride, const float16 rates,      /* 11 of them count, with bias corrections */
+    const int stride, const float16 rates,      /* learning rates of the 11 rows, with Adam's bias corrections */
     const float beta1, const float beta2, const float epsilon)
 {
     const int first = (int)get_global_id(0) * LANES, row = (int)get_global_id(1);

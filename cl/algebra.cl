@@ -1,5 +1,5 @@
 /* Algebra of plain float arrays of any number of elements: updates element by element, and sums.
-   The bits of sums depend on the device's shape only: items are added in a fixed order, then their results. Sums are in
+   The bits of sums depend only on the device's shape: a work-item adds in a fixed order, then results are added. Sums are in
    float64, or in pairs of floats where a device has none. Twin: HostSpace of runtime/algebra.py. */
 #include "common/precise.h"
 #pragma OPENCL FP_CONTRACT OFF
@@ -26,7 +26,7 @@ static inline void store_some(vf v, __global float *p, const long count)
         p[k] = LANE_OF(v, k);
 }
 
-/* x + scale y, at least `least` */
+/* result = max(x + scale y, least) */
 __kernel void add_scaled(
     __global const float *x, const float scale, __global const float *y, const float least, const long count,
     __global float *result)
@@ -36,7 +36,7 @@ __kernel void add_scaled(
         store_some(fmax(load_some(x + at, rest) + scale * load_some(y + at, rest), (vf)(least)), result + at, rest);
 }
 
-/* x + scale (x - y) */
+/* result = x + scale (x - y) */
 __kernel void extrapolate(
     __global const float *x, const float scale, __global const float *y, const long count, __global float *result)
 {
@@ -47,7 +47,7 @@ __kernel void extrapolate(
     store_some(here + scale * (here - load_some(y + at, rest)), result + at, rest);
 }
 
-/* x + scale y z, at least `least` */
+/* result = max(x + scale y z, least) */
 __kernel void add_product(
     __global const float *x, const float scale, __global const float *y, __global const float *z, const float least,
     const long count, __global float *result)
@@ -59,7 +59,7 @@ __kernel void add_product(
     store_some(fmax(load_some(x + at, rest) + product, (vf)(least)), result + at, rest);
 }
 
-/* x y, where y has `count` elements and repeats for every repetition (second index) */
+/* result = x y, where y has `count` elements and is repeated along x (global index 1) */
 __kernel void multiply(
     __global const float *x, __global const float *y, const long count, __global float *result)
 {
@@ -68,7 +68,7 @@ __kernel void multiply(
         store_some(load_some(x + there, rest) * load_some(y + at, rest), result + there, rest);
 }
 
-/* 1 / max(x, least); 0 where x is not above 0 */
+/* result = 1 / max(x, least) where x > 0, else 0 */
 __kernel void reciprocal(__global const float *x, const float least, const long count, __global float *result)
 {
     const long at = (long)get_global_id(0) * LANES, rest = count - at;
@@ -130,7 +130,7 @@ static inline float share_of(const float2 step, const sum_t squares)
 }
 #endif
 
-/* Combines a group's results in a tree into that of item 0. Groups of one have nothing to do. */
+/* Combines the results of a work-group in a tree; work-item 0 gets the result. */
 #define TREE(scratch, own, combined)                                                       \
     if (get_local_size(0) > 1) {                                                           \
         const int item = (int)get_local_id(0);                                             \
@@ -144,7 +144,7 @@ static inline float share_of(const float2 step, const sum_t squares)
             own = scratch[0];                                                              \
     }
 
-/* Writes each group's sum of x y. An item takes the vectors at first_by k, then every `step`, within `span`. */
+/* Writes each work-group's sum of x y. Work-item k takes vectors from first_by k on, one every `step`, within `span`. */
 __kernel void dot_parts(
     __global const float *x, __global const float *y, const long count, const long first_by, const long step, const long span,
     __local sum_t *scratch, __global sum_t *parts)
@@ -159,7 +159,7 @@ __kernel void dot_parts(
         parts[get_group_id(0)] = own;
 }
 
-/* Writes each group's sum of (x - y) (y - z), with the items of dot_parts. */
+/* Writes each work-group's sum of (x - y) (y - z), over the elements of dot_parts. */
 __kernel void turn_parts(
     __global const float *x, __global const float *y, __global const float *z, const long count, const long first_by,
     const long step, const long span, __local sum_t *scratch, __global sum_t *parts)
@@ -176,7 +176,7 @@ __kernel void turn_parts(
         parts[get_group_id(0)] = own;
 }
 
-/* The second level, by one group: the sum of all parts. It is added to what is there if asked. */
+/* The second level, by one work-group: writes the sum of all parts, or adds it to `whole` if `add`. */
 __kernel void dot_whole(
     __global const sum_t *parts, const int count, const int add, __local sum_t *scratch, __global sum_t *whole)
 {
@@ -188,7 +188,7 @@ __kernel void dot_whole(
         whole[0] = add ? sum_add(whole[0], own) : own;
 }
 
-/* Writes each group's largest x, or |x|. The second level is the same for a short array. */
+/* Writes each work-group's largest x, or |x| if `absolute`. The host takes the largest of these parts. */
 __kernel void largest_parts(
     __global const float *x, const int absolute, const long count, const long first_by, const long step, const long span,
     __local float *scratch, __global float *parts)
@@ -203,7 +203,7 @@ __kernel void largest_parts(
         parts[get_group_id(0)] = own;
 }
 
-/* x − y step/√squares: a step of fixed length (high, low) down y, or none if y is 0. The sum of squares is on the device. */
+/* result = x − y step/√squares: a step of fixed length, a pair (high, low), against y; none where y is 0. */
 __kernel void descend(
     __global const float *x, __global const float *y, const float2 step, __global const sum_t *squares, const long count,
     __global float *result)

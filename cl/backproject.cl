@@ -1,6 +1,6 @@
 /* Voxel-driven backprojection with FDK's distance weight: bilinear in the filtered projections, zero outside them.
    All kernels add to the volume, view after view, so that the bits do not depend on the number of launches. The volume may
-   be a brick of the grid, with its first voxel at `origin`. Twins: operators/twins/backproject.py.
+   be a brick of the grid, with its first voxel at `origin`. Twins: operators/twins/rays.py.
      backproject          any pose; a work-item takes LANES voxels along x and loops over the views
      backproject_upright  detector columns parallel to the volume's z; a work-item takes a column of voxels
      backproject_leaning  columns that lean a little, as every calibrated panel's do
@@ -9,14 +9,14 @@
 #include "common/lanes.h"
 #include "common/line_backprojection.h"
 
-/* FDK's weight of a sample. With DISTANCE_POWER 1 it is the angle by which a voxel turns per radian of the source. */
+/* A sample's weight, 1/depth² as in FDK. With DISTANCE_POWER 1: 1/depth, the turn of a ray per turn of the source. */
 #if DISTANCE_POWER == 1
 #define BY_DISTANCE(weight, inv) (weight) * (inv)
 #else
 #define BY_DISTANCE(weight, inv) (weight) * (inv) * (inv)
 #endif
 
-/* Samples at several places of a row, or of a transposed image's column: by lookup in two vectors, or by gathers. */
+/* Linear interpolation at LANES places of a line in memory: by lookup in two vectors where `fits`, else by gathers. */
 #ifdef V_LOOKUP
 #define COLUMN_SAMPLES(column, least, place, wv, fits)                                                       \
     ((fits) ? lerp_lookup(V_LOAD((column) + (least)), V_LOAD((column) + (least) + LANES), (place) - (least), wv) \
@@ -142,10 +142,10 @@ __kernel void backproject_upright(
         target[z * slice] = sum[z];
 }
 
-#define EVEN_DEPTH 0.02f   /* largest change of the depth along a block of voxels, over the depth */
+#define EVEN_DEPTH 0.02f   /* largest relative change of the depth along a block for which 1/depth counts as nearly linear */
 #define VOXEL_MARGIN 0.01f /* voxels: more than the rounding of where a column of voxels enters or leaves a view */
 
-/* Narrows the range of z between low and high to where start + per_z z >= 0. */
+/* Narrows the range (low, high) of z to where start + per_z z >= 0. */
 ALWAYS_INLINE float2 narrowed(const float2 within, const float start, const float per_z)
 {
     const float root = -start / per_z;
@@ -257,7 +257,7 @@ ALWAYS_INLINE vf samples_of(__global const float *line, const vf u, const int wi
     return V_PICK(0.0f, COLUMN_SAMPLES(line, least, place, us - V_FLOAT(place), fits), inside);
 }
 
-/* A vector of voxels lies along the lines, so that one or two lines see all of it. */
+/* A vector of voxels lies along the lines (ALONG_Z: lines are columns), so that one or two lines see all of it. */
 #ifdef ALONG_Z
 #define STRETCHED(begin) (begin).z *= LANES
 #define X_OF(first) ((vf)((first).x))

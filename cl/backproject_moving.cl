@@ -36,7 +36,7 @@ static inline vf sample_at(__global const float *field, const int4 shape, const 
 
 __kernel void push_displacement(
     __global const float *pull, /* (3: x y z, wide) voxels: w on a wider grid, with zeros for a vector's end */
-    const int4 wide, const int4 margin, /* the voxels of pull; the place of the grid's first voxel in it */
+    const int4 wide, const int4 margin, /* voxels x y z of pull; index of the grid's first voxel in it */
     const int4 shape, const int most_steps,
     __global float *push)       /* (3, shape), with room for a vector's end */
 {
@@ -70,7 +70,7 @@ __kernel void push_displacement(
     }
 }
 
-/* Displacements of two states at LANES voxels along an axis, and of a view between the states. */
+/* Loads the first state's displacement of LANES voxels along an axis, and its difference to the second state's. */
 #define TWO_STATES(name, axis)                                                   \
     const vf name##_0 = V_LOAD(first_push + axis * voxels + voxel);              \
     const vf name##_1 = V_LOAD(second_push + axis * voxels + voxel) - name##_0;

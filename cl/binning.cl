@@ -2,7 +2,7 @@
    counts are summed up, then every chunk writes the indices of its splats. A list has the order of the splats, so sums over
    a list always add in the same order.
    On CPUs a work-item takes a chunk (bin_count, bin_fill) or a tile (bin_within); bin_starts is one work-item.
-   On GPUs (_group) a group takes a chunk, with a work-item per splat, or a tile; bin_starts_group is one group. */
+   On GPUs (_group) a work-group takes a chunk, with a work-item per splat, or a tile; bin_starts_group is one work-group. */
 #include "common/group_sums.h"
 
 __kernel void bin_count(
@@ -47,7 +47,7 @@ __kernel void bin_within(const int total, const int chunks, __global int *counts
     tile_offsets[t + 1] = sum;
 }
 
-/* The number stays at the largest int where there are more indices: the host then raises an error. */
+/* Sums the tiles' counts to offsets. They stop at INT_MAX where there are more indices: the host then raises an error. */
 __kernel void bin_starts(const int total, __global int *tile_offsets)
 {
     if (get_global_id(0) > 0)
@@ -130,7 +130,7 @@ __kernel void bin_count_group(
             counts[(size_t)t * chunks + k] = having(boxes, item, chunk, x, y, z);
 }
 
-/* Returns the sum over the items before this one. `group_sum` becomes the sum over all items. */
+/* Returns the sum of `own` over the work-items before this one. `group_sum` becomes the sum over all. */
 ALWAYS_INLINE long group_scan(const long own, __local long *scratch, long *group_sum)
 {
     const int item = GROUP_ITEM, items = GROUP_ITEMS;

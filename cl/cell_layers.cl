@@ -1,6 +1,7 @@
-/* The intensity model over plain frames (F, rows, columns), one layer of time cells at a time. p of layer k has the weight
-   w_k of a line. Frames are -log(sum w exp(-p)), and shares are w exp(-p) / sum w exp(-p), without overflow. Weights are
-   (F, lines); a line is a row, or a column where `by_row` is 0. A work-item takes one pixel. Twin: detector/average.py. */
+/* The intensity model over plain frames (F, rows, columns), one layer of time cells at a time. Line integrals p of layer k
+   have the weight w_k of their line. Frames are -log(sum w exp(-p)), and shares are w exp(-p) / sum w exp(-p), without
+   overflow. Weights are (F, lines); a line is a row, or a column where `by_row` is 0. A work-item takes one pixel.
+   Twin: detector/attenuation.py. */
 
 #define PIXEL                                                                                              \
     const int u = (int)get_global_id(0), v = (int)get_global_id(1), f = (int)get_global_id(2);             \
@@ -19,7 +20,7 @@ __kernel void layer_least(
     least[at] = weight > 0.0f ? fmin(before, p[at]) : before;
 }
 
-/* Turns p into w exp(least - p), and adds it to the sum over the layers so far. */
+/* Replaces p by w exp(least - p), and adds it to the sum over the layers so far. */
 __kernel void layer_seen(
     __global float *p, __global const float *weights, const int rows, const int columns, const int by_row,
     const int first, __global const float *least, __global float *total)
@@ -30,7 +31,7 @@ __kernel void layer_seen(
     total[at] = first ? seen : total[at] + seen;
 }
 
-/* Turns least into the average, and the sum into its inverse. Both are 0 where no layer has weight. */
+/* Replaces `least` by the average, and the sum by its inverse. Both are 0 where no layer has weight. */
 __kernel void layer_average(const long count, __global float *least, __global float *total)
 {
     const size_t at = get_global_id(0);

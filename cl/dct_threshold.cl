@@ -1,7 +1,7 @@
 /* Shrinkage of all 4³ block DCTs of a volume, averaged (translation-invariant shrinkage, Coifman and Donoho 1995).
    A coefficient c loses clamp(c, ±threshold); a block's mean loses nothing. The losses of all blocks are added in
-   ``excess``. The result is v − TURNS excess / blocks that cover a voxel, because a call takes one block of TURNS. Volumes
-   are (z, y, pitch) with a guard.
+   ``excess``. The result is v − TURNS excess / (number of blocks that cover the voxel), because a call takes one of TURNS
+   blocks. Volumes are (z, y, pitch) with a guard.
    A work-item has one block in registers and, along x, a vector of blocks one voxel apart. Blocks of one launch do not meet
    in y and z, so no two add at the same time. Where work-items are the lanes they do not meet in x either.
    Twin: objective/dct_prox.py. */
@@ -34,7 +34,7 @@ static inline void inverse_4(vf *v, const int step)
     v[3 * step] = outer - slope;
 }
 
-/* Returns in space what the block or blocks at ``corner`` lose. Unrolled loops keep the block in registers. */
+/* Writes to `block` what the block or blocks at ``corner`` lose, in voxels. Unrolled loops keep the block in registers. */
 static inline void shrunk(__global const float *volume, const size_t corner, const int pitch, const size_t slice,
                           const float threshold, vf *block)
 {
@@ -103,7 +103,7 @@ __kernel void dct_excess(
     }
 }
 
-/* Copies plain (nz, ny, nx) to the padded layout. */
+/* Copies a plain volume (nz, ny, nx) to the padded layout, and sets `excess` to 0. */
 __kernel void dct_start(
     __global const float *volume, const int4 shape, const int pitch, __global float *padded, __global float *excess)
 {
@@ -115,7 +115,7 @@ __kernel void dct_start(
     excess[IMAGE_GUARD + row * pitch + x] = 0.0f;
 }
 
-/* Writes the result. A work-item takes LANES voxels of a row. */
+/* Writes the shrunk volume without padding. A work-item takes LANES voxels of a row. */
 __kernel void dct_end(
     __global const float *volume, __global const float *excess, const int4 shape, const int pitch, const int nonnegative,
     __global float *result)

@@ -1,7 +1,7 @@
 /* The intensity model over the cells of a frame: a detector adds photons, not line integrals.
 
-   The k-th cell of every line is drawn into the k-th layer as w_k p_k. The merged frame is -ln(sum w_k exp(-p_k)) and
-   its derivative by w_k p_k is the share exp(-p_k) / sum w_j exp(-p_j). Sums are of differences from the least p, so that
+   The k-th cell of every line is drawn into the k-th layer as w_k p_k. The merged frame M is -ln(sum w_k exp(-p_k)), and
+   dM/d(w_k p_k) is the share exp(-p_k) / sum w_j exp(-p_j). Sums are of differences from the least p, so that
    nearly equal times cost no digits, and nothing overflows. Twin: detector/attenuation.py. */
 #include "common/lanes.h"
 
@@ -13,7 +13,7 @@ __kernel void intensity_merge(
     __global const float *weights,  /* (layer_count, lines): weight in a line's window, 0 for no cell */
     const int layer_count, const int lines, const int width, const int pitch,
     const float unit,               /* the line integral that is 1 in the images */
-    __global float *shares,         /* layer_count images: derivative of the merged frame by the layers */
+    __global float *shares,         /* layer_count images: dM/d(w_k p_k) */
     __global float *merged)         /* guard, then (lines, pitch), padding is not written */
 {
     const int u = (int)get_global_id(0) * LANES, v = (int)get_global_id(1);
@@ -21,7 +21,7 @@ __kernel void intensity_merge(
         return;
     const size_t at = IMAGE_GUARD + (size_t)v * pitch + u, layer_size = IMAGE_GUARD + (size_t)lines * pitch;
     const vi inside = V_INT((vf)(u) + V_IOTA) < width;
-    vf least = (vf)(MAXFLOAT); /* of the brightest cell */
+    vf least = (vf)(MAXFLOAT); /* p of the brightest cell */
     for (int k = 0; k < layer_count; ++k)
         if (weights[(size_t)k * lines + v] > 0.0f)
             least = min(least, SEEN(k));
@@ -44,7 +44,7 @@ __kernel void intensity_merge(
     V_STORE(V_PICK(0.0f, any ? (least - brighter) / unit : (vf)(0.0f), inside), merged + at);
 }
 
-/* dL/dlayers, from dL/dmerged */
+/* Writes dL/d(layers) from dL/dM. */
 __kernel void intensity_split(
     __global const float *by_merged, /* guard, then (lines, pitch) */
     __global const float *shares,

@@ -40,7 +40,7 @@ __kernel void ssim_moments(
     V_STORE(xy, moments + 4 * image + row);
 }
 
-/* Pass over columns: the SSIM map, its derivatives by mean(x), mean(xx), mean(xy), and the sums of a group's pixels. */
+/* Pass over columns: dSSIM/d(mean(x), mean(xx), mean(xy)), and the sums over a work-group's pixels. */
 __kernel void ssim_map(
     __global const float *moments, __global const float *rendered, __global const float *measured,
     __global const float *mask, __constant float *window,

@@ -1,7 +1,7 @@
-/* Measures the device's best rate of multiply-adds on registers. Copies are the driver's own. */
+/* Measures the device's best rate of multiply-adds on registers. The driver's own copies measure the rate of copies. */
 #include "common/lanes.h"
 
-/* 8 independent chains of multiply-adds per work-item, so that latency does not count: 16 LANES `steps` operations. */
+/* 8 independent chains of multiply-adds per work-item hide latency: 16 LANES `steps` floating-point operations. */
 __kernel void multiply_add(const int steps, const float factor, __global float *out)
 {
     const vf a = (vf)(factor), b = (vf)(1.0f - factor);

@@ -9,12 +9,12 @@ __kernel void rays_forward(
     __global const float *cells,      /* (C, RAY_CELL), frame after frame */
     __global const int *cell_lines,   /* (C, 2): first line of a cell and the line after its last; ACROSS: columns */
     __global const int *line_cells,   /* (F, lines, 2): first cell, and the cell after the last, that may serve a line */
-    __global const int *frame_list,   /* the listed frames */
-    __global const float *weights, __global const int *weight_at, /* of each cell's lines, and where they begin */
+    __global const int *frame_list,   /* numbers of the frames to project */
+    __global const float *weights, __global const int *weight_at, /* weights of cells' lines, and each cell's start */
     const int4 shape, const int4 origin, /* voxels of the volume, and its first voxel in the grid, x y z */
     const int volume_pitch, const float4 pitch_mm,
     const int lines, const int width, const int image_pitch,
-    const int add,                    /* onto the image, for one more brick */
+    const int add,                    /* 1: adds to the image, for one more brick of the volume */
     __global float *image)            /* guard, then (listed frames, lines, pitch) */
 {
     const int u = (int)get_global_id(0) * LANES, v = (int)get_global_id(1), n = (int)get_global_id(2);

@@ -7,7 +7,7 @@
 #ifndef BLOCK_Z
 #define BLOCK_Z BLOCK
 #endif
-#define FEW_CELLS 8    /* the search does not pay for a frame of so few cells */
+#define FEW_CELLS 8    /* frames with at most so many cells are not searched: it would take longer */
 
 /* The weight of the voxel in the ray's sample, as in rays_forward. */
 static inline float ray_weight(const rays_t r, __global const float *cell, const int4 voxel)
@@ -40,9 +40,9 @@ __kernel void rays_adjoint(
     __local int range[2]; /* no cell outside of this range sees the block */
     const int item = (int)get_local_id(0), items = (int)get_local_size(0);
     const int4 block = (int4)((int)get_global_id(0) / items * BLOCK, (int)get_global_id(1) * BLOCK,
-                              (int)get_global_id(2) * BLOCK_Z, 0); /* by global id: a launch may have a part of the groups */
+                              (int)get_global_id(2) * BLOCK_Z, 0); /* by global id: launches may hold some groups only */
     const int4 own = block + (int4)(item % BLOCK, (item / BLOCK) % BLOCK, item / (BLOCK * BLOCK), 0);
-    const int4 corner = origin + block, voxel = origin + own; /* in the grid; own, block: in this volume */
+    const int4 corner = origin + block, voxel = origin + own; /* indices in the grid; own, block: in this volume */
     const int inside = own.x < shape.x && own.y < shape.y && own.z < shape.z;
     const index_t sy = volume_pitch, sz = sy * (shape.y + 2 * BORDER);
     __global float *to = volume + IMAGE_GUARD + (own.z + BORDER) * sz + (own.y + BORDER) * sy + own.x;

@@ -1,5 +1,5 @@
-/* Between frames and slots: what the upright kernels project from one pose, for the part of the panel that it serves.
-   A frame is an average over slots with a weight for each line; the transpose gives a slot its share of the frames.
+/* Converts between frames and slots. A slot holds what the upright kernels project from one pose, for the part of the panel
+   that this pose serves. A frame is an average of slots with a weight for each line; the transpose spreads frames to slots.
    A line is a detector row where `by_row`, else a column. */
 #include "common/ray_column.h"
 

@@ -1,12 +1,12 @@
 /* The projector of rays.cl where detector columns are nearly parallel to the volume's z. The rays of a column then share
-   most of their work. Volumes are turned, with z along a row, so that the samples of neighbouring lines are side by side.
+   most of their work. Volumes are transposed, with z along a row: samples of neighbouring lines lie side by side.
    Samples and weights are those of rays.cl. A work-item takes a detector column of one pose.
    LEAN 0: columns are parallel to z. Their rays cut a plane x = const (or y) at one y (or x), and two columns of voxels are
    blended once for all of them. LEAN 1: this place changes a little from line to line.
    Twin: operators/twins/rays.py. */
 #include "common/ray_column.h"
 
-#define TURN 16 /* voxels along x and z that are turned at a time */
+#define TURN 16 /* voxels along each side (x and z) of the tile that a work-item transposes */
 
 /* Copies (z, y, x), with voxel (z, y, x) at from.x + y from.y + z from.z + x, to guard, then (y, x, pitch) with a border of
    BORDER in y and x. The border must hold zeros before. */
@@ -37,7 +37,7 @@ __kernel void turn_upright(
 typedef struct {
     float sa, sb, sc;
     int na, nb, a_first, b_first, b_last, c_first, c_last;
-    size_t stride_a, stride_b; /* of a step along a and along b among the turned columns */
+    size_t stride_a, stride_b; /* floats from a voxel to the next along a and along b, in the transposed volume */
 } planes_t;
 
 RAY_INLINE planes_t planes_of(__global const float *cell, const int along_x, const int4 shape, const int4 origin,
@@ -60,7 +60,7 @@ RAY_INLINE planes_t planes_of(__global const float *cell, const int along_x, con
     return r;
 }
 
-/* The same for plane i. The source that stands for a parallel beam differs from plane to plane. */
+/* planes_of for plane i: a parallel beam counts as a cone beam with another source for every plane (common/ray.h). */
 RAY_INLINE planes_t planes_from(planes_t r, const int i)
 {
 #if RAY_PARALLEL
@@ -199,7 +199,7 @@ RAY_INLINE void sample_plane(__global const float *plane, const planes_t r, cons
 #endif
 
 __kernel void rays_upright(
-    __global const float *columns,    /* the whole turned volume */
+    __global const float *columns,    /* the whole volume, transposed by turn_upright */
     __global const float *cells,      /* (C, RAY_CELL) */
     __global const int *slots,        /* (S, SLOT): poses, and the parts of the panel that they serve */
     const int4 shape, const int4 origin, const int column_pitch, const float4 pitch_mm,

@@ -1,11 +1,11 @@
-/* The adjoint of rays_upright.cl. A ray of a detector column weighs the voxels of a column by its distance. Lines follow
+/* The adjoint of rays_upright.cl. A ray weighs voxels by its distance from their centres. Lines follow
    each other along the voxels, so a vector of voxels gathers from a few neighbouring lines. Each voxel has one writer, in a
    fixed order. LEAN as in ray_column.h. Twin: operators/twins/rays.py. */
 #include "common/ray_column.h"
 
-#define LINE_MARGIN 0.01f /* lines: more than the rounding of their places; beyond a voxel's neighbours they have weight 0 */
+#define LINE_MARGIN 0.01f /* lines added to each range, more than the rounding; lines too far from a voxel have weight 0 */
 #define PLANES ((ADJOINT_X > ADJOINT_Y ? ADJOINT_X : ADJOINT_Y) + LANES) /* planes of a box, in whole vectors */
-#define LEAST_SLOPE 1e-6f /* voxels per line: it is smaller near the source, where all lines have one height */
+#define LEAST_SLOPE 1e-6f /* voxels per line, lower limit: near the source all lines have one height */
 
 /* Floor and ceil of what an int can hold: PoCL's functions take ten times as long. */
 RAY_INLINE int whole_below(const float at)
@@ -62,14 +62,14 @@ RAY_INLINE int2 lines_along(__global const float *cell, const int u, const int f
    c = sc + ahead (dz + v ez) / (da + v ea) and at b = sb + across ahead + along (c - sc). The rays lie in a plane. */
 typedef struct {
     __global const float *values, *slopes; /* of line v; slopes where columns lean: (dz + v ez) / (da + v ea) */
-    int is_cut;                     /* whether lines of the slot beyond the last have the other main axis */
+    int is_cut;                     /* whether lines of the slot beyond the last follow the other main axis */
     int v_first, v_stop, last_start; /* last_start: the last place where two vectors may begin */
     float sb, sc, da, ea, dz, ez;
-    float inv;                      /* 1 / da; in a column that leans, one over its turn in the rays' plane */
+    float inv;                      /* 1 / da; where columns lean, 1 / (da ez - dz ea) */
     float bend, per_along;          /* 4 |ea / da|, 1 / |along| */
     float across, along;
     float first, last;              /* slope (dz + v ez) / (da + v ea) of the first and the last line */
-    float dense;                    /* largest number of lines to a voxel, times ahead */
+    float dense;                    /* largest number of lines per voxel, times ahead */
 } column_t;
 
 RAY_INLINE column_t column_of(__global const float *cell, const int u, const int along_x, const int2 lines)
@@ -106,11 +106,11 @@ RAY_INLINE column_t column_of(__global const float *cell, const int u, const int
     return r;
 }
 
-/* The lines of LANES voxels of a column: `most` lines from `first` on. */
+/* The lines that may touch LANES voxels of a column: `most` lines from `first` on, in each lane. */
 typedef struct {
     vi first;
     int base;  /* begin of two vectors of lines that hold them all, if they do */
-    int some;  /* whether there are any */
+    int some;  /* whether any line touches */
     int dense; /* whether two vectors hold them */
 } near_lines_t;
 
@@ -170,8 +170,8 @@ RAY_INLINE int2 bases_of_halves(const column_t r, const near_lines_t lines, cons
 #define EACH_LINE(body) OF_LINES(GATHER_VALUE(m), GATHER_SLOPE(m), (void)0, body)
 #endif
 
-/* Adds to LANES voxels of two columns, between which all their lines pass. under: heights up to the source. b: the place of
-   the rays' plane at these heights, from the first column on. */
+/* Adds to LANES voxels of two columns, between which all their lines pass. under: the source's height less
+   the voxels'. b: the place of the rays' plane at the voxels' heights, from the first column on. */
 RAY_INLINE void add_between(const column_t r, const near_lines_t lines, const int most, const float ahead, const vf under,
                             const vf b, float *low, float *high)
 {
@@ -182,7 +182,7 @@ RAY_INLINE void add_between(const column_t r, const near_lines_t lines, const in
     V_STORE(V_LOAD(high) + far, high);
 }
 
-/* Adds to LANES voxels of three columns, where lines pass the second. b: from the second column on. */
+/* Adds to LANES voxels of three columns, where lines pass the second on both sides. b: from the second column on. */
 RAY_INLINE void add_around(const column_t r, const near_lines_t lines, const int most, const float ahead, const vf under,
                            const vf b, float *low, float *middle, float *high)
 {
@@ -205,12 +205,12 @@ RAY_INLINE void add_across(const column_t r, const near_lines_t lines, const int
 }
 #endif
 
-/* What a detector column meets on each plane of a box. */
+/* The voxels and lines that a detector column meets on each plane of a box. */
 typedef struct {
     int from[PLANES], stop[PLANES]; /* voxels along z that its lines may touch; none where it misses the box */
     int first[PLANES];              /* column of voxels at or below the lower of its first and last line */
     int most[PLANES];               /* most lines that may touch a voxel */
-    float ahead[PLANES];            /* ahead of the source */
+    float ahead[PLANES];            /* planes from the source */
     float at[PLANES];               /* place of the rays' plane at the source's height */
 #if LEAN
     int is_between[PLANES];                      /* whether all lines pass between the first column and the next */

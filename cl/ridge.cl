@@ -60,7 +60,7 @@ __kernel void ridge_channels(
     }
 }
 
-/* Writes the responses of the filters, clamped. */
+/* Writes the filters' responses after their curves: slope_up clamp(t, ±σ knot_up) − slope_down clamp(t, ±σ knot_down). */
 __kernel void ridge_responses(
     __global const float *channels, const int4 shape, const int pitch, const int first, __constant const float *table,
     const float sigma, __global float *responses)
@@ -94,7 +94,7 @@ __kernel void ridge_responses(
     }
 }
 
-/* The transpose of the second filters. Each k has its own sums, which do not wait for one another. */
+/* Applies the transpose of the second filters. Each k has its own sums, so that additions do not wait for one another. */
 __kernel void ridge_channels_back(
     __global const float *responses, const int4 shape, const int pitch, const int first, __constant const float *table,
     __global float *channels)
@@ -130,7 +130,7 @@ __kernel void ridge_channels_back(
     }
 }
 
-/* The transpose of the first filters is the gradient. Writes v − step times it, without padding. */
+/* Applies the transpose of the first filters, which gives the gradient. Writes v − step · gradient, without padding. */
 __kernel void ridge_step(
     __global const float *volume, __global const float *channels, const int4 shape, const int pitch, const int first,
     __constant const float *table, const float step, const int nonnegative, __global float *result)

@@ -1,7 +1,7 @@
 /* Adjoint of the splat, first pass: sums over the footprint of a Gaussian in every time cell, which the chain rule reads.
    Every Gaussian has one writer, without atomics: results repeat bit for bit.
    splat_backward_rows: one work-item per Gaussian, with vectors along its lines (CPUs).
-   splat_backward_group: a group per Gaussian, with ACROSS items along a line and as many lines as fit (GPUs). */
+   splat_backward_group: a work-group per Gaussian, with ACROSS items along a line and as many lines as fit (GPUs). */
 #if GROUP > 1
 #define SPLAT_SPACE __local
 #endif
@@ -19,7 +19,7 @@ ALWAYS_INLINE splat_sums no_sums(void)
     return sum;
 }
 
-/* Adds the contribution of the pixels u.. of a line. h: gradient by the pixels. */
+/* Adds the contribution of the pixels u.. of a line. h: dL/d(pixels). */
 #if MOVING
 ALWAYS_INLINE void gather(splat_sums *sum, const footprint_line line, const int u, const float limit, const vf h)
 {
@@ -38,7 +38,7 @@ ALWAYS_INLINE void gather(splat_sums *sum, const footprint_line line, const int 
 #else
     const vf along = p.z + line.s.shift;
     const vf by_q = by_num * (m.e - (m.ezz + p.c2 * m.e) * p.rq);
-    const vf still = by_q * line.s.inv_kappa; /* Q has num at mid-time */
+    const vf still = by_q * line.s.inv_kappa; /* Q depends on num at mid-time, not on means over the window */
     const vf sb = 2.0f * by_q * p.b;
     sum->of[SUM_IK] += by_q * (along * along + p.c2);
     sum->of[SUM_B] += sb;
@@ -128,7 +128,7 @@ __kernel void splat_backward_rows(ARGUMENTS)
 #else
 __kernel void splat_backward_group(ARGUMENTS)
 {
-    const int g = (int)get_global_id(0) / ACROSS, item = GROUP_ITEM; /* a launch may have a part of the groups */
+    const int g = (int)get_global_id(0) / ACROSS, item = GROUP_ITEM; /* launches may hold some work-groups only */
     __local float tree[SUM_COUNT * GROUP], cell[CELL];
     __local int record_as_int[RECORD]; /* ints, because a device may flush ints copied as floats */
     __local const float *splat_record = (__local const float *)record_as_int;
@@ -141,7 +141,7 @@ __kernel void splat_backward_group(ARGUMENTS)
             record_as_int[f] = ((__global const int *)records)[at * RECORD + f];
         for (int f = item; f < CELL; f += GROUP)
             cell[f] = cells[c * CELL + f];
-        barrier(CLK_LOCAL_MEM_FENCE | CLK_GLOBAL_MEM_FENCE); /* wait until all have read where sums will be */
+        barrier(CLK_LOCAL_MEM_FENCE | CLK_GLOBAL_MEM_FENCE); /* wait until all have read what sums overwrite */
         __global const float *times = TIMES_OF(c, line_times, time_pitch);
         __global const float *image = images + LAYER_AT(cell, lines, pitch) + IMAGE_GUARD;
         splat_sums mine = no_sums();

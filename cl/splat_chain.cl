@@ -6,14 +6,14 @@
 #include "common/splat_sums.h"
 
 #if MOVING
-#define TURNED 4 /* what the record keeps of S: (along, across) by (u, v) */
+#define TURNED 4 /* numbers of the record that give S: d(along, across)/d(u, v) */
 #define POSES 3
 #else
 #define TURNED 0
 #define POSES (1 + FIXED_CONIC)
 #endif
 
-/* Maps the gradient by (u0, v0) and depth z to that by the mean, with u0 = (row 0 . x) / z and v0 = (row 1 . x) / z. */
+/* Adds dL/d(mean) from dL/d(u0, v0, depth z), with u0 = (row 0 . x) / z and v0 = (row 1 . x) / z. */
 static inline void add_by_centre(v3 *by_mean, __global const coefficient *m, const vf u0, const vf v0, const vf inv_z,
                           const vf by_u0, const vf by_v0, const vf by_z)
 {
@@ -30,8 +30,8 @@ static inline vf torque_about(const vf forth, const vf back, const vf s2, const 
     return 0.5f * (forth * (s2 * inv3) + back * (s3 * inv2)) * out_of_round(s2, s3, inv2, inv3);
 }
 
-/* The torque is forth - back, the gradients by all vectors crossed with them. Line integrals depend only on vectors over
-   scales, and a turn does not change them there: forth s2 / s3 = back s3 / s2. So the result is no small difference. */
+/* The torque is forth - back, the sum of (gradient x vector) over all vectors. Line integrals depend only on vectors over
+   scales, and a rotation does not change them there: forth s2 / s3 = back s3 / s2. So nothing cancels in this form. */
 static inline v3 torque_of(const v3 forth, const v3 back, const v3 s, const v3 inv)
 {
     return v3_make(torque_about(forth.x, back.x, s.y, s.z, inv.y, inv.z),
@@ -40,7 +40,7 @@ static inline v3 torque_of(const v3 forth, const v3 back, const v3 s, const v3 i
 }
 
 #if DEFORMED
-#define BY_PLACE by_place /* the cell, or end of a segment, adds to a state's own sums */
+#define BY_PLACE by_place /* gradients of places go to the sums of the cell's state */
 
 static inline void add_vector(__global float *rows, const int row, const int stride, const v3 by)
 {
@@ -50,7 +50,7 @@ static inline void add_vector(__global float *rows, const int row, const int str
     V_STORE(V_LOAD(at + 2 * (size_t)stride) + by.z, at + 2 * (size_t)stride);
 }
 
-/* Adds the derivative of the loss by the 3x3 map G. G turns from_source, eu and ev into the Gaussian's frame. */
+/* Adds dL/dG of the 3x3 matrix G, which takes from_source, eu and ev from the object to the reference. */
 static inline void add_by_pull(__global float *by_state, const int stride, const frame3 axes, const v3 from_source,
                                __global const float *cell, const v3 by_ray, const v3 by_eu, const v3 by_ev)
 {
@@ -112,7 +112,7 @@ __kernel void splat_chain(
             continue;
         const vf w = V_LOAD(fields + SUM_W * LANES), by_ik = V_LOAD(fields + SUM_IK * LANES);
 #if MOVING
-        /* Derivatives by S: with (along, across) = V D, D D' = V^-1 (..)(..)' V^-T. */
+        /* dL/dS, from (along, across) = V D and D D' = V^-1 (along, across)(along, across)' V^-T. */
         const vf zz = V_LOAD(fields + SUM_ZZ * LANES), zc = V_LOAD(fields + SUM_ZC * LANES), cc = V_LOAD(fields + SUM_CC * LANES);
         const vf along_u = V_LOAD(fields + SUM_COUNT * LANES), along_v = V_LOAD(fields + (SUM_COUNT + 1) * LANES);
         const vf across_u = V_LOAD(fields + (SUM_COUNT + 2) * LANES), across_v = V_LOAD(fields + (SUM_COUNT + 3) * LANES);
@@ -200,7 +200,7 @@ __kernel void splat_chain(
         by_place = v3_scale(straight, w / v3_dot(straight, straight)); /* the object's motion does not change this length */
 #endif
 #elif AFFINE
-        by_ray = v3_add(by_ray, v3_scale(ray, w / v3_dot(ray, ray))); /* a length, which no turn changes */
+        by_ray = v3_add(by_ray, v3_scale(ray, w / v3_dot(ray, ray))); /* by the ray's length, which no rotation changes */
 #endif
         by_s = v3_add(by_s, v3_scale(v3_mul(by_white_s, white), -1.0f));
 

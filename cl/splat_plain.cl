@@ -1,4 +1,4 @@
-/* Converts the arrays that users hold, parameter rows (11, count) in mm with quaternions of any length, into internal rows
+/* Converts users' arrays, parameter rows (11, count) in mm with quaternions of any length, into internal rows
    (11, stride) with unit quaternions, and back. Twins: NumPy's, in tests/operators/test_splat_plain.py. */
 
 #define ROWS 11
@@ -11,12 +11,12 @@ static inline float unit_of(const int row, const float per_mm, const float per_d
     return row < LENGTHS ? per_mm : row == DENSITY ? per_density : 1.0f;
 }
 
-/* Padding becomes a unit Gaussian, which changes nothing. */
+/* Writes internal rows from plain rows. Columns from `count` on become unit Gaussians, which are never drawn. */
 __kernel void rows_enter(
     __global const float *plain,  /* (11, count) */
     const int count, const int stride,
-    const float per_mm,           /* internal units of length */
-    const float per_density,      /* internal units of density, which is in 1/mm */
+    const float per_mm,           /* internal units of length in a mm */
+    const float per_density,      /* internal units of density in 1/mm */
     __global float *rows,         /* (11, stride) */
     __global float *norms)        /* (stride): lengths of the quaternions */
 {
@@ -38,7 +38,7 @@ __kernel void rows_enter(
     norms[g] = norm;
 }
 
-/* Adds gradients by internal rows to those by plain rows, or replaces these. */
+/* Writes dL/d(plain rows) from dL/d(internal rows), or adds it to what is there if `add`. */
 __kernel void rows_leave(
     __global const float *gradients, /* (13, stride) */
     __global const float *norms,

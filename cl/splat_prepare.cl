@@ -1,7 +1,7 @@
 /* Projects every Gaussian from every time cell of a frame, in one launch. A work-item takes LANES Gaussians and loops over
    the cells. For each cell it writes one record per Gaussian (common/splat.h): the splat and the box of its pixels. At the
    end it writes the box around each Gaussian's splats in all cells, from which binning.cl makes the lists of the tiles.
-   splat_prepare: a cell is one pose. With FIXED_CONIC this pose places the centre only.
+   splat_prepare: a cell is one pose. With FIXED_CONIC it places the centre only; conic and depth are those of another pose.
    splat_prepare_moving: a cell is a segment of the frame, in which the centre moves from one end to the other
    (common/splat_moving.h). Twin: operators/twins/splat.py. */
 #include "common/splat_view.h"
@@ -13,7 +13,7 @@
 #define FIELDS 12
 #else
 #define FIELDS COMMON_FIELDS
-#define POSES (1 + FIXED_CONIC) /* of a cell: the pose to which the constants of `cells` belong, and that of the centre */
+#define POSES (1 + FIXED_CONIC) /* poses of a cell: that of the constants in `cells`, and that of the centre */
 #endif
 
 /* The fields that both kinds of record share. fields (FIELDS, LANES); bounds (6, LANES): centre, u lo hi, v lo hi. */
@@ -125,7 +125,7 @@ __kernel void splat_prepare(
 #else
 
 #define MOVING_FIELD(rec) ((rec) - 6) /* fields have none of the record's six ints */
-#define POSES 3 /* of a cell: the middle of the segment and its two ends */
+#define POSES 3 /* poses of a cell: at the middle of the segment and at its two ends */
 
 /* The path of the centre in a segment, from one end to the other, and whether both ends lie in front of the source. */
 typedef struct { vf u, v; vi is_in_front; } centre_path;
@@ -221,7 +221,7 @@ __kernel void splat_prepare_moving(
         /* The path in widths of the splat: its length and direction. */
         const vf wide_u = s.l11 * path.u + s.l12 * path.v, wide_v = s.l22 * path.v;
         const vf speed = sqrt(wide_u * wide_u + wide_v * wide_v);
-        const vi moves = speed > 1e-6f; /* otherwise any direction will do */
+        const vi moves = speed > 1e-6f; /* without motion any direction will do */
         const vf inv_speed = 1.0f / V_PICK(1.0f, speed, moves);
         const vf cosine = V_PICK(1.0f, wide_u * inv_speed, moves), sine = V_PICK(0.0f, wide_v * inv_speed, moves);
         vf reach2 = (vf)(MAXFLOAT);

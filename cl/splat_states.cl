@@ -7,10 +7,10 @@
    A Gaussian has STATE_ROWS of common/splat_state.h in each state. */
 #define STATE_ROWS 12
 #define MOST_STEPS 50
-#define CLOSE 2e-5f     /* spacings: a shorter step ends the search; the next step would be its square */
-#define LEAST_DET 0.05f /* of G; below it a step is one of the fixed point y = m - w(y) */
+#define CLOSE 2e-5f     /* spacings of control points: a shorter step ends the search; the next would be its square */
+#define LEAST_DET 0.05f /* det G below which a Newton step is replaced by one of the fixed point y = m - w(y) */
 
-/* The four B-splines along an axis that reach a point, with both derivatives. The first belongs to control point `first`. */
+/* The four B-splines along an axis that reach a point, and two derivatives. The first belongs to control point `first`. */
 typedef struct { float value[4], slope[4], bend[4]; int first, start, stop; } splines;
 
 static inline splines splines_at(const float place, const float per_spacing, const int count)
@@ -80,7 +80,7 @@ static flow flow_at(__global const float4 *controls, const int4 counts, const fl
     return f;
 }
 
-/* The gradient by the point of the sum of by_pull[i][j] dw_i/dy_j. by_pull: rows i of three floats. */
+/* Returns d/d(point) of sum_ij by_pull[i][j] dw_i/dy_j. by_pull: rows i of three floats. */
 static float4 by_curvature(__global const float4 *controls, const int4 counts, const float4 origin, const float4 per_spacing,
                            __global const float *shares, const float4 point, const float4 by_pull[3])
 {
@@ -159,7 +159,7 @@ static inline float4 vector_of(__global const float *rows, const int row, const 
 
 __kernel void splat_states_back(
     __global const float *states, const int stride, FIELD,
-    __global const float *by_states, /* (S, STATE_ROWS, stride): derivatives of L by the places and by G */
+    __global const float *by_states, /* (S, STATE_ROWS, stride): dL/d(places) and dL/dG */
     __global float *gradients)       /* (13, stride), in which the rows of the mean are replaced */
 {
     const int g = (int)get_global_id(0);
@@ -175,7 +175,7 @@ __kernel void splat_states_back(
         }
         const float4 place = vector_of(states + at, 0, stride);
         float4 by_place = vector_of(by_states + at, 0, stride);
-        if (any((by_pull[0] != 0.0f) | (by_pull[1] != 0.0f) | (by_pull[2] != 0.0f))) /* the ends of a segment have none */
+        if (any((by_pull[0] != 0.0f) | (by_pull[1] != 0.0f) | (by_pull[2] != 0.0f))) /* ends of a segment have no dL/dG */
             by_place += by_curvature(controls, counts, origin, per_spacing, shares + s * RANK, place, by_pull);
         /* dy/dm = 1/G; its transpose has the rows of G's cofactors. */
         const float4 x = cross(pull[1], pull[2]), y = cross(pull[2], pull[0]), z = cross(pull[0], pull[1]);

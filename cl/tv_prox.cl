@@ -2,10 +2,10 @@
    Image Process. 18 (2009) 2419). Volumes (nz, ny, nx) have no padding. The dual has three planes, one per axis, with
    forward differences that end at the last voxel. A work-item takes one voxel. Twin: objective/tv.py.
    `shape`: voxels along x, y and z, and states of an object that changes. For several states (K, nz, ny, nx; build option
-   STATES) the dual has a fourth plane, the differences between a state and the next one. Its length counts apart from that
-   of the other three.
-   Neighbours behind a border are read at the voxel itself. A branch would become a masked access to an address behind the
-   buffer, which takes ten times as long although no lane wants it. */
+   STATES) the dual has a fourth plane, the differences between a state and the next one. Its absolute value is added to the
+   length of the other three.
+   Neighbours beyond a border are read at the voxel itself. A branch would become a masked access to an address beyond the
+   buffer, which takes ten times as long although no lane needs it. */
 
 __kernel void tv_primal(
     __global const float *observed, __global const float *moved, /* (K, nz, ny, nx); (3 or 4, K, nz, ny, nx): x, y, z, time */
@@ -32,9 +32,9 @@ __kernel void tv_primal(
 
 __kernel void tv_dual(
     __global const float *volume, const int4 shape, const float4 axis_weight,
-    const float step, const float time_step, /* one over the Lipschitz constant times the weight */
+    const float step, const float time_step, /* 1 / (Lipschitz constant · weight), of the three axes and of time */
     const float momentum,
-    __global const float *from,       /* moved; in the first call the dual itself */
+    __global const float *from,       /* `moved` of the call before, or the dual in the first call */
     __global float *dual, __global float *moved)
 {
     const int x = (int)get_global_id(0), y = (int)get_global_id(1), all = (int)get_global_id(2);

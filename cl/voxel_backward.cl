@@ -1,4 +1,4 @@
-/* Adjoint of the voxeliser: each Gaussian gathers the moments of dL/dvolume under it, then chains them to its parameters.
+/* Adjoint of the voxeliser: each Gaussian sums moments of value · dL/d(volume), then the chain rule gives its gradients.
    A work-item takes a Gaussian, with vectors along its rows (CPUs), or a group of GROUP items does, with ACROSS along a row
    (GPUs). */
 #include "common/gradient.h"
@@ -16,7 +16,7 @@
 #define PLACE_IN_ROW 0
 #endif
 
-/* The voxels of a row to visit: those of the box. Where a row costs its lanes anything, those within the cutoff. */
+/* The voxels of a row to visit: those of the box on a CPU; those within the cutoff on a GPU, where each costs time. */
 ALWAYS_INLINE int2 voxel_span(const voxel_row r, const int lo, const int hi, const float limit)
 {
 #if GROUP > 1
@@ -47,7 +47,7 @@ __kernel void voxel_backward(
     for (int z = record_as_int[VOX_LO + 2]; z <= record_as_int[VOX_HI + 2]; ++z)
         for (int y = record_as_int[VOX_LO + 1] + ROW_OF_GROUP; y <= record_as_int[VOX_HI + 1]; y += GROUP / ACROSS) {
             const voxel_row r = voxel_row_at(voxel_record, y, z);
-            if (r.k > limit) /* a corner of the box */
+            if (r.k > limit) /* the row meets only a corner of the box, beyond the cutoff */
                 continue;
             const int2 span = voxel_span(r, record_as_int[VOX_LO], record_as_int[VOX_HI], limit);
             __global const float *row = by_volume + IMAGE_GUARD + ((size_t)z * shape.y + y) * pitch;

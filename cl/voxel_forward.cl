@@ -21,7 +21,7 @@ __kernel void voxel_forward(
     const int x = (int)get_global_id(0), y = (int)get_global_id(1), z_first = (int)get_global_id(2) * DEPTH;
     const int item = (int)(get_local_id(1) * get_local_size(0) + get_local_id(0));
     const int items = (int)(get_local_size(0) * get_local_size(1));
-    const int t = ((int)get_global_id(2) * tiles.y + y / tile.y) * tiles.x + x / tile.x; /* the launch may be a part */
+    const int t = ((int)get_global_id(2) * tiles.y + y / tile.y) * tiles.x + x / tile.x; /* launches may be parts */
     const tile_list list = list_of(tile_offsets, t, capacity, count);
     float sum[DEPTH] = {0.0f};
     for (int done = 0; done < list.count; done += STAGED) {
@@ -72,7 +72,7 @@ __kernel void voxel_forward(
         for (int z = z_lo; z <= z_hi; ++z)
             for (int y = y_lo; y <= y_hi; ++y) {
                 const voxel_row r = voxel_row_at(voxel_record, y, z);
-                if (r.k > limit) /* a corner of the box */
+                if (r.k > limit) /* the row meets only a corner of the box, beyond the cutoff */
                     continue;
                 __global float *row = volume + IMAGE_GUARD + ((size_t)z * shape.y + y) * pitch;
                 for (int x = x_lo; x <= x_hi; x += LANES)

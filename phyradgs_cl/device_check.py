@@ -35,13 +35,13 @@ from phyradgs_cl.runtime import DeviceSpace, HostSpace, Runtime
 from phyradgs_cl.runtime.layout import pad_rows, pitch_of, unpad_rows
 
 VALUE, GRADIENT = 1e-4, 1e-3  # relative to the largest number; float32 leaves a tenth of them in tests
-_GRIDDED = 5e-3  # where an inverse is computed from a field's values at voxels
+_GRIDDED = 5e-3  # limit where an inverse is computed from a field's values at voxels
 SHAPE, GRID = (9, 12), Grid((5, 7, 6), (0.3, 0.24, 0.28), (0.1, -0.05, 0.1))
 GEOMETRY = ConeGeometry(5.0, 7.5, SHAPE, (3.9 / 9, 4.1 / 12), (0.1, 0.2))
 ORBIT = CircularOrbit(GEOMETRY, ConstantSpeed(0.3, 0.5))
 PARALLEL = CircularOrbit(ParallelGeometry(SHAPE, (2.6 / 9, 2.7 / 12), (0.1, 0.2)), ConstantSpeed(0.3, 0.5))
-UNIT = 2.0  # line integral that is 1 in images of the intensity model
-STEP = 1e-6  # of central differences
+UNIT = 2.0  # line integral of the value 1 in images of the intensity model
+STEP = 1e-6  # half a central difference
 Comparison = tuple[np.ndarray, np.ndarray, float]
 """Computed, expected, and the largest difference allowed, relative to the largest number expected."""
 
@@ -49,7 +49,7 @@ Comparison = tuple[np.ndarray, np.ndarray, float]
 @dataclass(frozen=True)
 class Verdict:
     """``agreeing``: kernels that agree with their twins; ``failures``: the others, in words. ``group_limits``: the largest
-    groups of kernels that run in groups."""
+    work-groups of kernels that run in work-groups."""
 
     device: str
     agreeing: frozenset[str]
@@ -77,7 +77,7 @@ def check_device(device: str | None = None, **launch_shape: bool | int) -> Verdi
 
 
 def _problem(check: Callable[[Runtime], Iterator[Comparison]], rt: Runtime, agreeing: set[str]) -> str:
-    """Returns the first problem in words, or "". Adds the kernels of comparisons that hold to ``agreeing``."""
+    """Returns the first problem in words, or "" without any. Adds the kernels of comparisons that hold to ``agreeing``."""
     try:
         for computed, expected, limit in check(rt):
             off = float(np.abs(np.asarray(computed, np.float64) - expected).max() / (np.abs(expected).max() or 1.0))
@@ -90,7 +90,7 @@ def _problem(check: Callable[[Runtime], Iterator[Comparison]], rt: Runtime, agre
 
 
 def _algebra(rt: Runtime) -> Iterator[Comparison]:
-    """Also the kernel that measures rates."""
+    """Compares the algebra of arrays, and the kernel that measures rates."""
     host, there = HostSpace(), DeviceSpace(rt)
     a, b, c = (_noise((3, 1999), seed) - np.float32(0.3) for seed in range(3))
     x, y, z = there.array(a), there.array(b), there.array(c)
@@ -110,7 +110,7 @@ def _algebra(rt: Runtime) -> Iterator[Comparison]:
 
 
 def _numbers(rt: Runtime) -> Iterator[Comparison]:
-    """What kernels rely on: pairs of floats where there is no float64, whole numbers in local memory."""
+    """Compares what kernels rely on: pairs of floats where there is no float64, whole numbers in local memory."""
     error = pair_error(rt)
     yield np.array(0.0 if rt.fp64 else error), np.zeros(()), PAIRS
     yield np.array(float(carried(rt)[0])), np.ones(()), 0.0
@@ -238,7 +238,7 @@ def _rays(rt: Runtime) -> Iterator[Comparison]:
 
 
 def _warps(rt: Runtime) -> Iterator[Comparison]:
-    """A field that moves neighbours together, and one that moves them apart."""
+    """Compares warps by a field that moves neighbours together, and by one that moves them apart."""
     volume, times_s = _noise(GRID.shape, 22), np.array([0.0, 1.0, 2.0])
     for size_mm in (0.1, 3.0):
         control_mm = size_mm * (_noise((2, 5, 5, 5, 3), 20) - 0.5)
@@ -359,7 +359,7 @@ def _noise(shape: tuple[int, ...], seed: int) -> np.ndarray:
 
 
 def _cloud(count: int = 3) -> np.ndarray:
-    """Parameter rows (11, G) in float32's numbers."""
+    """Returns parameter rows (11, G) float64, whose values float32 holds exactly."""
     rng = np.random.default_rng(count)
     turn = rng.normal(size=(4, count))
     parts = [
@@ -370,7 +370,7 @@ def _cloud(count: int = 3) -> np.ndarray:
 
 
 def _tables(orbit: CircularOrbit = ORBIT) -> tuple[TimeCells, TimeCells, TimeCells]:
-    """One pose, micro-views, and lines that integrate while the gantry moves."""
+    """Returns cells of one pose, of micro-views, and of lines that integrate while the gantry moves."""
     rolling = orbit, Shutter(0.8, 0.6, "columns", -1), 0, 0.2, SHAPE[1]
     still = static_cells(orbit, Shutter(0.8, 0.6), 0, 0.2, SHAPE[0])
     return still, micro_view_cells(*rolling, 3, 2), exact_cells(*rolling, 3)
@@ -379,7 +379,7 @@ def _tables(orbit: CircularOrbit = ORBIT) -> tuple[TimeCells, TimeCells, TimeCel
 def _differences(
     function: Callable[[np.ndarray], np.ndarray], rows: np.ndarray, h: np.ndarray | float = 1.0
 ) -> np.ndarray:
-    """Central differences (11, G) of Σ ``h`` · ``function``(rows)."""
+    """Returns central differences (11, G) of Σ ``h`` · ``function``(rows)."""
     result = np.zeros_like(rows)
     for index in np.ndindex(*rows.shape):
         ends = []
@@ -392,6 +392,6 @@ def _differences(
 
 
 def _by_class(found: np.ndarray, expected: np.ndarray) -> Iterator[Comparison]:
-    """Gradients (11, G), a class of parameters at a time: their sizes differ."""
+    """Yields gradients (11, G) found and expected, one class of parameters at a time, because their sizes differ."""
     for part in (MEAN, SCALE, QUATERNION, DENSITY):
         yield found[part], expected[part], GRADIENT

@@ -10,10 +10,10 @@ from phyradgs_cl.errors import DeviceError
 from phyradgs_cl.runtime import Runtime
 
 LASTING_S = 0.1, 1.0, 3.0
-"""Launches that are tried on GPUs: drivers of screens end those of 2 to 5 s."""
+"""Durations of launches that are tried on GPUs, in s: drivers of screens end those of 2 to 5 s."""
 PAIRS = 1e-12  # relative error that pairs of floats keep; 6e-8 is left of them otherwise
-_ITEMS = 32
-_TRIED_STEPS = 1 << 14
+_ITEMS = 32  # work-items in a work-group of the probes
+_TRIED_STEPS = 1 << 14  # multiply-adds of each chain in a first launch, which gives the speed
 
 
 def pair_error(rt: Runtime) -> float:
@@ -37,7 +37,8 @@ def carried(rt: Runtime) -> tuple[bool, bool, bool]:
 
 
 def longest_launch(make: Callable[[], Runtime], lasting_s: Sequence[float]) -> str:
-    """Tries launches of about so many seconds, each in a new context: a driver that ends one leaves its context dead."""
+    """Returns in words how long a launch may last. Tries launches of about so many seconds, each in a new context: a driver
+    that ends one leaves its context dead."""
     lived_s, steps = 0.0, _TRIED_STEPS
     for wanted_s in (0.01, *lasting_s):
         try:
@@ -52,7 +53,7 @@ def longest_launch(make: Callable[[], Runtime], lasting_s: Sequence[float]) -> s
 
 
 def _spin(rt: Runtime, steps: int) -> float:
-    """Returns the seconds of a launch with one group."""
+    """Returns the seconds of a launch with one work-group, in which each chain has ``steps`` multiply-adds."""
     out, started = rt.zeros(_ITEMS), time.perf_counter()
     rt.launch(rt.kernel("rates", "multiply_add"), _ITEMS, steps, np.float32(0.5), out, group=_ITEMS)
     rt.finish()
@@ -60,7 +61,8 @@ def _spin(rt: Runtime, steps: int) -> float:
 
 
 def probe_lines(device: str | None, limits: dict[str, int], check_s: float, **launch_shape: bool | int) -> Iterator[str]:
-    """Yields what is found, a line each. limits: the largest group by kernel; check_s: how long the comparison took."""
+    """Yields what is found, a line each. limits: the largest work-group by kernel; check_s: seconds that the comparison
+    took."""
 
     def make(profile: bool = False) -> Runtime:
         return Runtime(device, profile=profile, **launch_shape)  # type: ignore[arg-type]

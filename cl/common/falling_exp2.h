@@ -1,10 +1,10 @@
-/* The exponential of a Gaussian. */
+/* The exponential function of a Gaussian, for exponents of at most 0. */
 #include "common/lanes.h"
 
 #define MINUS_HALF_LOG2E (-0.72134752044f)
 
-/* 2^x for x <= 0, to 2e-7. PoCL's exp2 handles ranges and roundings that do not occur here, and would take half the time of
-   a splat's pixel or voxel; a GPU has an instruction. Below 2^-126 the result is 2^-126, not 0. */
+/* 2^x for x <= 0, to 2e-7 of it. PoCL's exp2 handles ranges and roundings that do not occur here. It would take half the
+   time of a splat's pixel or voxel; a GPU has an instruction. Below 2^-126 the result is 2^-126, not 0. */
 ALWAYS_INLINE vf falling_exp2(const vf x)
 {
 #if LANES == 1

@@ -5,7 +5,7 @@
 typedef struct {
 #if MOVING
     moving_line s;
-    float amp, speed, middle, half_time; /* amp: the part of the line's window in this segment */
+    float amp, speed, middle, half_time; /* amp: peak times the share of the line's window in this segment */
 #else
     splat_line s;
 #endif
@@ -41,7 +41,7 @@ ALWAYS_INLINE footprint_line footprint_at(SPLAT_SPACE const float *splat_record,
     return line;
 }
 
-/* The same for a single line. `times`: the cell's (TIME_ROWS, time_pitch), if splats move. */
+/* footprint_at of one line, whose times it looks up. `times`: the cell's (TIME_ROWS, time_pitch), if splats move. */
 ALWAYS_INLINE footprint_line footprint_alone(SPLAT_SPACE const float *splat_record, SPLAT_SPACE const float *cell,
                                              __global const float *times, const int time_pitch, const int v,
                                              const float4 path_limits)
@@ -62,7 +62,7 @@ ALWAYS_INLINE vf footprint_du(const footprint_line line, const int u)
 }
 
 #if GROUP > 1
-/* The same, with only the pixels within the cutoff. With t = l11 du + t0 and B = beta t + gamma, num <= cutoff2 Q is a
+/* footprint_alone with only the pixels within the cutoff. With t = l11 du + t0 and B = beta t + gamma, num <= cutoff2 Q is a
    quadratic in t. It does not depend on the distance of the line from the centre, so needles lose no digits. */
 ALWAYS_INLINE footprint_line footprint_within(SPLAT_SPACE const float *splat_record, SPLAT_SPACE const float *cell,
                                               __global const float *times, const int time_pitch, const int v,

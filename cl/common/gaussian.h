@@ -19,7 +19,7 @@ static inline v3 v3_mul(v3 a, v3 b) { return v3_make(a.x * b.x, a.y * b.y, a.z *
 static inline v3 v3_add(v3 a, v3 b) { return v3_make(a.x + b.x, a.y + b.y, a.z + b.z); }
 static inline v3 v3_scale(v3 a, vf s) { return v3_make(a.x * s, a.y * s, a.z * s); }
 
-/* The columns of R for a unit quaternion: the Gaussian's own axes in the world. */
+/* The columns of the rotation matrix R of a unit quaternion: the Gaussian's own axes in the world. */
 typedef struct { v3 a, b, c; } frame3;
 
 static inline frame3 quaternion_frame(vf w, vf x, vf y, vf z)

@@ -1,10 +1,10 @@
-/* Rows of a gradient matrix (13, stride): the parameters' rows, then the two numbers that density control reads. Rotations
-   are differentiated by a small turn in the Gaussian's own frame (a torque). They are stored as the tangent 2 q (0, torque)
-   of the unit quaternion. */
+/* Rows of a gradient matrix (13, stride): dL/d(parameters), then dL/d(centre on the detector), (u, v), for density control.
+   The gradient of a rotation is the torque, dL/d(small rotation about the Gaussian's own axes). It is stored as the tangent
+   2 q (0, torque) of the unit quaternion. */
 #include "common/gaussian.h"
 
 #define ROW_STATISTIC 11
-#define ROUND 4e-6f /* times the sum of two scales: rounding makes differences as large as this */
+#define ROUND 4e-6f /* scales that differ by at most so much of their sum count as equal: it may be rounding */
 
 /* The factor s3 / s2 - s2 / s3 of the torque about the third axis. Two scales that differ only by rounding count as equal:
    otherwise the torque would be rounding too, and Adam would make it a step of full length. */

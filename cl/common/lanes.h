@@ -1,5 +1,5 @@
-/* Vectors of LANES floats. Width 1 is a plain scalar, where comparisons give 1 instead of -1 and select/any have no scalar
-   form. Everything that differs is hidden here. */
+/* Vectors of LANES floats. With LANES 1 they are scalars, for which OpenCL differs: comparisons give 1 instead of -1, and
+   select and any do not exist. These macros hide the difference. */
 #ifndef LANES
 #error "build with -DLANES=1, 4, 8 or 16"
 #endif
@@ -85,7 +85,7 @@ static inline float v_sum(vf v)
 #endif
 #endif
 
-/* Fills a register element by element: through an array in memory the wide load would wait for all narrow stores. */
+/* Loads p[i] in each lane, element by element: through an array in memory the wide load would wait for all narrow stores. */
 #if LANES == 1
 #define GATHER(p, i) ((p)[i])
 #elif LANES == 4

@@ -1,7 +1,7 @@
-/* What a voxel receives from a view whose lines have their own poses, for backproject.cl and backproject_moving.cl. */
+/* The value that a voxel receives from a view whose lines have their own poses; backproject.cl, backproject_moving.cl. */
 
-#define LINE_STEPS 6
-#define LEAST_SPEED 0.1f
+#define LINE_STEPS 6      /* Newton steps, at most */
+#define LEAST_SPEED 0.1f  /* lower limit of the rate at which a voxel crosses lines, per line of the readout */
 
 static inline float line_position(__global const float *m, const float x, const float y, const float z, float *depth)
 {
@@ -18,7 +18,8 @@ static inline float line_sample(__global const float *line, const float u, const
 }
 
 /* Returns the line that is open where a voxel is: v(pose of line r) = r. Newton's method solves it on the piecewise linear v
-   between lines, from `line` on. `t`: the part of the way to the next line; both lines' depths are those of the voxel. */
+   between lines, from `line` on. `t`: share of the way to the next line; `speed`: rate at
+   which the voxel crosses lines; depth, next_depth: the voxel's in the poses of both lines. */
 static inline int line_seeing(
     __global const float *table, /* (lines, 12) */
     const int lines, int line, const float x, const float y, const float z,
@@ -41,7 +42,7 @@ static inline int line_seeing(
     return line;
 }
 
-/* FDK's weight of a sample of a line; `middle` is the depth of the line's middle. */
+/* A sample's weight: that of BY_DISTANCE (backproject.cl) at the depth `middle` between both lines, divided by `scale`. */
 #if DISTANCE_POWER == 1 /* see backproject.cl */
 #define BY_LINE(weight, middle, scale) ((weight) / ((middle) * (scale)))
 #else

@@ -22,7 +22,7 @@ static inline vwide wide_dot(__global const coefficient *row, vf x, vf y, vf z)
 }
 static inline vf wide_value(vwide a) { return WIDE_FLOAT(a); }
 
-/* a/b as whole + rest, |rest| <= 1/2. The whole is kept within the range of a detector's indices. */
+/* Returns the whole number nearest to a/b, at most 1e6, and the rest, |rest| <= 1/2. */
 static inline vf wide_ratio(vwide a, vwide b, vf *rest)
 {
     vwide ratio = a / b;
@@ -32,7 +32,7 @@ static inline vf wide_ratio(vwide a, vwide b, vf *rest)
 }
 #define COEFFICIENT(c) convert_float(c)
 
-/* a as whole + rest, |rest| <= 1/2 */
+/* Returns the whole number nearest to a, at most 1e6, and the rest, |rest| <= 1/2. */
 static inline vf wide_split(vwide a, vf *rest)
 {
     vf whole = clamp(rint(WIDE_FLOAT(a)), -1e6f, 1e6f);

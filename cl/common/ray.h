@@ -1,4 +1,4 @@
-/* Joseph's samples along LANES rays of one detector line, for the projector and both shapes of its adjoint.
+/* Joseph's samples along LANES rays of one detector line, for the projector and its adjoints on CPUs and GPUs.
    Everything is in voxel indices (x, y, z). All kernels take axis, planes and weights from here, and fma fixes the rounding,
    so a ray has the same samples in all of them.
    RAY_PARALLEL: the rays of a cell have one direction. RAY_SOURCE is this direction over its main component. RAY_D00, RAY_EU
@@ -16,15 +16,15 @@
 #define RAY_PARALLEL 0
 #endif
 #if RAY_PARALLEL
-#define START_OF(start, i) fma((start), (float)(i), 0.0f) /* rounded here, so that no sum can fuse the product */
+#define START_OF(start, i) fma((start), (float)(i), 0.0f) /* rounded here: no later sum can fuse the product */
 #define AHEAD_OF(start, i) 1.0f
 #else
 #define START_OF(start, i) (start)
 #define AHEAD_OF(start, i) ((float)(i) - (start))
 #endif
 
-/* ACROSS: a panel of few rows that is read along columns. Its rows are still the kernels' lines, for vectors of neighbouring
-   columns. A cell then serves columns, and every column has its own weight. */
+/* ACROSS: a panel of few rows that is read along columns. Its rows are still the kernels' lines, so that a vector
+   holds neighbouring columns. A cell then serves columns, and every column has its own weight. */
 #ifndef ACROSS
 #define ACROSS 0
 #endif
@@ -45,7 +45,7 @@ static inline own_t weight_of(__global const float *weights, const int u, const 
 }
 
 #define BORDER 1       /* zero voxels around a volume in y and z; in x the rows' padding does this */
-#define CLIP_MARGIN 0.01f /* planes: more than the rounding of a clipped end; samples outside have weight 0 */
+#define CLIP_MARGIN 0.01f /* planes beyond a clipped end: more than its rounding; samples there have weight 0 */
 
 #if RAY_LONG           /* a volume of 2^31 floats or more */
 typedef long index_t;
@@ -95,7 +95,7 @@ static inline int v_largest(vi v)
 }
 #endif
 
-/* A call would copy these structs of vectors through memory, which takes longer than the computation. */
+/* Inlined: a call would copy structs of vectors through memory, which takes longer than the computation. */
 #ifdef __clang__
 #define RAY_INLINE static inline __attribute__((always_inline))
 #else

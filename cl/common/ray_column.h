@@ -1,8 +1,8 @@
-/* The rays of one detector column, LANES lines at a time, and the list of poses and parts of the panel.
+/* The rays of one detector column, LANES lines at a time, and the table of slots (operators/rays/slots.py).
    LEAN 0: the column is parallel to the volume's z, and all its rays have one direction along x and y. */
 #include "common/ray.h"
 
-#define SLOT 8         /* ints of a slot: a pose, and the lines and columns [first, stop) of the panel that it serves */
+#define SLOT 8         /* ints of a slot: pose, and columns and lines [first, stop) of the panel that the pose serves */
 #define SLOT_CELL 0
 #define SLOT_U 1
 #define SLOT_U_STOP 2
@@ -52,7 +52,7 @@ RAY_INLINE int is_along_x(__global const float *cell, const int u, const int v)
 #endif
 }
 
-/* The length of each ray from one plane to the next. */
+/* The length in mm of each ray from one plane to the next. */
 RAY_INLINE vf column_steps_mm(__global const float *cell, column_rays_t d, const float4 pitch_mm)
 {
 #if RAY_PARALLEL

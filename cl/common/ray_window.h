@@ -1,4 +1,4 @@
-/* Finds which pixels may see a box of voxels, so that the adjoint need not try all cells and pixels. */
+/* Finds the pixels whose rays may meet a box of voxels, so that the adjoint need not try all cells and pixels. */
 #include "common/ray.h"
 
 typedef struct { vi u_lo, u_hi, v_lo, v_hi; } window_t;
@@ -15,8 +15,8 @@ RAY_INLINE void window_along(const vf at, const vf mx, const vf my, const vf mz,
     *hi = VI_PICK(*hi, min(*hi, to), ahead);
 }
 
-/* Pixels to which a box of half-size `half_size` about a voxel index `at` may project, in LANES neighbouring cells. It is a
-   bound and no estimate, within each cell's lines and the ``others`` of the detector. Returns which cells see the box.
+/* Pixels to which a box of half-size `half_size` about a voxel index `at` may project, in LANES neighbouring cells. No pixel
+   is missed. They lie within each cell's lines and the ``others`` of the detector. Returns which cells see the box.
    matrix (12, stride) maps a voxel index to u z, v z and z; cell_lines (C, 2). Cells from `stop` on do not count. */
 RAY_INLINE vi window_of(__global const float *matrix, const int stride, __global const int *cell_lines, const int others,
                         const int cell, const int stop, const float4 at, const float4 half_size, window_t *w)

@@ -39,7 +39,7 @@
 #define REC_U_HI 12
 #define REC_V_LO 13
 #define REC_V_HI 14
-#if MOVING                /* another factor of S, turned into the motion: common/splat_moving.h */
+#if MOVING                /* the factor V of S instead of L, rotated into the direction of motion: common/splat_moving.h */
 #define REC_ALONG_U 0
 #define REC_ALONG_V 1
 #define REC_ACROSS_V 2
@@ -48,7 +48,7 @@
 #define REC_REACH2 17     /* cutoff for |(along, across)|^2, enlarged by the largest Q */
 #endif
 
-/* Floats from the first image to a cell's image. All cells of a frame share one, unless each line's own are wanted. */
+/* Floats from the first image to a cell's image. All cells of a frame share one image, except with LAYERED. */
 #if LAYERED
 #define LAYER_AT(cell, lines, pitch) ((size_t)(cell)[CELL_LAYER] * (IMAGE_GUARD + (size_t)(lines) * (pitch)))
 #define LAYERS(count) (count)
@@ -93,7 +93,7 @@ static inline splat_line splat_on_line(SPLAT_SPACE const float *splat_record, SP
     return s;
 }
 
-/* Exponent (num/Q) and value at pixels u (absolute), whose offset from the centre is du. */
+/* The value at pixels u, whose offset from the centre is du; also num, B and 1/Q. */
 static inline vf splat_value(splat_line s, vf u, vf du, vf *num_out, vf *big_b, vf *inv_q)
 {
     vf t = s.l11 * du + s.t0;

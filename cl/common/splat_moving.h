@@ -10,7 +10,7 @@
 /* Rows of a cell's table of lines, of `time_pitch` floats each. */
 #define TIME_MIDDLE 0
 #define TIME_HALF 1
-#define TIME_WEIGHT 2 /* the part of the line's window in this segment */
+#define TIME_WEIGHT 2 /* share of the line's window in this segment */
 #define TIME_ROWS 3
 #define TIMES_OF(c, line_times, time_pitch) ((line_times) + (size_t)(c) * TIME_ROWS * (time_pitch))
 
@@ -117,7 +117,7 @@ ALWAYS_INLINE vf moving_exp(const vf z, const moving_pixel p)
     return falling_exp2((z * z + p.c2) * p.fall);
 }
 
-/* The line's integral over its window at a pixel. `rule` is a constant where this is inlined. */
+/* The pixel's line integral, averaged over its line's window. `rule` is a constant where this is inlined. */
 ALWAYS_INLINE vf moving_value(const int rule, const moving_line s, const moving_pixel p)
 {
     if (rule == CLOSED) {
@@ -190,7 +190,7 @@ ALWAYS_INLINE moving_means moving_all_means(const moving_line s, const moving_pi
 }
 
 /* Pixels of LANES lines from `v` on that the splat reaches within each line's window: the discs at its two ends (in whitened
-   coordinates) and the flat sides between them. Lines that see nothing of the segment get no pixels. */
+   coordinates) and the flat sides between them. Lines that are not open during the segment get no pixels. */
 ALWAYS_INLINE void moving_span(SPLAT_SPACE const float *splat_record, const vf dv, const vf middle, const vf half_time,
                                const vf weight, const int cuts, vi *u_lo, vi *u_hi)
 {

@@ -1,5 +1,5 @@
 /* The splats of a tile, in their order: tile_splat_ids[tile_offsets[tile]] to tile_splat_ids[tile_offsets[tile + 1] - 1], as
-   binning.cl writes them. Where the lists outgrew `capacity`, every tile lists all splats: this is slow, with the same
+   binning.cl writes them. Where a list does not fit into `capacity`, its tile tries all splats: slower, with the same
    result. */
 #include "common/lanes.h"
 

@@ -1,4 +1,4 @@
-/* The record of a Gaussian on a grid. With a voxel's offset D from the centre, its value is density exp(-|U D|^2 / 2), with
+/* A Gaussian's record on a grid, in voxels. At the offset D from the centre, the value is density exp(-|U D|^2 / 2), with
    U upper triangular. */
 #include "common/falling_exp2.h"
 

@@ -27,10 +27,10 @@ DENSITY = 6  # index in a placement, which is turn (rotation vector, rad), shift
 _MARGIN = 1.2  # margin of a shadow's half-width, for an oblique panel
 _FEWEST_TIMES, _MOST_TIMES = 6, 24  # times per exposure; the phantom's edge moves by a pixel between two of them
 _FEWEST_RAYS, _MOST_RAYS = 2, 6  # rays along each side of a pixel or a block, and per bead's radius
-_BLUR_PX = 0.8  # with less blur, differences of sharp edges would show single rays, which are half a pixel apart
+_BLUR_PX = 0.8  # σ of a blur, without which differences of sharp edges would show single rays, half a pixel apart
 _LEAST_ZEROS, _ZEROS_PX = 0.2, 5  # fraction of zeros from which air was clipped; side of the averaged blocks
 _BACKGROUND = 4  # cosines along each side of a frame: they describe holder, scatter and drift of the tube
-_STEP_PX = 0.25
+_STEP_PX = 0.25  # movement of a frame by half a central difference of a signal
 _MOST_PX = 1.5  # largest movement of a frame by a step of the placement
 _SETTLED_PX, _LINEAR_PX = 0.01, 0.3  # size of the last step; the largest step after which the signals are still valid
 

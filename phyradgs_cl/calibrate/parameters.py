@@ -15,9 +15,10 @@ from phyradgs_cl.text import suggest_name
 
 _STEP_PX = 0.25  # movement of the image at its edge by half a central difference
 _TIMING_STEP, _LARGEST_CUT = 0.1, 0.7  # shares of the stated time: half a central difference, and the most to subtract
-_MOST_TILT_RAD = math.radians(2.0)# for signals that change sign after half a turn, which errors of the voxels do not
-_SMALL_MISMATCH = 1.3  # an angle with this deviation is unknown: sines are not linear beyond
-_LEAST_KNOWN_RAD = math.radians(10.0)  # deviation of an angle that is unknown: sines are linear no further
+_MOST_TILT_RAD = math.radians(2.0)  # largest half of a central difference of an angle
+_SMALL_MISMATCH = 1.3  # ``mismatch`` of signals that change sign after half a turn, as the errors of voxels do not
+# an angle with a larger standard deviation counts as undetermined: sines are linear no further
+_LEAST_KNOWN_RAD = math.radians(10.0)
 _DEGREES = math.degrees(1.0)
 
 
@@ -50,7 +51,7 @@ class Parameter:
         return min(step, _TIMING_STEP * self.stated(scan) or step) if self.is_timing else step
 
     def is_known(self, deviation: float) -> bool:
-        """True where a value with this standard deviation, in the field's unit, is useful."""
+        """Returns whether a value with this standard deviation, in the field's unit, is useful."""
         return self.unit != "deg" or deviation < _LEAST_KNOWN_RAD
 
     def lowest(self, scan: Scan) -> float:
@@ -73,7 +74,8 @@ def _edge_pixels(scan: Scan, factor: float = 1.0) -> float:
 
 
 def _tilt_pixels(axis: int) -> Callable[[Scan], float]:
-    """Returns the pixels of a tilt. It magnifies one side: points move by the square of their distance from its axis."""
+    """Returns how many pixels a radian of tilt moves the panel's edge. A tilt magnifies one side: points move by the square
+    of their distance from its axis."""
     return lambda scan: _half_mm(scan, axis) ** 2 / _cone(scan).source_to_detector_mm / _pitch_mm(scan)
 
 
@@ -149,7 +151,8 @@ NAMES = list(dict.fromkeys([*PARAMETER_GROUPS, *PARAMETERS, WOBBLE, MOTION, DIRE
 
 @dataclass(frozen=True)
 class Request:
-    """The parameters to estimate. ``per_view``: wobble, motion or nothing (""). ``asks_direction``: test the readout's."""
+    """The parameters to estimate. ``per_view``: wobble, motion or nothing (""). ``asks_direction``: whether to test which
+    line is read first."""
 
     parameters: list[Parameter]
     per_view: str
@@ -161,12 +164,12 @@ class Request:
 
 
 def requested(what: str | None, scan: Scan, knows_shape: bool = False) -> Request:
-    """Reads names separated by commas. A parallel beam has neither tilt nor distances.
+    """Returns the request in names separated by commas. A parallel beam has neither tilt nor distances.
 
     None takes offset, roll and tilt, in a fly-scan also readout and exposure, for an object of known shape also distances.
 
-    Raises InputError for an unknown name, distances and tilts of a parallel beam, wobble together with motion, and the
-    timing of a gantry that stands still."""
+    Raises InputError for an unknown name, distances and tilts of a parallel beam, wobble together with motion, the timing of
+    a gantry that stands still, and a readout of 0 s."""
     if what is None:
         is_rolling = _turns(scan) and scan.shutter.readout_s > 0
         what = "offset,roll" if scan.is_parallel else "offset,roll,tilt"

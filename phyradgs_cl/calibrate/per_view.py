@@ -25,12 +25,12 @@ from phyradgs_cl.runtime import Runtime
 
 SPLINES = 7  # splines of a motion, each about a seventh of the scan wide
 TURN, SHIFT_V, SHIFT_U = 0, 1, 2
-_STEP_PX = 0.25
+_STEP_PX = 0.25  # movement of a frame by half a central difference of a signal
 _LEAST_NORM = 0.1  # fraction of the largest norm of a kind: parameters with weaker signals are not scaled up further
 _DEG = float(np.rad2deg(1.0))
 DISCRETISATION = 0.5  # fraction of the change since a grid half as fine: the error that remains, if it is of first order
-_STEPS = 3
-_ITERATIONS = 20
+_STEPS = 3  # Gauss–Newton steps on each grid
+_ITERATIONS = 20  # iterations of CGLS, for a step and for a deviation
 _DEVIATIONS = 3.0  # deviations of one value, which the root mean square of all has to exceed
 
 
@@ -45,7 +45,7 @@ class Kind:
 
 @dataclass(frozen=True, eq=False)
 class PerViewParameters(ABC):
-    """Values of the parameters. View f has ``basis`` (F, n) @ values (K,), of ``values`` (n, K).
+    """Values of the parameters, ``values`` (n, K). View f has the values (``basis`` @ ``values``)[f], (K,); basis is (F, n).
 
     - units (K,): the amount of each kind that moves a frame by a pixel at its edge.
     - circle (n, 2): values that vary as cosine and sine of the angle, as far as the basis can.
@@ -183,7 +183,8 @@ def view_step(
     norms = _norms(parameters.basis, signals)
     scale = _strength(operator) / np.maximum(norms, _LEAST_NORM * norms.max(0))
     if not np.array_equal(parameters.basis, np.eye(len(signals))):
-        scale = np.broadcast_to(scale.mean(0), scale.shape)  # a spline reaches over many views
+        # one scale for all splines, each of which reaches over many views
+        scale = np.broadcast_to(scale.mean(0), scale.shape)
     per_view = parameters.basis @ scale / parameters.basis.sum(1, keepdims=True)
     scaled = (signals * per_view[:, :, None, None]).astype(np.float32)
     views = ViewParameters(scaled, parameters.basis)

@@ -14,8 +14,8 @@ FEWEST_BEADS = 4
 WRONG_PHANTOM = "is it the right phantom, all of it in view, in mm? Does the gantry turn as stated ('phyradgs check')?"
 _LEAST_SHARE = 0.75  # least fraction of the beads that have to be in bright spots
 _SMOOTH = 0.5  # smoothing over a bead's radius: a bead of many voxels then has one maximum
-_PEAKS_PER_BEAD = 2.0
-_TOLERANCE_VOXELS = 1.5
+_PEAKS_PER_BEAD = 2.0  # bright spots that are compared, per bead
+_TOLERANCE_VOXELS = 1.5  # largest distance of a bead from its bright spot
 _TRIANGLES = 40  # triangles of known beads to try
 _APART = 0.05  # least angle in rad between different placements
 _MOST = 6  # placements to try where a nearly symmetric phantom fits equally well in several
@@ -85,7 +85,8 @@ def _peaks_mm(volume: np.ndarray, grid: Grid, most: int) -> np.ndarray:
 def _matching_triangles(
     beads_mm: np.ndarray, spots_mm: np.ndarray, within_mm: float
 ) -> Iterator[tuple[tuple[int, int, int], list[int]]]:
-    """Yields triangles of known points (n, 3) with triangles of seen points (m, 3) that have the same sides."""
+    """Yields triangles of known points (n, 3) with triangles of seen points (m, 3) whose sides differ by less than
+    ``within_mm``."""
     rng = np.random.default_rng(0)
     apart = np.linalg.norm(spots_mm[:, None] - spots_mm, axis=-1)
     for _ in range(_TRIANGLES):

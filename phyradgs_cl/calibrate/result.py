@@ -44,7 +44,7 @@ class Calibration:
 
     - parameters: an estimate each. alike: combinations of parameters, in words, that the frames do not distinguish from
       another object.
-    - residual_rms: of the frames before and after, in line integrals, on the finest grid. before, after: these residuals
+    - residual_rms: RMS residual before and after, in line integrals, on the finest grid. before, after: these residuals
       (F, rows, columns).
     - views: corrections per view, or the object's motion, where they were significant. The table has the root mean square of
       each kind, with the deviation of one.

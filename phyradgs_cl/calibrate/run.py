@@ -62,10 +62,13 @@ STAGES = (
 BEAD_STAGES = (Stage(48, first=8, again=4, steps=6, project=0), Stage(128, first=6, again=4, steps=6, project=0))
 _FEWEST_FRAMES, _FEWEST_COLUMNS = 8, 12
 _FEWEST_SPLINES = 4  # splines of a wobble: a cubic spline needs four
-_LEAST_EXPLAINED = 0.3  # of the frames' variance, by a phantom in its best place before any correction
-_ORDER_ERRORS, _ORDER_RATIO = 4.0, 1.04  # of the other readout direction's residual, as in ``check``
-_BEYOND = 1e6  # frames that an encoder table goes on for: first steps of the search may be very wrong
-_EXPECTED_SHARE = 0.25  # of the most passes of a stage: few parameters are determined, and steps become small early
+# least share of the frames' variance that a phantom in its best place explains, before any correction
+_LEAST_EXPLAINED = 0.3
+# standard errors, and ratio of the residuals, from which a direction of readout is the better; as in ``check``
+_ORDER_ERRORS, _ORDER_RATIO = 4.0, 1.04
+_BEYOND = 1e6  # frames by which an encoder table is continued: first steps of the search may be very wrong
+# passes expected over the most of a stage: few parameters are determined, and steps become small early
+_EXPECTED_SHARE = 0.25
 
 
 def calibrate(

@@ -25,7 +25,7 @@ from phyradgs_cl.calibrate.stages import Stage
 
 LEAST_SHARE = 0.2  # least fraction of a signal that the object and the other parameters leave unexplained
 LEAST_SHARE_OF_BEADS = 0.02  # the same for a known object, which has no voxels that explain signals by accident
-_TINY = 1e-9
+_TINY = 1e-9  # is added to diagonals before an inverse
 _GAUGE_FACTOR, _MOST_GAUGE = 2.0, 0.2  # factor of a gauge's share; most of it to count, as it is large in a wrong geometry
 DEVIATIONS = 3.0  # deviations by which a parameter has to differ from its stated value
 _MOST_PX = 2.0  # largest step, in pixels of the grid: signals are not linear beyond

@@ -12,9 +12,9 @@ from phyradgs_cl.checks import ceil_div
 NORMAL_MAD = 1.4826  # standard deviation of a normal variable over its median absolute deviation
 # Median of |x| over the standard deviation of a normal x, and the norm of the filter (-1/2, 1, -1/2).
 _MEDIAN_OF_NORMAL, _FILTER_NORM = 0.6745, 1.5**0.5
-_LARGEST_SAMPLE = 1_000_000
-_TENTHS = 10
-_BEHIND = 5.0  # in noise levels: larger line integrals have met the object
+_LARGEST_SAMPLE = 1_000_000  # pixels whose median is taken, at most
+_TENTHS = 10  # classes of line integrals with equal numbers of pixels
+_BEHIND = 5.0  # line integrals above so many noise levels have met the object
 _FRAMES = 16  # frames from which noise is estimated
 
 LEAST_SHARE = 1e-3

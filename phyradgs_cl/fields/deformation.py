@@ -17,7 +17,7 @@ from phyradgs_cl.fields.volume import Grid
 
 _LEVELS = 16  # steps of a weight's range at which the folding check distinguishes states
 _MOST_STEPS = 200  # iterations of the fixed point: enough for a contraction of 0.93
-_FLAT = 1e-4  # at points with smaller slopes the determinant is 1
+_FLAT = 1e-4  # slope of a displacement below which the determinant counts as 1
 _CLOSE = 1e-6  # fraction of the smallest control spacing at which the fixed point ends
 
 

@@ -10,8 +10,8 @@ from phyradgs_cl import checks
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields.volume import MOST_VOXELS, Grid, triple
 
-_LARGEST_MM = 1e9
-_ROUNDING = 1e-6  # in voxels: a box that ends so near to a voxel's face ends at that face
+_LARGEST_MM = 1e9  # largest length that an option takes; its inverse is the smallest
+_ROUNDING = 1e-6  # distance in voxels between a box's end and a voxel's face below which they are one
 _TYPED = 0.01  # the same for a typed box and the scan's voxels, whose sides are rarely round numbers
 
 
@@ -118,7 +118,8 @@ class GridChoice:
 
 
 def voxel_sides_mm(option: str, value: Any) -> tuple[float, float, float]:
-    """Returns the sides of a voxel (z, y, x) in mm from one length or three. InputError names ``option``."""
+    """Returns the sides of a voxel (z, y, x) in mm from one length or three. Raises InputError, which names ``option``, for
+    others."""
     sides_mm = _numbers(option, value, (1, 3), "0.5 or 1,0.5,0.5")
     for side_mm in sides_mm:
         checks.within(option, side_mm, 1 / _LARGEST_MM, _LARGEST_MM)

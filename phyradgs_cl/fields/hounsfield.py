@@ -19,20 +19,22 @@ Box = tuple[float, ...]
 """Z0, Z1, Y0, Y1, X0, X1 in mm."""
 Window = tuple[float, float, int]
 """Where a peak of the histogram has half its height, from and to in 1/mm, and the voxels between."""
-_FEWEST = 100  # voxels of a point: their mean has a tenth of a voxel's noise
+_FEWEST = 100  # voxels of a point, at least: their mean has a tenth of a voxel's noise
 _WATER_PER_MM = (0.009, 0.6)  # water's attenuation at 500 keV and at 10 keV
-_AIR_BELOW = 0.25  # of water: the lowest peak of a volume without air is fat, say
-_BINS, _SMOOTH_BINS = 512, 2.0
-_PROMINENT, _CERTAIN = 0.1, 3.0  # of a peak's own height, and of its root: eight times the noise of smooth counts
-_ZOOM = 2.5  # times water
-_SHORTENED = 5  # times, to a quarter each: metal may be a thousand times denser than water
+_AIR_BELOW = 0.25  # largest attenuation of air over water's: a lowest peak above it is fat, say
+_BINS, _SMOOTH_BINS = 512, 2.0  # bins of the histogram, and σ of its smoothing in bins
+# least prominence over a peak's height, and over the root of its height: eight times the noise of smooth counts
+_PROMINENT, _CERTAIN = 0.1, 3.0
+_ZOOM = 2.5  # end of the last histogram over that of water's peak
+# times that a histogram's range is cut to a quarter, at most: metal may be a thousand times denser than water
+_SHORTENED = 5
 _NOTE = re.compile(r"values in HU(?:, water ([-+.\de]+), air ([-+.\de]+) 1/mm)?")
 
 
 @dataclass(frozen=True)
 class Hounsfield:
-    """Attenuation of water, 0 HU, and of air, −1000 HU, in 1/mm. ``fitted``: a line that says to what. InputError for water
-    outside 1e-6 to 1e3, and for air that is not below it."""
+    """Attenuation of water, 0 HU, and of air, −1000 HU, in 1/mm. ``fitted``: a line that says to what. Raises
+    InputError for water outside 1e-6 to 1e3, and for air that is not below it."""
 
     water_per_mm: float
     air_per_mm: float = 0.0
@@ -46,7 +48,7 @@ class Hounsfield:
             raise InputError("Hounsfield units", found, "air below water", "exchange or move the boxes")
 
     def of(self, per_mm: np.ndarray) -> np.ndarray:
-        """Returns attenuation (z, y, x) in 1/mm as float32 in HU. InputError where float32 does not hold them."""
+        """Returns attenuation (z, y, x) in 1/mm as float32 in HU. Raises InputError where float32 does not hold them."""
         factor = 1000.0 / (self.water_per_mm - self.air_per_mm)
         hu = np.empty(per_mm.shape, np.float32)
         with np.errstate(over="ignore"):
@@ -79,7 +81,7 @@ class Hounsfield:
 
 
 def of_facts(facts: Mapping[str, object]) -> Hounsfield | None:
-    """Returns the scale in a volume's provenance, or None. InputError for a damaged one."""
+    """Returns the scale in a volume's provenance, or None without any. Raises InputError for a damaged one."""
     stored = facts.get(HOUNSFIELD)
     if stored is None:
         return None
@@ -106,7 +108,7 @@ def fitted(
     """Fits the scale of a volume (z, y, x) in 1/mm to the means of two boxes. A box that is None becomes the volume's own
     peak: the lowest is air, the largest above it water. ``insert_hu``: the HU of the second point, where it is not water.
 
-    InputError: less than 100 voxels; air that is not below water; no two peaks, peaks that cannot be air and water."""
+    Raises InputError for less than 100 voxels, air that is not below water, and where no two peaks can be air and water."""
     checks.within("--insert-hu", insert_hu, -900, 30_000)
     if values.min() < -10:  # no attenuation in 1/mm
         raise InputError("--hu", f"values from {values.min():g}, as of Hounsfield units", "attenuation in 1/mm")
@@ -141,7 +143,7 @@ def _mean(name: str, voxels: np.ndarray, is_peak: bool) -> tuple[float, str]:
 
 
 def _inside(option: str, values: np.ndarray, grid: Grid, box: Box) -> np.ndarray:
-    """Returns the voxels whose centres lie in a box. InputError for other than six numbers, rising in pairs."""
+    """Returns the voxels whose centres lie in a box. Raises InputError for other than six numbers, rising in pairs."""
     ends_mm = checks.numbers(option, np.asarray(box), (6,)).reshape(3, 2)
     if (ends_mm[:, 0] >= ends_mm[:, 1]).any():
         raise InputError(option, checks.short_repr(box), "Z0 below Z1, Y0 below Y1, X0 below X1")

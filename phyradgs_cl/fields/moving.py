@@ -54,7 +54,7 @@ class States:
 
 @dataclass(frozen=True, eq=False)
 class MovingTruth(States):
-    """True volumes of a simulated object. deformation: of the scan's reference; None if no field describes it."""
+    """True volumes of a simulated object. deformation: that of the scan's reference; None if no field describes it."""
 
     deformation: Deformation | None = None
 

@@ -51,7 +51,8 @@ class Grid:
 
     @classmethod
     def cube(cls, count: int, side_mm: float) -> "Grid":
-        """Returns a centred cube of ``count``³ voxels with a side of ``side_mm``. InputError: numbers not above 0."""
+        """Returns a centred cube of ``count``³ voxels with a side of ``side_mm``. Raises InputError for numbers not above
+        0."""
         checks.whole("count", count, 1, MOST_VOXELS)
         checks.positive("side_mm", side_mm)
         return cls((count,) * 3, (side_mm / count,) * 3)
@@ -85,7 +86,7 @@ class Grid:
 
     def data_array(self, values: np.ndarray, unit: str, times_s: np.ndarray | None = None) -> "DataArray":
         """Returns values (nz, ny, nx), or (K, nz, ny, nx) at ``times_s`` (K,), as xarray's DataArray with coordinates in mm
-        and s. ``unit``: of the values. InputError where xarray is not installed."""
+        and s. ``unit``: that of the values. Raises InputError where xarray is not installed."""
         xarray = checks.package("xarray", "the package of labelled arrays", "xarray")
         axes = {name: (name, axis, {"units": "mm"}) for name, axis in zip("zyx", self.axes_mm(), strict=True)}
         if times_s is not None:

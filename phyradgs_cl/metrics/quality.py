@@ -29,7 +29,7 @@ WINDOW, SIGMA = 11, 1.5
 K1, K2 = 0.01, 0.03
 _VOXELS_PER_BATCH = 1 << 20  # about ten float64 arrays of this size exist at once: 80 MB
 _EDGE = 0.25  # fraction of the steepest slope: at such voxels a displacement can be seen
-_MOST_POINTS = 2000
+_MOST_POINTS = 2000  # points at which motions are compared
 _INCH, _DPI = 3.2, 110  # inches and dots per inch of the figure of slices
 
 
@@ -126,7 +126,7 @@ def ssim_map(result: ArrayLike, reference: ArrayLike, data_range: float) -> Arra
 
 
 def _along_axis(result: Floats, reference: Floats, peak: float, axis: int) -> float:
-    """Returns the mean over those slices across ``axis`` that are not empty in the reference."""
+    """Returns the mean SSIM of those slices across ``axis`` that are not empty in the reference."""
     a, b = np.moveaxis(result, axis, 0), np.moveaxis(reference, axis, 0)
     full = np.flatnonzero(b.any(axis=(1, 2)))
     if full.size == 0:

@@ -12,11 +12,11 @@ INSTALL = 'pip install "phyradgs-cl[neural]"'
 
 
 def has_torch() -> bool:
-    """Whether the package torch can be imported."""
+    """Returns whether the package torch can be imported."""
     return importlib.util.find_spec("torch") is not None
 
 
 def require_torch(subject: str) -> None:
-    """Raises InputError that says what to install, unless PyTorch is there."""
+    """Raises InputError, which says what to install, where PyTorch is missing."""
     if not has_torch():
         raise InputError(subject, "no PyTorch", "the package torch", INSTALL)

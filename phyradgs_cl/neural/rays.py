@@ -13,7 +13,7 @@ from phyradgs_cl.acquisition.time_cells import TimeCells
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
 
-_BEYOND_VOLUME = 2.0  # in half-sides: further away than any corner of the volume
+_BEYOND_VOLUME = 2.0  # a distance in half-sides that is beyond every corner of the volume
 Field = Callable[[torch.Tensor], torch.Tensor]
 
 
@@ -32,7 +32,7 @@ class ExposureRays:
 
     @classmethod
     def of_cells(cls, table: TimeCells, grid: Grid) -> "ExposureRays":
-        """Returns the rays of still cells in mm, for a volume on ``grid`` in mm.
+        """Returns the rays of cells of fixed pose in mm, for a volume on ``grid`` in mm.
 
         Raises InputError for a table whose lines have different numbers of cells or different weights."""
         centre, unit = np.array(grid.offset_mm[::-1]), grid.half_longest_mm

@@ -84,7 +84,7 @@ class RidgeStep:
     def __call__(
         self, volume: SameArray, sigma: float, step: float, *, nonnegative: bool, out: DeviceArray | None = None
     ) -> SameArray:
-        """Returns v − ``step`` ∇R(v), float32; ``sigma`` in the unit of v (z, y, x). ``out``: as of ``DctProx``."""
+        """Returns v − ``step`` ∇R(v), float32; ``sigma`` in the unit of v (z, y, x). ``out``: as in ``DctProx``."""
         nz, ny, nx = self.shape
         observed, result = beside(self.rt, volume, out)
         padded = self._padded, Strides(GUARD, ny * pitch_of(nx), pitch_of(nx))
@@ -133,6 +133,6 @@ def correlated(channels: np.ndarray, filters: np.ndarray) -> np.ndarray:
 
 
 def correlated_back(responses: np.ndarray, filters: np.ndarray) -> np.ndarray:
-    """The transpose of ``correlated``, from (i, z, y, x) to (c, z + 2, y + 2, x + 2)."""
+    """Applies the transpose of ``correlated``, from (i, z, y, x) to (c, z + 2, y + 2, x + 2)."""
     padded = np.pad(responses, ((0, 0), (2, 2), (2, 2), (2, 2)))
     return correlated(padded, filters.swapaxes(0, 1)[..., ::-1, ::-1, ::-1])

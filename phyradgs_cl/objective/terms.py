@@ -144,7 +144,8 @@ def _axis_weights(shape: tuple[int, ...]) -> list[float]:
 
 
 def mean_density(rows: np.ndarray, weight: float) -> tuple[float, np.ndarray]:
-    """Float64 twin of the term in ``chain_activations``: ``weight`` times the mean, and its gradient by rows (11, G)."""
+    """Float64 twin of the term in ``chain_activations``: returns ``weight`` times the mean, and its gradient d/d(rows) (11,
+    G)."""
     gradient = np.zeros_like(rows)
     if (count := rows.shape[1]) == 0:
         return 0.0, gradient

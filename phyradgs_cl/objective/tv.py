@@ -99,7 +99,7 @@ def tv_prox(
 
 
 def differences(volume: np.ndarray, axis_weights: tuple[float, ...]) -> np.ndarray:
-    """Returns weighted forward differences (3, z, y, x) along z, y, x; 0 behind the last voxel. For states (K, z, y, x) the
+    """Returns weighted forward differences (3, z, y, x) along z, y, x; 0 at the last voxel. For states (K, z, y, x) the
     differences in time come first."""
     result = np.zeros((volume.ndim, *volume.shape))
     for axis, weight in enumerate(axis_weights):

@@ -16,15 +16,16 @@ from phyradgs_cl.operators.rays.layout import voxel_matrices
 from phyradgs_cl.runtime import Array, DeviceArray, Room, Runtime, SameArray, attempts
 from phyradgs_cl.runtime.layout import GUARD, Strides, move, padded_zeros, pitch_of, unpad_rows
 
-_VIEWS_PER_LAUNCH = 64  # a work-item reads a few lines of every view: they should stay in a core's cache
-_BYTES_A_LAUNCH = 1 << 28
-_VIEWS_SHARE = 0.25  # of the free memory
-_BLOCK_VOXELS = 128  # along z per work-item of the upright kernel
+_VIEWS_PER_LAUNCH = 64  # views of a launch, at most: a work-item reads a few lines of each, which should stay in the cache
+_BYTES_A_LAUNCH = 1 << 28  # upper limit for the frames that are uploaded together
+_VIEWS_SHARE = 0.25  # share of the free device memory for the frames that are uploaded together
+_BLOCK_VOXELS = 128  # voxels along z per work-item of the upright kernel, at most
 _COLUMN_ROWS = 512  # detector rows that such a block may project to
-_UPRIGHT = 1e-7  # change of u or depth over the volume's height, relative to the depth
-_MOST_LEAN = 0.25  # columns per row along z: beyond it the general kernel is faster
-LINE_SAMPLES = 4  # as long as so many samples takes a voxel of a view whose lines have their own poses
-_WIDEST = 16  # voxels of a vector, which may run past the last one
+# columns are upright where u·depth and depth change by less than so much of the depth over the volume's height
+_UPRIGHT = 1e-7
+_MOST_LEAN = 0.25  # largest lean: columns crossed per row crossed along z; beyond it the general kernel is faster
+LINE_SAMPLES = 4  # work of a voxel in a view with a pose for every line, in samples of a view with one pose
+_WIDEST = 16  # voxels of the widest vector, which may reach beyond the end of a column
 Arguments = tuple[DeviceArray, DeviceArray, DeviceArray, np.int32, np.int32, np.int32, np.int32, np.int64]
 
 
@@ -55,9 +56,9 @@ def backproject_lines(
     """Backprojects frames in which every line has its own pose: pose (F, lines, 12) mm, lines along ``axis``.
 
     A voxel reads the line r whose pose projects the voxel onto r, interpolated between neighbouring lines. Its value is
-    divided by the rate at which the voxel crosses lines: once for the angular step, and once more for the filter's scale
-    if frames were filtered across lines (``axis`` columns). See docs/mathematics.md. power: as of ``backproject``; frames
-    are not filtered where it is 1."""
+    divided by the rate at which the voxel crosses lines: once for the angular step, and once more for the filter's scale if
+    frames were filtered across lines (``axis`` columns). See docs/mathematics.md. power: as in ``backproject``; with 1 the
+    frames count as unfiltered."""
     pose = Readout(axis).poses(pose)
     matrices = voxel_matrices(pose.reshape(-1, 12), grid, is_parallel).reshape(len(pose), -1)
     views = Views(frames, axis == "columns", matrices, weight)
@@ -66,7 +67,8 @@ def backproject_lines(
 
 @dataclass(frozen=True, eq=False)
 class Views:
-    """Frames (F, rows, columns), whether their columns become rows, their matrices (F, …) and weights (F,)."""
+    """Frames (F, rows, columns), whether kernels get them transposed, the matrices of a frame's poses (F, 12 · poses), and
+    FDK's weights (F,)."""
 
     frames: Array
     is_turned: bool
@@ -75,7 +77,7 @@ class Views:
 
     @property
     def shape(self) -> tuple[int, int]:
-        """(lines, width) of a frame in the kernels."""
+        """(lines, width) of a frame in the kernels: (columns, rows) where it is transposed."""
         _, rows, columns = self.frames.shape
         return (columns, rows) if self.is_turned else (rows, columns)
 
@@ -85,7 +87,7 @@ class Views:
         return 4 * count * int(2 * GUARD + rows * pitch_of(width) + self.matrices.shape[1] + 1)
 
     def padded(self, rt: Runtime, part: slice) -> DeviceArray:
-        """Returns some of the frames, each as a padded image."""
+        """Returns the frames ``part`` on the device, (n, floats of a padded image), transposed where ``is_turned``."""
         count, (rows, width) = part.stop - part.start, self.shape
         pitch = pitch_of(width)
         each = 2 * GUARD + rows * pitch
@@ -102,7 +104,7 @@ class Views:
         return rt.upload(on_host)
 
     def parts(self, room: Room) -> Iterator[slice]:
-        """Yields runs of views that are uploaded together."""
+        """Yields slices of consecutive views that are uploaded together."""
         most_bytes = min(_BYTES_A_LAUNCH, room.largest_bytes, int(_VIEWS_SHARE * room.free_bytes))
         count = max(1, min(_VIEWS_PER_LAUNCH, most_bytes // self.bytes(1)))
         for first in range(0, len(self.matrices), count):
@@ -113,7 +115,8 @@ _Launch = Callable[[Arguments, Brick, DeviceArray], None]
 
 
 def in_bricks(rt: Runtime, views: Views, grid: Grid, step: int, launch: _Launch) -> Array:
-    """Returns the volume (z, y, x), computed in bricks of a multiple of ``step`` voxels along z if it does not fit."""
+    """Returns the volume (z, y, x) that ``launch`` fills. If it does not fit, bricks of a multiple of ``step`` voxels along
+    z are filled one after the other. Raises OutOfMemoryError where no brick fits."""
 
     is_resident = isinstance(views.frames, DeviceArray)
     volume: Array = rt.empty(grid.shape) if is_resident else np.empty(grid.shape, np.float32)
@@ -139,7 +142,7 @@ def in_bricks(rt: Runtime, views: Views, grid: Grid, step: int, launch: _Launch)
 def _backprojected(
     rt: Runtime, views: Views, parts: list[slice], brick: Brick, launch: _Launch
 ) -> DeviceArray:
-    """Returns a brick in the padded layout."""
+    """Returns the backprojection of all views in a brick, in the padded layout."""
     nz, ny, nx = brick.shape
     volume = padded_zeros(rt, nz * ny, nx)
     for part in parts:
@@ -157,7 +160,8 @@ def _general(rt: Runtime, power: int, images: Arguments, brick: Brick, volume: D
 
 
 def _lines(rt: Runtime, power: int, is_turned: bool, images: Arguments, brick: Brick, volume: DeviceArray) -> None:
-    """Launches the kernel of lines with vectors along the lines, which are columns where ``is_turned``."""
+    """Launches the kernel for one pose per line. Its vectors run along z where lines are columns (``is_turned``), else along
+    x."""
     nz, ny, nx = brick.shape
     along_z = {"ALONG_Z": 1} if is_turned and rt.lanes > 1 else {}
     kernel = rt.kernel("backproject", "backproject_lines", **_defines(power), **along_z)
@@ -178,15 +182,15 @@ def _upright(rt: Runtime, name: str, power: int, block: int, images: Arguments, 
 
 
 def _defines(power: int) -> dict[str, int]:
-    """Returns the build options of a power of the distance; those of FDK's own stay as they are."""
+    """Returns the build options for ``power``. The kernels' default is FDK's 2."""
     return {"IMAGE_GUARD": GUARD} if power == 2 else {"IMAGE_GUARD": GUARD, "DISTANCE_POWER": power}
 
 
 def _upright_block(matrices: np.ndarray, grid: Grid) -> tuple[int, bool]:
-    """Returns the voxels along z per work-item of the upright kernels, 0 if they do not apply, and whether columns lean.
+    """Returns the voxels along z per work-item of the upright kernels, 0 where they do not apply, and whether columns lean.
 
     In upright columns u and depth (rows 0 and 2 of a matrix) do not change with z. All voxels must lie in front of the
-    source, and the rest of a column's last vector too."""
+    source, also those by which a column's last vector exceeds the volume."""
     nz, ny, nx = grid.shape
     corners = np.array([[x, y, z, 1] for x in (0, nx - 1) for y in (0, ny - 1) for z in (0, nz - 1 + _WIDEST)])
     depth = matrices[:, 8:12] @ corners.T

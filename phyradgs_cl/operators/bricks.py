@@ -35,8 +35,8 @@ def cut(
     """Returns bricks as large as ``share`` of the free memory allows, in the order z, y.
 
     Sides are multiples of ``steps`` (z, y), except the last along an axis. ``needs`` returns the bytes of all buffers for a
-    brick of shape (z, y, x). The smallest brick may take all of the room if the share is too little. Raises
-    OutOfMemoryError if it does not fit then."""
+    brick of shape (z, y, x). A brick of the smallest size may take all of the free memory. Raises OutOfMemoryError where
+    even it does not fit."""
     nz, ny, nx = shape
     smallest = (min(steps[0], nz), min(steps[1], ny), nx)
     if not room.holds(*needs(smallest)):

@@ -82,7 +82,8 @@ class DeviceAdam:
         self, raw: DeviceArray, parameters: DeviceArray, gradients: DeviceArray, statistics: DeviceArray,
         count: int, stride: int, *, density_weight: float,
     ) -> None:
-        """Turns dL/dparameters into dL/draw in place, adds the term of the mean density and gathers the statistics."""
+        """Replaces dL/d(parameters) by dL/d(raw), adds the term of the mean density and gathers the statistics of density
+        control."""
         share = 1.0 / max(count, 1)
         self.rt.launch(
             self._chain, stride // self.rt.lanes, raw, parameters, count, stride,

@@ -1,7 +1,7 @@
 """Adaptive density control: clones and splits Gaussians with a large image gradient, and prunes faint and thin ones.
 
-It follows Kerbl et al. 2023 in R2-Gaussian's radiative form. The statistic is the mean norm of the gradient by the projected
-centre, in normalised detector units. Both halves of a clone or split have half the density."""
+It follows Kerbl et al. 2023 in R2-Gaussian's radiative form. The statistic is the mean norm of dL/d(projected
+centre), in normalised detector units. Both halves of a clone or split have half the density."""
 
 from dataclasses import dataclass
 
@@ -119,7 +119,7 @@ def _children(rows: np.ndarray, control: DensityControl, rng: np.random.Generato
 
 
 def rotate(quaternion: np.ndarray, vector: np.ndarray) -> np.ndarray:
-    """Returns vectors (3, S) turned by unit quaternions (4, S), w x y z."""
+    """Returns vectors (3, S) rotated by unit quaternions (4, S), w x y z."""
     w, axis = quaternion[0], quaternion[1:]
     cross = 2 * np.cross(axis, vector, axis=0)
     return np.asarray(vector + w * cross + np.cross(axis, cross, axis=0))

@@ -38,7 +38,9 @@ def shepp_logan(
     """Returns the head in a cube of side 2 · ``half_size_mm`` about the origin.
 
     ``variant``: "toft" (high contrast) or "kak-slaney". ``unit_attenuation_per_mm``: attenuation of grey level 1. By default
-    it is 1 / ``half_size_mm``, so that line integrals do not depend on the size. InputError: a wrong size or variant."""
+    it is 1 / ``half_size_mm``, so that line integrals do not depend on the size.
+
+    Raises InputError for a wrong size or variant."""
     positive("half_size_mm", half_size_mm)
     one_of("Shepp-Logan variant", variant, _GREY_LEVELS)
     unit = 1.0 / half_size_mm if unit_attenuation_per_mm is None else unit_attenuation_per_mm

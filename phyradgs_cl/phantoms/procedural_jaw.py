@@ -12,7 +12,7 @@ from phyradgs_cl.checks import at_least
 from phyradgs_cl.phantoms import implicit
 from phyradgs_cl.phantoms.implicit import Capsule, Field, Lattice, Point
 
-_CORTICAL, _TRABECULAR, _NERVE = 0.85, 0.50, 0.28
+_CORTICAL, _TRABECULAR, _NERVE = 0.85, 0.50, 0.28  # grey levels of bone and nerve
 _ENAMEL, _DENTINE, _PULP = 1.0, 0.72, 0.30
 _MUSCLE, _FAT = 0.24, 0.18
 _SHELL = 0.035  # cortical thickness

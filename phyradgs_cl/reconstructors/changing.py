@@ -22,15 +22,15 @@ from phyradgs_cl.reconstructors.voxels.priors import PriorWeight, TvPrior, axis_
 from phyradgs_cl.reconstructors.voxels.run import Iterations, IterativeOptions, MethodRun
 from phyradgs_cl.runtime import Runtime
 
-_STACKS, _FRAMES = 18, 3  # in memory at one time
+_STACKS, _FRAMES = 18, 3  # stacks of states, and stacks of frames, in memory at one time
 
 
 @dataclass(frozen=True)
 class ChangingOptions(IterativeOptions):
-    """states: of the object, each of as many frames; fewer where there are fewer frames. prior_weight: of total variation in
-    space, relative to the error of the gradient as in ``fista``. time_weight: of a voxel's change from one state to the
-    next, relative to an equal step between two voxels. subsets: as in ``fista``, but at most two for each frame of a state.
-    tv_iterations: as in ``fista``."""
+    """states: number of the object's states, each with as many frames; there are fewer where the scan has fewer frames.
+    prior_weight: weight of total variation in space, relative to the error of the gradient as in ``fista``. time_weight:
+    weight of a voxel's change from one state to the next, relative to an equal step between two voxels. subsets: as in
+    ``fista``, but at most two for each frame of a state. tv_iterations: as in ``fista``."""
 
     TRIALS: ClassVar[tuple[int, int]] = (1, 8)
     """Iterations of the short runs of ``estimate``: the first passes, which touch new memory, are slower."""
@@ -57,7 +57,7 @@ def changing(scan: Scan, options: ChangingOptions, rt: Runtime, **arguments: Any
         prox = TvProx(rt, shape, (options.time_weight, *axis_weights(scan.grid)))
         weight = PriorWeight(system, frame_error(scan, options.motion), options.prior_weight)
         prior, nonnegative = TvPrior(prox, options.tv_iterations), options.nonnegative
-        # a state has few frames: if a frame were many subsets' share of them, steps would be too long and diverge
+        # a state has few frames: where one of them is a large part of a subset, steps would be too long and diverge
         subsets = min(options.subsets, 2 * scan.frames // len(times_s))
         method = Fista(system, prior, weight, subsets=subsets, nonnegative=nonnegative)
 
@@ -73,7 +73,7 @@ def changing(scan: Scan, options: ChangingOptions, rt: Runtime, **arguments: Any
 
 
 def state_times_s(scan: Scan, count: int) -> np.ndarray:
-    """Returns the mean times (K,) in s of equal shares of the frames, at most one for each frame, and so none in a pause."""
+    """Returns the times (K,) in s of states: means over equal shares of the frames, each with a frame or more."""
     middles_s = np.unique(np.asarray(scan.frame_start_s, np.float64)) + scan.shutter.span_s / 2
     shares = np.array_split(middles_s, min(count, len(middles_s)))
     return np.array([share.mean() for share in shares])

@@ -15,7 +15,7 @@ State = Mapping[str, np.ndarray]
 RUN, _CHECKSUM = "run", "checksum"
 """The arrays of a state that hold the identity of its run, as JSON, and the checksum of the others."""
 _REMEDY = "start without --resume"
-_MOST_DIFFERENCES, _LONGEST_NAME = 3, 60
+_MOST_DIFFERENCES, _LONGEST_NAME = 3, 60  # differences that an error names, and characters of a name, at most
 
 
 def with_identity(state: State, identity: Mapping[str, Any]) -> State:
@@ -25,7 +25,7 @@ def with_identity(state: State, identity: Mapping[str, Any]) -> State:
 
 
 def without_identity(state: State, identity: Mapping[str, Any]) -> State:
-    """Returns the method's own state; raises InputError for a damaged one, and for that of another run."""
+    """Returns the method's own state. Raises InputError for a damaged state, and for the state of another run."""
     arrays = {name: array for name, array in state.items() if name != _CHECKSUM}
     if not np.array_equal(state.get(_CHECKSUM, -1), _checksum(arrays)):
         raise InputError("checkpoint", "arrays that do not match their checksum", "a whole checkpoint", _REMEDY)

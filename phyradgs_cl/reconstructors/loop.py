@@ -15,11 +15,11 @@ from phyradgs_cl.reconstructors.checkpoint import State, history_arrays, history
 from phyradgs_cl.reconstructors.result import Progress, ProgressReport
 from phyradgs_cl.signals import stop_on_interrupt
 
-SILENT_S = 10.0
+SILENT_S = 10.0  # seconds without a report after which a process that runs alone reports
 
 
 class Stepwise(Protocol):
-    """An iterative method, between its start and its result. ``iterations``: to do."""
+    """An iterative method, between its start and its result. ``iterations``: how many it is to do."""
 
     iterations: int
 
@@ -29,7 +29,7 @@ class Stepwise(Protocol):
 
     @property
     def remedy(self) -> str:
-        """Advice where it does not."""
+        """Advice for an error where ``quantity`` is not finite."""
 
     @property
     def iteration(self) -> int:
@@ -42,7 +42,7 @@ class Stepwise(Protocol):
     def step(self) -> None: ...
 
     def measures(self) -> Mapping[str, float]:
-        """Returns a line of the record: ``quantity`` and other numbers."""
+        """Returns the numbers of a line of the record: ``quantity`` and others."""
 
     def state(self) -> dict[str, np.ndarray]:
         """Returns the arrays from which ``restore`` continues with the next step."""
@@ -135,7 +135,7 @@ class Loop:
         return False
 
     def _reaches(self, every: int, before: int) -> bool:
-        """True if the step from iteration ``before`` has reached a multiple of ``every``, or the end."""
+        """Returns whether the step from iteration ``before`` has reached a multiple of ``every``, or the end."""
         now = self.method.iteration
         return now // every > before // every or now == self.method.iterations
 

@@ -85,7 +85,8 @@ def own_method(name: str, function: Any) -> Method:
 
 
 def imported(text: str, subject: str = "--method") -> Any:
-    """Imports ``package.module:name``, as ``python -m`` does also from the present folder."""
+    """Imports ``package.module:name``, as ``python -m`` does also from the present folder. Raises InputError where that
+    fails."""
     module, _, name = text.partition(":")
     if os.getcwd() not in sys.path:
         sys.path.append(os.getcwd())

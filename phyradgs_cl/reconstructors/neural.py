@@ -103,7 +103,7 @@ NAF = Method(partial(reconstruct_neural, method="naf"), NAF_PRESETS)
 
 # The released configuration Lineformer/chest_50: that of NAF, with 256 samples for 128 voxels
 SAX_PUBLISHED = LineOptions(**{**vars(NAF_PUBLISHED), "samples": 256})
-# Windows do not change the expected gradient of a squared error, and of few pixels per step they leave it to noise
+# Windows do not change the expected gradient of a squared error; with few pixels per step they make it noisier
 SAX_PRESETS = {"default": LineOptions(iterations=50, windows=0), "published": SAX_PUBLISHED}
 
 SAX_NERF = Method(partial(reconstruct_neural, method="sax-nerf"), SAX_PRESETS)

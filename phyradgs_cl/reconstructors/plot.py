@@ -28,7 +28,7 @@ def plot_result(
 ) -> "Figure":
     """Returns a figure of a volume's middle slices, the convergence record and, with a scan, a frame and its residual.
 
-    ``note``: of the residual's title. ``moves``: how the object moves or changes, for the residual."""
+    ``note``: text added to the residual's title. ``moves``: how the object moves or changes, for the residual."""
     if not (scan is None or isinstance(scan, Scan)):
         raise InputError("scan", checks.short_repr(scan), "the Scan of the result, or None")
     truth = None

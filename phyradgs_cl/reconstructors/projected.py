@@ -18,8 +18,8 @@ from phyradgs_cl.operators.rays.subrays import subrays_of
 from phyradgs_cl.operators.warp.operator import projector_of
 from phyradgs_cl.runtime import Runtime
 
-TIMES_PER_LINE = 16  # samples of a line's exposure, whose error is far below the noise
-_HOLDOUT_SEED, _HOLDOUT_FRAMES = 20, 8  # frames that are projected at one time
+TIMES_PER_LINE = 16  # times of a line's exposure at which it is projected: their error is far below the noise
+_HOLDOUT_SEED, _HOLDOUT_FRAMES = 20, 8  # seed of the drawn pixels; frames that are projected at one time
 Image = NDArray[np.float32]
 
 

@@ -17,8 +17,8 @@ from phyradgs_cl.runtime.memory import DeviceArray
 A = TypeVar("A")
 Shape = tuple[int, ...]
 _CPU_SPAN = 1 << 14  # elements that one work-item sums
-_GPU_GROUP, _GPU_GROUPS = 256, 512
-_ITEMS = 64  # items of a work-group on a CPU, in element-wise kernels
+_GPU_GROUP, _GPU_GROUPS = 256, 512  # work-items of a work-group, and work-groups of a sum, at most
+_ITEMS = 64  # work-items of a work-group on a CPU, in element-wise kernels
 
 
 class Space(Protocol, Generic[A]):
@@ -132,7 +132,7 @@ class DeviceSpace:
     def __init__(self, rt: Runtime) -> None:
         self.rt = rt
         self._unused: dict[int, list[DeviceArray]] = defaultdict(list)
-        # The partial sums of groups; their sum; the sum over several arrays, between which other sums may be made.
+        # partial sums of work-groups; their sum; the sum over several arrays, between which other sums may be made
         self._parts, self._whole, self._total = (rt.empty(count, np.float64) for count in (_GPU_GROUPS, 1, 1))
 
     def empty(self, shape: Shape) -> DeviceArray:
@@ -214,7 +214,8 @@ class DeviceSpace:
         return float(self.rt.download(self._parts).view(np.float32)[:groups].max())
 
     def _each(self, name: str, x: DeviceArray, *others: Any, period: int = 0) -> DeviceArray:
-        """Launches an element-wise kernel of x and others. ``period``: the length after which a short array repeats."""
+        """Launches an element-wise kernel of x and others. ``period``: the length after which a short second operand
+        repeats."""
         result, count = self.empty(x.shape), period or x.size
         items = ceil_div(count, self.rt.lanes), x.size // max(count, 1)
         kernel = self.rt.kernel("algebra", name)
@@ -238,7 +239,7 @@ class DeviceSpace:
         """Launches the first level of a sum over the first array. Returns the number of results in ``_parts``."""
         kernel = self.rt.kernel("algebra", name)
         count, group = arguments[0].size, self.rt.group(1, _GPU_GROUP, kernel)
-        if self.rt.pixel_items:  # on a GPU, neighbouring items read neighbouring elements
+        if self.rt.pixel_items:  # on a GPU, neighbouring work-items read neighbouring elements
             groups = min(_GPU_GROUPS, ceil_div(count, group))
             first_by, step, span = 1, groups * group, count
         else:

@@ -19,7 +19,7 @@ from phyradgs_cl.runtime.opencl import cl
 
 DEVICE_VARIABLE = "PHYRADGS_DEVICE"
 _NEVER_BY_DEFAULT = ("oclgrind", "fpga", "emulat")
-_RIGHT_MESA = 25
+_RIGHT_MESA = 25  # first version of Mesa whose rusticl computes right sums
 log = logging.getLogger(__name__)
 _targets: dict[int, str | None] = {}
 
@@ -71,7 +71,7 @@ def choose_device(wish: str | None = None, turn: int = 0) -> tuple[DeviceInfo, s
 
     ``wish`` (or the environment variable PHYRADGS_DEVICE) is an index, ``cpu``, ``gpu`` or a part of a device's or
     platform's name, or several of these with commas. ``turn`` counts processes that share a machine. Each process takes the
-    next of the list; without a list or an index it takes the next device of the same name. DeviceError: nothing fits."""
+    next of the list; without a list or an index, the next device of the same name. Raises DeviceError where none fits."""
     source = "--device"
     if not wish:
         wish, source = os.environ.get(DEVICE_VARIABLE), DEVICE_VARIABLE

@@ -13,7 +13,7 @@ from phyradgs_cl.checks import ceil_div
 from phyradgs_cl.runtime.context import Runtime
 from phyradgs_cl.runtime.memory import Array, DeviceArray, SameArray
 
-GUARD = 16
+GUARD = 16  # floats before the first row, and zeros at least after each
 
 _TILE = 16  # rows and columns that a CPU's work-item transposes at a time
 

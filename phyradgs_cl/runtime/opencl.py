@@ -38,7 +38,7 @@ _INCLUDE = re.compile(r'^\s*#include\s+"([^"]+)"\s*$')
 class Kernel:
     """The kernel ``function_name`` of ``cl/<program>.cl``, built with ``options`` at its first launch.
 
-    ``most_items``: the largest group, once the driver was asked for it."""
+    ``most_items``: the largest work-group in work-items, once the driver has been asked for it."""
 
     program: str
     function_name: str

@@ -1,5 +1,5 @@
-"""A run's device time by kernel: launches, seconds and bytes. Seconds are of OpenCL events. Bytes count each buffer of a
-launch once. The device's best rates are measured by copies of the driver and by a kernel of multiply-adds."""
+"""A run's device time by kernel: launches, seconds and bytes. Seconds are those of OpenCL's events. Bytes count each buffer
+of a launch once. The device's best rates are measured by copies of the driver and by a kernel of multiply-adds."""
 
 from collections import defaultdict
 from dataclasses import dataclass
@@ -10,7 +10,7 @@ from phyradgs_cl.runtime.opencl import cl
 
 _FOLD_AT = 20_000  # most events that are kept; folding them waits for the queue
 _COPY_BYTES = 1 << 26
-_STEPS = 20_000
+_STEPS = 20_000  # multiply-adds of each chain in a run that measures rates
 _REPEATS = 5
 
 

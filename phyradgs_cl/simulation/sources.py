@@ -22,8 +22,9 @@ from phyradgs_cl.operators.warp.volume import VolumeWarp
 from phyradgs_cl.phantoms import EllipsoidPhantom, MovingPhantom
 from phyradgs_cl.runtime import DeviceArray, MemoryShortage, Runtime
 
-WIDEST_RAY = 1.5  # voxels to a pixel; the usual scanner has 1.43 where voxels are as many as pixels
-_MOST_SAMPLES = 32
+# voxels across a pixel, at the axis, that one ray samples; the usual scanner has 1.43 with as many voxels as pixels
+WIDEST_RAY = 1.5
+_MOST_SAMPLES = 32  # rays along each side of a pixel, at most
 NEAREST = 0.1  # largest distance of matter from its place, in voxels to be reconstructed
 
 
@@ -215,9 +216,9 @@ class _Average:
 
 
 def part_of(cells: TimeCells, members: np.ndarray) -> tuple[TimeCells, np.ndarray]:
-    """Returns the table of some still cells, bool (C,), and the part (lines,) of each line's weight that they have.
+    """Returns a table of the cells ``members``, bool (C,), and the share (lines,) of each line's weight that they have.
 
-    The weights of a line in the new table sum to 1, or are 0."""
+    Weights are rescaled: those of a line sum to 1 in the new table, or are all 0. The cells must have fixed poses."""
     part = some_cells(cells, np.flatnonzero(members))
     share = part.line_weights()
     factors = np.divide(1.0, share, out=np.zeros_like(share), where=share > 0)

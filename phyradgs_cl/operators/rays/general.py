@@ -12,10 +12,10 @@ from phyradgs_cl.runtime.layout import GUARD
 
 # On a CPU a work-item of the adjoint owns a brick of voxels (x, y, z), in local memory with a border of 1 around it.
 _BRICK = (32, 32, 8)
-_SMALL_BRICK = (24, 24, 8)  # 27 kB of the 32 that OpenCL guarantees
+_SMALL_BRICK = (24, 24, 8)  # the brick that takes 27 kB of the 32 kB of local memory that OpenCL guarantees
 _BLOCK = 4  # on a GPU a work-group owns a block with so many voxels per side, or fewer along z; as in cl/rays_adjoint_gpu.cl
-_SAMPLES_PER_VOXEL = 4  # about as many samples of a view touch a voxel
-_LONG_FROM = 2**31  # floats that 32-bit indices cannot address
+_SAMPLES_PER_VOXEL = 4  # number of samples of one view that touch a voxel, about
+_LONG_FROM = 2**31  # number of floats of a volume from which indices need 64 bits
 
 
 def launch_forward(
@@ -66,20 +66,21 @@ def _owners(rt: Runtime, layout: RayLayout, cells: RayCells) -> tuple[tuple[int,
 
 
 def _parts(rt: Runtime, frames: int, samples_per_frame: int) -> Iterator[tuple[int, int]]:
-    """Yields the first frame of each launch and the one after its last. On a CPU one launch takes all frames."""
+    """Yields the frames [first, stop) of each launch. On a CPU one launch takes all frames."""
     step = max(rt.most_samples // samples_per_frame, 1) if rt.pixel_items else frames
     for first in range(0, frames, step):
         yield first, min(first + step, frames)
 
 
 def brick_of(rt: Runtime) -> tuple[int, int, int]:
-    """Voxels (x, y, z) that a CPU's work-item owns. Larger bricks share fewer rays with their neighbours: 14 % faster."""
+    """Returns the voxels (x, y, z) that a CPU's work-item owns. Larger bricks share fewer rays with their neighbours: 14 %
+    faster."""
     tile_bytes = 4 * math.prod(n + 2 for n in _BRICK)
     return _BRICK if rt.device.handle.local_mem_size >= tile_bytes else _SMALL_BRICK
 
 
 def owner_steps(rt: Runtime) -> tuple[int, int]:
-    """Voxels (z, y) that one owner has: a volume cut at multiples of them gives the bits of the uncut volume."""
+    """Returns the voxels (z, y) of one owner: a volume cut at multiples of them gives the bits of the uncut volume."""
     x, y, z = brick_of(rt)
     return (_BLOCK, _BLOCK) if rt.pixel_items else (z, y)
 

@@ -1,8 +1,9 @@
 """The intensity model at a volume: I(x) = −ln Σ w exp(−A_k x), its exact derivative J and Jᵀ.
 
-A_k is the projector of the k-th cell of every line. J = Σ_k s_k A_k with each pixel's softmax weight
-s_k = w_k exp(−p_k) / Σ_j w_j exp(−p_j). Jᵀ y = Σ_k A_kᵀ (s_k y). This takes one launch of the linear projector for each
-cell of a line; together they cost as much as one launch over all cells. Twin: ``intensity_frame`` in twins/rays.py."""
+A_k is the projector of the k-th cell of every line. J = Σ_k s_k A_k with each pixel's softmax weight s_k = w_k exp(−p_k) /
+Σ_j w_j exp(−p_j). Jᵀ y = Σ_k A_kᵀ (s_k y). This takes one launch of the linear projector for each cell of a line; together
+they cost as much as one launch over all cells. Twins in twins/rays.py: ``ray_frame`` with its intensity model,
+``intensity_volume``."""
 
 from collections.abc import Callable, Sequence
 from copy import copy
@@ -23,7 +24,7 @@ _HOST = HostSpace()
 
 
 class IntensityOperator:
-    """I(x), and J and Jᵀ at the last volume given to ``expected`` (A and Aᵀ before the first).
+    """Computes I(x), and J and Jᵀ at the last volume given to ``expected``; before the first they are A and Aᵀ.
 
     Arguments are those of ``RayOperator``, as is the rule for NumPy and device arrays. The operator stores one stack of
     frames (F, rows, columns) of softmax weights for each cell of a line. ``projector`` makes the A_k."""
@@ -53,7 +54,8 @@ class IntensityOperator:
 
     @property
     def holds(self) -> tuple[int, int]:
-        """Volumes and stacks of frames on the device besides ``memory``: integrals and weights of each layer."""
+        """Numbers of volumes and of stacks of frames on the device besides ``memory``: integrals and weights of each
+        layer."""
         return 2, 2 * len(self._operators) + 3
 
     def expected(self, volume: SameArray, out: SameArray | None = None) -> SameArray:
@@ -123,7 +125,8 @@ class IntensityOperator:
 
     def _shares_for(self, like: Array) -> list[Any]:
         is_there = isinstance(like, DeviceArray)
-        if self._shares and isinstance(self._shares[0], DeviceArray) != is_there:  # made by the other kind
+        # they lie on the other side: host or device
+        if self._shares and isinstance(self._shares[0], DeviceArray) != is_there:
             brought = self._device.array if is_there else self._device.numpy
             self._shares = [brought(share) for share in self._shares]
         if not self._shares and is_there:

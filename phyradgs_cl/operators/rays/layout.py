@@ -16,9 +16,9 @@ from phyradgs_cl.operators.splats.layout import projection_matrices
 from phyradgs_cl.runtime import DeviceArray, Runtime
 from phyradgs_cl.runtime.layout import GUARD, Strides, pitch_of
 
-_RAY_CELL_FLOATS = 16
+_RAY_CELL_FLOATS = 16  # floats of a cell in ``ray_constants``
 BORDER = 1  # zero voxels around a volume in y and z: samples need no test at its faces
-_WIDEST = 16  # cells are read as vectors, which may run past the last one
+_WIDEST = 16  # cells of the widest vector, which may reach beyond the last cell
 
 
 @dataclass(frozen=True)
@@ -26,8 +26,9 @@ class RayLayout:
     """Layout of volumes (z, y, x) and of stacks of frames with ``lines`` × ``width`` pixels in device memory.
 
     ``brick`` selects the voxels of the grid that the volume holds. It has a border of zeros, so that the frames of all
-    bricks add up to the frames of the grid. ``subrays`` (along v, along u): lines and width count the rays of pixels.
-    ``axis``: what a line is on the detector; ``is_across``: it is a row although columns are read."""
+    bricks add up to the frames of the grid. With ``subrays`` (along v, along u) lines and width count rays. ``axis``:
+    whether lines are rows or columns of the detector; ``is_across``: lines are rows although the readout goes along
+    columns."""
 
     grid: Grid
     lines: int
@@ -41,8 +42,9 @@ class RayLayout:
     def of_scan(
         cls, rt: Runtime, grid: Grid, detector_shape: tuple[int, int], axis: str, subrays: tuple[int, int] = (1, 1)
     ) -> "RayLayout":
-        """The layout of the complete grid, with the readout's lines as rows of the frames. Of a panel that is read along
-        columns of few rows, vectors of columns would be mostly empty: there the panel's rows are."""
+        """Returns the layout of the complete grid, with the readout's lines as rows of the frames. On CPUs a panel with
+        fewer rows than a vector has lanes keeps its rows as lines, also where columns are read: vectors along columns would
+        be mostly empty."""
         (rows, columns), (along_v, along_u) = detector_shape, subrays
         shape = rows * along_v, columns * along_u
         is_across = axis == "columns" and not rt.pixel_items and shape[0] < rt.lanes
@@ -50,7 +52,7 @@ class RayLayout:
         return cls(grid, *Readout(own).shape(shape), whole(grid.shape), subrays, own, is_across)
 
     def of(self, brick: Brick) -> "RayLayout":
-        """The layout of the same frames with another brick of the grid."""
+        """Returns the layout of the same frames with another brick of the grid."""
         return replace(self, brick=brick)
 
     @property
@@ -62,7 +64,7 @@ class RayLayout:
         return 2 * GUARD + count * self.lines * pitch_of(self.width)
 
     def turned_floats(self, count: int) -> int:
-        """Floats of frames with the readout's lines as columns."""
+        """Returns the floats of ``count`` padded, transposed frames, whose columns are the lines."""
         return 2 * GUARD + count * self.width * pitch_of(self.lines)
 
     def frames_shape(self, count: int) -> tuple[int, int, int]:
@@ -88,14 +90,14 @@ class RayLayout:
         return Strides(GUARD, self.width * row, row)
 
     def pixel_strides(self, axis: str, *, turned: bool = False) -> tuple[int, int, int, int]:
-        """Start of padded frames, and floats from column to column, row to row, frame to frame. ``turned``: of frames whose
-        lines are columns."""
+        """Returns the start of padded frames, and the floats from column to column, row to row, frame to frame. ``turned``:
+        of transposed frames, whose columns are the lines."""
         strides = self.turned_strides if turned else self.frames_strides
         steps = (1, strides.row) if (axis == "rows") != turned else (strides.row, 1)
         return (strides.start, *steps, strides.slice)
 
     def column_floats(self, axis: str) -> int:
-        """Floats of a padded frame with detector columns as rows."""
+        """Returns the floats of a padded frame whose rows are detector columns."""
         return self.width * pitch_of(self.lines) if axis == "rows" else self.lines * pitch_of(self.width)
 
     def inside(self, flat: np.ndarray) -> np.ndarray:
@@ -105,7 +107,8 @@ class RayLayout:
         return padded[BORDER:-BORDER, BORDER:-BORDER, :nx]
 
     def constants(self) -> tuple[np.ndarray | np.int32, ...]:
-        """The kernels' arguments: voxels, first voxel, pitch, voxel size, lines, width, pitch of the frames."""
+        """The kernels' arguments: the brick's voxels (x, y, z), its first voxel, pitch of its rows in floats, voxel size in
+        mm, lines and width of a frame, and pitch of its lines."""
         nz, ny, nx = self.brick.shape
         dz, dy, dx = self.grid.voxel_size_mm
         return (
@@ -133,13 +136,14 @@ class RayCells:
     weight_at: DeviceArray
     is_parallel: bool
     is_across: bool
-    most_per_line: int  # cells that may serve a line of a frame
+    most_per_line: int  # most cells that serve one line of a frame
 
     @classmethod
     def upload(
         cls, rt: Runtime, grid: Grid, tables: Sequence[TimeCells], rows_across: int | None = None
     ) -> "RayCells":
-        """rows_across: the panel's rows, where these are the kernels' lines although columns are read."""
+        """Uploads the tables of all frames. rows_across: the number of the panel's rows, where these are the kernels' lines
+        although columns are read."""
         starts = np.concatenate([[0], np.cumsum([table.count for table in tables])])
         pose = np.concatenate([table.readout.poses(table.pose) for table in tables])
         weights = [table.weights_of(cell) for table in tables for cell in range(table.count)]
@@ -147,7 +151,7 @@ class RayCells:
         served = [table.line_cells() + start for table, start in zip(tables, starts[:-1], strict=True)]
         if rows_across is not None:
             pose = np.concatenate([table.pose for table in tables])
-            # vectors begin at every column and may reach beyond a cell's: there its weight is 0
+            # vectors may begin at every column and reach beyond a cell's lines: there its weight is 0
             weights = [np.pad(weight, _WIDEST) for weight in weights]
             served = [np.tile(ends, (rows_across, 1)) for ends in zip(starts[:-1], starts[1:], strict=True)]
         matrices, stride = matrix_table(pose, grid, tables[0].is_parallel)
@@ -195,13 +199,14 @@ def ray_constants(pose: np.ndarray, grid: Grid, is_parallel: bool = False) -> np
 
 
 def _parallel_constants(pose: np.ndarray, grid: Grid) -> np.ndarray:
-    """The same for parallel beams: direction over its main component, and where rays cut the plane 0 of the main axis."""
+    """``ray_constants`` for parallel beams: the direction over its main component, and where rays cut plane 0 of the main
+    axis."""
     first = np.array(grid.first_centre_mm[::-1])
     pitch = np.array(grid.voxel_size_mm[::-1])
     direction, panel = pose[:, 0:3] / pitch, pose[:, 3:].reshape(-1, 3, 3) / pitch
     panel[:, 0] -= first / pitch
     size = np.abs(direction)
-    # the first of those that float32 cannot tell apart, as in the kernels: at 135° the two differ in the last bit
+    # among components that float32 cannot tell apart, the first, as in the kernels: at 135° two differ in the last bit
     main = np.argmax((size / size.max(axis=1, keepdims=True)).astype(np.float32), axis=1)
     cell = np.arange(len(pose))
     direction /= direction[cell, main][:, None]
@@ -213,7 +218,7 @@ def _parallel_constants(pose: np.ndarray, grid: Grid) -> np.ndarray:
 
 
 def voxel_matrices(pose: np.ndarray, grid: Grid, is_parallel: bool = False) -> np.ndarray:
-    """Returns the rows (C, 12) that map a voxel index (x, y, z) to (u·z, v·z, z); z is 1 in a parallel beam."""
+    """Returns the matrices (C, 3 · 4) that map a voxel index (x, y, z) to (u·z, v·z, z); z is 1 in a parallel beam."""
     matrix = projection_matrices(pose, is_parallel).reshape(-1, 3, 4)
     first = np.array(grid.first_centre_mm[::-1])
     pitch = np.array(grid.voxel_size_mm[::-1])
@@ -242,7 +247,7 @@ def layered(tables: Sequence[TimeCells]) -> tuple[list[list[TimeCells]], list[np
 
 
 def some_cells(table: TimeCells, cells: Sequence[int] | np.ndarray) -> TimeCells:
-    """Returns the table of some still cells."""
+    """Returns the table of the cells with these numbers. The cells must have fixed poses, without ends of a motion."""
     names = ["pose", "time_s", "line_start", "line_stop", "weight"]
     names += [] if table.line_share is None else ["line_share"]
     return replace(table, **{name: getattr(table, name)[cells] for name in names})

@@ -1,4 +1,5 @@
-"""The device memory of ray-driven operators: a volume or a brick of it, a batch of frames, and slots."""
+"""The device memory of ray-driven operators: buffers for a volume or a brick of it, a batch of frames, and slots
+(``slots.py``)."""
 
 from collections.abc import Iterator
 
@@ -14,17 +15,17 @@ from phyradgs_cl.operators.rays.upright import columns_floats, turn_volume
 from phyradgs_cl.runtime import Array, DeviceArray, Runtime
 from phyradgs_cl.runtime.layout import GUARD, Strides, move, pad_rows, unpad_rows
 
-_FRAMES_SHARE = 0.25  # of the free memory, for frames together with a brick
-_SLOTS_SHARE = 0.125  # of the free memory, for slots
-_MOST_SLOT_FLOATS = 2**26  # for slots at a time: more is not faster
+_FRAMES_SHARE = 0.25  # share of the free device memory for a batch of frames, where the volume is cut into bricks
+_SLOTS_SHARE = 0.125  # share of the free device memory for slots
+_MOST_SLOT_FLOATS = 2**26  # floats of all slots at a time, at most: more is not faster
 
 
 class RayMemory:
     """Buffers for a volume and for frames of ``layout``, planned at their first use.
 
     A volume that does not fit is cut into bricks, as large as fit together with some frames. ``slot_floats`` is the size of
-    the slots of one frame (``slots.py``), 0 without slots. With slots the volume is also stored with z along rows, if both
-    fit. Several operators may share one memory, one at a time: each call writes the buffers that it reads."""
+    the slots of one frame (``slots.py``), 0 without slots. With slots the volume is also stored transposed, with z along
+    rows, if both fit. Several operators may share one memory, one at a time: each call writes the buffers that it reads."""
 
     def __init__(self, rt: Runtime, layout: RayLayout, most_frames: int, slot_floats: int = 0) -> None:
         self.rt, self.layout, self.most_frames = rt, layout, most_frames
@@ -41,7 +42,8 @@ class RayMemory:
         self._padded: dict[tuple[int, int, int], np.ndarray] = {}
 
     def plan(self, share: float = 1.0) -> list[Brick]:
-        """Returns the bricks. A share below 1 plans again, with that share of the free memory."""
+        """Returns the bricks. A share below 1 plans again, with that share of the free memory. Raises OutOfMemoryError where
+        none fits."""
         if not self._bricks or share < 1:
             self.release()
             self._bricks, self._batch = self._planned(share)
@@ -93,13 +95,13 @@ class RayMemory:
         return cut(layout.grid.shape, steps, needs, room, share), frames
 
     def batches(self, count: int) -> Iterator[slice]:
-        """Yields runs of frames that fit on the device together."""
+        """Yields slices of consecutive frames that fit on the device together."""
         self.plan()
         for start in range(0, count, self._batch):
             yield slice(start, min(start + self._batch, count))
 
     def holds_all(self, frames: int) -> bool:
-        """Whether the complete volume and so many frames fit together; if they do, allocates the memory."""
+        """Returns whether the complete volume and so many frames fit together; if they do, allocates the memory."""
         if len(self.plan()) > 1 or self._batch < frames:
             return False
         self.volume(self._bricks[0])
@@ -117,7 +119,7 @@ class RayMemory:
             self._volume = self.rt.zeros(self.layout.of(largest).volume_floats)
             self._bordered = largest.shape
         layout = self.layout.of(brick)
-        if brick.shape != self._bordered:  # the border of the last shape lies among the voxels of this one
+        if brick.shape != self._bordered:  # the border of the last brick lies among the voxels of this one
             self._bordered = None
         return layout, DeviceArray(self._volume.buffer, (layout.volume_floats,), self._volume.dtype)
 
@@ -152,11 +154,11 @@ class RayMemory:
 
     @property
     def has_columns(self) -> bool:
-        """Whether a complete volume with z along rows fits as well; known after ``plan``."""
+        """Whether the transposed volume, with z along rows, fits as well; known after ``plan``."""
         return self._columns_bytes > 0
 
     def turned(self, volume: Array) -> DeviceArray:
-        """Returns a complete volume (z, y, x) with z along rows."""
+        """Returns a complete volume (z, y, x) transposed to (y, x, z), padded."""
         if self._columns is None:
             self._columns = self.rt.zeros(self._columns_bytes // 4)
         if isinstance(volume, DeviceArray):
@@ -186,13 +188,13 @@ class RayMemory:
         return DeviceArray(self._frames.buffer, (floats,), self._frames.dtype)
 
     def _frames_floats(self, count: int) -> int:
-        """Floats of frames stored by rows or, with slots, by columns: the larger of both."""
+        """Returns the floats of ``count`` frames, stored by rows or, with slots, by columns: the larger of both."""
         turned = self.layout.turned_floats(count) if self.slot_floats else 0
         return max(self.layout.frames_floats(count), turned)
 
     def write_frames(self, frames: Array, part: slice, axis: str, *, turned: bool = False) -> DeviceArray:
-        """Copies some frames (F, rows, columns) to the device, padded, with lines as rows, or as columns where ``turned``;
-        ``axis`` is the readout's."""
+        """Copies the frames ``part`` of (F, rows, columns) to the device, padded. Lines along ``axis`` become rows, or
+        columns where ``turned``."""
         count, layout = part.stop - part.start, self.layout
         on_device = self._some_frames(layout.turned_floats(count)) if turned else self.frames(count)
         if layout.subrays != SINGLE and isinstance(frames, DeviceArray):

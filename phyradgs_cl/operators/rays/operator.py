@@ -37,15 +37,15 @@ class LinearOperator(Protocol):
     def frames_shape(self) -> tuple[int, int, int]: ...
 
     def forward(self, volume: Any, out: Any = None) -> Any:
-        """A x: volume (nz, ny, nx) 1/mm to frames (F, rows, columns) float32. ``out`` receives the result if given."""
+        """Returns A x, frames (F, rows, columns) float32, of a volume (nz, ny, nx) in 1/mm. ``out`` receives it if given."""
         ...
 
     def adjoint(self, frames: Any, out: Any = None) -> Any:
-        """Aᵀ y: frames (F, rows, columns) to a volume (nz, ny, nx) float32."""
+        """Returns Aᵀ y, a volume (nz, ny, nx) float32, of frames (F, rows, columns). ``out`` receives it if given."""
         ...
 
     def subset(self, frames: Sequence[int]) -> "LinearOperator":
-        """Returns the rows of A for these frames, in this order."""
+        """Returns the operator for these frames, in this order."""
         ...
 
 
@@ -53,12 +53,11 @@ class RayOperator:
     """Joseph's projector and its matched adjoint over the cells of many frames; a ``LinearOperator``.
 
     NumPy arrays give NumPy arrays. Device arrays (plain, float32) give device arrays. ``out``, an array of the same kind,
-    receives the result.
-    detector_shape is (rows, columns); ``tables`` has the time cells of each frame, all read out along one axis. An operator
-    shares its tables and buffers with its subsets, and with operators that were given the same ``memory``: use them one at
-    a time. A volume that does not fit is projected in bricks. fewest_lines: as in ``upright_of``; ``FEWEST_LINES`` is
-    fastest for panels of few lines, and rounds differently. subrays: of a pixel (along v, along u), by
-    ``subrays_of``; those of ``memory`` if given.
+    receives the result. detector_shape is (rows, columns); ``tables`` has the time cells of each frame, all read out along
+    one axis. An operator shares its tables and buffers with its subsets, and with operators that were given the same
+    ``memory``: use them one at a time. A volume that does not fit is projected in bricks. fewest_lines: as in
+    ``upright_of``; ``FEWEST_LINES`` is fastest for panels of few lines, and rounds differently. subrays: rays of a pixel
+    (along v, along u), see ``subrays_of``; a given ``memory`` has its own.
 
     Joseph, IEEE Trans. Med. Imaging 1 (1982) 192. Raises InputError for tables that do not fit the detector."""
 
@@ -128,7 +127,7 @@ class RayOperator:
         return self._upright is not None and self.memory.slot_frames > 0
 
     def _forward_upright(self, columns: DeviceArray, part: slice, frames: DeviceArray) -> None:
-        """Projects a turned volume to some frames, in the padded layout."""
+        """Projects a volume with z along rows to the frames ``part``, in the padded layout."""
         assert self._upright is not None and self._poses is not None
         layout = self.memory.layout
         start, *steps = layout.pixel_strides(self._axis)
@@ -142,7 +141,8 @@ class RayOperator:
             merge_slots(self.rt, self._cells, slots, there, target, self._rays_shape, self._axis)
 
     def _slots_of(self, part: slice) -> Iterator[tuple[int, Slots]]:
-        """Yields the first frame, within the part, and the slots of as many frames as fit into memory at a time."""
+        """Yields the slots of as many frames at a time as fit into memory, and the number of their first frame within
+        ``part``."""
         assert self._upright is not None and self._poses is not None
         for first in range(part.start, part.stop, self.memory.slot_frames):
             key = first, min(first + self.memory.slot_frames, part.stop)
@@ -185,7 +185,8 @@ class RayOperator:
     def _adjoint_upright(
         self, layout: RayLayout, part: slice, frames: DeviceArray, target: tuple[DeviceArray, Strides], add: bool
     ) -> None:
-        """Adds the backprojection of some frames, stored column by column, to a volume with these strides."""
+        """Adds the backprojection of some frames, stored column by column, to a volume with these strides; replaces it
+        without ``add``."""
         assert self._upright is not None and self._poses is not None
         there, pitch_mm = self.memory.slots(), layout.constants()[3]
         each = layout.column_floats(self._axis)
@@ -197,7 +198,8 @@ class RayOperator:
             )
 
     def subset(self, frames: Sequence[int]) -> "RayOperator":
-        """Returns the operator for some of the frames, in this order. Keep it if you use it again: it keeps its tables."""
+        """Returns the operator for some of the frames, in this order. Keep it to use it again: it keeps its tables. Raises
+        InputError for no frames."""
         chosen = self._chosen[np.asarray(frames, np.int64)]
         if chosen.size == 0:
             raise InputError("subset", "no frames", "at least one frame")

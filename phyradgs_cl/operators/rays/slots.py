@@ -1,4 +1,4 @@
-"""Slots for the upright kernels: the projection of one pose onto the part of the panel that it serves.
+"""Slots of the upright kernels. A slot holds one pose's line integrals on the part of the panel that this pose serves.
 
 Frames are weighted averages of slots; each line of a frame has a weight in each of its slots. Neighbouring frames share
 poses where exposures follow each other without gaps: such a pose is projected once."""
@@ -14,15 +14,16 @@ from phyradgs_cl.operators.rays.layout import RayCells, matrix_table, ray_consta
 from phyradgs_cl.runtime import DeviceArray, Runtime
 from phyradgs_cl.runtime.layout import GUARD, pitch_of
 
-_SLOT_INTS, _SHARE_INTS = 8, 4  # as in cl/common/ray_column.h and cl/rays_slots.cl
-_SAME_POSE = 10  # decimals relative to the longest distance: poses that agree to them count as one
+_SLOT_INTS, _SHARE_INTS = 8, 4  # integers per slot and per share, as in cl/common/ray_column.h and cl/rays_slots.cl
+_SAME_POSE = 10  # poses, over the largest entry of all, that agree to so many decimals count as one
 
 
 @dataclass(frozen=True, eq=False)
 class UprightPoses:
     """The distinct poses of many frames on the device, and the pose of each cell.
 
-    For all E cells, frame after frame: pose_of (E,), and lines first, stop (E,); frame_cells (F + 1,) where frames begin."""
+    For all E cells, frame after frame: the number of the pose, pose_of (E,), and the lines [first, stop), (E,) each. Cells
+    of frame f begin at frame_cells[f]; frame_cells (F + 1,)."""
 
     cells: DeviceArray
     matrices: DeviceArray
@@ -31,7 +32,7 @@ class UprightPoses:
     first: np.ndarray
     stop: np.ndarray
     frame_cells: np.ndarray
-    is_plain: bool  # one cell with all lines for each frame, of weight 1
+    is_plain: bool  # whether every frame has one cell, with all lines and a weight of 1
     axis: str
     is_parallel: bool
 
@@ -55,7 +56,7 @@ class UprightPoses:
         )
 
     def floats_per_frame(self, detector_shape: tuple[int, int], leans: bool) -> int:
-        """Floats of the largest frame's slots: values and, where columns lean, slopes."""
+        """Returns the most floats that the slots of a frame need: values and, where columns lean, slopes."""
         rows, columns = detector_shape
         widest = int((self.stop - self.first).max())
         each = columns * pitch_of(widest) if self.axis == "rows" else widest * pitch_of(rows)
@@ -64,8 +65,8 @@ class UprightPoses:
     def slots(
         self, rt: Runtime, frames: np.ndarray, detector_shape: tuple[int, int], leans: bool, most_floats: int
     ) -> "Slots":
-        """Returns the slots of some frames, in the order of their first use, in at most ``most_floats`` floats. These are at
-        least ``floats_per_frame`` for each of the frames."""
+        """Returns the slots of the frames with these numbers, in the order of their first use, in at most ``most_floats``
+        floats. This limit must be at least ``floats_per_frame`` for each of the frames."""
         cells = np.concatenate([np.arange(self.frame_cells[f], self.frame_cells[f + 1]) for f in frames])
         of_frame = np.repeat(np.arange(len(frames)), np.diff(self.frame_cells)[frames])
         _, appears, slot = np.unique(self.pose_of[cells], return_index=True, return_inverse=True)
@@ -74,7 +75,8 @@ class UprightPoses:
         table = self._table(cells, appears, slot, detector_shape)
         values = 2 if leans else 1
         if values * len(table) * _columns_of(table) * pitch_of(_rows_of(table)) > most_floats:
-            # lines of one frame and of the next that share a pose lie far apart: a slot would have all lines between them
+            # the lines of cells that share a pose lie far apart, and a slot would have all between: each cell gets its own
+            # slot
             appears = slot = np.arange(len(cells))
             table = self._table(cells, appears, slot, detector_shape)
         by_slot = np.argsort(slot, kind="stable")
@@ -96,7 +98,8 @@ class UprightPoses:
     def _table(
         self, cells: np.ndarray, appears: np.ndarray, slot: np.ndarray, detector_shape: tuple[int, int]
     ) -> np.ndarray:
-        """Returns slots (S, 8) int32. appears (S,): the first cell of each slot; slot (E,): the slot of each cell."""
+        """Returns the table (S, 8) int32 of slots. appears (S,): the first cell of each slot; slot (E,): the slot of each
+        cell."""
         first, stop = np.full(len(appears), 2**31 - 1), np.zeros(len(appears), np.int64)
         np.minimum.at(first, slot, self.first[cells])
         np.maximum.at(stop, slot, self.stop[cells])
@@ -108,7 +111,8 @@ class UprightPoses:
         return table
 
     def _shares(self, cells: np.ndarray, of: np.ndarray) -> np.ndarray:
-        """Returns (E, 4): slot or frame, lines [first, stop), and the index of the first weight in ``RayCells``."""
+        """Returns the shares (E, 4): slot or frame, lines [first, stop), and the index of the first weight in
+        ``RayCells``."""
         begins = np.concatenate([[0], np.cumsum(self.stop - self.first)])
         return np.stack([of, self.first[cells], self.stop[cells], begins[cells]], -1)
 
@@ -125,7 +129,8 @@ def _rows_of(table: np.ndarray) -> int:
 
 @dataclass(frozen=True, eq=False)
 class Slots:
-    """Slots of some frames on the device (cl/rays_slots.cl); ``columns`` and ``rows`` are those of the largest."""
+    """Slots of some frames on the device, in the arrays of cl/rays_slots.cl. ``columns`` and ``rows``: sizes of the largest
+    slot."""
 
     slots: DeviceArray
     frame_shares: DeviceArray
@@ -147,12 +152,12 @@ class Slots:
 
     @property
     def floats(self) -> int:
-        """Floats of one value for each pixel of all slots."""
+        """Floats of all slots with one value per pixel."""
         return self.count * self.columns * self.pitch
 
     @property
     def strides(self) -> np.ndarray:
-        """Start of the line integrals, and floats from column to column, row to row, slot to slot."""
+        """Start of the line integrals, and steps from column to column, row to row and slot to slot, in floats (4,)."""
         return np.array([GUARD, self.pitch, 1, self.columns * self.pitch], np.int64)
 
     @property
@@ -164,7 +169,8 @@ def merge_slots(
     rt: Runtime, cells: RayCells, slots: Slots, integrals: DeviceArray,
     target: tuple[DeviceArray, np.ndarray], detector_shape: tuple[int, int], axis: str,
 ) -> None:
-    """Averages slots to frames. ``target`` is an array and its strides (start, column, row, frame)."""
+    """Writes the frames, weighted averages of slots. ``target``: an array and its strides (start, column, row, frame) in
+    floats."""
     rows, columns = detector_shape
     rt.launch(
         rt.kernel("rays_slots", "merge_slots", **{**slots.defines, "LEAN": 0}),
@@ -178,9 +184,10 @@ def split_slots(
     rt: Runtime, cells: RayCells, poses: UprightPoses, slots: Slots, turned: DeviceArray,
     detector_shape: tuple[int, int], pitch_mm: np.ndarray | np.int32, start: int, values: DeviceArray,
 ) -> None:
-    """Distributes frames to slots by weight, times each ray's length from plane to plane.
+    """Writes the transpose of ``merge_slots``: to each slot weight × pixel, times the ray's length from plane to plane in
+    mm.
 
-    turned: frames (F, columns, rows), which begin at ``start`` floats."""
+    turned: transposed frames (F, columns, rows), which begin at ``start`` floats."""
     rows, columns = detector_shape
     rt.launch(
         rt.kernel("rays_slots", "split_slots", **slots.defines), (slots.columns, slots.count),

@@ -14,13 +14,13 @@ from phyradgs_cl.metrics.align import block_means
 from phyradgs_cl.runtime import DeviceArray, Runtime
 
 SINGLE = (1, 1)
-_WIDEST = 1.25  # voxels from sub-ray to sub-ray
-# voxels from ray to ray of single rays: 1.43 on a usual scanner where voxels are as many as pixels. The shortest volume that
-# fits rays on a line loses 4 % of its density at 1.5, 16 % at 1.9, and a half at 2, where they may pass through every other
-# voxel alone. Voxels that begin with a density keep it.
+_WIDEST = 1.25  # largest distance of neighbouring sub-rays in the grid's middle, in voxels
+# Largest distance of neighbouring single rays, in voxels. A usual scanner with as many voxels as pixels has 1.43. The
+# shortest volume that fits rays on a line loses 4 % of its density at 1.5, 16 % at 1.9, and a half at 2, where rays may pass
+# through every other voxel alone. A method that begins with a dense volume keeps the density.
 _FARTHEST, _FARTHEST_OF_DENSE = 1.45, 2.0
-_ROUNDING = 1e-3
-_MOST = 8  # along an axis; so many at 10 voxels to a pixel
+_ROUNDING = 1e-3  # relative: a distance may exceed its limit by so much before a pixel gets another ray
+_MOST = 8  # most sub-rays of a pixel along an axis, reached where single rays are 10 voxels apart
 
 
 def subrays_of(grid: Grid, tables: Sequence[TimeCells], *, is_dense: bool = False) -> tuple[int, int]:
@@ -41,8 +41,8 @@ def subrays_of(grid: Grid, tables: Sequence[TimeCells], *, is_dense: bool = Fals
 
 
 def _depth(grid: Grid, pose: np.ndarray, *, is_nearest: bool) -> np.ndarray:
-    """Returns the depth (F,) of the grid's middle from the source, over the panel's, or of the nearest place of the
-    ellipsoid in its box; 0 for one behind the source."""
+    """Returns the depth (F,) of the grid's middle from the source, over the panel's depth. ``is_nearest`` takes the nearest
+    point of the ellipsoid in the grid's box instead. The depth is 0 for a point behind the source."""
     normal = np.cross(pose[:, 6:9], pose[:, 9:12])
     to_panel = np.einsum("fi,fi->f", pose[:, 3:6] - pose[:, :3], normal)
     to_middle = np.einsum("fi,fi->f", np.array(grid.offset_mm[::-1]) - pose[:, :3], normal)
@@ -51,13 +51,13 @@ def _depth(grid: Grid, pose: np.ndarray, *, is_nearest: bool) -> np.ndarray:
 
 
 def means(fine: np.ndarray, subrays: tuple[int, int]) -> np.ndarray:
-    """Returns B y: frames (F, rows, columns) of the finer panel's."""
+    """Returns B y, frames (F, rows, columns), of the finer panel's frames (F, rows · along_v, columns · along_u)."""
     along_v, along_u = subrays
     return block_means(fine, (1, along_v, along_u))
 
 
 def spread(frames: np.ndarray, subrays: tuple[int, int]) -> np.ndarray:
-    """Returns Bᵀ y: frames of the finer panel of frames (F, rows, columns)."""
+    """Returns Bᵀ y, frames of the finer panel (F, rows · along_v, columns · along_u), of frames (F, rows, columns)."""
     along_v, along_u = subrays
     shares = frames / np.float32(along_v * along_u)
     return np.asarray(shares.repeat(along_v, 1).repeat(along_u, 2))

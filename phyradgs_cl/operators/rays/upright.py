@@ -18,20 +18,21 @@ from phyradgs_cl.operators.rays.slots import Slots, UprightPoses
 from phyradgs_cl.runtime import DeviceArray, Runtime
 from phyradgs_cl.runtime.layout import GUARD, Strides, pitch_of
 
-_LINES = 128  # of a detector column per work-item
-FEWEST_LINES = 8  # per pose: with fewer, slots cost more than they save
-_VOXELS = 512  # of a volume's column that the lines of a work-item may meet in one slice
+_LINES = 128  # pixels of a detector column per work-item, at most
+FEWEST_LINES = 8  # lines per pose: with fewer, slots cost more than they save
+_VOXELS = 512  # voxels along z that the lines of a work-item may meet in one slice
 # Voxels (x, y, z) of a work-item of the adjoint: neighbouring columns share rays. The bits do not depend on them.
 _OWNED = ((16, 16, 128), (8, 8, 128), (8, 4, 128))
 _ITEMS_PER_UNIT = 4  # work-items that a compute unit should have at least, so that none waits long for the last
-_UPRIGHT = 1e-6  # voxels: how far a column, or a row, may lean over the whole detector
-_MOST_LEAN = 0.25  # voxels across per voxel along z: beyond it the general kernel is faster
-_TURN = 16  # voxels along x and z that are turned at a time; as in cl/rays_upright.cl
+_UPRIGHT = 1e-6  # columns are upright where they, and rows, lean by less than so many voxels over the whole detector
+_MOST_LEAN = 0.25  # largest lean of a column, in voxels across per voxel along z: beyond it the general kernel is faster
+_TURN = 16  # voxels along each side (x and z) of the tile that a work-item transposes; TURN in cl/rays_upright.cl
 
 
 @dataclass(frozen=True)
 class Upright:
-    """Lines of a detector column per work-item of the upright kernels, and whether columns lean and rays are parallel."""
+    """Build of the upright kernels: lines of a detector column per work-item, whether columns lean, whether rays are
+    parallel."""
 
     block: int
     leans: bool
@@ -44,8 +45,9 @@ def upright_of(
     """Returns how the upright kernels project these cells; None if the general kernel is needed.
 
     The upright kernels need poses that serve several lines each, rays with main axis x or y, and columns nearly along z. If
-    columns lean, the volume must lie between source and panel, as it always does in a parallel beam. fewest_lines: lines
-    read one after the other that a pose must serve on average, by default a whole vector of them."""
+    columns lean, the volume must lie between source and panel, as it always does in a parallel beam. fewest_lines:
+    consecutive lines that a pose must serve on average, by default a whole vector of them. It does not count where columns
+    are read."""
     served = sum(int((table.line_stop - table.line_start).sum()) for table in tables)
     lines = tables[0].lines
     fewest = fewest_lines or max(lanes, FEWEST_LINES)
@@ -71,7 +73,7 @@ def upright_of(
 
 
 def _is_steep(cells: np.ndarray, rows: int, columns: int) -> bool:
-    """Whether a ray of these cells (C, 16) may have the main axis z."""
+    """Returns whether a ray of these cells (C, 16) may have the main axis z."""
     d00, eu, ev = cells[:, 3:6], cells[:, 6:9], cells[:, 9:12]
     across = np.linalg.norm(ev[:, :2], axis=1)
     ends_z = [np.abs(d00 + u * eu + v * ev)[:, 2] for u in (0, columns - 1) for v in (0, rows - 1)]
@@ -86,7 +88,8 @@ def _least_horizontal(d00: np.ndarray, eu: np.ndarray, width: int) -> np.ndarray
 
 
 def _lies_between(grid: Grid, source: np.ndarray, d00: np.ndarray, eu: np.ndarray, ev: np.ndarray) -> bool:
-    """Whether the grid and a voxel around it lie between the source and the panel of every pose (C, 3), in voxels."""
+    """Returns whether the grid and a voxel around it lie between source and panel in every pose; vectors (C, 3) in
+    voxels."""
     nz, ny, nx = grid.shape
     corners = np.array([(x, y, z) for x in (-1, nx) for y in (-1, ny) for z in (-1, nz)])
     normal = np.cross(eu, ev)
@@ -95,7 +98,7 @@ def _lies_between(grid: Grid, source: np.ndarray, d00: np.ndarray, eu: np.ndarra
 
 
 def columns_floats(grid: Grid) -> int:
-    """Floats of the volume with z along rows."""
+    """Returns the floats of a padded volume with z along rows."""
     nz, ny, nx = grid.shape
     return 2 * GUARD + (ny + 2 * BORDER) * (nx + 2 * BORDER) * pitch_of(nz)
 
@@ -104,7 +107,7 @@ def launch_upright(
     rt: Runtime, layout: RayLayout, how: Upright, poses: UprightPoses, slots: Slots, columns: DeviceArray,
     target: tuple[DeviceArray, np.ndarray],
 ) -> None:
-    """Projects a turned volume to slots: an array, with strides as in ``Slots.strides``."""
+    """Projects a volume with z along rows to slots: ``target`` is an array and its strides, as in ``Slots.strides``."""
     shape, origin, _, pitch_mm, *_ = layout.constants()
     array, strides = target
     rt.launch(
@@ -119,7 +122,8 @@ def launch_upright_adjoint(
     rt: Runtime, layout: RayLayout, how: Upright, poses: UprightPoses, slots: Slots, values: DeviceArray,
     target: tuple[DeviceArray, Strides], *, add: bool = False,
 ) -> None:
-    """Backprojects slots, as ``split_slots`` writes them, into a volume with these strides."""
+    """Backprojects slots, as ``split_slots`` writes them, into a volume with these strides; ``add`` keeps the sums that are
+    in it."""
     shape, origin, *_ = layout.constants()
     (x, y, z), items = _owned(layout.brick.shape, rt.device.compute_units)
     rt.launch(
@@ -142,7 +146,8 @@ def _owned(shape: tuple[int, int, int], units: int) -> tuple[tuple[int, int, int
 def turn_volume(
     rt: Runtime, layout: RayLayout, volume: tuple[DeviceArray, Strides], columns: DeviceArray
 ) -> None:
-    """Copies a volume (z, y, x) with these strides to ``columns`` (y, x, z). Does not write the padding, which is zero."""
+    """Transposes a volume (z, y, x) with these strides to ``columns`` (y, x, z). Does not write the padding, which is
+    zero."""
     nz, ny, nx = layout.grid.shape
     shape, *_ = layout.constants()
     size = (ceil_div(nx, _TURN), ny, ceil_div(nz, _TURN))

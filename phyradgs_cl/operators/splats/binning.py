@@ -6,13 +6,13 @@ from phyradgs_cl.checks import ceil_div
 from phyradgs_cl.runtime import DeviceArray, LaterItem, MemoryShortage, Runtime
 
 _CHUNK = 512  # splats per work-item on a CPU
-_GROUP, _LARGEST_GROUP = 64, 256  # splats per group on a GPU; the larger where there would be too many counts
-_MANY_COUNTS = 1 << 22
-_SCANNED = 64  # counts per step of a group
-_SLACK = 1.5  # allocated over needed indices
-_NEAR = 1.25  # allocate again below this reserve
-_MOST_CHECKS = 2**38  # of a splat in a pixel: without lists a launch makes all, in a second on a fast GPU
-_MOST_ENTRIES = 2**31 - 1  # the kernels index them by int
+_GROUP, _LARGEST_GROUP = 64, 256  # splats per work-group on a GPU; the larger number where there would be too many counts
+_MANY_COUNTS = 1 << 22  # counts (tiles × groups) above which groups take more splats
+_SCANNED = 64  # counts per step of a work-group's scan
+_SLACK = 1.5  # indices allocated, over the indices needed
+_NEAR = 1.25  # memory for less than so many times the indices needed is allocated anew
+_MOST_CHECKS = 2**38  # tests of a splat in a pixel that a launch without lists may make: a second on a fast GPU
+_MOST_ENTRIES = 2**31 - 1  # indices of splats, at most: kernels address them by int
 
 
 class TileLists:
@@ -41,7 +41,7 @@ class TileLists:
 
     @property
     def samples(self) -> int:
-        """Pixels or voxels of all entries that there is memory for: the most samples that the tiles' splats have."""
+        """Upper limit of the samples of a launch: entries that there is memory for, times pixels or voxels of a tile."""
         return self.splat_ids.size * int(np.prod(self.tile[:3], dtype=np.int64))
 
     def build(self, extents: DeviceArray, count: int, stride: int, cells: int = 1) -> None:
@@ -82,11 +82,12 @@ class TileLists:
 
     @staticmethod
     def bytes(rt: Runtime, tiles: int, count: int) -> int:
-        """Returns the bytes of lists of ``count`` splats, without their indices."""
+        """Returns the bytes of the lists of ``count`` splats, without the splats' indices."""
         return 4 * (tiles + 1 + tiles * max(ceil_div(count, chunk_of(rt, tiles, count)), 1))
 
     def _make_room(self, needed: int, share: float) -> None:
-        """Allocates memory for more than ``needed`` indices, unless there is enough for ``share`` times as many."""
+        """Allocates memory for more than ``needed`` indices, unless there is enough for ``share`` times as many. Raises
+        MemoryShortage where ints cannot count them."""
         if needed >= _MOST_ENTRIES:
             found, expected = f"{needed} entries or more", f"fewer than {_MOST_ENTRIES}"
             remedy = "use fewer or smaller Gaussians"
@@ -97,7 +98,7 @@ class TileLists:
 
 
 def chunk_of(rt: Runtime, tiles: int, count: int) -> int:
-    """Returns the splats per work-item on a CPU, or per group on a GPU, where each has its own item."""
+    """Returns the splats per work-item on a CPU, or per work-group on a GPU, where each splat has its own work-item."""
     if not rt.pixel_items:
         return _CHUNK
     kernels = (rt.kernel("binning", f"bin_{step}_group") for step in ("count", "fill"))

@@ -1,7 +1,7 @@
 """Layout of Gaussians, time cells and layers of frames in device memory.
 
 A detector adds photons: the merged frame is −ln Σ w_k exp(−p_k) over the cells k of a line. The projector therefore draws
-w_k p_k into layer k. Merging also keeps the derivative by every layer, which the adjoint needs."""
+w_k p_k into layer k. Merging also keeps d(frame)/d(layer), which the adjoint needs."""
 
 from dataclasses import dataclass
 
@@ -14,7 +14,7 @@ from phyradgs_cl.runtime import DeviceArray, Kernel, Runtime
 from phyradgs_cl.runtime.layout import GUARD, padded_zeros, pitch_of
 
 STRIDE_OF = 16  # Gaussians are padded to a multiple of the widest vector
-CELL_FLOATS = 24
+CELL_FLOATS = 24  # floats of a cell; cl/common/splat.h
 
 
 @dataclass(eq=False)
@@ -88,7 +88,8 @@ class DeviceCells:
     def upload(
         cls, rt: Runtime, table: TimeCells, states: tuple[np.ndarray, np.ndarray] | None = None
     ) -> "DeviceCells":
-        """Uploads a frame's cells; ``states`` as from ``operators.splats.states.states_of``."""
+        """Uploads a frame's cells; ``states`` as from ``operators.splats.states.states_of``. Raises InputError for cells
+        that have a weight for each line."""
         shares, cell_states = (np.zeros(1), np.zeros(1)) if states is None else states
         if table.line_share is not None:
             raise InputError("--motion", "cells with a weight for each line", "cells with one weight", "take micro-views")
@@ -143,7 +144,7 @@ def cell_constants(
     pose: np.ndarray, weight: np.ndarray, layer: np.ndarray, is_parallel: bool = False
 ) -> np.ndarray:
     """Returns the (C, 24) float32 table of cl/common/splat.h."""
-    if is_parallel:  # a ray from the "source", less the direction, to the origin
+    if is_parallel:  # as rays from a source at minus the direction through the origin
         pose = np.concatenate([-pose[:, 0:3], np.zeros((len(pose), 3)), pose[:, 6:]], 1)
     source, d00 = pose[:, 0:3], pose[:, 3:6] - pose[:, 0:3]
     eu, ev = pose[:, 6:9], pose[:, 9:12]
@@ -160,7 +161,7 @@ def cell_constants(
 
 
 class Layers:
-    """Layers of frames of ``lines`` by ``width`` pixels; ``unit`` is the line integral that is 1 in them."""
+    """Layers of frames of ``lines`` by ``width`` pixels. ``unit``: the line integral of a layer's value 1."""
 
     def __init__(self, rt: Runtime, lines: int, width: int, unit: float) -> None:
         self.rt, self.lines, self.width, self.unit = rt, lines, width, unit
@@ -169,7 +170,8 @@ class Layers:
         self._split = rt.kernel("intensity", "intensity_split", IMAGE_GUARD=GUARD)
 
     def images(self, cells: DeviceCells) -> DeviceArray:
-        """Returns memory for the layers of ``cells``: images of GUARD floats and (lines, pitch)."""
+        """Returns memory for the layers of ``cells``: each GUARD floats and an image (lines, pitch); GUARD floats follow the
+        last."""
         if cells.layers > self._count:
             self._count = cells.layers
             self._drawn, self._shares, self._by_layers = (

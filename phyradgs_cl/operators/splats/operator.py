@@ -4,8 +4,8 @@
 nothing: it projects the Gaussians again (``prepare``), unless ``forward`` has just done so. All arrays lie on the device,
 without padding.
 
-``by_pose`` turns gradients by Gaussians into gradients by the pose: a gantry that turns equals an object that turns the
-other way; a panel that moves equals centres that move the other way on it, and rays of other lengths."""
+``by_pose`` converts dL/d(Gaussians) to dL/d(pose). A rotation of the gantry equals one of the object the other way. A shift
+of the panel equals a shift of the projected centres the other way, and changes the rays' lengths."""
 
 from collections.abc import Sequence
 from copy import copy
@@ -26,7 +26,7 @@ from phyradgs_cl.runtime.layout import GUARD, Strides, move, padded_zeros, pitch
 
 @dataclass(eq=False)
 class SplatPoint:
-    """A cloud in the kernels' layout, and the norms (stride,) of the user's quaternions."""
+    """A cloud in the kernels' layout, and the norms (stride,) that its quaternions had before they were normalised."""
 
     gaussians: DeviceGaussians
     norms: DeviceArray
@@ -55,7 +55,8 @@ class PlainRows:
         return SplatPoint(DeviceGaussians(inside, count, stride), norms)
 
     def leave(self, gradients: DeviceArray, point: SplatPoint, rows: DeviceArray, *, add: bool = False) -> None:
-        """Converts gradients (13, stride) by internal rows to gradients by plain rows (11, G); ``add`` adds to those."""
+        """Writes dL/d(plain rows), (11, G), to ``rows`` from dL/d(internal rows), (13, stride); ``add`` adds it to what is
+        there."""
         rt, cloud = self.rt, point.gaussians
         rt.launch(
             self._leave, cloud.count, gradients, point.norms, cloud.count, cloud.stride, *self._units, add,
@@ -72,7 +73,7 @@ class PlainRows:
         return SplatPoint(DeviceGaussians(rows, cloud.count, cloud.stride), point.norms)
 
     def densities(self, rows: DeviceArray) -> DeviceArray:
-        """Returns the density row of plain rows (11, G)."""
+        """Returns a copy (G,) of the densities in plain rows (11, G)."""
         count = rows.shape[1]
         density = self.rt.empty(count)
         self._copy_row(rows, DENSITY * count, count, np.float32(1), 0, density)
@@ -88,7 +89,7 @@ class PlainRows:
 class PlainImages:
     """Copies images (rows, columns) of a stack to one padded image of ``lines`` by ``width``, and back.
 
-    ``turned`` makes columns the lines. A volume (nz, ny, nx) counts as an image of nz · ny lines."""
+    ``turned`` transposes: columns become the lines. A volume (nz, ny, nx) counts as an image of nz · ny lines."""
 
     def __init__(self, rt: Runtime, lines: int, width: int, *, turned: bool = False) -> None:
         self.rt, self.turned = rt, turned
@@ -159,7 +160,7 @@ class SplatOperator:
     def _differentiate(
         self, point: SplatPoint, cells: DeviceCells, by_image: DeviceArray, gradients: DeviceArray
     ) -> None:
-        """Writes the gradients (13, stride) by internal rows of a frame from dL/dframe, padded."""
+        """Writes one frame's gradients dL/d(internal rows), (13, stride), from its padded dL/dframe."""
         is_ready = self._ready.holds(point, cells)
         self._ready.forget()
         if not is_ready:
@@ -168,8 +169,8 @@ class SplatOperator:
         self._projector.backward(point.gaussians, cells, by_image, gradients)
 
     def by_poses(self, point: SplatPoint, by_frames: DeviceArray) -> np.ndarray:
-        """Returns, for each frame, dL by the gantry's turn about z (rad) and the panel's shifts (pixels) along its columns
-        and rows: (F, 3) float64 from dL/dframes (F, rows, columns). Not for the intensity model."""
+        """Returns (F, 3) float64 from dL/dframes (F, rows, columns): for each frame dL/d(gantry angle about z) per rad, and
+        dL/d(panel shift) per pixel along its columns and along its rows. Not for the intensity model."""
         cloud, found = point.gaussians, np.empty((len(self._cells), 3))
         rows, gradients = self.rt.download(cloud.rows), self.rt.empty((ROWS + 2, cloud.stride))
         weighed = self.rt.download(self.forward(point)) * self.rt.download(by_frames)
@@ -184,7 +185,7 @@ class SplatOperator:
         return found
 
     def subset(self, frames: Sequence[int]) -> "SplatOperator":
-        """Returns the operator for some of the frames, in this order; costs nothing."""
+        """Returns the operator for some of the frames, in this order, without copies. Raises InputError for no frames."""
         part = copy(self)
         part._cells, part._poses = [self._cells[f] for f in frames], [self._poses[f] for f in frames]
         if not part._cells:
@@ -253,7 +254,7 @@ class _Ready:
         self.forget()
 
     def forget(self) -> None:
-        """To be called before the buffers change: after a failure they are not valid."""
+        """Marks the buffers as invalid. Call it before they change: a failure may leave them half written."""
         self._point: SplatPoint | None = None
         self._where: object = None
 
@@ -265,21 +266,22 @@ class _Ready:
 
 
 def by_pose(rows: np.ndarray, gradients: np.ndarray) -> tuple[float, float, float]:
-    """Returns dL by the gantry's turn about z (rad) and by the panel's shifts along and across a line.
+    """Returns dL/d(gantry angle about z) per rad, and dL/d(panel shift) along and across a line.
 
-    Shifts are in halves of the detector's width and lines. From internal rows (11, G) and their gradients (13, G)."""
+    Shifts are in halves of the detector's width and of its lines. rows (11, G): internal rows; gradients (13, G):
+    dL/d(rows)."""
     values, by = rows.astype(np.float64), gradients.astype(np.float64)
     (x, y, _), (by_x, by_y, _) = values[MEAN], by[MEAN]
     w, i, j, k = values[QUATERNION]
-    turned = np.stack([-k, -j, i, w]) / 2  # of a quaternion, by a turn about z before its own
+    turned = np.stack([-k, -j, i, w]) / 2  # dq/d(angle) of a quaternion for a rotation about z that follows its own
     by_object = np.sum(x * by_y - y * by_x) + np.sum(turned * by[QUATERNION])
     return -float(by_object), -float(by[11].sum()), -float(by[12].sum())
 
 
 def by_length(pose: np.ndarray, weighed: np.ndarray) -> np.ndarray:
-    """Returns the part of dL by the panel's shifts (2,), along columns and rows (pixels), that comes from the rays' length.
+    """Returns the part (2,) of dL/d(panel shift) per pixel, along columns and along rows, that comes from the rays' lengths.
 
-    Line integrals are proportional to it. From the ``pose`` (12,) and the frame times dL/dframe (rows, columns)."""
+    Line integrals are proportional to these. pose (12,) mm; weighed (rows, columns): the frame times dL/dframe."""
     source, first, column, row = pose.reshape(4, 3)
     v, u = (np.arange(n, dtype=np.float64) for n in weighed.shape)
     ray = first - source + v[:, None, None] * row + u[:, None] * column

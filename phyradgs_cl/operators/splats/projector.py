@@ -17,16 +17,17 @@ from phyradgs_cl.operators.splats.states import CloudStates
 from phyradgs_cl.runtime import DeviceArray, Kernel, Runtime
 from phyradgs_cl.runtime.layout import GUARD, pad_rows, padded_zeros, pitch_of, unpad_rows
 
-RECORD_FLOATS = {False: 16, True: 20}  # per splat and cell, by whether the cell has motion
-DEFAULT_TIME_ERROR = 0.005  # relative, RMS, of averages over time
-DEFAULT_CUTOFF_SIGMA = 3.7  # where a Gaussian has fallen to 0.1 % of its peak
-_BAND_LINES = 8
+RECORD_FLOATS = {False: 16, True: 20}  # floats per splat and cell, by whether the cell has motion
+DEFAULT_TIME_ERROR = 0.005  # largest error of averages over time, relative, RMS
+DEFAULT_CUTOFF_SIGMA = 3.7  # distance in σ from a Gaussian's centre at which it has fallen to 0.1 % of its peak
+_BAND_LINES = 8  # lines of a tile on a CPU
 GROUP_DEFINES = {False: {"GROUP": 1, "ACROSS": 1}, True: {"GROUP": 32, "ACROSS": 8}}
-"""Work-items of a Gaussian's adjoint, and how many of them lie along a line; by whether items are pixels."""
+"""Build options of a Gaussian's adjoint by ``Runtime.pixel_items``: work-items per Gaussian, and how many lie along a
+line."""
 
 
 def items_by_gaussian(rt: Runtime, count: int) -> tuple[tuple[int, int], tuple[int, int]]:
-    """Returns work-items and group of the kernels in which Gaussians sum over their pixels (``GROUP_DEFINES``)."""
+    """Returns the global size and the work-group of kernels in which Gaussians sum over their pixels (``GROUP_DEFINES``)."""
     items, across = (GROUP_DEFINES[rt.pixel_items][name] for name in ("GROUP", "ACROSS"))
     return (count * across, items // across), ((across, items // across) if items > 1 else (16, 1))
 
@@ -72,9 +73,9 @@ class SplatProjector:
 
     ``affine`` selects R2-Gaussian's approximation instead of the exact ray integral. ``cutoff_sigma`` is the Mahalanobis
     radius beyond which a Gaussian is not drawn; 0 draws all of it. ``time_error`` (relative, RMS) bounds the error of
-    averages over time in cells with motion.
-    ``intensity_unit`` is the line integral that is 1 in the image of a detector that averages intensities over a line's
-    cells; with None line integrals are averaged. ``states`` moves the cloud to the states of cells uploaded with them."""
+    averages over time in cells with motion. With ``intensity_unit`` a detector averages intensities over a line's cells; it
+    is the line integral of an image's value 1. With None line integrals are averaged. ``states`` moves the cloud to the
+    states of cells uploaded with them."""
 
     def __init__(
         self, rt: Runtime, lines: int, width: int, *, affine: bool = False,
@@ -110,7 +111,7 @@ class SplatProjector:
 
     @property
     def path_limits(self) -> np.ndarray:
-        """The kernels' limits of ``path_limits``, (4,)."""
+        """The function ``path_limits`` as the kernels' argument, (4,) float32 with an unused last element."""
         return np.array([*path_limits(self.time_error), 0], np.float32)
 
     # --- device to device: the reconstruction's loop --------------------------------------------------
@@ -121,7 +122,8 @@ class SplatProjector:
         return self.merge(cells)
 
     def draw(self, gaussians: DeviceGaussians, cells: DeviceCells) -> DeviceArray:
-        """Renders the frame before its layers are merged, flat and padded: frames of several clouds can be added here."""
+        """Renders the layers of a frame, or the frame if there are none, padded. Those of several clouds may be added before
+        ``merge``."""
         rt, kernel = self.rt, self._kernels[cells.moving, cells.fixed_conic, cells.is_parallel].forward
         if self.by_pixel and rt.tile(kernel) != (self.tile_w, self.tile_h):
             self._cut(*rt.tile(kernel))

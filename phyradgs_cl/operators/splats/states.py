@@ -11,10 +11,11 @@ from phyradgs_cl.fields import Deformation, Grid
 from phyradgs_cl.operators.splats.layout import DeviceCells, DeviceGaussians, stride_of
 from phyradgs_cl.runtime import DeviceArray, Kernel, Runtime
 
-STATE_ROWS = 12  # of a Gaussian in a state: its place x y z, and the rows of G
-_PROBED_SIDE, _PROBED_STATES = 9, 16
-_WRONG = 0.01  # of a voxel
-_BEND, _MOST_SEGMENTS = 0.25, 32  # of a voxel: a parabola that is bent by so much blurs by 0.3 of it
+STATE_ROWS = 12  # rows of a Gaussian in a state: its centre x, y, z, and the rows of G
+_PROBED_SIDE, _PROBED_STATES = 9, 16  # points along each axis of the grid, and states, at which the inverse is checked
+_WRONG = 0.01  # largest error of an inverse, in voxels
+# largest bend of a path in a segment, in voxels (its blur is 0.3 of it), and most segments of a frame
+_BEND, _MOST_SEGMENTS = 0.25, 32
 
 
 class CloudStates:
@@ -31,7 +32,8 @@ class CloudStates:
         self._states, self._by_states = rt.empty(1), rt.empty(1)
 
     def forward(self, gaussians: DeviceGaussians, shares: DeviceArray) -> DeviceArray:
-        """Returns the cloud in states (S, 12, stride) of weights ``shares`` (S, R), valid until the next call."""
+        """Returns the cloud in S states, (S, 12, stride), valid until the next call. ``shares`` (S, R): weights of the
+        fields."""
         rt, count, stride = self.rt, shares.shape[0], gaussians.stride
         if self._states.size < count * STATE_ROWS * stride:
             self._states = rt.empty(1)  # frees the old memory before it allocates the new
@@ -41,7 +43,7 @@ class CloudStates:
         return self._states
 
     def zeros(self, gaussians: DeviceGaussians, cells: DeviceCells) -> DeviceArray:
-        """Returns memory (S, 12, stride) of zeros for gradients by the states, valid until the next call."""
+        """Returns memory (S, 12, stride) of zeros for dL/d(states), valid until the next call."""
         floats = cells.shares.shape[0] * STATE_ROWS * gaussians.stride
         if self._by_states.size < floats:
             self._by_states = self.rt.empty(1)
@@ -50,8 +52,8 @@ class CloudStates:
         return self._by_states
 
     def back(self, gaussians: DeviceGaussians, cells: DeviceCells, gradients: DeviceArray) -> None:
-        """Writes dL/dmean into ``gradients`` (13, stride) from dL/dstates, in the memory of ``zeros``; ``forward`` of the
-        same cloud and cells was the last one."""
+        """Replaces the rows of the mean in ``gradients`` (13, stride) by dL/dmean, from dL/d(states) in the memory of
+        ``zeros``. The last ``forward`` must be of the same cloud and cells."""
         rt, count = self.rt, cells.shares.shape[0]
         kernel, field = self._kernel("splat_states_back"), (*self._field, cells.shares, np.int32(count))
         rt.launch(
@@ -60,7 +62,8 @@ class CloudStates:
         )  # fmt: skip
 
     def check_inverse(self, grid: Grid) -> None:
-        """Raises InputError where the place of some points of ``grid`` is not found in some states."""
+        """Raises InputError where points of ``grid`` do not return to themselves in some states: the field has no inverse
+        there."""
         rt, (z, y, x) = self.rt, (np.linspace(axis[0], axis[-1], _PROBED_SIDE) for axis in grid.axes_mm())
         mean = np.stack(np.meshgrid(x, y, z, indexing="ij")).reshape(3, -1)
         rows = np.ones((11, mean.shape[1]))
@@ -95,7 +98,8 @@ def segments_for_object(deformation: Deformation, lit_s: np.ndarray, voxel_mm: f
 
 def states_of(table: TimeCells, deformation: Deformation) -> tuple[np.ndarray, np.ndarray]:
     """Returns the weights (S, R) of the states that the cells of a frame see, in the order of time, and the state (C, poses)
-    of every pose of a cell. Raises InputError for cells whose shapes do not move, and without the times of their ends."""
+    of every pose of a cell. Raises InputError for cells whose splats keep their shape (``conic_pose``), and for cells with
+    motion but without the times of their ends."""
     if table.conic_pose is not None:
         expected = "one in which also the shapes of splats move"
         raise InputError("--object-motion", "--motion centres", expected, "take exact or micro-views")

@@ -11,10 +11,10 @@ from phyradgs_cl.operators.splats.projector import DEFAULT_CUTOFF_SIGMA, GROUP_D
 from phyradgs_cl.runtime import DeviceArray, Kernel, Runtime, attempts
 from phyradgs_cl.runtime.layout import GUARD, pad_rows, padded_zeros, pitch_of, unpad_rows
 
-RECORD_FLOATS = 20
-SUM_FLOATS = 16
-_TILE_ROWS = 8
-_DEFAULT_BRICK_BYTES = 1 << 28
+RECORD_FLOATS = 20  # floats of a Gaussian that ``voxel_prepare`` writes
+SUM_FLOATS = 16  # floats of a Gaussian's sums over voxels
+_TILE_ROWS = 8  # lines along z of a tile
+_DEFAULT_BRICK_BYTES = 1 << 28  # bytes of voxels that the device holds at a time
 
 
 class Voxeliser:
@@ -45,7 +45,8 @@ class Voxeliser:
     def forward(
         self, gaussians: DeviceGaussians, grid: Grid, start: tuple[int, int, int] = (0, 0, 0)
     ) -> DeviceArray:
-        """Returns the field on the voxels [start, start + shape) of ``grid``, in the padded layout, until the next call.
+        """Returns the field on the voxels [start, start + shape) of ``grid``, in the padded layout, valid until the next
+        call.
 
         Lengths are in the Gaussians' unit; ``start`` is (z, y, x). A part has the same bits as the complete field."""
         rt = self.rt
@@ -132,9 +133,9 @@ def _in_bricks(
         nz, ny, _ = shape
         voxels_bytes = 4 * (2 * GUARD + nz * ny * pitch_of(nx))
         if voxels_bytes > brick_bytes and nz * ny > 1:
-            return (room.free_bytes + 1,)  # more than ``brick_bytes``
+            return (room.free_bytes + 1,)  # too large: more than the free memory
         lists_bytes = TileLists.bytes(rt, int(np.prod(_tiles(rt, shape)[1])), gaussians.count)
-        entries_bytes = lists_bytes  # an estimate: the number is known after counting
+        entries_bytes = lists_bytes  # an estimate: the number of entries is known only after counting
         return voxels_bytes, lists_bytes, entries_bytes, records_bytes
 
     room = rt.room()
@@ -153,7 +154,7 @@ def _in_bricks(
 def _tiles(rt: Runtime, shape: Shape) -> tuple[Shape, Shape]:
     """Returns size and number of the tiles of a volume (z, y, x), both along x, y, z."""
     nz, ny, nx = shape
-    # a GPU's group has an item for each column of a tile
+    # a GPU's work-group has one work-item for each column (x, y) of a tile
     tile_x = 16 if rt.pixel_items else pitch_of(nx)
     tile_y = rt.group(16 * _TILE_ROWS, 16 * _TILE_ROWS, _forward(rt)) // 16
     return (tile_x, tile_y, _TILE_ROWS), (ceil_div(nx, tile_x), ceil_div(ny, tile_y), ceil_div(nz, _TILE_ROWS))

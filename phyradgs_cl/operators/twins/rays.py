@@ -1,5 +1,5 @@
-"""Float64 twins in NumPy of the ray-driven projector, its transpose, and the voxel-driven backprojections; of objects that
-move, warps of volumes and Gaussians in their states.
+"""Float64 twins in NumPy of the ray-driven projector, its transpose and the voxel-driven backprojections; and, for objects
+that move, of warps of volumes and of Gaussians in their states.
 
 The projector sums Joseph's samples one ray at a time. The backprojections solve for the ray of every voxel; with one pose
 per line they search all lines for the one on which the voxel falls."""
@@ -17,15 +17,15 @@ from phyradgs_cl.fields.gaussians import MEAN
 from phyradgs_cl.operators.rays.layout import some_cells
 from phyradgs_cl.operators.twins.splat import moving_frame, precision_matrices, splat_frame
 
-_REACH = 2  # voxels: as far as a coefficient counts
-_BORDER = 4  # coefficients before and behind the volume
+_REACH = 2  # largest distance of a spline coefficient from a place where it counts, in voxels
+_BORDER = 4  # coefficients beyond each face of the volume
 Volume = np.ndarray
 
 
 def joseph_image(
     volume: np.ndarray, grid: Grid, pose: np.ndarray, detector_shape: tuple[int, int], is_parallel: bool = False
 ) -> np.ndarray:
-    """Line integrals (nv, nu) of a volume (z, y, x) from one pose (12,)."""
+    """Returns the line integrals (nv, nu) of a volume (z, y, x) from one pose (12,)."""
     image = np.zeros(detector_shape)
     padded = np.pad(volume.astype(np.float64), 1)
     for index, points, step_mm in _rays(grid, pose, np.ones(detector_shape, bool), is_parallel):
@@ -35,7 +35,8 @@ def joseph_image(
 
 
 def joseph_adjoint(image: np.ndarray, grid: Grid, pose: np.ndarray, is_parallel: bool = False) -> np.ndarray:
-    """The transpose of ``joseph_image``: pixels (nv, nu) onto a volume (z, y, x), a corner of each sample at a time."""
+    """Returns the transpose of ``joseph_image``: pixels (nv, nu) onto a volume (z, y, x), a corner of each sample at a
+    time."""
     padded = np.zeros([n + 2 for n in grid.shape])
     for index, points, step_mm in _rays(grid, pose, image != 0, is_parallel):
         touching = np.all((points > -1) & (points < grid.shape[::-1]), axis=1)
@@ -62,7 +63,7 @@ def ray_frame(
 
 
 def ray_volume(frame: np.ndarray, grid: Grid, table: TimeCells) -> np.ndarray:
-    """The transpose of ``ray_frame`` with the log model: a frame (rows, columns) onto a volume (z, y, x)."""
+    """Returns the transpose of ``ray_frame`` with the log model: a frame (rows, columns) onto a volume (z, y, x)."""
     volume = np.zeros(grid.shape)
     for cell in range(table.count):
         image = np.zeros(frame.shape)
@@ -73,7 +74,7 @@ def ray_volume(frame: np.ndarray, grid: Grid, table: TimeCells) -> np.ndarray:
 
 
 def intensity_volume(frame: np.ndarray, volume: np.ndarray, grid: Grid, table: TimeCells) -> np.ndarray:
-    """The transpose of the derivative of ``ray_frame`` with the intensity model at ``volume``: a frame (rows, columns)
+    """Returns the transpose of d(``ray_frame``)/d(volume) with the intensity model at ``volume``: a frame (rows, columns)
     onto a volume (z, y, x)."""
     result = np.zeros(grid.shape)
     for cell, share in _shares(volume, grid, table, frame.shape):
@@ -102,7 +103,7 @@ def _lines(table: TimeCells, cell: int) -> tuple[slice, slice]:
 def _rays(
     grid: Grid, pose: np.ndarray, wanted: np.ndarray, is_parallel: bool
 ) -> Iterator[tuple[tuple[int, ...], np.ndarray, float]]:
-    """(pixel, sample points (n, 3) as voxel indices x y z, length of ray per sample in mm) of the wanted pixels."""
+    """Yields (pixel, sample points (n, 3) as voxel indices x y z, length of ray per sample in mm) of the wanted pixels."""
     pitch, first = np.array(grid.voxel_size_mm[::-1]), np.array(grid.first_centre_mm[::-1])
     pixels = (pixel_centres(pose, wanted.shape) - first) / pitch
     source = (pose[:3] - first) / pitch
@@ -122,7 +123,7 @@ def backprojection(
     frames: np.ndarray, pose: np.ndarray, weight: np.ndarray, grid: Grid, is_parallel: bool = False,
     push_mm: np.ndarray | None = None, power: int = 2,
 ) -> np.ndarray:
-    """Σ_f weight_f / z^power · frame_f(u, v); frames (F, rows, columns), pose (F, 12) mm, weight (F,) → (z, y, x).
+    """Returns Σ_f weight_f / z^power · frame_f(u, v); frames (F, rows, columns), pose (F, 12) mm, weight (F,) → (z, y, x).
 
     push_mm: (F, z, y, x, 3) displacement, components x, y, z, of the matter of each voxel at the time of a frame."""
     volume = np.zeros(grid.shape)
@@ -138,7 +139,8 @@ def lines_backprojection(
     frames: np.ndarray, pose: np.ndarray, weight: np.ndarray, grid: Grid, axis: str = "rows",
     is_parallel: bool = False, push_mm: np.ndarray | None = None, power: int = 2,
 ) -> np.ndarray:
-    """The same with one pose per line, pose (F, lines, 12) mm: by definition, see ``backproject_lines``."""
+    """Returns the backprojection with one pose per line, pose (F, lines, 12) mm, by the definition in
+    ``backproject_lines``."""
     speed_power = 2 if axis == "columns" and power == 2 else 1
     if axis == "columns":
         frames, pose = frames.transpose(0, 2, 1), transpose_pose(pose)
@@ -158,10 +160,10 @@ def lines_backprojection(
 def detector_position(
     pose: np.ndarray, grid: Grid, is_parallel: bool = False, push_mm: np.ndarray | float = 0.0
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Pixel column, row and depth (z, y, x) of voxel centres, displaced by ``push_mm`` (z, y, x, 3) in mm.
+    """Returns pixel column, row and depth (z, y, x) of voxel centres, displaced by ``push_mm`` (z, y, x, 3) in mm.
 
-    x − s = depth (d00 + u eu + v ev), solved. In a parallel
-    beam x − first pixel = u eu + v ev + t direction, and the depth is 1."""
+    Solves x − s = depth (d00 + u eu + v ev). In a parallel beam x − first pixel = u eu + v ev + t direction, and the depth
+    is 1."""
     z, y, x = np.meshgrid(*grid.axes_mm(), indexing="ij")
     if isinstance(push_mm, np.ndarray):
         x, y, z = x + push_mm[..., 0], y + push_mm[..., 1], z + push_mm[..., 2]
@@ -181,7 +183,7 @@ def detector_position(
 def _seen(
     frame: np.ndarray, u: np.ndarray, ahead: np.ndarray, depth: np.ndarray, power: int, speed_power: int
 ) -> float:
-    """What one voxel receives from a frame; u, ahead and depth are (lines,), one pose each."""
+    """Returns what one voxel receives from a frame; u, ahead and depth are (lines,), one pose each."""
     crossing = np.flatnonzero((ahead[:-1] >= 0) & (ahead[1:] <= 0))
     if crossing.size == 0 or depth.min() <= 0:
         return 0.0
@@ -246,7 +248,7 @@ def _taps(displacement: np.ndarray) -> Iterator[tuple[tuple[np.ndarray, ...], np
 
 
 def moved_rows(rows: np.ndarray, deformation: Deformation, weights: np.ndarray) -> np.ndarray:
-    """Returns parameter rows (11, G) of a reference in one state, of ``weights`` (R,); the peaks of densities stay."""
+    """Returns parameter rows (11, G) of a reference in one state, of ``weights`` (R,); densities keep their peaks."""
     mean = rows[MEAN].T + deformation.inverse_mm(rows[MEAN].T, weights)
     for _ in range(2):  # Newton steps: differences of frames need more digits
         off = mean + deformation.displacement_mm(mean, weights) - rows[MEAN].T

@@ -20,7 +20,7 @@ from phyradgs_cl.acquisition.time_cells import TimeCells
 
 
 def precision_matrices(rows: np.ndarray) -> np.ndarray:
-    """Σ⁻¹ (G, 3, 3) of parameter rows (11, G)."""
+    """Returns Σ⁻¹ (G, 3, 3) of parameter rows (11, G)."""
     turn = Rotation.from_quat(rows[[7, 8, 9, 6]].T).as_matrix()
     return np.asarray(np.einsum("gij,gj,gkj->gik", turn, 1 / rows[3:6].T ** 2, turn))
 
@@ -29,7 +29,7 @@ def splat_image(
     rows: np.ndarray, pose: np.ndarray, detector_shape: tuple[int, int], cutoff_sigma: float = 0.0,
     affine: bool = False, is_parallel: bool = False,
 ) -> np.ndarray:
-    """One static projection (nv, nu) of parameter rows (11, G) from one pose (12,)."""
+    """Returns one static projection (nv, nu) of parameter rows (11, G) from one pose (12,)."""
     image = np.zeros(detector_shape)
     if is_parallel:
         for row, precision in zip(rows.T, precision_matrices(rows), strict=True):
@@ -70,7 +70,8 @@ def _exact(
 def _in_parallel(
     row: np.ndarray, precision: np.ndarray, pose: np.ndarray, detector_shape: tuple[int, int], cutoff_sigma: float
 ) -> np.ndarray:
-    """The exact line integrals along parallel rays: density sqrt(2π/a) exp(−q/2) with q the smallest along the ray."""
+    """Returns the exact line integrals along parallel rays: density sqrt(2π/a) exp(−q/2) with q the smallest along the
+    ray."""
     offset = pixel_centres(pose, detector_shape) - row[:3]
     a = pose[:3] @ precision @ pose[:3]
     b = np.einsum("vui,ij,j->vu", offset, precision, pose[:3])
@@ -83,7 +84,7 @@ def _affine(
     row: np.ndarray, precision: np.ndarray, pose: np.ndarray, detector_shape: tuple[int, int],
     cutoff_sigma: float,
 ) -> np.ndarray:
-    """R2-Gaussian's splat: covariance through the Jacobian at the centre, ray factor of the central ray."""
+    """Returns R2-Gaussian's splat: covariance through the Jacobian at the centre, amplitude of the central ray."""
     source, eu, ev = pose[:3], pose[6:9], pose[9:12]
     centre = row[:3] - source
     inverse = np.linalg.inv(np.stack([eu, ev, pose[3:6] - source], -1))
@@ -105,7 +106,8 @@ def splat_frame(
     rows: np.ndarray, table: TimeCells, detector_shape: tuple[int, int], cutoff_sigma: float = 0.0,
     affine: bool = False,
 ) -> np.ndarray:
-    """Eq. 3 unfused: render every cell's whole projection, then weigh, cut into strips and add up."""
+    """Returns the frame (rows, columns) of the paper's Eq. 3 unfused: renders each cell's whole projection, weighs it, cuts
+    out the cell's lines and adds them up."""
     frame = np.zeros(detector_shape)
     for cell in range(table.count):
         lines = slice(int(table.line_start[cell]), int(table.line_stop[cell]))
@@ -121,7 +123,7 @@ def splat_frame(
 def voxel_field(
     rows: np.ndarray, z: np.ndarray, y: np.ndarray, x: np.ndarray, cutoff_sigma: float = 0.0
 ) -> np.ndarray:
-    """The field (nz, ny, nx) of parameter rows (11, G) at axes z, y, x, by direct evaluation."""
+    """Returns the field (nz, ny, nx) of parameter rows (11, G) at axes z, y, x, by direct evaluation."""
     points = np.stack(np.meshgrid(x, y, z, indexing="ij"), -1).transpose(2, 1, 0, 3)
     volume = np.zeros(points.shape[:3])
     for row, precision in zip(rows.T, precision_matrices(rows), strict=True):
@@ -132,12 +134,13 @@ def voxel_field(
     return volume
 
 
-_PANELS, _NODES = 6, 12
+_PANELS, _NODES = 6, 12  # panels of the quadrature in time, and Gauss–Legendre nodes of each
 
 
 @dataclass(frozen=True)
 class _Segment:
-    """One Gaussian in one segment: all vectors are (u, v) in pixels; ``length`` (lines, width) or a number."""
+    """One Gaussian in one segment, in pixels (u, v): mean centre and path (2,), conic (2, 2), Q's coefficients b (2,) and c
+    (2, 2), and the peak value over the ray's length."""
 
     centre: np.ndarray
     path: np.ndarray
@@ -151,7 +154,8 @@ def moving_frame(
     rows: np.ndarray, table: TimeCells, detector_shape: tuple[int, int], cutoff_sigma: float = 0.0,
     affine: bool = False, cloud_at: Callable[[float], np.ndarray] | None = None,
 ) -> np.ndarray:
-    """The merged frame (nv, nu) of parameter rows (11, G) over cells with motion, or over cells with a ``conic_pose``.
+    """Returns the merged frame (nv, nu) of parameter rows (11, G) over cells with motion, or over cells with a
+    ``conic_pose``.
 
     A cell with a ``conic_pose`` is a segment without a path: the splat of that pose, with its centre where the cell's pose
     has it. ``cloud_at`` gives the rows at a time in s, of an object that moves."""
@@ -175,7 +179,7 @@ def moving_frame(
 
 
 def _centre_segments(table: TimeCells) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The conic's pose (C, 12), each cell's own pose twice (C, 2, 12), and lines that see one time (C, 3, lines)."""
+    """Returns the conic's pose (C, 12), each cell's own pose twice (C, 2, 12), and lines that see one time (C, 3, lines)."""
     times = np.zeros((table.count, 3, table.lines))
     for cell, lines in enumerate(table.ranges):
         times[cell, 2, lines] = table.weight[cell]
@@ -183,7 +187,7 @@ def _centre_segments(table: TimeCells) -> tuple[np.ndarray, np.ndarray, np.ndarr
 
 
 def seen_at(pose: np.ndarray, point: np.ndarray, is_parallel: bool = False) -> np.ndarray:
-    """(u, v, depth) of a world point, u and v in pixels; the depth is 1 in a parallel beam."""
+    """Returns (u, v, depth) of a world point, u and v in pixels; the depth is 1 in a parallel beam."""
     if is_parallel:
         p = np.linalg.solve(np.stack([pose[6:9], pose[9:12], pose[:3]], -1), point - pose[3:6])
         return np.array([p[0], p[1], 1.0])
@@ -233,13 +237,13 @@ def _segment_image(
 
 
 def _exponent(s: _Segment, delta: np.ndarray, at: np.ndarray, big_q: np.ndarray) -> np.ndarray:
-    """q (lines, width) when the centre has moved for times ``at`` (lines, 1 or width)."""
+    """Returns q (lines, width) where the centre has moved by the path times ``at`` (lines, 1 or width)."""
     moved = delta - at[..., None] * s.path
     return np.asarray(np.einsum("...i,ij,...j", moved, s.conic, moved) / big_q)
 
 
 def _nearest(s: _Segment, delta: np.ndarray, times: np.ndarray, big_q: np.ndarray) -> np.ndarray:
-    """The smallest q within each line's window."""
+    """Returns the smallest q (lines, width) within each line's window."""
     fast = s.path @ s.conic @ s.path
     best = delta @ s.conic @ s.path / fast if fast > 0 else np.zeros(delta.shape[:2])
     first, last = (times[0] - times[1])[:, None], (times[0] + times[1])[:, None]
@@ -247,7 +251,7 @@ def _nearest(s: _Segment, delta: np.ndarray, times: np.ndarray, big_q: np.ndarra
 
 
 def _nodes() -> tuple[np.ndarray, np.ndarray]:
-    """Composite Gauss–Legendre nodes on [−1, 1] and weights that sum to 1."""
+    """Returns composite Gauss–Legendre nodes on [−1, 1] and weights that sum to 1."""
     node, weight = np.polynomial.legendre.leggauss(_NODES)
     middle = (np.arange(_PANELS) + 0.5) / _PANELS * 2 - 1
     return (middle[:, None] + node / _PANELS).ravel(), np.tile(weight / 2 / _PANELS, _PANELS)

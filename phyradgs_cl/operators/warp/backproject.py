@@ -1,7 +1,7 @@
 """FDK's backprojection of an object that moves: every voxel is taken where its matter is at the time of a view.
 
-The displacement of a view is blended of those of two states. S. Rit et al., Comparison of analytic and algebraic methods for
-motion-compensated cone-beam CT reconstruction of the thorax, IEEE Trans. Med. Imaging 28 (2009) 1513."""
+The displacement of a view is interpolated between those of two states. S. Rit et al., Comparison of analytic and algebraic
+methods for motion-compensated cone-beam CT reconstruction of the thorax, IEEE Trans. Med. Imaging 28 (2009) 1513."""
 
 from copy import copy
 from functools import lru_cache
@@ -19,17 +19,17 @@ from phyradgs_cl.operators.warp.states import MotionStates
 from phyradgs_cl.runtime import DeviceArray, Runtime
 from phyradgs_cl.runtime.layout import GUARD
 
-_MOST_STEPS = 100  # of the fixed point
+_MOST_STEPS = 100  # iterations of the fixed point that inverts a displacement, at most
 _PROBED = 500  # voxels at which an inverse is checked
-_WRONG = 0.1  # of a voxel
-_HELD_STATES = 3  # whose displacements are on the device
+_WRONG = 0.1  # largest error of an inverse, in voxels
+_HELD_STATES = 3  # states whose displacements stay on the device
 
 
 class MovingBackprojector:
     """FDK's backprojection for the states of an object that moves.
 
-    shares (F, K): of the states in each frame, at most two above 0. Holds up to nine volumes on the device.
-    Raises InputError where a field has no inverse."""
+    shares (F, K): the share of each state in a frame, at most two above 0. Holds up to nine volumes on the device. A call
+    raises InputError where a field has no inverse."""
 
     def __init__(self, rt: Runtime, states: MotionStates, shares: np.ndarray) -> None:
         self.rt, self.states, self.shares = rt, states, shares
@@ -45,8 +45,8 @@ class MovingBackprojector:
         self, frames: np.ndarray, pose: np.ndarray, weight: np.ndarray, grid: Grid, axis: str = "rows", *,
         is_parallel: bool = False,
     ) -> np.ndarray:  # fmt: skip
-        """Returns the backprojection (nz, ny, nx) float32 as ``backproject`` or, with a pose for every line,
-        ``backproject_lines`` of an object at rest. frames (F, rows, columns), weight (F,)."""
+        """Returns the backprojection (nz, ny, nx) float32 as ``backproject`` does, or ``backproject_lines`` with a pose for
+        every line. frames (F, rows, columns), pose (F, 12) or (F, lines, 12) mm, weight (F,)."""
         volume, pairs = np.zeros(grid.shape, np.float32), _pairs(self.shares)
         for first, second in np.unique(pairs, axis=0).tolist():
             views = np.flatnonzero((pairs == (first, second)).all(1))
@@ -58,7 +58,8 @@ class MovingBackprojector:
         self, pair: tuple[int, int], frames: np.ndarray, pose: np.ndarray, weights: np.ndarray, grid: Grid, axis: str,
         is_parallel: bool,
     ) -> np.ndarray:  # fmt: skip
-        """Backprojects the frames between two states; weights (F, 2): FDK's, and the share of the second."""
+        """Backprojects the frames that blend one pair of states; weights (F, 2): FDK's, and the share of the second
+        state."""
         rt, fields = self.rt, [self._push(state) for state in pair]
         size, by_lines = np.array([*grid.shape[::-1], 0], np.int32), pose.ndim == 3
         turned = by_lines and axis == "columns"
@@ -80,7 +81,8 @@ class MovingBackprojector:
         return result
 
     def _push_of(self, state: int) -> DeviceArray:
-        """Returns u (3, nz, ny, nx) in voxels, components x, y, z, of a state."""
+        """Returns u, the displacement of a state's matter from its reference, (3, nz, ny, nx) in voxels, components x, y, z.
+        Raises InputError where the field has no inverse."""
         rt, grid = self.rt, self.states.grid
         pull_mm, wide, margin = self._wide_pull_mm(state)
         spacing_mm = np.array(grid.voxel_size_mm[::-1])
@@ -95,7 +97,8 @@ class MovingBackprojector:
         return push
 
     def _wide_pull_mm(self, state: int) -> tuple[np.ndarray, Grid, tuple[int, int, int]]:
-        """Returns w on a grid as wide as matter of the grid moves, that grid, and its voxels before the grid's first."""
+        """Returns w (…, 3) in mm on a grid wide enough for the grid's matter to move in, that grid, and how many voxels (z,
+        y, x) it has before the grid's first."""
         grid, weights = self.states.grid, self.states.weights[state]
         reach_mm = np.abs(np.tensordot(weights, self.states.fields_mm, 1)).max((0, 1, 2))[::-1]
         margin = np.ceil(1.5 * reach_mm / grid.voxel_size_mm).astype(int) + 1
@@ -105,7 +108,7 @@ class MovingBackprojector:
         return self.states.deformation.on_grid_mm(wide, weights), wide, (z, y, x)
 
     def _check_inverse(self, state: int, push_mm: np.ndarray) -> None:
-        """Compares some voxels with the deformation itself."""
+        """Raises InputError where u, push_mm (voxels, 3), does not invert the deformation at some voxels."""
         grid = self.states.grid
         probed = np.linspace(0, len(push_mm) - 1, min(_PROBED, len(push_mm))).astype(int)
         z, y, x = (axis[i] for axis, i in zip(grid.axes_mm(), np.unravel_index(probed, grid.shape), strict=True))
@@ -117,7 +120,7 @@ class MovingBackprojector:
 
 
 def _pairs(shares: np.ndarray) -> np.ndarray:
-    """Returns the two states (F, 2) of every frame, twice the same where it has one."""
+    """Returns the two states (F, 2) of every frame; a frame with one state has it twice."""
     largest = np.argsort(-shares, axis=1, kind="stable")
     second = largest[:, min(1, shares.shape[1] - 1)]
     has_two = shares[np.arange(len(shares)), second] > 0

@@ -3,8 +3,9 @@
 W_k warps the volume to a state; of an object that changes it takes the state from a stack. P_k projects it to the time cells
 that the state stands for (``states.py``). A cell may also be a blend of two states.
 
-Derivatives of the frames A v by the displacement field w = Σ_r φ_r U_r: by the coefficients of the fields U_r, and by the
-weights φ_r. With w_k of the state k and the slope ∇v of the cubic volume:
+``FieldDerivative`` differentiates the frames A v with respect to the displacement field w = Σ_r φ_r U_r: to the coefficients
+d_r of the fields U_r (J, with B from coefficients to voxels), and to the weights φ_r. w_k is the field in state k, and ∇v
+the gradient of the cubic spline through the volume:
 
     J d = Σ_k P_k (∇v(y + w_k) · Σ_r φ_r,k B d_r),    Jᵀ y = Bᵀ Σ_k φ_r,k ∇v(y + w_k) P_kᵀ y"""
 
@@ -30,10 +31,10 @@ from phyradgs_cl.operators.warp.states import MOST_STATES, MotionStates
 from phyradgs_cl.operators.warp.volume import VolumeWarp
 from phyradgs_cl.runtime import DeviceArray, Runtime, SameArray
 
-_FRAMES_PER_STATE = 12  # beyond MOST_STATES: the more frames are projected, the less of the time goes to a warp
-_REACH = 2  # voxels: as far as a coefficient of cl/warp.cl counts
-_BORDER = 4  # coefficients before and behind the volume, as in cl/warp.cl
-_SETTLES = 8  # voxels of zeros more, within which coefficients fall to 3e-5
+_FRAMES_PER_STATE = 12  # frames for one state more than MOST_STATES: with more frames, warps take a smaller part of the time
+_REACH = 2  # largest distance of a spline coefficient from a place where it counts, in voxels, as in cl/warp.cl
+_BORDER = 4  # coefficients beyond each face of the volume, as in cl/warp.cl
+_SETTLES = 8  # further voxels of zeros, over which coefficients decay to 3e-5
 
 
 class WarpedOperator:
@@ -41,8 +42,8 @@ class WarpedOperator:
 
     Arguments and arrays are those of ``RayOperator``; with a ``StateStack`` volumes are stacks (K, nz, ny, nx). The volume
     must fit on the device as a whole. ``forward`` warps the volume once for each state that the operator's frames use.
-    Operators of one ``warp`` or ``memory`` share buffers: use them one at a time. Raises OutOfMemoryError for a volume in
-    bricks."""
+    Operators of one ``warp`` or ``memory`` share buffers: use them one at a time. Calls raise OutOfMemoryError where the
+    volume fits in bricks only."""
 
     def __init__(
         self, rt: Runtime, grid: Grid, detector_shape: tuple[int, int], tables: Sequence[TimeCells], *,
@@ -100,7 +101,8 @@ class WarpedOperator:
         self, function: Callable[[DeviceArray, DeviceArray], None], values: SameArray, shape: tuple[int, ...],
         out: SameArray | None,
     ) -> SameArray:  # fmt: skip
-        """Runs ``function(values, result)`` on the device; the result lies where the values lie."""
+        """Returns the result of ``function(values, result)`` on the device, where the values lie. Raises OutOfMemoryError
+        where the volume fits in bricks only."""
         if (bricks := len(self.memory.plan())) > 1:
             found = f"room for the volume in {bricks} bricks"
             expected = "room for the whole volume, which an object that moves needs"
@@ -126,7 +128,7 @@ class WarpedOperator:
 
     @property
     def holds(self) -> tuple[int, int]:
-        """Volumes and stacks of frames on the device besides ``memory`` and the fields."""
+        """Numbers of volumes and of stacks of frames on the device besides ``memory`` and the fields."""
         return self.warp.volumes, 1
 
 
@@ -150,10 +152,10 @@ def projector_of(
     rt: Runtime, grid: Grid, tables: Sequence[TimeCells], deformation: Deformation | None,
     state_times_s: np.ndarray | None = None,
 ) -> Callable[..., RayOperator | WarpedOperator]:
-    """Returns what makes the projector of an object that moves as ``deformation`` does at the times of ``tables``, or that
-    changes between states at ``state_times_s`` (K,).
+    """Returns a constructor of projectors for an object that moves as ``deformation`` does at the times of ``tables``, or
+    that changes between states at ``state_times_s`` (K,).
 
-    The nearest state stands for a cell: a blend of two would blur, and project every cell twice. The result takes the
+    The nearest state stands for a cell: a blend of two would blur, and project every cell twice. The constructor takes the
     arguments of ``RayOperator``, which it is for an object at rest."""
     if state_times_s is not None:
         return partial(WarpedOperator, warp=StateStack(rt, grid.shape, TimeStates(state_times_s)))
@@ -168,7 +170,7 @@ def projector_of(
 def _tables_by_state(
     tables: Sequence[TimeCells], warp: VolumeWarp | StateStack
 ) -> list[tuple[np.ndarray, list[TimeCells]]]:
-    """Returns for each state the frames that use it, and tables of their cells, weighted by the state's part."""
+    """Returns for each state the frames that use it, and tables of their cells, weighted by the state's share."""
     ends = np.cumsum([table.count for table in tables])[:-1]
     shares = np.split(warp.states.shares(np.concatenate([table.time_s for table in tables])), ends)
     by_state = []
@@ -187,7 +189,8 @@ def _with_share(table: TimeCells, share: np.ndarray) -> TimeCells | None:
 
 
 class FieldDerivative:
-    """The derivative at one volume (nz, ny, nx) in 1/mm and at the field of ``operator``; shares of states are constants.
+    """The derivative of frames at one volume (nz, ny, nx) in 1/mm and at the field of ``operator``; shares of states are
+    constants.
 
     Coefficients (R, cz, cy, cx, 3) are in mm as those of a ``Deformation``. Holds three volumes per state on the host."""
 
@@ -203,7 +206,8 @@ class FieldDerivative:
         self.slopes = {k: warp_slopes(volume, displacement) * per_mm for k, displacement in displacements.items()}
 
     def forward(self, change_mm: np.ndarray) -> np.ndarray:
-        """Returns J d: the change of the frames (F, rows, columns) float32 for a change of the coefficients."""
+        """Returns J d, the change of the frames (F, rows, columns) float32, for a change d (R, cz, cy, cx, 3) of the
+        coefficients."""
         fields_mm = np.stack([self._on_grid(one) for one in change_mm])
         return self._projected(lambda k: np.tensordot(self.weights[k].astype(np.float32), fields_mm, 1))
 
@@ -241,8 +245,8 @@ class FieldDerivative:
 
 
 def warp_slopes(volume: np.ndarray, displacement: np.ndarray) -> np.ndarray:
-    """Returns ∇v(y + w(y)) (nz, ny, nx, 3) float32 per voxel, x y z, of the volume (nz, ny, nx) by cubic splines, 0 outside,
-    for w (nz, ny, nx, 3) in voxels."""
+    """Returns ∇v(y + w(y)), (nz, ny, nx, 3) float32 per voxel in the order x, y, z, of the cubic spline through v (nz, ny,
+    nx), which is 0 outside. w (nz, ny, nx, 3) is in voxels, components x, y, z."""
     wide = scipy.ndimage.spline_filter(np.pad(volume, _BORDER + _SETTLES), output=np.float32)
     padded = np.ascontiguousarray(wide[(slice(_SETTLES, -_SETTLES),) * 3])
     strides = (padded.shape[1] * padded.shape[2], padded.shape[2], 1)

@@ -1,4 +1,4 @@
-"""The states of an object that changes, in one stack: W_k takes state k of it, in place of a warp of one volume."""
+"""The states of an object that changes, in one stack: W_k picks state k of it, in place of a warp of one volume."""
 
 from dataclasses import dataclass
 
@@ -11,7 +11,7 @@ from phyradgs_cl.runtime.layout import GUARD
 
 @dataclass(frozen=True, eq=False)
 class TimeStates:
-    """States at some times (K,) in s, rising. The nearest one stands for a time."""
+    """States at some times (K,) in s, rising. The state nearest in time stands for a time."""
 
     times_s: np.ndarray
 
@@ -29,7 +29,7 @@ class TimeStates:
 class StateStack:
     """W_k x = x_k of a stack x (K, nz, ny, nx), with the methods of a ``VolumeWarp``."""
 
-    volumes = 2  # stacks that it holds, at most
+    volumes = 2  # stacks on the device, at most
 
     def __init__(self, rt: Runtime, volume_shape: tuple[int, int, int], states: TimeStates) -> None:
         self.rt, self.states, self.shape = rt, states, (states.count, *volume_shape)
@@ -39,7 +39,7 @@ class StateStack:
         self.stack = FrameStack(rt, rt.kernel("warp", "add_frames", RANK=1))
 
     def is_still(self, state: int) -> bool:
-        """False: no state is the stack itself."""
+        """Returns False: every state is copied from the stack."""
         return False
 
     def source(self, stack: DeviceArray) -> DeviceArray:
@@ -62,9 +62,9 @@ class StateStack:
         return self._total
 
     def adjoint(self, state: int, moved: DeviceArray, total: DeviceArray) -> None:
-        """Adds W_kᵀ v to ``total``, which has nothing of state k yet: no two parts of an operator have the same state."""
+        """Writes W_kᵀ v into ``total``, where state k is zero before: no two parts of an operator have the same state."""
         self.rt.copy(moved, total, nbytes=4 * self._voxels, target_offset=4 * self._voxels * state)
 
     def read(self, total: DeviceArray, result: DeviceArray) -> None:
-        """Copies a stack."""
+        """Copies the stack ``total`` to ``result``."""
         self.rt.copy(total, result)

@@ -9,19 +9,20 @@ import numpy as np
 
 from phyradgs_cl.fields import Deformation, Grid
 
-MOST_STATES = 12
-_SPACING = 0.6  # voxels, RMS where the object moves, between a time and its nearest state
+MOST_STATES = 12  # most states of an object, unless ``most`` says otherwise
+# largest distance of a time from its nearest state where states are blended: displacement in voxels, RMS over moving voxels
+_SPACING = 0.6
 _SPACING_OF_NEAREST = 0.3  # the same where the nearest state stands for a time
-_MOVES = 0.1  # of the largest squared displacement: voxels that move as much count in that RMS
+_MOVES = 0.1  # a voxel moves if its squared displacement is at least so much of the largest one
 
 
 @dataclass(frozen=True, eq=False)
 class MotionStates:
     """States of ``deformation``, and which of them stand for a time.
 
-    fields_mm: (R, nz, ny, nx, 3) displacements of unit weight on ``grid``, components x, y, z. weights: (K, R) of each
-    state. metric: (R, R); the distance of two weights is √(dᵀ metric d), an RMS displacement in voxels. blends: whether two
-    states are blended for a time between them; else the nearest one stands for it."""
+    fields_mm: (R, nz, ny, nx, 3) displacements of unit weight on ``grid``, components x, y, z. weights: (K, R), the
+    fields' in each state. metric: (R, R); the distance of two weights is √(dᵀ metric d), an RMS displacement in voxels.
+    blends: whether two states are blended for a time between them; else the nearest one stands for it."""
 
     deformation: Deformation
     grid: Grid
@@ -37,8 +38,8 @@ class MotionStates:
     ) -> "MotionStates":  # fmt: skip
         """Chooses at most ``most`` states for times (T,) in s: each next one is the time furthest from the states so far.
 
-        least_voxels: displacement for a unit of every weight, added to the fields' own in the distances. With it fields of
-        zeros have several states too."""
+        least_voxels: displacement per unit of every weight that is added in the distances, so that fields of zeros have
+        several states too."""
         units, fields_mm = np.eye(deformation.rank), unit_fields_mm(deformation, grid)
         voxel_mm = min(grid.voxel_size_mm)
         seen = np.unique(deformation.weights_at(times_s), axis=0)
@@ -69,19 +70,19 @@ class MotionStates:
         return self.count == 1 and self.is_still(0)
 
     def is_still(self, state: int) -> bool:
-        """Whether nothing is displaced in a state."""
+        """Returns whether nothing is displaced in a state."""
         return not np.any(self._has_effect & (self.weights[state] != 0))
 
     @cached_property
     def _has_effect(self) -> np.ndarray:
-        """Whether a field displaces anything (R,)."""
+        """Whether each field displaces anything, (R,) bool."""
         return np.array([field.any() for field in self.fields_mm])
 
     def shares(self, times_s: np.ndarray | Sequence[float]) -> np.ndarray:
-        """Returns the share of each state (T, K) at times (T,); at most two of a row are above 0, and their sum is 1.
+        """Returns the share of each state (T, K) at times (T,) in s; at most two of a row are above 0, and their sum is 1.
 
-        The pair of a blend has the smallest error, in voxels: the distance of the time's weights from the line between the
-        two states, and the blur of blending two volumes that are displaced against each other."""
+        A blend takes the pair with the smallest error. It is the sum of two, in voxels: the distance of the time's weights
+        from the line between the two states, and the blur of blending two volumes that are displaced against each other."""
         wanted = self.deformation.weights_at(times_s)
         if not self.blends:
             distances = np.stack([_length(wanted - weights, self.metric) for weights in self.weights], -1)
@@ -103,11 +104,11 @@ class MotionStates:
 
 
 def unit_fields_mm(deformation: Deformation, grid: Grid) -> np.ndarray:
-    """Returns the displacements (R, nz, ny, nx, 3) of unit weight in mm."""
+    """Returns the displacements (R, nz, ny, nx, 3) of unit weight in mm, components x, y, z."""
     return np.stack([deformation.on_grid_mm(grid, unit) for unit in np.eye(deformation.rank)])
 
 
 def _length(difference: np.ndarray, metric: np.ndarray) -> np.ndarray:
-    """Returns the distances (T,) of weights (T, R)."""
+    """Returns the lengths (T,) in voxels, RMS, of differences (T, R) of weights."""
     squared: np.ndarray = np.einsum("tr,rs,ts->t", difference, metric, difference)
     return np.asarray(np.sqrt(np.maximum(squared, 0)))

@@ -50,11 +50,12 @@ from phyradgs_cl.reconstructors.result import ProgressReport, Reconstruction, ig
 from phyradgs_cl.runtime import Runtime
 
 log = logging.getLogger(__name__)
-_SAME_POSE = 1e-9  # of the largest length: views whose poses differ only by a rotation share their weights
-_BLOCK_BYTES = 1 << 26  # rows that are filtered at one time
+# views whose poses, rotated back to one angle, differ by at most this share of the largest entry share their weights
+_SAME_POSE = 1e-9
+_BLOCK_BYTES = 1 << 26  # bytes of the rows that are filtered at one time
 _WORKERS = -1  # all cores
 
-# Functions of the frequency over the Nyquist frequency; all are 1 at zero, so that no window changes the mean.
+# Windows as functions of the frequency over the Nyquist frequency; all are 1 at zero, so that none changes the mean.
 WINDOWS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
     "ram-lak": np.ones_like,
     "shepp-logan": lambda share: np.sinc(share / 2),
@@ -66,7 +67,8 @@ WINDOWS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
 
 @dataclass(frozen=True)
 class FdkOptions:
-    """window: of the ramp filter, one of ``WINDOWS``. extrapolate: how rows continue beyond the panel, one of ``WAYS``.
+    """window: window of the ramp filter, one of ``WINDOWS``. extrapolate: how rows continue beyond the panel, one of
+    ``WAYS``.
 
     motion: static (one pose per frame, mid-window), static-start (the frame's first pose) or per-row (every line at the
     middle of its own exposure). Of a model with more poses FDK uses a line's middle one."""
@@ -85,9 +87,9 @@ class FdkOptions:
 
 @dataclass(frozen=True)
 class FbpOptions(FdkOptions):
-    """deblur: sharpen a fly-scan along the angle, with this power of noise over that of the signal, as 0.01; 0 does not.
-    circle: set voxels outside of the circle that the panel's wider side reaches to 0, unless rows are extrapolated.
-    The other options are those of FDK."""
+    """deblur: sharpens a fly-scan along the angle; the power of noise over that of the signal, such as 0.01. 0 does not
+    sharpen. circle: sets voxels outside of the circle that the panel's wider side reaches to 0, unless rows are
+    extrapolated. The other options are those of FDK."""
 
     deblur: float = 0.0
     circle: bool = True
@@ -106,15 +108,15 @@ def fdk(
 
     ``seed`` is part of the common signature and not used.
 
-    Logs a warning for incomplete turns, and for an orbit that is not a circle about z. Raises InputError for one that is far
-    from it, and for parallel rays that are not at right angles to the axis."""
+    Logs a warning for incomplete turns, and for an orbit that is not a circle about z. Raises InputError for the other beam,
+    for an orbit far from a circle, and for parallel rays that are not at right angles to the axis."""
     started, method = time.perf_counter(), "fbp" if isinstance(options, FbpOptions) else "fdk"
     if deformation is not None and options.extrapolate == "reprojected":
         expected, remedy = "another way of rows beyond the panel", "leave extrapolate out"
         raise InputError("--object-motion", "extrapolate=reprojected, of an object at rest", expected, remedy)
     frames, numbers = _measured_frames(scan)
     poses = [options.motion.cells(scan, f).still().line_poses() for f in numbers]
-    # a frame at rest among frames with a pose for every line repeats its own
+    # beside frames with a pose for every line, a frame with one pose repeats it
     lines = max(map(len, poses))
     pose = np.concatenate(poses) if lines == 1 else np.stack([np.broadcast_to(p, (lines, 12)) for p in poses])
     check_beam(method, pose, scan.is_parallel)
@@ -176,7 +178,7 @@ def fdk_volume(
     pose = widened(pose, axis, missing)
 
     def of_views(images: np.ndarray, views: np.ndarray, power: int = 2) -> np.ndarray:
-        share, one = 0.5 * arc.gap_rad[views], pose[views]  # every ray is measured twice
+        share, one = 0.5 * arc.gap_rad[views], pose[views]  # 0.5: every ray is measured twice
         if moving is not None and power == 2:
             return moving.of_views(views)(images, one, share, grid, axis, is_parallel=is_parallel)
         if pose.ndim == 2:
@@ -200,7 +202,8 @@ def fdk_volume(
 def _seen(
     pose: np.ndarray, frames: np.ndarray, axis: str, is_parallel: bool
 ) -> tuple[np.ndarray, np.ndarray, weights.Fan, Arc]:
-    """Returns the poses of pixels, those turned back to one angle, their fan, and the arc of all views."""
+    """Returns the poses of pixels, those rotated back to one angle, their fan, and the arc of all views. Raises InputError
+    for a source on the rotation axis."""
     by_pixel = pose_of_pixels(pose, axis)
     if np.any(np.hypot(by_pixel[..., 0], by_pixel[..., 1]) <= 0):
         raise InputError("poses", "a source on the rotation axis", "a source beside it")
@@ -231,7 +234,7 @@ def _filtered(frames: np.ndarray, weight: RayWeight, missing: tuple[int, int], w
 
 
 def ramp_spectrum(length: int, window: str = "ram-lak") -> np.ndarray:
-    """The filter's real spectrum (length // 2 + 1,) for a pitch of 1 and a period of ``length`` samples.
+    """Returns the filter's real spectrum (length // 2 + 1,) for a pitch of 1 and a period of ``length`` samples.
 
     Sampling |frequency| instead would put a false constant under every row."""
     # the distance from sample 0 on a circle: the second half stands for negative distances
@@ -243,7 +246,7 @@ def ramp_spectrum(length: int, window: str = "ram-lak") -> np.ndarray:
 
 
 def ramp_filter(rows: np.ndarray, spacing_mm: float, window: str = "ram-lak") -> np.ndarray:
-    """The ramp filter along the last axis of (..., width), zero-padded so that nothing wraps around.
+    """Applies the ramp filter along the last axis of (..., width), zero-padded so that nothing wraps around.
 
     Returns the same shape in float32 and units of ``rows`` per mm. Float32 rows stay float32 throughout."""
     width = rows.shape[-1]

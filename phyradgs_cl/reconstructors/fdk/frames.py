@@ -11,7 +11,7 @@ Deblurring: in a parallel beam an exposure over an arc Δθ averages the sinogra
 detector row sees p(θ, s) averaged over [θ − Δθ/2, θ + Δθ/2], whatever the object. Along the views this is a convolution,
 which a Wiener filter inverts: with H(f) = sinc(f Δθ) it multiplies by (1 + λ) H / (H² + λ). λ is the power of noise over
 that of the signal; without it noise would grow without bound at the zeros of H. Rows that open later see the same box at
-other angles. A full turn is periodic, and behind half a turn the frames come back mirrored at the axis."""
+other angles. A full turn is periodic, and after half a turn the frames come back mirrored at the axis."""
 
 from dataclasses import replace
 
@@ -32,12 +32,12 @@ from phyradgs_cl.reconstructors.voxels.fista_tv import FistaTvOptions
 from phyradgs_cl.runtime import Runtime
 
 WAYS = ("none", "cosine", "cylinder", "reprojected")
-_SHARE = 0.5  # of the panel's columns, added at each side
-_SLOPE_PIXELS = 5  # that the slope at the edge is measured over
-_NOISE = 0.01  # of the largest line integral: an edge below it is air
-_UNEVEN = 0.02  # of a step between views
-_REACH = 8  # boxes that views are continued beyond the ends of an arc
-_FULL_TURN = 1.5  # steps: the largest gap of a full turn
+_SHARE = 0.5  # columns added at each side, over the panel's columns
+_SLOPE_PIXELS = 5  # pixels at the end of a row over which its slope is measured
+_NOISE = 0.01  # an edge below this share of the 99.9th percentile of line integrals is air
+_UNEVEN = 0.02  # largest deviation of an even step between views, over the step
+_REACH = 8  # exposure arcs by which views are continued beyond the ends of an arc
+_FULL_TURN = 1.5  # largest gap between views of a full turn, over the usual step
 
 
 def extrapolated(frames: np.ndarray, way: str) -> tuple[np.ndarray, int]:
@@ -78,8 +78,8 @@ def _curvature(frames: np.ndarray) -> np.ndarray:
     return np.broadcast_to(np.maximum(np.median(down, axis=0), 0)[None, :, None], (*frames.shape[:2], 1))
 
 
-_ITERATIONS = 30
-_MOST = 2.0  # of the panel's columns, added at each side
+_ITERATIONS = 30  # iterations of FISTA-TV that find the object beyond the panel
+_MOST = 2.0  # columns added at each side, at most, over the panel's columns
 
 
 def whole_object(scan: Scan, motion: Motion, rt: Runtime, report: ProgressReport) -> np.ndarray:
@@ -117,14 +117,14 @@ def reprojected(
 
 
 def _cells(pose: np.ndarray, lines: int, axis: str, is_parallel: bool) -> TimeCells:
-    """Returns a pose (1, 12) of all lines, or (lines, 12) of each, as still cells."""
+    """Returns a pose (1, 12) of all lines, or (lines, 12) of each, as cells of fixed pose."""
     ends = np.linspace(0, lines, len(pose) + 1).round().astype(np.int32)
     weight = np.ones(len(pose))
     return TimeCells(pose, 0 * weight, ends[:-1], ends[1:], weight, lines, axis, is_parallel=is_parallel)
 
 
 def _columns_beyond(pose: np.ndarray, columns: int, grid: Grid, is_parallel: bool) -> int:
-    """Returns how many more columns at a side panels of poses (n, 12) need to see the grid's whole box."""
+    """Returns how many more columns at each side panels of poses (n, 12) need to see the grid's whole box."""
     source, first, step_u, step_v = (pose[:, None, i : i + 3] for i in (0, 3, 6, 9))
     corners = np.stack(np.meshgrid(*grid.box_mm[::-1], indexing="ij"), -1).reshape(1, 8, 3)
     normal = np.cross(step_u, step_v)
@@ -141,7 +141,8 @@ def _columns_beyond(pose: np.ndarray, columns: int, grid: Grid, is_parallel: boo
 
 
 def deblurred(scan: Scan, frames: np.ndarray, angle_rad: np.ndarray, noise: float) -> np.ndarray:
-    """Returns frames (F, rows, columns) float32 as of a gantry that stops, at the angles (F,) of their middles.
+    """Returns frames (F, rows, columns) float32 as a gantry that stops would record them, at the angles (F,) of their
+    middles.
 
     noise: λ above. Raises InputError for views whose angles are not evenly spaced, in whatever order."""
     arc_rad = exposure_arc_rad(scan)

@@ -16,20 +16,21 @@ from phyradgs_cl.reconstructors.fdk.views import pose_of_pixels, view_angles
 
 log = logging.getLogger(__name__)
 
-_TRAVEL = 0.05  # of the panel's height, and a row: less than this concerns voxels that a circle sees in part too
-_CLASS_RAD = np.deg2rad(15)
-_VIEWS_A_CLASS = 2.0  # of a turn, at least
-_EVEN = 0.5  # of the panel's half height: rows beyond count less
-_LEAST_ROW = 0.02  # what the outermost row counts, so that voxels seen by no other are seen
-_LEAST_SHARE = 0.01  # of a class' width: less is as if it were not seen
-_NAMED = 0.01  # of the voxels
-_FEW_VIEWS = 24  # of a turn: from there densities of balls are within 2 %
+# least travel over the panel's height, and at least a row: less concerns only voxels that a circle sees in part too
+_TRAVEL = 0.05
+_CLASS_RAD = np.deg2rad(15)  # usual width of a class of directions
+_VIEWS_A_CLASS = 2.0  # views of one turn in a class, at least
+_EVEN = 0.5  # rows farther from the middle than this share of the panel's half height count less
+_LEAST_ROW = 0.02  # weight of the outermost row, so that voxels seen by no other row are seen
+_LEAST_SHARE = 0.01  # share of a class' directions below which a voxel counts as not seen from it
+_NAMED = 0.01  # share of the voxels with missing directions from which a warning is logged
+_FEW_VIEWS = 24  # views of a turn from which densities of balls are within 2 %; fewer cause a warning
 Backproject = Callable[[np.ndarray, np.ndarray], np.ndarray]
 """Returns a volume (z, y, x) of frames (n, rows, columns) and the numbers (n,) of their views."""
 
 
 def travels(pose: np.ndarray, rows: int, is_parallel: bool) -> bool:
-    """Whether the origin moves along the panel's rows from view to view of poses (F, r, c, 12): voxels miss some views."""
+    """Returns whether the origin moves along the panel's rows between poses (F, r, c, 12), so that voxels miss views."""
     middle = pose[:, pose.shape[1] // 2, pose.shape[2] // 2]
     first, across = middle[:, 3:6], np.cross(middle[:, 6:9], middle[:, 9:12])
     source = middle[:, :3]
@@ -57,8 +58,8 @@ def seen_volume(
 ) -> np.ndarray:  # fmt: skip
     """Returns the volume (z, y, x) of filtered frames (F, rows, columns) in which every voxel counts the views that see it.
 
-    pose (F, 12) or (F, lines, 12) mm. ``counted``: the weight of a view's pixels by which opposite rays share. Both
-    backprojections weigh views by their angular cells; ``backproject_seen`` divides by the distance once."""
+    pose (F, 12) or (F, lines, 12) mm. ``counted`` returns the weights (rows, columns) by which a view's rays share with
+    opposite ones. Both backprojections weigh views by angular cells; ``backproject_seen`` divides by the distance once."""
     by_pixel, shape = pose_of_pixels(pose, axis), frames.shape[1:]
     angle_rad, pace = _directions(by_pixel[:, [by_pixel.shape[1] // 2]], shape, is_parallel)
     turn_rad = 2 * np.pi if is_displaced else np.pi  # opposite rays are one where both sides are measured alike
@@ -87,8 +88,8 @@ def seen_volume(
 
 
 def _directions(pose: np.ndarray, shape: tuple[int, int], is_parallel: bool) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the angles about z (F, 1, columns) of the rays of poses (F, 1, c, 12), and what they turn by per radian of the
-    source, of a voxel on the panel."""
+    """Returns the angles about z (F, 1, columns) of the rays of poses (F, 1, c, 12), and how far the ray of a voxel on the
+    panel turns per radian of the source."""
     rays = weights.pixel_rays(pose, np.array([shape[0] // 2]), np.arange(shape[1]))
     if is_parallel:
         angle_rad = np.broadcast_to(np.arctan2(pose[..., 1], pose[..., 0]), rays.shape[:-1])
@@ -98,14 +99,14 @@ def _directions(pose: np.ndarray, shape: tuple[int, int], is_parallel: bool) -> 
 
 
 def _row_weight(rows: int) -> np.ndarray:
-    """Returns the weights (rows,): 1 in the middle, cos² towards the panel's first and last row."""
+    """Returns the weights (rows,) of the panel's rows: 1 in the middle, falling as cos² towards the first and last row."""
     away = np.abs(np.arange(rows) - (rows - 1) / 2) / max((rows - 1) / 2, 0.5)
     falling = np.cos(np.pi / 2 * np.clip((away - _EVEN) / (1 - _EVEN), 0, 1)) ** 2
     return np.maximum(falling, _LEAST_ROW)
 
 
 def _views_a_turn(angle_rad: np.ndarray) -> float:
-    """Returns the views (F,) of one turn where one follows the other; infinity where steps are too wide to tell turns."""
+    """Returns how many consecutive views at angles (F,) make a turn; infinity where steps are too wide to tell."""
     steps_rad = np.abs(np.angle(np.exp(1j * np.diff(angle_rad))))
     step_rad = float(np.median(steps_rad)) if steps_rad.size else 0.0
     return 2 * np.pi / step_rad if 0 < step_rad < np.pi / 2 else np.inf

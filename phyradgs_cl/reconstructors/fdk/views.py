@@ -15,22 +15,26 @@ from phyradgs_cl.reconstructors.fdk import weights
 # A scan with one gap that stands out is short. It is compared with the second largest and not with the median, so
 # that uneven views (four times as dense over one half, say) stay a full turn; 2.5 lets one view of many be lost.
 SHORT_SCAN_GAP = 2.5
-_SAME_VIEW = 1e-3  # of the mean gap: views closer than this share one cell (a second turn over the first)
-# Filled gaps up to the first cost less than 1 % of the density of balls a quarter of the field wide; larger than the
-# second they part the arc. Between the two more parts would cost more than filled gaps.
+_SAME_VIEW = 1e-3  # views closer than this share of the mean gap have one cell (a second turn over the first)
+# Gaps up to the first angle, filled, cost less than 1 % of the density of balls a quarter of the field wide. Gaps wider than
+# the second part the arc; between the two, more parts would cost more than filled gaps.
 _NAMED_RAD, _WIDE_RAD = np.deg2rad(5), np.deg2rad(10)
-# A misaligned panel's rays come again half a turn later, but for a strip that is measured once. Its small gaps are filled,
-# so that the strip counts fully; with a larger one it is a short scan.
+# The rays of a misaligned panel come again half a turn later, except for a strip that is measured once. Gaps of a full turn
+# up to this angle are filled, so that the strip counts fully; with a larger one the scan is short.
 _FILLED_RAD = np.deg2rad(15)
-_FILL_REACH = 0.5  # of a gap: how far from it views stand for it; larger smears, smaller draws streaks where it is wide
+# views within this share of a gap's width from it stand for it; more smears, less draws streaks where it is wide
+_FILL_REACH = 0.5
 log = logging.getLogger(__name__)
 
-_CIRCLE, _NO_CIRCLE = 0.05, 0.5  # of the way from source to panel: from here FDK loses decibels, or the object
-_PLANE_DEG, _NO_PLANE_DEG = 10.0, 45.0
-_LEAN_DEG, _NO_LEAN_DEG = 0.5, 10.0  # of a parallel beam
-_ROLL_DEG, _NO_ROLL_DEG = 3.0, 10.0  # of a cone's panel: densities are 0.1 % too low, 1.5 %, and all 0 at 90°
-_LEAST_OVERLAP = 2.0  # columns from the axis to the nearer edge of a displaced panel
-_TOLERATED_RAD = np.deg2rad(0.5)  # the fan of rays that are nearly parallel: half a turn is enough
+# distance of source or panel from a circle, over that between them: beyond the first a warning, the second an error
+_CIRCLE, _NO_CIRCLE = 0.05, 0.5
+_PLANE_DEG, _NO_PLANE_DEG = 10.0, 45.0  # angle of the source above its circle's middle: warning, error
+_LEAN_DEG, _NO_LEAN_DEG = 0.5, 10.0  # angle of parallel rays or rows from the plane of the rotation: warning, error
+# angle of a cone's rows from it: densities are 0.1 % and 1.5 % too low, and all 0 at 90°
+_ROLL_DEG, _NO_ROLL_DEG = 3.0, 10.0
+_LEAST_OVERLAP = 2.0  # columns from the axis to the nearer edge of a displaced panel: fewer cause a warning
+# missing angle without a warning: the fan of rays that are nearly parallel, for which half a turn is enough
+_TOLERATED_RAD = np.deg2rad(0.5)
 RayWeight = Callable[[int], np.ndarray]
 
 
@@ -38,10 +42,10 @@ RayWeight = Callable[[int], np.ndarray]
 class Arc:
     """The views' angular cells.
 
-    gap_rad (F,) is each view's share of the arc; progress_rad (F,) its angle from the start of the arc, which
-    begins half a step before the first view and ends half a step behind the last. A full turn has no start.
-    parts_rad (P, 2): where the parts between gaps begin and end, as progress. filled_rad: what the gaps take for which
-    the views beside them stand."""
+    gap_rad (F,) is each view's share of the arc; progress_rad (F,) its angle from the start of the arc, which begins half a
+    step before the first view and ends half a step behind the last. A full turn has no start. parts_rad (P, 2): where the
+    parts between gaps begin and end, as progress. filled_rad: total width of the gaps for which the views beside them
+    stand."""
 
     gap_rad: np.ndarray
     progress_rad: np.ndarray
@@ -59,14 +63,14 @@ class Arc:
         return float(np.pi * (1 - min(shares)))
 
     def covers(self, at_rad: np.ndarray) -> np.ndarray:
-        """Whether a part holds each angle (...), given as progress."""
+        """Returns whether a part holds each angle (...), given as progress, bool (...)."""
         turned = np.mod(at_rad, 2 * np.pi)[..., None]
         held: np.ndarray = ((turned >= self.parts_rad[:, 0]) & (turned <= self.parts_rad[:, 1])).any(-1)
         return held
 
 
 def filled_gap_rad(fan: weights.Fan) -> float:
-    """Returns the widest gap that the views beside it stand for, because they alone see some of its rays."""
+    """Returns the widest gap in rad for which the views beside it stand, because they alone see some of its rays."""
     if fan.is_put_aside:
         return 2 * np.pi
     return _FILLED_RAD if fan.is_displaced else 0.0
@@ -108,7 +112,7 @@ def _stand_out(ahead: np.ndarray) -> np.ndarray:
 
 
 def _only_here(centre: np.ndarray, ahead: np.ndarray, wide: np.ndarray) -> np.ndarray:
-    """Returns which narrow gaps (K,) no views opposite to them cover, so that those beside them have to; not the widest."""
+    """Returns which narrow gaps (K,), the widest gap apart, have no opposite views: the views beside them must stand in."""
     narrow = wide & (ahead <= _FILLED_RAD) & (np.arange(ahead.size) != np.argmax(ahead))
     opposite = centre + ahead / 2 + np.pi
     before = np.searchsorted(centre, np.mod(opposite - centre[0], 2 * np.pi) + centre[0], side="right") - 1
@@ -116,19 +120,20 @@ def _only_here(centre: np.ndarray, ahead: np.ndarray, wide: np.ndarray) -> np.nd
 
 
 def _steps(ahead: np.ndarray, wide: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the step (K,) from each view to the next and from the one before; at a gap it is that on the other side."""
+    """Returns the steps (K,) from each view to the next, and to each from the one before; at a gap the step on its other
+    side."""
     forward = np.where(wide, np.roll(ahead, 1), ahead)
     return forward, np.roll(np.where(wide, np.roll(ahead, -1), ahead), 1)
 
 
 def _filled_rad(ahead: np.ndarray) -> float:
-    """Returns what gaps (K,) take that are much wider than the usual step."""
+    """Returns the sum in rad by which gaps (K,) exceed the usual step where they are much wider than it."""
     usual = np.median(ahead) if ahead.size else 0.0
     return float((ahead - usual)[ahead > max(SHORT_SCAN_GAP * usual, _NAMED_RAD)].sum())
 
 
 def _filled_cells(ahead: np.ndarray, wide: np.ndarray) -> np.ndarray:
-    """Returns the cells (K,) of views of a full turn. Those near a wide gap share it, the nearer the more."""
+    """Returns the angular cells (K,) in rad of views of a full turn. Views near a wide gap share it, the nearer the more."""
     forward, back = _steps(ahead, wide)
     known = (forward + back) / 2
     cells = known.copy()
@@ -157,7 +162,7 @@ def _distinct(angle_rad: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def pose_of_pixels(pose: np.ndarray, axis: str) -> np.ndarray:
-    """Poses that broadcast to (F, rows, columns, 12)."""
+    """Returns poses that broadcast to (F, rows, columns, 12)."""
     if pose.ndim == 2:
         return pose[:, None, None]
     return pose[:, :, None] if axis == "rows" else pose[:, None]
@@ -260,7 +265,7 @@ def check_beam(method: str, pose: np.ndarray, is_parallel: bool) -> None:
 
 
 def _check_directions(pose: np.ndarray) -> None:
-    """Checks that parallel rays run nearly at right angles to the axis, as no filter along detector rows is right else."""
+    """Checks that parallel rays run nearly at right angles to the axis: otherwise no filter along detector rows is right."""
     rise_deg = np.rad2deg(np.arcsin(np.clip(np.abs(pose[..., 2]), 0, 1)))
     worst_deg = float(max(rise_deg.max(), _row_lean_deg(pose).max()))
     remedy = "take an iterative or splatting method: they take any orbit"
@@ -294,12 +299,12 @@ def _check_orbit(pose: np.ndarray) -> None:
     canonical = weights.turned_back(middle, azimuth_rad(middle)).reshape(-1, 4, 3)
     usual = np.median(canonical, axis=0)
     length_mm = float(np.linalg.norm(usual[1] - usual[0]))
-    off_mm = canonical[:, :2] - usual[:2]  # of source and panel
-    aside_mm = off_mm - np.eye(3)[2] * off_mm[:, :1, 2:]  # without the source's travel, of which a voxel misses views only
+    off_mm = canonical[:, :2] - usual[:2]  # offsets of source and panel from their usual places
+    aside_mm = off_mm - np.eye(3)[2] * off_mm[:, :1, 2:]  # less the source's travel along z, by which voxels only miss views
     above_deg = float(np.rad2deg(np.arctan2(abs(usual[0, 2]), np.hypot(*usual[0, :2]))))
 
     def distances_beyond(most: float, most_deg: float, of_mm: np.ndarray) -> str:
-        """Names the distances that are too large."""
+        """Returns in words which distances are too large."""
         off = float(np.linalg.norm(of_mm, axis=-1).max())
         parts = (
             f"{100 * off / length_mm:.0f} % of their distance off a circle about z",

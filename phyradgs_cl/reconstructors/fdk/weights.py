@@ -12,14 +12,14 @@ import numpy as np
 # twice (Wang's sine throughout). Every ray that is not counted evenly with its opposite adds noise and aliasing, so a
 # quarter-pixel offset touches two columns; wider transitions were noisier (up to 15 %) and no freer of artefacts.
 TRANSITION = 1.0
-_SYMMETRIC = 0.01  # pixels of overhang that are no displacement
-_ASIDE = 0.1  # of the fan: a panel that is less off centre was not put there on purpose, and sees the object's both sides
+_SYMMETRIC = 0.01  # overhang in pixels up to which a panel counts as symmetric
+_ASIDE = 0.1  # asymmetry over the fan: a panel with less was not displaced on purpose, and sees both sides of the object
 
-_PART_EDGE_RAD = np.deg2rad(15)  # over which a view beside a gap hands its rays to their opposites
+_PART_EDGE_RAD = np.deg2rad(15)  # angle from a gap over which a view hands its rays to their opposites
 
 
 def turned_back(pose: np.ndarray, angle_rad: np.ndarray) -> np.ndarray:
-    """Poses (F, ..., 12) turned by −angle (F,) about +z: equal for all views of a circular orbit."""
+    """Returns poses (F, ..., 12) rotated by −angle (F,) about +z: equal for all views of a circular orbit."""
     c, s = np.cos(angle_rad), np.sin(angle_rad)
     turn = np.zeros((len(angle_rad), 3, 3))
     turn[:, 0, 0], turn[:, 0, 1], turn[:, 1, 0], turn[:, 1, 1], turn[:, 2, 2] = c, s, -s, c, 1
@@ -27,7 +27,7 @@ def turned_back(pose: np.ndarray, angle_rad: np.ndarray) -> np.ndarray:
 
 
 def pixel_rays(pose: np.ndarray, rows: np.ndarray, columns: np.ndarray, is_parallel: bool = False) -> np.ndarray:
-    """Vectors (..., v, u, 3) mm from source, or the origin in a parallel beam, to pixels of rows (v,) and columns (u,).
+    """Returns vectors (..., v, u, 3) mm from source, or the origin in a parallel beam, to pixels of rows (v,), columns (u,).
 
     pose broadcasts to (..., v, u, 12): one for all pixels (1, 1, 12), one per row (v, 1, 12), one per column (1, u, 12)."""
     corner = pose[..., 3:6] if is_parallel else pose[..., 3:6] - pose[..., 0:3]
@@ -35,11 +35,11 @@ def pixel_rays(pose: np.ndarray, rows: np.ndarray, columns: np.ndarray, is_paral
 
 
 def ray_measure(pose: np.ndarray, rays: np.ndarray, is_parallel: bool = False) -> np.ndarray:
-    """The measure (v, u) of each ray per radian of gantry angle and mm of detector, over the filter's own 1/mm².
+    """Returns the measure (v, u) of each ray per radian of gantry angle and mm of detector, over the filter's own 1/mm².
 
-    |ȧ·n| / D with ȧ the source's motion per radian, n the ray's normal in the plane of ray and detector row, D the
-    distance of the row from the source. For a flat panel facing the source it is DSO / |ray|: FDK's cosine. In a parallel
-    beam it is the sine of the angle between rays and row: 1 for a panel across the rays."""
+    |ȧ·n| / D with ȧ the source's motion per radian, n the ray's normal in the plane of ray and detector row, D the distance
+    of the row from the source. For a flat panel facing the source it is DSO / |ray|: FDK's cosine. In a parallel beam it is
+    the sine of the angle between rays and row: 1 for a panel across the rays."""
     if is_parallel:
         across = np.cross(pose[..., 0:3], pose[..., 6:9]) / np.linalg.norm(pose[..., 6:9], axis=-1, keepdims=True)
         return np.linalg.norm(across, axis=-1)
@@ -53,8 +53,8 @@ def ray_measure(pose: np.ndarray, rays: np.ndarray, is_parallel: bool = False) -
 
 
 def fan_angle(pose: np.ndarray, rays: np.ndarray, is_parallel: bool = False) -> np.ndarray:
-    """Angle (v, u) of each ray about +z from the source's view of the axis, radians, counter-clockwise positive. In a
-    parallel beam: the distance in mm at which it passes the axis, positive on the same side."""
+    """Returns the angle (v, u) of each ray about +z from the source's view of the axis, radians, counter-clockwise positive.
+    In a parallel beam: the distance in mm at which it passes the axis, positive on the same side."""
     if is_parallel:
         along = pose[..., 0:2] / np.linalg.norm(pose[..., 0:2], axis=-1, keepdims=True)
         return along[..., 0] * rays[..., 1] - along[..., 1] * rays[..., 0]
@@ -95,14 +95,15 @@ class Fan:
 
     @property
     def half_rad(self) -> float:
-        """The wider side."""
+        """The fan angle of the wider side."""
         return max(self.high_rad, -self.low_rad)
 
 
 def measured_fan(pose: np.ndarray, shape: tuple[int, int], is_parallel: bool = False) -> Fan:
-    """What views with poses as in ``pixel_rays``, (F, ..., 12), see on a detector of ``shape`` (rows, columns).
+    """Returns the fan that all views with poses as in ``pixel_rays``, (F, ..., 12), see on a detector of ``shape`` (rows,
+    columns).
 
-    ``missing_columns`` would make the detector reach equally far on both sides of the axis."""
+    Its ``missing_columns`` would make the detector reach equally far on both sides of the axis."""
     rows, columns = np.arange(shape[0]), np.arange(shape[1])
     outer = pose[:, :, [0, -1]] if pose.shape[2] > 1 else pose
     ends = np.sort(fan_angle(outer, pixel_rays(outer, rows, columns[[0, -1]], is_parallel), is_parallel), axis=-1)
@@ -120,7 +121,7 @@ def measured_fan(pose: np.ndarray, shape: tuple[int, int], is_parallel: bool = F
 
 
 def displaced_weight(angle_rad: np.ndarray, fan: Fan) -> np.ndarray:
-    """1 ± sin over what the fan sees on both sides of the axis, 0 and 2 beyond; angle_rad of any shape.
+    """Returns 1 ± sin over what the fan sees on both sides of the axis, 0 and 2 beyond; angle_rad of any shape.
 
     Where the axis itself is not seen every ray is measured once, and counts 2. Where it falls into the panel's outermost
     pixel there is no room for a transition: a pixel counts by the part of its width on the axis' long side."""
@@ -136,7 +137,7 @@ def displaced_weight(angle_rad: np.ndarray, fan: Fan) -> np.ndarray:
 
 
 def short_scan_weight(progress_rad: float, angle_rad: np.ndarray, coverage_rad: float) -> np.ndarray:
-    """Parker's weight of rays at fan angles of any shape, for a view ``progress_rad`` into an arc.
+    """Returns Parker's weight of rays at fan angles of any shape, for a view ``progress_rad`` into an arc.
 
     Rays without an opposite in the arc count 2. Under half a turn there is no opposite at all."""
     margin = (coverage_rad - np.pi) / 2
@@ -147,10 +148,10 @@ def short_scan_weight(progress_rad: float, angle_rad: np.ndarray, coverage_rad: 
 
 
 def parted_weight(progress_rad: float, angle_rad: np.ndarray, parts_rad: np.ndarray) -> np.ndarray:
-    """The weight of rays at fan angles of any shape, for a view ``progress_rad`` into an arc of parts (P, 2).
+    """Returns the weight of rays at fan angles of any shape, for a view ``progress_rad`` into an arc of parts (P, 2).
 
-    A ray and its opposite share 2 by how deep in their parts their views are; a ray without an opposite counts 2. After
-    F. Noo et al., Phys. Med. Biol. 47 (2002) 2525."""
+    A ray and its opposite share 2 by how deep in their parts their views are; a ray without an opposite counts 2. After F.
+    Noo et al., Phys. Med. Biol. 47 (2002) 2525."""
     here = max(float(_depth(np.array(progress_rad), parts_rad)), 1e-6)
     there = _depth(np.mod(progress_rad + np.pi + 2 * angle_rad, 2 * np.pi), parts_rad)
     weight: np.ndarray = 2 * here / (here + there)
@@ -158,7 +159,7 @@ def parted_weight(progress_rad: float, angle_rad: np.ndarray, parts_rad: np.ndar
 
 
 def _depth(at_rad: np.ndarray, parts_rad: np.ndarray) -> np.ndarray:
-    """sin² from 0 at the ends of parts (P, 2) to 1 inside, at angles (...)."""
+    """Returns a smooth weight (sin²) at angles (...), from 0 at the ends of parts (P, 2) to 1 inside; 0 outside."""
     begin, end = parts_rad.T
     from_end = np.minimum(at_rad[..., None] - begin, end - at_rad[..., None])
     deep: np.ndarray = _eased(from_end, np.minimum(_PART_EDGE_RAD, (end - begin) / 2) / 2).max(-1)
@@ -166,6 +167,6 @@ def _depth(at_rad: np.ndarray, parts_rad: np.ndarray) -> np.ndarray:
 
 
 def _eased(distance_rad: float | np.ndarray, half_width_rad: np.ndarray) -> np.ndarray:
-    """sin² from 0 at the end of the arc to 1 at twice the half width from it."""
+    """Returns a smooth weight (sin²), from 0 at the end of the arc to 1 at a distance of 2 · ``half_width_rad`` from it."""
     share = np.clip(distance_rad / (2 * np.maximum(half_width_rad, 1e-12)), 0, 1)
     return np.sin(np.pi / 2 * share) ** 2

@@ -15,19 +15,19 @@ from phyradgs_cl.acquisition.altered.variants import altered_trajectory, shifted
 from phyradgs_cl.reconstructors.fits.residuals import fit_squares, vertex
 from phyradgs_cl.runtime import Runtime
 
-_ROUGH_SHIFTS = (-2.0, -1.0, 0.0, 1.0, 2.0)  # coarse pixels
+_ROUGH_SHIFTS = (-2.0, -1.0, 0.0, 1.0, 2.0)  # first trial shifts, in coarse pixels
 _ROUGH_ITERATIONS = 8
-_STEP = 0.25  # coarse pixels
-_MOST_STEPS = 8
+_STEP = 0.25  # distance between neighbouring trial shifts around the best, in coarse pixels
+_MOST_STEPS = 8  # moves to a better centre of three trial shifts, at most
 ANYWHERE = (-math.inf, math.inf)
-_MOST_VIEWS, _MOST_ROWS = 60, 64
-_BEYOND = 1.5  # steps between views, by which the opposite of a view may lie outside the scan
-_WIDEST_STEP_RAD = math.radians(10.0)  # between views that are interpolated
-_SMOOTHING_PX = 1.0  # interpolation lowers noise between pixels, which would draw the shift there
+_MOST_VIEWS, _MOST_ROWS = 60, 64  # views, and rows, that are compared, at most
+_BEYOND = 1.5  # steps between views by which the opposite of a view may lie outside the scan
+_WIDEST_STEP_RAD = math.radians(10.0)  # largest angle between two views that are interpolated
+_SMOOTHING_PX = 1.0  # σ of a smoothing of rows: interpolation lowers noise between pixels, which would draw the shift there
 _CORRELATED_PX = 2 * math.sqrt(math.pi) * _SMOOTHING_PX  # columns of smoothed noise per independent one
-_LEAST_OVERLAP, _LEAST_ENERGY = 0.25, 0.2  # of the columns, of the largest energy of an overlap
-_STEPS, _SETTLED_PX = 12, 1e-3
-_BIAS_PX = 0.02  # of views that are interpolated between their neighbours
+_LEAST_OVERLAP, _LEAST_ENERGY = 0.25, 0.2  # least overlap over the columns; least energy of an overlap over the largest
+_STEPS, _SETTLED_PX = 12, 1e-3  # Gauss–Newton steps, at most; a shorter step ends them
+_BIAS_PX = 0.02  # error of a shift because views are interpolated between their neighbours
 
 
 @dataclass(frozen=True, eq=False)
@@ -178,7 +178,7 @@ def _opposite(away: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
 
 
 def _few_rows(scan: Scan, frame: int) -> np.ndarray:
-    """Returns a frame smoothed along its rows, of means of blocks of rows, float64; masked pixels are interpolated."""
+    """Returns a frame as means over blocks of rows, smoothed along the rows, float64; masked pixels are interpolated."""
     image = np.asarray(scan.projections[frame], np.float64)
     if scan.pixel_mask is not None:
         columns = np.arange(image.shape[1])
@@ -192,8 +192,8 @@ def _few_rows(scan: Scan, frame: int) -> np.ndarray:
 
 
 def _rough_shift(pairs: list[_Pair]) -> float:
-    """Returns the shift, in half columns, under which the squared difference of the overlap is the smallest part of its
-    energy."""
+    """Returns the shift, in steps of half a column, for which the squared difference of the overlap is the smallest part of
+    its energy."""
     columns = pairs[0].view.shape[1]
     # a shift moves the view and the mirror image against each other, by twice its size
     lags = np.arange(1 - columns, columns)  # column of the mirror image less that of the view
@@ -227,7 +227,7 @@ def _refined_shift(pair: _Pair, shift_px: float) -> tuple[float, float]:
         if middle.size < _LEAST_OVERLAP * columns.size:
             return math.nan, 0.0
         difference = view(middle - half_lag) - mirrored(middle + half_lag)
-        # the derivative of the difference by the shift, which moves the two against each other
+        # d(difference)/d(shift): a shift moves the two against each other
         slope = -view(middle - half_lag, 1) - mirrored(middle + half_lag, 1)
         squares = float((slope**2).sum())
         step = -float((difference * slope).sum()) / max(squares, 1e-30)

@@ -14,10 +14,10 @@ from phyradgs_cl.reconstructors.voxels.cgls import Cgls
 from phyradgs_cl.reconstructors.voxels.system import System
 from phyradgs_cl.runtime import Runtime
 
-_FREEDOM = 0.3  # scale of patterns and levels relative to the volume's: without it they take motion for noise
+_FREEDOM = 0.3  # strength of patterns and levels over the volume's: with equal strength they would explain motion as noise
 _ITERATIONS = 20
-_MOST_TIMES = 12  # per exposure
-_DRAWS = 200
+_MOST_TIMES = 12  # times per exposure, at most
+_DRAWS = 200  # resamplings of the bootstrap
 _TINY = 1e-30
 
 
@@ -32,7 +32,8 @@ class FlatErrors:
 
     @classmethod
     def beside(cls, operator: LinearOperator) -> "FlatErrors":
-        """Scales the unknowns to the strength of ``operator``."""
+        """Returns the unknowns for the frames of ``operator``, in units that make them ``_FREEDOM`` times as strong as its
+        volume."""
         frames, rows, columns = shape = operator.frames_shape
         back = operator.adjoint(np.ones(shape, np.float32))
         strength = _FREEDOM * float(np.linalg.norm(back)) / math.sqrt(frames * rows * columns)
@@ -82,8 +83,8 @@ class ViewParameters:
 
 @dataclass(frozen=True, eq=False)
 class AugmentedOperator:
-    """A x + B b of one vector (x, b): a volume and other unknowns. B is scaled to about the strength of A, because CGLS
-    moves all unknowns together."""
+    """A x + B b of one vector (x, b): a volume and other unknowns. B has about the norm of A, because CGLS moves all
+    unknowns together."""
 
     operator: LinearOperator
     extra: FlatErrors | ViewParameters

@@ -15,14 +15,15 @@ from phyradgs_cl.prepare.step import fill_masked
 from phyradgs_cl.reconstructors.fdk.weights import fan_angle, pixel_rays
 from phyradgs_cl.reconstructors.fits.axis import AxisShift
 
-_SMOOTHING_PX = 1.0  # interpolation lowers noise between pixels, which would draw the shift there
-_COARSE_COLUMNS = 128
-_MOST_PX, _STEP_PX, _NEAR_PX = 16.0, 0.5, 2.0  # coarse pixels to either side; then about the best of them
-_FEWEST_VIEWS, _MOST_VIEWS, _WIDEST_STEP_RAD = 24, 360, math.radians(10.0)
-_MOST_ROWS, _MOST_PAIRS = 32, 48
-_LEAST_PX = 1.0  # from the axis to the middle of the panel's outer column
-_BLOCKS = 12  # of views, of the jackknife
-_BIAS_PX = 0.05  # measured errors of half-fans without noise, with features of two pixels
+_SMOOTHING_PX = 1.0  # σ of a smoothing of rows: interpolation lowers noise between pixels, which would draw the shift there
+_COARSE_COLUMNS = 128  # columns of the coarse frames, at most
+# trial shifts to either side, and their step; then about the best of them, in coarse pixels
+_MOST_PX, _STEP_PX, _NEAR_PX = 16.0, 0.5, 2.0
+_FEWEST_VIEWS, _MOST_VIEWS, _WIDEST_STEP_RAD = 24, 360, math.radians(10.0)  # views of a scan, views compared, step of views
+_MOST_ROWS, _MOST_PAIRS = 32, 48  # rows, and pairs of opposite rays in a row, that are compared
+_LEAST_PX = 1.0  # least distance from the axis to the middle of the panel's outer column
+_BLOCKS = 12  # blocks of views of the jackknife
+_BIAS_PX = 0.05  # error of the shift beside noise, measured with half-fans and features of two pixels
 _NONE = AxisShift(math.nan, math.nan, np.empty(0))
 
 
@@ -94,8 +95,8 @@ def _best(scan: Scan, turned: np.ndarray, frames: np.ndarray, pose: np.ndarray, 
 
 
 def _mean_squares(turned: np.ndarray, frames: np.ndarray, fan: np.ndarray, is_parallel: bool) -> np.ndarray | None:
-    """Returns the mean squares (F,) of rays less their opposites, of columns at fan angles (columns,); None where the axis
-    is not seen."""
+    """Returns the mean squares (F,) of rays less their opposites; fan (columns,): the fan angles of the columns. None where
+    the axis is not seen."""
     columns = np.arange(fan.size)
     if fan[-1] < fan[0]:
         fan, columns = fan[::-1], columns[::-1]

@@ -23,12 +23,12 @@ from phyradgs_cl.reconstructors.moving.signal import Bending, TemporalSplines
 from phyradgs_cl.runtime import Runtime
 
 _CG_STEPS = 8
-_DAMPING = 1e-3  # of the mean squared response of a control vector's component
-_ROUGHNESS = 1e-2  # of the same of a temporal coefficient
-_SHORTER = (1.0, 0.5, 0.25)
-_LEAST_DETERMINANT = 0.1
-_LEAST_VOXELS = 1.0  # by which states differ at least for a unit of weight
-_SUPPORT = 4  # intervals of a temporal spline
+_DAMPING = 1e-3  # damping, over the mean diagonal of JᵀJ
+_ROUGHNESS = 1e-2  # β, over the mean diagonal of JᵀJ of temporal coefficients
+_SHORTER = (1.0, 0.5, 0.25)  # shares of a step that are tried in turn
+_LEAST_DETERMINANT = 0.1  # least determinant of I + ∂w/∂y after a step: at 0 matter folds
+_LEAST_VOXELS = 1.0  # displacement per unit of weight that is added to the distances between states
+_SUPPORT = 4  # intervals in which a temporal spline differs from 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,7 +63,7 @@ class MotionField:
         return replace(self, control_mm=control_mm, temporal=self.temporal / factor)
 
     def refined(self, scan: Scan, spacing_mm: float) -> "MotionField":
-        """Returns the field on control points that are closer to each other: those that follow its values best."""
+        """Returns the field on control points ``spacing_mm`` apart, closer than before, which follow its values best."""
         coarse = self.deformation()
         units_mm = np.stack([coarse.on_grid_mm(scan.grid, unit) for unit in np.eye(coarse.rank)])
         control_mm, origin_mm = fitted_control_mm(units_mm, scan.grid, spacing_mm)
@@ -94,7 +94,8 @@ class FieldProblem:
     def operator(
         self, one: MotionField, tables: list[TimeCells] | None = None, warp: VolumeWarp | StateStack | None = None
     ) -> WarpedOperator:
-        """Returns the projector of a field; of other ``tables`` of the same times with its ``warp``."""
+        """Returns the projector of a field. With ``warp`` of an earlier call, ``tables`` may differ from the scan's, at the
+        same times."""
         if warp is None:
             states = MotionStates.of_times(one.deformation(), self.scan.grid, self.times_s, _LEAST_VOXELS)
             warp = VolumeWarp(self.rt, states)

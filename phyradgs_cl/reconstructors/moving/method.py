@@ -41,16 +41,21 @@ from phyradgs_cl.reconstructors.voxels.run import MethodRun
 from phyradgs_cl.reconstructors.voxels.stages import Stage, Stages
 from phyradgs_cl.runtime import Runtime
 
-_MOST_COLUMNS, _MOST_VOXELS, _MOST_FRAMES = 64, 32, 600  # of the coarse scan; more frames where a signal has more knots
-_TIMES_PER_PERIOD, _MOST_TIMES = 12, 6  # at which exposures see the object at least; but of one exposure
-_FIRST_PASSES, _PASSES = 8, 3  # of fista, at rest and in a round
-_WEIGHT, _TV_ITERATIONS = 0.42, 5  # of these passes
-_COARSE_SPACINGS, _FINE_SPACINGS = 2, 4  # of control points along the box's longest side
-_FINE_BENDING = (_FINE_SPACINGS / _COARSE_SPACINGS) ** 4  # times as stiff in terms of coefficients is as stiff in mm
-_COARSE_SHARE = 0.6  # of the rounds
-_FREE_KNOTS = 6
+# largest coarse scan: columns or rows, voxels along a side, frames (more where a signal has more knots)
+_MOST_COLUMNS, _MOST_VOXELS, _MOST_FRAMES = 64, 32, 600
+# times per period at which exposures see the object, at least; times of one exposure, at most
+_TIMES_PER_PERIOD, _MOST_TIMES = 12, 6
+_FIRST_PASSES, _PASSES = 8, 3  # passes of fista: the first ones, at rest, and those of a round
+_WEIGHT, _TV_ITERATIONS = 0.42, 5  # prior weight and TV iterations of these passes
+# spacings of control points along the box's longest side, in the first rounds and in the last
+_COARSE_SPACINGS, _FINE_SPACINGS = 2, 4
+# factor of γ for finer control points: the field then is as stiff in mm as before
+_FINE_BENDING = (_FINE_SPACINGS / _COARSE_SPACINGS) ** 4
+_COARSE_SHARE = 0.6  # share of the rounds with coarse control points
+_FREE_KNOTS = 6  # intervals of the splines where no signal has knots
 _AT_REST = "no motion found"
-_ITERATIONS_PER_ROUND = 6  # 7 rounds of the search come before the 35 passes that are the default of fista
+# iterations per round of the search: 7 rounds come before the 35 passes that are the default of fista
+_ITERATIONS_PER_ROUND = 6
 _STORED = ("field_control", "field_place", "field_times", "field_weights", "field_gain")
 
 
@@ -96,7 +101,7 @@ class FieldSearch:
 
     @property
     def finished(self) -> str | None:
-        """The first rounds of an object at rest find no step that lowers the residual."""
+        """An object is at rest where the first two rounds found no step of the field that lowers the residual."""
         return _AT_REST if self.iteration >= 2 and not self.field.control_mm.any() else None
 
     def step(self) -> None:
@@ -173,7 +178,7 @@ class FieldSearch:
 
 
 def _with_times(motion: Motion, scan: Scan, period_s: float | None) -> Motion:
-    """Returns the model with as many times as gantry and period need: the object's speed is not known yet."""
+    """Returns the model with as many times as gantry and period need; the object's speed is not known yet."""
     timed = with_times(motion, scan)
     if motion != PerRow() or not isinstance(timed, PerRow) or period_s is None:
         return timed
@@ -192,7 +197,7 @@ def _difference(one: MotionField, other: MotionField) -> float:
 
 @dataclass(frozen=True)
 class MovingOptions(FistaOptions):
-    """iterations: rounds of the search for the field, a sixth of them, and passes of ``fista`` after it. bending: stiffness
+    """iterations: a sixth are rounds of the search for the field, the rest passes of ``fista`` after it. bending: stiffness
     of the field, relative to how strongly frames respond to it. gating: what the motion follows at first: ``auto`` (the
     signal of the frames, where it repeats), ``free`` (any smooth curve in time), ``scan`` (the signal or phase that the scan
     states), or a file, NAME.csv (``load_gating``). The other options are those of ``fista``."""
@@ -231,7 +236,7 @@ class _Field:
 
     @property
     def for_passes(self) -> Deformation | None:
-        """None where nothing moves."""
+        """The deformation, or None where nothing moves."""
         return None if self.deformation is None or self.deformation.is_still else self.deformation
 
     def take(self, search: Any) -> None:
@@ -297,7 +302,7 @@ def _with_field_in_progress(one: _Field, progress: Progress) -> Progress:
 
 
 def _motion_facts(one: _Field, signal: MotionSignal, scan: Scan) -> dict[str, object]:
-    """Returns what was found, for the result: displacements relative to the mean place of matter in the scan."""
+    """Returns what was found, for the result's facts: displacements relative to the mean place of matter in the scan."""
     moves = one.for_passes is not None
     follows = signal.knot_s is not None
     facts: dict[str, object] = {"moves": moves, "follows": follows, "period_s": signal.period_s, "gain": one.gain}

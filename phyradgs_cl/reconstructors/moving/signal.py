@@ -16,17 +16,17 @@ from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Gating
 
-_NODES = 4  # times per knot between which the weights of a deformation are straight
-_STRETCH = 0.02  # of first differences in the bending energy: a field that is linear in air stays small there
-_HARMONICS = 6  # of the gantry's angle, which the object at rest explains
-_FEWEST_CYCLES = 5  # in the scan: slower motion is taken as free in time
-_BAND = 0.25  # on either side of the most frequent rate: breaths differ in length
-_PERIODIC_SHARE = 0.5  # of the power in that band, beyond what white noise has there
-_FEWEST_FRAMES = 16
-_FEWEST = 4  # values
-_KNOTS_PER_PERIOD = 6
-_SLOWER = 0.95  # of the power of a stated signal that does not repeat: knots follow what is slower than the rest
-_MOST_EVEN = 100_000  # times
+_NODES = 4  # times per interval of knots at which weights are stored; between them they are linear
+_STRETCH = 0.02  # weight of first differences in the bending energy: a field that is linear in air stays small there
+_HARMONICS = 6  # harmonics of the gantry's angle, which an object at rest explains
+_FEWEST_CYCLES = 5  # cycles in the scan, at least: slower motion is taken as free in time
+_BAND = 0.25  # half width of the band about the dominant rate, over that rate: breaths differ in length
+_PERIODIC_SHARE = 0.5  # least share of the power in that band, beyond what white noise has there, of a signal that repeats
+_FEWEST_FRAMES = 16  # frames of a scan in which a period is sought
+_FEWEST = 4  # values in a file, at least
+_KNOTS_PER_PERIOD = 6  # knots of the weights that follow a signal
+_SLOWER = 0.95  # share of the power below the rate that knots follow, of a stated signal that does not repeat
+_MOST_EVEN = 100_000  # evenly spaced times, at most
 _FORMS = f"at least {_FEWEST} lines: time in s, value; or one value for each frame"
 
 
@@ -63,7 +63,7 @@ class TemporalSplines:
         return BSpline(knots_s, np.eye(self.count), 3)(np.clip(times_s, self.first_s, self.last_s))
 
     def fit(self, times_s: np.ndarray, values: np.ndarray) -> np.ndarray:
-        """Returns coefficients (count, R) whose splines follow values (n, R) at times (n,), straight between them."""
+        """Returns coefficients (count, R) whose splines follow values (n, R) at times (n,), linear between them."""
         nodes_s = self.node_times_s
         wanted = np.stack([np.interp(nodes_s, times_s, column) for column in values.T], -1)
         return np.asarray(np.linalg.lstsq(self.at(nodes_s), wanted, rcond=None)[0])
@@ -105,10 +105,10 @@ def _apply(matrix: np.ndarray, control: np.ndarray, axis: int) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class MotionSignal:
-    """How the object's motion goes on in time. times_s (F,): the middles of the frames, rising. values (F,): mean 0, largest
-    size 1, without a unit or a sign. period_s: mean length of a cycle, or None where no cycle repeats. later (F,): the
-    quadrature, a quarter of a cycle later; None derives it from ``values``. knot_s: between two knots of weights that follow
-    the signal; None: weights need not follow it."""
+    """The course of the object's motion in time. times_s (F,): the middles of the frames, rising. values (F,): mean 0,
+    largest size 1, without a unit or a sign. period_s: mean length of a cycle, or None where no cycle repeats. later (F,):
+    the quadrature, a quarter of a cycle later; None derives it from ``values``. knot_s: time between two knots of weights
+    that follow the signal; None: weights need not follow it."""
 
     times_s: np.ndarray
     values: np.ndarray
@@ -168,7 +168,7 @@ def _spectrum(times_s: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, floa
 
 
 def _evenly(times_s: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Returns times at the median step of ``times_s`` (n,), and the values at them, straight between two of ``values``."""
+    """Returns times at the median step of ``times_s`` (n,), and the values at them, linear between two of ``values``."""
     length_s = float(times_s[-1] - times_s[0])
     step_s = max(float(np.median(np.diff(times_s))) if len(times_s) > 1 else 0.0, length_s / _MOST_EVEN)
     even_s = times_s[0] + step_s * np.arange(round(length_s / step_s) + 1 if step_s > 0 else 1)
@@ -176,19 +176,19 @@ def _evenly(times_s: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.nda
 
 
 def _shroud(scan: Scan) -> np.ndarray:
-    """Returns the mean of the valid pixels (F, rows) of every detector row."""
+    """Returns the means (F, rows) over the valid pixels of every detector row."""
     valid = np.broadcast_to(scan.valid, scan.projections.shape)
     return np.asarray((scan.projections * valid).sum(2, dtype=np.float64) / np.maximum(valid.sum(2), 1))
 
 
 def _gantry(scan: Scan, times_s: np.ndarray, order: np.ndarray) -> np.ndarray:
-    """Returns what an object at rest, or a slow drift, puts into a row (F, n): harmonics of the angle, and a line."""
+    """Returns the terms (F, n) that rest and slow drift put into a row: a constant, a line, harmonics of the angle."""
     poses = np.stack([scan.trajectory.pose(int(f), np.array([t]))[0] for f, t in zip(order, times_s, strict=True)])
     towards = poses[:, :3] - (0.0 if scan.is_parallel else np.array(scan.grid.offset_mm[::-1]))
     angle_rad = np.arctan2(towards[:, 1], towards[:, 0])
     harmonics = [wave(k * angle_rad) for k in range(1, _HARMONICS + 1) for wave in (np.cos, np.sin)]
     drift = (times_s - times_s[0]) / max(times_s[-1] - times_s[0], 1e-300)
-    most = max(1, len(times_s) // 4)  # of few frames they would explain everything
+    most = max(1, len(times_s) // 4)  # so many terms at most: more would explain all of few frames
     return np.stack([np.ones(len(times_s)), drift, *harmonics][:most], -1)
 
 

@@ -15,7 +15,7 @@ from phyradgs_cl.reconstructors.splats.options import SplatOptions
 from phyradgs_cl.runtime import DeviceArray, Runtime
 from phyradgs_cl.runtime.layout import pad_rows
 
-_PEAK_PERCENTILE = 99.9  # of line integrals; the maximum would be noise
+_PEAK_PERCENTILE = 99.9  # percentile of line integrals that counts as their peak; the maximum would be noise
 
 
 @dataclass(frozen=True)
@@ -120,7 +120,7 @@ def tables_of(
             needed = segments_for_object(deformation, start_s + lit_s, voxel_mm)
             if needed > tables[frame].count:
                 tables[frame] = replace(motion, segments=needed).cells(scan, frame)
-    # both models agree on a single value
+    # with a single value the log and the intensity model agree
     return tables, model == "intensity" and any(table.averages for table in tables)
 
 

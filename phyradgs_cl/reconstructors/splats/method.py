@@ -33,7 +33,7 @@ from phyradgs_cl.reconstructors.splats.start import box_of, first_population, in
 from phyradgs_cl.reconstructors.splats.step import Batch, FrameStep, sharing_of
 from phyradgs_cl.runtime import Runtime
 
-REPORT_EVERY, LEAST_RECORDED = 50, 20
+REPORT_EVERY, LEAST_RECORDED = 50, 20  # iterations between reports, and lines of a short run's record
 
 
 class SplatRun:
@@ -180,7 +180,7 @@ def reconstruct_splats(
         "ranks": rt.ranks.size,
     }  # fmt: skip
     if isinstance(options.motion, Exact):
-        # a frame's largest K
+        # segments: the largest number K of a frame
         facts |= {"segments": run.frames.most_cells, "motion_phases": run.phases()}
     cloud = cloud.scaled(scale.length_mm, scale.density_per_mm)
     return Reconstruction(volume, scan.grid, cloud, loop.record, facts, loop.state_if_interrupted())

@@ -13,7 +13,8 @@ from phyradgs_cl.operators import DEFAULT_CUTOFF_SIGMA
 from phyradgs_cl.optim import PUBLISHED_RATES, DensityControl, Rates
 from phyradgs_cl.text import repr_of_changes
 
-_STATIC_SHARE, _COARSE_ERROR = 0.4, 0.1  # of the coarse iterations, and their time error (docs/results/motion_models.md)
+# share of the coarse iterations with one pose per frame; time error of the rest (docs/results/motion_models.md)
+_STATIC_SHARE, _COARSE_ERROR = 0.4, 0.1
 
 
 @dataclass(frozen=True, repr=False)
@@ -83,7 +84,7 @@ class SplatOptions:
         return Static() if is_first else Exact(1, max(_COARSE_ERROR, self.motion.time_error))
 
     def batch_for(self, frames: int, ranks: int) -> int:
-        """Returns the frames per step: the option, or one for every rank."""
+        """Returns the frames per step: the option, or one for every rank. Raises InputError for more than the scan has."""
         if self.batch > frames:
             raise InputError("--batch", str(self.batch), f"no more than the scan's {frames} frames")
         return self.batch or min(ranks, frames)

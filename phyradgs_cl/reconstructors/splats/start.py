@@ -12,11 +12,12 @@ from phyradgs_cl.reconstructors.splats.device import Scale
 from phyradgs_cl.reconstructors.splats.options import SplatOptions
 
 log = logging.getLogger(__name__)
-_REFERENCE_PERCENTILE = 99.9
+_REFERENCE_PERCENTILE = 99.9  # percentile of the first volume: the unit of density
 
 
 def internal_scale(fdk: np.ndarray, grid: Grid) -> Scale:
-    """Returns half the longest side, and a high percentile of a first volume (1 where that is not positive)."""
+    """Returns half the longest side, and a high percentile of a first volume (1 over that side where it is not positive).
+    Raises NumericalError where the volume is not finite."""
     reference = float(np.percentile(fdk, _REFERENCE_PERCENTILE))
     if not np.isfinite(reference):
         raise NumericalError("projections", "values that overflow in FDK", "line integrals of order 1")

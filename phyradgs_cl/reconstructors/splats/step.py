@@ -21,7 +21,7 @@ from phyradgs_cl.reconstructors.splats.options import SplatOptions
 from phyradgs_cl.runtime import DeviceArray, Runtime
 
 _ROWS, _STATISTICS = 11, 2
-_DERIVED = 13  # with the centre on the detector, for density control
+_DERIVED = 13  # rows of gradients, with dL/d(centre on the detector) for density control
 Corner = tuple[int, int, int]
 """First voxel (z, y, x) of the sub-volume of the total variation."""
 
@@ -122,7 +122,7 @@ class SharedFrames(Alone):
             self._losses[place] = step.loss.value()
             own.append(np.concatenate([rt.download(cloud.gradients)[:_ROWS], rt.download(statistics)]))
         total = exact_sum(self.ranks, own, (_ROWS + _STATISTICS, stride), count)
-        # the gradients by the centre on the panel are in the statistics already
+        # dL/d(centre on the panel) is in the statistics already
         rt.write(cloud.gradients, np.pad(total[:_ROWS], ((0, _DERIVED - _ROWS), (0, 0))))
         rt.write(cloud.statistics, rt.download(cloud.statistics) + total[_ROWS:])
 

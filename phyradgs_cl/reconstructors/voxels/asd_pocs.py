@@ -32,7 +32,7 @@ class AsdPocsOptions(SartOptions):
 
 
 class AsdPocs(Algorithm):
-    """The residual is that of the volume between the SART pass and the TV steps."""
+    """ASD-POCS, whose residual is that of the volume between the SART pass and the TV steps."""
 
     def __init__(self, system: System, options: AsdPocsOptions, descend: TvDescent, epsilon: float) -> None:
         super().__init__(system)
@@ -78,5 +78,5 @@ def _started(system: System, options: AsdPocsOptions, run: MethodRun) -> AsdPocs
 
 METHOD = voxel_method(
     "asd-pocs", AsdPocsOptions(), _started, frames=2,
-    volumes=lambda scan, options: held_volumes(scan, options) + 4,  # of the steps
+    volumes=lambda scan, options: held_volumes(scan, options) + 4,  # 4: for the balance of the steps
 )

@@ -37,14 +37,15 @@ from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.runtime.algebra import HostSpace
 
 log = logging.getLogger(__name__)
-_VOLUMES, _FRAMES = 16, 3  # in memory at one time, with the prior `dct`
+_VOLUMES, _FRAMES = 16, 3  # volumes, and stacks of frames, in memory at one time, with the prior `dct`
 _HELD, _COPIES = 9, 2  # volumes that ``dct`` holds on the device, and more while a prior maps a volume of the host
-# of the passes before those on smaller voxels; measured in docs/results/settings.md
+# settings of the passes before those on smaller voxels, measured in docs/results/settings.md
 _COARSE_PASSES = 0.6  # share of all passes
 _COARSE_SUBSETS = 1.6  # times the option ``subsets``
 _COARSE_TIMES = 1 / 3  # share of the times in an exposure, but two at least
-_FAINTEST = 1e-6  # of the largest row sum of AᵀA: voxels with less have no part in its bound
-_MOST_DIVIDED = 90**2  # voxels of a slice: smaller ones are worth their time at 64³, not at 128³; of every slab alike
+_FAINTEST = 1e-6  # row sums of AᵀA below this share of the largest count as that large in the bound
+# largest slice, in voxels, whose smaller voxels are worth their time: at 64³, not at 128³; of every slab alike
+_MOST_DIVIDED = 90**2
 
 
 @dataclass(frozen=True)
@@ -133,13 +134,13 @@ def _row_sums(system: System) -> Any:
 
 
 def _curvature(system: System) -> float:
-    """Bounds the norm of AᵀA, which has no negative entry, by its largest row sum."""
+    """Returns the largest row sum of AᵀA, a bound of its norm, because no entry is negative."""
     return system.space.largest(_row_sums(system))
 
 
 def _tight_curvature(system: System) -> float:
-    """Bounds the norm of AᵀA, at the price of another pass, by the largest (AᵀA x)/x of an x > 0 (Collatz and Wielandt). Row
-    sums as x make the bound a sixth smaller."""
+    """Returns a bound of the norm of AᵀA, at the price of another pass: the largest (AᵀA x)/x of an x > 0 (Collatz and
+    Wielandt). Row sums as x make the bound a sixth smaller."""
     sums, space = _row_sums(system), system.space
     again = system.adjoint(system.apply_weights(system.forward(sums)))
     bound = space.largest(space.multiply(again, space.reciprocal(sums, _FAINTEST)))
@@ -147,7 +148,7 @@ def _tight_curvature(system: System) -> float:
 
 
 class Fista(Accelerated):
-    """The residual of a pass is that of all subsets, each at the extrapolated point of its step."""
+    """FISTA with subsets. The residual of a pass is that of all subsets, each at the extrapolated point of its step."""
 
     def __init__(
         self, system: System, prior: Prior, weight: PriorWeight, *, subsets: int, nonnegative: bool,
@@ -250,7 +251,8 @@ def fista_passes(
 
 
 def _gains_from_subvoxels(run: MethodRun, parts: int) -> bool:
-    """Whether the grid is small enough for smaller voxels, and every rank's device holds the method's volumes of them."""
+    """Returns whether the grid is small enough for smaller voxels, and every rank's device holds the method's volumes of
+    them."""
     shape, rt = run.scan.grid.shape, run.rt
     if math.prod(shape[1:]) > _MOST_DIVIDED:
         return False

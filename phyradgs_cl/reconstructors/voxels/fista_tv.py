@@ -27,7 +27,7 @@ class FistaTvOptions(IterativeOptions):
 
 
 class FistaTv(Accelerated):
-    """The residual is that of the new volume. A is linear, so A y follows from A xₖ and A xₖ₋₁ without a projection.
+    """FISTA with TV; the residual is that of the new volume. A is linear: A y follows from A xₖ and A xₖ₋₁.
 
     The intensity model replaces A x by I(x) and Aᵀ by Jᵀ at x. I is not linear along the momentum's line; that error
     vanishes with the steps."""

@@ -27,15 +27,17 @@ from phyradgs_cl.reconstructors.voxels.system import System
 from phyradgs_cl.runtime import Runtime, Space
 
 _SPREAD = 2.83  # an exposure's length in standard deviations of its five times, which reach from its start to its end
-_EDGES = 0.09  # of a voxel's side: the error of a ray's length at edges
-_LEAST = 1e-4  # of the largest value of Aᵀp: the weight of frames without noise
-# shares of the prior's weight, by the prior (docs/results/settings.md)
+_EDGES = 0.09  # error of a ray's length at edges, over a voxel's side
+_LEAST = 1e-4  # weight for frames without noise, over the largest value of Aᵀp
+# factors of the prior's weight for its maps, by the prior (docs/results/settings.md)
 _TV_ALONE, _TV_BEFORE_DCT, _DCT = 1.6, 0.8, 1.5
-_TV_AT_REST, _DCT_AT_REST = 0.5, 1.35  # before ridge, of scans that stop for each projection
-_RIDGE_NOISE, _RIDGE_LENGTH, _RIDGE_EVERY = 17.0, 0.5, 4  # noise that the step assumes, its length, and maps for each step
-_RIDGE_NOISE_AT_REST = 20.0
-_USUAL_NOISE, _LEAST_NOISE = 0.01, 0.001  # of line integrals: where the numbers at rest hold, and the least that they follow
-_LEAST_NOISE_SHARE = 0.1  # for the ridge step of scans without noise
+_TV_AT_REST, _DCT_AT_REST = 0.5, 1.35  # the same before ridge, for scans that stop for each projection
+# noise that a step assumes, over the prior's weight; its length; maps for each step
+_RIDGE_NOISE, _RIDGE_LENGTH, _RIDGE_EVERY = 17.0, 0.5, 4
+_RIDGE_NOISE_AT_REST = 20.0  # the noise for scans that stop
+# noise of line integrals for which the numbers of scans that stop hold, and the least that they follow
+_USUAL_NOISE, _LEAST_NOISE = 0.01, 0.001
+_LEAST_NOISE_SHARE = 0.1  # least noise share in ridge steps, for scans without noise
 _SUBVOXELS, _SUBVOXELS_WITH_RIDGE = 2 / 3, 0.85  # share of the smaller voxels in the result
 
 
@@ -57,7 +59,7 @@ def frame_error(scan: Scan, motion: Motion) -> FrameError:
 
 
 def _blur_mm(scan: Scan, motion: Motion) -> float:
-    """Length of a line's motion blur half-way between the volume's centre and its side."""
+    """Returns the length in mm of a line's motion blur half-way between the volume's centre and its side."""
     cells = motion.cells(scan, scan.frames // 2).still()
     line = cells.lines // 2
     serving = [c for c, lines in enumerate(cells.ranges) if lines.start <= line < lines.stop]
@@ -103,7 +105,7 @@ class PriorWeight:
 
 
 def _density(space: Space[Any], volume: Any) -> float:
-    """Mean of a volume's values weighted by their squares, in 1/mm: Σ x³ / Σ x², which air does not change."""
+    """Returns the mean of a volume's values weighted by their squares, in 1/mm: Σ x³ / Σ x², which air does not change."""
     squares = space.inner(volume, volume)
     return max(space.inner(space.multiply(volume, volume), volume) / squares, 0.0) if squares > 0 else 0.0
 
@@ -112,7 +114,7 @@ def _density(space: Space[Any], volume: Any) -> float:
 class PriorInputs:
     """The arguments of a prior: device, grid, and for piccs its image (nz, ny, nx) in 1/mm and the weight of the change.
 
-    tv_iterations: dual iterations per map. is_fly: of the scan, whose frames expose for an arc. noise: of its line
+    tv_iterations: dual iterations per map. is_fly: the scan's frames expose over an arc. noise: that of its line
     integrals, behind the object."""
 
     rt: Runtime
@@ -130,7 +132,8 @@ class PriorInputs:
         return TvAndDct(self.tv(tv_share), DctProx(self.rt, self.grid.shape), dct_share)
 
     def dct_then_ridge(self) -> "Prior":
-        """At rest the step does more of the work, most of it where noise is low; flat bodies lose by that on fly-scans."""
+        """Returns ``dct`` and ridge steps, or ``dct`` alone on small grids. For scans that stop, the step does more of the
+        work, most of it where noise is low; on fly-scans flat bodies would lose by that."""
         if min(self.grid.shape) < RIDGE_EDGE:
             return self.tv_and_dct()
         ridge = RidgeStep(self.rt, self.grid.shape, learned_ridge())
@@ -210,16 +213,17 @@ class ThenRidge(Prior):
     VOLUMES = RidgeStep.VOLUMES
 
     def __init__(self, before: Prior, ridge: RidgeStep, noise_factor: float) -> None:
-        """noise_factor: the noise that the step assumes, over the prior's weight."""
+        """noise_factor: ratio of the noise that the step assumes to the prior's weight."""
         self.before, self.ridge, self.noise_factor = before, ridge, noise_factor
-        self.maps = 0  # since the last step
+        self.maps = 0  # maps since the last step
 
     def __call__(self, space: Space[Any], volume: Any, weight: float, *, nonnegative: bool) -> Any:
         volume = self.before(space, volume, weight, nonnegative=nonnegative)
         self.maps = (self.maps + 1) % _RIDGE_EVERY
         if self.maps:
             return volume
-        # edges are no noise: steps that took all of the weight for it lost 0.2 dB with 180 views
+        # only a share of the weight stands for noise, the rest for edges: steps that took it all for noise lost 0.2 dB with
+        # 180 views
         sigma = self.noise_factor * weight * max(self.noise_share, _LEAST_NOISE_SHARE)
         out = space.place(self.ridge.shape)
         return self.ridge(volume, sigma=sigma, step=_RIDGE_LENGTH, nonnegative=nonnegative, out=out)

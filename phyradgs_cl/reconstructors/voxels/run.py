@@ -95,7 +95,7 @@ class WithFacts(Stepwise, Protocol):
     """A method with facts of its own for the result."""
 
     def facts(self, is_complete: bool) -> Mapping[str, object]:
-        """Returns them after the last step, of a run that came to its end or of an interrupted one."""
+        """Returns the facts after the last step. is_complete: the run came to its end and was not interrupted."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -18,7 +18,7 @@ from phyradgs_cl.reconstructors.voxels.run import Algorithm, IterativeOptions, v
 from phyradgs_cl.reconstructors.voxels.subsets import spread_order
 from phyradgs_cl.reconstructors.voxels.system import System, column_weights, row_weights
 
-_WEIGHT_CACHE_BYTES = 1 << 29
+_WEIGHT_CACHE_BYTES = 1 << 29  # memory of all column weights that are kept
 
 
 @dataclass(frozen=True)
@@ -72,18 +72,18 @@ class Sart(Algorithm):
             self.volume = space.add_product(self.volume, columns, update, self.relaxation, nonnegative=clip)
 
     def _columns(self, index: int) -> Any:
-        """Column weights of a subset, computed in every pass where the cache has no room for them."""
+        """Returns the column weights of a subset, computed in every pass where the cache has no room for them."""
         is_cached = index < len(self._column_weights)
         return self._column_weights[index] if is_cached else column_weights(self.subsets[index])
 
 
 def _cached_columns(volume_shape: tuple[int, ...], subsets: int) -> int:
-    """How many subsets keep their column weights, a volume each."""
+    """Returns how many subsets keep their column weights, a volume each."""
     return min(subsets, max(_WEIGHT_CACHE_BYTES // (4 * math.prod(volume_shape)), 1))
 
 
 def held_volumes(scan: Scan, options: SartOptions) -> int:
-    """How many volumes a run holds at one time."""
+    """Returns how many volumes a run holds at one time."""
     return 4 + _cached_columns(scan.grid.shape, checks.ceil_div(scan.frames, options.frames_per_subset))
 
 

@@ -91,8 +91,8 @@ class Stages:
         self._facts.update(self.method.facts(True))
 
     def facts(self, is_complete: bool) -> Mapping[str, object]:
-        """Returns the facts of the last stage, with the iterations of each stage, and its seconds in this process. A
-        complete run ends its stages without iterations first."""
+        """Returns the facts of the last stage, with the iterations of each stage, and its seconds in this process. In a
+        complete run, stages without iterations are ended first."""
         while is_complete and not self.is_last:
             self.advance()
         self._note()

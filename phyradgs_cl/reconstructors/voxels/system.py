@@ -23,8 +23,8 @@ from phyradgs_cl.runtime import DeviceSpace, HostSpace, MemoryShortage, Runtime,
 
 log = logging.getLogger(__name__)
 
-_SHORTEST_PATH = 0.1  # of the longest
-_FAINTEST = 1e-6  # of the largest sum over a voxel's rays
+_SHORTEST_PATH = 0.1  # shorter rays count as this share of the longest path
+_FAINTEST = 1e-6  # smaller sums over a voxel's rays count as this share of the largest
 S = TypeVar("S", bound="SharedOperator")
 
 
@@ -64,7 +64,7 @@ class System:
         measured = np.asarray(scan.projections, np.float32)
         model = scan.detector_model if detector_model == "scan" else detector_model
         intensity: IntensityOperator | SharedIntensity | None = None
-        if model == "intensity" and any(table.averages for table in tables):  # both models agree on a single value
+        if model == "intensity" and any(table.averages for table in tables):  # of one value both models are the same
             alone = IntensityOperator(rt, scan.grid, shape, tables, projector, subrays)
             intensity = SharedIntensity(rt.ranks, alone) if rt.ranks.size > 1 else alone
         if rt.ranks.size > 1:
@@ -145,7 +145,7 @@ class System:
         return self.masked(operator.forward(change, self.space.place(self.operator.frames_shape)))
 
     def back(self, frames: Any) -> Any:
-        """The transpose of ``derivative``: Aᵀ y, or Jᵀ y, of frames that are 0 at pixels that are not valid."""
+        """Returns the transpose of ``derivative``: Aᵀ y, or Jᵀ y, of frames that are 0 at pixels that are not valid."""
         operator = self.operator if self.intensity is None else self.intensity
         return operator.adjoint(frames, self.space.place(self.volume_shape))
 
@@ -227,11 +227,11 @@ class SharedOperator:
         self._part = whole.subset(list(run)) if len(run) else None
 
     def forward(self, volume: np.ndarray, out: None = None) -> np.ndarray:
-        """A x: volume (nz, ny, nx) 1/mm to frames (F, rows, columns) float32, in new memory of the host."""
+        """Returns A x, frames (F, rows, columns) float32 in new memory of the host, of a volume (nz, ny, nx) in 1/mm."""
         return self._gathered(None if self._part is None else self._part.forward(volume))
 
     def adjoint(self, frames: np.ndarray, out: None = None) -> np.ndarray:
-        """Aᵀ y: frames (F, rows, columns) to a volume (nz, ny, nx) float32."""
+        """Returns Aᵀ y, a volume (nz, ny, nx) float32, of frames (F, rows, columns)."""
         shape = (self.volume_shape[0], self.volume_shape[1] * self.volume_shape[2])
         parts = [] if self._part is None else [self._part.adjoint(frames[self._own]).reshape(shape)]
         return exact_sum(self.ranks, parts, shape, self.ranks.size).reshape(self.volume_shape)
