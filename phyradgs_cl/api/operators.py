@@ -1,6 +1,7 @@
 """One interface for everything that projects: values, transposes, frames, SciPy and PyTorch; arrays on host or device."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from typing import Any
 
@@ -73,11 +74,10 @@ def on_host(name: str, values: Any) -> np.ndarray:
 
 
 class Operator:
-    """A differentiable map between arrays of two shapes, on a device: ``y = A(x)``, and ``A.T(y)``.
+    """A differentiable map between arrays of two shapes, on a device: ``y = A(x)``, and ``A.derivative(x).T(y)``.
 
-    domain_shape, range_shape: shapes of x and y; None is any length. ``A.T`` is the transpose of the derivative at the x
-    of the last call. ``A.frames([3, 7])`` is the operator of some frames; ``A.intensity`` is the operator of a detector
-    that averages photons.
+    domain_shape, range_shape: shapes of x and y; None is any length. ``A.frames([3, 7])`` is the operator of some frames;
+    ``A.intensity`` is the operator of a detector that averages photons.
 
     Host arrays (NumPy's, or others' by DLPack) give NumPy's float32 arrays. pyopencl Arrays (float32, C order, on
     ``queue``) give such Arrays, and nothing is copied between host and device. An operator, its transpose and its frames
@@ -89,7 +89,7 @@ class Operator:
 
     Raises InputError, before anything is computed, for arrays of another shape, type or device."""
 
-    _instead = "vjp has the derivative"
+    _instead = "derivative(x).T is the transpose at x, and vjp(x) also has the value"
 
     def __init__(
         self, rt: Runtime, domain: tuple[str, Shape], range_: tuple[str, Shape],
@@ -99,7 +99,6 @@ class Operator:
         self.rt = rt
         self._domain, self._range = domain, range_
         self._at, self._frames, self._intensity = at, frames, intensity
-        self._back: Map | None = None
 
     @property
     def domain_shape(self) -> Shape:
@@ -141,8 +140,7 @@ class Operator:
 
     def __call__(self, x: Any) -> Any:
         """Returns y = A(x): from ``domain_shape`` to ``range_shape``, on the device where x is."""
-        y, self._back = self._value(x)
-        return to_user_array(self.rt, y)
+        return to_user_array(self.rt, self._value(x)[0])
 
     def vjp(self, x: Any) -> tuple[Any, Callable[[Any], Any]]:
         """Returns A(x), and the function from dL/dy to dL/dx at this x, which later calls do not change."""
@@ -153,10 +151,14 @@ class Operator:
 
         return to_user_array(self.rt, y), by_x
 
+    def derivative(self, x: Any) -> Any:
+        """Returns the derivative at x, whose ``T`` maps dL/dy (range_shape) to dL/dx (domain_shape). It computes A(x)."""
+        return Derivative(self.vjp(x)[1])
+
     @property
-    def T(self) -> "Operator":  # noqa: N802
-        """The transpose of the derivative at the last x, ``range_shape`` to ``domain_shape``; InputError before that."""
-        return Operator(self.rt, self._range, self._domain, self._at_last)
+    def T(self) -> "LinearOperator":  # noqa: N802
+        """The exact transpose of a ``LinearOperator``; InputError for any other operator."""
+        raise self._not_linear()
 
     def frames(self, chosen: Sequence[int]) -> Any:
         """Returns the operator of some of the frames, by their numbers from 0 and in this order; it shares all memory.
@@ -174,8 +176,7 @@ class Operator:
     def intensity(self) -> "Operator":
         """The operator of a detector that averages photons over an exposure: −ln Σ w exp(−p) over a line's times.
 
-        Without it a line is Σ w p. ``T`` of the result is the transpose of the derivative at its last x. Raises InputError
-        where it does not exist (transposes, voxels)."""
+        Without it a line is Σ w p. Raises InputError where it does not exist (transposes, voxels)."""
         if self._intensity is None:
             raise InputError("intensity", repr(self), "an operator from something to line integrals")
         return self._intensity()
@@ -190,11 +191,12 @@ class Operator:
     def _to_array(self, side: tuple[str, Shape], values: Any) -> Values:
         return to_operator_array(self.rt, side[0], values, side[1])
 
-    def _at_last(self, y: Values) -> tuple[Values, Map]:
-        if self._back is None:
-            remedy = "call the operator first: its derivative is taken at the last x"
-            raise InputError("T", "no x yet", "the transpose of a derivative at some x", remedy)
-        return self._back(y), _no_derivative
+
+@dataclass(frozen=True)
+class Derivative:
+    """The derivative of an operator at one x. T: the function from dL/dy to dL/dx, whatever is computed later."""
+
+    T: Map
 
 
 class LinearOperator(Operator, ScipyOperator):
@@ -221,6 +223,10 @@ class LinearOperator(Operator, ScipyOperator):
     def T(self) -> "LinearOperator":  # noqa: N802
         """The exact transpose: frames (F, rows, columns) to x, by the forward weights."""
         return LinearOperator(self.rt, self._range, self._domain, *self._pair[::-1])
+
+    def derivative(self, x: Any) -> "LinearOperator":
+        """Returns the operator itself: it is linear."""
+        return self
 
     def _matvec(self, x: np.ndarray) -> np.ndarray:
         return self(np.reshape(x, self.domain_shape)).ravel()
@@ -286,10 +292,6 @@ def as_torch(operator: Operator) -> Callable[..., Any]:
 def _is_index(number: object, count: int) -> bool:
     is_whole = isinstance(number, int | np.integer) and not isinstance(number, bool)
     return is_whole and 0 <= number < count  # type: ignore[operator]
-
-
-def _no_derivative(_: Values) -> Values:
-    raise InputError("T", "the derivative of a transpose", "that of the operator itself")
 
 
 def _text(shape: Shape) -> str:

@@ -382,11 +382,11 @@ CASES: dict[str, list[tuple[str, Callable[[], object]]]] = {
     "splat_operator": [
         ("motion", lambda: splat_operator(GOOD, "quick")), ("motion Frames", lambda: splat_operator(GOOD, Frames())),
         ("rows", lambda: splats()(np.zeros((10, 3)))), ("rows", lambda: splats()(FLAT)),
-        ("rows", lambda: splats()(FLAT * np.nan)), ("T", lambda: splats().frames([1]).T(FRAMES[:1])),
+        ("rows", lambda: splats()(FLAT * np.nan)), ("SplatProjection", lambda: splats().T(FRAMES)),
         ("of_densities", lambda: splats().intensity.of_densities(Gaussians.from_rows(FLAT + 1))),
         ("SplatProjection", lambda: lsqr(splats(), FRAMES.ravel())),
         ("SplatProjection", lambda: lsmr(splats(), FRAMES.ravel())),
-        ("Operator", lambda: cg(splats().T @ splats(), ONE)),
+        ("SplatProjection", lambda: cg(splats().T @ splats(), ONE)),
     ],
     "voxel_operator": [("grid", lambda: voxel_operator(16)), ("frames", lambda: voxel_operator(GOOD.grid).frames([0]))],
     "voxelise": [

@@ -38,17 +38,18 @@ def test_a_loop_over_arrays_of_the_device_moves_scalars_alone(rt: Runtime, scan:
     operator = getattr(of(scan, device=rt), detector) if detector else of(scan, device=rt)
     truth = scan.reference if "ray" in kind else cloud.rows()
     x, measured = operator.to_device(0.9 * truth), operator(operator.to_device(truth))
-    operator(x)
-    step = 0.01 * float(np.abs(truth).max() / np.abs(operator.T(operator(x) - measured).get()).max())
+    y, pull = operator.vjp(x)
+    step = 0.01 * float(np.abs(truth).max() / np.abs(pull(y - measured).get()).max())
     views = [(operator.frames([f]), measured[f : f + 1]) for f in range(scan.frames)]
 
     def one_pass() -> float:
         nonlocal x
         loss = 0.0
         for view, seen in views:
-            misfit = view(x) - seen
+            y, pull = view.vjp(x)
+            misfit = y - seen
             loss += float(pyopencl.array.dot(misfit, misfit).get())
-            x -= step * view.T(misfit)
+            x -= step * pull(misfit)
         return loss
 
     first = one_pass()  # tables of the device's own go up once
