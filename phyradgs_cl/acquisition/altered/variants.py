@@ -117,8 +117,8 @@ def shifted(scan: Scan, pixels: float) -> Scan:
 
 
 def turned(scan: Scan, angle_rad: np.ndarray, speed: float = 1.0) -> Scan:
-    """Returns the scan with frames turned about z by ``angle_rad`` (F,). In a frame the gantry is ``speed`` times as
-    fast."""
+    """Returns the scan with the poses of its frames turned about z by ``angle_rad`` (F,). Within a frame the gantry turns
+    ``speed`` times as fast."""
     first_rad = start_azimuths_rad(scan)
 
     def change(frame: int, pose: np.ndarray) -> np.ndarray:
