@@ -55,9 +55,9 @@ class Estimate:
 def estimate(
     scan: Scan, plan: RunPlan, rt: Runtime, around: Callable[[Reconstruction], float] | None = None
 ) -> Estimate:
-    """Returns the time and memory of a plan, from short runs of it; a method that cannot be resumed runs once, whole.
-    ``around`` returns the seconds that a run spends outside the method, from a result of it. The first trial builds the
-    kernels, as the run will."""
+    """Returns the time and memory of a plan, from short runs of it. A method without iterations, or that cannot be resumed,
+    runs once as a whole. ``around`` returns the seconds that a run spends outside the method, from a result of it. The first
+    trial builds the kernels, as the run will."""
     started = time.perf_counter()
     trials, total = _Trials(scan, plan, rt), getattr(plan.options, "iterations", None)
     few, more = getattr(plan.options, "TRIALS", _SPLAT_TRIALS if isinstance(plan.options, SplatOptions) else _TRIALS)

@@ -65,7 +65,7 @@ def _outline(first_s: np.ndarray, last_s: np.ndarray, line: np.ndarray) -> tuple
 
 
 def _turned_deg(scan: "Scan", frame: int) -> tuple[float, float]:
-    """Returns the source's azimuth when a frame's first line opens and when its last line closes."""
+    """Returns the source's azimuth in degrees when a frame's first line opens, and when its last line closes."""
     times_s = scan.frame_start_s[frame] + np.array([0.0, scan.shutter.span_s])
     source = towards_source(scan.trajectory.pose(frame, times_s), scan.is_parallel)
     first, last = np.rad2deg(np.unwrap(np.arctan2(source[:, 1], source[:, 0])))

@@ -159,7 +159,7 @@ def continued(trajectory: Trajectory, by_s: float) -> Trajectory:
 
 
 def _is_without_jumps(steps_rad: np.ndarray) -> bool:
-    """Whether no step of more than half a turn stands among steps that are mostly below a quarter."""
+    """True where no step (N,) exceeds half a turn, or where steps of a quarter turn and more are usual."""
     size_rad = np.abs(steps_rad)
     return bool(size_rad.max(initial=0) <= np.pi or np.median(size_rad) >= np.pi / 2)
 
@@ -255,8 +255,8 @@ def unit_directions(subject: str, poses: np.ndarray) -> np.ndarray:
 def resting_poses(
     poses: np.ndarray, middle_s: np.ndarray, span_s: float, subject: str = "poses", is_parallel: bool = False
 ) -> PoseTable:
-    """Returns a table for a gantry that stops for every frame: each pose (F, 12) holds ``span_s`` about its ``middle_s``
-    (F,)."""
+    """Returns a table for a gantry that stops for every frame. Each pose (F, 12) holds for ``span_s``, at least 0.5 s, about
+    its ``middle_s`` (F,) in s."""
     half_s = max(span_s / 2, 0.25) * (1 - 1e-10)  # two frames in a row must not share a time
     time_s = np.stack([middle_s - half_s, middle_s + half_s], -1).ravel()
     return PoseTable(time_s, np.repeat(poses, 2, axis=0), subject, is_parallel)
@@ -298,7 +298,7 @@ def behind_axis(geometry: Geometry, trajectory: Trajectory) -> tuple[Geometry, T
 
 
 def _is_off_axis(poses: np.ndarray) -> bool:
-    """Whether the plane of a panel, with poses (T, 12), passes beside the origin."""
+    """True where the plane of any panel, with poses (T, 12), does not pass through the origin."""
     normal = body_frames(poses)[..., 2]
     from_axis_mm = np.abs(np.einsum("ti,ti->t", poses[:, 3:6], normal))
     return bool((from_axis_mm > _AT_AXIS * np.linalg.norm(poses[:, :3], axis=1)).any())

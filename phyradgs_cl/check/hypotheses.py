@@ -29,7 +29,7 @@ _GAPS = 15  # number of places at which a missing or repeated frame is tried
 class Hypothesis:
     """A hypothesis: a description, advice, and a function that returns the scan under it.
 
-    ``factor``: on the sizes of pixels. Hypotheses with an equal one other than 1 differ only by the panel's shift."""
+    ``factor``: by which pixels are larger than stated. Those with one factor, if not 1, differ by the panel's shift only."""
 
     text: str
     advice: str

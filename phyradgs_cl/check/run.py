@@ -61,7 +61,7 @@ class _Answers:
         return finding
 
     def stop(self) -> CheckResult:
-        """Leaves the remaining questions open because of the last finding."""
+        """Answers the remaining questions with "cannot tell", because of the last finding, and returns the result."""
         cause = self.findings[-1]
         for question in self._questions[len(self.findings) : -1]:
             self.add(Finding(question, CANNOT_TELL, 0.0, 0.0, "", f"rests on {cause.question}: {cause.verdict}"))

@@ -134,7 +134,7 @@ def with_options(
     slot: str, options: Mapping[str, tuple[Any, Any]], make: Callable[[dict[str, Any]], Any]
 ) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
     """Returns a decorator that gives a command ``options``, each (annotation, default), in place of its parameter ``slot``.
-    Typer reads a command's signature, so that lists the options. The command gets ``make(values by name)``."""
+    Typer reads a command's signature, so the signature lists them. The command gets ``make(values by name)``."""
 
     def decorated(command: Callable[..., Any]) -> Callable[..., Any]:
         @functools.wraps(command)

@@ -287,8 +287,8 @@ class RotaryStage:
     def turned(
         self, angle_rad: np.ndarray, timing: Timing, subject: str
     ) -> tuple[CircularOrbit | PoseTable, Geometry]:
-        """Returns the trajectory of gantry angles (F,) and its plain geometry: a circular orbit where the axis crosses the
-        central ray at a right angle, else a table of poses."""
+        """Returns the trajectory of gantry angles (F,) in rad and the nearest circular geometry. It is a circular orbit
+        where the axis crosses the central ray at a right angle, else a pose table."""
         if self.axis_u_mm == self.roll_rad == self.tilt_rad == 0 and self.shift_mm is None:
             return turning(self.geometry, angle_rad, timing), self.geometry
         unwrapped = np.unwrap(angle_rad)

@@ -143,7 +143,7 @@ class Places:
             with self.opened("image_key", text) as (source, address):
                 key = h5.read_values(source, address, source.dataset(address))
                 checks.shape(source.name(address), key, (frames,))
-                key = np.where(key == -1, schema.INVALID, key)  # -1: frames by which nxtomo aligns
+                key = np.where(key == -1, schema.INVALID, key)  # -1: frames only for alignment in nxtomo
                 if not np.isin(key, range(schema.INVALID + 1)).all() or not np.any(key == schema.PROJECTION):
                     expected = "0 projection, 1 flat, 2 dark or 3 invalid, and at least one 0"
                     raise source.error(address, f"{np.unique(key)[:5]}", expected)
@@ -244,7 +244,7 @@ def beam(
         return None
 
     def pitch_mm() -> tuple[float, float]:
-        """Returns the pixel's sides on a panel behind the sample, without optics between them."""
+        """Returns a pixel's sides (v, u) in mm on a panel at the detector's distance, as if there were no optics."""
         at_sample, on_panel = sides_mm(lengths.at_sample), sides_mm(lengths.on_panel)
         if at_sample is None and on_panel is not None and lengths.optics and source.find(lengths.optics) is not None:
             times = h5.read_length(source, lengths.optics, _TIMES)

@@ -1,4 +1,4 @@
-"""Applies steps to a scan. Names the steps, in their physical order."""
+"""Applies the chosen preparation steps to a scan, in physical order."""
 
 import logging
 from collections.abc import Iterator, Mapping

@@ -27,7 +27,7 @@ from phyradgs_cl.report.page import head, web_script
 from phyradgs_cl.report.sections import facts_table, frame_pictures, note, section
 from phyradgs_cl.text import clock
 
-_MOST_POINTS = 400  # points of the convergence
+_MOST_POINTS = 400  # limit of the points of the convergence curve
 _SAMPLES = 64  # samples of the volume along a side from which the grey range is computed
 _LATE_S, _LATE_TIMES = 30.0, 6  # a run without news for this time, and for so many intervals, may have been killed
 _LOG_RATIO = 20.0  # ratio of largest to smallest value above which the axis is logarithmic

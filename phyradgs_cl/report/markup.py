@@ -87,7 +87,7 @@ def shown(value: object, unit_name: str = "") -> str:
 
 
 def number(value: float, resolution: float = 0.0) -> str:
-    """Returns a number as text with four significant digits. Values up to a millionth of ``resolution`` become 0."""
+    """Returns a number as text with at most four significant digits. Values up to a millionth of ``resolution`` become 0."""
     if abs(value) <= 1e-6 * resolution:
         value = 0.0
     if not math.isfinite(value):

@@ -27,7 +27,7 @@ from phyradgs_cl.reconstructors import Progress
 from phyradgs_cl.report.images import bytes_of, grey_range, png_bytes, top_row_first
 
 _GAP = 4  # pixels between slices
-_SMALLEST, _LARGEST = 128, 512  # pixels along the longest side of a slice
+_SMALLEST, _LARGEST = 128, 512  # least and most pixels along the longest side of a slice
 log = logging.getLogger(__name__)
 
 

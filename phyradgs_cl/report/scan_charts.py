@@ -113,7 +113,7 @@ def _plan(draw: "Callable[[Axes], None]", points: Sequence[Points], title: str, 
 
 
 def source_positions(scan: Scan) -> Points:
-    """Returns the poses (F, 12) of ``with_sources`` in the middle of every frame's exposure."""
+    """Returns the poses (F, 12) of ``with_sources`` at the middle of every frame's lit span."""
     return with_sources(scan, middle_poses(scan))
 
 

@@ -75,7 +75,7 @@ def run_evaluation(
     with finish_despite_interrupt(), written_beside(picture) as temporary:
         try:
             slices_png(temporary, volume, reference, title)
-        except OutputError as error:  # names the temporary file; what the disk says is behind it
+        except OutputError as error:  # its text names the temporary file; its cause is the system's error
             raise error.__cause__ or error from None
     known: dict[str, object] = {key: provenance[key] for key in ("method", "seconds", "gaussians") if key in provenance}
     files = {"volume": str(volume_path), "reference": str(reference_path), "picture": str(picture)}
@@ -100,7 +100,7 @@ def compared_states(result: Volume, truth: MovingTruth, truth_grid: Grid) -> dic
     points_mm = edge_points_mm(truth.volumes[0], truth_grid)
     try:
         mean_mm, high_mm = motion_error_mm(field, truth.deformation, points_mm, truth.times_s)
-    except InputError as error:  # strong contraction: the volumes can be compared all the same
+    except InputError as error:  # a deformation that cannot be inverted: metrics do not need its inverse
         log.warning("no error of the motion: %s", error)
         return {"states": rows, **means}
     return {"states": rows, **means, "mean_motion_error_mm": mean_mm, "p95_motion_error_mm": high_mm}

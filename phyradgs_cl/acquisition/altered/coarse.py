@@ -74,8 +74,8 @@ def some_frames(scan: Scan, frames: np.ndarray) -> Scan:
 def binned(scan: Scan, block: int) -> Scan:
     """Returns the scan with ``block`` × ``block`` pixels averaged to one. A block is no larger than the panel.
 
-    Only the valid pixels of a block are averaged; a block with less than half of them valid is masked. Rows and columns at
-    the far end that fill no block are dropped. A block of lines opens at the mean of its lines' times."""
+    Only the valid pixels of a block are averaged; a block with less than half of them valid is masked. The last rows and
+    columns that fill no block are dropped. A block of lines opens at the mean of its lines' times."""
     if block == 1:
         return replace(scan, reference=None, moving_truth=None)
     height, width = blocks = tuple(min(block, count) for count in scan.geometry.detector_shape)

@@ -51,7 +51,7 @@ class R2Folder:
     def frame(self, entry: Fields) -> np.ndarray:
         """Reads one projection (v, u) as stored."""
         name = entry.word("file_path")
-        first_copy = name.replace("_sim1", "")  # of a repeated simulation, whose first copy was kept
+        first_copy = name.replace("_sim1", "")  # names repeated simulations, of which the first copy was kept
         path = self.folder.file(first_copy if self.folder.exists(first_copy) else name, entry.name("file_path"))
         image = read_npy(path, 2)
         checks.shape(str(path), image, self.geometry.detector_shape)

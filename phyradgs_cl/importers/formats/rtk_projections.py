@@ -44,7 +44,7 @@ _MAKERS = (
 def _read_geometry(rtk: Any, reader_name: str, description: str, names: list[str]) -> Any:
     """Returns RTK's geometry of a description and of projections, whose headers hold angles and places."""
     reader = getattr(rtk, reader_name).New()
-    if hasattr(reader, "SetFilename"):  # Elekta's description has all
+    if hasattr(reader, "SetFilename"):  # Elekta's description holds the geometry of all projections
         reader.SetFilename(description)
         reader.GenerateOutputInformation()
         return reader.GetOutputObject()

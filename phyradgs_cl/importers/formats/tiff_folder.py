@@ -85,7 +85,7 @@ def import_scan(path: Path, options: ImportOptions) -> Scan:
 def _tables(path: Path) -> dict[str, Fields]:
     """Returns the file's own tables by name, and under "" those of a scanner file. Raises InputError for unknown names."""
     content = read_toml(path)
-    for place in (content, content.get("frames")):  # short for [angles] file
+    for place in (content, content.get("frames")):  # angles = "FILE" is short for [angles] file
         if isinstance(place, dict) and isinstance(place.get("angles"), str):
             text = place.pop("angles")
             content["angles"] = {**content.get("angles", {}), "file": text}

@@ -1,4 +1,4 @@
-"""OME-Zarr of versions 0.4 and 0.5: the full size of one volume, with its voxel sizes and place."""
+"""Reads OME-Zarr of versions 0.4 and 0.5: one volume at full resolution, with its voxel sizes and position."""
 
 import logging
 import math

@@ -39,8 +39,8 @@ class Series:
 
 @dataclass(frozen=True, eq=False)
 class _Column:
-    """The numbers (F,) at one place of the files' names. ``place``: 1 for the first. ``is_angle``: words beside them say
-    so."""
+    """The numbers (F,) at one place of the files' names. ``place``: 1 for the first. ``is_angle``: in degrees, by the
+    words next to them."""
 
     place: int
     values: np.ndarray

@@ -1,4 +1,4 @@
-"""Grey TIFF images, one or many per file, by tifffile; by Pillow where tifffile needs imagecodecs and that is missing."""
+"""Reads grey TIFF images, one or many per file, by tifffile; by Pillow where tifffile would need a missing imagecodecs."""
 
 import logging
 import math

@@ -1,4 +1,4 @@
-"""Typed values in HDF5: numbers with units, words, whole numbers and voxel grids. Every value is checked when it is read."""
+"""Reads and writes typed values in HDF5: numbers with units, words, whole numbers and voxel grids. Reading checks them."""
 
 import logging
 import math
