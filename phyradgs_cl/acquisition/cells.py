@@ -125,9 +125,8 @@ def _served_lines(served: np.ndarray) -> Served:
 
 
 def _middles_s(frame_start_s: np.ndarray, frame: int, edges_s: np.ndarray) -> np.ndarray:
-    """Returns the mid-times (K,) in s of one frame's cells, from their edges (K + 1,) in s after its start.
-
-    Frames on frame 0's grid get bitwise equal times for common cells."""
+    """Returns the mid-times (K,) in s of a frame's cells, from their edges (K + 1,) in s after its start. Frames on frame
+    0's grid get bitwise equal times for common cells."""
     step_s = edges_s[1] - edges_s[0]
     start_s, origin_s = float(frame_start_s[frame]), float(frame_start_s[0])
     cells = (start_s - origin_s) / step_s

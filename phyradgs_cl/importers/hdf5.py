@@ -41,9 +41,8 @@ def is_address(text: object) -> bool:
 @dataclass(frozen=True, eq=False)
 class Places:
     """Where the arrays of a scan are. ``stated``: for some of ``NAMES`` a list of FILE:/ADDRESS, or of /ADDRESS in
-    ``source``; for "axes" the order of the frames' axes. ``subject``: the option or table that states them, for messages.
-    ``linked_folder``: see ``open_hdf5``. ``folder``: the only folder from which files are read; None, for files that the
-    user names on the command line, allows any."""
+    ``source``; for "axes" the order of frames' axes. ``subject``: what states them. ``linked_folder``: see ``open_hdf5``.
+    ``folder``: the only folder from which files are read; None, for files that users name, allows any."""
 
     stated: Mapping[str, Sequence[str]]
     subject: str
@@ -226,9 +225,8 @@ class Lengths:
 def beam(
     source: Hdf5Source, lengths: Lengths, options: ImportOptions, panel: tuple[int, int], axis_columns: float = 0.0
 ) -> Geometry:
-    """Returns the geometry of the options' numbers, else of a file's. Where neither states the source's distance, the beam
-    is parallel, with a warning. ``axis_columns``: columns from the rotation axis to the panel's middle. Raises InputError
-    where a length is missing or impossible."""
+    """Returns a geometry of the options' numbers, else of a file's; a parallel beam, with a warning, where neither states
+    the source's distance. ``axis_columns``: columns from axis to panel's middle. Raises InputError for wrong lengths."""
     quantity = LENGTH
     for address in (address for pair in (*lengths.at_sample, *lengths.on_panel) for address in pair):
         if source.find(address) is not None and not h5.read_attribute(source, address, "units"):

@@ -1,5 +1,4 @@
-"""Reads and writes volume files in HDF5: a reconstruction as NXdata with grid, provenance and Gaussians. Reads also bare
-arrays /volume."""
+"""Reads and writes volume files in HDF5: NXdata with grid, provenance and Gaussians. Reads also bare arrays /volume."""
 
 import json
 import logging
@@ -359,8 +358,7 @@ def _read_states(source: Hdf5Source, shape: tuple[int, ...]) -> States | None:
 
 
 def _states_datasets(source: Hdf5Source, shape: tuple[int, ...]) -> tuple[np.ndarray, h5py.Dataset]:
-    """Returns the times (K,) in s of the states, and their dataset (K, nz, ny, nx). Raises InputError for other shapes, and
-    for times that do not rise."""
+    """Returns the times (K,) in s and the dataset (K, nz, ny, nx) of the states. Raises InputError for wrong ones."""
     times_s = h5.read_array(source, f"{_STATES}/time_s", (None,), h5.TIME)
     if len(times_s) == 0 or (np.diff(times_s) <= 0).any():
         raise source.error(f"{_STATES}/time_s", checks.short_repr(times_s.tolist()), "at least one time, rising")

@@ -133,9 +133,9 @@ def find_dead(
 ) -> np.ndarray:
     """Returns the dead pixels (v, u) bool of line integrals (F, v, u); none for fewer than five frames.
 
-    A pixel is dead if it never changes while its neighbours do. It is also dead if it is above, or below, all its neighbours
-    in 70 % of the frames and differs from the median of 3 × 3 pixels by more than ``deviations`` standard deviations of the
-    panel's pixels. Near ``axis_column`` small parts of the object stand still on the panel: there a dead pixel must be
+    A pixel is dead if it never changes while its neighbours do. It is also dead if, in 70 % of the frames, it is above, or
+    below, all its neighbours. It must then differ from the median of 3 × 3 pixels by more than ``deviations`` standard
+    deviations of the panel's pixels. Near ``axis_column`` small parts of the object stand still: there a dead pixel must be
     sharper than these. A row or column that differs from both neighbours over 90 % of its length is dead as a whole."""
     if len(frames) < LEAST_FRAMES:
         return np.zeros(frames.shape[1:], bool)

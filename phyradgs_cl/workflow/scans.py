@@ -95,8 +95,7 @@ def run_preparation(
     source: Path, output: Path, options: Preprocessing, make_runtime: Callable[[], Runtime], config: Path | None = None
 ) -> list[dict[str, Any]]:
     """Writes the scan ``source`` after the steps of ``options`` as line integrals, with bad pixels masked and interpolated.
-    Returns what each step did, in order. The file's provenance holds the same, and the source. Raises InputError for a
-    wrong scan or option, OutputError where the file cannot be written."""
+    Returns what each step did, in order, as the file's provenance states too. Raises InputError and OutputError."""
     if not options.chosen and options.flats == "mean":
         raise InputError("--steps", "none", f"some of {', '.join(STEPS)}", "leave it out for the usual ones")
     options.check_written()

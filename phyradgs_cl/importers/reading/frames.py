@@ -1,8 +1,7 @@
 """Converts frames of any origin to line integrals, with row 0 the lowest and bad pixels masked. Leaves out flats and darks
 that do not fit the others, and takes medians of the rest.
 
-Flats that were taken at several times of a scan, such as before and after it, are interpolated linearly in time. Time is
-counted in frames."""
+Flats of several times, such as before and after the scan, are interpolated linearly in time, which frame numbers count."""
 
 import logging
 from collections.abc import Mapping, Sequence

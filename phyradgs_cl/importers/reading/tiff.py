@@ -148,8 +148,8 @@ def _opened(path: Path) -> Iterator[Any]:
 
 
 def calibration(path: Path) -> tuple[np.ndarray | None, np.ndarray | None, str]:
-    """Returns the voxel sizes (x, y, z) in mm, the origin's place (x, y, z) in voxels and the text "Info" of a stack from
-    ImageJ, from tifffile, which keeps the same values of a BigTIFF as JSON, or in OME-TIFF. Without valid sizes it returns
+    """Returns the voxel sizes (x, y, z) in mm, the origin's place (x, y, z) in voxels and the text "Info" of a stack. It is
+    ImageJ's, an OME-TIFF, or a BigTIFF of tifffile, which keeps ImageJ's values as JSON. Without valid sizes it returns
     (None, None, ""), with a warning where the file has a part of them. A missing origin is None. Raises InputError for a
     stack with several channels or times. Call ``read_tiffs`` first, which checks the file."""
     with _opened(path) as tiff:
