@@ -105,7 +105,7 @@ def common_time_cells(
 
 @lru_cache(maxsize=8)  # all frames of a scan have the same windows
 def _common_shares(windows: bytes, samples: int) -> tuple[np.ndarray, np.ndarray, Served]:
-    """Returns cell edges (K + 1,), each line's share (K, lines) of its window in each cell, and the ``_served_lines``.
+    """Returns cells' edges (K + 1,) in s, ``_shares`` (K, lines) of lines' windows in them, and their ``_served_lines``.
 
     windows: bytes of the windows (lines, 2), in s after a frame's start. Do not write to the arrays: they are cached."""
     windows_s = np.frombuffer(windows, np.float64).reshape(-1, 2)

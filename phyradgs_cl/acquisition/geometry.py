@@ -109,7 +109,7 @@ GEOMETRIES = (ConeGeometry, ParallelGeometry)
 
 
 def _check_panel(geometry: Geometry) -> None:
-    """Makes the fields of a geometry's panel tuples, so that geometries compare. Raises InputError for impossible values."""
+    """Converts a geometry's fields to tuples, so that geometries can be compared. Raises InputError for impossible ones."""
     counts = checks.numbers("detector_shape", geometry.detector_shape, (2,))
     if (counts < 1).any() or (counts != np.floor(counts)).any():
         raise InputError("detector_shape", str(geometry.detector_shape), "two counts (rows, columns) of at least 1")

@@ -17,13 +17,13 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 OPAQUE, FEW = 50.0, 0.01  # largest line integral that a panel can measure; fraction of its pixels that may be broken
 _WIDEST_DEG = 120.0  # limit of a panel's fan and cone angles; dental scanners have 30°, nano-CT 60°
-_LARGEST_PITCH_MM, _LEAST_DISTANCE_MM = 5.0, 10.0  # limits that tell a wrong pixel from a wrong distance
+_LARGEST_PITCH_MM, _LEAST_DISTANCE_MM = 5.0, 10.0  # largest real pixel; least real distance to a panel
 _WRONG_UNIT = 100.0  # limit of readout over frame time: milliseconds given as seconds make it some hundreds
-_SHORT_READOUT_S, _MANY_LINES = 0.5e-3, 100  # warned of: so short a readout of so many lines; panels take some ms
-_SLOW_FPS, _LARGE_STEP_DEG = 2.0, 10.0  # warned of together: a gantry that turns so far between frames takes them faster
+_SHORT_READOUT_S, _MANY_LINES = 0.5e-3, 100  # a shorter readout of so many lines is warned of: panels take some ms
+_SLOW_FPS, _LARGE_STEP_DEG = 2.0, 10.0  # a lower rate with a larger step between frames is warned of
 _TIMES = 17  # angles sampled in an exposure: between two of them no gantry makes half a turn
 _SLACK = 1e-3  # relative tolerance: times and angles come rounded
-_MANY_FRAMES = 10  # least number warned of as radians: fewer frames may lie within a few degrees on purpose
+_MANY_FRAMES = 10  # least number of frames for the warning of radians: fewer may lie within a few degrees on purpose
 _ASIDE = 0.1  # fraction of the panel's width: a panel further off centre was displaced for a wider field of view
 
 

@@ -107,7 +107,7 @@ class TimeCells:
         return replace(self, pose=pose, line_share=share, **lines)
 
     def still(self) -> "TimeCells":
-        """Returns these cells, for ray operators. Raises InputError for what only splats support: moving, conic poses."""
+        """Returns these cells, for ray operators. Raises InputError for moving cells and conic poses, which need splats."""
         if self.is_moving:
             raise InputError("--motion", "cells with motion", "still cells: only splats move", "take --motion per-row")
         if self.conic_pose is not None:

@@ -129,7 +129,7 @@ class Operator:
         return InputError(repr(self), "an operator that is not linear in x", "a LinearOperator", self._instead)
 
     def to_device(self, values: Any) -> Any:
-        """Returns an x or a y, or a stack of them, as a pyopencl Array, float32, on ``queue``: the start of a loop there.
+        """Copies an x or a y, or a stack of them, to a pyopencl Array, float32, on ``queue``, to start a loop there.
 
         Raises InputError for anything but an array of real numbers, and for last axes that are neither those of x nor of y.
         """

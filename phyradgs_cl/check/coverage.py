@@ -99,7 +99,7 @@ def _width_mm(scan: Scan, p: np.ndarray, valid: np.ndarray, threshold: float) ->
 
 
 def _border(p: np.ndarray, valid: np.ndarray, columns: slice) -> float:
-    """Returns the 90th percentile over the frames of the largest mean, over an eighth of the rows, in border columns."""
+    """Returns the level at a border: the largest mean over an eighth of its rows, at the 90th percentile of the frames."""
     edge = p[:, :, columns]
     weight = valid[:, :, columns].astype(float)
     rows = max(1, edge.shape[1] // 8)

@@ -20,7 +20,7 @@ _JUMP = 2.5  # median step in recorded order over that of sorted angles, above w
 _UNLIKE = 2.0  # least difference of a repeated frame from the next view in angle, over the median one
 _OUTLIER = 4.0  # least residual of an outlier over the median one
 _ALIKE = 1.7  # limit of the ratio of both ends' residuals: right frames had at most 1.4, one odd frame at least 2.3
-_AT_BOTH_ENDS = 0.25  # limit of it over the residual in a random order: right frames had 0.2, odd ones mostly 0.3 or more
+_AT_BOTH_ENDS = 0.25  # limit of an end's residual over that in a random order: right frames had 0.2, odd ones mostly 0.3
 _MOST_OUTLIERS = 0.2  # fraction of the frames: with as many outliers, the cause is common to all
 _EXCHANGED = 0.5  # limit of the squared residual after an exchange of two frames, over the stated one
 

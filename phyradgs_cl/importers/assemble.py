@@ -27,7 +27,7 @@ _OF_A_TURN = ("exposure_s", "readout_s", "angle_at", "readout_axis", "readout_di
 Length = float | Callable[[], float]
 Pitch = tuple[float, float] | Callable[[], tuple[float, float]]
 _DISTANCES = ("source_to_axis_mm", "source_to_detector_mm")
-_VIEW_DIGITS = 5  # decimals of a view's normalised pose to which equal views count as one
+_VIEW_DIGITS = 5  # views that agree to so many decimals of their angle, or scaled pose, count as one
 _SLACK = 1e-6  # fraction of a frame's span by which a pose table extends beyond the times that are needed
 
 
@@ -327,7 +327,7 @@ def scan_on_stage(
 
 
 def along(values: np.ndarray, position: np.ndarray) -> np.ndarray:
-    """Returns values (F, ...) at frame positions (T,), linear between frames and beyond them."""
+    """Interpolates values (F, ...) at frame positions (T,), (T, ...), linearly, also beyond the first and last frame."""
     if len(values) == 1:
         return np.repeat(values, len(position), axis=0)
     left = np.clip(np.floor(position).astype(int), 0, len(values) - 2)

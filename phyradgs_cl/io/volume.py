@@ -262,7 +262,7 @@ def file_kind(path: str | Path) -> str:
 
 
 def _read_provenance(source: Hdf5Source) -> dict[str, object]:
-    """Reads how a volume was made; warns, once per file, if its run was interrupted."""
+    """Reads a volume's provenance; {} where the file has none. Warns, once per file, of an interrupted run."""
     provenance = _read_facts(source, "provenance", PROVENANCE) or {}
     if where := interruption(provenance):
         of = "" if where["iterations_asked"] is None else f" of {where['iterations_asked']}"

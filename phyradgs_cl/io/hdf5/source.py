@@ -129,7 +129,7 @@ class Hdf5Source:
         return thing
 
     def dataset(self, address: str) -> h5py.Dataset:
-        """Returns the dataset at an address. Raises InputError, with a misspelt name that is there, where there is none."""
+        """Returns the dataset at an address. Raises InputError where there is none, with a similar name that is there."""
         if (dataset := self.optional(address)) is not None:
             return dataset
         parent, name = posixpath.split(address)
