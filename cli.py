@@ -1,4 +1,4 @@
-"""The command line: the commands put together. Every error is one line on stderr and an exit status of its kind."""
+"""The command line, with all commands. Every error gives one line on stderr and the exit status of its kind."""
 
 import importlib
 from collections.abc import Iterator, Mapping
@@ -15,7 +15,7 @@ from phyradgs_cl.removed import removal
 
 _CLICK_ERROR: type[Exception] = next(c for c in typer.BadParameter.__mro__ if c.__name__ == "ClickException")
 HELP = {"help_option_names": ["-h", "--help"]}
-# name: the module of commands/ that has NAME_command, and the command's help in the list
+# By name: the module of commands/ that has NAME_command, and the command's help in the list.
 COMMANDS = {
     "simulate": ("simulate", "Simulate a fly-scan of a phantom or a volume."),
     "import": ("import_scan", "Turn the scan of another program into a scan file."),
@@ -35,11 +35,11 @@ COMMANDS = {
 
 
 class Interrupted(Exception):
-    """Carries Ctrl-C past Typer, which would end it without a message."""
+    """Carries Ctrl-C past Typer, which would end the program without a message."""
 
 
 class Loaded(Mapping[str, Any]):
-    """Typer's commands by name, each imported when it is used: their imports take time."""
+    """Typer's commands by name. Each is imported when it is used, since imports take time."""
 
     def __getitem__(self, name: str) -> Any:
         module_name, summary = COMMANDS[name]
@@ -110,7 +110,7 @@ def root(
 
 
 def run(arguments: list[str], program: typer.Typer = app) -> int:
-    """Runs one command of ``program``; returns the exit status."""
+    """Runs one command of ``program`` and returns the exit status. Prints errors instead of raising them."""
     if not takes_part(arguments):
         return 0
     with signals.answer_signals():
@@ -122,10 +122,10 @@ def run(arguments: list[str], program: typer.Typer = app) -> int:
             return complain(str(error), error.exit_code)
         except _CLICK_ERROR as error:
             return complain(usage_text(error, arguments))
-        except OSError as error:  # one that no reader or writer has named
+        except OSError as error:  # one that no function of ours has caught
             text = f"{error.filename or 'operating system'}: {error.strerror or error}"
             return complain(text, OutputError.exit_code if error.errno in NO_SPACE else 2)
-        except SystemExit:  # Typer's answer to a reader of its help that has left, as in `| head`
+        except SystemExit:  # Typer raises it where the reader of its help has closed the pipe, as `| head` does
             give_up_stdout()
             return 0
         except (Interrupted, KeyboardInterrupt, typer.Abort):

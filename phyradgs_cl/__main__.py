@@ -1,4 +1,4 @@
-"""Entry point: loads the command line (cli.py, inside the package or beside it) and runs it."""
+"""Entry point: loads the command line, cli.py inside the package or next to it, and runs it."""
 
 import importlib.util
 import signal
@@ -9,7 +9,7 @@ from phyradgs_cl import resource
 
 
 def load_cli() -> ModuleType:
-    """The module cli.py, wherever this installation keeps it."""
+    """Loads and returns the module cli.py. Raises ImportError or FileNotFoundError where the installation lacks it."""
     spec = importlib.util.spec_from_file_location("phyradgs_cl_cli", resource("cli.py"))
     if spec is None or spec.loader is None:
         raise ImportError("cli.py cannot be loaded: install phyradgs-cl again")
@@ -26,7 +26,7 @@ def main() -> None:
     except KeyboardInterrupt:  # while libraries load
         sys.stderr.write("phyradgs: interrupted, nothing written\n")
         status = 130
-    for number in (signal.SIGINT, signal.SIGTERM):  # the interpreter's own end would answer with a traceback
+    for number in (signal.SIGINT, signal.SIGTERM):  # a signal while the interpreter ends would print a traceback
         signal.signal(number, signal.SIG_IGN)
     sys.exit(status)
 

@@ -1,4 +1,4 @@
-"""Checks of values from users and files: each raises InputError about its subject, or returns."""
+"""Checks values from users and files. Each check raises InputError about its ``subject``, or returns."""
 
 import importlib
 import math
@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.text import suggest_name
 
-_LONGEST = 80
+_LONGEST = 80  # limit of the characters of a value in a message
 T = TypeVar("T")
 
 
@@ -41,12 +41,13 @@ def within(subject: str, value: float, lowest: float, highest: float) -> None:
 
 
 def ranged(default: T, lowest: float, highest: float, subject: str = "") -> T:
-    """Returns the default of a dataclass's field with the bounds that ``fields_within`` checks, and a name for messages."""
+    """Returns a dataclass's field with a default, and with the bounds and the name in messages for ``fields_within``."""
     return field(default=default, metadata={"range": (lowest, highest), "subject": subject})
 
 
 def fields_within(prefix: str, options: object) -> None:
-    """Checks every field of a dataclass that is ``ranged``, there or in a base class; numbers inside tuples one by one."""
+    """Raises InputError for a ``ranged`` field of a dataclass, or of a base class, out of its bounds. Numbers in tuples are
+    checked one by one. ``prefix`` comes before a field's name in messages."""
     own = [one for kind in reversed(type(options).__mro__) for one in getattr(kind, "__dataclass_fields__", {}).values()]
     for name, known in {one.name: one.metadata for one in own if "range" in one.metadata}.items():
         value = getattr(options, name)
@@ -63,7 +64,7 @@ def one_of(subject: str, value: object, allowed: Iterable[object]) -> None:
 
 
 def finite(subject: str, array: ArrayLike) -> None:
-    """Raises InputError if any element of ``array`` (any shape) is NaN or infinite; the message has the first."""
+    """Raises InputError, with the index of the first, if any element of ``array`` (any shape) is NaN or infinite."""
     good = np.isfinite(np.asarray(array))
     if not good.all():
         count = int(good.size - np.count_nonzero(good))
@@ -108,7 +109,7 @@ def whole(subject: str, value: float, lowest: int, highest: int) -> None:
 
 
 def package(name: str, use: str, install: str) -> ModuleType:
-    """Imports a package. Raises InputError with the command that installs it."""
+    """Imports a package. Raises InputError, with the command that installs it, where it is missing. ``use``: its purpose."""
     try:
         return importlib.import_module(name)
     except ImportError as error:
@@ -116,7 +117,7 @@ def package(name: str, use: str, install: str) -> ModuleType:
 
 
 def short_repr(value: object) -> str:
-    """Returns the repr of a wrong value, short enough for a message."""
+    """Returns the repr of a wrong value, cut to 80 characters for a message."""
     try:
         text = repr(value)
     except ValueError:  # Python refuses to print whole numbers of thousands of digits

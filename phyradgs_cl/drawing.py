@@ -1,5 +1,5 @@
-"""The parts that all figures share, of notebooks, reports and the documentation: colours, axes, curves, images. matplotlib
-is imported when something is drawn."""
+"""What figures in notebooks, reports and the documentation share: colours, axes, curves, images. matplotlib is imported
+when something is drawn."""
 
 import importlib
 import math
@@ -26,14 +26,14 @@ COLOURS = {
     "volume": "#dfe5ec",
 }
 INK, SOFT, FAINT, ACCENT, EXPOSED, EDGE, SAMPLE, BOX = COLOURS.values()
-_LONGEST_BAR = 0.3  # of a picture's width
+_LONGEST_BAR = 0.3  # limit of the scale bar's length, as a fraction of a picture's width
 _LOG_RATIO = 20.0  # largest over smallest value, above which an axis is logarithmic
 
 
 def new_figure(width_inch: float, height_inch: float) -> "Figure":
-    """Returns an empty figure. It is pyplot's where pyplot is imported, so that ``show()`` finds it."""
+    """Returns an empty figure. Where pyplot is imported it is a figure of pyplot, so that ``show()`` finds it."""
     if "ipykernel" in sys.modules:
-        with suppress(ImportError):  # a cell shows the figure that it ends with, once
+        with suppress(ImportError):  # makes a cell show, once, the figure that it returns
             importlib.import_module("matplotlib_inline.backend_inline")
     elif "matplotlib.pyplot" in sys.modules:
         return sys.modules["matplotlib.pyplot"].figure(figsize=(width_inch, height_inch), layout="constrained")
@@ -43,7 +43,7 @@ def new_figure(width_inch: float, height_inch: float) -> "Figure":
 
 
 def style_axes(axes: "Axes", x_label: str, y_label: str) -> None:
-    """Labels the axes, and draws two of the four sides and light lines across."""
+    """Labels the axes, hides the top and right sides, and draws light horizontal grid lines."""
     axes.set_xlabel(x_label, color=INK)
     axes.set_ylabel(y_label, color=INK)
     axes.spines[["top", "right"]].set_visible(False)

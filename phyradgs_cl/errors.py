@@ -8,9 +8,9 @@ from contextlib import contextmanager
 
 from phyradgs_cl.text import plain_text
 
-_OPTION = re.compile(r"(?<!\w)'[^']*'|--set |(?<![\w-])--([a-z][a-z-]*)")  # quoted commands and values stay
+_OPTION = re.compile(r"(?<!\w)'[^']*'|--set |(?<![\w-])--([a-z][a-z-]*)")  # quoted text matches whole, and stays
 _OTHER_NAMES = {"with": "others", "readout": "readout_axis", "air-mm": "air", "water-mm": "water", "hu": "hounsfield"}
-"""Options whose argument has another name."""
+"""By option, without dashes: the argument in Python, where it has another name."""
 
 
 class PhyradgsError(Exception):
@@ -37,35 +37,35 @@ class PhyradgsError(Exception):
 
 
 class InputError(PhyradgsError):
-    """A file, a dataset or an option is wrong."""
+    """Raised for a wrong file, dataset or option."""
 
 
 class NumericalError(PhyradgsError):
-    """Numbers are no longer finite."""
+    """Raised where numbers of an iteration are no longer finite."""
 
     exit_code = 3
 
 
 class OutputError(PhyradgsError):
-    """A result cannot be written: no room, no permission, or another run writes it."""
+    """Raised where a result cannot be written: no room, no permission, or another run writes it."""
 
     exit_code = 4
 
 
 class DeviceError(PhyradgsError):
-    """There is no OpenCL device, it fails, or a kernel does not build on it."""
+    """Raised where there is no OpenCL device, it fails, or a kernel does not build on it."""
 
     exit_code = 5
 
 
 class NoSuchDeviceError(InputError, DeviceError):
-    """The named device does not exist: a wrong option."""
+    """Raised where the named device does not exist, which is a wrong option."""
 
     exit_code = 2
 
 
 class OutOfMemoryError(DeviceError):
-    """The memory of the device or of the machine is exhausted."""
+    """Raised where the memory of the device or of the machine is exhausted."""
 
     exit_code = 6
 

@@ -1,6 +1,6 @@
-"""Time and memory of a reconstruction, from a few iterations of it. Two short runs of different length give the time per
-iteration and the time of everything else. A cloud of Gaussians grows under density control, so its short runs go through the
-whole schedule in fewer iterations."""
+"""Estimates the time and memory of a reconstruction from a few of its iterations. Two short runs of different length give
+the time per iteration and the time of everything else. A cloud of Gaussians grows under density control, so its short runs
+go through the whole schedule in fewer iterations."""
 
 import resource
 import sys
@@ -19,17 +19,17 @@ from phyradgs_cl.reconstructors import Reconstruction, RunPlan, method_of, recon
 from phyradgs_cl.reconstructors.splats.options import SplatOptions
 from phyradgs_cl.runtime import Runtime
 
-_SPLAT_TRIALS, _TRIALS = (20, 200), (1, 3)  # iterations
-_LEAST_DIFFERENCE_S = 0.3  # between the two trials, to be more than noise
-_LONGEST_TRIAL = 200
-_FEWEST_BETWEEN = 5  # iterations from one round of density control to the next, in a trial
+_SPLAT_TRIALS, _TRIALS = (20, 200), (1, 3)  # iterations of the two trials, of splats and of other methods
+_LEAST_DIFFERENCE_S = 0.3  # least difference of the trials' times, above noise
+_LONGEST_TRIAL = 200  # a trial of so many iterations is not prolonged
+_FEWEST_BETWEEN = 5  # least number of iterations between rounds of density control in a trial
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """seconds, host_bytes and device_bytes of a whole run; the seconds that the trials took. around_s: the
-    part of ``seconds`` outside the method: reading, comparing, writing. host_bytes: the process's largest resident memory,
-    with its buffers on a CPU device. device_bytes: the most memory in buffers at one time."""
+    """The time ``seconds`` and the memory of a whole run. trial_seconds: the time that the trials took. around_s: the part
+    of ``seconds`` outside the method, for reading, comparing and writing. host_bytes: the process's largest resident memory,
+    with its buffers on a CPU device. device_bytes: the largest memory in buffers at one time."""
 
     seconds: float
     host_bytes: int
@@ -55,9 +55,9 @@ class Estimate:
 def estimate(
     scan: Scan, plan: RunPlan, rt: Runtime, around: Callable[[Reconstruction], float] | None = None
 ) -> Estimate:
-    """Returns the time and memory of a plan, from short runs of it; a method without iterations runs once as a whole.
-    ``around`` returns the seconds that a run spends outside the method, from a result of it. The first trial builds the
-    kernels, as the run will."""
+    """Returns the time and memory of a plan, from short runs of it. A method without iterations, or that cannot be resumed,
+    runs once as a whole. ``around`` returns the seconds that a run spends outside the method, from a result of it. The first
+    trial builds the kernels, as the run will."""
     started = time.perf_counter()
     trials, total = _Trials(scan, plan, rt), getattr(plan.options, "iterations", None)
     few, more = getattr(plan.options, "TRIALS", _SPLAT_TRIALS if isinstance(plan.options, SplatOptions) else _TRIALS)
@@ -65,7 +65,7 @@ def estimate(
         seconds, each_s, total = trials.run(None), 0.0, 0
     elif total <= few:
         seconds = trials.run(total)
-        each_s = trials.run(total) / max(total, 1)  # with the kernels built
+        each_s = trials.run(total) / max(total, 1)  # the first run also built the kernels
     else:
         seconds, each_s = trials.extrapolated(few, more, total)
     around_s = around(trials.result) if around else 0.0
@@ -76,13 +76,13 @@ def estimate(
 
 
 class _Trials:
-    """Short runs of one plan. ``result`` and ``device_bytes`` are of the last and longest."""
+    """Short runs of one plan. ``result`` and ``device_bytes`` are those of the last run, which is the longest."""
 
     def __init__(self, scan: Scan, plan: RunPlan, rt: Runtime) -> None:
         self.scan, self.plan, self.rt = scan, plan, rt
 
     def run(self, iterations: int | None) -> float:
-        """Returns the seconds of a number of iterations, or of the method as a whole."""
+        """Runs some iterations, or, for None, the method as a whole. Returns the seconds that it took."""
         options = self.plan.options
         plan = self.plan if iterations is None else replace(self.plan, options=shortened(options, iterations))
         self.rt.reset_peak()
@@ -106,17 +106,17 @@ class _Trials:
 
     @property
     def _control_s(self) -> float:
-        """The seconds of the last run in density control, which is no part of an iteration."""
+        """The seconds that the last run spent in density control, which is no part of an iteration."""
         return float(self.result.facts.get("density_control_seconds", 0.0))
 
     def _rounds_due(self, total: int) -> float:
-        """Rounds of density control in the whole run, as a multiple of those in the last trial."""
+        """Returns the number of rounds of density control in the whole run over that in the last trial; 0 without any."""
         rounds = self.result.facts.get("density_control_rounds", 0)
         return sum(self.plan.options.control.is_due(i, total) for i in range(1, total + 1)) / rounds if rounds else 0.0
 
 
 def shortened(options: Any, iterations: int) -> Any:
-    """Returns the options of the same run in fewer iterations; all times in the schedule of splats shrink with it."""
+    """Returns the options of the same run in fewer iterations, with the schedule of splats shortened in proportion."""
     if not isinstance(options, SplatOptions) or iterations >= options.iterations:
         return replace(options, iterations=min(iterations, options.iterations))
     share, control = iterations / options.iterations, options.control
@@ -138,7 +138,8 @@ def seconds_around(path: Path, scan: Scan, result: Reconstruction) -> float:
 
 
 def peak_host_bytes() -> int:
-    """Returns the largest resident memory of this process so far. In Linux the system's call would add its parent's."""
+    """Returns the largest resident memory in bytes of this process so far. On Linux it is read from /proc, since getrusage
+    would include the parent's."""
     if peak_bytes := in_use_bytes("VmHWM:"):
         return peak_bytes
     largest = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss

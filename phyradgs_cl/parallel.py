@@ -1,5 +1,5 @@
-"""The processes (ranks) that work on the same scan: their launch, communication, shares of work; failing together; sums of
-floats whose bits depend neither on the order nor on the number of ranks.
+"""The processes (ranks) that work on the same scan: their launch, communication and parts of the work. Failures of some end
+all. Sums of floats have the same bits for any order and number of ranks.
 
 mpi4py is imported only where several processes were launched. For a sum every row is scaled by a power of two and rounded to
 integers of 64 bits, with the largest scale for which the sum cannot overflow. Adding integers is exact and associative. For
@@ -17,20 +17,19 @@ import numpy as np
 
 from phyradgs_cl.errors import InputError
 
-# (rank, size, rank on this machine, ranks on this machine) in the names of the launchers
+# Environment variables of each launcher for (rank, size, rank on this machine, ranks on this machine).
 _NAMES = ("RANK", "SIZE", "LOCAL_RANK", "LOCAL_SIZE")
 _LAUNCHERS = (
     *(tuple(f"{mpi}_COMM_WORLD_{name}" for name in _NAMES) for mpi in ("OMPI", "MV2")),
     ("PMI_RANK", "PMI_SIZE", "MPI_LOCALRANKID", "MPI_LOCALNRANKS"),
     ("PMIX_RANK", "SLURM_STEP_NUM_TASKS", "SLURM_LOCALID", "SLURM_STEP_TASKS_PER_NODE"),
 )
-# How long rank 0 waits for other failing ranks, and how much longer each next rank waits, so that one rank reports alone
-_PATIENCE_S = 5.0
-_LATER_S = 0.5
-_MOST_VALUES = 1 << 26  # of one call: counts of MPI before its version 4 end at 2³¹
-_BITS = 62
-_NOT_FINITE = 100_000  # more than any float's exponent
-_BLOCK_VALUES = 1 << 20
+_PATIENCE_S = 5.0  # time that rank 0 waits for other failing ranks
+_LATER_S = 0.5  # each next rank waits so much longer, so that only one reports
+_MOST_VALUES = 1 << 26  # limit of the values in one call: before version 4, MPI's counts end at 2³¹
+_BITS = 62  # bits of an int64 that a sum may use
+_NOT_FINITE = 100_000  # stands for the exponent of a row that is not finite: more than any float's
+_BLOCK_VALUES = 1 << 20  # values that are summed at a time
 
 
 @dataclass(frozen=True)
@@ -59,7 +58,7 @@ def launched(environment: Mapping[str, str] = os.environ) -> Launch:
 
 
 def _count(text: str | None) -> int | None:
-    """A count; SLURM writes 4(x2) for four on each of two machines."""
+    """Returns a count; None for other text. SLURM writes 4(x2) for four on each of two machines."""
     number = (text or "").split("(")[0].split(",")[0]
     return int(number) if number.isdigit() else None
 
@@ -94,7 +93,7 @@ class Communicator:
         return values
 
     def all_fail(self) -> bool:
-        """Waits, on a rank that fails, for the others: True if all ranks fail within a few seconds."""
+        """Waits, on a rank that fails, for the others. Returns True if all ranks fail within a few seconds."""
         return True
 
     def abort(self, status: int) -> NoReturn:
@@ -193,7 +192,7 @@ def failing_together(ranks: Communicator, report_error: Callable[[BaseException]
 
 
 def span(count: int, parts: int, part: int) -> range:
-    """The ``part``-th of ``parts`` runs of 0 … count−1, whose lengths differ by at most one."""
+    """Returns the ``part``-th of ``parts`` consecutive ranges of 0 … count−1, whose lengths differ by at most one."""
     return range(part * count // parts, (part + 1) * count // parts)
 
 
@@ -219,14 +218,15 @@ def exact_sum(ranks: Communicator, parts: Sequence[np.ndarray], shape: tuple[int
 
 def as_integers(values: np.ndarray, shift: np.ndarray, not_finite: np.ndarray) -> np.ndarray:
     """Returns values (rows, n) times 2^shift (rows,), rounded to int64; 0 in rows that are not finite."""
-    wide = np.multiply(values, np.ldexp(1.0, shift)[:, None], dtype=np.float64)  # by a power of two: exact
+    wide = np.multiply(values, np.ldexp(1.0, shift)[:, None], dtype=np.float64)  # exact, as a power of two
     if not_finite.any():
         wide[not_finite] = 0
     return np.rint(wide, out=wide).astype(np.int64)
 
 
 def _largest_exponents(ranks: Communicator, parts: Sequence[np.ndarray], rows: int) -> np.ndarray:
-    """Returns the least e with |values| < 2^e of every row over all ranks (int64); rows that are not finite have a mark."""
+    """Returns for each row (rows,) int64 the least e with |values| < 2^e over all ranks; ``_NOT_FINITE`` where not
+    finite."""
     exponents = np.full(rows, -300, np.int64)
     for part in parts:
         largest = np.abs(part).max(axis=1, initial=0.0).astype(np.float64)  # NaN where there is one

@@ -1,4 +1,4 @@
-"""Progress of a command on stderr: a line that is rewritten on a terminal or in a notebook, else one every ten seconds."""
+"""Shows a command's progress on stderr: a line rewritten on a terminal or in a notebook, else a line every ten seconds."""
 
 import sys
 import time
@@ -10,7 +10,7 @@ from phyradgs_cl.reconstructors import Progress
 from phyradgs_cl.text import clock
 
 _OVER = "\r\x1b[K"  # clears the line
-_TERMINAL_EVERY_S, _ELSEWHERE_EVERY_S = 0.2, 10.0
+_TERMINAL_EVERY_S, _ELSEWHERE_EVERY_S = 0.2, 10.0  # least time between two lines
 
 
 def has_reader() -> bool:
@@ -28,7 +28,7 @@ class Ticker:
     def __init__(self, noun: str) -> None:
         self.noun = noun
         self.is_terminal = has_reader()
-        self._width = 0  # of the line in a notebook, which cannot clear one
+        self._width = 0  # of the last line: a notebook cannot clear it, so spaces overwrite it
         self.started = self.last = time.monotonic()
         self.first: int | None = None
         self.first_share = 0.0
@@ -41,19 +41,19 @@ class Ticker:
         self.end_line()
 
     def end_line(self) -> None:
-        """Ends the line of a counter, and clears that of a stage."""
+        """Ends the open line with a line feed if it counts; clears it if it shows a stage."""
         if self.is_open:
             _write("" if self.is_counting else self._over(""), ends_line=self.is_counting)
         self.is_open = False
 
     def stage(self, text: str) -> None:
-        """Shows the present stage at once, on a terminal."""
+        """Shows the current stage in place of the line, on a terminal; elsewhere nothing."""
         if self.is_terminal:
             _write(self._over(text), ends_line=False)
             self.is_open, self.is_counting = True, False
 
     def end(self, text: str) -> None:
-        """Replaces the line by a last one, on a terminal."""
+        """Replaces the line by a last one that stays, on a terminal; elsewhere it shows nothing."""
         if self.is_terminal:
             _write(self._over(text), ends_line=False)
             self.is_open = self.is_counting = True
@@ -84,7 +84,7 @@ class Ticker:
         self.is_open = self.is_counting = self.is_terminal
 
     def _over(self, line: str) -> str:
-        """Returns the text that replaces the present line."""
+        """Returns the text that replaces the open line by ``line``."""
         if not _in_notebook():
             return f"{_OVER}{line}"
         before, self._width = self._width, len(line)
@@ -99,5 +99,5 @@ class Ticker:
 
 
 def _write(text: str, ends_line: bool = True) -> None:
-    with suppress(OSError):  # a full disk or a closed pipe behind stderr is no reason to stop
+    with suppress(OSError):  # a full disk or a closed pipe behind stderr must not stop a run
         typer.echo(text, err=True, nl=ends_line)

@@ -1,4 +1,4 @@
-"""Words that have left the program, and what to write now."""
+"""Options and values that the program no longer has, and what to write in their place."""
 
 from phyradgs_cl.errors import InputError
 
@@ -37,15 +37,15 @@ REMOVED = {
     "--what drift": "correct the frames by 'phyradgs prepare --steps air'",
     "--what start": "leave it out: another start only turns the object about the axis",
 }
-"""By word: a value with its option, or an option as Python spells it, with the method that it left if others keep it."""
+"""The remedy by word: a value with its option, or an option in Python's spelling, with its method where others keep it."""
 
 
 def removal(word: str, subject: str = "") -> InputError | None:
-    """Returns the error with the replacement if ``word`` has left; ``subject`` names it where the word alone does not."""
+    """Returns the InputError, with the remedy, for a word in ``REMOVED``; None for others. ``subject``: for the message."""
     return InputError(subject or word, "a word of an earlier version", "", REMOVED[word]) if word in REMOVED else None
 
 
 def refuse_removed(word: str, subject: str = "") -> None:
-    """Raises that error."""
+    """Raises the error of ``removal``, if there is one."""
     if (error := removal(word, subject)) is not None:
         raise error

@@ -28,8 +28,8 @@ else:
 
 @dataclass(frozen=True)
 class Settings:
-    """Options by name, unchecked, and the place where each was given, for errors. device: as from ``device_wish``; memory:
-    the device's limit in bytes."""
+    """Options by name, unchecked, and the place where each was given, for errors. device: as from ``device_wish``. memory:
+    limit of the device's memory in bytes; None: what the device has."""
 
     values: Mapping[str, Any]
     origins: Mapping[str, str]
@@ -40,8 +40,9 @@ class Settings:
     def plan(
         self, initial: Path | None = None, object_motion: Path | None = None, mu_water_per_mm: float | None = None
     ) -> methods.RunPlan:
-        """Returns the checked plan of a run that starts from the volume file ``initial``, if any, of an object that moves as
-        the file ``object_motion`` says, if any. ``mu_water_per_mm``: of a first volume in Hounsfield units."""
+        """Returns the checked plan of a run. ``initial``: the file of a volume to start from. ``object_motion``: the file of
+        the object's deformation. ``mu_water_per_mm``: water's attenuation, for a first volume in Hounsfield units. Raises
+        InputError for options that are unknown, wrong or out of range."""
         if mu_water_per_mm is not None and initial is None:
             raise InputError("--mu-water-per-mm", "given without --initial", "a first volume in Hounsfield units")
         values = dict(self.values)
@@ -50,7 +51,7 @@ class Settings:
             "seed": values.pop("seed", 0), "initial": None if initial is None else _initial_volume(initial, mu_water_per_mm),
             "object_motion": None if object_motion is None else _object_motion(object_motion),
         }  # fmt: skip
-        # an option of the command line means what --help says, whatever the method calls its own
+        # an option of the command line means preprocessing, as --help says, also if the method has one of this name
         flags = [f.name for f in fields(methods.Preprocessing) if self.origins.get(f.name) == _flag(f.name)]
         method = method or methods.DEFAULT_METHOD
         refuse_removed(f"--motion {values.get('motion')}", self.origins.get("motion", ""))
@@ -58,7 +59,7 @@ class Settings:
             return methods.plan_run(method, values, preset=preset, of_preprocessing=flags, **run)
 
     def preprocessing(self, defaults: Mapping[str, object]) -> methods.Preprocessing:
-        """Returns the checked preprocessing, of no method, with ``defaults`` for what nobody gave."""
+        """Returns the checked preprocessing alone, without a method, with ``defaults`` for options that were not given."""
         with self.naming_origins():
             return methods.preprocessing_of({**defaults, **self.values})
 
@@ -68,7 +69,7 @@ class Settings:
 
     @contextmanager
     def naming_origins(self, method: str = "") -> Iterator[None]:
-        """Makes errors of the body name the line of the file, or the --set, that holds the wrong option."""
+        """Makes errors of the body name the key in the file, or the --set, that holds the wrong option."""
         try:
             yield
         except PhyradgsError as error:
@@ -90,7 +91,8 @@ class Settings:
 def read_settings(
     config: Path | None, given: Mapping[str, object], assignments: Sequence[str] = ()
 ) -> Settings:
-    """Reads a configuration file. ``assignments`` NAME=VALUE win over it, and options ``given`` (not None) win over both."""
+    """Reads a configuration file. ``assignments`` NAME=VALUE replace its values, and options ``given``, if not None, replace
+    both. Raises InputError for a wrong file, assignment, device or memory."""
     values = read_config(config)
     origins = {key: f"config {config}: {key}" for key in values}
     for text in assignments:
@@ -128,7 +130,7 @@ def _flag(key: str) -> str:
 
 
 def _origin_of(subject: str, origins: Mapping[str, str]) -> str | None:
-    """Where the option that ``subject`` names stands, with the way into its table; None where nobody gave it."""
+    """Returns where the option that ``subject`` names was given, with its dotted name in a file; None where it was not."""
     words = re.findall(r"option ([\w-]+)", subject) or re.sub(r"\(.*\)", "", subject).split()[-1:]
     first, *rest = [part for word in words for part in word.lstrip("-").split(".")] or [""]
     origin = origins.get(first.replace("-", "_"))
@@ -136,12 +138,12 @@ def _origin_of(subject: str, origins: Mapping[str, str]) -> str | None:
 
 
 def read_config(path: Path | None) -> dict[str, Any]:
-    """The content of a TOML file, nothing for None. Raises InputError for a file that is missing or not TOML."""
+    """Returns the content of a TOML file; {} for None. Raises InputError for a file that is missing or not TOML."""
     return {} if path is None else read_toml(path, f"--config {path}")
 
 
 def assignment(text: str) -> dict[str, Any]:
-    """NAME=VALUE as a line of TOML; a value that is not TOML is a word, so that prior=dct needs no quotes."""
+    """Parses NAME=VALUE as TOML; a value that is not TOML is text, as in prior=dct. Raises InputError for other text."""
     name, sign, value = text.partition("=")
     if not (sign and name.strip()):
         raise InputError("--set", repr(text), "NAME=VALUE", "write for example tv_weight=0.002")
@@ -152,7 +154,7 @@ def assignment(text: str) -> dict[str, Any]:
 
 
 def merge(settings: dict[str, Any], changes: Mapping[str, Any]) -> None:
-    """Puts ``changes`` into ``settings``, table into table."""
+    """Puts ``changes`` into ``settings`` in place, merging nested tables."""
     for key, value in changes.items():
         if isinstance(value, Mapping) and isinstance(settings.get(key), dict):
             merge(settings[key], value)
@@ -161,7 +163,8 @@ def merge(settings: dict[str, Any], changes: Mapping[str, Any]) -> None:
 
 
 def device_wish(value: object, subject: str = "--device") -> str | None:
-    """The device asked for, or None; an empty wish would otherwise pass for none, or for any."""
+    """Returns the wanted device, or None for the best one. Raises InputError about ``subject`` for empty text, which would
+    match every name."""
     if value is None:
         return None
     if not isinstance(value, str) or not value.strip():

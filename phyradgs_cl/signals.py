@@ -1,7 +1,7 @@
-"""Ctrl-C and SIGTERM: one flag that both set. The first signal raises KeyboardInterrupt, except in a loop, and where a
-result is written: there it waits. A second press always raises. The flag is installed while the outermost block is open, and
-nothing is kept in the module. Signals belong to the main thread; in other threads the blocks do nothing. A signal that
-the user has set to be ignored stays ignored."""
+"""Handles Ctrl-C and SIGTERM by one flag that both set. The first signal raises KeyboardInterrupt, except in a loop of
+iterations and while a result is written: there it waits. A second one, over a second later, always raises. The flag is
+installed while the outermost block is open, and nothing is kept in the module. Signals belong to the main thread; in other
+threads the blocks do nothing. A signal that the user has set to be ignored stays ignored."""
 
 import signal
 import threading
@@ -15,16 +15,16 @@ from phyradgs_cl.errors import DeviceError
 NOTHING = "interrupted, nothing written"
 COMPLETE = "interrupted, the output is complete"
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
-_SAME_PRESS_S = 1.0  # wrappers (timeout, uv) send again what the terminal has sent already
+_SAME_PRESS_S = 1.0  # a signal so soon after the first counts as the same: wrappers (timeout, uv) send it again
 
 
 class InterruptedAfterwards(KeyboardInterrupt):
-    """A signal came during work that has been finished all the same."""
+    """Raised where a signal came during work that was nevertheless finished."""
 
 
 class StopFlag:
-    """The handler of both signals. waits: whether the first one waits; keeps: whether it waits also after a loop. farewell:
-    what the command line says where a signal has ended it."""
+    """The handler of both signals. waits: the first signal only sets the flag. keeps: it also does so after the end of a
+    loop. farewell: the message of the command line when a signal has ended it."""
 
     def __init__(self) -> None:
         self.waits = self.keeps = False
@@ -50,8 +50,8 @@ class StopFlag:
 
 @contextmanager
 def answer_signals(*, takes_default: bool = True) -> Iterator[StopFlag]:
-    """Installs the flag, and yields the one that is there already. takes_default: for SIGTERM, which otherwise ends the
-    process as it always does."""
+    """Installs a flag as handler and yields it, or yields the one that is installed already. takes_default: also replaces a
+    default handler, as SIGTERM's, which ends the process at once."""
     is_main = threading.current_thread() is threading.main_thread()
     installed, flag = _installed() if is_main else None, StopFlag()
     if installed is not None or not is_main:
@@ -72,15 +72,15 @@ def answer_signals(*, takes_default: bool = True) -> Iterator[StopFlag]:
 
 @contextmanager
 def stop_on_interrupt() -> Iterator[StopFlag]:
-    """For a loop: the first signal sets ``is_set``."""
+    """Makes the first signal in the body, a loop of iterations, only set ``is_set`` of the flag that it yields."""
     with _waiting() as flag:
         yield flag
 
 
 @contextmanager
 def keep_finished_work() -> Iterator[None]:
-    """For a loop and the writing of its result: signals wait from the end of the first loop in the body on. A signal that
-    has waited becomes InterruptedAfterwards at the end."""
+    """Makes signals wait from the first loop in the body to the end of the body, so that the loop's result is written. A
+    signal that has waited then raises InterruptedAfterwards."""
     with _waiting(waits=False) as flag:
         keeps, flag.keeps = flag.keeps, True
         try:
@@ -92,7 +92,7 @@ def keep_finished_work() -> Iterator[None]:
 
 @contextmanager
 def finish_despite_interrupt() -> Iterator[None]:
-    """For short work such as writing: a signal waits, then becomes InterruptedAfterwards."""
+    """Makes a signal wait during short work such as writing. It then raises InterruptedAfterwards."""
     with _waiting() as flag:
         yield
     flag.farewell = COMPLETE
@@ -106,16 +106,17 @@ def exit_status() -> int:
 
 
 def farewell() -> str:
-    """Returns what the command line says where a signal ends the present command."""
+    """Returns the message of the command line for a command that a signal has ended."""
     flag = _installed()
     return NOTHING if flag is None else flag.farewell
 
 
 @contextmanager
 def _waiting(waits: bool = True) -> Iterator[StopFlag]:
-    """Makes the first signal wait in the body; if not ``waits``, as it does around it.
+    """Makes the first signal wait in the body; if not ``waits``, it waits there only if it does so around the body.
 
-    A device that fails after a signal has only lost its compiler, which gets the signal too: that is KeyboardInterrupt."""
+    A device that fails after a signal has only lost its compiler, which got the signal too: this raises
+    KeyboardInterrupt."""
     with answer_signals(takes_default=False) as flag:
         before, flag.waits = flag.waits, flag.waits or waits
         try:
@@ -125,7 +126,7 @@ def _waiting(waits: bool = True) -> Iterator[StopFlag]:
                 raise
             raise KeyboardInterrupt from error
         finally:
-            flag.waits = before or (flag.keeps and flag.waits)  # the block around a loop keeps its work
+            flag.waits = before or (flag.keeps and flag.waits)  # after a loop the block around it still keeps its result
 
 
 def _installed() -> StopFlag | None:

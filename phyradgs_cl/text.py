@@ -1,4 +1,4 @@
-"""Text of files, users and other programs, made printable and compared with known names; numbers and times as text."""
+"""Makes text of files, users and other programs printable, compares names with known ones, and formats numbers and times."""
 
 import difflib
 import math
@@ -7,13 +7,13 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import fields
 from typing import Any
 
-# Control characters except tab and line feed: they move a terminal's cursor or end a string. Half surrogate pairs: Python
-# puts them in the place of bytes that are not UTF-8, and nothing encodes them.
+# Control characters except tab and line feed move a terminal's cursor or end a string. Half surrogate pairs stand in Python
+# for bytes that are not UTF-8, and cannot be encoded.
 _UNPRINTABLE = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\ud800-\udfff]")
 
 
 def plain_text(text: str) -> str:
-    """Returns ``text`` with a replacement character for each that a terminal, a page or a file may refuse."""
+    """Returns ``text`` with U+FFFD in place of each character that a terminal, a page or a file may refuse."""
     return _UNPRINTABLE.sub("\ufffd", text)
 
 
@@ -61,11 +61,11 @@ def repr_of_changes(thing: Any) -> str:
 
 
 def to_digits_of(value: float, deviation: float) -> str:
-    """Returns a value with as many decimals as two digits of its deviation have."""
+    """Returns a value as text with the decimals of two significant digits of its deviation."""
     return f"{value:.{max(0, 1 - math.floor(math.log10(max(deviation, 1e-12))))}f}"
 
 
 def clock(seconds: float) -> str:
-    """Returns minutes:seconds, or hours:minutes:seconds."""
+    """Returns a time in s as minutes:seconds, or hours:minutes:seconds from an hour on."""
     minutes, rest = divmod(int(seconds + 0.5), 60)
     return f"{minutes // 60}:{minutes % 60:02d}:{rest:02d}" if minutes >= 60 else f"{minutes}:{rest:02d}"

@@ -9,18 +9,18 @@ from phyradgs_cl.acquisition.shutter import Shutter
 from phyradgs_cl.acquisition.time_cells import TimeCells
 from phyradgs_cl.acquisition.trajectory import Trajectory, body_frames, is_parallel
 
-_SAME_TIME = 1e-6  # a frame shares the first one's grid of times if it begins on it to this fraction of a cell
-_NOTHING = 1e-9  # a smaller fraction of a line's window is rounding
-_INSTANT = 1e-9  # a window shorter than this fraction of the frame's span counts as a moment
-_OVERHANG = 0.1  # a line stays in a segment up to this fraction of a segment beyond its end
-_TURN_SAMPLES = 32
-_TURN_FACTOR = 0.32  # relative error per squared radian of turn
-_HARMLESS_PEAK = 4.0  # largest line integral whose averaging over a segment does no harm
-_MOST_SEGMENTS = 1000
+_SAME_TIME = 1e-6  # tolerance, as a fraction of a cell: a frame that begins on frame 0's grid of times shares it
+_NOTHING = 1e-9  # a smaller share of a line's window in a cell is rounding, and becomes 0
+_INSTANT = 1e-9  # a line's window shorter than this fraction of the frame's lit span counts as an instant
+_OVERHANG = 0.1  # a line's window that reaches at most this fraction of a segment into it has no part there
+_TURN_SAMPLES = 32  # intervals of the lit span in which the speed of the view's turn is measured
+_TURN_FACTOR = 0.32  # a frame's relative RMS error per squared radian of the view's turn in a segment
+_HARMLESS_PEAK = 4.0  # largest line integral at which averages of intensities need no further segments
+_MOST_SEGMENTS = 1000  # limit of the segments that ``segments_for`` chooses for a frame
 
 
 Served = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
-"""The used cells, their first lines, their last lines, and the order that sorts the first lines."""
+"""Indices of the cells that serve a line, their [first, stop) lines, and the order that sorts them by first line."""
 
 
 def static_cells(trajectory: Trajectory, shutter: Shutter, frame: int, start_s: float, lines: int) -> TimeCells:
@@ -31,7 +31,7 @@ def static_cells(trajectory: Trajectory, shutter: Shutter, frame: int, start_s: 
 def static_start_cells(
     trajectory: Trajectory, shutter: Shutter, frame: int, start_s: float, lines: int
 ) -> TimeCells:
-    """Returns one cell at the frame's first light. The volume is then rotated by half the span."""
+    """Returns one cell at the frame's first light. A volume is then rotated by half the arc of the lit span."""
     return _single_cell(trajectory, shutter, frame, start_s + shutter.lit_span_s[0], lines)
 
 
@@ -79,15 +79,16 @@ def per_line_cells(
 def common_time_cells(
     trajectory: Trajectory, shutter: Shutter, frame: int, frame_start_s: np.ndarray, lines: int, samples: int
 ) -> TimeCells:
-    """Returns cells of one exposure / ``samples`` each, on one grid of times for all lines, from first light to last.
+    """Returns cells on one grid of times for all lines, from first light to last. A cell lasts exposure / ``samples``.
 
     A line takes from each cell the fraction of its own window that lies in the cell: P(v) = Σ_k w_k(v) P(θ(t_k), v). Here
-    t_k is the cell's middle and w_k(v) = |window(v) ∩ cell k| / |window(v)|. Operators project the many lines of a pose
-    together. This is the paper's strip concatenation with fractional strips.
+    t_k is the cell's middle and w_k(v) = |window(v) ∩ cell k| / |window(v)|. So one projection from a pose serves many
+    lines. This is the paper's strip concatenation with fractional strips.
 
-    frame_start_s (F,): the starts of all frames. Frames that begin on the first one's grid share poses where they overlap
-    in time, as in a scan without gaps. Nothing can be shared in an exposure of 0 s, or if a cell is shorter than the readout
-    of a line. Then each line gets its own times."""
+    frame_start_s (F,): the starts of all frames in s. Frames that begin on frame 0's grid share poses where they overlap
+    in time, as in a scan without gaps. Lines share nothing in an exposure of 0 s, or where a cell is shorter than the
+    readout of a line: the cells are then those of ``per_line_cells``. With a pulsed beam, the exposure is its longest lit
+    part."""
     start_s = float(frame_start_s[frame])
     windows_s = shutter.line_windows_s(lines)
     length_s = float(np.ptp(windows_s, axis=1).max())
@@ -96,7 +97,7 @@ def common_time_cells(
     if length_s <= 0 or last_s - first_s > lines * step_s:
         return per_line_cells(trajectory, shutter, frame, start_s, lines, samples if length_s > 0 else 1)
     edges_s, share, (used, line_start, line_stop, order) = _common_shares(windows_s.tobytes(), samples)
-    latest_s = float(np.max(frame_start_s)) + last_s - step_s / 2  # a trajectory may end with the scan
+    latest_s = float(np.max(frame_start_s)) + last_s - step_s / 2  # a trajectory's table may end with the last exposure
     middle_s = np.minimum(_middles_s(frame_start_s, frame, edges_s), latest_s)[used]
     table = cell_table(trajectory, shutter, frame, middle_s, line_start, line_stop, np.ones(used.size), lines)
     return replace(table, line_share=share[used][order])
@@ -104,7 +105,7 @@ def common_time_cells(
 
 @lru_cache(maxsize=8)  # all frames of a scan have the same windows
 def _common_shares(windows: bytes, samples: int) -> tuple[np.ndarray, np.ndarray, Served]:
-    """Returns cell edges (K + 1,), each line's share (K, lines) of its window in each cell, and the ``_served_lines``.
+    """Returns cells' edges (K + 1,) in s, ``_shares`` (K, lines) of lines' windows in them, and their ``_served_lines``.
 
     windows: bytes of the windows (lines, 2), in s after a frame's start. Do not write to the arrays: they are cached."""
     windows_s = np.frombuffer(windows, np.float64).reshape(-1, 2)
@@ -116,7 +117,7 @@ def _common_shares(windows: bytes, samples: int) -> tuple[np.ndarray, np.ndarray
 
 
 def _served_lines(served: np.ndarray) -> Served:
-    """Returns which cells serve a line, with their first and last lines and the order. served: bool (K, lines)."""
+    """Returns ``Served`` from a table, bool (K, lines), of the lines that each of K cells serves."""
     used = np.flatnonzero(served.any(axis=1))
     line_start = served[used].argmax(axis=1)
     line_stop = served.shape[1] - served[used, ::-1].argmax(axis=1)
@@ -124,7 +125,8 @@ def _served_lines(served: np.ndarray) -> Served:
 
 
 def _middles_s(frame_start_s: np.ndarray, frame: int, edges_s: np.ndarray) -> np.ndarray:
-    """Returns the middles of the cells in s. Frames on the first one's grid get bitwise equal times for common cells."""
+    """Returns the mid-times (K,) in s of a frame's cells, from their edges (K + 1,) in s after its start. Frames on frame
+    0's grid get bitwise equal times for common cells."""
     step_s = edges_s[1] - edges_s[0]
     start_s, origin_s = float(frame_start_s[frame]), float(frame_start_s[0])
     cells = (start_s - origin_s) / step_s
@@ -178,7 +180,7 @@ def _line_times(windows_s: np.ndarray, edges_s: np.ndarray) -> np.ndarray:
     A line that reaches only a little way into a segment stays in the neighbouring one, which saves footprints."""
     length_s = edges_s[1] - edges_s[0]
     count = len(edges_s) - 1
-    opens, closes = ((windows_s - edges_s[0]) / length_s).T  # in segments after the first light
+    opens, closes = ((windows_s - edges_s[0]) / length_s).T  # in segments' lengths after first light
     first, last = _segments_of_lines(opens, closes, count)
     index = np.arange(count)[:, None]
     start = np.where(index == first, opens, index)
@@ -191,8 +193,9 @@ def _line_times(windows_s: np.ndarray, edges_s: np.ndarray) -> np.ndarray:
 
 
 def _segments_of_lines(opens: np.ndarray, closes: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the first and last segment (lines,) of every line. Those that it covers by at most ``_OVERHANG`` are left
-    out."""
+    """Returns the first and last segment (lines,) of every line, from its window in segments' lengths after first light.
+
+    A segment at either end is left out where the window covers at most ``_OVERHANG`` of it."""
     first = np.clip(np.floor(opens), 0, count - 1)
     last = np.clip(np.ceil(closes) - 1, first, count - 1)
     first = np.where((first < last) & (first + 1 - opens <= _OVERHANG), first + 1, first)
@@ -208,7 +211,8 @@ def segments_for(
 
     Both errors grow with the square of the view's turn in a segment. The factor was measured (benchmarks/time_exact.py) for
     Gaussians of 0.5 to 4 % of the half-width. intensity_peak: the largest line integral where the detector averages
-    intensities, else 0. Half of their variance in a segment remains; up to a peak of 4 the other errors are larger."""
+    intensities, else 0. Half the variance of the line integrals in a segment then remains as an error. Up to a peak of 4 it
+    is the smaller one."""
     first_s, last_s = shutter.lit_span_s
     pose = trajectory.pose(frame, start_s + np.linspace(first_s, last_s, _TURN_SAMPLES + 1))
     fastest_rad = float(np.max(_turns_rad(pose))) * _TURN_SAMPLES

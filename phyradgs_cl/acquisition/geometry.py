@@ -16,8 +16,8 @@ from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
 
 POSE_LENGTH = 12
-_MOST_VOXELS_AWAY = 1e6  # largest distance of a source: float32 moves its rays by 6 % of a voxel, at 1e7 by half of one
-_STEEP = 1e-2  # squared sine of a ray's angle to the z axis: where a steeper ray passes the axis is not certain
+_MOST_VOXELS_AWAY = 1e6  # limit of the source's distance: float32 displaces rays by 6 % of a voxel, at 1e7 by half of one
+_STEEP = 1e-2  # least squared sine of a ray's angle to z: where a steeper ray passes the axis is undetermined
 
 
 @dataclass(frozen=True)
@@ -109,7 +109,7 @@ GEOMETRIES = (ConeGeometry, ParallelGeometry)
 
 
 def _check_panel(geometry: Geometry) -> None:
-    """Checks a geometry's panel and makes its fields tuples, so that geometries can be compared. Raises InputError."""
+    """Converts a geometry's fields to tuples, so that geometries can be compared. Raises InputError for impossible ones."""
     counts = checks.numbers("detector_shape", geometry.detector_shape, (2,))
     if (counts < 1).any() or (counts != np.floor(counts)).any():
         raise InputError("detector_shape", str(geometry.detector_shape), "two counts (rows, columns) of at least 1")
@@ -122,8 +122,8 @@ def _check_panel(geometry: Geometry) -> None:
 
 
 def _panel_at(geometry: Geometry, angle_rad: np.ndarray | float) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the unit vector from the axis to the source (..., 3), and pixel (0, 0) and the two steps (..., 9). The
-    panel's plane contains the axis."""
+    """Returns the unit vector (..., 3) from the axis to the source, and the last 9 numbers (..., 9) of the pose in mm of a
+    panel whose plane contains the axis."""
     angle = np.asarray(angle_rad, dtype=np.float64)
     cos, sin, zero = np.cos(angle), np.sin(angle), np.zeros_like(angle)
     u_hat = np.stack([-sin, cos, zero], -1)
@@ -151,7 +151,7 @@ def _positive_mm(name: str, value: object, shape: tuple[int, ...]) -> None:
 
 
 def pixel_centres(pose: np.ndarray, detector_shape: tuple[int, int]) -> np.ndarray:
-    """Returns the world coordinates (..., nv, nu, 3) of all pixel centres for poses (..., 12)."""
+    """Returns the world coordinates (..., nv, nu, 3) in mm of all pixel centres for poses (..., 12)."""
     nv, nu = detector_shape
     pose = np.asarray(pose, dtype=np.float64)[..., None, None, :]
     columns, rows = np.arange(nu)[None, :, None], np.arange(nv)[:, None, None]
@@ -224,8 +224,8 @@ def default_grid(geometry: Geometry, poses: np.ndarray | None = None) -> Grid:
 
 
 def _travel_mm(poses: np.ndarray, geometry: Geometry) -> tuple[float, float]:
-    """Returns the lowest and highest z at which rays of poses (F, 12) to the panel's middle pass the z axis. A panel off
-    the central ray counts as on it."""
+    """Returns the lowest and highest z in mm at which rays of poses (F, 12) to the panel's middle pass the z axis. The
+    geometry's offset of the panel is taken out first."""
     (rows, columns), (off_v, off_u) = geometry.detector_shape, geometry.detector_offset_mm
     start, first, step_u, step_v = (poses[:, i : i + 3] for i in (0, 3, 6, 9))
     at_v, at_u = ((n - 1) / 2 - off / pitch for n, off, pitch in
@@ -278,7 +278,7 @@ def hidden(grid: Grid, pose: np.ndarray, detector_shape: tuple[int, int], is_par
 
 
 def grid_on_panel(grid: Grid, pose: np.ndarray) -> np.ndarray:
-    """Returns columns, rows and depths (3, 8) of a grid's corners in the parallel beam of a pose (12,)."""
+    """Projects a grid's 8 corners by the parallel beam of a pose (12,). Returns columns, rows and depths in mm, (3, 8)."""
     corners = np.stack(np.meshgrid(*grid.box_mm[::-1], indexing="ij"), -1).reshape(-1, 3)
     basis = np.stack([pose[6:9], pose[9:12], pose[0:3]], -1)
     return np.asarray(np.linalg.solve(basis, (corners - pose[3:6]).T))

@@ -23,10 +23,10 @@ from phyradgs_cl.fields import Deformation
 
 RAYS, SPLATS, LINE_POSES = "rays", "splats", "one pose per line"
 """The kinds of operator: ray projectors, splat projectors, and filtered backprojection."""
-_USUAL_TIMES, _MOST_TIMES = 6, 100  # usual and largest number of times in a line's exposure of ``PerRow``
-_FINE_STEP_VOXELS, _COARSE_STEP_VOXELS = 0.3, 3.6
-_OBJECT_STEP_VOXELS = 0.7  # travel per time of the object's fastest part: its mean travel is shorter
-_WEIGHT_TOLERANCE = 1e-3  # how far the weights of a line in a user's own model may sum to another number than 1
+_USUAL_TIMES, _MOST_TIMES = 6, 100  # times per exposure that ``PerRow`` chooses: 6 for usual motion, up to 100 for fast
+_FINE_STEP_VOXELS, _COARSE_STEP_VOXELS = 0.3, 3.6  # the rim's travel per time in voxels: up to 6 times, and beyond
+_OBJECT_STEP_VOXELS = 0.7  # travel per time of the object's fastest part in voxels: the rest of it travels less
+_WEIGHT_TOLERANCE = 1e-3  # largest difference from 1 of the sum of a line's weights in a user-defined model
 
 
 class Motion(Protocol):
@@ -80,7 +80,7 @@ class Static:
 
 @dataclass(frozen=True)
 class StaticStart:
-    """One pose per frame, at first light. The volume is rotated by half the span against that of ``static``."""
+    """One pose per frame, at first light. The volume is rotated by half the lit span's arc against that of ``static``."""
 
     operators: ClassVar = (RAYS, SPLATS, LINE_POSES)
     name: str = field(default="static-start", init=False, repr=False)
@@ -131,7 +131,7 @@ class Centres(MicroViews):
 class PerRow:
     """Every line averages over its own window. All lines of a frame share their times.
 
-    ``sub_intervals`` counts the times in an exposure; 0 takes as many as the scan's voxels need. The weight of a line in a
+    ``sub_intervals`` counts the times in an exposure; 0 takes as many as the scan needs (``of``). The weight of a line in a
     cell is the fraction of its window that lies there. Raises InputError for a count below 0."""
 
     operators: ClassVar = (RAYS,)
@@ -142,10 +142,11 @@ class PerRow:
         checks.whole("sub_intervals", self.sub_intervals, 0, 10_000)
 
     def of(self, scan: Scan, object_mm_per_s: float = 0.0) -> "PerRow":
-        """Returns the model with as many times as this scan needs, of an object with this speed.
+        """Returns the model with as many times as this scan needs; a stated number stays. The object's fastest part moves
+        with ``object_mm_per_s``.
 
-        One time serves 0.3 voxels of the rim's travel in an exposure, or 0.7 voxels of the object's, but 6 times serve up to
-        22 voxels. Beyond that one time serves 3.6 voxels (measured in docs/results/settings.md)."""
+        It is one time per 0.3 voxels of the rim's travel in an exposure, or per 0.7 voxels of the object's, up to 6 times.
+        They serve up to 22 voxels; beyond, it is one time per 3.6 voxels (measured in docs/results/settings.md)."""
         if self.sub_intervals:
             return self
         rim_voxels = rim_travel_voxels(scan)
@@ -229,7 +230,7 @@ def motions_for(*operators: str) -> tuple[Motion, ...]:
 
 
 def motion_of(motion: str | Motion) -> Motion:
-    """Returns the model of a name, with its default numbers, or the given model unchanged. InputError: unknown name."""
+    """Returns the model of a name, with its default numbers, or the given model. Raises InputError for an unknown name."""
     if not isinstance(motion, str):
         return motion
     if motion not in MOTIONS:
@@ -261,7 +262,7 @@ def motion_from_facts(facts: Mapping[str, object]) -> Motion | None:
 
 
 def check_motion(motion: Motion, taken: tuple[Motion, ...]) -> None:
-    """Raises InputError for one of ``MODELS`` whose class is not in ``taken``, and for values that are no model."""
+    """Raises InputError for one of ``MODELS`` whose class none of ``taken`` has, and for values that are no model."""
     if isinstance(motion, type) and hasattr(motion, "cells"):
         raise InputError("--motion", f"the class {motion.__name__}", "a model", f"write {motion.__name__}()")
     if not callable(getattr(motion, "cells", None)):

@@ -15,15 +15,15 @@ if TYPE_CHECKING:
     from phyradgs_cl.acquisition.scan import Scan
 
 log = logging.getLogger(__name__)
-OPAQUE, FEW = 50.0, 0.01  # a panel measures no larger line integrals; this fraction of the pixels may be broken
-_WIDEST_DEG = 120.0  # the largest fan of a panel; dental scanners have 30°, nano-CT 60°
-_LARGEST_PITCH_MM, _LEAST_DISTANCE_MM = 5.0, 10.0  # the largest pixel; the nearest panel with a wide fan
-_WRONG_UNIT = 100.0  # the readout over the frame time: seconds given as milliseconds make it some hundreds
-_SHORT_READOUT_S, _MANY_LINES = 0.5e-3, 100  # real panels take some ms to read hundreds of lines
-_SLOW_FPS, _LARGE_STEP_DEG = 2.0, 10.0  # a gantry that moves this far between frames takes them faster
-_TIMES = 17  # samples of an exposure: between two of them no gantry makes half a turn
+OPAQUE, FEW = 50.0, 0.01  # largest line integral that a panel can measure; fraction of its pixels that may be broken
+_WIDEST_DEG = 120.0  # limit of a panel's fan and cone angles; dental scanners have 30°, nano-CT 60°
+_LARGEST_PITCH_MM, _LEAST_DISTANCE_MM = 5.0, 10.0  # largest real pixel; least real distance to a panel
+_WRONG_UNIT = 100.0  # limit of readout over frame time: milliseconds given as seconds make it some hundreds
+_SHORT_READOUT_S, _MANY_LINES = 0.5e-3, 100  # a shorter readout of so many lines is warned of: panels take some ms
+_SLOW_FPS, _LARGE_STEP_DEG = 2.0, 10.0  # a lower rate with a larger step between frames is warned of
+_TIMES = 17  # angles sampled in an exposure: between two of them no gantry makes half a turn
 _SLACK = 1e-3  # relative tolerance: times and angles come rounded
-_MANY_FRAMES = 10  # fewer frames may lie within a few degrees on purpose
+_MANY_FRAMES = 10  # least number of frames for the warning of radians: fewer may lie within a few degrees on purpose
 _ASIDE = 0.1  # fraction of the panel's width: a panel further off centre was displaced for a wider field of view
 
 
@@ -34,7 +34,7 @@ def summary(scan: "Scan") -> str:
 
 
 def blur_facts(scan: "Scan") -> dict[str, float]:
-    """Returns ``blur_at_rim_px`` and ``blur_at_half_radius_px`` of a fly-scan, in columns. A scan at rest has no facts.
+    """Returns ``blur_at_rim_px`` and ``blur_at_half_radius_px`` of a fly-scan, in columns; an empty dict at rest.
 
     In an exposure with arc Δθ a point at radius r moves by r·Δθ, and blurs most where it moves at right angles to its ray.
     With the magnification M its image moves by M·r·Δθ, and M·r is the image's largest distance from the axis. So the blur is
@@ -133,7 +133,7 @@ def _joined(values: tuple[float, ...]) -> str:
 
 
 def check_plausible(scan: "Scan", named: Named = str, is_timed: bool = True) -> None:
-    """Raises InputError for pixels, voxels and times that no scanner has, and for line integrals that must be counts.
+    """Raises InputError for sizes and times that no scanner has, and for line integrals so large that they must be counts.
 
     Warns of times most likely in a wrong unit, of angles that look like radians and of line integrals that may be counts.
     ``named`` translates ``source_to_axis_mm``, ``source_to_detector_mm``, ``pixel_size_mm``, ``grid``, ``readout_s``,

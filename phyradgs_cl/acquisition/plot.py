@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
     from phyradgs_cl.acquisition.scan import Scan
 
-_MOST_CORNERS = 129  # the points along each side of a window's outline
+_MOST_CORNERS = 129  # most points along the opening, and along the closing, side of an outline
 
 
 def plot_frame(scan: "Scan", frame: int = 0) -> "Figure":
@@ -48,7 +48,7 @@ def plot_frame(scan: "Scan", frame: int = 0) -> "Figure":
 
 
 def draw_windows(axes: "Axes", shutter: Shutter, lines: int, start_s: float = 0.0) -> None:
-    """Draws when each of ``lines`` lines opens and closes, and in which part of that time a pulsed beam is on."""
+    """Draws the times in s, after ``start_s``, at which each line opens and closes, and the part with a pulsed beam on."""
     line = np.unique(np.linspace(0, lines - 1, _MOST_CORNERS).round().astype(int))
     lit_s = shutter.line_windows_s(lines)[line] + start_s
     if shutter.pulse_s is not None:
@@ -65,7 +65,7 @@ def _outline(first_s: np.ndarray, last_s: np.ndarray, line: np.ndarray) -> tuple
 
 
 def _turned_deg(scan: "Scan", frame: int) -> tuple[float, float]:
-    """Returns the source's azimuth when a frame's first line opens and when its last line closes."""
+    """Returns the source's azimuth in degrees when a frame's first line opens, and when its last line closes."""
     times_s = scan.frame_start_s[frame] + np.array([0.0, scan.shutter.span_s])
     source = towards_source(scan.trajectory.pose(frame, times_s), scan.is_parallel)
     first, last = np.rad2deg(np.unwrap(np.arctan2(source[:, 1], source[:, 0])))

@@ -12,15 +12,16 @@ from phyradgs_cl.acquisition.shutter import Shutter
 from phyradgs_cl.acquisition.trajectory import CircularOrbit, EncoderTable, FrameSweeps
 from phyradgs_cl.errors import InputError
 
-_FEWEST_TURNS, _MOST_TURNS = 1e-3, 10_000
+_FEWEST_TURNS, _MOST_TURNS = 1e-3, 10_000  # limits of the number of turns in either direction
 
 
 @dataclass(frozen=True)
 class Protocol:
     """``views`` frames in ``turns`` turns at constant speed, each exposing an arc of ``exposure_deg`` (paper, section 3.1).
 
-    The gantry turns clockwise, seen from above, where ``turns`` is below 0. ``readout_ratio`` is T_ro/T_exp. ``pulse``:
-    (start, length) of the time that the beam is on, in exposures; None: always."""
+    The gantry turns clockwise, seen from above, where ``turns`` is below 0. ``readout_ratio`` is T_ro/T_exp, and
+    ``exposure_s`` is T_exp. ``pulse``: (start, length) of the time that the beam is on, in exposures after a frame's start;
+    None: always. Raises InputError for values out of range."""
 
     views: int = 25
     exposure_deg: float = 14.4
@@ -75,7 +76,7 @@ class Protocol:
         return Shutter(self.exposure_s, self.readout_ratio * self.exposure_s, axis, direction, pulse_s)
 
     def frame_start_s(self) -> np.ndarray:
-        """Returns opening times (F,) in s. From frame to frame the gantry needs step/arc exposures."""
+        """Returns the frames' opening times (F,) in s, |step| / arc exposures apart; with an arc of 0, one after another."""
         if self.exposure_deg == 0:
             return np.arange(self.views) * self.shutter().span_s
         return np.arange(self.views) * abs(self.step_deg) / self.exposure_deg * self.exposure_s
@@ -93,7 +94,8 @@ class Protocol:
     ) -> CircularOrbit:
         """Returns the trajectory. A stop-and-shoot gantry rests at the mid-window angles of the same fly-scan.
 
-        Jitter is a smooth wander of deviation ``jitter_deg``, with one knot per frame, which the encoder records."""
+        Jitter adds a random angle of standard deviation ``jitter_deg`` at one knot per frame, linear between knots; the
+        encoder records it. Raises InputError for jitter of a fly-scan without an arc or without ``rng``."""
         first = self.angle_start_rad()
         arc_rad = self._arc_rad
         if not self.is_fly:
@@ -110,7 +112,7 @@ class Protocol:
 
     @property
     def _arc_rad(self) -> float:
-        """The arc of an exposure; negative clockwise."""
+        """The arc of an exposure in rad; negative for a clockwise gantry."""
         return float(np.copysign(np.deg2rad(self.exposure_deg), self.turns))
 
     def _wandering_encoder(self, jitter_rad: float, rng: np.random.Generator) -> EncoderTable:
@@ -130,7 +132,7 @@ PROTOCOLS = {
 
 
 def make_protocol(name: str, **changes: Any) -> Protocol:
-    """Returns the named protocol with those options changed that are not None."""
+    """Returns the named protocol with those fields changed that are not None. Raises InputError for an unknown name."""
     if name not in PROTOCOLS:
         raise InputError("protocol", repr(name), f"one of {', '.join(PROTOCOLS)}")
     return replace(PROTOCOLS[name], **{k: v for k, v in changes.items() if v is not None})

@@ -18,8 +18,8 @@ Named = Callable[[str], str]
 
 @dataclass(frozen=True)
 class Readout:
-    """Puts frames and poses in the order of operators, whose rows are the readout's lines. ``axis``: a line is "rows" or
-    "columns"."""
+    """Puts frames and poses in the order of operators, whose rows are the lines read out. ``axis`` is "rows" or "columns":
+    what one line is."""
 
     axis: str
 
@@ -33,7 +33,7 @@ class Readout:
         return frames if self.axis == "rows" else frames.swapaxes(-1, -2)
 
     def poses(self, pose: np.ndarray) -> np.ndarray:
-        """Returns poses (..., 12) of frames with lines first, or back."""
+        """Returns poses (..., 12) for frames in the order (lines, width), or back."""
         return pose if self.axis == "rows" else transpose_pose(pose)
 
     def spread(self, by_line: np.ndarray) -> np.ndarray:
@@ -57,7 +57,7 @@ def readout_order(
 
 
 def frame_time_of(fps: float | None, frame_time_s: float | None, named: Named = str) -> float | None:
-    """Returns the seconds between frames, from frames per second or as given. Raises InputError where the two differ."""
+    """Returns the seconds between frames, from frames per second or as given. Raises InputError where both differ."""
     if fps is None:
         return frame_time_s
     checks.positive(named("fps"), fps)
@@ -65,7 +65,7 @@ def frame_time_of(fps: float | None, frame_time_s: float | None, named: Named = 
 
 
 def seconds_of(word: str, in_ms: float | None, in_s: float | None, named: Named = str) -> float | None:
-    """Returns a time in s, from ms or as given. ``word``: its name, such as readout. InputError: they differ."""
+    """Returns a time in s, from ms or as given. Raises InputError where both differ. ``word``: "exposure" or "readout"."""
     if in_ms is None:
         return in_s
     checks.at_least(named(f"{word}_ms"), in_ms, 0)

@@ -31,8 +31,8 @@ if TYPE_CHECKING:
     from phyradgs_cl.acquisition.scan import Scan
 
 log = logging.getLogger(__name__)
-_MOST_RAD = 20 * np.pi  # ten turns
-_OTHERS = ("detector_model", "pixel_mask", "reference", "title", "lag", "provenance")
+_MOST_RAD = 20 * np.pi  # ten turns: angles over a larger range are most likely degrees
+_OTHERS = ("detector_model", "pixel_mask", "reference", "title", "lag", "provenance")  # fields of ``Scan``
 
 
 def from_poses(
@@ -46,7 +46,7 @@ def from_poses(
     of the source. grid: None takes the field of view of a full turn, and the travel along z. others: the fields
     detector_model, pixel_mask, reference, title, lag and provenance of ``Scan``.
 
-    Raises InputError for shapes that do not fit, and for poses from which no ray meets the grid."""
+    Raises InputError for shapes that do not fit, for raw counts, and for poses from which no ray meets the grid."""
     values = _uncounted(frames, others.get("pixel_mask"))
     checks.shape("frames", values, (None, None, None))
     table = checks.numbers("poses", poses, (len(values), POSE_LENGTH))
@@ -229,7 +229,8 @@ def _counts(geo: Any, name: str, length: int) -> np.ndarray:
 
 
 def _each(geo: Any, name: str, frames: int, length: int, absent: float) -> np.ndarray:
-    """Returns an attribute (F, length) for every frame, given once or for each. ``absent``: if missing."""
+    """Returns an attribute (F, length), which may be given once or per frame. A missing one is ``absent``, but DSO and DSD
+    must be there. Raises InputError for other shapes."""
     value = _of(geo, name) if name in ("DSO", "DSD") else getattr(geo, name, None)
     table = checks.numbers(f"geo.{name}", absent if value is None else value)
     per_frame = (frames,) if length == 1 else (frames, length)

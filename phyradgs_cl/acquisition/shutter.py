@@ -10,7 +10,7 @@ from phyradgs_cl.errors import InputError
 
 AXES = ("rows", "columns")
 _STEPS = 1000  # least number of float64 steps in an exposure: times within it are then exact to a thousandth
-_DARK = 1e-9  # fraction of the longest lit window: a shorter window is rounding in a line that the pulse misses
+_DARK = 1e-9  # a lit window below this fraction of the longest is rounding: the pulse misses its line
 
 
 @dataclass(frozen=True)
@@ -20,7 +20,8 @@ class Shutter:
     Line r of H opens ``r/(H−1)·readout_s`` after the frame's start and stays open for ``exposure_s``. A readout of 0 is a
     global shutter. ``axis``: "rows" or "columns", what one line is. ``direction``: +1 reads index 0 first, −1 the last index
     first. ``pulse_s`` (start after the frame's start, length): the time that the beam is on; None: always. A line sees the
-    part of its window in the pulse. Raises InputError for times below 0, other words, and a pulse that meets no frame."""
+    part of its window in the pulse. Raises InputError for times below 0, other axes or directions, and a pulse that
+    misses the frame."""
 
     exposure_s: float
     readout_s: float = 0.0
@@ -109,7 +110,7 @@ class Shutter:
         return self.in_pulse(np.stack([delay, delay + self.exposure_s], -1))
 
     def lit_share(self, lines: int) -> np.ndarray:
-        """Returns each line's lit time (lines,) relative to the longest one. Without a pulse it is 1 everywhere."""
+        """Returns each line's lit time (lines,) over the longest; all 1 without a pulse. Raises InputError if all are 0."""
         if self.pulse_s is None:
             return np.ones(lines)
         seen_s = np.diff(self.line_windows_s(lines))[:, 0]
@@ -120,7 +121,8 @@ class Shutter:
         return np.where(seen_s > _DARK * longest_s, seen_s / longest_s, 0.0)
 
     def strip_ranges(self, lines: int, strips: int) -> list[tuple[int, int]]:
-        """Returns [start, stop) of strips in reading order. Line r is in strip floor(r·M/H); a strip may be empty."""
+        """Returns the lines [start, stop) of M strips in reading order. Line r of H is in strip floor(r·M/H); a strip may be
+        empty."""
         edges = [checks.ceil_div(strip * lines, strips) for strip in range(strips + 1)]
         ranges = list(zip(edges[:-1], edges[1:], strict=True))
         if self.direction < 0:

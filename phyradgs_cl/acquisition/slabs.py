@@ -11,11 +11,11 @@ from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid, triple
 
 HALO_ROWS = 4
-"""Rows read on each side of a slab as well: slices between two rows need both, and priors look at neighbours."""
+"""Detector rows read beyond each side of a slab: slices between two rows need both, and priors compare neighbours."""
 
 
 def check_has_slabs(scan: Scan, subject: str, found: str) -> None:
-    """Raises InputError for scans whose slices need other rows. ``subject`` is the option to name, ``found`` its value."""
+    """Raises InputError where slices need rows of the whole panel. ``subject``: the option to name, ``found``: its value."""
     if not has_slabs(scan):
         expected = "all rows: only in a parallel beam about z does a slice need few of them"
         raise InputError(subject, found, expected, "take --roi-mm, with --margin-mm")
@@ -27,7 +27,7 @@ def has_slabs(scan: Scan) -> bool:
 
 
 def check_rows(scan: Scan, first: int, stop: int) -> None:
-    """Raises InputError for rows [first, stop) that the panel does not have, and for scans whose slices need other rows."""
+    """Raises InputError for rows [first, stop) that the panel does not have, and where ``has_slabs`` is False."""
     rows, found = scan.geometry.detector_shape[0], f"{first}:{stop}"
     check_has_slabs(scan, "--rows", found)
     if not 0 <= first < stop <= rows:
@@ -58,7 +58,8 @@ def slab(scan: Scan, first: int, stop: int) -> Scan:
 
 
 def slices_of(scan: Scan, first: int, stop: int) -> slice:
-    """Returns the slices of the scan's grid whose centres lie on detector rows [first, stop). All rows have all slices."""
+    """Returns the slices of the scan's grid whose centres lie on detector rows [first, stop). Slices beyond the panel
+    belong to its first or last row, so that all rows have all slices."""
     rows, pitch_mm = scan.geometry.detector_shape[0], scan.geometry.pixel_size_mm[0]
     row = (scan.grid.axes_mm()[0] - scan.geometry.detector_offset_mm[0]) / pitch_mm + (rows - 1) / 2
     number = np.clip(np.floor(row + 0.5), 0, rows - 1)

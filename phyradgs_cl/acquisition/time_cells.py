@@ -1,7 +1,8 @@
 """Time cells: one table of (pose, lines, weight) per frame, which drives every operator.
 
 A frame is a sum over cells. The pixel lines [line_start, line_stop) receive ``weight`` times the projection from the
-cell's pose. The weights of a line sum to 1. ``cells.py`` builds these tables."""
+cell's pose. The weights of a line sum to 1. A *still* cell has one pose. A *moving* cell is a segment of the frame's time,
+with a pose at either end. ``cells.py`` builds these tables."""
 
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -20,10 +21,10 @@ class TimeCells:
 
     - pose (C, 12) in mm: counts the detector's own rows and columns, whatever the readout axis. time_s (C,) in s.
     - line_start, line_stop (C,): count lines along the readout ``axis``, which has ``lines`` lines. weight (C,).
-    - line_share (C, lines): the fraction of each line's window that lies in a still cell, a factor of the weight. None: 1.
+    - line_share (C, lines): the fraction of each line's window that lies in a still cell; it multiplies the weight. None: 1.
 
-    - end_poses (C, 2, 12), end_times_s (C, 2): poses and times at the ends of moving cells, which are segments of the frame
-      with ``weight`` 1. Objects that move need the times.
+    - end_poses (C, 2, 12) in mm, end_times_s (C, 2) in s: at the ends of moving cells, whose ``weight`` is 1; None for still
+      cells. Objects that move need the times.
     - line_times (C, 3, lines): the part of each line's window in a segment. The numbers are the part's middle and half its
       length, in units of the segment's length from its mid-time, and its fraction of the whole window.
     - is_parallel: poses begin with the direction of parallel rays.
@@ -84,7 +85,7 @@ class TimeCells:
 
     @property
     def averages(self) -> bool:
-        """Whether a line has more than one cell."""
+        """Whether any line has more than one cell."""
         return bool(self.layer_numbers.any())
 
     def scaled(self, factor: float) -> "TimeCells":
@@ -106,7 +107,7 @@ class TimeCells:
         return replace(self, pose=pose, line_share=share, **lines)
 
     def still(self) -> "TimeCells":
-        """Returns these cells for operators on rays. Raises InputError for moving cells, which only splats support."""
+        """Returns these cells, for ray operators. Raises InputError for moving cells and conic poses, which need splats."""
         if self.is_moving:
             raise InputError("--motion", "cells with motion", "still cells: only splats move", "take --motion per-row")
         if self.conic_pose is not None:
@@ -134,14 +135,14 @@ class TimeCells:
         return self.pose[cell[nearest[first]]]
 
     def line_cells(self) -> np.ndarray:
-        """Returns for each line a range of cells (lines, 2), [first, stop). It holds all cells of the line."""
+        """Returns for each line a range [first, stop) of cells, (lines, 2). It holds the line's cells, and maybe others."""
         line = np.arange(self.lines)
         first = np.searchsorted(np.maximum.accumulate(self.line_stop), line, side="right")
         return np.stack([first, np.searchsorted(self.line_start, line, side="right")], -1)
 
     @cached_property
     def layer_numbers(self) -> np.ndarray:
-        """The layer (C,) of every cell. No line has two cells in one layer. There are as few as possible."""
+        """The layer (C,) of every cell, from 0 on: a line has at most one cell in a layer. There are as few as possible."""
         numbers = np.zeros(self.count, np.int64)
         free_from: list[int] = []
         for cell, (start, stop) in enumerate(zip(self.line_start, self.line_stop, strict=True)):
@@ -154,7 +155,7 @@ class TimeCells:
 
     @cached_property
     def layer_weights(self) -> np.ndarray:
-        """Weights (layers, lines) of each line's cell in each layer of ``layer_numbers``; 0 without a cell."""
+        """The weight (layers, lines) of each line's cell in each layer of ``layer_numbers``; 0 without a cell."""
         weights = np.zeros((int(self.layer_numbers.max(initial=-1)) + 1, self.lines))
         for cell, lines in enumerate(self.ranges):
             weights[self.layer_numbers[cell], lines] = self.weights_of(cell)

@@ -20,11 +20,11 @@ from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.text import repr_of_changes
 
-_LEAST_SPAN_S = 1e-6  # between samples of frames without duration
-_MOST_SAMPLES = 1024  # samples per frame
+_LEAST_SPAN_S = 1e-6  # least time over which ``sampled`` samples a frame, also one without duration
+_MOST_SAMPLES = 1024  # ``sampled`` tries no finer table once it has more samples per frame
 _LEAST_INCIDENCE = 1e-6  # least sine of the angle between rays and panel
-_AT_AXIS, _AWAY = 1e-6, 2.0  # in source distances: a panel so near counts as at the axis, and is moved so far
-_SAME_PLACE = 1e-9  # fraction of the longest distance: float64 rounds orbits by less
+_AT_AXIS, _AWAY = 1e-6, 2.0  # in source distances: a panel so near counts as at the axis; it is moved to this distance
+_SAME_PLACE = 1e-9  # tolerance of equal poses, as a fraction of the largest number: float64 rounds orbits by less
 
 
 class Trajectory(Protocol):
@@ -144,7 +144,7 @@ class FrameSweeps:
 
 
 def continued(trajectory: Trajectory, by_s: float) -> Trajectory:
-    """Returns an orbit whose encoder table goes on for ``by_s`` at either end, at the speed there; others as they are."""
+    """Extends an orbit's encoder table by ``by_s`` at either end, at the speed there. Other trajectories stay unchanged."""
     if not (isinstance(trajectory, CircularOrbit) and isinstance(trajectory.kinematics, EncoderTable)):
         return trajectory
     table = trajectory.kinematics
@@ -159,7 +159,7 @@ def continued(trajectory: Trajectory, by_s: float) -> Trajectory:
 
 
 def _is_without_jumps(steps_rad: np.ndarray) -> bool:
-    """Whether no step of more than half a turn stands among steps that are mostly below a quarter."""
+    """True where no step (N,) exceeds half a turn, or where steps of a quarter turn and more are usual."""
     size_rad = np.abs(steps_rad)
     return bool(size_rad.max(initial=0) <= np.pi or np.median(size_rad) >= np.pi / 2)
 
@@ -241,7 +241,8 @@ class PoseTable:
 
 
 def unit_directions(subject: str, poses: np.ndarray) -> np.ndarray:
-    """Returns a parallel beam's poses (F, 12) with directions of length 1. Raises InputError for rays within the panel."""
+    """Returns a parallel beam's poses (F, 12) with directions of length 1. Raises InputError for a direction that runs along
+    the panel or has length 0."""
     length = np.linalg.norm(poses[:, :3], axis=1)
     across = np.cross(poses[:, 6:9], poses[:, 9:12])
     towards = np.abs(np.einsum("ci,ci->c", across, poses[:, :3]))
@@ -254,8 +255,8 @@ def unit_directions(subject: str, poses: np.ndarray) -> np.ndarray:
 def resting_poses(
     poses: np.ndarray, middle_s: np.ndarray, span_s: float, subject: str = "poses", is_parallel: bool = False
 ) -> PoseTable:
-    """Returns a table for a gantry that stops for every frame: each pose (F, 12) holds ``span_s`` about its ``middle_s``
-    (F,)."""
+    """Returns a table for a gantry that stops for every frame. Each pose (F, 12) holds for ``span_s``, at least 0.5 s, about
+    its ``middle_s`` (F,) in s."""
     half_s = max(span_s / 2, 0.25) * (1 - 1e-10)  # two frames in a row must not share a time
     time_s = np.stack([middle_s - half_s, middle_s + half_s], -1).ravel()
     return PoseTable(time_s, np.repeat(poses, 2, axis=0), subject, is_parallel)
@@ -274,8 +275,8 @@ def resting_trajectory(geometry: Geometry, poses: np.ndarray, middle_s: np.ndarr
 def behind_axis(geometry: Geometry, trajectory: Trajectory) -> tuple[Geometry, Trajectory]:
     """Moves a panel at the axis away from the source, where its rays are the same. Returns geometry and trajectory.
 
-    No panel stands in its object. Such a panel was scaled to the axis, and rays would end there. User-defined trajectories
-    and panels elsewhere stay as they are."""
+    No real panel stands in its object: its sizes were scaled to the axis. Rays would end at it, within the object.
+    User-defined trajectories and panels elsewhere stay as they are."""
     if not isinstance(geometry, ConeGeometry):
         return geometry, trajectory
     if geometry.source_to_detector_mm > (1 + _AT_AXIS) * geometry.source_to_axis_mm:
@@ -297,7 +298,7 @@ def behind_axis(geometry: Geometry, trajectory: Trajectory) -> tuple[Geometry, T
 
 
 def _is_off_axis(poses: np.ndarray) -> bool:
-    """Whether the plane of a panel, with poses (T, 12), passes beside the origin."""
+    """True where the plane of any panel, with poses (T, 12), does not pass through the origin."""
     normal = body_frames(poses)[..., 2]
     from_axis_mm = np.abs(np.einsum("ti,ti->t", poses[:, 3:6], normal))
     return bool((from_axis_mm > _AT_AXIS * np.linalg.norm(poses[:, :3], axis=1)).any())
@@ -341,7 +342,8 @@ def sampled(trajectory: Trajectory, frame_start_s: np.ndarray, span_s: float, er
 
 
 def checked_poses(trajectory: Trajectory, frame: int, time_s: np.ndarray) -> np.ndarray:
-    """Returns poses (T, 12) of a trajectory at times (T,) s. InputError: a user-defined one returns other shapes or NaN."""
+    """Returns poses (T, 12) of a trajectory at times (T,) s. Raises InputError where a user-defined one returns other shapes
+    or numbers that are not finite."""
     subject = f"trajectory {type(trajectory).__name__}"
     return checks.numbers(subject, trajectory.pose(frame, time_s), (*time_s.shape, POSE_LENGTH))
 

@@ -1,4 +1,4 @@
-"""The geometry and timing of a scan, from its frames: calibration, moved views, and the gradient with respect to them."""
+"""Estimates a scan's geometry and timing from its frames: calibration, moved views, and the gradient dL/dviews."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -19,7 +19,7 @@ from phyradgs_cl.fields import Gaussians
 from phyradgs_cl.fields.gaussians import ROWS
 from phyradgs_cl.importers import load_beads
 
-_STEP_PX = 0.25  # at the image's edge: a smaller step is lost in voxels, a larger one bends at edges
+_STEP_PX = 0.25  # step of central differences at the image's edge: voxels' errors hide smaller ones, curvature larger ones
 
 
 @naming_arguments()
@@ -81,9 +81,10 @@ def pose_gradient(
     """Returns dL/dviews (F, 3) float64 for ``move_views``, per rad and mm, from dL/dframes (F, rows, columns).
 
     x: the object. ``Gaussians`` use the chain rule through the poses of every line; a volume (nz, ny, nx) in 1/mm on the
-    scan's grid uses central differences of a quarter of a pixel. by_frames: for half the squared misfit, the frames of x
-    less those of the scan; line integrals are averaged, whatever the detector. motion: that of ``splat_operator`` or
-    ``ray_operator``, with their defaults. device: what ``--device`` takes, or a Runtime. After Choi et al. 2026.
+    scan's grid uses central differences of a quarter of a pixel. by_frames: dL/dframes; for half the squared misfit, the
+    frames of x minus those of the scan. Line integrals are averaged, whatever the detector. motion: that of
+    ``splat_operator`` or ``ray_operator``, with their defaults. device: what ``--device`` takes, or a Runtime. After Choi et
+    al. 2026.
 
     Raises InputError as the operators do."""
     check_scan(scan)

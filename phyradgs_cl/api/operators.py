@@ -17,7 +17,7 @@ Device = str | Runtime | None
 Values = np.ndarray | DeviceArray
 """float32 in C order, on the host or on the device."""
 Map = Callable[[Any], Any]
-"""A function of values; its result is on the host or the device like its argument."""
+"""A function from ``Values`` to ``Values``; its result is on the host or the device, where its argument is."""
 Shape = tuple[int | None, ...]
 
 
@@ -30,7 +30,7 @@ def runtime_of(device: Device) -> Runtime:
 
 @lru_cache(maxsize=4)
 def _runtime_by_name(name: str | None) -> Runtime:
-    """One Runtime per device, so that programs are built once."""
+    """Returns the one Runtime of a device's name, so that programs are built once."""
     return Runtime(name)
 
 
@@ -56,12 +56,13 @@ def moved_to(rt: Runtime, values: Values, on_device: bool) -> Any:
 
 
 def computed(rt: Runtime, on_device: bool, function: Callable[[Any], Values], values: Values) -> Values:
-    """Applies a function that works on the device or on the host; the result is returned to where ``values`` are."""
+    """Applies a function that needs its argument on the device, or on the host. Returns the result where ``values`` are."""
     return moved_to(rt, function(moved_to(rt, values, on_device)), isinstance(values, DeviceArray))
 
 
 def on_host(name: str, values: Any) -> np.ndarray:
-    """Returns numbers as NumPy's float32 in C order; arrays of other libraries on the host enter by DLPack, not copied."""
+    """Returns numbers as NumPy's float32 in C order. Other libraries' arrays on the host enter by DLPack, without a copy.
+    Raises InputError about ``name`` for anything else."""
     has_dlpack = hasattr(values, "__dlpack__") and not isinstance(values, np.ndarray)
     try:
         array = np.from_dlpack(values) if has_dlpack else np.asarray(values)
@@ -117,7 +118,7 @@ class Operator:
 
     @property
     def shape(self) -> tuple[int, int]:
-        """(size of y, size of x) of a ``LinearOperator``, for SciPy; InputError for any other operator."""
+        """(size of y, size of x) of a ``LinearOperator``, for SciPy. Raises InputError for any other operator."""
         raise self._not_linear()
 
     def __matmul__(self, x: Any) -> Any:
@@ -127,7 +128,7 @@ class Operator:
         return InputError(repr(self), "an operator that is not linear in x", "a LinearOperator", self._instead)
 
     def to_device(self, values: Any) -> Any:
-        """Returns an x or a y, or a stack of them, as a pyopencl Array, float32, on ``queue``: the start of a loop there.
+        """Copies an x or a y, or a stack of them, to a pyopencl Array, float32, on ``queue``, to start a loop there.
 
         Raises InputError for anything but an array of real numbers, and for last axes that are neither those of x nor of y.
         """
@@ -161,7 +162,7 @@ class Operator:
         raise self._not_linear()
 
     def frames(self, chosen: Sequence[int]) -> Any:
-        """Returns the operator of some of the frames, by their numbers from 0 and in this order; it shares all memory.
+        """Returns the operator of some of the frames, by their numbers from 0, in this order. It shares all memory.
 
         Raises InputError for numbers of missing frames, for no number, and for an operator without frames."""
         if self._frames is None:
@@ -216,7 +217,7 @@ class LinearOperator(Operator, ScipyOperator):
         ScipyOperator.__init__(self, np.float32, (_size(range_), _size(domain)))
         self._pair = forward, adjoint
 
-    shape = (0, 0)  # SciPy's, which every operator sets
+    shape = (0, 0)  # SciPy's attribute, in place of the property: each instance sets it
     __matmul__ = ScipyOperator.__matmul__
 
     @property
@@ -245,7 +246,7 @@ def as_torch(operator: Operator) -> Callable[..., Any]:
 
     x (domain_shape) may be on any device and of any floating type; y (range_shape) is like it. The work is done in float32
     on the operator's device; float32 tensors on the host are not copied, by DLPack. Linear operators can be differentiated
-    any number of times, others once, and ``backward`` renders nothing again.
+    any number of times, others once. ``backward`` does not project x again.
 
     Raises InputError where PyTorch is not installed, for anything but an operator or a tensor, and as the operator does."""
     torch: Any = checks.package("torch", "for as_torch", "torch")

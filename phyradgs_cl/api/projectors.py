@@ -48,7 +48,7 @@ def ray_operator(
     is the scan's grid. device: what ``--device`` takes, or a Runtime. ``intensity`` of the result is for detectors that
     average photons. Joseph, IEEE Trans. Med. Imaging 1 (1982) 192.
 
-    Raises InputError for anything but a Scan or a Grid, and for an unknown motion or one that moves within a cell."""
+    Raises InputError for anything but a Scan or a Grid, for an unknown motion, and for one that only splats support."""
     model, voxels = _checked(scan, motion, models.RAYS), scan.grid if grid is None else _a_grid(grid)
     tables = [model.cells(scan, frame).still() for frame in range(scan.frames)]
     like = runtime_of(device), voxels, scan.geometry.detector_shape, tables
@@ -74,7 +74,7 @@ def _rays(engine: RayOperator) -> LinearOperator:
 
 def _intensities(rt: Runtime, engine: IntensityOperator) -> Operator:
     def at(volume: Values) -> tuple[Values, Map]:
-        own, on_device = copy(engine), isinstance(volume, DeviceArray)  # the copy's derivative stays at this volume
+        own, on_device = copy(engine), isinstance(volume, DeviceArray)  # the copy keeps the derivative at this volume
 
         def adjoint(frames: Values) -> Values:
             return _in_new_memory(rt, own.adjoint, frames, engine.volume_shape)
@@ -105,7 +105,7 @@ def splat_operator(
 
     Raises InputError for anything but a Scan, for an unknown motion, and for a cutoff out of range."""
     model = _checked(scan, motion, models.RAYS, models.SPLATS)
-    if isinstance(model, PerRow):  # splats have one weight for all lines of a cell
+    if isinstance(model, PerRow):  # splats cannot weigh the lines of a cell differently: each line gets cells of its own
         model = OwnTimes(model.of(scan).sub_intervals)
     _check_cutoff(cutoff_sigma)
     rt = runtime_of(device)
@@ -159,7 +159,8 @@ class SplatProjection(GaussianOperator):
         )
 
     def by_poses(self, gaussians: Any, by_frames: Any) -> np.ndarray:
-        """Returns dL/d(turn in rad, shifts along columns and rows in pixels) of each frame, (F, 3), from dL/dframes."""
+        """Returns dL/d(turn in rad, shifts along columns and rows in pixels), (F, 3), from dL/dframes (F, rows, columns).
+        Raises InputError for an operator that averages intensities."""
         rt, engine = self.rt, self._splats
         if engine.is_layered:
             raise InputError("by_poses", "averages of intensity", "averages of line integrals")
@@ -167,7 +168,8 @@ class SplatProjection(GaussianOperator):
         return engine.by_poses(point, moved_to(rt, self._to_array(self._range, by_frames), True))
 
     def of_densities(self, gaussians: Gaussians) -> LinearOperator:
-        """Returns the operator from the densities (G,) in 1/mm of this cloud to frames; InputError under ``intensity``."""
+        """Returns the linear operator from densities (G,) in 1/mm to frames; centres and shapes are those of ``gaussians``.
+        Raises InputError for an operator that averages intensities, which is not linear."""
         rt, engine, rows = self.rt, self._splats, self._to_array(self._domain, gaussians)
         if engine.is_layered:
             raise InputError("of_densities", "averages of intensity", "averages of line integrals, which are linear")
@@ -220,7 +222,7 @@ def initial_gaussians(scan: Scan, count: int = 0, *, seed: int = 0, device: Devi
     """Returns the cloud in mm and 1/mm from which ``phyradgs`` starts: Gaussians drawn from an FDK volume.
 
     count: their number; 0 derives it from the scan's grid, and there are fewer where too few voxels attenuate. seed: of
-    the draw. The result has mean and scale (G, 3). device: what ``--device`` takes, or a Runtime.
+    the random draw. The result has mean and scale (G, 3). device: what ``--device`` takes, or a Runtime.
 
     Raises InputError for anything but a Scan, and for a count or a seed below 0."""
     check_scan(scan)
@@ -233,7 +235,7 @@ def initial_gaussians(scan: Scan, count: int = 0, *, seed: int = 0, device: Devi
 
 
 def _checked(scan: Scan, motion: str | Motion, *kinds: str) -> Motion:
-    """Returns the model of a motion, checked against the scan."""
+    """Returns the motion model that a name or object means. Raises InputError where scan or operators do not suit it."""
     check_scan(scan)
     model = models.motion_of(motion)
     models.check_motion(model, models.motions_for(*kinds))

@@ -1,4 +1,4 @@
-"""Scans and volumes: reading, writing, simulating, preparing, reconstructing."""
+"""Reads, writes, simulates, prepares and reconstructs scans; reads and writes volumes and deformations."""
 
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -53,9 +53,9 @@ def load_scan(path: str | Path, flats: str = "mean") -> Scan:
 def save_scan(path: str | Path, scan: Scan) -> None:
     """Writes a complete scan file, or nothing: line integrals (F, rows, columns), lengths in mm, times in s.
 
-    path: the HDF5 file; an existing one is replaced. scan: a trajectory of a class of yours is sampled into a table of
+    path: the HDF5 file; an existing one is replaced. scan: a trajectory of a user-defined class is sampled into a table of
     poses. Raises InputError for anything but a Scan, and for a scan that the format cannot express; OutputError where
-    nothing can be written."""
+    the file cannot be written."""
     check_scan(scan)
     write_scan(_checked_path(path), scan)
 
@@ -66,7 +66,7 @@ def load_volume(path: str | Path, mu_water_per_mm: float | None = None) -> Recon
 
     Only an interrupted run has a state.
     path: the HDF5 file, or a file of ``phyradgs export`` (docs/export.md), which has a volume and a grid only.
-    mu_water_per_mm: attenuation of water, of such a file in Hounsfield units that does not state its scale. Raises
+    mu_water_per_mm: water's attenuation, for such a file in Hounsfield units that does not state its scale. Raises
     InputError, which names the HDF5 path of the wrong value, also for Hounsfield units without a scale."""
     file = _checked_path(path)
     if foreign_volume(file) is not None:
@@ -96,8 +96,8 @@ def load_deformation(path: str | Path) -> Deformation:
 def save_deformation(path: str | Path, deformation: Deformation) -> None:
     """Writes how an object moves to a file, whole or not at all.
 
-    path: of the HDF5 file. deformation: the value. Raises InputError for something else, OutputError where the file cannot
-    be written."""
+    path: the HDF5 file; an existing one is replaced. Raises InputError for anything but a Deformation, OutputError where the
+    file cannot be written."""
     if not isinstance(deformation, Deformation):
         raise InputError("deformation", checks.short_repr(deformation), "a Deformation")
     write_deformation(_checked_path(path), deformation)
@@ -115,7 +115,7 @@ def save_volume(
     hu: another format holds Hounsfield units, by the scale of ``Reconstruction.hounsfield``; a volume file keeps 1/mm and
     the scale.
     Raises InputError for anything but a result, a suffix that cannot be written, and ``hu`` without a scale; OutputError
-    where nothing can be written."""
+    where the file cannot be written."""
     if not isinstance(result, Reconstruction):
         remedy = "for an array, Reconstruction(volume, grid)"
         raise InputError("result", checks.short_repr(result), "a Reconstruction", remedy)
@@ -204,7 +204,7 @@ def reconstruct(
     (docs/api.md). options: the options of the method by name. ``motion``, ``strips``, ``sub_intervals`` and so on choose the
     motion model; nested options are dicts (``control={"every": 50}``). preset: the values from which they start.
 
-    grid: the voxels, in place of the scan's. Or ``size``, ``voxel_mm`` and ``roi_mm`` change parts of the scan's grid, and
+    grid: the voxel grid, in place of the scan's. Or ``size``, ``voxel_mm`` and ``roi_mm`` change parts of that, and
     ``margin_mm`` adds a margin that is filled and discarded (docs/methods.md#the-grid).
     holdout: percentage of the pixels that the method does not see; the facts of the result have the error there
     (docs/methods.md#quality-without-a-truth).
@@ -251,7 +251,8 @@ def reconstruct(
 
 
 def _first_volume(initial: object, grid: Grid) -> InitialVolume:
-    """Returns the first volume with its grid; InputError for anything else, and for other voxels."""
+    """Returns the volume ``initial`` with its grid. Raises InputError for anything else, and for an array that does not fit
+    ``grid``."""
     if isinstance(initial, Reconstruction):
         return InitialVolume(initial.volume, initial.grid)
     if not isinstance(initial, np.ndarray):
@@ -282,7 +283,7 @@ def _check_reconstruct(scan: object, grid: object, report: object, on_interrupt:
 
 @contextmanager
 def _reporting(report: ProgressReport | bool) -> Iterator[tuple[ProgressReport, Callable[[str], None]]]:
-    """Yields the report, and a function that ends its line with a text."""
+    """Yields the function that gets every ``Progress``, and one that ends its line in the terminal with a text."""
     if not isinstance(report, bool):
         yield report, lambda text: None
     elif not (report and has_reader()):

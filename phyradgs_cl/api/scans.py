@@ -1,4 +1,4 @@
-"""Scans from arrays: frames, a geometry and angles."""
+"""Makes scans from arrays: frames, a geometry and angles."""
 
 import logging
 from collections.abc import Callable, Mapping
@@ -23,15 +23,15 @@ from phyradgs_cl.importers.reading.frames import LineIntegrals, line_integrals
 from phyradgs_cl.removed import refuse_removed
 
 log = logging.getLogger(__name__)
-# the arguments of ``fly_scan`` that have another name in a Scan
+# The names in messages of values of a Scan that have another name among the arguments of ``fly_scan``.
 _ARGUMENTS = {
     "angles": "angles_deg", "exposure_s": "exposure_deg", "frame_time_s": "exposure_s", "readout_s": "readout_ratio",
     "readout_axis": "readout",
     "source_to_axis_mm": "geometry.source_to_axis_mm", "source_to_detector_mm": "geometry.source_to_detector_mm",
 }  # fmt: skip
-_SLACK = 1e-3  # relative: angles come rounded
-_AIR_SLACK = 0.2  # of a transmission, with noise
-_CLEAR_STEP_DEG = 90.0  # from frame to frame: below, angles say which way the gantry turns
+_SLACK = 1e-3  # relative tolerance of steps and arcs: angles come rounded
+_AIR_SLACK = 0.2  # tolerance of a transmission of 1 in air, for noise
+_CLEAR_STEP_DEG = 90.0  # steps of angles below this limit show which way the gantry turns
 
 
 def fly_scan(
@@ -93,10 +93,11 @@ def fly_scan(
 
 
 def _arcs_deg(angles_deg: np.ndarray, exposure_deg: float) -> np.ndarray:
-    """Returns the arc (F,) of each frame's exposure, in the sense in which the gantry turns then.
+    """Returns the arc (F,) in degrees of each frame's exposure, with the sign of the gantry's turn in that frame.
 
-    Angles (F,), unwrapped, that rise and fall are of a gantry that swings back. Its frames sweep towards the next one's
-    angle, except those from which it returns past their own. Steps too large to have a sense leave it as stated."""
+    Unwrapped angles (F,) that rise and fall are of a gantry that swings back. Its frames sweep towards the next frame's
+    angle, except at turning points before the next angle is reached. Where steps are too large to show a sense, all arcs
+    are as stated."""
     steps_deg = np.diff(angles_deg)
     arcs_deg = np.full(len(angles_deg), exposure_deg)
     is_clear = (np.abs(steps_deg) < _CLEAR_STEP_DEG).all() and (steps_deg > 0).any() and (steps_deg < 0).any()
@@ -145,7 +146,8 @@ def _pixels(
     frames: "ArrayLike", geometry: object, flats: "ArrayLike | None", darks: "ArrayLike | None",
     mask: "ArrayLike | None", quantity: str | None,
 ) -> LineIntegrals:
-    """Returns frames of any quantity as line integrals, with the mask of unusable pixels."""
+    """Returns frames of any quantity as line integrals, with the mask of unusable pixels. Raises InputError for shapes that
+    do not fit, an unclear quantity, and a mask of all pixels."""
     if not isinstance(geometry, GEOMETRIES):
         raise InputError("geometry", checks.short_repr(geometry), "a ConeGeometry or a ParallelGeometry")
     panel = geometry.detector_shape
@@ -189,7 +191,7 @@ def _scan(
 
 
 def _stack(name: str, frames: "ArrayLike", panel: tuple[int, int]) -> np.ndarray:
-    """Returns checked frames (n, rows, columns) of real numbers."""
+    """Returns frames (n, rows, columns) of real numbers. Raises InputError for other shapes, types, and for no frame."""
     stack = checks.real_array(name, frames)
     checks.shape(name, stack, (None, *panel))
     if len(stack) == 0:

@@ -1,4 +1,4 @@
-"""Finds what is wrong or suspicious in a scan before a reconstruction. ``run`` asks the questions in order, by subject."""
+"""Finds what is wrong or suspicious in a scan before a reconstruction. ``run.py`` asks the other modules' questions."""
 
 from phyradgs_cl.check.detector import CountReader
 from phyradgs_cl.check.finding import CANNOT_TELL, OK, SUSPICIOUS, Finding

@@ -25,23 +25,23 @@ from phyradgs_cl.reconstructors.fits.residuals import Fit, fit, fit_squares, t_s
 from phyradgs_cl.runtime import Runtime
 
 CONSISTENCY = "consistency"
-_LARGEST = 0.35  # residual over that in a random order: correct scans of every kind leave 0.02 to 0.23
-_DOUBTFUL = 0.1  # of that ratio: from here other orders and missing frames are tried
-_RANDOM_ORDERS = 2
-_FEWEST_FRAMES, _FEWEST_PIXELS = 5, 32
-_CLEAR = 0.5  # squared residual of another hypothesis over the stated one's
-_NEARLY = 1.5  # squared residual of a rough fit over the best one's: up to here a hypothesis is refined
-_ERRORS = 4.0
-_SYMMETRIC = 2.0  # residual in a random order over the stated one's
-_SAME = 0.03  # residual in a random order over the frames' spread: below this and _SYMMETRIC, angles leave no trace
-_MOST_REFINED = 2  # hypotheses about the whole scan
-_SHIFT_PENALTY = 1.5  # of the squared residual, per coarse pixel of shift: stated offsets are mostly right
+_LARGEST = 0.35  # limit of the residual over that in a random order: correct scans of every kind have 0.02 to 0.23
+_DOUBTFUL = 0.1  # above this ratio, other orders and missing frames are tried
+_RANDOM_ORDERS = 2  # random orders whose squared residuals are averaged
+_FEWEST_FRAMES, _FEWEST_PIXELS = 5, 32  # fewer frames, or valid coarse pixels per frame, cannot be judged
+_CLEAR = 0.5  # a hypothesis must leave less than this fraction of the stated scan's squared residual
+_NEARLY = 1.5  # a rough fit up to this factor above the best mean squared residual is refined
+_ERRORS = 4.0  # standard errors by which a hypothesis must fit better
+_SYMMETRIC = 2.0  # limit of the residual in a random order over the stated order's, for the same look from all angles
+_SAME = 0.03  # limit, for the same look, of the residual in a random order over the frames' standard deviation
+_MOST_REFINED = 2  # hypotheses about the whole scan whose shift is refined
+_SHIFT_PENALTY = 1.5  # factor on the squared residual per coarse pixel of shift: stated offsets are mostly right
 
 
 @dataclass(frozen=True, eq=False)
 class Consistency:
-    """The finding, the ``frames`` (indices) that fit together, whether further questions make sense (``is_sound``), and
-    whether the object looks different from different angles (``sees_angles``)."""
+    """The finding, and the indices ``frames`` (n,) of the frames that fit together. ``is_sound``: further questions make
+    sense. ``sees_angles``: the object looks different from different angles."""
 
     finding: Finding
     frames: np.ndarray
@@ -52,8 +52,8 @@ class Consistency:
 @dataclass(frozen=True, eq=False)
 class _CoarseFit:
     """The coarse scan with its best sense of rotation (``turned``), and with its best panel shift as well (``best``).
-    fitted: the fit of ``best``. random_total: its squared residual in a random order. rough_mean_square: that of the best
-    rough fit, per value."""
+    fitted: the fit of ``best``. random_total: the sum of its squared residuals in a random order. rough_mean_square: the
+    mean squared residual of the best rough fit."""
 
     turned: Scan
     best: Scan
@@ -126,7 +126,7 @@ def _best_sense(rt: Runtime, scan: Scan) -> tuple[Scan, Scan, float]:
     turned = best = scan
     least = _CLEAR * fit_squares(rt, scan).sum()
     for sense, rough, limits in zip(senses, roughs, limits_px, strict=True):
-        if rough.squares.mean() > _NEARLY * least_rough:  # in a narrow fan rough fits do not decide
+        if rough.squares.mean() > _NEARLY * least_rough:  # rough fits of a narrow fan are too close to decide
             continue
         shift = axis.refined_shift(rt, sense, rough, limits)
         if not shift.is_found:
@@ -147,7 +147,7 @@ def _random_order(rt: Runtime, scan: Scan) -> float:
 def _explanation(rt: Runtime, scan: Scan, as_stated: Scan, coarse: _CoarseFit) -> Hypothesis | None:
     """Returns the best hypothesis that fits far better than the stated scan does.
 
-    A panel that sees few rays twice fits any geometry: then it is the first other size under which frames are consistent."""
+    Frames of a panel that sees few rays twice fit any geometry: then it is the first other size with consistent frames."""
     is_one_sided = hypotheses.stated_redundancy(as_stated) < hypotheses.LEAST_REDUNDANCY
     about_scan = _refined_hypotheses(rt, scan, as_stated, np.inf if is_one_sided else coarse.rough_mean_square)
     if is_one_sided:
@@ -161,11 +161,11 @@ def _explanation(rt: Runtime, scan: Scan, as_stated: Scan, coarse: _CoarseFit) -
 
 
 def _refined_hypotheses(rt: Runtime, scan: Scan, as_stated: Scan, most: float) -> list[Hypothesis]:
-    """Returns the best two hypotheses about the whole scan, the panel shifted to fit best.
+    """Returns the best two hypotheses about the whole scan, with the panel shifted to fit best.
 
-    A rough fit must nearly reach ``most`` (mean squared residual): an offset between two coarse pixels hides other
-    differences there. Large shifts count against a hypothesis; of hypotheses with the same factor of sizes the one with the
-    smaller shift counts."""
+    The mean squared residual of a rough fit must only be below 1.5 ``most``: an offset between two coarse pixels hides
+    other differences. Large shifts count against a hypothesis. Of those with the same factor of sizes, the best one
+    counts."""
     tried: list[tuple[Hypothesis, Scan, axis.AxisShift]] = []
     for hypothesis in hypotheses.of_scan(scan, as_stated):
         other = hypothesis.scan()

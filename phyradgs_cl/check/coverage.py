@@ -9,15 +9,15 @@ from phyradgs_cl.acquisition.geometry import field_of_view_mm
 from phyradgs_cl.check.finding import FEWEST_COLUMNS, OK, SUSPICIOUS, Finding, too_narrow
 from phyradgs_cl.detector import noise_level
 
-_LARGEST_SHARE = 0.1  # line integral over the largest one
+_LARGEST_SHARE = 0.1  # limit of the line integral at the panel's sides, as a fraction of the largest one
 _DISPLACED = 0.1  # offset over the panel's width: a panel this far off centre was displaced on purpose
-_NOISES = 4.0
-_OPAQUE = 30.0  # line integral: no light passes
-_INVERTED = 0.9  # values at the panel's sides over the largest one: this high they are no air
+_NOISES = 4.0  # standard deviations of noise above which values count
+_OPAQUE = 30.0  # limit of line integrals: at larger ones no light passes
+_INVERTED = 0.9  # limit of values at the panel's sides over the largest one: higher ones are no air
 _BRIGHT = 0.05  # fraction of the pixels that may be brighter than the flats
-_FRAMES = 0.1  # fraction of the frames that may touch a border
-_COVERED = 0.1  # fraction of a column's rows
-_ANOTHER_SIZE = 5.0  # ratio of widths: a grid may hold a part of the object or be a little wider, but no more
+_FRAMES = 0.1  # fraction of the frames in which the object may touch a border
+_COVERED = 0.1  # least fraction of a column's rows in which the object counts as seen there
+_ANOTHER_SIZE = 5.0  # limit of a ratio of widths: a grid may hold a part of the object or be a little wider
 NO_OBJECT, OPAQUE, TOO_BRIGHT = "no object", "opaque", "too bright"  # units of findings without line integrals
 CUT_OFF = "line integral at the border"  # unit of a finding: the object reaches beyond the panel
 _QUESTION = "coverage"
@@ -64,7 +64,7 @@ def _check_values(p: np.ndarray, valid: np.ndarray, largest: float, threshold: f
 
 
 def _check_sides(scan: Scan, p: np.ndarray, valid: np.ndarray, largest: float, threshold: float) -> Finding:
-    """Looks for the object at the panel's sides, and compares its width with the grid's."""
+    """Returns the finding about the object at the panel's sides, and about its width compared with the grid's."""
     sides = {"left": _border(p, valid, slice(0, 2)), "right": _border(p, valid, slice(-2, None))}
     sides.pop(_short_side(scan), None)
     name, level = max(sides.items(), key=lambda item: item[1])
@@ -89,7 +89,7 @@ def _check_sides(scan: Scan, p: np.ndarray, valid: np.ndarray, largest: float, t
 
 
 def _width_mm(scan: Scan, p: np.ndarray, valid: np.ndarray, threshold: float) -> float:
-    """Returns the object's usual width at the axis: columns in which a tenth of the rows is above ``threshold``."""
+    """Returns the object's median width in mm at the axis: columns in which a tenth of the rows is above ``threshold``."""
     geometry = scan.geometry
     columns = float(np.median((((p > threshold) & valid).mean(1) > _COVERED).sum(1)))
     if isinstance(geometry, ParallelGeometry):
@@ -99,7 +99,7 @@ def _width_mm(scan: Scan, p: np.ndarray, valid: np.ndarray, threshold: float) ->
 
 
 def _border(p: np.ndarray, valid: np.ndarray, columns: slice) -> float:
-    """Returns the largest mean over an eighth of the border's rows, in the frame at the 90th percentile."""
+    """Returns the level at a border: the largest mean over an eighth of its rows, at the 90th percentile of the frames."""
     edge = p[:, :, columns]
     weight = valid[:, :, columns].astype(float)
     rows = max(1, edge.shape[1] // 8)
@@ -111,7 +111,7 @@ def _border(p: np.ndarray, valid: np.ndarray, columns: slice) -> float:
 
 
 def _short_side(scan: Scan) -> str:
-    """Returns the side on which a displaced panel is shorter from the axis; "" for a centred panel."""
+    """Returns the side, "left" or "right", on which a displaced panel ends nearer to the axis; "" for a centred one."""
     geometry = scan.geometry
     offset_mm = geometry.detector_offset_mm[1]
     width_mm = geometry.detector_shape[1] * geometry.pixel_size_mm[1]

@@ -18,22 +18,22 @@ from phyradgs_cl.runtime import Runtime
 GAIN = "gain drift"
 OVERFLOW = "overflow"  # unit of a finding without line integrals
 _SATURATION, _DEAD = "saturation", "dead pixels"
-_MOST_SATURATED = 1e-3  # fraction of all pixels
-_REPEATS = 3  # frames in which a clipped pixel has its least value
-_ZERO = 1e-6  # line integral
-_JUMP = 0.75  # difference between neighbouring pixels over the brightest transmission
-_MOST_JUMPS = 5e-4  # fraction of all pixels
-_MOST_DEAD = 2e-4  # fraction of all pixels
-_LARGEST_DRIFT, _DRIFT_DEVIATIONS = 0.015, 5.0
-_FEWEST_FRAMES = 8  # least number of frames to see a drift
+_MOST_SATURATED = 1e-3  # fraction of all pixels that may be saturated
+_REPEATS = 3  # least number of frames in which a clipped pixel has its least value
+_ZERO = 1e-6  # line integrals of a smaller size count as 0
+_JUMP = 0.75  # difference of neighbouring transmissions, over the brightest one, that counts as a jump
+_MOST_JUMPS = 5e-4  # fraction of all pixels that may jump
+_MOST_DEAD = 2e-4  # fraction of all pixels that may be dead
+_LARGEST_DRIFT, _DRIFT_DEVIATIONS = 0.015, 5.0  # limits of a relative change of gain, and of it in standard deviations
+_FEWEST_FRAMES = 8  # least number of frames in which a drift can be seen
 
 
 @dataclass
 class CountReader:
-    """``counts_to_attenuation`` for ``read_scan`` that remembers the counts' range.
+    """``counts_to_attenuation`` for ``read_scan`` that remembers saturated counts.
 
-    ``ceiling``: the largest count of any frame, None for files without counts. ``at_ceiling``: the fraction of the
-    projections' pixels with that count."""
+    ``ceiling``: the largest count of projections and flats, None for files without counts. ``at_ceiling``: the fraction of
+    the projections' pixels that lie together at that count."""
 
     ceiling: float | None = None
     at_ceiling: float = 0.0
@@ -93,18 +93,19 @@ def _clipped(saturation: Saturation, remedy: str) -> Finding:
 
 
 def _jumps(p: np.ndarray, masked: np.ndarray) -> float:
-    """Returns the fraction of pixels (F, v, u) that differ from a neighbour by most of the range. Dead pixels do not
-    count."""
+    """Returns the fraction of pixels (F, v, u) whose transmission differs from a neighbour's by most of the range. Single
+    dead pixels are filtered out first."""
     if p.shape[2] < 2:
         return 0.0
     transmission = np.where(masked, 1.0, np.exp(-np.clip(p, -20, 20))).astype(np.float32)
     brightest = float(np.percentile(transmission[:: max(1, len(p) // 20)], 99))
     jumps = np.abs(np.diff(median_filter(transmission, size=(1, 1, 5)), axis=2)) > _JUMP * brightest
-    return float(np.median(jumps.mean((1, 2))))  # the median ignores a few odd frames, which another question finds
+    return float(np.median(jumps.mean((1, 2))))  # ignores a few odd frames, which another question finds
 
 
 def _at_own_least(p: np.ndarray, masked: np.ndarray) -> float:
-    """Returns the fraction of pixels (F, v, u) that repeat their own least value, as counts clipped before the flats do.
+    """Returns the fraction of pixels (F, v, u) that repeat their own least value, as counts do that were clipped before the
+    division by the flats.
 
     Pixels that never change are dead, and line integrals of 0 are air in scans without noise. Neither counts."""
     least = p.min(0)
@@ -136,7 +137,7 @@ def check_dead_pixels(scan: Scan) -> tuple[Finding, np.ndarray]:
 def check_gain(rt: Runtime, scan: Scan) -> Finding:
     """Fits a ramp, and a step at each frame, to the levels of the frames of a coarse ``scan``.
 
-    A change of more than 1.5 % and five standard deviations is suspicious. Levels may turn with the gantry."""
+    A change of more than 1.5 % and five standard deviations is suspicious. Levels may vary with the sine of the angle."""
     if scan.frames < _FEWEST_FRAMES:
         return Finding(GAIN, CANNOT_TELL, 0.0, _LARGEST_DRIFT, "share", f"fewer than {_FEWEST_FRAMES} frames")
     level = fit(rt, scan).level

@@ -1,4 +1,4 @@
-"""Other statements about a scan: other units of sizes, other steps of the angles, lost frames, mirrored frames."""
+"""Hypotheses about what is wrong in a scan: units of sizes, steps of the angles, lost frames, mirrored frames."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
@@ -16,20 +16,20 @@ from phyradgs_cl.fields import Grid
 from phyradgs_cl.reconstructors.fits import axis
 
 SIZE_FACTORS = (10.0, 0.1, 1e3, 1e-3)
-LEAST_REDUNDANCY = 0.5  # fraction of the columns: with fewer rays measured twice, frames fit any size
+LEAST_REDUNDANCY = 0.5  # least fraction of columns whose rays are measured twice: with fewer, frames fit any size
 _UNITS = {10.0: " (in cm, read as mm?)", 1e3: " (in m, read as mm?)", 1e-3: " (in µm, read as mm?)"}
-_FANS = (0.02, 3.0)  # the panel's width over its distance from the source, in real scanners
-_GRID_FACTOR = 3.0  # a stated grid that differs more from the panel's view does not belong to the hypothesis
-_SAME_PLACE = 1.0  # in coarse pixels
-_ARC_PERCENTS = (-5, -4, -3, -2, -1, 1, 2, 3, 4, 5)
-_GAPS = 15  # places at which a missing or repeated frame is tried
+_FANS = (0.02, 3.0)  # range of the panel's width over its distance from the source in real scanners
+_GRID_FACTOR = 3.0  # a stated grid that differs by more from the panel's view is replaced
+_SAME_PLACE = 1.0  # in coarse pixels: smaller shifts of the panel cannot be told apart
+_ARC_PERCENTS = (-5, -4, -3, -2, -1, 1, 2, 3, 4, 5)  # changes of the angles' step that are tried
+_GAPS = 15  # number of places at which a missing or repeated frame is tried
 
 
 @dataclass(frozen=True, eq=False)
 class Hypothesis:
-    """Another statement about the scan: a description, advice, and the scan under it.
+    """A hypothesis: a description, advice, and a function that returns the scan under it.
 
-    Hypotheses with the same ``factor`` of sizes differ only by the panel's shift."""
+    ``factor``: by which pixels are larger than stated. Those with one factor, if not 1, differ by the panel's shift only."""
 
     text: str
     advice: str
@@ -65,14 +65,15 @@ def frame_number(scan: Scan, frame: int) -> int:
 
 
 def of_scan(scan: Scan, stated: Scan) -> Iterator[Hypothesis]:
-    """Yields hypotheses about the whole coarse ``scan``: sizes in another unit, mirrored frames. ``stated``: before it was
-    coarse."""
+    """Yields hypotheses about the whole coarse ``scan``: sizes in another unit, mirrored frames. ``stated``: the scan before
+    it was made coarse."""
     yield from _other_units(scan, stated)
     yield from _other_images(scan, stated)
 
 
 def _other_units(scan: Scan, stated: Scan) -> Iterator[Hypothesis]:
-    """Yields sizes and distances in other units. Only their ratio enters the fan; the panel's offset may decide."""
+    """Yields hypotheses of sizes or distances in other units. Only their ratio enters the fan angle; the panel's offset may
+    decide which of the two is wrong."""
     geometry = stated.geometry
     if isinstance(geometry, ParallelGeometry):
         return  # in a parallel beam sizes scale with the object
@@ -113,7 +114,7 @@ def _with_sizes(scan: Scan, stated: Scan, factor: float, keeps_axis: bool) -> Sc
 
 
 def _matching_grid(stated: Scan, panel_grid: Grid) -> Grid:
-    """Returns the stated grid. If that has another size or came from the wrong panel, returns the panel's."""
+    """Returns the stated grid, or ``panel_grid`` where the stated one has another size or was derived from the panel."""
     ratio = max(stated.grid.size_mm) / max(panel_grid.size_mm)
     is_derived = stated.grid == default_grid(stated.geometry)
     return panel_grid if is_derived or not 1 / _GRID_FACTOR < ratio < _GRID_FACTOR else stated.grid
@@ -131,7 +132,8 @@ def _other_images(scan: Scan, stated: Scan) -> Iterator[Hypothesis]:
 
 
 def of_frames(scan: Scan, shifted_scan: Scan, tries_orders: bool) -> Iterator[Hypothesis]:
-    """Yields other angle steps, exchanged pixel sizes and, with ``tries_orders``, missing or repeated frames."""
+    """Yields hypotheses of other angle steps, exchanged pixel sizes and, with ``tries_orders``, missing or repeated
+    frames."""
     yield from _other_steps(scan)
     yield from _exchanged_sizes(shifted_scan)
     if tries_orders:
@@ -139,7 +141,7 @@ def of_frames(scan: Scan, shifted_scan: Scan, tries_orders: bool) -> Iterator[Hy
 
 
 def _azimuths(scan: Scan) -> np.ndarray:
-    """Returns each frame's angle (F,) from the first one's. A trajectory's own angles keep their turns."""
+    """Returns each frame's angle (F,) in rad from the first one's. Angles that a trajectory states keep whole turns."""
     trajectory = variants.altered_trajectory(scan)
     angle_rad = getattr(trajectory.base, "angle_rad", None)
     if angle_rad is None:
@@ -187,7 +189,8 @@ def nearly_sized(scan: Scan, factor: float) -> Scan:
 
 
 def _missing_frames(scan: Scan) -> Iterator[Hypothesis]:
-    """Yields a missing or a repeated frame at fifteen places. Later frames are then one step further or less far."""
+    """Yields hypotheses of a missing or a repeated frame at 15 places. Later frames are then a step further, or a step
+    back."""
     sense = -1.0 if variants.altered_trajectory(scan).is_reversed else 1.0
     step = float(np.median(wrapped(np.diff(_azimuths(scan))))) * sense
     for at in np.unique(np.linspace(1, scan.frames - 1, _GAPS).round().astype(int)):

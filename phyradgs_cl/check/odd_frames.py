@@ -1,4 +1,4 @@
-"""Frames that do not belong to the scan: black or bright ones, repeated ones, and ones that do not fit the others."""
+"""Finds frames that do not belong to the scan: black or bright ones, repeated ones, and ones that do not fit the others."""
 
 from dataclasses import replace
 
@@ -12,17 +12,17 @@ from phyradgs_cl.detector import robust_deviation
 from phyradgs_cl.reconstructors.fits.residuals import Fit, fit, fit_squares
 from phyradgs_cl.runtime import Runtime
 
-_DEVIATIONS = 12.0
-_LEAST_CHANGE = 0.75  # of the usual mean line integral
-_FEWEST = 5
-_REPEATED = 0.15  # of the usual difference between neighbours
-_JUMP = 2.5  # steps of the order over steps of the angles sorted
-_UNLIKE = 2.0  # the difference from the view beside in angle over the usual one
-_OUTLIER = 4.0  # a frame's residual over the usual one
-_ALIKE = 1.7  # residuals of the two ends: right frames left 1.4 at most, one odd frame 2.3 at least
-_AT_BOTH_ENDS = 0.25  # over the residual in a random order: right frames left 0.2 at most, odd ones mostly 0.3 and more
-_MOST_OUTLIERS = 0.2  # of the frames
-_EXCHANGED = 0.5  # squared residual after an exchange of two frames over the stated one
+_DEVIATIONS = 12.0  # an odd frame's level differs from its neighbours' by more standard deviations than this …
+_LEAST_CHANGE = 0.75  # … and by more than this fraction of the median level
+_FEWEST = 5  # fewer frames are not judged
+_REPEATED = 0.15  # a repeated frame differs by less than this fraction of its neighbours' differences
+_JUMP = 2.5  # median step in recorded order over that of sorted angles, above which the order jumps
+_UNLIKE = 2.0  # least difference of a repeated frame from the next view in angle, over the median one
+_OUTLIER = 4.0  # least residual of an outlier over the median one
+_ALIKE = 1.7  # limit of the ratio of both ends' residuals: right frames had at most 1.4, one odd frame at least 2.3
+_AT_BOTH_ENDS = 0.25  # limit of an end's residual over that in a random order: right frames had 0.2, odd ones mostly 0.3
+_MOST_OUTLIERS = 0.2  # fraction of the frames: with as many outliers, the cause is common to all
+_EXCHANGED = 0.5  # limit of the squared residual after an exchange of two frames, over the stated one
 
 
 def without_odd_frames(scan: Scan) -> tuple[np.ndarray, list[str]]:
@@ -34,7 +34,7 @@ def without_odd_frames(scan: Scan) -> tuple[np.ndarray, list[str]]:
 
 
 def odd_frames(p: np.ndarray, mask: np.ndarray | None) -> list[int]:
-    """Returns frames of p (F, v, u) whose mean line integral is far from that of their neighbours."""
+    """Returns the indices of frames of p (F, v, u) whose mean line integral is far from their neighbours'."""
     if len(p) < _FEWEST:
         return []
     valid = 1.0 if mask is None else (np.asarray(mask) == 0).astype(np.float32)
@@ -46,9 +46,9 @@ def odd_frames(p: np.ndarray, mask: np.ndarray | None) -> list[int]:
 
 
 def repeated_frames(scan: Scan) -> list[int]:
-    """Returns frames that repeat their predecessor although the gantry has turned: they differ from it far less than
-    neighbours do. In an order that jumps, as the golden one, they are also unlike the view beside them in angle: views of a
-    round object from far apart may be alike as well."""
+    """Returns the indices of frames that repeat their predecessor although the gantry has turned: they differ from it far
+    less than neighbours do. In an order that jumps, such as the golden angle, they must also be unlike the next view in
+    angle, since distant views of a round object may be alike."""
     p = scan.projections
     if len(p) < _FEWEST:
         return []
@@ -71,7 +71,7 @@ def _rms(image: np.ndarray) -> float:
 
 
 def _neighbours(values: np.ndarray) -> np.ndarray:
-    """Returns (4, F): the two values before and the two after each of ``values`` (F,), mirrored at the ends."""
+    """Returns, as (4, F), the two values before and the two after each of ``values`` (F,), mirrored at the ends."""
     wide = np.r_[values[2:0:-1], values, values[-2:-4:-1]]
     return np.stack([wide[:-4], wide[1:-3], wide[3:-1], wide[4:]])
 
@@ -109,10 +109,10 @@ def without_outliers(
 
 
 def _ends_alike(residual: np.ndarray, random: float) -> np.ndarray:
-    """Returns which first and last frames (F,) fit about equally badly, as right ones of an open arc do.
+    """Returns which first and last frames, bool (F,), fit about equally badly, as correct ones of an open arc do.
 
-    They have neighbours on one side alone, so a fit of few iterations leaves them more, and a slow drift shows in them. If
-    they were taken out, those beside them would be the next."""
+    They have neighbours on one side only, so a fit of few iterations leaves larger residuals, and a slow drift shows in
+    them. If they were removed, the frames next to them would follow. random: the residual in a random order."""
     is_apart = residual >= _OUTLIER * np.median(residual)
     at_an_end = np.logical_and.accumulate(is_apart) | np.logical_and.accumulate(is_apart[::-1])[::-1]
     return at_an_end & (residual < _ALIKE * residual[::-1]) & (residual < _AT_BOTH_ENDS * random)

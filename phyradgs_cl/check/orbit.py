@@ -36,21 +36,22 @@ from phyradgs_cl.runtime import Runtime
 SIGN, CENTRE, DISTANCES = "sign of rotation", "centre of rotation", "distances"
 OTHER_CAUSE = "pixels, if pixel sizes are right"  # unit of an offset that wrong pixel sizes explain as well
 UNVERIFIED = "neither pixel sizes nor distances are verified by these frames"
-_ERRORS = 4.0  # standard errors between two hypotheses
-_SIGN_RATIO, _CLEAR_RATIO = 1.2, 3.0
-_TOLERATED_PX = 1 / 3
-_DEVIATIONS = 4.0
-_BIAS_FULL_TURN, _BIAS_HALF_TURN = 0.003, 0.04  # in coarse pixels: measured errors of the axis in coarse scans
-_WHOLE_PIXELS = 2  # blocks by which a shift from whole pixels is judged
-_LEAST_REDUNDANCY = 0.1  # of a panel that sees the axis at its edge
+_ERRORS = 4.0  # least difference of two hypotheses in standard errors
+_SIGN_RATIO, _CLEAR_RATIO = 1.2, 3.0  # ratios of squared residuals that decide on the sense of rotation: refined, and rough
+_TOLERATED_PX = 1 / 3  # shift of the panel that is always tolerated
+_DEVIATIONS = 4.0  # standard deviations of the shift that are tolerated
+_BIAS_FULL_TURN, _BIAS_HALF_TURN = 0.003, 0.04  # measured errors of the axis in coarse scans, in coarse pixels
+_WHOLE_PIXELS = 2  # limit, in pixels, of the tolerance for "ok", of a shift found without coarse pixels
+_LEAST_REDUNDANCY = 0.1  # least redundancy that is assumed, for a panel that sees the axis at its edge
 _NO_SIGN = "parallel rays show an object that turns one way and its mirror image that turns the other way alike"
 _SIGN_ADVICE = "look for a feature whose side is known: a mirror image would fit as well"
-_OTHER_SIZES, _SIZE_RATIO = (0.8, 1.25), 1.05
+_OTHER_SIZES, _SIZE_RATIO = (0.8, 1.25), 1.05  # factors on the fan that must fit worse; by this ratio of squared residuals
 
 
 @dataclass(frozen=True, eq=False)
 class Orbit:
-    """Whether the gantry turns the other way, the panel's shift along u, and the findings about both."""
+    """The findings about sense of rotation and axis, the panel's ``shift`` along u, and whether the gantry turns the other
+    way."""
 
     sign: Finding
     centre: Finding
@@ -65,7 +66,7 @@ class Orbit:
 
 
 def find_orbit(rt: Runtime, quick: Scan, as_stated: Scan, sees_angles: bool) -> Orbit:
-    """Answers from a coarse scan which way the gantry turns and where the axis is. Few columns decide neither."""
+    """Finds from the coarse scan ``quick`` which way the gantry turns and where the axis is. Few columns decide neither."""
     if quick.geometry.detector_shape[1] < FEWEST_COLUMNS:
         return Orbit(too_narrow(SIGN, "standard errors"), too_narrow(CENTRE, "pixels"))
     if not sees_angles:
@@ -78,7 +79,7 @@ def find_orbit(rt: Runtime, quick: Scan, as_stated: Scan, sees_angles: bool) -> 
     reverse, limits_px = reversed_rotation(quick), shifts_for_sense_px(quick)
     stated, other = (axis.rough_shift(rt, sense, limits_px) for sense in (quick, reverse))
     ratio = residual_ratio(stated.squares, other.squares)
-    is_rough = max(ratio, 1 / max(ratio, 1e-30)) >= _CLEAR_RATIO  # such a clear answer needs no closer look
+    is_rough = max(ratio, 1 / max(ratio, 1e-30)) >= _CLEAR_RATIO  # so clear an answer needs no refined shifts
     if not is_rough:
         stated = axis.refined_shift(rt, quick, stated, limits_px)
         other = axis.refined_shift(rt, reverse, other, limits_px)
@@ -130,10 +131,10 @@ def with_cause(finding: Finding, shift_px: float, stated_px: float, tolerance_px
 def centre_of(shift: axis.AxisShift, block: int, scan: Scan) -> tuple[axis.AxisShift, Finding]:
     """Returns the panel's shift and the finding about it. ``shift``: found with blocks of ``block`` pixels.
 
-    The error of coarse pixels is added to its deviation, because the bootstrap over frames does not include it. That error
-    is larger where ``scan`` measures fewer rays twice. Where less than half are measured twice, a shift that leaves fewer of
-    them fits better anyway. Opposite views of parallel rays give the shift as well, from whole pixels. The answer with the
-    smaller deviation counts; where few rays are measured twice, opposite views alone decide, or nothing does."""
+    The error of coarse pixels is added to its standard deviation, because the bootstrap over frames does not include it. It
+    is larger where ``scan`` measures fewer rays twice. Opposite views give a shift too, from pixels that are not coarse. The
+    shift with the smaller deviation counts. Where less than half of the rays are measured twice, opposite views alone
+    decide, or nothing does: any shift that leaves fewer such rays fits better."""
     pitch_mm = scan.geometry.pixel_size_mm[1]
     if has_axis_near_edge(scan):
         shift = shift_by_rays_seen_twice(scan)

@@ -1,4 +1,4 @@
-"""Asks all questions in an order in which each rests on those before. Errors found are corrected for the next."""
+"""Asks all questions in an order in which each relies on earlier answers. Errors found are corrected for the next ones."""
 
 import math
 from collections.abc import Callable
@@ -22,9 +22,9 @@ from phyradgs_cl.detector import without_lag
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.runtime import Runtime
 
-_SPARE_COLUMNS = 2.0  # coarse columns by which a stated offset may be wrong and the object still fits into the grid
+_SPARE_COLUMNS = 2.0  # coarse columns by which a stated offset may be wrong with the object still inside the grid
 Report = Callable[[int, int, str], None]
-"""Takes the number of answered questions, the number of all, and the next question."""
+"""The type of a callback for progress: it takes the number of answered questions, of all, and the next question."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,7 +61,7 @@ class _Answers:
         return finding
 
     def stop(self) -> CheckResult:
-        """Leaves the remaining questions open because of the last finding."""
+        """Answers the remaining questions with "cannot tell", because of the last finding, and returns the result."""
         cause = self.findings[-1]
         for question in self._questions[len(self.findings) : -1]:
             self.add(Finding(question, CANNOT_TELL, 0.0, 0.0, "", f"rests on {cause.question}: {cause.verdict}"))
@@ -76,7 +76,7 @@ def check(
     scan: Scan, rt: Runtime, counts: detector.CountReader | None = None,
     report: Report = lambda done, total, question: None,
 ) -> CheckResult:
-    """Looks for what is wrong or suspicious in a scan. ``counts``: the reader of the scan's file, if it remembers counts.
+    """Returns what is wrong or suspicious in a scan. ``counts``: the reader of the scan's file, if it remembers counts.
 
     Raises InputError where every pixel is masked, and for NaN or infinity elsewhere."""
     scan = without_lag(_finite(scan))
@@ -134,14 +134,15 @@ def check(
 def quick_scan(scan: Scan) -> Scan:
     """Returns the coarse scan for the questions about angles and the axis.
 
-    For a panel far beside the axis, the grid is cut to the object. The grid of the panel's view has so many voxels that few
-    frames would fit under wrong angles, too."""
+    For a panel far beside the axis, the grid is cut to the object. The grid of the panel's view has so many voxels that the
+    few frames of a coarse scan would fit under wrong angles too."""
     quick = coarse(scan, QUICK_COLUMNS)
     return around_object(quick, _SPARE_COLUMNS) if has_axis_near_edge(scan) else quick
 
 
 def _finite(scan: Scan) -> Scan:
-    """Returns the scan with zeros in place of masked values that are not finite."""
+    """Returns the scan with zeros in place of masked values that are not finite. Raises InputError for unmasked ones, and
+    where every pixel is masked."""
     p = np.asarray(scan.projections)
     if not scan.valid.any():
         raise InputError("pixel_mask", "every pixel masked", "at least one usable pixel", "correct the mask")

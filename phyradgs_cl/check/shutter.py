@@ -14,23 +14,23 @@ from phyradgs_cl.reconstructors.fits.residuals import fit_squares, residual_rati
 from phyradgs_cl.runtime import Runtime
 
 READOUT, EXPOSURE = "sign of readout", "exposure"
-_ERRORS = 4.0
-_ORDER_RATIO = 1.04  # the other order's squared residual over the stated one's; both models are equally free
-_OTHER_RATIO = 1.5  # the same for another axis or another time
-_REST_RATIO = 2.0  # the same for a gantry at rest: a model without blur fits better anyway, the more so with few views
-_AS_GOOD = 1.15
-_READOUT_SHARE = 0.86  # readout to try where none is stated, as a share of the time between frames
+_ERRORS = 4.0  # least difference of two hypotheses in standard errors
+_ORDER_RATIO = 1.04  # least ratio of squared residuals that decides between the two orders; both models are equally free
+_OTHER_RATIO = 1.5  # the same ratio for another axis or another time
+_REST_RATIO = 2.0  # the same for a gantry at rest: a model without blur fits better in any case, above all with few views
+_AS_GOOD = 1.15  # limit of the ratio of squared residuals of readouts that fit nearly as well as the best
+_READOUT_SHARE = 0.86  # readout that is tried where none is stated, as a fraction of the time between frames
 _OTHER_WAY, _AT_REST = "the other way", "all at once, the gantry at rest"
 _NEEDED_RATIO = {_OTHER_WAY: _ORDER_RATIO, _AT_REST: _REST_RATIO}
-_HALF_RATIO = 0.6  # squared residual with half the exposure over the stated one's: correct scans have 0.8 or more
-_WORSE_RATIO = 1.05
+_HALF_RATIO = 0.6  # limit of the squared residual with half the exposure over the stated one's: correct scans have ≥ 0.8
+_WORSE_RATIO = 1.05  # least ratio of squared residuals at which another exposure fits worse
 
 
 def check_readout(rt: Runtime, scan: Scan) -> Finding:
     """Fits a coarse fly-scan with its lines read as stated, and with them read otherwise.
 
-    Squared residuals have to differ by four standard errors and by a ratio. A wrong order of rows only twists the object,
-    which cone beams show. A wrong order of columns bends the object."""
+    Squared residuals have to differ by four standard errors and by a ratio. A wrong order of rows only twists the object
+    about the axis, which is visible in a cone beam alone. A wrong order of columns bends it."""
     stated = fit_squares(rt, scan)
     others: dict[str, np.ndarray] = {}
     for name, variant in _other_readouts(scan).items():
@@ -57,7 +57,8 @@ def check_readout(rt: Runtime, scan: Scan) -> Finding:
 
 
 def _compared(hypothesis: str, stated: np.ndarray, other: np.ndarray) -> tuple[str, float, float]:
-    """Returns a sentence, the standard errors by which the stated readout fits better, and the ratio of residuals."""
+    """Returns a sentence, the standard errors by which the stated readout fits better, and the other readout's squared
+    residual over the stated one's."""
     ratio, errors = residual_ratio(stated, other), t_statistic(stated, other)
     return f"{hypothesis}, the squared residual is {ratio:.4g} times as large ({errors:+.1f} standard errors)", errors, ratio
 
@@ -96,8 +97,9 @@ def _readout_advice(scan: Scan, name: str) -> str:
 def check_exposure(rt: Runtime, scan: Scan) -> Finding:
     """Fits a coarse scan with half the stated exposure, and with twice the stated exposure.
 
-    Only detail as fine as the arc of an exposure distinguishes a steady blur from a blurred object. A sharper model fits a
-    little better anyway, so half the exposure has to leave 40 % less. For ``ok`` both half and twice have to fit worse."""
+    Only detail as fine as the arc of an exposure distinguishes blur by motion from a blurred object. A sharper model always
+    fits a little better, so half the exposure is suspicious only where its squared residual is 40 % smaller. For ``ok`` half
+    and twice both have to fit worse."""
     if not scan.is_fly:
         text = "the gantry is stated to stand still: had it turned, a blurred object would fit as well"
         return Finding(EXPOSURE, CANNOT_TELL, 1.0, _HALF_RATIO, "share", text)

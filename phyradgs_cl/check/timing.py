@@ -25,12 +25,12 @@ from phyradgs_cl.check.finding import OK, SUSPICIOUS, Finding
 _TIMING, _ANGLES = "timing", "angles"
 _ROUNDING = 1e-3  # relative tolerance: files round times and angles
 _SPEED_TOLERANCE = 0.02  # relative tolerance: gantries vary their speed by less
-_LONGEST_TABLE = 100.0  # over the scan's duration: a longer table belongs to no single scan
-_FEW_RAD = math.radians(5)  # a scan that covers less of its table may have another unit of time
-_MILLISECONDS = (900.0, 3000.0)  # ratio of durations of table and scan: ms against s
-_WIDE = 3.0  # over the median step between angles
-_SAME_RAD = 1e-6
-_TOLERATED_DEG = 1.0  # nearly parallel rays need half a turn only
+_LONGEST_TABLE = 100.0  # limit of a table's duration over the scan's: a longer one belongs to no single scan
+_FEW_RAD = math.radians(5)  # a scan that covers a smaller arc of its table may have another unit of time
+_MILLISECONDS = (900.0, 3000.0)  # ratios of the durations of table and scan that mean ms against s
+_WIDE = 3.0  # a gap between views is wide above this multiple of the median step
+_SAME_RAD = 1e-6  # angles at most this far apart count as one
+_TOLERATED_DEG = 1.0  # coverage that may be missing: nearly parallel rays need half a turn only
 
 
 def check_timing(scan: Scan) -> Finding:
@@ -69,8 +69,8 @@ def _share(name: str, consequence: str, share: float) -> Finding:
 
 
 def _table(scan: Scan) -> list[Finding]:
-    """Finds a table of angles or poses that lasts far longer than the scan. Its unit of time differs from that of the
-    frames, because the scan would see next to nothing of the table."""
+    """Returns a finding for a table of angles or poses that lasts far longer than the scan, which sees hardly any of it: its
+    unit of time most likely differs from the frames'. Returns no finding otherwise."""
     table = scan.trajectory.kinematics if isinstance(scan.trajectory, CircularOrbit) else scan.trajectory
     if not isinstance(table, EncoderTable | PoseTable):
         return []
@@ -87,7 +87,7 @@ def _table(scan: Scan) -> list[Finding]:
 
 
 def _speed(scan: Scan, starts_s: np.ndarray) -> Finding:
-    """Compares the angle to the next frame with the speed within the frame. Medians count: gantries vary their speed."""
+    """Compares the angle to the next frame with the speed within the frame, by medians, since a gantry's speed varies."""
     span_s = scan.shutter.exposure_s or scan.shutter.span_s
     by_speed, stepped = np.empty(scan.frames - 1), np.empty(scan.frames - 1)
     for frame in range(scan.frames - 1):
@@ -113,8 +113,8 @@ def check_angles(scan: Scan) -> Finding:
     """Compares the largest gap between neighbouring views with three times the median one.
 
     Views that cover half a turn and the fan, or more, may leave one gap. Less coverage is suspicious with any steps.
-    Parallel rays across the axis see the same after half a turn, so their angles count modulo 180°. Rays that rise need a
-    full turn."""
+    Parallel rays across the axis see the same after half a turn, so their angles are taken modulo 180°. Parallel rays that
+    are tilted to the axis need a full turn."""
     turn_deg, needed_deg, of_needed = _needed_turn(scan)
     steps_deg = _steps_deg(scan, turn_deg)
     if steps_deg.size < 3:
@@ -139,7 +139,7 @@ def check_angles(scan: Scan) -> Finding:
 
 
 def is_full_turn(scan: Scan) -> bool:
-    """True where no gap between views is wide."""
+    """True where no gap between views, around a full turn, is wider than three times the median step."""
     steps_deg = _steps_deg(scan)
     return steps_deg.size > 0 and float(steps_deg.max()) <= _WIDE * float(np.median(steps_deg))
 
@@ -164,7 +164,7 @@ def _steps_deg(scan: Scan, turn_deg: float = 360.0) -> np.ndarray:
 
 
 def _half_fan_deg(scan: Scan, geometry: ConeGeometry) -> float:
-    """Returns half the fan of the reconstruction's box, at most half the panel's fan."""
+    """Returns half the fan angle of the grid's box, at most half that of the panel."""
     half_width_mm = geometry.detector_shape[1] * geometry.pixel_size_mm[1] / 2
     panel_rad = math.atan2(half_width_mm, geometry.source_to_detector_mm)
     radius_mm = max(scan.grid.size_mm[1:]) / 2

@@ -1,1 +1,1 @@
-"""The commands: options in, one call into the library, a result printed. cli.py has the table of them."""
+"""The commands. Each reads options, makes one call into the library and prints a result. cli.py lists them."""

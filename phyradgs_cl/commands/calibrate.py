@@ -1,4 +1,4 @@
-"""calibrate: a scan's true geometry and timing from its own frames."""
+"""The command calibrate: estimates a scan's true geometry and timing from its own frames."""
 
 import json
 from pathlib import Path
@@ -84,7 +84,7 @@ def calibrate_command(
 
 
 def _check_storable(scan: Loaded, names: list[str]) -> None:
-    """Raises InputError for corrections that a scan file cannot hold: two poses at one time."""
+    """Raises InputError for a wobble of frames that overlap in time: a scan file has one pose at a time."""
     if WOBBLE not in names:
         return
     period_s = float(np.diff(np.sort(scan.frame_start_s)).min(initial=np.inf))
@@ -109,7 +109,7 @@ def _as_text(result: Calibration) -> str:
 
 
 def _value(one: ParameterEstimate) -> str:
-    """Returns the estimate with two digits of its deviation; a dash without one."""
+    """Returns the estimate with two digits of its standard deviation; "-" without an estimate."""
     if one.found is None or one.deviation is None:
         return "-"
     return f"{to_digits_of(one.found, one.deviation)} ± {to_digits_of(one.deviation, one.deviation)}"

@@ -1,4 +1,4 @@
-"""check: what is wrong or suspicious in a scan."""
+"""The command check: finds what is wrong or suspicious in a scan."""
 
 import json
 import math
@@ -71,7 +71,7 @@ def _write_copy(scan: Path, target: Path, result: CheckResult, quiet: bool) -> N
 
 
 def _as_text(result: CheckResult, blur: str) -> str:
-    """Returns a line per question with its advice below, the line of the blur, if any, and the totals."""
+    """Returns a line per question with its advice below, the line ``blur``, if not empty, and the totals."""
     lines: list[str] = []
     for finding in result.findings:
         lines.append(f"{finding.verdict:12s} {finding.question:19s} {finding.text}")

@@ -1,4 +1,4 @@
-"""The console side of commands: options and arguments, output lines, exit statuses, help, and ranks under mpiexec."""
+"""What commands share with the console: options and arguments, output lines, exit statuses, help, ranks under mpiexec."""
 
 import math
 import os
@@ -21,11 +21,12 @@ from phyradgs_cl.text import plain_text
 
 AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
 SHARED_BY_RANKS = ("reconstruct",)
-"""Commands whose work ranks share; rank 0 alone runs the others."""
+"""Commands whose work all ranks share. Rank 0 alone runs the others."""
 
 
 def numbers(text: str) -> float | list[float] | str:
-    """Returns a number, or several with commas between; other text unchanged, for the error of the check that follows."""
+    """Returns the number in a text, or several with commas between. Returns other text unchanged: a later check refuses
+    it."""
     try:
         values = [float(part) for part in text.split(",")]
     except ValueError:
@@ -34,7 +35,7 @@ def numbers(text: str) -> float | list[float] | str:
 
 
 def option(help: str, default: bool | str = True, *flags: str, **more: Any) -> Any:
-    """An option with its help; ``default`` replaces the value in the help where it is text."""
+    """Returns a Typer option with its help. A text as ``default`` stands in the help in place of the default's value."""
     return typer.Option(*flags, help=help, show_default=default, **more)
 
 
@@ -49,7 +50,8 @@ def file_argument(name: str, help: str) -> Any:
 def pair_of(
     flag: str, form: str, example: str, largest: float = math.inf
 ) -> Callable[[str], tuple[float, float]]:
-    """Returns a parser of two finite numbers with a comma between, ``form``, of absolute value at most ``largest``."""
+    """Returns a parser of two finite numbers with a comma between, of absolute value at most ``largest``. It raises
+    InputError about ``flag``, with ``form`` and ``example``, for other text."""
 
     def pair(text: str) -> tuple[float, float]:
         try:
@@ -64,7 +66,7 @@ def pair_of(
 
 
 def file_parser(subject: str) -> Callable[[str], Path]:
-    """Returns a parser that refuses an empty name, which would mean the current folder."""
+    """Returns a parser of paths that raises InputError for an empty name, which would mean the current folder."""
 
     def file(text: str) -> Path:
         if not text.strip():
@@ -75,10 +77,10 @@ def file_parser(subject: str) -> Callable[[str], Path]:
 
 
 def say(text: str) -> None:
-    """Prints a result on stdout."""
+    """Prints a result on stdout. Raises OutputError where that fails; a reader that has closed the pipe is no error."""
     try:
         typer.echo(plain_text(text))
-    except BrokenPipeError:  # the reader has left, as after `| head`: no error, and no reason to stop
+    except BrokenPipeError:  # the reader has closed the pipe, as `| head` does
         give_up_stdout()
     except OSError as error:
         give_up_stdout()
@@ -87,7 +89,7 @@ def say(text: str) -> None:
 
 
 def complain(text: str, status: int = 2) -> int:
-    """Prints an error on stderr in one line; returns the exit status."""
+    """Prints an error on stderr in one line. Returns ``status``, the exit status."""
     remark("phyradgs: " + " ".join(text.split()))
     return status
 
@@ -98,7 +100,7 @@ def remark(text: str) -> None:
 
 
 def give_up_stdout() -> None:
-    """Discards unwritten output, which the interpreter would try to write at its end, with a traceback."""
+    """Discards unwritten output. The interpreter would try to write it at its end, and fail with a traceback."""
     with suppress(OSError, ValueError):
         nowhere = os.open(os.devnull, os.O_WRONLY)
         os.dup2(nowhere, sys.stdout.fileno())
@@ -114,7 +116,8 @@ def scores(metrics: Mapping[str, float | None]) -> str:
 
 
 def usage_text(error: Any, arguments: Sequence[str]) -> str:
-    """Returns Typer's message about the words of a command, with the value that it could not read."""
+    """Returns Typer's message about wrong arguments, with the value that it could not read; for words of earlier versions,
+    the replacement."""
     flag, param = str(getattr(error, "option_name", "")), getattr(error, "param", None)
     value = _value_of(param, arguments)
     words = [(flag.lstrip("-").replace("-", "_"), flag), *((f"{name} {value}", "") for name in getattr(param, "opts", ()))]
@@ -125,7 +128,7 @@ def usage_text(error: Any, arguments: Sequence[str]) -> str:
 
 
 def _value_of(parameter: Any, arguments: Sequence[str]) -> str | None:
-    """Returns the word that follows an option; None for an argument, whose place only Typer knows."""
+    """Returns the value that follows an option among the arguments; None where it is not there, as for positional ones."""
     for flag in (name for name in getattr(parameter, "opts", ()) if name.startswith("-")):
         for word, following in zip(arguments, [*arguments[1:], None], strict=True):
             if word == flag:
@@ -136,7 +139,7 @@ def _value_of(parameter: Any, arguments: Sequence[str]) -> str | None:
 
 
 class GroupedCommand(TyperCommand):
-    """A command whose help lists its options under the headings of ``groups``, heading: names of parameters.
+    """A command whose help lists its options under headings. ``groups``: names of parameters by heading.
 
     ``help`` is the last option of the first group. Options without a group are listed under "Options"."""
 
@@ -158,15 +161,15 @@ class GroupedCommand(TyperCommand):
 
 
 def takes_part(arguments: Sequence[str]) -> bool:
-    """True if this process has work in the command. Ranks other than 0 write nothing from here on."""
+    """True if this process takes part in the command. Turns off the output of ranks other than 0."""
     if launched().rank == 0:
         return True
-    sys.stdout = sys.stderr = None  # as in a process of a window: writers check for None
+    sys.stdout = sys.stderr = None  # as in a process without a console: writers check for None
     return any(arguments[:1] == [name] for name in SHARED_BY_RANKS)
 
 
 def last_words(error: BaseException) -> int:
-    """Writes the error with which a rank ends all ranks to stderr; returns the exit status."""
+    """Writes to stderr the error with which a rank ends all ranks. Returns the exit status."""
     rank = launched().rank
     if isinstance(error, KeyboardInterrupt):
         text, status = signals.farewell(), signals.exit_status()

@@ -1,4 +1,4 @@
-"""devices: the OpenCL devices, the one that is used, and whether its kernels compute correctly."""
+"""The command devices: lists OpenCL devices and the one that is used, and checks that its kernels compute correctly."""
 
 import time
 from typing import Annotated

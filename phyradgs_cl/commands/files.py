@@ -1,4 +1,4 @@
-"""info and export: the content of a file, and a volume for other programs."""
+"""The commands info and export: print a file's contents, and write a volume for other programs."""
 
 import json
 from pathlib import Path
@@ -120,7 +120,7 @@ def export_command(
 
 
 def _short(value: Any, is_inside: bool = False) -> str:
-    """Returns a value as text, its numbers to six digits."""
+    """Returns a value as text, its numbers with six significant digits. ``is_inside``: text in containers gets quotes."""
     match value:
         case float():
             return f"{value:.6g}"

@@ -1,4 +1,4 @@
-"""import: a scan of another program to a scan file."""
+"""The command import: turns a scan of another program into a scan file."""
 
 from contextlib import suppress
 from dataclasses import Field, fields
@@ -47,7 +47,7 @@ GROUPS = {
 
 
 def _annotated(one: Field[Any]) -> tuple[Any, Any]:
-    """Returns the kind of an option of imports, for Typer, and its default."""
+    """Returns Typer's annotation of a field of ``ImportOptions``, and its default."""
     words = one.metadata["help"], one.metadata["usual"]
     if one.name in _PAIRS:
         return Annotated[Any, _PAIRS[one.name](option_name(one.name), *words)], None
@@ -108,7 +108,7 @@ def _applied_in_words(scan: Scan) -> list[str]:
 
 
 def _refuse_overwriting(source: Path, output: Path) -> None:
-    """Raises InputError for an output that may belong to the input: an existing file in its folder that is no scan file."""
+    """Raises InputError for an output that is the input, or an existing file in its folder that is no scan file."""
     target, origin = output.resolve(), source.resolve()
     folder = origin if origin.is_dir() else origin.parent
     refuse_overwriting("--output", output, source)

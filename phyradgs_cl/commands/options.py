@@ -1,4 +1,4 @@
-"""Options that several commands share, those of a reconstruction among them, and parsers of their words."""
+"""Options that several commands share, such as those of a reconstruction, and the parsers of their values."""
 
 import functools
 import inspect
@@ -41,12 +41,12 @@ Steps = Annotated[str | None, option(_STEPS, "none", metavar="NAME,...")]
 
 
 def lengths(flag: str, help: str, default: str) -> Any:
-    """An option that takes two lengths V,U."""
+    """Returns an option that takes two lengths V,U in mm."""
     return option(help, default, flag, parser=pair_of(flag, "V,U in mm", "0,12.5", LARGEST_MM), metavar="V,U")
 
 
 def pitches(flag: str, help: str, default: str) -> Any:
-    """An option that takes the pitches of a pixel V,U, or one for square pixels."""
+    """Returns an option that takes the pitches V,U of a pixel in mm, or one number for square pixels."""
     pair = pair_of(flag, "V,U in mm, or one for square pixels", "0.148 or 0.3,0.15", LARGEST_MM)
     return option(help, default, flag, parser=lambda text: pair(text if "," in text else f"{text},{text}"), metavar="D|V,U")
 
@@ -56,7 +56,7 @@ def _asked(kind: Any, help: str, default: str, *flags: str, **more: Any) -> Any:
 
 
 def _numbers(help: str, metavar: str, *flags: str, default: str = "the scan's") -> Any:
-    """An option of numbers, which are checked where they are used."""
+    """Returns an option of numbers with commas between, which are checked where they are used."""
     return Annotated[Any, option(help, default, *flags, parser=numbers, metavar=metavar)]
 
 
@@ -66,7 +66,7 @@ _ROI = "Box of the volume about the axis, mm, or its sides about the scan's midd
 RoiMm = _numbers(_ROI, "D|Z,Y,X|Z0,Z1,Y0,Y1,X0,X1", "--roi-mm", "--roi")
 _MARGIN = "Width around the box, mm, that is reconstructed and discarded: for objects larger than box or panel."
 
-# heading of the help: names of parameters; a command shows those that it has
+# Names of parameters by heading of the help. A command shows those that it has.
 RUN_GROUPS = {
     "Basics": ("output", "method", "motion", "size", "iterations"),
     "Volume": ("voxel_mm", "roi_mm", "margin_mm", "initial", "mu_water_per_mm", "rows", "slab"),
@@ -117,7 +117,8 @@ RUN_OPTIONS: dict[str, Any] = {
 
 
 def with_run_options(*without: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
-    """Gives a command the options of a reconstruction, except ``without``, in place of its parameter ``settings``."""
+    """Returns a decorator that gives a command the options of a reconstruction, except ``without``, in place of its
+    parameter ``settings``."""
 
     def settings(options: dict[str, Any]) -> Settings:
         given = {name: None if value is False else value for name, value in options.items()}  # False: a flag not given
@@ -132,8 +133,8 @@ def with_run_options(*without: str) -> Callable[[Callable[..., Any]], Callable[.
 def with_options(
     slot: str, options: Mapping[str, tuple[Any, Any]], make: Callable[[dict[str, Any]], Any]
 ) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
-    """Gives a command ``options``, each (annotation, default), in place of its parameter ``slot``. Typer reads a command's
-    signature, so the signature lists the options; the command gets what ``make`` makes of their values."""
+    """Returns a decorator that gives a command ``options``, each (annotation, default), in place of its parameter ``slot``.
+    Typer reads a command's signature, so the signature lists them. The command gets ``make(values by name)``."""
 
     def decorated(command: Callable[..., Any]) -> Callable[..., Any]:
         @functools.wraps(command)

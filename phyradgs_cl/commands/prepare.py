@@ -1,4 +1,4 @@
-"""prepare: corrects the effects of panel and beam in a scan."""
+"""The command prepare: corrects the effects of panel and beam in a scan."""
 
 import json
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""reconstruct: a scan file to a volume file; estimate: the time and memory that this takes."""
+"""The commands reconstruct, from a scan file to a volume file, and estimate, for the time and memory that this takes."""
 
 import time
 from contextlib import ExitStack
@@ -104,7 +104,7 @@ def reconstruct_command(
         if page is not None:
             _finish(page, result, scan, output, runtimes[-1])
     written = output if result.state is None else partial_path(output)
-    used_s = time.process_time()  # of the command so far, with its start; other programs do not change it
+    used_s = time.process_time()  # of the whole command so far; other programs do not change it
     motion = getattr(plan.options, "motion", None)
     method = plan.method_name if motion is None else f"{plan.method_name}, motion {motion_facts(motion)['name']}"
     how = f"{method}{result.early_stop}, {result.facts['seconds']:.1f} s ({used_s:.1f} s of processor time)"
@@ -132,7 +132,8 @@ def _settings_of(plan: RunPlan, scan: Path) -> dict[str, object]:
 
 
 def _finish(page: "report.LivePage", result: Reconstruction, scan: Path, output: Path, rt: Runtime) -> None:
-    """Makes the live page of a complete run its report. The frames of a run in slabs may exceed the memory."""
+    """Turns the live page of a complete run into its report, and ends that of an interrupted one. A run in slabs gets no
+    report, since its frames may exceed the memory."""
     if result.state is not None:
         at, asked = result.facts["interrupted_at"], result.facts["options"]["iterations"]
         page.end(f"Interrupted at iteration {at} of {asked}: repeat the command with --resume to continue.")
@@ -149,7 +150,7 @@ def estimate_command(scan: Scan, settings: Settings, object_motion: ObjectMotion
     plan = settings.plan(object_motion=object_motion)
     loaded = load_scan(scan, plan.preprocessing.flats)
     rt = settings.runtime()
-    before_s = time.process_time()  # a run will start, and read the scan, as this command did
+    before_s = time.process_time()  # a run starts and reads the scan as this command did
 
     def around(result: Reconstruction) -> float:
         return before_s + seconds_around(scan, loaded, result)

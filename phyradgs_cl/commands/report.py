@@ -1,4 +1,4 @@
-"""report: a reconstruction as an HTML page; view: a volume in a window."""
+"""The commands report, a reconstruction as an HTML page, and view, a volume in napari."""
 
 from pathlib import Path
 from typing import Annotated

@@ -1,4 +1,4 @@
-"""simulate: a phantom or a volume to a scan file."""
+"""The command simulate: projects a phantom or a volume to a scan file."""
 
 from pathlib import Path
 from typing import Annotated, Any, Literal

@@ -1,4 +1,4 @@
-"""sweep: scans × settings × seeds."""
+"""The command sweep: reconstructs scans × settings × seeds."""
 
 from pathlib import Path
 from typing import Annotated, Any
@@ -32,7 +32,7 @@ def sweep_command(
 
         def tell(done: int, line: dict[str, Any]) -> None:
             ticker.end_line()
-            ticker.first = None  # the next run has a rate of its own
+            ticker.first = None  # the next run's rate starts anew
             outcome = f"failed: {line['error']}" if "error" in line else f"{line['seconds']:.1f} s{scores(line['metrics'])}"
             say(f"{done}/{len(runs)} {line['run']} ({line['label']}): {outcome}")
 

@@ -1,4 +1,4 @@
-"""Volumes in other programs' formats, with spacing, origin and directions: `export_volume`."""
+"""Writes volumes in other programs' formats, with spacing, origin and directions: `export_volume`."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -30,7 +30,7 @@ VOXELS: dict[str, Callable[[Path, Volume, str], None]] = {
 CLOUDS = {"ply": writers.write_ply, "npz": writers.write_npz}
 EXPORTS = (*VOXELS, "dicom", *CLOUDS, "zarr")
 OWN = "h5"
-"""The format of a volume file that gets a scale of Hounsfield units; its values stay in 1/mm."""
+"""The format of this package's volume files, which store a scale of Hounsfield units; their values stay in 1/mm."""
 ScaleOf = Callable[[Volume], Hounsfield | None]
 _SUFFIXES = {"nii": (".nii", ".nii.gz"), "tiff": (".tif", ".tiff"), "dicom": (), "zarr": (".ome.zarr", ".zarr")}
 
@@ -43,19 +43,20 @@ def export_volume(
 
     to: one of ``EXPORTS``; ply and npz take the Gaussians, all others the voxels. Or ``OWN``, a volume file with its scale.
     output: a file, or a folder for dicom and zarr; None takes the folder of ``path``.
-    mu_water_per_mm: attenuation of water; the values are then Hounsfield units.
-    scale_of: another way to the scale of Hounsfield units, as ``hu_scale``.
-    labels: patient, study and series, for dicom alone.
+    mu_water_per_mm: water's attenuation; the values are then written in Hounsfield units.
+    scale_of: in place of it, a function from the volume to its scale of Hounsfield units, as ``hu_scale``.
+    labels: patient, study and series, for dicom only.
 
-    InputError: an unknown format, a damaged volume or one without Gaussians, a suffix of another format, labels with another
-    format. OutputError: the output cannot be written."""
+    Raises InputError for an unknown format, a damaged volume or one without Gaussians, a suffix of another format, and
+    labels with another format. Raises OutputError where the output cannot be written."""
     target, scale_of = _checked(Path(path), to, output, mu_water_per_mm, labels, scale_of)
     export_stored(read_volume(path), to, target, str(path), scale_of, labels)
     return target
 
 
 def hu_scale(volume: Volume, air: Box | None = None, water: Box | None = None, insert_hu: float = 0.0) -> Hounsfield | None:
-    """Returns the scale that a volume holds, where neither a box nor an insert is given, else fits one."""
+    """Returns the scale of Hounsfield units that a volume holds; fits one where it has none, or where a box or an insert is
+    given."""
     if (stored := volume.scale) is not None and air is None and water is None and insert_hu == 0:
         return replace(stored, fitted=f"{stored.line}, as stored")
     return volume.hounsfield(air, water, insert_hu).scale
@@ -65,7 +66,7 @@ def _checked(
     path: Path, to: str, output: str | Path | None, mu_water_per_mm: float | None, labels: DicomLabels | None,
     scale_of: ScaleOf | None,
 ) -> tuple[Path, ScaleOf | None]:  # fmt: skip
-    """Returns the path to write and the way to the scale; InputError for options that do not fit the format."""
+    """Returns the path to write and the function to the scale. Raises InputError for options that do not fit the format."""
     checks.one_of("--to", to, (*EXPORTS, OWN))
     if mu_water_per_mm is not None and scale_of is not None:
         raise InputError("--mu-water-per-mm", "given with --hu", "one of the two", "leave one out")
@@ -75,7 +76,7 @@ def _checked(
     if to == OWN and scale_of is None:
         raise InputError("--hu", f"not given for {output}", "another format, or a scale to store", "add --hu")
     target = default_output(path, to) if output is None else Path(output)
-    suffixes = _suffixes(to)  # programs go by the suffix
+    suffixes = _suffixes(to)  # programs infer the format from it
     if suffixes and not target.name.lower().endswith(suffixes):
         raise InputError(f"output of --to {to}", str(target), f"a name that ends in {' or '.join(suffixes)}")
     refuse_overwriting("output", target, path)
@@ -88,14 +89,15 @@ def _checked(
 
 
 def _in_unit(values: np.ndarray, scale: Hounsfield | None) -> tuple[np.ndarray, str]:
-    """Returns values (z, y, x) in 1/mm, or in Hounsfield units where there is a scale, and a note of that."""
+    """Returns values (z, y, x) float32 in 1/mm, or in Hounsfield units where there is a scale, and a note of their unit."""
     plain = np.ascontiguousarray(values, np.float32)
     return (plain, "values in 1/mm") if scale is None else (scale.of(plain), scale.note)
 
 
 def state_times_s(moves: Deformation | States, count: int, during_s: tuple[float, float] | None = None) -> list[float]:
-    """Returns the middles (count,) in s of equal parts of a time, by default that of the motion; the stored times of as many
-    states. InputError: a count outside 1 to 1000, a time that ends before it begins, a time without any of the motion's."""
+    """Returns times (count,) in s: the middles of equal parts of ``during_s``, by default of the motion's span; without it,
+    the stored times of as many states. Raises InputError for a count outside 1 to 1000, and for a span that ends before it
+    begins or does not meet the motion's."""
     checks.whole("--states", count, 1, 1000)
     if isinstance(moves, States) and during_s is None and count == len(moves.times_s):
         return moves.times_s.tolist()
@@ -113,10 +115,10 @@ def export_states(
     output: str | Path | None = None, mu_water_per_mm: float | None = None, labels: DicomLabels | None = None,
     scale_of: ScaleOf | None = None,
 ) -> list[Path]:  # fmt: skip
-    """Writes the object of a volume file at each of evenly spaced times, and returns the paths. ``deformation``: how it
+    """Writes the object of a volume file at each of evenly spaced times in s, and returns the paths. ``deformation``: how it
     moves; None where the file holds its states. NIfTI holds all states in one file of four dimensions. The other formats get
     a file, or a folder, for each state: NAME_01.SUFFIX and so on. Other arguments and errors are those of
-    ``export_volume``; InputError also for a format of Gaussians."""
+    ``export_volume``. Raises InputError also for a format of Gaussians, and for a deformation beside the volume's grid."""
     if to in (*CLOUDS, OWN):
         raise InputError("--states", f"with --to {to}", "a format of voxels", "use nii, mha, nrrd, tiff, npy, zarr or dicom")
     target, scale_of = _checked(Path(path), to, output, mu_water_per_mm, labels, scale_of)
@@ -147,7 +149,7 @@ def export_stored(
     volume: Volume, to: str, target: Path, subject: str, scale_of: ScaleOf | None = None,
     labels: DicomLabels | None = None,
 ) -> None:  # fmt: skip
-    """Writes a volume as ``export_volume`` does; ``subject`` names it in messages."""
+    """Writes a volume to ``target`` as ``export_volume`` does; ``subject`` names the volume in messages."""
     if to in CLOUDS:
         CLOUDS[to](target, writers.gaussians_of(volume, subject))
         return
@@ -169,14 +171,14 @@ def export_stored(
 
 
 def _write_own(target: Path, volume: Volume, path: str, scale: Hounsfield | None) -> None:
-    """Writes all that the volume file ``path`` holds to another one, with the scale."""
+    """Writes all that the volume file ``path`` holds to another volume file, with the scale of Hounsfield units."""
     facts = volume.provenance if scale is None else {**volume.provenance, HOUNSFIELD: scale.facts()}
     parts = volume.gaussians, volume.metrics, read_state(path), volume.deformation, volume.states
     write_volume(target, volume.values, volume.required_grid, facts, *parts)
 
 
 def foreign_suffix(output: str | Path) -> str | None:
-    """Returns the suffix of another program's format, or None. A file with such a name must not hold HDF5."""
+    """Returns a path's suffix if it is of another program's format, else None. Such a file must not hold HDF5."""
     suffixes = (*(suffix for to in EXPORTS for suffix in _suffixes(to)), ".mhd", ".dcm", ".png")
     return next((suffix for suffix in suffixes if Path(output).name.lower().endswith(suffix)), None)
 
@@ -187,7 +189,7 @@ def default_output(path: Path, to: str) -> Path:
 
 
 def format_of(output: str | Path | None, subject: str = "--to") -> str:
-    """Returns the one of ``EXPORTS`` that the suffix of an output means; InputError, with the suffixes, for any other."""
+    """Returns the one of ``EXPORTS`` or ``OWN`` that an output's suffix means. Raises InputError for others and for None."""
     for to in (*EXPORTS, OWN):
         if output is not None and _suffixes(to) and Path(output).name.lower().endswith(_suffixes(to)):
             return to

@@ -1,4 +1,4 @@
-"""A DICOM series with one image per slice: CT Image module of PS3.3 (A.3, C.8.2), LPS, 16 bits per voxel, HU or 1/mm."""
+"""Writes a DICOM series, an image per slice: CT Image module of PS3.3 (A.3, C.8.2), LPS, 16 bits, HU or 1/mm."""
 
 import datetime
 import hashlib
@@ -21,14 +21,14 @@ from phyradgs_cl.io.volume import Volume
 
 _CT_IMAGE = "1.2.840.10008.5.1.4.1.1.2"
 _EXPLICIT_LITTLE = "1.2.840.10008.1.2.1"
-_LARGEST = 32_767
-_LONGEST = 64  # characters, of the value representations PN and LO
+_LARGEST = 32_767  # largest signed number of 16 bits
+_LONGEST = 64  # limit of the characters in DICOM's value representations PN and LO
 
 
 @dataclass(frozen=True)
 class DicomLabels:
-    """Labels by which viewers and archives list a series; None where not stated. patient: name (Family^Given) and ID; title
-    and date (YYYY-MM-DD) of the study; description of the series. InputError: a text that DICOM cannot hold."""
+    """Labels by which viewers and archives list a series; None where not stated. patient: name (Family^Given) and ID. title,
+    date (YYYY-MM-DD): of the study. description: of the series. Raises InputError for text that DICOM cannot hold."""
 
     patient: str | None = None
     title: str | None = None
@@ -68,8 +68,8 @@ class DicomLabels:
 
 
 def write_dicom(path: Path, volume: Volume, note: str, labels: DicomLabels) -> None:
-    """Writes a new folder with 0001.dcm from the lowest slice up; ``note``: "values in 1/mm", or "values in HU" with their
-    scale."""
+    """Writes a new folder with 0001.dcm for the lowest slice and so on. ``note``: "values in 1/mm", or "values in HU" with
+    their scale. Raises OutputError for a folder that holds files or cannot be written."""
     pydicom = checks.package("pydicom", "the package that this export needs", "phyradgs-cl[formats]")
     unit = "HU" if of_note(note)[0] else "1/mm"
     slope, grid = _rescale_slope(volume.values, unit), volume.required_grid
@@ -90,7 +90,8 @@ def write_dicom(path: Path, volume: Volume, note: str, labels: DicomLabels) -> N
 
 
 def _rescale_slope(values: np.ndarray, unit: str) -> str:
-    """Returns the value of one stored step as a decimal string: 1 HU where 16 bits hold the range, else just enough."""
+    """Returns the value of one stored integer step as a decimal string: 1 HU where 16 bits hold the range, else the least
+    step with which they do."""
     peak = float(np.abs(values).max())
     if unit == "HU" and peak <= _LARGEST:
         return "1"
@@ -123,7 +124,7 @@ def _common(pydicom: Any, shape: tuple[int, ...], unit: str, slope: str, uid: di
 
 
 def _place(image: Any, grid: Grid, index: int) -> None:
-    """Writes where slice ``index`` lies. PixelSpacing has the step from row to row first."""
+    """Sets the number, position and spacing of slice ``index`` in mm. PixelSpacing has the step from row to row first."""
     (dz, dy, dx), (z, y, x) = grid.voxel_size_mm, grid.first_centre_mm
     image.InstanceNumber = index + 1
     image.ImageOrientationPatient = [1, 0, 0, 0, 1, 0]
@@ -140,7 +141,8 @@ def _decimal(number: float) -> str:
 
 @contextmanager
 def folder_written_beside(path: Path) -> Iterator[Path]:
-    """Yields a new folder that becomes ``path`` on success and is removed otherwise. Never replaces a folder with files."""
+    """Yields a new folder that becomes ``path`` on success and is removed otherwise. Raises OutputError where ``path`` is a
+    file or a folder with files, or cannot be written."""
     target = Path(os.path.abspath(path))
     if target.is_symlink() or (target.exists() and (not target.is_dir() or any(target.iterdir()))):
         found = "an existing file or folder"

@@ -1,4 +1,4 @@
-"""OME-Zarr 0.5: a folder of chunks, at full size and at halves of it, which viewers load as they need them."""
+"""Writes OME-Zarr 0.5: a folder of chunks, at full and at successively halved resolution, which viewers load as needed."""
 
 from pathlib import Path
 from typing import Any
@@ -10,12 +10,13 @@ from phyradgs_cl.exporters.dicom import folder_written_beside
 from phyradgs_cl.fields import Grid, Hounsfield
 from phyradgs_cl.io.volume import Volume
 
-_CHUNK = 64  # voxels along each axis, at most; a level that has no more along any is the last
+_CHUNK = 64  # limit of a chunk's voxels along each axis; a level within it along all axes is the last
 
 
 def write_zarr(path: Path, volume: Volume, scale: Hounsfield | None) -> None:
-    """Writes a new folder, slab by slab: beside the volume (z, y, x) in 1/mm the memory holds 128 slices at most. A level's
-    voxels are means of 2×2×2 of the level before. ``scale``: the values are written in Hounsfield units."""
+    """Writes a new folder, slab by slab: besides the volume (z, y, x) in 1/mm, memory holds 128 slices at most. A level's
+    voxels are means of 2×2×2 of the level before. ``scale``: writes Hounsfield units by it; None writes 1/mm. Raises
+    OutputError as ``folder_written_beside`` does."""
     of_extra = "the package that this export needs", "phyradgs-cl[zarr]"
     writer, zarr = (checks.package(name, *of_extra) for name in ("ome_zarr.writer", "zarr"))
     grid, levels = volume.required_grid, list[dict[str, Any]]()
@@ -27,7 +28,7 @@ def write_zarr(path: Path, volume: Volume, scale: Hounsfield | None) -> None:
             shape, name = tuple((np.array(before.shape) // step).tolist()), f"s{len(levels)}"
             level = group.create_array(
                 name, shape=shape, chunks=tuple(min(n, _CHUNK) for n in shape), dtype="float32",
-                dimension_names=list("zyx"), config={"write_empty_chunks": True},  # a missing chunk is a lost one
+                dimension_names=list("zyx"), config={"write_empty_chunks": True},  # so that a missing chunk means a lost one
             )  # fmt: skip
             for start in range(0, shape[0], _CHUNK):
                 stop = min(start + _CHUNK, shape[0])
@@ -43,14 +44,14 @@ def write_zarr(path: Path, volume: Volume, scale: Hounsfield | None) -> None:
 
 
 def _means(slab: np.ndarray, step: np.ndarray) -> np.ndarray:
-    """Returns the means of (z, y, x) over blocks of ``step`` voxels, without those that do not fill a block."""
+    """Returns the means of a slab (z, y, x) over blocks of ``step`` (3,) voxels. Voxels that fill no block are left out."""
     (nz, ny, nx), (z, y, x) = np.array(slab.shape) // step, step
     cut = slab[: nz * z, : ny * y, : nx * x]
     return cut.reshape(nz, z, ny, y, nx, x).mean((1, 3, 5), dtype=np.float32)
 
 
 def _places(grid: Grid, factors: np.ndarray) -> list[dict[str, object]]:
-    """Returns sizes and place of voxels that are ``factors`` larger than the grid's."""
+    """Returns OME's scale and translation in mm of voxels ``factors`` (3,) times as large as the grid's."""
     first_mm = grid.first_centre_mm + (factors - 1) / 2 * grid.voxel_size_mm
     sizes = {"type": "scale", "scale": (factors * grid.voxel_size_mm).tolist()}
     return [sizes, {"type": "translation", "translation": first_mm.tolist()}]

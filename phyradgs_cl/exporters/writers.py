@@ -1,5 +1,5 @@
-"""Voxels as NIfTI, NRRD and MetaImage (by SimpleITK), TIFF as ImageJ writes it and NumPy; Gaussians as PLY and NumPy. The
-world's x, y, z are left, posterior, superior (LPS, the frame of DICOM and ITK). So the rotation axis, z, is up in every
+"""Writes voxels as NIfTI, NRRD and MetaImage (by SimpleITK), as TIFF like ImageJ's and as NumPy; Gaussians as PLY and NumPy.
+The world's x, y, z are left, posterior, superior (LPS, the frame of DICOM and ITK). So the rotation axis, z, is up in every
 viewer, and a slice looks the same in viewers that know directions and in those that show row 0 at the top."""
 
 import json
@@ -14,16 +14,17 @@ from phyradgs_cl.io.output import written_beside
 from phyradgs_cl.io.volume import Volume
 
 _WRITERS = {".mha": "MetaImageIO", ".nii": "NiftiImageIO", ".nii.gz": "NiftiImageIO", ".nrrd": "NrrdImageIO"}
-_MOST_NIFTI_VOXELS = 32_767  # along one axis
-_MOST_IMAGEJ_BYTES = 4_000_000_000  # ImageJ's TIFF counts in 32 bits
+_MOST_NIFTI_VOXELS = 32_767  # NIfTI's limit along one axis
+_MOST_IMAGEJ_BYTES = 4_000_000_000  # limit of ImageJ's TIFF, whose offsets have 32 bits
 _PLY_NAMES = (
     *("x", "y", "z", "scale_0", "scale_1", "scale_2"), *("rot_0", "rot_1", "rot_2", "rot_3", "density")
 )
 
 
 def write_image(path: Path, volume: Volume, note: str, times_s: Sequence[float] = (), states: Sequence[Volume] = ()) -> None:
-    """Writes NIfTI, NRRD or MetaImage, by the suffix; ``note``: "values in 1/mm" or "values in HU" with their scale.
-    ``states``: volumes that make one of four dimensions in place of ``volume``, at evenly spaced ``times_s``."""
+    """Writes NIfTI, NRRD or MetaImage, by the suffix. ``note``: "values in 1/mm" or "values in HU" with their scale.
+    ``states``: volumes that are written as one of four dimensions in place of ``volume``, at evenly spaced ``times_s``.
+    Raises InputError for too many voxels for NIfTI."""
     sitk = checks.package("SimpleITK", "the package that this export needs", "phyradgs-cl[formats]")
     suffix = next(suffix for suffix in reversed(_WRITERS) if path.name.lower().endswith(suffix))
     if suffix.startswith(".nii") and max(volume.values.shape) > _MOST_NIFTI_VOXELS:
@@ -78,7 +79,8 @@ def write_npy(path: Path, volume: Volume, note: str) -> None:
 
 
 def gaussians_of(volume: Volume, subject: str) -> dict[str, np.ndarray]:
-    """Returns mean (G, 3) and scale (G, 3) in mm, quaternion (G, 4) w x y z, density (G,) in 1/mm; float32."""
+    """Returns a volume's Gaussians by name: mean (G, 3) and scale (G, 3) in mm, quaternion (G, 4) w x y z, density (G,) in
+    1/mm, float32. Raises InputError for a volume without."""
     if volume.gaussians is None:
         remedy = "reconstruct with --method phyradgs or r2"
         raise InputError(f"{subject}:/entry/gaussians", "nothing there", "Gaussians", remedy)
@@ -86,13 +88,13 @@ def gaussians_of(volume: Volume, subject: str) -> dict[str, np.ndarray]:
 
 
 def write_npz(path: Path, cloud: dict[str, np.ndarray]) -> None:
-    """Writes four arrays by their names, without a pickle."""
+    """Writes the arrays of ``gaussians_of`` by their names, without a pickle."""
     with written_beside(path) as temporary, open(temporary, "wb") as file:
         np.savez(file, **cloud)  # type: ignore[arg-type]
 
 
 def write_ply(path: Path, cloud: dict[str, np.ndarray]) -> None:
-    """Writes binary PLY with one vertex per Gaussian; comments in the header state the units."""
+    """Writes the arrays of ``gaussians_of`` as binary PLY, a vertex per Gaussian. Comments in its header state the units."""
     columns = [cloud["mean"], cloud["scale"], cloud["quaternion"], cloud["density"][:, None]]
     rows = np.concatenate(columns, axis=1)
     properties = "".join(f"property float {name}\n" for name in _PLY_NAMES)

@@ -1,5 +1,5 @@
-"""Scans and volumes in other programs' formats, checked and converted to this package's conventions. `import_scan` and
-`load_volume` read them; a format is a module of formats/."""
+"""Reads scans and volumes in other programs' formats, checks them and converts them to this package's conventions.
+`import_scan` and `load_volume` are the entries; each format of scans has a module in formats/."""
 
 import lazy_loader
 

@@ -1,6 +1,6 @@
-"""The last steps of every importer: angles or poses and what is known about time make shutter, trajectory and opening
-times; these, line integrals, geometry and options make a scan. Also of a sample on a rotary stage between a source and a
-panel at rest, whose axis may be off the central ray."""
+"""The last steps of every importer: shutter, opening times and trajectory are made from angles or poses and the known
+times. These, the line integrals, the geometry and the options make a scan. ``RotaryStage`` is for a sample that turns
+between a source and a panel at rest; its axis may be off the central ray."""
 
 import logging
 from collections.abc import Callable, Mapping
@@ -27,15 +27,15 @@ _OF_A_TURN = ("exposure_s", "readout_s", "angle_at", "readout_axis", "readout_di
 Length = float | Callable[[], float]
 Pitch = tuple[float, float] | Callable[[], tuple[float, float]]
 _DISTANCES = ("source_to_axis_mm", "source_to_detector_mm")
-_VIEW_DIGITS = 5  # of directions: views that agree to so many are one
-_SLACK = 1e-6  # of a span: how far a table extends beyond the times that are needed
+_VIEW_DIGITS = 5  # views that agree to so many decimals of their angle, or scaled pose, count as one
+_SLACK = 1e-6  # fraction of a frame's span by which a pose table extends beyond the times that are needed
 
 
 @dataclass(frozen=True, eq=False)
 class Timing:
-    """When frames were taken. ``start_s`` (F,): opening of the line that is read first; ``is_fly``: the gantry never
-    stops; ``angle_at``: a stored angle belongs to the "start" or "middle" of the first line's exposure. ``assumed``:
-    the values that neither file nor user stated, by their names in ``acquisition/plausible.py``."""
+    """When frames were taken. ``start_s`` (F,): the times in s at which each frame's first line opens. ``is_fly``: the
+    gantry never stops. ``angle_at``: a stored angle belongs to the "start" or "middle" of the first line's exposure.
+    ``assumed``: the values that neither file nor user stated, by their names in ``acquisition/plausible.py``."""
 
     shutter: Shutter
     start_s: np.ndarray
@@ -45,14 +45,14 @@ class Timing:
 
     @property
     def angle_time_s(self) -> np.ndarray:
-        """The times (F,) of the stored angles."""
+        """The times (F,) in s of the stored angles."""
         return self.start_s + (self.shutter.exposure_s / 2 if self.angle_at == "middle" else 0.0)
 
 
 @dataclass(frozen=True, eq=False)
 class StoredTiming:
-    """The timing that a file states; None for missing values. ``start_s`` (F,): of a gantry that did not stop. ``written``:
-    names of the values in a description that the user wrote, as against a file's header."""
+    """The timing that a file states; None for missing values. ``start_s`` (F,): opening times of a gantry that did not stop.
+    ``written``: names of the values that the user wrote in a description, so not those of a scanner's header."""
 
     exposure_s: float | None = None
     readout_s: float | None = None
@@ -68,9 +68,11 @@ class StoredTiming:
 def make_timing(
     subject: str, frames: int | np.ndarray, options: ImportOptions, stored: StoredTiming | None = None
 ) -> Timing:
-    """Returns the timing of ``frames`` frames, or of those with these numbers (F,); options replace stored values. Start
-    times, or a time from frame to frame, mean that the gantry turned continuously, which needs an exposure. Without them
-    every frame was taken at rest, and options about a turn are refused."""
+    """Returns the timing of ``frames`` frames, or of frames with these numbers (F,). Options replace stored values. Start
+    times, or a time from frame to frame, mean that the gantry turned continuously; without them, every frame was at rest.
+
+    Raises InputError for a continuous turn without an exposure or with fewer than two rising start times, and for options
+    about the exposure or readout of frames at rest."""
     stored, place = stored or StoredTiming(), np.arange(frames) if isinstance(frames, int) else frames
     exposure_s, readout_s, frame_time_s = (
         getattr(stored, name) if getattr(options, name) is None else getattr(options, name)
@@ -105,8 +107,8 @@ def make_timing(
 
 
 def turning(geometry: Geometry, angle_rad: np.ndarray, timing: Timing) -> CircularOrbit:
-    """Returns a circular orbit through gantry angles (F,). Each frame turns at the slope of the angles over time, one-sided
-    at both ends; a frame at rest does not turn."""
+    """Returns a circular orbit through gantry angles (F,) in rad. A frame turns at the angles' slope over time, by central
+    differences, one-sided at both ends; a frame at rest does not turn."""
     angle_rad = np.asarray(angle_rad, np.float64)
     exposure_s = timing.shutter.exposure_s
     if not timing.is_fly:
@@ -118,7 +120,7 @@ def turning(geometry: Geometry, angle_rad: np.ndarray, timing: Timing) -> Circul
 
 
 def _check_rest(subject: str, shutter: Shutter, options: ImportOptions, stored: StoredTiming) -> None:
-    """Refuses options about a turn without a time from frame to frame; warns of a file's exposure."""
+    """Raises InputError for options about a turn without a time from frame to frame. Warns of a file's exposure."""
     turns = [name for name in options.given(_OF_A_TURN) if name != "exposure_s" or stored.exposure_s is None]
     frame_time = " or ".join(dict.fromkeys(map(options.named, ("frame_time_s", "fps"))))
     for name in (*map(options.called, turns), *stored.written):
@@ -161,8 +163,8 @@ def turn_of(pose: np.ndarray) -> Turned:
 def table_over_time(
     pose_at: Callable[[np.ndarray], np.ndarray], timing: Timing, subject: str, is_parallel: bool = False
 ) -> PoseTable:
-    """Returns a pose table that covers every frame's window. ``pose_at``: poses (T, 12) at frame positions (T,), where 2.5
-    is halfway from frame 2 to 3. A gantry at rest has each frame's pose at its middle."""
+    """Returns a pose table that covers every frame's window. ``pose_at`` returns poses (T, 12) at frame positions (T,),
+    where 2.5 is halfway from frame 2 to 3. A gantry at rest keeps each frame's pose through its window."""
     if not timing.is_fly:
         at_s = np.asarray(timing.start_s) + timing.shutter.middle_s
         poses = pose_at(np.arange(len(at_s), dtype=np.float64))
@@ -181,9 +183,9 @@ def assemble_scan(
     options: ImportOptions, *, title: str, source: str, grid: Grid | None = None,
     reference: np.ndarray | None = None, lag: float = 0.0, names: Mapping[str, str] | None = None, said: str = "",
 ) -> Scan:
-    """Returns the scan of line integrals with row 0 the lowest; without a grid it gets the cone's cube. ``names``: names in
-    messages about implausible values that a file states; ``said``: which frames were taken. InputError for such values, and
-    for a scan most of whose views are one."""
+    """Returns the scan of line integrals with row 0 the lowest. Without a grid it gets ``grid_of_scan``. ``names``: the
+    file's names of its values, for messages; ``said``: which frames were taken, in words. Raises InputError for implausible
+    values, and where more than half of the views are equal."""
     assumed = [*timing.assumed, *([] if options.detector_model else ["average"])] if timing.is_fly else []
     scan = Scan(
         projections=integrals.values, geometry=geometry, trajectory=trajectory, shutter=timing.shutter,
@@ -206,7 +208,7 @@ def assemble_scan(
 
 
 def _check_turn(trajectory: CircularOrbit | PoseTable, middle_s: np.ndarray, subject: str) -> None:
-    """Raises InputError for most views at one angle, at times (F,): the angles are missing, or those of something else."""
+    """Raises InputError where most views, at times (F,) in s, have one angle: the stored angles are missing or wrong."""
     if isinstance(trajectory, PoseTable):
         views = trajectory.pose(0, middle_s)
         views = views / np.abs(views).max(axis=0, initial=1e-9)
@@ -221,14 +223,14 @@ def _check_turn(trajectory: CircularOrbit | PoseTable, middle_s: np.ndarray, sub
 
 
 def with_options(options: ImportOptions, geometry: Geometry) -> Geometry:
-    """Returns a geometry with the options' lengths where they are given. InputError for distances of a parallel beam."""
+    """Returns a geometry with the options' lengths, where given. Raises InputError for distances of a parallel beam."""
     return (parallel if isinstance(geometry, ParallelGeometry) else cone)(options, *astuple(geometry))
 
 
 def parallel(
     options: ImportOptions, panel: tuple[int, int], pitch_mm: Pitch, offset_mm: tuple[float, float]
 ) -> ParallelGeometry:
-    """Returns a parallel beam of a file's numbers, or the options' where they are given. InputError for distances."""
+    """Returns a parallel beam of a file's numbers, or the options' where given. Raises InputError for given distances."""
     for name in options.given(_DISTANCES):
         expected, remedy = "no distance: this file has a parallel beam", "leave it out"
         raise InputError(options.named(name), f"{getattr(options, name):g}", expected, remedy)
@@ -239,8 +241,9 @@ def cone(
     options: ImportOptions, to_axis_mm: Length, to_detector_mm: Length, panel: tuple[int, int], pitch_mm: Pitch,
     offset_mm: tuple[float, float], names: Mapping[str, str] | None = None,
 ) -> ConeGeometry:
-    """Returns a geometry of a file's numbers, or the options' where they are given: functions that read numbers are called
-    then only. ``names``: what the file calls them, for messages. InputError unless the panel stands behind the axis."""
+    """Returns a cone beam of the options' numbers, else of a file's. A function that reads a number is called only where
+    the option is not given. ``names``: what the file calls the numbers, for messages. Raises InputError unless the panel
+    stands behind the axis."""
     axis_mm, detector_mm = map(partial(_taken, options), _DISTANCES, (to_axis_mm, to_detector_mm))
     if detector_mm <= axis_mm:
         axis, detector = (options.called(name, names) for name in _DISTANCES)
@@ -253,16 +256,16 @@ def cone(
 
 
 def _taken(options: ImportOptions, name: str, stored: Any) -> Any:
-    """Returns the option ``name`` where it is given, else a value, or that of a function that reads it."""
+    """Returns the option ``name`` where it is given, else ``stored``, which is a value or a function that reads it."""
     return options.taken(name, stored if callable(stored) else lambda: stored)
 
 
 @dataclass(frozen=True, eq=False)
 class RotaryStage:
-    """A source and a panel of ``geometry``, and an axis of rotation off the central ray, seen from the source.
+    """A source and a panel of ``geometry`` at rest, and an axis of rotation that may be off the central ray.
 
-    ``axis_u_mm``: the axis stands that far to the right, at its own distance. ``roll_rad``: its top leans to the right;
-    ``tilt_rad``: its top leans towards the panel. ``shift_mm`` (F, 2): shifts (v, u) of the panel per frame, or None."""
+    ``axis_u_mm``: the distance of the axis to the right of the central ray, seen from the source. ``roll_rad``: its top
+    leans to the right; ``tilt_rad``: towards the panel. ``shift_mm`` (F, 2): the panel's shifts (v, u) per frame."""
 
     geometry: Geometry
     axis_u_mm: float = 0.0
@@ -271,21 +274,21 @@ class RotaryStage:
     shift_mm: np.ndarray | None = None
 
     def poses(self, angle_rad: np.ndarray, shift_mm: np.ndarray | float = 0.0) -> np.ndarray:
-        """Returns the poses (T, 12) in the sample's frame at gantry angles (T,), with shifts (T, 2) of the panel."""
+        """Returns poses (T, 12) in the sample's coordinates at gantry angles (T,); ``shift_mm`` (T, 2): of the panel."""
         upright = self.geometry.pose(0.0).reshape(4, 3)  # x to the source, y to the right, z up
         is_parallel = isinstance(self.geometry, ParallelGeometry)
         parts = np.repeat(upright[None], len(angle_rad), axis=0)
         parts[:, int(is_parallel) : 2, 1] -= self.axis_u_mm  # the axis becomes the origin
         parts[:, 1, 2:0:-1] += shift_mm
-        leaning = Rotation.from_euler("YX", [-self.tilt_rad, -self.roll_rad])  # turns the z axis to the stage's
+        leaning = Rotation.from_euler("YX", [-self.tilt_rad, -self.roll_rad])  # rotates the z axis onto the stage's axis
         turned = (Rotation.from_euler("z", np.reshape(angle_rad, (-1, 1))) * leaning.inv()).as_matrix()
         return np.asarray(np.einsum("tij,tkj->tki", turned, parts).reshape(-1, 12))
 
     def turned(
         self, angle_rad: np.ndarray, timing: Timing, subject: str
     ) -> tuple[CircularOrbit | PoseTable, Geometry]:
-        """Returns the trajectory of gantry angles (F,) and its plain geometry: a circular orbit where the axis crosses the
-        central ray at a right angle, else a table of poses."""
+        """Returns the trajectory of gantry angles (F,) in rad and the nearest circular geometry. It is a circular orbit
+        where the axis crosses the central ray at a right angle, else a pose table."""
         if self.axis_u_mm == self.roll_rad == self.tilt_rad == 0 and self.shift_mm is None:
             return turning(self.geometry, angle_rad, timing), self.geometry
         unwrapped = np.unwrap(angle_rad)
@@ -305,11 +308,12 @@ def scan_on_stage(
     angle_rad: np.ndarray, places: np.ndarray, names: dict[str, str], said: str, *, stored: StoredTiming | None = None,
     flats: np.ndarray | None = None, darks: np.ndarray | None = None, flat_value: float | None = None,
 ) -> Scan:
-    """Returns the scan of the description ``path``: counts (F, v, u) of a sample on a stage with the first row and column at
-    ``sides``, gantry angles (F,) in rad, and numbers (F,) of the frames from 0 on, ``places``.
+    """Returns the scan of a sample on a stage, with counts ``frames`` (F, v, u) that the file ``path`` describes.
 
-    ``stored``: the file's timing; ``names``, ``said``: see ``assemble_scan``. Flats and darks are (n, v, u), or None where
-    the scanner has applied them; ``flat_value``: the file's counts of air; options come first."""
+    ``sides``: where row 0 and column 0 are, such as ("top", "left"). ``angle_rad`` (F,): of the gantry. ``places`` (F,): the
+    frames' numbers from 0 on. ``stored``: the file's timing. ``names``, ``said``: see ``assemble_scan``. ``flats``,
+    ``darks`` (n, v, u): None where the scanner has applied them. ``flat_value``: the file's counts of air. Options replace
+    values of the file."""
     timing = make_timing(str(path), places, options, stored)
     trajectory, geometry = stage.turned(angle_rad, timing, str(path))
     images = (None if one is None else oriented(one, options, *sides) for one in (frames, flats, darks))
@@ -323,7 +327,7 @@ def scan_on_stage(
 
 
 def along(values: np.ndarray, position: np.ndarray) -> np.ndarray:
-    """Returns values (F, ...) at frame positions (T,), linear between frames and beyond them."""
+    """Interpolates values (F, ...) at frame positions (T,), (T, ...), linearly, also beyond the first and last frame."""
     if len(values) == 1:
         return np.repeat(values, len(position), axis=0)
     left = np.clip(np.floor(position).astype(int), 0, len(values) - 2)

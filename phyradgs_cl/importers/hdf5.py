@@ -1,4 +1,4 @@
-"""What formats in HDF5 share: arrays at the addresses of the format, of the user's options or of a TOML, and the beam."""
+"""What formats in HDF5 share: arrays, at addresses that the format, the user's options or a TOML state, and the beam."""
 
 import logging
 from collections.abc import Iterator, Mapping, Sequence
@@ -28,21 +28,21 @@ STACKS = ("projections", "flats", "darks", "mask")
 NAMES = (*STACKS, "image_key", "angles", "axes")
 _AXES = ("frame", "v", "u")
 _DISTANCES = ("source_to_axis_mm", "source_to_detector_mm")
-_LIKE = 0.1  # relative difference of two sizes that may be of one pixel
-_LEAST_MM = 1e-4  # of a pixel
+_LIKE = 0.1  # relative difference up to which two stated sizes of a pixel agree
+_LEAST_MM = 1e-4  # a smaller pixel without a unit is taken to be in m
 _TIMES = replace(LENGTH, name="magnification", assumed="", factors=MappingProxyType({"": 1.0, "x": 1.0}))
 
 
 def is_address(text: object) -> bool:
-    """True for FILE:/ADDRESS."""
+    """True for text FILE:/ADDRESS, which names an array in an HDF5 file."""
     return isinstance(text, str) and text.rpartition(":/")[0] != ""
 
 
 @dataclass(frozen=True, eq=False)
 class Places:
-    """Where the arrays of a scan are. ``stated``: for some of ``NAMES`` FILE:/ADDRESS, or /ADDRESS of ``source``; for "axes"
-    the order of frames' axes. ``subject`` says who states it. ``folder``: where the files lie; None for files that the user
-    named on the command line, which may lie anywhere."""
+    """Where the arrays of a scan are. ``stated``: for some of ``NAMES`` a list of FILE:/ADDRESS, or of /ADDRESS in
+    ``source``; for "axes" the order of frames' axes. ``subject``: what states them. ``linked_folder``: see ``open_hdf5``.
+    ``folder``: the only folder from which files are read; None, for files that users name, allows any."""
 
     stated: Mapping[str, Sequence[str]]
     subject: str
@@ -52,7 +52,7 @@ class Places:
 
     @contextmanager
     def opened(self, name: str, text: str) -> Iterator[tuple[Hdf5Source, str]]:
-        """Yields the open file and the address inside it of one place."""
+        """Yields the open file and the address in it of a place ``text``. Raises InputError for a text that is no place."""
         file, _, address = text.rpartition(":/")
         subject = f"{self.subject} {name}"
         if self.source is not None and not file and text.startswith("/"):
@@ -68,15 +68,15 @@ class Places:
             yield other, f"/{address}"
 
     def _at(self, name: str, usual: Sequence[str]) -> Sequence[str]:
-        """Returns where an array is: the stated places, else the usual ones at which something is."""
+        """Returns where an array is: the stated places, else the ``usual`` addresses that exist."""
         there = [address for address in usual if self.source is not None and self.source.find(address) is not None]
         return self.stated.get(name, there)
 
     def stack(
         self, name: str, usual: Sequence[str] = (), panel: tuple[int, int] | None = None
     ) -> tuple[np.ndarray, dict[str, int]] | None:
-        """Reads frames (n, v, u) in their own type, and how many are at each place; None without a place. ``usual``:
-        addresses of the format, as far as they exist."""
+        """Reads frames (n, v, u) in their own type from the stated places, else from the ``usual`` addresses that exist.
+        Returns them with the number at each place; None without a place. Raises InputError for other shapes or panels."""
         stacks: dict[str, np.ndarray] = {}
         for text in self._at(name, usual):
             with self.opened(name, str(text)) as (source, address):
@@ -92,7 +92,7 @@ class Places:
             remedy = "of a stack of sinograms say v,frame,u"
             raise InputError(f"{self.subject} axes", " ".join(order), "frame, v and u in the order of the data", remedy)
         dataset = source.dataset(address)
-        long = [count for count in dataset.shape if count != 1]  # 1: axes that say nothing
+        long = [count for count in dataset.shape if count != 1]  # axes of length 1 carry no information
         shape = dataset.shape if dataset.ndim <= len(_AXES) or len(long) > len(_AXES) else tuple(long)
         if len(shape) == len(_AXES) - 1 and panel is not None:
             shape = tuple(np.insert(shape, order.index("frame"), 1).tolist())
@@ -107,10 +107,11 @@ class Places:
         self, projections: str = "/", *, key: Sequence[str] = (), flats: Sequence[str] = (), darks: Sequence[str] = (),
         mask: Sequence[str] = (),
     ) -> "Stacks":
-        """Reads all frames at the usual addresses of a format, or at the stated ones. A key of the frames sorts them;
-        flats and darks at addresses count before its own."""
+        """Reads all frames at the usual addresses of a format, or at the stated ones. ``key``: addresses of the frames'
+        kinds (projection, flat, dark, invalid). Flats and darks with addresses of their own replace those among the frames.
+        Raises InputError without projections, and for arrays that do not fit them."""
         if self.source is not None and "projections" not in self.stated:
-            self.source.dataset(projections)  # or says what is there in its place
+            self.source.dataset(projections)  # raises an error that says what is there
         if (stored := self.stack("projections", [projections])) is None:
             raise InputError(self.subject, "no place of the projections", "one of them")
         frames, panel = stored[0], (stored[0].shape[1], stored[0].shape[2])
@@ -121,7 +122,7 @@ class Places:
         for name, addresses in (("flats", flats), ("darks", darks), ("mask", mask)):
             if parts := self.stack(name, addresses, panel):
                 stacks[name] = parts[0]
-                at = {"pre": -0.5, "post": int(used.sum()) - 0.5}  # by what the addresses of flats end in
+                at = {"pre": -0.5, "post": int(used.sum()) - 0.5}  # place of flats by the end of their address
                 ends = [text.rpartition("_")[2] for text in parts[1]]
                 if name == "flats":
                     flats_at = np.repeat([at.get(end, np.nan) for end in ends], list(parts[1].values()))
@@ -135,12 +136,13 @@ class Places:
         return Stacks(frames if used.all() else frames[used], stacks["flats"], stacks["darks"], bad, used, flats_at)
 
     def _key(self, usual: Sequence[str], frames: int) -> np.ndarray:
-        """Reads the keys (F,) of frames, those of ``io.scan``; without any all frames are projections."""
+        """Reads the kinds (F,) of frames, numbered as in ``io.scan``; all are projections without a key. Raises InputError
+        for other numbers, and where no frame is a projection."""
         for text in self._at("image_key", usual)[:1]:
             with self.opened("image_key", text) as (source, address):
                 key = h5.read_values(source, address, source.dataset(address))
                 checks.shape(source.name(address), key, (frames,))
-                key = np.where(key == -1, schema.INVALID, key)  # -1: frames by which nxtomo aligns
+                key = np.where(key == -1, schema.INVALID, key)  # -1: frames only for alignment in nxtomo
                 if not np.isin(key, range(schema.INVALID + 1)).all() or not np.any(key == schema.PROJECTION):
                     expected = "0 projection, 1 flat, 2 dark or 3 invalid, and at least one 0"
                     raise source.error(address, f"{np.unique(key)[:5]}", expected)
@@ -148,7 +150,8 @@ class Places:
         return np.full(frames, schema.PROJECTION)
 
     def angles_rad(self, used: np.ndarray, options: ImportOptions, usual: str = "", unit: str = "deg") -> np.ndarray:
-        """Reads the angles, as stored, of the frames that ``used`` (F,) marks. ``unit``: of a dataset that states none."""
+        """Reads the angles in rad, with the stored sign, of frames marked in ``used``, bool (F,). ``unit``: if none
+        stated."""
         quantity = replace(ANGLE, assumed=unit)
         asked = [options.angles] if options.angles and is_address(options.angles) else self.stated.get("angles", ())
         for text in asked:
@@ -164,9 +167,9 @@ class Places:
 
 @dataclass(frozen=True, eq=False)
 class Stacks:
-    """Projections (P, v, u), flats and darks (n, v, u) or None, and a mask (v, u) or (P, v, u), non-zero for pixels that are
-    not to be used, or None. ``used`` (F,): which of the stored frames are projections. ``flats_at``: see
-    ``flats.light_of``."""
+    """Projections (P, v, u), flats and darks (n, v, u), and a mask (v, u) or (P, v, u), non-zero for pixels that are not to
+    be used; None: all are. ``used``, bool (F,): which stored frames are projections. ``flats_at``: ``at`` of
+    ``frames.light_of``."""
 
     projections: np.ndarray
     flats: np.ndarray
@@ -195,7 +198,7 @@ class Stacks:
 
 
 def places_of(options: ImportOptions, source: Hdf5Source) -> Places:
-    """Returns the places that options state. InputError for other names."""
+    """Returns the places that the option ``at`` states. Raises InputError for names that are not in ``NAMES``."""
     stated: dict[str, list[str]] = {}
     subject = options.named("at")
     for text in options.at or ():
@@ -208,8 +211,9 @@ def places_of(options: ImportOptions, source: Hdf5Source) -> Places:
 
 @dataclass(frozen=True)
 class Lengths:
-    """Addresses of the lengths of a scan: the distances from the axis to source and panel, and pairs (v, u) of a pixel's
-    sides, at the sample and on the panel, of which the first that exists counts. ``optics``: of their magnification."""
+    """Addresses of the lengths of a scan: the distances ``source`` and ``detector`` from the axis, and pairs (v, u) of a
+    pixel's sides, at the sample and on the panel; the first that exists counts. ``optics``: the microscope's
+    magnification."""
 
     source: str
     detector: str
@@ -221,13 +225,13 @@ class Lengths:
 def beam(
     source: Hdf5Source, lengths: Lengths, options: ImportOptions, panel: tuple[int, int], axis_columns: float = 0.0
 ) -> Geometry:
-    """Returns the geometry of a file, or the options' numbers where they are given. Where neither states a distance of the
-    source the beam is parallel, with a warning. ``axis_columns``: from the rotation axis to the panel's middle."""
+    """Returns a geometry of the options' numbers, else of a file's; a parallel beam, with a warning, where neither states
+    the source's distance. ``axis_columns``: columns from axis to panel's middle. Raises InputError for wrong lengths."""
     quantity = LENGTH
     for address in (address for pair in (*lengths.at_sample, *lengths.on_panel) for address in pair):
         if source.find(address) is not None and not h5.read_attribute(source, address, "units"):
             pixel = h5.read_values(source, address, source.dataset(address)).ravel()
-            if pixel.size and abs(float(pixel[0])) < _LEAST_MM:  # without units: in mm smaller than light can see
+            if pixel.size and abs(float(pixel[0])) < _LEAST_MM:  # less than 0.1 µm
                 quantity = replace(LENGTH, assumed="m")
 
     def sides_mm(pairs: Sequence[tuple[str, str]]) -> tuple[float, float] | None:
@@ -238,7 +242,7 @@ def beam(
         return None
 
     def pitch_mm() -> tuple[float, float]:
-        """Returns the pixel's sides on a panel behind the sample, without optics between them."""
+        """Returns a pixel's sides (v, u) in mm on a panel at the detector's distance, as if there were no optics."""
         at_sample, on_panel = sides_mm(lengths.at_sample), sides_mm(lengths.on_panel)
         if at_sample is None and on_panel is not None and lengths.optics and source.find(lengths.optics) is not None:
             times = h5.read_length(source, lengths.optics, _TIMES)
@@ -270,8 +274,9 @@ def beam(
 
 
 def exposure_s(source: Hdf5Source, address: str, used: np.ndarray, options: ImportOptions) -> float | None:
-    """Reads the exposure of the used frames, or takes the options' in its place. Where it differs, a gantry that stops for
-    every frame gets none, with a warning. None where the file has none."""
+    """Returns the exposure in s of the frames that ``used``, bool (F,), marks, or the option's in place of the file's. None
+    where the file has none. Where it differs between frames, a gantry that stops for every frame gets None, with a warning;
+    a fly-scan raises InputError."""
     if options.exposure_s is not None:
         return options.exposure_s if source.find(address) is not None else None
     try:

@@ -1,5 +1,5 @@
-"""Scans and objects of other programs: a module per format of scans, volumes by their suffix, beads and wires in TOML. Kinds
-of files that are not read are refused with the way to convert them."""
+"""Entries that read scans and objects of other programs: scans by a module per format, volumes by their suffix, beads and
+wires from TOML. Known kinds of files that are not read are refused with the way to convert them."""
 
 from collections import Counter
 from collections.abc import Callable, Iterator
@@ -64,8 +64,8 @@ def _is_dicom(path: Path) -> bool:
         return file.read(132)[128:] == b"DICM"
 
 
-# The module of formats/ by the format's name, loaded when it is needed. It has two functions:
-# recognises(path) -> bool of a file or folder, and import_scan(path, options) -> Scan; with an end behind a colon.
+# The module of formats/ by the format's name, loaded when it is needed. It has two functions for a file or folder:
+# recognises(path) -> bool and import_scan(path, options) -> Scan. MODULE:END stands for recognises_END, import_scan_END.
 FORMATS = {
     "r2": "r2_gaussian",
     "phyradgs": "r2_gaussian:with_times",
@@ -91,8 +91,8 @@ _KEYS = {"bead": ("centre_mm", "radius_mm", _COMMON), "wire": ("from_mm", "to_mm
 
 def import_scan(path: str | Path, options: ImportOptions | None = None, form: str | None = None) -> Scan:
     """Imports a file or folder of another program as a scan of line integrals, row 0 the lowest, in mm, s and radians.
-    ``options``: values that the files do not state; ``form``: a key of ``FORMATS``, None recognises it. InputError: an
-    unknown format, damaged or incomplete files, options without use for the format."""
+    ``options``: values that the files do not state; ``form``: a key of ``FORMATS``, None recognises it. Raises InputError
+    for an unknown format, damaged or incomplete files, and options that the format does not use."""
     path = Path(path)
     _check_there(path)
     form = form or recognise(path)
@@ -108,14 +108,14 @@ def import_scan(path: str | Path, options: ImportOptions | None = None, form: st
 
 
 def _check_there(path: Path) -> None:
-    """Raises InputError for what is neither a file nor a folder."""
+    """Raises InputError for a path that is neither a file nor a folder."""
     if not (path.is_dir() or path.is_file()):
         found = "something that is neither a file nor a folder" if path.exists() else "nothing there"
         raise InputError(str(path), found, "a scan to import", "check the path")
 
 
 def recognise(path: Path) -> str:
-    """Returns the name of the format of a file or folder, by its content. InputError if none fits, or more than one."""
+    """Returns the key in ``FORMATS`` of a file or folder, by its content. Raises InputError where none or several fit."""
     _check_there(path)
     expected = "one of the formats of docs/import.md"
     names = [name for name in FORMATS if _function("recognises", name)(path)]
@@ -139,15 +139,15 @@ def _function(name: str, form: str) -> Callable[..., Any]:
 
 
 def foreign_volume(path: str | Path) -> str | None:
-    """Returns the name of a volume format other than HDF5, by the suffix; None for any other file."""
+    """Returns the name of a file's volume format, such as "NIfTI", by its suffix; None for HDF5 and other files."""
     return reader[0] if (reader := _reader(path)) else None
 
 
 def load_volume(path: str | Path, mu_water_per_mm: float | None = None) -> Volume:
-    """Reads a volume (nz, ny, nx) float32 in 1/mm of any format. Its axes are turned to rise with the world's, which are LPS
-    (docs/export.md). Bare values have no grid: a dataset /volume, NRRD and TIFF without voxel sizes, .npy without its .json.
-    Hounsfield units are converted, see ``in_per_mm``. InputError: a damaged file, oblique axes, Hounsfield units without a
-    scale, NaN or infinity."""
+    """Reads a volume (nz, ny, nx) float32 in 1/mm of any format. Axes are reordered and flipped to rise with the world's,
+    LPS (docs/export.md). Bare values have no grid: a dataset /volume, files without voxel sizes, .npy without its .json.
+    Hounsfield units are converted, see ``in_per_mm``. Raises InputError for a damaged file, oblique axes, Hounsfield units
+    without ``mu_water_per_mm``, and values that are not finite."""
     if (reader := _reader(path)) is None:
         refuse_unread(Path(path), "a volume of a format of docs/formats.md")
         return in_per_mm(str(path), read_volume(path), mu_water_per_mm)
@@ -155,15 +155,16 @@ def load_volume(path: str | Path, mu_water_per_mm: float | None = None) -> Volum
 
 
 def load_states(path: str | Path) -> Iterator[tuple[float, Volume]]:
-    """Yields (time in s, volume) for each of the volumes of a NIfTI, NRRD or MetaImage file with four axes, else nothing.
-    InputError: as of ``load_volume``."""
+    """Yields (time in s, volume) for each volume of a NIfTI, NRRD or MetaImage file with four axes; nothing for other files.
+    Raises InputError as ``load_volume`` does."""
     if (reader := _reader(path)) is not None and reader[1] is read_image_volume:
         for state, time_s in enumerate(image_times_s(Path(path))):
             yield time_s, in_per_mm(str(path), read_image_volume(Path(path), state))
 
 
 def load_attenuation(path: str | Path, *, warn: bool = True) -> Volume:
-    """Reads a volume through which rays are to be sent; see ``check_attenuation``."""
+    """Reads a volume to be projected. Raises InputError, or warns, as ``check_attenuation`` does for values that are no
+    attenuation in 1/mm."""
     return check_attenuation(f"volume of {path}", load_volume(path), warn=warn)
 
 
@@ -173,7 +174,7 @@ def _reader(path: str | Path) -> tuple[str, Callable[[Path], Volume]] | None:
 
 
 def _read_npy(path: Path) -> Volume:
-    """Reads an array (z, y, x) and its grid, which a .json file of the same name holds."""
+    """Reads an array (z, y, x), with the grid in a .json file of the same name; without that file it has no grid."""
     values, beside = read_npy(path, 3), path.with_suffix(".json")
     facts = read_json(beside) if beside.is_file() else {}
     if "voxel_size_mm" not in facts:
@@ -203,8 +204,9 @@ def _read_zarr(path: Path) -> Volume:
 def _on_grid(
     path: Path, values: np.ndarray, size_mm: np.ndarray | None = None, first_mm: np.ndarray | None = None, note: str = ""
 ) -> Volume:
-    """Returns a volume with voxels of ``size_mm``, the first of them centred at ``first_mm`` (z, y, x); None centres the
-    volume. Without sizes it has no grid."""
+    """Returns a volume of values (z, y, x) with voxels of ``size_mm`` (3,), the first centred at ``first_mm`` (3,), both (z,
+    y, x). None for ``first_mm`` centres the volume at the origin. Without sizes it has no grid, and integers are divided by
+    the maximum of their type."""
     if size_mm is None:
         return Volume(finite_float32(str(path), shares_of_maximum(values)), None)
     centre_mm = np.zeros(3) if first_mm is None else first_mm + (np.array(values.shape) - 1) / 2 * size_mm
@@ -221,8 +223,8 @@ _READERS: dict[str, tuple[str, Callable[[Path], Volume]]] = {
 
 
 def load_beads(path: Path) -> EllipsoidPhantom:
-    """Reads the beads, then the wires, of a TOML file as a phantom with the file's name. InputError: not TOML; unknown,
-    missing or wrong keys; no bead; more than a thousand bodies."""
+    """Reads the beads, then the wires, of a TOML file as a phantom with the file's name. Raises InputError for a file that
+    is no TOML, unknown, missing or wrong keys, no bead, and more than a thousand bodies."""
     content = read_toml(path)
     refuse_unknown(str(path), content, ("title", _COMMON, *_KEYS))
     top, bodies = Fields(str(path), content), list[Ellipsoid | Cylinder]()

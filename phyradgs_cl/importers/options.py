@@ -53,8 +53,8 @@ def _option(help: str, usual: str | bool = _FILE, default: Any = None) -> Any:
 class ImportOptions:
     """Options of an import. None leaves a value to the file or to the format's convention. Readout axis and direction are
     those of the imported scan: row 0 the lowest, column 0 on the left, seen from the source. The command line has the words
-    of a data sheet, ``first``, ``fps``, ``exposure_ms`` and ``readout_ms``, from which the fields without help follow;
-    contradictions are refused. ``named``: returns the name of a field in messages."""
+    of a data sheet: ``first``, ``fps``, ``exposure_ms`` and ``readout_ms``. The fields without help are computed from them.
+    ``named`` returns the name of a field in messages. Raises InputError for values out of range, and for contradictions."""
 
     exposure_s: float | None = _option("Exposure of a line, s, in place of --exposure-ms.")
     readout_s: float | None = None
@@ -98,7 +98,7 @@ class ImportOptions:
                 elif name in _RANGES:
                     checks.within(self.named(name), number, *_RANGES[name])
         axis, direction = readout_order(self.first, self.readout_axis, self.readout_direction, self.named)
-        stated = {  # in the fields that every format reads
+        stated = {  # converted to the fields that every format reads
             "readout_axis": axis, "readout_direction": direction,
             "frame_time_s": frame_time_of(self.fps, self.frame_time_s, self.named),
             "exposure_s": seconds_of("exposure", self.exposure_ms, self.exposure_s, self.named),
@@ -111,8 +111,8 @@ class ImportOptions:
         return [name for name in among if getattr(self, name) != _DEFAULTS[name]]
 
     def taken(self, name: str, stored: Callable[[], T]) -> T:
-        """Returns the option ``name`` where it is given, else what ``stored`` reads from the file, whose errors then say the
-        option too."""
+        """Returns the option ``name`` where it is given, else the value that ``stored`` reads from the file. An InputError
+        of ``stored`` then names the option as a remedy."""
         value: T | None = getattr(self, name)
         if value is not None:
             return value
@@ -123,7 +123,7 @@ class ImportOptions:
             raise InputError(error.subject, error.found, error.expected, remedy) from error
 
     def angle_rad(self, count: int, stored: Callable[[], np.ndarray]) -> np.ndarray:
-        """Returns the angles (count,) of the option ``angles`` in rad, else those that ``stored`` reads, in rad."""
+        """Returns angles (count,) in rad: of the option ``angles``, else those that ``stored`` reads."""
         if self.angles is None:
             return self.taken("angles", stored)
         if not (steps := _STEPS.fullmatch(self.angles)):
@@ -133,12 +133,12 @@ class ImportOptions:
         return np.deg2rad(first + last * np.arange(count) if steps[2] == "," else np.linspace(first, last, count))
 
     def with_air(self, flat_value: float | None) -> "ImportOptions":
-        """Returns the options with a file's counts of air where they state none."""
+        """Returns the options with a file's counts of air as ``flat_value``, unless they state their own."""
         return replace(self, flat_value=self.flat_value or flat_value)
 
     def called(self, name: str, in_file: Mapping[str, str] | None = None) -> str:
-        """Returns the name of a value in messages: the word of a data sheet where the user gave that, what it is called
-        ``in_file`` where the user gave none."""
+        """Returns the name of the field ``name`` in messages: its name ``in_file`` where the user gave no option, else the
+        option that was given, such as fps for frame_time_s."""
         if in_file and name in in_file and getattr(self, name, None) is None:
             return in_file[name]
         word = _WORD_OF.get(name, name)
@@ -160,7 +160,7 @@ _DEFAULTS = {item.name: item.default for item in fields(ImportOptions) if item.n
 FIELDS = tuple(_DEFAULTS)
 """The names of the options, without ``named``."""
 
-# options of formats whose files state little
+# The options that formats use whose files state little.
 TIMING = (
     *("exposure_s", "readout_s", "frame_time_s", "angle_at", "readout_axis", "readout_direction"),
     *("first", "fps", "exposure_ms", "readout_ms"),

@@ -1,5 +1,5 @@
-"""Deformations, in a separate HDF5 file or inside a scan file; the truth in scan files: a reference volume, and of an object
-that moves its states and its deformation."""
+"""Reads and writes deformations, in an HDF5 file of their own or inside a scan file, and the truth of simulated scans: a
+reference volume, and the states and deformation of an object that moves."""
 
 from pathlib import Path
 
@@ -20,14 +20,15 @@ _MEANS = "at time t the object has, at point y, the attenuation of the reference
 
 
 def write_deformation(path: str | Path, deformation: Deformation) -> None:
-    """Writes a file with one deformation, whole or not at all. OutputError: the file cannot be written."""
+    """Writes a file with one deformation, whole or not at all. Raises OutputError where the file cannot be written."""
     with h5.new_hdf5(path, deformation.control_mm.nbytes + deformation.weights.nbytes) as file:
         write_deformation_group(h5.new_group(file, "entry", "NXentry"), deformation)
 
 
 def read_deformation(path: str | Path) -> Deformation:
-    """Reads a deformation file, or the true deformation of a simulated scan. Raises InputError, about the HDF5
-    path, for missing values, shapes that do not fit, unknown units, values that are not finite, and matter that folds."""
+    """Reads a deformation file, or the true deformation of a simulated scan. Raises InputError, about the HDF5 path, for
+    missing values, shapes that do not fit, unknown units, values that are not finite, and a map that folds (a determinant
+    of 0 or less)."""
     with open_hdf5(path) as source:
         places = [name for name in (DEFORMATION, *_in_scans(source)) if source.find(name) is not None]
         if not places:
@@ -37,7 +38,7 @@ def read_deformation(path: str | Path) -> Deformation:
 
 
 def holds_deformation(path: str | Path) -> bool:
-    """Returns whether a file, such as a volume of an object that moves, has a deformation of its own."""
+    """Returns whether a file has a group ``DEFORMATION``, as the volume of an object that moves may have."""
     with open_hdf5(path) as source:
         return source.find(DEFORMATION) is not None
 
@@ -56,7 +57,7 @@ def deformation_summary(path: str | Path) -> dict[str, object]:
 
 
 def write_deformation_group(parent: h5py.Group, deformation: Deformation) -> None:
-    """Writes a group ``deformation`` with the control points' vectors, their place, times and weights."""
+    """Writes a group ``deformation``: control points' vectors, origin and spacing in mm, times in s, and weights."""
     group = h5.new_group(parent, "deformation", "NXcollection")
     group.attrs["description"] = _MEANS
     h5.write_number(group, "control", deformation.control_mm, "mm", axes="field, z, y, x, component (x y z)")
@@ -67,7 +68,7 @@ def write_deformation_group(parent: h5py.Group, deformation: Deformation) -> Non
 
 
 def read_deformation_group(source: Hdf5Source, address: str) -> Deformation:
-    """Reads and checks the group at ``address``."""
+    """Reads the group at ``address``. Raises InputError as ``read_deformation`` does."""
     source.group(address)
     control_mm = h5.read_array(source, f"{address}/control", (None, None, None, None, 3), h5.LENGTH)
     origin_mm = h5.read_array(source, f"{address}/origin", (3,), h5.LENGTH)
@@ -90,7 +91,7 @@ def _in_scans(source: Hdf5Source) -> list[str]:
 
 
 def write_truth(extra: h5py.Group, scan: Scan) -> None:
-    """Writes the group ``reference`` of a scan that has a truth."""
+    """Writes the group ``reference`` of a scan with a true volume or true states; otherwise nothing."""
     moving = scan.moving_truth
     if scan.reference is None and moving is None:
         return
@@ -105,7 +106,8 @@ def write_truth(extra: h5py.Group, scan: Scan) -> None:
 
 
 def check_truth(source: Hdf5Source, entry: str, grid: Grid) -> tuple[bool, int]:
-    """Returns whether there is a reference, and the number of states; InputError where their shapes do not fit."""
+    """Returns whether a scan file has a reference, and its number of states. Raises InputError where their shapes do not
+    fit the grid."""
     if source.optional_group(f"{entry}/{schema.REFERENCE}") is None:
         return False, 0
     states, times = (source.optional(f"{entry}/{name}") for name in (schema.STATES, schema.STATE_TIMES))
@@ -121,12 +123,13 @@ def check_truth(source: Hdf5Source, entry: str, grid: Grid) -> tuple[bool, int]:
 
 
 def read_reference(source: Hdf5Source, entry: str) -> np.ndarray:
-    """Reads the reference (nz, ny, nx) float32 in 1/mm. InputError for values that are not finite, or nowhere above 0."""
+    """Reads the reference (nz, ny, nx) float32 in 1/mm. Raises InputError for values not finite, or nowhere above 0."""
     return _read_volumes(source, f"{entry}/{schema.TRUTH}")
 
 
 def read_moving_truth(source: Hdf5Source, entry: str) -> MovingTruth:
-    """Reads the states of an object that moves, their times, and its deformation if there is one."""
+    """Reads the true states of an object that moves, their times, and its deformation or None. Raises InputError as
+    ``read_reference`` and ``read_deformation`` do."""
     times_s = h5.read_array(source, f"{entry}/{schema.STATE_TIMES}", (None,), h5.TIME)
     volumes = _read_volumes(source, f"{entry}/{schema.STATES}")
     address = f"{entry}/{schema.DEFORMATION}"

@@ -1,4 +1,4 @@
-"""Reading within bounds: regular files no further than their size, their hashes, and the memory of this machine."""
+"""Bounded reading of regular files, their hashes, and the memory of this machine."""
 
 import hashlib
 import os
@@ -17,19 +17,19 @@ except ImportError:  # not POSIX
     resource = None  # type: ignore[assignment]
 
 HOST_SHARE = 0.8
-"""The largest part of this machine's memory for one array."""
+"""The largest fraction of this machine's memory that one array may take."""
 _BLOCK_BYTES = 1 << 20
 
 
 def regular_file(path: Path, subject: str, expected: str = "a regular file") -> os.stat_result:
-    """Returns the status of a readable regular file. InputError about ``subject`` for a missing file, a folder, a device or
-    a pipe: reading the last two may never end."""
+    """Returns the status of a readable regular file. Raises InputError about ``subject`` for a missing or unreadable file, a
+    folder, a device and a pipe: reading the last two may never end."""
     where, remedy = "" if str(path) in subject else f" {path}", "check the path"
     try:
         status = os.stat(path)
     except FileNotFoundError as error:
         raise InputError(subject, f"no file{where}" if where else "no such file", expected, remedy) from error
-    except (OSError, ValueError) as error:  # ValueError: a NUL, or half a surrogate pair
+    except (OSError, ValueError) as error:  # ValueError: a NUL or half a surrogate pair in the name
         reason = getattr(error, "strerror", None) or "no name of a file"
         raise InputError(subject, f"{reason}{where}", expected, remedy) from error
     if not stat.S_ISREG(status.st_mode):
@@ -41,7 +41,7 @@ def regular_file(path: Path, subject: str, expected: str = "a regular file") -> 
 
 
 def read_regular(path: Path, subject: str, most_bytes: int, expected: str) -> bytes:
-    """Reads a whole file of at most ``most_bytes``."""
+    """Reads a whole regular file. Raises InputError about ``subject`` for a larger one than ``most_bytes``."""
     if (size := regular_file(path, subject, expected).st_size) > most_bytes:
         raise InputError(subject, f"{size} bytes", f"at most {most_bytes} bytes for {expected}")
     try:
@@ -54,7 +54,7 @@ def decoded(data: bytes) -> str:
     """Returns the text of a file in UTF-8, in UTF-16 as Windows saves it, or in Windows' western code page 1252."""
     if data[:2] in (b"\xff\xfe", b"\xfe\xff"):
         return data.decode("utf-16", "replace")
-    if data[1:8:2] == bytes(4) or data[:8:2] == bytes(4):  # without a mark at its beginning
+    if data[1:8:2] == bytes(4) or data[:8:2] == bytes(4):  # UTF-16 without a byte order mark
         return data.decode("utf-16-le" if data[1:2] == b"\0" else "utf-16-be", "replace")
     try:
         return data.decode("utf-8-sig")
@@ -63,8 +63,8 @@ def decoded(data: bytes) -> str:
 
 
 def sha256_of(path: str | Path, given_up: threading.Event | None = None) -> str:
-    """Returns the SHA-256 of a file, or of the names and files in a folder, as 64 hexadecimal digits; stops early when
-    ``given_up`` is set."""
+    """Returns the SHA-256 of a file, or of the names and files in a folder, as 64 hexadecimal digits. Stops early, with a
+    meaningless result, when ``given_up`` is set. Raises InputError for a file that cannot be read."""
     digest, subject = hashlib.sha256(), str(path)
     if (folder := Path(path)).is_dir():
         for part in sorted(part for part in folder.rglob("*") if part.is_file()):
@@ -92,7 +92,7 @@ def hashing(path: str | Path) -> Iterator[Callable[[], str]]:
 
 
 def host_bytes() -> float:
-    """Returns this machine's memory; infinity where the system does not report it."""
+    """Returns this machine's memory in bytes; infinity where the system does not report it."""
     try:
         return float(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
     except (AttributeError, OSError, ValueError):
@@ -100,7 +100,8 @@ def host_bytes() -> float:
 
 
 def free_bytes() -> float:
-    """Returns the memory that this process may still take; infinity where the system does not report it."""
+    """Returns the memory in bytes that this process may still take: what Linux calls available (elsewhere all), at most
+    its limit of address space."""
     free = host_bytes()
     with suppress(OSError, ValueError, IndexError):
         free = 1024.0 * int(Path("/proc/meminfo").read_text().partition("MemAvailable:")[2].split()[0])
@@ -109,8 +110,8 @@ def free_bytes() -> float:
 
 
 def in_use_bytes(field: str) -> int:
-    """Returns the memory of this process from a field of Linux' /proc/self/status: "VmHWM:" for the peak of resident memory,
-    "VmSize:" for the address space; 0 on other systems."""
+    """Returns bytes of memory of this process, from a field of Linux' /proc/self/status: "VmHWM:" for the peak of resident
+    memory, "VmSize:" for the address space. Returns 0 on other systems."""
     try:
         return 1024 * int(Path("/proc/self/status").read_text().partition(field)[2].split()[0])
     except (OSError, ValueError, IndexError):

@@ -1,5 +1,5 @@
-"""Outputs that are whole or absent: written under another name, then renamed; one run per output by a lock file. Checkpoints
-of interrupted runs are plain arrays in a NumPy archive, never a pickle."""
+"""Writes outputs whole or not at all: under another name first, then renamed. A lock file allows one run per output.
+Checkpoints of interrupted runs are plain arrays in a NumPy archive, never a pickle."""
 
 import errno
 import glob
@@ -21,17 +21,17 @@ import numpy as np
 from phyradgs_cl.errors import InputError, OutputError
 
 NO_SPACE = (errno.ENOSPC, errno.EFBIG, getattr(errno, "EDQUOT", errno.ENOSPC))
-"""System errors for a lack of room: on the disk, for one file, of the user's quota."""
-_LONGEST = 50  # characters of the target's name, of up to four bytes each: names end at 255
-_LONGEST_BYTES = 255  # of a name, in all common file systems
-_SPARE_BYTES = 1 << 16  # for headers
+"""Error numbers of the system for a lack of room: on the disk, for one file, of the user's quota."""
+_LONGEST = 50  # characters of the target's name kept in a temporary name: each may take 4 of a name's 255 bytes
+_LONGEST_BYTES = 255  # length limit of a file's name in all common file systems
+_SPARE_BYTES = 1 << 16  # reserved beyond the arrays, for headers
 _WRITER = re.compile(r"\.([0-9a-f]{8})-(\d{1,9})-[0-9a-f]{8}\.part(\.[a-z.]+)?$")
-_FORMAT = 2
+_FORMAT = 2  # version of checkpoints
 _RESTART = "start without --resume"
 
 
 class BusyError(OutputError):
-    """Another run is at work on the output."""
+    """Raised where another run holds the lock of the output."""
 
 
 def check_writable(path: str | Path) -> None:
@@ -40,14 +40,14 @@ def check_writable(path: str | Path) -> None:
 
 
 def refuse_overwriting(option: str, output: str | Path, *others: Path | None) -> None:
-    """Raises InputError for an output that is one of the other files of a command."""
+    """Raises InputError about ``option`` for an output that is one of the other files of a command."""
     for path in others:
         if path is not None and Path(output).resolve() == path.resolve():
             raise InputError(option, f"{path}, which the command reads or writes", "another file to write")
 
 
 def make_folder(folder: Path, subject: Path) -> None:
-    """Creates a folder and those above it; OutputError about ``subject`` where that fails."""
+    """Creates a folder and those above it. Raises OutputError about ``subject`` where that fails."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -56,14 +56,14 @@ def make_folder(folder: Path, subject: Path) -> None:
 
 
 def lock_path(output: str | Path) -> Path:
-    """Returns the lock file of ``output``. It exists while a run writes there and means nothing after that run."""
+    """Returns the path of the lock file of ``output``. One that a dead process has left locks nothing."""
     return beside(Path(os.path.realpath(output)), ".lock", ".")
 
 
 @contextmanager
 def only_run(output: str | Path) -> Iterator[None]:
-    """Holds the lock of ``output``, which the system releases when a process ends. BusyError where another run holds
-    it."""
+    """Holds the lock of ``output``, which the system releases when a process ends. Raises BusyError where another run holds
+    it, and OutputError where it cannot be created."""
     from filelock import FileLock, Timeout
 
     path = lock_path(output)
@@ -87,9 +87,9 @@ def only_run(output: str | Path) -> Iterator[None]:
 @contextmanager
 def written_beside(path: str | Path, size_bytes: int = 0, suffix: str = "") -> Iterator[Path]:
     """Yields a temporary path in the target's folder that replaces the target on success, in one step. After an error an
-    existing target has its old content, and system errors of the body become OutputError about ``path``. ``size_bytes``: of
-    the arrays to be written. Their room is reserved first, for libraries that crash on a full disk or do not notice it.
-    ``suffix``: the ending of the temporary name, for libraries that go by it."""
+    existing target has its old content, and system errors of the body become OutputError about ``path``. ``size_bytes``:
+    size of the arrays to be written. Their room is reserved first, since some libraries crash on a full disk or do not
+    notice it. ``suffix``: the ending of the temporary name, from which some libraries infer the format."""
     target = _target(path)
     temporary = _create_beside(target, suffix)
     try:
@@ -112,7 +112,7 @@ def written_beside(path: str | Path, size_bytes: int = 0, suffix: str = "") -> I
 
 
 def _target(path: str | Path) -> Path:
-    """Returns the file to write, behind any symbolic link; OutputError where it or its folder is unsuitable."""
+    """Returns the file to write, behind any symbolic link. Raises OutputError where it or its folder cannot be written."""
     shown = str(path)
     if not shown or shown.endswith(("/", os.sep)) or os.path.isdir(shown):
         raise OutputError(shown or "output path", "a folder", "a file name", "add a file name to the path")
@@ -135,7 +135,8 @@ def _target(path: str | Path) -> Path:
 
 
 def _create_beside(target: Path, suffix: str = "") -> Path:
-    """Creates an empty file in the target's folder, with the permissions of the user's umask."""
+    """Creates an empty temporary file in the target's folder, with the permissions of the user's umask. Raises OutputError
+    where that fails."""
     temporary = temporary_name(target, suffix)
     try:
         os.close(os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
@@ -147,8 +148,8 @@ def _create_beside(target: Path, suffix: str = "") -> Path:
 
 
 def temporary_name(target: Path, suffix: str = "") -> Path:
-    """Returns a new name in the target's folder that holds the number of this process; removes files that dead
-    processes left."""
+    """Returns a new temporary path in the target's folder, with this process' number in its name. Removes the temporary
+    files that dead processes left for targets with the same stem."""
     for path in target.parent.glob(f".{glob.escape(target.stem[:_LONGEST])}*.part*"):
         writer = _WRITER.search(path.name)
         if writer and writer[1] == _machine() and _is_dead(int(writer[2])):
@@ -159,7 +160,7 @@ def temporary_name(target: Path, suffix: str = "") -> Path:
 
 @cache
 def _machine() -> str:
-    """Returns a name of this machine, or of the container on it, in which process numbers are unique."""
+    """Returns an identifier of this machine, or of the container on it, in which process numbers are unique."""
     namespace = ""
     with suppress(OSError):
         namespace = os.readlink("/proc/self/ns/pid")
@@ -184,7 +185,7 @@ def _discard(path: Path) -> None:
 
 
 def _flush_folder(folder: Path) -> None:
-    """Makes the renaming durable, on systems that open folders."""
+    """Writes a folder's entries to the disk, so that a renaming survives a power cut, on systems that allow it."""
     with suppress(OSError):
         descriptor = os.open(folder, os.O_RDONLY)
         try:
@@ -206,7 +207,7 @@ def _output_error(target: Path, error: BaseException) -> OutputError:
 
 
 def shortened(name: str, most_bytes: int) -> str:
-    """Returns ``name``, or its beginning and a digest of all of it in ``most_bytes``."""
+    """Returns ``name``, or, where it is longer than ``most_bytes``, its beginning and a digest of all of it."""
     raw = os.fsencode(name)
     if len(raw) <= most_bytes:
         return name
@@ -215,7 +216,7 @@ def shortened(name: str, most_bytes: int) -> str:
 
 
 def beside(path: str | Path, ending: str, beginning: str = "") -> Path:
-    """Returns the path ``beginning`` + name + ``ending`` in the same folder, shortened to a name that file systems take."""
+    """Returns the path ``beginning`` + name + ``ending`` in the same folder, with a name shortened to 255 bytes."""
     room = _LONGEST_BYTES - len(os.fsencode(beginning + ending))
     path = Path(path)
     return path.with_name(f"{beginning}{shortened(path.name, room)}{ending}")
@@ -242,7 +243,7 @@ def write_checkpoint(path: str | Path, state: Mapping[str, np.ndarray]) -> None:
 
 
 def read_checkpoint(path: str | Path) -> dict[str, np.ndarray]:
-    """Returns the state in a checkpoint. Raises InputError for a missing or damaged file, or another version's."""
+    """Returns the arrays of a checkpoint by name. Raises InputError for a missing or damaged file, or another version's."""
     if not Path(path).is_file():
         raise InputError("--resume", f"no checkpoint {path}", "one left by an interrupted run", _RESTART)
     try:
@@ -250,7 +251,7 @@ def read_checkpoint(path: str | Path) -> dict[str, np.ndarray]:
             arrays = dict(archive)
         if not all(isinstance(values, np.ndarray) for values in arrays.values()):
             raise ValueError("no array")
-    except Exception as error:  # zipfile, zlib and NumPy's parser pass on errors of every kind
+    except Exception as error:  # zipfile, zlib and NumPy's parser raise exceptions of every kind
         reason = f" ({error.strerror})" if isinstance(error, OSError) and error.strerror else ""
         raise InputError(str(path), f"a damaged checkpoint{reason}", "a complete one", _RESTART) from error
     if not np.array_equal(arrays.pop("format", None), _FORMAT):

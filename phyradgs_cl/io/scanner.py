@@ -1,4 +1,4 @@
-"""Scanner descriptions: a TOML file with the geometry, the volume and the readout of the panel."""
+"""Reads scanner descriptions: TOML files with the geometry, the volume and the readout of the panel."""
 
 import math
 from dataclasses import dataclass, replace
@@ -27,14 +27,14 @@ TABLES: dict[str, tuple[str, ...]] = {
     "readout": ("axis", "direction", "first", "ratio", "fps", "readout_ms"),
 }
 _WORDS = ("title",)
-MOST_LINES = 65_536
+MOST_LINES = 65_536  # largest number of rows, and of columns, of a panel
 
 
 @dataclass(frozen=True)
 class Scanner:
     """A scanner: geometry, imaged volume, and the default readout of its panel. ``readout_ratio``: T_ro/T_exp, None for the
     protocol's. ``pulse``: start and length of the beam in a frame, in exposures; None for a steady beam. ``lag``: the
-    panel's λ. ``fps``, ``readout_ms``: frame rate and readout of the data sheet."""
+    fraction λ of a frame from earlier frames. ``fps``, ``readout_ms``: frame rate and readout of the data sheet, or None."""
 
     name: str
     geometry: Geometry
@@ -49,14 +49,15 @@ class Scanner:
 
 
 def load_scanner(name_or_path: str | Path, data_dir: Path) -> Scanner:
-    """Loads a scanner by name (``data_dir``/NAME.toml) or from a path that ends in .toml. InputError: no such scanner, not
-    TOML; unknown, missing or wrong keys, as "FILE [table] key"."""
+    """Loads a scanner by name (``data_dir``/NAME.toml) or from a path that ends in .toml. Raises InputError for an unknown
+    scanner, text that is not TOML, and unknown, missing or wrong keys, which it names "FILE [table] key"."""
     path = _located(str(name_or_path), data_dir)
     return scanner_from(path, read_toml(path))
 
 
 def with_detector_count(geometry: Geometry, rows: int, columns: int) -> Geometry:
-    """Returns the same panel, of the same size and place, with another number of pixels."""
+    """Returns the geometry with a panel of the same size and place but other numbers of pixels. Raises InputError below
+    1."""
     if min(rows, columns) < 1:
         raise InputError("detector count", f"{rows} × {columns}", "at least 1 row and 1 column")
     (nv, nu), (pitch_v, pitch_u) = geometry.detector_shape, geometry.pixel_size_mm
@@ -83,7 +84,7 @@ def _describes_scanner(path: Path) -> bool:
 
 
 def scanner_from(path: Path, content: dict[str, object]) -> Scanner:
-    """Returns the scanner that the content of a TOML file describes; ``path`` names it in messages."""
+    """Returns the scanner that the content of the TOML file ``path`` describes. Raises InputError as ``load_scanner``."""
     refuse_unknown(str(path), content, (*TABLES, *_WORDS), "a table")
     tables = {name: Fields(f"{path} [{name}]", content.get(name, {}), keys) for name, keys in TABLES.items()}
     geometry = _geometry(tables["source"], tables["detector"])
@@ -103,7 +104,8 @@ def scanner_from(path: Path, content: dict[str, object]) -> Scanner:
 
 
 def _order(readout: Fields) -> tuple[str, int]:
-    """Returns readout axis and direction, from ``first`` or their own keys; rows from the lowest up by default."""
+    """Returns readout axis and direction from ``first`` or from their own keys; by default, rows from the lowest up. Raises
+    InputError for contradictions."""
     direction = readout.get("direction") if readout.has("direction") else 1
     if isinstance(direction, bool) or direction not in (1, -1):
         expected, remedy = "1 (index 0 first) or -1 (index 0 last)", 'a side in words goes into first, as first = "top"'

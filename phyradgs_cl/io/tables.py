@@ -1,4 +1,4 @@
-"""Typed values out of plain containers (TOML, JSON, pickles). An error names the value by its path in the container."""
+"""Reads typed values from plain containers (TOML, JSON, pickles). An error names the value by its path in the container."""
 
 import json
 import logging
@@ -19,9 +19,9 @@ if sys.version_info >= (3, 11):
 else:
     import tomli as tomllib
 
-LARGEST = 1e12  # of any angle, time or count that makes sense; keeps sums finite
-LARGEST_LENGTH = 1e9
-_MOST_TOML_BYTES = 16 << 20
+LARGEST = 1e12  # limit of the size of any number: no angle, time or count is larger, and sums stay finite
+LARGEST_LENGTH = 1e9  # limit of a length in mm; its inverse is the least one
+_MOST_TOML_BYTES = 16 << 20  # limit of a TOML file
 _COUNTS = {2: "two", 3: "three"}
 _log = logging.getLogger(__name__)
 PROVENANCE: dict[str, tuple[type, ...]] = {
@@ -35,17 +35,17 @@ PROVENANCE: dict[str, tuple[type, ...]] = {
 
 
 def read_toml(path: Path, subject: str = "") -> dict[str, Any]:
-    """Parses a TOML file. InputError about ``subject``, or the path, for a missing file or other text."""
+    """Parses a TOML file. Raises InputError, about ``subject`` or the path, for a missing file and for other text."""
     subject = subject or str(path)
     try:
         return tomllib.loads(decoded(read_regular(path, subject, _MOST_TOML_BYTES, "a TOML file")))
-    except (ValueError, RecursionError) as error:  # also numbers of too many digits and tables that are too deep
+    except (ValueError, RecursionError) as error:  # raised also for too many digits, and for deep tables
         raise InputError(subject, f"text that is not TOML ({error})", "a TOML file") from error
 
 
 def read_facts(subject: str, text: str, types: Mapping[str, tuple[type, ...]]) -> dict[str, object]:
-    """Parses a JSON object, such as provenance, which users edit. A field of a wrong type is left out with a warning; None
-    passes everywhere. InputError for other text."""
+    """Parses a JSON object, such as provenance, which users may edit. A field of another type than in ``types`` is left out,
+    with a warning; null is accepted in every field. Raises InputError for text that is not a JSON object."""
     try:
         facts = json.loads(text)
     except (ValueError, RecursionError) as error:
@@ -62,7 +62,7 @@ def read_facts(subject: str, text: str, types: Mapping[str, tuple[type, ...]]) -
 
 
 def _fits(value: object) -> bool:
-    """True for a list of tables, for a finite number of 64 bits at most, and for other types."""
+    """True for a list of tables, for a number of at most 64 bits that is finite, and for all other types."""
     if isinstance(value, list):
         return all(isinstance(line, dict) for line in value)
     return not isinstance(value, (int, float)) or abs(value) < 2**63
@@ -77,8 +77,8 @@ def refuse_unknown(subject: str, names: Collection[str], allowed: Collection[str
 
 
 class Fields:
-    """A mapping whose values are read one by one, each checked; ``subject`` names it in messages. ``allowed``: the only keys
-    that it may have; None allows any."""
+    """A table whose values are read one by one and checked. ``subject`` names it in messages. ``allowed``: the only keys
+    that it may have; None allows any. Methods raise InputError, about "SUBJECT key", for missing and for wrong values."""
 
     def __init__(self, subject: str, values: object, allowed: Collection[str] | None = None) -> None:
         if not isinstance(values, Mapping):
@@ -110,7 +110,7 @@ class Fields:
     def number(
         self, key: str, default: float | None = None, lowest: float = -LARGEST, highest: float = LARGEST
     ) -> float:
-        """Returns a finite number between two bounds, both included."""
+        """Returns a finite number from ``lowest`` to ``highest``, or ``default`` where the key is missing."""
         if default is not None and not self.has(key):
             return default
         value = self._finite(key, self.get(key))
@@ -120,18 +120,18 @@ class Fields:
         return value
 
     def length(self, key: str) -> float:
-        """Returns a number above zero, of a size that a scanner may have."""
+        """Returns a number from 1e-9 to 1e9: above 0, and of a size that a scanner may have."""
         value = self.number(key, highest=LARGEST_LENGTH)
         if value < 1 / LARGEST_LENGTH:
             raise self.error(key, f"{value:g}", "a number above 0")
         return value
 
     def position(self, key: str) -> float:
-        """Returns a number of a size that a scanner may have; 0 where the table has none."""
+        """Returns a number from -1e9 to 1e9; 0 where the key is missing."""
         return self.number(key, 0.0, -LARGEST_LENGTH, LARGEST_LENGTH)
 
     def numbers(self, key: str, count: int | None = None, largest: float = LARGEST) -> np.ndarray:
-        """Returns the finite numbers of a list or an array, (count,) float64, of size ``largest`` at most."""
+        """Returns the finite numbers of a list or an array, (count,) float64, each at most ``largest`` in size."""
         values = self.get(key)
         if isinstance(values, np.ndarray):
             values = values.tolist() if values.ndim == 1 else None
@@ -143,7 +143,7 @@ class Fields:
         return np.array([self._finite(key, value, largest) for value in values], np.float64)
 
     def lengths(self, key: str, count: int) -> np.ndarray:
-        """Returns (count,) numbers above zero."""
+        """Returns ``count`` numbers above 0, (count,) float64."""
         values = self.numbers(key, count)
         if values.min() <= 0:
             raise self.error(key, str(values.tolist()), "numbers above 0")
@@ -190,7 +190,7 @@ class Fields:
 
 
 def described(value: object) -> str:
-    """Returns a value for a message; of containers only type and length, since nested ones can take for ever to print."""
+    """Returns a short text of a value for messages. Containers give type and length only: nested ones may be huge."""
     if value is None or isinstance(value, (bool, int, float, str, bytes, np.generic)):
         return checks.short_repr(value)
     size = f" of {len(value)}" if isinstance(value, (Mapping, Sequence)) else ""

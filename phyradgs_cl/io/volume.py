@@ -1,4 +1,4 @@
-"""Volume files in HDF5: a reconstruction as an NXdata with its grid, provenance and Gaussians; also bare arrays /volume."""
+"""Reads and writes volume files in HDF5: NXdata with grid, provenance and Gaussians. Reads also bare arrays /volume."""
 
 import json
 import logging
@@ -30,21 +30,21 @@ _VOLUME, _BARE = f"{_DATA}/volume", "/volume"
 _AXES = ("z", "y", "x")
 _GAUSSIANS, _STATE, _STATES = "/entry/gaussians", "/entry/state", "/entry/time_series"
 _CLOUD = {"mean": (3,), "scale": (3,), "quaternion": (4,), "density": ()}
-_LOWEST_PER_MM, _HIGHEST_PER_MM = -10.0, 1000.0  # beyond noise below 0, and beyond gold
-_USUAL_PER_MM = 10.0  # values beyond, of a volume that the user takes for one in HU, are HU
+_LOWEST_PER_MM, _HIGHEST_PER_MM = -10.0, 1000.0  # limits of attenuation: below is no noise, above not even gold
+_USUAL_PER_MM = 10.0  # values beyond are HU where the user states water's attenuation
 VALUES = "values"
-"""The key, in a volume's provenance, of what a file of another format notes of its values."""
+"""The provenance's key of the note on its values that a file of another format holds."""
 FROM_HU = "1/mm, from HU"
-"""What it says of a volume that ``in_per_mm`` has converted."""
-_AXIS_TOLERANCE = 1e-3  # of a voxel, for axes stored in float32
+"""The note on the values of a volume that ``in_per_mm`` has converted."""
+_AXIS_TOLERANCE = 1e-3  # largest deviation of a voxel's centre, in voxels: axes may be stored in float32
 log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, eq=False)
 class Volume:
-    """Values (nz, ny, nx) float32 in 1/mm and their grid; None for a bare array. A volume file also holds ``provenance``
-    (types as in ``tables.PROVENANCE``), ``gaussians`` float32 in mm and 1/mm, and ``metrics`` by name. deformation: how the
-    object moves whose reference the volume is. states: the object at some times, whose mean the volume is."""
+    """Values (nz, ny, nx) float32 in 1/mm and their grid, or None for a bare array. A volume file also holds ``provenance``
+    (types as in ``tables.PROVENANCE``), ``gaussians`` float32 in mm and 1/mm, and ``metrics`` by name. deformation: the
+    object's motion, with the volume at rest. states: the object at several times; the volume is their mean."""
 
     values: np.ndarray
     grid: Grid | None
@@ -55,7 +55,7 @@ class Volume:
     states: States | None = None
 
     def at(self, time_s: float) -> np.ndarray:
-        """Returns the values (nz, ny, nx) at a time in s; of an object that neither moves nor changes always the same."""
+        """Returns the values (nz, ny, nx) in 1/mm at a time in s; always ``values`` without states and deformation."""
         if self.states is not None:
             return self.states.at(time_s)
         if (field := self.deformation) is None:
@@ -63,7 +63,7 @@ class Volume:
         return deformed(self.values, self.required_grid, field, field.weights_at(time_s)[0])
 
     def moved_by(self, deformation: Deformation, subject: str) -> "Volume":
-        """Returns the volume with another deformation. InputError, which names it by ``subject``, where it holds states."""
+        """Returns the volume with another deformation. Raises InputError, with ``subject``, for a volume with states."""
         if self.states is not None:
             found, expected = f"{subject}, which holds its states", "a volume whose object does not change"
             raise InputError("--object-motion", found, expected, "leave it out")
@@ -85,7 +85,7 @@ class Volume:
 
     @property
     def required_grid(self) -> Grid:
-        """Returns the grid; InputError for a bare array."""
+        """The grid. Raises InputError for a bare array."""
         if self.grid is None:
             raise InputError("volume", "values without voxel sizes", "a volume with its grid in mm")
         return self.grid
@@ -97,9 +97,9 @@ def write_volume(
     state: Mapping[str, np.ndarray] | None = None, deformation: Deformation | None = None, states: States | None = None,
 ) -> None:
     """Writes a volume (nz, ny, nx) in 1/mm, whole or not at all. ``provenance`` and ``metrics`` are stored as JSON, plain
-    values also as attributes; ``gaussians`` as float32; ``state``: arrays and texts from which an interrupted run resumes;
-    ``deformation``: how the object moves; ``states``: the object at some times. InputError: an array that
-    is not finite or does not fit the grid. OutputError: the file cannot be written."""
+    values also as attributes; ``gaussians`` as float32. ``state``: arrays and texts from which an interrupted run resumes.
+    ``deformation``: how the object moves; ``states``: the object at several times. Raises InputError where the volume is
+    not finite or does not fit the grid, OutputError where the file cannot be written."""
     checks.shape("volume", volume, grid.shape)
     checks.finite("volume", volume)
     arrays = [volume, *(state or {}).values(), *([] if gaussians is None else vars(gaussians).values())]
@@ -128,8 +128,8 @@ def write_volume(
 
 def read_volume(path: str | Path) -> Volume:
     """Reads a volume file, or a bare array /volume (z, y, x), which has no grid and whose integers are divided by the
-    maximum of their type. InputError names the HDF5 path of the damage. Warns of damaged provenance, which is left out,
-    and of a run that was interrupted."""
+    maximum of their type. Raises InputError, with the HDF5 path, for damage. Warns of provenance of a wrong type, which is
+    left out, and of a run that was interrupted."""
     with open_hdf5(path) as source:
         if isinstance(source.find(_BARE), h5py.Dataset):
             dataset, subject = source.dataset(_BARE), source.name(_BARE)
@@ -148,8 +148,8 @@ def read_volume(path: str | Path) -> Volume:
 
 
 def read_state(path: str | Path) -> dict[str, np.ndarray] | None:
-    """Reads the state from which an interrupted run resumes. None where there is none, and with a warning where it is
-    damaged. The caller checks the arrays."""
+    """Reads the state from which an interrupted run resumes, by name. Returns None where there is none, and, with a warning,
+    where it is damaged. The caller checks the arrays."""
     with open_hdf5(path) as source:
         try:
             group = source.optional_group(_STATE)
@@ -160,9 +160,9 @@ def read_state(path: str | Path) -> dict[str, np.ndarray] | None:
 
 
 def check_attenuation(subject: str, volume: Volume, *, warn: bool = True) -> Volume:
-    """Returns ``volume`` if rays can be sent through it. InputError about ``subject`` where the negative values outweigh
-    the positive ones, as in Hounsfield units, and for values that no file of ours may hold; a warning where the negative
-    values are more than a tenth."""
+    """Returns ``volume``, which is to be projected. Raises InputError about ``subject`` where the sum of the negative values
+    is at least that of the positive ones in size, as in Hounsfield units, and for values beyond 1e9. Warns where it is more
+    than a tenth."""
     values = volume.values
     if (size := float(np.abs(values).max())) > h5.ATTENUATION.largest:
         expected = f"attenuation of at most {h5.ATTENUATION.largest:g} 1/mm"
@@ -181,9 +181,9 @@ def check_attenuation(subject: str, volume: Volume, *, warn: bool = True) -> Vol
 
 
 def in_per_mm(subject: str, volume: Volume, mu_water_per_mm: float | None = None) -> Volume:
-    """Returns a volume in 1/mm. Values that a file notes as Hounsfield units are converted by the scale in the note, or by
-    water's attenuation; values beyond 10 by water's alone. The result then holds the scale. InputError about ``subject``
-    for noted Hounsfield units without either."""
+    """Returns a volume in 1/mm. Values that the file's note calls Hounsfield units are converted by the scale in the note,
+    else by ``mu_water_per_mm``. Values beyond 10 without a note are converted by ``mu_water_per_mm`` if it is given. The
+    result then holds the scale. Raises InputError about ``subject`` for noted Hounsfield units without either."""
     stated = None if mu_water_per_mm is None else Hounsfield(mu_water_per_mm)
     is_hu, scale = of_note(str(volume.provenance.get(VALUES, "")))
     if scale is None and (is_hu or float(np.abs(volume.values).max()) > _USUAL_PER_MM):
@@ -197,8 +197,8 @@ def in_per_mm(subject: str, volume: Volume, mu_water_per_mm: float | None = None
 
 
 def words_of_hu(volumes: Mapping[Path, Volume], mu_water_per_mm: float | None = None) -> str:
-    """Returns the names and scales of volumes that ``in_per_mm`` has converted, for the end of a line. InputError for
-    water's attenuation that none of them needed."""
+    """Returns the names and scales of volumes that ``in_per_mm`` has converted, to append to a line of output. Raises
+    InputError for water's attenuation that none of them needed."""
     scales = {path: one.scale for path, one in volumes.items() if one.provenance.get(VALUES) == FROM_HU}
     if mu_water_per_mm is not None and Hounsfield(mu_water_per_mm) not in scales.values():
         found = f"{mu_water_per_mm:g} for {' and '.join(map(str, volumes))}"
@@ -208,8 +208,8 @@ def words_of_hu(volumes: Mapping[Path, Volume], mu_water_per_mm: float | None = 
 
 
 def attenuation_of(subject: str, volume: Volume) -> Volume:
-    """Returns the volume. InputError about ``subject`` for values that no attenuation in 1/mm has: those of CT numbers, and
-    counts."""
+    """Returns the volume. Raises InputError about ``subject`` for values that are no attenuation in 1/mm, such as Hounsfield
+    units and counts."""
     lowest, highest = float(volume.values.min()), float(volume.values.max())
     if lowest < _LOWEST_PER_MM or highest > _HIGHEST_PER_MM:
         found = f"values from {lowest:g} to {highest:g}, as of Hounsfield units"
@@ -218,7 +218,7 @@ def attenuation_of(subject: str, volume: Volume) -> Volume:
 
 
 def volume_summary(path: str | Path) -> dict[str, Any]:
-    """Returns facts about a volume file without reading the voxels."""
+    """Returns facts about a volume file by name, without reading the voxels. Raises InputError for a damaged file."""
     with open_hdf5(path) as source:
         _, grid = _dataset_and_grid(source)
         means = source.optional(f"{_GAUSSIANS}/mean") if source.optional_group(_GAUSSIANS) else None
@@ -232,7 +232,7 @@ def volume_summary(path: str | Path) -> dict[str, Any]:
 
 
 def read_states(path: str | Path) -> States | None:
-    """Reads the object at some times from a volume file. None where the file has no states."""
+    """Reads the states, the object at several times, from a volume file. Returns None where the file has none."""
     with open_hdf5(path) as source:
         return _read_states(source, _dataset_and_grid(source)[1].shape)
 
@@ -245,8 +245,8 @@ def _states_summary(source: Hdf5Source, shape: tuple[int, ...]) -> dict[str, obj
 
 
 def file_kind(path: str | Path) -> str:
-    """Returns the kind of an HDF5 file: "scan", "volume", "plain-volume" (a bare dataset /volume) or "deformation", else
-    InputError."""
+    """Returns the kind of an HDF5 file: "scan", "volume", "plain-volume" (a bare dataset /volume) or "deformation". Raises
+    InputError for any other."""
     with open_hdf5(path) as source:
         if isinstance(source.find(_DATA), h5py.Group):
             return "volume"
@@ -262,7 +262,7 @@ def file_kind(path: str | Path) -> str:
 
 
 def _read_provenance(source: Hdf5Source) -> dict[str, object]:
-    """Reads how a volume was made; warns, once per file, if its run was interrupted."""
+    """Reads a volume's provenance; {} where the file has none. Warns, once per file, of an interrupted run."""
     provenance = _read_facts(source, "provenance", PROVENANCE) or {}
     if where := interruption(provenance):
         of = "" if where["iterations_asked"] is None else f" of {where['iterations_asked']}"
@@ -271,7 +271,7 @@ def _read_provenance(source: Hdf5Source) -> dict[str, object]:
 
 
 def interruption(provenance: Mapping[str, object]) -> dict[str, int | None]:
-    """Returns ``interrupted_at`` and ``iterations_asked`` of an interrupted run; an empty table for any other."""
+    """Returns ``interrupted_at`` and ``iterations_asked`` of an interrupted run; an empty dict for a complete one."""
     at, options = provenance.get("interrupted_at"), provenance.get("options")
     if type(at) is not int:  # a bool is an int too
         return {}
@@ -334,7 +334,7 @@ def _dataset_and_grid(source: Hdf5Source) -> tuple[h5py.Dataset, Grid]:
 
 
 def _grid_of_axes(source: Hdf5Source, shape: tuple[int, ...]) -> Grid:
-    """Derives the grid from the centres of the voxels along each axis."""
+    """Derives the grid from the voxels' centres along each axis. Raises InputError where they do not rise evenly."""
     steps_mm: list[float | None] = []
     centres_mm = []
     for name, count in zip(_AXES, shape, strict=True):
@@ -358,7 +358,7 @@ def _read_states(source: Hdf5Source, shape: tuple[int, ...]) -> States | None:
 
 
 def _states_datasets(source: Hdf5Source, shape: tuple[int, ...]) -> tuple[np.ndarray, h5py.Dataset]:
-    """Returns the times (K,) in s of states, and their dataset. InputError for times that do not rise, and other shapes."""
+    """Returns the times (K,) in s and the dataset (K, nz, ny, nx) of the states. Raises InputError for wrong ones."""
     times_s = h5.read_array(source, f"{_STATES}/time_s", (None,), h5.TIME)
     if len(times_s) == 0 or (np.diff(times_s) <= 0).any():
         raise source.error(f"{_STATES}/time_s", checks.short_repr(times_s.tolist()), "at least one time, rising")
@@ -368,7 +368,7 @@ def _states_datasets(source: Hdf5Source, shape: tuple[int, ...]) -> tuple[np.nda
 
 
 def _read_attenuation(source: Hdf5Source, address: str, dataset: h5py.Dataset) -> np.ndarray:
-    """Reads finite float32 in 1/mm."""
+    """Reads attenuation as float32 in 1/mm. Raises InputError for values that are not finite."""
     values = h5.read_values(source, address, dataset)
     checks.finite(source.name(address), values)
     return h5.in_unit(source, address, values, h5.ATTENUATION).astype(np.float32)
@@ -380,7 +380,7 @@ def shares_of_maximum(values: np.ndarray) -> np.ndarray:
 
 
 def finite_float32(subject: str, values: np.ndarray) -> np.ndarray:
-    """Returns ``values`` as contiguous float32; InputError about ``subject`` where one is not finite."""
+    """Returns ``values`` as contiguous float32. Raises InputError about ``subject`` where one is not finite."""
     with np.errstate(over="ignore"):  # values beyond float32 become infinite
         volume = np.ascontiguousarray(values, np.float32)
     bad = int(volume.size - np.count_nonzero(np.isfinite(volume)))
@@ -403,7 +403,7 @@ def _read_facts(source: Hdf5Source, name: str, types: Mapping[str, tuple[type, .
 
 
 def _read_metrics(source: Hdf5Source) -> dict[str, object] | None:
-    """Reads numbers by name; other values are left out with a warning."""
+    """Reads the metrics, numbers by name; other values are left out with a warning. None where the file has none."""
     metrics = _read_facts(source, "metrics", {})
     if metrics is None:
         return None

@@ -1,4 +1,4 @@
-"""Pixels to mask: sparks, which hit single pixels of single frames, and dead or hot pixels and lines.
+"""Finds pixels to mask: sparks, which hit single pixels of single frames, and dead or hot pixels and lines.
 
 Sparks (zingers) come from X-rays, cosmic rays or noise. As with cosmic rays on astronomers' panels, a feature that is
 sharper than the optics allow in every direction is no object: van Dokkum, Publ. Astron. Soc. Pac. 113 (2001) 1420.
@@ -18,26 +18,26 @@ from phyradgs_cl.prepare.step import Facts, MakeModel, unmasked_frames, with_mas
 _AROUND = np.ones((3, 3), bool)
 _NEIGHBOURS = np.array([[1, 1, 1], [1, 0, 1], [1, 1, 1]], bool)
 # Sparks
-_SHARPNESS = 0.3  # of a spark's height: how far both opposite pixels lie below it
-_NEAR, _FAR = 2, 3  # pixels away
-_MOVED = 5  # pixels within which the neighbouring frame shows a gap of the object again
-_SHOWN_AGAIN = 0.5  # of a spark's height
+_SHARPNESS = 0.3  # least difference from the pixels at both sides, as a fraction of a spark's height
+_NEAR, _FAR = 2, 3  # distances in pixels of the pixels at both sides
+_MOVED = 5  # side in pixels of the square in which a neighbouring frame may show the same gap of the object
+_SHOWN_AGAIN = 0.5  # least height of that gap, as a fraction of a spark's height
 _DIRECTIONS = ((0, 1), (1, 0), (1, 1), (1, -1))
 # Dead pixels
-LEAST_FRAMES = 5
-_DEVIATIONS = 10.0
-_MOST_TIMES = 0.7  # of the frames
-_MOST_FRAMES = 40
-_STILL_SIDES = 0.5  # of the outermost columns: if more never change, air has no noise
-_NEAR_AXIS = 1.5  # columns
-_SHARED = 0.1  # of a pixel's difference, in its four neighbours: an object is never as sharp as a dead pixel
-_LINE = 0.9  # of a line's pixels: from here the whole line is dead
+LEAST_FRAMES = 5  # fewer frames do not show dead pixels
+_DEVIATIONS = 10.0  # default of DeadOptions.deviations
+_MOST_TIMES = 0.7  # fraction of the frames above which a pixel that exceeds its neighbours is dead
+_MOST_FRAMES = 40  # frames that are examined, evenly spread
+_STILL_SIDES = 0.5  # fraction of the outermost columns' pixels: if more never change, air has no noise
+_NEAR_AXIS = 1.5  # distance in columns within which small parts of the object stand still
+_SHARED = 0.1  # fraction of a dead pixel's difference that its four neighbours do not reach, as an object's would
+_LINE = 0.9  # fraction of a line's pixels above which the whole line is dead
 
 
 @dataclass(frozen=True)
 class SparkOptions:
-    """threshold: least height in local deviations (``find_sparks``). least: least height in line integrals, dimensionless.
-    pixels: largest number of touching pixels that are one spark."""
+    """threshold: least height of a spark in local standard deviations (``find_sparks``). least: least height in line
+    integrals, dimensionless. pixels: largest number of touching pixels that count as one spark."""
 
     threshold: float = checks.ranged(5.0, 1, 1e3)
     least: float = checks.ranged(0.1, 0, 10)
@@ -69,9 +69,9 @@ def find_sparks(
 ) -> np.ndarray:
     """Returns the pixels of line integrals (F, v, u) that are brighter than an object can make them, bool (F, v, u).
 
-    They lie below the median of 5 × 5 pixels by ``least`` and by ``threshold`` deviations (from the median of 9 × 9 absolute
-    differences), are sharp in every direction, and form groups of at most ``pixels``. A feature that both the previous and
-    the next frame show nearby, at least half as high, is a gap of the object that moves on, and stays."""
+    They lie below the median of 5 × 5 pixels by ``least`` and by ``threshold`` standard deviations (from the median of 9 × 9
+    absolute differences), are sharp in every direction, and form groups of at most ``pixels``. A feature that both the
+    previous and the next frame show nearby, at least half as high, is a moving gap of the object, and is kept."""
     sparks = np.stack([_sparks_of(frame, threshold, least, pixels) for frame in frames])
     for f in np.flatnonzero(sparks.any(axis=(1, 2))) if len(frames) > 2 else ():
         height = _height(frames[f])
@@ -95,13 +95,13 @@ def _sparks_of(frame: np.ndarray, threshold: float, least: float, pixels: int) -
 
 
 def _height(frame: np.ndarray) -> np.ndarray:
-    """Returns how much brighter than the median of 5 × 5 pixels a frame (v, u) is, in line integrals."""
+    """Returns how far each pixel of line integrals (v, u) lies below the median of 5 × 5 pixels: how much brighter it is."""
     return np.asarray(scipy.ndimage.median_filter(frame, size=5, mode="nearest") - frame)
 
 
 def _opposite(frame: np.ndarray) -> Iterable[np.ndarray]:
-    """Yields for each direction the lower of the two opposite pixels (v, u), mirrored beyond the panel's edge. They are two
-    pixels away, or three where another spark is there."""
+    """Yields for each direction the lower value (v, u) of the pixels at both sides, two pixels away, or three where these
+    are higher, since another spark may be nearer. The frame is mirrored beyond the panel's edge."""
     wide = np.pad(frame, _FAR, mode="symmetric")
     rows, columns = frame.shape
 
@@ -133,10 +133,10 @@ def find_dead(
 ) -> np.ndarray:
     """Returns the dead pixels (v, u) bool of line integrals (F, v, u); none for fewer than five frames.
 
-    A pixel is dead if it never changes while its neighbours do. It is also dead if it exceeds all its neighbours in 70 % of
-    the frames and differs from the median of 3 × 3 pixels by more than ``deviations`` of the panel's pixels. Near
-    ``axis_column`` small parts of the object stand still on the panel: there a dead pixel has to be sharper than these. A
-    row or column that exceeds its two neighbours over nearly all its length is dead as a whole."""
+    A pixel is dead if it never changes while its neighbours do. It is also dead if, in 70 % of the frames, it is above, or
+    below, all its neighbours. It must then differ from the median of 3 × 3 pixels by more than ``deviations`` standard
+    deviations of the panel's pixels. Near ``axis_column`` small parts of the object stand still: there a dead pixel must be
+    sharper than these. A row or column that differs from both neighbours over 90 % of its length is dead as a whole."""
     if len(frames) < LEAST_FRAMES:
         return np.zeros(frames.shape[1:], bool)
     numbers = np.unique(np.linspace(0, len(frames) - 1, _MOST_FRAMES).round().astype(int))
@@ -149,8 +149,8 @@ def find_dead(
 
 
 def _lines(frames: np.ndarray, deviations: float) -> np.ndarray:
-    """Returns whole rows and columns (v, u) bool that exceed both neighbours nearly everywhere, in the median over frames.
-    That includes air, and no object is so long and thin."""
+    """Returns whole rows and columns, bool (v, u), that are above or below both neighbours nearly everywhere, in the median
+    over frames: also in air, and no object is so long and thin."""
     dead = np.zeros(frames.shape[1:], bool)
     floor = 1e-3 * max(float(np.percentile(frames, 99.9)), 1e-9)
     for axis in (0, 1):
@@ -167,7 +167,7 @@ def _lines(frames: np.ndarray, deviations: float) -> np.ndarray:
 
 
 def _constant(frames: np.ndarray) -> np.ndarray:
-    """Returns the pixels that never change while their neighbours do, except for air without noise."""
+    """Returns the pixels, bool (v, u), that never change while their neighbours do, except for air without noise."""
     swing = np.ptp(frames, axis=0)
     constant = swing == 0
     sides = np.zeros_like(constant)
@@ -180,7 +180,8 @@ def _constant(frames: np.ndarray) -> np.ndarray:
 
 
 def _exceeding(frames: np.ndarray, deviations: float) -> np.ndarray:
-    """Returns pixels far beyond all their neighbours in most frames: edges of the object move on, or have similar pixels."""
+    """Returns pixels, bool (v, u), far above or below all neighbours in most frames. Edges of objects move, or are
+    longer."""
     above = np.mean([f > scipy.ndimage.maximum_filter(f, footprint=_NEIGHBOURS) for f in frames], axis=0)
     below = np.mean([f < scipy.ndimage.minimum_filter(f, footprint=_NEIGHBOURS) for f in frames], axis=0)
     difference = np.median([f - scipy.ndimage.median_filter(f, size=3) for f in frames], axis=0)
@@ -190,7 +191,8 @@ def _exceeding(frames: np.ndarray, deviations: float) -> np.ndarray:
 
 
 def _shared(frames: np.ndarray) -> np.ndarray:
-    """Returns pixels whose difference from the median of 5 × 5 their four neighbours share; one of these may be dead too."""
+    """Returns pixels, bool (v, u), whose difference from the median of 5 × 5 is shared by their four neighbours, in their
+    median, since one of them may be dead too."""
     difference = np.median([f - scipy.ndimage.median_filter(f, size=5) for f in frames], axis=0)
     wide = np.pad(difference, 1, mode="edge")
     sides = np.median([wide[:-2, 1:-1], wide[2:, 1:-1], wide[1:-1, :-2], wide[1:-1, 2:]], axis=0)

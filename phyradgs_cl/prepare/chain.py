@@ -1,4 +1,4 @@
-"""The steps by name, in physical order, and their application to a scan."""
+"""Applies the chosen preparation steps to a scan, in physical order."""
 
 import logging
 from collections.abc import Iterator, Mapping
@@ -30,16 +30,16 @@ STEPS: Mapping[str, Step] = {
     "stripes": correct_stripes,
     "phase": retrieve,
 }
-"""In the order in which they run, whatever the order in which the user names them."""
+"""The steps by name, in the order in which they run, in whatever order the user names them."""
 DEFAULT_STEPS = "sparks,dead,rings"
 PREPARED_KEY = "prepared"
-"""Where a scan's provenance lists the steps that were applied."""
+"""The provenance's key of the list of applied steps."""
 
 
 @dataclass(frozen=True)
 class PrepareOptions:
     """flats: one of ``light.WAYS``, used when a file is read. steps: names of ``STEPS``, separated by commas. The other
-    fields hold the options of each step."""
+    fields hold the options of each step. Raises InputError for unknown steps, and for options of a step not named."""
 
     flats: str = "mean"
     steps: str = ""
@@ -83,7 +83,7 @@ STEP_FIELDS = frozenset(f.name for f in fields(PrepareOptions))
 
 
 def prepare(scan: Scan, options: PrepareOptions, make_model: MakeModel) -> Scan:
-    """Applies the chosen steps to a scan. Its provenance lists them with their options and numbers."""
+    """Returns the scan after the chosen steps. Its provenance lists them with their options and numbers."""
     for _, after, _ in one_by_one(scan, options, make_model):
         scan = after
     return scan

@@ -1,4 +1,5 @@
-"""Beam hardening: converts line integrals to those of the thinnest layer. There are three ways.
+"""Corrects beam hardening: converts line integrals to those that a thin layer's attenuation would give. There are three
+ways.
 
 Polynomial: the user measured it with a wedge. Tube voltage: bone in the scan's own volume is reprojected, and the spectrum
 gives the soft tissue that remains (Joseph and Spital, J. Comput. Assist. Tomogr. 2 (1978) 100); this is repeated with the
@@ -26,26 +27,27 @@ log = logging.getLogger(__name__)
 Polynomial = tuple[float, float, float]
 BoneIn = Callable[[np.ndarray], np.ndarray]
 """Maps a volume (z, y, x) to the attenuation of the bone in each voxel."""
-_LARGEST = 1e3
-_PASSES = 2  # bone from the volume, then the volume from corrected frames
-_BONE_VOXELS = 128  # along the longest side, at most: hardening by bone is smooth
+_LARGEST = 1e3  # limit of the size of polynomial coefficients, and of bone_per_mm
+_PASSES = 2  # repetitions of: bone from the volume, frames corrected for it, a volume of these
+_BONE_VOXELS = 128  # limit along the longest side of the volume that is searched for bone: its hardening is smooth
 # Candidates (end of soft tissue, start of pure bone) as fractions of the densest; above 1 for bone thinner than a voxel.
 _BETWEEN = [(soft, bone) for soft in (0.1, 0.2, 0.3, 0.4, 0.5, 0.6) for bone in (0.4, 0.7, 1.0) if soft < bone]
 _BETWEEN += [(0.7, 1.0), (0.7, 1.5), (0.8, 1.5)]
-_AS_WELL = 0.1  # of the part that bone explains: less bone wins, because it does less harm where another effect remains
-_NEARLY = 1.02  # times the rest that water leaves: a user who states a voltage has a hardened scan
-_NEWTON = 3  # steps leave an error of 1e-12
-_UNIFORM = 0.08  # relative RMS that one material may leave unexplained
-_SHADOW = 0.1  # of the longest path
+_AS_WELL = 0.1  # within this fraction of what bone explains, the candidate with the least bone wins: it does less harm
+_NEARLY = 1.02  # limit of bone's unexplained rest over water's: a user who states a voltage has a hardened scan
+_NEWTON = 3  # steps of Newton's method, which leave an error of 1e-12
+_UNIFORM = 0.08  # limit of the relative RMS that the path through one material leaves unexplained
+_SHADOW = 0.1  # fraction of the longest path above which pixels lie behind the object
 _WATER_TO = 8.0  # largest line integral to which the polynomial of a voltage is fitted
 _NONE: Polynomial = (0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True)
 class HardeningOptions:
-    """polynomial: coefficients of p², p³ and p⁴. kvp: tube voltage in kV, for its spectrum. Neither: fitted to one material.
-    With kvp, bone_per_mm: attenuation from which a voxel is bone, 0: candidates are tried. filter_mm: of aluminium.
-    anode_deg: angle of a tungsten anode, for SpekPy's spectrum; 0: Kramers' law."""
+    """polynomial: coefficients of p², p³ and p⁴. kvp: tube voltage in kV, for its spectrum; 0: none. Without both, a
+    polynomial is fitted to one material. With kvp, bone_per_mm: attenuation in 1/mm from which a voxel is bone; 0:
+    candidates are tried. filter_mm: thickness of aluminium. anode_deg: angle of a tungsten anode, for SpekPy's spectrum; 0:
+    Kramers' law. Raises InputError for values out of range or in contradiction."""
 
     polynomial: Polynomial = checks.ranged(_NONE, -_LARGEST, _LARGEST)
     kvp: float = 0.0
@@ -122,8 +124,8 @@ def _by_voltage(scan: Scan, options: HardeningOptions, make_model: MakeModel) ->
 def _straighten_two(
     frames: np.ndarray, spectrum: Spectrum, model: Model, blur: float, water: Polynomial, bone_in: BoneIn
 ) -> tuple[np.ndarray, float]:
-    """Returns straight line integrals (F, v, u) of soft tissue and bone, and bone's fraction of the volume's attenuation.
-    Without bone in the volume they are corrected for water. blur: of frames for the model, in pixels."""
+    """Returns corrected line integrals (F, v, u) of soft tissue and bone, and bone's fraction of the volume's attenuation.
+    Without bone in the volume they are corrected for water. blur: standard deviation, in pixels, that the model needs."""
     clean, share = straighten(frames, water), 0.0
     for _ in range(_PASSES):
         volume = model.regularised(step.smooth(clean, blur))
@@ -166,13 +168,13 @@ def find_bone(
 
 
 def _with_bone(bone: np.ndarray, frames: np.ndarray, spectrum: Spectrum, model: Model) -> np.ndarray:
-    """Returns straight line integrals for a given volume of ``bone`` (z, y, x)."""
+    """Returns corrected line integrals (F, v, u) for a given volume of ``bone`` (z, y, x) in 1/mm."""
     dense = np.maximum(model.frames(bone.astype(np.float32)), 0)
     return (_soft_beside(dense, frames, spectrum) + dense).astype(np.float32)
 
 
 def _soft_beside(dense: np.ndarray, frames: np.ndarray, spectrum: Spectrum) -> np.ndarray:
-    """Solves for the soft tissue that, with ``dense`` line integrals of bone, gives the measured ones (Newton's method)."""
+    """Returns the soft tissue's line integrals that, with ``dense`` ones of bone, give the measured ``frames`` (Newton)."""
     soft, small = np.asarray(frames - dense, np.float64), 1e-3
     for _ in range(_NEWTON):
         now = spectrum.hardened(soft, dense)
@@ -183,14 +185,14 @@ def _soft_beside(dense: np.ndarray, frames: np.ndarray, spectrum: Spectrum) -> n
 def fit_polynomial(frames: np.ndarray, model: Model) -> Polynomial:
     """Fits the polynomial for ``straighten``, p² alone, to line integrals (F, v, u) of one material and their paths.
 
-    The bend that the same fit finds in straight line integrals of that volume is subtracted. Raises InputError for an object
-    of several materials."""
+    The quadratic term that the same fit finds in reprojections of that volume, without hardening, is subtracted. Raises
+    InputError for an object of several materials, and for none."""
     path, level, bend, rest = _bend(frames, model)
     if rest > _UNIFORM:
         found = f"{100 * rest:.2g} % of the line integrals that the path through one material does not explain"
         remedy = "state hardening.kvp or hardening.polynomial"
         raise InputError("--steps hardening", found, f"at most {100 * _UNIFORM:.2g} %", remedy)
-    # the voxels themselves bend straight line integrals a little: that is no hardening
+    # reprojected voxels alone have a small quadratic term, which is no hardening
     return _bend(path * np.float32(level), model)[2] - bend, 0.0, 0.0
 
 
@@ -215,8 +217,8 @@ def _no_object() -> InputError:
 
 
 def _between(soft_to: float, bone_from: float, volume: np.ndarray) -> np.ndarray:
-    """Returns the bone of voxels (z, y, x) that may mix both: none up to ``soft_to``, all from ``bone_from``. Both are
-    fractions of the densest voxel, which the correction makes denser."""
+    """Returns the bone's attenuation in voxels (z, y, x) that may mix bone and soft tissue: none up to ``soft_to``, all from
+    ``bone_from``. Both are fractions of the ``densest`` voxel's attenuation."""
     if soft_to >= bone_from:
         return np.zeros_like(volume)
     soft, bone = soft_to * step.densest(volume), bone_from * step.densest(volume)

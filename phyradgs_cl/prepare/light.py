@@ -1,4 +1,4 @@
-"""Light that changes during a scan: its pattern from flats, its amount from air.
+"""Corrects light that changes during a scan: its pattern from flats, its amount from air.
 
 Flats are interpolated in time or combined. time: linearly between the means of flats that were taken together, in the order
 of the stored frames. pca: each frame takes the combination of their principal components that leaves the least total
@@ -22,12 +22,12 @@ from phyradgs_cl.io import ToAttenuation, read_scan
 from phyradgs_cl.prepare.step import Facts, MakeModel, unmasked_frames
 
 WAYS = ("mean", "time", "pca")
-_MOST_COMPONENTS, _CLEAR = 4, 4.0  # components, and their least variance over the median one's
-_REWEIGHTINGS = 12
-_LEAST_PIXELS = 20
+_MOST_COMPONENTS, _CLEAR = 4, 4.0  # limit of the principal components; their least variance over the median one's
+_REWEIGHTINGS = 12  # iterations of reweighted least squares
+_LEAST_PIXELS = 20  # least number of pixels of air in a frame
 _AROUND = np.ones((3, 3), bool)
 _MARGIN = 2  # pixels between air and the object's edge
-_PASSES = 3  # the threshold moves with the value of air
+_PASSES = 3  # repetitions in which the threshold of air follows the median of the air found
 Counts = np.ndarray
 
 
@@ -41,7 +41,7 @@ def flat_correction(way: str) -> ToAttenuation:
 
 
 def read_corrected(path: str | Path, flats: str = "mean", rows: tuple[int, int] | None = None) -> Scan:
-    """Reads a scan file, or some of its rows, as line integrals by ``flat_correction``. See ``io.read_scan``."""
+    """Reads a scan file, or its rows [first, stop), as line integrals by ``flat_correction``. See ``io.read_scan``."""
     scan = read_scan(path, flat_correction(flats), rows)
     return scan if flats == "mean" else replace(scan, provenance={**scan.provenance, "flats": flats})
 
@@ -49,7 +49,7 @@ def read_corrected(path: str | Path, flats: str = "mean", rows: tuple[int, int] 
 def _with_changing_flats(
     way: str, data: Counts, image_key: np.ndarray, quantity: str
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Converts counts with the flats of ``way``, "time" or "pca"."""
+    """Converts counts by flats that change, as ``way``, "time" or "pca", says. See ``flat_correction``."""
     flats = np.flatnonzero(image_key == FLAT)
     needed = 2 if way == "time" else 3
     if quantity != "counts" or len(flats) < needed:
@@ -68,7 +68,7 @@ def _with_changing_flats(
 
 
 def _in_time(signal: np.ndarray, flats: np.ndarray, numbers: np.ndarray) -> Iterator[np.ndarray]:
-    """Yields the flat of each projection, between the means of groups of flats by their frame numbers."""
+    """Yields the flat (v, u) of each projection: interpolated by frame number between the means of groups of flats."""
     groups = np.split(np.arange(len(flats)), np.flatnonzero(np.diff(flats) > 1) + 1)
     time = np.array([flats[group].mean() for group in groups])
     means = np.stack([signal[group].mean(axis=0) for group in groups])
@@ -84,7 +84,7 @@ def _of_components(signal: np.ndarray, counts: Iterable[np.ndarray]) -> Iterator
     ratio = np.divide(signal, mean, out=np.ones_like(signal), where=live)
     logs = np.log(np.maximum(ratio, TRANSMISSION_FLOOR)).reshape(len(signal), -1)
     _, size, components = np.linalg.svd(logs - logs.mean(axis=0), full_matrices=False)
-    size = size[: len(signal) - 1]  # the mean took one
+    size = size[: len(signal) - 1]  # the mean took one degree of freedom
     clear = size**2 > _CLEAR * np.median(size**2) if len(size) > 2 else size > 0
     used = components[: len(size)][clear][:_MOST_COMPONENTS].reshape(-1, *mean.shape)
     if not len(used):
@@ -138,8 +138,8 @@ def normalise_air(scan: Scan, options: AirOptions, make_model: MakeModel) -> tup
 def find_air(frames: np.ndarray, *, below: float = 0.05) -> np.ndarray:
     """Returns the pixels of line integrals (F, v, u) that no object covers, bool (F, v, u).
 
-    They are below the share ``below`` of the largest line integral, connected with the first or last column, and at least
-    two pixels away from all others."""
+    They are below the fraction ``below`` of the largest line integral (the 99.9th percentile), connected with the first or
+    last column, and at least two pixels away from all others."""
     limit = below * float(np.percentile(frames, 99.9))
     air = np.empty(frames.shape, bool)
     for f, frame in enumerate(frames):
@@ -155,7 +155,8 @@ def find_air(frames: np.ndarray, *, below: float = 0.05) -> np.ndarray:
 
 
 def enough_air(frames: np.ndarray, below: float, least: float, step: str, remedy: str) -> np.ndarray:
-    """Returns ``find_air``. Raises InputError where a frame has too little."""
+    """Returns the air, bool (F, v, u), of ``find_air``. Raises InputError about --steps ``step`` where a frame has less than
+    20 pixels, or than the fraction ``least``."""
     air = find_air(frames, below=below)
     counts = air.sum(axis=(1, 2))
     needed = max(_LEAST_PIXELS, int(np.ceil(least * frames[0].size)))

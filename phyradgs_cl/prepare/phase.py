@@ -1,11 +1,11 @@
-"""Phase retrieval from a single distance: line integrals of attenuation alone, without the bright and dark edges that
-free propagation from object to panel adds.
+"""Retrieves phase from a single distance: returns line integrals of attenuation alone, without the bright and dark edges
+that free propagation from object to panel adds.
 
 Paganin, Mayo, Gureyev, Miller and Wilkins, J. Microsc. 206 (2002) 33. For an object of one material (δ and β of its
 refractive index 1 − δ + iβ, thickness T) the transport-of-intensity equation gives the transmission exp(−p) at the panel as
 (1 − d δ/μ ∇²) exp(−μT), with μ = 4πβ/λ. Its inverse is a division by 1 + π λ d (δ/β) f² at the frequency f, in 1/mm.
 
-The filter is linear in the intensity, so it may follow the average over an exposure that a panel records. Rows that a
+The filter is linear in the intensity, so it also holds for the average over an exposure that a panel records. Rows that a
 rolling shutter reads later see the object turned further; the filter ignores that within its reach of some pixels."""
 
 import math
@@ -20,15 +20,16 @@ from phyradgs_cl.detector.attenuation import TRANSMISSION_FLOOR
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.prepare.step import Facts, MakeModel, unmasked_frames
 
-WAVELENGTH_MM_KEV = 1.239841984e-6  # Planck's constant times the speed of light
-_REACHES = 8  # of the filter's decay length, as a margin around a frame: exp(−8) of an edge comes back from the other side
+WAVELENGTH_MM_KEV = 1.239841984e-6  # wavelength in mm times energy in keV: Planck's constant times the speed of light
+_REACHES = 8  # margin around a frame in decay lengths of the filter: exp(−8) of an edge wraps around
 _RANGES = {"energy_kev": (1, 1000), "distance_mm": (0, 1e6), "delta_beta": (0, 1e6), "delta": (0, 1), "beta": (0, 1)}
 
 
 @dataclass(frozen=True)
 class PhaseOptions:
-    """energy_kev: of the beam. distance_mm: from object to panel; None: from the axis to the panel, by the geometry.
-    delta_beta: δ/β of the object's material; or delta and beta themselves."""
+    """energy_kev: the beam's energy. distance_mm: from object to panel; None: from the axis to the panel, by the geometry.
+    delta_beta: δ/β of the object's material; or delta and beta themselves. Raises InputError for values out of range or in
+    contradiction."""
 
     energy_kev: float | None = None
     distance_mm: float | None = None
@@ -89,12 +90,12 @@ def retrieve_phase(
 
 
 def filter_reach_mm(distance_mm: float, energy_kev: float, delta_beta: float) -> float:
-    """Returns the length over which the filter's kernel decays by e, √(λ d (δ/β) / 4π), at the object."""
+    """Returns the length in mm, in the object's plane, over which the filter's kernel decays by e: √(λ d (δ/β) / 4π)."""
     return math.sqrt(WAVELENGTH_MM_KEV / energy_kev * distance_mm * delta_beta / (4 * math.pi))
 
 
 def retrieve(scan: Scan, options: PhaseOptions, make_model: MakeModel) -> tuple[Scan, Facts]:
-    """Returns the scan with line integrals of attenuation alone."""
+    """Returns the scan with line integrals of attenuation alone. Raises InputError for a missing distance or material."""
     (energy_kev, delta_beta), geometry = options.stated(), scan.geometry
     pixel_mm = (geometry.pixel_size_mm[0] / geometry.magnification, geometry.pixel_size_mm[1] / geometry.magnification)
     distance_mm = options.distance_mm

@@ -1,4 +1,4 @@
-"""Rings: a pixel's wrong gain adds the same error to its line integrals in every view.
+"""Removes rings: a pixel's wrong gain adds the same error to its line integrals in every view.
 
 Over a full turn the mean of all views is the projection of the object averaged around the axis, and symmetric about it. A
 difference between a column and its mirror image is therefore an error of the panel. Its covariance between two independent
@@ -21,19 +21,19 @@ from phyradgs_cl.prepare.bad_pixels import axis_column
 from phyradgs_cl.prepare.single_gains import find_single_gains
 from phyradgs_cl.prepare.step import Facts, MakeModel, unmasked_frames
 
-_LEAST_FRAMES = 8
-_LEAST_PAIRS = 0.25  # of all columns: with fewer, columns are not compared with their mirror images
-_LEAST_SHARE = 0.25  # of the variance of the mean's noise: weaker patterns are not worth a correction
-_NEGLIGIBLE = 1e-4  # in line integrals: rings of a gain that is 0.01 % off
-_SURE = 12.0  # standard errors, of about 1/√pixels, of the pattern's variance over that of the noise
-_THRESHOLD = 3.5  # standard deviations of the pattern: larger coefficients belong to the object
-_SHIFTS = 8  # of the blocks, along each side
+_LEAST_FRAMES = 8  # scans of fewer frames stay as they are
+_LEAST_PAIRS = 0.25  # fraction of all columns: with fewer pairs, columns are not compared with their mirror images
+_LEAST_SHARE = 0.25  # least variance of a pattern over that of the mean's noise: weaker ones are not worth a correction
+_NEGLIGIBLE = 1e-4  # standard deviation of a negligible pattern, in line integrals: gains that are 0.01 % off
+_SURE = 12.0  # least variance of a pattern over that of the noise, in standard errors of about 1/√pixels
+_THRESHOLD = 3.5  # standard deviations of the pattern above which coefficients belong to the object
+_SHIFTS = 8  # positions of the blocks along each side, over which the result is averaged
 _EQUALLY_FAR = 1.15  # largest over smallest distance of the sources from their mean, on a full turn
 
 
 @dataclass(frozen=True)
 class RingOptions:
-    """window: side of the cosine blocks in pixels; wider patterns stay."""
+    """window: side in pixels of the blocks of cosines; wider patterns are not removed."""
 
     window: int = 10
 
@@ -44,7 +44,7 @@ class RingOptions:
 @dataclass(frozen=True)
 class Strength:
     """Variances, in line integrals squared, of the pattern, of its part common to a column, and of the noise in the mean of
-    all views. least: variance from which a pattern is certain."""
+    all views. least: the variance above which a pattern is certain."""
 
     pattern: float
     column: float
@@ -61,7 +61,7 @@ def ring_strength(frames: np.ndarray, *, axis_column: float | None = None, full_
 
     Its variance is the robust covariance of two sets of views in second differences along rows, taken of the difference
     between mirrored columns. The sets are the even and the odd views; on an arc (``full_turn`` False) its halves, which see
-    the object differently. ``axis_column``: the mirror, None: the middle."""
+    the object differently. ``axis_column``: the column of the axis, about which columns are mirrored; None: the middle."""
     return _strength(_means(frames, full_turn), axis_column)
 
 
@@ -85,7 +85,7 @@ def ring_pattern(
 
 
 def remove_rings(scan: Scan, options: RingOptions, make_model: MakeModel) -> tuple[Scan, Facts]:
-    """Returns the scan without its rings; the scan itself where no pattern is certain."""
+    """Returns the scan without rings and single wrong gains, unchanged where nothing is certain; and the step's numbers."""
     frames = unmasked_frames(scan)
     if options.window > frames.shape[2]:
         expected = f"no more than the panel's {frames.shape[2]} columns"
@@ -127,7 +127,7 @@ def _means(frames: np.ndarray, full_turn: bool) -> np.ndarray:
 
 def _pattern(frames: np.ndarray, strength: Strength, window: int, axis_column: float | None) -> np.ndarray:
     """Returns the pattern (v, u) float32 of a given strength. The symmetric and the antisymmetric part of the mean are
-    denoised apart; each has half of the pattern's variance."""
+    denoised separately; each has half of the pattern's variance."""
     mean = frames.mean(axis=0, dtype=np.float64)
     if not strength.is_certain:
         return np.zeros(mean.shape, np.float32)
@@ -136,7 +136,7 @@ def _pattern(frames: np.ndarray, strength: Strength, window: int, axis_column: f
     parts = [(mean + mean[:, mirrored]) / 2, (mean - mean[:, mirrored]) / 2] if whole else [mean]
     variances = np.array([strength.pattern - strength.column, strength.column]) / len(parts)
     rough = sum(part - _denoised(part, variances, window) for part in parts)
-    # of what the denoising removed, this share is the pattern, and the rest the noise of the mean
+    # this fraction of what the denoising removed is the pattern, and the rest the noise of the mean
     return np.asarray(rough * strength.pattern / (strength.pattern + strength.noise), np.float32)
 
 
@@ -188,7 +188,7 @@ def _joined(blocks: np.ndarray) -> np.ndarray:
 
 
 def mirror_columns(columns: int, axis_column: float | None) -> np.ndarray:
-    """Returns the mirror images about the axis, for the columns that have one, in descending order."""
+    """Returns the columns' mirror images about the axis, where they are on the panel, in descending order."""
     twice = columns - 1 if axis_column is None else 2 * axis_column
     if not abs(twice) < 2 * columns:
         return np.zeros(0, int)

@@ -1,4 +1,4 @@
-"""Scatter by a kernel: each ray scatters P · (−ln P) and P · (−ln P)², which wide Gaussians spread around it.
+"""Removes scatter by a kernel: a ray of transmission P scatters P · (−ln P) and P · (−ln P)², spread by wide Gaussians.
 
 Ohnesorge, Flohr and Klingenbeck-Regn, Eur. Radiol. 9 (1999) 563. The square lets thick rays scatter differently from thin
 ones, for which Sun and Star-Lack (Phys. Med. Biol. 55 (2010) 6695) take several kernels. The user states the ratio of
@@ -21,23 +21,23 @@ from phyradgs_cl.prepare.step import Facts, MakeModel, Model
 
 Kernel = Mapping[tuple[float, int], float]
 """{(standard deviation as a fraction of the panel's longer side, power of the line integral): height}"""
-_POWERS = (1, 2)  # of a ray's line integral
-_REACHES = (0.12, 0.18, 0.27, 0.4)  # of the panel's longer side; narrower ones respond to the gains of columns
+_POWERS = (1, 2)  # powers of a ray's line integral in the fitted kernel
+_REACHES = (0.12, 0.18, 0.27, 0.4)  # fitted widths over the panel's longer side; narrower ones would fit columns' gains
 _PASSES = 6  # alternating estimates of scatter and primary light
-_LEAST_PRIMARY = 0.05  # of the measured light
-_SHADOW = 0.1  # of the largest line integral: pixels above it lie behind the object
-_FITTED_FRAMES = 24
-_USUAL_REACH = 0.18
-_HEIGHT_STEP, _MOST_STEPS = 1.25, 8
-_TRIALS = 6  # of heights between the best step's neighbours
-_BETTER, _AS_WELL = 0.65, 1.05  # unexplained rest relative to that of the fitted kernel, and of the best height
-_LARGEST_HEIGHT, _BISECTIONS = 20.0, 20
+_LEAST_PRIMARY = 0.05  # least primary light, as a fraction of the measured light
+_SHADOW = 0.1  # fraction of the largest line integral above which pixels lie behind the object
+_FITTED_FRAMES = 24  # frames, evenly spread, to which heights are fitted
+_USUAL_REACH = 0.18  # width where the user states only to_primary
+_HEIGHT_STEP, _MOST_STEPS = 1.25, 8  # factor between heights that are tried; their number
+_TRIALS = 6  # heights tried between the best height's neighbours
+_BETTER, _AS_WELL = 0.65, 1.05  # limits of the unexplained rest: over the fitted kernel's, over the best height's
+_LARGEST_HEIGHT, _BISECTIONS = 20.0, 20  # upper end of the bisection for a stated ratio; its steps
 
 
 @dataclass(frozen=True)
 class ScatterOptions:
-    """to_primary: scatter over primary light behind the object; 0: fitted on air. reach: standard deviation of the kernel
-    over the panel's longer side; 0: fitted, or 0.18 where to_primary is stated."""
+    """to_primary: ratio of scatter to primary light behind the object; 0: the kernel is fitted to air. reach: standard
+    deviation of the kernel over the panel's longer side; 0: fitted, or 0.18 where to_primary is stated."""
 
     to_primary: float = checks.ranged(0.0, 0, 5)
     reach: float = checks.ranged(0.0, 0, 2)
@@ -67,8 +67,8 @@ def remove_scatter(frames: np.ndarray, kernel: Kernel) -> np.ndarray:
 
 
 def fit_scatter(frames: np.ndarray, air: np.ndarray, reach: float = 0.0) -> Kernel:
-    """Fits the kernel to the light above 1 of the pixels ``air`` in line integrals (F, v, u), by non-negative least squares.
-    A ``reach`` other than 0 fixes its width. Single frames may be lighter or darker, but not their mean."""
+    """Fits the kernel to the transmission above 1 at pixels ``air``, bool (F, v, u), of line integrals (F, v, u), by
+    non-negative least squares. A ``reach`` other than 0 fixes its width. Frames may differ in light, but not in the mean."""
     numbers = _some(len(frames))
     recorded, where = np.exp(-frames[numbers].astype(np.float64)), air[numbers]
     terms = list(itertools.product((reach,) if reach > 0 else _REACHES, _POWERS))
@@ -149,5 +149,5 @@ def _scattered(primary: np.ndarray, reach: float, power: int) -> np.ndarray:
 
 
 def _some(frames: int) -> np.ndarray:
-    """Returns the numbers of the frames to which heights are fitted."""
+    """Returns the indices of the frames to which heights are fitted."""
     return np.unique(np.linspace(0, frames - 1, _FITTED_FRAMES).round().astype(int))

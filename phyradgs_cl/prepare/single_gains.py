@@ -1,4 +1,4 @@
-"""Single columns and pixels with a wrong gain: outliers of the mean over views on one side of the axis only.
+"""Finds single columns and pixels with a wrong gain: outliers of the mean over views on one side of the axis only.
 
 The mean over a full turn is symmetric about the axis for every object, on an arc for a round one. A wrong gain therefore
 shows as a deviation that neither its neighbours nor their mirror images have, in two independent sets of views."""
@@ -10,18 +10,19 @@ import scipy
 
 from phyradgs_cl.detector.noise_level import NORMAL_MAD
 
-_DEVIATIONS = 8.0  # least deviation in robust standard deviations, in both sets
-_LEAST = 2e-3  # in line integrals: gains that are 0.2 % off
-_NEIGHBOURS = 7  # columns of the median from which a pixel may deviate
-_NEAR = 21  # columns that give the usual deviation
-_AXIS = 3  # columns at each side of the axis that stay, because an object's edges stand still there
+_DEVIATIONS = 8.0  # least deviation in robust standard deviations, in both sets of views
+_LEAST = 2e-3  # least deviation in line integrals: a gain that is 0.2 % off
+_NEIGHBOURS = 7  # width in columns of the median from which deviations are measured
+_NEAR = 21  # width in columns of the neighbourhood that gives the usual deviation
+_AXIS = 3  # columns at each side of the axis that are never changed, because an object's edges stand still there
 _UNEQUAL = 0.25  # largest difference between the two sets, relative to their mean, plus two standard deviations
 _OBJECT = 0.5  # largest deviation of the mirrored pixel, relative to the pixel's own: above it either may be wrong
 
 
 @dataclass(frozen=True)
 class SingleGains:
-    """offset: (v, u) float32, the error that gains add to line integrals, 0 elsewhere. columns, pixels: their numbers."""
+    """offset: the error (v, u) float32 that wrong gains add to line integrals, 0 elsewhere. columns, pixels: the numbers of
+    columns and of single pixels with one."""
 
     offset: np.ndarray
     columns: int = 0
@@ -33,7 +34,7 @@ class SingleGains:
 
     @property
     def words(self) -> str:
-        """As "1 column, gain off by 3.0 %"."""
+        """The numbers in words, as "1 column, gain off by 3.0 %"."""
         counted = [(self.columns, "column"), (self.pixels, "pixel")]
         names = " and ".join(f"{n} {name}{'s' if n > 1 else ''}" for n, name in counted if n)
         return f"{names}, gain off by {100 * float(np.abs(np.expm1(-self.offset)).max()):.1f} %"
@@ -42,8 +43,8 @@ class SingleGains:
 def find_single_gains(
     means: np.ndarray, mirrored: np.ndarray, usable: np.ndarray, full_turn: bool
 ) -> SingleGains:
-    """Finds single gains in the means (2, v, u) of two sets of views. mirrored: mirror images of the columns that have one;
-    other columns stay. usable: (v, u) bool, pixels without a mask."""
+    """Finds single wrong gains in the means (2, v, u) of two sets of views. mirrored: the columns' mirror images, as of
+    ``mirror_columns``; columns without one stay. usable: bool (v, u), False for masked pixels."""
     offset = np.zeros(usable.shape, np.float32)
     if len(mirrored) < _NEAR:
         return SingleGains(offset)
@@ -68,8 +69,8 @@ def _deviation(means: np.ndarray) -> np.ndarray:
 
 
 def _outliers(deviation: np.ndarray, unlike: np.ndarray, usable: np.ndarray) -> np.ndarray:
-    """Returns the errors (v, u) of outliers, 0 elsewhere. deviation: ``_deviation`` (set, v, u) of the means. unlike: the
-    same for the difference between mirrored columns."""
+    """Returns the errors (v, u) of outliers, 0 elsewhere. deviation: ``_deviation`` (set, v, u) of the means. unlike: that
+    of the means minus their mirror images."""
     around = (1, 3, 3)
     mirrored = deviation[..., ::-1]
     low, high = scipy.ndimage.minimum_filter(mirrored, around), scipy.ndimage.maximum_filter(mirrored, around)

@@ -1,4 +1,4 @@
-"""Parts that several steps share: the signature of a step, masked pixels, and how well a scan explains itself."""
+"""What several steps share: the type of a step, interpolation of masked pixels, and how well a scan explains itself."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -11,18 +11,18 @@ from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.fields import GridChoice
 
 Facts = dict[str, Any]
-"""Numbers of a step, for the provenance."""
-_COARSE_VOXELS = 48  # along the longest side
-_INSIDE = 0.1  # of the densest voxel: denser ones belong to the object
-_SMOOTH = 1 / 24  # of the panel's longer side: hardening and scatter are smoother than errors of a coarse grid
+"""A step's results by name, for the provenance."""
+_COARSE_VOXELS = 48  # limit along the longest side of a coarse model
+_INSIDE = 0.1  # fraction of the densest voxel's attenuation above which a voxel belongs to the object
+_SMOOTH = 1 / 24  # standard deviation over the panel's longer side: hardening and scatter are smoother than grid errors
 
 
 @dataclass(frozen=True)
 class Model:
-    """The scan's own reconstruction and forward projection on its grid, for steps that need the object.
+    """A scan's reconstruction and forward projection on its grid, for steps that need the object.
 
-    volume: frames (F, v, u) to (z, y, x). frames: the forward projection. regularised: a slower reconstruction with a weak
-    total-variation prior."""
+    volume: reconstructs frames (F, v, u) to a volume (z, y, x) in 1/mm. frames: projects a volume to frames. regularised:
+    reconstructs more slowly, with a weak total-variation prior."""
 
     volume: Callable[[np.ndarray], np.ndarray]
     frames: Callable[[np.ndarray], np.ndarray]
@@ -30,7 +30,7 @@ class Model:
 
 
 MakeModel = Callable[[Scan], Model]
-Step = Callable[[Scan, Any, MakeModel], tuple[Scan, Facts]]
+Step = Callable[[Scan, Any, MakeModel], tuple[Scan, Facts]]  # (scan, the step's options, make_model) -> scan, facts
 
 
 def unmasked_frames(scan: Scan) -> np.ndarray:
@@ -72,8 +72,8 @@ def with_masked(scan: Scan, bad: np.ndarray) -> Scan:
 
 
 def coarse_model(scan: Scan, make_model: MakeModel, most: int = _COARSE_VOXELS) -> tuple[Model, float]:
-    """Returns the scan's model on at most ``most`` voxels along the longest side, and the blur that its frames need. The
-    blur is a standard deviation in pixels."""
+    """Returns the scan's model on at most ``most`` voxels along the longest side, and the standard deviation in pixels by
+    which frames must be blurred for it."""
     factor = max(1.0, max(scan.grid.shape) / most)
     return make_model(scan.with_grid(GridChoice(size=round(max(scan.grid.shape) / factor)))), (factor - 1) / 2
 
@@ -98,8 +98,9 @@ def densest(volume: np.ndarray) -> float:
 def unexplained(frames: np.ndarray, volume: np.ndarray, inside: np.ndarray, model: Model) -> float:
     """Returns the relative RMS of the smooth residual of line integrals (F, v, u) and their reprojected ``volume``.
 
-    Only voxels ``inside`` the object count. The residual that the same reprojection leaves is subtracted: that part comes
-    from the grid and the number of views. The rest comes from hardening, scatter and the like."""
+    Only voxels ``inside`` the object, bool (z, y, x), count. The residual of a reprojected reconstruction of the
+    reprojection is subtracted: it comes from the grid and the number of views. What remains comes from hardening, scatter
+    and the like."""
 
     def reprojected(values: np.ndarray) -> np.ndarray:
         return model.frames(np.where(inside, np.maximum(values, 0), 0).astype(np.float32))

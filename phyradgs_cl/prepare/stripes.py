@@ -1,9 +1,9 @@
-"""Stripes in the sinograms of many views: columns that fluctuate, do not respond, or are wrong in all or some of the views.
+"""Removes stripes in sinograms of many views: columns that fluctuate, do not respond, or are wrong in all or some views.
 
 Vo, Atwood and Drakopoulos, Opt. Express 26 (2018) 28396. Neighbouring columns of a sinogram (view, column) record nearly the
 same values, in another order of views. So columns that are sorted by value hardly differ, and a median across them gives
-the values that a column should have recorded. Put back in the order of its views, they replace the column. Columns without
-an order, because they fluctuate or do not respond, are interpolated from their neighbours before.
+the values that a column should have recorded. Put back in the order of its views, they replace the column. Columns that
+fluctuate or do not respond have no such order. They are first interpolated from their neighbours.
 
 The paper sorts and replaces every column, which blurs a scan of a few hundred columns. Here a column is replaced if it
 deviates from the sorted medians much more than the columns at both its sides do, and than its mirror image about the axis.
@@ -21,19 +21,19 @@ from phyradgs_cl.prepare.bad_pixels import axis_column
 from phyradgs_cl.prepare.rings import mirror_columns
 from phyradgs_cl.prepare.step import Facts, MakeModel, unmasked_frames
 
-_LEAST_VIEWS = 60  # with fewer, neighbouring columns record other values
-_LEAST = 2e-3  # in line integrals: gains that are 0.2 % off
-_NEAR = 5  # columns of the median that stands for one side of a column
-_FLUCTUATING = 3.0  # times the fluctuation of the columns at both sides
-_UNRESPONSIVE = 10.0  # times less spread over the views than the columns at both sides
-_MIRRORED = 2.0  # times the deviation of the mirror image and of its neighbours
-_SMALLEST = 1e-6  # spread in line integrals: a stuck pixel has none
+_LEAST_VIEWS = 60  # with fewer views, neighbouring columns record other values
+_LEAST = 2e-3  # least deviation of a stripe in line integrals: a gain that is 0.2 % off
+_NEAR = 5  # width in columns of the median that stands for one side of a column
+_FLUCTUATING = 3.0  # least fluctuation over that of the columns at both sides
+_UNRESPONSIVE = 10.0  # least factor by which the spread over the views is below that of the columns at both sides
+_MIRRORED = 2.0  # least deviation over that of the mirror image and its neighbours
+_SMALLEST = 1e-6  # least spread in line integrals, for division: a stuck pixel has none
 
 
 @dataclass(frozen=True)
 class StripeOptions:
-    """width: of the median, in columns; stripes are narrower than half of it. ratio: least deviation of a stripe over those
-    of the columns at both sides; 0 replaces every column, as the paper does."""
+    """width: width of the median in columns; stripes are narrower than half of it. ratio: least deviation of a stripe over
+    that of the columns at both sides; 0 replaces every column, as the paper does."""
 
     width: int = 5
     ratio: float = checks.ranged(3.0, 0, 100)
@@ -49,8 +49,8 @@ def remove_stripes(
     """Returns line integrals (F, v, u) float32 without stripes, and the pixels (v, u) bool that were interpolated, and
     that were replaced after sorting.
 
-    width, ratio: as in ``StripeOptions``. axis_column: the mirror, None: the middle. Every detector row is filtered by
-    itself."""
+    width, ratio: as in ``StripeOptions``. axis_column: the column of the axis, about which columns are mirrored; None: the
+    middle. Every detector row is filtered separately."""
     mirrored = mirror_columns(frames.shape[2], axis_column)
     clean = np.array(frames, np.float32)
     interpolated, replaced = (np.zeros(frames.shape[1:], bool) for _ in range(2))
@@ -81,8 +81,8 @@ def _spread(sinogram: np.ndarray) -> np.ndarray:
 
 
 def _stand_out(values: np.ndarray, ratio: float, mirrored: np.ndarray) -> np.ndarray:
-    """Returns which columns have values (u,) above ``ratio`` times those at both sides, and clearly above those of their
-    images, if they have one in ``mirrored``; all of them for a ratio of 0."""
+    """Returns which columns, bool (u,), have values (u,) above ``ratio`` times those at both sides, and above twice those of
+    their mirror image, if they have one in ``mirrored``. For a ratio of 0 it returns all columns."""
     if ratio == 0:
         return np.ones(len(values), bool)
     columns, usual = np.arange(len(values)), scipy.ndimage.median_filter(values, _NEAR)
@@ -93,7 +93,7 @@ def _stand_out(values: np.ndarray, ratio: float, mirrored: np.ndarray) -> np.nda
 
 
 def _interpolate(sinogram: np.ndarray, bad: np.ndarray) -> None:
-    """Replaces the columns ``bad`` (u,) of a sinogram (F, u), in place, between the nearest others."""
+    """Interpolates the columns ``bad``, bool (u,), of a sinogram (F, u) in place, between the nearest others."""
     if bad.any() and not bad.all():
         good = np.flatnonzero(~bad)
         at = np.interp(np.flatnonzero(bad), good, np.arange(len(good)))

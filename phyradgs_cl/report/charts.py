@@ -1,4 +1,4 @@
-"""Charts of a page, drawn by matplotlib as SVG inside the page, and the charts that are curves."""
+"""Draws charts of a page by matplotlib, as SVG inside the page; the charts that are curves."""
 
 import hashlib
 import io
@@ -18,15 +18,16 @@ from phyradgs_cl.report.markup import Markup, element, label, number, unit
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-MOST_CHARTS = 3  # charts of convergence
-SIZE = 440, 320  # in the picture's own units, in which letters are 13 high
+MOST_CHARTS = 3  # limit of the charts of convergence
+SIZE = 440, 320  # width and height of a chart in units in which letters are 13 high
 _STYLE: Any = {"svg.fonttype": "none", "text.parse_math": False, "font.size": 13}
 Chart = tuple[str, Markup]
 """A caption and a drawing."""
 
 
 def chart(draw: "Callable[[Axes], None]", title: str, description: str, size: tuple[float, float] = SIZE) -> Markup:
-    """Returns an SVG element in the colours of the page. ``title`` and ``description`` are for screen readers."""
+    """Returns what ``draw`` draws as an SVG element in the page's colours. ``title``, ``description``: for screen
+    readers."""
     from matplotlib import rc_context
     from matplotlib.figure import Figure
 
@@ -44,7 +45,7 @@ def chart(draw: "Callable[[Axes], None]", title: str, description: str, size: tu
 
 
 def _label_powers(axes: "Axes") -> None:
-    """Labels logarithmic axes with plain numbers. With few powers of ten, 2 and 5 times these too."""
+    """Labels logarithmic axes with plain numbers: powers of ten and, below four decades, 2 and 5 times these."""
     from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
     for axis, scale, (low, high) in (
@@ -62,7 +63,7 @@ def _inline(svg: str) -> str:
     content = re.sub(r"<(metadata|style|clipPath)\b.*?</\1>|<!--.*?-->", "", content, flags=re.S)
     content = re.sub(r' clip-path="[^"]*"| font-family: [^;"]*;|font-family: [^;"]*; ', "", content)
     used = set(re.findall(r'xlink:href="#(\w+)"', content))
-    prefix = "c" + hashlib.sha256(content.encode()).hexdigest()[:8]  # names of SVG elements are shared by the whole page
+    prefix = "c" + hashlib.sha256(content.encode()).hexdigest()[:8]  # ids of SVG elements must be unique in the page
     content = re.sub(r' id="([^"]*)"', lambda m: f' id="{prefix}{m[1]}"' if m[1] in used else "", content)
     content = content.replace('xlink:href="#', f'href="#{prefix}').replace("#000000", COLOURS["ink"])
     for name, colour in COLOURS.items():
@@ -95,7 +96,7 @@ def draw_convergence(axes: "Axes", points: Sequence[tuple[float, float]], words:
 
 
 def views_chart(key: str, values: object) -> Chart | None:
-    """Returns a chart of a correction of every view. Returns None for values that are no numbers, which a file may hold."""
+    """Returns a chart of a correction of every view; None for fewer than two values, or values that are no numbers."""
     if not isinstance(values, list) or len(values) < 2 or not all(map(checks.is_number, values)):
         return None
     words = label(key).capitalize()
@@ -122,6 +123,6 @@ def histogram(edges: NDArray[np.float64], counts: NDArray[np.int64]) -> Markup:
 
 
 def note(axes: "Axes", words: str, point: Any, shift: tuple[float, float], **style: Any) -> None:
-    """Writes words next to a point. ``shift`` is in units of the picture, positive upwards."""
+    """Writes words next to a point. ``shift`` (right, up) is in points of the picture."""
     style = {"ha": "center", "color": INK, **style}
     axes.annotate(words, point, xytext=shift, textcoords="offset points", **style)

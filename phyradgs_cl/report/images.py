@@ -1,4 +1,4 @@
-"""Pictures of a page: values as grey or coloured PNG, and the slices of a volume that a page can show."""
+"""Makes pictures of a page: values as grey or coloured PNG, and the slices of a volume that a page can show."""
 
 import base64
 import io
@@ -10,13 +10,13 @@ from numpy.typing import NDArray
 
 from phyradgs_cl.fields import Grid
 
-LONGEST_EDGE = 192  # pixels of a slice in the page
-BUDGET_PIXELS = 16_000_000  # of all slices together: at worst, for pure noise, a page of some 20 MB
-# Plane, axis of the array that is cut, world axes to the right, and world axis up in the picture.
+LONGEST_EDGE = 192  # limit of the pixels along a side of a slice in the page
+BUDGET_PIXELS = 16_000_000  # limit of the pixels of all slices: at worst, for pure noise, a page of some 20 MB
+# Plane, axis of the array (z, y, x) that is cut, its letter, and the world axes to the right and up in the picture.
 PLANES = (("axial", 0, "z", "x", "y"), ("coronal", 1, "y", "x", "z"), ("sagittal", 2, "x", "y", "z"))
-_ROOM = 0.25  # widening of the window on either side, as a share of it
+_ROOM = 0.25  # room on either side of the window, as a fraction of its width
 _BLUE, _WHITE, _RED = (33, 86, 158), (247, 247, 245), (178, 34, 40)
-_PERCENTILE = 99.9  # a few very bright voxels would make all others dark
+_PERCENTILE = 99.9  # percentile that becomes white: a few very bright voxels would make all others dark
 Volume = NDArray[np.floating]
 
 
@@ -48,7 +48,7 @@ def bytes_of(image: NDArray[np.floating], low: float, high: float) -> NDArray[np
 
 
 def top_row_first(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Returns an image (rows, columns) whose row 0 is the lowest as a picture whose row 0 is the top."""
+    """Flips an image (rows, columns) whose row 0 is the lowest to a picture whose row 0 is the top."""
     return np.ascontiguousarray(image[::-1])
 
 
@@ -82,9 +82,10 @@ def grey_range(volume: NDArray[np.floating]) -> tuple[float, float]:
 
 @dataclass(frozen=True)
 class Window:
-    """Black and white at first (``low``, ``high``), and the range ``least`` to ``most`` of 256 grey levels, all in 1/mm.
+    """The initial values of black and white (``low``, ``high``), and the range ``least`` to ``most`` of the 256 grey levels,
+    all in 1/mm.
 
-    beyond: whether there are smaller values than ``least``, and larger values than ``most``."""
+    beyond: whether there are smaller values than ``least``, and larger ones than ``most``."""
 
     low: float
     high: float
@@ -94,7 +95,7 @@ class Window:
 
     @classmethod
     def of(cls, low: float, high: float, *volumes: Volume) -> "Window":
-        """Returns a window with room on both sides for streaks and overshoots, where there are any."""
+        """Returns a window whose grey levels extend, as far as values do, to a quarter of its width beyond either side."""
         room = _ROOM * (high - low)
         lowest, highest = (float(f([f(v) for v in volumes])) for f in (np.min, np.max))
         least, most = min(low, max(lowest, low - room)), max(high, min(highest, high + room))
@@ -103,10 +104,10 @@ class Window:
 
 @dataclass(frozen=True)
 class Plane:
-    """The slices of one orientation: ``indices`` among ``count`` slices.
+    """The slices of one orientation: ``indices`` of those shown, among ``count`` slices.
 
     layers: PNGs in base64, by layer. first_mm, step_mm: the centre of slice 0 and the distance to the next. size_mm: (width,
-    height). still: a PNG of the middle slice, for browsers without scripts."""
+    height). right, up: the world axes in the picture. still: a PNG of the middle slice, for browsers without scripts."""
 
     name: str
     axis: str
@@ -130,7 +131,8 @@ class Plane:
 
 
 def windows_of(volume: Volume, reference: Volume | None) -> dict[str, Window]:
-    """Returns a window per layer. Result and truth share the range of the truth, so that a wrong gain shows."""
+    """Returns a window by layer ("result", "truth", "difference"). Result and truth share the truth's range, so that a wrong
+    gain shows."""
     if reference is None or not float(reference.max()) > 0:
         return {"result": Window.of(*grey_range(volume), volume)}
     grey = Window.of(min(0.0, float(reference.min())), float(reference.max()), volume, reference)
@@ -196,7 +198,7 @@ def _picture(volume: Volume, axis: int, index: int, low: float, high: float) -> 
 
 
 def block_means(values: Volume, most_edge: int) -> Volume:
-    """Returns means over blocks of an array of any shape, along every axis that is longer than ``most_edge``."""
+    """Returns an array of any shape with at most ``most_edge`` means over blocks along every axis."""
     for axis, edge in enumerate(values.shape):
         if edge > most_edge:
             starts = (np.arange(most_edge) * edge) // most_edge

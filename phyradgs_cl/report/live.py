@@ -27,21 +27,22 @@ from phyradgs_cl.report.page import head, web_script
 from phyradgs_cl.report.sections import facts_table, frame_pictures, note, section
 from phyradgs_cl.text import clock
 
-_MOST_POINTS = 400  # points of the convergence
-_SAMPLES = 64  # samples along a side for the grey values
-_LATE_S, _LATE_TIMES = 30.0, 6  # without news for this time, or this multiple of the usual one, the run may have been killed
-_LOG_RATIO = 20.0  # largest over smallest value: above this ratio the axis is logarithmic
-_CHART = 560, 240
-_MARGIN = 64, 12, 12, 34  # margins of the chart: left, top, right, bottom
-EVERY_S = 5.0
-SHARE = 0.01  # pictures may cost the run this fraction of its time
-FRAMES = 2
+_MOST_POINTS = 400  # limit of the points of the convergence curve
+_SAMPLES = 64  # samples of the volume along a side from which the grey range is computed
+_LATE_S, _LATE_TIMES = 30.0, 6  # a run without news for this time, and for so many intervals, may have been killed
+_LOG_RATIO = 20.0  # ratio of largest to smallest value above which the axis is logarithmic
+_CHART = 560, 240  # width and height of the chart in pixels
+_MARGIN = 64, 12, 12, 34  # margins of the chart in pixels: left, top, right, bottom
+EVERY_S = 5.0  # time between two versions of the page
+SHARE = 0.01  # largest fraction of the run's time that pictures may cost
+FRAMES = 2  # number of frames that are computed
 FRAMES_FROM_S = 60.0  # no frames are computed in runs expected to be shorter: their report comes soon
 
 
 @dataclass(frozen=True, eq=False)
 class Snapshot:
-    """The middle slices (axial, coronal, sagittal) of the volume after an iteration, in 1/mm, and some frames."""
+    """The middle slices (axial, coronal, sagittal) of the volume after an iteration, in 1/mm, and some frames. high: the
+    value of white."""
 
     iteration: int
     slices: tuple[NDArray[np.floating], ...]
@@ -90,7 +91,7 @@ class Status:
     snapshot: Snapshot | None = None
 
     def after(self, progress: Progress, now: float) -> "Status":
-        """Returns the status after a report. A count that starts again, as in a trial, starts another curve."""
+        """Returns the status after a report at ``now``. Iterations that start again, as in a trial, start another curve."""
         last, points, first = self.progress, self.points, self.first
         is_same = last is not None and (last.quantity, last.iterations) == (progress.quantity, progress.iterations)
         if last is None or not is_same or progress.iteration < last.iteration:
@@ -109,7 +110,7 @@ class Status:
         return (self.progress.iteration - self.first[0]) / (self.reported - self.first[1])
 
     def left_s(self, now: float) -> float | None:
-        """The time in s until the last iteration."""
+        """Returns the time in s from ``now`` to the end of the last iteration; None before two reports."""
         if self.progress is None or self.per_s is None:
             return None
         return max(0.0, (self.progress.iterations - self.progress.iteration) / self.per_s - (now - self.reported))
@@ -220,10 +221,10 @@ log = logging.getLogger(__name__)
 class LivePage:
     """Writes a page about a running method, to which it listens. It is a context around the run.
 
-    A thread writes the page every ``every_s`` seconds, so an older page belongs to a run that was killed. Pictures are taken
+    A thread writes the page every ``every_s`` seconds, so an older page belongs to a run that was killed. Pictures are made
     between two iterations, as long as their time is below ``SHARE`` of the run's. An error, or Ctrl-C, leaves its reason on
-    the page. A file that was there before is replaced from the first iteration on, so a refused run leaves it alone. A page
-    that cannot be written is one warning, and no error."""
+    the page. An existing file is replaced at the first iteration, so a refused run does not change it. A page that cannot be
+    written gives one warning, and no error."""
 
     def __init__(self, path: Path, title: str, settings: Mapping[str, object], every_s: float = EVERY_S) -> None:
         self.path, self.every_s = path, every_s
@@ -256,7 +257,7 @@ class LivePage:
         self.end(f"Stopped by an error: {error}" if isinstance(error, Exception) else "Interrupted.")
 
     def stage(self, text: str) -> None:
-        """Says on the page what the run does before its first iteration."""
+        """Sets the text on the page that says what the run does before its first iteration."""
         self.status = replace(self.status, stage=text)
 
     def __call__(self, progress: Progress) -> None:

@@ -1,4 +1,4 @@
-"""The words of a page: HTML built from elements, so that no text of a file gets in unescaped, and facts as text."""
+"""Builds HTML from elements, so that text of files is always escaped, and formats facts as text."""
 
 import html
 import json
@@ -7,15 +7,15 @@ import math
 from phyradgs_cl.text import plain_text
 
 UNITS = {"_per_mm": "1/mm", "_mm": "mm", "_deg": "°", "_db": "dB", "_s": "s"}
-_RESOLUTION = {"mm": 1e-4, "°": 1e-4, "s": 1e-6}  # finer than any scanner's
+_RESOLUTION = {"mm": 1e-4, "°": 1e-4, "s": 1e-6}  # resolution by unit, finer than any scanner's
 _WORDS = {"psnr": "PSNR", "rms": "RMS", "ssim": "SSIM", "sha256": "SHA-256", "tv": "TV", "l1": "L1", "fdk": "FDK"}
-_LONGEST = 400
+_LONGEST = 400  # characters of a value that are shown
 _RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
 
 class Markup(str):
-    """Text that is HTML. Other text is escaped when it becomes part of an element."""
+    """Text that is HTML already. Other text is escaped when it becomes part of an element."""
 
 
 VOID = frozenset({"br", "img", "input", "link", "meta"})
@@ -37,7 +37,8 @@ def joined(*children: object) -> Markup:
 
 
 def raw_text(name: str, content: str, /, **attributes: object) -> Markup:
-    """Returns a ``style`` or ``script`` element of text from this package, which HTML does not unescape."""
+    """Returns a ``style`` or ``script`` element of text from this package, which must not be escaped. Raises ValueError for
+    text that would end the element."""
     if "</" + name in content.lower():
         raise ValueError(f"{name}: the content would end its element")
     return element(name, Markup(content), **attributes)
@@ -86,7 +87,7 @@ def shown(value: object, unit_name: str = "") -> str:
 
 
 def number(value: float, resolution: float = 0.0) -> str:
-    """Returns a number with at most four digits. Values up to a millionth of ``resolution`` become 0."""
+    """Returns a number as text with at most four significant digits. Values up to a millionth of ``resolution`` become 0."""
     if abs(value) <= 1e-6 * resolution:
         value = 0.0
     if not math.isfinite(value):

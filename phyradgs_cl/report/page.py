@@ -19,8 +19,9 @@ from phyradgs_cl.report.markup import Markup, element, joined, label, number, ra
 from phyradgs_cl.report.run import Change, Run, computed_views, load_run, step_changes
 from phyradgs_cl.runtime import Runtime
 
-DEFAULT_VIEWS = 3
-# Order matters: slices.js sends the window when it loads, so its listeners (space.js, motion.js) load first.
+DEFAULT_VIEWS = 3  # number of frames that a page compares with the volume
+# The order of the script's files matters: slices.js sends the window when it loads, so its listeners (space.js, motion.js)
+# come first.
 _SCRIPT = ("common", "shaders", "render", "space", "motion", "slices", "rows")
 _SCRIPTED = ("volume",)  # the script reveals these sections
 
@@ -80,7 +81,7 @@ def report_page(run: Run, views: Sequence[FramePair] = (), changes: Sequence[Cha
 
 
 def _arranged(shown: dict[str, Markup]) -> list[Markup]:
-    """Returns the sections. Metrics and convergence are side by side where there is room."""
+    """Returns the sections in order. Metrics and convergence stand side by side where the window is wide enough."""
     narrow = [part for name, part in shown.items() if name in ("metrics", "convergence")]
     wide = [part for name, part in shown.items() if name not in ("metrics", "convergence")]
     pair = element("div", *narrow, class_="pair") if narrow else Markup()
@@ -88,7 +89,7 @@ def _arranged(shown: dict[str, Markup]) -> list[Markup]:
 
 
 def head(title: str, script: str, reload_s: int | None = None) -> Markup:
-    """Returns the styles, and a policy that permits no network and no script except ``script``.
+    """Returns the page's head: the styles, and a policy that permits no network and no script except ``script``.
 
     reload_s: the seconds after which a browser without scripts loads the page again."""
     digest = base64_of(hashlib.sha256(script.encode()).digest())

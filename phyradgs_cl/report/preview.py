@@ -1,4 +1,4 @@
-"""Shows a volume outside of a report: as a picture of its middle slices, also during a run, or in a window of napari."""
+"""Shows a volume without a report: as a picture of its middle slices, also during a run, or in napari."""
 
 import logging
 import math
@@ -27,7 +27,7 @@ from phyradgs_cl.reconstructors import Progress
 from phyradgs_cl.report.images import bytes_of, grey_range, png_bytes, top_row_first
 
 _GAP = 4  # pixels between slices
-_SMALLEST, _LARGEST = 128, 512  # pixels along the longest side of a slice
+_SMALLEST, _LARGEST = 128, 512  # least and most pixels along the longest side of a slice
 log = logging.getLogger(__name__)
 
 
@@ -46,7 +46,7 @@ def write_preview(volume: NDArray[np.floating], grid: Grid, path: str | Path) ->
 class Preview:
     """Writes a picture of the present volume to ``io.partial_path`` of ``path``, as a listener to a running method.
 
-    It writes at most every ``every_s`` seconds. A picture that cannot be written is a warning, once."""
+    It writes at most every ``every_s`` seconds. Pictures that cannot be written give one warning, and no error."""
 
     def __init__(self, path: Path, every_s: float = 5.0) -> None:
         self.path, self.partial, self.every_s = path, partial_path(path), every_s
@@ -75,7 +75,7 @@ class Preview:
 
 
 def preview_image(volume: NDArray[np.floating], grid: Grid) -> NDArray[np.uint8]:
-    """Returns the picture (rows, columns) uint8, row 0 at the top. The slices are aligned at the bottom."""
+    """Returns the picture of middle slices, (rows, columns) uint8, row 0 at the top. Slices are aligned at the bottom."""
     low, high = grey_range(volume)
     per_mm = np.clip(max(grid.shape), _SMALLEST, _LARGEST) / max(grid.size_mm)
     slices = []
@@ -83,7 +83,7 @@ def preview_image(volume: NDArray[np.floating], grid: Grid) -> NDArray[np.uint8]
         image = bytes_of(np.take(volume, volume.shape[axis] // 2, axis=axis), low, high)
         size_mm = [side for a, side in enumerate(grid.size_mm) if a != axis]
         shape = [max(1, round(side * per_mm)) for side in size_mm]
-        ends = zip(shape, image.shape, strict=True)  # the nearest pixel keeps voxels visible
+        ends = zip(shape, image.shape, strict=True)  # the nearest voxel, so that single voxels stay visible
         rows, columns = (((np.arange(n) + 0.5) * m / n).astype(int) for n, m in ends)
         slices.append(top_row_first(image[rows[:, None], columns]))
     height, width = max(s.shape[0] for s in slices), sum(s.shape[1] + _GAP for s in slices) - _GAP
@@ -96,7 +96,7 @@ def preview_image(volume: NDArray[np.floating], grid: Grid) -> NDArray[np.uint8]
 
 
 def _shown_axes(grid: Grid) -> list[int]:
-    """Returns the axes to look along. For a grid of one layer this is only the axis across the layer."""
+    """Returns the axes (0 z, 1 y, 2 x) to look along. For a grid of one layer this is only the axis across the layer."""
     across = [min(n for a, n in enumerate(grid.shape) if a != axis) for axis in range(3)]
     return [axis for axis in range(3) if across[axis] > 1] or [0, 1, 2]
 
@@ -117,7 +117,7 @@ def view_volume(path: Path) -> None:
 
 
 def add_volume(viewer: Any, stored: Volume, name: str) -> None:
-    """Adds a volume to a viewer, in mm at its position, with axes z, y, x. y points up; grey begins at 0."""
+    """Adds a volume to napari's ``viewer``, in mm at its position, with axes z, y, x. y points up; black is 0."""
     viewer.add_image(stored.values, **_look_of_volume(stored, name))
     viewer.dims.axis_labels = _AXES
     if hasattr(viewer.camera, "orientation2d"):  # napari has this since 0.6; before, y points down

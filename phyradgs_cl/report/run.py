@@ -1,4 +1,4 @@
-"""The subject of a report: a stored volume, its scan, and how both compare. Also frames before and after each step."""
+"""Collects what a report shows: a stored volume, its scan, their comparison, and frames before and after each step."""
 
 import logging
 from collections.abc import Mapping
@@ -35,7 +35,7 @@ from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.text import plain_text
 
 log = logging.getLogger(__name__)
-_BINS = 80
+_BINS = 80  # bins of a histogram of line integrals
 Image = NDArray[np.float32]
 
 
@@ -76,7 +76,7 @@ class Run:
 
     @property
     def preprocessing(self) -> Preprocessing:
-        """The preprocessing of the frames, without steps that later versions lack. By default the usual one."""
+        """The run's preprocessing of frames, without options that this version lacks; the default where it is unknown."""
         table = self.stored.provenance.get("input")
         try:
             return preprocessing_of(_kept(table)) if isinstance(table, Mapping) else Preprocessing()
@@ -85,7 +85,7 @@ class Run:
 
     @property
     def record(self) -> list[dict[str, float]]:
-        """The finite numbers of the convergence record."""
+        """The convergence record, a line per entry, with its finite numbers only."""
         lines: Any = self.stored.provenance.get("record") or []
         return [{k: float(v) for k, v in line.items() if checks.is_number(v)} for line in lines]
 
@@ -118,7 +118,8 @@ def load_run(path: Path, scan_path: Path | None = None) -> Run:
 
 
 def _with_scan(run: Run, path: Path, is_given: bool, notes: list[str]) -> Run:
-    """Adds the scan of a file and the comparison with its reference. Appends remarks to ``notes``."""
+    """Returns the run with the scan of a file and the comparison with its reference. Appends remarks to ``notes``. Raises
+    InputError for a given file that is no scan."""
     kind = file_kind(path) if is_given else "scan"
     if kind != "scan":
         raise InputError(f"--scan {path}", f"a {kind}", "a scan")
@@ -147,7 +148,7 @@ def _with_scan(run: Run, path: Path, is_given: bool, notes: list[str]) -> Run:
 
 
 def _scan_of(path: Path, provenance: Mapping[str, object], notes: list[str]) -> Path | None:
-    """Returns the file that the provenance names, in the present or the volume's folder, if it has the stored hash."""
+    """Returns the scan file that the provenance names, in the current or the volume's folder, if it has the stored hash."""
     name = provenance.get("scan")
     if not isinstance(name, str) or not name:
         notes.append("The volume file names no scan.")
@@ -160,9 +161,9 @@ def _scan_of(path: Path, provenance: Mapping[str, object], notes: list[str]) -> 
 
 
 def _same_file(path: Path, name: str, sha256: object) -> Path | None:
-    """Returns the file ``name``, in the present or the volume's folder, if it has this hash."""
+    """Returns the file ``name``, in the current or the volume's folder, if it has this hash; None otherwise."""
     for place in (Path(name), path.parent / name, path.parent / Path(name).name):
-        with suppress(InputError):  # the name may be that of any file of this machine
+        with suppress(InputError):  # the name may be of any file, or none
             if sha256_of(place) == sha256:
                 return place
     return None
@@ -180,8 +181,8 @@ def computed_views(run: Run, rt: Runtime, count: int) -> list[FramePair]:
 
 
 def _named_deformation(path: Path, provenance: Mapping[str, object], notes: list[str]) -> Deformation | None:
-    """Returns how the object moved, from the file that the provenance names, if it has the stored hash. A missing one is
-    noted."""
+    """Returns the deformation in the file that the provenance names, if it has the stored hash; None otherwise, with a
+    remark where a file is named."""
     name = provenance.get("object_motion")
     if not isinstance(name, str) or not name:
         return None

@@ -1,4 +1,4 @@
-"""Charts of a scan: its geometry from above and from the side, and its shutter in space and time."""
+"""Draws charts of a scan: its geometry from above and from the side, and its shutter in space and time."""
 
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
@@ -17,18 +17,18 @@ from phyradgs_cl.report.markup import Markup, number
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-_MOST_FRAMES = 180  # marks on the orbit
-_ARC_SAMPLES = 24
-_FIRST_FRAMES = 4
-_MOST_DOTS, _MOST_CELLS, _LINES_WITH_DOTS = 600, 100_000, 12
+_MOST_FRAMES = 180  # limit of the source positions that are marked, about
+_ARC_SAMPLES = 24  # poses along the first frame's arc
+_FIRST_FRAMES = 4  # frames in the chart of successive frames
+_MOST_DOTS, _MOST_CELLS, _LINES_WITH_DOTS = 600, 100_000, 12  # limits of dots, of cells for any dots, of lines with dots
 _BESIDE = 0.75  # distance from the volume's middle, over its diagonal, of sources and panels of a parallel beam
-_ROOM = 0.06  # margin around the data, relative to them
+_ROOM = 0.06  # margin around the data, as a fraction of their range
 Points = NDArray[np.float64]
 
 
 def orbit_chart(scan: Scan) -> Markup:
-    """Returns the scanner from above: all source positions, the first frame's arc, rays, panel and volume. In a parallel
-    beam the arc is where the middle ray comes from."""
+    """Returns a chart of the scanner from above: all source positions, the first frame's arc, rays, panel and volume. In a
+    parallel beam, places on the middle ray stand for the source."""
     places = "directions of parallel rays" if scan.is_parallel else "source positions"
     middles, words = source_positions(scan), f"{scan.frames} {places}; the first frame's rays, panel and volume"
     arc = _first_arc(scan)
@@ -55,7 +55,7 @@ def orbit_chart(scan: Scan) -> Markup:
 
 
 def side_chart(scan: Scan) -> Markup:
-    """Returns the scanner from the side, in the plane of its axis and central ray: source, rays, panel and volume."""
+    """Returns a chart of the scanner from the side, in the plane of axis and central ray: source, rays, panel, volume."""
     pose = _first_arc(scan)[0]
     corners = panel_corners(pose, scan.geometry.detector_shape)
     across = (corners.mean(0) - pose[:3])[:2]
@@ -113,7 +113,7 @@ def _plan(draw: "Callable[[Axes], None]", points: Sequence[Points], title: str, 
 
 
 def source_positions(scan: Scan) -> Points:
-    """Returns the poses (F, 12) of ``with_sources`` in the middle of every frame's exposure."""
+    """Returns the poses (F, 12) of ``with_sources`` at the middle of every frame's lit span."""
     return with_sources(scan, middle_poses(scan))
 
 
@@ -152,7 +152,7 @@ def box_corners(scan: Scan) -> Points:
 
 
 def shutter_chart(scan: Scan, motion: Motion | None) -> Markup:
-    """Returns one frame in time: the exposures of all lines (Fig. 3 of the paper), and the times of the run's poses."""
+    """Returns a chart of one frame in time: the exposures of all lines (Fig. 3 of the paper), and the times of the poses."""
     return chart(lambda axes: draw_shutter(axes, scan, motion), "Shutter of one frame", shutter_words(scan))
 
 
@@ -176,7 +176,7 @@ def draw_shutter(axes: "Axes", scan: Scan, motion: Motion | None) -> None:
 
 
 def frames_chart(scan: Scan) -> Markup:
-    """Returns the first frames on one axis of time, so that their overlaps or pauses show."""
+    """Returns a chart of the first frames on one time axis, which shows overlaps and pauses."""
     start_s = np.asarray(scan.frame_start_s[:_FIRST_FRAMES]) - float(scan.frame_start_s[0])
     middle_s = (scan.shutter.delay_s(scan.lines).max() + scan.shutter.exposure_s) / 2
 
@@ -218,7 +218,8 @@ def _draw_samples(axes: "Axes", scan: Scan, motion: Motion) -> None:
 
 
 def sample_times(scan: Scan, motion: Motion) -> Points:
-    """Returns (time after the frame's start, line) of the poses, (N, 2). If every line has its own, some lines are taken."""
+    """Returns (time in s after the frame's start, line) of poses, (N, 2), of some lines if every line has its own; none for
+    too many cells."""
     rows = min(motion.strips, scan.lines) if isinstance(motion, MicroViews) else scan.lines
     if rows * getattr(motion, "sub_intervals", 1) > _MOST_CELLS:
         return np.empty((0, 2))

@@ -1,4 +1,4 @@
-"""The sections of a page. Each function makes HTML of a run, or returns None where there is nothing to show."""
+"""Makes the sections of a page. Each function returns HTML about a run, or None where there is nothing to show."""
 
 from collections.abc import Iterable, Mapping, Sequence
 
@@ -18,10 +18,10 @@ from phyradgs_cl.report.run import Change, Run
 from phyradgs_cl.report.scan_charts import frames_chart, orbit_chart, shutter_chart, shutter_words, side_chart
 from phyradgs_cl.text import flattened, to_digits_of
 
-_MOST_ROWS = 400  # rows of a table
-_STATES = 5
-_MOST_CHARTS, _MOST_COMBINATIONS = 6, 20  # charts and combinations of a calibration
-_ABSURD = 1e9  # no parameter of our files is larger
+_MOST_ROWS = 400  # limit of the rows of a table
+_STATES = 5  # number of states that are shown
+_MOST_CHARTS, _MOST_COMBINATIONS = 6, 20  # limits of the charts, and of the combinations, of a calibration
+_ABSURD = 1e9  # larger parameters come from damaged files and are not rounded
 
 
 def slices_section(run: Run) -> Markup:
@@ -157,7 +157,8 @@ def frame_pictures(views: Sequence[FramePair], style: str | None = None) -> tupl
 
 
 def preparation_section(run: Run, changes: Sequence[Change]) -> Markup | None:
-    """Shows the effect of each preprocessing step: pictures, a histogram and numbers. Numbers only for ``prepare``."""
+    """Shows the effect of each preprocessing step: pictures, a histogram and numbers. Of steps that ``phyradgs prepare`` has
+    applied it shows only the numbers."""
     prepared = [] if run.scan is None else run.scan.provenance.get(PREPARED_KEY)
     earlier = [element("div", element("h3", str(line.get("step"))), facts_table(line)) for line in _tables(prepared)]
     if not changes and not earlier:
@@ -183,7 +184,7 @@ def _change(change: Change) -> Markup:
 
 
 def calibration_section(scan: Scan) -> Markup | None:
-    """Shows the results of ``calibrate``, the first run first: tables of parameters, charts of views."""
+    """Shows the results of ``calibrate`` in the order of its runs: tables of parameters, charts of views."""
     calibrations = _tables(scan.provenance.get("calibrated_before")) + _tables([scan.provenance.get("calibration")])
     parts = [part for one in calibrations for part in _calibration(one, scan)]
     if not parts:
@@ -194,7 +195,8 @@ def calibration_section(scan: Scan) -> Markup | None:
 
 
 def _calibration(calibration: Mapping[str, object], scan: Scan) -> list[Markup]:
-    """Returns a row per parameter, combinations that frames do not distinguish, and a chart per correction of views."""
+    """Returns a table of parameters, the combinations that frames do not distinguish, and a chart per correction of
+    views."""
     parameters = _tables(calibration.get("parameters"))
     if not parameters:
         return []
@@ -260,7 +262,7 @@ def _motion_words(motion: Motion) -> str:
 
 
 def _tables(value: object) -> list[Mapping[str, object]]:
-    """Returns the tables of a list from a file. Anything else has none."""
+    """Returns the tables in a list from a file; [] for any other value."""
     return [line for line in value if isinstance(line, Mapping)] if isinstance(value, list) else []
 
 

@@ -1,4 +1,4 @@
-"""From file to file: what the commands do, without a word to the user. Its parts are imported when they are used."""
+"""What the commands do from file to file, without output to the user. Its parts are imported when they are used."""
 
 import lazy_loader
 

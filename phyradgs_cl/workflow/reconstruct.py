@@ -1,4 +1,4 @@
-"""From a scan file to a volume file, with checkpoints."""
+"""Reconstructs a scan file to a volume file, with checkpoints."""
 
 import logging
 import os
@@ -40,10 +40,10 @@ from phyradgs_cl.workflow.slabs import Slabs, reconstruct_slabs, remove_slabs, s
 from phyradgs_cl.workflow.volumes import compared_states
 
 log = logging.getLogger(__name__)
-_SETTLED = 5  # iterations from which on a residual says something: it begins with 1
-_UNLIKELY = 0.15  # of the norm of the line integrals: right scans left 0.13 at most, but for noise
-_AT_REST = 1.05  # the residual after three quarters of the iterations over the last: ten of SIRT leave more than they will
-_BEYOND_NOISE = 1.5  # times the noise: scans of 100 photons, which leave 0.7, had 1.1 at most
+_SETTLED = 5  # least number of recorded residuals for a warning: the first is 1
+_UNLIKELY = 0.15  # limit of the residual over the norm of the line integrals: correct scans had at most 0.13 beside noise
+_AT_REST = 1.05  # limit, for a converged run, of the residual after 3/4 of the iterations over the last one
+_BEYOND_NOISE = 1.5  # limit of the residual over the noise: correct scans of 100 photons, with 0.7, had at most 1.1
 _ALL_ROWS = Slabs()
 
 
@@ -52,8 +52,8 @@ def check_interval(seconds: float) -> None:
 
 
 class _Checkpoints:
-    """A listener that writes a checkpoint at most every ``every_s`` seconds; 0: none. A kill leaves the last complete one. A
-    checkpoint that cannot be written is a warning, once, and no error."""
+    """A listener of progress that writes a checkpoint at most every ``every_s`` seconds; 0: none. A killed run leaves the
+    last complete one. A checkpoint that cannot be written gives one warning, and no error."""
 
     def __init__(self, path: Path, every_s: float) -> None:
         self.path, self.every_s = path, every_s
@@ -79,7 +79,7 @@ class _Checkpoints:
 
     @contextmanager
     def mentioned_in_errors(self) -> Iterator[None]:
-        """Adds the way to resume to the errors of the body, if there is a checkpoint."""
+        """Adds the way to resume to the errors of the body, if this run has written a checkpoint."""
         try:
             yield
         except PhyradgsError as error:
@@ -100,10 +100,10 @@ def run_reconstruction(
 
     A parallel scan whose frames exceed half of this machine's memory is reconstructed in ``slabs`` of rows.
 
-    An interrupted run leaves ``output`` alone: it writes ``io.partial_path`` and a checkpoint, from which ``resume`` goes
-    on. A complete run removes both; a killed run leaves its last checkpoint. inputs: other files that the output must not
-    overwrite. ranks: those of the runtime; rank 0 alone writes and has metrics. Raises OutputError while another run writes
-    the output."""
+    An interrupted run does not change ``output``: it writes ``io.partial_path`` and a checkpoint, from which ``resume``
+    continues. A complete run removes both; a killed run leaves its last checkpoint. inputs: other files that the output
+    must not overwrite. ranks: those of the runtime; rank 0 alone writes and has metrics. Raises OutputError where the output
+    cannot be written, BusyError while another run writes it, and InputError for a wrong scan, option or checkpoint."""
     check_interval(checkpoint_every_s)
     leads = ranks is None or ranks.rank == 0
     if leads:
@@ -120,7 +120,8 @@ def run_reconstruction(
 
 
 def _slabs_of(plan: methods.RunPlan, slabs: Slabs, scan: Path, ranks: Communicator | None) -> list[tuple[int, int]]:
-    """Returns the slabs of a run, none for the whole scan at once. Raises InputError for slabs under several ranks."""
+    """Returns the slabs of a run; none for the whole scan at once. Raises InputError for slabs of an object that moves, with
+    a method that finds motion, and on several ranks."""
     if slabs == _ALL_ROWS and surely_fits(scan):
         return []
     with expecting(scan, "scan"):
@@ -180,16 +181,16 @@ def _reconstructed(
                 _keep_checkpoint(output, result)
                 _warn_of_residual(path, scan, result)
     except signals.InterruptedAfterwards:
-        # After a complete run the signal takes effect; an interrupted run reports it.
+        # Without a result, or after a complete run, pass the signal on. After an incomplete run the caller reports it.
         if result is None or result.state is None:
             raise
     return result, metrics
 
 
 def _metrics(scan: Scan, result: methods.Reconstruction) -> dict[str, float]:
-    """Returns the metrics against the scan's reference, by the rule of ``metrics.aligned``, and those on held-out pixels.
-    The latter leave the result's facts. These get the way of comparison, if it is not voxel by voxel. A result that moves or
-    changes has the means over the true states: the place of its own reference is free."""
+    """Returns the metrics against the scan's reference, by the rule of ``metrics.aligned``, and those on held-out pixels,
+    which it removes from the result's facts. It adds the way of comparison to these, if that is not voxel by voxel. A result
+    that moves or changes has the means over the true states, since the time of its own reference is arbitrary."""
     held_out = result.facts.pop(HELD_OUT, {})
     if scan.reference is None:
         return held_out
@@ -208,7 +209,7 @@ def _metrics(scan: Scan, result: methods.Reconstruction) -> dict[str, float]:
 
 
 def _warn_of_doubts(plan: methods.RunPlan, path: Path, scan: Scan) -> None:
-    """Warns of a run that is possible, but hardly meant."""
+    """Warns of options that do not suit the scan, of frames out of order, and of a scan without an object."""
     motion, preprocessing = getattr(plan.options, "motion", None), plan.preprocessing
     ignores_model = scan.detector_model == "intensity" and not hasattr(plan.options, "detector_model")
     if ignores_model and _averages(scan, plan.options):
@@ -234,7 +235,7 @@ def _warn_of_doubts(plan: methods.RunPlan, path: Path, scan: Scan) -> None:
 
 
 def _warn_of_residual(path: Path, scan: Scan, result: methods.Reconstruction) -> None:
-    """Warns where the iterations came to rest at a volume that leaves much more of the scan than its noise.
+    """Warns where the iterations have converged to a volume whose residual is far above the scan's noise.
 
     Measured on four objects of 32³, 25 views, by default: an axis off by 2 pixels left 0.25, one by 10 pixels 0.6, flats of
     another scale 0.48 to 1, reversed angles 0.12 to 0.24, wrong units and orders 0.16 to 0.28."""
@@ -252,7 +253,7 @@ def _warn_of_residual(path: Path, scan: Scan, result: methods.Reconstruction) ->
 
 
 def _averages(scan: Scan, options: Any) -> bool:
-    """True if the method averages over several poses of a line; with one pose, both detector models are the same."""
+    """True if the motion model has several poses per line; with one pose, both detector models give the same."""
     if not hasattr(options, "motion"):
         return False
     cells = options.motion.cells(scan, 0)
@@ -260,7 +261,7 @@ def _averages(scan: Scan, options: Any) -> bool:
 
 
 def profile_report(rt: Runtime, result: methods.Reconstruction) -> str:
-    """Returns a table of a run's device time by kernel; ``rt`` is the run's, opened with ``profile``."""
+    """Returns a table of a run's device time by kernel. ``rt``: the run's runtime, opened with ``profile``."""
     return profile_text(rt.kernel_uses(), float(result.facts["seconds"]))
 
 
@@ -290,7 +291,7 @@ def _keep_checkpoint(output: Path, result: methods.Reconstruction) -> None:
     path = checkpoint_path(output)
     if result.state is None:
         for outdated in (path, partial_path(output)):
-            with suppress(OSError):  # the volume is there, whatever lies in their place
+            with suppress(OSError):  # the volume is complete, so a failure here does no harm
                 outdated.unlink()
     else:
         write_checkpoint(path, result.state)
@@ -300,7 +301,8 @@ def resume_or_restart(
     plan: methods.RunPlan, scan: Path, output: Path, make_runtime: Callable[[], Runtime],
     report: methods.ProgressReport = methods.ignore_progress, checkpoint_every_s: float = 600.0,
 ) -> tuple[methods.Reconstruction, dict[str, float]]:
-    """Resumes from the output's checkpoint; starts from the beginning without one, or with a damaged or another run's."""
+    """Runs ``run_reconstruction`` from the output's checkpoint. Starts from the beginning where there is none, or where it
+    is damaged or of another run."""
     run = partial(run_reconstruction, plan, scan, output, make_runtime, report, checkpoint_every_s=checkpoint_every_s)
     checkpoint = checkpoint_path(output)
     if checkpoint.is_file() and methods.method_of(plan.method).is_resumable:
@@ -314,5 +316,5 @@ def resume_or_restart(
 
 
 def is_complete(result: methods.Reconstruction) -> bool:
-    """True if the run came to its end; an interrupted run has left a checkpoint."""
+    """True if the run came to its end; False if it was interrupted, and has left a checkpoint."""
     return result.facts.get("interrupted_at") is None

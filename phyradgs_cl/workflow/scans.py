@@ -1,4 +1,4 @@
-"""To a scan file: from a phantom or a volume, and from a scan without the effects of panel and beam."""
+"""Writes scan files: simulations of a phantom or a volume, and scans corrected for effects of panel and beam."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
@@ -27,8 +27,9 @@ _TOML = ".toml"
 
 @dataclass(frozen=True)
 class SimulationJob:
-    """What to simulate, a phantom by name or TOML file or a volume file, on which scanner; voxels and rays per pixel; the
-    file of the object's motion, which must not be overwritten."""
+    """What to simulate: a ``phantom`` by name or TOML file, or a ``volume`` file, on a ``scanner``, with ``size`` voxels
+    along the longest side and ``pixel_samples`` rays along a pixel's. motion_of_object: a file that must not be
+    overwritten."""
 
     output: Path
     phantom: str | None = None
@@ -40,21 +41,22 @@ class SimulationJob:
 
 
 def refuse_jitter(protocol: str, jitter_deg: float | None) -> None:
-    """A gantry that stands does not wander. Arc and readout say which fly-scan's mid-window poses it stands at."""
+    """Raises InputError for jitter with a stop-and-shoot protocol: its gantry rests at the mid-window poses of a
+    fly-scan."""
     if jitter_deg and not PROTOCOLS[protocol].is_fly:
         remedy = "leave it out, or choose a fly-scan"
         raise InputError("--jitter-deg", f"{jitter_deg} with --protocol {protocol}", "0", remedy)
 
 
 def refuse_noise_options(noise: str, given: Mapping[str, float | None]) -> None:
-    """Photons and electronic noise that are stated mean something with a model of noise only."""
+    """Raises InputError for photons or electronic noise ``given``, by option, without a model of noise."""
     stated = [f"{option} {value:g}" for option, value in given.items() if value is not None]
     if noise == "none" and stated:
         raise InputError(stated[0], "--noise none", "a model of noise with it", "add --noise tigre or beer")
 
 
 def phantom_of(name: str) -> str | EllipsoidPhantom:
-    """A phantom from a TOML file; a name of one of ours as it is. InputError for neither."""
+    """Returns the phantom of a TOML file, or the name of a built-in one unchanged. Raises InputError for other names."""
     if name.endswith(_TOML):
         return load_beads(Path(name))
     if name not in PHANTOMS:
@@ -63,12 +65,12 @@ def phantom_of(name: str) -> str | EllipsoidPhantom:
     return name
 
 
-@np.errstate(all="ignore")  # what overflows is found in the result, and reported in one line
+@np.errstate(all="ignore")  # overflow is found in the result, and reported in one line
 def run_simulation(
     job: SimulationJob, scanner: Scanner, options: SimulationOptions, rt: Runtime,
     report: Callable[[int, int], None],
 ) -> Scan:
-    """Simulates and writes a scan file; everything is checked before any work."""
+    """Simulates a scan, writes its file and returns it. Raises InputError and OutputError before any work."""
     if job.volume is not None and job.phantom is not None:
         raise InputError("--volume", f"given together with --phantom {job.phantom}", "one of the two")
     described = [Path(name) for name in (job.scanner, job.phantom or "") if name.endswith(_TOML)]
@@ -92,8 +94,8 @@ def run_simulation(
 def run_preparation(
     source: Path, output: Path, options: Preprocessing, make_runtime: Callable[[], Runtime], config: Path | None = None
 ) -> list[dict[str, Any]]:
-    """Writes the scan ``source`` after the steps of ``options`` as line integrals; says what each did, in order. The file
-    says the same, and of which scan. Bad pixels are masked and filled in. Raises InputError and OutputError as any run."""
+    """Writes the scan ``source`` after the steps of ``options`` as line integrals, with bad pixels masked and interpolated.
+    Returns what each step did, in order, as the file's provenance states too. Raises InputError and OutputError."""
     if not options.chosen and options.flats == "mean":
         raise InputError("--steps", "none", f"some of {', '.join(STEPS)}", "leave it out for the usual ones")
     options.check_written()

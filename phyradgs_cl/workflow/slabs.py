@@ -1,4 +1,4 @@
-"""Reconstruction of a parallel scan slab by slab: rows of one slab at a time are read, reconstructed and kept on disk.
+"""Reconstructs a parallel scan slab by slab: rows of one slab at a time are read, reconstructed and kept on disk.
 
 A slab's frames are those of its own rows: ``static`` takes the middle of their times, not of the whole frame's."""
 
@@ -29,14 +29,14 @@ from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.workflow.files import load_scan
 
 log = logging.getLogger(__name__)
-_HOST_SHARE = 0.5  # of this machine's memory, for the frames of a slab and what methods make of them
-_COPIES = 4  # arrays of a slab's frames that a method holds on the host
+_HOST_SHARE = 0.5  # fraction of this machine's memory for the frames of a slab and the arrays that methods make of them
+_COPIES = 4  # arrays of the size of a slab's frames that a method holds on the host
 
 
 @dataclass(frozen=True)
 class Slabs:
-    """Which rows of the panel to reconstruct, all by default, and how many at a time: rows_at_a_time 0 takes as many as half
-    of this machine's memory holds."""
+    """Which ``rows`` [first, stop) of the panel to reconstruct, None for all, and how many at a time. rows_at_a_time 0 takes
+    stated rows at once, and of all rows as many as half of this machine's memory holds."""
 
     rows: tuple[int, int] | None = None
     rows_at_a_time: int = 0
@@ -59,12 +59,13 @@ class Slabs:
 
 
 def surely_fits(path: Path) -> bool:
-    """True for a file so small that its frames, if they are counts of two bytes, are far from half of the memory."""
+    """True for a file so small that its frames surely fit, also if they are counts of 2 bytes that become float32; and
+    for a missing file."""
     return not path.is_file() or 2 * _COPIES * path.stat().st_size < _HOST_SHARE * host_bytes()
 
 
 def rows_of(text: str) -> tuple[int, int]:
-    """Parses ``A:B``. Raises InputError for other text."""
+    """Parses ``A:B``, detector rows [A, B). Raises InputError for other text."""
     first, colon, stop = text.partition(":")
     if not (colon and first.strip().isdigit() and stop.strip().isdigit()):
         raise InputError("--rows", repr(text), "A:B, the first detector row and the one after the last", "write 0:256")
@@ -75,10 +76,10 @@ def reconstruct_slabs(
     plan: methods.RunPlan, path: Path, output: Path, slabs: list[tuple[int, int]], rt: Runtime,
     report: methods.ProgressReport, *, resume: bool,
 ) -> methods.Reconstruction:
-    """Returns the volume of all slabs. Each is written beside ``output`` once it is whole; ``resume`` takes it from there.
+    """Returns the volume of all slabs, mapped from a file. Each finished slab is written beside ``output``; ``resume`` reads
+    it from there.
 
-    The volume is mapped from a file. Raises InputError for slabs that are of another run, and
-    KeyboardInterrupt where a slab is interrupted."""
+    Raises InputError where these are slabs of another run, and KeyboardInterrupt where a slab is interrupted."""
     header = read_scan_header(path)
     grid = header.with_grid(plan.preprocessing).grid
     whole = header.on_grid(grid)
@@ -107,11 +108,11 @@ def reconstruct_slabs(
 def _slab(
     plan: methods.RunPlan, path: Path, whole: Scan, rows: tuple[int, int], rt: Runtime, report: methods.ProgressReport
 ) -> methods.Reconstruction:
-    """Reconstructs the slices of some rows, from these and a few more on each side."""
+    """Reconstructs the slices of detector rows [first, stop), from these rows and ``HALO_ROWS`` on each side."""
     count, (first, stop) = whole.geometry.detector_shape[0], rows
     near = max(first - HALO_ROWS, 0), min(stop + HALO_ROWS, count)
     scan = load_scan(path, plan.preprocessing.flats, near).on_grid(part_of(whole.grid, slices_of(whole, *rows)))
-    if hasattr(plan.options, "iterations"):  # what explains frames needs the slices of all their rows
+    if hasattr(plan.options, "iterations"):  # iterations explain all frames, so they need the slices of all rows read
         z_mm, *across_mm = np.broadcast_to(plan.preprocessing.margin_mm or 0.0, 3).tolist()
         margin_mm = (max(z_mm, HALO_ROWS * whole.geometry.pixel_size_mm[0]), *across_mm)
         plan = replace(plan, preprocessing=replace(plan.preprocessing, margin_mm=margin_mm))
@@ -125,7 +126,7 @@ def _slab(
 def _named(
     report: methods.ProgressReport, number: int, count: int, rows: tuple[int, int]
 ) -> Callable[[methods.Progress], None]:
-    """Returns a report that names the slab."""
+    """Returns a report of progress that puts the slab's name in front, and passes no state on."""
     label = f"slab {number + 1} of {count}, rows {rows[0]}:{rows[1]}: "
 
     def passed_on(progress: methods.Progress) -> None:
@@ -135,7 +136,8 @@ def _named(
 
 
 class _Store:
-    """The finished slabs of a run, a .npy file each, in a folder beside the output, with the run that they are of."""
+    """The finished slabs of a run, a .npy file each, in a folder beside the output, with a note of the run's ``identity``.
+    Without ``resume`` it removes earlier slabs; with it, it raises InputError for those of another run."""
 
     def __init__(self, output: Path, identity: str, resume: bool) -> None:
         self.folder = beside(output, ".slabs")
@@ -149,7 +151,7 @@ class _Store:
         note.write_text(identity, encoding="utf-8")
 
     def slab(self, first: int, stop: int) -> np.ndarray | None:
-        """Returns a finished slab (z, y, x), mapped from its file, or None."""
+        """Returns a finished slab (z, y, x), mapped from its file; None where there is none."""
         path = self.folder / f"{first}-{stop}.npy"
         return np.load(path, mmap_mode="r") if path.exists() else None
 

@@ -1,5 +1,5 @@
-"""Scans × settings × seeds: the file of a sweep, checked before any run; the runs, made one after the other or by Dask's
-workers; their lines in one results file, and the table of means over scans and seeds."""
+"""Runs sweeps over scans × settings × seeds. The sweep's file is checked before any run. Runs are made one after the other
+or by Dask's workers. Each writes a line into one results file; a table has the means over scans and seeds."""
 
 import functools
 import glob
@@ -45,17 +45,17 @@ from phyradgs_cl.workflow.reconstruct import is_complete, resume_or_restart
 
 log = logging.getLogger(__name__)
 RESULTS, TABLE = "results.jsonl", "results.md"
-_RETRIES, _CONNECT_S, _BUSY_S = 3, 10.0, 20.0
-# other machines must not send work to this one
+_RETRIES, _CONNECT_S, _BUSY_S = 3, 10.0, 20.0  # Dask's retries of a run; timeout of its scheduler; wait for a busy output
+# Dask listens on this machine only: others must not send work to it
 _LOCAL = {"host": "127.0.0.1", "dashboard_address": "127.0.0.1:0", "silence_logs": logging.CRITICAL}
 Line = dict[str, Any]
 
-runtime_of_process = functools.cache(Runtime)  # built kernels stay from run to run
+runtime_of_process = functools.cache(Runtime)  # one runtime per process and device: built kernels stay from run to run
 
 
 @dataclass(frozen=True)
 class SweepRun:
-    """One reconstruction, as a worker gets it. facts: how its line in the results file begins; ``run`` is its name."""
+    """One reconstruction, as a worker gets it. facts: the first entries of its results line; "run" is its name."""
 
     scan: Path
     plan: RunPlan
@@ -65,9 +65,9 @@ class SweepRun:
 
 
 def plan_sweep(path: Path, folder: Path, checkpoint_every_s: float = 600.0) -> list[SweepRun]:
-    """Returns every run of the file GRID.toml, scan by scan. Volumes go to ``folder``/volumes. Patterns start at the folder
-    of ``path``. A name stands for a scan (path, size, time), a setting and a seed. Raises InputError for everything that
-    would stop a run: unknown keys, values out of range, patterns that match nothing, files that are no scans."""
+    """Returns every run of the sweep's file ``path``, scan by scan. Volumes go to ``folder``/volumes. Patterns start at the
+    folder of ``path``. A run's name is unique to its scan (path, size, time of change), setting and seed. Raises InputError
+    for all that would stop a run: unknown keys, values out of range, patterns without a match, files that are no scans."""
     document = read_toml(path, f"GRID {path}")
     refuse_unknown(f"{path}:", document, ("scans", "seeds", "options", "grid", "runs"))
     patterns = _list(document.get("scans"), str, f"{path}: scans", 'a list of files or patterns, as ["scans/*.h5"]')
@@ -104,7 +104,8 @@ def _files(pattern: str, path: Path) -> list[Path]:
 
 
 def _settings(document: Mapping[str, Any], path: Path) -> Iterator[dict[str, Any]]:
-    """Yields the options of every setting by dotted name: combinations of the lists of [[grid]], and [[runs]]."""
+    """Yields the options of every setting by dotted name: all combinations of the lists in each [[grid]], and each [[runs]],
+    each with the shared [options]. Raises InputError for a file without either, or with an empty list."""
     keys = [key for key in ("grid", "runs") if key in document]
     if not keys:
         remedy = "write for example [[grid]] with method = ['fdk', 'sirt']"
@@ -121,7 +122,7 @@ def _settings(document: Mapping[str, Any], path: Path) -> Iterator[dict[str, Any
 
 
 def _plan(values: Mapping[str, Any], seed: int, where: str) -> RunPlan:
-    """Returns the plan of a run; its errors state the values."""
+    """Returns the plan of a run. Raises the errors of ``plan_run`` with ``where`` and the values in front."""
     options = nested(values)
     method, preset = options.pop("method", DEFAULT_METHOD), options.pop("preset", None)
     try:
@@ -135,10 +136,11 @@ def run_sweep(
     runs: Sequence[SweepRun], folder: Path, workers: str | None = None, device: str | None = None, *,
     tell: Callable[[int, Line], object] = lambda done, line: None, report: ProgressReport = ignore_progress,
 ) -> int:  # fmt: skip
-    """Makes the runs that the results file lacks, then the table, results.md. Returns the number of runs that failed now,
-    which the next call makes again. workers: a number of Dask's workers on this machine, or the address of a Dask scheduler;
-    None makes the runs here. ``tell`` gets the number of finished runs and the last line. Raises OutputError where the
-    folder cannot be written, BusyError while another sweep uses it, InputError for no scheduler or a missing package."""
+    """Makes the runs that the results file lacks, then the table, results.md. Returns the number of runs that failed in this
+    call; the next call makes them again. workers: a number of Dask's workers on this machine, or the address of a Dask
+    scheduler; None makes the runs here. ``tell`` gets the number of finished runs and the last line. Raises OutputError
+    where the folder cannot be written, BusyError while another sweep uses it, and InputError for a scheduler that does not
+    answer or a missing package."""
     make_folder(folder / "volumes", folder)
     with only_run(folder / RESULTS):
         newest = {line["run"]: line for line in read_lines(folder / RESULTS)}
@@ -160,7 +162,7 @@ def run_sweep(
 
 def _made_here(runs: Sequence[SweepRun], device: str | None, report: ProgressReport) -> Iterator[Line]:
     for run in runs:
-        runtime_of_process(device)  # a missing device is not the error of a run
+        runtime_of_process(device)  # a missing device stops the sweep: it is no run's error
         with keep_finished_work():  # a finished run is kept, then the sweep stops
             try:
                 line = make_run(run, report, device)
@@ -170,10 +172,10 @@ def _made_here(runs: Sequence[SweepRun], device: str | None, report: ProgressRep
 
 
 def _made_by_workers(runs: Sequence[SweepRun], workers: str, device: str | None, page: Path) -> Iterator[Line]:
-    """Yields lines as the runs finish, and writes Dask's page about them."""
+    """Yields the runs' lines as they finish, and writes Dask's report to ``page``. Raises InputError without a scheduler."""
     os.environ.setdefault("DASK_DISTRIBUTED__SCHEDULER__WORKER_SATURATION", "1.0")  # a death counts against one run only
     dask = checks.package("distributed", "the package that --workers needs", "phyradgs-cl[cluster]")
-    logging.getLogger("distributed.client").setLevel(logging.CRITICAL)  # an error of ours says it
+    logging.getLogger("distributed.client").setLevel(logging.CRITICAL)  # InputError below says the same
     count, where = int(workers) if workers.isdigit() else None, {"address": workers, "timeout": _CONNECT_S}
     if count is not None:
         checks.within("--workers", count, 1, 1024)
@@ -184,7 +186,7 @@ def _made_by_workers(runs: Sequence[SweepRun], workers: str, device: str | None,
             if count is not None:
                 client.register_worker_callbacks(functools.partial(_begin, device))
                 client.cluster.adapt(minimum=count, maximum=count)  # else a worker that dies early is not replaced
-                device = None  # each has its own
+                device = None  # each worker has its own device
             run_of = {client.submit(make_run, run, device=device, retries=_RETRIES, pure=False): run for run in runs}
             for future in dask.as_completed(list(run_of)):
                 run = run_of.pop(future)
@@ -196,13 +198,14 @@ def _made_by_workers(runs: Sequence[SweepRun], workers: str, device: str | None,
 
 
 def _begin(device: str | None, dask_worker: Any) -> None:
-    """Gives a worker its device, by its number. Ctrl-C in a terminal reaches every process; the sweep answers it."""
+    """Sets a worker's device by the worker's number, and makes it ignore Ctrl-C, which the sweep's own process handles."""
     os.environ[DEVICE_VARIABLE] = str(choose_device(device, int(dask_worker.name))[0].index)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 def make_run(run: SweepRun, report: ProgressReport = ignore_progress, device: str | None = None) -> Line:
-    """Returns the line of a run, with the error where scan or options are at fault. Raises what another try may change."""
+    """Returns the results line of a run, or a line with the error where the scan, the options or a lack of memory is at
+    fault. Raises all other errors, after which another try may succeed, and KeyboardInterrupt for an incomplete run."""
     try:
         rt = runtime_of_process(device)
         result, metrics = resume_or_restart(run.plan, run.scan, run.output, lambda: rt, report, run.checkpoint_every_s)
@@ -210,7 +213,7 @@ def make_run(run: SweepRun, report: ProgressReport = ignore_progress, device: st
         return _failed(run, error)
     except Exception as error:
         runtime_of_process.cache_clear()  # the next run opens its device again
-        time.sleep(_BUSY_S if isinstance(error, BusyError) else 0)  # a lost worker may still be making it
+        time.sleep(_BUSY_S if isinstance(error, BusyError) else 0)  # a worker that lost contact may still be writing it
         raise
     if not is_complete(result):
         raise KeyboardInterrupt
@@ -220,7 +223,8 @@ def make_run(run: SweepRun, report: ProgressReport = ignore_progress, device: st
 
 
 def _failed(run: SweepRun, error: Exception) -> Line:
-    """Returns the line of a run that failed, or whose workers died. Raises OutputError where there is no room for any."""
+    """Returns the line of a failed run, or of dead workers. Raises an OutputError that all runs would meet, not
+    BusyError."""
     if isinstance(error, OutputError) and not isinstance(error, BusyError):
         raise error
     text = str(error) if isinstance(error, PhyradgsError) else f"{type(error).__name__}: {error}"
@@ -228,7 +232,8 @@ def _failed(run: SweepRun, error: Exception) -> Line:
 
 
 def markdown(lines: Sequence[Line], planned: int) -> str:
-    """Returns means and standard deviations over the scans and seeds of every setting, and the failed runs below."""
+    """Returns a table in Markdown: means and standard deviations over the scans and seeds of every setting, and the failed
+    runs below. planned: the number of all runs."""
     done, failed = [line for line in lines if "error" not in line], [line for line in lines if "error" in line]
     measured = {name for line in done for name in line["metrics"]}
     metrics = {**METRICS, **{name: metric for name, metric in HELD_OUT.items() if name in measured}}
@@ -255,7 +260,7 @@ def _mean(values: Sequence[Any], form: str) -> str:
 
 
 def read_lines(path: Path) -> list[Line]:
-    """Reads the lines of a results file that are whole, and warns of others; no lines where there is no file."""
+    """Reads the complete lines of a results file, and warns of damaged ones. Returns [] where there is no file."""
     lines, damaged = [], []
     text = path.read_text(encoding="utf-8", errors="replace") if path.exists() else ""
     for number, row in enumerate(text.split("\n"), 1):
@@ -270,7 +275,7 @@ def read_lines(path: Path) -> list[Line]:
 
 
 def append_line(path: Path, line: Mapping[str, Any]) -> None:
-    """Appends one line in a single write, and waits until it is on the disk."""
+    """Appends one line in a single write, and waits until it is on the disk. Raises OutputError where that fails."""
     text = plain_text(json.dumps(line, ensure_ascii=False, allow_nan=False, default=str)) + "\n"
     try:
         with open(path, "ab+") as file:

@@ -1,4 +1,4 @@
-"""Two volumes to numbers and a picture."""
+"""Compares a volume with a reference: metrics, and a picture of slices."""
 
 import logging
 from pathlib import Path
@@ -28,7 +28,7 @@ from phyradgs_cl.text import plain_text
 from phyradgs_cl.workflow.files import check_picture, load_reference, load_result
 
 log = logging.getLogger(__name__)
-_LITTLE = 0.5 - 1e-6  # of either box: less in common is most often a wrong size or offset
+_LITTLE = 0.5 - 1e-6  # least fraction of either box in common: less is most often a wrong size or offset
 
 
 @np.errstate(all="ignore")
@@ -38,10 +38,10 @@ def run_evaluation(
 ) -> dict[str, object]:
     """Compares a volume with a scan's reference or another volume, by the rule of ``metrics.aligned``, and writes the
     picture of slices. A volume without a scale is compared voxel by voxel. ``reference_voxel_mm``: sides of the voxels of a
-    reference without a scale, one length or (z, y, x). ``object_motion``: the file of a deformation, which shows the volume
-    at each true state of a scan; None takes the volume's own, if it has one. ``reference_of_rtk``: the
-    reference has RTK's axes. ``mu_water_per_mm``: of files in Hounsfield units that do not state their scale. InputError: no
-    such sides; files that do not fit each other; attenuation of water for files that are in 1/mm."""
+    reference without a scale, one length or (z, y, x). ``object_motion``: the file of a deformation, by which the volume is
+    moved to the time of each true state of a scan; None takes the volume's own, if it has one. ``reference_of_rtk``: the
+    reference has RTK's axes. ``mu_water_per_mm``: water's attenuation, for files in Hounsfield units without a scale. Raises
+    InputError for wrong sides, files that do not fit each other, and water's attenuation for files in 1/mm."""
     check_picture("--picture", picture, volume_path, reference_path, object_motion)
     field = None if object_motion is None else read_deformation(object_motion)
     result = attenuation_of(str(volume_path), load_result(volume_path, mu_water_per_mm))
@@ -75,7 +75,7 @@ def run_evaluation(
     with finish_despite_interrupt(), written_beside(picture) as temporary:
         try:
             slices_png(temporary, volume, reference, title)
-        except OutputError as error:  # names the temporary file; what the disk says is behind it
+        except OutputError as error:  # its text names the temporary file; its cause is the system's error
             raise error.__cause__ or error from None
     known: dict[str, object] = {key: provenance[key] for key in ("method", "seconds", "gaussians") if key in provenance}
     files = {"volume": str(volume_path), "reference": str(reference_path), "picture": str(picture)}
@@ -84,8 +84,8 @@ def run_evaluation(
 
 
 def compared_states(result: Volume, truth: MovingTruth, truth_grid: Grid) -> dict[str, object]:
-    """Returns PSNR and SSIM of a volume at the time of each true state, and their means. Where both deformations are known
-    the error of the motion follows."""
+    """Returns PSNR and SSIM of a volume at the time of each true state, and their means. Where both deformations are known,
+    it adds the mean and the 95th percentile of the motion's error in mm. Raises InputError for boxes that do not overlap."""
     grid, field = result.required_grid, result.deformation
     rows: list[dict[str, float]] = []
     for time_s, state in zip(truth.times_s, truth.volumes, strict=True):
@@ -100,7 +100,7 @@ def compared_states(result: Volume, truth: MovingTruth, truth_grid: Grid) -> dic
     points_mm = edge_points_mm(truth.volumes[0], truth_grid)
     try:
         mean_mm, high_mm = motion_error_mm(field, truth.deformation, points_mm, truth.times_s)
-    except InputError as error:  # strong contraction: the volumes can be compared all the same
+    except InputError as error:  # a deformation that cannot be inverted: metrics do not need its inverse
         log.warning("no error of the motion: %s", error)
         return {"states": rows, **means}
     return {"states": rows, **means, "mean_motion_error_mm": mean_mm, "p95_motion_error_mm": high_mm}
@@ -108,7 +108,7 @@ def compared_states(result: Volume, truth: MovingTruth, truth_grid: Grid) -> dic
 
 def _with_our_axes(volume: Volume) -> Volume:
     """Returns a volume of RTK, whose (x, y, z) are (y, z, x) here."""
-    z, y, x = 1, 2, 0  # the places of our axes in RTK's (z, y, x)
+    z, y, x = 1, 2, 0  # indices of our axes in RTK's (z, y, x)
     grid = volume.grid
     if grid is not None:
         shape, size_mm, at_mm = grid.shape, grid.voxel_size_mm, grid.offset_mm
@@ -117,7 +117,8 @@ def _with_our_axes(volume: Volume) -> Volume:
 
 
 def _grid_of(path: Path, reference: np.ndarray, grid: Grid | None, voxel_mm: object, volume_path: Path) -> Grid:
-    """Where the reference lies: its own grid, or voxels of ``voxel_mm`` centred on the axis."""
+    """Returns the reference's grid: its own, or voxels of ``voxel_mm`` centred on the axis. Raises InputError for both, and
+    for neither."""
     if voxel_mm is not None:
         if grid is not None:
             expected = f"a reference without a scale; {path} has {in_words(grid)}"
@@ -133,7 +134,7 @@ def _grid_of(path: Path, reference: np.ndarray, grid: Grid | None, voxel_mm: obj
 def _on_one_grid(
     volume_path: Path, reference_path: Path, result: tuple[np.ndarray, Grid], truth: tuple[np.ndarray, Grid]
 ) -> Aligned:
-    """Both on one grid; InputError where they have nothing in common that can be compared."""
+    """Returns both volumes on one grid. Raises InputError where they have no object in common; warns of little overlap."""
     pair = aligned(*result, *truth)
     if pair is None:
         found = f"{in_words(result[1])}, which has no voxel of the reference, {in_words(truth[1])}"

@@ -20,7 +20,7 @@ def start_azimuths_rad(scan: Scan) -> np.ndarray:
 
 
 def middle_poses(scan: Scan) -> np.ndarray:
-    """Returns the poses (F, 12) in the middle of every frame's exposure."""
+    """Returns the poses (F, 12) at the middle of every frame's lit span (``Shutter.middle_s``)."""
     times_s = np.asarray(scan.frame_start_s) + scan.shutter.middle_s
     return np.stack([scan.trajectory.pose(f, times_s[f : f + 1])[0] for f in range(scan.frames)])
 
@@ -31,7 +31,7 @@ def has_opposite_views(scan: Scan) -> bool:
 
 
 def exposure_arc_rad(scan: Scan) -> float:
-    """Returns the angle by which the gantry turns during one line's exposure in the middle frame. A gantry at rest has 0."""
+    """Returns the arc in rad, without sign, of one line's exposure in the middle frame; 0 for a gantry at rest."""
     if not scan.is_fly:
         return 0.0
     frame = scan.frames // 2

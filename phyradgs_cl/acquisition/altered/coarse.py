@@ -12,15 +12,15 @@ from phyradgs_cl.acquisition.scan import Scan
 from phyradgs_cl.acquisition.shutter import Shutter
 from phyradgs_cl.fields import Grid
 
-MOST_FRAMES = 60
-QUICK_COLUMNS, FINE_COLUMNS = 20, 32  # blocks along the detector's longer side
-SMOOTHING = 0.8  # standard deviation of the smoothing, in blocks
+MOST_FRAMES = 60  # limit of the frames of a coarse scan
+QUICK_COLUMNS, FINE_COLUMNS = 20, 32  # most blocks along the detector's longer side, in quick and in fine searches
+SMOOTHING = 0.8  # standard deviation of the Gaussian that smooths frames before binning, in blocks
 _LEAST_VALID = 0.5  # a block with a smaller fraction of valid pixels is masked
-_MOST_VOXELS = 64  # per side of the grid
-_MARGIN = 1  # voxels around the box: a too small size would fit an object that fills the box better
+_MOST_VOXELS = 64  # limit along the longest side of the grid's box, without the margin
+_MARGIN = 1  # voxels added on each side of the box: without them, too small a size fits an object that fills it better
 _OBJECT_SHARE = 0.02  # a column shows the object above this fraction of the largest line integral
-_LEAST_COLUMNS = 12  # least number of blocks across a panel that has as many columns
-_NARROW = 3  # blocks are this much smaller on a panel lower than two of them: a row of few blocks holds little
+_LEAST_COLUMNS = 12  # least number of blocks across a panel, if it has as many columns
+_NARROW = 3  # factor by which blocks shrink on a panel lower than two of them: a single row of blocks tells little
 
 
 def coarse(scan: Scan, columns: int) -> Scan:
@@ -36,7 +36,7 @@ def coarse(scan: Scan, columns: int) -> Scan:
 
 
 def smooth(scan: Scan, pixels: float | tuple[float, float]) -> Scan:
-    """Returns the scan with frames smoothed by a Gaussian, from valid pixels only. Their blocks have no aliasing.
+    """Returns the scan with frames smoothed by a Gaussian, from valid pixels only, so that their blocks do not alias.
 
     pixels: the standard deviation, or a pair of them (across rows, across columns)."""
     v_px, u_px = pixels if isinstance(pixels, tuple) else (pixels, pixels)
@@ -74,8 +74,8 @@ def some_frames(scan: Scan, frames: np.ndarray) -> Scan:
 def binned(scan: Scan, block: int) -> Scan:
     """Returns the scan with ``block`` × ``block`` pixels averaged to one. A block is no larger than the panel.
 
-    Only the valid pixels of a block are averaged; a block with less than half of them valid is masked. Rows and columns at
-    the far end that fill no block are dropped. A block of lines opens at the mean of its lines' times."""
+    Only the valid pixels of a block are averaged; a block with less than half of them valid is masked. The last rows and
+    columns that fill no block are dropped. A block of lines opens at the mean of its lines' times."""
     if block == 1:
         return replace(scan, reference=None, moving_truth=None)
     height, width = blocks = tuple(min(block, count) for count in scan.geometry.detector_shape)
@@ -110,9 +110,10 @@ def coarse_grid(grid: Grid, geometry: Geometry) -> Grid:
 def around_object(scan: Scan, spare_columns: float = 0.0) -> Scan:
     """Returns a coarse scan with its grid about the axis cut to the object that the frames show.
 
-    spare_columns: columns by which the grid is wider, because the axis may be off by as many.
+    spare_columns: pixels added to the radius, because the axis may be off by as many.
 
-    With few frames, voxels of air let a wrong hypothesis fit better than the right one. A panel's grid has many of them."""
+    With few frames, voxels of air let a wrong hypothesis fit better than the right one. A panel's grid has many of them.
+    A scan whose grid is off the axis, or whose frames show nothing, stays as it is."""
     geometry, grid = scan.geometry, scan.grid
     columns = np.where(scan.valid, scan.projections, 0).max((0, 1))
     shown = np.flatnonzero(columns > _OBJECT_SHARE * columns.max())

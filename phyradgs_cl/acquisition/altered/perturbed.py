@@ -62,7 +62,7 @@ class Sway:
         return splines((np.asarray(time_s, np.float64) - self.start_s) / (self.end_s - self.start_s), len(self.coefficients))
 
     def at(self, time_s: np.ndarray) -> np.ndarray:
-        """Returns turns and shifts (..., 6) at times (...)."""
+        """Returns turns in rad and shifts in mm, (..., 6), at times (...) s."""
         six: np.ndarray = self.basis(time_s) @ self.coefficients
         return six
 
@@ -132,7 +132,7 @@ class PerturbedTrajectory:
 
 
 def _seen_by(motion: np.ndarray, vectors: list[np.ndarray], places: int) -> list[np.ndarray]:
-    """Returns four vectors (..., 3) in the frame of an object that has turned and shifted by ``motion`` (..., 6).
+    """Returns four vectors (..., 3) in the coordinates of an object that has turned and shifted by ``motion`` (..., 6).
 
     The last two vectors are steps. Of the two before, the last ``places`` (1 or 2) are points, which a shift moves."""
     # An object that turns and shifts sees the scanner shifted back, then turned back.
@@ -173,6 +173,6 @@ def perturb(scan: Scan, correction: GeometryCorrection, views: Views | Sway | No
 
 
 def scan_course(scan: Scan) -> np.ndarray:
-    """Returns where each frame (F,) begins in the scan, from -1/2 for the first to 1/2 for the last."""
+    """Returns when each frame (F,) begins, as a fraction of the scan: from −1/2 for the first to 1/2 for the last."""
     starts_s = np.asarray(scan.frame_start_s, np.float64)
     return np.asarray((starts_s - starts_s.min()) / max(np.ptp(starts_s), 1e-30) - 0.5)

@@ -27,11 +27,11 @@ def sum_frames(
 ) -> Scan:
     """Returns a fly-scan without gaps, in which each frame sums the intensities of ``count`` successive projections.
 
-    scan: F projections (F, rows, columns); each stands for an interval in s, in which the gantry turns evenly. count: of
-    projections in an exposure. readout_ratio, readout, readout_direction: of the new panel, as in ``fly_scan``. A line
-    whose exposure begins within a projection takes a share of it. Frames that would need projections beyond the last are
-    left out. Photons, detector and object are those of the dense scan. It is a true test of a motion model, if the object
-    moves by less than a pixel from projection to projection.
+    scan: F projections (F, rows, columns); each stands for an interval in s, in which the gantry turns evenly. count: the
+    projections in an exposure. readout_ratio, readout, readout_direction: those of the new panel, as in ``fly_scan``. A line
+    whose exposure begins within a projection takes a fraction of it. Frames that would need projections beyond the last are
+    left out. Photons, detector and object are those of the dense scan. The result is a true test of a motion model if the
+    object moves by less than a pixel from projection to projection.
 
     Raises InputError for a count that no frame can have, a rolling shutter or lag in ``scan``, and uneven intervals."""
     if not isinstance(scan, Scan):
@@ -60,7 +60,8 @@ def sum_frames(
 
 
 def _interval_s(scan: Scan) -> tuple[float, float]:
-    """Returns the interval between projections in s, and the time at which that of the first one begins."""
+    """Returns the interval between projections, and the time at which the first one's begins, both in s. Raises InputError
+    for a rolling shutter, lag, or intervals that are uneven."""
     remedy = "give a scan whose frames are short, or of a gantry at rest"
     if scan.is_fly and scan.shutter.readout_s > 0:
         raise InputError("scan", f"a readout of {scan.shutter.readout_s:g} s", "a global shutter", remedy)
@@ -74,7 +75,7 @@ def _interval_s(scan: Scan) -> tuple[float, float]:
 
 
 def _continued(scan: Scan, first_s: float, step_s: float) -> tuple[Trajectory, int]:
-    """Returns a trajectory between the projections, and how many projections at either end lie beyond known poses."""
+    """Returns a trajectory through the projections' poses, and how many projections at either end it does not cover."""
     middle_s = first_s + (np.arange(scan.frames) + 0.5) * step_s
     own_s = scan.frame_start_s + scan.shutter.middle_s
     if isinstance(scan.trajectory, CircularOrbit):

@@ -117,8 +117,8 @@ def shifted(scan: Scan, pixels: float) -> Scan:
 
 
 def turned(scan: Scan, angle_rad: np.ndarray, speed: float = 1.0) -> Scan:
-    """Returns the scan with frames turned about z by ``angle_rad`` (F,). In a frame the gantry is ``speed`` times as
-    fast."""
+    """Returns the scan with the poses of its frames turned about z by ``angle_rad`` (F,). Within a frame the gantry turns
+    ``speed`` times as fast."""
     first_rad = start_azimuths_rad(scan)
 
     def change(frame: int, pose: np.ndarray) -> np.ndarray:
@@ -140,7 +140,7 @@ def stretched(scan: Scan, v: float, u: float) -> Scan:
         pose[..., _ROW_STEP] *= v
         return pose
 
-    half_mm = columns * scan.geometry.pixel_size_mm[1] / 2 + abs(scan.geometry.detector_offset_mm[1])  # its wider side
+    half_mm = columns * scan.geometry.pixel_size_mm[1] / 2 + abs(scan.geometry.detector_offset_mm[1])  # to the farther edge
     share = max(scan.grid.size_mm[1:]) * scan.geometry.magnification / (2 * u * half_mm)
     grows = abs(math.log(share * u)) < abs(math.log(share))
     z, y, x = scan.grid.voxel_size_mm

@@ -1,1 +1,1 @@
-"""One format per file: from another program's scan to ours."""
+"""Importers of scans, a module for each format of another program."""

@@ -28,7 +28,7 @@ from phyradgs_cl.io.scan.detector import read_duration
 from phyradgs_cl.io.scan.header import find_entry
 
 _log = logging.getLogger(__name__)
-_NOWHERE = "/no entry"  # of bare arrays: all else comes from the options
+_NOWHERE = "/no entry"  # stands for the entry of bare arrays: all else comes from the options
 _EXCHANGE = "/exchange"
 _INSTRUMENT = "/measurement/instrument"
 _DETECTOR, _OPTICS = f"{_INSTRUMENT}/detector", f"{_INSTRUMENT}/detection_system/objective"
@@ -47,7 +47,7 @@ _MOVES = ("x_translation", "y_translation", "z_translation")
 
 
 def recognises(path: Path) -> bool:
-    """True for an HDF5 file of no other format. InputError for a volume of this package."""
+    """True for an HDF5 file without Data Exchange's group. Raises InputError for a volume of this package."""
     if not path.is_file() or not h5py.is_hdf5(path):
         return False
     with open_hdf5(path) as source:
@@ -119,7 +119,7 @@ def _turned(source: Hdf5Source, detector: str) -> assemble.Turned:
 
 
 def _axis_columns(source: Hdf5Source, detector: str, turn: assemble.Turned, options: ImportOptions) -> float:
-    """Reads how far the panel's middle is to the right of the axis, in columns: nxtomo counts the axis's from there."""
+    """Returns how many columns the panel's middle lies to the right of the axis. nxtomo states the axis from the middle."""
     names = (f"{detector}/{name}" for name in ("x_rotation_axis_pixel_position", "estimated_cor_from_motor"))
     for address in [address for address in names if source.find(address) is not None][:1]:
         if column := h5.read_number(source, address):
@@ -152,7 +152,7 @@ def _motion(
 
 
 def _refuse_moves(source: Hdf5Source, entry: str, used: np.ndarray) -> None:
-    """Refuses a sample that moves between projections, which this import cannot express."""
+    """Raises InputError for a sample that moves between projections, which this import cannot express."""
     for name in _MOVES:
         address = f"{entry}/{schema.SAMPLE}/{name}"
         if source.find(address) is None or source.dataset(address).size == 1:

@@ -26,7 +26,7 @@ _NAMES = (
     *("SOD", "SDD", *_PLACES, "Start angle", "Last angle", "ROI (LTRB)", "Binned pixel size", "Voxel size"),
     *("Exposure time (ms)", "Number of averages"),
 )
-_WHOLE_MIDDLE, _WHOLE_PITCH_MM = (971, 767), 0.0748  # of the panel without binning: column, row, size of a pixel
+_WHOLE_MIDDLE, _WHOLE_PITCH_MM = (971, 767), 0.0748  # panel without binning: middle (column, row); pixel
 
 
 def recognises(path: Path) -> bool:
@@ -66,7 +66,7 @@ def import_scan(path: Path, options: ImportOptions) -> Scan:
 
 
 def _stage(scan: Settings, panel: tuple[int, int], options: ImportOptions, names: dict[str, str]) -> RotaryStage:
-    """Returns the stage of the settings, in a frame whose origin is as high as the source."""
+    """Returns the stage of the settings, in coordinates whose origin is at the source's height."""
     to_axis_mm = options.taken("source_to_axis_mm", partial(scan.length, "SOD"))
     to_detector_mm = options.taken("source_to_detector_mm", partial(scan.length, "SDD"))
 
@@ -89,7 +89,7 @@ def _stage(scan: Settings, panel: tuple[int, int], options: ImportOptions, names
 
 
 def _window_mm(scan: Settings) -> tuple[float, float]:
-    """Returns how far (right, up) of the panel's own middle the middle of its window is."""
+    """Returns the distances (right, up) in mm from the panel's middle to the middle of its window."""
     if not scan.has("ROI (LTRB)"):
         return 0.0, 0.0
     left, top, right, bottom = scan.listed("ROI (LTRB)", 4).tolist()

@@ -70,7 +70,7 @@ def import_scan(path: Path, options: ImportOptions) -> Scan:
 def _turning(
     scan: Settings, shape: tuple[int, int, int], options: ImportOptions, timing: assemble.Timing
 ) -> tuple[CircularOrbit | PoseTable, Geometry]:
-    """Returns the trajectory of a cone or parallel beam about the z axis."""
+    """Returns trajectory and geometry of a cone or parallel beam about z. Raises InputError for a helix, tilt or curve."""
     for name in ("helicalPitch", "tiltAngle"):
         if scan.number(name, 0.0):
             raise scan.error(name, f"{scan.number(name):g}", "0", "write it with convert_to_modularbeam()")
@@ -100,7 +100,7 @@ def _turning(
 def _modular(
     scan: Settings, shape: tuple[int, int, int], options: ImportOptions, timing: assemble.Timing
 ) -> tuple[PoseTable, Geometry]:
-    """Returns the table of poses of a modular beam."""
+    """Returns the pose table of a modular beam, and the nearest circular geometry."""
     options.refuse_unused("leap, which states every view", _OF_TABLES)
     source, centre, right, up = (scan.listed(name, 3 * shape[0]).reshape(-1, 3) for name in _VECTORS)
     step_u, step_v = right * scan.length("pixelWidth"), up * scan.length("pixelHeight")
@@ -111,7 +111,7 @@ def _modular(
 
 
 def _grid(scan: Settings) -> Grid | None:
-    """Returns LEAP's volume where the file states one."""
+    """Returns the grid of LEAP's volume; None where the file states none."""
     if not all(map(scan.has, ("numX", "numY", "numZ", "voxelWidth", "voxelHeight"))):
         return None
     sizes_mm = triple(scan.length(name) for name in ("voxelHeight", "voxelWidth", "voxelWidth"))

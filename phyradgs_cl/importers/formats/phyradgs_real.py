@@ -30,13 +30,14 @@ OPTIONS = (
 )
 PROJECTIONS = "projections"
 _ANGLES = ("first_row_start_angle", "first_row_end_angle", "last_row_end_angle")
-_TIMES_A_FRAME = 33
-_GAP = 1e-3  # of a frame's span, between the windows of two frames
+_TIMES_A_FRAME = 33  # poses of a frame's window in the pose table
+_GAP = 1e-3  # least time between the windows of two frames, as a fraction of a frame's span
 
 
 @dataclass(frozen=True, eq=False)
 class Circle:
-    """The circle of a body: centre (x, y), radius, height z (F,) and angles (F, 3) of each view, in mm and rad."""
+    """The circle of the source or the panel: centre (x, y) and radius in mm. Each view has a height z (F,) in mm and angles
+    (F, 3) in rad: at its first line's start and end, and at its last line's end."""
 
     centre: np.ndarray
     radius: float
@@ -55,7 +56,7 @@ class Circle:
         return cls(centre[:2], circle.length("radius"), z, angles)
 
     def at(self, view: int, share: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Returns angles (T,) and points (T, 3) at times in exposures after the view's start."""
+        """Returns angles (T,) and points (T, 3) of a view at times ``share`` (T,), in exposures after its start."""
         start, closed, _ = self.angle_rad[view]
         angle = start + (closed - start) * share
         x, y = (self.centre[:, None] + self.radius * np.stack([np.cos(angle), np.sin(angle)])).tolist()
@@ -128,7 +129,7 @@ def _frames_and_views(
 
 
 def _with_flat(subject: str, options: ImportOptions, frames: np.ndarray) -> ImportOptions:
-    """Takes the brightest pixel of all frames for air where no flat value is given, as the published code does."""
+    """Returns options with the brightest pixel as flat value, unless one is given, as the published code does; warns."""
     if options.flat_value is not None or options.quantity not in (None, "counts"):
         return options
     brightest = float(frames.max())
@@ -140,8 +141,8 @@ def _with_flat(subject: str, options: ImportOptions, frames: np.ndarray) -> Impo
 
 
 def _timing(subject: str, detector: Circle, options: ImportOptions) -> tuple[Shutter, np.ndarray]:
-    """Returns shutter and opening times (F,). Frames whose windows would overlap are moved apart, since each has its own
-    poses."""
+    """Returns shutter and opening times (F,) in s. Frames whose windows would overlap are moved apart in time, since one
+    pose table holds the poses of all."""
     exposure_s = synthetic.exposure_of_blurred_s(options)
     first, closed, done = np.unwrap(detector.angle_rad, axis=1).T
     ratio = synthetic.readout_ratio(subject, closed - first, done - closed)
@@ -155,7 +156,7 @@ def _view_poses(
     view: Fields, source_mm: np.ndarray, detector: tuple[np.ndarray, np.ndarray], centre: np.ndarray,
     panel: tuple[int, int], pitch: tuple[float, float],
 ) -> np.ndarray:
-    """Returns poses (T, 12) of one view. The panel is turned about +z from the angle at which its matrix holds."""
+    """Returns poses (T, 12) of one view, with the panel rotated about +z from the angle at which its matrix holds."""
     rotation, stands_at = _matrix(view)
     angle_rad, centre_mm = detector
     turned_rad = angle_rad - np.arctan2(stands_at[1] - centre[1], stands_at[0] - centre[0])

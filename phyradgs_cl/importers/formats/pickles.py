@@ -32,23 +32,23 @@ from phyradgs_cl.io.files import read_regular, regular_file
 from phyradgs_cl.io.tables import Fields, described
 
 OPTIONS = (*TIMING, "detector_model", "part")
-_PER_MM = 1e-3  # of a density per metre
+_PER_MM = 1e-3  # factor from 1/m to 1/mm
 _PARTS = {"train": ("train",), "test": ("val",), "all": ("train", "val")}
 TIGRE_MODULE, _END_BYTES = "tigre.utilities.geometry", 1 << 18
 OPTIONS_OF_TIGRE = (*TIMING, "row_0", "column_0", "quantity", "flat_value", "detector_model")
 _NAMES = ("DSO", "DSD", "nDetector", "dDetector", "nVoxel", "dVoxel", "offOrigin", "offDetector", "rotDetector", "COR")
-_SAME = 1e-9  # relative: poses of one circle
+_SAME = 1e-9  # relative tolerance of poses on one circle
 _CLASSES = ("Geometry", "ConeGeometryDefault", "ParallelGeometryDefault")
-_COPIES = 3  # arrays and line integrals, for every byte of the file
+_COPIES = 3  # bytes of memory for every byte of the file: arrays and line integrals
 
 
 def recognises(path: Path) -> bool:
-    """True for the suffix of a pickle without a geometry of TIGRE."""
+    """True for a file with a pickle's suffix that does not name TIGRE's geometry."""
     return path.is_file() and path.suffix.lower() in (".pickle", ".pkl") and not names_tigre(path)
 
 
 def names_tigre(path: Path) -> bool:
-    """True for a file that names TIGRE's geometry in its first or last bytes, where a pickle has its small parts."""
+    """True for a file that names TIGRE's geometry in its first or last 256 KiB, where a pickle has its small objects."""
     with open(path, "rb") as file:
         head = file.read(_END_BYTES)
         file.seek(max(0, os.fstat(file.fileno()).st_size - _END_BYTES))
@@ -56,7 +56,7 @@ def names_tigre(path: Path) -> bool:
 
 
 def import_scan(path: Path, options: ImportOptions) -> Scan:
-    """Imports the train (or val, or both) projections of a pickle."""
+    """Imports the train projections, or val, or both, of a pickle of NAF or SAX-NeRF."""
     options.refuse_unused("naf", OPTIONS)
     data = Fields(f"{path}:", read_pickle(path))
     geometry, grid = r2_gaussian.read_geometry(data, 1.0), r2_gaussian.read_grid(data, 1.0)
@@ -97,8 +97,8 @@ def _array(table: Fields, key: str, ndim: int) -> np.ndarray:
 
 
 def read_pickle(path: Path, unpickler: "type[PlainUnpickler] | None" = None) -> object:
-    """Reads dicts, lists, tuples, text, numbers and NumPy arrays of plain numbers; InputError for anything that the
-    unpickler, ``PlainUnpickler`` by default, refuses."""
+    """Reads dicts, lists, tuples, text, numbers and NumPy arrays of plain numbers. Raises InputError for anything that the
+    unpickler, by default ``PlainUnpickler``, refuses, and for damage."""
     subject = str(path)
     size = regular_file(path, subject).st_size
     check_room(subject, _COPIES * size)
@@ -115,7 +115,7 @@ class PlainUnpickler(pickle.Unpickler):
     """Python's unpickler with an allow-list of names."""
 
     def find_class(self, module: str, name: str) -> Any:
-        """Returns the function for a name of the list; InputError for any other name."""
+        """Returns the function for a name of the list. Raises InputError for any other name."""
         functions: dict[str, Any] = {  # new for every name, since a pickle can set attributes of a function
             "numpy.ndarray": object,  # an argument of _reconstruct
             "numpy.dtype": lambda code, *_: _Type(code),
@@ -174,19 +174,19 @@ class TigreUnpickler(PlainUnpickler):
     """The unpickler of plain arrays, which also takes TIGRE's geometries."""
 
     def find_class(self, module: str, name: str) -> Any:
-        """Returns the bag of attributes for a class of TIGRE's geometries; for other names what plain pickles may have."""
+        """Returns ``_Geometry`` for a class of TIGRE's geometries, and for other names what ``PlainUnpickler`` allows."""
         if module.startswith(TIGRE_MODULE) and name in _CLASSES:
             return _Geometry
         return super().find_class(module, name)
 
 
 def recognises_tigre(path: Path) -> bool:
-    """True for a pickle that names TIGRE's geometry in its first or last bytes."""
+    """True for a file with a pickle's suffix that names TIGRE's geometry."""
     return path.is_file() and path.suffix.lower() in (".pickle", ".pkl") and names_tigre(path)
 
 
 def import_scan_tigre(path: Path, options: ImportOptions) -> Scan:
-    """Imports the projections of a pickle."""
+    """Imports the projections of a pickle of TIGRE."""
     options.refuse_unused("tigre", OPTIONS_OF_TIGRE)
     content = read_pickle(path, TigreUnpickler)
     if isinstance(content, dict):
@@ -216,7 +216,7 @@ def import_scan_tigre(path: Path, options: ImportOptions) -> Scan:
 
 
 def _named(content: dict[object, Any], *words: str) -> Any:
-    """Returns the one value of a dictionary whose name begins with one of the words, None where there is none."""
+    """Returns the first value of a dictionary whose key begins with one of the words, in any case; None without one."""
     return next((value for name, value in content.items() if str(name).lower().startswith(words)), None)
 
 

@@ -51,7 +51,7 @@ class R2Folder:
     def frame(self, entry: Fields) -> np.ndarray:
         """Reads one projection (v, u) as stored."""
         name = entry.word("file_path")
-        first_copy = name.replace("_sim1", "")  # of a repeated simulation, whose first copy was kept
+        first_copy = name.replace("_sim1", "")  # names repeated simulations, of which the first copy was kept
         path = self.folder.file(first_copy if self.folder.exists(first_copy) else name, entry.name("file_path"))
         image = read_npy(path, 2)
         checks.shape(str(path), image, self.geometry.detector_shape)
@@ -99,8 +99,8 @@ def import_scan(path: Path, options: ImportOptions) -> Scan:
 
 
 def read_geometry(scanner: Fields, unit_mm: float) -> Geometry:
-    """Reads the beam of a scanner's table, lengths in ``unit_mm``; "Detector" values run [v, u], ``offDetector`` [u, v].
-    TIGRE does not use the distances of mode "parallel"."""
+    """Reads the beam of a scanner's table, whose lengths are in units of ``unit_mm``. "Detector" values run [v, u],
+    ``offDetector`` [u, v]. The distances of mode "parallel" are not read, as in TIGRE."""
     rows, columns = scanner.counts("nDetector", 2)
     pitch_v, pitch_u = (float(p * unit_mm) for p in _pitches(scanner, "Detector", (rows, columns)))
     offset_u, offset_v = (float(o * unit_mm) for o in _offset(scanner, "offDetector", 2))
@@ -114,7 +114,7 @@ def read_geometry(scanner: Fields, unit_mm: float) -> Geometry:
 
 
 def read_grid(scanner: Fields, unit_mm: float) -> Grid:
-    """Reads the voxel grid of a scanner's table, whose triples run [x, y, z]."""
+    """Reads the voxel grid of a scanner's table, whose triples run [x, y, z] and whose lengths are in ``unit_mm``."""
     counts = scanner.counts("nVoxel", 3)
     size = _pitches(scanner, "Voxel", counts) * unit_mm
     origin = _offset(scanner, "offOrigin", 3) * unit_mm
@@ -129,7 +129,7 @@ def _pitches(scanner: Fields, what: str, counts: tuple[int, ...]) -> np.ndarray:
 
 
 def _offset(scanner: Fields, key: str, count: int) -> np.ndarray:
-    """Returns (count,) lengths, 0 where the table has none; a third number of offDetector is not used."""
+    """Returns the first ``count`` lengths of a key, (count,), 0 where the table has none: offDetector may have a third."""
     if not scanner.has(key):
         return np.zeros(count)
     values = scanner.numbers(key)
@@ -139,7 +139,8 @@ def _offset(scanner: Fields, key: str, count: int) -> np.ndarray:
 
 
 def turned_volume(subject: str, volume: np.ndarray, grid: Grid, per_mm: float) -> np.ndarray:
-    """Returns a stored volume [x, y, z] as (z, y, x) float32 in 1/mm."""
+    """Returns a stored volume [x, y, z], times ``per_mm``, as (z, y, x) float32 in 1/mm. Raises InputError for another
+    shape than the grid's, and for values that are not finite in float32."""
     checks.shape(subject, volume, grid.shape[::-1])
     checks.finite(subject, volume)
     turned = np.transpose(volume, (2, 1, 0)).astype(np.float64) * per_mm
@@ -165,8 +166,8 @@ def import_scan_with_times(path: Path, options: ImportOptions) -> Scan:
 
 
 def timing_of_marks(subject: Fields, marks_rad: np.ndarray, options: ImportOptions) -> Timing:
-    """Returns the timing from angles (F, 3): first line's start and end, last line's end. The first stored line is read
-    first: column 0, or the top row in a readout along rows."""
+    """Returns the timing from angles (F, 3) in rad at the first line's start and end, and the last line's end. The first
+    stored line is read first: column 0, or the top row in a readout along rows."""
     exposure_s = exposure_of_blurred_s(options)
     ratio = readout_ratio(subject.subject, marks_rad[:, 1] - marks_rad[:, 0], marks_rad[:, 2] - marks_rad[:, 1])
     axis = options.readout_axis or "columns"
@@ -186,7 +187,8 @@ def exposure_of_blurred_s(options: ImportOptions) -> float:
 
 
 def readout_ratio(subject: str, exposure_arc: np.ndarray, readout_arc: np.ndarray) -> float:
-    """Returns T_ro/T_exp from the arcs (F,) of all frames. InputError where they differ."""
+    """Returns T_ro/T_exp from the arcs (F,) in rad of all frames. Raises InputError where it differs between frames, and for
+    exposures without an arc."""
     if np.any(exposure_arc == 0) or np.any(np.sign(exposure_arc) != np.sign(exposure_arc[0])):
         found = f"arcs from {exposure_arc.min():.6g} to {exposure_arc.max():.6g} rad"
         raise InputError(f"{subject} exposure", found, "arcs that turn one way, none of them 0")
@@ -198,6 +200,7 @@ def readout_ratio(subject: str, exposure_arc: np.ndarray, readout_arc: np.ndarra
 
 
 def start_times_s(first_rad: np.ndarray, closed_rad: np.ndarray, exposure_s: float) -> np.ndarray:
-    """Returns opening times (F,) for a gantry that turns at the mean speed of its exposures."""
+    """Returns opening times (F,) in s for a gantry that turns at the mean speed of its exposures, from angles (F,) in
+    rad."""
     speed_rad_per_s = float(np.mean(closed_rad - first_rad)) / exposure_s
     return (first_rad - first_rad[0]) / speed_rad_per_s

@@ -80,7 +80,8 @@ def import_scan(path: Path, options: ImportOptions) -> Scan:
 def scan_of(
     rtk: "RtkGeometry", stack: Stack, options: ImportOptions, subjects: tuple[str, str], title: str, source: str
 ) -> Scan:
-    """Returns the scan of a geometry and its projections, which ``subjects`` name in messages."""
+    """Returns the scan of a geometry and its projections. ``subjects`` names both in messages. Raises InputError where their
+    numbers of frames differ."""
     described, stored = subjects
     if len(stack.frames) != rtk.frames:
         found = f"{len(stack.frames)} frames, {rtk.frames} projections in {Path(described).name}"
@@ -95,8 +96,8 @@ def scan_of(
 def stack_of(
     frames: np.ndarray, origin_mm: tuple[float, ...], spacing_mm: tuple[float, ...], direction: np.ndarray, subject: str
 ) -> Stack:
-    """Returns the projections (F, v, u) of an image of ITK with its origin and spacing (3,) and direction (3, 3). InputError
-    unless its third axis, the frames, is perpendicular to the others."""
+    """Returns the projections (F, v, u) of an image of ITK with its origin and spacing (3,) and direction (3, 3). Raises
+    InputError unless its third axis, the frames, is perpendicular to the others."""
     steps_mm = direction * spacing_mm  # columns: along u, v and the frames
     if np.abs([*steps_mm[:2, 2], *steps_mm[2, :2]]).max() > 1e-9 * np.abs(steps_mm).max():
         raise InputError(subject, str(steps_mm.tolist())[:80], "axes of a stack: columns, rows, frames")
@@ -106,7 +107,7 @@ def stack_of(
 def _trajectory(
     rtk: "RtkGeometry", stack: Stack, timing: assemble.Timing, subject: str
 ) -> tuple[CircularOrbit | PoseTable, Geometry, assemble.Turned]:
-    """Returns a circular orbit where one describes the file, else a table of poses, with a plain geometry and the flips."""
+    """Returns a circular orbit where one describes the file, else a pose table; the nearest circular geometry; the flips."""
     panel = (stack.frames.shape[1], stack.frames.shape[2])
 
     def stored(position: np.ndarray) -> np.ndarray:
@@ -208,7 +209,7 @@ def _root(path: Path) -> ElementTree.Element:
 
 
 def _numbers(path: Path, parent: ElementTree.Element) -> dict[str, float]:
-    """Returns the numbers directly inside an element by their names. InputError for a curved panel."""
+    """Returns the numbers directly inside an element, by their names. Raises InputError for a curved panel."""
     texts = Settings(f"{path}:", {e.tag: e.text or "" for e in parent})
     if radius := texts.position(_RADIUS):
         raise texts.error(_RADIUS, f"{radius:g}", "a flat panel")

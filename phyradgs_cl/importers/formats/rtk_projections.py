@@ -23,8 +23,8 @@ _COPIES = 12  # bytes of memory for every byte of the files: RTK's images, packe
 
 @dataclass(frozen=True)
 class _Maker:
-    """Ends of the names of the description and of projections, RTK's reader of the geometry, the options that are used.
-    ``below``: where the projections are, if not in the description's folder."""
+    """A maker's files: the ends of the names of description and projections, the name of RTK's reader of the geometry, and
+    the options that are used. ``below``: a pattern of the projections, if not in the description's folder."""
 
     description: str
     suffixes: tuple[str, ...]
@@ -44,7 +44,7 @@ _MAKERS = (
 def _read_geometry(rtk: Any, reader_name: str, description: str, names: list[str]) -> Any:
     """Returns RTK's geometry of a description and of projections, whose headers hold angles and places."""
     reader = getattr(rtk, reader_name).New()
-    if hasattr(reader, "SetFilename"):  # Elekta's description has all
+    if hasattr(reader, "SetFilename"):  # Elekta's description holds the geometry of all projections
         reader.SetFilename(description)
         reader.GenerateOutputInformation()
         return reader.GetOutputObject()
@@ -61,7 +61,7 @@ def recognises(path: Path) -> bool:
 
 
 def _located(path: Path) -> tuple[_Maker, Path, list[Path]] | None:
-    """Returns the maker, the description and the projections in natural order."""
+    """Returns the maker, the description and the projections in natural order; None where no maker fits."""
     folder = SafeFolder(path if path.is_dir() else path.parent)
     descriptions = folder.matching(".xml") if path.is_dir() else [path]
     for maker in _MAKERS:

@@ -2,8 +2,8 @@
 
 The log has no description by its maker. Distances and pixels are as in TIGRE's reader. A pixel of the camera is Image
 Pixel Size times the magnification; X/Y Ratio is its width over its height. The central ray falls on the line Optical
-Axis, counted from the bottom. So are row 0 on top, and with it column 0 on the right seen from the source for a sample that
-turns counterclockwise seen from above, which the log calls CC. The log states no place of the axis across the panel."""
+Axis, counted from the bottom. Row 0 is on top, so column 0 is on the right, seen from the source, for a sample that turns
+counterclockwise seen from above, which the log calls CC. The log does not state the column of the axis."""
 
 import logging
 import re
@@ -36,7 +36,7 @@ _FIELDS = {
     "source_to_axis_mm": "Object to Source (mm)", "source_to_detector_mm": "Camera to Source (mm)",
     "exposure_s": "Exposure (ms)", "angles": "Rotation Step (deg)", "pixel_size_mm": "Image Pixel Size (um)",
 }  # fmt: skip
-_OFF = re.compile(r"OFF( *\(.*\))?", re.I)  # the log keeps the number that would hold if it were on
+_OFF = re.compile(r"OFF( *\(.*\))?", re.I)  # in OFF (n), n is the number that would be used if it were on
 _SENSES = {"CC": 1, "CCW": 1, "CW": -1, "C": -1}
 _ASSUMED = {
     "Rotation Direction": "CC", "Optical Axis (line)": "the middle", "Scanning Start Angle": "0",
@@ -98,7 +98,7 @@ def _geometry(scan: settings.Settings, panel: tuple[int, int], options: ImportOp
 
 
 def _timing(scan: settings.Settings, options: ImportOptions) -> assemble.StoredTiming:
-    """Returns the exposure of all averaged frames; none for a scanner that stopped for each and options without a rate."""
+    """Returns the exposure of all averaged frames together; none where the scanner stopped and options state no rate."""
     motion = next((scan.word(name) for name in ("Type of Detector Motion", "Type of Motion") if scan.has(name)), "")
     averaging = scan.word("Frame Averaging", default="OFF")
     averaged = re.fullmatch(r"ON *\(([1-9]\d{0,5})\)", averaging, re.I)
@@ -111,7 +111,8 @@ def _timing(scan: settings.Settings, options: ImportOptions) -> assemble.StoredT
 
 
 def _white(scan: settings.Settings, frames: np.ndarray, options: ImportOptions) -> float:
-    """Returns the counts of air: the option's, Reference Intensity, or the largest number of Depth (bits)."""
+    """Returns the counts of air: the option's, else Reference Intensity, else the largest number of Depth (bits). Raises
+    InputError for frames that are not flat-field corrected."""
     remedy = f"say {options.named('flat_value')}"
     if not options.flat_value and scan.word("Flat Field Correction", default="ON").upper() == "OFF":
         raise scan.error("Flat Field Correction", "OFF", "frames that the scanner has corrected", remedy)

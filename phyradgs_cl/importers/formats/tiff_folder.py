@@ -30,7 +30,7 @@ OWN_TABLES = {
     "timing": ("exposure_s", "readout_s", "frame_time_s", "start_s", "detector_model"),
 }
 _PER_FRAME, _ANGLES = ("values_deg", "file"), ("step_deg", "last_deg", "values_deg", "file")
-_KEYS = {  # by option: where the file states the same
+_KEYS = {  # by option: the file's key of the same value
     **{name: f"[timing] {name}" for name in ("exposure_s", "readout_s", "frame_time_s")},
     **{name: f"[readout] {name}" for name in ("first", "fps", "readout_ms")},
     **{name: f"[frames] {name}" for name in ("quantity", "flat_value", "row_0", "column_0")},
@@ -83,9 +83,9 @@ def import_scan(path: Path, options: ImportOptions) -> Scan:
 
 
 def _tables(path: Path) -> dict[str, Fields]:
-    """Returns the file's own tables by name, and under "" those of a scanner file. InputError for unknown names."""
+    """Returns the file's own tables by name, and under "" those of a scanner file. Raises InputError for unknown names."""
     content = read_toml(path)
-    for place in (content, content.get("frames")):  # short for [angles] file
+    for place in (content, content.get("frames")):  # angles = "FILE" is short for [angles] file
         if isinstance(place, dict) and isinstance(place.get("angles"), str):
             text = place.pop("angles")
             content["angles"] = {**content.get("angles", {}), "file": text}
@@ -96,7 +96,7 @@ def _tables(path: Path) -> dict[str, Fields]:
 
 
 def in_words_of_file(options: ImportOptions) -> ImportOptions:
-    """Returns the options with messages that name keys of the TOML for values not given as options."""
+    """Returns options whose messages name the TOML's key of a value that was not given as an option."""
     given = options.given(FIELDS)
     return replace(
         options, named=lambda field: (None if field in given else _KEYS.get(field)) or options.named(field)
@@ -158,7 +158,7 @@ def _line_integrals(
 
 
 def _files(folder: SafeFolder, frames: Fields, name: str, default: str = "") -> list[Path]:
-    """Returns the files of a pattern, or of a list of them in its order; of ``default`` where there is none."""
+    """Returns the files of the pattern ``name``, or of a list of patterns, in its order; without one, of ``default``."""
     value = frames.values.get(name) or default
     paths: list[Path] = []
     for one in value if isinstance(value, list) else [value] if value else []:
@@ -174,7 +174,8 @@ def _files(folder: SafeFolder, frames: Fields, name: str, default: str = "") -> 
 
 
 def _scanner(path: Path, scanner: Fields, panel: tuple[int, int], options: ImportOptions) -> Scanner:
-    """Returns the described scanner, whose panel has as many pixels as the images. Options come before its lengths."""
+    """Returns the described scanner, with the options' lengths in place of its own. Raises InputError where its panel has
+    other numbers of pixels than the images."""
     content = {name: dict(value) if isinstance(value, dict) else value for name, value in scanner.values.items()}
     source, detector = content.setdefault("source", {}), content.setdefault("detector", {})
     given: dict[str, dict[str, float | None]] = {
@@ -220,7 +221,8 @@ def _stored_timing(tables: dict[str, Fields], scanner: Scanner) -> StoredTiming:
 
 
 def _angles_rad(folder: SafeFolder, angles: Fields, used: np.ndarray, options: ImportOptions) -> np.ndarray:
-    """Reads the angles of the frames that ``used`` marks: a list, a file, a dataset, or the first and the last or a step."""
+    """Returns the angles in rad of the frames that ``used``, bool (F,), marks: from a list, a file, a dataset, or the first
+    with the last or a step. Raises InputError for none or several of these."""
     frames = int(used.sum())
     given = [key for key in _ANGLES if angles.has(key)]
     if len(given) != 1:

@@ -38,27 +38,27 @@ _STREAMS = {
     "Alignment/X-Shifts": "<f4", "Alignment/Y-Shifts": "<f4", "ReconSettings/CenterShift": "<f4",
     f"{_ONE}/DataType": "<i4", f"{_SEVERAL}/DataType": "<i4",
 }  # fmt: skip
-_TYPES = {5: "<u2", 10: "<f4"}
-_PER_FOLDER = 100
-_RESULT_BYTES = 5  # per pixel: a line integral in float32, and its mask
-_STEADY = 1e-3  # relative: how far the lengths of single images may differ
+_TYPES = {5: "<u2", 10: "<f4"}  # NumPy types by the numbers in DataType
+_PER_FOLDER = 100  # images in a folder ImageData1, ImageData2, …
+_RESULT_BYTES = 5  # memory per pixel of the result: a line integral in float32, and its mask
+_STEADY = 1e-3  # largest relative difference of a length between images
 
 
 class Streams(Fields):
     """Streams of numbers by their names. They may have room for more images than were taken."""
 
     def first_of(self, name: str, lowest: float = -LARGEST, highest: float = LARGEST) -> float:
-        """Returns the first number of a stream, which is between two bounds."""
+        """Returns the first number of a stream. Raises InputError for one out of the bounds."""
         return Fields(self.subject, {name: float(self.leading(name, 1)[0])}).number(name, lowest=lowest, highest=highest)
 
     def leading(self, name: str, count: int) -> np.ndarray:
-        """Returns the first ``count`` numbers (count,) of a stream."""
+        """Returns the first ``count`` numbers (count,) of a stream. Raises InputError for fewer."""
         if len(values := self.numbers(name)) < count:
             raise self.error(name, f"{len(values)} numbers", f"{count}, one for each image")
         return values[:count]
 
     def steady(self, name: str) -> float:
-        """Returns a length above 0 that is the same for all images, without its sign."""
+        """Returns a length in mm without its sign, one for all images. Raises InputError where it differs or is 0."""
         lengths = np.abs(self.numbers(name))
         lengths = lengths[lengths > 0]
         if not len(lengths) or np.ptp(lengths) > _STEADY * lengths[0]:
@@ -104,7 +104,7 @@ def import_scan(path: Path, options: ImportOptions) -> Scan:
 
 
 def _taken(scan: Streams, count: int) -> int:
-    """Returns how many images were taken of the ``count`` that were planned, with a line where the scan stopped early."""
+    """Returns how many of the ``count`` planned images were taken, with a warning where the scan stopped early."""
     taken = int(scan.first_of(f"{_INFO}/ImagesTaken", 0)) if scan.has(f"{_INFO}/ImagesTaken") else count
     if 0 < taken < count:
         _log.warning("%s: the scan stopped early: %d of %d images were taken", scan.subject, taken, count)
@@ -112,7 +112,7 @@ def _taken(scan: Streams, count: int) -> int:
 
 
 def _type(scan: Streams, name: str, default: float | None = None) -> str:
-    """Returns the type of an image's pixels; without a default the stream must be there."""
+    """Returns the NumPy type of an image's pixels, from the stream ``name``, which must be there without a default."""
     number = scan.first_of(name) if default is None or scan.has(name) else default
     if number not in _TYPES:
         raise scan.error(name, f"{number:g}", "5 (16 bits) or 10 (float32)")
@@ -120,7 +120,8 @@ def _type(scan: Streams, name: str, default: float | None = None) -> str:
 
 
 def _stage(scan: Streams, at: np.ndarray, panel: tuple[int, int], options: ImportOptions) -> RotaryStage:
-    """Returns a stage whose panel is shifted in every image, of numbers (F,), as the alignment says."""
+    """Returns a stage whose panel is shifted in every image as the alignment says. at (F,): the images' numbers from 0
+    on."""
     is_cone = not scan.has(f"{_INFO}/XrayGeometry") or scan.first_of(f"{_INFO}/XrayGeometry") == 1
 
     def pixel_mm(magnification: float = 1.0) -> tuple[float, float]:
@@ -148,7 +149,7 @@ def _stage(scan: Streams, at: np.ndarray, panel: tuple[int, int], options: Impor
 
 @contextmanager
 def open_ole(path: Path) -> Iterator[Any]:
-    """Yields an open container of olefile. Any error of the library in the body becomes InputError."""
+    """Yields the open OLE2 container. Any error of the library in the body becomes InputError."""
     regular_file(path, str(path))
     olefile = checks.package("olefile", "the package that reads .txrm", "phyradgs-cl[formats]")
     with naming_damage(path, "a container that cannot be read", "an OLE2 file"), olefile.OleFileIO(str(path)) as ole:
@@ -156,7 +157,7 @@ def open_ole(path: Path) -> Iterator[Any]:
 
 
 def read_stream(ole: Any, path: Path, name: str, dtype: str) -> np.ndarray:
-    """Returns a stream as numbers (n,). InputError for a missing one, and for one that is larger than its file."""
+    """Returns a stream as numbers (n,). Raises InputError for a missing one, and for one larger than its file."""
     found, most = f"{ole.get_size(name)} bytes" if ole.exists(name) else "nothing", path.stat().st_size
     if found == "nothing" or ole.get_size(name) > most:
         raise InputError(f"{path}: {name}", found, f"numbers in at most {most} bytes")
@@ -165,7 +166,7 @@ def read_stream(ole: Any, path: Path, name: str, dtype: str) -> np.ndarray:
 
 
 def read_images(ole: Any, path: Path, names: list[str], dtype: str, panel: tuple[int, int]) -> np.ndarray:
-    """Returns images (F, v, u), one per stream, row 0 as stored."""
+    """Returns images (F, v, u), one per stream, row 0 as stored. Raises InputError for other numbers of pixels."""
     check_room(str(path), len(names) * panel[0] * panel[1] * (np.dtype(dtype).itemsize + _RESULT_BYTES))
     stack = np.empty((len(names), *panel), dtype)
     for image, name in zip(stack, names, strict=True):

@@ -1,1 +1,1 @@
-"""Files of other programs as bytes, numbers and images, bounded."""
+"""Reads files of other programs as bytes, numbers and images, within bounds of size and place."""

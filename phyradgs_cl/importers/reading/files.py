@@ -1,4 +1,4 @@
-"""Foreign files and folders: names that stay inside the folder, and texts and arrays bounded by the file's own size."""
+"""Safe reading of foreign files: names stay inside the folder, and texts and arrays are bounded by the file's size."""
 
 import re
 from collections.abc import Iterator, Sequence
@@ -17,7 +17,7 @@ _MOST_TEXT_BYTES = 64 << 20
 
 
 def check_room(subject: str, needed_bytes: int) -> None:
-    """Raises InputError for more than ``HOST_SHARE`` of this machine's memory."""
+    """Raises InputError where ``needed_bytes`` are more than the fraction ``HOST_SHARE`` of this machine's memory."""
     found, most = (f"{n / 2**30:.3g} GiB" for n in (needed_bytes, HOST_SHARE * host_bytes()))
     if needed_bytes > HOST_SHARE * host_bytes():
         remedy = "import fewer frames at a time, or bin them"
@@ -26,7 +26,7 @@ def check_room(subject: str, needed_bytes: int) -> None:
 
 @contextmanager
 def naming_damage(path: Path, found: str, expected: str, remedy: str = "") -> Iterator[None]:
-    """Turns any error of a library in the body into InputError: damage raises any exception."""
+    """Turns any exception in the body but MemoryError into InputError, since damaged files make libraries raise any."""
     try:
         yield
     except (InputError, MemoryError):
@@ -37,7 +37,7 @@ def naming_damage(path: Path, found: str, expected: str, remedy: str = "") -> It
 
 
 def read_bytes(path: Path) -> bytes:
-    """Reads a whole file of at most 64 MiB."""
+    """Reads a whole regular file. Raises InputError for one of more than 64 MiB."""
     return read_regular(path, str(path), _MOST_TEXT_BYTES, "a description of a scan")
 
 
@@ -50,8 +50,8 @@ def read_json(path: Path) -> dict[str, object]:
 
 
 def read_npy(path: Path, ndim: int) -> np.ndarray:
-    """Reads a numeric array with ``ndim`` axes from a .npy file, in C order. InputError for a pickle, or for a header that
-    announces more than the file holds."""
+    """Reads an array of real numbers with ``ndim`` axes from a .npy file, in C order. Raises InputError for a pickle, a
+    header that announces more than the file holds, other types, and other or empty axes."""
     subject = str(path)
     regular_file(path, subject)
     with naming_damage(path, "a damaged .npy file", "a NumPy array"):
@@ -66,8 +66,8 @@ def read_npy(path: Path, ndim: int) -> np.ndarray:
 
 @dataclass(frozen=True)
 class SafeFolder:
-    """A folder that the user named. Its methods reach only names inside it, no absolute path and no "..". A link in it is
-    followed, for the user has put it there."""
+    """A folder that the user named. Its methods accept only names inside it: no absolute path and no "..". A link in it is
+    followed, for the user has put it there. Raises InputError for what is no folder."""
 
     root: Path
 
@@ -77,7 +77,8 @@ class SafeFolder:
             raise InputError(str(self.root), found, "a folder", "check the path")
 
     def file(self, name: object, subject: str) -> Path:
-        """Returns the path of the regular file ``name`` below the folder; ``subject`` says where the name stands."""
+        """Returns the path of the file ``name`` below the folder; ``subject``: what states the name. Raises InputError for a
+        name that leads outside, and for what is no regular file."""
         path = self.root / checked_name(name, subject)
         regular_file(path, subject)
         return path
@@ -86,8 +87,8 @@ class SafeFolder:
         return (self.root / name).exists()
 
     def glob(self, pattern: str, *suffixes: str) -> list[Path]:
-        """Returns the files that match a pattern of a folder in any case, in natural order of their names. With ``suffixes``
-        of images, names that end otherwise, and hidden ones, are left out, unless the pattern is a name."""
+        """Returns the files below the folder that match a pattern, in any case, in natural order of their names. A pattern
+        with wildcards matches only names that are not hidden and end in one of the ``suffixes``, if any are given."""
         name = PurePosixPath(pattern).name.lower()
         paths = [path for path in _files((self.root / pattern).parent) if fnmatchcase(path.name.lower(), name)]
         is_plain = not suffixes or not set(name) & set("*?[")
@@ -98,7 +99,8 @@ class SafeFolder:
         return [path for path in _files(self.root) if _is_one_of(path, suffixes)]
 
     def only(self, what: str, *suffixes: str) -> Path:
-        """Returns the one regular file with one of the suffixes; ``what`` names it in messages."""
+        """Returns the only file with one of the suffixes. Raises InputError for none or several. ``what``: its name
+        there."""
         paths = self.matching(*suffixes)
         if len(paths) != 1:
             names = ", ".join(path.name for path in paths[:5]) or "none"
@@ -118,7 +120,7 @@ def _is_one_of(path: Path, suffixes: tuple[str, ...]) -> bool:
 
 
 def checked_name(name: object, subject: str) -> str:
-    """Returns a relative path without "..", with forward slashes; InputError for any other."""
+    """Returns a relative path without "..", with forward slashes. Raises InputError for any other, as of ``subject``."""
     text = name.replace("\\", "/") if isinstance(name, str) else ""
     leads_out = PureWindowsPath(text).drive or text.startswith("/") or ".." in PurePosixPath(text).parts
     if not text.strip() or "\0" in text or leads_out:
@@ -128,5 +130,5 @@ def checked_name(name: object, subject: str) -> str:
 
 def in_natural_order(paths: Sequence[Path]) -> list[Path]:
     """Returns the paths sorted by name, numbers by value: 2.tif before 10.tif."""
-    parts = {path: re.split(r"(\d+)", path.name) for path in paths}  # text and number by turns
+    parts = {path: re.split(r"(\d+)", path.name) for path in paths}  # text and numbers alternate
     return sorted(paths, key=lambda path: [int(part) if i % 2 else part for i, part in enumerate(parts[path])])

@@ -1,8 +1,7 @@
-"""Frames of any origin: turned to row 0 the lowest, converted to line integrals, bad pixels masked. Flats and darks: those
-that do not fit the others, their medians, and flats over time.
+"""Converts frames of any origin to line integrals, with row 0 the lowest and bad pixels masked. Leaves out flats and darks
+that do not fit the others, and takes medians of the rest.
 
-Flats that were taken at several times of a scan, such as before and after it, are interpolated linearly in time. Frame
-numbers are the time."""
+Flats of several times, such as before and after the scan, are interpolated linearly in time, which frame numbers count."""
 
 import logging
 from collections.abc import Mapping, Sequence
@@ -20,22 +19,23 @@ from phyradgs_cl.importers.options import ImportOptions
 from phyradgs_cl.io.scan.reader import LARGEST_LINE_INTEGRAL
 
 _log = logging.getLogger(__name__)
-_PIXELS = 1 << 16  # looked at of a frame
-_TOGETHER, _APART = 0.1, 0.3  # relative: how far flats of one time, and of several, may differ in brightness
-_DARK = 0.02  # of the light: how far darks may differ
-_PATTERN, _TIMES = 0.02, 5.0  # of the light; of the usual deviation: how far the pattern of a frame may differ
-_BLOCK_BYTES = 1 << 26
+_PIXELS = 1 << 16  # pixels of a frame, at most, from which levels and patterns are computed
+_TOGETHER, _APART = 0.1, 0.3  # largest relative difference in brightness of flats of one time, and of several times
+_DARK = 0.02  # largest difference of a dark's level, as a fraction of the flats' level
+_PATTERN, _TIMES = 0.02, 5.0  # limit of a pattern's deviation: 0.02 of the flats' level, plus 5 median deviations
+_BLOCK_BYTES = 1 << 26  # memory of a block of rows whose median is taken
 Mask = np.ndarray | None
 TAKEN = "taken"
-"""The key of the provenance for which frames and flats were taken, in words."""
-_AIR = 0.2  # of a line integral beside the object, with noise
-_SAME = 1e-3  # relative difference of a flat that is at the ceiling too
+"""The provenance's key of a text that says which frames and flats were used."""
+_AIR = 0.2  # largest median line integral at the frames' borders that counts as air
+_SAME = 1e-3  # a flat at most this fraction above the saturation level counts as clipped too
 
 
 @dataclass(frozen=True, eq=False)
 class Light:
-    """Flats (G, v, u) of G times, the dark (1, v, u) or None, and each projection's place (P,) among the times, 0.5 halfway
-    from the first to the second. ``used``: how many flats and darks went in. ``said``: the same, in words."""
+    """Flats (G, v, u) at G times, the dark (1, v, u) or None, and each projection's place (P,) among the times: 0.5 is
+    halfway from the first to the second. ``used``: numbers of flats and darks that were used. ``said``: the same, in
+    words."""
 
     flats: np.ndarray
     dark: np.ndarray | None
@@ -45,8 +45,8 @@ class Light:
 
 
 def places(is_flat: np.ndarray, is_projection: np.ndarray) -> np.ndarray:
-    """Returns the places of flats among the projections, from the kinds (F,) bool of frames in the order in which they were
-    taken: −0.5 is before the first projection, 9.5 between numbers 9 and 10."""
+    """Returns the places (n,) of n flats among the projections: −0.5 is before the first, 9.5 between numbers 9 and 10.
+    is_flat, is_projection: bool (F,), for frames in the order in which they were taken."""
     return np.cumsum(is_projection)[is_flat] - 0.5
 
 
@@ -54,9 +54,9 @@ def light_of(
     subject: str, flats: np.ndarray, darks: np.ndarray | None, count: int, options: ImportOptions,
     at: np.ndarray | None = None, names: Mapping[str, Sequence[str]] | None = None,
 ) -> Light:
-    """Returns what divides ``count`` projections, from flats and darks (n, v, u). Of three or more, those that do not fit
-    the others are named and left out. ``at`` (n,): places of the flats as of ``places``, None where nothing states them;
-    ``names``: of single "flats" and "darks" in messages. InputError for the option flats "time" with flats of one time."""
+    """Returns the flats and dark for ``count`` projections, from flats and darks (n, v, u). Of three or more, those that do
+    not fit the others are left out, with a warning. ``at`` (n,): the flats' places as in ``places``; None: not stated.
+    ``names``: of each of the "flats" and "darks". Raises InputError for the option flats "time" with flats of one time."""
     at, assumed = _times(subject, len(flats), count, options, at)
     light = max(float(np.median(_levels(flats)[1])), 1e-30)
     times = [np.flatnonzero(at == time) for time in np.unique(at)]
@@ -77,7 +77,7 @@ def light_of(
 
 
 def median(stack: np.ndarray) -> np.ndarray:
-    """Returns the median (v, u) float64 of frames (n, v, u), a block of rows at a time. A frame with NaN affects its pixel
+    """Returns the median (v, u) float64 of frames (n, v, u), computed by blocks of rows. A NaN affects its own pixel
     only."""
     rows = max(1, _BLOCK_BYTES // max(1, 8 * stack[:, 0].size))
     starts = range(0, stack.shape[1], rows)
@@ -87,7 +87,7 @@ def median(stack: np.ndarray) -> np.ndarray:
 def _times(
     subject: str, flats: int, count: int, options: ImportOptions, at: np.ndarray | None
 ) -> tuple[np.ndarray, str]:
-    """Returns the places (n,) of flats as the option says, and what was assumed, in words."""
+    """Returns the places (n,) of flats, all equal where their median is wanted, and the assumption made, in words."""
     if options.flats != "time":
         return np.zeros(flats) if at is None or options.flats else at, ""
     if flats < 2 or (at is not None and np.ptp(at) == 0):
@@ -98,7 +98,7 @@ def _times(
 
 
 def _levels(stack: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Returns some pixels (n, k) of each frame, float64, those that are not finite as 0; and their medians (n,)."""
+    """Returns k pixels (n, k) float64 of each of n frames, with 0 for those that are not finite, and their medians (n,)."""
     pixels = stack.reshape(len(stack), -1)
     some = np.nan_to_num(pixels[:, :: -(-pixels.shape[1] // _PIXELS)].astype(np.float64), posinf=0.0, neginf=0.0)
     return some, np.median(some, axis=1)
@@ -108,8 +108,8 @@ def _fitting(
     kind: str, stack: np.ndarray, group: np.ndarray, tolerance: float, subject: str, light: float,
     names: Mapping[str, Sequence[str]],
 ) -> np.ndarray:
-    """Returns which frames (k,) of a group of a stack fit the others, in their level and in their pattern; all of them where
-    no majority says which ones are right. ``light``: counts of the flats. Warns of each that does not fit."""
+    """Returns which frames, bool (k,), of a group (k,) of indices into ``stack`` fit the others in level and pattern. All do
+    where no majority shows which are right. ``light``: the flats' level in counts. Warns of each that does not fit."""
     some, level = _levels(stack[group])
     usual = float(np.median(level))
     is_odd = np.abs(level - usual) > tolerance * light
@@ -133,8 +133,8 @@ def _fitting(
 
 @dataclass(frozen=True, eq=False)
 class LineIntegrals:
-    """Line integrals (P, v, u) float32 with the mask of unusable pixels, the panel's saturation as raw counts show it,
-    and the numbers of applied flats and darks as provenance."""
+    """Line integrals (P, v, u) float32 with the mask of unusable pixels, (v, u) or (P, v, u), or None. ``saturation``: of
+    the raw counts, or None. ``applied``: the provenance's entries about flats and darks."""
 
     values: np.ndarray
     mask: Mask
@@ -149,8 +149,9 @@ def line_integrals(
 ) -> LineIntegrals:
     """Converts ``frames`` (P, v, u) of any real type to line integrals. Masks clipped counts and values that no object has,
     with a warning. ``subject`` names the file; ``flats``, ``darks``: (n, v, u) or None. The quantity is that of the options,
-    else ``convention``, of the format or file; without either, frames with flats are counts and others are refused.
-    ``is_corrected``: the scanner has subtracted the darks. ``flats_at``, ``names``: see ``flats.light_of``."""
+    else ``convention``, of the format or file. Without either, frames with flats, or with a flat value, are counts.
+    ``is_corrected``: the scanner has subtracted the darks. ``flats_at``, ``names``: ``at``, ``names`` of ``light_of``.
+    Raises InputError for an unknown quantity, counts without flats, and flats or darks of another size."""
     has_flats = flats is not None and len(flats) > 0
     quantity = options.quantity or convention or ("counts" if has_flats or options.flat_value is not None else None)
     if quantity is None:
@@ -194,7 +195,8 @@ def line_integrals(
 
 
 def _refuse_logarithms(subject: str, frames: np.ndarray, flat: np.ndarray, options: ImportOptions) -> None:
-    """Raises InputError for line integrals with flats of ones: where counts are as bright as the flats, these are 0."""
+    """Raises InputError for flats of 1 with frames that are near 0 at their borders: these hold line integrals, not
+    counts."""
     border = np.concatenate([frames[..., 0].ravel(), frames[..., -1].ravel()])
     if (flat == 1).all() and abs(float(np.median(border))) < _AIR:
         remedy = f"say {options.named('quantity')} attenuation, and leave the flats out"
@@ -205,9 +207,10 @@ def _refuse_logarithms(subject: str, frames: np.ndarray, flat: np.ndarray, optio
 def _mask_clipped(
     subject: str, frames: np.ndarray, flat: np.ndarray, saturation: Saturation, unusable: np.ndarray, air: str
 ) -> None:
-    """Masks each frame's clipped pixels where the flat is brighter, since even air would read as an object there. Where the
-    flat is clipped too, the integral is 0, which is right for air. Masking those pixels as well would leave no air, and the
-    reconstruction would be 2 to 3 times further off than with thin parts lost. ``air``: why such pixels are air."""
+    """Sets ``unusable`` (P, v, u) at each frame's clipped pixels where the flat is brighter: even air would read as an
+    object there. Where the flat is clipped too, the integral is 0, which is right for air. Masking those pixels as well
+    would leave no air, and the reconstruction's error would be 2 to 3 times that of losing thin parts. ``air``: the reason
+    in words."""
     brighter = flat > saturation.level * (1 + _SAME)
     for frame, bad in zip(frames, unusable, strict=True):
         bad |= (frame == saturation.level) & brighter
@@ -217,15 +220,16 @@ def _mask_clipped(
 
 
 def compact(mask: np.ndarray) -> Mask:
-    """Returns a mask (P, v, u) as (v, u) where all frames agree, and None where no pixel is masked."""
+    """Returns a mask (P, v, u), as (v, u) where all frames agree; None without a masked pixel. Raises InputError if all
+    are."""
     if mask.all():
         raise InputError("pixels", "no usable value", "frames brighter than the dark", "check flats and darks")
     return None if not mask.any() else mask[0] if all(map(partial(np.array_equal, mask[0]), mask)) else mask
 
 
 def oriented(array: np.ndarray, options: ImportOptions, row_0: str, column_0: str = "left") -> np.ndarray:
-    """Returns frames or a mask (..., v, u) with row 0 the lowest and column 0 on the left, seen from the source. ``row_0``,
-    ``column_0``: where the format has them, unless the options state it."""
+    """Returns frames or a mask (..., v, u) with row 0 the lowest and column 0 on the left, seen from the source. ``row_0``
+    and ``column_0``: their sides in the format, such as "top"; the options' values come first."""
     if (options.row_0 or row_0) == "top":
         array = array[..., ::-1, :]
     if (options.column_0 or column_0) == "right":
@@ -234,5 +238,5 @@ def oriented(array: np.ndarray, options: ImportOptions, row_0: str, column_0: st
 
 
 def gantry_sign(options: ImportOptions, convention: str) -> float:
-    """Returns +1 where stored angles are the gantry's, −1 where they are the sample's."""
+    """Returns the factor from stored angles to the gantry's: +1 where the gantry turns, −1 where the sample does."""
     return 1.0 if (options.rotates or convention) == "gantry" else -1.0

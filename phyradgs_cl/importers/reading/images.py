@@ -1,5 +1,5 @@
-"""NIfTI, NRRD and MetaImage files, read by SimpleITK, with what it does not see: voxels that are missing or in another
-folder, a note of Hounsfield units, and NRRD's units."""
+"""Reads NIfTI, NRRD and MetaImage files by SimpleITK. Checks and reads also what SimpleITK does not: missing voxels, data in
+another folder, a note of Hounsfield units, and NRRD's units."""
 
 import gzip
 import math
@@ -27,12 +27,12 @@ _HEAD_BYTES, _VOXEL_BYTES = 1 << 16, 8
 _IN_HU, _NOTE_BYTES = b"values in HU", 79
 _READERS = {".nii": "Nifti", ".gz": "Nifti", ".mha": "Meta", ".mhd": "Meta", ".nrrd": "Nrrd"}
 _DATA_FILE = re.compile(rb"^(?:ElementDataFile *=|data ?file:) *(\S.*?)\s*$", re.M)
-_OBLIQUE = 1e-3  # largest sine of an angle between an axis and the world's
+_OBLIQUE = 1e-3  # largest accepted sine of the angle between an axis of the image and the world's
 
 
 @contextmanager
 def _opened(path: Path) -> Iterator[tuple[Any, Any]]:
-    """Yields SimpleITK and its reader of a file with a good header. Errors of SimpleITK in the body become InputError."""
+    """Yields SimpleITK and its reader of a file, with the header read. Errors of SimpleITK become InputError."""
     subject = str(path)
     regular_file(path, subject)
     sitk = checks.package("SimpleITK", "the package that reads NIfTI, NRRD and MetaImage", "phyradgs-cl[formats]")
@@ -44,21 +44,21 @@ def _opened(path: Path) -> Iterator[tuple[Any, Any]]:
         reader.ReadImageInformation()
         yield sitk, reader
     except (RuntimeError, EOFError, gzip.BadGzipFile, zlib.error) as error:
-        text = str(error).rpartition("ERROR: ")[2].partition("Reason:")[0]  # a reason is that of an earlier error
+        text = str(error).rpartition("ERROR: ")[2].partition("Reason:")[0]  # "Reason:" and on: an earlier error
         reason = re.sub(r"^\w+\(0x\w+\): ", "", text.strip()).replace(subject, "")[:100]
         raise InputError(subject, f"a damaged file ({reason})", "an image of three axes") from error
 
 
 def image_times_s(path: Path) -> list[float]:
-    """Returns the times of the volumes along the fourth axis of a file; [] for three axes. InputError: a damaged file."""
+    """Returns the times in s along a file's fourth axis; [] for a single volume. Raises InputError for a damaged file."""
     with _opened(path) as (_, reader):
         count = reader.GetSize()[3] if reader.GetDimension() > 3 else 1
         return [reader.GetOrigin()[3] + k * reader.GetSpacing()[3] for k in range(count if count > 1 else 0)]
 
 
 def read_image(path: Path, state: int | None = None) -> Any:
-    """Reads a SimpleITK image of three axes with one real number per voxel; ``state``: the place along a fourth axis.
-    InputError: a damaged file, other axes or voxels, voxels that are missing or in another folder."""
+    """Reads a SimpleITK image of three axes with one real number per voxel; ``state``: the index along a fourth axis.
+    Raises InputError for a damaged file, other axes or voxels, and voxels that are missing or in another folder."""
     subject = str(path)
     with _opened(path) as (sitk, reader):
         counts, axes = reader.GetSize(), reader.GetDimension()
@@ -80,8 +80,9 @@ def read_image(path: Path, state: int | None = None) -> Any:
 
 
 def _held_bytes(path: Path, reader: Any, voxel_bytes: int) -> int | None:
-    """Returns how many bytes of voxels a file holds, unpacked: SimpleITK fills those that are missing in NIfTI, and damaged
-    in packed MetaImages, without an error. None where it refuses them. InputError: data elsewhere."""
+    """Returns how many bytes of voxels a file holds, unpacked. SimpleITK fills missing voxels of NIfTI, and damaged ones of
+    packed MetaImages, without an error. None for NRRD, which it checks itself. Raises InputError for data outside the
+    folder or in several files."""
     with _unpacked(path) as file:
         head = file.read(_HEAD_BYTES)
         if reader.HasMetaDataKey("bitpix"):  # NIfTI, in which scaled integers come out as floats
@@ -106,15 +107,16 @@ def _unpacked(path: Path) -> Any:
 
 
 def _noted(path: Path) -> dict[str, object]:
-    """Returns what the file of an image in Hounsfield units notes of its values, for a volume's provenance."""
+    """Returns the note "values in HU …" of an image's file as a volume's provenance; {} for a file without it."""
     with _unpacked(path) as file:
         head = file.read(_HEAD_BYTES)
     return {VALUES: head[place : place + _NOTE_BYTES].decode("latin-1")} if (place := head.find(_IN_HU)) >= 0 else {}
 
 
 def read_image_volume(path: Path, state: int | None = None) -> Volume:
-    """Reads a volume with its axes turned to rise with the world's, which are LPS. A NRRD file without voxel sizes has no
-    grid; its integers are divided by the maximum of their type. ``state``, InputError: see ``read_image``; oblique axes."""
+    """Reads a volume (z, y, x) float32 with axes that rise with the world's, LPS. A NRRD file without voxel sizes has no
+    grid, and its integers are divided by the maximum of their type. ``state``: see ``read_image``. Raises InputError as
+    there, and for oblique axes, unknown units and impossible sizes."""
     subject, image = str(path), read_image(path, state)
     sitk = checks.package("SimpleITK", "the package that reads this file", "phyradgs-cl[formats]")
     header = _nrrd_header(path) if path.suffix.lower() == ".nrrd" else {}
@@ -142,7 +144,7 @@ def read_image_volume(path: Path, state: int | None = None) -> Volume:
 
 
 def _nrrd_header(path: Path) -> dict[str, str]:
-    """Returns the fields of a NRRD file, of which SimpleITK shows only some."""
+    """Returns the fields of a NRRD file, of which SimpleITK shows only some. Raises InputError for an unknown space."""
     with open(path, "rb") as file:
         lines = file.read(_HEAD_BYTES).split(b"\n\n")[0].decode("latin-1").splitlines()
     header = {key.strip().lower(): value.strip() for key, sign, value in (line.partition(":") for line in lines) if sign}

@@ -1,4 +1,4 @@
-"""OME-Zarr of versions 0.4 and 0.5: the full size of one volume, with its voxel sizes and place."""
+"""Reads OME-Zarr of versions 0.4 and 0.5: one volume at full resolution, with its voxel sizes and position."""
 
 import logging
 import math
@@ -16,9 +16,10 @@ log = logging.getLogger(__name__)
 
 
 def read_zarr(path: Path) -> tuple[np.ndarray, np.ndarray | None, np.ndarray | None, str]:
-    """Returns values (z, y, x) in their own type, the voxel sizes and the first voxel's centre (z, y, x) in mm, and what the
-    folder notes of its values. The sizes are None, with a warning, where an axis has no unit of length. Other axes than z, y
-    and x have one entry. InputError: no OME-Zarr, damaged metadata or chunks, several times or channels."""
+    """Returns values (z, y, x) in their own type, sizes (3,) of a voxel and the first one's centre (3,), both (z, y, x) in
+    mm, and the folder's note on its values. Sizes and centre are both None, with a warning, where an axis has no unit of
+    length, a number is not finite, or a size is not above 0. Raises InputError for what is no OME-Zarr of real numbers, for
+    damage, for several times or channels, and for more than the machine's memory."""
     subject = str(path)
     zarr = checks.package("zarr", "the package that reads OME-Zarr", "phyradgs-cl[zarr]")
     try:
@@ -31,7 +32,7 @@ def read_zarr(path: Path) -> tuple[np.ndarray, np.ndarray | None, np.ndarray | N
         missing = math.prod(array.cdata_shape) - array.nchunks_initialized
         long = [name for name, count in zip(axes, array.shape, strict=True) if name not in "zyx" and count > 1]
         order = [list(axes).index(name) for name in "zyx"]
-    except Exception as error:  # zarr and its stores pass on errors of every kind
+    except Exception as error:  # zarr and its stores raise exceptions of every kind
         found = f"no OME-Zarr ({type(error).__name__}: {str(error)[:100]})"
         raise InputError(subject, found, "a folder with multiscales, axes z, y and x") from error
     if array.dtype.kind not in "iuf" or long or 0 in array.shape:
@@ -56,7 +57,7 @@ def read_zarr(path: Path) -> tuple[np.ndarray, np.ndarray | None, np.ndarray | N
 
 
 def _sizes_and_first(facts: Any, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the sizes of voxels and the place of the first (count,), in the axes' units, of the largest level."""
+    """Returns a voxel's sizes and the first one's centre, each (count,), of the full resolution, in the axes' units."""
     sizes, first = np.ones(count), np.zeros(count)
     for change in (*facts["datasets"][0]["coordinateTransformations"], *facts.get("coordinateTransformations", ())):
         by = np.asarray(change[change["type"]], np.float64)

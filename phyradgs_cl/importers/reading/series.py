@@ -1,7 +1,7 @@
-"""Which files of a folder are a scan's frames, and their order: the numbers in their names, read as a person reads them.
+"""Finds which files of a folder are a scan's frames, and their order, from the numbers in their names.
 
-A number may be an index, an angle with sign and decimals, or a time. Files whose names have other words than the most are
-left out by name. A number that is missing, or there twice, is refused: all later angles would be wrong."""
+A number may be an index, an angle with sign and decimals, or a time. Files whose names have other words than most are left
+out, with a warning. A number that is missing, or there twice, is refused: all later angles would be wrong."""
 
 import logging
 import re
@@ -20,17 +20,17 @@ _NUMBER = re.compile(r"([-+]?)(\d+)(?:[.,](\d+))?")
 _DATE = r"(?<!\d)((?:19|20)\d\d)[-_.]?(0[1-9]|1[0-2])[-_.]?(0[1-9]|[12]\d|3[01])"
 _TIME = re.compile(_DATE + r"[-_ T.]*([01]\d|2[0-3])[-_.:h]?([0-5]\d)[-_.:m]?([0-5]\d)(?!\d)")
 _DEGREES, _ANGLE = re.compile(r"[ _]?(deg|°|grad)", re.I), re.compile(r"(deg|angle|ang|theta|phi|rot)[ _=]*$", re.I)
-_STEADY, _GAP = 0.25, 1.5  # of the usual step: how far a regular one differs; a gap between angles or times
-_USUAL, _STEADY_ANGLES = 0.5, 0.75  # share of regular steps in a series, and in angles or times whose gaps are holes
-_SMALL = 0.25  # of the largest group of names: smaller ones are no frames
+_STEADY, _GAP = 0.25, 1.5  # in usual steps: largest deviation of a regular step; least gap between angles or times
+_USUAL, _STEADY_ANGLES = 0.5, 0.75  # least fractions of regular steps: in a regular series; in angles whose gaps are holes
+_SMALL = 0.25  # a group of names below this fraction of the largest group's size is no series of frames
 _BEFORE, _AFTER = (re.compile(rf"(?<![a-z])({words})(?![a-z])", re.I) for words in ("before|pre|start", "after|post|end"))
-_STAMP = 10**7  # numbers from here on count milliseconds, and no frames
-_MOST_NAMES = 8  # in a message
+_STAMP = 10**7  # numbers from here on are times in milliseconds, not frames' indices
+_MOST_NAMES = 8  # names of files listed in a message
 
 
 @dataclass(frozen=True, eq=False)
 class Series:
-    """Files in the order of the scan, the number of each, (F,) or None without numbers, and what was taken, in words."""
+    """Files in the order of the scan, their numbers (F,), or None without, and which files were taken, in words."""
 
     paths: list[Path]
     numbers: np.ndarray | None
@@ -39,7 +39,8 @@ class Series:
 
 @dataclass(frozen=True, eq=False)
 class _Column:
-    """The numbers (F,) at one place of the names. ``is_angle``: in degrees, by the words beside them."""
+    """The numbers (F,) at one place of the files' names. ``place``: 1 for the first. ``is_angle``: in degrees, by the
+    words next to them."""
 
     place: int
     values: np.ndarray
@@ -55,8 +56,8 @@ class _Column:
 
     @cached_property
     def steps(self) -> tuple[float, np.ndarray]:
-        """The usual step between the sorted numbers, and how many of it each step (F − 1,) is. The usual step is the most
-        frequent one, or the median."""
+        """The usual step between the sorted numbers, and each step (F − 1,) in units of it. The usual step is the most
+        frequent one above 0, or the median where none makes up half of the steps."""
         steps = np.diff(np.sort(self.values))
         if not len(steps):
             return 1.0, steps
@@ -66,21 +67,22 @@ class _Column:
 
     @property
     def regular(self) -> float:
-        """The share of steps that are the usual one."""
+        """The fraction of steps that differ from the usual one by at most ``_STEADY`` of it."""
         return float(np.mean(np.abs(self.steps[1] - 1) <= _STEADY)) if len(self.values) > 1 else 1.0
 
     @property
     def rank(self) -> tuple[bool, bool, bool]:
-        """Ranks columns: regular ones before others, indices before angles, whole numbers before times."""
+        """The sort key of columns: regular ones before others, indices before angles, whole numbers before decimals."""
         return self.regular < _USUAL, self.is_angle, self.values.dtype.kind == "f"
 
 
 def series_of(
     paths: Sequence[Path], subject: str, remedy: str, *, order: int | None = None, holes: bool = False, skip: int = 0
 ) -> Series:
-    """Returns the frames among files, in their order. ``subject`` says where they are named; ``remedy``: what to do about a
-    hole. ``order``: the place of the number that counts, 1 the first; None finds it. ``holes``: numbers may be left out.
-    ``skip``: letters of a prefix that all files have. InputError: a hole, one number twice, several series."""
+    """Returns the frames among files, in their order. ``subject``: what names them, for messages; ``remedy``: what to do
+    about a hole. ``order``: the place in the names of the number that gives the order, 1 the first; None finds it.
+    ``holes``: numbers may be missing. ``skip``: length of a prefix that all files have. Raises InputError for a hole, one
+    number twice, and several series."""
     paths = list(paths) if skip else _of_one_series(list(paths), subject)
     columns = _columns([path.stem[skip:] for path in paths])
     if order is not None and order not in {column.place for column in columns}:
@@ -94,7 +96,7 @@ def series_of(
     distinct = sorted((column for column in varying if column.is_distinct), key=lambda column: column.rank)
     if order is not None:
         distinct = [column for column in columns if column.place == order][:1]
-    # turn and frame, say: numbers that count within each other, so that every pair is there once
+    # several numbers count together, such as turn and frame: every combination is there once
     pairs = set(zip(*(column.values.tolist() for column in varying), strict=True))
     are_pairs = len(pairs) == len(paths) == np.prod([len(np.unique(column.values)) for column in varying])
     key = distinct[0] if distinct else max(varying, key=lambda column: len(np.unique(column.values)))
@@ -134,7 +136,8 @@ def _words(name: str) -> tuple[str, ...]:
 
 
 def _of_one_series(paths: list[Path], subject: str) -> list[Path]:
-    """Returns the files whose names have the words of the most names, or words that alternate with theirs."""
+    """Returns the files whose names have the words of most names, or words that alternate with theirs. Raises InputError
+    for several series."""
     groups: dict[tuple[str, ...], list[Path]] = {}
     for path in paths:
         groups.setdefault(_words(path.stem), []).append(path)
@@ -154,7 +157,7 @@ def _of_one_series(paths: list[Path], subject: str) -> list[Path]:
 
 
 def _do_alternate(groups: list[list[Path]]) -> bool:
-    """True for names of as many numbers, one of which counts through all groups, not group by group."""
+    """True where the groups' names have equally many numbers, and one of these counts through all groups in turn."""
     if len({len(_words(group[0].stem)) for group in groups}) > 1:
         return False
     owner = [i for i, group in enumerate(groups) for _ in group]
@@ -166,7 +169,8 @@ def _do_alternate(groups: list[list[Path]]) -> bool:
 
 
 def _columns(names: list[str]) -> list[_Column]:
-    """Returns the numbers of names that have as many words, place by place."""
+    """Returns the numbers in names, by place; a date with a time in all names is one number, in s, if no other is
+    distinct."""
     columns, clocks = _read(names), [_TIME.search(name) for name in names]
     others = _read([_TIME.sub("", name) for name in names])
     if all(clocks) and not any(column.is_distinct for column in others):
@@ -202,8 +206,8 @@ def _column(place: int, numbers: tuple[re.Match[str], ...]) -> Iterator[_Column]
 
 
 def flat_places(flats: list[Path], darks: list[Path], series: Series) -> np.ndarray | None:
-    """Returns the places (n,) of flats among the projections, as of ``flats.places``, by words such as "before" in their
-    names, or by numbers that go on through flats, darks and projections; None where neither says it."""
+    """Returns the places (n,) of flats among the projections, as in ``frames.places``. Words such as "before" in their names
+    say it, or numbers that continue through flats, darks and projections; None where neither does."""
     ends = [[bool(words.search(path.stem)) for path in flats] for words in (_BEFORE, _AFTER)]
     if flats and all(map(np.logical_xor, *ends)):
         return np.where(ends[0], -0.5, len(series.paths) - 0.5)

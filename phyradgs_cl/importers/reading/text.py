@@ -1,4 +1,4 @@
-"""Texts as people, scanners and toolkits write them: numbers with decimal commas or units, tables of angles, descriptions of
+"""Reads texts of people, scanners and toolkits: numbers with decimal commas or units, tables of angles, and descriptions of
 scans as lines of names and values."""
 
 import logging
@@ -20,13 +20,13 @@ _ENGLISH, _GERMAN = (re.compile(rf"[-+]?\d{{1,3}}({k}\d{{3}})+{d}") for k, d in 
 _ONE_COMMA, _EITHER = re.compile(r"[-+]?\d*,\d+"), re.compile(r"[-+]?[1-9]\d{0,2},\d{3}")
 _COLUMNS = re.compile(r",\s+|[;:\s]+")
 _ANGLE, _RAD = re.compile(r"angle|theta|phi|rot|deg", re.I), re.compile(r"\brad", re.I)
-_BRIGHTER, _FEW = 1.2, 0.01  # of the counts of air: no noise of air is so bright; fraction of pixels that may be broken
+_BRIGHTER, _FEW = 1.2, 0.01  # factor on the counts of air that no noise exceeds; fraction of pixels that may be broken
 TO_RAD = {"deg": np.pi / 180, "rad": 1.0}
 
 
 def number_at_start(text: str, comma_is_decimal: bool = False) -> tuple[float, str] | None:
-    """Returns the number that a text begins with, and the text behind it, such as a unit. None where there is none, and
-    where a comma may stand for a decimal point or for thousands: as in 1,000 unless ``comma_is_decimal``."""
+    """Returns the number at the start of a text, and the text behind it, such as a unit. None without a number, and for a
+    comma that may be decimal or of thousands, as in 1,000; ``comma_is_decimal`` decides these."""
     if not (found := _BEGINNING.match(text.strip())):
         return None
     digits, power, rest = found[1], found[2] or "", found[3]
@@ -43,15 +43,16 @@ def number_at_start(text: str, comma_is_decimal: bool = False) -> tuple[float, s
 
 
 def commas_are_decimal(texts: list[str]) -> bool:
-    """True where some of the texts have a comma that can only be a decimal one, and none has a decimal point."""
+    """True where some of the texts are numbers with a comma that must be decimal, and none has a decimal point."""
     commas = any(_ONE_COMMA.fullmatch(text) and not _EITHER.fullmatch(text) for text in texts)
     return commas and not any(re.fullmatch(r"[-+]?\d*\.\d+", text) for text in texts)
 
 
 def read_angles_rad(path: Path, count: int, unit: str | None = None, column: int | None = None) -> np.ndarray:
-    """Reads (count,) angles in rad of a text file: one a line or all in one line, or in a column beside an index. A line of
-    names may say which column, and the unit, if ``unit`` ("deg", "rad") does not: else degrees. Text after a # is ignored.
-    ``column`` has the angles. InputError: another count, several columns without names, lines that are no numbers."""
+    """Reads angles (count,) in rad from a text file: one per line, all in one line, or in a column beside an index, which
+    then gives their order. A line of names may say which column, and rad. The unit is ``unit`` ("deg", "rad"), else that of
+    the names, else degrees. Text after a # is ignored. ``column``: the number of the angles' column, from 0 on. Raises
+    InputError for another count, several columns without names, and lines that are no numbers."""
     numbered = enumerate(read_text(path).splitlines(), 1)
     lines = [(i, text) for i, line in numbered if (text := line.partition("#")[0].strip())]
     is_header = [not re.search(r"\d", line) or (_cells(line, True) or _cells(line, False)) is None for _, line in lines]
@@ -72,7 +73,7 @@ def read_angles_rad(path: Path, count: int, unit: str | None = None, column: int
 
 
 def _cells(line: str, is_comma: bool) -> list[float] | None:
-    """Returns the numbers of a line of a table; None for anything else."""
+    """Returns the numbers in a line of a table; None for a line with anything else. ``is_comma``: commas are decimal."""
     parts = [part for part in (_COLUMNS if is_comma else re.compile(r"[,;:\s]+")).split(line) if part]
     try:
         return [float(part.replace(",", ".")) for part in parts]
@@ -81,7 +82,7 @@ def _cells(line: str, is_comma: bool) -> list[float] | None:
 
 
 def _is_decimal_comma(path: Path, lines: list[str]) -> bool:
-    """True where commas in a table are decimal ones, False where they are between its columns."""
+    """True where commas in a table are decimal, False where they separate columns. Raises InputError if they may be both."""
     parts = [part for line in lines for part in _COLUMNS.split(line) if "," in part]
     if not all(part.count(",") == 1 and "." not in part for part in parts):
         return False
@@ -98,13 +99,14 @@ def _is_decimal_comma(path: Path, lines: list[str]) -> bool:
 
 
 def _is_index(values: list[float]) -> bool:
-    """True for the numbers from 0 or 1 on, in any order."""
+    """True for consecutive numbers from 0 or 1 on, in any order."""
     first = min(values)
     return len(values) > 1 and first in (0, 1) and sorted(values) == [first + i for i in range(len(values))]
 
 
 def _column(path: Path, names: list[str], table: list[list[float]], count: int, column: int | None) -> np.ndarray:
-    """Returns the angles of a table: its only column or row, the one with a name, or the one beside an index."""
+    """Returns the angles of a table as stored: its only column or row, the one named so, or the one beside an index. An
+    index gives their order. Raises InputError for several columns."""
     widths = {len(row) for row in table}
     if widths == {1} or (len(table) == 1 and column is None) or (len(table) < count == sum(map(len, table))):
         return np.array([value for row in table for value in row])
@@ -133,8 +135,8 @@ def file_of_angles(folder: SafeFolder, name: str, *ends: str) -> Path | None:
 
 
 def measured_angles_rad(path: Path, steps_rad: np.ndarray) -> np.ndarray:
-    """Reads measured angles (F,) in rad. Such files count up or down, in either order: taken is what agrees best with equal
-    steps (F,). A line says how far both are apart."""
+    """Reads measured angles (F,) in rad. Their sign and order differ between files: those are taken that agree best with
+    equal steps (F,). A warning states the largest difference."""
     listed_rad = np.unwrap(read_angles_rad(path, len(steps_rad), column=1))
     ways = [steps_rad[0] + way - way[0] for way in (listed_rad, listed_rad[::-1], -listed_rad, -listed_rad[::-1])]
     best = min(ways, key=lambda way: float(np.abs(way - steps_rad).max()))
@@ -144,15 +146,15 @@ def measured_angles_rad(path: Path, steps_rad: np.ndarray) -> np.ndarray:
 
 
 class Settings(Fields):
-    """Names and texts. A text becomes a number where a number is asked for, and stays text where a word is."""
+    """Fields whose values are texts. Methods that return numbers parse them, also with units behind them."""
 
     def __init__(self, subject: str, values: Mapping[str, str | list[str]], comma_is_decimal: bool = False) -> None:
         super().__init__(subject, values)
         self.comma_is_decimal = comma_is_decimal
 
     def measured(self, key: str, quantity: Quantity, unit: str) -> float:
-        """Returns a number above zero in the package's unit of ``quantity``. It is in ``unit``, unless a unit behind it says
-        otherwise."""
+        """Returns a number above 0, converted to the package's unit of ``quantity``. The text states its unit behind it,
+        else it is in ``unit``."""
         found = number_at_start(str(self.get(key)), self.comma_is_decimal)
         stated = quantity.factor(found[1]) if found and found[1] else None
         factor = stated or quantity.factor(unit)
@@ -160,7 +162,7 @@ class Settings(Fields):
         return self.length(key) * factor
 
     def listed(self, key: str, count: int) -> np.ndarray:
-        """Returns the numbers (count,) of a text, which commas separate."""
+        """Returns the numbers (count,) of a text with commas between them."""
         return Settings(self.subject, {key: self.word(key).split(",")}).numbers(key, count)
 
     def _finite(self, key: str, value: object, largest: float = LARGEST) -> float:
@@ -171,10 +173,10 @@ class Settings(Fields):
 def read_settings(
     path: Path, names: Collection[str], separator: str = "=", sections: Collection[str] = ()
 ) -> Settings:
-    """Reads the lines NAME ``separator`` VALUE whose name is one of ``names``, in any case; other lines are not looked at.
+    """Reads the lines NAME ``separator`` VALUE whose name is one of ``names``, in any case; other lines are ignored.
 
-    ``sections``: the only [sections] that count, in any case; () takes all. Of a name in two sections the first counts.
-    InputError for a file without any of the names, and for one section that gives a name two values."""
+    ``sections``: the only [sections] that are read, in any case; () reads all. Of a name in two sections the first counts.
+    Raises InputError for a file without any of the names, and for one section that gives a name two values."""
     spelt, wanted = {name.lower(): name for name in names}, {section.lower() for section in sections}
     values: dict[tuple[str, str], str] = {}  # by section and name
     others: list[str] = []
@@ -198,7 +200,7 @@ def read_settings(
 
 
 def head_has(path: Path, *marks: bytes, most_bytes: int = 1 << 14) -> bool:
-    """True for a regular file whose beginning has all the marks, in any case."""
+    """True for a regular file with all the marks in its first ``most_bytes``, in any case."""
     if not path.is_file():
         return False
     with open(path, "rb") as file:
@@ -207,13 +209,13 @@ def head_has(path: Path, *marks: bytes, most_bytes: int = 1 << 14) -> bool:
 
 
 def say_missing(fields: Fields, meanings: Mapping[str, str]) -> None:
-    """Says in one line which of the names the description lacks, and what that means."""
+    """Warns, in one line, of names that the description lacks. ``meanings``: by name, the value that is then assumed."""
     if missing := [f"no {name} ({meaning})" for name, meaning in meanings.items() if not fields.has(name)]:
         _log.warning("%s %s", fields.subject, ", ".join(missing))
 
 
 def white_level(fields: Fields, key: str, frames: np.ndarray, remedy: str) -> float:
-    """Returns the counts of air that ``key`` states. InputError where frames (F, v, u) are much brighter."""
+    """Returns the counts of air that ``key`` states. Raises InputError where frames (F, v, u) are much brighter."""
     white = fields.length(key)
     brighter = sum(np.count_nonzero(frame > _BRIGHTER * white) for frame in frames) / frames.size
     if brighter > _FEW:

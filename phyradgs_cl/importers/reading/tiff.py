@@ -1,4 +1,4 @@
-"""Grey TIFF images, one or many per file, by tifffile; by Pillow where tifffile needs imagecodecs and that is missing."""
+"""Reads grey TIFF images, one or many per file, by tifffile; by Pillow where tifffile would need a missing imagecodecs."""
 
 import logging
 import math
@@ -21,16 +21,17 @@ from phyradgs_cl.io.hdf5.datasets import LENGTH
 
 SUFFIXES = (".tif", ".tiff")
 _log = logging.getLogger(__name__)
-_RESULT_BYTES = 5  # per pixel: a line integral in float32, and its mask
-_NO_SPACE = {"C": "channels", "T": "times"}  # axes of a stack that are none of a volume
+_RESULT_BYTES = 5  # memory per pixel of the result: a line integral in float32, and its mask
+_NO_SPACE = {"C": "channels", "T": "times"}  # axes of a stack that a volume does not have
 _OME_SIZES = re.compile(r'PhysicalSize([XYZ](?:Unit)?)="([^"]*)"')
 _OF_SIZE = ("unit", "spacing")
-_ORIENTATION = 274  # 1: row 0 at the top, column 0 on the left
+_ORIENTATION = 274  # number of the tag; its value 1 means row 0 at the top, column 0 on the left
 
 
 def read_tiffs(paths: list[Path]) -> np.ndarray:
     """Reads all images of all files in order: frames (F, v, u) in their own type, row 0 as stored. All headers are read
-    before any pixel, so that the frames are unpacked into one array of known size."""
+    before any pixel, so that the frames are unpacked into one array of known size. Raises InputError for damage, images of
+    several sizes or types, and more than the machine's memory."""
     headers = [_header(path) for path in paths]
     frames, (shape, dtype) = sum(count for count, _ in headers), headers[0][1]
     for path, (_, kind) in zip(paths, headers, strict=True):
@@ -58,12 +59,12 @@ def read_numbered(
     folder: SafeFolder, prefix: str, shape: tuple[int | None, ...], subject: str | Sequence[str], options: ImportOptions,
     first: int = 0, pattern: str = r"\d+",
 ) -> tuple[np.ndarray, np.ndarray, str]:
-    """Reads the TIFFs of a folder whose names are ``prefix`` and a number: frames (F, v, u) of ``shape``, in the numbers'
-    order; None is any size. Returns them with their places (F,) from 0 on, and what was taken, in words.
+    """Reads the TIFFs of a folder whose names are ``prefix`` and a number: frames (F, v, u) of ``shape`` in the numbers'
+    order; None in a shape accepts any size. Returns them with their places (F,) from 0 on, and which were taken, in words.
 
-    ``pattern``: a number in the names; ``first``: the number of the first frame where that is missing; ``subject`` names
-    what states the shape, or each of its three sizes. Files beyond the stated number are left out by name. InputError for
-    fewer, unless the options ask for the frames that are found."""
+    ``pattern``: the form of the number; ``first``: the first frame's number, used where that frame is missing; ``subject``:
+    what states the shape, or each of its three sizes, for messages. Files beyond the stated number are left out with a
+    warning. Raises InputError for fewer, unless the options say to take those found."""
     subjects = [subject] * 3 if isinstance(subject, str) else subject
     name = re.compile(re.escape(prefix) + pattern, re.I)
     paths = [path for path in folder.matching(*SUFFIXES) if name.fullmatch(path.stem)]
@@ -89,14 +90,15 @@ def read_numbered(
 
 
 def stack_shape(paths: list[Path]) -> tuple[int, int, int]:
-    """Returns the shape (frames, rows, columns) that ``read_tiffs`` would read, from headers alone; rows and columns of the
-    first file."""
+    """Returns the shape (frames, rows, columns) that ``read_tiffs`` would read, from headers alone. Rows and columns are
+    those of the first file."""
     headers = [_header(path) for path in paths]
     return sum(count for count, _ in headers), *headers[0][1][0]
 
 
 def _header(path: Path) -> tuple[int, tuple[tuple[int, int], np.dtype]]:
-    """Returns the number of images of one file, and their shape and type."""
+    """Returns the number of images in one file, and their (shape, type). Raises InputError for images that are not grey, are
+    turned, differ, or are missing."""
     images, kinds = 0, []
     with _opened(path) as tiff:
         for page in tiff.pages:  # one of which may be a stack (n, v, u)
@@ -123,8 +125,8 @@ def _header(path: Path) -> tuple[int, tuple[tuple[int, int], np.dtype]]:
 
 @contextmanager
 def _opened(path: Path) -> Iterator[Any]:
-    """Yields an open TIFF. Any error of the library in the body becomes InputError, and so do pages behind the file's end,
-    which the library logs and leaves out."""
+    """Yields an open TIFF. Any error of the library in the body becomes InputError. So do pages beyond the file's end, which
+    the library only logs and leaves out."""
     regular_file(path, str(path))
     tifffile = checks.package("tifffile", "the package that reads TIFF", "phyradgs-cl[formats]")
     logger, said = logging.getLogger("tifffile"), list[str]()
@@ -146,10 +148,10 @@ def _opened(path: Path) -> Iterator[Any]:
 
 
 def calibration(path: Path) -> tuple[np.ndarray | None, np.ndarray | None, str]:
-    """Returns the voxel sizes (x, y, z) in mm, the origin's place (x, y, z) in voxels and the text "Info" of a stack. ImageJ
-    wrote the stack, or tifffile, which keeps the same values of a BigTIFF as JSON, or a program that writes OME-TIFF. None
-    stands for missing values, which a warning names where the file has a part of them. InputError for a stack with several
-    channels or times. Call ``read_tiffs`` first."""
+    """Returns the voxel sizes (x, y, z) in mm, the origin's place (x, y, z) in voxels and the text "Info" of a stack. It is
+    ImageJ's, an OME-TIFF, or a BigTIFF of tifffile, which keeps ImageJ's values as JSON. Without valid sizes it returns
+    (None, None, ""), with a warning where the file has a part of them. A missing origin is None. Raises InputError for a
+    stack with several channels or times. Call ``read_tiffs`` first, which checks the file."""
     with _opened(path) as tiff:
         series = tiff.series[0]
         long = {axis: n for axis, n in zip(series.axes, series.shape, strict=False) if axis in _NO_SPACE and n > 1}

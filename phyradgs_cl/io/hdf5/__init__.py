@@ -1,1 +1,1 @@
-"""HDF5 files of any origin: opened without harm, read by type and unit."""
+"""Reads HDF5 files of any origin safely: links are followed only within allowed folders, values checked by type and unit."""

@@ -1,4 +1,4 @@
-"""Typed values in HDF5: numbers with units, words, whole numbers and voxel grids. Every value is checked when it is read."""
+"""Reads and writes typed values in HDF5: numbers with units, words, whole numbers and voxel grids. Reading checks them."""
 
 import logging
 import math
@@ -25,8 +25,8 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Quantity:
-    """A physical quantity. ``factors``: from unit names to the package's unit. ``assumed``: the unit of a dataset without
-    units. ``largest``: in the package's unit; larger numbers are damage and would overflow later."""
+    """A physical quantity. ``factors``: by a unit's name, the factor to the package's unit. ``assumed``: the unit of a
+    dataset without units. ``largest``: limit in the package's unit; larger numbers are damage and would overflow later."""
 
     name: str
     assumed: str
@@ -34,7 +34,7 @@ class Quantity:
     factors: MappingProxyType[str, float]
 
     def factor(self, unit: str) -> float | None:
-        """Returns the multiplier for a value in ``unit``, in any case, or None for an unknown unit."""
+        """Returns the factor from ``unit``, in upper or lower case, to the package's unit; None for an unknown unit."""
         return self.factors.get(unit.strip().rstrip(".").casefold())
 
     @property
@@ -74,14 +74,14 @@ ATTENUATION = _quantity("attenuation", "1/mm", 1e9, {
 def read_values(
     source: Hdf5Source, address: str, dataset: h5py.Dataset, kinds: str = "iuf", rows: slice | None = None
 ) -> np.ndarray:
-    """Reads a dataset in its own type, or some rows (..., v, u) of it. InputError unless NumPy's kind of that type is in
-    ``kinds``."""
+    """Reads a dataset in its own type, or only ``rows`` of a stack (..., v, u). Raises InputError unless the type's
+    ``dtype.kind`` is in ``kinds``, and for damage; OutOfMemoryError for more than this machine can hold."""
     if dataset.dtype.kind not in kinds:
         expected = "numbers" if "f" in kinds else "whole numbers"
         raise source.error(address, f"type {dataset.dtype}", expected, "store them as plain HDF5 numbers")
     try:
         share = 1 if rows is None else (rows.stop - rows.start) / dataset.shape[-2]
-        chunk_bytes = math.prod(dataset.chunks or ()) * dataset.dtype.itemsize  # HDF5 unpacks whole ones
+        chunk_bytes = math.prod(dataset.chunks or ()) * dataset.dtype.itemsize  # HDF5 unpacks whole chunks
         if max(share * dataset.nbytes, chunk_bytes) > HOST_SHARE * host_bytes():
             raise MemoryError
         return np.asarray(dataset[()] if rows is None else dataset[..., rows, :])
@@ -96,7 +96,8 @@ def read_array(
     source: Hdf5Source, address: str, shape: Sequence[int | None], quantity: Quantity | None = None,
     default: np.ndarray | None = None,
 ) -> np.ndarray:
-    """Reads a numeric dataset as finite float64, in the package's unit of ``quantity``; required without a ``default``."""
+    """Reads a numeric dataset as finite float64, in the package's unit of ``quantity``. Raises InputError for another shape,
+    values that are not finite, unknown units, and a missing dataset without a ``default``."""
     if default is not None and source.optional(address) is None:
         return default
     dataset = source.dataset(address)
@@ -105,8 +106,8 @@ def read_array(
 
 
 def read_per_frame(source: Hdf5Source, address: str, used: np.ndarray, quantity: Quantity) -> np.ndarray:
-    """Reads one finite number for each frame of which ``used`` (F,) is true, in the package's unit. The dataset has one for
-    every frame, where those of other frames may be anything, or only for the used ones."""
+    """Reads one finite number for each frame that ``used``, bool (F,), marks, in the package's unit. The dataset has a
+    number for every frame, of which the others are ignored, or only for the used ones."""
     dataset = source.dataset(address)
     if is_of_all := dataset.shape != (int(used.sum()),):
         checks.shape(source.name(address), dataset, used.shape)
@@ -123,8 +124,8 @@ def _finite(source: Hdf5Source, address: str, values: np.ndarray, quantity: Quan
 def read_number(
     source: Hdf5Source, address: str, quantity: Quantity | None = None, default: float | None = None
 ) -> float:
-    """Reads a finite number, in the package's unit of ``quantity``; required without a ``default``. Datasets of one element
-    are accepted."""
+    """Reads a finite number from a dataset of one element, in the package's unit of ``quantity``. Without a ``default`` the
+    dataset must be there."""
     if default is not None and source.optional(address) is None:
         return default
     dataset = source.dataset(address)
@@ -134,7 +135,7 @@ def read_number(
 
 
 def read_length(source: Hdf5Source, address: str, quantity: Quantity) -> float:
-    """Reads a required number above zero. Datasets of one element are accepted."""
+    """Reads a required number above 0 from a dataset of one element, in the package's unit."""
     value = read_number(source, address, quantity)
     if value < 1 / quantity.largest:
         raise source.error(address, str(value), f"a {quantity.name} above 0, of a real scanner", "correct the value")
@@ -151,7 +152,7 @@ def read_integers(source: Hdf5Source, address: str, shape: Sequence[int | None])
 def read_word(
     source: Hdf5Source, address: str, allowed: Collection[str] | None = None, default: str | None = None
 ) -> str:
-    """Reads a string, one of ``allowed`` where that is given; required without a ``default``."""
+    """Reads a string, which must be one of ``allowed``, if given. Without a ``default`` the dataset must be there."""
     if default is not None and source.optional(address) is None:
         return default
     dataset, word = source.dataset(address), None
@@ -186,7 +187,7 @@ def read_attribute(source: Hdf5Source, address: str, name: str) -> str | None:
 
 
 def _text(value: object) -> str | None:
-    """Returns the string in h5py's answer (str, bytes or an array of one), or None for anything else."""
+    """Returns the string in a value of h5py (str, bytes or an array of one of them); None for anything else."""
     if isinstance(value, np.ndarray) and value.size == 1:
         value = value.reshape(-1)[0]
     if isinstance(value, str):
@@ -195,12 +196,13 @@ def _text(value: object) -> str | None:
 
 
 def in_unit(source: Hdf5Source, address: str, values: np.ndarray, quantity: Quantity) -> np.ndarray:
-    """Converts finite values (any shape) to the package's unit, which a dataset's attribute "units" states. InputError for
-    values beyond ``quantity.largest``."""
+    """Converts finite values, of any shape, from the unit in the dataset's attribute "units" to the package's unit. Without
+    the attribute it assumes ``quantity.assumed``, with a warning unless the name ends in that unit. Raises InputError for an
+    unknown unit, and for values beyond ``quantity.largest``."""
     unit = (read_attribute(source, address, "units") or read_attribute(source, address, "unit") or "").strip()
     if not unit:
         unit = quantity.assumed
-        # A name that ends in the unit (time_s, angle_deg) states it well enough.
+        # a name that ends in the unit, such as time_s or angle_deg, states it
         if not posixpath.basename(address).endswith(f"_{unit}"):
             _log.warning("%s: no units attribute; %s assumed", source.name(address), unit)
     if (factor := quantity.factor(unit)) is None:
@@ -212,7 +214,8 @@ def in_unit(source: Hdf5Source, address: str, values: np.ndarray, quantity: Quan
 
 
 def read_grid(source: Hdf5Source, address: str) -> Grid:
-    """Reads the voxel grid in the group at ``address``: shape, voxel_size and offset, each (z, y, x)."""
+    """Reads the voxel grid in the group at ``address``: shape, voxel_size and offset (0 if missing), each (z, y, x). Raises
+    InputError for impossible ones."""
     shape = read_integers(source, f"{address}/shape", (3,)).tolist()
     voxel_size_mm = read_array(source, f"{address}/voxel_size", (3,), LENGTH)
     offset_mm = read_array(source, f"{address}/offset", (3,), LENGTH, default=np.zeros(3))
@@ -225,7 +228,7 @@ def read_grid(source: Hdf5Source, address: str) -> Grid:
 
 @contextmanager
 def new_hdf5(path: str | Path, size_bytes: int) -> Iterator[h5py.File]:
-    """Creates an HDF5 file for arrays of ``size_bytes``, whole or not at all; see ``written_beside``."""
+    """Yields a new HDF5 file for arrays of ``size_bytes``, written whole or not at all; see ``written_beside``."""
     with written_beside(path, size_bytes) as temporary, h5py.File(temporary, "w") as file:
         file.attrs["NX_class"], file.attrs["default"] = "NXroot", "entry"
         yield file

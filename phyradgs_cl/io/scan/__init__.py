@@ -1,4 +1,4 @@
-"""Scan files: reading part by part, writing. Addresses in a scan file, which is a NeXus NXtomo entry (docs/formats.md)."""
+"""Reads and writes scan files. This module holds the addresses in one, a NeXus NXtomo entry (docs/formats.md)."""
 
 DETECTOR = "instrument/detector"
 DATA, MASK = f"{DETECTOR}/data", f"{DETECTOR}/pixel_mask"

@@ -1,4 +1,5 @@
-"""The detector's part of a scan file: frames, keys, geometry, shutter and mask, without the pixels."""
+"""Reads the detector's part of a scan file: kinds of frames, geometry, shutter and mask, without the pixels. Functions raise
+InputError, about "FILE:/hdf5/path", for missing and for impossible values."""
 
 import logging
 
@@ -16,11 +17,11 @@ from phyradgs_cl.io.hdf5.datasets import LENGTH, TIME
 from phyradgs_cl.io.hdf5.source import Hdf5Source
 
 _log = logging.getLogger(__name__)
-_JITTER = 0.01  # of an exposure that a clock has measured
+_JITTER = 0.01  # largest deviation of a single measured time from their median, as a fraction of it
 
 
 def read_data_kind(source: Hdf5Source, entry: str) -> tuple[h5py.Dataset, str]:
-    """Returns the dataset of frames (F, v, u), unread, and their quantity."""
+    """Returns the dataset of frames (F, v, u), unread, and their quantity: "attenuation", "transmission" or "counts"."""
     address = f"{entry}/{schema.DETECTOR}/data"
     data, subject = source.dataset(address), source.name(address)
     if data.ndim != 3 or min(data.shape) < 1:
@@ -39,7 +40,7 @@ def read_data_kind(source: Hdf5Source, entry: str) -> tuple[h5py.Dataset, str]:
 
 
 def read_image_key(source: Hdf5Source, entry: str, frames: int) -> np.ndarray:
-    """Reads the key of each stored frame (F,); at least one is a projection."""
+    """Reads the image key (F,) of all stored frames: 0 projection, 1 flat, 2 dark, 3 invalid, and at least one 0."""
     address = f"{entry}/{schema.DETECTOR}/image_key"
     image_key = h5.read_integers(source, address, (frames,))
     wrong = ~np.isin(image_key, (schema.PROJECTION, schema.FLAT, schema.DARK, schema.INVALID))
@@ -61,7 +62,7 @@ def read_geometry(source: Hdf5Source, entry: str, detector_shape: tuple[int, int
     offset_mm = tuple(h5.read_array(source, offset, (2,), LENGTH, default=np.zeros(2)).tolist())
     if _is_parallel(source, entry):
         return ParallelGeometry(detector_shape, (pitch_v_mm, pitch_u_mm), offset_mm)
-    to_axis_mm = abs(h5.read_number(source, address, LENGTH))  # NeXus gives it a minus sign
+    to_axis_mm = abs(h5.read_number(source, address, LENGTH))  # in NeXus the source's distance is negative
     if to_axis_mm == 0:
         remedy = f"correct the value, or store 'parallel' as {entry}/{schema.BEAM} and no distance"
         raise source.error(address, "0", "a length other than 0", remedy)
@@ -70,7 +71,7 @@ def read_geometry(source: Hdf5Source, entry: str, detector_shape: tuple[int, int
 
 
 def _is_parallel(source: Hdf5Source, entry: str) -> bool:
-    """Reads which beam a file has. A file of another program without a source distance has a parallel beam."""
+    """True for a parallel beam: stated, or, with a warning, in a file of another program without a source distance."""
     beam, distance = f"{entry}/{schema.BEAM}", f"{entry}/{schema.SOURCE}/distance"
     has_distance = source.optional(distance) is not None
     if source.optional(beam) is not None:
@@ -86,7 +87,8 @@ def _is_parallel(source: Hdf5Source, entry: str) -> bool:
 
 
 def read_shutter(source: Hdf5Source, entry: str, used: np.ndarray, moving: bool) -> Shutter:
-    """Reads exposure and readout. The values of a rolling readout are required only where the gantry moves."""
+    """Reads exposure and readout, which must be there only where the gantry moves; their order only for a rolling readout.
+    used, bool (F,): the stored frames that are projections."""
     exposure_s = read_duration(source, f"{entry}/{schema.DETECTOR}/count_time", used, moving)
     needed = moving and exposure_s > 0
     readout_s = read_duration(source, f"{entry}/{schema.DETECTOR}/detector_readout_time", used, needed)
@@ -113,8 +115,8 @@ def _read_pulse(source: Hdf5Source, entry: str, span_s: float) -> tuple[float, f
 
 
 def read_duration(source: Hdf5Source, address: str, used: np.ndarray, needed: bool) -> float:
-    """Reads one time in s for all projections, stored once or for every frame: measured times differ by a percent, and their
-    median is taken. 0 where it is not needed and missing."""
+    """Reads one time in s for all projections, stored once or for every frame. Measured times may differ by a percent; their
+    median is returned. Returns 0 where it is missing and not ``needed``."""
     dataset = source.dataset(address) if needed else source.optional(address)
     if dataset is None:
         return 0.0
@@ -137,7 +139,7 @@ def read_duration(source: Hdf5Source, address: str, used: np.ndarray, needed: bo
 def read_starts(
     source: Hdf5Source, entry: str, used: np.ndarray, shutter: Shutter, moving: bool
 ) -> np.ndarray:
-    """Reads opening times (frames,) of the projections; evenly spaced where nothing moves and none are stored."""
+    """Reads the opening times (P,) in s of the projections; evenly spaced where nothing moves and none are stored."""
     address = f"{entry}/{schema.DETECTOR}/frame_start_time"
     if not moving and source.optional(address) is None:
         return np.arange(int(used.sum())) * max(shutter.span_s, 1.0)
@@ -145,7 +147,7 @@ def read_starts(
 
 
 def check_mask(source: Hdf5Source, entry: str, data_shape: tuple[int, ...]) -> tuple[int, ...] | None:
-    """Returns the shape of the pixel mask, unread, or None without one."""
+    """Returns the shape, (v, u) or (F, v, u), of the pixel mask without reading it; None without a mask."""
     address = f"{entry}/{schema.DETECTOR}/pixel_mask"
     mask = source.optional(address)
     if mask is None:

@@ -1,4 +1,4 @@
-"""The header of a scan file: everything but its large arrays, checked before those are read."""
+"""Reads the header of a scan file: everything but its large arrays, checked before those are read."""
 
 import logging
 from collections.abc import Callable
@@ -23,14 +23,14 @@ from phyradgs_cl.io.scan.motion import has_motion, read_gating, read_trajectory
 from phyradgs_cl.io.tables import read_facts
 
 _log = logging.getLogger(__name__)
-_DEEPEST_ENTRY = 3  # groups from the root to the one with the definition, which may be a subentry
+_DEEPEST_ENTRY = 3  # levels of groups searched below the root for NXtomo's definition, which a subentry may hold
 
 
 @dataclass(frozen=True, eq=False)
 class ScanHeader:
     """A checked scan without its arrays: ``scan.projections`` are zeros that take no memory. ``entry``: address of the
-    NXtomo group; image_key (F,) of all stored frames; ``mask_shape``, ``has_reference``, ``states`` (their number): optional
-    arrays."""
+    NXtomo group. ``image_key`` (F,): of all stored frames. ``mask_shape``: None without a mask. ``states``: the number of
+    true states. ``has_grid``: the file states the grid."""
 
     scan: Scan
     entry: str
@@ -44,7 +44,7 @@ class ScanHeader:
 
 
 def read_header(source: Hdf5Source) -> ScanHeader:
-    """Reads and checks everything but pixels, mask and reference; InputError names the damage by its HDF5 path."""
+    """Reads and checks everything but pixels, mask and reference. Raises InputError, with the HDF5 path, for damage."""
     entry = find_entry(source)
     data, quantity = detector.read_data_kind(source, entry)
     image_key = detector.read_image_key(source, entry, len(data))
@@ -84,9 +84,9 @@ def read_header(source: Hdf5Source) -> ScanHeader:
 
 
 def find_entry(source: Hdf5Source, asked: str | None = None) -> str:
-    """Returns the address of the NXtomo entry: the one ``asked`` for, else the only group with that definition, wherever it
-    stands; without one the root's @default, /entry, or the only NXentry. Of several it takes the root's @default, and says
-    so. InputError for none, or several."""
+    """Returns the address of the NXtomo entry: ``asked``, else the only group with that definition, at most 3 levels deep.
+    Of several it takes the root's @default, with a warning. Without one it takes the root's @default, /entry, or the only
+    NXentry. Raises InputError for none, and for several without a default."""
     if asked is not None:
         address = f"/{asked.strip('/')}"
         source.group(address)

@@ -1,5 +1,5 @@
-"""The motion of a scan file: θ(t) of the scanner as a pose table, an encoder table or two angles for each frame; the gating
-signal of an object that moves."""
+"""Reads and writes the motion in a scan file: the scanner's, as a pose table, an encoder table or two angles for each frame,
+and the gating signal of an object that moves."""
 
 import logging
 import math
@@ -19,13 +19,13 @@ from phyradgs_cl.io.hdf5.source import Hdf5Source
 
 _log = logging.getLogger(__name__)
 _KINEMATICS = (ConstantSpeed, SpeedRamp, EncoderTable, FrameSweeps)  # trajectories that files can hold
-_RAMP_ERROR_RAD = 1e-9
-_MOST_RAMP_SAMPLES = 500_000
-_SUSPECT_RAD = math.radians(5.0)
+_RAMP_ERROR_RAD = 1e-9  # largest error of the table of angles that stands for a speed ramp
+_MOST_RAMP_SAMPLES = 500_000  # limit of that table's length
+_SUSPECT_RAD = math.radians(5.0)  # a larger difference of table and rotation_angle is warned of
 
 
 def has_motion(source: Hdf5Source, entry: str) -> bool:
-    """True where the file states how the gantry moved during an exposure."""
+    """True where the file states how the gantry moved in an exposure, by end angles, an encoder table or a pose table."""
     end = source.optional(f"{entry}/{schema.SAMPLE}/rotation_angle_end")
     groups = (schema.KINEMATICS, schema.POSES)
     found = [source.optional_group(f"{entry}/{group}") for group in groups]
@@ -36,7 +36,8 @@ def read_trajectory(
     source: Hdf5Source, entry: str, geometry: Geometry, used: np.ndarray, start_s: np.ndarray,
     exposure_s: float,
 ) -> CircularOrbit | PoseTable:
-    """Reads the trajectory of the frames that the mask ``used`` (F,) selects and that open at ``start_s``."""
+    """Reads the trajectory of the P projections, which ``used``, bool (F,), marks among the stored frames and which open at
+    ``start_s`` (P,). Raises InputError for damage, and for tables whose times do not increase."""
     first_rad = read_angles(source, entry, "rotation_angle", used)
     poses, kinematics = f"{entry}/{schema.POSES}", f"{entry}/{schema.KINEMATICS}"
     if source.optional_group(poses) is not None:
@@ -57,17 +58,17 @@ def read_trajectory(
 
 
 def read_angles(source: Hdf5Source, entry: str, name: str, used: np.ndarray) -> np.ndarray:
-    """Reads gantry angles in radians of the used frames, from rotation_angle or rotation_angle_end."""
+    """Reads gantry angles (P,) in rad of the used frames from ``name``: rotation_angle or rotation_angle_end."""
     address = f"{entry}/{schema.SAMPLE}/{name}"
     angle_rad = h5.read_array(source, address, used.shape, h5.ANGLE)[used]
-    # The end angle has the sense of the start angle unless it states its own.
+    # unless it states its own, the end angle has the start angle's sense: gantry or sample
     start = f"{entry}/{schema.SAMPLE}/rotation_angle"
     return angle_rad * _sense(source, address, absent=_sense(source, start, absent=-1.0))
 
 
 def storable(scan: Scan) -> Scan:
-    """Returns the scan with a trajectory that files can hold. A user's own trajectory becomes a table of poses, exact to a
-    ten-thousandth of a pixel."""
+    """Returns the scan with a trajectory that files can hold. A user-defined trajectory becomes a pose table that is exact
+    to a ten-thousandth of a pixel. Raises InputError where no table is."""
     path = scan.trajectory
     if isinstance(path, PoseTable) or (isinstance(path, CircularOrbit) and isinstance(path.kinematics, _KINEMATICS)):
         return scan
@@ -76,7 +77,7 @@ def storable(scan: Scan) -> Scan:
 
 
 def write_motion(entry: h5py.Group, scan: Scan, frame_of: np.ndarray) -> None:
-    """Writes rotation angles and tables; row i of the (F,) arrays describes projection ``frame_of[i]``."""
+    """Writes rotation angles and tables. Stored frame i gets the angles of projection ``frame_of[i]``; frame_of (F,)."""
     first_rad, last_rad = _exposure_angles(scan)
     sample = entry[schema.SAMPLE]
     h5.write_number(sample, "rotation_angle", np.rad2deg(first_rad)[frame_of], "degree", rotates="gantry")
@@ -107,7 +108,7 @@ def _table_group(entry: h5py.Group, name: str, time_s: np.ndarray) -> h5py.Group
 
 
 def _exposure_angles(scan: Scan) -> tuple[np.ndarray, np.ndarray]:
-    """Returns gantry angles (F,) at the start and end of each exposure; both at mid-window if the gantry stands."""
+    """Returns gantry angles (F,) in rad at the start and end of each exposure; both at mid-window for a gantry at rest."""
     shutter = scan.shutter
     offsets_s = np.array([0.0, shutter.exposure_s] if scan.is_fly else [shutter.middle_s] * 2)
     pairs = np.array([_angles(scan, f, start_s + offsets_s) for f, start_s in enumerate(scan.frame_start_s)])
@@ -122,7 +123,8 @@ def _angles(scan: Scan, frame: int, time_s: np.ndarray) -> np.ndarray:
 
 
 def _angle_table(scan: Scan, kinematics: EncoderTable | SpeedRamp) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the encoder's table, or a speed ramp sampled until straight pieces follow it to a nanoradian."""
+    """Returns times (T,) in s and angles (T,) in rad: the encoder's, or samples of a speed ramp, between which linear
+    interpolation is exact to a nanoradian, up to 500,000 samples."""
     if isinstance(kinematics, EncoderTable):
         return kinematics.time_s, kinematics.angle_rad_table
     first_s, last_s = float(np.min(scan.frame_start_s)), float(np.max(scan.frame_start_s)) + scan.shutter.span_s
@@ -143,7 +145,7 @@ def _read_table_times(source: Hdf5Source, address: str) -> np.ndarray:
 
 
 def _sense(source: Hdf5Source, address: str, absent: float) -> float:
-    """Returns +1 where the angle is the gantry's, −1 where it is the sample's."""
+    """Returns +1 where the attribute "rotates" of an angle says gantry, −1 for sample; ``absent`` without the attribute."""
     rotates = h5.read_attribute(source, address, "rotates")
     if rotates is None:
         return absent
@@ -153,7 +155,7 @@ def _sense(source: Hdf5Source, address: str, absent: float) -> float:
 
 
 def _warn_if_apart(source: Hdf5Source, address: str, table_rad: np.ndarray, first_rad: np.ndarray) -> None:
-    """Warns of a table that contradicts rotation_angle, as with a wrong sense of rotation. The table is used."""
+    """Warns of table angles more than 5° from rotation_angle, as of a wrong sense of rotation. The table is used."""
     apart_rad = np.abs((table_rad - first_rad + np.pi) % (2 * np.pi) - np.pi)
     if apart_rad.max() > _SUSPECT_RAD:
         text = "%s: up to %.3g° from rotation_angle; the table is used"
@@ -161,8 +163,8 @@ def _warn_if_apart(source: Hdf5Source, address: str, table_rad: np.ndarray, firs
 
 
 def read_gating(source: Hdf5Source, entry: str, used: np.ndarray, middle_s: np.ndarray) -> Gating | None:
-    """Returns the signal or the phases of the projections, whose lines are open about ``middle_s`` (P,); None without them.
-    used (F,): the stored frames that are projections."""
+    """Returns the gating signal or phase of the projections, whose windows are centred at ``middle_s`` (P,); None without.
+    used, bool (F,): the stored frames that are projections. Raises InputError for both, and for equal times."""
     if source.optional_group(f"{entry}/{schema.GATING}") is None:
         return None
     signal, phase = f"{entry}/{schema.SIGNAL}", f"{entry}/{schema.PHASE}"
@@ -180,6 +182,6 @@ def read_gating(source: Hdf5Source, entry: str, used: np.ndarray, middle_s: np.n
 
 
 def write_gating(extra: h5py.Group, gating: Gating, middle_s: np.ndarray) -> None:
-    """Writes the values at the middles of all stored frames ``middle_s`` (F,)."""
+    """Writes the signal, or the phase in cycles, at the middles ``middle_s`` (F,) of all stored frames."""
     group, values = h5.new_group(extra, "gating", "NXcollection"), gating.at(middle_s)
     h5.write_number(group, "phase" if gating.is_phase else "signal", values, "cycle" if gating.is_phase else None)

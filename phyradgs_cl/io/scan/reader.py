@@ -1,4 +1,4 @@
-"""Scan files: a NeXus NXtomo entry in HDF5, read into a Scan of line integrals."""
+"""Reads scan files, a NeXus NXtomo entry in HDF5, into a Scan of line integrals."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -19,13 +19,14 @@ from phyradgs_cl.io.hdf5.datasets import read_values
 from phyradgs_cl.io.hdf5.source import Hdf5Source, open_hdf5
 from phyradgs_cl.io.scan.header import ScanHeader, read_header
 
-LARGEST_LINE_INTEGRAL = 1e6
-# (data (F, v, u), image_key (F,), quantity) -> line integrals (P, v, u) of the projections, bad pixels.
+LARGEST_LINE_INTEGRAL = 1e6  # limit of the size of a line integral in a file
+# (data (F, v, u), image_key (F,), quantity) -> line integrals (P, v, u) of the projections, mask of bad pixels or None.
 ToAttenuation = Callable[[np.ndarray, np.ndarray, str], tuple[np.ndarray, np.ndarray | None]]
 
 
 def read_scan_header(path: str | Path) -> Scan:
-    """Reads and checks everything of a scan file but its large arrays: the projections are zeros that take no memory."""
+    """Reads and checks a scan file except for its large arrays: the projections are zeros that take no memory. Raises
+    InputError as ``read_scan`` does."""
     with open_hdf5(path) as source:
         return read_header(source).scan
 
@@ -48,7 +49,7 @@ def read_scan(path: str | Path, to_attenuation: ToAttenuation, rows: tuple[int, 
             header = replace(header, scan=slab(header.scan, *rows))
         mask = _read_mask(source, header, lines)
         reference = read_reference(source, header.entry) if header.has_reference else None
-        has_states = header.states > 0 and rows is None  # slabs are compared with their part of the reference alone
+        has_states = header.states > 0 and rows is None  # slabs are compared with the reference alone
         moving = read_moving_truth(source, header.entry) if has_states else None
         data = _read_frames(source, header, mask, lines)
     projections, bad = _convert(source.name(f"{header.entry}/{schema.DATA}"), header, data, to_attenuation)
@@ -64,7 +65,7 @@ def read_scan(path: str | Path, to_attenuation: ToAttenuation, rows: tuple[int, 
 
 
 def scan_summary(path: str | Path, sha256: str | None = None) -> dict[str, object]:
-    """Returns facts about a scan file, checked without its pixels. sha256: the file's, where it is known already."""
+    """Returns facts about a scan file by name, and checks all but its pixels. sha256: the file's, if it is known already."""
     with open_hdf5(path) as source:
         header = read_header(source)
     scan, key = header.scan, header.image_key
@@ -87,8 +88,8 @@ def scan_summary(path: str | Path, sha256: str | None = None) -> dict[str, objec
 
 
 def _timing_facts(scan: Scan) -> dict[str, object]:
-    """Returns exposure, readout, blur, and the arcs of the first frame where the gantry has an angle. A scan that stops has
-    no times unless its exposure is stated, since its frames' starts are only their order."""
+    """Returns exposure, readout, blur, and, for a circular orbit, angles and the first frame's arcs in degrees. A
+    stop-and-shoot scan has no times unless its exposure is stated, since its frames' starts only give their order."""
     shutter = scan.shutter
     facts: dict[str, object] = {}
     if scan.is_fly or shutter.exposure_s > 0:
@@ -140,8 +141,8 @@ def _read_mask(source: Hdf5Source, header: ScanHeader, rows: slice | None) -> np
 def _read_frames(
     source: Hdf5Source, header: ScanHeader, mask: np.ndarray | None, rows: slice | None
 ) -> np.ndarray:
-    """Reads all stored frames (F, v, u); InputError for a value that is neither finite nor masked in a frame that is
-    used."""
+    """Reads all stored frames (F, v, u), or their ``rows``. Raises InputError for a value that is neither finite nor masked,
+    except in invalid frames."""
     address = f"{header.entry}/{schema.DATA}"
     data = read_values(source, address, source.dataset(address), rows=rows)
     if data.dtype.kind == "f":

@@ -32,10 +32,10 @@ def write_scan(
     """Writes a scan file, whole or not at all, in place of an existing one. Without ``data`` the line integrals of ``scan``
     are written. ``data``: (F, v, u) float32 or uint16 raw frames with flats and darks, whose ``quantity`` is "attenuation",
     "transmission" or "counts"; image_key (F,): 0 projection, 1 flat, 2 dark, 3 invalid, with as many 0 as ``scan`` has
-    frames. A user's own trajectory becomes a table of poses. Raises: InputError for arguments that contradict each other, or
-    a scan that the format cannot express; OutputError where the file cannot be written."""
+    frames. A user-defined trajectory becomes a table of poses. Raises InputError for arguments that contradict each other,
+    or a scan that the format cannot express; OutputError where the file cannot be written."""
     frames, key = _checked_frames(scan, data, image_key, quantity)
-    if scan.is_fly and scan.shutter.exposure_s == 0 and scan.shutter.readout_s > 0:  # in a file the gantry would stand
+    if scan.is_fly and scan.shutter.exposure_s == 0 and scan.shutter.readout_s > 0:  # would be read as at rest
         remedy = "give the exposure its real length"
         raise InputError("exposure_s", "0 in a fly-scan with a readout", "a time above 0 s", remedy)
     scan = storable(scan)
@@ -101,8 +101,8 @@ def _write_instrument(
 
 
 def _stored_durations(scan: Scan) -> tuple[float, float]:
-    """Returns exposure and readout in s for the file: 0 for a gantry that stops along a pose table, which would be read as
-    moving."""
+    """Returns exposure and readout in s for the file. Both are 0 for a stop-and-shoot scan with a pose table: with an
+    exposure it would be read as a fly-scan."""
     if not scan.is_fly and isinstance(scan.trajectory, PoseTable):
         return 0.0, 0.0
     return scan.shutter.exposure_s, scan.shutter.readout_s
@@ -144,7 +144,7 @@ def _write_links(entry: h5py.Group) -> None:
 
 def copy_with_offset(source: str | Path, target: str | Path, shift_u_mm: float) -> None:
     """Copies a scan file with its panel ``shift_u_mm`` further along u: changes detector_offset, and poses where it has
-    them. InputError for a file that is no scan, OutputError where the copy cannot be written."""
+    them. Raises InputError for a file that is no scan, OutputError where the copy cannot be written."""
     with open_hdf5(source) as opened:
         header = read_header(opened)
         poses = f"{header.entry}/{schema.POSES}/pose"
@@ -159,8 +159,8 @@ def copy_with_offset(source: str | Path, target: str | Path, shift_u_mm: float) 
 
 
 def copy_with_motion(source: str | Path, target: str | Path, scan: Scan) -> None:
-    """Copies a scan file with geometry, timing of lines, trajectory and provenance of ``scan``, which has its frames; equal
-    values are not touched. InputError for a file that is no scan, OutputError where the copy cannot be written."""
+    """Copies a scan file with the geometry, shutter, trajectory and provenance of ``scan``, which has the same frames. Equal
+    values are not touched. Raises InputError for a file that is no scan, OutputError where the copy cannot be written."""
     with open_hdf5(source) as opened:
         header = read_header(opened)
     stated, scan = header.scan, storable(scan)
@@ -192,7 +192,7 @@ def copy_with_motion(source: str | Path, target: str | Path, scan: Scan) -> None
 
 @contextmanager
 def _copied(source: str | Path, target: str | Path, entry: str) -> Iterator[h5py.Group]:
-    """Yields the entry of a copy, with the package's own group; the copy replaces ``target`` after the body."""
+    """Yields the entry of a copy of ``source``, with the group ``EXTRA``. The copy replaces ``target`` after the body."""
     with written_beside(target) as temporary:
         shutil.copyfile(source, temporary)
         with h5py.File(temporary, "r+") as file:

@@ -1,4 +1,4 @@
-"""The volume in 3D as a part of the page: 8-bit voxels in one picture, the Gaussians' centres, and the controls."""
+"""Makes the 3D picture of a page: 8-bit voxels in one PNG, the Gaussians' centres, and the controls."""
 
 import math
 
@@ -10,12 +10,12 @@ from phyradgs_cl.report.images import Window, base64_of, block_means, bytes_of, 
 from phyradgs_cl.report.interactive.viewer import decimals_of, slider
 from phyradgs_cl.report.markup import Markup, element, joined, json_block, number
 
-MOST_EDGE = 128  # voxels along a side
-MOST_TEXT = 2_000_000  # characters of base64, for voxels and centres together
-MOST_CENTRES = 20_000
-MOST_ZOOM = 8
-_TURN_DEG, _TILT_DEG = 325, 20  # with these angles the three marked edges are in front and on the left
-_PATIENCE_MS = 1500  # time that a picture at rest may take
+MOST_EDGE = 128  # limit of the voxels along a side
+MOST_TEXT = 2_000_000  # limit of the characters of base64, for voxels and centres together
+MOST_CENTRES = 20_000  # limit of the Gaussians' centres shown
+MOST_ZOOM = 8  # largest zoom
+_TURN_DEG, _TILT_DEG = 325, 20  # initial angles, which put the three marked edges in front and on the left
+_PATIENCE_MS = 1500  # longest time to draw a picture at rest
 _HELP = (
     "Drag to turn; on a touch screen one finger turns and two fingers tilt and zoom. Keys in the picture: arrows turn and "
     "tilt, + and − zoom, Home resets. Ctrl and the wheel zoom. Black and white are those of the slices."
@@ -25,7 +25,7 @@ _HELP = (
 def space(volume: NDArray[np.floating], grid: Grid, window: Window, gaussians: Gaussians | None) -> Markup | None:
     """Returns a 3D picture of a volume (nz, ny, nx), its controls and the data of the script.
 
-    Returns None for fewer than two voxels along a side. ``window``: that of the result's slices. ``gaussians``: in mm."""
+    Returns None for fewer than two voxels along any side. ``window``: that of the result's slices. ``gaussians``: in mm."""
     if not has_depth(volume):
         return None
     cloud = None if gaussians is None or not gaussians.count else gaussians
@@ -88,7 +88,7 @@ def _controls(threshold: int, cloud: Gaussians | None) -> list[Markup]:
 
 
 def _centres(cloud: Gaussians, grid: Grid) -> dict[str, str]:
-    """Returns evenly chosen centres in base64: places, 16 bit of the box in x, y, z; densities, 8 bit of their range."""
+    """Returns evenly chosen centres in base64: places x, y, z in the box as 16 bits, densities as 8 bits of their range."""
     some = np.unique(np.linspace(0, cloud.count - 1, min(cloud.count, MOST_CENTRES)).round().astype(int))
     low_mm, size_mm = (np.array(three[::-1]) for three in (np.array(grid.box_mm)[:, 0], grid.size_mm))
     share = (cloud.mean[some] - low_mm) / size_mm
@@ -102,7 +102,7 @@ def _centres(cloud: Gaussians, grid: Grid) -> dict[str, str]:
 def _atlas_within(steps: NDArray[np.uint8], most_text: int) -> tuple[str, int]:
     """Returns the slices of steps (nz, ny, nx) side by side as PNG in base64, and how many are in a row.
 
-    Noise does not shrink; it loses its lowest bits until the text is short enough."""
+    Noise compresses badly: voxels lose their lowest bits until the text has at most ``most_text`` characters."""
     nz, ny, nx = steps.shape
     columns = max(1, min(nz, round(math.sqrt(nz * ny / nx))))
     rows = math.ceil(nz / columns)
@@ -118,8 +118,8 @@ def _atlas_within(steps: NDArray[np.uint8], most_text: int) -> tuple[str, int]:
 
 
 def _between(steps: NDArray[np.uint8]) -> int:
-    """Returns the step that best divides steps into two classes: that with the largest variance between them (Otsu, IEEE
-    Transactions on Systems, Man, and Cybernetics 9 (1979) 62)."""
+    """Returns the grey step, from 1 to 255, that divides steps into two classes with the largest variance between them
+    (Otsu, IEEE Transactions on Systems, Man, and Cybernetics 9 (1979) 62)."""
     counts = np.bincount(steps.ravel(), minlength=256).astype(np.float64)
     below, sums = np.cumsum(counts), np.cumsum(counts * np.arange(256))
     above = below[-1] - below

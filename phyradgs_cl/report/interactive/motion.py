@@ -1,5 +1,5 @@
-"""Motion as a part of the page. One picture shows the lines of a fly-scan's frame at their own poses. The other shows an
-object that moves, with its slices at any time of the scan and arrows of the displacement.
+"""Makes the pictures of motion in a page. One shows the lines of a fly-scan's frame at their own poses. The other shows an
+object that moves, by slices at any time of the scan and arrows of the displacement.
 
 The page has the object's voxels once, as in the 3D picture, and its deformation as control points. The script makes the
 states: v(y + w(y, t)), trilinear."""
@@ -18,19 +18,19 @@ from phyradgs_cl.report.markup import Markup, element, joined, json_block, numbe
 from phyradgs_cl.report.scan_charts import box_corners, with_sources
 
 _TIMES = 49  # times at which the scanner's pose is given; the script interpolates between them
-_MOST_LINES = 64
-_FRAME_STEPS = 500  # steps of the slider
+_MOST_LINES = 64  # limit of the detector lines that are drawn
+_FRAME_STEPS = 500  # steps of the slider of a frame's time
 _LOOK_DEG = 125  # angle about the axis from the source to the eye, which is behind the panel and to one side
-_TILT_DEG = 28
+_TILT_DEG = 28  # elevation of the eye
 _FRAME_HELP = (
     "Lines that wait are thin and grey, exposed ones gold, with the rays of the first and the last. A line that has been "
     "read is blue, and stays where the panel was in the middle of its exposure. Drag, or press arrow keys here, to turn."
 )
-MOST_VALUES = 150_000  # values of control points, with 2 bytes each
-_MOST_TIMES = 2000
-_STEPS = 200  # steps of the time's slider
+MOST_VALUES = 150_000  # limit of the numbers in control points, of 2 bytes each
+_MOST_TIMES = 2000  # limit of the times at which the page has weights
+_STEPS = 200  # steps of the slider of the object's time
 _MOST_LENGTH = 10  # largest factor by which arrows are made longer
-_LARGEST = 32767  # largest number of 16 bits
+_LARGEST = 32767  # largest signed number of 16 bits
 _HELP = (
     "An arrow ends where matter is, and begins where the same matter is in the reference volume; black parts have none. "
     "Play, or arrow keys on the slider of the time, go through the scan. A click in a picture moves the other two slices."
@@ -103,8 +103,8 @@ def object_in_motion(
 
 
 def fitting(deformation: Deformation, grid: Grid) -> Deformation:
-    """Returns the deformation with at most ``MOST_VALUES`` numbers. One that has more gets control points at larger
-    distances, where it keeps its values."""
+    """Returns the deformation with at most ``MOST_VALUES`` numbers. One with more is sampled at control points farther
+    apart, at which it keeps its values."""
     spacing_mm = float(np.max(deformation.spacing_mm))
     reduced = deformation
     while reduced.control_mm.size > MOST_VALUES and spacing_mm < 2 * max(grid.size_mm):
@@ -124,7 +124,7 @@ def fitting(deformation: Deformation, grid: Grid) -> Deformation:
 
 
 def _data(deformation: Deformation, grid: Grid, span_s: tuple[float, float]) -> dict[str, object]:
-    """Returns the deformation for the script: control points in 16 bit of each field's largest, axes in x, y, z."""
+    """Returns the deformation for the script: control points as 16 bits of each field's largest value, axes x, y, z."""
     control_mm = deformation.control_mm
     largest_mm = np.abs(control_mm).max(axis=(1, 2, 3, 4))
     units_mm = np.where(largest_mm > 0, largest_mm, 1.0) / _LARGEST

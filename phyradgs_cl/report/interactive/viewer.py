@@ -11,7 +11,7 @@ from phyradgs_cl.report.markup import Markup, element, joined, json_block, numbe
 
 _LAYER_NAMES = {"result": "Result", "truth": "Truth", "difference": "Difference"}
 _MOST_ZOOM = 8
-_BAR = 0.3  # fraction of a picture's width, at most
+_BAR = 0.3  # largest length of the scale bar, as a fraction of a picture's width
 _HELP = (
     "Arrow keys, Page Up and Down, Home and End move a slider. The wheel moves the slice under the pointer, with Ctrl the "
     "zoom. A click in a picture, or dragging, moves the other two slices to that point."
@@ -75,8 +75,8 @@ def stills(planes: list[Plane], of: str, high: float) -> Markup:
 
 
 def picture(plane: Plane, of: str, *, canvases: int = 0, has_lines: bool = False) -> Markup:
-    """Returns a slice with the directions at its edges and a scale bar. Above it lie ``canvases`` for the script, and
-    crossing lines if ``has_lines``."""
+    """Returns a slice with world axes at its edges and a scale bar. On top of it are ``canvases``, a number of them, for the
+    script, and crossing lines if ``has_lines``."""
     width_mm, height_mm = plane.size_mm
     image = element(
         "img", src=data_uri(plane.still),
@@ -93,7 +93,7 @@ def picture(plane: Plane, of: str, *, canvases: int = 0, has_lines: bool = False
 
 
 def place(plane: Plane, k: int) -> str:
-    """Returns the place of the slice ``plane.indices[k]`` in words."""
+    """Returns the position of the slice ``plane.indices[k]`` in words, as "z = 1.5 mm, 17 of 32"."""
     where = number(plane.position_mm(k), plane.step_mm)
     return f"{plane.axis} = {where} mm, {plane.indices[k] + 1} of {plane.count}"
 
