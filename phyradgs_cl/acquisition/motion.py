@@ -5,7 +5,7 @@ On a stop-and-shoot scan every model of this module gives one pose per frame."""
 
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, fields, is_dataclass
+from dataclasses import asdict, dataclass, field, fields, is_dataclass, replace
 from typing import Any, ClassVar, Protocol
 
 import numpy as np
@@ -153,7 +153,7 @@ class PerRow:
         object_voxels = object_mm_per_s * scan.shutter.exposure_s / min(scan.grid.voxel_size_mm)
         fine = max(math.ceil(rim_voxels / _FINE_STEP_VOXELS), math.ceil(object_voxels / _OBJECT_STEP_VOXELS))
         coarse = math.ceil(max(rim_voxels, object_voxels) / _COARSE_STEP_VOXELS)
-        return PerRow(min(max(1, min(fine, _USUAL_TIMES), coarse), _MOST_TIMES))
+        return replace(self, sub_intervals=min(max(1, min(fine, _USUAL_TIMES), coarse), _MOST_TIMES))
 
     def cells(self, scan: Scan, frame: int) -> TimeCells:
         """Returns the ``TimeCells`` of one frame: cells of exposure / sub-intervals each, from first light to last."""

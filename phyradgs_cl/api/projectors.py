@@ -105,7 +105,7 @@ def splat_operator(
 
     Raises InputError for anything but a Scan, for an unknown motion, and for a cutoff out of range."""
     model = _checked(scan, motion, models.RAYS, models.SPLATS)
-    if isinstance(model, PerRow):  # splats cannot weigh the lines of a cell differently: each line gets cells of its own
+    if type(model) is PerRow:  # splats cannot weigh the lines of a cell differently: each line gets cells of its own
         model = OwnTimes(model.of(scan).sub_intervals)
     _check_cutoff(cutoff_sigma)
     rt = runtime_of(device)

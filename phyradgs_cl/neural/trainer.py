@@ -30,7 +30,7 @@ class Trainer:
         self.unit = density_per_mm * scan.grid.half_longest_mm  # unit of line integrals
         self.rng = np.random.default_rng(seed)
         motion = options.motion
-        if isinstance(motion, PerRow):  # the field evaluates single rays, so common times would save nothing
+        if type(motion) is PerRow:  # the field evaluates single rays, so common times would save nothing
             motion = OwnTimes(motion.of(scan).sub_intervals)
         tables = [motion.cells(scan, frame).still() for frame in range(scan.frames)]
         self.rays = [rays.ExposureRays.of_cells(table, scan.grid) for table in tables]

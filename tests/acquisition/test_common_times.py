@@ -1,15 +1,20 @@
 """Cells on one grid of times for all lines: shares, ends, and how exactly they stand for many times of each line."""
 
+from dataclasses import dataclass, field
+
 import numpy as np
 import pytest
 from ray_tables import noise
 from tolerances import COMMON_TIMES
 
-from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, ConstantSpeed, EncoderTable, Shutter
+from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, ConstantSpeed, EncoderTable, PerRow, Shutter
 from phyradgs_cl.acquisition.cells import common_time_cells, per_line_cells
+from phyradgs_cl.acquisition.motion import with_times
 from phyradgs_cl.acquisition.time_cells import TimeCells
+from phyradgs_cl.api import simulate
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.operators import IntensityOperator, RayOperator
+from phyradgs_cl.reconstructors.voxels.fista import _few_times
 from phyradgs_cl.runtime import Runtime
 
 GEOMETRY = ConeGeometry(500.0, 800.0, (24, 20), (4.0, 4.0))
@@ -85,3 +90,14 @@ def test_no_time_is_beyond_the_scan() -> None:
 def test_lines_with_nothing_to_share_have_times_of_their_own(shutter, samples) -> None:
     table = cells(shutter)
     assert table.line_share is None and table.count == 24 * samples
+
+
+def test_a_model_keeps_its_class_with_as_many_times_as_a_scan_needs() -> None:
+    @dataclass(frozen=True)
+    class Late(PerRow):
+        name: str = field(default="late", init=False, repr=False)
+
+    fly = simulate("spheres", size=16, views=3, exposure_deg=40.0)
+    timed = with_times(Late(), fly)
+    assert type(timed) is Late and timed.sub_intervals == with_times(PerRow(), fly).sub_intervals > 2
+    assert type(_few_times(timed)) is Late and _few_times(timed).sub_intervals == 2

@@ -217,8 +217,9 @@ def fista_stages(run: MethodRun, now: Callable[[], MethodRun]) -> list[Stage]:
 
 def _few_times(motion: Motion) -> Motion:
     """Returns the model with a third of its times: coarse passes only bring a first volume."""
-    times = motion.sub_intervals if isinstance(motion, PerRow) else 0
-    return PerRow(max(2, math.ceil(_COARSE_TIMES * times))) if times > 2 else motion
+    if not isinstance(motion, PerRow) or motion.sub_intervals <= 2:
+        return motion
+    return replace(motion, sub_intervals=max(2, math.ceil(_COARSE_TIMES * motion.sub_intervals)))
 
 
 def fista_passes(
