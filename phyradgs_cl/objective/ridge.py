@@ -17,9 +17,9 @@ from phyradgs_cl.runtime.layout import GUARD, Strides, beside, brought_to, move,
 
 EDGE = 5
 """The number of voxels along a side of a filter."""
-_SAMPLES = 200  # time for a voxel, in samples of a ray, at most
+_SAMPLES = 200  # upper limit of the time of one voxel in one launch, in samples of a ray; it sets the size of launches
 _SLICES = 2  # slices of channels and responses that are computed at a time
-_RING = _SLICES + 2  # slices in memory: a correlation needs three
+_RING = _SLICES + 2  # slices in memory: the correlation of two slices needs one more on either side
 
 
 @dataclass(frozen=True, eq=False)
