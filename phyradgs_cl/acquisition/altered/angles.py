@@ -4,7 +4,7 @@ import numpy as np
 
 from phyradgs_cl.acquisition.scan import Scan
 
-_ACROSS = 1e-3  # largest cosine between a ray and the axis at which the ray counts as across the axis
+_ACROSS = 1e-3  # upper limit of the cosine between a ray and the axis for a ray that counts as perpendicular to the axis
 
 
 def azimuth_rad(pose: np.ndarray) -> np.ndarray:

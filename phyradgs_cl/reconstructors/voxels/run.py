@@ -22,7 +22,8 @@ from phyradgs_cl.reconstructors.voxels.system import System
 from phyradgs_cl.runtime import Runtime
 
 MOST_ITERATIONS = 1_000_000
-_SYSTEM_FRAMES = 6  # stacks of frames: measurement, mask, transmission, and the intermediate results of one residual
+# number of stacks of all frames that a system holds: measurement, mask, transmission, and those of computing a residual
+_SYSTEM_FRAMES = 6
 
 
 @dataclass(frozen=True)
