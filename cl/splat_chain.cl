@@ -7,7 +7,7 @@
 
 #if MOVING
 #define TURNED 4 /* numbers of the record that give S: d(along, across)/d(u, v) */
-#define POSES 3
+#define POSES 3  /* poses of a cell, as in splat_prepare.cl */
 #else
 #define TURNED 0
 #define POSES (1 + FIXED_CONIC)

@@ -24,8 +24,8 @@ Sides = tuple[int, ...]
 
 LANE_CHOICES = (1, 4, 8, 16)
 _FUSING, _PAIRS = "-cl-mad-enable", '#line 1 "common/precise.h"'
-_TILE_ITEMS = 256  # items in a work-group that shares local memory
-_FEWEST_ITEMS = 32  # items that a kernel must be able to run in one group
+_TILE_ITEMS = 256  # most work-items of a work-group that shares a tile
+_FEWEST_ITEMS = 32  # least number of work-items that a kernel must be able to run in one work-group
 
 
 class Runtime:
