@@ -14,7 +14,7 @@ Box = tuple[slice, slice, slice]
 Point = tuple[float, float, float]
 
 FAR = np.float32(4.0)  # a distance larger than any inside the cube
-_REACH = 5.0  # distance in blend widths from which a body no longer counts in a union (exp(-5) = 0.7 %)
+_REACH = 5.0  # distance in blend widths beyond which a body no longer counts in a union (exp(-5) = 0.7 %)
 
 
 @dataclass(frozen=True)

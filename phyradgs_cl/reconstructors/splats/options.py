@@ -13,8 +13,9 @@ from phyradgs_cl.operators import DEFAULT_CUTOFF_SIGMA
 from phyradgs_cl.optim import PUBLISHED_RATES, DensityControl, Rates
 from phyradgs_cl.text import repr_of_changes
 
-# share of the coarse iterations with one pose per frame; time error of the rest (docs/results/motion_models.md)
-_STATIC_SHARE, _COARSE_ERROR = 0.4, 0.1
+# The next two are settings of the iterations before ``exact_from`` (docs/results/motion_models.md).
+_STATIC_SHARE = 0.4  # fraction of these iterations with one pose per frame
+_COARSE_ERROR = 0.1  # least time_error of the others
 
 
 @dataclass(frozen=True, repr=False)
