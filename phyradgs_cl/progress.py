@@ -11,7 +11,7 @@ from phyradgs_cl.text import clock
 
 _OVER = "\r\x1b[K"  # clears the line
 _TERMINAL_EVERY_S = 0.2  # least time between two lines on a terminal
-_ELSEWHERE_EVERY_S = 10.0  # the same in a file or pipe
+_ELSEWHERE_EVERY_S = 10.0  # least time between two lines in a file or pipe
 
 
 def has_reader() -> bool:

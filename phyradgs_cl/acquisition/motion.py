@@ -23,11 +23,11 @@ from phyradgs_cl.fields import Deformation
 
 RAYS, SPLATS, LINE_POSES = "rays", "splats", "one pose per line"
 """The kinds of operator: ray projectors, splat projectors, and filtered backprojection."""
-_USUAL_TIMES = 6  # most times per exposure that ``PerRow`` chooses by the two fine steps below
-_MOST_TIMES = 100  # most times per exposure that ``PerRow`` chooses at all, by the coarse step
+_USUAL_TIMES = 6  # most times per exposure that ``PerRow`` chooses for usual motion, by the two fine steps below
+_MOST_TIMES = 100  # most times per exposure that ``PerRow`` chooses for fast motion, by the coarse step below
 _FINE_STEP_VOXELS = 0.3  # travel of the volume's rim, in voxels, for which ``PerRow`` takes one time
-_OBJECT_STEP_VOXELS = 0.7  # the same for the object's fastest part: the rest of it travels less
-_COARSE_STEP_VOXELS = 3.6  # the same for the faster of the two, where it travels too far for _USUAL_TIMES
+_OBJECT_STEP_VOXELS = 0.7  # travel of the object's fastest part, in voxels, for one time: the rest of it travels less
+_COARSE_STEP_VOXELS = 3.6  # travel of rim or object, in voxels, for one time where _USUAL_TIMES are too few
 _WEIGHT_TOLERANCE = 1e-3  # largest difference from 1 of the sum of a line's weights in a user-defined model
 
 

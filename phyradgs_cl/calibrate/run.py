@@ -61,7 +61,7 @@ STAGES = (
 )
 BEAD_STAGES = (Stage(48, first=8, again=4, steps=6, project=0), Stage(128, first=6, again=4, steps=6, project=0))
 _FEWEST_FRAMES = 8  # least number of frames of a scan
-_FEWEST_COLUMNS = 12  # least number of its columns
+_FEWEST_COLUMNS = 12  # least number of columns of a scan
 _FEWEST_SPLINES = 4  # least number of splines of a wobble: a cubic spline needs four
 # least fraction of the frames' squares that a phantom in its best place explains, before any correction
 _LEAST_EXPLAINED = 0.3

@@ -25,10 +25,11 @@ from phyradgs_cl.calibrate.stages import Stage
 
 # A parameter is determined only if object and other parameters leave at least this fraction of its signal unexplained.
 LEAST_SHARE = 0.2
-LEAST_SHARE_OF_BEADS = 0.02  # the same for a known object, which has no voxels that explain signals by accident
+# the least unexplained fraction for a known object (beads), which has no voxels that explain signals by accident
+LEAST_SHARE_OF_BEADS = 0.02
 _TINY = 1e-9  # number that is added to the diagonal of a matrix before its inverse
 _GAUGE_FACTOR = 2.0  # a parameter's unexplained fraction has to be at least this many times that of its gauge (``GAUGES``)
-_MOST_GAUGE = 0.2  # upper limit of the gauge's unexplained fraction in that rule, as it is large in a wrong geometry
+_MOST_GAUGE = 0.2  # upper limit at which a gauge's unexplained fraction counts: it is large in a wrong geometry
 DEVIATIONS = 3.0  # a parameter is corrected if it differs from its stated value by more standard deviations
 _MOST_PX = 2.0  # largest step of a parameter, in coarse pixels at the image's edge: signals are not linear beyond
 _SETTLED = 0.1  # steps on a grid end when all are smaller than this many standard deviations

@@ -25,7 +25,7 @@ _JUMP = 0.75  # difference of neighbouring pixels' transmissions, over the brigh
 _MOST_JUMPS = 5e-4  # largest fraction of all pixels that may jump without a finding
 _MOST_DEAD = 2e-4  # largest fraction of all pixels that may be dead without a finding
 _LARGEST_DRIFT = 0.015  # largest relative change of the gain over the scan without a finding
-_DRIFT_DEVIATIONS = 5.0  # a larger change is a finding only beyond this many of its standard deviations
+_DRIFT_DEVIATIONS = 5.0  # a change of the gain is a finding only beyond this many of its standard deviations
 _FEWEST_FRAMES = 8  # least number of frames in which a drift can be seen
 
 

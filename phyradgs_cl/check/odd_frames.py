@@ -24,7 +24,8 @@ _OUTLIER = 4.0  # an outlier's residual is at least this many times the frames' 
 # An arc's first and last frame fit about equally badly where their residuals differ by less than this factor: right frames
 # had at most 1.4, one odd frame at least 2.3.
 _ALIKE = 1.7
-# upper limit of such a frame's residual over that in a random order: right frames had 0.2, odd ones mostly 0.3
+# Such a first or last frame is kept only with a residual below this fraction of that in a random order: right frames had
+# 0.2, odd ones mostly 0.3.
 _AT_BOTH_ENDS = 0.25
 _MOST_OUTLIERS = 0.2  # from this fraction of the frames on, the cause is common to all, and no frame counts as an outlier
 _EXCHANGED = 0.5  # two frames were exchanged where the opposite order leaves less than this fraction of the squared residual

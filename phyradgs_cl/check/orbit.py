@@ -38,17 +38,17 @@ OTHER_CAUSE = "pixels, if pixel sizes are right"  # unit of an offset that wrong
 UNVERIFIED = "neither pixel sizes nor distances are verified by these frames"
 _ERRORS = 4.0  # least difference of two hypotheses in standard errors; below it the answer is "cannot tell"
 _SIGN_RATIO = 1.2  # least ratio of both senses' squared residuals that decides on the sense of rotation
-_CLEAR_RATIO = 3.0  # from this ratio on, in rough fits, no refined shifts of the panel are needed
+_CLEAR_RATIO = 3.0  # ratio of both senses' squared residuals in rough fits from which no refined shifts are needed
 _TOLERATED_PX = 1 / 3  # shift of the panel in pixels that is always tolerated
 _DEVIATIONS = 4.0  # shift of the panel that is always tolerated, in standard deviations of the found shift
 _BIAS_FULL_TURN = 0.003  # measured error of the axis in coarse pixels, for coarse scans of a full turn
-_BIAS_HALF_TURN = 0.04  # the same for less than a full turn, or where some rays are measured once
+_BIAS_HALF_TURN = 0.04  # measured error of the axis in coarse pixels, where some rays are measured only once
 _WHOLE_PIXELS = 2  # "ok" needs a tolerance of at most this many pixels, where the shift is found without coarse pixels
 _LEAST_REDUNDANCY = 0.1  # lower limit of the assumed fraction of columns seen twice, for a panel with the axis at its edge
 _NO_SIGN = "parallel rays show an object that turns one way and its mirror image that turns the other way alike"
 _SIGN_ADVICE = "look for a feature whose side is known: a mirror image would fit as well"
 _OTHER_SIZES = (0.8, 1.25)  # factors on the fan; distances are "ok" where both fit worse than the stated fan
-_SIZE_RATIO = 1.05  # least ratio of squared residuals, of these fans to the stated one, that counts as worse
+_SIZE_RATIO = 1.05  # another fan fits worse from this ratio of its squared residual to the stated fan's
 
 
 @dataclass(frozen=True, eq=False)

@@ -17,8 +17,10 @@ READOUT, EXPOSURE = "sign of readout", "exposure"
 _ERRORS = 4.0  # least difference of two hypotheses in standard errors
 # least ratio of squared residuals that decides between the two orders of readout; both models are equally free
 _ORDER_RATIO = 1.04
-_OTHER_RATIO = 1.5  # the same ratio for another readout axis or readout time
-_REST_RATIO = 2.0  # the same for a gantry at rest: a model without blur fits better in any case, above all with few views
+_OTHER_RATIO = 1.5  # least ratio of squared residuals that decides for another readout axis or readout time
+# least ratio of squared residuals that decides for a gantry at rest: a model without blur fits better in any case, above
+# all with few views
+_REST_RATIO = 2.0
 _AS_GOOD = 1.15  # readouts with up to this many times the best one's squared residual are named beside it
 _READOUT_SHARE = 0.86  # readout time tried where none is stated, as a fraction of the time between frames
 _OTHER_WAY, _AT_REST = "the other way", "all at once, the gantry at rest"

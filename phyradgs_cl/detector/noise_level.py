@@ -24,7 +24,7 @@ _SAME = 1e-3  # largest relative difference between a flat and the projections' 
 _MOST_FRAMES = 8  # most frames that are searched for noise
 _LONGEST_EDGE = 1024  # longest side in pixels of the middle part of a frame that is searched for noise
 _ROUNDING = 0.5  # largest estimate of noise in counts that counts as none
-_RELATIVE = 2e-5  # the same as a fraction of the ceiling
+_RELATIVE = 2e-5  # largest estimate of noise, as a fraction of the ceiling, that counts as none
 # least ratio of two estimates of noise, along both axes and along rows: they agree for white noise and differ by far for
 # smooth structure
 _WHITE = 0.5

@@ -60,7 +60,7 @@ class StoredTiming:
     start_s: np.ndarray | None = None
     axis: str | None = None
     direction: int | None = None
-    pulse: tuple[float, float] | None = None  # in exposures, as the scanner's TOML gives it
+    pulse: tuple[float, float] | None = None  # start and length of the beam's pulse, as fractions of the exposure
     angle_at: str | None = None
     written: tuple[str, ...] = ()
 

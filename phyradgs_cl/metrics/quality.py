@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 Floats = NDArray[np.floating]
 WINDOW = 11  # side of SSIM's window in voxels
-SIGMA = 1.5  # standard deviation of its Gaussian weights in voxels
+SIGMA = 1.5  # standard deviation of the Gaussian weights in SSIM's window, in voxels
 K1, K2 = 0.01, 0.03  # SSIM's constants for means and for variances, as fractions of the data range (Wang et al. 2004)
 _VOXELS_PER_BATCH = 1 << 20  # voxels compared at a time: about ten float64 arrays of this size exist at once, 80 MB
 _EDGE = 0.25  # motions are compared at voxels with at least this fraction of the steepest slope, where they can be seen

@@ -65,7 +65,7 @@ class RidgeStep:
     """The step for volumes of a fixed ``shape`` (z, y, x). It does not change a volume thinner than a filter."""
 
     VOLUMES = 4
-    """How many volumes of floats it holds in memory, for 50 slices or more of 64 voxels in a row or more."""
+    """Most volumes of floats that a step holds in memory, for at least 50 slices with rows of at least 64 voxels."""
 
     def __init__(self, rt: Runtime, shape: tuple[int, int, int], ridge: Ridge) -> None:
         self.rt, self.shape = rt, shape

@@ -129,8 +129,10 @@ def _steps(axis_weights: tuple[float, ...]) -> tuple[float, float]:
     return (in_space / 2, 1 / (8 * time[0] ** 2)) if any(time) else (in_space, 0.0)
 
 
-_SMALLEST = 1e-6  # number over the volume's RMS that is added to the length of differences, which is 0 in flat regions
-_NOTHING = 1e-30  # lower limit of that number in 1/mm, for a volume of zeros
+# Addend to the length of differences, which is 0 in flat regions, before TV's gradient divides by it: _SMALLEST times the
+# volume's RMS, or _NOTHING, in 1/mm, for a volume of zeros.
+_SMALLEST = 1e-6
+_NOTHING = 1e-30
 
 
 class TvDescent:

@@ -40,8 +40,8 @@ PUBLISHED_RATES = Rates(
 )
 
 
-BETA1, BETA2 = 0.9, 0.999  # decay rates of the first and second moments
-EPSILON = 1e-15  # addend to the root of the second moments in the denominator
+BETA1, BETA2 = 0.9, 0.999  # Adam's decay rates of the first and second moments
+EPSILON = 1e-15  # Adam's addend to the root of the second moments, before the division by it
 
 
 def folded_rates(rates: np.ndarray, step: int) -> np.ndarray:

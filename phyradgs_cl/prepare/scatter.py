@@ -30,13 +30,13 @@ _SHADOW = 0.1  # pixels above this fraction of the largest line integral lie beh
 _FITTED_FRAMES = 24  # most frames, evenly spread, to which heights are fitted
 _USUAL_REACH = 0.18  # default standard deviation, as in _REACHES, where the user states only to_primary
 _HEIGHT_STEP = 1.25  # factor from one tried height of the kernel to the next
-_MOST_STEPS = 8  # most heights tried with that factor
+_MOST_STEPS = 8  # most heights of the kernel that are tried one after the other
 _TRIALS = 6  # most heights tried in the search between the best height's neighbours
 # the raised kernel is taken only if it leaves less than this fraction of the fitted kernel's unexplained rest
 _BETTER = 0.65
 _AS_WELL = 1.05  # heights are raised until the unexplained rest exceeds this many times the least so far
 _LARGEST_HEIGHT = 20.0  # upper end of the bisection for the kernel's height that gives a stated to_primary
-_BISECTIONS = 20  # halvings in that bisection
+_BISECTIONS = 20  # number of steps of the bisection for the height
 
 
 @dataclass(frozen=True)

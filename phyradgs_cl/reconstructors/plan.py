@@ -24,7 +24,7 @@ from phyradgs_cl.text import suggest_name
 _COUNTS = tuple(dict.fromkeys(f.name for model in MODELS for f in fields(model) if f.init))
 """The fields of motion models, by which options name them."""
 _ALL = motions_for(RAYS, SPLATS)  # for the user's own methods
-LARGEST_SEED = 2**63
+LARGEST_SEED = 2**63  # upper limit of the option ``seed``
 _DECIMALS = 6  # decimals of mm and s in a run's identity: a scan that went through a file is still the same scan
 _SUBJECT = "--object-motion"
 _MOST_VOXELS = 24  # most voxels along each side of the grid on which a deformation is checked

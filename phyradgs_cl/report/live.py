@@ -87,7 +87,7 @@ class Status:
     progress: Progress | None = None
     points: tuple[tuple[int, float], ...] = ()
     first: tuple[int, float] = (0, 0.0)
-    """Iteration and time of the first report in the present count."""
+    """Iteration, and time in s, of the present stage's first report, from which the rest of its time is estimated."""
     reported: float = 0.0
     snapshot: Snapshot | None = None
 

@@ -40,7 +40,8 @@ class Runtime:
     - ranks: the processes that work on the same scan, each with its own Runtime. Where a machine has several devices, each
       rank takes the next device."""
 
-    most_samples = 2**29  # per GPU launch: a display driver kills launches of seconds; this takes 0.1 s on a slow GPU
+    # Most samples of rays in one GPU launch: a display driver kills launches of seconds; this takes 0.1 s on a slow GPU.
+    most_samples = 2**29
 
     def __init__(
         self, device: str | None = None, *, lanes: int | None = None, fp64: bool | None = None,

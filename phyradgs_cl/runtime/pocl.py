@@ -47,7 +47,7 @@ _LIBRARIES = (
 """Flags of /proc/cpuinfo by which PoCL chooses a library, and the processor for which this library was compiled."""
 _OLDEST_TARGET = "athlon64"
 THREADS_VARIABLE = "POCL_MAX_PTHREAD_COUNT"
-_MOST_THREADS = 1024
+_MOST_THREADS = 1024  # largest number of threads that POCL_MAX_PTHREAD_COUNT may state
 _NO_CACHE_VARIABLE = "PYOPENCL_NO_CACHE"
 _unusable: tuple[Path, str] | None = None
 _kept_alive: list[ctypes.Array[ctypes.c_char]] = []

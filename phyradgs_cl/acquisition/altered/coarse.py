@@ -14,7 +14,7 @@ from phyradgs_cl.fields import Grid
 
 MOST_FRAMES = 60  # most frames of a coarse scan
 QUICK_COLUMNS = 20  # most blocks of pixels along the detector's longer side in quick searches
-FINE_COLUMNS = 32  # the same in fine searches
+FINE_COLUMNS = 32  # most blocks of pixels along the detector's longer side in fine searches
 SMOOTHING = 0.8  # standard deviation of the Gaussian that smooths frames before binning, in blocks
 _LEAST_VALID = 0.5  # a block with a smaller fraction of valid pixels is masked
 _MOST_VOXELS = 64  # most voxels along the longest side of the grid's box, without the margin

@@ -19,7 +19,7 @@ from phyradgs_cl.acquisition.trajectory import (
 from phyradgs_cl.errors import InputError
 
 log = logging.getLogger(__name__)
-_UNEVEN = 0.01  # upper limit of the range of the intervals between frames, as a fraction of their mean, for even intervals
+_UNEVEN = 0.01  # intervals between frames are uneven where their range exceeds this fraction of their mean
 
 
 def sum_frames(

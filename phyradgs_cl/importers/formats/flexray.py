@@ -27,7 +27,7 @@ _NAMES = (
     *("Exposure time (ms)", "Number of averages"),
 )
 _WHOLE_MIDDLE = (971, 767)  # (column, row) of the middle of the panel without binning
-_WHOLE_PITCH_MM = 0.0748  # pitch of its pixels
+_WHOLE_PITCH_MM = 0.0748  # pitch of the pixels of the panel without binning
 
 
 def recognises(path: Path) -> bool:

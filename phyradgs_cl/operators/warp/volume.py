@@ -39,7 +39,7 @@ class VolumeWarp:
         self.stack = FrameStack(rt, self.kernel("add_frames"))
         self._reaches: dict[int, tuple[DeviceArray, DeviceArray]] = {}
 
-    volumes = 4  # that it holds besides the fields, at most
+    volumes = 4  # most volumes on the device, besides the displacement fields
 
     def is_still(self, state: int) -> bool:
         """Whether W_k is the identity."""

@@ -16,7 +16,7 @@ from phyradgs_cl.reconstructors.fits.residuals import fit_squares, vertex
 from phyradgs_cl.runtime import Runtime
 
 _ROUGH_SHIFTS = (-2.0, -1.0, 0.0, 1.0, 2.0)  # first trial shifts, in coarse pixels
-_ROUGH_ITERATIONS = 8  # iterations of the fit for each of these shifts
+_ROUGH_ITERATIONS = 8  # number of iterations of the fit for each trial shift
 _STEP = 0.25  # distance between neighbouring trial shifts around the best, in coarse pixels
 _MOST_STEPS = 8  # most moves to a better centre of three trial shifts
 ANYWHERE = (-math.inf, math.inf)  # limits of the shift in pixels: none
@@ -30,7 +30,7 @@ _CORRELATED_PX = 2 * math.sqrt(math.pi) * _SMOOTHING_PX  # columns of smoothed n
 _LEAST_OVERLAP = 0.25  # least overlap of a view and its mirrored opposite, as a fraction of the columns
 _LEAST_ENERGY = 0.2  # least sum of squares in an overlap, as a fraction of the largest over all shifts
 _STEPS = 12  # most Gauss–Newton steps
-_SETTLED_PX = 1e-3  # a step shorter than this ends them
+_SETTLED_PX = 1e-3  # Gauss–Newton ends after a step shorter than this, in pixels
 _BIAS_PX = 0.02  # standard error of a shift in pixels because views are interpolated between their neighbours
 
 

@@ -42,16 +42,16 @@ from phyradgs_cl.reconstructors.voxels.stages import Stage, Stages
 from phyradgs_cl.runtime import Runtime
 
 _MOST_COLUMNS = 64  # most blocks of pixels along the longer side of the panel in the coarse scan
-_MOST_VOXELS = 32  # most voxels along the longest side of its grid
+_MOST_VOXELS = 32  # most voxels along the longest side of the coarse scan's grid
 _MOST_FRAMES = 600  # most frames of the coarse scan, or more: one for every knot of the signal
 _TIMES_PER_PERIOD = 12  # least number of times per period of the motion at which exposures see the object …
 _MOST_TIMES = 6  # … with at most this many in one exposure
 _FIRST_PASSES = 8  # passes of fista before the first round, with the object at rest
 _PASSES = 3  # passes of fista in each round
-_WEIGHT = 0.42  # prior weight of these passes
-_TV_ITERATIONS = 5  # TV iterations of each of these passes
+_WEIGHT = 0.42  # prior weight of the passes of fista
+_TV_ITERATIONS = 5  # TV iterations of each pass of fista
 _COARSE_SPACINGS = 2  # number of spacings of control points along the box's longest side, in the first rounds
-_FINE_SPACINGS = 4  # the same in the last rounds
+_FINE_SPACINGS = 4  # number of spacings of control points along the box's longest side, in the last rounds
 # factor on the bending weight γ for finer control points: the field then is as stiff in mm as before
 _FINE_BENDING = (_FINE_SPACINGS / _COARSE_SPACINGS) ** 4
 _COARSE_SHARE = 0.6  # fraction of the rounds with coarse control points

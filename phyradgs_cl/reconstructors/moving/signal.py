@@ -21,7 +21,7 @@ _STRETCH = 0.02  # weight of squared first differences in the bending energy: a 
 _HARMONICS = 6  # number of harmonics of the gantry's angle that are removed: an object at rest explains them
 _FEWEST_CYCLES = 5  # least number of cycles in the scan: slower motion is taken as free in time
 _BAND = 0.25  # half width of the band about the dominant rate, over that rate: breaths differ in length
-# A signal repeats where at least this fraction of its power lies in that band, beyond what white noise has there.
+# A signal repeats where at least this fraction of its power lies in the band, beyond what white noise has there.
 _PERIODIC_SHARE = 0.5
 _FEWEST_FRAMES = 16  # least number of frames of a scan in which a period is sought
 _FEWEST = 4  # least number of values in a file

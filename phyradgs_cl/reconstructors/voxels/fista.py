@@ -41,10 +41,10 @@ _VOLUMES = 16  # number of volumes in memory at one time, with the prior ``dct``
 _FRAMES = 3  # number of stacks of all frames in memory at one time
 _HELD = 9  # number of volumes that ``dct`` holds on the device
 _COPIES = 2  # number of further volumes on the device while a prior maps a volume of the host
-# The next three are settings of the passes before those on smaller voxels, measured in docs/results/settings.md.
-_COARSE_PASSES = 0.6  # number of these passes over that of all passes
-_COARSE_SUBSETS = 1.6  # number of subsets over the option ``subsets``
-_COARSE_TIMES = 1 / 3  # number of times in an exposure over that of the other passes, but two at least
+# Settings of the coarse passes, those before the passes on smaller voxels, measured in docs/results/settings.md.
+_COARSE_PASSES = 0.6  # fraction of all passes that are coarse
+_COARSE_SUBSETS = 1.6  # number of subsets in coarse passes, over the option ``subsets``
+_COARSE_TIMES = 1 / 3  # number of times per exposure in coarse passes over that in others, but two at least
 _FAINTEST = 1e-6  # row sums of AᵀA below this fraction of the largest count as that large in the bound
 # Voxels are divided in grids whose slices (y, x) have at most this many voxels: it is worth its time at 64³, not at 128³.
 # The height does not count, so that every slab is treated alike.

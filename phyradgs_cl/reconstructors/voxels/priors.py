@@ -35,17 +35,17 @@ _TV_ALONE = 1.6  # weight of TV in the prior ``tv``
 _TV_BEFORE_DCT = 0.8  # weight of TV in ``dct``
 _DCT = 1.5  # threshold of the block cosine transforms in ``dct``
 _TV_AT_REST = 0.5  # weight of TV before ridge steps, for scans that stop for each projection
-_DCT_AT_REST = 1.35  # threshold of the block cosine transforms in the same case
+_DCT_AT_REST = 1.35  # threshold of the block cosine transforms before ridge steps, for scans that stop for each projection
 _RIDGE_NOISE = 17.0  # noise that a ridge step assumes, over the prior's weight, for fly-scans
-_RIDGE_NOISE_AT_REST = 20.0  # the same for scans that stop
+_RIDGE_NOISE_AT_REST = 20.0  # noise that a ridge step assumes, over the prior's weight, for scans that stop
 _RIDGE_LENGTH = 0.5  # factor on the regulariser's gradient in a ridge step
 _RIDGE_EVERY = 4  # number of maps of the other prior for each ridge step
 # noise of line integrals for which _TV_AT_REST and _RIDGE_NOISE_AT_REST hold; they follow the sixth root of the scan's noise
 _USUAL_NOISE = 0.01
-_LEAST_NOISE = 0.001  # lower limit of the noise of line integrals that these two follow
+_LEAST_NOISE = 0.001  # lower limit of the scan's noise of line integrals in that sixth root
 _LEAST_NOISE_SHARE = 0.1  # lower limit of noise_share (``Prior``) in ridge steps, for scans without noise
 _SUBVOXELS = 2 / 3  # weight of the smaller voxels in the result, whose rest is the volume of the passes before
-_SUBVOXELS_WITH_RIDGE = 0.85  # the same with the prior ``ridge``
+_SUBVOXELS_WITH_RIDGE = 0.85  # weight of the smaller voxels in the result with the prior ``ridge``
 
 
 @dataclass(frozen=True)
@@ -157,10 +157,10 @@ class Prior:
     A subclass that starts from its last result keeps it in ``state``. This class is the prior none: x ≥ 0 alone."""
 
     VOLUMES: ClassVar[int] = 0
-    """How many more volumes the prior holds than ``dct``."""
+    """Number of volumes that the prior holds in memory beyond those of ``dct``."""
 
     noise_share = 1.0
-    """The share of noise in the weights of the present pass; the error of voxels at edges is the rest."""
+    """Fraction, 0 to 1, of the present pass's weight that stands for noise; the rest stands for errors at voxels' edges."""
 
     def __call__(self, space: Space[Any], volume: Any, weight: float, *, nonnegative: bool) -> Any:
         """Maps a volume (nz, ny, nx) of ``space``; ``weight`` in 1/mm."""
