@@ -37,7 +37,7 @@ from phyradgs_cl.runtime.layout import pad_rows, pitch_of, unpad_rows
 # Upper limits of the difference from float64 twins, over the largest number: of values, and of gradients. Float32 leaves a
 # tenth of them in tests.
 VALUE, GRADIENT = 1e-4, 1e-3
-_GRIDDED = 5e-3  # upper limit of that difference where an inverse is computed from a field's values at voxels
+_GRIDDED = 5e-3  # upper limit of the difference where an inverse is computed from a field's values at voxels
 SHAPE, GRID = (9, 12), Grid((5, 7, 6), (0.3, 0.24, 0.28), (0.1, -0.05, 0.1))
 GEOMETRY = ConeGeometry(5.0, 7.5, SHAPE, (3.9 / 9, 4.1 / 12), (0.1, 0.2))
 ORBIT = CircularOrbit(GEOMETRY, ConstantSpeed(0.3, 0.5))

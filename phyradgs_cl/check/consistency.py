@@ -34,10 +34,9 @@ _FEWEST_PIXELS = 32  # scans with fewer valid coarse pixels per frame cannot be 
 _CLEAR = 0.5  # a hypothesis must leave less than this fraction of the stated scan's squared residual
 _NEARLY = 1.5  # rough fits with up to this many times the least mean squared residual are refined
 _ERRORS = 4.0  # least advantage of a hypothesis over the stated scan, in standard errors
-# Frames look the same from every angle where both hold: a random order leaves at most _SYMMETRIC times the stated order's
-# residual, and at most _SAME times the standard deviation of the line integrals.
-_SYMMETRIC = 2.0
-_SAME = 0.03
+# Frames look the same from every angle where a random order leaves a residual within both of these limits.
+_SYMMETRIC = 2.0  # largest ratio of the residual in a random order to that in the stated order
+_SAME = 0.03  # largest ratio of the residual in a random order to the standard deviation of the line integrals
 _MOST_REFINED = 2  # most hypotheses about the whole scan for which the panel's shift is refined
 _SHIFT_PENALTY = 1.5  # factor on the squared residual per coarse pixel of the panel's shift: stated offsets are mostly right
 

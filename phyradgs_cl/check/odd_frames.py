@@ -12,10 +12,9 @@ from phyradgs_cl.detector import robust_deviation
 from phyradgs_cl.reconstructors.fits.residuals import Fit, fit, fit_squares
 from phyradgs_cl.runtime import Runtime
 
-# A frame is odd where its mean line integral differs from its neighbours' by more than _DEVIATIONS robust standard
-# deviations of such differences, and by more than _LEAST_CHANGE times the frames' median.
-_DEVIATIONS = 12.0
-_LEAST_CHANGE = 0.75
+# A frame is odd where its mean line integral differs from its neighbours' by more than both of these.
+_DEVIATIONS = 12.0  # difference in robust standard deviations of all frames' differences
+_LEAST_CHANGE = 0.75  # difference as a fraction of the frames' median mean line integral
 _FEWEST = 5  # scans of fewer frames are not judged
 _REPEATED = 0.15  # a repeated frame differs from its predecessor by less than this fraction of the neighbouring differences
 _JUMP = 2.5  # the order of angles jumps above this ratio of the median steps in recorded and in sorted order

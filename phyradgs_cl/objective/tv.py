@@ -129,10 +129,9 @@ def _steps(axis_weights: tuple[float, ...]) -> tuple[float, float]:
     return (in_space / 2, 1 / (8 * time[0] ** 2)) if any(time) else (in_space, 0.0)
 
 
-# Addend to the length of differences, which is 0 in flat regions, before TV's gradient divides by it: _SMALLEST times the
-# volume's RMS, or _NOTHING, in 1/mm, for a volume of zeros.
-_SMALLEST = 1e-6
-_NOTHING = 1e-30
+# TV's gradient divides by the length of differences, which is 0 in flat regions, plus the larger of these two.
+_SMALLEST = 1e-6  # addend as a fraction of the volume's RMS
+_NOTHING = 1e-30  # addend in 1/mm, for a volume of zeros
 
 
 class TvDescent:

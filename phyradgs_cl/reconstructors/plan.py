@@ -30,7 +30,7 @@ _SUBJECT = "--object-motion"
 _MOST_VOXELS = 24  # most voxels along each side of the grid on which a deformation is checked
 _LEAST_DETERMINANT = 0.05  # lower limit of a deformation's det(I + ∂w/∂y): near 0 matter folds
 _LEAST_COVERED = 0.5  # least fraction of the scan's time that a deformation has to cover: with less it is refused
-_MOSTLY_COVERED = 0.98  # least fraction that it covers without a warning
+_MOSTLY_COVERED = 0.98  # least fraction of the scan's time that a deformation covers without a warning
 log = logging.getLogger(__name__)
 
 

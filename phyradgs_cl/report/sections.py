@@ -21,7 +21,7 @@ from phyradgs_cl.text import flattened, to_digits_of
 _MOST_ROWS = 400  # most rows of a table
 _STATES = 5  # most states that are shown
 _MOST_CHARTS = 6  # most charts of a calibration
-_MOST_COMBINATIONS = 20  # most combinations of parameters that a calibration cannot tell apart
+_MOST_COMBINATIONS = 20  # most listed combinations of parameters that a calibration cannot tell apart
 _ABSURD = 1e9  # parameters of this size and more come from damaged files and are not rounded
 
 

@@ -20,13 +20,13 @@ from phyradgs_cl.io.scan.reader import LARGEST_LINE_INTEGRAL
 
 _log = logging.getLogger(__name__)
 _PIXELS = 1 << 16  # most pixels of a frame from which levels and patterns are computed
-# Largest difference of a frame's median from the usual one, as a fraction of the flats' level; others are left out.
-_TOGETHER = 0.1  # for flats of one time
-_APART = 0.3  # for flats of several times
-_DARK = 0.02  # for darks
-# A frame's pattern is odd where its mean deviation exceeds _TIMES median deviations plus _PATTERN times the flats' level.
-_PATTERN = 0.02
-_TIMES = 5.0
+# Largest differences of a frame's level from the usual level, as fractions of the flats' level; other frames are left out.
+_TOGETHER = 0.1  # largest difference among flats of one time
+_APART = 0.3  # largest difference among flats of several times
+_DARK = 0.02  # largest difference among darks
+# A frame is left out too where its pattern's mean deviation exceeds the sum of these two.
+_PATTERN = 0.02  # deviation as a fraction of the flats' level
+_TIMES = 5.0  # deviation as a multiple of the frames' median deviation
 _BLOCK_BYTES = 1 << 26  # most bytes of a block of rows whose median is taken
 Mask = np.ndarray | None
 TAKEN = "taken"

@@ -20,7 +20,7 @@ from phyradgs_cl.io.hdf5.source import Hdf5Source
 _log = logging.getLogger(__name__)
 _KINEMATICS = (ConstantSpeed, SpeedRamp, EncoderTable, FrameSweeps)  # trajectories that files can hold
 _RAMP_ERROR_RAD = 1e-9  # largest error in rad of the table of angles that stands for a speed ramp
-_MOST_RAMP_SAMPLES = 500_000  # most angles of that table
+_MOST_RAMP_SAMPLES = 500_000  # most angles of the table that stands for a speed ramp
 _SUSPECT_RAD = math.radians(5.0)  # largest difference between table and rotation_angle without a warning
 
 

@@ -13,7 +13,7 @@ _ITEMS_PER_UNIT = 4  # least number of work-items per compute unit that is aimed
 _HEADROOM = 64  # largest sum of the weights with which voxels add to one, as where the field contracts by 4 along each axis
 _TOGETHER = 8, 8, 4  # voxels (x, y, z) of a GPU's work-group, which add to a slab of local memory
 _SAMPLES = 16  # time to read the 4³ coefficients of a voxel, in samples of a ray
-_ADDED = 64  # time to add to these coefficients, in samples of a ray
+_ADDED = 64  # time to add to the 4³ coefficients of a voxel, in samples of a ray
 _ROUNDING = 1e-3  # margin in voxels around the range of displacements along z, more than their rounding
 
 

@@ -31,14 +31,13 @@ log = logging.getLogger(__name__)
 
 # Upper limits in pairs: beyond the first a warning is logged; beyond the second, _NO_…, InputError is raised.
 _CIRCLE = 0.05  # distance of source or panel from a circle about z, over the distance between source and panel
-_NO_CIRCLE = 0.5
+_NO_CIRCLE = 0.5  # distance from a circle, as for _CIRCLE, that is refused
 _PLANE_DEG = 10.0  # elevation of the source above the plane z = 0, seen from the origin
-_NO_PLANE_DEG = 45.0
+_NO_PLANE_DEG = 45.0  # elevation of the source that is refused
 _LEAN_DEG = 0.5  # angle of parallel rays, or of their detector rows, from the plane of the rotation
-_NO_LEAN_DEG = 10.0
-# angle of a cone beam's detector rows from the plane of the rotation: densities are 0.1 % and 1.5 % too low, and 0 at 90°
-_ROLL_DEG = 3.0
-_NO_ROLL_DEG = 10.0
+_NO_LEAN_DEG = 10.0  # angle of parallel rays or their rows that is refused
+_ROLL_DEG = 3.0  # angle of a cone beam's detector rows from the plane of the rotation: densities are 0.1 % too low
+_NO_ROLL_DEG = 10.0  # angle of a cone beam's rows that is refused: densities are 1.5 % too low, and 0 at 90°
 _LEAST_OVERLAP = 2.0  # least number of columns from the axis to a displaced panel's nearer edge without a warning
 # largest missing angle without a warning: the fan of rays that are nearly parallel, for which half a turn is enough
 _TOLERATED_RAD = np.deg2rad(0.5)

@@ -44,8 +44,8 @@ from phyradgs_cl.runtime import Runtime
 _MOST_COLUMNS = 64  # most blocks of pixels along the longer side of the panel in the coarse scan
 _MOST_VOXELS = 32  # most voxels along the longest side of the coarse scan's grid
 _MOST_FRAMES = 600  # most frames of the coarse scan, or more: one for every knot of the signal
-_TIMES_PER_PERIOD = 12  # least number of times per period of the motion at which exposures see the object …
-_MOST_TIMES = 6  # … with at most this many in one exposure
+_TIMES_PER_PERIOD = 12  # number of times per period of the motion at which exposures see the object
+_MOST_TIMES = 6  # most times of one exposure that this takes
 _FIRST_PASSES = 8  # passes of fista before the first round, with the object at rest
 _PASSES = 3  # passes of fista in each round
 _WEIGHT = 0.42  # prior weight of the passes of fista

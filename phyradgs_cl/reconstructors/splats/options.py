@@ -101,7 +101,7 @@ _PAPER = SplatOptions(
     motion=MicroViews(8, 5), gaussians=50_000, iterations=20_000, rates=PUBLISHED_RATES,
     control=PUBLISHED_CONTROL,
 )
-# A sixth of the default's iterations, with the schedule scaled in proportion, and two or three segments per frame.
+# The preset "quick": a sixth of the default's iterations, its schedule in proportion, and two or three segments per frame.
 _QUICK = SplatOptions(
     motion=Exact(time_error=0.02), iterations=500, parameter_terms_from=80,
     control=DensityControl(every=20, start_iteration=80),

@@ -42,7 +42,7 @@ _RIDGE_LENGTH = 0.5  # factor on the regulariser's gradient in a ridge step
 _RIDGE_EVERY = 4  # number of maps of the other prior for each ridge step
 # noise of line integrals for which _TV_AT_REST and _RIDGE_NOISE_AT_REST hold; they follow the sixth root of the scan's noise
 _USUAL_NOISE = 0.01
-_LEAST_NOISE = 0.001  # lower limit of the scan's noise of line integrals in that sixth root
+_LEAST_NOISE = 0.001  # lower limit of the scan's noise of line integrals that those two factors follow
 _LEAST_NOISE_SHARE = 0.1  # lower limit of noise_share (``Prior``) in ridge steps, for scans without noise
 _SUBVOXELS = 2 / 3  # weight of the smaller voxels in the result, whose rest is the volume of the passes before
 _SUBVOXELS_WITH_RIDGE = 0.85  # weight of the smaller voxels in the result with the prior ``ridge``
