@@ -143,7 +143,7 @@ __kernel void backproject_upright(
 }
 
 #define EVEN_DEPTH 0.02f   /* largest relative change of the depth along a block for which 1/depth counts as nearly linear */
-#define VOXEL_MARGIN 0.01f /* voxels: more than the rounding of where a column of voxels enters or leaves a view */
+#define VOXEL_MARGIN 0.01f /* margin in voxels, more than the rounding of where a column of voxels enters or leaves a view */
 
 /* Narrows the range (low, high) of z to where start + per_z z >= 0. */
 ALWAYS_INLINE float2 narrowed(const float2 within, const float start, const float per_z)

@@ -3,11 +3,11 @@
 #include "common/ray.h"
 #include "common/ray_window.h"
 
-#define BLOCK 4
+#define BLOCK 4        /* voxels along each side of a work-group's block; _BLOCK in operators/rays/general.py */
 #ifndef BLOCK_Z
 #define BLOCK_Z BLOCK
 #endif
-#define FEW_CELLS 8    /* frames with at most so many cells are not searched: it would take longer */
+#define FEW_CELLS 8    /* frames with at most this many time cells are not searched: it would take longer */
 
 /* The weight of the voxel in the ray's sample, as in rays_forward. */
 static inline float ray_weight(const rays_t r, __global const float *cell, const int4 voxel)

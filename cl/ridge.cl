@@ -12,7 +12,8 @@
 
 #define CHANNELS 4
 #define FILTERS 16
-#define TAPS 27
+#define TAPS 27 /* coefficients of a filter for one channel, 3^3 */
+/* Indices in `table` of the second filters, of these in the other order, and of slopes and knots. */
 #define SECOND (TAPS * CHANNELS)
 #define SECOND_BACK (SECOND + TAPS * CHANNELS * FILTERS)
 #define CURVES (SECOND_BACK + TAPS * CHANNELS * FILTERS)

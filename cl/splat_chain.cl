@@ -6,8 +6,8 @@
 #include "common/splat_sums.h"
 
 #if MOVING
-#define TURNED 4 /* numbers of the record that give S: d(along, across)/d(u, v) */
-#define POSES 3
+#define TURNED 4 /* floats of the record that give S: d(along, across)/d(u, v) */
+#define POSES 3  /* poses of a cell, as in splat_prepare.cl */
 #else
 #define TURNED 0
 #define POSES (1 + FIXED_CONIC)

@@ -66,7 +66,7 @@ ALWAYS_INLINE void add_line(const footprint_line line, const float limit, __glob
     __global float *image             /* guard, then (lines, pitch) */
 
 #if BLOCK_PIXEL
-#define STAGED 32 /* splats in cells that a group reads at a time */
+#define STAGED 32 /* records of splats that a work-group reads into local memory at a time */
 
 /* Groups have tile_w by tile_h items. A line's cells lie between those of the tile's first and last line. */
 __kernel void splat_forward_pixels(ARGUMENTS)

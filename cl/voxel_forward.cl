@@ -6,8 +6,8 @@
 #include "common/tile.h"
 #include "common/voxel.h"
 
-#define STAGED 32 /* Gaussians that a group reads at a time */
-#define DEPTH 8   /* voxels of a work-item: tile.z */
+#define STAGED 32 /* records of Gaussians that a work-group reads into local memory at a time */
+#define DEPTH 8   /* voxels along z of a work-item: tile.z */
 
 __kernel void voxel_forward(
     __global const float *records, __global const int *tile_offsets, __global const int *tile_splat_ids,

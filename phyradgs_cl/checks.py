@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.text import suggest_name
 
-_LONGEST = 80  # limit of the characters of a value in a message
+_LONGEST = 80  # most characters of a value in a message
 T = TypeVar("T")
 
 

@@ -34,14 +34,16 @@ from phyradgs_cl.optim import DeviceAdam, adam_step
 from phyradgs_cl.runtime import DeviceSpace, HostSpace, Runtime
 from phyradgs_cl.runtime.layout import pad_rows, pitch_of, unpad_rows
 
-VALUE, GRADIENT = 1e-4, 1e-3  # relative to the largest number; float32 leaves a tenth of them in tests
-_GRIDDED = 5e-3  # limit where an inverse is computed from a field's values at voxels
+# Upper limits of the difference from float64 twins, over the largest number: of values, and of gradients. Float32 leaves a
+# tenth of them in tests.
+VALUE, GRADIENT = 1e-4, 1e-3
+_GRIDDED = 5e-3  # upper limit of the difference where an inverse is computed from a field's values at voxels
 SHAPE, GRID = (9, 12), Grid((5, 7, 6), (0.3, 0.24, 0.28), (0.1, -0.05, 0.1))
 GEOMETRY = ConeGeometry(5.0, 7.5, SHAPE, (3.9 / 9, 4.1 / 12), (0.1, 0.2))
 ORBIT = CircularOrbit(GEOMETRY, ConstantSpeed(0.3, 0.5))
 PARALLEL = CircularOrbit(ParallelGeometry(SHAPE, (2.6 / 9, 2.7 / 12), (0.1, 0.2)), ConstantSpeed(0.3, 0.5))
 UNIT = 2.0  # line integral of the value 1 in images of the intensity model
-STEP = 1e-6  # half a central difference
+STEP = 1e-6  # half the step of central differences
 Comparison = tuple[np.ndarray, np.ndarray, float]
 """Computed, expected, and the largest difference allowed, relative to the largest number expected."""
 

@@ -11,9 +11,10 @@ from phyradgs_cl.runtime import Runtime
 
 LASTING_S = 0.1, 1.0, 3.0
 """Durations of launches that are tried on GPUs, in s: drivers of screens end those of 2 to 5 s."""
-PAIRS = 1e-12  # relative error that pairs of floats keep; 6e-8 is left of them otherwise
-_ITEMS = 32  # work-items in a work-group of the probes
-_TRIED_STEPS = 1 << 14  # multiply-adds of each chain in a first launch, which gives the speed
+# largest relative error of sums in pairs of floats; a compiler that contracts them leaves 6e-8, that of one float
+PAIRS = 1e-12
+_ITEMS = 32  # number of work-items in a work-group of the probes
+_TRIED_STEPS = 1 << 14  # number of multiply-adds of each chain in a first launch, which gives the speed
 
 
 def pair_error(rt: Runtime) -> float:

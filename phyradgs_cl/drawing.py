@@ -26,8 +26,8 @@ COLOURS = {
     "volume": "#dfe5ec",
 }
 INK, SOFT, FAINT, ACCENT, EXPOSED, EDGE, SAMPLE, BOX = COLOURS.values()
-_LONGEST_BAR = 0.3  # limit of the scale bar's length, as a fraction of a picture's width
-_LOG_RATIO = 20.0  # largest over smallest value, above which an axis is logarithmic
+_LONGEST_BAR = 0.3  # largest length of the scale bar, as a fraction of a picture's width
+_LOG_RATIO = 20.0  # ratio of the largest to the smallest value above which an axis is logarithmic
 
 
 def new_figure(width_inch: float, height_inch: float) -> "Figure":

@@ -19,9 +19,10 @@ from phyradgs_cl.reconstructors import Reconstruction, RunPlan, method_of, recon
 from phyradgs_cl.reconstructors.splats.options import SplatOptions
 from phyradgs_cl.runtime import Runtime
 
-_SPLAT_TRIALS, _TRIALS = (20, 200), (1, 3)  # iterations of the two trials, of splats and of other methods
-_LEAST_DIFFERENCE_S = 0.3  # least difference of the trials' times, above noise
-_LONGEST_TRIAL = 200  # a trial of so many iterations is not prolonged
+_SPLAT_TRIALS = (20, 200)  # iterations of the short and of the longer trial, for splats
+_TRIALS = (1, 3)  # iterations of both trials for other methods that state no ``TRIALS``
+_LEAST_DIFFERENCE_S = 0.3  # the longer trial is prolonged until the trials' times differ by this, to stand out from noise
+_LONGEST_TRIAL = 200  # number of iterations from which on a trial is not prolonged
 _FEWEST_BETWEEN = 5  # least number of iterations between rounds of density control in a trial
 
 

@@ -24,12 +24,12 @@ _LAUNCHERS = (
     ("PMI_RANK", "PMI_SIZE", "MPI_LOCALRANKID", "MPI_LOCALNRANKS"),
     ("PMIX_RANK", "SLURM_STEP_NUM_TASKS", "SLURM_LOCALID", "SLURM_STEP_TASKS_PER_NODE"),
 )
-_PATIENCE_S = 5.0  # time that rank 0 waits for other failing ranks
-_LATER_S = 0.5  # each next rank waits so much longer, so that only one reports
-_MOST_VALUES = 1 << 26  # limit of the values in one call: before version 4, MPI's counts end at 2³¹
-_BITS = 62  # bits of an int64 that a sum may use
-_NOT_FINITE = 100_000  # stands for the exponent of a row that is not finite: more than any float's
-_BLOCK_VALUES = 1 << 20  # values that are summed at a time
+_PATIENCE_S = 5.0  # longest time that rank 0 waits for other failing ranks
+_LATER_S = 0.5  # time that each next rank waits longer, so that only one reports
+_MOST_VALUES = 1 << 26  # most values in one call of MPI: before version 4, its counts end at 2³¹
+_BITS = 62  # most bits of an int64 that a sum may use
+_NOT_FINITE = 100_000  # number that stands for the exponent of a row that is not finite: more than any float's
+_BLOCK_VALUES = 1 << 20  # most values that are summed at a time
 
 
 @dataclass(frozen=True)

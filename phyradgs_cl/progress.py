@@ -10,7 +10,8 @@ from phyradgs_cl.reconstructors import Progress
 from phyradgs_cl.text import clock
 
 _OVER = "\r\x1b[K"  # clears the line
-_TERMINAL_EVERY_S, _ELSEWHERE_EVERY_S = 0.2, 10.0  # least time between two lines
+_TERMINAL_EVERY_S = 0.2  # least time between two lines on a terminal
+_ELSEWHERE_EVERY_S = 10.0  # least time between two lines in a file or pipe
 
 
 def has_reader() -> bool:

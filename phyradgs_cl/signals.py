@@ -15,7 +15,7 @@ from phyradgs_cl.errors import DeviceError
 NOTHING = "interrupted, nothing written"
 COMPLETE = "interrupted, the output is complete"
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
-_SAME_PRESS_S = 1.0  # a signal so soon after the first counts as the same: wrappers (timeout, uv) send it again
+_SAME_PRESS_S = 1.0  # a signal within this time of the first counts as the same: wrappers (timeout, uv) send it again
 
 
 class InterruptedAfterwards(KeyboardInterrupt):

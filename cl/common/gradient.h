@@ -3,8 +3,8 @@
    2 q (0, torque) of the unit quaternion. */
 #include "common/gaussian.h"
 
-#define ROW_STATISTIC 11
-#define ROUND 4e-6f /* scales that differ by at most so much of their sum count as equal: it may be rounding */
+#define ROW_STATISTIC 11 /* first of the two rows dL/d(centre on the detector) */
+#define ROUND 4e-6f      /* largest difference of two scales, over their sum, that counts as equal: it may be rounding */
 
 /* The factor s3 / s2 - s2 / s3 of the torque about the third axis. Two scales that differ only by rounding count as equal:
    otherwise the torque would be rounding too, and Adam would make it a step of full length. */

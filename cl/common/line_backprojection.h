@@ -1,7 +1,7 @@
 /* The value that a voxel receives from a view whose lines have their own poses; backproject.cl, backproject_moving.cl. */
 
-#define LINE_STEPS 6      /* Newton steps, at most */
-#define LEAST_SPEED 0.1f  /* lower limit of the rate at which a voxel crosses lines, per line of the readout */
+#define LINE_STEPS 6      /* most Newton steps */
+#define LEAST_SPEED 0.1f  /* lower limit of the lines that a voxel crosses per line of the readout; the steps divide by it */
 
 static inline float line_position(__global const float *m, const float x, const float y, const float z, float *depth)
 {

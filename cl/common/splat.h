@@ -20,7 +20,7 @@
 #endif
 
 #if MOVING
-#define RECORD 20
+#define RECORD 20 /* floats or ints of a record; RECORD_FLOATS in operators/splats/projector.py */
 #else
 #define RECORD 16
 #endif

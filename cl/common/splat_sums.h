@@ -1,5 +1,6 @@
 /* Sums over the pixels of a splat in one cell, which the chain rule reads. They overwrite the record from SUMS on, which
    only the projector and the first pass of the adjoint read. */
+/* Indices of the sums. */
 #define SUM_W 0          /* sum of gradient x value: dL/d(log amplitude) */
 #define SUM_IK 1         /* dL/d(1/kappa) */
 #define SUM_B 7          /* dL/dB with B = 1 + b.D, and its moments by u and v */
@@ -13,11 +14,11 @@
 #define SUM_CC 4
 #define SUM_Z 5          /* sums of dL/d(num) times z and across, for dL/d(centre) */
 #define SUM_C 6
-#define SUM_TZ 10        /* the same times the time t as well, for dL/d(path) */
+#define SUM_TZ 10        /* sums of dL/d(num) times t z and t across, with the time t, for dL/d(path) */
 #define SUM_TC 11
 #else
-#define SUMS 0
-#define SUM_COUNT 10
+#define SUMS 0           /* first index of the sums in the record */
+#define SUM_COUNT 10     /* number of sums */
 #define SUM_UU 2         /* dL/dS11, half of dL/dS12, dL/dS22 */
 #define SUM_UV 3
 #define SUM_VV 4

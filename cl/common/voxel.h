@@ -6,7 +6,7 @@
 #define VOXEL_SPACE __global /* memory of the records */
 #endif
 
-#define VOXEL_RECORD 20
+#define VOXEL_RECORD 20 /* floats or ints of a record; RECORD_FLOATS in operators/splats/voxelise.py */
 #define VOX_REST 0      /* 3: centre minus its nearest voxel, x y z */
 #define VOX_U11 3
 #define VOX_U12 4

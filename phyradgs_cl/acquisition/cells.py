@@ -9,14 +9,14 @@ from phyradgs_cl.acquisition.shutter import Shutter
 from phyradgs_cl.acquisition.time_cells import TimeCells
 from phyradgs_cl.acquisition.trajectory import Trajectory, body_frames, is_parallel
 
-_SAME_TIME = 1e-6  # tolerance, as a fraction of a cell: a frame that begins on frame 0's grid of times shares it
-_NOTHING = 1e-9  # a smaller share of a line's window in a cell is rounding, and becomes 0
-_INSTANT = 1e-9  # a line's window shorter than this fraction of the frame's lit span counts as an instant
-_OVERHANG = 0.1  # a line's window that reaches at most this fraction of a segment into it has no part there
-_TURN_SAMPLES = 32  # intervals of the lit span in which the speed of the view's turn is measured
+_SAME_TIME = 1e-6  # times that differ by less than this fraction of a time cell count as equal
+_NOTHING = 1e-9  # a smaller fraction of a line's window that lies in a time cell is rounding, and becomes 0
+_INSTANT = 1e-9  # a line's window up to this fraction of the frame's lit span counts as an instant
+_OVERHANG = 0.1  # a line's window that covers at most this fraction of the first or last segment that it meets leaves it out
+_TURN_SAMPLES = 32  # number of intervals of the lit span in which the speed of the view's turn is measured
 _TURN_FACTOR = 0.32  # a frame's relative RMS error per squared radian of the view's turn in a segment
-_HARMLESS_PEAK = 4.0  # largest line integral at which averages of intensities need no further segments
-_MOST_SEGMENTS = 1000  # limit of the segments that ``segments_for`` chooses for a frame
+_HARMLESS_PEAK = 4.0  # averages of intensities need no more segments up to this largest line integral
+_MOST_SEGMENTS = 1000  # most segments that ``segments_for`` chooses for a frame
 
 
 Served = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
@@ -132,7 +132,8 @@ def _middles_s(frame_start_s: np.ndarray, frame: int, edges_s: np.ndarray) -> np
     cells = (start_s - origin_s) / step_s
     number = np.arange(len(edges_s) - 1) + 0.5
     if abs(cells - round(cells)) < _SAME_TIME:
-        # Times counted from the first frame have the same bits in common cells, so operators project these once.
+        # Cells of two frames that cover the same time then get times with the same bits, and so the same pose: ``slots.py``
+        # of operators/rays projects equal poses once.
         start_s, number = origin_s, round(cells) + number
     middles_s: np.ndarray = start_s + edges_s[0] + number * step_s
     return middles_s

@@ -16,8 +16,9 @@ from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
 
 POSE_LENGTH = 12
-_MOST_VOXELS_AWAY = 1e6  # limit of the source's distance: float32 displaces rays by 6 % of a voxel, at 1e7 by half of one
-_STEEP = 1e-2  # least squared sine of a ray's angle to z: where a steeper ray passes the axis is undetermined
+# largest distance of the source from the axis, in voxels: float32 displaces rays by 6 % of a voxel, at 1e7 voxels by half
+_MOST_VOXELS_AWAY = 1e6
+_STEEP = 1e-2  # lower limit of the squared sine of a ray's angle to z: where a steeper ray passes the axis is undetermined
 
 
 @dataclass(frozen=True)

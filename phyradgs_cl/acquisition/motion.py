@@ -23,9 +23,11 @@ from phyradgs_cl.fields import Deformation
 
 RAYS, SPLATS, LINE_POSES = "rays", "splats", "one pose per line"
 """The kinds of operator: ray projectors, splat projectors, and filtered backprojection."""
-_USUAL_TIMES, _MOST_TIMES = 6, 100  # times per exposure that ``PerRow`` chooses: 6 for usual motion, up to 100 for fast
-_FINE_STEP_VOXELS, _COARSE_STEP_VOXELS = 0.3, 3.6  # the rim's travel per time in voxels: up to 6 times, and beyond
-_OBJECT_STEP_VOXELS = 0.7  # travel per time of the object's fastest part in voxels: the rest of it travels less
+_USUAL_TIMES = 6  # most times per exposure that ``PerRow`` chooses for usual motion, by the two fine steps below
+_MOST_TIMES = 100  # most times per exposure that ``PerRow`` chooses for fast motion, by the coarse step below
+_FINE_STEP_VOXELS = 0.3  # travel of the volume's rim, in voxels, for which ``PerRow`` takes one time
+_OBJECT_STEP_VOXELS = 0.7  # travel of the object's fastest part, in voxels, for one time: the rest of it travels less
+_COARSE_STEP_VOXELS = 3.6  # travel of rim or object, in voxels, for one time where _USUAL_TIMES are too few
 _WEIGHT_TOLERANCE = 1e-3  # largest difference from 1 of the sum of a line's weights in a user-defined model
 
 

@@ -15,16 +15,20 @@ if TYPE_CHECKING:
     from phyradgs_cl.acquisition.scan import Scan
 
 log = logging.getLogger(__name__)
-OPAQUE, FEW = 50.0, 0.01  # largest line integral that a panel can measure; fraction of its pixels that may be broken
-_WIDEST_DEG = 120.0  # limit of a panel's fan and cone angles; dental scanners have 30°, nano-CT 60°
-_LARGEST_PITCH_MM, _LEAST_DISTANCE_MM = 5.0, 10.0  # largest real pixel; least real distance to a panel
-_WRONG_UNIT = 100.0  # limit of readout over frame time: milliseconds given as seconds make it some hundreds
-_SHORT_READOUT_S, _MANY_LINES = 0.5e-3, 100  # a shorter readout of so many lines is warned of: panels take some ms
-_SLOW_FPS, _LARGE_STEP_DEG = 2.0, 10.0  # a lower rate with a larger step between frames is warned of
-_TIMES = 17  # angles sampled in an exposure: between two of them no gantry makes half a turn
+OPAQUE = 50.0  # largest line integral that a panel can measure; most pixels above it mean an error, a few a warning
+FEW = 0.01  # largest fraction of a panel's pixels that may be broken without a warning
+_WIDEST_DEG = 120.0  # upper limit of a panel's fan and cone angles; dental scanners have 30°, nano-CT 60°
+_LARGEST_PITCH_MM = 5.0  # largest pitch of real pixels: a wide fan with larger ones has wrong pixel sizes
+_LEAST_DISTANCE_MM = 10.0  # least real distance from source to panel: a wide fan with a shorter one has wrong distances
+_WRONG_UNIT = 100.0  # upper limit of readout over frame time: milliseconds given as seconds make it some hundreds
+_SHORT_READOUT_S = 0.5e-3  # a shorter readout of _MANY_LINES lines or more is warned of: panels take some ms
+_MANY_LINES = 100  # least number of lines for the warning of a short readout
+_SLOW_FPS = 2.0  # a lower frame rate is warned of where the median step between frames exceeds _LARGE_STEP_DEG
+_LARGE_STEP_DEG = 10.0  # largest step of the gantry between frames without a warning of a low frame rate
+_TIMES = 17  # number of angles sampled in an exposure: between two of them no gantry makes half a turn
 _SLACK = 1e-3  # relative tolerance: times and angles come rounded
 _MANY_FRAMES = 10  # least number of frames for the warning of radians: fewer may lie within a few degrees on purpose
-_ASIDE = 0.1  # fraction of the panel's width: a panel further off centre was displaced for a wider field of view
+_ASIDE = 0.1  # a panel off centre by more than this fraction of its width was displaced for a wider field of view
 
 
 def summary(scan: "Scan") -> str:

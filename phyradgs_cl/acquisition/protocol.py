@@ -12,7 +12,8 @@ from phyradgs_cl.acquisition.shutter import Shutter
 from phyradgs_cl.acquisition.trajectory import CircularOrbit, EncoderTable, FrameSweeps
 from phyradgs_cl.errors import InputError
 
-_FEWEST_TURNS, _MOST_TURNS = 1e-3, 10_000  # limits of the number of turns in either direction
+_FEWEST_TURNS = 1e-3  # least number of turns in either direction
+_MOST_TURNS = 10_000  # largest number of turns in either direction
 
 
 @dataclass(frozen=True)

@@ -36,7 +36,7 @@ DETECTOR_MODELS = ("log", "intensity")
 APPLIED = ("flats_applied", "darks_applied")
 """The provenance's keys of the numbers of flats and darks that were applied to the counts."""
 _TITLE = "cone-beam scan"
-LARGEST_LAG = 0.9  # no panel has nearly as much; towards 1 a frame holds hardly any new information
+LARGEST_LAG = 0.9  # upper limit of ``Scan.lag``: no panel has nearly as much; towards 1 a frame holds hardly anything new
 
 
 @dataclass(frozen=True)

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from phyradgs_cl.acquisition.scan import Scan
 
 log = logging.getLogger(__name__)
-_MOST_RAD = 20 * np.pi  # ten turns: angles over a larger range are most likely degrees
+_MOST_RAD = 20 * np.pi  # largest range of angles given as rad, ten turns: over a larger range they are most likely degrees
 _OTHERS = ("detector_model", "pixel_mask", "reference", "title", "lag", "provenance")  # fields of ``Scan``
 
 

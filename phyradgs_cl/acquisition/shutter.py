@@ -10,7 +10,7 @@ from phyradgs_cl.errors import InputError
 
 AXES = ("rows", "columns")
 _STEPS = 1000  # least number of float64 steps in an exposure: times within it are then exact to a thousandth
-_DARK = 1e-9  # a lit window below this fraction of the longest is rounding: the pulse misses its line
+_DARK = 1e-9  # a line's lit window up to this fraction of the longest is rounding: the beam's pulse misses the line
 
 
 @dataclass(frozen=True)

@@ -22,9 +22,10 @@ from phyradgs_cl.text import repr_of_changes
 
 _LEAST_SPAN_S = 1e-6  # least time over which ``sampled`` samples a frame, also one without duration
 _MOST_SAMPLES = 1024  # ``sampled`` tries no finer table once it has more samples per frame
-_LEAST_INCIDENCE = 1e-6  # least sine of the angle between rays and panel
-_AT_AXIS, _AWAY = 1e-6, 2.0  # in source distances: a panel so near counts as at the axis; it is moved to this distance
-_SAME_PLACE = 1e-9  # tolerance of equal poses, as a fraction of the largest number: float64 rounds orbits by less
+_LEAST_INCIDENCE = 1e-6  # lower limit of the sine of the angle between rays and panel
+_AT_AXIS = 1e-6  # a panel at most this far from the axis, in source-to-axis distances, counts as at the axis
+_AWAY = 2.0  # a panel at the axis is moved behind the object: factor on its distance from the source and on its sizes
+_SAME_PLACE = 1e-9  # largest difference of equal poses, as a fraction of their largest number: float64 rounds orbits by less
 
 
 class Trajectory(Protocol):

@@ -23,16 +23,21 @@ from phyradgs_cl.calibrate.stages import Stage
 from phyradgs_cl.detector.attenuation import TRANSMISSION_FLOOR
 from phyradgs_cl.phantoms import EllipsoidPhantom
 
-DENSITY = 6  # index in a placement, which is turn (rotation vector, rad), shift (mm), density
-_MARGIN = 1.2  # margin of a shadow's half-width, for an oblique panel
-_FEWEST_TIMES, _MOST_TIMES = 6, 24  # times per exposure; the phantom's edge moves by a pixel between two of them
-_FEWEST_RAYS, _MOST_RAYS = 2, 6  # rays along each side of a pixel or a block, and per bead's radius
-_BLUR_PX = 0.8  # σ of a blur, without which differences of sharp edges would show single rays, half a pixel apart
-_LEAST_ZEROS, _ZEROS_PX = 0.2, 5  # fraction of zeros from which air was clipped; side of the averaged blocks
-_BACKGROUND = 4  # cosines along each side of a frame: they describe holder, scatter and drift of the tube
-_STEP_PX = 0.25  # movement of a frame by half a central difference of a signal
-_MOST_PX = 1.5  # largest movement of a frame by a step of the placement
-_SETTLED_PX, _LINEAR_PX = 0.01, 0.3  # size of the last step; the largest step after which the signals are still valid
+DENSITY = 6  # index of the density in a placement, which is turn (rotation vector, rad), shift (mm), density
+_MARGIN = 1.2  # factor on the half-width of a bead's shadow, for an oblique panel
+# limits of the times per exposure; between them the phantom's edge moves by a pixel from one time to the next
+_FEWEST_TIMES, _MOST_TIMES = 6, 24
+_FEWEST_RAYS = 2  # least number of rays along each side of a pixel (or block of pixels), and per bead's radius
+_MOST_RAYS = 6  # largest number of rays along each side of a pixel
+# standard deviation in pixels of a blur, without which differences of sharp edges would show single rays, half a pixel apart
+_BLUR_PX = 0.8
+_LEAST_ZEROS = 0.2  # air was clipped at 0 where at least this fraction of the pixels is 0
+_ZEROS_PX = 5  # side in pixels of the blocks whose means give the noise of clipped air
+_BACKGROUND = 4  # number of cosines along each side of a frame: they describe holder, scatter and drift of the tube
+_STEP_PX = 0.25  # movement of a frame at its edge, in pixels, by half a central difference of a signal
+_MOST_PX = 1.5  # largest movement of a frame, in pixels, by one step of the placement
+_SETTLED_PX = 0.01  # the search ends at a step that moves the frame by less than this, in pixels
+_LINEAR_PX = 0.3  # after a larger step, in pixels, the signals are computed anew
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,9 +13,10 @@ from phyradgs_cl.errors import InputError
 from phyradgs_cl.removed import removal
 from phyradgs_cl.text import suggest_name
 
-_STEP_PX = 0.25  # movement of the image at its edge by half a central difference
-_TIMING_STEP, _LARGEST_CUT = 0.1, 0.7  # shares of the stated time: half a central difference, and the most to subtract
-_MOST_TILT_RAD = math.radians(2.0)  # largest half of a central difference of an angle
+_STEP_PX = 0.25  # movement of the image at its edge, in pixels, by half a central difference
+_TIMING_STEP = 0.1  # upper limit of half a central difference of a time, as a fraction of the stated time
+_LARGEST_CUT = 0.7  # largest decrease of a time that the search tries, as a fraction of the stated time
+_MOST_TILT_RAD = math.radians(2.0)  # upper limit, in rad, of half a central difference of an angle
 _SMALL_MISMATCH = 1.3  # ``mismatch`` of signals that change sign after half a turn, as the errors of voxels do not
 # an angle with a larger standard deviation counts as undetermined: sines are linear no further
 _LEAST_KNOWN_RAD = math.radians(10.0)

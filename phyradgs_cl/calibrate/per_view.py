@@ -23,15 +23,16 @@ from phyradgs_cl.reconstructors.fits.residuals import AugmentedOperator, ViewPar
 from phyradgs_cl.reconstructors.voxels.cgls import Cgls
 from phyradgs_cl.runtime import Runtime
 
-SPLINES = 7  # splines of a motion, each about a seventh of the scan wide
+SPLINES = 7  # default number of splines of a wobble or motion, each about a seventh of the scan wide
 TURN, SHIFT_V, SHIFT_U = 0, 1, 2
-_STEP_PX = 0.25  # movement of a frame by half a central difference of a signal
-_LEAST_NORM = 0.1  # fraction of the largest norm of a kind: parameters with weaker signals are not scaled up further
+_STEP_PX = 0.25  # movement of a frame, in pixels, by half a central difference of a signal
+_LEAST_NORM = 0.1  # lower limit of a signal's norm in the scaling of parameters, as a fraction of the largest of its kind
 _DEG = float(np.rad2deg(1.0))
-DISCRETISATION = 0.5  # fraction of the change since a grid half as fine: the error that remains, if it is of first order
+# discretisation error over the change of an estimate since a grid half as fine: half, where the error is of first order
+DISCRETISATION = 0.5
 _STEPS = 3  # Gauss–Newton steps on each grid
-_ITERATIONS = 20  # iterations of CGLS, for a step and for a deviation
-_DEVIATIONS = 3.0  # deviations of one value, which the root mean square of all has to exceed
+_ITERATIONS = 20  # iterations of CGLS for each step, and for each standard deviation
+_DEVIATIONS = 3.0  # a kind is corrected where its RMS over the views exceeds this many standard deviations
 
 
 @dataclass(frozen=True)

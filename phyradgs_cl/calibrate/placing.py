@@ -10,15 +10,15 @@ from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.phantoms import Ellipsoid, EllipsoidPhantom
 
-FEWEST_BEADS = 4
+FEWEST_BEADS = 4  # least number of beads of a phantom
 WRONG_PHANTOM = "is it the right phantom, all of it in view, in mm? Does the gantry turn as stated ('phyradgs check')?"
-_LEAST_SHARE = 0.75  # least fraction of the beads that have to be in bright spots
-_SMOOTH = 0.5  # smoothing over a bead's radius: a bead of many voxels then has one maximum
-_PEAKS_PER_BEAD = 2.0  # bright spots that are compared, per bead
-_TOLERANCE_VOXELS = 1.5  # largest distance of a bead from its bright spot
-_TRIANGLES = 40  # triangles of known beads to try
-_APART = 0.05  # least angle in rad between different placements
-_MOST = 6  # placements to try where a nearly symmetric phantom fits equally well in several
+_LEAST_SHARE = 0.75  # least fraction of the beads that have to lie in bright spots
+_SMOOTH = 0.5  # standard deviation of the smoothing over a bead's radius: a bead of many voxels then has one maximum
+_PEAKS_PER_BEAD = 2.0  # number of bright spots, per bead, that are compared with the beads
+_TOLERANCE_VOXELS = 1.5  # largest distance of a bead from its bright spot, in voxels
+_TRIANGLES = 40  # most triangles of known beads that are tried
+_APART = 0.05  # least angle in rad between placements that count as different
+_MOST = 6  # most placements that are tried, where a nearly symmetric phantom fits equally well in several
 
 
 def bead_centres_mm(phantom: EllipsoidPhantom) -> np.ndarray:

@@ -23,8 +23,8 @@ from phyradgs_cl.reconstructors.voxels.priors import axis_weights
 from phyradgs_cl.reconstructors.voxels.system import System
 from phyradgs_cl.runtime import Runtime
 
-_MOST_TIMES = 8  # times per exposure
-_VOXELS_PER_TIME = 2.0  # how far the volume's edge moves between two times
+_MOST_TIMES = 8  # most times per exposure
+_VOXELS_PER_TIME = 2.0  # travel of the volume's rim, in voxels, for which one time of an exposure is taken
 _TV = FistaTvOptions(tv_weight=0.0005, tv_iterations=8)
 
 

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 CORRECTED, AGREES, CANNOT_TELL = "corrected", "agrees", "cannot tell"
-_FRAMES = 4  # frames in the figure
+_FRAMES = 4  # most frames shown in the figure
 _ROW_INCH, _CURVES_INCH, _WIDTH_INCH = 1.8, 2.4, 7.0
 
 

@@ -60,14 +60,15 @@ STAGES = (
     Stage(96, first=50, again=15, steps=3, project=30),
 )
 BEAD_STAGES = (Stage(48, first=8, again=4, steps=6, project=0), Stage(128, first=6, again=4, steps=6, project=0))
-_FEWEST_FRAMES, _FEWEST_COLUMNS = 8, 12
-_FEWEST_SPLINES = 4  # splines of a wobble: a cubic spline needs four
-# least share of the frames' variance that a phantom in its best place explains, before any correction
+_FEWEST_FRAMES = 8  # least number of frames of a scan
+_FEWEST_COLUMNS = 12  # least number of columns of a scan
+_FEWEST_SPLINES = 4  # least number of splines of a wobble: a cubic spline needs four
+# least fraction of the frames' squares that a phantom in its best place explains, before any correction
 _LEAST_EXPLAINED = 0.3
-# standard errors, and ratio of the residuals, from which a direction of readout is the better; as in ``check``
-_ORDER_ERRORS, _ORDER_RATIO = 4.0, 1.04
-_BEYOND = 1e6  # frames by which an encoder table is continued: first steps of the search may be very wrong
-# passes expected over the most of a stage: few parameters are determined, and steps become small early
+_ORDER_ERRORS = 4.0  # least advantage of the better direction of readout, in standard errors; as in ``check``
+_ORDER_RATIO = 1.04  # least ratio of the two directions' squared residuals; as in ``check``
+_BEYOND = 1e6  # spans of a frame by which an encoder table is continued: first steps of the search may be very wrong
+# expected cost of a stage over its largest: few parameters are determined, and steps become small early
 _EXPECTED_SHARE = 0.25
 
 

@@ -23,13 +23,16 @@ from phyradgs_cl.calibrate.problem import CoarseProblem
 from phyradgs_cl.calibrate.result import AGREES, CANNOT_TELL, CORRECTED, ParameterEstimate
 from phyradgs_cl.calibrate.stages import Stage
 
-LEAST_SHARE = 0.2  # least fraction of a signal that the object and the other parameters leave unexplained
-LEAST_SHARE_OF_BEADS = 0.02  # the same for a known object, which has no voxels that explain signals by accident
-_TINY = 1e-9  # is added to diagonals before an inverse
-_GAUGE_FACTOR, _MOST_GAUGE = 2.0, 0.2  # factor of a gauge's share; most of it to count, as it is large in a wrong geometry
-DEVIATIONS = 3.0  # deviations by which a parameter has to differ from its stated value
-_MOST_PX = 2.0  # largest step, in pixels of the grid: signals are not linear beyond
-_SETTLED = 0.1  # largest last step, in standard deviations
+# A parameter is determined only if object and other parameters leave at least this fraction of its signal unexplained.
+LEAST_SHARE = 0.2
+# the least unexplained fraction for a known object (beads), which has no voxels that explain signals by accident
+LEAST_SHARE_OF_BEADS = 0.02
+_TINY = 1e-9  # number that is added to the diagonal of a matrix before its inverse
+_GAUGE_FACTOR = 2.0  # a parameter's unexplained fraction has to be at least this many times that of its gauge (``GAUGES``)
+_MOST_GAUGE = 0.2  # upper limit at which a gauge's unexplained fraction counts: it is large in a wrong geometry
+DEVIATIONS = 3.0  # a parameter is corrected if it differs from its stated value by more standard deviations
+_MOST_PX = 2.0  # largest step of a parameter, in coarse pixels at the image's edge: signals are not linear beyond
+_SETTLED = 0.1  # steps on a grid end when all are smaller than this many standard deviations
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,7 +8,7 @@ from phyradgs_cl.checks import ceil_div
 
 Report = Callable[[int, int, str, float], None]
 """Takes the passes done, the passes in all, the phase, and the share of the time that has passed."""
-_LEAST_SHARE = 0.1  # passes still expected, over the most, where a phase takes longer than expected
+_LEAST_SHARE = 0.1  # lower limit of the cost still expected of a phase, over that of the most passes still to come
 Passes = tuple[int, float]
 """The most passes to come, and the cost that all passes are expected to have together."""
 

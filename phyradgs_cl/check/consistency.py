@@ -25,17 +25,20 @@ from phyradgs_cl.reconstructors.fits.residuals import Fit, fit, fit_squares, t_s
 from phyradgs_cl.runtime import Runtime
 
 CONSISTENCY = "consistency"
-_LARGEST = 0.35  # limit of the residual over that in a random order: correct scans of every kind have 0.02 to 0.23
-_DOUBTFUL = 0.1  # above this ratio, other orders and missing frames are tried
+# upper limit of the ratio of the residual in the stated order to that in a random order: correct scans have 0.02 to 0.23
+_LARGEST = 0.35
+_DOUBTFUL = 0.1  # above this ratio of residuals, other orders of the frames and missing frames are tried
 _RANDOM_ORDERS = 2  # random orders whose squared residuals are averaged
-_FEWEST_FRAMES, _FEWEST_PIXELS = 5, 32  # fewer frames, or valid coarse pixels per frame, cannot be judged
+_FEWEST_FRAMES = 5  # scans of fewer frames cannot be judged
+_FEWEST_PIXELS = 32  # scans with fewer valid coarse pixels per frame cannot be judged
 _CLEAR = 0.5  # a hypothesis must leave less than this fraction of the stated scan's squared residual
-_NEARLY = 1.5  # a rough fit up to this factor above the best mean squared residual is refined
-_ERRORS = 4.0  # standard errors by which a hypothesis must fit better
-_SYMMETRIC = 2.0  # limit of the residual in a random order over the stated order's, for the same look from all angles
-_SAME = 0.03  # limit, for the same look, of the residual in a random order over the frames' standard deviation
-_MOST_REFINED = 2  # hypotheses about the whole scan whose shift is refined
-_SHIFT_PENALTY = 1.5  # factor on the squared residual per coarse pixel of shift: stated offsets are mostly right
+_NEARLY = 1.5  # rough fits with up to this many times the least mean squared residual are refined
+_ERRORS = 4.0  # least advantage of a hypothesis over the stated scan, in standard errors
+# Frames look the same from every angle where a random order leaves a residual within both of these limits.
+_SYMMETRIC = 2.0  # largest ratio of the residual in a random order to that in the stated order
+_SAME = 0.03  # largest ratio of the residual in a random order to the standard deviation of the line integrals
+_MOST_REFINED = 2  # most hypotheses about the whole scan for which the panel's shift is refined
+_SHIFT_PENALTY = 1.5  # factor on the squared residual per coarse pixel of the panel's shift: stated offsets are mostly right
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,15 +9,16 @@ from phyradgs_cl.acquisition.geometry import field_of_view_mm
 from phyradgs_cl.check.finding import FEWEST_COLUMNS, OK, SUSPICIOUS, Finding, too_narrow
 from phyradgs_cl.detector import noise_level
 
-_LARGEST_SHARE = 0.1  # limit of the line integral at the panel's sides, as a fraction of the largest one
-_DISPLACED = 0.1  # offset over the panel's width: a panel this far off centre was displaced on purpose
-_NOISES = 4.0  # standard deviations of noise above which values count
-_OPAQUE = 30.0  # limit of line integrals: at larger ones no light passes
-_INVERTED = 0.9  # limit of values at the panel's sides over the largest one: higher ones are no air
-_BRIGHT = 0.05  # fraction of the pixels that may be brighter than the flats
-_FRAMES = 0.1  # fraction of the frames in which the object may touch a border
-_COVERED = 0.1  # least fraction of a column's rows in which the object counts as seen there
-_ANOTHER_SIZE = 5.0  # limit of a ratio of widths: a grid may hold a part of the object or be a little wider
+_LARGEST_SHARE = 0.1  # upper limit of the line integral at the panel's sides, as a fraction of the largest one
+_DISPLACED = 0.1  # a panel that is off centre by this fraction of its width was displaced on purpose
+_NOISES = 4.0  # line integrals count as object only above this many standard deviations of the noise
+_OPAQUE = 30.0  # upper limit of the largest line integral: behind more material no light passes
+_INVERTED = 0.9  # upper limit of the median at the panel's sides over the largest value: higher sides are no air
+_BRIGHT = 0.05  # largest fraction of the pixels that may be brighter than the flats
+_FRAMES = 0.1  # largest fraction of the frames in which the object may touch a side of the panel
+_COVERED = 0.1  # a column shows the object where more than this fraction of its rows does
+# upper limit of the ratio of the grid's width to the panel's field of view, and of the object's width to the grid's
+_ANOTHER_SIZE = 5.0
 NO_OBJECT, OPAQUE, TOO_BRIGHT = "no object", "opaque", "too bright"  # units of findings without line integrals
 CUT_OFF = "line integral at the border"  # unit of a finding: the object reaches beyond the panel
 _QUESTION = "coverage"

@@ -18,13 +18,14 @@ from phyradgs_cl.runtime import Runtime
 GAIN = "gain drift"
 OVERFLOW = "overflow"  # unit of a finding without line integrals
 _SATURATION, _DEAD = "saturation", "dead pixels"
-_MOST_SATURATED = 1e-3  # fraction of all pixels that may be saturated
+_MOST_SATURATED = 1e-3  # largest fraction of all pixels that may be saturated without a finding
 _REPEATS = 3  # least number of frames in which a clipped pixel has its least value
 _ZERO = 1e-6  # line integrals of a smaller size count as 0
-_JUMP = 0.75  # difference of neighbouring transmissions, over the brightest one, that counts as a jump
-_MOST_JUMPS = 5e-4  # fraction of all pixels that may jump
-_MOST_DEAD = 2e-4  # fraction of all pixels that may be dead
-_LARGEST_DRIFT, _DRIFT_DEVIATIONS = 0.015, 5.0  # limits of a relative change of gain, and of it in standard deviations
+_JUMP = 0.75  # difference of neighbouring pixels' transmissions, over the brightest transmission, above which it is a jump
+_MOST_JUMPS = 5e-4  # largest fraction of all pixels that may jump without a finding
+_MOST_DEAD = 2e-4  # largest fraction of all pixels that may be dead without a finding
+_LARGEST_DRIFT = 0.015  # largest relative change of the gain over the scan without a finding
+_DRIFT_DEVIATIONS = 5.0  # a change of the gain is a finding only beyond this many of its standard deviations
 _FEWEST_FRAMES = 8  # least number of frames in which a drift can be seen
 
 

@@ -18,10 +18,10 @@ from phyradgs_cl.reconstructors.fits import axis
 SIZE_FACTORS = (10.0, 0.1, 1e3, 1e-3)
 LEAST_REDUNDANCY = 0.5  # least fraction of columns whose rays are measured twice: with fewer, frames fit any size
 _UNITS = {10.0: " (in cm, read as mm?)", 1e3: " (in m, read as mm?)", 1e-3: " (in µm, read as mm?)"}
-_FANS = (0.02, 3.0)  # range of the panel's width over its distance from the source in real scanners
-_GRID_FACTOR = 3.0  # a stated grid that differs by more from the panel's view is replaced
-_SAME_PLACE = 1.0  # in coarse pixels: smaller shifts of the panel cannot be told apart
-_ARC_PERCENTS = (-5, -4, -3, -2, -1, 1, 2, 3, 4, 5)  # changes of the angles' step that are tried
+_FANS = (0.02, 3.0)  # range of the panel's width over its distance from the source in real scanners; others are not tried
+_GRID_FACTOR = 3.0  # a stated grid wider or narrower than the panel's view by more than this factor is replaced
+_SAME_PLACE = 1.0  # shifts of the panel by fewer coarse pixels cannot be told apart
+_ARC_PERCENTS = (-5, -4, -3, -2, -1, 1, 2, 3, 4, 5)  # tried changes of the angle between views, in percent
 _GAPS = 15  # number of places at which a missing or repeated frame is tried
 
 

@@ -12,17 +12,22 @@ from phyradgs_cl.detector import robust_deviation
 from phyradgs_cl.reconstructors.fits.residuals import Fit, fit, fit_squares
 from phyradgs_cl.runtime import Runtime
 
-_DEVIATIONS = 12.0  # an odd frame's level differs from its neighbours' by more standard deviations than this …
-_LEAST_CHANGE = 0.75  # … and by more than this fraction of the median level
-_FEWEST = 5  # fewer frames are not judged
-_REPEATED = 0.15  # a repeated frame differs by less than this fraction of its neighbours' differences
-_JUMP = 2.5  # median step in recorded order over that of sorted angles, above which the order jumps
-_UNLIKE = 2.0  # least difference of a repeated frame from the next view in angle, over the median one
-_OUTLIER = 4.0  # least residual of an outlier over the median one
-_ALIKE = 1.7  # limit of the ratio of both ends' residuals: right frames had at most 1.4, one odd frame at least 2.3
-_AT_BOTH_ENDS = 0.25  # limit of an end's residual over that in a random order: right frames had 0.2, odd ones mostly 0.3
-_MOST_OUTLIERS = 0.2  # fraction of the frames: with as many outliers, the cause is common to all
-_EXCHANGED = 0.5  # limit of the squared residual after an exchange of two frames, over the stated one
+# A frame is odd where its mean line integral differs from its neighbours' by more than both of these.
+_DEVIATIONS = 12.0  # difference in robust standard deviations of all frames' differences
+_LEAST_CHANGE = 0.75  # difference as a fraction of the frames' median mean line integral
+_FEWEST = 5  # scans of fewer frames are not judged
+_REPEATED = 0.15  # a repeated frame differs from its predecessor by less than this fraction of the neighbouring differences
+_JUMP = 2.5  # the order of angles jumps above this ratio of the median steps in recorded and in sorted order
+_UNLIKE = 2.0  # a repeated frame differs from the next view in angle by more than this many times the median difference
+_OUTLIER = 4.0  # an outlier's residual is at least this many times the frames' median
+# An arc's first and last frame fit about equally badly where their residuals differ by less than this factor: right frames
+# had at most 1.4, one odd frame at least 2.3.
+_ALIKE = 1.7
+# Such a first or last frame is kept only with a residual below this fraction of that in a random order: right frames had
+# 0.2, odd ones mostly 0.3.
+_AT_BOTH_ENDS = 0.25
+_MOST_OUTLIERS = 0.2  # from this fraction of the frames on, the cause is common to all, and no frame counts as an outlier
+_EXCHANGED = 0.5  # two frames were exchanged where the opposite order leaves less than this fraction of the squared residual
 
 
 def without_odd_frames(scan: Scan) -> tuple[np.ndarray, list[str]]:

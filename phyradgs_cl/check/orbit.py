@@ -36,16 +36,19 @@ from phyradgs_cl.runtime import Runtime
 SIGN, CENTRE, DISTANCES = "sign of rotation", "centre of rotation", "distances"
 OTHER_CAUSE = "pixels, if pixel sizes are right"  # unit of an offset that wrong pixel sizes explain as well
 UNVERIFIED = "neither pixel sizes nor distances are verified by these frames"
-_ERRORS = 4.0  # least difference of two hypotheses in standard errors
-_SIGN_RATIO, _CLEAR_RATIO = 1.2, 3.0  # ratios of squared residuals that decide on the sense of rotation: refined, and rough
-_TOLERATED_PX = 1 / 3  # shift of the panel that is always tolerated
-_DEVIATIONS = 4.0  # standard deviations of the shift that are tolerated
-_BIAS_FULL_TURN, _BIAS_HALF_TURN = 0.003, 0.04  # measured errors of the axis in coarse scans, in coarse pixels
-_WHOLE_PIXELS = 2  # limit, in pixels, of the tolerance for "ok", of a shift found without coarse pixels
-_LEAST_REDUNDANCY = 0.1  # least redundancy that is assumed, for a panel that sees the axis at its edge
+_ERRORS = 4.0  # least difference of two hypotheses in standard errors; below it the answer is "cannot tell"
+_SIGN_RATIO = 1.2  # least ratio of both senses' squared residuals that decides on the sense of rotation
+_CLEAR_RATIO = 3.0  # ratio of both senses' squared residuals in rough fits from which no refined shifts are needed
+_TOLERATED_PX = 1 / 3  # shift of the panel in pixels that is always tolerated
+_DEVIATIONS = 4.0  # shift of the panel that is always tolerated, in standard deviations of the found shift
+_BIAS_FULL_TURN = 0.003  # measured error of the axis in coarse pixels, for coarse scans of a full turn
+_BIAS_HALF_TURN = 0.04  # measured error of the axis in coarse pixels, where some rays are measured only once
+_WHOLE_PIXELS = 2  # "ok" needs a tolerance of at most this many pixels, where the shift is found without coarse pixels
+_LEAST_REDUNDANCY = 0.1  # lower limit of the assumed fraction of columns seen twice, for a panel with the axis at its edge
 _NO_SIGN = "parallel rays show an object that turns one way and its mirror image that turns the other way alike"
 _SIGN_ADVICE = "look for a feature whose side is known: a mirror image would fit as well"
-_OTHER_SIZES, _SIZE_RATIO = (0.8, 1.25), 1.05  # factors on the fan that must fit worse; by this ratio of squared residuals
+_OTHER_SIZES = (0.8, 1.25)  # factors on the fan; distances are "ok" where both fit worse than the stated fan
+_SIZE_RATIO = 1.05  # another fan fits worse from this ratio of its squared residual to the stated fan's
 
 
 @dataclass(frozen=True, eq=False)

@@ -22,7 +22,7 @@ from phyradgs_cl.detector import without_lag
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.runtime import Runtime
 
-_SPARE_COLUMNS = 2.0  # coarse columns by which a stated offset may be wrong with the object still inside the grid
+_SPARE_COLUMNS = 2.0  # error of a stated detector offset, in coarse columns, for which the grid has room
 Report = Callable[[int, int, str], None]
 """The type of a callback for progress: it takes the number of answered questions, of all, and the next question."""
 

@@ -15,15 +15,19 @@ from phyradgs_cl.runtime import Runtime
 
 READOUT, EXPOSURE = "sign of readout", "exposure"
 _ERRORS = 4.0  # least difference of two hypotheses in standard errors
-_ORDER_RATIO = 1.04  # least ratio of squared residuals that decides between the two orders; both models are equally free
-_OTHER_RATIO = 1.5  # the same ratio for another axis or another time
-_REST_RATIO = 2.0  # the same for a gantry at rest: a model without blur fits better in any case, above all with few views
-_AS_GOOD = 1.15  # limit of the ratio of squared residuals of readouts that fit nearly as well as the best
-_READOUT_SHARE = 0.86  # readout that is tried where none is stated, as a fraction of the time between frames
+# least ratio of squared residuals that decides between the two orders of readout; both models are equally free
+_ORDER_RATIO = 1.04
+_OTHER_RATIO = 1.5  # least ratio of squared residuals that decides for another readout axis or readout time
+# least ratio of squared residuals that decides for a gantry at rest: a model without blur fits better in any case, above
+# all with few views
+_REST_RATIO = 2.0
+_AS_GOOD = 1.15  # readouts with up to this many times the best one's squared residual are named beside it
+_READOUT_SHARE = 0.86  # readout time tried where none is stated, as a fraction of the time between frames
 _OTHER_WAY, _AT_REST = "the other way", "all at once, the gantry at rest"
 _NEEDED_RATIO = {_OTHER_WAY: _ORDER_RATIO, _AT_REST: _REST_RATIO}
-_HALF_RATIO = 0.6  # limit of the squared residual with half the exposure over the stated one's: correct scans have ≥ 0.8
-_WORSE_RATIO = 1.05  # least ratio of squared residuals at which another exposure fits worse
+# An exposure is suspicious where half of it leaves at most this fraction of the squared residual: correct scans have ≥ 0.8.
+_HALF_RATIO = 0.6
+_WORSE_RATIO = 1.05  # another exposure fits worse from this ratio of its squared residual to the stated one's
 
 
 def check_readout(rt: Runtime, scan: Scan) -> Finding:

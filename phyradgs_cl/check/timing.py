@@ -24,13 +24,13 @@ from phyradgs_cl.check.finding import OK, SUSPICIOUS, Finding
 
 _TIMING, _ANGLES = "timing", "angles"
 _ROUNDING = 1e-3  # relative tolerance: files round times and angles
-_SPEED_TOLERANCE = 0.02  # relative tolerance: gantries vary their speed by less
-_LONGEST_TABLE = 100.0  # limit of a table's duration over the scan's: a longer one belongs to no single scan
-_FEW_RAD = math.radians(5)  # a scan that covers a smaller arc of its table may have another unit of time
-_MILLISECONDS = (900.0, 3000.0)  # ratios of the durations of table and scan that mean ms against s
+_SPEED_TOLERANCE = 0.02  # largest relative difference of the steps between frames from the speed within: gantries vary less
+_LONGEST_TABLE = 100.0  # upper limit of the ratio of a table's duration to the scan's: longer ones belong to no single scan
+_FEW_RAD = math.radians(5)  # where frames see a smaller arc of a long table, its unit of time may be another
+_MILLISECONDS = (900.0, 3000.0)  # a ratio of durations, table to scan, in this range means a table in ms and frames in s
 _WIDE = 3.0  # a gap between views is wide above this multiple of the median step
 _SAME_RAD = 1e-6  # angles at most this far apart count as one
-_TOLERATED_DEG = 1.0  # coverage that may be missing: nearly parallel rays need half a turn only
+_TOLERATED_DEG = 1.0  # missing coverage in degrees without a finding: nearly parallel rays need half a turn only
 
 
 def check_timing(scan: Scan) -> Finding:

@@ -16,7 +16,7 @@ from phyradgs_cl.removed import REMOVED
 from phyradgs_cl.runtime import DEVICE_VARIABLE, MEMORY_VARIABLE
 from phyradgs_cl.settings import Settings, read_settings
 
-LARGEST_MM = 1e6
+LARGEST_MM = 1e6  # largest size of lengths in mm that an option takes
 First = Literal[SIDES]  # type: ignore[valid-type]
 DetectorModel = Literal[DETECTOR_MODELS]  # type: ignore[valid-type]
 
@@ -33,7 +33,7 @@ ObjectMotion = Annotated[Path | None, file_option(_OBJECT_MOTION, "--object-moti
 IgnoreLag = Annotated[bool, option("Leave the scan's lag in the frames.", True, "--ignore-lag")]
 _CHECKPOINT = "Seconds from checkpoint to checkpoint of a run, which continues from its last; 0: on Ctrl-C only."
 CheckpointEvery = Annotated[float, option(_CHECKPOINT, metavar="SECONDS")]
-CHECKPOINT_EVERY_S = 600.0
+CHECKPOINT_EVERY_S = 600.0  # default time between checkpoints
 
 _STEPS = f"Corrections of the frames, of {', '.join(STEPS)} (docs: prepare.md)."
 STEPS_OF_PREPARE = option(_STEPS, DEFAULT_STEPS, metavar="NAME,...")

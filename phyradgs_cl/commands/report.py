@@ -14,7 +14,7 @@ EXAMPLES = {
     "report": "Example: phyradgs report volume.h5 -o report.html",
     "view": "Example: phyradgs view volume.h5",
 }
-MOST_VIEWS = 24
+MOST_VIEWS = 24  # largest number of frames that --views takes
 _SCAN_DEFAULT = "the one that the volume file names, if unchanged"
 _VIEWS = "Frames to compute from the volume and compare with the measurement."
 

@@ -15,20 +15,21 @@ from phyradgs_cl.errors import InputError
 
 PROJECTION, FLAT, DARK, INVALID = 0, 1, 2, 3  # the codes of NXtomo's image_key
 QUANTITIES = ("attenuation", "transmission", "counts")
-# Smallest transmission before the logarithm: a line integral of 13.8. It is finite, and below what 16-bit panels resolve.
+# Lower limit of the transmission before the logarithm, a line integral of 13.8; pixels at or below it are masked. It is
+# below what 16-bit panels resolve.
 TRANSMISSION_FLOOR = 1e-6
-_LARGEST = float(np.finfo(np.float32).max)
-_BLOCK_PIXELS = 1 << 18  # pixels converted at a time: float64 copies of a whole scan, or of one huge frame, are large
+_LARGEST = float(np.finfo(np.float32).max)  # default of the largest size of a value that counts as usable
+_BLOCK_PIXELS = 1 << 18  # most pixels converted at a time: float64 copies of a whole scan, or of one huge frame, are large
 Array = NDArray[np.floating]
 _ENERGY_KEV = np.array([15.0, 20.0, 30.0, 40.0, 50.0, 60.0, 80.0, 100.0, 150.0])
-# Mass attenuation in cm²/g of water, cortical bone (ICRU-44) and aluminium.
+# Mass attenuation coefficients at these energies, in cm²/g, of water, cortical bone (ICRU-44) and aluminium.
 _WATER = np.array([1.673, 0.8096, 0.3756, 0.2683, 0.2269, 0.2059, 0.1837, 0.1707, 0.1505])
 _BONE = np.array([9.032, 4.001, 1.331, 0.6655, 0.4242, 0.3148, 0.2229, 0.1855, 0.1480])
 _ALUMINIUM = np.array([7.955, 3.441, 1.128, 0.5685, 0.3681, 0.2778, 0.2018, 0.1704, 0.1378])
 _ALUMINIUM_G_PER_CM3 = 2.699
 _STEP_KEV = 2.0  # step of SpekPy's energies: finer steps change a half-value layer by less than a thousandth
-LOWEST_KVP, HIGHEST_KVP = 30.0, 150.0
-FILTER_MM = 5.0
+LOWEST_KVP, HIGHEST_KVP = 30.0, 150.0  # limits of a tube voltage in kV
+FILTER_MM = 5.0  # default thickness of the aluminium filter
 
 
 def counts_to_attenuation(

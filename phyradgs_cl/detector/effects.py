@@ -22,12 +22,12 @@ from phyradgs_cl.detector.attenuation import TRANSMISSION_FLOOR
 Array = NDArray[np.floating]
 # Above this mean, Poisson is drawn as a rounded normal, whose skewness is off by < 4e-5. NumPy's sampler fails near 9.2e18.
 NORMAL_FROM = 1e9
-COUNT_FLOOR = 0.5  # smallest count before the logarithm: below what a detector can tell
-_LARGEST_EXPONENT = 700.0  # largest exponent in float64: very negative line integrals, as of ringing, would overflow
-_SPARK_HEIGHT = (0.3, 2.0)  # range of a spark's light, over the light without object
-_SCATTER_REACH = 6.0  # the panel's longer side over the length of the scatter kernel
-_SCATTER_POWERS = (0.8, 1.5)  # powers of the primary light and of the line integral
-_SHADOW = 0.1  # fraction of the largest line integral: pixels above it lie behind the object
+COUNT_FLOOR = 0.5  # lower limit of counts before the logarithm: below what a detector can tell
+_LARGEST_EXPONENT = 700.0  # upper limit of exponents: very negative line integrals, as of ringing, would overflow float64
+_SPARK_HEIGHT = (0.3, 2.0)  # range of a spark's light, as fractions of the light without object
+_SCATTER_REACH = 6.0  # the panel's longer side over the decay length of the scatter kernel
+_SCATTER_POWERS = (0.8, 1.5)  # powers of the primary light and of the line integral, whose product is the scattered light
+_SHADOW = 0.1  # pixels above this fraction of the largest line integral lie behind the object
 
 
 def tigre_counts(line_integrals: ArrayLike, dose: float) -> tuple[Array, float]:

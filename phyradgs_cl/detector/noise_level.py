@@ -10,20 +10,24 @@ from phyradgs_cl.acquisition import Saturation
 from phyradgs_cl.checks import ceil_div
 
 NORMAL_MAD = 1.4826  # standard deviation of a normal variable over its median absolute deviation
-# Median of |x| over the standard deviation of a normal x, and the norm of the filter (-1/2, 1, -1/2).
-_MEDIAN_OF_NORMAL, _FILTER_NORM = 0.6745, 1.5**0.5
-_LARGEST_SAMPLE = 1_000_000  # pixels whose median is taken, at most
-_TENTHS = 10  # classes of line integrals with equal numbers of pixels
-_BEHIND = 5.0  # line integrals above so many noise levels have met the object
-_FRAMES = 16  # frames from which noise is estimated
+_MEDIAN_OF_NORMAL = 0.6745  # median of |x| over the standard deviation of a normal variable x with mean 0
+_FILTER_NORM = 1.5**0.5  # Euclidean norm of the filter (-1/2, 1, -1/2), by which it multiplies white noise
+_LARGEST_SAMPLE = 1_000_000  # number of pixels, about, whose median is taken where there are more
+_TENTHS = 10  # number of classes of line integrals with equal numbers of pixels
+_BEHIND = 5.0  # pixels above this many noise levels lie behind the object
+_FRAMES = 16  # number of frames, about, from which noise is estimated where there are more
 
 LEAST_SHARE = 1e-3
 """Saturation is suspected from this fraction of the pixels at one extreme."""
-_TOUCHING = 0.5  # fraction of the extreme pixels whose four neighbours are at the same extreme
-_SAME = 1e-3  # relative difference between a flat and the projections' ceiling that counts as none
-_MOST_FRAMES, _LONGEST_EDGE = 8, 1024  # number of frames, and their longest side, that are searched for noise
-_ROUNDING, _RELATIVE = 0.5, 2e-5  # noise that counts as none: in counts, and relative to the ceiling
-_WHITE = 0.5  # least ratio of two estimates that agree for white noise and differ by far for smooth structure
+_TOUCHING = 0.5  # pixels at an extreme are clipped if the four neighbours of more than this fraction of them are too
+_SAME = 1e-3  # largest relative difference between a flat and the projections' ceiling that counts as none
+_MOST_FRAMES = 8  # most frames that are searched for noise
+_LONGEST_EDGE = 1024  # longest side in pixels of the middle part of a frame that is searched for noise
+_ROUNDING = 0.5  # largest estimate of noise in counts that counts as none
+_RELATIVE = 2e-5  # largest estimate of noise, as a fraction of the ceiling, that counts as none
+# least ratio of two estimates of noise, along both axes and along rows: they agree for white noise and differ by far for
+# smooth structure
+_WHITE = 0.5
 
 
 def robust_deviation(values: np.ndarray) -> float:

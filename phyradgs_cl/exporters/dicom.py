@@ -22,7 +22,7 @@ from phyradgs_cl.io.volume import Volume
 _CT_IMAGE = "1.2.840.10008.5.1.4.1.1.2"
 _EXPLICIT_LITTLE = "1.2.840.10008.1.2.1"
 _LARGEST = 32_767  # largest signed number of 16 bits
-_LONGEST = 64  # limit of the characters in DICOM's value representations PN and LO
+_LONGEST = 64  # most characters of a text in DICOM's value representations PN and LO
 
 
 @dataclass(frozen=True)

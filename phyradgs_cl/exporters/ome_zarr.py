@@ -10,7 +10,7 @@ from phyradgs_cl.exporters.dicom import folder_written_beside
 from phyradgs_cl.fields import Grid, Hounsfield
 from phyradgs_cl.io.volume import Volume
 
-_CHUNK = 64  # limit of a chunk's voxels along each axis; a level within it along all axes is the last
+_CHUNK = 64  # most voxels of a chunk along each axis; a level with no more along all axes is the last
 
 
 def write_zarr(path: Path, volume: Volume, scale: Hounsfield | None) -> None:

@@ -14,8 +14,8 @@ from phyradgs_cl.io.output import written_beside
 from phyradgs_cl.io.volume import Volume
 
 _WRITERS = {".mha": "MetaImageIO", ".nii": "NiftiImageIO", ".nii.gz": "NiftiImageIO", ".nrrd": "NrrdImageIO"}
-_MOST_NIFTI_VOXELS = 32_767  # NIfTI's limit along one axis
-_MOST_IMAGEJ_BYTES = 4_000_000_000  # limit of ImageJ's TIFF, whose offsets have 32 bits
+_MOST_NIFTI_VOXELS = 32_767  # most voxels along one axis in NIfTI
+_MOST_IMAGEJ_BYTES = 4_000_000_000  # from this size on volumes become BigTIFF: offsets of ImageJ's TIFF have 32 bits
 _PLY_NAMES = (
     *("x", "y", "z", "scale_0", "scale_1", "scale_2"), *("rot_0", "rot_1", "rot_2", "rot_3", "density")
 )

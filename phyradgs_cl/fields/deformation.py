@@ -15,10 +15,10 @@ from phyradgs_cl import checks
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields.volume import Grid
 
-_LEVELS = 16  # steps of a weight's range at which the folding check distinguishes states
-_MOST_STEPS = 200  # iterations of the fixed point: enough for a contraction of 0.93
-_FLAT = 1e-4  # slope of a displacement below which the determinant counts as 1
-_CLOSE = 1e-6  # fraction of the smallest control spacing at which the fixed point ends
+_LEVELS = 16  # steps, up to a field's largest weight, to which the folding check rounds weights: equal states count once
+_MOST_STEPS = 200  # most iterations of the fixed point that inverts a field: enough for a contraction of 0.93
+_FLAT = 1e-4  # where the displacement has a smaller slope, in mm per mm, the Jacobian determinant counts as 1
+_CLOSE = 1e-6  # the fixed point ends at a change below this fraction of the smallest control spacing
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,9 +10,11 @@ from phyradgs_cl import checks
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields.volume import MOST_VOXELS, Grid, triple
 
-_LARGEST_MM = 1e9  # largest length that an option takes; its inverse is the smallest
-_ROUNDING = 1e-6  # distance in voxels between a box's end and a voxel's face below which they are one
-_TYPED = 0.01  # the same for a typed box and the scan's voxels, whose sides are rarely round numbers
+_LARGEST_MM = 1e9  # upper limit in mm of a length that an option takes; the lower limit of widths is 1e-9 mm
+_ROUNDING = 1e-6  # a box's end and a voxel's face at most this far apart, in voxels, count as one place
+# a typed box's end and a face of the scan's voxels at most this far apart, in voxels, count as one place: the voxels' sides
+# are rarely round numbers
+_TYPED = 0.01
 
 
 @dataclass(frozen=True)

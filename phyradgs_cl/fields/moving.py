@@ -14,8 +14,8 @@ from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields.deformation import Deformation
 from phyradgs_cl.fields.volume import Grid, triple
 
-_SLAB_VOXELS = 1 << 18  # voxels that one thread displaces at a time: their coordinates need six times a volume's memory
-_BORDER = 8  # voxels of zeros around a volume: a spline's coefficients fall to 3e-5 within them
+_SLAB_VOXELS = 1 << 18  # most voxels that one thread displaces at a time: coordinates need six times their memory
+_BORDER = 8  # width in voxels of the zeros around a volume: a spline's coefficients fall to 3e-5 within it
 
 
 @dataclass(frozen=True, eq=False)

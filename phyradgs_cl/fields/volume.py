@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 MOST_VOXELS = 2**38
 """The most voxels of a grid: a terabyte of float32. Larger requests come from damaged files."""
-_SAME_PLACE = 1e-3  # voxels by which grids stored in float32 may differ
+_SAME_PLACE = 1e-3  # largest distance in voxels at which voxels of two grids count as one: grids may be stored in float32
 T = TypeVar("T")
 
 

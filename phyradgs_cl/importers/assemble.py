@@ -27,8 +27,8 @@ _OF_A_TURN = ("exposure_s", "readout_s", "angle_at", "readout_axis", "readout_di
 Length = float | Callable[[], float]
 Pitch = tuple[float, float] | Callable[[], tuple[float, float]]
 _DISTANCES = ("source_to_axis_mm", "source_to_detector_mm")
-_VIEW_DIGITS = 5  # views that agree to so many decimals of their angle, or scaled pose, count as one
-_SLACK = 1e-6  # fraction of a frame's span by which a pose table extends beyond the times that are needed
+_VIEW_DIGITS = 5  # views count as one where their angles, or their scaled poses, agree to this many decimals
+_SLACK = 1e-6  # extension of a pose table beyond the times that are needed, as a fraction of a frame's span
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,7 +60,7 @@ class StoredTiming:
     start_s: np.ndarray | None = None
     axis: str | None = None
     direction: int | None = None
-    pulse: tuple[float, float] | None = None  # in exposures, as the scanner's TOML gives it
+    pulse: tuple[float, float] | None = None  # start and length of the beam's pulse, as fractions of the exposure
     angle_at: str | None = None
     written: tuple[str, ...] = ()
 

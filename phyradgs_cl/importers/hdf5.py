@@ -28,8 +28,8 @@ STACKS = ("projections", "flats", "darks", "mask")
 NAMES = (*STACKS, "image_key", "angles", "axes")
 _AXES = ("frame", "v", "u")
 _DISTANCES = ("source_to_axis_mm", "source_to_detector_mm")
-_LIKE = 0.1  # relative difference up to which two stated sizes of a pixel agree
-_LEAST_MM = 1e-4  # a smaller pixel without a unit is taken to be in m
+_LIKE = 0.1  # largest relative difference of two stated pixel sizes that agree
+_LEAST_MM = 1e-4  # a pixel size without a unit that would be smaller than this in mm is taken to be in m
 _TIMES = replace(LENGTH, name="magnification", assumed="", factors=MappingProxyType({"": 1.0, "x": 1.0}))
 
 

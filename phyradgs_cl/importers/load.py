@@ -45,7 +45,7 @@ _KINDS = {
     ("fit", "fits"): ("FITS", "convert them to TIFF: astropy.io.fits and tifffile.imwrite"),
     ("xrm", "txm"): ("single images or a volume of Xradia", "import the scan's .txrm, or export TIFFs"),
 }  # fmt: skip
-_MOST_FILES = 1000
+_MOST_FILES = 1000  # most files of a folder that are looked at for a message about unknown formats
 
 
 def refuse_unread(path: Path, expected: str) -> None:
@@ -83,8 +83,8 @@ FORMATS = {
     "leap": "leap",
     "tigre": "pickles:tigre",
 }
-_MOST_BODIES = 1000
-_LARGEST_MM, _LARGEST_PER_MM = 1e5, 1e5
+_MOST_BODIES = 1000  # most beads and wires of a phantom
+_LARGEST_MM, _LARGEST_PER_MM = 1e5, 1e5  # largest size of coordinates in mm, and of attenuations in 1/mm
 _COMMON = "attenuation_per_mm"
 _KEYS = {"bead": ("centre_mm", "radius_mm", _COMMON), "wire": ("from_mm", "to_mm", "radius_mm", _COMMON)}
 

@@ -18,7 +18,7 @@ except ImportError:  # not POSIX
 
 HOST_SHARE = 0.8
 """The largest fraction of this machine's memory that one array may take."""
-_BLOCK_BYTES = 1 << 20
+_BLOCK_BYTES = 1 << 20  # bytes of a file that are read at a time for its checksum
 
 
 def regular_file(path: Path, subject: str, expected: str = "a regular file") -> os.stat_result:

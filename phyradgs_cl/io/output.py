@@ -22,11 +22,11 @@ from phyradgs_cl.errors import InputError, OutputError
 
 NO_SPACE = (errno.ENOSPC, errno.EFBIG, getattr(errno, "EDQUOT", errno.ENOSPC))
 """Error numbers of the system for a lack of room: on the disk, for one file, of the user's quota."""
-_LONGEST = 50  # characters of the target's name kept in a temporary name: each may take 4 of a name's 255 bytes
-_LONGEST_BYTES = 255  # length limit of a file's name in all common file systems
-_SPARE_BYTES = 1 << 16  # reserved beyond the arrays, for headers
+_LONGEST = 50  # most characters of the target's name kept in a temporary name: each may take 4 of a name's 255 bytes
+_LONGEST_BYTES = 255  # most bytes of a file's name in all common file systems
+_SPARE_BYTES = 1 << 16  # bytes of the disk that are reserved beyond the arrays, for headers
 _WRITER = re.compile(r"\.([0-9a-f]{8})-(\d{1,9})-[0-9a-f]{8}\.part(\.[a-z.]+)?$")
-_FORMAT = 2  # version of checkpoints
+_FORMAT = 2  # version of the format of checkpoints
 _RESTART = "start without --resume"
 
 

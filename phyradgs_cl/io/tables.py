@@ -19,9 +19,9 @@ if sys.version_info >= (3, 11):
 else:
     import tomli as tomllib
 
-LARGEST = 1e12  # limit of the size of any number: no angle, time or count is larger, and sums stay finite
-LARGEST_LENGTH = 1e9  # limit of a length in mm; its inverse is the least one
-_MOST_TOML_BYTES = 16 << 20  # limit of a TOML file
+LARGEST = 1e12  # largest size of any number: no angle, time or count is larger, and sums stay finite
+LARGEST_LENGTH = 1e9  # largest length in mm; its inverse is the smallest length above 0
+_MOST_TOML_BYTES = 16 << 20  # most bytes of a TOML file
 _COUNTS = {2: "two", 3: "three"}
 _log = logging.getLogger(__name__)
 PROVENANCE: dict[str, tuple[type, ...]] = {

@@ -30,13 +30,13 @@ _VOLUME, _BARE = f"{_DATA}/volume", "/volume"
 _AXES = ("z", "y", "x")
 _GAUSSIANS, _STATE, _STATES = "/entry/gaussians", "/entry/state", "/entry/time_series"
 _CLOUD = {"mean": (3,), "scale": (3,), "quaternion": (4,), "density": ()}
-_LOWEST_PER_MM, _HIGHEST_PER_MM = -10.0, 1000.0  # limits of attenuation: below is no noise, above not even gold
-_USUAL_PER_MM = 10.0  # values beyond are HU where the user states water's attenuation
+_LOWEST_PER_MM, _HIGHEST_PER_MM = -10.0, 1000.0  # limits of attenuation in 1/mm: below is no noise, above not even gold
+_USUAL_PER_MM = 10.0  # values of a larger size are HU, not 1/mm, where the user states water's attenuation
 VALUES = "values"
 """The provenance's key of the note on its values that a file of another format holds."""
 FROM_HU = "1/mm, from HU"
 """The note on the values of a volume that ``in_per_mm`` has converted."""
-_AXIS_TOLERANCE = 1e-3  # largest deviation of a voxel's centre, in voxels: axes may be stored in float32
+_AXIS_TOLERANCE = 1e-3  # largest deviation of a voxel's centre from even spacing, in voxels: axes may be stored in float32
 log = logging.getLogger(__name__)
 
 

@@ -11,7 +11,7 @@ from phyradgs_cl.fields import Grid, triple
 
 Values = NDArray[np.floating]
 VOXEL_BY_VOXEL = "voxel by voxel"
-_ROUNDING = 1e-6  # tolerance of a box's faces, in voxels
+_ROUNDING = 1e-6  # largest distance, in voxels, of the faces of two boxes that count as equal
 
 
 @dataclass(frozen=True, eq=False)

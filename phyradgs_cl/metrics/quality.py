@@ -25,12 +25,14 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 Floats = NDArray[np.floating]
-WINDOW, SIGMA = 11, 1.5
-K1, K2 = 0.01, 0.03
-_VOXELS_PER_BATCH = 1 << 20  # about ten float64 arrays of this size exist at once: 80 MB
-_EDGE = 0.25  # fraction of the steepest slope: at such voxels a displacement can be seen
-_MOST_POINTS = 2000  # points at which motions are compared
-_INCH, _DPI = 3.2, 110  # inches and dots per inch of the figure of slices
+WINDOW = 11  # side of SSIM's window in voxels
+SIGMA = 1.5  # standard deviation of the Gaussian weights in SSIM's window, in voxels
+K1, K2 = 0.01, 0.03  # SSIM's constants for means and for variances, as fractions of the data range (Wang et al. 2004)
+_VOXELS_PER_BATCH = 1 << 20  # voxels compared at a time: about ten float64 arrays of this size exist at once, 80 MB
+_EDGE = 0.25  # motions are compared at voxels with at least this fraction of the steepest slope, where they can be seen
+_MOST_POINTS = 2000  # most voxels at which motions are compared
+_INCH = 3.2  # side of a slice in the figure, in inches
+_DPI = 110  # dots per inch of the figure
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ from phyradgs_cl.neural.options import LineOptions, NeuralOptions
 
 _WIDER = 4  # width of the feed-forward layers over that of the others
 _FACTORS = (1, 2_654_435_761, 805_459_861)  # factors of x, y, z in the hash (Müller et al., Eq. 4)
-_FIRST_FEATURES = 1e-4  # the first features are uniform in ± this (Müller et al., NAF)
+_FIRST_FEATURES = 1e-4  # largest size of the random initial features, which are uniform (Müller et al., NAF)
 
 
 class LineAttention(nn.Module):

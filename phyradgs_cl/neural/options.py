@@ -13,11 +13,13 @@ from phyradgs_cl.errors import InputError
 JITTERS = ("ray", "sample", "none")
 LAST_ACTIVATIONS = ("sigmoid", "leaky-relu")
 TORCH_DEVICES = ("auto", "cpu", "cuda", "mps")
+# The next three are defaults, used where the options do not state the numbers themselves.
 CELLS_PER_VOXEL = 1.0  # cells of the encoding's finest level per voxel, along the longest side
-SAMPLES_PER_VOXEL = 1.5  # samples per voxel along a ray: NAF takes 192 for 128 voxels
-SAMPLES_PER_TIME = 1.2  # the same for each ray of a pixel with several times, where only the mean over the rays counts
+SAMPLES_PER_VOXEL = 1.5  # samples along a ray per voxel of the longest side: NAF takes 192 for 128 voxels
+# samples along a ray per voxel for pixels with a ray at each of several times, where only the mean over the rays counts
+SAMPLES_PER_TIME = 1.2
 
-_FINEST = 2**24  # cells along a side: beyond it float32 coordinates have no fractions
+_FINEST = 2**24  # most cells of a level along a side: with more, float32 coordinates have no fractions
 
 
 @dataclass(frozen=True)

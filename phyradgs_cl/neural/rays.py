@@ -13,7 +13,7 @@ from phyradgs_cl.acquisition.time_cells import TimeCells
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
 
-_BEYOND_VOLUME = 2.0  # a distance in half-sides that is beyond every corner of the volume
+_BEYOND_VOLUME = 2.0  # distance from the volume's middle, in its longest half-sides, that is beyond every corner
 Field = Callable[[torch.Tensor], torch.Tensor]
 
 

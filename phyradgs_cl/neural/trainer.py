@@ -11,8 +11,9 @@ from phyradgs_cl.neural import rays
 from phyradgs_cl.neural.field import NeuralField, repeatable, to_array, to_tensor, voxel_values
 from phyradgs_cl.neural.options import LineOptions, NeuralOptions
 
-_BETAS, _EPSILON = (0.9, 0.999), 1e-8
-_POINTS_ON_CPU, _POINTS_ELSEWHERE = 2**14, 2**20  # points evaluated at once: as many as a CPU's cache or a GPU holds
+_BETAS, _EPSILON = (0.9, 0.999), 1e-8  # Adam's decay rates of both moments, and the addend to its denominator
+_POINTS_ON_CPU = 2**14  # most points at which a CPU evaluates the field at once: as many as its cache holds
+_POINTS_ELSEWHERE = 2**20  # most points at which another device evaluates the field at once: as many as a GPU holds
 
 
 class Trainer:

@@ -16,9 +16,10 @@ from phyradgs_cl.checks import ceil_div
 from phyradgs_cl.runtime import DeviceArray, Runtime, SameArray
 from phyradgs_cl.runtime.layout import GUARD, beside, brought_to, padded_zeros, pitch_of
 
-EDGE = 4  # voxels along a side of a block
-_SAMPLES = 8  # time for a voxel of a block, in samples of a ray
-# The shift along y for every shift along z, by turn. A turn has each shift of both once; four turns have all pairs.
+EDGE = 4  # voxels along each side of a block
+_SAMPLES = 8  # estimated time of one voxel in one launch, in samples of a ray; it sets the size of launches
+# Shift of the blocks along y in voxels for every shift along z, by turn. A turn has each shift of both once; four turns have
+# all pairs.
 TURNS = ((0, 1, 2, 3), (1, 3, 0, 2), (2, 0, 3, 1), (3, 2, 1, 0))
 
 

@@ -17,9 +17,9 @@ from phyradgs_cl.runtime.layout import GUARD, Strides, beside, brought_to, move,
 
 EDGE = 5
 """The number of voxels along a side of a filter."""
-_SAMPLES = 200  # time for a voxel, in samples of a ray, at most
+_SAMPLES = 200  # upper limit of the time of one voxel in one launch, in samples of a ray; it sets the size of launches
 _SLICES = 2  # slices of channels and responses that are computed at a time
-_RING = _SLICES + 2  # slices in memory: a correlation needs three
+_RING = _SLICES + 2  # slices in memory: the correlation of two slices needs one more on either side
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,7 +65,7 @@ class RidgeStep:
     """The step for volumes of a fixed ``shape`` (z, y, x). It does not change a volume thinner than a filter."""
 
     VOLUMES = 4
-    """How many volumes of floats it holds in memory, for 50 slices or more of 64 voxels in a row or more."""
+    """Most volumes of floats that a step holds in memory, for at least 50 slices with rows of at least 64 voxels."""
 
     def __init__(self, rt: Runtime, shape: tuple[int, int, int], ridge: Ridge) -> None:
         self.rt, self.shape = rt, shape

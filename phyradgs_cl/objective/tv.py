@@ -129,7 +129,9 @@ def _steps(axis_weights: tuple[float, ...]) -> tuple[float, float]:
     return (in_space / 2, 1 / (8 * time[0] ** 2)) if any(time) else (in_space, 0.0)
 
 
-_SMALLEST, _NOTHING = 1e-6, 1e-30  # floor of the differences over the volume's RMS; floor for a volume of zeros
+# TV's gradient divides by the length of differences, which is 0 in flat regions, plus the larger of these two.
+_SMALLEST = 1e-6  # addend as a fraction of the volume's RMS
+_NOTHING = 1e-30  # addend in 1/mm, for a volume of zeros
 
 
 class TvDescent:

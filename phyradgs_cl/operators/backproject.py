@@ -16,16 +16,17 @@ from phyradgs_cl.operators.rays.layout import voxel_matrices
 from phyradgs_cl.runtime import Array, DeviceArray, Room, Runtime, SameArray, attempts
 from phyradgs_cl.runtime.layout import GUARD, Strides, move, padded_zeros, pitch_of, unpad_rows
 
-_VIEWS_PER_LAUNCH = 64  # views of a launch, at most: a work-item reads a few lines of each, which should stay in the cache
-_BYTES_A_LAUNCH = 1 << 28  # upper limit for the frames that are uploaded together
-_VIEWS_SHARE = 0.25  # share of the free device memory for the frames that are uploaded together
-_BLOCK_VOXELS = 128  # voxels along z per work-item of the upright kernel, at most
-_COLUMN_ROWS = 512  # detector rows that such a block may project to
-# columns are upright where u·depth and depth change by less than so much of the depth over the volume's height
+_VIEWS_PER_LAUNCH = 64  # most views of a launch: a work-item reads a few lines of each, which should stay in the cache
+_BYTES_A_LAUNCH = 1 << 28  # most bytes of the frames that are uploaded together
+_VIEWS_SHARE = 0.25  # largest fraction of the free device memory for the frames that are uploaded together
+_BLOCK_VOXELS = 128  # most voxels along z per work-item of the upright kernel
+_COLUMN_ROWS = 512  # most detector rows to which the voxels of a work-item may project
+# columns of voxels are upright where u·depth and depth change over the volume's height by at most this fraction of the depth
 _UPRIGHT = 1e-7
-_MOST_LEAN = 0.25  # largest lean: columns crossed per row crossed along z; beyond it the general kernel is faster
-LINE_SAMPLES = 4  # work of a voxel in a view with a pose for every line, in samples of a view with one pose
-_WIDEST = 16  # voxels of the widest vector, which may reach beyond the end of a column
+# largest lean of a column of voxels, in detector columns crossed per row crossed: beyond it the general kernel is faster
+_MOST_LEAN = 0.25
+LINE_SAMPLES = 4  # time of a voxel in a view with a pose for every line, in samples of a view with one pose
+_WIDEST = 16  # number of voxels of the widest vector, which may reach beyond the end of a column
 Arguments = tuple[DeviceArray, DeviceArray, DeviceArray, np.int32, np.int32, np.int32, np.int32, np.int64]
 
 

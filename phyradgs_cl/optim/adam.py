@@ -8,7 +8,7 @@ from phyradgs_cl import checks
 from phyradgs_cl.fields import Activation
 from phyradgs_cl.runtime import DeviceArray, Runtime
 
-_RANGE = (1e-12, 10)  # a rate of 0 cannot decay; 1e-12 moves nothing in float32
+_RANGE = (1e-12, 10)  # limits of a learning rate: 0 could not decay, and 1e-12 moves nothing in float32
 
 
 @dataclass(frozen=True)
@@ -40,8 +40,8 @@ PUBLISHED_RATES = Rates(
 )
 
 
-BETA1, BETA2 = 0.9, 0.999
-EPSILON = 1e-15
+BETA1, BETA2 = 0.9, 0.999  # Adam's decay rates of the first and second moments
+EPSILON = 1e-15  # Adam's addend to the root of the second moments, before the division by it
 
 
 def folded_rates(rates: np.ndarray, step: int) -> np.ndarray:

@@ -29,7 +29,7 @@ _GREY_LEVELS = {
     "kak-slaney": (2.0, -0.98, -0.02, -0.02, 0.02, 0.02, 0.01, 0.01, 0.02, -0.02),
 }
 _OUTER, _INNER, _SWING = 60 / 64, 8 / 64, 8 / 64  # RTK's mm over half of its box of 128 mm
-_STEPS = 8  # frames of RTK's cycle, in which the sphere goes forth and back
+_STEPS = 8  # number of frames of RTK's cycle, in which the sphere goes forth and back
 
 
 def shepp_logan(

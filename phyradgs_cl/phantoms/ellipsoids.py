@@ -18,8 +18,8 @@ Triple = tuple[float, float, float]
 Matrix = tuple[Triple, Triple, Triple]
 
 IDENTITY: Matrix = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
-_PARALLEL = 1e-30  # replaces 0: a ray along a cylinder meets its side nowhere
-RAYS_PER_CHUNK = 1 << 15  # the intermediates of a chunk stay in a core's cache: 2-3 MB
+_PARALLEL = 1e-30  # smallest divisor, in place of 0, for a ray along a cylinder's axis, which meets its side nowhere
+RAYS_PER_CHUNK = 1 << 15  # most rays projected at a time: the intermediates, 2-3 MB, stay in a core's cache
 
 
 def rotation_about_z(angle_rad: float) -> Matrix:

@@ -13,8 +13,8 @@ Field = NDArray[np.float32]
 Box = tuple[slice, slice, slice]
 Point = tuple[float, float, float]
 
-FAR = np.float32(4.0)  # a distance larger than any inside the cube
-_REACH = 5.0  # distance in blend widths from which a body no longer counts in a union (exp(-5) = 0.7 %)
+FAR = np.float32(4.0)  # distance in half-sides of the phantom's cube that is larger than any inside it
+_REACH = 5.0  # distance in blend widths beyond which a body no longer counts in a union (exp(-5) = 0.7 %)
 
 
 @dataclass(frozen=True)

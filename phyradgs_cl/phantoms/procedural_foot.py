@@ -13,11 +13,13 @@ from phyradgs_cl.phantoms.implicit import Capsule, Field, Lattice, Point
 
 Bone = tuple[Capsule, ...]
 
-_CORTICAL, _TRABECULAR, _MARROW = 0.92, 0.56, 0.36  # grey levels of bone and marrow
+# Relative attenuations of bone and marrow, and of soft tissue.
+_CORTICAL, _TRABECULAR, _MARROW = 0.92, 0.56, 0.36
 _MUSCLE, _FAT, _SKIN = 0.24, 0.18, 0.27
-_SHELL = 0.022  # cortical thickness
+# Lengths from here on are in half-sides of the phantom's cube.
+_SHELL = 0.022  # thickness of cortical bone
 _SKIN_DEPTH, _FAT_DEPTH = 0.018, 0.06  # thickness of the skin, and of skin and fat together
-_JOINT_BLEND, _SKIN_BLEND = 0.012, 0.022
+_JOINT_BLEND, _SKIN_BLEND = 0.012, 0.022  # widths over which bodies that touch are blended into one
 
 # Tarsals and the stumps of the leg. Each bone is a chain of (x, y, z, radius).
 _TARSALS: tuple[tuple[tuple[float, float, float, float], ...], ...] = (

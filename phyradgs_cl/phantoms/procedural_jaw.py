@@ -12,12 +12,14 @@ from phyradgs_cl.checks import at_least
 from phyradgs_cl.phantoms import implicit
 from phyradgs_cl.phantoms.implicit import Capsule, Field, Lattice, Point
 
-_CORTICAL, _TRABECULAR, _NERVE = 0.85, 0.50, 0.28  # grey levels of bone and nerve
+# Attenuations, as fractions of enamel's.
+_CORTICAL, _TRABECULAR, _NERVE = 0.85, 0.50, 0.28
 _ENAMEL, _DENTINE, _PULP = 1.0, 0.72, 0.30
 _MUSCLE, _FAT = 0.24, 0.18
-_SHELL = 0.035  # cortical thickness
-_ENAMEL_DEPTH, _FAT_DEPTH = 0.020, 0.05
-_BONE_BLEND, _FLESH_BLEND = 0.025, 0.04
+# Lengths from here on are in half-sides of the phantom's cube.
+_SHELL = 0.035  # thickness of cortical bone
+_ENAMEL_DEPTH, _FAT_DEPTH = 0.020, 0.05  # thickness of enamel, and of fat
+_BONE_BLEND, _FLESH_BLEND = 0.025, 0.04  # widths over which bodies that touch are blended into one
 
 # The arc of the mandible: x = A sin(phi), y = Y0 - B cos(phi), phi from -_PHI_END to +_PHI_END.
 _ARC_A, _ARC_B, _ARC_Y0 = 0.60, 0.86, 0.22

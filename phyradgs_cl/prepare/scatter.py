@@ -22,16 +22,21 @@ from phyradgs_cl.prepare.step import Facts, MakeModel, Model
 Kernel = Mapping[tuple[float, int], float]
 """{(standard deviation as a fraction of the panel's longer side, power of the line integral): height}"""
 _POWERS = (1, 2)  # powers of a ray's line integral in the fitted kernel
-_REACHES = (0.12, 0.18, 0.27, 0.4)  # fitted widths over the panel's longer side; narrower ones would fit columns' gains
+# standard deviations of the fitted Gaussians over the panel's longer side; narrower ones would fit columns' gains
+_REACHES = (0.12, 0.18, 0.27, 0.4)
 _PASSES = 6  # alternating estimates of scatter and primary light
-_LEAST_PRIMARY = 0.05  # least primary light, as a fraction of the measured light
-_SHADOW = 0.1  # fraction of the largest line integral above which pixels lie behind the object
-_FITTED_FRAMES = 24  # frames, evenly spread, to which heights are fitted
-_USUAL_REACH = 0.18  # width where the user states only to_primary
-_HEIGHT_STEP, _MOST_STEPS = 1.25, 8  # factor between heights that are tried; their number
-_TRIALS = 6  # heights tried between the best height's neighbours
-_BETTER, _AS_WELL = 0.65, 1.05  # limits of the unexplained rest: over the fitted kernel's, over the best height's
-_LARGEST_HEIGHT, _BISECTIONS = 20.0, 20  # upper end of the bisection for a stated ratio; its steps
+_LEAST_PRIMARY = 0.05  # lower limit of the estimated primary light, as a fraction of the measured light
+_SHADOW = 0.1  # pixels above this fraction of the largest line integral lie behind the object
+_FITTED_FRAMES = 24  # most frames, evenly spread, to which heights are fitted
+_USUAL_REACH = 0.18  # default standard deviation, as in _REACHES, where the user states only to_primary
+_HEIGHT_STEP = 1.25  # factor from one tried height of the kernel to the next
+_MOST_STEPS = 8  # most heights of the kernel that are tried one after the other
+_TRIALS = 6  # most heights tried in the search between the best height's neighbours
+# the raised kernel is taken only if it leaves less than this fraction of the fitted kernel's unexplained rest
+_BETTER = 0.65
+_AS_WELL = 1.05  # heights are raised until the unexplained rest exceeds this many times the least so far
+_LARGEST_HEIGHT = 20.0  # upper end of the bisection for the kernel's height that gives a stated to_primary
+_BISECTIONS = 20  # number of steps of the bisection for the height
 
 
 @dataclass(frozen=True)

@@ -22,7 +22,8 @@ from phyradgs_cl.reconstructors.voxels.priors import PriorWeight, TvPrior, axis_
 from phyradgs_cl.reconstructors.voxels.run import Iterations, IterativeOptions, MethodRun
 from phyradgs_cl.runtime import Runtime
 
-_STACKS, _FRAMES = 18, 3  # stacks of states, and stacks of frames, in memory at one time
+_STACKS = 18  # number of stacks of all states' volumes in memory at one time
+_FRAMES = 3  # number of stacks of all frames in memory at one time
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,8 @@ State = Mapping[str, np.ndarray]
 RUN, _CHECKSUM = "run", "checksum"
 """The arrays of a state that hold the identity of its run, as JSON, and the checksum of the others."""
 _REMEDY = "start without --resume"
-_MOST_DIFFERENCES, _LONGEST_NAME = 3, 60  # differences that an error names, and characters of a name, at most
+_MOST_DIFFERENCES = 3  # most differences between two runs that an error names
+_LONGEST_NAME = 60  # most characters of a difference's name
 
 
 def with_identity(state: State, identity: Mapping[str, Any]) -> State:

@@ -15,7 +15,7 @@ from phyradgs_cl.reconstructors.checkpoint import State, history_arrays, history
 from phyradgs_cl.reconstructors.result import Progress, ProgressReport
 from phyradgs_cl.signals import stop_on_interrupt
 
-SILENT_S = 10.0  # seconds without a report after which a process that runs alone reports
+SILENT_S = 10.0  # time without a report after which a process that runs alone reports
 
 
 class Stepwise(Protocol):

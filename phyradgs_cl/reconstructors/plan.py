@@ -24,12 +24,13 @@ from phyradgs_cl.text import suggest_name
 _COUNTS = tuple(dict.fromkeys(f.name for model in MODELS for f in fields(model) if f.init))
 """The fields of motion models, by which options name them."""
 _ALL = motions_for(RAYS, SPLATS)  # for the user's own methods
-LARGEST_SEED = 2**63
-_DECIMALS = 6  # of mm and s: a scan that went through a file is still the same scan
+LARGEST_SEED = 2**63  # upper limit of the option ``seed``
+_DECIMALS = 6  # decimals of mm and s in a run's identity: a scan that went through a file is still the same scan
 _SUBJECT = "--object-motion"
-_MOST_VOXELS = 24  # along a side of the grid on which a deformation is looked at
-_LEAST_DETERMINANT = 0.05
-_LEAST_COVERED, _MOSTLY_COVERED = 0.5, 0.98  # of the scan, by the times of a deformation: below the first it is refused
+_MOST_VOXELS = 24  # most voxels along each side of the grid on which a deformation is checked
+_LEAST_DETERMINANT = 0.05  # lower limit of a deformation's det(I + ∂w/∂y): near 0 matter folds
+_LEAST_COVERED = 0.5  # least fraction of the scan's time that a deformation has to cover: with less it is refused
+_MOSTLY_COVERED = 0.98  # least fraction of the scan's time that a deformation covers without a warning
 log = logging.getLogger(__name__)
 
 

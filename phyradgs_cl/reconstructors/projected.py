@@ -18,8 +18,9 @@ from phyradgs_cl.operators.rays.subrays import subrays_of
 from phyradgs_cl.operators.warp.operator import projector_of
 from phyradgs_cl.runtime import Runtime
 
-TIMES_PER_LINE = 16  # times of a line's exposure at which it is projected: their error is far below the noise
-_HOLDOUT_SEED, _HOLDOUT_FRAMES = 20, 8  # seed of the drawn pixels; frames that are projected at one time
+TIMES_PER_LINE = 16  # number of times of a line's exposure at which it is projected: their error is far below the noise
+_HOLDOUT_SEED = 20  # seed of the random generator that draws held-out pixels
+_HOLDOUT_FRAMES = 8  # most frames that are projected at one time to measure their error
 Image = NDArray[np.float32]
 
 

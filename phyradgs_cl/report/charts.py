@@ -18,7 +18,7 @@ from phyradgs_cl.report.markup import Markup, element, label, number, unit
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-MOST_CHARTS = 3  # limit of the charts of convergence
+MOST_CHARTS = 3  # most charts of convergence
 SIZE = 440, 320  # width and height of a chart in units in which letters are 13 high
 _STYLE: Any = {"svg.fonttype": "none", "text.parse_math": False, "font.size": 13}
 Chart = tuple[str, Markup]

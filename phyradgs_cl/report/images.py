@@ -10,11 +10,11 @@ from numpy.typing import NDArray
 
 from phyradgs_cl.fields import Grid
 
-LONGEST_EDGE = 192  # limit of the pixels along a side of a slice in the page
-BUDGET_PIXELS = 16_000_000  # limit of the pixels of all slices: at worst, for pure noise, a page of some 20 MB
+LONGEST_EDGE = 192  # most pixels along each side of a slice in the page
+BUDGET_PIXELS = 16_000_000  # most pixels of all slices together: at worst, for pure noise, a page of some 20 MB
 # Plane, axis of the array (z, y, x) that is cut, its letter, and the world axes to the right and up in the picture.
 PLANES = (("axial", 0, "z", "x", "y"), ("coronal", 1, "y", "x", "z"), ("sagittal", 2, "x", "y", "z"))
-_ROOM = 0.25  # room on either side of the window, as a fraction of its width
+_ROOM = 0.25  # room of the sliders beyond either end of the grey window, as a fraction of its width
 _BLUE, _WHITE, _RED = (33, 86, 158), (247, 247, 245), (178, 34, 40)
 _PERCENTILE = 99.9  # percentile that becomes white: a few very bright voxels would make all others dark
 Volume = NDArray[np.floating]

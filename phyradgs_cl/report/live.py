@@ -27,16 +27,17 @@ from phyradgs_cl.report.page import head, web_script
 from phyradgs_cl.report.sections import facts_table, frame_pictures, note, section
 from phyradgs_cl.text import clock
 
-_MOST_POINTS = 400  # limit of the points of the convergence curve
-_SAMPLES = 64  # samples of the volume along a side from which the grey range is computed
-_LATE_S, _LATE_TIMES = 30.0, 6  # a run without news for this time, and for so many intervals, may have been killed
+_MOST_POINTS = 400  # most points of the convergence curve
+_SAMPLES = 64  # most samples of the volume along each side from which the grey range is computed
+# a run without news for this time, and for this many intervals between two versions of the page, may have been killed
+_LATE_S, _LATE_TIMES = 30.0, 6
 _LOG_RATIO = 20.0  # ratio of largest to smallest value above which the axis is logarithmic
 _CHART = 560, 240  # width and height of the chart in pixels
 _MARGIN = 64, 12, 12, 34  # margins of the chart in pixels: left, top, right, bottom
 EVERY_S = 5.0  # time between two versions of the page
 SHARE = 0.01  # largest fraction of the run's time that pictures may cost
-FRAMES = 2  # number of frames that are computed
-FRAMES_FROM_S = 60.0  # no frames are computed in runs expected to be shorter: their report comes soon
+FRAMES = 2  # number of frames that are computed from the volume and shown
+FRAMES_FROM_S = 60.0  # no frames are computed in runs that are expected to take less time: their report comes soon
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,7 +87,7 @@ class Status:
     progress: Progress | None = None
     points: tuple[tuple[int, float], ...] = ()
     first: tuple[int, float] = (0, 0.0)
-    """Iteration and time of the first report in the present count."""
+    """Iteration, and time in s, of the present stage's first report, from which the rest of its time is estimated."""
     reported: float = 0.0
     snapshot: Snapshot | None = None
 

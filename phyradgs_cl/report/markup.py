@@ -7,9 +7,9 @@ import math
 from phyradgs_cl.text import plain_text
 
 UNITS = {"_per_mm": "1/mm", "_mm": "mm", "_deg": "°", "_db": "dB", "_s": "s"}
-_RESOLUTION = {"mm": 1e-4, "°": 1e-4, "s": 1e-6}  # resolution by unit, finer than any scanner's
+_RESOLUTION = {"mm": 1e-4, "°": 1e-4, "s": 1e-6}  # resolution of shown values by unit, finer than any scanner's
 _WORDS = {"psnr": "PSNR", "rms": "RMS", "ssim": "SSIM", "sha256": "SHA-256", "tv": "TV", "l1": "L1", "fdk": "FDK"}
-_LONGEST = 400  # characters of a value that are shown
+_LONGEST = 400  # most characters of a value that are shown
 _RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 

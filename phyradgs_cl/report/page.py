@@ -19,7 +19,7 @@ from phyradgs_cl.report.markup import Markup, element, joined, label, number, ra
 from phyradgs_cl.report.run import Change, Run, computed_views, load_run, step_changes
 from phyradgs_cl.runtime import Runtime
 
-DEFAULT_VIEWS = 3  # number of frames that a page compares with the volume
+DEFAULT_VIEWS = 3  # default number of frames that a page compares with the volume
 # The order of the script's files matters: slices.js sends the window when it loads, so its listeners (space.js, motion.js)
 # come first.
 _SCRIPT = ("common", "shaders", "render", "space", "motion", "slices", "rows")

@@ -26,8 +26,8 @@ from phyradgs_cl.io import (
 from phyradgs_cl.reconstructors import Progress
 from phyradgs_cl.report.images import bytes_of, grey_range, png_bytes, top_row_first
 
-_GAP = 4  # pixels between slices
-_SMALLEST, _LARGEST = 128, 512  # least and most pixels along the longest side of a slice
+_GAP = 4  # width in pixels of the gap between slices
+_SMALLEST, _LARGEST = 128, 512  # least and largest number of pixels along the volume's longest side
 log = logging.getLogger(__name__)
 
 

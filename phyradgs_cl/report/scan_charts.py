@@ -17,11 +17,13 @@ from phyradgs_cl.report.markup import Markup, number
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-_MOST_FRAMES = 180  # limit of the source positions that are marked, about
-_ARC_SAMPLES = 24  # poses along the first frame's arc
-_FIRST_FRAMES = 4  # frames in the chart of successive frames
-_MOST_DOTS, _MOST_CELLS, _LINES_WITH_DOTS = 600, 100_000, 12  # limits of dots, of cells for any dots, of lines with dots
-_BESIDE = 0.75  # distance from the volume's middle, over its diagonal, of sources and panels of a parallel beam
+_MOST_FRAMES = 180  # number of marked source positions, about, where there are more
+_ARC_SAMPLES = 24  # number of poses along the first frame's arc
+_FIRST_FRAMES = 4  # most frames in the chart of successive frames
+_MOST_DOTS = 600  # most dots for the times at which a model projects lines
+_MOST_CELLS = 100_000  # most time cells of a frame of which dots are drawn
+_LINES_WITH_DOTS = 12  # most lines with dots
+_BESIDE = 0.75  # drawn distance of sources and panels of a parallel beam from the volume's middle, over its diagonal
 _ROOM = 0.06  # margin around the data, as a fraction of their range
 Points = NDArray[np.float64]
 

@@ -18,10 +18,11 @@ from phyradgs_cl.report.run import Change, Run
 from phyradgs_cl.report.scan_charts import frames_chart, orbit_chart, shutter_chart, shutter_words, side_chart
 from phyradgs_cl.text import flattened, to_digits_of
 
-_MOST_ROWS = 400  # limit of the rows of a table
-_STATES = 5  # number of states that are shown
-_MOST_CHARTS, _MOST_COMBINATIONS = 6, 20  # limits of the charts, and of the combinations, of a calibration
-_ABSURD = 1e9  # larger parameters come from damaged files and are not rounded
+_MOST_ROWS = 400  # most rows of a table
+_STATES = 5  # most states that are shown
+_MOST_CHARTS = 6  # most charts of a calibration
+_MOST_COMBINATIONS = 20  # most listed combinations of parameters that a calibration cannot tell apart
+_ABSURD = 1e9  # parameters of this size and more come from damaged files and are not rounded
 
 
 def slices_section(run: Run) -> Markup:

@@ -16,9 +16,10 @@ from phyradgs_cl.runtime.memory import DeviceArray
 
 A = TypeVar("A")
 Shape = tuple[int, ...]
-_CPU_SPAN = 1 << 14  # elements that one work-item sums
-_GPU_GROUP, _GPU_GROUPS = 256, 512  # work-items of a work-group, and work-groups of a sum, at most
-_ITEMS = 64  # work-items of a work-group on a CPU, in element-wise kernels
+_CPU_SPAN = 1 << 14  # least number of elements that a CPU's work-item sums
+_GPU_GROUP = 256  # most work-items of a GPU's work-group
+_GPU_GROUPS = 512  # most work-groups, or a CPU's work-items, of a sum
+_ITEMS = 64  # most work-items of a CPU's work-group in element-wise kernels
 
 
 class Space(Protocol, Generic[A]):

@@ -24,8 +24,8 @@ Sides = tuple[int, ...]
 
 LANE_CHOICES = (1, 4, 8, 16)
 _FUSING, _PAIRS = "-cl-mad-enable", '#line 1 "common/precise.h"'
-_TILE_ITEMS = 256  # items in a work-group that shares local memory
-_FEWEST_ITEMS = 32  # items that a kernel must be able to run in one group
+_TILE_ITEMS = 256  # most work-items of a work-group that shares a tile
+_FEWEST_ITEMS = 32  # least number of work-items that a kernel must be able to run in one work-group
 
 
 class Runtime:
@@ -40,7 +40,8 @@ class Runtime:
     - ranks: the processes that work on the same scan, each with its own Runtime. Where a machine has several devices, each
       rank takes the next device."""
 
-    most_samples = 2**29  # per GPU launch: a display driver kills launches of seconds; this takes 0.1 s on a slow GPU
+    # Most samples of rays in one GPU launch: a display driver kills launches of seconds; this takes 0.1 s on a slow GPU.
+    most_samples = 2**29
 
     def __init__(
         self, device: str | None = None, *, lanes: int | None = None, fp64: bool | None = None,

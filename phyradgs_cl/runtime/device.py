@@ -19,7 +19,7 @@ from phyradgs_cl.runtime.opencl import cl
 
 DEVICE_VARIABLE = "PHYRADGS_DEVICE"
 _NEVER_BY_DEFAULT = ("oclgrind", "fpga", "emulat")
-_RIGHT_MESA = 25  # first version of Mesa whose rusticl computes right sums
+_RIGHT_MESA = 25  # least major version of Mesa whose rusticl computes right sums; an older one causes a warning
 log = logging.getLogger(__name__)
 _targets: dict[int, str | None] = {}
 

@@ -13,9 +13,9 @@ from phyradgs_cl.checks import ceil_div
 from phyradgs_cl.runtime.context import Runtime
 from phyradgs_cl.runtime.memory import Array, DeviceArray, SameArray
 
-GUARD = 16  # floats before the first row, and zeros at least after each
+GUARD = 16  # number of floats before the first row, and least number of zeros after each row
 
-_TILE = 16  # rows and columns that a CPU's work-item transposes at a time
+_TILE = 16  # number of rows, and of columns, that a CPU's work-item transposes at a time
 
 
 @dataclass(frozen=True)

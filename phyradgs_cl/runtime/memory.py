@@ -16,9 +16,10 @@ from phyradgs_cl.runtime.device import DeviceInfo
 from phyradgs_cl.runtime.opencl import cl
 
 MEMORY_VARIABLE = "PHYRADGS_MEMORY"
-_SMALLER = 0.25  # fraction of the free memory for a second attempt
-_PLANNED = 0.9  # fraction of the free memory that plans may use
-_PLANNED_UNSEEN = 0.6  # the same if a GPU's driver does not say what other programs and the screen use
+_SMALLER = 0.25  # fraction of the first attempt's memory that a second attempt plans with, after memory was short
+_PLANNED = 0.9  # largest fraction of the free memory that plans may use
+# largest fraction of the memory that plans may use if a GPU's driver does not say what other programs and the screen use
+_PLANNED_UNSEEN = 0.6
 _UNITS = {"": 1, "B": 1}
 for _power, _letter in enumerate("KMGT", start=1):
     _UNITS |= {_letter: 1024**_power, f"{_letter}IB": 1024**_power, f"{_letter}B": 1000**_power}

@@ -27,11 +27,11 @@ from phyradgs_cl.parallel import Launch, launched
 
 log = logging.getLogger(__name__)
 
-_RECORD_BYTES = 2048  # bytes of a device record that are searched
-_LONGEST_TEXT = 64  # bytes of a name, at most
+_RECORD_BYTES = 2048  # number of bytes of PoCL's device record that are searched
+_LONGEST_TEXT = 64  # most bytes of a name in it
 _TRIPLE = re.compile(rb"x86_64-[a-z0-9_]+-linux-gnu\Z")
 _PROCESSOR = re.compile(rb"[a-z0-9][a-z0-9.-]*\Z")
-_USER_SPACE = 1 << 47  # addresses of a process are below it
+_USER_SPACE = 1 << 47  # upper limit of the addresses of a process
 CACHE_VARIABLE = "POCL_CACHE_DIR"
 AVX512_TARGET = "skylake-avx512"
 _AVX = {"avx", "cx16", "popcnt"}
@@ -47,7 +47,7 @@ _LIBRARIES = (
 """Flags of /proc/cpuinfo by which PoCL chooses a library, and the processor for which this library was compiled."""
 _OLDEST_TARGET = "athlon64"
 THREADS_VARIABLE = "POCL_MAX_PTHREAD_COUNT"
-_MOST_THREADS = 1024
+_MOST_THREADS = 1024  # largest number of threads that POCL_MAX_PTHREAD_COUNT may state
 _NO_CACHE_VARIABLE = "PYOPENCL_NO_CACHE"
 _unusable: tuple[Path, str] | None = None
 _kept_alive: list[ctypes.Array[ctypes.c_char]] = []

@@ -8,10 +8,10 @@ import numpy as np
 
 from phyradgs_cl.runtime.opencl import cl
 
-_FOLD_AT = 20_000  # most events that are kept; folding them waits for the queue
-_COPY_BYTES = 1 << 26
-_STEPS = 20_000  # multiply-adds of each chain in a run that measures rates
-_REPEATS = 5
+_FOLD_AT = 20_000  # most events that are kept; adding up more waits for the queue
+_COPY_BYTES = 1 << 26  # bytes of the copy that measures the memory's rate
+_STEPS = 20_000  # multiply-adds of each chain in the run that measures the arithmetic rate
+_REPEATS = 5  # runs of each measurement, of which the fastest counts
 
 
 @dataclass

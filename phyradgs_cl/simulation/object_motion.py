@@ -12,14 +12,14 @@ from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Deformation, Grid, control_points
 from phyradgs_cl.io.tables import Fields, read_toml
 
-_NODES = 40  # weights in a cycle: linear interpolation between them follows the curves to 0.3 %
-_SETTLING_NODES = 200  # times at which the weights of drying are stored
-_SPACINGS = 8.0  # spacings of control points along the longest side of the box
-_SLIDING_SPACINGS = 16.0  # the same for sliding, whose edge is about three control points wide
+_NODES = 40  # number of weights in a cycle: linear interpolation between them follows the curves to 0.3 %
+_SETTLING_NODES = 200  # number of times at which the weights of drying are stored
+_SPACINGS = 8.0  # number of spacings of control points along the longest side of the box
+_SLIDING_SPACINGS = 16.0  # number of spacings for sliding, whose edge is about three control points wide
 _ASIDE = 1 / 3  # amplitude of breathing along y, with its delay, over that along z
-_PERIODS = (0.5, 1.5)  # shortest and longest breath over the mean period
-_FADE = 3.0  # amplitudes over which the field falls to 0 beyond the box: its slope is then a third
-_MOST_CYCLES = 100_000  # cycles of breathing or sliding in a scan
+_PERIODS = (0.5, 1.5)  # limits of a breath's period, over the mean period
+_FADE = 3.0  # distance in amplitudes over which the field falls to 0 beyond the box: its slope is then a third
+_MOST_CYCLES = 100_000  # most cycles of breathing or sliding in a scan
 _COMMON = ("kind", "amplitude_mm", "amplitude", "states")
 _KEYS = {
     "breathing": (*_COMMON, "period_s", "jitter", "hysteresis", "seed"),

@@ -14,10 +14,11 @@ from phyradgs_cl.io import Scanner, load_scanner, with_detector_count
 from phyradgs_cl.simulation.object_motion import ObjectMotion, load_object_motion
 
 _NOISES = ("none", "tigre", "beer")
-# Far beyond any scanner, and far below an overflow of float32 or of a sampler.
-_LARGEST_PEAK, _LARGEST_NOISE = 1e4, 1e9
-_SMALLEST_DOSE, _LARGEST_DOSE = 1e-3, 1e12
-_LARGEST_DETECTOR = 32_000
+# Limits of options: far beyond any scanner, and far below an overflow of float32 or of a sampler.
+_LARGEST_PEAK = 1e4  # upper limit of the largest line integral
+_LARGEST_NOISE = 1e9  # upper limit of the electronic noise in counts
+_SMALLEST_DOSE, _LARGEST_DOSE = 1e-3, 1e12  # limits of the dose in photons per pixel
+_LARGEST_DETECTOR = 32_000  # most pixels along a side of the panel
 _TIMING = ("views", "exposure_deg", "readout_ratio", "start_deg", "pulse", "turns")
 _DATA_SHEET = ("first", "fps", "readout_ms")
 

@@ -21,9 +21,9 @@ from phyradgs_cl.simulation.options import SimulationOptions
 from phyradgs_cl.simulation.scenes import Scene, phantom_scene, volume_scene
 from phyradgs_cl.simulation.sources import FrameSource
 
-_LARGEST_GRID = 4096
-_SMALLEST_PHANTOM = 2  # procedural phantoms need 4 voxels and are drawn on twice as many
-_STATES = 8  # states of a phantom whose bodies move
+_LARGEST_GRID = 4096  # most voxels along a side of the volume
+_SMALLEST_PHANTOM = 2  # least number of voxels along a side: procedural phantoms need 4 and are drawn on twice as many
+_STATES = 8  # number of stored states of a phantom whose bodies move
 log = logging.getLogger(__name__)
 
 

@@ -16,8 +16,10 @@ from phyradgs_cl.phantoms import EllipsoidPhantom, MovingPhantom, make_phantom
 from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.simulation.sources import AnalyticSource, DeformedSource, FrameSource, VolumeSource, on_panel
 
-_DENSE = 0.5  # fraction of the largest attenuation: denser voxels may be bone in a beam of many energies
-_RARE = 0.2  # fraction of the commonest voxels: a threshold must not divide a material with more
+_DENSE = 0.5  # voxels above this fraction of the largest attenuation may be bone in a beam of many energies
+# The threshold of bone lies at an attenuation with fewer voxels than this fraction of the commonest one's: it must not
+# divide a material.
+_RARE = 0.2
 log = logging.getLogger(__name__)
 Moves = Callable[[Grid], Deformation]
 """Returns how an object in a box moves."""

@@ -22,10 +22,11 @@ from phyradgs_cl.operators.warp.volume import VolumeWarp
 from phyradgs_cl.phantoms import EllipsoidPhantom, MovingPhantom
 from phyradgs_cl.runtime import DeviceArray, MemoryShortage, Runtime
 
-# voxels across a pixel, at the axis, that one ray samples; the usual scanner has 1.43 with as many voxels as pixels
+# largest width of a pixel at the axis, in voxels, for which one ray is enough; the usual scanner with as many voxels as
+# pixels has 1.43
 WIDEST_RAY = 1.5
-_MOST_SAMPLES = 32  # rays along each side of a pixel, at most
-NEAREST = 0.1  # largest distance of matter from its place, in voxels to be reconstructed
+_MOST_SAMPLES = 32  # most rays along each side of a pixel
+NEAREST = 0.1  # largest distance of moving matter from its exact place, in voxels to be reconstructed
 
 
 class FrameSource(ABC):

@@ -40,10 +40,12 @@ from phyradgs_cl.workflow.slabs import Slabs, reconstruct_slabs, remove_slabs, s
 from phyradgs_cl.workflow.volumes import compared_states
 
 log = logging.getLogger(__name__)
-_SETTLED = 5  # least number of recorded residuals for a warning: the first is 1
-_UNLIKELY = 0.15  # limit of the residual over the norm of the line integrals: correct scans had at most 0.13 beside noise
-_AT_REST = 1.05  # limit, for a converged run, of the residual after 3/4 of the iterations over the last one
-_BEYOND_NOISE = 1.5  # limit of the residual over the noise: correct scans of 100 photons, with 0.7, had at most 1.1
+# A converged run is warned of where its last residual, as a fraction of the norm of the line integrals, is too large.
+_SETTLED = 5  # least number of recorded residuals for this warning: the first is 1
+_UNLIKELY = 0.15  # largest residual without a warning: correct scans had at most 0.13 beside noise
+_AT_REST = 1.05  # largest ratio of the residual after 3/4 of the iterations to the last one, for a run that has converged
+# largest ratio of the residual to the noise without a warning: correct scans of 100 photons, residual 0.7, had at most 1.1
+_BEYOND_NOISE = 1.5
 _ALL_ROWS = Slabs()
 
 

@@ -29,8 +29,9 @@ from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.workflow.files import load_scan
 
 log = logging.getLogger(__name__)
-_HOST_SHARE = 0.5  # fraction of this machine's memory for the frames of a slab and the arrays that methods make of them
-_COPIES = 4  # arrays of the size of a slab's frames that a method holds on the host
+# largest fraction of this machine's memory for the frames of a slab and the arrays that methods make of them
+_HOST_SHARE = 0.5
+_COPIES = 4  # number of arrays of the size of a slab's frames that a method holds on the host
 
 
 @dataclass(frozen=True)

@@ -45,7 +45,9 @@ from phyradgs_cl.workflow.reconstruct import is_complete, resume_or_restart
 
 log = logging.getLogger(__name__)
 RESULTS, TABLE = "results.jsonl", "results.md"
-_RETRIES, _CONNECT_S, _BUSY_S = 3, 10.0, 20.0  # Dask's retries of a run; timeout of its scheduler; wait for a busy output
+_RETRIES = 3  # most times that Dask repeats a run after an error
+_CONNECT_S = 10.0  # longest time to connect to Dask's scheduler
+_BUSY_S = 20.0  # time to wait before a run whose output another process writes is tried again
 # Dask listens on this machine only: others must not send work to it
 _LOCAL = {"host": "127.0.0.1", "dashboard_address": "127.0.0.1:0", "silence_logs": logging.CRITICAL}
 Line = dict[str, Any]

@@ -28,7 +28,7 @@ from phyradgs_cl.text import plain_text
 from phyradgs_cl.workflow.files import check_picture, load_reference, load_result
 
 log = logging.getLogger(__name__)
-_LITTLE = 0.5 - 1e-6  # least fraction of either box in common: less is most often a wrong size or offset
+_LITTLE = 0.5 - 1e-6  # least fraction of either box that both share: less is most often a wrong size or offset
 
 
 @np.errstate(all="ignore")

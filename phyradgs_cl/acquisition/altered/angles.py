@@ -4,7 +4,7 @@ import numpy as np
 
 from phyradgs_cl.acquisition.scan import Scan
 
-_ACROSS = 1e-3  # largest cosine between a ray and the axis at which the ray counts as across the axis
+_ACROSS = 1e-3  # a ray counts as perpendicular to the axis where the cosine of the angle between them is below this
 
 
 def azimuth_rad(pose: np.ndarray) -> np.ndarray:

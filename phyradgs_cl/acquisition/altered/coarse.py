@@ -12,11 +12,12 @@ from phyradgs_cl.acquisition.scan import Scan
 from phyradgs_cl.acquisition.shutter import Shutter
 from phyradgs_cl.fields import Grid
 
-MOST_FRAMES = 60  # limit of the frames of a coarse scan
-QUICK_COLUMNS, FINE_COLUMNS = 20, 32  # most blocks along the detector's longer side, in quick and in fine searches
+MOST_FRAMES = 60  # most frames of a coarse scan
+QUICK_COLUMNS = 20  # most blocks of pixels along the detector's longer side in quick searches
+FINE_COLUMNS = 32  # most blocks of pixels along the detector's longer side in fine searches
 SMOOTHING = 0.8  # standard deviation of the Gaussian that smooths frames before binning, in blocks
 _LEAST_VALID = 0.5  # a block with a smaller fraction of valid pixels is masked
-_MOST_VOXELS = 64  # limit along the longest side of the grid's box, without the margin
+_MOST_VOXELS = 64  # most voxels along the longest side of the grid's box, without the margin
 _MARGIN = 1  # voxels added on each side of the box: without them, too small a size fits an object that fills it better
 _OBJECT_SHARE = 0.02  # a column shows the object above this fraction of the largest line integral
 _LEAST_COLUMNS = 12  # least number of blocks across a panel, if it has as many columns

@@ -19,7 +19,7 @@ from phyradgs_cl.acquisition.trajectory import (
 from phyradgs_cl.errors import InputError
 
 log = logging.getLogger(__name__)
-_UNEVEN = 0.01  # intervals between frames may differ by this fraction of their mean
+_UNEVEN = 0.01  # intervals between frames are uneven where their range exceeds this fraction of their mean
 
 
 def sum_frames(

@@ -26,7 +26,8 @@ _NAMES = (
     *("SOD", "SDD", *_PLACES, "Start angle", "Last angle", "ROI (LTRB)", "Binned pixel size", "Voxel size"),
     *("Exposure time (ms)", "Number of averages"),
 )
-_WHOLE_MIDDLE, _WHOLE_PITCH_MM = (971, 767), 0.0748  # panel without binning: middle (column, row); pixel
+_WHOLE_MIDDLE = (971, 767)  # (column, row) of the middle of the panel without binning
+_WHOLE_PITCH_MM = 0.0748  # pitch of the pixels of the panel without binning
 
 
 def recognises(path: Path) -> bool:

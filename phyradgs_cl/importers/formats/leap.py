@@ -28,7 +28,8 @@ _NAMES = (
     *("numAngles", "numRows", "numCols", "pixelHeight", "pixelWidth", "centerRow", "centerCol", "angularRange", "phis"),
     *("sod", "sdd", "tau", "helicalPitch", "tiltAngle", *_VECTORS),
 )
-_BEAMS, _MOST, _ENDS = ("cone", "parallel", "modular"), 1_000_000, (".txt", ".cfg")
+_BEAMS, _ENDS = ("cone", "parallel", "modular"), (".txt", ".cfg")
+_MOST = 1_000_000  # largest number of angles, rows, columns, or voxels along an axis
 _OF_TABLES = (*TIMING, "row_0", "column_0", "quantity", "flat_value", "detector_model")
 
 

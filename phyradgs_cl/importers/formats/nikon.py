@@ -36,7 +36,7 @@ _NAMES = (
     *("DetectorPixelsX", "DetectorPixelsY", "DetectorPixelSizeX", "DetectorPixelSizeY", "DetectorOffsetX"),
     *("DetectorOffsetY", "InitialAngle", "AngularStep", "ObjectOffsetX", "ObjectRoll", "ObjectTilt", "Units", *_ENDS),
 )
-_MOST_FRAMES = 1_000_000
+_MOST_FRAMES = 1_000_000  # largest number of frames, and of rows or columns
 
 
 def recognises(path: Path) -> bool:

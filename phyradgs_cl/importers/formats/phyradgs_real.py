@@ -30,7 +30,7 @@ OPTIONS = (
 )
 PROJECTIONS = "projections"
 _ANGLES = ("first_row_start_angle", "first_row_end_angle", "last_row_end_angle")
-_TIMES_A_FRAME = 33  # poses of a frame's window in the pose table
+_TIMES_A_FRAME = 33  # number of poses in the pose table for the window of each frame
 _GAP = 1e-3  # least time between the windows of two frames, as a fraction of a frame's span
 
 

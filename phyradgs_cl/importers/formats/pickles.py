@@ -37,7 +37,7 @@ _PARTS = {"train": ("train",), "test": ("val",), "all": ("train", "val")}
 TIGRE_MODULE, _END_BYTES = "tigre.utilities.geometry", 1 << 18
 OPTIONS_OF_TIGRE = (*TIMING, "row_0", "column_0", "quantity", "flat_value", "detector_model")
 _NAMES = ("DSO", "DSD", "nDetector", "dDetector", "nVoxel", "dVoxel", "offOrigin", "offDetector", "rotDetector", "COR")
-_SAME = 1e-9  # relative tolerance of poses on one circle
+_SAME = 1e-9  # largest difference from one circle of poses that count as on it, over their largest entry
 _CLASSES = ("Geometry", "ConeGeometryDefault", "ParallelGeometryDefault")
 _COPIES = 3  # bytes of memory for every byte of the file: arrays and line integrals
 

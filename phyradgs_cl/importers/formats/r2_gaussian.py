@@ -27,7 +27,8 @@ ROW_0 = "top"
 OPTIONS = (*TIMING, "unit_mm", "detector_model", "part")
 OPTIONS_WITH_TIMES = ("exposure_s", "readout_axis", "readout_direction", "unit_mm", "detector_model", "part")
 _KEYS = ("first_line_start", "first_line_end", "last_line_end")
-_SAME = 1e-3  # relative spread of arcs that still counts as one exposure and one readout
+# largest range of the frames' ratios of readout to exposure that counts as none, over the largest of them or over 1
+_SAME = 1e-3
 
 
 @dataclass(frozen=True, eq=False)

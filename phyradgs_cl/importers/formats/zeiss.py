@@ -39,9 +39,9 @@ _STREAMS = {
     f"{_ONE}/DataType": "<i4", f"{_SEVERAL}/DataType": "<i4",
 }  # fmt: skip
 _TYPES = {5: "<u2", 10: "<f4"}  # NumPy types by the numbers in DataType
-_PER_FOLDER = 100  # images in a folder ImageData1, ImageData2, …
-_RESULT_BYTES = 5  # memory per pixel of the result: a line integral in float32, and its mask
-_STEADY = 1e-3  # largest relative difference of a length between images
+_PER_FOLDER = 100  # number of images in each of the folders ImageData1, ImageData2, …
+_RESULT_BYTES = 5  # bytes of memory per pixel of the result: a line integral in float32, and its mask
+_STEADY = 1e-3  # largest relative difference of a length between images that counts as none
 
 
 class Streams(Fields):

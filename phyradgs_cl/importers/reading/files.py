@@ -13,7 +13,7 @@ from phyradgs_cl.errors import InputError
 from phyradgs_cl.io.files import HOST_SHARE, decoded, host_bytes, read_regular, regular_file
 from phyradgs_cl.io.tables import read_facts
 
-_MOST_TEXT_BYTES = 64 << 20
+_MOST_TEXT_BYTES = 64 << 20  # most bytes of a text that describes a scan
 
 
 def check_room(subject: str, needed_bytes: int) -> None:

@@ -19,15 +19,19 @@ from phyradgs_cl.importers.options import ImportOptions
 from phyradgs_cl.io.scan.reader import LARGEST_LINE_INTEGRAL
 
 _log = logging.getLogger(__name__)
-_PIXELS = 1 << 16  # pixels of a frame, at most, from which levels and patterns are computed
-_TOGETHER, _APART = 0.1, 0.3  # largest relative difference in brightness of flats of one time, and of several times
-_DARK = 0.02  # largest difference of a dark's level, as a fraction of the flats' level
-_PATTERN, _TIMES = 0.02, 5.0  # limit of a pattern's deviation: 0.02 of the flats' level, plus 5 median deviations
-_BLOCK_BYTES = 1 << 26  # memory of a block of rows whose median is taken
+_PIXELS = 1 << 16  # most pixels of a frame from which levels and patterns are computed
+# Largest differences of a frame's level from the usual level, as fractions of the flats' level; other frames are left out.
+_TOGETHER = 0.1  # largest difference among flats of one time
+_APART = 0.3  # largest difference among flats of several times
+_DARK = 0.02  # largest difference among darks
+# A frame is left out too where its pattern's mean deviation exceeds the sum of these two.
+_PATTERN = 0.02  # deviation as a fraction of the flats' level
+_TIMES = 5.0  # deviation as a multiple of the frames' median deviation
+_BLOCK_BYTES = 1 << 26  # most bytes of a block of rows whose median is taken
 Mask = np.ndarray | None
 TAKEN = "taken"
 """The provenance's key of a text that says which frames and flats were used."""
-_AIR = 0.2  # largest median line integral at the frames' borders that counts as air
+_AIR = 0.2  # largest size of the median line integral at the frames' borders that counts as air
 _SAME = 1e-3  # a flat at most this fraction above the saturation level counts as clipped too
 
 

@@ -23,7 +23,8 @@ from phyradgs_cl.io.volume import VALUES, Volume, finite_float32, shares_of_maxi
 
 STACKS = (".mha", ".mhd")
 _SPACES = ("left-posterior-superior", "lps", "right-anterior-superior", "ras", "left-anterior-superior", "las", "")
-_HEAD_BYTES, _VOXEL_BYTES = 1 << 16, 8
+_HEAD_BYTES = 1 << 16  # bytes at a file's beginning that are searched for its header
+_VOXEL_BYTES = 8  # bytes of memory per voxel that reading takes
 _IN_HU, _NOTE_BYTES = b"values in HU", 79
 _READERS = {".nii": "Nifti", ".gz": "Nifti", ".mha": "Meta", ".mhd": "Meta", ".nrrd": "Nrrd"}
 _DATA_FILE = re.compile(rb"^(?:ElementDataFile *=|data ?file:) *(\S.*?)\s*$", re.M)

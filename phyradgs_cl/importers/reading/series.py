@@ -20,12 +20,14 @@ _NUMBER = re.compile(r"([-+]?)(\d+)(?:[.,](\d+))?")
 _DATE = r"(?<!\d)((?:19|20)\d\d)[-_.]?(0[1-9]|1[0-2])[-_.]?(0[1-9]|[12]\d|3[01])"
 _TIME = re.compile(_DATE + r"[-_ T.]*([01]\d|2[0-3])[-_.:h]?([0-5]\d)[-_.:m]?([0-5]\d)(?!\d)")
 _DEGREES, _ANGLE = re.compile(r"[ _]?(deg|°|grad)", re.I), re.compile(r"(deg|angle|ang|theta|phi|rot)[ _=]*$", re.I)
-_STEADY, _GAP = 0.25, 1.5  # in usual steps: largest deviation of a regular step; least gap between angles or times
-_USUAL, _STEADY_ANGLES = 0.5, 0.75  # least fractions of regular steps: in a regular series; in angles whose gaps are holes
+_STEADY = 0.25  # largest deviation of a regular step from the usual one, in usual steps
+_GAP = 1.5  # least gap between angles or times that counts as a hole, in usual steps
+_USUAL = 0.5  # least fraction of regular steps in a regular series
+_STEADY_ANGLES = 0.75  # least fraction of regular steps in angles or times whose gaps count as holes
 _SMALL = 0.25  # a group of names below this fraction of the largest group's size is no series of frames
 _BEFORE, _AFTER = (re.compile(rf"(?<![a-z])({words})(?![a-z])", re.I) for words in ("before|pre|start", "after|post|end"))
-_STAMP = 10**7  # numbers from here on are times in milliseconds, not frames' indices
-_MOST_NAMES = 8  # names of files listed in a message
+_STAMP = 10**7  # numbers from this one on are times in milliseconds, not frames' indices
+_MOST_NAMES = 8  # most names of files listed in a message
 
 
 @dataclass(frozen=True, eq=False)

@@ -20,7 +20,8 @@ _ENGLISH, _GERMAN = (re.compile(rf"[-+]?\d{{1,3}}({k}\d{{3}})+{d}") for k, d in 
 _ONE_COMMA, _EITHER = re.compile(r"[-+]?\d*,\d+"), re.compile(r"[-+]?[1-9]\d{0,2},\d{3}")
 _COLUMNS = re.compile(r",\s+|[;:\s]+")
 _ANGLE, _RAD = re.compile(r"angle|theta|phi|rot|deg", re.I), re.compile(r"\brad", re.I)
-_BRIGHTER, _FEW = 1.2, 0.01  # factor on the counts of air that no noise exceeds; fraction of pixels that may be broken
+_BRIGHTER = 1.2  # pixels above this many times the stated counts of air are too bright: no noise exceeds it
+_FEW = 0.01  # largest fraction of the pixels that may be too bright: they may be broken
 TO_RAD = {"deg": np.pi / 180, "rad": 1.0}
 
 

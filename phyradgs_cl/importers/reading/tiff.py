@@ -21,7 +21,7 @@ from phyradgs_cl.io.hdf5.datasets import LENGTH
 
 SUFFIXES = (".tif", ".tiff")
 _log = logging.getLogger(__name__)
-_RESULT_BYTES = 5  # memory per pixel of the result: a line integral in float32, and its mask
+_RESULT_BYTES = 5  # bytes of memory per pixel of the result: a line integral in float32, and its mask
 _NO_SPACE = {"C": "channels", "T": "times"}  # axes of a stack that a volume does not have
 _OME_SIZES = re.compile(r'PhysicalSize([XYZ](?:Unit)?)="([^"]*)"')
 _OF_SIZE = ("unit", "spacing")

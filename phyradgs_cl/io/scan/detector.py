@@ -17,7 +17,7 @@ from phyradgs_cl.io.hdf5.datasets import LENGTH, TIME
 from phyradgs_cl.io.hdf5.source import Hdf5Source
 
 _log = logging.getLogger(__name__)
-_JITTER = 0.01  # largest deviation of a single measured time from their median, as a fraction of it
+_JITTER = 0.01  # largest deviation of a measured time from the median of all frames' times, as a fraction of the median
 
 
 def read_data_kind(source: Hdf5Source, entry: str) -> tuple[h5py.Dataset, str]:

@@ -19,9 +19,9 @@ from phyradgs_cl.io.hdf5.source import Hdf5Source
 
 _log = logging.getLogger(__name__)
 _KINEMATICS = (ConstantSpeed, SpeedRamp, EncoderTable, FrameSweeps)  # trajectories that files can hold
-_RAMP_ERROR_RAD = 1e-9  # largest error of the table of angles that stands for a speed ramp
-_MOST_RAMP_SAMPLES = 500_000  # limit of that table's length
-_SUSPECT_RAD = math.radians(5.0)  # a larger difference of table and rotation_angle is warned of
+_RAMP_ERROR_RAD = 1e-9  # largest error in rad of the table of angles that stands for a speed ramp
+_MOST_RAMP_SAMPLES = 500_000  # most angles of the table that stands for a speed ramp
+_SUSPECT_RAD = math.radians(5.0)  # largest difference between table and rotation_angle without a warning
 
 
 def has_motion(source: Hdf5Source, entry: str) -> bool:

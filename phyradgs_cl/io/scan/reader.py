@@ -19,7 +19,7 @@ from phyradgs_cl.io.hdf5.datasets import read_values
 from phyradgs_cl.io.hdf5.source import Hdf5Source, open_hdf5
 from phyradgs_cl.io.scan.header import ScanHeader, read_header
 
-LARGEST_LINE_INTEGRAL = 1e6  # limit of the size of a line integral in a file
+LARGEST_LINE_INTEGRAL = 1e6  # largest size of a line integral in a file; a larger one raises an error
 # (data (F, v, u), image_key (F,), quantity) -> line integrals (P, v, u) of the projections, mask of bad pixels or None.
 ToAttenuation = Callable[[np.ndarray, np.ndarray, str], tuple[np.ndarray, np.ndarray | None]]
 

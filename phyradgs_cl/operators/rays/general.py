@@ -12,10 +12,10 @@ from phyradgs_cl.runtime.layout import GUARD
 
 # On a CPU a work-item of the adjoint owns a brick of voxels (x, y, z), in local memory with a border of 1 around it.
 _BRICK = (32, 32, 8)
-_SMALL_BRICK = (24, 24, 8)  # the brick that takes 27 kB of the 32 kB of local memory that OpenCL guarantees
-_BLOCK = 4  # on a GPU a work-group owns a block with so many voxels per side, or fewer along z; as in cl/rays_adjoint_gpu.cl
-_SAMPLES_PER_VOXEL = 4  # number of samples of one view that touch a voxel, about
-_LONG_FROM = 2**31  # number of floats of a volume from which indices need 64 bits
+_SMALL_BRICK = (24, 24, 8)  # brick of 27 kB for devices with no more than the 32 kB of local memory that OpenCL guarantees
+_BLOCK = 4  # voxels along each side of the block that a GPU's work-group owns (fewer along z); as in cl/rays_adjoint_gpu.cl
+_SAMPLES_PER_VOXEL = 4  # estimated number of samples of one pose's rays that touch a voxel
+_LONG_FROM = 2**31  # least number of floats of a volume whose indices need 64 bits
 
 
 def launch_forward(

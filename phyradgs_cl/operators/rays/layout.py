@@ -16,9 +16,9 @@ from phyradgs_cl.operators.splats.layout import projection_matrices
 from phyradgs_cl.runtime import DeviceArray, Runtime
 from phyradgs_cl.runtime.layout import GUARD, Strides, pitch_of
 
-_RAY_CELL_FLOATS = 16  # floats of a cell in ``ray_constants``
-BORDER = 1  # zero voxels around a volume in y and z: samples need no test at its faces
-_WIDEST = 16  # cells of the widest vector, which may reach beyond the last cell
+_RAY_CELL_FLOATS = 16  # number of floats of a time cell in ``ray_constants``
+BORDER = 1  # width of the zeros around a volume in y and z, in voxels: samples need no test at its faces
+_WIDEST = 16  # number of elements of the widest vector, which may reach beyond the last cell or line
 
 
 @dataclass(frozen=True)

@@ -15,9 +15,9 @@ from phyradgs_cl.operators.rays.upright import columns_floats, turn_volume
 from phyradgs_cl.runtime import Array, DeviceArray, Runtime
 from phyradgs_cl.runtime.layout import GUARD, Strides, move, pad_rows, unpad_rows
 
-_FRAMES_SHARE = 0.25  # share of the free device memory for a batch of frames, where the volume is cut into bricks
-_SLOTS_SHARE = 0.125  # share of the free device memory for slots
-_MOST_SLOT_FLOATS = 2**26  # floats of all slots at a time, at most: more is not faster
+_FRAMES_SHARE = 0.25  # largest fraction of the free device memory for a batch of frames, where a volume is cut into bricks
+_SLOTS_SHARE = 0.125  # largest fraction of the free device memory for slots (``slots.py``)
+_MOST_SLOT_FLOATS = 2**26  # most floats of all slots at a time: more is not faster
 
 
 class RayMemory:

@@ -15,7 +15,7 @@ from phyradgs_cl.runtime import DeviceArray, Runtime
 from phyradgs_cl.runtime.layout import GUARD, pitch_of
 
 _SLOT_INTS, _SHARE_INTS = 8, 4  # integers per slot and per share, as in cl/common/ray_column.h and cl/rays_slots.cl
-_SAME_POSE = 10  # poses, over the largest entry of all, that agree to so many decimals count as one
+_SAME_POSE = 10  # poses that agree to this many decimals, divided by the largest entry of all, count as one
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,11 +15,13 @@ from phyradgs_cl.runtime import DeviceArray, Runtime
 
 SINGLE = (1, 1)
 _WIDEST = 1.25  # largest distance of neighbouring sub-rays in the grid's middle, in voxels
-# Largest distance of neighbouring single rays, in voxels. A usual scanner with as many voxels as pixels has 1.43. The
-# shortest volume that fits rays on a line loses 4 % of its density at 1.5, 16 % at 1.9, and a half at 2, where rays may pass
-# through every other voxel alone. A method that begins with a dense volume keeps the density.
-_FARTHEST, _FARTHEST_OF_DENSE = 1.45, 2.0
-_ROUNDING = 1e-3  # relative: a distance may exceed its limit by so much before a pixel gets another ray
+# Largest distance of neighbouring single rays, in voxels; beyond it pixels get sub-rays. A usual scanner with as many voxels
+# as pixels has 1.43. The minimum-norm volume that fits rays on a line loses 4 % of its density at 1.5, 16 % at 1.9, and a
+# half at 2, where rays may pass through every other voxel alone.
+_FARTHEST = 1.45
+# Largest distance of neighbouring single rays for a method that begins with a volume of the object's density, which it keeps
+_FARTHEST_OF_DENSE = 2.0
+_ROUNDING = 1e-3  # relative tolerance by which a distance may exceed its limit before a pixel gets another ray
 _MOST = 8  # most sub-rays of a pixel along an axis, reached where single rays are 10 voxels apart
 
 

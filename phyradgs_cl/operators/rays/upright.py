@@ -18,13 +18,15 @@ from phyradgs_cl.operators.rays.slots import Slots, UprightPoses
 from phyradgs_cl.runtime import DeviceArray, Runtime
 from phyradgs_cl.runtime.layout import GUARD, Strides, pitch_of
 
-_LINES = 128  # pixels of a detector column per work-item, at most
-FEWEST_LINES = 8  # lines per pose: with fewer, slots cost more than they save
-_VOXELS = 512  # voxels along z that the lines of a work-item may meet in one slice
-# Voxels (x, y, z) of a work-item of the adjoint: neighbouring columns share rays. The bits do not depend on them.
+_LINES = 128  # most pixels of a detector column per work-item
+# least number of lines that a pose has to serve on average: with fewer, slots (``slots.py``) cost more than they save
+FEWEST_LINES = 8
+_VOXELS = 512  # most voxels along z that the lines of a work-item may meet in one slice
+# Numbers of voxels (x, y, z) of a work-item of the adjoint, the preferred first: neighbouring columns share rays. The bits
+# of the result do not depend on them.
 _OWNED = ((16, 16, 128), (8, 8, 128), (8, 4, 128))
-_ITEMS_PER_UNIT = 4  # work-items that a compute unit should have at least, so that none waits long for the last
-_UPRIGHT = 1e-6  # columns are upright where they, and rows, lean by less than so many voxels over the whole detector
+_ITEMS_PER_UNIT = 4  # least number of work-items per compute unit that is aimed at, so that none waits long for the last
+_UPRIGHT = 1e-6  # columns are upright where they, and rows, lean by at most this many voxels over the whole detector
 _MOST_LEAN = 0.25  # largest lean of a column, in voxels across per voxel along z: beyond it the general kernel is faster
 _TURN = 16  # voxels along each side (x and z) of the tile that a work-item transposes; TURN in cl/rays_upright.cl
 

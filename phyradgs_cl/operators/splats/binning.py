@@ -6,13 +6,15 @@ from phyradgs_cl.checks import ceil_div
 from phyradgs_cl.runtime import DeviceArray, LaterItem, MemoryShortage, Runtime
 
 _CHUNK = 512  # splats per work-item on a CPU
-_GROUP, _LARGEST_GROUP = 64, 256  # splats per work-group on a GPU; the larger number where there would be too many counts
-_MANY_COUNTS = 1 << 22  # counts (tiles × groups) above which groups take more splats
-_SCANNED = 64  # counts per step of a work-group's scan
-_SLACK = 1.5  # indices allocated, over the indices needed
-_NEAR = 1.25  # memory for less than so many times the indices needed is allocated anew
-_MOST_CHECKS = 2**38  # tests of a splat in a pixel that a launch without lists may make: a second on a fast GPU
-_MOST_ENTRIES = 2**31 - 1  # indices of splats, at most: kernels address them by int
+_GROUP = 64  # splats per work-group on a GPU
+_LARGEST_GROUP = 256  # most splats per work-group on a GPU, where _GROUP would give too many counts
+_MANY_COUNTS = 1 << 22  # groups take more splats where there would be more counts (tiles × groups) than this
+_SCANNED = 64  # counts per step of a work-group's prefix sum
+_SLACK = 1.5  # number of indices allocated over the number needed
+_NEAR = 1.25  # lists with room for less than this many times the indices needed are allocated anew before they overflow
+# most tests of a splat at a pixel for which a launch may risk lists that are too short: a second on a fast GPU
+_MOST_CHECKS = 2**38
+_MOST_ENTRIES = 2**31 - 1  # upper limit of the indices of splats in all lists: kernels address them by int
 
 
 class TileLists:

@@ -13,8 +13,8 @@ from phyradgs_cl.errors import InputError
 from phyradgs_cl.runtime import DeviceArray, Kernel, Runtime
 from phyradgs_cl.runtime.layout import GUARD, padded_zeros, pitch_of
 
-STRIDE_OF = 16  # Gaussians are padded to a multiple of the widest vector
-CELL_FLOATS = 24  # floats of a cell; cl/common/splat.h
+STRIDE_OF = 16  # the number of Gaussians is padded to a multiple of this, the width of the widest vector
+CELL_FLOATS = 24  # number of floats of a time cell's constants, as in cl/common/splat.h
 
 
 @dataclass(eq=False)

@@ -17,10 +17,11 @@ from phyradgs_cl.operators.splats.states import CloudStates
 from phyradgs_cl.runtime import DeviceArray, Kernel, Runtime
 from phyradgs_cl.runtime.layout import GUARD, pad_rows, padded_zeros, pitch_of, unpad_rows
 
-RECORD_FLOATS = {False: 16, True: 20}  # floats per splat and cell, by whether the cell has motion
-DEFAULT_TIME_ERROR = 0.005  # largest error of averages over time, relative, RMS
-DEFAULT_CUTOFF_SIGMA = 3.7  # distance in σ from a Gaussian's centre at which it has fallen to 0.1 % of its peak
-_BAND_LINES = 8  # lines of a tile on a CPU
+RECORD_FLOATS = {False: 16, True: 20}  # number of floats per splat and time cell, by whether the cell has motion
+DEFAULT_TIME_ERROR = 0.005  # default of the largest relative RMS error of averages over time
+# default distance from a Gaussian's centre, in standard deviations, beyond which it is 0: it has fallen to 0.1 % of its peak
+DEFAULT_CUTOFF_SIGMA = 3.7
+_BAND_LINES = 8  # number of detector lines of a tile on a CPU
 GROUP_DEFINES = {False: {"GROUP": 1, "ACROSS": 1}, True: {"GROUP": 32, "ACROSS": 8}}
 """Build options of a Gaussian's adjoint by ``Runtime.pixel_items``: work-items per Gaussian, and how many lie along a
 line."""

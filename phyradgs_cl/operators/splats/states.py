@@ -12,10 +12,11 @@ from phyradgs_cl.operators.splats.layout import DeviceCells, DeviceGaussians, st
 from phyradgs_cl.runtime import DeviceArray, Kernel, Runtime
 
 STATE_ROWS = 12  # rows of a Gaussian in a state: its centre x, y, z, and the rows of G
-_PROBED_SIDE, _PROBED_STATES = 9, 16  # points along each axis of the grid, and states, at which the inverse is checked
-_WRONG = 0.01  # largest error of an inverse, in voxels
-# largest bend of a path in a segment, in voxels (its blur is 0.3 of it), and most segments of a frame
-_BEND, _MOST_SEGMENTS = 0.25, 32
+_PROBED_SIDE = 9  # points along each axis of the grid at which the inverse of a field is checked
+_PROBED_STATES = 16  # states at even times in which it is checked, besides those in which a field moves most
+_WRONG = 0.01  # largest error of an inverse, in voxels; a larger one raises InputError
+_BEND = 0.25  # largest bend of a point's path in a segment, in voxels; the bend's blur is 0.3 of it
+_MOST_SEGMENTS = 32  # most segments of a frame: beyond it larger bends are accepted
 
 
 class CloudStates:

@@ -11,10 +11,10 @@ from phyradgs_cl.operators.splats.projector import DEFAULT_CUTOFF_SIGMA, GROUP_D
 from phyradgs_cl.runtime import DeviceArray, Kernel, Runtime, attempts
 from phyradgs_cl.runtime.layout import GUARD, pad_rows, padded_zeros, pitch_of, unpad_rows
 
-RECORD_FLOATS = 20  # floats of a Gaussian that ``voxel_prepare`` writes
-SUM_FLOATS = 16  # floats of a Gaussian's sums over voxels
-_TILE_ROWS = 8  # lines along z of a tile
-_DEFAULT_BRICK_BYTES = 1 << 28  # bytes of voxels that the device holds at a time
+RECORD_FLOATS = 20  # number of floats that ``voxel_prepare`` writes for each Gaussian
+SUM_FLOATS = 16  # number of floats of a Gaussian's sums over voxels
+_TILE_ROWS = 8  # number of voxels along z of a tile
+_DEFAULT_BRICK_BYTES = 1 << 28  # default of the most bytes of voxels that the device holds at a time
 
 
 class Voxeliser:

@@ -17,8 +17,8 @@ from phyradgs_cl.fields.gaussians import MEAN
 from phyradgs_cl.operators.rays.layout import some_cells
 from phyradgs_cl.operators.twins.splat import moving_frame, precision_matrices, splat_frame
 
-_REACH = 2  # largest distance of a spline coefficient from a place where it counts, in voxels
-_BORDER = 4  # coefficients beyond each face of the volume
+_REACH = 2  # largest distance, in voxels, at which a spline coefficient counts; also of places outside the volume that do
+_BORDER = 4  # width of the border of spline coefficients beyond each face of the volume, in voxels
 Volume = np.ndarray
 
 

@@ -134,7 +134,8 @@ def voxel_field(
     return volume
 
 
-_PANELS, _NODES = 6, 12  # panels of the quadrature in time, and Gauss–Legendre nodes of each
+_PANELS = 6  # number of panels of the quadrature in time
+_NODES = 12  # number of Gauss–Legendre nodes of each panel
 
 
 @dataclass(frozen=True)

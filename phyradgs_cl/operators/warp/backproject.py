@@ -19,10 +19,10 @@ from phyradgs_cl.operators.warp.states import MotionStates
 from phyradgs_cl.runtime import DeviceArray, Runtime
 from phyradgs_cl.runtime.layout import GUARD
 
-_MOST_STEPS = 100  # iterations of the fixed point that inverts a displacement, at most
-_PROBED = 500  # voxels at which an inverse is checked
-_WRONG = 0.1  # largest error of an inverse, in voxels
-_HELD_STATES = 3  # states whose displacements stay on the device
+_MOST_STEPS = 100  # most iterations of the fixed point that inverts a displacement
+_PROBED = 500  # most voxels at which an inverse is checked
+_WRONG = 0.1  # largest error of an inverse, in voxels; a larger one raises InputError
+_HELD_STATES = 3  # most states whose displacements stay on the device
 
 
 class MovingBackprojector:

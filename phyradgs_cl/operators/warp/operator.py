@@ -31,10 +31,11 @@ from phyradgs_cl.operators.warp.states import MOST_STATES, MotionStates
 from phyradgs_cl.operators.warp.volume import VolumeWarp
 from phyradgs_cl.runtime import DeviceArray, Runtime, SameArray
 
-_FRAMES_PER_STATE = 12  # frames for one state more than MOST_STATES: with more frames, warps take a smaller part of the time
-_REACH = 2  # largest distance of a spline coefficient from a place where it counts, in voxels, as in cl/warp.cl
-_BORDER = 4  # coefficients beyond each face of the volume, as in cl/warp.cl
-_SETTLES = 8  # further voxels of zeros, over which coefficients decay to 3e-5
+# number of frames that allows one state more than MOST_STATES: with more frames, warps take a smaller part of the time
+_FRAMES_PER_STATE = 12
+_REACH = 2  # largest distance, in voxels, at which a spline coefficient counts, as in cl/warp.cl
+_BORDER = 4  # width of the border of spline coefficients beyond each face of the volume, in voxels, as in cl/warp.cl
+_SETTLES = 8  # width in voxels of further zeros around it, over which coefficients decay to 3e-5
 
 
 class WarpedOperator:

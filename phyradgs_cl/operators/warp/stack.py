@@ -29,7 +29,7 @@ class TimeStates:
 class StateStack:
     """W_k x = x_k of a stack x (K, nz, ny, nx), with the methods of a ``VolumeWarp``."""
 
-    volumes = 2  # stacks on the device, at most
+    volumes = 2  # most stacks x on the device
 
     def __init__(self, rt: Runtime, volume_shape: tuple[int, int, int], states: TimeStates) -> None:
         self.rt, self.states, self.shape = rt, states, (states.count, *volume_shape)

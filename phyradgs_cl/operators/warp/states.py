@@ -12,8 +12,8 @@ from phyradgs_cl.fields import Deformation, Grid
 MOST_STATES = 12  # most states of an object, unless ``most`` says otherwise
 # largest distance of a time from its nearest state where states are blended: displacement in voxels, RMS over moving voxels
 _SPACING = 0.6
-_SPACING_OF_NEAREST = 0.3  # the same where the nearest state stands for a time
-_MOVES = 0.1  # a voxel moves if its squared displacement is at least so much of the largest one
+_SPACING_OF_NEAREST = 0.3  # largest distance, in voxels RMS, of a time from its nearest state where that state stands for it
+_MOVES = 0.1  # a voxel counts as moving if its squared displacement is at least this fraction of the largest one
 
 
 @dataclass(frozen=True, eq=False)

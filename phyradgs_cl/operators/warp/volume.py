@@ -7,13 +7,14 @@ from phyradgs_cl.operators.warp.states import MotionStates
 from phyradgs_cl.runtime import DeviceArray, DeviceSpace, Kernel, Runtime
 from phyradgs_cl.runtime.layout import GUARD, Strides, move, pitch_of
 
-_BORDER = 4  # coefficients before and behind the volume, as in cl/warp.cl: further ones are below 3e-3
-_MOST_OWNED = 8  # slices of the result that a CPU's work-item owns; it repeats the voxels that reach another's too
-_ITEMS_PER_UNIT = 4
-_HEADROOM = 64  # by which a sum of one voxel's shares may exceed 1, as where the field contracts by 4 along each axis
-_TOGETHER = 8, 8, 4  # voxels of a GPU's group, which add to a slab of local memory
-_SAMPLES, _ADDED = 16, 64  # as long as so many samples of a ray take the 4³ coefficients of a voxel, read or added to
-_ROUNDING = 1e-3  # voxels
+_BORDER = 4  # spline coefficients beyond each face of the volume, as in cl/warp.cl: further ones are below 3e-3
+_MOST_OWNED = 8  # most slices of the result that a CPU's work-item owns; it repeats the voxels that reach another's too
+_ITEMS_PER_UNIT = 4  # least number of work-items per compute unit that is aimed at
+_HEADROOM = 64  # largest sum of the weights with which voxels add to one, as where the field contracts by 4 along each axis
+_TOGETHER = 8, 8, 4  # voxels (x, y, z) of a GPU's work-group, which add to a slab of local memory
+_SAMPLES = 16  # time to read the 4³ coefficients of a voxel, in samples of a ray
+_ADDED = 64  # time to add to the 4³ coefficients of a voxel, in samples of a ray
+_ROUNDING = 1e-3  # margin in voxels around the range of displacements along z, more than their rounding
 
 
 class VolumeWarp:
@@ -38,7 +39,7 @@ class VolumeWarp:
         self.stack = FrameStack(rt, self.kernel("add_frames"))
         self._reaches: dict[int, tuple[DeviceArray, DeviceArray]] = {}
 
-    volumes = 4  # that it holds besides the fields, at most
+    volumes = 4  # most volumes on the device, besides the displacement fields
 
     def is_still(self, state: int) -> bool:
         """Whether W_k is the identity."""

@@ -50,10 +50,10 @@ from phyradgs_cl.reconstructors.result import ProgressReport, Reconstruction, ig
 from phyradgs_cl.runtime import Runtime
 
 log = logging.getLogger(__name__)
-# views whose poses, rotated back to one angle, differ by at most this share of the largest entry share their weights
+# upper limit of the difference of poses, rotated back to one angle, over their largest entry, at which views share weights
 _SAME_POSE = 1e-9
-_BLOCK_BYTES = 1 << 26  # bytes of the rows that are filtered at one time
-_WORKERS = -1  # all cores
+_BLOCK_BYTES = 1 << 26  # most bytes of the rows that are filtered at one time
+_WORKERS = -1  # threads of SciPy's transforms: -1 takes all cores
 
 # Windows as functions of the frequency over the Nyquist frequency; all are 1 at zero, so that none changes the mean.
 WINDOWS: dict[str, Callable[[np.ndarray], np.ndarray]] = {

@@ -32,12 +32,12 @@ from phyradgs_cl.reconstructors.voxels.fista_tv import FistaTvOptions
 from phyradgs_cl.runtime import Runtime
 
 WAYS = ("none", "cosine", "cylinder", "reprojected")
-_SHARE = 0.5  # columns added at each side, over the panel's columns
-_SLOPE_PIXELS = 5  # pixels at the end of a row over which its slope is measured
-_NOISE = 0.01  # an edge below this share of the 99.9th percentile of line integrals is air
-_UNEVEN = 0.02  # largest deviation of an even step between views, over the step
-_REACH = 8  # exposure arcs by which views are continued beyond the ends of an arc
-_FULL_TURN = 1.5  # largest gap between views of a full turn, over the usual step
+_SHARE = 0.5  # number of columns added at each side by "cosine" and "cylinder", over the panel's number of columns
+_SLOPE_PIXELS = 5  # number of pixels at the end of a row over which its slope is measured
+_NOISE = 0.01  # an edge of a row up to this fraction of the line integrals' 99.9th percentile counts as air
+_UNEVEN = 0.02  # largest deviation of a step between views from the median step, as a fraction of it, that counts as even
+_REACH = 8  # length of the continuation of views beyond each end of an arc, in arcs of an exposure
+_FULL_TURN = 1.5  # upper limit of the gaps between views of a full turn, over the median step
 
 
 def extrapolated(frames: np.ndarray, way: str) -> tuple[np.ndarray, int]:
@@ -79,7 +79,7 @@ def _curvature(frames: np.ndarray) -> np.ndarray:
 
 
 _ITERATIONS = 30  # iterations of FISTA-TV that find the object beyond the panel
-_MOST = 2.0  # columns added at each side, at most, over the panel's columns
+_MOST = 2.0  # most columns added at each side by "reprojected", over the panel's number of columns
 
 
 def whole_object(scan: Scan, motion: Motion, rt: Runtime, report: ProgressReport) -> np.ndarray:

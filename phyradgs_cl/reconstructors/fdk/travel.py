@@ -16,15 +16,16 @@ from phyradgs_cl.reconstructors.fdk.views import pose_of_pixels, view_angles
 
 log = logging.getLogger(__name__)
 
-# least travel over the panel's height, and at least a row: less concerns only voxels that a circle sees in part too
+# the orbit travels along z where it moves by more than this fraction of the panel's height, and by more than a row: less
+# travel concerns only voxels that a circle sees in part too
 _TRAVEL = 0.05
-_CLASS_RAD = np.deg2rad(15)  # usual width of a class of directions
-_VIEWS_A_CLASS = 2.0  # views of one turn in a class, at least
-_EVEN = 0.5  # rows farther from the middle than this share of the panel's half height count less
-_LEAST_ROW = 0.02  # weight of the outermost row, so that voxels seen by no other row are seen
-_LEAST_SHARE = 0.01  # share of a class' directions below which a voxel counts as not seen from it
-_NAMED = 0.01  # share of the voxels with missing directions from which a warning is logged
-_FEW_VIEWS = 24  # views of a turn from which densities of balls are within 2 %; fewer cause a warning
+_CLASS_RAD = np.deg2rad(15)  # default width in rad of a class of ray directions about z
+_VIEWS_A_CLASS = 2.0  # least number of views of one turn in a class: with fewer, classes are wider
+_EVEN = 0.5  # rows farther from the middle than this fraction of the panel's half height count less
+_LEAST_ROW = 0.02  # weight of the outermost row, over that of middle rows, so that voxels seen by no other row are seen
+_LEAST_SHARE = 0.01  # a voxel seen from less than this fraction of a class's directions counts as not fully seen from it
+_NAMED = 0.01  # largest fraction of the voxels with missing directions without a warning
+_FEW_VIEWS = 24  # least number of views per turn without a warning: densities of balls are then within 2 %
 Backproject = Callable[[np.ndarray, np.ndarray], np.ndarray]
 """Returns a volume (z, y, x) of frames (n, rows, columns) and the numbers (n,) of their views."""
 

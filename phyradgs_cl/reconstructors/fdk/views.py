@@ -12,28 +12,34 @@ from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.reconstructors.fdk import weights
 
-# A scan with one gap that stands out is short. It is compared with the second largest and not with the median, so
-# that uneven views (four times as dense over one half, say) stay a full turn; 2.5 lets one view of many be lost.
+# A gap between views stands out where it is wider than this many times another gap. The widest of all is compared with the
+# second widest, not with the median, so that uneven views (four times as dense over one half, say) stay a full turn. Any
+# gap wider than _WIDE_RAD is compared with both of its neighbours. 2.5 lets one view of many be lost.
 SHORT_SCAN_GAP = 2.5
-_SAME_VIEW = 1e-3  # views closer than this share of the mean gap have one cell (a second turn over the first)
-# Gaps up to the first angle, filled, cost less than 1 % of the density of balls a quarter of the field wide. Gaps wider than
-# the second part the arc; between the two, more parts would cost more than filled gaps.
-_NAMED_RAD, _WIDE_RAD = np.deg2rad(5), np.deg2rad(10)
+_SAME_VIEW = 1e-3  # views closer than this fraction of the mean gap share one angular cell (a second turn over the first)
+# lower limit of a filled gap that the warning counts: narrower ones cost less than 1 % of the density of balls a quarter of
+# the field wide
+_NAMED_RAD = np.deg2rad(5)
+# gaps up to this width, except for the widest of all, do not part the arc: more parts would cost more than filled gaps
+_WIDE_RAD = np.deg2rad(10)
 # The rays of a misaligned panel come again half a turn later, except for a strip that is measured once. Gaps of a full turn
-# up to this angle are filled, so that the strip counts fully; with a larger one the scan is short.
+# up to this width are filled, so that the strip counts fully; with a wider one the scan is short.
 _FILLED_RAD = np.deg2rad(15)
-# views within this share of a gap's width from it stand for it; more smears, less draws streaks where it is wide
+# views at most this fraction of a filled gap's width away from it stand for it: more smears, less draws streaks at wide gaps
 _FILL_REACH = 0.5
 log = logging.getLogger(__name__)
 
-# distance of source or panel from a circle, over that between them: beyond the first a warning, the second an error
-_CIRCLE, _NO_CIRCLE = 0.05, 0.5
-_PLANE_DEG, _NO_PLANE_DEG = 10.0, 45.0  # angle of the source above its circle's middle: warning, error
-_LEAN_DEG, _NO_LEAN_DEG = 0.5, 10.0  # angle of parallel rays or rows from the plane of the rotation: warning, error
-# angle of a cone's rows from it: densities are 0.1 % and 1.5 % too low, and all 0 at 90°
-_ROLL_DEG, _NO_ROLL_DEG = 3.0, 10.0
-_LEAST_OVERLAP = 2.0  # columns from the axis to the nearer edge of a displaced panel: fewer cause a warning
-# missing angle without a warning: the fan of rays that are nearly parallel, for which half a turn is enough
+# Upper limits in pairs: beyond the first a warning is logged; beyond the second, _NO_…, InputError is raised.
+_CIRCLE = 0.05  # distance of source or panel from a circle about z, over the distance between source and panel
+_NO_CIRCLE = 0.5  # distance from a circle, as for _CIRCLE, that is refused
+_PLANE_DEG = 10.0  # elevation of the source above the plane z = 0, seen from the origin
+_NO_PLANE_DEG = 45.0  # elevation of the source that is refused
+_LEAN_DEG = 0.5  # angle of parallel rays, or of their detector rows, from the plane of the rotation
+_NO_LEAN_DEG = 10.0  # angle of parallel rays or their rows that is refused
+_ROLL_DEG = 3.0  # angle of a cone beam's detector rows from the plane of the rotation: densities are 0.1 % too low
+_NO_ROLL_DEG = 10.0  # angle of a cone beam's rows that is refused: densities are 1.5 % too low, and 0 at 90°
+_LEAST_OVERLAP = 2.0  # least number of columns from the axis to a displaced panel's nearer edge without a warning
+# largest missing angle without a warning: the fan of rays that are nearly parallel, for which half a turn is enough
 _TOLERATED_RAD = np.deg2rad(0.5)
 RayWeight = Callable[[int], np.ndarray]
 

@@ -8,14 +8,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
-# The transition between seen once and seen twice is this many times as wide as the overhang, or all that is seen
-# twice (Wang's sine throughout). Every ray that is not counted evenly with its opposite adds noise and aliasing, so a
-# quarter-pixel offset touches two columns; wider transitions were noisier (up to 15 %) and no freer of artefacts.
+# Width of the transition between rays measured once and twice, over the overhang of the panel's longer side; at most all
+# that is measured twice (Wang's sine throughout). Every ray that is not counted evenly with its opposite adds noise and
+# aliasing, so a quarter-pixel offset touches two columns; wider transitions were noisier (up to 15 %) and no freer of
+# artefacts.
 TRANSITION = 1.0
-_SYMMETRIC = 0.01  # overhang in pixels up to which a panel counts as symmetric
-_ASIDE = 0.1  # asymmetry over the fan: a panel with less was not displaced on purpose, and sees both sides of the object
+_SYMMETRIC = 0.01  # largest overhang in pixels of a panel that counts as symmetric about the axis
+# largest asymmetry, as a fraction of the fan, of a panel that was not displaced on purpose: it sees both sides of the object
+_ASIDE = 0.1
 
-_PART_EDGE_RAD = np.deg2rad(15)  # angle from a gap over which a view hands its rays to their opposites
+_PART_EDGE_RAD = np.deg2rad(15)  # width of the arc beside a gap, in rad, over which views' weights rise from 0 to full
 
 
 def turned_back(pose: np.ndarray, angle_rad: np.ndarray) -> np.ndarray:

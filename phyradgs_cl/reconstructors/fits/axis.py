@@ -16,18 +16,22 @@ from phyradgs_cl.reconstructors.fits.residuals import fit_squares, vertex
 from phyradgs_cl.runtime import Runtime
 
 _ROUGH_SHIFTS = (-2.0, -1.0, 0.0, 1.0, 2.0)  # first trial shifts, in coarse pixels
-_ROUGH_ITERATIONS = 8
+_ROUGH_ITERATIONS = 8  # number of iterations of the fit for each trial shift
 _STEP = 0.25  # distance between neighbouring trial shifts around the best, in coarse pixels
-_MOST_STEPS = 8  # moves to a better centre of three trial shifts, at most
-ANYWHERE = (-math.inf, math.inf)
-_MOST_VIEWS, _MOST_ROWS = 60, 64  # views, and rows, that are compared, at most
-_BEYOND = 1.5  # steps between views by which the opposite of a view may lie outside the scan
+_MOST_STEPS = 8  # most moves to a better centre of three trial shifts
+ANYWHERE = (-math.inf, math.inf)  # limits of the shift in pixels: none
+_MOST_VIEWS = 60  # most views that are compared with their opposites
+_MOST_ROWS = 64  # most blocks of rows that are compared
+_BEYOND = 1.5  # largest distance of a view's opposite from the nearest view beyond the scan's end, in steps between views
 _WIDEST_STEP_RAD = math.radians(10.0)  # largest angle between two views that are interpolated
-_SMOOTHING_PX = 1.0  # σ of a smoothing of rows: interpolation lowers noise between pixels, which would draw the shift there
+# standard deviation in pixels of a smoothing along rows: interpolation lowers noise between pixels, which biases shifts
+_SMOOTHING_PX = 1.0
 _CORRELATED_PX = 2 * math.sqrt(math.pi) * _SMOOTHING_PX  # columns of smoothed noise per independent one
-_LEAST_OVERLAP, _LEAST_ENERGY = 0.25, 0.2  # least overlap over the columns; least energy of an overlap over the largest
-_STEPS, _SETTLED_PX = 12, 1e-3  # Gauss–Newton steps, at most; a shorter step ends them
-_BIAS_PX = 0.02  # error of a shift because views are interpolated between their neighbours
+_LEAST_OVERLAP = 0.25  # least overlap of a view and its mirrored opposite, as a fraction of the columns
+_LEAST_ENERGY = 0.2  # least sum of squares in an overlap, as a fraction of the largest over all shifts
+_STEPS = 12  # most Gauss–Newton steps
+_SETTLED_PX = 1e-3  # Gauss–Newton ends after a step shorter than this, in pixels
+_BIAS_PX = 0.02  # standard error of a shift in pixels because views are interpolated between their neighbours
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,11 +14,12 @@ from phyradgs_cl.reconstructors.voxels.cgls import Cgls
 from phyradgs_cl.reconstructors.voxels.system import System
 from phyradgs_cl.runtime import Runtime
 
-_FREEDOM = 0.3  # strength of patterns and levels over the volume's: with equal strength they would explain motion as noise
-_ITERATIONS = 20
-_MOST_TIMES = 12  # times per exposure, at most
-_DRAWS = 200  # resamplings of the bootstrap
-_TINY = 1e-30
+# norm of the map from patterns and levels to frames, over that from the volume: with equal norms they would explain motion
+_FREEDOM = 0.3
+_ITERATIONS = 20  # default number of iterations of a fit
+_MOST_TIMES = 12  # most times per exposure
+_DRAWS = 200  # resamplings of the bootstrap; the deviation is NaN unless more than half of them have a minimum
+_TINY = 1e-30  # lower limit of denominators
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,15 +15,20 @@ from phyradgs_cl.prepare.step import fill_masked
 from phyradgs_cl.reconstructors.fdk.weights import fan_angle, pixel_rays
 from phyradgs_cl.reconstructors.fits.axis import AxisShift
 
-_SMOOTHING_PX = 1.0  # σ of a smoothing of rows: interpolation lowers noise between pixels, which would draw the shift there
-_COARSE_COLUMNS = 128  # columns of the coarse frames, at most
-# trial shifts to either side, and their step; then about the best of them, in coarse pixels
-_MOST_PX, _STEP_PX, _NEAR_PX = 16.0, 0.5, 2.0
-_FEWEST_VIEWS, _MOST_VIEWS, _WIDEST_STEP_RAD = 24, 360, math.radians(10.0)  # views of a scan, views compared, step of views
-_MOST_ROWS, _MOST_PAIRS = 32, 48  # rows, and pairs of opposite rays in a row, that are compared
-_LEAST_PX = 1.0  # least distance from the axis to the middle of the panel's outer column
+# standard deviation in pixels of a smoothing along rows: interpolation lowers noise between pixels, which biases shifts
+_SMOOTHING_PX = 1.0
+_COARSE_COLUMNS = 128  # most columns of the coarse frames
+_MOST_PX = 16.0  # largest trial shift to either side, in coarse pixels
+_STEP_PX = 0.5  # distance between trial shifts, in pixels of the frames that are compared
+_NEAR_PX = 2.0  # largest distance, in coarse pixels, of the trial shifts on full frames from the best coarse one
+_FEWEST_VIEWS = 24  # least number of views of a scan
+_MOST_VIEWS = 360  # most views that are compared
+_WIDEST_STEP_RAD = math.radians(10.0)  # largest angle between neighbouring views: wider steps are not interpolated
+_MOST_ROWS = 32  # most rows that are compared
+_MOST_PAIRS = 48  # most pairs of opposite rays in a row that are compared
+_LEAST_PX = 1.0  # least distance, in pixels, from the axis to the middle of the panel's outer column
 _BLOCKS = 12  # blocks of views of the jackknife
-_BIAS_PX = 0.05  # error of the shift beside noise, measured with half-fans and features of two pixels
+_BIAS_PX = 0.05  # standard error of the shift in pixels beside noise, measured with half-fans and features of two pixels
 _NONE = AxisShift(math.nan, math.nan, np.empty(0))
 
 

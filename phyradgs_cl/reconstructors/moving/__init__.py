@@ -3,9 +3,9 @@
 from collections.abc import Mapping
 from typing import Any
 
-# Least gain that shows motion: the share by which the squared residual is smaller than at rest. Eight volumes at rest gain
-# up to 0.02. A breath of a third of a voxel gains 0.03 in a noisy scan, where its field does not help, and 0.06 in a clear
-# one, where it helps by 1.2 dB.
+# Least gain that shows motion: the fraction by which the squared residual with the field is smaller than that at rest. Eight
+# volumes at rest gain up to 0.02. A breath of a third of a voxel gains 0.03 in a noisy scan, where its field does not help,
+# and 0.06 in a clear one, where it helps by 1.2 dB.
 LEAST_GAIN = 0.03
 
 

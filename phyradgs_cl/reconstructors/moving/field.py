@@ -22,13 +22,13 @@ from phyradgs_cl.operators.warp.volume import VolumeWarp
 from phyradgs_cl.reconstructors.moving.signal import Bending, TemporalSplines
 from phyradgs_cl.runtime import Runtime
 
-_CG_STEPS = 8
-_DAMPING = 1e-3  # damping, over the mean diagonal of JᵀJ
-_ROUGHNESS = 1e-2  # β, over the mean diagonal of JᵀJ of temporal coefficients
-_SHORTER = (1.0, 0.5, 0.25)  # shares of a step that are tried in turn
-_LEAST_DETERMINANT = 0.1  # least determinant of I + ∂w/∂y after a step: at 0 matter folds
-_LEAST_VOXELS = 1.0  # displacement per unit of weight that is added to the distances between states
-_SUPPORT = 4  # intervals in which a temporal spline differs from 0
+_CG_STEPS = 8  # iterations of conjugate gradients for a step of the control vectors
+_DAMPING = 1e-3  # Levenberg damping of a step, as a fraction of the mean diagonal of JᵀJ
+_ROUGHNESS = 1e-2  # weight β of the weights' roughness in time, as a fraction of the mean diagonal of JᵀJ
+_SHORTER = (1.0, 0.5, 0.25)  # fractions of a step that are tried in turn, until one lowers the misfit
+_LEAST_DETERMINANT = 0.1  # lower limit of det(I + ∂w/∂y) after a step: at 0 matter folds
+_LEAST_VOXELS = 1.0  # displacement in voxels, per unit of weight, that is added to the distances between states
+_SUPPORT = 4  # number of intervals between knots in which a temporal spline differs from 0
 
 
 @dataclass(frozen=True, eq=False)

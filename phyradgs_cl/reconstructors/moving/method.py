@@ -41,20 +41,23 @@ from phyradgs_cl.reconstructors.voxels.run import MethodRun
 from phyradgs_cl.reconstructors.voxels.stages import Stage, Stages
 from phyradgs_cl.runtime import Runtime
 
-# largest coarse scan: columns or rows, voxels along a side, frames (more where a signal has more knots)
-_MOST_COLUMNS, _MOST_VOXELS, _MOST_FRAMES = 64, 32, 600
-# times per period at which exposures see the object, at least; times of one exposure, at most
-_TIMES_PER_PERIOD, _MOST_TIMES = 12, 6
-_FIRST_PASSES, _PASSES = 8, 3  # passes of fista: the first ones, at rest, and those of a round
-_WEIGHT, _TV_ITERATIONS = 0.42, 5  # prior weight and TV iterations of these passes
-# spacings of control points along the box's longest side, in the first rounds and in the last
-_COARSE_SPACINGS, _FINE_SPACINGS = 2, 4
-# factor of γ for finer control points: the field then is as stiff in mm as before
+_MOST_COLUMNS = 64  # most blocks of pixels along the longer side of the panel in the coarse scan
+_MOST_VOXELS = 32  # most voxels along the longest side of the coarse scan's grid
+_MOST_FRAMES = 600  # most frames of the coarse scan, or more: one for every knot of the signal
+_TIMES_PER_PERIOD = 12  # number of times per period of the motion at which exposures see the object
+_MOST_TIMES = 6  # most times of one exposure that this takes
+_FIRST_PASSES = 8  # passes of fista before the first round, with the object at rest
+_PASSES = 3  # passes of fista in each round
+_WEIGHT = 0.42  # prior weight of the passes of fista
+_TV_ITERATIONS = 5  # TV iterations of each pass of fista
+_COARSE_SPACINGS = 2  # number of spacings of control points along the box's longest side, in the first rounds
+_FINE_SPACINGS = 4  # number of spacings of control points along the box's longest side, in the last rounds
+# factor on the bending weight γ for finer control points: the field then is as stiff in mm as before
 _FINE_BENDING = (_FINE_SPACINGS / _COARSE_SPACINGS) ** 4
-_COARSE_SHARE = 0.6  # share of the rounds with coarse control points
-_FREE_KNOTS = 6  # intervals of the splines where no signal has knots
+_COARSE_SHARE = 0.6  # fraction of the rounds with coarse control points
+_FREE_KNOTS = 6  # number of intervals of the temporal splines where no signal has knots
 _AT_REST = "no motion found"
-# iterations per round of the search: 7 rounds come before the 35 passes that are the default of fista
+# iterations of the method per round of its search: 7 rounds come before the 35 passes that are the default of fista
 _ITERATIONS_PER_ROUND = 6
 _STORED = ("field_control", "field_place", "field_times", "field_weights", "field_gain")
 

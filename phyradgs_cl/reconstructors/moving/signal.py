@@ -16,17 +16,18 @@ from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Gating
 
-_NODES = 4  # times per interval of knots at which weights are stored; between them they are linear
-_STRETCH = 0.02  # weight of first differences in the bending energy: a field that is linear in air stays small there
-_HARMONICS = 6  # harmonics of the gantry's angle, which an object at rest explains
-_FEWEST_CYCLES = 5  # cycles in the scan, at least: slower motion is taken as free in time
+_NODES = 4  # number of times per interval between knots at which weights are stored; between them they are linear
+_STRETCH = 0.02  # weight of squared first differences in the bending energy: a field that is linear in air stays small there
+_HARMONICS = 6  # number of harmonics of the gantry's angle that are removed: an object at rest explains them
+_FEWEST_CYCLES = 5  # least number of cycles in the scan: slower motion is taken as free in time
 _BAND = 0.25  # half width of the band about the dominant rate, over that rate: breaths differ in length
-_PERIODIC_SHARE = 0.5  # least share of the power in that band, beyond what white noise has there, of a signal that repeats
-_FEWEST_FRAMES = 16  # frames of a scan in which a period is sought
-_FEWEST = 4  # values in a file, at least
-_KNOTS_PER_PERIOD = 6  # knots of the weights that follow a signal
-_SLOWER = 0.95  # share of the power below the rate that knots follow, of a stated signal that does not repeat
-_MOST_EVEN = 100_000  # evenly spaced times, at most
+# A signal repeats where at least this fraction of its power lies in the band, beyond what white noise has there.
+_PERIODIC_SHARE = 0.5
+_FEWEST_FRAMES = 16  # least number of frames of a scan in which a period is sought
+_FEWEST = 4  # least number of values in a file
+_KNOTS_PER_PERIOD = 6  # knots per period of the weights that follow a signal
+_SLOWER = 0.95  # knots follow rates up to this fraction of the power, for a stated signal that does not repeat
+_MOST_EVEN = 100_000  # largest number of evenly spaced intervals to which a signal is interpolated
 _FORMS = f"at least {_FEWEST} lines: time in s, value; or one value for each frame"
 
 

@@ -15,7 +15,7 @@ from phyradgs_cl.reconstructors.splats.options import SplatOptions
 from phyradgs_cl.runtime import DeviceArray, Runtime
 from phyradgs_cl.runtime.layout import pad_rows
 
-_PEAK_PERCENTILE = 99.9  # percentile of line integrals that counts as their peak; the maximum would be noise
+_PEAK_PERCENTILE = 99.9  # percentile of the line integrals that counts as their peak; the maximum would be noise
 
 
 @dataclass(frozen=True)

@@ -33,7 +33,8 @@ from phyradgs_cl.reconstructors.splats.start import box_of, first_population, in
 from phyradgs_cl.reconstructors.splats.step import Batch, FrameStep, sharing_of
 from phyradgs_cl.runtime import Runtime
 
-REPORT_EVERY, LEAST_RECORDED = 50, 20  # iterations between reports, and lines of a short run's record
+REPORT_EVERY = 50  # number of iterations between reports, and most between lines of the record
+LEAST_RECORDED = 20  # least number of lines of a run's record, if it has as many iterations
 
 
 class SplatRun:

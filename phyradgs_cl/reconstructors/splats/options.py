@@ -13,8 +13,9 @@ from phyradgs_cl.operators import DEFAULT_CUTOFF_SIGMA
 from phyradgs_cl.optim import PUBLISHED_RATES, DensityControl, Rates
 from phyradgs_cl.text import repr_of_changes
 
-# share of the coarse iterations with one pose per frame; time error of the rest (docs/results/motion_models.md)
-_STATIC_SHARE, _COARSE_ERROR = 0.4, 0.1
+# Settings of the iterations before ``exact_from``, which are coarse (docs/results/motion_models.md).
+_STATIC_SHARE = 0.4  # fraction of the coarse iterations with one pose per frame
+_COARSE_ERROR = 0.1  # lower limit of ``time_error`` in the other coarse iterations
 
 
 @dataclass(frozen=True, repr=False)
@@ -100,14 +101,14 @@ _PAPER = SplatOptions(
     motion=MicroViews(8, 5), gaussians=50_000, iterations=20_000, rates=PUBLISHED_RATES,
     control=PUBLISHED_CONTROL,
 )
-# a sixth of the iterations, the schedule scaled with them, and two or three segments per frame
+# The preset "quick": a sixth of the default's iterations, its schedule in proportion, and two or three segments per frame.
 _QUICK = SplatOptions(
     motion=Exact(time_error=0.02), iterations=500, parameter_terms_from=80,
     control=DensityControl(every=20, start_iteration=80),
 )
 
 PRESETS = {"default": SplatOptions(), "quick": _QUICK, "paper": _PAPER}
-# R2-Gaussian's constants; its 30,000 iterations are cut to ours unless asked for, rates decay over the run
+# R2-Gaussian's constants, but with our default number of iterations in place of its 30,000. Rates decay over the run.
 R2_PUBLISHED = SplatOptions(
     motion=Exact(), affine=True, gaussians=50_000, ssim_weight=0.25, tv_weight=0.05, density_weight=0.0,
     rates=PUBLISHED_RATES, control=PUBLISHED_CONTROL,

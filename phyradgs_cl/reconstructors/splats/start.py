@@ -12,7 +12,7 @@ from phyradgs_cl.reconstructors.splats.device import Scale
 from phyradgs_cl.reconstructors.splats.options import SplatOptions
 
 log = logging.getLogger(__name__)
-_REFERENCE_PERCENTILE = 99.9  # percentile of the first volume: the unit of density
+_REFERENCE_PERCENTILE = 99.9  # percentile of the first volume's values that is the unit of density
 
 
 def internal_scale(fdk: np.ndarray, grid: Grid) -> Scale:

@@ -20,8 +20,9 @@ from phyradgs_cl.reconstructors.splats.device import DeviceCloud, DeviceFrames, 
 from phyradgs_cl.reconstructors.splats.options import SplatOptions
 from phyradgs_cl.runtime import DeviceArray, Runtime
 
-_ROWS, _STATISTICS = 11, 2
-_DERIVED = 13  # rows of gradients, with dL/d(centre on the detector) for density control
+_ROWS = 11  # parameters of a Gaussian: rows of dL/d(parameters)
+_STATISTICS = 2  # rows of a Gaussian's statistics for density control
+_DERIVED = 13  # rows of ``cloud.gradients``: dL/d(parameters), then dL/d(centre on the detector), (u, v)
 Corner = tuple[int, int, int]
 """First voxel (z, y, x) of the sub-volume of the total variation."""
 

@@ -55,7 +55,7 @@ class AsdPocs(Algorithm):
         if tv_length > options.tv_ratio * data_length and residual > self.epsilon:
             self.tv_step *= options.tv_reduction
         cosine = space.inner(by_tv, by_data) / max(tv_length * data_length, 1e-30)
-        # the two steps now undo each other: more of them would only alternate
+        # the steps on data and on TV point against each other and undo each other: more of them would only alternate
         if cosine < -0.99 and residual <= self.epsilon:
             self.finished = "data and TV in balance"
         return residual

@@ -37,14 +37,17 @@ from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.runtime.algebra import HostSpace
 
 log = logging.getLogger(__name__)
-_VOLUMES, _FRAMES = 16, 3  # volumes, and stacks of frames, in memory at one time, with the prior `dct`
-_HELD, _COPIES = 9, 2  # volumes that ``dct`` holds on the device, and more while a prior maps a volume of the host
-# settings of the passes before those on smaller voxels, measured in docs/results/settings.md
-_COARSE_PASSES = 0.6  # share of all passes
-_COARSE_SUBSETS = 1.6  # times the option ``subsets``
-_COARSE_TIMES = 1 / 3  # share of the times in an exposure, but two at least
-_FAINTEST = 1e-6  # row sums of AᵀA below this share of the largest count as that large in the bound
-# largest slice, in voxels, whose smaller voxels are worth their time: at 64³, not at 128³; of every slab alike
+_VOLUMES = 16  # number of volumes in memory at one time, with the prior ``dct``
+_FRAMES = 3  # number of stacks of all frames in memory at one time
+_HELD = 9  # number of volumes that ``dct`` holds on the device
+_COPIES = 2  # number of further volumes on the device while a prior maps a volume of the host
+# Settings of the coarse passes, those before the passes on smaller voxels, measured in docs/results/settings.md.
+_COARSE_PASSES = 0.6  # fraction of all passes that are coarse
+_COARSE_SUBSETS = 1.6  # number of subsets in coarse passes, over the option ``subsets``
+_COARSE_TIMES = 1 / 3  # number of times per exposure in coarse passes over that in others, but two at least
+_FAINTEST = 1e-6  # row sums of AᵀA below this fraction of the largest count as that large in the bound
+# Voxels are divided in grids whose slices (y, x) have at most this many voxels: it is worth its time at 64³, not at 128³.
+# The height does not count, so that every slab is treated alike.
 _MOST_DIVIDED = 90**2
 
 

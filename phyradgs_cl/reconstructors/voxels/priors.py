@@ -26,19 +26,26 @@ from phyradgs_cl.reconstructors.result import function_name
 from phyradgs_cl.reconstructors.voxels.system import System
 from phyradgs_cl.runtime import Runtime, Space
 
-_SPREAD = 2.83  # an exposure's length in standard deviations of its five times, which reach from its start to its end
-_EDGES = 0.09  # error of a ray's length at edges, over a voxel's side
-_LEAST = 1e-4  # weight for frames without noise, over the largest value of Aᵀp
-# factors of the prior's weight for its maps, by the prior (docs/results/settings.md)
-_TV_ALONE, _TV_BEFORE_DCT, _DCT = 1.6, 0.8, 1.5
-_TV_AT_REST, _DCT_AT_REST = 0.5, 1.35  # the same before ridge, for scans that stop for each projection
-# noise that a step assumes, over the prior's weight; its length; maps for each step
-_RIDGE_NOISE, _RIDGE_LENGTH, _RIDGE_EVERY = 17.0, 0.5, 4
-_RIDGE_NOISE_AT_REST = 20.0  # the noise for scans that stop
-# noise of line integrals for which the numbers of scans that stop hold, and the least that they follow
-_USUAL_NOISE, _LEAST_NOISE = 0.01, 0.001
-_LEAST_NOISE_SHARE = 0.1  # least noise share in ridge steps, for scans without noise
-_SUBVOXELS, _SUBVOXELS_WITH_RIDGE = 2 / 3, 0.85  # share of the smaller voxels in the result
+# length of the source's path in an exposure over the standard deviation of its places, at five even times from start to end
+_SPREAD = 2.83
+_EDGES = 0.09  # error of a ray's path length at the object's edges, over a voxel's side
+_LEAST = 1e-4  # lower limit of the prior's weight, over the largest value of Aᵀp: it holds for frames without noise
+# The next five are factors on the option ``prior_weight`` in a prior's maps (docs/results/settings.md).
+_TV_ALONE = 1.6  # weight of TV in the prior ``tv``
+_TV_BEFORE_DCT = 0.8  # weight of TV in ``dct``
+_DCT = 1.5  # threshold of the block cosine transforms in ``dct``
+_TV_AT_REST = 0.5  # weight of TV before ridge steps, for scans that stop for each projection
+_DCT_AT_REST = 1.35  # threshold of the block cosine transforms before ridge steps, for scans that stop for each projection
+_RIDGE_NOISE = 17.0  # noise that a ridge step assumes, over the prior's weight, for fly-scans
+_RIDGE_NOISE_AT_REST = 20.0  # noise that a ridge step assumes, over the prior's weight, for scans that stop
+_RIDGE_LENGTH = 0.5  # factor on the regulariser's gradient in a ridge step
+_RIDGE_EVERY = 4  # number of maps of the other prior for each ridge step
+# noise of line integrals for which _TV_AT_REST and _RIDGE_NOISE_AT_REST hold; they follow the sixth root of the scan's noise
+_USUAL_NOISE = 0.01
+_LEAST_NOISE = 0.001  # lower limit of the scan's noise of line integrals that those two factors follow
+_LEAST_NOISE_SHARE = 0.1  # lower limit of noise_share (``Prior``) in ridge steps, for scans without noise
+_SUBVOXELS = 2 / 3  # weight of the smaller voxels in the result, whose rest is the volume of the passes before
+_SUBVOXELS_WITH_RIDGE = 0.85  # weight of the smaller voxels in the result with the prior ``ridge``
 
 
 @dataclass(frozen=True)
@@ -150,10 +157,10 @@ class Prior:
     A subclass that starts from its last result keeps it in ``state``. This class is the prior none: x ≥ 0 alone."""
 
     VOLUMES: ClassVar[int] = 0
-    """How many more volumes the prior holds than ``dct``."""
+    """Number of volumes that the prior holds in memory beyond those of ``dct``."""
 
     noise_share = 1.0
-    """The share of noise in the weights of the present pass; the error of voxels at edges is the rest."""
+    """Fraction, 0 to 1, of the present pass's weight that stands for noise; the rest stands for errors at voxels' edges."""
 
     def __call__(self, space: Space[Any], volume: Any, weight: float, *, nonnegative: bool) -> Any:
         """Maps a volume (nz, ny, nx) of ``space``; ``weight`` in 1/mm."""

@@ -21,8 +21,9 @@ from phyradgs_cl.reconstructors.result import ProgressReport, Reconstruction, ig
 from phyradgs_cl.reconstructors.voxels.system import System
 from phyradgs_cl.runtime import Runtime
 
-MOST_ITERATIONS = 1_000_000
-_SYSTEM_FRAMES = 6  # stacks of frames: measurement, mask, transmission, and the intermediate results of one residual
+MOST_ITERATIONS = 1_000_000  # upper limit of the option ``iterations``
+# number of stacks of all frames that a system holds: measurement, mask, transmission, and those of computing a residual
+_SYSTEM_FRAMES = 6
 
 
 @dataclass(frozen=True)
@@ -38,7 +39,7 @@ class IterativeOptions:
     """Weights pixels by their transmission. Some methods have an option of this name."""
 
     noise_stop: ClassVar[float] = 0.0
-    """Ends the run when the residual is this many times the noise. Some methods have an option of this name."""
+    """Ends the run where the residual is at most this many times the noise; 0: never. Some methods have such an option."""
 
     MOTIONS: ClassVar[tuple[Motion, ...]] = motions_for(RAYS)
 

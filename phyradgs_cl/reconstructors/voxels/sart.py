@@ -18,7 +18,7 @@ from phyradgs_cl.reconstructors.voxels.run import Algorithm, IterativeOptions, v
 from phyradgs_cl.reconstructors.voxels.subsets import spread_order
 from phyradgs_cl.reconstructors.voxels.system import System, column_weights, row_weights
 
-_WEIGHT_CACHE_BYTES = 1 << 29  # memory of all column weights that are kept
+_WEIGHT_CACHE_BYTES = 1 << 29  # most bytes of the column weights of subsets that are kept
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ import numpy as np
 from phyradgs_cl.checks import ceil_div
 from phyradgs_cl.reconstructors.voxels.system import System
 
-_GROWTH = 1.2  # residual of a pass over the smallest so far: where it is larger, the subsets' steps diverge
+_GROWTH = 1.2  # steps of subsets diverge where a pass leaves more than this many times the least residual so far
 
 
 def spread_order(count: int) -> list[int]:

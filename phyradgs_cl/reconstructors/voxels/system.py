@@ -23,8 +23,8 @@ from phyradgs_cl.runtime import DeviceSpace, HostSpace, MemoryShortage, Runtime,
 
 log = logging.getLogger(__name__)
 
-_SHORTEST_PATH = 0.1  # shorter rays count as this share of the longest path
-_FAINTEST = 1e-6  # smaller sums over a voxel's rays count as this share of the largest
+_SHORTEST_PATH = 0.1  # lower limit of a ray's path length through the volume, as a fraction of the longest path
+_FAINTEST = 1e-6  # lower limit of the sum of path lengths over a voxel's rays, as a fraction of the largest sum
 S = TypeVar("S", bound="SharedOperator")
 
 

@@ -10,11 +10,11 @@ from phyradgs_cl.report.images import Window, base64_of, block_means, bytes_of, 
 from phyradgs_cl.report.interactive.viewer import decimals_of, slider
 from phyradgs_cl.report.markup import Markup, element, joined, json_block, number
 
-MOST_EDGE = 128  # limit of the voxels along a side
-MOST_TEXT = 2_000_000  # limit of the characters of base64, for voxels and centres together
-MOST_CENTRES = 20_000  # limit of the Gaussians' centres shown
+MOST_EDGE = 128  # most voxels along each side of the volume in the page
+MOST_TEXT = 2_000_000  # most characters of base64, for voxels and centres together
+MOST_CENTRES = 20_000  # most centres of Gaussians that are shown
 MOST_ZOOM = 8  # largest zoom
-_TURN_DEG, _TILT_DEG = 325, 20  # initial angles, which put the three marked edges in front and on the left
+_TURN_DEG, _TILT_DEG = 325, 20  # initial angles of the view, which put the three marked edges in front and on the left
 _PATIENCE_MS = 1500  # longest time to draw a picture at rest
 _HELP = (
     "Drag to turn; on a touch screen one finger turns and two fingers tilt and zoom. Keys in the picture: arrows turn and "

@@ -17,18 +17,18 @@ from phyradgs_cl.report.interactive.viewer import decimals_of, picture, place, s
 from phyradgs_cl.report.markup import Markup, element, joined, json_block, number
 from phyradgs_cl.report.scan_charts import box_corners, with_sources
 
-_TIMES = 49  # times at which the scanner's pose is given; the script interpolates between them
-_MOST_LINES = 64  # limit of the detector lines that are drawn
-_FRAME_STEPS = 500  # steps of the slider of a frame's time
+_TIMES = 49  # number of times at which the scanner's pose is given; the script interpolates between them
+_MOST_LINES = 64  # most detector lines that are drawn
+_FRAME_STEPS = 500  # number of steps of the slider of a frame's time
 _LOOK_DEG = 125  # angle about the axis from the source to the eye, which is behind the panel and to one side
 _TILT_DEG = 28  # elevation of the eye
 _FRAME_HELP = (
     "Lines that wait are thin and grey, exposed ones gold, with the rays of the first and the last. A line that has been "
     "read is blue, and stays where the panel was in the middle of its exposure. Drag, or press arrow keys here, to turn."
 )
-MOST_VALUES = 150_000  # limit of the numbers in control points, of 2 bytes each
-_MOST_TIMES = 2000  # limit of the times at which the page has weights
-_STEPS = 200  # steps of the slider of the object's time
+MOST_VALUES = 150_000  # most numbers in the page's control points, of 2 bytes each
+_MOST_TIMES = 2000  # most times at which the page has weights
+_STEPS = 200  # number of steps of the slider of the object's time
 _MOST_LENGTH = 10  # largest factor by which arrows are made longer
 _LARGEST = 32767  # largest signed number of 16 bits
 _HELP = (

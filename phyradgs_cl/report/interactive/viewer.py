@@ -10,7 +10,7 @@ from phyradgs_cl.report.images import Plane, Window, base64_of, data_uri, diverg
 from phyradgs_cl.report.markup import Markup, element, joined, json_block, number
 
 _LAYER_NAMES = {"result": "Result", "truth": "Truth", "difference": "Difference"}
-_MOST_ZOOM = 8
+_MOST_ZOOM = 8  # largest zoom of a slice
 _BAR = 0.3  # largest length of the scale bar, as a fraction of a picture's width
 _HELP = (
     "Arrow keys, Page Up and Down, Home and End move a slider. The wheel moves the slice under the pointer, with Ctrl the "
