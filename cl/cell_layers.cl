@@ -10,25 +10,25 @@
     const size_t at = ((size_t)f * rows + v) * columns + u;                                                \
     const float weight = weights[by_row ? (size_t)f * rows + v : (size_t)f * columns + u];
 
-/* Keeps the least p of the layers so far that have weight. The first layer begins with infinity. */
+/* Keeps the least p of the layers so far that have weight, from infinity on. */
 __kernel void layer_least(
-    __global const float *p, __global const float *weights, const int rows, const int columns, const int by_row,
-    const int first, __global float *least)
+    __global const float *p, __global const float *weights, __global float *least,
+    const int rows, const int columns, const int by_row)
 {
     PIXEL
-    const float before = first ? INFINITY : least[at];
-    least[at] = weight > 0.0f ? fmin(before, p[at]) : before;
+    if (weight > 0.0f)
+        least[at] = fmin(least[at], p[at]);
 }
 
 /* Replaces p by w exp(least - p), and adds it to the sum over the layers so far. */
 __kernel void layer_seen(
-    __global float *p, __global const float *weights, const int rows, const int columns, const int by_row,
-    const int first, __global const float *least, __global float *total)
+    __global float *p, __global const float *weights, __global const float *least, __global float *total,
+    const int rows, const int columns, const int by_row)
 {
     PIXEL
     const float seen = weight > 0.0f ? weight * exp(least[at] - p[at]) : 0.0f;
     p[at] = seen;
-    total[at] = first ? seen : total[at] + seen;
+    total[at] += seen;
 }
 
 /* Replaces `least` by the average, and the sum by its inverse. Both are 0 where no layer has weight. */
@@ -44,7 +44,7 @@ __kernel void layer_average(const long count, __global float *least, __global fl
 
 /* Writes the weights themselves over all pixels of their lines. */
 __kernel void layer_weights(
-    __global const float *weights, const int rows, const int columns, const int by_row, __global float *spread)
+    __global const float *weights, __global float *spread, const int rows, const int columns, const int by_row)
 {
     PIXEL
     spread[at] = weight;

@@ -57,8 +57,8 @@ SPLATTING = ("phyradgs", "r2")
 NEURAL = ("naf", "sax-nerf")  # PyTorch, no kernel of ours
 FREEZES = ("a GPU's", "a GPU's without float64")  # builds, and cases, in which unwritten memory cannot be looked for
 NOT_INLINED = ("splat_prepare",)
-# "moving", "changing": the last frame of move_rows counts as unwritten, though memory full of NaN comes back without one.
-VECTORS_OR_FREEZES = ("moving", "changing", "asd-pocs", "fista", "phyradgs", "r2", "nothing", "operators")
+# "moving": the last frame of move_rows counts as unwritten, though memory full of NaN comes back without one.
+VECTORS_OR_FREEZES = ("moving", "asd-pocs", "fista", "phyradgs", "r2", "nothing", "operators")
 BUILDS = {
     "lanes 1": {"lanes": 1}, "a GPU's": {"lanes": 1, "pixel_items": True},
     "float pairs": {"lanes": 1, "fp64": False},

@@ -138,25 +138,23 @@ class IntensityOperator:
 
     def _device_average(self, p: list[DeviceArray]) -> tuple[DeviceArray, list[DeviceArray]]:
         """Computes ``intensity_average`` on the device. The shares overwrite p."""
-        least, total = self._device.empty(self.frames_shape), self._device.empty(self.frames_shape)
-        for k, (q, weights) in enumerate(zip(p, self._uploaded(), strict=True)):
-            self._launch("layer_least", q, weights, least, first=k == 0)
-        for k, (q, weights) in enumerate(zip(p, self._uploaded(), strict=True)):
-            self._launch("layer_seen", q, weights, least, total, first=k == 0)
+        least, total = self._device.full(self.frames_shape, np.inf), self._device.full(self.frames_shape, 0.0)
+        for q, weights in zip(p, self._uploaded(), strict=True):
+            self._launch("layer_least", q, weights, least)
+        for q, weights in zip(p, self._uploaded(), strict=True):
+            self._launch("layer_seen", q, weights, least, total)
         rt = self._device.rt
         rt.launch(
             rt.kernel("cell_layers", "layer_average"), total.size, np.int64(total.size), least, total, group=rt.group(64)
         )
         return least, [self._device.multiply(q, total) for q in p]
 
-    def _launch(self, name: str, *arrays: DeviceArray, first: bool | None = None) -> None:
-        """Launches a kernel over all pixels: arrays to read, shapes, whether it is the first layer, arrays to write."""
+    def _launch(self, name: str, *arrays: DeviceArray) -> None:
+        """Launches a kernel over all pixels of the frames."""
         frames, rows, columns = self.frames_shape
-        rt, inputs = self._device.rt, 1 if first is None else 2
-        words = [np.int32(n) for n in (rows, columns, self._by_row)] + ([] if first is None else [np.int32(first)])
-        items = (columns, rows, frames)
-        kernel = rt.kernel("cell_layers", name)
-        rt.launch(kernel, items, *arrays[:inputs], *words, *arrays[inputs:], group=rt.group(on_cpu=16))
+        rt = self._device.rt
+        sides = (np.int32(n) for n in (rows, columns, self._by_row))
+        rt.launch(rt.kernel("cell_layers", name), (columns, rows, frames), *arrays, *sides, group=rt.group(on_cpu=16))
 
     def _uploaded(self) -> list[DeviceArray]:
         """Returns the weights (F, lines) of each layer on the device, uploaded once."""
