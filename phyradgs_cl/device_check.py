@@ -238,7 +238,8 @@ def _rays(rt: Runtime) -> Iterator[Comparison]:
 
 
 def _warps(rt: Runtime) -> Iterator[Comparison]:
-    """Compares warps by a field that moves neighbours together, and by one that moves them apart."""
+    """Compares ``VolumeWarp``, its transpose, and a ``WarpedOperator`` with their twins. A small field keeps neighbouring
+    voxels neighbours; a large one scatters them."""
     volume, times_s = _noise(GRID.shape, 22), np.array([0.0, 1.0, 2.0])
     for size_mm in (0.1, 3.0):
         control_mm = size_mm * (_noise((2, 5, 5, 5, 3), 20) - 0.5)

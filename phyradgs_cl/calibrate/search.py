@@ -1,12 +1,15 @@
-"""The search for the parameters that all views share: Gauss–Newton steps from coarse to fine grids.
+"""Searches for the parameters that all views share, with Gauss–Newton steps from coarse to fine grids.
 
-On each grid a volume is reconstructed, the signals that a volume explains are removed (``reduced``), and the parameters step
-until the steps are small. On the first grid each step decides which parameters the frames determine.
+On each grid a volume is reconstructed, and every parameter's signal is computed: the change of the frames per unit of the
+parameter. The part of a signal that a change of the volume explains is removed (``reduced``). The parameters step until
+the steps are small, or the stage's steps are done. On the first grid each step also decides which parameters the frames
+determine. A known object of beads takes the place of the volume in a ``BeadProblem``.
 
 The steps are variable projection (Golub and Pereyra, SIAM J. Numer. Anal. 10 (1973) 413) in Kaufman's form. With A the
-operator at the parameters θ, x the volume and P the projector onto A's range, the Jacobian is J = (I − P) ∂A/∂θ x. Each
-parameter's signal ∂A/∂θ x is a central difference, from which CGLS removes the part that some volume explains. The remaining
-signals and residual give the step, its standard deviations, and the parameters that the frames determine at all."""
+operator at the parameters θ, x the volume and P the projector onto A's range, the Jacobian is J = (I − P) ∂A/∂θ x. The
+signal ∂A/∂θ x is a central difference, from which CGLS removes the part P ∂A/∂θ x. The remaining signals and residual
+give the step and its standard deviations. A parameter's share is the fraction of its signal that remains; the frames do
+not determine a parameter with too small a share."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace

@@ -163,8 +163,9 @@ def load_states(path: str | Path) -> Iterator[tuple[float, Volume]]:
 
 
 def load_attenuation(path: str | Path, *, warn: bool = True) -> Volume:
-    """Reads a volume to be projected. Raises InputError, or warns, as ``check_attenuation`` does for values that are no
-    attenuation in 1/mm."""
+    """Reads a volume (nz, ny, nx) in 1/mm that is to be projected. Raises InputError as ``load_volume`` does, and as
+    ``check_attenuation`` does for values that are no attenuation. warn: whether it may also warn of many negative
+    values."""
     return check_attenuation(f"volume of {path}", load_volume(path), warn=warn)
 
 

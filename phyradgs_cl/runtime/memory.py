@@ -72,7 +72,7 @@ SameArray = TypeVar("SameArray", bound=Array)
 
 @dataclass
 class Traffic:
-    """Counts the bytes sent to the device and back, and how often the host waited for the device."""
+    """Counts the bytes sent to the device and back, and the host's waits for the device."""
 
     bytes_up: int = 0
     bytes_down: int = 0
@@ -86,7 +86,7 @@ class Traffic:
 
 @dataclass(frozen=True)
 class Room:
-    """The memory that an operator may plan with: free bytes in all, and the most for one buffer."""
+    """Free device memory that an operator may plan with, and the largest single buffer, both in bytes."""
 
     free_bytes: int
     largest_bytes: int
@@ -119,7 +119,7 @@ class MemoryLedger:
 
     @contextmanager
     def reserved(self, nbytes: int) -> Iterator[None]:
-        """Reserves bytes for later: plans made in the body leave them free."""
+        """Reserves ``nbytes`` in the body of a ``with``: ``room`` then leaves them free."""
         self.reserved_bytes += nbytes
         try:
             yield
@@ -127,8 +127,8 @@ class MemoryLedger:
             self.reserved_bytes -= nbytes
 
     def room(self, largest_bytes: int) -> Room:
-        """Returns nine tenths of the rest of the limit, in buffers of at most ``largest_bytes``. It is six tenths where a
-        GPU's driver does not say what is free and nobody has set a limit."""
+        """Returns nine tenths of the memory left of the limit, in buffers of at most ``largest_bytes``. Takes six tenths
+        where a GPU's driver does not report its free memory and the user has set no limit."""
         free_bytes = max(self.limit_bytes - self.held_bytes - self.reserved_bytes, 0)
         return Room(int(self.planned * free_bytes), min(largest_bytes, self.limit_bytes))
 
@@ -176,7 +176,7 @@ def answers(queue: "cl.CommandQueue") -> bool:
 
 
 def reported_bytes(device: DeviceInfo) -> int | None:
-    """Returns the free memory where the device reports it (AMD's extension)."""
+    """Returns a device's free memory in bytes as AMD's drivers report it; None for other drivers."""
     with suppress(cl.Error, AttributeError):
         if "cl_amd_device_attribute_query" in device.handle.extensions:
             return int(device.handle.global_free_memory_amd[0]) * 1024  # type: ignore[index]
@@ -184,7 +184,8 @@ def reported_bytes(device: DeviceInfo) -> int | None:
 
 
 def memory_limit(wish: str | int | None) -> int | None:
-    """Returns the bytes that ``wish`` or the environment variable PHYRADGS_MEMORY allows; None without a limit."""
+    """Returns the bytes that ``wish``, or else the environment variable PHYRADGS_MEMORY, allows; None without a limit.
+    Raises InputError for text that is no size."""
     if wish is not None:
         return bytes_of(wish, "--memory")
     text = os.environ.get(MEMORY_VARIABLE)

@@ -126,7 +126,8 @@ class MotionSignal:
 
 
 def motion_signal(scan: Scan) -> MotionSignal:
-    """Returns the signal of a scan's frames. Its period is None where no rate dominates, or with less than 16 frames."""
+    """Returns the motion signal of a scan's frames. Its period is None where ``period_of`` finds none; ``knot_s`` is then
+    None too."""
     times_s = middle_times_s(scan)
     order = np.argsort(times_s, kind="stable")
     times_s, rows = times_s[order], _shroud(scan)[order]
@@ -143,7 +144,8 @@ def middle_times_s(scan: Scan) -> np.ndarray:
 
 
 def period_of(times_s: np.ndarray, values: np.ndarray) -> float | None:
-    """Returns the mean period of a signal (F,), or None where its power is not concentrated at one rate."""
+    """Returns the mean period in s of a signal (F,) at times (F,) in s. Returns None where its power is not concentrated
+    about one rate of at least five cycles in the scan, where it does not change, and for fewer than 16 values."""
     power, length_s = _spectrum(times_s, values)
     last = len(power) - 1
     if len(values) < _FEWEST_FRAMES or last < _FEWEST_CYCLES or not power.sum() > 0:
