@@ -100,7 +100,7 @@ class ParallelGeometry:
 
     @property
     def magnification(self) -> float:
-        """1: parallel rays do not magnify."""
+        """The magnification, 1: parallel rays do not magnify."""
         return 1.0
 
 
@@ -109,7 +109,8 @@ GEOMETRIES = (ConeGeometry, ParallelGeometry)
 
 
 def _check_panel(geometry: Geometry) -> None:
-    """Converts a geometry's fields to tuples, so that geometries can be compared. Raises InputError for impossible ones."""
+    """Converts a geometry's fields to tuples, so that geometries can be compared. Raises InputError for shapes, lengths
+    and offsets out of range."""
     counts = checks.numbers("detector_shape", geometry.detector_shape, (2,))
     if (counts < 1).any() or (counts != np.floor(counts)).any():
         raise InputError("detector_shape", str(geometry.detector_shape), "two counts (rows, columns) of at least 1")
@@ -159,10 +160,10 @@ def pixel_centres(pose: np.ndarray, detector_shape: tuple[int, int]) -> np.ndarr
 
 
 def plain_geometry(pose: np.ndarray, panel: tuple[int, int], is_parallel: bool = False) -> Geometry:
-    """Returns the circular geometry nearest to poses (F, 12), by mean distances and offsets.
+    """Returns the circular geometry nearest to poses (F, 12), by their mean distances and offsets.
 
-    The detector's distance is that of its plane. Its offset is measured from the foot of the source on that plane, in a
-    parallel beam from the foot of the axis, to the panel's middle."""
+    The detector's distance is that of its plane. Its offset goes from the foot of the source on that plane (in a parallel
+    beam, of the axis) to the panel's middle."""
     source, first, step_u, step_v = (pose[:, i : i + 3] for i in (0, 3, 6, 9))
     pitch_u, pitch_v = (np.linalg.norm(step, axis=1, keepdims=True) for step in (step_u, step_v))
     u_hat, v_hat = step_u / pitch_u, step_v / pitch_v

@@ -218,7 +218,8 @@ class ThenRidge(Prior):
     VOLUMES = RidgeStep.VOLUMES
 
     def __init__(self, before: Prior, ridge: RidgeStep, noise_factor: float) -> None:
-        """Takes noise_factor: the noise that the ridge step assumes, over the prior's weight."""
+        """Joins both maps. noise_factor: the noise that the ridge step assumes, over the part of the weight that is due
+        to noise."""
         self.before, self.ridge, self.noise_factor = before, ridge, noise_factor
         self.maps = 0  # maps since the last step
 
