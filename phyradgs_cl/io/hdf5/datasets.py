@@ -25,8 +25,8 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Quantity:
-    """A physical quantity. ``factors``: by a unit's name, the factor to the package's unit. ``assumed``: the unit of a
-    dataset without units. ``largest``: limit in the package's unit; larger numbers are damage and would overflow later."""
+    """A physical quantity. factors: from a unit's name to the factor to the package's unit. assumed: the unit of a
+    dataset without units. largest: limit in the package's unit; larger numbers are damage, and would overflow later."""
 
     name: str
     assumed: str
@@ -74,8 +74,8 @@ ATTENUATION = _quantity("attenuation", "1/mm", 1e9, {
 def read_values(
     source: Hdf5Source, address: str, dataset: h5py.Dataset, kinds: str = "iuf", rows: slice | None = None
 ) -> np.ndarray:
-    """Reads a dataset in its own type, or only ``rows`` of a stack (..., v, u). Raises InputError unless the type's
-    ``dtype.kind`` is in ``kinds``, and for damage; OutOfMemoryError for more than this machine can hold."""
+    """Reads a dataset in its own type; rows: reads only these rows of a stack (..., v, u). Raises InputError for damage,
+    and unless the type's ``dtype.kind`` is in ``kinds``; OutOfMemoryError for more than this machine can hold."""
     if dataset.dtype.kind not in kinds:
         expected = "numbers" if "f" in kinds else "whole numbers"
         raise source.error(address, f"type {dataset.dtype}", expected, "store them as plain HDF5 numbers")
@@ -106,8 +106,8 @@ def read_array(
 
 
 def read_per_frame(source: Hdf5Source, address: str, used: np.ndarray, quantity: Quantity) -> np.ndarray:
-    """Reads one finite number for each frame that ``used``, bool (F,), marks, in the package's unit. The dataset has a
-    number for every frame, of which the others are ignored, or only for the used ones."""
+    """Reads one finite number in the package's unit for each frame that ``used``, bool (F,), marks. The dataset has a
+    number for every frame, or for the used frames alone."""
     dataset = source.dataset(address)
     if is_of_all := dataset.shape != (int(used.sum()),):
         checks.shape(source.name(address), dataset, used.shape)
