@@ -15,10 +15,10 @@ Passes = tuple[int, float]
 
 @dataclass(frozen=True)
 class Stage:
-    """One of the grids, from coarse to fine: at most ``columns`` blocks along the panel's longer side.
+    """One grid of a calibration: at most ``columns`` blocks of pixels along the panel's longer side.
 
-    ``first``, ``again``: iterations of a first volume and of a later one. ``steps``: the most Gauss–Newton steps.
-    ``project``: iterations in each step that remove the part of a signal that a volume explains."""
+    first, again: iterations of a first volume and of a later one. steps: the most Gauss–Newton steps. project: iterations
+    of CGLS in each step that remove what a volume explains."""
 
     columns: int
     first: int
@@ -31,12 +31,14 @@ class Stage:
         return ceil_div(max(scan.geometry.detector_shape), self.columns)
 
     def passes(self, parameters: int, asks: bool) -> int:
-        """Returns the most passes through the frames. ``asks``: the stage tests which parameters the frames determine."""
+        """Returns the largest number of passes through the frames. asks: the stage also tests which parameters the frames
+        determine."""
         return self.first - self.again + self.steps * (self.again + self.project * (parameters + (3 if asks else 1)))
 
 
 def pass_cost(scans: Sequence[Scan], columns: int, most_frames: int) -> float:
-    """Returns the cost of one pass with at most ``columns``. It is proportional to rays times voxels along a ray."""
+    """Returns the cost of a pass through the scans with at most ``columns`` blocks, proportional to rays × voxels along a
+    ray."""
     shape = scans[0].geometry.detector_shape
     rows, across = (ceil_div(n, ceil_div(max(shape), columns)) for n in shape)
     return float(sum(min(scan.frames, most_frames) for scan in scans) * rows * across * max(rows, across))

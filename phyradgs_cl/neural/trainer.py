@@ -16,7 +16,7 @@ _POINTS_ON_CPU, _POINTS_ELSEWHERE = 2**14, 2**20  # points evaluated at once: as
 
 
 class Trainer:
-    """A field, its optimiser and the random draws, which change from step to step.
+    """Fits a field to a scan's rays. Holds the field, its optimiser and the random draws, which change from step to step.
 
     Lengths are in units of half the volume's longest side, attenuation in units of ``density_per_mm``."""
 

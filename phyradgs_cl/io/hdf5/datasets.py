@@ -124,8 +124,8 @@ def _finite(source: Hdf5Source, address: str, values: np.ndarray, quantity: Quan
 def read_number(
     source: Hdf5Source, address: str, quantity: Quantity | None = None, default: float | None = None
 ) -> float:
-    """Reads a finite number from a dataset of one element, in the package's unit of ``quantity``. Without a ``default`` the
-    dataset must be there."""
+    """Reads a finite number from a dataset of one element, in the package's unit of ``quantity``. Raises InputError where
+    the dataset is missing without a ``default``."""
     if default is not None and source.optional(address) is None:
         return default
     dataset = source.dataset(address)
@@ -152,7 +152,8 @@ def read_integers(source: Hdf5Source, address: str, shape: Sequence[int | None])
 def read_word(
     source: Hdf5Source, address: str, allowed: Collection[str] | None = None, default: str | None = None
 ) -> str:
-    """Reads a string, which must be one of ``allowed``, if given. Without a ``default`` the dataset must be there."""
+    """Reads a string, one of ``allowed`` if given. Raises InputError for others, and where the dataset is missing without
+    a ``default``."""
     if default is not None and source.optional(address) is None:
         return default
     dataset, word = source.dataset(address), None
@@ -187,7 +188,7 @@ def read_attribute(source: Hdf5Source, address: str, name: str) -> str | None:
 
 
 def _text(value: object) -> str | None:
-    """Returns the string in a value of h5py (str, bytes or an array of one of them); None for anything else."""
+    """Returns the string in a value of h5py: str, bytes or an array with one of either; None for anything else."""
     if isinstance(value, np.ndarray) and value.size == 1:
         value = value.reshape(-1)[0]
     if isinstance(value, str):
@@ -214,8 +215,8 @@ def in_unit(source: Hdf5Source, address: str, values: np.ndarray, quantity: Quan
 
 
 def read_grid(source: Hdf5Source, address: str) -> Grid:
-    """Reads the voxel grid in the group at ``address``: shape, voxel_size and offset (0 if missing), each (z, y, x). Raises
-    InputError for impossible ones."""
+    """Reads the voxel grid in the group ``address``: shape, voxel_size and offset (0 if missing), each (z, y, x). Raises
+    InputError for impossible values."""
     shape = read_integers(source, f"{address}/shape", (3,)).tolist()
     voxel_size_mm = read_array(source, f"{address}/voxel_size", (3,), LENGTH)
     offset_mm = read_array(source, f"{address}/offset", (3,), LENGTH, default=np.zeros(3))
