@@ -94,7 +94,7 @@ class _Trials:
         return time.perf_counter() - started
 
     def extrapolated(self, few: int, more: int, total: int) -> tuple[float, float]:
-        """Returns the seconds of ``total`` iterations, and of one of them, from runs of ``few`` and of ``more``."""
+        """Returns the seconds of ``total`` iterations, and those of a single one, from runs of ``few`` and of ``more``."""
         first_s = self.run(few) - self._control_s
         again_s = self.run(few) - self._control_s  # without the building of kernels
         more = min(more, total)

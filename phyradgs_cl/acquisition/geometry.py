@@ -123,8 +123,8 @@ def _check_panel(geometry: Geometry) -> None:
 
 
 def _panel_at(geometry: Geometry, angle_rad: np.ndarray | float) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the unit vector (..., 3) from the axis to the source, and the last 9 numbers (..., 9) of the pose in mm of a
-    panel whose plane contains the axis."""
+    """Returns the unit vector (..., 3) from the axis to the source, and the panel's 9 numbers (..., 9) of the poses in
+    mm. The panel's plane contains the axis."""
     angle = np.asarray(angle_rad, dtype=np.float64)
     cos, sin, zero = np.cos(angle), np.sin(angle), np.zeros_like(angle)
     u_hat = np.stack([-sin, cos, zero], -1)

@@ -111,7 +111,8 @@ def astra_vectors(scan: "Scan") -> np.ndarray:
 
 
 def check_others(others: Iterable[str], arguments: Iterable[str] = ()) -> None:
-    """Raises InputError for a keyword that is no optional field of ``Scan``. ``arguments``: further ones of the caller."""
+    """Raises InputError for a keyword that is neither an optional field of ``Scan`` nor one of the caller's
+    ``arguments``."""
     allowed = (*arguments, *_OTHERS)
     for name in others:
         if name not in _OTHERS:

@@ -98,7 +98,8 @@ class TimeCells:
         return replace(self, pose=self.pose * factors, end_poses=ends, conic_pose=conic)
 
     def finer(self, rows: int, columns: int) -> "TimeCells":
-        """Returns still cells for pixels cut into ``rows`` by ``columns`` parts. The parts of a line share its times."""
+        """Returns still cells for pixels cut into ``rows`` by ``columns`` parts. All parts of a line have the line's
+        times."""
         pose, (of_line, _) = self.pose.copy(), self.readout.shape((rows, columns))
         pose[:, 6:9] /= columns
         pose[:, 9:12] /= rows

@@ -215,7 +215,8 @@ def correction_of(values: Mapping[str, float]) -> GeometryCorrection:
 
 
 def in_words(weights: Mapping[str, float]) -> str:
-    """Returns a combination of parameters (weights by name) in words, the largest first, without small ones."""
+    """Returns a combination of parameters (weights by name) in words: the largest weight first, weights below 0.3 of it
+    left out."""
     order = sorted(weights, key=lambda name: -abs(weights[name]))
     largest = abs(weights[order[0]])
     main, *others = [name for name in order if abs(weights[name]) > 0.3 * largest]

@@ -68,7 +68,7 @@ class PerViewParameters(ABC):
 
     @abstractmethod
     def without_gauges(self, values: np.ndarray) -> np.ndarray:
-        """Returns values (n, K) without the part that another object explains exactly."""
+        """Returns values (n, K) less the part that a moved object explains exactly."""
 
     def kinds_of_stage(self, number: int, count: int) -> Sequence[int]:
         """Returns the indices of the kinds to estimate in stage ``number`` of ``count``: all, unless a subclass leaves
@@ -103,8 +103,8 @@ class WobbleParameters(PerViewParameters):
         return Views(per_view[:, TURN], per_view[:, SHIFT_V:])
 
     def without_gauges(self, values: np.ndarray) -> np.ndarray:
-        """Returns values without what a turned or shifted object explains: the mean of turns and of shifts along v, and
-        shifts along u that vary as cosine and sine of the angle."""
+        """Returns values (n, K) less what a turned or shifted object explains: the means of turns and of shifts along v,
+        and shifts along u that vary as cosine and sine of the angle."""
         rest = values.copy()
         rest[:, :SHIFT_U] -= (self.basis @ rest[:, :SHIFT_U]).mean(0)
         pattern, shifts = self.basis @ self.circle, self.basis @ rest[:, SHIFT_U]
@@ -143,7 +143,7 @@ class MotionParameters(PerViewParameters):
         return replace(self.still, coefficients=values)
 
     def without_gauges(self, values: np.ndarray) -> np.ndarray:
-        """Returns values without what another object explains. An object elsewhere explains the mean of each kind; a larger
+        """Returns values (n, K) less what a still object explains. One elsewhere explains the mean of each kind; a larger
         or smaller one explains shifts along x and y that follow the source."""
         rest = values - (self.basis @ values).mean(0)
         towards_source = self.circle - (self.basis @ self.circle).mean(0)

@@ -303,7 +303,7 @@ def _in_short(one: ParameterEstimate) -> str:
 
 
 def _with_provenance(corrected: Scan, scan: Scan, calibration: Calibration) -> Scan:
-    """Returns the corrected scan with this calibration in its provenance, after earlier ones."""
+    """Returns the corrected scan with this calibration in its provenance, behind earlier calibrations."""
     provenance = dict(scan.provenance)
     if (former := provenance.get("calibration")) is not None:
         earlier = provenance.get("calibrated_before", [])

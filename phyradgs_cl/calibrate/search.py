@@ -270,9 +270,10 @@ class Search:
         return values, resemblance * np.hypot(noise, DISCRETISATION * change)
 
     def corrections(self) -> dict[str, float]:
-        """Returns the values of the parameters that differ from the stated ones by three deviations.
+        """Returns the values, by name, of the parameters that differ from their stated values by three deviations.
 
-        The others go back to their stated values. This changes the remaining ones, and repeats until all differ."""
+        All other parameters go back to their stated values. That changes the remaining values, so the test repeats until
+        all differ."""
         values, deviations = self.estimates()
         deviation = dict(zip(self.determined or (), deviations, strict=True))
         names = self.determined or ()

@@ -26,11 +26,13 @@ _QUESTION = "coverage"
 def check_coverage(scan: Scan) -> Finding:
     """Checks that the panel sees the whole object, and that the scan's values can be line integrals.
 
-    The object touches a side where the two outermost columns are above a tenth of the largest line integral, and above
-    noise: in the mean over some eighth of the rows, in a tenth of the frames. A displaced panel may cut the object on its
-    short side; the top and bottom are not checked. Other findings: no object above the noise, inverted values, line
-    integrals beyond 30, pixels brighter than the flats, and a grid more than 5 times as wide as the panel's view, or than
-    which the object is 5 times wider."""
+    The object touches a side where the two outermost columns are above noise and a tenth of the largest line integral.
+    Their mean over some eighth of the rows counts, in at least a tenth of the frames. A displaced panel may cut the
+    object on its short side; the top and bottom are not checked.
+
+    Other findings: no object above the noise, inverted values, line integrals beyond 30, and pixels brighter than the
+    flats. A grid is of a wrong size where it is more than 5 times as wide as the panel's view, or the object more than 5
+    times as wide as the grid."""
     p = np.asarray(scan.projections)
     if p.shape[2] < FEWEST_COLUMNS:
         return too_narrow(_QUESTION, "line integral")

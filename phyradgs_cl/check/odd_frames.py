@@ -47,9 +47,9 @@ def odd_frames(p: np.ndarray, mask: np.ndarray | None) -> list[int]:
 
 
 def repeated_frames(scan: Scan) -> list[int]:
-    """Returns the indices of frames that repeat their predecessor although the gantry has turned: both differ far less
-    than neighbours do. In an order that jumps, such as the golden angle, such frames must also be unlike the next view in
-    angle, because distant views of a round object may be alike."""
+    """Returns the indices of frames that repeat their predecessor although the gantry has turned: the two differ far less
+    than neighbours do. In an order that jumps, such as the golden angle, they must also be unlike the next view in angle,
+    because distant views of a round object may look the same."""
     p = scan.projections
     if len(p) < _FEWEST:
         return []

@@ -135,8 +135,8 @@ def check(
 def quick_scan(scan: Scan) -> Scan:
     """Returns the coarse scan for the questions about angles and the axis.
 
-    For a panel far beside the axis, the grid is cut to the object. The grid of the panel's view has so many voxels that the
-    few frames of a coarse scan would fit under wrong angles too."""
+    For a panel far beside the axis, the grid is cut to the object. In all voxels of such a panel's view, the few frames
+    of a coarse scan would fit under wrong angles too."""
     quick = coarse(scan, QUICK_COLUMNS)
     return around_object(quick, _SPARE_COLUMNS) if has_axis_near_edge(scan) else quick
 

@@ -72,7 +72,7 @@ class Places:
             yield other, f"/{address}"
 
     def _at(self, name: str, usual: Sequence[str]) -> Sequence[str]:
-        """Returns the places of the array ``name``: the stated ones, else those of the ``usual`` addresses that exist."""
+        """Returns the places of the array ``name``: those stated, else the ``usual`` addresses that exist."""
         there = [address for address in usual if self.source is not None and self.source.find(address) is not None]
         return self.stated.get(name, there)
 

@@ -192,7 +192,7 @@ class Fields:
 
 
 def described(value: object) -> str:
-    """Returns a short text of a value for messages. Containers give type and length only: nested ones may be huge."""
+    """Returns a short text of a value for messages. A container gives its type and length only, because it may be huge."""
     if value is None or isinstance(value, (bool, int, float, str, bytes, np.generic)):
         return checks.short_repr(value)
     size = f" of {len(value)}" if isinstance(value, (Mapping, Sequence)) else ""

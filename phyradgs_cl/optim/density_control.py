@@ -112,7 +112,8 @@ def _strongest(statistic: np.ndarray, threshold: float, room: int) -> np.ndarray
 
 
 def _children(rows: np.ndarray, control: DensityControl, rng: np.random.Generator) -> np.ndarray:
-    """Draws one child (11, S) from each Gaussian (11, S): a smaller one, half as dense, within its parent."""
+    """Draws one child (11, S) from each Gaussian (11, S): smaller, half as dense, with its centre drawn from the parent's
+    distribution."""
     child: np.ndarray = rows.copy()
     child[g.MEAN] += rotate(rows[g.QUATERNION], rng.normal(size=(3, rows.shape[1])) * rows[g.SCALE])
     child[g.SCALE] /= control.split_factor

@@ -40,7 +40,7 @@ def move(
     rt: Runtime, source: tuple[DeviceArray, Strides], target: tuple[DeviceArray, Strides],
     shape: Sequence[int], *, turned: bool = False,
 ) -> None:
-    """Copies (nz, ny, nx) floats from one layout to another on the device; ``turned`` copies them to (nz, nx, ny)."""
+    """Copies (nz, ny, nx) floats from one layout to another on the device. turned: transposes to (nz, nx, ny)."""
     nz, ny, nx = (int(n) for n in shape)
     (from_array, from_strides), (to_array, to_strides) = source, target
     ends = from_array, from_strides.vector(), to_array, to_strides.vector(), np.int32(ny), np.int32(nx)

@@ -100,7 +100,7 @@ class Room:
 
 
 class MemoryLedger:
-    """Counts the memory in use on a device against a limit."""
+    """Counts the device memory in use against a limit, in bytes."""
 
     def __init__(self, device: DeviceInfo, limit_bytes: int | None) -> None:
         self.device = device

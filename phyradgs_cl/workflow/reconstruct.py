@@ -238,8 +238,8 @@ def _warn_of_doubts(plan: methods.RunPlan, path: Path, scan: Scan) -> None:
 def _warn_of_residual(path: Path, scan: Scan, result: methods.Reconstruction) -> None:
     """Warns where the iterations have converged to a volume whose residual is far above the scan's noise.
 
-    Measured on four objects of 32³, 25 views, by default: an axis off by 2 pixels left 0.25, one by 10 pixels 0.6, flats of
-    another scale 0.48 to 1, reversed angles 0.12 to 0.24, wrong units and orders 0.16 to 0.28."""
+    Measured on four objects of 32³, 25 views, by default. An axis off by 2 pixels left 0.25, by 10 pixels 0.6; flats of
+    another scale 0.48 to 1; reversed angles 0.12 to 0.24; wrong units and orders 0.16 to 0.28."""
     residuals = [float(one.get("residual", 0.0)) for one in result.record]
     if len(residuals) < _SETTLED or (residual := residuals[-1]) <= _UNLIKELY:
         return

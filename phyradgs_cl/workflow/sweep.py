@@ -262,7 +262,8 @@ def _mean(values: Sequence[Any], form: str) -> str:
 
 
 def read_lines(path: Path) -> list[Line]:
-    """Reads the complete lines of a results file, and warns of damaged ones. Returns [] where there is no file."""
+    """Reads the complete lines of a results file; [] where there is no file. Warns of damaged lines, which it leaves
+    out."""
     lines, damaged = [], []
     text = path.read_text(encoding="utf-8", errors="replace") if path.exists() else ""
     for number, row in enumerate(text.split("\n"), 1):

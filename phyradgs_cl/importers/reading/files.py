@@ -96,7 +96,8 @@ class SafeFolder:
         return [path for path in paths if is_plain or _is_one_of(path, suffixes)]
 
     def matching(self, *suffixes: str) -> list[Path]:
-        """Returns the files with one of the suffixes in any case, without hidden ones, in natural order of their names."""
+        """Returns the files with one of the suffixes, in upper or lower case, without hidden files, in natural order of
+        their names."""
         return [path for path in _files(self.root) if _is_one_of(path, suffixes)]
 
     def only(self, what: str, *suffixes: str) -> Path:

@@ -99,8 +99,8 @@ def segments_for_object(deformation: Deformation, lit_s: np.ndarray, voxel_mm: f
 
 def states_of(table: TimeCells, deformation: Deformation) -> tuple[np.ndarray, np.ndarray]:
     """Returns the weights (S, R) of the states that the cells of a frame see, in the order of time, and the state (C,
-    poses) of every pose of a cell. Raises InputError for cells whose splats keep their shape (``conic_pose``), and for
-    cells with motion without the times of their ends."""
+    poses) of every pose. Raises InputError for cells whose splats keep their shape (``conic_pose``), and for moving cells
+    without the times of their ends."""
     if table.conic_pose is not None:
         expected = "one in which also the shapes of splats move"
         raise InputError("--object-motion", "--motion centres", expected, "take exact or micro-views")

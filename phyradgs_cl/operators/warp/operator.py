@@ -153,11 +153,12 @@ def projector_of(
     rt: Runtime, grid: Grid, tables: Sequence[TimeCells], deformation: Deformation | None,
     state_times_s: np.ndarray | None = None,
 ) -> Callable[..., RayOperator | WarpedOperator]:
-    """Returns a constructor of projectors, with the arguments of ``RayOperator``, for an object that moves as
-    ``deformation`` does at the times of ``tables``, or that changes between states at ``state_times_s`` (K,).
+    """Returns a constructor of projectors, with the arguments of ``RayOperator``; ``RayOperator`` itself for an object at
+    rest.
 
-    Each cell takes the nearest state: a blend of two states would blur, and project every cell twice. For an object at
-    rest the constructor is ``RayOperator``."""
+    deformation: how the object moves, at the times of ``tables``; or state_times_s (K,): times in s of the states of an
+    object that changes. Each cell takes the nearest state: a blend of two states would blur, and project every cell
+    twice."""
     if state_times_s is not None:
         return partial(WarpedOperator, warp=StateStack(rt, grid.shape, TimeStates(state_times_s)))
     if deformation is None:

@@ -92,8 +92,8 @@ def seen_volume(
 
 
 def _directions(pose: np.ndarray, shape: tuple[int, int], is_parallel: bool) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the angles about z (F, 1, columns) of the rays of poses (F, 1, c, 12), and the turn of a voxel's ray per
-    radian of the source, for voxels on the panel."""
+    """Returns the angles about z (F, 1, columns) of the rays of poses (F, 1, c, 12). Also returns, for a voxel on the
+    panel, how far its ray turns per radian of the source."""
     rays = weights.pixel_rays(pose, np.array([shape[0] // 2]), np.arange(shape[1]))
     if is_parallel:
         angle_rad = np.broadcast_to(np.arctan2(pose[..., 1], pose[..., 0]), rays.shape[:-1])

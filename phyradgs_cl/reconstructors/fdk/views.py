@@ -210,8 +210,8 @@ def ray_weight(
 def opposite_weight(
     canonical: np.ndarray, shape: tuple[int, int], arc: Arc, is_parallel: bool
 ) -> Callable[[int], np.ndarray | float]:
-    """Returns a function from a view's index to the weights (rows, columns) by which its rays share with opposite ones of
-    an arc; 1 in a full turn."""
+    """Returns a function from a view's index to the weights (rows, columns) that divide each ray's weight with its
+    opposite."""
     rows, columns = np.arange(shape[0]), np.arange(shape[1])
 
     def weight(view: int) -> np.ndarray | float:

@@ -75,7 +75,7 @@ def _blur_mm(scan: Scan, motion: Motion) -> float:
 
 def adjoint_response(system: System) -> tuple[float, float]:
     """Returns the response of Aᵀ in the middle half of a volume, in mm: the standard deviation for independent unit noise
-    per ray, and the mean for a unit error common to all rays."""
+    of every ray, and the mean for a unit error of all rays."""
     noise = np.random.default_rng(0).standard_normal(system.measured.shape, np.float32)
     by_noise = system.adjoint(system.masked(system.apply_weights(system.space.array(noise))))
     by_ones = system.column_sums()
@@ -243,7 +243,7 @@ class ThenRidge(Prior):
 
 
 class Piccs(Prior):
-    """(1 − share) TV(x) + share TV(x − image), as one map after the other.
+    """The prior piccs: (1 − share) TV(x) + share TV(x − image), as the map of the first term and then that of the second.
 
     Prior image constrained compressed sensing: Chen, Tang and Leng, Med. Phys. 35 (2008) 660."""
 
