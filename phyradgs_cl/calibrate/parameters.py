@@ -215,8 +215,8 @@ def correction_of(values: Mapping[str, float]) -> GeometryCorrection:
 
 
 def in_words(weights: Mapping[str, float]) -> str:
-    """Returns a combination of parameters (weights by name) in words: the largest weight first, weights below 0.3 of it
-    left out."""
+    """Returns a combination of parameters (weights by name) in words: the largest weight first, without weights below 0.3
+    of the largest."""
     order = sorted(weights, key=lambda name: -abs(weights[name]))
     largest = abs(weights[order[0]])
     main, *others = [name for name in order if abs(weights[name]) > 0.3 * largest]

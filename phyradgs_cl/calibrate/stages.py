@@ -45,8 +45,8 @@ def pass_cost(scans: Sequence[Scan], columns: int, most_frames: int) -> float:
 
 
 class PassCounter:
-    """Counts passes and reports them. ``plan``: the passes of each phase, in order. Passes that turn out not to be needed
-    are removed, so that the total falls."""
+    """Counts passes and reports them. plan: number and cost of the passes of each phase, in order. Passes that turn out
+    not to be needed are removed, so that the total falls."""
 
     def __init__(self, report: Report, plan: Mapping[str, Passes]) -> None:
         self.plan = dict(plan)
@@ -55,7 +55,7 @@ class PassCounter:
         self._current: Passes = (0, 0.0)  # passes that remain in this phase
 
     def begin(self, phase: str, text: str) -> None:
-        """Begins a phase. The plan's earlier phases are over."""
+        """Begins a phase, with the words of its report; earlier phases of the plan are over."""
         while phase in self.plan and next(iter(self.plan)) != phase:
             self.plan.pop(next(iter(self.plan)))
         self._text, self._current = text, self.plan.pop(phase, (0, 0.0))

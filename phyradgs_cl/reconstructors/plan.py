@@ -170,7 +170,7 @@ def _converted(current: Any, value: Any, subject: str) -> Any:
 
 
 def _is_number(value: Any) -> bool:
-    """True for a finite number that a float can hold."""
+    """Returns whether ``value`` is a finite number that a float can hold."""
     return checks.is_number(value) and abs(value) <= sys.float_info.max
 
 

@@ -33,7 +33,7 @@ class MemoryShortage(OutOfMemoryError):
 
 @dataclass(eq=False)
 class DeviceArray:
-    """A typed, shaped piece of device memory."""
+    """An array in device memory: a buffer with a shape and a type, C-contiguous."""
 
     buffer: "cl.Buffer"
     shape: tuple[int, ...]
@@ -50,7 +50,7 @@ class DeviceArray:
 
 @dataclass(eq=False)
 class LaterItem:
-    """A number that the device is still computing."""
+    """A number that the device may still be computing."""
 
     _values: np.ndarray
     _event: "cl.Event"
@@ -61,7 +61,7 @@ class LaterItem:
 
     @property
     def value(self) -> np.generic:
-        """Returns the number, once ``is_here``."""
+        """Returns the number; valid once ``is_here`` is True."""
         return self._values[0]
 
 
@@ -133,7 +133,8 @@ class MemoryLedger:
         return Room(int(self.planned * free_bytes), min(largest_bytes, self.limit_bytes))
 
     def check(self, nbytes: int, largest_bytes: int) -> None:
-        """Raises MemoryShortage for a buffer that is too large or would exceed the limit."""
+        """Raises MemoryShortage for a buffer of ``nbytes`` that is larger than ``largest_bytes`` or would exceed the
+        limit."""
         subject, found = f"memory of {self.device.name}", f"{mebibytes(nbytes)} in one buffer"
         remedy = "use a smaller problem"
         if nbytes > largest_bytes:
@@ -193,7 +194,8 @@ def memory_limit(wish: str | int | None) -> int | None:
 
 
 def bytes_of(wish: str | int, subject: str) -> int:
-    """Parses 2GiB, 1.5 GB, 512M or a plain number of bytes. K, M, G and T alone are powers of 1024, as with iB."""
+    """Returns the bytes of a text such as 2GiB, 1.5 GB or 512M, or of a plain number. K, M, G and T alone are powers of
+    1024, as with iB. Raises InputError, about ``subject``, for other text."""
     text = "" if isinstance(wish, bool) else str(wish)
     match = re.fullmatch(r"\s*(\d+(?:\.\d+)?)\s*([A-Za-z]*)\s*", text)
     factor = _UNITS.get(match.group(2).upper()) if match else None
@@ -209,7 +211,8 @@ def mebibytes(nbytes: int) -> str:
 
 
 class Attempt:
-    """One attempt at work in bricks, which may fail for want of memory. As a context it gives the share of the memory."""
+    """One attempt at work in bricks, which may fail because memory is short. As a context it gives the fraction of the
+    free memory to plan with."""
 
     has_failed = False
 
@@ -227,14 +230,14 @@ class Attempt:
 
 
 def attempts(what: str) -> Iterator[Attempt]:
-    """Yields an attempt with all memory, and after a shortage, with a warning, one with a quarter of it."""
+    """Yields an attempt with all of the free memory; after a shortage, with a warning, one with a quarter of it."""
     yield (first := Attempt(what, 1.0))
     if first.has_failed:
         yield Attempt(what, _SMALLER)
 
 
 def is_cl_array(value: object) -> bool:
-    """Returns whether a value is a pyopencl.array.Array. Whoever has one has imported pyopencl."""
+    """Returns whether a value is a pyopencl.array.Array, without importing pyopencl where nobody has."""
     module = sys.modules.get("pyopencl.array")
     return module is not None and isinstance(value, module.Array)
 

@@ -26,7 +26,7 @@ _NARROW = 3  # factor by which blocks shrink on a panel lower than two of them: 
 def coarse(scan: Scan, columns: int) -> Scan:
     """Returns the scan with at most 60 frames, pixels averaged in blocks, a grid to match, and no reference.
 
-    The panel's longer side has at most ``columns`` blocks, unless its shorter side would become too short."""
+    The panel's longer side has at most ``columns`` blocks, unless too few rows or columns of blocks would be left."""
     shape = scan.geometry.detector_shape
     block = min(math.ceil(max(shape) / columns), max(1, shape[1] // _LEAST_COLUMNS))
     if 2 * block > shape[0]:

@@ -201,7 +201,7 @@ def read_settings(
 
 
 def head_has(path: Path, *marks: bytes, most_bytes: int = 1 << 14) -> bool:
-    """True for a regular file with all the marks in its first ``most_bytes``, in any case."""
+    """Returns whether a regular file has all the marks in its first ``most_bytes``, in upper or lower case."""
     if not path.is_file():
         return False
     with open(path, "rb") as file:

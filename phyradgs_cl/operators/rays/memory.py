@@ -154,7 +154,7 @@ class RayMemory:
 
     @property
     def has_columns(self) -> bool:
-        """Whether the transposed volume, with z along rows, fits besides the volume; False before ``plan``."""
+        """Whether the transposed volume, with z along rows, fits besides the volume; known after ``plan``."""
         return self._columns_bytes > 0
 
     def turned(self, volume: Array) -> DeviceArray:

@@ -170,7 +170,7 @@ class FieldSearch:
 
     def _reconstructed(self, one: MotionField, volume: np.ndarray | None, passes: int) -> np.ndarray:
         """Returns the volume (nz, ny, nx) after ``passes`` passes of ``fista`` on the coarse scan, from ``volume`` (None:
-        zeros)."""
+        the method's own start)."""
         options = FistaOptions(
             motion=self.motion, iterations=passes, prior="dct", prior_weight=_WEIGHT, tv_iterations=_TV_ITERATIONS
         )

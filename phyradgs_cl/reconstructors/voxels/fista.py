@@ -228,9 +228,9 @@ def fista_passes(
     now: Callable[[], MethodRun], passes: int, volume: np.ndarray | None, parts: int = 1, subsets: int = 0,
     has_few_times: bool = False,
 ) -> Iterations:  # fmt: skip
-    """Returns ``passes`` passes from ``volume`` (nz, ny, nx; None: zeros), with every voxel divided into ``parts`` along
-    each side. subsets: takes the place of the option, unless 0. has_few_times: takes a third of the times in an
-    exposure."""
+    """Returns ``passes`` passes from ``volume`` (nz, ny, nx; None: the method's own start), with every voxel divided into
+    ``parts`` along each side. subsets: takes the place of the option, unless 0. has_few_times: takes a third of the times
+    in an exposure."""
     whole = now()
     scan = replace(whole.scan, grid=whole.scan.grid.finer(parts), reference=None, moving_truth=None)
     options, rt = replace(whole.options, iterations=passes), whole.rt

@@ -101,9 +101,9 @@ class WithFacts(Stepwise, Protocol):
 
 @dataclass(frozen=True, eq=False)
 class MethodRun:
-    """A method's run on a scan. resume: the state to continue from. initial: the first volume in 1/mm; None: zeros.
-    deformation: how the object moves. state_times_s: times of its states if it changes. Seconds count from
-    ``started``."""
+    """A method's run on a scan. resume: the state to continue from. initial: the first volume (nz, ny, nx) in 1/mm; None:
+    the method's own start. deformation: how the object moves. state_times_s (K,): times of its states if it changes.
+    Seconds count from ``started``."""
 
     scan: Scan
     options: Any

@@ -119,8 +119,8 @@ def _atlas_within(steps: NDArray[np.uint8], most_text: int) -> tuple[str, int]:
 
 
 def _between(steps: NDArray[np.uint8]) -> int:
-    """Returns the grey level, from 1 to 255, that divides levels into the two classes farthest apart in variance (Otsu,
-    IEEE Transactions on Systems, Man, and Cybernetics 9 (1979) 62)."""
+    """Returns the grey level, from 1 to 255, that divides the levels into two classes. The variance between the classes
+    is the largest (Otsu, IEEE Transactions on Systems, Man, and Cybernetics 9 (1979) 62)."""
     counts = np.bincount(steps.ravel(), minlength=256).astype(np.float64)
     below, sums = np.cumsum(counts), np.cumsum(counts * np.arange(256))
     above = below[-1] - below
