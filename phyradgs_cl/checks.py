@@ -41,7 +41,7 @@ def within(subject: str, value: float, lowest: float, highest: float) -> None:
 
 
 def ranged(default: T, lowest: float, highest: float, subject: str = "") -> T:
-    """Returns a dataclass's field with a default, and with the bounds and the name in messages for ``fields_within``."""
+    """Returns a dataclass's field with a default. ``fields_within`` reads its bounds, and its name in messages."""
     return field(default=default, metadata={"range": (lowest, highest), "subject": subject})
 
 
@@ -128,7 +128,7 @@ def short_repr(value: object) -> str:
 
 
 def is_number(value: object) -> bool:
-    """True for a finite number that is no bool."""
+    """Returns whether ``value`` is a finite number and no bool."""
     if isinstance(value, bool) or not isinstance(value, int | float | np.integer | np.floating):
         return False
     return isinstance(value, int) or math.isfinite(value)  # isfinite fails on whole numbers beyond floats

@@ -50,8 +50,8 @@ Comparison = tuple[np.ndarray, np.ndarray, float]
 
 @dataclass(frozen=True)
 class Verdict:
-    """``agreeing``: kernels that agree with their twins; ``failures``: the others, in words. ``group_limits``: the largest
-    work-groups of kernels that run in work-groups."""
+    """The result of a device's check. agreeing: kernels that agree with their twins. failures: the other kernels, in
+    words. group_limits: the largest work-group, by name, of kernels that use work-groups."""
 
     device: str
     agreeing: frozenset[str]
@@ -79,7 +79,8 @@ def check_device(device: str | None = None, **launch_shape: bool | int) -> Verdi
 
 
 def _problem(check: Callable[[Runtime], Iterator[Comparison]], rt: Runtime, agreeing: set[str]) -> str:
-    """Returns the first problem in words, or "" without any. Adds the kernels of comparisons that hold to ``agreeing``."""
+    """Returns the first problem in words, "" without any. Adds to ``agreeing`` the kernels that ran, if all comparisons
+    hold."""
     try:
         for computed, expected, limit in check(rt):
             off = float(np.abs(np.asarray(computed, np.float64) - expected).max() / (np.abs(expected).max() or 1.0))
@@ -240,7 +241,8 @@ def _rays(rt: Runtime) -> Iterator[Comparison]:
 
 
 def _warps(rt: Runtime) -> Iterator[Comparison]:
-    """Compares warps by a field that moves neighbours together, and by one that moves them apart."""
+    """Compares ``VolumeWarp``, its transpose, and a ``WarpedOperator`` with their twins. A small field keeps neighbouring
+    voxels neighbours; a large one scatters them."""
     volume, times_s = _noise(GRID.shape, 22), np.array([0.0, 1.0, 2.0])
     for size_mm in (0.1, 3.0):
         control_mm = size_mm * (_noise((2, 5, 5, 5, 3), 20) - 0.5)
@@ -372,7 +374,8 @@ def _cloud(count: int = 3) -> np.ndarray:
 
 
 def _tables(orbit: CircularOrbit = ORBIT) -> tuple[TimeCells, TimeCells, TimeCells]:
-    """Returns cells of one pose, of micro-views, and of lines that integrate while the gantry moves."""
+    """Returns three tables of cells: with one pose, with micro-views, and with lines that integrate while the gantry
+    moves."""
     rolling = orbit, Shutter(0.8, 0.6, "columns", -1), 0, 0.2, SHAPE[1]
     still = static_cells(orbit, Shutter(0.8, 0.6), 0, 0.2, SHAPE[0])
     return still, micro_view_cells(*rolling, 3, 2), exact_cells(*rolling, 3)

@@ -18,7 +18,8 @@ _TRIED_STEPS = 1 << 14  # number of multiply-adds of each chain in a first launc
 
 
 def pair_error(rt: Runtime) -> float:
-    """Returns the relative error of sums of pairs of floats."""
+    """Returns the largest relative error of products and sums in pairs of floats: at most ``PAIRS`` where the driver
+    keeps them."""
     (x, y, z), sums = np.random.default_rng(1).uniform(0.5, 1, (3, 256)).astype(np.float32), rt.empty((256, 2))
     kernel = rt.kernel("probes", "probe_pairs", LANES=1, FP64=0)
     rt.launch(kernel, 256, *map(rt.upload, (x, y, z)), 256, sums, group=rt.group(on_cpu=16))
@@ -27,7 +28,8 @@ def pair_error(rt: Runtime) -> float:
 
 
 def carried(rt: Runtime) -> tuple[bool, bool, bool]:
-    """Returns whether whole numbers come through local memory as such, and as floats, and whether subnormals are kept."""
+    """Returns whether local memory keeps whole numbers, stored as ints and as floats, and whether subnormal floats are
+    kept."""
     numbers, tiny = np.arange(-8, _ITEMS - 8, dtype=np.int32), np.float32(1e-40)
     as_ints, as_floats, twice = rt.zeros(_ITEMS, np.int32), rt.zeros(_ITEMS), rt.zeros(_ITEMS, np.int32)
     kernel = rt.kernel("probes", "probe_numbers", LANES=1, FP64=0)
@@ -38,8 +40,10 @@ def carried(rt: Runtime) -> tuple[bool, bool, bool]:
 
 
 def longest_launch(make: Callable[[], Runtime], lasting_s: Sequence[float]) -> str:
-    """Returns in words how long a launch may last. Tries launches of about so many seconds, each in a new context: a driver
-    that ends one leaves its context dead."""
+    """Returns in words how long a launch may last: tries launches of about ``lasting_s`` seconds each, up to one that
+    fails.
+
+    make: returns a new Runtime for each try, because a driver that ends a launch leaves its context dead."""
     lived_s, steps = 0.0, _TRIED_STEPS
     for wanted_s in (0.01, *lasting_s):
         try:
@@ -62,8 +66,11 @@ def _spin(rt: Runtime, steps: int) -> float:
 
 
 def probe_lines(device: str | None, limits: dict[str, int], check_s: float, **launch_shape: bool | int) -> Iterator[str]:
-    """Yields what is found, a line each. limits: the largest work-group by kernel; check_s: seconds that the comparison
-    took."""
+    """Yields lines of text about a device: driver, treatment of numbers, work-groups, speed and, on GPUs, the longest
+    launch.
+
+    limits: the largest work-group by kernel. check_s: seconds that the comparison with the twins took. launch_shape:
+    options of ``Runtime``. A probe that raises DeviceError ends the lines with that failure."""
 
     def make(profile: bool = False) -> Runtime:
         return Runtime(device, profile=profile, **launch_shape)  # type: ignore[arg-type]

@@ -81,6 +81,6 @@ def draw_image(
 
 
 def round_length(most: float) -> float:
-    """Returns the largest 1, 2 or 5 times a power of ten up to ``most``."""
+    """Returns the largest length of 1, 2 or 5 times a power of ten that is at most ``most``."""
     power = 10.0 ** math.floor(math.log10(most))
     return max(f * power for f in (1, 2, 5) if f * power <= most * (1 + 1e-9))

@@ -28,9 +28,11 @@ _FEWEST_BETWEEN = 5  # least number of iterations between rounds of density cont
 
 @dataclass(frozen=True)
 class Estimate:
-    """The time ``seconds`` and the memory of a whole run. trial_seconds: the time that the trials took. around_s: the part
-    of ``seconds`` outside the method, for reading, comparing and writing. host_bytes: the process's largest resident memory,
-    with its buffers on a CPU device. device_bytes: the largest memory in buffers at one time."""
+    """The time ``seconds`` and the memory of a whole run.
+
+    trial_seconds: the time that the trials took. around_s: the part of ``seconds`` outside the method, for reading,
+    comparing and writing. host_bytes: the process's largest resident memory, with its buffers on a CPU device.
+    device_bytes: the largest memory in buffers at one time."""
 
     seconds: float
     host_bytes: int
@@ -56,8 +58,8 @@ class Estimate:
 def estimate(
     scan: Scan, plan: RunPlan, rt: Runtime, around: Callable[[Reconstruction], float] | None = None
 ) -> Estimate:
-    """Returns the time and memory of a plan, from short runs of it. A method without iterations, or that cannot be resumed,
-    runs once as a whole. ``around`` returns the seconds that a run spends outside the method, from a result of it. The first
+    """Returns the time and memory of a plan, from short runs of it. A method without iterations, or without checkpoints,
+    runs once as a whole. around: returns the seconds that a run spends outside the method, from its result. The first
     trial builds the kernels, as the run will."""
     started = time.perf_counter()
     trials, total = _Trials(scan, plan, rt), getattr(plan.options, "iterations", None)
@@ -77,7 +79,7 @@ def estimate(
 
 
 class _Trials:
-    """Short runs of one plan. ``result`` and ``device_bytes`` are those of the last run, which is the longest."""
+    """Short runs of one plan. result, device_bytes: those of the last run, which is the longest."""
 
     def __init__(self, scan: Scan, plan: RunPlan, rt: Runtime) -> None:
         self.scan, self.plan, self.rt = scan, plan, rt
@@ -93,7 +95,7 @@ class _Trials:
         return time.perf_counter() - started
 
     def extrapolated(self, few: int, more: int, total: int) -> tuple[float, float]:
-        """Returns the seconds of ``total`` iterations, and of one of them, from runs of ``few`` and of ``more``."""
+        """Returns the seconds of ``total`` iterations, and those of a single one, from runs of ``few`` and of ``more``."""
         first_s = self.run(few) - self._control_s
         again_s = self.run(few) - self._control_s  # without the building of kernels
         more = min(more, total)

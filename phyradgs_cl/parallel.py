@@ -58,7 +58,7 @@ def launched(environment: Mapping[str, str] = os.environ) -> Launch:
 
 
 def _count(text: str | None) -> int | None:
-    """Returns a count; None for other text. SLURM writes 4(x2) for four on each of two machines."""
+    """Returns the count in ``text``; None for other text. SLURM writes 4(x2) for four on each of two machines."""
     number = (text or "").split("(")[0].split(",")[0]
     return int(number) if number.isdigit() else None
 
@@ -81,7 +81,7 @@ class Communicator:
         """Replaces contiguous ``values`` by their maxima over all ranks, in place."""
 
     def any(self, flag: bool) -> bool:
-        """True where ``flag`` is set on any rank."""
+        """Returns whether ``flag`` is set on any rank."""
         return flag
 
     def bcast(self, value: Any) -> Any:

@@ -15,7 +15,7 @@ _ELSEWHERE_EVERY_S = 10.0  # least time between two lines in a file or pipe
 
 
 def has_reader() -> bool:
-    """True on a terminal or in a notebook's cell, where a line can be rewritten."""
+    """Returns whether stderr is a terminal or a notebook's cell, where a line can be rewritten."""
     return sys.stderr is not None and (sys.stderr.isatty() or _in_notebook())
 
 
@@ -24,7 +24,8 @@ def _in_notebook() -> bool:
 
 
 class Ticker:
-    """Counts finished ``noun``s, with the rate and the time left. As a context it ends the line that it rewrites."""
+    """Shows a count of finished ``noun``s, with the rate and the time left. As a context it ends the line that it
+    rewrites."""
 
     def __init__(self, noun: str) -> None:
         self.noun = noun

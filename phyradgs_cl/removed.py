@@ -41,7 +41,8 @@ REMOVED = {
 
 
 def removal(word: str, subject: str = "") -> InputError | None:
-    """Returns the InputError, with the remedy, for a word in ``REMOVED``; None for others. ``subject``: for the message."""
+    """Returns the InputError, with the remedy, for a word in ``REMOVED``; None for other words. subject: what the message
+    names."""
     return InputError(subject or word, "a word of an earlier version", "", REMOVED[word]) if word in REMOVED else None
 
 

@@ -28,8 +28,8 @@ else:
 
 @dataclass(frozen=True)
 class Settings:
-    """Options by name, unchecked, and the place where each was given, for errors. device: as from ``device_wish``. memory:
-    limit of the device's memory in bytes; None: what the device has."""
+    """Options by name, unchecked, and the place where each was given, for errors. device: as from ``device_wish``.
+    memory: limit of the device's memory in bytes; None for all that the device has."""
 
     values: Mapping[str, Any]
     origins: Mapping[str, str]

@@ -23,8 +23,8 @@ class InterruptedAfterwards(KeyboardInterrupt):
 
 
 class StopFlag:
-    """The handler of both signals. waits: the first signal only sets the flag. keeps: it also does so after the end of a
-    loop. farewell: the message of the command line when a signal has ended it."""
+    """Handles both signals. waits: the first signal only sets the flag. keeps: it waits also after the end of a loop.
+    farewell: the command line's message when a signal has ended it."""
 
     def __init__(self) -> None:
         self.waits = self.keeps = False
@@ -34,7 +34,7 @@ class StopFlag:
 
     @property
     def is_set(self) -> bool:
-        """True once a signal has come."""
+        """Whether a signal has come."""
         return self.first_s is not None
 
     def __call__(self, number: int, frame: FrameType | None) -> None:
@@ -50,8 +50,8 @@ class StopFlag:
 
 @contextmanager
 def answer_signals(*, takes_default: bool = True) -> Iterator[StopFlag]:
-    """Installs a flag as handler and yields it, or yields the one that is installed already. takes_default: also replaces a
-    default handler, as SIGTERM's, which ends the process at once."""
+    """Installs a flag as the signals' handler and yields it, or yields the flag that is installed already. takes_default:
+    also replaces a default handler, as SIGTERM's, which ends the process at once."""
     is_main = threading.current_thread() is threading.main_thread()
     installed, flag = _installed() if is_main else None, StopFlag()
     if installed is not None or not is_main:
@@ -79,8 +79,8 @@ def stop_on_interrupt() -> Iterator[StopFlag]:
 
 @contextmanager
 def keep_finished_work() -> Iterator[None]:
-    """Makes signals wait from the first loop in the body to the end of the body, so that the loop's result is written. A
-    signal that has waited then raises InterruptedAfterwards."""
+    """Makes signals wait from the first loop in the body to the end of the body, so that the loop's result is written.
+    Then raises InterruptedAfterwards if a signal has waited."""
     with _waiting(waits=False) as flag:
         keeps, flag.keeps = flag.keeps, True
         try:
@@ -92,7 +92,7 @@ def keep_finished_work() -> Iterator[None]:
 
 @contextmanager
 def finish_despite_interrupt() -> Iterator[None]:
-    """Makes a signal wait during short work such as writing. It then raises InterruptedAfterwards."""
+    """Makes a signal wait during short work such as writing. Then raises InterruptedAfterwards if one has waited."""
     with _waiting() as flag:
         yield
     flag.farewell = COMPLETE
@@ -113,7 +113,7 @@ def farewell() -> str:
 
 @contextmanager
 def _waiting(waits: bool = True) -> Iterator[StopFlag]:
-    """Makes the first signal wait in the body; if not ``waits``, it waits there only if it does so around the body.
+    """Makes the first signal wait in the body; with ``waits`` False only where it waits around the body.
 
     A device that fails after a signal has only lost its compiler, which got the signal too: this raises
     KeyboardInterrupt."""

@@ -24,14 +24,16 @@ Served = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 
 
 def static_cells(trajectory: Trajectory, shutter: Shutter, frame: int, start_s: float, lines: int) -> TimeCells:
-    """Returns one cell at the middle of the frame's lit span. That is the best single pose of a frame."""
+    """Returns one cell of all lines at the middle of the frame's lit span, in which any line is open. No other single
+    pose fits a frame better."""
     return _single_cell(trajectory, shutter, frame, start_s + shutter.middle_s, lines)
 
 
 def static_start_cells(
     trajectory: Trajectory, shutter: Shutter, frame: int, start_s: float, lines: int
 ) -> TimeCells:
-    """Returns one cell at the frame's first light. A volume is then rotated by half the arc of the lit span."""
+    """Returns one cell of all lines at the frame's first light. A volume then comes out rotated by half the arc of the
+    lit span."""
     return _single_cell(trajectory, shutter, frame, start_s + shutter.lit_span_s[0], lines)
 
 
@@ -65,7 +67,7 @@ def centre_cells(
 def per_line_cells(
     trajectory: Trajectory, shutter: Shutter, frame: int, start_s: float, lines: int, samples: int
 ) -> TimeCells:
-    """Returns ``samples`` cells for every line, at times of its exposure by the midpoint rule.
+    """Returns ``samples`` cells for every line, at the midpoints of equal parts of its exposure.
 
     The error falls with samples⁻² for fields that are smooth over the motion between two times."""
     opens_s, closes_s = shutter.line_windows_s(lines).T
@@ -85,10 +87,10 @@ def common_time_cells(
     t_k is the cell's middle and w_k(v) = |window(v) ∩ cell k| / |window(v)|. So one projection from a pose serves many
     lines. This is the paper's strip concatenation with fractional strips.
 
-    frame_start_s (F,): the starts of all frames in s. Frames that begin on frame 0's grid share poses where they overlap
-    in time, as in a scan without gaps. Lines share nothing in an exposure of 0 s, or where a cell is shorter than the
-    readout of a line: the cells are then those of ``per_line_cells``. With a pulsed beam, the exposure is its longest lit
-    part."""
+    frame_start_s (F,): the starts of all frames in s. Frames that start a whole number of cells after frame 0 share poses
+    where they overlap in time, as in a scan without gaps. In an exposure of 0 s, or where a cell is shorter than the
+    readout of a line, no lines share a cell: the result is ``per_line_cells``. With a pulsed beam, the exposure is its
+    longest lit part."""
     start_s = float(frame_start_s[frame])
     windows_s = shutter.line_windows_s(lines)
     length_s = float(np.ptp(windows_s, axis=1).max())
@@ -107,7 +109,7 @@ def common_time_cells(
 def _common_shares(windows: bytes, samples: int) -> tuple[np.ndarray, np.ndarray, Served]:
     """Returns cells' edges (K + 1,) in s, ``_shares`` (K, lines) of lines' windows in them, and their ``_served_lines``.
 
-    windows: bytes of the windows (lines, 2), in s after a frame's start. Do not write to the arrays: they are cached."""
+    windows: bytes of the windows (lines, 2), in s after a frame's start. The arrays are cached: do not write to them."""
     windows_s = np.frombuffer(windows, np.float64).reshape(-1, 2)
     first_s, last_s = float(windows_s.min()), float(windows_s.max())
     step_s = float(np.ptp(windows_s, axis=1).max()) / samples
@@ -125,8 +127,10 @@ def _served_lines(served: np.ndarray) -> Served:
 
 
 def _middles_s(frame_start_s: np.ndarray, frame: int, edges_s: np.ndarray) -> np.ndarray:
-    """Returns the mid-times (K,) in s of a frame's cells, from their edges (K + 1,) in s after its start. Frames on frame
-    0's grid get bitwise equal times for common cells."""
+    """Returns the middles (K,) in s of a frame's cells, whose edges (K + 1,) are in s after the frame's start.
+
+    Frames that start a whole number of cells after frame 0 get the same bits for the same time, so that they share
+    poses."""
     step_s = edges_s[1] - edges_s[0]
     start_s, origin_s = float(frame_start_s[frame]), float(frame_start_s[0])
     cells = (start_s - origin_s) / step_s
@@ -140,7 +144,8 @@ def _middles_s(frame_start_s: np.ndarray, frame: int, edges_s: np.ndarray) -> np
 
 
 def _shares(windows_s: np.ndarray, edges_s: np.ndarray) -> np.ndarray:
-    """Returns the share (K, lines) of each line's window (lines, 2) in cells between edges (K + 1,). Columns sum to 1."""
+    """Returns the fraction (K, lines) of each line's window (lines, 2) that lies in each cell between ``edges_s`` (K +
+    1,). Columns sum to 1."""
     opens, closes = windows_s.T
     length_s = closes - opens
     overlap = np.minimum(closes, edges_s[1:, None]) - np.maximum(opens, edges_s[:-1, None])
@@ -156,9 +161,10 @@ def _shares(windows_s: np.ndarray, edges_s: np.ndarray) -> np.ndarray:
 def exact_cells(
     trajectory: Trajectory, shutter: Shutter, frame: int, start_s: float, lines: int, segments: int
 ) -> TimeCells:
-    """Returns ``segments`` equal segments of the frame's lit span, in which splats move (docs/mathematics.md).
+    """Returns ``segments`` equal segments of the frame's lit span, within which splats move (docs/mathematics.md).
 
-    Every line integrates over its own window. A gantry at rest, or a span of 0 s, gives the cell of ``static_cells``."""
+    Every line integrates over its own window. A gantry at rest, or a lit span of 0 s, gives the result of
+    ``static_cells``."""
     first_s, last_s = shutter.lit_span_s
     if last_s <= first_s:
         return static_cells(trajectory, shutter, frame, start_s, lines)
@@ -176,9 +182,11 @@ def exact_cells(
 
 
 def _line_times(windows_s: np.ndarray, edges_s: np.ndarray) -> np.ndarray:
-    """Returns ``TimeCells.line_times`` (K, 3, lines) for windows (lines, 2) and edges of segments (K + 1,), both in s.
+    """Returns ``TimeCells.line_times`` (K, 3, lines) for windows (lines, 2) and edges of equal segments (K + 1,), both in
+    s.
 
-    A line that reaches only a little way into a segment stays in the neighbouring one, which saves footprints."""
+    A window that reaches at most ``_OVERHANG`` of a segment into it counts to the neighbouring segment alone, to save
+    footprints."""
     length_s = edges_s[1] - edges_s[0]
     count = len(edges_s) - 1
     opens, closes = ((windows_s - edges_s[0]) / length_s).T  # in segments' lengths after first light
@@ -194,7 +202,7 @@ def _line_times(windows_s: np.ndarray, edges_s: np.ndarray) -> np.ndarray:
 
 
 def _segments_of_lines(opens: np.ndarray, closes: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the first and last segment (lines,) of every line, from its window in segments' lengths after first light.
+    """Returns the first and last segment (lines,) of every line's window, given in segments' lengths after first light.
 
     A segment at either end is left out where the window covers at most ``_OVERHANG`` of it."""
     first = np.clip(np.floor(opens), 0, count - 1)
@@ -210,10 +218,10 @@ def segments_for(
 ) -> int:
     """Returns how many segments keep the error of straight paths and constant conics below ``time_error`` (relative RMS).
 
-    Both errors grow with the square of the view's turn in a segment. The factor was measured (benchmarks/time_exact.py) for
-    Gaussians of 0.5 to 4 % of the half-width. intensity_peak: the largest line integral where the detector averages
-    intensities, else 0. Half the variance of the line integrals in a segment then remains as an error. Up to a peak of 4 it
-    is the smaller one."""
+    Both errors grow with the square of the view's turn in a segment. The factor was measured (benchmarks/time_exact.py)
+    for Gaussians of 0.5 to 4 % of the half-width. intensity_peak: the largest line integral where the detector averages
+    intensities, else 0. There half the variance of the line integrals in a segment is a further error, smaller than the
+    others up to a peak of 4; a larger peak takes more segments."""
     first_s, last_s = shutter.lit_span_s
     pose = trajectory.pose(frame, start_s + np.linspace(first_s, last_s, _TURN_SAMPLES + 1))
     fastest_rad = float(np.max(_turns_rad(pose))) * _TURN_SAMPLES

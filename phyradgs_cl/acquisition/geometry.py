@@ -101,7 +101,7 @@ class ParallelGeometry:
 
     @property
     def magnification(self) -> float:
-        """1: parallel rays do not magnify."""
+        """The magnification, 1: parallel rays do not magnify."""
         return 1.0
 
 
@@ -110,7 +110,8 @@ GEOMETRIES = (ConeGeometry, ParallelGeometry)
 
 
 def _check_panel(geometry: Geometry) -> None:
-    """Converts a geometry's fields to tuples, so that geometries can be compared. Raises InputError for impossible ones."""
+    """Converts a geometry's fields to tuples, so that geometries can be compared. Raises InputError for shapes, lengths
+    and offsets out of range."""
     counts = checks.numbers("detector_shape", geometry.detector_shape, (2,))
     if (counts < 1).any() or (counts != np.floor(counts)).any():
         raise InputError("detector_shape", str(geometry.detector_shape), "two counts (rows, columns) of at least 1")
@@ -123,8 +124,8 @@ def _check_panel(geometry: Geometry) -> None:
 
 
 def _panel_at(geometry: Geometry, angle_rad: np.ndarray | float) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the unit vector (..., 3) from the axis to the source, and the last 9 numbers (..., 9) of the pose in mm of a
-    panel whose plane contains the axis."""
+    """Returns the unit vector (..., 3) from the axis to the source, and the panel's 9 numbers (..., 9) of the poses in
+    mm. The panel's plane contains the axis."""
     angle = np.asarray(angle_rad, dtype=np.float64)
     cos, sin, zero = np.cos(angle), np.sin(angle), np.zeros_like(angle)
     u_hat = np.stack([-sin, cos, zero], -1)
@@ -160,10 +161,10 @@ def pixel_centres(pose: np.ndarray, detector_shape: tuple[int, int]) -> np.ndarr
 
 
 def plain_geometry(pose: np.ndarray, panel: tuple[int, int], is_parallel: bool = False) -> Geometry:
-    """Returns the circular geometry nearest to poses (F, 12), by mean distances and offsets.
+    """Returns the circular geometry nearest to poses (F, 12), by their mean distances and offsets.
 
-    The detector's distance is that of its plane. Its offset is measured from the foot of the source on that plane, in a
-    parallel beam from the foot of the axis, to the panel's middle."""
+    The detector's distance is that of its plane. Its offset goes from the foot of the source on that plane (in a parallel
+    beam, of the axis) to the panel's middle."""
     source, first, step_u, step_v = (pose[:, i : i + 3] for i in (0, 3, 6, 9))
     pitch_u, pitch_v = (np.linalg.norm(step, axis=1, keepdims=True) for step in (step_u, step_v))
     u_hat, v_hat = step_u / pitch_u, step_v / pitch_v

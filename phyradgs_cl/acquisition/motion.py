@@ -41,9 +41,9 @@ class Motion(Protocol):
 def rim_travel_voxels(scan: Scan) -> float:
     """Returns the travel of the grid's rim, seen from the panel, during a line's exposure, in voxels of a slice (y, x).
 
-    The rim is the middles of the box's four sides around the axis. Their places relative to the panel move by r Δθ on a
-    circular orbit. Where the panel does not turn they move by its shift. The largest travel in the first, middle and last
-    frame counts; a gantry at rest has 0."""
+    The rim stands for the middles of the box's four sides around the axis. On a circular orbit they move relative to the
+    panel by r Δθ; where the panel does not turn, by its shift. The largest travel in the first, middle and last frame
+    counts; a gantry at rest has 0."""
     if not scan.is_fly:
         return 0.0
     half_x_mm, half_y_mm = scan.grid.size_mm[2] / 2, scan.grid.size_mm[1] / 2
@@ -70,7 +70,8 @@ def _place(scan: Scan, frame: int) -> tuple[Trajectory, Shutter, int, float, int
 
 @dataclass(frozen=True)
 class Static:
-    """One pose per frame, at the middle of its lit span. This model ignores the motion of the gantry."""
+    """One pose per frame, at the middle of its lit span, in which any line is open. This model ignores the motion of the
+    gantry."""
 
     operators: ClassVar = (RAYS, SPLATS, LINE_POSES)
     name: str = field(default="static", init=False, repr=False)
@@ -82,7 +83,8 @@ class Static:
 
 @dataclass(frozen=True)
 class StaticStart:
-    """One pose per frame, at first light. The volume is rotated by half the lit span's arc against that of ``static``."""
+    """One pose per frame, at first light. The volume comes out rotated by half the lit span's arc against that of
+    ``static``."""
 
     operators: ClassVar = (RAYS, SPLATS, LINE_POSES)
     name: str = field(default="static-start", init=False, repr=False)
@@ -131,10 +133,10 @@ class Centres(MicroViews):
 
 @dataclass(frozen=True)
 class PerRow:
-    """Every line averages over its own window. All lines of a frame share their times.
+    """Every line averages over its own window. Lines of a frame take their poses from one grid of times.
 
-    ``sub_intervals`` counts the times in an exposure; 0 takes as many as the scan needs (``of``). The weight of a line in a
-    cell is the fraction of its window that lies there. Raises InputError for a count below 0."""
+    ``sub_intervals`` counts the times in an exposure; 0 takes as many as the scan needs (``of``). The weight of a line in
+    a cell is the fraction of its window that lies there. Raises InputError for a count below 0."""
 
     operators: ClassVar = (RAYS,)
     name: str = field(default="per-row", init=False, repr=False)
@@ -144,11 +146,12 @@ class PerRow:
         checks.whole("sub_intervals", self.sub_intervals, 0, 10_000)
 
     def of(self, scan: Scan, object_mm_per_s: float = 0.0) -> "PerRow":
-        """Returns the model with as many times as this scan needs; a stated number stays. The object's fastest part moves
-        with ``object_mm_per_s``.
+        """Returns the model with as many times as the scan needs; a stated number stays. object_mm_per_s: speed of the
+        object's fastest part.
 
-        It is one time per 0.3 voxels of the rim's travel in an exposure, or per 0.7 voxels of the object's, up to 6 times.
-        They serve up to 22 voxels; beyond, it is one time per 3.6 voxels (measured in docs/results/settings.md)."""
+        It takes one time per 0.3 voxels of the rim's travel in an exposure, or per 0.7 voxels of the object's, up to 6
+        times. These serve up to 22 voxels; longer travel takes one time per 3.6 voxels (measured in
+        docs/results/settings.md)."""
         if self.sub_intervals:
             return self
         rim_voxels = rim_travel_voxels(scan)
@@ -186,7 +189,7 @@ class OwnTimes:
 
 @dataclass(frozen=True)
 class LineMiddles:
-    """Every line has one pose, at the middle of its exposure. This is the ``per-row`` of filtered backprojection."""
+    """One pose per line, at the middle of its exposure: the model ``per-row`` of filtered backprojection."""
 
     operators: ClassVar = (LINE_POSES,)
     name: str = field(default="per-row", init=False, repr=False)
@@ -198,10 +201,10 @@ class LineMiddles:
 
 @dataclass(frozen=True)
 class Exact:
-    """``segments`` per frame, in which splats move. Every line integrates over its own window.
+    """``segments`` of a frame's time, in which splats move. Every line integrates over its own window.
 
-    With 0 segments, as many are taken as keep a frame's error below ``time_error``, relative to the frame's RMS.
-    ``time_error`` also bounds the error of quadrature over time. Raises InputError for numbers out of range."""
+    0 segments takes as many as keep a frame's error below ``time_error``, relative to the frame's RMS. ``time_error``
+    also bounds the error of quadrature over time. Raises InputError for numbers out of range."""
 
     operators: ClassVar = (SPLATS,)
     name: str = field(default="exact", init=False, repr=False)
@@ -227,7 +230,8 @@ MOTIONS = tuple(dict.fromkeys(model.name for model in MODELS))
 
 
 def motions_for(*operators: str) -> tuple[Motion, ...]:
-    """Returns the models, with their default numbers, that suit one of these kinds of operator."""
+    """Returns the models, with their default numbers, that suit one of these types of operator: RAYS, SPLATS or
+    LINE_POSES."""
     return tuple(model() for model in MODELS if set(operators) & set(model.operators))
 
 
@@ -241,7 +245,7 @@ def motion_of(motion: str | Motion) -> Motion:
 
 
 def with_times(motion: Motion, scan: Scan, deformation: Deformation | None = None) -> Motion:
-    """Returns ``motion``. A ``PerRow`` without a number of times gets the number that scan and deformation need."""
+    """Returns ``motion``; a ``PerRow`` without a number of times gets the number that scan and deformation need."""
     speed_mm_per_s = 0.0 if deformation is None else deformation.fastest_mm_per_s
     return motion.of(scan, speed_mm_per_s) if isinstance(motion, PerRow) else motion
 
@@ -264,7 +268,7 @@ def motion_from_facts(facts: Mapping[str, object]) -> Motion | None:
 
 
 def check_motion(motion: Motion, taken: tuple[Motion, ...]) -> None:
-    """Raises InputError for one of ``MODELS`` whose class none of ``taken`` has, and for values that are no model."""
+    """Raises InputError for one of ``MODELS`` whose class none of ``taken`` has, and for a value that is no model."""
     if isinstance(motion, type) and hasattr(motion, "cells"):
         raise InputError("--motion", f"the class {motion.__name__}", "a model", f"write {motion.__name__}()")
     if not callable(getattr(motion, "cells", None)):

@@ -32,7 +32,7 @@ _ASIDE = 0.1  # a panel off centre by more than this fraction of its width was d
 
 
 def summary(scan: "Scan") -> str:
-    """Returns one line about the timing, one about the sizes, and one about the blur of a fly-scan. Values that the
+    """Returns one line about a scan's timing, one about its sizes, and one about the blur of a fly-scan. Values that the
     provenance lists as assumed are marked."""
     return "\n".join(filter(None, (_timing(scan), _sizes(scan), blur_line(scan))))
 
@@ -61,7 +61,7 @@ def blur_facts(scan: "Scan") -> dict[str, float]:
 
 
 def blur_line(scan: "Scan") -> str:
-    """Returns "blur at the rim: 1.4 px, at half radius 0.7 px" of a fly-scan; "" of a scan at rest."""
+    """Returns a line such as "blur at the rim: 1.4 px, at half radius 0.7 px" of a fly-scan; "" of a scan at rest."""
     facts = blur_facts(scan)
     return "blur at the rim: {:.2g} px, at half radius {:.2g} px".format(*facts.values()) if facts else ""
 
@@ -158,8 +158,8 @@ def check_plausible(scan: "Scan", named: Named = str, is_timed: bool = True) -> 
 
 
 def _check_opaque(scan: "Scan", subject: str) -> None:
-    """Raises InputError where most pixels are darker than a panel can measure: these are counts, whose air is bright. Warns
-    where some pixels are that dark."""
+    """Raises InputError where most pixels are darker than a panel can measure, as counts would be read, whose air is
+    bright. Warns where some pixels are that dark."""
     pairs = zip(scan.projections, scan.valid, strict=True)
     counts = [(np.count_nonzero(frame[valid] > OPAQUE), np.count_nonzero(valid)) for frame, valid in pairs]
     opaque, valid_pixels = np.sum(counts, axis=0).tolist()
@@ -184,8 +184,8 @@ def _warn_of_radians(angle_deg: np.ndarray, subject: str) -> bool:
 
 
 def _check_panel(geometry: Geometry, named: Named) -> None:
-    """Raises InputError for a panel with too wide a fan. It names the distances where they are too short for any panel and
-    the pixels are not too large, otherwise the pixels."""
+    """Raises InputError for a panel with too wide a fan. The error names the distances where they are too short for any
+    panel and the pixels are not too large, otherwise the pixels."""
     widest_deg = max(_cone_deg(geometry))
     if isinstance(geometry, ParallelGeometry) or widest_deg <= _WIDEST_DEG:
         return
@@ -229,7 +229,7 @@ def _longer_than_a_frame(subject: str, stated: str, time_s: float, frame_s: floa
 
 
 def _warn_of_slow_frames(frame_s: float, angle_deg: np.ndarray, subject: str) -> None:
-    """Warns of a low frame rate where the gantry turns far between two frames. angle_deg (F,)."""
+    """Warns of a low frame rate where the gantry turns far between two frames. angle_deg (F,): the frames' angles."""
     step_deg = float(np.median(np.abs(np.diff(angle_deg))))
     if _SLOW_FPS * frame_s > 1 and step_deg > _LARGE_STEP_DEG:
         log.warning("%s: %.3g fps and %.3g° from frame to frame; is the rate right?", subject, 1 / frame_s, step_deg)

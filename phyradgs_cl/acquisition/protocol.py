@@ -57,7 +57,7 @@ class Protocol:
         return 360.0 * self.turns / self.views
 
     def at_rate(self, fps: float, readout_ms: float | None = None, named: Named = str) -> "Protocol":
-        """Returns the protocol with exposure time and readout ratio from frames per second and a readout in ms.
+        """Returns the protocol with the exposure time and readout ratio of ``fps`` frames per second and a readout in ms.
 
         Raises InputError for an arc of 0, and for a readout longer than a frame."""
         checks.positive(named("fps"), fps)
@@ -77,7 +77,8 @@ class Protocol:
         return Shutter(self.exposure_s, self.readout_ratio * self.exposure_s, axis, direction, pulse_s)
 
     def frame_start_s(self) -> np.ndarray:
-        """Returns the frames' opening times (F,) in s, |step| / arc exposures apart; with an arc of 0, one after another."""
+        """Returns the frames' opening times (F,) in s, |step| / arc exposures apart; with an arc of 0, one after the
+        other."""
         if self.exposure_deg == 0:
             return np.arange(self.views) * self.shutter().span_s
         return np.arange(self.views) * abs(self.step_deg) / self.exposure_deg * self.exposure_s
@@ -133,7 +134,8 @@ PROTOCOLS = {
 
 
 def make_protocol(name: str, **changes: Any) -> Protocol:
-    """Returns the named protocol with those fields changed that are not None. Raises InputError for an unknown name."""
+    """Returns the protocol ``name`` with the ``changes`` of fields that are not None. Raises InputError for an unknown
+    name."""
     if name not in PROTOCOLS:
         raise InputError("protocol", repr(name), f"one of {', '.join(PROTOCOLS)}")
     return replace(PROTOCOLS[name], **{k: v for k, v in changes.items() if v is not None})

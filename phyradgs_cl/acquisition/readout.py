@@ -18,8 +18,8 @@ Named = Callable[[str], str]
 
 @dataclass(frozen=True)
 class Readout:
-    """Puts frames and poses in the order of operators, whose rows are the lines read out. ``axis`` is "rows" or "columns":
-    what one line is."""
+    """The readout of a panel along ``axis``, "rows" or "columns": what one line is. Orders frames and poses as operators
+    need them, whose rows are the lines read out."""
 
     axis: str
 
@@ -29,11 +29,11 @@ class Readout:
         return (rows, columns) if self.axis == "rows" else (columns, rows)
 
     def frames(self, frames: np.ndarray) -> np.ndarray:
-        """Returns a view of frames (..., rows, columns) as (..., lines, width), or back."""
+        """Returns a view of frames (..., rows, columns) as (..., lines, width), or of the latter as the former."""
         return frames if self.axis == "rows" else frames.swapaxes(-1, -2)
 
     def poses(self, pose: np.ndarray) -> np.ndarray:
-        """Returns poses (..., 12) for frames in the order (lines, width), or back."""
+        """Returns poses (..., 12) for frames in the order (lines, width), or those for the order (rows, columns)."""
         return pose if self.axis == "rows" else transpose_pose(pose)
 
     def spread(self, by_line: np.ndarray) -> np.ndarray:
@@ -57,7 +57,8 @@ def readout_order(
 
 
 def frame_time_of(fps: float | None, frame_time_s: float | None, named: Named = str) -> float | None:
-    """Returns the seconds between frames, from frames per second or as given. Raises InputError where both differ."""
+    """Returns the seconds between frames, from ``fps`` or else ``frame_time_s``; None without either. Raises InputError
+    where both are given and differ."""
     if fps is None:
         return frame_time_s
     checks.positive(named("fps"), fps)
@@ -65,7 +66,8 @@ def frame_time_of(fps: float | None, frame_time_s: float | None, named: Named = 
 
 
 def seconds_of(word: str, in_ms: float | None, in_s: float | None, named: Named = str) -> float | None:
-    """Returns a time in s, from ms or as given. Raises InputError where both differ. ``word``: "exposure" or "readout"."""
+    """Returns a time in s, from ``in_ms`` or else ``in_s``; None without either. Raises InputError where both are given
+    and differ. word: "exposure" or "readout", for the message."""
     if in_ms is None:
         return in_s
     checks.at_least(named(f"{word}_ms"), in_ms, 0)

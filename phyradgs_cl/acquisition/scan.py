@@ -169,7 +169,7 @@ class Scan:
 
     @property
     def valid(self) -> np.ndarray:
-        """The pixels that may be used, bool (F, nv, nu). This is a view."""
+        """The pixels that may be used, a bool view (F, nv, nu)."""
         unmasked = True if self.pixel_mask is None else np.asarray(self.pixel_mask) == 0
         return np.broadcast_to(unmasked, self.projections.shape)
 
@@ -179,7 +179,8 @@ class Scan:
         return self.shutter.lines(self.geometry.detector_shape)
 
     def on_grid(self, grid: Grid) -> "Scan":
-        """Returns the scan with another grid. A known true volume stays where the old grid contains the new one."""
+        """Returns the scan with another grid. A known true volume is cut to the new grid where the old one contains it,
+        else dropped."""
         if grid == self.grid:
             return self
         part = grid.slices_in(self.grid)
@@ -193,7 +194,7 @@ class Scan:
         return replace(self, grid=grid, reference=reference, moving_truth=moving)
 
     def with_grid(self, choice: GridChoice) -> "Scan":
-        """Returns the scan with the chosen grid. Raises InputError for a grid outside an orbit's field of view."""
+        """Returns the scan with the grid of ``choice``. Raises InputError for a grid outside an orbit's field of view."""
         grid = choice.of(self.grid)
         if choice.roi_mm is not None and isinstance(self.trajectory, CircularOrbit) and misses(grid, self.geometry):
             half_mm = ", ".join(f"±{half:.4g}" for half in field_of_view_mm(self.geometry))
@@ -202,8 +203,8 @@ class Scan:
         return self.on_grid(grid)
 
     def check_timing(self) -> None:
-        """Raises InputError for a trajectory that does not cover every frame's window, and for poses that are no numbers.
-        Raises it also for an exposure that is too short for the precision of the scan's times."""
+        """Raises InputError for a trajectory that does not cover every frame's window, and for poses that are not finite.
+        Raises InputError also for an exposure too short for the precision of the scan's times."""
         self.shutter.check_resolved(self.frame_start_s)
         last_s = self.shutter.span_s if self.is_fly else self.shutter.middle_s  # a gantry at rest has one pose
         for frame, start_s in enumerate(self.frame_start_s):
@@ -238,7 +239,7 @@ class Scan:
             log.warning(text, half_panel_mm, offset_mm, offset_mm * pitch_mm)
 
     def warn_of_negative_integrals(self) -> None:
-        """Warns of line integrals whose sum is below 0: most methods make a volume of zeros of them.
+        """Warns of line integrals whose sum is below 0, of which most methods make a volume of zeros.
 
         Raises InputError where frames have become NaN or infinite since the scan was made of them."""
         total = float(np.sum(self.projections, where=self.valid, dtype=np.float64))

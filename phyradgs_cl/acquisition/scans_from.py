@@ -111,7 +111,8 @@ def astra_vectors(scan: "Scan") -> np.ndarray:
 
 
 def check_others(others: Iterable[str], arguments: Iterable[str] = ()) -> None:
-    """Raises InputError for a keyword that is no optional field of ``Scan``. ``arguments``: further ones of the caller."""
+    """Raises InputError for a keyword that is neither an optional field of ``Scan`` nor one of the caller's
+    ``arguments``."""
     allowed = (*arguments, *_OTHERS)
     for name in others:
         if name not in _OTHERS:
@@ -138,7 +139,8 @@ def _uncounted(frames: ArrayLike, mask: np.ndarray | None) -> np.ndarray:
 
 
 def line_integrals(frames: ArrayLike, mask: np.ndarray | None) -> np.ndarray:
-    """Returns frames as float32, with 0 for masked pixels that are not finite. Raises InputError for other such pixels."""
+    """Returns frames as float32, with 0 for masked pixels that are not finite. Raises InputError where an unmasked pixel
+    is not finite."""
     values = checks.real_array("projections", frames)
     with np.errstate(over="ignore"):
         values = values.astype(np.float32, copy=False)
@@ -150,7 +152,7 @@ def line_integrals(frames: ArrayLike, mask: np.ndarray | None) -> np.ndarray:
 
 
 def poses_of_astra(vectors: ArrayLike, panel: tuple[int, int]) -> np.ndarray:
-    """Returns poses (F, 12) for ``cone_vec`` rows (F, 12) in mm and a panel (rows, columns)."""
+    """Returns poses (F, 12) in mm of ASTRA's ``cone_vec`` (F, 12) in mm and a panel (rows, columns)."""
     table = checks.numbers("vectors", vectors, (None, POSE_LENGTH))
     pose: np.ndarray = table.copy()
     pose[:, 3:6] -= _to_middle(pose, panel)
@@ -158,7 +160,7 @@ def poses_of_astra(vectors: ArrayLike, panel: tuple[int, int]) -> np.ndarray:
 
 
 def astra_of_poses(pose: np.ndarray, panel: tuple[int, int]) -> np.ndarray:
-    """Inverts ``poses_of_astra``."""
+    """Returns ASTRA's ``cone_vec`` (F, 12) in mm of poses (F, 12): inverts ``poses_of_astra``."""
     vectors = np.array(pose, np.float64)
     vectors[:, 3:6] += _to_middle(vectors, panel)
     return vectors
@@ -210,7 +212,7 @@ def poses_of_tigre(geo: Any, angles_rad: ArrayLike) -> tuple[np.ndarray, tuple[i
 
 
 def is_parallel_tigre(geo: Any) -> bool:
-    """True for a TIGRE geometry of parallel beams."""
+    """Returns whether a TIGRE geometry has parallel beams."""
     return bool(getattr(geo, "mode", None) == "parallel")
 
 
@@ -229,8 +231,8 @@ def _counts(geo: Any, name: str, length: int) -> np.ndarray:
 
 
 def _each(geo: Any, name: str, frames: int, length: int, absent: float) -> np.ndarray:
-    """Returns an attribute (F, length), which may be given once or per frame. A missing one is ``absent``, but DSO and DSD
-    must be there. Raises InputError for other shapes."""
+    """Returns an attribute (F, length) of a TIGRE geometry, which may be given once or per frame. ``absent`` stands for a
+    missing attribute, except for DSO and DSD. Raises InputError where these are missing, and for other shapes."""
     value = _of(geo, name) if name in ("DSO", "DSD") else getattr(geo, name, None)
     table = checks.numbers(f"geo.{name}", absent if value is None else value)
     per_frame = (frames,) if length == 1 else (frames, length)

@@ -59,7 +59,7 @@ class Shutter:
 
     @property
     def readout(self) -> Readout:
-        """The readout axis, which puts frames and poses in the order (lines, width)."""
+        """The order of the lines, which puts frames and poses in the order (lines, width)."""
         return Readout(self.axis)
 
     @property
@@ -110,7 +110,8 @@ class Shutter:
         return self.in_pulse(np.stack([delay, delay + self.exposure_s], -1))
 
     def lit_share(self, lines: int) -> np.ndarray:
-        """Returns each line's lit time (lines,) over the longest; all 1 without a pulse. Raises InputError if all are 0."""
+        """Returns each line's lit time (lines,) as a fraction of the longest; all 1 without a pulse. Raises InputError if
+        all are 0."""
         if self.pulse_s is None:
             return np.ones(lines)
         seen_s = np.diff(self.line_windows_s(lines))[:, 0]

@@ -15,14 +15,15 @@ HALO_ROWS = 4
 
 
 def check_has_slabs(scan: Scan, subject: str, found: str) -> None:
-    """Raises InputError where slices need rows of the whole panel. ``subject``: the option to name, ``found``: its value."""
+    """Raises InputError where ``has_slabs`` is False, because slices then need rows of the whole panel. subject: the
+    option to name; found: its value."""
     if not has_slabs(scan):
         expected = "all rows: only in a parallel beam about z does a slice need few of them"
         raise InputError(subject, found, expected, "take --roi-mm, with --margin-mm")
 
 
 def has_slabs(scan: Scan) -> bool:
-    """True for a parallel beam about z, in which few detector rows see a slice."""
+    """Returns whether few detector rows see a slice: in a parallel beam about z."""
     return isinstance(scan.geometry, ParallelGeometry) and isinstance(scan.trajectory, CircularOrbit)
 
 
@@ -68,7 +69,7 @@ def slices_of(scan: Scan, first: int, stop: int) -> slice:
 
 
 def part_of(grid: Grid, slices: slice) -> Grid:
-    """Returns the grid of some slices. For all slices this is ``grid`` itself."""
+    """Returns the grid of the slices ``slices``; ``grid`` itself for all slices."""
     if slices == slice(0, grid.shape[0]):
         return grid
     return grid.part(triple((slices.start, 0, 0)), triple((slices.stop - slices.start, *grid.shape[1:])))

@@ -19,18 +19,19 @@ from phyradgs_cl.errors import InputError
 class TimeCells:
     """The time cells of one frame, sorted by line_start.
 
-    - pose (C, 12) in mm: counts the detector's own rows and columns, whatever the readout axis. time_s (C,) in s.
+    - pose (C, 12) in mm, for the detector's own rows and columns, whatever the readout axis. time_s (C,) in s.
     - line_start, line_stop (C,): count lines along the readout ``axis``, which has ``lines`` lines. weight (C,).
-    - line_share (C, lines): the fraction of each line's window that lies in a still cell; it multiplies the weight. None: 1.
+    - line_share (C, lines): the fraction of each line's window that lies in a still cell; it multiplies the weight. None:
+      1.
 
-    - end_poses (C, 2, 12) in mm, end_times_s (C, 2) in s: at the ends of moving cells, whose ``weight`` is 1; None for still
-      cells. Objects that move need the times.
-    - line_times (C, 3, lines): the part of each line's window in a segment. The numbers are the part's middle and half its
-      length, in units of the segment's length from its mid-time, and its fraction of the whole window.
+    - end_poses (C, 2, 12) in mm, end_times_s (C, 2) in s: at the ends of moving cells, whose ``weight`` is 1; None for
+      still cells. Objects that move need the times.
+    - line_times (C, 3, lines): the part of each line's window in a segment. The numbers are the part's middle and half
+      its length, in units of the segment's length from its mid-time, and its fraction of the whole window.
     - is_parallel: poses begin with the direction of parallel rays.
 
-    - conic_pose (12,): only for splats. The cells' poses then place the centres of Gaussians, whose shapes and densities on
-      the panel are those of this pose.
+    - conic_pose (12,): for splats only. The cells' poses then place the centres of Gaussians, whose shapes and densities
+      on the panel are those of this pose.
 
     Methods raise InputError for user-defined cells that do not fit the scan."""
 
@@ -75,12 +76,12 @@ class TimeCells:
 
     @property
     def readout(self) -> Readout:
-        """The readout axis, which puts frames and poses in the order (lines, width)."""
+        """The order of the lines, which puts frames and poses in the order (lines, width)."""
         return Readout(self.axis)
 
     @property
     def is_moving(self) -> bool:
-        """Whether poses change within a cell. Only splats can be projected so."""
+        """Whether poses change within a cell. Only splats can be projected over such cells."""
         return self.end_poses is not None
 
     @property
@@ -97,7 +98,8 @@ class TimeCells:
         return replace(self, pose=self.pose * factors, end_poses=ends, conic_pose=conic)
 
     def finer(self, rows: int, columns: int) -> "TimeCells":
-        """Returns still cells for pixels cut into ``rows`` by ``columns`` parts. The parts of a line share its times."""
+        """Returns still cells for pixels cut into ``rows`` by ``columns`` parts. All parts of a line have the line's
+        times."""
         pose, (of_line, _) = self.pose.copy(), self.readout.shape((rows, columns))
         pose[:, 6:9] /= columns
         pose[:, 9:12] /= rows
@@ -107,7 +109,8 @@ class TimeCells:
         return replace(self, pose=pose, line_share=share, **lines)
 
     def still(self) -> "TimeCells":
-        """Returns these cells, for ray operators. Raises InputError for moving cells and conic poses, which need splats."""
+        """Returns the cells unchanged, for ray operators. Raises InputError for moving cells and conic poses, which need
+        splats."""
         if self.is_moving:
             raise InputError("--motion", "cells with motion", "still cells: only splats move", "take --motion per-row")
         if self.conic_pose is not None:
@@ -115,7 +118,8 @@ class TimeCells:
         return self
 
     def line_poses(self) -> np.ndarray:
-        """Returns each line's pose (lines, 12): that of the cell nearest to its mid-exposure. A single cell gives (1, 12).
+        """Returns each line's pose (lines, 12), that of the cell nearest to its mid-exposure. A table of a single cell
+        gives (1, 12).
 
         Raises InputError for a line without a cell."""
         if self.count == 1:
@@ -135,14 +139,16 @@ class TimeCells:
         return self.pose[cell[nearest[first]]]
 
     def line_cells(self) -> np.ndarray:
-        """Returns for each line a range [first, stop) of cells, (lines, 2). It holds the line's cells, and maybe others."""
+        """Returns for each line a range [first, stop) of cells, (lines, 2), that holds the line's cells, and maybe
+        others."""
         line = np.arange(self.lines)
         first = np.searchsorted(np.maximum.accumulate(self.line_stop), line, side="right")
         return np.stack([first, np.searchsorted(self.line_start, line, side="right")], -1)
 
     @cached_property
     def layer_numbers(self) -> np.ndarray:
-        """The layer (C,) of every cell, from 0 on: a line has at most one cell in a layer. There are as few as possible."""
+        """The layer (C,) of every cell, from 0 on. A line has at most one cell in a layer; layers are as few as
+        possible."""
         numbers = np.zeros(self.count, np.int64)
         free_from: list[int] = []
         for cell, (start, stop) in enumerate(zip(self.line_start, self.line_stop, strict=True)):

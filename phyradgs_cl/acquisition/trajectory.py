@@ -41,7 +41,7 @@ class Trajectory(Protocol):
 
 
 def is_parallel(trajectory: Trajectory) -> bool:
-    """True for poses that begin with the direction of parallel rays: the trajectory has ``is_parallel``."""
+    """Returns whether poses begin with the direction of parallel rays: whether the trajectory's ``is_parallel`` is True."""
     return bool(getattr(trajectory, "is_parallel", False))
 
 
@@ -55,7 +55,8 @@ class Kinematics(Protocol):
 
 @dataclass(frozen=True)
 class ConstantSpeed:
-    """θ(t) = θ0 + ω t: ``angle_start_rad`` at time 0, and ``speed_rad_per_s``. Raises InputError for inf or NaN."""
+    """A constant speed: θ(t) = θ0 + ω t, with ``angle_start_rad`` at time 0 and ``speed_rad_per_s``. Raises InputError
+    for inf or NaN."""
 
     angle_start_rad: float
     speed_rad_per_s: float
@@ -71,7 +72,7 @@ class ConstantSpeed:
 
 @dataclass(frozen=True)
 class SpeedRamp(ConstantSpeed):
-    """θ(t) = θ0 + ω t + ½ a t²: a gantry that speeds up or brakes by ``acceleration_rad_per_s2``.
+    """A gantry that speeds up or brakes by ``acceleration_rad_per_s2``: θ(t) = θ0 + ω t + ½ a t².
 
     ``angle_start_rad`` and ``speed_rad_per_s`` hold at time 0. Raises InputError for infinite values or NaN."""
 
@@ -145,7 +146,8 @@ class FrameSweeps:
 
 
 def continued(trajectory: Trajectory, by_s: float) -> Trajectory:
-    """Extends an orbit's encoder table by ``by_s`` at either end, at the speed there. Other trajectories stay unchanged."""
+    """Returns an orbit whose encoder table is ``by_s`` longer at either end, at the speed there. Other trajectories stay
+    unchanged."""
     if not (isinstance(trajectory, CircularOrbit) and isinstance(trajectory.kinematics, EncoderTable)):
         return trajectory
     table = trajectory.kinematics
@@ -160,7 +162,7 @@ def continued(trajectory: Trajectory, by_s: float) -> Trajectory:
 
 
 def _is_without_jumps(steps_rad: np.ndarray) -> bool:
-    """True where no step (N,) exceeds half a turn, or where steps of a quarter turn and more are usual."""
+    """Returns whether no step (N,) exceeds half a turn, or steps of a quarter turn and more are usual."""
     size_rad = np.abs(steps_rad)
     return bool(size_rad.max(initial=0) <= np.pi or np.median(size_rad) >= np.pi / 2)
 
@@ -256,15 +258,16 @@ def unit_directions(subject: str, poses: np.ndarray) -> np.ndarray:
 def resting_poses(
     poses: np.ndarray, middle_s: np.ndarray, span_s: float, subject: str = "poses", is_parallel: bool = False
 ) -> PoseTable:
-    """Returns a table for a gantry that stops for every frame. Each pose (F, 12) holds for ``span_s``, at least 0.5 s, about
-    its ``middle_s`` (F,) in s."""
+    """Returns a pose table for a gantry that stops for every frame. Each pose (F, 12) holds for ``span_s``, at least 0.5
+    s, about its ``middle_s`` (F,) in s."""
     half_s = max(span_s / 2, 0.25) * (1 - 1e-10)  # two frames in a row must not share a time
     time_s = np.stack([middle_s - half_s, middle_s + half_s], -1).ravel()
     return PoseTable(time_s, np.repeat(poses, 2, axis=0), subject, is_parallel)
 
 
 def resting_trajectory(geometry: Geometry, poses: np.ndarray, middle_s: np.ndarray) -> CircularOrbit | PoseTable:
-    """Returns a circular orbit where the poses (F, 12) of a gantry at rest are those of ``geometry``; otherwise a table."""
+    """Returns a circular orbit where the poses (F, 12) of a gantry at rest are those of ``geometry``; otherwise a pose
+    table."""
     is_parallel = isinstance(geometry, ParallelGeometry)
     side = -1 if is_parallel else 1  # rays run away from where a source would be
     angle_rad = np.arctan2(side * poses[:, 1], side * poses[:, 0])
@@ -274,10 +277,11 @@ def resting_trajectory(geometry: Geometry, poses: np.ndarray, middle_s: np.ndarr
 
 
 def behind_axis(geometry: Geometry, trajectory: Trajectory) -> tuple[Geometry, Trajectory]:
-    """Moves a panel at the axis away from the source, where its rays are the same. Returns geometry and trajectory.
+    """Returns geometry and trajectory with a panel at the axis moved away from the source, to where it meets the same
+    rays.
 
-    No real panel stands in its object: its sizes were scaled to the axis. Rays would end at it, within the object.
-    User-defined trajectories and panels elsewhere stay as they are."""
+    No real panel stands in its object: such a panel's sizes were scaled to the axis. Rays would end at it, within the
+    object. User-defined trajectories and panels elsewhere stay as they are."""
     if not isinstance(geometry, ConeGeometry):
         return geometry, trajectory
     if geometry.source_to_detector_mm > (1 + _AT_AXIS) * geometry.source_to_axis_mm:
@@ -299,7 +303,7 @@ def behind_axis(geometry: Geometry, trajectory: Trajectory) -> tuple[Geometry, T
 
 
 def _is_off_axis(poses: np.ndarray) -> bool:
-    """True where the plane of any panel, with poses (T, 12), does not pass through the origin."""
+    """Returns whether any panel's plane, with poses (T, 12), misses the origin."""
     normal = body_frames(poses)[..., 2]
     from_axis_mm = np.abs(np.einsum("ti,ti->t", poses[:, 3:6], normal))
     return bool((from_axis_mm > _AT_AXIS * np.linalg.norm(poses[:, :3], axis=1)).any())
@@ -317,9 +321,10 @@ _AS_TABLE = "give it as a PoseTable"
 
 
 def sampled(trajectory: Trajectory, frame_start_s: np.ndarray, span_s: float, error_mm: float) -> PoseTable:
-    """Samples a user-defined trajectory over ``span_s`` from each frame's start (F,), to a table within ``error_mm`` of it.
+    """Returns a pose table within ``error_mm`` of a user-defined trajectory, over ``span_s`` from each frame's start
+    (F,).
 
-    Raises InputError where a fine table is not close enough, as for frames that overlap in time with other poses."""
+    Raises InputError where a fine table is not close enough, as for frames that overlap in time with different poses."""
     samples = 2
     while True:
         offsets_s = np.linspace(0.0, max(span_s, _LEAST_SPAN_S), samples)
@@ -343,8 +348,8 @@ def sampled(trajectory: Trajectory, frame_start_s: np.ndarray, span_s: float, er
 
 
 def checked_poses(trajectory: Trajectory, frame: int, time_s: np.ndarray) -> np.ndarray:
-    """Returns poses (T, 12) of a trajectory at times (T,) s. Raises InputError where a user-defined one returns other shapes
-    or numbers that are not finite."""
+    """Returns poses (T, 12) of a trajectory at times (T,) s. Raises InputError where a user-defined trajectory returns
+    other shapes or numbers that are not finite."""
     subject = f"trajectory {type(trajectory).__name__}"
     return checks.numbers(subject, trajectory.pose(frame, time_s), (*time_s.shape, POSE_LENGTH))
 
@@ -352,7 +357,8 @@ def checked_poses(trajectory: Trajectory, frame: int, time_s: np.ndarray) -> np.
 def _checked_table(
     subject: str, times: np.ndarray, rows: np.ndarray, row: tuple[int, ...], what: str, expected: str
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Returns increasing times (T,) and finite rows (T, *row), float64. Raises InputError for others."""
+    """Returns increasing times (T,) and finite rows (T, *row), float64. Raises InputError for times that do not increase
+    and rows of another shape or not finite."""
     time_s, table = checks.numbers(f"{subject} times", times), checks.numbers(f"{subject} {what}", rows)
     if time_s.ndim != 1 or time_s.size < 2 or table.shape != (time_s.size, *row):
         raise InputError(subject, f"shapes {time_s.shape} and {table.shape}", expected)
@@ -370,7 +376,7 @@ def body_frames(table: np.ndarray) -> np.ndarray:
 
 
 def _check_covered(subject: str, frame: int, t: np.ndarray, table_s: np.ndarray) -> None:
-    """Raises InputError for times beyond a table. A nanosecond of tolerance absorbs the rounding of stored times."""
+    """Raises InputError for times beyond a table, by more than a nanosecond, which covers the rounding of stored times."""
     slack = 1e-9 * max(1.0, abs(table_s[-1]))
     if t.size and (t.min() < table_s[0] - slack or t.max() > table_s[-1] + slack):
         found = f"frame {frame} needs {t.min():.6g} to {t.max():.6g} s"

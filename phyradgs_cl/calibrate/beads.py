@@ -42,9 +42,10 @@ _LINEAR_PX = 0.3  # after a larger step, in pixels, the signals are computed ane
 
 @dataclass(frozen=True, eq=False)
 class BeadOperator:
-    """Frames (F, rows, columns) of a phantom seen along the lines of ``tables``, by a detector of ``model``.
+    """Computes the frames (F, rows, columns) of a phantom along the lines of ``tables``, for a detector of ``model``.
 
-    ``samples``: rays along each side of a pixel. ``clipped_noise``: standard deviation of noise clipped at 0, or 0."""
+    samples: rays along each side of a pixel. clipped_noise: standard deviation of noise that was clipped at 0; 0 without
+    clipping."""
 
     phantom: EllipsoidPhantom
     tables: Sequence[TimeCells]
@@ -54,7 +55,8 @@ class BeadOperator:
     clipped_noise: float
 
     def forward(self, placement: np.ndarray) -> np.ndarray:
-        """Returns the line integrals of the phantom at a placement (7,)."""
+        """Returns the frames of the phantom at a placement (7,): a turn (rotation vector, rad), a shift (mm), and a
+        density factor."""
         pose, weight = _poses_by_line(self.tables)
         frames, lines, samples = weight.shape
         turn = Rotation.from_rotvec(placement[:3]).as_matrix()
@@ -80,7 +82,8 @@ class BeadOperator:
 
 
 def _mean_of_clipped(p: np.ndarray, sigma: float) -> np.ndarray:
-    """Returns the mean of max(p + noise, 0) for normal noise. Clipping raises air more than faint shadows."""
+    """Returns the mean of max(p + noise, 0) for normal noise of deviation ``sigma``. Clipping raises air more than faint
+    shadows."""
     ratio = p / sigma
     return p * scipy.special.ndtr(ratio) + sigma * np.exp(-(ratio**2) / 2) / math.sqrt(2 * math.pi)
 
@@ -138,8 +141,9 @@ class _PanelLines:
 
     @cached_property
     def _panel_axes(self) -> tuple[tuple[np.ndarray, ...], ...]:
-        """Vectors (N, 3) whose inner products with a place are its distance from the source (in panel distances), its line
-        and its pixel. Each comes with the products of the source and of the first pixel (N,), and with its length (N,).
+        """Vectors (N, 3) whose inner products with a place in mm give its distance from the source (in panel distances),
+        its line and its pixel. Each comes with its products with the source and with the first pixel (N,), and with its
+        length (N,).
 
         In a parallel beam the distance is 1, and lines and pixels are those that a ray through the place meets."""
         normal = np.cross(self.line_step, self.pixel_step)
@@ -177,7 +181,8 @@ class _PanelLines:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class BeadProblem(CoarseFrames):
-    """The problem of ``CoarseProblem`` for a known phantom. Its objects are placements (7,); ``start`` is a guess."""
+    """The problem of ``CoarseProblem`` for a known phantom. Its placement (7,) takes the place of a volume; ``start`` is
+    a first guess."""
 
     phantom: EllipsoidPhantom
     start: np.ndarray
@@ -211,11 +216,11 @@ class BeadProblem(CoarseFrames):
         return BeadOperator(self.phantom, tables, small.geometry.detector_shape, model, rays, self.clipped_noise)
 
     def residual(self, operator: BeadOperator, placement: np.ndarray) -> np.ndarray:
-        """Returns measured less expected frames (F, rows, columns), without a smooth background."""
+        """Returns measured less expected frames (F, rows, columns), less a smooth background."""
         return self._without_background(self.measured - operator.forward(placement))
 
     def noise(self, residual: np.ndarray) -> float:
-        """Returns the standard deviation of a pixel, from noise and model errors."""
+        """Returns the standard deviation of the residual's valid pixels, which holds noise and model errors."""
         return float(np.std(residual if self.valid is None else residual[self.valid]))
 
     def explained(self, operator: BeadOperator, placement: np.ndarray) -> float:
@@ -251,18 +256,21 @@ class BeadProblem(CoarseFrames):
         return list(beyond.reshape(len(images), *self.measured.shape))
 
     def compared(self, frames: np.ndarray) -> np.ndarray:
-        """Returns the values that enter the misfit (F · pixels), float64: without background, blurred over single rays."""
+        """Returns the values (F · pixels,) float64 of frames that enter the misfit: blurred beyond single rays, without
+        background."""
         blurred = gaussian_filter(self._without_background(frames), (0, _BLUR_PX, _BLUR_PX), output=np.float64)
         return blurred.ravel()
 
     def _units(self) -> np.ndarray:
-        """Returns the amount of each number (7,) that moves a frame by a pixel at its edge, or doubles the density."""
+        """Returns the step (7,) of each number of a placement that moves a frame by a pixel at its edge, or doubles the
+        density."""
         scan = self.scans[0]
         pixel_mm = self.block * min(scan.geometry.pixel_size_mm) / scan.geometry.magnification
         return np.array([pixel_mm / (max(scan.grid.size_mm) / 2)] * 3 + [pixel_mm] * 3 + [1.0])
 
     def _signals(self, operator: BeadOperator, placement: np.ndarray) -> np.ndarray:
-        """Returns the change of the compared values (7, F · pixels) per unit of each number."""
+        """Returns the change (7, F · pixels) of the compared values per unit (``_units``) of each number of the
+        placement."""
         signals = []
         for number, unit in enumerate(self._units()):
             step = np.eye(DENSITY + 1)[number] * _STEP_PX * unit
@@ -271,7 +279,7 @@ class BeadProblem(CoarseFrames):
         return np.array(signals)
 
     def _without_background(self, frames: np.ndarray) -> np.ndarray:
-        """Returns frames less the background, which is their fit by a few cosines along each side."""
+        """Returns frames (F, rows, columns) less their fit by a few slow cosines along each side."""
         rows, columns = (_cosines(count) for count in frames.shape[1:])
         if self.valid is None:
             inner = np.einsum("vi,fvu,uj->fij", rows, frames, columns)
@@ -285,9 +293,10 @@ class BeadProblem(CoarseFrames):
 
 
 def _clipped_noise(scans: Sequence[Scan]) -> float:
-    """Returns the standard deviation of the noise about air where it was clipped at 0, from means of small blocks.
+    """Returns the standard deviation of the noise in air where the scans' noise was clipped at 0, from means of small
+    blocks.
 
-    Returns 0 where few pixels are 0."""
+    Returns 0 where few pixels are 0, or some are below."""
     values = np.concatenate([np.asarray(scan.projections, np.float32) for scan in scans])
     valid = np.concatenate([scan.valid for scan in scans])
     if np.mean(values[valid] == 0) < _LEAST_ZEROS or values[valid].min() < 0:
@@ -297,8 +306,9 @@ def _clipped_noise(scans: Sequence[Scan]) -> float:
 
 
 def _with_spread_of(scan: Scan, times: int) -> Scan:
-    """Returns the scan with longer exposures about the same middle, so that ``times`` moments have the standard deviation of
-    the whole exposure. Otherwise few moments would look like a shorter exposure. Pulses stay unchanged."""
+    """Returns the scan with longer exposures about the same middle, so that ``times`` moments spread as widely as the
+    whole exposure (standard deviation). Otherwise few moments would look like a shorter exposure. Scans with a pulse stay
+    unchanged."""
     if scan.shutter.pulse_s is not None:
         return scan
     exposure_s = scan.shutter.exposure_s / math.sqrt(1 - times**-2)
@@ -315,7 +325,7 @@ def _moved(placement: np.ndarray, step: np.ndarray) -> np.ndarray:
 
 
 def _cosines(count: int) -> np.ndarray:
-    """Returns the slowest cosines (count, n) along a side, which are orthonormal."""
+    """Returns the slowest cosines (count, n) along a side of ``count`` pixels, orthonormal."""
     order = np.arange(min(_BACKGROUND, count))
     waves = np.cos(np.pi * order * (np.arange(count)[:, None] + 0.5) / count)
     return waves / np.linalg.norm(waves, axis=0)

@@ -25,12 +25,13 @@ _DEGREES = math.degrees(1.0)
 
 @dataclass(frozen=True)
 class Parameter:
-    """A field of ``GeometryCorrection``.
+    """A parameter that can be calibrated: the field of ``GeometryCorrection`` that it changes.
 
     - scale: displayed units per unit of the field.
     - object_instead: the object that explains the frames as well, where they do not determine the parameter.
     - pixels: how far a unit of the field moves the image at its edge.
-    - mismatch: measured errors (docs/calibrate.md) over those of noise, because voxels do not represent the object exactly.
+    - mismatch: measured errors (docs/calibrate.md) over those of noise, because voxels do not represent the object
+      exactly.
     - is_axial: the parameter moves the image along the axis, like ``LIFT``. The others move it across, like ``TURN``."""
 
     name: str
@@ -52,11 +53,12 @@ class Parameter:
         return min(step, _TIMING_STEP * self.stated(scan) or step) if self.is_timing else step
 
     def is_known(self, deviation: float) -> bool:
-        """Returns whether a value with this standard deviation, in the field's unit, is useful."""
+        """Returns whether a value with the standard deviation ``deviation``, in the field's unit, is of use: an angle may
+        not be too uncertain, others always are."""
         return self.unit != "deg" or deviation < _LEAST_KNOWN_RAD
 
     def lowest(self, scan: Scan) -> float:
-        """Returns the lowest value of the field to try, at which times are still above 0."""
+        """Returns the lowest correction of the field to try: one that leaves times above 0; −∞ for other parameters."""
         stated = self.stated(scan) if self.is_timing else 0.0
         return -_LARGEST_CUT * stated if stated > 0 else -math.inf
 
@@ -70,13 +72,13 @@ def _pitch_mm(scan: Scan) -> float:
 
 
 def _edge_pixels(scan: Scan, factor: float = 1.0) -> float:
-    """Returns how many pixels a radian of roll moves the panel's further edge, times a factor."""
+    """Returns by how many pixels a radian of roll moves the panel's further edge, times ``factor``."""
     return factor * max(_half_mm(scan, 0), _half_mm(scan, 1)) / _pitch_mm(scan)
 
 
 def _tilt_pixels(axis: int) -> Callable[[Scan], float]:
-    """Returns how many pixels a radian of tilt moves the panel's edge. A tilt magnifies one side: points move by the square
-    of their distance from its axis."""
+    """Returns a function of the scan: by how many pixels a radian of tilt moves the panel's edge. A tilt magnifies one
+    side, so that points move by the square of their distance from its axis."""
     return lambda scan: _half_mm(scan, axis) ** 2 / _cone(scan).source_to_detector_mm / _pitch_mm(scan)
 
 
@@ -152,8 +154,8 @@ NAMES = list(dict.fromkeys([*PARAMETER_GROUPS, *PARAMETERS, WOBBLE, MOTION, DIRE
 
 @dataclass(frozen=True)
 class Request:
-    """The parameters to estimate. ``per_view``: wobble, motion or nothing (""). ``asks_direction``: whether to test which
-    line is read first."""
+    """What to estimate. parameters: those of all views. per_view: "wobble", "motion" or "". asks_direction: whether to
+    test which line is read first."""
 
     parameters: list[Parameter]
     per_view: str
@@ -165,12 +167,13 @@ class Request:
 
 
 def requested(what: str | None, scan: Scan, knows_shape: bool = False) -> Request:
-    """Returns the request in names separated by commas. A parallel beam has neither tilt nor distances.
+    """Returns the request that ``what`` states, names separated by commas. knows_shape: the object's shape is known.
 
-    None takes offset, roll and tilt, in a fly-scan also readout and exposure, for an object of known shape also distances.
+    None takes offset, roll and tilt, in a fly-scan with a rolling readout also readout and exposure, for an object of
+    known shape also distances. A parallel beam has neither tilt nor distances.
 
-    Raises InputError for an unknown name, distances and tilts of a parallel beam, wobble together with motion, the timing of
-    a gantry that stands still, and a readout of 0 s."""
+    Raises InputError for an unknown name, distances and tilts of a parallel beam, wobble together with motion, the timing
+    of a gantry that stands still, and a readout of 0 s."""
     if what is None:
         is_rolling = _turns(scan) and scan.shutter.readout_s > 0
         what = "offset,roll" if scan.is_parallel else "offset,roll,tilt"
@@ -213,7 +216,8 @@ def correction_of(values: Mapping[str, float]) -> GeometryCorrection:
 
 
 def in_words(weights: Mapping[str, float]) -> str:
-    """Describes a combination of parameters (weights by name). The largest comes first; small ones are left out."""
+    """Returns a combination of parameters (weights by name) in words: the largest weight first, without weights below 0.3
+    of the largest."""
     order = sorted(weights, key=lambda name: -abs(weights[name]))
     largest = abs(weights[order[0]])
     main, *others = [name for name in order if abs(weights[name]) > 0.3 * largest]

@@ -37,7 +37,8 @@ _DEVIATIONS = 3.0  # a kind is corrected where its RMS over the views exceeds th
 
 @dataclass(frozen=True)
 class Kind:
-    """A kind of parameter: its name and unit in the table, and how much of that unit is one unit of the parameter."""
+    """A kind of parameter: its name and unit in the table; scale: how many of that unit are one internal unit (rad or
+    mm)."""
 
     name: str
     unit: str
@@ -68,10 +69,11 @@ class PerViewParameters(ABC):
 
     @abstractmethod
     def without_gauges(self, values: np.ndarray) -> np.ndarray:
-        """Returns values (n, K) without the part that another object explains exactly."""
+        """Returns values (n, K) less the part that a moved object explains exactly."""
 
     def kinds_of_stage(self, number: int, count: int) -> Sequence[int]:
-        """Returns the kinds to estimate in a stage. By default these are all kinds."""
+        """Returns the indices of the kinds to estimate in stage ``number`` of ``count``: all, unless a subclass leaves
+        some out."""
         return range(len(self.KINDS))
 
     def operator(
@@ -81,7 +83,7 @@ class PerViewParameters(ABC):
 
 
 class WobbleParameters(PerViewParameters):
-    """A turn and two shifts per view, either separate for each view or as splines of time."""
+    """One turn (rad) and two shifts along v and u (mm) per view: separate for each view, or as splines of time."""
 
     KINDS = (Kind("turn per view", "deg", _DEG), Kind("shift-v per view", "mm", 1.0), Kind("shift-u per view", "mm", 1.0))
     MISMATCH = 4.0
@@ -89,7 +91,7 @@ class WobbleParameters(PerViewParameters):
 
     @classmethod
     def of(cls, scan: Scan, count: int = 0) -> "WobbleParameters":
-        """Returns zeros for every view, or for ``count`` splines."""
+        """Returns parameters of 0: separate ones for every view with ``count`` 0, else ``count`` splines of time."""
         if count:
             basis = splines(scan_course(scan) + 0.5, count)
             circle = _fitted_circle(scan, basis)
@@ -102,8 +104,8 @@ class WobbleParameters(PerViewParameters):
         return Views(per_view[:, TURN], per_view[:, SHIFT_V:])
 
     def without_gauges(self, values: np.ndarray) -> np.ndarray:
-        """Returns values without what a turned or shifted object explains: the mean of turns and of shifts along v, and
-        shifts along u that vary as cosine and sine of the angle."""
+        """Returns values (n, K) less what a turned or shifted object explains: the means of turns and of shifts along v,
+        and shifts along u that vary as cosine and sine of the angle."""
         rest = values.copy()
         rest[:, :SHIFT_U] -= (self.basis @ rest[:, :SHIFT_U]).mean(0)
         pattern, shifts = self.basis @ self.circle, self.basis @ rest[:, SHIFT_U]
@@ -111,14 +113,14 @@ class WobbleParameters(PerViewParameters):
         return rest
 
     def kinds_of_stage(self, number: int, count: int) -> Sequence[int]:
-        """Returns the kinds of a stage. Turns need fine detail, so they are estimated on the last two grids only, each time
-        from 0. The difference between the two grids then shows their error."""
+        """Returns the kinds of a stage. Turns need fine detail, so the last two grids alone estimate them, each from 0:
+        the difference between the two grids then shows their error."""
         return (TURN, SHIFT_V, SHIFT_U) if number >= count - 2 else (SHIFT_V, SHIFT_U)
 
 
 @dataclass(frozen=True, eq=False)
 class MotionParameters(PerViewParameters):
-    """Three turns and three shifts of the object, as splines of time."""
+    """Three turns (rad) and three shifts (mm) of the object about and along x, y, z, as splines of time."""
 
     still: Sway
 
@@ -142,7 +144,7 @@ class MotionParameters(PerViewParameters):
         return replace(self.still, coefficients=values)
 
     def without_gauges(self, values: np.ndarray) -> np.ndarray:
-        """Returns values without what another object explains. An object elsewhere explains the mean of each kind; a larger
+        """Returns values (n, K) less what a still object explains. One elsewhere explains the mean of each kind; a larger
         or smaller one explains shifts along x and y that follow the source."""
         rest = values - (self.basis @ values).mean(0)
         towards_source = self.circle - (self.basis @ self.circle).mean(0)
@@ -158,7 +160,8 @@ def _turn_unit_rad(scan: Scan) -> float:
 
 
 def units_of_views(scan: Scan) -> np.ndarray:
-    """Returns the turn (rad) and the shifts along v and u (mm) that move a view's frame by a pixel at its edge."""
+    """Returns (3,) the turn in rad and the shifts along v and u in mm that each move a view's frame by a pixel at its
+    edge."""
     return np.array([_turn_unit_rad(scan), *scan.geometry.pixel_size_mm])
 
 
@@ -176,8 +179,9 @@ def view_step(
     problem: CoarseProblem, correction: GeometryCorrection, parameters: PerViewParameters, volume: np.ndarray,
     kinds: Sequence[int], iterations: int,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the Gauss–Newton step (n, K) from the parameters' values for the object ``volume``; it is 0 for kinds outside
-    of ``kinds``. Also returns the signals (F, kinds, rows, columns) of a movement by one pixel, for each kind."""
+    """Returns a Gauss–Newton step (n, K) from the parameters' values at the object ``volume``, 0 for kinds outside of
+    ``kinds``. Also returns the signals (F, kinds, rows, columns): the change of the frames when each kind moves them by
+    one pixel."""
     operator = parameters.operator(problem, correction)
     residual = problem.residual(operator, volume)
     signals = np.stack([_signal(problem, correction, parameters, volume, kind) for kind in kinds], 1)
@@ -204,9 +208,11 @@ def view_deviations(
     problem: CoarseProblem, correction: GeometryCorrection, parameters: PerViewParameters,
     signals: np.ndarray, iterations: int,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Returns standard deviations (K,) of a view's parameters, and the shares (K,) of signals that no object explains.
+    """Returns the standard deviation (K,) of a view's parameter of each kind, in the parameters' units, and the fraction
+    (K,) of each kind's signals that no object explains.
 
-    signals: (F, K, rows, columns). The errors of the values that make up a view are taken as independent."""
+    signals: (F, K, rows, columns), changes of the frames per pixel of movement, of all kinds. Errors of the spline
+    coefficients that make up a view's value count as independent."""
     operator = parameters.operator(problem, correction)
     norms = _norms(parameters.basis, signals)
     noise = noise_level(problem.measured, problem.valid)
@@ -218,12 +224,12 @@ def view_deviations(
 
 
 def _norms(basis: np.ndarray, signals: np.ndarray) -> np.ndarray:
-    """Returns the norms (n, K) of each value's signal."""
+    """Returns the norm (n, K) of the frames' change per coefficient, from ``signals`` (F, K, rows, columns)."""
     return np.sqrt(basis.T**2 @ np.sum(np.square(signals, dtype=np.float64), (2, 3)))
 
 
 def _strength(operator: RayOperator) -> float:
-    """Returns a rough largest singular value of A. Parameters in its units converge as fast as the object does."""
+    """Returns a rough largest singular value of A in mm. Parameters scaled to it converge as fast as the object does."""
     lengths = operator.forward(np.ones(operator.volume_shape, np.float32))
     return float(np.linalg.norm(operator.adjoint(lengths)) / np.linalg.norm(lengths))
 
@@ -232,7 +238,7 @@ def _signal(
     problem: CoarseProblem, correction: GeometryCorrection, parameters: PerViewParameters, volume: np.ndarray,
     kind: int,
 ) -> np.ndarray:
-    """Returns the change of the frames (F, rows, columns) by a kind, where it moves each view by one pixel."""
+    """Returns the change of the frames (F, rows, columns) for ``kind``, per pixel of movement of each view."""
     step_px = _STEP_PX * problem.block
     step = np.zeros(len(parameters.units))
     step[kind] = step_px * parameters.units[kind]
@@ -243,7 +249,7 @@ def _signal(
 def _share(
     problem: CoarseProblem, operator: RayOperator, basis: np.ndarray, signals: np.ndarray, iterations: int
 ) -> float:
-    """Returns the fraction of signals (F, rows, columns), with random signs, that no object explains."""
+    """Returns the fraction of signals (F, rows, columns), with random signs, that no object explains, 0 to 1."""
     signs = np.random.default_rng(0).choice([-1.0, 1.0], basis.shape[1]).astype(np.float32)
     probe = signals * (basis @ signs).astype(np.float32)[:, None, None]
     (rest,) = problem.beyond_object(operator, np.zeros(operator.volume_shape, np.float32), [probe], iterations)
@@ -252,14 +258,16 @@ def _share(
 
 @dataclass(frozen=True, eq=False)
 class ViewsEstimate:
-    """``views``: corrections of significant kinds, None without any. ``table``: a line of the table per kind."""
+    """The result of ``estimate_views``. views: the corrections, 0 for kinds that are not significant; None where no kind
+    is. table: an estimate per kind, whose value is the root mean square over the views."""
 
     views: Views | Sway | None
     table: list[ParameterEstimate]
 
 
 def passes_of_views(scan: Scan, stages: Sequence[Stage], kinds: int) -> Passes:
-    """Returns the passes through the frames that ``estimate_views`` makes."""
+    """Returns the number of passes through the frames that ``estimate_views`` makes, and their total cost
+    (``pass_cost``)."""
     costs = [pass_cost([scan], stage.columns, scan.frames) for stage in stages]
     counts = [stage.first + (_STEPS - 1) * stage.again + _STEPS * _ITERATIONS for stage in stages]
     counts[-1] += kinds * _ITERATIONS
@@ -270,7 +278,8 @@ def estimate_views(
     rt: Runtime, scan: Scan, parameters: PerViewParameters, stages: Sequence[Stage],
     correction: GeometryCorrection, passes: PassCounter,
 ) -> ViewsEstimate:
-    """Estimates ``parameters`` of a scan after ``correction``, in a few Gauss–Newton steps per stage.
+    """Estimates ``parameters`` of a scan after ``correction``, in a few Gauss–Newton steps per stage, on ever finer
+    grids.
 
     A deviation combines noise and discretisation error, which is half the change since the coarser grid."""
     for number, stage in enumerate(stages):

@@ -33,9 +33,11 @@ def bead_centres_mm(phantom: EllipsoidPhantom) -> np.ndarray:
 
 
 def placements(phantom: EllipsoidPhantom, volume: np.ndarray, grid: Grid) -> list[np.ndarray]:
-    """Returns placements (6,), the best first, which take most of the known beads to bright spots of a volume (z, y, x).
+    """Returns up to 6 placements (6,), the best first, that take most of the known beads to bright spots of ``volume``
+    (nz, ny, nx).
 
-    A placement is a turn (rotation vector, rad) and a shift (mm). Raises InputError where none does."""
+    A placement is a turn (rotation vector, rad) and a shift (mm). Raises InputError where no placement takes three
+    quarters of the beads to spots."""
     beads_mm = bead_centres_mm(phantom)
     radius_mm = np.median([body.reach_mm for body in phantom.ellipsoids if isinstance(body, Ellipsoid)])
     smooth = gaussian_filter(volume, _SMOOTH * radius_mm / np.array(grid.voxel_size_mm))
@@ -67,7 +69,8 @@ def placements(phantom: EllipsoidPhantom, volume: np.ndarray, grid: Grid) -> lis
 
 
 def _peaks_mm(volume: np.ndarray, grid: Grid, most: int) -> np.ndarray:
-    """Returns the bright spots (m, 3), x y z in mm, of a volume (z, y, x): the centroids about its largest local maxima."""
+    """Returns the bright spots (m, 3), m ≤ ``most``, x y z in mm, of a volume (nz, ny, nx): the centroids of the 3³
+    voxels about its largest positive local maxima, without maxima in the outermost voxels."""
     inner = np.zeros(volume.shape, bool)
     inner[1:-1, 1:-1, 1:-1] = True
     peaks = np.argwhere((volume == maximum_filter(volume, 3)) & inner & (volume > 0))
@@ -85,8 +88,8 @@ def _peaks_mm(volume: np.ndarray, grid: Grid, most: int) -> np.ndarray:
 def _matching_triangles(
     beads_mm: np.ndarray, spots_mm: np.ndarray, within_mm: float
 ) -> Iterator[tuple[tuple[int, int, int], list[int]]]:
-    """Yields triangles of known points (n, 3) with triangles of seen points (m, 3) whose sides differ by less than
-    ``within_mm``."""
+    """Yields triangles of beads (n, 3) with triangles of spots (m, 3) whose sides differ by less than ``within_mm``, as
+    three indices each."""
     rng = np.random.default_rng(0)
     apart = np.linalg.norm(spots_mm[:, None] - spots_mm, axis=-1)
     for _ in range(_TRIANGLES):
@@ -100,7 +103,7 @@ def _matching_triangles(
 
 
 def _rigid(points: np.ndarray, targets: np.ndarray) -> np.ndarray:
-    """Returns the turn and shift (6,) that take points (n, 3) nearest to targets (n, 3)."""
+    """Returns the turn (rad) and shift (mm), (6,), that take points (n, 3) nearest to targets (n, 3), both in mm."""
     middle, there = points.mean(0), targets.mean(0)
     turn, _ = Rotation.align_vectors(targets - there, points - middle)
     return np.concatenate([turn.as_rotvec(), there - turn.apply(middle)])

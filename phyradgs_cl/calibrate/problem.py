@@ -30,10 +30,11 @@ _TV = FistaTvOptions(tv_weight=0.0005, tv_iterations=8)
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class CoarseFrames:
-    """``scans`` as stated, without pixels and with at most 60 frames each, and what was measured.
+    """The scans as stated, without pixels and with fewer frames, and their binned measurement.
 
-    measured (F, rows, columns): all frames in blocks of ``block`` pixels; valid: their valid pixels, None for all.
-    ``count_pass`` is called once per iteration, in which the frames are passed forward and back."""
+    measured (F, rows, columns): all scans' frames, in line integrals averaged over blocks of ``block`` × ``block``
+    pixels. valid, of the same shape: valid pixels; None: all. ``count_pass`` is called once per iteration, in which all
+    frames are projected and backprojected."""
 
     scans: Sequence[Scan]
     block: int
@@ -68,7 +69,7 @@ class CoarseProblem(CoarseFrames):
     def of(
         cls, rt: Runtime, scans: Sequence[Scan], stage: Stage, most_frames: int = coarse.MOST_FRAMES
     ) -> "CoarseProblem":
-        """Makes the scans as coarse as the stage says."""
+        """Returns the problem with the scans binned as ``stage`` says, and at most ``most_frames`` frames of each."""
         block = stage.block(scans[0])
         fewer = [coarse.fewer_frames(scan, most_frames) for scan in scans]
         small = [coarse.binned(coarse.smooth(scan, _smoothing_px(scan, block)), block) for scan in fewer]
@@ -84,7 +85,11 @@ class CoarseProblem(CoarseFrames):
         return replace(problem, measured=problem.masked(measured))
 
     def operator(self, correction: GeometryCorrection, views: Views | Sway | None = None) -> RayOperator:
-        """Returns the operator A of all frames after a correction."""
+        """Returns the operator A of the coarse frames of all scans, with the geometry changed by ``correction`` and
+        ``views``.
+
+        Each line integrates over 2 to 8 times of its exposure. views: changes of single views or of the object's pose;
+        None: none."""
         tables = []
         for scan in self.scans:
             small = coarse.binned(perturb(scan, correction, views), self.block)
@@ -94,8 +99,8 @@ class CoarseProblem(CoarseFrames):
         return RayOperator(self.rt, self.grid, small.geometry.detector_shape, tables, fewest_lines=FEWEST_LINES)
 
     def line_integrals(self, operator: RayOperator, volume: np.ndarray) -> np.ndarray:
-        """Returns the measurement as mean line integrals. A detector that averages intensity lowers line integrals at edges;
-        the difference is added as it is for ``volume``."""
+        """Returns the measurement as mean line integrals. A detector that averages intensity measures less at edges; the
+        difference at ``volume`` is added."""
         if self.scans[0].detector_model != "intensity":
             return self.measured
         return self.measured + self.masked(operator.forward(volume) - self._expected(operator, volume))
@@ -107,7 +112,8 @@ class CoarseProblem(CoarseFrames):
         return IntensityOperator(self.rt, self.grid, operator.detector_shape, operator.tables).expected(volume)
 
     def reconstruct(self, operator: RayOperator, start: np.ndarray | None, iterations: int) -> np.ndarray:
-        """Returns a nonnegative volume with little total variation, iterated from ``start``."""
+        """Returns a nonnegative volume (nz, ny, nx) with little total variation, after ``iterations`` from ``start``
+        (None: zeros)."""
         volume = np.zeros(self.grid.shape, np.float32) if start is None else start
         system = System(operator, self.line_integrals(operator, volume), self.valid)
         method = FistaTv(system, _TV, TvProx(self.rt, self.grid.shape, axis_weights(self.grid)))
@@ -118,7 +124,7 @@ class CoarseProblem(CoarseFrames):
         return method.volume
 
     def compared(self, frames: np.ndarray) -> np.ndarray:
-        """Returns the values of frames that enter the misfit (F · pixels)."""
+        """Returns the values (F · pixels,) of frames that enter the misfit: 0 at invalid pixels."""
         return self.masked(frames).ravel()
 
     def residual(self, operator: RayOperator, volume: np.ndarray) -> np.ndarray:
@@ -126,7 +132,8 @@ class CoarseProblem(CoarseFrames):
         return self.measured - self.masked(self._expected(operator, volume))
 
     def noise(self, residual: np.ndarray) -> float:
-        """Returns the standard deviation of a pixel's noise. A volume fits some noise, so ``residual`` is not used."""
+        """Returns the standard deviation of a pixel's noise, from the measurement: a volume would fit some noise of
+        ``residual``."""
         return noise_level(self.measured, self.valid)
 
     def beyond_object(
@@ -146,9 +153,9 @@ class CoarseProblem(CoarseFrames):
 
 
 def _smoothing_px(scan: Scan, block: int) -> float | tuple[float, float]:
-    """Returns the smoothing of blocks across rows and columns, in pixels. Rows read one after the other see the object
-    turned: smoothing across them would look like a shorter readout. Columns read so are sheared, which smoothing does not
-    change."""
+    """Returns the smoothing across (rows, columns), in pixels, before binning. Rows that are read one after the other see
+    the object at other angles: smoothing across them would look like a shorter readout. Columns read so are sheared,
+    which smoothing does not change."""
     if block == 1:
         return 0.0
     is_rolling = scan.shutter.readout_s > 0 and scan.shutter.axis == "rows"

@@ -22,8 +22,8 @@ _ROW_INCH, _CURVES_INCH, _WIDTH_INCH = 1.8, 2.4, 7.0
 class ParameterEstimate:
     """One parameter in ``unit``: its stated value, and the value found with its standard deviation.
 
-    These two are None where the frames do not determine the parameter. ``share``: the part of its signal that remains after
-    object and other parameters have adapted, 0 to 1."""
+    The latter two are None where the frames do not determine the parameter. share: the fraction of the frames' change
+    with the parameter that no object and no other parameter explains, 0 to 1."""
 
     name: str
     unit: str
@@ -80,11 +80,11 @@ class Calibration:
         }
 
     def per_view(self) -> dict[str, np.ndarray]:
-        """Returns the corrections of every view, (F,) by name and unit. Without corrections it is empty.
+        """Returns the corrections of every view, (F,) by name and unit; {} without corrections of views.
 
-        A wobble is added to the stated poses: source and panel turn counterclockwise as seen from above, and the panel moves
-        along its own v and u. A motion is the object's position in the middle of each view: turned about x, y and z, then
-        moved along them."""
+        A wobble is added to the stated poses: source and panel turn counterclockwise as seen from above, and the panel
+        moves along its own v and u. A motion is the object's position in the middle of each view: rotated about x, y and
+        z, then shifted along them."""
         if self.views is None:
             return {}
         if isinstance(self.views, Views):

@@ -179,8 +179,8 @@ class _Calibrator:
             self.search.fallback = {OFFSET_U: Fallback(shift.pixels * pitch_mm, shift.deviation * pitch_mm, is_significant)}
 
     def _search_common(self) -> None:
-        """Searches the parameters common to all views, in a scan whose views are corrected first. Their errors would look
-        like a roll."""
+        """Searches the parameters that all views share, in a scan whose single views are corrected first, because their
+        errors would look like a roll."""
         steady = self.ready
         if self.per_view is not None:
             self.passes.begin("views before", "views, before the rest")
@@ -195,8 +195,8 @@ class _Calibrator:
             self.passes.plan |= self._plan_of_stages(len(self.search.determined), number + 1)
 
     def _with_steady_views(self, scan: Scan) -> Scan:
-        """Returns the scan with its views corrected. A common shift along u counts as the panel's offset, if that is a
-        parameter."""
+        """Returns the scan with its single views corrected. The mean of their shifts along u counts as the panel's
+        offset, if the offset is to be estimated."""
         views = self._estimate_views(correction_of(self.search.at)).views
         if isinstance(views, Views) and OFFSET_U in self.search.at:
             common_mm = float(views.shift_mm[:, 1].mean())
@@ -205,7 +205,7 @@ class _Calibrator:
         return scan if views is None else perturb(scan, GeometryCorrection(), views)
 
     def _estimate_views(self, correction: GeometryCorrection) -> ViewsEstimate:
-        """Returns the views' estimate after a correction. It is made once for each correction."""
+        """Returns the estimate of single views after ``correction``, computed once for each correction."""
         assert self.per_view is not None
         if correction not in self.views_estimates:
             self.views_estimates[correction] = estimate_views(
@@ -214,7 +214,7 @@ class _Calibrator:
         return self.views_estimates[correction]
 
     def _problem(self, scans: Sequence[Scan], stage: Stage, most_frames: int = MOST_FRAMES) -> Problem:
-        """Returns the frames on the grid of a stage. The passes through them are counted."""
+        """Returns the frames on the grid of ``stage``, with their passes counted."""
         problem: Problem
         if self.phantom is None:
             problem = CoarseProblem.of(self.rt, scans, stage, most_frames)
@@ -223,7 +223,8 @@ class _Calibrator:
         return replace(problem, count_pass=self.passes.counter(pass_cost(scans, stage.columns, most_frames)))
 
     def _place(self, phantom: EllipsoidPhantom) -> np.ndarray:
-        """Returns a first placement (7,) of the phantom: the one of those seen that explains the frames best."""
+        """Returns a first placement (7,) of the phantom: among those where its beads are seen, the one that explains the
+        frames best."""
         bead_centres_mm(phantom)
         correction = correction_of(self.search.at)
         voxels = CoarseProblem.of(self.rt, self.ready, STAGES[-1])
@@ -241,9 +242,11 @@ class _Calibrator:
         return placement
 
     def _test_direction(self) -> list[ParameterEstimate]:
-        """Compares the residuals with lines read from either end, and corrects the scans' direction.
+        """Compares the residuals with lines read from either end, and corrects the scans' direction. Returns its line of
+        the table.
 
-        A correction takes four standard errors and 4 %. The deviation is that of a direction between 1 and −1."""
+        A correction takes four standard errors and 4 % of the squared residual. The deviation is that of a direction, 1
+        or −1."""
         self.passes.begin("order", "which line is read first")
         stage = self.stages[min(1, len(self.stages) - 1)]
         reverse = [reversed_readout(scan) for scan in self.ready]
@@ -267,7 +270,7 @@ class _Calibrator:
         return problem.residual(operator, problem.reconstruct(operator, None, stage.first))
 
     def _plan(self) -> dict[str, Passes]:
-        """Returns the most passes through the frames that each phase may need, in order."""
+        """Returns the largest number of passes through the frames, and their cost, of each phase by name, in order."""
         second, last = self.stages[min(1, len(self.stages) - 1)], self.stages[-1]
         parameters, views, most_frames = len(self.request.parameters), (0, 0.0), MOST_FRAMES
         if self.per_view is not None:
@@ -301,7 +304,7 @@ def _in_short(one: ParameterEstimate) -> str:
 
 
 def _with_provenance(corrected: Scan, scan: Scan, calibration: Calibration) -> Scan:
-    """Returns the corrected scan with this calibration in its provenance, after earlier ones."""
+    """Returns the corrected scan with this calibration in its provenance, behind earlier calibrations."""
     provenance = dict(scan.provenance)
     if (former := provenance.get("calibration")) is not None:
         earlier = provenance.get("calibrated_before", [])
@@ -338,7 +341,7 @@ def _check(scans: Sequence[Scan], request: Request, phantom: EllipsoidPhantom | 
 
 
 def _warn(scans: Sequence[Scan], phantom: EllipsoidPhantom | None) -> None:
-    """Warns of an unknown object wider than the panel, and of other scans with the same turn and timing."""
+    """Warns of an unknown object wider than the panel, and of further scans with the turn and timing of the first."""
     first, *others = scans
     if phantom is None and check_coverage(first).unit == CUT_OFF:
         log.warning(

@@ -1,12 +1,15 @@
-"""The search for the parameters that all views share: Gauss–Newton steps from coarse to fine grids.
+"""Searches for the parameters that all views share, with Gauss–Newton steps from coarse to fine grids.
 
-On each grid a volume is reconstructed, the signals that a volume explains are removed (``reduced``), and the parameters step
-until the steps are small. On the first grid each step decides which parameters the frames determine.
+On each grid a volume is reconstructed, and every parameter's signal is computed: the change of the frames per unit of the
+parameter. The part of a signal that a change of the volume explains is removed (``reduced``). The parameters step until
+the steps are small, or the stage's steps are done. On the first grid each step also decides which parameters the frames
+determine. A known object of beads takes the place of the volume in a ``BeadProblem``.
 
 The steps are variable projection (Golub and Pereyra, SIAM J. Numer. Anal. 10 (1973) 413) in Kaufman's form. With A the
-operator at the parameters θ, x the volume and P the projector onto A's range, the Jacobian is J = (I − P) ∂A/∂θ x. Each
-parameter's signal ∂A/∂θ x is a central difference, from which CGLS removes the part that some volume explains. The remaining
-signals and residual give the step, its standard deviations, and the parameters that the frames determine at all."""
+operator at the parameters θ, x the volume and P the projector onto A's range, the Jacobian is J = (I − P) ∂A/∂θ x. The
+signal ∂A/∂θ x is a central difference, from which CGLS removes the part P ∂A/∂θ x. The remaining signals and residual
+give the step and its standard deviations. A parameter's share is the fraction of its signal that remains; the frames do
+not determine a parameter with too small a share."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -39,9 +42,9 @@ _SETTLED = 0.1  # steps on a grid end when all are smaller than this many standa
 class Reduced:
     """The linear problem of the K parameters ``names`` on one grid. N = F · pixels, ordered by frame.
 
-    - jacobian (K, N): the parts of the signals that no volume explains, per unit of each parameter's field.
+    - jacobian (K, N): the part of each signal that no volume explains, per unit of the parameter's field.
     - residual (N,): the part of the residual that no volume explains.
-    - sizes (K,): norms of the whole signals. whole_gram (K, K): their inner products over their norms.
+    - sizes (K,): norms of the whole signals. whole_gram (K, K): inner products of the whole signals over their norms.
     - noise: standard deviation of a pixel. mismatch (K,): factors of the deviations, for errors other than noise."""
 
     names: tuple[str, ...]
@@ -54,7 +57,7 @@ class Reduced:
     noise: float
 
     def only(self, names: Sequence[str]) -> "Reduced":
-        """Returns the problem of some parameters. The others are fixed."""
+        """Returns the problem of the parameters ``names``. The others are fixed."""
         at = [self.names.index(name) for name in names]
         whole_gram = self.whole_gram[np.ix_(at, at)]
         mismatch, jacobian, sizes = self.mismatch[at], self.jacobian[at], self.sizes[at]
@@ -63,27 +66,28 @@ class Reduced:
         )
 
     def relative_to_stated(self, at: Mapping[str, float]) -> "Reduced":
-        """Returns the problem, linearised at the values ``at``, with its step counted from the stated values."""
+        """Returns the problem with its step counted from the stated values; it was linearised at the values ``at``, by
+        name."""
         back = np.array([at.get(name, 0.0) for name in self.names]) @ self.jacobian
         return replace(self, residual=self.residual + back)
 
     @property
     def unit(self) -> np.ndarray:
-        """The remaining signals (K, N) over the norms of the whole signals."""
+        """The part of each signal that no volume explains, over the norm of the whole signal, (K, N)."""
         return self.jacobian / self.sizes[:, None]
 
     @property
     def gram(self) -> np.ndarray:
-        """Inner products (K, K) of ``unit``. The diagonal is 1 where a volume explains nothing of a signal."""
+        """Inner products (K, K) of the rows of ``unit``. The diagonal is 1 where a volume explains nothing of a signal."""
         unit = self.unit
         return unit @ unit.T
 
     @property
     def shares(self) -> np.ndarray:
-        """How much of each parameter's signal (K,) no object explains, 0 to 1.
+        """The fraction (K,) of each parameter's signal that no object explains, 0 to 1.
 
         This is the smaller of two ratios. One is the remaining norm over the whole norm. The other is the parameter's
-        certainty among all others, over its certainty with a known object."""
+        certainty beside all others, over its certainty with a known object."""
         tiny = _TINY * np.eye(len(self.names))
         variance, variance_with_object = (np.diag(np.linalg.inv(gram + tiny)) for gram in (self.gram, self.whole_gram))
         certainty = variance_with_object / variance
@@ -94,10 +98,10 @@ class Reduced:
         return np.linalg.solve(self.gram, self.unit @ self.residual) / self.sizes
 
     def deviations(self) -> np.ndarray:
-        """Returns the standard deviations (K,) of the step, by a sandwich estimator.
+        """Returns the standard deviations (K,) of the step, by a sandwich estimator whose sample is the frames.
 
-        Its sample are the frames, so that noise may be correlated within a frame. Deviations are at least those of white
-        noise. The noise that the fit has removed from the residual is added back."""
+        Noise may therefore be correlated within a frame. Deviations are at least those of white noise. The noise that the
+        fit has removed from the residual is added back."""
         unit = self.unit
         residual = self.residual - self.step() @ self.jacobian
         by_frame = (unit * residual).reshape(len(self.names), self.frames, -1).sum(-1)
@@ -113,9 +117,10 @@ def reduced(
     problem: CoarseProblem | BeadProblem, operator: Any, parameters: Sequence[Parameter], at: Mapping[str, float],
     volume: np.ndarray, iterations: int,
 ) -> Reduced:
-    """Linearises the frames about the parameters' values ``at`` (by name) and the object ``volume``.
+    """Returns the frames linearised at the parameters' values ``at`` (by name) and the object ``volume``: a volume, or a
+    placement of beads.
 
-    operator: that of the problem at these values."""
+    operator: that of the problem at these values. iterations: those of CGLS that remove what a volume explains."""
     signals = [_signal(problem, one, at, volume) for one in parameters]
     images = [*signals, problem.residual(operator, volume)]
     *jacobian, residual = problem.beyond_object(operator, volume, images, iterations)
@@ -133,7 +138,8 @@ def reduced(
 def _signal(
     problem: CoarseProblem | BeadProblem, one: Parameter, at: Mapping[str, float], volume: np.ndarray
 ) -> np.ndarray:
-    """Returns the change of expected less measured frames (F, rows, columns) per unit of a parameter."""
+    """Returns the parameter's signal (F, rows, columns): d(expected frames)/d(parameter), per unit of its field, 0 at
+    invalid pixels."""
     step = one.step(problem.scans[0]) * (1 if one.is_timing else problem.block)
     ends = []
     for sign in (1, -1):
@@ -144,11 +150,11 @@ def _signal(
 
 
 def least_shares(problem: Reduced) -> dict[str, float]:
-    """Returns by name the least share of each parameter's signal that has to remain, in a problem with ``GAUGES``.
+    """Returns by name the least share with which a parameter counts as determined, from a problem with ``GAUGES``.
 
-    It exceeds the share that remains of a turn of all views; for parameters that move the image along the axis, that of a
-    lift. No frame distinguishes a turn from a turned object. Voxels do not follow such an object exactly, and leave as much
-    of any other signal."""
+    No frame distinguishes a turn of all views from a turned object. Voxels do not follow such an object exactly: they
+    leave a share of its signal, and as much of any other. The least share exceeds that of the turn; for parameters that
+    move the image along the axis, that of a lift."""
     remaining = {gauge.is_axial: float(problem.only([gauge.name]).shares[0]) for gauge in GAUGES}
     names = [name for name in problem.names if name in PARAMETERS]
     gauge_shares = {name: min(remaining[PARAMETERS[name].is_axial], _MOST_GAUGE) for name in names}
@@ -156,9 +162,8 @@ def least_shares(problem: Reduced) -> dict[str, float]:
 
 
 def indistinguishable(problem: Reduced, least: Mapping[str, float]) -> list[dict[str, float]]:
-    """Returns combinations of parameters, as weights by name, of which an object explains nearly all.
-
-    Nearly all is all but ``least``: the least share of the parameter with the largest weight."""
+    """Returns combinations of parameters, as weights by name, that an object explains but for less than the share in
+    ``least`` of the parameter with the largest weight."""
     values, vectors = scipy.linalg.eigh(problem.gram, problem.whole_gram + _TINY * np.eye(len(problem.names)))
     limits = np.array([least[problem.names[k]] for k in np.abs(vectors).argmax(0)])
     return [dict(zip(problem.names, map(float, weights), strict=True)) for weights in vectors[:, values < limits**2].T]
@@ -169,7 +174,8 @@ Problem = CoarseProblem | BeadProblem
 
 @dataclass(frozen=True)
 class Fallback:
-    """A parameter's value less the stated value, and its standard deviation, in the field's unit."""
+    """An estimate from outside of the search, in the field's unit: value less the stated value, and its standard
+    deviation."""
 
     value: float
     deviation: float
@@ -184,11 +190,11 @@ class Fallback:
 class Search:
     """The state of a search.
 
-    - at: the current values by name. former: those at the end of the previous grid, which shows the error of the voxels.
-    - determined: the parameters that the frames determine, None before the first step.
-    - fallback: estimates from elsewhere, for parameters that are not determined. fixed: those of them in use.
-    - held: parameters that fits do not determine, because wrong values fit better.
-    - shares: the part of each signal that remains. alike: combinations, in words, that no frame distinguishes.
+    - at: the current values by name. former: those at the end of the previous grid, which show the error of the voxels.
+    - determined: the parameters that the frames determine; None before the first step.
+    - fallback: estimates from elsewhere, for parameters that are not determined. fixed: the fallbacks in use.
+    - held: parameters that are not to be fitted, because wrong values would fit better.
+    - shares: each parameter's share, by name. alike: combinations, in words, that no frame distinguishes.
     - reduced: the last linear problem."""
 
     parameters: Sequence[Parameter]
@@ -203,7 +209,7 @@ class Search:
     reduced: Reduced | None = None
 
     def descend(self, problem: Problem, stage: Stage) -> None:
-        """Steps on one grid until the steps are small."""
+        """Steps on one grid until the steps are small, or the stage's steps are done."""
         volume: np.ndarray | None = None
         asks = self.determined is None
         self.former = {} if asks or isinstance(problem, BeadProblem) else dict(self.at)
@@ -221,7 +227,7 @@ class Search:
                 return
 
     def _decide_determined(self, linear: Reduced) -> None:
-        """Decides which parameters the frames determine: those with a large enough share and a useful deviation."""
+        """Sets which parameters the frames determine: those with a large enough share and a useful deviation."""
         has_gauges = GAUGES[0].name in linear.names
         least = least_shares(linear) if has_gauges else dict.fromkeys(linear.names, LEAST_SHARE_OF_BEADS)
         linear = linear.only([one.name for one in self.parameters])
@@ -237,7 +243,8 @@ class Search:
             self.at[name] = estimate.correction
 
     def _step(self, problem: Problem) -> bool:
-        """Moves the determined parameters, each as far as its signal is linear. Returns True where the step was small."""
+        """Moves the determined parameters, each no further than its signal is linear. Returns whether all steps were
+        small."""
         assert self.reduced is not None and self.determined is not None
         current = np.array([self.at.get(name, 0.0) for name in self.determined])
         change = self.reduced.step() - current
@@ -249,15 +256,15 @@ class Search:
         return bool(np.all(np.abs(change) < _SETTLED * self.reduced.deviations()))
 
     def keep_held(self) -> None:
-        """Leaves only the held parameters estimated."""
+        """Keeps estimates of the held parameters alone."""
         self.determined = ()
         self.fixed = {name: estimate for name, estimate in self.fixed.items() if name in self.held}
 
     def estimates(self) -> tuple[np.ndarray, np.ndarray]:
-        """Returns the values of the determined parameters and their standard deviations.
+        """Returns the values (K,) of the determined parameters and their standard deviations (K,), in the fields' units.
 
-        A deviation combines noise and discretisation error, which is half the change since the coarser grid. Both grow where
-        a parameter resembles undetermined ones, which stay as stated, right or wrong."""
+        A deviation combines noise and discretisation error, which is half the change since the coarser grid. Both grow
+        where a parameter resembles undetermined ones, which stay as stated, right or wrong."""
         if self.reduced is None or not self.determined:
             return np.zeros(0), np.zeros(0)
         values, noise = self.reduced.step(), self.reduced.deviations()
@@ -266,9 +273,10 @@ class Search:
         return values, resemblance * np.hypot(noise, DISCRETISATION * change)
 
     def corrections(self) -> dict[str, float]:
-        """Returns the values of the parameters that differ from the stated ones by three deviations.
+        """Returns the values, by name, of the parameters that differ from their stated values by three deviations.
 
-        The others go back to their stated values. This changes the remaining ones, and repeats until all differ."""
+        All other parameters go back to their stated values. That changes the remaining values, so the test repeats until
+        all differ."""
         values, deviations = self.estimates()
         deviation = dict(zip(self.determined or (), deviations, strict=True))
         names = self.determined or ()
@@ -282,7 +290,7 @@ class Search:
         return significant | dict(zip(names, map(float, values), strict=True))
 
     def table(self, scan: Scan, corrections: Mapping[str, float]) -> list[ParameterEstimate]:
-        """Returns an estimate per parameter. Those in ``corrections`` have these values."""
+        """Returns an estimate per parameter in displayed units. corrections: values by name, which replace those found."""
         values, deviations = self.estimates()
         estimates = {name: (estimate.value, estimate.deviation) for name, estimate in self.fixed.items()}
         estimates |= dict(zip(self.determined or (), zip(values.tolist(), deviations.tolist(), strict=True), strict=True))

@@ -15,10 +15,10 @@ Passes = tuple[int, float]
 
 @dataclass(frozen=True)
 class Stage:
-    """One of the grids, from coarse to fine: at most ``columns`` blocks along the panel's longer side.
+    """One grid of a calibration: at most ``columns`` blocks of pixels along the panel's longer side.
 
-    ``first``, ``again``: iterations of a first volume and of a later one. ``steps``: the most Gauss–Newton steps.
-    ``project``: iterations in each step that remove the part of a signal that a volume explains."""
+    first, again: iterations of a first volume and of a later one. steps: the most Gauss–Newton steps. project: iterations
+    of CGLS in each step that remove what a volume explains."""
 
     columns: int
     first: int
@@ -31,20 +31,22 @@ class Stage:
         return ceil_div(max(scan.geometry.detector_shape), self.columns)
 
     def passes(self, parameters: int, asks: bool) -> int:
-        """Returns the most passes through the frames. ``asks``: the stage tests which parameters the frames determine."""
+        """Returns the largest number of passes through the frames. asks: the stage also tests which parameters the frames
+        determine."""
         return self.first - self.again + self.steps * (self.again + self.project * (parameters + (3 if asks else 1)))
 
 
 def pass_cost(scans: Sequence[Scan], columns: int, most_frames: int) -> float:
-    """Returns the cost of one pass with at most ``columns``. It is proportional to rays times voxels along a ray."""
+    """Returns the cost of a pass through the scans with at most ``columns`` blocks, proportional to rays × voxels along a
+    ray."""
     shape = scans[0].geometry.detector_shape
     rows, across = (ceil_div(n, ceil_div(max(shape), columns)) for n in shape)
     return float(sum(min(scan.frames, most_frames) for scan in scans) * rows * across * max(rows, across))
 
 
 class PassCounter:
-    """Counts passes and reports them. ``plan``: the passes of each phase, in order. Passes that turn out not to be needed
-    are removed, so that the total falls."""
+    """Counts passes and reports them. plan: number and cost of the passes of each phase, in order. Passes that turn out
+    not to be needed are removed, so that the total falls."""
 
     def __init__(self, report: Report, plan: Mapping[str, Passes]) -> None:
         self.plan = dict(plan)
@@ -53,7 +55,7 @@ class PassCounter:
         self._current: Passes = (0, 0.0)  # passes that remain in this phase
 
     def begin(self, phase: str, text: str) -> None:
-        """Begins a phase. The plan's earlier phases are over."""
+        """Begins a phase, with the words of its report; earlier phases of the plan are over."""
         while phase in self.plan and next(iter(self.plan)) != phase:
             self.plan.pop(next(iter(self.plan)))
         self._text, self._current = text, self.plan.pop(phase, (0, 0.0))

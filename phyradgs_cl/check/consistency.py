@@ -43,8 +43,8 @@ _SHIFT_PENALTY = 1.5  # factor on the squared residual per coarse pixel of the p
 
 @dataclass(frozen=True, eq=False)
 class Consistency:
-    """The finding, and the indices ``frames`` (n,) of the frames that fit together. ``is_sound``: further questions make
-    sense. ``sees_angles``: the object looks different from different angles."""
+    """The answer about consistency. frames (n,): indices of the frames that fit together. is_sound: further questions
+    make sense. sees_angles: the object looks different from different angles."""
 
     finding: Finding
     frames: np.ndarray
@@ -55,8 +55,8 @@ class Consistency:
 @dataclass(frozen=True, eq=False)
 class _CoarseFit:
     """The coarse scan with its best sense of rotation (``turned``), and with its best panel shift as well (``best``).
-    fitted: the fit of ``best``. random_total: the sum of its squared residuals in a random order. rough_mean_square: the
-    mean squared residual of the best rough fit."""
+    fitted: the fit of ``best``. random_total: sum of the squared residuals of its frames in a random order.
+    rough_mean_square: mean squared residual of the best rough fit."""
 
     turned: Scan
     best: Scan
@@ -72,8 +72,8 @@ class _CoarseFit:
 def check_consistency(rt: Runtime, scan: Scan, as_stated: Scan) -> Consistency:
     """Finds frames and hypotheses that explain why the frames of a coarse ``scan`` do not fit together.
 
-    The value is the root of the ratio of two squared residuals: in the stated order over a random order.
-    ``as_stated``: the scan before it was made coarse."""
+    The finding's value is √(squared residual in the stated order / that in a random order). as_stated: the scan before it
+    was made coarse."""
     pixels = float(scan.valid.sum()) / scan.frames
     if scan.frames < _FEWEST_FRAMES or pixels < _FEWEST_PIXELS or scan.projections.shape[2] < FEWEST_COLUMNS:
         text = f"fewer than {_FEWEST_FRAMES} frames, {FEWEST_COLUMNS} columns or {_FEWEST_PIXELS} coarse pixels per frame"
@@ -117,10 +117,11 @@ def check_consistency(rt: Runtime, scan: Scan, as_stated: Scan) -> Consistency:
 
 
 def _best_sense(rt: Runtime, scan: Scan) -> tuple[Scan, Scan, float]:
-    """Chooses the sense of rotation and the panel's shift, where they fit far better than as stated. Both senses fit
-    opposite views equally well.
+    """Chooses the sense of rotation and the panel's shift, where they fit far better than as stated. A scan with opposite
+    views keeps its sense, because both senses fit such views equally well.
 
-    Returns the scan with the sense, the same with the shift, and the mean squared residual of the best rough fit."""
+    Returns the scan with the sense, the scan with sense and shift, and the mean squared residual of the best rough
+    fit."""
     senses, limits_px = [scan], [axis.ANYWHERE]
     if not has_opposite_views(scan):
         senses, limits_px = [scan, reversed_rotation(scan)], [axis.ANYWHERE, hypotheses.shifts_for_sense_px(scan)]
@@ -141,16 +142,17 @@ def _best_sense(rt: Runtime, scan: Scan) -> tuple[Scan, Scan, float]:
 
 
 def _random_order(rt: Runtime, scan: Scan) -> float:
-    """Returns the sum of squared residuals of the scan's frames in a random order, as the mean of two draws."""
+    """Returns the sum of squared residuals of the scan's frames in a random order, the mean of a few draws."""
     rng = np.random.default_rng(0)
     orders = [rng.permutation(scan.frames) for _ in range(_RANDOM_ORDERS)]
     return float(np.mean([fit_squares(rt, replace(scan, projections=scan.projections[order])).sum() for order in orders]))
 
 
 def _explanation(rt: Runtime, scan: Scan, as_stated: Scan, coarse: _CoarseFit) -> Hypothesis | None:
-    """Returns the best hypothesis that fits far better than the stated scan does.
+    """Returns the best hypothesis that fits far better than the stated scan does; None without one.
 
-    Frames of a panel that sees few rays twice fit any geometry: then it is the first other size with consistent frames."""
+    Frames of a panel that sees few rays twice fit any geometry. For them it returns the first hypothesis of other sizes
+    under which the frames are consistent."""
     is_one_sided = hypotheses.stated_redundancy(as_stated) < hypotheses.LEAST_REDUNDANCY
     about_scan = _refined_hypotheses(rt, scan, as_stated, np.inf if is_one_sided else coarse.rough_mean_square)
     if is_one_sided:
@@ -166,9 +168,9 @@ def _explanation(rt: Runtime, scan: Scan, as_stated: Scan, coarse: _CoarseFit) -
 def _refined_hypotheses(rt: Runtime, scan: Scan, as_stated: Scan, most: float) -> list[Hypothesis]:
     """Returns the best two hypotheses about the whole scan, with the panel shifted to fit best.
 
-    The mean squared residual of a rough fit must only be below 1.5 ``most``: an offset between two coarse pixels hides
-    other differences. Large shifts count against a hypothesis. Of those with the same factor of sizes, the best one
-    counts."""
+    most: the mean squared residual of a rough fit may be up to 1.5 ``most``, because an offset between two coarse pixels
+    hides other differences. Large shifts count against a hypothesis. Of hypotheses with the same factor of sizes, the
+    best counts."""
     tried: list[tuple[Hypothesis, Scan, axis.AxisShift]] = []
     for hypothesis in hypotheses.of_scan(scan, as_stated):
         other = hypothesis.scan()
@@ -195,7 +197,8 @@ def _is_consistent(rt: Runtime, scan: Scan) -> bool:
 
 
 def _best_below(rt: Runtime, candidates: Iterable[Hypothesis], stated: Fit, most: float) -> Hypothesis | None:
-    """Returns the hypothesis with the least squared residual, if that is below ``most`` and four standard errors better."""
+    """Returns the hypothesis with the least squared residual, if that is below ``most`` and four standard errors better
+    than ``stated``; else None."""
     best, least = None, most
     for hypothesis in candidates:
         squares = fit_squares(rt, hypothesis.scan())

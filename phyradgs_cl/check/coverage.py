@@ -25,12 +25,15 @@ _QUESTION = "coverage"
 
 
 def check_coverage(scan: Scan) -> Finding:
-    """Compares the line integrals at the panel's sides with a tenth of the largest one.
+    """Checks that the panel sees the whole object, and that the scan's values can be line integrals.
 
-    The object touches a side where the mean over a few rows of the two outermost columns is above threshold and noise, in a
-    tenth of the frames. A displaced panel may cut the object on its short side. Rows at the top and bottom are not checked.
-    Other findings: no object above the noise, inverted values, line integrals beyond 30, pixels brighter than the flats, and
-    a grid with another size than the object."""
+    The object touches a side where the two outermost columns are above noise and a tenth of the largest line integral.
+    Their mean over some eighth of the rows counts, in at least a tenth of the frames. A displaced panel may cut the
+    object on its short side; the top and bottom are not checked.
+
+    Other findings: no object above the noise, inverted values, line integrals beyond 30, and pixels brighter than the
+    flats. A grid is of a wrong size where it is more than 5 times as wide as the panel's view, or the object more than 5
+    times as wide as the grid."""
     p = np.asarray(scan.projections)
     if p.shape[2] < FEWEST_COLUMNS:
         return too_narrow(_QUESTION, "line integral")
@@ -41,7 +44,8 @@ def check_coverage(scan: Scan) -> Finding:
 
 
 def _check_values(p: np.ndarray, valid: np.ndarray, largest: float, threshold: float) -> Finding | None:
-    """Returns a finding where the values cannot be line integrals of an object; otherwise None."""
+    """Returns a finding where the values cannot be line integrals of an object; None where they can. largest: that of the
+    line integrals; threshold: the level above which a pixel sees the object."""
     noise = _NOISES * noise_level(p, valid)
     if largest <= noise:
         text = f"no object: line integrals reach {largest:.3g}, noise {noise:.3g}"
@@ -65,7 +69,7 @@ def _check_values(p: np.ndarray, valid: np.ndarray, largest: float, threshold: f
 
 
 def _check_sides(scan: Scan, p: np.ndarray, valid: np.ndarray, largest: float, threshold: float) -> Finding:
-    """Returns the finding about the object at the panel's sides, and about its width compared with the grid's."""
+    """Returns the finding about the object at the panel's sides, and about its width in mm compared with the grid's."""
     sides = {"left": _border(p, valid, slice(0, 2)), "right": _border(p, valid, slice(-2, None))}
     sides.pop(_short_side(scan), None)
     name, level = max(sides.items(), key=lambda item: item[1])
@@ -100,7 +104,8 @@ def _width_mm(scan: Scan, p: np.ndarray, valid: np.ndarray, threshold: float) ->
 
 
 def _border(p: np.ndarray, valid: np.ndarray, columns: slice) -> float:
-    """Returns the level at a border: the largest mean over an eighth of its rows, at the 90th percentile of the frames."""
+    """Returns the level of the two columns ``columns``: the largest mean over an eighth of the rows, at the 90th
+    percentile of the frames."""
     edge = p[:, :, columns]
     weight = valid[:, :, columns].astype(float)
     rows = max(1, edge.shape[1] // 8)

@@ -31,10 +31,10 @@ _FEWEST_FRAMES = 8  # least number of frames in which a drift can be seen
 
 @dataclass
 class CountReader:
-    """``counts_to_attenuation`` for ``read_scan`` that remembers saturated counts.
+    """Converts counts as ``counts_to_attenuation`` does, for ``read_scan``, and remembers saturated counts.
 
-    ``ceiling``: the largest count of projections and flats, None for files without counts. ``at_ceiling``: the fraction of
-    the projections' pixels that lie together at that count."""
+    ceiling: the largest count of projections and flats; None for files without counts. at_ceiling: the fraction of the
+    projections' pixels that lie in areas at that count."""
 
     ceiling: float | None = None
     at_ceiling: float = 0.0
@@ -50,10 +50,11 @@ class CountReader:
 
 
 def check_saturation(scan: Scan, counts: CountReader | None = None) -> Finding:
-    """Finds areas of pixels at one extreme value. More than 0.1 % of the pixels is suspicious.
+    """Finds areas of pixels at one extreme value, suspicious above 0.1 % of the pixels. counts: the reader of the scan's
+    file.
 
-    Only pixels whose neighbours have the same value count. Noise clipped at 0 gives single pixels, saturation whole areas.
-    Areas of exactly 0 may be air, so they get the answer ``cannot tell``."""
+    Only pixels whose neighbours have the same value count. Noise clipped at 0 gives single pixels, saturation whole
+    areas. Areas of exactly 0 may be air, so they get the answer "cannot tell"."""
     if counts is not None and counts.ceiling is not None and counts.at_ceiling > _MOST_SATURATED:
         return _clipped(Saturation(counts.ceiling, counts.at_ceiling), "lower the exposure, or mask these pixels")
     if scan.saturation is not None and scan.saturation.share > _MOST_SATURATED:
@@ -105,8 +106,8 @@ def _jumps(p: np.ndarray, masked: np.ndarray) -> float:
 
 
 def _at_own_least(p: np.ndarray, masked: np.ndarray) -> float:
-    """Returns the fraction of pixels (F, v, u) that repeat their own least value, as counts do that were clipped before the
-    division by the flats.
+    """Returns the fraction of pixels (F, v, u) that repeat their own least value, as those do whose counts were clipped
+    before the division by the flats.
 
     Pixels that never change are dead, and line integrals of 0 are air in scans without noise. Neither counts."""
     least = p.min(0)
@@ -115,9 +116,10 @@ def _at_own_least(p: np.ndarray, masked: np.ndarray) -> float:
 
 
 def check_dead_pixels(scan: Scan) -> tuple[Finding, np.ndarray]:
-    """Finds dead pixels that the mask does not have. Returns the finding and a map of them (v, u), bool.
+    """Finds dead pixels that the mask does not have. Returns the finding, and a map of them, bool (v, u).
 
-    A dead pixel always has the same value, or differs from its neighbours in every frame. More than 0.02 % is suspicious."""
+    A dead pixel always has the same value, or differs from its neighbours in every frame. More than 0.02 % of the pixels
+    is suspicious."""
     masked = ~scan.valid.any(0)
     if scan.frames < LEAST_FRAMES:
         text = f"fewer than {LEAST_FRAMES} frames"
@@ -136,9 +138,10 @@ def check_dead_pixels(scan: Scan) -> tuple[Finding, np.ndarray]:
 
 
 def check_gain(rt: Runtime, scan: Scan) -> Finding:
-    """Fits a ramp, and a step at each frame, to the levels of the frames of a coarse ``scan``.
+    """Finds drifts and jumps of the detector's gain, from the levels of the frames of a coarse ``scan``.
 
-    A change of more than 1.5 % and five standard deviations is suspicious. Levels may vary with the sine of the angle."""
+    It fits a ramp, and a step at each frame. A change of more than 1.5 % and five standard deviations is suspicious.
+    Levels may vary with the sine of the angle."""
     if scan.frames < _FEWEST_FRAMES:
         return Finding(GAIN, CANNOT_TELL, 0.0, _LARGEST_DRIFT, "share", f"fewer than {_FEWEST_FRAMES} frames")
     level = fit(rt, scan).level
@@ -158,7 +161,7 @@ def check_gain(rt: Runtime, scan: Scan) -> Finding:
 
 
 def _fit_change(turning: np.ndarray, shape: np.ndarray, level: np.ndarray) -> tuple[float, float, float]:
-    """Fits ``level`` (F,) by ``turning`` (F, n) and ``shape`` (F,).
+    """Fits ``level`` (F,) by least squares with the columns of ``turning`` (F, n) and with ``shape`` (F,).
 
     Returns the shape's coefficient, its standard deviation, and the squared residual."""
     design = np.column_stack([turning, shape])

@@ -12,8 +12,8 @@ FEWEST_COLUMNS = 8  # least number of columns that can be judged: four gave fals
 class Finding:
     """The answer to one ``question``, with the ``verdict`` "ok", "suspicious" or "cannot tell".
 
-    value: the measured number, in ``unit``. uncertainty: its standard deviation, where it is an estimate. threshold: the
-    value from which it is suspicious. text: what was found. advice: what to do about it."""
+    value: the measured number, in ``unit``. uncertainty: the value's standard deviation, where it is an estimate.
+    threshold: the value from which it is suspicious. text: what was found. advice: what to do about it."""
 
     question: str
     verdict: str
@@ -35,5 +35,5 @@ def too_narrow(question: str, unit: str) -> Finding:
 
 
 def same_from_everywhere(question: str) -> Finding:
-    """Returns the answer "cannot tell" to a question about angles, for an object that looks the same from all of them."""
+    """Returns the answer "cannot tell" to a question about angles, for an object that looks the same from every angle."""
     return Finding(question, CANNOT_TELL, 0.0, 0.0, "", "the object looks the same from every angle")

@@ -27,9 +27,10 @@ _GAPS = 15  # number of places at which a missing or repeated frame is tried
 
 @dataclass(frozen=True, eq=False)
 class Hypothesis:
-    """A hypothesis: a description, advice, and a function that returns the scan under it.
+    """What may be wrong in a scan: a description, advice, and a function that returns the scan corrected for it.
 
-    ``factor``: by which pixels are larger than stated. Those with one factor, if not 1, differ by the panel's shift only."""
+    factor: by which pixels are larger than stated. Hypotheses with one factor, if not 1, differ by the panel's shift
+    only."""
 
     text: str
     advice: str
@@ -38,18 +39,20 @@ class Hypothesis:
 
 
 def stated_redundancy(scan: Scan) -> float:
-    """Returns the fraction of columns whose rays a full turn measures twice. Negative: the axis misses the panel."""
+    """Returns the fraction of columns whose rays a full turn measures twice, by the stated offset. Negative where the
+    axis misses the panel."""
     geometry = scan.geometry
     return 1 - 2 * abs(geometry.detector_offset_mm[1]) / (geometry.pixel_size_mm[1] * geometry.detector_shape[1])
 
 
 def has_axis_near_edge(scan: Scan) -> bool:
-    """Whether the panel sees the axis but is so far off it that it sees few rays twice."""
+    """Returns whether the panel sees the axis, but so near its edge that it sees few rays twice."""
     return 0 <= stated_redundancy(scan) < LEAST_REDUNDANCY
 
 
 def shifts_for_sense_px(scan: Scan) -> tuple[float, float]:
-    """Returns the limits of the panel's shift, in pixels of the recorded scan, when senses of rotation are compared.
+    """Returns the limits (lowest, highest) of the panel's shift, in pixels of the recorded scan, for comparing senses of
+    rotation.
 
     A panel beside the axis goes no further off, because rays that are measured once fit under any angles."""
     offset_mm, pitch_mm = scan.geometry.detector_offset_mm[1], scan.geometry.pixel_size_mm[1]
@@ -65,15 +68,15 @@ def frame_number(scan: Scan, frame: int) -> int:
 
 
 def of_scan(scan: Scan, stated: Scan) -> Iterator[Hypothesis]:
-    """Yields hypotheses about the whole coarse ``scan``: sizes in another unit, mirrored frames. ``stated``: the scan before
+    """Yields hypotheses about the whole coarse ``scan``: sizes in another unit, mirrored frames. stated: the scan before
     it was made coarse."""
     yield from _other_units(scan, stated)
     yield from _other_images(scan, stated)
 
 
 def _other_units(scan: Scan, stated: Scan) -> Iterator[Hypothesis]:
-    """Yields hypotheses of sizes or distances in other units. Only their ratio enters the fan angle; the panel's offset may
-    decide which of the two is wrong."""
+    """Yields hypotheses of sizes or distances in other units. Only their ratio enters the fan angle; the panel's offset
+    may decide which of the two is wrong. A parallel beam has none."""
     geometry = stated.geometry
     if isinstance(geometry, ParallelGeometry):
         return  # in a parallel beam sizes scale with the object
@@ -102,7 +105,8 @@ def _times(name: str, factor: float) -> str:
 
 
 def _with_sizes(scan: Scan, stated: Scan, factor: float, keeps_axis: bool) -> Scan:
-    """Returns the coarse scan with pixels ``factor`` times as large, and with the grid that belongs to them."""
+    """Returns the coarse scan with pixels ``factor`` times as large, and with a grid for such pixels. keeps_axis: as in
+    ``resized``."""
     v_mm, u_mm = stated.geometry.pixel_size_mm
     off_v_mm, off_u_mm = (offset * (factor if keeps_axis else 1) for offset in stated.geometry.detector_offset_mm)
     pixel_size_mm = (factor * v_mm, factor * u_mm)
@@ -132,8 +136,8 @@ def _other_images(scan: Scan, stated: Scan) -> Iterator[Hypothesis]:
 
 
 def of_frames(scan: Scan, shifted_scan: Scan, tries_orders: bool) -> Iterator[Hypothesis]:
-    """Yields hypotheses of other angle steps, exchanged pixel sizes and, with ``tries_orders``, missing or repeated
-    frames."""
+    """Yields hypotheses about single frames of a coarse scan: other angle steps, exchanged pixel sizes (for
+    ``shifted_scan``) and, with ``tries_orders``, missing or repeated frames."""
     yield from _other_steps(scan)
     yield from _exchanged_sizes(shifted_scan)
     if tries_orders:
@@ -141,7 +145,8 @@ def of_frames(scan: Scan, shifted_scan: Scan, tries_orders: bool) -> Iterator[Hy
 
 
 def _azimuths(scan: Scan) -> np.ndarray:
-    """Returns each frame's angle (F,) in rad from the first one's. Angles that a trajectory states keep whole turns."""
+    """Returns each frame's angle (F,) in rad, counted from the first frame's. Angles that a trajectory states keep whole
+    turns."""
     trajectory = variants.altered_trajectory(scan)
     angle_rad = getattr(trajectory.base, "angle_rad", None)
     if angle_rad is None:
@@ -189,8 +194,8 @@ def nearly_sized(scan: Scan, factor: float) -> Scan:
 
 
 def _missing_frames(scan: Scan) -> Iterator[Hypothesis]:
-    """Yields hypotheses of a missing or a repeated frame at 15 places. Later frames are then a step further, or a step
-    back."""
+    """Yields hypotheses of a missing or a repeated frame at up to 15 places, after which all frames are a step further,
+    or a step back."""
     sense = -1.0 if variants.altered_trajectory(scan).is_reversed else 1.0
     step = float(np.median(wrapped(np.diff(_azimuths(scan))))) * sense
     for at in np.unique(np.linspace(1, scan.frames - 1, _GAPS).round().astype(int)):

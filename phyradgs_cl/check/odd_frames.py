@@ -31,7 +31,8 @@ _EXCHANGED = 0.5  # two frames were exchanged where the opposite order leaves le
 
 
 def without_odd_frames(scan: Scan) -> tuple[np.ndarray, list[str]]:
-    """Finds odd and repeated frames before any reconstruction. Returns the other frames (indices), and a note for each."""
+    """Finds odd and repeated frames before any reconstruction. Returns the indices (n,) of the other frames, and a note
+    for each one left out."""
     odd, repeated = odd_frames(scan.projections, scan.pixel_mask), repeated_frames(scan)
     notes = [f"frame {frame_number(scan, f)} is unlike all others (black, bright, or no image)" for f in odd]
     notes += [f"frame {frame_number(scan, f)} is frame {frame_number(scan, f - 1)} recorded twice" for f in repeated]
@@ -51,9 +52,9 @@ def odd_frames(p: np.ndarray, mask: np.ndarray | None) -> list[int]:
 
 
 def repeated_frames(scan: Scan) -> list[int]:
-    """Returns the indices of frames that repeat their predecessor although the gantry has turned: they differ from it far
-    less than neighbours do. In an order that jumps, such as the golden angle, they must also be unlike the next view in
-    angle, since distant views of a round object may be alike."""
+    """Returns the indices of frames that repeat their predecessor although the gantry has turned: the two differ far less
+    than neighbours do. In an order that jumps, such as the golden angle, they must also be unlike the next view in angle,
+    because distant views of a round object may look the same."""
     p = scan.projections
     if len(p) < _FEWEST:
         return []
@@ -86,9 +87,9 @@ def without_outliers(
 ) -> tuple[np.ndarray, Fit, list[str]]:
     """Removes frames whose residual is far above the others', the worst first, with a new fit after each.
 
-    random_square: the mean squared residual of frames in a random order. Returns the other frames (indices), their fit, and
-    notes. Where a fifth of the frames would go, the cause is common to all, and none is removed. Two outliers may be frames
-    whose order is exchanged."""
+    stated: the fit of all frames. random_square: the mean squared residual of frames in a random order. Returns the
+    indices (n,) of the other frames, their fit, and notes. Where a fifth of the frames would go, all frames have the same
+    cause, and none is removed. Two outliers may be frames whose order is exchanged."""
     remaining, current = np.arange(scan.frames), stated
     outliers: list[int] = []
     while len(outliers) < _MOST_OUTLIERS * scan.frames:
@@ -114,10 +115,11 @@ def without_outliers(
 
 
 def _ends_alike(residual: np.ndarray, random: float) -> np.ndarray:
-    """Returns which first and last frames, bool (F,), fit about equally badly, as correct ones of an open arc do.
+    """Returns which first and last frames, bool (F,), fit about equally badly, as correct frames of an open arc do.
 
-    They have neighbours on one side only, so a fit of few iterations leaves larger residuals, and a slow drift shows in
-    them. If they were removed, the frames next to them would follow. random: the residual in a random order."""
+    Frames at an end have neighbours on one side only, so a fit of few iterations leaves larger residuals, and a slow
+    drift shows in them. If they were removed, the frames next to them would follow. random: the residual in a random
+    order."""
     is_apart = residual >= _OUTLIER * np.median(residual)
     at_an_end = np.logical_and.accumulate(is_apart) | np.logical_and.accumulate(is_apart[::-1])[::-1]
     return at_an_end & (residual < _ALIKE * residual[::-1]) & (residual < _AT_BOTH_ENDS * random)

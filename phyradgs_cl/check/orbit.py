@@ -53,8 +53,8 @@ _SIZE_RATIO = 1.05  # another fan fits worse from this ratio of its squared resi
 
 @dataclass(frozen=True, eq=False)
 class Orbit:
-    """The findings about sense of rotation and axis, the panel's ``shift`` along u, and whether the gantry turns the other
-    way."""
+    """The findings about sense of rotation (``sign``) and axis (``centre``). shift: the panel's, along u. is_reversed:
+    the gantry turns the other way."""
 
     sign: Finding
     centre: Finding
@@ -69,7 +69,8 @@ class Orbit:
 
 
 def find_orbit(rt: Runtime, quick: Scan, as_stated: Scan, sees_angles: bool) -> Orbit:
-    """Finds from the coarse scan ``quick`` which way the gantry turns and where the axis is. Few columns decide neither."""
+    """Finds from the coarse scan ``quick`` which way the gantry turns and where the axis is. Both stay open with few
+    columns, and where the object looks the same from all angles (``sees_angles`` False)."""
     if quick.geometry.detector_shape[1] < FEWEST_COLUMNS:
         return Orbit(too_narrow(SIGN, "standard errors"), too_narrow(CENTRE, "pixels"))
     if not sees_angles:
@@ -115,10 +116,10 @@ def check_rotation(stated: axis.AxisShift, other: axis.AxisShift) -> Finding:
 
 
 def with_cause(finding: Finding, shift_px: float, stated_px: float, tolerance_px: float) -> Finding:
-    """Adds the cause to a suspicious sense of rotation: reversed angles, or frames mirrored in u.
+    """Returns a suspicious finding about the sense of rotation with its cause: reversed angles, or frames mirrored in u.
 
-    Frames are mirrored where the best panel offset under reversed angles (stated_px + shift_px) is nearer to the opposite of
-    the stated one than to it. A stated offset below the tolerance does not decide."""
+    Frames are mirrored where the best panel offset under reversed angles (stated_px + shift_px) is nearer to the opposite
+    of the stated offset than to it. A stated offset below ``tolerance_px`` does not decide."""
     if abs(stated_px) < tolerance_px:
         text = f"{finding.text}; frames mirrored in u would look the same"
         advice = f"change the sign of the angles ('gantry' for 'sample'), or import with the other {MIRROR_U}"
@@ -132,12 +133,12 @@ def with_cause(finding: Finding, shift_px: float, stated_px: float, tolerance_px
 
 
 def centre_of(shift: axis.AxisShift, block: int, scan: Scan) -> tuple[axis.AxisShift, Finding]:
-    """Returns the panel's shift and the finding about it. ``shift``: found with blocks of ``block`` pixels.
+    """Returns the panel's shift along u and the finding about it. shift: found with blocks of ``block`` pixels.
 
-    The error of coarse pixels is added to its standard deviation, because the bootstrap over frames does not include it. It
-    is larger where ``scan`` measures fewer rays twice. Opposite views give a shift too, from pixels that are not coarse. The
-    shift with the smaller deviation counts. Where less than half of the rays are measured twice, opposite views alone
-    decide, or nothing does: any shift that leaves fewer such rays fits better."""
+    The error of coarse pixels is added to its standard deviation, because the bootstrap over frames does not include it.
+    That error is larger where ``scan`` measures fewer rays twice. Opposite views give a shift too, from pixels that are
+    not coarse; the shift with the smaller deviation counts. Where less than half of the rays are measured twice, opposite
+    views alone decide, or nothing does: any shift that leaves fewer such rays fits better."""
     pitch_mm = scan.geometry.pixel_size_mm[1]
     if has_axis_near_edge(scan):
         shift = shift_by_rays_seen_twice(scan)
@@ -182,8 +183,8 @@ def check_centre(shift: axis.AxisShift, block: int, pitch_mm: float, stated_px: 
 def check_distances(rt: Runtime, scan: Scan) -> Finding:
     """Fits a coarse scan with its fan 0.8 and 1.25 times as wide, each with its own best shift of the panel.
 
-    Only the fan distinguishes these. The answer is ``ok`` where both fit worse, otherwise ``cannot tell``. Sizes that fit
-    far better make the frames inconsistent, which another question finds."""
+    Only the fan distinguishes these sizes. The answer is "ok" where both fit worse, otherwise "cannot tell". Sizes that
+    fit far better make the frames inconsistent, which another question finds."""
     stated = fit_squares(rt, scan)
     others = {factor: fit_squares(rt, axis.with_best_shift(rt, nearly_sized(scan, factor))) for factor in _OTHER_SIZES}
     ratios = {factor: residual_ratio(stated, other) for factor, other in others.items()}

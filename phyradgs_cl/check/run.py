@@ -29,11 +29,11 @@ Report = Callable[[int, int, str], None]
 
 @dataclass(frozen=True, eq=False)
 class CheckResult:
-    """The findings in order.
+    """The findings of a check, in order.
 
-    ``offset_mm``: the shift of the panel along u that explains the frames best, with its standard deviation
-    ``offset_spread_mm``. Both are NaN where no shift does, or where something else has to be corrected first. In that case
-    ``is_consistent`` is false."""
+    offset_mm: the shift of the panel along u that explains the frames best, and its standard deviation
+    ``offset_spread_mm``. Both are NaN where no shift does, or where something else has to be corrected first; in the
+    latter case ``is_consistent`` is False."""
 
     findings: list[Finding]
     offset_mm: float = math.nan
@@ -46,7 +46,7 @@ class CheckResult:
 
 
 class _Answers:
-    """Collects the findings and reports each of them."""
+    """Collects the findings, and reports each when it is there."""
 
     def __init__(self, questions: list[str], report: Report) -> None:
         self.findings: list[Finding] = []
@@ -76,9 +76,10 @@ def check(
     scan: Scan, rt: Runtime, counts: detector.CountReader | None = None,
     report: Report = lambda done, total, question: None,
 ) -> CheckResult:
-    """Returns what is wrong or suspicious in a scan. ``counts``: the reader of the scan's file, if it remembers counts.
+    """Returns what is wrong or suspicious in a scan. counts: the reader of the scan's file, if it remembers counts.
+    report: is called with the questions answered, their number, and the next question.
 
-    Raises InputError where every pixel is masked, and for NaN or infinity elsewhere."""
+    Raises InputError where every pixel is masked, and for NaN or infinity at other pixels."""
     scan = without_lag(_finite(scan))
     questions = ["timing", "angles", "saturation", "dead pixels", "coverage", consistency.CONSISTENCY]
     questions += [orbit.SIGN, orbit.CENTRE, *([] if scan.is_parallel else [orbit.DISTANCES]), detector.GAIN]
@@ -134,15 +135,15 @@ def check(
 def quick_scan(scan: Scan) -> Scan:
     """Returns the coarse scan for the questions about angles and the axis.
 
-    For a panel far beside the axis, the grid is cut to the object. The grid of the panel's view has so many voxels that the
-    few frames of a coarse scan would fit under wrong angles too."""
+    For a panel far beside the axis, the grid is cut to the object. In all voxels of such a panel's view, the few frames
+    of a coarse scan would fit under wrong angles too."""
     quick = coarse(scan, QUICK_COLUMNS)
     return around_object(quick, _SPARE_COLUMNS) if has_axis_near_edge(scan) else quick
 
 
 def _finite(scan: Scan) -> Scan:
-    """Returns the scan with zeros in place of masked values that are not finite. Raises InputError for unmasked ones, and
-    where every pixel is masked."""
+    """Returns the scan with zeros in place of masked values that are not finite. Raises InputError for unmasked values
+    that are not finite, and where every pixel is masked."""
     p = np.asarray(scan.projections)
     if not scan.valid.any():
         raise InputError("pixel_mask", "every pixel masked", "at least one usable pixel", "correct the mask")

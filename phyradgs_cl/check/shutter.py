@@ -31,7 +31,7 @@ _WORSE_RATIO = 1.05  # another exposure fits worse from this ratio of its square
 
 
 def check_readout(rt: Runtime, scan: Scan) -> Finding:
-    """Fits a coarse fly-scan with its lines read as stated, and with them read otherwise.
+    """Fits a coarse fly-scan with its lines read as stated, and with other orders, axes and times of the readout.
 
     Squared residuals have to differ by four standard errors and by a ratio. A wrong order of rows only twists the object
     about the axis, which is visible in a cone beam alone. A wrong order of columns bends it."""
@@ -61,8 +61,8 @@ def check_readout(rt: Runtime, scan: Scan) -> Finding:
 
 
 def _compared(hypothesis: str, stated: np.ndarray, other: np.ndarray) -> tuple[str, float, float]:
-    """Returns a sentence, the standard errors by which the stated readout fits better, and the other readout's squared
-    residual over the stated one's."""
+    """Returns a sentence about a readout; the standard errors by which the stated one fits better; and the other's
+    squared residual over the stated one's."""
     ratio, errors = residual_ratio(stated, other), t_statistic(stated, other)
     return f"{hypothesis}, the squared residual is {ratio:.4g} times as large ({errors:+.1f} standard errors)", errors, ratio
 
@@ -99,11 +99,11 @@ def _readout_advice(scan: Scan, name: str) -> str:
 
 
 def check_exposure(rt: Runtime, scan: Scan) -> Finding:
-    """Fits a coarse scan with half the stated exposure, and with twice the stated exposure.
+    """Fits a coarse scan with half and with twice the stated exposure.
 
-    Only detail as fine as the arc of an exposure distinguishes blur by motion from a blurred object. A sharper model always
-    fits a little better, so half the exposure is suspicious only where its squared residual is 40 % smaller. For ``ok`` half
-    and twice both have to fit worse."""
+    Only detail as fine as the arc of an exposure distinguishes blur by motion from a blurred object. A sharper model
+    always fits a little better, so half the exposure is suspicious only where its squared residual is 40 % smaller. For
+    "ok" both half and twice have to fit worse."""
     if not scan.is_fly:
         text = "the gantry is stated to stand still: had it turned, a blurred object would fit as well"
         return Finding(EXPOSURE, CANNOT_TELL, 1.0, _HALF_RATIO, "share", text)
@@ -136,5 +136,5 @@ def _twice_as_long(rt: Runtime, scan: Scan) -> np.ndarray | None:
 
 
 def _squares_exposed(rt: Runtime, scan: Scan, factor: float) -> np.ndarray:
-    """Returns squared residuals (F,) with lines open ``factor`` times as long, from the same moments on."""
+    """Returns squared residuals (F,) with lines that open as stated and stay open ``factor`` times as long."""
     return fit_squares(rt, replace(scan, shutter=replace(scan.shutter, exposure_s=factor * scan.shutter.exposure_s)))

@@ -36,9 +36,10 @@ _TOLERATED_DEG = 1.0  # missing coverage in degrees without a finding: nearly pa
 def check_timing(scan: Scan) -> Finding:
     """Compares exposure, readout and table times with the frame times, and the angles with the speed.
 
-    A line cannot open while it is open, a frame cannot be read while the one before is, and a gantry has one angle at a
-    time. The value is the worst of three numbers: exposure and readout over the shortest frame period (at most 1); 1 + the
-    relative difference between the angle steps and the speed within the frames; a table's duration over the scan's."""
+    A line cannot open while it is open, a frame cannot be read during the readout of the frame before, and a gantry has
+    one angle at a time. The value is the worst of three numbers: exposure and readout over the shortest frame period (at
+    most 1); 1 + the relative difference between the angle steps and the speed within the frames; a table's duration over
+    the scan's."""
     starts_s = np.asarray(scan.frame_start_s, np.float64)
     if scan.frames < 2:
         return Finding(_TIMING, OK, 0.0, 1.0, "share", "one frame: nothing to compare")
@@ -69,8 +70,8 @@ def _share(name: str, consequence: str, share: float) -> Finding:
 
 
 def _table(scan: Scan) -> list[Finding]:
-    """Returns a finding for a table of angles or poses that lasts far longer than the scan, which sees hardly any of it: its
-    unit of time most likely differs from the frames'. Returns no finding otherwise."""
+    """Returns a finding for a table of angles or poses that lasts far longer than the scan, so that its unit of time most
+    likely differs from the frames'; [] otherwise."""
     table = scan.trajectory.kinematics if isinstance(scan.trajectory, CircularOrbit) else scan.trajectory
     if not isinstance(table, EncoderTable | PoseTable):
         return []
@@ -110,11 +111,11 @@ def _speed(scan: Scan, starts_s: np.ndarray) -> Finding:
 
 
 def check_angles(scan: Scan) -> Finding:
-    """Compares the largest gap between neighbouring views with three times the median one.
+    """Compares the largest gap between neighbouring views with three times the median gap.
 
     Views that cover half a turn and the fan, or more, may leave one gap. Less coverage is suspicious with any steps.
-    Parallel rays across the axis see the same after half a turn, so their angles are taken modulo 180°. Parallel rays that
-    are tilted to the axis need a full turn."""
+    Parallel rays at right angles to the axis see the same after half a turn, so their angles are taken modulo 180°.
+    Parallel rays that are tilted to the axis need a full turn."""
     turn_deg, needed_deg, of_needed = _needed_turn(scan)
     steps_deg = _steps_deg(scan, turn_deg)
     if steps_deg.size < 3:
@@ -139,7 +140,7 @@ def check_angles(scan: Scan) -> Finding:
 
 
 def is_full_turn(scan: Scan) -> bool:
-    """True where no gap between views, around a full turn, is wider than three times the median step."""
+    """Returns whether no gap between views, around a full turn, is wider than three times the median gap."""
     steps_deg = _steps_deg(scan)
     return steps_deg.size > 0 and float(steps_deg.max()) <= _WIDE * float(np.median(steps_deg))
 
@@ -156,7 +157,7 @@ def _needed_turn(scan: Scan) -> tuple[float, float, str]:
 
 
 def _steps_deg(scan: Scan, turn_deg: float = 360.0) -> np.ndarray:
-    """Returns the degrees from each different view angle to the next, around a turn of ``turn_deg``."""
+    """Returns the angles (n,) in degrees from each distinct view angle to the next, around a turn of ``turn_deg``."""
     angles_deg = np.rad2deg(azimuth_rad(middle_poses(scan))) % turn_deg
     angles_deg = np.sort(angles_deg % turn_deg)  # the second % is needed because -1e-16 % 360 is 360
     steps_deg = np.diff(angles_deg, append=angles_deg[0] + turn_deg)

@@ -51,9 +51,10 @@ def frames_to_attenuation(
     frames: NDArray[np.generic], quantity: str, flats: NDArray[np.generic] | None = None,
     darks: NDArray[np.generic] | None = None, largest: float = _LARGEST, place: NDArray[np.floating] | None = None
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-    """Converts projections (P, v, u) that come with flats and darks (n, v, u) of their own, as ``counts_to_attenuation``.
+    """Converts projections (P, v, u) to line integrals, as ``counts_to_attenuation``, with flats and darks (n, v, u) in
+    arrays of their own.
 
-    Attenuation above ``largest`` is marked as unusable too. ``place`` (P,): each projection's place between the flats, which
+    Attenuation above ``largest`` is marked as unusable too. place (P,): each projection's place between the flats, which
     are interpolated; 0.5 is halfway from the first to the second. None takes the flats' mean."""
     return _converted(frames, range(len(frames)), quantity, flats, darks, largest, place)
 
@@ -118,10 +119,10 @@ def average(p: ArrayLike, weight: ArrayLike, model: str) -> NDArray[np.float64]:
 
 
 def intensity_average(p: Iterable[np.ndarray], weights: Iterable[np.ndarray]) -> tuple[np.ndarray, list[np.ndarray]]:
-    """Returns −ln Σ w exp(−p) over S moments, and each moment's share w exp(−p) / Σ w exp(−p), without overflow.
+    """Returns −ln Σ w exp(−p) over S moments, and each moment's softmax weight w exp(−p) / Σ w exp(−p), without overflow.
 
-    p: S arrays, whose precision the result has. weights: S numbers or arrays that broadcast, with sum 1. All 0 gives 0 for
-    both."""
+    p: S arrays of line integrals, whose precision the result has. weights: S numbers or arrays that broadcast, with sum
+    1. Where all weights are 0, both results are 0."""
     pairs = list(zip(p, weights, strict=True))
     least = np.minimum.reduce([np.where(w > 0, q, np.inf) for q, w in pairs])  # p of the brightest moment
     least = np.where(np.isfinite(least), least, 0)
@@ -133,9 +134,9 @@ def intensity_average(p: Iterable[np.ndarray], weights: Iterable[np.ndarray]) ->
 
 @dataclass(frozen=True, eq=False)
 class Spectrum:
-    """A spectrum. energy_kev (E,). weight (E,): fraction of the signal recorded at each energy, with sum 1.
+    """A beam's spectrum. energy_kev (E,). weight (E,): fraction of the signal recorded at each energy, with sum 1.
 
-    soft, bone (E,): the material's attenuation at each energy over its mean attenuation."""
+    soft, bone (E,): attenuation of soft tissue and of bone at each energy, over its mean attenuation."""
 
     energy_kev: Array
     weight: Array
@@ -168,7 +169,7 @@ def _kramers(kvp: float) -> tuple[Array, Array]:
 
 
 def _tungsten(kvp: float, anode_deg: float) -> tuple[Array, Array]:
-    """Returns energies and photons by SpekPy, with characteristic lines."""
+    """Returns energies (E,) in keV and the number of photons of each, by SpekPy, with characteristic lines."""
     spekpy = checks.package("spekpy", "the package that hardening.anode_deg asks", "phyradgs-cl[spectrum]")
     energy_kev, photons = spekpy.Spek(kvp=kvp, th=anode_deg, dk=_STEP_KEV).get_spectrum(diff=False)
     tabulated = energy_kev >= _ENERGY_KEV[0]

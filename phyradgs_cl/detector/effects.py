@@ -124,13 +124,14 @@ def without_lag(scan: Scan) -> Scan:
 
 
 def pixel_gains(shape: tuple[int, int], spread: float, rng: np.random.Generator) -> Array:
-    """Draws gains (v, u) about 1 with standard deviation ``spread``. A quarter of the variance is common to a column."""
+    """Draws gains (v, u) about 1 with standard deviation ``spread``. A quarter of the variance is that of whole columns."""
     own, column = rng.standard_normal(shape), rng.standard_normal((1, shape[1]))
     return np.maximum(1 + spread * (np.sqrt(0.75) * own + 0.5 * column), 0.05)
 
 
 def add_sparks(line_integrals: Array, share: float, rng: np.random.Generator) -> tuple[Array, NDArray[np.bool_]]:
-    """Adds light to a ``share`` of the pixels of line integrals (F, v, u). Returns the result and which pixels were hit."""
+    """Returns line integrals (F, v, u) with light added to a fraction ``share`` of the pixels, and which pixels were hit,
+    bool."""
     hit = rng.random(line_integrals.shape) < share
     height = rng.uniform(*_SPARK_HEIGHT, int(hit.sum()))
     sparked = np.array(line_integrals)

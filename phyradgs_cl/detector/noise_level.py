@@ -56,12 +56,14 @@ def noise_level(line_integrals: NDArray[np.float32], valid: NDArray[np.bool_] | 
 
 
 def noise_rms(line_integrals: NDArray[np.float32], chosen: NDArray[np.bool_], valid: NDArray[np.bool_]) -> float:
-    """Returns the root mean square of the noise of the pixels ``chosen`` (F, v, u), dimensionless. ``valid`` likewise.
+    """Returns the root mean square of the noise of the pixels ``chosen``, bool (F, v, u), dimensionless. valid, bool (F,
+    v, u): pixels that may be used.
 
-    Noise grows with attenuation, so it is estimated for each tenth of the line integrals and averaged as the chosen pixels
-    lie. Each estimate is the median of |second differences along rows of those along columns|. These vanish at straight
-    edges along either (Immerkær, Comput. Vis. Image Underst. 64 (1996) 300). Detail as fine as a pixel raises the estimate,
-    by up to 70 % on panels of 64² with noise of 0.5 %. For panels of fewer than three rows, rows alone are used."""
+    Noise grows with attenuation, so it is estimated for each tenth of the line integrals and averaged as the chosen
+    pixels lie. Each estimate is the median of |second differences along rows of those along columns|. These vanish at
+    straight edges along either (Immerkær, Comput. Vis. Image Underst. 64 (1996) 300). Detail as fine as a pixel raises
+    the estimate, by up to 70 % on panels of 64² with noise of 0.5 %. For panels of fewer than three rows, rows alone are
+    used."""
     usable, differences = valid, line_integrals
     means = line_integrals
     cuts = (_along_rows, _along_columns) if line_integrals.shape[-2] >= 3 else (_along_rows,)
@@ -81,9 +83,9 @@ def noise_rms(line_integrals: NDArray[np.float32], chosen: NDArray[np.bool_], va
 
 
 def noise_behind(line_integrals: NDArray[np.float32], valid: NDArray[np.bool_]) -> float:
-    """Returns ``noise_rms`` behind the object, from some of the frames. line_integrals and valid (F, v, u).
+    """Returns ``noise_rms`` behind the object, from some of the frames. line_integrals and valid: (F, v, u).
 
-    Air is left out because it has less noise, and in some files half of that is clipped at 0."""
+    Air is left out because its noise is lower, and in some files clipped at 0."""
     some = slice(None, None, max(1, len(line_integrals) // _FRAMES))
     frames, usable = line_integrals[some], valid[some]
     behind = usable & (frames > _BEHIND * noise_level(frames, usable))
@@ -127,9 +129,10 @@ def find_saturation(frames: NDArray[np.generic], flat: NDArray[np.floating]) -> 
 
 
 def clustered_share(extreme: Iterable[NDArray[np.bool_]]) -> float:
-    """Returns the fraction of pixels at an extreme, given frame by frame (v, u), if most of them have four such neighbours.
+    """Returns the fraction of pixels at an extreme value, given frame by frame as bool (v, u), if most of them have four
+    neighbours at it; else 0.
 
-    Otherwise it returns 0. Saturation puts whole areas at an extreme; clipped noise puts single pixels there."""
+    Saturation puts whole areas at an extreme; clipped noise puts single pixels there."""
     pixels = count = inner = touching = 0
     for at in extreme:
         pixels, count = pixels + at.size, count + int(np.count_nonzero(at))

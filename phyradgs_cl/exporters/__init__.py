@@ -55,8 +55,8 @@ def export_volume(
 
 
 def hu_scale(volume: Volume, air: Box | None = None, water: Box | None = None, insert_hu: float = 0.0) -> Hounsfield | None:
-    """Returns the scale of Hounsfield units that a volume holds; fits one where it has none, or where a box or an insert is
-    given."""
+    """Returns the scale of Hounsfield units that a volume holds. Fits a scale where it holds none, or where a box or an
+    insert is given."""
     if (stored := volume.scale) is not None and air is None and water is None and insert_hu == 0:
         return replace(stored, fitted=f"{stored.line}, as stored")
     return volume.hounsfield(air, water, insert_hu).scale
@@ -66,7 +66,8 @@ def _checked(
     path: Path, to: str, output: str | Path | None, mu_water_per_mm: float | None, labels: DicomLabels | None,
     scale_of: ScaleOf | None,
 ) -> tuple[Path, ScaleOf | None]:  # fmt: skip
-    """Returns the path to write and the function to the scale. Raises InputError for options that do not fit the format."""
+    """Returns the path to write, and the function to the scale or None. Raises InputError for options that do not fit the
+    format."""
     checks.one_of("--to", to, (*EXPORTS, OWN))
     if mu_water_per_mm is not None and scale_of is not None:
         raise InputError("--mu-water-per-mm", "given with --hu", "one of the two", "leave one out")
@@ -178,7 +179,7 @@ def _write_own(target: Path, volume: Volume, path: str, scale: Hounsfield | None
 
 
 def foreign_suffix(output: str | Path) -> str | None:
-    """Returns a path's suffix if it is of another program's format, else None. Such a file must not hold HDF5."""
+    """Returns a path's suffix if it is that of another program's format, which must not hold HDF5; else None."""
     suffixes = (*(suffix for to in EXPORTS for suffix in _suffixes(to)), ".mhd", ".dcm", ".png")
     return next((suffix for suffix in suffixes if Path(output).name.lower().endswith(suffix)), None)
 
@@ -189,7 +190,8 @@ def default_output(path: Path, to: str) -> Path:
 
 
 def format_of(output: str | Path | None, subject: str = "--to") -> str:
-    """Returns the one of ``EXPORTS`` or ``OWN`` that an output's suffix means. Raises InputError for others and for None."""
+    """Returns the format, of ``EXPORTS`` or ``OWN``, that an output's suffix means. Raises InputError for other suffixes
+    and for None."""
     for to in (*EXPORTS, OWN):
         if output is not None and _suffixes(to) and Path(output).name.lower().endswith(_suffixes(to)):
             return to

@@ -27,8 +27,9 @@ _LONGEST = 64  # most characters of a text in DICOM's value representations PN a
 
 @dataclass(frozen=True)
 class DicomLabels:
-    """Labels by which viewers and archives list a series; None where not stated. patient: name (Family^Given) and ID. title,
-    date (YYYY-MM-DD): of the study. description: of the series. Raises InputError for text that DICOM cannot hold."""
+    """Labels by which viewers and archives list a series; None where not stated. patient: name (Family^Given) and ID.
+    title, date (YYYY-MM-DD): those of the study. description: that of the series. Raises InputError for text that DICOM
+    cannot hold."""
 
     patient: str | None = None
     title: str | None = None
@@ -99,7 +100,7 @@ def _rescale_slope(values: np.ndarray, unit: str) -> str:
 
 
 def _common(pydicom: Any, shape: tuple[int, ...], unit: str, slope: str, uid: dict[str, str]) -> Any:
-    """Returns a data set with the values that all slices share."""
+    """Returns a DICOM data set with the values that all slices of a series have."""
     image = pydicom.dataset.Dataset()
     image.file_meta = pydicom.dataset.FileMetaDataset()
     image.file_meta.MediaStorageSOPClassUID = image.SOPClassUID = _CT_IMAGE

@@ -14,9 +14,9 @@ _CHUNK = 64  # most voxels of a chunk along each axis; a level with no more alon
 
 
 def write_zarr(path: Path, volume: Volume, scale: Hounsfield | None) -> None:
-    """Writes a new folder, slab by slab: besides the volume (z, y, x) in 1/mm, memory holds 128 slices at most. A level's
-    voxels are means of 2×2×2 of the level before. ``scale``: writes Hounsfield units by it; None writes 1/mm. Raises
-    OutputError as ``folder_written_beside`` does."""
+    """Writes a new folder, slab by slab: besides the volume (nz, ny, nx) in 1/mm, memory holds at most 128 slices. A
+    level's voxels are means of 2×2×2 voxels of the level before. scale: that of Hounsfield units to write; None writes
+    1/mm. Raises OutputError as ``folder_written_beside`` does."""
     of_extra = "the package that this export needs", "phyradgs-cl[zarr]"
     writer, zarr = (checks.package(name, *of_extra) for name in ("ome_zarr.writer", "zarr"))
     grid, levels = volume.required_grid, list[dict[str, Any]]()

@@ -46,8 +46,8 @@ def write_image(path: Path, volume: Volume, note: str, times_s: Sequence[float] 
 
 
 def write_tiff(path: Path, volume: Volume, note: str) -> None:
-    """Writes a page per slice from the lowest up, row 0 at the smallest y, with sizes in mm and the origin in pixels. Files
-    beyond 4 GB are BigTIFF, which ImageJ opens through Bio-Formats."""
+    """Writes a TIFF with a page per slice from the lowest up, row 0 at the smallest y, with sizes in mm and the origin in
+    pixels. Files beyond 4 GB are BigTIFF, which ImageJ opens through Bio-Formats."""
     tifffile = checks.package("tifffile", "the package that this export needs", "phyradgs-cl[formats]")
     dx, dy, dz = volume.required_grid.voxel_size_mm[::-1]
     first_mm = volume.required_grid.first_centre_mm[::-1]

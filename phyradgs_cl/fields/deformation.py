@@ -95,12 +95,12 @@ class Deformation:
 
     @property
     def reach_mm(self) -> np.ndarray:
-        """Bounds (R,) of the displacements of fields of unit weight: the longest control vector of each field."""
+        """Bounds (R,) in mm of the displacements by each field of unit weight: its longest control vector."""
         return np.asarray(np.linalg.norm(self.control_mm, axis=-1).max(axis=(1, 2, 3)))
 
     @property
     def fastest_mm_per_s(self) -> float:
-        """A bound of the speed at which any point's displacement changes."""
+        """A bound in mm/s of the speed at which any point's displacement changes."""
         rates_per_s = np.abs(np.diff(self.weights, axis=0)) / np.diff(self.times_s)[:, None]
         return float((rates_per_s @ self.reach_mm).max(initial=0.0))
 
@@ -152,7 +152,7 @@ class Deformation:
         return self.inverse_mm(centres_mm, weights).reshape(*grid.shape, 3).astype(np.float32)
 
     def inverse_mm(self, points_mm: np.ndarray, weights: "ArrayLike") -> np.ndarray:
-        """Returns the u of ``inverse_on_grid_mm``, (n, 3) float64 in mm, at points (n, 3), x y z."""
+        """Returns the displacement u of ``inverse_on_grid_mm``, (n, 3) float64 in mm, at points (n, 3), x y z."""
         moved_mm = np.zeros_like(points_mm)
         for _ in range(_MOST_STEPS):
             next_mm = -self.displacement_mm(points_mm + moved_mm, weights)
@@ -183,16 +183,15 @@ class Deformation:
         return smallest
 
     def _state(self, weights: "ArrayLike") -> np.ndarray:
-        """Returns the control vectors (nz, ny, nx, 3) of the state with these weights (R,)."""
+        """Returns the control vectors (nz, ny, nx, 3) in mm of the state with weights (R,)."""
         return np.tensordot(checks.numbers("weights", weights, (self.rank,)), self.control_mm, 1)
 
     def _in_spacings(self, points_mm: np.ndarray) -> np.ndarray:
         return (points_mm - self.origin_mm) / self.spacing_mm
 
     def bases(self, grid: Grid, slope_along: int | None = None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Returns β³ (voxels, control points) along z, y and x at the voxel centres of ``grid``.
-
-        Along ``slope_along`` (0: z) it returns the slope of β³ in 1/mm instead."""
+        """Returns β³ (voxels, control points) along z, y and x at the voxel centres of ``grid``. slope_along: the axis
+        (0: z) along which it is the slope of β³ in 1/mm instead; None: no axis."""
         matrices = []
         spacing_mm = np.broadcast_to(self.spacing_mm, 3)
         for axis, centres_mm in enumerate(grid.axes_mm()):

@@ -61,11 +61,11 @@ class GridChoice:
             raise InputError("--size", "all three", expected, "leave one out")
 
     def of(self, grid: Grid) -> Grid:
-        """Returns the chosen grid in place of ``grid``. Where nothing is chosen this is ``grid`` itself.
+        """Returns the chosen grid in place of ``grid``; ``grid`` itself where nothing is chosen.
 
         A box alone takes the voxels of ``grid`` that it meets by more than a hundredth, continued beyond ``grid``. The
-        volume is then a part of the one on ``grid``. A size alone keeps the box. A voxel alone keeps it too, with its sides
-        rounded up to whole voxels. Raises InputError for too many voxels."""
+        volume is then a part of the volume on ``grid``. A size alone keeps the box. A voxel alone keeps the box too, with
+        its sides rounded up to whole voxels. Raises InputError for too many voxels."""
         box_mm = self._box_mm(grid)
         sides_mm = box_mm[:, 1] - box_mm[:, 0]
         if self.size is not None:
@@ -120,8 +120,8 @@ class GridChoice:
 
 
 def voxel_sides_mm(option: str, value: Any) -> tuple[float, float, float]:
-    """Returns the sides of a voxel (z, y, x) in mm from one length or three. Raises InputError, which names ``option``, for
-    others."""
+    """Returns the sides of a voxel (z, y, x) in mm from one length or three. Raises InputError, which names ``option``,
+    for other values."""
     sides_mm = _numbers(option, value, (1, 3), "0.5 or 1,0.5,0.5")
     for side_mm in sides_mm:
         checks.within(option, side_mm, 1 / _LARGEST_MM, _LARGEST_MM)

@@ -35,8 +35,8 @@ _NOTE = re.compile(r"values in HU(?:, water ([-+.\de]+), air ([-+.\de]+) 1/mm)?"
 
 @dataclass(frozen=True)
 class Hounsfield:
-    """Attenuation of water, 0 HU, and of air, −1000 HU, in 1/mm. ``fitted``: a line that says to what. Raises
-    InputError for water outside 1e-6 to 1e3, and for air that is not below it."""
+    """A scale of Hounsfield units: attenuation of water, 0 HU, and of air, −1000 HU, in 1/mm. fitted: in words, to what
+    the scale was fitted. Raises InputError for water outside 1e-6 to 1e3, and for air that is not below it."""
 
     water_per_mm: float
     air_per_mm: float = 0.0
@@ -83,7 +83,7 @@ class Hounsfield:
 
 
 def of_facts(facts: Mapping[str, object]) -> Hounsfield | None:
-    """Returns the scale in a volume's provenance, or None without any. Raises InputError for a damaged one."""
+    """Returns the scale in a volume's provenance; None without a scale. Raises InputError for a damaged one."""
     stored = facts.get(HOUNSFIELD)
     if stored is None:
         return None
@@ -154,8 +154,8 @@ def _inside(option: str, values: np.ndarray, grid: Grid, box: Box) -> np.ndarray
 
 
 def _peaks(values: np.ndarray) -> tuple[Window, Window]:
-    """Returns the windows of air and of water. Metal is so dense that both may lie in a few bins, so the histogram is
-    shortened until it shows two peaks, and once more to end beyond water."""
+    """Returns the windows of air and of water in the histogram. Metal is so dense that both may lie in a few bins, so the
+    histogram is shortened until it shows two peaks, and once more to end beyond water."""
     lowest, highest = (float(v) for v in np.percentile(values, (0.1, 99.9)))
     for _ in range(_SHORTENED):
         if len(windows := _windows(values, lowest, highest)) > 1:

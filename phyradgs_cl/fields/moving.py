@@ -63,8 +63,8 @@ class MovingTruth(States):
 class Gating:
     """A signal that tells how far the object's motion is at some times.
 
-    times_s: (n,) rising, on the clock of ``Scan.frame_start_s``. values: (n,) of any unit and sign. With ``is_phase`` they
-    are phases in cycles, which rise, and whose whole cycles do not count.
+    times_s: (n,) rising, on the clock of ``Scan.frame_start_s``. values: (n,) of any unit and sign; with ``is_phase``
+    rising phases in cycles, of which only the part of a cycle counts.
 
     Raises InputError for shapes that differ, values that are not finite, and times that do not rise."""
 

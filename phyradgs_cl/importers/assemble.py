@@ -33,9 +33,9 @@ _SLACK = 1e-6  # extension of a pose table beyond the times that are needed, as 
 
 @dataclass(frozen=True, eq=False)
 class Timing:
-    """When frames were taken. ``start_s`` (F,): the times in s at which each frame's first line opens. ``is_fly``: the
-    gantry never stops. ``angle_at``: a stored angle belongs to the "start" or "middle" of the first line's exposure.
-    ``assumed``: the values that neither file nor user stated, by their names in ``acquisition/plausible.py``."""
+    """When frames were taken. start_s (F,): times in s at which each frame's first line opens. is_fly: the gantry never
+    stops. angle_at: a stored angle belongs to the "start" or "middle" of the first line's exposure. assumed: values that
+    neither file nor user stated, by their names in ``acquisition/plausible.py``."""
 
     shutter: Shutter
     start_s: np.ndarray
@@ -51,8 +51,8 @@ class Timing:
 
 @dataclass(frozen=True, eq=False)
 class StoredTiming:
-    """The timing that a file states; None for missing values. ``start_s`` (F,): opening times of a gantry that did not stop.
-    ``written``: names of the values that the user wrote in a description, so not those of a scanner's header."""
+    """The timing that a file states; None for missing values. start_s (F,): opening times of a gantry that did not stop.
+    written: names of the values that the user wrote in a description, so not those of a scanner's header."""
 
     exposure_s: float | None = None
     readout_s: float | None = None
@@ -68,8 +68,8 @@ class StoredTiming:
 def make_timing(
     subject: str, frames: int | np.ndarray, options: ImportOptions, stored: StoredTiming | None = None
 ) -> Timing:
-    """Returns the timing of ``frames`` frames, or of frames with these numbers (F,). Options replace stored values. Start
-    times, or a time from frame to frame, mean that the gantry turned continuously; without them, every frame was at rest.
+    """Returns the timing of ``frames`` frames, or of frames with these numbers (F,). Options replace stored values. With
+    start times, or a time from frame to frame, the gantry turned continuously; without, every frame was at rest.
 
     Raises InputError for a continuous turn without an exposure or with fewer than two rising start times, and for options
     about the exposure or readout of frames at rest."""
@@ -107,8 +107,8 @@ def make_timing(
 
 
 def turning(geometry: Geometry, angle_rad: np.ndarray, timing: Timing) -> CircularOrbit:
-    """Returns a circular orbit through gantry angles (F,) in rad. A frame turns at the angles' slope over time, by central
-    differences, one-sided at both ends; a frame at rest does not turn."""
+    """Returns a circular orbit through gantry angles (F,) in rad. Within a frame the gantry turns at the angles' slope
+    over time, by central differences, one-sided at both ends; a frame at rest does not turn."""
     angle_rad = np.asarray(angle_rad, np.float64)
     exposure_s = timing.shutter.exposure_s
     if not timing.is_fly:
@@ -120,7 +120,8 @@ def turning(geometry: Geometry, angle_rad: np.ndarray, timing: Timing) -> Circul
 
 
 def _check_rest(subject: str, shutter: Shutter, options: ImportOptions, stored: StoredTiming) -> None:
-    """Raises InputError for options about a turn without a time from frame to frame. Warns of a file's exposure."""
+    """Raises InputError for options about a turn without a time from frame to frame. Warns that a file's exposure is then
+    not used."""
     turns = [name for name in options.given(_OF_A_TURN) if name != "exposure_s" or stored.exposure_s is None]
     frame_time = " or ".join(dict.fromkeys(map(options.named, ("frame_time_s", "fps"))))
     for name in (*map(options.called, turns), *stored.written):
@@ -133,7 +134,7 @@ def _check_rest(subject: str, shutter: Shutter, options: ImportOptions, stored: 
 
 @dataclass(frozen=True)
 class Turned:
-    """The flips of stored images after which v points up and u to the right, seen from the source."""
+    """Flips of stored images after which v points up and u to the right, seen from the source."""
 
     rows: bool
     columns: bool
@@ -154,7 +155,7 @@ class Turned:
 
 
 def turn_of(pose: np.ndarray) -> Turned:
-    """Returns the flips of a stored image to row 0 below and column 0 left, from one of its poses (12,)."""
+    """Returns the flips of a stored image that put row 0 below and column 0 left, from one of its poses (12,)."""
     source, step_u, step_v = pose[:3], pose[6:9], pose[9:12]
     right = np.array([-source[1], source[0], 0.0])
     return Turned(rows=bool(step_v[2] < 0), columns=bool(step_u @ right < 0))
@@ -163,7 +164,7 @@ def turn_of(pose: np.ndarray) -> Turned:
 def table_over_time(
     pose_at: Callable[[np.ndarray], np.ndarray], timing: Timing, subject: str, is_parallel: bool = False
 ) -> PoseTable:
-    """Returns a pose table that covers every frame's window. ``pose_at`` returns poses (T, 12) at frame positions (T,),
+    """Returns a pose table that covers every frame's window. pose_at: returns poses (T, 12) at frame positions (T,),
     where 2.5 is halfway from frame 2 to 3. A gantry at rest keeps each frame's pose through its window."""
     if not timing.is_fly:
         at_s = np.asarray(timing.start_s) + timing.shutter.middle_s
@@ -183,9 +184,9 @@ def assemble_scan(
     options: ImportOptions, *, title: str, source: str, grid: Grid | None = None,
     reference: np.ndarray | None = None, lag: float = 0.0, names: Mapping[str, str] | None = None, said: str = "",
 ) -> Scan:
-    """Returns the scan of line integrals with row 0 the lowest. Without a grid it gets ``grid_of_scan``. ``names``: the
-    file's names of its values, for messages; ``said``: which frames were taken, in words. Raises InputError for implausible
-    values, and where more than half of the views are equal."""
+    """Returns the scan of line integrals with row 0 the lowest. grid: None takes ``grid_of_scan``. names: the file's
+    names of its values, for messages. said: in words, which frames were taken. Raises InputError for implausible values,
+    and where more than half of the views are equal."""
     assumed = [*timing.assumed, *([] if options.detector_model else ["average"])] if timing.is_fly else []
     scan = Scan(
         projections=integrals.values, geometry=geometry, trajectory=trajectory, shutter=timing.shutter,
@@ -230,7 +231,8 @@ def with_options(options: ImportOptions, geometry: Geometry) -> Geometry:
 def parallel(
     options: ImportOptions, panel: tuple[int, int], pitch_mm: Pitch, offset_mm: tuple[float, float]
 ) -> ParallelGeometry:
-    """Returns a parallel beam of a file's numbers, or the options' where given. Raises InputError for given distances."""
+    """Returns a parallel beam with the options' numbers, else the file's. Raises InputError for options that give
+    distances."""
     for name in options.given(_DISTANCES):
         expected, remedy = "no distance: this file has a parallel beam", "leave it out"
         raise InputError(options.named(name), f"{getattr(options, name):g}", expected, remedy)
@@ -241,8 +243,8 @@ def cone(
     options: ImportOptions, to_axis_mm: Length, to_detector_mm: Length, panel: tuple[int, int], pitch_mm: Pitch,
     offset_mm: tuple[float, float], names: Mapping[str, str] | None = None,
 ) -> ConeGeometry:
-    """Returns a cone beam of the options' numbers, else of a file's. A function that reads a number is called only where
-    the option is not given. ``names``: what the file calls the numbers, for messages. Raises InputError unless the panel
+    """Returns a cone beam with the options' numbers, else the file's. A function that reads a number is called only where
+    the option is not given. names: what the file calls the numbers, for messages. Raises InputError unless the panel
     stands behind the axis."""
     axis_mm, detector_mm = map(partial(_taken, options), _DISTANCES, (to_axis_mm, to_detector_mm))
     if detector_mm <= axis_mm:
@@ -264,8 +266,8 @@ def _taken(options: ImportOptions, name: str, stored: Any) -> Any:
 class RotaryStage:
     """A source and a panel of ``geometry`` at rest, and an axis of rotation that may be off the central ray.
 
-    ``axis_u_mm``: the distance of the axis to the right of the central ray, seen from the source. ``roll_rad``: its top
-    leans to the right; ``tilt_rad``: towards the panel. ``shift_mm`` (F, 2): the panel's shifts (v, u) per frame."""
+    axis_u_mm: the distance of the axis to the right of the central ray, seen from the source. roll_rad: the axis' top
+    leans to the right; tilt_rad: towards the panel. shift_mm (F, 2): the panel's shifts (v, u) per frame."""
 
     geometry: Geometry
     axis_u_mm: float = 0.0
@@ -274,7 +276,8 @@ class RotaryStage:
     shift_mm: np.ndarray | None = None
 
     def poses(self, angle_rad: np.ndarray, shift_mm: np.ndarray | float = 0.0) -> np.ndarray:
-        """Returns poses (T, 12) in the sample's coordinates at gantry angles (T,); ``shift_mm`` (T, 2): of the panel."""
+        """Returns poses (T, 12) in the sample's coordinates at gantry angles (T,). shift_mm (T, 2): the panel's shifts
+        (v, u)."""
         upright = self.geometry.pose(0.0).reshape(4, 3)  # x to the source, y to the right, z up
         is_parallel = isinstance(self.geometry, ParallelGeometry)
         parts = np.repeat(upright[None], len(angle_rad), axis=0)
@@ -308,12 +311,12 @@ def scan_on_stage(
     angle_rad: np.ndarray, places: np.ndarray, names: dict[str, str], said: str, *, stored: StoredTiming | None = None,
     flats: np.ndarray | None = None, darks: np.ndarray | None = None, flat_value: float | None = None,
 ) -> Scan:
-    """Returns the scan of a sample on a stage, with counts ``frames`` (F, v, u) that the file ``path`` describes.
+    """Returns the scan of a sample on a stage, with counts ``frames`` (F, v, u) that the file ``path`` describes. Options
+    replace values of the file.
 
-    ``sides``: where row 0 and column 0 are, such as ("top", "left"). ``angle_rad`` (F,): of the gantry. ``places`` (F,): the
-    frames' numbers from 0 on. ``stored``: the file's timing. ``names``, ``said``: see ``assemble_scan``. ``flats``,
-    ``darks`` (n, v, u): None where the scanner has applied them. ``flat_value``: the file's counts of air. Options replace
-    values of the file."""
+    - sides: where row 0 and column 0 are, such as ("top", "left"). angle_rad (F,): gantry angles. places (F,): the
+      frames' numbers from 0 on. names, said: see ``assemble_scan``. stored: the file's timing.
+    - flats, darks (n, v, u): None where the scanner has applied them. flat_value: the file's counts of air."""
     timing = make_timing(str(path), places, options, stored)
     trajectory, geometry = stage.turned(angle_rad, timing, str(path))
     images = (None if one is None else oriented(one, options, *sides) for one in (frames, flats, darks))
@@ -327,7 +330,8 @@ def scan_on_stage(
 
 
 def along(values: np.ndarray, position: np.ndarray) -> np.ndarray:
-    """Interpolates values (F, ...) at frame positions (T,), (T, ...), linearly, also beyond the first and last frame."""
+    """Returns values (F, ...) interpolated linearly at frame positions (T,), (T, ...), also beyond the first and last
+    frame."""
     if len(values) == 1:
         return np.repeat(values, len(position), axis=0)
     left = np.clip(np.floor(position).astype(int), 0, len(values) - 2)

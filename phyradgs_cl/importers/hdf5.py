@@ -34,15 +34,18 @@ _TIMES = replace(LENGTH, name="magnification", assumed="", factors=MappingProxyT
 
 
 def is_address(text: object) -> bool:
-    """True for text FILE:/ADDRESS, which names an array in an HDF5 file."""
+    """Returns whether ``text`` has the form FILE:/ADDRESS of an array in an HDF5 file."""
     return isinstance(text, str) and text.rpartition(":/")[0] != ""
 
 
 @dataclass(frozen=True, eq=False)
 class Places:
-    """Where the arrays of a scan are. ``stated``: for some of ``NAMES`` a list of FILE:/ADDRESS, or of /ADDRESS in
-    ``source``; for "axes" the order of frames' axes. ``subject``: what states them. ``linked_folder``: see ``open_hdf5``.
-    ``folder``: the only folder from which files are read; None, for files that users name, allows any."""
+    """Where the arrays of a scan are.
+
+    - stated: for some of ``NAMES`` a list of FILE:/ADDRESS, or of /ADDRESS in ``source``; for "axes" the order of frames'
+      axes. subject: what states them, for messages.
+    - linked_folder: see ``open_hdf5``. folder: the only folder from which files are read; None, for files that users
+      name, allows any."""
 
     stated: Mapping[str, Sequence[str]]
     subject: str
@@ -52,7 +55,8 @@ class Places:
 
     @contextmanager
     def opened(self, name: str, text: str) -> Iterator[tuple[Hdf5Source, str]]:
-        """Yields the open file and the address in it of a place ``text``. Raises InputError for a text that is no place."""
+        """Yields the open file and the address in it for ``text``, FILE:/ADDRESS or /ADDRESS. Raises InputError for other
+        text."""
         file, _, address = text.rpartition(":/")
         subject = f"{self.subject} {name}"
         if self.source is not None and not file and text.startswith("/"):
@@ -68,7 +72,7 @@ class Places:
             yield other, f"/{address}"
 
     def _at(self, name: str, usual: Sequence[str]) -> Sequence[str]:
-        """Returns where an array is: the stated places, else the ``usual`` addresses that exist."""
+        """Returns the places of the array ``name``: those stated, else the ``usual`` addresses that exist."""
         there = [address for address in usual if self.source is not None and self.source.find(address) is not None]
         return self.stated.get(name, there)
 
@@ -76,7 +80,8 @@ class Places:
         self, name: str, usual: Sequence[str] = (), panel: tuple[int, int] | None = None
     ) -> tuple[np.ndarray, dict[str, int]] | None:
         """Reads frames (n, v, u) in their own type from the stated places, else from the ``usual`` addresses that exist.
-        Returns them with the number at each place; None without a place. Raises InputError for other shapes or panels."""
+        Returns them, and the number of frames at each place; None without a place. Raises InputError for other shapes or
+        panels."""
         stacks: dict[str, np.ndarray] = {}
         for text in self._at(name, usual):
             with self.opened(name, str(text)) as (source, address):
@@ -107,8 +112,8 @@ class Places:
         self, projections: str = "/", *, key: Sequence[str] = (), flats: Sequence[str] = (), darks: Sequence[str] = (),
         mask: Sequence[str] = (),
     ) -> "Stacks":
-        """Reads all frames at the usual addresses of a format, or at the stated ones. ``key``: addresses of the frames'
-        kinds (projection, flat, dark, invalid). Flats and darks with addresses of their own replace those among the frames.
+        """Reads all frames at the stated places, else at a format's usual addresses. key: addresses of the frames' types
+        (projection, flat, dark, invalid). Flats and darks with addresses of their own replace those among the frames.
         Raises InputError without projections, and for arrays that do not fit them."""
         if self.source is not None and "projections" not in self.stated:
             self.source.dataset(projections)  # raises an error that says what is there
@@ -136,8 +141,8 @@ class Places:
         return Stacks(frames if used.all() else frames[used], stacks["flats"], stacks["darks"], bad, used, flats_at)
 
     def _key(self, usual: Sequence[str], frames: int) -> np.ndarray:
-        """Reads the kinds (F,) of frames, numbered as in ``io.scan``; all are projections without a key. Raises InputError
-        for other numbers, and where no frame is a projection."""
+        """Reads the types (F,) of frames, numbered as in ``io.scan``; without a key all are projections. Raises
+        InputError for other numbers, and where no frame is a projection."""
         for text in self._at("image_key", usual)[:1]:
             with self.opened("image_key", text) as (source, address):
                 key = h5.read_values(source, address, source.dataset(address))
@@ -150,8 +155,8 @@ class Places:
         return np.full(frames, schema.PROJECTION)
 
     def angles_rad(self, used: np.ndarray, options: ImportOptions, usual: str = "", unit: str = "deg") -> np.ndarray:
-        """Reads the angles in rad, with the stored sign, of frames marked in ``used``, bool (F,). ``unit``: if none
-        stated."""
+        """Reads the angles in rad, with the stored sign, of the frames marked in ``used``, bool (F,). unit: that of
+        angles without a stated unit."""
         quantity = replace(ANGLE, assumed=unit)
         asked = [options.angles] if options.angles and is_address(options.angles) else self.stated.get("angles", ())
         for text in asked:
@@ -167,8 +172,8 @@ class Places:
 
 @dataclass(frozen=True, eq=False)
 class Stacks:
-    """Projections (P, v, u), flats and darks (n, v, u), and a mask (v, u) or (P, v, u), non-zero for pixels that are not to
-    be used; None: all are. ``used``, bool (F,): which stored frames are projections. ``flats_at``: ``at`` of
+    """Projections (P, v, u), flats and darks (n, v, u), and a mask (v, u) or (P, v, u), non-zero for pixels not to be
+    used (None: use all). used, bool (F,): which stored frames are projections. flats_at: as ``at`` of
     ``frames.light_of``."""
 
     projections: np.ndarray
@@ -185,7 +190,8 @@ class Stacks:
     def line_integrals(
         self, subject: str, options: ImportOptions, row_0: str, convention: str | None = None, turn: Turned | None = None
     ) -> LineIntegrals:
-        """Converts the projections, with flips that a file declares; see ``frames.line_integrals`` and ``oriented``."""
+        """Returns the projections as line integrals, after the flips ``turn`` that a file declares. Other arguments: see
+        ``frames.line_integrals`` and ``oriented``."""
         frames, flats, darks, bad = (
             None if one is None else oriented(turn.frames(one) if turn else one, options, row_0)
             for one in (self.projections, self.flats, self.darks, self.mask)
@@ -211,8 +217,8 @@ def places_of(options: ImportOptions, source: Hdf5Source) -> Places:
 
 @dataclass(frozen=True)
 class Lengths:
-    """Addresses of the lengths of a scan: the distances ``source`` and ``detector`` from the axis, and pairs (v, u) of a
-    pixel's sides, at the sample and on the panel; the first that exists counts. ``optics``: the microscope's
+    """Addresses of a scan's lengths: the distances ``source`` and ``detector`` from the axis; pairs (v, u) of a pixel's
+    sides, at the sample and on the panel, of which the first that exists counts; ``optics``, the microscope's
     magnification."""
 
     source: str
@@ -225,8 +231,9 @@ class Lengths:
 def beam(
     source: Hdf5Source, lengths: Lengths, options: ImportOptions, panel: tuple[int, int], axis_columns: float = 0.0
 ) -> Geometry:
-    """Returns a geometry of the options' numbers, else of a file's; a parallel beam, with a warning, where neither states
-    the source's distance. ``axis_columns``: columns from axis to panel's middle. Raises InputError for wrong lengths."""
+    """Returns a geometry with the options' numbers, else the file's; a parallel beam, with a warning, where neither
+    states the source's distance. axis_columns: columns from axis to panel's middle. Raises InputError for wrong
+    lengths."""
     quantity = LENGTH
     for address in (address for pair in (*lengths.at_sample, *lengths.on_panel) for address in pair):
         if source.find(address) is not None and not h5.read_attribute(source, address, "units"):

@@ -49,7 +49,8 @@ _MOST_FILES = 1000  # most files of a folder that are looked at for a message ab
 
 
 def refuse_unread(path: Path, expected: str) -> None:
-    """Raises InputError for a file, or for a folder with mostly files, of a kind that is known and not read."""
+    """Raises InputError for a file of a known kind that is not read, and for a folder with such files. The error tells
+    how to convert them. expected: what the error says was expected."""
     entries = [path] if path.is_file() else sorted(path.iterdir())[:_MOST_FILES] if path.is_dir() else []
     files = [file for file in entries if file.is_file()]
     suffixes = Counter("dcm" if _is_dicom(file) else file.suffix.lower()[1:] for file in files)
@@ -91,7 +92,7 @@ _KEYS = {"bead": ("centre_mm", "radius_mm", _COMMON), "wire": ("from_mm", "to_mm
 
 def import_scan(path: str | Path, options: ImportOptions | None = None, form: str | None = None) -> Scan:
     """Imports a file or folder of another program as a scan of line integrals, row 0 the lowest, in mm, s and radians.
-    ``options``: values that the files do not state; ``form``: a key of ``FORMATS``, None recognises it. Raises InputError
+    options: values that the files do not state. form: a key of ``FORMATS``; None recognises the format. Raises InputError
     for an unknown format, damaged or incomplete files, and options that the format does not use."""
     path = Path(path)
     _check_there(path)
@@ -145,9 +146,11 @@ def foreign_volume(path: str | Path) -> str | None:
 
 def load_volume(path: str | Path, mu_water_per_mm: float | None = None) -> Volume:
     """Reads a volume (nz, ny, nx) float32 in 1/mm of any format. Axes are reordered and flipped to rise with the world's,
-    LPS (docs/export.md). Bare values have no grid: a dataset /volume, files without voxel sizes, .npy without its .json.
-    Hounsfield units are converted, see ``in_per_mm``. Raises InputError for a damaged file, oblique axes, Hounsfield units
-    without ``mu_water_per_mm``, and values that are not finite."""
+    LPS (docs/export.md).
+
+    Values without a grid are those of a dataset /volume, of files without voxel sizes, and of .npy without its .json.
+    Hounsfield units are converted, see ``in_per_mm``. Raises InputError for a damaged file, oblique axes, Hounsfield
+    units without ``mu_water_per_mm``, and values that are not finite."""
     if (reader := _reader(path)) is None:
         refuse_unread(Path(path), "a volume of a format of docs/formats.md")
         return in_per_mm(str(path), read_volume(path), mu_water_per_mm)
@@ -155,16 +158,17 @@ def load_volume(path: str | Path, mu_water_per_mm: float | None = None) -> Volum
 
 
 def load_states(path: str | Path) -> Iterator[tuple[float, Volume]]:
-    """Yields (time in s, volume) for each volume of a NIfTI, NRRD or MetaImage file with four axes; nothing for other files.
-    Raises InputError as ``load_volume`` does."""
+    """Yields (time in s, volume) for each volume of a NIfTI, NRRD or MetaImage file with four axes; nothing for other
+    files. Raises InputError as ``load_volume`` does."""
     if (reader := _reader(path)) is not None and reader[1] is read_image_volume:
         for state, time_s in enumerate(image_times_s(Path(path))):
             yield time_s, in_per_mm(str(path), read_image_volume(Path(path), state))
 
 
 def load_attenuation(path: str | Path, *, warn: bool = True) -> Volume:
-    """Reads a volume to be projected. Raises InputError, or warns, as ``check_attenuation`` does for values that are no
-    attenuation in 1/mm."""
+    """Reads a volume (nz, ny, nx) in 1/mm that is to be projected. Raises InputError as ``load_volume`` does, and as
+    ``check_attenuation`` does for values that are no attenuation. warn: whether it may also warn of many negative
+    values."""
     return check_attenuation(f"volume of {path}", load_volume(path), warn=warn)
 
 
@@ -174,7 +178,8 @@ def _reader(path: str | Path) -> tuple[str, Callable[[Path], Volume]] | None:
 
 
 def _read_npy(path: Path) -> Volume:
-    """Reads an array (z, y, x), with the grid in a .json file of the same name; without that file it has no grid."""
+    """Reads an array (nz, ny, nx) with the grid in a .json file of the same name; without that file the volume has no
+    grid."""
     values, beside = read_npy(path, 3), path.with_suffix(".json")
     facts = read_json(beside) if beside.is_file() else {}
     if "voxel_size_mm" not in facts:
@@ -188,7 +193,8 @@ def _read_npy(path: Path) -> Volume:
 
 
 def _read_tiff(path: Path) -> Volume:
-    """Reads pages from the lowest slice up, row 0 at the smallest y, with the sizes that ImageJ or OME write."""
+    """Reads a TIFF's pages as slices from the lowest up, row 0 at the smallest y, with the voxel sizes that ImageJ or OME
+    write."""
     values = tiff.read_tiffs([path])
     size_mm, origin, note = tiff.calibration(path)
     if size_mm is None:
@@ -204,9 +210,9 @@ def _read_zarr(path: Path) -> Volume:
 def _on_grid(
     path: Path, values: np.ndarray, size_mm: np.ndarray | None = None, first_mm: np.ndarray | None = None, note: str = ""
 ) -> Volume:
-    """Returns a volume of values (z, y, x) with voxels of ``size_mm`` (3,), the first centred at ``first_mm`` (3,), both (z,
-    y, x). None for ``first_mm`` centres the volume at the origin. Without sizes it has no grid, and integers are divided by
-    the maximum of their type."""
+    """Returns a volume of values (nz, ny, nx) with voxels of ``size_mm`` (3,), the first centred at ``first_mm`` (3,),
+    both (z, y, x). None for ``first_mm`` centres the volume at the origin. Without sizes it has no grid, and integers are
+    divided by the maximum of their type. note: the file's words about its values."""
     if size_mm is None:
         return Volume(finite_float32(str(path), shares_of_maximum(values)), None)
     centre_mm = np.zeros(3) if first_mm is None else first_mm + (np.array(values.shape) - 1) / 2 * size_mm

@@ -45,16 +45,18 @@ _FIRST_VIEW = "First view of this scan in a JSON of several (phyradgs-real)."
 
 
 def _option(help: str, usual: str | bool = _FILE, default: Any = None) -> Any:
-    """Returns a field with its help, and with the words for the value of an option that is not given."""
+    """Returns a field with its help text. usual: in words, the value of an option that is not given."""
     return field(default=default, metadata={"help": help, "usual": usual})
 
 
 @dataclass(frozen=True)
 class ImportOptions:
     """Options of an import. None leaves a value to the file or to the format's convention. Readout axis and direction are
-    those of the imported scan: row 0 the lowest, column 0 on the left, seen from the source. The command line has the words
-    of a data sheet: ``first``, ``fps``, ``exposure_ms`` and ``readout_ms``. The fields without help are computed from them.
-    ``named`` returns the name of a field in messages. Raises InputError for values out of range, and for contradictions."""
+    those of the imported scan: row 0 the lowest, column 0 on the left, seen from the source.
+
+    The command line has the words of a data sheet: ``first``, ``fps``, ``exposure_ms`` and ``readout_ms``. Fields without
+    help are computed from these words. ``named`` returns the name of a field in messages. Raises InputError for values
+    out of range, and for contradictions."""
 
     exposure_s: float | None = _option("Exposure of a line, s, in place of --exposure-ms.")
     readout_s: float | None = None

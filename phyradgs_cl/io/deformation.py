@@ -44,7 +44,7 @@ def holds_deformation(path: str | Path) -> bool:
 
 
 def deformation_summary(path: str | Path) -> dict[str, object]:
-    """Returns facts about a deformation file, checked as when it is read."""
+    """Returns facts about a deformation file by name. Raises InputError as ``read_deformation`` does."""
     field = read_deformation(path)
     rank, nz, ny, nx, _ = field.control_mm.shape
     return {
@@ -68,7 +68,7 @@ def write_deformation_group(parent: h5py.Group, deformation: Deformation) -> Non
 
 
 def read_deformation_group(source: Hdf5Source, address: str) -> Deformation:
-    """Reads the group at ``address``. Raises InputError as ``read_deformation`` does."""
+    """Reads the deformation in the group ``address``. Raises InputError as ``read_deformation`` does."""
     source.group(address)
     control_mm = h5.read_array(source, f"{address}/control", (None, None, None, None, 3), h5.LENGTH)
     origin_mm = h5.read_array(source, f"{address}/origin", (3,), h5.LENGTH)
@@ -106,8 +106,8 @@ def write_truth(extra: h5py.Group, scan: Scan) -> None:
 
 
 def check_truth(source: Hdf5Source, entry: str, grid: Grid) -> tuple[bool, int]:
-    """Returns whether a scan file has a reference, and its number of states. Raises InputError where their shapes do not
-    fit the grid."""
+    """Returns whether a scan file has a true volume or states, and the number of states. Raises InputError where their
+    shapes do not fit the grid."""
     if source.optional_group(f"{entry}/{schema.REFERENCE}") is None:
         return False, 0
     states, times = (source.optional(f"{entry}/{name}") for name in (schema.STATES, schema.STATE_TIMES))

@@ -110,8 +110,8 @@ def free_bytes() -> float:
 
 
 def in_use_bytes(field: str) -> int:
-    """Returns bytes of memory of this process, from a field of Linux' /proc/self/status: "VmHWM:" for the peak of resident
-    memory, "VmSize:" for the address space. Returns 0 on other systems."""
+    """Returns bytes of memory of this process, from the field of Linux' /proc/self/status: "VmHWM:" for the peak of
+    resident memory, "VmSize:" for the address space. Returns 0 on other systems."""
     try:
         return 1024 * int(Path("/proc/self/status").read_text().partition(field)[2].split()[0])
     except (OSError, ValueError, IndexError):

@@ -32,9 +32,11 @@ MOST_LINES = 65_536  # largest number of rows, and of columns, of a panel
 
 @dataclass(frozen=True)
 class Scanner:
-    """A scanner: geometry, imaged volume, and the default readout of its panel. ``readout_ratio``: T_ro/T_exp, None for the
-    protocol's. ``pulse``: start and length of the beam in a frame, in exposures; None for a steady beam. ``lag``: the
-    fraction λ of a frame from earlier frames. ``fps``, ``readout_ms``: frame rate and readout of the data sheet, or None."""
+    """A scanner: geometry, imaged volume, and the default readout of its panel.
+
+    readout_ratio: T_ro/T_exp; None takes the protocol's. pulse: start and length of the beam in a frame, in exposures;
+    None for a steady beam. lag: the fraction λ of a frame that stems from earlier frames. fps, readout_ms: frame rate and
+    readout of the data sheet, or None."""
 
     name: str
     geometry: Geometry
@@ -76,7 +78,7 @@ def _located(name: str, data_dir: Path) -> Path:
 
 
 def _describes_scanner(path: Path) -> bool:
-    """True for a TOML file with the table that every scanner has; the folder may hold other files."""
+    """Returns whether ``path`` is a TOML file with the table that every scanner has; the folder may hold other files."""
     try:
         return "source" in read_toml(path)
     except InputError:

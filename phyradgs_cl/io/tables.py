@@ -62,7 +62,8 @@ def read_facts(subject: str, text: str, types: Mapping[str, tuple[type, ...]]) -
 
 
 def _fits(value: object) -> bool:
-    """True for a list of tables, for a number of at most 64 bits that is finite, and for all other types."""
+    """Returns whether a list holds tables alone, or a number is finite and has at most 64 bits; True for all other
+    types."""
     if isinstance(value, list):
         return all(isinstance(line, dict) for line in value)
     return not isinstance(value, (int, float)) or abs(value) < 2**63
@@ -77,8 +78,9 @@ def refuse_unknown(subject: str, names: Collection[str], allowed: Collection[str
 
 
 class Fields:
-    """A table whose values are read one by one and checked. ``subject`` names it in messages. ``allowed``: the only keys
-    that it may have; None allows any. Methods raise InputError, about "SUBJECT key", for missing and for wrong values."""
+    """A table whose values are read and checked one at a time. subject: names the table in messages. allowed: the only
+    keys that it may have; None allows any. Methods raise InputError, about "SUBJECT key", for missing and for wrong
+    values."""
 
     def __init__(self, subject: str, values: object, allowed: Collection[str] | None = None) -> None:
         if not isinstance(values, Mapping):
@@ -96,7 +98,7 @@ class Fields:
         return InputError(self.name(key), found, expected, remedy)
 
     def has(self, key: str) -> bool:
-        """True where the table has a value that is not None."""
+        """Returns whether the table has a value for ``key`` that is not None."""
         return self.values.get(key) is not None
 
     def get(self, key: str) -> object:
@@ -190,7 +192,7 @@ class Fields:
 
 
 def described(value: object) -> str:
-    """Returns a short text of a value for messages. Containers give type and length only: nested ones may be huge."""
+    """Returns a short text of a value for messages. A container gives its type and length only, because it may be huge."""
     if value is None or isinstance(value, (bool, int, float, str, bytes, np.generic)):
         return checks.short_repr(value)
     size = f" of {len(value)}" if isinstance(value, (Mapping, Sequence)) else ""

@@ -42,9 +42,9 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, eq=False)
 class Volume:
-    """Values (nz, ny, nx) float32 in 1/mm and their grid, or None for a bare array. A volume file also holds ``provenance``
+    """Values (nz, ny, nx) float32 in 1/mm and their grid, None for a bare array. A volume file also holds ``provenance``
     (types as in ``tables.PROVENANCE``), ``gaussians`` float32 in mm and 1/mm, and ``metrics`` by name. deformation: the
-    object's motion, with the volume at rest. states: the object at several times; the volume is their mean."""
+    object's motion, with the volume as reference. states: the object at several times, with the volume as their mean."""
 
     values: np.ndarray
     grid: Grid | None
@@ -55,7 +55,8 @@ class Volume:
     states: States | None = None
 
     def at(self, time_s: float) -> np.ndarray:
-        """Returns the values (nz, ny, nx) in 1/mm at a time in s; always ``values`` without states and deformation."""
+        """Returns the values (nz, ny, nx) in 1/mm at a time in s; ``values`` where the volume has neither states nor a
+        deformation."""
         if self.states is not None:
             return self.states.at(time_s)
         if (field := self.deformation) is None:
@@ -63,7 +64,8 @@ class Volume:
         return deformed(self.values, self.required_grid, field, field.weights_at(time_s)[0])
 
     def moved_by(self, deformation: Deformation, subject: str) -> "Volume":
-        """Returns the volume with another deformation. Raises InputError, with ``subject``, for a volume with states."""
+        """Returns the volume with another deformation. Raises InputError, which names ``subject``, for a volume with
+        states."""
         if self.states is not None:
             found, expected = f"{subject}, which holds its states", "a volume whose object does not change"
             raise InputError("--object-motion", found, expected, "leave it out")
@@ -71,7 +73,7 @@ class Volume:
 
     @property
     def scale(self) -> Hounsfield | None:
-        """The scale of Hounsfield units that the file holds, or None."""
+        """The scale of Hounsfield units that the file holds; None without one."""
         return of_facts(self.provenance)
 
     def hounsfield(self, air: Box | None = None, water: Box | None = None, insert_hu: float = 0.0) -> "Volume":
@@ -148,8 +150,8 @@ def read_volume(path: str | Path) -> Volume:
 
 
 def read_state(path: str | Path) -> dict[str, np.ndarray] | None:
-    """Reads the state from which an interrupted run resumes, by name. Returns None where there is none, and, with a warning,
-    where it is damaged. The caller checks the arrays."""
+    """Reads the state from which an interrupted run resumes, by name. Returns None without a state and, with a warning,
+    for a damaged one. The caller checks the arrays."""
     with open_hdf5(path) as source:
         try:
             group = source.optional_group(_STATE)
@@ -160,9 +162,9 @@ def read_state(path: str | Path) -> dict[str, np.ndarray] | None:
 
 
 def check_attenuation(subject: str, volume: Volume, *, warn: bool = True) -> Volume:
-    """Returns ``volume``, which is to be projected. Raises InputError about ``subject`` where the sum of the negative values
-    is at least that of the positive ones in size, as in Hounsfield units, and for values beyond 1e9. Warns where it is more
-    than a tenth."""
+    """Returns ``volume``, which is to be projected. Raises InputError about ``subject`` for values beyond 1e9, and where
+    the negative values sum to at least the positive ones in size, as in Hounsfield units. Warns where they sum to more
+    than a tenth, unless ``warn`` is False."""
     values = volume.values
     if (size := float(np.abs(values).max())) > h5.ATTENUATION.largest:
         expected = f"attenuation of at most {h5.ATTENUATION.largest:g} 1/mm"
@@ -181,9 +183,10 @@ def check_attenuation(subject: str, volume: Volume, *, warn: bool = True) -> Vol
 
 
 def in_per_mm(subject: str, volume: Volume, mu_water_per_mm: float | None = None) -> Volume:
-    """Returns a volume in 1/mm. Values that the file's note calls Hounsfield units are converted by the scale in the note,
-    else by ``mu_water_per_mm``. Values beyond 10 without a note are converted by ``mu_water_per_mm`` if it is given. The
-    result then holds the scale. Raises InputError about ``subject`` for noted Hounsfield units without either."""
+    """Returns a volume in 1/mm, with the scale of converted Hounsfield units. Values that the file's note calls
+    Hounsfield units are converted by the note's scale, else by ``mu_water_per_mm``. Values beyond 10 without a note are
+    converted by ``mu_water_per_mm``, if given. Raises InputError about ``subject`` for noted Hounsfield units without
+    either scale."""
     stated = None if mu_water_per_mm is None else Hounsfield(mu_water_per_mm)
     is_hu, scale = of_note(str(volume.provenance.get(VALUES, "")))
     if scale is None and (is_hu or float(np.abs(volume.values).max()) > _USUAL_PER_MM):
@@ -245,8 +248,8 @@ def _states_summary(source: Hdf5Source, shape: tuple[int, ...]) -> dict[str, obj
 
 
 def file_kind(path: str | Path) -> str:
-    """Returns the kind of an HDF5 file: "scan", "volume", "plain-volume" (a bare dataset /volume) or "deformation". Raises
-    InputError for any other."""
+    """Returns what an HDF5 file holds: "scan", "volume", "plain-volume" (a bare dataset /volume) or "deformation". Raises
+    InputError for any other file."""
     with open_hdf5(path) as source:
         if isinstance(source.find(_DATA), h5py.Group):
             return "volume"
@@ -358,7 +361,8 @@ def _read_states(source: Hdf5Source, shape: tuple[int, ...]) -> States | None:
 
 
 def _states_datasets(source: Hdf5Source, shape: tuple[int, ...]) -> tuple[np.ndarray, h5py.Dataset]:
-    """Returns the times (K,) in s and the dataset (K, nz, ny, nx) of the states. Raises InputError for wrong ones."""
+    """Returns the times (K,) in s and the dataset (K, nz, ny, nx) of the states. Raises InputError for times that do not
+    rise, and for other shapes."""
     times_s = h5.read_array(source, f"{_STATES}/time_s", (None,), h5.TIME)
     if len(times_s) == 0 or (np.diff(times_s) <= 0).any():
         raise source.error(f"{_STATES}/time_s", checks.short_repr(times_s.tolist()), "at least one time, rising")
@@ -380,7 +384,7 @@ def shares_of_maximum(values: np.ndarray) -> np.ndarray:
 
 
 def finite_float32(subject: str, values: np.ndarray) -> np.ndarray:
-    """Returns ``values`` as contiguous float32. Raises InputError about ``subject`` where one is not finite."""
+    """Returns ``values`` as contiguous float32. Raises InputError about ``subject`` for NaN and values beyond float32."""
     with np.errstate(over="ignore"):  # values beyond float32 become infinite
         volume = np.ascontiguousarray(values, np.float32)
     bad = int(volume.size - np.count_nonzero(np.isfinite(volume)))

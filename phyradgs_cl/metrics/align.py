@@ -16,8 +16,8 @@ _ROUNDING = 1e-6  # largest distance, in voxels, of the faces of two boxes that 
 
 @dataclass(frozen=True, eq=False)
 class Aligned:
-    """A volume and a reference (nz, ny, nx), both on ``grid``. ``how``: how they were brought there, in words. ``share``:
-    the compared fraction of the reference's box."""
+    """A volume and a reference (nz, ny, nx), both on ``grid``. how: in words, how they came onto one grid. share: the
+    compared fraction of the reference's box."""
 
     volume: Values
     reference: Values
@@ -27,7 +27,7 @@ class Aligned:
 
 
 def aligned(volume: Values, grid: Grid, reference: Values, reference_grid: Grid) -> Aligned | None:
-    """Brings both volumes (nz, ny, nx) to one grid. None: the boxes share no voxel centre.
+    """Returns both volumes (nz, ny, nx) on one grid; None where the boxes have no voxel centre in common.
 
     Where the volume's voxels are whole blocks of the reference's, the reference is averaged over the blocks. Any other
     volume is resampled trilinearly onto the reference's voxels that lie in its box."""
@@ -50,7 +50,7 @@ def aligned(volume: Values, grid: Grid, reference: Values, reference_grid: Grid)
 
 
 def overlap(one: Grid, other: Grid) -> tuple[float, float]:
-    """Returns the volume that two boxes share, as a fraction of each box."""
+    """Returns the volume that both boxes cover, as a fraction of each box."""
     low, high = np.maximum(one.box_mm[:, 0], other.box_mm[:, 0]), np.minimum(one.box_mm[:, 1], other.box_mm[:, 1])
     shared_mm3 = float(np.prod(np.maximum(high - low, 0)))
     return shared_mm3 / math.prod(one.size_mm), shared_mm3 / math.prod(other.size_mm)
@@ -73,7 +73,7 @@ def block_means(values: Values, factors: tuple[int, int, int]) -> Values:
 
 
 def in_words(grid: Grid) -> str:
-    """Describes a grid in a few words. The order is x y z, as in all texts for users."""
+    """Returns a grid in a few words, in the order x y z, as in all texts for users."""
     sizes, offsets = (v[::-1] for v in (grid.voxel_size_mm, grid.offset_mm))
     digits = 3 - math.floor(math.log10(min(sizes)))  # an offset below a thousandth of a voxel is not shown
     words = f"{_times(grid.shape)} voxels (x y z) of {'×'.join(f'{s:.4g}' for s in sizes)} mm"

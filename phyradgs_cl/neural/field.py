@@ -60,9 +60,9 @@ def to_array(tensor: torch.Tensor) -> np.ndarray:
 
 
 class NeuralField(nn.Module):
-    """Attenuation (P,) of positions (P, 3) x y z, in [−1, 1] along the longest side of the volume.
+    """Maps positions (P, 3), x y z in [−1, 1] along the longest side of the volume, to attenuation (P,).
 
-    ``segment``: the number of neighbouring positions that belong together; 1 where every position stands for itself."""
+    segment: the number of neighbouring positions that belong together; 1 where every position stands for itself."""
 
     def __init__(self, encoding: HashEncoding, network: AttenuationNetwork, segment: int = 1) -> None:
         super().__init__()

@@ -44,7 +44,8 @@ class LineAttention(nn.Module):
 
 
 class LineAttentionBlocks(nn.Module):
-    """Attention and feed-forward layers in turn, each after a layer norm and beside an identity. Shapes stay (P, width)."""
+    """Attention and feed-forward layers in turn, each after a layer norm and with a skip connection. Shapes stay (P,
+    width)."""
 
     def __init__(self, width: int, segment: int, heads: int, head_width: int, blocks: int) -> None:
         super().__init__()
@@ -69,10 +70,10 @@ class LineAttentionBlocks(nn.Module):
 
 
 class AttenuationNetwork(nn.Module):
-    """Attenuation (P,) from features (P, inputs), in the units of ``options.density_bound``.
+    """Maps features (P, inputs) to attenuation (P,) in the units of ``options.density_bound``.
 
-    ``middle``: the modules between the first and the last layer. ``skip``: the place among all layers where the features
-    enter again. Leaky ReLU follows every layer but the last."""
+    middle: the modules between the first and the last layer. skip: the index among all layers where the features enter
+    again. Leaky ReLU follows every layer but the last."""
 
     def __init__(self, inputs: int, middle: list[nn.Module], skip: int, options: NeuralOptions) -> None:
         super().__init__()
@@ -112,9 +113,11 @@ def network_of(inputs: int, options: NeuralOptions) -> AttenuationNetwork:
 
 
 class HashEncoding(nn.Module):
-    """Features (P, levels · features) of positions (P, 3) in [0, 1]³, interpolated linearly between a level's corners.
+    """Maps positions (P, 3) in [0, 1]³ to features (P, levels · features), interpolated linearly between a level's
+    corners.
 
-    A level has an entry for each corner if its corners fit into 2^table_log2 entries. Otherwise they share by a hash."""
+    A level has an entry for each corner if its corners fit into 2^table_log2 entries. Otherwise corners share entries by
+    a hash."""
 
     def __init__(
         self, levels: int, features: int, base_resolution: int, growth: float, table_log2: int
@@ -144,7 +147,8 @@ class HashEncoding(nn.Module):
 
 
 def corners(positions: torch.Tensor, cells: int, size: int) -> tuple[torch.Tensor, torch.Tensor]:
-    """Returns entries (8, P) int64 and weights (8, P) of the corners around positions (P, 3), of a level."""
+    """Returns entries (8, P) int64 and weights (8, P) of the corners around positions (P, 3), in a level of ``cells``
+    cells along a side and ``size`` entries."""
     scaled = positions.t() * cells
     low = scaled.floor().clamp_(0, cells - 1)
     high_share = scaled - low  # (3, P)
@@ -172,7 +176,7 @@ def weighted_rows(table: torch.Tensor, index: torch.Tensor, weight: torch.Tensor
 
 
 class _Interpolate(torch.autograd.Function):
-    """Σ weight · table[index] over the 8 corners (B, 8) of each bag. The gradient sums into the table in one fixed order."""
+    """Returns Σ weight · table[index] over 8 corners, (B, 8). The gradient is summed into the table in one fixed order."""
 
     @staticmethod
     def forward(ctx: Any, table: torch.Tensor, index: torch.Tensor, weight: torch.Tensor) -> torch.Tensor:

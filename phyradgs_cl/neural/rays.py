@@ -121,7 +121,7 @@ def windows_and_scattered_pixels(
 
 
 def chosen_times(pixels: int, times: int, count: int, rng: np.random.Generator) -> np.ndarray:
-    """Returns ``count`` of the ``times`` of every pixel (R, count). None comes twice, and all are equally likely."""
+    """Draws ``count`` of the ``times`` of every pixel, (pixels, count). No time comes twice, and all are equally likely."""
     if count >= times:
         return np.broadcast_to(np.arange(times), (pixels, times))
     return np.argsort(rng.random((pixels, times)), axis=1)[:, :count]
@@ -142,7 +142,7 @@ def box_span(
 
 
 def sample_shifts(rays: int, samples: int, jitter: str, rng: np.random.Generator) -> np.ndarray:
-    """Returns the place of each sample in its interval, 0 to 1. (R, 1) for one shift per ray or none, else (R, samples)."""
+    """Returns the place of each sample in its interval, 0 to 1: (R, 1) for one shift per ray or none, else (R, samples)."""
     if jitter == "none":
         return np.full((rays, 1), 0.5, np.float32)
     return rng.random((rays, samples if jitter == "sample" else 1), np.float32)

@@ -17,7 +17,7 @@ _POINTS_ELSEWHERE = 2**20  # most points at which another device evaluates the f
 
 
 class Trainer:
-    """A field, its optimiser and the random draws, which change from step to step.
+    """Fits a field to a scan's rays. Holds the field, its optimiser and the random draws, which change from step to step.
 
     Lengths are in units of half the volume's longest side, attenuation in units of ``density_per_mm``."""
 

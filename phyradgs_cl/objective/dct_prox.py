@@ -24,7 +24,8 @@ TURNS = ((0, 1, 2, 3), (1, 3, 0, 2), (2, 0, 3, 1), (3, 2, 1, 0))
 
 
 class DctProx:
-    """The map for volumes of a fixed ``shape`` (z, y, x). It does not change a volume thinner than a block."""
+    """Shrinks the block cosine transforms of volumes of a fixed ``shape`` (nz, ny, nx). A volume thinner than a block
+    stays as it is."""
 
     def __init__(self, rt: Runtime, shape: tuple[int, int, int]) -> None:
         self.rt, self.shape = rt, shape
@@ -40,9 +41,11 @@ class DctProx:
     def __call__(
         self, volume: SameArray, threshold: float, turn: int, *, nonnegative: bool, out: DeviceArray | None = None
     ) -> SameArray:
-        """Maps a volume (z, y, x), float32. ``threshold``: that of the coefficients of the orthonormal transform.
+        """Returns the shrunk volume (nz, ny, nx) float32. threshold: that of the coefficients of the orthonormal
+        transform.
 
-        ``turn``, 0 to 3, chooses a quarter of the shifts. A device array gives a device array (``out``, if given)."""
+        turn: 0 to 3, chooses a quarter of the shifts. nonnegative: clips the result at 0. A device array gives a device
+        array (``out``, if given)."""
         rt, (nz, ny, nx) = self.rt, self.shape
         observed, result = beside(rt, volume, out)
         voxels, by_voxel = (nx, ny, nz), rt.group(on_cpu=16)
@@ -62,7 +65,7 @@ class DctProx:
 
 
 def dct_prox(volume: np.ndarray, threshold: float, turn: int, *, nonnegative: bool) -> np.ndarray:
-    """Float64 twin of ``DctProx``."""
+    """Returns the shrunk volume (nz, ny, nx) float64: the twin of ``DctProx``, with the same arguments."""
     volume = np.asarray(volume, np.float64)
     if min(volume.shape) < EDGE:
         return np.asarray(np.maximum(volume, 0) if nonnegative else volume)

@@ -26,7 +26,8 @@ _RING = _SLICES + 2  # slices in memory: the correlation of two slices needs one
 class Ridge:
     """The numbers of a regulariser, float32. first (4, 3, 3, 3), second (16, 4, 3, 3, 3): filters, with axes z, y, x.
 
-    ψ_i'(t) = slope_up[i] clip(t, ±σ knot_up[i]) − slope_down[i] clip(t, ±σ knot_down[i]). Each is (16,) and not below 0."""
+    ψ_i'(t) = slope_up[i] clip(t, ±σ knot_up[i]) − slope_down[i] clip(t, ±σ knot_down[i]). Slopes and knots are (16,)
+    each, and not below 0."""
 
     first: np.ndarray
     second: np.ndarray
@@ -42,7 +43,7 @@ class Ridge:
         return np.concatenate([part.ravel() for part in (*filters, *curves)]).astype(np.float32)
 
     def bend(self, responses: np.ndarray, sigma: float) -> np.ndarray:
-        """Returns ψ' of responses (16, z, y, x)."""
+        """Returns ψ_i' of the responses (16, z, y, x) of the filters; sigma: the noise σ in their unit."""
         columns = (self.slope_up, self.knot_up, self.slope_down, self.knot_down)
         up, knot_up, down, knot_down = (values.astype(np.float64)[:, None, None, None] for values in columns)
         rising, falling = (np.clip(responses, -sigma * knot, sigma * knot) for knot in (knot_up, knot_down))
@@ -51,7 +52,8 @@ class Ridge:
 
 @cache
 def learned_ridge() -> Ridge:
-    """Returns the regulariser of ``data/ridge.json``, whose unit is a thousandth (benchmarks/train_ridge.py)."""
+    """Returns the regulariser of ``data/ridge.json``, which stores its numbers in thousandths
+    (benchmarks/train_ridge.py)."""
     stored = json.loads((resource("data") / "ridge.json").read_text(encoding="utf-8"))
     first, second, *curves = (np.array(stored[name]) / 1000 for name in Ridge.__dataclass_fields__)
     first, second = first.reshape(-1, 3, 3, 3), second.reshape(len(curves[0]), -1, 3, 3, 3)
@@ -62,7 +64,8 @@ def learned_ridge() -> Ridge:
 
 
 class RidgeStep:
-    """The step for volumes of a fixed ``shape`` (z, y, x). It does not change a volume thinner than a filter."""
+    """Steps down the ridge regulariser for volumes of a fixed ``shape`` (nz, ny, nx). A volume thinner than a filter
+    stays as it is."""
 
     VOLUMES = 4
     """Most volumes of floats that a step holds in memory, for at least 50 slices with rows of at least 64 voxels."""
@@ -84,7 +87,8 @@ class RidgeStep:
     def __call__(
         self, volume: SameArray, sigma: float, step: float, *, nonnegative: bool, out: DeviceArray | None = None
     ) -> SameArray:
-        """Returns v − ``step`` ∇R(v), float32; ``sigma`` in the unit of v (z, y, x). ``out``: as in ``DctProx``."""
+        """Returns v − ``step`` ∇R(v), float32, for a volume v (nz, ny, nx); sigma in v's unit. nonnegative: clips the
+        result at 0. out: as in ``DctProx``."""
         nz, ny, nx = self.shape
         observed, result = beside(self.rt, volume, out)
         padded = self._padded, Strides(GUARD, ny * pitch_of(nx), pitch_of(nx))
@@ -101,7 +105,8 @@ class RidgeStep:
         return brought_to(self.rt, volume, result)
 
     def _launch(self, kernel: Kernel, first: int, less: int, *sources: DeviceArray, ends: tuple[object, ...]) -> None:
-        """Runs a kernel on slices from ``first`` on. Its result has ``less`` fewer voxels along each axis."""
+        """Runs a kernel on slices from ``first`` on. Its result has ``less`` voxels fewer along each axis than the
+        volume."""
         nz, ny, nx = (count - less for count in self.shape)
         start, stop = max(first, 0), min(first + _SLICES, nz)
         if start < stop:
@@ -112,7 +117,7 @@ class RidgeStep:
 
 
 def ridge_gradient(volume: np.ndarray, sigma: float, ridge: Ridge) -> np.ndarray:
-    """Returns ∇R of a volume (z, y, x), float64."""
+    """Returns ∇R of a volume (nz, ny, nx), float64; sigma in the volume's unit."""
     volume = np.asarray(volume, np.float64)
     if min(volume.shape) < EDGE:
         return np.zeros_like(volume)
@@ -121,7 +126,7 @@ def ridge_gradient(volume: np.ndarray, sigma: float, ridge: Ridge) -> np.ndarray
 
 
 def ridge_step(volume: np.ndarray, sigma: float, step: float, *, ridge: Ridge, nonnegative: bool) -> np.ndarray:
-    """Float64 twin of ``RidgeStep``."""
+    """Returns v − ``step`` ∇R(v), float64: the twin of ``RidgeStep``, with the same arguments."""
     moved: np.ndarray = np.asarray(volume, np.float64) - step * ridge_gradient(volume, sigma, ridge)
     return np.maximum(moved, 0) if nonnegative else moved
 

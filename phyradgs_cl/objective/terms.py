@@ -24,7 +24,7 @@ C2 = 0.03**2  # SSIM's addend to covariances and variances, for images with valu
 
 
 class ImageLoss:
-    """Loss and gradient of a frame of ``lines`` lines by ``width`` pixels, in the padded image layout."""
+    """Computes the loss of a frame of ``lines`` lines by ``width`` pixels, and its gradient, in the padded image layout."""
 
     def __init__(
         self, rt: Runtime, lines: int, width: int, pitch: int, ssim_weight: float, l1_weight: float = 1.0
@@ -44,7 +44,8 @@ class ImageLoss:
     def evaluate(
         self, rendered: DeviceArray, measured: DeviceArray, mask: DeviceArray, pixels: float
     ) -> DeviceArray:
-        """Returns dL/drendered, valid until the next call. ``mask``: 1 where a pixel counts. ``pixels``: its sum."""
+        """Returns dL/d(rendered), valid until the next call. mask: 1 where a pixel counts, else 0. pixels: the mask's
+        sum."""
         rt = self.rt
         vectors = ceil_div(self.width, rt.lanes)
         size = (np.int32(self.lines), np.int32(self.width), np.int32(self.pitch))
@@ -77,7 +78,7 @@ class ImageLoss:
 def image_loss(
     rendered: np.ndarray, measured: np.ndarray, mask: np.ndarray, ssim_weight: float, l1_weight: float = 1.0
 ) -> tuple[float, np.ndarray]:
-    """Float64 twin of ``ImageLoss``: returns the loss and dL/drendered of images (lines, width)."""
+    """Returns the loss and dL/d(rendered) of images (lines, width): the float64 twin of ``ImageLoss``."""
     x, y = rendered * mask, measured * mask
     mx, my = _blur(x), _blur(y)
     xx, yy, xy = _blur(x * x) - mx * mx, _blur(y * y) - my * my, _blur(x * y) - mx * my
@@ -98,7 +99,8 @@ def _blur(image: np.ndarray) -> np.ndarray:
 
 
 class TotalVariation:
-    """Value and gradient for volumes of a fixed ``shape`` (z, y, x) in the padded layout."""
+    """Computes the anisotropic total variation of volumes of a fixed ``shape`` (nz, ny, nx), and its gradient, in the
+    padded layout."""
 
     def __init__(self, rt: Runtime, shape: tuple[int, int, int], pitch: int) -> None:
         self.rt, self.shape, self.pitch = rt, shape, pitch
@@ -110,7 +112,7 @@ class TotalVariation:
         self.gradient = rt.zeros(2 * GUARD + nz * ny * pitch)
 
     def evaluate(self, volume: DeviceArray) -> DeviceArray:
-        """Returns dTV/dvolume, valid until the next call."""
+        """Returns dTV/d(volume), valid until the next call."""
         nz, ny, _ = self.shape
         items, tile, _ = self.rt.shape_of_lines(self._kernel, self.pitch, ny, nz)
         self.rt.launch(
@@ -125,7 +127,7 @@ class TotalVariation:
 
 
 def total_variation(volume: np.ndarray) -> tuple[float, np.ndarray]:
-    """Float64 twin of ``TotalVariation``: returns its value for a volume (z, y, x), and the gradient."""
+    """Returns the total variation of a volume (nz, ny, nx), and its gradient: the float64 twin of ``TotalVariation``."""
     volume = np.asarray(volume, np.float64)
     gradient = np.zeros_like(volume)
     value = 0.0
@@ -139,14 +141,14 @@ def total_variation(volume: np.ndarray) -> tuple[float, np.ndarray]:
 
 
 def _axis_weights(shape: tuple[int, ...]) -> list[float]:
-    """Returns one over the number of differences along each axis (z, y, x). An axis of one voxel has 0."""
+    """Returns one over the number of differences along each axis (z, y, x); 0 for an axis of one voxel."""
     total = int(np.prod(shape))
     return [1.0 / (total // n * (n - 1)) if n > 1 else 0.0 for n in shape]
 
 
 def mean_density(rows: np.ndarray, weight: float) -> tuple[float, np.ndarray]:
-    """Float64 twin of the term in ``chain_activations``: returns ``weight`` times the mean, and its gradient d/d(rows) (11,
-    G)."""
+    """Returns ``weight`` times the mean density of parameter rows (11, G), and its gradient d/d(rows), (11, G): the
+    float64 twin of the term in ``chain_activations``."""
     gradient = np.zeros_like(rows)
     if (count := rows.shape[1]) == 0:
         return 0.0, gradient

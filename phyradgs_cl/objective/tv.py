@@ -18,9 +18,10 @@ from phyradgs_cl.runtime.layout import beside, brought_to
 
 
 class TvProx:
-    """The map for volumes of a fixed ``shape`` (z, y, x), or (K, z, y, x) of K states.
+    """The proximal map of TV for volumes of a fixed ``shape`` (nz, ny, nx), or (K, nz, ny, nx) of K states.
 
-    A call starts from the dual of the call before. axis_weights: factors of the differences along the axes of ``shape``."""
+    A call starts from the dual of the call before. axis_weights: factors of the differences along the axes of
+    ``shape``."""
 
     def __init__(
         self, rt: Runtime, shape: tuple[int, ...], axis_weights: tuple[float, ...] = (1.0, 1.0, 1.0)
@@ -39,7 +40,8 @@ class TvProx:
 
     @property
     def dual(self) -> np.ndarray:
-        """The dual field (3, nz, ny, nx) along x, y, z, with vectors of length at most 1. Of states (4, K, nz, ny, nx)."""
+        """The dual field (3, nz, ny, nx) along x, y, z, with vectors of length at most 1; for K states (4, K, nz, ny,
+        nx)."""
         return self.rt.download(self._dual)
 
     @dual.setter
@@ -49,9 +51,10 @@ class TvProx:
     def __call__(
         self, volume: SameArray, weight: float, iterations: int, *, nonnegative: bool, out: DeviceArray | None = None
     ) -> SameArray:
-        """Maps a volume (z, y, x), float32, by ``iterations`` from the last dual.
+        """Returns the map of a volume of ``shape``, float32, after ``iterations`` from the last dual. weight: in the
+        volume's unit.
 
-        A device array gives a device array (``out``, if given)."""
+        nonnegative: maps to x ≥ 0. A device array gives a device array (``out``, if given)."""
         observed, result = beside(self.rt, volume, out)
         weight = max(weight, 0.0)
         steps = np.float32(np.array(_steps(self.axis_weights)) / (weight or 1.0))
@@ -80,7 +83,7 @@ def tv_prox(
     volume: np.ndarray, weight: float, iterations: int, *, nonnegative: bool,
     axis_weights: tuple[float, ...] = (1.0, 1.0, 1.0),
 ) -> np.ndarray:
-    """Float64 twin of ``TvProx`` from a dual of zeros."""
+    """Returns the map of a volume, float64, from a dual of zeros: the twin of ``TvProx``, with the same arguments."""
     b = np.asarray(volume, np.float64)
     dual = np.zeros((b.ndim, *b.shape))
     moved = dual.copy()
@@ -122,7 +125,7 @@ def _primal_of(
 def _steps(axis_weights: tuple[float, ...]) -> tuple[float, float]:
     """Returns the steps of the dual in space and in time: one over the Lipschitz constant of the differences.
 
-    For states, each of the two is half as long as it would be alone. A large weight in time then leaves the step in space
+    For states, each step is half as long as it would be alone. A large weight in time then leaves the step in space
     long."""
     *time, z, y, x = axis_weights
     in_space = 1 / (4 * (z * z + y * y + x * x))
@@ -135,7 +138,7 @@ _NOTHING = 1e-30  # addend in 1/mm, for a volume of zeros
 
 
 class TvDescent:
-    """Steps of TV descent for volumes of a fixed ``shape`` (z, y, x)."""
+    """Steps down the total variation of volumes of a fixed ``shape`` (nz, ny, nx)."""
 
     def __init__(self, rt: Runtime, shape: tuple[int, int, int]) -> None:
         self.rt, self.shape = rt, shape
@@ -145,11 +148,12 @@ class TvDescent:
         self._space = DeviceSpace(rt)
 
     def gradient(self, volume: SameArray) -> SameArray:
-        """Returns dTV/dvolume (z, y, x) float32. A device array gives a device array."""
+        """Returns dTV/d(volume), (nz, ny, nx) float32. A device array gives a device array."""
         return self._where_it_is(lambda x: self._gradient(x, self._least(x)), volume)
 
     def __call__(self, volume: SameArray, step: float, count: int) -> SameArray:
-        """Takes ``count`` steps of Euclidean length ``step`` (1/mm) downhill. A device array gives a device array."""
+        """Returns a volume (nz, ny, nx) after ``count`` steps downhill of Euclidean length ``step``, in the volume's
+        unit. A device array gives a device array."""
 
         def descended(x: DeviceArray) -> DeviceArray:
             least = self._least(x)
@@ -176,8 +180,8 @@ class TvDescent:
 
 
 def tv_gradient(volume: np.ndarray, least: float | None = None) -> np.ndarray:
-    """Float64 twin of ``gradient``: that of Σ |backward difference|, (z, y, x). ``least``: the floor, None for the
-    volume's."""
+    """Returns the gradient of Σ |backward difference|, (nz, ny, nx): the float64 twin of ``TvDescent.gradient``. least:
+    the floor of the differences; None takes the volume's."""
     volume = np.asarray(volume, np.float64)
     least = _least_of(volume) if least is None else least
     difference = np.stack([np.diff(volume, axis=a, prepend=volume.take([0], axis=a)) for a in range(3)])
@@ -194,7 +198,7 @@ def _least_of(volume: np.ndarray) -> float:
 
 
 def tv_descent(volume: np.ndarray, step: float, count: int) -> np.ndarray:
-    """Float64 twin of ``TvDescent``."""
+    """Returns a volume after ``count`` steps downhill of length ``step``: the float64 twin of ``TvDescent``."""
     result = np.array(volume, np.float64)
     least = _least_of(result)
     for _ in range(count):

@@ -34,11 +34,11 @@ def backproject(
     rt: Runtime, frames: SameArray, pose: np.ndarray, weight: np.ndarray, grid: Grid, *, is_parallel: bool = False,
     power: int = 2,
 ) -> SameArray:
-    """Returns Σ_f weight_f / z^power · frame_f(u, v) at every voxel centre; z is the voxel's depth relative to the
-    detector's.
+    """Returns Σ_f weight_f / z^power · frame_f(u, v) at every voxel centre, with z the voxel's depth over the detector's.
 
-    frames (F, rows, columns), bilinear and zero outside; pose (F, 12) mm; weight (F,). z is 1 in a parallel beam. The
-    result (z, y, x) float32 is on the device if the frames are. power: 2 of FDK, or 1."""
+    frames (F, rows, columns) are interpolated bilinearly, 0 outside; pose (F, 12) mm; weight (F,). power: 2 for FDK's
+    distance weight, or 1. z is 1 in a parallel beam. The volume (nz, ny, nx) float32 lies where ``frames`` do: on the
+    device or the host. Raises OutOfMemoryError where not even a brick fits."""
     matrices = voxel_matrices(pose, grid, is_parallel)
     block, leans = (0, False) if rt.pixel_items else _upright_block(matrices, grid)
     views = Views(frames, bool(block), matrices, weight)
@@ -54,12 +54,12 @@ def backproject_lines(
     rt: Runtime, frames: SameArray, pose: np.ndarray, weight: np.ndarray, grid: Grid, axis: str = "rows", *,
     is_parallel: bool = False, power: int = 2,
 ) -> SameArray:
-    """Backprojects frames in which every line has its own pose: pose (F, lines, 12) mm, lines along ``axis``.
+    """Backprojects frames (F, rows, columns) in which every line along ``axis`` has its own pose: pose (F, lines, 12) mm.
 
-    A voxel reads the line r whose pose projects the voxel onto r, interpolated between neighbouring lines. Its value is
-    divided by the rate at which the voxel crosses lines: once for the angular step, and once more for the filter's scale if
-    frames were filtered across lines (``axis`` columns). See docs/mathematics.md. power: as in ``backproject``; with 1 the
-    frames count as unfiltered."""
+    A voxel reads the line whose pose projects the voxel onto that line, interpolated between neighbouring lines. Its
+    value is divided by the rate at which the voxel crosses lines: once for the angular step, and once more for the
+    filter's scale where frames were filtered across lines (``axis`` columns). See docs/mathematics.md. power: as in
+    ``backproject``; with 1 the frames count as unfiltered."""
     pose = Readout(axis).poses(pose)
     matrices = voxel_matrices(pose.reshape(-1, 12), grid, is_parallel).reshape(len(pose), -1)
     views = Views(frames, axis == "columns", matrices, weight)
@@ -68,8 +68,8 @@ def backproject_lines(
 
 @dataclass(frozen=True, eq=False)
 class Views:
-    """Frames (F, rows, columns), whether kernels get them transposed, the matrices of a frame's poses (F, 12 · poses), and
-    FDK's weights (F,)."""
+    """The views to backproject. frames (F, rows, columns); is_turned: kernels get them transposed. matrices (F, 12 ·
+    poses): ``voxel_matrices`` of a frame's poses. weight (F,): FDK's weights."""
 
     frames: Array
     is_turned: bool
@@ -83,12 +83,12 @@ class Views:
         return (columns, rows) if self.is_turned else (rows, columns)
 
     def bytes(self, count: int) -> int:
-        """Returns the bytes of ``count`` views on the device."""
+        """Returns the bytes that ``count`` views take on the device."""
         rows, width = self.shape
         return 4 * count * int(2 * GUARD + rows * pitch_of(width) + self.matrices.shape[1] + 1)
 
     def padded(self, rt: Runtime, part: slice) -> DeviceArray:
-        """Returns the frames ``part`` on the device, (n, floats of a padded image), transposed where ``is_turned``."""
+        """Returns the frames ``part`` on the device, (n, floats of a padded frame), transposed where ``is_turned``."""
         count, (rows, width) = part.stop - part.start, self.shape
         pitch = pitch_of(width)
         each = 2 * GUARD + rows * pitch
@@ -105,7 +105,7 @@ class Views:
         return rt.upload(on_host)
 
     def parts(self, room: Room) -> Iterator[slice]:
-        """Yields slices of consecutive views that are uploaded together."""
+        """Yields slices of consecutive views that are on the device together, for one launch each."""
         most_bytes = min(_BYTES_A_LAUNCH, room.largest_bytes, int(_VIEWS_SHARE * room.free_bytes))
         count = max(1, min(_VIEWS_PER_LAUNCH, most_bytes // self.bytes(1)))
         for first in range(0, len(self.matrices), count):
@@ -116,8 +116,8 @@ _Launch = Callable[[Arguments, Brick, DeviceArray], None]
 
 
 def in_bricks(rt: Runtime, views: Views, grid: Grid, step: int, launch: _Launch) -> Array:
-    """Returns the volume (z, y, x) that ``launch`` fills. If it does not fit, bricks of a multiple of ``step`` voxels along
-    z are filled one after the other. Raises OutOfMemoryError where no brick fits."""
+    """Returns the volume (nz, ny, nx) that ``launch`` fills. One that does not fit is filled brick by brick; their sides
+    along z are multiples of ``step`` voxels. Raises OutOfMemoryError where no brick fits."""
 
     is_resident = isinstance(views.frames, DeviceArray)
     volume: Array = rt.empty(grid.shape) if is_resident else np.empty(grid.shape, np.float32)
@@ -161,8 +161,8 @@ def _general(rt: Runtime, power: int, images: Arguments, brick: Brick, volume: D
 
 
 def _lines(rt: Runtime, power: int, is_turned: bool, images: Arguments, brick: Brick, volume: DeviceArray) -> None:
-    """Launches the kernel for one pose per line. Its vectors run along z where lines are columns (``is_turned``), else along
-    x."""
+    """Launches the kernel for one pose per line. Its vectors run along z where lines are detector columns
+    (``is_turned``), else along x."""
     nz, ny, nx = brick.shape
     along_z = {"ALONG_Z": 1} if is_turned and rt.lanes > 1 else {}
     kernel = rt.kernel("backproject", "backproject_lines", **_defines(power), **along_z)
@@ -173,7 +173,8 @@ def _lines(rt: Runtime, power: int, is_turned: bool, images: Arguments, brick: B
 
 
 def _upright(rt: Runtime, name: str, power: int, block: int, images: Arguments, brick: Brick, volume: DeviceArray) -> None:
-    """Launches an upright kernel. ``images`` are transposed: their width is the number of detector rows."""
+    """Launches one of the kernels ``name`` for upright columns. ``images``: arguments of transposed frames, whose width
+    is the number of detector rows."""
     nz, ny, nx = brick.shape
     sizes = {"BLOCK_VOXELS": _BLOCK_VOXELS, "COLUMN_ROWS": _COLUMN_ROWS}
     kernel = rt.kernel("backproject", name, **_defines(power), **sizes)
@@ -188,10 +189,11 @@ def _defines(power: int) -> dict[str, int]:
 
 
 def _upright_block(matrices: np.ndarray, grid: Grid) -> tuple[int, bool]:
-    """Returns the voxels along z per work-item of the upright kernels, 0 where they do not apply, and whether columns lean.
+    """Returns the voxels along z per work-item of the kernels for upright columns, 0 where they do not apply, and whether
+    columns lean.
 
     In upright columns u and depth (rows 0 and 2 of a matrix) do not change with z. All voxels must lie in front of the
-    source, also those by which a column's last vector exceeds the volume."""
+    source, with those by which a column's last vector exceeds the volume."""
     nz, ny, nx = grid.shape
     corners = np.array([[x, y, z, 1] for x in (0, nx - 1) for y in (0, ny - 1) for z in (0, nz - 1 + _WIDEST)])
     depth = matrices[:, 8:12] @ corners.T
@@ -209,7 +211,7 @@ def _upright_block(matrices: np.ndarray, grid: Grid) -> tuple[int, bool]:
 
 
 def _images(rt: Runtime, views: Views, part: slice) -> Arguments:
-    """Returns the kernels' first arguments: padded images on the device, matrices, weights, and their sizes."""
+    """Returns the kernels' first arguments: padded frames, matrices and weights on the device, and their sizes."""
     images, (rows, width) = views.padded(rt, part), views.shape
     count, each = images.shape
     sizes = (np.int32(count), np.int32(rows), np.int32(width), np.int32(pitch_of(width)), np.int64(each))
@@ -224,7 +226,7 @@ def volume_shape(brick: Brick) -> tuple[np.ndarray, np.ndarray, np.int32]:
 
 
 def _strides(brick: Brick) -> Strides:
-    """Returns the strides of a padded brick."""
+    """Returns the strides in floats of a brick with padded rows."""
     _, ny, nx = brick.shape
     return Strides(GUARD, ny * pitch_of(nx), pitch_of(nx))
 

@@ -12,7 +12,7 @@ Shape = tuple[int, int, int]
 
 @dataclass(frozen=True)
 class Brick:
-    """The voxels [start, start + shape) of a volume, both z, y, x."""
+    """A box of voxels of a volume: [start, start + shape), both (z, y, x)."""
 
     start: Shape
     shape: Shape
@@ -32,11 +32,12 @@ def cut(
     shape: Shape, steps: tuple[int, int], needs: Callable[[Shape], tuple[int, ...]], room: Room,
     share: float = 1.0,
 ) -> list[Brick]:
-    """Returns bricks as large as ``share`` of the free memory allows, in the order z, y.
+    """Returns bricks of a volume of ``shape``, as large as ``share`` (0 to 1) of the free memory allows, in the order z,
+    y.
 
-    Sides are multiples of ``steps`` (z, y), except the last along an axis. ``needs`` returns the bytes of all buffers for a
-    brick of shape (z, y, x). A brick of the smallest size may take all of the free memory. Raises OutOfMemoryError where
-    even it does not fit."""
+    Sides are multiples of ``steps`` (z, y), except the last along an axis. ``needs`` returns the bytes of each buffer for
+    a brick of shape (z, y, x). A brick of the smallest size may take all of the free memory. Raises OutOfMemoryError
+    where it does not fit."""
     nz, ny, nx = shape
     smallest = (min(steps[0], nz), min(steps[1], ny), nx)
     if not room.holds(*needs(smallest)):
@@ -52,7 +53,7 @@ def cut(
 
 
 def _candidates(shape: Shape, steps: tuple[int, int]) -> Iterator[Shape]:
-    """Yields shapes of bricks, from the volume down to ``steps``."""
+    """Yields shapes (z, y, x) of bricks, from the whole volume down to the smallest, of ``steps`` (z, y)."""
     nz, ny, nx = shape
     for dz in _parts(nz, steps[0]):
         yield dz, ny, nx
@@ -61,7 +62,7 @@ def _candidates(shape: Shape, steps: tuple[int, int]) -> Iterator[Shape]:
 
 
 def _parts(count: int, step: int) -> Iterator[int]:
-    """Yields the length of parts when ``count`` is cut into 1, 2, 3 … parts that are multiples of ``step``."""
+    """Yields the lengths of equal parts, from one of ``count`` downwards; all but ``count`` are multiples of ``step``."""
     last = count + 1
     for pieces in range(1, ceil_div(count, step) + 1):
         fair = ceil_div(count, pieces)

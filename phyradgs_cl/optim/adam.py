@@ -13,7 +13,7 @@ _RANGE = (1e-12, 10)  # limits of a learning rate: 0 could not decay, and 1e-12 
 
 @dataclass(frozen=True)
 class Rates:
-    """The (first, last) rate of each kind of parameter, in internal units (half-sides of the volume).
+    """The (first, last) learning rate of each type of parameter, in internal units (half-sides of the volume).
 
     The default rates are two to ten times the published ones, which are made for 20,000 iterations and more. In 3,000
     iterations, the published rates end 1 to 2 dB lower (docs/results/settings.md)."""
@@ -54,7 +54,7 @@ def folded_rates(rates: np.ndarray, step: int) -> np.ndarray:
 def adam_step(
     raw: np.ndarray, gradients: np.ndarray, moments: np.ndarray, rates: np.ndarray, step: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Float64 twin of one step: returns the new raw (11, G) and moments (2, 11, G)."""
+    """Returns the raw parameters (11, G) and moments (2, 11, G) after one step: the float64 twin of ``DeviceAdam.step``."""
     first = BETA1 * moments[0] + (1 - BETA1) * gradients
     second = BETA2 * moments[1] + (1 - BETA2) * gradients**2
     stepped = raw - folded_rates(rates, step)[:, None] * first / (np.sqrt(second) + EPSILON)
@@ -62,7 +62,7 @@ def adam_step(
 
 
 class DeviceAdam:
-    """The raw parameters (11, stride) on the device with their moments, and the kernels that move them."""
+    """Runs Adam's kernels on raw parameters (11, stride) and their moments on the device."""
 
     def __init__(self, rt: Runtime, activation: Activation) -> None:
         self.rt, self.activation = rt, activation
@@ -71,7 +71,7 @@ class DeviceAdam:
         self._step = rt.kernel("adam", "adam_step")
 
     def activate(self, raw: DeviceArray, parameters: DeviceArray, count: int, stride: int) -> None:
-        """Writes parameter rows from raw rows."""
+        """Writes parameter rows (11, stride) from raw rows; ``count`` of the columns are Gaussians."""
         self.rt.launch(
             self._activate, stride // self.rt.lanes, raw, count, stride,
             np.float32(self.activation.scale_min), np.float32(self.activation.scale_max), parameters,
@@ -82,8 +82,8 @@ class DeviceAdam:
         self, raw: DeviceArray, parameters: DeviceArray, gradients: DeviceArray, statistics: DeviceArray,
         count: int, stride: int, *, density_weight: float,
     ) -> None:
-        """Replaces dL/d(parameters) by dL/d(raw), adds the term of the mean density and gathers the statistics of density
-        control."""
+        """Replaces dL/d(parameters) in ``gradients`` by dL/d(raw), adds the term of the mean density, and adds to the
+        ``statistics`` of density control."""
         share = 1.0 / max(count, 1)
         self.rt.launch(
             self._chain, stride // self.rt.lanes, raw, parameters, count, stride,
@@ -95,7 +95,8 @@ class DeviceAdam:
         self, raw: DeviceArray, gradients: DeviceArray, moments: DeviceArray, stride: int, rates: np.ndarray,
         step: int,
     ) -> None:
-        """Takes one step of Adam. ``rates`` (11,). ``step`` counts from 1."""
+        """Takes one step of Adam down ``gradients``, dL/d(raw). rates (11,): learning rates per parameter row. step:
+        counts from 1."""
         rates16 = np.zeros(16, np.float32)
         rates16[:11] = folded_rates(rates, step)
         self.rt.launch(

@@ -35,13 +35,13 @@ class DensityControl:
         checks.fields_within("control.", self)
 
     def allows(self, scale: np.ndarray) -> np.ndarray:
-        """Returns which of the scales (3, G) are not too thin."""
+        """Returns which Gaussians of scales (3, G) are not too thin, bool (G,)."""
         if self.prune_aspect <= 0:
             return np.ones(scale.shape[1], bool)
         return np.asarray(scale.max(0) <= self.prune_aspect * scale.min(0))
 
     def is_due(self, iteration: int, iterations: int) -> bool:
-        """Returns whether to act after ``iteration`` (counted from 1)."""
+        """Returns whether a round is due after ``iteration`` (counted from 1) of a run of ``iterations``."""
         inside = self.start_iteration < iteration < self.stop_fraction * iterations
         return self.every > 0 and inside and iteration % self.every == 0
 
@@ -65,9 +65,10 @@ def control_density(
     population: Population, statistic: np.ndarray, activation: Activation, control: DensityControl,
     box: np.ndarray, rng: np.random.Generator,
 ) -> Population:
-    """Does one round of density control.
+    """Returns the population after one round of density control: clones, splits and prunes.
 
-    statistic (G,): mean gradient norm. box (2, 3): lowest and highest corner x y z; Gaussians with centres outside go."""
+    statistic (G,): mean gradient norm. box (2, 3): lowest and highest corner x y z; Gaussians with centres outside are
+    removed."""
     rows = activation.apply(population.raw)
     room = max(control.max_gaussians - statistic.size, 0)
     has_large_gradient = _strongest(statistic, control.threshold, room)
@@ -92,7 +93,8 @@ def control_density(
 def prune(
     population: Population, activation: Activation, control: DensityControl, box: np.ndarray
 ) -> Population:
-    """Removes Gaussians that are faint, outside the box or too thin. Sorts the others by height: neighbours share lines."""
+    """Returns the population without Gaussians that are faint, outside the box or too thin, sorted by height: neighbours
+    then share lines of the detector."""
     rows = activation.apply(population.raw)
     inside = np.all((rows[g.MEAN] >= box[0][:, None]) & (rows[g.MEAN] <= box[1][:, None]), axis=0)
     kept = np.flatnonzero(inside & (rows[g.DENSITY] >= control.prune_density) & control.allows(rows[g.SCALE]))
@@ -100,7 +102,7 @@ def prune(
 
 
 def _strongest(statistic: np.ndarray, threshold: float, room: int) -> np.ndarray:
-    """Returns which statistics are at or above the threshold; of more than ``room``, the largest."""
+    """Returns which statistics are at or above the threshold, bool (G,); of more than ``room``, only the largest."""
     chosen = statistic >= threshold
     if int(chosen.sum()) > room:
         order = np.argsort(-statistic, kind="stable")[:room]
@@ -110,7 +112,8 @@ def _strongest(statistic: np.ndarray, threshold: float, room: int) -> np.ndarray
 
 
 def _children(rows: np.ndarray, control: DensityControl, rng: np.random.Generator) -> np.ndarray:
-    """Draws one child (11, S) from each Gaussian (11, S), smaller and half as dense."""
+    """Draws one child (11, S) from each Gaussian (11, S): smaller, half as dense, with its centre drawn from the parent's
+    distribution."""
     child: np.ndarray = rows.copy()
     child[g.MEAN] += rotate(rows[g.QUATERNION], rng.normal(size=(3, rows.shape[1])) * rows[g.SCALE])
     child[g.SCALE] /= control.split_factor

@@ -35,10 +35,10 @@ _STEPS = 8  # number of frames of RTK's cycle, in which the sphere goes forth an
 def shepp_logan(
     half_size_mm: float, variant: str = "toft", unit_attenuation_per_mm: float | None = None
 ) -> EllipsoidPhantom:
-    """Returns the head in a cube of side 2 · ``half_size_mm`` about the origin.
+    """Returns Shepp and Logan's head in a cube of side 2 · ``half_size_mm`` about the origin.
 
-    ``variant``: "toft" (high contrast) or "kak-slaney". ``unit_attenuation_per_mm``: attenuation of grey level 1. By default
-    it is 1 / ``half_size_mm``, so that line integrals do not depend on the size.
+    variant: "toft" (high contrast) or "kak-slaney". unit_attenuation_per_mm: attenuation of grey level 1. None takes 1 /
+    ``half_size_mm``, so that line integrals do not depend on the size.
 
     Raises InputError for a wrong size or variant."""
     positive("half_size_mm", half_size_mm)
@@ -87,8 +87,8 @@ def sphere_phantom(half_size_mm: float) -> EllipsoidPhantom:
 class MovingBody:
     """A body that goes from end to end of a line and back at constant speed.
 
-    body: in the middle of its line. swing_mm: (x, y, z) from there to the end that it reaches after half a period; it starts
-    at the other end. period_s: the time forth and back. Raises InputError for a period that is not positive."""
+    body: at the middle of its line. swing_mm: (x, y, z) from the middle to the end that it reaches after half a period;
+    it starts at the other end. period_s: the time there and back. Raises InputError for a period that is not positive."""
 
     body: Body
     swing_mm: Triple
@@ -99,13 +99,13 @@ class MovingBody:
         positive("period_s", self.period_s)
 
     def shift_mm(self, time_s: ArrayLike) -> Array:
-        """Returns the shift (n, 3) from the middle at times (n,)."""
+        """Returns the shift (n, 3), x y z in mm, from the middle of its line at times (n,) in s."""
         phase = np.atleast_1d(np.asarray(time_s, np.float64)) / self.period_s
         way = np.interp(phase, [0.0, 0.5, 1.0], [-1.0, 1.0, -1.0], period=1.0)
         return np.outer(way, self.swing_mm)
 
     def at(self, time_s: float) -> Body:
-        """Returns the body at its place at a time."""
+        """Returns the body where it is at a time in s."""
         shift_mm = self.shift_mm(time_s)[0]
         if isinstance(self.body, Ellipsoid):
             x, y, z = (np.asarray(self.body.centre_mm) + shift_mm).tolist()
@@ -147,13 +147,13 @@ class MovingPhantom:
         return max(4 * float(np.linalg.norm(body.swing_mm)) / body.period_s for body in self.moving)
 
     def at(self, time_s: float) -> EllipsoidPhantom:
-        """Returns the phantom at rest as it is at a time."""
+        """Returns the phantom as it is at a time in s, at rest."""
         return EllipsoidPhantom((*self.resting, *(body.at(time_s) for body in self.moving)), self.name)
 
     def line_integrals(self, source: ArrayLike, target: ArrayLike, time_s: ArrayLike) -> Array:
         """Integrates attenuation from ``source`` to ``target``, world points (n, ..., 3) in mm that broadcast.
 
-        time_s (n,): the time of each entry along the first axis. Returns (n, ...) float64."""
+        time_s (n,): the time of each entry along the first axis. Returns (n, ...) float64, dimensionless."""
         start, end = np.asarray(source, np.float64), np.asarray(target, np.float64)
         total = EllipsoidPhantom(self.resting, self.name).line_integrals(start, end)
         for body in self.moving:

@@ -30,10 +30,11 @@ def rotation_about_z(angle_rad: float) -> Matrix:
 
 @dataclass(frozen=True)
 class Ellipsoid:
-    """One solid ellipsoid, whose attenuation adds to that of other bodies.
+    """A solid ellipsoid, whose attenuation adds to that of other bodies.
 
-    Centre (x, y, z); semi-axes along the columns of the 3x3 ``rotation``. A negative ``attenuation_per_mm`` carves a hole.
-    Raises InputError for semi-axes that are not positive, values that are not finite, and a matrix that is no rotation."""
+    Centre (x, y, z); semi-axes along the columns of the 3x3 ``rotation``. A negative ``attenuation_per_mm`` carves a
+    hole. Raises InputError for semi-axes that are not positive, values that are not finite, and a matrix that is no
+    rotation."""
 
     centre_mm: Triple
     semi_axes_mm: Triple
@@ -65,7 +66,7 @@ class Ellipsoid:
 
     @property
     def ends_mm(self) -> tuple[Triple, Triple]:
-        """The ends of a line segment. The whole body lies within ``reach_mm`` of it."""
+        """The ends of a line segment, from which no point of the body is further than ``reach_mm``."""
         return self.centre_mm, self.centre_mm
 
     @property
@@ -73,7 +74,7 @@ class Ellipsoid:
         return max(self.semi_axes_mm)
 
     def chord_fraction(self, start: Array, step: Array) -> Array:
-        """Returns the part (n,) of each segment start + t·step (n, 3), 0 <= t <= 1, that lies inside."""
+        """Returns the fraction (n,) of each segment start + t·step (n, 3), 0 <= t <= 1, that lies inside."""
         to_ball = self.to_unit_ball.T
         o = (start - np.asarray(self.centre_mm)) @ to_ball
         d = step @ to_ball
@@ -86,7 +87,7 @@ class Ellipsoid:
         return np.clip(nearest + half, 0.0, 1.0) - np.clip(nearest - half, 0.0, 1.0)
 
     def contains(self, x: Array, y: Array, z: Array) -> NDArray[np.bool_]:
-        """Returns whether points lie inside, given by coordinates in mm that broadcast."""
+        """Returns whether points, given by coordinates in mm that broadcast, lie inside, bool (...)."""
         cx, cy, cz = self.centre_mm
         # The sum has one term per axis before it broadcasts, so coordinates of a grid stay one-dimensional.
         rows = [m[0] * (x - cx) + m[1] * (y - cy) + m[2] * (z - cz) for m in self.to_unit_ball]
@@ -135,7 +136,7 @@ class Cylinder:
         return self.length_mm / 2 * along + self.radius_mm * np.sqrt(np.maximum(1 - along**2, 0))
 
     def chord_fraction(self, start: Array, step: Array) -> Array:
-        """Returns the part (n,) of each segment start + t·step (n, 3), 0 <= t <= 1, that lies inside."""
+        """Returns the fraction (n,) of each segment start + t·step (n, 3), 0 <= t <= 1, that lies inside."""
         o = start - np.asarray(self.ends_mm[0])
         height, rise = o @ self.axis, step @ self.axis
         o, d = o - height[:, None] * self.axis, step - rise[:, None] * self.axis
@@ -149,7 +150,7 @@ class Cylinder:
         return np.maximum(np.clip(last, 0.0, 1.0) - np.clip(first, 0.0, 1.0), 0.0)
 
     def contains(self, x: Array, y: Array, z: Array) -> NDArray[np.bool_]:
-        """Returns whether points lie inside, given by coordinates in mm that broadcast."""
+        """Returns whether points, given by coordinates in mm that broadcast, lie inside, bool (...)."""
         points = [c - c0 for c, c0 in zip((x, y, z), self.ends_mm[0], strict=True)]
         height = sum(a * p for a, p in zip(self.axis, points, strict=True))
         across = sum((p - a * height) ** 2 for a, p in zip(self.axis, points, strict=True))

@@ -62,7 +62,8 @@ class Lattice:
         return (z, y, x)
 
     def coverage(self, distance: Field) -> Field:
-        """Returns the part of each voxel that lies inside. It is linear in the distance across one voxel."""
+        """Returns the fraction of each voxel that lies inside a body at ``distance``. It is linear in the distance across
+        one voxel."""
         return np.clip(0.5 - distance / np.float32(self.step), 0.0, 1.0)
 
 
@@ -103,7 +104,7 @@ def add_to_union(union: Field, box: Box, distance: Field, blend: float) -> None:
 
 
 def union_distance(union: Field, blend: float) -> Field:
-    """Returns the distance of a sum of ``add_to_union``; FAR where no body is near."""
+    """Returns the distance to the union that ``add_to_union`` has stored; FAR where no body is near."""
     with np.errstate(divide="ignore"):
         return np.minimum(-np.float32(blend) * np.log(union), FAR)
 

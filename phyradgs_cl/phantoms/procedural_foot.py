@@ -113,7 +113,7 @@ def _soft_tissue(lattice: Lattice, cover: list[Capsule], ripple: Field, rng: np.
 
 
 def _add_bone(volume: Field, lattice: Lattice, bone: Bone, ripple: Field, grain: Field) -> None:
-    """Replaces what is in `volume` by a bone: cortical shell, trabeculae, and fatty marrow in the middle."""
+    """Replaces the content of `volume` by a bone: cortical shell, trabeculae, and fatty marrow in the middle."""
     box = implicit.capsule_box(lattice, bone, 0.05)
     distance = implicit.capsule_union(lattice, bone, _JOINT_BLEND, box) + ripple[box]
     outer = lattice.coverage(distance)

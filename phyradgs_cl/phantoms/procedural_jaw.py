@@ -162,7 +162,7 @@ def _soft_tissue(lattice: Lattice, bone: Field, teeth: list[Tooth], rng: np.rand
 
 
 def _fill_bone(volume: Field, lattice: Lattice, distance: Field, rng: np.random.Generator) -> None:
-    """Replaces what is in `volume` by cortical bone around trabeculae around the nerve's canal."""
+    """Replaces the content of `volume` by cortical bone around trabeculae, which surround the nerve's canal."""
     _, _, z = lattice.points(lattice.everything)
     outer = lattice.coverage(distance)
     inner = lattice.coverage(distance + np.float32(_SHELL))

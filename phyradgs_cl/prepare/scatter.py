@@ -41,8 +41,9 @@ _BISECTIONS = 20  # number of steps of the bisection for the height
 
 @dataclass(frozen=True)
 class ScatterOptions:
-    """to_primary: ratio of scatter to primary light behind the object; 0: the kernel is fitted to air. reach: standard
-    deviation of the kernel over the panel's longer side; 0: fitted, or 0.18 where to_primary is stated."""
+    """Options of the scatter step. to_primary: ratio of scatter to primary light behind the object; 0: the kernel is
+    fitted to air. reach: standard deviation of the kernel over the panel's longer side; 0: fitted, or 0.18 where
+    to_primary is stated."""
 
     to_primary: float = checks.ranged(0.0, 0, 5)
     reach: float = checks.ranged(0.0, 0, 2)
@@ -67,13 +68,15 @@ def subtract_scatter(scan: Scan, options: ScatterOptions, make_model: MakeModel)
 
 
 def remove_scatter(frames: np.ndarray, kernel: Kernel) -> np.ndarray:
-    """Returns line integrals (F, v, u) float32 without the scatter of a kernel."""
+    """Returns line integrals (F, v, u) float32 less the scatter that ``kernel`` predicts; frames (F, v, u): line
+    integrals."""
     return -np.log(_primary(np.exp(-frames.astype(np.float64)), kernel)).astype(np.float32)
 
 
 def fit_scatter(frames: np.ndarray, air: np.ndarray, reach: float = 0.0) -> Kernel:
-    """Fits the kernel to the transmission above 1 at pixels ``air``, bool (F, v, u), of line integrals (F, v, u), by
-    non-negative least squares. A ``reach`` other than 0 fixes its width. Frames may differ in light, but not in the mean."""
+    """Returns the kernel fitted, by non-negative least squares, to the transmission above 1 at pixels ``air``, bool (F,
+    v, u), of line integrals (F, v, u). A ``reach`` other than 0 fixes its width. Single frames may differ in light, but
+    not their mean."""
     numbers = _some(len(frames))
     recorded, where = np.exp(-frames[numbers].astype(np.float64)), air[numbers]
     terms = list(itertools.product((reach,) if reach > 0 else _REACHES, _POWERS))
@@ -122,7 +125,8 @@ def raised(kernel: Kernel, frames: np.ndarray, air: np.ndarray, model: Model, bl
 
 
 def _height_for(frames: np.ndarray, to_primary: float, reach: float) -> float:
-    """Returns the height that gives a ratio of scatter to primary light, by bisection: the ratio grows with it."""
+    """Returns the kernel's height that gives ``to_primary``, the ratio of scatter to primary light, by bisection: the
+    ratio grows with the height."""
     some = frames[_some(len(frames))]
     low, high = 0.0, _LARGEST_HEIGHT
     for _ in range(_BISECTIONS):
@@ -133,7 +137,7 @@ def _height_for(frames: np.ndarray, to_primary: float, reach: float) -> float:
 
 
 def _ratio(before: np.ndarray, after: np.ndarray) -> float:
-    """Returns scatter over primary light behind the object, from line integrals with and without scatter."""
+    """Returns scatter over primary light behind the object, from line integrals before and after the removal of scatter."""
     shadow = after > _SHADOW * float(np.percentile(after, 99.9))
     primary = float(np.exp(-after[shadow].astype(np.float64)).sum())
     return float(np.exp(-before[shadow].astype(np.float64)).sum()) / max(primary, 1e-20) - 1

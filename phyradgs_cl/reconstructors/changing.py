@@ -28,10 +28,12 @@ _FRAMES = 3  # number of stacks of all frames in memory at one time
 
 @dataclass(frozen=True)
 class ChangingOptions(IterativeOptions):
-    """states: number of the object's states, each with as many frames; there are fewer where the scan has fewer frames.
-    prior_weight: weight of total variation in space, relative to the error of the gradient as in ``fista``. time_weight:
-    weight of a voxel's change from one state to the next, relative to an equal step between two voxels. subsets: as in
-    ``fista``, but at most two for each frame of a state. tv_iterations: as in ``fista``."""
+    """Options of ``changing``.
+
+    - states: number of the object's states, each with as many frames; fewer where the scan has fewer frames.
+    - prior_weight: weight of total variation in space, relative to the error of the gradient as in ``fista``.
+    - time_weight: weight of a voxel's change from one state to the next, relative to an equal step between two voxels.
+    - subsets: as in ``fista``, but at most two for each frame of a state. tv_iterations: as in ``fista``."""
 
     TRIALS: ClassVar[tuple[int, int]] = (1, 8)
     """Iterations of the short runs of ``estimate``: the first passes, which touch new memory, are slower."""
@@ -74,7 +76,8 @@ def changing(scan: Scan, options: ChangingOptions, rt: Runtime, **arguments: Any
 
 
 def state_times_s(scan: Scan, count: int) -> np.ndarray:
-    """Returns the times (K,) in s of states: means over equal shares of the frames, each with a frame or more."""
+    """Returns the mean times (K,) in s of up to ``count`` states, which take equal numbers of frames in the order of
+    time."""
     middles_s = np.unique(np.asarray(scan.frame_start_s, np.float64)) + scan.shutter.span_s / 2
     shares = np.array_split(middles_s, min(count, len(middles_s)))
     return np.array([share.mean() for share in shares])

@@ -20,7 +20,7 @@ _LONGEST_NAME = 60  # most characters of a difference's name
 
 
 def with_identity(state: State, identity: Mapping[str, Any]) -> State:
-    """Returns a method's state with the identity of its run, as from ``RunPlan.identity``, and a checksum."""
+    """Returns a method's state with a checksum and the identity of its run, of ``RunPlan.identity``."""
     arrays = {**state, RUN: np.array(json.dumps(identity, default=repr))}
     return {**arrays, _CHECKSUM: np.array(_checksum(arrays))}
 
@@ -40,7 +40,7 @@ def without_identity(state: State, identity: Mapping[str, Any]) -> State:
 
 
 def _checksum(arrays: State) -> int:
-    """Returns the CRC-32 of all arrays with their names, types and shapes: they decide on what a device reads."""
+    """Returns the CRC-32 of all arrays with their names, types and shapes, which decide on what a device reads."""
     total = 0
     for name in sorted(arrays):
         array = arrays[name]
@@ -50,7 +50,7 @@ def _checksum(arrays: State) -> int:
 
 
 def _differences(then: object, now: object, name: str = "") -> Iterator[str]:
-    """Yields NAME (then, now) for every value that differs in two trees of tables."""
+    """Yields "NAME (then, now)" for every value that differs between two trees of tables."""
     if isinstance(then, dict) and isinstance(now, dict):
         for key in sorted({*then, *now}):
             yield from _differences(then.get(key), now.get(key), f"{name}.{key}" if name else key)
@@ -59,10 +59,10 @@ def _differences(then: object, now: object, name: str = "") -> Iterator[str]:
 
 
 def history_arrays(record: Sequence[Mapping[str, float]], seconds: float) -> dict[str, np.ndarray]:
-    """Returns a convergence record and the seconds so far as arrays of a state."""
+    """Returns the convergence record and the run's seconds so far as arrays of a state."""
     return {"record": np.array(json.dumps(list(record))), "seconds": np.array(seconds)}
 
 
 def history_of(state: State) -> tuple[list[dict[str, float]], float]:
-    """Returns the convergence record and the seconds of a state."""
+    """Returns the convergence record and the run's seconds so far from a state."""
     return json.loads(str(state["record"])), float(state["seconds"])

@@ -19,13 +19,13 @@ SILENT_S = 10.0  # time without a report after which a process that runs alone r
 
 
 class Stepwise(Protocol):
-    """An iterative method, between its start and its result. ``iterations``: how many it is to do."""
+    """What ``Loop`` needs of an iterative method, between its start and its result. iterations: how many to do."""
 
     iterations: int
 
     @property
     def quantity(self) -> str:
-        """The name of the measure of convergence, loss or residual, which must stay finite."""
+        """The name of the measure of convergence, ``loss`` or ``residual``, which must stay finite."""
 
     @property
     def remedy(self) -> str:
@@ -37,28 +37,29 @@ class Stepwise(Protocol):
 
     @property
     def finished(self) -> str | None:
-        """The reason for which the method has ended before its last iteration, or None."""
+        """The reason for which the method has ended before its last iteration; None while it goes on."""
 
     def step(self) -> None: ...
 
     def measures(self) -> Mapping[str, float]:
-        """Returns the numbers of a line of the record: ``quantity`` and others."""
+        """Returns the numbers of a line of the convergence record: ``quantity`` and others, by name."""
 
     def state(self) -> dict[str, np.ndarray]:
         """Returns the arrays from which ``restore`` continues with the next step."""
 
     def restore(self, state: State) -> None:
-        """Restores a state; raises InputError for one that this run cannot have written."""
+        """Restores a state of ``state``. Raises InputError for a state that this run cannot have written."""
 
     def present_volume(self) -> tuple[np.ndarray, Grid]:
         """Returns the present volume (nz, ny, nx) in 1/mm, and its grid in mm."""
 
 
 class Loop:
-    """Runs a method. ``stopped_by`` is ``iterations``, ``interrupt``, or the method's own reason.
+    """Runs a method to its end, an interruption, or its own reason to stop, and records its convergence.
 
-    record_every, report_every: iterations between lines of the record, and between reports, which come sooner for slow
-    iterations. started: the ``time.perf_counter`` from which seconds count."""
+    stopped_by: ``iterations``, ``interrupt``, or the method's reason. record_every, report_every: iterations between
+    lines of the record, and between reports, which come sooner for slow iterations. started: the ``time.perf_counter``
+    from which seconds count."""
 
     def __init__(
         self, method: Stepwise, ranks: Communicator, report: ProgressReport, started: float,
@@ -72,8 +73,8 @@ class Loop:
         self._reported = time.perf_counter()
 
     def run(self, resume: State | None) -> None:
-        """Makes all steps after the state ``resume``. Ctrl-C, or a report that raises KeyboardInterrupt, ends the run after
-        the present step, unless that is the last."""
+        """Makes all steps, after those of the state ``resume`` if given. Ctrl-C, or a report that raises
+        KeyboardInterrupt, ends the run after the present step, unless that is the last."""
         method = self.method
         if resume is not None:
             method.restore(resume)
@@ -91,12 +92,12 @@ class Loop:
 
     @property
     def seconds(self) -> float:
-        """Seconds since the start, with those before an interruption."""
+        """Seconds since the start, with those before an interruption that this run resumes."""
         return time.perf_counter() - self._started
 
     @property
     def interrupted_at(self) -> int | None:
-        """The iteration after which Ctrl-C has stopped the run, or None."""
+        """The iteration after which Ctrl-C has stopped the run; None without an interruption."""
         return self.method.iteration if self.stopped_by == "interrupt" else None
 
     def state(self) -> dict[str, np.ndarray]:
@@ -104,11 +105,11 @@ class Loop:
         return {**self.method.state(), **history_arrays(self.record, self.seconds)}
 
     def state_if_interrupted(self) -> dict[str, np.ndarray] | None:
-        """Returns the state of an interrupted run, or None."""
+        """Returns the state of an interrupted run; None without an interruption."""
         return self.state() if self.stopped_by == "interrupt" else None
 
     def _tell(self, before: int) -> bool:
-        """Records and reports the step from iteration ``before``; returns True if the report asks to stop."""
+        """Records and reports the step that began at iteration ``before``. Returns True if the report asks to stop."""
         is_recorded = self._reaches(self.record_every, before)
         is_slow = time.perf_counter() - self._reported > SILENT_S and self.ranks.size == 1  # ranks do not agree on a time
         is_reported = self._reaches(self.report_every, before) or (is_slow and self.method.iteration > before)
@@ -135,7 +136,8 @@ class Loop:
         return False
 
     def _reaches(self, every: int, before: int) -> bool:
-        """Returns whether the step from iteration ``before`` has reached a multiple of ``every``, or the end."""
+        """Returns whether the step that began at iteration ``before`` has reached a multiple of ``every``, or the last
+        iteration."""
         now = self.method.iteration
         return now // every > before // every or now == self.method.iterations
 

@@ -32,10 +32,10 @@ _FORM = "a function (scan, options, rt, …)"
 
 @dataclass(frozen=True)
 class Method:
-    """A reconstruction method: its function, and its presets of options, of which the first is the default.
+    """A reconstruction method: its function, and its presets of options by name, of which the first is the default.
 
-    is_resumable: it has checkpoints. is_shared: several ranks can share its work. takes_initial: it can start from a volume.
-    takes_deformation: its object may move. finds_motion: it finds how the object moves or changes."""
+    is_resumable: has checkpoints. is_shared: several ranks can share its work. takes_initial: can start from a volume.
+    takes_deformation: can take an object that moves. finds_motion: finds how the object moves or changes."""
 
     run: Callable[..., Reconstruction]
     presets: Mapping[str, Any]
@@ -48,15 +48,15 @@ class Method:
 
 @dataclass(frozen=True)
 class OwnOptions:
-    """The only option of a function whose options have no annotation: the motion model."""
+    """Options of a user's function whose ``options`` argument has no annotation: the motion model alone."""
 
     motion: Motion = PerRow()
 
 
 def own_method(name: str, function: Any) -> Method:
-    """Returns the user's function as a method, whose options are the defaults of their class.
+    """Returns a user's function as a method, with the defaults of its options' class.
 
-    Raises InputError for anything but such a function, and for options without defaults."""
+    Raises InputError for anything but a function (scan, options, rt), and for options without defaults."""
     subject = f"--method {name}"
     try:
         parameters = inspect.signature(function).parameters
@@ -85,8 +85,8 @@ def own_method(name: str, function: Any) -> Method:
 
 
 def imported(text: str, subject: str = "--method") -> Any:
-    """Imports ``package.module:name``, as ``python -m`` does also from the present folder. Raises InputError where that
-    fails."""
+    """Returns the object ``package.module:name``, found also in the present folder, as ``python -m`` does. Raises
+    InputError, about ``subject``, where the import fails."""
     module, _, name = text.partition(":")
     if os.getcwd() not in sys.path:
         sys.path.append(os.getcwd())
@@ -105,7 +105,7 @@ def imported(text: str, subject: str = "--method") -> Any:
 
 
 def _plain(value: Any) -> Any:
-    """Returns a fact for files: the repr of values that JSON cannot hold."""
+    """Returns a value that JSON can hold: tables of plain values, and the repr of everything else."""
     if isinstance(value, Mapping):
         return {key: _plain(one) for key, one in value.items()}
     return value if isinstance(value, int | float | str | None) else repr(value)
@@ -184,7 +184,7 @@ def method_name(method: object) -> str:
 
 
 def method_of(method: object) -> Method:
-    """Returns the method of that name, or the user's own function, given as such or as ``package.module:name``.
+    """Returns the method for a name, or for the user's own function, given as such or as ``package.module:name``.
 
     Raises InputError for anything else, and for a function that cannot be imported."""
     name = method_name(method)

@@ -31,7 +31,7 @@ def reconstruct_neural(
     scan: Scan, options: NeuralOptions, rt: Runtime, *, method: str, seed: int = 0,
     report: ProgressReport = ignore_progress, resume: State | None = None,
 ) -> Reconstruction:
-    """Returns the volume of a neural field. The seed draws first parameters, frames, pixels and samples.
+    """Returns the volume of a neural field fitted to a scan. The seed draws first parameters, frames, pixels and samples.
 
     ``rt`` computes the FDK volume that sets the unit of attenuation; PyTorch does the rest. ``resume`` continues an
     interrupted run of the same scan and options from its state. Raises InputError where PyTorch is not installed."""
@@ -60,7 +60,8 @@ def reconstruct_neural(
 
 
 class _Passes:
-    """A trainer as the ``Stepwise`` that a ``Loop`` runs: a step is a frame, an iteration a pass over all frames."""
+    """A trainer as the ``Stepwise`` that a ``Loop`` runs: a step takes one frame, an iteration is a pass over all
+    frames."""
 
     quantity, remedy, finished = "loss", "check the scan for extreme values, or lower the rate", None
 

@@ -55,7 +55,7 @@ def preset_of(method: object, preset: str | None = None) -> Any:
 
 
 def changed_options(method: object, base: Any, given: Mapping[str, Any]) -> Any:
-    """Returns a method's options ``base`` with changes by name, as ``method_options`` does."""
+    """Returns options ``base`` of a method with the changes ``given`` by field name, as ``method_options`` does."""
     name, changes = method_name(method), dict(given)
     if hasattr(base, "motion"):
         motion = changes.pop("motion", None)
@@ -65,12 +65,13 @@ def changed_options(method: object, base: Any, given: Mapping[str, Any]) -> Any:
 
 
 def preprocessing_of(changes: Mapping[str, Any]) -> Preprocessing:
-    """Returns the checked preprocessing with ``changes`` by name."""
+    """Returns the default preprocessing with ``changes`` by field name. Raises InputError for an unknown name or value."""
     return _changed(Preprocessing(), changes, "reconstruct")
 
 
 def _models(options: Any) -> dict[str, Any]:
-    """Returns the models of ``options`` by name; the preset's own model has the preset's counts."""
+    """Returns the motion models of a method's options by name; the preset's own model keeps its counts of strips and
+    times."""
     own = [options.motion] if hasattr(options.motion, "name") else []
     return {model.name: model for model in (*getattr(options, "MOTIONS", _ALL), *own)}
 
@@ -80,7 +81,8 @@ def _has(model: Any, count: str) -> bool:
 
 
 def _motion(method: str, options: Any, motion: Any, counts: dict[str, Any]) -> Motion:
-    """Returns the motion model of that name with the given counts, each of which it must have, or the user's own model."""
+    """Returns the motion model named ``motion`` with the given counts of strips and times, or the user's own model.
+    Raises InputError for an unknown name, and for counts that the model lacks."""
     if callable(getattr(motion, "cells", None)) and not counts:
         return motion
     models = _models(options)
@@ -102,7 +104,8 @@ def _motion(method: str, options: Any, motion: Any, counts: dict[str, Any]) -> M
 
 
 def _implied_motion(usual: str, counts: Mapping[str, Any], models: Mapping[str, Any]) -> str:
-    """Returns the name of the usual model, or of the only model with the given counts; ``centres`` is chosen by name only.
+    """Returns the name of the usual model, or of the only other model with the given counts of strips and times.
+    ``centres`` must be named.
 
     A method whose usual model is static stays static unless ``motion`` is given."""
     if usual.startswith("static") or all(_has(models[usual], key) for key in counts):
@@ -118,7 +121,7 @@ def _motion_options(options: Any) -> list[str]:
 
 
 def _changed(options: Any, changes: Mapping[str, Any], subject: str) -> Any:
-    """Returns ``options`` with ``changes`` by name; ``subject`` is the method, or the table of the options."""
+    """Returns ``options`` with ``changes`` by field name. subject: the method or table that an error names."""
     known = {f.name: getattr(options, f.name) for f in fields(options) if f.name != "motion"}
     values: dict[str, Any] = {}
     for key, value in changes.items():
@@ -138,14 +141,15 @@ def _changed(options: Any, changes: Mapping[str, Any], subject: str) -> Any:
 
 
 def _having(option: str) -> str:
-    """Returns the advice to use a method that has the option, or nothing."""
+    """Returns the advice to use a method that has ``option``; "" where none has it."""
     usual = {name: next(iter(one.presets.values())) for name, one in METHODS.items()}
     having = [name for name, options in usual.items() if hasattr(options, option)]
     return f"--method {' or '.join(having)} has it" if having else ""
 
 
 def _converted(current: Any, value: Any, subject: str) -> Any:
-    """Returns ``value`` as the type of the present value: number, word, tuple or nested table; unchanged if that is None."""
+    """Returns ``value`` as the type of ``current``: number, word, tuple or nested table; unchanged where ``current`` is
+    None."""
     if current is None:  # the options check it themselves
         return value.item() if isinstance(value, np.generic) else value
     if isinstance(value, np.generic | np.ndarray):
@@ -167,7 +171,7 @@ def _converted(current: Any, value: Any, subject: str) -> Any:
 
 
 def _is_number(value: Any) -> bool:
-    """True for a finite number that a float can hold."""
+    """Returns whether ``value`` is a finite number that a float can hold."""
     return checks.is_number(value) and abs(value) <= sys.float_info.max
 
 
@@ -198,9 +202,9 @@ class ObjectMotion:
 
 @dataclass(frozen=True, eq=False)
 class RunPlan:
-    """What to run on a scan. method: a name as from ``method_name``, or a function of the user's own. options: the method's,
-    checked. preprocessing: what happens to the frames first. Raises InputError for a seed out of range, and for an object
-    that moves with a method that takes it to be at rest."""
+    """What to run on a scan. method: a name as from ``method_name``, or a function of the user's own. options: the
+    method's, checked. preprocessing: changes of the frames before the method. Raises InputError for a seed out of range,
+    and for an object that moves with a method that takes objects at rest only."""
 
     method: "str | Callable[..., Any]"
     options: Any
@@ -219,7 +223,7 @@ class RunPlan:
 
     @property
     def method_name(self) -> str:
-        """The method's name; of a function ``module:name``."""
+        """The method's name; ``module:name`` for a user's function."""
         return method_name(self.method)
 
     def identity(self, scan: Scan) -> dict[str, Any]:
@@ -238,7 +242,7 @@ class RunPlan:
 
 
 def _geometry(scan: Scan) -> Iterator[np.ndarray]:
-    """Yields when every frame is taken, and the poses at its start and its end."""
+    """Yields the times at which frames start, then each frame's poses at the start and the end of its span, all rounded."""
     yield np.round(scan.frame_start_s, _DECIMALS)
     span_s = np.array([0.0, scan.shutter.span_s])
     for frame, start_s in enumerate(scan.frame_start_s):
@@ -274,8 +278,8 @@ def plan_run(
 
 
 def check_object_motion(deformation: Deformation, scan: Scan) -> None:
-    """Raises InputError for a deformation of another place, another time or another unit than the scan's, and where matter
-    folds or is compressed to nothing."""
+    """Raises InputError for a deformation whose place, times or unit do not fit the scan, and for one that folds matter
+    or compresses it to nothing."""
     _check_times(deformation, scan)
     grid = scan.grid.in_shape(triple(min(n, _MOST_VOXELS) for n in scan.grid.shape))
     if not deformation.control_mm.any():

@@ -26,7 +26,8 @@ Image = NDArray[np.float32]
 
 @dataclass(frozen=True, eq=False)
 class FramePair:
-    """One frame: measured and computed (rows, columns) line integrals, 0 where ``valid`` is not."""
+    """One measured frame and the same frame computed from a volume, in line integrals (rows, columns), 0 where ``valid``
+    is False."""
 
     frame: int
     measured: Image
@@ -35,7 +36,7 @@ class FramePair:
 
     @property
     def residual(self) -> Image:
-        """Measured minus computed."""
+        """Measured minus computed line integrals (rows, columns)."""
         return self.measured - self.computed
 
     @property
@@ -45,7 +46,7 @@ class FramePair:
 
     @property
     def relative(self) -> float:
-        """``rms`` as a share of that of the measurement."""
+        """``rms`` over the root mean square of the measured frame."""
         return self.rms / (_rms(self.measured[self.valid]) or 1.0)
 
 
@@ -54,7 +55,7 @@ def _rms(values: NDArray[np.floating]) -> float:
 
 
 def spread_frames(frames: int, count: int) -> list[int]:
-    """Returns ``count`` frame numbers spread evenly over the scan, with the first."""
+    """Returns up to ``count`` frame numbers spread evenly over a scan of ``frames`` frames, from frame 0."""
     return sorted({(k * frames) // count for k in range(min(count, frames))})
 
 
@@ -62,10 +63,10 @@ def frame_pairs(
     rt: Runtime, scan: Scan, volume: np.ndarray, grid: Grid, frames: Sequence[int],
     moves: Deformation | States | None = None,
 ) -> list[FramePair]:
-    """Returns some frames of a scan with those of a volume (nz, ny, nx) in 1/mm, under the scan's true motion and that of
-    the object. Its states take the place of the volume.
+    """Returns the frames of a scan with those computed from a volume (nz, ny, nx) in 1/mm, under the motion of gantry and
+    object. Where ``moves`` is States, their volumes take the place of ``volume``.
 
-    For a detector that averages intensity the computed frames do so too."""
+    Where the detector averages intensity, so do the computed frames."""
     motion = PerRow(sub_intervals=TIMES_PER_LINE)
     tables = [motion.cells(scan, frame) for frame in frames]
     if isinstance(moves, States):
@@ -86,7 +87,8 @@ def frame_pairs(
 
 
 def held_out(scan: Scan, percent: float) -> np.ndarray:
-    """Draws a percentage of the valid pixels (F, v, u) bool, the same in every run. Raises InputError for none."""
+    """Draws ``percent`` of the valid pixels, bool (F, v, u), the same in every run. Raises InputError where no pixel is
+    drawn."""
     drawn = np.random.default_rng(_HOLDOUT_SEED).random(scan.projections.shape, np.float32) < percent / 100
     held: np.ndarray = drawn & scan.valid
     if not held.any():
@@ -98,8 +100,8 @@ def holdout_errors(
     rt: Runtime, scan: Scan, held: np.ndarray, volume: np.ndarray, grid: Grid,
     moves: Deformation | States | None = None,
 ) -> dict[str, float]:
-    """Returns the RMS residual of a volume (nz, ny, nx) in 1/mm at held-out pixels (F, v, u), the part of it that is their
-    own noise, and their number.
+    """Returns by name: the RMS residual of a volume (nz, ny, nx) in 1/mm at held-out pixels (F, v, u), the noise of these
+    pixels, and their number.
 
     No reconstruction can have a smaller true error than the noise. Both are dimensionless, as line integrals are."""
     squares = 0.0

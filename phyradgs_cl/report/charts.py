@@ -26,8 +26,7 @@ Chart = tuple[str, Markup]
 
 
 def chart(draw: "Callable[[Axes], None]", title: str, description: str, size: tuple[float, float] = SIZE) -> Markup:
-    """Returns what ``draw`` draws as an SVG element in the page's colours. ``title``, ``description``: for screen
-    readers."""
+    """Returns what ``draw`` draws as an SVG element in the page's colours. title, description: text for screen readers."""
     from matplotlib import rc_context
     from matplotlib.figure import Figure
 
@@ -96,7 +95,8 @@ def draw_convergence(axes: "Axes", points: Sequence[tuple[float, float]], words:
 
 
 def views_chart(key: str, values: object) -> Chart | None:
-    """Returns a chart of a correction of every view; None for fewer than two values, or values that are no numbers."""
+    """Returns a chart of one correction, by its ``key``, over the views; None for fewer than two values, or values that
+    are no numbers."""
     if not isinstance(values, list) or len(values) < 2 or not all(map(checks.is_number, values)):
         return None
     words = label(key).capitalize()
@@ -123,6 +123,6 @@ def histogram(edges: NDArray[np.float64], counts: NDArray[np.int64]) -> Markup:
 
 
 def note(axes: "Axes", words: str, point: Any, shift: tuple[float, float], **style: Any) -> None:
-    """Writes words next to a point. ``shift`` (right, up) is in points of the picture."""
+    """Writes words next to a point of a chart. shift: (right, up) in points of the picture, 1/72 inch."""
     style = {"ha": "center", "color": INK, **style}
     axes.annotate(words, point, xytext=shift, textcoords="offset points", **style)

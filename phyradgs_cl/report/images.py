@@ -72,7 +72,8 @@ def diverging() -> NDArray[np.uint8]:
 
 
 def grey_range(volume: NDArray[np.floating]) -> tuple[float, float]:
-    """Returns the values of black and white: 0 and a high percentile. Where nothing is above 0 they are the extremes."""
+    """Returns the values of black and white: 0 and a high percentile of the volume; the extremes where nothing is above
+    0."""
     high = float(np.percentile(volume, _PERCENTILE))
     if high > 0:
         return 0.0, high
@@ -82,10 +83,10 @@ def grey_range(volume: NDArray[np.floating]) -> tuple[float, float]:
 
 @dataclass(frozen=True)
 class Window:
-    """The initial values of black and white (``low``, ``high``), and the range ``least`` to ``most`` of the 256 grey levels,
-    all in 1/mm.
+    """The initial values of black and white (``low``, ``high``), and the range ``least`` to ``most`` of the 256 grey
+    levels, all in 1/mm.
 
-    beyond: whether there are smaller values than ``least``, and larger ones than ``most``."""
+    beyond: whether the volume has values below ``least``, and above ``most``."""
 
     low: float
     high: float
@@ -106,8 +107,9 @@ class Window:
 class Plane:
     """The slices of one orientation: ``indices`` of those shown, among ``count`` slices.
 
-    layers: PNGs in base64, by layer. first_mm, step_mm: the centre of slice 0 and the distance to the next. size_mm: (width,
-    height). right, up: the world axes in the picture. still: a PNG of the middle slice, for browsers without scripts."""
+    layers: PNGs in base64, by layer (result, truth or difference). first_mm, step_mm: the centre of slice 0 and the
+    distance to the next. size_mm: (width, height). right, up: the world axes in the picture. still: a PNG of the middle
+    slice, for browsers without scripts."""
 
     name: str
     axis: str
@@ -123,7 +125,7 @@ class Plane:
 
     @property
     def middle(self) -> int:
-        """The position in ``indices`` of the slice that the still shows."""
+        """The position in ``indices`` of the middle slice, which ``still`` shows."""
         return len(self.indices) // 2
 
     def position_mm(self, k: int) -> float:
@@ -131,8 +133,8 @@ class Plane:
 
 
 def windows_of(volume: Volume, reference: Volume | None) -> dict[str, Window]:
-    """Returns a window by layer ("result", "truth", "difference"). Result and truth share the truth's range, so that a wrong
-    gain shows."""
+    """Returns a window by layer ("result", "truth", "difference"). Result and truth have the truth's range, so that a
+    wrong gain shows."""
     if reference is None or not float(reference.max()) > 0:
         return {"result": Window.of(*grey_range(volume), volume)}
     grey = Window.of(min(0.0, float(reference.min())), float(reference.max()), volume, reference)
@@ -142,7 +144,7 @@ def windows_of(volume: Volume, reference: Volume | None) -> dict[str, Window]:
 
 
 def planes_of(volume: Volume, reference: Volume | None, grid: Grid, windows: Mapping[str, Window]) -> list[Plane]:
-    """Returns the three orientations of a volume (nz, ny, nx), with a layer for each of the windows."""
+    """Returns the three orientations of a volume (nz, ny, nx) in 1/mm, with a layer for each of the windows."""
     layers: dict[str, Volume] = {"result": volume}
     if reference is not None and "truth" in windows:
         layers |= {"truth": reference, "difference": volume - reference}
@@ -186,7 +188,8 @@ def stills_of(planes: Sequence[Plane], volume: Volume, window: tuple[float, floa
 
 
 def _slice_counts(shape: tuple[int, ...], layers: int) -> list[int]:
-    """Returns the number of slices along every axis: all of them, or as many as the budget allows."""
+    """Returns the number of slices to show along every axis: all, or as many as the page's budget allows for ``layers``
+    layers."""
     edges = [min(n, LONGEST_EDGE) for n in shape]
     pixels = [int(np.prod(edges)) // edges[axis] for axis in range(3)]
     most = max(1, BUDGET_PIXELS // (layers * sum(pixels)))

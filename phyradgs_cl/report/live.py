@@ -43,7 +43,7 @@ FRAMES_FROM_S = 60.0  # no frames are computed in runs that are expected to take
 @dataclass(frozen=True, eq=False)
 class Snapshot:
     """The middle slices (axial, coronal, sagittal) of the volume after an iteration, in 1/mm, and some frames. high: the
-    value of white."""
+    value of white in 1/mm."""
 
     iteration: int
     slices: tuple[NDArray[np.floating], ...]
@@ -92,7 +92,8 @@ class Status:
     snapshot: Snapshot | None = None
 
     def after(self, progress: Progress, now: float) -> "Status":
-        """Returns the status after a report at ``now``. Iterations that start again, as in a trial, start another curve."""
+        """Returns the status after a report at ``now`` (s since 1970). Iterations that start again, as in a trial, start
+        a new curve."""
         last, points, first = self.progress, self.points, self.first
         is_same = last is not None and (last.quantity, last.iterations) == (progress.quantity, progress.iterations)
         if last is None or not is_same or progress.iteration < last.iteration:
@@ -105,7 +106,7 @@ class Status:
 
     @property
     def per_s(self) -> float | None:
-        """Iterations per second, from the second report on."""
+        """Iterations per second, from the second report on; None before."""
         if self.progress is None or self.reported <= self.first[1] or self.progress.iteration <= self.first[0]:
             return None
         return (self.progress.iteration - self.first[0]) / (self.reported - self.first[1])
@@ -220,12 +221,12 @@ log = logging.getLogger(__name__)
 
 
 class LivePage:
-    """Writes a page about a running method, to which it listens. It is a context around the run.
+    """Writes a page about a running method, as a listener to its progress. It is a context around the run.
 
-    A thread writes the page every ``every_s`` seconds, so an older page belongs to a run that was killed. Pictures are made
-    between two iterations, as long as their time is below ``SHARE`` of the run's. An error, or Ctrl-C, leaves its reason on
-    the page. An existing file is replaced at the first iteration, so a refused run does not change it. A page that cannot be
-    written gives one warning, and no error."""
+    A thread writes the page every ``every_s`` seconds, so that an older page belongs to a run that was killed. Pictures
+    are made between two iterations, as long as their time is below ``SHARE`` of the run's. An error, or Ctrl-C, leaves
+    its reason on the page. An existing file is replaced at the first iteration, so that a refused run does not change it.
+    A page that cannot be written gives one warning, and no error."""
 
     def __init__(self, path: Path, title: str, settings: Mapping[str, object], every_s: float = EVERY_S) -> None:
         self.path, self.every_s = path, every_s

@@ -31,7 +31,7 @@ def element(name: str, /, *children: object, **attributes: object) -> Markup:
 
 
 def joined(*children: object) -> Markup:
-    """Joins children, which are escaped where they are no Markup. None adds nothing."""
+    """Returns the children as one text, escaped where they are no Markup. None adds nothing."""
     shown = (c if isinstance(c, Markup) else html.escape(_plain(c)) for c in children if c is not None)
     return Markup("".join(shown))
 
@@ -64,7 +64,7 @@ def _plain(value: object) -> str:
 
 
 def label(key: str) -> str:
-    """Returns the words of a key: ``source_to_axis_mm`` is "source to axis"."""
+    """Returns a key as words without its unit: ``source_to_axis_mm`` is "source to axis"."""
     for ending in UNITS:
         if key.endswith(ending) and key != ending:
             key = key[: -len(ending)]
@@ -73,12 +73,12 @@ def label(key: str) -> str:
 
 
 def unit(key: str) -> str:
-    """Returns the unit that the name of a fact ends with, or an empty text."""
+    """Returns the unit with which the name of a fact ends; "" without one."""
     return next((u for ending, u in UNITS.items() if key.endswith(ending)), "")
 
 
 def shown(value: object, unit_name: str = "") -> str:
-    """Returns a value with its unit. A very long value is cut."""
+    """Returns a value as text with its unit. A very long text is cut."""
     text = _text(value, _RESOLUTION.get(unit_name, 0.0))
     if len(text) > _LONGEST:
         text = text[:_LONGEST] + "…"

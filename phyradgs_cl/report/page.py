@@ -52,7 +52,7 @@ def write_report(
 
 
 def report_page(run: Run, views: Sequence[FramePair] = (), changes: Sequence[Change] = ()) -> str:
-    """Returns the page as text. ``views`` come from ``computed_views``, ``changes`` from ``step_changes``."""
+    """Returns the page as text. views: as from ``computed_views``; changes: as from ``step_changes``."""
     of_scan = {} if run.scan is None else {
         "preparation": sections.preparation_section(run, changes),
         "projections": sections.projections_section(run.scan, views),

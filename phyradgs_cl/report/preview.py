@@ -44,7 +44,7 @@ def write_preview(volume: NDArray[np.floating], grid: Grid, path: str | Path) ->
 
 
 class Preview:
-    """Writes a picture of the present volume to ``io.partial_path`` of ``path``, as a listener to a running method.
+    """Writes a picture of the present volume to ``io.partial_path`` of ``path``, as a listener to a method's progress.
 
     It writes at most every ``every_s`` seconds. Pictures that cannot be written give one warning, and no error."""
 
@@ -96,7 +96,7 @@ def preview_image(volume: NDArray[np.floating], grid: Grid) -> NDArray[np.uint8]
 
 
 def _shown_axes(grid: Grid) -> list[int]:
-    """Returns the axes (0 z, 1 y, 2 x) to look along. For a grid of one layer this is only the axis across the layer."""
+    """Returns the axes (0 z, 1 y, 2 x) to look along: all or, for a grid of one layer, only the axis across the layer."""
     across = [min(n for a, n in enumerate(grid.shape) if a != axis) for axis in range(3)]
     return [axis for axis in range(3) if across[axis] > 1] or [0, 1, 2]
 
@@ -128,7 +128,7 @@ def add_volume(viewer: Any, stored: Volume, name: str) -> None:
 
 
 def napari_reader(path: str | list[str]) -> Callable[[str | list[str]], list[Layer]] | None:
-    """Returns the function that reads a file for napari, which asks this for every .h5 file. Returns None for files that are
+    """Returns the function that reads a file for napari, which calls this for every .h5 file; None for files that are
     neither a volume nor a scan of phyradgs-cl."""
     paths = [path] if isinstance(path, str) else path
     with suppress(PhyradgsError):

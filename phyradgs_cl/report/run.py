@@ -61,7 +61,7 @@ class Run:
 
     @property
     def motion(self) -> Motion | None:
-        """The motion model of the run, with the segments that it chose. None where the provenance lacks it."""
+        """The motion model of the run, with the number of segments in use; None where the provenance lacks it."""
         options = self.stored.provenance.get("options")
         table = options.get("motion") if isinstance(options, Mapping) else None
         if not isinstance(table, Mapping):
@@ -91,7 +91,8 @@ class Run:
 
 
 def _kept(table: Mapping[str, Any], of: str = "") -> dict[str, Any]:
-    """Returns options by name, without options that this version no longer has."""
+    """Returns the options of ``table`` by name, without those that this version no longer has. of: the name of a nested
+    table."""
     return {
         name: _kept(value, f"{name}.") if isinstance(value, Mapping) else value
         for name, value in table.items() if f"{of}{name}" not in REMOVED
@@ -118,8 +119,8 @@ def load_run(path: Path, scan_path: Path | None = None) -> Run:
 
 
 def _with_scan(run: Run, path: Path, is_given: bool, notes: list[str]) -> Run:
-    """Returns the run with the scan of a file and the comparison with its reference. Appends remarks to ``notes``. Raises
-    InputError for a given file that is no scan."""
+    """Returns the run with the scan of a file and the comparison with its reference. Appends remarks to ``notes``.
+    is_given: the user named the file; raises InputError where it is then no scan."""
     kind = file_kind(path) if is_given else "scan"
     if kind != "scan":
         raise InputError(f"--scan {path}", f"a {kind}", "a scan")
@@ -148,7 +149,8 @@ def _with_scan(run: Run, path: Path, is_given: bool, notes: list[str]) -> Run:
 
 
 def _scan_of(path: Path, provenance: Mapping[str, object], notes: list[str]) -> Path | None:
-    """Returns the scan file that the provenance names, in the current or the volume's folder, if it has the stored hash."""
+    """Returns the scan file that the provenance names, in the current or the volume's folder, if it has the stored hash;
+    else None."""
     name = provenance.get("scan")
     if not isinstance(name, str) or not name:
         notes.append("The volume file names no scan.")
@@ -161,7 +163,7 @@ def _scan_of(path: Path, provenance: Mapping[str, object], notes: list[str]) -> 
 
 
 def _same_file(path: Path, name: str, sha256: object) -> Path | None:
-    """Returns the file ``name``, in the current or the volume's folder, if it has this hash; None otherwise."""
+    """Returns the file ``name``, in the current or the volume's folder, if it has the hash ``sha256``; None otherwise."""
     for place in (Path(name), path.parent / name, path.parent / Path(name).name):
         with suppress(InputError):  # the name may be of any file, or none
             if sha256_of(place) == sha256:
@@ -170,7 +172,7 @@ def _same_file(path: Path, name: str, sha256: object) -> Path | None:
 
 
 def computed_views(run: Run, rt: Runtime, count: int) -> list[FramePair]:
-    """Returns ``count`` frames of the scan after the run's preprocessing, with those computed from its volume."""
+    """Returns ``count`` frames of the scan after the run's preprocessing, each with the frame computed from its volume."""
     if run.scan is None or count < 1:
         return []
     if run.deformation is None and "object_motion" in run.stored.provenance:
@@ -211,7 +213,7 @@ class Change:
 
 
 def step_changes(run: Run, rt: Runtime) -> list[Change]:
-    """Repeats the run's preprocessing on its scan and returns the effect of each step."""
+    """Returns the effect of each preprocessing step of the run, repeated on its scan."""
     if run.scan is None or not run.preprocessing.chosen:
         return []
     changes: list[Change] = []

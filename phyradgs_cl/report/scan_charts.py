@@ -83,7 +83,8 @@ def side_chart(scan: Scan) -> Markup:
 
 
 def _draw_rays(axes: "Axes", panel: Points, source: Points, is_parallel: bool) -> None:
-    """Draws the rays to a panel's two ends (2, 2): from the source, or as long as a parallel beam's middle ray."""
+    """Draws the rays to a panel's two ends (2, 2): from the source or, in a parallel beam, each as long as the middle
+    ray."""
     starts = panel + source - panel.mean(0) if is_parallel else (source, source)
     for start, end in zip(starts, panel, strict=True):
         axes.plot(*np.array([start, end]).T, color=ACCENT, alpha=0.55, lw=1)
@@ -120,8 +121,8 @@ def source_positions(scan: Scan) -> Points:
 
 
 def with_sources(scan: Scan, poses: Points) -> Points:
-    """Returns poses (..., 12) that begin with the source in mm. A parallel beam has a place on its middle ray instead, in
-    front of the volume. Its panel, whose distance does not matter, is then behind the volume."""
+    """Returns poses (..., 12) that begin with the source in mm. In a parallel beam, a place on the middle ray in front of
+    the volume stands for the source. The panel, whose distance does not matter there, is put behind the volume."""
     if not scan.is_parallel:
         return poses
     away = poses[..., :3]
@@ -159,7 +160,8 @@ def shutter_chart(scan: Scan, motion: Motion | None) -> Markup:
 
 
 def draw_shutter(axes: "Axes", scan: Scan, motion: Motion | None) -> None:
-    """Draws the windows, the poses' times, the lengths of exposure and readout, and the gantry's angle above."""
+    """Draws the lines' windows, the times of the run's poses, the lengths of exposure and readout, and above them the
+    gantry's angle."""
     shutter, last = scan.shutter, max(scan.lines - 1, 1)
     draw_windows(axes, shutter, scan.lines)
     if motion is not None:
@@ -192,7 +194,7 @@ def frames_chart(scan: Scan) -> Markup:
 
 
 def shutter_words(scan: Scan) -> str:
-    """Returns a description of the shutter, without a full stop."""
+    """Returns the shutter in words, without a full stop."""
     shutter = scan.shutter
     kind = "global shutter" if shutter.readout_s == 0 else f"rolling shutter along {shutter.axis}"
     words = f"{kind}: exposure {number(shutter.exposure_s)} s, readout {number(shutter.readout_s)} s"
@@ -220,8 +222,8 @@ def _draw_samples(axes: "Axes", scan: Scan, motion: Motion) -> None:
 
 
 def sample_times(scan: Scan, motion: Motion) -> Points:
-    """Returns (time in s after the frame's start, line) of poses, (N, 2), of some lines if every line has its own; none for
-    too many cells."""
+    """Returns (time in s after the frame's start, line) of poses, (N, 2); of some lines where every line has its own
+    poses, and of none for too many cells."""
     rows = min(motion.strips, scan.lines) if isinstance(motion, MicroViews) else scan.lines
     if rows * getattr(motion, "sub_intervals", 1) > _MOST_CELLS:
         return np.empty((0, 2))

@@ -219,7 +219,7 @@ def _calibration(calibration: Mapping[str, object], scan: Scan) -> list[Markup]:
 
 
 def _cells(line: Mapping[str, object]) -> list[str]:
-    """Returns the cells of a parameter: name, stated value, estimate with its deviation, verdict."""
+    """Returns a parameter's cells of the table: name, stated value, estimate with its deviation, verdict."""
     estimate, deviation, unit_name = line.get("found"), line.get("deviation"), line.get("unit")
     of = unit_name if isinstance(unit_name, str) else ""
     value = "–" if estimate is None else f"{shown(estimate)} ± {_or_dash(deviation, of)}"

@@ -23,7 +23,7 @@ _ITEMS = 64  # most work-items of a CPU's work-group in element-wise kernels
 
 
 class Space(Protocol, Generic[A]):
-    """Arrays of one kind. Operands have the same shape unless a function states another."""
+    """Arrays on one side, host or device, and their algebra. Operands have one shape unless a method states another."""
 
     def array(self, values: np.ndarray) -> A:
         """Returns host values as an array of this space, which may share their memory."""
@@ -34,37 +34,38 @@ class Space(Protocol, Generic[A]):
     def full(self, shape: Shape, value: float) -> A: ...
 
     def place(self, shape: Shape) -> A | None:
-        """Returns memory for a function's result, its argument ``out``; None on the host, where functions make their own."""
+        """Returns memory for a result, as the argument ``out`` of operators; None on the host, where operators make their
+        own."""
 
     def take(self, x: A, chosen: Sequence[int]) -> A:
-        """Returns the ``chosen`` entries along the first axis, in this order."""
+        """Returns the ``chosen`` entries along the first axis, in the order given."""
 
     def add(self, x: A, y: A, scale: float = 1.0, *, nonnegative: bool = False) -> A:
-        """Returns x + ``scale`` y; ``nonnegative`` clips it at 0."""
+        """Returns x + ``scale`` y, clipped at 0 if ``nonnegative``."""
 
     def extrapolate(self, x: A, y: A, scale: float) -> A:
         """Returns x + ``scale`` (x − y)."""
 
     def add_product(self, x: A, y: A, z: A, scale: float = 1.0, *, nonnegative: bool = False) -> A:
-        """Returns x + ``scale`` y z element by element; ``nonnegative`` clips it at 0."""
+        """Returns x + ``scale`` y z element by element, clipped at 0 if ``nonnegative``."""
 
     def multiply(self, x: A, y: A) -> A:
         """Returns x y element by element. y may have only the last axes of x."""
 
     def reciprocal(self, x: A, share: float) -> A:
-        """Returns 1/x, with x raised to ``share`` of its largest value; 0 where x is not above 0."""
+        """Returns 1/x, where x counts as at least ``share`` of its largest value; 0 where x is 0 or less."""
 
     def inner(self, x: A, y: A) -> float:
         """Returns Σ x y, with the accuracy of float64."""
 
     def turn(self, x: A, y: A, z: A) -> float:
-        """Returns Σ (x − y) (y − z). It is above 0 where the steps from z to y and from y to x have one direction."""
+        """Returns Σ (x − y)(y − z): above 0 where the steps from z to y and from y to x point the same way."""
 
     def norm(self, x: A) -> float:
         """Returns √Σ x²."""
 
     def sum_squares(self, arrays: Iterable[A]) -> float:
-        """Returns Σ ‖x‖² over arrays, which may be generated. A device sends one number back."""
+        """Returns Σ ‖x‖² over ``arrays``, which may come from a generator. A device sends back one number for all."""
 
     def largest(self, x: A, *, absolute: bool = False) -> float:
         """Returns the largest x, or the largest |x|."""
@@ -215,8 +216,8 @@ class DeviceSpace:
         return float(self.rt.download(self._parts).view(np.float32)[:groups].max())
 
     def _each(self, name: str, x: DeviceArray, *others: Any, period: int = 0) -> DeviceArray:
-        """Launches an element-wise kernel of x and others. ``period``: the length after which a short second operand
-        repeats."""
+        """Launches an element-wise kernel of x and the other arguments. period: the length of a shorter second operand,
+        which repeats along x; 0 where it has the length of x."""
         result, count = self.empty(x.shape), period or x.size
         items = ceil_div(count, self.rt.lanes), x.size // max(count, 1)
         kernel = self.rt.kernel("algebra", name)

@@ -100,7 +100,7 @@ class Runtime:
 
     @property
     def group_limits(self) -> dict[str, int]:
-        """The largest groups, by name, of the kernels whose limit was asked for."""
+        """The largest work-group in work-items, by name, of the kernels that ``most_items`` was called for."""
         return {one.function_name: one.most_items for one in self._kernels.values() if one.most_items is not None}
 
     def _build(self, program: str, options: tuple[str, ...]) -> "cl.Program":
@@ -120,7 +120,8 @@ class Runtime:
 
     @staticmethod
     def _allowed(source: str, options: tuple[str, ...]) -> list[str]:
-        """Returns build options without those that would break sums of pairs of floats. Some drivers ignore the pragma."""
+        """Returns the build options. Sums of pairs of floats lose the option that fuses multiply and add, because some
+        drivers ignore the pragma against it."""
         has_pairs = "-DFP64=0" in options and _PAIRS in source
         return [option for option in options if not (has_pairs and option == _FUSING)]
 
@@ -140,7 +141,7 @@ class Runtime:
         return array
 
     def room(self) -> Room:
-        """Returns the memory that an operator may plan with now: the rest of the limit, and the largest allocation."""
+        """Returns the memory in bytes that an operator may plan with now, in all and in one buffer."""
         return self.ledger.room(self.device.largest_allocation_bytes)
 
     @property
@@ -186,7 +187,7 @@ class Runtime:
 
     @naming_failures("a copy from it")
     def read_item(self, array: DeviceArray, index: int) -> np.generic:
-        """Returns one element of a flat array. This waits for the queue."""
+        """Returns element ``index`` of a flat array, after all work enqueued before."""
         value = np.empty(1, array.dtype)
         offset = index * array.dtype.itemsize
         cl.enqueue_copy(self.queue, value, array.buffer, src_offset=offset, is_blocking=True)
@@ -195,7 +196,8 @@ class Runtime:
 
     @naming_failures("a copy from it")
     def read_item_later(self, array: DeviceArray, index: int) -> LaterItem:
-        """Returns one element of a flat array after the work enqueued so far, without waiting."""
+        """Returns element ``index`` of a flat array as it will be after the work enqueued so far, without waiting for the
+        device."""
         value = np.empty(1, array.dtype)
         offset = index * array.dtype.itemsize
         event = cl.enqueue_copy(self.queue, value, array.buffer, src_offset=offset, is_blocking=False)
@@ -223,11 +225,15 @@ class Runtime:
     def launch(
         self, kernel: Kernel, items: int | tuple[int, ...], *args: Any, group: int | tuple[int, ...] = 1, samples: int = 0
     ) -> None:
-        """Enqueues ``items`` work-items in groups of ``group``, whose missing sides are 1. Items past the end do nothing.
+        """Enqueues at least ``items`` work-items, rounded up to whole work-groups: a kernel must do nothing past its last
+        item.
 
-        Python's whole numbers become int, its other numbers float. For a long give np.int64; for a float that may be whole,
-        give np.float32. ``samples``: what all items read, in samples of a ray. On a GPU more than ``most_samples`` go in
-        several launches. The kernel's items then keep their global ids, and groups get new ones."""
+        group: the sides of a work-group, missing ones 1. An int is a number of work-items along the first axis; on a GPU
+        they also lie along other axes where the first is short. Sides are halved until the kernel can run. samples: the
+        work of all items, as the number of ray samples that take as long to read; on a GPU more than ``most_samples`` are
+        divided among launches. Items then keep their global ids, and groups get new ones. Python's whole numbers become
+        int, its other numbers float: give np.int64 for a long, and np.float32 for a float that may be whole. Raises
+        DeviceError, or MemoryShortage, where a launch fails."""
         shape = (items,) if isinstance(items, (int, np.integer)) else items
         if min(shape) < 1:
             return
@@ -249,8 +255,8 @@ class Runtime:
             raise self.ledger.error(f"a launch of {kernel.function_name}", error, self.queue) from error
 
     def _sides(self, items: int, shape: Sides) -> Sides:
-        """Returns the sides of a work-group of ``items``: along the first axis, but on a GPU no longer than that axis asks
-        for, where another axis divides by what is left. Items past the end of the first axis would idle."""
+        """Returns the sides of a work-group of ``items``: all along the first axis. On a GPU with a shorter first axis
+        the rest goes along another axis that it divides, because items past the end would idle."""
         sides = [int(items), *([1] * (len(shape) - 1))]
         while self.pixel_items and sides[0] % 2 == 0 and sides[0] // 2 >= shape[0]:
             axis = next((k for k in range(1, len(shape)) if shape[k] % (2 * sides[k]) == 0), None)
@@ -260,14 +266,15 @@ class Runtime:
         return tuple(sides)
 
     def group(self, on_cpu: int = 1, on_gpu: int = 64, *kernels: Kernel) -> int:
-        """Returns the work-group size for this class of device. On a GPU it is halved until it suits ``kernels``, whose
-        items work together."""
+        """Returns the work-items of a work-group for this kind of device. A GPU's number is halved until all ``kernels``
+        can run in it: their items share local memory, so ``launch`` must not halve it."""
         while self.pixel_items and any(on_gpu > self.most_items(kernel) for kernel in kernels):
             on_gpu //= 2
         return on_gpu if self.pixel_items else on_cpu
 
     def most_items(self, kernel: Kernel) -> int:
-        """Returns the largest group in which a kernel can run. Its registers may allow fewer items than the device does."""
+        """Returns the largest work-group, in work-items, in which a kernel can run. Its registers may allow fewer than
+        the device."""
         if kernel.most_items is None:
             kernel.most_items = self._asked(kernel, "WORK_GROUP_SIZE")
         return kernel.most_items
@@ -276,7 +283,8 @@ class Runtime:
         return int(self.compile(kernel).get_work_group_info(getattr(cl.kernel_work_group_info, name), self.device.handle))
 
     def _fitting(self, kernel: Kernel, group: tuple[int, ...]) -> tuple[int, ...]:
-        """Returns the group with sides halved until the kernel can run in it. It is for kernels whose items work alone."""
+        """Returns sides of a work-group, halved until the kernel can run in them. Raises DeviceError below 32
+        work-items."""
         if math.prod(group) == 1:
             return group
         most, sides = self.most_items(kernel), list(group)
@@ -288,8 +296,8 @@ class Runtime:
         return tuple(sides)
 
     def tile(self, kernel: Kernel | None = None) -> tuple[int, int]:
-        """Returns the sides of a work-group's tile on a GPU. It is as wide as items run together, and as many lines high as
-        the kernel, or the device, allows."""
+        """Returns (width, lines) of a work-group's tile of pixels on a GPU: as wide as items run in lockstep, and as many
+        lines as ``kernel``, or the device, allows."""
         rates = self.kernel("rates", "multiply_add")
         if self._multiple is None:
             self._multiple = min(max(self._asked(rates, "PREFERRED_WORK_GROUP_SIZE_MULTIPLE"), 16), 64)
@@ -298,8 +306,8 @@ class Runtime:
         return width, most // width
 
     def shape_of_lines(self, kernel: Kernel, width: int, *rows: int) -> tuple[tuple[int, ...], tuple[int, int], int]:
-        """Returns work-items, group and number of groups of a kernel that steps along lines of ``width`` pixels. A work-item
-        takes a line on a CPU, and a pixel on a GPU."""
+        """Returns work-items, work-group and number of groups of a kernel over ``rows`` of ``width`` pixels. A work-item
+        takes a whole line on a CPU, and a pixel on a GPU."""
         items, group = ((width, *rows), self.tile(kernel)) if self.pixel_items else ((1, *rows), (1, 1))
         sides = (*group, *([1] * (len(rows) - 1)))
         return items, group, math.prod(ceil_div(n, side) for n, side in zip(items, sides, strict=True))
@@ -314,7 +322,8 @@ class Runtime:
             self._profile.add(name, event, nbytes)
 
     def kernel_uses(self) -> dict[str, KernelUse]:
-        """Returns launches, seconds and bytes by kernel since the last call, the longest first. Needs ``profile=True``."""
+        """Returns launches, seconds and bytes by kernel since the last call, the longest time first. Needs
+        ``profile=True``."""
         self.queue.finish()
         return self._profile.uses()
 
@@ -323,7 +332,8 @@ class Runtime:
         return {name: use.seconds for name, use in self.kernel_uses().items()}
 
     def best_rates(self) -> Rates:
-        """Measures the device's best rates of copying and computing (per second). Needs ``profile=True``."""
+        """Measures the device's best rates: bytes copied and floating-point operations per second. Needs
+        ``profile=True``."""
         kernel = self.compile(self.kernel("rates", "multiply_add"))
         return measure_rates(self.queue, kernel, self.lanes, self.device.compute_units, self.group())
 
@@ -336,7 +346,8 @@ def default_lanes(device: DeviceInfo) -> int:
 
 
 def _parts(items: Sides, group: Sides, pieces: int) -> Iterator[tuple[Sides | None, Sides]]:
-    """Yields first item and work-items of ``pieces`` parts or more, as far as groups allow. A whole has None as first."""
+    """Yields the first item and the number of work-items, per axis, of each of ``pieces`` launches or more; whole groups
+    stay together. One piece has None as its first item."""
     if pieces <= 1:
         yield None, items
         return

@@ -67,11 +67,12 @@ def list_devices() -> list[DeviceInfo]:
 
 
 def choose_device(wish: str | None = None, turn: int = 0) -> tuple[DeviceInfo, str]:
-    """Returns the device to use, and the reason in words.
+    """Returns the device to use, and the reason in words. Raises DeviceError where no device fits.
 
     ``wish`` (or the environment variable PHYRADGS_DEVICE) is an index, ``cpu``, ``gpu`` or a part of a device's or
-    platform's name, or several of these with commas. ``turn`` counts processes that share a machine. Each process takes the
-    next of the list; without a list or an index, the next device of the same name. Raises DeviceError where none fits."""
+    platform's name, or a list of such words with commas. ``turn`` is this process's number among those of one machine:
+    process ``turn`` takes the entry of that number in the list. Without a list or an index it takes the next device of
+    the same name."""
     source = "--device"
     if not wish:
         wish, source = os.environ.get(DEVICE_VARIABLE), DEVICE_VARIABLE
@@ -142,7 +143,7 @@ def _describe(index: int, of: "cl.Platform", device: "cl.Device") -> DeviceInfo:
 
 
 def known_fault(device: DeviceInfo) -> str | None:
-    """Returns what is known to be wrong with a device's driver, in words; otherwise None."""
+    """Returns a known fault of a device's driver in words; None without one."""
     version = re.search(r"\d+", device.handle.driver_version)
     if device.platform.lower() == "rusticl" and version and int(version[0]) < _RIGHT_MESA:
         return f"rusticl of Mesa {device.handle.driver_version} computes wrong sums: install Mesa {_RIGHT_MESA} or newer"
@@ -151,7 +152,7 @@ def known_fault(device: DeviceInfo) -> str | None:
 
 @cache
 def warn_of_fault(device: DeviceInfo) -> None:
-    """Warns once of a driver that is known to be wrong."""
+    """Warns where a device's driver has a known fault."""
     if fault := known_fault(device):
         log.warning("%s: %s", device.name, fault)
 

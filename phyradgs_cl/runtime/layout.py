@@ -40,7 +40,7 @@ def move(
     rt: Runtime, source: tuple[DeviceArray, Strides], target: tuple[DeviceArray, Strides],
     shape: Sequence[int], *, turned: bool = False,
 ) -> None:
-    """Copies (nz, ny, nx) floats from one layout to another on the device; ``turned`` copies them to (nz, nx, ny)."""
+    """Copies (nz, ny, nx) floats from one layout to another on the device. turned: transposes to (nz, nx, ny)."""
     nz, ny, nx = (int(n) for n in shape)
     (from_array, from_strides), (to_array, to_strides) = source, target
     ends = from_array, from_strides.vector(), to_array, to_strides.vector(), np.int32(ny), np.int32(nx)
@@ -55,13 +55,13 @@ def move(
 
 
 def beside(rt: Runtime, volume: Array, out: DeviceArray | None) -> tuple[DeviceArray, DeviceArray]:
-    """Returns a volume on the device, and memory for a result of its shape: ``out`` if given."""
+    """Returns a volume of either side on the device, and device memory for a result of its shape: ``out`` if given."""
     there = volume if isinstance(volume, DeviceArray) else rt.upload(volume, np.float32)
     return there, rt.empty(volume.shape) if out is None else out
 
 
 def brought_to(rt: Runtime, like: SameArray, result: DeviceArray) -> SameArray:
-    """Returns a result where ``like`` lies, on the device or on the host."""
+    """Returns a device's result on the side of ``like``: as a device array, or as NumPy's."""
     return cast(SameArray, result if isinstance(like, DeviceArray) else rt.download(result))
 
 
@@ -75,7 +75,7 @@ def padded_zeros(rt: Runtime, rows: int, width: int, images: int = 1) -> DeviceA
 
 
 def pad_rows(values: np.ndarray) -> np.ndarray:
-    """Returns (..., rows, width) in the flat padded layout, float32."""
+    """Returns images or volumes (..., rows, width) as flat float32 in the padded layout."""
     width = values.shape[-1]
     rows = int(np.prod(values.shape[:-1], dtype=np.int64))
     flat = np.zeros(2 * GUARD + rows * pitch_of(width), np.float32)

@@ -34,7 +34,7 @@ class MemoryShortage(OutOfMemoryError):
 
 @dataclass(eq=False)
 class DeviceArray:
-    """A typed, shaped piece of device memory."""
+    """An array in device memory: a buffer with a shape and a type, C-contiguous."""
 
     buffer: "cl.Buffer"
     shape: tuple[int, ...]
@@ -51,7 +51,7 @@ class DeviceArray:
 
 @dataclass(eq=False)
 class LaterItem:
-    """A number that the device is still computing."""
+    """A number that the device may still be computing."""
 
     _values: np.ndarray
     _event: "cl.Event"
@@ -62,7 +62,7 @@ class LaterItem:
 
     @property
     def value(self) -> np.generic:
-        """Returns the number, once ``is_here``."""
+        """Returns the number; valid once ``is_here`` is True."""
         return self._values[0]
 
 
@@ -73,7 +73,7 @@ SameArray = TypeVar("SameArray", bound=Array)
 
 @dataclass
 class Traffic:
-    """Counts the bytes sent to the device and back, and how often the host waited for the device."""
+    """Counts the bytes sent to the device and back, and the host's waits for the device."""
 
     bytes_up: int = 0
     bytes_down: int = 0
@@ -87,7 +87,7 @@ class Traffic:
 
 @dataclass(frozen=True)
 class Room:
-    """The memory that an operator may plan with: free bytes in all, and the most for one buffer."""
+    """Free device memory that an operator may plan with, and the largest single buffer, both in bytes."""
 
     free_bytes: int
     largest_bytes: int
@@ -101,7 +101,7 @@ class Room:
 
 
 class MemoryLedger:
-    """Counts the memory in use on a device against a limit."""
+    """Counts the device memory in use against a limit, in bytes."""
 
     def __init__(self, device: DeviceInfo, limit_bytes: int | None) -> None:
         self.device = device
@@ -120,7 +120,7 @@ class MemoryLedger:
 
     @contextmanager
     def reserved(self, nbytes: int) -> Iterator[None]:
-        """Reserves bytes for later: plans made in the body leave them free."""
+        """Reserves ``nbytes`` in the body of a ``with``: ``room`` then leaves them free."""
         self.reserved_bytes += nbytes
         try:
             yield
@@ -128,13 +128,14 @@ class MemoryLedger:
             self.reserved_bytes -= nbytes
 
     def room(self, largest_bytes: int) -> Room:
-        """Returns nine tenths of the rest of the limit, in buffers of at most ``largest_bytes``. It is six tenths where a
-        GPU's driver does not say what is free and nobody has set a limit."""
+        """Returns nine tenths of the memory left of the limit, in buffers of at most ``largest_bytes``. Takes six tenths
+        where a GPU's driver does not report its free memory and the user has set no limit."""
         free_bytes = max(self.limit_bytes - self.held_bytes - self.reserved_bytes, 0)
         return Room(int(self.planned * free_bytes), min(largest_bytes, self.limit_bytes))
 
     def check(self, nbytes: int, largest_bytes: int) -> None:
-        """Raises MemoryShortage for a buffer that is too large or would exceed the limit."""
+        """Raises MemoryShortage for a buffer of ``nbytes`` that is larger than ``largest_bytes`` or would exceed the
+        limit."""
         subject, found = f"memory of {self.device.name}", f"{mebibytes(nbytes)} in one buffer"
         remedy = "use a smaller problem"
         if nbytes > largest_bytes:
@@ -177,7 +178,7 @@ def answers(queue: "cl.CommandQueue") -> bool:
 
 
 def reported_bytes(device: DeviceInfo) -> int | None:
-    """Returns the free memory where the device reports it (AMD's extension)."""
+    """Returns a device's free memory in bytes as AMD's drivers report it; None for other drivers."""
     with suppress(cl.Error, AttributeError):
         if "cl_amd_device_attribute_query" in device.handle.extensions:
             return int(device.handle.global_free_memory_amd[0]) * 1024  # type: ignore[index]
@@ -185,7 +186,8 @@ def reported_bytes(device: DeviceInfo) -> int | None:
 
 
 def memory_limit(wish: str | int | None) -> int | None:
-    """Returns the bytes that ``wish`` or the environment variable PHYRADGS_MEMORY allows; None without a limit."""
+    """Returns the bytes that ``wish``, or else the environment variable PHYRADGS_MEMORY, allows; None without a limit.
+    Raises InputError for text that is no size."""
     if wish is not None:
         return bytes_of(wish, "--memory")
     text = os.environ.get(MEMORY_VARIABLE)
@@ -193,7 +195,8 @@ def memory_limit(wish: str | int | None) -> int | None:
 
 
 def bytes_of(wish: str | int, subject: str) -> int:
-    """Parses 2GiB, 1.5 GB, 512M or a plain number of bytes. K, M, G and T alone are powers of 1024, as with iB."""
+    """Returns the bytes of a text such as 2GiB, 1.5 GB or 512M, or of a plain number. K, M, G and T alone are powers of
+    1024, as with iB. Raises InputError, about ``subject``, for other text."""
     text = "" if isinstance(wish, bool) else str(wish)
     match = re.fullmatch(r"\s*(\d+(?:\.\d+)?)\s*([A-Za-z]*)\s*", text)
     factor = _UNITS.get(match.group(2).upper()) if match else None
@@ -209,7 +212,8 @@ def mebibytes(nbytes: int) -> str:
 
 
 class Attempt:
-    """One attempt at work in bricks, which may fail for want of memory. As a context it gives the share of the memory."""
+    """One attempt at work in bricks, which may fail because memory is short. As a context it gives the fraction of the
+    free memory to plan with."""
 
     has_failed = False
 
@@ -227,14 +231,14 @@ class Attempt:
 
 
 def attempts(what: str) -> Iterator[Attempt]:
-    """Yields an attempt with all memory, and after a shortage, with a warning, one with a quarter of it."""
+    """Yields an attempt with all of the free memory; after a shortage, with a warning, one with a quarter of it."""
     yield (first := Attempt(what, 1.0))
     if first.has_failed:
         yield Attempt(what, _SMALLER)
 
 
 def is_cl_array(value: object) -> bool:
-    """Returns whether a value is a pyopencl.array.Array. Whoever has one has imported pyopencl."""
+    """Returns whether a value is a pyopencl.array.Array, without importing pyopencl where nobody has."""
     module = sys.modules.get("pyopencl.array")
     return module is not None and isinstance(value, module.Array)
 

@@ -71,8 +71,8 @@ def _expand(relative: str, pasted: set[str]) -> list[str]:
 
 
 def naming_failures(work: str) -> Callable[[Callable[P, R]], Callable[P, R]]:
-    """Decorates a method of a runtime, so that OpenCL's errors become DeviceError or MemoryShortage about its ``work``.
-    Drivers queue work: a launch may be refused at once, or fail later in any call that waits."""
+    """Decorates a method of ``Runtime``: OpenCL's errors become DeviceError, or MemoryShortage, that name ``work``, such
+    as "a copy". Drivers queue work, so a launch may also fail in a later call that waits."""
 
     def decorate(method: Callable[P, R]) -> Callable[P, R]:
         @wraps(method)

@@ -83,7 +83,7 @@ def prepare_environment() -> None:
 
 
 def _share_cores(launch: Launch) -> None:
-    """Divides the cores among the processes on a machine, unless their launcher has bound them."""
+    """Limits PoCL to this process's part of the cores, unless the launcher has bound its processes to cores."""
     cores = os.cpu_count() or 1
     is_bound = len(os.sched_getaffinity(0)) < cores
     if launch.local_size > 1 and not is_bound:
@@ -186,7 +186,7 @@ def use_library_target(device_address: int) -> str | None:
 
 
 def _text(memory: bytes) -> bytes | None:
-    """Returns the C string at the start of some memory. Returns None where it does not end there."""
+    """Returns the C string at the start of ``memory``; None where no zero byte ends it."""
     text, end, _ = memory.partition(b"\0")
     return text if end else None
 

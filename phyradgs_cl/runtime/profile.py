@@ -61,7 +61,7 @@ class Rates:
 
 
 def profile_text(uses: dict[str, KernelUse], wall_s: float) -> str:
-    """Formats a table of ``uses`` (Profile.uses) and the part of ``wall_s`` that kernels take."""
+    """Formats a table of ``uses`` (of ``Profile.uses``), with the kernels' fraction of ``wall_s``."""
     busy_s = sum(use.seconds for use in uses.values())
     rows = [("kernel", "launches", "seconds", "share", "ms each", "GB/s")]
     for name, use in uses.items():
@@ -77,7 +77,7 @@ def profile_text(uses: dict[str, KernelUse], wall_s: float) -> str:
 def measure_rates(
     queue: "cl.CommandQueue", multiply_add: "cl.Kernel", lanes: int, units: int, group: int
 ) -> Rates:
-    """Measures both rates, each as the best of a few runs. ``queue`` needs profiling."""
+    """Measures the rates of copies and of multiply-adds, each the best of a few runs. ``queue`` needs profiling."""
     context = queue.context
     source, target = (cl.Buffer(context, cl.mem_flags.READ_WRITE, _COPY_BYTES) for _ in range(2))
     cl.enqueue_fill_buffer(queue, source, np.zeros(1, np.float32), 0, _COPY_BYTES)

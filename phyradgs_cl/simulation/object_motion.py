@@ -91,8 +91,8 @@ class ObjectMotion:
         return Deformation(control_mm, origin_mm, spacing_mm, times_s, weights)
 
     def state_times_s(self, first_s: float, last_s: float) -> Array:
-        """Returns the times (K,) of the true volumes: the middles of equal parts of the cycle about the middle of the scan.
-        Where nothing repeats, they are those of equal parts of the whole scan."""
+        """Returns the times (K,) in s of the true volumes: the middles of equal parts of the cycle about the middle of
+        the scan; where nothing repeats, of the whole scan."""
         parts = (np.arange(self.states) + 0.5) / self.states
         if self.kind == "drying":
             return np.asarray(first_s + parts * (last_s - first_s))
@@ -102,12 +102,13 @@ class ObjectMotion:
         return np.asarray(first + parts * (last - first))
 
     def _sliding_mm(self, places: list[Array], height: Array) -> list[Array]:
-        """Returns the control vectors of a cylinder about the z axis, whose edge is about three control points wide."""
+        """Returns the control vectors in mm of a cylinder about the z axis that moves along z. Its edge is about three
+        control points wide."""
         _, y, x = places
         return [_vectors(z=(np.hypot(x, y) < self.radius).astype(float))]
 
     def _cycles_s(self, first_s: float, last_s: float) -> Array:
-        """Returns the beginnings of all cycles that touch the scan. The first one begins at its first light or before."""
+        """Returns the beginnings in s of all cycles that touch the scan. The first begins at first light or before."""
         count = int(np.ceil((last_s - first_s) / self.period_s)) + 1
         if count > _MOST_CYCLES:
             expected = f"at most {_MOST_CYCLES} cycles in the scan's {last_s - first_s:.4g} s"
@@ -119,7 +120,7 @@ class ObjectMotion:
         return np.asarray(begins_s[: int(np.searchsorted(begins_s, last_s)) + 1])
 
     def _weights(self, first_s: float, last_s: float) -> tuple[Array, Array]:
-        """Returns times (T,) and weights (T, R) of the preset's fields."""
+        """Returns times (T,) in s and weights (T, R) of the preset's fields."""
         if self.kind == "drying":
             settling_s = (last_s - first_s) / 3 if self.settling_s is None else self.settling_s
             times_s = np.linspace(first_s, max(last_s, np.nextafter(first_s, np.inf)), _SETTLING_NODES)
@@ -153,7 +154,7 @@ def load_object_motion(path: str | Path) -> ObjectMotion:
 
 
 def _breath(phase: Array) -> Array:
-    """Returns how far a breath has gone at a phase: 0 at whole numbers, 1 half-way between."""
+    """Returns how far a breath has gone at a phase in cycles: 0 at whole numbers, 1 half-way between."""
     return np.asarray(1 - np.cos(np.pi * phase) ** 4)
 
 

@@ -91,7 +91,8 @@ def scanner_for(
 
 
 def scanner_options(scanner: Scanner, protocol: str, **given: Any) -> SimulationOptions:
-    """Returns options of a simulation with a named protocol. Missing ones and None take the scanner's value or the default.
+    """Returns options of a simulation with a named protocol. The scanner's value, or the default, stands for options that
+    are missing or None.
 
     Raises InputError for unknown options, values out of range, and values that contradict each other."""
     given = {key: value for key, value in given.items() if value is not None}

@@ -81,7 +81,8 @@ def simulate(
 ) -> Scan:
     """Returns a scan of the object that ``source`` projects, with noise.
 
-    reference (nz, ny, nx): the truth, which ``peak`` scales too. bone: its bone's source, for a beam of many energies."""
+    reference (nz, ny, nx): the truth in 1/mm, which ``peak`` scales too. bone: the source of the object's bone, for a
+    beam of many energies."""
     if options.kvp and bone is None:
         expected = "an object of voxels, whose dense ones are bone: foot, jaw or a volume"
         raise InputError("--kvp", "a phantom in closed form", expected, "leave it out")
@@ -145,8 +146,8 @@ def _gating(scan: Scan, scene: Scene) -> Gating:
 
 
 def default_time_samples(protocol: Protocol, grid: Grid, fastest_mm_per_s: float = 0.0) -> int:
-    """Returns the number of samples per line, at least 8. From one to the next, the volume's edge, or the fastest part of an
-    object that moves, goes at most half a voxel."""
+    """Returns the number of time samples per line, at least 8. From one to the next, the volume's edge, or the fastest
+    part of a moving object, goes at most half a voxel."""
     path_mm = np.deg2rad(protocol.exposure_deg) * max(grid.size_mm[1:]) / 2
     path_mm = max(path_mm, fastest_mm_per_s * protocol.exposure_s)
     return int(np.clip(np.ceil(2 * path_mm / min(grid.voxel_size_mm)), 8, 128))

@@ -122,7 +122,7 @@ def _voxel_scene(
     rt: Runtime, volume: np.ndarray, fine: Grid, grid: Grid, title: str, deformation: Deformation | None,
     geometry: Geometry, axis: str, pixel_samples: int,
 ) -> Scene:
-    """Returns the scene of a volume (z, y, x) on ``fine``, with its block means on ``grid`` as the truth."""
+    """Returns the scene of a volume (nz, ny, nx) on the grid ``fine``, with its block means on ``grid`` as the truth."""
 
     def source_of(values: np.ndarray) -> FrameSource:
         return on_panel(geometry, grid, pixel_samples, lambda panel: on_one_panel(values, panel))
@@ -153,8 +153,8 @@ def _voxel_scene(
 
 
 def bone_from(volume: np.ndarray) -> float:
-    """Returns the attenuation from which voxels (z, y, x) are bone. It is half the largest value, or the end of the material
-    that this value would divide."""
+    """Returns the attenuation in 1/mm from which voxels (nz, ny, nx) count as bone: half the largest value, or the upper
+    end of a material that this value would divide."""
     largest = float(volume.max())
     counts, edges = np.histogram(volume, 64, (0.1 * largest, max(largest, 1e-20)))
     is_rare = (edges[1:] > _DENSE * largest) & (counts < _RARE * counts.max())

@@ -30,7 +30,7 @@ NEAREST = 0.1  # largest distance of moving matter from its exact place, in voxe
 
 
 class FrameSource(ABC):
-    """An object that can be projected to the frame of a cell table. Attenuation is multiplied by ``factor``."""
+    """An object that is projected to the frame of a table of time cells, with its attenuation multiplied by ``factor``."""
 
     pixel_samples = 1  # rays along each side of a pixel
 
@@ -43,7 +43,7 @@ class FrameSource(ABC):
 
 
 class VolumeSource(FrameSource):
-    """Frames of a voxel volume (z, y, x) in 1/mm by the ray-driven projector."""
+    """Projects a voxel volume (nz, ny, nx) in 1/mm with the ray-driven projector."""
 
     def __init__(
         self, rt: Runtime, volume: np.ndarray, grid: Grid, geometry: Geometry, axis: str, memory: RayMemory | None = None
@@ -65,7 +65,8 @@ class VolumeSource(FrameSource):
         return (self._rt.download(frames) if isinstance(frames, DeviceArray) else frames)[0]
 
     def _where_it_fits(self, volume: np.ndarray) -> np.ndarray | DeviceArray:
-        """Returns the volume on the device, or on the host without room for it and the operator's padded copy."""
+        """Returns the volume on the device; on the host where the device lacks room for the volume and the operator's
+        padded copy."""
         if not self._rt.room().holds(volume.nbytes, 4 * self._memory.layout.volume_floats):
             return volume
         try:
@@ -75,7 +76,9 @@ class VolumeSource(FrameSource):
 
 
 class AnalyticSource(FrameSource):
-    """Frames of a phantom with closed-form line integrals, in float64, with moving bodies at the times of cells."""
+    """Projects a phantom with closed-form line integrals to float32 frames, computed in float64.
+
+    Moving bodies stand where they are at each time cell's time."""
 
     def __init__(self, phantom: EllipsoidPhantom | MovingPhantom, geometry: Geometry) -> None:
         self._phantom, self._geometry = phantom, geometry
@@ -100,7 +103,7 @@ class AnalyticSource(FrameSource):
 
 
 class PixelAreaSource(FrameSource):
-    """Frames whose pixels average over their area, from ``samples`` by ``samples`` rays of a finer panel."""
+    """Averages each pixel over its area: over ``samples`` × ``samples`` pixels of a finer panel, the source ``finer``."""
 
     def __init__(self, finer: FrameSource, samples: int) -> None:
         self._finer, self._samples = finer, samples
@@ -121,17 +124,19 @@ class PixelAreaSource(FrameSource):
 
 
 def line_groups(cells: TimeCells) -> Iterator[tuple[int, int, np.ndarray]]:
-    """Yields (first line, line after the last, cells) for every run of lines with the same cells."""
+    """Yields (first line, line after the last, indices of cells) for every run of lines that the same cells serve."""
     ranges = np.stack([cells.line_start, cells.line_stop], -1)
     for start, stop in np.unique(ranges, axis=0):
         yield int(start), int(stop), np.flatnonzero((ranges == (start, stop)).all(axis=1))
 
 
 def on_panel(geometry: Geometry, grid: Grid, pixel_samples: int, make: Callable[[Geometry], FrameSource]) -> FrameSource:
-    """Makes a source for the panel. With several samples per pixel, a finer panel is averaged over the panel's pixels.
+    """Returns the source that ``make`` builds for the panel; with several samples per pixel, one that averages a finer
+    panel.
 
-    pixel_samples: 0 takes one sample where a pixel, at the axis, has at most ``WIDEST_RAY`` voxels of the grid. Otherwise it
-    takes one for every voxel: rays through the middles of wide pixels alone would miss parts of the truth."""
+    pixel_samples: samples along each side of a pixel, at most 32. 0 takes one where a pixel, projected to the axis, has
+    at most ``WIDEST_RAY`` voxels of the grid, else one per voxel: rays through the middles of wide pixels would miss
+    parts of the object. Raises InputError for a number out of range."""
     checks.within("--pixel-samples", pixel_samples, 0, _MOST_SAMPLES)
     if pixel_samples == 0:
         voxels = max(geometry.pixel_size_mm) / geometry.magnification / min(grid.voxel_size_mm)
@@ -142,11 +147,12 @@ def on_panel(geometry: Geometry, grid: Grid, pixel_samples: int, make: Callable[
 
 
 class DeformedSource(FrameSource):
-    """Frames of a deforming volume (z, y, x) in 1/mm on ``grid``.
+    """Projects a deforming volume (nz, ny, nx) in 1/mm on ``grid``.
 
-    A frame at a single time sees the object exactly then. In other frames the weights φ_r of each time cell are rounded, so
-    that all cells with the same rounded weights project one deformed volume. The rounding displaces no point by more than
-    ``NEAREST`` of ``voxel_mm``. ``frames`` deforms once for each state of all its frames. make: a volume's source."""
+    Cells at one time see the object exactly as it is then. For other frames the weights φ_r of each time cell are
+    rounded, so that cells with the same rounded weights share one deformed volume. The rounding displaces no point by
+    more than ``NEAREST`` of ``voxel_mm``. ``frames`` deforms the volume once for each distinct state of all its frames.
+    make: returns the source of a volume."""
 
     def __init__(
         self, rt: Runtime, volume: np.ndarray, grid: Grid, deformation: Deformation, voxel_mm: float,
@@ -176,7 +182,8 @@ class DeformedSource(FrameSource):
         return (each.frame() for each in sums)
 
     def _volumes(self, weights: np.ndarray) -> Callable[[int], np.ndarray]:
-        """Returns a function that makes the volume of each state of ``weights`` (K, R). On the device if it has room."""
+        """Returns a function from a state's index to its volume (nz, ny, nx), for ``weights`` (K, R). It deforms on the
+        device where all buffers fit."""
         volume, rank = self._volume, self._deformation.rank
         if not self._rt.room().scaled(0.5).holds(3 * rank * volume.nbytes, *[2 * volume.nbytes] * 2):
             spline = SplineVolume(volume, self._grid)
@@ -187,20 +194,20 @@ class DeformedSource(FrameSource):
         return lambda k: volume if warp.is_still(k) else np.maximum(self._rt.download(warp.forward(k, source)), least)
 
     def _rounded_weights(self, cells: TimeCells) -> np.ndarray:
-        """Returns the weights (C, R) of the states from which the cells are projected."""
+        """Returns the weights (C, R) at the cells' times, rounded unless they are the same for all cells."""
         weights = self._deformation.weights_at(cells.time_s)
         return np.round(weights / self._step) * self._step if np.ptp(weights, axis=0).any() else weights
 
 
 class _Average:
-    """A frame as the average of frames, each of some of its time cells."""
+    """Averages a frame from frames that each hold some of its time cells."""
 
     def __init__(self, cells: TimeCells, model: str) -> None:
         self._readout, self._is_log = cells.readout, model == "log"
         self._sum: np.ndarray | None = None  # Σ w p, or ln Σ w exp(−p)
 
     def add(self, frame: np.ndarray, share: np.ndarray) -> None:
-        """Adds line integrals (rows, columns), with the share (lines,) of each line's weight."""
+        """Adds line integrals (rows, columns); share (lines,): their fraction of each line's weight."""
         weight = self._readout.spread(share)
         if self._is_log:
             self._sum = weight * frame + (0.0 if self._sum is None else self._sum)
@@ -217,7 +224,7 @@ class _Average:
 
 
 def part_of(cells: TimeCells, members: np.ndarray) -> tuple[TimeCells, np.ndarray]:
-    """Returns a table of the cells ``members``, bool (C,), and the share (lines,) of each line's weight that they have.
+    """Returns a table of the cells ``members``, bool (C,), and their fraction (lines,) of each line's weight.
 
     Weights are rescaled: those of a line sum to 1 in the new table, or are all 0. The cells must have fixed poses."""
     part = some_cells(cells, np.flatnonzero(members))

@@ -42,8 +42,8 @@ def load_scan(path: str | Path, flats: str = "mean", rows: tuple[int, int] | Non
 
 @contextmanager
 def expecting(path: str | Path, *kinds: str) -> Iterator[None]:
-    """Makes an InputError of the body name the kind of the file, if it is none of ``kinds``; for a scan of another program,
-    the command that imports it."""
+    """Makes an InputError of the body name what the file holds, if that is none of ``kinds``; for a scan of another
+    program, also the command that imports it."""
     try:
         yield
     except InputError as error:
@@ -61,7 +61,8 @@ def expecting(path: str | Path, *kinds: str) -> Iterator[None]:
 
 
 def _is_foreign_scan(path: Path) -> bool:
-    """True for a scan in a format of ``import``. An NXtomo file whose frames state a quantity is a scan of this package."""
+    """Returns whether ``path`` is a scan in a format of ``import``. An NXtomo file whose frames state a quantity is a
+    scan of this package."""
     try:
         if importers.recognise(path) != "nxtomo":
             return True

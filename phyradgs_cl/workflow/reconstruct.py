@@ -54,8 +54,8 @@ def check_interval(seconds: float) -> None:
 
 
 class _Checkpoints:
-    """A listener of progress that writes a checkpoint at most every ``every_s`` seconds; 0: none. A killed run leaves the
-    last complete one. A checkpoint that cannot be written gives one warning, and no error."""
+    """Writes a checkpoint at most every ``every_s`` seconds (0: none), as a listener to a method's progress. A killed run
+    leaves its last complete checkpoint. One that cannot be written gives one warning, and no error."""
 
     def __init__(self, path: Path, every_s: float) -> None:
         self.path, self.every_s = path, every_s
@@ -191,8 +191,9 @@ def _reconstructed(
 
 def _metrics(scan: Scan, result: methods.Reconstruction) -> dict[str, float]:
     """Returns the metrics against the scan's reference, by the rule of ``metrics.aligned``, and those on held-out pixels,
-    which it removes from the result's facts. It adds the way of comparison to these, if that is not voxel by voxel. A result
-    that moves or changes has the means over the true states, since the time of its own reference is arbitrary."""
+    which it removes from the result's facts. A comparison other than voxel by voxel is added to these facts. For a result
+    that moves or changes, the metrics are means over the true states, because the time of its own reference is
+    arbitrary."""
     held_out = result.facts.pop(HELD_OUT, {})
     if scan.reference is None:
         return held_out
@@ -239,8 +240,8 @@ def _warn_of_doubts(plan: methods.RunPlan, path: Path, scan: Scan) -> None:
 def _warn_of_residual(path: Path, scan: Scan, result: methods.Reconstruction) -> None:
     """Warns where the iterations have converged to a volume whose residual is far above the scan's noise.
 
-    Measured on four objects of 32³, 25 views, by default: an axis off by 2 pixels left 0.25, one by 10 pixels 0.6, flats of
-    another scale 0.48 to 1, reversed angles 0.12 to 0.24, wrong units and orders 0.16 to 0.28."""
+    Measured on four objects of 32³, 25 views, by default. An axis off by 2 pixels left 0.25, by 10 pixels 0.6; flats of
+    another scale 0.48 to 1; reversed angles 0.12 to 0.24; wrong units and orders 0.16 to 0.28."""
     residuals = [float(one.get("residual", 0.0)) for one in result.record]
     if len(residuals) < _SETTLED or (residual := residuals[-1]) <= _UNLIKELY:
         return
@@ -255,7 +256,7 @@ def _warn_of_residual(path: Path, scan: Scan, result: methods.Reconstruction) ->
 
 
 def _averages(scan: Scan, options: Any) -> bool:
-    """True if the motion model has several poses per line; with one pose, both detector models give the same."""
+    """Returns whether the motion model has several poses per line; with one pose, both detector models give the same."""
     if not hasattr(options, "motion"):
         return False
     cells = options.motion.cells(scan, 0)
@@ -303,8 +304,8 @@ def resume_or_restart(
     plan: methods.RunPlan, scan: Path, output: Path, make_runtime: Callable[[], Runtime],
     report: methods.ProgressReport = methods.ignore_progress, checkpoint_every_s: float = 600.0,
 ) -> tuple[methods.Reconstruction, dict[str, float]]:
-    """Runs ``run_reconstruction`` from the output's checkpoint. Starts from the beginning where there is none, or where it
-    is damaged or of another run."""
+    """Runs ``run_reconstruction`` from the output's checkpoint; from the beginning where there is no checkpoint, or one
+    that is damaged or of another run."""
     run = partial(run_reconstruction, plan, scan, output, make_runtime, report, checkpoint_every_s=checkpoint_every_s)
     checkpoint = checkpoint_path(output)
     if checkpoint.is_file() and methods.method_of(plan.method).is_resumable:
@@ -318,5 +319,5 @@ def resume_or_restart(
 
 
 def is_complete(result: methods.Reconstruction) -> bool:
-    """True if the run came to its end; False if it was interrupted, and has left a checkpoint."""
+    """Returns whether the run came to its end; False for an interrupted run, which has left a checkpoint."""
     return result.facts.get("interrupted_at") is None

@@ -27,9 +27,8 @@ _TOML = ".toml"
 
 @dataclass(frozen=True)
 class SimulationJob:
-    """What to simulate: a ``phantom`` by name or TOML file, or a ``volume`` file, on a ``scanner``, with ``size`` voxels
-    along the longest side and ``pixel_samples`` rays along a pixel's. motion_of_object: a file that must not be
-    overwritten."""
+    """What to simulate: a ``phantom`` by name or TOML file, or a ``volume`` file, on a ``scanner``. size: voxels along
+    the longest side. pixel_samples: rays along a pixel's side. motion_of_object: a file that must not be overwritten."""
 
     output: Path
     phantom: str | None = None

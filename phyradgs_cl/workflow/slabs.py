@@ -36,15 +36,15 @@ _COPIES = 4  # number of arrays of the size of a slab's frames that a method hol
 
 @dataclass(frozen=True)
 class Slabs:
-    """Which ``rows`` [first, stop) of the panel to reconstruct, None for all, and how many at a time. rows_at_a_time 0 takes
-    stated rows at once, and of all rows as many as half of this machine's memory holds."""
+    """Which ``rows`` [first, stop) of the panel to reconstruct (None: all), and how many at a time. rows_at_a_time 0
+    takes stated rows at once; of all rows it takes as many as half of this machine's memory holds."""
 
     rows: tuple[int, int] | None = None
     rows_at_a_time: int = 0
 
     def of(self, scan: Scan) -> list[tuple[int, int]]:
-        """Returns the slabs [first, stop) of a scan, of which only the header is needed; an empty list for the whole scan at
-        once. Raises InputError for rows that the scan does not have, and for slabs of anything but a parallel beam."""
+        """Returns the slabs [first, stop) of a scan, from its header; [] for the whole scan at once. Raises InputError
+        for rows that the scan does not have, and for slabs of anything but a parallel beam."""
         rows = scan.geometry.detector_shape[0]
         first, stop = self.rows or (0, rows)
         at_a_time = self.rows_at_a_time
@@ -60,8 +60,8 @@ class Slabs:
 
 
 def surely_fits(path: Path) -> bool:
-    """True for a file so small that its frames surely fit, also if they are counts of 2 bytes that become float32; and
-    for a missing file."""
+    """Returns whether a file is so small that its frames surely fit into memory, also if they are counts of 2 bytes that
+    become float32. True for a missing file."""
     return not path.is_file() or 2 * _COPIES * path.stat().st_size < _HOST_SHARE * host_bytes()
 
 
@@ -77,10 +77,10 @@ def reconstruct_slabs(
     plan: methods.RunPlan, path: Path, output: Path, slabs: list[tuple[int, int]], rt: Runtime,
     report: methods.ProgressReport, *, resume: bool,
 ) -> methods.Reconstruction:
-    """Returns the volume of all slabs, mapped from a file. Each finished slab is written beside ``output``; ``resume`` reads
-    it from there.
+    """Returns the volume of all slabs, mapped from a file. Each finished slab is written beside ``output``; ``resume``
+    reads it from there.
 
-    Raises InputError where these are slabs of another run, and KeyboardInterrupt where a slab is interrupted."""
+    Raises InputError where the slabs there are of another run, and KeyboardInterrupt where a slab is interrupted."""
     header = read_scan_header(path)
     grid = header.with_grid(plan.preprocessing).grid
     whole = header.on_grid(grid)
@@ -127,7 +127,7 @@ def _slab(
 def _named(
     report: methods.ProgressReport, number: int, count: int, rows: tuple[int, int]
 ) -> Callable[[methods.Progress], None]:
-    """Returns a report of progress that puts the slab's name in front, and passes no state on."""
+    """Returns a listener that passes progress on to ``report``, with the slab's name in front and without the state."""
     label = f"slab {number + 1} of {count}, rows {rows[0]}:{rows[1]}: "
 
     def passed_on(progress: methods.Progress) -> None:
@@ -137,8 +137,8 @@ def _named(
 
 
 class _Store:
-    """The finished slabs of a run, a .npy file each, in a folder beside the output, with a note of the run's ``identity``.
-    Without ``resume`` it removes earlier slabs; with it, it raises InputError for those of another run."""
+    """The finished slabs of a run, each a .npy file in a folder beside the output, with a note of the run's ``identity``.
+    Without ``resume`` it removes earlier slabs; with ``resume`` it raises InputError for slabs of another run."""
 
     def __init__(self, output: Path, identity: str, resume: bool) -> None:
         self.folder = beside(output, ".slabs")
@@ -152,7 +152,7 @@ class _Store:
         note.write_text(identity, encoding="utf-8")
 
     def slab(self, first: int, stop: int) -> np.ndarray | None:
-        """Returns a finished slab (z, y, x), mapped from its file; None where there is none."""
+        """Returns a finished slab (nz, ny, nx), mapped from its file; None where it is not finished."""
         path = self.folder / f"{first}-{stop}.npy"
         return np.load(path, mmap_mode="r") if path.exists() else None
 

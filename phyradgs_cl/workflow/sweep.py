@@ -57,7 +57,8 @@ runtime_of_process = functools.cache(Runtime)  # one runtime per process and dev
 
 @dataclass(frozen=True)
 class SweepRun:
-    """One reconstruction, as a worker gets it. facts: the first entries of its results line; "run" is its name."""
+    """One reconstruction of a sweep, as a worker gets it. facts: the first entries of its results line, of which "run" is
+    its name."""
 
     scan: Path
     plan: RunPlan
@@ -106,8 +107,8 @@ def _files(pattern: str, path: Path) -> list[Path]:
 
 
 def _settings(document: Mapping[str, Any], path: Path) -> Iterator[dict[str, Any]]:
-    """Yields the options of every setting by dotted name: all combinations of the lists in each [[grid]], and each [[runs]],
-    each with the shared [options]. Raises InputError for a file without either, or with an empty list."""
+    """Yields the options of every setting by dotted name: all combinations of the lists in each [[grid]], and each
+    [[runs]], with the [options] of all. Raises InputError for a file without either, or with an empty list."""
     keys = [key for key in ("grid", "runs") if key in document]
     if not keys:
         remedy = "write for example [[grid]] with method = ['fdk', 'sirt']"
@@ -124,7 +125,8 @@ def _settings(document: Mapping[str, Any], path: Path) -> Iterator[dict[str, Any
 
 
 def _plan(values: Mapping[str, Any], seed: int, where: str) -> RunPlan:
-    """Returns the plan of a run. Raises the errors of ``plan_run`` with ``where`` and the values in front."""
+    """Returns the plan of a run. Raises the errors of ``plan_run``, with ``where`` and the values in front of the
+    message."""
     options = nested(values)
     method, preset = options.pop("method", DEFAULT_METHOD), options.pop("preset", None)
     try:
@@ -225,8 +227,8 @@ def make_run(run: SweepRun, report: ProgressReport = ignore_progress, device: st
 
 
 def _failed(run: SweepRun, error: Exception) -> Line:
-    """Returns the line of a failed run, or of dead workers. Raises an OutputError that all runs would meet, not
-    BusyError."""
+    """Returns the results line of a run that failed, also by dead workers. Raises an OutputError that all runs would
+    meet, except BusyError."""
     if isinstance(error, OutputError) and not isinstance(error, BusyError):
         raise error
     text = str(error) if isinstance(error, PhyradgsError) else f"{type(error).__name__}: {error}"
@@ -262,7 +264,8 @@ def _mean(values: Sequence[Any], form: str) -> str:
 
 
 def read_lines(path: Path) -> list[Line]:
-    """Reads the complete lines of a results file, and warns of damaged ones. Returns [] where there is no file."""
+    """Reads the complete lines of a results file; [] where there is no file. Warns of damaged lines, which it leaves
+    out."""
     lines, damaged = [], []
     text = path.read_text(encoding="utf-8", errors="replace") if path.exists() else ""
     for number, row in enumerate(text.split("\n"), 1):

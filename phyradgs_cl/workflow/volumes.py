@@ -107,7 +107,7 @@ def compared_states(result: Volume, truth: MovingTruth, truth_grid: Grid) -> dic
 
 
 def _with_our_axes(volume: Volume) -> Volume:
-    """Returns a volume of RTK, whose (x, y, z) are (y, z, x) here."""
+    """Returns a volume of RTK, whose axes (x, y, z) are this package's (y, z, x)."""
     z, y, x = 1, 2, 0  # indices of our axes in RTK's (z, y, x)
     grid = volume.grid
     if grid is not None:

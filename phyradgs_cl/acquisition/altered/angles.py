@@ -14,7 +14,7 @@ def azimuth_rad(pose: np.ndarray) -> np.ndarray:
 
 
 def start_azimuths_rad(scan: Scan) -> np.ndarray:
-    """Returns the angles (F,) of ``azimuth_rad`` at the start of each frame."""
+    """Returns the source's angle (F,) about +z, in (-π, π], when each frame's first line opens."""
     starts = [scan.trajectory.pose(f, scan.frame_start_s[f : f + 1]) for f in range(scan.frames)]
     return azimuth_rad(np.concatenate(starts))
 
@@ -26,7 +26,7 @@ def middle_poses(scan: Scan) -> np.ndarray:
 
 
 def has_opposite_views(scan: Scan) -> bool:
-    """True where views half a turn apart are mirror images: parallel rays that run across the axis."""
+    """Returns whether views half a turn apart are mirror images: those of parallel rays at right angles to the axis."""
     return scan.is_parallel and bool((np.abs(middle_poses(scan)[:, 2]) < _ACROSS).all())
 
 
@@ -41,5 +41,5 @@ def exposure_arc_rad(scan: Scan) -> float:
 
 
 def wrapped(angle: np.ndarray | float) -> np.ndarray:
-    """Returns angles (...) in radians, in [-π, π)."""
+    """Returns angles (...) in rad, wrapped to [-π, π)."""
     return (np.asarray(angle) + np.pi) % (2 * np.pi) - np.pi

@@ -27,7 +27,7 @@ _NARROW = 3  # factor by which blocks shrink on a panel lower than two of them: 
 def coarse(scan: Scan, columns: int) -> Scan:
     """Returns the scan with at most 60 frames, pixels averaged in blocks, a grid to match, and no reference.
 
-    The detector's longer side has at most ``columns`` blocks."""
+    The panel's longer side has at most ``columns`` blocks, unless too few rows or columns of blocks would be left."""
     shape = scan.geometry.detector_shape
     block = min(math.ceil(max(shape) / columns), max(1, shape[1] // _LEAST_COLUMNS))
     if 2 * block > shape[0]:
@@ -37,9 +37,11 @@ def coarse(scan: Scan, columns: int) -> Scan:
 
 
 def smooth(scan: Scan, pixels: float | tuple[float, float]) -> Scan:
-    """Returns the scan with frames smoothed by a Gaussian, from valid pixels only, so that their blocks do not alias.
+    """Returns the scan with frames smoothed by a Gaussian, so that blocks of their pixels do not alias. Masked pixels
+    have no weight.
 
-    pixels: the standard deviation, or a pair of them (across rows, across columns)."""
+    pixels: the standard deviation in pixels, or a pair of them (across rows, across columns). Up to 0.5 the scan stays as
+    it is."""
     v_px, u_px = pixels if isinstance(pixels, tuple) else (pixels, pixels)
     if max(v_px, u_px) <= 0.5:
         return scan
@@ -60,7 +62,7 @@ def fewer_frames(scan: Scan, most: int) -> Scan:
 
 
 def some_frames(scan: Scan, frames: np.ndarray) -> Scan:
-    """Returns the scan with the given frames (indices) only. The trajectory keeps the frame numbers of the file."""
+    """Returns the scan with the frames of the given indices alone. The trajectory keeps the frame numbers of the file."""
     trajectory = altered_trajectory(scan)
     mask = scan.pixel_mask
     return replace(
@@ -73,9 +75,10 @@ def some_frames(scan: Scan, frames: np.ndarray) -> Scan:
 
 
 def binned(scan: Scan, block: int) -> Scan:
-    """Returns the scan with ``block`` × ``block`` pixels averaged to one. A block is no larger than the panel.
+    """Returns the scan with ``block`` × ``block`` pixels averaged to one, and without its reference. A block is no larger
+    than the panel.
 
-    Only the valid pixels of a block are averaged; a block with less than half of them valid is masked. The last rows and
+    Only the valid pixels of a block are averaged; a block with fewer than half of them valid is masked. The last rows and
     columns that fill no block are dropped. A block of lines opens at the mean of its lines' times."""
     if block == 1:
         return replace(scan, reference=None, moving_truth=None)
@@ -98,7 +101,8 @@ def binned(scan: Scan, block: int) -> Scan:
 
 
 def coarse_grid(grid: Grid, geometry: Geometry) -> Grid:
-    """Returns a grid of the same box with a margin of one voxel. Voxels are about a pixel at the axis, but no finer."""
+    """Returns a grid of the same box with a margin of one voxel. Its voxels are about as large as a pixel of ``geometry``
+    at the axis, and no finer than those of ``grid``."""
     height_mm, width_mm = (pitch / geometry.magnification for pitch in geometry.pixel_size_mm)
     least_mm = max(max(grid.size_mm) / _MOST_VOXELS, min(grid.voxel_size_mm))
     wanted_mm = (max(height_mm, least_mm), *(max(width_mm, least_mm),) * 2)
@@ -111,9 +115,9 @@ def coarse_grid(grid: Grid, geometry: Geometry) -> Grid:
 def around_object(scan: Scan, spare_columns: float = 0.0) -> Scan:
     """Returns a coarse scan with its grid about the axis cut to the object that the frames show.
 
-    spare_columns: pixels added to the radius, because the axis may be off by as many.
+    spare_columns: pixels added to the object's radius, because the axis may be off by as many.
 
-    With few frames, voxels of air let a wrong hypothesis fit better than the right one. A panel's grid has many of them.
+    With few frames, voxels of air let a wrong hypothesis fit better than the right one, and a panel's grid has much air.
     A scan whose grid is off the axis, or whose frames show nothing, stays as it is."""
     geometry, grid = scan.geometry, scan.grid
     columns = np.where(scan.valid, scan.projections, 0).max((0, 1))
@@ -134,7 +138,7 @@ def around_object(scan: Scan, spare_columns: float = 0.0) -> Scan:
 
 
 def _binned_panel(geometry: Geometry, height: int, width: int) -> Geometry:
-    """Returns the panel made of whole blocks. Pixels dropped at the far end move its middle."""
+    """Returns the panel of whole blocks of ``height`` × ``width`` pixels. Pixels dropped at the far end move its middle."""
     (rows, columns), (pitch_v_mm, pitch_u_mm) = geometry.detector_shape, geometry.pixel_size_mm
     offset_v_mm, offset_u_mm = geometry.detector_offset_mm
     return replace(

@@ -16,9 +16,10 @@ from phyradgs_cl.acquisition.trajectory import CircularOrbit, Trajectory, is_par
 class GeometryCorrection:
     """Differences from a scan's stated geometry and timing. All zeros leave the scan as stated.
 
-    Offsets move the panel along its own columns and rows. Roll turns it in its plane; tilts turn it about v and u through
-    its middle. Distances move source and panel away from the axis. Times lengthen readout and exposure. turn_rad turns all
-    views about the axis, and lift_mm raises them along it. A turned or lowered object would explain these two as well."""
+    Offsets move the panel along its own columns and rows. Roll rotates it in its plane; tilts rotate it about v and u
+    through its middle. Distances move source and panel away from the axis. Times lengthen readout and exposure. turn_rad
+    rotates all views about the axis, and lift_mm raises them along it; a turned or lowered object would explain turn_rad
+    and lift_mm as well."""
 
     offset_u_mm: float = 0.0
     offset_v_mm: float = 0.0
@@ -35,7 +36,7 @@ class GeometryCorrection:
 
 @dataclass(frozen=True, eq=False)
 class Views:
-    """Corrections of each view in the file: turns (F,) about the axis in rad; the panel's shifts (F, 2) along v and u in
+    """Corrections of single views: a rotation (F,) about the axis in rad, and the panel's shifts (F, 2) along v and u in
     mm."""
 
     turn_rad: np.ndarray
@@ -44,8 +45,8 @@ class Views:
 
 @dataclass(frozen=True, eq=False)
 class Sway:
-    """A rigid motion of the object: turns about x, y and z in rad, then shifts along them in mm. Both are cubic splines of
-    time with coefficients (n, 6), between ``start_s`` and ``end_s``. They are constant before and after."""
+    """A rigid motion of the object: rotations about x, y and z in rad, then shifts along them in mm. All six are cubic
+    splines of time with coefficients (n, 6), between ``start_s`` and ``end_s``, and constant before and after."""
 
     coefficients: np.ndarray
     start_s: float
@@ -58,11 +59,11 @@ class Sway:
         return cls(np.zeros((count, 6)), float(starts_s.min()), float(starts_s.max() + scan.shutter.span_s))
 
     def basis(self, time_s: np.ndarray) -> np.ndarray:
-        """Returns the values (..., n) of the splines at times (...)."""
+        """Returns the values (..., n) of all splines at times (...) in s."""
         return splines((np.asarray(time_s, np.float64) - self.start_s) / (self.end_s - self.start_s), len(self.coefficients))
 
     def at(self, time_s: np.ndarray) -> np.ndarray:
-        """Returns turns in rad and shifts in mm, (..., 6), at times (...) s."""
+        """Returns rotations in rad and shifts in mm, (..., 6), at times (...) in s."""
         six: np.ndarray = self.basis(time_s) @ self.coefficients
         return six
 
@@ -76,8 +77,8 @@ def splines(fraction: np.ndarray, count: int) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class PerturbedTrajectory:
-    """Poses of ``base`` after a correction of all views, for a panel of ``shape`` (rows, columns). ``views`` then corrects
-    single views, or lets the object move."""
+    """Poses of ``base`` after ``correction``, for a panel of ``shape`` (rows, columns). ``views`` then corrects single
+    views, or lets the object move."""
 
     base: Trajectory
     shape: tuple[int, int]
@@ -91,7 +92,7 @@ class PerturbedTrajectory:
 
     @cached_property
     def _turn(self) -> np.ndarray:
-        """The turned u, v and normal as columns (3, 3), in components along the old u, v and normal."""
+        """The panel's corrected u, v and normal as columns (3, 3), in components along the stated u, v and normal."""
         correction = self.correction
         turn: np.ndarray = Rotation.from_rotvec(
             [correction.tilt_u_rad, correction.tilt_v_rad, correction.roll_rad]
@@ -112,8 +113,8 @@ class PerturbedTrajectory:
         return np.concatenate(vectors, -1)
 
     def _with_moved_panel(self, pose: np.ndarray, shift_v_mm: float, shift_u_mm: float) -> list[np.ndarray]:
-        """Returns source (or direction), first pixel, column step and row step, each (..., 3). They include the correction
-        of all views and the panel's shifts in one view."""
+        """Returns source (or direction), first pixel, column step and row step, each (..., 3), after the correction of
+        all views and one view's shifts of the panel."""
         correction = self.correction
         source, first, column, row = np.moveaxis(pose.reshape(*pose.shape[:-1], 4, 3), -2, 0)
         pitch_u_mm, pitch_v_mm = (np.linalg.norm(step, axis=-1, keepdims=True) for step in (column, row))
@@ -132,9 +133,10 @@ class PerturbedTrajectory:
 
 
 def _seen_by(motion: np.ndarray, vectors: list[np.ndarray], places: int) -> list[np.ndarray]:
-    """Returns four vectors (..., 3) in the coordinates of an object that has turned and shifted by ``motion`` (..., 6).
+    """Returns four vectors (..., 3) in the coordinates of an object that has rotated and shifted by ``motion`` (..., 6).
 
-    The last two vectors are steps. Of the two before, the last ``places`` (1 or 2) are points, which a shift moves."""
+    The last two vectors are steps. Of the first two, the last ``places`` (1 or 2) are points, which a shift moves; a
+    direction is not."""
     # An object that turns and shifts sees the scanner shifted back, then turned back.
     back = Rotation.from_rotvec(motion[..., :3].reshape(-1, 3)).as_matrix().reshape(*motion.shape[:-1], 3, 3)
     shifted = np.stack(vectors, -2)
@@ -143,9 +145,9 @@ def _seen_by(motion: np.ndarray, vectors: list[np.ndarray], places: int) -> list
 
 
 def perturb(scan: Scan, correction: GeometryCorrection, views: Views | Sway | None = None) -> Scan:
-    """Returns the scan after a correction. Its frames are unchanged.
+    """Returns the scan with its geometry and timing after a correction. Its frames are unchanged.
 
-    Offsets and distances of a circular orbit remain numbers of its geometry. Others make the trajectory a
+    Offsets and distances of a circular orbit stay numbers of its geometry. Other corrections make the trajectory a
     ``PerturbedTrajectory``."""
     shutter, geometry, trajectory = scan.shutter, scan.geometry, scan.trajectory
     source_mm = correction.source_distance_mm
@@ -173,6 +175,6 @@ def perturb(scan: Scan, correction: GeometryCorrection, views: Views | Sway | No
 
 
 def scan_course(scan: Scan) -> np.ndarray:
-    """Returns when each frame (F,) begins, as a fraction of the scan: from −1/2 for the first to 1/2 for the last."""
+    """Returns when each frame (F,) begins, as a fraction of the scan: −1/2 for the first, 1/2 for the last."""
     starts_s = np.asarray(scan.frame_start_s, np.float64)
     return np.asarray((starts_s - starts_s.min()) / max(np.ptp(starts_s), 1e-30) - 0.5)

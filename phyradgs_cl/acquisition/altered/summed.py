@@ -60,8 +60,8 @@ def sum_frames(
 
 
 def _interval_s(scan: Scan) -> tuple[float, float]:
-    """Returns the interval between projections, and the time at which the first one's begins, both in s. Raises InputError
-    for a rolling shutter, lag, or intervals that are uneven."""
+    """Returns the interval between projections, and the time at which the first projection's interval begins, both in s.
+    Raises InputError for a rolling shutter, for lag, and for uneven intervals."""
     remedy = "give a scan whose frames are short, or of a gantry at rest"
     if scan.is_fly and scan.shutter.readout_s > 0:
         raise InputError("scan", f"a readout of {scan.shutter.readout_s:g} s", "a global shutter", remedy)
@@ -75,7 +75,7 @@ def _interval_s(scan: Scan) -> tuple[float, float]:
 
 
 def _continued(scan: Scan, first_s: float, step_s: float) -> tuple[Trajectory, int]:
-    """Returns a trajectory through the projections' poses, and how many projections at either end it does not cover."""
+    """Returns a trajectory through the projections' poses, and how many projections at either end lie outside of it."""
     middle_s = first_s + (np.arange(scan.frames) + 0.5) * step_s
     own_s = scan.frame_start_s + scan.shutter.middle_s
     if isinstance(scan.trajectory, CircularOrbit):
@@ -94,15 +94,16 @@ def _continued(scan: Scan, first_s: float, step_s: float) -> tuple[Trajectory, i
 
 
 def _shares(delay: np.ndarray, count: int) -> np.ndarray:
-    """Returns the share (projections, lines) of each projection in each line's exposure. ``delay`` (lines,): the opening of
-    a line after the frame's start, in projections."""
+    """Returns the fraction (projections, lines) of each projection's interval that lies in each line's exposure of
+    ``count`` projections. delay (lines,): the opening of a line after the frame's start, in projections."""
     number = np.arange(int(np.ceil(delay.max() - 1e-9)) + count)[:, None]
     overlap = np.minimum(number + 1, delay + count) - np.maximum(number, delay)
     return np.where(overlap > 1e-9, overlap, 0.0)
 
 
 def _sum(scan: Scan, start: int, share: np.ndarray, readout: Readout) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the line integrals (rows, columns) of one frame, and the pixels that any of its projections masks."""
+    """Returns one frame's line integrals (rows, columns), summed over projections from ``start`` on with the fractions
+    ``share``, and its masked pixels: those that any of these projections masks."""
     total, is_masked = np.zeros(scan.projections.shape[1:]), np.zeros(scan.projections.shape[1:], bool)
     for number, lines in enumerate(share, start):
         of_lines = np.broadcast_to(readout.spread(lines), total.shape)

@@ -24,7 +24,7 @@ _STEPS = _ROW_STEP, _COLUMN_STEP  # index: axis 0 (v), axis 1 (u)
 class AlteredTrajectory:
     """Poses of ``base`` for a ``panel`` (rows, columns), altered in the order of the fields.
 
-    - is_reversed: the gantry turns the other way. This is a mirror image, whose columns run backwards; the panel's
+    - is_reversed: the gantry turns the other way. The poses are mirrored, so that columns run backwards; the panel's
       offset_u_mm stays on its side.
     - shift_px: the panel moves along u, in its own columns.
     - images: maps poses (..., 12) to those of frames that lie otherwise on the panel. None leaves the frames as stated.
@@ -73,7 +73,7 @@ class AlteredTrajectory:
 
 @dataclass(frozen=True, eq=False)
 class MappedTrajectory:
-    """Poses of ``base`` mapped by ``change``. It takes a frame number and the frame's poses (..., 12), and returns poses."""
+    """Poses of ``base`` mapped by ``change``, a function of a frame's number and its poses (..., 12) that returns poses."""
 
     base: Trajectory
     change: Callable[[int, np.ndarray], np.ndarray]
@@ -97,7 +97,7 @@ def altered_trajectory(scan: Scan) -> AlteredTrajectory:
 
 
 def with_trajectory(scan: Scan, **changes: Any) -> Scan:
-    """Returns the scan with changed fields of its ``AlteredTrajectory``."""
+    """Returns the scan with ``changes`` to the fields of its ``AlteredTrajectory``."""
     return replace(scan, trajectory=replace(altered_trajectory(scan), **changes))
 
 
@@ -112,13 +112,14 @@ def reversed_readout(scan: Scan) -> Scan:
 
 
 def shifted(scan: Scan, pixels: float) -> Scan:
-    """Returns the scan with its panel moved along u by ``pixels`` of the recorded scan, however the scan is binned."""
+    """Returns the scan with its panel moved along u by ``pixels`` columns of the recorded scan, also where the scan is
+    binned."""
     return with_trajectory(scan, shift_px=pixels)
 
 
 def turned(scan: Scan, angle_rad: np.ndarray, speed: float = 1.0) -> Scan:
-    """Returns the scan with the poses of its frames turned about z by ``angle_rad`` (F,). Within a frame the gantry turns
-    ``speed`` times as fast."""
+    """Returns the scan with the poses of its frames rotated about z by ``angle_rad`` (F,). Within a frame the gantry
+    turns ``speed`` times as fast."""
     first_rad = start_azimuths_rad(scan)
 
     def change(frame: int, pose: np.ndarray) -> np.ndarray:
@@ -129,8 +130,8 @@ def turned(scan: Scan, angle_rad: np.ndarray, speed: float = 1.0) -> Scan:
 
 
 def stretched(scan: Scan, v: float, u: float) -> Scan:
-    """Returns the scan with pixels ``v`` times as high and ``u`` times as wide about the panel's middle. The grid grows with
-    the pixels if it then matches the panel's view better."""
+    """Returns the scan with pixels ``v`` times as high and ``u`` times as wide about the panel's middle. The grid grows
+    with the pixels if it then fits the panel's view better."""
     rows, columns = scan.geometry.detector_shape
 
     def change(_: int, pose: np.ndarray) -> np.ndarray:
@@ -149,7 +150,8 @@ def stretched(scan: Scan, v: float, u: float) -> Scan:
 
 
 def mirrored(scan: Scan, axis: str) -> Scan:
-    """Returns the scan with its frames mirrored in ``axis``, u or v, on the stated panel."""
+    """Returns the scan with its frames mirrored along ``axis``, u or v, on the panel as stated. Lines along that axis are
+    then read in the opposite order."""
     number = ("v", "u").index(axis)
     is_read_along = scan.shutter.axis == ("rows", "columns")[number]
     images = partial(_flipped, axis=number, count=altered_trajectory(scan).panel[number])
@@ -187,7 +189,7 @@ def _flipped(pose: np.ndarray, axis: int, count: int) -> np.ndarray:
 
 
 def _rotated(pose: np.ndarray, angle_rad: np.ndarray) -> np.ndarray:
-    """Returns poses (..., 12) turned about z by angles (...)."""
+    """Returns poses (..., 12) rotated about z by angles (...) in rad."""
     cos, sin = np.cos(angle_rad)[..., None], np.sin(angle_rad)[..., None]
     vectors: np.ndarray = pose.reshape(*pose.shape[:-1], 4, 3).copy()
     x, y = vectors[..., 0].copy(), vectors[..., 1].copy()

@@ -47,7 +47,8 @@ _MOVES = ("x_translation", "y_translation", "z_translation")
 
 
 def recognises(path: Path) -> bool:
-    """True for an HDF5 file without Data Exchange's group. Raises InputError for a volume of this package."""
+    """Returns whether ``path`` is an HDF5 file without Data Exchange's group. Raises InputError for a volume of this
+    package."""
     if not path.is_file() or not h5py.is_hdf5(path):
         return False
     with open_hdf5(path) as source:
@@ -61,7 +62,7 @@ def recognises(path: Path) -> bool:
 
 
 def import_scan(path: Path, options: ImportOptions) -> Scan:
-    """Imports the projections of the file's NXtomo entry, or of the addresses among the options, with flats and darks."""
+    """Imports the projections, flats and darks of the file's NXtomo entry, or of the addresses among the options."""
     options.refuse_unused("nxtomo", OF_HDF5)
     with open_hdf5(path, options.linked_folder) as source:
         places = hdf5.places_of(options, source)
@@ -119,7 +120,8 @@ def _turned(source: Hdf5Source, detector: str) -> assemble.Turned:
 
 
 def _axis_columns(source: Hdf5Source, detector: str, turn: assemble.Turned, options: ImportOptions) -> float:
-    """Returns how many columns the panel's middle lies to the right of the axis. nxtomo states the axis from the middle."""
+    """Returns how many columns the panel's middle lies to the right of the axis. Files of nxtomo state the axis from the
+    middle."""
     names = (f"{detector}/{name}" for name in ("x_rotation_axis_pixel_position", "estimated_cor_from_motor"))
     for address in [address for address in names if source.find(address) is not None][:1]:
         if column := h5.read_number(source, address):
@@ -131,7 +133,8 @@ def _axis_columns(source: Hdf5Source, detector: str, turn: assemble.Turned, opti
 def _motion(
     places: hdf5.Places, entry: str, used: np.ndarray, geometry: Geometry, options: ImportOptions
 ) -> tuple[assemble.Timing, CircularOrbit]:
-    """Reads timing and orbit. With ``rotation_angle_end`` every frame has its own sweep; else the angles give the speed."""
+    """Reads timing and orbit. With ``rotation_angle_end`` every frame turns from its start to its end angle; without, the
+    start angles give the speed."""
     assert places.source is not None
     source, detector, angles = places.source, f"{entry}/{schema.DETECTOR}", f"{entry}/{schema.SAMPLE}/rotation_angle"
     sign = gantry_sign(options, h5.read_attribute(source, angles, "rotates") or "sample")
@@ -163,7 +166,7 @@ def _refuse_moves(source: Hdf5Source, entry: str, used: np.ndarray) -> None:
 
 
 def recognises_exchange(path: Path) -> bool:
-    """True for an HDF5 file with a group /exchange."""
+    """Returns whether ``path`` is an HDF5 file with a group /exchange."""
     if not path.is_file() or not h5py.is_hdf5(path):
         return False
     with open_hdf5(path) as source:

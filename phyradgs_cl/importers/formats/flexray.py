@@ -31,7 +31,7 @@ _WHOLE_PITCH_MM = 0.0748  # pitch of the pixels of the panel without binning
 
 
 def recognises(path: Path) -> bool:
-    """True for a folder with "scan settings.txt", and for that file."""
+    """Returns whether ``path`` is a folder with "scan settings.txt", or that file."""
     file = path / _FILE if path.is_dir() else path
     return file.name.lower() == _FILE and head_has(file, b"sod", b"sdd")
 
@@ -90,7 +90,7 @@ def _stage(scan: Settings, panel: tuple[int, int], options: ImportOptions, names
 
 
 def _window_mm(scan: Settings) -> tuple[float, float]:
-    """Returns the distances (right, up) in mm from the panel's middle to the middle of its window."""
+    """Returns (right, up) in mm, from the panel's middle to the middle of the window that was read."""
     if not scan.has("ROI (LTRB)"):
         return 0.0, 0.0
     left, top, right, bottom = scan.listed("ROI (LTRB)", 4).tolist()

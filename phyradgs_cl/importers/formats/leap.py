@@ -34,7 +34,7 @@ _OF_TABLES = (*TIMING, "row_0", "column_0", "quantity", "flat_value", "detector_
 
 
 def recognises(path: Path) -> bool:
-    """True for a text file of LEAP's parameters, and for a folder with one."""
+    """Returns whether ``path`` is a text file of LEAP's parameters, or a folder with such a file."""
     return bool(_descriptions(path))
 
 

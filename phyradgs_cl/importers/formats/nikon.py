@@ -40,7 +40,7 @@ _MOST_FRAMES = 1_000_000  # largest number of frames, and of rows or columns
 
 
 def recognises(path: Path) -> bool:
-    """True for a .xtekct file, and for a folder with one."""
+    """Returns whether ``path`` is a .xtekct file, or a folder with such a file."""
     return bool(SafeFolder(path).matching(".xtekct")) if path.is_dir() else path.suffix.lower() == ".xtekct"
 
 
@@ -75,7 +75,7 @@ def import_scan(path: Path, options: ImportOptions) -> Scan:
 
 
 def _angles(scan: Settings, measured: Path | None, count: int) -> np.ndarray:
-    """Returns the angles (count,) in rad: the measured ones, or equal steps."""
+    """Returns the angles (count,) in rad: those of the file ``measured`` or, without it, equal steps."""
     if measured is not None and not scan.has("AngularStep"):
         return read_angles_rad(measured, count, column=1)
     steps_rad = np.deg2rad(scan.number("InitialAngle", 0.0) + scan.number("AngularStep") * np.arange(count))
@@ -83,7 +83,7 @@ def _angles(scan: Settings, measured: Path | None, count: int) -> np.ndarray:
 
 
 def _stage(scan: Settings, panel: tuple[int, int], options: ImportOptions, names: dict[str, str]) -> RotaryStage:
-    """Returns the stage of the description; options replace its lengths."""
+    """Returns the stage that the .xtekct describes, with the options' lengths in place of its own."""
     lengths = partial(scan.length, "SrcToObject"), partial(scan.length, "SrcToDetector")
 
     def pitch_mm() -> tuple[float, float]:

@@ -36,8 +36,8 @@ _GAP = 1e-3  # least time between the windows of two frames, as a fraction of a 
 
 @dataclass(frozen=True, eq=False)
 class Circle:
-    """The circle of the source or the panel: centre (x, y) and radius in mm. Each view has a height z (F,) in mm and angles
-    (F, 3) in rad: at its first line's start and end, and at its last line's end."""
+    """The circle of the source or the panel: centre (x, y) and radius in mm. Each view has a height z (F,) in mm and
+    angles (F, 3) in rad, at its first line's start and end and at its last line's end."""
 
     centre: np.ndarray
     radius: float
@@ -56,7 +56,8 @@ class Circle:
         return cls(centre[:2], circle.length("radius"), z, angles)
 
     def at(self, view: int, share: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Returns angles (T,) and points (T, 3) of a view at times ``share`` (T,), in exposures after its start."""
+        """Returns angles (T,) in rad and points (T, 3) in mm of a view at times ``share`` (T,), in exposures after its
+        start."""
         start, closed, _ = self.angle_rad[view]
         angle = start + (closed - start) * share
         x, y = (self.centre[:, None] + self.radius * np.stack([np.cos(angle), np.sin(angle)])).tolist()
@@ -64,7 +65,8 @@ class Circle:
 
 
 def recognises(path: Path) -> bool:
-    """True for a .json that is not the description of another format, and for a folder with one and TIFF frames."""
+    """Returns whether ``path`` is a .json that does not describe another format, or a folder with such a file and TIFF
+    frames."""
     others = (synthetic.META, synthetic.META_WITH_TIMES)
     if not path.is_dir():
         return path.suffix.lower() == ".json" and path.name not in others
@@ -129,7 +131,7 @@ def _frames_and_views(
 
 
 def _with_flat(subject: str, options: ImportOptions, frames: np.ndarray) -> ImportOptions:
-    """Returns options with the brightest pixel as flat value, unless one is given, as the published code does; warns."""
+    """Returns options whose flat value, unless given, is the brightest pixel, as in the published code; warns of it."""
     if options.flat_value is not None or options.quantity not in (None, "counts"):
         return options
     brightest = float(frames.max())
@@ -141,8 +143,8 @@ def _with_flat(subject: str, options: ImportOptions, frames: np.ndarray) -> Impo
 
 
 def _timing(subject: str, detector: Circle, options: ImportOptions) -> tuple[Shutter, np.ndarray]:
-    """Returns shutter and opening times (F,) in s. Frames whose windows would overlap are moved apart in time, since one
-    pose table holds the poses of all."""
+    """Returns shutter and opening times (F,) in s. Frames whose windows would overlap are moved apart in time, because
+    one pose table holds the poses of all frames."""
     exposure_s = synthetic.exposure_of_blurred_s(options)
     first, closed, done = np.unwrap(detector.angle_rad, axis=1).T
     ratio = synthetic.readout_ratio(subject, closed - first, done - closed)

@@ -43,12 +43,12 @@ _COPIES = 3  # bytes of memory for every byte of the file: arrays and line integ
 
 
 def recognises(path: Path) -> bool:
-    """True for a file with a pickle's suffix that does not name TIGRE's geometry."""
+    """Returns whether ``path`` is a file with a pickle's suffix that does not name TIGRE's geometry."""
     return path.is_file() and path.suffix.lower() in (".pickle", ".pkl") and not names_tigre(path)
 
 
 def names_tigre(path: Path) -> bool:
-    """True for a file that names TIGRE's geometry in its first or last 256 KiB, where a pickle has its small objects."""
+    """Returns whether a file names TIGRE's geometry in its first or last 256 KiB, where a pickle has its small objects."""
     with open(path, "rb") as file:
         head = file.read(_END_BYTES)
         file.seek(max(0, os.fstat(file.fileno()).st_size - _END_BYTES))
@@ -97,8 +97,8 @@ def _array(table: Fields, key: str, ndim: int) -> np.ndarray:
 
 
 def read_pickle(path: Path, unpickler: "type[PlainUnpickler] | None" = None) -> object:
-    """Reads dicts, lists, tuples, text, numbers and NumPy arrays of plain numbers. Raises InputError for anything that the
-    unpickler, by default ``PlainUnpickler``, refuses, and for damage."""
+    """Reads dicts, lists, tuples, text, numbers and NumPy arrays of plain numbers. Raises InputError for a damaged file,
+    and for anything that the unpickler refuses, by default ``PlainUnpickler``."""
     subject = str(path)
     size = regular_file(path, subject).st_size
     check_room(subject, _COPIES * size)
@@ -112,7 +112,7 @@ def read_pickle(path: Path, unpickler: "type[PlainUnpickler] | None" = None) -> 
 
 
 class PlainUnpickler(pickle.Unpickler):
-    """Python's unpickler with an allow-list of names."""
+    """Python's unpickler, limited to a list of allowed names."""
 
     def find_class(self, module: str, name: str) -> Any:
         """Returns the function for a name of the list. Raises InputError for any other name."""
@@ -171,7 +171,7 @@ class _Geometry(SimpleNamespace):
 
 
 class TigreUnpickler(PlainUnpickler):
-    """The unpickler of plain arrays, which also takes TIGRE's geometries."""
+    """The unpickler of plain arrays that also takes TIGRE's geometries."""
 
     def find_class(self, module: str, name: str) -> Any:
         """Returns ``_Geometry`` for a class of TIGRE's geometries, and for other names what ``PlainUnpickler`` allows."""
@@ -181,7 +181,7 @@ class TigreUnpickler(PlainUnpickler):
 
 
 def recognises_tigre(path: Path) -> bool:
-    """True for a file with a pickle's suffix that names TIGRE's geometry."""
+    """Returns whether ``path`` is a file with a pickle's suffix that names TIGRE's geometry."""
     return path.is_file() and path.suffix.lower() in (".pickle", ".pkl") and names_tigre(path)
 
 
@@ -216,14 +216,15 @@ def import_scan_tigre(path: Path, options: ImportOptions) -> Scan:
 
 
 def _named(content: dict[object, Any], *words: str) -> Any:
-    """Returns the first value of a dictionary whose key begins with one of the words, in any case; None without one."""
+    """Returns the first value of a dictionary whose key begins with one of ``words``, in upper or lower case; None
+    without one."""
     return next((value for name, value in content.items() if str(name).lower().startswith(words)), None)
 
 
 def _trajectory(
     geo: Any, poses: np.ndarray, angle_rad: np.ndarray, timing: Timing, subject: str
 ) -> tuple[CircularOrbit | PoseTable, Geometry]:
-    """Returns a circular orbit where one value of each length describes the poses (F, 12), else a table of them."""
+    """Returns a circular orbit where single values of the lengths describe all poses (F, 12), else a table of the poses."""
     rows, columns = np.ravel(geo.nDetector).tolist()
     pitch_v, pitch_u = np.ravel(geo.dDetector).tolist()
     off_v, off_u = np.resize(0.0 if geo.offDetector is None else geo.offDetector, 2).tolist()

@@ -42,7 +42,8 @@ class R2Folder:
 
     @classmethod
     def opened(cls, given: Path, usual: str, unit_mm: float) -> "R2Folder":
-        """Reads the description named ``usual`` of a folder, or ``given`` if that is a description."""
+        """Opens a folder with the description ``usual``, or the folder of ``given`` if that is a description. unit_mm:
+        the scene's unit of length."""
         folder = SafeFolder(given if given.is_dir() else given.parent)
         name = usual if given.is_dir() else given.name
         path = folder.file(name, str(folder.root / name))
@@ -61,7 +62,8 @@ class R2Folder:
     def scan(
         self, path: Path, entries: list[Fields], orbit: CircularOrbit, timing: Timing, options: ImportOptions
     ) -> Scan:
-        """Returns the scan of the listed frames along ``orbit``, with the truth in 1/mm where the folder has it."""
+        """Returns the scan of the frames in ``entries`` along ``orbit``, with the true volume in 1/mm where the folder
+        has it."""
         grid, reference = read_grid(self.meta.table("scanner"), self.unit_mm), None
         if self.meta.has("vol"):
             truth = self.folder.file(self.meta.word("vol"), self.meta.name("vol"))
@@ -77,20 +79,21 @@ class R2Folder:
 
 
 def entries_of(meta: Fields, prefix: str, part: str) -> list[Fields]:
-    """Returns the entries of a part; "all" means train, then test."""
+    """Returns the entries of frames of ``part``, train or test; "all" means train, then test. prefix: that of their
+    keys."""
     parts = ("train", "test") if part == "all" else (part,)
     return [entry for name in parts for entry in meta.tables(f"{prefix}{name}")]
 
 
 def recognises(path: Path) -> bool:
-    """True for a folder with R2-Gaussian's description, and for the description itself."""
+    """Returns whether ``path`` is a folder with R2-Gaussian's description, or the description itself."""
     if path.is_dir():
         return (path / META).exists() and not (path / META_WITH_TIMES).exists()
     return path.name == META
 
 
 def import_scan(path: Path, options: ImportOptions) -> Scan:
-    """Imports the ``proj_train`` (or test, or all) frames of a folder."""
+    """Imports the frames of a folder's ``proj_train``, or of the part that the options state."""
     options.refuse_unused("r2", OPTIONS)
     opened = R2Folder.opened(path, META, options.unit_mm)
     entries = entries_of(opened.meta, "proj_", options.part)
@@ -130,7 +133,8 @@ def _pitches(scanner: Fields, what: str, counts: tuple[int, ...]) -> np.ndarray:
 
 
 def _offset(scanner: Fields, key: str, count: int) -> np.ndarray:
-    """Returns the first ``count`` lengths of a key, (count,), 0 where the table has none: offDetector may have a third."""
+    """Returns the first ``count`` numbers (count,) of ``key``, whose third may be unused; zeros where the table lacks the
+    key. Raises InputError for fewer numbers."""
     if not scanner.has(key):
         return np.zeros(count)
     values = scanner.numbers(key)
@@ -140,8 +144,8 @@ def _offset(scanner: Fields, key: str, count: int) -> np.ndarray:
 
 
 def turned_volume(subject: str, volume: np.ndarray, grid: Grid, per_mm: float) -> np.ndarray:
-    """Returns a stored volume [x, y, z], times ``per_mm``, as (z, y, x) float32 in 1/mm. Raises InputError for another
-    shape than the grid's, and for values that are not finite in float32."""
+    """Returns a stored volume [x, y, z], times ``per_mm``, as (nz, ny, nx) float32 in 1/mm. Raises InputError for a shape
+    other than the grid's, and for values that are not finite in float32."""
     checks.shape(subject, volume, grid.shape[::-1])
     checks.finite(subject, volume)
     turned = np.transpose(volume, (2, 1, 0)).astype(np.float64) * per_mm
@@ -151,12 +155,13 @@ def turned_volume(subject: str, volume: np.ndarray, grid: Grid, per_mm: float) -
 
 
 def recognises_with_times(path: Path) -> bool:
-    """True for a folder with PhyRadGS's description, and for the description itself."""
+    """Returns whether ``path`` is a folder with PhyRadGS's description, or the description itself."""
     return (path / META_WITH_TIMES).exists() if path.is_dir() else path.name == META_WITH_TIMES
 
 
 def import_scan_with_times(path: Path, options: ImportOptions) -> Scan:
-    """Imports a folder's ``simulate_train`` (or test, or all) frames, read out along columns unless the options differ."""
+    """Imports the frames of a folder's ``simulate_train``, or of the part that the options state. They are read out along
+    columns unless the options differ."""
     options.refuse_unused("phyradgs", OPTIONS_WITH_TIMES)
     opened = R2Folder.opened(path, META_WITH_TIMES, options.unit_mm)
     entries = entries_of(opened.meta, "simulate_", options.part)
@@ -167,8 +172,8 @@ def import_scan_with_times(path: Path, options: ImportOptions) -> Scan:
 
 
 def timing_of_marks(subject: Fields, marks_rad: np.ndarray, options: ImportOptions) -> Timing:
-    """Returns the timing from angles (F, 3) in rad at the first line's start and end, and the last line's end. The first
-    stored line is read first: column 0, or the top row in a readout along rows."""
+    """Returns the timing from gantry angles (F, 3) in rad at the first line's start and end, and the last line's end. The
+    first stored line is read first: column 0, or the top row in a readout along rows."""
     exposure_s = exposure_of_blurred_s(options)
     ratio = readout_ratio(subject.subject, marks_rad[:, 1] - marks_rad[:, 0], marks_rad[:, 2] - marks_rad[:, 1])
     axis = options.readout_axis or "columns"
@@ -180,7 +185,7 @@ def timing_of_marks(subject: Fields, marks_rad: np.ndarray, options: ImportOptio
 
 
 def exposure_of_blurred_s(options: ImportOptions) -> float:
-    """Returns the exposure in s of the options, or 1 s: the files do not state it."""
+    """Returns the options' exposure in s, or else 1 s, because the files state none. Raises InputError for 0 s or less."""
     exposure_s = 1.0 if options.exposure_s is None else options.exposure_s
     if exposure_s <= 0:
         raise InputError(options.named("exposure_s"), f"{exposure_s:g}", "a time above 0 s", "the frames are blurred")

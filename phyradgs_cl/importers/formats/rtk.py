@@ -42,7 +42,7 @@ _TO_WORLD = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
 
 @dataclass(frozen=True, eq=False)
 class Stack:
-    """Projections (F, v, u); origin and steps along u and v, each (2,): (x, y) in the image's plane in mm."""
+    """Projections (F, v, u), and their image plane: its origin, and the steps along u and v, each (2,) as (x, y) in mm."""
 
     frames: np.ndarray
     origin_mm: np.ndarray
@@ -51,8 +51,8 @@ class Stack:
 
 
 def recognises(path: Path) -> bool:
-    """True for an .xml file that has no raw projections beside it, for a folder with one and a MetaImage, and for a
-    MetaImage in such a folder."""
+    """Returns whether ``path`` is an .xml file without raw projections beside it, a folder with such a file and a
+    MetaImage, or a MetaImage in such a folder."""
     folder = SafeFolder(path if path.is_dir() else path.parent)
     is_stack = path.suffix.lower() in STACKS
     descriptions = folder.matching(".xml") if path.is_dir() or is_stack else [path] if path.suffix.lower() == ".xml" else []
@@ -64,7 +64,7 @@ def recognises(path: Path) -> bool:
 
 
 def import_scan(path: Path, options: ImportOptions) -> Scan:
-    """Imports a folder with one .xml and one .mha (or .mhd); or one of the two files, with the other in its folder."""
+    """Imports a folder with one .xml and one .mha (or .mhd), or one of both files with the other in its folder."""
     options.refuse_unused("rtk", OPTIONS)
     folder = SafeFolder(path if path.is_dir() else path.parent)
     is_stack = path.suffix.lower() in STACKS and path.is_file()
@@ -80,8 +80,8 @@ def import_scan(path: Path, options: ImportOptions) -> Scan:
 def scan_of(
     rtk: "RtkGeometry", stack: Stack, options: ImportOptions, subjects: tuple[str, str], title: str, source: str
 ) -> Scan:
-    """Returns the scan of a geometry and its projections. ``subjects`` names both in messages. Raises InputError where their
-    numbers of frames differ."""
+    """Returns the scan of a geometry and its projections. subjects: names of both in messages. Raises InputError where
+    their numbers of frames differ."""
     described, stored = subjects
     if len(stack.frames) != rtk.frames:
         found = f"{len(stack.frames)} frames, {rtk.frames} projections in {Path(described).name}"
@@ -96,8 +96,8 @@ def scan_of(
 def stack_of(
     frames: np.ndarray, origin_mm: tuple[float, ...], spacing_mm: tuple[float, ...], direction: np.ndarray, subject: str
 ) -> Stack:
-    """Returns the projections (F, v, u) of an image of ITK with its origin and spacing (3,) and direction (3, 3). Raises
-    InputError unless its third axis, the frames, is perpendicular to the others."""
+    """Returns the projections (F, v, u) of an image of ITK with its origin and spacing (3,) in mm and its direction (3,
+    3). Raises InputError unless the third axis, the frames, is perpendicular to the others."""
     steps_mm = direction * spacing_mm  # columns: along u, v and the frames
     if np.abs([*steps_mm[:2, 2], *steps_mm[2, :2]]).max() > 1e-9 * np.abs(steps_mm).max():
         raise InputError(subject, str(steps_mm.tolist())[:80], "axes of a stack: columns, rows, frames")
@@ -107,7 +107,8 @@ def stack_of(
 def _trajectory(
     rtk: "RtkGeometry", stack: Stack, timing: assemble.Timing, subject: str
 ) -> tuple[CircularOrbit | PoseTable, Geometry, assemble.Turned]:
-    """Returns a circular orbit where one describes the file, else a pose table; the nearest circular geometry; the flips."""
+    """Returns a circular orbit where the file's poses lie on one, else a pose table; the nearest circular geometry; and
+    the images' flips."""
     panel = (stack.frames.shape[1], stack.frames.shape[2])
 
     def stored(position: np.ndarray) -> np.ndarray:
@@ -128,7 +129,7 @@ def _trajectory(
 
 @dataclass(frozen=True, eq=False)
 class RtkGeometry:
-    """Numbers of all projections by RTK's names: each (F,), lengths in mm, angles in radians."""
+    """The numbers of all projections by RTK's names: each (F,), lengths in mm, angles in rad."""
 
     values: dict[str, np.ndarray]
 
@@ -138,12 +139,12 @@ class RtkGeometry:
 
     @property
     def is_parallel(self) -> bool:
-        """True for a parallel beam."""
+        """Whether the beam is parallel."""
         return not self.values[_TO_DETECTOR].any()
 
     @property
     def is_circular(self) -> bool:
-        """True where all projections are on one untilted circle with one panel."""
+        """Whether all projections are on one untilted circle with one panel."""
         of_source = (_TO_AXIS, "SourceOffsetX", "SourceOffsetY") if self.is_parallel else ()
         steady = [v for name, v in self.values.items() if name not in (_ANGLE, *of_source)]
         still = all(np.ptp(v) <= 1e-9 * (1 + np.abs(v).max()) for v in steady)
@@ -153,8 +154,8 @@ class RtkGeometry:
     def poses(
         self, position: np.ndarray, origin_mm: np.ndarray, step_u: np.ndarray, step_v: np.ndarray
     ) -> np.ndarray:
-        """Returns poses (T, 12) at frame positions (T,), linear between and beyond frames. ``origin_mm`` (2,): place (u, v)
-        of pixel (0, 0) in the image's plane; ``step_u``, ``step_v`` (2,): from column to column and row to row."""
+        """Returns poses (T, 12) at frame positions (T,), linear between and beyond frames. origin_mm (2,): place (u, v)
+        of pixel (0, 0) in the image's plane; step_u, step_v (2,): in mm, from column to column and row to row."""
         at = {name: along(np.unwrap(v) if name in _ANGLES else v, position) for name, v in self.values.items()}
         # from the gantry's to RTK's fixed frame: the inverse of Rz(−in plane) Rx(−out of plane) Ry(−gantry)
         angles_rad = np.stack([at[name] for name in ("GantryAngle", "OutOfPlaneAngle", "InPlaneAngle")], -1)
@@ -172,7 +173,7 @@ class RtkGeometry:
 
 
 def read_rtk_xml(path: Path) -> RtkGeometry:
-    """Reads a geometry file. A warning says that a file without SourceToDetectorDistance has a parallel beam. Raises
+    """Reads a geometry file. Warns that a file without SourceToDetectorDistance counts as a parallel beam. Raises
     InputError for numbers that are missing or that no scanner has."""
     root = _root(path)
     common, projections = _numbers(path, root), [_numbers(path, e) for e in root.iterfind("Projection")]

@@ -23,8 +23,8 @@ _COPIES = 12  # bytes of memory for every byte of the files: RTK's images, packe
 
 @dataclass(frozen=True)
 class _Maker:
-    """A maker's files: the ends of the names of description and projections, the name of RTK's reader of the geometry, and
-    the options that are used. ``below``: a pattern of the projections, if not in the description's folder."""
+    """A maker's files: the ends of the names of description and projections, the name of RTK's reader of the geometry,
+    and the options that apply. below: a pattern of the projections, where they are not in the description's folder."""
 
     description: str
     suffixes: tuple[str, ...]
@@ -56,7 +56,7 @@ def _read_geometry(rtk: Any, reader_name: str, description: str, names: list[str
 
 
 def recognises(path: Path) -> bool:
-    """True for a folder, or a description, of one of the makers, with its projections."""
+    """Returns whether ``path`` is a folder, or a description, of one of the makers, with its projections."""
     return _located(path) is not None
 
 

@@ -45,7 +45,7 @@ _ASSUMED = {
 
 
 def recognises(path: Path) -> bool:
-    """True for a .log file of a SkyScan, and for a folder with one."""
+    """Returns whether ``path`` is a .log file of a SkyScan, or a folder with such a file."""
     paths = SafeFolder(path).matching(".log") if path.is_dir() else [path] if path.suffix.lower() == ".log" else []
     return any(settings.head_has(file, b"[system]", b"scanner=") for file in paths)
 
@@ -98,7 +98,9 @@ def _geometry(scan: settings.Settings, panel: tuple[int, int], options: ImportOp
 
 
 def _timing(scan: settings.Settings, options: ImportOptions) -> assemble.StoredTiming:
-    """Returns the exposure of all averaged frames together; none where the scanner stopped and options state no rate."""
+    """Returns the exposure in s of all averaged frames together; no exposure where the file has none, and where the
+    scanner stopped for each frame and the options state no frame time. Raises InputError for a Frame Averaging that is
+    neither ON with a count nor OFF."""
     motion = next((scan.word(name) for name in ("Type of Detector Motion", "Type of Motion") if scan.has(name)), "")
     averaging = scan.word("Frame Averaging", default="OFF")
     averaged = re.fullmatch(r"ON *\(([1-9]\d{0,5})\)", averaging, re.I)
@@ -112,7 +114,8 @@ def _timing(scan: settings.Settings, options: ImportOptions) -> assemble.StoredT
 
 def _white(scan: settings.Settings, frames: np.ndarray, options: ImportOptions) -> float:
     """Returns the counts of air: the option's, else Reference Intensity, else the largest number of Depth (bits). Raises
-    InputError for frames that are not flat-field corrected."""
+    InputError for frames that are not flat-field corrected, unless the option is given, and for frames (F, v, u) much
+    brighter than Reference Intensity."""
     remedy = f"say {options.named('flat_value')}"
     if not options.flat_value and scan.word("Flat Field Correction", default="ON").upper() == "OFF":
         raise scan.error("Flat Field Correction", "OFF", "frames that the scanner has corrected", remedy)

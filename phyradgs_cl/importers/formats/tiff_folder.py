@@ -43,7 +43,7 @@ _SCANNER = ("title", "source", "detector", "volume", "readout", "beam")
 
 
 def recognises(path: Path) -> bool:
-    """True for a .toml file, and for a folder with one."""
+    """Returns whether ``path`` is a .toml file, or a folder with such a file."""
     return bool(SafeFolder(path).matching(".toml")) if path.is_dir() else path.suffix.lower() == ".toml"
 
 
@@ -83,7 +83,8 @@ def import_scan(path: Path, options: ImportOptions) -> Scan:
 
 
 def _tables(path: Path) -> dict[str, Fields]:
-    """Returns the file's own tables by name, and under "" those of a scanner file. Raises InputError for unknown names."""
+    """Returns the file's own tables by name, and under "" all tables of a scanner file. Raises InputError for unknown
+    names."""
     content = read_toml(path)
     for place in (content, content.get("frames")):  # angles = "FILE" is short for [angles] file
         if isinstance(place, dict) and isinstance(place.get("angles"), str):
@@ -96,7 +97,7 @@ def _tables(path: Path) -> dict[str, Fields]:
 
 
 def in_words_of_file(options: ImportOptions) -> ImportOptions:
-    """Returns options whose messages name the TOML's key of a value that was not given as an option."""
+    """Returns the options so that messages name the TOML's key of a value, unless the user gave the value as an option."""
     given = options.given(FIELDS)
     return replace(
         options, named=lambda field: (None if field in given else _KEYS.get(field)) or options.named(field)
@@ -104,7 +105,7 @@ def in_words_of_file(options: ImportOptions) -> ImportOptions:
 
 
 def _with_file(options: ImportOptions, tables: dict[str, Fields]) -> ImportOptions:
-    """Returns the options, completed by values of the file with the same names."""
+    """Returns the options, completed by the values that the file has under the same names."""
     frames = tables["frames"]
     table_of = {**dict.fromkeys(("quantity", "row_0", "column_0"), frames), "rotates": tables["angles"]}
     table_of["detector_model"] = tables["timing"]
@@ -115,7 +116,7 @@ def _with_file(options: ImportOptions, tables: dict[str, Fields]) -> ImportOptio
 
 
 def _in_hdf5(folder: SafeFolder, frames: Fields, options: ImportOptions) -> hdf5.Stacks | None:
-    """Reads the frames where the projections have an address in HDF5, else returns None."""
+    """Reads the frames where the projections have an address in HDF5; returns None where they have not."""
     stated = {name: frames.values[name] for name in (*hdf5.STACKS, "image_key", "axes") if frames.has(name)}
     lists = {name: value if isinstance(value, list) else [value] for name, value in stated.items()}
     if not all(map(hdf5.is_address, lists.get("projections", [None]))):
@@ -124,7 +125,7 @@ def _in_hdf5(folder: SafeFolder, frames: Fields, options: ImportOptions) -> hdf5
 
 
 def _projections(folder: SafeFolder, tables: dict[str, Fields], options: ImportOptions, others: set[Path]) -> Series:
-    """Returns the files of the projections in order, without those that flats, darks and mask name."""
+    """Returns the files of the projections in order, without ``others``, the files of flats, darks and mask."""
     frames, angles = tables["frames"], tables["angles"]
     paths = [path for path in _files(folder, frames, "projections", "*.tif*") if path not in others]
     if not paths:
@@ -158,7 +159,8 @@ def _line_integrals(
 
 
 def _files(folder: SafeFolder, frames: Fields, name: str, default: str = "") -> list[Path]:
-    """Returns the files of the pattern ``name``, or of a list of patterns, in its order; without one, of ``default``."""
+    """Returns the files of the pattern, or list of patterns, that ``frames`` has under ``name``, in its order; else those
+    of ``default``."""
     value = frames.values.get(name) or default
     paths: list[Path] = []
     for one in value if isinstance(value, list) else [value] if value else []:
@@ -174,8 +176,8 @@ def _files(folder: SafeFolder, frames: Fields, name: str, default: str = "") -> 
 
 
 def _scanner(path: Path, scanner: Fields, panel: tuple[int, int], options: ImportOptions) -> Scanner:
-    """Returns the described scanner, with the options' lengths in place of its own. Raises InputError where its panel has
-    other numbers of pixels than the images."""
+    """Returns the described scanner with the options' lengths in place of its own. Raises InputError where its panel's
+    numbers of pixels are not those of the images."""
     content = {name: dict(value) if isinstance(value, dict) else value for name, value in scanner.values.items()}
     source, detector = content.setdefault("source", {}), content.setdefault("detector", {})
     given: dict[str, dict[str, float | None]] = {
@@ -221,8 +223,8 @@ def _stored_timing(tables: dict[str, Fields], scanner: Scanner) -> StoredTiming:
 
 
 def _angles_rad(folder: SafeFolder, angles: Fields, used: np.ndarray, options: ImportOptions) -> np.ndarray:
-    """Returns the angles in rad of the frames that ``used``, bool (F,), marks: from a list, a file, a dataset, or the first
-    with the last or a step. Raises InputError for none or several of these."""
+    """Returns the angles in rad of the frames that ``used``, bool (F,), marks: from a list, a file, a dataset, or the
+    first angle with the last or a step. Raises InputError unless exactly one of these is given."""
     frames = int(used.sum())
     given = [key for key in _ANGLES if angles.has(key)]
     if len(given) != 1:

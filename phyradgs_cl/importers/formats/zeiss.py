@@ -45,20 +45,21 @@ _STEADY = 1e-3  # largest relative difference of a length between images that co
 
 
 class Streams(Fields):
-    """Streams of numbers by their names. They may have room for more images than were taken."""
+    """Streams of numbers of a .txrm file, by name. A stream may have room for more images than were taken."""
 
     def first_of(self, name: str, lowest: float = -LARGEST, highest: float = LARGEST) -> float:
-        """Returns the first number of a stream. Raises InputError for one out of the bounds."""
+        """Returns the first number of a stream. Raises InputError for a number outside of [lowest, highest]."""
         return Fields(self.subject, {name: float(self.leading(name, 1)[0])}).number(name, lowest=lowest, highest=highest)
 
     def leading(self, name: str, count: int) -> np.ndarray:
-        """Returns the first ``count`` numbers (count,) of a stream. Raises InputError for fewer."""
+        """Returns the first ``count`` numbers (count,) of a stream. Raises InputError where it has fewer."""
         if len(values := self.numbers(name)) < count:
             raise self.error(name, f"{len(values)} numbers", f"{count}, one for each image")
         return values[:count]
 
     def steady(self, name: str) -> float:
-        """Returns a length in mm without its sign, one for all images. Raises InputError where it differs or is 0."""
+        """Returns a length in mm without its sign, which all images must share. Raises InputError where it differs or is
+        0."""
         lengths = np.abs(self.numbers(name))
         lengths = lengths[lengths > 0]
         if not len(lengths) or np.ptp(lengths) > _STEADY * lengths[0]:
@@ -67,7 +68,7 @@ class Streams(Fields):
 
 
 def recognises(path: Path) -> bool:
-    """True for a .txrm file."""
+    """Returns whether ``path`` is a .txrm file."""
     return path.is_file() and path.suffix.lower() == ".txrm"
 
 
@@ -104,7 +105,7 @@ def import_scan(path: Path, options: ImportOptions) -> Scan:
 
 
 def _taken(scan: Streams, count: int) -> int:
-    """Returns how many of the ``count`` planned images were taken, with a warning where the scan stopped early."""
+    """Returns how many of the ``count`` planned images were taken. Warns where the scan stopped early."""
     taken = int(scan.first_of(f"{_INFO}/ImagesTaken", 0)) if scan.has(f"{_INFO}/ImagesTaken") else count
     if 0 < taken < count:
         _log.warning("%s: the scan stopped early: %d of %d images were taken", scan.subject, taken, count)
@@ -112,7 +113,8 @@ def _taken(scan: Streams, count: int) -> int:
 
 
 def _type(scan: Streams, name: str, default: float | None = None) -> str:
-    """Returns the NumPy type of an image's pixels, from the stream ``name``, which must be there without a default."""
+    """Returns the NumPy type of an image's pixels from the stream ``name``; ``default``, if given, stands for a missing
+    stream. Raises InputError for other types than 16 bits and float32."""
     number = scan.first_of(name) if default is None or scan.has(name) else default
     if number not in _TYPES:
         raise scan.error(name, f"{number:g}", "5 (16 bits) or 10 (float32)")

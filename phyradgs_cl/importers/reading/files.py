@@ -26,7 +26,8 @@ def check_room(subject: str, needed_bytes: int) -> None:
 
 @contextmanager
 def naming_damage(path: Path, found: str, expected: str, remedy: str = "") -> Iterator[None]:
-    """Turns any exception in the body but MemoryError into InputError, since damaged files make libraries raise any."""
+    """Turns any exception in the body but MemoryError into InputError, because libraries may raise any for a damaged
+    file."""
     try:
         yield
     except (InputError, MemoryError):
@@ -66,8 +67,8 @@ def read_npy(path: Path, ndim: int) -> np.ndarray:
 
 @dataclass(frozen=True)
 class SafeFolder:
-    """A folder that the user named. Its methods accept only names inside it: no absolute path and no "..". A link in it is
-    followed, for the user has put it there. Raises InputError for what is no folder."""
+    """A folder that the user named. Its methods accept only names inside the folder, without an absolute path or "..".
+    They follow links in it, because the user has put them there. Raises InputError for what is no folder."""
 
     root: Path
 
@@ -95,12 +96,13 @@ class SafeFolder:
         return [path for path in paths if is_plain or _is_one_of(path, suffixes)]
 
     def matching(self, *suffixes: str) -> list[Path]:
-        """Returns the files with one of the suffixes in any case, without hidden ones, in natural order of their names."""
+        """Returns the files with one of the suffixes, in upper or lower case, without hidden files, in natural order of
+        their names."""
         return [path for path in _files(self.root) if _is_one_of(path, suffixes)]
 
     def only(self, what: str, *suffixes: str) -> Path:
-        """Returns the only file with one of the suffixes. Raises InputError for none or several. ``what``: its name
-        there."""
+        """Returns the only file with one of the suffixes. Raises InputError for none or several. what: the file's role,
+        for messages."""
         paths = self.matching(*suffixes)
         if len(paths) != 1:
             names = ", ".join(path.name for path in paths[:5]) or "none"
@@ -120,7 +122,8 @@ def _is_one_of(path: Path, suffixes: tuple[str, ...]) -> bool:
 
 
 def checked_name(name: object, subject: str) -> str:
-    """Returns a relative path without "..", with forward slashes. Raises InputError for any other, as of ``subject``."""
+    """Returns ``name``, a relative path without "..", with forward slashes. Raises InputError about ``subject`` for any
+    other."""
     text = name.replace("\\", "/") if isinstance(name, str) else ""
     leads_out = PureWindowsPath(text).drive or text.startswith("/") or ".." in PurePosixPath(text).parts
     if not text.strip() or "\0" in text or leads_out:

@@ -38,8 +38,7 @@ _SAME = 1e-3  # a flat at most this fraction above the saturation level counts a
 @dataclass(frozen=True, eq=False)
 class Light:
     """Flats (G, v, u) at G times, the dark (1, v, u) or None, and each projection's place (P,) among the times: 0.5 is
-    halfway from the first to the second. ``used``: numbers of flats and darks that were used. ``said``: the same, in
-    words."""
+    halfway from the first to the second. used: numbers of flats and darks in use. said: these numbers in words."""
 
     flats: np.ndarray
     dark: np.ndarray | None
@@ -102,7 +101,8 @@ def _times(
 
 
 def _levels(stack: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Returns k pixels (n, k) float64 of each of n frames, with 0 for those that are not finite, and their medians (n,)."""
+    """Returns k pixels (n, k) float64 of each of n frames, with 0 for pixels that are not finite, and their medians
+    (n,)."""
     pixels = stack.reshape(len(stack), -1)
     some = np.nan_to_num(pixels[:, :: -(-pixels.shape[1] // _PIXELS)].astype(np.float64), posinf=0.0, neginf=0.0)
     return some, np.median(some, axis=1)
@@ -112,8 +112,8 @@ def _fitting(
     kind: str, stack: np.ndarray, group: np.ndarray, tolerance: float, subject: str, light: float,
     names: Mapping[str, Sequence[str]],
 ) -> np.ndarray:
-    """Returns which frames, bool (k,), of a group (k,) of indices into ``stack`` fit the others in level and pattern. All do
-    where no majority shows which are right. ``light``: the flats' level in counts. Warns of each that does not fit."""
+    """Returns which frames, bool (k,), of a group (k,) of indices into ``stack`` fit the others in level and pattern. All
+    fit where no majority shows which are right. light: the flats' level in counts. Warns of each that does not fit."""
     some, level = _levels(stack[group])
     usual = float(np.median(level))
     is_odd = np.abs(level - usual) > tolerance * light
@@ -137,8 +137,8 @@ def _fitting(
 
 @dataclass(frozen=True, eq=False)
 class LineIntegrals:
-    """Line integrals (P, v, u) float32 with the mask of unusable pixels, (v, u) or (P, v, u), or None. ``saturation``: of
-    the raw counts, or None. ``applied``: the provenance's entries about flats and darks."""
+    """Line integrals (P, v, u) float32 with the mask of unusable pixels, (v, u) or (P, v, u), or None. saturation: that
+    of the raw counts, or None. applied: the provenance's entries about flats and darks."""
 
     values: np.ndarray
     mask: Mask
@@ -151,10 +151,13 @@ def line_integrals(
     darks: np.ndarray | None = None, convention: str | None = None, is_corrected: bool = False,
     flats_at: np.ndarray | None = None, names: Mapping[str, Sequence[str]] | None = None,
 ) -> LineIntegrals:
-    """Converts ``frames`` (P, v, u) of any real type to line integrals. Masks clipped counts and values that no object has,
-    with a warning. ``subject`` names the file; ``flats``, ``darks``: (n, v, u) or None. The quantity is that of the options,
-    else ``convention``, of the format or file. Without either, frames with flats, or with a flat value, are counts.
-    ``is_corrected``: the scanner has subtracted the darks. ``flats_at``, ``names``: ``at``, ``names`` of ``light_of``.
+    """Returns ``frames`` (P, v, u) of any real type as line integrals. Masks clipped counts and values that no object
+    has, with a warning.
+
+    - subject: names the file. flats, darks: (n, v, u) or None. flats_at, names: ``at``, ``names`` of ``light_of``.
+    - convention: the quantity of the format or file, unless the options state one. Without either, frames with flats, or
+      with a flat value, are counts. is_corrected: the scanner has subtracted the darks.
+
     Raises InputError for an unknown quantity, counts without flats, and flats or darks of another size."""
     has_flats = flats is not None and len(flats) > 0
     quantity = options.quantity or convention or ("counts" if has_flats or options.flat_value is not None else None)
@@ -212,9 +215,10 @@ def _mask_clipped(
     subject: str, frames: np.ndarray, flat: np.ndarray, saturation: Saturation, unusable: np.ndarray, air: str
 ) -> None:
     """Sets ``unusable`` (P, v, u) at each frame's clipped pixels where the flat is brighter: even air would read as an
-    object there. Where the flat is clipped too, the integral is 0, which is right for air. Masking those pixels as well
-    would leave no air, and the reconstruction's error would be 2 to 3 times that of losing thin parts. ``air``: the reason
-    in words."""
+    object there. air: the reason in words.
+
+    Where the flat is clipped too, the integral is 0, which is right for air. Masking those pixels as well would leave no
+    air, and the reconstruction's error would be 2 to 3 times that of losing thin parts."""
     brighter = flat > saturation.level * (1 + _SAME)
     for frame, bad in zip(frames, unusable, strict=True):
         bad |= (frame == saturation.level) & brighter
@@ -225,7 +229,7 @@ def _mask_clipped(
 
 def compact(mask: np.ndarray) -> Mask:
     """Returns a mask (P, v, u), as (v, u) where all frames agree; None without a masked pixel. Raises InputError if all
-    are."""
+    are masked."""
     if mask.all():
         raise InputError("pixels", "no usable value", "frames brighter than the dark", "check flats and darks")
     return None if not mask.any() else mask[0] if all(map(partial(np.array_equal, mask[0]), mask)) else mask

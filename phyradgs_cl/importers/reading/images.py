@@ -58,8 +58,9 @@ def image_times_s(path: Path) -> list[float]:
 
 
 def read_image(path: Path, state: int | None = None) -> Any:
-    """Reads a SimpleITK image of three axes with one real number per voxel; ``state``: the index along a fourth axis.
-    Raises InputError for a damaged file, other axes or voxels, and voxels that are missing or in another folder."""
+    """Reads a SimpleITK image of three axes with one real number per voxel. state: the index along a fourth axis; None
+    for an image without one. Raises InputError for a damaged file, other axes or voxels, and voxels that are missing or
+    in another folder."""
     subject = str(path)
     with _opened(path) as (sitk, reader):
         counts, axes = reader.GetSize(), reader.GetDimension()
@@ -81,8 +82,8 @@ def read_image(path: Path, state: int | None = None) -> Any:
 
 
 def _held_bytes(path: Path, reader: Any, voxel_bytes: int) -> int | None:
-    """Returns how many bytes of voxels a file holds, unpacked. SimpleITK fills missing voxels of NIfTI, and damaged ones of
-    packed MetaImages, without an error. None for NRRD, which it checks itself. Raises InputError for data outside the
+    """Returns how many bytes of voxels a file holds, unpacked: SimpleITK fills missing voxels of NIfTI, and damaged ones
+    of packed MetaImages, without an error. None for NRRD, which SimpleITK checks. Raises InputError for data outside the
     folder or in several files."""
     with _unpacked(path) as file:
         head = file.read(_HEAD_BYTES)

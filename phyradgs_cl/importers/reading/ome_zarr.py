@@ -57,7 +57,7 @@ def read_zarr(path: Path) -> tuple[np.ndarray, np.ndarray | None, np.ndarray | N
 
 
 def _sizes_and_first(facts: Any, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Returns a voxel's sizes and the first one's centre, each (count,), of the full resolution, in the axes' units."""
+    """Returns a voxel's sizes and the first voxel's centre, each (count,), at full resolution, in the axes' units."""
     sizes, first = np.ones(count), np.zeros(count)
     for change in (*facts["datasets"][0]["coordinateTransformations"], *facts.get("coordinateTransformations", ())):
         by = np.asarray(change[change["type"]], np.float64)

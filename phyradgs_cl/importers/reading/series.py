@@ -32,7 +32,8 @@ _MOST_NAMES = 8  # most names of files listed in a message
 
 @dataclass(frozen=True, eq=False)
 class Series:
-    """Files in the order of the scan, their numbers (F,), or None without, and which files were taken, in words."""
+    """Files in the order of the scan; their numbers (F,), None where names have none; and in words, which files were
+    taken."""
 
     paths: list[Path]
     numbers: np.ndarray | None
@@ -41,8 +42,8 @@ class Series:
 
 @dataclass(frozen=True, eq=False)
 class _Column:
-    """The numbers (F,) at one place of the files' names. ``place``: 1 for the first. ``is_angle``: in degrees, by the
-    words next to them."""
+    """The numbers (F,) at one place of the files' names. place: 1 for the first. is_angle: the words beside them say
+    degrees."""
 
     place: int
     values: np.ndarray
@@ -69,7 +70,7 @@ class _Column:
 
     @property
     def regular(self) -> float:
-        """The fraction of steps that differ from the usual one by at most ``_STEADY`` of it."""
+        """The fraction of steps that differ from the usual step by at most ``_STEADY`` of it."""
         return float(np.mean(np.abs(self.steps[1] - 1) <= _STEADY)) if len(self.values) > 1 else 1.0
 
     @property
@@ -159,7 +160,7 @@ def _of_one_series(paths: list[Path], subject: str) -> list[Path]:
 
 
 def _do_alternate(groups: list[list[Path]]) -> bool:
-    """True where the groups' names have equally many numbers, and one of these counts through all groups in turn."""
+    """Returns whether the groups' names have equally many numbers, of which one counts through all groups in turn."""
     if len({len(_words(group[0].stem)) for group in groups}) > 1:
         return False
     owner = [i for i, group in enumerate(groups) for _ in group]

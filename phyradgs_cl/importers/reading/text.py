@@ -44,7 +44,7 @@ def number_at_start(text: str, comma_is_decimal: bool = False) -> tuple[float, s
 
 
 def commas_are_decimal(texts: list[str]) -> bool:
-    """True where some of the texts are numbers with a comma that must be decimal, and none has a decimal point."""
+    """Returns whether some of the texts are numbers with a comma that must be decimal, and none has a decimal point."""
     commas = any(_ONE_COMMA.fullmatch(text) and not _EITHER.fullmatch(text) for text in texts)
     return commas and not any(re.fullmatch(r"[-+]?\d*\.\d+", text) for text in texts)
 
@@ -83,7 +83,8 @@ def _cells(line: str, is_comma: bool) -> list[float] | None:
 
 
 def _is_decimal_comma(path: Path, lines: list[str]) -> bool:
-    """True where commas in a table are decimal, False where they separate columns. Raises InputError if they may be both."""
+    """Returns whether commas in a table are decimal; False where they separate columns. Raises InputError if they may be
+    both."""
     parts = [part for line in lines for part in _COLUMNS.split(line) if "," in part]
     if not all(part.count(",") == 1 and "." not in part for part in parts):
         return False
@@ -100,14 +101,14 @@ def _is_decimal_comma(path: Path, lines: list[str]) -> bool:
 
 
 def _is_index(values: list[float]) -> bool:
-    """True for consecutive numbers from 0 or 1 on, in any order."""
+    """Returns whether the values are consecutive numbers from 0 or 1 on, in any order."""
     first = min(values)
     return len(values) > 1 and first in (0, 1) and sorted(values) == [first + i for i in range(len(values))]
 
 
 def _column(path: Path, names: list[str], table: list[list[float]], count: int, column: int | None) -> np.ndarray:
-    """Returns the angles of a table as stored: its only column or row, the one named so, or the one beside an index. An
-    index gives their order. Raises InputError for several columns."""
+    """Returns the angles of a table as stored: its only column or row, the column named so, or the one beside an index.
+    An index gives their order. Raises InputError for several columns."""
     widths = {len(row) for row in table}
     if widths == {1} or (len(table) == 1 and column is None) or (len(table) < count == sum(map(len, table))):
         return np.array([value for row in table for value in row])
@@ -136,8 +137,8 @@ def file_of_angles(folder: SafeFolder, name: str, *ends: str) -> Path | None:
 
 
 def measured_angles_rad(path: Path, steps_rad: np.ndarray) -> np.ndarray:
-    """Reads measured angles (F,) in rad. Their sign and order differ between files: those are taken that agree best with
-    equal steps (F,). A warning states the largest difference."""
+    """Reads measured angles (F,) in rad. Files differ in sign and order: takes those that agree best with equal steps
+    (F,), and warns of the largest difference."""
     listed_rad = np.unwrap(read_angles_rad(path, len(steps_rad), column=1))
     ways = [steps_rad[0] + way - way[0] for way in (listed_rad, listed_rad[::-1], -listed_rad, -listed_rad[::-1])]
     best = min(ways, key=lambda way: float(np.abs(way - steps_rad).max()))
@@ -154,8 +155,8 @@ class Settings(Fields):
         self.comma_is_decimal = comma_is_decimal
 
     def measured(self, key: str, quantity: Quantity, unit: str) -> float:
-        """Returns a number above 0, converted to the package's unit of ``quantity``. The text states its unit behind it,
-        else it is in ``unit``."""
+        """Returns a number above 0, in the package's unit of ``quantity``. unit: that of a text without a unit behind its
+        number."""
         found = number_at_start(str(self.get(key)), self.comma_is_decimal)
         stated = quantity.factor(found[1]) if found and found[1] else None
         factor = stated or quantity.factor(unit)
@@ -201,7 +202,7 @@ def read_settings(
 
 
 def head_has(path: Path, *marks: bytes, most_bytes: int = 1 << 14) -> bool:
-    """True for a regular file with all the marks in its first ``most_bytes``, in any case."""
+    """Returns whether a regular file has all the marks in its first ``most_bytes``, in upper or lower case."""
     if not path.is_file():
         return False
     with open(path, "rb") as file:

@@ -97,8 +97,8 @@ def stack_shape(paths: list[Path]) -> tuple[int, int, int]:
 
 
 def _header(path: Path) -> tuple[int, tuple[tuple[int, int], np.dtype]]:
-    """Returns the number of images in one file, and their (shape, type). Raises InputError for images that are not grey, are
-    turned, differ, or are missing."""
+    """Returns the number of images in one file, and their (shape, type). Raises InputError for images that are not grey,
+    have an orientation other than the usual, differ, or are missing."""
     images, kinds = 0, []
     with _opened(path) as tiff:
         for page in tiff.pages:  # one of which may be a stack (n, v, u)
@@ -148,10 +148,12 @@ def _opened(path: Path) -> Iterator[Any]:
 
 
 def calibration(path: Path) -> tuple[np.ndarray | None, np.ndarray | None, str]:
-    """Returns the voxel sizes (x, y, z) in mm, the origin's place (x, y, z) in voxels and the text "Info" of a stack. It is
-    ImageJ's, an OME-TIFF, or a BigTIFF of tifffile, which keeps ImageJ's values as JSON. Without valid sizes it returns
-    (None, None, ""), with a warning where the file has a part of them. A missing origin is None. Raises InputError for a
-    stack with several channels or times. Call ``read_tiffs`` first, which checks the file."""
+    """Returns the voxel sizes (x, y, z) in mm, the origin's place (x, y, z) in voxels and the text "Info" of a stack:
+    ImageJ's, an OME-TIFF, or a BigTIFF of tifffile, which keeps ImageJ's values as JSON.
+
+    Without valid sizes it returns (None, None, ""), with a warning where the file has some of them. A missing origin is
+    None. Raises InputError for a stack with several channels or times. Call ``read_tiffs`` first, which checks the
+    file."""
     with _opened(path) as tiff:
         series = tiff.series[0]
         long = {axis: n for axis, n in zip(series.axes, series.shape, strict=False) if axis in _NO_SPACE and n > 1}

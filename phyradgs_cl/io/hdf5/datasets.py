@@ -25,8 +25,8 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Quantity:
-    """A physical quantity. ``factors``: by a unit's name, the factor to the package's unit. ``assumed``: the unit of a
-    dataset without units. ``largest``: limit in the package's unit; larger numbers are damage and would overflow later."""
+    """A physical quantity. factors: from a unit's name to the factor to the package's unit. assumed: the unit of a
+    dataset without units. largest: limit in the package's unit; larger numbers are damage, and would overflow later."""
 
     name: str
     assumed: str
@@ -74,8 +74,8 @@ ATTENUATION = _quantity("attenuation", "1/mm", 1e9, {
 def read_values(
     source: Hdf5Source, address: str, dataset: h5py.Dataset, kinds: str = "iuf", rows: slice | None = None
 ) -> np.ndarray:
-    """Reads a dataset in its own type, or only ``rows`` of a stack (..., v, u). Raises InputError unless the type's
-    ``dtype.kind`` is in ``kinds``, and for damage; OutOfMemoryError for more than this machine can hold."""
+    """Reads a dataset in its own type; rows: reads only these rows of a stack (..., v, u). Raises InputError for damage,
+    and unless the type's ``dtype.kind`` is in ``kinds``; OutOfMemoryError for more than this machine can hold."""
     if dataset.dtype.kind not in kinds:
         expected = "numbers" if "f" in kinds else "whole numbers"
         raise source.error(address, f"type {dataset.dtype}", expected, "store them as plain HDF5 numbers")
@@ -106,8 +106,8 @@ def read_array(
 
 
 def read_per_frame(source: Hdf5Source, address: str, used: np.ndarray, quantity: Quantity) -> np.ndarray:
-    """Reads one finite number for each frame that ``used``, bool (F,), marks, in the package's unit. The dataset has a
-    number for every frame, of which the others are ignored, or only for the used ones."""
+    """Reads one finite number in the package's unit for each frame that ``used``, bool (F,), marks. The dataset has a
+    number for every frame, or for the used frames alone."""
     dataset = source.dataset(address)
     if is_of_all := dataset.shape != (int(used.sum()),):
         checks.shape(source.name(address), dataset, used.shape)
@@ -124,8 +124,8 @@ def _finite(source: Hdf5Source, address: str, values: np.ndarray, quantity: Quan
 def read_number(
     source: Hdf5Source, address: str, quantity: Quantity | None = None, default: float | None = None
 ) -> float:
-    """Reads a finite number from a dataset of one element, in the package's unit of ``quantity``. Without a ``default`` the
-    dataset must be there."""
+    """Reads a finite number from a dataset of one element, in the package's unit of ``quantity``. Raises InputError where
+    the dataset is missing without a ``default``."""
     if default is not None and source.optional(address) is None:
         return default
     dataset = source.dataset(address)
@@ -152,7 +152,8 @@ def read_integers(source: Hdf5Source, address: str, shape: Sequence[int | None])
 def read_word(
     source: Hdf5Source, address: str, allowed: Collection[str] | None = None, default: str | None = None
 ) -> str:
-    """Reads a string, which must be one of ``allowed``, if given. Without a ``default`` the dataset must be there."""
+    """Reads a string, one of ``allowed`` if given. Raises InputError for others, and where the dataset is missing without
+    a ``default``."""
     if default is not None and source.optional(address) is None:
         return default
     dataset, word = source.dataset(address), None
@@ -187,7 +188,7 @@ def read_attribute(source: Hdf5Source, address: str, name: str) -> str | None:
 
 
 def _text(value: object) -> str | None:
-    """Returns the string in a value of h5py (str, bytes or an array of one of them); None for anything else."""
+    """Returns the string in a value of h5py: str, bytes or an array with one of either; None for anything else."""
     if isinstance(value, np.ndarray) and value.size == 1:
         value = value.reshape(-1)[0]
     if isinstance(value, str):
@@ -214,8 +215,8 @@ def in_unit(source: Hdf5Source, address: str, values: np.ndarray, quantity: Quan
 
 
 def read_grid(source: Hdf5Source, address: str) -> Grid:
-    """Reads the voxel grid in the group at ``address``: shape, voxel_size and offset (0 if missing), each (z, y, x). Raises
-    InputError for impossible ones."""
+    """Reads the voxel grid in the group ``address``: shape, voxel_size and offset (0 if missing), each (z, y, x). Raises
+    InputError for impossible values."""
     shape = read_integers(source, f"{address}/shape", (3,)).tolist()
     voxel_size_mm = read_array(source, f"{address}/voxel_size", (3,), LENGTH)
     offset_mm = read_array(source, f"{address}/offset", (3,), LENGTH, default=np.zeros(3))

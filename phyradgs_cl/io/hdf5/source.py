@@ -59,7 +59,7 @@ def open_hdf5(path: str | Path, linked_folder: Path | None = None) -> "Iterator[
 
 @dataclass(frozen=True, eq=False)
 class Hdf5Source:
-    """An open file, the path by which messages name it, and the folders in which linked files may lie."""
+    """An open HDF5 file. path: its name in messages. folders: those in which linked files may lie."""
 
     file: h5py.File
     path: Path
@@ -139,8 +139,8 @@ class Hdf5Source:
         raise self.error(address, "nothing there", f"a dataset {name!r}", remedy)
 
     def misspelling(self, parent: str, name: str) -> str:
-        """Returns the remedy "rename A to B" for a name A in the group ``parent`` that is close to ``name``; "" without
-        one."""
+        """Returns the remedy "rename A to B", for a name A in the group ``parent`` that is close to ``name``, B; ""
+        without such a name."""
         group = self.find(parent)
         others = {n.lower(): n for n in group if n not in _ALIKE} if isinstance(group, h5py.Group) else {}
         close = [others[n] for n in difflib.get_close_matches(name.lower(), others, n=1, cutoff=_CLOSE) if others[n] != name]

@@ -71,7 +71,8 @@ def read_geometry(source: Hdf5Source, entry: str, detector_shape: tuple[int, int
 
 
 def _is_parallel(source: Hdf5Source, entry: str) -> bool:
-    """True for a parallel beam: stated, or, with a warning, in a file of another program without a source distance."""
+    """Returns whether the beam is parallel: as stated or, with a warning, in another program's file without a source
+    distance."""
     beam, distance = f"{entry}/{schema.BEAM}", f"{entry}/{schema.SOURCE}/distance"
     has_distance = source.optional(distance) is not None
     if source.optional(beam) is not None:
@@ -139,7 +140,8 @@ def read_duration(source: Hdf5Source, address: str, used: np.ndarray, needed: bo
 def read_starts(
     source: Hdf5Source, entry: str, used: np.ndarray, shutter: Shutter, moving: bool
 ) -> np.ndarray:
-    """Reads the opening times (P,) in s of the projections; evenly spaced where nothing moves and none are stored."""
+    """Reads the opening times (P,) in s of the projections; returns evenly spaced times where nothing moves and none are
+    stored."""
     address = f"{entry}/{schema.DETECTOR}/frame_start_time"
     if not moving and source.optional(address) is None:
         return np.arange(int(used.sum())) * max(shutter.span_s, 1.0)

@@ -28,9 +28,10 @@ _DEEPEST_ENTRY = 3  # levels of groups searched below the root for NXtomo's defi
 
 @dataclass(frozen=True, eq=False)
 class ScanHeader:
-    """A checked scan without its arrays: ``scan.projections`` are zeros that take no memory. ``entry``: address of the
-    NXtomo group. ``image_key`` (F,): of all stored frames. ``mask_shape``: None without a mask. ``states``: the number of
-    true states. ``has_grid``: the file states the grid."""
+    """A checked scan without its arrays: ``scan.projections`` are zeros that take no memory.
+
+    entry: address of the NXtomo group. image_key (F,): of all stored frames. mask_shape: None without a mask. states: the
+    number of true states. has_grid: the file states the grid."""
 
     scan: Scan
     entry: str
@@ -84,9 +85,9 @@ def read_header(source: Hdf5Source) -> ScanHeader:
 
 
 def find_entry(source: Hdf5Source, asked: str | None = None) -> str:
-    """Returns the address of the NXtomo entry: ``asked``, else the only group with that definition, at most 3 levels deep.
-    Of several it takes the root's @default, with a warning. Without one it takes the root's @default, /entry, or the only
-    NXentry. Raises InputError for none, and for several without a default."""
+    """Returns the address of the NXtomo entry: ``asked``, else the only group with that definition, at most 3 levels
+    deep. Of several groups it takes the root's @default, with a warning. Without such a group it takes the root's
+    @default, /entry, or the only NXentry. Raises InputError where no entry is left, and for several without a default."""
     if asked is not None:
         address = f"/{asked.strip('/')}"
         source.group(address)

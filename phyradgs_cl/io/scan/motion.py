@@ -25,7 +25,8 @@ _SUSPECT_RAD = math.radians(5.0)  # largest difference between table and rotatio
 
 
 def has_motion(source: Hdf5Source, entry: str) -> bool:
-    """True where the file states how the gantry moved in an exposure, by end angles, an encoder table or a pose table."""
+    """Returns whether the file states how the gantry moved in an exposure, by end angles, an encoder table or a pose
+    table."""
     end = source.optional(f"{entry}/{schema.SAMPLE}/rotation_angle_end")
     groups = (schema.KINEMATICS, schema.POSES)
     found = [source.optional_group(f"{entry}/{group}") for group in groups]
@@ -58,7 +59,8 @@ def read_trajectory(
 
 
 def read_angles(source: Hdf5Source, entry: str, name: str, used: np.ndarray) -> np.ndarray:
-    """Reads gantry angles (P,) in rad of the used frames from ``name``: rotation_angle or rotation_angle_end."""
+    """Reads gantry angles (P,) in rad of the frames that ``used``, bool (F,), marks, from ``name``: rotation_angle or
+    rotation_angle_end."""
     address = f"{entry}/{schema.SAMPLE}/{name}"
     angle_rad = h5.read_array(source, address, used.shape, h5.ANGLE)[used]
     # unless it states its own, the end angle has the start angle's sense: gantry or sample
@@ -67,8 +69,8 @@ def read_angles(source: Hdf5Source, entry: str, name: str, used: np.ndarray) -> 
 
 
 def storable(scan: Scan) -> Scan:
-    """Returns the scan with a trajectory that files can hold. A user-defined trajectory becomes a pose table that is exact
-    to a ten-thousandth of a pixel. Raises InputError where no table is."""
+    """Returns the scan with a trajectory that files can hold. A user-defined trajectory becomes a pose table that is
+    exact to a ten-thousandth of a pixel. Raises InputError where no table is that exact."""
     path = scan.trajectory
     if isinstance(path, PoseTable) or (isinstance(path, CircularOrbit) and isinstance(path.kinematics, _KINEMATICS)):
         return scan
@@ -155,7 +157,8 @@ def _sense(source: Hdf5Source, address: str, absent: float) -> float:
 
 
 def _warn_if_apart(source: Hdf5Source, address: str, table_rad: np.ndarray, first_rad: np.ndarray) -> None:
-    """Warns of table angles more than 5° from rotation_angle, as of a wrong sense of rotation. The table is used."""
+    """Warns of table angles more than 5° from rotation_angle, as after a wrong sense of rotation. The table's angles are
+    used all the same."""
     apart_rad = np.abs((table_rad - first_rad + np.pi) % (2 * np.pi) - np.pi)
     if apart_rad.max() > _SUSPECT_RAD:
         text = "%s: up to %.3g° from rotation_angle; the table is used"
@@ -163,8 +166,9 @@ def _warn_if_apart(source: Hdf5Source, address: str, table_rad: np.ndarray, firs
 
 
 def read_gating(source: Hdf5Source, entry: str, used: np.ndarray, middle_s: np.ndarray) -> Gating | None:
-    """Returns the gating signal or phase of the projections, whose windows are centred at ``middle_s`` (P,); None without.
-    used, bool (F,): the stored frames that are projections. Raises InputError for both, and for equal times."""
+    """Returns the gating signal or phase of the projections, whose windows are centred at ``middle_s`` (P,); None where
+    the file has neither. used, bool (F,): the stored frames that are projections. Raises InputError for signal and phase
+    together, and for equal times."""
     if source.optional_group(f"{entry}/{schema.GATING}") is None:
         return None
     signal, phase = f"{entry}/{schema.SIGNAL}", f"{entry}/{schema.PHASE}"

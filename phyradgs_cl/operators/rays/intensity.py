@@ -24,10 +24,12 @@ _HOST = HostSpace()
 
 
 class IntensityOperator:
-    """Computes I(x), and J and Jᵀ at the last volume given to ``expected``; before the first they are A and Aᵀ.
+    """Computes frames I(x), and the derivative J and Jᵀ at the last volume given to ``expected``. Without one, J is A:
+    that of x = 0.
 
-    Arguments are those of ``RayOperator``, as is the rule for NumPy and device arrays. The operator stores one stack of
-    frames (F, rows, columns) of softmax weights for each cell of a line. ``projector`` makes the A_k."""
+    Arguments and arrays are those of ``RayOperator``. The cells of a frame are split into layers with at most one cell
+    per line; the operator keeps one stack of softmax weights (F, rows, columns) per layer. projector: makes the operator
+    A_k of a layer."""
 
     def __init__(
         self, rt: Runtime, grid: Grid, detector_shape: tuple[int, int], tables: Sequence[TimeCells],
@@ -48,14 +50,14 @@ class IntensityOperator:
 
     @property
     def memory(self) -> RayMemory:
-        """The memory that the projectors of all layers share."""
+        """The buffers that the projectors of all layers share."""
         memory: RayMemory = self._operators[0].memory
         return memory
 
     @property
     def holds(self) -> tuple[int, int]:
-        """Numbers of volumes and of stacks of frames on the device besides ``memory``: integrals and weights of each
-        layer."""
+        """Numbers of volumes and of stacks of frames on the device besides ``memory``: each layer's line integrals and
+        weights."""
         return 2, 2 * len(self._operators) + 3
 
     def expected(self, volume: SameArray, out: SameArray | None = None) -> SameArray:
@@ -95,7 +97,8 @@ class IntensityOperator:
         return same
 
     def subset(self, frames: Sequence[int]) -> "IntensityOperator":
-        """Returns the operator for some of the frames, in this order. J of the subset has its own volume."""
+        """Returns the operator for some of the frames, in the order given. Its J is that of x = 0 until its own
+        ``expected``."""
         chosen = list(frames)
         part = copy(self)
         part.frames_shape = (len(chosen), *self.frames_shape[1:])
@@ -124,6 +127,7 @@ class IntensityOperator:
         return out
 
     def _shares_for(self, like: Array) -> list[Any]:
+        """Returns the softmax weights of each layer where ``like`` lies: device or host."""
         is_there = isinstance(like, DeviceArray)
         # they lie on the other side: host or device
         if self._shares and isinstance(self._shares[0], DeviceArray) != is_there:
@@ -137,7 +141,8 @@ class IntensityOperator:
         return self._shares or self._weights
 
     def _device_average(self, p: list[DeviceArray]) -> tuple[DeviceArray, list[DeviceArray]]:
-        """Computes ``intensity_average`` on the device. The shares overwrite p."""
+        """Returns frames (F, rows, columns) and the softmax weights of each layer, as ``intensity_average`` does on the
+        host. The weights overwrite the line integrals p."""
         least, total = self._device.full(self.frames_shape, np.inf), self._device.full(self.frames_shape, 0.0)
         for q, weights in zip(p, self._uploaded(), strict=True):
             self._launch("layer_least", q, weights, least)
@@ -150,7 +155,7 @@ class IntensityOperator:
         return least, [self._device.multiply(q, total) for q in p]
 
     def _launch(self, name: str, *arrays: DeviceArray) -> None:
-        """Launches a kernel over all pixels of the frames."""
+        """Launches a kernel of cl/cell_layers.cl over all pixels of the frames."""
         frames, rows, columns = self.frames_shape
         rt = self._device.rt
         sides = (np.int32(n) for n in (rows, columns, self._by_row))

@@ -23,11 +23,11 @@ _WIDEST = 16  # number of elements of the widest vector, which may reach beyond 
 
 @dataclass(frozen=True)
 class RayLayout:
-    """Layout of volumes (z, y, x) and of stacks of frames with ``lines`` × ``width`` pixels in device memory.
+    """Layout of volumes (nz, ny, nx) and of stacks of frames with ``lines`` × ``width`` pixels in device memory.
 
-    ``brick`` selects the voxels of the grid that the volume holds. It has a border of zeros, so that the frames of all
-    bricks add up to the frames of the grid. With ``subrays`` (along v, along u) lines and width count rays. ``axis``:
-    whether lines are rows or columns of the detector; ``is_across``: lines are rows although the readout goes along
+    ``brick``: the voxels of the grid that the volume holds, inside a border of zeros, so that the frames of all bricks
+    add up to the frames of the grid. ``subrays``: rays of a pixel along (v, u); lines and width count rays. ``axis``:
+    whether lines are rows or columns of the detector. ``is_across``: lines are rows although the readout goes along
     columns."""
 
     grid: Grid
@@ -42,9 +42,11 @@ class RayLayout:
     def of_scan(
         cls, rt: Runtime, grid: Grid, detector_shape: tuple[int, int], axis: str, subrays: tuple[int, int] = (1, 1)
     ) -> "RayLayout":
-        """Returns the layout of the complete grid, with the readout's lines as rows of the frames. On CPUs a panel with
-        fewer rows than a vector has lanes keeps its rows as lines, also where columns are read: vectors along columns would
-        be mostly empty."""
+        """Returns the layout of the complete grid, with the readout's lines as rows of the frames.
+
+        detector_shape: (rows, columns). axis: the readout's. A CPU's vectors run along rows of the frames, which a panel
+        with fewer rows than lanes would leave mostly empty: where such a panel is read along columns, its rows stay the
+        lines."""
         (rows, columns), (along_v, along_u) = detector_shape, subrays
         shape = rows * along_v, columns * along_u
         is_across = axis == "columns" and not rt.pixel_items and shape[0] < rt.lanes
@@ -64,7 +66,7 @@ class RayLayout:
         return 2 * GUARD + count * self.lines * pitch_of(self.width)
 
     def turned_floats(self, count: int) -> int:
-        """Returns the floats of ``count`` padded, transposed frames, whose columns are the lines."""
+        """Returns the floats of ``count`` padded frames stored transposed (F, width, lines)."""
         return 2 * GUARD + count * self.width * pitch_of(self.lines)
 
     def frames_shape(self, count: int) -> tuple[int, int, int]:
@@ -72,36 +74,36 @@ class RayLayout:
 
     @property
     def volume_strides(self) -> Strides:
-        """Strides of a padded volume."""
+        """Strides in floats of the padded volume, from its first voxel inside the border."""
         _, ny, nx = self.brick.shape
         row, slice_ = pitch_of(nx), pitch_of(nx) * (ny + 2 * BORDER)
         return Strides(GUARD + BORDER * (slice_ + row), slice_, row)
 
     @property
     def frames_strides(self) -> Strides:
-        """Strides of padded frames."""
+        """Strides in floats of a stack of frames (F, lines, width) whose rows are padded to their pitch."""
         row = pitch_of(self.width)
         return Strides(GUARD, self.lines * row, row)
 
     @property
     def turned_strides(self) -> Strides:
-        """Strides of padded frames whose lines are columns."""
+        """Strides in floats of a stack of transposed frames (F, width, lines) whose rows are padded to their pitch."""
         row = pitch_of(self.lines)
         return Strides(GUARD, self.width * row, row)
 
     def pixel_strides(self, axis: str, *, turned: bool = False) -> tuple[int, int, int, int]:
-        """Returns the start of padded frames, and the floats from column to column, row to row, frame to frame. ``turned``:
-        of transposed frames, whose columns are the lines."""
+        """Returns, in floats, the start of padded frames and the steps from column to column, row to row and frame to
+        frame of the detector. axis: the readout's. turned: the frames are stored transposed, (F, width, lines)."""
         strides = self.turned_strides if turned else self.frames_strides
         steps = (1, strides.row) if (axis == "rows") != turned else (strides.row, 1)
         return (strides.start, *steps, strides.slice)
 
     def column_floats(self, axis: str) -> int:
-        """Returns the floats of a padded frame whose rows are detector columns."""
+        """Returns the floats of one padded frame stored by detector columns, for a readout along ``axis``."""
         return self.width * pitch_of(self.lines) if axis == "rows" else self.lines * pitch_of(self.width)
 
     def inside(self, flat: np.ndarray) -> np.ndarray:
-        """Returns the volume (z, y, x) as a view of its padded floats."""
+        """Returns the volume (nz, ny, nx) as a view into its padded floats, without the border."""
         nz, ny, nx = self.brick.shape
         padded = flat[GUARD:-GUARD].reshape(nz + 2 * BORDER, ny + 2 * BORDER, pitch_of(nx))
         return padded[BORDER:-BORDER, BORDER:-BORDER, :nx]
@@ -124,7 +126,7 @@ class RayLayout:
 
 @dataclass(frozen=True, eq=False)
 class RayCells:
-    """The time cells of many frames on the device, frame after frame; cl/rays.cl describes the arrays."""
+    """The time cells of many frames on the device, frame after frame, in the arrays that cl/rays.cl describes."""
 
     cells: DeviceArray
     cell_lines: DeviceArray
@@ -142,8 +144,8 @@ class RayCells:
     def upload(
         cls, rt: Runtime, grid: Grid, tables: Sequence[TimeCells], rows_across: int | None = None
     ) -> "RayCells":
-        """Uploads the tables of all frames. rows_across: the number of the panel's rows, where these are the kernels' lines
-        although columns are read."""
+        """Uploads the tables of all frames. rows_across: the panel's number of rows where they are the kernels' lines
+        although columns are read (``RayLayout.is_across``), else None."""
         starts = np.concatenate([[0], np.cumsum([table.count for table in tables])])
         pose = np.concatenate([table.readout.poses(table.pose) for table in tables])
         weights = [table.weights_of(cell) for table in tables for cell in range(table.count)]
@@ -177,7 +179,8 @@ def _starts_of(parts: Sequence[np.ndarray]) -> np.ndarray:
 
 
 def matrix_table(pose: np.ndarray, grid: Grid, is_parallel: bool = False) -> tuple[np.ndarray, int]:
-    """Returns ``voxel_matrices`` of poses (C, 12) as (12, stride), and the stride. Vectors may read past C."""
+    """Returns ``voxel_matrices`` of poses (C, 12) transposed to (12, stride), and the stride: more than C, because
+    vectors read past the last pose."""
     stride = len(pose) + _WIDEST
     matrices = np.zeros((12, stride))
     matrices[:, : len(pose)] = voxel_matrices(pose, grid, is_parallel).T
@@ -185,7 +188,7 @@ def matrix_table(pose: np.ndarray, grid: Grid, is_parallel: bool = False) -> tup
 
 
 def ray_constants(pose: np.ndarray, grid: Grid, is_parallel: bool = False) -> np.ndarray:
-    """Converts poses (C, 12) to voxel indices: the (C, 16) float32 table of cl/common/ray.h."""
+    """Returns poses (C, 12) in voxel indices: the (C, 16) float32 table of cl/common/ray.h."""
     if is_parallel:
         return _parallel_constants(pose, grid)
     first = np.array(grid.first_centre_mm[::-1])
@@ -199,8 +202,8 @@ def ray_constants(pose: np.ndarray, grid: Grid, is_parallel: bool = False) -> np
 
 
 def _parallel_constants(pose: np.ndarray, grid: Grid) -> np.ndarray:
-    """``ray_constants`` for parallel beams: the direction over its main component, and where rays cut plane 0 of the main
-    axis."""
+    """Returns ``ray_constants`` for parallel beams: the ray's direction over its main component, and where rays cut plane
+    0 of the main axis."""
     first = np.array(grid.first_centre_mm[::-1])
     pitch = np.array(grid.voxel_size_mm[::-1])
     direction, panel = pose[:, 0:3] / pitch, pose[:, 3:].reshape(-1, 3, 3) / pitch
@@ -233,7 +236,8 @@ def layers(table: TimeCells) -> list[TimeCells]:
 
 
 def layered(tables: Sequence[TimeCells]) -> tuple[list[list[TimeCells]], list[np.ndarray]]:
-    """Splits the cells of F frames: the tables of each layer with weights of 1, and the original weights.
+    """Splits the cells of F frames into layers. Returns each layer's tables, with weights of 1, and each layer's original
+    weights.
 
     Weights are float32, (F, lines, 1) or (F, 1, lines) by the readout's axis; 0 where a layer has no cell for a line."""
     split = [layers(table) for table in tables]
@@ -247,13 +251,13 @@ def layered(tables: Sequence[TimeCells]) -> tuple[list[list[TimeCells]], list[np
 
 
 def some_cells(table: TimeCells, cells: Sequence[int] | np.ndarray) -> TimeCells:
-    """Returns the table of the cells with these numbers. The cells must have fixed poses, without ends of a motion."""
+    """Returns the table of the cells with the numbers ``cells``. They must have fixed poses, without ends of a motion."""
     names = ["pose", "time_s", "line_start", "line_stop", "weight"]
     names += [] if table.line_share is None else ["line_share"]
     return replace(table, **{name: getattr(table, name)[cells] for name in names})
 
 
 def _empty(table: TimeCells) -> TimeCells:
-    """Returns a table with one cell that serves no line: a table must not be empty."""
+    """Returns the table with one cell that serves no line, because a table must not be empty."""
     one = some_cells(table, [0])
     return replace(one, line_stop=one.line_start.copy(), weight=np.zeros(1))

@@ -23,9 +23,9 @@ _MOST_SLOT_FLOATS = 2**26  # most floats of all slots at a time: more is not fas
 class RayMemory:
     """Buffers for a volume and for frames of ``layout``, planned at their first use.
 
-    A volume that does not fit is cut into bricks, as large as fit together with some frames. ``slot_floats`` is the size of
-    the slots of one frame (``slots.py``), 0 without slots. With slots the volume is also stored transposed, with z along
-    rows, if both fit. Several operators may share one memory, one at a time: each call writes the buffers that it reads."""
+    A volume that does not fit is cut into bricks, as large as fit together with some frames. slot_floats: floats of one
+    frame's slots (``slots.py``), 0 without slots. With slots the volume is also stored transposed, with z along rows, if
+    both fit. Several operators may share one memory, one at a time: each call writes the buffers that it reads."""
 
     def __init__(self, rt: Runtime, layout: RayLayout, most_frames: int, slot_floats: int = 0) -> None:
         self.rt, self.layout, self.most_frames = rt, layout, most_frames
@@ -42,8 +42,8 @@ class RayMemory:
         self._padded: dict[tuple[int, int, int], np.ndarray] = {}
 
     def plan(self, share: float = 1.0) -> list[Brick]:
-        """Returns the bricks. A share below 1 plans again, with that share of the free memory. Raises OutOfMemoryError where
-        none fits."""
+        """Returns the bricks of the volume. ``share`` below 1 plans again, with that fraction of the free memory. Raises
+        OutOfMemoryError where no brick fits."""
         if not self._bricks or share < 1:
             self.release()
             self._bricks, self._batch = self._planned(share)
@@ -101,7 +101,7 @@ class RayMemory:
             yield slice(start, min(start + self._batch, count))
 
     def holds_all(self, frames: int) -> bool:
-        """Returns whether the complete volume and so many frames fit together; if they do, allocates the memory."""
+        """Returns whether the complete volume and ``frames`` frames fit together; allocates their buffers if they do."""
         if len(self.plan()) > 1 or self._batch < frames:
             return False
         self.volume(self._bricks[0])
@@ -113,7 +113,7 @@ class RayMemory:
         return True
 
     def volume(self, brick: Brick) -> tuple[RayLayout, DeviceArray]:
-        """Returns memory for a brick, with undefined content."""
+        """Returns the layout of a brick, and memory for it with undefined content."""
         if self._volume is None:
             largest = self._bricks[0]
             self._volume = self.rt.zeros(self.layout.of(largest).volume_floats)
@@ -124,9 +124,9 @@ class RayMemory:
         return layout, DeviceArray(self._volume.buffer, (layout.volume_floats,), self._volume.dtype)
 
     def write_volume(self, volume: Array, brick: Brick) -> tuple[RayLayout, DeviceArray]:
-        """Copies a brick of a volume (z, y, x) to the device, into the padded layout.
+        """Copies a brick of a volume (nz, ny, nx) to the device. Returns its layout and the padded copy.
 
-        The padded host array is kept for the next call: new pages cost more than the copy."""
+        The padded host array is kept for the next call, because new pages cost more than the copy."""
         layout, on_device = self.volume(brick)
         if isinstance(volume, DeviceArray):
             if self._bordered != brick.shape:
@@ -144,7 +144,7 @@ class RayMemory:
         return layout, on_device
 
     def read_volume(self, layout: RayLayout, on_device: DeviceArray, result: Array) -> None:
-        """Copies a padded brick to its place in a volume (z, y, x)."""
+        """Copies a padded brick from the device to its place in the volume ``result`` (nz, ny, nx)."""
         brick = layout.brick
         if isinstance(result, DeviceArray):
             plain = Strides.plain(result.shape, brick.start)
@@ -154,11 +154,11 @@ class RayMemory:
 
     @property
     def has_columns(self) -> bool:
-        """Whether the transposed volume, with z along rows, fits as well; known after ``plan``."""
+        """Whether the transposed volume, with z along rows, fits besides the volume; known after ``plan``."""
         return self._columns_bytes > 0
 
     def turned(self, volume: Array) -> DeviceArray:
-        """Returns a complete volume (z, y, x) transposed to (y, x, z), padded."""
+        """Returns the complete volume (nz, ny, nx) on the device, padded and transposed to (y, x, z)."""
         if self._columns is None:
             self._columns = self.rt.zeros(self._columns_bytes // 4)
         if isinstance(volume, DeviceArray):
@@ -188,13 +188,13 @@ class RayMemory:
         return DeviceArray(self._frames.buffer, (floats,), self._frames.dtype)
 
     def _frames_floats(self, count: int) -> int:
-        """Returns the floats of ``count`` frames, stored by rows or, with slots, by columns: the larger of both."""
+        """Returns the floats of a buffer for ``count`` frames, which holds them by rows or, with slots, by columns."""
         turned = self.layout.turned_floats(count) if self.slot_floats else 0
         return max(self.layout.frames_floats(count), turned)
 
     def write_frames(self, frames: Array, part: slice, axis: str, *, turned: bool = False) -> DeviceArray:
-        """Copies the frames ``part`` of (F, rows, columns) to the device, padded. Lines along ``axis`` become rows, or
-        columns where ``turned``."""
+        """Copies the frames ``part`` of (F, rows, columns) to the device, padded. Lines along ``axis`` become rows of the
+        copy, or its columns where ``turned``."""
         count, layout = part.stop - part.start, self.layout
         on_device = self._some_frames(layout.turned_floats(count)) if turned else self.frames(count)
         if layout.subrays != SINGLE and isinstance(frames, DeviceArray):

@@ -28,7 +28,8 @@ from phyradgs_cl.runtime.layout import Strides
 
 
 class LinearOperator(Protocol):
-    """The interface that iterative methods need: A, Aᵀ, and A restricted to some frames."""
+    """The interface that iterative methods need: A, Aᵀ, and A restricted to some frames. ``out`` receives a result if
+    given."""
 
     @property
     def volume_shape(self) -> tuple[int, ...]: ...
@@ -37,27 +38,28 @@ class LinearOperator(Protocol):
     def frames_shape(self) -> tuple[int, int, int]: ...
 
     def forward(self, volume: Any, out: Any = None) -> Any:
-        """Returns A x, frames (F, rows, columns) float32, of a volume (nz, ny, nx) in 1/mm. ``out`` receives it if given."""
+        """Returns A x, frames (F, rows, columns) float32, of a volume x (nz, ny, nx) in 1/mm."""
         ...
 
     def adjoint(self, frames: Any, out: Any = None) -> Any:
-        """Returns Aᵀ y, a volume (nz, ny, nx) float32, of frames (F, rows, columns). ``out`` receives it if given."""
+        """Returns Aᵀ y, a volume (nz, ny, nx) float32, of frames y (F, rows, columns)."""
         ...
 
     def subset(self, frames: Sequence[int]) -> "LinearOperator":
-        """Returns the operator for these frames, in this order."""
+        """Returns the operator for the frames with the numbers ``frames``, in the order given."""
         ...
 
 
 class RayOperator:
-    """Joseph's projector and its matched adjoint over the cells of many frames; a ``LinearOperator``.
+    """Projects volumes with Joseph's method over the time cells of many frames, and backprojects with its transpose; a
+    ``LinearOperator``.
 
-    NumPy arrays give NumPy arrays. Device arrays (plain, float32) give device arrays. ``out``, an array of the same kind,
-    receives the result. detector_shape is (rows, columns); ``tables`` has the time cells of each frame, all read out along
-    one axis. An operator shares its tables and buffers with its subsets, and with operators that were given the same
+    NumPy arrays give NumPy arrays; device arrays (plain, float32) give device arrays. ``out``, an array of the same kind,
+    receives the result. detector_shape: (rows, columns). tables: the time cells of each frame, all read out along one
+    axis. An operator shares its tables and buffers with its subsets, and with operators that were given the same
     ``memory``: use them one at a time. A volume that does not fit is projected in bricks. fewest_lines: as in
     ``upright_of``; ``FEWEST_LINES`` is fastest for panels of few lines, and rounds differently. subrays: rays of a pixel
-    (along v, along u), see ``subrays_of``; a given ``memory`` has its own.
+    along (v, u), see ``subrays_of``; a given ``memory`` brings its own.
 
     Joseph, IEEE Trans. Med. Imaging 1 (1982) 192. Raises InputError for tables that do not fit the detector."""
 
@@ -93,7 +95,7 @@ class RayOperator:
 
     @property
     def tables(self) -> list[TimeCells]:
-        """The time cells of each frame."""
+        """The time cells of each frame of this operator."""
         return [self._tables[f] for f in self._chosen]
 
     def forward(self, volume: SameArray, out: SameArray | None = None) -> SameArray:
@@ -141,7 +143,7 @@ class RayOperator:
             merge_slots(self.rt, self._cells, slots, there, target, self._rays_shape, self._axis)
 
     def _slots_of(self, part: slice) -> Iterator[tuple[int, Slots]]:
-        """Yields the slots of as many frames at a time as fit into memory, and the number of their first frame within
+        """Yields the slots of as many frames at a time as fit into memory, after the number of their first frame within
         ``part``."""
         assert self._upright is not None and self._poses is not None
         for first in range(part.start, part.stop, self.memory.slot_frames):
@@ -185,8 +187,8 @@ class RayOperator:
     def _adjoint_upright(
         self, layout: RayLayout, part: slice, frames: DeviceArray, target: tuple[DeviceArray, Strides], add: bool
     ) -> None:
-        """Adds the backprojection of some frames, stored column by column, to a volume with these strides; replaces it
-        without ``add``."""
+        """Backprojects the frames ``part``, stored column by column, into a volume with the strides of ``target``. add:
+        adds to that volume, else replaces it."""
         assert self._upright is not None and self._poses is not None
         there, pitch_mm = self.memory.slots(), layout.constants()[3]
         each = layout.column_floats(self._axis)
@@ -198,8 +200,8 @@ class RayOperator:
             )
 
     def subset(self, frames: Sequence[int]) -> "RayOperator":
-        """Returns the operator for some of the frames, in this order. Keep it to use it again: it keeps its tables. Raises
-        InputError for no frames."""
+        """Returns the operator for the frames with the numbers ``frames``, in the order given. Keep it to use it again,
+        because it uploads tables. Raises InputError for no frames."""
         chosen = self._chosen[np.asarray(frames, np.int64)]
         if chosen.size == 0:
             raise InputError("subset", "no frames", "at least one frame")
@@ -214,7 +216,7 @@ class RayOperator:
         self._slots: dict[tuple[int, int], Slots] = {}
 
     def _listed(self, part: slice) -> DeviceArray:
-        """Returns the indices of some of the operator's frames, on the device."""
+        """Returns the indices, among the frames of the whole scan, of this operator's frames ``part``, on the device."""
         key = part.start, part.stop
         if key not in self._lists:
             self._lists[key] = self.rt.upload(self._chosen[part], np.int32)

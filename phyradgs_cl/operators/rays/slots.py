@@ -20,10 +20,10 @@ _SAME_POSE = 10  # poses that agree to this many decimals, divided by the larges
 
 @dataclass(frozen=True, eq=False)
 class UprightPoses:
-    """The distinct poses of many frames on the device, and the pose of each cell.
+    """The distinct poses of F frames on the device, and the pose of each of their E cells, frame after frame.
 
-    For all E cells, frame after frame: the number of the pose, pose_of (E,), and the lines [first, stop), (E,) each. Cells
-    of frame f begin at frame_cells[f]; frame_cells (F + 1,)."""
+    pose_of (E,): number of a cell's pose; first, stop (E,): its lines [first, stop). frame_cells (F + 1,): cells of frame
+    f begin at frame_cells[f]."""
 
     cells: DeviceArray
     matrices: DeviceArray
@@ -56,7 +56,7 @@ class UprightPoses:
         )
 
     def floats_per_frame(self, detector_shape: tuple[int, int], leans: bool) -> int:
-        """Returns the most floats that the slots of a frame need: values and, where columns lean, slopes."""
+        """Returns the most floats that the slots of one frame need: line integrals and, where columns lean, slopes."""
         rows, columns = detector_shape
         widest = int((self.stop - self.first).max())
         each = columns * pitch_of(widest) if self.axis == "rows" else widest * pitch_of(rows)
@@ -66,7 +66,7 @@ class UprightPoses:
         self, rt: Runtime, frames: np.ndarray, detector_shape: tuple[int, int], leans: bool, most_floats: int
     ) -> "Slots":
         """Returns the slots of the frames with these numbers, in the order of their first use, in at most ``most_floats``
-        floats. This limit must be at least ``floats_per_frame`` for each of the frames."""
+        floats. ``most_floats`` must be at least ``floats_per_frame``."""
         cells = np.concatenate([np.arange(self.frame_cells[f], self.frame_cells[f + 1]) for f in frames])
         of_frame = np.repeat(np.arange(len(frames)), np.diff(self.frame_cells)[frames])
         _, appears, slot = np.unique(self.pose_of[cells], return_index=True, return_inverse=True)
@@ -98,8 +98,8 @@ class UprightPoses:
     def _table(
         self, cells: np.ndarray, appears: np.ndarray, slot: np.ndarray, detector_shape: tuple[int, int]
     ) -> np.ndarray:
-        """Returns the table (S, 8) int32 of slots. appears (S,): the first cell of each slot; slot (E,): the slot of each
-        cell."""
+        """Returns the table (S, 8) int32 of S slots. appears (S,): index in ``cells`` of each slot's first cell; slot
+        (E,): the slot of each cell."""
         first, stop = np.full(len(appears), 2**31 - 1), np.zeros(len(appears), np.int64)
         np.minimum.at(first, slot, self.first[cells])
         np.maximum.at(stop, slot, self.stop[cells])
@@ -111,8 +111,8 @@ class UprightPoses:
         return table
 
     def _shares(self, cells: np.ndarray, of: np.ndarray) -> np.ndarray:
-        """Returns the shares (E, 4): slot or frame, lines [first, stop), and the index of the first weight in
-        ``RayCells``."""
+        """Returns a row (E, 4) per cell: its slot or frame ``of``, its lines [first, stop), and the index of its first
+        weight in ``RayCells``."""
         begins = np.concatenate([[0], np.cumsum(self.stop - self.first)])
         return np.stack([of, self.first[cells], self.stop[cells], begins[cells]], -1)
 
@@ -129,8 +129,8 @@ def _rows_of(table: np.ndarray) -> int:
 
 @dataclass(frozen=True, eq=False)
 class Slots:
-    """Slots of some frames on the device, in the arrays of cl/rays_slots.cl. ``columns`` and ``rows``: sizes of the largest
-    slot."""
+    """Slots of some frames on the device, in the arrays of cl/rays_slots.cl. columns, rows: size of the largest slot in
+    pixels."""
 
     slots: DeviceArray
     frame_shares: DeviceArray
@@ -147,12 +147,12 @@ class Slots:
 
     @property
     def pitch(self) -> int:
-        """Floats from one column of a slot to the next."""
+        """Floats from one detector column of a slot to the next."""
         return pitch_of(self.rows)
 
     @property
     def floats(self) -> int:
-        """Floats of all slots with one value per pixel."""
+        """Floats of all slots, with one line integral per pixel."""
         return self.count * self.columns * self.pitch
 
     @property
@@ -169,8 +169,8 @@ def merge_slots(
     rt: Runtime, cells: RayCells, slots: Slots, integrals: DeviceArray,
     target: tuple[DeviceArray, np.ndarray], detector_shape: tuple[int, int], axis: str,
 ) -> None:
-    """Writes the frames, weighted averages of slots. ``target``: an array and its strides (start, column, row, frame) in
-    floats."""
+    """Writes frames as weighted averages of the slots' line integrals. target: an array and its strides in floats (start,
+    column, row, frame)."""
     rows, columns = detector_shape
     rt.launch(
         rt.kernel("rays_slots", "merge_slots", **{**slots.defines, "LEAN": 0}),
@@ -184,10 +184,11 @@ def split_slots(
     rt: Runtime, cells: RayCells, poses: UprightPoses, slots: Slots, turned: DeviceArray,
     detector_shape: tuple[int, int], pitch_mm: np.ndarray | np.int32, start: int, values: DeviceArray,
 ) -> None:
-    """Writes the transpose of ``merge_slots``: to each slot weight × pixel, times the ray's length from plane to plane in
-    mm.
+    """Writes the transpose of ``merge_slots``: to each slot weight × pixel, times the ray's length between neighbouring
+    planes of voxels in mm.
 
-    turned: transposed frames (F, columns, rows), which begin at ``start`` floats."""
+    turned: transposed frames (F, columns, rows), which begin at ``start`` floats. values: receives a float per pixel of a
+    slot."""
     rows, columns = detector_shape
     rt.launch(
         rt.kernel("rays_slots", "split_slots", **slots.defines), (slots.columns, slots.count),

@@ -26,11 +26,12 @@ _MOST = 8  # most sub-rays of a pixel along an axis, reached where single rays a
 
 
 def subrays_of(grid: Grid, tables: Sequence[TimeCells], *, is_dense: bool = False) -> tuple[int, int]:
-    """Returns how many rays (along v, along u) a pixel needs in the middle of the grid, by the median over frames. One,
-    unless voxels would lie between rays; then so many that they lie at most ``_WIDEST`` voxels apart.
+    """Returns how many rays (along v, along u) a pixel needs in the middle of the grid, by the median over frames. (1, 1)
+    unless voxels would lie between rays; then so many that rays are at most ``_WIDEST`` voxels apart.
 
-    is_dense: the method begins with a volume that has the object's density. It is then enough that rays touch every voxel
-    where the grid is nearest to the source. Behind, they pass at other heights in other views, which fill the gaps."""
+    is_dense: the method begins with a volume that has the object's density. Rays then need to touch every voxel only
+    where the grid is nearest to the source. Further from the source they pass at other heights in other views, which fill
+    the gaps."""
     pose = np.stack([table.pose[0] for table in tables])
     steps = pose[:, 6:].reshape(-1, 2, 3)[:, ::-1] / grid.voxel_size_mm[::-1]
     spacing = np.linalg.norm(steps, axis=-1)
@@ -43,8 +44,8 @@ def subrays_of(grid: Grid, tables: Sequence[TimeCells], *, is_dense: bool = Fals
 
 
 def _depth(grid: Grid, pose: np.ndarray, *, is_nearest: bool) -> np.ndarray:
-    """Returns the depth (F,) of the grid's middle from the source, over the panel's depth. ``is_nearest`` takes the nearest
-    point of the ellipsoid in the grid's box instead. The depth is 0 for a point behind the source."""
+    """Returns the depth (F,) of the grid's middle from the source, over the panel's depth. With ``is_nearest`` the point
+    is the nearest of the ellipsoid in the grid's box. The depth is 0 for a point behind the source."""
     normal = np.cross(pose[:, 6:9], pose[:, 9:12])
     to_panel = np.einsum("fi,fi->f", pose[:, 3:6] - pose[:, :3], normal)
     to_middle = np.einsum("fi,fi->f", np.array(grid.offset_mm[::-1]) - pose[:, :3], normal)
@@ -53,13 +54,13 @@ def _depth(grid: Grid, pose: np.ndarray, *, is_nearest: bool) -> np.ndarray:
 
 
 def means(fine: np.ndarray, subrays: tuple[int, int]) -> np.ndarray:
-    """Returns B y, frames (F, rows, columns), of the finer panel's frames (F, rows · along_v, columns · along_u)."""
+    """Returns B y, frames (F, rows, columns), for frames y (F, rows · along_v, columns · along_u) of the finer panel."""
     along_v, along_u = subrays
     return block_means(fine, (1, along_v, along_u))
 
 
 def spread(frames: np.ndarray, subrays: tuple[int, int]) -> np.ndarray:
-    """Returns Bᵀ y, frames of the finer panel (F, rows · along_v, columns · along_u), of frames (F, rows, columns)."""
+    """Returns Bᵀ y, frames (F, rows · along_v, columns · along_u) of the finer panel, for frames y (F, rows, columns)."""
     along_v, along_u = subrays
     shares = frames / np.float32(along_v * along_u)
     return np.asarray(shares.repeat(along_v, 1).repeat(along_u, 2))
@@ -68,7 +69,7 @@ def spread(frames: np.ndarray, subrays: tuple[int, int]) -> np.ndarray:
 def launch_means(
     rt: Runtime, fine: DeviceArray, strides: Sequence[int], subrays: tuple[int, int], frames: DeviceArray, part: slice
 ) -> None:
-    """Writes B y of padded frames to the frames ``part`` of a plain stack (F, rows, columns)."""
+    """Writes B y of the padded frames ``fine`` to the frames ``part`` of the plain stack ``frames`` (F, rows, columns)."""
     _, rows, columns = frames.shape
     rt.launch(
         rt.kernel("subrays", "subray_means"), (columns, rows, part.stop - part.start), fine, np.array(strides, np.int64),
@@ -80,7 +81,7 @@ def launch_means(
 def launch_spread(
     rt: Runtime, frames: DeviceArray, part: slice, subrays: tuple[int, int], fine: DeviceArray, strides: Sequence[int]
 ) -> None:
-    """Writes Bᵀ y of the frames ``part`` of a plain stack (F, rows, columns) to padded frames."""
+    """Writes Bᵀ y of the frames ``part`` of a plain stack (F, rows, columns) to the padded frames ``fine``."""
     _, rows, columns = frames.shape
     rt.launch(
         rt.kernel("subrays", "spread_subrays"), (columns, rows, part.stop - part.start), frames, np.int32(part.start),

@@ -33,8 +33,8 @@ _TURN = 16  # voxels along each side (x and z) of the tile that a work-item tran
 
 @dataclass(frozen=True)
 class Upright:
-    """Build of the upright kernels: lines of a detector column per work-item, whether columns lean, whether rays are
-    parallel."""
+    """How the upright kernels are built. block: lines of a detector column per work-item. leans: columns lean against z.
+    is_parallel: rays are parallel."""
 
     block: int
     leans: bool
@@ -44,12 +44,12 @@ class Upright:
 def upright_of(
     grid: Grid, tables: Sequence[TimeCells], detector_shape: tuple[int, int], lanes: int, fewest_lines: int | None = None
 ) -> Upright | None:
-    """Returns how the upright kernels project these cells; None if the general kernel is needed.
+    """Returns how the upright kernels project the cells of ``tables``; None where the general kernel is needed.
 
-    The upright kernels need poses that serve several lines each, rays with main axis x or y, and columns nearly along z. If
-    columns lean, the volume must lie between source and panel, as it always does in a parallel beam. fewest_lines:
-    consecutive lines that a pose must serve on average, by default a whole vector of them. It does not count where columns
-    are read."""
+    The upright kernels need poses that serve several lines each, rays with main axis x or y, and columns nearly along z.
+    If columns lean, the volume must lie between source and panel, which holds in every parallel beam. fewest_lines:
+    consecutive lines that a pose must serve on average, by default as many as a vector has lanes; it has no effect where
+    columns are read."""
     served = sum(int((table.line_stop - table.line_start).sum()) for table in tables)
     lines = tables[0].lines
     fewest = fewest_lines or max(lanes, FEWEST_LINES)
@@ -75,7 +75,7 @@ def upright_of(
 
 
 def _is_steep(cells: np.ndarray, rows: int, columns: int) -> bool:
-    """Returns whether a ray of these cells (C, 16) may have the main axis z."""
+    """Returns whether some ray of the cells (C, 16) may have the main axis z."""
     d00, eu, ev = cells[:, 3:6], cells[:, 6:9], cells[:, 9:12]
     across = np.linalg.norm(ev[:, :2], axis=1)
     ends_z = [np.abs(d00 + u * eu + v * ev)[:, 2] for u in (0, columns - 1) for v in (0, rows - 1)]
@@ -84,7 +84,7 @@ def _is_steep(cells: np.ndarray, rows: int, columns: int) -> bool:
 
 
 def _least_horizontal(d00: np.ndarray, eu: np.ndarray, width: int) -> np.ndarray:
-    """Returns (C,) the smallest length of d00 + u eu for u in [0, width − 1]; arguments (C, 2)."""
+    """Returns the smallest length (C,) of d00 + u eu for u in [0, width − 1]; vectors (C, 2)."""
     nearest = -np.sum(d00 * eu, 1) / np.maximum(np.sum(eu * eu, 1), 1e-30)
     return np.asarray(np.linalg.norm(d00 + np.clip(nearest, 0, width - 1)[:, None] * eu, axis=1))
 
@@ -100,7 +100,7 @@ def _lies_between(grid: Grid, source: np.ndarray, d00: np.ndarray, eu: np.ndarra
 
 
 def columns_floats(grid: Grid) -> int:
-    """Returns the floats of a padded volume with z along rows."""
+    """Returns the floats of a padded volume stored transposed, with z along rows."""
     nz, ny, nx = grid.shape
     return 2 * GUARD + (ny + 2 * BORDER) * (nx + 2 * BORDER) * pitch_of(nz)
 
@@ -109,7 +109,7 @@ def launch_upright(
     rt: Runtime, layout: RayLayout, how: Upright, poses: UprightPoses, slots: Slots, columns: DeviceArray,
     target: tuple[DeviceArray, np.ndarray],
 ) -> None:
-    """Projects a volume with z along rows to slots: ``target`` is an array and its strides, as in ``Slots.strides``."""
+    """Projects a volume with z along rows to slots. target: an array and its strides in floats, as ``Slots.strides``."""
     shape, origin, _, pitch_mm, *_ = layout.constants()
     array, strides = target
     rt.launch(
@@ -124,8 +124,8 @@ def launch_upright_adjoint(
     rt: Runtime, layout: RayLayout, how: Upright, poses: UprightPoses, slots: Slots, values: DeviceArray,
     target: tuple[DeviceArray, Strides], *, add: bool = False,
 ) -> None:
-    """Backprojects slots, as ``split_slots`` writes them, into a volume with these strides; ``add`` keeps the sums that are
-    in it."""
+    """Backprojects slots, as ``split_slots`` writes them, into a volume. target: the volume and its strides. add: adds to
+    that volume, else replaces it."""
     shape, origin, *_ = layout.constants()
     (x, y, z), items = _owned(layout.brick.shape, rt.device.compute_units)
     rt.launch(
@@ -137,7 +137,8 @@ def launch_upright_adjoint(
 
 
 def _owned(shape: tuple[int, int, int], units: int) -> tuple[tuple[int, int, int], tuple[int, ...]]:
-    """Returns the voxels (x, y, z) of a work-item and the number of work-items: the largest that keep all units busy."""
+    """Returns the voxels (x, y, z) of a work-item and the work-items along x, y, z. The voxels are as many as keep all
+    compute units busy."""
     for owned in _OWNED:
         items = tuple(ceil_div(n, own) for n, own in zip(shape[::-1], owned, strict=True))
         if math.prod(items) >= _ITEMS_PER_UNIT * units:
@@ -148,8 +149,8 @@ def _owned(shape: tuple[int, int, int], units: int) -> tuple[tuple[int, int, int
 def turn_volume(
     rt: Runtime, layout: RayLayout, volume: tuple[DeviceArray, Strides], columns: DeviceArray
 ) -> None:
-    """Transposes a volume (z, y, x) with these strides to ``columns`` (y, x, z). Does not write the padding, which is
-    zero."""
+    """Transposes a volume (nz, ny, nx), given with its strides, to ``columns`` (y, x, z). Does not write the padding,
+    which is zero."""
     nz, ny, nx = layout.grid.shape
     shape, *_ = layout.constants()
     size = (ceil_div(nx, _TURN), ny, ceil_div(nz, _TURN))

@@ -18,12 +18,13 @@ _MOST_ENTRIES = 2**31 - 1  # upper limit of the indices of splats in all lists: 
 
 
 class TileLists:
-    """Builds, for tiles of a 2D or 3D domain, the list of splats whose extent touches each tile.
+    """Builds lists of the splats whose extent touches each tile of a 2D or 3D domain.
 
-    ``tile`` is a tile's size and ``tiles`` their number, along x, y, z. Lists keep the order of the splats, so that sums
-    over them repeat bit for bit. The memory for indices follows the number needed by former builds. The host waits for this
-    number if the count of splats is new, ``waits`` is set, or a GPU would take long without lists. Otherwise it reads the
-    number later; until then kernels do not use lists that did not fit (cl/common/tile.h)."""
+    tile: a tile's size in pixels or voxels along x, y, z. tiles: the number of tiles along x, y, z. Lists keep the order
+    of the splats, so that sums over them repeat bit for bit. Memory for the lists follows the entries that former builds
+    needed. The host waits for that number if the count of splats is new, ``waits`` is set, or a GPU would take long
+    without lists. Otherwise it reads the number later; until then kernels do not use lists that did not fit
+    (cl/common/tile.h)."""
 
     def __init__(self, rt: Runtime, tile: tuple[int, int, int], tiles: tuple[int, int, int]) -> None:
         self.rt = rt
@@ -43,13 +44,15 @@ class TileLists:
 
     @property
     def samples(self) -> int:
-        """Upper limit of the samples of a launch: entries that there is memory for, times pixels or voxels of a tile."""
+        """Upper limit of a launch's samples (see ``Runtime.launch``): list entries with memory, times pixels or voxels of
+        a tile."""
         return self.splat_ids.size * int(np.prod(self.tile[:3], dtype=np.int64))
 
     def build(self, extents: DeviceArray, count: int, stride: int, cells: int = 1) -> None:
-        """Fills ``tile_offsets`` (tiles + 1,) and ``splat_ids`` from extents (6, stride), for splats in so many cells.
+        """Fills ``tile_offsets`` (tiles + 1,) and ``splat_ids`` from extents (6, stride) of ``count`` splats. cells: time
+        cells in which each splat was projected.
 
-        Raises MemoryShortage for 2^31 indices or more; smaller bricks of a volume may have fewer."""
+        Raises MemoryShortage for 2^31 list entries or more; smaller bricks of a volume may have fewer."""
         rt = self.rt
         chunk = chunk_of(rt, self.total, count)
         chunks = max(ceil_div(count, chunk), 1)
@@ -84,12 +87,12 @@ class TileLists:
 
     @staticmethod
     def bytes(rt: Runtime, tiles: int, count: int) -> int:
-        """Returns the bytes of the lists of ``count`` splats, without the splats' indices."""
+        """Returns the bytes of the lists of ``count`` splats, without the entries themselves."""
         return 4 * (tiles + 1 + tiles * max(ceil_div(count, chunk_of(rt, tiles, count)), 1))
 
     def _make_room(self, needed: int, share: float) -> None:
-        """Allocates memory for more than ``needed`` indices, unless there is enough for ``share`` times as many. Raises
-        MemoryShortage where ints cannot count them."""
+        """Allocates memory for more than ``needed`` list entries, unless ``share`` times as many fit already. Raises
+        MemoryShortage where ints cannot count the entries."""
         if needed >= _MOST_ENTRIES:
             found, expected = f"{needed} entries or more", f"fewer than {_MOST_ENTRIES}"
             remedy = "use fewer or smaller Gaussians"
@@ -100,7 +103,7 @@ class TileLists:
 
 
 def chunk_of(rt: Runtime, tiles: int, count: int) -> int:
-    """Returns the splats per work-item on a CPU, or per work-group on a GPU, where each splat has its own work-item."""
+    """Returns the splats per work-item on a CPU, or per work-group on a GPU, whose work-items take one splat each."""
     if not rt.pixel_items:
         return _CHUNK
     kernels = (rt.kernel("binning", f"bin_{step}_group") for step in ("count", "fill"))

@@ -19,7 +19,7 @@ CELL_FLOATS = 24  # number of floats of a time cell's constants, as in cl/common
 
 @dataclass(eq=False)
 class DeviceGaussians:
-    """Parameter rows (11, stride) float32 on the device, of which the first ``count`` columns are real."""
+    """Parameter rows (11, stride) float32 on the device. The first ``count`` columns are Gaussians, the rest is padding."""
 
     rows: DeviceArray
     count: int
@@ -36,7 +36,7 @@ def stride_of(count: int) -> int:
 
 
 def pad_columns(rows: np.ndarray) -> np.ndarray:
-    """Pads rows (11, G) to (11, stride) float32."""
+    """Pads parameter rows (11, G) to (11, stride) float32 with unit Gaussians."""
     padded = np.zeros((rows.shape[0], stride_of(rows.shape[1])), np.float32)
     padded[3:7] = 1.0
     padded[10] = 1.0
@@ -57,13 +57,13 @@ def split_coefficients(rt: Runtime, matrix: np.ndarray) -> DeviceArray:
 class DeviceCells:
     """The time cells of one frame on the device; lines are always the slow axis of the image.
 
-    A frame read out along columns is projected as its transpose: only the poses' pixel steps are exchanged. With motion,
-    ``matrices`` has three poses per cell (middle, both ends) and ``line_times`` (C, 3, time_pitch) the integration times of
-    the lines; without motion ``line_times`` has one element. The intensity model draws cells into ``layers`` images in
-    which no line has two cells; ``layer_weights`` (layers, lines) are the cells' shares of a line's window. With
-    ``fixed_conic``, ``cells`` are of the conic's pose, and ``matrices`` have two poses per cell, its own one last.
-    Of an object that moves, ``shares`` (S, R) are the weights of its states, and ``cell_states`` (C, poses) the state of
-    every pose; else both have one element."""
+    A frame read out along columns is projected as its transpose: its poses' pixel steps are exchanged. With motion,
+    ``matrices`` has three poses per cell (middle, both ends) and ``line_times`` (C, 3, time_pitch) the integration times
+    of the lines; without motion ``line_times`` has one element. The intensity model draws cells into ``layers`` images,
+    each with at most one cell per line; ``layer_weights`` (layers, lines) are the cells' fractions of a line's window.
+    With ``fixed_conic``, ``cells`` are those of the pose that gives a splat its shape, and ``matrices`` have that pose
+    and then the cell's own. For an object that moves, ``shares`` (S, R) are the weights of the fields in S states, and
+    ``cell_states`` (C, poses) the state of every pose; else both have one element."""
 
     cells: DeviceArray
     matrices: DeviceArray
@@ -88,8 +88,8 @@ class DeviceCells:
     def upload(
         cls, rt: Runtime, table: TimeCells, states: tuple[np.ndarray, np.ndarray] | None = None
     ) -> "DeviceCells":
-        """Uploads a frame's cells; ``states`` as from ``operators.splats.states.states_of``. Raises InputError for cells
-        that have a weight for each line."""
+        """Uploads a frame's cells. states: for an object that moves, as from ``states_of``. Raises InputError for cells
+        that have a separate weight for each line."""
         shares, cell_states = (np.zeros(1), np.zeros(1)) if states is None else states
         if table.line_share is not None:
             raise InputError("--motion", "cells with a weight for each line", "cells with one weight", "take micro-views")
@@ -123,10 +123,10 @@ class DeviceCells:
 
 
 def projection_matrices(pose: np.ndarray, is_parallel: bool = False) -> np.ndarray:
-    """Returns the rows (C, 12) that map a world point x to (u·z, v·z, z): pixel column, line and depth of its ray.
+    """Returns the matrices (C, 3 · 4) that map a world point x to (u·z, v·z, z): pixel column, line and depth of its ray.
 
-    x − source = z (d00 + u·eu + v·ev), with d00 from the source to pixel (0, 0). In a parallel beam x is on the ray through
-    (u, v): x − pixel (0, 0) = u·eu + v·ev + t·direction; z is 1."""
+    x − source = z (d00 + u·eu + v·ev), with d00 from the source to pixel (0, 0). In a parallel beam x is on the ray
+    through (u, v): x − pixel (0, 0) = u·eu + v·ev + t·direction; z is 1."""
     if is_parallel:
         inverse = np.linalg.inv(np.stack([pose[:, 6:9], pose[:, 9:12], pose[:, 0:3]], -1))
         shift = -np.einsum("cij,cj->ci", inverse, pose[:, 3:6])
@@ -143,7 +143,7 @@ def projection_matrices(pose: np.ndarray, is_parallel: bool = False) -> np.ndarr
 def cell_constants(
     pose: np.ndarray, weight: np.ndarray, layer: np.ndarray, is_parallel: bool = False
 ) -> np.ndarray:
-    """Returns the (C, 24) float32 table of cl/common/splat.h."""
+    """Returns the (C, 24) float32 table of cl/common/splat.h for poses (C, 12), weights (C,) and layers (C,) of cells."""
     if is_parallel:  # as rays from a source at minus the direction through the origin
         pose = np.concatenate([-pose[:, 0:3], np.zeros((len(pose), 3)), pose[:, 6:]], 1)
     source, d00 = pose[:, 0:3], pose[:, 3:6] - pose[:, 0:3]
@@ -161,7 +161,8 @@ def cell_constants(
 
 
 class Layers:
-    """Layers of frames of ``lines`` by ``width`` pixels. ``unit``: the line integral of a layer's value 1."""
+    """Draws a frame's layers, of ``lines`` × ``width`` pixels, and merges them. unit: the line integral of a layer's
+    value 1."""
 
     def __init__(self, rt: Runtime, lines: int, width: int, unit: float) -> None:
         self.rt, self.lines, self.width, self.unit = rt, lines, width, unit
@@ -170,8 +171,8 @@ class Layers:
         self._split = rt.kernel("intensity", "intensity_split", IMAGE_GUARD=GUARD)
 
     def images(self, cells: DeviceCells) -> DeviceArray:
-        """Returns memory for the layers of ``cells``: each GUARD floats and an image (lines, pitch); GUARD floats follow the
-        last."""
+        """Returns memory for the layers of ``cells``: each has GUARD floats and an image (lines, pitch); GUARD floats
+        follow the last layer."""
         if cells.layers > self._count:
             self._count = cells.layers
             self._drawn, self._shares, self._by_layers = (
@@ -181,14 +182,14 @@ class Layers:
         return DeviceArray(self._drawn.buffer, (floats,), self._drawn.dtype)
 
     def merge(self, cells: DeviceCells, merged: DeviceArray) -> None:
-        """Writes −ln Σ w exp(−p) of the layers drawn last into ``merged``."""
+        """Writes −ln Σ w exp(−p) over the layers drawn last, in line integrals, into ``merged``."""
         self._launch(
             self._merge, (self._drawn, cells.layer_weights), cells,
             (np.float32(self.unit), self._shares, merged),
         )
 
     def split(self, cells: DeviceCells, by_merged: DeviceArray) -> DeviceArray:
-        """Returns dL/dlayers of the last ``merge`` from dL/dmerged, valid until the next call."""
+        """Returns dL/d(layers) of the last ``merge`` from dL/d(merged), valid until the next call."""
         self._launch(self._split, (by_merged, self._shares), cells, (self._by_layers,))
         return self._by_layers
 

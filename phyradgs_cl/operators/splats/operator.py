@@ -26,16 +26,18 @@ from phyradgs_cl.runtime.layout import GUARD, Strides, move, padded_zeros, pitch
 
 @dataclass(eq=False)
 class SplatPoint:
-    """A cloud in the kernels' layout, and the norms (stride,) that its quaternions had before they were normalised."""
+    """A cloud of Gaussians in the kernels' layout, and the norms (stride,) that its quaternions had before they were
+    normalised."""
 
     gaussians: DeviceGaussians
     norms: DeviceArray
 
 
 class PlainRows:
-    """Converts parameter rows (11, G) in mm, quaternions of any length, to internal rows in units of ``length_mm``.
+    """Converts parameter rows (11, G), in mm and 1/mm with quaternions of any length, to the kernels' rows in units of
+    ``length_mm``.
 
-    Internal densities are in 1/``length_mm`` for ``line_integrals``, which have no unit then, else in 1/mm."""
+    The kernels' densities are in 1/``length_mm`` with ``line_integrals``, which then have no unit, else in 1/mm."""
 
     def __init__(self, rt: Runtime, length_mm: float, *, line_integrals: bool) -> None:
         self.rt = rt
@@ -46,7 +48,7 @@ class PlainRows:
         self._copy = rt.kernel("splat_plain", "row_copy")
 
     def enter(self, rows: DeviceArray) -> SplatPoint:
-        """Copies rows (11, G) float32 to a cloud; the rows may change afterwards."""
+        """Returns the cloud of parameter rows (11, G) float32. It is a copy: the rows may change afterwards."""
         rt, count = self.rt, rows.shape[1]
         stride = stride_of(count)
         inside, norms = rt.empty((ROWS, stride)), rt.empty(stride)
@@ -55,8 +57,8 @@ class PlainRows:
         return SplatPoint(DeviceGaussians(inside, count, stride), norms)
 
     def leave(self, gradients: DeviceArray, point: SplatPoint, rows: DeviceArray, *, add: bool = False) -> None:
-        """Writes dL/d(plain rows), (11, G), to ``rows`` from dL/d(internal rows), (13, stride); ``add`` adds it to what is
-        there."""
+        """Writes dL/d(plain rows), (11, G), to ``rows`` from dL/d(kernels' rows), (13, stride). add: adds to ``rows``
+        instead."""
         rt, cloud = self.rt, point.gaussians
         rt.launch(
             self._leave, cloud.count, gradients, point.norms, cloud.count, cloud.stride, *self._units, add,
@@ -65,7 +67,7 @@ class PlainRows:
 
 
     def with_densities(self, point: SplatPoint, density: DeviceArray) -> SplatPoint:
-        """Returns the cloud with densities (G,) in 1/mm in place of its former ones."""
+        """Returns a cloud like ``point`` with the densities ``density`` (G,) in 1/mm."""
         rt, cloud = self.rt, point.gaussians
         rows = rt.empty((ROWS, cloud.stride))
         rt.copy(cloud.rows, rows)
@@ -87,9 +89,9 @@ class PlainRows:
 
 
 class PlainImages:
-    """Copies images (rows, columns) of a stack to one padded image of ``lines`` by ``width``, and back.
+    """Copies images (rows, columns) of a plain stack to one padded image of ``lines`` × ``width``, and back.
 
-    ``turned`` transposes: columns become the lines. A volume (nz, ny, nx) counts as an image of nz · ny lines."""
+    turned: transposes, so that columns become the lines. A volume (nz, ny, nx) counts as an image of nz · ny lines."""
 
     def __init__(self, rt: Runtime, lines: int, width: int, *, turned: bool = False) -> None:
         self.rt, self.turned = rt, turned
@@ -99,7 +101,7 @@ class PlainImages:
         self._image: DeviceArray | None = None
 
     def enter(self, images: DeviceArray, number: int = 0) -> DeviceArray:
-        """Returns image ``number`` in the padded layout, valid until the next call."""
+        """Returns image ``number`` of the stack ``images`` in the padded layout, valid until the next call."""
         if self._image is None:
             self._image = padded_zeros(self.rt, *self._by_line[1:])
         source, target = (images, self._place(number)), (self._image, self._padded)
@@ -107,7 +109,7 @@ class PlainImages:
         return self._image
 
     def leave(self, image: DeviceArray, images: DeviceArray, number: int = 0) -> None:
-        """Copies a padded image to image ``number``."""
+        """Copies a padded image to image ``number`` of the stack ``images``."""
         source, target = (image, self._padded), (images, self._place(number))
         move(self.rt, source, target, self._by_line, turned=self.turned)
 
@@ -116,10 +118,11 @@ class PlainImages:
 
 
 class SplatOperator:
-    """Maps parameter rows (11, G) to frames (F, rows, columns) of line integrals; ``intensity`` averages intensities.
+    """Maps parameter rows (11, G) to frames (F, rows, columns) of line integrals.
 
-    ``tables`` has the time cells of each frame in mm, all read out along one axis. ``length_mm`` is the kernels' unit of
-    length; the scene should have a size of about 1 in it. Subsets share all memory: use them one at a time."""
+    tables: the time cells of each frame in mm, all read out along one axis. intensity: the detector averages intensities
+    over a line's cells, not line integrals. length_mm: the kernels' unit of length, in which the scene should have a size
+    of about 1. Subsets share all memory: use them one at a time."""
 
     def __init__(
         self, rt: Runtime, detector_shape: tuple[int, int], tables: Sequence[TimeCells], length_mm: float, *,
@@ -149,7 +152,7 @@ class SplatOperator:
         return frames
 
     def back(self, point: SplatPoint, by_frames: DeviceArray) -> DeviceArray:
-        """Returns dL/drows (11, G) float32 at a cloud from dL/dframes (F, rows, columns)."""
+        """Returns dL/d(rows), (11, G) float32 at a cloud, from dL/d(frames), (F, rows, columns)."""
         rt, gaussians = self.rt, point.gaussians
         by_rows, gradients = rt.empty((ROWS, gaussians.count)), rt.empty((ROWS + 2, gaussians.stride))
         for number, cells in enumerate(self._cells):
@@ -160,7 +163,7 @@ class SplatOperator:
     def _differentiate(
         self, point: SplatPoint, cells: DeviceCells, by_image: DeviceArray, gradients: DeviceArray
     ) -> None:
-        """Writes one frame's gradients dL/d(internal rows), (13, stride), from its padded dL/dframe."""
+        """Writes one frame's gradients dL/d(kernels' rows), (13, stride), from its padded dL/d(frame)."""
         is_ready = self._ready.holds(point, cells)
         self._ready.forget()
         if not is_ready:
@@ -169,8 +172,8 @@ class SplatOperator:
         self._projector.backward(point.gaussians, cells, by_image, gradients)
 
     def by_poses(self, point: SplatPoint, by_frames: DeviceArray) -> np.ndarray:
-        """Returns (F, 3) float64 from dL/dframes (F, rows, columns): for each frame dL/d(gantry angle about z) per rad, and
-        dL/d(panel shift) per pixel along its columns and along its rows. Not for the intensity model."""
+        """Returns (F, 3) float64 from dL/d(frames), (F, rows, columns): for each frame dL/d(gantry angle about z) per
+        rad, and dL/d(panel shift) per pixel, along columns and along rows. Not for the intensity model."""
         cloud, found = point.gaussians, np.empty((len(self._cells), 3))
         rows, gradients = self.rt.download(cloud.rows), self.rt.empty((ROWS + 2, cloud.stride))
         weighed = self.rt.download(self.forward(point)) * self.rt.download(by_frames)
@@ -185,7 +188,8 @@ class SplatOperator:
         return found
 
     def subset(self, frames: Sequence[int]) -> "SplatOperator":
-        """Returns the operator for some of the frames, in this order, without copies. Raises InputError for no frames."""
+        """Returns the operator for the frames with the numbers ``frames``, in the order given; it copies no memory.
+        Raises InputError for no frames."""
         part = copy(self)
         part._cells, part._poses = [self._cells[f] for f in frames], [self._poses[f] for f in frames]
         if not part._cells:
@@ -195,21 +199,22 @@ class SplatOperator:
 
 
 class DensityOperator:
-    """The linear part of a ``SplatOperator``: densities (G,) in 1/mm of a fixed cloud to frames."""
+    """Maps the densities (G,) in 1/mm of a cloud, whose other parameters stay fixed, to frames: the linear part of
+    ``SplatOperator``."""
 
     def __init__(self, operator: SplatOperator, point: SplatPoint) -> None:
         self._operator, self._point = operator, point
 
     def forward(self, density: DeviceArray) -> DeviceArray:
-        """Projects densities (G,) float32 to frames (F, rows, columns)."""
+        """Returns the frames (F, rows, columns) float32 of densities (G,) in 1/mm."""
         return self._operator.forward(self._operator.rows.with_densities(self._point, density))
 
     def adjoint(self, frames: DeviceArray) -> DeviceArray:
-        """Backprojects frames (F, rows, columns) float32 to densities (G,)."""
+        """Returns the transpose of ``forward``: densities (G,) from frames (F, rows, columns), both float32."""
         return self._operator.rows.densities(self._operator.back(self._point, frames))
 
     def subset(self, frames: Sequence[int]) -> "DensityOperator":
-        """Returns the operator for some of the frames, in this order."""
+        """Returns the operator for the frames with the numbers ``frames``, in the order given."""
         return DensityOperator(self._operator.subset(frames), self._point)
 
 
@@ -235,7 +240,7 @@ class VoxelOperator:
         return volume
 
     def back(self, point: SplatPoint, by_volume: DeviceArray) -> DeviceArray:
-        """Returns dL/drows (11, G) float32 at a cloud from dL/dvolume (nz, ny, nx)."""
+        """Returns dL/d(rows), (11, G) float32 at a cloud, from dL/d(volume), (nz, ny, nx)."""
         rt, gaussians = self.rt, point.gaussians
         by_rows, gradients = rt.empty((ROWS, gaussians.count)), rt.empty((ROWS + 2, gaussians.stride))
         if not self._ready.holds(point, self):
@@ -248,13 +253,13 @@ class VoxelOperator:
 
 
 class _Ready:
-    """Records the cloud and cells for which the kernels' buffers hold the input of a gradient."""
+    """Records for which cloud and cells the kernels' buffers are ready for a gradient."""
 
     def __init__(self) -> None:
         self.forget()
 
     def forget(self) -> None:
-        """Marks the buffers as invalid. Call it before they change: a failure may leave them half written."""
+        """Marks the buffers as invalid. Call it before they change, because a failure may leave them half written."""
         self._point: SplatPoint | None = None
         self._where: object = None
 
@@ -268,8 +273,8 @@ class _Ready:
 def by_pose(rows: np.ndarray, gradients: np.ndarray) -> tuple[float, float, float]:
     """Returns dL/d(gantry angle about z) per rad, and dL/d(panel shift) along and across a line.
 
-    Shifts are in halves of the detector's width and of its lines. rows (11, G): internal rows; gradients (13, G):
-    dL/d(rows)."""
+    Shifts are in halves of the detector's width and of its lines. rows (11, G): the kernels' rows; gradients (13, G):
+    dL/d(rows), then two rows for shifts of the projected centres."""
     values, by = rows.astype(np.float64), gradients.astype(np.float64)
     (x, y, _), (by_x, by_y, _) = values[MEAN], by[MEAN]
     w, i, j, k = values[QUATERNION]
@@ -279,9 +284,10 @@ def by_pose(rows: np.ndarray, gradients: np.ndarray) -> tuple[float, float, floa
 
 
 def by_length(pose: np.ndarray, weighed: np.ndarray) -> np.ndarray:
-    """Returns the part (2,) of dL/d(panel shift) per pixel, along columns and along rows, that comes from the rays' lengths.
+    """Returns the part (2,) of dL/d(panel shift) per pixel, along columns and along rows, that comes from the rays'
+    lengths.
 
-    Line integrals are proportional to these. pose (12,) mm; weighed (rows, columns): the frame times dL/dframe."""
+    Line integrals are proportional to the rays' lengths. pose (12,) mm; weighed (rows, columns): frame × dL/d(frame)."""
     source, first, column, row = pose.reshape(4, 3)
     v, u = (np.arange(n, dtype=np.float64) for n in weighed.shape)
     ray = first - source + v[:, None, None] * row + u[:, None] * column

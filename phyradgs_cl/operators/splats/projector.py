@@ -28,17 +28,18 @@ line."""
 
 
 def items_by_gaussian(rt: Runtime, count: int) -> tuple[tuple[int, int], tuple[int, int]]:
-    """Returns the global size and the work-group of kernels in which Gaussians sum over their pixels (``GROUP_DEFINES``)."""
+    """Returns the work-items and the sides of a work-group, both (x, y), of kernels in which ``count`` Gaussians sum over
+    their pixels."""
     items, across = (GROUP_DEFINES[rt.pixel_items][name] for name in ("GROUP", "ACROSS"))
     return (count * across, items // across), ((across, items // across) if items > 1 else (16, 1))
 
 
 def path_limits(time_error: float) -> tuple[float, float, float]:
-    """Returns the longest paths within a line's window, in widths of the splat, for 1, 2 and 3 Gauss–Legendre times.
+    """Returns the longest path within a line's window, in widths of the splat, for 1, 2 and 3 Gauss–Legendre times.
 
     The rules' remainders for exp(−x²/2), whose 2nd, 4th and 6th derivatives are at most 1, 3 and 15, are path²/24,
-    path⁴/1440 and path⁶/134400 of the peak. An error of twice ``time_error`` in the worst pixel is about half of that RMS.
-    Longer paths use the closed form, whose moments lose digits below 0.7."""
+    path⁴/1440 and path⁶/134400 of the peak. An error of twice ``time_error`` in the worst pixel is a relative RMS error
+    of about ``time_error``. Longer paths use the closed form, whose moments lose digits below a path of 0.7."""
     worst = 2 * time_error
     one, two, three = (24 * worst) ** (1 / 2), (1440 * worst) ** (1 / 4), (134400 * worst) ** (1 / 6)
     return one, two, max(three, 0.7)
@@ -46,7 +47,7 @@ def path_limits(time_error: float) -> tuple[float, float, float]:
 
 @dataclass(frozen=True)
 class _Kernels:
-    """The four passes, compiled for cells with or without motion, or with motion of the centres only."""
+    """The kernels of the four passes, compiled for splats at rest, with motion, or with motion of the centres alone."""
 
     prepare: Kernel
     forward: Kernel
@@ -70,13 +71,13 @@ class _Kernels:
 
 
 class SplatProjector:
-    """Renders frames of ``lines`` lines (along the readout axis) by ``width`` pixels.
+    """Renders Gaussians to frames of ``lines`` lines (along the readout axis) by ``width`` pixels, and differentiates the
+    frames.
 
-    ``affine`` selects R2-Gaussian's approximation instead of the exact ray integral. ``cutoff_sigma`` is the Mahalanobis
-    radius beyond which a Gaussian is not drawn; 0 draws all of it. ``time_error`` (relative, RMS) bounds the error of
-    averages over time in cells with motion. With ``intensity_unit`` a detector averages intensities over a line's cells; it
-    is the line integral of an image's value 1. With None line integrals are averaged. ``states`` moves the cloud to the
-    states of cells uploaded with them."""
+    affine: R2-Gaussian's approximation instead of the exact ray integral. cutoff_sigma: Mahalanobis radius beyond which a
+    Gaussian is not drawn; 0 draws all of it. time_error: limit of the error (relative, RMS) of averages over time in
+    cells with motion. intensity_unit: the line integral of an image's value 1, where a detector averages intensities over
+    a line's cells; None averages line integrals. states: moves the cloud to the states of cells uploaded with them."""
 
     def __init__(
         self, rt: Runtime, lines: int, width: int, *, affine: bool = False,
@@ -105,7 +106,7 @@ class SplatProjector:
         }
 
     def _cut(self, tile_w: int, tile_h: int) -> None:
-        """Cuts the frame into tiles, for which there will be lists."""
+        """Cuts the frame into tiles of ``tile_w`` × ``tile_h`` pixels, each with a list of splats."""
         self.tile_w, self.tile_h = tile_w, tile_h
         tiles = (ceil_div(self.width, tile_w), ceil_div(self.lines, tile_h), 1)
         self.lists = TileLists(self.rt, (tile_w, tile_h, 1), tiles)
@@ -123,8 +124,8 @@ class SplatProjector:
         return self.merge(cells)
 
     def draw(self, gaussians: DeviceGaussians, cells: DeviceCells) -> DeviceArray:
-        """Renders the layers of a frame, or the frame if there are none, padded. Those of several clouds may be added before
-        ``merge``."""
+        """Renders the layers of a frame, padded; without layers, the frame itself. Layers of several clouds may be added
+        before ``merge``."""
         rt, kernel = self.rt, self._kernels[cells.moving, cells.fixed_conic, cells.is_parallel].forward
         if self.by_pixel and rt.tile(kernel) != (self.tile_w, self.tile_h):
             self._cut(*rt.tile(kernel))
@@ -142,7 +143,7 @@ class SplatProjector:
         return drawn
 
     def merge(self, cells: DeviceCells) -> DeviceArray:
-        """Merges the layers of the last ``draw``; the frame is valid until the next call."""
+        """Returns the frame merged from the layers of the last ``draw``, valid until the next call."""
         if self._layers is not None:
             self._layers.merge(cells, self.image)
         return self.image
@@ -150,9 +151,11 @@ class SplatProjector:
     def backward(
         self, gaussians: DeviceGaussians, cells: DeviceCells, by_image: DeviceArray, gradients: DeviceArray
     ) -> None:
-        """Writes dL/dparameters into ``gradients`` (13, stride), rows as in cl/common/gradient.h.
+        """Writes dL/d(parameters) into ``gradients`` (13, stride), rows as in cl/common/gradient.h, from the padded
+        dL/d(frame).
 
-        Call ``prepare`` or ``forward`` with the same Gaussians and cells before: the sums overwrite their records."""
+        Call ``prepare`` or ``forward`` with the same Gaussians and cells before each call: it overwrites their
+        results."""
         rt = self.rt
         items, group = items_by_gaussian(rt, gaussians.count)
         by_images = by_image if self._layers is None else self._layers.split(cells, by_image)
@@ -173,7 +176,7 @@ class SplatProjector:
             self.states.back(gaussians, cells, gradients)
 
     def prepare(self, gaussians: DeviceGaussians, cells: DeviceCells) -> None:
-        """Projects every Gaussian from every pose: the first step of ``draw``, whose records ``backward`` needs."""
+        """Projects every Gaussian from every pose: the first step of ``draw``, whose results ``backward`` needs."""
         rt = self.rt
         footprints = gaussians.stride * cells.count
         if self._records.size < footprints * RECORD_FLOATS[cells.moving]:
@@ -202,7 +205,7 @@ class SplatProjector:
         return unpad_rows(self.rt.download(image), (self.lines, self.width))
 
     def project_adjoint(self, rows: np.ndarray, cells: DeviceCells, by_image: np.ndarray) -> np.ndarray:
-        """Returns dL/drows (11, G) for parameter rows (11, G) and dL/dframe (lines, width)."""
+        """Returns dL/d(rows), (11, G), for parameter rows (11, G) and dL/d(frame), (lines, width)."""
         gaussians = DeviceGaussians.upload(self.rt, rows)
         self.forward(gaussians, cells)
         gradients = self.rt.zeros((13, gaussians.stride))

@@ -20,7 +20,7 @@ _MOST_SEGMENTS = 32  # most segments of a frame: beyond it larger bends are acce
 
 
 class CloudStates:
-    """Moves clouds as ``deformation`` does, in the clouds' unit of length, to the states of a frame's cells."""
+    """Moves clouds to the states of a frame's cells, as ``deformation`` does in the clouds' unit of length."""
 
     def __init__(self, rt: Runtime, deformation: Deformation) -> None:
         self.rt, self.deformation = rt, deformation
@@ -33,7 +33,7 @@ class CloudStates:
         self._states, self._by_states = rt.empty(1), rt.empty(1)
 
     def forward(self, gaussians: DeviceGaussians, shares: DeviceArray) -> DeviceArray:
-        """Returns the cloud in S states, (S, 12, stride), valid until the next call. ``shares`` (S, R): weights of the
+        """Returns the cloud in S states, (S, 12, stride), valid until the next call. shares (S, R): weights of the R
         fields."""
         rt, count, stride = self.rt, shares.shape[0], gaussians.stride
         if self._states.size < count * STATE_ROWS * stride:
@@ -53,8 +53,8 @@ class CloudStates:
         return self._by_states
 
     def back(self, gaussians: DeviceGaussians, cells: DeviceCells, gradients: DeviceArray) -> None:
-        """Replaces the rows of the mean in ``gradients`` (13, stride) by dL/dmean, from dL/d(states) in the memory of
-        ``zeros``. The last ``forward`` must be of the same cloud and cells."""
+        """Replaces the rows of the mean in ``gradients`` (13, stride) by dL/d(mean of the reference), from the
+        dL/d(states) in the memory of ``zeros``. The last ``forward`` must be of the same cloud and cells."""
         rt, count = self.rt, cells.shares.shape[0]
         kernel, field = self._kernel("splat_states_back"), (*self._field, cells.shares, np.int32(count))
         rt.launch(
@@ -63,8 +63,8 @@ class CloudStates:
         )  # fmt: skip
 
     def check_inverse(self, grid: Grid) -> None:
-        """Raises InputError where points of ``grid`` do not return to themselves in some states: the field has no inverse
-        there."""
+        """Raises InputError where the field has no inverse: where points of ``grid`` do not return to themselves in some
+        probed states."""
         rt, (z, y, x) = self.rt, (np.linspace(axis[0], axis[-1], _PROBED_SIDE) for axis in grid.axes_mm())
         mean = np.stack(np.meshgrid(x, y, z, indexing="ij")).reshape(3, -1)
         rows = np.ones((11, mean.shape[1]))
@@ -87,8 +87,9 @@ class CloudStates:
 
 
 def segments_for_object(deformation: Deformation, lit_s: np.ndarray, voxel_mm: float) -> int:
-    """Returns the number of segments of a frame that is lit from lit_s[0] to lit_s[1]. In a segment the path of any point of
-    the object is bent by at most a quarter of a voxel. Splats follow its mean place, and a straight path about it."""
+    """Returns how many segments a frame needs that is lit from lit_s[0] to lit_s[1], up to ``_MOST_SEGMENTS``. Within a
+    segment the path of any point of the object is bent by at most a quarter of a voxel, because splats follow a straight
+    path."""
     for count in range(1, _MOST_SEGMENTS):
         weights = deformation.weights_at(np.linspace(lit_s[0], lit_s[1], 2 * count + 1))
         bend_mm = np.abs(weights[1::2] - (weights[:-1:2] + weights[2::2]) / 2) @ deformation.reach_mm
@@ -98,9 +99,9 @@ def segments_for_object(deformation: Deformation, lit_s: np.ndarray, voxel_mm: f
 
 
 def states_of(table: TimeCells, deformation: Deformation) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the weights (S, R) of the states that the cells of a frame see, in the order of time, and the state (C, poses)
-    of every pose of a cell. Raises InputError for cells whose splats keep their shape (``conic_pose``), and for cells with
-    motion but without the times of their ends."""
+    """Returns the weights (S, R) of the states that the cells of a frame see, in the order of time, and the state (C,
+    poses) of every pose. Raises InputError for cells whose splats keep their shape (``conic_pose``), and for moving cells
+    without the times of their ends."""
     if table.conic_pose is not None:
         expected = "one in which also the shapes of splats move"
         raise InputError("--object-motion", "--motion centres", expected, "take exact or micro-views")

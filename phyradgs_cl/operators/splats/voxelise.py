@@ -18,7 +18,8 @@ _DEFAULT_BRICK_BYTES = 1 << 28  # default of the most bytes of voxels that the d
 
 
 class Voxeliser:
-    """Evaluates the field of Gaussians at the voxel centres of a grid of fixed ``shape`` (z, y, x)."""
+    """Evaluates the field of Gaussians at the voxel centres of grids of one ``shape`` (nz, ny, nx), and differentiates
+    it."""
 
     def __init__(
         self, rt: Runtime, shape: tuple[int, int, int], *, cutoff_sigma: float = DEFAULT_CUTOFF_SIGMA
@@ -48,7 +49,8 @@ class Voxeliser:
         """Returns the field on the voxels [start, start + shape) of ``grid``, in the padded layout, valid until the next
         call.
 
-        Lengths are in the Gaussians' unit; ``start`` is (z, y, x). A part has the same bits as the complete field."""
+        Lengths are in the Gaussians' unit; ``start`` is (z, y, x). A part of a grid has the same bits as in the complete
+        field."""
         rt = self.rt
         self.prepare(gaussians, grid, start)
         self.lists.build(self._extents, gaussians.count, gaussians.stride)
@@ -65,7 +67,8 @@ class Voxeliser:
         self, gaussians: DeviceGaussians, grid: Grid, by_volume: DeviceArray, gradients: DeviceArray, *,
         add: bool, weight: float = 1.0,
     ) -> None:
-        """Writes ``weight`` × dL/dparameters to ``gradients`` (13, stride), or adds it; call ``forward`` before."""
+        """Writes ``weight`` × dL/d(parameters) to ``gradients`` (13, stride), or adds to them, from the padded
+        dL/d(volume). Call ``forward`` or ``prepare`` with the same Gaussians before."""
         rt = self.rt
         if self._sums.size < gaussians.stride * SUM_FLOATS:
             self._sums = rt.zeros(gaussians.stride * SUM_FLOATS)
@@ -80,7 +83,7 @@ class Voxeliser:
         )  # fmt: skip
 
     def prepare(self, gaussians: DeviceGaussians, grid: Grid, start: tuple[int, int, int]) -> None:
-        """Projects every Gaussian onto the grid: the first step of ``forward``, whose records ``backward`` needs."""
+        """Finds the voxels that every Gaussian touches: the first step of ``forward``, whose results ``backward`` needs."""
         rt, stride = self.rt, gaussians.stride
         if self._records.size < stride * RECORD_FLOATS:
             self._records = rt.empty(stride * RECORD_FLOATS)
@@ -98,12 +101,12 @@ class Voxeliser:
         return self._index[1]
 
     def voxelise(self, rows: np.ndarray, grid: Grid) -> np.ndarray:
-        """Returns the volume (z, y, x) float32 of parameter rows (11, G)."""
+        """Returns the volume (nz, ny, nx) float32 of parameter rows (11, G)."""
         volume = self.forward(DeviceGaussians.upload(self.rt, rows), grid)
         return unpad_rows(self.rt.download(volume), self.shape)
 
     def voxelise_adjoint(self, rows: np.ndarray, grid: Grid, by_volume: np.ndarray) -> np.ndarray:
-        """Returns dL/drows (11, G) for dL/dvolume (z, y, x)."""
+        """Returns dL/d(rows), (11, G), for dL/d(volume), (nz, ny, nx)."""
         gaussians = DeviceGaussians.upload(self.rt, rows)
         self.forward(gaussians, grid)
         gradients = self.rt.zeros((13, gaussians.stride))
@@ -115,9 +118,10 @@ def voxelise(
     rt: Runtime, rows: np.ndarray, grid: Grid, *, cutoff_sigma: float = DEFAULT_CUTOFF_SIGMA,
     brick_bytes: int = _DEFAULT_BRICK_BYTES,
 ) -> np.ndarray:
-    """Returns the complete grid (z, y, x) float32, computed brick by brick with the same bits.
+    """Returns the field (nz, ny, nx) float32 of parameter rows (11, G) on the complete grid, computed brick by brick with
+    the same bits.
 
-    The device holds ``brick_bytes`` of voxels at a time, or less if memory is short."""
+    brick_bytes: bytes of voxels on the device at a time, or fewer if memory is short."""
     for attempt in attempts("voxeliser"):
         with attempt as share:
             volume = _in_bricks(rt, DeviceGaussians.upload(rt, rows), grid, cutoff_sigma, brick_bytes, share)
@@ -152,7 +156,7 @@ def _in_bricks(
 
 
 def _tiles(rt: Runtime, shape: Shape) -> tuple[Shape, Shape]:
-    """Returns size and number of the tiles of a volume (z, y, x), both along x, y, z."""
+    """Returns size and number of the tiles of a volume of ``shape`` (nz, ny, nx), both along x, y, z."""
     nz, ny, nx = shape
     # a GPU's work-group has one work-item for each column (x, y) of a tile
     tile_x = 16 if rt.pixel_items else pitch_of(nx)
@@ -165,7 +169,7 @@ def _forward(rt: Runtime) -> Kernel:
 
 
 def index_matrix(grid: Grid) -> np.ndarray:
-    """Returns the rows (12,) that map a world point (x, y, z) to voxel indices along x, y, z."""
+    """Returns the matrix (3 · 4,) that maps a world point (x, y, z) in mm to voxel indices along x, y, z."""
     matrix = np.zeros((3, 4))
     for row, (first, d) in enumerate(zip(grid.first_centre_mm[::-1], grid.voxel_size_mm[::-1], strict=True)):
         matrix[row, row], matrix[row, 3] = 1 / d, -first / d

@@ -25,7 +25,7 @@ Volume = np.ndarray
 def joseph_image(
     volume: np.ndarray, grid: Grid, pose: np.ndarray, detector_shape: tuple[int, int], is_parallel: bool = False
 ) -> np.ndarray:
-    """Returns the line integrals (nv, nu) of a volume (z, y, x) from one pose (12,)."""
+    """Returns the line integrals (nv, nu) of a volume (nz, ny, nx) in 1/mm from one pose (12,) in mm."""
     image = np.zeros(detector_shape)
     padded = np.pad(volume.astype(np.float64), 1)
     for index, points, step_mm in _rays(grid, pose, np.ones(detector_shape, bool), is_parallel):
@@ -35,8 +35,7 @@ def joseph_image(
 
 
 def joseph_adjoint(image: np.ndarray, grid: Grid, pose: np.ndarray, is_parallel: bool = False) -> np.ndarray:
-    """Returns the transpose of ``joseph_image``: pixels (nv, nu) onto a volume (z, y, x), a corner of each sample at a
-    time."""
+    """Returns the transpose of ``joseph_image``: pixels (nv, nu) backprojected to a volume (nz, ny, nx)."""
     padded = np.zeros([n + 2 for n in grid.shape])
     for index, points, step_mm in _rays(grid, pose, image != 0, is_parallel):
         touching = np.all((points > -1) & (points < grid.shape[::-1]), axis=1)
@@ -52,7 +51,8 @@ def joseph_adjoint(image: np.ndarray, grid: Grid, pose: np.ndarray, is_parallel:
 def ray_frame(
     volume: np.ndarray, grid: Grid, table: TimeCells, detector_shape: tuple[int, int], model: str = "log"
 ) -> np.ndarray:
-    """Returns the merged frame (rows, columns) of a volume (z, y, x): the weighted lines of each cell's image, added up."""
+    """Returns the frame (rows, columns) of a volume (nz, ny, nx) in 1/mm, merged over the time cells of ``table``. model:
+    log averages line integrals, intensity averages intensities."""
     frame = np.zeros(detector_shape)
     for cell in range(table.count):
         image = joseph_image(volume, grid, table.pose[cell], detector_shape, table.is_parallel)
@@ -63,7 +63,7 @@ def ray_frame(
 
 
 def ray_volume(frame: np.ndarray, grid: Grid, table: TimeCells) -> np.ndarray:
-    """Returns the transpose of ``ray_frame`` with the log model: a frame (rows, columns) onto a volume (z, y, x)."""
+    """Returns the transpose of ``ray_frame`` with the log model: a frame (rows, columns) to a volume (nz, ny, nx)."""
     volume = np.zeros(grid.shape)
     for cell in range(table.count):
         image = np.zeros(frame.shape)
@@ -75,7 +75,7 @@ def ray_volume(frame: np.ndarray, grid: Grid, table: TimeCells) -> np.ndarray:
 
 def intensity_volume(frame: np.ndarray, volume: np.ndarray, grid: Grid, table: TimeCells) -> np.ndarray:
     """Returns the transpose of d(``ray_frame``)/d(volume) with the intensity model at ``volume``: a frame (rows, columns)
-    onto a volume (z, y, x)."""
+    to a volume (nz, ny, nx)."""
     result = np.zeros(grid.shape)
     for cell, share in _shares(volume, grid, table, frame.shape):
         result += joseph_adjoint(share * frame, grid, table.pose[cell], table.is_parallel)
@@ -85,7 +85,7 @@ def intensity_volume(frame: np.ndarray, volume: np.ndarray, grid: Grid, table: T
 def _shares(
     volume: np.ndarray, grid: Grid, table: TimeCells, detector_shape: tuple[int, ...]
 ) -> Iterator[tuple[int, np.ndarray]]:
-    """Yields each cell and its share (rows, columns) of a pixel's light, 0 on lines that it does not serve."""
+    """Yields each cell and its fraction (rows, columns) of a pixel's light, 0 on lines that the cell does not serve."""
     shape = (detector_shape[0], detector_shape[1])
     total = np.exp(-ray_frame(volume, grid, table, shape, "intensity"))
     for cell in range(table.count):
@@ -103,7 +103,8 @@ def _lines(table: TimeCells, cell: int) -> tuple[slice, slice]:
 def _rays(
     grid: Grid, pose: np.ndarray, wanted: np.ndarray, is_parallel: bool
 ) -> Iterator[tuple[tuple[int, ...], np.ndarray, float]]:
-    """Yields (pixel, sample points (n, 3) as voxel indices x y z, length of ray per sample in mm) of the wanted pixels."""
+    """Yields (pixel, sample points (n, 3) as voxel indices x y z, length of ray per sample in mm) for the pixels
+    ``wanted``."""
     pitch, first = np.array(grid.voxel_size_mm[::-1]), np.array(grid.first_centre_mm[::-1])
     pixels = (pixel_centres(pose, wanted.shape) - first) / pitch
     source = (pose[:3] - first) / pitch
@@ -123,9 +124,10 @@ def backprojection(
     frames: np.ndarray, pose: np.ndarray, weight: np.ndarray, grid: Grid, is_parallel: bool = False,
     push_mm: np.ndarray | None = None, power: int = 2,
 ) -> np.ndarray:
-    """Returns Σ_f weight_f / z^power · frame_f(u, v); frames (F, rows, columns), pose (F, 12) mm, weight (F,) → (z, y, x).
+    """Returns the volume (nz, ny, nx) Σ_f weight_f / z^power · frame_f(u, v), for frames (F, rows, columns), pose (F, 12)
+    mm and weight (F,), as ``backproject`` does.
 
-    push_mm: (F, z, y, x, 3) displacement, components x, y, z, of the matter of each voxel at the time of a frame."""
+    push_mm: (F, nz, ny, nx, 3) displacement, components x, y, z, of the matter of each voxel at the time of a frame."""
     volume = np.zeros(grid.shape)
     pushes: Iterable[np.ndarray | float] = [0.0] * len(frames) if push_mm is None else push_mm
     for frame, one, share, moved in zip(frames.astype(np.float64), pose, weight, pushes, strict=True):
@@ -139,8 +141,8 @@ def lines_backprojection(
     frames: np.ndarray, pose: np.ndarray, weight: np.ndarray, grid: Grid, axis: str = "rows",
     is_parallel: bool = False, push_mm: np.ndarray | None = None, power: int = 2,
 ) -> np.ndarray:
-    """Returns the backprojection with one pose per line, pose (F, lines, 12) mm, by the definition in
-    ``backproject_lines``."""
+    """Returns the volume (nz, ny, nx) of ``backproject_lines`` by its definition. pose (F, lines, 12) in mm; other
+    arguments as in ``backprojection``."""
     speed_power = 2 if axis == "columns" and power == 2 else 1
     if axis == "columns":
         frames, pose = frames.transpose(0, 2, 1), transpose_pose(pose)
@@ -160,10 +162,11 @@ def lines_backprojection(
 def detector_position(
     pose: np.ndarray, grid: Grid, is_parallel: bool = False, push_mm: np.ndarray | float = 0.0
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Returns pixel column, row and depth (z, y, x) of voxel centres, displaced by ``push_mm`` (z, y, x, 3) in mm.
+    """Returns pixel column, pixel row and depth, (nz, ny, nx) each, of voxel centres displaced by ``push_mm`` (nz, ny,
+    nx, 3).
 
-    Solves x − s = depth (d00 + u eu + v ev). In a parallel beam x − first pixel = u eu + v ev + t direction, and the depth
-    is 1."""
+    Solves x − s = depth (d00 + u eu + v ev). In a parallel beam x − first pixel = u eu + v ev + t direction, and the
+    depth is 1."""
     z, y, x = np.meshgrid(*grid.axes_mm(), indexing="ij")
     if isinstance(push_mm, np.ndarray):
         x, y, z = x + push_mm[..., 0], y + push_mm[..., 1], z + push_mm[..., 2]
@@ -183,7 +186,8 @@ def detector_position(
 def _seen(
     frame: np.ndarray, u: np.ndarray, ahead: np.ndarray, depth: np.ndarray, power: int, speed_power: int
 ) -> float:
-    """Returns what one voxel receives from a frame; u, ahead and depth are (lines,), one pose each."""
+    """Returns what a frame adds to one voxel. For the pose of each line: u (lines,), pixel along the line; ahead
+    (lines,), lines from that line to the voxel; depth (lines,)."""
     crossing = np.flatnonzero((ahead[:-1] >= 0) & (ahead[1:] <= 0))
     if crossing.size == 0 or depth.min() <= 0:
         return 0.0
@@ -206,8 +210,8 @@ def _bilinear(frame: np.ndarray, v: np.ndarray, u: np.ndarray) -> np.ndarray:
 
 
 def warp_forward(volume: Volume, displacement: np.ndarray) -> Volume:
-    """Returns v(y + w(y)) (nz, ny, nx) by cubic splines, 0 further than ``_REACH`` outside, for w (nz, ny, nx, 3) in
-    voxels, components x, y, z."""
+    """Returns v(y + w(y)), (nz, ny, nx), by cubic splines, for w (nz, ny, nx, 3) in voxels, components x, y, z. It is 0
+    further than ``_REACH`` voxels outside of the volume."""
     padded = _coefficients(np.pad(np.asarray(volume, np.float64), _BORDER))
     result = np.zeros(volume.shape)
     for place, weight in _taps(displacement):
@@ -234,7 +238,7 @@ def _coefficients(values: Volume) -> Volume:
 
 
 def _taps(displacement: np.ndarray) -> Iterator[tuple[tuple[np.ndarray, ...], np.ndarray]]:
-    """Yields indices into the volume with its border, and weights, for the neighbours of each place."""
+    """Yields indices into the volume with its border, and spline weights, of the neighbours of each displaced voxel."""
     shape = displacement.shape[:3]
     places = np.indices(shape) + np.moveaxis(np.asarray(displacement, np.float64), -1, 0)[::-1]
     sides = np.reshape(shape, (3, 1, 1, 1))
@@ -248,7 +252,8 @@ def _taps(displacement: np.ndarray) -> Iterator[tuple[tuple[np.ndarray, ...], np
 
 
 def moved_rows(rows: np.ndarray, deformation: Deformation, weights: np.ndarray) -> np.ndarray:
-    """Returns parameter rows (11, G) of a reference in one state, of ``weights`` (R,); densities keep their peaks."""
+    """Returns parameter rows (11, G) of a reference's Gaussians in the state with field weights (R,); densities keep
+    their peaks."""
     mean = rows[MEAN].T + deformation.inverse_mm(rows[MEAN].T, weights)
     for _ in range(2):  # Newton steps: differences of frames need more digits
         off = mean + deformation.displacement_mm(mean, weights) - rows[MEAN].T
@@ -262,7 +267,8 @@ def moved_rows(rows: np.ndarray, deformation: Deformation, weights: np.ndarray) 
 def deformed_frame(
     rows: np.ndarray, table: TimeCells, detector_shape: tuple[int, int], deformation: Deformation, affine: bool = False
 ) -> np.ndarray:
-    """Returns the merged frame (nv, nu) of a reference's parameter rows (11, G), whose cells see it in their own states."""
+    """Returns the merged frame (nv, nu) of a reference's parameter rows (11, G), which each cell sees in the state at its
+    time."""
 
     def cloud_at(time_s: float) -> np.ndarray:
         return moved_rows(rows, deformation, deformation.weights_at(time_s)[0])

@@ -29,7 +29,7 @@ def splat_image(
     rows: np.ndarray, pose: np.ndarray, detector_shape: tuple[int, int], cutoff_sigma: float = 0.0,
     affine: bool = False, is_parallel: bool = False,
 ) -> np.ndarray:
-    """Returns one static projection (nv, nu) of parameter rows (11, G) from one pose (12,)."""
+    """Returns the frame (nv, nu) of parameter rows (11, G) from one pose (12,), at rest."""
     image = np.zeros(detector_shape)
     if is_parallel:
         for row, precision in zip(rows.T, precision_matrices(rows), strict=True):
@@ -70,8 +70,8 @@ def _exact(
 def _in_parallel(
     row: np.ndarray, precision: np.ndarray, pose: np.ndarray, detector_shape: tuple[int, int], cutoff_sigma: float
 ) -> np.ndarray:
-    """Returns the exact line integrals along parallel rays: density sqrt(2π/a) exp(−q/2) with q the smallest along the
-    ray."""
+    """Returns one Gaussian's line integrals (nv, nu) along parallel rays: density √(2π/a) exp(−q/2), with q the smallest
+    along the ray."""
     offset = pixel_centres(pose, detector_shape) - row[:3]
     a = pose[:3] @ precision @ pose[:3]
     b = np.einsum("vui,ij,j->vu", offset, precision, pose[:3])
@@ -84,7 +84,8 @@ def _affine(
     row: np.ndarray, precision: np.ndarray, pose: np.ndarray, detector_shape: tuple[int, int],
     cutoff_sigma: float,
 ) -> np.ndarray:
-    """Returns R2-Gaussian's splat: covariance through the Jacobian at the centre, amplitude of the central ray."""
+    """Returns one Gaussian's frame (nv, nu) by R2-Gaussian's approximation: covariance through the Jacobian at the
+    centre, amplitude of the central ray."""
     source, eu, ev = pose[:3], pose[6:9], pose[9:12]
     centre = row[:3] - source
     inverse = np.linalg.inv(np.stack([eu, ev, pose[3:6] - source], -1))
@@ -106,8 +107,8 @@ def splat_frame(
     rows: np.ndarray, table: TimeCells, detector_shape: tuple[int, int], cutoff_sigma: float = 0.0,
     affine: bool = False,
 ) -> np.ndarray:
-    """Returns the frame (rows, columns) of the paper's Eq. 3 unfused: renders each cell's whole projection, weighs it, cuts
-    out the cell's lines and adds them up."""
+    """Returns the frame (rows, columns) of the paper's Eq. 3, one cell at a time: renders the cell's whole projection,
+    weighs it, cuts out the cell's lines and adds them up."""
     frame = np.zeros(detector_shape)
     for cell in range(table.count):
         lines = slice(int(table.line_start[cell]), int(table.line_stop[cell]))
@@ -123,7 +124,8 @@ def splat_frame(
 def voxel_field(
     rows: np.ndarray, z: np.ndarray, y: np.ndarray, x: np.ndarray, cutoff_sigma: float = 0.0
 ) -> np.ndarray:
-    """Returns the field (nz, ny, nx) of parameter rows (11, G) at axes z, y, x, by direct evaluation."""
+    """Returns the field (nz, ny, nx) of parameter rows (11, G) at the axes z, y, x, in the rows' unit of length, by
+    direct evaluation."""
     points = np.stack(np.meshgrid(x, y, z, indexing="ij"), -1).transpose(2, 1, 0, 3)
     volume = np.zeros(points.shape[:3])
     for row, precision in zip(rows.T, precision_matrices(rows), strict=True):
@@ -158,8 +160,8 @@ def moving_frame(
     """Returns the merged frame (nv, nu) of parameter rows (11, G) over cells with motion, or over cells with a
     ``conic_pose``.
 
-    A cell with a ``conic_pose`` is a segment without a path: the splat of that pose, with its centre where the cell's pose
-    has it. ``cloud_at`` gives the rows at a time in s, of an object that moves."""
+    A cell with a ``conic_pose`` is a segment without a path: the splat keeps the shape of that pose, at the centre that
+    the cell's pose gives. cloud_at: returns the rows at a time in s, for an object that moves."""
     moved = table.conic_pose is not None
     poses, end_poses, line_times = _centre_segments(table) if moved else (table.pose, table.end_poses, table.line_times)
     assert end_poses is not None and line_times is not None
@@ -180,7 +182,8 @@ def moving_frame(
 
 
 def _centre_segments(table: TimeCells) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Returns the conic's pose (C, 12), each cell's own pose twice (C, 2, 12), and lines that see one time (C, 3, lines)."""
+    """Returns the conic's pose for each cell (C, 12), each cell's own pose twice (C, 2, 12), and integration times (C, 3,
+    lines) of one instant."""
     times = np.zeros((table.count, 3, table.lines))
     for cell, lines in enumerate(table.ranges):
         times[cell, 2, lines] = table.weight[cell]
@@ -238,13 +241,14 @@ def _segment_image(
 
 
 def _exponent(s: _Segment, delta: np.ndarray, at: np.ndarray, big_q: np.ndarray) -> np.ndarray:
-    """Returns q (lines, width) where the centre has moved by the path times ``at`` (lines, 1 or width)."""
+    """Returns the exponent q (lines, width) of a segment whose centre has moved by its path times ``at`` (lines, 1 or
+    width)."""
     moved = delta - at[..., None] * s.path
     return np.asarray(np.einsum("...i,ij,...j", moved, s.conic, moved) / big_q)
 
 
 def _nearest(s: _Segment, delta: np.ndarray, times: np.ndarray, big_q: np.ndarray) -> np.ndarray:
-    """Returns the smallest q (lines, width) within each line's window."""
+    """Returns the smallest exponent q (lines, width) within each line's window."""
     fast = s.path @ s.conic @ s.path
     best = delta @ s.conic @ s.path / fast if fast > 0 else np.zeros(delta.shape[:2])
     first, last = (times[0] - times[1])[:, None], (times[0] + times[1])[:, None]

@@ -26,17 +26,17 @@ _HELD_STATES = 3  # most states whose displacements stay on the device
 
 
 class MovingBackprojector:
-    """FDK's backprojection for the states of an object that moves.
+    """Backprojects the frames of an object that moves, as FDK does.
 
-    shares (F, K): the share of each state in a frame, at most two above 0. Holds up to nine volumes on the device. A call
-    raises InputError where a field has no inverse."""
+    shares (F, K): the fraction of each of K states in a frame, at most two above 0. Holds up to nine volumes on the
+    device. Calls raise InputError where a field has no inverse."""
 
     def __init__(self, rt: Runtime, states: MotionStates, shares: np.ndarray) -> None:
         self.rt, self.states, self.shares = rt, states, shares
         self._push = lru_cache(_HELD_STATES)(self._push_of)
 
     def of_views(self, views: np.ndarray) -> "MovingBackprojector":
-        """Returns the backprojector of some of the views, by their numbers (n,)."""
+        """Returns the backprojector of the views with the numbers ``views`` (n,)."""
         some = copy(self)  # which shares the displacements on the device
         some.shares = self.shares[views]
         return some
@@ -45,8 +45,8 @@ class MovingBackprojector:
         self, frames: np.ndarray, pose: np.ndarray, weight: np.ndarray, grid: Grid, axis: str = "rows", *,
         is_parallel: bool = False,
     ) -> np.ndarray:  # fmt: skip
-        """Returns the backprojection (nz, ny, nx) float32 as ``backproject`` does, or ``backproject_lines`` with a pose for
-        every line. frames (F, rows, columns), pose (F, 12) or (F, lines, 12) mm, weight (F,)."""
+        """Returns the backprojection (nz, ny, nx) float32: that of ``backproject``, or of ``backproject_lines`` with a
+        pose per line. frames (F, rows, columns), pose (F, 12) or (F, lines, 12) mm, weight (F,)."""
         volume, pairs = np.zeros(grid.shape, np.float32), _pairs(self.shares)
         for first, second in np.unique(pairs, axis=0).tolist():
             views = np.flatnonzero((pairs == (first, second)).all(1))
@@ -58,8 +58,7 @@ class MovingBackprojector:
         self, pair: tuple[int, int], frames: np.ndarray, pose: np.ndarray, weights: np.ndarray, grid: Grid, axis: str,
         is_parallel: bool,
     ) -> np.ndarray:  # fmt: skip
-        """Backprojects the frames that blend one pair of states; weights (F, 2): FDK's, and the share of the second
-        state."""
+        """Backprojects the frames between one pair of states. weights (F, 2): FDK's, and the second state's fraction."""
         rt, fields = self.rt, [self._push(state) for state in pair]
         size, by_lines = np.array([*grid.shape[::-1], 0], np.int32), pose.ndim == 3
         turned = by_lines and axis == "columns"
@@ -81,8 +80,8 @@ class MovingBackprojector:
         return result
 
     def _push_of(self, state: int) -> DeviceArray:
-        """Returns u, the displacement of a state's matter from its reference, (3, nz, ny, nx) in voxels, components x, y, z.
-        Raises InputError where the field has no inverse."""
+        """Returns the displacement u of a state's matter from the reference, (3, nz, ny, nx) in voxels, components x, y,
+        z. Raises InputError where the field has no inverse."""
         rt, grid = self.rt, self.states.grid
         pull_mm, wide, margin = self._wide_pull_mm(state)
         spacing_mm = np.array(grid.voxel_size_mm[::-1])
@@ -97,8 +96,8 @@ class MovingBackprojector:
         return push
 
     def _wide_pull_mm(self, state: int) -> tuple[np.ndarray, Grid, tuple[int, int, int]]:
-        """Returns w (…, 3) in mm on a grid wide enough for the grid's matter to move in, that grid, and how many voxels (z,
-        y, x) it has before the grid's first."""
+        """Returns the field w (…, 3) in mm on a wider grid, which holds the grid's matter wherever it moves; that wider
+        grid; and its voxels (z, y, x) before the grid's first."""
         grid, weights = self.states.grid, self.states.weights[state]
         reach_mm = np.abs(np.tensordot(weights, self.states.fields_mm, 1)).max((0, 1, 2))[::-1]
         margin = np.ceil(1.5 * reach_mm / grid.voxel_size_mm).astype(int) + 1
@@ -108,7 +107,7 @@ class MovingBackprojector:
         return self.states.deformation.on_grid_mm(wide, weights), wide, (z, y, x)
 
     def _check_inverse(self, state: int, push_mm: np.ndarray) -> None:
-        """Raises InputError where u, push_mm (voxels, 3), does not invert the deformation at some voxels."""
+        """Raises InputError where u, push_mm (voxels, 3), does not invert the deformation at some probed voxels."""
         grid = self.states.grid
         probed = np.linspace(0, len(push_mm) - 1, min(_PROBED, len(push_mm))).astype(int)
         z, y, x = (axis[i] for axis, i in zip(grid.axes_mm(), np.unravel_index(probed, grid.shape), strict=True))
@@ -120,7 +119,7 @@ class MovingBackprojector:
 
 
 def _pairs(shares: np.ndarray) -> np.ndarray:
-    """Returns the two states (F, 2) of every frame; a frame with one state has it twice."""
+    """Returns the two states (F, 2) of every frame from shares (F, K); a frame with one state has it twice."""
     largest = np.argsort(-shares, axis=1, kind="stable")
     second = largest[:, min(1, shares.shape[1] - 1)]
     has_two = shares[np.arange(len(shares)), second] > 0

@@ -39,12 +39,12 @@ _SETTLES = 8  # width in voxels of further zeros around it, over which coefficie
 
 
 class WarpedOperator:
-    """Ray-driven projector of an object that moves as the states of ``warp`` do; a ``LinearOperator``.
+    """Projects an object that moves as the states of ``warp`` do; a ``LinearOperator``.
 
-    Arguments and arrays are those of ``RayOperator``; with a ``StateStack`` volumes are stacks (K, nz, ny, nx). The volume
-    must fit on the device as a whole. ``forward`` warps the volume once for each state that the operator's frames use.
-    Operators of one ``warp`` or ``memory`` share buffers: use them one at a time. Calls raise OutOfMemoryError where the
-    volume fits in bricks only."""
+    Other arguments and arrays are those of ``RayOperator``; with a ``StateStack`` volumes are stacks (K, nz, ny, nx).
+    ``forward`` warps the volume once for each state that the operator's frames use. Operators of one ``warp`` or
+    ``memory`` share buffers: use them one at a time. Calls raise OutOfMemoryError where the whole volume does not fit on
+    the device."""
 
     def __init__(
         self, rt: Runtime, grid: Grid, detector_shape: tuple[int, int], tables: Sequence[TimeCells], *,
@@ -77,15 +77,15 @@ class WarpedOperator:
             self.warp.stack.add(part.places, frames)
 
     def backprojections(self, frames: DeviceArray) -> Iterator[tuple[int, DeviceArray]]:
-        """Yields each state k that frames use, and P_kᵀ y (nz, ny, nx) of frames (F, rows, columns); the next one overwrites
-        it."""
+        """Yields each state k that frames use, and P_kᵀ y (nz, ny, nx) of frames y (F, rows, columns), valid until the
+        next step."""
         for part in self._parts:
             taken = self.warp.stack.take(frames, part.frames)
             yield part.state, part.operator.adjoint(taken, out=self.warp.moved())
 
     @property
     def states(self) -> list[int]:
-        """The states that frames use."""
+        """The numbers of the states that this operator's frames use."""
         return [part.state for part in self._parts]
 
     def adjoint(self, frames: SameArray, out: SameArray | None = None) -> SameArray:
@@ -102,8 +102,8 @@ class WarpedOperator:
         self, function: Callable[[DeviceArray, DeviceArray], None], values: SameArray, shape: tuple[int, ...],
         out: SameArray | None,
     ) -> SameArray:  # fmt: skip
-        """Returns the result of ``function(values, result)`` on the device, where the values lie. Raises OutOfMemoryError
-        where the volume fits in bricks only."""
+        """Calls ``function(values, result)`` on the device. Returns the result where ``values`` lie. Raises
+        OutOfMemoryError where the whole volume does not fit."""
         if (bricks := len(self.memory.plan())) > 1:
             found = f"room for the volume in {bricks} bricks"
             expected = "room for the whole volume, which an object that moves needs"
@@ -120,7 +120,8 @@ class WarpedOperator:
         return out
 
     def subset(self, frames: Sequence[int]) -> "WarpedOperator":
-        """Returns the operator of some of the frames, in this order. Keep it if you use it again: it keeps its tables."""
+        """Returns the operator for the frames with the numbers ``frames``, in the order given. Keep it to use it again,
+        because it uploads tables."""
         chosen = np.asarray(frames, np.int64)
         part = copy(self)
         part._parts = [piece for each in self._parts if (piece := each.subset(self.rt, chosen)) is not None]
@@ -134,14 +135,14 @@ class WarpedOperator:
 
 
 class _Part:
-    """The projector P_k of one state, for the frames (n,) of the stack that use it."""
+    """The projector P_k of one state, and the numbers ``frames`` (n,) of the operator's frames that use the state."""
 
     def __init__(self, rt: Runtime, state: int, frames: np.ndarray, operator: RayOperator) -> None:
         self.state, self.frames, self.operator = state, frames, operator
         self.places = rt.upload(frames, np.int32)
 
     def subset(self, rt: Runtime, chosen: np.ndarray) -> "_Part | None":
-        """Returns the part of the ``chosen`` frames of the stack; None where none of them uses the state."""
+        """Returns the part of the operator's frames ``chosen``; None where none of them uses the state."""
         position = np.full(max(int(chosen.max()), int(self.frames.max())) + 1, -1)
         position[self.frames] = np.arange(len(self.frames))
         own = position[chosen]
@@ -153,11 +154,12 @@ def projector_of(
     rt: Runtime, grid: Grid, tables: Sequence[TimeCells], deformation: Deformation | None,
     state_times_s: np.ndarray | None = None,
 ) -> Callable[..., RayOperator | WarpedOperator]:
-    """Returns a constructor of projectors for an object that moves as ``deformation`` does at the times of ``tables``, or
-    that changes between states at ``state_times_s`` (K,).
+    """Returns a constructor of projectors, with the arguments of ``RayOperator``; ``RayOperator`` itself for an object at
+    rest.
 
-    The nearest state stands for a cell: a blend of two would blur, and project every cell twice. The constructor takes the
-    arguments of ``RayOperator``, which it is for an object at rest."""
+    deformation: how the object moves, at the times of ``tables``; or state_times_s (K,): times in s of the states of an
+    object that changes. Each cell takes the nearest state: a blend of two states would blur, and project every cell
+    twice."""
     if state_times_s is not None:
         return partial(WarpedOperator, warp=StateStack(rt, grid.shape, TimeStates(state_times_s)))
     if deformation is None:
@@ -171,7 +173,8 @@ def projector_of(
 def _tables_by_state(
     tables: Sequence[TimeCells], warp: VolumeWarp | StateStack
 ) -> list[tuple[np.ndarray, list[TimeCells]]]:
-    """Returns for each state the frames that use it, and tables of their cells, weighted by the state's share."""
+    """Returns for each state the numbers of the frames that use it, and tables of their cells, weighted by the state's
+    fraction."""
     ends = np.cumsum([table.count for table in tables])[:-1]
     shares = np.split(warp.states.shares(np.concatenate([table.time_s for table in tables])), ends)
     by_state = []
@@ -190,10 +193,11 @@ def _with_share(table: TimeCells, share: np.ndarray) -> TimeCells | None:
 
 
 class FieldDerivative:
-    """The derivative of frames at one volume (nz, ny, nx) in 1/mm and at the field of ``operator``; shares of states are
-    constants.
+    """Derivative J of the frames at one volume (nz, ny, nx) in 1/mm and at the field of ``operator``. The states'
+    fractions of a time count as constants.
 
-    Coefficients (R, cz, cy, cx, 3) are in mm as those of a ``Deformation``. Holds three volumes per state on the host."""
+    Coefficients (R, cz, cy, cx, 3) are in mm, as those of a ``Deformation``. Holds three volumes per state on the
+    host."""
 
     def __init__(self, operator: WarpedOperator, volume: np.ndarray) -> None:
         assert isinstance(operator.warp, VolumeWarp)
@@ -213,7 +217,7 @@ class FieldDerivative:
         return self._projected(lambda k: np.tensordot(self.weights[k].astype(np.float32), fields_mm, 1))
 
     def adjoint(self, frames: np.ndarray) -> np.ndarray:
-        """Returns Jᵀ y (R, cz, cy, cx, 3) float64 of frames (F, rows, columns)."""
+        """Returns Jᵀ y, (R, cz, cy, cx, 3) float64, for frames y (F, rows, columns)."""
         rt = self.operator.rt
         by_field = np.zeros_like(self._fields_mm)
         for k, volume in self.operator.backprojections(rt.upload(frames, np.float32)):
@@ -226,7 +230,7 @@ class FieldDerivative:
         ]).astype(np.float64)  # fmt: skip
 
     def by_weights(self) -> np.ndarray:
-        """Returns the change of the frames (R, F, rows, columns) float32 for a unit of each weight at all times."""
+        """Returns d(frames)/d(weight φ_r), (R, F, rows, columns) float32, for a weight that changes alike at all times."""
         return np.stack([self._projected(dict.fromkeys(self.slopes, field).__getitem__) for field in self._fields_mm])
 
     def _projected(self, field_of: Callable[[int], np.ndarray]) -> np.ndarray:
@@ -246,8 +250,8 @@ class FieldDerivative:
 
 
 def warp_slopes(volume: np.ndarray, displacement: np.ndarray) -> np.ndarray:
-    """Returns ∇v(y + w(y)), (nz, ny, nx, 3) float32 per voxel in the order x, y, z, of the cubic spline through v (nz, ny,
-    nx), which is 0 outside. w (nz, ny, nx, 3) is in voxels, components x, y, z."""
+    """Returns ∇v(y + w(y)), (nz, ny, nx, 3) float32 per voxel, components x, y, z, of the cubic spline through v (nz, ny,
+    nx). The spline is 0 outside. w (nz, ny, nx, 3) is in voxels, components x, y, z."""
     wide = scipy.ndimage.spline_filter(np.pad(volume, _BORDER + _SETTLES), output=np.float32)
     padded = np.ascontiguousarray(wide[(slice(_SETTLES, -_SETTLES),) * 3])
     strides = (padded.shape[1] * padded.shape[2], padded.shape[2], 1)

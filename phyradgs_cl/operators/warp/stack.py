@@ -11,7 +11,7 @@ from phyradgs_cl.runtime.layout import GUARD
 
 @dataclass(frozen=True, eq=False)
 class TimeStates:
-    """States at some times (K,) in s, rising. The state nearest in time stands for a time."""
+    """States of an object at times (K,) in s, rising. The state nearest in time stands for any time."""
 
     times_s: np.ndarray
 
@@ -21,13 +21,13 @@ class TimeStates:
         return len(self.times_s)
 
     def shares(self, times_s: np.ndarray) -> np.ndarray:
-        """Returns the share of each state (T, K) at times (T,): 1 of the nearest one."""
+        """Returns the fraction of each state (T, K) at times (T,): 1 for the nearest, else 0."""
         borders_s = (self.times_s[1:] + self.times_s[:-1]) / 2
         return np.asarray(np.eye(self.count)[np.searchsorted(borders_s, times_s, "right")])
 
 
 class StateStack:
-    """W_k x = x_k of a stack x (K, nz, ny, nx), with the methods of a ``VolumeWarp``."""
+    """Picks states from a stack x (K, nz, ny, nx): W_k x = x_k, with the methods of a ``VolumeWarp``."""
 
     volumes = 2  # most stacks x on the device
 
@@ -46,7 +46,7 @@ class StateStack:
         return stack
 
     def forward(self, state: int, source: DeviceArray) -> DeviceArray:
-        """Returns state k (nz, ny, nx); the next call overwrites it."""
+        """Returns state k (nz, ny, nx) of the stack ``source``, valid until the next call."""
         self.rt.copy(source, self._one, nbytes=4 * self._voxels, source_offset=4 * self._voxels * state)
         return self.moved()
 
@@ -55,14 +55,14 @@ class StateStack:
         return DeviceArray(self._one.buffer, self._one_shape, self._one.dtype)
 
     def zeros(self) -> DeviceArray:
-        """Returns a stack of zeros; the next call overwrites it."""
+        """Returns a stack (K, nz, ny, nx) of zeros, valid until the next call."""
         if self._total is None:
             self._total = self.rt.empty(self.shape)
         self.rt.fill(self._total, 0)
         return self._total
 
     def adjoint(self, state: int, moved: DeviceArray, total: DeviceArray) -> None:
-        """Writes W_kᵀ v into ``total``, where state k is zero before: no two parts of an operator have the same state."""
+        """Writes W_kᵀ v into state k of ``total``, which must be zero: no two parts of an operator have the same state."""
         self.rt.copy(moved, total, nbytes=4 * self._voxels, target_offset=4 * self._voxels * state)
 
     def read(self, total: DeviceArray, result: DeviceArray) -> None:

@@ -18,11 +18,12 @@ _MOVES = 0.1  # a voxel counts as moving if its squared displacement is at least
 
 @dataclass(frozen=True, eq=False)
 class MotionStates:
-    """States of ``deformation``, and which of them stand for a time.
+    """Representative states of ``deformation``, and which of them stand for a time.
 
     fields_mm: (R, nz, ny, nx, 3) displacements of unit weight on ``grid``, components x, y, z. weights: (K, R), the
-    fields' in each state. metric: (R, R); the distance of two weights is √(dᵀ metric d), an RMS displacement in voxels.
-    blends: whether two states are blended for a time between them; else the nearest one stands for it."""
+    fields' weights in each state. metric: (R, R); the distance of two states is √(dᵀ metric d), an RMS displacement in
+    voxels, for a difference d of weights. blends: whether a time between two states gets a blend of both, else the
+    nearest state."""
 
     deformation: Deformation
     grid: Grid
@@ -36,10 +37,11 @@ class MotionStates:
         cls, deformation: Deformation, grid: Grid, times_s: np.ndarray, least_voxels: float = 0.0, blends: bool = True,
         most: int = MOST_STATES,
     ) -> "MotionStates":  # fmt: skip
-        """Chooses at most ``most`` states for times (T,) in s: each next one is the time furthest from the states so far.
+        """Chooses at most ``most`` states for times (T,) in s: each next state is that of the time furthest from the
+        states so far.
 
-        least_voxels: displacement per unit of every weight that is added in the distances, so that fields of zeros have
-        several states too."""
+        least_voxels: displacement in voxels per unit of every weight, added in the distances, so that fields of zeros
+        have several states too."""
         units, fields_mm = np.eye(deformation.rank), unit_fields_mm(deformation, grid)
         voxel_mm = min(grid.voxel_size_mm)
         seen = np.unique(deformation.weights_at(times_s), axis=0)
@@ -70,19 +72,19 @@ class MotionStates:
         return self.count == 1 and self.is_still(0)
 
     def is_still(self, state: int) -> bool:
-        """Returns whether nothing is displaced in a state."""
+        """Returns whether state ``state`` displaces nothing."""
         return not np.any(self._has_effect & (self.weights[state] != 0))
 
     @cached_property
     def _has_effect(self) -> np.ndarray:
-        """Whether each field displaces anything, (R,) bool."""
+        """Whether each field displaces any voxel, (R,) bool."""
         return np.array([field.any() for field in self.fields_mm])
 
     def shares(self, times_s: np.ndarray | Sequence[float]) -> np.ndarray:
-        """Returns the share of each state (T, K) at times (T,) in s; at most two of a row are above 0, and their sum is 1.
+        """Returns the fraction of each state (T, K) at times (T,) in s. A row sums to 1, with at most two states above 0.
 
-        A blend takes the pair with the smallest error. It is the sum of two, in voxels: the distance of the time's weights
-        from the line between the two states, and the blur of blending two volumes that are displaced against each other."""
+        A blend takes the pair of states with the smallest error. This error, in voxels, adds two: the distance of the
+        time's weights from the line between both states, and the blur of two volumes displaced against each other."""
         wanted = self.deformation.weights_at(times_s)
         if not self.blends:
             distances = np.stack([_length(wanted - weights, self.metric) for weights in self.weights], -1)

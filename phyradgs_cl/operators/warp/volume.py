@@ -18,12 +18,12 @@ _ROUNDING = 1e-3  # margin in voxels around the range of displacements along z, 
 
 
 class VolumeWarp:
-    """(W_k v)(y) = v(y + w_k(y)), 0 outside the volume, for the states of ``states``.
+    """Warps a volume v to each state k of ``states``: (W_k v)(y) = v(y + w_k(y)), 0 outside the volume.
 
     Cubic splines through the voxels hardly blur: W_k = B_k F E puts the volume between zeros (E), solves for its spline's
-    coefficients (F) and samples the spline (B_k). F is its own transpose.
-    Holds 3 R volumes on the device for the R fields; a state's displacement is their weighted sum, made where it is used.
-    Results have the same bits in every run: no sum depends on the order of work-items."""
+    coefficients (F) and samples the spline (B_k). F is its own transpose. Holds 3 R volumes on the device for the R
+    fields; a state's displacement is their weighted sum, made where it is used. Results have the same bits in every run:
+    no sum depends on the order of work-items."""
 
     def __init__(self, rt: Runtime, states: MotionStates) -> None:
         self.rt, self.states, self.shape = rt, states, states.grid.shape
@@ -42,11 +42,11 @@ class VolumeWarp:
     volumes = 4  # most volumes on the device, besides the displacement fields
 
     def is_still(self, state: int) -> bool:
-        """Whether W_k is the identity."""
+        """Returns whether W_k is the identity for state k."""
         return self.states.is_still(state)
 
     def source(self, volume: DeviceArray) -> DeviceArray:
-        """Returns the spline's coefficients of a volume (nz, ny, nx); the next call overwrites them."""
+        """Returns F E v, the spline's coefficients of a volume v (nz, ny, nx), valid until the next call."""
         if self._source is None:
             self._source = self.rt.empty(self._floats)
         self.rt.fill(self._source, 0)
@@ -55,7 +55,8 @@ class VolumeWarp:
         return self._source
 
     def _filter(self, values: DeviceArray) -> None:
-        """Applies F in place. Its planes are whole rows: their ends are zeros, and stay so."""
+        """Applies F in place to padded coefficients. It filters whole rows of a plane: their padding is zeros, and stays
+        so."""
         nz, ny, nx = (n + 2 * _BORDER for n in self.shape)
         slice_, row = self._strides.slice, self._strides.row
         start = np.int64(self._strides.start - _BORDER * (slice_ + row + 1))
@@ -67,7 +68,7 @@ class VolumeWarp:
             self.rt.launch(across, (width // lanes, planes), values, start, *sides, group=group)
 
     def forward(self, state: int, source: DeviceArray) -> DeviceArray:
-        """Returns W_k v (nz, ny, nx); the next call overwrites it."""
+        """Returns W_k v (nz, ny, nx) for the coefficients ``source`` of v, valid until the next call."""
         nz, ny, nx = self.shape
         result, blocks = self.moved(), ceil_div(nx, self.rt.lanes)
         self.rt.launch(
@@ -84,14 +85,14 @@ class VolumeWarp:
         return DeviceArray(self._moved.buffer, self.shape, self._moved.dtype)
 
     def zeros(self) -> DeviceArray:
-        """Returns zeros in the layout of the coefficients; the next call overwrites it."""
+        """Returns zeros in the layout of the coefficients, valid until the next call."""
         if self._total is None:
             self._total = self.rt.empty(self._floats)
         self.rt.fill(self._total, 0)
         return self._total
 
     def adjoint(self, state: int, moved: DeviceArray, total: DeviceArray) -> None:
-        """Adds W_kᵀ v to ``total`` for a volume v in the memory of ``moved``."""
+        """Adds B_kᵀ v to ``total`` for a volume v in the memory of ``moved``; ``read`` then applies Eᵀ F."""
         if self.rt.pixel_items:
             self._adjoint_fixed(state, moved, total)
             return
@@ -105,12 +106,13 @@ class VolumeWarp:
         )  # fmt: skip
 
     def read(self, total: DeviceArray, result: DeviceArray) -> None:
-        """Writes the volume Eᵀ F ``total`` (nz, ny, nx); changes ``total``."""
+        """Writes the volume Eᵀ F ``total`` (nz, ny, nx) to ``result``. Overwrites ``total``."""
         self._filter(total)
         move(self.rt, (total, self._strides), (result, Strides.plain(self.shape)), self.shape)
 
     def _adjoint_fixed(self, state: int, moved: DeviceArray, total: DeviceArray) -> None:
-        """Adds integers: 2³¹ / ``_HEADROOM`` is the largest voxel, so that rounding is that of float32."""
+        """Adds B_kᵀ v in whole numbers, whose sums do not depend on their order. 2³¹ / ``_HEADROOM`` stands for the
+        largest voxel, so that rounding is that of float32."""
         largest = self._space.largest(moved, absolute=True)
         if not largest > 0:
             return
@@ -142,7 +144,8 @@ class VolumeWarp:
         return np.array([*self.shape[::-1], 0], np.int32)
 
     def _reach(self, state: int) -> tuple[DeviceArray, DeviceArray]:
-        """Returns the least and largest displacement along z of every slice (nz, 2) and row (nz, ny, 2), in voxels."""
+        """Returns the least and the largest displacement along z, in voxels, of every slice (nz, 2) and of every row (nz,
+        ny, 2)."""
         fields = (self.states.fields_mm[..., 2] / self.states.grid.voxel_size_mm[0]).astype(np.float32)
         along_z = np.tensordot(self.states.weights[state].astype(np.float32), fields, 1)
         rows = np.stack([along_z.min(-1) - _ROUNDING, along_z.max(-1) + _ROUNDING], -1)
@@ -151,7 +154,7 @@ class VolumeWarp:
 
 
 class FrameStack:
-    """Memory for the frames of one state at a time on the device."""
+    """Device memory for the frames of one state at a time."""
 
     def __init__(self, rt: Runtime, add: Kernel) -> None:
         self.rt, self._add = rt, add
@@ -159,14 +162,14 @@ class FrameStack:
         self._shape: tuple[int, ...] = ()
 
     def of(self, count: int, detector_shape: tuple[int, int]) -> DeviceArray:
-        """Returns memory for ``count`` frames; the next call overwrites it."""
+        """Returns memory for ``count`` frames of ``detector_shape``, valid until the next call."""
         self._shape = (count, *detector_shape)
         if self._memory is None or self._memory.size < np.prod(self._shape):
             self._memory = self.rt.empty(self._shape)
         return DeviceArray(self._memory.buffer, self._shape, self._memory.dtype)
 
     def take(self, frames: DeviceArray, chosen: np.ndarray) -> DeviceArray:
-        """Returns some of the frames (F, rows, columns)."""
+        """Returns a copy of the frames ``chosen`` of a stack (F, rows, columns), valid until the next call."""
         taken = self.of(len(chosen), (frames.shape[1], frames.shape[2]))
         each = taken.nbytes // len(chosen)
         for k, frame in enumerate(chosen.tolist()):
@@ -174,7 +177,7 @@ class FrameStack:
         return taken
 
     def add(self, places: DeviceArray, frames: DeviceArray) -> None:
-        """Adds the frames of the last ``of`` or ``take`` to those at ``places`` (n,) of ``frames``."""
+        """Adds the frames of the last ``of`` or ``take`` to the frames with the numbers ``places`` (n,) of ``frames``."""
         assert self._memory is not None
         count, pixels = self._shape[0], int(np.prod(self._shape[1:]))
         group = self.rt.group(on_cpu=min(pixels, 64))

@@ -67,11 +67,11 @@ WINDOWS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
 
 @dataclass(frozen=True)
 class FdkOptions:
-    """window: window of the ramp filter, one of ``WINDOWS``. extrapolate: how rows continue beyond the panel, one of
-    ``WAYS``.
+    """Options of FDK. window: window of the ramp filter, one of ``WINDOWS``. extrapolate: how rows continue beyond the
+    panel, one of ``WAYS``.
 
     motion: static (one pose per frame, mid-window), static-start (the frame's first pose) or per-row (every line at the
-    middle of its own exposure). Of a model with more poses FDK uses a line's middle one."""
+    middle of its own exposure). Of a model with several poses per line FDK uses the middle pose."""
 
     MOTIONS: ClassVar[tuple[Motion, ...]] = motions_for(LINE_POSES)
 
@@ -87,9 +87,9 @@ class FdkOptions:
 
 @dataclass(frozen=True)
 class FbpOptions(FdkOptions):
-    """deblur: sharpens a fly-scan along the angle; the power of noise over that of the signal, such as 0.01. 0 does not
-    sharpen. circle: sets voxels outside of the circle that the panel's wider side reaches to 0, unless rows are
-    extrapolated. The other options are those of FDK."""
+    """Options of FBP, with those of FDK. deblur: sharpens a fly-scan along the angle: the power of noise over that of the
+    signal, such as 0.01; 0 does not sharpen. circle: sets voxels to 0 outside of the circle that the panel's wider side
+    reaches, unless rows are extrapolated."""
 
     deblur: float = 0.0
     circle: bool = True
@@ -137,7 +137,7 @@ def fdk(
 def _moving(
     rt: Runtime, scan: Scan, motion: Motion, numbers: np.ndarray, deformation: Deformation
 ) -> MovingBackprojector | None:
-    """Returns the backprojector of an object that moves, by each frame's mean time; None for one at rest."""
+    """Returns the backprojector of an object that moves, with each frame at its mean time; None for an object at rest."""
     times_s = np.array([motion.cells(scan, f).time_s.mean() for f in numbers])
     states = MotionStates.of_times(deformation, scan.grid, times_s)
     return None if states.is_at_rest else MovingBackprojector(rt, states, states.shares(times_s))
@@ -153,12 +153,13 @@ def fdk_volume(
     axis: str = "rows", extrapolate: str = "none", whole: Callable[[], np.ndarray] | None = None,
     is_parallel: bool = False, circle: bool = False, moving: MovingBackprojector | None = None,
 ) -> np.ndarray:
-    """Returns FDK, or FBP of parallel beams, of line integrals (F, rows, columns) on ``grid``, (z, y, x) float32 in 1/mm.
+    """Returns FDK, or FBP of parallel beams, of line integrals (F, rows, columns) on ``grid``, (nz, ny, nx) float32 in
+    1/mm.
 
-    pose (F, 12) mm, or (F, lines, 12) with a pose for every line along ``axis``. Displaced detectors (full turns) and short
-    scans are recognised and weighted. Logs a warning where data are missing. ``whole`` reconstructs the object (z, y, x) in
-    1/mm on ``grid``, for ``reprojected``. ``circle``, for parallel beams: as in ``FbpOptions``. ``moving`` backprojects an
-    object that moves. Raises InputError for a source on the rotation axis."""
+    pose: (F, 12) mm, or (F, lines, 12) with a pose for every line along ``axis``. Displaced detectors (full turns) and
+    short scans are recognised and weighted. whole: reconstructs the complete object (nz, ny, nx) in 1/mm on ``grid``, for
+    extrapolate ``reprojected``. circle, for parallel beams: as in ``FbpOptions``. moving: backprojects an object that
+    moves. Logs a warning where data are missing. Raises InputError for a source on the rotation axis."""
     by_pixel, canonical, fan, arc = _seen(pose, frames, axis, is_parallel)
     if extrapolate != "none" and fan.is_put_aside:
         log.warning("%s: the rows of a displaced detector are not extrapolated", "FBP" if is_parallel else "FDK")
@@ -202,8 +203,8 @@ def fdk_volume(
 def _seen(
     pose: np.ndarray, frames: np.ndarray, axis: str, is_parallel: bool
 ) -> tuple[np.ndarray, np.ndarray, weights.Fan, Arc]:
-    """Returns the poses of pixels, those rotated back to one angle, their fan, and the arc of all views. Raises InputError
-    for a source on the rotation axis."""
+    """Returns the poses that broadcast to all pixels, these poses rotated back to one angle, their fan, and the arc of
+    all views. Raises InputError for a source on the rotation axis."""
     by_pixel = pose_of_pixels(pose, axis)
     if np.any(np.hypot(by_pixel[..., 0], by_pixel[..., 1]) <= 0):
         raise InputError("poses", "a source on the rotation axis", "a source beside it")
@@ -217,7 +218,8 @@ def _seen(
 
 
 def _filtered(frames: np.ndarray, weight: RayWeight, missing: tuple[int, int], window: str) -> np.ndarray:
-    """Returns weighted and filtered frames (F, rows, columns + missing) float32.
+    """Returns weighted and filtered frames (F, rows, columns + missing) float32. weight: returns a view's weights (rows,
+    columns); missing: columns to add at both ends.
 
     The rows of a displaced detector are widened to be symmetric, because the filter's response continues beyond them."""
     views, rows, columns = frames.shape
@@ -258,8 +260,8 @@ def ramp_filter(rows: np.ndarray, spacing_mm: float, window: str = "ram-lak") ->
 
 
 def static_fdk(rt: Runtime, scan: Scan, deformation: Deformation | None = None) -> np.ndarray:
-    """Returns FDK, or FBP of a parallel beam, (z, y, x) in 1/mm at the mid-window poses: a start or a reference of other
-    methods. deformation: how the object moves."""
+    """Returns FDK, or FBP of a parallel beam, (nz, ny, nx) in 1/mm at the mid-window poses: a start or a reference of
+    other methods. deformation: how the object moves; None: at rest."""
     frames, numbers = _measured_frames(scan)
     pose = np.concatenate([Static().cells(scan, f).pose for f in numbers])
     moving = None if deformation is None else _moving(rt, scan, Static(), numbers, deformation)
@@ -267,9 +269,9 @@ def static_fdk(rt: Runtime, scan: Scan, deformation: Deformation | None = None) 
 
 
 def _measured_frames(scan: Scan) -> tuple[np.ndarray, np.ndarray]:
-    """Returns frames (F, v, u) with masked pixels filled in, and their numbers.
+    """Returns frames (n, v, u) with masked pixels filled in, and the frames' numbers (n,).
 
-    Frames that are masked completely are left out, so that their neighbours cover their angles."""
+    Frames that are masked completely are left out, so that their neighbours cover their angles, unless all frames are."""
     frames, numbers = unmasked_frames(scan), np.arange(scan.frames)
     if np.asarray(scan.pixel_mask).ndim == 3:
         measured = np.flatnonzero(scan.valid.any(axis=(1, 2)))

@@ -41,7 +41,8 @@ _FULL_TURN = 1.5  # upper limit of the gaps between views of a full turn, over t
 
 
 def extrapolated(frames: np.ndarray, way: str) -> tuple[np.ndarray, int]:
-    """Returns line integrals (F, v, u + 2 n) float32 continued beyond the first and last column, and n."""
+    """Returns line integrals (F, v, u + 2 n) float32, ``frames`` (F, v, u) continued beyond both sides as ``way`` says,
+    and n."""
     count = max(1, round(_SHARE * frames.shape[2]))
     beyond = np.arange(1, count + 1)
     least = _NOISE * float(np.percentile(frames, 99.9))
@@ -60,9 +61,10 @@ def extrapolated(frames: np.ndarray, way: str) -> tuple[np.ndarray, int]:
 
 
 def _chords(edge: np.ndarray, slope: np.ndarray, curvature: np.ndarray, beyond: np.ndarray) -> np.ndarray:
-    """Returns line integrals p (F, v, n): p² = edge² + 2 edge slope d − a d² at d pixels beyond the panel.
+    """Returns line integrals p (F, v, n) at d pixels beyond the panel: p² = edge² + 2 edge slope d − a d².
 
-    The slope does not rise, and the curvature a is large enough to reach 0 within the n pixels."""
+    edge, slope: line integral and its change per pixel at a row's end. A rising slope counts as 0, and the curvature a is
+    raised until p reaches 0 within the n pixels."""
     falling, reach = np.minimum(slope, 0), beyond[-1]
     widest = (edge**2 + 2 * reach * edge * falling) / reach**2
     squares = edge**2 + 2 * edge * falling * beyond - np.maximum(curvature, widest) * beyond**2
@@ -83,9 +85,9 @@ _MOST = 2.0  # most columns added at each side by "reprojected", over the panel'
 
 
 def whole_object(scan: Scan, motion: Motion, rt: Runtime, report: ProgressReport) -> np.ndarray:
-    """Returns a volume (nz, ny, nx) in 1/mm on the scan's grid that explains its frames.
+    """Returns a volume (nz, ny, nx) in 1/mm on the scan's grid that explains the scan's frames.
 
-    Raises KeyboardInterrupt if it is stopped, because FDK has no checkpoints."""
+    Raises KeyboardInterrupt when the user stops the run, because FDK has no checkpoints."""
 
     def hook(progress: Progress) -> Progress:
         return replace(progress, quantity=f"rows beyond the panel: {progress.quantity}", state=None)
@@ -117,14 +119,14 @@ def reprojected(
 
 
 def _cells(pose: np.ndarray, lines: int, axis: str, is_parallel: bool) -> TimeCells:
-    """Returns a pose (1, 12) of all lines, or (lines, 12) of each, as cells of fixed pose."""
+    """Returns time cells of fixed pose: one pose (1, 12) for all lines, or (lines, 12), one for each."""
     ends = np.linspace(0, lines, len(pose) + 1).round().astype(np.int32)
     weight = np.ones(len(pose))
     return TimeCells(pose, 0 * weight, ends[:-1], ends[1:], weight, lines, axis, is_parallel=is_parallel)
 
 
 def _columns_beyond(pose: np.ndarray, columns: int, grid: Grid, is_parallel: bool) -> int:
-    """Returns how many more columns at each side panels of poses (n, 12) need to see the grid's whole box."""
+    """Returns the columns to add at each side so that panels of poses (n, 12) see the grid's whole box."""
     source, first, step_u, step_v = (pose[:, None, i : i + 3] for i in (0, 3, 6, 9))
     corners = np.stack(np.meshgrid(*grid.box_mm[::-1], indexing="ij"), -1).reshape(1, 8, 3)
     normal = np.cross(step_u, step_v)
@@ -141,10 +143,10 @@ def _columns_beyond(pose: np.ndarray, columns: int, grid: Grid, is_parallel: boo
 
 
 def deblurred(scan: Scan, frames: np.ndarray, angle_rad: np.ndarray, noise: float) -> np.ndarray:
-    """Returns frames (F, rows, columns) float32 as a gantry that stops would record them, at the angles (F,) of their
-    middles.
+    """Returns frames (F, rows, columns) float32 without the motion blur along the angle, as a gantry that stops would
+    record them. angle_rad (F,): gantry angles at the frames' middles.
 
-    noise: λ above. Raises InputError for views whose angles are not evenly spaced, in whatever order."""
+    noise: λ above. Raises InputError where views are not evenly spaced in angle; their order does not matter."""
     arc_rad = exposure_arc_rad(scan)
     if arc_rad == 0:
         return frames
@@ -177,7 +179,8 @@ def deblurred(scan: Scan, frames: np.ndarray, angle_rad: np.ndarray, noise: floa
 
 
 def _mirrored(line: np.ndarray, scan: Scan) -> np.ndarray:
-    """Returns views (F, columns) as from the other side: mirrored at the column of the axis, continued beyond the panel."""
+    """Returns one row of all views, (F, columns), as seen from the other side: mirrored at the column of the axis.
+    Columns beyond the panel take its last value."""
     columns = line.shape[1]
     axis = (columns - 1) / 2 - scan.geometry.detector_offset_mm[1] / scan.geometry.pixel_size_mm[1]
     at = np.clip(2 * axis - np.arange(columns), 0, columns - 1)

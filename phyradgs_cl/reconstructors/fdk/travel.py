@@ -31,7 +31,8 @@ Backproject = Callable[[np.ndarray, np.ndarray], np.ndarray]
 
 
 def travels(pose: np.ndarray, rows: int, is_parallel: bool) -> bool:
-    """Returns whether the origin moves along the panel's rows between poses (F, r, c, 12), so that voxels miss views."""
+    """Returns whether the origin moves along the panel's rows between poses (F, r, c, 12), so that voxels miss some
+    views."""
     middle = pose[:, pose.shape[1] // 2, pose.shape[2] // 2]
     first, across = middle[:, 3:6], np.cross(middle[:, 6:9], middle[:, 9:12])
     source = middle[:, :3]
@@ -45,7 +46,8 @@ def travels(pose: np.ndarray, rows: int, is_parallel: bool) -> bool:
 
 
 def still_along_z(canonical: np.ndarray, is_parallel: bool) -> np.ndarray:
-    """Returns poses (F, r, c, 12) without the height of their sources or first pixels, on which no ray's weight depends."""
+    """Returns poses (F, r, c, 12) without the height of the source or, in a parallel beam, of the first pixel: the
+    weights of rays do not depend on that height."""
     level = canonical.copy()
     level[..., 5] -= canonical[..., 5 if is_parallel else 2]
     if not is_parallel:
@@ -57,10 +59,12 @@ def seen_volume(
     frames: np.ndarray, pose: np.ndarray, axis: str, grid: Grid, is_displaced: bool, is_parallel: bool,
     counted: Callable[[int], np.ndarray | float], backproject: Backproject, backproject_seen: Backproject,
 ) -> np.ndarray:  # fmt: skip
-    """Returns the volume (z, y, x) of filtered frames (F, rows, columns) in which every voxel counts the views that see it.
+    """Returns the volume (nz, ny, nx) of filtered frames (F, rows, columns) in which every voxel counts the views that
+    see it.
 
-    pose (F, 12) or (F, lines, 12) mm. ``counted`` returns the weights (rows, columns) by which a view's rays share with
-    opposite ones. Both backprojections weigh views by angular cells; ``backproject_seen`` divides by the distance once."""
+    pose (F, 12) or (F, lines, 12) mm. counted: returns a view's weights (rows, columns) that divide a ray with its
+    opposite. Both backprojections weigh views by angular cells; ``backproject_seen`` divides by the distance once, not
+    twice."""
     by_pixel, shape = pose_of_pixels(pose, axis), frames.shape[1:]
     angle_rad, pace = _directions(by_pixel[:, [by_pixel.shape[1] // 2]], shape, is_parallel)
     turn_rad = 2 * np.pi if is_displaced else np.pi  # opposite rays are one where both sides are measured alike
@@ -89,8 +93,8 @@ def seen_volume(
 
 
 def _directions(pose: np.ndarray, shape: tuple[int, int], is_parallel: bool) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the angles about z (F, 1, columns) of the rays of poses (F, 1, c, 12), and how far the ray of a voxel on the
-    panel turns per radian of the source."""
+    """Returns the angles about z (F, 1, columns) of the rays of poses (F, 1, c, 12). Also returns, for a voxel on the
+    panel, how far its ray turns per radian of the source."""
     rays = weights.pixel_rays(pose, np.array([shape[0] // 2]), np.arange(shape[1]))
     if is_parallel:
         angle_rad = np.broadcast_to(np.arctan2(pose[..., 1], pose[..., 0]), rays.shape[:-1])
@@ -114,14 +118,15 @@ def _views_a_turn(angle_rad: np.ndarray) -> float:
 
 
 def _warn_if_few_views(views_a_turn: float, name: str) -> None:
-    """Logs that a turn has too few views for right densities: each voxel is seen for a turn or less."""
+    """Logs a warning where a turn has too few views for right densities, because each voxel is seen for a turn or less."""
     if views_a_turn < _FEW_VIEWS - 0.5:
         text = "%s: %.0f views a turn are few for a helix: densities may be 5 %% wrong at 17 views, 20 %% at 7; take %d"
         log.warning(text, name, views_a_turn, _FEW_VIEWS)
 
 
 def _warn_if_unseen(covered: np.ndarray, name: str, turn: str) -> None:
-    """Logs how many voxels the views see from too few directions; covered: the share (z, y, x) of those that they need."""
+    """Logs how many voxels the views see from too few directions. covered: fraction (nz, ny, nx) of the needed directions
+    that a voxel has."""
     share = float((covered < 1 - 1e-3).mean())
     if share > _NAMED:
         text = "%s: %.0f %% of the voxels are seen from less than %s turn, the least from %.0f°: their densities are wrong"

@@ -46,12 +46,12 @@ RayWeight = Callable[[int], np.ndarray]
 
 @dataclass(frozen=True, eq=False)
 class Arc:
-    """The views' angular cells.
+    """The angles that the views cover, and the angular cell of each view.
 
-    gap_rad (F,) is each view's share of the arc; progress_rad (F,) its angle from the start of the arc, which begins half a
-    step before the first view and ends half a step behind the last. A full turn has no start. parts_rad (P, 2): where the
-    parts between gaps begin and end, as progress. filled_rad: total width of the gaps for which the views beside them
-    stand."""
+    gap_rad (F,): each view's part of the arc. progress_rad (F,): its angle from the arc's start, which is half a step
+    before the first view; the end is half a step behind the last. In a full turn progress counts from the view of the
+    least angle. parts_rad (P, 2): progress where each part between gaps begins and ends. filled_rad: total width of the
+    gaps that the views beside them cover."""
 
     gap_rad: np.ndarray
     progress_rad: np.ndarray
@@ -61,7 +61,8 @@ class Arc:
     filled_rad: float = 0.0
 
     def unseen_rad(self, fan_rad: float = 0.0) -> float:
-        """Returns the angle, of half a turn, from which rays up to this fan angle are measured from neither side."""
+        """Returns the angle, of half a turn, from which rays are measured from neither side: the largest for rays at fan
+        angles −fan_rad, 0 and fan_rad."""
         at_rad = np.linspace(0, 2 * np.pi, 1440, endpoint=False)
         shares = [
             (self.covers(at_rad) | self.covers(at_rad + np.pi + 2 * fan)).mean() for fan in (-fan_rad, 0.0, fan_rad)
@@ -69,23 +70,25 @@ class Arc:
         return float(np.pi * (1 - min(shares)))
 
     def covers(self, at_rad: np.ndarray) -> np.ndarray:
-        """Returns whether a part holds each angle (...), given as progress, bool (...)."""
+        """Returns whether a part of the arc holds each angle (...), counted as progress in rad; bool (...)."""
         turned = np.mod(at_rad, 2 * np.pi)[..., None]
         held: np.ndarray = ((turned >= self.parts_rad[:, 0]) & (turned <= self.parts_rad[:, 1])).any(-1)
         return held
 
 
 def filled_gap_rad(fan: weights.Fan) -> float:
-    """Returns the widest gap in rad for which the views beside it stand, because they alone see some of its rays."""
+    """Returns the width in rad up to which gaps count to the views beside them, because these alone see some of the gap's
+    rays."""
     if fan.is_put_aside:
         return 2 * np.pi
     return _FILLED_RAD if fan.is_displaced else 0.0
 
 
 def view_arc(angle_rad: np.ndarray, filled_rad: float = 0.0) -> Arc:
-    """Returns the arc that views at angles (F,) cover, in any order and over any number of turns.
+    """Returns the arc that views at gantry angles (F,) cover, in any order and over any number of turns.
 
-    Gaps that stand out part it, unless all are at most ``filled_rad`` wide: then the views beside them stand for them."""
+    Gaps that stand out divide the arc into parts. If all are at most ``filled_rad`` wide, the arc is a full turn, and the
+    views beside the gaps count for them."""
     cell, centre = _distinct(angle_rad)
     count = np.bincount(cell)
     ahead = np.diff(centre, append=centre[0] + 2 * np.pi)
@@ -107,7 +110,8 @@ def view_arc(angle_rad: np.ndarray, filled_rad: float = 0.0) -> Arc:
 
 
 def _stand_out(ahead: np.ndarray) -> np.ndarray:
-    """Returns which gaps (K,) to the next view are no steps between views: the largest of all, and those beside steps."""
+    """Returns which gaps (K,) to the next view are more than a step, bool (K,): the largest where it stands out from all,
+    and others that stand out from their neighbours."""
     wide = np.zeros(ahead.size, bool)
     if ahead.size < 2:
         return wide
@@ -118,7 +122,8 @@ def _stand_out(ahead: np.ndarray) -> np.ndarray:
 
 
 def _only_here(centre: np.ndarray, ahead: np.ndarray, wide: np.ndarray) -> np.ndarray:
-    """Returns which narrow gaps (K,), the widest gap apart, have no opposite views: the views beside them must stand in."""
+    """Returns which narrow gaps (K,) have a gap on the opposite side too, bool (K,), so that the views beside them must
+    count for them. The widest gap is never among them."""
     narrow = wide & (ahead <= _FILLED_RAD) & (np.arange(ahead.size) != np.argmax(ahead))
     opposite = centre + ahead / 2 + np.pi
     before = np.searchsorted(centre, np.mod(opposite - centre[0], 2 * np.pi) + centre[0], side="right") - 1
@@ -126,20 +131,21 @@ def _only_here(centre: np.ndarray, ahead: np.ndarray, wide: np.ndarray) -> np.nd
 
 
 def _steps(ahead: np.ndarray, wide: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the steps (K,) from each view to the next, and to each from the one before; at a gap the step on its other
-    side."""
+    """Returns the angles (K,) in rad from each view to the next, and from the view before to each. Where a gap follows or
+    precedes, the step on the view's other side takes its place."""
     forward = np.where(wide, np.roll(ahead, 1), ahead)
     return forward, np.roll(np.where(wide, np.roll(ahead, -1), ahead), 1)
 
 
 def _filled_rad(ahead: np.ndarray) -> float:
-    """Returns the sum in rad by which gaps (K,) exceed the usual step where they are much wider than it."""
+    """Returns the sum in rad of what gaps (K,) have beyond the usual step, over gaps much wider than that step."""
     usual = np.median(ahead) if ahead.size else 0.0
     return float((ahead - usual)[ahead > max(SHORT_SCAN_GAP * usual, _NAMED_RAD)].sum())
 
 
 def _filled_cells(ahead: np.ndarray, wide: np.ndarray) -> np.ndarray:
-    """Returns the angular cells (K,) in rad of views of a full turn. Views near a wide gap share it, the nearer the more."""
+    """Returns the angular cells (K,) in rad of views of a full turn. The views near a wide gap divide it, the nearer the
+    more."""
     forward, back = _steps(ahead, wide)
     known = (forward + back) / 2
     cells = known.copy()
@@ -152,7 +158,7 @@ def _filled_cells(ahead: np.ndarray, wide: np.ndarray) -> np.ndarray:
 
 
 def _distinct(angle_rad: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Returns each view's cell (F,), and the cells' ascending angles (K,) on the turn."""
+    """Returns the number of each view's angle (F,), and the K distinct angles in rad, ascending within a turn."""
     turned = np.mod(np.asarray(angle_rad, np.float64), 2 * np.pi)
     order = np.argsort(turned, kind="stable")
     tolerance = _SAME_VIEW * 2 * np.pi / turned.size
@@ -168,14 +174,15 @@ def _distinct(angle_rad: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def pose_of_pixels(pose: np.ndarray, axis: str) -> np.ndarray:
-    """Returns poses that broadcast to (F, rows, columns, 12)."""
+    """Returns poses (F, 12) or (F, lines, 12), lines along ``axis``, as a view that broadcasts to (F, rows, columns,
+    12)."""
     if pose.ndim == 2:
         return pose[:, None, None]
     return pose[:, :, None] if axis == "rows" else pose[:, None]
 
 
 def view_angles(by_pixel: np.ndarray) -> np.ndarray:
-    """Returns each view's gantry angle (F,), the mean of its lines' angles, in radians."""
+    """Returns each view's gantry angle (F,) in rad, the mean over its pixels' poses (F, r, c, 12)."""
     angle_rad = azimuth_rad(by_pixel)
     first = angle_rad[:, :1, :1]
     return (first + wrapped(angle_rad - first).mean(axis=(1, 2), keepdims=True))[:, 0, 0]
@@ -209,8 +216,8 @@ def ray_weight(
 def opposite_weight(
     canonical: np.ndarray, shape: tuple[int, int], arc: Arc, is_parallel: bool
 ) -> Callable[[int], np.ndarray | float]:
-    """Returns a function from a view's index to the weights (rows, columns) by which its rays share with opposite ones of
-    an arc; 1 in a full turn."""
+    """Returns a function from a view's index to the weights (rows, columns) that divide each ray's weight with its
+    opposite."""
     rows, columns = np.arange(shape[0]), np.arange(shape[1])
 
     def weight(view: int) -> np.ndarray | float:

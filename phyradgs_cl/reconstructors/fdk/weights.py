@@ -21,7 +21,7 @@ _PART_EDGE_RAD = np.deg2rad(15)  # width of the arc beside a gap, in rad, over w
 
 
 def turned_back(pose: np.ndarray, angle_rad: np.ndarray) -> np.ndarray:
-    """Returns poses (F, ..., 12) rotated by −angle (F,) about +z: equal for all views of a circular orbit."""
+    """Returns poses (F, ..., 12) rotated by −angle_rad (F,) about +z, which makes all views of a circular orbit equal."""
     c, s = np.cos(angle_rad), np.sin(angle_rad)
     turn = np.zeros((len(angle_rad), 3, 3))
     turn[:, 0, 0], turn[:, 0, 1], turn[:, 1, 0], turn[:, 1, 1], turn[:, 2, 2] = c, s, -s, c, 1
@@ -37,11 +37,12 @@ def pixel_rays(pose: np.ndarray, rows: np.ndarray, columns: np.ndarray, is_paral
 
 
 def ray_measure(pose: np.ndarray, rays: np.ndarray, is_parallel: bool = False) -> np.ndarray:
-    """Returns the measure (v, u) of each ray per radian of gantry angle and mm of detector, over the filter's own 1/mm².
+    """Returns |ȧ·n| / D (v, u), which generalises FDK's cosine: the measure of each ray per radian of gantry angle and mm
+    of detector, over the filter's own 1/mm².
 
-    |ȧ·n| / D with ȧ the source's motion per radian, n the ray's normal in the plane of ray and detector row, D the distance
-    of the row from the source. For a flat panel facing the source it is DSO / |ray|: FDK's cosine. In a parallel beam it is
-    the sine of the angle between rays and row: 1 for a panel across the rays."""
+    ȧ is the source's motion per radian, n the ray's normal in the plane of ray and detector row, D the distance of the
+    row from the source. For a flat panel that faces the source the measure is DSO / |ray|, FDK's cosine. In a parallel
+    beam it is the sine of the angle between rays and row: 1 for a panel across the rays."""
     if is_parallel:
         across = np.cross(pose[..., 0:3], pose[..., 6:9]) / np.linalg.norm(pose[..., 6:9], axis=-1, keepdims=True)
         return np.linalg.norm(across, axis=-1)
@@ -55,8 +56,8 @@ def ray_measure(pose: np.ndarray, rays: np.ndarray, is_parallel: bool = False) -
 
 
 def fan_angle(pose: np.ndarray, rays: np.ndarray, is_parallel: bool = False) -> np.ndarray:
-    """Returns the angle (v, u) of each ray about +z from the source's view of the axis, radians, counter-clockwise positive.
-    In a parallel beam: the distance in mm at which it passes the axis, positive on the same side."""
+    """Returns the angle in rad (v, u) of each ray about +z, from the direction source to axis, counter-clockwise
+    positive. In a parallel beam: the distance in mm at which the ray passes the axis, positive on the same side."""
     if is_parallel:
         along = pose[..., 0:2] / np.linalg.norm(pose[..., 0:2], axis=-1, keepdims=True)
         return along[..., 0] * rays[..., 1] - along[..., 1] * rays[..., 0]
@@ -66,10 +67,10 @@ def fan_angle(pose: np.ndarray, rays: np.ndarray, is_parallel: bool = False) -> 
 
 @dataclass(frozen=True)
 class Fan:
-    """The fan angles that every view sees; in a parallel beam distances from the axis (see ``fan_angle``).
+    """The fan angles that every view sees; in a parallel beam distances in mm from the axis (see ``fan_angle``).
 
-    missing_columns: how far the detector is off centre, in columns at its two ends. pixel_rad: the width of the pixel at its
-    short end."""
+    missing_columns: columns to add at the panel's two ends to make it symmetric about the axis. pixel_rad: the width of
+    the pixel at the shorter end."""
 
     low_rad: float
     high_rad: float
@@ -82,12 +83,13 @@ class Fan:
 
     @property
     def is_put_aside(self) -> bool:
-        """Whether one side is short on purpose; less may be a misaligned panel that still sees the whole object."""
+        """Whether one side is so short that the detector was displaced on purpose. Less may be a misaligned panel that
+        still sees the whole object."""
         return abs(self.low_rad + self.high_rad) > _ASIDE * (self.high_rad - self.low_rad)
 
     @property
     def sees_axis(self) -> bool:
-        """Whether the axis is seen, by a pixel's centre or by its outer half."""
+        """Whether the panel sees the axis, with a pixel's centre or its outer half."""
         return self.low_rad - self.pixel_rad / 2 < 0 < self.high_rad + self.pixel_rad / 2
 
     @property
@@ -97,7 +99,7 @@ class Fan:
 
     @property
     def half_rad(self) -> float:
-        """The fan angle of the wider side."""
+        """The fan angle of the wider side; in a parallel beam its distance in mm from the axis."""
         return max(self.high_rad, -self.low_rad)
 
 
@@ -123,10 +125,12 @@ def measured_fan(pose: np.ndarray, shape: tuple[int, int], is_parallel: bool = F
 
 
 def displaced_weight(angle_rad: np.ndarray, fan: Fan) -> np.ndarray:
-    """Returns 1 ± sin over what the fan sees on both sides of the axis, 0 and 2 beyond; angle_rad of any shape.
+    """Returns the weights of rays at fan angles of any shape: 1 ± sin where both sides of the axis are seen, 0 and 2
+    beyond.
 
-    Where the axis itself is not seen every ray is measured once, and counts 2. Where it falls into the panel's outermost
-    pixel there is no room for a transition: a pixel counts by the part of its width on the axis' long side."""
+    Where the panel does not see the axis, every ray is measured once and counts 2. Where the axis falls into the panel's
+    outermost pixel there is no room for a transition: a pixel then counts by the part of its width on the axis' long
+    side."""
     if not fan.sees_axis:
         return np.full(angle_rad.shape, 2.0)
     short = min(fan.high_rad, -fan.low_rad)
@@ -139,9 +143,10 @@ def displaced_weight(angle_rad: np.ndarray, fan: Fan) -> np.ndarray:
 
 
 def short_scan_weight(progress_rad: float, angle_rad: np.ndarray, coverage_rad: float) -> np.ndarray:
-    """Returns Parker's weight of rays at fan angles of any shape, for a view ``progress_rad`` into an arc.
+    """Returns Parker's weight of rays at fan angles of any shape, for a view ``progress_rad`` into an arc of
+    ``coverage_rad``.
 
-    Rays without an opposite in the arc count 2. Under half a turn there is no opposite at all."""
+    Rays without an opposite in the arc count 2, which are all rays of an arc under half a turn."""
     margin = (coverage_rad - np.pi) / 2
     if margin <= 0:
         return np.full(angle_rad.shape, 2.0)
@@ -152,8 +157,8 @@ def short_scan_weight(progress_rad: float, angle_rad: np.ndarray, coverage_rad: 
 def parted_weight(progress_rad: float, angle_rad: np.ndarray, parts_rad: np.ndarray) -> np.ndarray:
     """Returns the weight of rays at fan angles of any shape, for a view ``progress_rad`` into an arc of parts (P, 2).
 
-    A ray and its opposite share 2 by how deep in their parts their views are; a ray without an opposite counts 2. After F.
-    Noo et al., Phys. Med. Biol. 47 (2002) 2525."""
+    The weights of a ray and its opposite add up to 2, by how deep in their parts the two views are. A ray without an
+    opposite counts 2. After F. Noo et al., Phys. Med. Biol. 47 (2002) 2525."""
     here = max(float(_depth(np.array(progress_rad), parts_rad)), 1e-6)
     there = _depth(np.mod(progress_rad + np.pi + 2 * angle_rad, 2 * np.pi), parts_rad)
     weight: np.ndarray = 2 * here / (here + there)

@@ -36,8 +36,9 @@ _BIAS_PX = 0.02  # standard error of a shift in pixels because views are interpo
 
 @dataclass(frozen=True, eq=False)
 class AxisShift:
-    """A shift of the panel along u in pixels of the recorded scan, its standard deviation (both NaN where no shift fits
-    best), and the squared residuals (F,) of the nearest trial."""
+    """A shift of the panel along u, and the fit that found it. pixels, deviation: the shift and its standard deviation in
+    pixels of the recorded scan, both NaN where no shift fits best. squares (F,): squared residuals of the nearest
+    trial."""
 
     pixels: float
     deviation: float
@@ -52,7 +53,8 @@ _NONE = AxisShift(math.nan, math.nan, np.empty(0))
 
 
 def rough_shift(rt: Runtime, scan: Scan, limits_px: tuple[float, float] = ANYWHERE) -> AxisShift:
-    """Returns the best of five shifts within limits, one coarse pixel apart, after a few iterations; without a deviation."""
+    """Returns the best of five shifts within ``limits_px``, one coarse pixel apart, after a few iterations. Its deviation
+    is NaN."""
     block = columns_per_block(scan)
     shifts_px = [block * shift for shift in _ROUGH_SHIFTS if limits_px[0] <= block * shift <= limits_px[1]]
     trials = [fit_squares(rt, shifted(scan, shift_px), _ROUGH_ITERATIONS) for shift_px in shifts_px]
@@ -63,8 +65,8 @@ def rough_shift(rt: Runtime, scan: Scan, limits_px: tuple[float, float] = ANYWHE
 def refined_shift(
     rt: Runtime, scan: Scan, rough: AxisShift, limits_px: tuple[float, float] = ANYWHERE
 ) -> AxisShift:
-    """Returns the shift near ``rough`` with the least residual, from a parabola through three neighbouring shifts. Where it
-    lies outside of the limits, that is ``rough``, fitted with all iterations and without a deviation."""
+    """Returns the shift near ``rough`` with the least residual, from a parabola through three neighbouring shifts. Where
+    that lies outside of ``limits_px``, returns ``rough`` fitted with all iterations, whose deviation is NaN."""
     block = columns_per_block(scan)
     centre = rough.pixels / block
     trials: dict[float, np.ndarray] = {}
@@ -94,7 +96,7 @@ def axis_shift(rt: Runtime, scan: Scan) -> AxisShift:
 
 def with_best_shift(rt: Runtime, scan: Scan) -> Scan:
     """Returns the coarse scan shifted to the least residual of three shifts, one coarse pixel apart, after a few
-    iterations."""
+    iterations; the scan as it is where no shift fits best."""
     block, start = columns_per_block(scan), altered_trajectory(scan).shift_px
     shifts = np.array([-1.0, 0.0, 1.0])
     trials = np.stack([fit_squares(rt, shifted(scan, start + block * shift), _ROUGH_ITERATIONS) for shift in shifts])
@@ -103,14 +105,14 @@ def with_best_shift(rt: Runtime, scan: Scan) -> Scan:
 
 
 def columns_per_block(scan: Scan) -> int:
-    """Returns how many columns of the recorded scan form one of the coarse scan."""
+    """Returns how many columns of the recorded scan make up a column of the coarse scan."""
     return altered_trajectory(scan).blocks[1]
 
 
 @dataclass(frozen=True, eq=False)
 class _Pair:
-    """A view and the mirror image of its opposite (rows, columns), and by how many columns the stated axis lies further
-    right in the view than in the mirror image."""
+    """A view and the mirror image of its opposite, both (rows, columns). apart_px: columns by which the stated axis lies
+    further right in the view than in the mirror image."""
 
     view: np.ndarray
     mirrored: np.ndarray
@@ -120,9 +122,10 @@ class _Pair:
 def opposite_shift(scan: Scan) -> AxisShift:
     """Returns the panel's shift along u under which views half a turn apart are mirror images, with its deviation.
 
-    A view's opposite is interpolated between its two neighbours in angle, or extrapolated by a step: a half turn has
-    opposite views at its ends only. NaN for other beams, for panels that are rolled or move along the axis, and where no
-    views are opposite. NaN also for columns read one after the other, whose mirror images are seen from other angles."""
+    A view's opposite is interpolated between its two neighbours in angle, or extrapolated by a step, because a half turn
+    has opposite views at its ends only. NaN for cone beams, for panels that are rolled or move along the axis, and where
+    no views are opposite. NaN also for columns read one after the other, whose mirror images are seen from other
+    angles."""
     if not has_opposite_views(scan) or (scan.shutter.axis == "columns" and scan.shutter.readout_s > 0):
         return _NONE
     pairs = _pairs(scan)
@@ -163,8 +166,8 @@ def _pairs(scan: Scan) -> list[_Pair]:
 
 
 def _opposite(away: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
-    """Returns two frames and their shares, which sum to 1, that make up the view at angle 0 of frames at angles ``away``
-    (F,) in rad; None where none are near."""
+    """Returns two frames and their weights, which sum to 1, that make up the view at angle 0 of frames at angles ``away``
+    (F,) in rad; None where no frame is near."""
     order = np.argsort(away)
     step = float(np.median(np.abs(np.diff(away[order])))) if len(away) > 1 else math.inf
     above = int(np.searchsorted(away[order], 0.0))
@@ -182,7 +185,8 @@ def _opposite(away: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
 
 
 def _few_rows(scan: Scan, frame: int) -> np.ndarray:
-    """Returns a frame as means over blocks of rows, smoothed along the rows, float64; masked pixels are interpolated."""
+    """Returns a frame as means over blocks of rows, (few rows, columns) float64, smoothed along the rows; masked pixels
+    are interpolated."""
     image = np.asarray(scan.projections[frame], np.float64)
     if scan.pixel_mask is not None:
         columns = np.arange(image.shape[1])
@@ -196,8 +200,8 @@ def _few_rows(scan: Scan, frame: int) -> np.ndarray:
 
 
 def _rough_shift(pairs: list[_Pair]) -> float:
-    """Returns the shift, in steps of half a column, for which the squared difference of the overlap is the smallest part of
-    its energy."""
+    """Returns the shift in pixels, a multiple of half a column, with the least squared difference of overlapping images
+    over their energy."""
     columns = pairs[0].view.shape[1]
     # a shift moves the view and the mirror image against each other, by twice its size
     lags = np.arange(1 - columns, columns)  # column of the mirror image less that of the view
@@ -219,8 +223,8 @@ def _correlation(mirrored: np.ndarray, view: np.ndarray) -> np.ndarray:
 
 
 def _refined_shift(pair: _Pair, shift_px: float) -> tuple[float, float]:
-    """Returns the shift of least squares near ``shift_px`` by Gauss–Newton, NaN where it leads away, and one over its
-    variance."""
+    """Returns the shift in pixels of least squares near ``shift_px`` by Gauss–Newton (NaN where the steps lead away), and
+    the inverse of its variance."""
     last = pair.view.shape[1] - 1
     columns = np.arange(last + 1)
     view, mirrored = (CubicSpline(columns, image, axis=1) for image in (pair.view, pair.mirrored))

@@ -24,8 +24,9 @@ _TINY = 1e-30  # lower limit of denominators
 
 @dataclass(frozen=True, eq=False)
 class FlatErrors:
-    """Unknowns b: a pattern (rows, columns) common to all frames (noise of flats, air that is not 0) and a level (F,) per
-    frame (the source's brightness), in line integrals. ``pattern_unit`` and ``level_unit``: line integral per unknown."""
+    """Unknowns b of errors of flats: a pattern (rows, columns) that all frames share (noise of flats, air that is not 0)
+    and a level (F,) per frame (the source's brightness). pattern_unit, level_unit: line integral per unit of an
+    unknown."""
 
     frames_shape: tuple[int, int, int]
     pattern_unit: float
@@ -33,8 +34,8 @@ class FlatErrors:
 
     @classmethod
     def beside(cls, operator: LinearOperator) -> "FlatErrors":
-        """Returns the unknowns for the frames of ``operator``, in units that make them ``_FREEDOM`` times as strong as its
-        volume."""
+        """Returns the unknowns for the frames of ``operator``, in units that make their effect on frames ``_FREEDOM``
+        times as strong as the volume's."""
         frames, rows, columns = shape = operator.frames_shape
         back = operator.adjoint(np.ones(shape, np.float32))
         strength = _FREEDOM * float(np.linalg.norm(back)) / math.sqrt(frames * rows * columns)
@@ -45,7 +46,7 @@ class FlatErrors:
         return math.prod(self.frames_shape[1:]) + self.frames_shape[0]
 
     def add_to(self, frames: np.ndarray, values: np.ndarray) -> np.ndarray:
-        """Returns frames + B values."""
+        """Returns frames (F, rows, columns) + B b for unknowns b (count,)."""
         pattern, level = self.parts(values)
         return frames + pattern + level[:, None, None]
 
@@ -53,7 +54,7 @@ class FlatErrors:
         return np.concatenate([self.pattern_unit * frames.sum(0).ravel(), self.level_unit * frames.sum((1, 2))])
 
     def parts(self, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Returns the pattern (rows, columns) and the levels (F,) in line integrals."""
+        """Returns the pattern (rows, columns) and the levels (F,), in line integrals, of unknowns (count,)."""
         frames, rows, columns = self.frames_shape
         pattern, level = np.split(values, [values.size - frames])
         return self.pattern_unit * pattern.reshape(rows, columns), self.level_unit * level
@@ -61,8 +62,8 @@ class FlatErrors:
 
 @dataclass(frozen=True, eq=False)
 class ViewParameters:
-    """Unknowns b: parameters (n, K) of single views. View f has the values ``basis`` (F, n) @ parameters (K,), each of which
-    adds that many of its ``signals`` (F, K, rows, columns)."""
+    """Unknowns b: coefficients (n, K) of parameters of single views. View f has the values (basis @ b)[f], (K,), for
+    ``basis`` (F, n); its frame changes by their products with ``signals`` (F, K, rows, columns), summed over K."""
 
     signals: np.ndarray
     basis: np.ndarray
@@ -78,14 +79,14 @@ class ViewParameters:
         return (self.basis.T @ np.einsum("fkvu,fvu->fk", self.signals, frames)).ravel()
 
     def parts(self, values: np.ndarray) -> np.ndarray:
-        """Returns the parameters (n, K)."""
+        """Returns flat unknowns (n · K,) as coefficients (n, K)."""
         return values.reshape(self.basis.shape[1], self.signals.shape[1])
 
 
 @dataclass(frozen=True, eq=False)
 class AugmentedOperator:
-    """A x + B b of one vector (x, b): a volume and other unknowns. B has about the norm of A, because CGLS moves all
-    unknowns together."""
+    """Maps one vector (x, b), a volume and further unknowns, to frames A x + B b. B should have about the norm of A,
+    because CGLS moves all unknowns together."""
 
     operator: LinearOperator
     extra: FlatErrors | ViewParameters
@@ -99,7 +100,7 @@ class AugmentedOperator:
         return self.operator.frames_shape
 
     def system(self, measured: np.ndarray, valid: np.ndarray | None) -> System:
-        """Returns the equations for the measured frames (F, rows, columns). They cannot be divided into subsets."""
+        """Returns the equations for measured frames (F, rows, columns); valid: as in ``System``. They have no subsets."""
         return System(self, measured, valid)  # type: ignore[arg-type]
 
     def forward(self, vector: np.ndarray, out: None = None) -> np.ndarray:
@@ -111,15 +112,15 @@ class AugmentedOperator:
         return np.concatenate([volume, self.extra.adjoint(frames)]).astype(np.float32)
 
     def parts(self, vector: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Returns the volume (z, y, x) and the other unknowns (count,) of a vector."""
+        """Returns the volume (nz, ny, nx) and the further unknowns (count,) of a vector (x, b)."""
         volume, values = np.split(vector, [vector.size - self.extra.count])
         return np.ascontiguousarray(volume.reshape(self.operator.volume_shape)), values
 
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """squares (F,): mean squared residual of each frame, dimensionless. level (F,): the constant that the fit added to each
-    frame's line integrals."""
+    """Result of ``fit``. squares (F,): mean squared residual of each frame's line integrals. level (F,): the constant
+    that the fit added to each frame's line integrals."""
 
     squares: np.ndarray
     level: np.ndarray
@@ -130,7 +131,7 @@ class Fit:
 
 
 def fit(rt: Runtime, scan: Scan, iterations: int = _ITERATIONS) -> Fit:
-    """Reconstructs a coarse scan by CGLS, each line at its own times, together with errors of its flats."""
+    """Reconstructs a coarse scan by CGLS, together with errors of its flats, every line at its own times."""
     times = min(max(2, math.ceil(rim_travel_voxels(scan))), _MOST_TIMES)
     system = System.of_scan(rt, scan, PerRow(times), fewest_lines=FEWEST_LINES)
     flats = FlatErrors.beside(system.operator)
@@ -153,8 +154,8 @@ def fit_squares(rt: Runtime, scan: Scan, iterations: int = _ITERATIONS) -> np.nd
 def t_statistic(stated: np.ndarray, other: np.ndarray) -> float:
     """Returns by how many standard errors the stated hypothesis explains the frames better than the other.
 
-    stated, other (F,): squared residuals, compared frame by frame, relative to their sum; frames are the sample. 0 with
-    fewer than three frames, or where both are the same."""
+    stated, other (F,): mean squared residuals of each frame. Their difference over their sum is the sample, a value per
+    frame. Returns 0 with fewer than three frames, or where all differences are equal."""
     difference = (other - stated) / np.maximum(stated + other, _TINY)
     if difference.size < 3:
         return 0.0
@@ -163,14 +164,16 @@ def t_statistic(stated: np.ndarray, other: np.ndarray) -> float:
 
 
 def residual_ratio(stated: np.ndarray, other: np.ndarray) -> float:
-    """Returns the other hypothesis's squared residual (F,) over the stated one's, summed over the frames."""
+    """Returns the sum over the frames of the other hypothesis's squared residuals (F,), over that of the stated one."""
     return float(other.sum() / max(float(stated.sum()), _TINY))
 
 
 def vertex(at: np.ndarray, squares: np.ndarray) -> tuple[float, float]:
-    """Returns the minimum of a parabola and its standard deviation, by a bootstrap over the frames.
+    """Returns the minimum of the parabola through three sums of squares, and its standard deviation by a bootstrap over
+    frames.
 
-    at (3,): even, ascending places; squares (3, F): each frame's square there. NaN where there is no minimum."""
+    at (3,): evenly spaced, ascending values of a parameter; squares (3, F): each frame's squared residual there. NaN
+    where the parabola has no minimum; the deviation is also NaN where that holds for half of the resamplings."""
     frames = squares.shape[1]
     draws = np.random.default_rng(0).integers(0, frames, (_DRAWS, frames))
     drawn = np.array([_minimum(at, squares[:, draw].sum(1)) for draw in draws])

@@ -33,11 +33,11 @@ _NONE = AxisShift(math.nan, math.nan, np.empty(0))
 
 
 def shift_by_rays_seen_twice(scan: Scan) -> AxisShift:
-    """Returns the panel's shift along u under which rays and their opposites agree best, its deviation by a jackknife over
-    the views, and their mean squares (F,).
+    """Returns the panel's shift along u under which rays and their opposites agree best, its deviation by a jackknife
+    over the views, and the mean squares (F,) of their differences.
 
-    NaN where views are more than 10° apart, where columns are read one after the other, and where no shift within an eighth
-    of the panel agrees best."""
+    NaN where views are more than 10° apart, where columns are read one after the other, and where no shift within an
+    eighth of the panel agrees best."""
     if scan.shutter.axis == "columns" and scan.shutter.readout_s > 0:
         return _NONE  # a ray and its opposite are read at other times
     poses = middle_poses(scan)
@@ -56,8 +56,8 @@ def shift_by_rays_seen_twice(scan: Scan) -> AxisShift:
 
 
 def _level_rows(scan: Scan, views: np.ndarray, pose: np.ndarray) -> np.ndarray:
-    """Returns frames (F, rows, columns) of the rows next to the plane of the source, where opposite rays meet the same
-    matter."""
+    """Returns frames (n, few rows, columns) of ``views``, with the rows next to the plane of the source: opposite rays
+    there meet the same matter."""
     rows = scan.projections.shape[1]
     level_mm = pose[5] + np.arange(rows) * pose[11] - (0.0 if scan.is_parallel else pose[2])
     near = np.sort(np.argsort(np.abs(level_mm), kind="stable")[: max(1, min(_MOST_ROWS, rows // 2))])
@@ -68,7 +68,7 @@ def _level_rows(scan: Scan, views: np.ndarray, pose: np.ndarray) -> np.ndarray:
 
 
 def _binned(frames: np.ndarray, pose: np.ndarray, block: int) -> tuple[np.ndarray, np.ndarray]:
-    """Returns frames of means of ``block`` columns, smoothed, and the pose (12,) of such a panel."""
+    """Returns frames averaged over blocks of ``block`` columns and smoothed, and the pose (12,) of the coarser panel."""
     columns = frames.shape[2] // block
     means = frames[:, :, : columns * block].reshape(*frames.shape[:2], columns, block).mean(-1)
     coarse = pose.copy()
@@ -100,8 +100,8 @@ def _best(scan: Scan, turned: np.ndarray, frames: np.ndarray, pose: np.ndarray, 
 
 
 def _mean_squares(turned: np.ndarray, frames: np.ndarray, fan: np.ndarray, is_parallel: bool) -> np.ndarray | None:
-    """Returns the mean squares (F,) of rays less their opposites; fan (columns,): the fan angles of the columns. None where
-    the axis is not seen."""
+    """Returns the mean squares (F,) of rays less their opposites. turned (F,): views' angles in rad; fan (columns,): fan
+    angles of the columns. None where the columns do not see the axis."""
     columns = np.arange(fan.size)
     if fan[-1] < fan[0]:
         fan, columns = fan[::-1], columns[::-1]
@@ -120,7 +120,7 @@ def _mean_squares(turned: np.ndarray, frames: np.ndarray, fan: np.ndarray, is_pa
 
 
 def _at_column(frames: np.ndarray, column: float) -> np.ndarray:
-    """Returns frames (F, rows) at a place between columns, by the cubic through four."""
+    """Returns frames (F, rows) at a fractional column, by the cubic through four columns."""
     low = int(np.clip(np.floor(column), 1, frames.shape[2] - 3))
     t = column - low
     weights = np.array([

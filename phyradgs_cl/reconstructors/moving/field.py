@@ -33,8 +33,8 @@ _SUPPORT = 4  # number of intervals between knots in which a temporal spline dif
 
 @dataclass(frozen=True, eq=False)
 class MotionField:
-    """A displacement field in the form in which it is sought. control_mm: (R, cz, cy, cx, 3) as in ``Deformation``.
-    temporal: (count, R) coefficients of the weights."""
+    """A displacement field during its search. control_mm: (R, cz, cy, cx, 3) as in ``Deformation``. temporal: (count, R),
+    spline coefficients in time of the fields' weights."""
 
     control_mm: np.ndarray
     origin_mm: tuple[float, float, float]
@@ -44,7 +44,8 @@ class MotionField:
 
     @classmethod
     def at_rest(cls, scan: Scan, spacing_mm: float, splines: TemporalSplines, temporal: np.ndarray) -> "MotionField":
-        """Returns zeros over the scan's grid, with weights of mean 0 whose largest size is 1."""
+        """Returns a field of zeros over the scan's grid. Its weights, from ``temporal`` (count, R), have mean 0 and
+        largest size 1."""
         origin_mm, counts = control_points(scan.grid, spacing_mm)
         centred = temporal - splines.at(splines.node_times_s).mean(0) @ temporal  # splines sum to 1
         control_mm = np.zeros((temporal.shape[1], *counts, 3))
@@ -63,7 +64,8 @@ class MotionField:
         return replace(self, control_mm=control_mm, temporal=self.temporal / factor)
 
     def refined(self, scan: Scan, spacing_mm: float) -> "MotionField":
-        """Returns the field on control points ``spacing_mm`` apart, closer than before, which follow its values best."""
+        """Returns the field on control points ``spacing_mm`` apart, closer than before, fitted to the displacements at
+        the voxels."""
         coarse = self.deformation()
         units_mm = np.stack([coarse.on_grid_mm(scan.grid, unit) for unit in np.eye(coarse.rank)])
         control_mm, origin_mm = fitted_control_mm(units_mm, scan.grid, spacing_mm)
@@ -72,7 +74,7 @@ class MotionField:
 
 @dataclass(eq=False)
 class FieldProblem:
-    """The frames of a scan under a motion model, as a function of the field. bending: γ, relative to the response of the
+    """The misfit of a scan under a motion model, as a function of the field. bending: γ, relative to the response of the
     frames to a control vector."""
 
     rt: Runtime
@@ -94,8 +96,8 @@ class FieldProblem:
     def operator(
         self, one: MotionField, tables: list[TimeCells] | None = None, warp: VolumeWarp | StateStack | None = None
     ) -> WarpedOperator:
-        """Returns the projector of a field. With ``warp`` of an earlier call, ``tables`` may differ from the scan's, at the
-        same times."""
+        """Returns the projector of an object that moves as ``one`` does. With the ``warp`` of an earlier projector,
+        ``tables`` may differ from the scan's, at the same times."""
         if warp is None:
             states = MotionStates.of_times(one.deformation(), self.scan.grid, self.times_s, _LEAST_VOXELS)
             warp = VolumeWarp(self.rt, states)
@@ -105,11 +107,11 @@ class FieldProblem:
         return WarpedOperator(self.rt, self.scan.grid, shape, tables, warp=warp, subrays=subrays)
 
     def residual(self, one: MotionField, volume: np.ndarray) -> np.ndarray:
-        """Returns p − A v (F, rows, columns) at the valid pixels, 0 elsewhere."""
+        """Returns p − A v (F, rows, columns), dimensionless, at the valid pixels; 0 elsewhere."""
         return self._masked(self.scan.projections - self.operator(one).forward(volume))
 
     def space_step(self, one: MotionField, volume: np.ndarray) -> MotionField:
-        """Returns the field after a step on its control vectors, or the field itself."""
+        """Returns the field after a step on its control vectors; the field unchanged where no step lowers the sum."""
         operator = self.operator(one)
         residual = self._masked(self.scan.projections - operator.forward(volume))
         derivative = FieldDerivative(operator, volume)
@@ -136,7 +138,8 @@ class FieldProblem:
         return self._first_better(one, residual, candidates, volume, penalty)
 
     def time_step(self, one: MotionField, volume: np.ndarray) -> MotionField:
-        """Returns the field after a step on the coefficients of its weights, or the field itself."""
+        """Returns the field after a step on the coefficients of its weights; the field unchanged where no step lowers the
+        sum."""
         operator = self.operator(one)
         residual = self._masked(self.scan.projections - operator.forward(volume))
         hessian, downhill = self._temporal_equations(one, operator, volume, residual)
@@ -161,9 +164,10 @@ class FieldProblem:
     def _temporal_equations(
         self, one: MotionField, operator: WarpedOperator, volume: np.ndarray, residual: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Returns JᵀJ (count, R, count, R) and Jᵀ r (count, R) of the temporal coefficients.
+        """Returns JᵀJ (count, R, count, R) and Jᵀ r (count, R) for the temporal coefficients and the residual r (F, rows,
+        columns).
 
-        Splines that no frame sees together are projected together: every ``colours``-th one."""
+        Splines that no frame sees together are projected together."""
         count, rank = one.temporal.shape
         spans_s = max(float(np.ptp(table.time_s)) for table in self.tables)
         # splines of one colour are so far apart that a frame sees at most one of them: one projection serves all
@@ -198,7 +202,8 @@ class FieldProblem:
         self, one: MotionField, residual: np.ndarray, candidates: Iterable[MotionField], volume: np.ndarray,
         penalty: Callable[[MotionField], float],
     ) -> MotionField:  # fmt: skip
-        """Returns the first candidate whose misfit and penalty are smaller than those of ``one``, else ``one``."""
+        """Returns the first of ``candidates`` that does not fold and whose squared misfit plus ``penalty`` is below that
+        of ``one``, else ``one``."""
         before = sum_squares(residual) + penalty(one)
         for candidate in candidates:
             # a field that folds has no inverse, however well its frames fit
@@ -218,7 +223,8 @@ def sum_squares(values: np.ndarray) -> float:
 
 
 def conjugate_gradients(apply: Callable[[np.ndarray], np.ndarray], right: np.ndarray, steps: int) -> np.ndarray:
-    """Returns an approximate solution of A x = b after so many steps from 0, fewer where the residual falls to 1 %."""
+    """Returns an approximate solution of A x = b after ``steps`` steps from 0, or fewer where the residual's norm falls
+    to 1 %."""
     solution, residual = np.zeros_like(right), right.copy()
     direction, squares = residual.copy(), sum_squares(residual)
     least = 1e-4 * squares

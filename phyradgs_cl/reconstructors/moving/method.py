@@ -63,7 +63,7 @@ _STORED = ("field_control", "field_place", "field_times", "field_weights", "fiel
 
 
 def coarse_scan(scan: Scan, most_frames: int = _MOST_FRAMES) -> Scan:
-    """Returns the scan with blocks of pixels, few voxels in the same box, and at most ``most_frames`` frames."""
+    """Returns the scan with binned pixels, fewer voxels in the same box, and at most ``most_frames`` frames."""
     block = math.ceil(max(scan.geometry.detector_shape) / _MOST_COLUMNS)
     small = binned(smooth(fewer_frames(scan, most_frames), SMOOTHING * block if block > 1 else 0.0), block)
     least_mm = max(max(scan.grid.size_mm) / _MOST_VOXELS, min(scan.grid.voxel_size_mm))
@@ -71,7 +71,8 @@ def coarse_scan(scan: Scan, most_frames: int = _MOST_FRAMES) -> Scan:
 
 
 def initial_field(scan: Scan, signal: MotionSignal, last_s: float, first_s: float) -> MotionField:
-    """Returns a field at rest. Its weights follow a signal that has knots, else a line and its square in time."""
+    """Returns a field at rest over the times from ``first_s`` to ``last_s``. Its weights follow ``signal`` where it has a
+    knot spacing, else a line and its square in time."""
     spacing_mm = max(scan.grid.size_mm) / _COARSE_SPACINGS
     if signal.knot_s is not None:
         between_s = float(np.median(np.diff(signal.times_s)))
@@ -84,7 +85,8 @@ def initial_field(scan: Scan, signal: MotionSignal, last_s: float, first_s: floa
 
 
 class FieldSearch:
-    """The search as a ``Stepwise`` on a coarse copy of the scan. rounds: how many. bending: as in ``FieldProblem``."""
+    """Searches the field on a coarse copy of the scan, as a ``Stepwise``. rounds: iterations of the search. bending: as
+    in ``FieldProblem``."""
 
     quantity, remedy = "residual", "check the scan for extreme values"
 
@@ -104,7 +106,8 @@ class FieldSearch:
 
     @property
     def finished(self) -> str | None:
-        """An object is at rest where the first two rounds found no step of the field that lowers the residual."""
+        """The reason to end: the object is at rest, where the first two rounds found no step of the field that lowers the
+        residual. Else None."""
         return _AT_REST if self.iteration >= 2 and not self.field.control_mm.any() else None
 
     def step(self) -> None:
@@ -151,9 +154,9 @@ class FieldSearch:
         return resampled(self.volume, self.scan.grid, self.grid)[0], self.grid
 
     def finding(self) -> tuple[Deformation, float]:
-        """Returns the field, and by which share the squared residual is smaller than that of an object at rest after as many
-        passes. The field is zeros unless the share exceeds ``LEAST_GAIN`` and what as many free numbers would explain in
-        noise."""
+        """Returns the field, and the fraction by which its squared residual is below that of an object at rest after as
+        many passes. The field is zeros unless that fraction exceeds ``LEAST_GAIN``, and what as many free numbers would
+        explain of noise."""
         if not self.field.control_mm.any():
             return self.field.deformation(), 0.0
         moving = self._reconstructed(self.field, self.volume, _PASSES)
@@ -169,7 +172,8 @@ class FieldSearch:
         return sum_squares(self.problem.residual(one, volume))
 
     def _reconstructed(self, one: MotionField, volume: np.ndarray | None, passes: int) -> np.ndarray:
-        """Returns the volume after ``passes`` passes of ``fista`` on the coarse scan."""
+        """Returns the volume (nz, ny, nx) after ``passes`` passes of ``fista`` on the coarse scan, from ``volume`` (None:
+        the method's own start)."""
         options = FistaOptions(
             motion=self.motion, iterations=passes, prior="dct", prior_weight=_WEIGHT, tv_iterations=_TV_ITERATIONS
         )
@@ -181,7 +185,8 @@ class FieldSearch:
 
 
 def _with_times(motion: Motion, scan: Scan, period_s: float | None) -> Motion:
-    """Returns the model with as many times as gantry and period need; the object's speed is not known yet."""
+    """Returns the model with as many times per exposure as the gantry and the signal's period need. The object's speed is
+    not known yet."""
     timed = with_times(motion, scan)
     if motion != PerRow() or not isinstance(timed, PerRow) or period_s is None:
         return timed
@@ -190,7 +195,7 @@ def _with_times(motion: Motion, scan: Scan, period_s: float | None) -> Motion:
 
 
 def _difference(one: MotionField, other: MotionField) -> float:
-    """Returns the change of the control vectors and weights between two rounds, relative to their size."""
+    """Returns the root of the summed squared relative changes of control vectors and of weights between two rounds."""
     pairs = [(one.control_mm, other.control_mm), (one.temporal, other.temporal)]
     parts: list[Any] = [
         sum_squares(new - old) / sum_squares(new) for new, old in pairs if new.shape == old.shape and new.any()
@@ -200,10 +205,13 @@ def _difference(one: MotionField, other: MotionField) -> float:
 
 @dataclass(frozen=True)
 class MovingOptions(FistaOptions):
-    """iterations: a sixth are rounds of the search for the field, the rest passes of ``fista`` after it. bending: stiffness
-    of the field, relative to how strongly frames respond to it. gating: what the motion follows at first: ``auto`` (the
-    signal of the frames, where it repeats), ``free`` (any smooth curve in time), ``scan`` (the signal or phase that the scan
-    states), or a file, NAME.csv (``load_gating``). The other options are those of ``fista``."""
+    """Options of ``moving``, with those of ``fista``.
+
+    - iterations: a sixth are rounds of the search for the field, the rest passes of ``fista`` after it.
+    - bending: stiffness of the field, relative to how strongly frames respond to it.
+    - gating: what the motion follows at first: ``auto`` (the signal of the frames, where it repeats), ``free`` (any
+      smooth curve in time), ``scan`` (the signal or phase that the scan states), or a file, NAME.csv
+      (``load_gating``)."""
 
     TRIALS: ClassVar[tuple[int, int]] = (1, 7)
     """Iterations of the short runs of ``estimate``: one round alone, two rounds with five passes."""
@@ -232,18 +240,18 @@ class MovingOptions(FistaOptions):
 
 @dataclass
 class _Field:
-    """The field between the search and the passes: kept in the states of the passes, which need it to resume."""
+    """Hands the field from the search to the passes, and keeps it in their states, which need it to resume."""
 
     deformation: Deformation | None = None
     gain: float = 0.0
 
     @property
     def for_passes(self) -> Deformation | None:
-        """The deformation, or None where nothing moves."""
+        """The field as a deformation; None where nothing moves."""
         return None if self.deformation is None or self.deformation.is_still else self.deformation
 
     def take(self, search: Any) -> None:
-        """Takes what a complete ``FieldSearch`` has found."""
+        """Takes the field and its gain from a complete ``FieldSearch``."""
         self.deformation, self.gain = search.finding()
 
     def state(self) -> dict[str, np.ndarray]:
@@ -253,7 +261,7 @@ class _Field:
         return dict(zip(_STORED, (one.control_mm, place, one.times_s, one.weights, np.array(self.gain)), strict=True))
 
     def restore(self, state: State) -> State:
-        """Takes the field from a state of the passes. Returns the other arrays."""
+        """Takes the field from a state of the passes, if it holds one. Returns the state's other arrays."""
         if _STORED[0] not in state:
             return state
         control_mm, place, times_s, weights, gain = (state[name] for name in _STORED)
@@ -305,7 +313,8 @@ def _with_field_in_progress(one: _Field, progress: Progress) -> Progress:
 
 
 def _motion_facts(one: _Field, signal: MotionSignal, scan: Scan) -> dict[str, object]:
-    """Returns what was found, for the result's facts: displacements relative to the mean place of matter in the scan."""
+    """Returns what the search found, for the result's facts. Displacements count from the mean place of matter in the
+    scan."""
     moves = one.for_passes is not None
     follows = signal.knot_s is not None
     facts: dict[str, object] = {"moves": moves, "follows": follows, "period_s": signal.period_s, "gain": one.gain}

@@ -33,7 +33,7 @@ _FORMS = f"at least {_FEWEST} lines: time in s, value; or one value for each fra
 
 @dataclass(frozen=True)
 class TemporalSplines:
-    """Uniform cubic B-splines that cover first_s to last_s in ``intervals`` intervals; ``count`` of them."""
+    """Uniform cubic B-splines in time, ``count`` of them, over ``intervals`` equal intervals from first_s to last_s."""
 
     first_s: float
     last_s: float
@@ -59,23 +59,26 @@ class TemporalSplines:
         return np.linspace(self.first_s, self.last_s, _NODES * self.intervals + 1)
 
     def at(self, times_s: np.ndarray) -> np.ndarray:
-        """Returns the splines (n, count) at times (n,), which are moved into the covered part."""
+        """Returns the values (n, count) of all splines at times (n,) in s; times outside of the covered span count as its
+        ends."""
         knots_s = self.first_s + self.step_s * np.arange(-3, self.intervals + 4)
         return BSpline(knots_s, np.eye(self.count), 3)(np.clip(times_s, self.first_s, self.last_s))
 
     def fit(self, times_s: np.ndarray, values: np.ndarray) -> np.ndarray:
-        """Returns coefficients (count, R) whose splines follow values (n, R) at times (n,), linear between them."""
+        """Returns coefficients (count, R) whose splines follow ``values`` (n, R) at times (n,) in s, taken as linear in
+        between."""
         nodes_s = self.node_times_s
         wanted = np.stack([np.interp(nodes_s, times_s, column) for column in values.T], -1)
         return np.asarray(np.linalg.lstsq(self.at(nodes_s), wanted, rcond=None)[0])
 
     def roughness(self) -> np.ndarray:
-        """Returns the matrix (count, count) of the sum of squared second differences of coefficients."""
+        """Returns the matrix K (count, count) for which cᵀ K c is the sum of squared second differences of coefficients
+        c."""
         return _difference_squares(self.count, 2)
 
 
 class Bending:
-    """Half the gradient of the bending energy of control vectors: Σ ‖∂²U/∂i∂j‖² by differences of coefficients.
+    """Half the gradient of the bending energy Σ ‖∂²U/∂i∂j‖² of control vectors, by differences between neighbours.
 
     counts: (cz, cy, cx) of the control points."""
 
@@ -95,7 +98,7 @@ class Bending:
 
 
 def _difference_squares(count: int, order: int) -> np.ndarray:
-    """Returns DᵀD (count, count) of the differences D of an order."""
+    """Returns DᵀD (count, count), with D the differences of ``order`` between neighbours."""
     differences = np.diff(np.eye(count), order, axis=0)
     return np.asarray(differences.T @ differences)
 
@@ -106,10 +109,12 @@ def _apply(matrix: np.ndarray, control: np.ndarray, axis: int) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class MotionSignal:
-    """The course of the object's motion in time. times_s (F,): the middles of the frames, rising. values (F,): mean 0,
-    largest size 1, without a unit or a sign. period_s: mean length of a cycle, or None where no cycle repeats. later (F,):
-    the quadrature, a quarter of a cycle later; None derives it from ``values``. knot_s: time between two knots of weights
-    that follow the signal; None: weights need not follow it."""
+    """The course of the object's motion in time.
+
+    - times_s (F,): the middles of the frames, rising. values (F,): mean 0, largest size 1, without a unit or a sign.
+    - period_s: mean length of a cycle; None where no cycle repeats.
+    - later (F,): the quadrature, a quarter of a cycle later; None derives it from ``values``.
+    - knot_s: time between two knots of weights that follow the signal; None where weights need not follow it."""
 
     times_s: np.ndarray
     values: np.ndarray
@@ -118,7 +123,7 @@ class MotionSignal:
     knot_s: float | None = None
 
     def pair(self) -> np.ndarray:
-        """Returns the signal and its quadrature (F, 2), a quarter of a cycle later; both together follow hysteresis."""
+        """Returns (F, 2) the signal and its quadrature, a quarter of a cycle later. Both together can follow hysteresis."""
         later = self.later
         if later is None:
             even_s, even = _evenly(self.times_s, self.values)
@@ -127,7 +132,8 @@ class MotionSignal:
 
 
 def motion_signal(scan: Scan) -> MotionSignal:
-    """Returns the signal of a scan's frames. Its period is None where no rate dominates, or with less than 16 frames."""
+    """Returns the motion signal of a scan's frames. Its period is None where ``period_of`` finds none; ``knot_s`` is then
+    None too."""
     times_s = middle_times_s(scan)
     order = np.argsort(times_s, kind="stable")
     times_s, rows = times_s[order], _shroud(scan)[order]
@@ -139,12 +145,13 @@ def motion_signal(scan: Scan) -> MotionSignal:
 
 
 def middle_times_s(scan: Scan) -> np.ndarray:
-    """Returns the middles (F,) of the times at which a frame's lines are open."""
+    """Returns the middle (F,) in s of each frame's span, in which any of its lines is open."""
     return np.asarray(scan.frame_start_s, np.float64) + scan.shutter.span_s / 2
 
 
 def period_of(times_s: np.ndarray, values: np.ndarray) -> float | None:
-    """Returns the mean period of a signal (F,), or None where its power is not concentrated at one rate."""
+    """Returns the mean period in s of a signal (F,) at times (F,) in s. Returns None where its power is not concentrated
+    about one rate of at least five cycles in the scan, where it does not change, and for fewer than 16 values."""
     power, length_s = _spectrum(times_s, values)
     last = len(power) - 1
     if len(values) < _FEWEST_FRAMES or last < _FEWEST_CYCLES or not power.sum() > 0:
@@ -162,14 +169,14 @@ def period_of(times_s: np.ndarray, values: np.ndarray) -> float | None:
 
 
 def _spectrum(times_s: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, float]:
-    """Returns the power of a signal (n,) at 0, 1, 2 … cycles in the time that is returned with it."""
+    """Returns the power of a signal (n,) at 0, 1, 2 … cycles per time span, and that span in s."""
     even_s, even = _evenly(times_s, values)
     power = np.abs(np.fft.rfft((even - even.mean()) * np.hanning(len(even)))) ** 2
     return power, float(even_s[-1] - even_s[0]) * len(even) / max(len(even) - 1, 1)
 
 
 def _evenly(times_s: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Returns times at the median step of ``times_s`` (n,), and the values at them, linear between two of ``values``."""
+    """Returns times evenly spaced at the median step of ``times_s`` (n,), and ``values`` interpolated linearly at them."""
     length_s = float(times_s[-1] - times_s[0])
     step_s = max(float(np.median(np.diff(times_s))) if len(times_s) > 1 else 0.0, length_s / _MOST_EVEN)
     even_s = times_s[0] + step_s * np.arange(round(length_s / step_s) + 1 if step_s > 0 else 1)
@@ -177,13 +184,14 @@ def _evenly(times_s: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.nda
 
 
 def _shroud(scan: Scan) -> np.ndarray:
-    """Returns the means (F, rows) over the valid pixels of every detector row."""
+    """Returns the mean (F, rows) of every detector row over its valid pixels, the Amsterdam shroud."""
     valid = np.broadcast_to(scan.valid, scan.projections.shape)
     return np.asarray((scan.projections * valid).sum(2, dtype=np.float64) / np.maximum(valid.sum(2), 1))
 
 
 def _gantry(scan: Scan, times_s: np.ndarray, order: np.ndarray) -> np.ndarray:
-    """Returns the terms (F, n) that rest and slow drift put into a row: a constant, a line, harmonics of the angle."""
+    """Returns the terms (F, n) that explain a row's mean of an object at rest: a constant, a line in time, harmonics of
+    the gantry's angle. n is at most a quarter of F."""
     poses = np.stack([scan.trajectory.pose(int(f), np.array([t]))[0] for f, t in zip(order, times_s, strict=True)])
     towards = poses[:, :3] - (0.0 if scan.is_parallel else np.array(scan.grid.offset_mm[::-1]))
     angle_rad = np.arctan2(towards[:, 1], towards[:, 0])
@@ -201,7 +209,7 @@ def scaled(values: np.ndarray) -> np.ndarray:
 
 
 def gating_of_scan(scan: Scan) -> Gating:
-    """Returns what the scan states. Raises InputError for a scan without gating."""
+    """Returns the signal or phase that the scan states. Raises InputError for a scan without gating."""
     if scan.gating is None:
         remedy = "take --set gating=auto, or a file NAME.csv"
         raise InputError("gating", "scan, which states neither", "a signal or a phase in phyradgs/gating", remedy)
@@ -242,9 +250,9 @@ def load_gating(path: str, scan: Scan) -> Gating:
 
 
 def signal_of(gating: Gating, scan: Scan, subject: str) -> MotionSignal:
-    """Returns the signal of a gating, with the period of the phases, or of the spectrum where one rate dominates.
+    """Returns the motion signal of a gating. Its period is that of the phases or, of values, that of ``period_of``.
 
-    Raises InputError, about ``subject``, for times that miss the scan and values that do not change."""
+    Raises InputError, about ``subject``, for times that miss the scan and for values that do not change."""
     times_s, values = gating.times_s, gating.values
     advance = float(gating.steps.sum()) if gating.is_phase else 0.0
     if advance == 0 and (gating.is_phase or np.ptp(values) == 0):

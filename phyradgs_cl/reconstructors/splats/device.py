@@ -20,7 +20,7 @@ _PEAK_PERCENTILE = 99.9  # percentile of the line integrals that counts as their
 
 @dataclass(frozen=True)
 class Scale:
-    """One internal unit of length in mm, and of density in 1/mm."""
+    """Internal units of a splatting run: the unit of length in mm, and of density in 1/mm."""
 
     length_mm: float
     density_per_mm: float
@@ -31,7 +31,8 @@ class Scale:
 
 
 class DeviceCloud:
-    """A population on the device. Arrays have ``gaussians.stride`` columns, of which the first ``count`` are Gaussians."""
+    """The Gaussians of a run on the device. Arrays have ``gaussians.stride`` columns, the first ``count`` of them
+    Gaussians."""
 
     def __init__(self, rt: Runtime, population: Population) -> None:
         self.rt, self.count = rt, population.count
@@ -48,7 +49,7 @@ class DeviceCloud:
         adam.activate(self.raw, self.gaussians.rows, self.count, self.gaussians.stride)
 
     def move(self, adam: DeviceAdam, rates: np.ndarray, step: int) -> None:
-        """Does one step of Adam down the gradients; ``rates`` (11,), ``step`` counts from 1."""
+        """Does a step of Adam down the gradients. rates (11,): step sizes by parameter; step: counts from 1."""
         adam.step(self.raw, self.gradients, self.moments, self.gaussians.stride, rates, step)
 
     def population(self) -> Population:
@@ -56,7 +57,8 @@ class DeviceCloud:
         return Population(self.rt.download(self.raw)[:, :count], self.rt.download(self.moments)[:, :, :count])
 
     def read_statistics(self) -> np.ndarray:
-        """Returns (2, count) float32: the sum of the centre's gradient norms, and the number of frames that had one."""
+        """Returns (2, count) float32: the sum of the centre's gradient norms over frames, and the number of frames with a
+        gradient."""
         return self.rt.download(self.statistics)[:, : self.count]
 
     def write_statistics(self, statistics: np.ndarray) -> None:
@@ -67,7 +69,7 @@ class DeviceCloud:
 
 
 class DeviceFrames:
-    """Time cells, with the states of an object that moves, measurement in internal units and mask of every frame."""
+    """Time cells, measurement in internal units and mask of every frame on the device."""
 
     def __init__(
         self, rt: Runtime, scan: Scan, options: SplatOptions, scale: Scale, deformation: Deformation | None = None
@@ -83,7 +85,7 @@ class DeviceFrames:
         self._mask, self._pixels = _upload_masks(rt, scan)
 
     def follow(self, motion: Motion) -> bool:
-        """Takes the time cells of a motion model. Returns whether the detector averages intensities over them."""
+        """Takes the time cells of a motion model. Returns whether frames average intensities over a line's cells."""
         tables, merges = tables_of(self.scan, motion, self._model, self.deformation)
         of_object = self.deformation
         states = [None if of_object is None else states_of(table, of_object) for table in tables]
@@ -100,7 +102,7 @@ class DeviceFrames:
         return max(cells.count for cells in self._cells)
 
     def get(self, frame: int) -> tuple[DeviceCells, DeviceArray, DeviceArray, float]:
-        """Returns a frame's time cells, measurement, mask and number of valid pixels."""
+        """Returns a frame's time cells, measurement, mask (1 at valid pixels) and number of valid pixels."""
         mask = frame if len(self._mask) > 1 else 0
         return self._cells[frame], self._measured[frame], self._mask[mask], self._pixels[mask]
 
@@ -108,7 +110,7 @@ class DeviceFrames:
 def tables_of(
     scan: Scan, motion: Motion, model: str, deformation: Deformation | None = None
 ) -> tuple[list[TimeCells], bool]:
-    """Returns the time cells of every frame in mm, and whether the detector model averages intensities over them.
+    """Returns the time cells of every frame in mm, and whether frames average intensities over a line's cells.
 
     Where ``exact`` chooses the segments, an object that moves gets as many as its paths need."""
     peak = float(np.percentile(scan.projections, _PEAK_PERCENTILE)) if model == "intensity" else 0.0
@@ -125,7 +127,8 @@ def tables_of(
 
 
 def _upload_masks(rt: Runtime, scan: Scan) -> tuple[list[DeviceArray], list[float]]:
-    """Uploads masks, 1 at valid pixels: one for all frames, or one per frame. Returns them with their valid pixels."""
+    """Uploads masks, 1 at valid pixels: one for all frames, or one per frame. Returns the masks and their numbers of
+    valid pixels."""
     masks = np.zeros((1, *scan.geometry.detector_shape)) if scan.pixel_mask is None else scan.pixel_mask
     stack = [(m == 0).astype(np.float32) for m in (masks if masks.ndim == 3 else masks[None])]
     arrays = [rt.upload(pad_rows(scan.shutter.readout.frames(m))) for m in stack]

@@ -38,7 +38,7 @@ LEAST_RECORDED = 20  # least number of lines of a run's record, if it has as man
 
 
 class SplatRun:
-    """The state of one optimisation, the same on every rank, as the ``Stepwise`` that a ``Loop`` runs."""
+    """The state of an optimisation, the same on every rank, as the ``Stepwise`` that a ``Loop`` runs."""
 
     quantity, remedy, finished = "loss", "check the scan for extreme values", None
 
@@ -73,7 +73,7 @@ class SplatRun:
             self.control_density()
 
     def motion_at(self, iteration: int) -> Motion:
-        """Returns the motion model of an iteration. An object that moves needs its segments from the first one on."""
+        """Returns the motion model of an iteration: coarse in early iterations, except for an object that moves."""
         is_coarse = self.frames.scan.is_fly and self.frames.deformation is None
         return self.options.motion_at(iteration / max(self.iterations, 1)) if is_coarse else self.options.motion
 
@@ -124,7 +124,7 @@ class SplatRun:
         }  # fmt: skip
 
     def restore(self, state: State) -> None:
-        """Continues from ``state``, on any number of ranks up to the batch."""
+        """Continues from ``state``, on any number of ranks up to the frames of a batch."""
         self.iteration, self.batch = int(state["iteration"]), int(state["batch"])
         self.sharing = sharing_of(self.rt.ranks, self.batch)
         self.rng.bit_generator.state = json.loads(str(state["rng"]))
@@ -137,7 +137,7 @@ class SplatRun:
         return self.activation.apply(self.cloud.population().raw.astype(np.float64))
 
     def present_cloud(self) -> Gaussians:
-        """Returns the cloud in internal units, without Gaussians that density control would remove for their shape."""
+        """Returns the cloud in internal units, without Gaussians whose shape density control would not allow."""
         rows = self.parameters()
         return Gaussians.from_rows(rows[:, self.options.control.allows(rows[SCALE])])
 
@@ -155,9 +155,9 @@ def reconstruct_splats(
 ) -> Reconstruction:
     """Runs a splatting method under its name ``phyradgs`` or ``r2``.
 
-    ``resume`` continues an interrupted run of the same scan and options from its state. The cloud is drawn from ``initial``
-    (nz, ny, nx) in 1/mm, or else from an FDK volume. The cloud and the volume are the reference of ``deformation``, of an
-    object that moves."""
+    resume: continues an interrupted run of the same scan and options from its state. initial: the volume (nz, ny, nx) in
+    1/mm from which the cloud is drawn; None: an FDK volume. deformation: how the object moves; the cloud and the volume
+    are then the object's reference."""
     started = time.perf_counter()
     if deformation is not None and deformation.is_still:
         deformation = None
@@ -191,7 +191,8 @@ def first_cloud(
     rt: Runtime, scan: Scan, options: SplatOptions, seed: int, initial: np.ndarray | None = None,
     deformation: Deformation | None = None,
 ) -> tuple[Scale, Population, np.random.Generator]:
-    """Returns internal units, the first cloud, and the generator that drew it, from an ``initial`` volume or FDK's."""
+    """Returns the internal units, the first cloud, and the generator that drew it, from ``initial`` (nz, ny, nx) in 1/mm
+    or, without, from FDK's volume."""
     first = static_fdk(rt, scan, deformation) if initial is None else initial
     scale = internal_scale(first, scan.grid)
     rng = np.random.default_rng(seed)

@@ -22,14 +22,14 @@ _COARSE_ERROR = 0.1  # lower limit of ``time_error`` in the other coarse iterati
 class SplatOptions:
     """Options of a splatting run; lengths in half-sides of the volume, densities relative to FDK's 99.9th percentile.
 
-    gaussians: size of the first cloud; 0 chooses it from the grid. Weights are Eq. 4's λ. tv_edge: edge of the random
-    sub-volume in voxels. scale_min_voxels: raises the smallest scale to this share of a voxel. detector_model: what quantity
-    the detector averages over a line's times, line integrals (log) or intensity, or the model that the scan states (scan).
-    exact_from: share of the iterations before which the motion ``exact`` is coarse, first one pose for each frame, then one
-    segment of few times; 0: it never is.
-
-    iterations: frames, with a step of Adam every ``batch`` of them (0: as many as there are ranks) at rates × √batch. The
-    same batch gives the same bits on any number of ranks (docs/cluster.md)."""
+    - gaussians: size of the first cloud; 0 chooses it from the grid. The weights are Eq. 4's λ. tv_edge: edge in voxels
+      of the random sub-volume for total variation. scale_min_voxels: least scale as a fraction of a voxel.
+    - detector_model: what the detector averages over a line's times: line integrals (log), intensity, or what the scan
+      states (scan).
+    - exact_from: fraction of the iterations before which the motion ``exact`` is coarse: first one pose for each frame,
+      then one segment of few times. 0: it is exact throughout.
+    - iterations: frames, with a step of Adam every ``batch`` of them (0: as many as there are ranks) at rates × √batch.
+      The same batch gives the same bits on any number of ranks (docs/cluster.md)."""
 
     MOTIONS: ClassVar[tuple[Motion, ...]] = motions_for(SPLATS)
 
@@ -66,7 +66,7 @@ class SplatOptions:
         check_motion(self.motion, self.MOTIONS)
 
     def activation(self, grid: Grid) -> Activation:
-        """Returns the bounds of the scales on ``grid`` (in internal units)."""
+        """Returns the map from raw to actual parameters, with its bounds of the scales on ``grid`` (in internal units)."""
         smallest = max(self.scale_min, self.scale_min_voxels * min(grid.voxel_size_mm))
         return Activation(smallest, max(self.scale_max, 2 * smallest))
 
@@ -78,21 +78,23 @@ class SplatOptions:
         return int(min(max(voxels / 16, 1000), 50_000))
 
     def motion_at(self, share: float) -> Motion:
-        """Returns the motion model after this share of the run: early iterations cannot use what the last ones need."""
+        """Returns the motion model after the fraction ``share`` of the run: coarser in early iterations, which gain
+        nothing from exact motion."""
         if not isinstance(self.motion, Exact) or share >= self.exact_from:
             return self.motion
         is_first = share < _STATIC_SHARE * self.exact_from
         return Static() if is_first else Exact(1, max(_COARSE_ERROR, self.motion.time_error))
 
     def batch_for(self, frames: int, ranks: int) -> int:
-        """Returns the frames per step: the option, or one for every rank. Raises InputError for more than the scan has."""
+        """Returns the frames per step: the option or, where it is 0, one for every rank. Raises InputError for more than
+        the scan has."""
         if self.batch > frames:
             raise InputError("--batch", str(self.batch), f"no more than the scan's {frames} frames")
         return self.batch or min(ranks, frames)
 
     @property
     def asks_for_gaussians(self) -> bool:
-        """Whether the user chose the size of the first cloud: it is no preset's."""
+        """Whether the user chose the size of the first cloud, and not a preset or the grid."""
         return self.gaussians not in {0, *(preset.gaussians for preset in (*PRESETS.values(), R2_PUBLISHED))}
 
 

@@ -16,8 +16,8 @@ _REFERENCE_PERCENTILE = 99.9  # percentile of the first volume's values that is 
 
 
 def internal_scale(fdk: np.ndarray, grid: Grid) -> Scale:
-    """Returns half the longest side, and a high percentile of a first volume (1 over that side where it is not positive).
-    Raises NumericalError where the volume is not finite."""
+    """Returns the internal units: half the longest side in mm, and the 99.9th percentile of an FDK volume in 1/mm (one
+    over that half side where it is not positive). Raises NumericalError where the percentile is not finite."""
     reference = float(np.percentile(fdk, _REFERENCE_PERCENTILE))
     if not np.isfinite(reference):
         raise NumericalError("projections", "values that overflow in FDK", "line integrals of order 1")
@@ -27,7 +27,7 @@ def internal_scale(fdk: np.ndarray, grid: Grid) -> Scale:
 def first_population(
     volume: np.ndarray, grid: Grid, options: SplatOptions, rng: np.random.Generator
 ) -> Population:
-    """Returns the raw parameters of the initial cloud, drawn from an FDK volume in internal units."""
+    """Returns the raw parameters of the first cloud, drawn from a volume (nz, ny, nx), all in internal units."""
     activation = options.activation(grid)
     requested = options.gaussians_for(grid)
     cloud = initial_cloud(
@@ -48,11 +48,12 @@ def initial_cloud(
     volume: np.ndarray, grid: Grid, count: int, *, threshold: float, density_share: float,
     scale_bounds: tuple[float, float], scale_factor: float, rng: np.random.Generator,
 ) -> Gaussians:
-    """Draws up to ``count`` isotropic Gaussians at voxels above ``threshold``, without replacement.
+    """Draws up to ``count`` isotropic Gaussians at voxels above ``threshold``, without replacement; all in internal
+    units.
 
-    volume (nz, ny, nx) and everything else in internal units. Density is ``density_share`` of the voxel's value;
-    the scale is ``scale_factor`` × the RMS distance to the three nearest others. An empty volume still gives
-    one faint Gaussian in the middle, so that there is something to optimise."""
+    volume (nz, ny, nx). A Gaussian's density is ``density_share`` of the voxel's value; its scale is ``scale_factor`` ×
+    the RMS distance to the three nearest others, within ``scale_bounds``. An empty volume still gives one faint Gaussian
+    in the middle, so that there is something to optimise."""
     candidates = np.flatnonzero(volume.ravel() > threshold)
     if candidates.size == 0:
         log.warning(
@@ -71,7 +72,7 @@ def initial_cloud(
 
 
 def neighbour_distance(points: np.ndarray, fallback: float) -> np.ndarray:
-    """Returns the RMS distance (G,) from each point to its three nearest others."""
+    """Returns the RMS distance (G,) from each point (G, 3) to its three nearest others; ``fallback`` for a single point."""
     neighbours = min(4, len(points))
     if neighbours < 2:
         return np.full(len(points), fallback)

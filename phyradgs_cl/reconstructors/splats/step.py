@@ -29,8 +29,8 @@ Corner = tuple[int, int, int]
 
 @dataclass(frozen=True)
 class Batch:
-    """The frames of one step, a corner for each (None if the total variation has no weight), and whether the density
-    term applies (``late``)."""
+    """The frames of one step by number, a corner of a sub-volume for each (None if total variation has no weight), and
+    ``late``: whether the density term applies."""
 
     frames: list[int]
     corners: list[Corner | None]
@@ -38,8 +38,8 @@ class Batch:
 
 
 class FrameStep:
-    """Frames, projector, loss, total variation and optimiser of a scan, in internal units; ``grid`` is the volume's.
-    ``deformation``, in mm, moves the object."""
+    """Computes gradients from single frames of a scan, in internal units; ``grid`` is the volume's. deformation: how the
+    object moves, in mm."""
 
     def __init__(
         self, rt: Runtime, scan: Scan, options: SplatOptions, scale: Scale, grid: Grid,
@@ -70,7 +70,7 @@ class FrameStep:
             self.projector.time_error = getattr(motion, "time_error", DEFAULT_TIME_ERROR)
 
     def draw_corner(self, rng: np.random.Generator) -> Corner | None:
-        """Draws a sub-volume for the total variation, if it has a weight."""
+        """Draws the corner (z, y, x) of a sub-volume for total variation; None where that has no weight."""
         if self.options.tv_weight == 0:
             return None
         room = (n - edge + 1 for n, edge in zip(self.grid.shape, self.crop.shape, strict=True))
@@ -80,8 +80,8 @@ class FrameStep:
     def gradient(
         self, cloud: DeviceCloud, frame: int, corner: Corner | None, late: bool, statistics: DeviceArray
     ) -> None:
-        """Writes dL/draw of a frame into the gradients of an activated cloud, and adds to the ``statistics`` (2, stride) of
-        density control. ``corner`` and ``late`` as in ``Batch``."""
+        """Writes one frame's dL/d(raw parameters) into the gradients of an activated cloud, and adds to the
+        ``statistics`` (2, stride) of density control. corner, late: as in ``Batch``."""
         options, gaussians, by_cloud = self.options, cloud.gaussians, cloud.gradients
         cells, measured, mask, pixels = self.frames.get(frame)
         rendered = self.projector.forward(gaussians, cells)
@@ -95,10 +95,10 @@ class FrameStep:
 
 
 class Alone:
-    """One process, one frame per step."""
+    """One process, which takes one frame per step."""
 
     def differentiate(self, step: FrameStep, cloud: DeviceCloud, batch: Batch) -> None:
-        """Writes dL/draw of the batch into the cloud's gradients and adds to its statistics."""
+        """Writes dL/d(raw parameters) of the batch into the cloud's gradients, and adds to its statistics."""
         step.gradient(cloud, batch.frames[0], batch.corners[0], batch.late, cloud.statistics)
 
     def loss(self, step: FrameStep) -> float:
@@ -107,7 +107,7 @@ class Alone:
 
 
 class SharedFrames(Alone):
-    """Several frames per step: rank r has frames r, r + ranks, … of the batch."""
+    """Ranks that share several frames per step: rank r takes the frames r, r + ranks, … of the batch."""
 
     def __init__(self, ranks: Communicator) -> None:
         self.ranks = ranks
@@ -134,7 +134,7 @@ class SharedFrames(Alone):
 
 
 def sharing_of(ranks: Communicator, batch: int) -> Alone:
-    """Returns how ``ranks`` share steps of ``batch`` frames. Raises InputError if some would have no frame."""
+    """Returns how ``ranks`` share steps of ``batch`` frames. Raises InputError where some rank would have no frame."""
     if ranks.size > batch:
         found = f"{batch} for {ranks.size} ranks"
         raise InputError("--batch", found, "a frame for every rank", "raise it, or take fewer ranks")

@@ -17,10 +17,11 @@ from phyradgs_cl.reconstructors.voxels.system import System
 
 @dataclass(frozen=True)
 class AsdPocsOptions(SartOptions):
-    """tv_steps: TV steps per iteration. tv_share: α, length of a TV step over the change of the first SART pass.
+    """Options of ASD-POCS. tv_steps: TV steps per iteration. tv_share: α, length of a TV step over the change by the
+    first SART pass.
 
-    tv_reduction: factor of that length when TV moves the volume by more than ``tv_ratio`` (r_max) of the SART pass's change
-    and the residual is above ε. residual_share: ε over the residual of the FDK volume."""
+    tv_reduction: factor of that length when TV moves the volume by more than ``tv_ratio`` (r_max) of the SART pass's
+    change and the residual is above ε. residual_share: ε over the residual of the FDK volume."""
 
     iterations: int = 10
     relaxation_reduction: float = 0.9999
@@ -32,7 +33,7 @@ class AsdPocsOptions(SartOptions):
 
 
 class AsdPocs(Algorithm):
-    """ASD-POCS, whose residual is that of the volume between the SART pass and the TV steps."""
+    """ASD-POCS. The residual of an iteration is that of the volume between the SART pass and the TV steps."""
 
     def __init__(self, system: System, options: AsdPocsOptions, descend: TvDescent, epsilon: float) -> None:
         super().__init__(system)

@@ -11,7 +11,7 @@ from phyradgs_cl.reconstructors.voxels.system import System
 
 @dataclass(frozen=True)
 class CglsOptions(IterativeOptions):
-    """noise_stop: as in ``sart``. CGLS does not clip: ``nonnegative`` must stay false."""
+    """Options of CGLS. noise_stop: as in ``sart``. nonnegative must stay False, because CGLS does not clip."""
 
     iterations: int = 60
     nonnegative: bool = False
@@ -24,7 +24,7 @@ class CglsOptions(IterativeOptions):
 
 
 class Cgls(Algorithm):
-    """Minimises ‖p − A x‖ over the Krylov spaces of AᵀA from x = 0. The residual is that after the step.
+    """Minimises ‖p − A x‖ over the Krylov spaces of AᵀA from x = 0. The residual of an iteration is that after its step.
 
     In the intensity model the residual is p − I(x), and J replaces A. Directions then combine as in nonlinear conjugate
     gradients (Polak and Ribière 1969), which is the same iteration where I is linear."""

@@ -53,15 +53,18 @@ _MOST_DIVIDED = 90**2
 
 @dataclass(frozen=True)
 class FistaOptions(IterativeOptions):
-    """prior: one of ``PRIORS``, a user's function, or its ``package.module:function``. A function takes (volume (nz, ny, nx)
-    in 1/mm, weight in 1/mm) and returns a volume; docs/methods.md says how to scale a denoiser. The prior piccs is (1 −
-    prior_share) TV(x) + prior_share TV(x − first volume). prior_weight: threshold relative to two errors of the gradient,
-    added in squares: the noise of the frames, and edges inside large voxels.
+    """Options of FISTA.
 
-    subvoxels: parts of a voxel's side in the last 2/5 of the passes; 0: 2 for slices of up to 90² voxels where memory
-    allows, else 1. subsets: of the frames, with one step each, 1.6 times as many before smaller voxels; subsets whose steps
-    diverge are joined two by two.
-    tv_iterations: dual iterations per proximal map of TV. transmission_weights: as in ``fista-tv``."""
+    - prior: one of ``PRIORS``, a user's function, or its ``package.module:function``. A function takes (volume (nz, ny,
+      nx) in 1/mm, weight in 1/mm) and returns a volume; docs/methods.md says how to scale a denoiser. The prior piccs is
+      (1 − prior_share) TV(x) + prior_share TV(x − first volume).
+    - prior_weight: threshold relative to two errors of the gradient, added in squares: the noise of the frames, and edges
+      inside large voxels.
+    - subvoxels: parts of a voxel's side in the last 2/5 of the passes; 0: 2 for slices of up to 90² voxels where memory
+      allows, else 1.
+    - subsets: of the frames, with one step each, 1.6 times as many before smaller voxels; subsets whose steps diverge are
+      joined two by two. tv_iterations: dual iterations per proximal map of TV.
+    - transmission_weights: as in ``fista-tv``."""
 
     FUNCTIONS: ClassVar[tuple[str, ...]] = ("prior",)
     """Options that may be a function."""
@@ -90,7 +93,7 @@ class FistaOptions(IterativeOptions):
 
 
 class Accelerated(Algorithm):
-    """A proximal gradient method with FISTA's momentum, restarted where it points uphill.
+    """A proximal gradient method with FISTA's momentum, restarted where the momentum has overshot a minimum.
 
     The restart is the gradient scheme of O'Donoghue and Candès, Found. Comput. Math. 15 (2015) 715."""
 
@@ -109,16 +112,16 @@ class Accelerated(Algorithm):
 
     @property
     def next_momentum(self) -> float:
-        """tₖ₊₁ of Eq. 4.2."""
+        """The momentum's number tₖ₊₁ of Eq. 4.2."""
         return float((1 + np.sqrt(1 + 4 * self.momentum**2)) / 2)
 
     @property
     def extrapolation(self) -> float:
-        """βₖ of Eq. 4.3."""
+        """The factor βₖ of the last change in the next point, Eq. 4.3."""
         return (self.momentum - 1) / self.next_momentum
 
     def accept(self, point: Any, volume: Any) -> None:
-        """Takes the result of the step from ``point`` as the present volume."""
+        """Takes ``volume``, the result of the step from ``point``, as the present volume."""
         # gradient restart: the step points against the last movement, so momentum carried the point past a minimum
         is_uphill = self.system.space.turn(point, volume, self.volume) > 0
         self.momentum = 1.0 if is_uphill else self.next_momentum
@@ -137,13 +140,13 @@ def _row_sums(system: System) -> Any:
 
 
 def _curvature(system: System) -> float:
-    """Returns the largest row sum of AᵀA, a bound of its norm, because no entry is negative."""
+    """Returns the largest row sum of AᵀA in mm², a bound of its norm because no entry is negative."""
     return system.space.largest(_row_sums(system))
 
 
 def _tight_curvature(system: System) -> float:
-    """Returns a bound of the norm of AᵀA, at the price of another pass: the largest (AᵀA x)/x of an x > 0 (Collatz and
-    Wielandt). Row sums as x make the bound a sixth smaller."""
+    """Returns a bound in mm² of the norm of AᵀA, at the price of another pass: the largest (AᵀA x)/x of an x > 0 (Collatz
+    and Wielandt). Row sums as x make the bound a sixth smaller."""
     sums, space = _row_sums(system), system.space
     again = system.adjoint(system.apply_weights(system.forward(sums)))
     bound = space.largest(space.multiply(again, space.reciprocal(sums, _FAINTEST)))
@@ -200,8 +203,8 @@ METHOD = Method(fista, {"default": FistaOptions()}, is_shared=True, takes_initia
 
 
 def fista_stages(run: MethodRun, now: Callable[[], MethodRun]) -> list[Stage]:
-    """Returns the passes on the scan's own voxels, and those on smaller ones if there are any. A stage that starts asks
-    ``now`` for its run, because the motion of the object may be known only then."""
+    """Returns the passes on the scan's own voxels and, where the options or the grid ask for smaller voxels, those on
+    them. A stage that starts takes its run from ``now``, because the motion of the object may be known only then."""
     options = run.options
     parts = options.subvoxels or (2 if _gains_from_subvoxels(run, 2) else 1)
     first = round(_COARSE_PASSES * options.iterations) if parts > 1 else 0
@@ -219,7 +222,7 @@ def fista_stages(run: MethodRun, now: Callable[[], MethodRun]) -> list[Stage]:
 
 
 def _few_times(motion: Motion) -> Motion:
-    """Returns the model with a third of its times: coarse passes only bring a first volume."""
+    """Returns a per-row model with a third of its times per exposure, for coarse passes; other models unchanged."""
     if not isinstance(motion, PerRow) or motion.sub_intervals <= 2:
         return motion
     return replace(motion, sub_intervals=max(2, math.ceil(_COARSE_TIMES * motion.sub_intervals)))
@@ -229,8 +232,9 @@ def fista_passes(
     now: Callable[[], MethodRun], passes: int, volume: np.ndarray | None, parts: int = 1, subsets: int = 0,
     has_few_times: bool = False,
 ) -> Iterations:  # fmt: skip
-    """Returns one stage from a volume (nz, ny, nx), with every voxel divided into ``parts`` along each side. subsets: in
-    place of those of the options. has_few_times: a third of the times in an exposure are enough."""
+    """Returns ``passes`` passes from ``volume`` (nz, ny, nx; None: the method's own start), with every voxel divided into
+    ``parts`` along each side. subsets: takes the place of the option, unless 0. has_few_times: takes a third of the times
+    in an exposure."""
     whole = now()
     scan = replace(whole.scan, grid=whole.scan.grid.finer(parts), reference=None, moving_truth=None)
     options, rt = replace(whole.options, iterations=passes), whole.rt
@@ -255,8 +259,8 @@ def fista_passes(
 
 
 def _gains_from_subvoxels(run: MethodRun, parts: int) -> bool:
-    """Returns whether the grid is small enough for smaller voxels, and every rank's device holds the method's volumes of
-    them."""
+    """Returns whether the grid is small enough for smaller voxels, and every rank's device has room for the method's
+    volumes of smaller voxels."""
     shape, rt = run.scan.grid.shape, run.rt
     if math.prod(shape[1:]) > _MOST_DIVIDED:
         return False

@@ -15,10 +15,11 @@ from phyradgs_cl.reconstructors.voxels.system import System
 
 @dataclass(frozen=True)
 class FistaTvOptions(IterativeOptions):
-    """tv_weight: λ as a share of the largest value of Aᵀp, so that it holds for any unit and dose.
+    """Options of FISTA-TV. tv_weight: λ as a fraction of the largest value of Aᵀp, so that it holds for any unit and
+    dose.
 
-    tv_iterations: dual iterations per proximal map, which starts from the last dual. transmission_weights: least
-    squares weighted by transmission (PWLS), ½ Σ t (p − A x)², with λ a share of the largest value of Aᵀ t p."""
+    tv_iterations: dual iterations per proximal map, each from the last dual. transmission_weights: least squares weighted
+    by transmission t (PWLS), ½ Σ t (p − A x)², with λ a fraction of the largest value of Aᵀ t p."""
 
     iterations: int = 100
     tv_weight: float = ranged(0.001, 0, 1e6)
@@ -27,10 +28,10 @@ class FistaTvOptions(IterativeOptions):
 
 
 class FistaTv(Accelerated):
-    """FISTA with TV; the residual is that of the new volume. A is linear: A y follows from A xₖ and A xₖ₋₁.
+    """FISTA with TV on all frames at once. The residual of an iteration is that of its new volume.
 
-    The intensity model replaces A x by I(x) and Aᵀ by Jᵀ at x. I is not linear along the momentum's line; that error
-    vanishes with the steps."""
+    A is linear, so that A y at the extrapolated point y follows from A xₖ and A xₖ₋₁. The intensity model replaces A x by
+    I(x) and Aᵀ by Jᵀ at x. I is not linear along the momentum's line; that error vanishes with the steps."""
 
     ARRAYS = ("volume", "previous", "projected", "projected_previous")
 

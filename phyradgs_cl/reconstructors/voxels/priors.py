@@ -52,14 +52,15 @@ _SUBVOXELS_WITH_RIDGE = 0.85  # weight of the smaller voxels in the result with 
 class FrameError:
     """The error of a pixel that no volume on the grid explains.
 
-    noise: its noise, dimensionless. edges_mm: the discretisation error at edges, over the density there in 1/mm."""
+    noise: standard deviation of its line integral. edges_mm: discretisation error at edges, over the density there in
+    1/mm."""
 
     noise: float
     edges_mm: float = 0.0
 
 
 def frame_error(scan: Scan, motion: Motion) -> FrameError:
-    """Estimates the error of a scan's pixels on its grid. A motion blur averages the error at edges."""
+    """Estimates the error of a scan's pixels on its grid. The motion blur of ``motion`` averages the error at edges."""
     voxel_mm = max(scan.grid.voxel_size_mm[1:])
     edges_mm = _EDGES * voxel_mm / math.sqrt(1 + _blur_mm(scan, motion) / voxel_mm)
     return FrameError(noise_behind(np.asarray(scan.projections, np.float32), scan.valid), edges_mm)
@@ -81,7 +82,7 @@ def _blur_mm(scan: Scan, motion: Motion) -> float:
 
 def adjoint_response(system: System) -> tuple[float, float]:
     """Returns the response of Aᵀ in the middle half of a volume, in mm: the standard deviation for independent unit noise
-    per ray, and the mean for a unit error common to all rays."""
+    of every ray, and the mean for a unit error of all rays."""
     noise = np.random.default_rng(0).standard_normal(system.measured.shape, np.float32)
     by_noise = system.adjoint(system.masked(system.apply_weights(system.space.array(noise))))
     by_ones = system.column_sums()
@@ -91,7 +92,8 @@ def adjoint_response(system: System) -> tuple[float, float]:
 
 
 class PriorWeight:
-    """``strength`` times the error of the gradient Aᵀ(p − A x). It follows the density of the volume x."""
+    """The weight of a prior: ``strength`` times the error of the gradient Aᵀ(p − A x), which grows with the density of
+    x."""
 
     def __init__(self, system: System, error: FrameError, strength: float) -> None:
         self.space, self.error, self.strength = system.space, error, strength
@@ -100,13 +102,14 @@ class PriorWeight:
         self.noise_mm, self.common_mm = adjoint_response(system)
 
     def at(self, volume: Any) -> float:
-        """Returns the weight at a volume, in the unit of the gradient."""
+        """Returns the weight at a volume (nz, ny, nx) in 1/mm, in the gradient's unit, mm."""
         by_noise = self.error.noise * self.noise_mm
         by_edges = self.error.edges_mm * _density(self.space, volume) * self.common_mm
         return max(self.strength * math.hypot(by_noise, by_edges), self.least)
 
     def noise_share(self, weight: float) -> float:
-        """Returns the share of noise in a weight: edges make up most of it where views are many, or photons."""
+        """Returns the part of ``weight`` that is due to noise, 0 to 1. Edges make up most of a weight where views or
+        photons are many."""
         by_noise = self.strength * self.error.noise * self.noise_mm
         return min(by_noise / weight, 1.0) if weight > 0 else 1.0  # empty frames have no weight
 
@@ -119,10 +122,11 @@ def _density(space: Space[Any], volume: Any) -> float:
 
 @dataclass(frozen=True, eq=False)
 class PriorInputs:
-    """The arguments of a prior: device, grid, and for piccs its image (nz, ny, nx) in 1/mm and the weight of the change.
+    """What a prior is made from. image (nz, ny, nx) in 1/mm and share: for piccs, its image and the weight of the change
+    from it.
 
-    tv_iterations: dual iterations per map. is_fly: the scan's frames expose over an arc. noise: that of its line
-    integrals, behind the object."""
+    tv_iterations: dual iterations per map. is_fly: the scan's frames expose over an arc. noise: standard deviation of
+    line integrals behind the object."""
 
     rt: Runtime
     grid: Grid
@@ -139,8 +143,8 @@ class PriorInputs:
         return TvAndDct(self.tv(tv_share), DctProx(self.rt, self.grid.shape), dct_share)
 
     def dct_then_ridge(self) -> "Prior":
-        """Returns ``dct`` and ridge steps, or ``dct`` alone on small grids. For scans that stop, the step does more of the
-        work, most of it where noise is low; on fly-scans flat bodies would lose by that."""
+        """Returns ``dct`` with ridge steps, or ``dct`` alone on small grids. For scans that stop, the ridge step does
+        more of the work, most of it where noise is low. Fly-scans of flat bodies would lose by that."""
         if min(self.grid.shape) < RIDGE_EDGE:
             return self.tv_and_dct()
         ridge = RidgeStep(self.rt, self.grid.shape, learned_ridge())
@@ -152,9 +156,9 @@ class PriorInputs:
 
 
 class Prior:
-    """A map x → argmin ½‖x' − x‖² + weight R(x'), x' ≥ 0 if asked, or an approximation of it.
+    """Maps x to argmin over x' of ½‖x' − x‖² + weight R(x'), x' ≥ 0 if asked, or to an approximation of it.
 
-    A subclass that starts from its last result keeps it in ``state``. This class is the prior none: x ≥ 0 alone."""
+    A subclass that starts from its last result keeps that in ``state``. This class is the prior ``none``: x ≥ 0 alone."""
 
     VOLUMES: ClassVar[int] = 0
     """Number of volumes that the prior holds in memory beyond those of ``dct``."""
@@ -175,7 +179,7 @@ class Prior:
 
 
 class TvPrior(Prior):
-    """Isotropic total variation, its weight multiplied by ``share``."""
+    """The prior tv: isotropic total variation, its weight multiplied by ``share``."""
 
     def __init__(self, prox: TvProx, iterations: int, share: float = 1.0) -> None:
         self.prox, self.iterations, self.share = prox, iterations, share
@@ -192,7 +196,7 @@ class TvPrior(Prior):
 
 
 class TvAndDct(Prior):
-    """Total variation, then a shrinkage of block cosine transforms, which follows best from a smooth volume.
+    """The prior dct: total variation, then a shrinkage of block cosine transforms, which works best on a smooth volume.
 
     share: the threshold of the shrinkage over the prior's weight."""
 
@@ -215,12 +219,14 @@ class TvAndDct(Prior):
 
 
 class ThenRidge(Prior):
-    """Another prior, and after every fourth of its maps a step down the learned ridge regulariser."""
+    """The prior ridge: the map ``before`` and, after every fourth of its maps, a step down the learned ridge
+    regulariser."""
 
     VOLUMES = RidgeStep.VOLUMES
 
     def __init__(self, before: Prior, ridge: RidgeStep, noise_factor: float) -> None:
-        """noise_factor: ratio of the noise that the step assumes to the prior's weight."""
+        """Joins both maps. noise_factor: the noise that the ridge step assumes, over the part of the weight that is due
+        to noise."""
         self.before, self.ridge, self.noise_factor = before, ridge, noise_factor
         self.maps = 0  # maps since the last step
 
@@ -244,7 +250,7 @@ class ThenRidge(Prior):
 
 
 class Piccs(Prior):
-    """(1 − share) TV(x) + share TV(x − image), as one map after the other.
+    """The prior piccs: (1 − share) TV(x) + share TV(x − image), as the map of the first term and then that of the second.
 
     Prior image constrained compressed sensing: Chen, Tang and Leng, Med. Phys. 35 (2008) 660."""
 
@@ -277,7 +283,8 @@ Denoiser = Callable[[np.ndarray, float], np.ndarray]
 
 
 class OwnPrior(Prior):
-    """A user's denoiser on the host in place of a proximal map (Venkatakrishnan, Bouman and Wohlberg 2013)."""
+    """A user's denoiser on the host in place of a proximal map (plug-and-play: Venkatakrishnan, Bouman and Wohlberg
+    2013)."""
 
     def __init__(self, denoiser: Denoiser) -> None:
         self.denoiser, self.subject = denoiser, f"--prior {function_name(denoiser)}"
@@ -304,9 +311,10 @@ PRIORS: dict[str, Callable[[PriorInputs], Prior]] = {
 
 
 def prior_of(prior: str | Denoiser, inputs: PriorInputs) -> Prior:
-    """Returns a prior by its name in ``PRIORS``, or a user's function, itself or by ``package.module:function``.
+    """Returns a prior by its name in ``PRIORS``, or from a user's function, given as such or as
+    ``package.module:function``.
 
-    Raises InputError for a name that is no function, and for piccs without an image."""
+    Raises InputError for what is neither a name nor a function, and for piccs without an image."""
     if isinstance(prior, str) and prior in PRIORS:
         return PRIORS[prior](inputs)
     own = imported(prior, "--prior") if isinstance(prior, str) else prior
@@ -316,17 +324,18 @@ def prior_of(prior: str | Denoiser, inputs: PriorInputs) -> Prior:
 
 
 def volumes_of(prior: str | Denoiser) -> int:
-    """Returns how many more volumes a prior holds than ``dct``."""
+    """Returns how many more volumes the prior holds on the device than ``dct``."""
     return ThenRidge.VOLUMES if prior == "ridge" else 0
 
 
 def subvoxel_share(prior: str | Denoiser, shape: tuple[int, int, int]) -> float:
-    """Returns the share of smaller voxels (z, y, x) in a result. Larger ones average noise, which ridge leaves less of."""
+    """Returns the weight of the smaller voxels in a result of ``shape`` (nz, ny, nx), 0 to 1. Larger voxels average
+    noise, of which ridge leaves less."""
     return _SUBVOXELS_WITH_RIDGE if prior == "ridge" and min(shape) >= RIDGE_EDGE else _SUBVOXELS
 
 
 def axis_weights(grid: Grid) -> tuple[float, float, float]:
-    """Returns weights (z, y, x) that turn differences into slopes, 1 along the finest axis."""
+    """Returns factors (z, y, x) that turn differences between voxels into slopes, 1 along the finest axis."""
     finest = min(grid.voxel_size_mm)
     z, y, x = (finest / pitch for pitch in grid.voxel_size_mm)
     return z, y, x

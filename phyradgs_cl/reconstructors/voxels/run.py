@@ -31,9 +31,9 @@ class IterativeOptions:
     """Options of every iterative method.
 
     motion: static, micro-views, or per-row (every line at its own times). iterations: passes over all frames.
-    nonnegative: clip the volume at 0 after every update. tolerance: stop when an iteration changes the volume by
-    less than this share of its norm; 0 runs all iterations. detector_model: which quantity the detector averages over a
-    line's times, line integrals (log) or intensity, or the model that the scan states (scan)."""
+    nonnegative: clip the volume at 0 after every update. tolerance: stop when an iteration changes the volume by less
+    than this fraction of its norm; 0 runs all iterations. detector_model: what the detector averages over a line's times:
+    line integrals (log), intensity, or what the scan states (scan)."""
 
     transmission_weights: ClassVar[bool] = False
     """Weights pixels by their transmission. Some methods have an option of this name."""
@@ -56,9 +56,10 @@ class IterativeOptions:
 
 
 class Algorithm:
-    """One iterative method on one system. ``volume`` (nz, ny, nx) in 1/mm is an array of the system's space.
+    """An iterative method on a system. ``volume`` (nz, ny, nx) in 1/mm is an array of the system's space.
 
-    A subclass writes ``step``, and names its running state: attributes that are arrays of the space, and numbers."""
+    A subclass writes ``step``, and names its running state: ``ARRAYS``, attributes that are arrays of the space, and
+    ``NUMBERS``."""
 
     ARRAYS: ClassVar[tuple[str, ...]] = ("volume",)
     NUMBERS: ClassVar[tuple[str, ...]] = ()
@@ -93,16 +94,17 @@ class Algorithm:
 
 
 class WithFacts(Stepwise, Protocol):
-    """A method with facts of its own for the result."""
+    """A ``Stepwise`` that has facts of its own for the result."""
 
     def facts(self, is_complete: bool) -> Mapping[str, object]:
-        """Returns the facts after the last step. is_complete: the run came to its end and was not interrupted."""
+        """Returns the facts after the last step. is_complete: the run came to its end, without an interruption."""
 
 
 @dataclass(frozen=True, eq=False)
 class MethodRun:
-    """One run: scan, options, device, seed, report, the state to resume from, the first volume in 1/mm, how the object
-    moves, and the times in s of its states if it changes. Seconds count from ``started``."""
+    """A method's run on a scan. resume: the state to continue from. initial: the first volume (nz, ny, nx) in 1/mm; None:
+    the method's own start. deformation: how the object moves. state_times_s (K,): times of its states if it changes.
+    Seconds count from ``started``."""
 
     scan: Scan
     options: Any
@@ -116,8 +118,8 @@ class MethodRun:
     started: float = field(default_factory=time.perf_counter)
 
     def system(self, *, volumes: int, frames: int) -> System:
-        """Returns the scan's system, for an algorithm that holds ``volumes`` volumes and ``frames`` stacks of all frames at
-        one time, its tables included. They stay on the device where it has room for them."""
+        """Returns the scan's system, with its arrays on the device where all fit: ``volumes`` volumes and ``frames``
+        stacks of all frames, which the algorithm holds at one time, and the tables."""
         system = System.of_scan(
             self.rt, self.scan, self.options.motion, self.options.detector_model, deformation=self.deformation,
             state_times_s=self.state_times_s, is_dense=self.initial is not None,
@@ -127,10 +129,10 @@ class MethodRun:
         return system.resident(self.rt, volumes + 2, frames + _SYSTEM_FRAMES)
 
     def result(self, name: str, method: WithFacts) -> Reconstruction:
-        """Runs a method in a loop; returns volume, record and facts.
+        """Runs a method in a loop. Returns its volume, convergence record and facts.
 
-        The record has a line per iteration: the residual ‖p − A x‖/‖p‖, the change ‖x − x'‖/‖x‖, and the seconds since the
-        start."""
+        The record has a line per iteration: the residual ‖p − A x‖/‖p‖, the change ‖x − x'‖/‖x‖, and the seconds since
+        the start."""
         loop = Loop(method, self.rt.ranks, self.report, self.started)
         loop.run(self.resume)
         facts: dict[str, object] = {
@@ -146,7 +148,8 @@ def voxel_method(
     name: str, default: IterativeOptions, make: Callable[[System, Any, MethodRun], Algorithm], *,
     volumes: int | Callable[[Scan, Any], int], frames: int,
 ) -> Method:
-    """Returns an algorithm as a method. ``volumes`` and ``frames`` as in ``MethodRun.system``; a function gives volumes."""
+    """Returns the algorithm that ``make`` builds as a method. volumes, frames: as in ``MethodRun.system``; volumes may be
+    a function of scan and options."""
 
     def reconstruct(scan: Scan, options: Any, rt: Runtime, **arguments: Any) -> Reconstruction:
         run = MethodRun(scan, options, rt, **arguments)
@@ -157,7 +160,7 @@ def voxel_method(
 
 
 class Iterations:
-    """An algorithm and its convergence, as the ``Stepwise`` that a ``Loop`` runs."""
+    """An algorithm with its residual and change, as the ``Stepwise`` that a ``Loop`` runs."""
 
     quantity, remedy = "residual", "check the scan for extreme values, or lower the relaxation"
 
@@ -199,6 +202,6 @@ class Iterations:
         self.algorithm.restore(state)
 
     def present_volume(self) -> tuple[np.ndarray, Grid]:
-        """Returns the volume, or the mean of the states."""
+        """Returns the volume (nz, ny, nx) in 1/mm, for an object that changes the mean of its states, and its grid."""
         values = self.algorithm.system.space.numpy(self.algorithm.volume)
         return values if values.ndim == 3 else values.mean(0), self.grid

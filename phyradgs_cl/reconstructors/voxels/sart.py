@@ -23,11 +23,12 @@ _WEIGHT_CACHE_BYTES = 1 << 29  # most bytes of the column weights of subsets tha
 
 @dataclass(frozen=True)
 class SartOptions(IterativeOptions):
-    """relaxation: λ, the applied share of each correction; relaxation_reduction: its factor per iteration.
+    """Options of SART. relaxation: λ, the applied fraction of each correction; relaxation_reduction: its factor per
+    iteration.
 
     frames_per_subset: frames that are corrected for together, 1 for SART; a pass takes neighbours in time far apart.
-    noise_stop: the run ends when the residual falls to this many times the estimated noise of the measurement (discrepancy
-    principle, Morozov 1966); further iterations fit the noise. 0 runs all iterations."""
+    noise_stop: the run ends when the residual falls to this many times the estimated noise of the measurement
+    (discrepancy principle, Morozov 1966); further iterations fit the noise. 0 runs all iterations."""
 
     relaxation: float = checks.ranged(1.0, 1e-6, 2)
     relaxation_reduction: float = checks.ranged(0.999, 1e-6, 1)
@@ -39,10 +40,10 @@ OS_SART = SartOptions(frames_per_subset=10)
 
 
 class Sart(Algorithm):
-    """x ← x + λ V Aᵢᵀ W (pᵢ − Aᵢ x) over subsets i, W = 1/(Aᵢ 1), V = 1/(Aᵢᵀ 1).
+    """SART, x ← x + λ V Aᵢᵀ W (pᵢ − Aᵢ x) over subsets i of the frames, with W = 1/(Aᵢ 1) and V = 1/(Aᵢᵀ 1).
 
-    The intensity model replaces Aᵢᵀ by Jᵢᵀ and Aᵢ x by Iᵢ(x). The residual is that of the pass: of every subset just before
-    its correction."""
+    The intensity model replaces Aᵢᵀ by Jᵢᵀ and Aᵢ x by Iᵢ(x). The residual of a pass takes every subset just before its
+    correction."""
 
     NUMBERS = ("relaxation",)
 
@@ -62,7 +63,7 @@ class Sart(Algorithm):
         return float(np.sqrt(squares))
 
     def _corrections(self) -> Iterator[Any]:
-        """Corrects for all subsets. Yields the residual of each just before its correction."""
+        """Corrects the volume for all subsets. Yields the residual of each subset just before its correction."""
         space, clip = self.system.space, self.options.nonnegative
         for index, subset in enumerate(self.subsets):
             columns = self._columns(index)
@@ -72,18 +73,18 @@ class Sart(Algorithm):
             self.volume = space.add_product(self.volume, columns, update, self.relaxation, nonnegative=clip)
 
     def _columns(self, index: int) -> Any:
-        """Returns the column weights of a subset, computed in every pass where the cache has no room for them."""
+        """Returns the column weights (nz, ny, nx) of a subset; computes them anew where the cache has no room for them."""
         is_cached = index < len(self._column_weights)
         return self._column_weights[index] if is_cached else column_weights(self.subsets[index])
 
 
 def _cached_columns(volume_shape: tuple[int, ...], subsets: int) -> int:
-    """Returns how many subsets keep their column weights, a volume each."""
+    """Returns how many of ``subsets`` subsets keep their column weights, each of a volume's size."""
     return min(subsets, max(_WEIGHT_CACHE_BYTES // (4 * math.prod(volume_shape)), 1))
 
 
 def held_volumes(scan: Scan, options: SartOptions) -> int:
-    """Returns how many volumes a run holds at one time."""
+    """Returns how many volumes a run holds at one time, with the column weights."""
     return 4 + _cached_columns(scan.grid.shape, checks.ceil_div(scan.frames, options.frames_per_subset))
 
 
@@ -96,16 +97,17 @@ METHOD, OS_METHOD = _method("sart", SartOptions()), _method("os-sart", OS_SART)
 
 @dataclass(frozen=True)
 class SirtOptions(IterativeOptions):
-    """relaxation: λ between 0 and 2."""
+    """Options of SIRT. relaxation: λ, between 0 and 2."""
 
     iterations: int = 100
     relaxation: float = ranged(1.0, 1e-6, 2)
 
 
 class Sirt(Algorithm):
-    """x ← x + λ C Aᵀ R (p − A x), R = 1/(A 1), C = 1/(Aᵀ 1). The intensity model replaces Aᵀ by Jᵀ and A x by I(x).
+    """SIRT, x ← x + λ C Aᵀ R (p − A x), with R = 1/(A 1) and C = 1/(Aᵀ 1). The intensity model replaces Aᵀ by Jᵀ and A x
+    by I(x).
 
-    The residual is that before the correction, of which √R ‖·‖ falls in every step."""
+    The residual of an iteration is that before its correction, of which √R ‖·‖ falls in every step."""
 
     def __init__(self, system: System, options: SirtOptions) -> None:
         super().__init__(system)

@@ -20,10 +20,10 @@ _STAGE, _VOLUME = "stage", "volume_before"  # entries of a state: the present st
 
 @dataclass(frozen=True)
 class Stage:
-    """One stage: its number of iterations, and a function that makes its method, to start from a volume (nz, ny, nx).
+    """One stage of a run. make: returns the stage's method, which starts from a volume (nz, ny, nx) or, from None, anew.
 
-    ``merge`` combines the stage's volume and that of the stages before it to the result of the whole run (nz, ny, nx).
-    ``end`` is called with the finished method."""
+    merge: combines the stage's volume and that of the stages before it to the result (nz, ny, nx) of the whole run. end:
+    is called with the finished method."""
 
     name: str
     iterations: int
@@ -33,7 +33,7 @@ class Stage:
 
 
 class Stages:
-    """One stage after the other as one ``Stepwise``, which a ``Loop`` runs, reports, stops and resumes.
+    """Stages, one after the other, as one ``Stepwise`` that a ``Loop`` runs, reports, stops and resumes.
 
     The first stage starts from the run's first volume, if any."""
 
@@ -91,8 +91,8 @@ class Stages:
         self._facts.update(self.method.facts(True))
 
     def facts(self, is_complete: bool) -> Mapping[str, object]:
-        """Returns the facts of the last stage, with the iterations of each stage, and its seconds in this process. In a
-        complete run, stages without iterations are ended first."""
+        """Returns the facts of the last stage, with each stage's iterations and its seconds in this process. In a
+        complete run, ends remaining stages, which have no iterations."""
         while is_complete and not self.is_last:
             self.advance()
         self._note()
@@ -118,6 +118,6 @@ def repeated(volume: np.ndarray | None, parts: int) -> np.ndarray | None:
 
 
 def merge_subvoxels(volume: np.ndarray, before: np.ndarray | None, parts: int, share: float) -> np.ndarray:
-    """Returns the mean of ``before`` (nz, ny, nx) and, weighted by ``share``, of the means of ``volume`` over blocks."""
+    """Returns (1 − share) ``before`` + share · (means of ``volume`` over blocks of ``parts``³ voxels), (nz, ny, nx)."""
     assert before is not None
     return before + np.float32(share) * (block_means(volume, (parts,) * 3) - before)

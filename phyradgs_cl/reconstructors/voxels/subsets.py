@@ -11,13 +11,13 @@ _GROWTH = 1.2  # steps of subsets diverge where a pass leaves more than this man
 
 
 def spread_order(count: int) -> list[int]:
-    """Returns 0 … count−1 in steps near the golden section of count, so that each is far from the few before it."""
+    """Returns the numbers 0 … count − 1, each far from the few before it, in steps near the golden section of ``count``."""
     step = next(s for s in range(max(round(0.618 * count), 1), 2 * count + 1) if np.gcd(s, count) == 1)
     return [(i * step) % count for i in range(count)]
 
 
 class OrderedSubsets:
-    """A system in ``count`` subsets: every count-th frame, in an order that spreads them over the turn."""
+    """A system divided into ``count`` subsets: every count-th frame each, in an order that spreads them over the turn."""
 
     def __init__(self, system: System, count: int) -> None:
         self.system, self.least_residual = system, float("inf")
@@ -35,7 +35,8 @@ class OrderedSubsets:
         self._systems = [self.system.subset(range(first, frames, count)) for first in spread_order(count)]
 
     def join_if_diverging(self, residual: float) -> bool:
-        """Joins subsets two by two if a pass with this residual shows that their steps diverge. Returns whether it did."""
+        """Joins subsets two by two where the ``residual`` of a pass has grown so much that their steps diverge. Returns
+        whether it did."""
         diverges = residual > _GROWTH * self.least_residual and len(self) > 1
         if diverges:
             self.split(ceil_div(len(self), 2))

@@ -30,12 +30,15 @@ S = TypeVar("S", bound="SharedOperator")
 
 @dataclass(frozen=True, eq=False)
 class System:
-    """Operator A and measurement p (F, rows, columns) float32. Volumes (nz, ny, nx) and frames are arrays of ``space``.
+    """The operator A and the measurement p (F, rows, columns) float32 of a scan. Volumes (nz, ny, nx) and frames are
+    arrays of ``space``.
 
     valid: (F, rows, columns) or (rows, columns), 1 or 0; None: all pixels are valid. Pixels that are not valid are 0 in
     ``measured`` and in every residual, as if A had no rows for them.
+
     intensity: set where the detector averages intensity. The measurement is then compared with I(x) in place of A x, and
     residuals go back through Jᵀ in place of Aᵀ; J is the derivative of I at the volume of the last comparison.
+
     transmission: (F, rows, columns) weights of pixels by their transmission, mean 1; None: equal weights."""
 
     operator: LinearOperator
@@ -50,11 +53,11 @@ class System:
         cls, rt: Runtime, scan: Scan, motion: Motion, detector_model: str = "log", *, fewest_lines: int | None = None,
         deformation: Deformation | None = None, state_times_s: np.ndarray | None = None, is_dense: bool = False,
     ) -> "System":  # fmt: skip
-        """Returns the system of a scan under ``motion``, of an object that moves as ``deformation`` does, or that changes
-        between states at ``state_times_s`` (K,). Volumes are then stacks (K, nz, ny, nx).
+        """Returns the system of a scan under the motion model ``motion``. deformation: how the object moves.
+        state_times_s (K,): times in s of an object that changes; volumes are then stacks (K, nz, ny, nx).
 
-        detector_model: log, intensity, or scan for the stated one. fewest_lines: as in ``RayOperator``, without a motion.
-        is_dense: as in ``subrays_of``."""
+        detector_model: log, intensity, or scan for the scan's own. fewest_lines: as in ``RayOperator``, for an object at
+        rest. is_dense: as in ``subrays_of``."""
         tables = [motion.cells(scan, f).still() for f in range(scan.frames)]
         shape = scan.geometry.detector_shape
         projector = projector_of(rt, scan.grid, tables, deformation, state_times_s)
@@ -75,9 +78,10 @@ class System:
         return cls(operator, np.where(valid, measured, np.float32(0)), valid, intensity)
 
     def resident(self, rt: Runtime, volumes: int, frames: int) -> "System":
-        """Returns the system on the device, if it has room for the operators, the volumes, and stacks of all frames.
+        """Returns the system with its arrays on the device, if that has room for the operators, ``volumes`` volumes, and
+        ``frames`` stacks of all frames.
 
-        Otherwise the system stays on the host. It always does in bricks and on several ranks, which sum there."""
+        Otherwise the system stays on the host, as it does in bricks and on several ranks, which sum there."""
         kinds = RayOperator, WarpedOperator, IntensityOperator
         operators = [o for o in (self.operator, self.intensity) if isinstance(o, kinds)]
         if len(operators) < 1 + (self.intensity is not None):
@@ -101,8 +105,8 @@ class System:
         return replace(self, measured=space.array(self.measured), valid=valid, transmission=transmission, space=space)
 
     def leave_room(self, rt: Runtime, nbytes: int) -> bool:
-        """Frees the buffers of the ray operators if they leave less than ``nbytes`` of the device, and returns whether they
-        did. They plan again when they are next used."""
+        """Frees the buffers of the ray operators where they leave less than ``nbytes`` of the memory limit. Returns
+        whether it did. The operators plan their buffers again at their next use."""
         operators = [o for o in (self.operator, self.intensity) if isinstance(o, RayOperator | IntensityOperator)]
         planned_bytes = sum(operator.memory.planned_bytes for operator in operators)
         if rt.ledger.limit_bytes - max(planned_bytes, rt.ledger.held_bytes) >= nbytes:
@@ -124,15 +128,15 @@ class System:
         return frames if self.valid is None else self.space.multiply(frames, self.valid)
 
     def forward(self, volume: Any) -> Any:
-        """Returns A x at the valid pixels."""
+        """Returns A x (F, rows, columns), 0 at pixels that are not valid."""
         return self.masked(self.operator.forward(volume, self.space.place(self.operator.frames_shape)))
 
     def adjoint(self, frames: Any) -> Any:
-        """Returns Aᵀ y of frames that are 0 at pixels that are not valid."""
+        """Returns Aᵀ y (nz, ny, nx) of frames y that are 0 at pixels that are not valid."""
         return self.operator.adjoint(frames, self.space.place(self.volume_shape))
 
     def expected(self, volume: Any) -> Any:
-        """Returns the measurement expected of x at the valid pixels: A x, or I(x) in the intensity model."""
+        """Returns the expected measurement of x: A x or, in the intensity model, I(x); 0 at pixels that are not valid."""
         return self.masked(self._model(volume, self.space.place(self.operator.frames_shape)))
 
     @property
@@ -140,7 +144,8 @@ class System:
         return self.operator.forward if self.intensity is None else self.intensity.expected
 
     def derivative(self, change: Any) -> Any:
-        """Returns A d, or J d: the change in ``expected`` for a change d of the last volume compared."""
+        """Returns A d or, in the intensity model, J d: the change of ``expected`` for a change d of the last volume
+        compared."""
         operator = self.operator if self.intensity is None else self.intensity
         return self.masked(operator.forward(change, self.space.place(self.operator.frames_shape)))
 
@@ -150,37 +155,37 @@ class System:
         return operator.adjoint(frames, self.space.place(self.volume_shape))
 
     def residual(self, volume: Any) -> Any:
-        """Returns p − A x, or p − I(x), dimensionless."""
+        """Returns p − A x or, in the intensity model, p − I(x), dimensionless; 0 at pixels that are not valid."""
         # the frames before their mask have no name: a name would keep their memory
         expected = self.masked(self._model(volume, self.space.place(self.operator.frames_shape)))
         return self.space.add(self.measured, expected, -1.0)
 
     def difference(self, x: Any, y: Any) -> Any:
-        """Returns x − y."""
+        """Returns x − y for arrays of one shape."""
         return self.space.add(x, y, -1.0)
 
     def linearise_at(self, volume: Any) -> None:
-        """Makes J the derivative of I at ``volume``, for a run that resumes there. A is the same everywhere."""
+        """Sets J to the derivative of I at ``volume``, for a run that resumes there. A is the same at every volume."""
         if self.intensity is not None:
             self.expected(volume)
 
     def noise_norm(self) -> float:
-        """Returns the norm of the measurement's noise, estimated from the measurement."""
+        """Returns the norm of the measurement's noise over the valid pixels, estimated from the measurement."""
         measured = self.space.numpy(self.measured)
         valid = None if self.valid is None else np.broadcast_to(self.space.numpy(self.valid) != 0, measured.shape)
         pixels = measured.size if valid is None else np.count_nonzero(valid)
         return float(noise_level(measured, valid) * np.sqrt(pixels))
 
     def row_sums(self) -> Any:
-        """Returns A 1 in mm: the length of every ray in the volume."""
+        """Returns A 1 (F, rows, columns) in mm: the length of every ray in the volume."""
         return self.forward(self.space.full(self.volume_shape, 1.0))
 
     def column_sums(self) -> Any:
-        """Returns Aᵀ 1 in mm over the valid pixels, or Aᵀ t with transmission weights."""
+        """Returns Aᵀ 1 (nz, ny, nx) in mm over the valid pixels; with transmission weights t, Aᵀ t."""
         return self.adjoint(self.masked(self.apply_weights(self.space.full(self.measured.shape, 1.0))))
 
     def apply_weights(self, frames: Any) -> Any:
-        """Returns frames times their transmission weights, if there are any."""
+        """Returns frames times their transmission weights; unchanged where there are none."""
         return frames if self.transmission is None else self.space.multiply(frames, self.transmission)
 
     def transmission_weighted(self) -> "System":
@@ -188,7 +193,7 @@ class System:
         return replace(self, transmission=transmission_weights(self.measured, self.valid))
 
     def subset(self, frames: Sequence[int]) -> "System":
-        """Returns the system of some frames."""
+        """Returns the system of the frames with the numbers ``frames``, in the order given."""
         numbers, valid = list(frames), self.valid
         if valid is not None and len(valid.shape) == 3:
             valid = self.space.take(valid, numbers)
@@ -202,9 +207,9 @@ class System:
 def row_weights(system: System) -> Any:
     """Returns 1/(A 1) of every ray in 1/mm.
 
-    A ray shorter than a tenth of the longest path counts as that long. A ray that only grazes an edge of the volume would
-    otherwise put its noise on one or two voxels, and corners of the volume become bright. TIGRE measures the paths in a box
-    that is a tenth larger, for the same reason."""
+    A ray shorter than a tenth of the longest counts as that tenth. A ray that only grazes an edge of the volume would
+    otherwise put its noise on one or two voxels, and corners of the volume would become bright. TIGRE measures the paths
+    in a box that is a tenth larger, for the same reason."""
     return system.space.reciprocal(system.row_sums(), _SHORTEST_PATH)
 
 
@@ -214,7 +219,7 @@ def column_weights(system: System) -> Any:
 
 
 class SharedOperator:
-    """A ``LinearOperator`` whose frames the ranks share; ``whole`` has all frames.
+    """A ``LinearOperator`` whose frames the ranks divide among them; ``whole`` is the operator of all frames.
 
     Volumes and frames are complete on every rank, so that methods do the same on each. Sums of volumes do not depend on
     their order, only on the number of frames per rank."""
@@ -237,7 +242,8 @@ class SharedOperator:
         return exact_sum(self.ranks, parts, shape, self.ranks.size).reshape(self.volume_shape)
 
     def subset(self: S, frames: Sequence[int]) -> S:
-        """Returns the operator of some of the frames, in this order, which the ranks share again."""
+        """Returns the operator of the frames with the numbers ``frames``, in the order given, divided among the ranks
+        anew."""
         return type(self)(self.ranks, self.whole.subset(frames))
 
     def _gathered(self, part: np.ndarray | None) -> np.ndarray:
@@ -246,11 +252,11 @@ class SharedOperator:
 
 
 class SharedIntensity(SharedOperator):
-    """An ``IntensityOperator`` whose frames the ranks share."""
+    """An ``IntensityOperator`` whose frames the ranks divide among them."""
 
     whole: IntensityOperator
     _part: IntensityOperator | None
 
     def expected(self, volume: np.ndarray, out: None = None) -> np.ndarray:
-        """Returns I(x) (F, rows, columns) float32 of a volume (nz, ny, nx) in 1/mm. J is that at x from then on."""
+        """Returns I(x) (F, rows, columns) float32 of a volume (nz, ny, nx) in 1/mm, and sets J to the derivative there."""
         return self._gathered(None if self._part is None else self._part.expected(volume))

@@ -25,7 +25,8 @@ _HELP = (
 def space(volume: NDArray[np.floating], grid: Grid, window: Window, gaussians: Gaussians | None) -> Markup | None:
     """Returns a 3D picture of a volume (nz, ny, nx), its controls and the data of the script.
 
-    Returns None for fewer than two voxels along any side. ``window``: that of the result's slices. ``gaussians``: in mm."""
+    Returns None for fewer than two voxels along any side. window: that of the result's slices. gaussians: in mm, or
+    None."""
     if not has_depth(volume):
         return None
     cloud = None if gaussians is None or not gaussians.count else gaussians
@@ -118,8 +119,8 @@ def _atlas_within(steps: NDArray[np.uint8], most_text: int) -> tuple[str, int]:
 
 
 def _between(steps: NDArray[np.uint8]) -> int:
-    """Returns the grey step, from 1 to 255, that divides steps into two classes with the largest variance between them
-    (Otsu, IEEE Transactions on Systems, Man, and Cybernetics 9 (1979) 62)."""
+    """Returns the grey level, from 1 to 255, that divides the levels into two classes. The variance between the classes
+    is the largest (Otsu, IEEE Transactions on Systems, Man, and Cybernetics 9 (1979) 62)."""
     counts = np.bincount(steps.ravel(), minlength=256).astype(np.float64)
     below, sums = np.cumsum(counts), np.cumsum(counts * np.arange(256))
     above = below[-1] - below

@@ -103,8 +103,8 @@ def object_in_motion(
 
 
 def fitting(deformation: Deformation, grid: Grid) -> Deformation:
-    """Returns the deformation with at most ``MOST_VALUES`` numbers. One with more is sampled at control points farther
-    apart, at which it keeps its values."""
+    """Returns the deformation with at most ``MOST_VALUES`` numbers. A larger one is sampled at control points farther
+    apart, where it keeps its values."""
     spacing_mm = float(np.max(deformation.spacing_mm))
     reduced = deformation
     while reduced.control_mm.size > MOST_VALUES and spacing_mm < 2 * max(grid.size_mm):

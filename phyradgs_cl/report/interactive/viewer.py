@@ -64,7 +64,7 @@ def _figure(plane: Plane) -> Markup:
 
 
 def stills(planes: list[Plane], of: str, high: float) -> Markup:
-    """Returns pictures without controls, and a bar of their values. Black is 0, white is ``high`` in 1/mm or more."""
+    """Returns pictures without controls, and a bar of their values: black is 0, white is ``high`` in 1/mm or more."""
     figures = []
     for plane in planes:
         words = f"{plane.name.capitalize()} slice ({place(plane, plane.middle)})"
@@ -75,8 +75,8 @@ def stills(planes: list[Plane], of: str, high: float) -> Markup:
 
 
 def picture(plane: Plane, of: str, *, canvases: int = 0, has_lines: bool = False) -> Markup:
-    """Returns a slice with world axes at its edges and a scale bar. On top of it are ``canvases``, a number of them, for the
-    script, and crossing lines if ``has_lines``."""
+    """Returns a slice with world axes at its edges and a scale bar. canvases: how many canvases lie on top for the
+    script. has_lines: crossing lines lie on top."""
     width_mm, height_mm = plane.size_mm
     image = element(
         "img", src=data_uri(plane.still),
