@@ -19,9 +19,9 @@ from phyradgs_cl.io import (
     scan_summary,
     volume_summary,
 )
+from phyradgs_cl.io.attenuation import FROM_HU, VALUES
 from phyradgs_cl.io.hdf5.source import open_hdf5
 from phyradgs_cl.io.output import refuse_overwriting
-from phyradgs_cl.io.volume import FROM_HU, VALUES
 from phyradgs_cl.prepare.light import read_corrected
 
 _KINDS = {
