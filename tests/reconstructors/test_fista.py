@@ -255,7 +255,6 @@ def test_ridge_follows_the_maps_of_dct_on_a_fly_scan_and_less_total_variation_at
     assert not np.array_equal(turned, at_rest)
 
 
-
 def test_a_prior_is_found_by_its_name(rt, scan, tmp_path, monkeypatch) -> None:
     own = "nothing = lambda volume, noise: 0 * volume\nless = lambda volume, noise: volume[1:]\n"
     (tmp_path / "own_priors.py").write_text(own)
